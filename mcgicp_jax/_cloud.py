@@ -1,0 +1,226 @@
+"""The point cloud: positions, channels, and what is derived from them once."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.typing import ArrayLike
+from jaxtyping import Array, Bool, Float, Int
+
+from mcgicp_jax._pose import Pose, is_concrete, pose_matrix
+
+_SMALLEST_CLASS = 128
+
+
+def size_class(num_points: int) -> int:
+    """The smallest padded size that holds `num_points` rows.
+
+    JAX compiles per shape. Sizes grow by at most a quarter (128, 160, 192, 240, ...), so that a stream of clouds of
+    different sizes meets few programs and wastes at most 25 % of its rows.
+    """
+    size = _SMALLEST_CLASS
+    while size < num_points:
+        size = int(size * 1.25) // 16 * 16
+    return size
+
+
+def _as_float(name: str, values: ArrayLike) -> Any:
+    """A floating-point array; NumPy stays NumPy (and float64), so that nothing is lost before an origin is taken off."""
+    if isinstance(values, jax.Array):
+        return values if jnp.issubdtype(values.dtype, jnp.floating) else values.astype(float)
+    try:
+        array = np.asarray(values)
+    except ValueError as error:
+        raise ValueError(f"{name}: expected numbers in a rectangular array, got rows of unequal length") from error
+    if array.dtype.kind not in "fiub":
+        raise ValueError(f"{name}: expected real numbers, got dtype {array.dtype}")
+    return array if array.dtype in (np.float32, np.float64) else array.astype(np.float64)
+
+
+class PointCloud(eqx.Module):
+    """Points with channels; a pytree whose arrays may all carry leading batch dimensions.
+
+    `preprocess` makes from a raw cloud (NumPy arrays, any size) one that is ready to register (JAX arrays, padded to
+    a size class, with neighbours). Rows that are not `valid` are padding and take part in nothing.
+    To put other values in, as when a network makes the channels, use `cloud.replace(channels=...)`.
+
+    Attributes:
+        points: (N, 3), metres, relative to `origin`.
+        channels: (N, C), in the unit that the user gives; C may be 0.
+        valid: (N,), False for padding.
+        neighbors: (N, k) row numbers of the k nearest points, the point itself first; −1 where there are fewer.
+        covariances: (N, 3, 3), or None: if given, the methods take these instead of computing their own.
+        origin: (3,) float64, taken off the points to keep float32 exact at large (UTM) coordinates; 0 otherwise.
+        channel_names: C names, such as ("intensity",) or ("red", "green", "blue"); files are written by them.
+    """
+
+    points: Float[Array, "*batch N 3"] | Float[np.ndarray, "*batch N 3"]
+    channels: Float[Array, "*batch N C"] | Float[np.ndarray, "*batch N C"]
+    valid: Bool[Array, "*batch N"] | Bool[np.ndarray, "*batch N"]
+    neighbors: Int[Array, "*batch N k"] | None
+    covariances: Float[Array, "*batch N 3 3"] | Float[np.ndarray, "*batch N 3 3"] | None
+    origin: Float[Array, "*batch 3"] | Float[np.ndarray, "*batch 3"]
+    channel_names: tuple[str, ...] = eqx.field(static=True)
+
+    def __init__(
+        self,
+        points: ArrayLike,
+        channels: ArrayLike | None = None,
+        *,
+        covariances: ArrayLike | None = None,
+        channel_names: Sequence[str] | None = None,
+    ):
+        """A raw cloud.
+
+        Args:
+            points: (N, 3), metres. Lists, any real dtype, NumPy or JAX.
+            channels: (N, C), or (N,) for a single one.
+            covariances: (N, 3, 3), dimensionless as GICP's are (1 in the surface, ε across it).
+            channel_names: one name per channel.
+
+        Raises:
+            ValueError: where a shape or dtype does not fit; the message names the argument.
+        """
+        points = _as_float("points", points)
+        if points.ndim != 2 or points.shape[1] != 3:
+            raise ValueError(f"points: expected shape (N, 3), got {points.shape}")
+        if channels is None:
+            channels = np.zeros((len(points), 0), points.dtype)
+        channels = _as_float("channels", channels)
+        if channels.ndim == 1:
+            channels = channels[:, None]
+        if channels.ndim != 2 or channels.shape[0] != points.shape[0]:
+            raise ValueError(f"channels: expected shape ({points.shape[0]}, C) to go with points, got {channels.shape}")
+        if covariances is not None:
+            covariances = _as_float("covariances", covariances)
+            if covariances.shape != (points.shape[0], 3, 3):
+                raise ValueError(f"covariances: expected shape ({points.shape[0]}, 3, 3), got {covariances.shape}")
+        if channel_names is None:
+            channel_names = [f"channel_{i}" for i in range(channels.shape[1])]
+        if len(channel_names) != channels.shape[1]:
+            raise ValueError(f"channel_names: expected {channels.shape[1]} names, got {len(channel_names)}")
+        self.points = points
+        self.channels = channels
+        self.valid = np.ones(points.shape[0], bool)
+        self.neighbors = None
+        self.covariances = covariances
+        self.origin = np.zeros(3)
+        self.channel_names = tuple(channel_names)
+
+    def replace(self, **arrays: Any) -> PointCloud:
+        """The cloud with some of its arrays exchanged (`points`, `channels`, `covariances`, ...); shapes must agree.
+
+        Neighbours stay as they are: to autodiff they are constants.
+        """
+        fields = {name: getattr(self, name) for name in self.__dataclass_fields__}
+        unknown = arrays.keys() - fields.keys()
+        if unknown:
+            raise ValueError(f"replace: no field named {', '.join(sorted(unknown))}; there are {', '.join(fields)}")
+        for name, value in arrays.items():
+            if fields[name] is not None and np.shape(value) != np.shape(fields[name]) and name != "channels":
+                raise ValueError(f"{name}: expected shape {np.shape(fields[name])}, got {np.shape(value)}")
+        if "channels" in arrays:
+            channels = arrays["channels"]
+            if np.shape(channels)[:-1] != np.shape(self.points)[:-1]:
+                raise ValueError(f"channels: expected shape ({self.points.shape[-2]}, C), got {np.shape(channels)}")
+            if channels.shape[-1] != self.channels.shape[-1] and "channel_names" not in arrays:
+                arrays["channel_names"] = tuple(f"channel_{i}" for i in range(channels.shape[-1]))
+        return _build(**fields | arrays)
+
+    def __len__(self) -> int:
+        """The number of points, padding not counted."""
+        return int(np.sum(np.asarray(self.valid)))
+
+    def __repr__(self) -> str:
+        if not is_concrete(self) or self.points.ndim != 2:
+            size = f"shape {tuple(self.points.shape[:-1])}"
+        elif len(self) == self.points.shape[0]:
+            size = f"{len(self)} points"
+        else:
+            size = f"{len(self)} points padded to {self.points.shape[0]}"
+        names = ", ".join(self.channel_names) if self.channel_names else "none"
+        parts = [size, f"channels: {names}", str(self.points.dtype)]
+        if self.neighbors is not None:
+            parts.append(f"{self.neighbors.shape[-1]} neighbors")
+        if is_concrete(self.origin) and np.any(self.origin):
+            parts.append(f"origin {np.array2string(np.asarray(self.origin), precision=1)}")
+        return f"PointCloud({', '.join(parts)})"
+
+    def unpad(self) -> PointCloud:
+        """A raw cloud: the valid rows alone, as NumPy arrays in the user's frame (float64 if an origin was taken off)."""
+        keep = np.asarray(self.valid)
+        points = np.asarray(self.points)[keep]
+        if np.any(self.origin):
+            points = points.astype(np.float64) + np.asarray(self.origin)
+        covariances = None if self.covariances is None else np.asarray(self.covariances)[keep]
+        return PointCloud(
+            points, np.asarray(self.channels)[keep], covariances=covariances, channel_names=self.channel_names
+        )
+
+    def pad(self, size: int) -> PointCloud:
+        """The cloud with rows of padding added at the end, `size` in all."""
+        missing = size - self.points.shape[0]
+        if missing < 0:
+            raise ValueError(f"size: expected at least {self.points.shape[0]}, the cloud's rows, got {size}")
+
+        def grow(array: Any, fill: float = 0) -> Any:
+            if array is None:
+                return None
+            xp = np if isinstance(array, np.ndarray) else jnp
+            return xp.pad(array, [(0, missing)] + [(0, 0)] * (array.ndim - 1), constant_values=fill)
+
+        return self.replace_rows(
+            points=grow(self.points),
+            channels=grow(self.channels),
+            valid=grow(self.valid),
+            neighbors=grow(self.neighbors, -1),
+            covariances=grow(self.covariances),
+        )
+
+    def replace_rows(self, **arrays: Any) -> PointCloud:
+        """The cloud with another number of rows; nothing is checked."""
+        fields = {name: getattr(self, name) for name in self.__dataclass_fields__}
+        return _build(**fields | arrays)
+
+    def transform(self, pose: Pose) -> PointCloud:
+        """The cloud moved by a pose: points p become R p + t, covariances C become R C Rᵀ."""
+        matrix = pose_matrix(pose, "pose")
+        numpy = np if isinstance(self.points, np.ndarray) and is_concrete(matrix) else jnp
+        rotation = numpy.asarray(matrix[:3, :3], self.points.dtype)
+        translation, origin = matrix[:3, 3], self.origin
+        if is_concrete(origin, matrix) and np.any(origin):
+            # The large part of the motion stays in float64.
+            origin = np.asarray(matrix)[:3, :3] @ origin + translation
+            translation = np.zeros(3)
+        points = self.points @ rotation.T + numpy.asarray(translation, self.points.dtype)
+        covariances = None if self.covariances is None else rotation @ self.covariances @ rotation.T
+        return self.replace(points=points, covariances=covariances, origin=origin)
+
+    @staticmethod
+    def stack(clouds: Sequence[PointCloud]) -> PointCloud:
+        """One cloud with a leading batch dimension, for `jax.vmap`; padded to the size class of the largest."""
+        if not clouds:
+            raise ValueError("clouds: expected at least one, got none")
+        size = max(size_class(cloud.points.shape[0]) for cloud in clouds)
+        names = clouds[0].channel_names
+        for i, cloud in enumerate(clouds):
+            if cloud.channel_names != names:
+                raise ValueError(f"clouds[{i}]: expected the channels {names}, got {cloud.channel_names}")
+        padded = [cloud.pad(size) for cloud in clouds]
+        stacked = jax.tree.map(lambda *rows: jnp.stack(rows), *padded)
+        if is_concrete(stacked):
+            stacked = stacked.replace_rows(origin=np.stack([np.asarray(cloud.origin) for cloud in clouds]))
+        return stacked
+
+
+def _build(**fields: Any) -> PointCloud:
+    """A cloud from finished fields, past the conversions and checks of its constructor."""
+    cloud = object.__new__(PointCloud)
+    for name, value in fields.items():
+        object.__setattr__(cloud, name, value)
+    return cloud

@@ -1,0 +1,67 @@
+"""Poses at the border: what a user may hand in, and what every module inside receives."""
+
+from __future__ import annotations
+
+from typing import TypeAlias
+
+import jax
+import jax.numpy as jnp
+import jaxlie
+import numpy as np
+from jax.typing import DTypeLike
+from jaxtyping import Array, Float
+
+Pose: TypeAlias = "jaxlie.SE3 | Float[Array, '*batch 4 4'] | Float[np.ndarray, '*batch 4 4']"
+
+# A matrix that a user typed with a few digits is still a rotation; one that mirrors or scales is not.
+_ROTATION_TOLERANCE = 1e-3
+
+
+def is_concrete(*trees: object) -> bool:
+    """Whether every array in the trees holds numbers now, rather than standing for them under a transformation."""
+    return not any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(trees))
+
+
+def pose_matrix(pose: Pose | None, name: str = "init") -> Float[np.ndarray, "4 4"] | Float[Array, "4 4"]:
+    """The (4, 4) matrix of a pose, in the precision that it came in (float64 for NumPy); `None` is the identity.
+
+    Raises `ValueError`, where the values are concrete, if the shape is wrong or the matrix is no rigid motion.
+    """
+    if pose is None:
+        return np.eye(4)
+    matrix = pose.as_matrix() if isinstance(pose, jaxlie.SE3) else pose
+    if not is_concrete(matrix):
+        if matrix.shape != (4, 4):
+            raise ValueError(f"{name}: expected a jaxlie.SE3 or a (4, 4) matrix, got shape {matrix.shape}")
+        return matrix
+    try:
+        matrix = np.asarray(matrix, dtype=np.float64)
+    except (TypeError, ValueError) as error:
+        raise ValueError(f"{name}: expected a jaxlie.SE3 or a (4, 4) matrix, got {type(pose).__name__}") from error
+    if matrix.shape != (4, 4):
+        raise ValueError(f"{name}: expected a jaxlie.SE3 or a (4, 4) matrix, got shape {matrix.shape}")
+    rotation = matrix[:3, :3]
+    # Written so that NaN fails as well.
+    rigid = np.abs(rotation @ rotation.T - np.eye(3)).max() <= _ROTATION_TOLERANCE and np.linalg.det(rotation) > 0
+    if not (rigid and np.isfinite(matrix).all() and np.array_equal(matrix[3], [0.0, 0.0, 0.0, 1.0])):
+        raise ValueError(
+            f"{name}: expected a rigid motion (rotation of determinant 1, last row 0 0 0 1), got\n{matrix}"
+        )
+    return matrix
+
+
+def translation_matrix(offset: Float[np.ndarray, "3"]) -> Float[np.ndarray, "4 4"]:
+    matrix = np.eye(4)
+    matrix[:3, 3] = offset
+    return matrix
+
+
+def se3_from_matrix(matrix: Float[np.ndarray, "4 4"] | Float[Array, "4 4"], dtype: DTypeLike) -> jaxlie.SE3:
+    """`jaxlie.SE3` in the given precision, its quaternion normalised."""
+    pose = jaxlie.SE3.from_matrix(jnp.asarray(matrix, dtype))
+    return cast_pose(pose.normalize(), dtype)
+
+
+def cast_pose(pose: jaxlie.SE3, dtype: DTypeLike) -> jaxlie.SE3:
+    """jaxlie computes some constants in the default precision; this undoes the promotion."""
+    return jaxlie.SE3(pose.wxyz_xyz.astype(dtype))

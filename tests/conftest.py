@@ -1,0 +1,25 @@
+"""Shapes are executed: every annotated function of the package is checked by beartype while the tests run."""
+
+import os
+import pathlib
+
+from jaxtyping import install_import_hook
+
+# Compiled programs are kept between runs: compilation is most of what the tests cost.
+os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(pathlib.Path(__file__).parent.parent / ".jax_cache"))
+os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0.2")
+
+with install_import_hook("mcgicp_jax", "beartype.beartype"):
+    import mcgicp_jax  # noqa: F401
+
+import pytest  # noqa: E402
+
+DATA = pathlib.Path(os.environ.get("MCGICP_DATA", pathlib.Path(__file__).parents[2] / "shared" / "data"))
+
+
+@pytest.fixture(scope="session")
+def data() -> pathlib.Path:
+    """The folder of real clouds; tests that need it are skipped where it is not."""
+    if not DATA.is_dir():
+        pytest.skip(f"no real data in {DATA} (set MCGICP_DATA)")
+    return DATA
