@@ -1,5 +1,26 @@
-"""Multi-channel generalized ICP in JAX."""
+"""Multi-channel generalized ICP in JAX: registration of point clouds that carry channels.
+
+Frames: `T_target_source` maps source coordinates into the target's frame. Metres and radians throughout.
+"""
 
 from mcgicp_jax._cloud import PointCloud as PointCloud
+from mcgicp_jax._cost import Cauchy as Cauchy
+from mcgicp_jax._cost import GemanMcClure as GemanMcClure
+from mcgicp_jax._cost import Huber as Huber
+from mcgicp_jax._cost import Tukey as Tukey
+from mcgicp_jax._cost import mahalanobis_cost as mahalanobis_cost
+from mcgicp_jax._methods import GICP as GICP
+from mcgicp_jax._methods import ColorICP as ColorICP
+from mcgicp_jax._methods import MultiChannelGICP as MultiChannelGICP
+from mcgicp_jax._methods import PointToPlane as PointToPlane
+from mcgicp_jax._methods import PointToPoint as PointToPoint
+from mcgicp_jax._preprocess import preprocess as preprocess
+from mcgicp_jax._register import align as align
+from mcgicp_jax._register import find_correspondences as find_correspondences
+from mcgicp_jax._register import register as register
+from mcgicp_jax._result import Registration as Registration
+from mcgicp_jax._result import Status as Status
+from mcgicp_jax._search import Correspondences as Correspondences
+from mcgicp_jax._search import KDTreeSearch as KDTreeSearch
 
 __version__ = "0.1.0"

@@ -50,12 +50,6 @@ def pose_matrix(pose: Pose | None, name: str = "init") -> Float[np.ndarray, "4 4
     return matrix
 
 
-def translation_matrix(offset: Float[np.ndarray, "3"]) -> Float[np.ndarray, "4 4"]:
-    matrix = np.eye(4)
-    matrix[:3, 3] = offset
-    return matrix
-
-
 def se3_from_matrix(matrix: Float[np.ndarray, "4 4"] | Float[Array, "4 4"], dtype: DTypeLike) -> jaxlie.SE3:
     """`jaxlie.SE3` in the given precision, its quaternion normalised."""
     pose = jaxlie.SE3.from_matrix(jnp.asarray(matrix, dtype))
@@ -65,3 +59,14 @@ def se3_from_matrix(matrix: Float[np.ndarray, "4 4"] | Float[Array, "4 4"], dtyp
 def cast_pose(pose: jaxlie.SE3, dtype: DTypeLike) -> jaxlie.SE3:
     """jaxlie computes some constants in the default precision; this undoes the promotion."""
     return jaxlie.SE3(pose.wxyz_xyz.astype(dtype))
+
+
+def rotation_from_quaternion(wxyz: Float[np.ndarray, "*batch 4"]) -> Float[np.ndarray, "*batch 3 3"]:
+    """In float64 from the outset: jaxlie would compute it in float32 where x64 is off."""
+    w, x, y, z = np.moveaxis(wxyz / np.linalg.norm(wxyz, axis=-1, keepdims=True), -1, 0)
+    rows = [
+        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+    ]
+    return np.moveaxis(np.array(rows), (0, 1), (-2, -1))

@@ -1,0 +1,270 @@
+"""Local, plane and multi-channel covariances, and the closed-form algebra that they are made of.
+
+Inside, arrays are laid out as structures of arrays: points (3, N), symmetric 3×3 matrices (6, N) in the order
+xx, xy, xz, yy, yz, zz, and symmetric 2×2 matrices (3, N) as xx, xy, yy. The compiler then works along N. No LAPACK
+call is made per point: besides being slow, batched ones can dead-lock XLA's thread pool on CPUs.
+"""
+
+from __future__ import annotations
+
+from typing import TypeAlias
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+# Relative to the trace: what keeps the square root of a collinear neighbourhood's 2×2 covariance regular.
+_REGULARISATION = 1e-6
+
+
+def symmetric_from_matrix(matrix: Float[Array, "N 3 3"]) -> Float[Array, "6 N"]:
+    matrix = 0.5 * (matrix + matrix.swapaxes(-1, -2))
+    return jnp.stack([matrix[:, i, j] for i, j in ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))])
+
+
+def matrix_from_symmetric(symmetric: Float[Array, "6 N"]) -> Float[Array, "N 3 3"]:
+    xx, xy, xz, yy, yz, zz = symmetric
+    return jnp.stack([xx, xy, xz, xy, yy, yz, xz, yz, zz], axis=-1).reshape(-1, 3, 3)
+
+
+def multiply(symmetric: Float[Array, "6 N"], vector: Float[Array, "3 N"]) -> Float[Array, "3 N"]:
+    """Matrix times vector, row by row."""
+    xx, xy, xz, yy, yz, zz = symmetric
+    x, y, z = vector
+    return jnp.stack([xx * x + xy * y + xz * z, xy * x + yy * y + yz * z, xz * x + yz * y + zz * z])
+
+
+def rotate(rotation: Float[Array, "3 3"], symmetric: Float[Array, "6 N"]) -> Float[Array, "6 N"]:
+    """R C Rᵀ."""
+    xx, xy, xz, yy, yz, zz = symmetric
+    rows = ((xx, xy, xz), (xy, yy, yz), (xz, yz, zz))
+    half = [[sum(rotation[i, k] * rows[k][j] for k in range(3)) for j in range(3)] for i in range(3)]
+    pairs = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
+    return jnp.stack([sum(half[i][k] * rotation[j, k] for k in range(3)) for i, j in pairs])
+
+
+def inverse(symmetric: Float[Array, "6 N"]) -> Float[Array, "6 N"]:
+    """The inverse by cofactors; the matrices must be regular."""
+    xx, xy, xz, yy, yz, zz = symmetric
+    cxx, cxy, cxz = yy * zz - yz * yz, xz * yz - xy * zz, xy * yz - xz * yy
+    determinant = xx * cxx + xy * cxy + xz * cxz
+    cofactors = jnp.stack([cxx, cxy, cxz, xx * zz - xz * xz, xy * xz - xx * yz, xx * yy - xy * xy])
+    return cofactors / determinant
+
+
+def outer(vector: Float[Array, "3 N"]) -> Float[Array, "6 N"]:
+    x, y, z = vector
+    return jnp.stack([x * x, x * y, x * z, y * y, y * z, z * z])
+
+
+def orthonormal_basis(normal: Float[Array, "3 N"]) -> tuple[Float[Array, "3 N"], Float[Array, "3 N"]]:
+    """Two unit vectors that complete the normal to a right-handed frame.
+
+    Duff et al., Building an Orthonormal Basis, Revisited, JCGT 2017.
+    """
+    x, y, z = normal
+    sign = jnp.where(z >= 0, 1.0, -1.0).astype(z.dtype)
+    a = -1.0 / (sign + z)
+    b = x * y * a
+    first = jnp.stack([1.0 + sign * x * x * a, sign * b, -sign * x])
+    second = jnp.stack([b, sign + y * y * a, -y])
+    return first, second
+
+
+@jax.custom_jvp
+def smallest_eigenvector(symmetric: Float[Array, "6 N"]) -> Float[Array, "3 N"]:
+    """The unit eigenvector of the smallest eigenvalue: the normal of a neighbourhood with this covariance.
+
+    Closed form, after Eberly, A Robust Eigensolver for 3×3 Symmetric Matrices (Geometric Tools, 2014): first the
+    eigenvector of the eigenvalue that stands apart from the other two, then the rest in the plane across it. Its
+    derivative is written in terms of the gaps between the eigenvalues and is zero where there is none (an isotropic
+    neighbourhood has no normal that could move).
+    """
+    symmetric = _scale_to_one(symmetric)
+    xx, xy, xz, yy, yz, zz = symmetric
+    mean = (xx + yy + zz) / 3
+    ax, ay, az = xx - mean, yy - mean, zz - mean
+    spread = jnp.sqrt((ax * ax + ay * ay + az * az + 2 * (xy * xy + xz * xz + yz * yz)) / 6)
+    isotropic = spread <= jnp.finfo(symmetric.dtype).eps
+    scale = 1 / jnp.where(isotropic, 1, spread)
+    # The matrix (A − mean)/spread has the eigenvalues 2 cos(φ + 2πk/3).
+    bxx, bxy, bxz, byy, byz, bzz = ax * scale, xy * scale, xz * scale, ay * scale, yz * scale, az * scale
+    half_determinant = 0.5 * (
+        bxx * (byy * bzz - byz * byz) + bxy * (bxz * byz - bxy * bzz) + bxz * (bxy * byz - bxz * byy)
+    )
+    angle = jnp.arccos(jnp.clip(half_determinant, -1, 1)) / 3
+    largest, smallest = 2 * jnp.cos(angle), 2 * jnp.cos(angle + 2 * jnp.pi / 3)
+    apart = jnp.where(half_determinant >= 0, largest, smallest)
+    first = _null_vector(bxx - apart, bxy, bxz, byy - apart, byz, bzz - apart)
+    # Where the smallest eigenvalue stands apart that is the answer. Elsewhere it is in the plane across.
+    u, v = orthonormal_basis(first)
+    shifted = jnp.stack([bxx, bxy, bxz, byy, byz, bzz])
+    a, b, c = project(shifted, u, v)
+    # Eigenvector of [[a, b], [b, c]] for its smaller eigenvalue, by half of the angle of the larger one.
+    direction = 0.5 * jnp.arctan2(2 * b, a - c)
+    across = -jnp.sin(direction) * u + jnp.cos(direction) * v
+    normal = jnp.where(half_determinant >= 0, across, first)
+    return jnp.where(isotropic, jnp.array([[0.0], [0.0], [1.0]], symmetric.dtype), normal)
+
+
+def _scale_to_one(symmetric: Float[Array, "6 N"]) -> Float[Array, "6 N"]:
+    """Divided by the trace: 1e-6 m or 1e6 m apart, products of entries stay within float32."""
+    trace = symmetric[0] + symmetric[3] + symmetric[5]
+    return symmetric / jnp.where(trace > 0, trace, 1)
+
+
+def _null_vector(xx: Array, xy: Array, xz: Array, yy: Array, yz: Array, zz: Array) -> Float[Array, "3 N"]:
+    """Unit null vector of a symmetric matrix of rank two: the longest cross product of two of its rows."""
+    rows = (jnp.stack([xx, xy, xz]), jnp.stack([xy, yy, yz]), jnp.stack([xz, yz, zz]))
+    crosses = [jnp.cross(rows[i], rows[j], axis=0) for i, j in ((0, 1), (0, 2), (1, 2))]
+    squares = [jnp.sum(cross * cross, axis=0) for cross in crosses]
+    best, length = crosses[0], squares[0]
+    for cross, square in zip(crosses[1:], squares[1:], strict=True):
+        best = jnp.where(square > length, cross, best)
+        length = jnp.maximum(square, length)
+    unit = best / jnp.sqrt(jnp.where(length > 0, length, 1))
+    return jnp.where(length > 0, unit, jnp.array([[0.0], [0.0], [1.0]], best.dtype))
+
+
+@smallest_eigenvector.defjvp
+def _smallest_eigenvector_jvp(
+    primals: tuple[Float[Array, "6 N"]], tangents: tuple[Float[Array, "6 N"]]
+) -> tuple[Float[Array, "3 N"], Float[Array, "3 N"]]:
+    """dn = −B (Bᵀ A B − λ)⁻¹ Bᵀ dA n, with B a basis of the plane across n and λ = nᵀ A n."""
+    (symmetric,), (tangent,) = primals, tangents
+    normal = smallest_eigenvector(symmetric)
+    trace = symmetric[0] + symmetric[3] + symmetric[5]
+    scale = 1 / jnp.where(trace > 0, trace, 1)
+    scaled = symmetric * scale
+    u, v = orthonormal_basis(normal)
+    a, b, c = project(scaled, u, v)
+    eigenvalue = jnp.sum(normal * multiply(scaled, normal), axis=0)
+    a, c = a - eigenvalue, c - eigenvalue
+    # The product of the two gaps; at no gap there is no derivative, and the answer is zero rather than NaN.
+    determinant = a * c - b * b
+    gap = determinant > 64 * jnp.finfo(symmetric.dtype).eps ** 2
+    determinant = jnp.where(gap, determinant, 1)
+    turned = multiply(tangent * scale, normal)
+    du, dv = jnp.sum(u * turned, axis=0), jnp.sum(v * turned, axis=0)
+    along_u, along_v = (c * du - b * dv) / determinant, (a * dv - b * du) / determinant
+    return normal, jnp.where(gap, -(along_u * u + along_v * v), 0)
+
+
+def project(symmetric: Float[Array, "6 N"], u: Float[Array, "3 N"], v: Float[Array, "3 N"]) -> Float[Array, "3 N"]:
+    """The 2×2 matrix Bᵀ C B in the basis B = [u v]."""
+    cu, cv = multiply(symmetric, u), multiply(symmetric, v)
+    return jnp.stack([jnp.sum(u * cu, axis=0), jnp.sum(u * cv, axis=0), jnp.sum(v * cv, axis=0)])
+
+
+def inverse_square_root(symmetric: Float[Array, "3 N"]) -> Float[Array, "3 N"]:
+    """A^{-1/2} of positive definite 2×2 matrices, by trace and determinant (Cayley-Hamilton)."""
+    a, b, c = symmetric
+    s = jnp.sqrt(a * c - b * b)
+    t = jnp.sqrt(a + c + 2 * s)
+    return jnp.stack([(c / s + 1) / t, -b / s / t, (a / s + 1) / t])
+
+
+def sandwich(outside: Float[Array, "3 N"], inside: Float[Array, "3 N"]) -> Float[Array, "3 N"]:
+    """W A W for symmetric 2×2 matrices."""
+    p, q, r = outside
+    a, b, c = inside
+    return jnp.stack(
+        [
+            p * p * a + 2 * p * q * b + q * q * c,
+            p * q * a + (p * r + q * q) * b + q * r * c,
+            q * q * a + 2 * q * r * b + r * r * c,
+        ]
+    )
+
+
+def floor_eigenvalues(symmetric: Float[Array, "3 N"], floor: Float[Array, ""]) -> Float[Array, "3 N"]:
+    """Raise the eigenvalues of 2×2 matrices to at least `floor`; matrices above it stay as they are, bit by bit."""
+    a, b, c = symmetric
+    mean, half = 0.5 * (a + c), 0.5 * (a - c)
+    square = half * half + b * b
+    radius = jnp.where(square > 0, jnp.sqrt(jnp.where(square > 0, square, 1)), 0)
+    below = mean - radius < floor
+    low, high = jnp.maximum(mean - radius, floor), jnp.maximum(mean + radius, floor)
+    middle, ratio = 0.5 * (high + low), 0.5 * (high - low) / jnp.where(radius > 0, radius, 1)
+    raised = jnp.stack([middle + ratio * half, ratio * b, middle - ratio * half])
+    return jnp.where(below, raised, symmetric)
+
+
+# One (k, N) array per coordinate. Kept apart on purpose: jaxlib 0.10.2 on CPUs miscompiles, in float32, the reduction
+# of a (3, k, N) array over its middle axis where the result is broadcast back and subtracted.
+Offsets: TypeAlias = tuple[Float[Array, "k N"], Float[Array, "k N"], Float[Array, "k N"]]
+
+
+def gather(points: Float[Array, "3 N"], neighbors: Int[Array, "N k"]) -> tuple[Offsets, Bool[Array, "k N"]]:
+    """Neighbours as offsets from their point, and which of them there are."""
+    rows = neighbors.T
+    present = rows >= 0
+    rows = jnp.where(present, rows, 0)
+    x, y, z = (jnp.where(present, coordinate[rows] - coordinate, 0) for coordinate in points)
+    return (x, y, z), present
+
+
+def weighted_covariance(offsets: Offsets, weights: Float[Array, "k N"]) -> Float[Array, "6 N"]:
+    """Covariance about the weighted mean; zero where all weights are."""
+    total = jnp.sum(weights, axis=0)
+    weights = weights / jnp.where(total > 0, total, 1)
+    x, y, z = (offset - jnp.sum(weights * offset, axis=0) for offset in offsets)
+    pairs = ((x, x), (x, y), (x, z), (y, y), (y, z), (z, z))
+    return jnp.stack([jnp.sum(weights * p * q, axis=0) for p, q in pairs])
+
+
+def local_covariance(points: Float[Array, "3 N"], neighbors: Int[Array, "N k"]) -> Float[Array, "6 N"]:
+    """Covariance of each point's neighbourhood, metres²."""
+    offsets, present = gather(points, neighbors)
+    return weighted_covariance(offsets, present.astype(points.dtype))
+
+
+def plane_covariance(
+    local: Float[Array, "6 N"], normal: Float[Array, "3 N"], epsilon: Float[Array, ""]
+) -> Float[Array, "6 N"]:
+    """GICP's covariance I − (1−ε) n nᵀ: 1 in the surface, ε across it (Segal et al., Generalized-ICP, RSS 2009).
+
+    Neighbours that all coincide span no surface: the identity.
+    """
+    spread = local[0] + local[3] + local[5] > 0
+    identity = jnp.array([[1.0], [0.0], [0.0], [1.0], [0.0], [1.0]], local.dtype)
+    return identity - jnp.where(spread, (1 - epsilon) * outer(normal), 0)
+
+
+def multichannel_covariance(
+    points: Float[Array, "3 N"],
+    whitened: Float[Array, "N C"],
+    neighbors: Int[Array, "N k"],
+    epsilon: Float[Array, ""],
+    min_eigenvalue: Float[Array, ""],
+) -> Float[Array, "6 N"]:
+    """Ω in the tangent plane and ε across it (Servos & Waslander 2014, eqs. 6-10).
+
+    Args:
+        whitened: channels divided by the Cholesky factor of Λ, so that the kernel of eq. 7 is exp(−½ |Δ|²).
+        min_eigenvalue: floor for the eigenvalues of Ω, which reach 0 where only the point itself looks like it.
+
+    Ω = Σ_w^{-1/2} Σ_t Σ_w^{-1/2} is written as I + Σ_w^{-1/2} (Σ_t − Σ_w) Σ_w^{-1/2}: uniform channels then give
+    GICP's covariance to the last digit.
+    """
+    offsets, present = gather(points, neighbors)
+    local = weighted_covariance(offsets, present.astype(points.dtype))
+    rows = jnp.where(neighbors.T >= 0, neighbors.T, 0)
+    square = jnp.zeros(rows.shape, points.dtype)
+    for channel in whitened.T:
+        difference = channel[rows] - channel[None, :]
+        square = square + difference * difference
+    alike = weighted_covariance(offsets, jnp.where(present, jnp.exp(-0.5 * square), 0))
+
+    normal = smallest_eigenvector(local)
+    u, v = orthonormal_basis(normal)
+    unweighted, weighted = project(local, u, v), project(alike, u, v)
+    trace = unweighted[0] + unweighted[2]
+    spread = trace > 0
+    scale = 1 / jnp.where(spread, trace, 1)
+    regular = unweighted * scale + _REGULARISATION * jnp.array([[1.0], [0.0], [1.0]], points.dtype)
+    regular = jnp.where(spread, regular, jnp.array([[1.0], [0.0], [1.0]], points.dtype))
+    change = sandwich(inverse_square_root(regular), (weighted - unweighted) * scale)
+    a, b, c = floor_eigenvalues(change, min_eigenvalue - 1)
+    uv = jnp.stack([2 * u[i] * v[j] if i == j else u[i] * v[j] + u[j] * v[i] for i in range(3) for j in range(i, 3)])
+    return plane_covariance(local, normal, epsilon) + a * outer(u) + b * uv + c * outer(v)

@@ -1,0 +1,141 @@
+"""From a raw cloud to one that is ready to register."""
+
+from __future__ import annotations
+
+import warnings
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.typing import ArrayLike
+from jaxtyping import Float, Int
+
+from mcgicp_jax._cloud import PointCloud, size_class
+from mcgicp_jax._pose import is_concrete
+from mcgicp_jax._search import AbstractSearch, KDTreeSearch
+
+MIN_POINTS = 4
+# Clouds further from zero than this many times their own size keep their origin apart, in float64.
+_FAR = 8.0
+# Voxel numbers are packed into one 64-bit key, 21 bits each.
+_VOXELS_PER_AXIS = 2**21
+
+
+def preprocess(
+    cloud: PointCloud | ArrayLike,
+    voxel_size: float | None = None,
+    num_neighbors: int = 20,
+    *,
+    search: AbstractSearch | None = None,
+) -> PointCloud:
+    """Make a cloud ready to register: finite rows, voxel-downsampled, with neighbours, padded to a size class.
+
+    Do this once per cloud, and register it as often as needed. Runs on the host.
+
+    Args:
+        cloud: raw cloud, or an (N, 3) array. A cloud that is padded already is unpadded first.
+        voxel_size: metres; points and channels of one voxel are averaged. None keeps every point.
+        num_neighbors: k, the neighbours (the point itself among them) that a covariance is computed from; at least 3.
+            Fewer are used where the cloud has fewer points.
+        search: how neighbours are found; by default SciPy's k-d tree.
+
+    Returns:
+        JAX arrays, float32 or, where JAX's x64 is on and the input has it, float64. Coordinates far from zero for the
+        cloud's size lose their origin, which `PointCloud.origin` keeps.
+
+    Raises:
+        ValueError: for fewer than four finite points, or arguments that make no sense.
+    Warns:
+        UserWarning: once per call, if rows with NaN or infinity were left out.
+    """
+    if not isinstance(cloud, PointCloud):
+        cloud = PointCloud(cloud)
+    if not is_concrete(cloud):
+        raise ValueError("cloud: expected numbers, got tracers; preprocess outside of jit, grad and vmap")
+    if voxel_size is not None and not 0 < voxel_size < np.inf:
+        raise ValueError(f"voxel_size: expected a positive number of metres or None, got {voxel_size!r}")
+    if num_neighbors < 3:
+        raise ValueError(f"num_neighbors: expected at least 3, got {num_neighbors}")
+    cloud = _finite(cloud.unpad())
+    points = np.asarray(cloud.points)
+    channels, covariances = np.asarray(cloud.channels), cloud.covariances
+    if voxel_size is not None:
+        if covariances is not None:
+            raise ValueError("voxel_size: expected None for a cloud with covariances, which cannot be averaged")
+        points, channels = _downsample(points, channels, voxel_size)
+        if len(points) < MIN_POINTS:
+            raise ValueError(
+                f"voxel_size: {voxel_size} m leaves {len(points)} points, expected at least {MIN_POINTS}; choose a smaller one"
+            )
+    dtype = jax.dtypes.canonicalize_dtype(points.dtype)
+    origin = _far_origin(points)
+    points = (points - origin).astype(dtype)
+    # Searched as they will be used, after rounding.
+    neighbors = (search or KDTreeSearch()).neighbors(points, num_neighbors)
+    ready = cloud.replace_rows(
+        points=points,
+        channels=channels.astype(dtype),
+        valid=np.ones(len(points), bool),
+        neighbors=neighbors.astype(np.int32),
+        covariances=None if covariances is None else np.asarray(covariances, dtype),
+        origin=origin,
+    ).pad(size_class(len(points)))
+    return ready.replace_rows(
+        **{
+            name: None if value is None else jnp.asarray(value)
+            for name in ("points", "channels", "valid", "neighbors", "covariances")
+            for value in [getattr(ready, name)]
+        }
+    )
+
+
+def _finite(cloud: PointCloud) -> PointCloud:
+    keep = np.isfinite(cloud.points).all(axis=1) & np.isfinite(cloud.channels).all(axis=1)
+    if cloud.covariances is not None:
+        keep &= np.isfinite(cloud.covariances).all(axis=(1, 2))
+    if keep.sum() < MIN_POINTS:
+        raise ValueError(f"cloud: expected at least {MIN_POINTS} finite points, got {keep.sum()} of {keep.size}")
+    if keep.all():
+        return cloud
+    warnings.warn(f"left out {np.sum(~keep)} of {keep.size} points that are NaN or infinite", UserWarning, stacklevel=3)
+    return PointCloud(
+        cloud.points[keep],
+        cloud.channels[keep],
+        covariances=None if cloud.covariances is None else cloud.covariances[keep],
+        channel_names=cloud.channel_names,
+    )
+
+
+def _downsample(
+    points: Float[np.ndarray, "N 3"], channels: Float[np.ndarray, "N C"], voxel_size: float
+) -> tuple[Float[np.ndarray, "M 3"], Float[np.ndarray, "M C"]]:
+    """The mean of each voxel, in float64; voxels in lexical order of their position."""
+    cells = np.floor(points.astype(np.float64) / voxel_size)
+    cells -= cells.min(axis=0)
+    if cells.max() >= _VOXELS_PER_AXIS:
+        raise ValueError(
+            f"voxel_size: {voxel_size} m divides the cloud into {cells.max():.0f} voxels along an axis, "
+            f"expected fewer than {_VOXELS_PER_AXIS}; choose a larger one"
+        )
+    x, y, z = cells.astype(np.int64).T
+    key = (x << 42) | (y << 21) | z
+    order = np.argsort(key, kind="stable")
+    key = key[order]
+    starts = np.flatnonzero(np.concatenate([[True], key[1:] != key[:-1]]))
+    counts = np.diff(np.append(starts, len(key)))[:, None]
+
+    def mean(values: np.ndarray) -> np.ndarray:
+        if values.shape[1] == 0:
+            return np.zeros((len(starts), 0), values.dtype)
+        return (np.add.reduceat(values[order].astype(np.float64), starts, axis=0) / counts).astype(values.dtype)
+
+    return mean(points), mean(channels)
+
+
+def _far_origin(points: Float[np.ndarray, "N 3"]) -> Float[np.ndarray, "3"]:
+    """Zero for clouds about the origin; the centre of those far away, where float32 would lose their shape."""
+    low, high = points.min(axis=0).astype(np.float64), points.max(axis=0).astype(np.float64)
+    center = 0.5 * (low + high)
+    if np.linalg.norm(center) <= _FAR * np.linalg.norm(high - low):
+        return np.zeros(3)
+    return center

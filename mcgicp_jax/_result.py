@@ -1,0 +1,109 @@
+"""What a registration says: the pose, how it ended, and how good the fit is."""
+
+from __future__ import annotations
+
+import enum
+from typing import Any
+
+import equinox as eqx
+import jax.numpy as jnp
+import jaxlie
+import numpy as np
+from jaxtyping import Array, Float, Int
+
+from mcgicp_jax._pose import is_concrete, rotation_from_quaternion
+
+
+class Status(enum.IntEnum):
+    """How a registration ended. Only CONVERGED is success."""
+
+    CONVERGED = 0
+    """The last update moved the pose by less than both tolerances, and every direction is held."""
+    MAX_ITERATIONS = 1
+    """The pose was still moving when the iterations ran out."""
+    TOO_FEW_CORRESPONDENCES = 2
+    """Fewer than four source points have a match within `max_distance`: no overlap, or a start too far away."""
+    DEGENERATE = 3
+    """The pose came to rest, but the pairs leave at least one direction free; it is where the start had it."""
+    NON_FINITE = 4
+    """The numbers overflowed or became NaN."""
+
+
+class Registration(eqx.Module):
+    """The outcome of `register` or `align`; a pytree. Everything in it belongs to the returned pose.
+
+    After a host call the numbers are NumPy's; inside a transformation, and with a batch dimension, they are arrays.
+
+    Attributes:
+        T_target_source: maps source coordinates into the target's frame, b ≈ T a. Its precision is that of the clouds;
+            at large (UTM) coordinates use `matrix`.
+        status_code: value of the `Status`.
+        num_iterations: matches were sought, and the pose weighed, this many times.
+        num_inliers: pairs within `max_distance`.
+        cost: Σ ρ(dᵀ M d) over them.
+        rmse: root mean square distance of the pairs, metres.
+        information: (6, 6) Σ Jᵀ M J for the twist ξ = (v, ω) of T exp(ξ), metres and radians, in the source's frame.
+            It weighs directions against each other; its scale is that of GICP's relative covariances, so its inverse
+            is *not* a covariance of the pose.
+        history: per iteration, at the pose before its update: "cost", "rmse", "num_inliers", and the update's length
+            "translation_step" (metres, at the centroid of the pairs) and "rotation_step" (radians). Entries after
+            `num_iterations` are NaN where the length is fixed (inside a transformation).
+    """
+
+    T_target_source: jaxlie.SE3
+    status_code: Int[Array, "*batch"] | int
+    num_iterations: Int[Array, "*batch"] | int
+    num_inliers: Int[Array, "*batch"] | int
+    cost: Float[Array, "*batch"] | float
+    rmse: Float[Array, "*batch"] | float
+    information: Float[Array, "*batch 6 6"] | Float[np.ndarray, "*batch 6 6"]
+    history: dict[str, Any]
+    source_origin: Float[Array, "*batch 3"] | Float[np.ndarray, "*batch 3"]
+    target_origin: Float[Array, "*batch 3"] | Float[np.ndarray, "*batch 3"]
+    centred: jaxlie.SE3
+    """The pose between the clouds' own origins (0 unless coordinates are large)."""
+
+    @property
+    def status(self) -> Status | Int[Array, "*batch"]:
+        """The `Status`; an array of its values inside a transformation or for a batch."""
+        if is_concrete(self.status_code) and np.ndim(self.status_code) == 0:
+            return Status(int(self.status_code))
+        return self.status_code
+
+    @property
+    def converged(self) -> Any:
+        """Whether the status is CONVERGED."""
+        return self.status == Status.CONVERGED
+
+    @property
+    def matrix(self) -> Float[np.ndarray, "*batch 4 4"] | Float[Array, "*batch 4 4"]:
+        """T_target_source as (4, 4); float64 NumPy outside a transformation, with all digits at large coordinates."""
+        return pose_in_user_frame(self.centred, self.source_origin, self.target_origin)
+
+    def __repr__(self) -> str:
+        if not is_concrete(self) or np.ndim(self.status_code):
+            return f"Registration(batch of shape {np.shape(self.status_code)})"
+        translation = np.array2string(self.matrix[:3, 3], precision=4, suppress_small=True)
+        angle = np.degrees(float(jnp.linalg.norm(self.centred.rotation().log())))
+        return (
+            f"Registration({self.status.name}: translation {translation} m, rotation {angle:.3f}°, "
+            f"{self.num_iterations} iterations, {self.num_inliers} inliers, rmse {float(self.rmse):.4g} m)"
+        )
+
+
+def pose_in_user_frame(
+    centred: jaxlie.SE3, source_origin: Array | np.ndarray, target_origin: Array | np.ndarray
+) -> Array | np.ndarray:
+    """T(o_t) · T · T(−o_s)."""
+    if is_concrete(centred, source_origin, target_origin):
+        parameters = np.asarray(centred.wxyz_xyz, np.float64)
+        rotation = rotation_from_quaternion(parameters[..., :4])
+        offset = np.asarray(target_origin, np.float64) - np.einsum("...ij,...j->...i", rotation, source_origin)
+        matrix = np.zeros((*rotation.shape[:-2], 4, 4))
+        matrix[..., :3, :3] = rotation
+        matrix[..., :3, 3] = parameters[..., 4:] + offset
+        matrix[..., 3, 3] = 1
+        return matrix
+    matrix = centred.as_matrix().astype(centred.wxyz_xyz.dtype)
+    offset = target_origin - jnp.einsum("...ij,...j->...i", matrix[..., :3, :3], source_origin)
+    return matrix.at[..., :3, 3].add(offset.astype(matrix.dtype))

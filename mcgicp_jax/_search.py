@@ -1,0 +1,256 @@
+"""Nearest neighbours on the host, and the correspondences that they make.
+
+The only module that knows SciPy. Everything in it that a callback may run is NumPy alone.
+"""
+
+from __future__ import annotations
+
+import abc
+import collections
+import hashlib
+import threading
+from functools import partial
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import scipy.spatial
+from jax.typing import ArrayLike
+from jaxtyping import Array, Bool, Float, Int
+
+from mcgicp_jax._pose import rotation_from_quaternion
+
+# How many candidates, as a multiple of those asked for, are looked at to break a tie by row number.
+_TIE_CANDIDATES = 8
+
+
+class Correspondences(eqx.Module):
+    """For each source point, its match in the target; a pytree.
+
+    To autodiff the row numbers are constants: gradients are taken with the matches held.
+
+    Attributes:
+        indices: (N,) rows of the target.
+        distances: (N,) metres between the moved source point and its match (position only, not channels).
+        valid: (N,) whether the pair counts: both points exist and lie within `max_distance` of each other.
+    """
+
+    indices: Int[Array, "*batch N"]
+    distances: Float[Array, "*batch N"]
+    valid: Bool[Array, "*batch N"]
+
+    def __repr__(self) -> str:
+        return f"Correspondences({self.indices.shape[-1]} source rows)"
+
+
+class AbstractIndex(abc.ABC):
+    """Target points, laid out to be searched."""
+
+    @abc.abstractmethod
+    def nearest(
+        self,
+        pose: Float[ArrayLike, "7"],
+        points: Float[ArrayLike, "3 N"],
+        descriptors: Float[ArrayLike, "N D"],
+        valid: Bool[ArrayLike, "N"],
+        max_distance: Float[ArrayLike, ""],
+    ) -> Int[np.ndarray, "N"]:
+        """Row of the nearest target point for each source point, moved by a pose; descriptors do not move.
+
+        Args:
+            pose: quaternion wxyz and translation, as in `jaxlie.SE3.wxyz_xyz`.
+            max_distance: metres; rows without a match this near may name any target row.
+        """
+
+
+class AbstractSearch(eqx.Module):
+    """A way to find nearest neighbours."""
+
+    @abc.abstractmethod
+    def index(
+        self, points: Float[ArrayLike, "3 M"], descriptors: Float[ArrayLike, "M D"], valid: Bool[ArrayLike, "M"]
+    ) -> AbstractIndex:
+        """Lay out the valid target rows for searching."""
+
+    @abc.abstractmethod
+    def nearest_traced(
+        self,
+        pose: Float[Array, "7"],
+        source: tuple[Float[Array, "3 N"], Float[Array, "N D"], Bool[Array, "N"]],
+        target: tuple[Float[Array, "3 M"], Float[Array, "M D"], Bool[Array, "M"]],
+        max_distance: Float[Array, ""],
+        running: Bool[Array, ""],
+    ) -> Int[Array, "N"]:
+        """`AbstractIndex.nearest` inside a transformation; clouds are points, descriptors, valid.
+
+        Where not `running`, as in a lane of a batch that is done, the answer is not used and may be anything.
+        """
+
+    @abc.abstractmethod
+    def neighbors(self, points: Float[np.ndarray, "N 3"], num_neighbors: int) -> Int[np.ndarray, "N k"]:
+        """The k nearest points of every point, itself among them, nearest first; −1 where there are fewer."""
+
+
+class KDTreeSearch(AbstractSearch):
+    """Exact search with SciPy's k-d tree on the host. Equal distances are ordered by row, so that results repeat.
+
+    Attributes:
+        workers: threads of one query; −1 takes all cores.
+    """
+
+    workers: int = eqx.field(static=True, default=-1)
+
+    def index(
+        self, points: Float[ArrayLike, "3 M"], descriptors: Float[ArrayLike, "M D"], valid: Bool[ArrayLike, "M"]
+    ) -> KDTreeIndex:
+        return KDTreeIndex(np.asarray(points), np.asarray(descriptors), np.asarray(valid), self.workers)
+
+    def nearest_traced(
+        self,
+        pose: Float[Array, "7"],
+        source: tuple[Float[Array, "3 N"], Float[Array, "N D"], Bool[Array, "N"]],
+        target: tuple[Float[Array, "3 M"], Float[Array, "M D"], Bool[Array, "M"]],
+        max_distance: Float[Array, ""],
+        running: Bool[Array, ""],
+    ) -> Int[Array, "N"]:
+        return jax.pure_callback(
+            partial(_nearest_callback, self.workers),
+            jax.ShapeDtypeStruct(source[2].shape, jnp.int32),
+            pose,
+            source,
+            target,
+            max_distance,
+            running,
+            vmap_method="expand_dims",
+        )
+
+    def neighbors(self, points: Float[np.ndarray, "N 3"], num_neighbors: int) -> Int[np.ndarray, "N k"]:
+        found = _nearest(_tree(points), points, num_neighbors, self.workers)
+        missing = num_neighbors - found.shape[1]
+        return np.pad(found, [(0, 0), (0, missing)], constant_values=-1)
+
+
+class KDTreeIndex(AbstractIndex):
+    def __init__(
+        self,
+        points: Float[np.ndarray, "3 M"],
+        descriptors: Float[np.ndarray, "M D"],
+        valid: Bool[np.ndarray, "M"],
+        workers: int,
+    ):
+        self._rows = np.flatnonzero(valid).astype(np.int32)
+        self._tree = _tree(np.hstack([points.T, descriptors])[self._rows]) if self._rows.size else None
+        self._workers = workers
+
+    def nearest(
+        self,
+        pose: Float[ArrayLike, "7"],
+        points: Float[ArrayLike, "3 N"],
+        descriptors: Float[ArrayLike, "N D"],
+        valid: Bool[ArrayLike, "N"],
+        max_distance: Float[ArrayLike, ""],
+    ) -> Int[np.ndarray, "N"]:
+        valid, descriptors = np.asarray(valid), np.asarray(descriptors)
+        indices = np.zeros(valid.size, np.int32)
+        pose = np.asarray(pose, np.float64)
+        # A pose that has diverged must not become an exception inside the tree; the step will say NON_FINITE.
+        if self._tree is None or not np.isfinite(pose).all():
+            return indices
+        rotation = rotation_from_quaternion(pose[:4])
+        active = np.flatnonzero(valid)
+        moved = np.asarray(points).T[active] @ rotation.T + pose[4:]
+        # With descriptors, the nearest may lie beyond the gate while a pair within it is further in all dimensions:
+        # then the whole space is searched. The margin covers rounding; the gate itself is applied to the position.
+        bound = np.inf if descriptors.shape[1] else 1.001 * float(max_distance)
+        queries = np.hstack([moved, descriptors[active]])
+        found = _nearest(self._tree, queries, 1, self._workers, bound)[:, 0]
+        indices[active] = self._rows[np.where(found < self._rows.size, found, 0)]
+        return indices
+
+
+class _IndexCache:
+    """The trees of the targets seen last, by content: a callback that is pure still builds each tree only once."""
+
+    def __init__(self, size: int):
+        self._size = size
+        self._lock = threading.Lock()
+        self._indices: collections.OrderedDict[bytes, KDTreeIndex] = collections.OrderedDict()
+
+    def get(self, points: np.ndarray, descriptors: np.ndarray, valid: np.ndarray, workers: int) -> KDTreeIndex:
+        digest = hashlib.blake2b(repr((points.shape, descriptors.shape, points.dtype, workers)).encode())
+        for array in (points, descriptors, valid):
+            digest.update(np.ascontiguousarray(array))
+        key = digest.digest()
+        with self._lock:
+            if key in self._indices:
+                self._indices.move_to_end(key)
+                return self._indices[key]
+        index = KDTreeIndex(points, descriptors, valid, workers)
+        with self._lock:
+            self._indices[key] = index
+            while len(self._indices) > self._size:
+                self._indices.popitem(last=False)
+        return index
+
+
+_index_cache = _IndexCache(size=256)
+
+
+def _nearest_callback(
+    workers: int,
+    pose: Any,
+    source: tuple[Any, Any, Any],
+    target: tuple[Any, Any, Any],
+    max_distance: Any,
+    running: Any,
+) -> Int[np.ndarray, "*batch N"]:
+    """`nearest` over any leading batch dimensions, some of them 1 where an argument has no batch."""
+    trailing = (1, 2, 2, 1, 2, 2, 1, 0, 0)
+    arrays = [np.asarray(array) for array in (pose, *source, *target, max_distance, running)]
+    batch = np.broadcast_shapes(*(array.shape[: array.ndim - n] for array, n in zip(arrays, trailing, strict=True)))
+    lanes = [
+        np.broadcast_to(array, batch + array.shape[array.ndim - n :]) for array, n in zip(arrays, trailing, strict=True)
+    ]
+    indices = np.zeros(lanes[3].shape, np.int32)
+    for lane in np.ndindex(batch):
+        pose, *source_arrays, points, descriptors, valid, limit, active = (array[lane] for array in lanes)
+        if active:
+            index = _index_cache.get(points, descriptors, valid, workers)
+            indices[lane] = index.nearest(pose, *source_arrays, limit)
+    return indices
+
+
+def _tree(rows: Float[np.ndarray, "M D"]) -> scipy.spatial.cKDTree:
+    # Unbalanced and uncompacted trees build several times faster and are searched about as fast.
+    return scipy.spatial.cKDTree(rows, balanced_tree=False, compact_nodes=False)
+
+
+def _nearest(
+    tree: scipy.spatial.cKDTree, queries: Float[np.ndarray, "N D"], k: int, workers: int, bound: float = np.inf
+) -> Int[np.ndarray, "N k"]:
+    """Rows of the k nearest, ordered by (distance, row); `tree.n` where nothing lies within `bound`.
+
+    The tree leaves the order of equal distances to chance. One neighbour more than needed shows where there are any.
+    """
+    k = min(k, tree.n)
+    asked = min(k + 1, tree.n)
+    distances, rows = tree.query(queries, np.arange(1, asked + 1), workers=workers, distance_upper_bound=bound)
+    nearest = rows[:, :k].astype(np.int32)
+    tied = np.flatnonzero((distances[:, 1:] == distances[:, :-1]).any(axis=1) & np.isfinite(distances[:, 0]))
+    while tied.size:
+        order = np.lexsort((rows[tied], distances[tied]), axis=1)
+        nearest[tied] = np.take_along_axis(rows[tied], order, axis=1)[:, :k]
+        # A tie that the last candidate shares may go on beyond it.
+        open_ended = np.isfinite(distances[tied, -1]) & (distances[tied, k - 1] == distances[tied, -1])
+        tied = tied[open_ended]
+        if asked == min(_TIE_CANDIDATES * (k + 1), tree.n):
+            break
+        asked = min(2 * asked, _TIE_CANDIDATES * (k + 1), tree.n)
+        if tied.size:
+            wider = tree.query(queries[tied], np.arange(1, asked + 1), workers=workers, distance_upper_bound=bound)
+            distances = np.full((len(queries), asked), np.inf)
+            rows = np.full((len(queries), asked), tree.n)
+            distances[tied], rows[tied] = wider
+    return nearest

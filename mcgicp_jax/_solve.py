@@ -1,0 +1,209 @@
+"""One pose update from 73 numbers, and the root that carries the gradient."""
+
+from __future__ import annotations
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import jaxlie
+import lineax as lx
+import optimistix as optx
+from jaxtyping import Array, Bool, Float
+
+from mcgicp_jax import _covariance as cov
+from mcgicp_jax._cost import AbstractKernel, Moments, evaluate_pairs
+from mcgicp_jax._methods import AbstractMethod, Surface
+from mcgicp_jax._pose import cast_pose
+from mcgicp_jax._search import Correspondences
+
+# optimistix starts at damping 1: the form is scaled so that this is small beside its eigenvalues.
+_HESSIAN_SCALE = 1e4
+_MAX_STEPS = 32
+_MAX_NEWTON_STEPS = 8
+# Row and column of each stored entry of the symmetric 3×3 and 4×4 matrices.
+_SYMMETRIC_3 = ((0, 1, 2), (1, 3, 4), (2, 4, 5))
+_SYMMETRIC_4 = ((0, 1, 2, 3), (1, 4, 5, 6), (2, 5, 7, 8), (3, 6, 8, 9))
+# dD/dξ at the identity, (12, 6): D = [ω× | v] by rows, ξ = (v, ω).
+_TANGENT = (
+    (0, 0, 0, 0, 0, 0),
+    (0, 0, 0, 0, 0, -1),
+    (0, 0, 0, 0, 1, 0),
+    (1, 0, 0, 0, 0, 0),
+    (0, 0, 0, 0, 0, 1),
+    (0, 0, 0, 0, 0, 0),
+    (0, 0, 0, -1, 0, 0),
+    (0, 1, 0, 0, 0, 0),
+    (0, 0, 0, 0, -1, 0),
+    (0, 0, 0, 1, 0, 0),
+    (0, 0, 0, 0, 0, 0),
+    (0, 0, 1, 0, 0, 0),
+)
+
+
+class Update(eqx.Module):
+    """What one update found.
+
+    Attributes:
+        twist: (6,) ξ = (v, ω), metres and radians: the pose T moves to T(c) exp(ξ) T(−c) T about the centre c.
+        information: (6, 6) Σ JᵀMJ in the same twist.
+        degenerate: whether a direction is held by nothing.
+    """
+
+    twist: Float[Array, "6"]
+    information: Float[Array, "6 6"]
+    degenerate: Bool[Array, ""]
+
+
+def solve_update(moments: Moments) -> Update:
+    """Minimise Σ w (d − D h)ᵀ M (d − D h) over the change of pose, M held, to full convergence.
+
+    Levenberg-Marquardt on 13 residuals, a square root of the (13, 13) quadratic form in (D, 1): its cost does not
+    depend on the number of points. Lengths are measured in units of the points' radius, so that translations and
+    rotations, millimetres and kilometres, weigh alike.
+    """
+    dtype = moments.e.dtype
+    eps = jnp.finfo(dtype).eps
+    radius = jnp.where(moments.radius > 0, moments.radius, 1)
+    form = _quadratic_form(moments, radius)
+    tangent = jnp.asarray(_TANGENT, dtype)
+    unit_information = tangent.T @ form[:12, :12] @ tangent
+    trace = jnp.trace(unit_information)
+    scale = _HESSIAN_SCALE / jnp.where(trace > 0, trace / 6, 1)
+    root, _ = _semidefinite_root(form * scale)
+    solver = optx.LevenbergMarquardt(rtol=4 * eps, atol=4 * eps, linear_solver=lx.Normal(lx.Cholesky()))
+    solution = optx.least_squares(_residuals, solver, jnp.zeros(6, dtype), root, max_steps=_MAX_STEPS, throw=False)
+    _, pivots = _semidefinite_root(unit_information)
+    units = jnp.array([1.0, 1.0, 1.0, radius, radius, radius], dtype)
+    return Update(
+        twist=solution.value * radius / units,
+        information=unit_information * units[:, None] * units,
+        degenerate=~jnp.all(pivots > 64 * eps * jnp.max(jnp.diagonal(unit_information))),
+    )
+
+
+def _quadratic_form(moments: Moments, radius: Float[Array, ""]) -> Float[Array, "13 13"]:
+    """The form in (vec D, 1), lengths in units of the radius; M keeps its unit."""
+    units = jnp.stack([1 / radius, 1 / radius, 1 / radius, jnp.ones_like(radius)])
+    rows = jnp.asarray(_SYMMETRIC_3)[:, None, :, None]
+    columns = jnp.asarray(_SYMMETRIC_4)[None, :, None, :]
+    quadratic = moments.Q[rows, columns] * units[None, :, None, None] * units[None, None, None, :]
+    linear = (moments.G * units / radius).reshape(12)
+    constant = moments.e / radius**2
+    return jnp.block([[quadratic.reshape(12, 12), -linear[:, None]], [-linear[None, :], constant[None, None]]])
+
+
+def _semidefinite_root(form: Float[Array, "D D"]) -> tuple[Float[Array, "D D"], Float[Array, "D"]]:
+    """L with L Lᵀ = form and the pivots, by Cholesky's recurrence; a pivot lost to rounding leaves its column zero.
+
+    Written out, because LAPACK's answer for a semidefinite matrix is NaN, and because its batched calls are avoided.
+    """
+    floor = form.shape[0] * jnp.finfo(form.dtype).eps * jnp.diagonal(form)
+    columns, pivots = [], []
+    for i in range(form.shape[0]):
+        pivot = form[i, i]
+        regular = pivot > floor[i]
+        column = jnp.where(regular, form[:, i] / jnp.sqrt(jnp.where(regular, pivot, 1)), 0)
+        # Rows above the pivot hold what rounding left of the zeros there.
+        column = column.at[:i].set(0)
+        form = form - jnp.outer(column, column)
+        columns.append(column)
+        pivots.append(pivot)
+    return jnp.stack(columns, axis=1), jnp.stack(pivots)
+
+
+def _residuals(twist: Float[Array, "6"], root: Float[Array, "13 13"]) -> Float[Array, "13"]:
+    change = jaxlie.SE3.exp(twist).as_matrix()[:3].astype(twist.dtype)
+    change = change - jnp.eye(3, 4, dtype=twist.dtype)
+    return root.T @ jnp.append(change.reshape(12), 1)
+
+
+def move_pose(pose: jaxlie.SE3, twist: Float[Array, "6"], center: Float[Array, "3"]) -> jaxlie.SE3:
+    """T(c) exp(ξ) T(−c) T, normalised."""
+    change = jaxlie.SE3.exp(twist)
+    rotation = (change.rotation() @ pose.rotation()).normalize()
+    translation = change @ (pose.translation() - center) + center
+    return cast_pose(jaxlie.SE3.from_rotation_and_translation(rotation, translation), pose.wxyz_xyz.dtype)
+
+
+def information_at_source(
+    information: Float[Array, "6 6"], pose: jaxlie.SE3, center: Float[Array, "3"]
+) -> Float[Array, "6 6"]:
+    """From the twist about the centre in the target's frame to ξ of T exp(ξ), the twist of the source's frame."""
+    identity = jaxlie.SO3.identity()
+    to_center = jaxlie.SE3.from_rotation_and_translation(identity, -center) @ pose
+    adjoint = to_center.adjoint().astype(information.dtype)
+    return adjoint.T @ information @ adjoint
+
+
+def balance(
+    twist: Float[Array, "6"],
+    args: tuple[
+        jaxlie.SE3,
+        Float[Array, "3"],
+        Float[Array, ""],
+        Surface,
+        Surface,
+        Correspondences,
+        AbstractMethod,
+        AbstractKernel | None,
+    ],
+) -> Float[Array, "6"]:
+    """g(T) = Σ w Jᵀ M(R) d at the pose moved by a twist, lengths in units of the radius: forces and torques in balance.
+
+    Every GICP renews M between updates, so its answer is the root of g, not the minimum of F: derivatives of the pose
+    follow from g with the dependence of M and of the robust weights on the pose kept.
+    """
+    pose, center, radius, source, target, matches, method, robust = args
+    units = jnp.stack([radius] * 3 + [jnp.ones_like(radius)] * 3)
+    moved = move_pose(pose, twist * units, center)
+    rotation = moved.rotation().as_matrix().astype(twist.dtype)
+    pairs = evaluate_pairs(rotation, moved.translation(), source, target, matches, method, robust)
+    force = pairs.weight * cov.multiply(pairs.information, pairs.residual)
+    torque = jnp.cross(pairs.moved - center[:, None], force, axis=0)
+    return jnp.concatenate([jnp.sum(force, axis=1) * radius, jnp.sum(torque, axis=1)])
+
+
+def refine_pose(
+    pose: jaxlie.SE3,
+    usable: Bool[Array, ""],
+    moments: Moments,
+    source: Surface,
+    target: Surface,
+    matches: Correspondences,
+    method: AbstractMethod,
+    robust: AbstractKernel | None,
+) -> jaxlie.SE3:
+    """The root of g near a pose, which carries the gradient of the answer by the implicit function theorem.
+
+    The pose that comes in is a constant to autodiff. Where it is not `usable` it comes back as it is, with a gradient of
+    zero.
+    """
+    pose, moments = jax.lax.stop_gradient((pose, moments))
+    pose_in = pose
+    pose = jax.tree.map(lambda a, b: jnp.where(usable, a, b), pose, jaxlie.SE3(identity_parameters(pose)))
+    matches = eqx.tree_at(lambda m: m.valid, matches, matches.valid & usable)
+    radius = jnp.where(usable & (moments.radius > 0), moments.radius, 1)
+    center = jnp.where(usable, moments.center, 0)
+    weight = jnp.where(usable, jnp.sum(moments.Q[jnp.array([0, 3, 5]), 9]) * radius**2, 1)
+    args = (pose, center, radius, source, target, matches, method, robust)
+    eps = jnp.finfo(pose.wxyz_xyz.dtype).eps
+    solution = optx.root_find(
+        _normalised_balance,
+        optx.Newton(rtol=4 * eps, atol=4 * eps),
+        jnp.zeros(6, pose.wxyz_xyz.dtype),
+        (usable, weight, args),
+        max_steps=_MAX_NEWTON_STEPS,
+        throw=False,
+    )
+    units = jnp.stack([radius] * 3 + [jnp.ones_like(radius)] * 3)
+    refined = move_pose(pose, solution.value * units, center)
+    return jax.tree.map(lambda a, b: jnp.where(usable, a, b), refined, pose_in)
+
+
+def _normalised_balance(twist: Float[Array, "6"], args: tuple) -> Float[Array, "6"]:  # type: ignore[type-arg]
+    usable, weight, balance_args = args
+    return jnp.where(usable, balance(twist, balance_args) / weight, twist)
+
+
+def identity_parameters(pose: jaxlie.SE3) -> Float[Array, "7"]:
+    return jnp.array([1, 0, 0, 0, 0, 0, 0], pose.wxyz_xyz.dtype)
