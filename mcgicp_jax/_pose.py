@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+from functools import partial
 from typing import TypeAlias
 
 import jax
 import jax.numpy as jnp
 import jaxlie
 import numpy as np
-from jax.typing import DTypeLike
+from jax.typing import ArrayLike, DTypeLike
 from jaxtyping import Array, Float
 
 Pose: TypeAlias = "jaxlie.SE3 | Float[Array, '*batch 4 4'] | Float[np.ndarray, '*batch 4 4']"
@@ -50,7 +51,8 @@ def pose_matrix(pose: Pose | None, name: str = "init") -> Float[np.ndarray, "4 4
     return matrix
 
 
-def se3_from_matrix(matrix: Float[np.ndarray, "4 4"] | Float[Array, "4 4"], dtype: DTypeLike) -> jaxlie.SE3:
+@partial(jax.jit, static_argnames="dtype")
+def se3_from_matrix(matrix: Float[ArrayLike, "4 4"], dtype: DTypeLike) -> jaxlie.SE3:
     """`jaxlie.SE3` in the given precision, its quaternion normalised."""
     pose = jaxlie.SE3.from_matrix(jnp.asarray(matrix, dtype))
     return cast_pose(pose.normalize(), dtype)

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import partial
-from typing import Any
+from typing import Any, TypeAlias
 
 import equinox as eqx
 import jax
@@ -42,16 +42,36 @@ class Settings(eqx.Module):
     max_iterations: Int[Array, ""]
 
 
+class Measurement(eqx.Module):
+    """What one pass over the matched pairs finds at a pose."""
+
+    moments: Moments
+    num_inliers: Int[Array, ""]
+    cost: Float[Array, ""]
+    rmse: Float[Array, ""]
+
+
 class State(eqx.Module):
-    """Where the loop stands. All but `pose`, which is the next one while the loop runs, belongs to the pose before."""
+    """Where the loop stands.
+
+    Attributes:
+        pose: the next pose while the loop runs; the one that was measured when it ends.
+        status: value of a `Status`, or `_RUNNING`.
+        num_iterations: measurements so far.
+        measured: at the pose before.
+        information: (6, 6) at the pose before.
+        record: one number per entry of `Registration.history`.
+    """
 
     pose: jaxlie.SE3
     status: Int[Array, ""]
     num_iterations: Int[Array, ""]
-    matches: Correspondences
-    moments: Moments
+    measured: Measurement
     information: Float[Array, "6 6"]
     record: dict[str, Float[Array, ""]]
+
+
+Carry: TypeAlias = tuple[State, Correspondences, dict[str, Array]]
 
 
 def gate(
@@ -65,43 +85,65 @@ def gate(
     return Correspondences(indices=indices, distances=distances, valid=valid)
 
 
-def step(
+@jax.jit
+def measure(
     pose: jaxlie.SE3,
-    num_iterations: Int[Array, ""],
     matches: Correspondences,
     source: Surface,
     target: Surface,
     method: AbstractMethod,
     robust: AbstractKernel | None,
-    settings: Settings,
-) -> State:
-    """Weigh the matches at the pose, and update the pose unless it has come to rest."""
+) -> Measurement:
+    """Weigh the matches at the pose: the only part of a step that touches the points."""
     rotation = pose.rotation().as_matrix().astype(source.points.dtype)
     pairs = evaluate_pairs(rotation, pose.translation(), source, target, matches, method, robust)
-    measured = moments(pairs, matches)
-    update = solve_update(measured)
-    moved = move_pose(pose, update.twist, measured.center)
-
     num_inliers = jnp.sum(matches.valid)
+    square = jnp.sum(pairs.residual * pairs.residual, axis=0)
+    return Measurement(
+        moments=moments(pairs, matches),
+        num_inliers=num_inliers,
+        cost=jnp.sum(pairs.cost),
+        rmse=jnp.sqrt(jnp.sum(square) / jnp.maximum(num_inliers, 1)),
+    )
+
+
+@jax.jit
+def match_and_measure(
+    pose: jaxlie.SE3,
+    indices: Int[Array, "N"],
+    source: Surface,
+    target: Surface,
+    method: AbstractMethod,
+    robust: AbstractKernel | None,
+    settings: Settings,
+) -> tuple[Correspondences, Measurement]:
+    matches = gate(pose, source, target, indices, settings.max_distance)
+    return matches, measure(pose, matches, source, target, method, robust)
+
+
+@jax.jit
+def update(pose: jaxlie.SE3, num_iterations: Int[Array, ""], measured: Measurement, settings: Settings) -> State:
+    """Update the pose unless it has come to rest. Compiled once, whatever the size of the clouds."""
+    change = solve_update(measured.moments)
+    moved = move_pose(pose, change.twist, measured.moments.center)
     num_iterations = num_iterations + 1
-    translation_step = jnp.linalg.norm(update.twist[:3])
-    rotation_step = jnp.linalg.norm(update.twist[3:])
+    translation_step = jnp.linalg.norm(change.twist[:3])
+    rotation_step = jnp.linalg.norm(change.twist[3:])
     at_rest = (translation_step <= settings.translation_tolerance) & (rotation_step <= settings.rotation_tolerance)
-    finite = jnp.isfinite(measured.e) & jnp.all(jnp.isfinite(moved.wxyz_xyz))
+    finite = jnp.isfinite(measured.moments.e) & jnp.all(jnp.isfinite(moved.wxyz_xyz))
     outcomes = (
-        (num_inliers < _MIN_CORRESPONDENCES, Status.TOO_FEW_CORRESPONDENCES),
+        (measured.num_inliers < _MIN_CORRESPONDENCES, Status.TOO_FEW_CORRESPONDENCES),
         (~finite, Status.NON_FINITE),
-        (at_rest & update.degenerate, Status.DEGENERATE),
+        (at_rest & change.degenerate, Status.DEGENERATE),
         (at_rest, Status.CONVERGED),
         (num_iterations >= settings.max_iterations, Status.MAX_ITERATIONS),
     )
     conditions, codes = zip(*outcomes, strict=True)
     status = jnp.select(list(conditions), [jnp.int32(code) for code in codes], jnp.int32(_RUNNING))
-    square = jnp.sum(pairs.residual * pairs.residual, axis=0)
     record = {
-        "cost": jnp.sum(pairs.cost),
-        "rmse": jnp.sqrt(jnp.sum(square) / jnp.maximum(num_inliers, 1)),
-        "num_inliers": num_inliers.astype(square.dtype),
+        "cost": measured.cost,
+        "rmse": measured.rmse,
+        "num_inliers": measured.num_inliers.astype(measured.rmse.dtype),
         "translation_step": translation_step,
         "rotation_step": rotation_step,
     }
@@ -110,26 +152,10 @@ def step(
         pose=jaxlie.SE3(jnp.where(status == _RUNNING, moved.wxyz_xyz, pose.wxyz_xyz)),
         status=status,
         num_iterations=num_iterations,
-        matches=matches,
-        moments=measured,
-        information=information_at_source(update.information, pose, measured.center),
+        measured=measured,
+        information=information_at_source(change.information, pose, measured.moments.center),
         record=record,
     )
-
-
-@jax.jit
-def match_and_step(
-    pose: jaxlie.SE3,
-    num_iterations: Int[Array, ""],
-    indices: Int[Array, "N"],
-    source: Surface,
-    target: Surface,
-    method: AbstractMethod,
-    robust: AbstractKernel | None,
-    settings: Settings,
-) -> State:
-    matches = gate(pose, source, target, indices, settings.max_distance)
-    return step(pose, num_iterations, matches, source, target, method, robust, settings)
 
 
 def _run_on_host(
@@ -140,43 +166,46 @@ def _run_on_host(
     robust: AbstractKernel | None,
     settings: Settings,
     search: AbstractSearch,
-) -> tuple[State, dict[str, np.ndarray]]:
+) -> tuple[State, Correspondences, dict[str, np.ndarray]]:
     """The loop for concrete inputs: matches from the host's tree between compiled steps."""
     index = search.index(target.points, target.descriptors, target.valid)
     num_iterations = jnp.int32(0)
     records = []
     while True:
         indices = index.nearest(pose.wxyz_xyz, source.points, source.descriptors, source.valid, settings.max_distance)
-        state = match_and_step(pose, num_iterations, indices, source, target, method, robust, settings)
+        matches, measured = match_and_measure(pose, indices, source, target, method, robust, settings)
+        state = update(pose, num_iterations, measured, settings)
         records.append(state.record)
         if state.status != _RUNNING:
             break
         pose, num_iterations = state.pose, state.num_iterations
-    history = {name: np.array([float(record[name]) for record in records]) for name in records[0]}
-    return state, history
+    records = jax.device_get(records)
+    return state, matches, {name: np.array([record[name] for record in records]) for name in records[0]}
 
 
 def _run_traced(
     pose: jaxlie.SE3,
-    advance: Callable[[jaxlie.SE3, Int[Array, ""], Bool[Array, ""]], State],
+    match: Callable[[jaxlie.SE3, Bool[Array, ""]], tuple[Correspondences, Measurement]],
+    settings: Settings,
     max_iterations: int,
-) -> tuple[State, dict[str, Array]]:
-    """The loop inside a transformation. `advance(pose, num_iterations, running)` is one step."""
+) -> Carry:
+    """The loop inside a transformation. `match(pose, running)` finds the pairs and weighs them."""
+
+    def advance(pose: jaxlie.SE3, num_iterations: Array, running: Array) -> tuple[State, Correspondences]:
+        matches, measured = match(pose, running)
+        return update(pose, num_iterations, measured, settings), matches
+
+    def body(carry: Carry) -> Carry:
+        before, _, history = carry
+        state, matches = advance(before.pose, before.num_iterations, before.status == _RUNNING)
+        history = {name: values.at[before.num_iterations].set(state.record[name]) for name, values in history.items()}
+        return state, matches, history
+
     shapes = jax.eval_shape(advance, pose, jnp.int32(0), jnp.bool_(True))
-    state = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), shapes)
-    state = eqx.tree_at(lambda s: (s.pose, s.status), state, (pose, jnp.int32(_RUNNING)))
+    state, matches = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), shapes)
+    state = eqx.tree_at(lambda state: (state.pose, state.status), state, (pose, jnp.int32(_RUNNING)))
     history = {name: jnp.full(max_iterations, jnp.nan, value.dtype) for name, value in state.record.items()}
-
-    def running(carry: tuple[State, dict[str, Array]]) -> Bool[Array, ""]:
-        return carry[0].status == _RUNNING
-
-    def body(carry: tuple[State, dict[str, Array]]) -> tuple[State, dict[str, Array]]:
-        state, history = carry
-        new = advance(state.pose, state.num_iterations, state.status == _RUNNING)
-        history = {name: values.at[state.num_iterations].set(new.record[name]) for name, values in history.items()}
-        return new, history
-
-    return jax.lax.while_loop(running, body, (state, history))
+    return jax.lax.while_loop(lambda carry: carry[0].status == _RUNNING, body, (state, matches, history))
 
 
 def find_correspondences(
@@ -289,13 +318,15 @@ def _align(
     settings: Settings,
     max_iterations: int,
 ) -> tuple[jaxlie.SE3, State, dict[str, Array]]:
-    constants = jax.lax.stop_gradient((matches, source, target, method, robust, settings))
+    constants = jax.lax.stop_gradient((matches, source, target, method, robust))
 
-    def advance(pose: jaxlie.SE3, num_iterations: Int[Array, ""], running: Bool[Array, ""]) -> State:
-        return step(pose, num_iterations, *constants)
+    def match(pose: jaxlie.SE3, running: Bool[Array, ""]) -> tuple[Correspondences, Measurement]:
+        return matches, measure(pose, *constants)
 
-    state, history = _run_traced(jax.lax.stop_gradient(start), advance, max_iterations)
-    return _refine(state, source, target, method, robust), state, history
+    state, _, history = _run_traced(
+        jax.lax.stop_gradient(start), match, jax.lax.stop_gradient(settings), max_iterations
+    )
+    return _refine(state, matches, source, target, method, robust), state, history
 
 
 def register(
@@ -345,12 +376,12 @@ def register(
     differentiable = (source_surface, target_surface, method, robust)
     constants = jax.lax.stop_gradient((start, *differentiable, settings))
     if is_concrete(constants):
-        state, history = _run_on_host(*constants, search)
+        state, matches, history = _run_on_host(*constants, search)
     else:
-        state, history = _search_traced(*constants, search, max_iterations)
+        state, matches, history = _search_traced(*constants, search, max_iterations)
     if is_concrete(differentiable):
         return _registration(state.pose, state, history, source, target)
-    pose = _refine(state, *differentiable)
+    pose = _refine(state, matches, *differentiable)
     return _registration(pose, state, history, source, target)
 
 
@@ -364,22 +395,27 @@ def _search_traced(
     settings: Settings,
     search: AbstractSearch,
     max_iterations: int,
-) -> tuple[State, dict[str, Array]]:
+) -> Carry:
     """The loop of `register` for traced inputs; pose and matches are constants to autodiff."""
 
-    def advance(pose: jaxlie.SE3, num_iterations: Int[Array, ""], running: Bool[Array, ""]) -> State:
+    def match(pose: jaxlie.SE3, running: Bool[Array, ""]) -> tuple[Correspondences, Measurement]:
         indices = _nearest_traced(search, pose, source, target, settings.max_distance, running)
-        return match_and_step(pose, num_iterations, indices, source, target, method, robust, settings)
+        return match_and_measure(pose, indices, source, target, method, robust, settings)
 
-    return _run_traced(start, advance, max_iterations)
+    return _run_traced(start, match, settings, max_iterations)
 
 
 @jax.jit
 def _refine(
-    state: State, source: Surface, target: Surface, method: AbstractMethod, robust: AbstractKernel | None
+    state: State,
+    matches: Correspondences,
+    source: Surface,
+    target: Surface,
+    method: AbstractMethod,
+    robust: AbstractKernel | None,
 ) -> jaxlie.SE3:
     usable = (state.status == Status.CONVERGED) | (state.status == Status.MAX_ITERATIONS)
-    return refine_pose(state.pose, usable, state.moments, source, target, state.matches, method, robust)
+    return refine_pose(state.pose, usable, state.measured.moments, source, target, matches, method, robust)
 
 
 def _ready(name: str, cloud: PointCloud | ArrayLike) -> PointCloud:
@@ -438,13 +474,8 @@ def _registration(
     if not is_concrete(source.origin) or np.any(source.origin):
         adjoint = _translation_adjoint(-source.origin)
         information = adjoint.T @ information @ adjoint
-    numbers = (
-        state.status,
-        state.num_iterations,
-        jnp.sum(state.matches.valid),
-        state.record["cost"],
-        state.record["rmse"],
-    )
+    measured = state.measured
+    numbers = (state.status, state.num_iterations, measured.num_inliers, measured.cost, measured.rmse)
     if is_concrete(numbers):
         numbers = tuple(np.asarray(number)[()] for number in numbers)
     status, num_iterations, num_inliers, cost, rmse = numbers
