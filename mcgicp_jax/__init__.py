@@ -3,6 +3,10 @@
 Frames: `T_target_source` maps source coordinates into the target's frame. Metres and radians throughout.
 """
 
+from mcgicp_jax import datasets as datasets
+from mcgicp_jax import io as io
+from mcgicp_jax import metrics as metrics
+from mcgicp_jax import plot as plot
 from mcgicp_jax._cloud import PointCloud as PointCloud
 from mcgicp_jax._cost import Cauchy as Cauchy
 from mcgicp_jax._cost import GemanMcClure as GemanMcClure

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, TypeAlias
 
 import equinox as eqx
 import jax
@@ -13,6 +13,9 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float, Int
 
 from mcgicp_jax._pose import Pose, is_concrete, pose_matrix
+
+# What a user may hand in: an array of any library, or rows in lists.
+Values: TypeAlias = ArrayLike | Sequence[Any]
 
 _SMALLEST_CLASS = 128
 
@@ -29,8 +32,8 @@ def size_class(num_points: int) -> int:
     return size
 
 
-def _as_float(name: str, values: ArrayLike) -> Any:
-    """A floating-point array; NumPy stays NumPy (and float64), so that nothing is lost before an origin is taken off."""
+def _as_float(name: str, values: Values) -> Any:
+    """A floating-point array; NumPy stays NumPy, and float64, until an origin has been taken off."""
     if isinstance(values, jax.Array):
         return values if jnp.issubdtype(values.dtype, jnp.floating) else values.astype(float)
     try:
@@ -69,10 +72,10 @@ class PointCloud(eqx.Module):
 
     def __init__(
         self,
-        points: ArrayLike,
-        channels: ArrayLike | None = None,
+        points: Values,
+        channels: Values | None = None,
         *,
-        covariances: ArrayLike | None = None,
+        covariances: Values | None = None,
         channel_names: Sequence[str] | None = None,
     ):
         """A raw cloud.
@@ -86,31 +89,29 @@ class PointCloud(eqx.Module):
         Raises:
             ValueError: where a shape or dtype does not fit; the message names the argument.
         """
-        points = _as_float("points", points)
-        if points.ndim != 2 or points.shape[1] != 3:
-            raise ValueError(f"points: expected shape (N, 3), got {points.shape}")
+        self.points = _as_float("points", points)
+        if self.points.ndim != 2 or self.points.shape[1] != 3:
+            raise ValueError(f"points: expected shape (N, 3), got {self.points.shape}")
+        size = self.points.shape[0]
         if channels is None:
-            channels = np.zeros((len(points), 0), points.dtype)
-        channels = _as_float("channels", channels)
-        if channels.ndim == 1:
-            channels = channels[:, None]
-        if channels.ndim != 2 or channels.shape[0] != points.shape[0]:
-            raise ValueError(f"channels: expected shape ({points.shape[0]}, C) to go with points, got {channels.shape}")
-        if covariances is not None:
-            covariances = _as_float("covariances", covariances)
-            if covariances.shape != (points.shape[0], 3, 3):
-                raise ValueError(f"covariances: expected shape ({points.shape[0]}, 3, 3), got {covariances.shape}")
+            channels = np.zeros((size, 0), self.points.dtype)
+        self.channels = _as_float("channels", channels)
+        if self.channels.ndim == 1:
+            self.channels = self.channels[:, None]
+        if self.channels.ndim != 2 or self.channels.shape[0] != size:
+            raise ValueError(f"channels: expected shape ({size}, C) to go with points, got {self.channels.shape}")
+        self.covariances = None if covariances is None else _as_float("covariances", covariances)
+        if self.covariances is not None and self.covariances.shape != (size, 3, 3):
+            raise ValueError(f"covariances: expected shape ({size}, 3, 3), got {self.covariances.shape}")
+        count = self.channels.shape[1]
         if channel_names is None:
-            channel_names = [f"channel_{i}" for i in range(channels.shape[1])]
-        if len(channel_names) != channels.shape[1]:
-            raise ValueError(f"channel_names: expected {channels.shape[1]} names, got {len(channel_names)}")
-        self.points = points
-        self.channels = channels
-        self.valid = np.ones(points.shape[0], bool)
-        self.neighbors = None
-        self.covariances = covariances
-        self.origin = np.zeros(3)
+            channel_names = [f"channel_{i}" for i in range(count)]
+        if len(channel_names) != count:
+            raise ValueError(f"channel_names: expected {count} names, got {len(channel_names)}")
         self.channel_names = tuple(channel_names)
+        self.valid = np.ones(size, bool)
+        self.neighbors = None
+        self.origin = np.zeros(3)
 
     def replace(self, **arrays: Any) -> PointCloud:
         """The cloud with some of its arrays exchanged (`points`, `channels`, `covariances`, ...); shapes must agree.
@@ -152,7 +153,7 @@ class PointCloud(eqx.Module):
         return f"PointCloud({', '.join(parts)})"
 
     def unpad(self) -> PointCloud:
-        """A raw cloud: the valid rows alone, as NumPy arrays in the user's frame (float64 if an origin was taken off)."""
+        """A raw cloud: the valid rows alone, NumPy arrays in the user's frame, float64 if an origin was taken off."""
         keep = np.asarray(self.valid)
         points = np.asarray(self.points)[keep]
         if np.any(self.origin):
@@ -168,7 +169,7 @@ class PointCloud(eqx.Module):
         if missing < 0:
             raise ValueError(f"size: expected at least {self.points.shape[0]}, the cloud's rows, got {size}")
 
-        def grow(array: Any, fill: float = 0) -> Any:
+        def grow(array: Any, fill: int = 0) -> Any:
             if array is None:
                 return None
             xp = np if isinstance(array, np.ndarray) else jnp

@@ -13,7 +13,7 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float
 
 from mcgicp_jax import _covariance as cov
-from mcgicp_jax._cloud import PointCloud
+from mcgicp_jax._cloud import PointCloud, Values
 from mcgicp_jax._pose import is_concrete
 
 
@@ -97,7 +97,7 @@ class ColorICP(AbstractMethod):
 
     channel_weights: Float[Array, "..."]
 
-    def __init__(self, channel_weights: ArrayLike):
+    def __init__(self, channel_weights: Values):
         """Raises `ValueError` if a weight is negative or not finite."""
         self.channel_weights = _weights(channel_weights)
 
@@ -165,8 +165,8 @@ class MultiChannelGICP(AbstractGeneralized):
 
     def __init__(
         self,
-        channel_covariance: ArrayLike | None = None,
-        channel_weights: ArrayLike | None = None,
+        channel_covariance: Values | None = None,
+        channel_weights: Values | None = None,
         epsilon: ArrayLike = 1e-3,
         min_eigenvalue: ArrayLike = 1e-3,
     ):
@@ -319,7 +319,7 @@ def _spacing(cloud: PointCloud) -> Float[Array, ""]:
     return jnp.nanmedian(jnp.where(jnp.asarray(cloud.valid) & (second >= 0), distances, jnp.nan))
 
 
-def _number(name: str, value: ArrayLike) -> Array:
+def _number(name: str, value: Values) -> Array:
     try:
         return jnp.asarray(value, float) if is_concrete(value) else jnp.asarray(value)
     except (TypeError, ValueError) as error:
@@ -333,7 +333,7 @@ def _positive_scalar(name: str, value: ArrayLike) -> Float[Array, ""]:
     return number
 
 
-def _weights(value: ArrayLike) -> Float[Array, "..."]:
+def _weights(value: Values) -> Float[Array, "..."]:
     weights = _number("channel_weights", value)
     if weights.ndim > 1:
         raise ValueError(f"channel_weights: expected a scalar or shape (C,), got {weights.shape}")
@@ -342,7 +342,7 @@ def _weights(value: ArrayLike) -> Float[Array, "..."]:
     return weights
 
 
-def _covariance(value: Any) -> Float[Array, "..."]:
+def _covariance(value: Values) -> Float[Array, "..."]:
     covariance = _number("channel_covariance", value)
     if covariance.ndim > 2 or (covariance.ndim == 2 and covariance.shape[0] != covariance.shape[1]):
         raise ValueError(f"channel_covariance: expected a scalar, shape (C,) or (C, C), got {covariance.shape}")

@@ -7,10 +7,9 @@ import warnings
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.typing import ArrayLike
-from jaxtyping import Float, Int
+from jaxtyping import Float
 
-from mcgicp_jax._cloud import PointCloud, size_class
+from mcgicp_jax._cloud import PointCloud, Values, size_class
 from mcgicp_jax._pose import is_concrete
 from mcgicp_jax._search import AbstractSearch, KDTreeSearch
 
@@ -22,7 +21,7 @@ _VOXELS_PER_AXIS = 2**21
 
 
 def preprocess(
-    cloud: PointCloud | ArrayLike,
+    cloud: PointCloud | Values,
     voxel_size: float | None = None,
     num_neighbors: int = 20,
     *,
@@ -65,7 +64,8 @@ def preprocess(
         points, channels = _downsample(points, channels, voxel_size)
         if len(points) < MIN_POINTS:
             raise ValueError(
-                f"voxel_size: {voxel_size} m leaves {len(points)} points, expected at least {MIN_POINTS}; choose a smaller one"
+                f"voxel_size: expected one that leaves at least {MIN_POINTS} points, got {voxel_size} m, "
+                f"which leaves {len(points)}"
             )
     dtype = jax.dtypes.canonicalize_dtype(points.dtype)
     origin = _far_origin(points)

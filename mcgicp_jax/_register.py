@@ -17,7 +17,7 @@ import numpy as np
 from jax.typing import ArrayLike, DTypeLike
 from jaxtyping import Array, Bool, Float, Int
 
-from mcgicp_jax._cloud import PointCloud
+from mcgicp_jax._cloud import PointCloud, Values
 from mcgicp_jax._cost import AbstractKernel, Moments, centred_pose, evaluate_pairs, match_residual, moments
 from mcgicp_jax._methods import AbstractMethod, Surface, prepare
 from mcgicp_jax._pose import Pose, is_concrete, pose_matrix, se3_from_matrix
@@ -131,7 +131,7 @@ def update(pose: jaxlie.SE3, num_iterations: Int[Array, ""], measured: Measureme
     rotation_step = jnp.linalg.norm(change.twist[3:])
     at_rest = (translation_step <= settings.translation_tolerance) & (rotation_step <= settings.rotation_tolerance)
     finite = jnp.isfinite(measured.moments.e) & jnp.all(jnp.isfinite(moved.wxyz_xyz))
-    outcomes = (
+    outcomes: tuple[tuple[Array, Status], ...] = (
         (measured.num_inliers < _MIN_CORRESPONDENCES, Status.TOO_FEW_CORRESPONDENCES),
         (~finite, Status.NON_FINITE),
         (at_rest & change.degenerate, Status.DEGENERATE),
@@ -259,8 +259,8 @@ def _nearest_traced(
     max_distance: Float[Array, ""],
     running: Bool[Array, ""],
 ) -> Int[Array, "N"]:
-    clouds = [(cloud.points, cloud.descriptors, cloud.valid) for cloud in (source, target)]
-    return search.nearest_traced(pose.wxyz_xyz, *clouds, max_distance, running)
+    source_rows, target_rows = ((cloud.points, cloud.descriptors, cloud.valid) for cloud in (source, target))
+    return search.nearest_traced(pose.wxyz_xyz, source_rows, target_rows, max_distance, running)
 
 
 def align(
@@ -286,7 +286,8 @@ def align(
         matches: from `find_correspondences`.
         method: open numbers are chosen from the data.
         init: T_target_source to start from; the identity by default.
-        translation_tolerance, rotation_tolerance: metres and radians; the pose rests once an update is below both.
+        translation_tolerance, rotation_tolerance: metres and radians; the pose rests once an update is below
+            both.
         robust: kernel of each pair's Mahalanobis distance.
 
     Raises:
@@ -330,8 +331,8 @@ def _align(
 
 
 def register(
-    source: PointCloud | ArrayLike,
-    target: PointCloud | ArrayLike,
+    source: PointCloud | Values,
+    target: PointCloud | Values,
     method: AbstractMethod,
     *,
     init: Pose | None = None,
@@ -418,7 +419,7 @@ def _refine(
     return refine_pose(state.pose, usable, state.measured.moments, source, target, matches, method, robust)
 
 
-def _ready(name: str, cloud: PointCloud | ArrayLike) -> PointCloud:
+def _ready(name: str, cloud: PointCloud | Values) -> PointCloud:
     try:
         if not isinstance(cloud, PointCloud):
             cloud = PointCloud(cloud)
@@ -467,30 +468,28 @@ def _registration(
 ) -> Registration:
     """The result in the user's frames; NumPy where everything is concrete."""
     matrix = pose_in_user_frame(pose, source.origin, target.origin)
-    information = state.information
-    if is_concrete(information, source.origin):
-        information = np.asarray(information)
-        history = {name: np.asarray(values) for name, values in history.items()}
+    measured = state.measured
+    numbers: Any = {
+        "status_code": state.status,
+        "num_iterations": state.num_iterations,
+        "num_inliers": measured.num_inliers,
+        "cost": measured.cost,
+        "rmse": measured.rmse,
+        "information": state.information,
+        "history": history,
+    }
+    if is_concrete(numbers):
+        # NumPy's scalars, rather than arrays without dimensions, print as numbers.
+        numbers = jax.tree.map(lambda number: np.asarray(number)[()], numbers)
     if not is_concrete(source.origin) or np.any(source.origin):
         adjoint = _translation_adjoint(-source.origin)
-        information = adjoint.T @ information @ adjoint
-    measured = state.measured
-    numbers = (state.status, state.num_iterations, measured.num_inliers, measured.cost, measured.rmse)
-    if is_concrete(numbers):
-        numbers = tuple(np.asarray(number)[()] for number in numbers)
-    status, num_iterations, num_inliers, cost, rmse = numbers
+        numbers["information"] = adjoint.T @ numbers["information"] @ adjoint
     return Registration(
         T_target_source=se3_from_matrix(matrix, pose.wxyz_xyz.dtype),
-        status_code=status,
-        num_iterations=num_iterations,
-        num_inliers=num_inliers,
-        cost=cost,
-        rmse=rmse,
-        information=information,
-        history=history,
         source_origin=source.origin,
         target_origin=target.origin,
         centred=pose,
+        **numbers,
     )
 
 

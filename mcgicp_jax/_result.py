@@ -64,7 +64,7 @@ class Registration(eqx.Module):
     """The pose between the clouds' own origins (0 unless coordinates are large)."""
 
     @property
-    def status(self) -> Status | Int[Array, "*batch"]:
+    def status(self) -> Any:
         """The `Status`; an array of its values inside a transformation or for a batch."""
         if is_concrete(self.status_code) and np.ndim(self.status_code) == 0:
             return Status(int(self.status_code))
@@ -83,7 +83,7 @@ class Registration(eqx.Module):
     def __repr__(self) -> str:
         if not is_concrete(self) or np.ndim(self.status_code):
             return f"Registration(batch of shape {np.shape(self.status_code)})"
-        translation = np.array2string(self.matrix[:3, 3], precision=4, suppress_small=True)
+        translation = np.array2string(np.asarray(self.matrix)[:3, 3], precision=4, suppress_small=True)
         angle = np.degrees(float(jnp.linalg.norm(self.centred.rotation().log())))
         return (
             f"Registration({self.status.name}: translation {translation} m, rotation {angle:.3f}°, "
@@ -104,6 +104,6 @@ def pose_in_user_frame(
         matrix[..., :3, 3] = parameters[..., 4:] + offset
         matrix[..., 3, 3] = 1
         return matrix
-    matrix = centred.as_matrix().astype(centred.wxyz_xyz.dtype)
-    offset = target_origin - jnp.einsum("...ij,...j->...i", matrix[..., :3, :3], source_origin)
-    return matrix.at[..., :3, 3].add(offset.astype(matrix.dtype))
+    traced = centred.as_matrix().astype(centred.wxyz_xyz.dtype)
+    shift = target_origin - jnp.einsum("...ij,...j->...i", traced[..., :3, :3], source_origin)
+    return traced.at[..., :3, 3].add(shift.astype(traced.dtype))

@@ -10,7 +10,7 @@ import collections
 import hashlib
 import threading
 from functools import partial
-from typing import Any
+from typing import Any, TypeAlias
 
 import equinox as eqx
 import jax
@@ -24,6 +24,10 @@ from mcgicp_jax._pose import rotation_from_quaternion
 
 # How many candidates, as a multiple of those asked for, are looked at to break a tie by row number.
 _TIE_CANDIDATES = 8
+
+
+# Points (3, N), descriptors (N, D), valid (N,).
+Rows: TypeAlias = tuple[Float[Array, "3 _N"], Float[Array, "_N D"], Bool[Array, "_N"]]
 
 
 class Correspondences(eqx.Module):
@@ -78,8 +82,8 @@ class AbstractSearch(eqx.Module):
     def nearest_traced(
         self,
         pose: Float[Array, "7"],
-        source: tuple[Float[Array, "3 N"], Float[Array, "N D"], Bool[Array, "N"]],
-        target: tuple[Float[Array, "3 M"], Float[Array, "M D"], Bool[Array, "M"]],
+        source: Rows,
+        target: Rows,
         max_distance: Float[Array, ""],
         running: Bool[Array, ""],
     ) -> Int[Array, "N"]:
@@ -110,8 +114,8 @@ class KDTreeSearch(AbstractSearch):
     def nearest_traced(
         self,
         pose: Float[Array, "7"],
-        source: tuple[Float[Array, "3 N"], Float[Array, "N D"], Bool[Array, "N"]],
-        target: tuple[Float[Array, "3 M"], Float[Array, "M D"], Bool[Array, "M"]],
+        source: Rows,
+        target: Rows,
         max_distance: Float[Array, ""],
         running: Bool[Array, ""],
     ) -> Int[Array, "N"]:
@@ -163,7 +167,7 @@ class KDTreeIndex(AbstractIndex):
         moved = np.asarray(points).T[active] @ rotation.T + pose[4:]
         # With descriptors, the nearest may lie beyond the gate while a pair within it is further in all dimensions:
         # then the whole space is searched. The margin covers rounding; the gate itself is applied to the position.
-        bound = np.inf if descriptors.shape[1] else 1.001 * float(max_distance)
+        bound = np.inf if descriptors.shape[1] else 1.001 * float(np.asarray(max_distance))
         queries = np.hstack([moved, descriptors[active]])
         found = _nearest(self._tree, queries, 1, self._workers, bound)[:, 0]
         indices[active] = self._rows[np.where(found < self._rows.size, found, 0)]
@@ -181,7 +185,7 @@ class _IndexCache:
     def get(self, points: np.ndarray, descriptors: np.ndarray, valid: np.ndarray, workers: int) -> KDTreeIndex:
         digest = hashlib.blake2b(repr((points.shape, descriptors.shape, points.dtype, workers)).encode())
         for array in (points, descriptors, valid):
-            digest.update(np.ascontiguousarray(array))
+            digest.update(np.ascontiguousarray(array).data)
         key = digest.digest()
         with self._lock:
             if key in self._indices:
@@ -215,10 +219,10 @@ def _nearest_callback(
     ]
     indices = np.zeros(lanes[3].shape, np.int32)
     for lane in np.ndindex(batch):
-        pose, *source_arrays, points, descriptors, valid, limit, active = (array[lane] for array in lanes)
+        moving, *source_rows, points, descriptors, valid, limit, active = (array[lane] for array in lanes)
         if active:
             index = _index_cache.get(points, descriptors, valid, workers)
-            indices[lane] = index.nearest(pose, *source_arrays, limit)
+            indices[lane] = index.nearest(moving, *source_rows, limit)  # type: ignore[call-arg]
     return indices
 
 

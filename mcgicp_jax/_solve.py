@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import jaxlie
 import lineax as lx
 import optimistix as optx
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Int
 
 from mcgicp_jax import _covariance as cov
 from mcgicp_jax._cost import AbstractKernel, Moments, evaluate_pairs
@@ -44,7 +44,7 @@ class Update(eqx.Module):
     """What one update found.
 
     Attributes:
-        twist: (6,) ξ = (v, ω), metres and radians: the pose T moves to T(c) exp(ξ) T(−c) T about the centre c.
+        twist: (6,) ξ = (v, ω), metres and radians: points turn by exp(ω) about the centre and move by v.
         information: (6, 6) Σ JᵀMJ in the same twist.
         degenerate: whether a direction is held by nothing.
     """
@@ -62,7 +62,7 @@ def solve_update(moments: Moments) -> Update:
     rotations, millimetres and kilometres, weigh alike.
     """
     dtype = moments.e.dtype
-    eps = jnp.finfo(dtype).eps
+    eps = float(jnp.finfo(dtype).eps)
     radius = jnp.where(moments.radius > 0, moments.radius, 1)
     form = _quadratic_form(moments, radius)
     tangent = jnp.asarray(_TANGENT, dtype)
@@ -70,8 +70,12 @@ def solve_update(moments: Moments) -> Update:
     trace = jnp.trace(unit_information)
     scale = _HESSIAN_SCALE / jnp.where(trace > 0, trace / 6, 1)
     root, _ = _semidefinite_root(form * scale)
-    solver = optx.LevenbergMarquardt(rtol=4 * eps, atol=4 * eps, linear_solver=lx.Normal(lx.Cholesky()))
-    solution = optx.least_squares(_residuals, solver, jnp.zeros(6, dtype), root, max_steps=_MAX_STEPS, throw=False)
+    solver: optx.LevenbergMarquardt = optx.LevenbergMarquardt(
+        rtol=4 * eps, atol=4 * eps, linear_solver=lx.Normal(lx.Cholesky())
+    )
+    solution: optx.Solution = optx.least_squares(
+        _residuals, solver, jnp.zeros(6, dtype), root, max_steps=_MAX_STEPS, throw=False
+    )
     _, pivots = _semidefinite_root(unit_information)
     units = jnp.array([1.0, 1.0, 1.0, radius, radius, radius], dtype)
     return Update(
@@ -97,31 +101,38 @@ def _semidefinite_root(form: Float[Array, "D D"]) -> tuple[Float[Array, "D D"], 
 
     Written out, because LAPACK's answer for a semidefinite matrix is NaN, and because its batched calls are avoided.
     """
-    floor = form.shape[0] * jnp.finfo(form.dtype).eps * jnp.diagonal(form)
-    columns, pivots = [], []
-    for i in range(form.shape[0]):
+    size = form.shape[0]
+    floor = size * jnp.finfo(form.dtype).eps * jnp.diagonal(form)
+    rows = jnp.arange(size)
+
+    def eliminate(i: Int[Array, ""], carry: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
+        form, root, pivots = carry
         pivot = form[i, i]
         regular = pivot > floor[i]
-        column = jnp.where(regular, form[:, i] / jnp.sqrt(jnp.where(regular, pivot, 1)), 0)
         # Rows above the pivot hold what rounding left of the zeros there.
-        column = column.at[:i].set(0)
-        form = form - jnp.outer(column, column)
-        columns.append(column)
-        pivots.append(pivot)
-    return jnp.stack(columns, axis=1), jnp.stack(pivots)
+        column = jnp.where(regular & (rows >= i), form[:, i] / jnp.sqrt(jnp.where(regular, pivot, 1)), 0)
+        return form - jnp.outer(column, column), root.at[:, i].set(column), pivots.at[i].set(pivot)
+
+    # A loop rather than an unrolled chain: it compiles four times faster.
+    _, root, pivots = jax.lax.fori_loop(0, size, eliminate, (form, jnp.zeros_like(form), jnp.zeros_like(floor)))
+    return root, pivots
 
 
 def _residuals(twist: Float[Array, "6"], root: Float[Array, "13 13"]) -> Float[Array, "13"]:
-    change = jaxlie.SE3.exp(twist).as_matrix()[:3].astype(twist.dtype)
-    change = change - jnp.eye(3, 4, dtype=twist.dtype)
+    rotation = _rotation(twist) - jnp.eye(3, dtype=twist.dtype)
+    change = jnp.concatenate([rotation, twist[:3, None]], axis=1)
     return root.T @ jnp.append(change.reshape(12), 1)
 
 
+def _rotation(twist: Float[Array, "6"]) -> Float[Array, "3 3"]:
+    return jaxlie.SO3.exp(twist[3:]).as_matrix().astype(twist.dtype)
+
+
 def move_pose(pose: jaxlie.SE3, twist: Float[Array, "6"], center: Float[Array, "3"]) -> jaxlie.SE3:
-    """T(c) exp(ξ) T(−c) T, normalised."""
-    change = jaxlie.SE3.exp(twist)
-    rotation = (change.rotation() @ pose.rotation()).normalize()
-    translation = change @ (pose.translation() - center) + center
+    """The pose whose points p = T a have gone to c + exp(ω)(p − c) + v."""
+    turn = jaxlie.SO3.exp(twist[3:])
+    rotation = (turn @ pose.rotation()).normalize()
+    translation = center + turn @ (pose.translation() - center) + twist[:3]
     return cast_pose(jaxlie.SE3.from_rotation_and_translation(rotation, translation), pose.wxyz_xyz.dtype)
 
 
@@ -186,8 +197,8 @@ def refine_pose(
     center = jnp.where(usable, moments.center, 0)
     weight = jnp.where(usable, jnp.sum(moments.Q[jnp.array([0, 3, 5]), 9]) * radius**2, 1)
     args = (pose, center, radius, source, target, matches, method, robust)
-    eps = jnp.finfo(pose.wxyz_xyz.dtype).eps
-    solution = optx.root_find(
+    eps = float(jnp.finfo(pose.wxyz_xyz.dtype).eps)
+    solution: optx.Solution = optx.root_find(
         _normalised_balance,
         optx.Newton(rtol=4 * eps, atol=4 * eps),
         jnp.zeros(6, pose.wxyz_xyz.dtype),

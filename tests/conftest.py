@@ -10,7 +10,8 @@ os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(pathlib.Path(__file__).pa
 os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0.2")
 
 with install_import_hook("mcgicp_jax", "beartype.beartype"):
-    import mcgicp_jax  # noqa: F401
+    import mcgicp_jax
+    import mcgicp_jax.__main__  # noqa: F401
 
 import pytest  # noqa: E402
 

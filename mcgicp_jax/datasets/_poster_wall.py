@@ -1,0 +1,238 @@
+"""A flat wall of posters before a noisy RGB-D camera: geometry slides along it, colour does not."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import TypeAlias
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from mcgicp_jax._cloud import PointCloud
+
+# The first Kinect: pixels, and the focal length in pixels.
+_WIDTH, _HEIGHT, _FOCAL = 640, 480, 525.0
+_COLOR_NOISE = 0.02
+
+# Metres from the wall, and how far the camera sways about that.
+_DISTANCE, _DISTANCE_SWAY = 1.35, 0.12
+# Radians: the tilt sways on a circle, in steps that turn the camera by 1.5° from frame to frame.
+_TILT, _TILT_PHASE = np.deg2rad(2.0), 2 * np.arcsin(0.375)
+
+# Metres: a texel is finer than the 2.3 mm that a pixel covers on a wall 1.2 m away.
+_TEXEL = 0.0015
+# Metres: the wall is divided into cells, one poster in each, and repeats beyond them.
+_CELL_WIDTH, _CELL_HEIGHT, _COLUMNS, _ROWS = 0.84, 0.75, 4, 3
+_BORDER = 0.015
+_WALL_COLOR = np.array([0.72, 0.70, 0.66])
+# Away from 0 and 1, so that noise is rarely clipped.
+_PALETTE = np.array(
+    [
+        [0.85, 0.20, 0.18],
+        [0.93, 0.62, 0.15],
+        [0.90, 0.85, 0.30],
+        [0.25, 0.60, 0.30],
+        [0.15, 0.55, 0.60],
+        [0.16, 0.28, 0.62],
+        [0.50, 0.25, 0.55],
+        [0.90, 0.88, 0.84],
+        [0.12, 0.12, 0.15],
+        [0.55, 0.38, 0.25],
+    ]
+)
+
+Grid: TypeAlias = Float[np.ndarray, "h w"]
+Image: TypeAlias = Float[np.ndarray, "h w 3"]
+Colors: TypeAlias = Float[np.ndarray, "colors 3"]
+
+
+@dataclass(frozen=True, eq=False)
+class Frame:
+    """What a sensor saw, and from where.
+
+    Two frames give the true relative pose: `T_target_source = inv(target.pose) @ source.pose`.
+
+    Attributes:
+        cloud: in the sensor's frame, metres.
+        pose: (4, 4), sensor to world, exact.
+    """
+
+    cloud: PointCloud
+    pose: Float[np.ndarray, "4 4"]
+
+
+def poster_wall(
+    num_frames: int = 2, *, points_per_frame: int = 12_000, step: float = 0.03, noise: float = 1.0, seed: int = 0
+) -> list[Frame]:
+    """A camera moves along a flat wall of posters; only the colours tell how far.
+
+    The wall is the plane z = 0 of the world; the camera (x right, y down, z ahead; 640 × 480 pixels, focal length 525)
+    looks at it from 1.23 to 1.47 m. From frame to frame it moves by `step` in one direction along the wall, by at most
+    0.3 `step` across it, and turns by 1.5°. The rays of every frame fall between those of the others.
+
+    Frame i is the same whatever `num_frames` is.
+
+    Args:
+        points_per_frame: approximately; the rays cover the whole image, 1 to 307,200 of them.
+        step: metres along the wall between consecutive frames.
+        noise: 1 for a Kinect, 0 for none. Scales the standard deviations: of depth, 0.0012 + 0.0019 (z − 0.4)²
+            metres, which moves a point along its ray; and of each colour, 0.02.
+        seed: the same seed gives the same posters, path and noise.
+
+    Returns:
+        Frames whose clouds have the channels red, green and blue, from 0 to 1.
+
+    Raises:
+        ValueError: if a number is out of its range.
+    """
+    if num_frames < 1:
+        raise ValueError(f"num_frames: expected at least 1, got {num_frames}")
+    if not 1 <= points_per_frame <= _WIDTH * _HEIGHT:
+        raise ValueError(f"points_per_frame: expected 1 to {_WIDTH * _HEIGHT}, got {points_per_frame}")
+    if not noise >= 0:
+        raise ValueError(f"noise: expected 0 or more, got {noise}")
+    scene_rng, path_rng, *frame_rngs = np.random.default_rng(seed).spawn(num_frames + 2)
+    wall = _paint_wall(scene_rng)
+    poses = _camera_path(path_rng, num_frames, step)
+    return [
+        Frame(_observe(rng, wall, pose, points_per_frame, noise), pose)
+        for rng, pose in zip(frame_rngs, poses, strict=True)
+    ]
+
+
+# The camera
+
+
+def _camera_path(rng: np.random.Generator, num_frames: int, step: float) -> list[Float[np.ndarray, "4 4"]]:
+    start = rng.uniform(0, 1, 2) * (_COLUMNS * _CELL_WIDTH, _ROWS * _CELL_HEIGHT)
+    heading, tilt_start, sway_start = rng.uniform(0, 2 * np.pi, 3)
+    tilt_axes = np.linalg.qr(rng.normal(size=(3, 2)))[0]
+    poses = []
+    for i in range(num_frames):
+        tilt = tilt_start + i * _TILT_PHASE
+        sway = sway_start + 0.3 * step / _DISTANCE_SWAY * i
+        pose = np.eye(4)
+        pose[:3, :3] = _rotation(tilt_axes @ (_TILT * np.array([np.cos(tilt), np.sin(tilt)])))
+        pose[:2, 3] = start + i * step * np.array([np.cos(heading), np.sin(heading)])
+        pose[2, 3] = -_DISTANCE + _DISTANCE_SWAY * np.sin(sway)
+        poses.append(pose)
+    return poses
+
+
+def _rotation(vector: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3 3"]:
+    """Rodrigues' formula, for a rotation vector that is not 0."""
+    angle = np.linalg.norm(vector)
+    x, y, z = vector / angle
+    cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+    return np.eye(3) + np.sin(angle) * cross + (1 - np.cos(angle)) * cross @ cross
+
+
+def _observe(
+    rng: np.random.Generator, wall: Image, pose: Float[np.ndarray, "4 4"], size: int, noise: float
+) -> PointCloud:
+    rays = _rays(rng, size)
+    rotation, center = pose[:3, :3], pose[:3, 3]
+    depth = -center[2] / (rays @ rotation[2])
+    hits = (depth[:, None] * rays) @ rotation.T + center
+    colors = _sample(wall, hits[:, :2] / _TEXEL)
+    depth_noise = noise * (0.0012 + 0.0019 * (depth - 0.4) ** 2)
+    depth = depth + depth_noise * rng.normal(size=depth.shape)
+    colors = np.clip(colors + noise * _COLOR_NOISE * rng.normal(size=colors.shape), 0, 1)
+    return PointCloud(depth[:, None] * rays, colors, channel_names=("red", "green", "blue"))
+
+
+def _rays(rng: np.random.Generator, size: int) -> Float[np.ndarray, "N 3"]:
+    """Rays (x, y, 1) on a regular grid of the image, the grid shifted at random and each ray anywhere in its pixel."""
+    columns = max(round(np.sqrt(size * _WIDTH / _HEIGHT)), 1)
+    rows = max(round(size / columns), 1)
+    u, v = np.meshgrid(np.arange(columns) + rng.uniform(), np.arange(rows) + rng.uniform())
+    pixels = np.stack([u.ravel() * _WIDTH / columns, v.ravel() * _HEIGHT / rows], axis=1)
+    pixels += rng.uniform(-0.5, 0.5, pixels.shape)
+    xy = (pixels - (_WIDTH / 2, _HEIGHT / 2)) / _FOCAL
+    return np.concatenate([xy, np.ones((len(xy), 1))], axis=1)
+
+
+def _sample(wall: Image, texels: Float[np.ndarray, "N 2"]) -> Float[np.ndarray, "N 3"]:
+    """Bilinear; the wall repeats in both directions."""
+    height, width, _ = wall.shape
+    x0, y0 = np.floor(texels).astype(int).T
+    right, down = (texels - np.floor(texels)).T[..., None]
+    x1, y1 = (x0 + 1) % width, (y0 + 1) % height
+    x0, y0 = x0 % width, y0 % height
+    above = (1 - right) * wall[y0, x0] + right * wall[y0, x1]
+    below = (1 - right) * wall[y1, x0] + right * wall[y1, x1]
+    return (1 - down) * above + down * below
+
+
+# The wall
+
+
+def _paint_wall(rng: np.random.Generator) -> Image:
+    cell = np.array([round(_CELL_WIDTH / _TEXEL), round(_CELL_HEIGHT / _TEXEL)])
+    wall = np.empty((_ROWS * cell[1], _COLUMNS * cell[0], 3), np.float32)
+    wall[:] = _WALL_COLOR
+    designs = [_gradient, _stripes, _text, _discs, _diamonds]
+    for i, which in enumerate(rng.permutation(_ROWS * _COLUMNS)):
+        size = (cell * rng.uniform(0.62, 0.92, 2)).astype(int)
+        x, y = cell * (i % _COLUMNS, i // _COLUMNS) + rng.integers(0, cell - size)
+        wall[y : y + size[1], x : x + size[0]] = _poster(rng, designs[which % len(designs)], size)
+    return wall
+
+
+def _poster(rng: np.random.Generator, design: Callable[..., Image], size: Int[np.ndarray, "2"]) -> Image:
+    width, height = size * _TEXEL
+    x, y = np.meshgrid((np.arange(size[0]) + 0.5) * _TEXEL, (np.arange(size[1]) + 0.5) * _TEXEL)
+    frame, *colors = rng.permutation(_PALETTE)
+    picture = design(rng, x, y, np.array(colors))
+    picture[np.minimum(np.minimum(x, width - x), np.minimum(y, height - y)) < _BORDER] = frame
+    return picture
+
+
+def _gradient(rng: np.random.Generator, x: Grid, y: Grid, colors: Colors) -> Image:
+    """From one colour to another and on to a third."""
+    angle = rng.uniform(0, 2 * np.pi)
+    along = np.cos(angle) * x + np.sin(angle) * y
+    share = (along - along.min()) / np.ptp(along)
+    return np.stack([np.interp(share, [0, 0.5, 1], channel) for channel in colors[:3].T], axis=-1)
+
+
+def _stripes(rng: np.random.Generator, x: Grid, y: Grid, colors: Colors) -> Image:
+    """Bands of uneven width, in any direction."""
+    angle = rng.uniform(0, 2 * np.pi)
+    return colors[_bands(rng, np.cos(angle) * x + np.sin(angle) * y, 0.02, 0.10) % 4]
+
+
+def _diamonds(rng: np.random.Generator, x: Grid, y: Grid, colors: Colors) -> Image:
+    """Uneven bands at 45° across uneven bands at −45°."""
+    return colors[(_bands(rng, x + y, 0.08, 0.25) + 2 * _bands(rng, x - y, 0.08, 0.25)) % 5]
+
+
+def _discs(rng: np.random.Generator, x: Grid, y: Grid, colors: Colors) -> Image:
+    """Discs over one another on a plain ground."""
+    label = np.zeros(x.shape, int)
+    for i in range(14):
+        radius = rng.uniform(0.03, 0.12)
+        center_x, center_y = rng.uniform(0, x.max()), rng.uniform(0, y.max())
+        label[np.hypot(x - center_x, y - center_y) < radius] = 1 + i % (len(colors) - 1)
+    return colors[label]
+
+
+def _text(rng: np.random.Generator, x: Grid, y: Grid, colors: Colors) -> Image:
+    """Lines of words, blocks of one colour each, under a headline of larger ones."""
+    ink, paper = sorted(colors[:4], key=np.sum)[::3]
+    letters = np.zeros(x.shape, bool)
+    top, height = 0.04, 0.07
+    while top < y.max():
+        line = (y >= top) & (y < top + height) & (x > 0.04) & (x < x.max() - 0.04)
+        letters |= line & (_bands(rng, x, 0.4 * height, 3 * height) % 2 == 0)
+        top += 1.6 * height
+        height = rng.uniform(0.018, 0.032)
+    return np.where(letters[..., None], ink, paper)
+
+
+def _bands(rng: np.random.Generator, along: Grid, narrowest: float, widest: float) -> Int[np.ndarray, "h w"]:
+    """Numbers the bands of random width that a coordinate passes through."""
+    count = int(np.ptp(along) / narrowest) + 1
+    edges = along.min() + np.cumsum(rng.uniform(narrowest, widest, count))
+    return np.searchsorted(edges, along)

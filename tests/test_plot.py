@@ -1,0 +1,243 @@
+"""Figures: what they show, not only that they appear."""
+
+import subprocess
+import sys
+
+import matplotlib.image
+import numpy as np
+import pytest
+
+from mcgicp_jax import PointCloud, plot
+from mcgicp_jax.datasets import poster_wall
+
+
+@pytest.fixture(scope="module")
+def wall():
+    target, source = poster_wall(2, seed=0)
+    return source.cloud, target.cloud, np.linalg.inv(target.pose) @ source.pose
+
+
+@pytest.fixture(scope="module")
+def rooms():
+    """Without channels: a floor and four walls, the source 0.3 m off in both directions."""
+    rng = np.random.default_rng(0)
+
+    def room():
+        points = rng.uniform(-1, 1, (20_000, 3)) * [4, 3, 1]
+        floor, ends, sides = points[:4000], points[4000:12_000], points[12_000:]
+        floor[:, 2] = -1
+        ends[:, 0] = 4 * np.sign(ends[:, 0])
+        sides[:, 1] = 3 * np.sign(sides[:, 1])
+        return points
+
+    T = np.eye(4)
+    T[:2, 3] = 0.3
+    return PointCloud(room() - T[:3, 3]), PointCloud(room()), T
+
+
+def shown(panel):
+    return np.asarray(panel.images[0].get_array())
+
+
+def test_a_fitting_pose_leaves_less_difference_of_color(wall, tmp_path):
+    source, target, truth = wall
+    path = tmp_path / "wall.png"
+    figure = plot.before_after(source, target, {"truth": truth}, path=path)
+    panels = np.array(figure.axes).reshape(2, 3)
+    assert [panel.get_ylabel() for panel in panels[:, 0]] == ["start", "truth"]
+    start, fitted = (float(panel.get_xlabel().split()[-1]) for panel in panels[:, 2])
+    assert fitted < 0.6 * start
+    height, width, _ = matplotlib.image.imread(path).shape
+    assert width > 1000 and height > 500
+    assert matplotlib.image.imread(path).std() > 0.1
+
+
+def test_tiles_of_the_source_alternate_with_tiles_of_the_target(wall):
+    source, target, truth = wall
+    red, green = (np.tile(color, (len(cloud), 1)) for color, cloud in (([1.0, 0, 0], source), ([0, 1.0, 0], target)))
+    figure = plot.before_after(
+        source.replace(channels=red, channel_names=source.channel_names),
+        target.replace(channels=green, channel_names=target.channel_names),
+        {"truth": truth},
+    )
+    picture = shown(figure.axes[3])
+    is_red, is_green = (np.all(picture == color, axis=-1) for color in ([1, 0, 0], [0, 1, 0]))
+    assert 0.4 < is_red.mean() < 0.55 and 0.4 < is_green.mean() < 0.55
+    # About a dozen tiles across: as often does the colour change along a row.
+    middle = is_red[len(is_red) // 2 - 5]
+    assert 9 <= np.sum(middle[1:] != middle[:-1]) <= 13
+
+
+def test_the_wall_is_seen_upright_from_the_camera(wall):
+    source, target, truth = wall
+    figure = plot.before_after(source, target, {"start": truth})
+    assert len(figure.axes) == 3
+    picture = shown(figure.axes[0])
+    # The camera's x is to the right and its y down; rows of the picture go up.
+    x, y = target.points[:, 0], target.points[:, 1]
+    corner = target.channels[(x > 0.45) & (x < 0.65) & (y > -0.5) & (y < -0.3)].mean(axis=0)
+    height, width, _ = picture.shape
+    extent_x, extent_y = np.percentile(x, [2, 98]), np.percentile(-y, [2, 98])
+    columns = np.round((np.array([0.45, 0.65]) - extent_x[0]) / np.ptp(extent_x) * width).astype(int)
+    rows = np.round((np.array([0.3, 0.5]) - extent_y[0]) / np.ptp(extent_y) * height).astype(int)
+    np.testing.assert_allclose(picture[slice(*rows), slice(*columns)].mean(axis=(0, 1)), corner, atol=0.04)
+
+
+def test_clouds_without_color_are_overlaid_and_black_where_they_fit(rooms):
+    source, target, truth = rooms
+    figure = plot.before_after(source, target, {"fitted": truth})
+    panels = np.array(figure.axes).reshape(2, 2)
+
+    def black(panel):
+        picture = shown(panel)
+        dark = picture.min(axis=-1) < 0.2
+        return np.sum(picture.max(axis=-1)[dark] < 0.2) / dark.sum()
+
+    assert black(panels[0, 0]) < 0.2
+    assert black(panels[1, 0]) > 0.6
+
+
+def test_the_detail_shows_where_poses_differ(wall):
+    source, target, truth = wall
+
+    # Paint everything grey but for one patch, in the target's upper right.
+    def grey(cloud, points):
+        patch = (np.abs(points[:, 0] - 0.4) < 0.1) & (np.abs(points[:, 1] + 0.3) < 0.1)
+        return cloud.replace(channels=np.where(patch[:, None], [0.9, 0.1, 0.1], 0.5), channel_names=cloud.channel_names)
+
+    figure = plot.before_after(
+        grey(source, source.transform(truth).points), grey(target, target.points), {"truth": truth}
+    )
+    height, width, _ = shown(figure.axes[0]).shape
+    column, row = np.mean(figure.axes[1].get_xlim()), np.mean(figure.axes[1].get_ylim())
+    assert 0.6 * width < column < 0.85 * width and 0.6 * height < row < 0.85 * height
+
+
+def test_poses_without_overlap_and_odd_clouds_are_drawn(wall):
+    source, target, _ = wall
+    away = np.eye(4)
+    away[0, 3] = 100
+    figure = plot.before_after(source, target, {"away": away})
+    assert figure.axes[5].get_xlabel() == "no overlap"
+    points = np.array(target.points)
+    points[::7] = np.nan
+    plot.before_after(source, PointCloud(points, target.channels, channel_names=target.channel_names), {})
+    plot.before_after(PointCloud(np.zeros((0, 3))), PointCloud(np.ones((5, 3))), {})
+
+
+def test_padding_and_origin_change_nothing(wall):
+    source, target, truth = wall
+    shift = np.array([4e5, 5e6, 100.0])
+    moved = target.replace(points=target.points).replace_rows(origin=shift)
+    T = truth.copy()
+    T[:3, 3] += shift
+    plain = plot.before_after(source, target, {"start": truth})
+    same = plot.before_after(source.pad(16_000), moved.pad(16_000), {"start": T})
+    difference = np.nan_to_num(np.abs(shown(plain.axes[2]) - shown(same.axes[2])))
+    assert difference.mean() < 1e-3
+
+
+def test_before_after_refuses_what_it_cannot_draw(wall):
+    source, target, _ = wall
+    with pytest.raises(ValueError, match=r"poses\['mirror'\]: .*rigid"):
+        plot.before_after(source, target, {"mirror": np.diag([1.0, 1, -1, 1])})
+    with pytest.raises(ValueError, match="target: expected at least 3 points, got 2"):
+        plot.before_after(source, PointCloud(np.eye(3)[:2]), {})
+
+
+def test_clouds_take_their_own_colors(wall):
+    source, _, _ = wall
+    intense = PointCloud(np.eye(3), np.array([1.0, 2.0, 3.0]), channel_names=["intensity"])
+    plain = PointCloud(np.eye(3))
+    figure = plot.clouds(source, intense, plain, names=["wall", "scan", "plain"])
+    wall_trace, scan, bare = figure.data
+    assert [trace.name for trace in figure.data] == ["wall", "scan", "plain"]
+    where = np.flatnonzero(np.all(source.points == [wall_trace.x[0], wall_trace.y[0], wall_trace.z[0]], axis=1))[0]
+    red, green, blue = np.round(255 * source.channels[where]).astype(int)
+    assert wall_trace.marker.color[0] == f"rgb({red},{green},{blue})"
+    assert dict(zip(scan.marker.color, scan.x, strict=True))[1.0] == 1
+    assert isinstance(bare.marker.color, str) and bare.marker.color.startswith("#")
+    assert figure.layout.scene.aspectmode == "data"
+
+
+@pytest.mark.parametrize("scale", [1, 255, 65535])
+def test_colors_may_be_bytes_or_words(scale):
+    cloud = PointCloud(np.eye(3), scale * np.eye(3), channel_names=["red", "green", "blue"])
+    (trace,) = plot.clouds(cloud).data
+    assert set(trace.marker.color) == {"rgb(255,0,0)", "rgb(0,255,0)", "rgb(0,0,255)"}
+
+
+def test_large_clouds_are_thinned_and_padding_is_left_out():
+    rng = np.random.default_rng(0)
+    large, small = PointCloud(rng.normal(size=(90_000, 3))), PointCloud(rng.normal(size=(10_000, 3))).pad(20_000)
+    drawn = [len(trace.x) for trace in plot.clouds(large, small).data]
+    assert drawn == [45_000, 5_000]
+    assert [len(trace.x) for trace in plot.clouds(small).data] == [10_000]
+    with pytest.raises(ValueError, match="names: expected 2"):
+        plot.clouds(large, small, names=["one"])
+
+
+def test_ellipsoids_are_the_covariances_at_one_scale():
+    rng = np.random.default_rng(1)
+    cloud = PointCloud(rng.uniform(0, 5, (50, 3)))
+    factors = rng.normal(size=(50, 3, 3))
+    covariances = factors @ np.swapaxes(factors, 1, 2) + 0.1 * np.eye(3)
+    indices = [3, 17, 40]
+    _, mesh = plot.covariances(cloud, covariances, indices=indices).data
+    vertices = np.stack([mesh.x, mesh.y, mesh.z], axis=1).reshape(3, -1, 3)
+    faces = np.stack([mesh.i, mesh.j, mesh.k], axis=1)
+    assert faces.max() == 3 * vertices.shape[1] - 1
+    offsets = vertices - cloud.points[indices][:, None]
+    squared = np.einsum("mvi,mij,mvj->mv", offsets, np.linalg.inv(covariances[indices]), offsets)
+    np.testing.assert_allclose(squared, squared[0, 0], rtol=1e-8)
+    (one,) = plot.covariances(cloud, covariances, indices=[3]).data[1:]
+    assert np.ptp(one.x) < 0.3 * np.ptp(cloud.points)
+
+
+def test_covariances_are_checked():
+    cloud, covariances = PointCloud(np.eye(3)), np.tile(np.eye(3), (3, 1, 1))
+    with pytest.raises(ValueError, match=r"covariances: expected shape \(3, 3, 3\)"):
+        plot.covariances(cloud, covariances[:2], indices=[0])
+    for indices in ([], [3], [-1]):
+        with pytest.raises(ValueError, match="indices: expected rows"):
+            plot.covariances(cloud, covariances, indices=indices)
+
+
+def test_convergence_has_a_line_per_method():
+    histories = {"GICP": [1.0, 0.5, 0.4], "MC-GICP": np.array([1.0, 0.1])}
+    figure = plot.convergence(histories, ylabel="rmse (m)")
+    (panel,) = figure.axes
+    for line, (name, history) in zip(panel.lines, histories.items(), strict=True):
+        assert line.get_label() == name
+        np.testing.assert_array_equal(line.get_ydata(), history)
+    assert (panel.get_yscale(), panel.get_ylabel(), panel.get_xlabel()) == ("log", "rmse (m)", "iteration")
+    with pytest.raises(ValueError, match=r"histories\['x'\]: .* \(1, 2\)"):
+        plot.convergence({"x": np.array([[1.0, 2.0]])})
+
+
+@pytest.mark.parametrize("package", ["matplotlib", "plotly"])
+def test_a_missing_package_is_named(monkeypatch, wall, package):
+    source, target, _ = wall
+    for name in [name for name in sys.modules if name.partition(".")[0] == package]:
+        monkeypatch.setitem(sys.modules, name, None)
+    draw = {
+        "matplotlib": [lambda: plot.before_after(source, target, {}), lambda: plot.convergence({"x": [1.0]})],
+        "plotly": [
+            lambda: plot.clouds(source),
+            lambda: plot.covariances(source, np.zeros((len(source), 3, 3)), indices=[0]),
+        ],
+    }
+    for function in draw[package]:
+        with pytest.raises(ImportError, match=rf"plotting needs {package}: pip install 'mcgicp_jax\[plot\]'"):
+            function()
+
+
+def test_nothing_is_imported_before_it_is_needed_and_no_window_opens():
+    program = (
+        "import sys, mcgicp_jax.plot as plot\n"
+        "loaded = {name.partition('.')[0] for name in sys.modules}\n"
+        "sys.exit(1) if loaded & {'matplotlib', 'plotly'} else None\n"
+        "plot.convergence({'x': [1.0, 0.5]})\n"
+        "sys.exit(2 if 'matplotlib.pyplot' in sys.modules else 0)\n"
+    )
+    assert subprocess.run([sys.executable, "-c", program], check=False).returncode == 0
