@@ -9,6 +9,7 @@ import equinox as eqx
 import jax.numpy as jnp
 import jaxlie
 import numpy as np
+from jax.typing import ArrayLike
 from jaxtyping import Array, Float, Int
 
 from mcgicp_jax._pose import is_concrete, rotation_from_quaternion
@@ -18,7 +19,7 @@ class Status(enum.IntEnum):
     """How a registration ended. Only CONVERGED is success."""
 
     CONVERGED = 0
-    """The last update moved the pose by less than both tolerances, and every direction is held."""
+    """The last update moved the pose by less than both tolerances, and the pairs hold every direction."""
     MAX_ITERATIONS = 1
     """The pose was still moving when the iterations ran out."""
     TOO_FEW_CORRESPONDENCES = 2
@@ -38,24 +39,24 @@ class Registration(eqx.Module):
         T_target_source: maps source coordinates into the target's frame, b ≈ T a. Its precision is that of the clouds;
             at large (UTM) coordinates use `matrix`.
         status_code: value of the `Status`.
-        num_iterations: matches were sought, and the pose weighed, this many times.
+        num_iterations: updates of the pose.
         num_inliers: pairs within `max_distance`.
         cost: Σ ρ(dᵀ M d) over them.
         rmse: root mean square distance of the pairs, metres.
         information: (6, 6) Σ Jᵀ M J for the twist ξ = (v, ω) of T exp(ξ), metres and radians, in the source's frame.
             It weighs directions against each other; its scale is that of GICP's relative covariances, so its inverse
             is *not* a covariance of the pose.
-        history: per iteration, at the pose before its update: "cost", "rmse", "num_inliers", and the update's length
-            "translation_step" (metres, at the centroid of the pairs) and "rotation_step" (radians). Entries after
-            `num_iterations` are NaN where the length is fixed (inside a transformation).
+        history: before each update, and last at the returned pose: "cost", "rmse", "num_inliers", and the length of
+            the update from there, "translation_step" (metres, at the centroid of the pairs) and "rotation_step"
+            (radians). Inside a transformation the length is fixed, and NaN fills what was not needed.
     """
 
     T_target_source: jaxlie.SE3
-    status_code: Int[Array, "*batch"] | int
-    num_iterations: Int[Array, "*batch"] | int
-    num_inliers: Int[Array, "*batch"] | int
-    cost: Float[Array, "*batch"] | float
-    rmse: Float[Array, "*batch"] | float
+    status_code: Int[ArrayLike, "*batch"]
+    num_iterations: Int[ArrayLike, "*batch"]
+    num_inliers: Int[ArrayLike, "*batch"]
+    cost: Float[ArrayLike, "*batch"]
+    rmse: Float[ArrayLike, "*batch"]
     information: Float[Array, "*batch 6 6"] | Float[np.ndarray, "*batch 6 6"]
     history: dict[str, Any]
     source_origin: Float[Array, "*batch 3"] | Float[np.ndarray, "*batch 3"]
@@ -67,7 +68,7 @@ class Registration(eqx.Module):
     def status(self) -> Any:
         """The `Status`; an array of its values inside a transformation or for a batch."""
         if is_concrete(self.status_code) and np.ndim(self.status_code) == 0:
-            return Status(int(self.status_code))
+            return Status(int(np.asarray(self.status_code)))
         return self.status_code
 
     @property
@@ -87,7 +88,7 @@ class Registration(eqx.Module):
         angle = np.degrees(float(jnp.linalg.norm(self.centred.rotation().log())))
         return (
             f"Registration({self.status.name}: translation {translation} m, rotation {angle:.3f}°, "
-            f"{self.num_iterations} iterations, {self.num_inliers} inliers, rmse {float(self.rmse):.4g} m)"
+            f"{self.num_iterations} iterations, {self.num_inliers} inliers, rmse {np.asarray(self.rmse):.4g} m)"
         )
 
 

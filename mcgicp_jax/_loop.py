@@ -1,0 +1,284 @@
+"""The loop of registration: one step, and the two drivers that repeat it.
+
+Find matches at this pose; weigh them; update the pose; stop when it no longer moves. On the host the matches come from
+a tree between compiled steps; inside a transformation the whole loop is one program.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import partial
+from typing import TypeAlias
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import jaxlie
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
+
+from mcgicp_jax._cost import AbstractKernel, Moments, evaluate_pairs, match_residual, moments
+from mcgicp_jax._methods import AbstractMethod, Surface
+from mcgicp_jax._result import Status
+from mcgicp_jax._search import AbstractSearch, Correspondences
+from mcgicp_jax._solve import information_at_source, move_pose, refine_pose, solve_update
+
+# The pose still moves; or its last update was below the tolerances, and one more measurement ends the loop.
+_RUNNING, _SETTLED = -1, -2
+_MIN_CORRESPONDENCES = 4
+
+
+class Settings(eqx.Module):
+    """Numbers of the loop, as arrays: changing one compiles nothing."""
+
+    max_distance: Float[Array, ""]
+    translation_tolerance: Float[Array, ""]
+    rotation_tolerance: Float[Array, ""]
+    max_iterations: Int[Array, ""]
+
+
+class Measurement(eqx.Module):
+    """What one pass over the matched pairs finds at a pose."""
+
+    moments: Moments
+    num_inliers: Int[Array, ""]
+    cost: Float[Array, ""]
+    rmse: Float[Array, ""]
+
+
+class State(eqx.Module):
+    """Where the loop stands.
+
+    Attributes:
+        pose: the next pose while the loop goes on; the one that was measured when it ends.
+        status: value of a `Status`, `_RUNNING` or `_SETTLED`.
+        num_iterations: updates so far.
+        measured: at the pose before.
+        information: (6, 6) at the pose before.
+        record: one number per entry of `Registration.history`.
+    """
+
+    pose: jaxlie.SE3
+    status: Int[Array, ""]
+    num_iterations: Int[Array, ""]
+    measured: Measurement
+    information: Float[Array, "6 6"]
+    record: dict[str, Float[Array, ""]]
+
+
+Carry: TypeAlias = tuple[State, Correspondences, dict[str, Array]]
+
+
+def gate(
+    pose: jaxlie.SE3, source: Surface, target: Surface, indices: Int[Array, "N"], max_distance: Float[Array, ""]
+) -> Correspondences:
+    """Keep the pairs within `max_distance`, metres of position: channels choose a match, but do not gate it."""
+    rotation = pose.rotation().as_matrix().astype(source.points.dtype)
+    _, residual = match_residual(rotation, pose.translation(), source, target, indices)
+    distances = jnp.sqrt(jnp.sum(residual * residual, axis=0))
+    valid = source.valid & target.valid[indices] & (distances <= max_distance)
+    return Correspondences(indices=indices, distances=distances, valid=valid)
+
+
+@jax.jit
+def measure(
+    pose: jaxlie.SE3,
+    matches: Correspondences,
+    source: Surface,
+    target: Surface,
+    method: AbstractMethod,
+    robust: AbstractKernel | None,
+) -> Measurement:
+    """Weigh the matches at the pose: the only part of a step that touches the points."""
+    rotation = pose.rotation().as_matrix().astype(source.points.dtype)
+    pairs = evaluate_pairs(rotation, pose.translation(), source, target, matches, method, robust)
+    num_inliers = jnp.sum(matches.valid)
+    square = jnp.sum(pairs.residual * pairs.residual, axis=0)
+    return Measurement(
+        moments=moments(pairs, matches),
+        num_inliers=num_inliers,
+        cost=jnp.sum(pairs.cost),
+        rmse=jnp.sqrt(jnp.sum(square) / jnp.maximum(num_inliers, 1)),
+    )
+
+
+@jax.jit
+def match_and_measure(
+    pose: jaxlie.SE3,
+    indices: Int[Array, "N"],
+    source: Surface,
+    target: Surface,
+    method: AbstractMethod,
+    robust: AbstractKernel | None,
+    settings: Settings,
+) -> tuple[Correspondences, Measurement]:
+    matches = gate(pose, source, target, indices, settings.max_distance)
+    return matches, measure(pose, matches, source, target, method, robust)
+
+
+@jax.jit
+def update(
+    pose: jaxlie.SE3, status: Int[Array, ""], num_iterations: Int[Array, ""], measured: Measurement, settings: Settings
+) -> State:
+    """Update the pose, unless it has come to rest. Compiled once, whatever the size of the clouds."""
+    change = solve_update(measured.moments)
+    moved = move_pose(pose, change.twist, measured.moments.center)
+    settled = status == _SETTLED
+    translation_step = jnp.linalg.norm(change.twist[:3])
+    rotation_step = jnp.linalg.norm(change.twist[3:])
+    at_rest = (translation_step <= settings.translation_tolerance) & (rotation_step <= settings.rotation_tolerance)
+    finite = jnp.isfinite(measured.moments.e) & jnp.all(jnp.isfinite(moved.wxyz_xyz))
+    outcomes: tuple[tuple[Array, int], ...] = (
+        (measured.num_inliers < _MIN_CORRESPONDENCES, Status.TOO_FEW_CORRESPONDENCES),
+        (~finite, Status.NON_FINITE),
+        (settled & change.degenerate, Status.DEGENERATE),
+        (settled, Status.CONVERGED),
+        (num_iterations >= settings.max_iterations, Status.MAX_ITERATIONS),
+        (at_rest, _SETTLED),
+    )
+    conditions, codes = zip(*outcomes, strict=True)
+    status = jnp.select(list(conditions), [jnp.int32(code) for code in codes], jnp.int32(_RUNNING))
+    record = {
+        "cost": measured.cost,
+        "rmse": measured.rmse,
+        "num_inliers": measured.num_inliers.astype(measured.rmse.dtype),
+        "translation_step": translation_step,
+        "rotation_step": rotation_step,
+    }
+    return State(
+        # The pose that all this was measured at is the one that is returned.
+        pose=jaxlie.SE3(jnp.where(status < 0, moved.wxyz_xyz, pose.wxyz_xyz)),
+        status=status,
+        num_iterations=num_iterations + (status < 0),
+        measured=measured,
+        information=information_at_source(change.information, pose, measured.moments.center),
+        record=record,
+    )
+
+
+def run_on_host(
+    pose: jaxlie.SE3,
+    source: Surface,
+    target: Surface,
+    method: AbstractMethod,
+    robust: AbstractKernel | None,
+    settings: Settings,
+    search: AbstractSearch,
+) -> tuple[State, Correspondences, dict[str, np.ndarray]]:
+    """The loop for concrete inputs: matches from the host's tree between compiled steps."""
+    index = search.index(target.points, target.descriptors, target.valid)
+    status, num_iterations = jnp.int32(_RUNNING), jnp.int32(0)
+    records = []
+    while status < 0:
+        if status == _RUNNING:
+            indices = index.nearest(
+                pose.wxyz_xyz, source.points, source.descriptors, source.valid, settings.max_distance
+            )
+        matches, measured = match_and_measure(pose, indices, source, target, method, robust, settings)
+        state = update(pose, status, num_iterations, measured, settings)
+        pose, status, num_iterations = state.pose, state.status, state.num_iterations
+        records.append(state.record)
+    records = jax.device_get(records)
+    return state, matches, {name: np.array([record[name] for record in records]) for name in records[0]}
+
+
+def _while_loop(
+    pose: jaxlie.SE3,
+    match: Callable[[jaxlie.SE3, Int[Array, ""], Int[Array, "N"]], tuple[Correspondences, Measurement]],
+    num_rows: int,
+    settings: Settings,
+    max_iterations: int,
+) -> Carry:
+    """The loop inside a transformation. `match(pose, status, indices)` finds pairs, or keeps them, and weighs them."""
+
+    def advance(
+        pose: jaxlie.SE3, status: Int[Array, ""], num_iterations: Int[Array, ""], indices: Int[Array, "N"]
+    ) -> tuple[State, Correspondences]:
+        matches, measured = match(pose, status, indices)
+        return update(pose, status, num_iterations, measured, settings), matches
+
+    def body(carry: Carry) -> Carry:
+        before, matches, history = carry
+        count = before.num_iterations
+        state, matches = advance(before.pose, before.status, count, matches.indices)
+        return state, matches, {name: values.at[count].set(state.record[name]) for name, values in history.items()}
+
+    running, zero = jnp.int32(_RUNNING), jnp.int32(0)
+    shapes = jax.eval_shape(advance, pose, running, zero, jnp.zeros(num_rows, jnp.int32))
+    state, matches = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), shapes)
+    state = eqx.tree_at(lambda state: (state.pose, state.status), state, (pose, running))
+    # One entry per update, and one for the measurement at the end.
+    history = {name: jnp.full(max_iterations + 1, jnp.nan, value.dtype) for name, value in state.record.items()}
+    return jax.lax.while_loop(lambda carry: carry[0].status < 0, body, (state, matches, history))
+
+
+@partial(jax.jit, static_argnames="max_iterations")
+def run_traced(
+    start: jaxlie.SE3,
+    source: Surface,
+    target: Surface,
+    method: AbstractMethod,
+    robust: AbstractKernel | None,
+    settings: Settings,
+    search: AbstractSearch,
+    max_iterations: int,
+) -> Carry:
+    """The loop of `register` for traced inputs; pose and matches are constants to autodiff."""
+
+    def match(
+        pose: jaxlie.SE3, status: Int[Array, ""], indices: Int[Array, "N"]
+    ) -> tuple[Correspondences, Measurement]:
+        running = status == _RUNNING
+        found = nearest_traced(search, pose, source, target, settings.max_distance, running)
+        indices = jnp.where(running, found, indices)
+        return match_and_measure(pose, indices, source, target, method, robust, settings)
+
+    return _while_loop(start, match, source.valid.size, settings, max_iterations)
+
+
+@partial(jax.jit, static_argnames="max_iterations")
+def align_traced(
+    start: jaxlie.SE3,
+    source: Surface,
+    target: Surface,
+    matches: Correspondences,
+    method: AbstractMethod,
+    robust: AbstractKernel | None,
+    settings: Settings,
+    max_iterations: int,
+) -> tuple[jaxlie.SE3, State, dict[str, Array]]:
+    constants = jax.lax.stop_gradient((matches, source, target, method, robust))
+
+    def match(
+        pose: jaxlie.SE3, status: Int[Array, ""], indices: Int[Array, "N"]
+    ) -> tuple[Correspondences, Measurement]:
+        return matches, measure(pose, *constants)
+
+    start, settings = jax.lax.stop_gradient((start, settings))
+    state, _, history = _while_loop(start, match, source.valid.size, settings, max_iterations)
+    return refine(state, matches, source, target, method, robust), state, history
+
+
+@jax.jit
+def refine(
+    state: State,
+    matches: Correspondences,
+    source: Surface,
+    target: Surface,
+    method: AbstractMethod,
+    robust: AbstractKernel | None,
+) -> jaxlie.SE3:
+    usable = (state.status == Status.CONVERGED) | (state.status == Status.MAX_ITERATIONS)
+    return refine_pose(state.pose, usable, state.measured.moments, source, target, matches, method, robust)
+
+
+def nearest_traced(
+    search: AbstractSearch,
+    pose: jaxlie.SE3,
+    source: Surface,
+    target: Surface,
+    max_distance: Float[Array, ""],
+    running: Bool[Array, ""],
+) -> Int[Array, "N"]:
+    source_rows, target_rows = ((cloud.points, cloud.descriptors, cloud.valid) for cloud in (source, target))
+    return search.nearest_traced(pose.wxyz_xyz, source_rows, target_rows, max_distance, running)

@@ -1,0 +1,46 @@
+"""Small synthetic clouds with known motion, shared by the tests: few sizes, since every size compiles."""
+
+import numpy as np
+
+import mcgicp_jax as mcg
+
+
+def motion(twist=(0.05, -0.03, 0.04, 0.02, -0.03, 0.05)) -> np.ndarray:
+    """A rigid motion, (4, 4) float64: the translation, and the rotation vector."""
+    *translation, x, y, z = twist
+    angle = np.linalg.norm([x, y, z])
+    cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+    matrix = np.eye(4)
+    if angle > 0:
+        matrix[:3, :3] += np.sin(angle) / angle * cross + (1 - np.cos(angle)) / angle**2 * cross @ cross
+    matrix[:3, 3] = translation
+    return matrix
+
+
+def room_corner(size: int, noise: float = 0.01, channel_noise: float = 0.02, seed: int = 0, channels: int = 2):
+    """Points on three faces of a 2 m cube, and smooth channels painted on them: (N, 3), (N, C)."""
+    rng = np.random.default_rng(seed)
+    face = rng.integers(0, 3, size)
+    points = rng.random((size, 3)) * 2
+    points[np.arange(size), face] = 0
+    x, y, z = points.T
+    paint = np.stack([np.sin(5 * x) * np.cos(4 * y) + z, np.sin(3 * z + x), np.cos(4 * y + 2 * z)], axis=1)[:, :channels]
+    return points + noise * rng.normal(size=points.shape), paint + channel_noise * rng.normal(size=paint.shape)
+
+
+def wall(size: int, noise: float = 0.002, seed: int = 0):
+    """Points on a flat 2 m wall, and three smooth channels painted on it."""
+    rng = np.random.default_rng(seed)
+    x, y = 2 * rng.random((2, size))
+    points = np.stack([x, y, noise * rng.normal(size=size)], axis=1)
+    paint = np.stack([np.sin(7 * x), np.cos(6 * y + x), np.sin(5 * (x + y))], axis=1)
+    return points, paint + 0.01 * rng.normal(size=paint.shape)
+
+
+def pair(scene=room_corner, size: int = 2000, truth: np.ndarray | None = None, **settings):
+    """Source and target, preprocessed, sampled independently; and T_target_source."""
+    truth = motion() if truth is None else truth
+    points, channels = scene(size, seed=1, **settings)
+    source = mcg.PointCloud((points - truth[:3, 3]) @ truth[:3, :3], channels)
+    target = mcg.PointCloud(*scene(size, seed=2, **settings))
+    return mcg.preprocess(source), mcg.preprocess(target), truth

@@ -1,0 +1,317 @@
+"""Registration end to end: right poses, honest outcomes, clear errors."""
+
+import copy
+import pickle
+import warnings
+
+import jax
+import numpy as np
+import pytest
+
+import mcgicp_jax as mcg
+from mcgicp_jax import Status
+from mcgicp_jax.metrics import pose_error
+from tests.scenes import motion, pair, room_corner, wall
+
+X64 = bool(jax.config.jax_enable_x64)
+METHODS = {
+    "point-to-point": mcg.PointToPoint(),
+    "point-to-plane": mcg.PointToPlane(),
+    "gicp": mcg.GICP(),
+    "color-icp": mcg.ColorICP(0.3),
+    "mc-gicp": mcg.MultiChannelGICP(0.05, 0.3),
+    "mc-gicp from the data": mcg.MultiChannelGICP(),
+}
+# What sampling leaves: 2,000 points with 1 cm of noise; ICP pairs are as far apart as the samples.
+ACCURACY = {"point-to-point": 2e-2, "color-icp": 2e-2}
+TIGHT = {"translation_tolerance": 1e-10 if X64 else 1e-6, "rotation_tolerance": 1e-10 if X64 else 1e-6}
+
+
+@pytest.fixture(scope="module")
+def room():
+    return pair()
+
+
+def difference(first, second):
+    return max(pose_error(np.asarray(first), np.asarray(second)))
+
+
+@pytest.mark.parametrize("name", METHODS)
+def test_every_method_finds_the_pose(name, room):
+    source, target, truth = room
+    result = mcg.register(source, target, METHODS[name], max_distance=0.5)
+    assert result.converged and result.status is Status.CONVERGED
+    assert difference(result.matrix, truth) < ACCURACY.get(name, 4e-3)
+    assert result.num_inliers > 1950
+    assert len(result.history["cost"]) == result.num_iterations + 1
+    assert result.history["cost"][-1] == result.cost
+    np.testing.assert_allclose(result.T_target_source.as_matrix(), result.matrix, atol=1e-6)
+
+
+@pytest.mark.parametrize("name", ["gicp", "mc-gicp"])
+def test_swapped_clouds_give_the_inverse(name, room):
+    source, target, _ = room
+    forward = mcg.register(source, target, METHODS[name], max_distance=0.5, **TIGHT)
+    backward = mcg.register(target, source, METHODS[name], max_distance=0.5, **TIGHT)
+    # Each direction has its own matches, so the answers agree to the noise of matching.
+    assert difference(forward.matrix @ backward.matrix, np.eye(4)) < 2e-3
+
+
+@pytest.mark.parametrize("name", ["gicp", "mc-gicp", "point-to-plane", "color-icp"])
+def test_moving_a_cloud_moves_the_answer(name, room):
+    source, target, _ = room
+    move = motion((0.3, -0.2, 0.5, 0.4, -0.7, 1.1))
+    before = mcg.register(source, target, METHODS[name], max_distance=0.5, **TIGHT)
+    moved = mcg.register(source.transform(move), target, METHODS[name], init=np.linalg.inv(move), max_distance=0.5, **TIGHT)
+    assert difference(moved.matrix @ move, before.matrix) < (1e-8 if X64 else 5e-5)
+    moved = mcg.register(source, target.transform(move), METHODS[name], init=move, max_distance=0.5, **TIGHT)
+    assert difference(np.linalg.inv(move) @ moved.matrix, before.matrix) < (1e-8 if X64 else 5e-5)
+
+
+@pytest.mark.parametrize("name", ["gicp", "mc-gicp"])
+def test_four_noisy_starts_reach_one_pose(name, room):
+    source, target, truth = room
+    rng = np.random.default_rng(0)
+    poses = []
+    for _ in range(4):
+        start = truth @ motion(np.concatenate([rng.normal(scale=0.05, size=3), rng.normal(scale=0.03, size=3)]))
+        result = mcg.register(source, target, METHODS[name], init=start, max_distance=0.5, **TIGHT)
+        assert difference(start, truth) > 0.01
+        poses.append(result.matrix)
+    assert max(difference(pose, poses[0]) for pose in poses) < 1e-3
+
+
+def test_the_channels_hold_what_geometry_does_not():
+    source, target, truth = pair(wall, truth=motion((0.05, -0.04, 0.01, 0.002, 0.003, 0.02)))
+    geometry = mcg.register(source, target, mcg.GICP(), max_distance=0.2)
+    channels = mcg.register(source, target, mcg.MultiChannelGICP(), max_distance=0.2)
+    assert channels.converged
+    assert pose_error(channels.matrix, truth)[0] < 3e-3 < 3e-2 < pose_error(geometry.matrix, truth)[0]
+
+
+def test_the_result_belongs_to_the_returned_pose(room):
+    source, target, _ = room
+    method = METHODS["mc-gicp"]
+    for iterations, status in ((2, Status.MAX_ITERATIONS), (64, Status.CONVERGED)):
+        result = mcg.register(source, target, method, max_distance=0.5, max_iterations=iterations, **TIGHT)
+        assert result.status is status
+        matches = mcg.find_correspondences(source, target, result.matrix, method, max_distance=0.5)
+        cost = mcg.mahalanobis_cost(result.matrix, source, target, matches, method)
+        np.testing.assert_allclose(result.cost, cost, rtol=1e-4)
+        assert result.num_inliers == matches.valid.sum()
+        np.testing.assert_allclose(result.rmse, np.sqrt(np.mean(matches.distances[matches.valid] ** 2)), rtol=1e-4)
+
+
+def test_information_is_the_curvature_of_the_cost_with_M_held(room):
+    source, target, _ = room
+    method = mcg.PointToPoint()
+    result = mcg.register(source, target, method, max_distance=0.5)
+    matches = mcg.find_correspondences(source, target, result.matrix, method, max_distance=0.5)
+    # With M = I, F(T exp(ξ)) ≈ Σ |d − R(v + ω × a)|²: half of its Hessian without the curvature of the residual.
+    points = np.asarray(source.points, float)[np.asarray(matches.valid)]
+    jacobian = np.concatenate([np.broadcast_to(np.eye(3), (len(points), 3, 3)), np.cross(np.eye(3), points[:, None]).swapaxes(1, 2)], axis=2)
+    np.testing.assert_allclose(result.information, np.einsum("nia,nib->ab", jacobian, jacobian), rtol=1e-4, atol=1e-1)
+
+
+def test_align_reaches_the_balance_of_forces(room):
+    source, target, truth = room
+    method = METHODS["mc-gicp"]
+    matches = mcg.find_correspondences(source, target, truth, method, max_distance=0.5)
+    result = mcg.align(source, target, matches, method)
+    again = mcg.align(source, target, matches, method, init=result.matrix, max_iterations=1)
+    assert result.converged and again.converged
+    assert difference(result.matrix, again.matrix) < (1e-10 if X64 else 2e-6)
+
+
+@pytest.mark.parametrize("robust", [mcg.Huber, mcg.Cauchy, mcg.GemanMcClure, mcg.Tukey])
+def test_robust_kernels_resist_outliers(robust):
+    truth = motion()
+    points, channels = room_corner(2000, seed=1)
+    target = mcg.preprocess(mcg.PointCloud(*room_corner(2000, seed=2)))
+    # A fifth of the source has been lifted, all of it in one direction.
+    points[:400] += [0.0, 0.0, 0.3]
+    source = mcg.preprocess(mcg.PointCloud((points - truth[:3, 3]) @ truth[:3, :3], channels))
+    plain = mcg.register(source, target, mcg.GICP(), max_distance=0.5)
+    kernel = mcg.register(source, target, mcg.GICP(), max_distance=0.5, robust=robust(1.0))
+    assert kernel.converged
+    # They pull along z; what is left across it is the noise of sampling, the same for both.
+    pull, resisted = (abs(result.matrix[2, 3] - truth[2, 3]) for result in (plain, kernel))
+    assert resisted < 0.3 * pull
+
+
+# --- Outcomes
+
+
+def test_clouds_without_overlap_do_not_converge(room):
+    source, target, _ = room
+    result = mcg.register(source, target, mcg.GICP(), init=motion((50, 0, 0, 0, 0, 0)), max_distance=0.5)
+    assert result.status is Status.TOO_FEW_CORRESPONDENCES
+    assert not result.converged and result.num_inliers == 0 and result.cost == 0
+    np.testing.assert_allclose(result.matrix, motion((50, 0, 0, 0, 0, 0)))
+    assert "TOO_FEW_CORRESPONDENCES" in repr(result)
+
+
+def test_a_flat_wall_is_degenerate_for_point_to_plane():
+    points, _ = wall(2000, noise=0.0)
+    source, target = mcg.preprocess(points + [0.1, 0.0, 0.02]), mcg.preprocess(points)
+    result = mcg.register(source, target, mcg.PointToPlane(), max_distance=0.5)
+    assert result.status is Status.DEGENERATE and not result.converged
+    # What is held is found; what is free stays where it was.
+    np.testing.assert_allclose(result.matrix[:3, 3], [0, 0, -0.02], atol=1e-4)
+
+
+def test_running_out_of_iterations_is_not_convergence(room):
+    source, target, _ = room
+    result = mcg.register(source, target, mcg.PointToPoint(), max_distance=0.5, max_iterations=3)
+    assert result.status is Status.MAX_ITERATIONS and result.num_iterations == 3
+
+
+def test_overflow_is_told(room):
+    source, target, _ = room
+    huge = source.replace(points=source.points.at[0].set(1e30 if not X64 else 1e200))
+    result = mcg.register(huge, target, mcg.PointToPoint(), max_distance=np.inf)
+    assert result.status is Status.NON_FINITE and not result.converged
+
+
+def test_identical_clouds_converge_at_once(room):
+    source, _, _ = room
+    result = mcg.register(source, source, METHODS["mc-gicp"], max_distance=0.5)
+    assert result.converged and result.num_iterations == 1
+    np.testing.assert_allclose(result.matrix, np.eye(4), atol=1e-6)
+
+
+@pytest.mark.parametrize("name", ["gicp", "mc-gicp", "point-to-plane"])
+def test_large_coordinates_lose_nothing(name):
+    utm = np.array([4.5e5, 5.2e6, 300.0])
+    truth = motion()
+    points, channels = room_corner(2000, seed=1)
+    target_points, target_channels = room_corner(2000, seed=2)
+    points = (points - truth[:3, 3]) @ truth[:3, :3]
+    near = mcg.register(
+        mcg.preprocess(mcg.PointCloud(points, channels)),
+        mcg.preprocess(mcg.PointCloud(target_points, target_channels)),
+        METHODS[name],
+        max_distance=0.5,
+    )
+    shift = motion((*utm, 0, 0, 0))
+    far = mcg.register(
+        mcg.preprocess(mcg.PointCloud(points + utm, channels)),
+        mcg.preprocess(mcg.PointCloud(target_points + utm, target_channels)),
+        METHODS[name],
+        max_distance=0.5,
+    )
+    assert far.converged and far.matrix.dtype == np.float64
+    unshifted = np.linalg.inv(shift) @ far.matrix @ shift
+    # A rotation of float32 carries 6e-8 rad to 5,000 km; what counts is where the cloud itself goes.
+    cloud = np.c_[points + utm, np.ones(len(points))]
+    expected = np.c_[points, np.ones(len(points))] @ near.matrix.T
+    assert np.abs((cloud @ far.matrix.T - expected)[:, :3] - utm).max() < 1e-4
+    assert np.abs(unshifted[:3, :3] - near.matrix[:3, :3]).max() < 1e-5
+
+
+# --- Input
+
+
+def test_bare_arrays_are_enough():
+    truth = motion()
+    points, _ = room_corner(2000, seed=1)
+    target, _ = room_corner(2000, seed=2)
+    result = mcg.register((points - truth[:3, 3]) @ truth[:3, :3], target.tolist(), mcg.GICP(), max_distance=0.5)
+    assert result.converged and difference(result.matrix, truth) < 4e-3
+
+
+def test_rows_that_are_not_finite_are_left_out_with_one_warning():
+    points, channels = room_corner(2000, seed=1)
+    broken = np.concatenate([points, np.full((50, 3), np.nan)])
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        cloud = mcg.preprocess(mcg.PointCloud(broken, np.concatenate([channels, np.zeros((50, 2))])))
+    assert [str(warning.message) for warning in caught] == ["left out 50 of 2050 points that are NaN or infinite"]
+    expected = mcg.preprocess(mcg.PointCloud(points, channels))
+    result = mcg.register(cloud, expected, METHODS["mc-gicp"], max_distance=0.5)
+    assert result.converged and difference(result.matrix, np.eye(4)) < 1e-6
+
+
+BAD_ARGUMENTS = {
+    "max_distance": [{"max_distance": 0.0}, {"max_distance": -1.0}, {"max_distance": np.nan}],
+    "max_iterations": [{"max_iterations": 0}],
+    "translation_tolerance": [{"translation_tolerance": -1.0}],
+    "rotation_tolerance": [{"rotation_tolerance": np.nan}],
+    "init": [{"init": np.eye(3)}, {"init": np.diag([1.0, 1, -1, 1])}, {"init": np.full((4, 4), np.nan)}, {"init": 2 * np.eye(4)}],
+}
+
+
+@pytest.mark.parametrize("name, arguments", [(name, bad) for name, cases in BAD_ARGUMENTS.items() for bad in cases])
+def test_a_bad_argument_is_named(name, arguments, room):
+    source, target, _ = room
+    with pytest.raises(ValueError, match=name):
+        mcg.register(source, target, mcg.GICP(), **{"max_distance": 0.5} | arguments)
+
+
+@pytest.mark.parametrize(
+    "points, message",
+    [
+        (np.zeros((0, 3)), "source: cloud: expected at least 4 finite points, got 0"),
+        (np.zeros((1, 3)), "source: cloud: expected at least 4 finite points, got 1"),
+        (np.full((10, 3), np.nan), "source: cloud: expected at least 4 finite points, got 0 of 10"),
+        (np.zeros((10, 2)), r"source: points: expected shape \(N, 3\), got \(10, 2\)"),
+        (np.zeros((10, 3), complex), "source: points: expected real numbers, got dtype complex128"),
+        ([[1, 2, 3], [4, 5]], "source: points: expected numbers in a rectangular array"),
+        (np.array([["a", "b", "c"]]), "source: points: expected real numbers"),
+    ],
+)
+def test_a_bad_cloud_is_named(points, message, room):
+    with pytest.raises(ValueError, match=message):
+        mcg.register(points, room[1], mcg.GICP(), max_distance=0.5)
+
+
+def test_channel_counts_must_fit(room):
+    source, target, _ = room
+    with pytest.raises(ValueError, match=r"channels: expected as many .* got 1 and 2"):
+        mcg.register(source.replace(channels=source.channels[:, :1]), target, METHODS["mc-gicp"], max_distance=0.5)
+    with pytest.raises(ValueError, match=r"channel_covariance: expected .* 2 channels, got \(3,\)"):
+        mcg.register(source, target, mcg.MultiChannelGICP(np.ones(3), 0.1), max_distance=0.5)
+    with pytest.raises(ValueError, match=r"channel_weights: expected .* 2 channels, got \(3,\)"):
+        mcg.register(source, target, mcg.ColorICP(np.ones(3)), max_distance=0.5)
+    # Geometry alone does not look at channels.
+    assert mcg.register(source.replace(channels=source.channels[:, :1]), target, mcg.GICP(), max_distance=0.5).converged
+
+
+@pytest.mark.parametrize(
+    "make, message",
+    [
+        (lambda: mcg.GICP(0.0), "epsilon: expected one positive number"),
+        (lambda: mcg.GICP(-1e-3), "epsilon"),
+        (lambda: mcg.MultiChannelGICP(epsilon=np.nan), "epsilon"),
+        (lambda: mcg.MultiChannelGICP(min_eigenvalue=0.0), "min_eigenvalue"),
+        (lambda: mcg.MultiChannelGICP([[1.0, 2.0], [2.0, 1.0]]), "channel_covariance: expected it symmetric and positive"),
+        (lambda: mcg.MultiChannelGICP([[1.0, 0.5], [0.0, 1.0]]), "channel_covariance: expected it symmetric"),
+        (lambda: mcg.MultiChannelGICP(np.zeros((2, 3))), "channel_covariance: expected a scalar"),
+        (lambda: mcg.MultiChannelGICP(0.0), "channel_covariance"),
+        (lambda: mcg.ColorICP(-1.0), "channel_weights: expected finite numbers of at least 0"),
+        (lambda: mcg.ColorICP("red"), "channel_weights: expected numbers"),
+        (lambda: mcg.Huber(0.0), "scale: expected one positive number"),
+    ],
+)
+def test_bad_numbers_of_methods_are_named(make, message):
+    with pytest.raises(ValueError, match=message):
+        make()
+
+
+def test_no_channels_make_multi_channel_gicp_plain_gicp(room):
+    source, target, _ = room
+    bare = [cloud.replace(channels=cloud.channels[:, :0]) for cloud in (source, target)]
+    plain = mcg.register(*bare, mcg.GICP(), max_distance=0.5)
+    multi = mcg.register(*bare, mcg.MultiChannelGICP(), max_distance=0.5)
+    np.testing.assert_allclose(plain.matrix, multi.matrix, atol=1e-12 if X64 else 1e-6)
+
+
+def test_results_repeat_and_survive_pickle(room):
+    source, target, _ = room
+    results = [mcg.register(source, target, METHODS["mc-gicp"], max_distance=0.5) for _ in range(5)]
+    workers = mcg.register(source, target, METHODS["mc-gicp"], max_distance=0.5, search=mcg.KDTreeSearch(workers=1))
+    for result in [*results, workers, pickle.loads(pickle.dumps(results[0])), copy.deepcopy(results[0])]:
+        np.testing.assert_array_equal(result.matrix, results[0].matrix)
+        assert result.status is results[0].status and result.cost == results[0].cost
+    for method in METHODS.values():
+        assert repr(pickle.loads(pickle.dumps(method))) == repr(method)

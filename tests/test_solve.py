@@ -1,0 +1,119 @@
+"""The update from 73 numbers, against least squares on all residuals."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import scipy.optimize
+from scipy.spatial.transform import Rotation
+
+from mcgicp_jax import _covariance as cov
+from mcgicp_jax import _solve
+from mcgicp_jax._cost import Pairs, moments
+from mcgicp_jax._search import Correspondences
+
+X64 = jax.config.jax_enable_x64
+N = 2000
+
+
+def random_pairs(seed: int, scale: float = 1.0, offset: float = 0.0, noise: float = 0.05):
+    """Pairs displaced by a rotation and a translation, with anisotropic M, some without a match."""
+    rng = np.random.default_rng(seed)
+    moved = scale * rng.normal(size=(N, 3)) + offset
+    turn = Rotation.from_rotvec(0.1 * rng.normal(size=3))
+    center = moved.mean(axis=0)
+    residual = turn.apply(moved - center) + center + scale * 0.2 * rng.normal(size=3) - moved
+    residual += scale * noise * rng.normal(size=(N, 3))
+    factor = rng.normal(size=(N, 3, 3)) * np.array([1, 1, 20])
+    information = factor @ factor.swapaxes(1, 2)
+    weight = rng.random(N)
+    valid = rng.random(N) < 0.9
+    residual[~valid] = 0
+    weight[~valid] = 0
+    return moved, residual, information, weight, valid
+
+
+def solve(moved, residual, information, weight, valid):
+    matches = Correspondences(indices=jnp.zeros(N, jnp.int32), distances=jnp.zeros(N), valid=jnp.asarray(valid))
+    pairs = Pairs(
+        moved=jnp.asarray(moved.T, float),
+        residual=jnp.asarray(residual.T, float),
+        information=cov.symmetric_from_matrix(jnp.asarray(information, float)),
+        square=jnp.zeros(N),
+        weight=jnp.asarray(weight, float),
+        cost=jnp.zeros(N),
+    )
+    return jax.jit(lambda p, m: (moments(p, m), _solve.solve_update(moments(p, m))))(pairs, matches)
+
+
+def whitened(twist, moved, residual, information, weight, center):
+    """The 3N residuals: a square root of w M times d − D h."""
+    root = np.linalg.cholesky(information * weight[:, None, None] + 1e-300 * np.eye(3)).swapaxes(1, 2)
+    arm = moved - center
+    change = Rotation.from_rotvec(twist[3:]).apply(arm) - arm + twist[:3]
+    return np.einsum("nij,nj->ni", root, residual - change).ravel()
+
+
+@pytest.mark.parametrize("scale, offset", [(1, 0), (1, 300), (1e-3, 0), (1e3, 1e4)])
+def test_update_is_the_least_squares_answer_on_all_residuals(scale, offset):
+    moved, residual, information, weight, valid = random_pairs(0, scale, offset)
+    measured, update = solve(moved, residual, information, weight, valid)
+    center = moved[valid].mean(axis=0)
+    units = np.array([scale, scale, scale, 1, 1, 1])
+    used = valid & (weight > 0)
+    data = (moved[used], residual[used], information[used], weight[used], center)
+    expected = scipy.optimize.least_squares(
+        lambda twist: whitened(units * twist, *data) / scale, np.zeros(6), method="lm", xtol=1e-15, ftol=1e-15
+    )
+    np.testing.assert_allclose(measured.center, center, rtol=1e-5 if not X64 else 1e-12)
+    np.testing.assert_allclose(update.twist / units, expected.x, atol=1e-9 if X64 else 1e-5)
+    assert not update.degenerate
+
+
+@pytest.mark.parametrize("scale", [1, 1e-3, 1e3])
+def test_information_is_the_sum_of_jacobians(scale):
+    moved, residual, information, weight, valid = random_pairs(1, scale)
+    measured, update = solve(moved, residual, information, weight, valid)
+    arm = moved - np.asarray(measured.center, float)
+    jacobian = np.zeros((N, 3, 6))
+    jacobian[:, :, :3] = np.eye(3)
+    for axis in range(3):
+        jacobian[:, :, 3 + axis] = np.cross(np.eye(3)[axis], arm)
+    expected = np.einsum("n,nia,nij,njb->ab", weight, jacobian, information, jacobian)
+    units = 1 / np.array([1, 1, 1, scale, scale, scale])
+    actual = np.asarray(update.information, float) * np.outer(units, units)
+    expected = expected * np.outer(units, units)
+    np.testing.assert_allclose(actual, expected, atol=np.abs(expected).max() * (1e-12 if X64 else 1e-5))
+
+
+def test_exact_pairs_need_no_second_update():
+    moved, residual, information, weight, valid = random_pairs(2, noise=0.0)
+    measured, update = solve(moved, residual, information, weight, valid)
+    turn = Rotation.from_rotvec(np.asarray(update.twist[3:], float))
+    center = np.asarray(measured.center, float)
+    change = turn.apply(moved - center) + center + np.asarray(update.twist[:3], float) - moved
+    np.testing.assert_allclose(change[valid], residual[valid], atol=1e-10 if X64 else 1e-5)
+
+
+@pytest.mark.parametrize("missing", ["no pairs", "one direction"])
+def test_free_directions_are_told_and_stay_put(missing):
+    moved, residual, information, weight, valid = random_pairs(3)
+    if missing == "no pairs":
+        valid[:], weight[:], residual[:] = False, 0, 0
+    else:
+        # Planes through a common axis: nothing holds the translation along it.
+        normals = np.random.default_rng(0).normal(size=(N, 3)) * [1, 1, 0]
+        information = np.einsum("ni,nj->nij", normals, normals)
+    _, update = solve(moved, residual, information, weight, valid)
+    assert update.degenerate
+    assert np.isfinite(update.twist).all()
+    np.testing.assert_allclose(update.twist[2] if missing == "one direction" else update.twist, 0, atol=1e-2)
+
+
+@pytest.mark.parametrize("rank", [13, 7, 0])
+def test_square_root_of_semidefinite_matrices(rank):
+    factor = np.random.default_rng(rank).normal(size=(13, max(rank, 1))) * (rank > 0)
+    form = factor @ factor.T
+    root, pivots = jax.jit(_solve._semidefinite_root)(jnp.asarray(form, float))
+    np.testing.assert_allclose(root @ root.T, form, atol=1e-10 if X64 else 1e-3)
+    assert np.sum(np.asarray(pivots) > 1e-3) == rank

@@ -1,0 +1,384 @@
+"""Gradients against finite differences, and registration under jit, vmap and their compositions."""
+
+import threading
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import mcgicp_jax as mcg
+from mcgicp_jax import Status
+from tests.scenes import motion, pair
+
+X64 = bool(jax.config.jax_enable_x64)
+needs_x64 = pytest.mark.skipif(not X64, reason="finite differences need float64: JAX_ENABLE_X64=1")
+GATE = 0.4
+# (method, robust kernel): every number in them is differentiated.
+CASES = {
+    "mc-gicp": (mcg.MultiChannelGICP([[0.05, 0.01], [0.01, 0.08]], 0.3, epsilon=1e-2), mcg.Cauchy(0.5)),
+    "gicp": (mcg.GICP(1e-2), mcg.Huber(0.3)),
+    "point-to-plane": (mcg.PointToPlane(), mcg.GemanMcClure(0.5)),
+    "point-to-point": (mcg.PointToPoint(), mcg.Tukey(1.0)),
+    "color-icp": (mcg.ColorICP(0.3), None),
+}
+CONVERGED = {"translation_tolerance": 1e-12, "rotation_tolerance": 1e-12, "max_iterations": 200}
+
+
+@pytest.fixture(scope="module")
+def noisy():
+    """5 cm of noise on a 2 m cloud: what is neglected in a gradient shows."""
+    return pair(size=400, noise=0.05, channel_noise=0.05)
+
+
+def weigh(matrix):
+    """One number of a pose, into which all of its entries go."""
+    return jnp.sum(jnp.asarray(np.random.default_rng(0).normal(size=(3, 4))) * matrix[:3])
+
+
+def inputs_of(source, target, method, robust):
+    """Everything that a pose can be differentiated with respect to, by name."""
+    inputs = {
+        "source points": source.points,
+        "target points": target.points,
+        "source channels": source.channels,
+        "target channels": target.channels,
+        "method": method,
+        "robust": robust,
+    }
+    if source.covariances is not None:
+        inputs |= {"source covariances": source.covariances, "target covariances": target.covariances}
+    return inputs
+
+
+def clouds_with(inputs, source, target):
+    def filled(name, cloud):
+        arrays = {key.split()[1]: value for key, value in inputs.items() if key.startswith(name)}
+        return cloud.replace(**arrays)
+
+    return filled("source", source), filled("target", target)
+
+
+def directional_errors(loss, inputs, gradient):
+    """Relative error of the gradient along a random direction in each input, against a fourth-order difference."""
+    rng = np.random.default_rng(1)
+    for name, value in inputs.items():
+        leaves, structure = jax.tree.flatten(value)
+        for i, leaf in enumerate(leaves):
+            direction = rng.normal(size=leaf.shape)
+            if name == "method" and leaf.ndim == 2:
+                direction = direction + direction.T
+            if name == "method" or name == "robust":
+                direction = direction * np.abs(np.asarray(leaf))
+
+            def at(step, name=name, leaves=leaves, structure=structure, i=i, leaf=leaf, direction=direction):
+                moved = [*leaves[:i], leaf + step * direction, *leaves[i + 1 :]]
+                return float(loss(inputs | {name: jax.tree.unflatten(structure, moved)}))
+
+            step = 2e-6
+            expected = (8 * (at(step) - at(-step)) - (at(2 * step) - at(-2 * step))) / (12 * step)
+            actual = float(jnp.sum(jax.tree.leaves(gradient[name])[i] * direction))
+            yield f"{name}[{i}]", actual, expected
+
+
+def check_gradient(loss, inputs):
+    compiled = jax.jit(loss)
+    gradient = jax.jit(jax.grad(loss))(inputs)
+    scale = 1e-3
+    for name, actual, expected in directional_errors(compiled, inputs, gradient):
+        assert np.isfinite(actual)
+        assert abs(actual - expected) <= 1e-6 * max(abs(expected), scale), name
+    # Forward mode, along one direction through everything.
+    tangent = jax.tree.map(lambda leaf: jnp.asarray(np.random.default_rng(2).normal(size=leaf.shape)), inputs)
+    _, forward = jax.jit(lambda i, t: jax.jvp(loss, (i,), (t,)))(inputs, tangent)
+    reverse = sum(jax.tree.leaves(jax.tree.map(lambda a, b: jnp.sum(a * b), gradient, tangent)))
+    np.testing.assert_allclose(forward, reverse, rtol=1e-9, atol=1e-12)
+
+
+@needs_x64
+@pytest.mark.parametrize("name", CASES)
+def test_align_has_the_gradient_of_its_answer(name, noisy):
+    source, target, _ = noisy
+    method, robust = CASES[name]
+    start = mcg.register(source, target, method, robust=robust, max_distance=GATE).matrix
+    matches = mcg.find_correspondences(source, target, start, method, max_distance=GATE)
+
+    def loss(inputs):
+        clouds = clouds_with(inputs, source, target)
+        result = mcg.align(*clouds, matches, inputs["method"], robust=inputs["robust"], init=start, **CONVERGED)
+        return weigh(result.matrix)
+
+    check_gradient(loss, inputs_of(source, target, method, robust))
+
+
+@needs_x64
+def test_align_has_the_gradient_of_given_covariances(noisy):
+    source, target, _ = noisy
+    method, robust = CASES["gicp"]
+    rng = np.random.default_rng(0)
+    clouds = []
+    for cloud in (source, target):
+        factor = rng.normal(size=(cloud.points.shape[0], 3, 3))
+        covariances = factor @ factor.swapaxes(1, 2) / 3 + 0.1 * np.eye(3)
+        clouds.append(cloud.replace(covariances=jnp.asarray(covariances)))
+    source, target = clouds
+    matches = mcg.find_correspondences(source, target, motion(), method, max_distance=GATE)
+
+    def loss(inputs):
+        clouds = clouds_with(inputs, source, target)
+        result = mcg.align(*clouds, matches, inputs["method"], robust=inputs["robust"], init=motion(), **CONVERGED)
+        return weigh(result.matrix)
+
+    check_gradient(loss, inputs_of(source, target, method, robust))
+
+
+@needs_x64
+@pytest.mark.parametrize("name", ["mc-gicp", "gicp", "point-to-point"])
+def test_register_has_the_gradient_of_its_answer(name, noisy):
+    """Where no match flips within the step of the difference, which is checked."""
+    source, target, _ = noisy
+    method, robust = CASES[name]
+    start = mcg.register(source, target, method, robust=robust, max_distance=GATE, **CONVERGED)
+    assert start.converged
+
+    def result_of(inputs):
+        clouds = clouds_with(inputs, source, target)
+        return mcg.register(
+            *clouds, inputs["method"], robust=inputs["robust"], init=start.matrix, max_distance=GATE, **CONVERGED
+        )
+
+    inputs = inputs_of(source, target, method, robust)
+    compiled = jax.jit(lambda inputs: weigh(result_of(inputs).matrix))
+    gradient = jax.jit(jax.grad(lambda inputs: weigh(result_of(inputs).matrix)))(inputs)
+    before = mcg.find_correspondences(source, target, start.matrix, method, max_distance=GATE)
+    rng = np.random.default_rng(1)
+    for key in ("source points", "target points", "source channels"):
+        direction = rng.normal(size=inputs[key].shape)
+        step = 1e-6
+        values = []
+        for sign in (-1, 1):
+            moved = inputs | {key: inputs[key] + sign * step * direction}
+            values.append(float(compiled(moved)))
+            clouds = clouds_with(moved, source, target)
+            after = mcg.find_correspondences(*clouds, result_of(moved).matrix, method, max_distance=GATE)
+            np.testing.assert_array_equal(after.indices, before.indices)
+            np.testing.assert_array_equal(after.valid, before.valid)
+        expected = (values[1] - values[0]) / (2 * step)
+        actual = float(jnp.sum(gradient[key] * direction))
+        # A second-order difference, since more steps would flip a match.
+        assert abs(actual - expected) <= 1e-6 * max(abs(expected), 1e-2), key
+
+
+@needs_x64
+def test_implicit_gradient_is_that_of_the_unrolled_loop(noisy):
+    """Differentiating through 60 updates with M renewed each time reaches the same number, at many times the cost."""
+    source, target, _ = noisy
+    method, _ = CASES["gicp"]
+    from mcgicp_jax import _loop, _solve
+    from mcgicp_jax._methods import prepare
+    from mcgicp_jax._pose import se3_from_matrix
+
+    matches = mcg.find_correspondences(source, target, motion(), method, max_distance=GATE)
+
+    def unrolled(points):
+        surfaces = prepare(method, source.replace(points=points)), prepare(method, target)
+
+        def body(pose, _):
+            measured = _loop.measure(pose, matches, *surfaces, method, None)
+            information, gradient = _normal_equations(measured.moments)
+            twist = jnp.linalg.solve(information, gradient)
+            return _solve.move_pose(pose, twist, measured.moments.center), None
+
+        pose, _ = jax.lax.scan(body, se3_from_matrix(motion(), points.dtype), length=60)
+        return weigh(pose.as_matrix())
+
+    def implicit(points):
+        return weigh(mcg.align(source.replace(points=points), target, matches, method, init=motion(), **CONVERGED).matrix)
+
+    expected, actual = jax.jit(jax.grad(unrolled))(source.points), jax.jit(jax.grad(implicit))(source.points)
+    np.testing.assert_allclose(actual, expected, atol=1e-8 * np.abs(expected).max())
+
+
+def _normal_equations(moments):
+    """Gauss-Newton's information and right-hand side of a (v, ω) twist, from the 73 numbers."""
+    from mcgicp_jax import _solve
+
+    tangent = jnp.asarray(_solve._TANGENT, moments.e.dtype)
+    form = _solve._quadratic_form(moments, jnp.ones_like(moments.radius))
+    return tangent.T @ form[:12, :12] @ tangent, -tangent.T @ form[:12, 12]
+
+
+def test_the_start_has_no_influence_on_the_answer(noisy):
+    source, target, _ = noisy
+    method, _ = CASES["gicp"]
+    matches = mcg.find_correspondences(source, target, motion(), method, max_distance=GATE)
+    gradient = jax.grad(lambda init: weigh(mcg.align(source, target, matches, method, init=init).matrix))
+    np.testing.assert_array_equal(gradient(jnp.asarray(motion(), source.points.dtype)), 0)
+
+
+def test_padding_has_no_gradient_and_degenerate_neighborhoods_a_finite_one():
+    source, target, _ = pair(size=400)
+    # Coincident, collinear and isotropic neighbourhoods.
+    points = np.array(source.points)
+    points[:25] = points[0]
+    points[25:50] = points[25] + np.linspace(0, 0.1, 25)[:, None] * [1.0, 2.0, 3.0]
+    grid = np.stack(np.meshgrid(*[np.arange(3) * 0.05] * 3), axis=-1).reshape(-1, 3)
+    points[50:77] = points[50] + grid
+    cloud = mcg.preprocess(mcg.PointCloud(points[:400], np.array(source.channels)[:400]))
+    method = CASES["mc-gicp"][0]
+
+    def loss(points, channels):
+        moved = cloud.replace(points=points, channels=channels)
+        return weigh(mcg.register(moved, target, method, max_distance=GATE).matrix)
+
+    gradients = jax.jit(jax.grad(loss, argnums=(0, 1)))(cloud.points, cloud.channels)
+    for gradient in gradients:
+        assert np.isfinite(gradient).all()
+        assert np.abs(gradient[:400]).max() > 0
+        np.testing.assert_array_equal(gradient[400:], 0)
+
+
+def test_no_pairs_give_no_gradient_and_say_why(noisy):
+    source, target, _ = noisy
+    method, _ = CASES["mc-gicp"]
+
+    def loss(points):
+        result = mcg.register(source.replace(points=points + 100), target, method, max_distance=GATE)
+        return weigh(result.matrix), result
+
+    gradient, result = jax.jit(jax.grad(loss, has_aux=True))(source.points)
+    np.testing.assert_array_equal(gradient, 0)
+    assert result.status is Status.TOO_FEW_CORRESPONDENCES
+
+
+def test_identical_clouds_have_a_finite_gradient(noisy):
+    source, _, _ = noisy
+    method, _ = CASES["mc-gicp"]
+
+    def loss(points):
+        result = mcg.register(source.replace(points=points), source, method, max_distance=GATE)
+        return mcg.metrics.pose_error(result.matrix, jnp.eye(4, dtype=points.dtype))[0]
+
+    value, gradient = jax.jit(jax.value_and_grad(loss))(source.points)
+    assert value < 1e-5 and np.isfinite(gradient).all()
+
+
+@pytest.mark.timeout(240)
+def test_the_traced_loop_is_the_host_loop(noisy):
+    source, target, _ = noisy
+    method, robust = CASES["mc-gicp"]
+    host = mcg.register(source, target, method, robust=robust, max_distance=GATE)
+
+    @eqx.filter_jit
+    def traced(source, target, method, robust):
+        return mcg.register(source, target, method, robust=robust, max_distance=GATE)
+
+    inside = traced(source, target, method, robust)
+    assert inside.status is host.status and inside.num_iterations == host.num_iterations
+    assert inside.num_inliers == host.num_inliers
+    # Inside, the pose is refined to the root that carries the gradient.
+    np.testing.assert_allclose(inside.matrix, host.matrix, atol=2e-4)
+    np.testing.assert_allclose(inside.history["cost"][: host.num_iterations], host.history["cost"][:-1], rtol=1e-3)
+    assert np.isnan(inside.history["cost"][host.num_iterations + 1 :]).all()
+    # jit inside jit, and grad of jit of jit.
+    nested = jax.jit(lambda points: jnp.sum(traced(source.replace(points=points), target, method, robust).matrix))
+    assert np.isfinite(jax.grad(nested)(source.points)).all()
+
+
+@pytest.mark.timeout(240)
+def test_a_batch_is_its_lanes(noisy):
+    source, target, _ = noisy
+    method, _ = CASES["mc-gicp"]
+    starts = jnp.asarray(np.stack([motion(), motion((50, 0, 0, 0, 0, 0)), np.eye(4)]), source.points.dtype)
+
+    def lane(start, points):
+        result = mcg.register(source.replace(points=points), target, method, init=start, max_distance=GATE)
+        return weigh(result.matrix), result
+
+    batched = jax.jit(jax.vmap(jax.value_and_grad(lane, argnums=1, has_aux=True), in_axes=(0, None)))
+    (values, results), gradients = batched(starts, source.points)
+    assert list(results.status) == [Status.CONVERGED, Status.TOO_FEW_CORRESPONDENCES, Status.CONVERGED]
+    assert results.matrix.shape == (3, 4, 4)
+    single = jax.jit(jax.value_and_grad(lane, argnums=1, has_aux=True))
+    for i, start in enumerate(starts):
+        (value, _), gradient = single(start, source.points)
+        np.testing.assert_allclose(values[i], value, atol=1e-9 if X64 else 1e-4)
+        scale = max(np.abs(gradient).max(), 1e-6)
+        np.testing.assert_allclose(gradients[i], gradient, atol=scale * (1e-6 if X64 else 5e-2))
+
+
+@pytest.mark.timeout(240)
+def test_stacked_clouds_go_through_vmap():
+    pairs = [pair(size=400), pair(size=350), pair(size=300)]
+    sources, targets = (mcg.PointCloud.stack([p[i] for p in pairs]) for i in (0, 1))
+    register = jax.jit(jax.vmap(lambda s, t: mcg.register(s, t, mcg.GICP(1e-2), max_distance=GATE)))
+    results = register(sources, targets)
+    for i, (source, target, _) in enumerate(pairs):
+        single = mcg.register(source, target, mcg.GICP(1e-2), max_distance=GATE)
+        np.testing.assert_allclose(results.matrix[i], single.matrix, atol=1e-3)
+        assert results.status[i] == single.status
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(280)
+def test_nothing_dead_locks():
+    """Large clouds, two threads, hundreds of calls, gradients under vmap: a hang fails by its time limit."""
+    source, target, _ = pair(size=20_000)
+    method = mcg.MultiChannelGICP(0.05, 0.3)
+    loss = jax.jit(
+        jax.value_and_grad(
+            lambda channels: weigh(
+                mcg.register(source.replace(channels=channels), target, method, max_distance=0.2, max_iterations=4).matrix
+            )
+        )
+    )
+    expected = loss(source.channels)[0]
+    failures = []
+
+    def work():
+        for _ in range(10):
+            if loss(source.channels)[0] != expected:
+                failures.append("another value")
+
+    threads = [threading.Thread(target=work) for _ in range(2)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert not failures
+
+    small, other, _ = pair(size=2000)
+    batch = jnp.stack([small.channels + 0.01 * i for i in range(8)])
+    batched = jax.jit(
+        jax.vmap(
+            jax.grad(
+                lambda channels: weigh(
+                    mcg.register(small.replace(channels=channels), other, method, max_distance=0.2, max_iterations=4).matrix
+                )
+            )
+        )
+    )
+    for _ in range(100):
+        gradient = jax.block_until_ready(batched(batch))
+    assert np.isfinite(gradient).all()
+
+
+def test_one_compilation_per_size_and_none_per_call():
+    method = mcg.GICP()
+    counts = {}
+
+    def counted(event, duration, **_):
+        if event == "/jax/core/compile/backend_compile_duration":
+            counts[event] = counts.get(event, 0) + 1
+
+    clouds = [pair(size=size, noise=0.013) for size in (330, 340, 350)]
+    mcg.register(*clouds[0][:2], method, max_distance=GATE)
+    jax.monitoring.register_event_duration_secs_listener(counted)
+    try:
+        # 330, 340 and 350 points share a size class; numbers may change as well.
+        for i, (source, target, _) in enumerate(clouds):
+            mcg.register(source, target, mcg.GICP(1e-3 * (i + 1)), max_distance=GATE + 0.01 * i, max_iterations=9 + i)
+    finally:
+        jax.monitoring.clear_event_listeners()
+    assert counts == {}
