@@ -3,17 +3,19 @@
 from __future__ import annotations
 
 import abc
+from functools import partial
+from typing import TypeAlias
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.typing import ArrayLike
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float
 
 from mcgicp_jax import _covariance as cov
 from mcgicp_jax._cloud import PointCloud
-from mcgicp_jax._methods import AbstractMethod, Surface, prepare
+from mcgicp_jax._methods import AbstractGeneralized, AbstractMethod, Surface, prepare
 from mcgicp_jax._pose import Pose, is_concrete, pose_matrix
 from mcgicp_jax._search import Correspondences
 
@@ -100,28 +102,25 @@ class Pairs(eqx.Module):
         residual: (3, N) d = b − T a.
         information: (6, N) M.
         square: (N,) dᵀ M d.
-        weight: (N,) robust weight; 0 without a match.
-        cost: (N,) ρ(dᵀ M d); 0 without a match.
+        valid: (N,) whether there is a match.
+        weight: (N,) robust weight, times the share of a soft match; 0 without a match.
+        cost: (N,) ρ(dᵀ M d), times that share; 0 without a match.
+        share: (N,) what this pair counts of all that its source point has: 1, or less with several candidates.
     """
 
     moved: Float[Array, "3 N"]
     residual: Float[Array, "3 N"]
     information: Float[Array, "6 N"]
     square: Float[Array, "N"]
+    valid: Bool[Array, "N"]
     weight: Float[Array, "N"]
     cost: Float[Array, "N"]
+    share: Float[Array, "N"]
 
 
-def match_residual(
-    rotation: Float[Array, "3 3"],
-    translation: Float[Array, "3"],
-    source: Surface,
-    target: Surface,
-    indices: Int[Array, "N"],
-) -> tuple[Float[Array, "3 N"], Float[Array, "3 N"]]:
-    """T a and d = b − T a for every source row."""
-    moved = jnp.dot(rotation, source.points, precision="highest") + translation[:, None]
-    return moved, target.points[:, indices] - moved
+def move_points(rotation: Float[Array, "3 3"], translation: Float[Array, "3"], source: Surface) -> Float[Array, "3 N"]:
+    """T a for every source row."""
+    return jnp.dot(rotation, source.points, precision="highest") + translation[:, None]
 
 
 def evaluate_pairs(
@@ -132,22 +131,57 @@ def evaluate_pairs(
     matches: Correspondences,
     method: AbstractMethod,
     robust: AbstractKernel | None,
+    temperature: Float[Array, ""] | None,
 ) -> Pairs:
-    """Residual, weight matrix and cost of every pair at a pose, with M at that pose."""
-    moved, residual = match_residual(rotation, translation, source, target, matches.indices)
+    """Residual, weight matrix and cost of every pair at a pose, with M at that pose.
+
+    With m candidates per source point there are m N pairs, candidate by candidate.
+    """
+    candidates = matches.indices.reshape(-1, source.valid.size)
+    if len(candidates) > 1:
+        source = jax.tree.map(lambda array, axis: jnp.concatenate([array] * len(candidates), axis), source, _ROW_AXES)
+    indices, valid = candidates.reshape(-1), matches.valid.reshape(-1)
+    moved = move_points(rotation, translation, source)
     # A row without a match may point anywhere: zero it before it is squared, so that its gradient is zero and not NaN.
-    residual = jnp.where(matches.valid, residual, 0)
-    information = method.information(target.covariance[:, matches.indices], source.covariance, rotation)
+    residual = jnp.where(valid, target.points[:, indices] - moved, 0)
+    information = method.information(target.covariance[:, indices], source.covariance, rotation)
     square = jnp.sum(residual * cov.multiply(information, residual), axis=0)
     weight, cost = (jnp.ones_like(square), square) if robust is None else (robust.weight(square), robust.rho(square))
+    share = valid.astype(square.dtype)
+    if temperature is not None:
+        apart = source.descriptors - target.descriptors[indices]
+        far = jnp.sum(residual * residual, axis=0) + jnp.sum(apart * apart, axis=1)
+        share = _softmax(-0.5 * far / temperature**2, valid, candidates.shape)
     return Pairs(
         moved=moved,
         residual=residual,
         information=information,
         square=square,
-        weight=jnp.where(matches.valid, weight, 0),
-        cost=jnp.where(matches.valid, cost, 0),
+        valid=valid,
+        weight=share * weight,
+        cost=share * cost,
+        share=share,
     )
+
+
+# Along which axis of each array of a surface its points are counted.
+_ROW_AXES = Surface(points=1, covariance=1, descriptors=0, valid=0)  # type: ignore[arg-type]
+
+
+def _softmax(logits: Float[Array, "N"], valid: Bool[Array, "N"], shape: tuple[int, ...]) -> Float[Array, "N"]:
+    """Over the valid candidates of each source point; 0 where it has none."""
+    logits, valid = logits.reshape(shape), valid.reshape(shape)
+    highest = jax.lax.stop_gradient(jnp.max(jnp.where(valid, logits, -jnp.inf), axis=0))
+    shifted = jnp.where(valid, logits - jnp.where(jnp.isfinite(highest), highest, 0), 0)
+    powers = jnp.where(valid, jnp.exp(shifted), 0)
+    total = jnp.sum(powers, axis=0)
+    return (powers / jnp.where(total > 0, total, 1)).reshape(-1)
+
+
+# All that decides how a pose is weighed, in the order of `evaluate_pairs`.
+Model: TypeAlias = tuple[
+    Surface, Surface, Correspondences, AbstractMethod, AbstractKernel | None, Float[Array, ""] | None
+]
 
 
 class Moments(eqx.Module):
@@ -172,8 +206,9 @@ class Moments(eqx.Module):
     Q: Float[Array, "6 10"]
 
 
-def moments(pairs: Pairs, matches: Correspondences) -> Moments:
-    mask = matches.valid.astype(pairs.moved.dtype)
+def moments(pairs: Pairs) -> Moments:
+    """The 73 numbers, in one pass over the pairs."""
+    mask = pairs.valid.astype(pairs.moved.dtype)
     count = jnp.maximum(jnp.sum(mask), 1)
     center = jnp.sum(mask * pairs.moved, axis=1) / count
     p = mask * (pairs.moved - center[:, None])
@@ -200,6 +235,8 @@ def mahalanobis_cost(
     method: AbstractMethod,
     *,
     robust: AbstractKernel | None = None,
+    temperature: ArrayLike | None = None,
+    log_determinant: bool = False,
 ) -> Float[Array, ""]:
     """F(T) = Σ ρ(dᵀ M d) with d = b − T a and M = (C^B + R C^A Rᵀ)⁻¹ (Servos & Waslander 2014, eq. 3, whose inverse is
     missing in print).
@@ -212,25 +249,45 @@ def mahalanobis_cost(
         source, target: preprocessed clouds.
         matches: from `find_correspondences`.
         method: which covariances; open numbers are chosen from the data.
+        robust: kernel of each pair's Mahalanobis distance.
+        temperature: metres; with several candidates per source point (`num_candidates`), each pair counts by a softmax
+            of −½ (distance / temperature)², distances in position and α · channel. This gives α a gradient. Towards 0
+            the nearest candidate alone counts.
+        log_determinant: add Σ log det (C^B + R C^A Rᵀ). Together with the squared distance that is a Gaussian
+            likelihood; without it, a loss that learns covariances (or ε, or Λ) is lowered by inflating them. For `GICP`
+            and `MultiChannelGICP`.
 
     Returns:
         The cost; metres² for the methods with M = I, otherwise in units of GICP's relative covariances.
 
     Raises:
-        ValueError: if the matches do not belong to the source, or a cloud lacks the neighbours that the method needs.
+        ValueError: if the matches do not belong to the source, a cloud lacks the neighbours that the method needs, or
+            the method has no determinant.
     """
-    if matches.indices.shape != source.points.shape[:1]:
-        raise ValueError(
-            f"matches: expected one per source row ({source.points.shape[0]}), got shape {matches.indices.shape}"
-        )
+    check_matches(matches, source, temperature)
+    if log_determinant and not isinstance(method, AbstractGeneralized):
+        raise ValueError(f"log_determinant: expected a method with covariances, got {type(method).__name__}")
     method = method.resolve(source, target)
     dtype = source.points.dtype
     matrix = centred_pose(pose_matrix(pose, "pose"), source, target)
     rotation, translation = jnp.asarray(matrix[:3, :3], dtype), jnp.asarray(matrix[:3, 3], dtype)
-    return _total_cost(rotation, translation, prepare(method, source), prepare(method, target), matches, method, robust)
+    surfaces = prepare(method, source), prepare(method, target)
+    temperature = None if temperature is None else jnp.asarray(temperature, dtype)
+    return _total_cost(rotation, translation, *surfaces, matches, method, robust, temperature, log_determinant)
 
 
-@jax.jit
+def check_matches(matches: Correspondences, source: PointCloud, temperature: ArrayLike | None) -> None:
+    """Raise `ValueError` unless there is a match, or a softened choice of candidates, for every source row."""
+    rows = source.points.shape[0]
+    if matches.indices.ndim > 2 or matches.indices.shape[-1] != rows:
+        raise ValueError(f"matches: expected one per source row ({rows}), got shape {matches.indices.shape}")
+    if matches.indices.ndim == 2 and temperature is None:
+        raise ValueError(f"temperature: expected metres to go with {matches.indices.shape[0]} candidates, got None")
+    if temperature is not None and is_concrete(temperature) and not np.asarray(temperature) > 0:
+        raise ValueError(f"temperature: expected a positive number of metres, got {temperature!r}")
+
+
+@partial(jax.jit, static_argnames="log_determinant")
 def _total_cost(
     rotation: Float[Array, "3 3"],
     translation: Float[Array, "3"],
@@ -239,8 +296,14 @@ def _total_cost(
     matches: Correspondences,
     method: AbstractMethod,
     robust: AbstractKernel | None,
+    temperature: Float[Array, ""] | None,
+    log_determinant: bool,
 ) -> Float[Array, ""]:
-    return jnp.sum(evaluate_pairs(rotation, translation, source, target, matches, method, robust).cost)
+    pairs = evaluate_pairs(rotation, translation, source, target, matches, method, robust, temperature)
+    cost = jnp.sum(pairs.cost)
+    if log_determinant:
+        cost = cost - jnp.sum(pairs.share * jnp.log(cov.determinant(pairs.information)))
+    return cost
 
 
 def centred_pose(matrix: Array | np.ndarray, source: PointCloud, target: PointCloud) -> Array | np.ndarray:

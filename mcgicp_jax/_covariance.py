@@ -52,6 +52,11 @@ def inverse(symmetric: Float[Array, "6 N"]) -> Float[Array, "6 N"]:
     return cofactors / determinant
 
 
+def determinant(symmetric: Float[Array, "6 N"]) -> Float[Array, "N"]:
+    xx, xy, xz, yy, yz, zz = symmetric
+    return xx * (yy * zz - yz * yz) + xy * (xz * yz - xy * zz) + xz * (xy * yz - xz * yy)
+
+
 def outer(vector: Float[Array, "3 N"]) -> Float[Array, "6 N"]:
     x, y, z = vector
     return jnp.stack([x * x, x * y, x * z, y * y, y * z, z * z])

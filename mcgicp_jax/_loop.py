@@ -17,7 +17,7 @@ import jaxlie
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from mcgicp_jax._cost import AbstractKernel, Moments, evaluate_pairs, match_residual, moments
+from mcgicp_jax._cost import AbstractKernel, Model, Moments, evaluate_pairs, moments, move_points
 from mcgicp_jax._methods import AbstractMethod, Surface
 from mcgicp_jax._result import Status
 from mcgicp_jax._search import AbstractSearch, Correspondences
@@ -70,32 +70,33 @@ Carry: TypeAlias = tuple[State, Correspondences, dict[str, Array]]
 
 
 def gate(
-    pose: jaxlie.SE3, source: Surface, target: Surface, indices: Int[Array, "N"], max_distance: Float[Array, ""]
+    pose: jaxlie.SE3,
+    source: Surface,
+    target: Surface,
+    indices: Int[Array, "*candidates N"] | Int[np.ndarray, "*candidates N"],
+    max_distance: Float[Array, ""],
 ) -> Correspondences:
     """Keep the pairs within `max_distance`, metres of position: channels choose a match, but do not gate it."""
     rotation = pose.rotation().as_matrix().astype(source.points.dtype)
-    _, residual = match_residual(rotation, pose.translation(), source, target, indices)
-    distances = jnp.sqrt(jnp.sum(residual * residual, axis=0))
-    valid = source.valid & target.valid[indices] & (distances <= max_distance)
+    found, indices = jnp.asarray(indices) >= 0, jnp.maximum(indices, 0)
+    square = jnp.zeros(indices.shape, source.points.dtype)
+    for moved, coordinate in zip(move_points(rotation, pose.translation(), source), target.points, strict=True):
+        square = square + (coordinate[indices] - moved) ** 2
+    distances = jnp.sqrt(square)
+    valid = found & source.valid & target.valid[indices] & (distances <= max_distance)
     return Correspondences(indices=indices, distances=distances, valid=valid)
 
 
 @jax.jit
-def measure(
-    pose: jaxlie.SE3,
-    matches: Correspondences,
-    source: Surface,
-    target: Surface,
-    method: AbstractMethod,
-    robust: AbstractKernel | None,
-) -> Measurement:
+def measure(pose: jaxlie.SE3, model: Model) -> Measurement:
     """Weigh the matches at the pose: the only part of a step that touches the points."""
+    source = model[0]
     rotation = pose.rotation().as_matrix().astype(source.points.dtype)
-    pairs = evaluate_pairs(rotation, pose.translation(), source, target, matches, method, robust)
-    num_inliers = jnp.sum(matches.valid)
-    square = jnp.sum(pairs.residual * pairs.residual, axis=0)
+    pairs = evaluate_pairs(rotation, pose.translation(), *model)
+    num_inliers = jnp.sum(jnp.any(pairs.valid.reshape(-1, source.valid.size), axis=0))
+    square = pairs.share * jnp.sum(pairs.residual * pairs.residual, axis=0)
     return Measurement(
-        moments=moments(pairs, matches),
+        moments=moments(pairs),
         num_inliers=num_inliers,
         cost=jnp.sum(pairs.cost),
         rmse=jnp.sqrt(jnp.sum(square) / jnp.maximum(num_inliers, 1)),
@@ -105,7 +106,7 @@ def measure(
 @jax.jit
 def match_and_measure(
     pose: jaxlie.SE3,
-    indices: Int[Array, "N"],
+    indices: Int[Array, "N"] | Int[np.ndarray, "N"],
     source: Surface,
     target: Surface,
     method: AbstractMethod,
@@ -113,7 +114,7 @@ def match_and_measure(
     settings: Settings,
 ) -> tuple[Correspondences, Measurement]:
     matches = gate(pose, source, target, indices, settings.max_distance)
-    return matches, measure(pose, matches, source, target, method, robust)
+    return matches, measure(pose, (source, target, matches, method, robust, None))
 
 
 @jax.jit
@@ -167,13 +168,12 @@ def run_on_host(
 ) -> tuple[State, Correspondences, dict[str, np.ndarray]]:
     """The loop for concrete inputs: matches from the host's tree between compiled steps."""
     index = search.index(target.points, target.descriptors, target.valid)
+    rows = source.points, source.descriptors, source.valid
     status, num_iterations = jnp.int32(_RUNNING), jnp.int32(0)
     records = []
     while status < 0:
         if status == _RUNNING:
-            indices = index.nearest(
-                pose.wxyz_xyz, source.points, source.descriptors, source.valid, settings.max_distance
-            )
+            indices = index.nearest(pose.wxyz_xyz, *rows, settings.max_distance)[0]
         matches, measured = match_and_measure(pose, indices, source, target, method, robust, settings)
         state = update(pose, status, num_iterations, measured, settings)
         pose, status, num_iterations = state.pose, state.status, state.num_iterations
@@ -184,15 +184,15 @@ def run_on_host(
 
 def _while_loop(
     pose: jaxlie.SE3,
-    match: Callable[[jaxlie.SE3, Int[Array, ""], Int[Array, "N"]], tuple[Correspondences, Measurement]],
-    num_rows: int,
+    match: Callable[[jaxlie.SE3, Int[Array, ""], Array], tuple[Correspondences, Measurement]],
+    shape: tuple[int, ...],
     settings: Settings,
     max_iterations: int,
 ) -> Carry:
     """The loop inside a transformation. `match(pose, status, indices)` finds pairs, or keeps them, and weighs them."""
 
     def advance(
-        pose: jaxlie.SE3, status: Int[Array, ""], num_iterations: Int[Array, ""], indices: Int[Array, "N"]
+        pose: jaxlie.SE3, status: Int[Array, ""], num_iterations: Int[Array, ""], indices: Int[Array, "*candidates N"]
     ) -> tuple[State, Correspondences]:
         matches, measured = match(pose, status, indices)
         return update(pose, status, num_iterations, measured, settings), matches
@@ -204,7 +204,7 @@ def _while_loop(
         return state, matches, {name: values.at[count].set(state.record[name]) for name, values in history.items()}
 
     running, zero = jnp.int32(_RUNNING), jnp.int32(0)
-    shapes = jax.eval_shape(advance, pose, running, zero, jnp.zeros(num_rows, jnp.int32))
+    shapes = jax.eval_shape(advance, pose, running, zero, jnp.zeros(shape, jnp.int32))
     state, matches = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), shapes)
     state = eqx.tree_at(lambda state: (state.pose, state.status), state, (pose, running))
     # One entry per update, and one for the measurement at the end.
@@ -229,47 +229,33 @@ def run_traced(
         pose: jaxlie.SE3, status: Int[Array, ""], indices: Int[Array, "N"]
     ) -> tuple[Correspondences, Measurement]:
         running = status == _RUNNING
-        found = nearest_traced(search, pose, source, target, settings.max_distance, running)
+        found = nearest_traced(search, pose, source, target, settings.max_distance, running)[0]
         indices = jnp.where(running, found, indices)
         return match_and_measure(pose, indices, source, target, method, robust, settings)
 
-    return _while_loop(start, match, source.valid.size, settings, max_iterations)
+    return _while_loop(start, match, source.valid.shape, settings, max_iterations)
 
 
 @partial(jax.jit, static_argnames="max_iterations")
 def align_traced(
-    start: jaxlie.SE3,
-    source: Surface,
-    target: Surface,
-    matches: Correspondences,
-    method: AbstractMethod,
-    robust: AbstractKernel | None,
-    settings: Settings,
-    max_iterations: int,
+    start: jaxlie.SE3, model: Model, settings: Settings, max_iterations: int
 ) -> tuple[jaxlie.SE3, State, dict[str, Array]]:
-    constants = jax.lax.stop_gradient((matches, source, target, method, robust))
+    """The loop of `align`: matches stay. Returns the refined pose too."""
+    start, constants, settings = jax.lax.stop_gradient((start, model, settings))
+    matches = constants[2]
 
-    def match(
-        pose: jaxlie.SE3, status: Int[Array, ""], indices: Int[Array, "N"]
-    ) -> tuple[Correspondences, Measurement]:
-        return matches, measure(pose, *constants)
+    def match(pose: jaxlie.SE3, status: Int[Array, ""], indices: Array) -> tuple[Correspondences, Measurement]:
+        return matches, measure(pose, constants)
 
-    start, settings = jax.lax.stop_gradient((start, settings))
-    state, _, history = _while_loop(start, match, source.valid.size, settings, max_iterations)
-    return refine(state, matches, source, target, method, robust), state, history
+    state, _, history = _while_loop(start, match, matches.indices.shape, settings, max_iterations)
+    return refine(state, model), state, history
 
 
 @jax.jit
-def refine(
-    state: State,
-    matches: Correspondences,
-    source: Surface,
-    target: Surface,
-    method: AbstractMethod,
-    robust: AbstractKernel | None,
-) -> jaxlie.SE3:
+def refine(state: State, model: Model) -> jaxlie.SE3:
+    """The pose of a loop that has ended, with the gradient of the answer."""
     usable = (state.status == Status.CONVERGED) | (state.status == Status.MAX_ITERATIONS)
-    return refine_pose(state.pose, usable, state.measured.moments, source, target, matches, method, robust)
+    return refine_pose(state.pose, usable, state.measured.moments, model)
 
 
 def nearest_traced(
@@ -279,6 +265,7 @@ def nearest_traced(
     target: Surface,
     max_distance: Float[Array, ""],
     running: Bool[Array, ""],
-) -> Int[Array, "N"]:
+    num_candidates: int = 1,
+) -> Int[Array, "m N"]:
     source_rows, target_rows = ((cloud.points, cloud.descriptors, cloud.valid) for cloud in (source, target))
-    return search.nearest_traced(pose.wxyz_xyz, source_rows, target_rows, max_distance, running)
+    return search.nearest_traced(pose.wxyz_xyz, source_rows, target_rows, max_distance, running, num_candidates)

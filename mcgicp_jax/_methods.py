@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import abc
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import equinox as eqx
 import jax
@@ -247,7 +247,8 @@ def _weighted_channels(cloud: PointCloud, weights: Float[Array, "..."]) -> Float
     count = cloud.channels.shape[-1]
     if weights.shape not in ((), (count,)):
         raise ValueError(
-            f"channel_weights: expected a scalar or shape ({count},) for clouds of {count} channels, got {weights.shape}"
+            f"channel_weights: expected a scalar or shape ({count},), for clouds of {count} channels, "
+            f"got {weights.shape}"
         )
     return jnp.asarray(cloud.channels) * weights.astype(cloud.channels.dtype)
 
@@ -262,8 +263,8 @@ def _whiten(channels: Float[Array, "N C"], covariance: Float[Array, "..."]) -> F
         factor = jnp.linalg.cholesky(covariance)
         return jax.scipy.linalg.solve_triangular(factor, channels.T, lower=True).T
     raise ValueError(
-        f"channel_covariance: expected a scalar, shape ({count},) or ({count}, {count}) for clouds of {count} channels, "
-        f"got {covariance.shape}"
+        f"channel_covariance: expected a scalar, shape ({count},) or ({count}, {count}), for clouds of {count} "
+        f"channels, got {covariance.shape}"
     )
 
 

@@ -12,7 +12,7 @@ from jax.typing import ArrayLike, DTypeLike
 from jaxtyping import Array, Int
 
 from mcgicp_jax._cloud import PointCloud, Values
-from mcgicp_jax._cost import AbstractKernel, centred_pose
+from mcgicp_jax._cost import AbstractKernel, centred_pose, check_matches
 from mcgicp_jax._loop import Settings, State, align_traced, gate, nearest_traced, refine, run_on_host, run_traced
 from mcgicp_jax._methods import AbstractMethod, Surface, prepare
 from mcgicp_jax._pose import Pose, is_concrete, pose_matrix, se3_from_matrix
@@ -33,6 +33,7 @@ def find_correspondences(
     method: AbstractMethod,
     *,
     max_distance: ArrayLike,
+    num_candidates: int = 1,
     search: AbstractSearch | None = None,
 ) -> Correspondences:
     """The match of every source point at a pose: nearest in position and α · channel (Servos & Waslander 2014, IV-A).
@@ -42,6 +43,8 @@ def find_correspondences(
         pose: T_target_source, `jaxlie.SE3` or (4, 4); None is the identity.
         method: its channel weights span the space that is searched.
         max_distance: metres of position; pairs further apart do not count.
+        num_candidates: m, how many target points to find for each source point; more than one for the soft matches of
+            `align` and `mahalanobis_cost`. The arrays are then (m, N), nearest first.
 
     Raises:
         ValueError: if `max_distance` is not positive or the clouds' channels do not fit each other or the method.
@@ -53,7 +56,9 @@ def find_correspondences(
     args = jax.lax.stop_gradient((se3_from_matrix(matrix, dtype), source_surface, target_surface))
     start, source_surface, target_surface = args
     limit = jnp.asarray(max_distance, dtype)
-    indices = _find(search or KDTreeSearch(), start, source_surface, target_surface, limit)
+    if num_candidates < 1:
+        raise ValueError(f"num_candidates: expected at least 1, got {num_candidates}")
+    indices = _find(search or KDTreeSearch(), start, source_surface, target_surface, limit, num_candidates)
     return _gate(start, source_surface, target_surface, indices, limit)
 
 
@@ -61,12 +66,15 @@ _gate = jax.jit(gate)
 
 
 def _find(
-    search: AbstractSearch, pose: jaxlie.SE3, source: Surface, target: Surface, max_distance: Array
-) -> Int[Array, "N"]:
+    search: AbstractSearch, pose: jaxlie.SE3, source: Surface, target: Surface, max_distance: Array, num_candidates: int
+) -> Int[Array, "*candidates N"]:
     if is_concrete(pose, source, target):
         index = search.index(target.points, target.descriptors, target.valid)
-        return jnp.asarray(index.nearest(pose.wxyz_xyz, source.points, source.descriptors, source.valid, max_distance))
-    return nearest_traced(search, pose, source, target, max_distance, jnp.bool_(True))
+        rows = source.points, source.descriptors, source.valid
+        found = jnp.asarray(index.nearest(pose.wxyz_xyz, *rows, max_distance, num_candidates))
+    else:
+        found = nearest_traced(search, pose, source, target, max_distance, jnp.bool_(True), num_candidates)
+    return found if num_candidates > 1 else found[0]
 
 
 def align(
@@ -80,6 +88,7 @@ def align(
     translation_tolerance: ArrayLike = _TRANSLATION_TOLERANCE,
     rotation_tolerance: ArrayLike = _ROTATION_TOLERANCE,
     robust: AbstractKernel | None = None,
+    temperature: ArrayLike | None = None,
 ) -> Registration:
     """The pose that balances given matches: updates with M renewed, until the pose rests. Pure JAX.
 
@@ -95,22 +104,20 @@ def align(
         init: T_target_source to start from; the identity by default.
         translation_tolerance, rotation_tolerance: metres and radians; the update that is below both is the last.
         robust: kernel of each pair's Mahalanobis distance.
+        temperature: metres; softens several candidates per source point, as in `mahalanobis_cost`.
 
     Raises:
         ValueError: if an argument does not fit; outcomes of well-formed input are told by `Registration.status`.
     """
     _check_loop(max_iterations, translation_tolerance, rotation_tolerance)
-    if matches.indices.shape != source.points.shape[:1]:
-        raise ValueError(
-            f"matches: expected one per source row ({source.points.shape[0]}), got shape {matches.indices.shape}"
-        )
+    check_matches(matches, source, temperature)
     method, source_surface, target_surface = _surfaces(source, target, method)
     dtype = source_surface.points.dtype
     start = se3_from_matrix(centred_pose(pose_matrix(init), source, target), dtype)
     settings = _settings(jnp.inf, translation_tolerance, rotation_tolerance, max_iterations, dtype)
-    pose, state, history = align_traced(
-        start, source_surface, target_surface, matches, method, robust, settings, max_iterations
-    )
+    softness = None if temperature is None else jnp.asarray(temperature, dtype)
+    model = (source_surface, target_surface, matches, method, robust, softness)
+    pose, state, history = align_traced(start, model, settings, max_iterations)
     return _registration(pose, state, history, source, target)
 
 
@@ -166,7 +173,7 @@ def register(
         state, matches, history = run_traced(*constants, search, max_iterations)
     if is_concrete(differentiable):
         return _registration(state.pose, state, history, source, target)
-    pose = refine(state, matches, *differentiable)
+    pose = refine(state, (source_surface, target_surface, matches, method, robust, None))
     return _registration(pose, state, history, source, target)
 
 

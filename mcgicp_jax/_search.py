@@ -36,7 +36,7 @@ class Correspondences(eqx.Module):
     To autodiff the row numbers are constants: gradients are taken with the matches held.
 
     Attributes:
-        indices: (N,) rows of the target.
+        indices: (N,) rows of the target; or (m, N), nearest first, if several candidates were asked for.
         distances: (N,) metres between the moved source point and its match (position only, not channels).
         valid: (N,) whether the pair counts: both points exist and lie within `max_distance` of each other.
     """
@@ -60,12 +60,16 @@ class AbstractIndex(abc.ABC):
         descriptors: Float[ArrayLike, "N D"],
         valid: Bool[ArrayLike, "N"],
         max_distance: Float[ArrayLike, ""],
-    ) -> Int[np.ndarray, "N"]:
-        """Row of the nearest target point for each source point, moved by a pose; descriptors do not move.
+        num_candidates: int = 1,
+    ) -> Int[np.ndarray, "m N"]:
+        """Rows of the m nearest target points of each source point, moved by a pose; descriptors do not move.
 
         Args:
             pose: quaternion wxyz and translation, as in `jaxlie.SE3.wxyz_xyz`.
-            max_distance: metres; rows without a match this near may name any target row.
+            max_distance: metres; −1 may stand for a target point that lies further away.
+
+        Returns:
+            Nearest first; −1 where there is none.
         """
 
 
@@ -86,7 +90,8 @@ class AbstractSearch(eqx.Module):
         target: Rows,
         max_distance: Float[Array, ""],
         running: Bool[Array, ""],
-    ) -> Int[Array, "N"]:
+        num_candidates: int = 1,
+    ) -> Int[Array, "m N"]:
         """`AbstractIndex.nearest` inside a transformation; clouds are points, descriptors, valid.
 
         Where not `running`, as in a lane of a batch that is done, the answer is not used and may be anything.
@@ -118,10 +123,11 @@ class KDTreeSearch(AbstractSearch):
         target: Rows,
         max_distance: Float[Array, ""],
         running: Bool[Array, ""],
-    ) -> Int[Array, "N"]:
+        num_candidates: int = 1,
+    ) -> Int[Array, "m N"]:
         return jax.pure_callback(
-            partial(_nearest_callback, self.workers),
-            jax.ShapeDtypeStruct(source[2].shape, jnp.int32),
+            partial(_nearest_callback, self.workers, num_candidates),
+            jax.ShapeDtypeStruct((num_candidates, *source[2].shape), jnp.int32),
             pose,
             source,
             target,
@@ -155,9 +161,10 @@ class KDTreeIndex(AbstractIndex):
         descriptors: Float[ArrayLike, "N D"],
         valid: Bool[ArrayLike, "N"],
         max_distance: Float[ArrayLike, ""],
-    ) -> Int[np.ndarray, "N"]:
+        num_candidates: int = 1,
+    ) -> Int[np.ndarray, "m N"]:
         valid, descriptors = np.asarray(valid), np.asarray(descriptors)
-        indices = np.zeros(valid.size, np.int32)
+        indices = np.full((num_candidates, valid.size), -1, np.int32)
         pose = np.asarray(pose, np.float64)
         # A pose that has diverged must not become an exception inside the tree; the step will say NON_FINITE.
         if self._tree is None or not np.isfinite(pose).all():
@@ -169,8 +176,8 @@ class KDTreeIndex(AbstractIndex):
         # then the whole space is searched. The margin covers rounding; the gate itself is applied to the position.
         bound = np.inf if descriptors.shape[1] else 1.001 * float(np.asarray(max_distance))
         queries = np.hstack([moved, descriptors[active]])
-        found = _nearest(self._tree, queries, 1, self._workers, bound)[:, 0]
-        indices[active] = self._rows[np.where(found < self._rows.size, found, 0)]
+        found = _nearest(self._tree, queries, num_candidates, self._workers, bound).T
+        indices[: len(found), active] = np.append(self._rows, -1)[found]
         return indices
 
 
@@ -204,12 +211,13 @@ _index_cache = _IndexCache(size=256)
 
 def _nearest_callback(
     workers: int,
+    num_candidates: int,
     pose: Any,
     source: tuple[Any, Any, Any],
     target: tuple[Any, Any, Any],
     max_distance: Any,
     running: Any,
-) -> Int[np.ndarray, "*batch N"]:
+) -> Int[np.ndarray, "*batch m N"]:
     """`nearest` over any leading batch dimensions, some of them 1 where an argument has no batch."""
     trailing = (1, 2, 2, 1, 2, 2, 1, 0, 0)
     arrays = [np.asarray(array) for array in (pose, *source, *target, max_distance, running)]
@@ -217,12 +225,13 @@ def _nearest_callback(
     lanes = [
         np.broadcast_to(array, batch + array.shape[array.ndim - n :]) for array, n in zip(arrays, trailing, strict=True)
     ]
-    indices = np.zeros(lanes[3].shape, np.int32)
+    indices = np.full((*batch, num_candidates, lanes[3].shape[-1]), -1, np.int32)
     for lane in np.ndindex(batch):
-        moving, *source_rows, points, descriptors, valid, limit, active = (array[lane] for array in lanes)
+        # Of each cloud: points, descriptors, valid.
+        moving, a, b, c, p, q, r, limit, active = (array[lane] for array in lanes)
         if active:
-            index = _index_cache.get(points, descriptors, valid, workers)
-            indices[lane] = index.nearest(moving, *source_rows, limit)  # type: ignore[call-arg]
+            index = _index_cache.get(p, q, r, workers)
+            indices[lane] = index.nearest(moving, a, b, c, limit, num_candidates)
     return indices
 
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -11,10 +13,8 @@ import optimistix as optx
 from jaxtyping import Array, Bool, Float, Int
 
 from mcgicp_jax import _covariance as cov
-from mcgicp_jax._cost import AbstractKernel, Moments, evaluate_pairs
-from mcgicp_jax._methods import AbstractMethod, Surface
+from mcgicp_jax._cost import Model, Moments, evaluate_pairs
 from mcgicp_jax._pose import cast_pose
-from mcgicp_jax._search import Correspondences
 
 # optimistix starts at damping 1: the form is scaled so that this is small beside its eigenvalues.
 _HESSIAN_SCALE = 1e4
@@ -77,10 +77,10 @@ def solve_update(moments: Moments) -> Update:
         _residuals, solver, jnp.zeros(6, dtype), root, max_steps=_MAX_STEPS, throw=False
     )
     _, pivots = _semidefinite_root(unit_information)
-    units = jnp.array([1.0, 1.0, 1.0, radius, radius, radius], dtype)
+    units = _units(radius)
     return Update(
-        twist=solution.value * radius / units,
-        information=unit_information * units[:, None] * units,
+        twist=solution.value * units,
+        information=unit_information * radius**2 / (units[:, None] * units),
         degenerate=~jnp.all(pivots > 64 * eps * jnp.max(jnp.diagonal(unit_information))),
     )
 
@@ -147,74 +147,55 @@ def information_at_source(
 
 
 def balance(
-    twist: Float[Array, "6"],
-    args: tuple[
-        jaxlie.SE3,
-        Float[Array, "3"],
-        Float[Array, ""],
-        Surface,
-        Surface,
-        Correspondences,
-        AbstractMethod,
-        AbstractKernel | None,
-    ],
+    twist: Float[Array, "6"], args: tuple[jaxlie.SE3, Float[Array, "3"], Float[Array, ""], Model]
 ) -> Float[Array, "6"]:
     """g(T) = Σ w Jᵀ M(R) d at the pose moved by a twist, lengths in units of the radius: forces and torques in balance.
 
     Every GICP renews M between updates, so its answer is the root of g, not the minimum of F: derivatives of the pose
-    follow from g with the dependence of M and of the robust weights on the pose kept.
+    follow from g with the dependence of M and of the weights on the pose kept.
     """
-    pose, center, radius, source, target, matches, method, robust = args
-    units = jnp.stack([radius] * 3 + [jnp.ones_like(radius)] * 3)
-    moved = move_pose(pose, twist * units, center)
+    pose, center, radius, model = args
+    moved = move_pose(pose, twist * _units(radius), center)
     rotation = moved.rotation().as_matrix().astype(twist.dtype)
-    pairs = evaluate_pairs(rotation, moved.translation(), source, target, matches, method, robust)
+    pairs = evaluate_pairs(rotation, moved.translation(), *model)
     force = pairs.weight * cov.multiply(pairs.information, pairs.residual)
     torque = jnp.cross(pairs.moved - center[:, None], force, axis=0)
     return jnp.concatenate([jnp.sum(force, axis=1) * radius, jnp.sum(torque, axis=1)])
 
 
-def refine_pose(
-    pose: jaxlie.SE3,
-    usable: Bool[Array, ""],
-    moments: Moments,
-    source: Surface,
-    target: Surface,
-    matches: Correspondences,
-    method: AbstractMethod,
-    robust: AbstractKernel | None,
-) -> jaxlie.SE3:
+def _units(radius: Float[Array, ""]) -> Float[Array, "6"]:
+    """Metres and radians of a twist whose lengths are in units of the radius."""
+    return jnp.stack([radius] * 3 + [jnp.ones_like(radius)] * 3)
+
+
+def refine_pose(pose: jaxlie.SE3, usable: Bool[Array, ""], moments: Moments, model: Model) -> jaxlie.SE3:
     """The root of g near a pose, which carries the gradient of the answer by the implicit function theorem.
 
-    The pose that comes in is a constant to autodiff. Where it is not `usable` it comes back as it is, with a gradient of
-    zero.
+    The pose that comes in is a constant to autodiff. Where it is not `usable` it comes back as it is, with a gradient
+    of zero.
     """
     pose, moments = jax.lax.stop_gradient((pose, moments))
-    pose_in = pose
-    pose = jax.tree.map(lambda a, b: jnp.where(usable, a, b), pose, jaxlie.SE3(identity_parameters(pose)))
+    source, target, matches, *weighing = model
+    # Where there is no root to be found, the identity without pairs keeps every number and derivative finite.
     matches = eqx.tree_at(lambda m: m.valid, matches, matches.valid & usable)
+    start = jaxlie.SE3(jnp.where(usable, pose.wxyz_xyz, jaxlie.SE3.identity().wxyz_xyz.astype(pose.wxyz_xyz.dtype)))
     radius = jnp.where(usable & (moments.radius > 0), moments.radius, 1)
     center = jnp.where(usable, moments.center, 0)
-    weight = jnp.where(usable, jnp.sum(moments.Q[jnp.array([0, 3, 5]), 9]) * radius**2, 1)
-    args = (pose, center, radius, source, target, matches, method, robust)
+    # The trace of Σ w M, in the unit of g: makes a tolerance on g mean something.
+    scale = jnp.where(usable, jnp.sum(moments.Q[jnp.array([0, 3, 5]), 9]) * radius**2, 1)
     eps = float(jnp.finfo(pose.wxyz_xyz.dtype).eps)
     solution: optx.Solution = optx.root_find(
-        _normalised_balance,
+        _scaled_balance,
         optx.Newton(rtol=4 * eps, atol=4 * eps),
         jnp.zeros(6, pose.wxyz_xyz.dtype),
-        (usable, weight, args),
+        (usable, scale, (start, center, radius, (source, target, matches, *weighing))),
         max_steps=_MAX_NEWTON_STEPS,
         throw=False,
     )
-    units = jnp.stack([radius] * 3 + [jnp.ones_like(radius)] * 3)
-    refined = move_pose(pose, solution.value * units, center)
-    return jax.tree.map(lambda a, b: jnp.where(usable, a, b), refined, pose_in)
+    refined = move_pose(start, solution.value * _units(radius), center)
+    return jaxlie.SE3(jnp.where(usable, refined.wxyz_xyz, pose.wxyz_xyz))
 
 
-def _normalised_balance(twist: Float[Array, "6"], args: tuple) -> Float[Array, "6"]:  # type: ignore[type-arg]
-    usable, weight, balance_args = args
-    return jnp.where(usable, balance(twist, balance_args) / weight, twist)
-
-
-def identity_parameters(pose: jaxlie.SE3) -> Float[Array, "7"]:
-    return jnp.array([1, 0, 0, 0, 0, 0, 0], pose.wxyz_xyz.dtype)
+def _scaled_balance(twist: Float[Array, "6"], args: tuple[Any, ...]) -> Float[Array, "6"]:
+    usable, scale, balance_args = args
+    return jnp.where(usable, balance(twist, balance_args) / scale, twist)

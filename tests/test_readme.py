@@ -1,0 +1,28 @@
+"""The README is run: its snippets, in order, in one namespace."""
+
+import pathlib
+import re
+
+import pytest
+
+README = pathlib.Path(__file__).parent.parent / "README.md"
+
+
+@pytest.mark.timeout(240)
+def test_snippets_run_as_printed(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    snippets = re.findall(r"```python\n(.*?)```", README.read_text(), flags=re.DOTALL)
+    assert len(snippets) == 2
+    namespace = {}
+    for snippet in snippets:
+        exec(compile(snippet, str(README), "exec"), namespace)
+    assert "CONVERGED" in capsys.readouterr().out
+    gradient = namespace["gradient"]
+    assert gradient.shape == namespace["source_cloud"].channels.shape
+    assert abs(gradient).max() > 0
+
+
+def test_it_is_short_and_has_two_set_up_commands():
+    text = README.read_text()
+    assert 60 <= len(text.splitlines()) <= 100
+    assert len(re.findall(r"^pip install .*$", text, flags=re.MULTILINE)) == 2
