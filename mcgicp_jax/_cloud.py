@@ -18,6 +18,8 @@ from mcgicp_jax._pose import Pose, is_concrete, pose_matrix
 Values: TypeAlias = ArrayLike | Sequence[Any]
 
 _SMALLEST_CLASS = 128
+# In sizes of the cloud: from here on its origin is kept apart, in float64.
+_FAR = 8.0
 
 
 def size_class(num_points: int) -> int:
@@ -32,10 +34,17 @@ def size_class(num_points: int) -> int:
     return size
 
 
+def is_far(offset: Float[np.ndarray, "3"], size: float) -> bool:
+    """Whether a cloud of this size, metres, lies so far from zero that float32 would lose its shape."""
+    return bool(np.linalg.norm(offset) > _FAR * size)
+
+
 def _as_float(name: str, values: Values) -> Any:
     """A floating-point array; NumPy stays NumPy, and float64, until an origin has been taken off."""
     if isinstance(values, jax.Array):
-        return values if jnp.issubdtype(values.dtype, jnp.floating) else values.astype(float)
+        if jnp.issubdtype(values.dtype, jnp.complexfloating):
+            raise ValueError(f"{name}: expected real numbers, got dtype {values.dtype}")
+        return values if values.dtype in (jnp.float32, jnp.float64) else values.astype(float)
     try:
         array = np.asarray(values)
     except ValueError as error:
@@ -122,9 +131,16 @@ class PointCloud(eqx.Module):
         unknown = arrays.keys() - fields.keys()
         if unknown:
             raise ValueError(f"replace: no field named {', '.join(sorted(unknown))}; there are {', '.join(fields)}")
+        shapes = {
+            "points": np.shape(self.points),
+            "valid": np.shape(self.valid),
+            "covariances": (*np.shape(self.points), 3),
+            "origin": np.shape(self.origin),
+        }
         for name, value in arrays.items():
-            if fields[name] is not None and np.shape(value) != np.shape(fields[name]) and name != "channels":
-                raise ValueError(f"{name}: expected shape {np.shape(fields[name])}, got {np.shape(value)}")
+            expected = shapes.get(name, np.shape(value))
+            if np.shape(value) != expected and not (name == "covariances" and value is None):
+                raise ValueError(f"{name}: expected shape {expected}, got {np.shape(value)}")
         if "channels" in arrays:
             channels = arrays["channels"]
             if np.shape(channels)[:-1] != np.shape(self.points)[:-1]:
@@ -191,15 +207,17 @@ class PointCloud(eqx.Module):
     def transform(self, pose: Pose) -> PointCloud:
         """The cloud moved by a pose: points p become R p + t, covariances C become R C Rᵀ."""
         matrix = pose_matrix(pose, "pose")
-        numpy = np if isinstance(self.points, np.ndarray) and is_concrete(matrix) else jnp
-        rotation = numpy.asarray(matrix[:3, :3], self.points.dtype)
-        translation, origin = matrix[:3, 3], self.origin
-        if is_concrete(origin, matrix) and np.any(origin):
-            # The large part of the motion stays in float64.
-            origin = np.asarray(matrix)[:3, :3] @ origin + translation
-            translation = np.zeros(3)
-        points = self.points @ rotation.T + numpy.asarray(translation, self.points.dtype)
+        xp = np if isinstance(self.points, np.ndarray) and is_concrete(matrix) else jnp
+        rotation = xp.asarray(matrix[:3, :3], self.points.dtype)
+        points = self.points @ rotation.T
         covariances = None if self.covariances is None else rotation @ self.covariances @ rotation.T
+        offset, origin = matrix[:3, :3] @ self.origin + matrix[:3, 3], self.origin
+        if is_concrete(points, offset) and is_far(np.asarray(offset), float(np.abs(points).max(initial=0))):
+            # The large part of a motion stays in float64.
+            origin = np.asarray(offset, np.float64)
+        else:
+            points = points + xp.asarray(offset, points.dtype)
+            origin = xp.zeros_like(origin)
         return self.replace(points=points, covariances=covariances, origin=origin)
 
     @staticmethod

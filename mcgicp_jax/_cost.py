@@ -138,8 +138,14 @@ def evaluate_pairs(
     With m candidates per source point there are m N pairs, candidate by candidate.
     """
     candidates = matches.indices.reshape(-1, source.valid.size)
-    if len(candidates) > 1:
-        source = jax.tree.map(lambda array, axis: jnp.concatenate([array] * len(candidates), axis), source, _ROW_AXES)
+    times = len(candidates)
+    if times > 1:
+        source = Surface(
+            points=jnp.tile(source.points, (1, times)),
+            covariance=jnp.tile(source.covariance, (1, times)),
+            descriptors=jnp.tile(source.descriptors, (times, 1)),
+            valid=jnp.tile(source.valid, times),
+        )
     indices, valid = candidates.reshape(-1), matches.valid.reshape(-1)
     moved = move_points(rotation, translation, source)
     # A row without a match may point anywhere: zero it before it is squared, so that its gradient is zero and not NaN.
@@ -162,10 +168,6 @@ def evaluate_pairs(
         cost=share * cost,
         share=share,
     )
-
-
-# Along which axis of each array of a surface its points are counted.
-_ROW_AXES = Surface(points=1, covariance=1, descriptors=0, valid=0)  # type: ignore[arg-type]
 
 
 def _softmax(logits: Float[Array, "N"], valid: Bool[Array, "N"], shape: tuple[int, ...]) -> Float[Array, "N"]:

@@ -9,13 +9,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from mcgicp_jax._cloud import PointCloud, Values, size_class
+from mcgicp_jax._cloud import PointCloud, Values, is_far, size_class
 from mcgicp_jax._pose import is_concrete
 from mcgicp_jax._search import AbstractSearch, KDTreeSearch
 
 MIN_POINTS = 4
-# Clouds further from zero than this many times their own size keep their origin apart, in float64.
-_FAR = 8.0
 # Voxel numbers are packed into one 64-bit key, 21 bits each.
 _VOXELS_PER_AXIS = 2**21
 
@@ -136,6 +134,4 @@ def _far_origin(points: Float[np.ndarray, "N 3"]) -> Float[np.ndarray, "3"]:
     """Zero for clouds about the origin; the centre of those far away, where float32 would lose their shape."""
     low, high = points.min(axis=0).astype(np.float64), points.max(axis=0).astype(np.float64)
     center = 0.5 * (low + high)
-    if np.linalg.norm(center) <= _FAR * np.linalg.norm(high - low):
-        return np.zeros(3)
-    return center
+    return center if is_far(center, float(np.linalg.norm(high - low))) else np.zeros(3)

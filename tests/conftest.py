@@ -13,7 +13,7 @@ with install_import_hook("mcgicp_jax", "beartype.beartype"):
     import mcgicp_jax
     import mcgicp_jax.__main__  # noqa: F401
 
-import pytest  # noqa: E402
+import pytest
 
 DATA = pathlib.Path(os.environ.get("MCGICP_DATA", pathlib.Path(__file__).parents[2] / "shared" / "data"))
 

@@ -24,7 +24,9 @@ def room_corner(size: int, noise: float = 0.01, channel_noise: float = 0.02, see
     points = rng.random((size, 3)) * 2
     points[np.arange(size), face] = 0
     x, y, z = points.T
-    paint = np.stack([np.sin(5 * x) * np.cos(4 * y) + z, np.sin(3 * z + x), np.cos(4 * y + 2 * z)], axis=1)[:, :channels]
+    paint = np.stack([np.sin(5 * x) * np.cos(4 * y) + z, np.sin(3 * z + x), np.cos(4 * y + 2 * z)], axis=1)[
+        :, :channels
+    ]
     return points + noise * rng.normal(size=points.shape), paint + channel_noise * rng.normal(size=paint.shape)
 
 

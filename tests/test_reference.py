@@ -72,7 +72,9 @@ def test_channels_hold_the_flat_table(data):
         pair = np.load(path)
         source, target = (
             # One size for all pairs: every size compiles.
-            mcg.preprocess(mcg.PointCloud(pair[f"{name}_points_flat"], pair[f"{name}_rgb"]), voxel_size=0.01).pad(12_000)
+            mcg.preprocess(mcg.PointCloud(pair[f"{name}_points_flat"], pair[f"{name}_rgb"]), voxel_size=0.01).pad(
+                12_000
+            )
             for name in ("source", "target")
         )
         for name, method in (("gicp", mcg.GICP()), ("mc-gicp", mcg.MultiChannelGICP(0.05**2, 0.5))):

@@ -62,7 +62,9 @@ def test_moving_a_cloud_moves_the_answer(name, room):
     source, target, _ = room
     move = motion((0.3, -0.2, 0.5, 0.4, -0.7, 1.1))
     before = mcg.register(source, target, METHODS[name], max_distance=0.5, **TIGHT)
-    moved = mcg.register(source.transform(move), target, METHODS[name], init=np.linalg.inv(move), max_distance=0.5, **TIGHT)
+    moved = mcg.register(
+        source.transform(move), target, METHODS[name], init=np.linalg.inv(move), max_distance=0.5, **TIGHT
+    )
     assert difference(moved.matrix @ move, before.matrix) < (1e-8 if X64 else 5e-5)
     moved = mcg.register(source, target.transform(move), METHODS[name], init=move, max_distance=0.5, **TIGHT)
     assert difference(np.linalg.inv(move) @ moved.matrix, before.matrix) < (1e-8 if X64 else 5e-5)
@@ -109,7 +111,9 @@ def test_information_is_the_curvature_of_the_cost_with_M_held(room):
     matches = mcg.find_correspondences(source, target, result.matrix, method, max_distance=0.5)
     # With M = I, F(T exp(ξ)) ≈ Σ |d − R(v + ω × a)|²: half of its Hessian without the curvature of the residual.
     points = np.asarray(source.points, float)[np.asarray(matches.valid)]
-    jacobian = np.concatenate([np.broadcast_to(np.eye(3), (len(points), 3, 3)), np.cross(np.eye(3), points[:, None]).swapaxes(1, 2)], axis=2)
+    jacobian = np.concatenate(
+        [np.broadcast_to(np.eye(3), (len(points), 3, 3)), np.cross(np.eye(3), points[:, None]).swapaxes(1, 2)], axis=2
+    )
     np.testing.assert_allclose(result.information, np.einsum("nia,nib->ab", jacobian, jacobian), rtol=1e-4, atol=1e-1)
 
 
@@ -153,7 +157,7 @@ def test_clouds_without_overlap_do_not_converge(room):
 
 def test_a_flat_wall_is_degenerate_for_point_to_plane():
     points, _ = wall(2000, noise=0.0)
-    source, target = mcg.preprocess(points + [0.1, 0.0, 0.02]), mcg.preprocess(points)
+    source, target = mcg.preprocess(points + np.array([0.1, 0.0, 0.02])), mcg.preprocess(points)
     result = mcg.register(source, target, mcg.PointToPlane(), max_distance=0.5)
     assert result.status is Status.DEGENERATE and not result.converged
     # What is held is found; what is free stays where it was.
@@ -237,7 +241,12 @@ BAD_ARGUMENTS = {
     "max_iterations": [{"max_iterations": 0}],
     "translation_tolerance": [{"translation_tolerance": -1.0}],
     "rotation_tolerance": [{"rotation_tolerance": np.nan}],
-    "init": [{"init": np.eye(3)}, {"init": np.diag([1.0, 1, -1, 1])}, {"init": np.full((4, 4), np.nan)}, {"init": 2 * np.eye(4)}],
+    "init": [
+        {"init": np.eye(3)},
+        {"init": np.diag([1.0, 1, -1, 1])},
+        {"init": np.full((4, 4), np.nan)},
+        {"init": 2 * np.eye(4)},
+    ],
 }
 
 
@@ -284,7 +293,10 @@ def test_channel_counts_must_fit(room):
         (lambda: mcg.GICP(-1e-3), "epsilon"),
         (lambda: mcg.MultiChannelGICP(epsilon=np.nan), "epsilon"),
         (lambda: mcg.MultiChannelGICP(min_eigenvalue=0.0), "min_eigenvalue"),
-        (lambda: mcg.MultiChannelGICP([[1.0, 2.0], [2.0, 1.0]]), "channel_covariance: expected it symmetric and positive"),
+        (
+            lambda: mcg.MultiChannelGICP([[1.0, 2.0], [2.0, 1.0]]),
+            "channel_covariance: expected it symmetric and positive",
+        ),
         (lambda: mcg.MultiChannelGICP([[1.0, 0.5], [0.0, 1.0]]), "channel_covariance: expected it symmetric"),
         (lambda: mcg.MultiChannelGICP(np.zeros((2, 3))), "channel_covariance: expected a scalar"),
         (lambda: mcg.MultiChannelGICP(0.0), "channel_covariance"),

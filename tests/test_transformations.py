@@ -195,7 +195,9 @@ def test_implicit_gradient_is_that_of_the_unrolled_loop(noisy):
         return weigh(pose.as_matrix())
 
     def implicit(points):
-        return weigh(mcg.align(source.replace(points=points), target, matches, method, init=motion(), **CONVERGED).matrix)
+        return weigh(
+            mcg.align(source.replace(points=points), target, matches, method, init=motion(), **CONVERGED).matrix
+        )
 
     expected, actual = jax.jit(jax.grad(unrolled))(source.points), jax.jit(jax.grad(implicit))(source.points)
     np.testing.assert_allclose(actual, expected, atol=1e-8 * np.abs(expected).max())
@@ -330,7 +332,9 @@ def test_nothing_dead_locks():
     loss = jax.jit(
         jax.value_and_grad(
             lambda channels: weigh(
-                mcg.register(source.replace(channels=channels), target, method, max_distance=0.2, max_iterations=4).matrix
+                mcg.register(
+                    source.replace(channels=channels), target, method, max_distance=0.2, max_iterations=4
+                ).matrix
             )
         )
     )
@@ -355,7 +359,9 @@ def test_nothing_dead_locks():
         jax.vmap(
             jax.grad(
                 lambda channels: weigh(
-                    mcg.register(small.replace(channels=channels), other, method, max_distance=0.2, max_iterations=4).matrix
+                    mcg.register(
+                        small.replace(channels=channels), other, method, max_distance=0.2, max_iterations=4
+                    ).matrix
                 )
             )
         )

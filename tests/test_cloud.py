@@ -1,0 +1,265 @@
+"""The point cloud as a container: nothing is lost on the way in, out, through jit, or into a file."""
+
+import copy
+import pickle
+
+import jax
+import jax.numpy as jnp
+import jaxlie
+import numpy as np
+import pytest
+
+from mcgicp_jax import PointCloud, preprocess
+from tests import reference as ref
+
+POINTS, CHANNELS = ref.scene(150, 2)
+T = ref.pose([0.3, -0.5, 0.8], [1.0, -2.0, 0.5])
+UTM = np.array([512_345.6, 5_403_210.9, 312.3])
+
+
+def covariances(seed=0):
+    root = np.random.default_rng(seed).normal(size=(150, 3, 3))
+    return (root @ root.swapaxes(1, 2)).astype(np.float32).astype(float)
+
+
+def raw(**kwargs):
+    return PointCloud(POINTS, CHANNELS, channel_names=("intensity", "heat"), **kwargs)
+
+
+def ready(cloud=None):
+    return preprocess(raw(covariances=covariances()) if cloud is None else cloud, num_neighbors=4)
+
+
+def leaves(cloud):
+    return {name: getattr(cloud, name) for name in cloud.__dataclass_fields__ if name != "channel_names"}
+
+
+def assert_same(a, b):
+    assert a.channel_names == b.channel_names
+    for name, value in leaves(a).items():
+        other = getattr(b, name)
+        if value is None:
+            assert other is None
+        else:
+            assert np.asarray(value).dtype == np.asarray(other).dtype
+            np.testing.assert_array_equal(value, other)
+
+
+def test_a_single_channel_may_be_a_vector():
+    np.testing.assert_array_equal(PointCloud(POINTS, CHANNELS[:, 0]).channels, CHANNELS[:, :1])
+
+
+def test_without_channels_there_are_none():
+    cloud = PointCloud(POINTS)
+    assert cloud.channels.shape == (150, 0)
+    assert cloud.channel_names == ()
+    assert len(cloud) == 150
+
+
+@pytest.mark.parametrize("size", [150, 160, 333])
+def test_unpad_undoes_pad(size):
+    cloud = raw(covariances=covariances())
+    padded = cloud.pad(size)
+    assert padded.points.shape == (size, 3)
+    assert len(padded) == 150
+    assert_same(padded.unpad(), cloud)
+
+
+def test_padding_says_so():
+    padded = ready().pad(240)
+    for name, fill in {"points": 0, "channels": 0, "valid": False, "neighbors": -1, "covariances": 0}.items():
+        assert (np.asarray(getattr(padded, name))[150:] == fill).all()
+    np.testing.assert_array_equal(padded.neighbors[:160], ready().neighbors)
+
+
+def test_a_cloud_cannot_be_padded_to_less():
+    with pytest.raises(ValueError, match="size"):
+        raw().pad(149)
+
+
+def test_unpad_after_preprocess_gives_the_input_back():
+    cloud = ready().unpad()
+    np.testing.assert_array_equal(cloud.points, POINTS)
+    np.testing.assert_array_equal(cloud.channels, CHANNELS)
+    np.testing.assert_array_equal(cloud.covariances, covariances())
+    assert cloud.channel_names == ("intensity", "heat")
+    assert isinstance(cloud.points, np.ndarray)
+
+
+def test_replace_exchanges_and_leaves_the_rest():
+    cloud = ready()
+    channels = jnp.ones_like(cloud.channels)
+    replaced = cloud.replace(channels=channels)
+    assert_same(replaced, ready().replace(channels=channels))
+    assert replaced.points is cloud.points
+    assert not np.any(np.asarray(cloud.channels)[:150] == 1)
+
+
+def test_replace_with_another_number_of_channels_names_them_anew():
+    replaced = ready().replace(channels=jnp.zeros((160, 5)))
+    assert len(replaced.channel_names) == 5
+
+
+@pytest.mark.parametrize(
+    "arrays, message",
+    [
+        ({"points": np.zeros((159, 3))}, "points"),
+        ({"points": np.zeros((160, 2))}, "points"),
+        ({"channels": np.zeros((159, 2))}, "channels"),
+        ({"channels": np.zeros(160)}, "channels"),
+        ({"covariances": np.zeros((160, 3))}, "covariances"),
+        ({"colour": np.zeros((160, 3))}, "colour"),
+    ],
+    ids=str,
+)
+def test_replace_refuses_what_does_not_fit(arrays, message):
+    with pytest.raises(ValueError, match=message):
+        ready().replace(**arrays)
+
+
+def test_replace_checks_covariances_where_there_were_none():
+    with pytest.raises(ValueError, match="covariances"):
+        ready(raw()).replace(covariances=np.zeros((5,)))
+
+
+def test_replace_can_take_covariances_away():
+    assert ready().replace(covariances=None).covariances is None
+
+
+@pytest.mark.parametrize("form", ["numpy", "jax", "jaxlie"])
+@pytest.mark.parametrize("cloud", [raw(covariances=covariances()), ready()], ids=["raw", "ready"])
+def test_transform_moves_points_and_turns_covariances(form, cloud):
+    pose = {
+        "numpy": T,
+        "jax": jnp.asarray(T),
+        "jaxlie": jaxlie.SE3.from_matrix(jnp.asarray(T)),
+    }[form]
+    moved = cloud.transform(pose)
+    R, t = T[:3, :3], T[:3, 3]
+    atol = ref.tolerance(2e-6, 1e-12)
+    np.testing.assert_allclose(np.asarray(moved.points)[:150], POINTS @ R.T + t, atol=atol)
+    np.testing.assert_allclose(np.asarray(moved.covariances)[:150], R @ covariances() @ R.T, atol=10 * atol)
+    np.testing.assert_array_equal(moved.channels, cloud.channels)
+    assert moved.points.dtype == cloud.points.dtype
+    assert len(moved) == 150
+
+
+def test_transform_there_and_back():
+    cloud = ready()
+    back = cloud.transform(T).transform(np.linalg.inv(T))
+    np.testing.assert_allclose(back.points[:150], cloud.points[:150], atol=ref.tolerance(2e-6, 1e-12))
+
+
+def test_transform_keeps_the_digits_of_large_coordinates():
+    cloud = ready(PointCloud(POINTS + UTM))
+    expected = (POINTS + UTM) @ T[:3, :3].T + T[:3, 3]
+    np.testing.assert_allclose(cloud.transform(T).unpad().points, expected, rtol=0, atol=ref.tolerance(2e-6, 1e-8))
+
+
+def test_transform_to_large_coordinates_keeps_the_digits():
+    """A scan taken in the sensor's frame, put into a map that is in UTM."""
+    far = T.copy()
+    far[:3, 3] += UTM
+    expected = POINTS @ far[:3, :3].T + far[:3, 3]
+    np.testing.assert_allclose(ready().transform(far).unpad().points, expected, rtol=0, atol=ref.tolerance(2e-6, 1e-8))
+
+
+def test_transform_under_jit_and_grad():
+    cloud = ready()
+    pose = jnp.asarray(T, cloud.points.dtype)
+    moved = jax.jit(PointCloud.transform)(cloud, pose)
+    np.testing.assert_allclose(moved.points, cloud.transform(T).points, atol=ref.tolerance(2e-6, 1e-12))
+    gradient = jax.grad(lambda pose: jnp.sum(cloud.transform(pose).points[:150]))(pose)
+    np.testing.assert_allclose(gradient[:3, 3], 150, rtol=1e-6)
+
+
+@pytest.mark.parametrize(
+    "pose",
+    [np.eye(3), 2 * np.eye(4), np.diag([-1.0, 1, 1, 1]), np.full((4, 4), np.nan), "left", np.eye(4) + 1],
+    ids=["shape", "scale", "mirror", "NaN", "text", "not rigid"],
+)
+def test_transform_refuses_what_is_no_pose(pose):
+    with pytest.raises(ValueError, match="pose"):
+        raw().transform(pose)
+
+
+def test_stack():
+    clouds = [ready(), ready(raw(covariances=covariances()).transform(T))]
+    clouds[1] = preprocess(clouds[1].unpad(), num_neighbors=4).pad(200)
+    stacked = PointCloud.stack(clouds)
+    assert stacked.points.shape == (2, 240, 3)
+    for i, cloud in enumerate(clouds):
+        lane = jax.tree.map(lambda leaf, i=i: leaf[i], stacked)
+        assert_same(lane.unpad(), cloud.unpad())
+        np.testing.assert_array_equal(lane.neighbors[:150], cloud.neighbors[:150])
+        assert not np.any(lane.valid[150:])
+    assert "2" in repr(stacked)
+
+
+def test_stack_keeps_large_origins():
+    clouds = [ready(PointCloud(POINTS + UTM)), ready(PointCloud(POINTS - UTM))]
+    stacked = PointCloud.stack(clouds)
+    np.testing.assert_array_equal(stacked.origin, [cloud.origin for cloud in clouds])
+    assert np.asarray(stacked.origin).dtype == np.float64
+
+
+def test_stack_of_nothing():
+    with pytest.raises(ValueError, match="clouds"):
+        PointCloud.stack([])
+
+
+def pickled(cloud):
+    return pickle.loads(pickle.dumps(cloud))
+
+
+@pytest.mark.parametrize("cloud", [raw(), raw(covariances=covariances()), ready()], ids=["raw", "covariances", "ready"])
+@pytest.mark.parametrize("through", [pickled, copy.deepcopy])
+def test_copies_are_the_same(cloud, through):
+    assert_same(through(cloud), cloud)
+    assert repr(through(cloud)) == repr(cloud)
+
+
+def test_a_cloud_goes_through_jit():
+    cloud = ready()
+    through = jax.jit(lambda cloud: cloud)(cloud)
+    assert isinstance(through, PointCloud)
+    assert_same(through.replace(origin=cloud.origin), cloud)
+    assert not np.any(through.origin)
+    flat, structure = jax.tree.flatten(cloud)
+    assert_same(jax.tree.unflatten(structure, flat), cloud)
+
+
+def test_clouds_of_one_size_class_share_a_program():
+    traced = []
+
+    @jax.jit
+    def total(cloud):
+        traced.append(1)
+        return jnp.sum(cloud.points)
+
+    for num_points in (129, 140, 160):
+        total(preprocess(PointCloud(np.resize(POINTS, (num_points, 3))), num_neighbors=4))
+    assert len(traced) == 1
+
+
+@pytest.mark.parametrize(
+    "cloud, expected",
+    [
+        (raw(), ["150 points", "intensity, heat"]),
+        (ready(), ["150 points padded to 160", "4 neighbors"]),
+        (PointCloud(POINTS), ["none"]),
+        (ready(PointCloud(POINTS + UTM)), ["origin", "e+06"]),
+    ],
+)
+def test_repr_is_short_and_says_what_matters(cloud, expected):
+    text = repr(cloud)
+    assert len(text) < 160
+    assert text.startswith("PointCloud(")
+    for part in expected:
+        assert part in text
+
+
+def test_repr_inside_a_transformation():
+    seen = []
+    jax.jit(lambda cloud: seen.append(repr(cloud)) or cloud.points)(ready())
+    assert "160" in seen[0]

@@ -1,0 +1,349 @@
+"""The cost, its kernels and its gradients, against NumPy and central differences."""
+
+import functools
+
+import jax
+import jax.numpy as jnp
+import jaxlie
+import numpy as np
+import pytest
+
+from mcgicp_jax import (
+    GICP,
+    Cauchy,
+    ColorICP,
+    Correspondences,
+    GemanMcClure,
+    Huber,
+    MultiChannelGICP,
+    PointCloud,
+    PointToPlane,
+    PointToPoint,
+    Tukey,
+    mahalanobis_cost,
+    preprocess,
+)
+from mcgicp_jax._cost import evaluate_pairs, moments
+from mcgicp_jax._methods import prepare
+from tests import reference as ref
+from tests.reference import tolerance
+
+N, K, ROWS = 150, 12, 160
+EPSILON, FLOOR, REGULARISATION = 0.02, 1e-3, 1e-6
+LAMBDA = np.array([[0.5, 0.2, 0.0], [0.2, 0.4, -0.1], [0.0, -0.1, 0.6]])
+T = ref.pose([0.05, -0.08, 0.1], [0.03, 0.05, -0.04])
+KERNELS = {"huber": Huber, "cauchy": Cauchy, "geman_mcclure": GemanMcClure, "tukey": Tukey}
+SCALE = 0.4
+METHODS = {
+    "PointToPoint": PointToPoint(),
+    "PointToPlane": PointToPlane(),
+    "ColorICP": ColorICP(0.2),
+    "GICP": GICP(EPSILON),
+    "MultiChannelGICP": MultiChannelGICP(LAMBDA, 0.2, EPSILON, FLOOR),
+}
+
+
+@functools.cache
+def problem():
+    """Two clouds, their neighbours, and matches of which some are none."""
+    raw = [ref.scene(N, 3, seed) for seed in (0, 1)]
+    neighbors = [ref.nearest(points, points, K) for points, _ in raw]
+    clouds = [preprocess(PointCloud(*arrays), num_neighbors=K) for arrays in raw]
+    (a, ca), (b, cb) = raw
+    matched = ref.match(a, b, T, 0.3, ca, cb, 0.2)
+    assert 30 < np.sum(matched >= 0) < 140
+    rows = np.full(ROWS, -1)
+    rows[:N] = matched
+    # What has no match points at padding, of all rows the least useful.
+    matches = Correspondences(
+        indices=jnp.asarray(np.where(rows >= 0, rows, ROWS - 1), jnp.int32),
+        distances=jnp.zeros(ROWS, clouds[0].points.dtype),
+        valid=jnp.asarray(rows >= 0),
+    )
+    return raw, neighbors, clouds, matches, matched
+
+
+def information(name, source, target, neighbors, channel_covariance=LAMBDA, epsilon=EPSILON):
+    """The reference's M, from points and channels of both clouds."""
+    if name in ("PointToPoint", "ColorICP"):
+        return ref.identity_information
+    if name == "PointToPlane":
+        return ref.plane_information([ref.normal(target[0][row]) for row in neighbors[1]])
+    sides = zip((source, target), neighbors, strict=True)
+    if name == "GICP":
+        return ref.pair_information(*(ref.gicp_covariances(side[0], rows, epsilon) for side, rows in sides))
+    return ref.pair_information(
+        *(
+            ref.multi_channel_covariances(*side, rows, channel_covariance, epsilon, FLOOR, REGULARISATION)
+            for side, rows in sides
+        )
+    )
+
+
+def reference_cost(name, pose=T, source=None, target=None, rho=None, **numbers):
+    raw, neighbors, _, _, matched = problem()
+    source, target = source or raw[0], target or raw[1]
+    return ref.cost(pose, source[0], target[0], matched, information(name, source, target, neighbors, **numbers), rho)
+
+
+@pytest.mark.parametrize("kernel", [None, *KERNELS])
+@pytest.mark.parametrize("name", METHODS)
+def test_cost_against_the_reference(name, kernel):
+    _, _, clouds, matches, _ = problem()
+    robust = None if kernel is None else KERNELS[kernel](SCALE)
+    rho = None if kernel is None else functools.partial(ref.ROBUST[kernel], c=SCALE)
+    actual = mahalanobis_cost(T, *clouds, matches, METHODS[name], robust=robust)
+    assert actual.dtype == clouds[0].points.dtype
+    assert float(actual) == pytest.approx(reference_cost(name, rho=rho), rel=tolerance(1e-4, 1e-10))
+
+
+@pytest.mark.parametrize("form", ["jax", "jaxlie"])
+def test_every_form_of_pose(form):
+    _, _, clouds, matches, _ = problem()
+    pose = jnp.asarray(T) if form == "jax" else jaxlie.SE3.from_matrix(jnp.asarray(T))
+    actual = mahalanobis_cost(pose, *clouds, matches, METHODS["GICP"])
+    assert float(actual) == pytest.approx(reference_cost("GICP"), rel=tolerance(1e-4, 1e-10))
+
+
+@pytest.mark.parametrize("kernel", [None, "cauchy"])
+def test_at_large_coordinates_the_cost_is_the_same(kernel):
+    utm = np.array([512_345.6, 5_403_210.9, 312.3])
+    raw, _, _, matches, _ = problem()
+    clouds = [preprocess(PointCloud(points + utm, channels), num_neighbors=K) for points, channels in raw]
+    shift, back = np.eye(4), np.eye(4)
+    shift[:3, 3], back[:3, 3] = utm, -utm
+    robust = None if kernel is None else Cauchy(SCALE)
+    rho = None if kernel is None else functools.partial(ref.ROBUST["cauchy"], c=SCALE)
+    actual = mahalanobis_cost(shift @ T @ back, *clouds, matches, METHODS["MultiChannelGICP"], robust=robust)
+    assert float(actual) == pytest.approx(reference_cost("MultiChannelGICP", rho=rho), rel=tolerance(1e-3, 1e-6))
+
+
+SQUARES = np.concatenate([[0.0, 1e-12], np.geomspace(1e-4, 1e4, 60)])
+
+
+@pytest.mark.parametrize("scale", [0.1, 1.0, 7.0])
+@pytest.mark.parametrize("name", KERNELS)
+def test_kernels_against_the_reference(name, scale):
+    kernel = KERNELS[name](scale)
+    squares = jnp.asarray(SQUARES, jnp.zeros(()).dtype)
+    expected = [ref.ROBUST[name](s2, scale) for s2 in SQUARES]
+    np.testing.assert_allclose(
+        kernel.rho(squares), expected, rtol=tolerance(2e-5, 1e-9), atol=tolerance(3e-7, 1e-15) * scale**2
+    )
+
+
+@pytest.mark.parametrize("scale", [0.1, 1.0, 7.0])
+@pytest.mark.parametrize("name", KERNELS)
+def test_the_weight_is_the_derivative_of_rho(name, scale):
+    kernel = KERNELS[name](scale)
+    dtype = jnp.zeros(()).dtype
+    # Away from the corners of Huber and Tukey, where a central difference straddles two branches.
+    squares = SQUARES[(SQUARES > 1e-5) & (np.abs(SQUARES / scale**2 - 1) > 0.01)]
+    step = 3e-4 * squares
+    expected = [
+        (ref.ROBUST[name](s2 + h, scale) - ref.ROBUST[name](s2 - h, scale)) / (2 * h)
+        for s2, h in zip(squares, step, strict=True)
+    ]
+    weights = kernel.weight(jnp.asarray(squares, dtype))
+    np.testing.assert_allclose(weights, expected, rtol=tolerance(1e-4, 1e-5), atol=tolerance(1e-6, 1e-8))
+    slope = jax.vmap(jax.grad(lambda s2: kernel.rho(s2[None])[0]))(jnp.asarray(squares, dtype))
+    np.testing.assert_allclose(slope, weights, rtol=tolerance(1e-4, 1e-10), atol=1e-6)
+    np.testing.assert_allclose(kernel.weight(jnp.zeros(1, dtype)), 1)
+
+
+@pytest.mark.parametrize("name", KERNELS)
+def test_gradients_of_kernels_are_finite(name):
+    kernel, squares = KERNELS[name](1.0), jnp.array([0.0, 1.0, 1e-30, 1e30])
+    for function in (kernel.rho, kernel.weight):
+        assert np.isfinite(jax.grad(lambda s2, function=function: jnp.sum(function(s2)))(squares)).all()
+
+
+@pytest.mark.parametrize("scale", [0, -1.0, np.nan, np.inf, np.ones(2)])
+@pytest.mark.parametrize("name", KERNELS)
+def test_a_scale_that_makes_no_sense(name, scale):
+    with pytest.raises(ValueError, match="scale"):
+        KERNELS[name](scale)
+
+
+ARGUMENTS = ("pose", "source points", "target points", "source channels", "target channels", "Λ", "ε")
+
+
+@functools.partial(jax.jit, static_argnums=0)
+def value_and_gradients(name, *arguments):
+    _, _, clouds, matches, _ = problem()
+
+    def value(pose, source_points, target_points, source_channels, target_channels, channel_covariance, epsilon):
+        source = clouds[0].replace(points=source_points, channels=source_channels)
+        target = clouds[1].replace(points=target_points, channels=target_channels)
+        method = METHODS[name]
+        if name == "GICP":
+            method = GICP(epsilon)
+        elif name == "MultiChannelGICP":
+            method = MultiChannelGICP(channel_covariance, 0.2, epsilon, FLOOR)
+        return mahalanobis_cost(pose, source, target, matches, method, robust=Cauchy(SCALE))
+
+    return jax.value_and_grad(value, argnums=tuple(range(7)))(*arguments)
+
+
+@functools.cache
+def gradients(name):
+    _, _, (source, target), _, _ = problem()
+    numbers = (source.points, target.points, source.channels, target.channels, LAMBDA, EPSILON)
+    _, found = value_and_gradients(name, *(jnp.asarray(a, source.points.dtype) for a in (T, *numbers)))
+    return dict(zip(ARGUMENTS, found, strict=True))
+
+
+@pytest.mark.parametrize("argument", ARGUMENTS)
+@pytest.mark.parametrize("name", ["PointToPlane", "ColorICP", "GICP", "MultiChannelGICP"])
+def test_gradients_against_differences_of_the_reference(name, argument):
+    raw = problem()[0]
+    gradient = np.asarray(gradients(name)[argument], float)
+    assert np.isfinite(gradient).all()
+    which = ARGUMENTS.index(argument)
+    (a, ca), (b, cb) = raw
+    at = (T, a, b, ca, cb, LAMBDA, np.array(EPSILON))
+    rng = np.random.default_rng(which)
+    direction = rng.normal(size=at[which].shape)
+    if argument == "pose":
+        # A pose that leaves SO(3) has no cost to speak of: along the group, δT = ξ^ T.
+        w = rng.normal(size=3)
+        hat = np.array([[0, -w[2], w[1]], [w[2], 0, -w[0]], [-w[1], w[0], 0]])
+        direction[:3], direction[3] = np.hstack([hat @ T[:3, :3], rng.normal(size=(3, 1))]), 0
+    if argument == "Λ":
+        direction += direction.T
+
+    def value(changed):
+        x = [*at[:which], changed, *at[which + 1 :]]
+        rho = functools.partial(ref.ROBUST["cauchy"], c=SCALE)
+        return reference_cost(name, x[0], (x[1], x[3]), (x[2], x[4]), rho, channel_covariance=x[5], epsilon=x[6])
+
+    expected = ref.difference(value, at[which], direction, 1e-5 * (EPSILON if argument == "ε" else 0.1))
+    if gradient.shape[:1] == (ROWS,):
+        np.testing.assert_array_equal(gradient[N:], 0)
+        gradient = gradient[:N]
+    actual = np.sum(gradient * direction)
+    assert actual == pytest.approx(expected, rel=tolerance(5e-3, 1e-6), abs=tolerance(1e-4, 1e-9))
+
+
+def test_the_gradients_are_not_all_zero():
+    """What each method depends on, and on nothing else."""
+    sensitive = {name: {a for a, g in gradients(name).items() if np.any(g)} for name in METHODS}
+    points = {"pose", "source points", "target points"}
+    assert sensitive["PointToPoint"] == sensitive["ColorICP"] == sensitive["PointToPlane"] == points
+    assert sensitive["GICP"] == points | {"ε"}
+    assert sensitive["MultiChannelGICP"] == set(ARGUMENTS)
+
+
+def test_rows_without_a_match_add_nothing():
+    """Whatever they point at, and whatever lies there: the value and the gradient do not move."""
+    _, _, (source, target), matches, matched = problem()
+    free = np.flatnonzero(matched < 0)[:5]
+    elsewhere = Correspondences(
+        indices=matches.indices.at[free].set(3), distances=matches.distances, valid=matches.valid
+    )
+    for method in METHODS.values():
+        cost = mahalanobis_cost(T, source, target, matches, method)
+        np.testing.assert_allclose(mahalanobis_cost(T, source, target, elsewhere, method), cost, rtol=1e-6)
+
+
+def test_not_even_nan_where_there_is_no_match():
+    _, _, (source, target), matches, matched = problem()
+    free = np.flatnonzero(matched < 0)[:5]
+    points = source.points.at[free].set(jnp.nan)
+
+    def cost(points):
+        return mahalanobis_cost(T, source.replace(points=points), target, matches, PointToPoint(), robust=Huber(SCALE))
+
+    value, gradient = jax.value_and_grad(cost)(points)
+    expected, gradient_of_all = jax.value_and_grad(cost)(source.points)
+    assert value == expected
+    np.testing.assert_array_equal(gradient, gradient_of_all)
+
+
+def test_padding_of_given_covariances_adds_nothing():
+    """Their padding is zero, and a pair of two such rows has no inverse: no NaN may come of it."""
+    _, _, clouds, matches, _ = problem()
+    given = np.tile(np.diag([1.0, 1.0, 0.01]), (N, 1, 1))
+    source, target = (
+        preprocess(PointCloud(cloud.unpad().points, cloud.unpad().channels, covariances=given), num_neighbors=K)
+        for cloud in clouds
+    )
+
+    def cost(points, covariances):
+        moved = source.replace(points=points, covariances=covariances)
+        return mahalanobis_cost(T, moved, target, matches, GICP())
+
+    value, found = jax.value_and_grad(cost, argnums=(0, 1))(source.points, source.covariances)
+    assert np.isfinite(value)
+    for gradient in found:
+        assert np.isfinite(gradient).all()
+        np.testing.assert_array_equal(gradient[N:], 0)
+
+
+def test_no_matches_cost_nothing():
+    _, _, clouds, matches, _ = problem()
+    none = Correspondences(indices=matches.indices, distances=matches.distances, valid=jnp.zeros(ROWS, bool))
+    for method in METHODS.values():
+        assert mahalanobis_cost(T, *clouds, none, method) == 0
+
+
+def test_matches_of_another_cloud_are_refused():
+    _, _, clouds, matches, _ = problem()
+    with pytest.raises(ValueError, match="matches"):
+        mahalanobis_cost(T, clouds[0].pad(200), clouds[1], matches, GICP())
+
+
+def test_a_batch_is_its_lanes():
+    _, _, (source, target), matches, _ = problem()
+    dtype = source.points.dtype
+    poses = jnp.asarray(np.stack([T, ref.pose([0.02, 0, 0], [0, 0.1, 0]), np.eye(4)]), dtype)
+
+    def cost(pose):
+        return mahalanobis_cost(pose, source, target, matches, METHODS["MultiChannelGICP"])
+
+    values, slopes = jax.jit(jax.vmap(jax.value_and_grad(cost)))(poses)
+    for i, pose in enumerate(poses):
+        assert float(values[i]) == pytest.approx(
+            reference_cost("MultiChannelGICP", np.asarray(pose, float)), rel=tolerance(1e-4, 1e-6)
+        )
+    assert np.isfinite(slopes).all()
+
+
+@pytest.mark.parametrize("kernel", [None, "huber"])
+def test_the_moments_say_what_the_pairs_say(kernel):
+    """e − 2⟨D, G⟩ + ⟨D, Q(D)⟩ = Σ w (d − D h)ᵀ M (d − D h) for any D."""
+    _, _, (source, target), matches, matched = problem()
+    dtype = source.points.dtype
+    method = METHODS["MultiChannelGICP"]
+    surfaces = prepare(method, source), prepare(method, target)
+    R, t = jnp.asarray(T[:3, :3], dtype), jnp.asarray(T[:3, 3], dtype)
+    robust = None if kernel is None else Huber(SCALE)
+    found = jax.jit(lambda: moments(evaluate_pairs(R, t, *surfaces, matches, method, robust), matches))()
+
+    raw, neighbors, _, _, _ = problem()
+    pair_information = information("MultiChannelGICP", *raw, neighbors)
+    kept = np.flatnonzero(matched >= 0)
+    moved = raw[0][0][kept] @ T[:3, :3].T + T[:3, 3]
+    center = moved.mean(axis=0)
+    np.testing.assert_allclose(found.center, center, atol=tolerance(1e-6, 1e-12))
+    radius = np.sqrt(np.mean(np.sum((moved - center) ** 2, axis=1)))
+    assert float(found.radius) == pytest.approx(radius, rel=tolerance(1e-5, 1e-12))
+
+    D = 0.05 * np.random.default_rng(0).normal(size=(3, 4))
+    expected = 0.0
+    for i, p in zip(kept, moved, strict=True):
+        M = pair_information(i, matched[i], T[:3, :3])
+        d = raw[1][0][matched[i]] - p
+        s2 = d @ M @ d
+        weight = 1.0 if kernel is None or s2 <= SCALE**2 else SCALE / np.sqrt(s2)
+        left = d - D @ np.append(p - center, 1)
+        expected += weight * left @ M @ left
+    Q = np.zeros((3, 4, 3, 4))
+    three, four = np.triu_indices(3), np.triu_indices(4)
+    for row, (i, j) in enumerate(zip(*three, strict=True)):
+        for column, (k, l) in enumerate(zip(*four, strict=True)):
+            for p, q in {(i, j), (j, i)}:
+                for r, s in {(k, l), (l, k)}:
+                    Q[p, r, q, s] = found.Q[row, column]
+    actual = float(found.e) - 2 * np.sum(D * np.asarray(found.G)) + np.einsum("ij,ijkl,kl", D, Q, D)
+    assert actual == pytest.approx(expected, rel=tolerance(1e-4, 1e-10))

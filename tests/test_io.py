@@ -1,0 +1,928 @@
+"""Files: what is written comes back, what others write is understood, and what is broken says so in one ValueError."""
+
+import io as stdio
+import pathlib
+import pickle
+import struct
+import sys
+import tracemalloc
+import zipfile
+
+import jax
+import laspy
+import numpy as np
+import plyfile
+import pypcd4
+import pytest
+from hypothesis import HealthCheck, example, given, settings
+from hypothesis import strategies as st
+
+from mcgicp_jax import io
+from mcgicp_jax._cloud import PointCloud
+
+RNG = np.random.default_rng(0)
+N = 40
+INTENSITY = ("intensity",)
+RGB = ("red", "green", "blue")
+FORMATS = (".ply", ".pcd", ".las", ".laz", ".bin", ".npy", ".npz", ".xyz", ".txt", ".csv")
+NAMED = (".ply", ".pcd", ".npz", ".xyz", ".txt", ".csv")
+EXTRAS = {".ply": "plyfile", ".pcd": "pypcd4", ".las": "laspy", ".laz": "laspy"}
+
+
+def make(names=INTENSITY, dtype=np.float32, num_points=N):
+    """Points within 10 m; whole intensities, colours that are 255ths."""
+    scale = {"intensity": 1} | dict.fromkeys(RGB, 255)
+    channels = [
+        RNG.integers(0, 256, num_points).astype(dtype) / dtype(scale[n]) if n in scale else RNG.random(num_points)
+        for n in names
+    ]
+    points = RNG.uniform(-10, 10, (num_points, 3)).astype(dtype)
+    return PointCloud(points, np.array(channels, dtype).reshape(len(names), num_points).T, channel_names=names)
+
+
+def same(actual, expected, points_atol=0.0, channels_atol=0.0):
+    """The values are those expected, whatever the order of the channels."""
+    assert sorted(actual.channel_names) == sorted(expected.channel_names)
+    order = [actual.channel_names.index(name) for name in expected.channel_names]
+    np.testing.assert_allclose(actual.points, expected.points, rtol=0, atol=points_atol)
+    np.testing.assert_allclose(actual.channels[:, order], expected.channels, rtol=0, atol=channels_atol)
+
+
+def structured(**columns):
+    rows = np.empty(len(next(iter(columns.values()))), [(name, np.asarray(v).dtype) for name, v in columns.items()])
+    for name, values in columns.items():
+        rows[name] = values
+    return rows
+
+
+def xyz(dtype=np.float32):
+    return dict(zip("xyz", RNG.uniform(-10, 10, (3, N)).astype(dtype), strict=True))
+
+
+def write_ply(path, rows, text=False, byte_order="<", more=()):
+    plyfile.PlyData([plyfile.PlyElement.describe(rows, "vertex"), *more], text=text, byte_order=byte_order).write(path)
+
+
+def write_pcd(path, encoding=pypcd4.Encoding.BINARY, counts=None, **columns):
+    values = [np.asarray(column) for column in columns.values()]
+    types = [column.dtype for column in values]
+    pypcd4.PointCloud.from_points(values, list(columns), types, counts).save(path, encoding)
+
+
+def las_data(point_format=2, num_points=N, **columns):
+    header = laspy.LasHeader(point_format=point_format)
+    header.scales, header.offsets = np.full(3, 1e-3), np.array([500_000.0, 5_400_000.0, 100.0])
+    las = laspy.LasData(header)
+    las.xyz = header.offsets + RNG.integers(0, 10**6, (num_points, 3)) * 1e-3
+    for name, values in columns.items():
+        las[name] = values
+    return las
+
+
+def bytes_of(suffix, folder, names=INTENSITY):
+    io.write(folder / f"seed{suffix}", make(names))
+    return (folder / f"seed{suffix}").read_bytes()
+
+
+# Round trips
+
+
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+@pytest.mark.parametrize(
+    "names", [(), INTENSITY, RGB, INTENSITY + RGB, ("channel_0",), ("channel_0", "heat", *INTENSITY)]
+)
+@pytest.mark.parametrize("suffix", FORMATS)
+def test_round_trip(tmp_path, suffix, names, dtype):
+    cloud, path = make(names, dtype), tmp_path / f"cloud{suffix}"
+    fits = {".bin": len(names) == 1, ".las": {*names} <= {*INTENSITY, *RGB}}
+    fits[".laz"] = fits[".las"]
+    if not fits.get(suffix, True):
+        with pytest.raises(ValueError, match=r"channel.*\.ply"):
+            io.write(path, cloud)
+        assert not list(tmp_path.iterdir())
+        return
+    io.write(path, cloud)
+    back = io.read(path)
+    if suffix in (".npy", ".bin"):
+        unnamed = [f"channel_{i}" for i in range(len(names))]
+        cloud = cloud.replace(channel_names=tuple(unnamed) if suffix == ".npy" else INTENSITY)
+    las, kitti = suffix in (".las", ".laz"), suffix == ".bin"
+    same(back, cloud, 1e-7 if las else 1e-6 * kitti, 1e-7 if las else 1e-6 * kitti)
+    if suffix in (".ply", ".pcd", ".npz", ".npy"):
+        assert back.points.dtype == dtype
+        assert back.channels.dtype == dtype or not names
+    same(io.read(path), back)
+
+
+@pytest.mark.parametrize("suffix", NAMED)
+def test_any_name_survives(tmp_path, suffix):
+    names = (
+        "time",
+        "reflectance",
+        "intensity",
+        "channel_time",
+        "x",
+        "X",
+        "Red",
+        "r",
+        "rgb",
+        "_",
+        "list",
+        "scalar_a",
+        "1",
+    )
+    cloud = make(names)
+    io.write(tmp_path / f"c{suffix}", cloud)
+    same(io.read(tmp_path / f"c{suffix}"), cloud)
+
+
+@pytest.mark.parametrize("suffix", NAMED)
+def test_channel_order(tmp_path, suffix):
+    names = ("heat", *RGB, "intensity", "dust")
+    io.write(tmp_path / f"c{suffix}", make(names))
+    back = io.read(tmp_path / f"c{suffix}")
+    assert back.channel_names == (names if suffix == ".npz" else ("intensity", *RGB, "heat", "dust"))
+
+
+@pytest.mark.parametrize("suffix", [s for s in NAMED if s != ".npz"])
+@pytest.mark.parametrize("names", [("two words",), ("naïve",), ("a,b",), ("",), ("a", "a")])
+def test_names_that_do_not_fit(tmp_path, suffix, names):
+    with pytest.raises(ValueError, match=r"channel_names.*npz"):
+        io.write(tmp_path / f"c{suffix}", make(names))
+
+
+def test_npz_keeps_everything(tmp_path):
+    covariances = RNG.random((N, 3, 3))
+    cloud = PointCloud(make().points, RNG.random((N, 2)), covariances=covariances, channel_names=("two words", "ü"))
+    io.write(tmp_path / "c.npz", cloud)
+    back = io.read(tmp_path / "c.npz")
+    same(back, cloud)
+    np.testing.assert_array_equal(back.covariances, covariances)
+
+
+@pytest.mark.parametrize("suffix", NAMED)
+def test_extreme_values_survive(tmp_path, suffix):
+    cloud = make((*RGB, "heat"), np.float64)
+    cloud.points[:4, 0] = [np.nan, np.inf, -np.inf, 5_400_000.123456789]
+    cloud.channels[:5] = np.array([[np.nan], [1e308], [-1], [-0.0], [1 / 3]])
+    io.write(tmp_path / f"c{suffix}", cloud)
+    same(io.read(tmp_path / f"c{suffix}"), cloud)
+
+
+@pytest.mark.parametrize("suffix", [".ply", ".pcd"])
+def test_colours_of_mixed_precision_survive(tmp_path, suffix):
+    cloud = PointCloud(make().points, make(RGB, np.float64).channels, channel_names=RGB)
+    io.write(tmp_path / f"c{suffix}", cloud)
+    same(io.read(tmp_path / f"c{suffix}"), cloud)
+
+
+@pytest.mark.parametrize("suffix", FORMATS)
+def test_only_valid_rows_in_the_users_frame(tmp_path, suffix):
+    raw, valid = make(), np.arange(N) % 3 > 0
+    origin = np.zeros(3) if suffix == ".bin" else np.array([500_000.0, 5_400_000.0, 0.0])
+    io.write(tmp_path / f"c{suffix}", raw.replace_rows(valid=valid, origin=origin))
+    back = io.read(tmp_path / f"c{suffix}")
+    np.testing.assert_allclose(back.points, raw.points[valid].astype(np.float64) + origin, rtol=0, atol=1e-6)
+
+
+def test_suffix_in_any_case(tmp_path):
+    for suffix in FORMATS:
+        io.write(tmp_path / f"c{suffix.upper()}", make())
+        io.read(str(tmp_path / f"c{suffix.upper()}"))
+    assert len(list(tmp_path.iterdir())) == len(FORMATS)
+
+
+# PLY
+
+
+@pytest.mark.parametrize(("text", "byte_order"), [(True, "="), (False, "<"), (False, ">")])
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+def test_ply_encodings(tmp_path, text, byte_order, dtype):
+    columns = xyz(dtype) | {"red": np.arange(N, dtype=np.uint8), "green": np.full(N, 255, np.uint8)}
+    columns |= {"blue": np.zeros(N, np.uint8), "scalar_intensity": RNG.random(N).astype(dtype)}
+    write_ply(tmp_path / "c.ply", structured(**columns), text, byte_order)
+    cloud = io.read(tmp_path / "c.ply")
+    assert cloud.channel_names == ("intensity", *RGB)
+    assert cloud.points.dtype == cloud.channels.dtype == dtype
+    assert cloud.points.dtype.isnative and cloud.points.flags.writeable
+    np.testing.assert_array_equal(cloud.points.T, [columns[axis] for axis in "xyz"])
+    np.testing.assert_array_equal(cloud.channels[:, 0], columns["scalar_intensity"])
+    np.testing.assert_array_equal(cloud.channels[:, 1], np.arange(N).astype(dtype) / dtype(255))
+    np.testing.assert_array_equal(cloud.channels[:, 2:], np.tile([1.0, 0.0], (N, 1)))
+
+
+@pytest.mark.parametrize(
+    "column",
+    ["intensity", "scalar_Intensity", "Intensity", "reflectance", "scalar_Reflectance", "reflectivity", "remission"],
+)
+@pytest.mark.parametrize("dtype", [np.float32, np.uint16, np.uint8, np.float64])
+def test_ply_intensity_names(tmp_path, column, dtype):
+    values = np.arange(N).astype(dtype)
+    write_ply(tmp_path / "c.ply", structured(**xyz(), **{column: values}))
+    cloud = io.read(tmp_path / "c.ply")
+    assert cloud.channel_names == INTENSITY
+    np.testing.assert_array_equal(cloud.channels[:, 0], values)
+
+
+@pytest.mark.parametrize(
+    "names", [("r", "g", "b"), ("diffuse_red", "diffuse_green", "diffuse_blue"), ("Red", "Green", "Blue")]
+)
+@pytest.mark.parametrize(("dtype", "scale"), [(np.float32, 1), (np.uint8, 255), (np.uint16, 65535), (np.int32, 255)])
+def test_ply_colour_names(tmp_path, names, dtype, scale):
+    values = RNG.integers(0, 2, (3, N)) * (scale if scale > 1 else 0.5)
+    write_ply(tmp_path / "c.ply", structured(**xyz(), **dict(zip(names, values.astype(dtype), strict=True))))
+    cloud = io.read(tmp_path / "c.ply")
+    assert cloud.channel_names == RGB
+    np.testing.assert_allclose(cloud.channels, values.T / scale, rtol=1e-6)
+
+
+def test_ply_intensity_is_not_reflectivity(tmp_path):
+    columns = {"reflectivity": np.zeros(N, np.float32), "intensity": np.ones(N, np.float32)}
+    write_ply(tmp_path / "c.ply", structured(**xyz(), **columns))
+    cloud = io.read(tmp_path / "c.ply")
+    assert cloud.channel_names == ("intensity", "reflectivity")
+    np.testing.assert_array_equal(cloud.channels, np.tile([1.0, 0.0], (N, 1)))
+
+
+def test_ply_of_a_mesh_with_normals(tmp_path):
+    noise = dict.fromkeys(("nx", "ny", "nz", "alpha", "label", "ring", "time", "curvature"), np.ones(N, np.float32))
+    rows = structured(**xyz(), **noise, heat=np.full(N, 3.0, np.float32))
+    faces = np.array([((0, 1, 2),), ((2, 3, 4),)], [("vertex_indices", "i4", (3,))])
+    for text in (False, True):
+        write_ply(tmp_path / "c.ply", rows, text, more=[plyfile.PlyElement.describe(faces, "face")])
+        cloud = io.read(tmp_path / "c.ply")
+        assert cloud.channel_names == ("heat",)
+        np.testing.assert_array_equal(cloud.points[:, 1], rows["y"])
+
+
+@pytest.mark.parametrize("newline", [b"\r\n", b"\r"])
+def test_ply_newlines(tmp_path, newline):
+    lines = [b"ply", b"format ascii 1.0", b"element vertex 2"]
+    lines += [b"property float " + axis for axis in (b"x", b"y", b"z")] + [b"end_header"]
+    (tmp_path / "c.ply").write_bytes(newline.join(lines) + newline + b"1 2 3\n4 5 6\n")
+    np.testing.assert_array_equal(io.read(tmp_path / "c.ply").points, [[1, 2, 3], [4, 5, 6]])
+
+
+def test_ply_as_others_read_it(tmp_path):
+    cloud = make(("intensity", *RGB))
+    io.write(tmp_path / "c.ply", cloud)
+    ply = plyfile.PlyData.read(tmp_path / "c.ply")
+    assert (ply.text, ply.byte_order) == (False, "<")
+    vertex = ply["vertex"]
+    assert [(p.name, p.val_dtype) for p in vertex.properties] == [
+        *((axis, "f4") for axis in "xyz"),
+        ("intensity", "f4"),
+        *((name, "u1") for name in RGB),
+    ]
+    np.testing.assert_array_equal(vertex["red"], np.rint(cloud.channels[:, 1] * 255))
+
+
+# PCD
+
+
+@pytest.mark.parametrize("encoding", ["ascii", "binary", "binary_compressed"])
+@pytest.mark.parametrize("num_points", [1, N, 3000])
+def test_pcd_encodings(tmp_path, encoding, num_points):
+    points = (RNG.integers(-9, 9, (3, num_points)) / 4).astype(np.float32)
+    columns = dict(zip("xyz", points, strict=True)) | {"intensity": np.arange(num_points, dtype=np.float32)}
+    columns |= {"ring": np.arange(num_points, dtype=np.uint16), "heat": np.ones(num_points)}
+    write_pcd(tmp_path / "c.pcd", pypcd4.Encoding(encoding), **columns)
+    assert f"DATA {encoding}".encode() in (tmp_path / "c.pcd").read_bytes()
+    cloud = io.read(tmp_path / "c.pcd")
+    assert cloud.channel_names == ("intensity", "heat")
+    np.testing.assert_array_equal(cloud.points.T, points)
+    np.testing.assert_array_equal(cloud.channels.T, [columns["intensity"], columns["heat"]])
+
+
+@pytest.mark.parametrize("encoding", ["binary", "binary_compressed"])
+@pytest.mark.parametrize(("field", "dtype"), [("rgb", np.float32), ("rgb", np.uint32), ("rgba", np.uint32)])
+def test_pcd_packed_rgb(tmp_path, encoding, field, dtype):
+    colours = RNG.integers(0, 256, (N, 3), np.uint8)
+    packed = (np.uint32(0xFE000000) if field == "rgba" else 0) + colours.astype(np.uint32) @ np.array(
+        [65536, 256, 1], "u4"
+    )
+    intensity = np.arange(N, dtype=np.float32)
+    columns = xyz() | {field: packed.astype("u4").view(dtype), "intensity": intensity}
+    write_pcd(tmp_path / "c.pcd", pypcd4.Encoding(encoding), **columns)
+    cloud = io.read(tmp_path / "c.pcd")
+    assert cloud.channel_names == ("intensity", *RGB)
+    np.testing.assert_array_equal(cloud.channels[:, 1:], colours.astype(np.float32) / np.float32(255))
+    np.testing.assert_array_equal(cloud.channels[:, 0], intensity)
+
+
+def test_pcd_as_others_read_it(tmp_path):
+    cloud = make(("intensity", *RGB))
+    io.write(tmp_path / "c.pcd", cloud)
+    pcd = pypcd4.PointCloud.from_path(tmp_path / "c.pcd")
+    assert pcd.fields == ("x", "y", "z", "intensity", "rgb")
+    np.testing.assert_array_equal(
+        pypcd4.PointCloud.decode_rgb(pcd.pc_data["rgb"]), np.rint(cloud.channels[:, 1:] * 255).astype(np.uint8)
+    )
+
+
+def test_pcd_padding_and_vectors_are_no_channels(tmp_path):
+    header = (
+        "VERSION .7\nFIELDS x y z _ intensity fpfh _\nSIZE 4 4 4 1 4 4 1\nTYPE F F F U F F U\nCOUNT 1 1 1 4 1 2 1\n"
+    )
+    header += "WIDTH 2\nHEIGHT 1\nVIEWPOINT 0 0 0 1 0 0 0\nPOINTS 2\nDATA binary\n"
+    rows = struct.pack("<3f4xf2fx", 1, 2, 3, 7, 0, 0) + struct.pack("<3f4xf2fx", 4, 5, 6, 8, 0, 0)
+    (tmp_path / "c.pcd").write_bytes(b"# a comment\n" + header.encode() + rows)
+    cloud = io.read(tmp_path / "c.pcd")
+    assert cloud.channel_names == INTENSITY
+    np.testing.assert_array_equal(cloud.points, [[1, 2, 3], [4, 5, 6]])
+    np.testing.assert_array_equal(cloud.channels, [[7], [8]])
+
+
+def test_pcd_text_with_any_white_space(tmp_path):
+    header = (
+        "FIELDS x y z i _\nSIZE 4 4 4 4 1\nTYPE F F F F U\nCOUNT 1 1 1 1 1\nWIDTH 2\nHEIGHT 1\nPOINTS 2\nDATA ascii\n"
+    )
+    (tmp_path / "c.pcd").write_text(header + "1  2\t3 4 0 \n5 nan 7 8 0\r\n")
+    cloud = io.read(tmp_path / "c.pcd")
+    np.testing.assert_array_equal(cloud.points, [[1, 2, 3], [5, np.nan, 7]])
+    assert cloud.channel_names == INTENSITY
+
+
+def test_real_pair_is_the_same_in_both_formats(data):
+    for ply, pcd, num_points in [("source", "251371071", 69792), ("target", "251370668", 69088)]:
+        a, b = (io.read(data / "lidar_pair" / name) for name in (f"{ply}.ply", f"{pcd}.pcd"))
+        assert len(a) == num_points and a.channel_names == INTENSITY and a.points.dtype == np.float32
+        same(a, b)
+
+
+# LAS
+
+
+@pytest.mark.parametrize("suffix", [".las", ".laz"])
+@pytest.mark.parametrize("point_format", [0, 2, 3, 6, 7, 8])
+def test_las_in_utm_is_exact(tmp_path, suffix, point_format):
+    colour = point_format in (2, 3, 7, 8)
+    columns = {name: RNG.integers(0, 65536, 120_000) for name in (INTENSITY + RGB if colour else INTENSITY)}
+    las = las_data(point_format, 120_000, **columns)
+    las.write(str(tmp_path / f"c{suffix}"))
+    cloud = io.read(tmp_path / f"c{suffix}")
+    assert cloud.points.dtype == np.float64
+    np.testing.assert_array_equal(cloud.points, las.xyz)
+    assert cloud.channel_names == (INTENSITY + RGB if colour else INTENSITY)
+    np.testing.assert_array_equal(cloud.channels[:, 0], columns["intensity"])
+    if colour:
+        np.testing.assert_array_equal(cloud.channels[:, 1:].T, np.array([columns[name] for name in RGB]) / 65535)
+
+
+@pytest.mark.parametrize("suffix", [".las", ".laz"])
+def test_las_with_extra_dimensions(tmp_path, suffix):
+    las = las_data(6, intensity=np.arange(N))
+    las.add_extra_dim(laspy.ExtraBytesParams("amplitude", np.float64))
+    las["amplitude"] = RNG.random(N)
+    las.write(str(tmp_path / f"c{suffix}"))
+    cloud = io.read(tmp_path / f"c{suffix}")
+    assert cloud.channel_names == INTENSITY
+    np.testing.assert_array_equal(cloud.points, las.xyz)
+
+
+def test_las_8_bit_colours(tmp_path):
+    las_data(2, red=np.arange(N), green=np.full(N, 255), blue=np.zeros(N)).write(str(tmp_path / "c.las"))
+    cloud = io.read(tmp_path / "c.las")
+    assert cloud.channel_names == RGB  # and no intensity, which is 0
+    np.testing.assert_allclose(cloud.channels[:, 0], np.arange(N) / 255)
+    np.testing.assert_array_equal(cloud.channels[:, 1], 1)
+
+
+@pytest.mark.parametrize("suffix", [".las", ".laz"])
+def test_las_writes_utm_and_again(tmp_path, suffix):
+    points = np.array([500_000.0, 5_400_000.0, 100.0]) + RNG.integers(0, 10**6, (N, 3)) * 1e-3
+    io.write(tmp_path / f"a{suffix}", PointCloud(points))
+    first = io.read(tmp_path / f"a{suffix}")
+    np.testing.assert_allclose(first.points, points, rtol=0, atol=2e-9)
+    io.write(tmp_path / f"b{suffix}", first)
+    same(io.read(tmp_path / f"b{suffix}"), first)
+
+
+@pytest.mark.parametrize(
+    ("cloud", "message"),
+    [
+        (PointCloud(np.ones((2, 3)), np.array([[0.5], [1]]), channel_names=INTENSITY), "whole numbers"),
+        (PointCloud(np.ones((2, 3)), np.array([[-1], [1]]), channel_names=INTENSITY), "whole numbers"),
+        (PointCloud(np.ones((2, 3)), np.array([[70_000], [1]]), channel_names=INTENSITY), "whole numbers"),
+        (PointCloud(np.ones((2, 3)), np.array([[np.nan], [1]]), channel_names=INTENSITY), "whole numbers"),
+        (PointCloud(np.ones((2, 3)), np.full((2, 3), 1.5), channel_names=RGB), "0 to 1"),
+        (PointCloud(np.ones((2, 3)), np.full((2, 3), 0.001), channel_names=RGB), "dark"),
+        (PointCloud(np.ones((2, 3)), np.ones((2, 2)), channel_names=("red", "green")), "LAS holds intensity and"),
+        (PointCloud(np.full((2, 3), np.nan)), "finite"),
+    ],
+)
+def test_las_cannot_hold(tmp_path, cloud, message):
+    with pytest.raises(ValueError, match=rf"{message}.*\.ply"):
+        io.write(tmp_path / "c.las", cloud)
+    assert not list(tmp_path.iterdir())
+
+
+# KITTI, NumPy, text
+
+
+def test_kitti(tmp_path, data):
+    rows = RNG.uniform(-50, 50, (N, 4)).astype("<f4")
+    rows.tofile(tmp_path / "c.bin")
+    cloud = io.read(tmp_path / "c.bin")
+    np.testing.assert_array_equal(np.column_stack([cloud.points, cloud.channels]), rows)
+    assert cloud.channel_names == INTENSITY
+    scan = io.read(data / "kitti/sequences/04/velodyne/000000.bin")
+    assert len(scan) > 100_000 and scan.channels.min() >= 0 and scan.channels.max() < 1
+
+
+def test_kitti_refuses_large_coordinates(tmp_path):
+    with pytest.raises(ValueError, match=r"float32.*\.ply"):
+        io.write(tmp_path / "c.bin", PointCloud(np.full((2, 3), 5e5), np.ones(2)))
+
+
+def test_npz_of_others(tmp_path, data):
+    points, colours = make().points, RNG.integers(0, 256, (N, 4), np.uint8)
+    np.savez_compressed(tmp_path / "c.npz", points=points, colors=colours, Intensity=np.arange(N), labels=np.ones(N))
+    cloud = io.read(tmp_path / "c.npz")
+    assert cloud.channel_names == ("intensity", *RGB)
+    np.testing.assert_allclose(cloud.channels, np.column_stack([np.arange(N), colours[:, :3] / 255]), rtol=1e-6)
+    frame = io.read(data / "icl_livingroom1/frame_000000.npz")
+    assert frame.channel_names == RGB and frame.points.dtype == np.float32
+
+
+@pytest.mark.parametrize(
+    "array", [np.arange(12).reshape(4, 3), np.asfortranarray(RNG.random((5, 6))), np.ones((2, 4), ">f4")]
+)
+def test_npy_of_others(tmp_path, array):
+    np.save(tmp_path / "c.npy", array)
+    cloud = io.read(tmp_path / "c.npy")
+    np.testing.assert_array_equal(np.column_stack([cloud.points, cloud.channels]), array)
+
+
+@pytest.mark.parametrize(
+    ("text", "names", "channels"),
+    [
+        ("1 2 3\n4 5 6\n", (), np.empty((2, 0))),
+        ("1,2,3,.5\n4, 5, 6, .6", ("channel_0",), [[0.5], [0.6]]),
+        ("1;2;3;.5\n4;5;6;.6", ("channel_0",), [[0.5], [0.6]]),
+        ("x,y,z,Intensity,time\n1,2,3,8,0\n4,5,6,9,0\n", INTENSITY, [[8], [9]]),
+        ("\ufeffX;Y;Z;i\n1;2;3;8\n4;5;6;9\n", INTENSITY, [[8], [9]]),
+        ("//X Y Z R G B\n1 2 3 0 51 255\n4 5 6 255 0 0\n", RGB, [[0, 0.2, 1], [1, 0, 0]]),
+        (
+            "# made by hand\n\n# x y z red green blue\n1 2 3 0 65535 0\n4 5 6 1 0 0\n",
+            RGB,
+            [[0, 1, 0], [1 / 65535, 0, 0]],
+        ),
+        ("x y z r g b\n1 2 3 0.0 1.0 0.5\n4 5 6 1.0 1.0 1.0\n", RGB, [[0, 1, 0.5], [1, 1, 1]]),
+        ("x y z r g b\n1 2 3 0.0 1.0 0.0\n4 5 6 1.0 1.0 1.0\n", RGB, [[0, 1, 0], [1, 1, 1]]),
+        ("x y z r g b\n1 2 3 0 1 0\n4 5 6 0.5 1 1\n", RGB, [[0, 1, 0], [0.5, 1, 1]]),
+        ("z,y,x,heat\n3,2,1,7\n6,5,4,8\n", ("heat",), [[7], [8]]),
+    ],
+)
+def test_text_of_others(tmp_path, text, names, channels):
+    for suffix in (".xyz", ".txt", ".csv"):
+        (tmp_path / f"c{suffix}").write_text(text)
+        cloud = io.read(tmp_path / f"c{suffix}")
+        np.testing.assert_array_equal(cloud.points, [[1, 2, 3], [4, 5, 6]])
+        assert cloud.channel_names == names
+        np.testing.assert_array_equal(cloud.channels, channels)
+
+
+# Broken files
+
+
+def refuses(path, match=None):
+    """One ValueError that starts with the path, and no memory of the size that a header claims."""
+    tracemalloc.start()
+    try:
+        with pytest.raises(ValueError, match=match) as caught:
+            io.read(path)
+        peak = tracemalloc.get_traced_memory()[1]
+    finally:
+        tracemalloc.stop()
+    assert str(caught.value).startswith(str(path))
+    assert peak < 50e6
+
+
+@pytest.mark.parametrize("suffix", FORMATS)
+def test_no_such_file(tmp_path, suffix):
+    with pytest.raises(FileNotFoundError):
+        io.read(tmp_path / f"none{suffix}")
+    (tmp_path / f"folder{suffix}").mkdir()
+    with pytest.raises(IsADirectoryError):
+        io.read(tmp_path / f"folder{suffix}")
+
+
+@pytest.mark.parametrize("name", ["c.obj", "c", "c.ply.gz", ".ply"])
+def test_unknown_suffix(tmp_path, name):
+    (tmp_path / name).write_bytes(b"1 2 3")
+    refuses(tmp_path / name, "unknown suffix")
+    with pytest.raises(ValueError, match="unknown suffix"):
+        io.write(tmp_path / name, make())
+
+
+CONTENTS = {
+    "empty": b"",
+    "prose": b"It was a bright cold day in April, and the clocks were striking.\n" * 20,
+    "numbers": b"1 2 3\n4 5 6\n" * 20,
+    "zeros": bytes(1600),
+    "noise": np.random.default_rng(5).bytes(1600),
+    "ply": b"ply\n" + b"x" * 2000,
+    "image": b"\x89PNG\r\n\x1a\n" + np.random.default_rng(6).bytes(1592),
+    "pickle": pickle.dumps([print]),
+}
+
+
+@pytest.mark.parametrize("content", CONTENTS)
+@pytest.mark.parametrize("suffix", FORMATS)
+def test_no_cloud(tmp_path, suffix, content):
+    (tmp_path / f"c{suffix}").write_bytes(CONTENTS[content])
+    if (suffix, content) in {(".bin", "zeros"), *((text, "numbers") for text in (".xyz", ".txt", ".csv"))}:
+        assert len(io.read(tmp_path / f"c{suffix}"))
+    else:
+        refuses(tmp_path / f"c{suffix}")
+
+
+@pytest.mark.parametrize("true_suffix", FORMATS)
+@pytest.mark.parametrize("suffix", FORMATS)
+def test_mislabelled(tmp_path, suffix, true_suffix):
+    kind = {".laz": ".las", ".xyz": ".csv", ".txt": ".csv"}
+    if kind.get(suffix, suffix) != kind.get(true_suffix, true_suffix):
+        (tmp_path / f"c{suffix}").write_bytes(bytes_of(true_suffix, tmp_path))
+        refuses(tmp_path / f"c{suffix}")
+
+
+@pytest.mark.parametrize("suffix", [s for s in FORMATS if s not in (".xyz", ".txt", ".csv")])
+@pytest.mark.parametrize("fraction", [0.02, 0.2, 0.5, 0.9, 0.999])
+def test_truncated(tmp_path, suffix, fraction):
+    whole = bytes_of(suffix, tmp_path)
+    (tmp_path / f"c{suffix}").write_bytes(whole[: int(fraction * len(whole)) - 1 | 1])  # odd: within a row
+    refuses(tmp_path / f"c{suffix}")
+
+
+@pytest.mark.parametrize("encoding", ["ascii", "binary", "binary_compressed"])
+def test_truncated_pcd_at_a_row(tmp_path, encoding):
+    write_pcd(tmp_path / "c.pcd", pypcd4.Encoding(encoding), **dict.fromkeys("xyz", np.zeros(N)))
+    whole = (tmp_path / "c.pcd").read_bytes()
+    cut = {"ascii": len(whole) - len(whole.splitlines(True)[-1]), "binary": -24, "binary_compressed": -1}[encoding]
+    (tmp_path / "c.pcd").write_bytes(whole[:cut])
+    refuses(tmp_path / "c.pcd")
+
+
+@pytest.mark.parametrize(
+    "text", ["1 2\n3 4\n", "1 2 3\n4 5\n", "1 2 3\n4 5 six\n", "x,y,z\n", "lat lon\n1 2\n", "x y z i\n1 2 3\n"]
+)
+def test_broken_text(tmp_path, text):
+    (tmp_path / "c.csv").write_text(text)
+    refuses(tmp_path / "c.csv")
+
+
+def lie(whole, old, new):
+    assert whole.count(old) == 1
+    return whole.replace(old, new)
+
+
+@pytest.mark.parametrize("claim", [N + 1, 2 * N, 10**6, 10**9, 10**15])
+@pytest.mark.parametrize("text", [False, True])
+def test_lying_ply(tmp_path, text, claim):
+    faces = np.array([((0, 1, 2),), ((2, 3, 4),)], [("vertex_indices", "i4", (3,))])
+    write_ply(tmp_path / "a.ply", structured(**xyz()), text, more=[plyfile.PlyElement.describe(faces, "face")])
+    whole = (tmp_path / "a.ply").read_bytes()
+    # In the binary file the faces' bytes do make up one more vertex.
+    lies = [("face 2", f"face {claim}")] + [(f"vertex {N}", f"vertex {claim}")] * (text or claim > N + 1)
+    for old, new in lies:
+        (tmp_path / "c.ply").write_bytes(lie(whole, old.encode(), new.encode()))
+        refuses(tmp_path / "c.ply")
+
+
+@pytest.mark.parametrize("claim", [0, N - 1, N + 1, 2 * N, 10**6, 10**9, 10**15])
+@pytest.mark.parametrize("encoding", ["ascii", "binary", "binary_compressed"])
+def test_lying_pcd(tmp_path, encoding, claim):
+    write_pcd(tmp_path / "c.pcd", pypcd4.Encoding(encoding), **dict.fromkeys("xyz", np.zeros(N)))
+    whole = (tmp_path / "c.pcd").read_bytes()
+    if (encoding, claim) != ("binary", N - 1):  # bytes at the end are no harm
+        (tmp_path / "c.pcd").write_bytes(lie(whole, f"POINTS {N}".encode(), f"POINTS {claim}".encode()))
+        refuses(tmp_path / "c.pcd")
+    (tmp_path / "c.pcd").write_bytes(lie(whole, b"COUNT 1 1 1", f"COUNT 1 1 {max(claim, 2)}".encode()))
+    refuses(tmp_path / "c.pcd")
+
+
+def test_lying_compressed_pcd(tmp_path):
+    write_pcd(tmp_path / "c.pcd", pypcd4.Encoding.BINARY_COMPRESSED, **dict.fromkeys("xyz", np.zeros(N)))
+    whole = (tmp_path / "c.pcd").read_bytes()
+    at = whole.index(b"compressed\n") + 11
+    for lengths in [(2**32 - 1, 24 * N), (2**20, 24 * N), (20, 2**32 - 1), (0, 0), (0, 24 * N)]:
+        (tmp_path / "c.pcd").write_bytes(whole[:at] + struct.pack("<II", *lengths) + whole[at + 8 :])
+        refuses(tmp_path / "c.pcd")
+    claim = lie(whole[:at], f"POINTS {N}".encode(), b"POINTS 100000000")
+    (tmp_path / "c.pcd").write_bytes(claim + whole[at : at + 4] + struct.pack("<I", 24 * 10**8) + whole[at + 8 :])
+    refuses(tmp_path / "c.pcd", "more than the file can hold")
+
+
+def test_pcd_with_no_points_of_many_values(tmp_path):
+    write_pcd(tmp_path / "c.pcd", **dict.fromkeys("xyz", np.zeros(N)))
+    whole = lie((tmp_path / "c.pcd").read_bytes(), f"POINTS {N}".encode(), b"POINTS 0")
+    (tmp_path / "c.pcd").write_bytes(lie(whole, b"COUNT 1 1 1", b"COUNT 1 1 300000"))
+    refuses(tmp_path / "c.pcd", "no points")
+
+
+# Where a LAS header says: its points' place, the number of records before them, bytes per point, the number of points.
+@pytest.mark.parametrize(("at", "form"), [(96, "<I"), (100, "<I"), (105, "<H"), (107, "<I")])
+@pytest.mark.parametrize("suffix", [".las", ".laz"])
+def test_lying_las(tmp_path, suffix, at, form):
+    whole = bytearray(bytes_of(suffix, tmp_path))
+    for claim in (10**4, 2**16 - 1) if form == "<H" else (10**4, 10**9, 2**32 - 1):
+        struct.pack_into(form, whole, at, claim)
+        (tmp_path / f"c{suffix}").write_bytes(whole)
+        refuses(tmp_path / f"c{suffix}")
+
+
+def test_las_of_absurd_scale(tmp_path):
+    whole = bytearray(bytes_of(".las", tmp_path))
+    struct.pack_into("<d", whole, 131, 1e305)
+    (tmp_path / "c.las").write_bytes(whole)
+    refuses(tmp_path / "c.las", "overflow")
+
+
+@pytest.mark.parametrize("point_format", [2, 7])
+def test_lying_laz_tables(tmp_path, point_format):
+    resource = pytest.importorskip("resource")  # lazrs allocates out of tracemalloc's sight
+    las_data(point_format).write(str(tmp_path / "c.laz"))
+    whole = (tmp_path / "c.laz").read_bytes()
+    header_size, start = struct.unpack_from("<HI", whole, 94)
+    (table,) = struct.unpack_from("<q", whole, start)
+    # The place of the chunk table, its length, the bytes per point that LASzip knows of, the lengths of the layers.
+    places = [(start, "<q", 1), (table + 4, "<I", 1), (header_size + 54 + 36, "<H", 1)]
+    places += [(start + 12 + laspy.PointFormat(7).size, "<4I", 4)] * (point_format == 7)
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    for at, form, count in places:
+        for claim in (10**4, 2**16 - 1) if form == "<H" else (10**5, 2**31 - 1, 2**32 - 1):
+            changed = bytearray(whole)
+            struct.pack_into(form, changed, at, *[claim] * count)
+            (tmp_path / "c.laz").write_bytes(changed)
+            refuses(tmp_path / "c.laz")
+    assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss < before + 500_000  # KiB
+
+
+@pytest.mark.parametrize("claim", [N - 1, N + 1])
+def test_laz_by_one_point(tmp_path, claim):
+    las_data(7).write(str(tmp_path / "c.laz"))
+    whole = bytearray((tmp_path / "c.laz").read_bytes())
+    struct.pack_into("<Q", whole, 247, claim)
+    (tmp_path / "c.laz").write_bytes(whole)
+    refuses(tmp_path / "c.laz", f"claims {claim} points, the file has {N}")
+
+
+def array_bytes(array, shape=None):
+    """A .npy file, its header claiming another shape."""
+    stream = stdio.BytesIO()
+    header = {"descr": np.lib.format.dtype_to_descr(array.dtype), "fortran_order": False, "shape": shape or array.shape}
+    np.lib.format.write_array_header_1_0(stream, header)
+    return stream.getvalue() + array.tobytes()
+
+
+@pytest.mark.parametrize("shape", [(N + 1, 3), (10**9, 3), (2**62, 3), (N * 3,), (N, 1, 3)])
+def test_lying_arrays(tmp_path, shape):
+    content = array_bytes(make().points, shape)
+    (tmp_path / "c.npy").write_bytes(content)
+    with zipfile.ZipFile(tmp_path / "c.npz", "w") as archive:
+        archive.writestr("points.npy", content)
+    refuses(tmp_path / "c.npy")
+    refuses(tmp_path / "c.npz")
+
+
+class Trap:
+    def __reduce__(self):
+        return exit, (3,)
+
+
+@pytest.mark.parametrize(
+    "array", [np.array([[Trap()] * 3], object), np.array([["1", "2", "3"]]), np.ones((2, 3), complex)]
+)
+def test_arrays_of_no_numbers(tmp_path, array):
+    np.save(tmp_path / "c.npy", array)
+    np.savez(tmp_path / "c.npz", points=array)
+    refuses(tmp_path / "c.npy")
+    refuses(tmp_path / "c.npz")
+
+
+@pytest.mark.parametrize(
+    "arrays",
+    [
+        {"channels": np.ones((N, 1))},
+        {"points": np.ones((N, 3)), "channels": np.ones((N + 1, 1))},
+        {"points": np.ones((N, 3)), "channels": np.ones((N, 1)), "channel_names": np.array(["a", "b"])},
+        {"points": np.ones((N, 3)), "rgb": np.ones((N, 2))},
+        {"points": np.ones((N, 3)), "intensity": np.ones(N - 1)},
+        {"points": np.ones((N, 2))},
+        {"points": np.ones((0, 3))},
+    ],
+)
+def test_broken_npz(tmp_path, arrays):
+    np.savez(tmp_path / "c.npz", **arrays)
+    refuses(tmp_path / "c.npz")
+
+
+def test_what_a_library_raises(tmp_path, monkeypatch):
+    panic = type("PanicException", (BaseException,), {})
+    (tmp_path / "c.laz").write_bytes(b"LASF")
+    for error, expected in [(panic("index"), ValueError), (AssertionError(), ValueError)] + [
+        (error(), error) for error in (KeyboardInterrupt, ImportError)
+    ]:
+
+        def fail(file, size, error=error):
+            raise error
+
+        monkeypatch.setitem(io.READERS, ".laz", fail)
+        with pytest.raises(expected):
+            io.read(tmp_path / "c.laz")
+
+
+def test_no_coordinates(tmp_path):
+    write_ply(tmp_path / "c.ply", structured(x=np.ones(3), y=np.ones(3), intensity=np.ones(3)))
+    refuses(tmp_path / "c.ply", r"no numbers x, y, z; there are x, y, intensity")
+    plyfile.PlyData([plyfile.PlyElement.describe(structured(a=np.ones(3)), "face")]).write(tmp_path / "c.ply")
+    refuses(tmp_path / "c.ply", "no vertices")
+
+
+@pytest.mark.parametrize("suffix", FORMATS)
+def test_nothing_to_write(tmp_path, suffix):
+    with pytest.raises(ValueError, match="at least one point"):
+        io.write(tmp_path / f"c{suffix}", make(num_points=0))
+    with pytest.raises(ValueError, match="single cloud"):
+        io.write(tmp_path / f"c{suffix}", jax.tree.map(lambda *rows: np.stack(rows), make(), make()))
+
+
+@pytest.mark.parametrize("suffix", FORMATS)
+def test_a_failed_write_leaves_the_old_file(tmp_path, suffix, monkeypatch):
+    path = tmp_path / f"c{suffix}"
+    path.write_bytes(b"old")
+
+    def fail(file, cloud):
+        file.write(b"half")
+        raise OSError("disk full")
+
+    monkeypatch.setitem(io.WRITERS, suffix, fail)
+    with pytest.raises(OSError, match="disk full"):
+        io.write(path, make())
+    assert path.read_bytes() == b"old" and list(tmp_path.iterdir()) == [path]
+
+
+@pytest.mark.parametrize("suffix", EXTRAS)
+def test_missing_extra(tmp_path, suffix, monkeypatch):
+    io.write(tmp_path / f"c{suffix}", make())
+    monkeypatch.setitem(sys.modules, EXTRAS[suffix], None)
+    for action, call in [("reading", lambda p: io.read(p)), ("writing", lambda p: io.write(p, make()))]:
+        with pytest.raises(
+            ImportError, match=rf"{action} .*{suffix} .*{EXTRAS[suffix]}.*pip install 'mcgicp_jax\[io\]'"
+        ):
+            call(tmp_path / f"c{suffix}")
+    assert len(list(tmp_path.iterdir())) == 1
+
+
+def test_missing_lazrs(tmp_path, monkeypatch):
+    io.write(tmp_path / "c.laz", make())
+    io.write(tmp_path / "c.las", make())
+    monkeypatch.setitem(sys.modules, "lazrs", None)
+    io.read(tmp_path / "c.las")
+    for call in (lambda p: io.read(p), lambda p: io.write(p, make())):
+        with pytest.raises(ImportError, match=r"needs lazrs: pip install"):
+            call(tmp_path / "c.laz")
+
+
+# Mutations
+
+
+@pytest.fixture(scope="module")
+def seeds(tmp_path_factory):
+    """Small valid files, of every format and encoding."""
+    folder = tmp_path_factory.mktemp("seeds")
+    files = [
+        (suffix, bytes_of(suffix, folder, INTENSITY if suffix == ".bin" else INTENSITY + RGB)) for suffix in FORMATS
+    ]
+    rows = structured(**xyz(), red=np.ones(N, np.uint8))
+    faces = np.array([((0, 1, 2),), ((2, 3, 4),)], [("vertex_indices", "i4", (3,))])
+    for text in (True, False):
+        write_ply(folder / "a.ply", rows, text, more=[plyfile.PlyElement.describe(faces, "face")])
+        files.append((".ply", (folder / "a.ply").read_bytes()))
+    for encoding in ("ascii", "binary_compressed"):
+        write_pcd(folder / "a.pcd", pypcd4.Encoding(encoding), **xyz(), ring=np.zeros(N, np.uint16))
+        files.append((".pcd", (folder / "a.pcd").read_bytes()))
+    las_data(7, red=np.arange(N)).write(str(folder / "a.laz"))
+    files.append((".laz", (folder / "a.laz").read_bytes()))
+    return folder, files
+
+
+CHANGE = st.tuples(
+    st.sampled_from(["put", "cut", "insert", "digits"]),
+    st.floats(0, 1, exclude_max=True),
+    st.binary(min_size=1, max_size=8),
+)
+
+
+@settings(max_examples=800, deadline=None, derandomize=True, suppress_health_check=list(HealthCheck))
+@given(which=st.integers(0, 99), header=st.booleans(), changes=st.lists(CHANGE, min_size=1, max_size=4))
+@example(which=3, header=False, changes=[("put", 0.9, b"\xff" * 8)])
+def test_mutations(seeds, which, header, changes):
+    folder, files = seeds
+    suffix, content = files[which % len(files)]
+    for kind, place, new in changes:
+        at = int(place * min(len(content), 600 if header else len(content)))
+        if kind == "digits":
+            content = content[:at] + content[at:].replace(b"0", b"9" * len(new), 1)
+        else:
+            content = content[:at] + (b"" if kind == "cut" else new) + content[at + len(new) * (kind != "insert") :]
+    path = pathlib.Path(folder / f"mutated{suffix}")
+    path.write_bytes(content)
+    try:
+        cloud = io.read(path)
+    except ValueError as error:
+        assert str(error).startswith(str(path))
+    else:
+        same(io.read(path), cloud)
+
+
+# Poses
+
+
+def poses(num_poses=50):
+    """Any rotations, half turns and the smallest ones among them; translations of kilometres."""
+    quaternions = RNG.normal(size=(num_poses, 4))
+    quaternions[:8] = np.vstack([np.eye(4), [1, 1, 0, 1e-9], [0, 1, 1, 0], [1e-9, 0, 0, 1], [1e-5, 0, 1, 0]])
+    matrices = np.tile(np.eye(4), (num_poses, 1, 1))
+    matrices[:, :3, 3] = RNG.uniform(-1e4, 1e4, (num_poses, 3))
+    for matrix, q in zip(matrices, quaternions / np.linalg.norm(quaternions, axis=1, keepdims=True), strict=True):
+        x, y, z, w = q
+        matrix[:3, :3] = [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
+            [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
+            [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
+        ]
+    return matrices
+
+
+@pytest.mark.parametrize("num_poses", [1, 4, 8, 50])
+def test_poses_round_trip(tmp_path, num_poses):
+    matrices = poses()[:num_poses]
+    times = 1305031102.175304 + np.arange(num_poses)
+    io.write_poses(tmp_path / "kitti.txt", matrices)
+    io.write_poses(tmp_path / "tum.txt", list(matrices), timestamps=times)
+    np.testing.assert_array_equal(io.read_poses(tmp_path / "kitti.txt"), matrices)
+    np.testing.assert_allclose(io.read_poses(tmp_path / "tum.txt"), matrices, rtol=0, atol=1e-14)
+    rows = np.loadtxt(tmp_path / "tum.txt", ndmin=2)
+    np.testing.assert_array_equal(rows[:, 0], times)
+    assert (rows[:, 7] >= 0).all()
+
+
+def test_pose_conventions(tmp_path):
+    quarter = np.array([[0, -1, 0, 1], [1, 0, 0, 2], [0, 0, 1, 3], [0, 0, 0, 1.0]])  # about z
+    (tmp_path / "tum.txt").write_text("# timestamp tx ty tz qx qy qz qw\n0 1 2 3 0 0 2 2\n")
+    (tmp_path / "bare.txt").write_text("1 2 3 0 0 -0.5 -0.5\n")
+    (tmp_path / "kitti.txt").write_text("0 -1 0 1 1 0 0 2 0 0 1 3\n")
+    np.savetxt(tmp_path / "matrix.txt", quarter)
+    for name in ("tum", "bare", "kitti", "matrix"):
+        read = io.read_poses(tmp_path / f"{name}.txt")
+        assert read.dtype == np.float64
+        np.testing.assert_allclose(read, quarter[None], atol=1e-15)
+
+
+def test_real_poses(data):
+    np.testing.assert_array_equal(
+        io.read_poses(data / "lidar_pair/T_target_source.txt")[0], np.loadtxt(data / "lidar_pair/T_target_source.txt")
+    )
+    assert io.read_poses(data / "kitti/poses/04.txt").shape == (10, 4, 4)
+    assert io.read_poses(data / "tum_fr1_xyz/pose_curr.txt").shape == (1, 4, 4)
+    assert io.read_poses(data / "icl_livingroom1/poses.txt").shape == (4, 4, 4)
+
+
+@pytest.mark.parametrize(
+    "content",
+    [
+        b"",
+        b"\n\n",
+        b"# nothing\n",
+        b"some words\n",
+        b"\xff\xfe\x00",
+        b"1 2 3\n",
+        b"0 1 2 3 0 0 0 0\n",
+        b"0 1 2 3 0 0 nan 1\n",
+        b"2 0 0 0 0 1 0 0 0 0 1 0\n",
+        b"1 0 0 0 0 1 0 0 0 0 -1 0\n",
+        b"1 0 0 inf 0 1 0 0 0 0 1 0\n",
+        b"1 0 0 0 0 1 0 0 0 0 1 0\n1 0 0\n",
+        b"1 0 0 0\n0 1 0 0\n0 0 1 0\n0 0 0 2\n",
+        b"1 0 0 0\n0 1 0 0\n0 0 1 0\n",
+    ],
+)
+@pytest.mark.filterwarnings("error")
+def test_broken_poses(tmp_path, content):
+    path = tmp_path / "poses.txt"
+    path.write_bytes(content)
+    with pytest.raises(ValueError) as caught:
+        io.read_poses(path)
+    assert str(caught.value).startswith(str(path))
+
+
+def test_poses_that_do_not_fit(tmp_path):
+    with pytest.raises(FileNotFoundError):
+        io.read_poses(tmp_path / "none.txt")
+    with pytest.raises(ValueError, match=r"poses\[1\]"):
+        io.write_poses(tmp_path / "p.txt", np.stack([np.eye(4), 2 * np.eye(4)]))
+    with pytest.raises(ValueError, match="timestamps"):
+        io.write_poses(tmp_path / "p.txt", poses()[:4], timestamps=[1.0, 2.0])
+    assert not list(tmp_path.iterdir())

@@ -1,0 +1,97 @@
+"""The plan of the house: imports run one way, SciPy has one door, nothing is printed or asserted."""
+
+import ast
+import pathlib
+
+import mcgicp_jax
+
+ROOT = pathlib.Path(mcgicp_jax.__file__).parent
+ORDER = [
+    *("_pose", "_cloud", "_search", "_preprocess", "_covariance", "_methods", "_cost", "_solve", "_result"),
+    *(
+        "_loop",
+        "_uncertainty",
+        "_register",
+        "_batch",
+        "_odometry",
+        "metrics",
+        "_formats",
+        "io",
+        "datasets",
+        "plot",
+        "__main__",
+    ),
+]
+MODULES = {path.stem for path in ROOT.iterdir()}
+
+
+def files():
+    for path in sorted(ROOT.rglob("*.py")):
+        parts = path.relative_to(ROOT).with_suffix("").parts
+        yield path, parts, ast.parse(path.read_text(encoding="utf-8"))
+
+
+def imports(parts, tree):
+    """Full names of the modules that a file imports, anywhere in it."""
+    package = ("mcgicp_jax", *parts)[:-1]
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Import):
+            yield from (alias.name for alias in node.names)
+        elif isinstance(node, ast.ImportFrom):
+            start = package[: len(package) - node.level + 1] if node.level else ()
+            base = ".".join((*start, *filter(None, [node.module])))
+            yield base
+            yield from (f"{base}.{alias.name}" for alias in node.names)
+
+
+def test_the_imports_are_read():
+    found = {parts: set(imports(parts, tree)) for _, parts, tree in files()}
+    assert {"mcgicp_jax._cloud", "jax.numpy"} <= found[("_methods",)]
+    assert set(imports(("datasets", "x"), ast.parse("from ..io import read\nfrom .y import z"))) == {
+        *("mcgicp_jax.io", "mcgicp_jax.io.read", "mcgicp_jax.datasets.y", "mcgicp_jax.datasets.y.z")
+    }
+
+
+def test_every_module_has_its_place():
+    assert {parts[0] for _, parts, _ in files()} - {"__init__"} <= set(ORDER)
+
+
+def test_imports_run_one_way():
+    backward = [
+        f"{'/'.join(parts)} imports {name}"
+        for _, parts, tree in files()
+        if parts != ("__init__",)
+        for name in imports(parts, tree)
+        if name.startswith("mcgicp_jax.") and name.split(".")[1] in ORDER
+        if ORDER.index(name.split(".")[1]) > ORDER.index(parts[0])
+    ]
+    assert not backward
+
+
+def test_nothing_inside_imports_the_package_as_a_whole():
+    """That would be an edge to everything."""
+    users = {
+        "/".join(parts)
+        for _, parts, tree in files()
+        for node in ast.walk(tree)
+        if (isinstance(node, ast.Import) and any(alias.name == "mcgicp_jax" for alias in node.names))
+        or (isinstance(node, ast.ImportFrom) and node.module == "mcgicp_jax" and {a.name for a in node.names} - MODULES)
+    }
+    assert not {name for name in users if name.startswith("_")} - {"__init__", "__main__"}
+
+
+def test_scipy_has_one_door():
+    users = {
+        "/".join(parts) for _, parts, tree in files() for name in imports(parts, tree) if name.split(".")[0] == "scipy"
+    }
+    assert users == {"_search"}
+
+
+def test_nothing_is_printed_or_asserted():
+    found = []
+    for path, parts, tree in files():
+        for node in ast.walk(tree):
+            printed = isinstance(node, ast.Call) and isinstance(node.func, ast.Name) and node.func.id == "print"
+            if (printed and parts != ("__main__",)) or isinstance(node, ast.Assert):
+                found.append(f"{path.name}:{node.lineno}")
+    assert not found

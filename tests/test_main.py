@@ -1,0 +1,296 @@
+"""The command line, as a stranger meets it: exit codes, files, and messages of one line."""
+
+import os
+import subprocess
+import sys
+
+import jax
+import matplotlib.image
+import numpy as np
+import platformdirs
+import pytest
+
+import mcgicp_jax as mcg
+from mcgicp_jax import io, metrics, plot
+from mcgicp_jax.__main__ import main
+from tests.scenes import motion, room_corner
+
+TRUTH = motion()
+
+
+def save(path, points, channels=None, names=None):
+    io.write(path, mcg.PointCloud(points, channels, channel_names=names))
+    return str(path)
+
+
+def moved_back(points):
+    return (points - TRUTH[:3, 3]) @ TRUTH[:3, :3]
+
+
+@pytest.fixture(scope="module")
+def files(tmp_path_factory):
+    """Source and target with an intensity, the source without, and the true pose."""
+    folder = tmp_path_factory.mktemp("clouds")
+    points, channels = room_corner(1000, seed=1, channels=1)
+    target_points, target_channels = room_corner(1000, seed=2, channels=1)
+    io.write_poses(folder / "truth.txt", [TRUTH])
+    return {
+        "source": save(folder / "source.npz", moved_back(points), channels, ["intensity"]),
+        "target": save(folder / "target.ply", target_points, target_channels, ["intensity"]),
+        "bare": save(folder / "bare.npz", moved_back(points)),
+        "truth": str(folder / "truth.txt"),
+        "folder": folder,
+    }
+
+
+def close_to_truth(pose, factor=1.0):
+    translation, rotation = metrics.pose_error(pose, TRUTH)
+    return translation < 0.01 * factor and rotation < 0.01 * factor
+
+
+def printed_matrix(text):
+    rows = text.split("T_target_source:\n")[1].splitlines()[:4]
+    return np.array([row.split() for row in rows], float)
+
+
+@pytest.mark.parametrize("method", ["mc-gicp", "gicp", "color-icp", "point-to-plane", "point-to-point"])
+def test_register_prints_the_pose(files, capsys, method):
+    assert main(["register", files["source"], files["target"], "--method", method]) == 0
+    text, errors = capsys.readouterr()
+    assert errors == ""
+    assert f"method:    {method}" in text and "status:    converged after" in text and " of 1,000, rmse 0.0" in text
+    assert close_to_truth(printed_matrix(text), factor=1 if "gicp" in method or "plane" in method else 4)
+
+
+def test_register_writes_its_files(files, tmp_path, capsys):
+    pose, aligned, picture = tmp_path / "pose.txt", tmp_path / "aligned.ply", tmp_path / "picture.png"
+    outputs = ["--output", str(pose), "--aligned", str(aligned), "--plot", str(picture)]
+    assert main(["register", files["source"], files["target"], "--voxel-size", "0.1", *outputs]) == 0
+    text = capsys.readouterr().out
+    (written,) = io.read_poses(pose)
+    np.testing.assert_allclose(written, printed_matrix(text), atol=1e-8)
+    source, moved = io.read(files["source"]), io.read(aligned)
+    # All points, not the voxels
+    np.testing.assert_allclose(moved.points, source.points @ written[:3, :3].T + written[:3, 3], atol=1e-6)
+    np.testing.assert_array_equal(moved.channels, source.channels)
+    assert matplotlib.image.imread(picture).ndim == 3 and str(picture) in text
+    # The pose is one to start from.
+    again = ["register", files["source"], files["target"], "--init", str(pose), "--max-iterations", "2"]
+    assert main(again) == 0
+
+
+def test_the_start_is_used_and_drawn(files, monkeypatch, tmp_path, capsys):
+    drawn = {}
+    monkeypatch.setattr(plot, "before_after", lambda source, target, poses, path: drawn.update(poses))
+    options = ["--init", files["truth"], "--plot", "x.png", "--method", "gicp"]
+    assert main(["register", files["source"], files["target"], *options]) == 0
+    np.testing.assert_allclose(drawn["start"], TRUTH)
+    np.testing.assert_allclose(drawn["gicp"], printed_matrix(capsys.readouterr().out), atol=1e-8)
+    far = np.eye(4)
+    far[:3, 3] = 50
+    io.write_poses(tmp_path / "far.txt", [far])
+    assert main(["register", files["source"], files["target"], "--init", str(tmp_path / "far.txt")]) == 1
+
+
+def test_numbers_reach_the_method(files, capsys):
+    numbers = ["--channel-covariance", "0.25", "--channel-weights", "0.5", "--epsilon", "0.01"]
+    assert main(["register", files["source"], files["target"], *numbers]) == 0
+    assert "mc-gicp, channel_covariance 0.25, channel_weights 0.5, epsilon 0.01" in capsys.readouterr().out
+    assert main(["register", files["source"], files["target"], "--method", "color-icp", *numbers[2:4]]) == 0
+    assert "color-icp, channel_weights 0.5\n" in capsys.readouterr().out
+
+
+def test_what_does_not_converge_is_no_success(files, tmp_path, capsys):
+    far = save(tmp_path / "far.npz", room_corner(1000)[0] + 100)
+    assert main(["register", far, files["target"], "--method", "gicp"]) == 1
+    text, errors = capsys.readouterr()
+    assert "status:    too few correspondences" in text and "inliers:   0 of" in text
+    assert errors.startswith("mcgicp: gicp did not converge (too few correspondences)") and "--init" in errors
+    assert main(["register", files["source"], files["target"], "--max-iterations", "1"]) == 1
+    assert "max iterations" in capsys.readouterr().err
+    flat = save(tmp_path / "flat.npz", np.random.default_rng(0).random((500, 3)) * [1, 1, 0])
+    assert main(["register", flat, flat, "--method", "point-to-plane"]) == 1
+    assert "nothing holds the pose in at least one direction" in capsys.readouterr().err
+
+
+def test_compare(files, capsys):
+    assert main(["compare", files["source"], files["target"], "--truth", files["truth"]]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    rows = {line.split()[0]: line.split()[1:] for line in lines if line.endswith("converged")}
+    assert list(rows) == ["mc-gicp", "gicp", "color-icp", "point-to-plane", "point-to-point"]
+    start = next(line.split() for line in lines if line.startswith("(start)"))
+    assert float(start[1]) == pytest.approx(1e3 * np.linalg.norm(TRUTH[:3, 3]), abs=0.01)
+    assert float(rows["gicp"][0]) < 10 < float(start[1])
+    assert float(rows["gicp"][1]) < 0.6 < float(start[2])
+
+
+def test_compare_without_channels_or_truth(files, capsys):
+    assert main(["compare", files["bare"], files["target"]]) == 0
+    text = capsys.readouterr().out
+    assert "error" not in text and text.count("left out") == 2 and text.count("converged") == 3
+    assert main(["compare", files["bare"], files["target"], "--max-iterations", "1"]) == 1
+    assert "gicp did not converge" in capsys.readouterr().err
+
+
+def test_demo(tmp_path, capsys):
+    folder = tmp_path / "some" / "folder"
+    assert main(["demo", "--output", str(folder)]) == 0
+    text, errors = capsys.readouterr()
+    assert errors == "" and str(folder / "before_after.png") in text
+    height, width, _ = matplotlib.image.imread(folder / "before_after.png").shape
+    assert height > width > 500
+    error = {line.split()[0]: float(line.split()[1]) for line in text.split("status\n")[1].splitlines()[:6]}
+    assert error["mc-gicp"] < 5 and error["color-icp"] < 10
+    # What the text says: geometry slides.
+    assert min(error["gicp"], error["point-to-plane"], error["point-to-point"]) > 20
+    (truth,) = io.read_poses(folder / "truth.txt")
+    assert 1e3 * metrics.pose_error(np.eye(4), truth)[0] == pytest.approx(error["(start)"], abs=0.01)
+    assert len(io.read(folder / "source.npz")) > 10_000
+
+
+def test_common_channels_are_used(files, tmp_path, capsys):
+    cloud = io.read(files["source"])
+    junk = np.random.default_rng(0).normal(size=(len(cloud), 1))
+    several = save(tmp_path / "several.npz", cloud.points, np.hstack([junk, cloud.channels]), ["humidity", "intensity"])
+    assert main(["register", files["source"], files["target"]]) == 0
+    text = capsys.readouterr().out
+    assert "channels:  intensity\n" in text
+    expected = printed_matrix(text)
+    assert main(["register", several, files["target"]]) == 0
+    text = capsys.readouterr().out
+    assert "several.npz has humidity, intensity" in text
+    np.testing.assert_allclose(printed_matrix(text), expected, atol=1e-6)
+
+
+def test_no_common_channels_is_said(files, capsys):
+    for method in ("mc-gicp", "color-icp"):
+        assert main(["register", files["bare"], files["target"], "--method", method]) == 2
+        error = capsys.readouterr().err
+        assert "bare.npz has no channels" in error and "target.ply has intensity" in error and "--method gicp" in error
+    assert main(["register", files["bare"], files["target"], "--method", "gicp"]) == 0
+
+
+def test_voxels_are_chosen_from_the_data(tmp_path, capsys):
+    for size, rows, voxels in ((1.0, 30_000, "voxels of "), (1000.0, 30_000, "voxels of "), (1.0, 5000, "all kept")):
+        points = size * room_corner(rows, noise=0.002)[0]
+        half = save(tmp_path / "half.npz", points[::2])
+        whole = save(tmp_path / "whole.npz", points)
+        assert main(["register", half, whole, "--method", "point-to-plane"]) in (0, 1)
+        first, second, *_ = capsys.readouterr().out.splitlines()
+        used = int(first.split("target ")[1].split()[0].replace(",", ""))
+        assert voxels in first
+        distance = float(second.split("up to ")[1].split()[0])
+        if voxels == "all kept":
+            assert used == rows
+            # Half of the points: a voxel of twice the area that a point has
+            assert distance == pytest.approx(6 * size * np.sqrt(12 / (rows / 2)), rel=0.5)
+        else:
+            assert 8000 < used <= 20_000
+            voxel_size = float(first.split("voxels of ")[1].split()[0])
+            assert distance == pytest.approx(6 * voxel_size)
+
+
+def test_clouds_with_covariances_keep_their_points(tmp_path, capsys):
+    points, _ = room_corner(21_000)
+    cloud = mcg.PointCloud(points, covariances=np.tile(np.eye(3), (len(points), 1, 1)))
+    io.write(tmp_path / "cloud.npz", cloud)
+    assert main(["register", str(tmp_path / "cloud.npz"), str(tmp_path / "cloud.npz"), "--method", "gicp"]) == 0
+    assert "(all kept)" in capsys.readouterr().out
+
+
+def broken(folder):
+    """Arguments that are wrong, and what the message must name."""
+    good = save(folder / "good.npz", room_corner(200)[0])
+    (folder / "cut.ply").write_bytes(b"ply\nformat ascii 1.0\nelement vertex 9\nproperty float x\n")
+    (folder / "empty.pcd").write_bytes(b"")
+    io.write_poses(folder / "two.txt", [TRUTH, TRUTH])
+    np.savetxt(folder / "scaled.txt", 2 * np.eye(4))
+    nan = save(folder / "nan.npz", np.full((9, 3), np.nan))
+    return [
+        ([str(folder / "nowhere.ply"), good], "nowhere.ply: No such file"),
+        ([good, str(folder / "cut.ply")], "cut.ply: cannot be read"),
+        ([str(folder / "empty.pcd"), good], "empty.pcd"),
+        ([str(folder), good], str(folder)),
+        ([good, nan], "nan.npz: cloud: expected at least 4 finite points"),
+        ([good, good, "--init", str(folder / "two.txt")], "two.txt: expected one pose, got 2"),
+        ([good, good, "--init", str(folder / "scaled.txt")], "scaled.txt"),
+        ([good, good, "--epsilon", "-1"], "epsilon: expected one positive number"),
+        ([good, good, "--channel-weights", "1"], "gicp has no channel_weights"),
+        ([good, good, "--voxel-size", "-1"], "voxel_size: expected"),
+        ([good, good, "--num-neighbors", "1"], "num_neighbors: expected"),
+        ([good, good, "--max-distance", "0"], "max_distance: expected"),
+        ([good, good, "--max-iterations", "0"], "max_iterations: expected"),
+        ([good, good, "--aligned", str(folder / "out.doc")], "unknown suffix '.doc'"),
+        ([good, good, "--output", str(folder / "no" / "pose.txt")], "No such file or directory"),
+    ]
+
+
+def test_wrong_input_gets_one_line(tmp_path, capsys):
+    for args, message in broken(tmp_path):
+        assert main(["register", *args, "--method", "gicp"]) == 2, args
+        errors = capsys.readouterr().err
+        assert errors.startswith("mcgicp: ") and errors.count("\n") == 1, errors
+        assert message in errors
+
+
+def test_a_missing_package_is_named(files, monkeypatch, capsys):
+    monkeypatch.setitem(sys.modules, "plyfile", None)
+    assert main(["register", files["source"], files["target"]]) == 2
+    assert "pip install 'mcgicp_jax[io]'" in capsys.readouterr().err
+
+
+def test_points_left_out_are_told_in_one_line(files, tmp_path, capsys):
+    cloud = io.read(files["bare"])
+    points = np.vstack([cloud.points, [[np.nan, 0, 0]]])
+    assert main(["register", save(tmp_path / "nan.npz", points), files["target"], "--method", "gicp"]) == 0
+    assert capsys.readouterr().err == "mcgicp: left out 1 of 1001 points that are NaN or infinite\n"
+
+
+@pytest.mark.parametrize(
+    ("command", "words"),
+    [
+        ([], ["demo", "register", "compare"]),
+        (["demo"], ["--output"]),
+        (["register"], ["SOURCE TARGET", "--method {mc-gicp,", "--voxel-size", "20,000", "6 voxel sizes", "--aligned"]),
+        (["compare"], ["SOURCE TARGET", "--truth", "--channel-weights", "metres per channel"]),
+    ],
+)
+def test_help(command, words, capsys):
+    with pytest.raises(SystemExit) as ended:
+        main([*command, "--help"])
+    text = " ".join(capsys.readouterr().out.replace("│", " ").split())
+    assert ended.value.code == 0
+    assert all(word in text for word in words)
+    assert "None" not in text
+
+
+@pytest.mark.parametrize("args", [[], ["align"], ["register"], ["register", "a", "b", "--method", "icp"]])
+def test_misuse_exits_with_2(args, capsys):
+    with pytest.raises(SystemExit) as ended:
+        main(args)
+    assert ended.value.code == 2
+    assert capsys.readouterr().err
+
+
+def test_an_unwritable_cache_is_no_error(files, monkeypatch, capsys):
+    def refuse(*args, **kwargs):
+        raise PermissionError(13, "Permission denied", "/cache")
+
+    monkeypatch.delenv("JAX_COMPILATION_CACHE_DIR", raising=False)
+    monkeypatch.setattr(platformdirs, "user_cache_path", refuse)
+    before = jax.config.jax_compilation_cache_dir
+    assert main(["register", files["bare"], files["target"], "--method", "gicp"]) == 0
+    assert capsys.readouterr().err == ""
+    assert jax.config.jax_compilation_cache_dir == before
+
+
+def test_compiled_programs_are_kept(files, tmp_path):
+    """As its own process, started in an empty folder with an empty home."""
+    hidden = {"JAX_COMPILATION_CACHE_DIR", "XDG_CACHE_HOME"}
+    environment = {name: value for name, value in os.environ.items() if name not in hidden}
+    environment |= {"HOME": str(tmp_path), "XDG_CACHE_HOME": str(tmp_path / "cache")}
+    command = [sys.executable, "-m", "mcgicp_jax", "register", files["source"], files["target"], "--output", "pose.txt"]
+    done = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True, timeout=120)
+    assert (done.returncode, done.stderr) == (0, "")
+    assert close_to_truth(io.read_poses(tmp_path / "pose.txt")[0])
+    assert len(list((tmp_path / "cache" / "mcgicp_jax").iterdir())) > 5

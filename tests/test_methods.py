@@ -1,0 +1,213 @@
+"""The five methods: what they weigh a pair with, what they search, and the numbers that they choose from the data."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from mcgicp_jax import GICP, ColorICP, MultiChannelGICP, PointCloud, PointToPlane, PointToPoint, preprocess
+from mcgicp_jax._methods import prepare
+from tests import reference as ref
+from tests.reference import tolerance
+
+NOISE = np.array([0.02, 3.0])
+METHODS = [PointToPoint(), PointToPlane(), GICP(), ColorICP(0.1), MultiChannelGICP(0.3, 0.1)]
+NAMES = [type(method).__name__ for method in METHODS]
+
+
+def ready(num_points=150, num_channels=3, seed=0, **kwargs):
+    points, channels = ref.scene(num_points, num_channels, seed)
+    return preprocess(PointCloud(points, channels, **kwargs), num_neighbors=20)
+
+
+def noisy(seed, num_points=2000, noise=NOISE):
+    """Channels that are linear in the position, and noise of known size."""
+    rng = np.random.default_rng(seed)
+    points, _ = ref.scene(num_points, 0, seed)
+    channels = points[:, :2] * [1.0, -40.0] + rng.normal(size=(num_points, 2)) * noise
+    return points, preprocess(PointCloud(points, channels), num_neighbors=20)
+
+
+@pytest.mark.parametrize("method", METHODS, ids=NAMES)
+def test_information(method):
+    """M in the target's frame, from the covariances of both, the source's turned."""
+    rng = np.random.default_rng(0)
+    root = rng.normal(size=(2, 150, 3, 3))
+    source, target = root @ root.swapaxes(2, 3) + 0.1 * np.eye(3)
+    R = ref.rotation(rng.normal(size=3))
+    dtype = jnp.zeros(()).dtype
+    packed = [jnp.asarray(ref.packed(side), dtype) for side in (target, source)]
+    actual = ref.symmetric(jax.jit(lambda *args: method.information(*args))(*packed, jnp.asarray(R, dtype)))
+    generalised = isinstance(method, GICP | MultiChannelGICP)
+    expected = np.linalg.inv(target + R @ source @ R.T) if generalised else target
+    np.testing.assert_allclose(actual, expected, atol=tolerance(2e-4, 1e-11))
+
+
+@pytest.mark.parametrize("method", METHODS, ids=NAMES)
+def test_descriptors_are_channels_in_metres(method):
+    cloud = ready()
+    surface = prepare(method, cloud)
+    if isinstance(method, ColorICP | MultiChannelGICP):
+        np.testing.assert_allclose(surface.descriptors, 0.1 * cloud.channels, rtol=1e-6)
+    else:
+        assert surface.descriptors.shape == (160, 0)
+    np.testing.assert_array_equal(surface.points, cloud.points.T)
+    np.testing.assert_array_equal(surface.valid, cloud.valid)
+
+
+def test_one_weight_per_channel():
+    cloud = ready()
+    weights = np.array([0.0, 0.5, 3.0])
+    for method in (ColorICP(weights), MultiChannelGICP(0.3, weights)):
+        np.testing.assert_allclose(prepare(method, cloud).descriptors, cloud.channels * weights, rtol=1e-6)
+
+
+@pytest.mark.parametrize("method", [PointToPoint(), ColorICP(0.1)], ids=["PointToPoint", "ColorICP"])
+def test_points_alone_weigh_alike_in_all_directions(method):
+    found = ref.symmetric(prepare(method, ready()).covariance)
+    np.testing.assert_array_equal(found, np.broadcast_to(np.eye(3), found.shape))
+
+
+@pytest.mark.parametrize("method", [GICP(), MultiChannelGICP(0.3, 0.1)], ids=["GICP", "MultiChannelGICP"])
+def test_given_covariances_are_taken(method):
+    root = np.random.default_rng(0).normal(size=(150, 3, 3))
+    given = (root @ root.swapaxes(1, 2)).astype(np.float32)
+    found = ref.symmetric(prepare(method, ready(covariances=given)).covariance)[:150]
+    np.testing.assert_allclose(found, given, rtol=1e-6, atol=1e-6)
+
+
+def test_normals_of_given_covariances():
+    root = np.random.default_rng(0).normal(size=(150, 3, 3))
+    given = (root @ root.swapaxes(1, 2)).astype(np.float32).astype(float)
+    normals = np.linalg.eigh(given)[1][:, :, 0]
+    found = ref.symmetric(prepare(PointToPlane(), ready(covariances=given)).covariance)[:150]
+    clear = np.diff(np.linalg.eigvalsh(given))[:, 0] > 0.1
+    expected = normals[:, :, None] * normals[:, None, :]
+    np.testing.assert_allclose(found[clear], expected[clear], atol=tolerance(1e-4, 1e-11))
+
+
+@pytest.mark.parametrize("unit", [1.0, 1e-4, 1e4])
+def test_noise_is_found(unit):
+    """Λ = 2σ², and α = spacing/σ, where a slope of the channel is not noise."""
+    points, target = noisy(0, noise=unit * NOISE)
+    _, source = noisy(1, noise=unit * NOISE)
+    slope = (1 - unit) * np.array([1.0, -40.0])
+    target, source = (
+        cloud.replace(channels=cloud.channels - cloud.points[:, :2] * jnp.asarray(slope, cloud.points.dtype))
+        for cloud in (target, source)
+    )
+    method = MultiChannelGICP().resolve(source, target)
+    sigma = np.sqrt(np.asarray(method.channel_covariance, float) / 2)
+    np.testing.assert_allclose(sigma, unit * NOISE, rtol=0.06)
+    nearest = ref.nearest(points, points, 2)[:, 1]
+    spacing = np.median(np.linalg.norm(points[nearest] - points, axis=1))
+    np.testing.assert_allclose(np.asarray(method.channel_weights) * sigma, spacing, rtol=1e-4)
+
+
+def test_padding_takes_no_part_in_the_choice():
+    (_, target), (_, source) = noisy(0), noisy(1)
+    method = MultiChannelGICP().resolve(source, target)
+    padded = MultiChannelGICP().resolve(source.pad(3000), target.pad(3000))
+    np.testing.assert_allclose(padded.channel_covariance, method.channel_covariance, rtol=1e-5)
+    np.testing.assert_allclose(padded.channel_weights, method.channel_weights, rtol=1e-5)
+
+
+def test_a_constant_channel_says_nothing():
+    cloud = ready()
+    cloud = cloud.replace(channels=cloud.channels.at[:, 1].set(jnp.where(cloud.valid, 255.0, 0)))
+    method = MultiChannelGICP().resolve(cloud, cloud)
+    assert method.channel_weights[1] == 0
+    assert np.all(np.asarray(method.channel_weights)[[0, 2]] > 0)
+    without = cloud.replace(channels=cloud.channels[:, jnp.array([0, 2])])
+    expected = prepare(MultiChannelGICP().resolve(without, without), without).covariance
+    np.testing.assert_allclose(prepare(method, cloud).covariance, expected, atol=tolerance(1e-5, 1e-12))
+
+
+def test_a_channel_without_noise_stays_finite():
+    """Rendered: a step between two flat colours, most neighbourhoods of one colour alone."""
+    points, _ = ref.scene(150, 0)
+    cloud = preprocess(PointCloud(points, (points[:, 0] > 0).astype(float)), num_neighbors=4)
+    method = MultiChannelGICP().resolve(cloud, cloud)
+    for number in (method.channel_covariance, method.channel_weights):
+        assert np.all(np.isfinite(number) & (np.asarray(number) > 0))
+
+
+def test_without_channels_nothing_is_to_be_chosen():
+    cloud = ready(num_channels=0)
+    method = MultiChannelGICP().resolve(cloud, cloud)
+    assert method.channel_covariance.shape == method.channel_weights.shape == (0,)
+    np.testing.assert_allclose(
+        prepare(method, cloud).covariance, prepare(GICP(), cloud).covariance, atol=tolerance(1e-6, 1e-15)
+    )
+
+
+def test_what_is_given_is_kept():
+    cloud = ready()
+    method = MultiChannelGICP(0.5).resolve(cloud, cloud)
+    assert method.channel_covariance == 0.5
+    assert method.channel_weights.shape == (3,)
+    method = MultiChannelGICP(channel_weights=0.25).resolve(cloud, cloud)
+    assert method.channel_weights == 0.25
+    assert method.channel_covariance.shape == (3,)
+    done = MultiChannelGICP(0.5, 0.25)
+    assert done.resolve(cloud, cloud) is done
+
+
+def test_what_is_chosen_is_constant_to_autodiff():
+    cloud = ready()
+
+    def chosen(points, channels):
+        moved = cloud.replace(points=points, channels=channels)
+        method = MultiChannelGICP().resolve(moved, moved)
+        return jnp.sum(method.channel_covariance) + jnp.sum(method.channel_weights)
+
+    for gradient in jax.jit(jax.grad(chosen, argnums=(0, 1)))(cloud.points, cloud.channels):
+        np.testing.assert_array_equal(gradient, 0)
+
+
+@pytest.mark.parametrize("method", METHODS, ids=NAMES)
+def test_the_numbers_of_a_method_are_arrays(method):
+    for leaf in jax.tree.leaves(method):
+        assert isinstance(leaf, jax.Array)
+        assert leaf.dtype == jnp.zeros(()).dtype
+    assert jax.tree.structure(jax.tree.map(lambda leaf: 2 * leaf, method)) == jax.tree.structure(method)
+    assert len(repr(method)) < 400
+
+
+@pytest.mark.parametrize(
+    "make, message",
+    [
+        (lambda: GICP(0), "epsilon"),
+        (lambda: GICP(-1e-3), "epsilon"),
+        (lambda: GICP(np.nan), "epsilon"),
+        (lambda: GICP(np.inf), "epsilon"),
+        (lambda: GICP(np.array([1e-3, 1e-3])), "epsilon"),
+        (lambda: MultiChannelGICP(epsilon=-1), "epsilon"),
+        (lambda: MultiChannelGICP(min_eigenvalue=0), "min_eigenvalue"),
+        (lambda: MultiChannelGICP(min_eigenvalue=-1.0), "min_eigenvalue"),
+        (lambda: MultiChannelGICP(0.0), "channel_covariance"),
+        (lambda: MultiChannelGICP(-1.0), "channel_covariance"),
+        (lambda: MultiChannelGICP(np.nan), "channel_covariance"),
+        (lambda: MultiChannelGICP(np.array([1.0, 0.0])), "channel_covariance"),
+        (lambda: MultiChannelGICP(np.array([[1.0, 2.0], [2.0, 1.0]])), "channel_covariance"),
+        (lambda: MultiChannelGICP(np.array([[1.0, 0.5], [0.1, 1.0]])), "channel_covariance"),
+        (lambda: MultiChannelGICP(np.ones((2, 3))), "channel_covariance"),
+        (lambda: MultiChannelGICP(np.ones((1, 2, 2))), "channel_covariance"),
+        (lambda: MultiChannelGICP("auto"), "channel_covariance"),
+        (lambda: MultiChannelGICP(1.0, -0.1), "channel_weights"),
+        (lambda: MultiChannelGICP(1.0, np.array([0.1, np.inf])), "channel_weights"),
+        (lambda: MultiChannelGICP(1.0, np.ones((2, 2))), "channel_weights"),
+        (lambda: ColorICP(-1.0), "channel_weights"),
+        (lambda: ColorICP(np.nan), "channel_weights"),
+        (lambda: prepare(ColorICP(np.array([1.0, 2.0])), ready()), "channel_weights"),
+        (lambda: prepare(MultiChannelGICP(np.array([1.0, 2.0]), 0.1), ready()), "channel_covariance"),
+        (lambda: prepare(MultiChannelGICP(np.eye(2), 0.1), ready()), "channel_covariance"),
+        (lambda: prepare(MultiChannelGICP(), ready()), "channel_covariance"),
+        (lambda: prepare(MultiChannelGICP(1.0), ready()), "channel_weights"),
+        (lambda: prepare(GICP(), PointCloud(np.zeros((5, 3)))), "neighbors"),
+        (lambda: prepare(PointToPlane(), PointCloud(np.zeros((5, 3)))), "neighbors"),
+    ],
+)
+def test_numbers_that_make_no_sense(make, message):
+    with pytest.raises(ValueError, match=message):
+        make()

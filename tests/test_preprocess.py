@@ -1,0 +1,235 @@
+"""From raw clouds to ready ones: voxels, size classes, far origins, and what is turned away."""
+
+import itertools
+import warnings
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from mcgicp_jax import GICP, PointCloud, preprocess
+from mcgicp_jax._cloud import size_class
+from mcgicp_jax._methods import prepare
+from tests import reference as ref
+
+POINTS, CHANNELS = ref.scene(150, 2)
+UTM = np.array([512_345.6, 5_403_210.9, 312.3])
+
+
+def ready(values=POINTS, **kwargs):
+    return preprocess(values, **{"num_neighbors": 4} | kwargs)
+
+
+@settings(max_examples=20, deadline=None)
+@given(seed=st.integers(0, 2**31), voxel_size=st.floats(0.05, 5), shift=st.floats(-50, 50))
+def test_voxels_hold_the_mean_of_what_falls_into_them(seed, voxel_size, shift):
+    rng = np.random.default_rng(seed)
+    points = (rng.uniform(-10, 10, (150, 3)) + shift).astype(np.float32).astype(float)
+    channels = rng.normal(size=(150, 2)).astype(np.float32).astype(float)
+    cloud = ready(PointCloud(points, channels), voxel_size=voxel_size).unpad()
+    expected = ref.voxel_means(np.hstack([points, channels]), points, voxel_size)
+    actual = np.hstack([cloud.points, cloud.channels]).astype(float)
+    # The order of the rows is the library's own affair.
+    actual = actual[np.lexsort(np.round(actual, 3).T[::-1])]
+    expected = expected[np.lexsort(np.round(expected, 3).T[::-1])]
+    np.testing.assert_allclose(actual, expected, atol=ref.tolerance(3e-5, 1e-9))
+
+
+def test_voxel_cells_are_aligned_with_zero():
+    """The cells of two clouds in one frame are the same cells."""
+    points = np.array([[0.1, 0.1, 0.1], [0.9, 0.9, 0.9], [-0.1, 0.5, 0.5], [1.1, 0.5, 0.5], [5, 5, 5], [7, 7, 7.0]])
+    cloud = ready(points, voxel_size=1.0)
+    assert len(cloud) == 5
+    np.testing.assert_allclose(np.sort(cloud.unpad().points[:, 0]), [-0.1, 0.5, 1.1, 5, 7], atol=1e-6)
+
+
+def test_the_order_of_the_rows_does_not_matter_to_voxels():
+    order = np.random.default_rng(0).permutation(150)
+    one = ready(PointCloud(POINTS, CHANNELS), voxel_size=0.5)
+    other = ready(PointCloud(POINTS[order], CHANNELS[order]), voxel_size=0.5)
+    np.testing.assert_allclose(one.points, other.points, atol=1e-6)
+    np.testing.assert_allclose(one.channels, other.channels, atol=1e-6)
+    np.testing.assert_array_equal(one.neighbors, other.neighbors)
+
+
+def test_size_classes():
+    sizes = [size_class(n) for n in range(20_000)]
+    assert all(size >= n for n, size in enumerate(sizes))
+    assert all(a <= b for a, b in itertools.pairwise(sizes))
+    assert all((size - n) / size <= 0.25 for n, size in enumerate(sizes) if n >= 128)
+    assert len(set(sizes)) < 30
+    assert all(size_class(size) == size for size in set(sizes))
+    assert size_class(10_000_000) < 12_500_000
+
+
+@pytest.mark.parametrize("num_points", [4, 128, 129, 150])
+def test_rows_are_padded_to_the_size_class(num_points):
+    cloud = ready(PointCloud(POINTS[:num_points], CHANNELS[:num_points]), num_neighbors=6)
+    assert cloud.points.shape == (size_class(num_points), 3)
+    assert len(cloud) == num_points
+    np.testing.assert_array_equal(cloud.valid, np.arange(size_class(num_points)) < num_points)
+    np.testing.assert_array_equal(np.asarray(cloud.points)[:num_points], POINTS[:num_points])
+    np.testing.assert_array_equal(np.asarray(cloud.channels)[:num_points], CHANNELS[:num_points])
+    expected = ref.nearest(POINTS[:num_points], POINTS[:num_points], 6)
+    np.testing.assert_array_equal(np.asarray(cloud.neighbors)[:num_points], expected)
+    assert (np.asarray(cloud.neighbors)[num_points:] == -1).all()
+
+
+def test_rows_that_are_not_finite_are_left_out_with_one_warning():
+    points, channels = POINTS.copy(), CHANNELS.copy()
+    points[3, 1], points[9, 2], channels[17, 0], channels[3, 1] = np.nan, -np.inf, np.inf, np.nan
+    covariances = np.tile(np.eye(3), (150, 1, 1))
+    covariances[20, 1, 1] = np.nan
+    with pytest.warns(UserWarning, match="4 of 150") as caught:
+        cloud = ready(PointCloud(points, channels, covariances=covariances))
+    assert len(caught) == 1
+    keep = ~np.isin(np.arange(150), [3, 9, 17, 20])
+    np.testing.assert_array_equal(cloud.unpad().points, POINTS[keep])
+    np.testing.assert_array_equal(cloud.unpad().channels, CHANNELS[keep])
+
+
+def test_a_finite_cloud_warns_of_nothing():
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        ready(PointCloud(POINTS, CHANNELS), voxel_size=0.1)
+
+
+def test_large_coordinates_lose_nothing():
+    points = POINTS + UTM
+    cloud, local = ready(points, num_neighbors=20), ready(POINTS, num_neighbors=20)
+    assert np.abs(cloud.points).max() < 5
+    assert np.asarray(cloud.origin).dtype == np.float64
+    np.testing.assert_allclose(cloud.unpad().points, points, rtol=0, atol=ref.tolerance(2e-7, 1e-9))
+    np.testing.assert_array_equal(cloud.neighbors, local.neighbors)
+    found = prepare(GICP(), cloud).covariance, prepare(GICP(), local).covariance
+    np.testing.assert_allclose(*found, atol=ref.tolerance(1e-4, 1e-6))
+
+
+def test_large_coordinates_in_voxels():
+    points = POINTS + UTM
+    expected = ref.voxel_means(points, points, 0.5)
+    actual = ready(points, voxel_size=0.5).unpad().points
+    np.testing.assert_allclose(actual[np.lexsort(actual.T[::-1])], expected, rtol=0, atol=ref.tolerance(2e-7, 1e-8))
+
+
+def test_a_cloud_about_zero_keeps_its_origin():
+    assert not np.any(ready(POINTS).origin)
+    assert not np.any(ready(POINTS + np.array([5.0, -5, 0])).origin)
+
+
+def test_preprocessing_again_starts_from_what_is_there():
+    once = ready(PointCloud(POINTS + UTM, CHANNELS), num_neighbors=20)
+    again = preprocess(once, num_neighbors=6)
+    np.testing.assert_allclose(again.unpad().points, POINTS + UTM, rtol=0, atol=ref.tolerance(5e-7, 1e-9))
+    np.testing.assert_array_equal(again.channels, once.channels)
+    assert again.neighbors.shape == (160, 6)
+
+
+def strided(array):
+    return np.repeat(array, 2, axis=0)[::2]
+
+
+def read_only(array):
+    array = array.copy()
+    array.setflags(write=False)
+    return array
+
+
+FORMS = {
+    "float64": lambda a: a,
+    "float32": lambda a: a.astype(np.float32),
+    "float16": lambda a: a.astype(np.float16),
+    "int64": lambda a: np.round(100 * a).astype(np.int64),
+    "int16": lambda a: np.round(100 * a).astype(np.int16),
+    "uint8": lambda a: np.round(10 * (a - a.min())).astype(np.uint8),
+    "big-endian": lambda a: a.astype(">f4"),
+    "lists": lambda a: a.tolist(),
+    "Fortran order": np.asfortranarray,
+    "non-contiguous": strided,
+    "reversed": lambda a: a[::-1],
+    "read-only": read_only,
+    "jax": jnp.asarray,
+    "jax int32": lambda a: jnp.asarray(np.round(100 * a), jnp.int32),
+    "jax float16": lambda a: jnp.asarray(a, jnp.float16),
+    "jax bfloat16": lambda a: jnp.asarray(a, jnp.bfloat16),
+}
+
+
+@pytest.mark.parametrize("form", FORMS)
+def test_every_real_form_of_numbers_is_taken(form):
+    points, channels = FORMS[form](POINTS), FORMS[form](CHANNELS)
+    cloud = ready(PointCloud(points, channels))
+    assert cloud.points.dtype in (jnp.float32, jnp.float64)
+    assert cloud.channels.dtype == cloud.points.dtype
+    np.testing.assert_array_equal(np.asarray(cloud.points)[:150], np.asarray(points, float))
+    np.testing.assert_array_equal(np.asarray(cloud.channels)[:150], np.asarray(channels, float))
+
+
+def test_the_input_is_not_written_to():
+    points, channels = POINTS.copy(), CHANNELS.copy()
+    points[5] = np.nan
+    copies = points.copy(), channels.copy()
+    with pytest.warns(UserWarning):
+        ready(PointCloud(points, channels), voxel_size=0.2)
+    np.testing.assert_array_equal(points, copies[0])
+    np.testing.assert_array_equal(channels, copies[1])
+
+
+BAD_CLOUDS = {
+    "one row": ("points", lambda: PointCloud(np.zeros(3))),
+    "two columns": ("points", lambda: PointCloud(np.zeros((5, 2)))),
+    "four columns": ("points", lambda: PointCloud(np.zeros((5, 4)))),
+    "transposed": ("points", lambda: PointCloud(POINTS.T)),
+    "batch": ("points", lambda: PointCloud(np.zeros((2, 5, 3)))),
+    "complex": ("points", lambda: PointCloud(POINTS.astype(complex))),
+    "complex in jax": ("points", lambda: PointCloud(jnp.asarray(POINTS).astype(complex))),
+    "strings": ("points", lambda: PointCloud(np.full((5, 3), "1"))),
+    "objects": ("points", lambda: PointCloud(np.full((5, 3), None))),
+    "dates": ("points", lambda: PointCloud(np.zeros((5, 3), "datetime64[s]"))),
+    "ragged": ("points", lambda: PointCloud([[0, 0, 0], [0, 0]])),
+    "nothing": ("points", lambda: PointCloud([])),
+    "a string": ("points", lambda: PointCloud("cloud.ply")),
+    "channel rows": ("channels", lambda: PointCloud(POINTS, np.zeros((149, 1)))),
+    "channel shape": ("channels", lambda: PointCloud(POINTS, np.zeros((150, 1, 1)))),
+    "channel scalar": ("channels", lambda: PointCloud(POINTS, 1.0)),
+    "channel strings": ("channels", lambda: PointCloud(POINTS, np.full((150, 1), "red"))),
+    "channel complex": ("channels", lambda: PointCloud(POINTS, 1j * CHANNELS)),
+    "covariance shape": ("covariances", lambda: PointCloud(POINTS, covariances=np.zeros((150, 3)))),
+    "covariance dtype": ("covariances", lambda: PointCloud(POINTS, covariances=np.full((150, 3, 3), "x"))),
+    "names": ("channel_names", lambda: PointCloud(POINTS, CHANNELS, channel_names=["intensity"])),
+    "three points": ("4 finite points.*3", lambda: ready(POINTS[:3])),
+    "no points": ("4 finite points.*0", lambda: ready(np.zeros((0, 3)))),
+    "nothing finite": ("4 finite points.*0 of 150", lambda: ready(POINTS * np.nan)),
+    "three finite": (
+        "4 finite points.*3 of 5",
+        lambda: ready(POINTS[:5] + np.array([[np.inf], [np.nan], [0], [0], [0]])),
+    ),
+    "k of 2": ("num_neighbors", lambda: ready(num_neighbors=2)),
+    "k of 0": ("num_neighbors", lambda: ready(num_neighbors=0)),
+    "k of -1": ("num_neighbors", lambda: ready(num_neighbors=-1)),
+    "voxels of 0": ("voxel_size", lambda: ready(voxel_size=0.0)),
+    "voxels of -1": ("voxel_size", lambda: ready(voxel_size=-1.0)),
+    "voxels of NaN": ("voxel_size", lambda: ready(voxel_size=np.nan)),
+    "voxels of infinity": ("voxel_size", lambda: ready(voxel_size=np.inf)),
+    "too many voxels": ("voxel_size", lambda: ready(voxel_size=1e-9)),
+    "too few voxels": ("voxel_size", lambda: ready(POINTS + 50, voxel_size=100.0)),
+    "voxels and covariances": (
+        "voxel_size",
+        lambda: ready(PointCloud(POINTS, covariances=np.tile(np.eye(3), (150, 1, 1))), voxel_size=0.1),
+    ),
+}
+
+
+@pytest.mark.parametrize("case", BAD_CLOUDS)
+def test_malformed_input_is_turned_away_by_name(case):
+    message, make = BAD_CLOUDS[case]
+    with pytest.raises(ValueError, match=message):
+        make()
+
+
+def test_points_inside_a_transformation_cannot_be_preprocessed():
+    with pytest.raises(ValueError, match="tracers"):
+        jax.jit(lambda points: ready(points).points)(jnp.asarray(POINTS))

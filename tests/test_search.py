@@ -1,0 +1,198 @@
+"""Nearest neighbours against brute force: ties, padding, channels, the gate."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+
+from mcgicp_jax import ColorICP, KDTreeSearch, PointCloud, PointToPoint, find_correspondences, preprocess
+from tests import reference as ref
+
+SIZES = {"source": 150, "target": 140}
+T = ref.pose([0.1, -0.2, 0.3], [0.05, 0.1, -0.02])
+
+
+def clouds(num_channels=3, seed=0):
+    pair = [ref.scene(size, num_channels, seed + i) for i, size in enumerate(SIZES.values())]
+    return [preprocess(PointCloud(*arrays), num_neighbors=4) for arrays in pair], pair
+
+
+def integers(shape, high, seed):
+    return np.random.default_rng(seed).integers(0, high, shape).astype(float)
+
+
+def query(pose, source, target, max_distance=np.inf, source_channels=None, target_channels=None, search=None):
+    """Through the index itself, all rows valid."""
+    parameters = np.concatenate([Rotation.from_matrix(pose[:3, :3]).as_quat()[[3, 0, 1, 2]], pose[:3, 3]])
+    source_channels = np.zeros((len(source), 0)) if source_channels is None else source_channels
+    target_channels = np.zeros((len(target), 0)) if target_channels is None else target_channels
+    index = (search or KDTreeSearch()).index(target.T, target_channels, np.ones(len(target), bool))
+    valid = np.ones(len(source), bool)
+    return index.nearest(parameters, source.T, source_channels, valid, np.asarray(max_distance))
+
+
+@settings(max_examples=25, deadline=None)
+@given(seed=st.integers(0, 2**31), k=st.integers(1, 25), num_points=st.integers(4, 60))
+def test_neighbors_of_random_points(seed, k, num_points):
+    points = np.random.default_rng(seed).normal(size=(num_points, 3))
+    np.testing.assert_array_equal(KDTreeSearch().neighbors(points, k), ref.nearest(points, points, k))
+
+
+@settings(max_examples=25, deadline=None)
+@given(seed=st.integers(0, 2**31), k=st.integers(1, 12), high=st.integers(2, 5))
+def test_ties_are_ordered_by_row(seed, k, high):
+    """Few integer coordinates: most distances are shared, and many points coincide."""
+    points = integers((80, 3), high, seed)
+    np.testing.assert_array_equal(KDTreeSearch().neighbors(points, k), ref.nearest(points, points, k))
+
+
+@pytest.mark.parametrize("workers", [1, 2, -1])
+def test_ties_do_not_depend_on_the_number_of_threads(workers):
+    points = integers((200, 3), 4, 0)
+    found = KDTreeSearch(workers=workers).neighbors(points, 8)
+    np.testing.assert_array_equal(found, ref.nearest(points, points, 8))
+
+
+@pytest.mark.parametrize("copies", [4, 16])
+def test_ties_among_copies_of_one_point(copies):
+    rng = np.random.default_rng(0)
+    target = np.repeat(rng.normal(size=(3, 3)), copies, axis=0)[rng.permutation(3 * copies)]
+    np.testing.assert_array_equal(query(np.eye(4), target, target), ref.nearest(target, target)[:, 0])
+
+
+def test_the_point_itself_comes_first():
+    points, _ = ref.scene(500)
+    np.testing.assert_array_equal(KDTreeSearch().neighbors(points, 6)[:, 0], np.arange(500))
+
+
+def test_fewer_points_than_neighbors():
+    points = np.random.default_rng(0).normal(size=(5, 3))
+    found = KDTreeSearch().neighbors(points, 8)
+    assert found.shape == (5, 8)
+    assert (found[:, 5:] == -1).all()
+    np.testing.assert_array_equal(np.sort(found[:, :5], axis=1), np.broadcast_to(np.arange(5), (5, 5)))
+
+
+@settings(max_examples=25, deadline=None)
+@given(seed=st.integers(0, 2**31), high=st.integers(2, 6), num_channels=st.integers(0, 3))
+def test_nearest_with_ties_in_position_and_channels(seed, high, num_channels):
+    source, target = integers((40, 3), high, seed), integers((50, 3), high, seed + 1)
+    channels = integers((40, num_channels), 3, seed + 2), integers((50, num_channels), 3, seed + 3)
+    half_turn = np.diag([-1.0, -1, 1, 1])
+    half_turn[:3, 3] = [high - 1, high - 1, 0]
+    expected = ref.match(source, target, half_turn, np.inf, *channels, 1.0)
+    np.testing.assert_array_equal(query(half_turn, source, target, np.inf, *channels), expected)
+
+
+@pytest.mark.parametrize("max_distance", [0.05, 0.2, 1.0, np.inf])
+@pytest.mark.parametrize("weights", [0.0, 0.3, np.array([0.1, 0.0, 2.0])], ids=str)
+def test_correspondences_against_the_reference(weights, max_distance):
+    """Only the position turns; channels take part in the search, and not in the gate."""
+    (source, target), ((a, ca), (b, cb)) = clouds()
+    found = find_correspondences(source, target, T, ColorICP(weights), max_distance=max_distance)
+    expected = ref.match(a, b, T, max_distance, ca, cb, weights)
+    valid = np.asarray(found.valid)
+    np.testing.assert_array_equal(np.where(valid, found.indices, -1)[:150], expected)
+    assert not valid[150:].any()
+    moved = a @ T[:3, :3].T + T[:3, 3]
+    apart = np.linalg.norm(b[expected] - moved, axis=1)
+    np.testing.assert_allclose(
+        np.asarray(found.distances)[:150][valid[:150]], apart[expected >= 0], atol=ref.tolerance(1e-6, 1e-12)
+    )
+
+
+def test_without_channels_only_the_position_counts():
+    (source, target), ((a, _), (b, _)) = clouds()
+    found = find_correspondences(source, target, T, PointToPoint(), max_distance=0.3)
+    np.testing.assert_array_equal(np.where(found.valid, found.indices, -1)[:150], ref.match(a, b, T, 0.3))
+
+
+def test_the_gate_is_in_metres_of_position():
+    """A match 0.1 m away whose colour differs by 100 counts; one 0.6 m away of the very same colour does not."""
+    target = np.array([[0.1, 0, 0], [0, 9, 9], [9, 0, 9], [9, 9, 0.0]])
+    source = np.array([[0.0, 0, 0], [0, 9, 9.6], [5, 5, 5], [9, 9, 0.0]])
+    colours = np.array([100.0, 3, 4, 5]), np.array([0.0, 3, 4, 5])
+    pair = [preprocess(PointCloud(*arrays), num_neighbors=3) for arrays in zip((source, target), colours, strict=True)]
+    found = find_correspondences(*pair, np.eye(4), ColorICP(1e-3), max_distance=0.5)
+    np.testing.assert_array_equal(found.valid[:4], [True, False, False, True])
+
+
+def test_a_match_beyond_the_gate_is_not_replaced_by_a_nearer_one():
+    """The gate follows the search: the nearest in position and colour lies too far away, so there is no match."""
+    target = np.array([[0.0, 0, 0], [2, 0, 0], [9, 9, 9], [9, 9, 0]])
+    cloud = preprocess(PointCloud(target, [0.0, 1, 7, 8]), num_neighbors=3)
+    source = preprocess(PointCloud(target, [1.0, 1, 7, 8]), num_neighbors=3)
+    found = find_correspondences(source, cloud, np.eye(4), ColorICP(100.0), max_distance=0.5)
+    np.testing.assert_array_equal(found.indices[:4], [1, 1, 2, 3])
+    np.testing.assert_array_equal(found.valid[:4], [False, True, True, True])
+
+
+def test_padding_is_never_matched():
+    """Rows of padding lie at the origin, right on top of the source."""
+    points, channels = ref.scene(140, 3)
+    target = preprocess(PointCloud(points + np.array([3.0, 0, 0]), channels), num_neighbors=4)
+    source = preprocess(PointCloud(0.01 * points[:100], channels[:100]), num_neighbors=4).pad(160)
+    for method in (PointToPoint(), ColorICP(0.1)):
+        found = find_correspondences(source, target, None, method, max_distance=10.0)
+        assert np.asarray(found.indices)[:100].max() < 140
+        np.testing.assert_array_equal(found.valid, np.arange(160) < 100)
+
+
+@pytest.mark.parametrize("empty", ["source", "target", "both"])
+@pytest.mark.parametrize("method", [PointToPoint(), ColorICP(0.1)], ids=["position", "channels"])
+def test_a_cloud_without_valid_rows_has_no_matches(empty, method):
+    source, target = clouds()[0]
+    if empty != "target":
+        source = source.replace(valid=jnp.zeros_like(source.valid))
+    if empty != "source":
+        target = target.replace(valid=jnp.zeros_like(target.valid))
+    assert not np.any(find_correspondences(source, target, T, method, max_distance=1.0).valid)
+
+
+def find(source, target, pose, weights, max_distance):
+    return find_correspondences(source, target, pose, ColorICP(weights), max_distance=max_distance)
+
+
+def test_traced_and_batched_it_finds_the_same():
+    pairs = [clouds(seed=10 * i)[0] for i in range(3)]
+    expected = [find(*pair, T, 0.3, 0.4) for pair in pairs]
+    pose = jnp.asarray(T, pairs[0][0].points.dtype)
+    jitted = jax.jit(find)(*pairs[0], pose, 0.3, 0.4)
+    np.testing.assert_array_equal(jitted.valid, expected[0].valid)
+    np.testing.assert_array_equal(jitted.indices[jitted.valid], expected[0].indices[expected[0].valid])
+    sources, targets = (PointCloud.stack(side) for side in zip(*pairs, strict=True))
+    batched = jax.jit(jax.vmap(find, in_axes=(0, 0, None, None, 0)))(sources, targets, pose, 0.3, jnp.full(3, 0.4))
+    for i, one in enumerate(expected):
+        np.testing.assert_array_equal(batched.valid[i], one.valid)
+        np.testing.assert_array_equal(batched.indices[i][one.valid], one.indices[one.valid])
+
+
+@pytest.mark.parametrize("what", ["points", "channels"])
+@pytest.mark.parametrize("which", ["source", "target"])
+def test_values_that_are_not_finite_match_nothing(which, what):
+    """As when a network returns NaN: an outcome to be told, not an exception from inside the tree."""
+    pair = dict(zip(("source", "target"), clouds()[0], strict=True))
+    array = getattr(pair[which], what)
+    pair[which] = pair[which].replace(**{what: array.at[3, 1].set(jnp.nan)})
+    found = find_correspondences(*pair.values(), T, ColorICP(0.3), max_distance=1.0)
+    if which == "source":
+        assert not found.valid[3]
+    else:
+        assert not np.any(np.asarray(found.indices)[np.asarray(found.valid)] == 3)
+    assert np.sum(found.valid) > 50
+
+
+@pytest.mark.parametrize("max_distance", [0, -1.0, np.nan, np.ones(2)])
+def test_a_gate_that_makes_no_sense(max_distance):
+    with pytest.raises(ValueError, match="max_distance"):
+        find_correspondences(*clouds()[0], T, PointToPoint(), max_distance=max_distance)
+
+
+def test_channels_that_do_not_fit():
+    source, target = clouds(3)[0][0], clouds(1)[0][1]
+    with pytest.raises(ValueError, match=r"channels.*3 and 1"):
+        find_correspondences(source, target, T, ColorICP(0.1), max_distance=1.0)
+    find_correspondences(source, target, T, PointToPoint(), max_distance=1.0)
