@@ -20,6 +20,7 @@ from mcgicp_jax import (
     PointToPlane,
     PointToPoint,
     Tukey,
+    find_correspondences,
     mahalanobis_cost,
     preprocess,
 )
@@ -95,6 +96,38 @@ def test_cost_against_the_reference(name, kernel):
     actual = mahalanobis_cost(T, *clouds, matches, METHODS[name], robust=robust)
     assert actual.dtype == clouds[0].points.dtype
     assert float(actual) == pytest.approx(reference_cost(name, rho=rho), rel=tolerance(1e-4, 1e-10))
+
+
+@pytest.mark.parametrize("name", ["GICP", "MultiChannelGICP"])
+def test_the_determinant_against_the_reference(name):
+    """Σ dᵀMd + log det (C^B + R C^A Rᵀ): twice a negative log-likelihood, up to a constant."""
+    raw, neighbors, clouds, matches, matched = problem()
+    weigh = information(name, *raw, neighbors)
+    determinants = [np.linalg.slogdet(weigh(i, j, T[:3, :3]))[1] for i, j in enumerate(matched) if j >= 0]
+    actual = mahalanobis_cost(T, *clouds, matches, METHODS[name], log_determinant=True)
+    assert float(actual) == pytest.approx(reference_cost(name) - sum(determinants), rel=tolerance(1e-4, 1e-10))
+
+
+@pytest.mark.parametrize("name", ["PointToPlane", "ColorICP", "MultiChannelGICP"])
+def test_soft_matches_against_the_reference(name):
+    """Each candidate counts by exp(−½ (distance/τ)²), in position and weighted channels, over its point's sum."""
+    raw, neighbors, clouds, _, _ = problem()
+    temperature, gate, num_candidates = 0.15, 0.3, 4
+    found = find_correspondences(*clouds, T, METHODS[name], max_distance=gate, num_candidates=num_candidates)
+    actual = mahalanobis_cost(T, *clouds, found, METHODS[name], robust=Cauchy(SCALE), temperature=temperature)
+    (a, ca), (b, cb) = raw
+    alpha = 0.0 if name == "PointToPlane" else 0.2
+    moved = a @ T[:3, :3].T + T[:3, 3]
+    rows = ref.nearest(np.hstack([moved, alpha * ca]), np.hstack([b, alpha * cb]), num_candidates)
+    weigh, expected = information(name, *raw, neighbors), 0.0
+    for i, candidates in enumerate(rows):
+        kept = [j for j in candidates if np.linalg.norm(b[j] - moved[i]) <= gate]
+        far = np.array([np.sum((b[j] - moved[i]) ** 2) + np.sum((alpha * (cb[j] - ca[i])) ** 2) for j in kept])
+        shares = np.exp(-0.5 * far / temperature**2)
+        for j, share in zip(kept, shares / shares.sum(), strict=True):
+            d = b[j] - moved[i]
+            expected += share * ref.ROBUST["cauchy"](d @ weigh(i, j, T[:3, :3]) @ d, SCALE)
+    assert float(actual) == pytest.approx(expected, rel=tolerance(1e-4, 1e-10))
 
 
 @pytest.mark.parametrize("form", ["jax", "jaxlie"])
@@ -318,7 +351,7 @@ def test_the_moments_say_what_the_pairs_say(kernel):
     surfaces = prepare(method, source), prepare(method, target)
     R, t = jnp.asarray(T[:3, :3], dtype), jnp.asarray(T[:3, 3], dtype)
     robust = None if kernel is None else Huber(SCALE)
-    found = jax.jit(lambda: moments(evaluate_pairs(R, t, *surfaces, matches, method, robust), matches))()
+    found = jax.jit(lambda: moments(evaluate_pairs(R, t, *surfaces, matches, method, robust, None)))()
 
     raw, neighbors, _, _, _ = problem()
     pair_information = information("MultiChannelGICP", *raw, neighbors)

@@ -24,14 +24,14 @@ def integers(shape, high, seed):
     return np.random.default_rng(seed).integers(0, high, shape).astype(float)
 
 
-def query(pose, source, target, max_distance=np.inf, source_channels=None, target_channels=None, search=None):
+def query(pose, source, target, max_distance=np.inf, source_channels=None, target_channels=None, num_candidates=1):
     """Through the index itself, all rows valid."""
     parameters = np.concatenate([Rotation.from_matrix(pose[:3, :3]).as_quat()[[3, 0, 1, 2]], pose[:3, 3]])
     source_channels = np.zeros((len(source), 0)) if source_channels is None else source_channels
     target_channels = np.zeros((len(target), 0)) if target_channels is None else target_channels
-    index = (search or KDTreeSearch()).index(target.T, target_channels, np.ones(len(target), bool))
+    index = KDTreeSearch().index(target.T, target_channels, np.ones(len(target), bool))
     valid = np.ones(len(source), bool)
-    return index.nearest(parameters, source.T, source_channels, valid, np.asarray(max_distance))
+    return index.nearest(parameters, source.T, source_channels, valid, np.asarray(max_distance), num_candidates)
 
 
 @settings(max_examples=25, deadline=None)
@@ -60,7 +60,7 @@ def test_ties_do_not_depend_on_the_number_of_threads(workers):
 def test_ties_among_copies_of_one_point(copies):
     rng = np.random.default_rng(0)
     target = np.repeat(rng.normal(size=(3, 3)), copies, axis=0)[rng.permutation(3 * copies)]
-    np.testing.assert_array_equal(query(np.eye(4), target, target), ref.nearest(target, target)[:, 0])
+    np.testing.assert_array_equal(query(np.eye(4), target, target)[0], ref.nearest(target, target)[:, 0])
 
 
 def test_the_point_itself_comes_first():
@@ -84,7 +84,15 @@ def test_nearest_with_ties_in_position_and_channels(seed, high, num_channels):
     half_turn = np.diag([-1.0, -1, 1, 1])
     half_turn[:3, 3] = [high - 1, high - 1, 0]
     expected = ref.match(source, target, half_turn, np.inf, *channels, 1.0)
-    np.testing.assert_array_equal(query(half_turn, source, target, np.inf, *channels), expected)
+    np.testing.assert_array_equal(query(half_turn, source, target, np.inf, *channels)[0], expected)
+
+
+@pytest.mark.parametrize("num_candidates", [2, 7, 60])
+def test_several_candidates(num_candidates):
+    """Nearest first, ties by row; −1 where the target has no more points."""
+    source, target = integers((40, 3), 4, 0), integers((50, 3), 4, 1)
+    found = query(np.eye(4), source, target, num_candidates=num_candidates)
+    np.testing.assert_array_equal(found.T, ref.nearest(source, target, num_candidates))
 
 
 @pytest.mark.parametrize("max_distance", [0.05, 0.2, 1.0, np.inf])
