@@ -65,7 +65,7 @@ class PointCloud(eqx.Module):
         points: (N, 3), metres, relative to `origin`.
         channels: (N, C), in the unit that the user gives; C may be 0.
         valid: (N,), False for padding.
-        neighbors: (N, k) row numbers of the k nearest points, the point itself first; −1 where there are fewer.
+        neighbors: (N, k) row numbers of the k nearest points, the point itself among them; −1 where there are fewer.
         covariances: (N, 3, 3), or None: if given, the methods take these instead of computing their own.
         origin: (3,) float64, taken off the points to keep float32 exact at large (UTM) coordinates; 0 otherwise.
         channel_names: C names, such as ("intensity",) or ("red", "green", "blue"); files are written by them.
@@ -191,12 +191,18 @@ class PointCloud(eqx.Module):
             xp = np if isinstance(array, np.ndarray) else jnp
             return xp.pad(array, [(0, missing)] + [(0, 0)] * (array.ndim - 1), constant_values=fill)
 
+        covariances = grow(self.covariances)
+        if covariances is not None:
+            # Padding is weighed and left out: its covariances must have inverses.
+            xp = np if isinstance(covariances, np.ndarray) else jnp
+            padding = xp.arange(size)[:, None, None] >= size - missing
+            covariances = xp.where(padding, xp.eye(3, dtype=covariances.dtype), covariances)
         return self.replace_rows(
             points=grow(self.points),
             channels=grow(self.channels),
             valid=grow(self.valid),
             neighbors=grow(self.neighbors, -1),
-            covariances=grow(self.covariances),
+            covariances=covariances,
         )
 
     def replace_rows(self, **arrays: Any) -> PointCloud:

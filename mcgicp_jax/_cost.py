@@ -15,12 +15,12 @@ from jaxtyping import Array, Bool, Float
 
 from mcgicp_jax import _covariance as cov
 from mcgicp_jax._cloud import PointCloud
-from mcgicp_jax._methods import AbstractGeneralized, AbstractMethod, Surface, prepare
+from mcgicp_jax._methods import AbstractGeneralized, AbstractMethod, Numbers, Surface, prepare
 from mcgicp_jax._pose import Pose, is_concrete, pose_matrix
 from mcgicp_jax._search import Correspondences
 
 
-class AbstractKernel(eqx.Module):
+class AbstractKernel(Numbers):
     """A robust kernel ρ of the squared Mahalanobis distance s² of one pair; ρ(s²) ≈ s² for small distances.
 
     Attributes:
@@ -304,14 +304,16 @@ def _total_cost(
     pairs = evaluate_pairs(rotation, translation, source, target, matches, method, robust, temperature)
     cost = jnp.sum(pairs.cost)
     if log_determinant:
-        cost = cost - jnp.sum(pairs.share * jnp.log(cov.determinant(pairs.information)))
+        determinant = jnp.where(pairs.valid, cov.determinant(pairs.information), 1)
+        cost = cost - jnp.sum(pairs.share * jnp.log(determinant))
     return cost
 
 
 def centred_pose(matrix: Array | np.ndarray, source: PointCloud, target: PointCloud) -> Array | np.ndarray:
     """The same motion between the clouds' own origins: T(−o_t) · T · T(o_s), in the precision that it comes in."""
     rotation, translation = matrix[:3, :3], matrix[:3, 3]
-    shifted = rotation @ source.origin + translation - target.origin
+    # In this order two far origins cancel before they meet the rotation.
+    shifted = (rotation - np.eye(3)) @ source.origin + (source.origin - target.origin) + translation
     if isinstance(shifted, np.ndarray) and isinstance(matrix, np.ndarray):
         result = matrix.copy()
         result[:3, 3] = shifted

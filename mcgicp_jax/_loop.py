@@ -122,7 +122,8 @@ def update(
     pose: jaxlie.SE3, status: Int[Array, ""], num_iterations: Int[Array, ""], measured: Measurement, settings: Settings
 ) -> State:
     """Update the pose, unless it has come to rest. Compiled once, whatever the size of the clouds."""
-    change = solve_update(measured.moments)
+    with jax.default_matmul_precision("highest"):
+        change = solve_update(measured.moments)
     moved = move_pose(pose, change.twist, measured.moments.center)
     settled = status == _SETTLED
     translation_step = jnp.linalg.norm(change.twist[:3])
@@ -255,7 +256,8 @@ def align_traced(
 def refine(state: State, model: Model) -> jaxlie.SE3:
     """The pose of a loop that has ended, with the gradient of the answer."""
     usable = (state.status == Status.CONVERGED) | (state.status == Status.MAX_ITERATIONS)
-    return refine_pose(state.pose, usable, state.measured.moments, model)
+    with jax.default_matmul_precision("highest"):
+        return refine_pose(state.pose, usable, state.measured.moments, model)
 
 
 def nearest_traced(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import abc
+import dataclasses
 from typing import ClassVar
 
 import equinox as eqx
@@ -34,7 +35,21 @@ class Surface(eqx.Module):
     valid: Bool[Array, "N"]
 
 
-class AbstractMethod(eqx.Module):
+class Numbers(eqx.Module):
+    """A module of a few numbers, whose `repr` shows them."""
+
+    def __repr__(self) -> str:
+        parts = []
+        for field in dataclasses.fields(self):
+            value = getattr(self, field.name)
+            if value is None or not is_concrete(value):
+                parts.append(f"{field.name}={value}")
+            else:
+                parts.append(f"{field.name}={np.array2string(np.asarray(value), precision=4, separator=', ')}")
+        return f"{type(self).__name__}({', '.join(parts)})"
+
+
+class AbstractMethod(Numbers):
     """A registration method. Its numbers are arrays, so that gradients can be taken with respect to a method."""
 
     uses_channels: ClassVar[bool] = False
@@ -132,8 +147,8 @@ class GICP(AbstractGeneralized):
     epsilon: Float[Array, ""]
 
     def __init__(self, epsilon: ArrayLike = 1e-3):
-        """Raises `ValueError` unless ε is positive."""
-        self.epsilon = _positive_scalar("epsilon", epsilon)
+        """Raises `ValueError` unless ε is positive, and large enough for the precision (1.2e-5 in float32)."""
+        self.epsilon = _epsilon(epsilon)
 
     def covariance(self, cloud: PointCloud) -> Float[Array, "6 N"]:
         if cloud.covariances is not None:
@@ -173,7 +188,7 @@ class MultiChannelGICP(AbstractGeneralized):
         """Raises `ValueError` if Λ is not positive definite, a weight is negative, or ε or the floor not positive."""
         self.channel_covariance = None if channel_covariance is None else _covariance(channel_covariance)
         self.channel_weights = None if channel_weights is None else _weights(channel_weights)
-        self.epsilon = _positive_scalar("epsilon", epsilon)
+        self.epsilon = _epsilon(epsilon)
         self.min_eigenvalue = _positive_scalar("min_eigenvalue", min_eigenvalue)
 
     def resolve(self, source: PointCloud, target: PointCloud) -> MultiChannelGICP:
@@ -334,6 +349,15 @@ def _positive_scalar(name: str, value: ArrayLike) -> Float[Array, ""]:
     return number
 
 
+def _epsilon(value: ArrayLike) -> Float[Array, ""]:
+    epsilon = _positive_scalar("epsilon", value)
+    # 1 − (1 − ε) loses ε to rounding, and the covariance its inverse.
+    least = 100 * float(jnp.finfo(epsilon.dtype).eps)
+    if is_concrete(epsilon) and float(epsilon) < least:
+        raise ValueError(f"epsilon: expected at least {least:.2g} in {epsilon.dtype}, got {value!r}")
+    return epsilon
+
+
 def _weights(value: Values) -> Float[Array, "..."]:
     weights = _number("channel_weights", value)
     if weights.ndim > 1:
@@ -350,7 +374,7 @@ def _covariance(value: Values) -> Float[Array, "..."]:
     if is_concrete(covariance):
         matrix = np.asarray(covariance, np.float64)
         matrix = matrix if matrix.ndim == 2 else np.diag(np.atleast_1d(matrix))
-        symmetric = np.allclose(matrix, matrix.T, rtol=1e-5, atol=0)
+        symmetric = np.allclose(matrix, matrix.T, rtol=1e-5, atol=1e-6 * np.abs(matrix).max(initial=0))
         # An empty matrix (no channels) is positive definite; NaN is not.
         if not (np.isfinite(matrix).all() and symmetric and np.all(np.linalg.eigvalsh(matrix) > 0)):
             raise ValueError(f"channel_covariance: expected it symmetric and positive definite, got {value!r}")

@@ -134,4 +134,6 @@ def _far_origin(points: Float[np.ndarray, "N 3"]) -> Float[np.ndarray, "3"]:
     """Zero for clouds about the origin; the centre of those far away, where float32 would lose their shape."""
     low, high = points.min(axis=0).astype(np.float64), points.max(axis=0).astype(np.float64)
     center = 0.5 * (low + high)
+    # A number that float32 holds, so that it stays the same inside a transformation.
+    center = center.astype(np.float32).astype(np.float64)
     return center if is_far(center, float(np.linalg.norm(high - low))) else np.zeros(3)

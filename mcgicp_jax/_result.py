@@ -37,7 +37,7 @@ class Registration(eqx.Module):
 
     Attributes:
         T_target_source: maps source coordinates into the target's frame, b ≈ T a. Its precision is that of the clouds;
-            at large (UTM) coordinates use `matrix`.
+            at large (UTM) coordinates use `matrix`, or inside a transformation in float32 `centred`.
         status_code: value of the `Status`.
         num_iterations: updates of the pose.
         num_inliers: pairs within `max_distance`.
@@ -49,6 +49,8 @@ class Registration(eqx.Module):
         history: before each update, and last at the returned pose: "cost", "rmse", "num_inliers", and the length of
             the update from there, "translation_step" (metres, at the centroid of the pairs) and "rotation_step"
             (radians). Inside a transformation the length is fixed, and NaN fills what was not needed.
+        source_origin, target_origin: what the clouds had taken off, `PointCloud.origin`.
+        centred: the pose between those origins, which `matrix` is made from.
     """
 
     T_target_source: jaxlie.SE3
@@ -62,7 +64,6 @@ class Registration(eqx.Module):
     source_origin: Float[Array, "*batch 3"] | Float[np.ndarray, "*batch 3"]
     target_origin: Float[Array, "*batch 3"] | Float[np.ndarray, "*batch 3"]
     centred: jaxlie.SE3
-    """The pose between the clouds' own origins (0 unless coordinates are large)."""
 
     @property
     def status(self) -> Any:
@@ -99,12 +100,13 @@ def pose_in_user_frame(
     if is_concrete(centred, source_origin, target_origin):
         parameters = np.asarray(centred.wxyz_xyz, np.float64)
         rotation = rotation_from_quaternion(parameters[..., :4])
-        offset = np.asarray(target_origin, np.float64) - np.einsum("...ij,...j->...i", rotation, source_origin)
+        offset = target_origin - source_origin - np.einsum("...ij,...j->...i", rotation - np.eye(3), source_origin)
         matrix = np.zeros((*rotation.shape[:-2], 4, 4))
         matrix[..., :3, :3] = rotation
         matrix[..., :3, 3] = parameters[..., 4:] + offset
         matrix[..., 3, 3] = 1
         return matrix
     traced = centred.as_matrix().astype(centred.wxyz_xyz.dtype)
-    shift = target_origin - jnp.einsum("...ij,...j->...i", traced[..., :3, :3], source_origin)
+    turned = jnp.einsum("...ij,...j->...i", traced[..., :3, :3] - jnp.eye(3), source_origin, precision="highest")
+    shift = target_origin - source_origin - turned
     return traced.at[..., :3, 3].add(shift.astype(traced.dtype))

@@ -150,8 +150,10 @@ class KDTreeIndex(AbstractIndex):
         valid: Bool[np.ndarray, "M"],
         workers: int,
     ):
-        self._rows = np.flatnonzero(valid).astype(np.int32)
-        self._tree = _tree(np.hstack([points.T, descriptors])[self._rows]) if self._rows.size else None
+        rows = np.hstack([points.T, descriptors])
+        # The tree refuses what is not finite; the measurement at the pose will say NON_FINITE.
+        self._rows = np.flatnonzero(valid & np.isfinite(rows).all(axis=1)).astype(np.int32)
+        self._tree = _tree(rows[self._rows]) if self._rows.size else None
         self._workers = workers
 
     def nearest(
@@ -166,17 +168,15 @@ class KDTreeIndex(AbstractIndex):
         valid, descriptors = np.asarray(valid), np.asarray(descriptors)
         indices = np.full((num_candidates, valid.size), -1, np.int32)
         pose = np.asarray(pose, np.float64)
-        # A pose that has diverged must not become an exception inside the tree; the step will say NON_FINITE.
         if self._tree is None or not np.isfinite(pose).all():
             return indices
-        rotation = rotation_from_quaternion(pose[:4])
-        active = np.flatnonzero(valid)
-        moved = np.asarray(points).T[active] @ rotation.T + pose[4:]
+        moved = np.asarray(points).T @ rotation_from_quaternion(pose[:4]).T + pose[4:]
+        queries = np.hstack([moved, descriptors])
+        active = np.flatnonzero(valid & np.isfinite(queries).all(axis=1))
         # With descriptors, the nearest may lie beyond the gate while a pair within it is further in all dimensions:
         # then the whole space is searched. The margin covers rounding; the gate itself is applied to the position.
         bound = np.inf if descriptors.shape[1] else 1.001 * float(np.asarray(max_distance))
-        queries = np.hstack([moved, descriptors[active]])
-        found = _nearest(self._tree, queries, num_candidates, self._workers, bound).T
+        found = _nearest(self._tree, queries[active], num_candidates, self._workers, bound).T
         indices[: len(found), active] = np.append(self._rows, -1)[found]
         return indices
 

@@ -61,7 +61,7 @@ def before_after(
     source, target = _drawable(source), _drawable(target)
     if len(target) < 3:
         raise ValueError(f"target: expected at least 3 points, got {len(target)}")
-    moved = [np.asarray(source.transform(matrix).points) for matrix in named.values()]
+    moved = [np.asarray(source.transform(matrix).unpad().points) for matrix in named.values()]
     source_colors, target_colors = _rgb(source), _rgb(target)
     target_points = np.asarray(target.points)
     view = _view(target_points)

@@ -67,8 +67,10 @@ def test_unpad_undoes_pad(size):
 
 def test_padding_says_so():
     padded = ready().pad(240)
-    for name, fill in {"points": 0, "channels": 0, "valid": False, "neighbors": -1, "covariances": 0}.items():
+    for name, fill in {"points": 0, "channels": 0, "valid": False, "neighbors": -1}.items():
         assert (np.asarray(getattr(padded, name))[150:] == fill).all()
+    # They are weighed, with no weight, and must have inverses.
+    np.testing.assert_array_equal(padded.covariances[160:], np.broadcast_to(np.eye(3), (80, 3, 3)))
     np.testing.assert_array_equal(padded.neighbors[:160], ready().neighbors)
 
 

@@ -408,7 +408,13 @@ def test_soft_matches_give_every_number_a_gradient(noisy):
         clouds = clouds_with(inputs, source, target)
         temperature = inputs["temperature"]
         result = mcg.align(
-            *clouds, matches, inputs["method"], robust=inputs["robust"], init=start, temperature=temperature, **CONVERGED
+            *clouds,
+            matches,
+            inputs["method"],
+            robust=inputs["robust"],
+            init=start,
+            temperature=temperature,
+            **CONVERGED,
         )
         return weigh(result.matrix)
 
