@@ -170,7 +170,8 @@ class KDTreeIndex(AbstractIndex):
         pose = np.asarray(pose, np.float64)
         if self._tree is None or not np.isfinite(pose).all():
             return indices
-        moved = np.asarray(points).T @ rotation_from_quaternion(pose[:4]).T + pose[4:]
+        with np.errstate(invalid="ignore"):
+            moved = np.asarray(points).T @ rotation_from_quaternion(pose[:4]).T + pose[4:]
         queries = np.hstack([moved, descriptors])
         active = np.flatnonzero(valid & np.isfinite(queries).all(axis=1))
         # With descriptors, the nearest may lie beyond the gate while a pair within it is further in all dimensions:

@@ -70,16 +70,19 @@ def solve_update(moments: Moments) -> Update:
     trace = jnp.trace(unit_information)
     scale = _HESSIAN_SCALE / jnp.where(trace > 0, trace / 6, 1)
     root, _ = _semidefinite_root(form * scale)
+    # optimistix computes its step sizes in the default precision, and wants no other beside it.
+    root = root.astype(float)
+    tolerance = 4 * float(jnp.finfo(root.dtype).eps)
     solver: optx.LevenbergMarquardt = optx.LevenbergMarquardt(
-        rtol=4 * eps, atol=4 * eps, linear_solver=lx.Normal(lx.Cholesky())
+        rtol=tolerance, atol=tolerance, linear_solver=lx.Normal(lx.Cholesky())
     )
     solution: optx.Solution = optx.least_squares(
-        _residuals, solver, jnp.zeros(6, dtype), root, max_steps=_MAX_STEPS, throw=False
+        _residuals, solver, jnp.zeros(6), root, max_steps=_MAX_STEPS, throw=False
     )
     _, pivots = _semidefinite_root(unit_information)
     units = _units(radius)
     return Update(
-        twist=solution.value * units,
+        twist=solution.value.astype(dtype) * units,
         information=unit_information * radius**2 / (units[:, None] * units),
         degenerate=~jnp.all(pivots > 64 * eps * jnp.max(jnp.diagonal(unit_information))),
     )

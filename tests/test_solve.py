@@ -10,7 +10,6 @@ from scipy.spatial.transform import Rotation
 from mcgicp_jax import _covariance as cov
 from mcgicp_jax import _solve
 from mcgicp_jax._cost import Pairs, moments
-from mcgicp_jax._search import Correspondences
 
 X64 = jax.config.jax_enable_x64
 N = 2000
@@ -34,16 +33,18 @@ def random_pairs(seed: int, scale: float = 1.0, offset: float = 0.0, noise: floa
 
 
 def solve(moved, residual, information, weight, valid):
-    matches = Correspondences(indices=jnp.zeros(N, jnp.int32), distances=jnp.zeros(N), valid=jnp.asarray(valid))
     pairs = Pairs(
         moved=jnp.asarray(moved.T, float),
         residual=jnp.asarray(residual.T, float),
         information=cov.symmetric_from_matrix(jnp.asarray(information, float)),
         square=jnp.zeros(N),
+        valid=jnp.asarray(valid),
         weight=jnp.asarray(weight, float),
         cost=jnp.zeros(N),
+        share=jnp.asarray(valid, float),
     )
-    return jax.jit(lambda p, m: (moments(p, m), _solve.solve_update(moments(p, m))))(pairs, matches)
+    measured = jax.jit(moments)(pairs)
+    return measured, jax.jit(_solve.solve_update)(measured)
 
 
 def whitened(twist, moved, residual, information, weight, center):
@@ -89,7 +90,7 @@ def test_information_is_the_sum_of_jacobians(scale):
 def test_exact_pairs_need_no_second_update():
     moved, residual, information, weight, valid = random_pairs(2, noise=0.0)
     measured, update = solve(moved, residual, information, weight, valid)
-    turn = Rotation.from_rotvec(np.asarray(update.twist[3:], float))
+    turn = Rotation.from_rotvec(np.array(update.twist[3:], float))
     center = np.asarray(measured.center, float)
     change = turn.apply(moved - center) + center + np.asarray(update.twist[:3], float) - moved
     np.testing.assert_allclose(change[valid], residual[valid], atol=1e-10 if X64 else 1e-5)
