@@ -137,6 +137,9 @@ class PointCloud(eqx.Module):
             "covariances": (*np.shape(self.points), 3),
             "origin": np.shape(self.origin),
         }
+        for name in arrays.keys() & {"points", "channels", "covariances"}:
+            if arrays[name] is not None:
+                arrays[name] = _as_float(name, arrays[name]).astype(self.points.dtype)
         for name, value in arrays.items():
             expected = shapes.get(name, np.shape(value))
             if np.shape(value) != expected and not (name == "covariances" and value is None):

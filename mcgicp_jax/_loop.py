@@ -99,7 +99,8 @@ def measure(pose: jaxlie.SE3, model: Model) -> Measurement:
         moments=moments(pairs),
         num_inliers=num_inliers,
         cost=jnp.sum(pairs.cost),
-        rmse=jnp.sqrt(jnp.sum(square) / jnp.maximum(num_inliers, 1)),
+        # 0/0 is NaN on purpose: no pairs are no fit.
+        rmse=jnp.sqrt(jnp.sum(square) / num_inliers),
     )
 
 

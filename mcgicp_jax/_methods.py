@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import abc
+import contextlib
 import dataclasses
 from typing import ClassVar
 
@@ -202,12 +203,16 @@ class MultiChannelGICP(AbstractGeneralized):
         if self.channel_covariance is not None and self.channel_weights is not None:
             return self
         source, target = jax.lax.stop_gradient((source, target))
-        sigma, constant = _channel_noise(source, target)
+        # What is known now is computed now: a compiler that folds a median as a constant takes seconds, and complains.
+        with _eagerly_if(is_concrete(source, target)):
+            sigma, constant = _channel_noise(source, target)
         covariance, weights = self.channel_covariance, self.channel_weights
         if covariance is None:
             covariance = 2 * sigma**2
         if weights is None:
-            weights = jnp.where(constant, 0, _spacing(target) / sigma)
+            with _eagerly_if(is_concrete(target)):
+                spacing = _spacing(target)
+            weights = jnp.where(constant, 0, spacing / sigma)
         return eqx.tree_at(
             lambda method: (method.channel_covariance, method.channel_weights),
             self,
@@ -245,6 +250,10 @@ def prepare(method: AbstractMethod, cloud: PointCloud) -> Surface:
         descriptors=method.descriptors(cloud),
         valid=jnp.asarray(cloud.valid),
     )
+
+
+def _eagerly_if(concrete: bool) -> contextlib.AbstractContextManager[None]:
+    return jax.ensure_compile_time_eval() if concrete else contextlib.nullcontext()
 
 
 def _identity(cloud: PointCloud) -> Float[Array, "6 N"]:

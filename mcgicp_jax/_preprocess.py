@@ -49,7 +49,7 @@ def preprocess(
         cloud = PointCloud(cloud)
     if not is_concrete(cloud):
         raise ValueError("cloud: expected numbers, got tracers; preprocess outside of jit, grad and vmap")
-    if voxel_size is not None and not 0 < voxel_size < np.inf:
+    if voxel_size is not None and (isinstance(voxel_size, str) or not 0 < voxel_size < np.inf):
         raise ValueError(f"voxel_size: expected a positive number of metres or None, got {voxel_size!r}")
     if num_neighbors < 3:
         raise ValueError(f"num_neighbors: expected at least 3, got {num_neighbors}")

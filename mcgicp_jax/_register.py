@@ -193,6 +193,11 @@ def _surfaces(
 ) -> tuple[AbstractMethod, Surface, Surface]:
     if not isinstance(method, AbstractMethod):
         raise ValueError(f"method: expected one such as MultiChannelGICP(), got {method!r}")
+    for name, cloud in (("source", source), ("target", target)):
+        if cloud.points.ndim != 2:
+            raise ValueError(
+                f"{name}: expected a single cloud, got shape {cloud.points.shape}; use jax.vmap for a batch"
+            )
     if method.uses_channels and source.channels.shape[-1] != target.channels.shape[-1]:
         raise ValueError(
             f"channels: expected as many in the source as in the target for {type(method).__name__}, "
@@ -261,13 +266,17 @@ def _translation_adjoint(offset: Array | np.ndarray) -> Array | np.ndarray:
 
 
 def _check_positive(name: str, value: ArrayLike) -> None:
-    if is_concrete(value) and not (np.ndim(value) == 0 and np.asarray(value) > 0):
+    if is_concrete(value) and not (_is_number(value) and np.asarray(value) > 0):
         raise ValueError(f"{name}: expected a positive number, got {value!r}")
 
 
+def _is_number(value: object) -> bool:
+    return np.ndim(value) == 0 and np.asarray(value).dtype.kind in "fiu"  # type: ignore[arg-type]
+
+
 def _check_loop(max_iterations: int, translation_tolerance: ArrayLike, rotation_tolerance: ArrayLike) -> None:
-    if max_iterations < 1:
+    if not _is_number(max_iterations) or max_iterations < 1:
         raise ValueError(f"max_iterations: expected at least 1, got {max_iterations!r}")
     for name, value in (("translation_tolerance", translation_tolerance), ("rotation_tolerance", rotation_tolerance)):
-        if is_concrete(value) and not (np.ndim(value) == 0 and np.asarray(value) >= 0):
+        if is_concrete(value) and not (_is_number(value) and np.asarray(value) >= 0):
             raise ValueError(f"{name}: expected a number of at least 0, got {value!r}")

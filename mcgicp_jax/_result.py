@@ -42,7 +42,7 @@ class Registration(eqx.Module):
         num_iterations: updates of the pose.
         num_inliers: pairs within `max_distance`.
         cost: Σ ρ(dᵀ M d) over them.
-        rmse: root mean square distance of the pairs, metres.
+        rmse: root mean square distance of the pairs, metres; mostly the spacing of the points. NaN without pairs.
         information: (6, 6) Σ Jᵀ M J for the twist ξ = (v, ω) of T exp(ξ), metres and radians, in the source's frame.
             It weighs directions against each other; its scale is that of GICP's relative covariances, so its inverse
             is *not* a covariance of the pose.

@@ -73,7 +73,7 @@ def test_channels_hold_the_flat_table(data):
         source, target = (
             # One size for all pairs: every size compiles.
             mcg.preprocess(mcg.PointCloud(pair[f"{name}_points_flat"], pair[f"{name}_rgb"]), voxel_size=0.01).pad(
-                12_000
+                18_000
             )
             for name in ("source", "target")
         )

@@ -150,7 +150,7 @@ def test_clouds_without_overlap_do_not_converge(room):
     source, target, _ = room
     result = mcg.register(source, target, mcg.GICP(), init=motion((50, 0, 0, 0, 0, 0)), max_distance=0.5)
     assert result.status is Status.TOO_FEW_CORRESPONDENCES
-    assert not result.converged and result.num_inliers == 0 and result.cost == 0
+    assert not result.converged and result.num_inliers == 0 and result.cost == 0 and np.isnan(result.rmse)
     np.testing.assert_allclose(result.matrix, motion((50, 0, 0, 0, 0, 0)))
     assert "TOO_FEW_CORRESPONDENCES" in repr(result)
 
@@ -248,7 +248,13 @@ def test_rows_that_are_not_finite_are_left_out_with_one_warning():
 
 
 BAD_ARGUMENTS = {
-    "max_distance": [{"max_distance": 0.0}, {"max_distance": -1.0}, {"max_distance": np.nan}],
+    "max_distance": [
+        {"max_distance": "1"},
+        {"max_distance": None},
+        {"max_distance": 0.0},
+        {"max_distance": -1.0},
+        {"max_distance": np.nan},
+    ],
     "max_iterations": [{"max_iterations": 0}],
     "translation_tolerance": [{"translation_tolerance": -1.0}],
     "rotation_tolerance": [{"rotation_tolerance": np.nan}],
@@ -283,6 +289,28 @@ def test_a_bad_argument_is_named(name, arguments, room):
 def test_a_bad_cloud_is_named(points, message, room):
     with pytest.raises(ValueError, match=message):
         mcg.register(points, room[1], mcg.GICP(), max_distance=0.5)
+
+
+def test_a_batch_needs_vmap(room):
+    batch = mcg.PointCloud.stack([room[0], room[0]])
+    with pytest.raises(ValueError, match=r"source: expected a single cloud, got points .* jax.vmap"):
+        mcg.register(batch, room[1], mcg.GICP(), max_distance=0.5)
+
+
+def test_integer_channels_count_as_numbers(room):
+    source, target, _ = room
+    poses = [
+        mcg.register(
+            *(
+                cloud.replace(channels=np.round(100 * np.asarray(cloud.channels)).astype(kind))
+                for cloud in (source, target)
+            ),
+            mcg.ColorICP(0.003),
+            max_distance=0.5,
+        ).matrix
+        for kind in (int, float)
+    ]
+    np.testing.assert_array_equal(*poses)
 
 
 def test_channel_counts_must_fit(room):
