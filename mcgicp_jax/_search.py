@@ -156,6 +156,10 @@ class KDTreeIndex(AbstractIndex):
         self._tree = _tree(rows[self._rows]) if self._rows.size else None
         self._workers = workers
 
+    @property
+    def num_rows(self) -> int:
+        return self._rows.size
+
     def nearest(
         self,
         pose: Float[ArrayLike, "7"],
@@ -185,8 +189,8 @@ class KDTreeIndex(AbstractIndex):
 class _IndexCache:
     """The trees of the targets seen last, by content: a callback that is pure still builds each tree only once."""
 
-    def __init__(self, size: int):
-        self._size = size
+    def __init__(self, rows: int):
+        self._rows = rows
         self._lock = threading.Lock()
         self._indices: collections.OrderedDict[bytes, KDTreeIndex] = collections.OrderedDict()
 
@@ -202,12 +206,13 @@ class _IndexCache:
         index = KDTreeIndex(points, descriptors, valid, workers)
         with self._lock:
             self._indices[key] = index
-            while len(self._indices) > self._size:
+            while len(self._indices) > 1 and sum(kept.num_rows for kept in self._indices.values()) > self._rows:
                 self._indices.popitem(last=False)
         return index
 
 
-_index_cache = _IndexCache(size=256)
+# Enough for hundreds of scans in a batch, some hundred megabytes.
+_index_cache = _IndexCache(rows=2_000_000)
 
 
 def _nearest_callback(

@@ -23,7 +23,7 @@ import numpy as np
 
 # Points and runs: PyPose takes seconds for 5,000.
 AGAINST_PYPOSE = {1000: 7, 2000: 7, 5000: 3}
-AGAINST_PLAIN = {2000: 9, 6000: 9, 20000: 7}
+AGAINST_PLAIN = {2000: 15, 6000: 15, 20000: 9}
 # PyPose keeps every pair, so must we: the scene is 2 m wide.
 KEEP_ALL = 10.0
 GATE = 0.4
