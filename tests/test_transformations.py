@@ -136,7 +136,7 @@ def test_align_has_the_gradient_of_given_covariances(noisy):
 
 
 @needs_x64
-@pytest.mark.parametrize("name", ["mc-gicp", "gicp", "point-to-point"])
+@pytest.mark.parametrize("name", CASES)
 def test_register_has_the_gradient_of_its_answer(name, noisy):
     """Where no match flips within the step of the difference, which is checked."""
     source, target, _ = noisy
@@ -170,6 +170,20 @@ def test_register_has_the_gradient_of_its_answer(name, noisy):
         actual = float(jnp.sum(gradient[key] * direction))
         # A second-order difference, since more steps would flip a match.
         assert abs(actual - expected) <= 1e-6 * max(abs(expected), 1e-2), key
+
+
+@needs_x64
+def test_jacobians_agree_forward_and_backward(noisy):
+    source, target, _ = noisy
+    method, _ = CASES["gicp"]
+    matches = mcg.find_correspondences(source, target, motion(), method, max_distance=GATE)
+
+    def pose(epsilon):
+        return mcg.align(source, target, matches, mcg.GICP(epsilon), init=motion(), **CONVERGED).matrix
+
+    forward, backward = (jax.jit(jacobian(pose))(jnp.asarray(1e-2)) for jacobian in (jax.jacfwd, jax.jacrev))
+    assert np.abs(forward).max() > 1e-3
+    np.testing.assert_allclose(forward, backward, rtol=1e-9, atol=1e-12)
 
 
 @needs_x64
