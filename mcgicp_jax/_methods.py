@@ -383,8 +383,9 @@ def _covariance(value: Values) -> Float[Array, "..."]:
     if is_concrete(covariance):
         matrix = np.asarray(covariance, np.float64)
         matrix = matrix if matrix.ndim == 2 else np.diag(np.atleast_1d(matrix))
-        symmetric = np.allclose(matrix, matrix.T, rtol=1e-5, atol=1e-6 * np.abs(matrix).max(initial=0))
+        finite = bool(np.isfinite(matrix).all())
+        symmetric = finite and np.allclose(matrix, matrix.T, rtol=1e-5, atol=1e-6 * np.abs(matrix).max(initial=0))
         # An empty matrix (no channels) is positive definite; NaN is not.
-        if not (np.isfinite(matrix).all() and symmetric and np.all(np.linalg.eigvalsh(matrix) > 0)):
+        if not (symmetric and np.all(np.linalg.eigvalsh(matrix) > 0)):
             raise ValueError(f"channel_covariance: expected it symmetric and positive definite, got {value!r}")
     return covariance
