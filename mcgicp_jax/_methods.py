@@ -74,11 +74,8 @@ class AbstractMethod(Numbers):
         return jnp.zeros((cloud.points.shape[0], 0), cloud.points.dtype)
 
 
-class PointToPoint(AbstractMethod):
-    """Plain ICP (Besl & McKay 1992): M = I."""
-
-    def covariance(self, cloud: PointCloud) -> Float[Array, "6 N"]:
-        return _identity(cloud)
+class AbstractOneSided(AbstractMethod):
+    """Methods whose weight matrix M is known from the target alone."""
 
     def information(
         self, target: Float[Array, "6 N"], source: Float[Array, "6 N"], rotation: Float[Array, "3 3"]
@@ -86,7 +83,14 @@ class PointToPoint(AbstractMethod):
         return target
 
 
-class PointToPlane(AbstractMethod):
+class PointToPoint(AbstractOneSided):
+    """Plain ICP (Besl & McKay 1992): M = I."""
+
+    def covariance(self, cloud: PointCloud) -> Float[Array, "6 N"]:
+        return _identity(cloud)
+
+
+class PointToPlane(AbstractOneSided):
     """Point-to-plane ICP (Chen & Medioni 1991): M = n nᵀ with the target's normals."""
 
     def covariance(self, cloud: PointCloud) -> Float[Array, "6 N"]:
@@ -96,13 +100,8 @@ class PointToPlane(AbstractMethod):
             local = cov.local_covariance(jnp.asarray(cloud.points).T, _neighbors(cloud))
         return cov.outer(cov.smallest_eigenvector(local))
 
-    def information(
-        self, target: Float[Array, "6 N"], source: Float[Array, "6 N"], rotation: Float[Array, "3 3"]
-    ) -> Float[Array, "6 N"]:
-        return target
 
-
-class ColorICP(AbstractMethod):
+class ColorICP(AbstractOneSided):
     """ICP whose matches are nearest in position and channels (Johnson & Kang 1999): M = I.
 
     Attributes:
@@ -119,11 +118,6 @@ class ColorICP(AbstractMethod):
 
     def covariance(self, cloud: PointCloud) -> Float[Array, "6 N"]:
         return _identity(cloud)
-
-    def information(
-        self, target: Float[Array, "6 N"], source: Float[Array, "6 N"], rotation: Float[Array, "3 3"]
-    ) -> Float[Array, "6 N"]:
-        return target
 
     def descriptors(self, cloud: PointCloud) -> Float[Array, "N D"]:
         return _weighted_channels(cloud, self.channel_weights)
