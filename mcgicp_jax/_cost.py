@@ -101,7 +101,6 @@ class Pairs(eqx.Module):
         moved: (3, N) T a.
         residual: (3, N) d = b − T a.
         information: (6, N) M.
-        square: (N,) dᵀ M d.
         valid: (N,) whether there is a match.
         weight: (N,) robust weight, times the share of a soft match; 0 without a match.
         cost: (N,) ρ(dᵀ M d), times that share; 0 without a match.
@@ -111,7 +110,6 @@ class Pairs(eqx.Module):
     moved: Float[Array, "3 N"]
     residual: Float[Array, "3 N"]
     information: Float[Array, "6 N"]
-    square: Float[Array, "N"]
     valid: Bool[Array, "N"]
     weight: Float[Array, "N"]
     cost: Float[Array, "N"]
@@ -162,7 +160,6 @@ def evaluate_pairs(
         moved=moved,
         residual=residual,
         information=information,
-        square=square,
         valid=valid,
         weight=share * weight,
         cost=share * cost,

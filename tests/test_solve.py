@@ -37,7 +37,6 @@ def solve(moved, residual, information, weight, valid):
         moved=jnp.asarray(moved.T, float),
         residual=jnp.asarray(residual.T, float),
         information=cov.symmetric_from_matrix(jnp.asarray(information, float)),
-        square=jnp.zeros(N),
         valid=jnp.asarray(valid),
         weight=jnp.asarray(weight, float),
         cost=jnp.zeros(N),
