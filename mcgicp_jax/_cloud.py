@@ -54,6 +54,24 @@ def _as_float(name: str, values: Values) -> Any:
     return array if array.dtype in (np.float32, np.float64) else array.astype(np.float64)
 
 
+def _as_mask(values: Values, shape: tuple[int, ...]) -> Any:
+    """`channel_valid` for channels of this shape; a single channel may come as a vector."""
+    mask = values if isinstance(values, jax.Array) else np.asarray(values)
+    if mask.dtype != bool:
+        raise ValueError(f"channel_valid: expected booleans, got dtype {mask.dtype}")
+    if mask.shape == shape[:-1] and shape[-1] == 1:
+        mask = mask[..., None]
+    if mask.shape != shape:
+        raise ValueError(f"channel_valid: expected shape {shape} to go with channels, got {mask.shape}")
+    return mask
+
+
+def _blank(channels: Any, channel_valid: Any) -> Any:
+    """Channels with 0 where there are none: what is missing, mostly NaN, never reaches arithmetic."""
+    xp = np if isinstance(channels, np.ndarray) and isinstance(channel_valid, np.ndarray) else jnp
+    return xp.where(channel_valid, channels, 0)
+
+
 class PointCloud(eqx.Module):
     """Points with channels; a pytree whose arrays may all carry leading batch dimensions.
 
@@ -64,6 +82,8 @@ class PointCloud(eqx.Module):
     Attributes:
         points: (N, 3), metres, relative to `origin`.
         channels: (N, C), in the unit that the user gives; C may be 0.
+        channel_valid: (N, C), False where a point has no such channel, as outside of a camera's view; its value there
+            is 0 and takes part in nothing. None: all points have all channels.
         valid: (N,), False for padding.
         neighbors: (N, k) row numbers of the k nearest points, the point itself among them; −1 where there are fewer.
         covariances: (N, 3, 3), or None: if given, the methods take these instead of computing their own.
@@ -73,6 +93,7 @@ class PointCloud(eqx.Module):
 
     points: Float[Array, "*batch N 3"] | Float[np.ndarray, "*batch N 3"]
     channels: Float[Array, "*batch N C"] | Float[np.ndarray, "*batch N C"]
+    channel_valid: Bool[Array, "*batch N C"] | Bool[np.ndarray, "*batch N C"] | None
     valid: Bool[Array, "*batch N"] | Bool[np.ndarray, "*batch N"]
     neighbors: Int[Array, "*batch N k"] | None
     covariances: Float[Array, "*batch N 3 3"] | Float[np.ndarray, "*batch N 3 3"] | None
@@ -84,6 +105,7 @@ class PointCloud(eqx.Module):
         points: Values,
         channels: Values | None = None,
         *,
+        channel_valid: Values | None = None,
         covariances: Values | None = None,
         channel_names: Sequence[str] | None = None,
     ):
@@ -92,6 +114,8 @@ class PointCloud(eqx.Module):
         Args:
             points: (N, 3), metres. Lists, any real dtype, NumPy or JAX.
             channels: (N, C), or (N,) for a single one.
+            channel_valid: booleans in the shape of `channels`, False where a point has no such channel; its value may
+                then be anything, NaN too. None: all are there.
             covariances: (N, 3, 3), dimensionless as GICP's are (1 in the surface, ε across it).
             channel_names: one name per channel.
 
@@ -109,6 +133,10 @@ class PointCloud(eqx.Module):
             self.channels = self.channels[:, None]
         if self.channels.ndim != 2 or self.channels.shape[0] != size:
             raise ValueError(f"channels: expected shape ({size}, C) to go with points, got {self.channels.shape}")
+        self.channel_valid = None
+        if channel_valid is not None:
+            self.channel_valid = _as_mask(channel_valid, np.shape(self.channels))
+            self.channels = _blank(self.channels, self.channel_valid)
         self.covariances = None if covariances is None else _as_float("covariances", covariances)
         if self.covariances is not None and self.covariances.shape != (size, 3, 3):
             raise ValueError(f"covariances: expected shape ({size}, 3, 3), got {self.covariances.shape}")
@@ -125,6 +153,7 @@ class PointCloud(eqx.Module):
     def replace(self, **arrays: Any) -> PointCloud:
         """The cloud with some of its arrays exchanged (`points`, `channels`, `covariances`, ...); shapes must agree.
 
+        Points keep the channels that they have: where there is `channel_valid`, it holds for other `channels` too.
         Neighbours stay as they are: to autodiff they are constants.
         """
         fields = {name: getattr(self, name) for name in self.__dataclass_fields__}
@@ -150,7 +179,11 @@ class PointCloud(eqx.Module):
                 raise ValueError(f"channels: expected shape ({self.points.shape[-2]}, C), got {np.shape(channels)}")
             if channels.shape[-1] != self.channels.shape[-1] and "channel_names" not in arrays:
                 arrays["channel_names"] = tuple(f"channel_{i}" for i in range(channels.shape[-1]))
-        return _build(**fields | arrays)
+        fields |= arrays
+        if fields["channel_valid"] is not None and arrays.keys() & {"channels", "channel_valid"}:
+            fields["channel_valid"] = _as_mask(fields["channel_valid"], np.shape(fields["channels"]))
+            fields["channels"] = _blank(fields["channels"], fields["channel_valid"])
+        return _build(**fields)
 
     def __len__(self) -> int:
         """The number of points, padding not counted."""
@@ -163,8 +196,11 @@ class PointCloud(eqx.Module):
             size = f"{len(self)} points"
         else:
             size = f"{len(self)} points padded to {self.points.shape[0]}"
-        names = ", ".join(self.channel_names) if self.channel_names else "none"
-        parts = [size, f"channels: {names}", str(self.points.dtype)]
+        names = list(self.channel_names)
+        if self.channel_valid is not None and is_concrete(self) and self.points.ndim == 2:
+            shares = np.mean(np.asarray(self.channel_valid)[np.asarray(self.valid)], axis=0)
+            names = [f"{name} ({share:.0%})" for name, share in zip(names, shares, strict=True)]
+        parts = [size, f"channels: {', '.join(names) or 'none'}", str(self.points.dtype)]
         if self.neighbors is not None:
             parts.append(f"{self.neighbors.shape[-1]} neighbors")
         if is_concrete(self.origin) and np.any(self.origin):
@@ -179,7 +215,11 @@ class PointCloud(eqx.Module):
             points = points.astype(np.float64) + np.asarray(self.origin)
         covariances = None if self.covariances is None else np.asarray(self.covariances)[keep]
         return PointCloud(
-            points, np.asarray(self.channels)[keep], covariances=covariances, channel_names=self.channel_names
+            points,
+            np.asarray(self.channels)[keep],
+            channel_valid=None if self.channel_valid is None else np.asarray(self.channel_valid)[keep],
+            covariances=covariances,
+            channel_names=self.channel_names,
         )
 
     def pad(self, size: int) -> PointCloud:
@@ -203,6 +243,7 @@ class PointCloud(eqx.Module):
         return self.replace_rows(
             points=grow(self.points),
             channels=grow(self.channels),
+            channel_valid=grow(self.channel_valid),
             valid=grow(self.valid),
             neighbors=grow(self.neighbors, -1),
             covariances=covariances,
@@ -239,6 +280,12 @@ class PointCloud(eqx.Module):
         for i, cloud in enumerate(clouds):
             if cloud.channel_names != names:
                 raise ValueError(f"clouds[{i}]: expected the channels {names}, got {cloud.channel_names}")
+        if any(cloud.channel_valid is not None for cloud in clouds):
+            everywhere = [np.ones(cloud.channels.shape, bool) for cloud in clouds]
+            clouds = [
+                cloud if cloud.channel_valid is not None else cloud.replace(channel_valid=mask)
+                for cloud, mask in zip(clouds, everywhere, strict=True)
+            ]
         padded = [cloud.pad(size) for cloud in clouds]
         stacked = jax.tree.map(lambda *rows: jnp.stack(rows), *padded)
         if is_concrete(stacked):

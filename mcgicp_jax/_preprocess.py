@@ -7,7 +7,7 @@ import warnings
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from mcgicp_jax._cloud import PointCloud, Values, is_far, size_class
 from mcgicp_jax._pose import is_concrete
@@ -31,7 +31,8 @@ def preprocess(
 
     Args:
         cloud: raw cloud, or an (N, 3) array. A cloud that is padded already is unpadded first.
-        voxel_size: metres; points and channels of one voxel are averaged. None keeps every point.
+        voxel_size: metres; points and channels of one voxel are averaged, each channel over the points that have it.
+            None keeps every point.
         num_neighbors: k, the neighbours (the point itself among them) that a covariance is computed from; at least 3.
             Fewer are used where the cloud has fewer points.
         search: how neighbours are found; by default SciPy's k-d tree.
@@ -56,10 +57,11 @@ def preprocess(
     cloud = _finite(cloud.unpad())
     points = np.asarray(cloud.points)
     channels, covariances = np.asarray(cloud.channels), cloud.covariances
+    channel_valid = None if cloud.channel_valid is None else np.asarray(cloud.channel_valid)
     if voxel_size is not None:
         if covariances is not None:
             raise ValueError("voxel_size: expected None for a cloud with covariances, which cannot be averaged")
-        points, channels = _downsample(points, channels, voxel_size)
+        points, channels, channel_valid = _downsample(points, channels, channel_valid, voxel_size)
         if len(points) < MIN_POINTS:
             raise ValueError(
                 f"voxel_size: expected one that leaves at least {MIN_POINTS} points, got {voxel_size} m, "
@@ -73,6 +75,8 @@ def preprocess(
     ready = cloud.replace_rows(
         points=points,
         channels=channels.astype(dtype),
+        # Clouds that lack nothing share the programs of those that never could.
+        channel_valid=None if channel_valid is None or channel_valid.all() else channel_valid,
         valid=np.ones(len(points), bool),
         neighbors=neighbors.astype(np.int32),
         covariances=None if covariances is None else np.asarray(covariances, dtype),
@@ -81,7 +85,7 @@ def preprocess(
     return ready.replace_rows(
         **{
             name: None if value is None else jnp.asarray(value)
-            for name in ("points", "channels", "valid", "neighbors", "covariances")
+            for name in ("points", "channels", "channel_valid", "valid", "neighbors", "covariances")
             for value in [getattr(ready, name)]
         }
     )
@@ -99,15 +103,19 @@ def _finite(cloud: PointCloud) -> PointCloud:
     return PointCloud(
         cloud.points[keep],
         cloud.channels[keep],
+        channel_valid=None if cloud.channel_valid is None else cloud.channel_valid[keep],
         covariances=None if cloud.covariances is None else cloud.covariances[keep],
         channel_names=cloud.channel_names,
     )
 
 
 def _downsample(
-    points: Float[np.ndarray, "N 3"], channels: Float[np.ndarray, "N C"], voxel_size: float
-) -> tuple[Float[np.ndarray, "M 3"], Float[np.ndarray, "M C"]]:
-    """The mean of each voxel, in float64; voxels in lexical order of their position."""
+    points: Float[np.ndarray, "N 3"],
+    channels: Float[np.ndarray, "N C"],
+    channel_valid: Bool[np.ndarray, "N C"] | None,
+    voxel_size: float,
+) -> tuple[Float[np.ndarray, "M 3"], Float[np.ndarray, "M C"], Bool[np.ndarray, "M C"] | None]:
+    """The mean of each voxel, in float64, and which channels it has; voxels in lexical order of their position."""
     cells = np.floor(points.astype(np.float64) / voxel_size)
     cells -= cells.min(axis=0)
     if cells.max() >= _VOXELS_PER_AXIS:
@@ -120,14 +128,19 @@ def _downsample(
     order = np.argsort(key, kind="stable")
     key = key[order]
     starts = np.flatnonzero(np.concatenate([[True], key[1:] != key[:-1]]))
-    counts = np.diff(np.append(starts, len(key)))[:, None]
 
-    def mean(values: np.ndarray) -> np.ndarray:
+    def total(values: np.ndarray) -> np.ndarray:
         if values.shape[1] == 0:
-            return np.zeros((len(starts), 0), values.dtype)
-        return (np.add.reduceat(values[order].astype(np.float64), starts, axis=0) / counts).astype(values.dtype)
+            return np.zeros((len(starts), 0))
+        return np.add.reduceat(values[order].astype(np.float64), starts, axis=0)
 
-    return mean(points), mean(channels)
+    counts = np.diff(np.append(starts, len(key)))[:, None]
+    means = (total(points) / counts).astype(points.dtype)
+    if channel_valid is None:
+        return means, (total(channels) / counts).astype(channels.dtype), None
+    # What is missing is stored as 0, so a sum over all is one over those that are there.
+    counts = total(channel_valid)
+    return means, (total(channels) / np.maximum(counts, 1)).astype(channels.dtype), counts > 0
 
 
 def _far_origin(points: Float[np.ndarray, "N 3"]) -> Float[np.ndarray, "3"]:

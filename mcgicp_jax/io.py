@@ -37,9 +37,11 @@ def read(path: str | os.PathLike[str]) -> PointCloud:
     line, or else are x, y, z, channel_0, ... as in `.npy`, (N, 3 + C). `.npz` holds `points` (N, 3), and `channels`
     (N, C) with `channel_names`, or `intensity` (N,) and `rgb` or `colors` (N, 3).
 
+    NaN in a channel says, in every format, that the point has no such channel: `PointCloud.channel_valid`.
+
     Returns:
         A cloud of NumPy arrays: points (N, 3), metres, as float64 where the file holds them so (always in LAS and
-        text); channels (N, C). Rows that are not finite are kept.
+        text); channels (N, C). Rows whose coordinates are not finite are kept.
 
     Raises:
         OSError: if the file cannot be opened.
@@ -56,6 +58,9 @@ def read(path: str | os.PathLike[str]) -> PointCloud:
             cloud = reader(file, size)
             if len(cloud) == 0:
                 raise ValueError("it has no points")
+            missing = np.isnan(cloud.channels)
+            if missing.any():
+                cloud = cloud.replace(channel_valid=~missing)
         except ImportError:
             raise
         except BaseException as error:
@@ -73,7 +78,8 @@ def write(path: str | os.PathLike[str], cloud: PointCloud) -> None:
     `read` gives the same cloud back, with what the format can hold: float32 and float64 stay as they are in PLY, PCD
     and NPZ, colours that are whole 255ths are stored as 8-bit integers; `.npy` keeps no names, `.npz` alone keeps the
     order of the channels and the covariances; KITTI holds float32. LAS rounds coordinates to a power of ten, at worst
-    5·10⁻⁹ of the cloud's extent, and colours to 16 bits. A failed write leaves an existing file as it was.
+    5·10⁻⁹ of the cloud's extent, and colours to 16 bits. Channels that a point does not have become NaN, which LAS
+    cannot hold. A failed write leaves an existing file as it was.
 
     Args:
         path: `.ply`, `.pcd`, `.las`, `.laz`, `.bin` (KITTI), `.npy`, `.npz`, `.xyz`, `.txt` or `.csv`.
@@ -90,8 +96,12 @@ def write(path: str | os.PathLike[str], cloud: PointCloud) -> None:
         raise ValueError(f"cloud: expected a single cloud, got points of shape {tuple(cloud.points.shape)}")
     if len(cloud) == 0:
         raise ValueError("cloud: expected at least one point to write, got none")
+    cloud = cloud.unpad()
+    if cloud.channel_valid is not None:
+        channels = np.where(cloud.channel_valid, cloud.channels, np.nan)
+        cloud = cloud.replace(channels=channels, channel_valid=None)
     with _replacing(path) as file:
-        writer(file, cloud.unpad())
+        writer(file, cloud)
 
 
 def read_poses(path: str | os.PathLike[str]) -> Float[np.ndarray, "N 4 4"]:

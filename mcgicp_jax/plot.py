@@ -41,11 +41,11 @@ def before_after(
 ) -> matplotlib.figure.Figure:
     """What each pose makes of the source, seen in the direction in which the target is thinnest; a row per pose.
 
-    Clouds that both have the channels red, green and blue alternate like the squares of a chess board, target beside
-    moved source: a pattern that runs through unbroken is one that fits. Next to it is the difference of the colours.
-    Other clouds are laid over each other, the target in blue and the source in orange: black is where both are. What
-    stands upright is drawn dark and what lies flat pale, since the rings that a LiDAR draws on the ground move with it.
-    The detail shows where the poses differ most.
+    Clouds whose points all have the channels red, green and blue alternate like the squares of a chess board, target
+    beside moved source: a pattern that runs through unbroken is one that fits. Next to it is the difference of the
+    colours. Other clouds are laid over each other, the target in blue and the source in orange: black is where both
+    are. What stands upright is drawn dark and what lies flat pale, since the rings that a LiDAR draws on the ground
+    move with it. The detail shows where the poses differ most.
 
     Args:
         poses: `T_target_source` by the name of its method. The first row is the identity, "start", or the poses' own
@@ -324,7 +324,7 @@ def _scatter(graphs: Any, cloud: PointCloud, name: str, color: str, share: float
     marker: dict[str, Any] = {"size": 1.5, "color": color}
     if rgb is not None:
         marker["color"] = [f"rgb({r},{g},{b})" for r, g, b in np.round(255 * rgb[kept]).astype(int)]
-    elif "intensity" in cloud.channel_names and len(cloud):
+    elif _everywhere(cloud, ("intensity",)) and len(cloud):
         intensity = np.asarray(cloud.channels)[:, cloud.channel_names.index("intensity")]
         low, high = np.nanpercentile(intensity, [2, 98])
         marker |= {"color": intensity[kept], "colorscale": "Viridis", "cmin": low, "cmax": high}
@@ -373,13 +373,26 @@ def _drawable(cloud: PointCloud) -> PointCloud:
     cloud = cloud.unpad()
     points = np.asarray(cloud.points, np.float64)
     finite = np.isfinite(points).all(axis=1)
-    return PointCloud(points[finite], np.asarray(cloud.channels)[finite], channel_names=cloud.channel_names)
+    return PointCloud(
+        points[finite],
+        np.asarray(cloud.channels)[finite],
+        channel_valid=None if cloud.channel_valid is None else np.asarray(cloud.channel_valid)[finite],
+        channel_names=cloud.channel_names,
+    )
+
+
+def _everywhere(cloud: PointCloud, names: tuple[str, ...]) -> bool:
+    """Whether every point has all of these channels."""
+    if not set(names) <= set(cloud.channel_names):
+        return False
+    columns = [cloud.channel_names.index(name) for name in names]
+    return cloud.channel_valid is None or bool(np.asarray(cloud.channel_valid)[:, columns].all())
 
 
 def _rgb(cloud: PointCloud) -> Points | None:
-    """Colours in 0..1 from channels in 0..1, 0..255 or 0..65535; None if the cloud has none."""
+    """Colours in 0..1 from channels in 0..1, 0..255 or 0..65535; None if not every point has one."""
     names = ("red", "green", "blue")
-    if not set(names) <= set(cloud.channel_names):
+    if not _everywhere(cloud, names):
         return None
     channels = np.asarray(cloud.channels, float)[:, [cloud.channel_names.index(name) for name in names]]
     largest = channels.max(initial=0)

@@ -22,6 +22,11 @@ def covariances(seed=0):
     return (root @ root.swapaxes(1, 2)).astype(np.float32).astype(float)
 
 
+def partial(seed=0, share=0.4):
+    """Which points have which of the two channels."""
+    return np.random.default_rng(seed).random((150, 2)) < share
+
+
 def raw(**kwargs):
     return PointCloud(POINTS, CHANNELS, channel_names=("intensity", "heat"), **kwargs)
 
@@ -56,9 +61,50 @@ def test_without_channels_there_are_none():
     assert len(cloud) == 150
 
 
+def test_a_missing_channel_is_stored_as_zero():
+    """Whatever stands there, NaN mostly: it never reaches arithmetic."""
+    values = np.where(partial(), CHANNELS, np.nan)
+    for form in (np.asarray, jnp.asarray):
+        cloud = PointCloud(POINTS, form(values), channel_valid=form(partial()))
+        np.testing.assert_array_equal(cloud.channels, np.where(partial(), CHANNELS, 0))
+        np.testing.assert_array_equal(cloud.channel_valid, partial())
+
+
+def test_the_mask_of_a_single_channel_may_be_a_vector():
+    cloud = PointCloud(POINTS, CHANNELS[:, 0], channel_valid=partial()[:, 0])
+    np.testing.assert_array_equal(cloud.channel_valid, partial()[:, :1])
+
+
+@pytest.mark.parametrize(
+    "mask", [np.ones((150, 1), bool), np.ones((149, 2), bool), np.ones(150, bool), np.ones((150, 2))], ids=np.shape
+)
+def test_a_mask_that_does_not_fit(mask):
+    for make in (raw, ready().replace, ready(raw(channel_valid=partial())).replace):
+        with pytest.raises(ValueError, match="channel_valid: expected"):
+            make(channel_valid=mask)
+
+
+def test_replaced_channels_keep_the_mask():
+    cloud = ready(raw(channel_valid=partial()))
+    replaced = cloud.replace(channels=jnp.where(cloud.channel_valid, 2 * cloud.channels, jnp.nan))
+    np.testing.assert_array_equal(replaced.channels, 2 * cloud.channels)
+    np.testing.assert_array_equal(replaced.channel_valid, cloud.channel_valid)
+    assert cloud.replace(channel_valid=None).channel_valid is None
+    with pytest.raises(ValueError, match=r"channel_valid: expected shape \(160, 3\)"):
+        cloud.replace(channels=jnp.zeros((160, 3)))
+
+
+def test_what_is_missing_has_no_gradient():
+    cloud = ready(raw(channel_valid=partial()))
+    gradient = jax.grad(lambda channels: jnp.sum(cloud.replace(channels=channels).channels))(
+        jnp.where(cloud.channel_valid, cloud.channels, jnp.nan)
+    )
+    np.testing.assert_array_equal(gradient, np.asarray(cloud.channel_valid, float))
+
+
 @pytest.mark.parametrize("size", [150, 160, 333])
 def test_unpad_undoes_pad(size):
-    cloud = raw(covariances=covariances())
+    cloud = raw(covariances=covariances(), channel_valid=partial())
     padded = cloud.pad(size)
     assert padded.points.shape == (size, 3)
     assert len(padded) == 150
@@ -198,6 +244,17 @@ def test_stack():
     assert "2" in repr(stacked)
 
 
+def test_stack_of_whole_and_partial_channels():
+    clouds = [ready(raw()), ready(raw(channel_valid=partial()))]
+    assert PointCloud.stack(clouds[:1] * 2).channel_valid is None
+    for order in (clouds, clouds[::-1]):
+        stacked = PointCloud.stack(order)
+        for i, cloud in enumerate(order):
+            mask = np.ones((150, 2), bool) if cloud.channel_valid is None else partial()
+            np.testing.assert_array_equal(stacked.channel_valid[i, :150], mask)
+            np.testing.assert_array_equal(stacked.channels[i], cloud.channels)
+
+
 def test_stack_keeps_large_origins():
     clouds = [ready(PointCloud(POINTS + UTM)), ready(PointCloud(POINTS - UTM))]
     stacked = PointCloud.stack(clouds)
@@ -214,7 +271,11 @@ def pickled(cloud):
     return pickle.loads(pickle.dumps(cloud))
 
 
-@pytest.mark.parametrize("cloud", [raw(), raw(covariances=covariances()), ready()], ids=["raw", "covariances", "ready"])
+@pytest.mark.parametrize(
+    "cloud",
+    [raw(), raw(covariances=covariances()), raw(channel_valid=partial()), ready()],
+    ids=["raw", "covariances", "partial", "ready"],
+)
 @pytest.mark.parametrize("through", [pickled, copy.deepcopy])
 def test_copies_are_the_same(cloud, through):
     assert_same(through(cloud), cloud)
@@ -250,6 +311,7 @@ def test_clouds_of_one_size_class_share_a_program():
         (raw(), ["150 points", "intensity, heat"]),
         (ready(), ["150 points padded to 160", "4 neighbors"]),
         (PointCloud(POINTS), ["none"]),
+        (ready(raw(channel_valid=partial())), ["intensity (33%), heat (35%)"]),
         (ready(PointCloud(POINTS + UTM)), ["origin", "e+06"]),
     ],
 )

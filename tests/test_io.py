@@ -164,9 +164,26 @@ def test_npz_keeps_everything(tmp_path):
 def test_extreme_values_survive(tmp_path, suffix):
     cloud = make((*RGB, "heat"), np.float64)
     cloud.points[:4, 0] = [np.nan, np.inf, -np.inf, 5_400_000.123456789]
-    cloud.channels[:5] = np.array([[np.nan], [1e308], [-1], [-0.0], [1 / 3]])
+    cloud.channels[:5] = np.array([[np.inf], [1e308], [-1], [-0.0], [1 / 3]])
     io.write(tmp_path / f"c{suffix}", cloud)
     same(io.read(tmp_path / f"c{suffix}"), cloud)
+
+
+@pytest.mark.parametrize("suffix", [*NAMED, ".npy", ".bin"])
+def test_a_missing_channel_is_missing_in_the_file(tmp_path, suffix):
+    cloud = make(INTENSITY if suffix == ".bin" else ("intensity", *RGB))
+    present = RNG.random(cloud.channels.shape) < 0.5
+    cloud = cloud.replace(channel_valid=present)
+    io.write(tmp_path / f"c{suffix}", cloud)
+    back = io.read(tmp_path / f"c{suffix}")
+    np.testing.assert_array_equal(back.points, cloud.points)
+    np.testing.assert_array_equal(back.channel_valid, present)
+    np.testing.assert_array_equal(back.channels, np.where(present, cloud.channels, 0))
+
+
+def test_nothing_missing_is_no_mask(tmp_path):
+    io.write(tmp_path / "c.ply", make().replace(channel_valid=np.ones((N, 1), bool)))
+    assert io.read(tmp_path / "c.ply").channel_valid is None
 
 
 @pytest.mark.parametrize("suffix", [".ply", ".pcd"])

@@ -38,6 +38,44 @@ def test_voxels_hold_the_mean_of_what_falls_into_them(seed, voxel_size, shift):
     np.testing.assert_allclose(actual, expected, atol=ref.tolerance(3e-5, 1e-9))
 
 
+@settings(max_examples=20, deadline=None)
+@given(seed=st.integers(0, 2**31), voxel_size=st.floats(0.05, 5), share=st.sampled_from([0.1, 0.5, 0.9]))
+def test_a_voxel_averages_each_channel_over_the_points_that_have_it(seed, voxel_size, share):
+    rng = np.random.default_rng(seed)
+    present = rng.random((150, 2)) < share
+    present[0] = False
+    cloud = ready(PointCloud(POINTS, np.where(present, CHANNELS, np.nan), channel_valid=present), voxel_size=voxel_size)
+    # Large voxels may leave nothing missing.
+    mask = np.ones(cloud.channels.shape, bool) if cloud.channel_valid is None else np.asarray(cloud.channel_valid)
+    for i in range(2):
+        # A cloud of the points with this channel alone has the same means in the same cells.
+        mine = np.asarray(cloud.valid) & mask[:, i]
+        expected = ref.voxel_means(CHANNELS[present[:, i], i : i + 1], POINTS[present[:, i]], voxel_size)
+        np.testing.assert_allclose(
+            np.sort(np.asarray(cloud.channels)[mine, i]), np.sort(expected[:, 0]), atol=ref.tolerance(1e-6, 1e-12)
+        )
+        np.testing.assert_array_equal(np.asarray(cloud.channels)[~mine, i], 0)
+    whole = ready(PointCloud(POINTS, CHANNELS), voxel_size=voxel_size)
+    np.testing.assert_array_equal(cloud.points, whole.points)
+
+
+def test_what_turns_out_whole_has_no_mask():
+    """Points without a channel that are left out, or fall into a voxel with others: the cloud lacks nothing."""
+    points, present = POINTS.copy(), np.ones((150, 2), bool)
+    points[3], present[3] = np.nan, False
+    with pytest.warns(UserWarning, match="1 of 150"):
+        assert ready(PointCloud(points, CHANNELS, channel_valid=present)).channel_valid is None
+    assert ready(PointCloud(POINTS, CHANNELS, channel_valid=np.ones((150, 2), bool))).channel_valid is None
+
+
+def test_a_channel_that_is_said_to_be_there_must_be_finite():
+    channels, present = CHANNELS.copy(), np.ones((150, 2), bool)
+    channels[3:5, 1], present[3, 1] = np.nan, False
+    with pytest.warns(UserWarning, match="1 of 150"):
+        cloud = ready(PointCloud(POINTS, channels, channel_valid=present))
+    assert len(cloud) == 149 and np.sum(~np.asarray(cloud.channel_valid)[:149]) == 1
+
+
 def test_voxel_cells_are_aligned_with_zero():
     """The cells of two clouds in one frame are the same cells."""
     points = np.array([[0.1, 0.1, 0.1], [0.9, 0.9, 0.9], [-0.1, 0.5, 0.5], [1.1, 0.5, 0.5], [5, 5, 5], [7, 7, 7.0]])

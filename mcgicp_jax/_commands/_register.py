@@ -201,9 +201,15 @@ def _read_pose(path: Path) -> Float[np.ndarray, "4 4"]:
 def _preprocess(
     path: Path, cloud: mcg.PointCloud, channels: Sequence[str], voxel_size: float | None, num_neighbors: int
 ) -> mcg.PointCloud:
-    values = np.asarray(cloud.channels)[:, [cloud.channel_names.index(name) for name in channels]]
+    columns = [cloud.channel_names.index(name) for name in channels]
     try:
-        cloud = mcg.PointCloud(cloud.points, values, covariances=cloud.covariances, channel_names=channels)
+        cloud = mcg.PointCloud(
+            cloud.points,
+            np.asarray(cloud.channels)[:, columns],
+            channel_valid=None if cloud.channel_valid is None else np.asarray(cloud.channel_valid)[:, columns],
+            covariances=cloud.covariances,
+            channel_names=channels,
+        )
         return mcg.preprocess(cloud, voxel_size, num_neighbors)
     except ValueError as error:
         raise ValueError(f"{path}: {error}") from error
