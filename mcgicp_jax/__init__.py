@@ -13,6 +13,7 @@ from mcgicp_jax._cost import GemanMcClure as GemanMcClure
 from mcgicp_jax._cost import Huber as Huber
 from mcgicp_jax._cost import Tukey as Tukey
 from mcgicp_jax._cost import mahalanobis_cost as mahalanobis_cost
+from mcgicp_jax._kdtree import KDTreeSearch as KDTreeSearch
 from mcgicp_jax._methods import GICP as GICP
 from mcgicp_jax._methods import ColorICP as ColorICP
 from mcgicp_jax._methods import MultiChannelGICP as MultiChannelGICP
@@ -25,6 +26,5 @@ from mcgicp_jax._register import register as register
 from mcgicp_jax._result import Registration as Registration
 from mcgicp_jax._result import Status as Status
 from mcgicp_jax._search import Correspondences as Correspondences
-from mcgicp_jax._search import KDTreeSearch as KDTreeSearch
 
 __version__ = "0.1.0"

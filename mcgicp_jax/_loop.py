@@ -15,7 +15,7 @@ import jax
 import jax.numpy as jnp
 import jaxlie
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Float, Int
 
 from mcgicp_jax._cost import AbstractKernel, Model, Moments, evaluate_pairs, moments, move_points
 from mcgicp_jax._methods import AbstractMethod, Surface
@@ -169,13 +169,12 @@ def run_on_host(
     search: AbstractSearch,
 ) -> tuple[State, Correspondences, dict[str, np.ndarray]]:
     """The loop for concrete inputs: matches from the host's tree between compiled steps."""
-    index = search.index(target.points, target.descriptors, target.valid)
-    rows = source.points, source.descriptors, source.valid
+    index = search.index(target.rows)
     status, num_iterations = jnp.int32(_RUNNING), jnp.int32(0)
     records = []
     while status < 0:
         if status == _RUNNING:
-            indices = index.nearest(pose.wxyz_xyz, *rows, settings.max_distance)[0]
+            indices = index.nearest(pose.wxyz_xyz, source.rows, settings.max_distance)[0]
         matches, measured = match_and_measure(pose, indices, source, target, method, robust, settings)
         state = update(pose, status, num_iterations, measured, settings)
         pose, status, num_iterations = state.pose, state.status, state.num_iterations
@@ -231,7 +230,8 @@ def run_traced(
         pose: jaxlie.SE3, status: Int[Array, ""], indices: Int[Array, "N"]
     ) -> tuple[Correspondences, Measurement]:
         running = status == _RUNNING
-        found = nearest_traced(search, pose, source, target, settings.max_distance, running)[0]
+        rows = source.rows, target.rows
+        found = search.nearest_traced(pose.wxyz_xyz, *rows, settings.max_distance, running)[0]
         indices = jnp.where(running, found, indices)
         return match_and_measure(pose, indices, source, target, method, robust, settings)
 
@@ -259,16 +259,3 @@ def refine(state: State, model: Model) -> jaxlie.SE3:
     usable = (state.status == Status.CONVERGED) | (state.status == Status.MAX_ITERATIONS)
     with jax.default_matmul_precision("highest"):
         return refine_pose(state.pose, usable, state.measured.moments, model)
-
-
-def nearest_traced(
-    search: AbstractSearch,
-    pose: jaxlie.SE3,
-    source: Surface,
-    target: Surface,
-    max_distance: Float[Array, ""],
-    running: Bool[Array, ""],
-    num_candidates: int = 1,
-) -> Int[Array, "m N"]:
-    source_rows, target_rows = ((cloud.points, cloud.descriptors, cloud.valid) for cloud in (source, target))
-    return search.nearest_traced(pose.wxyz_xyz, source_rows, target_rows, max_distance, running, num_candidates)

@@ -17,6 +17,7 @@ from jaxtyping import Array, Bool, Float
 from mcgicp_jax import _covariance as cov
 from mcgicp_jax._cloud import PointCloud, Values
 from mcgicp_jax._pose import is_concrete
+from mcgicp_jax._search import Rows
 
 
 class Surface(eqx.Module):
@@ -34,6 +35,11 @@ class Surface(eqx.Module):
     covariance: Float[Array, "6 N"]
     descriptors: Float[Array, "N D"]
     valid: Bool[Array, "N"]
+
+    @property
+    def rows(self) -> Rows:
+        """What a search needs to know."""
+        return Rows(points=self.points, descriptors=self.descriptors, valid=self.valid)
 
 
 class Numbers(eqx.Module):

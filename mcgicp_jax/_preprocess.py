@@ -10,8 +10,9 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from mcgicp_jax._cloud import PointCloud, Values, is_far, size_class
+from mcgicp_jax._kdtree import KDTreeSearch
 from mcgicp_jax._pose import is_concrete
-from mcgicp_jax._search import AbstractSearch, KDTreeSearch
+from mcgicp_jax._search import AbstractSearch
 
 MIN_POINTS = 4
 # Voxel numbers are packed into one 64-bit key, 21 bits each.

@@ -13,12 +13,13 @@ from jaxtyping import Array, Int
 
 from mcgicp_jax._cloud import PointCloud, Values
 from mcgicp_jax._cost import AbstractKernel, centred_pose, check_matches
-from mcgicp_jax._loop import Settings, State, align_traced, gate, nearest_traced, refine, run_on_host, run_traced
+from mcgicp_jax._kdtree import KDTreeSearch
+from mcgicp_jax._loop import Settings, State, align_traced, gate, refine, run_on_host, run_traced
 from mcgicp_jax._methods import AbstractMethod, Surface, prepare
 from mcgicp_jax._pose import Pose, is_concrete, pose_matrix, se3_from_matrix
 from mcgicp_jax._preprocess import preprocess
 from mcgicp_jax._result import Registration, pose_in_user_frame
-from mcgicp_jax._search import AbstractSearch, Correspondences, KDTreeSearch
+from mcgicp_jax._search import AbstractSearch, Correspondences
 
 _MAX_ITERATIONS = 64
 # Nearest-neighbour matches often end in a small cycle; real scans were seen to circle within 0.2 mm and 0.4 mrad.
@@ -69,11 +70,11 @@ def _find(
     search: AbstractSearch, pose: jaxlie.SE3, source: Surface, target: Surface, max_distance: Array, num_candidates: int
 ) -> Int[Array, "*candidates N"]:
     if is_concrete(pose, source, target):
-        index = search.index(target.points, target.descriptors, target.valid)
-        rows = source.points, source.descriptors, source.valid
-        found = jnp.asarray(index.nearest(pose.wxyz_xyz, *rows, max_distance, num_candidates))
+        index = search.index(target.rows)
+        found = jnp.asarray(index.nearest(pose.wxyz_xyz, source.rows, max_distance, num_candidates))
     else:
-        found = nearest_traced(search, pose, source, target, max_distance, jnp.bool_(True), num_candidates)
+        rows = source.rows, target.rows
+        found = search.nearest_traced(pose.wxyz_xyz, *rows, max_distance, jnp.bool_(True), num_candidates)
     return found if num_candidates > 1 else found[0]
 
 

@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from mcgicp_jax import ColorICP, KDTreeSearch, PointCloud, PointToPoint, find_correspondences, preprocess
+from mcgicp_jax._search import Rows
 from tests import reference as ref
 
 SIZES = {"source": 150, "target": 140}
@@ -29,9 +30,9 @@ def query(pose, source, target, max_distance=np.inf, source_channels=None, targe
     parameters = np.concatenate([Rotation.from_matrix(pose[:3, :3]).as_quat()[[3, 0, 1, 2]], pose[:3, 3]])
     source_channels = np.zeros((len(source), 0)) if source_channels is None else source_channels
     target_channels = np.zeros((len(target), 0)) if target_channels is None else target_channels
-    index = KDTreeSearch().index(target.T, target_channels, np.ones(len(target), bool))
-    valid = np.ones(len(source), bool)
-    return index.nearest(parameters, source.T, source_channels, valid, np.asarray(max_distance), num_candidates)
+    index = KDTreeSearch().index(Rows(target.T, target_channels, np.ones(len(target), bool)))
+    source_rows = Rows(source.T, source_channels, np.ones(len(source), bool))
+    return index.nearest(parameters, source_rows, np.asarray(max_distance), num_candidates)
 
 
 @settings(max_examples=25, deadline=None)

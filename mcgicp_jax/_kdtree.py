@@ -1,0 +1,193 @@
+"""Nearest neighbours by SciPy's k-d tree, on the host.
+
+The only module that knows SciPy. What a callback runs of it is NumPy alone.
+"""
+
+from __future__ import annotations
+
+import collections
+import hashlib
+import threading
+from functools import partial
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import scipy.spatial
+from jax.typing import ArrayLike
+from jaxtyping import Array, Bool, Float, Int
+
+from mcgicp_jax._pose import rotation_from_quaternion
+from mcgicp_jax._search import AbstractIndex, AbstractSearch, Rows
+
+# How many candidates, as a multiple of those asked for, are looked at to break a tie by row number.
+_TIE_CANDIDATES = 8
+
+
+class KDTreeSearch(AbstractSearch):
+    """Exact search with SciPy's k-d tree on the host. Equal distances are ordered by row, so that results repeat.
+
+    Attributes:
+        workers: threads of one query; −1 takes all cores.
+    """
+
+    workers: int = eqx.field(static=True, default=-1)
+
+    def index(self, target: Rows) -> KDTreeIndex:
+        return KDTreeIndex(_on_host(target), self.workers)
+
+    def nearest_traced(
+        self,
+        pose: Float[Array, "7"],
+        source: Rows,
+        target: Rows,
+        max_distance: Float[Array, ""],
+        running: Bool[Array, ""],
+        num_candidates: int = 1,
+    ) -> Int[Array, "m N"]:
+        arguments = (pose, source, target, max_distance, running)
+        dimensions = tuple(leaf.ndim for leaf in jax.tree.leaves(arguments))
+        return jax.pure_callback(
+            partial(_nearest_callback, self.workers, num_candidates, dimensions),
+            jax.ShapeDtypeStruct((num_candidates, *source.valid.shape), jnp.int32),
+            *arguments,
+            vmap_method="expand_dims",
+        )
+
+    def neighbors(self, points: Float[np.ndarray, "N 3"], num_neighbors: int) -> Int[np.ndarray, "N k"]:
+        found = _nearest(_tree(points), points, num_neighbors, self.workers)
+        missing = num_neighbors - found.shape[1]
+        return np.pad(found, [(0, 0), (0, missing)], constant_values=-1)
+
+
+class KDTreeIndex(AbstractIndex):
+    """A tree of the finite rows.
+
+    Args:
+        target: NumPy's arrays.
+        workers: as of `KDTreeSearch`.
+    """
+
+    def __init__(self, target: Rows, workers: int):
+        rows = np.hstack([target.points.T, target.descriptors])
+        # The tree refuses what is not finite; the measurement at the pose will say NON_FINITE.
+        self._rows = np.flatnonzero(target.valid & np.isfinite(rows).all(axis=1)).astype(np.int32)
+        self._tree = _tree(rows[self._rows]) if self._rows.size else None
+        self._workers = workers
+
+    @property
+    def num_rows(self) -> int:
+        return self._rows.size
+
+    def nearest(
+        self, pose: Float[ArrayLike, "7"], source: Rows, max_distance: Float[ArrayLike, ""], num_candidates: int = 1
+    ) -> Int[np.ndarray, "m N"]:
+        source = _on_host(source)
+        indices = np.full((num_candidates, source.valid.size), -1, np.int32)
+        pose = np.asarray(pose, np.float64)
+        if self._tree is None or not np.isfinite(pose).all():
+            return indices
+        with np.errstate(invalid="ignore"):
+            moved = source.points.T @ rotation_from_quaternion(pose[:4]).T + pose[4:]
+        queries = np.hstack([moved, source.descriptors])
+        active = np.flatnonzero(source.valid & np.isfinite(queries).all(axis=1))
+        # With descriptors, the nearest may lie beyond the gate while a pair within it is further in all dimensions:
+        # then the whole space is searched. The margin covers rounding; the gate itself is applied to the position.
+        bound = np.inf if source.descriptors.shape[1] else 1.001 * float(np.asarray(max_distance))
+        found = _nearest(self._tree, queries[active], num_candidates, self._workers, bound).T
+        indices[: len(found), active] = np.append(self._rows, -1)[found]
+        return indices
+
+
+class _IndexCache:
+    """The trees of the targets seen last, by content: a callback that is pure still builds each tree only once."""
+
+    def __init__(self, rows: int):
+        self._rows = rows
+        self._lock = threading.Lock()
+        self._indices: collections.OrderedDict[bytes, KDTreeIndex] = collections.OrderedDict()
+
+    def get(self, target: Rows, workers: int) -> KDTreeIndex:
+        arrays = jax.tree.leaves(target)
+        digest = hashlib.blake2b(repr([workers, *((array.shape, array.dtype) for array in arrays)]).encode())
+        for array in arrays:
+            digest.update(np.ascontiguousarray(array).data)
+        key = digest.digest()
+        with self._lock:
+            if key in self._indices:
+                self._indices.move_to_end(key)
+                return self._indices[key]
+        index = KDTreeIndex(target, workers)
+        with self._lock:
+            self._indices[key] = index
+            while len(self._indices) > 1 and sum(kept.num_rows for kept in self._indices.values()) > self._rows:
+                self._indices.popitem(last=False)
+        return index
+
+
+# Enough for hundreds of scans in a batch, some hundred megabytes.
+_index_cache = _IndexCache(rows=2_000_000)
+
+
+def _nearest_callback(
+    workers: int, num_candidates: int, dimensions: tuple[int, ...], *arguments: Any
+) -> Int[np.ndarray, "*batch m N"]:
+    """`nearest` over any leading batch dimensions, some of them 1 where an argument has no batch.
+
+    Args:
+        dimensions: how many each array has without the batch.
+        arguments: those of `AbstractSearch.nearest_traced`.
+    """
+    leaves, structure = jax.tree.flatten(arguments)
+    arrays = [np.asarray(leaf) for leaf in leaves]
+    own = [array.shape[array.ndim - n :] for array, n in zip(arrays, dimensions, strict=True)]
+    batch = np.broadcast_shapes(*(array.shape[: array.ndim - n] for array, n in zip(arrays, dimensions, strict=True)))
+    lanes = [np.broadcast_to(array, batch + shape) for array, shape in zip(arrays, own, strict=True)]
+    num_rows = arguments[1].valid.shape[-1]
+    indices = np.full((*batch, num_candidates, num_rows), -1, np.int32)
+    for lane in np.ndindex(batch):
+        pose, source, target, max_distance, running = jax.tree.unflatten(structure, [array[lane] for array in lanes])
+        if running:
+            index = _index_cache.get(target, workers)
+            indices[lane] = index.nearest(pose, source, max_distance, num_candidates)
+    return indices
+
+
+def _on_host(rows: Rows) -> Rows:
+    return jax.tree.map(np.asarray, rows)
+
+
+def _tree(rows: Float[np.ndarray, "M D"]) -> scipy.spatial.cKDTree:
+    # Unbalanced and uncompacted trees build several times faster and are searched about as fast.
+    return scipy.spatial.cKDTree(rows, balanced_tree=False, compact_nodes=False)
+
+
+def _nearest(
+    tree: scipy.spatial.cKDTree, queries: Float[np.ndarray, "N D"], k: int, workers: int, bound: float = np.inf
+) -> Int[np.ndarray, "N k"]:
+    """Rows of the k nearest, ordered by (distance, row); `tree.n` where nothing lies within `bound`.
+
+    The tree leaves the order of equal distances to chance. One neighbour more than needed shows where there are any.
+    """
+    k = min(k, tree.n)
+    asked = min(k + 1, tree.n)
+    distances, rows = tree.query(queries, np.arange(1, asked + 1), workers=workers, distance_upper_bound=bound)
+    nearest = rows[:, :k].astype(np.int32)
+    tied = np.flatnonzero((distances[:, 1:] == distances[:, :-1]).any(axis=1) & np.isfinite(distances[:, 0]))
+    while tied.size:
+        order = np.lexsort((rows[tied], distances[tied]), axis=1)
+        nearest[tied] = np.take_along_axis(rows[tied], order, axis=1)[:, :k]
+        # A tie that the last candidate shares may go on beyond it.
+        open_ended = np.isfinite(distances[tied, -1]) & (distances[tied, k - 1] == distances[tied, -1])
+        tied = tied[open_ended]
+        if asked == min(_TIE_CANDIDATES * (k + 1), tree.n):
+            break
+        asked = min(2 * asked, _TIE_CANDIDATES * (k + 1), tree.n)
+        if tied.size:
+            wider = tree.query(queries[tied], np.arange(1, asked + 1), workers=workers, distance_upper_bound=bound)
+            distances = np.full((len(queries), asked), np.inf)
+            rows = np.full((len(queries), asked), tree.n)
+            distances[tied], rows[tied] = wider
+    return nearest
