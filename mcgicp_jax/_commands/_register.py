@@ -145,11 +145,12 @@ def demo(output: Path = Path("mcgicp_demo")) -> int:
         output: Folder for the two clouds, the true pose and a picture.
     """
     output.mkdir(parents=True, exist_ok=True)
-    target, source = datasets.poster_wall(2)
+    frames = datasets.poster_wall(2)
+    target, source = frames
     source_file, target_file, truth_file = (output / name for name in ("source.npz", "target.npz", "truth.txt"))
     io.write(source_file, source.cloud)
     io.write(target_file, target.cloud)
-    io.write_poses(truth_file, [np.linalg.inv(target.pose) @ source.pose])
+    io.write_poses(truth_file, [np.linalg.inv(frames.path(0)) @ frames.path(1)])
     options = Options(voxel_size="off", max_distance=0.08, plot=output / "before_after.png")
     _compare(source_file, target_file, options, truth_file)
     print(

@@ -3,17 +3,26 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from functools import partial
 from typing import TypeAlias
 
 import numpy as np
 from jaxtyping import Float, Int
 
 from mcgicp_jax._cloud import PointCloud
+from mcgicp_jax.datasets._frame import (
+    SyntheticFrames,
+    check_noise,
+    check_points_per_frame,
+    rotation_from_vector,
+    scene_and_path_rng,
+)
 
 # The first Kinect: pixels, and the focal length in pixels.
 _WIDTH, _HEIGHT, _FOCAL = 640, 480, 525.0
 _COLOR_NOISE = 0.02
+# Seconds between frames.
+_PERIOD = 1 / 30
 
 # Metres from the wall, and how far the camera sways about that.
 _DISTANCE, _DISTANCE_SWAY = 1.35, 0.12
@@ -47,38 +56,30 @@ Image: TypeAlias = Float[np.ndarray, "h w 3"]
 Colors: TypeAlias = Float[np.ndarray, "colors 3"]
 
 
-@dataclass(frozen=True, eq=False)
-class Frame:
-    """What a sensor saw, and from where.
-
-    Two frames give the true relative pose: `T_target_source = inv(target.pose) @ source.pose`.
-
-    Attributes:
-        cloud: in the sensor's frame, metres.
-        pose: (4, 4), sensor to world, exact.
-    """
-
-    cloud: PointCloud
-    pose: Float[np.ndarray, "4 4"]
-
-
 def poster_wall(
-    num_frames: int = 2, *, points_per_frame: int = 12_000, step: float = 0.03, noise: float = 1.0, seed: int = 0
-) -> list[Frame]:
+    num_frames: int = 2,
+    *,
+    points_per_frame: int = 12_000,
+    step: float = 0.03,
+    heading: float | None = None,
+    noise: float = 1.0,
+    seed: int = 0,
+) -> SyntheticFrames:
     """A camera moves along a flat wall of posters; only the colours tell how far.
 
     The wall is the plane z = 0 of the world; the camera (x right, y down, z ahead; 640 × 480 pixels, focal length 525)
     looks at it from 1.23 to 1.47 m. From frame to frame it moves by `step` in one direction along the wall, by at most
-    0.3 `step` across it, and turns by 1.5°. The rays of every frame fall between those of the others.
-
-    Frame i is the same whatever `num_frames` is.
+    0.3 `step` across it, and turns by 1.5°. The rays of every frame fall between those of the others. The posters
+    repeat after 3.36 m sideways and 2.25 m upwards.
 
     Args:
         points_per_frame: approximately; the rays cover the whole image, 1 to 307,200 of them.
         step: metres along the wall between consecutive frames.
+        heading: radians from the right, clockwise: π moves from right to left, as in Fig. 3 of Servos & Waslander
+            (2014). None: any, by the seed.
         noise: 1 for a Kinect, 0 for none. Scales the standard deviations: of depth, 0.0012 + 0.0019 (z − 0.4)²
             metres, which moves a point along its ray; and of each colour, 0.02.
-        seed: the same seed gives the same posters, path and noise.
+        seed: the same seed gives the same posters, path, rays and noise. `observe` draws the latter two anew.
 
     Returns:
         Frames whose clouds have the channels red, green and blue, from 0 to 1.
@@ -86,50 +87,46 @@ def poster_wall(
     Raises:
         ValueError: if a number is out of its range.
     """
-    if num_frames < 1:
-        raise ValueError(f"num_frames: expected at least 1, got {num_frames}")
-    if not 1 <= points_per_frame <= _WIDTH * _HEIGHT:
-        raise ValueError(f"points_per_frame: expected 1 to {_WIDTH * _HEIGHT}, got {points_per_frame}")
-    if not noise >= 0:
-        raise ValueError(f"noise: expected 0 or more, got {noise}")
-    scene_rng, path_rng, *frame_rngs = np.random.default_rng(seed).spawn(num_frames + 2)
-    wall = _paint_wall(scene_rng)
-    poses = _camera_path(path_rng, num_frames, step)
-    return [
-        Frame(_observe(rng, wall, pose, points_per_frame, noise), pose)
-        for rng, pose in zip(frame_rngs, poses, strict=True)
-    ]
+    check_points_per_frame(points_per_frame, _WIDTH * _HEIGHT)
+    check_noise(noise)
+    scene_rng, path_rng = scene_and_path_rng(seed)
+    observer = partial(_observe, _paint_wall(scene_rng), points_per_frame, noise)
+    return SyntheticFrames(num_frames, _camera_path(path_rng, step, heading), observer, _PERIOD, seed)
 
 
 # The camera
 
 
-def _camera_path(rng: np.random.Generator, num_frames: int, step: float) -> list[Float[np.ndarray, "4 4"]]:
+def _camera_path(
+    rng: np.random.Generator, step: float, heading: float | None
+) -> Callable[[int], Float[np.ndarray, "4 4"]]:
     start = rng.uniform(0, 1, 2) * (_COLUMNS * _CELL_WIDTH, _ROWS * _CELL_HEIGHT)
-    heading, tilt_start, sway_start = rng.uniform(0, 2 * np.pi, 3)
+    any_heading, tilt_start, sway_start = rng.uniform(0, 2 * np.pi, 3)
     tilt_axes = np.linalg.qr(rng.normal(size=(3, 2)))[0]
-    poses = []
-    for i in range(num_frames):
-        tilt = tilt_start + i * _TILT_PHASE
-        sway = sway_start + 0.3 * step / _DISTANCE_SWAY * i
-        pose = np.eye(4)
-        pose[:3, :3] = _rotation(tilt_axes @ (_TILT * np.array([np.cos(tilt), np.sin(tilt)])))
-        pose[:2, 3] = start + i * step * np.array([np.cos(heading), np.sin(heading)])
-        pose[2, 3] = -_DISTANCE + _DISTANCE_SWAY * np.sin(sway)
-        poses.append(pose)
-    return poses
+    heading = any_heading if heading is None else heading
+    move = step * np.array([np.cos(heading), np.sin(heading)])
+    return partial(_pose, start, move, tilt_start, tilt_axes, sway_start)
 
 
-def _rotation(vector: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3 3"]:
-    """Rodrigues' formula, for a rotation vector that is not 0."""
-    angle = np.linalg.norm(vector)
-    x, y, z = vector / angle
-    cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
-    return np.eye(3) + np.sin(angle) * cross + (1 - np.cos(angle)) * cross @ cross
+def _pose(
+    start: Float[np.ndarray, "2"],
+    move: Float[np.ndarray, "2"],
+    tilt_start: float,
+    tilt_axes: Float[np.ndarray, "3 2"],
+    sway_start: float,
+    index: int,
+) -> Float[np.ndarray, "4 4"]:
+    tilt = tilt_start + index * _TILT_PHASE
+    sway = sway_start + 0.3 * np.linalg.norm(move) / _DISTANCE_SWAY * index
+    pose = np.eye(4)
+    pose[:3, :3] = rotation_from_vector(tilt_axes @ (_TILT * np.array([np.cos(tilt), np.sin(tilt)])))
+    pose[:2, 3] = start + index * move
+    pose[2, 3] = -_DISTANCE + _DISTANCE_SWAY * np.sin(sway)
+    return pose
 
 
 def _observe(
-    rng: np.random.Generator, wall: Image, pose: Float[np.ndarray, "4 4"], size: int, noise: float
+    wall: Image, size: int, noise: float, rng: np.random.Generator, pose: Float[np.ndarray, "4 4"]
 ) -> PointCloud:
     rays = _rays(rng, size)
     rotation, center = pose[:3, :3], pose[:3, 3]

@@ -1,0 +1,124 @@
+"""A furnished room: geometry holds a pose in it from every side."""
+
+from __future__ import annotations
+
+from functools import partial
+
+import numpy as np
+from jaxtyping import Float
+
+from mcgicp_jax._cloud import PointCloud
+from mcgicp_jax.datasets._frame import (
+    SyntheticFrames,
+    check_noise,
+    check_points_per_frame,
+    rotation_from_vector,
+    scene_and_path_rng,
+)
+from mcgicp_jax.datasets._raycast import Box, cast, patches, random_rays, swaying_rotation
+
+# Metres: length, width and height of the room, and how thick its walls are.
+_SIZE, _WALL = np.array([8.0, 6.0, 2.8]), 0.2
+_NUM_BOXES = 14
+# Metres: the sensor goes round on a circle at this height, above the furniture.
+_SENSOR_HEIGHT, _RADIUS, _HIGHEST_BOX = 1.7, 1.6, 1.4
+# Radians: the sensor is tilted, each time in another direction.
+_TILT, _TILT_PHASE = np.deg2rad(2.0), 0.7
+_POINT_NOISE, _COLOR_NOISE = 0.01, 0.02
+_PERIOD = 0.1
+# Patches of each width, metres, how strong they are; and what colour they have.
+_PAINT = ((0.6, 0.12), (0.2, 0.08))
+_PAINT_COLOR = np.array([1.0, 0.6, -0.5])
+
+
+def box_room(
+    num_frames: int = 2,
+    *,
+    points_per_frame: int = 5000,
+    step: float = 0.1,
+    noise: float = 1.0,
+    along_rays: bool = False,
+    seed: int = 0,
+) -> SyntheticFrames:
+    """A sensor walks round in a closed room, 8 × 6 × 2.8 m, with boxes for furniture; walls and boxes are painted.
+
+    It sees in all directions alike; every frame has fresh rays, so that no two hit the same points. From frame to frame
+    it moves by `step` on a circle of radius 1.6 m, turns as the circle does, and sways by up to 2°.
+
+    Args:
+        points_per_frame: exactly.
+        step: metres between consecutive frames.
+        noise: scales the standard deviations: 0.01 m of the points, 0.02 of each colour. 0 for none.
+        along_rays: whether points are moved along their rays alone, rather than in all directions alike.
+        seed: the same seed gives the same room, path, rays and noise. `observe` draws the latter two anew.
+
+    Returns:
+        Frames whose clouds have the channels red, green and blue, from 0 to 1. The world's z axis points up.
+
+    Raises:
+        ValueError: if a number is out of its range.
+    """
+    check_noise(noise)
+    check_points_per_frame(points_per_frame, 10_000_000)
+    scene_rng, path_rng = scene_and_path_rng(seed)
+    boxes = [*_shell(), *_furniture(scene_rng)]
+    colors = scene_rng.uniform(0.25, 0.75, (len(boxes), 3))
+    observer = partial(_observe, boxes, colors, int(scene_rng.integers(2**31)), points_per_frame, noise, along_rays)
+    path = partial(_pose, step, *path_rng.uniform(0, 2 * np.pi, 2))
+    return SyntheticFrames(num_frames, path, observer, _PERIOD, seed)
+
+
+def _pose(step: float, start: float, tilt_start: float, index: int) -> Float[np.ndarray, "4 4"]:
+    angle = start + index * step / _RADIUS
+    pose = np.eye(4)
+    turn = rotation_from_vector(np.array([0, 0, angle + np.pi / 2]))
+    pose[:3, :3] = turn @ swaying_rotation(_TILT, tilt_start + index * _TILT_PHASE)
+    center = _SIZE / 2
+    pose[:3, 3] = center[0] + _RADIUS * np.cos(angle), center[1] + _RADIUS * np.sin(angle), _SENSOR_HEIGHT
+    return pose
+
+
+def _observe(
+    boxes: list[Box],
+    colors: Float[np.ndarray, "B 3"],
+    pattern: int,
+    size: int,
+    noise: float,
+    along_rays: bool,
+    rng: np.random.Generator,
+    pose: Float[np.ndarray, "4 4"],
+) -> PointCloud:
+    rotation, center = pose[:3, :3], pose[:3, 3]
+    hits = cast(center, random_rays(rng, size) @ rotation.T, boxes, np.inf)
+    rays = hits.rays @ rotation
+    error = rng.normal(size=(len(rays), 1)) * rays if along_rays else rng.normal(size=rays.shape)
+    points = hits.distance[:, None] * rays + noise * _POINT_NOISE * error
+    painted = colors[hits.solid] + patches(hits.points, _PAINT, pattern)[:, None] * _PAINT_COLOR
+    seen = np.clip(painted + noise * _COLOR_NOISE * rng.normal(size=painted.shape), 0, 1)
+    return PointCloud(points, seen, channel_names=("red", "green", "blue"))
+
+
+def _shell() -> list[Box]:
+    """Floor, ceiling and four walls, whose edges overlap."""
+    shell = []
+    for axis in range(3):
+        for side in (0.0, _SIZE[axis]):
+            low, high = np.full(3, -_WALL), _SIZE + _WALL
+            low[axis], high[axis] = (side - _WALL, side) if side == 0 else (side, side + _WALL)
+            shell.append(Box(low, high))
+    return shell
+
+
+def _furniture(rng: np.random.Generator) -> list[Box]:
+    """Boxes on the floor, most of them against the walls as furniture is, some over one another."""
+    boxes = []
+    for _ in range(_NUM_BOXES):
+        size = rng.uniform((0.3, 0.3, 0.3), (1.6, 1.0, _HIGHEST_BOX))
+        if rng.uniform() < 0.5:
+            size[:2] = size[1::-1]
+        low = np.append(rng.uniform(0, _SIZE[:2] - size[:2]), 0)
+        if rng.uniform() < 0.7:
+            axis = rng.integers(2)
+            low[axis] = rng.choice([0, _SIZE[axis] - size[axis]])
+        boxes.append(Box(low, low + size))
+    return boxes

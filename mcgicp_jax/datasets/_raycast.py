@@ -1,0 +1,200 @@
+"""Rays cast into scenes of boxes and upright cylinders, and patterns to paint them with."""
+
+from __future__ import annotations
+
+import abc
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from mcgicp_jax.datasets._frame import rotation_from_vector
+
+
+class AbstractSolid(abc.ABC):
+    """A solid that the sensor is outside of."""
+
+    @property
+    @abc.abstractmethod
+    def bounds(self) -> tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3"]]:
+        """Lowest and highest coordinates, metres."""
+
+    @abc.abstractmethod
+    def meet(
+        self, origin: Float[np.ndarray, "3"], rays: Float[np.ndarray, "N 3"]
+    ) -> tuple[Float[np.ndarray, "N"], Float[np.ndarray, "N 3"]]:
+        """Where rays of unit length enter it: metres along the ray, infinite where they miss; and the unit normals."""
+
+
+@dataclass(frozen=True, eq=False)
+class Box(AbstractSolid):
+    """An axis-aligned box, from its lowest corner to its highest, metres."""
+
+    low: Float[np.ndarray, "3"]
+    high: Float[np.ndarray, "3"]
+
+    @property
+    def bounds(self) -> tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3"]]:
+        return self.low, self.high
+
+    def meet(
+        self, origin: Float[np.ndarray, "3"], rays: Float[np.ndarray, "N 3"]
+    ) -> tuple[Float[np.ndarray, "N"], Float[np.ndarray, "N 3"]]:
+        # A ray along a face divides by zero: infinities of the right sign, or NaN, which is no hit.
+        with np.errstate(divide="ignore", invalid="ignore"):
+            first, second = (self.low - origin) / rays, (self.high - origin) / rays
+        near, far = np.minimum(first, second), np.maximum(first, second)
+        axis = np.argmax(near, axis=1)
+        entry, leave = near[np.arange(len(rays)), axis], far.min(axis=1)
+        normals = np.zeros_like(rays)
+        normals[np.arange(len(rays)), axis] = -np.sign(rays[np.arange(len(rays)), axis])
+        return np.where((entry > 0) & (entry <= leave), entry, np.inf), normals
+
+
+@dataclass(frozen=True, eq=False)
+class Cylinder(AbstractSolid):
+    """The mantle of an upright cylinder; metres.
+
+    Attributes:
+        foot: (3,), centre of its lower end.
+    """
+
+    foot: Float[np.ndarray, "3"]
+    radius: float
+    height: float
+
+    @property
+    def bounds(self) -> tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3"]]:
+        around = np.array([self.radius, self.radius, 0])
+        return self.foot - around, self.foot + around + (0, 0, self.height)
+
+    def meet(
+        self, origin: Float[np.ndarray, "3"], rays: Float[np.ndarray, "N 3"]
+    ) -> tuple[Float[np.ndarray, "N"], Float[np.ndarray, "N 3"]]:
+        offset = origin - self.foot
+        square, product = (rays[:, :2] ** 2).sum(axis=1), rays[:, :2] @ offset[:2]
+        discriminant = product**2 - square * (offset[:2] @ offset[:2] - self.radius**2)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            entry = (-product - np.sqrt(discriminant)) / square
+            height = offset[2] + entry * rays[:, 2]
+            normals = (offset + entry[:, None] * rays) * (1, 1, 0) / self.radius
+        return np.where((entry > 0) & (height >= 0) & (height <= self.height), entry, np.inf), normals
+
+
+@dataclass(frozen=True, eq=False)
+class Hits:
+    """Where rays end; those that meet nothing are left out.
+
+    Attributes:
+        rays: (N, 3), unit directions in the world.
+        distance: (N,), metres.
+        points: (N, 3), in the world, metres.
+        normals: (N, 3), unit, towards the sensor.
+        solid: (N,), which of the solids.
+    """
+
+    rays: Float[np.ndarray, "N 3"]
+    distance: Float[np.ndarray, "N"]
+    points: Float[np.ndarray, "N 3"]
+    normals: Float[np.ndarray, "N 3"]
+    solid: Int[np.ndarray, "N"]
+
+
+def cast(
+    origin: Float[np.ndarray, "3"], rays: Float[np.ndarray, "M 3"], solids: Sequence[AbstractSolid], reach: float
+) -> Hits:
+    """The nearest hit of every ray within `reach` metres; of two as near, that of the first solid."""
+    distance = np.full(len(rays), reach)
+    normals = np.zeros_like(rays)
+    solid = np.full(len(rays), -1)
+    for number, candidate in enumerate(solids):
+        rows = _towards(candidate, origin, rays, reach)
+        entry, facing = candidate.meet(origin, rays[rows])
+        nearer = entry < distance[rows]
+        rows = rows[nearer]
+        distance[rows], normals[rows], solid[rows] = entry[nearer], facing[nearer], number
+    met = solid >= 0
+    points = origin + distance[met, None] * rays[met]
+    return Hits(rays[met], distance[met], points, normals[met], solid[met])
+
+
+def _towards(
+    solid: AbstractSolid, origin: Float[np.ndarray, "3"], rays: Float[np.ndarray, "M 3"], reach: float
+) -> Int[np.ndarray, "K"]:
+    """The rays within the cone about a sphere around the solid."""
+    low, high = solid.bounds
+    center, radius = (low + high) / 2 - origin, np.linalg.norm(high - low) / 2
+    away = np.linalg.norm(center)
+    if away - radius > reach:
+        return np.empty(0, int)
+    if away <= radius:
+        return np.arange(len(rays))
+    return np.flatnonzero(rays @ (center / away) >= np.sqrt(1 - (radius / away) ** 2))
+
+
+# Sensors
+
+
+def random_rays(rng: np.random.Generator, size: int) -> Float[np.ndarray, "N 3"]:
+    """Unit rays in all directions alike."""
+    rays = rng.normal(size=(size, 3))
+    return rays / np.linalg.norm(rays, axis=1, keepdims=True)
+
+
+def spinning_rays(
+    rng: np.random.Generator, size: int, beams: int, lowest: float, highest: float
+) -> Float[np.ndarray, "N 3"]:
+    """One turn of a LiDAR, about `size` unit rays: x ahead, z up, beams between two elevations in radians.
+
+    The turn starts anywhere, and the beams look in directions a little apart, as they do in a real one.
+    """
+    columns = max(round(size / beams), 1)
+    beam = np.arange(beams)
+    # Multiples of the golden ratio spread the beams' offsets evenly over a column.
+    azimuth = 2 * np.pi / columns * (np.arange(columns)[:, None] + rng.uniform() + 0.618034 * beam % 1)
+    elevation = np.broadcast_to(np.linspace(lowest, highest, beams), azimuth.shape)
+    x, y = np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth)
+    return np.stack([x, y, np.sin(elevation)], axis=-1).reshape(-1, 3)
+
+
+def swaying_rotation(tilt: float, phase: float) -> Float[np.ndarray, "3 3"]:
+    """A rotation by `tilt` radians about a horizontal axis in the direction `phase`, radians."""
+    return rotation_from_vector(tilt * np.array([np.cos(phase), np.sin(phase), 0]))
+
+
+# Patterns
+
+
+def value_noise(points: Float[np.ndarray, "N D"], cell: float, seed: int) -> Float[np.ndarray, "N"]:
+    """A smooth random pattern in space, from −1 to 1, whose patches are about `cell` metres wide; D is 1, 2 or 3."""
+    scaled = np.asarray(points, float) / cell
+    corner = np.floor(scaled).astype(np.int64)
+    share = scaled - corner
+    share = share * share * (3 - 2 * share)
+    total = np.zeros(len(scaled))
+    for bits in np.ndindex(*(2,) * scaled.shape[1]):
+        weight = np.prod(np.where(bits, share, 1 - share), axis=1)
+        total += weight * random_cells(corner + bits, seed)
+    return 2 * total - 1
+
+
+def patches(
+    points: Float[np.ndarray, "N D"], layers: Sequence[tuple[float, float]], seed: int
+) -> Float[np.ndarray, "N"]:
+    """Layers of `value_noise`, each of a width of its patches (metres) and a strength."""
+    total = np.zeros(len(points))
+    for number, (cell, strength) in enumerate(layers):
+        total += strength * value_noise(points, cell, seed + number)
+    return total
+
+
+def random_cells(cells: Int[np.ndarray, "N D"], seed: int) -> Float[np.ndarray, "N"]:
+    """A random number from 0 to 1 for each cell of an endless grid (SplitMix64 as a hash)."""
+    mixed = np.full(len(cells), seed, np.uint64)
+    for column in cells.T:
+        mixed = (mixed ^ column.astype(np.uint64)) + np.uint64(0x9E3779B97F4A7C15)
+        mixed = (mixed ^ (mixed >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
+        mixed = (mixed ^ (mixed >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
+        mixed = mixed ^ (mixed >> np.uint64(31))
+    return (mixed >> np.uint64(11)) / 2.0**53

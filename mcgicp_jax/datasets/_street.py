@@ -1,0 +1,319 @@
+"""A street as a spinning LiDAR with a panoramic camera sees it."""
+
+from __future__ import annotations
+
+import enum
+from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import partial
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from mcgicp_jax._cloud import PointCloud
+from mcgicp_jax.datasets._frame import (
+    SyntheticFrames,
+    check_noise,
+    check_points_per_frame,
+    rotation_from_vector,
+    scene_and_path_rng,
+)
+from mcgicp_jax.datasets._raycast import (
+    AbstractSolid,
+    Box,
+    Cylinder,
+    Hits,
+    cast,
+    patches,
+    random_cells,
+    spinning_rays,
+    swaying_rotation,
+)
+
+# The LiDAR: Velodyne's HDL-64E, on the roof of a car; metres, radians and seconds.
+_BEAMS, _LOWEST, _HIGHEST = 64, np.deg2rad(-24.8), np.deg2rad(2.0)
+_REACH, _SENSOR_HEIGHT, _PERIOD = 80.0, 1.9, 0.1
+# How the car sways: sideways about the middle of its lane, in heading, and in roll and pitch.
+_LANE, _SWAY, _YAW, _TILT = -1.6, 0.25, np.deg2rad(1.5), np.deg2rad(0.8)
+# Standard deviations: of the range, metres; of the intensity, its own and relative to it; of the colours.
+_RANGE_NOISE, _INTENSITY_NOISE, _INTENSITY_SPECKLE, _COLOR_NOISE = 0.02, 0.01, 0.05, 0.02
+# Metres: at this range the intensity has fallen to half.
+_HALF_INTENSITY = 40.0
+
+# Metres from the middle of the street: parked cars, kerb, façades; and how high the kerb is.
+_PARKING, _KERB, _FACADE, _KERB_HEIGHT = 3.0, 5.0, 8.5, 0.12
+_DEPTH = 12.0
+_SUN = np.array([0.35, -0.5, 0.79])
+_PALETTE = np.array(
+    [[0.72, 0.45, 0.36], [0.80, 0.74, 0.62], [0.62, 0.60, 0.58], [0.86, 0.82, 0.76], [0.55, 0.36, 0.30]]
+)
+_CAR_PALETTE = np.array(
+    [[0.75, 0.10, 0.10], [0.90, 0.90, 0.90], [0.08, 0.08, 0.10], [0.15, 0.25, 0.55], [0.55, 0.57, 0.60]]
+)
+_GLASS = np.array([0.16, 0.20, 0.26])
+
+
+class _Kind(enum.IntEnum):
+    GROUND = 0
+    PAVEMENT = 1
+    BUILDING = 2
+    CAR = 3
+    POLE = 4
+    BIN = 5
+
+
+@dataclass(frozen=True, eq=False)
+class _Thing:
+    """Something that stands in the street.
+
+    Attributes:
+        color: (3,), without its pattern.
+        reflectance: of the laser, without its pattern.
+        windows: of a building: their pitch along the façade and upwards, width, height, and how far they are set back;
+            metres.
+    """
+
+    kind: _Kind
+    solid: AbstractSolid
+    color: Float[np.ndarray, "3"]
+    reflectance: float
+    windows: Float[np.ndarray, "5"] | None = None
+
+
+def street(
+    num_frames: int = 50,
+    *,
+    points_per_frame: int = 30_000,
+    step: float = 1.0,
+    noise: float = 1.0,
+    seed: int = 0,
+) -> SyntheticFrames:
+    """A car drives along a street of houses with a spinning 64-beam LiDAR and a panoramic camera on its roof.
+
+    Ground with markings, kerbs, façades with windows set back in them, parked cars, poles and bins. From frame to frame
+    the car moves by `step` along the axis x of the world, by at most a sixth of that across it, and sways a little in
+    every direction. The camera is taken to be where the LiDAR is, and gives every point its colour.
+
+    Args:
+        points_per_frame: rays, a multiple of the 64 beams; the few that meet nothing within 80 m give no point.
+        step: metres along the street between consecutive frames.
+        noise: scales the standard deviations: 0.02 m of the range; of the intensity 0.01, and 5 % of it; 0.02 of each
+            colour. 0 for none.
+        seed: the same seed gives the same street, path, rays and noise. `observe` draws the latter two anew.
+
+    Returns:
+        Frames whose clouds have the channels intensity, red, green and blue, from 0 to 1. The intensity falls with
+        range and with the angle of incidence. The world's z axis points up, the sensor's x axis ahead.
+
+    Raises:
+        ValueError: if a number is out of its range.
+    """
+    check_noise(noise)
+    check_points_per_frame(points_per_frame, 10_000_000)
+    scene_rng, path_rng = scene_and_path_rng(seed)
+    things = _things(scene_rng, -2 * _REACH, num_frames * step + 2 * _REACH)
+    observer = partial(_observe, things, int(scene_rng.integers(2**31)), points_per_frame, noise)
+    path = partial(_pose, step, *path_rng.uniform(0, 2 * np.pi, 3))
+    return SyntheticFrames(num_frames, path, observer, _PERIOD, seed)
+
+
+# The sensor
+
+
+def _pose(step: float, sway: float, yaw: float, tilt: float, index: int) -> Float[np.ndarray, "4 4"]:
+    pose = np.eye(4)
+    heading = rotation_from_vector(np.array([0, 0, _YAW * np.sin(yaw + index / 4)]))
+    pose[:3, :3] = heading @ swaying_rotation(_TILT, tilt + 0.7 * index)
+    pose[:3, 3] = index * step, _LANE + _SWAY * np.sin(sway + index * step / (6 * _SWAY)), _SENSOR_HEIGHT
+    return pose
+
+
+def _observe(
+    things: list[_Thing],
+    pattern: int,
+    size: int,
+    noise: float,
+    rng: np.random.Generator,
+    pose: Float[np.ndarray, "4 4"],
+) -> PointCloud:
+    rotation, center = pose[:3, :3], pose[:3, 3]
+    rays = spinning_rays(rng, size, _BEAMS, _LOWEST, _HIGHEST) @ rotation.T
+    hits = cast(center, rays, [thing.solid for thing in things], _REACH)
+    hits, glass = _into_windows(hits, things)
+    colors, reflectance = _paint(hits, glass, things, pattern)
+    incidence = np.abs(np.sum(hits.rays * hits.normals, axis=1))
+    intensity = reflectance * np.sqrt(incidence) / (1 + (hits.distance / _HALF_INTENSITY) ** 2)
+    light = 0.5 + 0.5 * np.maximum(hits.normals @ _SUN, 0)
+    channels = np.column_stack([intensity, light[:, None] * colors])
+    sigma = np.column_stack(
+        [np.hypot(_INTENSITY_NOISE, _INTENSITY_SPECKLE * intensity), *[light * 0 + _COLOR_NOISE] * 3]
+    )
+    channels = np.clip(channels + noise * sigma * rng.normal(size=channels.shape), 0, 1)
+    distance = hits.distance + noise * _RANGE_NOISE * rng.normal(size=hits.distance.shape)
+    return PointCloud(
+        distance[:, None] * (hits.rays @ rotation), channels, channel_names=("intensity", "red", "green", "blue")
+    )
+
+
+# The street
+
+
+def _things(rng: np.random.Generator, start: float, end: float) -> list[_Thing]:
+    """From one end to the other, one after another: a longer street begins like a shorter one."""
+    road = Box(np.array([start, -60.0, -1.0]), np.array([end, 60.0, 0.0]))
+    things = [_Thing(_Kind.GROUND, road, np.full(3, 0.33), 0.2)]
+    for side, side_rng in zip((-1, 1), rng.spawn(2), strict=True):
+        low, high = np.array([start, _KERB, -1.0]), np.array([end, 30.0, _KERB_HEIGHT])
+        things.append(_Thing(_Kind.PAVEMENT, _box(low, high, side), np.full(3, 0.52), 0.3))
+        for make, own_rng in zip((_buildings, _cars, _poles, _bins), side_rng.spawn(4), strict=True):
+            things += make(own_rng, side, start, end)
+    return things
+
+
+def _box(low: Float[np.ndarray, "3"], high: Float[np.ndarray, "3"], side: int) -> Box:
+    """A box on the left of the street (side 1), or its image on the right (−1)."""
+    mirror = np.array([1, side, 1])
+    return Box(np.minimum(mirror * low, mirror * high), np.maximum(mirror * low, mirror * high))
+
+
+def _buildings(rng: np.random.Generator, side: int, start: float, end: float) -> Iterator[_Thing]:
+    x = start
+    while x < end:
+        width, height, setback = rng.uniform((7, 6, 0), (16, 15, 0.8))
+        pitch, opening = rng.uniform((1.8, 2.9), (3.2, 3.5)), rng.uniform((0.8, 1.3), (1.4, 1.9))
+        # A whole number of windows and storeys: no window is cut off.
+        pitch = np.array([width, height]) / np.round((width, height) / pitch)
+        low, high = np.array([x, _FACADE + setback, 0.0]), np.array([x + width, _FACADE + setback + _DEPTH, height])
+        yield _Thing(
+            _Kind.BUILDING,
+            _box(low, high, side),
+            rng.choice(_PALETTE) * rng.uniform(0.85, 1.1),
+            rng.uniform(0.25, 0.55),
+            np.array([*pitch, *opening, rng.uniform(0.08, 0.25)]),
+        )
+        # Side by side, with a passage between them, or at a side street.
+        x += width + rng.choice([0, rng.uniform(1.5, 4), 9], p=[0.7, 0.2, 0.1])
+
+
+def _cars(rng: np.random.Generator, side: int, start: float, end: float) -> Iterator[_Thing]:
+    x = start
+    while x < end:
+        length, width, sill, roof = rng.uniform((3.6, 1.65, 0.85, 1.40), (4.9, 1.85, 1.05, 1.60))
+        y = rng.uniform(_PARKING + 0.1, _KERB - width - 0.05)
+        color, reflectance = rng.choice(_CAR_PALETTE), rng.uniform(0.15, 0.6)
+        body = np.array([x, y, 0.2]), np.array([x + length, y + width, sill])
+        bonnet, boot = rng.uniform((0.8, 0.2), (1.3, 0.8))
+        cabin = np.array([x + bonnet, y + 0.12, sill]), np.array([x + length - boot, y + width - 0.12, roof])
+        yield _Thing(_Kind.CAR, _box(*body, side), color, reflectance)
+        yield _Thing(_Kind.CAR, _box(*cabin, side), 0.5 * color + 0.5 * _GLASS, 0.1)
+        x += length + rng.choice([rng.uniform(0.6, 1.5), rng.uniform(4, 14)])
+
+
+def _poles(rng: np.random.Generator, side: int, start: float, end: float) -> Iterator[_Thing]:
+    x = start
+    while x < end:
+        radius, height = rng.uniform((0.06, 4.0), (0.18, 8.0))
+        foot = np.array([x, side * (_KERB + rng.uniform(0.4, 0.9)), 0.0])
+        yield _Thing(_Kind.POLE, Cylinder(foot, radius, height), rng.uniform(0.2, 0.5, 3), rng.uniform(0.3, 0.7))
+        x += rng.uniform(8, 22)
+
+
+def _bins(rng: np.random.Generator, side: int, start: float, end: float) -> Iterator[_Thing]:
+    x = start
+    while x < end:
+        size = rng.uniform((0.4, 0.4, 0.8), (1.2, 0.7, 1.3))
+        low = np.array([x, rng.uniform(_KERB + 1.2, _FACADE - 0.9), 0.0])
+        yield _Thing(_Kind.BIN, _box(low, low + size, side), rng.uniform(0.1, 0.6, 3), rng.uniform(0.2, 0.5))
+        x += rng.uniform(6, 25)
+
+
+def _into_windows(hits: Hits, things: list[_Thing]) -> tuple[Hits, Bool[np.ndarray, "N"]]:
+    """Hits on the plane of a window moved on, to the glass or to the reveal; and which of them are on glass."""
+    kinds = np.array([thing.kind for thing in things])
+    front = np.flatnonzero((kinds[hits.solid] == _Kind.BUILDING) & (hits.normals[:, 1] != 0))
+    pitch, opening, recess = np.split(_windows(things)[hits.solid[front]], [2, 4], axis=1)
+    corner = np.array([thing.solid.bounds[0] for thing in things])[hits.solid[front]]
+    # Along the façade and upwards, from the middle of a window.
+    offset = (hits.points[front] - corner)[:, [0, 2]] % pitch - pitch / 2
+    within = (np.abs(offset) < opening / 2).all(axis=1)
+    front, offset, opening, recess = front[within], offset[within], opening[within], recess[within, 0]
+    rays = hits.rays[front]
+    with np.errstate(divide="ignore"):
+        # How much further to the plane of the glass, and to the two sides that the ray is heading for.
+        to_glass = recess / np.abs(rays[:, 1])
+        to_sides = (np.sign(rays[:, [0, 2]]) * opening / 2 - offset) / rays[:, [0, 2]]
+    further = np.column_stack([to_glass, to_sides])
+    first = np.argmin(further, axis=1)
+    extra = further[np.arange(len(front)), first]
+    distance, points, normals = hits.distance.copy(), hits.points.copy(), hits.normals.copy()
+    distance[front] += extra
+    points[front] += extra[:, None] * rays
+    axis = np.array([1, 0, 2])[first]
+    normals[front] = 0
+    normals[front, axis] = -np.sign(rays[np.arange(len(front)), axis])
+    glass = np.zeros(len(points), bool)
+    glass[front[first == 0]] = True
+    return Hits(hits.rays, distance, points, normals, hits.solid), glass
+
+
+def _windows(things: list[_Thing]) -> Float[np.ndarray, "B 5"]:
+    """Of every thing; NaN where it is no building."""
+    none = np.full(5, np.nan)
+    return np.array([none if thing.windows is None else thing.windows for thing in things])
+
+
+# How it is painted
+
+_ASPHALT = ((2.5, 0.035), (0.5, 0.03), (0.12, 0.02))
+_PLASTER = ((3.0, 0.06), (0.5, 0.05), (0.15, 0.03))
+# Metres: slabs of the pavement, mended pieces of the road, shop signs.
+_SLAB, _PIECE, _SIGN = 0.6, np.array([3.1, 1.55]), 3.7
+
+
+def _paint(
+    hits: Hits, glass: Bool[np.ndarray, "N"], things: list[_Thing], pattern: int
+) -> tuple[Float[np.ndarray, "N 3"], Float[np.ndarray, "N"]]:
+    """Colour, and reflectance for the laser, of the surface at every hit."""
+    kinds = np.array([thing.kind for thing in things])[hits.solid]
+    colors = np.array([thing.color for thing in things])[hits.solid]
+    reflectance = np.array([thing.reflectance for thing in things])[hits.solid]
+
+    rows = np.flatnonzero(kinds == _Kind.GROUND)
+    ground = hits.points[rows, :2]
+    stain = patches(ground, _ASPHALT, pattern)
+    mended = np.where(random_cells(np.floor(ground / _PIECE).astype(int), pattern + 3) < 0.15, -0.09, 0)
+    marked = _is_marked(ground, pattern + 4)
+    colors[rows] = np.where(marked[:, None], 0.85, colors[rows] + (stain + mended)[:, None])
+    reflectance[rows] = np.where(marked, 0.85, reflectance[rows] + 0.6 * (stain + mended))
+
+    rows = np.flatnonzero(kinds == _Kind.PAVEMENT)
+    slab = random_cells(np.floor(hits.points[rows, :2] / _SLAB).astype(int), pattern + 5) - 0.5
+    stain = 0.12 * slab + patches(hits.points[rows, :2], _ASPHALT, pattern + 6)
+    colors[rows] += stain[:, None]
+    reflectance[rows] += 0.6 * stain
+
+    rows = np.flatnonzero(kinds == _Kind.BUILDING)
+    stain = patches(hits.points[rows], _PLASTER, pattern + 9)
+    colors[rows] += stain[:, None]
+    reflectance[rows] += stain
+    shop = (hits.points[rows, 2] > 2.55) & (hits.points[rows, 2] < 3.05)
+    cell = np.stack([np.floor(hits.points[rows, 0] / _SIGN), np.sign(hits.points[rows, 1])], axis=1).astype(int)
+    sign = shop & (random_cells(cell, pattern + 12) < 0.6)
+    hue = np.stack([random_cells(cell, pattern + 13 + channel) for channel in range(3)], axis=1)
+    colors[rows] = np.where(sign[:, None], 0.15 + 0.7 * hue, colors[rows])
+    reflectance[rows] = np.where(sign, 0.6, reflectance[rows])
+    colors[glass] = _GLASS
+    reflectance[glass] = 0.06
+    return np.clip(colors, 0.03, 0.97), np.clip(reflectance, 0.02, 0.97)
+
+
+def _is_marked(ground: Float[np.ndarray, "N 2"], pattern: int) -> Bool[np.ndarray, "N"]:
+    """White paint: a dashed line in the middle, parking bays along the kerbs, a crossing here and there."""
+    x, y = ground.T
+    dashes = (np.abs(y) < 0.08) & (x % 9 < 4)
+    bays = (np.abs(np.abs(y) - _PARKING) < 0.06) & (x % 6 < 5.4)
+    ends = (np.abs(y) > _PARKING) & (np.abs(y) < _KERB) & (x % 6 < 0.12)
+    block = np.floor(x / 30).astype(int)[:, None]
+    place = 4 + 20 * random_cells(block, pattern)
+    crossing = (np.abs(x % 30 - place) < 1.5) & (y % 1.0 < 0.5) & (np.abs(y) < _KERB)
+    return dashes | bays | ends | crossing

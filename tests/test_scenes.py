@@ -1,0 +1,305 @@
+"""Synthetic scenes: rays against brute force, points on the surfaces that they are said to lie on, lazy sequences."""
+
+import pickle
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.spatial import cKDTree
+from scipy.spatial.transform import Rotation
+
+from mcgicp_jax.datasets import box_room, corridor, poster_wall, street
+from mcgicp_jax.datasets._raycast import Box, Cylinder, cast, random_rays, spinning_rays, value_noise
+from mcgicp_jax.datasets._street import _Kind, _things
+
+SCENES = [poster_wall, box_room, corridor, street]
+LIDAR = [box_room, corridor, street]
+
+
+def in_world(frame):
+    return frame.cloud.transform(frame.pose).points
+
+
+# Rays
+
+
+def march(origin, ray, inside, reach, step=1e-3):
+    """Metres to the first place along a ray that is inside, found by walking."""
+    along = np.arange(0, reach, step)
+    met = inside(origin + along[:, None] * ray)
+    return along[np.argmax(met)] if met.any() else np.inf
+
+
+@settings(max_examples=25, deadline=None)
+@given(st.integers(0, 10_000))
+def test_the_nearest_hit_is_found(seed):
+    rng = np.random.default_rng(seed)
+    low = rng.uniform(-4, 3, (3, 3))
+    boxes = [Box(corner, corner + rng.uniform(0.2, 2, 3)) for corner in low]
+    cylinder = Cylinder(rng.uniform(-4, 4, 3), rng.uniform(0.2, 1), rng.uniform(0.5, 3))
+    origin = rng.uniform(-5, 5, 3)
+
+    def in_box(box, points):
+        return ((points >= box.low) & (points <= box.high)).all(axis=1)
+
+    def in_mantle(points):
+        x, y, z = (points - cylinder.foot).T
+        # A thin shell, for the ends are open.
+        shell = np.abs(np.hypot(x, y) - cylinder.radius) < 2e-3
+        return shell & (z >= 0) & (z <= cylinder.height)
+
+    inside = [lambda p, box=box: in_box(box, p) for box in boxes] + [in_mantle]
+    x, y, _ = origin - cylinder.foot
+    if any(within(origin[None])[0] for within in inside) or np.hypot(x, y) < cylinder.radius + 0.01:
+        return
+    rays = random_rays(rng, 40)
+    hits = cast(origin, rays, [*boxes, cylinder], reach=8.0)
+    expected = np.array([min(march(origin, ray, within, 8.0) for within in inside) for ray in rays])
+    found = np.full(len(rays), np.inf)
+    rows = [np.flatnonzero((rays == ray).all(axis=1))[0] for ray in hits.rays]
+    found[rows] = hits.distance
+    # Walking may step over a corner or graze a mantle.
+    agree = np.isclose(found, expected, atol=0.02) | (np.isinf(found) & np.isinf(expected))
+    assert agree.mean() >= 0.9
+    np.testing.assert_allclose(hits.points, origin + hits.distance[:, None] * hits.rays)
+    np.testing.assert_allclose(np.linalg.norm(hits.normals, axis=1), 1, atol=1e-9)
+    assert np.all(np.sum(hits.normals * hits.rays, axis=1) < 0)
+
+
+def test_hits_on_known_solids_are_exact():
+    box, pole = Box(np.array([2.0, -1, -1]), np.array([3.0, 1, 1])), Cylinder(np.array([0.0, 3, -1]), 0.5, 2.0)
+    rays = np.array([[1.0, 0, 0], [0, 1, 0], [-1, 0, 0], [0, 0.6, 0.8]])
+    hits = cast(np.zeros(3), rays, [box, pole], np.inf)
+    np.testing.assert_array_equal(hits.solid, [0, 1])
+    np.testing.assert_allclose(hits.distance, [2, 2.5])
+    np.testing.assert_allclose(hits.normals, [[-1, 0, 0], [0, -1, 0]])
+    assert len(cast(np.zeros(3), rays, [box, pole], 2.2).solid) == 1
+
+
+def test_a_lidar_turns_once_and_never_starts_alike():
+    first, second = (spinning_rays(np.random.default_rng(seed), 6400, 64, -0.4, 0.1) for seed in (0, 1))
+    assert first.shape == (6400, 3)
+    np.testing.assert_allclose(np.linalg.norm(first, axis=1), 1)
+    assert len(np.unique(np.round(first[:, 2], 9))) == 64
+    assert cKDTree(second).query(first)[0].min() > 1e-6
+    azimuth = np.sort(np.arctan2(first[::64, 1], first[::64, 0]))
+    np.testing.assert_allclose(np.diff(azimuth), 2 * np.pi / 100, atol=1e-9)
+
+
+@pytest.mark.parametrize("dimensions", [1, 2, 3])
+def test_value_noise_is_smooth_bounded_and_the_same_everywhere(dimensions):
+    rng = np.random.default_rng(0)
+    points = rng.uniform(-300, 300, (5000, dimensions))
+    values = value_noise(points, 0.7, 3)
+    assert -1 <= values.min() < -0.3 and 0.3 < values.max() <= 1 and abs(values.mean()) < 0.1
+    np.testing.assert_array_equal(values[:10], value_noise(points[:10], 0.7, 3))
+    near = value_noise(points + 1e-4 * rng.normal(size=points.shape), 0.7, 3)
+    assert np.abs(near - values).max() < 5e-3
+    # Nothing of one seed is seen in another, nor some cells further.
+    for other in (value_noise(points, 0.7, 4), value_noise(points + 7, 0.7, 3)):
+        assert abs(np.corrcoef(values, other)[0, 1]) < 0.1
+
+
+# Sequences
+
+
+@pytest.mark.parametrize("scene", SCENES)
+def test_a_frame_is_the_same_however_many_there_are(scene):
+    two, many = scene(2, points_per_frame=2000, seed=5), scene(9, points_per_frame=2000, seed=5)
+    other = scene(2, points_per_frame=2000, seed=6)
+    for i in range(2):
+        np.testing.assert_array_equal(two[i].pose, many[i].pose)
+        np.testing.assert_array_equal(two[i].cloud.points, many[i].cloud.points)
+        np.testing.assert_array_equal(two[i].cloud.channels, many[i].cloud.channels)
+    assert not np.allclose(two[0].pose, other[0].pose)
+    assert not np.array_equal(two[0].cloud.channels[:100], other[0].cloud.channels[:100])
+
+
+@pytest.mark.parametrize("scene", SCENES)
+def test_a_sequence_is_lazy_and_behaves_like_a_list(scene):
+    frames = scene(6, points_per_frame=500, step=0.05)
+    assert len(frames) == 6 and len(list(frames)) == 6
+    np.testing.assert_array_equal(frames[-1].pose, frames[5].pose)
+    part = frames[4:1:-2]
+    assert len(part) == 2
+    np.testing.assert_array_equal([frame.time for frame in part], [frames[4].time, frames[2].time])
+    assert len(part[5:]) == 0
+    for index in (6, -7):
+        with pytest.raises(IndexError, match=rf"expected -6 to 5, got {index}"):
+            frames[index]
+    with pytest.raises(ValueError, match="num_frames: expected at least 1, got 0"):
+        scene(0)
+    again = pickle.loads(pickle.dumps(frames))
+    np.testing.assert_array_equal(again[3].cloud.points, frames[3].cloud.points)
+    # However long: nothing is made before it is asked for.
+    assert len(scene(100, points_per_frame=500)) == 100
+
+
+@pytest.mark.parametrize("scene", SCENES)
+def test_a_frame_can_be_observed_again(scene):
+    frames = scene(3, points_per_frame=2000)
+    first, second, same = frames.observe(1, 0), frames.observe(1, 1), frames.observe(1, 0)
+    np.testing.assert_array_equal(first.cloud.points, same.cloud.points)
+    np.testing.assert_array_equal(first.pose, frames[1].pose)
+    np.testing.assert_array_equal(frames.observe(-2).cloud.points, frames[1].cloud.points)
+    clouds = [frame.cloud for frame in (first, second, frames[1])]
+    for i, cloud in enumerate(clouds):
+        for other in clouds[:i]:
+            # Fresh rays, not the same with other noise.
+            assert cKDTree(cloud.points).query(other.points)[0].min() > 0
+    with pytest.raises(IndexError):
+        frames.observe(3, 0)
+
+
+@pytest.mark.parametrize("scene", SCENES)
+def test_noise_scales(scene):
+    clean, noisy, twice = (scene(1, points_per_frame=4000, noise=noise, seed=2)[0].cloud for noise in (0.0, 1.0, 2.0))
+    size = [np.linalg.norm(cloud.points - clean.points, axis=1) for cloud in (noisy, twice)]
+    np.testing.assert_allclose(size[1], 2 * size[0], atol=1e-12)
+    assert 0.001 < size[0].mean() < 0.03
+    changed = [(cloud.channels - clean.channels) for cloud in (noisy, twice)]
+    inside = (twice.channels > 0) & (twice.channels < 1)
+    np.testing.assert_allclose(changed[1][inside], 2 * changed[0][inside], atol=1e-12)
+    assert 0.003 < changed[0][inside].std() < 0.03
+    for value in (-0.1, np.nan):
+        with pytest.raises(ValueError, match=rf"^noise: expected 0 or more, got {value}"):
+            scene(noise=value)
+    with pytest.raises(ValueError, match=r"^points_per_frame: expected"):
+        scene(points_per_frame=0)
+
+
+@pytest.mark.parametrize("scene", LIDAR)
+def test_the_sensor_moves_by_steps_and_poses_are_rigid(scene):
+    frames = scene(40, points_per_frame=64, step=0.3)
+    poses = np.array([frames.path(i) for i in range(40)])
+    rotations = poses[:, :3, :3]
+    np.testing.assert_allclose(rotations @ rotations.swapaxes(1, 2) - np.eye(3), 0, atol=1e-12)
+    moves = np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1)
+    assert moves.min() > 0.29 and moves.max() < 0.32
+    turns = Rotation.from_matrix(rotations[:-1].swapaxes(1, 2) @ rotations[1:]).magnitude()
+    assert turns.min() > 0 and turns.max() < np.deg2rad(15)
+    np.testing.assert_allclose(np.diff([frame.time for frame in frames]), 0.1)
+
+
+# Each scene
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_the_room_is_closed_and_its_points_are_on_its_walls_and_boxes(seed):
+    frames = box_room(30, points_per_frame=3000, noise=0.0, step=0.35, seed=seed)
+    boxes = frames.observer.args[0]
+    for frame in frames[::6]:
+        points = in_world(frame)
+        assert len(points) == 3000
+        assert np.all(points > -1e-9) and np.all(points < (8 + 1e-9, 6 + 1e-9, 2.8 + 1e-9))
+        outside = [np.maximum(box.low - points, points - box.high).max(axis=1) for box in boxes]
+        # On the surface of one, inside of none.
+        np.testing.assert_allclose(np.min(outside, axis=0), 0, atol=1e-9)
+        share = [np.mean(np.abs(distance) < 1e-9) for distance in outside]
+        assert min(share[:6]) > 0.02 and sum(share[6:]) > 0.05
+
+
+def test_noise_along_the_rays_keeps_their_directions():
+    kinds = [{"noise": 0.0}, {}, {"along_rays": True}]
+    clean, free, along = (box_room(1, **each)[0].cloud.points for each in kinds)
+    directions = clean / np.linalg.norm(clean, axis=1, keepdims=True)
+    across = [np.linalg.norm(np.cross(points - clean, directions), axis=1).mean() for points in (free, along)]
+    assert across[0] > 0.01 and across[1] < 1e-12
+    assert np.std(np.sum((along - clean) * directions, axis=1)) == pytest.approx(0.01, rel=0.05)
+    assert np.std(free - clean) == pytest.approx(0.01, rel=0.02)
+
+
+def test_the_corridor_has_the_same_shape_everywhere_along_its_axis():
+    frames = corridor(20, noise=0.0, step=1.0)
+    for frame in frames[::5]:
+        x, y, z = in_world(frame).T
+        on = [np.abs(np.abs(y) - 1.2) < 1e-9, np.abs(z) < 1e-9, np.abs(z - 2.5) < 1e-9]
+        assert np.all(np.any(on, axis=0))
+        assert min(each.mean() for each in on) > 0.1
+        assert np.all(np.linalg.norm(frame.cloud.points, axis=1) < 12)
+        assert np.ptp(x) > 15
+
+
+def test_only_a_textured_corridor_tells_where_one_is():
+    bare = corridor(2, textured=False, noise=0.0)[0].cloud
+    assert np.ptp(bare.channels) == 0
+    first, second = corridor(2, noise=0.0, points_per_frame=20_000)
+    tree = cKDTree(in_world(second))
+
+    def disagreement(shift):
+        distance, nearest = tree.query(in_world(first) + np.array([shift, 0, 0]))
+        return np.abs(first.cloud.channels - second.cloud.channels[nearest])[distance < 0.03].mean()
+
+    assert disagreement(0) < 0.3 * disagreement(0.1) and disagreement(0) < 0.3 * disagreement(-0.1)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_the_points_of_the_street_lie_on_its_things(seed):
+    frames = street(20, points_per_frame=6400, noise=0.0, seed=seed)
+    things = frames.observer.args[0]
+    points = in_world(frames[7])
+    outside = np.full((len(things), len(points)), np.inf)
+    for row, thing in enumerate(things):
+        if isinstance(thing.solid, Box):
+            outside[row] = np.maximum(thing.solid.low - points, points - thing.solid.high).max(axis=1)
+        else:
+            x, y, z = (points - thing.solid.foot).T
+            near = (z >= -1e-9) & (z <= thing.solid.height + 1e-9)
+            outside[row] = np.where(near, np.hypot(x, y) - thing.solid.radius, np.inf)
+    nearest = np.argmin(np.abs(outside), axis=0)
+    distance = outside[nearest, np.arange(len(points))]
+    kinds = np.array([thing.kind for thing in things])[nearest]
+    surface = np.abs(distance) < 1e-9
+    # All but what lies in windows, which are set back from the façade by up to 25 cm.
+    assert np.all(kinds[~surface] == _Kind.BUILDING)
+    assert np.all((distance[~surface] > -0.25 - 1e-9) & (distance[~surface] < 0))
+    assert 0.02 < np.mean(~surface) < 0.3
+    present = {kind: np.mean(kinds == kind) for kind in _Kind}
+    assert present[_Kind.GROUND] > 0.2 and min(present.values()) > 1e-3
+    assert len(points) > 0.9 * 6400 and np.linalg.norm(frames[7].cloud.points, axis=1).max() < 80.3
+
+
+def test_glass_lies_behind_the_facade_and_reflects_little():
+    frames = street(1, points_per_frame=64_000, noise=0.0)
+    things = frames.observer.args[0]
+    cloud, points = frames[0].cloud, in_world(frames[0])
+    found = 0
+    for thing in things:
+        if thing.windows is None:
+            continue
+        low, high = thing.solid.bounds
+        face = low[1] if low[1] > 0 else high[1]
+        depth = np.abs(points[:, 1]) - abs(face)
+        inside = (points[:, 0] > low[0]) & (points[:, 0] < high[0]) & (points[:, 2] > 0.2)
+        glass = inside & (np.abs(depth - thing.windows[4]) < 1e-9)
+        # Behind the opening of a window, never beyond its edges.
+        offset = (points[glass][:, [0, 2]] - low[[0, 2]]) % thing.windows[:2] - thing.windows[:2] / 2
+        assert np.all(np.abs(offset) <= thing.windows[2:4] / 2 + 1e-9)
+        assert cloud.channels[glass, 0].max(initial=0) <= 0.06
+        found += glass.sum()
+    assert found > 1000
+
+
+def test_two_views_of_the_street_agree_about_its_colors():
+    first, second = street(2, points_per_frame=64_000, noise=0.0)
+    distance, nearest = cKDTree(in_world(second)).query(in_world(first))
+    close = distance < 0.03
+    assert close.mean() > 0.02
+    difference = np.abs(first.cloud.channels - second.cloud.channels[nearest])[close]
+    assert np.median(difference[:, 1:]) < 0.02 and np.median(difference[:, 0]) < 0.03
+
+
+def test_a_longer_street_begins_like_a_shorter_one():
+    short, long = (_things(np.random.default_rng(0), -10.0, end) for end in (50.0, 90.0))
+    for kind in (_Kind.BUILDING, _Kind.CAR, _Kind.POLE, _Kind.BIN):
+        ends = [[thing.solid.bounds[0] for thing in things if thing.kind == kind] for things in (short, long)]
+        rows = {tuple(corner) for corner in ends[1]}
+        assert ends[0] and all(tuple(corner) in rows for corner in ends[0]) and len(ends[1]) > len(ends[0])
+
+
+def test_a_wall_from_right_to_left():
+    frames = poster_wall(5, heading=np.pi, step=0.1, points_per_frame=100)
+    places = np.array([frame.pose[:3, 3] for frame in frames])
+    np.testing.assert_allclose(np.diff(places[:, 0]), -0.1)
+    np.testing.assert_allclose(np.diff(places[:, 1]), 0, atol=1e-12)
