@@ -1,0 +1,59 @@
+"""Images of cameras: reading them, and looking colours up in them."""
+
+from __future__ import annotations
+
+import os
+from typing import Any, TypeAlias
+
+import numpy as np
+from jaxtyping import Bool, Float, UInt8, UInt16
+
+Picture: TypeAlias = UInt8[np.ndarray, "height width 3"]
+
+
+def read_image(path: str | os.PathLike[str]) -> Picture:
+    """Any image as 8-bit red, green and blue."""
+    return np.asarray(_open(path).convert("RGB"))
+
+
+def read_depth(path: str | os.PathLike[str]) -> UInt16[np.ndarray, "height width"]:
+    """A 16-bit depth image, in its own unit."""
+    depth = np.asarray(_open(path))
+    if depth.ndim != 2 or depth.dtype != np.uint16:
+        raise ValueError(f"{path}: expected a 16-bit depth image, got {depth.dtype} of shape {depth.shape}")
+    return depth
+
+
+def look_up(image: Picture, pixels: Float[np.ndarray, "N 2"]) -> tuple[Float[np.ndarray, "N 3"], Bool[np.ndarray, "N"]]:
+    """Colours from 0 to 1 at pixels (column, row; the first centre is 0, 0), bilinear; and which of them are inside."""
+    height, width, _ = image.shape
+    # Written so that NaN is outside.
+    inside = np.all((pixels >= 0) & (pixels <= (width - 1, height - 1)), axis=1)
+    column, row = np.where(inside[:, None], pixels, 0).T
+    left, top = np.floor(column).astype(int), np.floor(row).astype(int)
+    right, bottom = np.minimum(left + 1, width - 1), np.minimum(top + 1, height - 1)
+    across, down = (column - left)[:, None], (row - top)[:, None]
+    above = (1 - across) * image[top, left] + across * image[top, right]
+    below = (1 - across) * image[bottom, left] + across * image[bottom, right]
+    return ((1 - down) * above + down * below) / 255, inside
+
+
+def back_project(
+    depth: Float[np.ndarray, "height width"], focal: tuple[float, float], center: tuple[float, float]
+) -> tuple[Float[np.ndarray, "N 3"], Float[np.ndarray, "N 2"]]:
+    """Points that a pinhole camera (x right, y down, z ahead) saw, and their pixels; depth in metres, 0 for none."""
+    row, column = np.nonzero(depth > 0)
+    pixels = np.stack([column, row], axis=1).astype(float)
+    distance = depth[row, column, None]
+    return np.hstack([(pixels - center) / focal * distance, distance]), pixels
+
+
+def _open(path: str | os.PathLike[str]) -> Any:
+    try:
+        from PIL import Image
+    except ImportError as error:
+        raise ImportError("reading images needs pillow: pip install 'mcgicp_jax[io]'") from error
+    try:
+        return Image.open(path)
+    except Image.UnidentifiedImageError as error:
+        raise ValueError(f"{path}: cannot be read as an image") from error

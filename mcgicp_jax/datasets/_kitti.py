@@ -1,0 +1,94 @@
+"""The KITTI odometry data set."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float
+
+from mcgicp_jax import io
+from mcgicp_jax._cloud import PointCloud
+from mcgicp_jax.datasets._frame import AbstractFrames, Frame
+from mcgicp_jax.datasets._images import look_up, read_image
+
+
+def kitti(folder: str | os.PathLike[str]) -> KITTIFrames:
+    """A sequence of the KITTI odometry data set (Geiger et al. 2012), such as `dataset/sequences/04`.
+
+    It has `velodyne/*.bin`, `calib.txt`, `times.txt`, and may have `image_2/*.png`, the left colour camera; the poses
+    are in `dataset/poses/04.txt`, where they are known.
+
+    Returns:
+        Frames of the Velodyne (x ahead, y left, z up) with the channel intensity, from 0 to 0.99, and if there are
+        images red, green and blue, from 0 to 1. Colours are valid where a point lies in the image, about a sixth of a
+        scan; a point that something nearer hides from the camera alone is not recognised. Poses are those of the
+        Velodyne in the world, which is camera 0 at the start.
+
+    Raises:
+        OSError: if a file is missing; a scan or an image when its frame is read.
+        ValueError: if there are no scans, or a file is no such file.
+    """
+    return KITTIFrames(Path(folder))
+
+
+class KITTIFrames(AbstractFrames):
+    """See `kitti`."""
+
+    def __init__(self, folder: Path):
+        self.folder = folder
+        self._scans = sorted((folder / "velodyne").glob("*.bin"))
+        if not self._scans:
+            raise ValueError(f"{folder}: expected scans in velodyne/*.bin, found none")
+        calibration = _read_calibration(folder / "calib.txt")
+        # From the Velodyne to camera 0, and on to the pixels of camera 2.
+        self._to_camera = np.vstack([calibration["Tr"], [0, 0, 0, 1]])
+        self._projection = calibration["P2"] @ self._to_camera
+        self._times = np.loadtxt(folder / "times.txt", ndmin=1)
+        poses = folder.absolute().parents[1] / "poses" / f"{folder.absolute().name}.txt"
+        self._poses = io.read_poses(poses) if poses.is_file() else None
+        self._colored = (folder / "image_2").is_dir()
+
+    def __len__(self) -> int:
+        return len(self._scans)
+
+    def _frame(self, index: int) -> Frame:
+        scan = self._scans[index]
+        # Scans, images, times and poses go by number, of which a copy may have some alone.
+        number = int(scan.stem)
+        cloud = io.read(scan)
+        if self._colored:
+            cloud = self._paint(cloud, self.folder / "image_2" / f"{scan.stem}.png")
+        pose = None
+        if self._poses is not None and number < len(self._poses):
+            pose = np.linalg.inv(self._to_camera) @ self._poses[number] @ self._to_camera
+        time = float(self._times[number]) if number < len(self._times) else None
+        return Frame(cloud, pose, time)
+
+    def _paint(self, cloud: PointCloud, image: Path) -> PointCloud:
+        homogeneous = cloud.points @ self._projection[:, :3].T + self._projection[:, 3]
+        ahead = homogeneous[:, 2:] > 0
+        pixels = np.where(ahead, homogeneous[:, :2] / np.where(ahead, homogeneous[:, 2:], 1), -1)
+        colors, inside = look_up(read_image(image), pixels)
+        valid = np.column_stack([np.ones(len(inside), bool), *[inside] * 3])
+        return PointCloud(
+            cloud.points,
+            np.hstack([cloud.channels, colors.astype(np.float32)]),
+            channel_valid=valid,
+            channel_names=("intensity", "red", "green", "blue"),
+        )
+
+
+def _read_calibration(path: Path) -> dict[str, Float[np.ndarray, "3 4"]]:
+    """The 3×4 matrices of calib.txt by their names."""
+    matrices = {}
+    for line in path.read_text().splitlines():
+        name, _, numbers = line.partition(":")
+        values = np.array(numbers.split(), float)
+        if values.size == 12:
+            matrices[name] = values.reshape(3, 4)
+    for name in ("P2", "Tr"):
+        if name not in matrices:
+            raise ValueError(f"{path}: expected a line {name}: with 12 numbers, found {', '.join(matrices) or 'none'}")
+    return matrices

@@ -1,0 +1,339 @@
+"""Readers of data sets, on files written in their form and on the real ones."""
+
+import shutil
+
+import numpy as np
+import pytest
+import scipy.io
+from PIL import Image
+from scipy.spatial import cKDTree
+from scipy.spatial.transform import Rotation, Slerp
+
+from mcgicp_jax import io, metrics
+from mcgicp_jax.datasets import ford_campus, kitti, seven_scenes, tum_rgbd
+from mcgicp_jax.datasets._images import look_up
+from tests.scenes import motion
+
+
+def ramp(height, width):
+    """An image that tells its pixels: red goes with the column, green with the row; blue is 51."""
+    row, column = np.mgrid[:height, :width]
+    return np.stack([255 * column / (width - 1), 255 * row / (height - 1), np.full(row.shape, 51)], axis=-1)
+
+
+def save_image(path, array):
+    path.parent.mkdir(parents=True, exist_ok=True)
+    Image.fromarray(np.asarray(array)).save(path)
+
+
+def colors_differ(first, second, reach):
+    """Mean difference of the colours of points that lie at the same place in the world."""
+    clouds = [frame.cloud.transform(frame.pose) for frame in (first, second)]
+    rows = [np.arange(len(c)) if c.channel_valid is None else np.flatnonzero(c.channel_valid[:, -1]) for c in clouds]
+    points, colors = zip(
+        *((c.points[row], c.channels[row, -3:]) for c, row in zip(clouds, rows, strict=True)), strict=True
+    )
+    chosen = np.random.default_rng(0).permutation(len(points[0]))[:20_000]
+    distance, nearest = cKDTree(points[1]).query(points[0][chosen])
+    return np.abs(colors[0][chosen] - colors[1][nearest])[distance < reach].mean()
+
+
+# Looking colours up
+
+
+def test_colors_are_bilinear_and_only_inside():
+    image = ramp(11, 21).astype(np.uint8)
+    pixels = np.array([[0, 0], [20, 10], [3, 4], [3.5, 4.5], [-0.1, 3], [20.1, 3], [3, 10.1], [np.nan, 1], [np.inf, 1]])
+    colors, inside = look_up(image, pixels)
+    np.testing.assert_array_equal(inside, [True] * 4 + [False] * 5)
+    np.testing.assert_allclose(colors[0], [0, 0, 0.2])
+    np.testing.assert_allclose(colors[1], [1, 1, 0.2])
+    np.testing.assert_allclose(colors[2], image[4, 3] / 255)
+    np.testing.assert_allclose(colors[3], image[4:6, 3:5].mean(axis=(0, 1)) / 255)
+
+
+# KITTI
+
+CALIBRATION = {"P0": [100, 0, 50, 0, 0, 100, 20, 0, 0, 0, 1, 0], "P2": [100, 0, 50, 30, 0, 100, 20, 0, 0, 0, 1, 0]}
+# From x ahead, y left, z up to x right, y down, z ahead.
+TO_CAMERA = [0, -1, 0, 0, 0, 0, -1, 0, 1, 0, 0, -0.5]
+
+
+@pytest.fixture
+def kitti_folder(tmp_path):
+    """Scans 3 and 4 of sequence 77: the one ahead of the camera, the other all around."""
+    folder = tmp_path / "sequences" / "77"
+    (folder / "velodyne").mkdir(parents=True)
+    ahead = np.array(
+        [[10.5, 0, 0, 0.1], [10.5, 3, 1, 0.2], [5.5, -2, -0.5, 0.3], [-10.5, 0, 0, 0.4], [10.5, 9, 0, 0.5]]
+    )
+    around = np.random.default_rng(0).normal(scale=10, size=(50, 4))
+    for number, scan in ((3, ahead), (4, around)):
+        scan.astype("<f4").tofile(folder / "velodyne" / f"{number:06d}.bin")
+        save_image(folder / "image_2" / f"{number:06d}.png", ramp(41, 101).astype(np.uint8))
+    lines = [f"{name}: {' '.join(map(str, row))}" for name, row in (CALIBRATION | {"Tr": TO_CAMERA}).items()]
+    (folder / "calib.txt").write_text("\n".join(lines))
+    np.savetxt(folder / "times.txt", 0.1 * np.arange(6))
+    (tmp_path / "poses").mkdir()
+    io.write_poses(tmp_path / "poses" / "77.txt", [motion((i, 0, 0.1 * i, 0, 0.02 * i, 0)) for i in range(6)])
+    return folder
+
+
+def test_kitti_points_get_the_color_of_their_pixel(kitti_folder):
+    frames = kitti(kitti_folder)
+    assert len(frames) == 2
+    cloud = frames[0].cloud
+    assert cloud.channel_names == ("intensity", "red", "green", "blue")
+    np.testing.assert_allclose(cloud.channels[:, 0], [0.1, 0.2, 0.3, 0.4, 0.5], atol=1e-6)
+    # Depth 10 and 5; u = (100 x + 50 z + 30) / z, with x = −y of the scan; v = 100 y / z + 20, with y = −z of the scan.
+    pixels = np.array([[53, 20], [23, 10], [96, 30]])
+    np.testing.assert_allclose(cloud.channels[:3, 1:3], pixels / (100, 40), atol=0.005)
+    np.testing.assert_array_equal(cloud.channel_valid[:, 0], True)
+    np.testing.assert_array_equal(cloud.channel_valid[:, 1:], np.repeat([[1], [1], [1], [0], [0]], 3, axis=1) == 1)
+
+
+def test_kitti_times_and_poses_go_by_the_number_of_the_scan(kitti_folder):
+    frames = kitti(str(kitti_folder))
+    assert [frame.time for frame in frames] == pytest.approx([0.3, 0.4])
+    to_camera = np.vstack([np.reshape(TO_CAMERA, (3, 4)), [0, 0, 0, 1]])
+    np.testing.assert_allclose(
+        frames[1].pose, np.linalg.inv(to_camera) @ motion((4, 0, 0.4, 0, 0.08, 0)) @ to_camera, atol=1e-9
+    )
+    # A step of the camera ahead is one of the Velodyne ahead.
+    np.testing.assert_allclose(kitti(kitti_folder)[0].pose[:3, 3], [0.3, -3, 0], atol=0.1)
+    shutil.rmtree(kitti_folder.parents[1] / "poses")
+    shutil.rmtree(kitti_folder / "image_2")
+    bare = kitti(kitti_folder)[0]
+    assert bare.pose is None and bare.cloud.channel_names == ("intensity",) and bare.cloud.channel_valid is None
+
+
+def test_what_is_no_kitti_sequence_is_refused_by_name(kitti_folder, tmp_path):
+    with pytest.raises(ValueError, match=r"nowhere: expected scans in velodyne"):
+        kitti(tmp_path / "nowhere")
+    (kitti_folder / "calib.txt").write_text("P2: 1 2 3\n")
+    with pytest.raises(ValueError, match=r"calib.txt: expected a line P2: with 12 numbers, found none"):
+        kitti(kitti_folder)
+    (kitti_folder / "calib.txt").unlink()
+    with pytest.raises(FileNotFoundError, match=r"calib.txt"):
+        kitti(kitti_folder)
+
+
+def test_real_kitti_scans_have_the_colors_of_the_road(data):
+    frames = kitti(data / "kitti" / "sequences" / "04")
+    assert len(frames) == 10
+    first, second = frames[:2]
+    assert np.mean(first.cloud.channel_valid[:, 1]) == pytest.approx(0.16, abs=0.02)
+    relative = np.linalg.inv(first.pose) @ second.pose
+    np.testing.assert_allclose(relative[:3, 3], [1.31, 0, 0], atol=0.05)
+    assert second.time - first.time == pytest.approx(0.104, abs=0.01)
+    # Where the two see the same spot it has the same colour, more so than in the colours of other pixels.
+    right = colors_differ(first, second, 0.1)
+    swapped = type(second)(second.cloud.replace(channels=second.cloud.channels[::-1]), second.pose, None)
+    assert right < 0.07 and right < 0.5 * colors_differ(first, swapped, 0.1)
+
+
+# TUM RGB-D
+
+
+@pytest.fixture
+def tum_folder(tmp_path):
+    folder = tmp_path / "rgbd_dataset_freiburg2_made_up"
+    depth = np.zeros((480, 640), np.uint16)
+    depth[100, 200], depth[300, 400] = 5000, 10_000
+    for name in ("1.0", "1.1", "1.2"):
+        save_image(folder / "depth" / f"{name}.png", depth)
+        save_image(folder / "rgb" / f"{name}.png", ramp(480, 640).astype(np.uint8))
+    (folder / "depth.txt").write_text("# depth maps\n1.000 depth/1.0.png\n1.100 depth/1.1.png\n1.200 depth/1.2.png\n")
+    # One is too far in time from any; they are not in step.
+    (folder / "rgb.txt").write_text("# colour\n0.985 rgb/1.0.png\n1.111 rgb/1.1.png\n1.300 rgb/1.2.png\n")
+    poses = [motion((0.1 * i, 0, 0, 0, 0, 0.2 * i)) for i in range(3)]
+    io.write_poses(folder / "groundtruth.txt", poses, [0.96, 1.04, 1.09])
+    return folder
+
+
+def test_tum_frames_are_put_together_by_time(tum_folder):
+    frames = tum_rgbd(tum_folder)
+    assert len(frames) == 2
+    assert [frame.time for frame in frames] == [1.0, 1.1]
+    cloud = frames[0].cloud
+    np.testing.assert_allclose(cloud.points[:, 2], [1, 2])
+    np.testing.assert_allclose(
+        cloud.points[:, :2],
+        [
+            [(200 - 325.1) / 520.9, (100 - 249.7) / 521.0],
+            np.multiply(2, [(400 - 325.1) / 520.9, (300 - 249.7) / 521.0]),
+        ],
+        rtol=1e-5,
+    )
+    np.testing.assert_allclose(cloud.channels[:, :2], [[200 / 639, 100 / 479], [400 / 639, 300 / 479]], atol=0.005)
+    assert cloud.channel_valid is None
+    # Half way between two poses; and beyond the last of them.
+    times = Slerp([0.96, 1.04], Rotation.from_rotvec([[0, 0, 0], [0, 0, 0.2]]))
+    np.testing.assert_allclose(frames[0].pose[:3, :3], times(1.0).as_matrix(), atol=1e-9)
+    np.testing.assert_allclose(frames[0].pose[:3, 3], [0.05, 0, 0], atol=1e-9)
+    assert frames[1].pose is None
+    (tum_folder / "groundtruth.txt").unlink()
+    assert tum_rgbd(tum_folder)[0].pose is None
+
+
+def test_what_is_no_tum_sequence_is_refused_by_name(tum_folder):
+    (tum_folder / "rgb.txt").write_text("9.0 rgb/1.0.png\n")
+    with pytest.raises(ValueError, match=r"made_up: expected depth and colour images within 0.02 s"):
+        tum_rgbd(tum_folder)
+    (tum_folder / "rgb.txt").write_text("9.0\n")
+    with pytest.raises(ValueError, match=r"rgb.txt: expected lines of a time stamp"):
+        tum_rgbd(tum_folder)
+    (tum_folder / "rgb.txt").unlink()
+    with pytest.raises(FileNotFoundError, match=r"rgb.txt"):
+        tum_rgbd(tum_folder)
+
+
+def test_the_real_tum_pair_in_the_layout_of_the_data_set(data, tmp_path):
+    folder = tmp_path / "rgbd_dataset_freiburg1_xyz"
+    folder.mkdir()
+    rows = []
+    for i, name in enumerate(("prev", "curr")):
+        for kind in ("img", "dep"):
+            shutil.copy(data / "tum_fr1_xyz" / f"{kind}_{name}.png", folder)
+        rows.append(f"{i} {(data / 'tum_fr1_xyz' / f'pose_{name}.txt').read_text().strip()}")
+    (folder / "depth.txt").write_text("0 dep_prev.png\n1 dep_curr.png\n")
+    (folder / "rgb.txt").write_text("0.01 img_prev.png\n1.01 img_curr.png\n")
+    (folder / "groundtruth.txt").write_text("# timestamp tx ty tz qx qy qz qw\n" + "\n".join(rows))
+    target, source = tum_rgbd(folder)
+    shift, turn = metrics.pose_error(source.pose, target.pose)
+    assert 0.01 < shift < 0.05 and turn < 0.05
+    assert len(source.cloud) > 150_000
+    # The measured poses make the colours agree; moved poses do not.
+    right = colors_differ(source, target, 0.01)
+    for axis in range(2):
+        moved = source.pose.copy()
+        moved[:3, 3] += 0.03 * source.pose[:3, axis]
+        assert right < 0.8 * colors_differ(type(source)(source.cloud, moved), target, 0.01)
+
+
+# 7-Scenes
+
+
+def test_real_frames_of_7_scenes(data):
+    frames = seven_scenes(data / "sevenscenes_redkitchen")
+    assert len(frames) == 5 and [frame.time for frame in frames] == pytest.approx([n / 30 for n in range(560, 581, 5)])
+    first, last = frames[0], frames[-1]
+    np.testing.assert_allclose(
+        first.pose, np.loadtxt(data / "sevenscenes_redkitchen" / "frame-000560.pose.txt"), atol=1e-4
+    )
+    assert 200_000 < len(first.cloud) < 307_200
+    assert np.mean(first.cloud.channel_valid) > 0.99
+    assert colors_differ(first, last, 0.005) < 0.072
+
+
+def test_7_scenes_know_where_there_is_no_depth_and_no_color(tmp_path):
+    depth = np.full((480, 640), 65535, np.uint16)
+    depth[240, 320], depth[0, 0], depth[100, 100], depth[50, 2] = 2000, 0, 1000, 300
+    save_image(tmp_path / "frame-000030.depth.png", depth)
+    save_image(tmp_path / "frame-000030.color.png", ramp(480, 640).astype(np.uint8))
+    np.savetxt(tmp_path / "frame-000030.pose.txt", motion())
+    (frame,) = seven_scenes(tmp_path)
+    assert len(frame.cloud) == 3 and frame.time == pytest.approx(1)
+    np.testing.assert_allclose(sorted(frame.cloud.points[:, 2]), [0.3, 1, 2])
+    np.testing.assert_allclose(frame.pose, motion(), atol=1e-9)
+    ahead = np.argmax(frame.cloud.points[:, 2])
+    np.testing.assert_allclose(frame.cloud.points[ahead], [0, 0, 2])
+    # 26 mm aside at 2 m, and turned by 0.45°.
+    expected = 320 + 525 * (2 * -0.0079041 - 0.025559) / 2.0018
+    assert 639 * frame.cloud.channels[ahead, 0] == pytest.approx(expected, abs=2.6)
+    # So near, the colour camera looks past the corner.
+    assert not frame.cloud.channel_valid[np.argmin(frame.cloud.points[:, 2])].any()
+    with pytest.raises(ValueError, match="expected images frame"):
+        seven_scenes(tmp_path / "nowhere")
+    (tmp_path / "frame-000030.depth.png").write_bytes(b"no image")
+    with pytest.raises(ValueError, match=r"frame-000030.depth.png: cannot be read as an image"):
+        seven_scenes(tmp_path)[0]
+
+
+# Ford Campus
+
+
+def write_ford(folder, reflectivity=None):
+    """Two scans of five points; cameras 1 and 3 of five see some of them; the second scan is too late for an image."""
+    (folder / "SCANS").mkdir(parents=True)
+    points = np.array([[1.0, 2, 3, 4, 5], [0, 1, 0, 1, 0], [0.5, 0.5, 0.5, 0.5, -0.5]])
+    empty = {"points_index": np.zeros((1, 0)), "pixels": np.zeros((2, 0)), "xyz": np.zeros((3, 0))}
+    cameras = [dict(empty) for _ in range(5)]
+    cameras[1] |= {"points_index": np.array([[1, 3]]), "pixels": np.array([[1.0, 1616], [1.5, 1231.5]])}
+    cameras[3] |= {"points_index": np.array([[3, 5]]), "pixels": np.array([[1.0, 809], [1.5, 617.5]])}
+    dtype = [(name, object) for name in empty]
+    records = np.array([[tuple(camera[name] for name in empty) for camera in cameras]], dtype)
+    for number, late in ((75, 0.0), (76, 1e6)):
+        scan = {
+            "XYZ": points,
+            "X_wv": np.array([[10.0], [20], [-1], [0.1], [0.2], [0.3]]),
+            "timestamp_camera": 1.2e9 * 1e6 + 30_000 + late,
+            "timestamp_laser": 1.2e9 * 1e6 + late,
+            "image_index": 0,
+            "Cam": records,
+        }
+        if reflectivity is not None:
+            scan["reflectivity"] = reflectivity
+        scipy.io.savemat(folder / "SCANS" / f"Scan{number:04d}.mat", {"SCAN": scan})
+    for camera in range(5):
+        save_image(folder / "IMAGES" / f"Cam{camera}" / "image0011.ppm", ramp(616, 1616).astype(np.uint8))
+    (folder / "Timestamp.log").write_text(
+        "frame curr_timestamp_sync\n10 1199999999900000 1 2\n11 1200000000020000 1 2\n12 1200000000140000 1 2\n"
+    )
+
+
+def test_ford_scans_are_colored_by_the_image_of_their_time(tmp_path):
+    write_ford(tmp_path)
+    frames = ford_campus(tmp_path)
+    assert len(frames) == 2
+    cloud = frames[0].cloud
+    assert cloud.channel_names == ("red", "green", "blue")
+    np.testing.assert_allclose(cloud.points[:, 0], [1, 2, 3, 4, 5])
+    np.testing.assert_array_equal(cloud.channel_valid[:, 0], [True, False, True, False, True])
+    # The corners of the image; the third point is seen by two cameras, of which the first counts.
+    np.testing.assert_allclose(cloud.channels[[0, 2, 4], :2], [[0, 0], [1, 1], [808 / 1615, 308 / 615]], atol=0.005)
+    assert not frames[1].cloud.channel_valid.any()
+    assert frames[1].time - frames[0].time == pytest.approx(1)
+
+
+def test_ford_poses_are_those_of_the_laser(tmp_path):
+    write_ford(tmp_path)
+    pose = ford_campus(tmp_path)[0].pose
+    vehicle, laser = np.eye(4), np.eye(4)
+    vehicle[:3, :3] = Rotation.from_euler("xyz", [0.1, 0.2, 0.3]).as_matrix()
+    vehicle[:3, 3] = 10, 20, -1
+    # The laser's axes: ahead is the vehicle's right ... its z axis is up, the vehicle's is down.
+    laser[:3, :3] = [[0, 1, 0], [1, 0, 0], [0, 0, -1]]
+    laser[:3, 3] = 2.4, -0.01, -2.3
+    np.testing.assert_allclose(pose, vehicle @ laser, atol=1e-9)
+
+
+def test_ford_scans_with_reflectance_have_an_intensity(tmp_path):
+    write_ford(tmp_path, reflectivity=np.array([[9.0, 8, 7, 6, 5]]))
+    cloud = ford_campus(tmp_path)[1].cloud
+    assert cloud.channel_names == ("intensity", "red", "green", "blue")
+    np.testing.assert_allclose(cloud.channels[:, 0], [9, 8, 7, 6, 5])
+    assert cloud.channel_valid[:, 0].all()
+
+
+def test_ford_without_images_has_points_alone(tmp_path):
+    write_ford(tmp_path)
+    shutil.rmtree(tmp_path / "IMAGES")
+    assert not ford_campus(tmp_path)[0].cloud.channel_valid.any()
+    (tmp_path / "Timestamp.log").unlink()
+    assert not ford_campus(tmp_path)[0].cloud.channel_valid.any()
+
+
+def test_what_is_no_ford_data_is_refused_by_name(tmp_path):
+    with pytest.raises(ValueError, match=r"nowhere: expected scans in SCANS"):
+        ford_campus(tmp_path / "nowhere")
+    write_ford(tmp_path)
+    scipy.io.savemat(tmp_path / "SCANS" / "Scan0075.mat", {"other": 1})
+    (tmp_path / "SCANS" / "Scan0076.mat").write_bytes(b"no such thing")
+    frames = ford_campus(tmp_path)
+    for i, name in enumerate(("Scan0075.mat", "Scan0076.mat")):
+        with pytest.raises(ValueError, match=f"{name}: cannot be read as a scan of Ford Campus"):
+            frames[i]
+    (tmp_path / "Timestamp.log").write_text("nothing\n")
+    with pytest.raises(ValueError, match=r"Timestamp.log: expected rows"):
+        ford_campus(tmp_path)
