@@ -7,6 +7,8 @@ from mcgicp_jax import datasets as datasets
 from mcgicp_jax import io as io
 from mcgicp_jax import metrics as metrics
 from mcgicp_jax import plot as plot
+from mcgicp_jax._batch import register_as_completed as register_as_completed
+from mcgicp_jax._batch import register_batch as register_batch
 from mcgicp_jax._cloud import PointCloud as PointCloud
 from mcgicp_jax._cost import Cauchy as Cauchy
 from mcgicp_jax._cost import GemanMcClure as GemanMcClure

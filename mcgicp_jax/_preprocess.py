@@ -51,10 +51,7 @@ def preprocess(
         cloud = PointCloud(cloud)
     if not is_concrete(cloud):
         raise ValueError("cloud: expected numbers, got tracers; preprocess outside of jit, grad and vmap")
-    if voxel_size is not None and (isinstance(voxel_size, str) or not 0 < voxel_size < np.inf):
-        raise ValueError(f"voxel_size: expected a positive number of metres or None, got {voxel_size!r}")
-    if num_neighbors < 3:
-        raise ValueError(f"num_neighbors: expected at least 3, got {num_neighbors}")
+    check_preprocessing(voxel_size, num_neighbors)
     cloud = _finite(cloud.unpad())
     points = np.asarray(cloud.points)
     channels, covariances = np.asarray(cloud.channels), cloud.covariances
@@ -90,6 +87,14 @@ def preprocess(
             for value in [getattr(ready, name)]
         }
     )
+
+
+def check_preprocessing(voxel_size: float | None, num_neighbors: int) -> None:
+    """Raise `ValueError` for what is wrong with `preprocess`'s arguments whatever the cloud."""
+    if voxel_size is not None and (isinstance(voxel_size, str) or not 0 < voxel_size < np.inf):
+        raise ValueError(f"voxel_size: expected a positive number of metres or None, got {voxel_size!r}")
+    if num_neighbors < 3:
+        raise ValueError(f"num_neighbors: expected at least 3, got {num_neighbors}")
 
 
 def _finite(cloud: PointCloud) -> PointCloud:

@@ -21,10 +21,10 @@ from mcgicp_jax._preprocess import preprocess
 from mcgicp_jax._result import Registration, pose_in_user_frame
 from mcgicp_jax._search import AbstractSearch, Correspondences
 
-_MAX_ITERATIONS = 64
+MAX_ITERATIONS = 64
 # Nearest-neighbour matches often end in a small cycle; real scans were seen to circle within 0.2 mm and 0.4 mrad.
-_TRANSLATION_TOLERANCE = 5e-4
-_ROTATION_TOLERANCE = 5e-4
+TRANSLATION_TOLERANCE = 5e-4
+ROTATION_TOLERANCE = 5e-4
 
 
 def find_correspondences(
@@ -85,9 +85,9 @@ def align(
     method: AbstractMethod,
     *,
     init: Pose | None = None,
-    max_iterations: int = _MAX_ITERATIONS,
-    translation_tolerance: ArrayLike = _TRANSLATION_TOLERANCE,
-    rotation_tolerance: ArrayLike = _ROTATION_TOLERANCE,
+    max_iterations: int = MAX_ITERATIONS,
+    translation_tolerance: ArrayLike = TRANSLATION_TOLERANCE,
+    rotation_tolerance: ArrayLike = ROTATION_TOLERANCE,
     robust: AbstractKernel | None = None,
     temperature: ArrayLike | None = None,
 ) -> Registration:
@@ -129,9 +129,9 @@ def register(
     *,
     init: Pose | None = None,
     max_distance: ArrayLike,
-    max_iterations: int = _MAX_ITERATIONS,
-    translation_tolerance: ArrayLike = _TRANSLATION_TOLERANCE,
-    rotation_tolerance: ArrayLike = _ROTATION_TOLERANCE,
+    max_iterations: int = MAX_ITERATIONS,
+    translation_tolerance: ArrayLike = TRANSLATION_TOLERANCE,
+    rotation_tolerance: ArrayLike = ROTATION_TOLERANCE,
     robust: AbstractKernel | None = None,
     search: AbstractSearch | None = None,
 ) -> Registration:
@@ -158,8 +158,7 @@ def register(
     Raises:
         ValueError: if an argument does not fit: shapes, dtypes, channel counts, fewer than four finite points.
     """
-    _check_positive("max_distance", max_distance)
-    _check_loop(max_iterations, translation_tolerance, rotation_tolerance)
+    check_settings(method, max_distance, max_iterations, translation_tolerance, rotation_tolerance)
     source, target = _ready("source", source), _ready("target", target)
     method, source_surface, target_surface = _surfaces(source, target, method)
     dtype = source_surface.points.dtype
@@ -192,8 +191,7 @@ def _ready(name: str, cloud: PointCloud | Values) -> PointCloud:
 def _surfaces(
     source: PointCloud, target: PointCloud, method: AbstractMethod
 ) -> tuple[AbstractMethod, Surface, Surface]:
-    if not isinstance(method, AbstractMethod):
-        raise ValueError(f"method: expected one such as MultiChannelGICP(), got {method!r}")
+    _check_method(method)
     for name, cloud in (("source", source), ("target", target)):
         if cloud.points.ndim != 2:
             raise ValueError(
@@ -264,6 +262,24 @@ def _translation_adjoint(offset: Array | np.ndarray) -> Array | np.ndarray:
     x, y, z = offset
     cross = xp.stack([xp.stack([zero, -z, y]), xp.stack([z, zero, -x]), xp.stack([-y, x, zero])])
     return xp.block([[xp.eye(3), cross], [xp.zeros((3, 3)), xp.eye(3)]])
+
+
+def check_settings(
+    method: AbstractMethod,
+    max_distance: ArrayLike,
+    max_iterations: int,
+    translation_tolerance: ArrayLike,
+    rotation_tolerance: ArrayLike,
+) -> None:
+    """Raise `ValueError` for what is wrong with `register`'s arguments whatever the clouds."""
+    _check_method(method)
+    _check_positive("max_distance", max_distance)
+    _check_loop(max_iterations, translation_tolerance, rotation_tolerance)
+
+
+def _check_method(method: AbstractMethod) -> None:
+    if not isinstance(method, AbstractMethod):
+        raise ValueError(f"method: expected one such as MultiChannelGICP(), got {method!r}")
 
 
 def _check_positive(name: str, value: ArrayLike) -> None:

@@ -28,6 +28,10 @@ class Status(enum.IntEnum):
     """The pose came to rest, but the pairs leave at least one direction free; it is where the start had it."""
     NON_FINITE = 4
     """The numbers overflowed or became NaN."""
+    INVALID_INPUT = 5
+    """The pair is one that `register` raises an error for; in a batch only. Its pose is NaN."""
+    LOST = 6
+    """The worker that had the pair died or failed, and another one too; in a batch only. Its pose is NaN."""
 
 
 class Registration(eqx.Module):
@@ -66,6 +70,25 @@ class Registration(eqx.Module):
     source_origin: Float[Array, "*batch 3"] | Float[np.ndarray, "*batch 3"]
     target_origin: Float[Array, "*batch 3"] | Float[np.ndarray, "*batch 3"]
     centred: jaxlie.SE3
+
+    @classmethod
+    def without_pose(cls, status: Status) -> Registration:
+        """What stands for a pair that was not registered: every number that cannot be had is NaN."""
+        nowhere = jaxlie.SE3(jnp.full(7, jnp.nan))
+        nan = np.full((), np.nan)[()]
+        return cls(
+            T_target_source=nowhere,
+            status_code=np.int32(status),
+            num_iterations=np.int32(0),
+            num_inliers=np.int32(0),
+            cost=nan,
+            rmse=nan,
+            information=np.zeros((6, 6)),
+            history={},
+            source_origin=np.zeros(3),
+            target_origin=np.zeros(3),
+            centred=nowhere,
+        )
 
     @property
     def status(self) -> Any:

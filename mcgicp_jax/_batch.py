@@ -1,0 +1,351 @@
+"""Many pairs: each is registered on its own, by threads or by any executor, and none spoils another."""
+
+from __future__ import annotations
+
+import collections
+import itertools
+import os
+import warnings
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import (
+    FIRST_COMPLETED,
+    BrokenExecutor,
+    Executor,
+    Future,
+    ProcessPoolExecutor,
+    ThreadPoolExecutor,
+)
+from concurrent.futures import wait as wait_for
+from dataclasses import dataclass
+from multiprocessing import get_context
+from typing import Any, TypeAlias
+
+import jaxlie
+import numpy as np
+from jax.typing import ArrayLike
+
+from mcgicp_jax._cloud import PointCloud, Values
+from mcgicp_jax._cost import AbstractKernel
+from mcgicp_jax._kdtree import KDTreeSearch
+from mcgicp_jax._methods import AbstractMethod
+from mcgicp_jax._pose import Pose, pose_matrix
+from mcgicp_jax._preprocess import check_preprocessing, preprocess
+from mcgicp_jax._register import MAX_ITERATIONS, ROTATION_TOLERANCE, TRANSLATION_TOLERANCE, check_settings, register
+from mcgicp_jax._result import Registration, Status
+from mcgicp_jax._search import AbstractSearch
+
+Cloud: TypeAlias = "PointCloud | Values | Callable[[], PointCloud | Values]"
+
+# Pairs sent at a time to workers that are not threads, and how many such chunks are under way at most.
+_CHUNK = 8
+_CHUNKS_UNDER_WAY = 64
+
+
+def register_batch(
+    sources: Iterable[Cloud] | Cloud,
+    targets: Iterable[Cloud] | Cloud,
+    method: AbstractMethod,
+    *,
+    init: Iterable[Pose | None] | Pose | None = None,
+    max_distance: ArrayLike,
+    max_iterations: int = MAX_ITERATIONS,
+    translation_tolerance: ArrayLike = TRANSLATION_TOLERANCE,
+    rotation_tolerance: ArrayLike = ROTATION_TOLERANCE,
+    robust: AbstractKernel | None = None,
+    search: AbstractSearch | None = None,
+    voxel_size: float | None = None,
+    num_neighbors: int = 20,
+    executor: Executor | None = None,
+) -> list[Registration]:
+    """Register many pairs of clouds of any sizes: one `Registration` per pair, in their order.
+
+    As `register_as_completed`, which explains the arguments, but waits for all.
+    """
+    completed = register_as_completed(
+        sources,
+        targets,
+        method,
+        init=init,
+        max_distance=max_distance,
+        max_iterations=max_iterations,
+        translation_tolerance=translation_tolerance,
+        rotation_tolerance=rotation_tolerance,
+        robust=robust,
+        search=search,
+        voxel_size=voxel_size,
+        num_neighbors=num_neighbors,
+        executor=executor,
+    )
+    return [result for _, result in sorted(completed, key=lambda item: item[0])]
+
+
+def register_as_completed(
+    sources: Iterable[Cloud] | Cloud,
+    targets: Iterable[Cloud] | Cloud,
+    method: AbstractMethod,
+    *,
+    init: Iterable[Pose | None] | Pose | None = None,
+    max_distance: ArrayLike,
+    max_iterations: int = MAX_ITERATIONS,
+    translation_tolerance: ArrayLike = TRANSLATION_TOLERANCE,
+    rotation_tolerance: ArrayLike = ROTATION_TOLERANCE,
+    robust: AbstractKernel | None = None,
+    search: AbstractSearch | None = None,
+    voxel_size: float | None = None,
+    num_neighbors: int = 20,
+    executor: Executor | None = None,
+) -> Iterator[tuple[int, Registration]]:
+    """Register many pairs of clouds, and hand out each result as soon as it is there.
+
+    Every pair is a registration of its own: its result is the same, bit for bit, whatever the other pairs, their order
+    and the number of workers, and a slow pair holds nobody. What `register` raises as an error of a pair becomes the
+    status `INVALID_INPUT` and a warning. Clouds are taken from iterators only as they are needed.
+
+    Args:
+        sources, targets: iterables of equal length of clouds from `preprocess`, raw clouds or (N, 3) arrays; or one
+            cloud for all pairs on one side. In place of a cloud, a function without arguments that makes it, such as
+            `functools.partial(mcgicp_jax.io.read, path)`: it is called by the worker.
+        method: as in `register`; numbers left open are chosen for each pair from its data.
+        init: T_target_source to start from: one for all, or an iterable of one per pair.
+        max_distance, max_iterations, translation_tolerance, rotation_tolerance, robust: as in `register`.
+        search: how neighbours and matches are found; by default SciPy's k-d tree, one thread per pair.
+        voxel_size, num_neighbors: as in `preprocess`, for raw clouds; the workers prepare them.
+        executor: who does the work: any `concurrent.futures.Executor`, such as a `ProcessPoolExecutor` with the start
+            method "spawn" or Dask's `Client.get_executor()`; by default threads, one per core. A pair whose worker
+            dies is sent once more, and gets the status `LOST` and a warning if that fails too.
+
+    Returns:
+        An iterator of the number of the pair, from 0, and its `Registration`.
+
+    Raises:
+        ValueError: if an argument that concerns all pairs does not fit, or one side has fewer clouds than the other.
+    Warns:
+        UserWarning: for each pair with the status `INVALID_INPUT` or `LOST`, why.
+    """
+    check_settings(method, max_distance, max_iterations, translation_tolerance, rotation_tolerance)
+    check_preprocessing(voxel_size, num_neighbors)
+    _check_executor(executor)
+    job = _Job(
+        method=method,
+        settings={
+            "max_distance": max_distance,
+            "max_iterations": max_iterations,
+            "translation_tolerance": translation_tolerance,
+            "rotation_tolerance": rotation_tolerance,
+            "robust": robust,
+        },
+        search=search or KDTreeSearch(workers=1),
+        voxel_size=voxel_size,
+        num_neighbors=num_neighbors,
+    )
+    return _gather(job, _pairs(job, sources, targets, init), executor)
+
+
+@dataclass(frozen=True)
+class _Pair:
+    index: int
+    source: Cloud
+    target: Cloud
+    init: Pose | None
+
+
+@dataclass(frozen=True)
+class _Job:
+    """What all pairs have in common."""
+
+    method: AbstractMethod
+    settings: dict[str, Any]
+    search: AbstractSearch
+    voxel_size: float | None
+    num_neighbors: int
+
+    def ready(self, name: str, cloud: Cloud) -> PointCloud:
+        """The cloud, prepared if it was not; a `ValueError` names it."""
+        try:
+            if not isinstance(cloud, PointCloud) and callable(cloud):
+                cloud = cloud()
+            if not isinstance(cloud, PointCloud):
+                cloud = PointCloud(cloud)
+            if cloud.neighbors is None:
+                cloud = preprocess(cloud, self.voxel_size, self.num_neighbors, search=self.search)
+        except (ValueError, OSError) as error:
+            raise ValueError(f"{name}: {error}") from error
+        return cloud
+
+    def register(self, pair: _Pair) -> _Outcome:
+        try:
+            source, target = self.ready("source", pair.source), self.ready("target", pair.target)
+            result = register(source, target, self.method, init=pair.init, search=self.search, **self.settings)
+        except ValueError as error:
+            return _Outcome(pair.index, Registration.without_pose(Status.INVALID_INPUT), str(error))
+        return _Outcome(pair.index, result)
+
+
+@dataclass(frozen=True)
+class _Outcome:
+    index: int
+    result: Registration
+    reason: str | None = None
+
+
+def _register_chunk(job: _Job, chunk: list[_Pair]) -> list[_Outcome]:
+    return [job.register(pair) for pair in chunk]
+
+
+def _gather(job: _Job, pairs: Iterator[_Pair], executor: Executor | None) -> Iterator[tuple[int, Registration]]:
+    if executor is None:
+        num_workers = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+        with ThreadPoolExecutor(num_workers, thread_name_prefix="mcgicp") as threads:
+            yield from _dispatch(_Shipping(job, threads), pairs, 1, 2 * num_workers)
+    elif isinstance(executor, ThreadPoolExecutor):
+        yield from _dispatch(_Shipping(job, executor), pairs, 1, _CHUNKS_UNDER_WAY)
+    else:
+        yield from _dispatch(_Shipping(job, executor), pairs, _CHUNK, _CHUNKS_UNDER_WAY)
+
+
+def _dispatch(
+    shipping: _Shipping, pairs: Iterator[_Pair], chunk_size: int, most: int
+) -> Iterator[tuple[int, Registration]]:
+    """Send chunks, `most` of them under way at a time, and hand out what comes back."""
+    try:
+        while chunk := list(itertools.islice(pairs, chunk_size)):
+            shipping.send(chunk)
+            while len(shipping.under_way) >= most:
+                yield from shipping.receive()
+        while shipping.under_way:
+            yield from shipping.receive()
+        yield from shipping.receive_suspects()
+    finally:
+        shipping.stop()
+
+
+class _Shipping:
+    """Chunks on their way through an executor.
+
+    A chunk that fails, mostly because its worker died, is a suspect: it may have killed the worker, or been beside
+    the one that did. Suspects are sent again at the end, pair by pair and each alone, so that only the pair that is to
+    blame is given up.
+    """
+
+    def __init__(self, job: _Job, executor: Executor):
+        self._job = job
+        self._executor = executor
+        self._replacement: Executor | None = None
+        self._suspects: collections.deque[_Pair] = collections.deque()
+        self.under_way: dict[Future[list[_Outcome]], list[_Pair]] = {}
+
+    def send(self, chunk: list[_Pair]) -> None:
+        try:
+            future = self._executor.submit(_register_chunk, self._job, chunk)
+        except BrokenExecutor:
+            # A pool of processes dies with any of them; another takes its place.
+            self._replacement = self._executor = ProcessPoolExecutor(mp_context=get_context("spawn"))
+            future = self._executor.submit(_register_chunk, self._job, chunk)
+        self.under_way[future] = chunk
+
+    def receive(self) -> Iterator[tuple[int, Registration]]:
+        """Wait until something has come back."""
+        done, _ = wait_for(self.under_way, return_when=FIRST_COMPLETED)
+        for future in done:
+            chunk = self.under_way.pop(future)
+            try:
+                outcomes = future.result()
+            except Exception as error:
+                numbers = ", ".join(str(pair.index) for pair in chunk)
+                _warn(f"the worker of the pairs {numbers} failed ({_words(error)}); they are sent again")
+                self._suspects.extend(chunk)
+            else:
+                yield from map(_report, outcomes)
+
+    def receive_suspects(self) -> Iterator[tuple[int, Registration]]:
+        while self._suspects:
+            pair = self._suspects.popleft()
+            self.send([pair])
+            future, _ = self.under_way.popitem()
+            try:
+                outcomes = future.result()
+            except Exception as error:
+                result = Registration.without_pose(Status.LOST)
+                outcomes = [_Outcome(pair.index, result, f"its worker failed twice ({_words(error)})")]
+            yield from map(_report, outcomes)
+
+    def stop(self) -> None:
+        """Take back what has not begun."""
+        for future in self.under_way:
+            future.cancel()
+        if self._replacement is not None:
+            self._replacement.shutdown(cancel_futures=True)
+
+
+def _report(outcome: _Outcome) -> tuple[int, Registration]:
+    if outcome.reason is not None:
+        _warn(f"pair {outcome.index}: {outcome.reason}")
+    return outcome.index, outcome.result
+
+
+def _warn(message: str) -> None:
+    warnings.warn(message, UserWarning, stacklevel=2)
+
+
+def _words(error: BaseException) -> str:
+    return f"{type(error).__name__}: {error}".rstrip(": ")
+
+
+def _pairs(
+    job: _Job,
+    sources: Iterable[Cloud] | Cloud,
+    targets: Iterable[Cloud] | Cloud,
+    init: Iterable[Pose | None] | Pose | None,
+) -> Iterator[_Pair]:
+    """The pairs, made as they are asked for; what concerns all of them is checked at once."""
+    sides: dict[str, Any] = {"sources": sources, "targets": targets, "init": init}
+    one_for_all = {"sources": _is_one_cloud(sources), "targets": _is_one_cloud(targets), "init": _is_one_pose(init)}
+    if one_for_all["sources"] and one_for_all["targets"]:
+        raise ValueError("sources: expected several clouds on one side at least, got one on each; call register")
+    for name in sides:
+        if one_for_all[name]:
+            one = pose_matrix(sides[name]) if name == "init" else job.ready(name, sides[name])
+            sides[name] = itertools.repeat(one)
+        elif isinstance(sides[name], jaxlie.SE3):
+            sides[name] = np.asarray(sides[name].as_matrix())
+        elif not isinstance(sides[name], Iterable):
+            raise ValueError(f"{name}: expected an iterable with one per pair, got {type(sides[name]).__name__}")
+    several = {name: values for name, values in sides.items() if not one_for_all[name]}
+    sizes = {name: len(values) for name, values in several.items() if hasattr(values, "__len__")}
+    if len(set(sizes.values())) > 1:
+        raise ValueError(f"{next(iter(sizes))}: expected one per pair on all sides, got {sizes}")
+    return _zip_pairs(sides, tuple(several))
+
+
+def _zip_pairs(sides: dict[str, Any], several: tuple[str, ...]) -> Iterator[_Pair]:
+    iterators = {name: iter(values) for name, values in sides.items()}
+    end: Any = object()
+    for index in itertools.count():
+        values = {name: next(iterator, end) for name, iterator in iterators.items()}
+        ended = [name for name in several if values[name] is end]
+        if ended:
+            if len(ended) < len(several):
+                raise ValueError(f"{ended[0]}: expected one per pair, got {index}, fewer than on the other side")
+            return
+        yield _Pair(index, values["sources"], values["targets"], values["init"])
+
+
+def _is_one_cloud(given: object) -> bool:
+    if isinstance(given, PointCloud):
+        return True
+    return callable(given) or getattr(given, "ndim", None) == 2
+
+
+def _is_one_pose(given: object) -> bool:
+    if isinstance(given, jaxlie.SE3):
+        return given.wxyz_xyz.ndim == 1
+    return given is None or getattr(given, "ndim", None) == 2
+
+
+def _check_executor(executor: Executor | None) -> None:
+    context = getattr(executor, "_mp_context", None)
+    if isinstance(executor, ProcessPoolExecutor) and context is not None and context.get_start_method() == "fork":
+        raise ValueError(
+            "executor: expected processes that are spawned, got forked ones, in which JAX may hang; "
+            'use ProcessPoolExecutor(mp_context=multiprocessing.get_context("spawn"))'
+        )

@@ -1,0 +1,334 @@
+"""Many pairs: each as if it were alone, whatever the others, their order and the workers."""
+
+import copy
+import multiprocessing
+import os
+import pickle
+import signal
+import threading
+import warnings
+from concurrent.futures import BrokenExecutor, Executor, Future, ProcessPoolExecutor, ThreadPoolExecutor
+from functools import partial
+
+import jax
+import numpy as np
+import pytest
+
+import mcgicp_jax as mcg
+from mcgicp_jax import Status
+from mcgicp_jax.metrics import pose_error
+from tests.scenes import motion, room_corner
+
+METHOD = mcg.MultiChannelGICP(0.05, 0.3)
+# Two size classes, both of other tests.
+SIZES = (300, 310, 500, 290, 480, 305)
+
+
+def raw_pair(size, seed):
+    truth = motion(0.02 * np.random.default_rng(seed).normal(size=6))
+    points, channels = room_corner(size, seed=2 * seed + 1)
+    source = mcg.PointCloud((points - truth[:3, 3]) @ truth[:3, :3], channels)
+    return source, mcg.PointCloud(*room_corner(size + 20, seed=2 * seed + 2)), truth
+
+
+@pytest.fixture(scope="module")
+def raw():
+    return [raw_pair(size, seed) for seed, size in enumerate(SIZES)]
+
+
+def prepared(raw):
+    return [[mcg.preprocess(pair[side]) for pair in raw] for side in (0, 1)]
+
+
+def batch(sources, targets, **settings):
+    return mcg.register_batch(sources, targets, METHOD, max_distance=0.5, **settings)
+
+
+@pytest.fixture(scope="module")
+def alone(raw):
+    """Each pair by `register`."""
+    return [
+        mcg.register(mcg.preprocess(source), mcg.preprocess(target), METHOD, max_distance=0.5)
+        for source, target, _ in raw
+    ]
+
+
+def assert_same(first, second):
+    """Bit for bit, NaN included."""
+    assert len(first) == len(second)
+    for one, other in zip(first, second, strict=True):
+        for a, b in zip(jax.tree.leaves(one), jax.tree.leaves(other), strict=True):
+            np.testing.assert_array_equal(np.asarray(a), np.asarray(b))
+
+
+def test_each_pair_is_as_if_it_were_alone(raw, alone):
+    results = batch(*prepared(raw))
+    assert_same(results, alone)
+    for result, (_, _, truth) in zip(results, raw, strict=True):
+        assert max(pose_error(result.matrix, truth)) < 0.02
+    # Matches of one of them circle.
+    assert sum(result.converged for result in results) >= 5
+
+
+def test_raw_clouds_are_prepared_by_the_workers(raw):
+    results = batch([pair[0] for pair in raw], [pair[1] for pair in raw], voxel_size=0.1, num_neighbors=12)
+    expected = [
+        mcg.register(*(mcg.preprocess(cloud, 0.1, 12) for cloud in pair[:2]), METHOD, max_distance=0.5) for pair in raw
+    ]
+    assert_same(results, expected)
+
+
+@pytest.mark.parametrize("num_workers", [1, 2, 5])
+def test_order_and_number_of_workers_change_nothing(raw, alone, num_workers):
+    order = np.random.default_rng(num_workers).permutation(len(raw))
+    sources, targets = prepared(raw)
+    with ThreadPoolExecutor(num_workers) as threads:
+        results = batch([sources[i] for i in order], [targets[i] for i in order], executor=threads)
+    assert_same(results, [alone[i] for i in order])
+
+
+SPOILED = {
+    "empty": np.zeros((0, 3)),
+    "one point": np.zeros((1, 3)),
+    "too few": np.eye(3),
+    "not a number": np.full((50, 3), np.nan),
+    "no cloud": np.zeros((50, 2)),
+    "no channels": np.random.default_rng(0).random((300, 3)),
+}
+
+
+@pytest.mark.parametrize("what", SPOILED)
+@pytest.mark.parametrize("side", ["source", "target"])
+def test_a_bad_pair_has_its_status_and_spoils_no_other(raw, alone, what, side):
+    clouds = dict(zip(("source", "target"), prepared(raw), strict=True))
+    clouds[side][2] = SPOILED[what]
+    with pytest.warns(UserWarning, match=r"pair 2: (source|target|channels)"):
+        results = batch(*clouds.values())
+    assert results[2].status is Status.INVALID_INPUT and not results[2].converged
+    assert np.isnan(results[2].matrix).any() and "INVALID_INPUT" in repr(results[2])
+    del results[2]
+    assert_same(results, alone[:2] + alone[3:])
+
+
+def test_pairs_without_overlap_or_far_from_rest_have_the_status_of_register(raw, alone):
+    sources, targets = prepared(raw)
+    starts = [None] * len(raw)
+    starts[1] = motion((100.0, 0, 0, 0, 0, 0))
+    results = batch(sources, targets, init=starts)
+    assert results[1].status is Status.TOO_FEW_CORRESPONDENCES
+    del results[1]
+    assert_same(results, alone[:1] + alone[2:])
+    assert {result.status for result in batch(sources, targets, max_iterations=1)} == {Status.MAX_ITERATIONS}
+
+
+def test_a_start_that_is_no_rigid_motion_is_the_pairs_own_affair(raw, alone):
+    starts = [np.eye(4)] * len(raw)
+    starts[0] = 2 * np.eye(4)
+    with pytest.warns(UserWarning, match=r"pair 0: init: expected a rigid motion"):
+        results = batch(*prepared(raw), init=starts)
+    assert results[0].status is Status.INVALID_INPUT
+    assert_same(results[1:], alone[1:])
+
+
+def test_one_target_for_all(raw):
+    sources, targets = prepared(raw)
+    expected = [mcg.register(source, targets[0], METHOD, max_distance=0.5) for source in sources]
+    assert_same(batch(sources, targets[0]), expected)
+    assert_same(batch(sources, raw[0][1]), expected)
+    backward = [mcg.register(targets[0], source, METHOD, max_distance=0.5) for source in sources]
+    assert_same(batch(targets[0], sources), backward)
+
+
+def test_starts_for_all_or_for_each(raw):
+    sources, targets = prepared(raw)
+    starts = np.stack([motion(0.01 * np.arange(6) * i) for i in range(len(raw))])
+    expected = [
+        mcg.register(source, target, METHOD, init=start, max_distance=0.5)
+        for source, target, start in zip(sources, targets, starts, strict=True)
+    ]
+    assert_same(batch(sources, targets, init=starts), expected)
+    assert_same(batch(sources, targets, init=iter(starts)), expected)
+    one = batch(sources, targets, init=starts[1])
+    assert_same(one[1:2], expected[1:2])
+    assert_same(one[:1], [mcg.register(sources[0], targets[0], METHOD, init=starts[1], max_distance=0.5)])
+
+
+def test_iterators_are_consumed_as_needed(raw):
+    """Never many more pairs are held than there are workers."""
+    sources, targets = prepared(raw)
+    taken, most = 0, 0
+
+    def clouds():
+        nonlocal taken
+        for _ in range(60):
+            taken += 1
+            yield sources[0]
+
+    for finished, _ in enumerate(
+        mcg.register_as_completed(clouds(), targets[0], mcg.PointToPoint(), max_distance=0.5, max_iterations=1)
+    ):
+        most = max(most, taken - finished)
+    assert taken == 60
+    assert most <= 4 * os.cpu_count() + 4
+
+
+def test_functions_that_make_clouds_are_called_by_the_workers(raw, alone):
+    threads = []
+
+    def make(cloud):
+        threads.append(threading.current_thread())
+        return cloud
+
+    def missing():
+        raise FileNotFoundError(2, "No such file", "scan.ply")
+
+    sources = [partial(make, pair[0]) for pair in raw]
+    sources[1] = missing
+    with pytest.warns(UserWarning, match=r"pair 1: source: .*scan\.ply"):
+        results = batch(sources, [pair[1] for pair in raw])
+    assert results[1].status is Status.INVALID_INPUT
+    assert threading.main_thread() not in threads and len(threads) == len(raw) - 1
+    assert_same(results[2:], alone[2:])
+
+
+def test_results_come_as_they_finish(raw):
+    sources, targets = prepared(raw)
+    gate = threading.Event()
+
+    def slow():
+        gate.wait(60)
+        return sources[0]
+
+    numbers = []
+    for number, result in mcg.register_as_completed([slow, *sources[1:3]], targets[:3], METHOD, max_distance=0.5):
+        numbers.append(number)
+        gate.set()
+        assert result.num_inliers > 250
+    assert sorted(numbers) == [0, 1, 2] and numbers[0] != 0
+
+
+@pytest.mark.parametrize(
+    ("settings", "name"),
+    [
+        ({"max_distance": -1.0}, "max_distance"),
+        ({"translation_tolerance": -1.0}, "translation_tolerance"),
+        ({"max_iterations": 0}, "max_iterations"),
+        ({"voxel_size": 0.0}, "voxel_size"),
+        ({"num_neighbors": 2}, "num_neighbors"),
+        ({"init": 2 * np.eye(4)}, "init"),
+    ],
+)
+def test_what_concerns_all_pairs_is_raised_at_once(raw, settings, name):
+    sources, targets = prepared(raw)
+    with pytest.raises(ValueError, match=name):
+        mcg.register_as_completed(sources, targets, METHOD, **{"max_distance": 0.5} | settings)
+
+
+def test_sides_that_do_not_fit(raw):
+    sources, targets = prepared(raw)
+    with pytest.raises(ValueError, match=r"sources: expected one per pair.*'targets': 2"):
+        batch(sources, targets[:2])
+    with pytest.raises(ValueError, match=r"targets: expected one per pair, got 2"):
+        batch(iter(sources), iter(targets[:2]))
+    with pytest.raises(ValueError, match="sources: expected several"):
+        batch(sources[0], targets[0])
+    with pytest.raises(ValueError, match=r"targets: .*expected at least 4 finite points"):
+        batch(sources, np.eye(3))
+    assert batch([], []) == []
+
+
+class Unlucky(Executor):
+    """Whose worker dies with some of the pairs, always or at first."""
+
+    def __init__(self, deadly, times, at_submit=False):
+        self.deadly, self.times, self.sent = deadly, times, []
+
+    def submit(self, function, job, chunk):
+        future = Future()
+        numbers = [pair.index for pair in chunk]
+        self.sent.append(numbers)
+        if self.deadly in numbers and self.times > 0:
+            self.times -= 1
+            future.set_exception(BrokenExecutor("a worker died"))
+        else:
+            future.set_result(function(job, chunk))
+        return future
+
+
+def test_a_worker_that_dies_costs_a_retry(raw, alone):
+    executor = Unlucky(deadly=2, times=1)
+    with pytest.warns(UserWarning, match=r"pairs 0, 1, 2, 3, 4, 5 failed \(BrokenExecutor: a worker died\)"):
+        results = batch(*prepared(raw), executor=executor)
+    assert_same(results, alone)
+    assert executor.sent == [[0, 1, 2, 3, 4, 5], [0], [1], [2], [3], [4], [5]]
+
+
+def test_a_pair_that_kills_its_workers_is_given_up_alone(raw, alone):
+    with pytest.warns(UserWarning, match="pair 2: its worker failed twice"), warnings.catch_warnings():
+        warnings.filterwarnings("ignore", "the worker of the pairs")
+        results = batch(*prepared(raw), executor=Unlucky(deadly=2, times=9))
+    assert results[2].status is Status.LOST
+    del results[2]
+    assert_same(results, alone[:2] + alone[3:])
+
+
+def die(marker):
+    """The first process that comes here is gone."""
+    try:
+        marker.touch(exist_ok=False)
+    except FileExistsError:
+        return mcg.PointCloud(*room_corner(300, seed=1))
+    os.kill(os.getpid(), signal.SIGKILL)
+
+
+@pytest.mark.slow
+def test_spawned_processes_and_one_that_is_killed(raw, alone, tmp_path):
+    sources, targets = prepared(raw)
+    context = multiprocessing.get_context("spawn")
+    with ProcessPoolExecutor(1, mp_context=context) as processes:
+        assert_same(batch(sources, targets, executor=processes), alone)
+        with pytest.warns(UserWarning, match="BrokenProcessPool"):
+            results = batch([partial(die, tmp_path / "marker"), *sources], [targets[0], *targets], executor=processes)
+    assert results[0].converged
+    assert_same(results[1:], alone)
+
+
+def test_forked_processes_are_refused(raw):
+    with (
+        ProcessPoolExecutor(1, mp_context=multiprocessing.get_context("fork")) as processes,
+        pytest.raises(ValueError, match="spawn"),
+    ):
+        batch(*prepared(raw), executor=processes)
+
+
+@pytest.mark.slow
+def test_a_cluster_that_loses_a_worker(raw, alone):
+    """Processes of Dask's, one of which is killed while it works."""
+    distributed = pytest.importorskip("distributed")
+    sources, targets = prepared(raw)
+    repeats = 12
+    with (
+        distributed.LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address=None) as cluster,
+        distributed.Client(cluster) as client,
+    ):
+        numbers = []
+        completed = mcg.register_as_completed(
+            sources * repeats, targets * repeats, METHOD, max_distance=0.5, executor=client.get_executor()
+        )
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            for number, result in completed:
+                if not numbers:
+                    os.kill(next(iter(client.run(os.getpid).values())), signal.SIGKILL)
+                numbers.append(number)
+                assert_same([result], [alone[number % len(raw)]])
+    assert sorted(numbers) == list(range(repeats * len(raw)))
+
+
+def test_everything_survives_pickle_and_deepcopy(raw, alone):
+    cloud = mcg.preprocess(raw[0][0])
+    for thing in (cloud, raw[0][0], METHOD, alone[0], mcg.KDTreeSearch(1), mcg.Huber(1.0)):
+        for twin in (pickle.loads(pickle.dumps(thing)), copy.deepcopy(thing)):
+            assert type(twin) is type(thing)
+            assert_same([twin], [thing])
+            assert repr(twin) == repr(thing)
