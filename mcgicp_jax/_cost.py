@@ -11,13 +11,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.typing import ArrayLike
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Int
 
 from mcgicp_jax import _covariance as cov
 from mcgicp_jax._cloud import PointCloud
 from mcgicp_jax._methods import AbstractGeneralized, AbstractMethod, Numbers, Surface, prepare
 from mcgicp_jax._pose import Pose, is_concrete, pose_matrix
-from mcgicp_jax._search import Correspondences
+from mcgicp_jax._search import Correspondences, Rows
 
 
 class AbstractKernel(Numbers):
@@ -143,6 +143,7 @@ def evaluate_pairs(
             covariance=jnp.tile(source.covariance, (1, times)),
             descriptors=jnp.tile(source.descriptors, (times, 1)),
             valid=jnp.tile(source.valid, times),
+            absence=None if source.absence is None else jnp.tile(source.absence, (times, 1)),
         )
     indices, valid = candidates.reshape(-1), matches.valid.reshape(-1)
     moved = move_points(rotation, translation, source)
@@ -153,8 +154,7 @@ def evaluate_pairs(
     weight, cost = (jnp.ones_like(square), square) if robust is None else (robust.weight(square), robust.rho(square))
     share = valid.astype(square.dtype)
     if temperature is not None:
-        apart = source.descriptors - target.descriptors[indices]
-        far = jnp.sum(residual * residual, axis=0) + jnp.sum(apart * apart, axis=1)
+        far = jnp.sum(residual * residual, axis=0) + _square_apart(source.rows, target.rows, indices)
         share = _softmax(-0.5 * far / temperature**2, valid, candidates.shape)
     return Pairs(
         moved=moved,
@@ -165,6 +165,15 @@ def evaluate_pairs(
         cost=share * cost,
         share=share,
     )
+
+
+def _square_apart(source: Rows, target: Rows, indices: Int[Array, "N"]) -> Float[Array, "N"]:
+    """Squared distance of the pairs in their descriptors, metres²."""
+    square = (source.descriptors - target.descriptors[indices]) ** 2
+    for absence in (source.absence, None if target.absence is None else target.absence[indices]):
+        if absence is not None:
+            square = jnp.where(absence > 0, absence, square)
+    return jnp.sum(square, axis=1)
 
 
 def _softmax(logits: Float[Array, "N"], valid: Bool[Array, "N"], shape: tuple[int, ...]) -> Float[Array, "N"]:

@@ -238,9 +238,78 @@ def plane_covariance(
     return identity - jnp.where(spread, (1 - epsilon) * outer(normal), 0)
 
 
+def channel_kernel(whitened: Float[Array, "N C"], neighbors: Int[Array, "N k"]) -> Float[Array, "k N"]:
+    """How alike each neighbour and its point look: exp(−½ |Δ|²) (Servos & Waslander 2014, eq. 7).
+
+    Args:
+        whitened: channels divided by the Cholesky factor of Λ.
+    """
+    rows = jnp.where(neighbors.T >= 0, neighbors.T, 0)
+    square = jnp.zeros(rows.shape, whitened.dtype)
+    for channel in whitened.T:
+        difference = channel[rows] - channel[None, :]
+        square = square + difference * difference
+    return jnp.exp(-0.5 * square)
+
+
+def partial_channel_kernel(
+    channels: Float[Array, "N C"],
+    channel_valid: Bool[Array, "N C"],
+    covariance: Float[Array, "..."],
+    neighbors: Int[Array, "N k"],
+) -> Float[Array, "k N"]:
+    """The kernel of eq. 7 where points lack channels: over those that both have, with the marginal of Λ on them.
+
+    A channel that a neighbour lacks counts as it does, on average, with the neighbours that have it. A factor of 1
+    would say that the neighbour looks the same, and draw Ω out across the border of a camera's view; leaving the
+    neighbour out would cut Ω off there. Measured at such borders, drawn through scans whose channels were all known,
+    this choice leaves Ω the least biased.
+
+    Args:
+        covariance: Λ, scalar or (C,) or (C, C), channel units².
+    """
+    rows = jnp.where(neighbors.T >= 0, neighbors.T, 0)
+    # The point itself says nothing about how alike its neighbours look.
+    others = (neighbors.T >= 0) & (jnp.arange(neighbors.shape[0]) != neighbors.T)
+    common = [valid[rows] & valid for valid in channel_valid.T]
+    differences = [
+        jnp.where(both, channel[rows] - channel, 0) for channel, both in zip(channels.T, common, strict=True)
+    ]
+    count = len(common)
+    matrix = covariance if covariance.ndim == 2 else jnp.diag(jnp.broadcast_to(covariance, (count,)))
+    squares = [difference * difference / matrix[i, i] for i, difference in enumerate(differences)]
+    kernel = jnp.exp(-0.5 * (_marginal_square(differences, common, matrix) if covariance.ndim == 2 else sum(squares)))
+    for square, both in zip(squares, common, strict=True):
+        known = both & others
+        number = jnp.sum(known, axis=0)
+        average = jnp.sum(jnp.where(known, jnp.exp(-0.5 * square), 0), axis=0) / jnp.maximum(number, 1)
+        kernel = kernel * jnp.where(both, 1, jnp.where(number > 0, average, 1))
+    return kernel
+
+
+def _marginal_square(
+    differences: list[Float[Array, "k N"]], common: list[Bool[Array, "k N"]], covariance: Float[Array, "C C"]
+) -> Float[Array, "k N"]:
+    """Δᵀ Λ⁻¹ Δ over the common channels: rows and columns of the others are those of the identity, and their Δ is 0.
+
+    By Cholesky's recurrence, written out over the channels.
+    """
+    root: list[list[Array]] = []
+    solution: list[Array] = []
+    for i, both in enumerate(common):
+        row: list[Array] = []
+        for j in range(i):
+            entry = jnp.where(both & common[j], covariance[i, j], 0)
+            row.append((entry - sum(a * b for a, b in zip(row, root[j], strict=False))) / root[j][j])
+        pivot = jnp.sqrt(jnp.where(both, covariance[i, i], 1) - sum(a * a for a in row))
+        solution.append((differences[i] - sum(a * y for a, y in zip(row, solution, strict=True))) / pivot)
+        root.append([*row, pivot])
+    return sum((y * y for y in solution), start=jnp.zeros_like(differences[0]))
+
+
 def multichannel_covariance(
     points: Float[Array, "3 N"],
-    whitened: Float[Array, "N C"],
+    kernel: Float[Array, "k N"],
     neighbors: Int[Array, "N k"],
     epsilon: Float[Array, ""],
     min_eigenvalue: Float[Array, ""],
@@ -248,7 +317,7 @@ def multichannel_covariance(
     """Ω in the tangent plane and ε across it (Servos & Waslander 2014, eqs. 6-10).
 
     Args:
-        whitened: channels divided by the Cholesky factor of Λ, so that the kernel of eq. 7 is exp(−½ |Δ|²).
+        kernel: λ_j of each neighbour.
         min_eigenvalue: floor for the eigenvalues of Ω, which reach 0 where only the point itself looks like it.
 
     Ω = Σ_w^{-1/2} Σ_t Σ_w^{-1/2} is written as I + Σ_w^{-1/2} (Σ_t − Σ_w) Σ_w^{-1/2}: uniform channels then give
@@ -256,14 +325,7 @@ def multichannel_covariance(
     """
     offsets, present = gather(points, neighbors)
     local = weighted_covariance(offsets, present.astype(points.dtype))
-    if whitened.shape[1] == 0:
-        return plane_covariance(local, smallest_eigenvector(local), epsilon)
-    rows = jnp.where(neighbors.T >= 0, neighbors.T, 0)
-    square = jnp.zeros(rows.shape, points.dtype)
-    for channel in whitened.T:
-        difference = channel[rows] - channel[None, :]
-        square = square + difference * difference
-    alike = weighted_covariance(offsets, jnp.where(present, jnp.exp(-0.5 * square), 0))
+    alike = weighted_covariance(offsets, jnp.where(present, kernel, 0))
 
     normal = smallest_eigenvector(local)
     u, v = orthonormal_basis(normal)

@@ -63,7 +63,7 @@ class KDTreeSearch(AbstractSearch):
 
 
 class KDTreeIndex(AbstractIndex):
-    """A tree of the finite rows.
+    """A tree of the finite rows; where rows lack channels, one for each set of channels that pairs have in common.
 
     Args:
         target: NumPy's arrays.
@@ -71,11 +71,14 @@ class KDTreeIndex(AbstractIndex):
     """
 
     def __init__(self, target: Rows, workers: int):
-        rows = np.hstack([target.points.T, target.descriptors])
+        points = np.hstack([target.points.T, target.descriptors])
         # The tree refuses what is not finite; the measurement at the pose will say NON_FINITE.
-        self._rows = np.flatnonzero(target.valid & np.isfinite(rows).all(axis=1)).astype(np.int32)
-        self._tree = _tree(rows[self._rows]) if self._rows.size else None
+        self._rows = np.flatnonzero(target.valid & np.isfinite(points).all(axis=1)).astype(np.int32)
+        self._points = points[self._rows]
+        self._absence = None if target.absence is None else target.absence[self._rows]
         self._workers = workers
+        # Trees are built when first asked for. Threads that ask at the same time build the same.
+        self._parts: dict[bytes, list[_Part]] = {}
 
     @property
     def num_rows(self) -> int:
@@ -87,7 +90,7 @@ class KDTreeIndex(AbstractIndex):
         source = _on_host(source)
         indices = np.full((num_candidates, source.valid.size), -1, np.int32)
         pose = np.asarray(pose, np.float64)
-        if self._tree is None or not np.isfinite(pose).all():
+        if not self._rows.size or not np.isfinite(pose).all():
             return indices
         with np.errstate(invalid="ignore"):
             moved = source.points.T @ rotation_from_quaternion(pose[:4]).T + pose[4:]
@@ -96,9 +99,63 @@ class KDTreeIndex(AbstractIndex):
         # With descriptors, the nearest may lie beyond the gate while a pair within it is further in all dimensions:
         # then the whole space is searched. The margin covers rounding; the gate itself is applied to the position.
         bound = np.inf if source.descriptors.shape[1] else 1.001 * float(np.asarray(max_distance))
-        found = _nearest(self._tree, queries[active], num_candidates, self._workers, bound).T
-        indices[: len(found), active] = np.append(self._rows, -1)[found]
+        if source.absence is None:
+            patterns, which = np.zeros((1, source.descriptors.shape[1])), np.zeros(active.size, int)
+        else:
+            # Few, since a sensor sees a point or does not.
+            patterns, which = np.unique(source.absence[active], axis=0, return_inverse=True)
+        for i, absence in enumerate(patterns):
+            alike = which.ravel() == i
+            found = self._nearest(queries[active[alike]], absence, num_candidates, bound)
+            indices[: found.shape[1], active[alike]] = found.T
         return indices
+
+    def _nearest(
+        self, queries: Float[np.ndarray, "N D"], absence: Float[np.ndarray, "C"], k: int, bound: float
+    ) -> Int[np.ndarray, "N m"]:
+        """Rows of the target, −1 for none, for queries that lack the same channels."""
+        parts = self._parts_for(absence)
+        found = [part.nearest(queries, k, self._workers, bound) for part in parts]
+        rows = np.hstack([np.append(part.rows, -1)[each] for part, each in zip(parts, found, strict=True)])
+        if len(parts) == 1:
+            return rows
+        squares = np.hstack([part.squares(queries, each) for part, each in zip(parts, found, strict=True)])
+        return np.take_along_axis(rows, np.lexsort((rows, squares), axis=1)[:, :k], axis=1)
+
+    def _parts_for(self, absence: Float[np.ndarray, "C"]) -> list[_Part]:
+        key = absence.tobytes()
+        if key not in self._parts:
+            if self._absence is None:
+                self._parts[key] = [_Part(self._points, self._rows, absence)]
+            else:
+                patterns, which = np.unique(np.maximum(self._absence, absence), axis=0, return_inverse=True)
+                groups = [which.ravel() == i for i in range(len(patterns))]
+                self._parts[key] = [
+                    _Part(self._points[group], self._rows[group], pattern)
+                    for group, pattern in zip(groups, patterns, strict=True)
+                ]
+        return self._parts[key]
+
+
+class _Part:
+    """A tree of target rows that all have the same channels in common with a query."""
+
+    def __init__(self, points: Float[np.ndarray, "M D"], rows: Int[np.ndarray, "M"], absence: Float[np.ndarray, "C"]):
+        common = np.concatenate([np.ones(3, bool), absence == 0])
+        self.rows = rows
+        self._columns = slice(None) if common.all() else np.flatnonzero(common)
+        self._points = points[:, self._columns]
+        self._missing = absence.sum()
+        self._tree = _tree(self._points)
+
+    def nearest(self, queries: Float[np.ndarray, "N D"], k: int, workers: int, bound: float) -> Int[np.ndarray, "N m"]:
+        """Numbers of this part's rows, nearest first, no more than there are; the number of rows beyond the bound."""
+        return _nearest(self._tree, queries[:, self._columns], k, workers, bound)
+
+    def squares(self, queries: Float[np.ndarray, "N D"], found: Int[np.ndarray, "N m"]) -> Float[np.ndarray, "N m"]:
+        """Squared distances to rows of this part, with what the channels count that are not in common; metres²."""
+        difference = queries[:, None, self._columns] - self._points[found]
+        return np.sum(difference * difference, axis=2) + self._missing
 
 
 class _IndexCache:

@@ -29,17 +29,19 @@ class Surface(eqx.Module):
         descriptors: (N, D), channels in metres (α · channel), searched along with the position; D is 0 where a method
             matches by position alone.
         valid: (N,).
+        absence: (N, D), as in `Rows`; None if no point lacks a channel.
     """
 
     points: Float[Array, "3 N"]
     covariance: Float[Array, "6 N"]
     descriptors: Float[Array, "N D"]
     valid: Bool[Array, "N"]
+    absence: Float[Array, "N D"] | None = None
 
     @property
     def rows(self) -> Rows:
         """What a search needs to know."""
-        return Rows(points=self.points, descriptors=self.descriptors, valid=self.valid)
+        return Rows(points=self.points, descriptors=self.descriptors, valid=self.valid, absence=self.absence)
 
 
 class Numbers(eqx.Module):
@@ -79,6 +81,10 @@ class AbstractMethod(Numbers):
         """Channels as metres, to be searched along with the position."""
         return jnp.zeros((cloud.points.shape[0], 0), cloud.points.dtype)
 
+    def absence(self, cloud: PointCloud) -> Float[Array, "N D"] | None:
+        """What the channels that points lack add to squared distances in the search, as in `Rows`."""
+        return None
+
 
 class AbstractOneSided(AbstractMethod):
     """Methods whose weight matrix M is known from the target alone."""
@@ -112,21 +118,40 @@ class ColorICP(AbstractOneSided):
 
     Attributes:
         channel_weights: α, scalar or (C,), metres per channel unit.
+        missing_variance: (C,), channel units²: what the search takes a channel to differ by, squared, where one point
+            of a pair lacks it. None: from the data if points do, see `resolve`.
     """
 
     uses_channels: ClassVar[bool] = True
 
     channel_weights: Float[Array, "..."]
+    missing_variance: Float[Array, "..."] | None
 
     def __init__(self, channel_weights: Values):
         """Raises `ValueError` if a weight is negative or not finite."""
         self.channel_weights = _weights(channel_weights)
+        self.missing_variance = None
+
+    def resolve(self, source: PointCloud, target: PointCloud) -> ColorICP:
+        """Where points lack channels: the variance of a difference between two measurements of one spot, the Λ that
+        `MultiChannelGICP` chooses. Constant to autodiff."""
+        if self.missing_variance is not None or (source.channel_valid is None and target.channel_valid is None):
+            return self
+        variance = MultiChannelGICP(channel_weights=0.0).resolve(source, target).channel_covariance
+        return eqx.tree_at(lambda method: method.missing_variance, self, variance, is_leaf=lambda leaf: leaf is None)
 
     def covariance(self, cloud: PointCloud) -> Float[Array, "6 N"]:
         return _identity(cloud)
 
     def descriptors(self, cloud: PointCloud) -> Float[Array, "N D"]:
         return _weighted_channels(cloud, self.channel_weights)
+
+    def absence(self, cloud: PointCloud) -> Float[Array, "N D"] | None:
+        if cloud.channel_valid is None:
+            return None
+        if self.missing_variance is None:
+            raise ValueError("missing_variance: not chosen yet; call method.resolve(source, target) first")
+        return _absence(cloud, self.channel_weights, self.missing_variance)
 
 
 class AbstractGeneralized(AbstractMethod):
@@ -226,18 +251,30 @@ class MultiChannelGICP(AbstractGeneralized):
         points = jnp.asarray(cloud.points)
         if self.channel_covariance is None:
             raise ValueError("channel_covariance: not chosen yet; call method.resolve(source, target) first")
+        neighbors, epsilon = _neighbors(cloud), self.epsilon.astype(points.dtype)
+        channels, covariance = jnp.asarray(cloud.channels), self.channel_covariance.astype(points.dtype)
+        _check_covariance_fits(covariance, channels.shape[-1])
+        if channels.shape[-1] == 0:
+            return GICP(self.epsilon).covariance(cloud)
+        if cloud.channel_valid is None:
+            kernel = cov.channel_kernel(_whiten(channels, covariance), neighbors)
+        else:
+            kernel = cov.partial_channel_kernel(channels, jnp.asarray(cloud.channel_valid), covariance, neighbors)
         return cov.multichannel_covariance(
-            points.T,
-            _whiten(jnp.asarray(cloud.channels), self.channel_covariance),
-            _neighbors(cloud),
-            self.epsilon.astype(points.dtype),
-            self.min_eigenvalue.astype(points.dtype),
+            points.T, kernel, neighbors, epsilon, self.min_eigenvalue.astype(points.dtype)
         )
 
     def descriptors(self, cloud: PointCloud) -> Float[Array, "N D"]:
         if self.channel_weights is None:
             raise ValueError("channel_weights: not chosen yet; call method.resolve(source, target) first")
         return _weighted_channels(cloud, self.channel_weights)
+
+    def absence(self, cloud: PointCloud) -> Float[Array, "N D"] | None:
+        if cloud.channel_valid is None:
+            return None
+        if self.channel_covariance is None or self.channel_weights is None:
+            raise ValueError("channel_covariance: not chosen yet; call method.resolve(source, target) first")
+        return _absence(cloud, self.channel_weights, self.channel_covariance)
 
 
 @jax.jit
@@ -249,6 +286,7 @@ def prepare(method: AbstractMethod, cloud: PointCloud) -> Surface:
         covariance=method.covariance(cloud),
         descriptors=method.descriptors(cloud),
         valid=jnp.asarray(cloud.valid),
+        absence=method.absence(cloud),
     )
 
 
@@ -277,19 +315,28 @@ def _weighted_channels(cloud: PointCloud, weights: Float[Array, "..."]) -> Float
     return jnp.asarray(cloud.channels) * weights.astype(cloud.channels.dtype)
 
 
+def _absence(cloud: PointCloud, weights: Float[Array, "..."], covariance: Float[Array, "..."]) -> Float[Array, "N C"]:
+    """α² Λ_cc where a point lacks channel c, the expected square of the difference of a true match: a pair is then
+    neither nearer nor further for what is not known of it."""
+    variances = jnp.diagonal(covariance) if covariance.ndim == 2 else covariance
+    expected = (weights**2 * variances).astype(cloud.channels.dtype)
+    return jnp.where(jnp.asarray(cloud.channel_valid), 0, expected)
+
+
+def _check_covariance_fits(covariance: Float[Array, "..."], count: int) -> None:
+    if covariance.shape not in ((), (count,), (count, count)):
+        raise ValueError(
+            f"channel_covariance: expected a scalar, shape ({count},) or ({count}, {count}), for clouds of {count} "
+            f"channels, got {covariance.shape}"
+        )
+
+
 def _whiten(channels: Float[Array, "N C"], covariance: Float[Array, "..."]) -> Float[Array, "N C"]:
     """Channels in which Λ is the identity."""
-    count = channels.shape[-1]
-    covariance = covariance.astype(channels.dtype)
-    if covariance.shape in ((), (count,)):
+    if covariance.ndim < 2:
         return channels / jnp.sqrt(covariance)
-    if covariance.shape == (count, count):
-        factor = jnp.linalg.cholesky(covariance)
-        return jax.scipy.linalg.solve_triangular(factor, channels.T, lower=True).T
-    raise ValueError(
-        f"channel_covariance: expected a scalar, shape ({count},) or ({count}, {count}), for clouds of {count} "
-        f"channels, got {covariance.shape}"
-    )
+    factor = jnp.linalg.cholesky(covariance)
+    return jax.scipy.linalg.solve_triangular(factor, channels.T, lower=True).T
 
 
 @jax.jit
@@ -298,6 +345,8 @@ def _channel_noise(source: PointCloud, target: PointCloud) -> tuple[Float[Array,
     residuals, values = [], []
     for cloud in (source, target):
         valid = jnp.asarray(cloud.valid)[:, None]
+        if cloud.channel_valid is not None:
+            valid = valid & jnp.asarray(cloud.channel_valid)
         residuals.append(jnp.where(valid, _fit_residual(cloud), jnp.nan))
         values.append(jnp.where(valid, jnp.asarray(cloud.channels), jnp.nan))
     sigma = jnp.nanmedian(jnp.concatenate(residuals), axis=0)
@@ -305,34 +354,43 @@ def _channel_noise(source: PointCloud, target: PointCloud) -> tuple[Float[Array,
     spread = jnp.nanstd(everything, axis=0)
     constant = ~(spread > 1e3 * jnp.finfo(spread.dtype).eps * jnp.nanmax(jnp.abs(everything), axis=0, initial=0))
     # Rendered channels have no noise; a thousandth of their spread keeps Λ and α finite.
-    return jnp.where(constant, 1, jnp.maximum(sigma, 1e-3 * spread)), constant
+    return jnp.where(constant, 1, jnp.fmax(sigma, 1e-3 * spread)), constant
 
 
 def _fit_residual(cloud: PointCloud) -> Float[Array, "N C"]:
     """Standard deviation of each channel about its linear fit over each neighbourhood's tangent plane."""
     points, neighbors = jnp.asarray(cloud.points).T, _neighbors(cloud)
     offsets, present = cov.gather(points, neighbors)
-    weights = present.astype(points.dtype)
-    count = jnp.maximum(jnp.sum(weights, axis=0), 1)
-    u, v = cov.orthonormal_basis(cov.smallest_eigenvector(cov.weighted_covariance(offsets, weights)))
+    basis = cov.orthonormal_basis(
+        cov.smallest_eigenvector(cov.weighted_covariance(offsets, present.astype(points.dtype)))
+    )
+    x, y = (sum(offset * b for offset, b in zip(offsets, axis, strict=True)) for axis in basis)
     rows = jnp.where(present, neighbors.T, 0)
+    residuals = []
+    for i, channel in enumerate(jnp.asarray(cloud.channels).T):
+        known = present if cloud.channel_valid is None else present & jnp.asarray(cloud.channel_valid)[:, i][rows]
+        residuals.append(_residual_of_line(x, y, channel[rows], known.astype(x.dtype)))
+    return jnp.stack(residuals, axis=-1) if residuals else jnp.zeros((points.shape[1], 0), points.dtype)
+
+
+def _residual_of_line(
+    x: Float[Array, "k N"], y: Float[Array, "k N"], values: Float[Array, "k N"], weights: Float[Array, "k N"]
+) -> Float[Array, "N"]:
+    """Standard deviation of values about their fit a + b x + c y; NaN where there are too few."""
+    count = jnp.sum(weights, axis=0)
 
     def centred(values: Float[Array, "k N"]) -> Float[Array, "k N"]:
-        return weights * (values - jnp.sum(weights * values, axis=0) / count)
+        return weights * (values - jnp.sum(weights * values, axis=0) / jnp.maximum(count, 1))
 
-    x, y = (centred(sum(offset * b for offset, b in zip(offsets, basis, strict=True))) for basis in (u, v))
+    x, y, values = centred(x), centred(y), centred(values)
     xx, xy, yy = jnp.sum(x * x, axis=0), jnp.sum(x * y, axis=0), jnp.sum(y * y, axis=0)
     determinant = xx * yy - xy * xy
     planar = determinant > 1e-6 * (xx + yy) ** 2
     safe = jnp.where(planar, determinant, 1)
-    residuals = []
-    for channel in jnp.asarray(cloud.channels).T:
-        values = centred(channel[rows])
-        xc, yc = jnp.sum(x * values, axis=0), jnp.sum(y * values, axis=0)
-        explained = jnp.where(planar, (yy * xc * xc - 2 * xy * xc * yc + xx * yc * yc) / safe, 0)
-        square = jnp.sum(values * values, axis=0) - explained
-        residuals.append(jnp.sqrt(jnp.maximum(square, 0) / jnp.maximum(count - 3, 1)))
-    return jnp.stack(residuals, axis=-1) if residuals else jnp.zeros((points.shape[1], 0), points.dtype)
+    xc, yc = jnp.sum(x * values, axis=0), jnp.sum(y * values, axis=0)
+    explained = jnp.where(planar, (yy * xc * xc - 2 * xy * xc * yc + xx * yc * yc) / safe, 0)
+    square = jnp.maximum(jnp.sum(values * values, axis=0) - explained, 0)
+    return jnp.where(count > 3, jnp.sqrt(square / jnp.maximum(count - 3, 1)), jnp.nan)
 
 
 @jax.jit

@@ -17,11 +17,15 @@ class Rows(eqx.Module):
         points: (3, N), metres.
         descriptors: (N, D), channels in metres (α · channel), searched along with the position; D may be 0.
         valid: (N,), False for rows that match nothing and are no match.
+        absence: (N, D), metres²: 0 where a row has the channel of a descriptor; else what the descriptor adds to the
+            squared distance of a pair, which is the same for all rows. A pair has a channel if both of its rows do.
+            None: no row lacks any.
     """
 
     points: Float[Array, "3 N"] | Float[np.ndarray, "3 N"]
     descriptors: Float[Array, "N D"] | Float[np.ndarray, "N D"]
     valid: Bool[Array, "N"] | Bool[np.ndarray, "N"]
+    absence: Float[Array, "N D"] | Float[np.ndarray, "N D"] | None = None
 
 
 class Correspondences(eqx.Module):

@@ -88,6 +88,18 @@ def match(source, target, T, max_distance, source_channels=None, target_channels
     return np.where(apart <= max_distance, index, -1)
 
 
+def match_partial(source, target, source_present, target_present, absence, k: int = 1) -> np.ndarray:
+    """The k nearest targets, ties by index, of rows of positions and descriptors, (N, 3 + D): a descriptor that either
+    row lacks adds its `absence`, (D,), to the squared distance."""
+    found = []
+    for row, present in zip(source, source_present, strict=True):
+        both = present & target_present
+        squared = ((target[:, :3] - row[:3]) ** 2).sum(axis=1)
+        squared = squared + np.where(both, (target[:, 3:] - row[3:]) ** 2, absence).sum(axis=1)
+        found.append(np.lexsort((np.arange(len(target)), squared))[:k])
+    return np.array(found)
+
+
 def voxel_means(rows, points, size: float) -> np.ndarray:
     """The mean row of every occupied cell of a grid, sorted."""
     cells: dict[tuple, list] = {}
@@ -128,18 +140,32 @@ def full_covariance(value, num_channels: int) -> np.ndarray:
     return value if value.ndim == 2 else np.diag(np.broadcast_to(value, (num_channels,)))
 
 
-def omega(members, channels, query_channels, channel_covariance, regularisation=0.0):
+def kernel(apart, common, others, channel_covariance) -> np.ndarray:
+    """Eq. 7 for one point's neighbours, whose channels differ from it by `apart`, (k, C), where `common`.
+
+    The marginal of Λ on the common channels; for another, the mean factor over those `others` that have it.
+    """
+    full = full_covariance(channel_covariance, apart.shape[1])
+    result = np.ones(len(apart))
+    for j, both in enumerate(common):
+        d = apart[j, both]
+        result[j] = np.exp(-0.5 * d @ np.linalg.inv(full[np.ix_(both, both)]) @ d)
+        for c in np.flatnonzero(~both):
+            known = common[:, c] & others
+            if known.any():
+                result[j] *= np.mean(np.exp(-0.5 * apart[known, c] ** 2 / full[c, c]))
+    return result
+
+
+def omega(members, kernel, regularisation=0.0):
     """Eqs. 6-10 for one point: Ω, the tangent basis (3, 2) and the normal.
 
     `regularisation` is what is added to Σ_w, relative to its trace; Ω is then I + Σ_w^{-1/2} (Σ_t − Σ_w) Σ_w^{-1/2}.
     """
-    members, channels = np.asarray(members, float), np.asarray(channels, float)
+    members = np.asarray(members, float)
     _, vectors = np.linalg.eigh(local_covariance(members))
     n, tangent = vectors[:, 0], vectors[:, 1:]
     z = (members - members.mean(axis=0)) @ tangent  # eq. 6
-    apart = channels - np.asarray(query_channels, float)
-    inverse = np.linalg.inv(full_covariance(channel_covariance, channels.shape[1]))
-    kernel = np.exp(-0.5 * np.einsum("ji,ik,jk->j", apart, inverse, apart))  # eq. 7
     mean = kernel @ z / kernel.sum()  # eq. 8
     weighted = (z - mean).T @ (kernel[:, None] * (z - mean)) / kernel.sum()  # eq. 9
     unweighted = local_covariance(z)
@@ -148,14 +174,16 @@ def omega(members, channels, query_channels, channel_covariance, regularisation=
 
 
 def multi_channel_covariances(
-    points, channels, neighbors, channel_covariance, epsilon, floor=0.0, regularisation=0.0
+    points, channels, neighbors, channel_covariance, epsilon, floor=0.0, regularisation=0.0, present=None
 ) -> np.ndarray:
     """Ω in the tangent plane + ε n nᵀ; Ω's eigenvalues are raised to `floor`."""
     points, channels = np.asarray(points, float), np.asarray(channels, float)
+    present = np.ones(channels.shape, bool) if present is None else present
     result = []
     for i, row in enumerate(neighbors):
         row = row[row >= 0]
-        plane, tangent, n = omega(points[row], channels[row], channels[i], channel_covariance, regularisation)
+        alike = kernel(channels[row] - channels[i], present[row] & present[i], row != i, channel_covariance)  # eq. 7
+        plane, tangent, n = omega(points[row], alike, regularisation)
         values, vectors = np.linalg.eigh(plane)
         plane = vectors @ np.diag(np.maximum(values, floor)) @ vectors.T
         result.append(tangent @ plane @ tangent.T + epsilon * np.outer(n, n))

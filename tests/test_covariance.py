@@ -81,6 +81,50 @@ def test_multichannel_against_the_reference(num_points, num_channels, channel_co
     compare(actual, ref.multi_channel_covariances(*args, 1e-3), 3e-4, 2e-4)
 
 
+def partial(num_points, num_channels, share=0.6, seed=0):
+    """Which points have which channels: some all, some none, some here and there."""
+    present = np.random.default_rng(seed).random((num_points, num_channels)) < share
+    present[: num_points // 4] = True
+    present[num_points // 4 : num_points // 3] = False
+    return present
+
+
+@pytest.mark.parametrize(
+    "num_points, channel_covariance",
+    [(150, 0.3), (150, np.array([0.1, 0.3, 0.9])), (150, full_lambda(3)), (2000, full_lambda(3))],
+    ids=["scalar", "variances", "full", "full-2000"],
+)
+def test_missing_channels_against_the_reference(num_points, channel_covariance):
+    points, channels = ref.scene(num_points, 3, seed=3)
+    present = partial(num_points, 3)
+    args = (points, channels, neighbors_of(num_points, 3), channel_covariance, EPSILON, 1e-3, REGULARISATION)
+    cloud = preprocess(PointCloud(points, np.where(present, channels, np.nan), channel_valid=present), num_neighbors=K)
+    actual = covariances(MultiChannelGICP(channel_covariance, 0.1, EPSILON, min_eigenvalue=1e-3), cloud)
+    compare(actual, ref.multi_channel_covariances(*args, present))
+
+
+@pytest.mark.parametrize("channel_covariance", [0.3, full_lambda(3)], ids=["scalar", "full"])
+def test_a_mask_that_misses_nothing_changes_nothing(channel_covariance):
+    cloud, method = cloud_of(150, 3), MultiChannelGICP(channel_covariance, 0.1)
+    whole = cloud.replace(channel_valid=np.ones(cloud.channels.shape, bool))
+    compare(covariances(method, whole), covariances(method, cloud), 1e-5, 1e-12)
+
+
+def test_a_channel_that_nobody_has_changes_nothing():
+    """Nor does one that is seen at a single point of each neighbourhood, or nowhere near."""
+    cloud = cloud_of(150, 3)
+    method = MultiChannelGICP(full_lambda(3), 0.1)
+    some = np.ones(cloud.channels.shape, bool)
+    some[:, 2] = False
+    without = cloud.replace(channels=cloud.channels[:, :2])
+    expected = covariances(MultiChannelGICP(full_lambda(3)[:2, :2], 0.1), without)
+    compare(covariances(method, cloud.replace(channel_valid=some)), expected, 1e-5, 1e-12)
+    some[7, 2] = True
+    compare(covariances(method, cloud.replace(channel_valid=some)), expected, 1e-5, 1e-12)
+    nothing = cloud.replace(channel_valid=np.zeros_like(some))
+    compare(covariances(method, nothing), covariances(GICP(), cloud), 1e-6, 1e-12)
+
+
 @pytest.mark.parametrize("channels", ["none", "uniform"])
 def test_without_contrast_it_is_gicp_bit_by_bit(channels):
     """Operation by operation the very same numbers; compiled, the two are different programs that round differently."""
@@ -178,6 +222,41 @@ def test_the_unit_of_length_does_not_matter(scale):
     cloud, method = cloud_of(2000, 3), MultiChannelGICP(0.3, 0.1, EPSILON)
     scaled = cloud.replace(points=cloud.points * jnp.asarray(scale, cloud.points.dtype))
     compare(covariances(method, scaled), covariances(method, cloud), 5e-4, 1e-9)
+
+
+@pytest.mark.parametrize("argument", [1, 2], ids=["channels", "Λ"])
+def test_gradients_through_missing_channels(argument):
+    """Exact where there is something, and 0, never NaN, where there is not."""
+    rng = np.random.default_rng(argument)
+    points, channels = ref.scene(150, 3, seed=3)
+    present, neighbors = partial(150, 3), neighbors_of(150, 3)
+    cloud = preprocess(PointCloud(points, channels, channel_valid=present), num_neighbors=K)
+    weights = rng.normal(size=(150, 3, 3))
+    weights += weights.swapaxes(1, 2)
+    at = [channels, full_lambda(3)]
+    direction = rng.normal(size=at[argument - 1].shape)
+    direction = direction + direction.T if argument == 2 else direction
+
+    def expected_sum(value):
+        args = [points, *at[: argument - 1], value, *at[argument:]]
+        args.insert(2, neighbors)
+        found = ref.multi_channel_covariances(*args, EPSILON, 1e-3, REGULARISATION, present)
+        return np.sum(weights * found)
+
+    expected = ref.difference(expected_sum, at[argument - 1], direction, 1e-6)
+    packed = np.zeros((6, cloud.points.shape[0]))
+    packed[:, :150] = ref.packed(2 * weights * (1 - np.eye(3)) + weights * np.eye(3))
+    dtype = cloud.points.dtype
+    inputs = [jnp.full((160, 3), jnp.nan, dtype).at[:150].set(channels.astype(dtype)), jnp.asarray(at[1], dtype)]
+    inputs[0] = jnp.where(cloud.channel_valid, inputs[0], jnp.nan)
+    _, gradients = weighted_sum_and_gradients(
+        cloud.points, *inputs, jnp.asarray(EPSILON, dtype), cloud, jnp.asarray(packed, dtype), False
+    )
+    gradient = np.asarray(gradients[argument], float)
+    if argument == 1:
+        np.testing.assert_array_equal(gradient[~np.asarray(cloud.channel_valid)], 0)
+        gradient = gradient[:150]
+    assert np.sum(gradient * direction) == pytest.approx(expected, rel=tolerance(3e-3, 1e-6))
 
 
 def weighted_sum(points, channels, channel_covariance, epsilon, cloud, weights, as_gicp):

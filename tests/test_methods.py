@@ -104,6 +104,28 @@ def test_noise_is_found(unit):
     np.testing.assert_allclose(np.asarray(method.channel_weights) * sigma, spacing, rtol=1e-4)
 
 
+def test_noise_is_found_where_the_channel_is():
+    """Each channel by the points that have it, and at their neighbours that do."""
+    (_, target), (_, source) = noisy(0), noisy(1)
+    rng = np.random.default_rng(2)
+    clouds = []
+    for cloud in (source, target):
+        present = np.stack([rng.random(len(cloud)) < 0.7, np.asarray(cloud.points)[: len(cloud), 0] > 0.5], axis=1)
+        mask = np.pad(present, [(0, cloud.points.shape[0] - len(cloud)), (0, 0)])
+        clouds.append(cloud.replace(channel_valid=mask))
+    method = MultiChannelGICP().resolve(*clouds)
+    np.testing.assert_allclose(np.sqrt(np.asarray(method.channel_covariance) / 2), NOISE, rtol=0.1)
+
+
+def test_a_channel_that_nobody_has_says_nothing():
+    cloud = ready()
+    mask = np.ones(cloud.channels.shape, bool)
+    mask[:, 1] = False
+    method = MultiChannelGICP().resolve(*[cloud.replace(channel_valid=mask)] * 2)
+    assert np.isfinite(method.channel_covariance).all()
+    np.testing.assert_array_equal(np.asarray(method.channel_weights) > 0, [True, False, True])
+
+
 def test_padding_takes_no_part_in_the_choice():
     (_, target), (_, source) = noisy(0), noisy(1)
     method = MultiChannelGICP().resolve(source, target)

@@ -1,5 +1,6 @@
 """Nearest neighbours against brute force: ties, padding, channels, the gate."""
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -8,7 +9,15 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from mcgicp_jax import ColorICP, KDTreeSearch, PointCloud, PointToPoint, find_correspondences, preprocess
+from mcgicp_jax import (
+    ColorICP,
+    KDTreeSearch,
+    MultiChannelGICP,
+    PointCloud,
+    PointToPoint,
+    find_correspondences,
+    preprocess,
+)
 from mcgicp_jax._search import Rows
 from tests import reference as ref
 
@@ -94,6 +103,75 @@ def test_several_candidates(num_candidates):
     source, target = integers((40, 3), 4, 0), integers((50, 3), 4, 1)
     found = query(np.eye(4), source, target, num_candidates=num_candidates)
     np.testing.assert_array_equal(found.T, ref.nearest(source, target, num_candidates))
+
+
+@settings(max_examples=25, deadline=None)
+@given(seed=st.integers(0, 2**31), share=st.floats(0, 1), k=st.sampled_from([1, 3]), missing=st.integers(1, 4))
+def test_nearest_with_missing_channels(seed, share, k, missing):
+    """By brute force, with ties: integers everywhere."""
+    rows = [integers((size, 5), 4, seed + i) for i, size in enumerate((40, 50))]
+    masks = np.split(np.random.default_rng(seed).random((90, 2)) < share, [40])
+    absence = np.array([float(missing), 2.0])
+    source, target = (
+        Rows(
+            points=row[:, :3].T,
+            descriptors=np.where(mask, row[:, 3:], 0),
+            valid=np.ones(len(row), bool),
+            absence=np.where(mask, 0, absence),
+        )
+        for row, mask in zip(rows, masks, strict=True)
+    )
+    still = np.array([1.0, 0, 0, 0, 0, 0, 0])
+    found = KDTreeSearch().index(target).nearest(still, source, np.inf, k)
+    np.testing.assert_array_equal(found.T, ref.match_partial(*rows, *masks, absence, k))
+    # One of the two clouds may lack nothing.
+    whole = eqx.tree_at(lambda rows: rows.absence, target, None)
+    found = KDTreeSearch().index(whole).nearest(still, source, np.inf, k)
+    expected = ref.match_partial(rows[0], np.hstack([rows[1][:, :3], whole.descriptors]), masks[0], True, absence, k)
+    np.testing.assert_array_equal(found.T, expected)
+
+
+def partial_clouds(share=0.5, num_channels=3):
+    """A camera that sees some of the points: channel 0 is everywhere, the others come and go together."""
+    _, pair = clouds(num_channels)
+    masks = []
+    for i, (points, _) in enumerate(pair):
+        seen = np.random.default_rng(i).random(len(points)) < share
+        masks.append(np.stack([np.ones(len(points), bool), seen, seen], axis=1))
+    ready = [
+        preprocess(PointCloud(*arrays, channel_valid=mask), num_neighbors=6)
+        for arrays, mask in zip(pair, masks, strict=True)
+    ]
+    return ready, pair, masks
+
+
+@pytest.mark.parametrize(
+    "method",
+    [ColorICP([0.1, 0.0, 2.0]), MultiChannelGICP([0.1, 0.2, 0.3], 0.3), MultiChannelGICP(0.2 * np.eye(3) + 0.1, 0.3)],
+    ids=["ColorICP", "variances", "full"],
+)
+def test_missing_channels_count_as_in_a_true_match(method):
+    (source, target), ((a, ca), (b, cb)), masks = partial_clouds()
+    resolved = method.resolve(source, target)
+    variance = resolved.missing_variance if isinstance(method, ColorICP) else resolved.channel_covariance
+    variance = np.diag(variance) if np.ndim(variance) == 2 else np.asarray(variance)
+    weights = np.asarray(resolved.channel_weights)
+    moved = a @ T[:3, :3].T + T[:3, 3]
+    rows = np.hstack([moved, weights * ca]), np.hstack([b, weights * cb])
+    expected = ref.match_partial(*rows, *masks, weights**2 * variance)[:, 0]
+    found = find_correspondences(source, target, T, method, max_distance=np.inf)
+    np.testing.assert_array_equal(np.asarray(found.indices)[:150], expected)
+
+
+def test_missing_channels_traced_and_batched():
+    (source, target), *_ = partial_clouds()
+    whole = target.replace(channel_valid=None)
+    expected = [find(source, cloud, T, 0.3, 0.4) for cloud in (target, whole)]
+    pose = jnp.asarray(T, source.points.dtype)
+    np.testing.assert_array_equal(jax.jit(find)(source, target, pose, 0.3, 0.4).indices, expected[0].indices)
+    targets = PointCloud.stack([target, whole])
+    batched = jax.jit(jax.vmap(find, in_axes=(None, 0, None, None, None)))(source, targets, pose, 0.3, 0.4)
+    np.testing.assert_array_equal(batched.indices[0], expected[0].indices)
 
 
 @pytest.mark.parametrize("max_distance", [0.05, 0.2, 1.0, np.inf])

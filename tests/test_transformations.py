@@ -115,6 +115,36 @@ def test_align_has_the_gradient_of_its_answer(name, noisy):
 
 
 @needs_x64
+@pytest.mark.parametrize("name", ["mc-gicp", "color-icp"])
+def test_align_has_the_gradient_where_channels_are_missing(name, noisy):
+    source, target, _ = noisy
+    method, robust = CASES[name]
+    clouds = []
+    for i, cloud in enumerate((source, target)):
+        mask = np.random.default_rng(i).random(cloud.channels.shape) < 0.7
+        clouds.append(cloud.replace(channel_valid=mask))
+    source, target = clouds
+    method = method.resolve(source, target)
+    start = mcg.register(source, target, method, robust=robust, max_distance=GATE).matrix
+    matches = mcg.find_correspondences(source, target, start, method, max_distance=GATE, num_candidates=2)
+
+    def loss(inputs):
+        clouds = clouds_with(inputs, source, target)
+        settings = {"robust": inputs["robust"], "init": start, "temperature": 0.1, **CONVERGED}
+        return weigh(mcg.align(*clouds, matches, inputs["method"], **settings).matrix)
+
+    inputs = inputs_of(source, target, method, robust)
+    check_gradient(loss, inputs)
+    # What stands where nothing is, NaN for one, is not seen.
+    for side, cloud in (("source", source), ("target", target)):
+        inputs[f"{side} channels"] = jnp.where(cloud.channel_valid, cloud.channels, jnp.nan)
+    gradient = jax.jit(jax.grad(loss))(inputs)
+    for side, cloud in (("source", source), ("target", target)):
+        assert np.isfinite(gradient[f"{side} channels"]).all()
+        np.testing.assert_array_equal(gradient[f"{side} channels"][~np.asarray(cloud.channel_valid)], 0)
+
+
+@needs_x64
 def test_align_has_the_gradient_of_given_covariances(noisy):
     source, target, _ = noisy
     method, robust = CASES["gicp"]
