@@ -21,6 +21,8 @@ from mcgicp_jax._methods import ColorICP as ColorICP
 from mcgicp_jax._methods import MultiChannelGICP as MultiChannelGICP
 from mcgicp_jax._methods import PointToPlane as PointToPlane
 from mcgicp_jax._methods import PointToPoint as PointToPoint
+from mcgicp_jax._odometry import aggregate as aggregate
+from mcgicp_jax._odometry import odometry as odometry
 from mcgicp_jax._preprocess import preprocess as preprocess
 from mcgicp_jax._register import align as align
 from mcgicp_jax._register import find_correspondences as find_correspondences

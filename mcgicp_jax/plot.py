@@ -254,6 +254,44 @@ def convergence(
     return figure
 
 
+def trajectories(
+    trajectories: Mapping[str, Sequence[Pose] | Float[np.ndarray, "N 4 4"]],
+    *,
+    path: str | os.PathLike[str] | None = None,
+) -> matplotlib.figure.Figure:
+    """The ways that poses take, laid over each other in the plane in which the first of them is widest.
+
+    Args:
+        trajectories: poses, sensor to one world, by name.
+        path: a file to save the figure in; its ending tells the format.
+
+    Raises:
+        ValueError: if there are no poses under a name, or one is no pose.
+        ImportError: if matplotlib is missing.
+    """
+    figures = _module("matplotlib.figure")
+    figure = figures.Figure((7, 5), layout="constrained")
+    panel = figure.subplots()
+    plane, start = None, None
+    for name, poses in trajectories.items():
+        places = np.array([pose_matrix(pose, f"trajectories[{name!r}][{i}]")[:3, 3] for i, pose in enumerate(poses)])
+        if not len(places):
+            raise ValueError(f"trajectories[{name!r}]: expected at least one pose, got none")
+        if plane is None or start is None:
+            start = places[0]
+            plane = np.linalg.svd(places - places.mean(axis=0))[2][:2]
+            # The first axis the way that the sensor goes.
+            plane[0] *= 1 if (places[-1] - start) @ plane[0] >= 0 else -1
+        along, across = plane @ (places - start).T
+        panel.plot(along, across, marker=".", markersize=4, linewidth=1, label=name)
+    panel.set(xlabel="metres", ylabel="metres", aspect="equal", adjustable="datalim")
+    panel.grid(alpha=0.3)
+    panel.legend()
+    if path is not None:
+        figure.savefig(path, dpi=120)
+    return figure
+
+
 # In three dimensions
 
 

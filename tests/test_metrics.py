@@ -1,13 +1,17 @@
 """Pose errors: against SciPy, near the singularities, and under every transformation."""
 
+import itertools
+
 import jax
 import jax.numpy as jnp
 import jaxlie
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from mcgicp_jax.metrics import pose_error
+from mcgicp_jax.metrics import ate, kitti_errors, pose_error, rpe
 
 EASY_ANGLES = [1e-9, 1e-5, 0.3, 1.7, 3.0, np.pi - 1e-5, np.pi - 1e-9]
 
@@ -125,3 +129,105 @@ def test_malformed_poses_are_refused_by_name():
         pose_error(np.eye(4), 2 * np.eye(4))
     with pytest.raises(ValueError, match=r"^T: .*shape"):
         jax.jit(pose_error)(jnp.eye(3), jnp.eye(4))
+
+
+# Trajectories
+
+
+def walk(rng, size, step=1.0):
+    """Poses one after another, each a step ahead of the one before and turned a little."""
+    poses = [np.eye(4)]
+    for _ in range(size - 1):
+        poses.append(poses[-1] @ pose(0.1 * rng.normal(size=3), [step, 0, 0]))
+    return np.array(poses)
+
+
+def disturbed(rng, poses, scale=0.05):
+    return np.array([each @ pose(0.01 * rng.normal(size=3), scale * rng.normal(size=3)) for each in poses])
+
+
+@settings(max_examples=30, deadline=None)
+@given(st.integers(0, 10_000), st.integers(1, 30))
+def test_the_trajectory_error_does_not_know_the_world(seed, size):
+    rng = np.random.default_rng(seed)
+    truth = walk(rng, size)
+    moved = random_pose(rng) @ truth
+    assert ate(moved, truth) == pytest.approx(0, abs=1e-9)
+    assert ate(moved, truth, alignment="first") == pytest.approx(0, abs=1e-9)
+    noisy = disturbed(rng, truth)
+    assert ate(random_pose(rng) @ noisy, truth) == pytest.approx(ate(noisy, truth), abs=1e-9)
+    assert ate(noisy, truth) <= ate(noisy, truth, alignment="first") + 1e-9
+
+
+def test_the_alignment_is_the_best_there_is():
+    rng = np.random.default_rng(0)
+    truth = walk(rng, 20)
+    noisy = disturbed(rng, truth, scale=0.3)
+    rotation, _ = Rotation.align_vectors(*(each[:, :3, 3] - each[:, :3, 3].mean(axis=0) for each in (truth, noisy)))
+    aligned = rotation.apply(noisy[:, :3, 3] - noisy[:, :3, 3].mean(axis=0)) + truth[:, :3, 3].mean(axis=0)
+    expected = np.sqrt(((aligned - truth[:, :3, 3]) ** 2).sum(axis=1).mean())
+    assert ate(noisy, truth) == pytest.approx(expected, abs=1e-9)
+    # Mirrored, no rotation fits: a reflection would.
+    mirrored = noisy.copy()
+    mirrored[:, 2, 3] *= -1
+    assert ate(mirrored, noisy) > 0.1
+
+
+def test_aligned_by_the_first_pose_a_turn_there_counts_in_full():
+    truth = np.array([pose([0, 0, 0], [i, 0, 0]) for i in range(11)])
+    bent = truth.copy()
+    bent[0] = truth[0] @ pose([0, 0, 0.1])
+    expected = np.sqrt(np.mean([(2 * np.sin(0.05) * i) ** 2 for i in range(11)]))
+    assert ate(bent, truth, alignment="first") == pytest.approx(expected)
+    assert ate(bent, truth) == pytest.approx(0, abs=1e-9)
+
+
+@pytest.mark.parametrize("delta", [1, 3])
+def test_relative_errors_are_pose_errors_of_the_motions(delta):
+    rng = np.random.default_rng(1)
+    truth = walk(rng, 8)
+    noisy = disturbed(rng, truth)
+    translation, rotation = rpe(random_pose(rng) @ noisy, truth, delta)
+    for i in range(8 - delta):
+        motions = [np.linalg.inv(each[i]) @ each[i + delta] for each in (noisy, truth)]
+        assert (translation[i], rotation[i]) == pytest.approx(pose_error(*motions), abs=1e-9)
+    assert len(translation) == len(rotation) == 8 - delta
+
+
+def test_kitti_errors_by_their_definition():
+    rng = np.random.default_rng(2)
+    truth = walk(rng, 120, step=0.7)
+    noisy = disturbed(rng, truth)
+    along = [0.0]
+    for before, after in itertools.pairwise(truth):
+        along.append(along[-1] + np.linalg.norm(after[:3, 3] - before[:3, 3]))
+    percent, degrees = [], []
+    for first in range(0, 120, 10):
+        for length in (5, 20, 60):
+            last = next((i for i in range(first, 120) if along[i] > along[first] + length), None)
+            if last is not None:
+                motions = [np.linalg.inv(each[first]) @ each[last] for each in (noisy, truth)]
+                translation, rotation = pose_error(*motions)
+                percent.append(100 * translation / length)
+                degrees.append(np.rad2deg(rotation) / length)
+    got = kitti_errors(noisy, truth, lengths=(5.0, 20.0, 60.0))
+    assert got == pytest.approx((np.mean(percent), np.mean(degrees)), rel=1e-9)
+    # A scale that is 2 % wrong is 2 % of the length, but for the last step's excess.
+    straight = np.array([pose([0, 0, 0], [i, 0, 0]) for i in range(1000)])
+    stretched = straight.copy()
+    stretched[:, :3, 3] *= 1.02
+    assert kitti_errors(stretched, straight) == pytest.approx((2.0, 0), rel=0.01)
+
+
+def test_wrong_trajectories_are_refused_by_name():
+    truth = walk(np.random.default_rng(3), 5)
+    for call, message in (
+        (lambda: ate(list(truth[:4]), list(truth)), "poses: expected as many as true_poses, at least one, got 4 and 5"),
+        (lambda: ate([], []), "poses: expected as many"),
+        (lambda: rpe(truth, truth, 5), "delta: expected 1 to 4 for 5 poses, got 5"),
+        (lambda: kitti_errors(truth, truth), "lengths: expected one below 4.0 m"),
+        (lambda: ate(2 * truth, truth), r"poses\[0\]"),
+        (lambda: ate(truth, truth, alignment="best"), "alignment"),
+    ):
+        with pytest.raises((ValueError, TypeError), match=message):
+            call()

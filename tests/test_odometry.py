@@ -1,0 +1,150 @@
+"""Odometry over sequences with exact truth, and the maps made of them."""
+
+import itertools
+from collections import defaultdict
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+import mcgicp_jax as mcg
+from mcgicp_jax import datasets, metrics
+from tests.scenes import motion
+
+
+@pytest.fixture(scope="module")
+def room():
+    frames = datasets.box_room(5, points_per_frame=2000, step=0.08)
+    return list(frames), [frames.path(i) for i in range(5)]
+
+
+def test_poses_follow_the_truth(room):
+    frames, truth = room
+    steps = list(mcg.odometry(frames, mcg.GICP(), max_distance=0.5, start=truth[0]))
+    assert len(steps) == 5 and steps[0].registration is None
+    assert all(step.registration.converged for step in steps[1:])
+    np.testing.assert_array_equal(steps[0].pose, truth[0])
+    poses = [step.pose for step in steps]
+    assert metrics.ate(poses, truth, alignment="first") < 0.03
+    assert np.max(metrics.rpe(poses, truth)[0]) < 0.015
+    assert all(pose.dtype == np.float64 for pose in poses)
+    assert all(len(step.cloud) == len(frame.cloud) for step, frame in zip(steps, frames, strict=True))
+
+
+def test_clouds_do_as_well_as_frames_and_preprocessed_ones_are_kept(room):
+    frames, _ = room
+    clouds = [mcg.preprocess(frame.cloud) for frame in frames[:2]]
+    steps = list(mcg.odometry(clouds, mcg.GICP(), max_distance=0.5))
+    assert steps[0].cloud is clouds[0] and steps[1].cloud is clouds[1]
+    np.testing.assert_array_equal(steps[0].pose, np.eye(4))
+    again = list(mcg.odometry((frame.cloud for frame in frames[:2]), mcg.GICP(), max_distance=0.5))
+    np.testing.assert_array_equal(again[1].pose, steps[1].pose)
+    np.testing.assert_allclose(steps[1].pose, steps[1].registration.matrix, atol=1e-7)
+
+
+def test_frames_are_taken_one_by_one(room):
+    frames, _ = room
+    taken = []
+
+    def stream():
+        for i in itertools.count():
+            taken.append(i)
+            yield frames[i % 2]
+
+    endless = mcg.odometry(stream(), mcg.GICP(), max_distance=0.5)
+    assert taken == []
+    for _ in range(3):
+        next(endless)
+    assert taken == [0, 1, 2]
+
+
+def test_each_pair_starts_from_the_motion_before(room, monkeypatch):
+    frames, _ = room
+    starts = []
+    register = mcg.register
+
+    def spy(*args, init, **options):
+        starts.append(init)
+        return register(*args, init=init, **options)
+
+    monkeypatch.setattr("mcgicp_jax._odometry.register", spy)
+    guess = motion((0.05, 0, 0, 0, 0, 0.05))
+    steps = list(mcg.odometry(frames[:4], mcg.GICP(), max_distance=0.5, init=guess, max_iterations=30))
+    np.testing.assert_array_equal(starts[0], guess)
+    for start, step in zip(starts[1:], steps[1:], strict=False):
+        np.testing.assert_array_equal(start, step.registration.matrix)
+
+
+def test_a_frame_that_does_not_overlap_is_passed_by_at_constant_velocity(room):
+    frames, _ = room
+    lost = mcg.PointCloud(frames[0].cloud.points + 1000, frames[0].cloud.channels)
+    clouds = [frames[0].cloud, frames[1].cloud, lost, frames[3].cloud]
+    steps = list(mcg.odometry(clouds, mcg.GICP(), max_distance=0.5))
+    assert steps[2].registration.status == mcg.Status.TOO_FEW_CORRESPONDENCES
+    assert steps[3].registration.status == mcg.Status.TOO_FEW_CORRESPONDENCES
+    before = steps[1].registration.matrix
+    np.testing.assert_allclose(steps[2].pose, before @ before, atol=1e-6)
+    np.testing.assert_allclose(steps[3].pose, before @ before @ before, atol=1e-6)
+
+
+def test_rotations_stay_rotations():
+    cloud = mcg.preprocess(datasets.box_room(1, points_per_frame=1000)[0].cloud)
+    *_, last = mcg.odometry(itertools.repeat(cloud, 40), mcg.GICP(), max_distance=0.5, init=motion())
+    np.testing.assert_allclose(last.pose[:3, :3] @ last.pose[:3, :3].T, np.eye(3), atol=1e-14)
+
+
+# Maps
+
+
+@settings(max_examples=30, deadline=None)
+@given(st.integers(0, 1000), st.integers(1, 4), st.floats(0.05, 3), st.booleans())
+def test_a_map_is_the_mean_of_each_voxel(seed, count, voxel_size, partial):
+    rng = np.random.default_rng(seed)
+    clouds, poses, voxels = [], [], defaultdict(list)
+    for _ in range(count):
+        size = int(rng.integers(1, 60))
+        points, channels = rng.normal(size=(size, 3)), rng.normal(size=(size, 2))
+        valid = rng.random((size, 2)) < 0.6 if partial else None
+        pose = motion(rng.normal(size=6))
+        clouds.append(mcg.PointCloud(points, channels, channel_valid=valid, channel_names=["a", "b"]))
+        poses.append(pose)
+        world = points @ pose[:3, :3].T + pose[:3, 3]
+        for i, point in enumerate(world):
+            values = np.where(valid[i], channels[i], np.nan) if partial else channels[i]
+            voxels[tuple(np.floor(point / voxel_size))].append(np.concatenate([point, values]))
+    made = mcg.aggregate(iter(clouds), iter(poses), voxel_size)
+    assert len(made) == len(voxels) and made.channel_names == ("a", "b")
+    for point, channel, row in zip(made.points, made.channels, range(len(made)), strict=True):
+        members = np.array(voxels[tuple(np.floor(point / voxel_size))])
+        np.testing.assert_allclose(point, members[:, :3].mean(axis=0), atol=1e-9)
+        for column in range(2):
+            present = members[~np.isnan(members[:, 3 + column]), 3 + column]
+            there = made.channel_valid is None or made.channel_valid[row, column]
+            assert there == (present.size > 0)
+            if there:
+                assert channel[column] == pytest.approx(present.mean(), abs=1e-9)
+
+
+def test_a_map_of_the_room_is_sharp_at_the_true_poses(room):
+    frames, truth = room
+    clouds = [frame.cloud for frame in frames]
+    sharp = mcg.aggregate(clouds, truth, 0.05)
+    blurred = mcg.aggregate(clouds, [pose @ motion((0, 0, 0, 0.1 * i, 0, 0)) for i, pose in enumerate(truth)], 0.05)
+    assert len(sharp) < len(blurred) < sum(map(len, clouds))
+
+
+def test_what_makes_no_map_is_refused_by_name(room):
+    frames, truth = room
+    clouds = [frame.cloud for frame in frames]
+    bare = mcg.PointCloud(clouds[0].points)
+    for arguments, message in (
+        (([], [], 0.1), "clouds: expected at least one"),
+        ((clouds[:1], truth[:1], 0.0), "voxel_size: expected a positive"),
+        ((clouds[:1], truth[:2], 0.1), "argument"),
+        (([clouds[0], bare], truth[:2], 0.1), r"clouds\[1\]: expected the channels"),
+        ((clouds[:1], [2 * np.eye(4)], 0.1), r"poses\[0\]"),
+        ((clouds[:1], [motion((1e6, 0, 0, 0, 0, 0))], 0.1), "voxel_size: 0.1 m puts points"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            mcg.aggregate(*arguments)
