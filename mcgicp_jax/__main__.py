@@ -12,6 +12,7 @@ import jax
 import platformdirs
 import tyro
 
+from mcgicp_jax._commands._odometry import odometry
 from mcgicp_jax._commands._register import compare, demo, register
 
 
@@ -40,7 +41,12 @@ def _explanation(error: Exception) -> str:
 def main(args: Sequence[str] | None = None) -> int:
     """Returns the exit code: 0, 1 if a registration did not converge, 2 if the input was wrong."""
     _keep_compiled_programs()
-    commands: dict[str, Callable[..., int]] = {"demo": demo, "register": register, "compare": compare}
+    commands: dict[str, Callable[..., int]] = {
+        "demo": demo,
+        "register": register,
+        "compare": compare,
+        "odometry": odometry,
+    }
     with warnings.catch_warnings():
         warnings.showwarning = _show_warning
         try:

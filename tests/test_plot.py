@@ -241,3 +241,17 @@ def test_nothing_is_imported_before_it_is_needed_and_no_window_opens():
         "sys.exit(2 if 'matplotlib.pyplot' in sys.modules else 0)\n"
     )
     assert subprocess.run([sys.executable, "-c", program], check=False).returncode == 0
+
+
+def test_trajectories_are_drawn_in_their_plane(tmp_path):
+    poses = np.tile(np.eye(4), (5, 1, 1))
+    poses[:, :3, 3] = np.outer(np.arange(5), [0, 3, 4]) + 7
+    figure = plot.trajectories({"truth": poses, "gicp": list(poses)}, path=tmp_path / "way.png")
+    (panel,) = figure.axes
+    for line in panel.lines:
+        np.testing.assert_allclose(line.get_xdata(), 5 * np.arange(5), atol=1e-9)
+        np.testing.assert_allclose(line.get_ydata(), 0, atol=1e-9)
+    assert [text.get_text() for text in panel.get_legend().get_texts()] == ["truth", "gicp"]
+    assert (tmp_path / "way.png").stat().st_size > 1000
+    with pytest.raises(ValueError, match=r"trajectories\['none'\]: expected at least one pose"):
+        plot.trajectories({"none": []})

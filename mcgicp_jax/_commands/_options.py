@@ -86,13 +86,13 @@ def scales(clouds: Sequence[mcg.PointCloud], options: Options) -> tuple[float | 
     # Covariances cannot be averaged.
     few = largest <= _MOST_POINTS or any(cloud.covariances is not None for cloud in clouds)
     if size == "off" or (size == "auto" and few):
-        return None, _VOXELS_PER_DISTANCE * _round_voxel_size(clouds, largest // 2) if distance == "auto" else distance
+        return None, _VOXELS_PER_DISTANCE * round_voxel_size(clouds, largest // 2) if distance == "auto" else distance
     if size == "auto":
-        size = _round_voxel_size(clouds, _MOST_POINTS)
+        size = round_voxel_size(clouds, _MOST_POINTS)
     return size, _VOXELS_PER_DISTANCE * size if distance == "auto" else distance
 
 
-def _round_voxel_size(clouds: Sequence[mcg.PointCloud], most: int) -> float:
+def round_voxel_size(clouds: Sequence[mcg.PointCloud], most: int) -> float:
     """The smallest of 1, 1.5, 2, 3, 5, 7, 10, ... times a power of ten that leaves each `most` points; metres."""
     finite = [np.asarray(cloud.points, np.float64)[np.isfinite(cloud.points).all(axis=1)] for cloud in clouds]
     extent = max((np.ptp(points, axis=0).max() for points in finite if len(points)), default=0.0)
@@ -108,6 +108,25 @@ def _round_voxel_size(clouds: Sequence[mcg.PointCloud], most: int) -> float:
         return max(len(np.unique(number)) for number in numbers)
 
     return sizes[bisect.bisect_left(sizes, -most, key=lambda size: -occupied(size))]
+
+
+def with_channels(cloud: mcg.PointCloud, names: Sequence[str]) -> mcg.PointCloud:
+    """The cloud with some of its channels."""
+    missing = [name for name in names if name not in cloud.channel_names]
+    if missing:
+        raise ValueError(f"no channel {', '.join(missing)}; there are {listed(cloud.channel_names)}")
+    columns = [cloud.channel_names.index(name) for name in names]
+    return mcg.PointCloud(
+        cloud.points,
+        np.asarray(cloud.channels)[:, columns],
+        channel_valid=None if cloud.channel_valid is None else np.asarray(cloud.channel_valid)[:, columns],
+        covariances=cloud.covariances,
+        channel_names=names,
+    )
+
+
+def listed(names: Sequence[str]) -> str:
+    return ", ".join(names) if names else "no channels"
 
 
 def described(method: AbstractMethod) -> str:

@@ -21,8 +21,10 @@ from mcgicp_jax._commands._options import (
     MethodName,
     Options,
     described,
+    listed,
     scales,
     status_of,
+    with_channels,
     words,
 )
 from mcgicp_jax._methods import AbstractMethod
@@ -40,7 +42,7 @@ class Pair:
         self.whole = io.read(source), io.read(target)
         names = [cloud.channel_names for cloud in self.whole]
         self.channels = [name for name in names[0] if name in names[1]]
-        self.difference = f"{source} has {_listed(names[0])}, {target} has {_listed(names[1])}"
+        self.difference = f"{source} has {listed(names[0])}, {target} has {listed(names[1])}"
         voxel_size, self.max_distance = scales(self.whole, options)
         self.source, self.target = (
             _preprocess(path, cloud, self.channels, voxel_size, options.num_neighbors)
@@ -52,7 +54,7 @@ class Pair:
         voxels = "all kept" if voxel_size is None else f"voxels of {voxel_size:g} m"
         print(f"points:    source {counts[0]}, target {counts[1]} ({voxels})")
         print(f"pairs:     up to {self.max_distance:g} m apart")
-        print(f"channels:  {_listed(self.channels)}" + (f" ({self.difference})" if names[0] != names[1] else ""))
+        print(f"channels:  {listed(self.channels)}" + (f" ({self.difference})" if names[0] != names[1] else ""))
 
     def method(self, name: MethodName) -> AbstractMethod:
         """The method, with its numbers from the options or else from the data."""
@@ -202,22 +204,10 @@ def _read_pose(path: Path) -> Float[np.ndarray, "4 4"]:
 def _preprocess(
     path: Path, cloud: mcg.PointCloud, channels: Sequence[str], voxel_size: float | None, num_neighbors: int
 ) -> mcg.PointCloud:
-    columns = [cloud.channel_names.index(name) for name in channels]
     try:
-        cloud = mcg.PointCloud(
-            cloud.points,
-            np.asarray(cloud.channels)[:, columns],
-            channel_valid=None if cloud.channel_valid is None else np.asarray(cloud.channel_valid)[:, columns],
-            covariances=cloud.covariances,
-            channel_names=channels,
-        )
-        return mcg.preprocess(cloud, voxel_size, num_neighbors)
+        return mcg.preprocess(with_channels(cloud, channels), voxel_size, num_neighbors)
     except ValueError as error:
         raise ValueError(f"{path}: {error}") from error
-
-
-def _listed(names: Sequence[str]) -> str:
-    return ", ".join(names) if names else "no channels"
 
 
 def _verdict(results: dict[MethodName, mcg.Registration]) -> int:

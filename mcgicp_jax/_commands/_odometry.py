@@ -1,0 +1,174 @@
+"""`mcgicp odometry DATASET PATH`."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Annotated, Any, Literal, TypeAlias
+
+import numpy as np
+import tyro
+from jaxtyping import Float
+from tqdm import tqdm
+
+import mcgicp_jax as mcg
+from mcgicp_jax import datasets, io, metrics, plot
+from mcgicp_jax._commands._options import METHODS, File, MethodName, listed, round_voxel_size, with_channels
+from mcgicp_jax._methods import AbstractMethod
+
+DatasetName: TypeAlias = Literal["kitti", "ford", "tum", "7-scenes", "street", "corridor", "box-room", "poster-wall"]
+Dataset: TypeAlias = Annotated[DatasetName, tyro.conf.Positional, tyro.conf.arg(metavar="DATASET")]
+Folder: TypeAlias = Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="PATH", help_behavior_hint="")]
+Names: TypeAlias = Annotated[tuple[str, ...], tyro.conf.arg(metavar="NAMES", help_behavior_hint="(default: all)")]
+
+# What opens it, from a folder or for a number of frames; voxels, and how far two matched points may lie apart, metres.
+_READERS: dict[str, tuple[Callable[[Path], datasets.AbstractFrames], float, float]] = {
+    "kitti": (datasets.kitti, 0.25, 2.5),
+    "ford": (datasets.ford_campus, 0.25, 2.5),
+    "tum": (datasets.tum_rgbd, 0.03, 0.2),
+    "7-scenes": (datasets.seven_scenes, 0.03, 0.2),
+}
+_SCENES: dict[str, tuple[Callable[[int], datasets.AbstractFrames], float | None, float]] = {
+    "street": (datasets.street, 0.2, 2.0),
+    "corridor": (datasets.corridor, None, 0.5),
+    "box-room": (datasets.box_room, None, 0.5),
+    "poster-wall": (datasets.poster_wall, None, 0.1),
+}
+_FRAMES_OF_A_SCENE = 20
+_KITTI_LENGTHS = np.arange(100.0, 900, 100)
+
+
+def odometry(
+    dataset: Dataset,
+    path: Folder = Path(),
+    method: MethodName = "mc-gicp",
+    channels: Names = (),
+    voxel_size: float | Literal["auto", "off"] = "auto",
+    max_distance: float | Literal["auto"] = "auto",
+    num_frames: int | Literal["all"] = "all",
+    output: File = None,
+    map: File = None,
+    plot: File = None,
+) -> int:
+    """Follow the sensor through a sequence: each frame is registered to the one before.
+
+    DATASET is kitti, ford, tum or 7-scenes, whose sequence is the folder PATH; or street, corridor, box-room or
+    poster-wall, which are made up and need none. Where the truth is known, the errors are printed. The exit code is 0
+    only if all registrations converged; output files are written in any case.
+
+    Args:
+        dataset: Form of the data set, or a scene.
+        path: Folder of the sequence, such as sequences/04.
+        method: mc-gicp and color-icp use channels, the others geometry alone.
+        channels: Channels to use, such as intensity, or red green blue.
+        voxel_size: Metres; the points of one voxel are averaged. auto: 0.25 for kitti and ford, 0.2 for street, 0.03
+            for tum and 7-scenes, off for the others.
+        max_distance: Metres; points further apart make no pair. auto: 2.5 for kitti and ford, 2 for street, 0.5 for
+            corridor and box-room, 0.2 for tum and 7-scenes, 0.1 for poster-wall.
+        num_frames: How many, from the start; all of a scene are 20.
+        output: File for the poses, sensor to world: the upper three rows of each matrix in one row (KITTI).
+        map: File for the map in the world, such as map.ply, thinned to voxels: those of the registration, or else such
+            as would leave at most half of the first cloud.
+        plot: Picture to draw of the way from above, such as way.png.
+    """
+    frames, usual_voxel, usual_distance = _open(dataset, path, num_frames)
+    voxel = usual_voxel if voxel_size == "auto" else None if voxel_size == "off" else voxel_size
+    distance = usual_distance if max_distance == "auto" else max_distance
+    names = channels or frames[0].cloud.channel_names
+    print(f"frames:    {len(frames)} of {dataset}, {len(frames[0].cloud):,} points in the first")
+    print(f"channels:  {listed(names)}")
+    truth: list[Float[np.ndarray, "4 4"] | None] = []
+    clouds = _clouds(frames, names, truth)
+    chosen = _method(method, frames, names, voxel)
+    steps = mcg.odometry(clouds, chosen, voxel_size=voxel, max_distance=distance, start=frames[0].pose)
+    poses, ends, kept = [], [], []
+    for step in tqdm(steps, total=len(frames), unit="frame", disable=None):
+        poses.append(step.pose)
+        if step.registration is not None:
+            ends.append(step.registration)
+        if map is not None:
+            kept.append(step.cloud.unpad())
+    _report(poses, truth, ends)
+    if output is not None:
+        io.write_poses(output, poses)
+    if map is not None:
+        thinned = round_voxel_size(kept[:1], len(kept[0]) // 2) if voxel is None else voxel
+        io.write(map, mcg.aggregate(kept, poses, thinned))
+        print(f"map:       {map}, voxels of {thinned:g} m")
+    if plot is not None:
+        _draw(plot, method, poses, truth)
+    failed = sum(not result.converged for result in ends)
+    if failed:
+        print(f"mcgicp: {failed} of {len(ends)} registrations did not converge", file=sys.stderr)
+    return 1 if failed else 0
+
+
+def _open(
+    dataset: DatasetName, path: Path, num_frames: int | Literal["all"]
+) -> tuple[datasets.AbstractFrames, float | None, float]:
+    if num_frames != "all" and num_frames < 2:
+        raise ValueError(f"num_frames: expected at least 2, got {num_frames}")
+    if dataset in _SCENES:
+        scene, voxel, distance = _SCENES[dataset]
+        return scene(_FRAMES_OF_A_SCENE if num_frames == "all" else num_frames), voxel, distance
+    reader, voxel, distance = _READERS[dataset]
+    frames = reader(path)
+    return frames if num_frames == "all" else frames[:num_frames], voxel, distance
+
+
+def _clouds(
+    frames: datasets.AbstractFrames, names: tuple[str, ...], truth: list[Float[np.ndarray, "4 4"] | None]
+) -> Iterator[mcg.PointCloud]:
+    """One cloud after another; their poses are set aside."""
+    for frame in frames:
+        truth.append(frame.pose)
+        yield with_channels(frame.cloud, names)
+
+
+def _method(
+    name: MethodName, frames: datasets.AbstractFrames, channels: tuple[str, ...], voxel_size: float | None
+) -> AbstractMethod:
+    kind = METHODS[name]
+    if kind is not mcg.ColorICP:
+        return kind()
+    # Its weights from the first pair, as mc-gicp would choose them.
+    first, second = (mcg.preprocess(with_channels(frame.cloud, channels), voxel_size) for frame in frames[:2])
+    numbers: dict[str, Any] = {"channel_weights": mcg.MultiChannelGICP().resolve(second, first).channel_weights}
+    return mcg.ColorICP(**numbers)
+
+
+def _report(
+    poses: list[Float[np.ndarray, "4 4"]],
+    truth: list[Float[np.ndarray, "4 4"] | None],
+    results: list[mcg.Registration],
+) -> None:
+    iterations = np.mean([np.asarray(result.num_iterations) for result in results])
+    converged = sum(bool(result.converged) for result in results)
+    print(f"pairs:     {converged} of {len(results)} converged, {iterations:.1f} iterations in the mean")
+    known = [row for row, pose in enumerate(truth) if pose is not None]
+    if len(known) < 2:
+        print("errors:    the truth is not known")
+        return
+    estimated, true = [poses[row] for row in known], [truth[row] for row in known]
+    translation, rotation = metrics.rpe(estimated, true)
+    print(f"per pair:  {1e3 * translation.mean():.1f} mm, {np.degrees(rotation.mean()):.3f}° in the mean")
+    whole = metrics.ate(estimated, true)
+    first = metrics.ate(estimated, true, alignment="first")
+    print(f"ATE:       {1e3 * whole:.1f} mm rms after the best alignment, {1e3 * first:.1f} mm from the first pose")
+    length = float(np.linalg.norm(np.diff(np.array(true)[:, :3, 3], axis=0), axis=1).sum())
+    stretches = _KITTI_LENGTHS[length > _KITTI_LENGTHS] if length > _KITTI_LENGTHS[0] else np.array([length / 2])
+    percent, degrees = metrics.kitti_errors(estimated, true, lengths=stretches.tolist(), step=1)
+    shown = ", ".join(f"{stretch:.3g}" for stretch in stretches)
+    print(f"drift:     {percent:.2f} %, {degrees:.4f}°/m over stretches of {shown} m")
+
+
+def _draw(
+    path: Path,
+    method: MethodName,
+    poses: list[Float[np.ndarray, "4 4"]],
+    truth: list[Float[np.ndarray, "4 4"] | None],
+) -> None:
+    known = [pose for pose in truth if pose is not None]
+    plot.trajectories(({"truth": known} if known else {}) | {method: poses}, path=path)
+    print(f"picture:   {path}")

@@ -1,0 +1,74 @@
+"""`mcgicp odometry`, on scenes and on real scans."""
+
+import matplotlib.image
+import numpy as np
+import pytest
+
+from mcgicp_jax import datasets, io
+from mcgicp_jax.__main__ import main
+
+
+def number_after(text, label):
+    return float(text.split(label)[1].split()[0].strip("%,°"))
+
+
+def test_a_scene_is_followed_and_its_files_are_written(tmp_path, capsys):
+    poses, map, way = tmp_path / "poses.txt", tmp_path / "map.ply", tmp_path / "way.png"
+    files = ["--output", str(poses), "--map", str(map), "--plot", str(way)]
+    assert main(["odometry", "box-room", "--num-frames", "3", "--method", "gicp", *files]) == 0
+    text, errors = capsys.readouterr()
+    assert errors == "" and "pairs:     2 of 2 converged" in text
+    assert number_after(text, "per pair: ") < 15 and number_after(text, "drift: ") < 20
+    written, frames = io.read_poses(poses), datasets.box_room(3)
+    assert len(written) == 3
+    np.testing.assert_allclose(written[0], frames.path(0), atol=1e-12)
+    np.testing.assert_allclose(written[2][:3, 3], frames.path(2)[:3, 3], atol=0.03)
+    made = io.read(map)
+    assert made.channel_names == ("red", "green", "blue") and 2000 < len(made) < 15_000
+    # In the world: the room.
+    assert np.all(made.points > -0.1) and np.all(made.points < (8.1, 6.1, 2.9))
+    assert matplotlib.image.imread(way).ndim == 3 and str(way) in text and str(map) in text
+
+
+def test_what_does_not_converge_is_no_success(capsys):
+    assert main(["odometry", "corridor", "--num-frames", "2", "--method", "gicp", "--max-distance", "1e-6"]) == 1
+    text, errors = capsys.readouterr()
+    assert "pairs:     0 of 1 converged" in text
+    assert errors == "mcgicp: 1 of 1 registrations did not converge\n"
+
+
+def test_channels_can_be_chosen(capsys):
+    options = ["--num-frames", "2", "--channels", "intensity", "--voxel-size", "0.4"]
+    assert main(["odometry", "street", *options]) == 0
+    text = capsys.readouterr().out
+    assert "channels:  intensity\n" in text and number_after(text, "per pair: ") < 100
+    assert main(["odometry", "street", *options, "--method", "color-icp"]) == 0
+    assert main(["odometry", "street", "--channels", "humidity"]) == 2
+    assert "no channel humidity; there are intensity, red, green, blue" in capsys.readouterr().err
+
+
+def test_wrong_input_gets_one_line(tmp_path, capsys):
+    for args, message in (
+        (["kitti", str(tmp_path)], "expected scans in velodyne/*.bin, found none"),
+        (["tum", str(tmp_path)], "depth.txt: No such file"),
+        (["box-room", "--num-frames", "1"], "num_frames: expected at least 2, got 1"),
+    ):
+        assert main(["odometry", *args]) == 2
+        errors = capsys.readouterr().err
+        assert errors.startswith("mcgicp: ") and errors.count("\n") == 1 and message in errors
+
+
+def test_help_says_what_there_is(capsys):
+    with pytest.raises(SystemExit):
+        main(["odometry", "--help"])
+    text = " ".join(capsys.readouterr().out.replace("│", " ").split())
+    assert all(word in text for word in ("DATASET PATH", "7-scenes", "--map", "--channels", "0.25 for kitti"))
+    assert "None" not in text
+
+
+@pytest.mark.slow
+def test_real_scans_are_followed(data, capsys):
+    folder = str(data / "kitti" / "sequences" / "04")
+    assert main(["odometry", "kitti", folder, "--method", "gicp", "--num-frames", "4", "--voxel-size", "0.5"]) == 0
+    text = capsys.readouterr().out
+    assert "pairs:     3 of 3 converged" in text and number_after(text, "per pair: ") < 50
