@@ -15,6 +15,7 @@ from mcgicp_jax._cost import GemanMcClure as GemanMcClure
 from mcgicp_jax._cost import Huber as Huber
 from mcgicp_jax._cost import Tukey as Tukey
 from mcgicp_jax._cost import mahalanobis_cost as mahalanobis_cost
+from mcgicp_jax._dense import DenseSearch as DenseSearch
 from mcgicp_jax._kdtree import KDTreeSearch as KDTreeSearch
 from mcgicp_jax._methods import GICP as GICP
 from mcgicp_jax._methods import ColorICP as ColorICP

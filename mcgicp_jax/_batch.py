@@ -26,11 +26,21 @@ from jax.typing import ArrayLike
 
 from mcgicp_jax._cloud import PointCloud, Values
 from mcgicp_jax._cost import AbstractKernel
-from mcgicp_jax._kdtree import KDTreeSearch
+from mcgicp_jax._dense import DenseSearch, default_search
+from mcgicp_jax._lanes import run_problems
+from mcgicp_jax._loop import Problem
 from mcgicp_jax._methods import AbstractMethod
 from mcgicp_jax._pose import Pose, pose_matrix
 from mcgicp_jax._preprocess import check_preprocessing, preprocess
-from mcgicp_jax._register import MAX_ITERATIONS, ROTATION_TOLERANCE, TRANSLATION_TOLERANCE, check_settings, register
+from mcgicp_jax._register import (
+    MAX_ITERATIONS,
+    ROTATION_TOLERANCE,
+    TRANSLATION_TOLERANCE,
+    check_settings,
+    pose_problem,
+    register,
+    registration_of,
+)
 from mcgicp_jax._result import Registration, Status
 from mcgicp_jax._search import AbstractSearch
 
@@ -108,7 +118,9 @@ def register_as_completed(
         method: as in `register`; numbers left open are chosen for each pair from its data.
         init: T_target_source to start from: one for all, or an iterable of one per pair.
         max_distance, max_iterations, translation_tolerance, rotation_tolerance, robust: as in `register`.
-        search: how neighbours and matches are found; by default SciPy's k-d tree, one thread per pair.
+        search: how neighbours and matches are found; by default SciPy's k-d tree, one thread per pair. With
+            `DenseSearch`, the default on an accelerator, many pairs are the lanes of one compiled program, which are
+            spread over all local devices.
         voxel_size, num_neighbors: as in `preprocess`, for raw clouds; the workers prepare them.
         executor: who does the work: any `concurrent.futures.Executor`, such as a `ProcessPoolExecutor` with the start
             method "spawn" or Dask's `Client.get_executor()`; by default threads, one per core. A pair whose worker
@@ -134,7 +146,7 @@ def register_as_completed(
             "rotation_tolerance": rotation_tolerance,
             "robust": robust,
         },
-        search=search or KDTreeSearch(workers=1),
+        search=search,
         voxel_size=voxel_size,
         num_neighbors=num_neighbors,
     )
@@ -155,9 +167,13 @@ class _Job:
 
     method: AbstractMethod
     settings: dict[str, Any]
-    search: AbstractSearch
+    search: AbstractSearch | None
     voxel_size: float | None
     num_neighbors: int
+
+    def chosen_search(self) -> AbstractSearch:
+        """That of the machine where the pair is registered, if none was asked for."""
+        return self.search or default_search(workers=1)
 
     def ready(self, name: str, cloud: Cloud) -> PointCloud:
         """The cloud, prepared if it was not; a `ValueError` names it."""
@@ -167,7 +183,7 @@ class _Job:
             if not isinstance(cloud, PointCloud):
                 cloud = PointCloud(cloud)
             if cloud.neighbors is None:
-                cloud = preprocess(cloud, self.voxel_size, self.num_neighbors, search=self.search)
+                cloud = preprocess(cloud, self.voxel_size, self.num_neighbors, search=self.chosen_search())
         except (ValueError, OSError) as error:
             raise ValueError(f"{name}: {error}") from error
         return cloud
@@ -175,10 +191,47 @@ class _Job:
     def register(self, pair: _Pair) -> _Outcome:
         try:
             source, target = self.ready("source", pair.source), self.ready("target", pair.target)
-            result = register(source, target, self.method, init=pair.init, search=self.search, **self.settings)
+            search = self.chosen_search()
+            result = register(source, target, self.method, init=pair.init, search=search, **self.settings)
         except ValueError as error:
-            return _Outcome(pair.index, Registration.without_pose(Status.INVALID_INPUT), str(error))
+            return _invalid(pair, error)
         return _Outcome(pair.index, result)
+
+    def problem(self, pair: _Pair) -> _Outcome | tuple[_Problem, Problem]:
+        """The pair as a lane takes it: both clouds of one size, so that few programs serve all."""
+        try:
+            source, target = self.ready("source", pair.source), self.ready("target", pair.target)
+            size = max(source.points.shape[0], target.points.shape[0])
+            source, target = source.pad(size), target.pad(size)
+            problem = pose_problem(source, target, self.method, pair.init, **self.settings)
+        except ValueError as error:
+            return _invalid(pair, error)
+        return _Problem(pair.index, source, target), problem
+
+    def register_all(self, pairs: Iterable[_Pair], num_threads: int) -> Iterator[_Outcome]:
+        """All that there are on this machine, in lanes; threads prepare them."""
+        with ThreadPoolExecutor(num_threads, thread_name_prefix="mcgicp") as threads:
+            rejected: list[_Outcome] = []
+
+            def problems() -> Iterator[tuple[_Problem, Problem]]:
+                for problem in _ahead(threads, self.problem, pairs, 2 * num_threads):
+                    if isinstance(problem, _Outcome):
+                        rejected.append(problem)
+                    else:
+                        yield problem
+
+            for key, state, history in run_problems(problems(), self.chosen_search(), self.settings["max_iterations"]):
+                yield _Outcome(key.index, registration_of(state.pose, state, history, key.source, key.target))
+            yield from rejected
+
+
+@dataclass(frozen=True)
+class _Problem:
+    """What is needed once the problem is solved."""
+
+    index: int
+    source: PointCloud
+    target: PointCloud
 
 
 @dataclass(frozen=True)
@@ -188,13 +241,32 @@ class _Outcome:
     reason: str | None = None
 
 
+def _invalid(pair: _Pair, error: ValueError) -> _Outcome:
+    return _Outcome(pair.index, Registration.without_pose(Status.INVALID_INPUT), str(error))
+
+
 def _register_chunk(job: _Job, chunk: list[_Pair]) -> list[_Outcome]:
+    if isinstance(job.chosen_search(), DenseSearch):
+        return list(job.register_all(chunk, 1))
     return [job.register(pair) for pair in chunk]
 
 
+def _ahead(executor: Executor, function: Callable[[_Pair], Any], pairs: Iterable[_Pair], most: int) -> Iterator[Any]:
+    """The function of each pair, in order, up to `most` of them computed ahead."""
+    futures: collections.deque[Future[Any]] = collections.deque()
+    for pair in pairs:
+        futures.append(executor.submit(function, pair))
+        if len(futures) > most:
+            yield futures.popleft().result()
+    while futures:
+        yield futures.popleft().result()
+
+
 def _gather(job: _Job, pairs: Iterator[_Pair], executor: Executor | None) -> Iterator[tuple[int, Registration]]:
-    if executor is None:
-        num_workers = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    num_workers = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    if executor is None and isinstance(job.chosen_search(), DenseSearch):
+        yield from map(_report, job.register_all(pairs, num_workers))
+    elif executor is None:
         with ThreadPoolExecutor(num_workers, thread_name_prefix="mcgicp") as threads:
             yield from _dispatch(_Shipping(job, threads), pairs, 1, 2 * num_workers)
     elif isinstance(executor, ThreadPoolExecutor):

@@ -67,6 +67,10 @@ class State(eqx.Module):
 
 
 Carry: TypeAlias = tuple[State, Correspondences, dict[str, Array]]
+# Finds pairs at a pose, or keeps those whose target rows are given, and weighs them.
+Match: TypeAlias = Callable[[jaxlie.SE3, Int[Array, ""], Array], tuple[Correspondences, Measurement]]
+# What the loop of `register` is about: start, source, target, method, robust kernel, settings.
+Problem: TypeAlias = tuple[jaxlie.SE3, Surface, Surface, AbstractMethod, AbstractKernel | None, Settings]
 
 
 def gate(
@@ -183,34 +187,43 @@ def run_on_host(
     return state, matches, {name: np.array([record[name] for record in records]) for name in records[0]}
 
 
-def _while_loop(
+def _measure_and_update(
     pose: jaxlie.SE3,
-    match: Callable[[jaxlie.SE3, Int[Array, ""], Array], tuple[Correspondences, Measurement]],
-    shape: tuple[int, ...],
+    status: Int[Array, ""],
+    num_iterations: Int[Array, ""],
+    indices: Int[Array, "*candidates N"],
+    match: Match,
     settings: Settings,
-    max_iterations: int,
-) -> Carry:
-    """The loop inside a transformation. `match(pose, status, indices)` finds pairs, or keeps them, and weighs them."""
+) -> tuple[State, Correspondences]:
+    matches, measured = match(pose, status, indices)
+    return update(pose, status, num_iterations, measured, settings), matches
 
-    def advance(
-        pose: jaxlie.SE3, status: Int[Array, ""], num_iterations: Int[Array, ""], indices: Int[Array, "*candidates N"]
-    ) -> tuple[State, Correspondences]:
-        matches, measured = match(pose, status, indices)
-        return update(pose, status, num_iterations, measured, settings), matches
 
-    def body(carry: Carry) -> Carry:
-        before, matches, history = carry
-        count = before.num_iterations
-        state, matches = advance(before.pose, before.status, count, matches.indices)
-        return state, matches, {name: values.at[count].set(state.record[name]) for name, values in history.items()}
-
+def _begin(pose: jaxlie.SE3, match: Match, shape: tuple[int, ...], settings: Settings, max_iterations: int) -> Carry:
+    """The loop before its first step, with room for all of its history."""
     running, zero = jnp.int32(_RUNNING), jnp.int32(0)
-    shapes = jax.eval_shape(advance, pose, running, zero, jnp.zeros(shape, jnp.int32))
+    step = partial(_measure_and_update, match=match, settings=settings)
+    shapes = jax.eval_shape(step, pose, running, zero, jnp.zeros(shape, jnp.int32))
     state, matches = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), shapes)
     state = eqx.tree_at(lambda state: (state.pose, state.status), state, (pose, running))
     # One entry per update, and one for the measurement at the end.
     history = {name: jnp.full(max_iterations + 1, jnp.nan, value.dtype) for name, value in state.record.items()}
-    return jax.lax.while_loop(lambda carry: carry[0].status < 0, body, (state, matches, history))
+    return state, matches, history
+
+
+def _step(carry: Carry, match: Match, settings: Settings) -> Carry:
+    before, matches, history = carry
+    count = before.num_iterations
+    state, matches = _measure_and_update(before.pose, before.status, count, matches.indices, match, settings)
+    return state, matches, {name: values.at[count].set(state.record[name]) for name, values in history.items()}
+
+
+def _while_loop(
+    pose: jaxlie.SE3, match: Match, shape: tuple[int, ...], settings: Settings, max_iterations: int
+) -> Carry:
+    """The loop inside a transformation."""
+    start = _begin(pose, match, shape, settings, max_iterations)
+    return jax.lax.while_loop(lambda carry: carry[0].status < 0, partial(_step, match=match, settings=settings), start)
 
 
 @partial(jax.jit, static_argnames="max_iterations")
@@ -225,6 +238,12 @@ def run_traced(
     max_iterations: int,
 ) -> Carry:
     """The loop of `register` for traced inputs; pose and matches are constants to autodiff."""
+    match = _matching((start, source, target, method, robust, settings), search)
+    return _while_loop(start, match, source.valid.shape, settings, max_iterations)
+
+
+def _matching(problem: Problem, search: AbstractSearch) -> Match:
+    _, source, target, method, robust, settings = problem
 
     def match(
         pose: jaxlie.SE3, status: Int[Array, ""], indices: Int[Array, "N"]
@@ -235,7 +254,29 @@ def run_traced(
         indices = jnp.where(running, found, indices)
         return match_and_measure(pose, indices, source, target, method, robust, settings)
 
-    return _while_loop(start, match, source.valid.shape, settings, max_iterations)
+    return match
+
+
+@partial(jax.jit, static_argnames="max_iterations")
+def begin_lane(problem: Problem, search: AbstractSearch, max_iterations: int) -> Carry:
+    """The loop of `register` before its first step."""
+    start, source, *_, settings = problem
+    return _begin(start, _matching(problem, search), source.valid.shape, settings, max_iterations)
+
+
+@partial(jax.jit, static_argnames="num_steps")
+def run_lanes(problems: Problem, carries: Carry, search: AbstractSearch, num_steps: int) -> Carry:
+    """Some steps of many loops at once, whose arrays are stacked; those that have ended stay as they are."""
+
+    def run(problem: Problem, carry: Carry) -> Carry:
+        step = partial(_step, match=_matching(problem, search), settings=problem[-1])
+        return jax.lax.while_loop(
+            lambda counted: (counted[0][0].status < 0) & (counted[1] < num_steps),
+            lambda counted: (step(counted[0]), counted[1] + 1),
+            (carry, jnp.int32(0)),
+        )[0]
+
+    return jax.vmap(run)(problems, carries)
 
 
 @partial(jax.jit, static_argnames="max_iterations")

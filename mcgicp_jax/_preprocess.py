@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from mcgicp_jax._cloud import PointCloud, Values, is_far, size_class
-from mcgicp_jax._kdtree import KDTreeSearch
+from mcgicp_jax._dense import default_search
 from mcgicp_jax._pose import is_concrete
 from mcgicp_jax._search import AbstractSearch
 
@@ -36,7 +36,7 @@ def preprocess(
             None keeps every point.
         num_neighbors: k, the neighbours (the point itself among them) that a covariance is computed from; at least 3.
             Fewer are used where the cloud has fewer points.
-        search: how neighbours are found; by default SciPy's k-d tree.
+        search: how neighbours are found; by default SciPy's k-d tree, on an accelerator `DenseSearch`.
 
     Returns:
         JAX arrays, float32 or, where JAX's x64 is on and the input has it, float64. Coordinates far from zero for the
@@ -69,7 +69,7 @@ def preprocess(
     origin = _far_origin(points)
     points = (points - origin).astype(dtype)
     # Searched as they will be used, after rounding.
-    neighbors = (search or KDTreeSearch()).neighbors(points, num_neighbors)
+    neighbors = (search or default_search()).neighbors(points, num_neighbors)
     ready = cloud.replace_rows(
         points=points,
         channels=channels.astype(dtype),

@@ -13,8 +13,8 @@ from jaxtyping import Array, Int
 
 from mcgicp_jax._cloud import PointCloud, Values
 from mcgicp_jax._cost import AbstractKernel, centred_pose, check_matches
-from mcgicp_jax._kdtree import KDTreeSearch
-from mcgicp_jax._loop import Settings, State, align_traced, gate, refine, run_on_host, run_traced
+from mcgicp_jax._dense import default_search
+from mcgicp_jax._loop import Problem, Settings, State, align_traced, gate, refine, run_on_host, run_traced
 from mcgicp_jax._methods import AbstractMethod, Surface, prepare
 from mcgicp_jax._pose import Pose, is_concrete, pose_matrix, se3_from_matrix
 from mcgicp_jax._preprocess import preprocess
@@ -59,7 +59,7 @@ def find_correspondences(
     limit = jnp.asarray(max_distance, dtype)
     if num_candidates < 1:
         raise ValueError(f"num_candidates: expected at least 1, got {num_candidates}")
-    indices = _find(search or KDTreeSearch(), start, source_surface, target_surface, limit, num_candidates)
+    indices = _find(search or default_search(), start, source_surface, target_surface, limit, num_candidates)
     return _gate(start, source_surface, target_surface, indices, limit)
 
 
@@ -119,7 +119,7 @@ def align(
     softness = None if temperature is None else jnp.asarray(temperature, dtype)
     model = (source_surface, target_surface, matches, method, robust, softness)
     pose, state, history = align_traced(start, model, settings, max_iterations)
-    return _registration(pose, state, history, source, target)
+    return registration_of(pose, state, history, source, target)
 
 
 def register(
@@ -150,7 +150,7 @@ def register(
         translation_tolerance, rotation_tolerance: metres (at the centroid of the pairs) and radians; the update that is
             below both is the last.
         robust: kernel of each pair's Mahalanobis distance: `Huber`, `Cauchy`, `GemanMcClure`, `Tukey`.
-        search: how matches are found; by default SciPy's k-d tree.
+        search: how matches are found; by default SciPy's k-d tree, on an accelerator `DenseSearch`.
 
     Returns:
         The pose and how it ended: see `Registration`; check `converged`.
@@ -160,21 +160,39 @@ def register(
     """
     check_settings(method, max_distance, max_iterations, translation_tolerance, rotation_tolerance)
     source, target = _ready("source", source), _ready("target", target)
-    method, source_surface, target_surface = _surfaces(source, target, method)
-    dtype = source_surface.points.dtype
-    start = se3_from_matrix(centred_pose(pose_matrix(init), source, target), dtype)
-    settings = _settings(max_distance, translation_tolerance, rotation_tolerance, max_iterations, dtype)
-    search = search or KDTreeSearch()
-    differentiable = (source_surface, target_surface, method, robust)
-    constants = jax.lax.stop_gradient((start, *differentiable, settings))
+    problem = pose_problem(
+        source, target, method, init, max_distance, max_iterations, translation_tolerance, rotation_tolerance, robust
+    )
+    search = search or default_search()
+    constants = jax.lax.stop_gradient(problem)
+    differentiable = _, _, method, robust = problem[1:5]
     if is_concrete(constants):
         state, matches, history = run_on_host(*constants, search)
     else:
         state, matches, history = run_traced(*constants, search, max_iterations)
     if is_concrete(differentiable):
-        return _registration(state.pose, state, history, source, target)
-    pose = refine(state, (source_surface, target_surface, matches, method, robust, None))
-    return _registration(pose, state, history, source, target)
+        return registration_of(state.pose, state, history, source, target)
+    pose = refine(state, (*problem[1:3], matches, method, robust, None))
+    return registration_of(pose, state, history, source, target)
+
+
+def pose_problem(
+    source: PointCloud,
+    target: PointCloud,
+    method: AbstractMethod,
+    init: Pose | None,
+    max_distance: ArrayLike,
+    max_iterations: int,
+    translation_tolerance: ArrayLike,
+    rotation_tolerance: ArrayLike,
+    robust: AbstractKernel | None,
+) -> Problem:
+    """What the loop of `register` is about, for prepared clouds."""
+    method, source_surface, target_surface = _surfaces(source, target, method)
+    dtype = source_surface.points.dtype
+    start = se3_from_matrix(centred_pose(pose_matrix(init), source, target), dtype)
+    settings = _settings(max_distance, translation_tolerance, rotation_tolerance, max_iterations, dtype)
+    return start, source_surface, target_surface, method, robust, settings
 
 
 def _ready(name: str, cloud: PointCloud | Values) -> PointCloud:
@@ -225,7 +243,7 @@ def _settings(
     )
 
 
-def _registration(
+def registration_of(
     pose: jaxlie.SE3, state: State, history: dict[str, Any], source: PointCloud, target: PointCloud
 ) -> Registration:
     """The result in the user's frames; NumPy where everything is concrete."""

@@ -53,7 +53,7 @@ class AbstractIndex(abc.ABC):
     @abc.abstractmethod
     def nearest(
         self, pose: Float[ArrayLike, "7"], source: Rows, max_distance: Float[ArrayLike, ""], num_candidates: int = 1
-    ) -> Int[np.ndarray, "m N"]:
+    ) -> Int[Array, "m N"] | Int[np.ndarray, "m N"]:
         """Rows of the m nearest target points of each source point, moved by a pose; descriptors do not move.
 
         Args:

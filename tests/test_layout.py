@@ -7,11 +7,24 @@ import mcgicp_jax
 
 ROOT = pathlib.Path(mcgicp_jax.__file__).parent
 ORDER = [
-    *("_pose", "_cloud", "_search", "_kdtree", "_preprocess", "_covariance", "_methods", "_cost", "_solve", "_result"),
+    *(
+        "_pose",
+        "_cloud",
+        "_search",
+        "_kdtree",
+        "_dense",
+        "_preprocess",
+        "_covariance",
+        "_methods",
+        "_cost",
+        "_solve",
+        "_result",
+    ),
     *(
         "_loop",
         "_uncertainty",
         "_register",
+        "_lanes",
         "_batch",
         "metrics",
         "_formats",

@@ -1,0 +1,94 @@
+"""Many registrations as the lanes of one compiled program, without callbacks: for accelerators."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from functools import partial
+from typing import Any, Generic, TypeAlias, TypeVar
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.sharding import Mesh, NamedSharding, PartitionSpec
+from jaxtyping import Array, Int
+
+from mcgicp_jax._loop import Carry, Problem, State, begin_lane, run_lanes
+from mcgicp_jax._search import AbstractSearch
+
+Key = TypeVar("Key")
+Ended: TypeAlias = tuple[Key, State, dict[str, np.ndarray]]
+
+# Of one device. On a CPU the lanes that wait for others cost as much as those that work.
+_LANES = 64
+_LANES_ON_CPU = 4
+# Of every lane, before those that have ended give way to others: few registrations take less, and a slow one then
+# keeps one lane busy, not all.
+_STEPS = 4
+
+
+def run_problems(
+    problems: Iterable[tuple[Key, Problem]], search: AbstractSearch, max_iterations: int
+) -> Iterator[Ended[Key]]:
+    """Run the loop of `register` on problems, many at a time; hand out how each has ended, as soon as it has.
+
+    Problems of the same shapes share a program. Its number of lanes is fixed, so that a result does not depend on what
+    else there is to do. With several local devices the lanes are spread over them.
+    """
+    groups: dict[Any, _Group[Key]] = {}
+    for key, problem in problems:
+        leaves, structure = jax.tree.flatten(problem)
+        kind = structure, tuple((leaf.shape, leaf.dtype) for leaf in leaves)
+        group = groups.setdefault(kind, _Group(problem, search, max_iterations))
+        group.add(key, problem)
+        while group.is_full():
+            yield from group.run()
+    for group in groups.values():
+        while group.is_busy():
+            yield from group.run()
+
+
+class _Group(Generic[Key]):
+    """Lanes of problems that have the same shapes."""
+
+    def __init__(self, example: Problem, search: AbstractSearch, max_iterations: int):
+        self._search = search
+        self._max_iterations = max_iterations
+        devices = jax.local_devices()
+        per_device = _LANES_ON_CPU if devices[0].platform == "cpu" else _LANES
+        self._keys: list[Key | None] = [None] * (per_device * len(devices))
+        sharding = NamedSharding(Mesh(np.array(devices), ("lanes",)), PartitionSpec("lanes"))
+        self._put = jax.jit(_put, donate_argnums=0, out_shardings=sharding)
+        lane = example, begin_lane(example, search, max_iterations)
+        # A status of zero is one that has ended.
+        stack = partial(jax.tree.map, lambda leaf: jnp.zeros((len(self._keys), *leaf.shape), leaf.dtype))
+        self._lanes: tuple[Problem, Carry] = jax.jit(stack, out_shardings=sharding)(lane)
+
+    def is_full(self) -> bool:
+        return None not in self._keys
+
+    def is_busy(self) -> bool:
+        return any(key is not None for key in self._keys)
+
+    def add(self, key: Key, problem: Problem) -> None:
+        free = self._keys.index(None)
+        self._keys[free] = key
+        self._lanes = self._put(self._lanes, (problem, begin_lane(problem, self._search, self._max_iterations)), free)
+
+    def run(self) -> Iterator[Ended[Key]]:
+        """Some steps of all lanes; those that have ended are handed out, and free."""
+        problems, carries = self._lanes
+        carries = run_lanes(problems, carries, self._search, _STEPS)
+        self._lanes = problems, carries
+        # Not the matches: they stay where they are.
+        states, histories = jax.device_get((carries[0], carries[2]))
+        for lane, key in enumerate(self._keys):
+            if key is not None and states.status[lane] >= 0:
+                self._keys[lane] = None
+                state: State = jax.tree.map(lambda leaf, lane=lane: leaf[lane], states)
+                # Of the measurements that were made, one more than updates.
+                count = int(state.num_iterations) + 1
+                yield key, state, {name: values[lane, :count] for name, values in histories.items()}
+
+
+def _put(lanes: tuple[Problem, Carry], lane: tuple[Problem, Carry], number: Int[Array, ""]) -> tuple[Problem, Carry]:
+    return jax.tree.map(lambda leaves, leaf: leaves.at[number].set(leaf), lanes, lane)

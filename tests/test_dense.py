@@ -1,0 +1,214 @@
+"""Brute force on the device: the tree's answers, and a whole batch as one program, on one device or several."""
+
+import os
+import pathlib
+import subprocess
+import sys
+import textwrap
+
+import jax
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+import mcgicp_jax as mcg
+from mcgicp_jax import DenseSearch, KDTreeSearch, Status
+from mcgicp_jax._dense import _nearest
+from mcgicp_jax._search import Rows
+from mcgicp_jax.metrics import pose_error
+from tests import reference as ref
+from tests.scenes import motion
+from tests.test_batch import METHOD, SIZES, assert_same, prepared, raw_pair
+
+T = ref.pose([0.1, -0.2, 0.3], [0.05, 0.1, -0.02])
+
+
+def rows(points, descriptors=None, valid=None, absence=None):
+    descriptors = np.zeros((len(points), 0)) if descriptors is None else descriptors
+    valid = np.ones(len(points), bool) if valid is None else valid
+    arrays = (np.asarray(array, np.float32) for array in (points.T, descriptors))
+    return Rows(*arrays, valid, None if absence is None else np.asarray(absence, np.float32))
+
+
+def query(search, source, target, num_candidates=1):
+    at_rest = np.array([1, 0, 0, 0, 0, 0, 0], np.float32)
+    return np.asarray(search.index(target).nearest(at_rest, source, np.asarray(np.inf), num_candidates))
+
+
+@settings(max_examples=25, deadline=None)
+@given(seed=st.integers(0, 2**31), high=st.integers(2, 6), num_channels=st.sampled_from([0, 2]), size=st.just(50))
+def test_ties_are_ordered_by_row(seed, high, num_channels, size):
+    """Few integer coordinates: most distances are shared, and many points coincide."""
+    rng = np.random.default_rng(seed)
+    points, channels = rng.integers(0, high, (size, 3)), rng.integers(0, 3, (size, num_channels))
+    everything = np.hstack([points, channels]).astype(float)
+    found = query(DenseSearch(), rows(points[:40], channels[:40]), rows(points, channels), 7)
+    np.testing.assert_array_equal(found.T, ref.nearest(everything[:40], everything, 7))
+
+
+@settings(max_examples=25, deadline=None)
+@given(seed=st.integers(0, 2**31), num_points=st.integers(4, 120), scale=st.sampled_from([1e-3, 1.0, 1e4]))
+def test_neighbors_of_random_points(seed, num_points, scale):
+    points = (scale * np.random.default_rng(seed).normal(size=(num_points, 3))).astype(np.float32)
+    np.testing.assert_array_equal(DenseSearch().neighbors(points, 20), KDTreeSearch().neighbors(points, 20))
+
+
+def test_neighbors_far_from_the_origin_lose_nothing():
+    """As a product of matrices the distances would be nothing but rounding here."""
+    points = np.random.default_rng(0).random((300, 3)).astype(np.float32) + np.float32(3000)
+    np.testing.assert_array_equal(DenseSearch().neighbors(points, 5), KDTreeSearch().neighbors(points, 5))
+
+
+@pytest.mark.parametrize("lacking", ["source", "target", "both"])
+def test_channels_that_are_not_there_add_what_they_would_on_average(lacking):
+    rng = np.random.default_rng(0)
+    source, target = rng.random((40, 3)), rng.random((50, 3))
+    channels, absence = (rng.random((40, 2)), rng.random((50, 2))), np.array([0.02, 0.1])
+    masks = [rng.random((40, 2)) < 0.5, rng.random((50, 2)) < 0.5]
+    clouds = []
+    for side, points, values, missing in zip(("source", "target"), (source, target), channels, masks, strict=True):
+        if lacking not in (side, "both"):
+            missing[:] = False
+        clouds.append(rows(points, values, absence=np.where(missing, absence, 0) if missing.any() else None))
+    expected = ref.match_partial(
+        np.hstack([source, channels[0]]), np.hstack([target, channels[1]]), ~masks[0], ~masks[1], absence, 3
+    )
+    np.testing.assert_array_equal(query(DenseSearch(), *clouds, 3).T, expected)
+    np.testing.assert_array_equal(query(KDTreeSearch(), *clouds, 3).T, expected)
+
+
+def test_padding_and_what_is_not_finite_match_nothing():
+    points = np.random.default_rng(0).random((60, 3))
+    source, target = points.copy(), points.copy()
+    source[3], target[7], target[8] = np.nan, np.inf, np.nan
+    valid = np.arange(60) < 50
+    found = query(DenseSearch(), rows(source, valid=valid), rows(target, valid=valid))[0]
+    assert found[3] == -1 and (found[50:] == -1).all()
+    assert not np.isin(found, [7, 8]).any() and found.max() < 50
+    np.testing.assert_array_equal(found[10:50], np.arange(10, 50))
+    assert (query(DenseSearch(), rows(source), rows(target, valid=np.zeros(60, bool))) == -1).all()
+
+
+@pytest.mark.parametrize("num_candidates", [1, 20])
+@pytest.mark.parametrize("lanes", [None, 3])
+def test_no_table_of_pairs_is_stored(num_candidates, lanes):
+    size = 2000
+    cloud = rows(np.zeros((size, 3)), np.zeros((size, 2)))
+    pose = np.zeros(7, np.float32)
+    function = _nearest
+    if lanes:
+        pose, cloud = jax.tree.map(lambda array: np.stack([array] * lanes), (pose, cloud))
+        function = jax.jit(jax.vmap(_nearest, in_axes=(0, 0, 0, None)), static_argnums=3)
+    memory = function.lower(pose, cloud, cloud, num_candidates).compile().memory_analysis()
+    assert memory.temp_size_in_bytes < 0.1 * 4 * size**2
+
+
+@pytest.fixture(scope="module")
+def raw():
+    return [raw_pair(size, seed) for seed, size in enumerate(SIZES)]
+
+
+@pytest.fixture(scope="module")
+def clouds(raw):
+    return prepared(raw)
+
+
+def test_matches_are_those_of_the_tree(clouds):
+    source, target = clouds[0][0], clouds[1][0]
+    for method in (mcg.PointToPoint(), mcg.ColorICP(0.3)):
+        found = [
+            mcg.find_correspondences(source, target, T, method, max_distance=0.4, search=search)
+            for search in (KDTreeSearch(), DenseSearch())
+        ]
+        np.testing.assert_array_equal(found[0].valid, found[1].valid)
+        np.testing.assert_array_equal(found[0].indices[found[0].valid], found[1].indices[found[1].valid])
+
+
+def test_preprocess_and_register_agree_with_the_tree(raw):
+    results = []
+    for search in (KDTreeSearch(), DenseSearch()):
+        source, target = (mcg.preprocess(cloud, search=search) for cloud in raw[0][:2])
+        results.append(mcg.register(source, target, METHOD, max_distance=0.5, search=search))
+    assert max(pose_error(results[0].matrix, results[1].matrix)) < 1e-5
+    assert results[0].num_inliers == results[1].num_inliers
+
+
+def test_register_with_it_is_one_program_without_callbacks(clouds):
+    # Inside a transformation the pose is refined further, by about a tolerance.
+    settings = {"max_distance": 0.5, "translation_tolerance": 1e-6, "rotation_tolerance": 1e-6}
+
+    def answer(points):
+        moved = clouds[0][0].replace(points=points)
+        return mcg.register(moved, clouds[1][0], METHOD, search=DenseSearch(), **settings).matrix
+
+    assert "callback" not in jax.jit(answer).lower(clouds[0][0].points).as_text()
+    expected = mcg.register(clouds[0][0], clouds[1][0], METHOD, **settings)
+    assert max(pose_error(np.asarray(jax.jit(answer)(clouds[0][0].points), float), expected.matrix)) < 1e-5
+
+
+def lanes(sources, targets, **arguments):
+    return mcg.register_batch(sources, targets, METHOD, max_distance=0.5, search=DenseSearch(), **arguments)
+
+
+def test_a_batch_in_lanes_is_its_pairs(raw, clouds):
+    """With more pairs than lanes of a size, so that lanes are used again."""
+    results = lanes(*clouds)
+    for result, source, target in zip(results, *clouds, strict=True):
+        alone = mcg.register(source, target, METHOD, max_distance=0.5, max_iterations=64)
+        assert result.status is alone.status
+        assert list(result.history) == list(alone.history)
+        if alone.converged:
+            assert max(pose_error(result.matrix, alone.matrix)) < 1e-5
+            assert result.num_iterations == alone.num_iterations
+            np.testing.assert_allclose(result.history["cost"], alone.history["cost"], rtol=1e-3)
+            np.testing.assert_allclose(result.information, alone.information, rtol=1e-2, atol=1)
+    order = np.random.default_rng(0).permutation(len(raw))
+    assert_same(lanes(*([side[i] for i in order] for side in clouds)), [results[i] for i in order])
+    assert_same(lanes(*(side[1:3] for side in clouds)), results[1:3])
+
+
+def test_a_bad_pair_spoils_no_other_lane(clouds):
+    expected = lanes(*clouds)
+    sources, targets = (list(side) for side in clouds)
+    sources[0], targets[4] = np.zeros((3, 3)), np.full((9, 3), np.nan)
+    starts = [None, motion((100.0, 0, 0, 0, 0, 0)), None, None, None, None]
+    with pytest.warns(UserWarning, match="pair [04]"):
+        results = lanes(sources, targets, init=starts)
+    assert [result.status for result in results[:2]] == [Status.INVALID_INPUT, Status.TOO_FEW_CORRESPONDENCES]
+    assert results[4].status is Status.INVALID_INPUT
+    for i in (2, 3, 5):
+        assert_same(results[i : i + 1], expected[i : i + 1])
+
+
+SHARDED = """
+    import jax, numpy as np
+    import mcgicp_jax as mcg
+    from mcgicp_jax import _lanes
+    from tests.test_batch import METHOD, SIZES, prepared, raw_pair
+    assert jax.local_device_count() == 4
+    clouds = prepared([raw_pair(size, seed) for seed, size in enumerate(SIZES)])
+    devices, run_lanes = set(), _lanes.run_lanes
+
+    def spy(problems, carries, *rest):
+        carries = run_lanes(problems, carries, *rest)
+        devices.add(len(carries[0].status.sharding.device_set))
+        return carries
+
+    _lanes.run_lanes = spy
+    results = mcg.register_batch(*clouds, METHOD, max_distance=0.5, search=mcg.DenseSearch())
+    assert devices == {4}
+    np.save("poses.npy", [result.matrix for result in results])
+"""
+
+
+@pytest.mark.slow
+def test_lanes_are_spread_over_the_devices(clouds, tmp_path):
+    expected = np.array([result.matrix for result in lanes(*clouds)])
+    root = pathlib.Path(__file__).parents[1]
+    path = os.pathsep.join([str(root), os.environ.get("PYTHONPATH", "")])
+    environment = os.environ | {"XLA_FLAGS": "--xla_force_host_platform_device_count=4", "PYTHONPATH": path}
+    subprocess.run([sys.executable, "-c", textwrap.dedent(SHARDED)], cwd=tmp_path, env=environment, check=True)
+    found = np.load(tmp_path / "poses.npy")
+    settled = [0, 2, 3, 4, 5]
+    np.testing.assert_allclose(found[settled], expected[settled], atol=1e-5)
