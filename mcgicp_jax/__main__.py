@@ -12,6 +12,7 @@ import jax
 import platformdirs
 import tyro
 
+from mcgicp_jax._commands._batch import batch
 from mcgicp_jax._commands._odometry import odometry
 from mcgicp_jax._commands._register import compare, demo, register
 
@@ -46,6 +47,7 @@ def main(args: Sequence[str] | None = None) -> int:
         "register": register,
         "compare": compare,
         "odometry": odometry,
+        "batch": batch,
     }
     with warnings.catch_warnings():
         warnings.showwarning = _show_warning

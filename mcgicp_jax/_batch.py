@@ -6,7 +6,7 @@ import collections
 import itertools
 import os
 import warnings
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Generator, Iterable, Iterator
 from concurrent.futures import (
     FIRST_COMPLETED,
     BrokenExecutor,
@@ -104,7 +104,7 @@ def register_as_completed(
     voxel_size: float | None = None,
     num_neighbors: int = 20,
     executor: Executor | None = None,
-) -> Iterator[tuple[int, Registration]]:
+) -> Generator[tuple[int, Registration], None, None]:
     """Register many pairs of clouds, and hand out each result as soon as it is there.
 
     Every pair is a registration of its own: its result is the same, bit for bit, whatever the other pairs, their order
@@ -127,12 +127,12 @@ def register_as_completed(
             dies is sent once more, and gets the status `LOST` and a warning if that fails too.
 
     Returns:
-        An iterator of the number of the pair, from 0, and its `Registration`.
+        A generator of the number of the pair, from 0, and its `Registration`.
 
     Raises:
         ValueError: if an argument that concerns all pairs does not fit, or one side has fewer clouds than the other.
     Warns:
-        UserWarning: for each pair with the status `INVALID_INPUT` or `LOST`, why.
+        PairWarning: for each pair with the status `INVALID_INPUT` or `LOST`, why; a `UserWarning`.
     """
     check_settings(method, max_distance, max_iterations, translation_tolerance, rotation_tolerance)
     check_preprocessing(voxel_size, num_neighbors)
@@ -151,6 +151,20 @@ def register_as_completed(
         num_neighbors=num_neighbors,
     )
     return _gather(job, _pairs(job, sources, targets, init), executor)
+
+
+class PairWarning(UserWarning):
+    """Why a pair of a batch has no pose.
+
+    Attributes:
+        index: number of the pair, from 0.
+        reason: what is wrong with it.
+    """
+
+    def __init__(self, index: int, reason: str):
+        super().__init__(f"pair {index}: {reason}")
+        self.index = index
+        self.reason = reason
 
 
 @dataclass(frozen=True)
@@ -262,7 +276,9 @@ def _ahead(executor: Executor, function: Callable[[_Pair], Any], pairs: Iterable
         yield futures.popleft().result()
 
 
-def _gather(job: _Job, pairs: Iterator[_Pair], executor: Executor | None) -> Iterator[tuple[int, Registration]]:
+def _gather(
+    job: _Job, pairs: Iterator[_Pair], executor: Executor | None
+) -> Generator[tuple[int, Registration], None, None]:
     num_workers = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     if executor is None and isinstance(job.chosen_search(), DenseSearch):
         yield from map(_report, job.register_all(pairs, num_workers))
@@ -324,7 +340,8 @@ class _Shipping:
                 outcomes = future.result()
             except Exception as error:
                 numbers = ", ".join(str(pair.index) for pair in chunk)
-                _warn(f"the worker of the pairs {numbers} failed ({_words(error)}); they are sent again")
+                message = f"the worker of the pairs {numbers} failed ({_words(error)}); they are sent again"
+                warnings.warn(message, UserWarning, stacklevel=2)
                 self._suspects.extend(chunk)
             else:
                 yield from map(_report, outcomes)
@@ -351,12 +368,8 @@ class _Shipping:
 
 def _report(outcome: _Outcome) -> tuple[int, Registration]:
     if outcome.reason is not None:
-        _warn(f"pair {outcome.index}: {outcome.reason}")
+        warnings.warn(PairWarning(outcome.index, outcome.reason), stacklevel=2)
     return outcome.index, outcome.result
-
-
-def _warn(message: str) -> None:
-    warnings.warn(message, UserWarning, stacklevel=2)
 
 
 def _words(error: BaseException) -> str:

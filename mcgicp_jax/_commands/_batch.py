@@ -1,0 +1,227 @@
+"""`mcgicp batch PAIRS`."""
+
+from __future__ import annotations
+
+import collections
+import contextlib
+import csv
+import itertools
+import sys
+import time
+import warnings
+from collections.abc import Generator, Sequence
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Annotated, Any, Literal, TypeAlias
+
+import numpy as np
+import tyro
+from jaxtyping import Float
+from tqdm import tqdm
+
+import mcgicp_jax as mcg
+from mcgicp_jax import io
+from mcgicp_jax._batch import PairWarning
+from mcgicp_jax._commands._options import METHODS, MethodName, Options, listed, scales, status_of, with_channels
+from mcgicp_jax._commands._table import COLUMNS, POSE, Row, Table, pose_of
+from mcgicp_jax._methods import AbstractMethod
+
+Pairs: TypeAlias = Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="PAIRS")]
+Names: TypeAlias = Annotated[tuple[str, ...], tyro.conf.arg(metavar="NAMES", help_behavior_hint="(default: all)")]
+
+_INTERRUPTED = 130
+
+
+@dataclass(frozen=True)
+class Pair:
+    """Two files, relative to `folder`, and where to start."""
+
+    folder: Path
+    source: str
+    target: str
+    init: Float[np.ndarray, "4 4"] | None = None
+
+    @property
+    def key(self) -> tuple[str, str]:
+        return self.source, self.target
+
+    def paths(self) -> tuple[Path, Path]:
+        return self.folder / self.source, self.folder / self.target
+
+
+def batch(
+    pairs: Pairs,
+    output: Path,
+    method: MethodName = "mc-gicp",
+    glob: str = "*",
+    channels: Names = (),
+    voxel_size: float | Literal["auto", "off"] = "auto",
+    max_distance: float | Literal["auto"] = "auto",
+    num_neighbors: int = 20,
+    max_iterations: int = 64,
+) -> int:
+    """Register many pairs of clouds, and write a table of their poses T_target_source.
+
+    PAIRS is a CSV file with the columns source and target, files relative to its folder, and, if wanted, m00 m01 ...
+    m23 for the pose to start from; or a folder, each file of which is registered to the one before it in the order of
+    names. A row is written as soon as its pair is done, and pairs that are in the table already are left out: after
+    Ctrl-C, or with more pairs, run the same command again. The exit code is 0 only if all pairs converged.
+
+    Args:
+        pairs: CSV file or folder.
+        output: Table to write or to complete, .csv or .npz: source, target, status, iterations, inliers, cost, rmse,
+            the upper three rows of the pose, and the reason why a pair could not be registered.
+        method: mc-gicp and color-icp use channels (intensity, colours, ...), the others geometry alone.
+        glob: Which files of a folder, such as "*.ply".
+        channels: Channels to use, such as intensity, or red green blue. By default those that both clouds of the first
+            pair have; every cloud must have them.
+        voxel_size: Metres, off, or auto, as for mcgicp register, chosen by the first pair.
+        max_distance: Metres, or auto, as for mcgicp register, chosen by the first pair.
+        num_neighbors: Neighbours that the covariance of a point is computed from.
+        max_iterations: Of finding matches and updating the pose.
+    """
+    everything = _pairs_of_folder(pairs, glob) if pairs.is_dir() else _pairs_of_table(pairs)
+    table = Table(output)
+    rows = {(row["source"], row["target"]): row for row in table.read()}
+    missing = [pair for pair in everything if pair.key not in rows]
+    finished = len(everything) - len(missing)
+    print(f"pairs:     {len(everything):,}" + (f", of which {finished:,} are in {output}" if finished else ""))
+    interrupted = False
+    if missing:
+        options = Options(voxel_size=voxel_size, max_distance=max_distance, num_neighbors=num_neighbors)
+        settings = _settings(missing, METHODS[method], channels, options)
+        begin = time.perf_counter()
+        with (
+            table.appending() as append,
+            tqdm(total=len(everything), initial=finished, unit="pair", disable=None) as bar,
+            contextlib.closing(_rows(missing, settings | {"max_iterations": max_iterations}, bar)) as completed,
+        ):
+            try:
+                for pair, row in completed:
+                    append(row)
+                    rows[pair.key] = row
+                    bar.update()
+            except KeyboardInterrupt:
+                interrupted = True
+        done = sum(pair.key in rows for pair in missing)
+        rate = done / (time.perf_counter() - begin)
+        print(f"done:      {done:,} of {len(missing):,}, {rate:.3g} pairs per second")
+    table.finish(list(rows.values()))
+    counts = collections.Counter(rows[pair.key]["status"] for pair in everything if pair.key in rows)
+    print("status:    " + ", ".join(f"{count:,} {name}" for name, count in counts.most_common()))
+    if interrupted:
+        print("mcgicp: interrupted; run the same command again for the rest", file=sys.stderr)
+        return _INTERRUPTED
+    failed = counts.total() - counts[_word(mcg.Status.CONVERGED)]
+    if failed:
+        print(f"mcgicp: {failed} of {len(everything)} pairs did not converge; see {output}", file=sys.stderr)
+    return 1 if failed else 0
+
+
+def _pairs_of_table(path: Path) -> list[Pair]:
+    with open(path, newline="", encoding="utf-8") as file:
+        reader = csv.DictReader(file)
+        columns = reader.fieldnames or []
+        if not {"source", "target"} <= set(columns):
+            raise ValueError(f"{path}: expected the columns source and target, got {listed(columns)}")
+        with_start = set(POSE) <= set(columns)
+        pairs = []
+        for row in reader:
+            if not row["source"] or not row["target"]:
+                raise ValueError(f"{path}: line {reader.line_num}: expected two files, got {row}")
+            start = pose_of(row) if with_start else None
+            pairs.append(Pair(path.parent, row["source"], row["target"], start))
+    return _checked(path, pairs)
+
+
+def _pairs_of_folder(folder: Path, glob: str) -> list[Pair]:
+    names = sorted(path.name for path in folder.glob(glob) if path.is_file())
+    return _checked(folder, [Pair(folder, source, target) for target, source in itertools.pairwise(names)])
+
+
+def _checked(path: Path, pairs: list[Pair]) -> list[Pair]:
+    if not pairs:
+        raise ValueError(f"{path}: expected pairs of clouds, got none")
+    repeated = [key for key, count in collections.Counter(pair.key for pair in pairs).items() if count > 1]
+    if repeated:
+        raise ValueError(f"{path}: expected each pair once, got {' '.join(repeated[0])} more often")
+    return pairs
+
+
+def _settings(
+    pairs: Sequence[Pair], kind: type[AbstractMethod], channels: Sequence[str], options: Options
+) -> dict[str, Any]:
+    """What all pairs have in common, chosen by the first one that can be read."""
+    for pair in pairs:
+        try:
+            clouds = [io.read(path) for path in pair.paths()]
+        except (ValueError, OSError) as error:
+            reason = error
+            continue
+        break
+    else:
+        raise reason
+    first, second = (cloud.channel_names for cloud in clouds)
+    names = tuple(channels) or tuple(name for name in first if name in second)
+    if kind.uses_channels and not names:
+        raise ValueError("expected clouds with channels in common, got none; use gicp instead (--method gicp)")
+    voxel_size, max_distance = scales(clouds, options)
+    voxels = "all kept" if voxel_size is None else f"voxels of {voxel_size:g} m"
+    print(f"points:    {voxels}; pairs up to {max_distance:g} m apart")
+    print(f"channels:  {listed(names)}")
+    numbers = {}
+    if kind is mcg.ColorICP:
+        source, target = (
+            mcg.preprocess(with_channels(cloud, names), voxel_size, options.num_neighbors) for cloud in clouds
+        )
+        numbers["channel_weights"] = mcg.MultiChannelGICP().resolve(source, target).channel_weights
+    return {
+        "method": kind(**numbers),
+        "channels": names,
+        "max_distance": max_distance,
+        "voxel_size": voxel_size,
+        "num_neighbors": options.num_neighbors,
+    }
+
+
+def _rows(pairs: Sequence[Pair], settings: dict[str, Any], bar: tqdm) -> Generator[tuple[Pair, Row], None, None]:
+    """The row of each pair, as it finishes; the reasons of those that fail go there and to stderr."""
+    reasons: dict[int, str] = {}
+    show = warnings.showwarning
+
+    def keep(message: Warning | str, *rest: Any, **options: Any) -> None:
+        if isinstance(message, PairWarning):
+            reasons[message.index] = message.reason
+            message = f"{' '.join(pairs[message.index].key)}: {message.reason}"
+        with bar.external_write_mode(file=sys.stderr):
+            show(message, *rest, **options)
+
+    arguments = settings.copy()
+    method, names = arguments.pop("method"), arguments.pop("channels")
+    sources, targets = ([partial(_read, pair.paths()[side], names) for pair in pairs] for side in (0, 1))
+    starts = [pair.init for pair in pairs]
+    completed = mcg.register_as_completed(sources, targets, method, init=starts, **arguments)
+    with warnings.catch_warnings(), contextlib.closing(completed):
+        warnings.simplefilter("always", PairWarning)
+        warnings.showwarning = keep
+        for index, result in completed:
+            yield pairs[index], _row(pairs[index], result, reasons.pop(index, ""))
+
+
+def _read(path: Path, channels: Sequence[str]) -> mcg.PointCloud:
+    try:
+        return with_channels(io.read(path), channels)
+    except ValueError as error:
+        raise error if str(path) in str(error) else ValueError(f"{path}: {error}") from error
+
+
+def _row(pair: Pair, result: mcg.Registration, reason: str) -> Row:
+    numbers = (result.num_iterations, result.num_inliers, result.cost, result.rmse, *result.matrix[:3].ravel())
+    values = (np.asarray(number).item() for number in numbers)
+    texts = (*pair.key, _word(status_of(result)), *map(repr, values), " ".join(reason.split()))
+    return dict(zip(COLUMNS, texts, strict=True))
+
+
+def _word(status: mcg.Status) -> str:
+    return status.name.lower()

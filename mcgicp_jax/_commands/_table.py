@@ -1,0 +1,96 @@
+"""The table that `mcgicp batch` writes row by row, and completes when it is run again."""
+
+from __future__ import annotations
+
+import contextlib
+import csv
+import os
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+from typing import Any, TypeAlias
+
+import numpy as np
+from jaxtyping import Float
+
+Row: TypeAlias = dict[str, str]
+
+# The upper three rows of a pose.
+POSE = tuple(f"m{row}{column}" for row in range(3) for column in range(4))
+COLUMNS = ("source", "target", "status", "iterations", "inliers", "cost", "rmse", *POSE, "reason")
+_TEXTS = ("source", "target", "status", "reason")
+
+
+class Table:
+    """Results in a file: rows of a .csv, or arrays of an .npz, whose rows gather in a .csv beside it until the end."""
+
+    def __init__(self, path: Path):
+        if path.suffix.lower() not in (".csv", ".npz"):
+            raise ValueError(f"output: expected a file .csv or .npz, got {path}")
+        self._path = path
+        self._rows = path if path.suffix.lower() == ".csv" else path.with_name(f"{path.name}.csv")
+
+    def read(self) -> list[Row]:
+        """The rows so far."""
+        rows = self._read_arrays() if self._rows != self._path and self._path.exists() else []
+        return rows + (self._read_rows() if self._rows.exists() else [])
+
+    @contextlib.contextmanager
+    def appending(self) -> Iterator[Callable[[Row], None]]:
+        """A function that adds a row, which is in the file when it returns."""
+        begun = self._rows.exists() and self._rows.stat().st_size > 0
+        if begun:
+            self._drop_torn_line()
+        with open(self._rows, "a", newline="", encoding="utf-8") as file:
+            writer = csv.DictWriter(file, COLUMNS, lineterminator="\n")
+            if not begun:
+                writer.writeheader()
+
+            def append(row: Row) -> None:
+                writer.writerow(row)
+                file.flush()
+
+            yield append
+
+    def finish(self, rows: Sequence[Row]) -> None:
+        """Write the arrays of an .npz, in the order of the rows."""
+        if self._rows == self._path or not rows:
+            return
+        arrays: dict[str, Any] = {name: np.array([row[name] for row in rows]) for name in _TEXTS}
+        arrays |= {name: np.array([float(row[name]) for row in rows]) for name in ("cost", "rmse")}
+        arrays |= {name: np.array([int(row[name]) for row in rows]) for name in ("iterations", "inliers")}
+        arrays["T_target_source"] = np.stack([pose_of(row) for row in rows])
+        temporary = self._path.with_name(f".{self._path.name}.{os.getpid()}.npz")
+        np.savez_compressed(temporary, **arrays)
+        os.replace(temporary, self._path)
+        self._rows.unlink(missing_ok=True)
+
+    def _read_rows(self) -> list[Row]:
+        with open(self._rows, newline="", encoding="utf-8") as file:
+            lines = file.readlines()
+        # A process that was killed may have left half a line.
+        reader = csv.DictReader(line for line in lines if line.endswith("\n"))
+        if lines and tuple(reader.fieldnames or ()) != COLUMNS:
+            raise ValueError(f"{self._rows}: expected a table of mcgicp batch, got the columns {reader.fieldnames}")
+        return list(reader)
+
+    def _drop_torn_line(self) -> None:
+        content = self._rows.read_bytes()
+        whole = content[: content.rfind(b"\n") + 1]
+        if whole != content:
+            self._rows.write_bytes(whole)
+
+    def _read_arrays(self) -> list[Row]:
+        with np.load(self._path, allow_pickle=False) as arrays:
+            if "T_target_source" not in arrays:
+                raise ValueError(f"{self._path}: expected a table of mcgicp batch, got the arrays {arrays.files}")
+            poses = arrays["T_target_source"]
+            columns: dict[str, list[Any]] = {name: arrays[name].tolist() for name in COLUMNS if name in arrays}
+        columns |= {name: poses[:, i // 4, i % 4].tolist() for i, name in enumerate(POSE)}
+        rows = zip(*(columns[name] for name in COLUMNS), strict=True)
+        return [dict(zip(COLUMNS, map(str, row), strict=True)) for row in rows]
+
+
+def pose_of(row: Row) -> Float[np.ndarray, "4 4"]:
+    matrix = np.eye(4)
+    matrix[:3] = np.array([float(row[name]) for name in POSE]).reshape(3, 4)
+    return matrix

@@ -1,0 +1,176 @@
+"""`mcgicp batch`: a table that grows row by row, is completed when the command is run again, and loses nothing."""
+
+import csv
+import os
+import signal
+import subprocess
+import sys
+import time
+
+import numpy as np
+import pytest
+
+import mcgicp_jax as mcg
+from mcgicp_jax import io
+from mcgicp_jax.__main__ import main
+from mcgicp_jax.metrics import pose_error
+from tests.scenes import motion, room_corner
+
+NUM_FILES = 5
+OPTIONS = ["--max-distance", "0.5", "--voxel-size", "off"]
+
+
+def pose(i):
+    return motion(0.01 * i * np.arange(1, 7))
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """Clouds of one room, seen from one place after another."""
+    folder = tmp_path_factory.mktemp("scans")
+    for i in range(NUM_FILES):
+        points, channels = room_corner(1000, seed=i, channels=1)
+        seen = (points - pose(i)[:3, 3]) @ pose(i)[:3, :3]
+        io.write(folder / f"scan_{i}.ply", mcg.PointCloud(seen, channels, channel_names=["intensity"]))
+    (folder / "notes.txt").write_text("no cloud\n")
+    return folder
+
+
+def table(path):
+    with open(path, newline="", encoding="utf-8") as file:
+        return list(csv.DictReader(file))
+
+
+def write_pairs(path, rows, columns=("source", "target")):
+    with open(path, "w", newline="", encoding="utf-8") as file:
+        csv.writer(file).writerows([columns, *rows])
+    return str(path)
+
+
+def matrix(row):
+    return np.array([[float(row[f"m{i}{j}"]) for j in range(4)] for i in range(3)] + [[0, 0, 0, 1]])
+
+
+def run_folder(folder, output, *options):
+    return main(["batch", str(folder), "--glob", "*.ply", "--output", str(output), *OPTIONS, *options])
+
+
+def test_a_folder_is_registered_file_by_file(folder, tmp_path, capsys):
+    output = tmp_path / "results.csv"
+    assert run_folder(folder, output) == 0
+    rows = sorted(table(output), key=lambda row: row["source"])
+    assert [(row["source"], row["target"]) for row in rows] == [
+        (f"scan_{i + 1}.ply", f"scan_{i}.ply") for i in range(NUM_FILES - 1)
+    ]
+    for i, row in enumerate(rows):
+        assert row["status"] == "converged" and row["reason"] == ""
+        assert max(pose_error(matrix(row), np.linalg.inv(pose(i)) @ pose(i + 1))) < 0.03
+        assert int(row["inliers"]) > 900
+    text = capsys.readouterr().out
+    assert f"{NUM_FILES - 1} converged" in text and "pairs per second" in text and "intensity" in text
+
+
+def test_a_second_run_does_what_is_missing(folder, tmp_path, capsys):
+    output = tmp_path / "results.csv"
+    names = [f"scan_{i}.ply" for i in range(NUM_FILES)]
+    pairs = write_pairs(folder / "pairs.csv", [names[:2]])
+    command = ["batch", pairs, "--output", str(output), *OPTIONS]
+    assert main(command) == 0
+    first = output.read_text()
+    # As a process leaves it that is killed while it writes.
+    output.write_text(first + "scan_2.ply,scan_3.p")
+    write_pairs(folder / "pairs.csv", [names[:2], names[2:4]])
+    capsys.readouterr()
+    assert main(command) == 0
+    assert "1 are in" in capsys.readouterr().out
+    assert output.read_text().startswith(first)
+    assert [row["source"] for row in table(output)] == [names[0], names[2]]
+    complete = output.read_text()
+    assert main(command) == 0
+    assert output.read_text() == complete
+
+
+def test_arrays_instead_of_rows(folder, tmp_path):
+    output = tmp_path / "results.npz"
+    assert run_folder(folder, output) == 0
+    assert [path.name for path in tmp_path.iterdir()] == ["results.npz"]
+    assert run_folder(folder, tmp_path / "results.csv") == 0
+    expected = {row["source"]: row for row in table(tmp_path / "results.csv")}
+    for _ in range(2):
+        with np.load(output) as arrays:
+            assert len(arrays["source"]) == NUM_FILES - 1
+            for name, found in zip(arrays["source"], arrays["T_target_source"], strict=True):
+                np.testing.assert_array_equal(found, matrix(expected[name]))
+            assert (arrays["status"] == "converged").all() and arrays["iterations"].dtype.kind == "i"
+        # The second time there is nothing to do.
+        assert run_folder(folder, output) == 0
+
+
+def test_pairs_that_fail_are_told_apart(folder, tmp_path, capsys):
+    far = [float(x) for x in motion((50.0, 0, 0, 0, 0, 0))[:3].ravel()]
+    start = [float(x) for x in np.eye(4)[:3].ravel()]
+    pairs = write_pairs(
+        folder / "bad.csv",
+        [
+            ("missing.ply", "scan_0.ply", *start),
+            ("scan_1.ply", "scan_0.ply", *start),
+            ("notes.txt", "scan_0.ply", *start),
+            ("scan_2.ply", "scan_1.ply", *far),
+        ],
+        ("source", "target", *(f"m{i}{j}" for i in range(3) for j in range(4))),
+    )
+    output = tmp_path / "results.csv"
+    assert main(["batch", pairs, "--output", str(output), *OPTIONS]) == 1
+    rows = {row["source"]: row for row in table(output)}
+    assert rows["scan_1.ply"]["status"] == "converged"
+    assert rows["scan_2.ply"]["status"] == "too_few_correspondences"
+    assert rows["missing.ply"]["status"] == rows["notes.txt"]["status"] == "invalid_input"
+    assert "missing.ply" in rows["missing.ply"]["reason"] and "notes.txt" in rows["notes.txt"]["reason"]
+    errors = capsys.readouterr().err
+    assert "mcgicp: missing.ply scan_0.ply: source:" in errors
+    assert "3 of 4 pairs did not converge" in errors
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        ("a,b\n1,2\n", "source and target"),
+        ("source,target\n", "expected pairs"),
+        ("source,target\nx.ply,\n", "line 2"),
+        ("source,target\nx.ply,y.ply\nx.ply,y.ply\n", "once"),
+        ("source,target\nx.ply,y.ply\n", "x.ply"),
+    ],
+)
+def test_a_list_that_makes_no_sense(tmp_path, capsys, content, message):
+    (tmp_path / "pairs.csv").write_text(content)
+    assert main(["batch", str(tmp_path / "pairs.csv"), "--output", str(tmp_path / "results.csv"), *OPTIONS]) == 2
+    errors = capsys.readouterr().err
+    assert message in errors and errors.count("\n") == 1
+
+
+def test_a_table_of_something_else_is_left_alone(folder, tmp_path, capsys):
+    (tmp_path / "precious.csv").write_text("a,b\n1,2\n")
+    assert run_folder(folder, tmp_path / "precious.csv") == 2
+    assert (tmp_path / "precious.csv").read_text() == "a,b\n1,2\n"
+    assert run_folder(folder, tmp_path / "results.txt") == 2
+    assert ".npz" in capsys.readouterr().err
+
+
+@pytest.mark.slow
+def test_control_c_loses_nothing_that_is_done(folder, tmp_path):
+    names = [f"scan_{i}.ply" for i in range(NUM_FILES)]
+    repeated = [(a, f"../{folder.name}/{'./' * k}{b}") for k in range(60) for a in names for b in names if a != b]
+    pairs = write_pairs(folder / "many.csv", repeated)
+    output = tmp_path / "results.csv"
+    command = [sys.executable, "-m", "mcgicp_jax", "batch", pairs, "--output", str(output), *OPTIONS]
+    process = subprocess.Popen(command, stderr=subprocess.PIPE, stdout=subprocess.PIPE, text=True, env=os.environ)
+    deadline = time.monotonic() + 120
+    while (not output.exists() or output.read_text().count("\n") < 20) and time.monotonic() < deadline:
+        time.sleep(0.05)
+    process.send_signal(signal.SIGINT)
+    text, errors = process.communicate(timeout=60)
+    assert process.returncode == 130
+    assert "run the same command again" in errors and "Traceback" not in errors
+    rows = table(output)
+    assert 19 <= len(rows) < len(repeated)
+    assert f"done:      {len(rows):,} of {len(repeated):,}" in text
