@@ -14,6 +14,7 @@ import tyro
 
 from mcgicp_jax._commands._batch import batch
 from mcgicp_jax._commands._odometry import odometry
+from mcgicp_jax._commands._paper import paper
 from mcgicp_jax._commands._register import compare, demo, register
 
 
@@ -48,6 +49,7 @@ def main(args: Sequence[str] | None = None) -> int:
         "compare": compare,
         "odometry": odometry,
         "batch": batch,
+        "paper": paper,
     }
     with warnings.catch_warnings():
         warnings.showwarning = _show_warning

@@ -32,6 +32,8 @@ _MOST_POINTS = 50_000
 # before_after: inches at most, all panels across and one panel up; pixels and tiles along the longer side of a panel;
 # the share of a side that the detail shows.
 _WIDEST, _HIGHEST, _PIXELS, _TILES, _DETAIL = 12, 4.5, 500, 12, 0.25
+# Pixels along the longer side of a map.
+_MAP_PIXELS = 1400
 # Pixels are this much finer than the points lie apart, as far as _PIXELS allows.
 _PIXELS_PER_SPACING = 3
 
@@ -124,7 +126,11 @@ class _View:
         return np.where(inside, row * self.width + column, -1), local[:, 2]
 
 
-def _view(points: Points) -> _View:
+def _view(
+    points: Points,
+    most_pixels: int = _PIXELS,
+    limits: Float[np.ndarray, "2 2"] | None = None,
+) -> _View:
     """The two longest principal axes of the points, seen from the side of the origin: of the sensor, mostly."""
     center = points.mean(axis=0)
     _, vectors = np.linalg.eigh(np.cov((points - center).T))
@@ -133,10 +139,12 @@ def _view(points: Points) -> _View:
     right = right if right[np.argmax(np.abs(right))] > 0 else -right
     axes = np.stack([right, np.cross(normal, right), normal], axis=1)
     low, high = np.percentile(((points - center) @ axes)[:, :2], [2, 98], axis=0)
+    if limits is not None:
+        low, high = limits.T
     margin = np.maximum(0.02 * (high - low), 1e-6)
     low, extent = low - margin, high - low + 2 * margin
     spacing = np.sqrt(extent.prod() / len(points))
-    pixel = max(spacing / _PIXELS_PER_SPACING, extent.max() / _PIXELS)
+    pixel = max(spacing / _PIXELS_PER_SPACING, extent.max() / most_pixels)
     width, height = np.ceil(extent / pixel).astype(int)
     return _View(center, axes, low, float(pixel), int(width), int(height))
 
@@ -287,6 +295,122 @@ def trajectories(
     panel.set(xlabel="metres", ylabel="metres", aspect="equal", adjustable="datalim")
     panel.grid(alpha=0.3)
     panel.legend()
+    if path is not None:
+        figure.savefig(path, dpi=120)
+    return figure
+
+
+def maps(
+    maps: Mapping[str, PointCloud],
+    *,
+    limits: Float[np.ndarray, "2 2"] | None = None,
+    path: str | os.PathLike[str] | None = None,
+) -> matplotlib.figure.Figure:
+    """Clouds in one world, a panel for each, seen in the direction in which the first of them is thinnest.
+
+    Clouds with the channels red, green and blue are drawn in these; others in grey, by their intensity or height.
+
+    Args:
+        maps: clouds, as from `aggregate`, by name.
+        limits: from where to where, along the two axes of the picture, in metres from the middle of the first cloud;
+            by default all of it.
+        path: a file to save the figure in; its ending tells the format.
+
+    Raises:
+        ValueError: if there is none, or the first has fewer than 3 points.
+        ImportError: if matplotlib is missing.
+    """
+    figures = _module("matplotlib.figure")
+    drawn = {name: _drawable(cloud) for name, cloud in maps.items()}
+    if not drawn or len(next(iter(drawn.values()))) < 3:
+        raise ValueError("maps: expected at least one, the first of at least 3 points")
+    view = _view(np.asarray(next(iter(drawn.values())).points), _MAP_PIXELS, limits)
+    wide = view.width > 1.5 * view.height
+    shape = (len(drawn), 1) if wide else (1, len(drawn))
+    aspect = view.height / view.width
+    width = _WIDEST if wide else _WIDEST / len(drawn)
+    figure = figures.Figure((width * shape[1], (width * aspect + 0.35) * shape[0]), layout="constrained")
+    for panel, (name, cloud) in zip(figure.subplots(*shape, squeeze=False).ravel(), drawn.items(), strict=True):
+        picture = np.nan_to_num(_paint(view, np.asarray(cloud.points), _shades(cloud, view)), nan=1)
+        extent = (0, view.width * view.pixel, 0, view.height * view.pixel)
+        panel.imshow(picture, origin="lower", interpolation="nearest", extent=extent)
+        panel.set_title(name, fontsize="medium")
+        panel.tick_params(labelsize="x-small")
+    if path is not None:
+        figure.savefig(path, dpi=120)
+    return figure
+
+
+def _shades(cloud: PointCloud, view: _View) -> Points:
+    """The colours of a cloud, or grey."""
+    colors = _rgb(cloud)
+    if colors is not None:
+        return np.nan_to_num(colors, nan=0.5)
+    if "intensity" in cloud.channel_names:
+        values = np.asarray(cloud.channels)[:, cloud.channel_names.index("intensity")]
+    else:
+        values = view.project(np.asarray(cloud.points))[1]
+    low, high = np.nanpercentile(values, [2, 98])
+    grey = np.clip((values - low) / max(high - low, np.finfo(float).tiny), 0, 1)
+    return np.repeat(0.85 * np.nan_to_num(grey, nan=0.5)[:, None], 3, axis=1)
+
+
+def surface_covariances(
+    cloud: PointCloud,
+    covariances: Mapping[str, Float[ArrayLike, "N 3 3"]],
+    *,
+    indices: Sequence[int] | Int[np.ndarray, "M"],
+    path: str | os.PathLike[str] | None = None,
+) -> matplotlib.figure.Figure:
+    """Covariances within a flat surface as ellipses over its picture, a panel for each name.
+
+    All are drawn to one scale, at which a standard deviation of 1 just has room among the others.
+
+    Args:
+        covariances: (N, 3, 3) for the rows of `cloud.points`, by name.
+        indices: the rows to draw.
+        path: a file to save the figure in; its ending tells the format.
+
+    Raises:
+        ValueError: if covariances have another shape.
+        ImportError: if matplotlib is missing.
+    """
+    figures, collections = _module("matplotlib.figure"), _module("matplotlib.collections")
+    raw, rows = _drawable(cloud), np.asarray(indices, int)
+    view = _view(np.asarray(raw.points), _MAP_PIXELS)
+    # The cloud as the covariances go by, and what its picture is painted from.
+    centers = np.asarray(cloud.points, float)[rows] + np.asarray(cloud.origin)
+    places = ((centers - view.center) @ view.axes)[:, :2] - view.low
+    room = 2 * _room(centers, float(np.ptp(np.asarray(raw.points), axis=0).max()))
+    picture = np.nan_to_num(_paint(view, np.asarray(raw.points), _shades(raw, view)), nan=1)
+    width = _WIDEST / len(covariances)
+    figure = figures.Figure((_WIDEST, width * view.height / view.width + 0.35), layout="constrained")
+    panels = figure.subplots(1, len(covariances), squeeze=False)[0]
+    for panel, (name, values) in zip(panels, covariances.items(), strict=True):
+        matrices = np.asarray(values, float)
+        if matrices.shape != (cloud.points.shape[0], 3, 3):
+            raise ValueError(
+                f"covariances[{name!r}]: expected shape ({cloud.points.shape[0]}, 3, 3), got {matrices.shape}"
+            )
+        flat = view.axes[:, :2].T @ matrices[rows] @ view.axes[:, :2]
+        sizes, vectors = np.linalg.eigh(flat)
+        lengths = room * np.sqrt(np.maximum(sizes, 0))
+        angles = np.degrees(np.arctan2(vectors[:, 1, 1], vectors[:, 0, 1]))
+        ellipses = collections.EllipseCollection(
+            lengths[:, 1],
+            lengths[:, 0],
+            angles,
+            units="xy",
+            offsets=places,
+            transOffset=panel.transData,
+            facecolors="none",
+            edgecolors="black",
+            linewidths=1.2,
+        )
+        panel.imshow(picture, origin="lower", extent=(0, view.width * view.pixel, 0, view.height * view.pixel))
+        panel.add_collection(ellipses)
+        panel.set_title(name, fontsize="medium")
+        panel.set(xticks=[], yticks=[], xlim=(0, view.width * view.pixel), ylim=(0, view.height * view.pixel))
     if path is not None:
         figure.savefig(path, dpi=120)
     return figure
