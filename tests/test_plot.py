@@ -7,8 +7,9 @@ import matplotlib.image
 import numpy as np
 import pytest
 
-from mcgicp_jax import PointCloud, plot
+from mcgicp_jax import PointCloud, aggregate, plot
 from mcgicp_jax.datasets import poster_wall
+from tests.scenes import motion
 
 
 @pytest.fixture(scope="module")
@@ -255,3 +256,39 @@ def test_trajectories_are_drawn_in_their_plane(tmp_path):
     assert (tmp_path / "way.png").stat().st_size > 1000
     with pytest.raises(ValueError, match=r"trajectories\['none'\]: expected at least one pose"):
         plot.trajectories({"none": []})
+
+
+def test_maps_show_the_same_part_of_the_world():
+    frames = poster_wall(2, points_per_frame=2000)
+    whole = aggregate([frame.cloud for frame in frames], [frame.pose for frame in frames], 0.01)
+    moved = whole.transform(motion((0.3, 0, 0, 0, 0, 0)))
+    bare = PointCloud(whole.points)
+    figure = plot.maps({"one": whole, "moved": moved, "bare": bare})
+    one, other, grey = (panel.images[0].get_array() for panel in figure.axes)
+    assert one.shape == other.shape == grey.shape
+    assert [panel.get_title() for panel in figure.axes] == ["one", "moved", "bare"]
+    # Where the moved map has left, the paper is white; without channels it is grey.
+    assert np.mean(np.all(other == 1, axis=-1)) > np.mean(np.all(one == 1, axis=-1)) + 0.1
+    assert np.ptp(one, axis=-1).max() > 0.3 and np.ptp(grey, axis=-1).max() == 0
+    part = plot.maps({"part": whole}, limits=np.array([[-0.2, 0.3], [-0.1, 0.1]])).axes[0]
+    assert part.get_xlim()[1] == pytest.approx(0.5, rel=0.1) and part.get_ylim()[1] == pytest.approx(0.2, rel=0.1)
+    with pytest.raises(ValueError, match="maps: expected at least one"):
+        plot.maps({})
+
+
+def test_covariances_within_a_surface_are_drawn_as_they_are():
+    x, y = np.meshgrid(np.arange(20) * 0.1, np.arange(10) * 0.1)
+    points = np.stack([x.ravel(), y.ravel(), np.zeros(200)], axis=1)
+    cloud = PointCloud(points)
+    along = np.tile(np.diag([1.0, 0.25, 1e-3]), (200, 1, 1))
+    slanted = np.tile(np.diag([1.0, 1.0, 1e-3]), (200, 1, 1))
+    slanted[:, 0, 1] = slanted[:, 1, 0] = 0.6
+    figure = plot.surface_covariances(cloud, {"along": along, "slanted": slanted}, indices=[0, 5, 10])
+    (first,), (second,) = (panel.collections for panel in figure.axes)
+    np.testing.assert_allclose(first.get_widths() / first.get_heights(), 2)
+    np.testing.assert_allclose(np.abs(np.sin(np.radians(first.get_angles()))), 0, atol=1e-9)
+    np.testing.assert_allclose(np.abs(np.tan(np.radians(second.get_angles()))), 1)
+    assert len(first.get_offsets()) == 3
+    np.testing.assert_allclose(np.diff(first.get_offsets()[:, 0]), 0.5)
+    with pytest.raises(ValueError, match=r"covariances\['short'\]: expected shape \(200, 3, 3\)"):
+        plot.surface_covariances(cloud, {"short": along[:5]}, indices=[0])
