@@ -210,15 +210,20 @@ class PointCloud(eqx.Module):
     def unpad(self) -> PointCloud:
         """A raw cloud: the valid rows alone, NumPy arrays in the user's frame, float64 if an origin was taken off."""
         keep = np.asarray(self.valid)
-        points = np.asarray(self.points)[keep]
+        whole = bool(keep.all())
+
+        def kept(array: Any) -> Any:
+            # A plain copy takes a tenth of the time.
+            return None if array is None else np.array(array) if whole else np.asarray(array)[keep]
+
+        points = kept(self.points)
         if np.any(self.origin):
             points = points.astype(np.float64) + np.asarray(self.origin)
-        covariances = None if self.covariances is None else np.asarray(self.covariances)[keep]
         return PointCloud(
             points,
-            np.asarray(self.channels)[keep],
-            channel_valid=None if self.channel_valid is None else np.asarray(self.channel_valid)[keep],
-            covariances=covariances,
+            kept(self.channels),
+            channel_valid=kept(self.channel_valid),
+            covariances=kept(self.covariances),
             channel_names=self.channel_names,
         )
 

@@ -5,6 +5,7 @@ And the choice of a search where none is asked for.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from functools import partial
 
 import equinox as eqx
@@ -36,6 +37,12 @@ class DenseSearch(AbstractSearch):
 
     def index(self, target: Rows) -> DenseIndex:
         return DenseIndex(target)
+
+    def follow(
+        self, source: Rows, target: Rows, max_distance: Float[ArrayLike, ""]
+    ) -> Callable[[Float[ArrayLike, "7"]], Int[Array, "N"]]:
+        index = self.index(target)
+        return lambda pose: index.nearest(pose, source, max_distance)[0]
 
     def nearest_traced(
         self,

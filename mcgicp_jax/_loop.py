@@ -173,15 +173,17 @@ def run_on_host(
     search: AbstractSearch,
 ) -> tuple[State, Correspondences, dict[str, np.ndarray]]:
     """The loop for concrete inputs: matches from the host's tree between compiled steps."""
-    index = search.index(target.rows)
-    status, num_iterations = jnp.int32(_RUNNING), jnp.int32(0)
+    nearest = search.follow(source.rows, target.rows, settings.max_distance)
+    status, num_iterations = np.asarray(_RUNNING, np.int32), np.asarray(0, np.int32)
     records = []
     while status < 0:
         if status == _RUNNING:
-            indices = index.nearest(pose.wxyz_xyz, source.rows, settings.max_distance)[0]
+            indices = nearest(pose.wxyz_xyz)
         matches, measured = match_and_measure(pose, indices, source, target, method, robust, settings)
         state = update(pose, status, num_iterations, measured, settings)
-        pose, status, num_iterations = state.pose, state.status, state.num_iterations
+        pose, num_iterations = state.pose, state.num_iterations
+        # As a number of the host's: comparing arrays would be a program of its own, each time.
+        status = np.asarray(state.status)
         records.append(state.record)
     records = jax.device_get(records)
     return state, matches, {name: np.array([record[name] for record in records]) for name in records[0]}

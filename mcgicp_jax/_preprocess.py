@@ -7,7 +7,7 @@ import warnings
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 
 from mcgicp_jax._cloud import PointCloud, Values, is_far, size_class
 from mcgicp_jax._dense import default_search
@@ -15,7 +15,7 @@ from mcgicp_jax._pose import is_concrete
 from mcgicp_jax._search import AbstractSearch
 
 MIN_POINTS = 4
-# Voxel numbers are packed into one 64-bit key, 21 bits each.
+# Voxel numbers are packed into one 63-bit key.
 _VOXELS_PER_AXIS = 2**21
 
 
@@ -98,13 +98,14 @@ def check_preprocessing(voxel_size: float | None, num_neighbors: int) -> None:
 
 
 def _finite(cloud: PointCloud) -> PointCloud:
-    keep = np.isfinite(cloud.points).all(axis=1) & np.isfinite(cloud.channels).all(axis=1)
-    if cloud.covariances is not None:
-        keep &= np.isfinite(cloud.covariances).all(axis=(1, 2))
+    arrays = [array for array in (cloud.points, cloud.channels, cloud.covariances) if array is not None]
+    finite = [np.isfinite(array) for array in arrays]
+    # Most clouds are whole, and asking for all at once is far quicker than for each row.
+    if len(cloud.points) >= MIN_POINTS and all(each.all() for each in finite):
+        return cloud
+    keep = np.all([each.all(axis=tuple(range(1, each.ndim))) for each in finite], axis=0)
     if keep.sum() < MIN_POINTS:
         raise ValueError(f"cloud: expected at least {MIN_POINTS} finite points, got {keep.sum()} of {keep.size}")
-    if keep.all():
-        return cloud
     warnings.warn(f"left out {np.sum(~keep)} of {keep.size} points that are NaN or infinite", UserWarning, stacklevel=3)
     return PointCloud(
         cloud.points[keep],
@@ -122,31 +123,44 @@ def _downsample(
     voxel_size: float,
 ) -> tuple[Float[np.ndarray, "M 3"], Float[np.ndarray, "M C"], Bool[np.ndarray, "M C"] | None]:
     """The mean of each voxel, in float64, and which channels it has; voxels in lexical order of their position."""
-    cells = np.floor(points.astype(np.float64) / voxel_size)
-    cells -= cells.min(axis=0)
-    if cells.max() >= _VOXELS_PER_AXIS:
-        raise ValueError(
-            f"voxel_size: {voxel_size} m divides the cloud into {cells.max():.0f} voxels along an axis, "
-            f"expected fewer than {_VOXELS_PER_AXIS}; choose a larger one"
-        )
-    x, y, z = cells.astype(np.int64).T
-    key = (x << 42) | (y << 21) | z
-    order = np.argsort(key, kind="stable")
+    # Column by column: a third of the time that rows take.
+    columns = np.ascontiguousarray(points.T, np.float64)
+    key, largest = np.zeros(len(points), np.int64), 1
+    for column in columns:
+        cell = np.floor(column / voxel_size)
+        cell -= cell.min()
+        along = cell.max() + 1
+        if along > _VOXELS_PER_AXIS:
+            raise ValueError(
+                f"voxel_size: {voxel_size} m divides the cloud into {along:.0f} voxels along an axis, "
+                f"expected at most {_VOXELS_PER_AXIS}; choose a larger one"
+            )
+        key = key * int(along) + cell.astype(np.int64)
+        largest *= int(along)
+    order = _stable_order(key, largest)
     key = key[order]
     starts = np.flatnonzero(np.concatenate([[True], key[1:] != key[:-1]]))
 
     def total(values: np.ndarray) -> np.ndarray:
-        if values.shape[1] == 0:
-            return np.zeros((len(starts), 0))
-        return np.add.reduceat(values[order].astype(np.float64), starts, axis=0)
+        sums = [np.add.reduceat(column[order].astype(np.float64), starts) for column in values.T]
+        return np.stack(sums, axis=1) if sums else np.zeros((len(starts), 0))
 
     counts = np.diff(np.append(starts, len(key)))[:, None]
-    means = (total(points) / counts).astype(points.dtype)
+    means = (total(columns.T) / counts).astype(points.dtype)
     if channel_valid is None:
         return means, (total(channels) / counts).astype(channels.dtype), None
     # What is missing is stored as 0, so a sum over all is one over those that are there.
     counts = total(channel_valid)
     return means, (total(channels) / np.maximum(counts, 1)).astype(channels.dtype), counts > 0
+
+
+def _stable_order(key: Int[np.ndarray, "N"], largest: int) -> Int[np.ndarray, "N"]:
+    """What sorts the keys, which are below `largest`; equal ones stay in their order."""
+    bits = (len(key) - 1).bit_length()
+    if (largest - 1).bit_length() + bits > 63:
+        return np.argsort(key, kind="stable")
+    # Plain numbers are sorted several times faster than an order is found.
+    return np.sort((key << bits) | np.arange(len(key))) & ((1 << bits) - 1)
 
 
 def _far_origin(points: Float[np.ndarray, "N 3"]) -> Float[np.ndarray, "3"]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import abc
+from collections.abc import Callable
 
 import equinox as eqx
 import numpy as np
@@ -71,6 +72,15 @@ class AbstractSearch(eqx.Module):
     @abc.abstractmethod
     def index(self, target: Rows) -> AbstractIndex:
         """Lay out the valid target rows for searching."""
+
+    @abc.abstractmethod
+    def follow(
+        self, source: Rows, target: Rows, max_distance: Float[ArrayLike, ""]
+    ) -> Callable[[Float[ArrayLike, "7"]], Int[Array, "N"] | Int[np.ndarray, "N"]]:
+        """For one registration: a function that finds the nearest target row of each source row, pose after pose.
+
+        What it returns is that of `AbstractIndex.nearest`; it may use what it knows from the pose before.
+        """
 
     @abc.abstractmethod
     def nearest_traced(

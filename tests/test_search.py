@@ -283,3 +283,41 @@ def test_channels_that_do_not_fit():
     with pytest.raises(ValueError, match=r"channels.*3 and 1"):
         find_correspondences(source, target, T, ColorICP(0.1), max_distance=1.0)
     find_correspondences(source, target, T, PointToPoint(), max_distance=1.0)
+
+
+@settings(max_examples=25, deadline=None)
+@given(
+    seed=st.integers(0, 2**31),
+    step=st.sampled_from([0.0, 1e-4, 0.01, 0.3]),
+    num_channels=st.sampled_from([0, 2]),
+    max_distance=st.sampled_from([0.2, 0.5]),
+)
+def test_matches_that_are_followed_are_those_found_anew(seed, step, num_channels, max_distance):
+    """At every pose of a walk, of small steps and large, ties and points without a match among them."""
+    rng = np.random.default_rng(seed)
+    clouds = []
+    for size in (60, 50):
+        points = np.where(rng.random((size, 1)) < 0.5, rng.random((size, 3)), rng.integers(0, 3, (size, 3)) / 2)
+        valid = rng.random(size) < 0.9
+        clouds.append(Rows(points.T, rng.integers(0, 2, (size, num_channels)) * 0.1, valid))
+    limit = np.asarray(max_distance)
+    index, nearest = KDTreeSearch().index(clouds[1]), KDTreeSearch().follow(*clouds, limit)
+    pose = np.array([1.0, 0, 0, 0, 0, 0, 0])
+    for _ in range(8):
+        expected, found = index.nearest(pose, clouds[0], limit)[0], nearest(pose)
+        moved = clouds[0].points.T @ Rotation.from_quat(pose[[1, 2, 3, 0]]).as_matrix().T + pose[4:]
+        apart = np.linalg.norm(moved - clouds[1].points.T[np.maximum(found, 0)], axis=1)
+        # Beyond the gate there may be a match or none.
+        within = (expected >= 0) | ((found >= 0) & (apart <= max_distance))
+        np.testing.assert_array_equal(found[within], expected[within])
+        pose = pose + step * rng.normal(size=7) * [0.1, 0.1, 0.1, 0.1, 1, 1, 1]
+        pose[:4] /= np.linalg.norm(pose[:4])
+
+
+def test_a_pose_that_is_not_a_number_matches_nothing():
+    (source, target), _ = clouds()
+    rows = [Rows(cloud.points.T, np.zeros((len(cloud.valid), 0)), cloud.valid) for cloud in (source, target)]
+    nearest = KDTreeSearch().follow(*rows, np.asarray(1.0))
+    assert (nearest(np.full(7, np.nan)) == -1).all()
+    assert (nearest(np.array([1.0, 0, 0, 0, np.inf, 0, 0])) == -1).all()
+    assert (nearest(np.array([1.0, 0, 0, 0, 0, 0, 0])) >= 0).any()
