@@ -234,8 +234,10 @@ class _Job:
                     else:
                         yield problem
 
-            for key, state, history in run_problems(problems(), self.chosen_search(), self.settings["max_iterations"]):
-                yield _Outcome(key.index, registration_of(state.pose, state, history, key.source, key.target))
+            limit = self.settings["max_iterations"]
+            for key, state, assessed, history in run_problems(problems(), self.chosen_search(), limit):
+                result = registration_of(state.pose, state, assessed, history, key.source, key.target)
+                yield _Outcome(key.index, result)
             yield from rejected
 
 

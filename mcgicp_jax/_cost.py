@@ -223,16 +223,20 @@ def moments(pairs: Pairs) -> Moments:
     radius = jnp.sqrt(jnp.sum(p * p) / count)
     weighted = pairs.weight * pairs.information
     force = cov.multiply(weighted, pairs.residual)
-    x, y, z = p
-    h = jnp.stack([x, y, z, jnp.ones_like(x)])
-    hh = jnp.stack([x * x, x * y, x * z, x, y * y, y * z, y, z * z, z, jnp.ones_like(x)])
+    h = jnp.concatenate([p, jnp.ones_like(p[:1])])
     return Moments(
         center=center,
         radius=radius,
         e=jnp.sum(pairs.residual * force),
         G=jnp.dot(force, h.T, precision="highest"),
-        Q=jnp.dot(weighted, hh.T, precision="highest"),
+        Q=jnp.dot(weighted, powers(p).T, precision="highest"),
     )
+
+
+def powers(p: Float[Array, "3 N"]) -> Float[Array, "10 N"]:
+    """The upper triangle of h hᵀ with h = (p, 1)."""
+    x, y, z = p
+    return jnp.stack([x * x, x * y, x * z, x, y * y, y * z, y, z * z, z, jnp.ones_like(x)])
 
 
 def mahalanobis_cost(

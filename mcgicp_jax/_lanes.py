@@ -12,11 +12,11 @@ import numpy as np
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from jaxtyping import Array, Int
 
-from mcgicp_jax._loop import Carry, Problem, State, begin_lane, run_lanes
+from mcgicp_jax._loop import Assessment, Carry, Problem, State, assess_lanes, begin_lane, run_lanes
 from mcgicp_jax._search import AbstractSearch
 
 Key = TypeVar("Key")
-Ended: TypeAlias = tuple[Key, State, dict[str, np.ndarray]]
+Ended: TypeAlias = tuple[Key, State, Assessment, dict[str, np.ndarray]]
 
 # Of one device. On a CPU the lanes that wait for others cost as much as those that work.
 _LANES = 64
@@ -80,14 +80,17 @@ class _Group(Generic[Key]):
         carries = run_lanes(problems, carries, self._search, _STEPS)
         self._lanes = problems, carries
         # Not the matches: they stay where they are.
-        states, histories = jax.device_get((carries[0], carries[2]))
+        ended = np.asarray(carries[0].status) >= 0
+        if not any(ended[lane] and key is not None for lane, key in enumerate(self._keys)):
+            return
+        states, histories, assessments = jax.device_get((carries[0], carries[2], assess_lanes(problems, carries)))
         for lane, key in enumerate(self._keys):
-            if key is not None and states.status[lane] >= 0:
+            if key is not None and ended[lane]:
                 self._keys[lane] = None
-                state: State = jax.tree.map(lambda leaf, lane=lane: leaf[lane], states)
+                state, assessed = jax.tree.map(lambda leaf, lane=lane: leaf[lane], (states, assessments))
                 # Of the measurements that were made, one more than updates.
                 count = int(state.num_iterations) + 1
-                yield key, state, {name: values[lane, :count] for name, values in histories.items()}
+                yield key, state, assessed, {name: values[lane, :count] for name, values in histories.items()}
 
 
 def _put(lanes: tuple[Problem, Carry], lane: tuple[Problem, Carry], number: Int[Array, ""]) -> tuple[Problem, Carry]:

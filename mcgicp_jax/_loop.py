@@ -15,13 +15,22 @@ import jax
 import jax.numpy as jnp
 import jaxlie
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from mcgicp_jax._cost import AbstractKernel, Model, Moments, evaluate_pairs, moments, move_points
+from mcgicp_jax._evidence import Evidence
 from mcgicp_jax._methods import AbstractMethod, Surface
 from mcgicp_jax._result import Status
 from mcgicp_jax._search import AbstractSearch, Correspondences
-from mcgicp_jax._solve import information_at_source, move_pose, refine_pose, solve_update
+from mcgicp_jax._solve import adjoint_to_center, move_pose, refine_pose, solve_update
+from mcgicp_jax._uncertainty import (
+    Directions,
+    Felt,
+    directions_at_source,
+    estimate_covariance,
+    feel,
+    find_directions,
+)
 
 # The pose still moves; or its last update was below the tolerances, and one more measurement ends the loop.
 _RUNNING, _SETTLED = -1, -2
@@ -35,12 +44,14 @@ class Settings(eqx.Module):
     translation_tolerance: Float[Array, ""]
     rotation_tolerance: Float[Array, ""]
     max_iterations: Int[Array, ""]
+    hold_free_directions: Bool[Array, ""]
 
 
 class Measurement(eqx.Module):
-    """What one pass over the matched pairs finds at a pose."""
+    """What one pass over the matched pairs finds at a pose; `felt` is None for matches that were given."""
 
     moments: Moments
+    felt: Felt | None
     num_inliers: Int[Array, ""]
     cost: Float[Array, ""]
     rmse: Float[Array, ""]
@@ -55,6 +66,7 @@ class State(eqx.Module):
         num_iterations: updates so far.
         measured: at the pose before.
         information: (6, 6) at the pose before.
+        directions: at the pose before, about the centroid; None for matches that were given.
         record: one number per entry of `Registration.history`.
     """
 
@@ -63,14 +75,33 @@ class State(eqx.Module):
     num_iterations: Int[Array, ""]
     measured: Measurement
     information: Float[Array, "6 6"]
+    directions: Directions | None
     record: dict[str, Float[Array, ""]]
 
 
 Carry: TypeAlias = tuple[State, Correspondences, dict[str, Array]]
 # Finds pairs at a pose, or keeps those whose target rows are given, and weighs them.
 Match: TypeAlias = Callable[[jaxlie.SE3, Int[Array, ""], Array], tuple[Correspondences, Measurement]]
-# What the loop of `register` is about: start, source, target, method, robust kernel, settings.
-Problem: TypeAlias = tuple[jaxlie.SE3, Surface, Surface, AbstractMethod, AbstractKernel | None, Settings]
+# What the source and the target know of what holds a pose.
+Evidences: TypeAlias = tuple[Evidence, Evidence]
+# The covariance of a pose, (6, 6), and the directions that it could move in.
+Assessment: TypeAlias = tuple[Array, Directions | None]
+
+
+class Problem(eqx.Module):
+    """What the loop of `register` is about."""
+
+    start: jaxlie.SE3
+    source: Surface
+    target: Surface
+    method: AbstractMethod
+    robust: AbstractKernel | None
+    settings: Settings
+    evidence: Evidences
+
+    def model(self, matches: Correspondences) -> Model:
+        """All that weighs a pose, for these matches."""
+        return self.source, self.target, matches, self.method, self.robust, None
 
 
 def gate(
@@ -92,15 +123,17 @@ def gate(
 
 
 @jax.jit
-def measure(pose: jaxlie.SE3, model: Model) -> Measurement:
+def measure(pose: jaxlie.SE3, model: Model, evidence: Evidences | None) -> Measurement:
     """Weigh the matches at the pose: the only part of a step that touches the points."""
-    source = model[0]
+    source, _, matches, *_ = model
     rotation = pose.rotation().as_matrix().astype(source.points.dtype)
     pairs = evaluate_pairs(rotation, pose.translation(), *model)
+    found = moments(pairs)
     num_inliers = jnp.sum(jnp.any(pairs.valid.reshape(-1, source.valid.size), axis=0))
     square = pairs.share * jnp.sum(pairs.residual * pairs.residual, axis=0)
     return Measurement(
-        moments=moments(pairs),
+        moments=found,
+        felt=None if evidence is None else feel(pairs, found.center, evidence, rotation, matches.indices),
         num_inliers=num_inliers,
         cost=jnp.sum(pairs.cost),
         # 0/0 is NaN on purpose: no pairs are no fit.
@@ -110,16 +143,10 @@ def measure(pose: jaxlie.SE3, model: Model) -> Measurement:
 
 @jax.jit
 def match_and_measure(
-    pose: jaxlie.SE3,
-    indices: Int[Array, "N"] | Int[np.ndarray, "N"],
-    source: Surface,
-    target: Surface,
-    method: AbstractMethod,
-    robust: AbstractKernel | None,
-    settings: Settings,
+    pose: jaxlie.SE3, indices: Int[Array, "N"] | Int[np.ndarray, "N"], problem: Problem
 ) -> tuple[Correspondences, Measurement]:
-    matches = gate(pose, source, target, indices, settings.max_distance)
-    return matches, measure(pose, (source, target, matches, method, robust, None))
+    matches = gate(pose, problem.source, problem.target, indices, problem.settings.max_distance)
+    return matches, measure(pose, problem.model(matches), problem.evidence)
 
 
 @jax.jit
@@ -127,8 +154,16 @@ def update(
     pose: jaxlie.SE3, status: Int[Array, ""], num_iterations: Int[Array, ""], measured: Measurement, settings: Settings
 ) -> State:
     """Update the pose, unless it has come to rest. Compiled once, whatever the size of the clouds."""
+    radius = jnp.where(measured.moments.radius > 0, measured.moments.radius, 1)
+    directions, basis = None, jnp.eye(6, dtype=radius.dtype)
+    degenerate = jnp.bool_(False)
     with jax.default_matmul_precision("highest"):
-        change = solve_update(measured.moments)
+        if measured.felt is not None:
+            directions = find_directions(measured.felt, measured.moments.center, radius)
+            degenerate = ~jnp.all(directions.held)
+            # What nothing holds would follow the nearest neighbours' pull: it stays where the start has it.
+            basis = jnp.asarray(directions.twists).T * (directions.held | ~settings.hold_free_directions)
+        change = solve_update(measured.moments, radius, basis)
     moved = move_pose(pose, change.twist, measured.moments.center)
     settled = status == _SETTLED
     translation_step = jnp.linalg.norm(change.twist[:3])
@@ -138,7 +173,7 @@ def update(
     outcomes: tuple[tuple[Array, int], ...] = (
         (measured.num_inliers < _MIN_CORRESPONDENCES, Status.TOO_FEW_CORRESPONDENCES),
         (~finite, Status.NON_FINITE),
-        (settled & change.degenerate, Status.DEGENERATE),
+        (settled & (change.degenerate | degenerate), Status.DEGENERATE),
         (settled, Status.CONVERGED),
         (num_iterations >= settings.max_iterations, Status.MAX_ITERATIONS),
         (at_rest, _SETTLED),
@@ -152,34 +187,29 @@ def update(
         "translation_step": translation_step,
         "rotation_step": rotation_step,
     }
+    adjoint = adjoint_to_center(pose, measured.moments.center)
     return State(
         # The pose that all this was measured at is the one that is returned.
         pose=jaxlie.SE3(jnp.where(status < 0, moved.wxyz_xyz, pose.wxyz_xyz)),
         status=status,
         num_iterations=num_iterations + (status < 0),
         measured=measured,
-        information=information_at_source(change.information, pose, measured.moments.center),
+        information=adjoint.T @ change.information @ adjoint,
+        directions=directions,
         record=record,
     )
 
 
-def run_on_host(
-    pose: jaxlie.SE3,
-    source: Surface,
-    target: Surface,
-    method: AbstractMethod,
-    robust: AbstractKernel | None,
-    settings: Settings,
-    search: AbstractSearch,
-) -> tuple[State, Correspondences, dict[str, np.ndarray]]:
+def run_on_host(problem: Problem, search: AbstractSearch) -> tuple[State, Correspondences, dict[str, np.ndarray]]:
     """The loop for concrete inputs: matches from the host's tree between compiled steps."""
-    nearest = search.follow(source.rows, target.rows, settings.max_distance)
+    pose, settings = problem.start, problem.settings
+    nearest = search.follow(problem.source.rows, problem.target.rows, settings.max_distance)
     status, num_iterations = np.asarray(_RUNNING, np.int32), np.asarray(0, np.int32)
     records = []
     while status < 0:
         if status == _RUNNING:
             indices = nearest(pose.wxyz_xyz)
-        matches, measured = match_and_measure(pose, indices, source, target, method, robust, settings)
+        matches, measured = match_and_measure(pose, indices, problem)
         state = update(pose, status, num_iterations, measured, settings)
         pose, num_iterations = state.pose, state.num_iterations
         # As a number of the host's: comparing arrays would be a program of its own, each time.
@@ -229,32 +259,20 @@ def _while_loop(
 
 
 @partial(jax.jit, static_argnames="max_iterations")
-def run_traced(
-    start: jaxlie.SE3,
-    source: Surface,
-    target: Surface,
-    method: AbstractMethod,
-    robust: AbstractKernel | None,
-    settings: Settings,
-    search: AbstractSearch,
-    max_iterations: int,
-) -> Carry:
+def run_traced(problem: Problem, search: AbstractSearch, max_iterations: int) -> Carry:
     """The loop of `register` for traced inputs; pose and matches are constants to autodiff."""
-    match = _matching((start, source, target, method, robust, settings), search)
-    return _while_loop(start, match, source.valid.shape, settings, max_iterations)
+    shape = problem.source.valid.shape
+    return _while_loop(problem.start, _matching(problem, search), shape, problem.settings, max_iterations)
 
 
 def _matching(problem: Problem, search: AbstractSearch) -> Match:
-    _, source, target, method, robust, settings = problem
-
     def match(
         pose: jaxlie.SE3, status: Int[Array, ""], indices: Int[Array, "N"]
     ) -> tuple[Correspondences, Measurement]:
         running = status == _RUNNING
-        rows = source.rows, target.rows
-        found = search.nearest_traced(pose.wxyz_xyz, *rows, settings.max_distance, running)[0]
-        indices = jnp.where(running, found, indices)
-        return match_and_measure(pose, indices, source, target, method, robust, settings)
+        rows = problem.source.rows, problem.target.rows
+        found = search.nearest_traced(pose.wxyz_xyz, *rows, problem.settings.max_distance, running)[0]
+        return match_and_measure(pose, jnp.where(running, found, indices), problem)
 
     return match
 
@@ -262,8 +280,8 @@ def _matching(problem: Problem, search: AbstractSearch) -> Match:
 @partial(jax.jit, static_argnames="max_iterations")
 def begin_lane(problem: Problem, search: AbstractSearch, max_iterations: int) -> Carry:
     """The loop of `register` before its first step."""
-    start, source, *_, settings = problem
-    return _begin(start, _matching(problem, search), source.valid.shape, settings, max_iterations)
+    shape = problem.source.valid.shape
+    return _begin(problem.start, _matching(problem, search), shape, problem.settings, max_iterations)
 
 
 @partial(jax.jit, static_argnames="num_steps")
@@ -271,7 +289,7 @@ def run_lanes(problems: Problem, carries: Carry, search: AbstractSearch, num_ste
     """Some steps of many loops at once, whose arrays are stacked; those that have ended stay as they are."""
 
     def run(problem: Problem, carry: Carry) -> Carry:
-        step = partial(_step, match=_matching(problem, search), settings=problem[-1])
+        step = partial(_step, match=_matching(problem, search), settings=problem.settings)
         return jax.lax.while_loop(
             lambda counted: (counted[0][0].status < 0) & (counted[1] < num_steps),
             lambda counted: (step(counted[0]), counted[1] + 1),
@@ -279,6 +297,15 @@ def run_lanes(problems: Problem, carries: Carry, search: AbstractSearch, num_ste
         )[0]
 
     return jax.vmap(run)(problems, carries)
+
+
+@jax.jit
+def assess_lanes(problems: Problem, carries: Carry) -> Assessment:
+    def of_lane(problem: Problem, carry: Carry) -> Assessment:
+        state, matches, _ = carry
+        return assess(state, problem.model(matches), problem.evidence)
+
+    return jax.vmap(of_lane)(problems, carries)
 
 
 @partial(jax.jit, static_argnames="max_iterations")
@@ -290,7 +317,7 @@ def align_traced(
     matches = constants[2]
 
     def match(pose: jaxlie.SE3, status: Int[Array, ""], indices: Array) -> tuple[Correspondences, Measurement]:
-        return matches, measure(pose, constants)
+        return matches, measure(pose, constants, None)
 
     state, _, history = _while_loop(start, match, matches.indices.shape, settings, max_iterations)
     return refine(state, model), state, history
@@ -300,5 +327,24 @@ def align_traced(
 def refine(state: State, model: Model) -> jaxlie.SE3:
     """The pose of a loop that has ended, with the gradient of the answer."""
     usable = (state.status == Status.CONVERGED) | (state.status == Status.MAX_ITERATIONS)
+    if state.directions is not None:
+        # The root of g would slide along a direction that the loop has left alone.
+        usable = usable & jnp.all(state.directions.held)
     with jax.default_matmul_precision("highest"):
         return refine_pose(state.pose, usable, state.measured.moments, model)
+
+
+@jax.jit
+def assess(state: State, model: Model, evidence: Evidences | None) -> tuple[Float[Array, "6 6"], Directions | None]:
+    """Of a loop that has ended: the covariance of its pose, NaN where there is none to be had, and the directions."""
+    state, model = jax.lax.stop_gradient((state, model))
+    directions, measured = state.directions, state.measured.moments
+    radius = jnp.where(measured.radius > 0, measured.radius, 1)
+    found = (state.status != Status.TOO_FEW_CORRESPONDENCES) & (state.status != Status.NON_FINITE)
+    if directions is None:
+        found = found & (state.status != Status.DEGENERATE)
+    with jax.default_matmul_precision("highest"):
+        covariance = estimate_covariance(state.pose, measured.center, radius, directions, model, evidence)
+        if directions is not None:
+            directions = directions_at_source(directions, state.pose)
+    return jnp.where(found, covariance, jnp.nan), directions

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import jaxlie
@@ -14,7 +15,19 @@ from jaxtyping import Array, Int
 from mcgicp_jax._cloud import PointCloud, Values
 from mcgicp_jax._cost import AbstractKernel, centred_pose, check_matches
 from mcgicp_jax._dense import default_search
-from mcgicp_jax._loop import Problem, Settings, State, align_traced, gate, refine, run_on_host, run_traced
+from mcgicp_jax._evidence import find_evidence
+from mcgicp_jax._loop import (
+    Assessment,
+    Problem,
+    Settings,
+    State,
+    align_traced,
+    assess,
+    gate,
+    refine,
+    run_on_host,
+    run_traced,
+)
 from mcgicp_jax._methods import AbstractMethod, Surface, prepare
 from mcgicp_jax._pose import Pose, is_concrete, pose_matrix, se3_from_matrix
 from mcgicp_jax._preprocess import preprocess
@@ -119,7 +132,7 @@ def align(
     softness = None if temperature is None else jnp.asarray(temperature, dtype)
     model = (source_surface, target_surface, matches, method, robust, softness)
     pose, state, history = align_traced(start, model, settings, max_iterations)
-    return registration_of(pose, state, history, source, target)
+    return registration_of(pose, state, assess(state, model, None), history, source, target)
 
 
 def register(
@@ -134,6 +147,7 @@ def register(
     rotation_tolerance: ArrayLike = ROTATION_TOLERANCE,
     robust: AbstractKernel | None = None,
     search: AbstractSearch | None = None,
+    hold_free_directions: bool = True,
 ) -> Registration:
     """Register two clouds: find matches, update the pose, repeat until it rests.
 
@@ -151,6 +165,9 @@ def register(
             below both is the last.
         robust: kernel of each pair's Mahalanobis distance: `Huber`, `Cauchy`, `GemanMcClure`, `Tukey`.
         search: how matches are found; by default SciPy's k-d tree, on an accelerator `DenseSearch`.
+        hold_free_directions: leave the pose where `init` has it in the directions that nothing holds, neither the shape
+            of the clouds nor, for the methods that use them, their channels. If False it goes where the nearest
+            neighbours pull it. The status is DEGENERATE either way.
 
     Returns:
         The pose and how it ended: see `Registration`; check `converged`.
@@ -161,19 +178,19 @@ def register(
     check_settings(method, max_distance, max_iterations, translation_tolerance, rotation_tolerance)
     source, target = _ready("source", source), _ready("target", target)
     problem = pose_problem(
-        source, target, method, init, max_distance, max_iterations, translation_tolerance, rotation_tolerance, robust
+        *(source, target, method, init, max_distance, max_iterations),
+        *(translation_tolerance, rotation_tolerance, robust, hold_free_directions),
     )
     search = search or default_search()
     constants = jax.lax.stop_gradient(problem)
-    differentiable = _, _, method, robust = problem[1:5]
+    differentiable = problem.source, problem.target, problem.method, problem.robust
     if is_concrete(constants):
-        state, matches, history = run_on_host(*constants, search)
+        state, matches, history = run_on_host(constants, search)
     else:
-        state, matches, history = run_traced(*constants, search, max_iterations)
-    if is_concrete(differentiable):
-        return registration_of(state.pose, state, history, source, target)
-    pose = refine(state, (*problem[1:3], matches, method, robust, None))
-    return registration_of(pose, state, history, source, target)
+        state, matches, history = run_traced(constants, search, max_iterations)
+    model = problem.model(matches)
+    pose = state.pose if is_concrete(differentiable) else refine(state, model)
+    return registration_of(pose, state, assess(state, model, problem.evidence), history, source, target)
 
 
 def pose_problem(
@@ -186,13 +203,22 @@ def pose_problem(
     translation_tolerance: ArrayLike,
     rotation_tolerance: ArrayLike,
     robust: AbstractKernel | None,
+    hold_free_directions: bool = True,
 ) -> Problem:
     """What the loop of `register` is about, for prepared clouds."""
     method, source_surface, target_surface = _surfaces(source, target, method)
     dtype = source_surface.points.dtype
-    start = se3_from_matrix(centred_pose(pose_matrix(init), source, target), dtype)
-    settings = _settings(max_distance, translation_tolerance, rotation_tolerance, max_iterations, dtype)
-    return start, source_surface, target_surface, method, robust, settings
+    return Problem(
+        start=se3_from_matrix(centred_pose(pose_matrix(init), source, target), dtype),
+        source=source_surface,
+        target=target_surface,
+        method=method,
+        robust=robust,
+        settings=_settings(
+            max_distance, translation_tolerance, rotation_tolerance, max_iterations, dtype, hold_free_directions
+        ),
+        evidence=(find_evidence(method, source), find_evidence(method, target)),
+    )
 
 
 def _ready(name: str, cloud: PointCloud | Values) -> PointCloud:
@@ -234,36 +260,51 @@ def _settings(
     rotation_tolerance: ArrayLike,
     max_iterations: int,
     dtype: DTypeLike,
+    hold_free_directions: bool = False,
 ) -> Settings:
     return Settings(
         max_distance=jnp.asarray(max_distance, dtype),
         translation_tolerance=jnp.asarray(translation_tolerance, dtype),
         rotation_tolerance=jnp.asarray(rotation_tolerance, dtype),
         max_iterations=jnp.int32(max_iterations),
+        hold_free_directions=jnp.bool_(hold_free_directions),
     )
 
 
 def registration_of(
-    pose: jaxlie.SE3, state: State, history: dict[str, Any], source: PointCloud, target: PointCloud
+    pose: jaxlie.SE3,
+    state: State,
+    assessed: Assessment,
+    history: dict[str, Any],
+    source: PointCloud,
+    target: PointCloud,
 ) -> Registration:
     """The result in the user's frames; NumPy where everything is concrete."""
     matrix = pose_in_user_frame(pose, source.origin, target.origin)
     measured = state.measured
+    covariance, directions = assessed
     numbers: Any = {
         "status_code": state.status,
         "num_iterations": state.num_iterations,
         "num_inliers": measured.num_inliers,
         "cost": measured.cost,
         "rmse": measured.rmse,
+        "overlap": measured.num_inliers / jnp.sum(jnp.asarray(source.valid)),
         "information": state.information,
+        "covariance": covariance,
+        "directions": directions,
         "history": history,
     }
     if is_concrete(numbers):
         # NumPy's scalars, rather than arrays without dimensions, print as numbers.
         numbers = jax.tree.map(lambda number: np.asarray(number)[()], numbers)
     if not is_concrete(source.origin) or np.any(source.origin):
-        adjoint = _translation_adjoint(-source.origin)
-        numbers["information"] = adjoint.T @ numbers["information"] @ adjoint
+        to_centred, from_centred = _translation_adjoint(-source.origin), _translation_adjoint(source.origin)
+        numbers["information"] = to_centred.T @ numbers["information"] @ to_centred
+        numbers["covariance"] = from_centred @ numbers["covariance"] @ from_centred.T
+        if directions is not None:
+            moved = numbers["directions"].twists @ from_centred.T, numbers["directions"].center + source.origin
+            numbers["directions"] = eqx.tree_at(lambda d: (d.twists, d.center), numbers["directions"], moved)
     return Registration(
         T_target_source=se3_from_matrix(matrix, pose.wxyz_xyz.dtype),
         source_origin=source.origin,

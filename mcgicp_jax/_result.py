@@ -12,7 +12,9 @@ import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float, Int
 
+from mcgicp_jax._directions import FreeDirection, describe, free_directions
 from mcgicp_jax._pose import is_concrete, rotation_from_quaternion
+from mcgicp_jax._uncertainty import Directions
 
 
 class Status(enum.IntEnum):
@@ -25,7 +27,8 @@ class Status(enum.IntEnum):
     TOO_FEW_CORRESPONDENCES = 2
     """Fewer than four source points have a match within `max_distance`: no overlap, or a start too far away."""
     DEGENERATE = 3
-    """The pose came to rest, but the pairs leave at least one direction free; it is where the start had it."""
+    """The pose came to rest, but nothing holds at least one direction: see `Registration.free_directions`. There it is
+    where the start had it, unless `hold_free_directions` was off."""
     NON_FINITE = 4
     """The numbers overflowed or became NaN."""
     INVALID_INPUT = 5
@@ -49,9 +52,18 @@ class Registration(eqx.Module):
         num_inliers: pairs within `max_distance`.
         cost: Σ ρ(dᵀ M d) over them.
         rmse: root mean square distance of the pairs, metres; mostly the spacing of the points. NaN without pairs.
+        overlap: share of the source points that have a match, 0 to 1; the others are rejected, as too far away. Little
+            overlap, or a share below what is known of the scene, is the one sign that a wrong minimum gives of itself.
         information: (6, 6) Σ Jᵀ M J for the twist ξ = (v, ω) of T exp(ξ), metres and radians, in the source's frame.
             It weighs directions against each other; its scale is that of GICP's relative covariances, so its inverse
             is *not* a covariance of the pose.
+        covariance: (6, 6) of ξ, in the same order and frame, estimated from how the pairs disagree (see
+            `_uncertainty.estimate_covariance`). It covers the noise and the sampling of the points. It does not know of
+            a wrong minimum, of errors that all points share (calibration, motion during a scan), or of things that
+            moved. A direction that nothing holds has a standard deviation of 1000 times the radius of the cloud. NaN
+            where there is no pose, or too few pairs to tell.
+        directions: six directions and what holds each, see `free_directions`; None from `align`, whose matches are
+            given.
         history: before each update, and last at the returned pose: "cost", "rmse", "num_inliers", and the length of
             the update from there, "translation_step" (metres, at the centroid of the pairs) and "rotation_step"
             (radians). Inside a transformation the length is fixed, and NaN fills what was not needed.
@@ -65,7 +77,10 @@ class Registration(eqx.Module):
     num_inliers: Int[ArrayLike, "*batch"]
     cost: Float[ArrayLike, "*batch"]
     rmse: Float[ArrayLike, "*batch"]
+    overlap: Float[ArrayLike, "*batch"]
     information: Float[Array, "*batch 6 6"] | Float[np.ndarray, "*batch 6 6"]
+    covariance: Float[Array, "*batch 6 6"] | Float[np.ndarray, "*batch 6 6"]
+    directions: Directions | None
     history: dict[str, Any]
     source_origin: Float[Array, "*batch 3"] | Float[np.ndarray, "*batch 3"]
     target_origin: Float[Array, "*batch 3"] | Float[np.ndarray, "*batch 3"]
@@ -83,7 +98,10 @@ class Registration(eqx.Module):
             num_inliers=np.int32(0),
             cost=nan,
             rmse=nan,
+            overlap=np.float64(0),
             information=np.zeros((6, 6)),
+            covariance=np.full((6, 6), np.nan),
+            directions=None,
             history={},
             source_origin=np.zeros(3),
             target_origin=np.zeros(3),
@@ -107,14 +125,35 @@ class Registration(eqx.Module):
         """T_target_source as (4, 4); float64 NumPy outside a transformation, with all digits at large coordinates."""
         return pose_in_user_frame(self.centred, self.source_origin, self.target_origin)
 
+    @property
+    def free_directions(self) -> tuple[FreeDirection, ...]:
+        """The directions in which the shape of the clouds lets the pose slide, and whether the channels hold it.
+
+        Empty where geometry holds all six, and for `align`. For one registration outside of transformations; inside,
+        and for a batch, use `directions`.
+        """
+        if not is_concrete(self.directions) or np.ndim(self.status_code):
+            raise ValueError("free_directions: expected a single registration outside of jit; use directions")
+        if self.directions is None or self.status in (Status.TOO_FEW_CORRESPONDENCES, Status.NON_FINITE):
+            return ()
+        return free_directions(self.directions)
+
     def __repr__(self) -> str:
         if not is_concrete(self) or np.ndim(self.status_code):
             return f"Registration(batch of shape {np.shape(self.status_code)})"
-        translation = np.array2string(np.asarray(self.matrix)[:3, 3], precision=4, suppress_small=True)
+        if np.any(self.source_origin):
+            # Far from zero, the translation says little: it is the motion of a point that is nowhere near.
+            origin = np.append(self.source_origin, 1)
+            moved, where = (np.asarray(self.matrix) @ origin - origin)[:3], "of the source's origin "
+        else:
+            moved, where = np.asarray(self.matrix)[:3, 3], ""
+        translation = np.array2string(moved, precision=4, suppress_small=True)
         angle = np.degrees(float(jnp.linalg.norm(self.centred.rotation().log())))
+        free = describe(self.free_directions)
         return (
-            f"Registration({self.status.name}: translation {translation} m, rotation {angle:.3f}°, "
-            f"{self.num_iterations} iterations, {self.num_inliers} inliers, rmse {np.asarray(self.rmse):.4g} m)"
+            f"Registration({self.status.name}: translation {where}{translation} m, rotation {angle:.3f}°, "
+            f"{self.num_iterations} iterations, {self.num_inliers} inliers ({self.overlap:.0%}), "
+            f"rmse {np.asarray(self.rmse):.4g} m{'; ' if free else ''}{free})"
         )
 
 

@@ -54,49 +54,67 @@ class Update(eqx.Module):
     degenerate: Bool[Array, ""]
 
 
-def solve_update(moments: Moments) -> Update:
+def solve_update(moments: Moments, radius: Float[Array, ""], basis: Float[Array, "6 6"]) -> Update:
     """Minimise Σ w (d − D h)ᵀ M (d − D h) over the change of pose, M held, to full convergence.
 
     Levenberg-Marquardt on 13 residuals, a square root of the (13, 13) quadratic form in (D, 1): its cost does not
     depend on the number of points. Lengths are measured in units of the points' radius, so that translations and
     rotations, millimetres and kilometres, weigh alike.
+
+    Args:
+        radius: metres; `Moments.radius`, and 1 where that is 0.
+        basis: the twists, in units of the radius, that the pose may move along: columns; those to be held are zero.
     """
     dtype = moments.e.dtype
     eps = float(jnp.finfo(dtype).eps)
-    radius = jnp.where(moments.radius > 0, moments.radius, 1)
     form = _quadratic_form(moments, radius)
-    tangent = jnp.asarray(_TANGENT, dtype)
-    unit_information = tangent.T @ form[:12, :12] @ tangent
+    unit_information = twist_form(moments.Q, radius)
     trace = jnp.trace(unit_information)
     scale = _HESSIAN_SCALE / jnp.where(trace > 0, trace / 6, 1)
     root, _ = _semidefinite_root(form * scale)
     # optimistix computes its step sizes in the default precision, and wants no other beside it.
-    root = root.astype(float)
+    root, columns = root.astype(float), basis.astype(float)
     tolerance = 4 * float(jnp.finfo(root.dtype).eps)
     solver: optx.LevenbergMarquardt = optx.LevenbergMarquardt(
         rtol=tolerance, atol=tolerance, linear_solver=lx.Normal(lx.Cholesky())
     )
     solution: optx.Solution = optx.least_squares(
-        _residuals, solver, jnp.zeros(6), root, max_steps=_MAX_STEPS, throw=False
+        _residuals, solver, jnp.zeros(6), (root, columns), max_steps=_MAX_STEPS, throw=False
     )
     _, pivots = _semidefinite_root(unit_information)
-    units = _units(radius)
+    metres = units(radius)
     return Update(
-        twist=solution.value.astype(dtype) * units,
-        information=unit_information * radius**2 / (units[:, None] * units),
+        twist=(basis @ solution.value.astype(dtype)) * metres,
+        information=unit_information * radius**2 / (metres[:, None] * metres),
         degenerate=~jnp.all(pivots > 64 * eps * jnp.max(jnp.diagonal(unit_information))),
     )
 
 
 def _quadratic_form(moments: Moments, radius: Float[Array, ""]) -> Float[Array, "13 13"]:
     """The form in (vec D, 1), lengths in units of the radius; M keeps its unit."""
-    units = jnp.stack([1 / radius, 1 / radius, 1 / radius, jnp.ones_like(radius)])
+    quadratic, lengths = _unit_quadratic(moments.Q, radius), _unit_lengths(radius)
+    linear = (moments.G * lengths / radius).reshape(12)
+    constant = moments.e / radius**2
+    return jnp.block([[quadratic, -linear[:, None]], [-linear[None, :], constant[None, None]]])
+
+
+def _unit_quadratic(moments: Float[Array, "6 10"], radius: Float[Array, ""]) -> Float[Array, "12 12"]:
+    lengths = _unit_lengths(radius)
     rows = jnp.asarray(_SYMMETRIC_3)[:, None, :, None]
     columns = jnp.asarray(_SYMMETRIC_4)[None, :, None, :]
-    quadratic = moments.Q[rows, columns] * units[None, :, None, None] * units[None, None, None, :]
-    linear = (moments.G * units / radius).reshape(12)
-    constant = moments.e / radius**2
-    return jnp.block([[quadratic.reshape(12, 12), -linear[:, None]], [-linear[None, :], constant[None, None]]])
+    quadratic = moments[rows, columns] * lengths[None, :, None, None] * lengths[None, None, None, :]
+    return quadratic.reshape(12, 12)
+
+
+def _unit_lengths(radius: Float[Array, ""]) -> Float[Array, "4"]:
+    """What h = (p, 1) is divided by: lengths in units of the radius."""
+    return jnp.stack([1 / radius, 1 / radius, 1 / radius, jnp.ones_like(radius)])
+
+
+def twist_form(moments: Float[Array, "6 10"], radius: Float[Array, ""]) -> Float[Array, "6 6"]:
+    """Σ w JᵀKJ from the moments Σ w K ⊗ h hᵀ of any symmetric K, for twists with lengths in units of the radius."""
+    tangent = jnp.asarray(_TANGENT, moments.dtype)
+    return tangent.T @ _unit_quadratic(moments, radius) @ tangent
 
 
 def _semidefinite_root(form: Float[Array, "D D"]) -> tuple[Float[Array, "D D"], Float[Array, "D"]]:
@@ -121,7 +139,9 @@ def _semidefinite_root(form: Float[Array, "D D"]) -> tuple[Float[Array, "D D"], 
     return root, pivots
 
 
-def _residuals(twist: Float[Array, "6"], root: Float[Array, "13 13"]) -> Float[Array, "13"]:
+def _residuals(along: Float[Array, "6"], args: tuple[Float[Array, "13 13"], Float[Array, "6 6"]]) -> Float[Array, "13"]:
+    root, basis = args
+    twist = basis @ along
     rotation = _rotation(twist) - jnp.eye(3, dtype=twist.dtype)
     change = jnp.concatenate([rotation, twist[:3, None]], axis=1)
     return root.T @ jnp.append(change.reshape(12), 1)
@@ -139,14 +159,16 @@ def move_pose(pose: jaxlie.SE3, twist: Float[Array, "6"], center: Float[Array, "
     return cast_pose(jaxlie.SE3.from_rotation_and_translation(rotation, translation), pose.wxyz_xyz.dtype)
 
 
-def information_at_source(
-    information: Float[Array, "6 6"], pose: jaxlie.SE3, center: Float[Array, "3"]
-) -> Float[Array, "6 6"]:
-    """From the twist about the centre in the target's frame to ξ of T exp(ξ), the twist of the source's frame."""
-    identity = jaxlie.SO3.identity()
-    to_center = jaxlie.SE3.from_rotation_and_translation(identity, -center) @ pose
-    adjoint = to_center.adjoint().astype(information.dtype)
-    return adjoint.T @ information @ adjoint
+def adjoint_to_center(pose: jaxlie.SE3, center: Float[Array, "3"]) -> Float[Array, "6 6"]:
+    """From ξ of T exp(ξ), the twist of the source's frame, to the twist about the centre in the target's frame."""
+    to_center = jaxlie.SE3.from_rotation_and_translation(jaxlie.SO3.identity(), -center) @ pose
+    return to_center.adjoint().astype(pose.wxyz_xyz.dtype)
+
+
+def adjoint_to_source(pose: jaxlie.SE3, center: Float[Array, "3"]) -> Float[Array, "6 6"]:
+    """The way back."""
+    to_center = jaxlie.SE3.from_rotation_and_translation(jaxlie.SO3.identity(), -center) @ pose
+    return to_center.inverse().adjoint().astype(pose.wxyz_xyz.dtype)
 
 
 def balance(
@@ -158,7 +180,7 @@ def balance(
     follow from g with the dependence of M and of the weights on the pose kept.
     """
     pose, center, radius, model = args
-    moved = move_pose(pose, twist * _units(radius), center)
+    moved = move_pose(pose, twist * units(radius), center)
     rotation = moved.rotation().as_matrix().astype(twist.dtype)
     pairs = evaluate_pairs(rotation, moved.translation(), *model)
     force = pairs.weight * cov.multiply(pairs.information, pairs.residual)
@@ -166,7 +188,7 @@ def balance(
     return jnp.concatenate([jnp.sum(force, axis=1) * radius, jnp.sum(torque, axis=1)])
 
 
-def _units(radius: Float[Array, ""]) -> Float[Array, "6"]:
+def units(radius: Float[Array, ""]) -> Float[Array, "6"]:
     """Metres and radians of a twist whose lengths are in units of the radius."""
     return jnp.stack([radius] * 3 + [jnp.ones_like(radius)] * 3)
 
@@ -195,7 +217,7 @@ def refine_pose(pose: jaxlie.SE3, usable: Bool[Array, ""], moments: Moments, mod
         max_steps=_MAX_NEWTON_STEPS,
         throw=False,
     )
-    refined = move_pose(start, solution.value * _units(radius), center)
+    refined = move_pose(start, solution.value * units(radius), center)
     return jaxlie.SE3(jnp.where(usable, refined.wxyz_xyz, pose.wxyz_xyz))
 
 

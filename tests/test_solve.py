@@ -43,7 +43,7 @@ def solve(moved, residual, information, weight, valid):
         share=jnp.asarray(valid, float),
     )
     measured = jax.jit(moments)(pairs)
-    return measured, jax.jit(_solve.solve_update)(measured)
+    return measured, jax.jit(_solve.solve_update)(measured, measured.radius, jnp.eye(6))
 
 
 def whitened(twist, moved, residual, information, weight, center):

@@ -1,0 +1,120 @@
+"""Whether the covariance of a pose can be believed: errors of simulated registrations beside what was claimed.
+
+    python -m tests.benchmarks.calibration [--pairs 84]
+
+Three scenes with exact truth (a furnished room, a street, a wall of posters), two noise levels, fresh rays and noise
+for every pair. Printed is the normalised estimation error squared per degree of freedom, eᵀ C⁻¹ e / d, averaged over
+the pairs: 1 where the claims are right, above where they are too bold, below where they are too modest. d counts the
+directions that are held. Beside `Registration.covariance` stand those of the same poses by the inverse Hessian: bare,
+scaled by the variance of the residuals, and small_gicp's for the same clouds.
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Callable
+
+import numpy as np
+import small_gicp
+
+import mcgicp_jax as mcg
+from mcgicp_jax import datasets
+from mcgicp_jax._uncertainty import Directions
+
+
+def box_room(noise: float) -> datasets.SyntheticFrames:
+    return datasets.box_room(2, points_per_frame=5000, noise=noise)
+
+
+def street(noise: float) -> datasets.SyntheticFrames:
+    return datasets.street(2, points_per_frame=12_000, noise=noise)
+
+
+def wall(noise: float) -> datasets.SyntheticFrames:
+    return datasets.poster_wall(2, noise=noise)
+
+
+# Scene, largest distance of a pair in metres
+SCENES: dict[str, tuple[Callable[[float], datasets.SyntheticFrames], float]] = {
+    "box room": (box_room, 0.5),
+    "street": (street, 1.5),
+    "poster wall": (wall, 0.08),
+}
+METHODS = {"GICP": mcg.GICP(), "MC-GICP": mcg.MultiChannelGICP()}
+
+
+def twist_error(matrix: np.ndarray, truth: np.ndarray) -> np.ndarray:
+    """ξ in T = T_true exp(ξ), to first order."""
+    left = np.linalg.inv(truth) @ matrix
+    rotation = left[:3, :3]
+    omega = 0.5 * np.array(
+        [rotation[2, 1] - rotation[1, 2], rotation[0, 2] - rotation[2, 0], rotation[1, 0] - rotation[0, 1]]
+    )
+    return np.append(left[:3, 3], omega)
+
+
+def normalised(error: np.ndarray, covariance: np.ndarray, directions: Directions) -> float:
+    """eᵀ C⁻¹ e / d among the directions that are held."""
+    coefficients = np.linalg.inv(np.asarray(directions.twists, np.float64).T)[np.asarray(directions.held)]
+    error, covariance = coefficients @ error, coefficients @ covariance @ coefficients.T
+    return float(error @ np.linalg.solve(covariance, error) / len(error))
+
+
+def peers_hessian(
+    source: np.ndarray, target: np.ndarray, truth: np.ndarray, max_distance: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """small_gicp's error and H⁻¹ in the same twist, ξ = (v, ω)."""
+    clouds = [small_gicp.preprocess_points(points, 0.001, num_neighbors=20)[0] for points in (target, source)]
+    tree = small_gicp.KdTree(clouds[0])
+    result = small_gicp.align(
+        *clouds, tree, init_T_target_source=truth, registration_type="GICP", max_correspondence_distance=max_distance
+    )
+    # Its twist is (ω, v).
+    order = [3, 4, 5, 0, 1, 2]
+    return twist_error(result.T_target_source, truth), np.linalg.inv(result.H[np.ix_(order, order)])
+
+
+def calibrate(scene: str, noise: float, pairs: int) -> dict[str, list[float]]:
+    make, max_distance = SCENES[scene]
+    frames = make(noise)
+    claims: dict[str, list[float]] = {}
+    for seed in range(pairs):
+        target, source = (frames.observe(i, noise_seed=2 * seed + i) for i in (0, 1))
+        truth = np.linalg.inv(target.pose) @ source.pose
+        clouds = [mcg.preprocess(frame.cloud) for frame in (source, target)]
+        for name, method in METHODS.items():
+            result = mcg.register(*clouds, method, init=truth, max_distance=max_distance)
+            error = twist_error(result.matrix, truth)
+            held = result.directions
+            variance = float(result.cost) / (3 * int(result.num_inliers))
+            inverse = np.linalg.pinv(np.asarray(result.information, np.float64))
+            claims.setdefault(f"{name} covariance", []).append(normalised(error, np.asarray(result.covariance), held))
+            claims.setdefault(f"{name} H⁻¹", []).append(normalised(error, inverse, held))
+            claims.setdefault(f"{name} σ² H⁻¹", []).append(normalised(error, variance * inverse, held))
+            claims.setdefault(f"{name} held", []).append(np.sum(held.held))
+            if name == "GICP":
+                raw = [np.asarray(frame.cloud.points, np.float64) for frame in (source, target)]
+                error, inverse = peers_hessian(*raw, truth, max_distance)
+                claims.setdefault("small_gicp H⁻¹", []).append(normalised(error, inverse, held))
+    return claims
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--pairs", type=int, default=84, help="per scene and noise level")
+    parser.add_argument("--scenes", nargs="*", default=list(SCENES))
+    arguments = parser.parse_args()
+    columns: list[str] = []
+    for scene in arguments.scenes:
+        for noise in (1.0, 2.0):
+            claims = calibrate(scene, noise, arguments.pairs)
+            if not columns:
+                columns = list(claims)
+                print("| scene | noise | pairs | " + " | ".join(columns) + " |")
+                print("|---" * (len(columns) + 3) + "|")
+            means = " | ".join(f"{np.mean(claims[name]):.2f}" for name in columns)
+            print(f"| {scene} | {noise:g} | {arguments.pairs} | {means} |", flush=True)
+
+
+if __name__ == "__main__":
+    main()
