@@ -216,7 +216,7 @@ def _order(rows: Sequence[_Row], errors: Sequence[_Errors]) -> str:
 def _figure_1(output: Path) -> Iterator[str]:
     (frame,) = datasets.poster_wall(1, points_per_frame=_FINE_POINTS)
     cloud = mcg.preprocess(frame.cloud, num_neighbors=40)
-    drawn = _spread(np.asarray(cloud.points)[np.asarray(cloud.valid), :2], 0.08)
+    drawn = _spread(np.asarray(cloud.points)[np.asarray(cloud.valid), :2], 0.06)
     methods = {"GICP": mcg.GICP(), "MC-GICP, colour": mcg.MultiChannelGICP()}
     covariances = {
         name: cov.matrix_from_symmetric(prepare(method.resolve(cloud, cloud), cloud).covariance)
