@@ -80,6 +80,7 @@ def kitti_folder(tmp_path):
 
 
 def test_kitti_points_get_the_color_of_their_pixel(kitti_folder):
+    (kitti_folder / "velodyne" / "of no number.bin").touch()
     frames = kitti(kitti_folder)
     assert len(frames) == 2
     cloud = frames[0].cloud
@@ -112,6 +113,10 @@ def test_what_is_no_kitti_sequence_is_refused_by_name(kitti_folder, tmp_path):
         kitti(tmp_path / "nowhere")
     (kitti_folder / "calib.txt").write_text("P2: 1 2 3\n")
     with pytest.raises(ValueError, match=r"calib.txt: expected a line P2: with 12 numbers, found none"):
+        kitti(kitti_folder)
+    (kitti_folder / "times.txt").write_text("0.1\nlater\n")
+    (kitti_folder / "calib.txt").write_text(f"P2: {' 1' * 12}\nTr: {' 1' * 12}\ncalib_time: 09-Jan-2012\n")
+    with pytest.raises(ValueError, match=r"times.txt: expected a number of seconds"):
         kitti(kitti_folder)
     (kitti_folder / "calib.txt").unlink()
     with pytest.raises(FileNotFoundError, match=r"calib.txt"):

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import collections
+import itertools
 import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -75,27 +77,35 @@ def odometry(
     frames, usual_voxel, usual_distance = _open(dataset, path, num_frames)
     voxel = usual_voxel if voxel_size == "auto" else None if voxel_size == "off" else voxel_size
     distance = usual_distance if max_distance == "auto" else max_distance
-    names = channels or frames[0].cloud.channel_names
-    print(f"frames:    {len(frames)} of {dataset}, {len(frames[0].cloud):,} points in the first")
+    first = frames[0]
+    names = channels or first.cloud.channel_names
+    print(f"frames:    {len(frames)} of {dataset}, {len(first.cloud):,} points in the first")
     print(f"channels:  {listed(names)}")
     truth: list[Float[np.ndarray, "4 4"] | None] = []
     clouds = _clouds(frames, names, truth)
     chosen = _method(method, frames, names, voxel)
-    steps = mcg.odometry(clouds, chosen, voxel_size=voxel, max_distance=distance, start=frames[0].pose)
-    poses, ends, kept = [], [], []
-    for step in tqdm(steps, total=len(frames), unit="frame", disable=None):
-        poses.append(step.pose)
-        if step.registration is not None:
-            ends.append(step.registration)
-        if map is not None:
-            kept.append(step.cloud.unpad())
+    steps = mcg.odometry(clouds, chosen, voxel_size=voxel, max_distance=distance, start=first.pose)
+    poses, ends = [], []
+
+    def followed() -> Iterator[tuple[mcg.PointCloud, Float[np.ndarray, "4 4"]]]:
+        for step in tqdm(steps, total=len(frames), unit="frame", disable=None):
+            poses.append(step.pose)
+            if step.registration is not None:
+                ends.append(step.registration)
+            yield step.cloud, step.pose
+
+    if map is None:
+        collections.deque(followed(), maxlen=0)
+    else:
+        thinned = round_voxel_size([first.cloud], len(first.cloud) // 2) if voxel is None else voxel
+        # Cloud by cloud: none is kept once it is in the map.
+        clouds_again, poses_again = itertools.tee(followed())
+        world = mcg.aggregate((cloud for cloud, _ in clouds_again), (pose for _, pose in poses_again), thinned)
+        io.write(map, world)
+        print(f"map:       {map}, {len(world):,} points, voxels of {thinned:g} m")
     _report(poses, truth, ends)
     if output is not None:
         io.write_poses(output, poses)
-    if map is not None:
-        thinned = round_voxel_size(kept[:1], len(kept[0]) // 2) if voxel is None else voxel
-        io.write(map, mcg.aggregate(kept, poses, thinned))
-        print(f"map:       {map}, voxels of {thinned:g} m")
     if plot is not None:
         _draw(plot, method, poses, truth)
     failed = sum(not result.converged for result in ends)
@@ -114,6 +124,8 @@ def _open(
         return scene(_FRAMES_OF_A_SCENE if num_frames == "all" else num_frames), voxel, distance
     reader, voxel, distance = _READERS[dataset]
     frames = reader(path)
+    if len(frames) < 2:
+        raise ValueError(f"{path}: expected at least 2 frames, got {len(frames)}")
     return frames if num_frames == "all" else frames[:num_frames], voxel, distance
 
 
@@ -152,7 +164,7 @@ def _report(
         return
     estimated, true = [poses[row] for row in known], [truth[row] for row in known]
     translation, rotation = metrics.rpe(estimated, true)
-    print(f"per pair:  {1e3 * translation.mean():.1f} mm, {np.degrees(rotation.mean()):.3f}° in the mean")
+    print(f"per pair:  {1e3 * translation.mean():.1f} mm, {np.degrees(rotation.mean()):.3f} deg in the mean")
     whole = metrics.ate(estimated, true)
     first = metrics.ate(estimated, true, alignment="first")
     print(f"ATE:       {1e3 * whole:.1f} mm rms after the best alignment, {1e3 * first:.1f} mm from the first pose")
@@ -160,7 +172,7 @@ def _report(
     stretches = _KITTI_LENGTHS[length > _KITTI_LENGTHS] if length > _KITTI_LENGTHS[0] else np.array([length / 2])
     percent, degrees = metrics.kitti_errors(estimated, true, lengths=stretches.tolist(), step=1)
     shown = ", ".join(f"{stretch:.3g}" for stretch in stretches)
-    print(f"drift:     {percent:.2f} %, {degrees:.4f}°/m over stretches of {shown} m")
+    print(f"drift:     {percent:.2f} %, {degrees:.4f} deg/m over stretches of {shown} m")
 
 
 def _draw(

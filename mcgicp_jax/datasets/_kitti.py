@@ -38,14 +38,15 @@ class KITTIFrames(AbstractFrames):
 
     def __init__(self, folder: Path):
         self.folder = folder
-        self._scans = sorted((folder / "velodyne").glob("*.bin"))
+        # Scans, images, times and poses go by number, of which a copy may have some alone.
+        self._scans = sorted(scan for scan in (folder / "velodyne").glob("*.bin") if scan.stem.isdecimal())
         if not self._scans:
             raise ValueError(f"{folder}: expected scans in velodyne/*.bin, found none")
         calibration = _read_calibration(folder / "calib.txt")
         # From the Velodyne to camera 0, and on to the pixels of camera 2.
         self._to_camera = np.vstack([calibration["Tr"], [0, 0, 0, 1]])
         self._projection = calibration["P2"] @ self._to_camera
-        self._times = np.loadtxt(folder / "times.txt", ndmin=1)
+        self._times = _read_times(folder / "times.txt")
         poses = folder.absolute().parents[1] / "poses" / f"{folder.absolute().name}.txt"
         self._poses = io.read_poses(poses) if poses.is_file() else None
         self._colored = (folder / "image_2").is_dir()
@@ -55,7 +56,6 @@ class KITTIFrames(AbstractFrames):
 
     def _frame(self, index: int) -> Frame:
         scan = self._scans[index]
-        # Scans, images, times and poses go by number, of which a copy may have some alone.
         number = int(scan.stem)
         cloud = io.read(scan)
         if self._colored:
@@ -80,12 +80,23 @@ class KITTIFrames(AbstractFrames):
         )
 
 
+def _read_times(path: Path) -> Float[np.ndarray, "N"]:
+    """Seconds, one in each line."""
+    try:
+        return np.array(path.read_text().split(), float)
+    except ValueError as error:
+        raise ValueError(f"{path}: expected a number of seconds in each line: {error}") from error
+
+
 def _read_calibration(path: Path) -> dict[str, Float[np.ndarray, "3 4"]]:
     """The 3×4 matrices of calib.txt by their names."""
     matrices = {}
     for line in path.read_text().splitlines():
         name, _, numbers = line.partition(":")
-        values = np.array(numbers.split(), float)
+        try:
+            values = np.array(numbers.split(), float)
+        except ValueError:
+            continue  # such as the date of a calibration
         if values.size == 12:
             matrices[name] = values.reshape(3, 4)
     for name in ("P2", "Tr"):

@@ -49,9 +49,9 @@ class SevenScenesFrames(AbstractFrames):
     """See `seven_scenes`."""
 
     def __init__(self, folder: Path):
-        self._depths = sorted(folder.glob("frame-*.depth.png"))
+        self._depths = sorted(folder.glob(f"frame-{6 * '[0-9]'}.depth.png"))
         if not self._depths:
-            raise ValueError(f"{folder}: expected images frame-*.depth.png, found none")
+            raise ValueError(f"{folder}: expected images frame-XXXXXX.depth.png, found none")
 
     def __len__(self) -> int:
         return len(self._depths)
@@ -72,5 +72,5 @@ class SevenScenesFrames(AbstractFrames):
             channel_valid=np.repeat(inside[:, None], 3, axis=1),
             channel_names=("red", "green", "blue"),
         )
-        (pose,) = io.read_poses(path.with_name(f"{name}.pose.txt"))
-        return Frame(cloud, pose, _PERIOD * int(name.removeprefix("frame-")))
+        poses = io.read_poses(path.with_name(f"{name}.pose.txt"))
+        return Frame(cloud, poses[0], _PERIOD * int(name.removeprefix("frame-")))

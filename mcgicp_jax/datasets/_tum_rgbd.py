@@ -62,7 +62,9 @@ class TUMFrames(AbstractFrames):
         self._depths = [self._depths[row] for row in np.flatnonzero(together)]
         self._colors = [colors[row] for row in nearest[together]]
         truth = folder / "groundtruth.txt"
-        self._truth = (np.loadtxt(truth, usecols=0, ndmin=1), io.read_poses(truth)) if truth.is_file() else None
+        # Poses are read first: they name the file where it is none.
+        poses = io.read_poses(truth) if truth.is_file() else None
+        self._truth = None if poses is None else (np.loadtxt(truth, usecols=0, ndmin=1), poses)
 
     def __len__(self) -> int:
         return len(self._times)
