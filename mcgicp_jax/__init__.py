@@ -9,6 +9,7 @@ from mcgicp_jax import metrics as metrics
 from mcgicp_jax import plot as plot
 from mcgicp_jax._batch import register_as_completed as register_as_completed
 from mcgicp_jax._batch import register_batch as register_batch
+from mcgicp_jax._channels import estimate_channel_covariance as estimate_channel_covariance
 from mcgicp_jax._cloud import PointCloud as PointCloud
 from mcgicp_jax._cost import Cauchy as Cauchy
 from mcgicp_jax._cost import GemanMcClure as GemanMcClure

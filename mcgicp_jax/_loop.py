@@ -32,15 +32,25 @@ from mcgicp_jax._uncertainty import (
     find_directions,
 )
 
-# The pose still moves; or its last update was below the tolerances, and one more measurement ends the loop.
-_RUNNING, _SETTLED = -1, -2
+# The pose still moves, with all pairs or, after it has come to rest with those, with the near ones alone; or its last
+# update was below the tolerances, and one more measurement ends the loop.
+_COARSE, _RUNNING, _SETTLED = -3, -1, -2
 _MIN_CORRESPONDENCES = 4
 
 
 class Settings(eqx.Module):
-    """Numbers of the loop, as arrays: changing one compiles nothing."""
+    """Numbers of the loop, as arrays: changing one compiles nothing.
+
+    Attributes:
+        max_distance: metres; pairs further apart do not count.
+        fine_distance: metres; the same once the pose has come to rest, until it rests again. If not smaller than
+            `max_distance`, there is no such second part.
+        translation_tolerance, rotation_tolerance: metres and radians, of an update after which the pose is at rest.
+        max_iterations: in both parts together.
+    """
 
     max_distance: Float[Array, ""]
+    fine_distance: Float[Array, ""]
     translation_tolerance: Float[Array, ""]
     rotation_tolerance: Float[Array, ""]
     max_iterations: Int[Array, ""]
@@ -62,7 +72,7 @@ class State(eqx.Module):
 
     Attributes:
         pose: the next pose while the loop goes on; the one that was measured when it ends.
-        status: value of a `Status`, `_RUNNING` or `_SETTLED`.
+        status: value of a `Status`, `_COARSE`, `_RUNNING` or `_SETTLED`.
         num_iterations: updates so far.
         measured: at the pose before.
         information: (6, 6) at the pose before.
@@ -142,10 +152,17 @@ def measure(pose: jaxlie.SE3, model: Model, evidence: Evidences | None) -> Measu
 
 
 @jax.jit
+def _first_status(settings: Settings) -> Int[Array, ""]:
+    return jnp.where(settings.fine_distance < settings.max_distance, jnp.int32(_COARSE), jnp.int32(_RUNNING))
+
+
+@jax.jit
 def match_and_measure(
-    pose: jaxlie.SE3, indices: Int[Array, "N"] | Int[np.ndarray, "N"], problem: Problem
+    pose: jaxlie.SE3, status: Int[Array, ""], indices: Int[Array, "N"] | Int[np.ndarray, "N"], problem: Problem
 ) -> tuple[Correspondences, Measurement]:
-    matches = gate(pose, problem.source, problem.target, indices, problem.settings.max_distance)
+    settings = problem.settings
+    distance = jnp.where(status == _COARSE, settings.max_distance, settings.fine_distance)
+    matches = gate(pose, problem.source, problem.target, indices, distance)
     return matches, measure(pose, problem.model(matches), problem.evidence)
 
 
@@ -165,7 +182,7 @@ def update(
             basis = jnp.asarray(directions.twists).T * (directions.held | ~settings.hold_free_directions)
         change = solve_update(measured.moments, radius, basis)
     moved = move_pose(pose, change.twist, measured.moments.center)
-    settled = status == _SETTLED
+    coarse, settled = status == _COARSE, status == _SETTLED
     translation_step = jnp.linalg.norm(change.twist[:3])
     rotation_step = jnp.linalg.norm(change.twist[3:])
     at_rest = (translation_step <= settings.translation_tolerance) & (rotation_step <= settings.rotation_tolerance)
@@ -176,7 +193,8 @@ def update(
         (settled & (change.degenerate | degenerate), Status.DEGENERATE),
         (settled, Status.CONVERGED),
         (num_iterations >= settings.max_iterations, Status.MAX_ITERATIONS),
-        (at_rest, _SETTLED),
+        (coarse & ~at_rest, _COARSE),
+        (at_rest & ~coarse, _SETTLED),
     )
     conditions, codes = zip(*outcomes, strict=True)
     status = jnp.select(list(conditions), [jnp.int32(code) for code in codes], jnp.int32(_RUNNING))
@@ -204,12 +222,12 @@ def run_on_host(problem: Problem, search: AbstractSearch) -> tuple[State, Corres
     """The loop for concrete inputs: matches from the host's tree between compiled steps."""
     pose, settings = problem.start, problem.settings
     nearest = search.follow(problem.source.rows, problem.target.rows, settings.max_distance)
-    status, num_iterations = np.asarray(_RUNNING, np.int32), np.asarray(0, np.int32)
+    status, num_iterations = np.asarray(_first_status(settings)), np.asarray(0, np.int32)
     records = []
     while status < 0:
-        if status == _RUNNING:
+        if status != _SETTLED:
             indices = nearest(pose.wxyz_xyz)
-        matches, measured = match_and_measure(pose, indices, problem)
+        matches, measured = match_and_measure(pose, status, indices, problem)
         state = update(pose, status, num_iterations, measured, settings)
         pose, num_iterations = state.pose, state.num_iterations
         # As a number of the host's: comparing arrays would be a program of its own, each time.
@@ -233,11 +251,11 @@ def _measure_and_update(
 
 def _begin(pose: jaxlie.SE3, match: Match, shape: tuple[int, ...], settings: Settings, max_iterations: int) -> Carry:
     """The loop before its first step, with room for all of its history."""
-    running, zero = jnp.int32(_RUNNING), jnp.int32(0)
+    first, zero = _first_status(settings), jnp.int32(0)
     step = partial(_measure_and_update, match=match, settings=settings)
-    shapes = jax.eval_shape(step, pose, running, zero, jnp.zeros(shape, jnp.int32))
+    shapes = jax.eval_shape(step, pose, first, zero, jnp.zeros(shape, jnp.int32))
     state, matches = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), shapes)
-    state = eqx.tree_at(lambda state: (state.pose, state.status), state, (pose, running))
+    state = eqx.tree_at(lambda state: (state.pose, state.status), state, (pose, first))
     # One entry per update, and one for the measurement at the end.
     history = {name: jnp.full(max_iterations + 1, jnp.nan, value.dtype) for name, value in state.record.items()}
     return state, matches, history
@@ -269,10 +287,10 @@ def _matching(problem: Problem, search: AbstractSearch) -> Match:
     def match(
         pose: jaxlie.SE3, status: Int[Array, ""], indices: Int[Array, "N"]
     ) -> tuple[Correspondences, Measurement]:
-        running = status == _RUNNING
+        running = status != _SETTLED
         rows = problem.source.rows, problem.target.rows
         found = search.nearest_traced(pose.wxyz_xyz, *rows, problem.settings.max_distance, running)[0]
-        return match_and_measure(pose, jnp.where(running, found, indices), problem)
+        return match_and_measure(pose, status, jnp.where(running, found, indices), problem)
 
     return match
 

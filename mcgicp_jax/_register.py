@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from typing import Any
+import warnings
+from collections.abc import Sequence
+from typing import Any, TypeAlias
 
 import equinox as eqx
 import jax
@@ -10,8 +12,9 @@ import jax.numpy as jnp
 import jaxlie
 import numpy as np
 from jax.typing import ArrayLike, DTypeLike
-from jaxtyping import Array, Int
+from jaxtyping import Array, Float, Int
 
+from mcgicp_jax._channels import eagerly_if, neighbors_of, point_spacing, with_channels_matched
 from mcgicp_jax._cloud import PointCloud, Values
 from mcgicp_jax._cost import AbstractKernel, centred_pose, check_matches
 from mcgicp_jax._dense import default_search
@@ -28,13 +31,19 @@ from mcgicp_jax._loop import (
     run_on_host,
     run_traced,
 )
-from mcgicp_jax._methods import AbstractMethod, Surface, prepare
+from mcgicp_jax._methods import AbstractMethod, MultiChannelGICP, Surface, prepare
 from mcgicp_jax._pose import Pose, is_concrete, pose_matrix, se3_from_matrix
 from mcgicp_jax._preprocess import preprocess
 from mcgicp_jax._result import Registration, pose_in_user_frame
 from mcgicp_jax._search import AbstractSearch, Correspondences
 
+# Metres; or coarse and fine.
+Distance: TypeAlias = ArrayLike | tuple[ArrayLike, ArrayLike]
+
 MAX_ITERATIONS = 64
+# Gates as multiples of the target's spacing. With the wide one the pose is found from a start several points away;
+# at rest, its pairs across edges and across the border of the overlap pull, and the narrow one leaves those out.
+_COARSE_SPACINGS, _FINE_SPACINGS = 10.0, 2.5
 # Nearest-neighbour matches often end in a small cycle; real scans were seen to circle within 0.2 mm and 0.4 mrad.
 TRANSLATION_TOLERANCE = 5e-4
 ROTATION_TOLERANCE = 5e-4
@@ -141,13 +150,15 @@ def register(
     method: AbstractMethod,
     *,
     init: Pose | None = None,
-    max_distance: ArrayLike,
+    max_distance: Distance | None = None,
     max_iterations: int = MAX_ITERATIONS,
     translation_tolerance: ArrayLike = TRANSLATION_TOLERANCE,
     rotation_tolerance: ArrayLike = ROTATION_TOLERANCE,
     robust: AbstractKernel | None = None,
     search: AbstractSearch | None = None,
     hold_free_directions: bool = True,
+    match_channels: bool = False,
+    scales: Sequence[float] = (),
 ) -> Registration:
     """Register two clouds: find matches, update the pose, repeat until it rests.
 
@@ -159,7 +170,9 @@ def register(
             without voxels.
         method: `MultiChannelGICP()`, `GICP()`, `PointToPlane()`, `PointToPoint()` or `ColorICP(...)`.
         init: T_target_source to start from, `jaxlie.SE3` or (4, 4); the identity by default.
-        max_distance: metres of position; pairs further apart do not count.
+        max_distance: metres of position; pairs further apart do not count. Two numbers are one to find the pose with,
+            and a smaller one to refine it with once it has come to rest. None: 10 and 2.5 times the median distance
+            between neighbouring points of the target. A start that is further off needs more.
         max_iterations: how often, at most, matches are found and the pose is updated.
         translation_tolerance, rotation_tolerance: metres (at the centroid of the pairs) and radians; the update that is
             below both is the last.
@@ -168,6 +181,11 @@ def register(
         hold_free_directions: leave the pose where `init` has it in the directions that nothing holds, neither the shape
             of the clouds nor, for the methods that use them, their channels. If False it goes where the nearest
             neighbours pull it. The status is DEGENERATE either way.
+        match_channels: whether the source's channels are first scaled and shifted to be distributed like the target's,
+            as where exposures differ. It needs clouds that see much the same.
+        scales: voxel sizes, metres, coarse to fine, for a start that is far off: the clouds are registered in each of
+            them first, with its own default of `max_distance`, and each pose that is found starts the next. With
+            numbers alone, outside of transformations.
 
     Returns:
         The pose and how it ended: see `Registration`; check `converged`.
@@ -177,6 +195,12 @@ def register(
     """
     check_settings(method, max_distance, max_iterations, translation_tolerance, rotation_tolerance)
     source, target = _ready("source", source), _ready("target", target)
+    if match_channels:
+        source = _matched(source, target, method)
+    for voxel_size in scales:
+        pair = _coarser(source, voxel_size), _coarser(target, voxel_size)
+        found = register(*pair, method, init=init, max_iterations=max_iterations, robust=robust, search=search)
+        init = found.matrix if found.converged else init
     problem = pose_problem(
         *(source, target, method, init, max_distance, max_iterations),
         *(translation_tolerance, rotation_tolerance, robust, hold_free_directions),
@@ -198,7 +222,7 @@ def pose_problem(
     target: PointCloud,
     method: AbstractMethod,
     init: Pose | None,
-    max_distance: ArrayLike,
+    max_distance: Distance | None,
     max_iterations: int,
     translation_tolerance: ArrayLike,
     rotation_tolerance: ArrayLike,
@@ -208,6 +232,7 @@ def pose_problem(
     """What the loop of `register` is about, for prepared clouds."""
     method, source_surface, target_surface = _surfaces(source, target, method)
     dtype = source_surface.points.dtype
+    distances = _usual_distances(target) if max_distance is None else max_distance
     return Problem(
         start=se3_from_matrix(centred_pose(pose_matrix(init), source, target), dtype),
         source=source_surface,
@@ -215,10 +240,24 @@ def pose_problem(
         method=method,
         robust=robust,
         settings=_settings(
-            max_distance, translation_tolerance, rotation_tolerance, max_iterations, dtype, hold_free_directions
+            distances, translation_tolerance, rotation_tolerance, max_iterations, dtype, hold_free_directions
         ),
         evidence=(find_evidence(method, source), find_evidence(method, target)),
     )
+
+
+def _matched(source: PointCloud, target: PointCloud, method: AbstractMethod) -> PointCloud:
+    _check_channels(source, target, method)
+    return with_channels_matched(source, target)
+
+
+def _coarser(cloud: PointCloud, voxel_size: float) -> PointCloud:
+    return preprocess(cloud.replace(covariances=None), voxel_size, neighbors_of(cloud).shape[-1])
+
+
+def _usual_distances(target: PointCloud) -> Float[Array, "2"]:
+    with eagerly_if(is_concrete(target)):
+        return point_spacing(target) * jnp.array([_COARSE_SPACINGS, _FINE_SPACINGS], target.points.dtype)
 
 
 def _ready(name: str, cloud: PointCloud | Values) -> PointCloud:
@@ -241,11 +280,10 @@ def _surfaces(
             raise ValueError(
                 f"{name}: expected a single cloud, got shape {cloud.points.shape}; use jax.vmap for a batch"
             )
-    if method.uses_channels and source.channels.shape[-1] != target.channels.shape[-1]:
-        raise ValueError(
-            f"channels: expected as many in the source as in the target for {type(method).__name__}, "
-            f"got {source.channels.shape[-1]} and {target.channels.shape[-1]}"
-        )
+    if method.uses_channels:
+        _check_channels(source, target, method)
+        if isinstance(method, MultiChannelGICP) and source.channels.shape[-1] == 0:
+            warnings.warn("the clouds have no channels: MultiChannelGICP is GICP then", UserWarning, stacklevel=4)
     if source.points.dtype != target.points.dtype:
         raise ValueError(
             f"points: expected one precision in both clouds, got {source.points.dtype} and {target.points.dtype}"
@@ -254,16 +292,26 @@ def _surfaces(
     return method, prepare(method, source), prepare(method, target)
 
 
+def _check_channels(source: PointCloud, target: PointCloud, method: AbstractMethod) -> None:
+    if source.channels.shape[-1] != target.channels.shape[-1]:
+        raise ValueError(
+            f"channels: expected as many in the source as in the target for {type(method).__name__}, "
+            f"got {source.channels.shape[-1]} and {target.channels.shape[-1]}"
+        )
+
+
 def _settings(
-    max_distance: ArrayLike,
+    max_distance: Distance,
     translation_tolerance: ArrayLike,
     rotation_tolerance: ArrayLike,
     max_iterations: int,
     dtype: DTypeLike,
     hold_free_directions: bool = False,
 ) -> Settings:
+    coarse, fine = jnp.broadcast_to(jnp.asarray(max_distance, dtype), (2,))
     return Settings(
-        max_distance=jnp.asarray(max_distance, dtype),
+        max_distance=coarse,
+        fine_distance=fine,
         translation_tolerance=jnp.asarray(translation_tolerance, dtype),
         rotation_tolerance=jnp.asarray(rotation_tolerance, dtype),
         max_iterations=jnp.int32(max_iterations),
@@ -325,14 +373,15 @@ def _translation_adjoint(offset: Array | np.ndarray) -> Array | np.ndarray:
 
 def check_settings(
     method: AbstractMethod,
-    max_distance: ArrayLike,
+    max_distance: Distance | None,
     max_iterations: int,
     translation_tolerance: ArrayLike,
     rotation_tolerance: ArrayLike,
 ) -> None:
     """Raise `ValueError` for what is wrong with `register`'s arguments whatever the clouds."""
     _check_method(method)
-    _check_positive("max_distance", max_distance)
+    if max_distance is not None:
+        _check_distances(max_distance)
     _check_loop(max_iterations, translation_tolerance, rotation_tolerance)
 
 
@@ -344,6 +393,15 @@ def _check_method(method: AbstractMethod) -> None:
 def _check_positive(name: str, value: ArrayLike) -> None:
     if is_concrete(value) and not (_is_number(value) and np.asarray(value) > 0):
         raise ValueError(f"{name}: expected a positive number, got {value!r}")
+
+
+def _check_distances(distances: Any) -> None:
+    if np.shape(distances) != (2,):
+        _check_positive("max_distance", distances)
+    elif is_concrete(distances):
+        coarse, fine = distances
+        if not (_is_number(coarse) and _is_number(fine) and coarse >= fine > 0):
+            raise ValueError(f"max_distance: expected a positive number and then a smaller one, got {distances!r}")
 
 
 def _is_number(value: object) -> bool:

@@ -15,6 +15,7 @@ ORDER = [
         "_dense",
         "_preprocess",
         "_covariance",
+        "_channels",
         "_methods",
         "_evidence",
         "_cost",

@@ -88,7 +88,7 @@ def test_normals_of_given_covariances():
 
 @pytest.mark.parametrize("unit", [1.0, 1e-4, 1e4])
 def test_noise_is_found(unit):
-    """Λ = 2σ², and α = spacing/σ, where a slope of the channel is not noise."""
+    """Λ = 2 (1.5 σ)², and α = 2.5 spacing/σ, where a slope of the channel is not noise."""
     points, target = noisy(0, noise=unit * NOISE)
     _, source = noisy(1, noise=unit * NOISE)
     slope = (1 - unit) * np.array([1.0, -40.0])
@@ -97,11 +97,11 @@ def test_noise_is_found(unit):
         for cloud in (target, source)
     )
     method = MultiChannelGICP().resolve(source, target)
-    sigma = np.sqrt(np.asarray(method.channel_covariance, float) / 2)
+    sigma = np.sqrt(np.asarray(method.channel_covariance, float) / 2) / 1.5
     np.testing.assert_allclose(sigma, unit * NOISE, rtol=0.06)
     nearest = ref.nearest(points, points, 2)[:, 1]
     spacing = np.median(np.linalg.norm(points[nearest] - points, axis=1))
-    np.testing.assert_allclose(np.asarray(method.channel_weights) * sigma, spacing, rtol=1e-4)
+    np.testing.assert_allclose(np.asarray(method.channel_weights) * sigma, 2.5 * spacing, rtol=1e-4)
 
 
 def test_noise_is_found_where_the_channel_is():
@@ -114,7 +114,7 @@ def test_noise_is_found_where_the_channel_is():
         mask = np.pad(present, [(0, cloud.points.shape[0] - len(cloud)), (0, 0)])
         clouds.append(cloud.replace(channel_valid=mask))
     method = MultiChannelGICP().resolve(*clouds)
-    np.testing.assert_allclose(np.sqrt(np.asarray(method.channel_covariance) / 2), NOISE, rtol=0.1)
+    np.testing.assert_allclose(np.sqrt(np.asarray(method.channel_covariance) / 2) / 1.5, NOISE, rtol=0.1)
 
 
 def test_a_channel_that_nobody_has_says_nothing():

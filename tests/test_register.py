@@ -252,6 +252,10 @@ BAD_ARGUMENTS = {
         {"max_distance": 0.0},
         {"max_distance": -1.0},
         {"max_distance": np.nan},
+        {"max_distance": (0.2, 0.5)},
+        {"max_distance": (0.5, 0.0)},
+        {"max_distance": (np.nan, 0.1)},
+        {"max_distance": np.array([0.5, 0.4, 0.3])},
     ],
     "max_iterations": [{"max_iterations": 0}],
     "translation_tolerance": [{"translation_tolerance": -1.0}],
@@ -287,6 +291,64 @@ def test_a_bad_argument_is_named(name, arguments, room):
 def test_a_bad_cloud_is_named(points, message, room):
     with pytest.raises(ValueError, match=message):
         mcg.register(points, room[1], mcg.GICP(), max_distance=0.5)
+
+
+def test_two_distances_are_two_registrations_in_a_row(room):
+    source, target, _ = room
+    method = mcg.GICP()
+    first = mcg.register(source, target, method, max_distance=0.5)
+    second = mcg.register(source, target, method, init=first.matrix, max_distance=0.08)
+    result = mcg.register(source, target, method, max_distance=(0.5, 0.08))
+    assert result.converged and result.num_iterations == first.num_iterations + second.num_iterations
+    assert result.num_inliers == second.num_inliers < first.num_inliers
+    # The first stops a step earlier: its last pose is not measured once more.
+    assert difference(result.matrix, second.matrix) < 1e-4
+    same = mcg.register(source, target, method, max_distance=(0.5, 0.5))
+    np.testing.assert_array_equal(same.matrix, first.matrix)
+
+
+def test_the_default_distances_come_from_the_spacing(room):
+    source, target, truth = room
+    rows = np.asarray(target.neighbors)[: len(target), 1]
+    points = np.asarray(target.points)
+    spacing = np.median(np.linalg.norm(points[rows] - points[: len(target)], axis=1))
+    method = METHODS["mc-gicp"]
+    result = mcg.register(source, target, method)
+    given = mcg.register(source, target, method, max_distance=(10 * spacing, 2.5 * spacing))
+    assert result.converged and difference(result.matrix, truth) < 4e-3
+    assert difference(result.matrix, given.matrix) < 1e-6
+    assert difference(jax.jit(lambda s: mcg.register(s, target, method).matrix)(source), result.matrix) < 2e-4
+
+
+def test_scales_find_a_start_that_is_far_off():
+    truth = motion((2, 1.5, -1, 0.1, 0.1, -0.4))
+    source, target, _ = pair(truth=truth, noise=0.003)
+    method = METHODS["mc-gicp"]
+    near = mcg.register(source, target, method)
+    assert difference(near.matrix, truth) > 1
+    far = mcg.register(source, target, method, scales=(0.3, 0.15))
+    assert far.converged and difference(far.matrix, truth) < 4e-3
+    with pytest.raises(ValueError, match="tracers"):
+        jax.jit(lambda s: mcg.register(s, target, method, scales=(0.2,)).matrix)(source)
+
+
+def test_matched_channels_undo_gain_and_offset():
+    source, target, truth = pair(wall)
+    other = source.replace(channels=source.channels * np.array([0.8, 1.3, 0.5]) + np.array([0.1, -0.2, 0.3]))
+    method = mcg.MultiChannelGICP()
+    expected = mcg.register(source, target, method, match_channels=True)
+    result = mcg.register(other, target, method, match_channels=True)
+    assert result.converged and difference(result.matrix, expected.matrix) < 1e-5
+    assert difference(result.matrix, truth) < 6e-3
+    plain = mcg.register(other, target, method)
+    assert difference(plain.matrix, truth) > 2 * difference(result.matrix, truth)
+
+
+def test_without_channels_it_says_that_it_is_gicp(room):
+    bare = [cloud.replace(channels=np.zeros((*cloud.points.shape[:1], 0))) for cloud in room[:2]]
+    with pytest.warns(UserWarning, match="no channels: MultiChannelGICP is GICP then"):
+        result = mcg.register(*bare, mcg.MultiChannelGICP())
+    np.testing.assert_array_equal(result.matrix, mcg.register(*bare, mcg.GICP()).matrix)
 
 
 def test_a_batch_needs_vmap(room):

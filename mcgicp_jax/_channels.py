@@ -1,0 +1,205 @@
+"""What the channels of clouds are like: their noise, how two measurements of one spot differ, gain and offset."""
+
+from __future__ import annotations
+
+import contextlib
+import itertools
+from collections.abc import Sequence
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float
+
+from mcgicp_jax import _covariance as cov
+from mcgicp_jax._cloud import PointCloud
+from mcgicp_jax._kdtree import KDTreeSearch
+from mcgicp_jax._pose import Pose, pose_matrix
+from mcgicp_jax._preprocess import preprocess
+from mcgicp_jax._search import Rows
+
+# Shares of the values below which gain and offset are read off.
+_QUANTILES = tuple(share / 20 for share in range(1, 20))
+# Fewer differences than this tell no variance.
+_MIN_DIFFERENCES = 10
+
+
+def estimate_channel_covariance(
+    clouds: Sequence[PointCloud], poses: Sequence[Pose], *, max_distance: float | None = None
+) -> Float[np.ndarray, "C C"]:
+    """Λ with its cross terms, measured: the covariance of the difference between two measurements of one spot.
+
+    For `MultiChannelGICP(channel_covariance=...)`, from clouds of known poses (Servos & Waslander 2014, IV-C). Each
+    cloud is compared with the next: every point with the nearest one, if it is near enough to be the same spot. The
+    mean difference of two clouds, as of their exposures, does not count. An entry of Λ is taken over the differences
+    that have both of its channels.
+
+    Args:
+        clouds: at least two, in any order in which neighbours overlap; prepared, or raw ones that are used as they are.
+        poses: sensor to world, `jaxlie.SE3` or (4, 4), one per cloud.
+        max_distance: metres; by default half the median distance between neighbouring points.
+
+    Returns:
+        (C, C), channel units², float64, symmetric and positive definite.
+
+    Raises:
+        ValueError: if there is not one pose for each cloud, the channels differ, or fewer than ten spots were seen
+            twice in a channel.
+    """
+    if len(clouds) < 2 or len(clouds) != len(poses):
+        raise ValueError(f"poses: expected one for each of two clouds or more, got {len(poses)} for {len(clouds)}")
+    matrices = [np.asarray(pose_matrix(pose, f"poses[{i}]")) for i, pose in enumerate(poses)]
+    ready = [cloud if cloud.neighbors is not None else preprocess(cloud) for cloud in clouds]
+    names = ready[0].channel_names
+    for i, cloud in enumerate(ready):
+        if cloud.channel_names != names:
+            raise ValueError(f"clouds[{i}]: expected the channels {names}, got {cloud.channel_names}")
+    products, counts = np.zeros((len(names), len(names))), np.zeros((len(names), len(names)))
+    for target, source in itertools.pairwise(zip(ready, matrices, strict=True)):
+        limit = 0.5 * float(point_spacing(target[0])) if max_distance is None else max_distance
+        differences, known = _differences(*source, *target, limit)
+        number = np.maximum(known.sum(axis=0), 1)
+        differences = np.where(known, differences - differences.sum(axis=0) / number, 0)
+        products += differences.T @ differences
+        counts += known.T.astype(float) @ known
+    if counts.size and np.diagonal(counts).min() < _MIN_DIFFERENCES:
+        least = names[int(np.diagonal(counts).argmin())]
+        raise ValueError(
+            f"clouds: expected {_MIN_DIFFERENCES} spots or more that were seen twice, got "
+            f"{np.diagonal(counts).min():.0f} with the channel {least!r}; check the poses, or raise max_distance"
+        )
+    # Where no differences have both of two channels, nothing is known of their covariance.
+    return _positive_definite(products / np.maximum(counts, 1))
+
+
+def _differences(
+    source: PointCloud,
+    source_pose: Float[np.ndarray, "4 4"],
+    target: PointCloud,
+    target_pose: Float[np.ndarray, "4 4"],
+    max_distance: float,
+) -> tuple[Float[np.ndarray, "N C"], Bool[np.ndarray, "N C"]]:
+    """Differences between channels of the same spots, 0 where one is missing, and where there are any."""
+    matrix = np.linalg.inv(target_pose) @ source_pose
+    moved, fixed = source.transform(matrix).unpad(), target.unpad()
+    rows = [
+        Rows(points=np.asarray(cloud.points).T, descriptors=np.zeros((len(cloud), 0)), valid=np.ones(len(cloud), bool))
+        for cloud in (moved, fixed)
+    ]
+    at_rest = np.array([1.0, 0, 0, 0, 0, 0, 0])
+    (nearest,) = KDTreeSearch().index(rows[1]).nearest(at_rest, rows[0], max_distance)
+    distances = np.linalg.norm(np.asarray(fixed.points)[nearest] - np.asarray(moved.points), axis=1)
+    near = (nearest >= 0) & (distances <= max_distance)
+    pair = [(moved, np.flatnonzero(near)), (fixed, nearest[near])]
+    known = np.ones((near.sum(), moved.channels.shape[1]), bool)
+    for cloud, chosen in pair:
+        if cloud.channel_valid is not None:
+            known &= np.asarray(cloud.channel_valid)[chosen]
+    values = [np.asarray(cloud.channels, np.float64)[chosen] for cloud, chosen in pair]
+    return np.where(known, values[0] - values[1], 0), known
+
+
+def _positive_definite(covariance: Float[np.ndarray, "C C"]) -> Float[np.ndarray, "C C"]:
+    """The same but for eigenvalues that are not positive: channels that never differ, entries from different spots."""
+    deviations = np.sqrt(np.maximum(np.diagonal(covariance), np.finfo(np.float32).tiny))
+    values, vectors = np.linalg.eigh(covariance / np.outer(deviations, deviations))
+    return (vectors * np.maximum(values, 1e-6)) @ vectors.T * np.outer(deviations, deviations)
+
+
+@jax.jit
+def with_channels_matched(source: PointCloud, target: PointCloud) -> PointCloud:
+    """The source, each channel scaled and shifted so that its values are distributed like the target's.
+
+    By the quantiles from 5 to 95 %: robust against what only one of the clouds sees, as long as that is little. Gain
+    and offset are constants to autodiff.
+    """
+    quantiles = [_channel_quantiles(jax.lax.stop_gradient(cloud)) for cloud in (source, target)]
+    means = [jnp.mean(values, axis=0) for values in quantiles]
+    spreads = [jnp.std(values, axis=0) for values in quantiles]
+    telling = (spreads[0] > 0) & (spreads[1] > 0)
+    gain = jnp.where(telling, spreads[1] / jnp.where(telling, spreads[0], 1), 1)
+    offset = means[1] - gain * means[0]
+    known = jnp.isfinite(gain) & jnp.isfinite(offset)
+    channels = jnp.asarray(source.channels)
+    return source.replace(channels=jnp.where(known, gain, 1) * channels + jnp.where(known, offset, 0))
+
+
+def _channel_quantiles(cloud: PointCloud) -> Float[Array, "Q C"]:
+    valid = jnp.asarray(cloud.valid)[:, None]
+    if cloud.channel_valid is not None:
+        valid = valid & jnp.asarray(cloud.channel_valid)
+    values = jnp.where(valid, jnp.asarray(cloud.channels), jnp.nan)
+    return jnp.nanquantile(values, jnp.asarray(_QUANTILES, values.dtype), axis=0)
+
+
+def eagerly_if(concrete: bool) -> contextlib.AbstractContextManager[None]:
+    return jax.ensure_compile_time_eval() if concrete else contextlib.nullcontext()
+
+
+def neighbors_of(cloud: PointCloud) -> Array:
+    if cloud.neighbors is None:
+        raise ValueError("cloud: expected one with neighbors or covariances; make it with mcgicp_jax.preprocess")
+    return jnp.asarray(cloud.neighbors)
+
+
+@jax.jit
+def channel_noise(source: PointCloud, target: PointCloud) -> tuple[Float[Array, "C"], Bool[Array, "C"]]:
+    """σ per channel, and which channels are constant (theirs is 1)."""
+    residuals, values = [], []
+    for cloud in (source, target):
+        valid = jnp.asarray(cloud.valid)[:, None]
+        if cloud.channel_valid is not None:
+            valid = valid & jnp.asarray(cloud.channel_valid)
+        residuals.append(jnp.where(valid, _fit_residual(cloud), jnp.nan))
+        values.append(jnp.where(valid, jnp.asarray(cloud.channels), jnp.nan))
+    sigma = jnp.nanmedian(jnp.concatenate(residuals), axis=0)
+    everything = jnp.concatenate(values)
+    spread = jnp.nanstd(everything, axis=0)
+    constant = ~(spread > 1e3 * jnp.finfo(spread.dtype).eps * jnp.nanmax(jnp.abs(everything), axis=0, initial=0))
+    # Rendered channels have no noise; a thousandth of their spread keeps Λ and α finite.
+    return jnp.where(constant, 1, jnp.fmax(sigma, 1e-3 * spread)), constant
+
+
+def _fit_residual(cloud: PointCloud) -> Float[Array, "N C"]:
+    """Standard deviation of each channel about its linear fit over each neighbourhood's tangent plane."""
+    points, neighbors = jnp.asarray(cloud.points).T, neighbors_of(cloud)
+    offsets, present = cov.gather(points, neighbors)
+    basis = cov.orthonormal_basis(
+        cov.smallest_eigenvector(cov.weighted_covariance(offsets, present.astype(points.dtype)))
+    )
+    x, y = (sum(offset * b for offset, b in zip(offsets, axis, strict=True)) for axis in basis)
+    rows = jnp.where(present, neighbors.T, 0)
+    residuals = []
+    for i, channel in enumerate(jnp.asarray(cloud.channels).T):
+        known = present if cloud.channel_valid is None else present & jnp.asarray(cloud.channel_valid)[:, i][rows]
+        residuals.append(_residual_of_line(x, y, channel[rows], known.astype(x.dtype)))
+    return jnp.stack(residuals, axis=-1) if residuals else jnp.zeros((points.shape[1], 0), points.dtype)
+
+
+def _residual_of_line(
+    x: Float[Array, "k N"], y: Float[Array, "k N"], values: Float[Array, "k N"], weights: Float[Array, "k N"]
+) -> Float[Array, "N"]:
+    """Standard deviation of values about their fit a + b x + c y; NaN where there are too few."""
+    count = jnp.sum(weights, axis=0)
+
+    def centred(values: Float[Array, "k N"]) -> Float[Array, "k N"]:
+        return weights * (values - jnp.sum(weights * values, axis=0) / jnp.maximum(count, 1))
+
+    x, y, values = centred(x), centred(y), centred(values)
+    xx, xy, yy = jnp.sum(x * x, axis=0), jnp.sum(x * y, axis=0), jnp.sum(y * y, axis=0)
+    determinant = xx * yy - xy * xy
+    planar = determinant > 1e-6 * (xx + yy) ** 2
+    safe = jnp.where(planar, determinant, 1)
+    xc, yc = jnp.sum(x * values, axis=0), jnp.sum(y * values, axis=0)
+    explained = jnp.where(planar, (yy * xc * xc - 2 * xy * xc * yc + xx * yc * yc) / safe, 0)
+    square = jnp.maximum(jnp.sum(values * values, axis=0) - explained, 0)
+    return jnp.where(count > 3, jnp.sqrt(square / jnp.maximum(count - 3, 1)), jnp.nan)
+
+
+@jax.jit
+def point_spacing(cloud: PointCloud) -> Float[Array, ""]:
+    """Median distance to the nearest other point, metres."""
+    points, neighbors = jnp.asarray(cloud.points), neighbors_of(cloud)
+    second = neighbors[:, min(1, neighbors.shape[1] - 1)]
+    distances = jnp.linalg.norm(points[jnp.maximum(second, 0)] - points, axis=-1)
+    return jnp.nanmedian(jnp.where(jnp.asarray(cloud.valid) & (second >= 0), distances, jnp.nan))

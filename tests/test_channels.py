@@ -1,0 +1,90 @@
+"""What is measured of channels: Λ from aligned clouds, gain and offset."""
+
+import jax
+import numpy as np
+import pytest
+
+from mcgicp_jax import PointCloud, estimate_channel_covariance, preprocess
+from mcgicp_jax._channels import with_channels_matched
+from tests import reference as ref
+from tests.scenes import motion
+
+NOISE = np.array([[0.04, 0.03, 0.0], [0.03, 0.09, -0.02], [0.0, -0.02, 0.01]])
+POSES = [np.eye(4), motion((0.5, -0.2, 0.1, 0.1, 0.2, -0.1)), motion((1, 2, 3, 0.3, 0, 0.2))]
+
+
+def seen_again(num_points=1500, present=None, exposure=0.0):
+    """The same spots, seen from each of the poses with noise of known covariance."""
+    points, channels = ref.scene(num_points, 3)
+    clouds = []
+    for i, pose in enumerate(POSES):
+        rng = np.random.default_rng(i)
+        noise = rng.multivariate_normal(np.zeros(3), NOISE, num_points) + exposure * i
+        mask = None if present is None else rng.random((num_points, 3)) < present
+        local = (points - pose[:3, 3]) @ pose[:3, :3]
+        clouds.append(PointCloud(local + 1e-4 * rng.normal(size=local.shape), channels + noise, channel_valid=mask))
+    return clouds
+
+
+@pytest.mark.parametrize("prepared", [False, True])
+@pytest.mark.parametrize("present", [None, 0.7])
+def test_the_covariance_of_a_difference_is_found(present, prepared):
+    clouds = seen_again(present=present, exposure=0.4)
+    clouds = [preprocess(cloud) for cloud in clouds] if prepared else clouds
+    found = estimate_channel_covariance(clouds, POSES)
+    np.testing.assert_allclose(found, 2 * NOISE, atol=0.015)
+    assert np.linalg.eigvalsh(found).min() > 0
+
+
+def test_channels_that_are_never_seen_together_have_no_covariance():
+    clouds = seen_again()
+    half = np.arange(1500) < 750
+    mask = np.stack([half, ~half, ~half], axis=1)
+    found = estimate_channel_covariance([cloud.replace(channel_valid=mask) for cloud in clouds], POSES)
+    np.testing.assert_allclose(found, 2 * NOISE * [[1, 0, 0], [0, 1, 1], [0, 1, 1]], atol=0.02)
+
+
+def test_channels_without_noise_have_a_covariance_that_can_be_inverted():
+    points, channels = ref.scene(500, 2)
+    found = estimate_channel_covariance([PointCloud(points, channels)] * 2, POSES[:1] * 2)
+    assert np.isfinite(found).all() and np.linalg.eigvalsh(found).min() > 0
+
+
+@pytest.mark.parametrize(
+    "make, message",
+    [
+        (lambda clouds: (clouds, POSES[:2]), "poses: expected one for each of two clouds or more, got 2 for 3"),
+        (lambda clouds: (clouds[:1], POSES[:1]), "poses: expected one for each of two clouds or more, got 1 for 1"),
+        (lambda clouds: (clouds[:2], [np.eye(4), 2 * np.eye(4)]), r"poses\[1\]: expected a rigid motion"),
+        (lambda clouds: ([clouds[0], PointCloud(POSES[0][:, :3])], POSES[:2]), r"clouds\[1\]: expected the channels"),
+        (lambda clouds: (clouds[:2], POSES[1:]), "clouds: expected 10 spots or more .* 'channel_0'"),
+    ],
+    ids=["one pose short", "one cloud", "scale", "channels", "no overlap"],
+)
+def test_what_cannot_be_measured(make, message):
+    with pytest.raises(ValueError, match=message):
+        estimate_channel_covariance(*make(seen_again()))
+
+
+@pytest.mark.parametrize("present", [None, 0.5])
+def test_gain_and_offset_are_undone(present):
+    points, channels = ref.scene(500, 3)
+    mask = None if present is None else np.random.default_rng(0).random(channels.shape) < present
+    target = preprocess(PointCloud(points, channels, channel_valid=mask))
+    source = target.replace(channels=target.channels * np.array([0.5, 3.0, 1.0]) + np.array([7.0, 0.0, -1.0]))
+    matched = with_channels_matched(source, target)
+    np.testing.assert_allclose(matched.channels[:500], target.channels[:500], atol=ref.tolerance(2e-5, 1e-12))
+
+
+def test_channels_that_say_nothing_are_not_matched():
+    """Constant, or seen by nobody: at most shifted, and finite."""
+    points, channels = ref.scene(500, 3)
+    channels[:, 1] = 4.0
+    mask = np.ones(channels.shape, bool)
+    mask[:, 2] = False
+    target = preprocess(PointCloud(points, channels, channel_valid=mask))
+    source = target.replace(channels=target.channels + 1)
+    matched = with_channels_matched(source, target)
+    np.testing.assert_allclose(matched.channels[:500], target.channels[:500], atol=1e-5)
+    gradient = jax.grad(lambda values: with_channels_matched(source.replace(channels=values), target).channels.sum())
+    assert np.isfinite(gradient(source.channels)).all()
