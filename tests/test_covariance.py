@@ -260,7 +260,7 @@ def test_gradients_through_missing_channels(argument):
 
 
 def weighted_sum(points, channels, channel_covariance, epsilon, cloud, weights, as_gicp):
-    method = GICP(epsilon) if as_gicp else MultiChannelGICP(channel_covariance, 0.1, epsilon)
+    method = GICP(epsilon) if as_gicp else MultiChannelGICP(channel_covariance, 0.1, epsilon, min_eigenvalue=1e-3)
     return jnp.sum(weights * method.covariance(cloud.replace(points=points, channels=channels)))
 
 
