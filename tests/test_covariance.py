@@ -568,3 +568,23 @@ def test_rotate_multiply_and_outer(seed):
     np.testing.assert_allclose(products, vectors[:, :, None] * vectors[:, None, :], atol=2 * atol)
     np.testing.assert_allclose(cov.matrix_from_symmetric(packed), matrices, atol=0)
     np.testing.assert_allclose(cov.symmetric_from_matrix(jnp.asarray(matrices, dtype())), packed, atol=0)
+
+
+def test_large_clouds_are_taken_block_by_block(monkeypatch):
+    """Values and gradients, with blocks that do not come out even and neighbours that are missing."""
+    rng = np.random.default_rng(0)
+    points = jnp.asarray(rng.random((3, 700)), float)
+    neighbors = jnp.asarray(np.where(rng.random((700, 8)) < 0.9, rng.integers(0, 700, (700, 8)), -1), jnp.int32)
+    weights = jnp.asarray(rng.normal(size=(6, 700)), float)
+
+    def both():
+        def weighed(points):
+            return jnp.sum(weights * cov.local_covariance(points, neighbors))
+
+        return jax.jit(functools.partial(cov.local_covariance, neighbors=neighbors))(points), jax.grad(weighed)(points)
+
+    whole = both()
+    monkeypatch.setattr(cov, "_LARGEST_WHOLE", 100)
+    monkeypatch.setattr(cov, "_BLOCK", 128)
+    for one, other in zip(both(), whole, strict=True):
+        np.testing.assert_allclose(one, other, rtol=1e-5, atol=1e-6)

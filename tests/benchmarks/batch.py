@@ -1,0 +1,193 @@
+"""Many pairs: pairs per second beside small_gicp in as many processes as there are cores, and the memory of a stream.
+
+Run `python -m tests.benchmarks.batch`; see README.md. Libraries take turns, and what is compared is compared within one
+turn.
+"""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import multiprocessing
+import os
+import pathlib
+import resource
+import statistics
+import time
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+DATA = pathlib.Path(os.environ.get("MCGICP_DATA", pathlib.Path(__file__).parents[3] / "shared" / "data"))
+NUM_TURNS = 5
+GATE = 1.0
+# Those of small_gicp's defaults, for both.
+TOLERANCES = {"translation_tolerance": 1e-3, "rotation_tolerance": np.radians(0.1)}
+
+Pair = tuple[np.ndarray, np.ndarray, np.ndarray]
+
+
+def lidar_pairs(count: int, keep: float, thinned: float | None) -> list[Pair]:
+    """Resamplings and random rigid moves of one pair of scans, thinned first: source, target and the true pose."""
+    import mcgicp_jax as mcg
+
+    folder = DATA / "lidar_pair"
+    source, target = (np.asarray(mcg.io.read(folder / f"{name}.ply").points, float) for name in ("source", "target"))
+    if thinned is not None:
+        source, target = (mcg.preprocess(cloud, thinned).unpad().points.astype(float) for cloud in (source, target))
+    truth = np.loadtxt(folder / "T_target_source.txt")
+    rng = np.random.default_rng(0)
+    pairs = []
+    for _ in range(count):
+        moved = np.eye(4)
+        moved[:3, :3] = Rotation.from_rotvec(0.01 * rng.normal(size=3)).as_matrix()
+        moved[:3, 3] = 0.2 * rng.normal(size=3)
+        a, b = (cloud[rng.random(len(cloud)) < keep] for cloud in (source, target))
+        pairs.append(((a @ moved[:3, :3].T + moved[:3, 3]).astype(np.float32), b, truth @ np.linalg.inv(moved)))
+    return pairs
+
+
+def ours(pairs: list[Pair], voxel: float | None) -> list[np.ndarray]:
+    import mcgicp_jax as mcg
+
+    sources, targets = ([pair[side].astype(np.float32) for pair in pairs] for side in (0, 1))
+    results = mcg.register_batch(sources, targets, mcg.GICP(), max_distance=GATE, voxel_size=voxel, **TOLERANCES)
+    return [np.asarray(result.matrix) for result in results]
+
+
+def theirs(pairs: list[Pair], voxel: float | None) -> list[np.ndarray]:
+    import small_gicp
+
+    poses = []
+    for source, target, _ in pairs:
+        (a, _), (b, tree) = (_prepared(cloud.astype(float), voxel) for cloud in (source, target))
+        result = small_gicp.align(b, a, tree, np.eye(4), max_correspondence_distance=GATE, num_threads=1)
+        poses.append(np.asarray(result.T_target_source))
+    return poses
+
+
+def _prepared(points: np.ndarray, voxel: float | None) -> tuple[Any, Any]:
+    import small_gicp
+
+    if voxel is not None:
+        return small_gicp.preprocess_points(points, voxel, num_neighbors=20, num_threads=1)
+    cloud = small_gicp.PointCloud(points)
+    tree = small_gicp.KdTree(cloud)
+    small_gicp.estimate_covariances(cloud, tree, num_neighbors=20, num_threads=1)
+    return cloud, tree
+
+
+def _serve(connection: Any, pairs: list[Pair], voxel: float | None) -> None:
+    connection.send(None)
+    while connection.recv():
+        connection.send(theirs(pairs, voxel))
+
+
+class Processes:
+    """small_gicp in several processes, each with its share of the pairs."""
+
+    def __init__(self, pairs: list[Pair], voxel: float | None, count: int):
+        context = multiprocessing.get_context("spawn")
+        self._connections = []
+        for i in range(count):
+            mine, other = context.Pipe()
+            context.Process(target=_serve, args=(other, pairs[i::count], voxel), daemon=True).start()
+            self._connections.append(mine)
+        for connection in self._connections:
+            connection.recv()
+
+    def __call__(self) -> list[np.ndarray]:
+        for connection in self._connections:
+            connection.send(True)
+        shares = [connection.recv() for connection in self._connections]
+        poses: list[Any] = [None] * sum(map(len, shares))
+        for i, share in enumerate(shares):
+            poses[i :: len(shares)] = share
+        return poses
+
+    def close(self) -> None:
+        for connection in self._connections:
+            connection.send(False)
+
+
+def _timed(function: Callable[[], Any]) -> tuple[float, float, Any]:
+    """Wall time, and processor time of this process alone."""
+    wall, cpu = time.perf_counter(), time.process_time()
+    answer = function()
+    return time.perf_counter() - wall, time.process_time() - cpu, answer
+
+
+def rates() -> None:
+    cores = len(os.sched_getaffinity(0))
+    print(f"\nPairs per second, preprocessing included, {cores} cores, GICP, medians of {NUM_TURNS} turns")
+    print(f"{'pairs':>12} {'points':>8} {'ours':>8} {'small_gicp':>11} {'ratio':>7} {'over the turns':>15}", end="")
+    print(f" {'processor time ratio':>21} {'poses apart':>12}")
+    for count, voxel, keep, thinned in ((64, 0.25, 0.95, None), (256, None, 0.77, 0.5)):
+        pairs = lidar_pairs(count, keep, thinned)
+        processes = Processes(pairs, voxel, cores)
+        ours(pairs, voxel)
+        processes()
+        turns = []
+        for _ in range(NUM_TURNS):
+            wall, cpu, mine = _timed(lambda pairs=pairs, voxel=voxel: ours(pairs, voxel))
+            wall_theirs, _, other = _timed(processes)
+            _, cpu_theirs, _ = _timed(lambda pairs=pairs, voxel=voxel: theirs(pairs[:16], voxel))
+            turns.append((count / wall, count / wall_theirs, wall_theirs / wall, cpu_theirs * count / 16 / cpu))
+        mine_rate, rate, _, cpu_ratio = (statistics.median(column) for column in zip(*turns, strict=True))
+        ratios = sorted(turn[2] for turn in turns)
+        apart = max(np.linalg.norm(a[:3, 3] - b[:3, 3]) for a, b in zip(mine, other, strict=True))
+        processes.close()
+        size = _size(pairs[0], voxel)
+        print(f"{count:12} {size:8,} {mine_rate:8.1f} {rate:11.1f} {statistics.median(ratios):7.2f}", end="")
+        print(f" {ratios[0]:6.2f} to {ratios[-1]:.2f} {cpu_ratio:20.2f} {1e3 * apart:9.2f} mm")
+
+
+def _size(pair: Pair, voxel: float | None) -> int:
+    import mcgicp_jax as mcg
+
+    return len(mcg.preprocess(pair[0], voxel))
+
+
+def memory() -> None:
+    """Peak memory of streams of clouds that are made as they are consumed."""
+    import mcgicp_jax as mcg
+
+    rng = np.random.default_rng(0)
+
+    def clouds(count: int) -> Iterator[np.ndarray]:
+        for _ in range(count):
+            points = rng.random((300, 3)).astype(np.float32)
+            points[np.arange(300), np.arange(300) % 3] = 0
+            yield points
+
+    print("\nPeak memory of the process after a stream of pairs of 300 points, GICP")
+    target = next(clouds(1))
+    for count in (100, 1000, 10000):
+        wall = time.perf_counter()
+        completed = mcg.register_as_completed(clouds(count), target, mcg.GICP(), max_distance=0.2, max_iterations=8)
+        statuses: dict[str, int] = {}
+        for _, result in completed:
+            statuses[result.status.name] = statuses.get(result.status.name, 0) + 1
+        peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+        print(
+            f"{count:8,} pairs {peak:8.0f} MB {count / (time.perf_counter() - wall):8.0f} pairs per second {statuses}"
+        )
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("parts", nargs="*", help="which of rates, memory; both by default")
+    chosen = parser.parse_args().parts or ["rates", "memory"]
+    print(f"{os.cpu_count()} cores, load {os.getloadavg()[0]:.1f} before")
+    with contextlib.suppress(KeyboardInterrupt):
+        if "rates" in chosen:
+            rates()
+        if "memory" in chosen:
+            memory()
+    print(f"load {os.getloadavg()[0]:.1f} after")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,234 @@
+"""One pair at a time, beside small_gicp and Open3D: preprocessing, alignment and the whole, over sizes of clouds.
+
+Run `python -m tests.benchmarks.speed`; see README.md. All libraries get the same clouds and take turns in one process,
+and what is compared is compared within one turn. Open3D is left out where it is not installed.
+"""
+
+from __future__ import annotations
+
+import argparse
+import importlib.util
+import os
+import pathlib
+import resource
+import statistics
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+import mcgicp_jax as mcg
+
+DATA = pathlib.Path(os.environ.get("MCGICP_DATA", pathlib.Path(__file__).parents[3] / "shared" / "data"))
+NUM_TURNS = 9
+# Of small_gicp by default, for all.
+TOLERANCES = {"translation_tolerance": 1e-3, "rotation_tolerance": np.radians(0.1)}
+MAX_ITERATIONS = 20
+NUM_NEIGHBORS = 20
+
+Stages = tuple[float, float, np.ndarray]
+
+
+def lidar_pair() -> tuple[np.ndarray, np.ndarray]:
+    return tuple(
+        np.asarray(mcg.io.read(DATA / "lidar_pair" / f"{name}.ply").points, float) for name in ("source", "target")
+    )
+
+
+def kitti() -> tuple[np.ndarray, np.ndarray]:
+    folder = DATA / "kitti" / "sequences" / "04" / "velodyne"
+    target, source = (np.asarray(mcg.io.read(path).points, float) for path in sorted(folder.glob("*.bin"))[:2])
+    return source, target
+
+
+def million() -> tuple[np.ndarray, np.ndarray]:
+    """A rolling landscape of a million points, twice, half a metre apart."""
+    clouds = []
+    for seed in (0, 1):
+        x, y = np.random.default_rng(seed).random((2, 1_000_000)) * 200
+        clouds.append(np.stack([x, y, 3 * np.sin(x / 7) * np.cos(y / 5) + np.sin(x + y / 3)], axis=1))
+    return clouds[0] + [0.3, -0.2, 0.1], clouds[1]
+
+
+CASES: dict[str, tuple[Callable[[], tuple[np.ndarray, np.ndarray]], float | None, float, int]] = {
+    "lidar_pair, 0.5 m": (lidar_pair, 0.5, 1.0, NUM_TURNS),
+    "lidar_pair, 0.25 m": (lidar_pair, 0.25, 1.0, NUM_TURNS),
+    "lidar_pair, 0.1 m": (lidar_pair, 0.1, 1.0, NUM_TURNS),
+    "kitti, 0.25 m": (kitti, 0.25, 2.5, NUM_TURNS),
+    "kitti, all": (kitti, None, 2.5, 3),
+    "a million": (million, None, 1.0, 1),
+}
+
+
+def ours(source: np.ndarray, target: np.ndarray, voxel: float | None, gate: float) -> Stages:
+    begin = time.perf_counter()
+    clouds = [mcg.preprocess(cloud.astype(np.float32), voxel, NUM_NEIGHBORS) for cloud in (source, target)]
+    ready = time.perf_counter()
+    result = mcg.register(*clouds, mcg.GICP(), max_distance=gate, max_iterations=MAX_ITERATIONS, **TOLERANCES)
+    return ready - begin, time.perf_counter() - ready, np.asarray(result.matrix)
+
+
+def small(num_threads: int) -> Callable[..., Stages]:
+    import small_gicp
+
+    def prepared(points: np.ndarray, voxel: float | None) -> tuple[Any, Any]:
+        if voxel is not None:
+            return small_gicp.preprocess_points(points, voxel, num_neighbors=NUM_NEIGHBORS, num_threads=num_threads)
+        cloud = small_gicp.PointCloud(points)
+        tree = small_gicp.KdTree(cloud, num_threads=num_threads)
+        small_gicp.estimate_covariances(cloud, tree, NUM_NEIGHBORS, num_threads)
+        return cloud, tree
+
+    def run(source: np.ndarray, target: np.ndarray, voxel: float | None, gate: float) -> Stages:
+        begin = time.perf_counter()
+        (a, _), (b, tree) = (prepared(cloud, voxel) for cloud in (source, target))
+        ready = time.perf_counter()
+        result = small_gicp.align(
+            b,
+            a,
+            tree,
+            np.eye(4),
+            max_correspondence_distance=gate,
+            num_threads=num_threads,
+            max_iterations=MAX_ITERATIONS,
+        )
+        return ready - begin, time.perf_counter() - ready, np.asarray(result.T_target_source)
+
+    return run
+
+
+def open3d(source: np.ndarray, target: np.ndarray, voxel: float | None, gate: float) -> Stages:
+    import open3d as o3d
+
+    pipeline = o3d.pipelines.registration
+    begin = time.perf_counter()
+    clouds = []
+    for points in (source, target):
+        cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(points))
+        cloud = cloud if voxel is None else cloud.voxel_down_sample(voxel)
+        cloud.estimate_normals(o3d.geometry.KDTreeSearchParamKNN(NUM_NEIGHBORS))
+        clouds.append(cloud)
+    ready = time.perf_counter()
+    result = pipeline.registration_generalized_icp(
+        *clouds,
+        gate,
+        np.eye(4),
+        pipeline.TransformationEstimationForGeneralizedICP(),
+        pipeline.ICPConvergenceCriteria(max_iteration=MAX_ITERATIONS),
+    )
+    return ready - begin, time.perf_counter() - ready, np.asarray(result.transformation)
+
+
+def turns(chart: pathlib.Path | None, chosen: list[str]) -> None:
+    libraries: dict[str, Callable[..., Stages]] = {"ours": ours, "small 1": small(1), "small 2": small(2)}
+    if importlib.util.find_spec("open3d") is not None:
+        libraries["open3d"] = open3d
+    print("\nMilliseconds: prepare + align, medians; and ours / the better of small_gicp, median of the turns")
+    header = "".join(f"{name:>20}" for name in libraries)
+    print(f"{'clouds':>20} {'points':>9}{header} {'prepare':>8} {'align':>6} {'whole':>6} {'/ open3d':>9} {'apart':>8}")
+    drawn: dict[str, list[tuple[int, float]]] = {name: [] for name in libraries}
+    for case in chosen:
+        load, voxel, gate, count = CASES[case]
+        source, target = load()
+        times: dict[str, list[tuple[float, float]]] = {name: [] for name in libraries}
+        poses = {}
+        for turn in range(count + 1):
+            for name, run in libraries.items():
+                *stages, poses[name] = run(source, target, voxel, gate)
+                # The first turn compiles and warms.
+                if turn:
+                    times[name].append((stages[0], stages[1]))
+        size = len(mcg.preprocess(source.astype(np.float32), voxel))
+        cells = []
+        for name, stages in times.items():
+            prepare, align = (1e3 * statistics.median(column) for column in zip(*stages, strict=True))
+            cells.append(f"{f'{prepare:.0f} + {align:.0f}':>20}")
+            drawn[name].append((size, prepare + align))
+        ratios = [_ratio(times, stage) for stage in (slice(0, 1), slice(1, 2), slice(0, 2))]
+        beside = _ratio_to(times, "open3d") if "open3d" in times else float("nan")
+        apart = 1e3 * np.linalg.norm(poses["ours"][:3, 3] - poses["small 1"][:3, 3])
+        print(f"{case:>20} {size:9,}{''.join(cells)} ", end="")
+        print(f"{ratios[0]:8.2f} {ratios[1]:6.2f} {ratios[2]:6.2f} {beside:9.2f} {apart:5.1f} mm", flush=True)
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+    print(f"peak memory of the process, all libraries: {peak:.0f} MB")
+    if chart is not None:
+        _draw(chart, drawn)
+
+
+def _ratio(times: dict[str, list[tuple[float, float]]], stage: slice) -> float:
+    """Ours over the better of small_gicp with one and two threads, turn by turn."""
+    rows = zip(times["ours"], times["small 1"], times["small 2"], strict=True)
+    return statistics.median(sum(a[stage]) / min(sum(b[stage]), sum(c[stage])) for a, b, c in rows)
+
+
+def _ratio_to(times: dict[str, list[tuple[float, float]]], name: str) -> float:
+    return statistics.median(sum(a) / sum(b) for a, b in zip(times["ours"], times[name], strict=True))
+
+
+def _draw(path: pathlib.Path, drawn: dict[str, list[tuple[int, float]]]) -> None:
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(6, 4), layout="constrained")
+    axes = figure.subplots()
+    for name, points in drawn.items():
+        axes.loglog(*zip(*sorted(points), strict=True), marker="o", label=name)
+    axes.set(xlabel="points of each cloud", ylabel="whole, ms")
+    axes.legend()
+    figure.savefig(path)
+    print(f"chart: {path}")
+
+
+_FIRST_CALL = """
+import time; begin = time.perf_counter()
+import numpy as np, mcgicp_jax as mcg
+imported = time.perf_counter()
+rng = np.random.default_rng(0)
+target = rng.random((6000, 3)); target[np.arange(6000), np.arange(6000) % 3] = 0
+mcg.register(target + 0.01, target, mcg.GICP(), max_distance=0.2)
+print(imported - begin, time.perf_counter() - imported)
+"""
+
+
+def starts(folder: pathlib.Path) -> None:
+    """Import, first call, and first call of a second process, in fresh processes; seconds."""
+
+    def run(code: str, **environment: str) -> list[float]:
+        text = subprocess.run(
+            [sys.executable, "-c", code], env=os.environ | environment, capture_output=True, text=True, check=True
+        ).stdout
+        return [float(number) for number in text.split()]
+
+    bare = "import time; a = time.perf_counter()\nimport jax, optimistix, scipy.spatial\nprint(time.perf_counter() - a)"
+    package = "import time; a = time.perf_counter()\nimport mcgicp_jax\nprint(time.perf_counter() - a)"
+    rows = [(run(package)[0], run(bare)[0]) for _ in range(5)]
+    ratio = statistics.median(a / b for a, b in rows)
+    seconds, without = (statistics.median(column) for column in zip(*rows, strict=True))
+    print(f"\nimport: {seconds:.2f} s, {ratio:.2f} times `import jax, optimistix, scipy.spatial` ({without:.2f} s)")
+    cache = {
+        "JAX_COMPILATION_CACHE_DIR": str(folder),
+        "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0",
+        "JAX_PERSISTENT_CACHE_MIN_ENTRY_SIZE_BYTES": "-1",
+    }
+    first, second = (run(_FIRST_CALL, **cache)[1] for _ in range(2))
+    print(f"first call of two raw clouds of 6,000 points: {first:.1f} s; in a second process: {second:.1f} s")
+
+
+def main() -> None:
+    import tempfile
+
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("cases", nargs="*", help=f"which of {', '.join(CASES)}; all by default")
+    parser.add_argument("--chart", type=pathlib.Path, help="picture of time against points, such as speed.png")
+    arguments = parser.parse_args()
+    print(f"{os.cpu_count()} cores, load {os.getloadavg()[0]:.1f} before")
+    turns(arguments.chart, arguments.cases or list(CASES))
+    with tempfile.TemporaryDirectory() as folder:
+        starts(pathlib.Path(folder))
+    print(f"load {os.getloadavg()[0]:.1f} after")
+
+
+if __name__ == "__main__":
+    main()
