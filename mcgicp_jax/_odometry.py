@@ -7,14 +7,13 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from jax.typing import ArrayLike
 from jaxtyping import Float
 
 from mcgicp_jax._cloud import PointCloud
 from mcgicp_jax._methods import AbstractMethod
 from mcgicp_jax._pose import Pose, pose_matrix
 from mcgicp_jax._preprocess import preprocess
-from mcgicp_jax._register import register
+from mcgicp_jax._register import Distance, register
 from mcgicp_jax._result import Registration, Status
 from mcgicp_jax.datasets import Frame
 
@@ -43,7 +42,7 @@ def odometry(
     *,
     voxel_size: float | None = None,
     num_neighbors: int = 20,
-    max_distance: ArrayLike,
+    max_distance: Distance | None = None,
     start: Pose | None = None,
     **options: Any,
 ) -> Iterator[Step]:
@@ -57,7 +56,8 @@ def odometry(
         frames: frames of a data set, or clouds; clouds that are preprocessed already are taken as they are.
         method: numbers that it leaves open are chosen from the data of every pair.
         voxel_size, num_neighbors: for `preprocess`.
-        max_distance: metres; for the first pair, whose motion is not yet known, it must be more than the motion.
+        max_distance: metres, as in `register`; for the first pair, whose motion is not yet known, it must be more than
+            the motion.
         start: pose of the first frame in the world; the identity by default.
         options: further arguments of `register`; `init` starts the first pair.
 
