@@ -127,20 +127,25 @@ def turns(chart: pathlib.Path | None, chosen: list[str]) -> None:
     if importlib.util.find_spec("open3d") is not None:
         libraries["open3d"] = open3d
     print("\nMilliseconds: prepare + align, medians; and ours / the better of small_gicp, median of the turns")
+    print("work: processor time of the whole, ours / small_gicp with one thread")
     header = "".join(f"{name:>20}" for name in libraries)
-    print(f"{'clouds':>20} {'points':>9}{header} {'prepare':>8} {'align':>6} {'whole':>6} {'/ open3d':>9} {'apart':>8}")
+    ratios_header = f"{'prepare':>8} {'align':>6} {'whole':>6} {'/ open3d':>9} {'work':>6} {'apart':>8}"
+    print(f"{'clouds':>20} {'points':>9}{header} {ratios_header}")
     drawn: dict[str, list[tuple[int, float]]] = {name: [] for name in libraries}
     for case in chosen:
         load, voxel, gate, count = CASES[case]
         source, target = load()
         times: dict[str, list[tuple[float, float]]] = {name: [] for name in libraries}
+        work: dict[str, list[float]] = {name: [] for name in libraries}
         poses = {}
         for turn in range(count + 1):
             for name, run in libraries.items():
+                begin = time.process_time()
                 *stages, poses[name] = run(source, target, voxel, gate)
                 # The first turn compiles and warms.
                 if turn:
                     times[name].append((stages[0], stages[1]))
+                    work[name].append(time.process_time() - begin)
         size = len(mcg.preprocess(source.astype(np.float32), voxel))
         cells = []
         for name, stages in times.items():
@@ -149,9 +154,13 @@ def turns(chart: pathlib.Path | None, chosen: list[str]) -> None:
             drawn[name].append((size, prepare + align))
         ratios = [_ratio(times, stage) for stage in (slice(0, 1), slice(1, 2), slice(0, 2))]
         beside = _ratio_to(times, "open3d") if "open3d" in times else float("nan")
+        effort = statistics.median(a / b for a, b in zip(work["ours"], work["small 1"], strict=True))
         apart = 1e3 * np.linalg.norm(poses["ours"][:3, 3] - poses["small 1"][:3, 3])
         print(f"{case:>20} {size:9,}{''.join(cells)} ", end="")
-        print(f"{ratios[0]:8.2f} {ratios[1]:6.2f} {ratios[2]:6.2f} {beside:9.2f} {apart:5.1f} mm", flush=True)
+        print(
+            f"{ratios[0]:8.2f} {ratios[1]:6.2f} {ratios[2]:6.2f} {beside:9.2f} {effort:6.2f} {apart:5.1f} mm",
+            flush=True,
+        )
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
     print(f"peak memory of the process, all libraries: {peak:.0f} MB")
     if chart is not None:
