@@ -1,0 +1,333 @@
+"""What holds a pose, and how well it is known."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+import mcgicp_jax as mcg
+from mcgicp_jax import _covariance as cov
+from mcgicp_jax import datasets
+from mcgicp_jax._evidence import find_evidence
+from mcgicp_jax._uncertainty import Felt, find_directions
+
+from .scenes import motion, pair, room_corner, wall
+
+
+def matrices(symmetric):
+    return np.asarray(cov.matrix_from_symmetric(symmetric), np.float64)
+
+
+def mean_evidence(cloud, method):
+    found = find_evidence(method, cloud)
+    keep = np.asarray(cloud.valid)
+    channels = None if found.channels is None else matrices(found.channels)[keep].mean(axis=0)
+    return matrices(found.geometry)[keep].mean(axis=0), channels
+
+
+# Evidence
+
+
+@pytest.mark.parametrize("turn", [(0, 0, 0, 0, 0, 0), (1, 2, 3, 0.4, -0.7, 0.2)])
+@pytest.mark.parametrize("size", [1e-3, 1, 1e3])
+def test_a_flat_wall_is_felt_along_its_normal_alone(size, turn):
+    points, _ = wall(2000, noise=0.005)
+    pose = motion(turn)
+    cloud = mcg.preprocess(size * (points @ pose[:3, :3].T + pose[:3, 3]))
+    geometry, _ = mean_evidence(cloud, mcg.GICP())
+    geometry = pose[:3, :3].T @ geometry @ pose[:3, :3]
+    assert geometry[2, 2] > 0.95
+    # The normals themselves waver by more than this: what noise makes of them is taken off.
+    assert np.abs(np.linalg.eigvalsh(geometry[:2, :2])).max() < 5e-4
+
+
+def test_a_line_is_felt_across_alone_and_a_single_spot_not_at_all():
+    rng = np.random.default_rng(0)
+    along = np.array([1, 2, 3]) / np.sqrt(14)
+    line = np.outer(rng.uniform(high=4, size=2000), along) + 1e-3 * rng.normal(size=(2000, 3))
+    geometry, _ = mean_evidence(mcg.preprocess(line), mcg.GICP())
+    assert abs(along @ geometry @ along) < 1e-3 and np.linalg.eigvalsh(geometry)[1] > 0.1
+    geometry, _ = mean_evidence(mcg.preprocess(np.tile([[1.0, 2.0, 3.0]], (2000, 1))), mcg.GICP())
+    np.testing.assert_allclose(geometry, 0, atol=1e-6)
+
+
+def test_channels_are_felt_along_their_gradient():
+    """A ramp of slope g is felt by α²g²/(1 + α²g²) along it, and not at all across."""
+    points, _ = wall(2000, noise=0.0)
+    cloud = mcg.preprocess(mcg.PointCloud(points, 3 * points[:, :1]))
+    method = mcg.MultiChannelGICP(channel_covariance=1.0, channel_weights=0.5)
+    _, channels = mean_evidence(cloud, method)
+    np.testing.assert_allclose(channels, np.diag([1.5**2 / (1 + 1.5**2), 0, 0]), atol=2e-3)
+
+
+def test_noise_of_the_channels_holds_nothing():
+    points, _ = wall(2000)
+    noise = np.random.default_rng(1).normal(size=(2000, 3))
+    cloud = mcg.preprocess(mcg.PointCloud(points, noise))
+    _, channels = mean_evidence(cloud, mcg.MultiChannelGICP().resolve(cloud, cloud))
+    assert np.abs(channels).max() < 5e-3
+
+
+# Directions
+
+
+@settings(deadline=None, max_examples=30)
+@given(seed=st.integers(0, 2**32 - 1), held=st.integers(0, 6), radius=st.sampled_from([1e-3, 1.0, 300.0]))
+def test_directions_are_the_eigenvectors_of_the_share_of_motion(seed, held, radius):
+    """Against SciPy's generalised eigenvalues of random pairs that feel motions along `held` random twists."""
+    import scipy.linalg
+
+    rng = np.random.default_rng(seed)
+    p = radius * rng.normal(size=(3, 200))
+    weight = rng.uniform(0.5, 1.5, 200)
+    normals = rng.normal(size=(200, 3))
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    matrices = np.einsum("ni,nj->nij", normals, normals) * (held / 6)
+    hh = np.einsum("in,jn->ijn", *[np.concatenate([p, np.ones((1, 200))])] * 2)[np.triu_indices(4)]
+    upper = matrices[:, *np.triu_indices(3)].T
+    felt = Felt(
+        geometry=jnp.asarray((weight * upper) @ hh.T, float), channels=None, mass=jnp.asarray(hh @ weight, float)
+    )
+    found = jax.jit(find_directions)(felt, jnp.zeros(3), jnp.asarray(radius, float))
+    arms = p.T / radius
+    jacobians = np.concatenate([np.tile(np.eye(3), (200, 1, 1)), -np.cross(arms[:, None, :], np.eye(3)[None])], axis=2)
+    jacobians[:, :, 3:] = np.stack([np.cross(axis, arms) for axis in np.eye(3)], axis=2)
+    felt_motion = np.einsum("n,nai,nab,nbj->ij", weight, jacobians, matrices, jacobians)
+    all_motion = np.einsum("n,nai,naj->ij", weight, jacobians, jacobians)
+    expected = scipy.linalg.eigvalsh(felt_motion, all_motion)
+    np.testing.assert_allclose(found.geometry, expected, atol=2e-4)
+    twists = np.asarray(found.twists, np.float64)
+    np.testing.assert_allclose(twists @ all_motion @ twists.T / weight.sum(), np.eye(6), atol=2e-3)
+
+
+@pytest.fixture(scope="module")
+def flat():
+    return pair(wall, truth=motion((0.03, -0.02, 0.01, 0.01, -0.01, 0.02)))
+
+
+def test_geometry_slides_on_a_wall_and_stays_where_it_started(flat):
+    source, target, truth = flat
+    result = mcg.register(source, target, mcg.GICP(), max_distance=0.3)
+    assert result.status is mcg.Status.DEGENERATE and not result.converged
+    kinds = [(direction.is_rotation, direction.held_by_channels) for direction in result.free_directions]
+    assert kinds == [(False, False), (False, False), (True, False)]
+    for direction in result.free_directions[:2]:
+        assert abs(direction.axis[2]) < 0.05
+    assert abs(result.free_directions[2].axis[2]) > 0.99
+    # What is held is found: height and tilt. What is not stays: the way along the wall, and the turn about its normal.
+    left = np.linalg.inv(truth) @ result.matrix
+    assert abs(left[2, 3]) < 2e-3 and np.abs(left[:2, 2]).max() < 2e-3
+    centroid = result.directions.center
+    assert np.linalg.norm((result.matrix[:3, :3] @ centroid + result.matrix[:3, 3] - centroid)[:2]) < 2e-3
+    assert abs(result.matrix[1, 0]) < 1e-3
+    assert "held by nothing" in repr(result)
+
+
+def test_without_the_hold_the_nearest_neighbours_pull(flat):
+    source, target, _ = flat
+    result = mcg.register(source, target, mcg.GICP(), max_distance=0.3, hold_free_directions=False)
+    assert result.status in (mcg.Status.DEGENERATE, mcg.Status.MAX_ITERATIONS)
+    centroid = result.directions.center
+    assert np.linalg.norm((result.matrix[:3, :3] @ centroid + result.matrix[:3, 3] - centroid)[:2]) > 2e-3
+
+
+def test_the_channels_hold_what_geometry_leaves_free(flat):
+    source, target, truth = flat
+    result = mcg.register(source, target, mcg.MultiChannelGICP(), max_distance=0.3)
+    assert result.converged and len(result.free_directions) == 3
+    assert all(direction.held_by_channels for direction in result.free_directions)
+    assert mcg.metrics.pose_error(result.matrix, truth)[0] < 0.01
+    assert repr(result).count("held by the channels: all") == 1
+
+
+def test_nothing_is_free_in_a_corner():
+    source, target, _ = pair()
+    result = mcg.register(source, target, mcg.GICP(), max_distance=0.5)
+    assert result.converged and result.free_directions == () and "free" not in repr(result)
+
+
+@pytest.mark.parametrize("textured", [True, False])
+def test_a_corridor_is_free_along_its_axis(textured):
+    target, source = datasets.corridor(2, textured=textured)
+    truth = np.linalg.inv(target.pose) @ source.pose
+    clouds = [mcg.preprocess(frame.cloud) for frame in (source, target)]
+    result = mcg.register(*clouds, mcg.MultiChannelGICP(), max_distance=0.5)
+    (direction,) = result.free_directions
+    assert not direction.is_rotation and direction.held_by_channels == textured
+    axis = source.pose[:3, :3].T @ [1, 0, 0]
+    assert abs(direction.axis @ axis) > 0.995
+    assert result.status is (mcg.Status.CONVERGED if textured else mcg.Status.DEGENERATE)
+    if textured:
+        # Of 0.2 m, with points 0.15 m apart; what it claims to know is no better.
+        assert mcg.metrics.pose_error(result.matrix, truth)[0] < 0.1
+
+
+@settings(deadline=None, max_examples=10)
+@given(scale=st.sampled_from([1e-4, 1.0, 1e4]), shift=st.sampled_from([0.0, 3.0]))
+def test_units_and_origin_change_nothing(scale, shift):
+    results = []
+    for factor, offset in ((1, 0), (scale, shift)):
+        points, channels = wall(2000)
+        other, more = wall(2000, seed=1)
+        clouds = [
+            mcg.preprocess(mcg.PointCloud(factor * (p + offset), c)) for p, c in ((points, channels), (other, more))
+        ]
+        results.append(
+            mcg.register(
+                *clouds,
+                mcg.MultiChannelGICP(),
+                max_distance=0.3 * factor,
+                translation_tolerance=5e-4 * factor,
+            )
+        )
+    first, second = (result.directions for result in results)
+    np.testing.assert_allclose(first.geometry, second.geometry, atol=5e-3)
+    np.testing.assert_allclose(first.channels, second.channels, atol=5e-3)
+
+
+def test_real_scenes(data):
+    """A flat table and a road leave three directions free, a street none."""
+    file = np.load(data / "planar_table" / "pair_000015_000025.npz")
+    table = [
+        mcg.preprocess(mcg.PointCloud(file[f"{which}_points_flat"], file[f"{which}_rgb"]), 0.01)
+        for which in ("source", "target")
+    ]
+    scans = [np.fromfile(data / f"kitti/sequences/04/velodyne/{i:06d}.bin", np.float32).reshape(-1, 4) for i in (1, 0)]
+    street = [mcg.preprocess(mcg.PointCloud(scan[:, :3], scan[:, 3:]), 0.25) for scan in scans]
+    road = [mcg.preprocess(mcg.PointCloud(scan[:, :3], scan[:, 3:]), 0.1) for scan in map(on_the_road, scans)]
+
+    result = mcg.register(*table, mcg.GICP(), max_distance=0.1)
+    assert result.status is mcg.Status.DEGENERATE
+    assert [direction.is_rotation for direction in result.free_directions] == [False, False, True]
+    result = mcg.register(*table, mcg.MultiChannelGICP(), max_distance=0.1)
+    assert result.converged and [direction.held_by_channels for direction in result.free_directions] == [True] * 3
+
+    result = mcg.register(*road, mcg.GICP(), init=motion((1.3, 0, 0, 0, 0, 0)), max_distance=0.5)
+    assert result.status is mcg.Status.DEGENERATE
+    forward, sideways, yaw = result.free_directions
+    assert abs(forward.axis[0]) > 0.99 and abs(sideways.axis[1]) > 0.99
+    assert yaw.is_rotation and abs(yaw.axis[2]) > 0.99
+
+    result = mcg.register(*street, mcg.GICP(), max_distance=1.5)
+    assert result.converged and result.free_directions == ()
+
+
+def on_the_road(scan):
+    """Points of the ground ahead: within 25 m, 6 m to each side, 6 cm of its plane."""
+    scan = scan[(np.abs(scan[:, 1]) < 6) & (np.hypot(scan[:, 0], scan[:, 1]) < 25)]
+    plane, near = None, np.abs(scan[:, 2] + 1.73) < 0.3
+    for _ in range(10):
+        x, y, z = scan[near, :3].T
+        plane = np.linalg.lstsq(np.stack([x, y, np.ones_like(x)], axis=1), z, rcond=None)[0]
+        near = np.abs(scan[:, 2] - scan[:, :2] @ plane[:2] - plane[2]) < 0.06
+    return scan[near]
+
+
+# Covariance
+
+
+def test_the_covariance_is_a_covariance():
+    source, target, _ = pair()
+    matches = mcg.find_correspondences(source, target, motion(), mcg.GICP(), max_distance=0.5)
+    for result in (
+        mcg.register(source, target, mcg.GICP(), max_distance=0.5),
+        mcg.register(source, target, mcg.MultiChannelGICP(), max_distance=0.5, robust=mcg.Cauchy(0.3)),
+        mcg.align(source, target, matches, mcg.GICP(), init=motion()),
+    ):
+        covariance = np.asarray(result.covariance)
+        np.testing.assert_array_equal(covariance, covariance.T)
+        assert np.linalg.eigvalsh(covariance / np.sqrt(np.outer(*[np.diagonal(covariance)] * 2))).min() > 0
+        # 2000 points of 1 cm noise: millimetres, milliradians
+        assert np.all(np.sqrt(np.diagonal(covariance)) < 6e-3) and np.all(np.sqrt(np.diagonal(covariance)) > 1e-4)
+
+
+def test_the_covariance_follows_the_unit_of_length():
+    source, target, _ = pair()
+    unit = np.array([1e3, 1e3, 1e3, 1, 1, 1])
+    covariances = []
+    for factor in (1, 1e3):
+        clouds = [mcg.preprocess(factor * np.asarray(cloud.unpad().points, np.float64)) for cloud in (source, target)]
+        result = mcg.register(
+            *clouds, mcg.GICP(), max_distance=0.5 * factor, translation_tolerance=5e-4 * factor, init=None
+        )
+        covariances.append(np.asarray(result.covariance))
+    small, large = covariances
+    ratio = large / (small * np.outer(unit, unit))
+    # Cells of space are cut differently in other units.
+    np.testing.assert_allclose(np.diagonal(ratio), 1, rtol=0.3)
+
+
+def test_what_nothing_holds_is_not_known(flat):
+    source, target, _ = flat
+    result = mcg.register(source, target, mcg.GICP(), max_distance=0.3)
+    for direction in result.free_directions:
+        deviation = np.sqrt(direction.twist @ np.linalg.pinv(np.asarray(result.information)) @ direction.twist)
+        assert np.isfinite(deviation)
+        # A motion of one metre, of ten times the radius
+        scaled = direction.twist / (direction.twist @ direction.twist)
+        assert scaled @ np.asarray(result.covariance) @ scaled > 1
+    held = np.asarray(result.directions.twists)[np.asarray(result.directions.held)]
+    coefficients = np.linalg.inv(np.asarray(result.directions.twists, np.float64).T)[np.asarray(result.directions.held)]
+    assert len(held) == 3
+    assert np.sqrt(np.diagonal(coefficients @ result.covariance @ coefficients.T)).max() < 5e-3
+
+
+def test_without_a_pose_there_is_no_covariance():
+    source, target, _ = pair()
+    result = mcg.register(source, target, mcg.GICP(), init=motion((50, 0, 0, 0, 0, 0)), max_distance=0.5)
+    assert np.all(np.isnan(result.covariance)) and result.free_directions == () and result.overlap == 0
+
+
+def test_large_coordinates_keep_the_covariance_of_the_points():
+    """In UTM the twist is about a zero point far away; seen from the cloud it is the same covariance, but for the cells
+    of space, which are cut elsewhere."""
+    source, target, _ = pair()
+    offset = np.array([4.5e5, 5.2e6, 100.0])
+    near = mcg.register(source, target, mcg.GICP(), max_distance=0.5)
+    clouds = [mcg.preprocess(np.asarray(c.unpad().points, np.float64) + offset) for c in (source, target)]
+    far = mcg.register(*clouds, mcg.GICP(), max_distance=0.5)
+    to_near = np.eye(6)
+    to_near[:3, 3:] = -np.cross(np.eye(3), offset)
+    brought = to_near @ far.covariance @ to_near.T
+    np.testing.assert_allclose(np.diagonal(brought), np.diagonal(near.covariance), rtol=0.5)
+    assert far.free_directions == near.free_directions == ()
+
+
+def test_traced_and_batched_results_carry_the_same():
+    clouds = [pair(truth=motion((0.02 * i, 0.01, 0, 0.01, 0, 0.02)))[:2] for i in range(3)]
+    stacked = [mcg.PointCloud.stack([clouds[i][which] for i in range(3)]) for which in (0, 1)]
+    run = jax.jit(jax.vmap(lambda s, t: mcg.register(s, t, mcg.GICP(), max_distance=0.5)))
+    batch = run(*stacked)
+    with pytest.raises(ValueError, match="free_directions"):
+        _ = batch.free_directions
+    for i, (source, target) in enumerate(clouds):
+        alone = mcg.register(source, target, mcg.GICP(), max_distance=0.5)
+        np.testing.assert_allclose(batch.directions.geometry[i], alone.directions.geometry, atol=1e-3)
+        np.testing.assert_allclose(
+            np.sqrt(np.diagonal(batch.covariance[i])), np.sqrt(np.diagonal(alone.covariance)), rtol=0.05
+        )
+
+
+def test_the_claims_hold_on_average():
+    """A few simulated pairs: enough to see a covariance that is wrong by a factor of two in standard deviation."""
+    room = datasets.box_room(2, points_per_frame=2000)
+    squares = []
+    for seed in range(20):
+        target, source = (room.observe(i, noise_seed=2 * seed + i) for i in (0, 1))
+        truth = np.linalg.inv(target.pose) @ source.pose
+        clouds = [mcg.preprocess(frame.cloud) for frame in (source, target)]
+        result = mcg.register(*clouds, mcg.GICP(), init=truth, max_distance=0.5)
+        left = np.linalg.inv(truth) @ result.matrix
+        error = np.append(left[:3, 3], [left[2, 1] - left[1, 2], left[0, 2] - left[2, 0], left[1, 0] - left[0, 1]])
+        error[3:] *= 0.5
+        squares.append(error @ np.linalg.solve(np.asarray(result.covariance, np.float64), error) / 6)
+    assert 0.5 < np.mean(squares) < 1.9
+
+
+def test_the_corner_of_a_room_is_what_it_says():
+    """The painted corner: evidence of geometry and of channels are both plenty."""
+    cloud = mcg.preprocess(mcg.PointCloud(*room_corner(2000)))
+    geometry, channels = mean_evidence(cloud, mcg.MultiChannelGICP().resolve(cloud, cloud))
+    assert np.linalg.eigvalsh(geometry).min() > 0.2 and np.linalg.eigvalsh(channels).min() > 0.05
