@@ -33,65 +33,86 @@ class FreeDirection:
 
     def __repr__(self) -> str:
         held = "held by the channels" if self.held_by_channels else "held by nothing"
-        return f"{self._motion()} ({held})"
+        return f"{self.name} ({held})"
 
-    def _motion(self) -> str:
+    @property
+    def name(self) -> str:
+        """Such as "translation along (1, 0, 0)"."""
         axis = self.axis * np.sign(self.axis[np.argmax(np.abs(self.axis))])
         x, y, z = np.round(axis, 2) + 0.0
         return f"{'rotation about' if self.is_rotation else 'translation along'} ({x:g}, {y:g}, {z:g})"
 
 
 def free_directions(directions: Directions) -> tuple[FreeDirection, ...]:
-    """Of a single registration: translations first, those that nothing holds before those that the channels do."""
+    """Of a single registration: those that nothing holds before those that the channels do, translations first."""
     free, held = np.asarray(directions.free), np.asarray(directions.held)
-    twists = np.asarray(directions.twists, np.float64)
-    # The motion of the points: of their centroid, and by turning about it.
-    center, radius = np.asarray(directions.center, np.float64), float(np.asarray(directions.radius))
-    motions = np.concatenate([twists[:, :3] + np.cross(twists[:, 3:], center), radius * twists[:, 3:]], axis=1)
+    motions = _motions(directions)
     found: list[FreeDirection] = []
     for by_channels in (False, True):
-        rows = motions[free & (held == by_channels)]
-        if not len(rows):
-            continue
-        for motion in _separate(rows):
-            turning = np.linalg.norm(motion[3:]) > _PURE * np.linalg.norm(motion)
-            axis = motion[3:] if turning else motion[:3]
-            omega = motion[3:] / radius
-            found.append(
-                FreeDirection(
-                    twist=np.concatenate([motion[:3] - np.cross(omega, center), omega]),
-                    held_by_channels=by_channels,
-                    axis=axis / np.linalg.norm(axis),
-                    is_rotation=bool(turning),
-                )
-            )
+        group = motions[free & (held == by_channels)]
+        found += [_named(motion, directions, by_channels) for motion in _separate(group) @ group]
     return tuple(found)
 
 
-def _separate(motions: Float[np.ndarray, "m 6"]) -> Float[np.ndarray, "m 6"]:
-    """Other motions of the same span: translations first, along the axes of the frame as far as there is a choice."""
-    # Rows are orthonormal in the mean motion of the points, and stay so.
-    turning, _, _ = np.linalg.svd(motions[:, 3:])
-    ordered = (turning.T @ motions)[::-1]
+def shares(directions: Directions) -> list[tuple[str, float, float]]:
+    """Name, share of geometry and share of the channels of six directions: the free ones first."""
+    free, motions = np.asarray(directions.free), _motions(directions)
+    geometry, channels = np.asarray(directions.geometry), np.asarray(directions.channels)
+    found: list[tuple[str, float, float]] = []
+    for group in (free, ~free):
+        mixing = _separate(motions[group])
+        names = [_named(motion, directions, False).name for motion in mixing @ motions[group]]
+        # The shares are eigenvalues, and the mixing is orthogonal.
+        found += zip(names, mixing**2 @ geometry[group], mixing**2 @ channels[group], strict=True)
+    return [(name, float(by_geometry), float(by_channels)) for name, by_geometry, by_channels in found]
+
+
+def _motions(directions: Directions) -> Float[np.ndarray, "6 6"]:
+    """How the points move, root mean square: with their centroid, and by turning about it."""
+    twists = np.asarray(directions.twists, np.float64)
+    center, radius = np.asarray(directions.center, np.float64), np.asarray(directions.radius)
+    return np.concatenate([twists[:, :3] + np.cross(twists[:, 3:], center), radius * twists[:, 3:]], axis=1)
+
+
+def _named(motion: Float[np.ndarray, "6"], directions: Directions, by_channels: bool) -> FreeDirection:
+    center, radius = np.asarray(directions.center, np.float64), np.asarray(directions.radius)
+    turning = np.linalg.norm(motion[3:]) > _PURE * np.linalg.norm(motion)
+    axis, omega = motion[3:] if turning else motion[:3], motion[3:] / radius
+    return FreeDirection(
+        twist=np.concatenate([motion[:3] - np.cross(omega, center), omega]),
+        held_by_channels=by_channels,
+        axis=axis / np.linalg.norm(axis),
+        is_rotation=bool(turning),
+    )
+
+
+def _separate(motions: Float[np.ndarray, "m 6"]) -> Float[np.ndarray, "m m"]:
+    """How to mix motions so that translations come first, along the axes of the frame as far as there is a choice.
+
+    Orthogonal, since the motions are, in the mean motion of the points.
+    """
+    if not len(motions):
+        return np.zeros((0, 0))
+    mixing = np.linalg.svd(motions[:, 3:])[0].T[::-1]
+    ordered = mixing @ motions
     flat = np.linalg.norm(ordered[:, 3:], axis=1) <= _PURE * np.linalg.norm(ordered, axis=1)
     if flat.sum() == 2:
-        pair = ordered[flat]
-        axis = np.argmax(np.linalg.norm(pair[:, :3], axis=0))
-        cosine, sine = pair[:, axis] / np.linalg.norm(pair[:, axis])
-        ordered[flat] = np.array([[cosine, sine], [-sine, cosine]]) @ pair
-    return ordered
+        axis = np.argmax(np.linalg.norm(ordered[flat, :3], axis=0))
+        cosine, sine = ordered[flat, axis] / np.linalg.norm(ordered[flat, axis])
+        mixing[flat] = np.array([[cosine, sine], [-sine, cosine]]) @ mixing[flat]
+    return mixing
 
 
 def describe(found: Sequence[FreeDirection]) -> str:
-    """In one sentence; empty if geometry holds everything."""
+    """All of them, and what holds which; empty if there are none."""
     if not found:
         return ""
     held = [direction for direction in found if direction.held_by_channels]
-    everything = ", ".join(direction._motion() for direction in found)
+    everything = ", ".join(direction.name for direction in found)
     if not held:
         verdict = "held by nothing"
     elif len(held) == len(found):
         verdict = "held by the channels: all"
     else:
-        verdict = "held by the channels: " + ", ".join(direction._motion() for direction in held)
-    return f"free by geometry: {everything}; {verdict}"
+        verdict = "held by the channels: " + ", ".join(direction.name for direction in held)
+    return f"{everything}; {verdict}"

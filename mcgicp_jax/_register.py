@@ -198,8 +198,16 @@ def register(
     if match_channels:
         source = _matched(source, target, method)
     for voxel_size in scales:
-        pair = _coarser(source, voxel_size), _coarser(target, voxel_size)
-        found = register(*pair, method, init=init, max_iterations=max_iterations, robust=robust, search=search)
+        found = register(
+            _coarser(source, voxel_size),
+            _coarser(target, voxel_size),
+            method,
+            init=init,
+            max_iterations=max_iterations,
+            robust=robust,
+            search=search,
+            hold_free_directions=hold_free_directions,
+        )
         init = found.matrix if found.converged else init
     problem = pose_problem(
         *(source, target, method, init, max_distance, max_iterations),

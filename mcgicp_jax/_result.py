@@ -153,7 +153,7 @@ class Registration(eqx.Module):
         return (
             f"Registration({self.status.name}: translation {where}{translation} m, rotation {angle:.3f}°, "
             f"{self.num_iterations} iterations, {self.num_inliers} inliers ({self.overlap:.0%}), "
-            f"rmse {np.asarray(self.rmse):.4g} m{'; ' if free else ''}{free})"
+            f"rmse {np.asarray(self.rmse):.4g} m{'; free by geometry: ' if free else ''}{free})"
         )
 
 

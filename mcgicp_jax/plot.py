@@ -16,7 +16,10 @@ from jax.typing import ArrayLike
 from jaxtyping import Float, Int
 
 from mcgicp_jax._cloud import PointCloud
+from mcgicp_jax._directions import shares
 from mcgicp_jax._pose import Pose, pose_matrix
+from mcgicp_jax._result import Registration
+from mcgicp_jax._uncertainty import CHANNELS_HOLD, GEOMETRY_HOLDS
 
 if TYPE_CHECKING:
     import matplotlib.figure
@@ -259,6 +262,45 @@ def convergence(
     panel.xaxis.get_major_locator().set_params(integer=True)
     panel.grid(alpha=0.3)
     panel.legend()
+    return figure
+
+
+def localizability(result: Registration, *, path: str | os.PathLike[str] | None = None) -> matplotlib.figure.Figure:
+    """What holds each of six directions: the share of the points' motion that geometry feels, and that channels do.
+
+    Dashed are the shares from which on a direction counts as held. The channels' share is told of the directions that
+    geometry leaves free.
+
+    Args:
+        result: of `register`, a single one.
+        path: a file to save the figure in; its ending tells the format.
+
+    Raises:
+        ValueError: if the result has no directions, as one of `align`.
+        ImportError: if matplotlib is missing.
+    """
+    if result.directions is None or np.ndim(result.status_code):
+        raise ValueError("result: expected a single one of `register`, got one without directions, or a batch")
+    figures = _module("matplotlib.figure")
+    figure = figures.Figure((7.5, 3.2), layout="constrained")
+    panel = figure.subplots()
+    lowest = 1e-4
+    rows = np.arange(6)
+    names, *values = zip(*shares(result.directions), strict=True)
+    bars = (
+        ("geometry", values[0], GEOMETRY_HOLDS, _CLOUD_COLORS[0], -0.2),
+        ("channels", values[1], CHANNELS_HOLD, _CLOUD_COLORS[1], 0.2),
+    )
+    for name, share, threshold, color, offset in bars:
+        panel.barh(rows + offset, np.maximum(share, lowest) - lowest, 0.38, lowest, color=color, label=name)
+        panel.axvline(threshold, color=color, linestyle="--", linewidth=1)
+    panel.set(xscale="log", xlim=(lowest, 1), xlabel="share of the points' motion that is felt")
+    panel.set_yticks(rows, names)
+    panel.invert_yaxis()
+    panel.set_title(result.status.name, loc="left", fontsize="medium")
+    figure.legend(loc="outside upper right", ncols=2, frameon=False)
+    if path is not None:
+        figure.savefig(path, dpi=120)
     return figure
 
 

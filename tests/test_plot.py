@@ -7,7 +7,7 @@ import matplotlib.image
 import numpy as np
 import pytest
 
-from mcgicp_jax import PointCloud, aggregate, plot
+from mcgicp_jax import MultiChannelGICP, PointCloud, aggregate, plot, preprocess, register
 from mcgicp_jax.datasets import poster_wall
 from tests.scenes import motion
 
@@ -242,6 +242,21 @@ def test_nothing_is_imported_before_it_is_needed_and_no_window_opens():
         "sys.exit(2 if 'matplotlib.pyplot' in sys.modules else 0)\n"
     )
     assert subprocess.run([sys.executable, "-c", program], check=False).returncode == 0
+
+
+def test_localizability_has_two_bars_per_direction_and_names_the_free_ones_first(wall, tmp_path):
+    clouds = [preprocess(cloud) for cloud in wall[:2]]
+    result = register(*clouds, MultiChannelGICP(), max_distance=0.08)
+    figure = plot.localizability(result, path=tmp_path / "held.png")
+    (panel,) = figure.axes
+    labels = [label.get_text().split(" (")[0] for label in panel.get_yticklabels()]
+    assert labels[:3] == ["translation along", "translation along", "rotation about"]
+    widths = np.array([bar.get_x() + bar.get_width() for bar in panel.patches]).reshape(2, 6)
+    geometry, channels = widths
+    assert np.all(geometry[:3] < 2e-3) and np.all(geometry[3:] > 0.9) and np.all(channels[:3] > 5e-3)
+    assert (tmp_path / "held.png").stat().st_size > 1000
+    with pytest.raises(ValueError, match="result: expected a single one of `register`"):
+        plot.localizability(result.without_pose(result.status))
 
 
 def test_trajectories_are_drawn_in_their_plane(tmp_path):

@@ -27,6 +27,7 @@ from mcgicp_jax._commands._options import (
     with_channels,
     words,
 )
+from mcgicp_jax._directions import describe
 from mcgicp_jax._methods import AbstractMethod
 
 Source: TypeAlias = Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="SOURCE")]
@@ -115,7 +116,13 @@ def register(
     result = pair.register(chosen)
     plural = "" if result.num_iterations == 1 else "s"
     print(f"status:    {words(result)} after {result.num_iterations} iteration{plural}")
-    print(f"inliers:   {result.num_inliers:,} of {len(pair.source):,}, rmse {result.rmse:.4g} m")
+    print(f"inliers:   {result.num_inliers:,} of {len(pair.source):,} ({result.overlap:.0%}), rmse {result.rmse:.4g} m")
+    if result.converged and np.all(np.isfinite(result.covariance)):
+        x, y, z, *angles = np.sqrt(np.diagonal(result.covariance))
+        roll, pitch, yaw = np.degrees(angles)
+        print(f"deviation: x {x:.2g}, y {y:.2g}, z {z:.2g} m; about x {roll:.2g}, y {pitch:.2g}, z {yaw:.2g} degrees")
+    if result.free_directions:
+        print(f"free:      {describe(result.free_directions)}")
     print("T_target_source:")
     for row in result.matrix:
         print("".join(f"{number:16.8f}" for number in row))
@@ -156,8 +163,9 @@ def demo(output: Path = Path("mcgicp_demo")) -> int:
     options = Options(voxel_size="off", max_distance=0.08, plot=output / "before_after.png")
     _compare(source_file, target_file, options, truth_file)
     print(
-        "Geometry alone slides along the flat wall: gicp, point-to-plane and point-to-point may come to rest, but in"
-        "\ntheir rows of the picture the posters do not fit. The channels red, green and blue hold the other two."
+        "Geometry leaves a flat wall free to slide: gicp, point-to-plane and point-to-point say so (degenerate) and"
+        "\nstay where they started along it; in their rows of the picture the posters do not fit. The channels red,"
+        "\ngreen and blue hold the other two."
         f"\nThe clouds are in {output}; try: mcgicp register {source_file} {target_file}"
     )
     return 0
