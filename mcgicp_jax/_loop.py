@@ -95,7 +95,7 @@ Match: TypeAlias = Callable[[jaxlie.SE3, Int[Array, ""], Array], tuple[Correspon
 # What the source and the target know of what holds a pose.
 Evidences: TypeAlias = tuple[Evidence, Evidence]
 # The covariance of a pose, (6, 6), and the directions that it could move in.
-Assessment: TypeAlias = tuple[Array, Directions | None]
+Assessment: TypeAlias = tuple[Array | np.ndarray, Directions | None]
 
 
 class Problem(eqx.Module):
