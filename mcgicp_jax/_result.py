@@ -164,7 +164,9 @@ def pose_in_user_frame(
     if is_concrete(centred, source_origin, target_origin):
         parameters = np.asarray(centred.wxyz_xyz, np.float64)
         rotation = rotation_from_quaternion(parameters[..., :4])
-        offset = target_origin - source_origin - np.einsum("...ij,...j->...i", rotation - np.eye(3), source_origin)
+        # Origins that come out of `jit` are float32, exactly; what is made from them here must not be.
+        start, end = np.asarray(source_origin, np.float64), np.asarray(target_origin, np.float64)
+        offset = end - start - np.einsum("...ij,...j->...i", rotation - np.eye(3), start)
         matrix = np.zeros((*rotation.shape[:-2], 4, 4))
         matrix[..., :3, :3] = rotation
         matrix[..., :3, 3] = parameters[..., 4:] + offset

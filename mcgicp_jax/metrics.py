@@ -9,6 +9,7 @@ from typing import Any, Literal, TypeAlias
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
 from mcgicp_jax._pose import Pose, is_concrete, pose_matrix
@@ -20,8 +21,8 @@ Poses: TypeAlias = Float[np.ndarray, "N 4 4"] | Sequence[Any]
 _KITTI_LENGTHS = (100.0, 200.0, 300.0, 400.0, 500.0, 600.0, 700.0, 800.0)
 
 
-def pose_error(T: Pose, T_true: Pose) -> tuple[Scalar, Scalar]:
-    """The length and the angle of the motion `T_true⁻¹ T` that is left over.
+def pose_error(T: Pose, T_true: Pose, *, at: ArrayLike | None = None) -> tuple[Scalar, Scalar]:
+    """How far the pose takes a point from where it belongs, and the angle of the rotation that is left over.
 
     Concrete poses are compared in float64. Under `jit`, `grad` and `vmap` the errors have the precision of the traced
     pose; both are differentiable, with gradient 0 where the error itself is 0.
@@ -29,20 +30,26 @@ def pose_error(T: Pose, T_true: Pose) -> tuple[Scalar, Scalar]:
     Args:
         T: `jaxlie.SE3` or (4, 4).
         T_true: `jaxlie.SE3` or (4, 4).
+        at: (3,), metres, the point in the source's frame; the origin by default, whose error is that of the
+            translations, and the length of `T_true⁻¹ T`. Take one in the cloud, such as its centroid, where that lies
+            far from the origin: at UTM coordinates 1e-8 rad move the origin by 5 cm, and the cloud by nothing.
 
     Returns:
         Translation in metres and rotation in radians, 0 to π: plain floats, or JAX scalars where a pose is traced.
 
     Raises:
-        ValueError: if a pose has another shape or is no rigid motion; the message names it.
+        ValueError: if a pose has another shape or is no rigid motion, or the point another shape; the message names it.
     """
     matrix, true = pose_matrix(T, "T"), pose_matrix(T_true, "T_true")
-    if is_concrete(matrix, true):
-        translation, rotation = _errors(matrix, true, np)
+    point: Any = np.zeros(3) if at is None else at
+    if np.shape(point) != (3,):
+        raise ValueError(f"at: expected a point of shape (3,), got {np.shape(point)}")
+    if is_concrete(matrix, true, point):
+        translation, rotation = _errors(matrix, true, np.asarray(point, np.float64), np)
         return float(translation), float(rotation)
-    dtype = jnp.result_type(*(each.dtype for each in (matrix, true) if not is_concrete(each)))
+    dtype = jnp.result_type(*(each.dtype for each in (matrix, true, point) if not is_concrete(each)))
     with jax.default_matmul_precision("highest"):
-        return _errors(jnp.asarray(matrix, dtype), jnp.asarray(true, dtype), jnp)
+        return _errors(jnp.asarray(matrix, dtype), jnp.asarray(true, dtype), jnp.asarray(point, dtype), jnp)
 
 
 def ate(poses: Poses, true_poses: Poses, alignment: Literal["umeyama", "first"] = "umeyama") -> float:
@@ -137,7 +144,9 @@ def _relative_errors(
     estimated: Float[np.ndarray, "N 4 4"], true: Float[np.ndarray, "N 4 4"], first: np.ndarray, last: np.ndarray
 ) -> tuple[Float[np.ndarray, "M"], Float[np.ndarray, "M"]]:
     moved, moved_truly = (np.linalg.inv(each[first]) @ each[last] for each in (estimated, true))
-    errors = [_errors(matrix, matrix_true, np) for matrix, matrix_true in zip(moved, moved_truly, strict=True)]
+    errors = [
+        _errors(matrix, matrix_true, np.zeros(3), np) for matrix, matrix_true in zip(moved, moved_truly, strict=True)
+    ]
     translation, rotation = np.array(errors).reshape(-1, 2).T
     return translation, rotation
 
@@ -149,13 +158,15 @@ def _best_rotation(points: Float[np.ndarray, "N 3"], onto: Float[np.ndarray, "N 
     return left @ np.diag([1, 1, sign]) @ right
 
 
-def _errors(matrix: Any, true: Any, numpy: ModuleType) -> tuple[Any, Any]:
+def _errors(matrix: Any, true: Any, point: Any, numpy: ModuleType) -> tuple[Any, Any]:
     """For float arrays of `numpy`, which is NumPy or `jax.numpy`."""
     left = true[:3, :3].T @ matrix[:3, :3]
     # sin(angle) · axis and cos(angle): unlike either alone, the two together are accurate at every angle.
     sine = numpy.stack([left[2, 1] - left[1, 2], left[0, 2] - left[2, 0], left[1, 0] - left[0, 1]]) / 2
     cosine = (numpy.trace(left) - 1) / 2
-    return _norm(matrix[:3, 3] - true[:3, 3], numpy), numpy.arctan2(_norm(sine, numpy), cosine)
+    # Differences first: at large coordinates each of the two moved points alone has lost digits.
+    shift = matrix[:3, 3] - true[:3, 3] + (matrix[:3, :3] - true[:3, :3]) @ point
+    return _norm(shift, numpy), numpy.arctan2(_norm(sine, numpy), cosine)
 
 
 def _norm(vector: Any, numpy: ModuleType) -> Any:

@@ -805,10 +805,8 @@ def test_missing_lazrs(tmp_path, monkeypatch):
 # Mutations
 
 
-@pytest.fixture(scope="module")
-def seeds(tmp_path_factory):
+def make_seeds(folder):
     """Small valid files, of every format and encoding."""
-    folder = tmp_path_factory.mktemp("seeds")
     files = [
         (suffix, bytes_of(suffix, folder, INTENSITY if suffix == ".bin" else INTENSITY + RGB)) for suffix in FORMATS
     ]
@@ -822,7 +820,13 @@ def seeds(tmp_path_factory):
         files.append((".pcd", (folder / "a.pcd").read_bytes()))
     las_data(7, red=np.arange(N)).write(str(folder / "a.laz"))
     files.append((".laz", (folder / "a.laz").read_bytes()))
-    return folder, files
+    return files
+
+
+@pytest.fixture(scope="module")
+def seeds(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("seeds")
+    return folder, make_seeds(folder)
 
 
 CHANGE = st.tuples(

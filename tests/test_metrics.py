@@ -57,6 +57,35 @@ def test_the_same_pose_has_no_error():
     assert pose_error(rounded, rounded) == pytest.approx((0, 0), abs=1e-15)
 
 
+def test_the_error_is_that_of_the_point_asked_for():
+    rng = np.random.default_rng(8)
+    for _ in range(20):
+        T, truth, point = random_pose(rng), random_pose(rng), rng.normal(scale=5, size=3)
+        moved, moved_truly = (matrix[:3, :3] @ point + matrix[:3, 3] for matrix in (T, truth))
+        translation, rotation = pose_error(T, truth, at=point)
+        assert translation == pytest.approx(np.linalg.norm(moved - moved_truly), rel=1e-12)
+        assert rotation == pose_error(T, truth)[1]
+        assert pose_error(T, truth, at=np.zeros(3)) == pose_error(T, truth)
+        single = jax.jit(lambda *args: pose_error(*args[:2], at=args[2]))(jnp.asarray(T), truth, point)
+        np.testing.assert_allclose(single, (translation, rotation), rtol=1e-5)
+
+
+def test_at_utm_coordinates_the_error_is_that_of_the_cloud():
+    utm = np.array([4.5e5, 5.2e6, 300.0])
+    to_center = pose(np.zeros(3), utm)
+    for left_over in (pose([0, 0, 1e-8]), pose([1e-8, 0, 0], [0, 2e-4, 0])):
+        T = to_center @ left_over @ np.linalg.inv(to_center)
+        expected = np.linalg.norm(left_over[:3, 3])
+        assert pose_error(T, np.eye(4), at=utm)[0] == pytest.approx(expected, abs=1e-8)
+        assert pose_error(T, np.eye(4))[0] > 1e-3
+
+
+@pytest.mark.parametrize("point", [0.0, np.zeros(2), np.zeros((1, 3))])
+def test_a_point_of_another_shape_is_named(point):
+    with pytest.raises(ValueError, match=r"at: expected a point of shape \(3,\), got"):
+        pose_error(np.eye(4), np.eye(4), at=point)
+
+
 @pytest.mark.parametrize("make", [jnp.asarray, lambda T: jaxlie.SE3.from_matrix(jnp.asarray(T))])
 def test_takes_every_form_of_pose(make):
     rng = np.random.default_rng(3)

@@ -70,6 +70,12 @@ class Pair:
             numbers = {"channel_weights": mcg.MultiChannelGICP().resolve(self.source, self.target).channel_weights}
         return kind(**numbers).resolve(self.source, self.target)
 
+    def errors(self, pose: Float[np.ndarray, "4 4"], true_pose: Float[np.ndarray, "4 4"]) -> str:
+        """In millimetres, of the middle of the source, and degrees."""
+        middle = np.asarray(self.source.unpad().points, np.float64).mean(axis=0)
+        translation, rotation = metrics.pose_error(pose, true_pose, at=middle)
+        return f"{1e3 * float(translation):9.2f}  {np.degrees(rotation):11.3f}"
+
     def register(self, method: AbstractMethod) -> mcg.Registration:
         return mcg.register(
             self.source,
@@ -124,8 +130,10 @@ def register(
     if result.free_directions:
         print(f"free:      {describe(result.free_directions)}")
     print("T_target_source:")
+    # At large coordinates the eighth decimal of a rotation is centimetres.
+    form = "22.14f" if np.any(pair.source.origin) else "15.8f"
     for row in result.matrix:
-        print("".join(f"{number:16.8f}" for number in row))
+        print("".join(f" {number:{form}}" for number in row))
     if output is not None:
         io.write_poses(output, [result.matrix])
     if aligned is not None:
@@ -142,7 +150,8 @@ def compare(source: Source, target: Target, shared: Options, truth: File = None)
     Args:
         source: Cloud to move.
         target: Cloud that stays.
-        truth: The true pose T_target_source, for the errors.
+        truth: The true pose T_target_source, for the errors: how far the centroid of SOURCE is from where it belongs,
+            and the angle.
     """
     return _verdict(_compare(source, target, shared, truth))
 
@@ -178,7 +187,7 @@ def _compare(source: Path, target: Path, options: Options, truth: Path | None) -
     measures = "inliers      rmse, m" if true_pose is None else "error, mm   error, deg"
     print(f"\n{'method':15}  {measures:>22}  iterations  time, ms  status")
     if true_pose is not None:
-        print(f"{'(start)':15}  {_errors(pair.start, true_pose)}")
+        print(f"{'(start)':15}  {pair.errors(pair.start, true_pose)}")
     for name, kind in METHODS.items():
         if kind.uses_channels and not pair.channels:
             print(f"{name:15}  left out, needs channels in common")
@@ -190,16 +199,11 @@ def _compare(source: Path, target: Path, options: Options, truth: Path | None) -
         milliseconds = 1e3 * (time.perf_counter() - begin)
         values = f"{result.num_inliers:9,}  {result.rmse:11.4g}"
         if true_pose is not None:
-            values = _errors(np.asarray(result.matrix), true_pose)
+            values = pair.errors(np.asarray(result.matrix), true_pose)
         print(f"{name:15}  {values}  {result.num_iterations:10}  {milliseconds:8.0f}  {words(result)}")
     print("(time of a second call: without compiling, preparing the clouds, choosing numbers)\n")
     pair.draw(results)
     return results
-
-
-def _errors(pose: Float[np.ndarray, "4 4"], true_pose: Float[np.ndarray, "4 4"]) -> str:
-    translation, rotation = metrics.pose_error(pose, true_pose)
-    return f"{1e3 * float(translation):9.2f}  {np.degrees(rotation):11.3f}"
 
 
 def _read_pose(path: Path) -> Float[np.ndarray, "4 4"]:

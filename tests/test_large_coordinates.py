@@ -1,0 +1,133 @@
+"""UTM coordinates, 5,000 km from zero, lose nothing: not in float32, not in batches, files and commands."""
+
+import csv
+
+import jax
+import numpy as np
+import pytest
+
+import mcgicp_jax as mcg
+from mcgicp_jax import io
+from mcgicp_jax.__main__ import main
+from mcgicp_jax.metrics import pose_error
+from tests.scenes import motion, room_corner
+
+UTM = np.array([4.5e5, 5.2e6, 300.0])
+TRUTH = motion()
+TO_UTM = motion((*UTM, 0, 0, 0))
+UTM_TRUTH = TO_UTM @ TRUTH @ np.linalg.inv(TO_UTM)
+OPTIONS = ["--max-distance", "0.5", "--voxel-size", "off"]
+
+
+def scene(offset):
+    """Source and target, raw, moved away by an offset that leaves the points' own digits as they are."""
+    clouds = []
+    for seed in (1, 2):
+        points, channels = room_corner(1000, seed=seed, channels=1)
+        points = points if seed == 2 else (points - TRUTH[:3, 3]) @ TRUTH[:3, :3]
+        # What UTM coordinates can hold, and LAS: a tenth of a millimetre.
+        points = np.round(points, 4)
+        channels = np.round(100 * (channels + 2))
+        clouds.append(mcg.PointCloud(points + offset, channels, channel_names=["intensity"]))
+    return clouds
+
+
+@pytest.fixture(scope="module")
+def near():
+    source, target = scene(np.zeros(3))
+    return mcg.register(source, target, mcg.MultiChannelGICP(), max_distance=0.5)
+
+
+def assert_as_near(matrix, near):
+    """Every point of the cloud goes where it goes near the origin, to 1e-4 m."""
+    matrix = np.asarray(matrix)
+    assert matrix.dtype == np.float64
+    points = np.asarray(scene(np.zeros(3))[0].points)
+    expected = points @ near.matrix[:3, :3].T + near.matrix[:3, 3]
+    moved = (points + UTM) @ matrix[:3, :3].T + (matrix[:3, 3] - UTM)
+    assert np.abs(moved - expected).max() < 1e-4
+
+
+def test_register_from_raw_clouds_and_arrays(near):
+    source, target = scene(UTM)
+    result = mcg.register(source, target, mcg.MultiChannelGICP(), max_distance=0.5)
+    assert result.converged
+    assert_as_near(result.matrix, near)
+    # From a start that is itself one of UTM.
+    again = mcg.register(source, target, mcg.MultiChannelGICP(), init=result.matrix, max_distance=0.5)
+    assert again.converged and again.num_iterations <= 2
+    assert max(pose_error(again.matrix, result.matrix, at=UTM)) < 5e-4
+    points = [cloud.points.tolist() for cloud in (source, target)]
+    assert pose_error(mcg.register(*points, mcg.GICP(), max_distance=0.5).matrix, UTM_TRUTH, at=UTM)[0] < 1e-2
+
+
+def test_where_only_one_cloud_is_far(near):
+    source, target = scene(np.zeros(3))[0], scene(UTM)[1]
+    result = mcg.register(source, target, mcg.MultiChannelGICP(), init=TO_UTM, max_distance=0.5)
+    assert result.converged
+    assert_as_near(result.matrix @ np.linalg.inv(TO_UTM), near)
+
+
+@pytest.mark.parametrize("search", [None, mcg.DenseSearch()], ids=["threads", "lanes"])
+def test_a_batch(search, near):
+    source, target = scene(UTM)
+    pairs = mcg.register_batch([source] * 3, [target] * 3, mcg.MultiChannelGICP(), max_distance=0.5, search=search)
+    for result in pairs:
+        assert result.converged
+        assert_as_near(result.matrix, near)
+
+
+def test_inside_a_transformation():
+    @jax.jit
+    def pose(source, target):
+        return mcg.register(source, target, mcg.GICP(), max_distance=0.5)
+
+    # The pose is refined there, so its like is one that is, too.
+    near, far = (pose(*(mcg.preprocess(cloud) for cloud in scene(offset))) for offset in (np.zeros(3), UTM))
+    assert far.converged
+    assert_as_near(far.matrix, near)
+
+
+@pytest.fixture(scope="module", params=[".ply", ".las", ".npz", ".txt"])
+def files(request, tmp_path_factory):
+    folder = tmp_path_factory.mktemp("utm")
+    for name, cloud in zip(("source", "target"), scene(UTM), strict=True):
+        io.write(folder / f"{name}{request.param}", cloud)
+    io.write_poses(folder / "truth.txt", [UTM_TRUTH])
+    return folder, [str(folder / f"{name}{request.param}") for name in ("source", "target")]
+
+
+def test_files_and_the_command(files, near, capsys):
+    folder, pair = files
+    outputs = ["--output", str(folder / "pose.txt"), "--aligned", str(folder / "moved.ply")]
+    assert main(["register", *pair, *OPTIONS, *outputs]) == 0
+    (written,) = io.read_poses(folder / "pose.txt")
+    assert_as_near(written, near)
+    # Copied from the screen, it is as good.
+    rows = capsys.readouterr().out.split("T_target_source:\n")[1].splitlines()[:4]
+    assert_as_near(np.array([row.split() for row in rows], float), near)
+    expected = np.asarray(scene(np.zeros(3))[0].points) @ near.matrix[:3, :3].T + near.matrix[:3, 3]
+    assert np.abs(io.read(folder / "moved.ply").points - UTM - expected).max() < 1e-4
+    assert main(["register", *pair, *OPTIONS, "--init", str(folder / "pose.txt"), "--max-iterations", "3"]) == 0
+
+
+def test_compare_measures_at_the_cloud(files, capsys):
+    folder, pair = files
+    assert main(["compare", *pair, *OPTIONS, "--truth", str(folder / "truth.txt")]) == 0
+    rows = [line.split() for line in capsys.readouterr().out.splitlines()]
+    far = {row[0]: row[1:3] for row in rows if row and row[0] in ("(start)", "mc-gicp", "gicp")}
+    middle = np.asarray(scene(np.zeros(3))[0].points).mean(axis=0)
+    start = 1e3 * pose_error(np.eye(4), TRUTH, at=middle)[0]
+    assert float(far["(start)"][0]) == pytest.approx(start, abs=0.02)
+    assert float(far["mc-gicp"][0]) < 5 and float(far["gicp"][0]) < 5
+
+
+def test_the_batch_command(files, near, capsys):
+    folder, pair = files
+    suffix = pair[0][-4:]
+    (folder / "pairs.csv").write_text(f"source,target\nsource{suffix},target{suffix}\n")
+    assert main(["batch", str(folder / "pairs.csv"), "--output", str(folder / "out.csv"), *OPTIONS]) == 0
+    with open(folder / "out.csv", newline="", encoding="utf-8") as file:
+        (row,) = csv.DictReader(file)
+    matrix = np.array([[float(row[f"m{i}{j}"]) for j in range(4)] for i in range(3)] + [[0, 0, 0, 1]])
+    assert_as_near(matrix, near)
