@@ -1,0 +1,101 @@
+"""Many registrations in one process: does it grow?
+
+    python -m tests.benchmarks.soak [--registrations 10000]
+
+Clouds of 100 to 700 points, each of another size than the last, by GICP and by MC-GICP with a robust kernel, every
+fifth pair at UTM coordinates, every hundredth inside `jax.jit`. Printed are the memory of the process (resident, after
+a garbage collection), what JAX has compiled, and how many trees are kept for callbacks. Once all pairs of size classes
+have been met, neither memory nor compilations should grow.
+"""
+
+from __future__ import annotations
+
+import argparse
+import collections
+import gc
+import logging
+import pathlib
+import resource
+import time
+
+import jax
+import numpy as np
+
+import mcgicp_jax as mcg
+from mcgicp_jax import _kdtree
+from mcgicp_jax._cloud import size_class
+from tests.scenes import room_corner
+
+_METHODS = ((mcg.GICP(), None), (mcg.MultiChannelGICP(), mcg.Huber(1.0)))
+_SIZES = (100, 700)
+_REPORTS = 10
+_TRACED_EVERY = 100
+_UTM = np.array([4.5e5, 5.2e6, 300.0])
+
+
+class Compilations(logging.Handler):
+    """Counts what JAX compiles, by its own log."""
+
+    def __init__(self) -> None:
+        super().__init__(logging.WARNING)
+        self.count = 0
+
+    def emit(self, record: logging.LogRecord) -> None:
+        self.count += record.getMessage().startswith("Compiling ")
+
+
+def clouds(rng: np.random.Generator, turn: int) -> tuple[mcg.PointCloud, mcg.PointCloud]:
+    offset = _UTM if turn % 5 == 0 else np.zeros(3)
+    made = []
+    for seed in (2 * turn, 2 * turn + 1):
+        points, channels = room_corner(int(rng.integers(*_SIZES)), seed=seed)
+        made.append(mcg.preprocess(mcg.PointCloud(points + offset, channels)))
+    return made[0], made[1]
+
+
+def resident_mib() -> float:
+    gc.collect()
+    return int(pathlib.Path("/proc/self/statm").read_text().split()[1]) * resource.getpagesize() / 2**20
+
+
+@jax.jit
+def traced(source: mcg.PointCloud, target: mcg.PointCloud) -> jax.Array:
+    return mcg.register(source, target, mcg.GICP(), max_distance=0.5).status_code
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--registrations", type=int, default=10_000)
+    options = parser.parse_args()
+    compilations = Compilations()
+    for name in ("jax._src.interpreters.pxla", "jax._src.dispatch"):
+        logger = logging.getLogger(name)
+        logger.addHandler(compilations)
+        logger.propagate = False
+    jax.config.update("jax_log_compiles", True)
+    rng = np.random.default_rng(0)
+    outcomes: collections.Counter[str] = collections.Counter()
+    begin = time.perf_counter()
+    print("| registrations | resident, MiB | compilations | trees kept |    time |")
+    print("| ------------: | ------------: | -----------: | ---------: | ------: |")
+    for turn in range(options.registrations):
+        source, target = clouds(rng, turn)
+        if turn % _TRACED_EVERY == 0:
+            padded = [cloud.pad(size_class(_SIZES[1])) for cloud in (source, target)]
+            outcomes[mcg.Status(int(traced(*padded))).name] += 1
+        else:
+            method, robust = _METHODS[turn % 2]
+            result = mcg.register(source, target, method, max_distance=0.5, robust=robust)
+            outcomes[result.status.name] += 1
+        if (turn + 1) % (options.registrations // _REPORTS) == 0:
+            trees = len(_kdtree._index_cache._indices)
+            print(
+                f"| {turn + 1:13,} | {resident_mib():13.0f} | {compilations.count:12,} | {trees:10} "
+                f"| {time.perf_counter() - begin:5.0f} s |",
+                flush=True,
+            )
+    print(", ".join(f"{count:,} {name}" for name, count in outcomes.most_common()))
+
+
+if __name__ == "__main__":
+    main()
