@@ -13,9 +13,23 @@ with install_import_hook("mcgicp_jax", "beartype.beartype"):
     import mcgicp_jax
     import mcgicp_jax.__main__  # noqa: F401
 
+import jax
 import pytest
 
 DATA = pathlib.Path(os.environ.get("MCGICP_DATA", pathlib.Path(__file__).parents[2] / "shared" / "data"))
+
+
+# Each compiled program is mapped into memory in dozens of pieces, of which Linux grants a process 65,530: the compiler
+# aborts at more, and this suite meets as many.
+_MAPS = pathlib.Path("/proc/self/maps")
+_MANY_MAPS = 30_000
+
+
+@pytest.fixture(autouse=True, scope="module")
+def programs_are_let_go():
+    yield
+    if _MAPS.exists() and len(_MAPS.read_bytes().splitlines()) > _MANY_MAPS:
+        jax.clear_caches()
 
 
 @pytest.fixture(scope="session")
