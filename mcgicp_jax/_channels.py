@@ -9,7 +9,7 @@ from collections.abc import Sequence
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Int
 
 from mcgicp_jax import _covariance as cov
 from mcgicp_jax._cloud import PointCloud
@@ -161,39 +161,28 @@ def channel_noise(source: PointCloud, target: PointCloud) -> tuple[Float[Array, 
 
 
 def _fit_residual(cloud: PointCloud) -> Float[Array, "N C"]:
-    """Standard deviation of each channel about its linear fit over each neighbourhood's tangent plane."""
+    """Standard deviation of each channel about its linear fit over each neighbourhood's tangent plane.
+
+    NaN where too few neighbours have the channel.
+    """
     points, neighbors = jnp.asarray(cloud.points).T, neighbors_of(cloud)
-    offsets, present = cov.gather(points, neighbors)
-    basis = cov.orthonormal_basis(
-        cov.smallest_eigenvector(cov.weighted_covariance(offsets, present.astype(points.dtype)))
-    )
-    x, y = (sum(offset * b for offset, b in zip(offsets, axis, strict=True)) for axis in basis)
-    rows = jnp.where(present, neighbors.T, 0)
-    residuals = []
-    for i, channel in enumerate(jnp.asarray(cloud.channels).T):
-        known = present if cloud.channel_valid is None else present & jnp.asarray(cloud.channel_valid)[:, i][rows]
-        residuals.append(_residual_of_line(x, y, channel[rows], known.astype(x.dtype)))
+
+    def of_rows(rows: Int[Array, "n"], neighbors: Int[Array, "n k"]) -> tuple[Float[Array, "n"], ...]:
+        offsets, present = cov.gather(points, rows, neighbors)
+        basis = cov.orthonormal_basis(
+            cov.smallest_eigenvector(cov.weighted_covariance(offsets, present.astype(points.dtype)))
+        )
+        x, y = (sum(offset * b for offset, b in zip(offsets, axis, strict=True)) for axis in basis)
+        near = jnp.where(present, neighbors.T, 0)
+        residuals = []
+        for i, channel in enumerate(jnp.asarray(cloud.channels).T):
+            known = present if cloud.channel_valid is None else present & jnp.asarray(cloud.channel_valid)[:, i][near]
+            fit = cov.fit_linear(x, y, channel[near], known.astype(x.dtype))
+            residuals.append(jnp.where(fit.weight > 3, jnp.sqrt(fit.residual), jnp.nan))
+        return tuple(residuals)
+
+    residuals = cov.by_blocks(of_rows, neighbors)
     return jnp.stack(residuals, axis=-1) if residuals else jnp.zeros((points.shape[1], 0), points.dtype)
-
-
-def _residual_of_line(
-    x: Float[Array, "k N"], y: Float[Array, "k N"], values: Float[Array, "k N"], weights: Float[Array, "k N"]
-) -> Float[Array, "N"]:
-    """Standard deviation of values about their fit a + b x + c y; NaN where there are too few."""
-    count = jnp.sum(weights, axis=0)
-
-    def centred(values: Float[Array, "k N"]) -> Float[Array, "k N"]:
-        return weights * (values - jnp.sum(weights * values, axis=0) / jnp.maximum(count, 1))
-
-    x, y, values = centred(x), centred(y), centred(values)
-    xx, xy, yy = jnp.sum(x * x, axis=0), jnp.sum(x * y, axis=0), jnp.sum(y * y, axis=0)
-    determinant = xx * yy - xy * xy
-    planar = determinant > 1e-6 * (xx + yy) ** 2
-    safe = jnp.where(planar, determinant, 1)
-    xc, yc = jnp.sum(x * values, axis=0), jnp.sum(y * values, axis=0)
-    explained = jnp.where(planar, (yy * xc * xc - 2 * xy * xc * yc + xx * yc * yc) / safe, 0)
-    square = jnp.maximum(jnp.sum(values * values, axis=0) - explained, 0)
-    return jnp.where(count > 3, jnp.sqrt(square / jnp.maximum(count - 3, 1)), jnp.nan)
 
 
 @jax.jit

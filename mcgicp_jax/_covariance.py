@@ -7,7 +7,8 @@ call is made per point: besides being slow, batched ones can dead-lock XLA's thr
 
 from __future__ import annotations
 
-from typing import TypeAlias
+from collections.abc import Callable
+from typing import NamedTuple, TypeAlias, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -20,6 +21,8 @@ _REGULARISATION = 1e-6
 # they are made block by block.
 _LARGEST_WHOLE = 16_000
 _BLOCK = 2048
+
+Tree = TypeVar("Tree")
 
 
 def symmetric_from_matrix(matrix: Float[Array, "N 3 3"]) -> Float[Array, "6 N"]:
@@ -206,15 +209,31 @@ def floor_eigenvalues(symmetric: Float[Array, "3 N"], floor: Float[Array, ""]) -
 Offsets: TypeAlias = tuple[Float[Array, "k N"], Float[Array, "k N"], Float[Array, "k N"]]
 
 
+def by_blocks(function: Callable[[Int[Array, "n"], Int[Array, "n k"]], Tree], neighbors: Int[Array, "N k"]) -> Tree:
+    """What a function of rows and their neighbours makes of all rows; large clouds are gone through block by block.
+
+    Args:
+        function: of row numbers, and the neighbours of these rows; its arrays have the rows as their last dimension.
+    """
+    num_points = neighbors.shape[0]
+    rows = jnp.arange(num_points)
+    if num_points <= _LARGEST_WHOLE:
+        return function(rows, neighbors)
+    num_blocks = -(-num_points // _BLOCK)
+    missing = num_blocks * _BLOCK - num_points
+    rows = jnp.pad(rows, (0, missing)).reshape(num_blocks, _BLOCK)
+    neighbors = jnp.pad(neighbors, [(0, missing), (0, 0)], constant_values=-1).reshape(num_blocks, _BLOCK, -1)
+    blocks = jax.lax.map(lambda block: function(*block), (rows, neighbors))
+    return jax.tree.map(lambda leaf: jnp.moveaxis(leaf, 0, -2).reshape(*leaf.shape[1:-1], -1)[..., :num_points], blocks)
+
+
 def gather(
-    points: Float[Array, "3 M"], neighbors: Int[Array, "N k"], centers: Float[Array, "3 N"] | None = None
+    points: Float[Array, "3 M"], rows: Int[Array, "N"], neighbors: Int[Array, "N k"]
 ) -> tuple[Offsets, Bool[Array, "k N"]]:
-    """Neighbours as offsets from their centres, by default the points themselves, and which of them there are."""
-    rows = neighbors.T
-    present = rows >= 0
-    rows = jnp.where(present, rows, 0)
-    pairs = zip(points, points if centers is None else centers, strict=True)
-    x, y, z = (jnp.where(present, coordinate[rows] - center, 0) for coordinate, center in pairs)
+    """The neighbours of some rows as offsets from these, and which of them there are."""
+    present = neighbors.T >= 0
+    near = jnp.where(present, neighbors.T, 0)
+    x, y, z = (jnp.where(present, coordinate[near] - coordinate[rows], 0) for coordinate in points)
     return (x, y, z), present
 
 
@@ -230,20 +249,48 @@ def weighted_covariance(offsets: Offsets, weights: Float[Array, "k N"]) -> Float
 def local_covariance(points: Float[Array, "3 N"], neighbors: Int[Array, "N k"]) -> Float[Array, "6 N"]:
     """Covariance of each point's neighbourhood, metres²."""
 
-    def of_rows(rows: tuple[Float[Array, "3 n"], Int[Array, "n k"]]) -> Float[Array, "6 n"]:
-        centers, their_neighbors = rows
-        offsets, present = gather(points, their_neighbors, centers)
+    def of_rows(rows: Int[Array, "n"], neighbors: Int[Array, "n k"]) -> Float[Array, "6 n"]:
+        offsets, present = gather(points, rows, neighbors)
         return weighted_covariance(offsets, present.astype(points.dtype))
 
-    num_points = points.shape[1]
-    if num_points <= _LARGEST_WHOLE:
-        return of_rows((points, neighbors))
-    num_blocks = -(-num_points // _BLOCK)
-    missing = num_blocks * _BLOCK - num_points
-    centers = jnp.pad(points, [(0, 0), (0, missing)]).reshape(3, num_blocks, _BLOCK).swapaxes(0, 1)
-    padded = jnp.pad(neighbors, [(0, missing), (0, 0)], constant_values=-1).reshape(num_blocks, _BLOCK, -1)
-    blocks = jax.lax.map(of_rows, (centers, padded))
-    return blocks.swapaxes(0, 1).reshape(6, -1)[:, :num_points]
+    return by_blocks(of_rows, neighbors)
+
+
+class LinearFit(NamedTuple):
+    """Of values over a plane, by weighted least squares.
+
+    Attributes:
+        gradient: of the values along x and y; 0 where the points lie on a line.
+        residual: variance of the values about the fit; meaningless for three points or fewer.
+        inverse: (3, N) symmetric; times `residual` it is the covariance of the gradient. 0 on a line.
+        weight: sum of the weights.
+    """
+
+    gradient: tuple[Float[Array, "N"], Float[Array, "N"]]
+    residual: Float[Array, "N"]
+    inverse: Float[Array, "3 N"]
+    weight: Float[Array, "N"]
+
+
+def fit_linear(
+    x: Float[Array, "k N"], y: Float[Array, "k N"], values: Float[Array, "k N"], weights: Float[Array, "k N"]
+) -> LinearFit:
+    """Fit a + b x + c y to the values of each neighbourhood; weights are 1 or, for what does not count, 0."""
+    count = jnp.sum(weights, axis=0)
+
+    def centred(values: Float[Array, "k N"]) -> Float[Array, "k N"]:
+        return weights * (values - jnp.sum(weights * values, axis=0) / jnp.maximum(count, 1))
+
+    x, y, values = centred(x), centred(y), centred(values)
+    xx, xy, yy = jnp.sum(x * x, axis=0), jnp.sum(x * y, axis=0), jnp.sum(y * y, axis=0)
+    determinant = xx * yy - xy * xy
+    planar = determinant > 1e-6 * (xx + yy) ** 2
+    inverse = jnp.where(planar, jnp.stack([yy, -xy, xx]) / jnp.where(planar, determinant, 1), 0)
+    p, q, r = inverse
+    xv, yv = jnp.sum(x * values, axis=0), jnp.sum(y * values, axis=0)
+    gx, gy = p * xv + q * yv, q * xv + r * yv
+    square = jnp.maximum(jnp.sum(values * values, axis=0) - gx * xv - gy * yv, 0)
+    return LinearFit((gx, gy), square / jnp.maximum(count - 3, 1), inverse, count)
 
 
 def plane_covariance(
@@ -258,24 +305,27 @@ def plane_covariance(
     return identity - jnp.where(spread, (1 - epsilon) * outer(normal), 0)
 
 
-def channel_kernel(whitened: Float[Array, "N C"], neighbors: Int[Array, "N k"]) -> Float[Array, "k N"]:
+def channel_kernel(
+    whitened: Float[Array, "M C"], rows: Int[Array, "N"], neighbors: Int[Array, "N k"]
+) -> Float[Array, "k N"]:
     """How alike each neighbour and its point look: exp(−½ |Δ|²) (Servos & Waslander 2014, eq. 7).
 
     Args:
         whitened: channels divided by the Cholesky factor of Λ.
     """
-    rows = jnp.where(neighbors.T >= 0, neighbors.T, 0)
-    square = jnp.zeros(rows.shape, whitened.dtype)
+    near = jnp.where(neighbors.T >= 0, neighbors.T, 0)
+    square = jnp.zeros(near.shape, whitened.dtype)
     for channel in whitened.T:
-        difference = channel[rows] - channel[None, :]
+        difference = channel[near] - channel[rows]
         square = square + difference * difference
     return jnp.exp(-0.5 * square)
 
 
 def partial_channel_kernel(
-    channels: Float[Array, "N C"],
-    channel_valid: Bool[Array, "N C"],
+    channels: Float[Array, "M C"],
+    channel_valid: Bool[Array, "M C"],
     covariance: Float[Array, "..."],
+    rows: Int[Array, "N"],
     neighbors: Int[Array, "N k"],
 ) -> Float[Array, "k N"]:
     """The kernel of eq. 7 where points lack channels: over those that both have, with the marginal of Λ on them.
@@ -288,12 +338,12 @@ def partial_channel_kernel(
     Args:
         covariance: Λ, scalar or (C,) or (C, C), channel units².
     """
-    rows = jnp.where(neighbors.T >= 0, neighbors.T, 0)
+    near = jnp.where(neighbors.T >= 0, neighbors.T, 0)
     # The point itself says nothing about how alike its neighbours look.
-    others = (neighbors.T >= 0) & (jnp.arange(neighbors.shape[0]) != neighbors.T)
-    common = [valid[rows] & valid for valid in channel_valid.T]
+    others = (neighbors.T >= 0) & (rows != neighbors.T)
+    common = [valid[near] & valid[rows] for valid in channel_valid.T]
     differences = [
-        jnp.where(both, channel[rows] - channel, 0) for channel, both in zip(channels.T, common, strict=True)
+        jnp.where(both, channel[near] - channel[rows], 0) for channel, both in zip(channels.T, common, strict=True)
     ]
     count = len(common)
     matrix = covariance if covariance.ndim == 2 else jnp.diag(jnp.broadcast_to(covariance, (count,)))
@@ -329,7 +379,7 @@ def _marginal_square(
 
 def multichannel_covariance(
     points: Float[Array, "3 N"],
-    kernel: Float[Array, "k N"],
+    kernel: Callable[[Int[Array, "n"], Int[Array, "n k"]], Float[Array, "k n"]],
     neighbors: Int[Array, "N k"],
     epsilon: Float[Array, ""],
     min_eigenvalue: Float[Array, ""],
@@ -337,25 +387,41 @@ def multichannel_covariance(
     """Ω in the tangent plane and ε across it (Servos & Waslander 2014, eqs. 6-10).
 
     Args:
-        kernel: λ_j of each neighbour.
+        kernel: λ_j of the neighbours of some rows.
         min_eigenvalue: floor for the eigenvalues of Ω, which reach 0 where only the point itself looks like it.
 
     Ω = Σ_w^{-1/2} Σ_t Σ_w^{-1/2} is written as I + Σ_w^{-1/2} (Σ_t − Σ_w) Σ_w^{-1/2}: uniform channels then give
     GICP's covariance to rounding, whatever the neighbourhood.
     """
-    offsets, present = gather(points, neighbors)
-    local = weighted_covariance(offsets, present.astype(points.dtype))
-    alike = weighted_covariance(offsets, jnp.where(present, kernel, 0))
 
+    def of_rows(rows: Int[Array, "n"], neighbors: Int[Array, "n k"]) -> Float[Array, "6 n"]:
+        offsets, present = gather(points, rows, neighbors)
+        local = weighted_covariance(offsets, present.astype(points.dtype))
+        alike = weighted_covariance(offsets, jnp.where(present, kernel(rows, neighbors), 0))
+        return _multichannel(local, alike, epsilon, min_eigenvalue)
+
+    return by_blocks(of_rows, neighbors)
+
+
+def _multichannel(
+    local: Float[Array, "6 N"], alike: Float[Array, "6 N"], epsilon: Float[Array, ""], min_eigenvalue: Float[Array, ""]
+) -> Float[Array, "6 N"]:
+    """From the covariance of all neighbours and that of those that look alike."""
     normal = smallest_eigenvector(local)
     u, v = orthonormal_basis(normal)
     unweighted, weighted = project(local, u, v), project(alike, u, v)
     trace = unweighted[0] + unweighted[2]
     spread = trace > 0
     scale = 1 / jnp.where(spread, trace, 1)
-    regular = unweighted * scale + _REGULARISATION * jnp.array([[1.0], [0.0], [1.0]], points.dtype)
-    regular = jnp.where(spread, regular, jnp.array([[1.0], [0.0], [1.0]], points.dtype))
+    regular = unweighted * scale + _REGULARISATION * jnp.array([[1.0], [0.0], [1.0]], local.dtype)
+    regular = jnp.where(spread, regular, jnp.array([[1.0], [0.0], [1.0]], local.dtype))
     change = sandwich(inverse_square_root(regular), (weighted - unweighted) * scale)
-    a, b, c = floor_eigenvalues(change, min_eigenvalue - 1)
-    uv = jnp.stack([2 * u[i] * v[j] if i == j else u[i] * v[j] + u[j] * v[i] for i in range(3) for j in range(i, 3)])
-    return plane_covariance(local, normal, epsilon) + a * outer(u) + b * uv + c * outer(v)
+    inside = embed(floor_eigenvalues(change, min_eigenvalue - 1), u, v)
+    return plane_covariance(local, normal, epsilon) + inside
+
+
+def embed(symmetric: Float[Array, "3 N"], u: Float[Array, "3 N"], v: Float[Array, "3 N"]) -> Float[Array, "6 N"]:
+    """B A Bᵀ in the basis B = [u v]: a 2×2 matrix of the tangent plane as a 3×3 one."""
+    a, b, c = symmetric
+    cross = jnp.stack([2 * u[i] * v[j] if i == j else u[i] * v[j] + u[j] * v[i] for i in range(3) for j in range(i, 3)])
+    return a * outer(u) + b * cross + c * outer(v)

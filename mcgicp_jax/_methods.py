@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import abc
 import dataclasses
+from functools import partial
 from typing import ClassVar
 
 import equinox as eqx
@@ -265,9 +266,9 @@ class MultiChannelGICP(AbstractGeneralized):
         if channels.shape[-1] == 0:
             return GICP(self.epsilon).covariance(cloud)
         if cloud.channel_valid is None:
-            kernel = cov.channel_kernel(_whiten(channels, covariance), neighbors)
+            kernel = partial(cov.channel_kernel, _whiten(channels, covariance))
         else:
-            kernel = cov.partial_channel_kernel(channels, jnp.asarray(cloud.channel_valid), covariance, neighbors)
+            kernel = partial(cov.partial_channel_kernel, channels, jnp.asarray(cloud.channel_valid), covariance)
         return cov.multichannel_covariance(
             points.T, kernel, neighbors, epsilon, self.min_eigenvalue.astype(points.dtype)
         )
