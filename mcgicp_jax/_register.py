@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
 from typing import Any, TypeAlias
 
 import equinox as eqx
@@ -18,7 +19,7 @@ from mcgicp_jax._channels import eagerly_if, neighbors_of, point_spacing, with_c
 from mcgicp_jax._cloud import PointCloud, Values
 from mcgicp_jax._cost import AbstractKernel, centred_pose, check_matches
 from mcgicp_jax._dense import default_search
-from mcgicp_jax._evidence import find_evidence
+from mcgicp_jax._evidence import Evidence, find_evidence
 from mcgicp_jax._loop import (
     Assessment,
     Problem,
@@ -238,7 +239,8 @@ def pose_problem(
     hold_free_directions: bool = True,
 ) -> Problem:
     """What the loop of `register` is about, for prepared clouds."""
-    method, source_surface, target_surface = _surfaces(source, target, method)
+    method = _checked(source, target, method)
+    (source_surface, source_evidence), (target_surface, target_evidence) = _look_at_both(method, source, target)
     dtype = source_surface.points.dtype
     distances = _usual_distances(target) if max_distance is None else max_distance
     return Problem(
@@ -250,8 +252,33 @@ def pose_problem(
         settings=_settings(
             distances, translation_tolerance, rotation_tolerance, max_iterations, dtype, hold_free_directions
         ),
-        evidence=(find_evidence(method, source), find_evidence(method, target)),
+        evidence=(source_evidence, target_evidence),
     )
+
+
+def _look_at_both(
+    method: AbstractMethod, source: PointCloud, target: PointCloud
+) -> tuple[tuple[Surface, Evidence], tuple[Surface, Evidence]]:
+    if not is_concrete(method, source, target):
+        return _look(method, source), _look(method, target)
+    # On CPUs a program runs on the thread that calls it, by and large: two threads take half of the time.
+    x64, device = jax.config.jax_enable_x64, jax.config.jax_default_device
+
+    def look_at_source() -> tuple[Surface, Evidence]:
+        # What a user has set for a block of code holds in that block's thread alone.
+        with jax.enable_x64(x64), jax.default_device(device):
+            return jax.block_until_ready(_look(method, source))
+
+    with ThreadPoolExecutor(1) as thread:
+        seen = thread.submit(look_at_source)
+        target_seen = jax.block_until_ready(_look(method, target))
+        return seen.result(), target_seen
+
+
+@jax.jit
+def _look(method: AbstractMethod, cloud: PointCloud) -> tuple[Surface, Evidence]:
+    """In one program, since both look at the same neighbourhoods."""
+    return prepare(method, cloud), find_evidence(method, cloud)
 
 
 def _matched(source: PointCloud, target: PointCloud, method: AbstractMethod) -> PointCloud:
@@ -282,6 +309,12 @@ def _ready(name: str, cloud: PointCloud | Values) -> PointCloud:
 def _surfaces(
     source: PointCloud, target: PointCloud, method: AbstractMethod
 ) -> tuple[AbstractMethod, Surface, Surface]:
+    method = _checked(source, target, method)
+    return method, prepare(method, source), prepare(method, target)
+
+
+def _checked(source: PointCloud, target: PointCloud, method: AbstractMethod) -> AbstractMethod:
+    """The method with its open numbers chosen, for clouds that fit each other and it."""
     _check_method(method)
     for name, cloud in (("source", source), ("target", target)):
         if cloud.points.ndim != 2:
@@ -296,8 +329,7 @@ def _surfaces(
         raise ValueError(
             f"points: expected one precision in both clouds, got {source.points.dtype} and {target.points.dtype}"
         )
-    method = method.resolve(source, target)
-    return method, prepare(method, source), prepare(method, target)
+    return method.resolve(source, target)
 
 
 def _check_channels(source: PointCloud, target: PointCloud, method: AbstractMethod) -> None:

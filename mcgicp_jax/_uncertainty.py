@@ -28,6 +28,8 @@ GEOMETRY_HOLDS, CHANNELS_HOLD = 2e-3, 5e-3
 _CELL = 2.0
 # Radii of the pairs: the standard deviation that a direction has which nothing holds.
 _UNKNOWN = 10.0
+# Pairs, at most, whose medians tell how rough surfaces are.
+_MEDIAN_OF = 4096
 _LEAST_SHARE = 0.2
 _IDENTITY = np.array([1, 0, 0, 1, 0, 1])
 _HASH = np.array([73856093, 19349663, 83492791, 50331653], np.int32)
@@ -204,10 +206,13 @@ def _share_across(
     of what the two roughnesses add up to; and when the point moves, its match makes up for β of it.
     """
     source, target = evidence
-    across = jnp.dot(rotation, source.normal, precision="highest")
+    # Thousands of pairs are enough, and sorting all of a large cloud's takes long.
+    some = slice(None, None, 1 + pairs.valid.size // _MEDIAN_OF)
+    valid = pairs.valid[some]
+    across = jnp.dot(rotation, source.normal[:, some], precision="highest")
     # Medians, since planes do not fit at edges: of the square of a normal variate, and of the mean of two such squares.
-    seen = jnp.where(pairs.valid, jnp.sum(across * pairs.residual, axis=0) ** 2, jnp.nan)
-    expected = jnp.where(pairs.valid, source.roughness + target.roughness[indices], jnp.nan)
+    seen = jnp.where(valid, jnp.sum(across * pairs.residual[:, some], axis=0) ** 2, jnp.nan)
+    expected = jnp.where(valid, source.roughness[some] + target.roughness[indices[some]], jnp.nan)
     ratio = (jnp.nanmedian(seen) / 0.455) / (jnp.nanmedian(expected) / 0.693)
     return jnp.where(jnp.isfinite(ratio), jnp.clip(ratio, _LEAST_SHARE, 1), 1)
 
@@ -244,8 +249,10 @@ def _sum_over_cells(
     cell = jnp.floor(jnp.where(sized, moved / 2.0**level, 0)).astype(jnp.int32)
     keys = (*cell, level.astype(jnp.int32))
     number = jnp.abs(sum((key * prime for key, prime in zip(keys, _HASH, strict=True)), jnp.int32(0))) % valid.size
-    count = jnp.zeros(valid.size, jnp.int32).at[number].add(valid)
-    return jnp.zeros_like(scores).at[:, number].add(scores), jnp.sum(count > 0)
+    # In rows, so that what is scattered is seven numbers at a time.
+    rows = jnp.concatenate([scores, valid[None].astype(scores.dtype)]).T
+    *sums, counts = jnp.zeros_like(rows).at[number].add(rows).T
+    return jnp.stack(sums), jnp.sum(counts > 0)
 
 
 def directions_at_source(directions: Directions, pose: jaxlie.SE3) -> Directions:
