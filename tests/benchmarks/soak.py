@@ -68,7 +68,7 @@ def main() -> None:
     parser.add_argument("--registrations", type=int, default=10_000)
     options = parser.parse_args()
     compilations = Compilations()
-    for name in ("jax._src.interpreters.pxla", "jax._src.dispatch"):
+    for name in ("jax._src.interpreters.pxla", "jax._src.dispatch", "jax._src.compiler"):
         logger = logging.getLogger(name)
         logger.addHandler(compilations)
         logger.propagate = False

@@ -1,0 +1,65 @@
+"""The same clouds give the same numbers, to the last bit: again, with other threads, in another process."""
+
+import os
+import subprocess
+import sys
+
+import jax
+import numpy as np
+import pytest
+
+import mcgicp_jax as mcg
+from tests.scenes import pair
+
+METHODS = {"gicp": mcg.GICP(), "mc-gicp": mcg.MultiChannelGICP()}
+# On one core: JAX, too, has other threads there.
+_IN_ANOTHER_PROCESS = """
+import os
+if hasattr(os, "sched_setaffinity"):
+    os.sched_setaffinity(0, [min(os.sched_getaffinity(0))])
+from tests.test_repeatable import METHODS, bits, clouds
+import mcgicp_jax as mcg
+for method in METHODS.values():
+    print(bits(mcg.register(*clouds(), method)))
+"""
+
+
+def clouds():
+    # Rounded, so that many distances are equal.
+    raw = [cloud.unpad() for cloud in pair(size=1000)[:2]]
+    return [mcg.preprocess(mcg.PointCloud(np.round(cloud.points, 2), cloud.channels)) for cloud in raw]
+
+
+def bits(result):
+    numbers = (result.matrix, result.cost, result.rmse, result.information, result.covariance, result.overlap)
+    return b"".join(np.asarray(number).tobytes() for number in numbers).hex() + result.status.name
+
+
+@pytest.fixture(scope="module")
+def expected():
+    return {name: bits(mcg.register(*clouds(), method)) for name, method in METHODS.items()}
+
+
+@pytest.mark.parametrize("name", METHODS)
+def test_a_hundred_times_with_any_number_of_workers(name, expected):
+    prepared = clouds()
+    for turn in range(100):
+        search = mcg.KDTreeSearch(workers=(-1, 1, 2, 3, 8)[turn % 5])
+        if turn % 20 == 0:
+            prepared = [mcg.preprocess(cloud.unpad(), search=search) for cloud in prepared]
+        assert bits(mcg.register(*prepared, METHODS[name], search=search)) == expected[name]
+
+
+@pytest.mark.parametrize("name", METHODS)
+def test_in_a_batch_of_threads(name, expected):
+    source, target = clouds()
+    for result in mcg.register_batch([source] * 8, [target] * 8, METHODS[name]):
+        assert bits(result) == expected[name]
+
+
+def test_in_another_process(expected):
+    environment = os.environ | {"JAX_ENABLE_X64": str(int(jax.config.jax_enable_x64))}
+    command = [sys.executable, "-c", _IN_ANOTHER_PROCESS]
+    done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=300)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.split() == list(expected.values())
