@@ -187,8 +187,14 @@ def _fit_residual(cloud: PointCloud) -> Float[Array, "N C"]:
 
 @jax.jit
 def point_spacing(cloud: PointCloud) -> Float[Array, ""]:
-    """Median distance to the nearest other point, metres."""
-    points, neighbors = jnp.asarray(cloud.points), neighbors_of(cloud)
-    second = neighbors[:, min(1, neighbors.shape[1] - 1)]
-    distances = jnp.linalg.norm(points[jnp.maximum(second, 0)] - points, axis=-1)
-    return jnp.nanmedian(jnp.where(jnp.asarray(cloud.valid) & (second >= 0), distances, jnp.nan))
+    """Median distance to the nearest neighbour that lies elsewhere, metres; 0 if all lie in one place.
+
+    Some files hold points twice, and some scanners report each beam without an echo as a point at the origin.
+    """
+    neighbors = neighbors_of(cloud)
+    present = jnp.asarray(cloud.valid)[:, None] & (neighbors >= 0)
+    square = jnp.zeros(neighbors.shape, cloud.points.dtype)
+    for coordinate in jnp.asarray(cloud.points).T:
+        square = square + (coordinate[jnp.maximum(neighbors, 0)] - coordinate[:, None]) ** 2
+    nearest = jnp.min(jnp.where(present & (square > 0), square, jnp.inf), axis=1)
+    return jnp.nan_to_num(jnp.nanmedian(jnp.where(jnp.isfinite(nearest), jnp.sqrt(nearest), jnp.nan)))

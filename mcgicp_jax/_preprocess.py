@@ -17,6 +17,7 @@ from mcgicp_jax._search import AbstractSearch
 MIN_POINTS = 4
 # Voxel numbers are packed into one 63-bit key.
 _VOXELS_PER_AXIS = 2**21
+_LARGEST = np.finfo(np.float32).max
 
 
 def preprocess(
@@ -99,7 +100,8 @@ def check_preprocessing(voxel_size: float | None, num_neighbors: int) -> None:
 
 def _finite(cloud: PointCloud) -> PointCloud:
     arrays = [array for array in (cloud.points, cloud.channels, cloud.covariances) if array is not None]
-    finite = [np.isfinite(array) for array in arrays]
+    # Beyond float32 is beyond all bounds: what is written as 1e300 or 1e39 stands for no number.
+    finite = [np.abs(array) <= _LARGEST for array in arrays]
     # Most clouds are whole, and asking for all at once is far quicker than for each row.
     if len(cloud.points) >= MIN_POINTS and all(each.all() for each in finite):
         return cloud

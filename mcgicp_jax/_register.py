@@ -388,11 +388,13 @@ def registration_of(
         numbers = jax.tree.map(lambda number: np.asarray(number)[()], numbers)
     if not is_concrete(source.origin) or np.any(source.origin):
         to_centred, from_centred = _translation_adjoint(-source.origin), _translation_adjoint(source.origin)
-        numbers["information"] = to_centred.T @ numbers["information"] @ to_centred
-        numbers["covariance"] = from_centred @ numbers["covariance"] @ from_centred.T
-        if directions is not None:
-            moved = numbers["directions"].twists @ from_centred.T, numbers["directions"].center + source.origin
-            numbers["directions"] = eqx.tree_at(lambda d: (d.twists, d.center), numbers["directions"], moved)
+        # What was not finite stays so, and the status tells.
+        with np.errstate(invalid="ignore", over="ignore"):
+            numbers["information"] = to_centred.T @ numbers["information"] @ to_centred
+            numbers["covariance"] = from_centred @ numbers["covariance"] @ from_centred.T
+            if directions is not None:
+                moved = numbers["directions"].twists @ from_centred.T, numbers["directions"].center + source.origin
+                numbers["directions"] = eqx.tree_at(lambda d: (d.twists, d.center), numbers["directions"], moved)
     return Registration(
         T_target_source=se3_from_matrix(matrix, pose.wxyz_xyz.dtype),
         source_origin=source.origin,

@@ -1,0 +1,252 @@
+"""Whatever comes in, there is an error that names it or an outcome that can be believed; and it stays as it was."""
+
+import copy
+import re
+import warnings
+from functools import partial
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+import mcgicp_jax as mcg
+from mcgicp_jax import Status
+from mcgicp_jax._channels import point_spacing
+from mcgicp_jax.metrics import pose_error
+from tests.scenes import motion, pair, room_corner
+
+METHODS = {
+    "point-to-point": mcg.PointToPoint(),
+    "point-to-plane": mcg.PointToPlane(),
+    "gicp": mcg.GICP(),
+    "color-icp": mcg.ColorICP(0.1),
+    "mc-gicp": mcg.MultiChannelGICP(),
+}
+# All clouds fit into the smallest size class: one program per method serves them.
+MOST = 128
+UTM = np.array([4.5e5, 5.2e6, 300.0])
+# What an error may be about.
+NAMED = re.compile(r"(source|target): |(init|points|channels|channel_valid|max_distance): ")
+
+
+def shape(kind, size, rng):
+    points = rng.normal(size=(size, 3))
+    return {
+        "room": lambda: room_corner(size, seed=int(rng.integers(100)))[0],
+        "ball": lambda: points,
+        "plane": lambda: points * [1, 1, 0],
+        "line": lambda: points[:, :1] * [1, 2, 3],
+        "axis": lambda: points * [1, 0, 0],
+        "one place": lambda: np.tile(rng.normal(size=3), (size, 1)),
+        "few places": lambda: np.resize(points[:5], (size, 3)),
+        "grid": lambda: np.rint(2 * points),
+    }[kind]()
+
+
+def spoiled(points, value, share, rng):
+    return np.where(rng.random((len(points), 1)) < share, value, points)
+
+
+def painted(kind, size, rng):
+    channels = rng.normal(size=(size, 2))
+    return {
+        "noise": lambda: channels,
+        "constant": lambda: np.ones((size, 2)),
+        "one of them constant": lambda: channels * [1, 0],
+        "NaN": lambda: np.full((size, 2), np.nan),
+        "some NaN": lambda: spoiled(channels, np.nan, 0.2, rng),
+        "huge": lambda: 1e38 * channels,
+        "beyond float32": lambda: 1e300 * channels,
+        "tiny": lambda: 1e-40 * channels,
+        "integers": lambda: np.rint(100 * channels),
+    }[kind]()
+
+
+def frozen(array):
+    array = array.copy()
+    array.setflags(write=False)
+    return array
+
+
+LAYOUTS = {
+    "plain": lambda array: array,
+    "columns": np.asfortranarray,
+    "every other": lambda array: np.repeat(array, 2, axis=0)[::2],
+    "backwards": lambda array: array[::-1].copy()[::-1],
+    "read-only": frozen,
+    "list": lambda array: array.tolist(),
+    "jax": lambda array: jnp.asarray(array, jnp.float32),
+    "big-endian": lambda array: array.astype(array.dtype.newbyteorder(">")),
+}
+DTYPES = (float, np.float32, np.float16, np.longdouble, int, np.uint8, bool)
+
+
+@st.composite
+def clouds(draw, channels=True):
+    """Points and channels as a user may have them, and whether they are said where channels are missing."""
+    rng = np.random.default_rng(draw(st.integers(0, 2**31)))
+    size = draw(st.sampled_from([0, 1, 3, 4, 5, 20, 100, MOST]))
+    kinds = st.sampled_from(["room", "ball", "plane", "line", "axis", "one place", "few places", "grid"])
+    points = shape(draw(kinds), size, rng)
+    scale = draw(st.sampled_from([1.0, 1.0, 1.0, 1e-6, 1e-3, 1e3, 1e6, 1e-300, 1e-30, 1e18, 1e30, 1e39]))
+    offset = draw(st.sampled_from([np.zeros(3), np.zeros(3), UTM, np.full(3, 1e12)]))
+    points = scale * points + offset
+    value = draw(st.sampled_from([None, None, np.nan, np.inf, -np.inf, 0.0, 1e30, 1e200]))
+    if value is not None:
+        points = spoiled(points, value, draw(st.sampled_from([0.02, 0.5, 1.0])), rng)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        points = points.astype(draw(st.sampled_from(DTYPES)))
+        layout = draw(st.sampled_from(list(LAYOUTS)))
+        points = LAYOUTS[layout](points) if size or layout != "list" else np.zeros((0, 3))
+    if not channels:
+        return points, None, None
+    kinds = ["noise", "constant", "one of them constant", "NaN", "some NaN", "huge", "beyond float32", "tiny"]
+    values = painted(draw(st.sampled_from([*kinds, "integers"])), size, rng)
+    return points, LAYOUTS[draw(st.sampled_from(["plain", "columns", "read-only"]))](values), draw(st.booleans())
+
+
+def cloud_of(points, channels, told):
+    return mcg.PointCloud(points, channels, channel_valid=np.isfinite(channels) if told else None)
+
+
+def outcome(function):
+    """The registration, or None for an error that names what is wrong. No arithmetic warns."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", UserWarning)
+        warnings.simplefilter("error", RuntimeWarning)
+        try:
+            return function()
+        except ValueError as error:
+            assert NAMED.match(str(error)), str(error)
+            return None
+
+
+def assert_believable(result, init=None):
+    status = result.status
+    assert isinstance(status, Status) and status not in (Status.INVALID_INPUT, Status.LOST)
+    rotation = result.matrix[:3, :3]
+    if status is not Status.NON_FINITE:
+        assert np.isfinite(result.matrix).all()
+        np.testing.assert_allclose(rotation @ rotation.T, np.eye(3), atol=1e-5)
+    if status is Status.TOO_FEW_CORRESPONDENCES:
+        assert result.num_inliers < 4
+    if status is Status.CONVERGED:
+        assert result.num_inliers >= 4 and 0 < result.overlap <= 1
+        assert np.isfinite([result.cost, result.rmse]).all() and np.isfinite(result.information).all()
+        assert all(direction.held_by_channels for direction in result.free_directions)
+    assert status.name in repr(result)
+
+
+def copied(values):
+    return copy.deepcopy(np.asarray(values))
+
+
+@settings(max_examples=80, deadline=None)
+@given(st.data())
+def test_register_survives_anything(data):
+    name = data.draw(st.sampled_from(list(METHODS)))
+    usual = (room_corner(100, seed=5)[0], room_corner(100, seed=6)[1], False)
+    given_source = data.draw(clouds())
+    given_target = data.draw(st.one_of(st.just(given_source), st.just(usual), clouds()))
+    if data.draw(st.booleans()):
+        given_source, given_target = given_target, given_source
+    init = data.draw(
+        st.sampled_from([None, None, motion(), motion((1e6, 0, 0, 0, 0, 3)), motion((1e30, 0, 0, 0, 0, 1))])
+    )
+    max_distance = data.draw(st.sampled_from([None, None, 0.5, (1.0, 0.1), 1e-9, np.inf]))
+    values = [array for cloud in (given_source, given_target) for array in cloud[:2]]
+    before = [copied(array) for array in values]
+    result = outcome(
+        lambda: mcg.register(
+            named("source", given_source),
+            named("target", given_target),
+            METHODS[name],
+            init=init,
+            max_distance=max_distance,
+        )
+    )
+    if result is not None:
+        assert_believable(result)
+    for array, kept in zip(values, before, strict=True):
+        np.testing.assert_array_equal(np.asarray(array), kept)
+
+
+def named(name, cloud):
+    try:
+        return cloud_of(*cloud)
+    except ValueError as error:
+        raise ValueError(f"{name}: {error}") from error
+
+
+def middle(points):
+    points = points.astype(float)
+    return points[np.all(np.abs(points) < 1e38, axis=1)].mean(axis=0)
+
+
+@settings(max_examples=40, deadline=None)
+@given(clouds(channels=False), st.sampled_from(["point-to-point", "gicp"]))
+def test_bare_arrays_of_any_kind(cloud, name):
+    points, _, _ = cloud
+    before = copied(points)
+    result = outcome(lambda: mcg.register(points, points, METHODS[name]))
+    if result is not None:
+        assert_believable(result)
+        if result.converged:
+            assert max(pose_error(result.matrix, np.eye(4), at=middle(before))) < 1e-3
+    np.testing.assert_array_equal(np.asarray(points), before)
+
+
+@pytest.mark.parametrize("what", ["points twice", "beams without an echo"])
+def test_points_in_one_place_do_not_set_the_default_distance(what):
+    source, target, truth = (each.unpad() if isinstance(each, mcg.PointCloud) else each for each in pair(size=1000))
+    spacing = float(point_spacing(mcg.preprocess(target)))
+    if what == "points twice":
+        crowded = np.concatenate([target.points, target.points])
+    else:
+        crowded = np.concatenate([target.points, np.zeros((1200, 3))])
+    assert float(point_spacing(mcg.preprocess(crowded))) == pytest.approx(spacing, rel=0.02)
+    result = mcg.register(source.points, crowded, mcg.GICP())
+    assert result.converged and max(pose_error(result.matrix, truth)) < 1e-2
+    assert float(point_spacing(mcg.preprocess(np.ones((10, 3))))) == 0
+
+
+def test_what_no_float32_holds_is_left_out():
+    """In both precisions alike, and without a warning from the arithmetic."""
+    points, channels = room_corner(100)
+    points[3, 0], channels[5, 1] = 1e39, -1e300
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", RuntimeWarning)
+        with pytest.warns(UserWarning, match="left out 2 of 100 points that are NaN or infinite"):
+            cloud = mcg.preprocess(mcg.PointCloud(points, channels))
+    assert len(cloud) == 98
+    with pytest.raises(ValueError, match="cloud: expected at least 4 finite points, got 0 of 100"):
+        mcg.preprocess(points + 1e40)
+
+
+def test_more_neighbors_than_points():
+    points, channels = room_corner(100)
+    cloud = mcg.preprocess(mcg.PointCloud(points, channels), num_neighbors=150)
+    # All points have the same normal then, which holds little.
+    result = mcg.register(cloud, cloud, mcg.GICP())
+    assert result.status is Status.DEGENERATE
+    assert_believable(result)
+
+
+def test_a_batch_tells_what_register_tells():
+    """Hostile pairs side by side: each has the status of `register`, or INVALID_INPUT where that raises."""
+    rng = np.random.default_rng(0)
+    kinds = ["room", "plane", "line", "one place", "few places"]
+    points = [scale * shape(kind, 100, rng) for kind in kinds for scale in (1.0, 1e-6, 1e18, 1e39)]
+    points += [np.zeros((0, 3)), np.full((100, 3), np.nan), np.zeros((100, 2)), [[1, 2, 3], [4]]]
+    target = room_corner(100, seed=5)[0]
+    expected = [outcome(partial(mcg.register, each, target, mcg.GICP())) for each in points]
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", UserWarning)
+        results = mcg.register_batch(points, target, mcg.GICP())
+    for result, alone in zip(results, expected, strict=True):
+        assert result.status is (Status.INVALID_INPUT if alone is None else alone.status)
+        if alone is not None:
+            np.testing.assert_array_equal(result.matrix, alone.matrix)
