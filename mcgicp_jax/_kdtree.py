@@ -26,6 +26,8 @@ from mcgicp_jax._search import AbstractIndex, AbstractSearch, Rows
 # How many candidates are looked at to break a tie by row number: a multiple of those asked for, and at least so many.
 _TIE_CANDIDATES = 8
 _LEAST_TIE_CANDIDATES = 64
+# A tree of more points falls out of a processor's caches, and is searched faster by queries that lie side by side.
+_LARGEST_UNORDERED = 50_000
 
 
 class KDTreeSearch(AbstractSearch):
@@ -64,9 +66,12 @@ class KDTreeSearch(AbstractSearch):
         )
 
     def neighbors(self, points: Float[np.ndarray, "N 3"], num_neighbors: int) -> Int[np.ndarray, "N k"]:
-        found, _ = _nearest(_tree(points), points, num_neighbors, self.workers)
-        missing = num_neighbors - found.shape[1]
-        return np.pad(found, [(0, 0), (0, missing)], constant_values=-1)
+        tree = _tree(points)
+        # In the order of the tree's leaves, each query finds in the processor's caches what the one before has read.
+        found, _ = _nearest(tree, points[tree.indices], num_neighbors, self.workers)
+        neighbors = np.full((len(points), num_neighbors), -1, np.int32)
+        neighbors[tree.indices, : found.shape[1]] = found
+        return neighbors
 
 
 class KDTreeIndex(AbstractIndex):
@@ -200,12 +205,17 @@ class _Follower:
         self._queries: Float[np.ndarray, "N D"] = np.full((source.valid.size, 3 + source.descriptors.shape[1]), np.nan)
         self._rows: Int[np.ndarray, "N"] = np.full(source.valid.size, -1, np.int32)
         self._slack: Float[np.ndarray, "N"] = np.zeros(source.valid.size)
+        # Rows that are there, those close to each other in space one after the other where that pays.
+        self._order: Int[np.ndarray, "n"] = np.flatnonzero(source.valid)
+        if self._order.size > _LARGEST_UNORDERED:
+            points = np.nan_to_num(source.points.T[self._order], posinf=0, neginf=0)
+            self._order = self._order[scipy.spatial.cKDTree(points, 256, balanced_tree=False).indices]
 
     def nearest(self, pose: Float[ArrayLike, "7"]) -> Int[np.ndarray, "N"]:
         queries = _moved(pose, self._source)
         shift = queries[:, :3] - self._queries[:, :3]
         # Written so that NaN is looked for.
-        stale = np.flatnonzero(self._source.valid & ~(np.einsum("ij,ij->i", shift, shift) < self._slack**2))
+        stale = self._order[~(np.einsum("ij,ij->i", shift, shift) < self._slack**2)[self._order]]
         absence = None if self._source.absence is None else self._source.absence[stale]
         found, self._slack[stale] = self._index.nearest_of(queries[stale], absence, self._max_distance, 1)
         self._queries[stale] = queries[stale]

@@ -262,7 +262,7 @@ def _look_at_both(
     if not is_concrete(method, source, target):
         return _look(method, source), _look(method, target)
     # On CPUs a program runs on the thread that calls it, by and large: two threads take half of the time.
-    x64, device = jax.config.jax_enable_x64, jax.config.jax_default_device
+    x64, device = jax.enable_x64.value, jax.default_device.value
 
     def look_at_source() -> tuple[Surface, Evidence]:
         # What a user has set for a block of code holds in that block's thread alone.
