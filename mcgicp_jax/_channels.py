@@ -16,7 +16,7 @@ from mcgicp_jax._cloud import PointCloud
 from mcgicp_jax._kdtree import KDTreeSearch
 from mcgicp_jax._pose import Pose, pose_matrix
 from mcgicp_jax._preprocess import preprocess
-from mcgicp_jax._search import Rows
+from mcgicp_jax._search import Correspondences, Rows
 
 # Shares of the values below which gain and offset are read off.
 _QUANTILES = tuple(share / 20 for share in range(1, 20))
@@ -107,13 +107,22 @@ def _positive_definite(covariance: Float[np.ndarray, "C C"]) -> Float[np.ndarray
 
 
 @jax.jit
-def with_channels_matched(source: PointCloud, target: PointCloud) -> PointCloud:
+def with_channels_matched(source: PointCloud, target: PointCloud, matches: Correspondences | None = None) -> PointCloud:
     """The source, each channel scaled and shifted so that its values are distributed like the target's.
 
-    By the quantiles from 5 to 95 %: robust against what only one of the clouds sees, as long as that is little. Gain
-    and offset are constants to autodiff.
+    By the quantiles from 5 to 95 %: robust against what only one of the clouds sees, as long as that is little; with
+    matches, by the matched points alone. Not pair by pair: noise, and pairs across edges,
+    would make the gain too small. Gain and offset are constants to autodiff.
     """
-    quantiles = [_channel_quantiles(jax.lax.stop_gradient(cloud)) for cloud in (source, target)]
+    source_values, target_values = jax.lax.stop_gradient((_known_values(source), _known_values(target)))
+    if matches is not None:
+        target_values = target_values[matches.indices]
+        paired = matches.valid[:, None] & jnp.isfinite(source_values) & jnp.isfinite(target_values)
+        # A few points tell no distribution.
+        paired = paired & (jnp.sum(paired, axis=0) > len(_QUANTILES))
+        source_values, target_values = (jnp.where(paired, values, jnp.nan) for values in (source_values, target_values))
+    shares = jnp.asarray(_QUANTILES, source_values.dtype)
+    quantiles = [jnp.nanquantile(values, shares, axis=0) for values in (source_values, target_values)]
     means = [jnp.mean(values, axis=0) for values in quantiles]
     spreads = [jnp.std(values, axis=0) for values in quantiles]
     telling = (spreads[0] > 0) & (spreads[1] > 0)
@@ -124,12 +133,12 @@ def with_channels_matched(source: PointCloud, target: PointCloud) -> PointCloud:
     return source.replace(channels=jnp.where(known, gain, 1) * channels + jnp.where(known, offset, 0))
 
 
-def _channel_quantiles(cloud: PointCloud) -> Float[Array, "Q C"]:
+def _known_values(cloud: PointCloud) -> Float[Array, "N C"]:
+    """Channels, NaN where there are none."""
     valid = jnp.asarray(cloud.valid)[:, None]
     if cloud.channel_valid is not None:
         valid = valid & jnp.asarray(cloud.channel_valid)
-    values = jnp.where(valid, jnp.asarray(cloud.channels), jnp.nan)
-    return jnp.nanquantile(values, jnp.asarray(_QUANTILES, values.dtype), axis=0)
+    return jnp.where(valid, jnp.asarray(cloud.channels), jnp.nan)
 
 
 def eagerly_if(concrete: bool) -> contextlib.AbstractContextManager[None]:
@@ -147,11 +156,9 @@ def channel_noise(source: PointCloud, target: PointCloud) -> tuple[Float[Array, 
     """σ per channel, and which channels are constant (theirs is 1)."""
     residuals, values = [], []
     for cloud in (source, target):
-        valid = jnp.asarray(cloud.valid)[:, None]
-        if cloud.channel_valid is not None:
-            valid = valid & jnp.asarray(cloud.channel_valid)
-        residuals.append(jnp.where(valid, _fit_residual(cloud), jnp.nan))
-        values.append(jnp.where(valid, jnp.asarray(cloud.channels), jnp.nan))
+        known = _known_values(cloud)
+        residuals.append(jnp.where(jnp.isnan(known), jnp.nan, _fit_residual(cloud)))
+        values.append(known)
     sigma = jnp.nanmedian(jnp.concatenate(residuals), axis=0)
     everything = jnp.concatenate(values)
     spread = jnp.nanstd(everything, axis=0)

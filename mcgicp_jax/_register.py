@@ -32,7 +32,7 @@ from mcgicp_jax._loop import (
     run_on_host,
     run_traced,
 )
-from mcgicp_jax._methods import AbstractMethod, MultiChannelGICP, Surface, prepare
+from mcgicp_jax._methods import AbstractMethod, MultiChannelGICP, PointToPoint, Surface, prepare
 from mcgicp_jax._pose import Pose, is_concrete, pose_matrix, se3_from_matrix
 from mcgicp_jax._preprocess import preprocess
 from mcgicp_jax._result import Registration, pose_in_user_frame
@@ -182,8 +182,9 @@ def register(
         hold_free_directions: leave the pose where `init` has it in the directions that nothing holds, neither the shape
             of the clouds nor, for the methods that use them, their channels. If False it goes where the nearest
             neighbours pull it. The status is DEGENERATE either way.
-        match_channels: whether the source's channels are first scaled and shifted to be distributed like the target's,
-            as where exposures differ. It needs clouds that see much the same.
+        match_channels: whether the source's channels are scaled and shifted to be distributed like the target's, as
+            where exposures differ: at first by all points, and once a pose is found, by those that both clouds see
+            there; the pose is then found anew from there.
         scales: voxel sizes, metres, coarse to fine, for a start that is far off: the clouds are registered in each of
             them first, with its own default of `max_distance`, and each pose that is found starts the next. With
             numbers alone, outside of transformations.
@@ -210,20 +211,29 @@ def register(
             hold_free_directions=hold_free_directions,
         )
         init = found.matrix if found.converged else init
-    problem = pose_problem(
-        *(source, target, method, init, max_distance, max_iterations),
-        *(translation_tolerance, rotation_tolerance, robust, hold_free_directions),
-    )
     search = search or default_search()
-    constants = jax.lax.stop_gradient(problem)
+    options = max_distance, max_iterations, translation_tolerance, rotation_tolerance, robust, hold_free_directions
+    problem = pose_problem(source, target, method, init, *options)
+    state, matches, history = _run(problem, search, max_iterations)
+    if match_channels:
+        source = _matched(source, target, method, _nearest_points(source, target, problem, state, search))
+        problem = pose_problem(source, target, method, None, *options)
+        problem = eqx.tree_at(lambda problem: problem.start, problem, state.pose)
+        state, matches, history = _run(problem, search, max_iterations)
     differentiable = problem.source, problem.target, problem.method, problem.robust
-    if is_concrete(constants):
-        state, matches, history = run_on_host(constants, search)
-    else:
-        state, matches, history = run_traced(constants, search, max_iterations)
     model = problem.model(matches)
     pose = state.pose if is_concrete(differentiable) else refine(state, model)
     return registration_of(pose, state, assess(state, model, problem.evidence), history, source, target)
+
+
+def _run(
+    problem: Problem, search: AbstractSearch, max_iterations: int
+) -> tuple[State, Correspondences, dict[str, Array] | dict[str, np.ndarray]]:
+    """The loop; pose and matches are constants to autodiff."""
+    constants = jax.lax.stop_gradient(problem)
+    if is_concrete(constants):
+        return run_on_host(constants, search)
+    return run_traced(constants, search, max_iterations)
 
 
 def pose_problem(
@@ -281,9 +291,20 @@ def _look(method: AbstractMethod, cloud: PointCloud) -> tuple[Surface, Evidence]
     return prepare(method, cloud), find_evidence(method, cloud)
 
 
-def _matched(source: PointCloud, target: PointCloud, method: AbstractMethod) -> PointCloud:
+def _matched(
+    source: PointCloud, target: PointCloud, method: AbstractMethod, matches: Correspondences | None = None
+) -> PointCloud:
     _check_channels(source, target, method)
-    return with_channels_matched(source, target)
+    return with_channels_matched(source, target, matches)
+
+
+def _nearest_points(
+    source: PointCloud, target: PointCloud, problem: Problem, state: State, search: AbstractSearch
+) -> Correspondences:
+    """Which points both clouds see at a pose, whatever their channels."""
+    pose = jax.lax.stop_gradient(pose_in_user_frame(state.pose, source.origin, target.origin))
+    distance = problem.settings.fine_distance
+    return find_correspondences(source, target, pose, PointToPoint(), max_distance=distance, search=search)
 
 
 def _coarser(cloud: PointCloud, voxel_size: float) -> PointCloud:

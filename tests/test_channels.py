@@ -1,10 +1,11 @@
 """What is measured of channels: Λ from aligned clouds, gain and offset."""
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from mcgicp_jax import PointCloud, estimate_channel_covariance, preprocess
+from mcgicp_jax import Correspondences, PointCloud, estimate_channel_covariance, preprocess
 from mcgicp_jax._channels import with_channels_matched
 from tests import reference as ref
 from tests.scenes import motion
@@ -74,6 +75,36 @@ def test_gain_and_offset_are_undone(present):
     source = target.replace(channels=target.channels * np.array([0.5, 3.0, 1.0]) + np.array([7.0, 0.0, -1.0]))
     matched = with_channels_matched(source, target)
     np.testing.assert_allclose(matched.channels[:500], target.channels[:500], atol=ref.tolerance(2e-5, 1e-12))
+
+
+@pytest.mark.parametrize("present", [None, 0.5])
+def test_what_only_one_cloud_sees_does_not_count_with_matches(present):
+    points, channels = ref.scene(500, 3)
+    mask = None if present is None else np.random.default_rng(0).random((500, 3)) < present
+    target = preprocess(PointCloud(points, channels, channel_valid=mask))
+    gain, offset = np.array([0.5, 3.0, 1.0]), np.array([7.0, 0.0, -1.0])
+    alien = np.arange(len(target.points)) >= 300
+    source = target.replace(channels=np.where(alien[:, None], 9.0, target.channels * gain + offset))
+    indices = jnp.asarray(np.roll(np.arange(len(alien)), 7), jnp.int32)
+    rolled = target.replace(
+        channels=np.roll(target.channels, -7, axis=0),
+        channel_valid=None if mask is None else np.roll(target.channel_valid, -7, axis=0),
+        valid=np.roll(target.valid, -7),
+    )
+    matches = Correspondences(indices=indices, distances=jnp.zeros(len(alien)), valid=jnp.asarray(~alien))
+    matched = with_channels_matched(source, rolled, matches)
+    np.testing.assert_allclose(matched.channels[:300], target.channels[:300], atol=ref.tolerance(2e-5, 1e-12))
+    fooled = with_channels_matched(source, rolled)
+    assert np.abs(fooled.channels[:300] - target.channels[:300]).max() > 0.3
+
+
+def test_a_few_matches_tell_nothing():
+    cloud = preprocess(PointCloud(*ref.scene(500, 3)))
+    rows = jnp.arange(len(cloud.points), dtype=jnp.int32)
+    for count in (0, 3):
+        matches = Correspondences(indices=rows, distances=jnp.zeros(rows.size), valid=rows < count)
+        matched = with_channels_matched(cloud.replace(channels=2 * cloud.channels), cloud, matches)
+        np.testing.assert_array_equal(matched.channels, 2 * cloud.channels)
 
 
 def test_channels_that_say_nothing_are_not_matched():

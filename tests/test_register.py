@@ -344,6 +344,24 @@ def test_matched_channels_undo_gain_and_offset():
     assert difference(plain.matrix, truth) > 2 * difference(result.matrix, truth)
 
 
+def test_matched_channels_are_not_fooled_by_what_one_cloud_sees():
+    """A fifth of the source, far off to the side, is bright: by all points its gain would be wrong."""
+    source, target, truth = pair(wall)
+    points, channels = np.array(source.points), 0.8 * np.array(source.channels) + 0.1
+    points[:400, 0] += 5
+    channels[:400] = 3.0
+    source = mcg.preprocess(mcg.PointCloud(points[:2000], channels[:2000]))
+    method = mcg.MultiChannelGICP()
+    right = mcg.PointCloud(points[:2000], (channels[:2000] - 0.1) / 0.8)
+    expected = mcg.register(mcg.preprocess(right), target, method)
+    result = mcg.register(source, target, method, match_channels=True)
+    assert result.converged and difference(result.matrix, truth) < 6e-3
+    assert difference(result.matrix, expected.matrix) < 2e-3
+    assert len(result.history["cost"]) == result.num_iterations + 1
+    jitted = jax.jit(lambda source: mcg.register(source, target, method, match_channels=True).matrix)(source)
+    assert difference(jitted, result.matrix) < 2e-4
+
+
 def test_without_channels_it_says_that_it_is_gicp(room):
     bare = [cloud.replace(channels=np.zeros((*cloud.points.shape[:1], 0))) for cloud in room[:2]]
     with pytest.warns(UserWarning, match="no channels: MultiChannelGICP is GICP then"):
