@@ -152,33 +152,35 @@ def neighbors_of(cloud: PointCloud) -> Array:
 
 
 @jax.jit
-def channel_noise(source: PointCloud, target: PointCloud) -> tuple[Float[Array, "C"], Bool[Array, "C"]]:
-    """σ per channel, and which channels are constant (theirs is 1)."""
-    residuals, values = [], []
+def channel_noise(
+    source: PointCloud, target: PointCloud
+) -> tuple[Float[Array, "C"], Bool[Array, "C"], Float[Array, ""]]:
+    """σ per channel, which channels are constant (theirs is 1), and the variance of points across the surface, λ₀."""
+    residuals, values, across = [], [], []
     for cloud in (source, target):
+        residual, variance = _fit_residuals(cloud)
         known = _known_values(cloud)
-        residuals.append(jnp.where(jnp.isnan(known), jnp.nan, _fit_residual(cloud)))
+        residuals.append(jnp.where(jnp.isnan(known), jnp.nan, residual))
         values.append(known)
+        across.append(jnp.where(jnp.asarray(cloud.valid), variance, jnp.nan))
     sigma = jnp.nanmedian(jnp.concatenate(residuals), axis=0)
     everything = jnp.concatenate(values)
     spread = jnp.nanstd(everything, axis=0)
     constant = ~(spread > 1e3 * jnp.finfo(spread.dtype).eps * jnp.nanmax(jnp.abs(everything), axis=0, initial=0))
     # Rendered channels have no noise; a thousandth of their spread keeps Λ and α finite.
-    return jnp.where(constant, 1, jnp.fmax(sigma, 1e-3 * spread)), constant
+    return jnp.where(constant, 1, jnp.fmax(sigma, 1e-3 * spread)), constant, jnp.nanmedian(jnp.concatenate(across))
 
 
-def _fit_residual(cloud: PointCloud) -> Float[Array, "N C"]:
-    """Standard deviation of each channel about its linear fit over each neighbourhood's tangent plane.
-
-    NaN where too few neighbours have the channel.
-    """
+def _fit_residuals(cloud: PointCloud) -> tuple[Float[Array, "N C"], Float[Array, "N"]]:
+    """Standard deviation of each channel about its linear fit over each neighbourhood's tangent plane, NaN where too
+    few neighbours have the channel; and the variance of the neighbours across that plane, metres²."""
     points, neighbors = jnp.asarray(cloud.points).T, neighbors_of(cloud)
 
     def of_rows(rows: Int[Array, "n"], neighbors: Int[Array, "n k"]) -> tuple[Float[Array, "n"], ...]:
         offsets, present = cov.gather(points, rows, neighbors)
-        basis = cov.orthonormal_basis(
-            cov.smallest_eigenvector(cov.weighted_covariance(offsets, present.astype(points.dtype)))
-        )
+        local = cov.weighted_covariance(offsets, present.astype(points.dtype))
+        normal = cov.smallest_eigenvector(local)
+        basis = cov.orthonormal_basis(normal)
         x, y = (sum(offset * b for offset, b in zip(offsets, axis, strict=True)) for axis in basis)
         near = jnp.where(present, neighbors.T, 0)
         residuals = []
@@ -186,10 +188,10 @@ def _fit_residual(cloud: PointCloud) -> Float[Array, "N C"]:
             known = present if cloud.channel_valid is None else present & jnp.asarray(cloud.channel_valid)[:, i][near]
             fit = cov.fit_linear(x, y, channel[near], known.astype(x.dtype))
             residuals.append(jnp.where(fit.weight > 3, jnp.sqrt(fit.residual), jnp.nan))
-        return tuple(residuals)
+        return jnp.sum(normal * cov.multiply(local, normal), axis=0), *residuals
 
-    residuals = cov.by_blocks(of_rows, neighbors)
-    return jnp.stack(residuals, axis=-1) if residuals else jnp.zeros((points.shape[1], 0), points.dtype)
+    across, *residuals = cov.by_blocks(of_rows, neighbors)
+    return jnp.stack(residuals, axis=-1) if residuals else jnp.zeros((points.shape[1], 0), points.dtype), across
 
 
 @jax.jit

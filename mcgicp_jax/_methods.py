@@ -25,6 +25,9 @@ from mcgicp_jax._search import Rows
 _SPREAD = 1.5
 # In spacings of the target.
 _REACH = 2.5
+# The least floor of Ω, and the variance of a match along each axis of a surface whose points lie at random, spacing².
+_MIN_EIGENVALUE = 5e-3
+_MATCH_VARIANCE = 0.72
 
 
 class Surface(eqx.Module):
@@ -202,7 +205,8 @@ class MultiChannelGICP(AbstractGeneralized):
         channel_weights: α, scalar or (C,), metres per channel unit. None: from the data, see `resolve`.
         epsilon: ε, as in `GICP`.
         min_eigenvalue: floor of Ω's eigenvalues, where nothing nearby looks alike. A match is one of the samples, and
-            no sample lies just where it should: within the surface it cannot hold as well as across it.
+            no sample lies just where it should: within the surface it cannot hold as well as across it. None: chosen
+            along with Λ, see `resolve`; 0.005 with a Λ that is given.
     """
 
     uses_channels: ClassVar[bool] = True
@@ -210,20 +214,20 @@ class MultiChannelGICP(AbstractGeneralized):
     channel_covariance: Float[Array, "..."] | None
     channel_weights: Float[Array, "..."] | None
     epsilon: Float[Array, ""]
-    min_eigenvalue: Float[Array, ""]
+    min_eigenvalue: Float[Array, ""] | None
 
     def __init__(
         self,
         channel_covariance: Values | None = None,
         channel_weights: Values | None = None,
         epsilon: ArrayLike = 1e-3,
-        min_eigenvalue: ArrayLike = 5e-3,
+        min_eigenvalue: ArrayLike | None = None,
     ):
         """Raises `ValueError` if Λ is not positive definite, a weight is negative, or ε or the floor not positive."""
         self.channel_covariance = None if channel_covariance is None else _covariance(channel_covariance)
         self.channel_weights = None if channel_weights is None else _weights(channel_weights)
         self.epsilon = _epsilon(epsilon)
-        self.min_eigenvalue = _positive_scalar("min_eigenvalue", min_eigenvalue)
+        self.min_eigenvalue = None if min_eigenvalue is None else _positive_scalar("min_eigenvalue", min_eigenvalue)
 
     def resolve(self, source: PointCloud, target: PointCloud) -> MultiChannelGICP:
         """Λ and α from the data, where they were left open; constants to autodiff.
@@ -233,24 +237,33 @@ class MultiChannelGICP(AbstractGeneralized):
         wide in all, edges and whatever moved between the two with it: Λ = 2 (1.5 σ)². α = 2.5 spacing/σ, with the
         median distance between neighbouring target points: one σ weighs as much as the radius within which matches end
         up, so that channels choose among the points there. A channel that is constant says nothing: its α is 0.
+
+        The floor goes with Λ: along an axis within the surface a match is off by a variance of 0.72 spacing², where
+        points lie at random, and across the surface by 2 λ₀, the median smallest eigenvalue of the neighbourhoods
+        being λ₀. It is ε times their ratio, from 0.005 to 1. As λ₀ has the bends of the surface in it, the ratio is at
+        least that: it can raise the floor, as for rendered scenes, and not lower it.
         """
         if self.channel_covariance is not None and self.channel_weights is not None:
             return self
         source, target = jax.lax.stop_gradient((source, target))
         # What is known now is computed now: a compiler that folds a median as a constant takes seconds, and complains.
         with eagerly_if(is_concrete(source, target)):
-            sigma, constant = channel_noise(source, target)
-        covariance, weights = self.channel_covariance, self.channel_weights
+            sigma, constant, across = channel_noise(source, target)
+        with eagerly_if(is_concrete(target)):
+            spacing = point_spacing(target)
+        covariance, weights, floor = self.channel_covariance, self.channel_weights, self.min_eigenvalue
         if covariance is None:
             covariance = 2 * (_SPREAD * sigma) ** 2
+            if floor is None:
+                within = jax.lax.stop_gradient(self.epsilon) * _MATCH_VARIANCE * spacing**2
+                smooth = ~(2 * across > within)
+                floor = jnp.where(smooth, 1, jnp.maximum(within / jnp.where(smooth, 1, 2 * across), _MIN_EIGENVALUE))
         if weights is None:
-            with eagerly_if(is_concrete(target)):
-                spacing = point_spacing(target)
             weights = jnp.where(constant, 0, _REACH * spacing / sigma)
         return eqx.tree_at(
-            lambda method: (method.channel_covariance, method.channel_weights),
+            lambda method: (method.channel_covariance, method.channel_weights, method.min_eigenvalue),
             self,
-            (covariance, weights),
+            (covariance, weights, floor),
             is_leaf=lambda leaf: leaf is None,
         )
 
@@ -269,9 +282,8 @@ class MultiChannelGICP(AbstractGeneralized):
             kernel = partial(cov.channel_kernel, _whiten(channels, covariance))
         else:
             kernel = partial(cov.partial_channel_kernel, channels, jnp.asarray(cloud.channel_valid), covariance)
-        return cov.multichannel_covariance(
-            points.T, kernel, neighbors, epsilon, self.min_eigenvalue.astype(points.dtype)
-        )
+        floor = jnp.asarray(_MIN_EIGENVALUE if self.min_eigenvalue is None else self.min_eigenvalue, points.dtype)
+        return cov.multichannel_covariance(points.T, kernel, neighbors, epsilon, floor)
 
     def descriptors(self, cloud: PointCloud) -> Float[Array, "N D"]:
         if self.channel_weights is None:

@@ -104,6 +104,22 @@ def test_noise_is_found(unit):
     np.testing.assert_allclose(np.asarray(method.channel_weights) * sigma, 2.5 * spacing, rtol=1e-4)
 
 
+@pytest.mark.parametrize("roughness, expected", [(1.0, 0.005), (0.03, None), (0.0, 1.0)])
+def test_the_floor_of_omega_rises_on_smooth_surfaces(roughness, expected):
+    """ε · 0.72 spacing² by twice the variance across the surface; where Λ is given it stays."""
+    rng = np.random.default_rng(0)
+    points = np.pad(rng.random((2000, 2)), [(0, 0), (0, 1)])
+    spacing = np.median(np.linalg.norm(points[ref.nearest(points, points, 2)[:, 1]] - points, axis=1))
+    points[:, 2] = roughness * spacing * rng.normal(size=2000)
+    cloud = preprocess(PointCloud(points, rng.random(2000)), num_neighbors=20)
+    found = MultiChannelGICP().resolve(cloud, cloud).min_eigenvalue
+    # The plane that fits 20 noisy neighbours takes three degrees of freedom from their variance.
+    expected = expected or 1e-3 * 0.72 / (2 * roughness**2 * 17 / 20)
+    np.testing.assert_allclose(found, expected, rtol=0.05)
+    assert MultiChannelGICP(0.3).resolve(cloud, cloud).min_eigenvalue is None
+    assert MultiChannelGICP(min_eigenvalue=0.2).resolve(cloud, cloud).min_eigenvalue == np.float32(0.2)
+
+
 def test_noise_is_found_where_the_channel_is():
     """Each channel by the points that have it, and at their neighbours that do."""
     (_, target), (_, source) = noisy(0), noisy(1)
