@@ -64,6 +64,7 @@ def register_batch(
     rotation_tolerance: ArrayLike = ROTATION_TOLERANCE,
     robust: AbstractKernel | None = None,
     search: AbstractSearch | None = None,
+    hold_free_directions: bool = True,
     voxel_size: float | None = None,
     num_neighbors: int = 20,
     executor: Executor | None = None,
@@ -83,6 +84,7 @@ def register_batch(
         rotation_tolerance=rotation_tolerance,
         robust=robust,
         search=search,
+        hold_free_directions=hold_free_directions,
         voxel_size=voxel_size,
         num_neighbors=num_neighbors,
         executor=executor,
@@ -102,6 +104,7 @@ def register_as_completed(
     rotation_tolerance: ArrayLike = ROTATION_TOLERANCE,
     robust: AbstractKernel | None = None,
     search: AbstractSearch | None = None,
+    hold_free_directions: bool = True,
     voxel_size: float | None = None,
     num_neighbors: int = 20,
     executor: Executor | None = None,
@@ -122,6 +125,7 @@ def register_as_completed(
         search: how neighbours and matches are found; by default SciPy's k-d tree, one thread per pair. With
             `DenseSearch`, the default on an accelerator, many pairs are the lanes of one compiled program, which are
             spread over all local devices.
+        hold_free_directions: as in `register`.
         voxel_size, num_neighbors: as in `preprocess`, for raw clouds; the workers prepare them.
         executor: who does the work: any `concurrent.futures.Executor`, such as a `ProcessPoolExecutor` with the start
             method "spawn" or Dask's `Client.get_executor()`; by default threads, one per core. A pair whose worker
@@ -146,6 +150,7 @@ def register_as_completed(
             "translation_tolerance": translation_tolerance,
             "rotation_tolerance": rotation_tolerance,
             "robust": robust,
+            "hold_free_directions": hold_free_directions,
         },
         search=search,
         voxel_size=voxel_size,

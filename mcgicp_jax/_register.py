@@ -246,7 +246,7 @@ def pose_problem(
     translation_tolerance: ArrayLike,
     rotation_tolerance: ArrayLike,
     robust: AbstractKernel | None,
-    hold_free_directions: bool = True,
+    hold_free_directions: bool,
 ) -> Problem:
     """What the loop of `register` is about, for prepared clouds."""
     method = _checked(source, target, method)

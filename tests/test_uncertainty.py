@@ -128,7 +128,10 @@ def test_geometry_slides_on_a_wall_and_stays_where_it_started(flat):
 
 def test_without_the_hold_the_nearest_neighbours_pull(flat):
     source, target, _ = flat
-    result = mcg.register(source, target, mcg.GICP(), max_distance=0.3, hold_free_directions=False)
+    options = {"max_distance": 0.3, "hold_free_directions": False}
+    result = mcg.register(source, target, mcg.GICP(), **options)
+    (batched,) = mcg.register_batch([source], [target], mcg.GICP(), **options)
+    np.testing.assert_array_equal(batched.matrix, result.matrix)
     assert result.status in (mcg.Status.DEGENERATE, mcg.Status.MAX_ITERATIONS)
     centroid = result.directions.center
     assert np.linalg.norm((result.matrix[:3, :3] @ centroid + result.matrix[:3, 3] - centroid)[:2]) > 2e-3
