@@ -209,14 +209,15 @@ def floor_eigenvalues(symmetric: Float[Array, "3 N"], floor: Float[Array, ""]) -
 Offsets: TypeAlias = tuple[Float[Array, "k N"], Float[Array, "k N"], Float[Array, "k N"]]
 
 
-def by_blocks(function: Callable[[Int[Array, "n"], Int[Array, "n k"]], Tree], neighbors: Int[Array, "N k"]) -> Tree:
-    """What a function of rows and their neighbours makes of all rows; large clouds are gone through block by block.
+def by_blocks(
+    function: Callable[[Int[Array, "n"], Int[Array, "n k"]], Tree], rows: Int[Array, "N"], neighbors: Int[Array, "N k"]
+) -> Tree:
+    """What a function of rows and their neighbours makes of them; many are gone through block by block.
 
     Args:
-        function: of row numbers, and the neighbours of these rows; its arrays have the rows as their last dimension.
+        function: its arrays have the rows as their last dimension.
     """
-    num_points = neighbors.shape[0]
-    rows = jnp.arange(num_points)
+    num_points = rows.size
     if num_points <= _LARGEST_WHOLE:
         return function(rows, neighbors)
     num_blocks = -(-num_points // _BLOCK)
@@ -253,7 +254,7 @@ def local_covariance(points: Float[Array, "3 N"], neighbors: Int[Array, "N k"]) 
         offsets, present = gather(points, rows, neighbors)
         return weighted_covariance(offsets, present.astype(points.dtype))
 
-    return by_blocks(of_rows, neighbors)
+    return by_blocks(of_rows, jnp.arange(neighbors.shape[0]), neighbors)
 
 
 class LinearFit(NamedTuple):
@@ -400,7 +401,7 @@ def multichannel_covariance(
         alike = weighted_covariance(offsets, jnp.where(present, kernel(rows, neighbors), 0))
         return _multichannel(local, alike, epsilon, min_eigenvalue)
 
-    return by_blocks(of_rows, neighbors)
+    return by_blocks(of_rows, jnp.arange(neighbors.shape[0]), neighbors)
 
 
 def _multichannel(

@@ -68,7 +68,7 @@ def find_evidence(method: AbstractMethod, cloud: PointCloud) -> Evidence:
             reach=jnp.sqrt(jnp.max(sum(offset * offset for offset in offsets), axis=0)),
         )
 
-    return cov.by_blocks(of_rows, jnp.asarray(cloud.neighbors))
+    return cov.by_blocks(of_rows, jnp.arange(points.shape[1]), jnp.asarray(cloud.neighbors))
 
 
 Basis: TypeAlias = tuple[Float[Array, "3 N"], Float[Array, "3 N"]]

@@ -147,7 +147,9 @@ def color_icp(source: mcg.PointCloud, target: mcg.PointCloud) -> Any:
 def colored_icp(scales: tuple[int, ...]) -> Callable[..., np.ndarray]:
     def run(source: mcg.PointCloud, target: mcg.PointCloud, start: np.ndarray, voxel: float) -> np.ndarray:
         registration = open3d.pipelines.registration
-        clouds = [as_open3d(cloud.unpad()) for cloud in (source, target)]
+        clouds = [
+            as_open3d(cloud.unpad()) if isinstance(cloud, mcg.PointCloud) else cloud for cloud in (source, target)
+        ]
         for scale in scales:
             pair = [cloud.voxel_down_sample(scale * voxel) if scale > 1 else cloud for cloud in clouds]
             for cloud in pair:

@@ -128,6 +128,46 @@ def open3d(source: np.ndarray, target: np.ndarray, voxel: float | None, gate: fl
     return ready - begin, time.perf_counter() - ready, np.asarray(result.transformation)
 
 
+def colored() -> None:
+    """MC-GICP as it comes beside Open3D's colored ICP at one scale: six pairs of a flat table, from raw clouds."""
+    import open3d as o3d
+
+    from tests.benchmarks import accuracy
+
+    pairs, voxel = list(accuracy.table("_flat")), 0.01
+    theirs = accuracy.colored_icp((1,))
+
+    def run_ours(pair: accuracy.Pair) -> np.ndarray:
+        with concurrent.futures.ThreadPoolExecutor(2) as threads:
+            clouds = list(threads.map(lambda cloud: mcg.preprocess(cloud, voxel), (pair.source, pair.target)))
+        return mcg.register(*clouds, mcg.MultiChannelGICP()).matrix
+
+    def run_theirs(pair: accuracy.Pair) -> np.ndarray:
+        clouds = [accuracy.as_open3d(cloud).voxel_down_sample(voxel) for cloud in (pair.source, pair.target)]
+        return theirs(*clouds, np.eye(4), voxel)
+
+    ratios, times, errors = [], [], []
+    for turn in range(NUM_TURNS + 1):
+        for pair in pairs:
+            row = []
+            for run in (run_ours, run_theirs):
+                begin = time.perf_counter()
+                pose = run(pair)
+                row.append((time.perf_counter() - begin, mcg.metrics.pose_error(pose, pair.truth)[0]))
+            if turn:
+                (a, _), (b, _) = row
+                ratios.append(a / b)
+                times.append((a, b))
+                errors.append([error for _, error in row])
+    a, b = 1e3 * np.median(times, axis=0)
+    first, second = 1e3 * np.mean(errors, axis=0)
+    print(
+        f"\nflat table, whole: MC-GICP {a:.0f} ms, colored ICP of Open3D {o3d.__version__} at one scale {b:.0f} ms, ",
+        end="",
+    )
+    print(f"ratio {statistics.median(ratios):.2f}; mean errors {first:.1f} and {second:.1f} mm")
+
+
 def turns(chart: pathlib.Path | None, chosen: list[str]) -> None:
     libraries: dict[str, Callable[..., Stages]] = {"ours": ours, "small 1": small(1), "small 2": small(2)}
     if importlib.util.find_spec("open3d") is not None:
@@ -240,6 +280,8 @@ def main() -> None:
     arguments = parser.parse_args()
     print(f"{os.cpu_count()} cores, load {os.getloadavg()[0]:.1f} before")
     turns(arguments.chart, arguments.cases or list(CASES))
+    if importlib.util.find_spec("open3d") is not None and not arguments.cases:
+        colored()
     with tempfile.TemporaryDirectory() as folder:
         starts(pathlib.Path(folder))
     print(f"load {os.getloadavg()[0]:.1f} after")
