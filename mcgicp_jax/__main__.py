@@ -14,6 +14,7 @@ import tyro
 
 from mcgicp_jax._commands._batch import batch
 from mcgicp_jax._commands._odometry import odometry
+from mcgicp_jax._commands._options import VERSION
 from mcgicp_jax._commands._paper import paper
 from mcgicp_jax._commands._register import compare, demo, register
 
@@ -42,6 +43,10 @@ def _explanation(error: Exception) -> str:
 
 def main(args: Sequence[str] | None = None) -> int:
     """Returns the exit code: 0, 1 if a registration did not converge, 2 if the input was wrong."""
+    args = sys.argv[1:] if args is None else args
+    if list(args) == ["--version"]:
+        print(f"mcgicp {VERSION}")
+        return 0
     _keep_compiled_programs()
     commands: dict[str, Callable[..., int]] = {
         "demo": demo,
@@ -57,7 +62,7 @@ def main(args: Sequence[str] | None = None) -> int:
             return tyro.extras.subcommand_cli_from_dict(
                 commands,
                 prog="mcgicp",
-                description="Registration of point clouds with channels.",
+                description="Registration of point clouds with channels. --version prints the version.",
                 args=args,
                 config=(tyro.conf.OmitArgPrefixes, tyro.conf.DisallowNone),
             )

@@ -15,6 +15,7 @@ import re
 import struct
 import zipfile
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any, BinaryIO, TypeAlias
 
 import numpy as np
@@ -427,6 +428,14 @@ def _write_text(file: BinaryIO, cloud: PointCloud, delimiter: str, mark: str) ->
     # Widened first, since "%s" prints the shortest number that gives the same one back in its own precision.
     table = np.column_stack([cloud.points, cloud.channels]).astype(np.float64)
     np.savetxt(file, table, fmt="%s", delimiter=delimiter, header=delimiter.join(names), comments=mark)
+
+
+def by_suffix(table: dict[str, Callable[..., Any]], path: Path) -> Callable[..., Any]:
+    """The reader or writer of a file; raises `ValueError` for a suffix that is in no table."""
+    try:
+        return table[path.suffix.lower()]
+    except KeyError:
+        raise ValueError(f"{path}: unknown suffix {path.suffix!r}; there are {', '.join(table)}") from None
 
 
 READERS: dict[str, Callable[[BinaryIO, int], PointCloud]] = {

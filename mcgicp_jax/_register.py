@@ -348,7 +348,8 @@ def _checked(source: PointCloud, target: PointCloud, method: AbstractMethod) -> 
             warnings.warn("the clouds have no channels: MultiChannelGICP is GICP then", UserWarning, stacklevel=4)
     if source.points.dtype != target.points.dtype:
         raise ValueError(
-            f"points: expected one precision in both clouds, got {source.points.dtype} and {target.points.dtype}"
+            f"points: expected one precision in both clouds, got {source.points.dtype} in the source and "
+            f"{target.points.dtype} in the target; make them alike before preprocess, as by points.astype(np.float32)"
         )
     return method.resolve(source, target)
 

@@ -18,23 +18,27 @@ from mcgicp_jax._uncertainty import Directions
 
 
 class Status(enum.IntEnum):
-    """How a registration ended. Only CONVERGED is success."""
+    """How a registration ended. Only CONVERGED is success.
+
+    Attributes:
+        CONVERGED: the last update moved the pose by less than both tolerances, and the pairs hold every direction.
+        MAX_ITERATIONS: the pose was still moving when the iterations ran out.
+        TOO_FEW_CORRESPONDENCES: fewer than four source points have a match within `max_distance`: no overlap, or a
+            start too far away.
+        DEGENERATE: the pose came to rest, but nothing holds at least one direction: see
+            `Registration.free_directions`. There it is where the start had it, unless `hold_free_directions` was off.
+        NON_FINITE: the numbers overflowed or became NaN.
+        INVALID_INPUT: the pair is one that `register` raises an error for; in a batch only. Its pose is NaN.
+        LOST: the worker that had the pair died or failed, and another one too; in a batch only. Its pose is NaN.
+    """
 
     CONVERGED = 0
-    """The last update moved the pose by less than both tolerances, and the pairs hold every direction."""
     MAX_ITERATIONS = 1
-    """The pose was still moving when the iterations ran out."""
     TOO_FEW_CORRESPONDENCES = 2
-    """Fewer than four source points have a match within `max_distance`: no overlap, or a start too far away."""
     DEGENERATE = 3
-    """The pose came to rest, but nothing holds at least one direction: see `Registration.free_directions`. There it is
-    where the start had it, unless `hold_free_directions` was off."""
     NON_FINITE = 4
-    """The numbers overflowed or became NaN."""
     INVALID_INPUT = 5
-    """The pair is one that `register` raises an error for; in a batch only. Its pose is NaN."""
     LOST = 6
-    """The worker that had the pair died or failed, and another one too; in a batch only. Its pose is NaN."""
 
 
 class Registration(eqx.Module):

@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import os
 import uuid
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Float
 
 from mcgicp_jax._cloud import PointCloud
-from mcgicp_jax._formats import READERS, WRITERS
+from mcgicp_jax._formats import READERS, WRITERS, by_suffix
 from mcgicp_jax._pose import pose_matrix
 
 
@@ -49,7 +49,7 @@ def read(path: str | os.PathLike[str]) -> PointCloud:
         ValueError: if the file is no cloud, is damaged, or has no points; the message starts with the path.
     """
     path = Path(path)
-    reader = _by_suffix(READERS, path)
+    reader = by_suffix(READERS, path)
     with open(path, "rb") as file:
         try:
             size = os.fstat(file.fileno()).st_size
@@ -67,7 +67,7 @@ def read(path: str | os.PathLike[str]) -> PointCloud:
             # The libraries raise whatever comes to them, lazrs even a panic of Rust's, which is no Exception.
             if not isinstance(error, Exception) and type(error).__name__ != "PanicException":
                 raise
-            reason = str(error) or type(error).__name__
+            reason = "it is no text" if isinstance(error, UnicodeError) else str(error) or type(error).__name__
             raise ValueError(f"{path}: cannot be read as {path.suffix.lower()}: {reason}") from error
     return cloud
 
@@ -91,7 +91,7 @@ def write(path: str | os.PathLike[str], cloud: PointCloud) -> None:
         ValueError: if the cloud is empty or a batch, or has what the format cannot hold.
     """
     path = Path(path)
-    writer = _by_suffix(WRITERS, path)
+    writer = by_suffix(WRITERS, path)
     if cloud.points.ndim != 2:
         raise ValueError(f"cloud: expected a single cloud, got points of shape {tuple(cloud.points.shape)}")
     if len(cloud) == 0:
@@ -123,7 +123,8 @@ def read_poses(path: str | os.PathLike[str]) -> Float[np.ndarray, "N 4 4"]:
             lines = [line for line in file if line.split("#")[0].strip()]
             rows = np.loadtxt(lines, ndmin=2) if lines else np.empty((0, 0))
         except ValueError as error:
-            raise ValueError(f"{path}: cannot be read as poses: {error}") from error
+            reason = "it is no text" if isinstance(error, UnicodeError) else error
+            raise ValueError(f"{path}: cannot be read as poses: {reason}") from error
     poses = np.tile(np.eye(4), (len(rows), 1, 1))
     if rows.shape == (4, 4):
         poses = rows[None]
@@ -188,11 +189,13 @@ def _quaternions(rotations: Float[np.ndarray, "N 3 3"]) -> Float[np.ndarray, "N 
     return columns / np.take_along_axis(lengths, longest, axis=1) * np.where(columns[:, 3:] < 0, -1, 1)
 
 
-def _by_suffix(table: dict[str, Callable[..., Any]], path: Path) -> Callable[..., Any]:
+@contextlib.contextmanager
+def _named(path: Path) -> Iterator[None]:
+    """Errors name the file as the user knows it."""
     try:
-        return table[path.suffix.lower()]
-    except KeyError:
-        raise ValueError(f"{path}: unknown suffix {path.suffix!r}; there are {', '.join(table)}") from None
+        yield
+    except OSError as error:
+        raise type(error)(error.errno, error.strerror, str(path)) from None
 
 
 @contextlib.contextmanager
@@ -200,13 +203,11 @@ def _replacing(path: Path) -> Iterator[BinaryIO]:
     """A file that takes the name `path` once it is complete."""
     temporary = path.with_name(f".{uuid.uuid4().hex}.tmp")
     try:
-        try:
+        with _named(path):
             file = open(temporary, "x+b")  # noqa: SIM115
-        except OSError as error:
-            # Named as the user knows it.
-            raise type(error)(error.errno, error.strerror, str(path)) from None
         with file:
             yield file
-        os.replace(temporary, path)
+        with _named(path):
+            os.replace(temporary, path)
     finally:
         temporary.unlink(missing_ok=True)

@@ -604,6 +604,14 @@ def _rgb(cloud: PointCloud) -> Points | None:
     return np.clip(channels / full_scale, 0, 1)
 
 
+def check_picture(path: str | os.PathLike[str]) -> None:
+    """Raise `ValueError` for a file that no picture can be saved in, by its ending."""
+    kinds = _module("matplotlib.figure").Figure().canvas.get_supported_filetypes()
+    suffix = os.path.splitext(path)[1]
+    if suffix.lower().removeprefix(".") not in kinds:
+        raise ValueError(f"{os.fspath(path)}: unknown suffix {suffix!r}; there are .{', .'.join(kinds)}")
+
+
 def _module(name: str) -> Any:
     try:
         return importlib.import_module(name)

@@ -226,15 +226,25 @@ def broken(folder):
         ([good, good, "--max-iterations", "0"], "max_iterations: expected"),
         ([good, good, "--aligned", str(folder / "out.doc")], "unknown suffix '.doc'"),
         ([good, good, "--output", str(folder / "no" / "pose.txt")], "No such file or directory"),
+        ([good, good, "--output", str(folder)], f"{folder}: Is a directory"),
+        ([good, good, "--plot", str(folder / "picture.doc")], "picture.doc: unknown suffix '.doc'; there are ."),
+        ([good, good, "--init", good], "good.npz: cannot be read as poses: it is no text"),
     ]
 
 
 def test_wrong_input_gets_one_line(tmp_path, capsys):
     for args, message in broken(tmp_path):
         assert main(["register", *args, "--method", "gicp"]) == 2, args
-        errors = capsys.readouterr().err
+        text, errors = capsys.readouterr()
         assert errors.startswith("mcgicp: ") and errors.count("\n") == 1, errors
         assert message in errors
+        # It is found before any work is done.
+        assert text == ""
+
+
+def test_the_version(capsys):
+    assert main(["--version"]) == 0
+    assert capsys.readouterr().out == f"mcgicp {mcg.__version__}\n"
 
 
 def test_a_missing_package_is_named(files, monkeypatch, capsys):

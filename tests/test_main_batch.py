@@ -13,6 +13,7 @@ import pytest
 import mcgicp_jax as mcg
 from mcgicp_jax import io
 from mcgicp_jax.__main__ import main
+from mcgicp_jax._commands._table import POSE
 from mcgicp_jax.metrics import pose_error
 from tests.scenes import motion, room_corner
 
@@ -139,10 +140,15 @@ def test_pairs_that_fail_are_told_apart(folder, tmp_path, capsys):
         ("source,target\nx.ply,\n", "line 2"),
         ("source,target\nx.ply,y.ply\nx.ply,y.ply\n", "once"),
         ("source,target\nx.ply,y.ply\n", "x.ply"),
+        (
+            ",".join(["source,target", *POSE]) + "\nx.ply,y.ply" + 12 * ",a",
+            "line 2: expected numbers in m00",
+        ),
+        ("\x80\xff", "pairs.csv: expected a CSV file or a folder; it is no text"),
     ],
 )
 def test_a_list_that_makes_no_sense(tmp_path, capsys, content, message):
-    (tmp_path / "pairs.csv").write_text(content)
+    (tmp_path / "pairs.csv").write_bytes(content.encode("latin-1"))
     assert main(["batch", str(tmp_path / "pairs.csv"), "--output", str(tmp_path / "results.csv"), *OPTIONS]) == 2
     errors = capsys.readouterr().err
     assert message in errors and errors.count("\n") == 1

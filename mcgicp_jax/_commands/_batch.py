@@ -23,7 +23,16 @@ from tqdm import tqdm
 import mcgicp_jax as mcg
 from mcgicp_jax import io
 from mcgicp_jax._batch import PairWarning
-from mcgicp_jax._commands._options import METHODS, MethodName, Options, listed, scales, status_of, with_channels
+from mcgicp_jax._commands._options import (
+    METHODS,
+    MethodName,
+    Options,
+    check_outputs,
+    listed,
+    scales,
+    status_of,
+    with_channels,
+)
 from mcgicp_jax._commands._table import COLUMNS, POSE, Row, Table, pose_of
 from mcgicp_jax._methods import AbstractMethod
 
@@ -81,6 +90,9 @@ def batch(
         num_neighbors: Neighbours that the covariance of a point is computed from.
         max_iterations: Of finding matches and updating the pose.
     """
+    options = Options(voxel_size, max_distance, num_neighbors, max_iterations)
+    options.check()
+    check_outputs(output)
     everything = _pairs_of_folder(pairs, glob) if pairs.is_dir() else _pairs_of_table(pairs)
     table = Table(output)
     rows = {(row["source"], row["target"]): row for row in table.read()}
@@ -89,7 +101,6 @@ def batch(
     print(f"pairs:     {len(everything):,}" + (f", of which {finished:,} are in {output}" if finished else ""))
     interrupted = False
     if missing:
-        options = Options(voxel_size=voxel_size, max_distance=max_distance, num_neighbors=num_neighbors)
         settings = _settings(missing, METHODS[method], channels, options)
         begin = time.perf_counter()
         with (
@@ -121,7 +132,11 @@ def batch(
 
 def _pairs_of_table(path: Path) -> list[Pair]:
     with open(path, newline="", encoding="utf-8") as file:
-        reader = csv.DictReader(file)
+        try:
+            lines = file.readlines()
+        except UnicodeError as error:
+            raise ValueError(f"{path}: expected a CSV file or a folder; it is no text") from error
+        reader = csv.DictReader(lines)
         columns = reader.fieldnames or []
         if not {"source", "target"} <= set(columns):
             raise ValueError(f"{path}: expected the columns source and target, got {listed(columns)}")
@@ -130,7 +145,12 @@ def _pairs_of_table(path: Path) -> list[Pair]:
         for row in reader:
             if not row["source"] or not row["target"]:
                 raise ValueError(f"{path}: line {reader.line_num}: expected two files, got {row}")
-            start = pose_of(row) if with_start else None
+            try:
+                start = pose_of(row) if with_start else None
+            except (TypeError, ValueError) as error:
+                raise ValueError(
+                    f"{path}: line {reader.line_num}: expected numbers in m00 ... m23, got {row}"
+                ) from error
             pairs.append(Pair(path.parent, row["source"], row["target"], start))
     return _checked(path, pairs)
 

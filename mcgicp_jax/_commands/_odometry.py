@@ -16,7 +16,16 @@ from tqdm import tqdm
 
 import mcgicp_jax as mcg
 from mcgicp_jax import datasets, io, metrics, plot
-from mcgicp_jax._commands._options import METHODS, File, MethodName, listed, round_voxel_size, with_channels
+from mcgicp_jax._commands._options import (
+    METHODS,
+    File,
+    MethodName,
+    Options,
+    check_outputs,
+    listed,
+    round_voxel_size,
+    with_channels,
+)
 from mcgicp_jax._methods import AbstractMethod
 
 DatasetName: TypeAlias = Literal["kitti", "ford", "tum", "7-scenes", "street", "corridor", "box-room", "poster-wall"]
@@ -77,6 +86,8 @@ def odometry(
             as would leave at most half of the first cloud.
         plot: Picture to draw of the way from above, such as way.png.
     """
+    check_outputs(output, cloud=map, picture=plot)
+    Options(voxel_size, max_distance).check()
     frames, usual_voxel, usual_distance = _open(dataset, path, num_frames)
     voxel = usual_voxel if voxel_size == "auto" else None if voxel_size == "off" else voxel_size
     distance = usual_distance if max_distance == "auto" else max_distance

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import bisect
+import errno
+import os
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,13 +14,18 @@ import numpy as np
 import tyro
 
 import mcgicp_jax as mcg
+from mcgicp_jax import plot
+from mcgicp_jax._formats import READERS, WRITERS, by_suffix
 from mcgicp_jax._methods import AbstractMethod
+from mcgicp_jax._preprocess import check_preprocessing
+from mcgicp_jax._register import check_settings
 
 MethodName: TypeAlias = Literal["mc-gicp", "gicp", "color-icp", "point-to-plane", "point-to-point"]
 File: TypeAlias = Annotated[Path | None, tyro.conf.arg(metavar="FILE", help_behavior_hint="")]
 Numbers: TypeAlias = Annotated[tuple[float, ...], tyro.conf.arg(help_behavior_hint="(default: from the data)")]
 Epsilon: TypeAlias = Annotated[float | None, tyro.conf.arg(metavar="FLOAT", help_behavior_hint="(default: 0.001)")]
 
+VERSION = mcg.__version__
 METHODS: dict[MethodName, type[AbstractMethod]] = {
     "mc-gicp": mcg.MultiChannelGICP,
     "gicp": mcg.GICP,
@@ -70,6 +77,14 @@ class Options:
     epsilon: Epsilon = None
     plot: File = None
 
+    def check(self) -> None:
+        """Raise `ValueError` or `OSError` for what no clouds would fit, before any is read."""
+        check_preprocessing(None if isinstance(self.voxel_size, str) else self.voxel_size, self.num_neighbors)
+        distance = None if self.max_distance == "auto" else self.max_distance
+        method = mcg.MultiChannelGICP(**self.numbers())
+        check_settings(method, distance, self.max_iterations, translation_tolerance=0, rotation_tolerance=0)
+        check_outputs(picture=self.plot)
+
     def numbers(self) -> dict[str, Any]:
         """The methods' numbers that were given."""
         given: dict[str, Any] = {} if self.epsilon is None else {"epsilon": self.epsilon}
@@ -77,6 +92,26 @@ class Options:
             if values := getattr(self, name):
                 given[name] = values[0] if len(values) == 1 else values
         return given
+
+
+def check_outputs(*files: Path | None, cloud: Path | None = None, picture: Path | None = None) -> None:
+    """Raise `ValueError` or `OSError` for files that could not be written in the end, before the work is done."""
+    for path in (*files, cloud, picture):
+        if path is not None and path.is_dir():
+            raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), str(path))
+        if path is not None and not path.parent.is_dir():
+            raise FileNotFoundError(errno.ENOENT, f"{os.strerror(errno.ENOENT)}: {path.parent}", str(path))
+    if cloud is not None:
+        by_suffix(WRITERS, cloud)
+    if picture is not None:
+        plot.check_picture(picture)
+
+
+def check_inputs(*clouds: Path) -> None:
+    """The same for clouds that could not be read, before the first of them is."""
+    for path in clouds:
+        by_suffix(READERS, path)
+        path.stat()
 
 
 def scales(clouds: Sequence[mcg.PointCloud], options: Options) -> tuple[float | None, float]:

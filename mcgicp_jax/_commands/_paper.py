@@ -91,6 +91,9 @@ def paper(
     """
     if num_frames < 3:
         raise ValueError(f"num_frames: expected at least 3, got {num_frames}")
+    if kitti is not None:
+        # Before minutes of work, that of the street.
+        _known(datasets.kitti(kitti)[0])
     output.mkdir(parents=True, exist_ok=True)
     street = datasets.street(num_frames, points_per_frame=points_per_frame)
     parts = [

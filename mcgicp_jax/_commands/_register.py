@@ -20,6 +20,8 @@ from mcgicp_jax._commands._options import (
     File,
     MethodName,
     Options,
+    check_inputs,
+    check_outputs,
     described,
     listed,
     scales,
@@ -38,6 +40,8 @@ class Pair:
     """Two clouds with their common channels, ready to register."""
 
     def __init__(self, source: Path, target: Path, options: Options):
+        options.check()
+        check_inputs(source, target)
         self.options = options
         self.start = np.eye(4) if options.init is None else _read_pose(options.init)
         self.whole = io.read(source), io.read(target)
@@ -55,7 +59,9 @@ class Pair:
         voxels = "all kept" if voxel_size is None else f"voxels of {voxel_size:g} m"
         print(f"points:    source {counts[0]}, target {counts[1]} ({voxels})")
         print(f"pairs:     up to {self.max_distance:g} m apart")
-        print(f"channels:  {listed(self.channels)}" + (f" ({self.difference})" if names[0] != names[1] else ""))
+        # Where none are in common, that is an error or of no concern.
+        difference = f" ({self.difference})" if self.channels and names[0] != names[1] else ""
+        print(f"channels:  {listed(self.channels)}{difference}")
 
     def method(self, name: MethodName) -> AbstractMethod:
         """The method, with its numbers from the options or else from the data."""
@@ -116,6 +122,7 @@ def register(
     unknown = shared.numbers().keys() - METHODS[method].__dataclass_fields__.keys()
     if unknown:
         raise ValueError(f"{method} has no {' and no '.join(sorted(unknown))}")
+    check_outputs(output, cloud=aligned)
     pair = Pair(source, target, shared)
     chosen = pair.method(method)
     print(f"method:    {method}{described(chosen)}")
@@ -181,8 +188,8 @@ def demo(output: Path = Path("mcgicp_demo")) -> int:
 
 
 def _compare(source: Path, target: Path, options: Options, truth: Path | None) -> dict[MethodName, mcg.Registration]:
-    pair = Pair(source, target, options)
     true_pose = None if truth is None else _read_pose(truth)
+    pair = Pair(source, target, options)
     results: dict[MethodName, mcg.Registration] = {}
     measures = "inliers      rmse, m" if true_pose is None else "error, mm   error, deg"
     print(f"\n{'method':15}  {measures:>22}  iterations  time, ms  status")
