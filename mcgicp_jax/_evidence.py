@@ -28,6 +28,7 @@ class Evidence(eqx.Module):
     Attributes:
         geometry: (6, N), by the normal: n nᵀ, less what the noise of normals makes of a flat surface.
         channels: (6, N), by the gradient of the channels within the surface; None where a method uses none.
+        noise: (N,) variance of all descriptors about their gradients, metres²; 0 where a method uses none.
         normal: (3, N) unit vectors.
         roughness: (N,) square of a neighbour's height over the point, across the surface, halved: metres².
         reach: (N,) metres, the distance to the farthest neighbour.
@@ -35,6 +36,7 @@ class Evidence(eqx.Module):
 
     geometry: Float[Array, "6 N"]
     channels: Float[Array, "6 N"] | None
+    noise: Float[Array, "N"]
     normal: Float[Array, "3 N"]
     roughness: Float[Array, "N"]
     reach: Float[Array, "N"]
@@ -57,12 +59,13 @@ def find_evidence(method: AbstractMethod, cloud: PointCloud) -> Evidence:
         # The very nearest lie near because their heights are alike; far ones may be higher because the surface bends.
         rank = min(_ROUGHNESS_RANK, offsets[0].shape[0] - 1)
         smallest = jnp.maximum(jnp.sum(normal * cov.multiply(local, normal), axis=0), 0)
-        channels = None
+        channels, noise = None, jnp.zeros(rows.size, points.dtype)
         if descriptors is not None:
-            channels = _channels(descriptors, channel_valid, offsets, present, neighbors, basis)
+            channels, noise = _channels(descriptors, channel_valid, offsets, present, neighbors, basis)
         return Evidence(
             geometry=_geometry(local, normal, smallest, basis, count),
             channels=channels,
+            noise=noise,
             normal=normal,
             roughness=0.5 * sum(offset[rank] * axis for offset, axis in zip(offsets, normal, strict=True)) ** 2,
             reach=jnp.sqrt(jnp.max(sum(offset * offset for offset in offsets), axis=0)),
@@ -113,21 +116,24 @@ def _channels(
     present: Bool[Array, "k N"],
     neighbors: Int[Array, "N k"],
     basis: Basis,
-) -> Float[Array, "6 N"]:
+) -> tuple[Float[Array, "6 N"], Float[Array, "N"]]:
     """What a match in position and α · channel gives way by when its point moves within the surface.
 
     Where α · channel has the gradients g, the nearest target point to one that has moved by x lies at (I + A)⁻¹ x, with
-    A = Σ g gᵀ: the share A (I + A)⁻¹ of the motion is felt. The variance of a fitted gradient is taken off A.
+    A = Σ g gᵀ: the share A (I + A)⁻¹ of the motion is felt. The variance of a fitted gradient is taken off A. The
+    second answer is the variance of the descriptors about their gradients.
     """
     x, y = (sum(offset * b for offset, b in zip(offsets, axis, strict=True)) for axis in basis)
     near = jnp.where(present, neighbors.T, 0)
     total = jnp.zeros((3, neighbors.shape[0]), descriptors.dtype)
-    noise = total
+    uncertain = total
+    noise = total[0]
     for i, descriptor in enumerate(descriptors.T):
         known = present if channel_valid is None else present & channel_valid[:, i][near]
         fit = cov.fit_linear(x, y, descriptor[near], known.astype(x.dtype))
         gx, gy = fit.gradient
         told = fit.weight > 3
         total = total + jnp.where(told, jnp.stack([gx * gx, gx * gy, gy * gy]), 0)
-        noise = noise + jnp.where(told, fit.residual * fit.inverse, 0)
-    return cov.embed((total - noise) / (1 + total[0] + total[2]), *basis)
+        uncertain = uncertain + jnp.where(told, fit.residual * fit.inverse, 0)
+        noise = noise + jnp.where(told, fit.residual, 0)
+    return cov.embed((total - uncertain) / (1 + total[0] + total[2]), *basis), noise

@@ -166,6 +166,10 @@ def estimate_covariance(
     if evidence is not None and matches.indices.ndim == 1:
         geometry, channels = pair_evidence(evidence, rotation, matches.indices)
         geometry = _share_across(pairs, evidence, rotation, matches.indices) * geometry
+        if channels is not None:
+            # K = A (I + A)⁻¹ with an A that is smaller by the ratio.
+            ratio, trace = _channel_ratio(pairs, model, evidence), channels[0] + channels[3] + channels[5]
+            channels = ratio * channels / (1 - (1 - ratio) * jnp.clip(trace, 0, 1))
         share = geometry if channels is None else geometry + channels
         stiffness = _symmetric_product(stiffness, share)
         fake = force - pairs.weight * cov.multiply(pairs.information, cov.multiply(share, pairs.residual))
@@ -214,6 +218,28 @@ def _share_across(
     seen = jnp.where(valid, jnp.sum(across * pairs.residual[:, some], axis=0) ** 2, jnp.nan)
     expected = jnp.where(valid, source.roughness[some] + target.roughness[indices[some]], jnp.nan)
     ratio = (jnp.nanmedian(seen) / 0.455) / (jnp.nanmedian(expected) / 0.693)
+    return jnp.where(jnp.isfinite(ratio), jnp.clip(ratio, _LEAST_SHARE, 1), 1)
+
+
+def _channel_ratio(pairs: Pairs, model: Model, evidence: tuple[Evidence, Evidence]) -> Float[Array, ""]:
+    """By how much less channels tell of a motion than their gradients let expect, where they are noisy.
+
+    As in `_share_across`: among neighbours with noisy channels, the nearest is one whose noise is like the point's.
+    """
+    source, target, matches, *_ = model
+    some = slice(None, None, 1 + pairs.valid.size // _MEDIAN_OF)
+    indices = matches.indices[some]
+    complete = pairs.valid[some]
+    for surface, rows in ((source, some), (target, indices)):
+        if surface.absence is not None:
+            complete = complete & jnp.all(surface.absence[rows] == 0, axis=1)
+    difference = source.descriptors[some] - target.descriptors[indices]
+    # Pair by pair, since edges are noisier than what lies between them.
+    expected = jnp.where(complete, evidence[0].noise[some] + evidence[1].noise[indices], jnp.nan)
+    seen = jnp.sum(difference * difference, axis=1) / jnp.where(expected > 0, expected, jnp.nan)
+    # The median of a sum of C squares of normal variates, divided by C (Wilson & Hilferty 1931).
+    median = (1 - 2 / (9 * difference.shape[1])) ** 3
+    ratio = jnp.nanmedian(seen) / median
     return jnp.where(jnp.isfinite(ratio), jnp.clip(ratio, _LEAST_SHARE, 1), 1)
 
 
