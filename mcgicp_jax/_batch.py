@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import collections
 import itertools
-import os
 import warnings
 from collections.abc import Callable, Generator, Iterable, Iterator
 from concurrent.futures import (
@@ -44,6 +43,7 @@ from mcgicp_jax._register import (
 )
 from mcgicp_jax._result import Registration, Status
 from mcgicp_jax._search import AbstractSearch
+from mcgicp_jax._threads import num_cores
 
 Cloud: TypeAlias = "PointCloud | Values | Callable[[], PointCloud | Values]"
 
@@ -287,7 +287,7 @@ def _ahead(executor: Executor, function: Callable[[_Pair], Any], pairs: Iterable
 def _gather(
     job: _Job, pairs: Iterator[_Pair], executor: Executor | None
 ) -> Generator[tuple[int, Registration], None, None]:
-    num_workers = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    num_workers = num_cores()
     if executor is None and isinstance(job.chosen_search(), DenseSearch):
         yield from map(_report, job.register_all(pairs, num_workers))
     elif executor is None:

@@ -22,10 +22,13 @@ from jaxtyping import Array, Bool, Float, Int
 
 from mcgicp_jax._pose import rotation_from_quaternion
 from mcgicp_jax._search import AbstractIndex, AbstractSearch, Rows
+from mcgicp_jax._threads import num_cores, side_by_side
 
 # How many candidates are looked at to break a tie by row number: a multiple of those asked for, and at least so many.
 _TIE_CANDIDATES = 8
 _LEAST_TIE_CANDIDATES = 64
+# Queries that are worth a thread of their own.
+_LEAST_PART = 500
 # A tree of more points falls out of a processor's caches, and is searched faster by queries that lie side by side.
 _LARGEST_UNORDERED = 50_000
 
@@ -310,7 +313,7 @@ def _nearest(
     k = min(k, tree.n)
     asked = min(k + 1, tree.n)
     most = min(max(_TIE_CANDIDATES * (k + 1), _LEAST_TIE_CANDIDATES), tree.n)
-    distances, rows = tree.query(queries, np.arange(1, asked + 1), workers=workers, distance_upper_bound=bound)
+    distances, rows = _query(tree, queries, asked, workers, bound)
     nearest = rows[:, :k].astype(np.int32)
     # A part in a million covers rounding. A single row has no second, and infinity less infinity no meaning.
     second = np.minimum(distances[:, min(1, asked - 1)], bound)
@@ -327,8 +330,18 @@ def _nearest(
             break
         asked = min(2 * asked, most)
         if tied.size:
-            wider = tree.query(queries[tied], np.arange(1, asked + 1), workers=workers, distance_upper_bound=bound)
+            wider = _query(tree, queries[tied], asked, workers, bound)
             distances = np.full((len(queries), asked), np.inf)
             rows = np.full((len(queries), asked), tree.n)
             distances[tied], rows[tied] = wider
     return nearest, slack
+
+
+def _query(
+    tree: scipy.spatial.cKDTree, queries: Float[np.ndarray, "N D"], k: int, workers: int, bound: float
+) -> tuple[Float[np.ndarray, "N k"], Int[np.ndarray, "N k"]]:
+    ask = partial(tree.query, k=np.arange(1, k + 1), distance_upper_bound=bound)
+    most = num_cores() if workers == -1 else workers
+    parts = np.array_split(queries, max(1, min(most, len(queries) // _LEAST_PART)))
+    distances, rows = zip(*side_by_side([partial(ask, part) for part in parts]), strict=True)
+    return np.concatenate(distances), np.concatenate(rows)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Sequence
-from concurrent.futures import ThreadPoolExecutor
 from typing import Any, TypeAlias
 
 import equinox as eqx
@@ -37,6 +36,7 @@ from mcgicp_jax._pose import Pose, is_concrete, pose_matrix, se3_from_matrix
 from mcgicp_jax._preprocess import preprocess
 from mcgicp_jax._result import Registration, pose_in_user_frame
 from mcgicp_jax._search import AbstractSearch, Correspondences
+from mcgicp_jax._threads import side_by_side
 
 # Metres; or coarse and fine.
 Distance: TypeAlias = ArrayLike | tuple[ArrayLike, ArrayLike]
@@ -279,10 +279,11 @@ def _look_at_both(
         with jax.enable_x64(x64), jax.default_device(device):
             return jax.block_until_ready(_look(method, source))
 
-    with ThreadPoolExecutor(1) as thread:
-        seen = thread.submit(look_at_source)
-        target_seen = jax.block_until_ready(_look(method, target))
-        return seen.result(), target_seen
+    def look_at_target() -> tuple[Surface, Evidence]:
+        return jax.block_until_ready(_look(method, target))
+
+    seen_target, seen_source = side_by_side([look_at_target, look_at_source])
+    return seen_source, seen_target
 
 
 @jax.jit

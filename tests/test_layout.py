@@ -11,6 +11,7 @@ ORDER = [
         "_pose",
         "_cloud",
         "_search",
+        "_threads",
         "_kdtree",
         "_dense",
         "_preprocess",
