@@ -20,8 +20,6 @@ from mcgicp_jax._search import Correspondences, Rows
 
 # Shares of the values below which gain and offset are read off.
 _QUANTILES = tuple(share / 20 for share in range(1, 20))
-# Rows that a median is taken of, at most.
-_SAMPLE = 4096
 # Fewer differences than this tell no variance.
 _MIN_DIFFERENCES = 10
 
@@ -113,8 +111,8 @@ def with_channels_matched(source: PointCloud, target: PointCloud, matches: Corre
     """The source, each channel scaled and shifted so that its values are distributed like the target's.
 
     By the quantiles from 5 to 95 %: robust against what only one of the clouds sees, as long as that is little; with
-    matches, by the matched points alone. Not pair by pair: noise, and pairs across edges,
-    would make the gain too small. Gain and offset are constants to autodiff.
+    matches, by the matched points alone. Not pair by pair: noise, and pairs across edges, would make the gain too
+    small. Gain and offset are constants to autodiff.
     """
     source_values, target_values = jax.lax.stop_gradient((_known_values(source), _known_values(target)))
     if matches is not None:
@@ -160,24 +158,20 @@ def channel_noise(
     """σ per channel, which channels are constant (theirs is 1), and the variance of points across the surface, λ₀."""
     residuals, values, across = [], [], []
     for cloud in (source, target):
+        valid = jnp.asarray(cloud.valid)
         # Where points lack channels, few may have one.
-        some = _sample(cloud) if cloud.channel_valid is None else slice(None)
-        residual, variance = _fit_residuals(cloud, jnp.arange(cloud.points.shape[0])[some])
+        rows, counts = (jnp.arange(valid.size), valid) if cloud.channel_valid is not None else cov.some_rows(valid)
+        residual, variance = _fit_residuals(cloud, rows)
         known = _known_values(cloud)
-        residuals.append(jnp.where(jnp.isnan(known[some]), jnp.nan, residual))
+        residuals.append(jnp.where(counts[:, None] & ~jnp.isnan(known[rows]), residual, jnp.nan))
         values.append(known)
-        across.append(jnp.where(jnp.asarray(cloud.valid)[some], variance, jnp.nan))
+        across.append(jnp.where(counts, variance, jnp.nan))
     sigma = jnp.nanmedian(jnp.concatenate(residuals), axis=0)
     everything = jnp.concatenate(values)
     spread = jnp.nanstd(everything, axis=0)
     constant = ~(spread > 1e3 * jnp.finfo(spread.dtype).eps * jnp.nanmax(jnp.abs(everything), axis=0, initial=0))
     # Rendered channels have no noise; a thousandth of their spread keeps Λ and α finite.
     return jnp.where(constant, 1, jnp.fmax(sigma, 1e-3 * spread)), constant, jnp.nanmedian(jnp.concatenate(across))
-
-
-def _sample(cloud: PointCloud) -> slice:
-    """Rows to take a median of: some thousands tell it as well as all, and far sooner."""
-    return slice(None, None, 1 + cloud.points.shape[0] // _SAMPLE)
 
 
 def _fit_residuals(cloud: PointCloud, rows: Int[Array, "n"]) -> tuple[Float[Array, "n C"], Float[Array, "n"]]:
@@ -209,11 +203,11 @@ def point_spacing(cloud: PointCloud) -> Float[Array, ""]:
 
     Some files hold points twice, and some scanners report each beam without an echo as a point at the origin.
     """
-    some = _sample(cloud)
-    neighbors = neighbors_of(cloud)[some]
-    present = jnp.asarray(cloud.valid)[some, None] & (neighbors >= 0)
+    rows, counts = cov.some_rows(jnp.asarray(cloud.valid))
+    neighbors = neighbors_of(cloud)[rows]
+    present = counts[:, None] & (neighbors >= 0)
     square = jnp.zeros(neighbors.shape, cloud.points.dtype)
     for coordinate in jnp.asarray(cloud.points).T:
-        square = square + (coordinate[jnp.maximum(neighbors, 0)] - coordinate[some, None]) ** 2
+        square = square + (coordinate[jnp.maximum(neighbors, 0)] - coordinate[rows, None]) ** 2
     nearest = jnp.min(jnp.where(present & (square > 0), square, jnp.inf), axis=1)
     return jnp.nan_to_num(jnp.nanmedian(jnp.where(jnp.isfinite(nearest), jnp.sqrt(nearest), jnp.nan)))

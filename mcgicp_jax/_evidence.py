@@ -27,7 +27,7 @@ class Evidence(eqx.Module):
 
     Attributes:
         geometry: (6, N), by the normal: n nᵀ, less what the noise of normals makes of a flat surface.
-        channels: (6, N), by the gradient of the channels within the surface; None where a method uses none.
+        channels: (6, N), by the gradient of the channels within the surface; None where none are used.
         noise: (N,) variance of all descriptors about their gradients, metres²; 0 where a method uses none.
         normal: (3, N) unit vectors.
         roughness: (N,) square of a neighbour's height over the point, across the surface, halved: metres².
@@ -47,7 +47,7 @@ def find_evidence(method: AbstractMethod, cloud: PointCloud) -> Evidence:
     """The evidence that a resolved method finds in a preprocessed cloud; constant to autodiff."""
     method, cloud = jax.lax.stop_gradient((method, cloud))
     points = jnp.asarray(cloud.points).T
-    descriptors = method.descriptors(cloud) if method.uses_channels else None
+    descriptors = method.descriptors(cloud) if method.uses_channels and cloud.channels.shape[-1] else None
     channel_valid = None if cloud.channel_valid is None else jnp.asarray(cloud.channel_valid)
 
     def of_rows(rows: Int[Array, "n"], neighbors: Int[Array, "n k"]) -> Evidence:
@@ -61,7 +61,7 @@ def find_evidence(method: AbstractMethod, cloud: PointCloud) -> Evidence:
         smallest = jnp.maximum(jnp.sum(normal * cov.multiply(local, normal), axis=0), 0)
         channels, noise = None, jnp.zeros(rows.size, points.dtype)
         if descriptors is not None:
-            channels, noise = _channels(descriptors, channel_valid, offsets, present, neighbors, basis)
+            channels, noise = _channels(descriptors, channel_valid, offsets, present, rows, neighbors, basis)
         return Evidence(
             geometry=_geometry(local, normal, smallest, basis, count),
             channels=channels,
@@ -114,14 +114,16 @@ def _channels(
     channel_valid: Bool[Array, "M C"] | None,
     offsets: cov.Offsets,
     present: Bool[Array, "k N"],
+    rows: Int[Array, "N"],
     neighbors: Int[Array, "N k"],
     basis: Basis,
 ) -> tuple[Float[Array, "6 N"], Float[Array, "N"]]:
     """What a match in position and α · channel gives way by when its point moves within the surface.
 
     Where α · channel has the gradients g, the nearest target point to one that has moved by x lies at (I + A)⁻¹ x, with
-    A = Σ g gᵀ: the share A (I + A)⁻¹ of the motion is felt. The variance of a fitted gradient is taken off A. The
-    second answer is the variance of the descriptors about their gradients.
+    A = Σ g gᵀ: the share A (I + A)⁻¹ of the motion is felt; written A / (1 + tr A), which is the same for one gradient,
+    and less for several. The variance of a fitted gradient is taken off A. The second answer is the variance of the
+    descriptors about their gradients.
     """
     x, y = (sum(offset * b for offset, b in zip(offsets, axis, strict=True)) for axis in basis)
     near = jnp.where(present, neighbors.T, 0)
@@ -132,7 +134,7 @@ def _channels(
         known = present if channel_valid is None else present & channel_valid[:, i][near]
         fit = cov.fit_linear(x, y, descriptor[near], known.astype(x.dtype))
         gx, gy = fit.gradient
-        told = fit.weight > 3
+        told = fit.weight > 3 if channel_valid is None else (fit.weight > 3) & channel_valid[:, i][rows]
         total = total + jnp.where(told, jnp.stack([gx * gx, gx * gy, gy * gy]), 0)
         uncertain = uncertain + jnp.where(told, fit.residual * fit.inverse, 0)
         noise = noise + jnp.where(told, fit.residual, 0)

@@ -37,7 +37,7 @@ class KDTreeSearch(AbstractSearch):
     """Exact search with SciPy's k-d tree on the host. Equal distances are ordered by row, so that results repeat.
 
     Attributes:
-        workers: threads of one query; −1 takes all cores.
+        workers: threads of one query, at most; −1 takes all cores.
     """
 
     workers: int = eqx.field(static=True, default=-1)

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from mcgicp_jax._cloud import PointCloud
+from mcgicp_jax._cloud import PointCloud, Values
 from mcgicp_jax._methods import AbstractMethod
 from mcgicp_jax._pose import Pose, pose_matrix
 from mcgicp_jax._preprocess import preprocess
@@ -37,7 +37,7 @@ class Step:
 
 
 def odometry(
-    frames: Iterable[Frame | PointCloud],
+    frames: Iterable[Frame | PointCloud | Values],
     method: AbstractMethod,
     *,
     voxel_size: float | None = None,
@@ -53,7 +53,7 @@ def odometry(
     pairs or without finite numbers is replaced by the motion before; its `registration` says so.
 
     Args:
-        frames: frames of a data set, or clouds; clouds that are preprocessed already are taken as they are.
+        frames: frames of a data set, clouds or (N, 3) arrays; what is preprocessed already is taken as it is.
         method: numbers that it leaves open are chosen from the data of every pair.
         voxel_size, num_neighbors: for `preprocess`.
         max_distance: metres, as in `register`; for the first pair, whose motion is not yet known, it must be more than
@@ -72,6 +72,7 @@ def odometry(
     before: PointCloud | None = None
     for frame in frames:
         cloud = frame.cloud if isinstance(frame, Frame) else frame
+        cloud = cloud if isinstance(cloud, PointCloud) else PointCloud(cloud)
         if cloud.neighbors is None:
             cloud = preprocess(cloud, voxel_size, num_neighbors)
         if before is None:
@@ -85,13 +86,13 @@ def odometry(
         before = cloud
 
 
-def aggregate(clouds: Iterable[PointCloud], poses: Iterable[Pose], voxel_size: float) -> PointCloud:
+def aggregate(clouds: Iterable[PointCloud | Values], poses: Iterable[Pose], voxel_size: float) -> PointCloud:
     """One map of many clouds: the mean of all points, and of their channels, in each voxel of the world.
 
     Clouds are taken one by one; memory grows with the map, not with their number.
 
     Args:
-        clouds: in their sensors' frames, with the same channels.
+        clouds: or (N, 3) arrays, in their sensors' frames, with the same channels.
         poses: one for each, sensor to world.
         voxel_size: metres.
 
@@ -106,7 +107,7 @@ def aggregate(clouds: Iterable[PointCloud], poses: Iterable[Pose], voxel_size: f
         raise ValueError(f"voxel_size: expected a positive number of metres, got {voxel_size!r}")
     keys, sums, names = np.empty(0, np.int64), None, None
     for i, (cloud, pose) in enumerate(zip(clouds, poses, strict=True)):
-        cloud = cloud.unpad()
+        cloud = cloud.unpad() if isinstance(cloud, PointCloud) else PointCloud(cloud)
         if names is None:
             names = cloud.channel_names
         elif cloud.channel_names != names:

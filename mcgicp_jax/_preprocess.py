@@ -108,7 +108,7 @@ def _finite(cloud: PointCloud) -> PointCloud:
     keep = np.all([each.all(axis=tuple(range(1, each.ndim))) for each in finite], axis=0)
     if keep.sum() < MIN_POINTS:
         raise ValueError(f"cloud: expected at least {MIN_POINTS} finite points, got {keep.sum()} of {keep.size}")
-    warnings.warn(f"left out {np.sum(~keep)} of {keep.size} points that are NaN or infinite", UserWarning, stacklevel=3)
+    warnings.warn(f"left out {np.sum(~keep)} of {keep.size} points with a NaN or infinity", UserWarning, stacklevel=3)
     return PointCloud(
         cloud.points[keep],
         cloud.channels[keep],

@@ -40,6 +40,10 @@ class Status(enum.IntEnum):
     INVALID_INPUT = 5
     LOST = 6
 
+    # Printed by name, which an IntEnum is not.
+    __str__ = enum.Enum.__str__
+    __format__ = enum.Enum.__format__  # type: ignore[assignment]
+
 
 class Registration(eqx.Module):
     """The outcome of `register` or `align`; a pytree. Everything in it belongs to the returned pose.

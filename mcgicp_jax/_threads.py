@@ -5,7 +5,7 @@ from __future__ import annotations
 import functools
 import os
 from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor
 from typing import TypeVar
 
 Answer = TypeVar("Answer")
@@ -19,11 +19,23 @@ def num_cores() -> int:
 def side_by_side(calls: Sequence[Callable[[], Answer]]) -> list[Answer]:
     """The answers of calls, of which this thread makes the first, and others at the same time the rest.
 
-    The others are those of the whole process, and no call may make use of them itself. They stay, since a new thread
-    begins on the core of the one that started it, and most queries are over before it is given another.
+    The others are those of the whole process. They stay, since a new thread begins on the core of the one that started
+    it, and most queries are over before it is given another. What none of them has begun when this thread is ready, it
+    does itself: nobody waits for threads that wait.
     """
-    others = [_threads().submit(call) for call in calls[1:]]
-    return [calls[0](), *(other.result() for other in others)]
+    others = [(call, _submit(call)) for call in calls[1:]]
+    answers = [calls[0]()]
+    for call, answer in others:
+        answers.append(call() if answer is None or answer.cancel() else answer.result())
+    return answers
+
+
+def _submit(call: Callable[[], Answer]) -> Future[Answer] | None:
+    try:
+        return _threads().submit(call)
+    except RuntimeError:
+        # While the interpreter shuts down, no thread takes anything new.
+        return None
 
 
 @functools.cache

@@ -28,8 +28,6 @@ GEOMETRY_HOLDS, CHANNELS_HOLD = 2e-3, 5e-3
 _CELL = 2.0
 # Radii of the pairs: the standard deviation that a direction has which nothing holds.
 _UNKNOWN = 10.0
-# Pairs, at most, whose medians tell how rough surfaces are.
-_MEDIAN_OF = 4096
 _LEAST_SHARE = 0.2
 _IDENTITY = np.array([1, 0, 0, 1, 0, 1])
 _HASH = np.array([73856093, 19349663, 83492791, 50331653], np.int32)
@@ -165,7 +163,7 @@ def estimate_covariance(
     pull = jnp.zeros(6, force.dtype)
     if evidence is not None and matches.indices.ndim == 1:
         geometry, channels = pair_evidence(evidence, rotation, matches.indices)
-        geometry = _share_across(pairs, evidence, rotation, matches.indices) * geometry
+        geometry = _share_across(pairs, model[0].valid, evidence, rotation, matches.indices) * geometry
         if channels is not None:
             # K = A (I + A)⁻¹ with an A that is smaller by the ratio.
             ratio, trace = _channel_ratio(pairs, model, evidence), channels[0] + channels[3] + channels[5]
@@ -201,7 +199,11 @@ def estimate_covariance(
 
 
 def _share_across(
-    pairs: Pairs, evidence: tuple[Evidence, Evidence], rotation: Float[Array, "3 3"], indices: Int[Array, "N"]
+    pairs: Pairs,
+    points_valid: Bool[Array, "N"],
+    evidence: tuple[Evidence, Evidence],
+    rotation: Float[Array, "3 3"],
+    indices: Int[Array, "N"],
 ) -> Float[Array, ""]:
     """The share of a motion across the surface that is felt: less than 1 where surfaces are rough beside their spacing.
 
@@ -210,9 +212,8 @@ def _share_across(
     of what the two roughnesses add up to; and when the point moves, its match makes up for β of it.
     """
     source, target = evidence
-    # Thousands of pairs are enough, and sorting all of a large cloud's takes long.
-    some = slice(None, None, 1 + pairs.valid.size // _MEDIAN_OF)
-    valid = pairs.valid[some]
+    some, valid = cov.some_rows(points_valid)
+    valid = valid & pairs.valid[some]
     across = jnp.dot(rotation, source.normal[:, some], precision="highest")
     # Medians, since planes do not fit at edges: of the square of a normal variate, and of the mean of two such squares.
     seen = jnp.where(valid, jnp.sum(across * pairs.residual[:, some], axis=0) ** 2, jnp.nan)
@@ -227,9 +228,9 @@ def _channel_ratio(pairs: Pairs, model: Model, evidence: tuple[Evidence, Evidenc
     As in `_share_across`: among neighbours with noisy channels, the nearest is one whose noise is like the point's.
     """
     source, target, matches, *_ = model
-    some = slice(None, None, 1 + pairs.valid.size // _MEDIAN_OF)
+    some, complete = cov.some_rows(source.valid)
     indices = matches.indices[some]
-    complete = pairs.valid[some]
+    complete = complete & pairs.valid[some]
     for surface, rows in ((source, some), (target, indices)):
         if surface.absence is not None:
             complete = complete & jnp.all(surface.absence[rows] == 0, axis=1)
@@ -237,8 +238,10 @@ def _channel_ratio(pairs: Pairs, model: Model, evidence: tuple[Evidence, Evidenc
     # Pair by pair, since edges are noisier than what lies between them.
     expected = jnp.where(complete, evidence[0].noise[some] + evidence[1].noise[indices], jnp.nan)
     seen = jnp.sum(difference * difference, axis=1) / jnp.where(expected > 0, expected, jnp.nan)
-    # The median of a sum of C squares of normal variates, divided by C (Wilson & Hilferty 1931).
-    median = (1 - 2 / (9 * difference.shape[1])) ** 3
+    # The median of a sum of C squares of normal variates, divided by C (Wilson & Hilferty 1931). Channels that are
+    # constant, or weigh nothing, are none of them.
+    count = jnp.maximum(jnp.sum(jnp.any(source.descriptors != 0, axis=0)), 1)
+    median = (1 - 2 / (9 * count)) ** 3
     ratio = jnp.nanmedian(seen) / median
     return jnp.where(jnp.isfinite(ratio), jnp.clip(ratio, _LEAST_SHARE, 1), 1)
 
@@ -270,9 +273,8 @@ def _sum_over_cells(
     """Sums over cells of space, and how many there are. Sizes are rounded to powers of two: cells are small where
     points are dense. Two cells may share a sum by chance, which does no harm: being independent, they do not correlate.
     """
-    sized = valid & (size > 0)
-    level = jnp.round(jnp.log2(jnp.where(sized, size, 1)))
-    cell = jnp.floor(jnp.where(sized, moved / 2.0**level, 0)).astype(jnp.int32)
+    level = jnp.round(jnp.log2(jnp.where(valid & (size > 0), size, 1)))
+    cell = jnp.floor(jnp.where(valid, moved / 2.0**level, 0)).astype(jnp.int32)
     keys = (*cell, level.astype(jnp.int32))
     number = jnp.abs(sum((key * prime for key, prime in zip(keys, _HASH, strict=True)), jnp.int32(0))) % valid.size
     # In rows, so that what is scattered is seven numbers at a time.

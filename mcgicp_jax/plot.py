@@ -379,7 +379,7 @@ def maps(
         panel.set_title(name, fontsize="medium")
         panel.tick_params(labelsize="x-small")
     if path is not None:
-        figure.savefig(path, dpi=120)
+        figure.savefig(path, dpi=120, bbox_inches="tight")
     return figure
 
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from mcgicp_jax import Correspondences, PointCloud, estimate_channel_covariance, preprocess
-from mcgicp_jax._channels import with_channels_matched
+from mcgicp_jax._channels import point_spacing, with_channels_matched
 from tests import reference as ref
 from tests.scenes import motion
 
@@ -119,3 +119,11 @@ def test_channels_that_say_nothing_are_not_matched():
     np.testing.assert_allclose(matched.channels[:500], target.channels[:500], atol=1e-5)
     gradient = jax.grad(lambda values: with_channels_matched(source.replace(channels=values), target).channels.sum())
     assert np.isfinite(gradient(source.channels)).all()
+
+
+def test_padding_takes_no_part_in_the_spacing():
+    points = np.random.default_rng(0).uniform(size=(300, 3))
+    cloud = preprocess(points)
+    expected = float(point_spacing(cloud))
+    for size in (5_000, 100_000):
+        assert float(point_spacing(cloud.pad(size))) == expected

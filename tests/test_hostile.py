@@ -219,7 +219,7 @@ def test_what_no_float32_holds_is_left_out():
     points[3, 0], channels[5, 1] = 1e39, -1e300
     with warnings.catch_warnings():
         warnings.simplefilter("error", RuntimeWarning)
-        with pytest.warns(UserWarning, match="left out 2 of 100 points that are NaN or infinite"):
+        with pytest.warns(UserWarning, match="left out 2 of 100 points with a NaN or infinity"):
             cloud = mcg.preprocess(mcg.PointCloud(points, channels))
     assert len(cloud) == 98
     with pytest.raises(ValueError, match="cloud: expected at least 4 finite points, got 0 of 100"):

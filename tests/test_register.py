@@ -241,7 +241,7 @@ def test_rows_that_are_not_finite_are_left_out_with_one_warning():
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         cloud = mcg.preprocess(mcg.PointCloud(broken, np.concatenate([channels, np.zeros((50, 2))])))
-    assert [str(warning.message) for warning in caught] == ["left out 50 of 2050 points that are NaN or infinite"]
+    assert [str(warning.message) for warning in caught] == ["left out 50 of 2050 points with a NaN or infinity"]
     expected = mcg.preprocess(mcg.PointCloud(points, channels))
     result = mcg.register(cloud, expected, METHODS["mc-gicp"], max_distance=0.5)
     assert result.converged and difference(result.matrix, np.eye(4)) < 1e-6

@@ -1,0 +1,38 @@
+"""Work side by side: every answer in its place, and no waiting for those who wait."""
+
+import threading
+from concurrent.futures import ThreadPoolExecutor
+from functools import partial
+
+import pytest
+
+from mcgicp_jax import _threads
+from mcgicp_jax._threads import side_by_side
+
+
+def test_answers_come_in_order_and_the_first_from_this_thread():
+    calls = [partial(lambda i: (i, threading.get_ident()), i) for i in range(20)]
+    answers = side_by_side(calls)
+    assert [i for i, _ in answers] == list(range(20))
+    assert answers[0][1] == threading.get_ident()
+
+
+@pytest.mark.timeout(30)
+def test_calls_may_themselves_work_side_by_side():
+    def fan(depth):
+        return 1 if depth == 0 else sum(side_by_side([partial(fan, depth - 1)] * 3))
+
+    with ThreadPoolExecutor(8) as users:
+        assert list(users.map(fan, [4] * 8)) == [81] * 8
+
+
+def test_without_threads_this_one_does_it_all(monkeypatch):
+    ended = ThreadPoolExecutor(1)
+    ended.shutdown()
+    monkeypatch.setattr(_threads, "_threads", lambda: ended)
+    assert side_by_side([partial(int, text) for text in "123"]) == [1, 2, 3]
+
+
+def test_an_error_is_raised():
+    with pytest.raises(ZeroDivisionError):
+        side_by_side([lambda: 1, lambda: 1 // 0])
