@@ -232,7 +232,7 @@ def test_implicit_gradient_is_that_of_the_unrolled_loop(noisy):
         surfaces = prepare(method, source.replace(points=points)), prepare(method, target)
 
         def body(pose, _):
-            measured = _loop.measure(pose, (*surfaces, matches, method, None, None))
+            measured = _loop.measure(pose, (*surfaces, matches, method, None, None), None)
             information, gradient = _normal_equations(measured.moments)
             twist = jnp.linalg.solve(information, gradient)
             return _solve.move_pose(pose, twist, measured.moments.center), None
