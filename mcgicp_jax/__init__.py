@@ -7,6 +7,7 @@ from mcgicp_jax import datasets as datasets
 from mcgicp_jax import io as io
 from mcgicp_jax import metrics as metrics
 from mcgicp_jax import plot as plot
+from mcgicp_jax._batch import PairWarning as PairWarning
 from mcgicp_jax._batch import register_as_completed as register_as_completed
 from mcgicp_jax._batch import register_batch as register_batch
 from mcgicp_jax._channels import estimate_channel_covariance as estimate_channel_covariance

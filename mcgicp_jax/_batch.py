@@ -167,10 +167,9 @@ class PairWarning(UserWarning):
         reason: what is wrong with it.
     """
 
-    def __init__(self, index: int, reason: str):
-        super().__init__(f"pair {index}: {reason}")
-        self.index = index
-        self.reason = reason
+    # Set afterwards, since whoever catches, copies or repeats warnings makes them of a message alone.
+    index: int
+    reason: str
 
 
 @dataclass(frozen=True)
@@ -376,7 +375,9 @@ class _Shipping:
 
 def _report(outcome: _Outcome) -> tuple[int, Registration]:
     if outcome.reason is not None:
-        warnings.warn(PairWarning(outcome.index, outcome.reason), stacklevel=2)
+        warning = PairWarning(f"pair {outcome.index}: {outcome.reason}")
+        warning.index, warning.reason = outcome.index, outcome.reason
+        warnings.warn(warning, stacklevel=2)
     return outcome.index, outcome.result
 
 

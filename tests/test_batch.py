@@ -110,6 +110,15 @@ def test_a_bad_pair_has_its_status_and_spoils_no_other(raw, alone, what, side):
     assert_same(results, alone[:2] + alone[3:])
 
 
+def test_the_warning_can_be_sent_copied_and_repeated():
+    with pytest.warns(mcg.PairWarning) as caught:
+        batch([np.zeros((50, 2))], [np.zeros((50, 3))])
+    warning = caught[0].message
+    for same in (warning, pickle.loads(pickle.dumps(warning)), copy.deepcopy(warning)):
+        assert same.index == 0 and str(same) == f"pair 0: {same.reason}" and "source" in same.reason
+    assert str(mcg.PairWarning(str(warning))) == str(warning)
+
+
 def test_pairs_without_overlap_or_far_from_rest_have_the_status_of_register(raw, alone):
     sources, targets = prepared(raw)
     starts = [None] * len(raw)

@@ -22,7 +22,6 @@ from tqdm import tqdm
 
 import mcgicp_jax as mcg
 from mcgicp_jax import io
-from mcgicp_jax._batch import PairWarning
 from mcgicp_jax._commands._options import (
     METHODS,
     MethodName,
@@ -211,7 +210,7 @@ def _rows(pairs: Sequence[Pair], settings: dict[str, Any], bar: tqdm) -> Generat
     show = warnings.showwarning
 
     def keep(message: Warning | str, *rest: Any, **options: Any) -> None:
-        if isinstance(message, PairWarning):
+        if isinstance(message, mcg.PairWarning):
             reasons[message.index] = message.reason
             message = f"{' '.join(pairs[message.index].key)}: {message.reason}"
         with bar.external_write_mode(file=sys.stderr):
@@ -223,7 +222,7 @@ def _rows(pairs: Sequence[Pair], settings: dict[str, Any], bar: tqdm) -> Generat
     starts = [pair.init for pair in pairs]
     completed = mcg.register_as_completed(sources, targets, method, init=starts, **arguments)
     with warnings.catch_warnings(), contextlib.closing(completed):
-        warnings.simplefilter("always", PairWarning)
+        warnings.simplefilter("always", mcg.PairWarning)
         warnings.showwarning = keep
         for index, result in completed:
             yield pairs[index], _row(pairs[index], result, reasons.pop(index, ""))
