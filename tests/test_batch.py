@@ -70,6 +70,7 @@ def test_each_pair_is_as_if_it_were_alone(raw, alone):
     assert sum(result.converged for result in results) >= 5
 
 
+@pytest.mark.slow
 def test_raw_clouds_are_prepared_by_the_workers(raw):
     results = batch([pair[0] for pair in raw], [pair[1] for pair in raw], voxel_size=0.1, num_neighbors=12)
     expected = [

@@ -134,6 +134,7 @@ def test_compare_without_channels_or_truth(files, capsys):
     assert "gicp did not converge" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_demo(tmp_path, capsys):
     folder = tmp_path / "some" / "folder"
     assert main(["demo", "--output", str(folder)]) == 0
@@ -174,6 +175,7 @@ def test_no_common_channels_is_said(files, capsys):
     assert main(["register", files["bare"], files["target"], "--method", "gicp"]) == 0
 
 
+@pytest.mark.slow
 def test_voxels_are_chosen_from_the_data(tmp_path, capsys):
     for size, rows, voxels in ((1.0, 30_000, "voxels of "), (1000.0, 30_000, "voxels of "), (1.0, 5000, "all kept")):
         points = size * room_corner(rows, noise=0.002)[0]
@@ -298,6 +300,7 @@ def test_an_unwritable_cache_is_no_error(files, monkeypatch, capsys):
     assert jax.config.jax_compilation_cache_dir == before
 
 
+@pytest.mark.slow
 def test_compiled_programs_are_kept(files, tmp_path):
     """As its own process, started in an empty folder with an empty home."""
     hidden = {"JAX_COMPILATION_CACHE_DIR", "XDG_CACHE_HOME"}

@@ -37,6 +37,7 @@ def test_what_does_not_converge_is_no_success(capsys):
     assert errors == "mcgicp: 1 of 1 registrations did not converge\n"
 
 
+@pytest.mark.slow
 def test_channels_can_be_chosen(capsys):
     options = ["--num-frames", "2", "--channels", "intensity", "--voxel-size", "0.4"]
     assert main(["odometry", "street", *options]) == 0

@@ -8,6 +8,7 @@ import pytest
 README = pathlib.Path(__file__).parent.parent / "README.md"
 
 
+@pytest.mark.slow
 @pytest.mark.timeout(240)
 def test_snippets_run_as_printed(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)

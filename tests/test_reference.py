@@ -71,6 +71,7 @@ def test_kitti_agrees_with_small_gicp(target, source, data):
     check_against_small_gicp(source, target)
 
 
+@pytest.mark.slow
 def test_channels_hold_the_flat_table(data):
     """The paper's claim on real colours: what geometry leaves free, the channels hold."""
     errors = {"gicp": [], "mc-gicp": []}

@@ -320,6 +320,7 @@ def test_the_default_distances_come_from_the_spacing(room):
     assert difference(jax.jit(lambda s: mcg.register(s, target, method).matrix)(source), result.matrix) < 2e-4
 
 
+@pytest.mark.slow
 def test_scales_find_a_start_that_is_far_off():
     truth = motion((2, 1.5, -1, 0.1, 0.1, -0.4))
     source, target, _ = pair(truth=truth, noise=0.003)
@@ -344,6 +345,7 @@ def test_matched_channels_undo_gain_and_offset():
     assert difference(plain.matrix, truth) > 2 * difference(result.matrix, truth)
 
 
+@pytest.mark.slow
 def test_matched_channels_are_not_fooled_by_what_one_cloud_sees():
     """A fifth of the source, far off to the side, is bright: by all points its gain would be wrong."""
     source, target, truth = pair(wall)

@@ -191,6 +191,7 @@ def test_units_and_origin_change_nothing(scale, shift):
     np.testing.assert_allclose(first.channels, second.channels, atol=5e-3)
 
 
+@pytest.mark.slow
 def test_real_scenes(data):
     """A flat table and a road leave three directions free, a street none."""
     file = np.load(data / "planar_table" / "pair_000015_000025.npz")
