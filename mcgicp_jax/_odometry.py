@@ -70,11 +70,14 @@ def odometry(
     motion = pose_matrix(options.pop("init", None))
     pose = np.asarray(pose_matrix(start, "start"))
     before: PointCloud | None = None
-    for frame in frames:
+    for i, frame in enumerate(frames):
         cloud = frame.cloud if isinstance(frame, Frame) else frame
-        cloud = cloud if isinstance(cloud, PointCloud) else PointCloud(cloud)
-        if cloud.neighbors is None:
-            cloud = preprocess(cloud, voxel_size, num_neighbors)
+        try:
+            cloud = cloud if isinstance(cloud, PointCloud) else PointCloud(cloud)
+            if cloud.neighbors is None:
+                cloud = preprocess(cloud, voxel_size, num_neighbors)
+        except ValueError as error:
+            raise ValueError(f"frames[{i}]: {error}") from error
         if before is None:
             yield Step(cloud, pose, None)
         else:

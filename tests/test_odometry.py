@@ -148,3 +148,11 @@ def test_what_makes_no_map_is_refused_by_name(room):
     ):
         with pytest.raises(ValueError, match=message):
             mcg.aggregate(*arguments)
+
+
+def test_a_frame_that_is_no_cloud_is_told_by_its_number(room):
+    frames, _ = room
+    steps = mcg.odometry([frames[0], np.zeros((2, 3))], mcg.GICP())
+    next(steps)
+    with pytest.raises(ValueError, match=r"frames\[1\]: cloud: expected at least 4 finite points"):
+        next(steps)
