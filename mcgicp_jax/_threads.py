@@ -21,21 +21,20 @@ def side_by_side(calls: Sequence[Callable[[], Answer]]) -> list[Answer]:
 
     The others are those of the whole process. They stay, since a new thread begins on the core of the one that started
     it, and most queries are over before it is given another. What none of them has begun when this thread is ready, it
-    does itself: nobody waits for threads that wait.
+    does itself, the last first, since they begin with the first: nobody waits for threads that wait.
     """
     others = [(call, _submit(call)) for call in calls[1:]]
-    answers = [calls[0]()]
-    for call, answer in others:
-        answers.append(call() if answer is None or answer.cancel() else answer.result())
-    return answers
+    first = calls[0]()
+    own = {i: call() for i, (call, answer) in reversed(list(enumerate(others))) if answer.cancel()}
+    return [first, *(own[i] if i in own else answer.result() for i, (_, answer) in enumerate(others))]
 
 
-def _submit(call: Callable[[], Answer]) -> Future[Answer] | None:
+def _submit(call: Callable[[], Answer]) -> Future[Answer]:
     try:
         return _threads().submit(call)
     except RuntimeError:
-        # While the interpreter shuts down, no thread takes anything new.
-        return None
+        # While the interpreter shuts down, no thread takes anything new: what nobody begins can be cancelled.
+        return Future()
 
 
 @functools.cache

@@ -29,6 +29,7 @@ NUM_TURNS = 9
 TOLERANCES = {"translation_tolerance": 1e-3, "rotation_tolerance": np.radians(0.1)}
 MAX_ITERATIONS = 20
 NUM_NEIGHBORS = 20
+THREADS = concurrent.futures.ThreadPoolExecutor(2)
 
 Stages = tuple[float, float, np.ndarray]
 
@@ -67,11 +68,9 @@ CASES: dict[str, tuple[Callable[[], tuple[np.ndarray, np.ndarray]], float | None
 def ours(source: np.ndarray, target: np.ndarray, voxel: float | None, gate: float) -> Stages:
     begin = time.perf_counter()
     # Two clouds side by side, as one would where there is more than one core.
-    with concurrent.futures.ThreadPoolExecutor(2) as threads:
-        prepared = threads.map(
-            lambda cloud: mcg.preprocess(cloud.astype(np.float32), voxel, NUM_NEIGHBORS), (source, target)
-        )
-        clouds = list(prepared)
+    clouds = list(
+        THREADS.map(lambda cloud: mcg.preprocess(cloud.astype(np.float32), voxel, NUM_NEIGHBORS), (source, target))
+    )
     ready = time.perf_counter()
     result = mcg.register(*clouds, mcg.GICP(), max_distance=gate, max_iterations=MAX_ITERATIONS, **TOLERANCES)
     return ready - begin, time.perf_counter() - ready, np.asarray(result.matrix)
@@ -138,8 +137,7 @@ def colored() -> None:
     theirs = accuracy.colored_icp((1,))
 
     def run_ours(pair: accuracy.Pair) -> np.ndarray:
-        with concurrent.futures.ThreadPoolExecutor(2) as threads:
-            clouds = list(threads.map(lambda cloud: mcg.preprocess(cloud, voxel), (pair.source, pair.target)))
+        clouds = list(THREADS.map(lambda cloud: mcg.preprocess(cloud, voxel), (pair.source, pair.target)))
         return mcg.register(*clouds, mcg.MultiChannelGICP()).matrix
 
     def run_theirs(pair: accuracy.Pair) -> np.ndarray:
