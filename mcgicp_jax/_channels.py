@@ -179,21 +179,19 @@ def _fit_residuals(cloud: PointCloud, rows: Int[Array, "n"]) -> tuple[Float[Arra
     where too few neighbours have the channel; and the variance of the neighbours across that plane, metres²."""
     points = jnp.asarray(cloud.points).T
 
-    def of_rows(rows: Int[Array, "n"], neighbors: Int[Array, "n k"]) -> tuple[Float[Array, "n"], ...]:
-        offsets, present = cov.gather(points, rows, neighbors)
-        local = cov.weighted_covariance(offsets, present.astype(points.dtype))
-        normal = cov.smallest_eigenvector(local)
+    def fit(around: cov.Neighborhoods) -> tuple[Float[Array, "n"], ...]:
+        normal, present = around.normal, around.present
         basis = cov.orthonormal_basis(normal)
-        x, y = (sum(offset * b for offset, b in zip(offsets, axis, strict=True)) for axis in basis)
-        near = jnp.where(present, neighbors.T, 0)
+        x, y = (sum(offset * b for offset, b in zip(around.offsets, axis, strict=True)) for axis in basis)
+        near = jnp.where(present, around.neighbors.T, 0)
         residuals = []
         for i, channel in enumerate(jnp.asarray(cloud.channels).T):
             known = present if cloud.channel_valid is None else present & jnp.asarray(cloud.channel_valid)[:, i][near]
-            fit = cov.fit_linear(x, y, channel[near], known.astype(x.dtype))
-            residuals.append(jnp.where(fit.weight > 3, jnp.sqrt(fit.residual), jnp.nan))
-        return jnp.sum(normal * cov.multiply(local, normal), axis=0), *residuals
+            linear = cov.fit_linear(x, y, channel[near], known.astype(x.dtype))
+            residuals.append(jnp.where(linear.weight > 3, jnp.sqrt(linear.residual), jnp.nan))
+        return jnp.sum(normal * cov.multiply(around.covariance, normal), axis=0), *residuals
 
-    across, *residuals = cov.by_blocks(of_rows, rows, neighbors_of(cloud)[rows])
+    across, *residuals = cov.by_neighborhoods(fit, points, neighbors_of(cloud)[rows], rows)
     return jnp.stack(residuals, axis=-1) if residuals else jnp.zeros((rows.size, 0), points.dtype), across
 
 

@@ -150,11 +150,11 @@ def evaluate_pairs(
     # A row without a match may point anywhere: zero it before it is squared, so that its gradient is zero and not NaN.
     residual = jnp.where(valid, target.points[:, indices] - moved, 0)
     information = method.information(target.covariance[:, indices], source.covariance, rotation)
-    square = jnp.sum(residual * cov.multiply(information, residual), axis=0)
+    square = cov.inner(residual, cov.multiply(information, residual))
     weight, cost = (jnp.ones_like(square), square) if robust is None else (robust.weight(square), robust.rho(square))
     share = valid.astype(square.dtype)
     if temperature is not None:
-        far = jnp.sum(residual * residual, axis=0) + _square_apart(source.rows, target.rows, indices)
+        far = cov.inner(residual, residual) + _square_apart(source.rows, target.rows, indices)
         share = _softmax(-0.5 * far / temperature**2, valid, candidates.shape)
     return Pairs(
         moved=moved,

@@ -17,10 +17,10 @@ from jaxtyping import Array, Bool, Float, Int
 # Relative to the trace: what keeps the square root of a collinear neighbourhood's 2×2 covariance regular. Much more
 # would be seen in Ω where it is small; as it is, rounding in float32 leaves Ω two digits along a line.
 _REGULARISATION = 1e-6
-# Tables of the neighbours of more points than that fall out of a processor's caches, which makes them ten times slower:
-# they are made block by block.
+# Neighbourhoods of more points than that are gone through block by block: what is made of one block stays in a
+# processor's caches, and XLA sums over a first axis column by column there, twenty times slower from so many on.
 _LARGEST_WHOLE = 16_000
-_BLOCK = 2048
+_BLOCK = 8192
 # Rows, at most, that a median is taken of.
 _MEDIAN_OF = 4096
 
@@ -61,6 +61,12 @@ def rotate(rotation: Float[Array, "3 3"], symmetric: Float[Array, "6 N"]) -> Flo
     half = [[sum(rotation[i, k] * rows[k][j] for k in range(3)) for j in range(3)] for i in range(3)]
     pairs = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
     return jnp.stack([sum(half[i][k] * rotation[j, k] for k in range(3)) for i, j in pairs])
+
+
+def inner(a: Float[Array, "3 N"], b: Float[Array, "3 N"]) -> Float[Array, "N"]:
+    """aᵀ b, row by row. Written out, for sums over a first axis are slow: see `_LARGEST_WHOLE`."""
+    x, y, z = a * b
+    return x + y + z
 
 
 def inverse(symmetric: Float[Array, "6 N"]) -> Float[Array, "6 N"]:
@@ -221,26 +227,58 @@ def floor_eigenvalues(symmetric: Float[Array, "3 N"], floor: Float[Array, ""]) -
 Offsets: TypeAlias = tuple[Float[Array, "k N"], Float[Array, "k N"], Float[Array, "k N"]]
 
 
-def by_blocks(
-    function: Callable[[Int[Array, "n"], Int[Array, "n k"]], Tree], rows: Int[Array, "N"], neighbors: Int[Array, "N k"]
+class Neighborhoods(NamedTuple):
+    """Some points of a cloud, and what lies around them.
+
+    Attributes:
+        rows: of the points in the cloud.
+        neighbors: (n, k) rows of their neighbours; −1 for none.
+        offsets: of the neighbours from the points, metres; 0 where there is none.
+        present: (k, n) which neighbours there are.
+        covariance: (6, n) of the neighbours about their mean, metres².
+        normal: (3, n) unit vectors, the eigenvectors of the smallest eigenvalue.
+    """
+
+    rows: Int[Array, "n"]
+    neighbors: Int[Array, "n k"]
+    offsets: Offsets
+    present: Bool[Array, "k n"]
+    covariance: Float[Array, "6 n"]
+    normal: Float[Array, "3 n"]
+
+
+def by_neighborhoods(
+    function: Callable[[Neighborhoods], Tree],
+    points: Float[Array, "3 M"],
+    neighbors: Int[Array, "N k"],
+    rows: Int[Array, "N"] | None = None,
 ) -> Tree:
-    """What a function of rows and their neighbours makes of them; many are gone through block by block.
+    """What a function makes of points and what lies around them; many are gone through block by block.
 
     Args:
-        function: its arrays have the rows as their last dimension.
+        function: its arrays have the points as their last dimension.
+        neighbors: of the rows.
+        rows: of the points; all by default.
     """
+
+    def around(rows: Int[Array, "n"], neighbors: Int[Array, "n k"]) -> Tree:
+        offsets, present = _gather(points, rows, neighbors)
+        local = weighted_covariance(offsets, present.astype(points.dtype))
+        return function(Neighborhoods(rows, neighbors, offsets, present, local, smallest_eigenvector(local)))
+
+    rows = jnp.arange(points.shape[1]) if rows is None else rows
     num_points = rows.size
     if num_points <= _LARGEST_WHOLE:
-        return function(rows, neighbors)
+        return around(rows, neighbors)
     num_blocks = -(-num_points // _BLOCK)
     missing = num_blocks * _BLOCK - num_points
     rows = jnp.pad(rows, (0, missing)).reshape(num_blocks, _BLOCK)
     neighbors = jnp.pad(neighbors, [(0, missing), (0, 0)], constant_values=-1).reshape(num_blocks, _BLOCK, -1)
-    blocks = jax.lax.map(lambda block: function(*block), (rows, neighbors))
+    blocks = jax.lax.map(lambda block: around(*block), (rows, neighbors))
     return jax.tree.map(lambda leaf: jnp.moveaxis(leaf, 0, -2).reshape(*leaf.shape[1:-1], -1)[..., :num_points], blocks)
 
 
-def gather(
+def _gather(
     points: Float[Array, "3 M"], rows: Int[Array, "N"], neighbors: Int[Array, "N k"]
 ) -> tuple[Offsets, Bool[Array, "k N"]]:
     """The neighbours of some rows as offsets from these, and which of them there are."""
@@ -257,16 +295,6 @@ def weighted_covariance(offsets: Offsets, weights: Float[Array, "k N"]) -> Float
     x, y, z = (offset - jnp.sum(weights * offset, axis=0) for offset in offsets)
     pairs = ((x, x), (x, y), (x, z), (y, y), (y, z), (z, z))
     return jnp.stack([jnp.sum(weights * p * q, axis=0) for p, q in pairs])
-
-
-def local_covariance(points: Float[Array, "3 N"], neighbors: Int[Array, "N k"]) -> Float[Array, "6 N"]:
-    """Covariance of each point's neighbourhood, metres²."""
-
-    def of_rows(rows: Int[Array, "n"], neighbors: Int[Array, "n k"]) -> Float[Array, "6 n"]:
-        offsets, present = gather(points, rows, neighbors)
-        return weighted_covariance(offsets, present.astype(points.dtype))
-
-    return by_blocks(of_rows, jnp.arange(neighbors.shape[0]), neighbors)
 
 
 class LinearFit(NamedTuple):
@@ -318,18 +346,16 @@ def plane_covariance(
     return identity - jnp.where(spread, (1 - epsilon) * outer(normal), 0)
 
 
-def channel_kernel(
-    whitened: Float[Array, "M C"], rows: Int[Array, "N"], neighbors: Int[Array, "N k"]
-) -> Float[Array, "k N"]:
+def channel_kernel(whitened: Float[Array, "M C"], around: Neighborhoods) -> Float[Array, "k N"]:
     """How alike each neighbour and its point look: exp(−½ |Δ|²) (Servos & Waslander 2014, eq. 7).
 
     Args:
         whitened: channels divided by the Cholesky factor of Λ.
     """
-    near = jnp.where(neighbors.T >= 0, neighbors.T, 0)
+    near = jnp.where(around.present, around.neighbors.T, 0)
     square = jnp.zeros(near.shape, whitened.dtype)
     for channel in whitened.T:
-        difference = channel[near] - channel[rows]
+        difference = channel[near] - channel[around.rows]
         square = square + difference * difference
     return jnp.exp(-0.5 * square)
 
@@ -338,8 +364,7 @@ def partial_channel_kernel(
     channels: Float[Array, "M C"],
     channel_valid: Bool[Array, "M C"],
     covariance: Float[Array, "..."],
-    rows: Int[Array, "N"],
-    neighbors: Int[Array, "N k"],
+    around: Neighborhoods,
 ) -> Float[Array, "k N"]:
     """The kernel of eq. 7 where points lack channels: over those that both have, with the marginal of Λ on them.
 
@@ -351,9 +376,9 @@ def partial_channel_kernel(
     Args:
         covariance: Λ, scalar or (C,) or (C, C), channel units².
     """
-    near = jnp.where(neighbors.T >= 0, neighbors.T, 0)
+    rows, near = around.rows, jnp.where(around.present, around.neighbors.T, 0)
     # The point itself says nothing about how alike its neighbours look.
-    others = (neighbors.T >= 0) & (rows != neighbors.T)
+    others = around.present & (rows != near)
     common = [valid[near] & valid[rows] for valid in channel_valid.T]
     differences = [
         jnp.where(both, channel[near] - channel[rows], 0) for channel, both in zip(channels.T, common, strict=True)
@@ -391,36 +416,19 @@ def _marginal_square(
 
 
 def multichannel_covariance(
-    points: Float[Array, "3 N"],
-    kernel: Callable[[Int[Array, "n"], Int[Array, "n k"]], Float[Array, "k n"]],
-    neighbors: Int[Array, "N k"],
-    epsilon: Float[Array, ""],
-    min_eigenvalue: Float[Array, ""],
+    around: Neighborhoods, kernel: Float[Array, "k N"], epsilon: Float[Array, ""], min_eigenvalue: Float[Array, ""]
 ) -> Float[Array, "6 N"]:
     """Ω in the tangent plane and ε across it (Servos & Waslander 2014, eqs. 6-10).
 
     Args:
-        kernel: λ_j of the neighbours of some rows.
+        kernel: λ_j of the neighbours.
         min_eigenvalue: floor for the eigenvalues of Ω, which reach 0 where only the point itself looks like it.
 
     Ω = Σ_w^{-1/2} Σ_t Σ_w^{-1/2} is written as I + Σ_w^{-1/2} (Σ_t − Σ_w) Σ_w^{-1/2}: uniform channels then give
     GICP's covariance to rounding, whatever the neighbourhood.
     """
-
-    def of_rows(rows: Int[Array, "n"], neighbors: Int[Array, "n k"]) -> Float[Array, "6 n"]:
-        offsets, present = gather(points, rows, neighbors)
-        local = weighted_covariance(offsets, present.astype(points.dtype))
-        alike = weighted_covariance(offsets, jnp.where(present, kernel(rows, neighbors), 0))
-        return _multichannel(local, alike, epsilon, min_eigenvalue)
-
-    return by_blocks(of_rows, jnp.arange(neighbors.shape[0]), neighbors)
-
-
-def _multichannel(
-    local: Float[Array, "6 N"], alike: Float[Array, "6 N"], epsilon: Float[Array, ""], min_eigenvalue: Float[Array, ""]
-) -> Float[Array, "6 N"]:
-    """From the covariance of all neighbours and that of those that look alike."""
-    normal = smallest_eigenvector(local)
+    local, normal = around.covariance, around.normal
+    alike = weighted_covariance(around.offsets, jnp.where(around.present, kernel, 0))
     u, v = orthonormal_basis(normal)
     unweighted, weighted = project(local, u, v), project(alike, u, v)
     trace = unweighted[0] + unweighted[2]

@@ -6,16 +6,17 @@ the pose slides along a plane, so do the matches, and nothing holds it. Evidence
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import TypeAlias
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Float
 
 from mcgicp_jax import _covariance as cov
 from mcgicp_jax._cloud import PointCloud
-from mcgicp_jax._methods import AbstractMethod
+from mcgicp_jax._methods import AbstractMethod, Surface, surface
 
 _ROUGHNESS_RANK = 5
 
@@ -43,25 +44,32 @@ class Evidence(eqx.Module):
 
 
 @jax.jit
-def find_evidence(method: AbstractMethod, cloud: PointCloud) -> Evidence:
-    """The evidence that a resolved method finds in a preprocessed cloud; constant to autodiff."""
-    method, cloud = jax.lax.stop_gradient((method, cloud))
-    points = jnp.asarray(cloud.points).T
+def look(method: AbstractMethod, cloud: PointCloud) -> tuple[Surface, Evidence]:
+    """The surface and the evidence that a resolved method finds in a preprocessed cloud. Both look at the same
+    neighbourhoods. Evidence is constant to autodiff."""
+    covariance, evidence = method.covariance(cloud), _evidence(*jax.lax.stop_gradient((method, cloud)))
+
+    def both(around: cov.Neighborhoods) -> tuple[Float[Array, "6 n"], Evidence]:
+        return covariance(around), evidence(jax.lax.stop_gradient(around))
+
+    covariances, found = cov.by_neighborhoods(both, jnp.asarray(cloud.points).T, jnp.asarray(cloud.neighbors))
+    return surface(method, cloud, covariances), found
+
+
+def _evidence(method: AbstractMethod, cloud: PointCloud) -> Callable[[cov.Neighborhoods], Evidence]:
     descriptors = method.descriptors(cloud) if method.uses_channels and cloud.channels.shape[-1] else None
     channel_valid = None if cloud.channel_valid is None else jnp.asarray(cloud.channel_valid)
 
-    def of_rows(rows: Int[Array, "n"], neighbors: Int[Array, "n k"]) -> Evidence:
-        offsets, present = cov.gather(points, rows, neighbors)
-        count = jnp.maximum(jnp.sum(present, axis=0), 1).astype(points.dtype)
-        local = cov.weighted_covariance(offsets, present.astype(points.dtype))
-        normal = cov.smallest_eigenvector(local)
+    def find(around: cov.Neighborhoods) -> Evidence:
+        offsets, local, normal = around.offsets, around.covariance, around.normal
+        count = jnp.maximum(jnp.sum(around.present, axis=0), 1).astype(normal.dtype)
         basis = cov.orthonormal_basis(normal)
         # The very nearest lie near because their heights are alike; far ones may be higher because the surface bends.
         rank = min(_ROUGHNESS_RANK, offsets[0].shape[0] - 1)
         smallest = jnp.maximum(jnp.sum(normal * cov.multiply(local, normal), axis=0), 0)
-        channels, noise = None, jnp.zeros(rows.size, points.dtype)
+        channels, noise = None, jnp.zeros_like(smallest)
         if descriptors is not None:
-            channels, noise = _channels(descriptors, channel_valid, offsets, present, rows, neighbors, basis)
+            channels, noise = _channels(descriptors, channel_valid, around, basis)
         return Evidence(
             geometry=_geometry(local, normal, smallest, basis, count),
             channels=channels,
@@ -71,7 +79,7 @@ def find_evidence(method: AbstractMethod, cloud: PointCloud) -> Evidence:
             reach=jnp.sqrt(jnp.max(sum(offset * offset for offset in offsets), axis=0)),
         )
 
-    return cov.by_blocks(of_rows, jnp.arange(points.shape[1]), jnp.asarray(cloud.neighbors))
+    return find
 
 
 Basis: TypeAlias = tuple[Float[Array, "3 N"], Float[Array, "3 N"]]
@@ -112,10 +120,7 @@ def _geometry(
 def _channels(
     descriptors: Float[Array, "M C"],
     channel_valid: Bool[Array, "M C"] | None,
-    offsets: cov.Offsets,
-    present: Bool[Array, "k N"],
-    rows: Int[Array, "N"],
-    neighbors: Int[Array, "N k"],
+    around: cov.Neighborhoods,
     basis: Basis,
 ) -> tuple[Float[Array, "6 N"], Float[Array, "N"]]:
     """What a match in position and α · channel gives way by when its point moves within the surface.
@@ -125,16 +130,16 @@ def _channels(
     and less for several. The variance of a fitted gradient is taken off A. The second answer is the variance of the
     descriptors about their gradients.
     """
-    x, y = (sum(offset * b for offset, b in zip(offsets, axis, strict=True)) for axis in basis)
-    near = jnp.where(present, neighbors.T, 0)
-    total = jnp.zeros((3, neighbors.shape[0]), descriptors.dtype)
+    present, near = around.present, jnp.where(around.present, around.neighbors.T, 0)
+    x, y = (sum(offset * b for offset, b in zip(around.offsets, axis, strict=True)) for axis in basis)
+    total = jnp.zeros((3, around.rows.size), descriptors.dtype)
     uncertain = total
     noise = total[0]
     for i, descriptor in enumerate(descriptors.T):
         known = present if channel_valid is None else present & channel_valid[:, i][near]
         fit = cov.fit_linear(x, y, descriptor[near], known.astype(x.dtype))
         gx, gy = fit.gradient
-        told = fit.weight > 3 if channel_valid is None else (fit.weight > 3) & channel_valid[:, i][rows]
+        told = fit.weight > 3 if channel_valid is None else (fit.weight > 3) & channel_valid[:, i][around.rows]
         total = total + jnp.where(told, jnp.stack([gx * gx, gx * gy, gy * gy]), 0)
         uncertain = uncertain + jnp.where(told, fit.residual * fit.inverse, 0)
         noise = noise + jnp.where(told, fit.residual, 0)

@@ -17,6 +17,7 @@ import jaxlie
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
+from mcgicp_jax import _covariance as cov
 from mcgicp_jax._cost import AbstractKernel, Model, Moments, evaluate_pairs, moments, move_points
 from mcgicp_jax._evidence import Evidence
 from mcgicp_jax._methods import AbstractMethod, Surface
@@ -140,7 +141,7 @@ def measure(pose: jaxlie.SE3, model: Model, evidence: Evidences | None) -> Measu
     pairs = evaluate_pairs(rotation, pose.translation(), *model)
     found = moments(pairs)
     num_inliers = jnp.sum(jnp.any(pairs.valid.reshape(-1, source.valid.size), axis=0))
-    square = pairs.share * jnp.sum(pairs.residual * pairs.residual, axis=0)
+    square = pairs.share * cov.inner(pairs.residual, pairs.residual)
     return Measurement(
         moments=found,
         felt=None if evidence is None else feel(pairs, found.center, evidence, rotation, matches.indices),

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import abc
 import dataclasses
+from collections.abc import Callable
 from functools import partial
-from typing import ClassVar
+from typing import ClassVar, TypeAlias
 
 import equinox as eqx
 import jax
@@ -28,6 +29,10 @@ _REACH = 2.5
 # The least floor of Ω, and the variance of a match along each axis of a surface whose points lie at random, spacing².
 _MIN_EIGENVALUE = 5e-3
 _MATCH_VARIANCE = 0.72
+
+
+# What a method makes of points and what lies around them: (6, n) symmetric 3×3 matrices.
+Covariance: TypeAlias = Callable[[cov.Neighborhoods], Float[Array, "6 n"]]
 
 
 class Surface(eqx.Module):
@@ -78,8 +83,8 @@ class AbstractMethod(Numbers):
         return self
 
     @abc.abstractmethod
-    def covariance(self, cloud: PointCloud) -> Float[Array, "6 N"]:
-        """What this method knows of the surface at each point."""
+    def covariance(self, cloud: PointCloud) -> Covariance:
+        """What this method knows of the surface at points of a cloud."""
 
     @abc.abstractmethod
     def information(
@@ -108,19 +113,19 @@ class AbstractOneSided(AbstractMethod):
 class PointToPoint(AbstractOneSided):
     """Plain ICP (Besl & McKay 1992): M = I."""
 
-    def covariance(self, cloud: PointCloud) -> Float[Array, "6 N"]:
-        return _identity(cloud)
+    def covariance(self, cloud: PointCloud) -> Covariance:
+        return _identity
 
 
 class PointToPlane(AbstractOneSided):
     """Point-to-plane ICP (Chen & Medioni 1991): M = n nᵀ with the target's normals."""
 
-    def covariance(self, cloud: PointCloud) -> Float[Array, "6 N"]:
+    def covariance(self, cloud: PointCloud) -> Covariance:
         if cloud.covariances is not None:
-            local = cov.symmetric_from_matrix(jnp.asarray(cloud.covariances))
-        else:
-            local = cov.local_covariance(jnp.asarray(cloud.points).T, neighbors_of(cloud))
-        return cov.outer(cov.smallest_eigenvector(local))
+            given = _given(cloud)
+            return lambda around: cov.outer(cov.smallest_eigenvector(given(around)))
+        neighbors_of(cloud)
+        return lambda around: cov.outer(around.normal)
 
 
 class ColorICP(AbstractOneSided):
@@ -150,8 +155,8 @@ class ColorICP(AbstractOneSided):
         variance = MultiChannelGICP(channel_weights=0.0).resolve(source, target).channel_covariance
         return eqx.tree_at(lambda method: method.missing_variance, self, variance, is_leaf=lambda leaf: leaf is None)
 
-    def covariance(self, cloud: PointCloud) -> Float[Array, "6 N"]:
-        return _identity(cloud)
+    def covariance(self, cloud: PointCloud) -> Covariance:
+        return _identity
 
     def descriptors(self, cloud: PointCloud) -> Float[Array, "N D"]:
         return _weighted_channels(cloud, self.channel_weights)
@@ -186,11 +191,12 @@ class GICP(AbstractGeneralized):
         """Raises `ValueError` unless ε is positive, and large enough for the precision (1.2e-5 in float32)."""
         self.epsilon = _epsilon(epsilon)
 
-    def covariance(self, cloud: PointCloud) -> Float[Array, "6 N"]:
+    def covariance(self, cloud: PointCloud) -> Covariance:
         if cloud.covariances is not None:
-            return cov.symmetric_from_matrix(jnp.asarray(cloud.covariances))
-        local = cov.local_covariance(jnp.asarray(cloud.points).T, neighbors_of(cloud))
-        return cov.plane_covariance(local, cov.smallest_eigenvector(local), self.epsilon.astype(local.dtype))
+            return _given(cloud)
+        neighbors_of(cloud)
+        epsilon = self.epsilon.astype(cloud.points.dtype)
+        return lambda around: cov.plane_covariance(around.covariance, around.normal, epsilon)
 
 
 class MultiChannelGICP(AbstractGeneralized):
@@ -267,14 +273,14 @@ class MultiChannelGICP(AbstractGeneralized):
             is_leaf=lambda leaf: leaf is None,
         )
 
-    def covariance(self, cloud: PointCloud) -> Float[Array, "6 N"]:
+    def covariance(self, cloud: PointCloud) -> Covariance:
         if cloud.covariances is not None:
-            return cov.symmetric_from_matrix(jnp.asarray(cloud.covariances))
-        points = jnp.asarray(cloud.points)
+            return _given(cloud)
         if self.channel_covariance is None:
             raise ValueError("channel_covariance: not chosen yet; call method.resolve(source, target) first")
-        neighbors, epsilon = neighbors_of(cloud), self.epsilon.astype(points.dtype)
-        channels, covariance = jnp.asarray(cloud.channels), self.channel_covariance.astype(points.dtype)
+        neighbors_of(cloud)
+        dtype = cloud.points.dtype
+        channels, covariance = jnp.asarray(cloud.channels), self.channel_covariance.astype(dtype)
         _check_covariance_fits(covariance, channels.shape[-1])
         if channels.shape[-1] == 0:
             return GICP(self.epsilon).covariance(cloud)
@@ -282,8 +288,9 @@ class MultiChannelGICP(AbstractGeneralized):
             kernel = partial(cov.channel_kernel, _whiten(channels, covariance))
         else:
             kernel = partial(cov.partial_channel_kernel, channels, jnp.asarray(cloud.channel_valid), covariance)
-        floor = jnp.asarray(_MIN_EIGENVALUE if self.min_eigenvalue is None else self.min_eigenvalue, points.dtype)
-        return cov.multichannel_covariance(points.T, kernel, neighbors, epsilon, floor)
+        epsilon = self.epsilon.astype(dtype)
+        floor = jnp.asarray(_MIN_EIGENVALUE if self.min_eigenvalue is None else self.min_eigenvalue, dtype)
+        return lambda around: cov.multichannel_covariance(around, kernel(around), epsilon, floor)
 
     def descriptors(self, cloud: PointCloud) -> Float[Array, "N D"]:
         if self.channel_weights is None:
@@ -301,19 +308,31 @@ class MultiChannelGICP(AbstractGeneralized):
 @jax.jit
 def prepare(method: AbstractMethod, cloud: PointCloud) -> Surface:
     """The surface that a resolved method sees in a cloud."""
-    points = jnp.asarray(cloud.points)
+    points = jnp.asarray(cloud.points).T
+    # Where covariances are given, or none are needed, there may be no neighbours.
+    neighbors = jnp.zeros((points.shape[1], 0), jnp.int32) if cloud.neighbors is None else jnp.asarray(cloud.neighbors)
+    return surface(method, cloud, cov.by_neighborhoods(method.covariance(cloud), points, neighbors))
+
+
+def surface(method: AbstractMethod, cloud: PointCloud, covariance: Float[Array, "6 N"]) -> Surface:
+    """The surface that a resolved method sees in a cloud, with its own covariances."""
     return Surface(
-        points=points.T,
-        covariance=method.covariance(cloud),
+        points=jnp.asarray(cloud.points).T,
+        covariance=covariance,
         descriptors=method.descriptors(cloud),
         valid=jnp.asarray(cloud.valid),
         absence=method.absence(cloud),
     )
 
 
-def _identity(cloud: PointCloud) -> Float[Array, "6 N"]:
-    identity = jnp.array([[1.0], [0.0], [0.0], [1.0], [0.0], [1.0]], cloud.points.dtype)
-    return jnp.broadcast_to(identity, (6, cloud.points.shape[0]))
+def _identity(around: cov.Neighborhoods) -> Float[Array, "6 n"]:
+    identity = jnp.array([[1.0], [0.0], [0.0], [1.0], [0.0], [1.0]], around.normal.dtype)
+    return jnp.broadcast_to(identity, (6, around.rows.size))
+
+
+def _given(cloud: PointCloud) -> Covariance:
+    covariances = cov.symmetric_from_matrix(jnp.asarray(cloud.covariances))
+    return lambda around: covariances[:, around.rows]
 
 
 def _weighted_channels(cloud: PointCloud, weights: Float[Array, "..."]) -> Float[Array, "N C"]:

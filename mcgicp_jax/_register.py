@@ -18,7 +18,7 @@ from mcgicp_jax._channels import eagerly_if, neighbors_of, point_spacing, with_c
 from mcgicp_jax._cloud import PointCloud, Values
 from mcgicp_jax._cost import AbstractKernel, centred_pose, check_matches
 from mcgicp_jax._dense import default_search
-from mcgicp_jax._evidence import Evidence, find_evidence
+from mcgicp_jax._evidence import Evidence, look
 from mcgicp_jax._loop import (
     Assessment,
     Problem,
@@ -270,26 +270,20 @@ def _look_at_both(
     method: AbstractMethod, source: PointCloud, target: PointCloud
 ) -> tuple[tuple[Surface, Evidence], tuple[Surface, Evidence]]:
     if not is_concrete(method, source, target):
-        return _look(method, source), _look(method, target)
+        return look(method, source), look(method, target)
     # On CPUs a program runs on the thread that calls it, by and large: two threads take half of the time.
     x64, device = jax.enable_x64.value, jax.default_device.value
 
     def look_at_source() -> tuple[Surface, Evidence]:
         # What a user has set for a block of code holds in that block's thread alone.
         with jax.enable_x64(x64), jax.default_device(device):
-            return jax.block_until_ready(_look(method, source))
+            return jax.block_until_ready(look(method, source))
 
     def look_at_target() -> tuple[Surface, Evidence]:
-        return jax.block_until_ready(_look(method, target))
+        return jax.block_until_ready(look(method, target))
 
     seen_target, seen_source = side_by_side([look_at_target, look_at_source])
     return seen_source, seen_target
-
-
-@jax.jit
-def _look(method: AbstractMethod, cloud: PointCloud) -> tuple[Surface, Evidence]:
-    """In one program, since both look at the same neighbourhoods."""
-    return prepare(method, cloud), find_evidence(method, cloud)
 
 
 def _matched(

@@ -216,7 +216,7 @@ def _share_across(
     valid = valid & pairs.valid[some]
     across = jnp.dot(rotation, source.normal[:, some], precision="highest")
     # Medians, since planes do not fit at edges: of the square of a normal variate, and of the mean of two such squares.
-    seen = jnp.where(valid, jnp.sum(across * pairs.residual[:, some], axis=0) ** 2, jnp.nan)
+    seen = jnp.where(valid, cov.inner(across, pairs.residual[:, some]) ** 2, jnp.nan)
     expected = jnp.where(valid, source.roughness[some] + target.roughness[indices[some]], jnp.nan)
     ratio = (jnp.nanmedian(seen) / 0.455) / (jnp.nanmedian(expected) / 0.693)
     return jnp.where(jnp.isfinite(ratio), jnp.clip(ratio, _LEAST_SHARE, 1), 1)
@@ -255,7 +255,7 @@ def _change_of_weight(pairs: Pairs, robust: AbstractKernel | None) -> Float[Arra
     if robust is None:
         return jnp.zeros_like(pairs.information)
     pull = cov.multiply(pairs.information, pairs.residual)
-    square = jnp.sum(pairs.residual * pull, axis=0)
+    square = cov.inner(pairs.residual, pull)
     slope = jax.grad(lambda square: jnp.sum(robust.weight(square)))(square)
     return 2 * pairs.share * slope * cov.outer(pull)
 

@@ -132,7 +132,9 @@ def test_without_contrast_it_is_gicp_bit_by_bit(channels):
     values = None if channels == "none" else np.full((2000, 3), [0.1, 77.7, -3e4])
     cloud = preprocess(PointCloud(points, values), num_neighbors=K)
     method = MultiChannelGICP(0.3, 0.1, EPSILON)
-    np.testing.assert_array_equal(method.covariance(cloud), GICP(EPSILON).covariance(cloud))
+    with jax.disable_jit():
+        several, one = (prepare(each, cloud).covariance for each in (method, GICP(EPSILON)))
+    np.testing.assert_array_equal(several, one)
     compiled = prepare(method, cloud).covariance, prepare(GICP(EPSILON), cloud).covariance
     np.testing.assert_allclose(*compiled, rtol=0, atol=8 * np.finfo(dtype()).eps)
 
@@ -261,7 +263,7 @@ def test_gradients_through_missing_channels(argument):
 
 def weighted_sum(points, channels, channel_covariance, epsilon, cloud, weights, as_gicp):
     method = GICP(epsilon) if as_gicp else MultiChannelGICP(channel_covariance, 0.1, epsilon, min_eigenvalue=1e-3)
-    return jnp.sum(weights * method.covariance(cloud.replace(points=points, channels=channels)))
+    return jnp.sum(weights * prepare(method, cloud.replace(points=points, channels=channels)).covariance)
 
 
 weighted_sum_and_gradients = jax.jit(jax.value_and_grad(weighted_sum, argnums=(0, 1, 2, 3)), static_argnums=6)
@@ -578,10 +580,10 @@ def test_large_clouds_are_taken_block_by_block(monkeypatch):
     weights = jnp.asarray(rng.normal(size=(6, 700)), float)
 
     def both():
-        def weighed(points):
-            return jnp.sum(weights * cov.local_covariance(points, neighbors))
+        def local(points):
+            return cov.by_neighborhoods(lambda around: around.covariance, points, neighbors)
 
-        return jax.jit(functools.partial(cov.local_covariance, neighbors=neighbors))(points), jax.grad(weighed)(points)
+        return jax.jit(local)(points), jax.grad(lambda points: jnp.sum(weights * local(points)))(points)
 
     whole = both()
     monkeypatch.setattr(cov, "_LARGEST_WHOLE", 100)

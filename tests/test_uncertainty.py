@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 import mcgicp_jax as mcg
 from mcgicp_jax import _covariance as cov
 from mcgicp_jax import datasets
-from mcgicp_jax._evidence import find_evidence
+from mcgicp_jax._evidence import look
 from mcgicp_jax._uncertainty import Felt, find_directions
 
 from .scenes import motion, pair, room_corner, wall
@@ -21,7 +21,7 @@ def matrices(symmetric):
 
 
 def mean_evidence(cloud, method):
-    found = find_evidence(method, cloud)
+    _, found = look(method, cloud)
     keep = np.asarray(cloud.valid)
     channels = None if found.channels is None else matrices(found.channels)[keep].mean(axis=0)
     return matrices(found.geometry)[keep].mean(axis=0), channels
