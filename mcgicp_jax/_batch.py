@@ -167,9 +167,9 @@ class PairWarning(UserWarning):
         reason: what is wrong with it.
     """
 
-    # Set afterwards, since whoever catches, copies or repeats warnings makes them of a message alone.
-    index: int
-    reason: str
+    # Set afterwards: whoever catches, copies or repeats warnings may make them of a message alone.
+    index: int | None = None
+    reason: str = ""
 
 
 @dataclass(frozen=True)

@@ -145,9 +145,13 @@ def eagerly_if(concrete: bool) -> contextlib.AbstractContextManager[None]:
     return jax.ensure_compile_time_eval() if concrete else contextlib.nullcontext()
 
 
-def neighbors_of(cloud: PointCloud) -> Array:
+def check_neighbors(cloud: PointCloud) -> None:
     if cloud.neighbors is None:
         raise ValueError("cloud: expected one with neighbors or covariances; make it with mcgicp_jax.preprocess")
+
+
+def neighbors_of(cloud: PointCloud) -> Array:
+    check_neighbors(cloud)
     return jnp.asarray(cloud.neighbors)
 
 

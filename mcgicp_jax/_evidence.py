@@ -45,18 +45,20 @@ class Evidence(eqx.Module):
 
 @jax.jit
 def look(method: AbstractMethod, cloud: PointCloud) -> tuple[Surface, Evidence]:
-    """The surface and the evidence that a resolved method finds in a preprocessed cloud. Both look at the same
-    neighbourhoods. Evidence is constant to autodiff."""
-    covariance, evidence = method.covariance(cloud), _evidence(*jax.lax.stop_gradient((method, cloud)))
+    """The surface and the evidence that a resolved method finds in a preprocessed cloud.
+
+    Both look at the same neighbourhoods. Evidence is constant to autodiff.
+    """
+    covariance, find = method.covariance_around(cloud), _evidence_of(*jax.lax.stop_gradient((method, cloud)))
 
     def both(around: cov.Neighborhoods) -> tuple[Float[Array, "6 n"], Evidence]:
-        return covariance(around), evidence(jax.lax.stop_gradient(around))
+        return covariance(around), find(jax.lax.stop_gradient(around))
 
-    covariances, found = cov.by_neighborhoods(both, jnp.asarray(cloud.points).T, jnp.asarray(cloud.neighbors))
-    return surface(method, cloud, covariances), found
+    covariances, evidence = cov.by_neighborhoods(both, jnp.asarray(cloud.points).T, jnp.asarray(cloud.neighbors))
+    return surface(method, cloud, covariances), evidence
 
 
-def _evidence(method: AbstractMethod, cloud: PointCloud) -> Callable[[cov.Neighborhoods], Evidence]:
+def _evidence_of(method: AbstractMethod, cloud: PointCloud) -> Callable[[cov.Neighborhoods], Evidence]:
     descriptors = method.descriptors(cloud) if method.uses_channels and cloud.channels.shape[-1] else None
     channel_valid = None if cloud.channel_valid is None else jnp.asarray(cloud.channel_valid)
 

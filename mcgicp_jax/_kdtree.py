@@ -27,8 +27,8 @@ from mcgicp_jax._threads import num_cores, side_by_side
 # How many candidates are looked at to break a tie by row number: a multiple of those asked for, and at least so many.
 _TIE_CANDIDATES = 8
 _LEAST_TIE_CANDIDATES = 64
-# Queries that are worth being given to another thread, and in how many parts all of them are: several, since a thread
-# may come late.
+# Queries that are worth being given to another thread, and how many such parts there are, at most, for each thread:
+# several, since a thread may come late.
 _LEAST_PART, _PARTS_PER_THREAD = 1000, 8
 # A tree of more points falls out of a processor's caches, and is searched faster by queries that lie side by side.
 _LARGEST_UNORDERED = 50_000
@@ -345,5 +345,5 @@ def _query(
     most = num_cores() if workers == -1 else workers
     count = 1 if most == 1 else min(_PARTS_PER_THREAD * most, len(queries) // _LEAST_PART)
     parts = np.array_split(queries, max(1, count))
-    distances, rows = zip(*side_by_side([partial(ask, part) for part in parts]), strict=True)
+    distances, rows = zip(*side_by_side([partial(ask, part) for part in parts], most), strict=True)
     return np.concatenate(distances), np.concatenate(rows)

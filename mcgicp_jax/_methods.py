@@ -16,7 +16,7 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float
 
 from mcgicp_jax import _covariance as cov
-from mcgicp_jax._channels import channel_noise, eagerly_if, neighbors_of, point_spacing
+from mcgicp_jax._channels import channel_noise, check_neighbors, eagerly_if, point_spacing
 from mcgicp_jax._cloud import PointCloud, Values
 from mcgicp_jax._pose import is_concrete
 from mcgicp_jax._search import Rows
@@ -31,7 +31,7 @@ _MIN_EIGENVALUE = 5e-3
 _MATCH_VARIANCE = 0.72
 
 
-# What a method makes of points and what lies around them: (6, n) symmetric 3×3 matrices.
+# From points and what lies around them to symmetric 3×3 matrices, whose meaning is the method's affair.
 Covariance: TypeAlias = Callable[[cov.Neighborhoods], Float[Array, "6 n"]]
 
 
@@ -83,8 +83,16 @@ class AbstractMethod(Numbers):
         return self
 
     @abc.abstractmethod
-    def covariance(self, cloud: PointCloud) -> Covariance:
-        """What this method knows of the surface at points of a cloud."""
+    def covariance_around(self, cloud: PointCloud) -> Covariance:
+        """What this method knows of the surface at points of a cloud, as a function of what lies around them."""
+
+    def covariance(self, cloud: PointCloud) -> Float[Array, "6 N"]:
+        """The same at each point: symmetric 3×3 matrices, by their upper triangles."""
+        points = jnp.asarray(cloud.points).T
+        # Where covariances are given, or none are needed, there may be no neighbours.
+        none = jnp.zeros((points.shape[1], 0), jnp.int32)
+        neighbors = none if cloud.neighbors is None else jnp.asarray(cloud.neighbors)
+        return cov.by_neighborhoods(self.covariance_around(cloud), points, neighbors)
 
     @abc.abstractmethod
     def information(
@@ -113,18 +121,18 @@ class AbstractOneSided(AbstractMethod):
 class PointToPoint(AbstractOneSided):
     """Plain ICP (Besl & McKay 1992): M = I."""
 
-    def covariance(self, cloud: PointCloud) -> Covariance:
+    def covariance_around(self, cloud: PointCloud) -> Covariance:
         return _identity
 
 
 class PointToPlane(AbstractOneSided):
     """Point-to-plane ICP (Chen & Medioni 1991): M = n nᵀ with the target's normals."""
 
-    def covariance(self, cloud: PointCloud) -> Covariance:
+    def covariance_around(self, cloud: PointCloud) -> Covariance:
         if cloud.covariances is not None:
             given = _given(cloud)
             return lambda around: cov.outer(cov.smallest_eigenvector(given(around)))
-        neighbors_of(cloud)
+        check_neighbors(cloud)
         return lambda around: cov.outer(around.normal)
 
 
@@ -155,7 +163,7 @@ class ColorICP(AbstractOneSided):
         variance = MultiChannelGICP(channel_weights=0.0).resolve(source, target).channel_covariance
         return eqx.tree_at(lambda method: method.missing_variance, self, variance, is_leaf=lambda leaf: leaf is None)
 
-    def covariance(self, cloud: PointCloud) -> Covariance:
+    def covariance_around(self, cloud: PointCloud) -> Covariance:
         return _identity
 
     def descriptors(self, cloud: PointCloud) -> Float[Array, "N D"]:
@@ -191,10 +199,10 @@ class GICP(AbstractGeneralized):
         """Raises `ValueError` unless ε is positive, and large enough for the precision (1.2e-5 in float32)."""
         self.epsilon = _epsilon(epsilon)
 
-    def covariance(self, cloud: PointCloud) -> Covariance:
+    def covariance_around(self, cloud: PointCloud) -> Covariance:
         if cloud.covariances is not None:
             return _given(cloud)
-        neighbors_of(cloud)
+        check_neighbors(cloud)
         epsilon = self.epsilon.astype(cloud.points.dtype)
         return lambda around: cov.plane_covariance(around.covariance, around.normal, epsilon)
 
@@ -273,17 +281,17 @@ class MultiChannelGICP(AbstractGeneralized):
             is_leaf=lambda leaf: leaf is None,
         )
 
-    def covariance(self, cloud: PointCloud) -> Covariance:
+    def covariance_around(self, cloud: PointCloud) -> Covariance:
         if cloud.covariances is not None:
             return _given(cloud)
         if self.channel_covariance is None:
             raise ValueError("channel_covariance: not chosen yet; call method.resolve(source, target) first")
-        neighbors_of(cloud)
+        check_neighbors(cloud)
         dtype = cloud.points.dtype
         channels, covariance = jnp.asarray(cloud.channels), self.channel_covariance.astype(dtype)
         _check_covariance_fits(covariance, channels.shape[-1])
         if channels.shape[-1] == 0:
-            return GICP(self.epsilon).covariance(cloud)
+            return GICP(self.epsilon).covariance_around(cloud)
         if cloud.channel_valid is None:
             kernel = partial(cov.channel_kernel, _whiten(channels, covariance))
         else:
@@ -308,10 +316,7 @@ class MultiChannelGICP(AbstractGeneralized):
 @jax.jit
 def prepare(method: AbstractMethod, cloud: PointCloud) -> Surface:
     """The surface that a resolved method sees in a cloud."""
-    points = jnp.asarray(cloud.points).T
-    # Where covariances are given, or none are needed, there may be no neighbours.
-    neighbors = jnp.zeros((points.shape[1], 0), jnp.int32) if cloud.neighbors is None else jnp.asarray(cloud.neighbors)
-    return surface(method, cloud, cov.by_neighborhoods(method.covariance(cloud), points, neighbors))
+    return surface(method, cloud, method.covariance(cloud))
 
 
 def surface(method: AbstractMethod, cloud: PointCloud, covariance: Float[Array, "6 N"]) -> Surface:

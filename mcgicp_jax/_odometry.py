@@ -12,7 +12,7 @@ from jaxtyping import Float
 from mcgicp_jax._cloud import PointCloud, Values
 from mcgicp_jax._methods import AbstractMethod
 from mcgicp_jax._pose import Pose, pose_matrix
-from mcgicp_jax._preprocess import preprocess
+from mcgicp_jax._preprocess import check_preprocessing, preprocess
 from mcgicp_jax._register import Distance, register
 from mcgicp_jax._result import Registration, Status
 from mcgicp_jax.datasets import Frame
@@ -67,6 +67,7 @@ def odometry(
     Raises:
         ValueError: if a cloud or an argument does not fit.
     """
+    check_preprocessing(voxel_size, num_neighbors)
     motion = pose_matrix(options.pop("init", None))
     pose = np.asarray(pose_matrix(start, "start"))
     before: PointCloud | None = None

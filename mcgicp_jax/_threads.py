@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import collections
 import functools
 import os
 from collections.abc import Callable, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor, wait
 from typing import TypeVar
 
 Answer = TypeVar("Answer")
@@ -16,24 +17,48 @@ def num_cores() -> int:
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
-def side_by_side(calls: Sequence[Callable[[], Answer]]) -> list[Answer]:
-    """The answers of calls, of which this thread makes the first, and others at the same time the rest.
+def side_by_side(calls: Sequence[Callable[[], Answer]], most: int | None = None) -> list[Answer]:
+    """The answers of calls, of which this thread makes the first and others take their share of the rest.
 
     The others are those of the whole process. They stay, since a new thread begins on the core of the one that started
-    it, and most queries are over before it is given another. What none of them has begun when this thread is ready, it
-    does itself, the last first, since they begin with the first: nobody waits for threads that wait.
+    it, and most queries are over before it is given another. Whoever is ready takes the next call, so that nobody waits
+    for threads that come late, or that wait themselves.
+
+    Args:
+        most: threads at work, this one among them; as many as there are calls by default.
     """
-    others = [(call, _submit(call)) for call in calls[1:]]
-    first = calls[0]()
-    own = {i: call() for i, (call, answer) in reversed(list(enumerate(others))) if answer.cancel()}
-    return [first, *(own[i] if i in own else answer.result() for i, (_, answer) in enumerate(others))]
+    answers: dict[int, Answer] = {}
+    waiting = collections.deque(enumerate(calls))
+    first, call = waiting.popleft()
 
+    def work() -> None:
+        while waiting:
+            try:
+                i, call = waiting.popleft()
+            except IndexError:
+                # Another one was quicker.
+                return
+            answers[i] = call()
 
-def _submit(call: Callable[[], Answer]) -> Future[Answer]:
+    helpers = [_submit(work) for _ in range(min(len(calls), most or len(calls)) - 1)]
     try:
-        return _threads().submit(call)
+        answers[first] = call()
+        work()
+    finally:
+        # After an error nobody goes on.
+        waiting.clear()
+        begun = [helper for helper in helpers if not helper.cancel()]
+        wait(begun)
+    for helper in begun:
+        helper.result()
+    return [answers[i] for i in range(len(calls))]
+
+
+def _submit(work: Callable[[], None]) -> Future[None]:
+    try:
+        return _threads().submit(work)
     except RuntimeError:
-        # While the interpreter shuts down, no thread takes anything new: what nobody begins can be cancelled.
+        # No new thread can be had, as while the interpreter shuts down: what nobody begins can be cancelled.
         return Future()
 
 

@@ -117,7 +117,8 @@ def test_the_warning_can_be_sent_copied_and_repeated():
     warning = caught[0].message
     for same in (warning, pickle.loads(pickle.dumps(warning)), copy.deepcopy(warning)):
         assert same.index == 0 and str(same) == f"pair 0: {same.reason}" and "source" in same.reason
-    assert str(mcg.PairWarning(str(warning))) == str(warning)
+    bare = mcg.PairWarning(str(warning))
+    assert str(bare) == str(warning) and bare.index is None and bare.reason == ""
 
 
 def test_pairs_without_overlap_or_far_from_rest_have_the_status_of_register(raw, alone):

@@ -11,6 +11,8 @@ from hypothesis import strategies as st
 
 from mcgicp_jax import GICP, MultiChannelGICP, PointCloud, PointToPlane, preprocess
 from mcgicp_jax import _covariance as cov
+from mcgicp_jax._channels import channel_noise
+from mcgicp_jax._evidence import look
 from mcgicp_jax._methods import prepare
 from tests import reference as ref
 from tests.reference import tolerance
@@ -132,9 +134,7 @@ def test_without_contrast_it_is_gicp_bit_by_bit(channels):
     values = None if channels == "none" else np.full((2000, 3), [0.1, 77.7, -3e4])
     cloud = preprocess(PointCloud(points, values), num_neighbors=K)
     method = MultiChannelGICP(0.3, 0.1, EPSILON)
-    with jax.disable_jit():
-        several, one = (prepare(each, cloud).covariance for each in (method, GICP(EPSILON)))
-    np.testing.assert_array_equal(several, one)
+    np.testing.assert_array_equal(method.covariance(cloud), GICP(EPSILON).covariance(cloud))
     compiled = prepare(method, cloud).covariance, prepare(GICP(EPSILON), cloud).covariance
     np.testing.assert_allclose(*compiled, rtol=0, atol=8 * np.finfo(dtype()).eps)
 
@@ -263,7 +263,7 @@ def test_gradients_through_missing_channels(argument):
 
 def weighted_sum(points, channels, channel_covariance, epsilon, cloud, weights, as_gicp):
     method = GICP(epsilon) if as_gicp else MultiChannelGICP(channel_covariance, 0.1, epsilon, min_eigenvalue=1e-3)
-    return jnp.sum(weights * prepare(method, cloud.replace(points=points, channels=channels)).covariance)
+    return jnp.sum(weights * method.covariance(cloud.replace(points=points, channels=channels)))
 
 
 weighted_sum_and_gradients = jax.jit(jax.value_and_grad(weighted_sum, argnums=(0, 1, 2, 3)), static_argnums=6)
@@ -587,6 +587,30 @@ def test_large_clouds_are_taken_block_by_block(monkeypatch):
 
     whole = both()
     monkeypatch.setattr(cov, "_LARGEST_WHOLE", 100)
-    monkeypatch.setattr(cov, "_BLOCK", 128)
+    monkeypatch.setattr(cov, "_LARGEST_BLOCK", 128)
     for one, other in zip(both(), whole, strict=True):
         np.testing.assert_allclose(one, other, rtol=1e-5, atol=1e-6)
+
+
+def test_surfaces_evidence_and_noise_are_the_same_block_by_block(monkeypatch):
+    points, channels = ref.scene(700, 3, seed=4)
+    mask = np.random.default_rng(0).random((700, 3)) < 0.8
+    clouds = [preprocess(PointCloud(points, channels, channel_valid=valid), num_neighbors=K) for valid in (None, mask)]
+    rows = clouds[0].points.shape[0]
+    covariances = np.broadcast_to(np.diag([1.0, 2.0, 3.0]), (rows, 3, 3)).astype(clouds[0].points.dtype)
+    told = clouds[0].replace(covariances=covariances)
+    method = MultiChannelGICP(0.3 * np.eye(3), 0.1)
+
+    def everything():
+        # Anew each time: what was compiled before is whole.
+        def of_all():
+            noise = [channel_noise.__wrapped__(cloud, clouds[0]) for cloud in clouds]
+            return noise, [look.__wrapped__(method, cloud) for cloud in (*clouds, told)]
+
+        return jax.tree.leaves(jax.jit(of_all)())
+
+    whole = everything()
+    monkeypatch.setattr(cov, "_LARGEST_WHOLE", 100)
+    monkeypatch.setattr(cov, "_LARGEST_BLOCK", 128)
+    for one, other in zip(everything(), whole, strict=True):
+        np.testing.assert_allclose(one, other, rtol=tolerance(1e-3, 1e-9), atol=tolerance(2e-4, 1e-9))

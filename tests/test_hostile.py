@@ -144,7 +144,6 @@ def copied(values):
     return copy.deepcopy(np.asarray(values))
 
 
-@pytest.mark.slow
 @settings(max_examples=80, deadline=None)
 @given(st.data())
 def test_register_survives_anything(data):

@@ -117,9 +117,7 @@ def test_the_floor_of_omega_rises_on_smooth_surfaces(roughness, expected):
     expected = expected or 1e-3 * 0.72 / (2 * roughness**2 * 17 / 20)
     np.testing.assert_allclose(found, expected, rtol=0.05)
     assert MultiChannelGICP(0.3).resolve(cloud, cloud).min_eigenvalue is None
-    assert MultiChannelGICP(min_eigenvalue=0.2).resolve(cloud, cloud).min_eigenvalue == jnp.asarray(
-        0.2
-    )  # of the default precision
+    assert MultiChannelGICP(min_eigenvalue=0.2).resolve(cloud, cloud).min_eigenvalue == jnp.asarray(0.2)
 
 
 def test_noise_is_found_where_the_channel_is():

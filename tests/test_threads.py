@@ -1,6 +1,7 @@
 """Work side by side: every answer in its place, and no waiting for those who wait."""
 
 import threading
+import time
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 
@@ -36,3 +37,39 @@ def test_without_threads_this_one_does_it_all(monkeypatch):
 def test_an_error_is_raised():
     with pytest.raises(ZeroDivisionError):
         side_by_side([lambda: 1, lambda: 1 // 0])
+
+
+def test_no_more_threads_than_asked_for_are_at_work(monkeypatch):
+    running, peak = [], []
+
+    def work():
+        running.append(1)
+        peak.append(len(running))
+        time.sleep(0.01)
+        running.pop()
+
+    with ThreadPoolExecutor(8) as threads:
+        monkeypatch.setattr(_threads, "_threads", lambda: threads)
+        side_by_side([work] * 20, 3)
+        assert max(peak) == 3
+        peak.clear()
+        side_by_side([work] * 20, 1)
+        assert max(peak) == 1
+
+
+@pytest.mark.timeout(30)
+def test_after_an_error_nobody_goes_on(monkeypatch):
+    calls = []
+
+    def fail():
+        raise ZeroDivisionError
+
+    def slow():
+        calls.append(1)
+        time.sleep(0.05)
+
+    with ThreadPoolExecutor(1) as threads:
+        monkeypatch.setattr(_threads, "_threads", lambda: threads)
+        with pytest.raises(ZeroDivisionError):
+            side_by_side([fail, *[slow] * 50])
+    assert len(calls) <= 1

@@ -210,7 +210,7 @@ def _rows(pairs: Sequence[Pair], settings: dict[str, Any], bar: tqdm) -> Generat
     show = warnings.showwarning
 
     def keep(message: Warning | str, *rest: Any, **options: Any) -> None:
-        if isinstance(message, mcg.PairWarning):
+        if isinstance(message, mcg.PairWarning) and message.index is not None:
             reasons[message.index] = message.reason
             message = f"{' '.join(pairs[message.index].key)}: {message.reason}"
         with bar.external_write_mode(file=sys.stderr):
