@@ -180,3 +180,26 @@ def test_control_c_loses_nothing_that_is_done(folder, tmp_path):
     rows = table(output)
     assert 19 <= len(rows) < len(repeated)
     assert f"done:      {len(rows):,} of {len(repeated):,}" in text
+
+
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
+def test_control_c_is_noticed_where_python_loses_it(folder, tmp_path, capsys, monkeypatch):
+    completed = mcg.register_as_completed
+
+    class Loses:
+        def __del__(self):
+            signal.raise_signal(signal.SIGINT)
+
+    def interrupted(*arguments, **options):
+        for answer in completed(*arguments, **options):
+            yield answer
+            Loses()
+
+    monkeypatch.setattr(mcg, "register_as_completed", interrupted)
+    output = tmp_path / "results.csv"
+    before = signal.getsignal(signal.SIGINT)
+    assert run_folder(folder, output) == 130
+    assert signal.getsignal(signal.SIGINT) is before
+    assert len(table(output)) == 2 and "interrupted" in capsys.readouterr().err
+    monkeypatch.undo()
+    assert run_folder(folder, output) == 0 and len(table(output)) == NUM_FILES - 1

@@ -6,13 +6,16 @@ import collections
 import contextlib
 import csv
 import itertools
+import signal
 import sys
+import threading
 import time
 import warnings
-from collections.abc import Generator, Sequence
+from collections.abc import Generator, Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
+from types import FrameType
 from typing import Annotated, Any, Literal, TypeAlias
 
 import numpy as np
@@ -106,12 +109,15 @@ def batch(
             table.appending() as append,
             tqdm(total=len(everything), initial=finished, unit="pair", disable=None) as bar,
             contextlib.closing(_rows(missing, settings | {"max_iterations": max_iterations}, bar)) as completed,
+            _interrupts() as pressed,
         ):
             try:
                 for pair, row in completed:
                     append(row)
                     rows[pair.key] = row
                     bar.update()
+                    if pressed:
+                        raise KeyboardInterrupt
             except KeyboardInterrupt:
                 interrupted = True
         done = sum(pair.key in rows for pair in missing)
@@ -127,6 +133,29 @@ def batch(
     if failed:
         print(f"mcgicp: {failed} of {len(everything)} pairs did not converge; see {output}", file=sys.stderr)
     return 1 if failed else 0
+
+
+@contextlib.contextmanager
+def _interrupts() -> Iterator[list[int]]:
+    """One entry for each Ctrl-C, which interrupts as it always does.
+
+    Python loses an interrupt that comes while a callback of the garbage collector runs, and JAX has one.
+    """
+    pressed: list[int] = []
+
+    def notice(number: int, frame: FrameType | None) -> None:
+        pressed.append(number)
+        signal.default_int_handler(number, frame)
+
+    if threading.current_thread() is not threading.main_thread():
+        # Interrupts do not come here.
+        yield pressed
+        return
+    before = signal.signal(signal.SIGINT, notice)
+    try:
+        yield pressed
+    finally:
+        signal.signal(signal.SIGINT, before)
 
 
 def _pairs_of_table(path: Path) -> list[Pair]:
