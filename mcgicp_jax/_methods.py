@@ -265,15 +265,13 @@ class MultiChannelGICP(AbstractGeneralized):
             sigma, constant, across = channel_noise(source, target)
         with eagerly_if(is_concrete(target)):
             spacing = point_spacing(target)
-        covariance, weights, floor = self.channel_covariance, self.channel_weights, self.min_eigenvalue
-        if covariance is None:
-            covariance = 2 * (_SPREAD * sigma) ** 2
-            if floor is None:
-                within = jax.lax.stop_gradient(self.epsilon) * _MATCH_VARIANCE * spacing**2
-                smooth = ~(2 * across > within)
-                floor = jnp.where(smooth, 1, jnp.maximum(within / jnp.where(smooth, 1, 2 * across), _MIN_EIGENVALUE))
-        if weights is None:
-            weights = jnp.where(constant, 0, _REACH * spacing / sigma)
+        covariance, weights, floor = _chosen(sigma, constant, across, spacing, jax.lax.stop_gradient(self.epsilon))
+        if self.channel_covariance is not None:
+            covariance, floor = self.channel_covariance, self.min_eigenvalue
+        if self.min_eigenvalue is not None:
+            floor = self.min_eigenvalue
+        if self.channel_weights is not None:
+            weights = self.channel_weights
         return eqx.tree_at(
             lambda method: (method.channel_covariance, method.channel_weights, method.min_eigenvalue),
             self,
@@ -328,6 +326,21 @@ def surface(method: AbstractMethod, cloud: PointCloud, covariance: Float[Array, 
         valid=jnp.asarray(cloud.valid),
         absence=method.absence(cloud),
     )
+
+
+@jax.jit
+def _chosen(
+    sigma: Float[Array, "C"],
+    constant: Bool[Array, "C"],
+    across: Float[Array, ""],
+    spacing: Float[Array, ""],
+    epsilon: Float[Array, ""],
+) -> tuple[Float[Array, "C"], Float[Array, "C"], Float[Array, ""]]:
+    """Λ, α and the floor of Ω, as `MultiChannelGICP.resolve` says."""
+    within = epsilon * _MATCH_VARIANCE * spacing**2
+    smooth = ~(2 * across > within)
+    floor = jnp.where(smooth, 1, jnp.maximum(within / jnp.where(smooth, 1, 2 * across), _MIN_EIGENVALUE))
+    return 2 * (_SPREAD * sigma) ** 2, jnp.where(constant, 0, _REACH * spacing / sigma), floor
 
 
 def _identity(around: cov.Neighborhoods) -> Float[Array, "6 n"]:
