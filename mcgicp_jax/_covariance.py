@@ -64,7 +64,7 @@ def rotate(rotation: Float[Array, "3 3"], symmetric: Float[Array, "6 N"]) -> Flo
 
 
 def inner(a: Float[Array, "3 N"], b: Float[Array, "3 N"]) -> Float[Array, "N"]:
-    """aᵀ b, row by row. Written out for the pairs of a whole cloud, which is twenty times faster than a sum.
+    """aᵀ b, row by row. Written out for the pairs of a whole cloud, since sums over a first axis are slow there.
 
     Not for neighbourhoods: there sums keep XLA from computing what they are made of again for each use, and are faster.
     """

@@ -266,10 +266,10 @@ class MultiChannelGICP(AbstractGeneralized):
         with eagerly_if(is_concrete(target)):
             spacing = point_spacing(target)
         covariance, weights, floor = _chosen(sigma, constant, across, spacing, jax.lax.stop_gradient(self.epsilon))
-        if self.channel_covariance is not None:
-            covariance, floor = self.channel_covariance, self.min_eigenvalue
-        if self.min_eigenvalue is not None:
+        if self.channel_covariance is not None or self.min_eigenvalue is not None:
             floor = self.min_eigenvalue
+        if self.channel_covariance is not None:
+            covariance = self.channel_covariance
         if self.channel_weights is not None:
             weights = self.channel_weights
         return eqx.tree_at(
