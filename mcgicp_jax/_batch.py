@@ -222,7 +222,7 @@ class _Job:
             source, target = self.ready("source", pair.source), self.ready("target", pair.target)
             size = max(source.points.shape[0], target.points.shape[0])
             source, target = source.pad(size), target.pad(size)
-            problem = pose_problem(source, target, self.method, pair.init, **self.settings)
+            problem = pose_problem(source, target, self.method, pair.init, **self.settings, most_threads=1)
         except ValueError as error:
             return _invalid(pair, error)
         return _Problem(pair.index, source, target), problem

@@ -38,10 +38,14 @@ class KDTreeSearch(AbstractSearch):
     """Exact search with SciPy's k-d tree on the host. Equal distances are ordered by row, so that results repeat.
 
     Attributes:
-        workers: threads of one query, at most; −1 takes all cores.
+        workers: threads of one registration, at most; −1 takes all cores.
     """
 
     workers: int = eqx.field(static=True, default=-1)
+
+    @property
+    def most_threads(self) -> int | None:
+        return None if self.workers == -1 else self.workers
 
     def index(self, target: Rows) -> KDTreeIndex:
         return KDTreeIndex(_on_host(target), self.workers)
@@ -104,7 +108,8 @@ class KDTreeIndex(AbstractIndex):
         self, pose: Float[ArrayLike, "7"], source: Rows, max_distance: Float[ArrayLike, ""], num_candidates: int = 1
     ) -> Int[np.ndarray, "m N"]:
         source = _on_host(source)
-        queries = _moved(pose, source)
+        queries = np.hstack([_moved(pose, np.asarray(source.points.T, np.float64)), source.descriptors])
+        queries[~source.valid] = np.nan
         return self.nearest_of(queries, source.absence, float(np.asarray(max_distance)), num_candidates)[0].T
 
     def nearest_of(
@@ -123,18 +128,19 @@ class KDTreeIndex(AbstractIndex):
         if not self._rows.size:
             return indices, slack
         finite = np.isfinite(queries)
-        # Most often all are, and asking for all at once is quicker than for each row.
-        active = np.arange(len(queries)) if finite.all() else np.flatnonzero(finite.all(axis=1))
+        # Most often all are: asking for all at once is quicker than for each row, and a slice copies nothing.
+        active: slice | Int[np.ndarray, "n"] = slice(None) if finite.all() else np.flatnonzero(finite.all(axis=1))
         # With descriptors, the nearest may lie beyond the gate while a pair within it is further in all dimensions:
         # then the whole space is searched. The margin covers rounding; the gate itself is applied to the position.
         bound = np.inf if queries.shape[1] > 3 else 1.001 * max_distance
         if absence is None:
-            patterns, which = np.zeros((1, queries.shape[1] - 3)), np.zeros(active.size, int)
+            groups = [(np.zeros(queries.shape[1] - 3), active)]
         else:
             # Few, since a sensor sees a point or does not.
             patterns, which = np.unique(absence[active], axis=0, return_inverse=True)
-        for i, pattern in enumerate(patterns):
-            alike = active[which.ravel() == i]
+            rows = np.arange(len(queries))[active]
+            groups = [(pattern, rows[which.ravel() == i]) for i, pattern in enumerate(patterns)]
+        for pattern, alike in groups:
             found, slack[alike] = self._nearest(queries[alike], pattern, k, bound)
             indices[alike, : found.shape[1]] = found
         return indices, slack
@@ -146,9 +152,9 @@ class KDTreeIndex(AbstractIndex):
         parts = self._parts_for(absence)
         answers = [part.nearest(queries, k, self._workers, bound) for part in parts]
         found = [each for each, _ in answers]
-        rows = np.hstack([np.append(part.rows, -1)[each] for part, each in zip(parts, found, strict=True)])
         if len(parts) == 1:
-            return rows, answers[0][1]
+            return parts[0].rows[found[0]], answers[0][1]
+        rows = np.hstack([part.rows[each] for part, each in zip(parts, found, strict=True)])
         squares = np.hstack([part.squares(queries, each) for part, each in zip(parts, found, strict=True)])
         nearest = np.take_along_axis(rows, np.lexsort((rows, squares), axis=1)[:, :k], axis=1)
         return nearest, np.zeros(len(queries))
@@ -173,7 +179,8 @@ class _Part:
 
     def __init__(self, points: Float[np.ndarray, "M D"], rows: Int[np.ndarray, "M"], absence: Float[np.ndarray, "C"]):
         common = np.concatenate([np.ones(3, bool), absence == 0])
-        self.rows = rows
+        # Of the numbers that are answered; the last one, for that of nothing.
+        self.rows = np.append(rows, np.int32(-1))
         self._columns = slice(None) if common.all() else np.flatnonzero(common)
         self._points = points[:, self._columns]
         self._missing = absence.sum()
@@ -203,29 +210,34 @@ class _Follower:
 
     def __init__(self, index: KDTreeIndex, source: Rows, max_distance: float):
         self._index = index
-        self._source = source
         self._max_distance = max_distance
-        # Where each point was when its match was looked for, the match, and how far it may move.
-        self._queries: Float[np.ndarray, "N D"] = np.full((source.valid.size, 3 + source.descriptors.shape[1]), np.nan)
+        # Source rows that are there, those close to each other in space one after the other where that pays. All that
+        # is kept is kept in their order.
+        order: Int[np.ndarray, "n"] = np.flatnonzero(source.valid)
+        if order.size > _LARGEST_UNORDERED:
+            points = np.nan_to_num(source.points.T[order], posinf=0, neginf=0)
+            order = order[np.asarray(scipy.spatial.cKDTree(points, 256, balanced_tree=False).indices)]
+        self._order = order
+        self._points = np.asarray(source.points.T[order], np.float64)
+        self._descriptors = source.descriptors[order]
+        self._absence = None if source.absence is None else source.absence[order]
+        # Where each point was when its match was looked for, and how far it may move from there.
+        self._asked: Float[np.ndarray, "n 3"] = np.full((order.size, 3), np.nan)
+        self._slack: Float[np.ndarray, "n"] = np.zeros(order.size)
         self._rows: Int[np.ndarray, "N"] = np.full(source.valid.size, -1, np.int32)
-        self._slack: Float[np.ndarray, "N"] = np.zeros(source.valid.size)
-        # Rows that are there, those close to each other in space one after the other where that pays.
-        self._order: Int[np.ndarray, "n"] = np.flatnonzero(source.valid)
-        if self._order.size > _LARGEST_UNORDERED:
-            points = np.nan_to_num(source.points.T[self._order], posinf=0, neginf=0)
-            self._order = self._order[scipy.spatial.cKDTree(points, 256, balanced_tree=False).indices]
 
     def nearest(self, pose: Float[ArrayLike, "7"]) -> Int[np.ndarray, "N"]:
-        queries = _moved(pose, self._source)
-        shift = queries[:, :3] - self._queries[:, :3]
+        moved = _moved(pose, self._points)
+        shift = moved - self._asked
         # Written so that NaN is looked for.
-        stale = self._order[~(np.einsum("ij,ij->i", shift, shift) < self._slack**2)[self._order]]
-        absence = None if self._source.absence is None else self._source.absence[stale]
-        found, self._slack[stale] = self._index.nearest_of(queries[stale], absence, self._max_distance, 1)
-        self._queries[stale] = queries[stale]
+        stale = np.flatnonzero(~(np.einsum("ij,ij->i", shift, shift) < self._slack**2))
+        queries = np.hstack([moved[stale], self._descriptors[stale]])
+        absence = None if self._absence is None else self._absence[stale]
+        found, self._slack[stale] = self._index.nearest_of(queries, absence, self._max_distance, 1)
+        self._asked[stale] = moved[stale]
         # What was handed out before stays as it was.
         self._rows = self._rows.copy()
-        self._rows[stale] = found[:, 0]
+        self._rows[self._order[stale]] = found[:, 0]
         return self._rows
 
 
@@ -287,14 +299,11 @@ def _on_host(rows: Rows) -> Rows:
     return jax.tree.map(np.asarray, rows)
 
 
-def _moved(pose: Float[ArrayLike, "7"], source: Rows) -> Float[np.ndarray, "N D"]:
-    """Positions at a pose, in float64, and descriptors; NaN for rows that are not valid."""
+def _moved(pose: Float[ArrayLike, "7"], points: Float[np.ndarray, "N 3"]) -> Float[np.ndarray, "N 3"]:
     pose = np.asarray(pose, np.float64)
     # What a pose without numbers moves is nowhere; the measurement will tell.
     with np.errstate(invalid="ignore"):
-        moved = source.points.T @ rotation_from_quaternion(pose[:4]).T + pose[4:]
-    moved[~source.valid] = np.nan
-    return np.hstack([moved, source.descriptors])
+        return points @ rotation_from_quaternion(pose[:4]).T + pose[4:]
 
 
 def _tree(rows: Float[np.ndarray, "M D"]) -> scipy.spatial.cKDTree:
@@ -344,6 +353,8 @@ def _query(
     ask = partial(tree.query, k=np.arange(1, k + 1), distance_upper_bound=bound)
     most = num_cores() if workers == -1 else workers
     count = 1 if most == 1 else min(_PARTS_PER_THREAD * most, len(queries) // _LEAST_PART)
-    parts = np.array_split(queries, max(1, count))
+    if count <= 1:
+        return ask(queries)
+    parts = np.array_split(queries, count)
     distances, rows = zip(*side_by_side([partial(ask, part) for part in parts], most), strict=True)
     return np.concatenate(distances), np.concatenate(rows)

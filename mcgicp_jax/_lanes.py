@@ -12,7 +12,16 @@ import numpy as np
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from jaxtyping import Array, Int
 
-from mcgicp_jax._loop import Assessment, Carry, Problem, State, assess_lanes, begin_lane, run_lanes
+from mcgicp_jax._loop import (
+    Assessment,
+    Carry,
+    Problem,
+    State,
+    assess_lanes,
+    begin_lane,
+    history_of,
+    run_lanes,
+)
 from mcgicp_jax._search import AbstractSearch
 
 Key = TypeVar("Key")
@@ -83,14 +92,14 @@ class _Group(Generic[Key]):
         ended = np.asarray(carries[0].status) >= 0
         if not any(ended[lane] and key is not None for lane, key in enumerate(self._keys)):
             return
-        states, histories, assessments = jax.device_get((carries[0], carries[2], assess_lanes(problems, carries)))
+        states, records, assessments = jax.device_get((carries[0], carries[2], assess_lanes(problems, carries)))
         for lane, key in enumerate(self._keys):
             if key is not None and ended[lane]:
                 self._keys[lane] = None
                 state, assessed = jax.tree.map(lambda leaf, lane=lane: leaf[lane], (states, assessments))
                 # Of the measurements that were made, one more than updates.
                 count = int(state.num_iterations) + 1
-                yield key, state, assessed, {name: values[lane, :count] for name, values in histories.items()}
+                yield key, state, assessed, history_of(records[lane, :count])
 
 
 def _put(lanes: tuple[Problem, Carry], lane: tuple[Problem, Carry], number: Int[Array, ""]) -> tuple[Problem, Carry]:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import partial
-from typing import TypeAlias
+from typing import Any, TypeAlias
 
 import equinox as eqx
 import jax
@@ -37,6 +37,7 @@ from mcgicp_jax._uncertainty import (
 # update was below the tolerances, and one more measurement ends the loop.
 _COARSE, _RUNNING, _SETTLED = -3, -1, -2
 _MIN_CORRESPONDENCES = 4
+_RECORDED = ("cost", "rmse", "num_inliers", "translation_step", "rotation_step")
 
 
 class Settings(eqx.Module):
@@ -78,7 +79,7 @@ class State(eqx.Module):
         measured: at the pose before.
         information: (6, 6) at the pose before.
         directions: at the pose before, about the centroid; None for matches that were given.
-        record: one number per entry of `Registration.history`.
+        record: one number per entry of `Registration.history`, in the order of `_RECORDED`.
     """
 
     pose: jaxlie.SE3
@@ -87,10 +88,11 @@ class State(eqx.Module):
     measured: Measurement
     information: Float[Array, "6 6"]
     directions: Directions | None
-    record: dict[str, Float[Array, ""]]
+    record: Float[Array, "5"]
 
 
-Carry: TypeAlias = tuple[State, Correspondences, dict[str, Array]]
+# And the records so far.
+Carry: TypeAlias = tuple[State, Correspondences, Float[Array, "... 5"]]
 # Finds pairs at a pose, or keeps those whose target rows are given, and weighs them.
 Match: TypeAlias = Callable[[jaxlie.SE3, Int[Array, ""], Array], tuple[Correspondences, Measurement]]
 # What the source and the target know of what holds a pose.
@@ -199,13 +201,7 @@ def update(
     )
     conditions, codes = zip(*outcomes, strict=True)
     status = jnp.select(list(conditions), [jnp.int32(code) for code in codes], jnp.int32(_RUNNING))
-    record = {
-        "cost": measured.cost,
-        "rmse": measured.rmse,
-        "num_inliers": measured.num_inliers.astype(measured.rmse.dtype),
-        "translation_step": translation_step,
-        "rotation_step": rotation_step,
-    }
+    record = (measured.cost, measured.rmse, measured.num_inliers, translation_step, rotation_step)
     adjoint = adjoint_to_center(pose, measured.moments.center)
     return State(
         # The pose that all this was measured at is the one that is returned.
@@ -215,8 +211,13 @@ def update(
         measured=measured,
         information=adjoint.T @ change.information @ adjoint,
         directions=directions,
-        record=record,
+        record=jnp.stack([number.astype(measured.rmse.dtype) for number in record]),
     )
+
+
+def history_of(records: Float[Array, "*batch T 5"] | Float[np.ndarray, "*batch T 5"]) -> dict[str, Any]:
+    """By name."""
+    return {name: records[..., i] for i, name in enumerate(_RECORDED)}
 
 
 def run_on_host(problem: Problem, search: AbstractSearch) -> tuple[State, Correspondences, dict[str, np.ndarray]]:
@@ -234,8 +235,7 @@ def run_on_host(problem: Problem, search: AbstractSearch) -> tuple[State, Corres
         # As a number of the host's: comparing arrays would be a program of its own, each time.
         status = np.asarray(state.status)
         records.append(state.record)
-    records = jax.device_get(records)
-    return state, matches, {name: np.array([record[name] for record in records]) for name in records[0]}
+    return state, matches, history_of(np.stack([np.asarray(record) for record in records]))
 
 
 def _measure_and_update(
@@ -257,16 +257,15 @@ def _begin(pose: jaxlie.SE3, match: Match, shape: tuple[int, ...], settings: Set
     shapes = jax.eval_shape(step, pose, first, zero, jnp.zeros(shape, jnp.int32))
     state, matches = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), shapes)
     state = eqx.tree_at(lambda state: (state.pose, state.status), state, (pose, first))
-    # One entry per update, and one for the measurement at the end.
-    history = {name: jnp.full(max_iterations + 1, jnp.nan, value.dtype) for name, value in state.record.items()}
-    return state, matches, history
+    # One for each update, and one for the measurement at the end.
+    return state, matches, jnp.full((max_iterations + 1, len(_RECORDED)), jnp.nan, state.record.dtype)
 
 
 def _step(carry: Carry, match: Match, settings: Settings) -> Carry:
-    before, matches, history = carry
+    before, matches, records = carry
     count = before.num_iterations
     state, matches = _measure_and_update(before.pose, before.status, count, matches.indices, match, settings)
-    return state, matches, {name: values.at[count].set(state.record[name]) for name, values in history.items()}
+    return state, matches, records.at[count].set(state.record)
 
 
 def _while_loop(
@@ -278,10 +277,14 @@ def _while_loop(
 
 
 @partial(jax.jit, static_argnames="max_iterations")
-def run_traced(problem: Problem, search: AbstractSearch, max_iterations: int) -> Carry:
+def run_traced(
+    problem: Problem, search: AbstractSearch, max_iterations: int
+) -> tuple[State, Correspondences, dict[str, Array]]:
     """The loop of `register` for traced inputs; pose and matches are constants to autodiff."""
     shape = problem.source.valid.shape
-    return _while_loop(problem.start, _matching(problem, search), shape, problem.settings, max_iterations)
+    match = _matching(problem, search)
+    state, matches, records = _while_loop(problem.start, match, shape, problem.settings, max_iterations)
+    return state, matches, history_of(records)
 
 
 def _matching(problem: Problem, search: AbstractSearch) -> Match:
@@ -338,8 +341,8 @@ def align_traced(
     def match(pose: jaxlie.SE3, status: Int[Array, ""], indices: Array) -> tuple[Correspondences, Measurement]:
         return matches, measure(pose, constants, None)
 
-    state, _, history = _while_loop(start, match, matches.indices.shape, settings, max_iterations)
-    return refine(state, model), state, history
+    state, _, records = _while_loop(start, match, matches.indices.shape, settings, max_iterations)
+    return refine(state, model), state, history_of(records)
 
 
 @jax.jit

@@ -77,17 +77,12 @@ def preprocess(
         # Clouds that lack nothing share the programs of those that never could.
         channel_valid=None if channel_valid is None or channel_valid.all() else channel_valid,
         valid=np.ones(len(points), bool),
-        neighbors=neighbors.astype(np.int32),
+        neighbors=neighbors.astype(np.int32, copy=False),
         covariances=None if covariances is None else np.asarray(covariances, dtype),
         origin=origin,
     ).pad(size_class(len(points)))
-    return ready.replace_rows(
-        **{
-            name: None if value is None else jnp.asarray(value)
-            for name in ("points", "channels", "channel_valid", "valid", "neighbors", "covariances")
-            for value in [getattr(ready, name)]
-        }
-    )
+    names = ("points", "channels", "channel_valid", "valid", "neighbors", "covariances")
+    return ready.replace_rows(**jax.tree.map(jnp.asarray, {name: getattr(ready, name) for name in names}))
 
 
 def check_preprocessing(voxel_size: float | None, num_neighbors: int) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Sequence
+from functools import partial
 from typing import Any, TypeAlias
 
 import equinox as eqx
@@ -213,11 +214,11 @@ def register(
         init = found.matrix if found.converged else init
     search = search or default_search()
     options = max_distance, max_iterations, translation_tolerance, rotation_tolerance, robust, hold_free_directions
-    problem = pose_problem(source, target, method, init, *options)
+    problem = pose_problem(source, target, method, init, *options, search.most_threads)
     state, matches, history = _run(problem, search, max_iterations)
     if match_channels:
         source = _matched(source, target, method, _nearest_points(source, target, problem, state, search))
-        problem = pose_problem(source, target, method, None, *options)
+        problem = pose_problem(source, target, method, None, *options, search.most_threads)
         problem = eqx.tree_at(lambda problem: problem.start, problem, state.pose)
         state, matches, history = _run(problem, search, max_iterations)
     differentiable = problem.source, problem.target, problem.method, problem.robust
@@ -228,12 +229,14 @@ def register(
 
 def _run(
     problem: Problem, search: AbstractSearch, max_iterations: int
-) -> tuple[State, Correspondences, dict[str, Array] | dict[str, np.ndarray]]:
+) -> tuple[State, Correspondences, dict[str, Any]]:
     """The loop; pose and matches are constants to autodiff."""
-    constants = jax.lax.stop_gradient(problem)
-    if is_concrete(constants):
-        return run_on_host(constants, search)
-    return run_traced(constants, search, max_iterations)
+    if not is_concrete(problem):
+        problem = jax.lax.stop_gradient(problem)
+        # Where nothing but a derivative was asked for there are numbers now.
+        if not is_concrete(problem):
+            return run_traced(problem, search, max_iterations)
+    return run_on_host(problem, search)
 
 
 def pose_problem(
@@ -247,10 +250,12 @@ def pose_problem(
     rotation_tolerance: ArrayLike,
     robust: AbstractKernel | None,
     hold_free_directions: bool,
+    most_threads: int | None,
 ) -> Problem:
     """What the loop of `register` is about, for prepared clouds."""
     method = _checked(source, target, method)
-    (source_surface, source_evidence), (target_surface, target_evidence) = _look_at_both(method, source, target)
+    seen = _look_at_both(method, source, target, most_threads)
+    (source_surface, source_evidence), (target_surface, target_evidence) = seen
     dtype = source_surface.points.dtype
     distances = _usual_distances(target) if max_distance is None else max_distance
     return Problem(
@@ -267,7 +272,7 @@ def pose_problem(
 
 
 def _look_at_both(
-    method: AbstractMethod, source: PointCloud, target: PointCloud
+    method: AbstractMethod, source: PointCloud, target: PointCloud, most_threads: int | None
 ) -> tuple[tuple[Surface, Evidence], tuple[Surface, Evidence]]:
     if not is_concrete(method, source, target):
         return look(method, source), look(method, target)
@@ -282,7 +287,7 @@ def _look_at_both(
     def look_at_target() -> tuple[Surface, Evidence]:
         return jax.block_until_ready(look(method, target))
 
-    seen_target, seen_source = side_by_side([look_at_target, look_at_source])
+    seen_target, seen_source = side_by_side([look_at_target, look_at_source], most_threads)
     return seen_source, seen_target
 
 
@@ -358,13 +363,15 @@ def _check_channels(source: PointCloud, target: PointCloud, method: AbstractMeth
         )
 
 
+# Compiled, since as many small calls take ten times as long.
+@partial(jax.jit, static_argnames="dtype")
 def _settings(
     max_distance: Distance,
     translation_tolerance: ArrayLike,
     rotation_tolerance: ArrayLike,
-    max_iterations: int,
+    max_iterations: ArrayLike,
     dtype: DTypeLike,
-    hold_free_directions: bool = False,
+    hold_free_directions: ArrayLike = False,
 ) -> Settings:
     coarse, fine = jnp.broadcast_to(jnp.asarray(max_distance, dtype), (2,))
     return Settings(
@@ -372,8 +379,8 @@ def _settings(
         fine_distance=fine,
         translation_tolerance=jnp.asarray(translation_tolerance, dtype),
         rotation_tolerance=jnp.asarray(rotation_tolerance, dtype),
-        max_iterations=jnp.int32(max_iterations),
-        hold_free_directions=jnp.bool_(hold_free_directions),
+        max_iterations=jnp.asarray(max_iterations, jnp.int32),
+        hold_free_directions=jnp.asarray(hold_free_directions, bool),
     )
 
 
@@ -395,15 +402,16 @@ def registration_of(
         "num_inliers": measured.num_inliers,
         "cost": measured.cost,
         "rmse": measured.rmse,
-        "overlap": measured.num_inliers / jnp.sum(jnp.asarray(source.valid)),
         "information": state.information,
         "covariance": covariance,
         "directions": directions,
         "history": history,
     }
-    if is_concrete(numbers):
+    valid = source.valid
+    if is_concrete(numbers, valid):
         # NumPy's scalars, rather than arrays without dimensions, print as numbers.
-        numbers = jax.tree.map(lambda number: np.asarray(number)[()], numbers)
+        numbers, valid = jax.tree.map(lambda number: np.asarray(number)[()], (numbers, valid))
+    numbers["overlap"] = (numbers["num_inliers"] / valid.sum()).astype(numbers["rmse"].dtype)
     if not is_concrete(source.origin) or np.any(source.origin):
         to_centred, from_centred = _translation_adjoint(-source.origin), _translation_adjoint(source.origin)
         # What was not finite stays so, and the status tells.

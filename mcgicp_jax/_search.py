@@ -69,6 +69,11 @@ class AbstractIndex(abc.ABC):
 class AbstractSearch(eqx.Module):
     """A way to find nearest neighbours."""
 
+    @property
+    def most_threads(self) -> int | None:
+        """How many threads of the host one registration may keep busy; None for as many as it has use for."""
+        return None
+
     @abc.abstractmethod
     def index(self, target: Rows) -> AbstractIndex:
         """Lay out the valid target rows for searching."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from typing import Any
 
 import equinox as eqx
@@ -74,13 +75,7 @@ def solve_update(moments: Moments, radius: Float[Array, ""], basis: Float[Array,
     root, _ = _semidefinite_root(form * scale)
     # optimistix computes its step sizes in the default precision, and wants no other beside it.
     root, columns = root.astype(float), basis.astype(float)
-    tolerance = 4 * float(jnp.finfo(root.dtype).eps)
-    solver: optx.LevenbergMarquardt = optx.LevenbergMarquardt(
-        rtol=tolerance, atol=tolerance, linear_solver=lx.Normal(lx.Cholesky())
-    )
-    solution: optx.Solution = optx.least_squares(
-        _residuals, solver, jnp.zeros(6), (root, columns), max_steps=_MAX_STEPS, throw=False
-    )
+    solution = _least_squares(root, columns)
     _, pivots = _semidefinite_root(unit_information)
     metres = units(radius)
     return Update(
@@ -88,6 +83,42 @@ def solve_update(moments: Moments, radius: Float[Array, ""], basis: Float[Array,
         information=unit_information * radius**2 / (metres[:, None] * metres),
         degenerate=~jnp.all(pivots > 64 * eps * jnp.max(jnp.diagonal(unit_information))),
     )
+
+
+def _least_squares(root: Float[Array, "13 13"], basis: Float[Array, "6 6"]) -> optx.Solution:
+    # The residuals are sums of numbers up to the root of the scale, 100, and rounded accordingly: with less, steps
+    # of the last digits would go on for ever.
+    tolerance = 64 * float(jnp.finfo(root.dtype).eps)
+    solver: optx.LevenbergMarquardt = optx.LevenbergMarquardt(
+        rtol=tolerance, atol=tolerance, linear_solver=lx.Normal(lx.Cholesky())
+    )
+    solver = eqx.tree_at(lambda solver: solver.search, solver, _TrustRegion())
+    return optx.least_squares(_residuals, solver, jnp.zeros(6), (root, basis), max_steps=_MAX_STEPS, throw=False)
+
+
+class _TrustRegion(optx.AbstractSearch):
+    """optimistix's trust region, and steps that change the cost by no more than rounding are taken.
+
+    At the minimum it is chance whether a step lowers the rounded cost. Where it came out low, no other step would be,
+    and shorter and shorter ones would be tried and refused, some twenty of them. (Conn, Gould & Toint, Trust-Region
+    Methods, 2000, section 17.4.2.)
+    """
+
+    inner: Any = optx.ClassicalTrustRegion()
+
+    def init(self, y: Array, f_info_struct: Any) -> Any:
+        return self.inner.init(y, f_info_struct)
+
+    def step(
+        self, first_step: Bool[Array, ""], y: Array, y_eval: Array, f_info: Any, f_eval_info: Any, state: Any
+    ) -> tuple[Array, Bool[Array, ""], Any, Any]:
+        size, accept, result, after = self.inner.step(first_step, y, y_eval, f_info, f_eval_info, state)
+        cost = f_info.as_min()
+        level = jnp.abs(f_eval_info.as_min() - cost) <= 8 * jnp.finfo(cost.dtype).eps * cost
+        # A refusal would have raised the damping.
+        before = state.step_size, state
+        size, after = jax.tree.map(partial(jnp.where, level & ~accept), before, (size, after))
+        return size, accept | level, result, after
 
 
 def _quadratic_form(moments: Moments, radius: Float[Array, ""]) -> Float[Array, "13 13"]:

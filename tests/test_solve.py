@@ -95,6 +95,21 @@ def test_exact_pairs_need_no_second_update():
     np.testing.assert_allclose(change[valid], residual[valid], atol=1e-10 if X64 else 1e-5)
 
 
+def test_rounding_at_the_minimum_costs_no_steps():
+    """There, chance decides whether the rounded cost falls and whether the last digits rest: either alone can take
+    all steps that there are."""
+
+    def num_steps(seed):
+        moved, residual, information, weight, valid = random_pairs(seed)
+        measured, update = solve(moved, residual, information, weight, valid)
+        form = _solve._quadratic_form(measured, measured.radius)
+        scale = _solve._HESSIAN_SCALE / jnp.mean(jnp.diagonal(update.information))
+        root, _ = _solve._semidefinite_root(form * scale)
+        return int(jax.jit(lambda root: _solve._least_squares(root, jnp.eye(6)).stats["num_steps"])(root))
+
+    assert max(num_steps(seed) for seed in range(10)) < 16
+
+
 @pytest.mark.parametrize("missing", ["no pairs", "one direction"])
 def test_free_directions_are_told_and_stay_put(missing):
     moved, residual, information, weight, valid = random_pairs(3)
