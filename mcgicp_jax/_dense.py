@@ -38,12 +38,6 @@ class DenseSearch(AbstractSearch):
     def index(self, target: Rows) -> DenseIndex:
         return DenseIndex(target)
 
-    def follow(
-        self, source: Rows, target: Rows, max_distance: Float[ArrayLike, ""]
-    ) -> Callable[[Float[ArrayLike, "7"]], Int[Array, "N"]]:
-        index = self.index(target)
-        return lambda pose: index.nearest(pose, source, max_distance)[0]
-
     def nearest_traced(
         self,
         pose: Float[Array, "7"],
@@ -76,6 +70,11 @@ class DenseIndex(AbstractIndex):
         self, pose: Float[ArrayLike, "7"], source: Rows, max_distance: Float[ArrayLike, ""], num_candidates: int = 1
     ) -> Int[Array, "m N"]:
         return _nearest(jnp.asarray(pose, source.points.dtype), source, self._target, num_candidates)
+
+    def follow(
+        self, source: Rows, max_distance: Float[ArrayLike, ""]
+    ) -> Callable[[Float[ArrayLike, "7"]], Int[Array, "N"]]:
+        return lambda pose: self.nearest(pose, source, max_distance)[0]
 
 
 @partial(jax.jit, static_argnames="num_candidates")

@@ -50,11 +50,6 @@ class KDTreeSearch(AbstractSearch):
     def index(self, target: Rows) -> KDTreeIndex:
         return KDTreeIndex(_on_host(target), self.workers)
 
-    def follow(
-        self, source: Rows, target: Rows, max_distance: Float[ArrayLike, ""]
-    ) -> Callable[[Float[ArrayLike, "7"]], Int[np.ndarray, "N"]]:
-        return _Follower(self.index(target), _on_host(source), float(np.asarray(max_distance))).nearest
-
     def nearest_traced(
         self,
         pose: Float[Array, "7"],
@@ -111,6 +106,11 @@ class KDTreeIndex(AbstractIndex):
         queries = np.hstack([_moved(pose, np.asarray(source.points.T, np.float64)), source.descriptors])
         queries[~source.valid] = np.nan
         return self.nearest_of(queries, source.absence, float(np.asarray(max_distance)), num_candidates)[0].T
+
+    def follow(
+        self, source: Rows, max_distance: Float[ArrayLike, ""]
+    ) -> Callable[[Float[ArrayLike, "7"]], Int[np.ndarray, "N"]]:
+        return _Follower(self, _on_host(source), float(np.asarray(max_distance))).nearest
 
     def nearest_of(
         self,

@@ -15,6 +15,7 @@ import jax
 import jax.numpy as jnp
 import jaxlie
 import numpy as np
+from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float, Int
 
 from mcgicp_jax import _covariance as cov
@@ -22,7 +23,7 @@ from mcgicp_jax._cost import AbstractKernel, Model, Moments, evaluate_pairs, mom
 from mcgicp_jax._evidence import Evidence
 from mcgicp_jax._methods import AbstractMethod, Surface
 from mcgicp_jax._result import Status
-from mcgicp_jax._search import AbstractSearch, Correspondences
+from mcgicp_jax._search import AbstractSearch, Correspondences, Rows
 from mcgicp_jax._solve import adjoint_to_center, move_pose, refine_pose, solve_update
 from mcgicp_jax._uncertainty import (
     Directions,
@@ -33,9 +34,11 @@ from mcgicp_jax._uncertainty import (
     find_directions,
 )
 
-# The pose still moves, with all pairs or, after it has come to rest with those, with the near ones alone; or its last
-# update was below the tolerances, and one more measurement ends the loop.
+# The pose still moves: at first with far pairs too, and with some of the points; once it is nearly at rest with those,
+# with the near pairs of all. Or its last update was below the tolerances, and one more measurement ends the loop.
 _COARSE, _RUNNING, _SETTLED = -3, -1, -2
+# In tolerances: an update below this ends the coarse part, whose pose will not be the last.
+_NEARLY_AT_REST = 10.0
 _MIN_CORRESPONDENCES = 4
 _RECORDED = ("cost", "rmse", "num_inliers", "translation_step", "rotation_step")
 
@@ -45,14 +48,15 @@ class Settings(eqx.Module):
 
     Attributes:
         max_distance: metres; pairs further apart do not count.
-        fine_distance: metres; the same once the pose has come to rest, until it rests again. If not smaller than
-            `max_distance`, there is no such second part.
+        fine_distance: metres; the same once the pose is nearly at rest, until it rests.
+        coarse_stride: until then, one row of so many takes part, since some thousands find a pose nearly as well.
         translation_tolerance, rotation_tolerance: metres and radians, of an update after which the pose is at rest.
         max_iterations: in both parts together.
     """
 
     max_distance: Float[Array, ""]
     fine_distance: Float[Array, ""]
+    coarse_stride: Int[Array, ""]
     translation_tolerance: Float[Array, ""]
     rotation_tolerance: Float[Array, ""]
     max_iterations: Int[Array, ""]
@@ -94,7 +98,7 @@ class State(eqx.Module):
 # And the records so far.
 Carry: TypeAlias = tuple[State, Correspondences, Float[Array, "... 5"]]
 # Finds pairs at a pose, or keeps those whose target rows are given, and weighs them.
-Match: TypeAlias = Callable[[jaxlie.SE3, Int[Array, ""], Array], tuple[Correspondences, Measurement]]
+Match: TypeAlias = Callable[[jaxlie.SE3, Int[Array, ""], Int[Array, ""], Array], tuple[Correspondences, Measurement]]
 # What the source and the target know of what holds a pose.
 Evidences: TypeAlias = tuple[Evidence, Evidence]
 # The covariance of a pose, (6, 6), and the directions that it could move in.
@@ -156,16 +160,29 @@ def measure(pose: jaxlie.SE3, model: Model, evidence: Evidences | None) -> Measu
 
 @jax.jit
 def _first_status(settings: Settings) -> Int[Array, ""]:
-    return jnp.where(settings.fine_distance < settings.max_distance, jnp.int32(_COARSE), jnp.int32(_RUNNING))
+    coarse = (settings.fine_distance < settings.max_distance) | (settings.coarse_stride > 1)
+    return jnp.where(coarse, jnp.int32(_COARSE), jnp.int32(_RUNNING))
+
+
+@jax.jit
+def _stride(status: Int[ArrayLike, ""], num_iterations: Int[ArrayLike, ""], settings: Settings) -> Int[Array, ""]:
+    """One row of so many takes part now. What is measured last is measured with all."""
+    coarse = (status == _COARSE) & (num_iterations < settings.max_iterations)
+    return jnp.where(coarse, settings.coarse_stride, 1)
 
 
 @jax.jit
 def match_and_measure(
-    pose: jaxlie.SE3, status: Int[Array, ""], indices: Int[Array, "N"] | Int[np.ndarray, "N"], problem: Problem
+    pose: jaxlie.SE3,
+    status: Int[Array, ""],
+    num_iterations: Int[Array, ""],
+    indices: Int[Array, "N"] | Int[np.ndarray, "N"],
+    problem: Problem,
 ) -> tuple[Correspondences, Measurement]:
     settings = problem.settings
     distance = jnp.where(status == _COARSE, settings.max_distance, settings.fine_distance)
-    matches = gate(pose, problem.source, problem.target, indices, distance)
+    part = jnp.arange(problem.source.valid.size) % _stride(status, num_iterations, settings) == 0
+    matches = gate(pose, problem.source, problem.target, jnp.where(part, indices, -1), distance)
     return matches, measure(pose, problem.model(matches), problem.evidence)
 
 
@@ -188,7 +205,10 @@ def update(
     coarse, settled = status == _COARSE, status == _SETTLED
     translation_step = jnp.linalg.norm(change.twist[:3])
     rotation_step = jnp.linalg.norm(change.twist[3:])
-    at_rest = (translation_step <= settings.translation_tolerance) & (rotation_step <= settings.rotation_tolerance)
+    tolerances = jnp.where(coarse, _NEARLY_AT_REST, 1)
+    at_rest = (translation_step <= tolerances * settings.translation_tolerance) & (
+        rotation_step <= tolerances * settings.rotation_tolerance
+    )
     finite = jnp.isfinite(measured.moments.e) & jnp.all(jnp.isfinite(moved.wxyz_xyz))
     outcomes: tuple[tuple[Array, int], ...] = (
         (measured.num_inliers < _MIN_CORRESPONDENCES, Status.TOO_FEW_CORRESPONDENCES),
@@ -223,19 +243,29 @@ def history_of(records: Float[Array, "*batch T 5"] | Float[np.ndarray, "*batch T
 def run_on_host(problem: Problem, search: AbstractSearch) -> tuple[State, Correspondences, dict[str, np.ndarray]]:
     """The loop for concrete inputs: matches from the host's tree between compiled steps."""
     pose, settings = problem.start, problem.settings
-    nearest = search.follow(problem.source.rows, problem.target.rows, settings.max_distance)
+    index, source = search.index(problem.target.rows), problem.source.rows
     status, num_iterations = np.asarray(_first_status(settings)), np.asarray(0, np.int32)
-    records = []
+    followed, records = 0, []
     while status < 0:
         if status != _SETTLED:
+            stride = int(_stride(status, num_iterations, settings))
+            if stride != followed:
+                nearest = index.follow(_every(stride, source), settings.max_distance)
+                followed = stride
             indices = nearest(pose.wxyz_xyz)
-        matches, measured = match_and_measure(pose, status, indices, problem)
+        matches, measured = match_and_measure(pose, status, num_iterations, indices, problem)
         state = update(pose, status, num_iterations, measured, settings)
         pose, num_iterations = state.pose, state.num_iterations
         # As a number of the host's: comparing arrays would be a program of its own, each time.
         status = np.asarray(state.status)
         records.append(state.record)
     return state, matches, history_of(np.stack([np.asarray(record) for record in records]))
+
+
+def _every(stride: int | Int[Array, ""], source: Rows) -> Rows:
+    """One row of so many alone."""
+    part = source.valid & (jnp.arange(source.valid.size) % stride == 0)
+    return Rows(points=source.points, descriptors=source.descriptors, valid=part, absence=source.absence)
 
 
 def _measure_and_update(
@@ -246,7 +276,7 @@ def _measure_and_update(
     match: Match,
     settings: Settings,
 ) -> tuple[State, Correspondences]:
-    matches, measured = match(pose, status, indices)
+    matches, measured = match(pose, status, num_iterations, indices)
     return update(pose, status, num_iterations, measured, settings), matches
 
 
@@ -289,12 +319,13 @@ def run_traced(
 
 def _matching(problem: Problem, search: AbstractSearch) -> Match:
     def match(
-        pose: jaxlie.SE3, status: Int[Array, ""], indices: Int[Array, "N"]
+        pose: jaxlie.SE3, status: Int[Array, ""], num_iterations: Int[Array, ""], indices: Int[Array, "N"]
     ) -> tuple[Correspondences, Measurement]:
         running = status != _SETTLED
-        rows = problem.source.rows, problem.target.rows
+        source = _every(_stride(status, num_iterations, problem.settings), problem.source.rows)
+        rows = source, problem.target.rows
         found = search.nearest_traced(pose.wxyz_xyz, *rows, problem.settings.max_distance, running)[0]
-        return match_and_measure(pose, status, jnp.where(running, found, indices), problem)
+        return match_and_measure(pose, status, num_iterations, jnp.where(running, found, indices), problem)
 
     return match
 
@@ -338,7 +369,9 @@ def align_traced(
     start, constants, settings = jax.lax.stop_gradient((start, model, settings))
     matches = constants[2]
 
-    def match(pose: jaxlie.SE3, status: Int[Array, ""], indices: Array) -> tuple[Correspondences, Measurement]:
+    def match(
+        pose: jaxlie.SE3, status: Int[Array, ""], num_iterations: Int[Array, ""], indices: Array
+    ) -> tuple[Correspondences, Measurement]:
         return matches, measure(pose, constants, None)
 
     state, _, records = _while_loop(start, match, matches.indices.shape, settings, max_iterations)

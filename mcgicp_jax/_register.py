@@ -46,6 +46,8 @@ MAX_ITERATIONS = 64
 # Gates as multiples of the target's spacing. With the wide one the pose is found from a start several points away;
 # at rest, its pairs across edges and across the border of the overlap pull, and the narrow one leaves those out.
 _COARSE_SPACINGS, _FINE_SPACINGS = 10.0, 2.5
+# Rows of the source, at least, that find the pose until it is nearly at rest; then all do.
+_COARSE_ROWS = 4096
 # Nearest-neighbour matches often end in a small cycle; real scans were seen to circle within 0.2 mm and 0.4 mrad.
 TRANSLATION_TOLERANCE = 5e-4
 ROTATION_TOLERANCE = 5e-4
@@ -164,6 +166,8 @@ def register(
 ) -> Registration:
     """Register two clouds: find matches, update the pose, repeat until it rests.
 
+    Of a large source, some thousands of points find the pose until it is nearly at rest; then all of them do.
+
     With numbers it runs on the host, between compiled steps. Inside `jit`, `vmap` or `grad` it is one loop whose
     matches come from a callback; its derivatives are those of `align` at the final matches.
 
@@ -173,7 +177,7 @@ def register(
         method: `MultiChannelGICP()`, `GICP()`, `PointToPlane()`, `PointToPoint()` or `ColorICP(...)`.
         init: T_target_source to start from, `jaxlie.SE3` or (4, 4); the identity by default.
         max_distance: metres of position; pairs further apart do not count. Two numbers are one to find the pose with,
-            and a smaller one to refine it with once it has come to rest. None: 10 and 2.5 times the median distance
+            and a smaller one to refine it with once it is nearly at rest. None: 10 and 2.5 times the median distance
             between neighbouring points of the target. A start that is further off needs more.
         max_iterations: how often, at most, matches are found and the pose is updated.
         translation_tolerance, rotation_tolerance: metres (at the centroid of the pairs) and radians; the update that is
@@ -258,6 +262,8 @@ def pose_problem(
     (source_surface, source_evidence), (target_surface, target_evidence) = seen
     dtype = source_surface.points.dtype
     distances = _usual_distances(target) if max_distance is None else max_distance
+    xp = np if is_concrete(source.valid) else jnp
+    stride = xp.maximum(xp.sum(xp.asarray(source.valid)) // _COARSE_ROWS, 1)
     return Problem(
         start=se3_from_matrix(centred_pose(pose_matrix(init), source, target), dtype),
         source=source_surface,
@@ -265,7 +271,7 @@ def pose_problem(
         method=method,
         robust=robust,
         settings=_settings(
-            distances, translation_tolerance, rotation_tolerance, max_iterations, dtype, hold_free_directions
+            distances, translation_tolerance, rotation_tolerance, max_iterations, dtype, hold_free_directions, stride
         ),
         evidence=(source_evidence, target_evidence),
     )
@@ -372,11 +378,13 @@ def _settings(
     max_iterations: ArrayLike,
     dtype: DTypeLike,
     hold_free_directions: ArrayLike = False,
+    coarse_stride: ArrayLike = 1,
 ) -> Settings:
     coarse, fine = jnp.broadcast_to(jnp.asarray(max_distance, dtype), (2,))
     return Settings(
         max_distance=coarse,
         fine_distance=fine,
+        coarse_stride=jnp.asarray(coarse_stride, jnp.int32),
         translation_tolerance=jnp.asarray(translation_tolerance, dtype),
         rotation_tolerance=jnp.asarray(rotation_tolerance, dtype),
         max_iterations=jnp.asarray(max_iterations, jnp.int32),

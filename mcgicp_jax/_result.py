@@ -23,8 +23,8 @@ class Status(enum.IntEnum):
     Attributes:
         CONVERGED: the last update moved the pose by less than both tolerances, and the pairs hold every direction.
         MAX_ITERATIONS: the pose was still moving when the iterations ran out.
-        TOO_FEW_CORRESPONDENCES: fewer than four source points have a match within `max_distance`: no overlap, or a
-            start too far away.
+        TOO_FEW_CORRESPONDENCES: fewer than four of the source points that were looked for have a match within
+            `max_distance`: no overlap, or a start too far away.
         DEGENERATE: the pose came to rest, but nothing holds at least one direction: see
             `Registration.free_directions`. There it is where the start had it, unless `hold_free_directions` was off.
         NON_FINITE: the numbers overflowed or became NaN.
@@ -74,7 +74,8 @@ class Registration(eqx.Module):
             given.
         history: before each update, and last at the returned pose: "cost", "rmse", "num_inliers", and the length of
             the update from there, "translation_step" (metres, at the centroid of the pairs) and "rotation_step"
-            (radians). Inside a transformation the length is fixed, and NaN fills what was not needed.
+            (radians). Of a large source, the first entries are of the points that find the pose (see `register`).
+            Inside a transformation the length is fixed, and NaN fills what was not needed.
         source_origin, target_origin: what the clouds had taken off, `PointCloud.origin`.
         centred: the pose between those origins, which `matrix` is made from.
     """

@@ -65,6 +65,15 @@ class AbstractIndex(abc.ABC):
             Nearest first; −1 where there is none.
         """
 
+    @abc.abstractmethod
+    def follow(
+        self, source: Rows, max_distance: Float[ArrayLike, ""]
+    ) -> Callable[[Float[ArrayLike, "7"]], Int[Array, "N"] | Int[np.ndarray, "N"]]:
+        """For one registration: a function that finds the nearest target row of each source row, pose after pose.
+
+        What it returns is that of `nearest`; it may use what it knows from the pose before.
+        """
+
 
 class AbstractSearch(eqx.Module):
     """A way to find nearest neighbours."""
@@ -77,15 +86,6 @@ class AbstractSearch(eqx.Module):
     @abc.abstractmethod
     def index(self, target: Rows) -> AbstractIndex:
         """Lay out the valid target rows for searching."""
-
-    @abc.abstractmethod
-    def follow(
-        self, source: Rows, target: Rows, max_distance: Float[ArrayLike, ""]
-    ) -> Callable[[Float[ArrayLike, "7"]], Int[Array, "N"] | Int[np.ndarray, "N"]]:
-        """For one registration: a function that finds the nearest target row of each source row, pose after pose.
-
-        What it returns is that of `AbstractIndex.nearest`; it may use what it knows from the pose before.
-        """
 
     @abc.abstractmethod
     def nearest_traced(

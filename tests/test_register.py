@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import mcgicp_jax as mcg
-from mcgicp_jax import Status
+from mcgicp_jax import Status, _register
 from mcgicp_jax.metrics import pose_error
 from tests.scenes import motion, pair, room_corner, wall
 
@@ -296,15 +296,35 @@ def test_a_bad_cloud_is_named(points, message, room):
 def test_two_distances_are_two_registrations_in_a_row(room):
     source, target, _ = room
     method = mcg.GICP()
-    first = mcg.register(source, target, method, max_distance=0.5)
+    # The first needs to come to rest nearly.
+    coarse = {"translation_tolerance": 5e-3, "rotation_tolerance": 5e-3}
+    first = mcg.register(source, target, method, max_distance=0.5, **coarse)
     second = mcg.register(source, target, method, init=first.matrix, max_distance=0.08)
     result = mcg.register(source, target, method, max_distance=(0.5, 0.08))
     assert result.converged and result.num_iterations == first.num_iterations + second.num_iterations
     assert result.num_inliers == second.num_inliers < first.num_inliers
     # The first stops a step earlier: its last pose is not measured once more.
     assert difference(result.matrix, second.matrix) < 1e-4
-    same = mcg.register(source, target, method, max_distance=(0.5, 0.5))
-    np.testing.assert_array_equal(same.matrix, first.matrix)
+    same, single = (mcg.register(source, target, method, max_distance=distance) for distance in ((0.5, 0.5), 0.5))
+    np.testing.assert_array_equal(same.matrix, single.matrix)
+
+
+def test_some_of_the_points_find_the_pose_and_all_settle_it(room, monkeypatch):
+    source, target, _ = room
+    # So few points come to rest within 0.4 mm; that large scans do where other libraries do, test_reference.py tests.
+    to_rest = {"max_distance": 0.3, "translation_tolerance": 1e-4, "rotation_tolerance": 1e-4}
+    plain = mcg.register(source, target, mcg.GICP(), **to_rest)
+    monkeypatch.setattr(_register, "_COARSE_ROWS", len(source) // 5)
+    result = mcg.register(source, target, mcg.GICP(), **to_rest)
+    pairs = result.history["num_inliers"]
+    assert 4 * pairs[0] < plain.history["num_inliers"][0] and pairs[-1] == result.num_inliers
+    assert result.converged and difference(result.matrix, plain.matrix) < 4e-4
+    traced = jax.jit(lambda cloud: mcg.register(cloud, target, mcg.GICP(), **to_rest))(source)
+    assert traced.status == Status.CONVERGED and difference(traced.matrix, result.matrix) < 4e-4
+    np.testing.assert_allclose(traced.history["num_inliers"][: len(pairs)], pairs, rtol=1e-2)
+    # What is measured last is measured with all points, wherever the iterations have run out.
+    stopped = mcg.register(source, target, mcg.GICP(), max_distance=0.3, max_iterations=1)
+    assert stopped.status == Status.MAX_ITERATIONS and stopped.num_inliers > 0.9 * plain.num_inliers
 
 
 def test_the_default_distances_come_from_the_spacing(room):

@@ -301,7 +301,8 @@ def test_matches_that_are_followed_are_those_found_anew(seed, step, num_channels
         valid = rng.random(size) < 0.9
         clouds.append(Rows(points.T, rng.integers(0, 2, (size, num_channels)) * 0.1, valid))
     limit = np.asarray(max_distance)
-    index, nearest = KDTreeSearch().index(clouds[1]), KDTreeSearch().follow(*clouds, limit)
+    index = KDTreeSearch().index(clouds[1])
+    nearest = index.follow(clouds[0], limit)
     pose = np.array([1.0, 0, 0, 0, 0, 0, 0])
     for _ in range(8):
         expected, found = index.nearest(pose, clouds[0], limit)[0], nearest(pose)
@@ -317,7 +318,7 @@ def test_matches_that_are_followed_are_those_found_anew(seed, step, num_channels
 def test_a_pose_that_is_not_a_number_matches_nothing():
     (source, target), _ = clouds()
     rows = [Rows(cloud.points.T, np.zeros((len(cloud.valid), 0)), cloud.valid) for cloud in (source, target)]
-    nearest = KDTreeSearch().follow(*rows, np.asarray(1.0))
+    nearest = KDTreeSearch().index(rows[1]).follow(rows[0], np.asarray(1.0))
     assert (nearest(np.full(7, np.nan)) == -1).all()
     assert (nearest(np.array([1.0, 0, 0, 0, np.inf, 0, 0])) == -1).all()
     assert (nearest(np.array([1.0, 0, 0, 0, 0, 0, 0])) >= 0).any()
