@@ -170,12 +170,12 @@ def channel_noise(
         residuals.append(jnp.where(counts[:, None] & ~jnp.isnan(known[rows]), residual, jnp.nan))
         values.append(known)
         across.append(jnp.where(counts, variance, jnp.nan))
-    sigma = jnp.nanmedian(jnp.concatenate(residuals), axis=0)
+    sigma = cov.median(jnp.concatenate(residuals).T)
     everything = jnp.concatenate(values)
     spread = jnp.nanstd(everything, axis=0)
     constant = ~(spread > 1e3 * jnp.finfo(spread.dtype).eps * jnp.nanmax(jnp.abs(everything), axis=0, initial=0))
     # Rendered channels have no noise; a thousandth of their spread keeps Λ and α finite.
-    return jnp.where(constant, 1, jnp.fmax(sigma, 1e-3 * spread)), constant, jnp.nanmedian(jnp.concatenate(across))
+    return jnp.where(constant, 1, jnp.fmax(sigma, 1e-3 * spread)), constant, cov.median(jnp.concatenate(across))
 
 
 def _fit_residuals(cloud: PointCloud, rows: Int[Array, "n"]) -> tuple[Float[Array, "n C"], Float[Array, "n"]]:
@@ -212,4 +212,4 @@ def point_spacing(cloud: PointCloud) -> Float[Array, ""]:
     for coordinate in jnp.asarray(cloud.points).T:
         square = square + (coordinate[jnp.maximum(neighbors, 0)] - coordinate[rows, None]) ** 2
     nearest = jnp.min(jnp.where(present & (square > 0), square, jnp.inf), axis=1)
-    return jnp.nan_to_num(jnp.nanmedian(jnp.where(jnp.isfinite(nearest), jnp.sqrt(nearest), jnp.nan)))
+    return jnp.nan_to_num(cov.median(jnp.where(jnp.isfinite(nearest), jnp.sqrt(nearest), jnp.nan)))

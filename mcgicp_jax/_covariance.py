@@ -37,6 +37,27 @@ def some_rows(valid: Bool[Array, "N"]) -> tuple[Int[Array, "n"], Bool[Array, "n"
     return rows, inside & valid[rows]
 
 
+def median(values: Float[Array, "*batch n"]) -> Float[Array, "*batch"]:
+    """Over the last axis; NaN do not count, and where there is nothing else the answer is NaN. Constant to autodiff.
+
+    Sorted as integers, whose order is made that of the numbers: on CPUs XLA takes five times as long to sort floats.
+    """
+    kind = jnp.int32 if values.dtype == jnp.float32 else jnp.int64
+    largest = jnp.iinfo(kind).max
+
+    def turned(bits: Int[Array, "*batch n"]) -> Int[Array, "*batch n"]:
+        # Of negative numbers, the larger one has the smaller bits.
+        return jnp.where(bits < 0, bits ^ largest, bits)
+
+    absent = jnp.isnan(values)
+    # One and the same NaN, which comes last.
+    bits = jax.lax.bitcast_convert_type(jnp.where(absent, jnp.nan, values), kind)
+    ordered = jax.lax.bitcast_convert_type(turned(jnp.sort(turned(bits))), values.dtype)
+    count = jnp.sum(~absent, axis=-1, keepdims=True)
+    middle = jnp.concatenate([jnp.maximum(count - 1, 0) // 2, count // 2], axis=-1)
+    return jnp.mean(jnp.take_along_axis(ordered, middle, axis=-1), axis=-1)
+
+
 def symmetric_from_matrix(matrix: Float[Array, "N 3 3"]) -> Float[Array, "6 N"]:
     matrix = 0.5 * (matrix + matrix.swapaxes(-1, -2))
     return jnp.stack([matrix[:, i, j] for i, j in ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))])

@@ -218,7 +218,7 @@ def _share_across(
     # Medians, since planes do not fit at edges: of the square of a normal variate, and of the mean of two such squares.
     seen = jnp.where(valid, cov.inner(across, pairs.residual[:, some]) ** 2, jnp.nan)
     expected = jnp.where(valid, source.roughness[some] + target.roughness[indices[some]], jnp.nan)
-    ratio = (jnp.nanmedian(seen) / 0.455) / (jnp.nanmedian(expected) / 0.693)
+    ratio = (cov.median(seen) / 0.455) / (cov.median(expected) / 0.693)
     return jnp.where(jnp.isfinite(ratio), jnp.clip(ratio, _LEAST_SHARE, 1), 1)
 
 
@@ -242,7 +242,7 @@ def _channel_ratio(pairs: Pairs, model: Model, evidence: tuple[Evidence, Evidenc
     # constant, or weigh nothing, are none of them.
     count = jnp.maximum(jnp.sum(jnp.any(source.descriptors != 0, axis=0)), 1)
     median = (1 - 2 / (9 * count)) ** 3
-    ratio = jnp.nanmedian(seen) / median
+    ratio = cov.median(seen) / median
     return jnp.where(jnp.isfinite(ratio), jnp.clip(ratio, _LEAST_SHARE, 1), 1)
 
 

@@ -1,6 +1,7 @@
 """Covariances and their closed-form algebra, against NumPy; compiled, at the sizes that are met in use."""
 
 import functools
+import warnings
 
 import jax
 import jax.numpy as jnp
@@ -614,3 +615,30 @@ def test_surfaces_evidence_and_noise_are_the_same_block_by_block(monkeypatch):
     monkeypatch.setattr(cov, "_LARGEST_BLOCK", 128)
     for one, other in zip(everything(), whole, strict=True):
         np.testing.assert_allclose(one, other, rtol=tolerance(1e-3, 1e-9), atol=tolerance(2e-4, 1e-9))
+
+
+NUMBERS = st.floats(width=32, allow_nan=True, allow_infinity=True)
+
+
+@settings(deadline=None, max_examples=100)
+@given(st.lists(NUMBERS, min_size=7, max_size=7))
+def test_median_is_that_of_numpy(values):
+    values = np.array(values, float)
+    with np.errstate(invalid="ignore"), warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        expected = np.nanmedian(values.astype(np.float32).astype(float))
+    actual = jax.jit(cov.median)(jnp.asarray(values, float))
+    # XLA takes the smallest numbers for zero.
+    np.testing.assert_allclose(actual, expected, rtol=1e-6, atol=1e-37)
+
+
+def test_median_of_several_and_of_nothing():
+    values = np.random.default_rng(0).normal(size=(4, 1000))
+    values[0, ::3], values[1] = np.nan, np.nan
+    actual = jax.jit(cov.median)(jnp.asarray(values, float))
+    np.testing.assert_allclose(
+        np.asarray(actual)[[0, 2, 3]], np.nanmedian(values[[0, 2, 3]], axis=1), rtol=tolerance(1e-6, 1e-12)
+    )
+    assert np.isnan(actual[1])
+    slope = jax.grad(lambda scale: jnp.sum(cov.median(scale * jnp.asarray(values[2:], float))))(1.0)
+    assert slope == 0
