@@ -126,7 +126,8 @@ def orthonormal_basis(normal: Float[Array, "3 N"]) -> tuple[Float[Array, "3 N"],
     return first, second
 
 
-@jax.custom_jvp
+# Compiled by itself, as is `fit_linear`, so that it is traced once for all neighbourhoods of a size.
+@jax.jit
 def smallest_eigenvector(symmetric: Float[Array, "6 N"]) -> Float[Array, "3 N"]:
     """The unit eigenvector of the smallest eigenvalue: the normal of a neighbourhood with this covariance.
 
@@ -135,6 +136,11 @@ def smallest_eigenvector(symmetric: Float[Array, "6 N"]) -> Float[Array, "3 N"]:
     derivative is written in terms of the gaps between the eigenvalues and is zero where there is none (an isotropic
     neighbourhood has no normal that could move).
     """
+    return _smallest_eigenvector(symmetric)
+
+
+@jax.custom_jvp
+def _smallest_eigenvector(symmetric: Float[Array, "6 N"]) -> Float[Array, "3 N"]:
     symmetric = _scale_to_one(symmetric)
     xx, xy, xz, yy, yz, zz = symmetric
     mean = (xx + yy + zz) / 3
@@ -181,13 +187,13 @@ def _null_vector(xx: Array, xy: Array, xz: Array, yy: Array, yz: Array, zz: Arra
     return jnp.where(length > 0, unit, jnp.array([[0.0], [0.0], [1.0]], best.dtype))
 
 
-@smallest_eigenvector.defjvp
+@_smallest_eigenvector.defjvp
 def _smallest_eigenvector_jvp(
     primals: tuple[Float[Array, "6 N"]], tangents: tuple[Float[Array, "6 N"]]
 ) -> tuple[Float[Array, "3 N"], Float[Array, "3 N"]]:
     """dn = −B (Bᵀ A B − λ)⁻¹ Bᵀ dA n, with B a basis of the plane across n and λ = nᵀ A n."""
     (symmetric,), (tangent,) = primals, tangents
-    normal = smallest_eigenvector(symmetric)
+    normal = _smallest_eigenvector(symmetric)
     trace = symmetric[0] + symmetric[3] + symmetric[5]
     scale = 1 / jnp.where(trace > 0, trace, 1)
     scaled = symmetric * scale
@@ -338,6 +344,7 @@ class LinearFit(NamedTuple):
     weight: Float[Array, "N"]
 
 
+@jax.jit
 def fit_linear(
     x: Float[Array, "k N"], y: Float[Array, "k N"], values: Float[Array, "k N"], weights: Float[Array, "k N"]
 ) -> LinearFit:

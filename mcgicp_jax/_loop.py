@@ -172,6 +172,12 @@ def _stride(status: Int[ArrayLike, ""], num_iterations: Int[ArrayLike, ""], sett
 
 
 @jax.jit
+def _every(stride: Int[ArrayLike, ""], valid: Bool[Array, "N"]) -> Bool[Array, "N"]:
+    """One valid row of so many."""
+    return valid & (jnp.arange(valid.size) % stride == 0)
+
+
+@jax.jit
 def match_and_measure(
     pose: jaxlie.SE3,
     status: Int[Array, ""],
@@ -181,7 +187,7 @@ def match_and_measure(
 ) -> tuple[Correspondences, Measurement]:
     settings = problem.settings
     distance = jnp.where(status == _COARSE, settings.max_distance, settings.fine_distance)
-    part = jnp.arange(problem.source.valid.size) % _stride(status, num_iterations, settings) == 0
+    part = _every(_stride(status, num_iterations, settings), problem.source.valid)
     matches = gate(pose, problem.source, problem.target, jnp.where(part, indices, -1), distance)
     return matches, measure(pose, problem.model(matches), problem.evidence)
 
@@ -248,10 +254,10 @@ def run_on_host(problem: Problem, search: AbstractSearch) -> tuple[State, Corres
     followed, records = 0, []
     while status < 0:
         if status != _SETTLED:
-            stride = int(_stride(status, num_iterations, settings))
+            stride = int(_stride(status, num_iterations, settings)) if status == _COARSE else 1
             if stride != followed:
-                nearest = index.follow(_every(stride, source), settings.max_distance)
-                followed = stride
+                followed, part = stride, source if stride == 1 else _part(stride, source)
+                nearest = index.follow(part, settings.max_distance)
             indices = nearest(pose.wxyz_xyz)
         matches, measured = match_and_measure(pose, status, num_iterations, indices, problem)
         state = update(pose, status, num_iterations, measured, settings)
@@ -262,10 +268,10 @@ def run_on_host(problem: Problem, search: AbstractSearch) -> tuple[State, Corres
     return state, matches, history_of(np.stack([np.asarray(record) for record in records]))
 
 
-def _every(stride: int | Int[Array, ""], source: Rows) -> Rows:
+def _part(stride: int | Int[Array, ""], source: Rows) -> Rows:
     """One row of so many alone."""
-    part = source.valid & (jnp.arange(source.valid.size) % stride == 0)
-    return Rows(points=source.points, descriptors=source.descriptors, valid=part, absence=source.absence)
+    valid = _every(stride, source.valid)
+    return Rows(points=source.points, descriptors=source.descriptors, valid=valid, absence=source.absence)
 
 
 def _measure_and_update(
@@ -322,8 +328,8 @@ def _matching(problem: Problem, search: AbstractSearch) -> Match:
         pose: jaxlie.SE3, status: Int[Array, ""], num_iterations: Int[Array, ""], indices: Int[Array, "N"]
     ) -> tuple[Correspondences, Measurement]:
         running = status != _SETTLED
-        source = _every(_stride(status, num_iterations, problem.settings), problem.source.rows)
-        rows = source, problem.target.rows
+        stride = _stride(status, num_iterations, problem.settings)
+        rows = _part(stride, problem.source.rows), problem.target.rows
         found = search.nearest_traced(pose.wxyz_xyz, *rows, problem.settings.max_distance, running)[0]
         return match_and_measure(pose, status, num_iterations, jnp.where(running, found, indices), problem)
 

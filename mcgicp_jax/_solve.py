@@ -92,7 +92,7 @@ def _least_squares(root: Float[Array, "13 13"], basis: Float[Array, "6 6"]) -> o
     solver: optx.LevenbergMarquardt = optx.LevenbergMarquardt(
         rtol=tolerance, atol=tolerance, linear_solver=lx.Normal(lx.Cholesky())
     )
-    solver = eqx.tree_at(lambda solver: solver.search, solver, _TrustRegion())
+    solver = eqx.tree_at(lambda solver: solver.search, solver, _TrustRegion(solver.search))
     return optx.least_squares(_residuals, solver, jnp.zeros(6), (root, basis), max_steps=_MAX_STEPS, throw=False)
 
 
@@ -104,7 +104,7 @@ class _TrustRegion(optx.AbstractSearch):
     Methods, 2000, section 17.4.2.)
     """
 
-    inner: Any = optx.ClassicalTrustRegion()
+    inner: Any
 
     def init(self, y: Array, f_info_struct: Any) -> Any:
         return self.inner.init(y, f_info_struct)
@@ -170,6 +170,7 @@ def _semidefinite_root(form: Float[Array, "D D"]) -> tuple[Float[Array, "D D"], 
     return root, pivots
 
 
+@jax.jit
 def _residuals(along: Float[Array, "6"], args: tuple[Float[Array, "13 13"], Float[Array, "6 6"]]) -> Float[Array, "13"]:
     root, basis = args
     twist = basis @ along
