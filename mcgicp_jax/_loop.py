@@ -37,8 +37,9 @@ from mcgicp_jax._uncertainty import (
 # The pose still moves: at first with far pairs too, and with some of the points; once it is nearly at rest with those,
 # with the near pairs of all. Or its last update was below the tolerances, and one more measurement ends the loop.
 _COARSE, _RUNNING, _SETTLED = -3, -1, -2
-# In tolerances: an update below this ends the coarse part, whose pose will not be the last.
-_NEARLY_AT_REST = 10.0
+# An update below so many tolerances, that moves the points by less than this share of the narrow gate, ends the coarse
+# part, whose pose will not be the last.
+_NEARLY_AT_REST, _SHARE_OF_GATE = 10.0, 0.25
 _MIN_CORRESPONDENCES = 4
 _RECORDED = ("cost", "rmse", "num_inliers", "translation_step", "rotation_step")
 
@@ -211,10 +212,15 @@ def update(
     coarse, settled = status == _COARSE, status == _SETTLED
     translation_step = jnp.linalg.norm(change.twist[:3])
     rotation_step = jnp.linalg.norm(change.twist[3:])
-    tolerances = jnp.where(coarse, _NEARLY_AT_REST, 1)
-    at_rest = (translation_step <= tolerances * settings.translation_tolerance) & (
-        rotation_step <= tolerances * settings.rotation_tolerance
-    )
+
+    def below(times: float) -> Bool[Array, ""]:
+        return (translation_step <= times * settings.translation_tolerance) & (
+            rotation_step <= times * settings.rotation_tolerance
+        )
+
+    motion = translation_step + radius * rotation_step
+    nearly = below(_NEARLY_AT_REST) & (motion <= _SHARE_OF_GATE * settings.fine_distance)
+    at_rest = below(1.0) | (coarse & nearly)
     finite = jnp.isfinite(measured.moments.e) & jnp.all(jnp.isfinite(moved.wxyz_xyz))
     outcomes: tuple[tuple[Array, int], ...] = (
         (measured.num_inliers < _MIN_CORRESPONDENCES, Status.TOO_FEW_CORRESPONDENCES),
