@@ -12,16 +12,7 @@ import numpy as np
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from jaxtyping import Array, Int
 
-from mcgicp_jax._loop import (
-    Assessment,
-    Carry,
-    Problem,
-    State,
-    assess_lanes,
-    begin_lane,
-    history_of,
-    run_lanes,
-)
+from mcgicp_jax._loop import Assessment, Carry, Problem, State, assess_lanes, begin_lane, history_of, run_lanes
 from mcgicp_jax._search import AbstractSearch
 
 Key = TypeVar("Key")

@@ -173,23 +173,12 @@ def _stride(status: Int[ArrayLike, ""], num_iterations: Int[ArrayLike, ""], sett
 
 
 @jax.jit
-def _every(stride: Int[ArrayLike, ""], valid: Bool[Array, "N"]) -> Bool[Array, "N"]:
-    """One valid row of so many."""
-    return valid & (jnp.arange(valid.size) % stride == 0)
-
-
-@jax.jit
 def match_and_measure(
-    pose: jaxlie.SE3,
-    status: Int[Array, ""],
-    num_iterations: Int[Array, ""],
-    indices: Int[Array, "N"] | Int[np.ndarray, "N"],
-    problem: Problem,
+    pose: jaxlie.SE3, status: Int[Array, ""], indices: Int[Array, "N"] | Int[np.ndarray, "N"], problem: Problem
 ) -> tuple[Correspondences, Measurement]:
     settings = problem.settings
     distance = jnp.where(status == _COARSE, settings.max_distance, settings.fine_distance)
-    part = _every(_stride(status, num_iterations, settings), problem.source.valid)
-    matches = gate(pose, problem.source, problem.target, jnp.where(part, indices, -1), distance)
+    matches = gate(pose, problem.source, problem.target, indices, distance)
     return matches, measure(pose, problem.model(matches), problem.evidence)
 
 
@@ -265,7 +254,7 @@ def run_on_host(problem: Problem, search: AbstractSearch) -> tuple[State, Corres
                 followed, part = stride, source if stride == 1 else _part(stride, source)
                 nearest = index.follow(part, settings.max_distance)
             indices = nearest(pose.wxyz_xyz)
-        matches, measured = match_and_measure(pose, status, num_iterations, indices, problem)
+        matches, measured = match_and_measure(pose, status, indices, problem)
         state = update(pose, status, num_iterations, measured, settings)
         pose, num_iterations = state.pose, state.num_iterations
         # As a number of the host's: comparing arrays would be a program of its own, each time.
@@ -274,10 +263,11 @@ def run_on_host(problem: Problem, search: AbstractSearch) -> tuple[State, Corres
     return state, matches, history_of(np.stack([np.asarray(record) for record in records]))
 
 
-def _part(stride: int | Int[Array, ""], source: Rows) -> Rows:
-    """One row of so many alone."""
-    valid = _every(stride, source.valid)
-    return Rows(points=source.points, descriptors=source.descriptors, valid=valid, absence=source.absence)
+@jax.jit
+def _part(stride: Int[ArrayLike, ""], source: Rows) -> Rows:
+    """One row of so many; the others match nothing."""
+    part = jnp.arange(source.valid.size) % stride == 0
+    return eqx.tree_at(lambda rows: rows.valid, source, source.valid & part)
 
 
 def _measure_and_update(
@@ -337,7 +327,7 @@ def _matching(problem: Problem, search: AbstractSearch) -> Match:
         stride = _stride(status, num_iterations, problem.settings)
         rows = _part(stride, problem.source.rows), problem.target.rows
         found = search.nearest_traced(pose.wxyz_xyz, *rows, problem.settings.max_distance, running)[0]
-        return match_and_measure(pose, status, num_iterations, jnp.where(running, found, indices), problem)
+        return match_and_measure(pose, status, jnp.where(running, found, indices), problem)
 
     return match
 
