@@ -15,34 +15,28 @@ from concurrent.futures import (
     ThreadPoolExecutor,
 )
 from concurrent.futures import wait as wait_for
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from multiprocessing import get_context
 from typing import Any, TypeAlias
 
+import equinox as eqx
+import jax
 import jaxlie
 import numpy as np
-from jax.typing import ArrayLike
 
 from mcgicp_jax._cloud import PointCloud, Values
-from mcgicp_jax._cost import AbstractKernel
 from mcgicp_jax._dense import DenseSearch, default_search
 from mcgicp_jax._lanes import run_problems
-from mcgicp_jax._loop import Problem
 from mcgicp_jax._methods import AbstractMethod
+from mcgicp_jax._options import Options, check_method
+from mcgicp_jax._outcome import registration_of
 from mcgicp_jax._pose import Pose, pose_matrix
 from mcgicp_jax._preprocess import check_preprocessing, preprocess
-from mcgicp_jax._register import (
-    MAX_ITERATIONS,
-    ROTATION_TOLERANCE,
-    TRANSLATION_TOLERANCE,
-    Distance,
-    check_settings,
-    pose_problem,
-    register,
-    registration_of,
-)
-from mcgicp_jax._result import Registration, Status
+from mcgicp_jax._register import pose_problem, register_with
+from mcgicp_jax._result import Registration, Status, computed
 from mcgicp_jax._search import AbstractSearch
+from mcgicp_jax._sizes import size_class
+from mcgicp_jax._step import Problem
 from mcgicp_jax._threads import num_cores
 
 Cloud: TypeAlias = "PointCloud | Values | Callable[[], PointCloud | Values]"
@@ -58,16 +52,10 @@ def register_batch(
     method: AbstractMethod,
     *,
     init: Iterable[Pose | None] | Pose | None = None,
-    max_distance: Distance | None = None,
-    max_iterations: int = MAX_ITERATIONS,
-    translation_tolerance: ArrayLike = TRANSLATION_TOLERANCE,
-    rotation_tolerance: ArrayLike = ROTATION_TOLERANCE,
-    robust: AbstractKernel | None = None,
-    search: AbstractSearch | None = None,
-    hold_free_directions: bool = True,
     voxel_size: float | None = None,
     num_neighbors: int = 20,
     executor: Executor | None = None,
+    **options: Any,
 ) -> list[Registration]:
     """Register many pairs of clouds of any sizes: one `Registration` per pair, in their order.
 
@@ -78,16 +66,10 @@ def register_batch(
         targets,
         method,
         init=init,
-        max_distance=max_distance,
-        max_iterations=max_iterations,
-        translation_tolerance=translation_tolerance,
-        rotation_tolerance=rotation_tolerance,
-        robust=robust,
-        search=search,
-        hold_free_directions=hold_free_directions,
         voxel_size=voxel_size,
         num_neighbors=num_neighbors,
         executor=executor,
+        **options,
     )
     return [result for _, result in sorted(completed, key=lambda item: item[0])]
 
@@ -98,16 +80,10 @@ def register_as_completed(
     method: AbstractMethod,
     *,
     init: Iterable[Pose | None] | Pose | None = None,
-    max_distance: Distance | None = None,
-    max_iterations: int = MAX_ITERATIONS,
-    translation_tolerance: ArrayLike = TRANSLATION_TOLERANCE,
-    rotation_tolerance: ArrayLike = ROTATION_TOLERANCE,
-    robust: AbstractKernel | None = None,
-    search: AbstractSearch | None = None,
-    hold_free_directions: bool = True,
     voxel_size: float | None = None,
     num_neighbors: int = 20,
     executor: Executor | None = None,
+    **options: Any,
 ) -> Generator[tuple[int, Registration], None, None]:
     """Register many pairs of clouds, and hand out each result as soon as it is there.
 
@@ -121,15 +97,13 @@ def register_as_completed(
             `functools.partial(mcgicp_jax.io.read, path)`: it is called by the worker.
         method: as in `register`; numbers left open are chosen for each pair from its data.
         init: T_target_source to start from: one for all, or an iterable of one per pair.
-        max_distance, max_iterations, translation_tolerance, rotation_tolerance, robust: as in `register`.
-        search: how neighbours and matches are found; by default SciPy's k-d tree, one thread per pair. With
-            `DenseSearch`, the default on an accelerator, many pairs are the lanes of one compiled program, which are
-            spread over all local devices.
-        hold_free_directions: as in `register`.
         voxel_size, num_neighbors: as in `preprocess`, for raw clouds; the workers prepare them.
         executor: who does the work: any `concurrent.futures.Executor`, such as a `ProcessPoolExecutor` with the start
             method "spawn" or Dask's `Client.get_executor()`; by default threads, one per core. A pair whose worker
             dies is sent once more, and gets the status `LOST` and a warning if that fails too.
+        options: any option of `register`. `search` is also how neighbours are found; by default SciPy's k-d tree, one
+            thread per pair. With `DenseSearch`, the default on an accelerator, many pairs are the lanes of one compiled
+            program, which are spread over all local devices (unless `match_channels` or `scales` are given).
 
     Returns:
         A generator of the number of the pair, from 0, and its `Registration`.
@@ -139,23 +113,10 @@ def register_as_completed(
     Warns:
         PairWarning: for each pair with the status `INVALID_INPUT` or `LOST`, why; a `UserWarning`.
     """
-    check_settings(method, max_distance, max_iterations, translation_tolerance, rotation_tolerance)
+    check_method(method)
     check_preprocessing(voxel_size, num_neighbors)
     _check_executor(executor)
-    job = _Job(
-        method=method,
-        settings={
-            "max_distance": max_distance,
-            "max_iterations": max_iterations,
-            "translation_tolerance": translation_tolerance,
-            "rotation_tolerance": rotation_tolerance,
-            "robust": robust,
-            "hold_free_directions": hold_free_directions,
-        },
-        search=search,
-        voxel_size=voxel_size,
-        num_neighbors=num_neighbors,
-    )
+    job = _Job(method, Options(**options), voxel_size, num_neighbors)
     return _gather(job, _pairs(job, sources, targets, init), executor)
 
 
@@ -185,14 +146,19 @@ class _Job:
     """What all pairs have in common."""
 
     method: AbstractMethod
-    settings: dict[str, Any]
-    search: AbstractSearch | None
+    options: Options
     voxel_size: float | None
     num_neighbors: int
 
     def chosen_search(self) -> AbstractSearch:
         """That of the machine where the pair is registered, if none was asked for."""
-        return self.search or default_search(workers=1)
+        return self.options.search or default_search(workers=1)
+
+    @property
+    def uses_lanes(self) -> bool:
+        """Whether pairs are the lanes of one program."""
+        several = self.options.match_channels or len(self.options.scales) > 0
+        return isinstance(self.chosen_search(), DenseSearch) and not several
 
     def ready(self, name: str, cloud: Cloud) -> PointCloud:
         """The cloud, prepared if it was not; a `ValueError` names it."""
@@ -210,19 +176,18 @@ class _Job:
     def register(self, pair: _Pair) -> _Outcome:
         try:
             source, target = self.ready("source", pair.source), self.ready("target", pair.target)
-            search = self.chosen_search()
-            result = register(source, target, self.method, init=pair.init, search=search, **self.settings)
+            options = replace(self.options, search=self.chosen_search())
+            result = register_with(source, target, self.method, pair.init, options)
         except ValueError as error:
             return _invalid(pair, error)
-        return _Outcome(pair.index, result)
+        return _Outcome(pair.index, computed(result))
 
     def problem(self, pair: _Pair) -> _Outcome | tuple[_Problem, Problem]:
-        """The pair as a lane takes it: both clouds of one size, so that few programs serve all."""
+        """The pair as a lane takes it: both surfaces of one size class, so that few programs serve all."""
         try:
             source, target = self.ready("source", pair.source), self.ready("target", pair.target)
-            size = max(source.points.shape[0], target.points.shape[0])
-            source, target = source.pad(size), target.pad(size)
-            problem = pose_problem(source, target, self.method, pair.init, **self.settings, most_threads=1)
+            problem = pose_problem(source, target, self.method, pair.init, self.options, num_threads=1)
+            problem = _padded(problem, size_class(max(len(source.points), len(target.points))))
         except ValueError as error:
             return _invalid(pair, error)
         return _Problem(pair.index, source, target), problem
@@ -239,11 +204,21 @@ class _Job:
                     else:
                         yield problem
 
-            limit = self.settings["max_iterations"]
-            for key, state, assessed, history in run_problems(problems(), self.chosen_search(), limit):
-                result = registration_of(state.pose, state, assessed, history, key.source, key.target)
+            limit = self.options.max_iterations
+            for key, state, assessment, history in run_problems(problems(), self.chosen_search(), limit):
+                result = registration_of(state, assessment, history, key.source, key.target)
                 yield _Outcome(key.index, result)
             yield from rejected
+
+
+def _padded(problem: Problem, size: int) -> Problem:
+    """Both surfaces with rows that match nothing, `size` in all."""
+
+    def grow(array: np.ndarray) -> np.ndarray:
+        return np.pad(array, [(0, size - len(array))] + [(0, 0)] * (array.ndim - 1))
+
+    source, target = (jax.tree.map(grow, surface) for surface in (problem.source, problem.target))
+    return eqx.tree_at(lambda problem: (problem.source, problem.target), problem, (source, target))
 
 
 @dataclass(frozen=True)
@@ -267,7 +242,7 @@ def _invalid(pair: _Pair, error: ValueError) -> _Outcome:
 
 
 def _register_chunk(job: _Job, chunk: list[_Pair]) -> list[_Outcome]:
-    if isinstance(job.chosen_search(), DenseSearch):
+    if job.uses_lanes:
         return list(job.register_all(chunk, 1))
     return [job.register(pair) for pair in chunk]
 
@@ -287,7 +262,7 @@ def _gather(
     job: _Job, pairs: Iterator[_Pair], executor: Executor | None
 ) -> Generator[tuple[int, Registration], None, None]:
     num_workers = num_cores()
-    if executor is None and isinstance(job.chosen_search(), DenseSearch):
+    if executor is None and job.uses_lanes:
         yield from map(_report, job.register_all(pairs, num_workers))
     elif executor is None:
         with ThreadPoolExecutor(num_workers, thread_name_prefix="mcgicp") as threads:

@@ -13,25 +13,13 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float, Int
 
 from mcgicp_jax._pose import Pose, is_concrete, pose_matrix
+from mcgicp_jax._sizes import size_class
 
 # What a user may hand in: an array of any library, or rows in lists.
 Values: TypeAlias = ArrayLike | Sequence[Any]
 
-_SMALLEST_CLASS = 128
 # In sizes of the cloud: from here on its origin is kept apart, in float64.
 _FAR = 8.0
-
-
-def size_class(num_points: int) -> int:
-    """The smallest padded size that holds `num_points` rows.
-
-    JAX compiles per shape. Sizes grow by at most a quarter (128, 160, 192, 240, ...), so that a stream of clouds of
-    different sizes meets few programs and wastes at most 25 % of its rows.
-    """
-    size = _SMALLEST_CLASS
-    while size < num_points:
-        size = int(size * 1.25) // 16 * 16
-    return size
 
 
 def is_far(offset: Float[np.ndarray, "3"], size: float) -> bool:
@@ -75,8 +63,9 @@ def _blank(channels: Any, channel_valid: Any) -> Any:
 class PointCloud(eqx.Module):
     """Points with channels; a pytree whose arrays may all carry leading batch dimensions.
 
-    `preprocess` makes from a raw cloud (NumPy arrays, any size) one that is ready to register (JAX arrays, padded to
-    a size class, with neighbours). Rows that are not `valid` are padding and take part in nothing.
+    `preprocess` makes from a raw cloud one that is ready to register, with neighbours. Both have NumPy arrays of as
+    many rows as there are points. What is computed of a cloud is kept as long as the cloud is used, so its arrays must
+    not be changed in place. Rows that are not `valid` are padding, see `pad`, and take part in nothing.
     To put other values in, as when a network makes the channels, use `cloud.replace(channels=...)`.
 
     Attributes:
@@ -95,7 +84,7 @@ class PointCloud(eqx.Module):
     channels: Float[Array, "*batch N C"] | Float[np.ndarray, "*batch N C"]
     channel_valid: Bool[Array, "*batch N C"] | Bool[np.ndarray, "*batch N C"] | None
     valid: Bool[Array, "*batch N"] | Bool[np.ndarray, "*batch N"]
-    neighbors: Int[Array, "*batch N k"] | None
+    neighbors: Int[Array, "*batch N k"] | Int[np.ndarray, "*batch N k"] | None
     covariances: Float[Array, "*batch N 3 3"] | Float[np.ndarray, "*batch N 3 3"] | None
     origin: Float[Array, "*batch 3"] | Float[np.ndarray, "*batch 3"]
     channel_names: tuple[str, ...] = eqx.field(static=True)
@@ -227,8 +216,16 @@ class PointCloud(eqx.Module):
             channel_names=self.channel_names,
         )
 
-    def pad(self, size: int) -> PointCloud:
-        """The cloud with rows of padding added at the end, `size` in all."""
+    def pad(self, size: int | None = None) -> PointCloud:
+        """The cloud with rows of padding added at the end, `size` in all.
+
+        For functions that you compile: inside `jax.jit`, clouds of one size share a program. By default the size is
+        the smallest of 128, 256, 512, ... that holds the cloud.
+
+        Raises:
+            ValueError: if the cloud has more rows.
+        """
+        size = size_class(self.points.shape[0]) if size is None else size
         missing = size - self.points.shape[0]
         if missing < 0:
             raise ValueError(f"size: expected at least {self.points.shape[0]}, the cloud's rows, got {size}")
@@ -295,10 +292,8 @@ class PointCloud(eqx.Module):
                 for cloud, mask in zip(clouds, everywhere, strict=True)
             ]
         padded = [cloud.pad(size) for cloud in clouds]
-        stacked = jax.tree.map(lambda *rows: jnp.stack(rows), *padded)
-        if is_concrete(stacked):
-            stacked = stacked.replace_rows(origin=np.stack([np.asarray(cloud.origin) for cloud in clouds]))
-        return stacked
+        xp = np if is_concrete(padded) else jnp
+        return jax.tree.map(lambda *rows: xp.stack([xp.asarray(row) for row in rows]), *padded)
 
 
 def _build(**fields: Any) -> PointCloud:

@@ -16,9 +16,9 @@ import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float, Int
 
-from mcgicp_jax._cloud import size_class
-from mcgicp_jax._kdtree import KDTreeSearch
-from mcgicp_jax._search import AbstractIndex, AbstractSearch, Rows
+from mcgicp_jax._search import AbstractIndex, AbstractSearch, Rows, on_host
+from mcgicp_jax._sizes import size_class
+from mcgicp_jax._trees import KDTreeSearch
 
 
 def default_search(workers: int = -1) -> AbstractSearch:
@@ -50,37 +50,39 @@ class DenseSearch(AbstractSearch):
         return _nearest(pose, source, target, num_candidates)
 
     def neighbors(self, points: Float[np.ndarray, "N 3"], num_neighbors: int) -> Int[np.ndarray, "N k"]:
-        size, count = size_class(len(points)), len(points)
-        rows = Rows(
-            points=np.pad(points.T, [(0, 0), (0, size - count)]),
-            descriptors=np.zeros((size, 0), points.dtype),
-            valid=np.arange(size) < count,
-        )
-        at_rest = jaxlie.SE3.identity().wxyz_xyz.astype(points.dtype)
-        return np.asarray(_nearest(at_rest, rows, rows, num_neighbors)).T[:count]
+        rows = Rows(points, np.zeros((len(points), 0), points.dtype), np.ones(len(points), bool))
+        at_rest = np.array([1, 0, 0, 0, 0, 0, 0], points.dtype)
+        return self.index(rows).nearest(at_rest, rows, np.inf, num_neighbors).T
 
 
 class DenseIndex(AbstractIndex):
-    """The target as it is: there is nothing to lay out."""
+    """The target as it is, padded to a size class: there is nothing to lay out."""
 
     def __init__(self, target: Rows):
-        self._target = target
+        self._target = _padded(target)
 
     def nearest(
-        self, pose: Float[ArrayLike, "7"], source: Rows, max_distance: Float[ArrayLike, ""], num_candidates: int = 1
-    ) -> Int[Array, "m N"]:
-        return _nearest(jnp.asarray(pose, source.points.dtype), source, self._target, num_candidates)
+        self, pose: Float[ArrayLike, "7"], source: Rows, max_distance: float, num_candidates: int = 1
+    ) -> Int[np.ndarray, "m N"]:
+        size, padded = source.valid.size, _padded(source)
+        found = _nearest(jnp.asarray(pose, source.points.dtype), padded, self._target, num_candidates)
+        return np.asarray(found)[:, :size]
 
-    def follow(
-        self, source: Rows, max_distance: Float[ArrayLike, ""]
-    ) -> Callable[[Float[ArrayLike, "7"]], Int[Array, "N"]]:
+    def follow(self, source: Rows, max_distance: float) -> Callable[[Float[ArrayLike, "7"]], Int[np.ndarray, "N"]]:
         return lambda pose: self.nearest(pose, source, max_distance)[0]
+
+
+def _padded(rows: Rows) -> Rows:
+    """In a size class, so that clouds of every size run few programs."""
+    rows = on_host(rows)
+    missing = size_class(rows.valid.size) - rows.valid.size
+    return jax.tree.map(lambda array: np.pad(array, [(0, missing)] + [(0, 0)] * (array.ndim - 1)), rows)
 
 
 @partial(jax.jit, static_argnames="num_candidates")
 def _nearest(pose: Float[Array, "7"], source: Rows, target: Rows, num_candidates: int) -> Int[Array, "m N"]:
     rotation = jaxlie.SO3(pose[:4]).as_matrix().astype(pose.dtype)
-    moved = jnp.dot(rotation, source.points, precision="highest") + pose[4:, None]
+    moved = jnp.dot(source.points, rotation.T, precision="highest") + pose[4:]
     queries = eqx.tree_at(lambda rows: rows.points, source, moved)
     rows = jnp.arange(target.valid.size, dtype=jnp.int32)
 
@@ -111,14 +113,14 @@ def _nearest(pose: Float[Array, "7"], source: Rows, target: Rows, num_candidates
 def _squares(source: Rows, target: Rows) -> Float[Array, "N M"]:
     """Squared distance of every source row to every target row, metres²; never stored if it is reduced at once."""
     square = jnp.zeros((source.valid.size, target.valid.size), jnp.asarray(source.points).dtype)
-    for query, point in zip(source.points, target.points, strict=True):
+    for query, point in zip(source.points.T, target.points.T, strict=True):
         square = square + (query[:, None] - point) ** 2
     for column in range(source.descriptors.shape[1]):
         added = (source.descriptors[:, column, None] - target.descriptors[:, column]) ** 2
         for rows, axis in ((source, 1), (target, 0)):
-            if rows.absence is not None:
-                absence = jnp.expand_dims(rows.absence[:, column], axis)
-                added = jnp.where(absence > 0, absence, added)
+            if rows.penalty is not None:
+                penalty = jnp.expand_dims(rows.penalty[:, column], axis)
+                added = jnp.where(penalty > 0, penalty, added)
         square = square + added
     return square
 

@@ -12,8 +12,10 @@ import numpy as np
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from jaxtyping import Array, Int
 
-from mcgicp_jax._loop import Assessment, Carry, Problem, State, assess_lanes, begin_lane, history_of, run_lanes
 from mcgicp_jax._search import AbstractSearch
+from mcgicp_jax._step import Assessment, Problem, State, history_of
+from mcgicp_jax._sums import matched_rows
+from mcgicp_jax._traced import Carry, assess, begin, cleaned, step_of_lane
 
 Key = TypeVar("Key")
 Ended: TypeAlias = tuple[Key, State, Assessment, dict[str, np.ndarray]]
@@ -95,3 +97,35 @@ class _Group(Generic[Key]):
 
 def _put(lanes: tuple[Problem, Carry], lane: tuple[Problem, Carry], number: Int[Array, ""]) -> tuple[Problem, Carry]:
     return jax.tree.map(lambda leaves, leaf: leaves.at[number].set(leaf), lanes, lane)
+
+
+@partial(jax.jit, static_argnames="max_iterations")
+def begin_lane(problem: Problem, search: AbstractSearch, max_iterations: int) -> Carry:
+    """The loop of `register` before its first step."""
+    return begin(problem, search, max_iterations)
+
+
+@partial(jax.jit, static_argnames="num_steps")
+def run_lanes(problems: Problem, carries: Carry, search: AbstractSearch, num_steps: int) -> Carry:
+    """Some steps of many loops at once, whose arrays are stacked; those that have ended stay as they are."""
+
+    def run(problem: Problem, carry: Carry) -> Carry:
+        return jax.lax.while_loop(
+            lambda counted: (counted[0][0].status < 0) & (counted[1] < num_steps),
+            lambda counted: (step_of_lane(counted[0], problem, search), counted[1] + 1),
+            (carry, jnp.int32(0)),
+        )[0]
+
+    return jax.vmap(run)(problems, carries)
+
+
+@jax.jit
+def assess_lanes(problems: Problem, carries: Carry) -> Assessment:
+    """Covariance and directions of loops that have ended."""
+
+    def of_lane(problem: Problem, carry: Carry) -> Assessment:
+        state, matches, _ = carry
+        matches = cleaned(matches)
+        return assess(state, problem, matched_rows(problem.source, problem.target, matches), matches)
+
+    return jax.vmap(of_lane)(problems, carries)

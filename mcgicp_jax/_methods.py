@@ -3,10 +3,7 @@
 from __future__ import annotations
 
 import abc
-import dataclasses
-from collections.abc import Callable
-from functools import partial
-from typing import ClassVar, TypeAlias
+from typing import ClassVar
 
 import equinox as eqx
 import jax
@@ -15,11 +12,17 @@ import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float
 
-from mcgicp_jax import _covariance as cov
-from mcgicp_jax._channels import channel_noise, check_neighbors, eagerly_if, point_spacing
+from mcgicp_jax import _algebra as alg
+from mcgicp_jax._channels import channel_noise, point_spacing
 from mcgicp_jax._cloud import PointCloud, Values
-from mcgicp_jax._pose import is_concrete
-from mcgicp_jax._search import Rows
+from mcgicp_jax._forces import Forces, weighed
+from mcgicp_jax._kernels import AbstractKernel, Numbers
+from mcgicp_jax._local import locals_of
+from mcgicp_jax._neighborhoods import NO_NEIGHBORS as _NO_NEIGHBORS
+from mcgicp_jax._neighborhoods import channel_kernel, multichannel_covariance, plane_covariance
+from mcgicp_jax._pose import AnyArray, canonical_float, is_concrete
+from mcgicp_jax._statistics import constant, namespace
+from mcgicp_jax._surface import Local, Neighborhoods, Table, covariance_of, points_of
 
 # Between aligned real scans (RGB-D and LiDAR), the standard deviation of the channels' differences was 0.9 to 2.6 times
 # what the noise within each scan gives, in the geometric mean this.
@@ -31,82 +34,76 @@ _MIN_EIGENVALUE = 5e-3
 _MATCH_VARIANCE = 0.72
 
 
-# From points and what lies around them to symmetric 3×3 matrices, whose meaning is the method's affair.
-Covariance: TypeAlias = Callable[[cov.Neighborhoods], Float[Array, "6 n"]]
-
-
-class Surface(eqx.Module):
-    """A cloud as a method sees it, laid out as structures of arrays for the hot step.
-
-    Attributes:
-        points: (3, N).
-        covariance: (6, N), symmetric 3×3 matrices; what they mean is the method's affair.
-        descriptors: (N, D), channels in metres (α · channel), searched along with the position; D is 0 where a method
-            matches by position alone.
-        valid: (N,).
-        absence: (N, D), as in `Rows`; None if no point lacks a channel.
-    """
-
-    points: Float[Array, "3 N"]
-    covariance: Float[Array, "6 N"]
-    descriptors: Float[Array, "N D"]
-    valid: Bool[Array, "N"]
-    absence: Float[Array, "N D"] | None = None
-
-    @property
-    def rows(self) -> Rows:
-        """What a search needs to know."""
-        return Rows(points=self.points, descriptors=self.descriptors, valid=self.valid, absence=self.absence)
-
-
-class Numbers(eqx.Module):
-    """A module of a few numbers, whose `repr` shows them."""
-
-    def __repr__(self) -> str:
-        parts = []
-        for field in dataclasses.fields(self):
-            value = getattr(self, field.name)
-            if value is None or not is_concrete(value):
-                parts.append(f"{field.name}={value}")
-            else:
-                parts.append(f"{field.name}={np.array2string(np.asarray(value), precision=4, separator=', ')}")
-        return f"{type(self).__name__}({', '.join(parts)})"
-
-
 class AbstractMethod(Numbers):
-    """A registration method. Its numbers are arrays, so that gradients can be taken with respect to a method."""
+    """A registration method. Its numbers are arrays, so that gradients can be taken with respect to a method.
+
+    A subclass says which covariance a point has, and how a correspondence is weighed with those of its two points.
+    """
 
     uses_channels: ClassVar[bool] = False
 
-    def resolve(self, source: PointCloud, target: PointCloud) -> AbstractMethod:
-        """The method with every number that was left open chosen from the data."""
+    def is_open(self, source: PointCloud, target: PointCloud) -> bool:
+        """Whether a number has been left to be chosen from the data."""
+        return False
+
+    def chosen(self, source: PointCloud, target: PointCloud, locals: tuple[Local, Local]) -> AbstractMethod:
+        """The method with every open number chosen from the data, given the local statistics of both clouds."""
         return self
 
-    @abc.abstractmethod
-    def covariance_around(self, cloud: PointCloud) -> Covariance:
-        """What this method knows of the surface at points of a cloud, as a function of what lies around them."""
+    def resolve(self, source: PointCloud, target: PointCloud) -> AbstractMethod:
+        """The method with every open number chosen from the data of two preprocessed clouds; constants to autodiff."""
+        if not self.is_open(source, target):
+            return self
+        return self.chosen(source, target, locals_of(source, target, with_channels=True))
 
-    def covariance(self, cloud: PointCloud) -> Float[Array, "6 N"]:
-        """The same at each point: symmetric 3×3 matrices, by their upper triangles."""
-        points = jnp.asarray(cloud.points).T
-        # Where covariances are given, or none are needed, there may be no neighbours.
-        none = jnp.zeros((points.shape[1], 0), jnp.int32)
-        neighbors = none if cloud.neighbors is None else jnp.asarray(cloud.neighbors)
-        return cov.by_neighborhoods(self.covariance_around(cloud), points, neighbors)
+    @abc.abstractmethod
+    def covariance(
+        self,
+        points: Float[Array, "3 n"],
+        around: Neighborhoods | None,
+        local: Local | None,
+        given: Float[Array, "6 n"] | None,
+    ) -> Float[Array, "6 n"]:
+        """Symmetric 3×3 matrices of some points, whose meaning is the method's affair.
+
+        Args:
+            around, local: neighbourhoods and their statistics; None for clouds that were not preprocessed.
+            given: covariances that the cloud brings; None if it brings none.
+        """
 
     @abc.abstractmethod
     def information(
         self, target: Float[Array, "6 N"], source: Float[Array, "6 N"], rotation: Float[Array, "3 3"]
     ) -> Float[Array, "6 N"]:
-        """M of each pair: the weight matrix of its residual b − T a, in the target's frame."""
+        """M of each correspondence, the weight matrix of its residual b − T a, in the target's frame."""
 
-    def descriptors(self, cloud: PointCloud) -> Float[Array, "N D"]:
-        """Channels as metres, to be searched along with the position."""
-        return jnp.zeros((cloud.points.shape[0], 0), cloud.points.dtype)
+    def forces(
+        self,
+        source: Table,
+        target: Table,
+        moved: Float[Array, "3 N"],
+        rotation: Float[Array, "3 3"],
+        valid: Bool[Array, "N"],
+        robust: AbstractKernel | None,
+    ) -> Forces:
+        """What each correspondence does to a pose. Terms add: `super().forces(...) + more`.
 
-    def absence(self, cloud: PointCloud) -> Float[Array, "N D"] | None:
-        """What the channels that points lack add to squared distances in the search, as in `Rows`."""
+        Args:
+            source, target: matched rows of the surfaces' tables, see `_surface`.
+            moved: T a.
+            valid: which correspondences count; the residual of the others is 0.
+        """
+        residual = jnp.where(valid, points_of(target) - moved, 0)
+        information = self.information(covariance_of(target), covariance_of(source), rotation)
+        return weighed(residual, information, robust)
+
+    def weights(self, num_channels: int) -> Float[AnyArray, "C"] | None:
+        """α of each channel, metres per channel unit; None where a method matches by position alone."""
         return None
+
+    def missing_variances(self, num_channels: int) -> Float[AnyArray, "C"]:
+        """The variance of a channel's difference in a true match, channel units², for channels that points lack."""
+        raise NotImplementedError
 
 
 class AbstractOneSided(AbstractMethod):
@@ -121,19 +118,27 @@ class AbstractOneSided(AbstractMethod):
 class PointToPoint(AbstractOneSided):
     """Plain ICP (Besl & McKay 1992): M = I."""
 
-    def covariance_around(self, cloud: PointCloud) -> Covariance:
-        return _identity
+    def covariance(
+        self,
+        points: Float[Array, "3 n"],
+        around: Neighborhoods | None,
+        local: Local | None,
+        given: Float[Array, "6 n"] | None,
+    ) -> Float[Array, "6 n"]:
+        return _identity(points)
 
 
 class PointToPlane(AbstractOneSided):
     """Point-to-plane ICP (Chen & Medioni 1991): M = n nᵀ with the target's normals."""
 
-    def covariance_around(self, cloud: PointCloud) -> Covariance:
-        if cloud.covariances is not None:
-            given = _given(cloud)
-            return lambda around: cov.outer(cov.smallest_eigenvector(given(around)))
-        check_neighbors(cloud)
-        return lambda around: cov.outer(around.normal)
+    def covariance(
+        self,
+        points: Float[Array, "3 n"],
+        around: Neighborhoods | None,
+        local: Local | None,
+        given: Float[Array, "6 n"] | None,
+    ) -> Float[Array, "6 n"]:
+        return alg.outer(_known(local).normal if given is None else alg.smallest_eigenvector(given))
 
 
 class ColorICP(AbstractOneSided):
@@ -141,8 +146,8 @@ class ColorICP(AbstractOneSided):
 
     Attributes:
         channel_weights: α, scalar or (C,), metres per channel unit.
-        missing_variance: (C,), channel units²: what the search takes a channel to differ by, squared, where one point
-            of a pair lacks it. None: from the data if points do, see `resolve`.
+        missing_variance: (C,), channel units²: how far the search takes a channel to differ, squared, where one point
+            of a correspondence lacks it. None: from the data if points do, see `chosen`.
     """
 
     uses_channels: ClassVar[bool] = True
@@ -155,35 +160,41 @@ class ColorICP(AbstractOneSided):
         self.channel_weights = _weights(channel_weights)
         self.missing_variance = None
 
-    def resolve(self, source: PointCloud, target: PointCloud) -> ColorICP:
+    def is_open(self, source: PointCloud, target: PointCloud) -> bool:
+        lacking = source.channel_valid is not None or target.channel_valid is not None
+        return lacking and self.missing_variance is None
+
+    def chosen(self, source: PointCloud, target: PointCloud, locals: tuple[Local, Local]) -> ColorICP:
         """Where points lack channels: the variance of a difference between two measurements of one spot, the Λ that
         `MultiChannelGICP` chooses. Constant to autodiff."""
-        if self.missing_variance is not None or (source.channel_valid is None and target.channel_valid is None):
-            return self
-        variance = MultiChannelGICP(channel_weights=0.0).resolve(source, target).channel_covariance
+        variance = MultiChannelGICP(channel_weights=0.0).chosen(source, target, locals).channel_covariance
         return eqx.tree_at(lambda method: method.missing_variance, self, variance, is_leaf=lambda leaf: leaf is None)
 
-    def covariance_around(self, cloud: PointCloud) -> Covariance:
-        return _identity
+    def covariance(
+        self,
+        points: Float[Array, "3 n"],
+        around: Neighborhoods | None,
+        local: Local | None,
+        given: Float[Array, "6 n"] | None,
+    ) -> Float[Array, "6 n"]:
+        return _identity(points)
 
-    def descriptors(self, cloud: PointCloud) -> Float[Array, "N D"]:
-        return _weighted_channels(cloud, self.channel_weights)
+    def weights(self, num_channels: int) -> Float[AnyArray, "C"]:
+        return _spread_out(self.channel_weights, num_channels)
 
-    def absence(self, cloud: PointCloud) -> Float[Array, "N D"] | None:
-        if cloud.channel_valid is None:
-            return None
+    def missing_variances(self, num_channels: int) -> Float[AnyArray, "C"]:
         if self.missing_variance is None:
             raise ValueError("missing_variance: not chosen yet; call method.resolve(source, target) first")
-        return _absence(cloud, self.channel_weights, self.missing_variance)
+        return _spread_out(self.missing_variance, num_channels)
 
 
 class AbstractGeneralized(AbstractMethod):
-    """Methods that weigh a pair with the covariances of both of its points: M = (C^B + R C^A Rᵀ)⁻¹."""
+    """Methods that weigh a correspondence with the covariances of both of its points: M = (C^B + R C^A Rᵀ)⁻¹."""
 
     def information(
         self, target: Float[Array, "6 N"], source: Float[Array, "6 N"], rotation: Float[Array, "3 3"]
     ) -> Float[Array, "6 N"]:
-        return cov.inverse(target + cov.rotate(rotation, source))
+        return alg.inverse(target + alg.rotate(rotation, source))
 
 
 class GICP(AbstractGeneralized):
@@ -199,12 +210,14 @@ class GICP(AbstractGeneralized):
         """Raises `ValueError` unless ε is positive, and large enough for the precision (1.2e-5 in float32)."""
         self.epsilon = _epsilon(epsilon)
 
-    def covariance_around(self, cloud: PointCloud) -> Covariance:
-        if cloud.covariances is not None:
-            return _given(cloud)
-        check_neighbors(cloud)
-        epsilon = self.epsilon.astype(cloud.points.dtype)
-        return lambda around: cov.plane_covariance(around.covariance, around.normal, epsilon)
+    def covariance(
+        self,
+        points: Float[Array, "3 n"],
+        around: Neighborhoods | None,
+        local: Local | None,
+        given: Float[Array, "6 n"] | None,
+    ) -> Float[Array, "6 n"]:
+        return plane_covariance(_known(local), self.epsilon.astype(points.dtype)) if given is None else given
 
 
 class MultiChannelGICP(AbstractGeneralized):
@@ -215,12 +228,12 @@ class MultiChannelGICP(AbstractGeneralized):
 
     Attributes:
         channel_covariance: Λ of eq. 7, scalar or (C,) variances or (C, C), channel units²; how far the channel values
-            of two measurements of one and the same spot lie apart. None: from the data, see `resolve`.
-        channel_weights: α, scalar or (C,), metres per channel unit. None: from the data, see `resolve`.
+            of two measurements of one and the same spot lie apart. None: from the data, see `chosen`.
+        channel_weights: α, scalar or (C,), metres per channel unit. None: from the data, see `chosen`.
         epsilon: ε, as in `GICP`.
         min_eigenvalue: floor of Ω's eigenvalues, where nothing nearby looks alike. A match is one of the samples, and
             no sample lies just where it should: within the surface it cannot hold as well as across it. None: chosen
-            along with Λ, see `resolve`; 0.005 with a Λ that is given.
+            along with Λ, see `chosen`; 0.005 with a Λ that is given.
     """
 
     uses_channels: ClassVar[bool] = True
@@ -243,7 +256,10 @@ class MultiChannelGICP(AbstractGeneralized):
         self.epsilon = _epsilon(epsilon)
         self.min_eigenvalue = None if min_eigenvalue is None else _positive_scalar("min_eigenvalue", min_eigenvalue)
 
-    def resolve(self, source: PointCloud, target: PointCloud) -> MultiChannelGICP:
+    def is_open(self, source: PointCloud, target: PointCloud) -> bool:
+        return self.channel_covariance is None or self.channel_weights is None
+
+    def chosen(self, source: PointCloud, target: PointCloud, locals: tuple[Local, Local]) -> MultiChannelGICP:
         """Λ and α from the data, where they were left open; constants to autodiff.
 
         σ, the noise of a channel, is the median residual of a linear fit of the channel over the tangent plane of each
@@ -257,15 +273,16 @@ class MultiChannelGICP(AbstractGeneralized):
         being λ₀. It is ε times their ratio, from 0.005 to 1. As λ₀ has the bends of the surface in it, the ratio is at
         least that: it can raise the floor, as for rendered scenes, and not lower it.
         """
-        if self.channel_covariance is not None and self.channel_weights is not None:
-            return self
-        source, target = jax.lax.stop_gradient((source, target))
-        # What is known now is computed now: a compiler that folds a median as a constant takes seconds, and complains.
-        with eagerly_if(is_concrete(source, target)):
-            sigma, constant, across = channel_noise(source, target)
-        with eagerly_if(is_concrete(target)):
-            spacing = point_spacing(target)
-        covariance, weights, floor = _chosen(sigma, constant, across, spacing, jax.lax.stop_gradient(self.epsilon))
+        source, target, locals, epsilon = constant((source, target, locals, self.epsilon))
+        xp = namespace(source, target, locals, epsilon)
+        sigma, uniform, across = channel_noise(source, target, locals)
+        spacing = point_spacing(target)
+        with np.errstate(over="ignore", invalid="ignore"):
+            within = xp.asarray(epsilon, spacing.dtype) * _MATCH_VARIANCE * spacing**2
+            smooth = ~(2 * across > within)
+            floor = xp.where(smooth, 1, xp.maximum(within / xp.where(smooth, 1, 2 * across), _MIN_EIGENVALUE))
+            numbers = [2 * (_SPREAD * sigma) ** 2, xp.where(uniform, 0, _REACH * spacing / sigma), floor]
+        covariance, weights, floor = (jax.device_put(xp.asarray(number, epsilon.dtype)) for number in numbers)
         if self.channel_covariance is not None or self.min_eigenvalue is not None:
             floor = self.min_eigenvalue
         if self.channel_covariance is not None:
@@ -279,99 +296,63 @@ class MultiChannelGICP(AbstractGeneralized):
             is_leaf=lambda leaf: leaf is None,
         )
 
-    def covariance_around(self, cloud: PointCloud) -> Covariance:
-        if cloud.covariances is not None:
-            return _given(cloud)
+    def covariance(
+        self,
+        points: Float[Array, "3 n"],
+        around: Neighborhoods | None,
+        local: Local | None,
+        given: Float[Array, "6 n"] | None,
+    ) -> Float[Array, "6 n"]:
+        if given is not None:
+            return given
         if self.channel_covariance is None:
             raise ValueError("channel_covariance: not chosen yet; call method.resolve(source, target) first")
-        check_neighbors(cloud)
-        dtype = cloud.points.dtype
-        channels, covariance = jnp.asarray(cloud.channels), self.channel_covariance.astype(dtype)
-        _check_covariance_fits(covariance, channels.shape[-1])
-        if channels.shape[-1] == 0:
-            return GICP(self.epsilon).covariance_around(cloud)
-        if cloud.channel_valid is None:
-            kernel = partial(cov.channel_kernel, _whiten(channels, covariance))
-        else:
-            kernel = partial(cov.partial_channel_kernel, channels, jnp.asarray(cloud.channel_valid), covariance)
-        epsilon = self.epsilon.astype(dtype)
-        floor = jnp.asarray(_MIN_EIGENVALUE if self.min_eigenvalue is None else self.min_eigenvalue, dtype)
-        return lambda around: cov.multichannel_covariance(around, kernel(around), epsilon, floor)
+        if around is None:
+            raise ValueError(_NO_NEIGHBORS)
+        local, epsilon = _known(local), self.epsilon.astype(points.dtype)
+        covariance = self.channel_covariance.astype(points.dtype)
+        _check_covariance_fits(covariance, around.num_channels)
+        if around.num_channels == 0:
+            return plane_covariance(local, epsilon)
+        floor = jnp.asarray(_MIN_EIGENVALUE if self.min_eigenvalue is None else self.min_eigenvalue, points.dtype)
+        return multichannel_covariance(around, local, channel_kernel(around, covariance), epsilon, floor)
 
-    def descriptors(self, cloud: PointCloud) -> Float[Array, "N D"]:
+    def weights(self, num_channels: int) -> Float[AnyArray, "C"]:
         if self.channel_weights is None:
             raise ValueError("channel_weights: not chosen yet; call method.resolve(source, target) first")
-        return _weighted_channels(cloud, self.channel_weights)
+        return _spread_out(self.channel_weights, num_channels)
 
-    def absence(self, cloud: PointCloud) -> Float[Array, "N D"] | None:
-        if cloud.channel_valid is None:
-            return None
-        if self.channel_covariance is None or self.channel_weights is None:
+    def missing_variances(self, num_channels: int) -> Float[AnyArray, "C"]:
+        if self.channel_covariance is None:
             raise ValueError("channel_covariance: not chosen yet; call method.resolve(source, target) first")
-        return _absence(cloud, self.channel_weights, self.channel_covariance)
+        xp = namespace(self.channel_covariance)
+        covariance = xp.asarray(self.channel_covariance)
+        return _spread_out(xp.diagonal(covariance) if covariance.ndim == 2 else covariance, num_channels)
 
 
-@jax.jit
-def prepare(method: AbstractMethod, cloud: PointCloud) -> Surface:
-    """The surface that a resolved method sees in a cloud."""
-    return surface(method, cloud, method.covariance(cloud))
+def _identity(points: Float[Array, "3 n"]) -> Float[Array, "6 n"]:
+    identity = jnp.array([[1.0], [0.0], [0.0], [1.0], [0.0], [1.0]], points.dtype)
+    return jnp.broadcast_to(identity, (6, points.shape[1]))
 
 
-def surface(method: AbstractMethod, cloud: PointCloud, covariance: Float[Array, "6 N"]) -> Surface:
-    """The surface that a resolved method sees in a cloud, with its own covariances."""
-    return Surface(
-        points=jnp.asarray(cloud.points).T,
-        covariance=covariance,
-        descriptors=method.descriptors(cloud),
-        valid=jnp.asarray(cloud.valid),
-        absence=method.absence(cloud),
-    )
+def _known(local: Local | None) -> Local:
+    if local is None:
+        raise ValueError(_NO_NEIGHBORS)
+    return local
 
 
-@jax.jit
-def _chosen(
-    sigma: Float[Array, "C"],
-    constant: Bool[Array, "C"],
-    across: Float[Array, ""],
-    spacing: Float[Array, ""],
-    epsilon: Float[Array, ""],
-) -> tuple[Float[Array, "C"], Float[Array, "C"], Float[Array, ""]]:
-    """Λ, α and the floor of Ω, as `MultiChannelGICP.resolve` says."""
-    within = epsilon * _MATCH_VARIANCE * spacing**2
-    smooth = ~(2 * across > within)
-    floor = jnp.where(smooth, 1, jnp.maximum(within / jnp.where(smooth, 1, 2 * across), _MIN_EIGENVALUE))
-    return 2 * (_SPREAD * sigma) ** 2, jnp.where(constant, 0, _REACH * spacing / sigma), floor
-
-
-def _identity(around: cov.Neighborhoods) -> Float[Array, "6 n"]:
-    identity = jnp.array([[1.0], [0.0], [0.0], [1.0], [0.0], [1.0]], around.normal.dtype)
-    return jnp.broadcast_to(identity, (6, around.rows.size))
-
-
-def _given(cloud: PointCloud) -> Covariance:
-    covariances = cov.symmetric_from_matrix(jnp.asarray(cloud.covariances))
-    return lambda around: covariances[:, around.rows]
-
-
-def _weighted_channels(cloud: PointCloud, weights: Float[Array, "..."]) -> Float[Array, "N C"]:
-    count = cloud.channels.shape[-1]
-    if weights.shape not in ((), (count,)):
+def _spread_out(numbers: Float[AnyArray, "..."], num_channels: int) -> Float[AnyArray, "C"]:
+    """One number per channel."""
+    if numbers.shape not in ((), (num_channels,)):
         raise ValueError(
-            f"channel_weights: expected a scalar or shape ({count},), for clouds of {count} channels, "
-            f"got {weights.shape}"
+            f"channel_weights: expected a scalar or shape ({num_channels},), for clouds of {num_channels} channels, "
+            f"got {numbers.shape}"
         )
-    return jnp.asarray(cloud.channels) * weights.astype(cloud.channels.dtype)
+    xp = namespace(numbers)
+    return xp.broadcast_to(xp.asarray(numbers), (num_channels,))
 
 
-def _absence(cloud: PointCloud, weights: Float[Array, "..."], covariance: Float[Array, "..."]) -> Float[Array, "N C"]:
-    """α² Λ_cc where a point lacks channel c, the expected square of the difference of a true match: a pair is then
-    neither nearer nor further for what is not known of it."""
-    variances = jnp.diagonal(covariance) if covariance.ndim == 2 else covariance
-    expected = (weights**2 * variances).astype(cloud.channels.dtype)
-    return jnp.where(jnp.asarray(cloud.channel_valid), 0, expected)
-
-
-def _check_covariance_fits(covariance: Float[Array, "..."], count: int) -> None:
+def _check_covariance_fits(covariance: Float[AnyArray, "..."], count: int) -> None:
     if covariance.shape not in ((), (count,), (count, count)):
         raise ValueError(
             f"channel_covariance: expected a scalar, shape ({count},) or ({count}, {count}), for clouds of {count} "
@@ -379,17 +360,10 @@ def _check_covariance_fits(covariance: Float[Array, "..."], count: int) -> None:
         )
 
 
-def _whiten(channels: Float[Array, "N C"], covariance: Float[Array, "..."]) -> Float[Array, "N C"]:
-    """Channels in which Λ is the identity."""
-    if covariance.ndim < 2:
-        return channels / jnp.sqrt(covariance)
-    factor = jnp.linalg.cholesky(covariance)
-    return jax.scipy.linalg.solve_triangular(factor, channels.T, lower=True).T
-
-
 def _number(name: str, value: Values) -> Array:
     try:
-        return jnp.asarray(value, float) if is_concrete(value) else jnp.asarray(value)
+        # By way of NumPy, which compiles nothing.
+        return jax.device_put(np.asarray(value, canonical_float())) if is_concrete(value) else jnp.asarray(value)
     except (TypeError, ValueError) as error:
         raise ValueError(f"{name}: expected numbers, got {value!r}") from error
 

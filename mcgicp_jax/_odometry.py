@@ -11,10 +11,11 @@ from jaxtyping import Float
 
 from mcgicp_jax._cloud import PointCloud, Values
 from mcgicp_jax._methods import AbstractMethod
+from mcgicp_jax._options import Options, check_method
 from mcgicp_jax._pose import Pose, pose_matrix
 from mcgicp_jax._preprocess import check_preprocessing, preprocess
-from mcgicp_jax._register import Distance, register
-from mcgicp_jax._result import Registration, Status
+from mcgicp_jax._register import register_with
+from mcgicp_jax._result import Registration, Status, computed
 from mcgicp_jax.datasets import Frame
 
 # Voxel numbers are packed into one 64-bit key, 21 bits each, from −2²⁰ on.
@@ -42,7 +43,7 @@ def odometry(
     *,
     voxel_size: float | None = None,
     num_neighbors: int = 20,
-    max_distance: Distance | None = None,
+    init: Pose | None = None,
     start: Pose | None = None,
     **options: Any,
 ) -> Iterator[Step]:
@@ -56,10 +57,10 @@ def odometry(
         frames: frames of a data set, clouds or (N, 3) arrays; what is preprocessed already is taken as it is.
         method: numbers that it leaves open are chosen from the data of every pair.
         voxel_size, num_neighbors: for `preprocess`.
-        max_distance: metres, as in `register`; for the first pair, whose motion is not yet known, it must be more than
-            the motion.
+        init: T_target_source to start the first pair from, whose motion is not yet known; the identity by default, and
+            then `max_distance` must be more than the motion.
         start: pose of the first frame in the world; the identity by default.
-        options: further arguments of `register`; `init` starts the first pair.
+        options: any option of `register`.
 
     Yields:
         A step for every frame, the first among them.
@@ -68,7 +69,9 @@ def odometry(
         ValueError: if a cloud or an argument does not fit.
     """
     check_preprocessing(voxel_size, num_neighbors)
-    motion = pose_matrix(options.pop("init", None))
+    check_method(method)
+    chosen = Options(**options)
+    motion = pose_matrix(init)
     pose = np.asarray(pose_matrix(start, "start"))
     before: PointCloud | None = None
     for i, frame in enumerate(frames):
@@ -82,11 +85,11 @@ def odometry(
         if before is None:
             yield Step(cloud, pose, None)
         else:
-            result = register(cloud, before, method, init=motion, max_distance=max_distance, **options)
+            result = register_with(cloud, before, method, motion, chosen)
             if result.status not in (Status.TOO_FEW_CORRESPONDENCES, Status.NON_FINITE):
                 motion = np.asarray(result.matrix)
             pose = _rigid(pose @ motion)
-            yield Step(cloud, pose, result)
+            yield Step(cloud, pose, computed(result))
         before = cloud
 
 

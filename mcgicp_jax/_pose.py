@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
 from functools import partial
-from typing import TypeAlias
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 import jax
 import jax.numpy as jnp
@@ -11,6 +12,14 @@ import jaxlie
 import numpy as np
 from jax.typing import ArrayLike, DTypeLike
 from jaxtyping import Array, Float
+
+# Arrays of NumPy, outside of transformations, or of JAX; and single numbers of either.
+if TYPE_CHECKING:
+    AnyArray: TypeAlias = Any
+    AnyScalar: TypeAlias = Any
+else:
+    AnyArray = Array | np.ndarray
+    AnyScalar = ArrayLike
 
 Pose: TypeAlias = "jaxlie.SE3 | Float[Array, '*batch 4 4'] | Float[np.ndarray, '*batch 4 4']"
 
@@ -21,6 +30,20 @@ _ROTATION_TOLERANCE = 1e-3
 def is_concrete(*trees: object) -> bool:
     """Whether every array in the trees holds numbers now, rather than standing for them under a transformation."""
     return not any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(trees))
+
+
+def computed_now() -> contextlib.AbstractContextManager[None]:
+    """What is computed within is computed now, even while a caller's `jit` is traced, of which it would become a part.
+
+    Only then: what JAX evaluates at compile time is evaluated operation by operation.
+    """
+    staged = isinstance(jnp.array(np.zeros(())), jax.core.Tracer)
+    return jax.ensure_compile_time_eval() if staged else contextlib.nullcontext()
+
+
+def canonical_float() -> Any:
+    """JAX's default precision: float64 where x64 is on."""
+    return jax.dtypes.canonicalize_dtype(np.float64)
 
 
 def pose_matrix(pose: Pose | None, name: str = "init") -> Float[np.ndarray, "4 4"] | Float[Array, "4 4"]:
@@ -51,11 +74,31 @@ def pose_matrix(pose: Pose | None, name: str = "init") -> Float[np.ndarray, "4 4
     return matrix
 
 
-@partial(jax.jit, static_argnames="dtype")
 def se3_from_matrix(matrix: Float[ArrayLike, "4 4"], dtype: DTypeLike) -> jaxlie.SE3:
-    """`jaxlie.SE3` in the given precision, its quaternion normalised."""
+    """`jaxlie.SE3` in the given precision, its quaternion normalised; of NumPy arrays where the matrix is concrete."""
+    if not is_concrete(matrix):
+        return _se3_from_traced(matrix, dtype)
+    matrix = np.asarray(matrix, np.float64)
+    if not np.isfinite(matrix).all():
+        return se3(np.full(7, np.nan, dtype))
+    xyzw = np.array([0.0, 0, 0, 1])
+    if np.any(matrix[:3, :3] != np.eye(3)):
+        # Imported where it is needed: it takes a fifth of the time that the package takes.
+        from scipy.spatial.transform import Rotation
+
+        xyzw = Rotation.from_matrix(matrix[:3, :3]).as_quat(canonical=True)
+    return se3(np.concatenate([xyzw[3:], xyzw[:3], matrix[:3, 3]]).astype(dtype))
+
+
+@partial(jax.jit, static_argnames="dtype")
+def _se3_from_traced(matrix: Float[Array, "4 4"], dtype: DTypeLike) -> jaxlie.SE3:
     pose = jaxlie.SE3.from_matrix(jnp.asarray(matrix, dtype))
     return cast_pose(pose.normalize(), dtype)
+
+
+def se3(parameters: AnyArray) -> jaxlie.SE3:
+    """A pose of NumPy's numbers, too: (7,) quaternion wxyz and translation."""
+    return jaxlie.SE3(parameters)
 
 
 def cast_pose(pose: jaxlie.SE3, dtype: DTypeLike) -> jaxlie.SE3:

@@ -5,11 +5,10 @@ from __future__ import annotations
 import warnings
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from mcgicp_jax._cloud import PointCloud, Values, is_far, size_class
+from mcgicp_jax._cloud import PointCloud, Values, is_far
 from mcgicp_jax._dense import default_search
 from mcgicp_jax._pose import is_concrete
 from mcgicp_jax._search import AbstractSearch
@@ -27,7 +26,7 @@ def preprocess(
     *,
     search: AbstractSearch | None = None,
 ) -> PointCloud:
-    """Make a cloud ready to register: finite rows, voxel-downsampled, with neighbours, padded to a size class.
+    """Make a cloud ready to register: finite rows, voxel-downsampled, with neighbours.
 
     Do this once per cloud, and register it as often as needed. Runs on the host.
 
@@ -40,8 +39,8 @@ def preprocess(
         search: how neighbours are found; by default SciPy's k-d tree, on an accelerator `DenseSearch`.
 
     Returns:
-        JAX arrays, float32 or, where JAX's x64 is on and the input has it, float64. Coordinates far from zero for the
-        cloud's size lose their origin, which `PointCloud.origin` keeps.
+        Read-only NumPy arrays, float32 or, where JAX's x64 is on and the input has it, float64. Coordinates far from
+        zero for the cloud's size lose their origin, which `PointCloud.origin` keeps.
 
     Raises:
         ValueError: for fewer than four finite points, or arguments that make no sense.
@@ -71,18 +70,21 @@ def preprocess(
     points = (points - origin).astype(dtype)
     # Searched as they will be used, after rounding.
     neighbors = (search or default_search()).neighbors(points, num_neighbors)
-    ready = cloud.replace_rows(
-        points=points,
-        channels=channels.astype(dtype),
+    arrays = {
+        "points": points,
+        "channels": channels.astype(dtype),
         # Clouds that lack nothing share the programs of those that never could.
-        channel_valid=None if channel_valid is None or channel_valid.all() else channel_valid,
-        valid=np.ones(len(points), bool),
-        neighbors=neighbors.astype(np.int32, copy=False),
-        covariances=None if covariances is None else np.asarray(covariances, dtype),
-        origin=origin,
-    ).pad(size_class(len(points)))
-    names = ("points", "channels", "channel_valid", "valid", "neighbors", "covariances")
-    return ready.replace_rows(**jax.tree.map(jnp.asarray, {name: getattr(ready, name) for name in names}))
+        "channel_valid": None if channel_valid is None or channel_valid.all() else channel_valid,
+        "valid": np.ones(len(points), bool),
+        "neighbors": neighbors.astype(np.int32, copy=False),
+        "covariances": None if covariances is None else np.asarray(covariances, dtype),
+        "origin": origin,
+    }
+    for array in arrays.values():
+        if array is not None:
+            # What is computed of the cloud is kept beside it.
+            array.setflags(write=False)
+    return cloud.replace_rows(**arrays)
 
 
 def check_preprocessing(voxel_size: float | None, num_neighbors: int) -> None:

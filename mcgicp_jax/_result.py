@@ -6,15 +6,16 @@ import enum
 from typing import Any
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import jaxlie
 import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float, Int
 
-from mcgicp_jax._directions import FreeDirection, describe, free_directions
-from mcgicp_jax._pose import is_concrete, rotation_from_quaternion
-from mcgicp_jax._uncertainty import Directions
+from mcgicp_jax._deferred import Deferred
+from mcgicp_jax._directions import Directions, FreeDirection, describe, free_directions
+from mcgicp_jax._pose import AnyArray, canonical_float, is_concrete, rotation_from_quaternion, se3
 
 
 class Status(enum.IntEnum):
@@ -62,22 +63,13 @@ class Registration(eqx.Module):
         rmse: root mean square distance of the pairs, metres; mostly the spacing of the points. NaN without pairs.
         overlap: share of the source points that have a match, 0 to 1; the others are rejected, as too far away. Little
             overlap, or a share below what is known of the scene, is the one sign that a wrong minimum gives of itself.
-        information: (6, 6) Σ Jᵀ M J for the twist ξ = (v, ω) of T exp(ξ), metres and radians, in the source's frame.
-            It weighs directions against each other; its scale is that of GICP's relative covariances, so its inverse
-            is *not* a covariance of the pose.
-        covariance: (6, 6) of ξ, in the same order and frame, estimated from how the pairs disagree (see
-            `_uncertainty.estimate_covariance`). It covers the noise and the sampling of the points. It does not know of
-            a wrong minimum, of errors that all points share (calibration, motion during a scan), or of things that
-            moved. A direction that nothing holds has a standard deviation of 1000 times the radius of the cloud. NaN
-            where there is no pose, or too few pairs to tell.
-        directions: six directions and what holds each, see `free_directions`; None from `align`, whose matches are
-            given.
         history: before each update, and last at the returned pose: "cost", "rmse", "num_inliers", and the length of
             the update from there, "translation_step" (metres, at the centroid of the pairs) and "rotation_step"
             (radians). Of a large source, the first entries are of the points that find the pose (see `register`).
             Inside a transformation the length is fixed, and NaN fills what was not needed.
         source_origin, target_origin: what the clouds had taken off, `PointCloud.origin`.
         centred: the pose between those origins, which `matrix` is made from.
+        constraints, uncertainty: `information`, `directions` and `covariance`, computed when they are first read.
     """
 
     T_target_source: jaxlie.SE3
@@ -87,20 +79,27 @@ class Registration(eqx.Module):
     cost: Float[ArrayLike, "*batch"]
     rmse: Float[ArrayLike, "*batch"]
     overlap: Float[ArrayLike, "*batch"]
-    information: Float[Array, "*batch 6 6"] | Float[np.ndarray, "*batch 6 6"]
-    covariance: Float[Array, "*batch 6 6"] | Float[np.ndarray, "*batch 6 6"]
-    directions: Directions | None
     history: dict[str, Any]
     source_origin: Float[Array, "*batch 3"] | Float[np.ndarray, "*batch 3"]
     target_origin: Float[Array, "*batch 3"] | Float[np.ndarray, "*batch 3"]
     centred: jaxlie.SE3
+    constraints: Deferred[tuple[Any, Directions | None]]
+    uncertainty: Deferred[Any]
+
+    @classmethod
+    def build(cls, **fields: Any) -> Registration:
+        """A result of finished fields, past equinox's constructor, which would compute what is deferred."""
+        result = object.__new__(cls)
+        for name, value in fields.items():
+            object.__setattr__(result, name, value)
+        return result
 
     @classmethod
     def without_pose(cls, status: Status) -> Registration:
         """What stands for a pair that was not registered: every number that cannot be had is NaN."""
-        nowhere = jaxlie.SE3(jnp.full(7, jnp.nan))
+        nowhere = se3(np.full(7, np.nan, canonical_float()))
         nan = np.full((), np.nan)[()]
-        return cls(
+        return cls.build(
             T_target_source=nowhere,
             status_code=np.int32(status),
             num_iterations=np.int32(0),
@@ -108,14 +107,39 @@ class Registration(eqx.Module):
             cost=nan,
             rmse=nan,
             overlap=np.float64(0),
-            information=np.zeros((6, 6)),
-            covariance=np.full((6, 6), np.nan),
-            directions=None,
             history={},
             source_origin=np.zeros(3),
             target_origin=np.zeros(3),
             centred=nowhere,
+            constraints=Deferred.of((np.zeros((6, 6)), None)),
+            uncertainty=Deferred.of(np.full((6, 6), np.nan)),
         )
+
+    @property
+    def information(self) -> Float[AnyArray, "*batch 6 6"]:
+        """(6, 6) Σ Jᵀ M J for the twist ξ = (v, ω) of T exp(ξ), metres and radians, in the source's frame.
+
+        It weighs directions against each other; its scale is that of GICP's relative covariances, so its inverse is
+        *not* a covariance of the pose.
+        """
+        return self.constraints.value[0]
+
+    @property
+    def directions(self) -> Directions | None:
+        """Six directions and what constrains each, see `free_directions`; None from `align`."""
+        return self.constraints.value[1]
+
+    @property
+    def covariance(self) -> Float[AnyArray, "*batch 6 6"]:
+        """(6, 6) of ξ, in the same order and frame as `information`, estimated from how the matches disagree (see
+        `_uncertainty`).
+
+        It covers the noise and the sampling of the points. It does not know of a wrong minimum, of errors that all
+        points share (calibration, motion during a scan), or of things that moved. A direction that nothing constrains
+        has a standard deviation of 10 times the radius of the matched points. NaN where there is no pose, or too few
+        matches to tell.
+        """
+        return self.uncertainty.value
 
     @property
     def status(self) -> Any:
@@ -148,7 +172,7 @@ class Registration(eqx.Module):
         return free_directions(self.directions)
 
     def __repr__(self) -> str:
-        if not is_concrete(self) or np.ndim(self.status_code):
+        if not is_concrete(self.centred, self.history) or np.ndim(self.status_code):
             return f"Registration(batch of shape {np.shape(self.status_code)})"
         if np.any(self.source_origin):
             # Far from zero, the translation says little: it is the motion of a point that is nowhere near.
@@ -157,13 +181,19 @@ class Registration(eqx.Module):
         else:
             moved, where = np.asarray(self.matrix)[:3, 3], ""
         translation = np.array2string(moved, precision=4, suppress_small=True)
-        angle = np.degrees(float(jnp.linalg.norm(self.centred.rotation().log())))
+        cosine = (np.trace(np.asarray(self.matrix)[:3, :3]) - 1) / 2
+        angle = np.degrees(np.arccos(np.clip(cosine, -1, 1)))
         free = describe(self.free_directions)
         return (
             f"Registration({self.status.name}: translation {where}{translation} m, rotation {angle:.3f}°, "
             f"{self.num_iterations} iterations, {self.num_inliers} inliers ({self.overlap:.0%}), "
             f"rmse {np.asarray(self.rmse):.4g} m{'; free by geometry: ' if free else ''}{free})"
         )
+
+
+def computed(result: Registration) -> Registration:
+    """The result with everything computed: it holds nothing of its clouds any more."""
+    return jax.tree.map(lambda leaf: leaf, result)
 
 
 def pose_in_user_frame(

@@ -1,32 +1,35 @@
-"""Correspondences, and what finds them: a search lays out target points, and answers for the source's nearest ones."""
+"""Correspondences, and what finds them: a search lays out target points and answers for the source's nearest ones."""
 
 from __future__ import annotations
 
 import abc
 from collections.abc import Callable
+from typing import NamedTuple
 
 import equinox as eqx
+import jax
 import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float, Int
 
+from mcgicp_jax._pose import AnyArray
 
-class Rows(eqx.Module):
-    """The points of a cloud as a search sees them; a pytree, of NumPy's or JAX's arrays.
+
+class Rows(NamedTuple):
+    """The points of a cloud as a search sees them; NumPy or JAX arrays.
 
     Attributes:
-        points: (3, N), metres.
+        points: (N, 3), metres.
         descriptors: (N, D), channels in metres (α · channel), searched along with the position; D may be 0.
         valid: (N,), False for rows that match nothing and are no match.
-        absence: (N, D), metres²: 0 where a row has the channel of a descriptor; else what the descriptor adds to the
-            squared distance of a pair, which is the same for all rows. A pair has a channel if both of its rows do.
-            None: no row lacks any.
+        penalty: (N, D), metres²: 0 where a row has the channel of a descriptor; where it lacks it, what the descriptor
+            adds to the squared search distance, the same for all rows. None: no row lacks a channel.
     """
 
-    points: Float[Array, "3 N"] | Float[np.ndarray, "3 N"]
-    descriptors: Float[Array, "N D"] | Float[np.ndarray, "N D"]
-    valid: Bool[Array, "N"] | Bool[np.ndarray, "N"]
-    absence: Float[Array, "N D"] | Float[np.ndarray, "N D"] | None = None
+    points: Float[AnyArray, "*batch N 3"]
+    descriptors: Float[AnyArray, "*batch N D"]
+    valid: Bool[AnyArray, "*batch N"]
+    penalty: Float[AnyArray, "*batch N D"] | None = None
 
 
 class Correspondences(eqx.Module):
@@ -37,12 +40,12 @@ class Correspondences(eqx.Module):
     Attributes:
         indices: (N,) rows of the target; or (m, N), nearest first, if several candidates were asked for.
         distances: (N,) metres between the moved source point and its match (position only, not channels).
-        valid: (N,) whether the pair counts: both points exist and lie within `max_distance` of each other.
+        valid: (N,) whether the match counts: both points exist and lie within `max_distance` of each other.
     """
 
-    indices: Int[Array, "*batch N"]
-    distances: Float[Array, "*batch N"]
-    valid: Bool[Array, "*batch N"]
+    indices: Int[AnyArray, "*batch N"]
+    distances: Float[AnyArray, "*batch N"]
+    valid: Bool[AnyArray, "*batch N"]
 
     def __repr__(self) -> str:
         return f"Correspondences({self.indices.shape[-1]} source rows)"
@@ -53,8 +56,8 @@ class AbstractIndex(abc.ABC):
 
     @abc.abstractmethod
     def nearest(
-        self, pose: Float[ArrayLike, "7"], source: Rows, max_distance: Float[ArrayLike, ""], num_candidates: int = 1
-    ) -> Int[Array, "m N"] | Int[np.ndarray, "m N"]:
+        self, pose: Float[ArrayLike, "7"], source: Rows, max_distance: float, num_candidates: int = 1
+    ) -> Int[np.ndarray, "m N"]:
         """Rows of the m nearest target points of each source point, moved by a pose; descriptors do not move.
 
         Args:
@@ -66,12 +69,10 @@ class AbstractIndex(abc.ABC):
         """
 
     @abc.abstractmethod
-    def follow(
-        self, source: Rows, max_distance: Float[ArrayLike, ""]
-    ) -> Callable[[Float[ArrayLike, "7"]], Int[Array, "N"] | Int[np.ndarray, "N"]]:
+    def follow(self, source: Rows, max_distance: float) -> Callable[[Float[ArrayLike, "7"]], Int[np.ndarray, "N"]]:
         """For one registration: a function that finds the nearest target row of each source row, pose after pose.
 
-        What it returns is that of `nearest`; it may use what it knows from the pose before.
+        Its answers are those of `nearest`; it may use what it knows from the pose before.
         """
 
 
@@ -79,13 +80,13 @@ class AbstractSearch(eqx.Module):
     """A way to find nearest neighbours."""
 
     @property
-    def most_threads(self) -> int | None:
+    def num_threads(self) -> int | None:
         """How many threads of the host one registration may keep busy; None for as many as it has use for."""
         return None
 
     @abc.abstractmethod
     def index(self, target: Rows) -> AbstractIndex:
-        """Lay out the valid target rows for searching."""
+        """Lay out the valid target rows for searching; concrete arrays."""
 
     @abc.abstractmethod
     def nearest_traced(
@@ -99,9 +100,14 @@ class AbstractSearch(eqx.Module):
     ) -> Int[Array, "m N"]:
         """`AbstractIndex.nearest` inside a transformation.
 
-        Where not `running`, as in a lane of a batch that is done, the answer is not used and may be anything.
+        Where not `running`, as in a lane that has finished, the answer is not used and may be anything.
         """
 
     @abc.abstractmethod
     def neighbors(self, points: Float[np.ndarray, "N 3"], num_neighbors: int) -> Int[np.ndarray, "N k"]:
         """The k nearest points of every point, itself among them, nearest first; −1 where there are fewer."""
+
+
+def on_host(tree: Rows) -> Rows:
+    """The same with NumPy arrays."""
+    return jax.tree.map(np.asarray, tree)

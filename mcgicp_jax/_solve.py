@@ -1,9 +1,9 @@
-"""One pose update from 73 numbers, and the root that carries the gradient."""
+"""One pose update from the sums over correspondences, and the derivative of the pose as a root."""
 
 from __future__ import annotations
 
 from functools import partial
-from typing import Any
+from typing import Any, TypeAlias
 
 import equinox as eqx
 import jax
@@ -13,12 +13,15 @@ import lineax as lx
 import optimistix as optx
 from jaxtyping import Array, Bool, Float, Int
 
-from mcgicp_jax import _covariance as cov
-from mcgicp_jax._cost import Model, Moments, evaluate_pairs
+from mcgicp_jax._kernels import AbstractKernel
+from mcgicp_jax._methods import AbstractMethod
 from mcgicp_jax._pose import cast_pose
+from mcgicp_jax._sums import Matched, Sums, forces_at
 
 # optimistix starts at damping 1: the form is scaled so that this is small beside its eigenvalues.
 _HESSIAN_SCALE = 1e4
+# Steps of Levenberg-Marquardt, of which at most 16 were seen, at noisy data; and of Newton's method from a pose of the
+# loop, which converges quadratically, in 3 or 4.
 _MAX_STEPS = 32
 _MAX_NEWTON_STEPS = 8
 # Row and column of each stored entry of the symmetric 3×3 and 4×4 matrices.
@@ -46,8 +49,8 @@ class Update(eqx.Module):
 
     Attributes:
         twist: (6,) ξ = (v, ω), metres and radians: points turn by exp(ω) about the centre and move by v.
-        information: (6, 6) Σ JᵀMJ in the same twist.
-        degenerate: whether a direction is held by nothing.
+        information: (6, 6) Σ JᵀMJ in the same twist, lengths in units of the radius.
+        degenerate: whether a direction is constrained by nothing.
     """
 
     twist: Float[Array, "6"]
@@ -55,33 +58,33 @@ class Update(eqx.Module):
     degenerate: Bool[Array, ""]
 
 
-def solve_update(moments: Moments, radius: Float[Array, ""], basis: Float[Array, "6 6"]) -> Update:
-    """Minimise Σ w (d − D h)ᵀ M (d − D h) over the change of pose, M held, to full convergence.
+def solve_update(sums: Sums, basis: Float[Array, "6 6"]) -> Update:
+    """Minimise e − 2⟨D, G⟩ + ⟨D, Q(D)⟩ = Σ w (d − D h)ᵀ M (d − D h) over the change of pose D = [ΔR − I | Δt], M held,
+    to full convergence.
 
     Levenberg-Marquardt on 13 residuals, a square root of the (13, 13) quadratic form in (D, 1): its cost does not
     depend on the number of points. Lengths are measured in units of the points' radius, so that translations and
     rotations, millimetres and kilometres, weigh alike.
 
     Args:
-        radius: metres; `Moments.radius`, and 1 where that is 0.
         basis: the twists, in units of the radius, that the pose may move along: columns; those to be held are zero.
     """
-    dtype = moments.e.dtype
+    radius, dtype = sums.radius, sums.totals.dtype
     eps = float(jnp.finfo(dtype).eps)
-    form = _quadratic_form(moments, radius)
-    unit_information = twist_form(moments.Q, radius)
+    form = _quadratic_form(sums, radius)
+    unit_information = twist_form(sums.stiffness, radius)
     trace = jnp.trace(unit_information)
     scale = _HESSIAN_SCALE / jnp.where(trace > 0, trace / 6, 1)
-    root, _ = _semidefinite_root(form * scale)
+    # Both square roots in one loop, for the sake of compilation.
+    padded = jnp.zeros_like(form).at[:6, :6].set(unit_information)
+    roots, pivots = jax.vmap(_semidefinite_root)(jnp.stack([form * scale, padded]))
     # optimistix computes its step sizes in the default precision, and wants no other beside it.
-    root, columns = root.astype(float), basis.astype(float)
-    solution = _least_squares(root, columns)
-    _, pivots = _semidefinite_root(unit_information)
-    metres = units(radius)
+    root, columns = roots[0].astype(float), basis.astype(float)
+    twist = basis @ _least_squares(root, columns).value.astype(dtype)
     return Update(
-        twist=(basis @ solution.value.astype(dtype)) * metres,
-        information=unit_information * radius**2 / (metres[:, None] * metres),
-        degenerate=~jnp.all(pivots > 64 * eps * jnp.max(jnp.diagonal(unit_information))),
+        twist=jnp.concatenate([twist[:3] * radius, _rotation_vector(twist[3:])]),
+        information=unit_information,
+        degenerate=~jnp.all(pivots[1, :6] > 64 * eps * jnp.max(jnp.diagonal(unit_information))),
     )
 
 
@@ -121,19 +124,19 @@ class _TrustRegion(optx.AbstractSearch):
         return size, accept | level, result, after
 
 
-def _quadratic_form(moments: Moments, radius: Float[Array, ""]) -> Float[Array, "13 13"]:
+def _quadratic_form(sums: Sums, radius: Float[Array, ""]) -> Float[Array, "13 13"]:
     """The form in (vec D, 1), lengths in units of the radius; M keeps its unit."""
-    quadratic, lengths = _unit_quadratic(moments.Q, radius), _unit_lengths(radius)
-    linear = (moments.G * lengths / radius).reshape(12)
-    constant = moments.e / radius**2
+    quadratic, lengths = _unit_quadratic(sums.stiffness, radius), _unit_lengths(radius)
+    linear = (sums.first * lengths / radius).reshape(12)
+    constant = sums.constant / radius**2
     return jnp.block([[quadratic, -linear[:, None]], [-linear[None, :], constant[None, None]]])
 
 
-def _unit_quadratic(moments: Float[Array, "6 10"], radius: Float[Array, ""]) -> Float[Array, "12 12"]:
+def _unit_quadratic(second: Float[Array, "6 10"], radius: Float[Array, ""]) -> Float[Array, "12 12"]:
     lengths = _unit_lengths(radius)
     rows = jnp.asarray(_SYMMETRIC_3)[:, None, :, None]
     columns = jnp.asarray(_SYMMETRIC_4)[None, :, None, :]
-    quadratic = moments[rows, columns] * lengths[None, :, None, None] * lengths[None, None, None, :]
+    quadratic = second[rows, columns] * lengths[None, :, None, None] * lengths[None, None, None, :]
     return quadratic.reshape(12, 12)
 
 
@@ -142,10 +145,10 @@ def _unit_lengths(radius: Float[Array, ""]) -> Float[Array, "4"]:
     return jnp.stack([1 / radius, 1 / radius, 1 / radius, jnp.ones_like(radius)])
 
 
-def twist_form(moments: Float[Array, "6 10"], radius: Float[Array, ""]) -> Float[Array, "6 6"]:
-    """Σ w JᵀKJ from the moments Σ w K ⊗ h hᵀ of any symmetric K, for twists with lengths in units of the radius."""
-    tangent = jnp.asarray(_TANGENT, moments.dtype)
-    return tangent.T @ _unit_quadratic(moments, radius) @ tangent
+def twist_form(second: Float[Array, "6 10"], radius: Float[Array, ""]) -> Float[Array, "6 6"]:
+    """Σ JᵀKJ from Σ K ⊗ h hᵀ of any symmetric K, for twists with lengths in units of the radius."""
+    tangent = jnp.asarray(_TANGENT, second.dtype)
+    return tangent.T @ _unit_quadratic(second, radius) @ tangent
 
 
 def _semidefinite_root(form: Float[Array, "D D"]) -> tuple[Float[Array, "D D"], Float[Array, "D"]]:
@@ -172,15 +175,26 @@ def _semidefinite_root(form: Float[Array, "D D"]) -> tuple[Float[Array, "D D"], 
 
 @jax.jit
 def _residuals(along: Float[Array, "6"], args: tuple[Float[Array, "13 13"], Float[Array, "6 6"]]) -> Float[Array, "13"]:
+    """Square roots of the terms of the cost, whose rotation is given by half of its Rodrigues vector s = tan(θ/2) a.
+
+    ΔR − I = 2 (S + S²) / (1 + s·s) with S = [s]× (Cayley): without the square roots and cases of the exponential map,
+    whose derivatives would be half of what an update compiles. To first order 2 s is the rotation vector.
+    """
     root, basis = args
     twist = basis @ along
-    rotation = _rotation(twist) - jnp.eye(3, dtype=twist.dtype)
+    half = 0.5 * twist[3:]
+    cross = jnp.cross(half[:, None], jnp.eye(3, dtype=half.dtype), axis=0)
+    rotation = 2 / (1 + half @ half) * (cross + cross @ cross)
     change = jnp.concatenate([rotation, twist[:3, None]], axis=1)
     return root.T @ jnp.append(change.reshape(12), 1)
 
 
-def _rotation(twist: Float[Array, "6"]) -> Float[Array, "3 3"]:
-    return jaxlie.SO3.exp(twist[3:]).as_matrix().astype(twist.dtype)
+def _rotation_vector(twice: Float[Array, "3"]) -> Float[Array, "3"]:
+    """Axis times angle, of twice half the Rodrigues vector."""
+    square = 0.25 * (twice @ twice)
+    turned = square > 0
+    tangent = jnp.sqrt(jnp.where(turned, square, 1))
+    return twice * jnp.where(turned, jnp.arctan(tangent) / tangent, 1)
 
 
 def move_pose(pose: jaxlie.SE3, twist: Float[Array, "6"], center: Float[Array, "3"]) -> jaxlie.SE3:
@@ -203,56 +217,131 @@ def adjoint_to_source(pose: jaxlie.SE3, center: Float[Array, "3"]) -> Float[Arra
     return to_center.inverse().adjoint().astype(pose.wxyz_xyz.dtype)
 
 
-def balance(
-    twist: Float[Array, "6"], args: tuple[jaxlie.SE3, Float[Array, "3"], Float[Array, ""], Model]
-) -> Float[Array, "6"]:
-    """g(T) = Σ w Jᵀ M(R) d at the pose moved by a twist, lengths in units of the radius: forces and torques in balance.
-
-    Every GICP renews M between updates, so its answer is the root of g, not the minimum of F: derivatives of the pose
-    follow from g with the dependence of M and of the weights on the pose kept.
-    """
-    pose, center, radius, model = args
-    moved = move_pose(pose, twist * units(radius), center)
-    rotation = moved.rotation().as_matrix().astype(twist.dtype)
-    pairs = evaluate_pairs(rotation, moved.translation(), *model)
-    force = pairs.weight * cov.multiply(pairs.information, pairs.residual)
-    torque = jnp.cross(pairs.moved - center[:, None], force, axis=0)
-    return jnp.concatenate([jnp.sum(force, axis=1) * radius, jnp.sum(torque, axis=1)])
-
-
 def units(radius: Float[Array, ""]) -> Float[Array, "6"]:
     """Metres and radians of a twist whose lengths are in units of the radius."""
     return jnp.stack([radius] * 3 + [jnp.ones_like(radius)] * 3)
 
 
-def refine_pose(pose: jaxlie.SE3, usable: Bool[Array, ""], moments: Moments, model: Model) -> jaxlie.SE3:
-    """The root of g near a pose, which carries the gradient of the answer by the implicit function theorem.
+class Root(eqx.Module):
+    """Where the derivative of a pose is taken: the pose is the root of g(T) = Σ w Jᵀ M(R) d near it.
 
-    The pose that comes in is a constant to autodiff. Where it is not `usable` it comes back as it is, with a gradient
-    of zero.
+    Every GICP renews M between updates, so its answer is the root of g, not the minimum of F: derivatives of the pose
+    follow from g with the dependence of M and of the weights on the pose kept.
+
+    Attributes:
+        center, radius: metres, of the sums at the pose.
+        scale: of g, so that a tolerance on it means something.
+        usable: whether there is a root; where there is none, the derivative is zero.
     """
-    pose, moments = jax.lax.stop_gradient((pose, moments))
-    source, target, matches, *weighing = model
-    # Where there is no root to be found, the identity without pairs keeps every number and derivative finite.
-    matches = eqx.tree_at(lambda m: m.valid, matches, matches.valid & usable)
-    start = jaxlie.SE3(jnp.where(usable, pose.wxyz_xyz, jaxlie.SE3.identity().wxyz_xyz.astype(pose.wxyz_xyz.dtype)))
-    radius = jnp.where(usable & (moments.radius > 0), moments.radius, 1)
-    center = jnp.where(usable, moments.center, 0)
-    # The trace of Σ w M, in the unit of g: makes a tolerance on g mean something.
-    scale = jnp.where(usable, jnp.sum(moments.Q[jnp.array([0, 3, 5]), 9]) * radius**2, 1)
-    eps = float(jnp.finfo(pose.wxyz_xyz.dtype).eps)
-    solution: optx.Solution = optx.root_find(
-        _scaled_balance,
-        optx.Newton(rtol=4 * eps, atol=4 * eps),
-        jnp.zeros(6, pose.wxyz_xyz.dtype),
-        (usable, scale, (start, center, radius, (source, target, matches, *weighing))),
-        max_steps=_MAX_NEWTON_STEPS,
-        throw=False,
+
+    center: Float[Array, "3"]
+    radius: Float[Array, ""]
+    scale: Float[Array, ""]
+    usable: Bool[Array, ""]
+
+
+def root_near(sums: Sums, usable: Bool[Array, ""]) -> Root:
+    """What the derivative needs to know of the sums at a pose."""
+    radius = jnp.where(usable, sums.radius, 1)
+    # The trace of Σ w M, in the unit of g.
+    scale = jnp.sum(sums.stiffness[jnp.array([0, 3, 5]), 9]) * radius**2
+    return Root(
+        center=jnp.where(usable, sums.center, 0), radius=radius, scale=jnp.where(usable, scale, 1), usable=usable
     )
-    refined = move_pose(start, solution.value * units(radius), center)
-    return jaxlie.SE3(jnp.where(usable, refined.wxyz_xyz, pose.wxyz_xyz))
 
 
-def _scaled_balance(twist: Float[Array, "6"], args: tuple[Any, ...]) -> Float[Array, "6"]:
-    usable, scale, balance_args = args
-    return jnp.where(usable, balance(twist, balance_args) / scale, twist)
+Model: TypeAlias = tuple[Matched, AbstractMethod, AbstractKernel | None]
+
+
+@jax.custom_jvp
+def with_derivative(pose: Float[Array, "7"], root: Root, model: Model) -> Float[Array, "7"]:
+    """The pose, whose derivative is that of the root of g next to it: −(∂g/∂ξ)⁻¹ ∂g/∂θ, by the implicit function
+    theorem.
+
+    Newton's method goes from the pose to the root, where the derivative is taken; the pose itself stays what the loop
+    has found. Where the root is not usable, or Newton's method does not reach it, the derivative is zero.
+
+    Args:
+        pose: `jaxlie.SE3.wxyz_xyz`; a constant to autodiff.
+        model: matched rows, method and kernel, by which everything differentiable comes in.
+    """
+    return pose
+
+
+def _with_derivative_jvp(
+    primals: tuple[Float[Array, "7"], Root, Model], tangents: tuple[Any, Any, Any]
+) -> tuple[Float[Array, "7"], Float[Array, "7"]]:
+    pose, root, model = primals
+    leaves, structure = jax.tree.flatten(model)
+    slopes = jax.tree.leaves(tangents[2], is_leaf=_is_symbolic_zero)
+    moving = [i for i, slope in enumerate(slopes) if not _is_symbolic_zero(slope)]
+    if not moving:
+        return pose, jnp.zeros_like(pose)
+    constants = jax.lax.stop_gradient((pose, root, leaves))
+    at_root, inverse, found = _newton(constants[0], constants[1], jax.tree.unflatten(structure, constants[2]))
+
+    def balance_of(values: list[Array]) -> Float[Array, "6"]:
+        changed = list(constants[2])
+        for i, value in zip(moving, values, strict=True):
+            changed[i] = value
+        return _balance(jnp.zeros_like(at_root[:6]), at_root, constants[1], jax.tree.unflatten(structure, changed))
+
+    _, change = jax.jvp(balance_of, ([leaves[i] for i in moving],), ([slopes[i] for i in moving],))
+    twist = jnp.where(found, -inverse @ change, 0) * units(constants[1].radius)
+    return pose, _along(constants[0], twist, constants[1].center)
+
+
+with_derivative.defjvp(_with_derivative_jvp, symbolic_zeros=True)
+
+
+def _along(pose: Float[Array, "7"], twist: Float[Array, "6"], center: Float[Array, "3"]) -> Float[Array, "7"]:
+    """How the parameters of a pose change along a twist about a centre, to first order; linear in the twist."""
+    rotation = jaxlie.SO3(jnp.append(jnp.zeros(1, twist.dtype), 0.5 * twist[3:])) @ jaxlie.SO3(pose[:4])
+    translation = twist[:3] + jnp.cross(twist[3:], pose[4:] - center)
+    return jnp.concatenate([rotation.wxyz.astype(pose.dtype), translation])
+
+
+def _is_symbolic_zero(tangent: object) -> bool:
+    return isinstance(tangent, jax.custom_derivatives.SymbolicZero)
+
+
+def _newton(
+    pose: Float[Array, "7"], root: Root, model: Model
+) -> tuple[Float[Array, "7"], Float[Array, "6 6"], Bool[Array, ""]]:
+    """The root of g next to a pose, the inverse of ∂g/∂ξ there, and whether it was reached."""
+    eps = float(jnp.finfo(pose.dtype).eps)
+    identity = jnp.eye(6, dtype=pose.dtype)
+
+    def step(carry: tuple[Array, Array, Array, Array]) -> tuple[Array, Array, Array, Array]:
+        count, pose, _, _ = carry
+        balance, push = jax.linearize(lambda twist: _balance(twist, pose, root, model), jnp.zeros_like(pose[:6]))
+        jacobian = jnp.where(root.usable, jax.vmap(push, out_axes=1)(identity), identity)
+        inverse = jnp.linalg.inv(jacobian)
+        twist = jnp.where(root.usable, -inverse @ balance, 0)
+        moved = pose + _along(pose, twist * units(root.radius), root.center)
+        moved = moved.at[:4].divide(jnp.sqrt(jnp.sum(moved[:4] ** 2)))
+        return count + 1, moved, inverse, jnp.max(jnp.abs(twist))
+
+    def unfinished(carry: tuple[Array, Array, Array, Array]) -> Bool[Array, ""]:
+        count, _, _, size = carry
+        # Newton's method squares the error: after a step of the root of a rounding error, the rest is rounding.
+        return (count < _MAX_NEWTON_STEPS) & ~(size <= jnp.sqrt(eps))
+
+    start = jnp.int32(0), pose, identity, jnp.asarray(jnp.inf, pose.dtype)
+    _, at_root, inverse, size = jax.lax.while_loop(unfinished, step, start)
+    return at_root, inverse, root.usable & (size <= jnp.sqrt(eps))
+
+
+def _balance(twist: Float[Array, "6"], pose: Float[Array, "7"], root: Root, model: Model) -> Float[Array, "6"]:
+    """g at a pose moved along a twist, to first order in it; lengths in units of the radius: forces and torques."""
+    matched, method, robust = model
+    rotation = jaxlie.SO3(pose[:4]).as_matrix().astype(pose.dtype)
+    v, omega = twist[:3] * root.radius, twist[3:]
+    turned = rotation + jnp.cross(omega[:, None], rotation, axis=0)
+    translation = pose[4:] + v + jnp.cross(omega, pose[4:] - root.center)
+    # Where there is no root to be found, no correspondence keeps every number and derivative finite.
+    matched = eqx.tree_at(lambda matched: matched.valid, matched, matched.valid & root.usable)
+    moved, forces, _ = forces_at(turned, translation, matched, method, robust)
+    arms = jnp.where(matched.valid, moved - root.center[:, None], 0)
+    torque = jnp.cross(arms, forces.force, axis=0)
+    return jnp.concatenate([jnp.sum(forces.force, axis=1) * root.radius, jnp.sum(torque, axis=1)]) / root.scale

@@ -16,10 +16,9 @@ from jax.typing import ArrayLike
 from jaxtyping import Float, Int
 
 from mcgicp_jax._cloud import PointCloud
-from mcgicp_jax._directions import shares
+from mcgicp_jax._directions import CHANNELS_HOLD, GEOMETRY_HOLDS, shares
 from mcgicp_jax._pose import Pose, pose_matrix
 from mcgicp_jax._result import Registration
-from mcgicp_jax._uncertainty import CHANNELS_HOLD, GEOMETRY_HOLDS
 
 if TYPE_CHECKING:
     import matplotlib.figure

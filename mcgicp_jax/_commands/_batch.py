@@ -33,6 +33,7 @@ from mcgicp_jax._commands._options import (
     listed,
     scales,
     status_of,
+    weights_from,
     with_channels,
 )
 from mcgicp_jax._commands._table import COLUMNS, POSE, Row, Table, pose_of
@@ -223,7 +224,7 @@ def _settings(
         source, target = (
             mcg.preprocess(with_channels(cloud, names), voxel_size, options.num_neighbors) for cloud in clouds
         )
-        numbers["channel_weights"] = mcg.MultiChannelGICP().resolve(source, target).channel_weights
+        numbers["channel_weights"] = weights_from(source, target)
     return {
         "method": kind(**numbers),
         "channels": names,

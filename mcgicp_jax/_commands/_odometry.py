@@ -24,6 +24,7 @@ from mcgicp_jax._commands._options import (
     check_outputs,
     listed,
     round_voxel_size,
+    weights_from,
     with_channels,
 )
 from mcgicp_jax._methods import AbstractMethod
@@ -160,7 +161,7 @@ def _method(
         return kind()
     # Its weights from the first pair, as mc-gicp would choose them.
     first, second = (mcg.preprocess(with_channels(frame.cloud, channels), voxel_size) for frame in frames[:2])
-    numbers: dict[str, Any] = {"channel_weights": mcg.MultiChannelGICP().resolve(second, first).channel_weights}
+    numbers: dict[str, Any] = {"channel_weights": weights_from(second, first)}
     return mcg.ColorICP(**numbers)
 
 

@@ -17,8 +17,8 @@ import mcgicp_jax as mcg
 from mcgicp_jax import plot
 from mcgicp_jax._formats import READERS, WRITERS, by_suffix
 from mcgicp_jax._methods import AbstractMethod
+from mcgicp_jax._options import Options as Chosen
 from mcgicp_jax._preprocess import check_preprocessing
-from mcgicp_jax._register import check_settings
 
 MethodName: TypeAlias = Literal["mc-gicp", "gicp", "color-icp", "point-to-plane", "point-to-point"]
 File: TypeAlias = Annotated[Path | None, tyro.conf.arg(metavar="FILE", help_behavior_hint="")]
@@ -81,8 +81,8 @@ class Options:
         """Raise `ValueError` or `OSError` for what no clouds would fit, before any is read."""
         check_preprocessing(None if isinstance(self.voxel_size, str) else self.voxel_size, self.num_neighbors)
         distance = None if self.max_distance == "auto" else self.max_distance
-        method = mcg.MultiChannelGICP(**self.numbers())
-        check_settings(method, distance, self.max_iterations, translation_tolerance=0, rotation_tolerance=0)
+        mcg.MultiChannelGICP(**self.numbers())
+        Chosen(max_distance=distance, max_iterations=self.max_iterations)
         check_outputs(picture=self.plot)
 
     def numbers(self) -> dict[str, Any]:
@@ -158,6 +158,12 @@ def with_channels(cloud: mcg.PointCloud, names: Sequence[str]) -> mcg.PointCloud
         covariances=cloud.covariances,
         channel_names=names,
     )
+
+
+def weights_from(source: mcg.PointCloud, target: mcg.PointCloud) -> Any:
+    """α from the data, as mc-gicp chooses it."""
+    chosen: Any = mcg.MultiChannelGICP().resolve(source, target)
+    return chosen.channel_weights
 
 
 def listed(names: Sequence[str]) -> str:

@@ -13,10 +13,12 @@ from jaxtyping import Float, Int
 from tqdm import tqdm
 
 import mcgicp_jax as mcg
-from mcgicp_jax import _covariance as cov
 from mcgicp_jax import datasets, metrics, plot
-from mcgicp_jax._commands._options import with_channels
-from mcgicp_jax._methods import AbstractMethod, prepare
+from mcgicp_jax._algebra import matrix_from_symmetric
+from mcgicp_jax._commands._options import weights_from, with_channels
+from mcgicp_jax._methods import AbstractMethod
+from mcgicp_jax._surface import covariance_of
+from mcgicp_jax._surfaces import surfaces_of
 
 Folder: TypeAlias = Annotated[Path | None, tyro.conf.arg(metavar="PATH", help_behavior_hint="")]
 
@@ -61,7 +63,7 @@ class _Row:
     def method_for(self, source: mcg.PointCloud, target: mcg.PointCloud) -> AbstractMethod:
         if self.method is not None:
             return self.method
-        numbers: dict[str, Any] = {"channel_weights": mcg.MultiChannelGICP().resolve(source, target).channel_weights}
+        numbers: dict[str, Any] = {"channel_weights": weights_from(source, target)}
         return mcg.ColorICP(**numbers)
 
 
@@ -243,7 +245,7 @@ def _figure_1(output: Path) -> Iterator[str]:
     drawn = _spread(np.asarray(cloud.points)[np.asarray(cloud.valid), :2], 0.06)
     methods = {"GICP": mcg.GICP(), "MC-GICP, colour": mcg.MultiChannelGICP()}
     covariances = {
-        name: cov.matrix_from_symmetric(prepare(method.resolve(cloud, cloud), cloud).covariance)
+        name: matrix_from_symmetric(covariance_of(surfaces_of(method, cloud, cloud, observed=False)[1].table))
         for name, method in methods.items()
     }
     plot.surface_covariances(cloud, covariances, indices=drawn, path=output / "figure_1.png")

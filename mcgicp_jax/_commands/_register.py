@@ -26,6 +26,7 @@ from mcgicp_jax._commands._options import (
     listed,
     scales,
     status_of,
+    weights_from,
     with_channels,
     words,
 )
@@ -73,7 +74,7 @@ class Pair:
         fields = kind.__dataclass_fields__
         numbers = {field: value for field, value in self.options.numbers().items() if field in fields}
         if kind is mcg.ColorICP and not numbers:
-            numbers = {"channel_weights": mcg.MultiChannelGICP().resolve(self.source, self.target).channel_weights}
+            numbers = {"channel_weights": weights_from(self.source, self.target)}
         return kind(**numbers).resolve(self.source, self.target)
 
     def errors(self, pose: Float[np.ndarray, "4 4"], true_pose: Float[np.ndarray, "4 4"]) -> str:

@@ -1,0 +1,249 @@
+"""Closed-form algebra of symmetric 3×3 and 2×2 matrices, one for each point, with gradients that are never NaN.
+
+Arrays are laid out as structures of arrays: vectors (3, N), symmetric 3×3 matrices (6, N) in the order xx, xy, xz, yy,
+yz, zz, and symmetric 2×2 matrices (3, N) as xx, xy, yy. The compiler then vectorises along N. There is no LAPACK call
+per point: besides being slow, two batched ones at once can dead-lock XLA's thread pool on CPUs (jax 0.10.2).
+"""
+
+from __future__ import annotations
+
+from typing import TypeAlias
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+
+def symmetric_from_matrix(matrix: Float[Array, "N 3 3"]) -> Float[Array, "6 N"]:
+    matrix = 0.5 * (matrix + matrix.swapaxes(-1, -2))
+    return jnp.stack([matrix[:, i, j] for i, j in ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))])
+
+
+def matrix_from_symmetric(symmetric: Float[Array, "6 N"]) -> Float[Array, "N 3 3"]:
+    xx, xy, xz, yy, yz, zz = symmetric
+    return jnp.stack([xx, xy, xz, xy, yy, yz, xz, yz, zz], axis=-1).reshape(-1, 3, 3)
+
+
+def multiply(symmetric: Float[Array, "6 N"], vector: Float[Array, "3 N"]) -> Float[Array, "3 N"]:
+    """Matrix times vector, row by row."""
+    xx, xy, xz, yy, yz, zz = symmetric
+    x, y, z = vector
+    return jnp.stack([xx * x + xy * y + xz * z, xy * x + yy * y + yz * z, xz * x + yz * y + zz * z])
+
+
+def rotate(rotation: Float[Array, "3 3"], symmetric: Float[Array, "6 N"]) -> Float[Array, "6 N"]:
+    """R C Rᵀ."""
+    xx, xy, xz, yy, yz, zz = symmetric
+    rows = ((xx, xy, xz), (xy, yy, yz), (xz, yz, zz))
+    half = [[sum(rotation[i, k] * rows[k][j] for k in range(3)) for j in range(3)] for i in range(3)]
+    pairs = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
+    return jnp.stack([sum(half[i][k] * rotation[j, k] for k in range(3)) for i, j in pairs])
+
+
+def inner(a: Float[Array, "3 N"], b: Float[Array, "3 N"]) -> Float[Array, "N"]:
+    """aᵀ b, row by row. Written out for the pairs of a whole cloud, since sums over a first axis are slow there.
+
+    Not for neighbourhoods: there sums keep XLA from computing what they are made of again for each use, and are faster.
+    """
+    x, y, z = a * b
+    return x + y + z
+
+
+def inverse(symmetric: Float[Array, "6 N"]) -> Float[Array, "6 N"]:
+    """The inverse by cofactors; the matrices must be regular."""
+    xx, xy, xz, yy, yz, zz = symmetric
+    cxx, cxy, cxz = yy * zz - yz * yz, xz * yz - xy * zz, xy * yz - xz * yy
+    determinant = xx * cxx + xy * cxy + xz * cxz
+    cofactors = jnp.stack([cxx, cxy, cxz, xx * zz - xz * xz, xy * xz - xx * yz, xx * yy - xy * xy])
+    return cofactors / determinant
+
+
+def determinant(symmetric: Float[Array, "6 N"]) -> Float[Array, "N"]:
+    xx, xy, xz, yy, yz, zz = symmetric
+    return xx * (yy * zz - yz * yz) + xy * (xz * yz - xy * zz) + xz * (xy * yz - xz * yy)
+
+
+def outer(vector: Float[Array, "3 N"]) -> Float[Array, "6 N"]:
+    x, y, z = vector
+    return jnp.stack([x * x, x * y, x * z, y * y, y * z, z * z])
+
+
+def orthonormal_basis(normal: Float[Array, "3 N"]) -> tuple[Float[Array, "3 N"], Float[Array, "3 N"]]:
+    """Two unit vectors that complete the normal to a right-handed frame.
+
+    Duff et al., Building an Orthonormal Basis, Revisited, JCGT 2017.
+    """
+    first, second = _basis(*normal)
+    return jnp.stack(first), jnp.stack(second)
+
+
+def _basis(x: Array, y: Array, z: Array) -> tuple[Entries, Entries]:
+    sign = jnp.where(z >= 0, 1.0, -1.0).astype(z.dtype)
+    a = -1.0 / (sign + z)
+    b = x * y * a
+    return (1.0 + sign * x * x * a, sign * b, -sign * x), (b, sign + y * y * a, -y)
+
+
+@jax.jit
+def smallest_eigenvector(symmetric: Float[Array, "6 N"]) -> Float[Array, "3 N"]:
+    """The unit eigenvector of the smallest eigenvalue: the normal of a neighbourhood with this covariance.
+
+    Closed form, after Eberly, A Robust Eigensolver for 3×3 Symmetric Matrices (Geometric Tools, 2014): first the
+    eigenvector of the eigenvalue that stands apart from the other two, then the rest in the plane across it. Its
+    derivative is written in terms of the gaps between the eigenvalues and is zero where there is none (an isotropic
+    neighbourhood has no normal that could move).
+    """
+    return _smallest_eigenvector(symmetric)
+
+
+@jax.custom_jvp
+def _smallest_eigenvector(symmetric: Float[Array, "6 N"]) -> Float[Array, "3 N"]:
+    # On scalars, coordinate by coordinate: XLA makes few loops of them, and many of stacked arrays.
+    xx, xy, xz, yy, yz, zz = _scale_to_one(symmetric)
+    mean = (xx + yy + zz) / 3
+    ax, ay, az = xx - mean, yy - mean, zz - mean
+    spread = jnp.sqrt((ax * ax + ay * ay + az * az + 2 * (xy * xy + xz * xz + yz * yz)) / 6)
+    isotropic = spread <= jnp.finfo(symmetric.dtype).eps
+    scale = 1 / jnp.where(isotropic, 1, spread)
+    # The matrix B = (A − mean)/spread has the eigenvalues 2 cos(φ + 2πk/3).
+    xx, xy, xz, yy, yz, zz = ax * scale, xy * scale, xz * scale, ay * scale, yz * scale, az * scale
+    half_determinant = 0.5 * (xx * (yy * zz - yz * yz) + xy * (xz * yz - xy * zz) + xz * (xy * yz - xz * yy))
+    # The largest stands apart where the determinant is positive, the smallest where it is negative: of −B, the largest.
+    positive = half_determinant >= 0
+    apart = 2 * jnp.cos(jnp.arccos(jnp.minimum(jnp.abs(half_determinant), 1)) / 3)
+    apart = jnp.where(positive, apart, -apart)
+    first = _null_vector(xx - apart, xy, xz, yy - apart, yz, zz - apart)
+    # Where the smallest eigenvalue stands apart that is the answer. Elsewhere it is in the plane across.
+    u, v = _basis(*first)
+    bu, bv = (_times((xx, xy, xz, yy, yz, zz), axis) for axis in (u, v))
+    a, b, c = _dot(u, bu), _dot(u, bv), _dot(v, bv)
+    # The eigenvector of [[a, b], [b, c]] for its smaller eigenvalue, of two forms the one without cancellation.
+    half = 0.5 * (a - c)
+    radius = jnp.sqrt(half * half + b * b)
+    along, across = jnp.where(half >= 0, -b, half - radius), jnp.where(half >= 0, radius + half, b)
+    square = along * along + across * across
+    regular = square > 0
+    length = jnp.sqrt(jnp.where(regular, square, 1))
+    along, across = along / length, jnp.where(regular, across / length, 1)
+    chosen = [jnp.where(positive, along * p + across * q, n) for p, q, n in zip(u, v, first, strict=True)]
+    return jnp.stack([jnp.where(isotropic, default, axis) for axis, default in zip(chosen, (0, 0, 1), strict=True)])
+
+
+# Vectors and matrices whose entries are arrays of one number for each point.
+Entries: TypeAlias = tuple[Array, ...]
+
+
+def _dot(a: Entries, b: Entries) -> Array:
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+
+
+def _times(symmetric: Entries, vector: Entries) -> Entries:
+    xx, xy, xz, yy, yz, zz = symmetric
+    x, y, z = vector
+    return xx * x + xy * y + xz * z, xy * x + yy * y + yz * z, xz * x + yz * y + zz * z
+
+
+def _cross(a: Entries, b: Entries) -> Entries:
+    return a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
+
+
+def _scale_to_one(symmetric: Float[Array, "6 N"]) -> Entries:
+    """Divided by the trace: 1e-6 m or 1e6 m apart, products of entries stay within float32."""
+    xx, xy, xz, yy, yz, zz = symmetric
+    trace = xx + yy + zz
+    scale = 1 / jnp.where(trace > 0, trace, 1)
+    return tuple(entry * scale for entry in (xx, xy, xz, yy, yz, zz))
+
+
+def _null_vector(xx: Array, xy: Array, xz: Array, yy: Array, yz: Array, zz: Array) -> Entries:
+    """Unit null vector of a symmetric matrix of rank two: the longest cross product of two of its rows."""
+    rows = ((xx, xy, xz), (xy, yy, yz), (xz, yz, zz))
+    crosses = [_cross(rows[i], rows[j]) for i, j in ((0, 1), (0, 2), (1, 2))]
+    best, length = crosses[0], _dot(crosses[0], crosses[0])
+    for cross in crosses[1:]:
+        square = _dot(cross, cross)
+        longer = square > length
+        best = tuple(jnp.where(longer, new, old) for new, old in zip(cross, best, strict=True))
+        length = jnp.maximum(square, length)
+    regular = length > 0
+    root = jnp.sqrt(jnp.where(regular, length, 1))
+    return tuple(jnp.where(regular, axis / root, default) for axis, default in zip(best, (0, 0, 1), strict=True))
+
+
+@_smallest_eigenvector.defjvp
+def _smallest_eigenvector_jvp(
+    primals: tuple[Float[Array, "6 N"]], tangents: tuple[Float[Array, "6 N"]]
+) -> tuple[Float[Array, "3 N"], Float[Array, "3 N"]]:
+    """dn = −B (Bᵀ A B − λ)⁻¹ Bᵀ dA n, with B a basis of the plane across n and λ = nᵀ A n."""
+    (symmetric,), (tangent,) = primals, tangents
+    normal = _smallest_eigenvector(symmetric)
+    trace = symmetric[0] + symmetric[3] + symmetric[5]
+    scale = 1 / jnp.where(trace > 0, trace, 1)
+    scaled = symmetric * scale
+    u, v = orthonormal_basis(normal)
+    a, b, c = project(scaled, u, v)
+    eigenvalue = jnp.sum(normal * multiply(scaled, normal), axis=0)
+    a, c = a - eigenvalue, c - eigenvalue
+    # The product of the two gaps and their sum tell the smaller one: where it is lost in rounding there is no
+    # derivative, and the answer is zero rather than NaN.
+    determinant = a * c - b * b
+    gap = determinant > 64 * jnp.finfo(symmetric.dtype).eps * (a + c)
+    determinant = jnp.where(gap, determinant, 1)
+    turned = multiply(tangent * scale, normal)
+    du, dv = jnp.sum(u * turned, axis=0), jnp.sum(v * turned, axis=0)
+    along_u, along_v = (c * du - b * dv) / determinant, (a * dv - b * du) / determinant
+    return normal, jnp.where(gap, -(along_u * u + along_v * v), 0)
+
+
+def project(symmetric: Float[Array, "6 N"], u: Float[Array, "3 N"], v: Float[Array, "3 N"]) -> Float[Array, "3 N"]:
+    """The 2×2 matrix Bᵀ C B in the basis B = [u v]."""
+    cu, cv = multiply(symmetric, u), multiply(symmetric, v)
+    return jnp.stack([jnp.sum(u * cu, axis=0), jnp.sum(u * cv, axis=0), jnp.sum(v * cv, axis=0)])
+
+
+def inverse_square_root(symmetric: Float[Array, "3 N"]) -> Float[Array, "3 N"]:
+    """A^{-1/2} of positive definite 2×2 matrices, by trace and determinant (Cayley-Hamilton)."""
+    a, b, c = symmetric
+    s = jnp.sqrt(a * c - b * b)
+    t = jnp.sqrt(a + c + 2 * s)
+    return jnp.stack([(c / s + 1) / t, -b / s / t, (a / s + 1) / t])
+
+
+def sandwich(outside: Float[Array, "3 N"], inside: Float[Array, "3 N"]) -> Float[Array, "3 N"]:
+    """W A W for symmetric 2×2 matrices."""
+    p, q, r = outside
+    a, b, c = inside
+    return jnp.stack(
+        [
+            p * p * a + 2 * p * q * b + q * q * c,
+            p * q * a + (p * r + q * q) * b + q * r * c,
+            q * q * a + 2 * q * r * b + r * r * c,
+        ]
+    )
+
+
+def floor_eigenvalues(symmetric: Float[Array, "3 N"], floor: Float[Array, ""]) -> Float[Array, "3 N"]:
+    """Raise the eigenvalues of 2×2 matrices to at least `floor`; matrices above it stay as they are, bit by bit."""
+    a, b, c = symmetric
+    mean, half = 0.5 * (a + c), 0.5 * (a - c)
+    square = half * half + b * b
+    radius = jnp.where(square > 0, jnp.sqrt(jnp.where(square > 0, square, 1)), 0)
+    below = mean - radius < floor
+    low, high = jnp.maximum(mean - radius, floor), jnp.maximum(mean + radius, floor)
+    middle, ratio = 0.5 * (high + low), 0.5 * (high - low) / jnp.where(radius > 0, radius, 1)
+    raised = jnp.stack([middle + ratio * half, ratio * b, middle - ratio * half])
+    return jnp.where(below, raised, symmetric)
+
+
+def embed(symmetric: Float[Array, "3 N"], u: Float[Array, "3 N"], v: Float[Array, "3 N"]) -> Float[Array, "6 N"]:
+    """B A Bᵀ in the basis B = [u v]: a 2×2 matrix of the tangent plane as a 3×3 one."""
+    a, b, c = symmetric
+    cross = jnp.stack([2 * u[i] * v[j] if i == j else u[i] * v[j] + u[j] * v[i] for i in range(3) for j in range(i, 3)])
+    return a * outer(u) + b * cross + c * outer(v)
+
+
+def symmetric_product(a: Float[Array, "6 N"], b: Float[Array, "6 N"]) -> Float[Array, "6 N"]:
+    """(A B + B A) / 2."""
+    axes = jnp.eye(3, dtype=a.dtype)[:, :, None]
+    columns = [multiply(a, multiply(b, jnp.broadcast_to(axis, (3, a.shape[1])))) for axis in axes]
+    return jnp.stack([0.5 * (columns[j][i] + columns[i][j]) for i in range(3) for j in range(i, 3)])

@@ -1,0 +1,235 @@
+"""The loop on the host: compiled programs over blocks of rows, matches from an index between them.
+
+A point's way from `PointCloud` to `Registration`, in ten sentences. `preprocess` gives it k neighbours. `describe`
+computes a row of local statistics from these, whatever the method. `method.covariance` and the local statistics give it
+a row of a surface: position, covariance, observability. A search finds, at the current pose, its nearest target point
+in position and α · channel. NumPy gathers the target's row beside its own. `method.forces` says what the two do to the
+pose: force, stiffness and cost. `sums_of` adds these up over a block of correspondences, and `combine` over all blocks.
+`update` computes the next pose from the sums, and the steps repeat until the pose no longer moves. `scores_of` says,
+once more for each point, what its force tells of the covariance of the pose. `Registration` holds the pose, how the
+loop ended, and that covariance.
+"""
+
+from __future__ import annotations
+
+from functools import partial
+from typing import Any, TypeAlias
+
+import jax
+import jaxlie
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
+
+from mcgicp_jax._blocks import map_blocks, map_rows
+from mcgicp_jax._deferred import Deferred
+from mcgicp_jax._kernels import AbstractKernel
+from mcgicp_jax._methods import AbstractMethod
+from mcgicp_jax._pose import AnyArray, AnyScalar, rotation_from_quaternion
+from mcgicp_jax._search import AbstractIndex, Correspondences, Rows
+from mcgicp_jax._statistics import sampled_rows
+from mcgicp_jax._step import (
+    COARSE,
+    RUNNING,
+    SETTLED,
+    Assessment,
+    Problem,
+    State,
+    constraints_of,
+    covariance_of_pose,
+    history_of,
+    update,
+)
+from mcgicp_jax._sums import Matched, Sums, combine, move_rows, sums_of, within
+from mcgicp_jax._surface import Surface
+from mcgicp_jax._uncertainty import Details, Scores, discount_rows, discounts, scatter_of, scores_of
+
+# Rotation and translation of a pose.
+Moving: TypeAlias = tuple[Float[AnyArray, "3 3"], Float[AnyArray, "3"]]
+# Rows of a block of correspondences. One size for all, so that few programs are compiled: small clouds fill little of a
+# large block, and large clouds pay some 0.1 ms for the call of each small one.
+CORRESPONDENCE_BLOCK = 2048
+
+
+def register_on_host(
+    problem: Problem, index: AbstractIndex, num_threads: int | None
+) -> tuple[State, Assessment, dict[str, np.ndarray]]:
+    """Find matches at this pose; sum their forces; update the pose; stop when it no longer moves."""
+    pose, settings, records = problem.start, problem.settings, []
+    coarse = settings.fine_distance < settings.max_distance or settings.coarse_stride > 1
+    status: Any = np.int32(COARSE if coarse else RUNNING)
+    num_iterations: Any = np.int32(0)
+    followed: int | None = None
+    while status < 0:
+        last = num_iterations >= settings.max_iterations
+        stride = int(settings.coarse_stride) if status == COARSE and not last else 1
+        if status != SETTLED and stride != followed:
+            followed, source = stride, _every(stride, problem.source)
+            nearest = index.follow(source.rows, float(settings.max_distance))
+        if status != SETTLED:
+            matches = _Matches(source, problem.target, nearest(pose.wxyz_xyz))
+        gate = settings.max_distance if status == COARSE else settings.fine_distance
+        sums = _measure(pose, matches, gate, problem)
+        state = update(pose, status, num_iterations, sums, settings)
+        pose, num_iterations, status = state.pose, np.asarray(state.num_iterations), np.asarray(state.status)
+        records.append(state.record)
+    assessment = Assessment(
+        Deferred(partial(constraints_of, state)),
+        Deferred(partial(_covariance, state, matches, gate, problem, num_threads)),
+    )
+    return state, assessment, history_of(np.stack([np.asarray(record) for record in records]))
+
+
+def _every(stride: int, source: Surface) -> Surface:
+    """Every so many-th row of a surface."""
+    return source if stride == 1 else jax.tree.map(lambda array: np.ascontiguousarray(array[::stride]), source)
+
+
+class _Matches:
+    """Source rows, and the target row that each has been matched with."""
+
+    def __init__(self, source: Surface, target: Surface, indices: Int[np.ndarray, "N"]):
+        self.source, self.target = source, target
+        self.rows = np.maximum(indices, 0)
+        self.found = (indices >= 0) & source.rows.valid & target.rows.valid[self.rows]
+        self.size = indices.size
+
+    def rows_at(self, index: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Source and target rows, and which have a match."""
+        return self.source.table[index], self.target.table[self.rows[index]], self.found[index]
+
+    def block(self, index: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """The same of a block; rows that are repeated to fill it have no match."""
+        source, target, found = self.rows_at(index)
+        if not isinstance(index, slice):
+            found[self.size - index[0] :] = False
+        return source, target, found
+
+    def details(self, index: Any) -> Details:
+        source: Any = self.source.details
+        target: Any = self.target.details
+        return Details(source[index], target[self.rows[index]])
+
+
+def _moving(pose: jaxlie.SE3, dtype: Any) -> Moving:
+    """Rotation and translation of a pose, with NumPy."""
+    parameters = np.asarray(pose.wxyz_xyz)
+    return rotation_from_quaternion(parameters[:4].astype(np.float64)).astype(dtype), parameters[4:]
+
+
+def _measure(pose: jaxlie.SE3, matches: _Matches, gate: Float[AnyScalar, ""], problem: Problem) -> Sums:
+    """The sums at a pose over the matches within a gate, metres."""
+    moving = _moving(pose, matches.source.table.dtype)
+
+    def sums(index: Any) -> Sums:
+        return _sums(moving, *matches.block(index), gate, problem.method, problem.robust)
+
+    parts = map_blocks(sums, matches.size, CORRESPONDENCE_BLOCK)
+    return combine([part for _, part in parts], matches.source.table.dtype)
+
+
+@jax.jit
+def _sums(
+    moving: Moving,
+    source: Float[AnyArray, "n L"],
+    target: Float[AnyArray, "n L"],
+    found: Bool[AnyArray, "n"],
+    gate: Float[AnyScalar, ""],
+    method: AbstractMethod,
+    robust: AbstractKernel | None,
+) -> Sums:
+    return sums_of(*moving, _matched(moving, source, target, found, gate), method, robust)
+
+
+def _matched(
+    moving: Moving,
+    source: Float[AnyArray, "n L"],
+    target: Float[AnyArray, "n L"],
+    found: Bool[AnyArray, "n"],
+    gate: Float[AnyScalar, ""],
+) -> Matched:
+    valid, _ = within(move_rows(*moving, source), target, found, gate)
+    return Matched(source, target, valid)
+
+
+def _covariance(
+    state: State, matches: _Matches, gate: Float[AnyScalar, ""], problem: Problem, num_threads: int | None
+) -> Float[Array, "6 6"]:
+    """The covariance of the pose of a loop that has ended."""
+    source, target = matches.source, matches.target
+    moving = _moving(state.pose, source.table.dtype)
+    some, counts = sampled_rows(source.rows.valid)
+
+    def discount(index: Any) -> Any:
+        rows = some[index]
+        sides = (
+            jax.tree.map(lambda array: array[rows], source.rows),
+            jax.tree.map(lambda array: array[matches.rows[rows]], target.rows),
+        )
+        return _discount_rows(moving, *matches.rows_at(rows), gate, matches.details(rows), *sides)
+
+    rows = map_rows(discount, some.size, CORRESPONDENCE_BLOCK, num_threads)
+    num_channels = np.sum(np.any(source.rows.descriptors != 0, axis=0))
+    discount_of_all = discounts(np.where(counts[:, None], rows, np.nan), num_channels)
+
+    def scores(index: Any) -> Scores:
+        weighing = (problem.method, problem.robust, discount_of_all, np.int32(matches.size))
+        return _scores(moving, state.sums, *matches.block(index), gate, matches.details(index), *weighing)
+
+    parts = map_blocks(scores, matches.size, CORRESPONDENCE_BLOCK, num_threads)
+    answer, pull = (
+        np.sum([np.asarray(getattr(part, name), np.float64) for _, part in parts], axis=0)
+        for name in ("answer", "pull")
+    )
+    rows, cells = (
+        np.concatenate([getattr(part, name)[: rows.stop - rows.start] for rows, part in parts])
+        for name in ("rows", "cells")
+    )
+    scatter, num_cells = scatter_of(Scores(rows, cells, answer, pull), matches.size)
+    dtype = source.table.dtype
+    with np.errstate(invalid="ignore", over="ignore"):
+        numbers = (answer.astype(dtype), pull.astype(dtype), scatter.astype(dtype))
+    return covariance_of_pose(state, *numbers, np.int32(num_cells))
+
+
+@jax.jit
+def _discount_rows(
+    moving: Moving,
+    source: Float[AnyArray, "n L"],
+    target: Float[AnyArray, "n L"],
+    found: Bool[AnyArray, "n"],
+    gate: Float[AnyScalar, ""],
+    details: Details,
+    source_rows: Rows,
+    target_rows: Rows,
+) -> Float[AnyArray, "n 3"]:
+    return discount_rows(*moving, _matched(moving, source, target, found, gate), details, source_rows, target_rows)
+
+
+@jax.jit
+def _scores(
+    moving: Moving,
+    sums: Sums,
+    source: Float[AnyArray, "n L"],
+    target: Float[AnyArray, "n L"],
+    found: Bool[AnyArray, "n"],
+    gate: Float[AnyScalar, ""],
+    details: Details,
+    method: AbstractMethod,
+    robust: AbstractKernel | None,
+    discount: Float[AnyArray, "2"],
+    num_cells: Int[AnyScalar, ""],
+) -> Scores:
+    matched = _matched(moving, source, target, found, gate)
+    return scores_of(moving, sums.center, sums.radius, matched, details, discount, num_cells, method, robust)
+
+
+def correspondences_at(
+    matrix: Float[np.ndarray, "4 4"], source: Rows, target: Rows, indices: Int[np.ndarray, "m N"], gate: float
+) -> Correspondences:
+    """Matches within a gate, metres of position; NumPy, so that nothing is compiled."""
+    rows, dtype = np.maximum(indices, 0), source.points.dtype
+    with np.errstate(invalid="ignore"):
+        moved = source.points.astype(np.float64) @ matrix[:3, :3].T + matrix[:3, 3]
+        distances = np.linalg.norm(target.points[rows] - moved, axis=-1).astype(dtype)
+        valid = (indices >= 0) & source.valid & target.valid[rows] & (distances <= gate)
+    return Correspondences(rows.astype(np.int32), distances, valid)

@@ -1,0 +1,70 @@
+"""The options of a registration, from wherever it is called: written down and checked once."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, TypeAlias
+
+import numpy as np
+from jax.typing import ArrayLike
+
+from mcgicp_jax._kernels import AbstractKernel
+from mcgicp_jax._methods import AbstractMethod
+from mcgicp_jax._pose import is_concrete
+from mcgicp_jax._search import AbstractSearch
+
+# Metres; or coarse and fine.
+Distance: TypeAlias = ArrayLike | tuple[ArrayLike, ArrayLike]
+
+
+@dataclass(frozen=True)
+class Options:
+    """Options of `register`, which explains them; every function that registers takes them all.
+
+    The tolerances are in metres and radians. Nearest-neighbour matches often end in a small cycle; real scans were seen
+    to circle within 0.2 mm and 0.4 mrad.
+    """
+
+    max_distance: Distance | None = None
+    max_iterations: int = 64
+    translation_tolerance: ArrayLike = 5e-4
+    rotation_tolerance: ArrayLike = 5e-4
+    robust: AbstractKernel | None = None
+    search: AbstractSearch | None = None
+    hold_free_directions: bool = True
+    match_channels: bool = False
+    scales: Sequence[float] = ()
+
+    def __post_init__(self) -> None:
+        if self.max_distance is not None:
+            _check_distances(self.max_distance)
+        if not _is_number(self.max_iterations) or self.max_iterations < 1:
+            raise ValueError(f"max_iterations: expected at least 1, got {self.max_iterations!r}")
+        for name in ("translation_tolerance", "rotation_tolerance"):
+            value = getattr(self, name)
+            if is_concrete(value) and not (_is_number(value) and np.asarray(value) >= 0):
+                raise ValueError(f"{name}: expected a number of at least 0, got {value!r}")
+
+
+def check_method(method: AbstractMethod) -> None:
+    if not isinstance(method, AbstractMethod):
+        raise ValueError(f"method: expected one such as MultiChannelGICP(), got {method!r}")
+
+
+def check_positive(name: str, value: ArrayLike) -> None:
+    if is_concrete(value) and not (_is_number(value) and np.asarray(value) > 0):
+        raise ValueError(f"{name}: expected a positive number, got {value!r}")
+
+
+def _check_distances(distances: Any) -> None:
+    if np.shape(distances) != (2,):
+        check_positive("max_distance", distances)
+    elif is_concrete(distances):
+        coarse, fine = distances
+        if not (_is_number(coarse) and _is_number(fine) and coarse >= fine > 0):
+            raise ValueError(f"max_distance: expected a positive number and then a smaller one, got {distances!r}")
+
+
+def _is_number(value: object) -> bool:
+    return np.ndim(value) == 0 and np.asarray(value).dtype.kind in "fiu"  # type: ignore[arg-type]

@@ -1,0 +1,103 @@
+"""From the end of the loop to a `Registration` in the user's frames."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array
+
+from mcgicp_jax._cloud import PointCloud
+from mcgicp_jax._deferred import Deferred
+from mcgicp_jax._directions import Directions
+from mcgicp_jax._pose import is_concrete, se3_from_matrix
+from mcgicp_jax._result import Registration, pose_in_user_frame
+from mcgicp_jax._step import Assessment, State
+
+
+def registration_of(
+    state: State,
+    assessment: Assessment,
+    history: dict[str, Any],
+    source: PointCloud,
+    target: PointCloud,
+) -> Registration:
+    """The result in the user's frames; NumPy where everything is concrete."""
+    concrete = is_concrete(state, history)
+    if concrete:
+        # NumPy's numbers, which cost no program to be read.
+        state, history = jax.tree.map(np.asarray, (state, history))
+    pose = state.pose
+    matrix = pose_in_user_frame(pose, source.origin, target.origin)
+    numbers: Any = {
+        "status_code": state.status,
+        "num_iterations": state.num_iterations,
+        "num_inliers": state.record[..., 2],
+        "cost": state.record[..., 0],
+        "rmse": state.record[..., 1],
+        "history": history,
+    }
+    valid = source.valid
+    if is_concrete(numbers, valid):
+        # NumPy's scalars, rather than arrays without dimensions, print as numbers.
+        numbers, valid = jax.tree.map(lambda number: np.asarray(number)[()], (numbers, valid))
+    numbers["num_inliers"] = numbers["num_inliers"].astype(np.int32)
+    numbers["overlap"] = (numbers["num_inliers"] / valid.sum()).astype(numbers["rmse"].dtype)
+    far = not is_concrete(source.origin, target.origin) or np.any(source.origin) or np.any(target.origin)
+    return Registration.build(
+        T_target_source=se3_from_matrix(matrix, pose.wxyz_xyz.dtype) if far else pose,
+        source_origin=source.origin,
+        target_origin=target.origin,
+        centred=pose,
+        constraints=_later(lambda: _constraints(assessment, source.origin), concrete),
+        uncertainty=_later(lambda: _covariance(assessment, source.origin), concrete),
+        **numbers,
+    )
+
+
+def _later(compute: Callable[[], Any], concrete: bool) -> Deferred[Any]:
+    """Read when it is asked for; what is traced must be read before the trace ends."""
+    return Deferred(compute) if concrete else Deferred.of(compute())
+
+
+def _read(deferred: Deferred[Any]) -> Any:
+    """With NumPy arrays where it is concrete: a large origin is float64."""
+    value = deferred.value
+    return jax.tree.map(np.asarray, value) if is_concrete(value) else value
+
+
+def _constraints(assessment: Assessment, origin: Any) -> tuple[Any, Directions | None]:
+    """Information and directions in the frame of the user's source."""
+    information, directions = _read(assessment.constraints)
+    if is_concrete(origin) and not np.any(origin):
+        return information, directions
+    to_centred, from_centred = _translation_adjoint(-origin), _translation_adjoint(origin)
+    # What was not finite stays so, and the status says it.
+    with np.errstate(invalid="ignore", over="ignore"):
+        if directions is not None:
+            moved = directions.twists @ from_centred.T, directions.center + origin
+            directions = eqx.tree_at(lambda d: (d.twists, d.center), directions, moved)
+        return to_centred.T @ information @ to_centred, directions
+
+
+def _covariance(assessment: Assessment, origin: Any) -> Any:
+    """The covariance in the frame of the user's source."""
+    covariance = _read(assessment.covariance)
+    if is_concrete(origin) and not np.any(origin):
+        return covariance
+    from_centred = _translation_adjoint(origin)
+    with np.errstate(invalid="ignore", over="ignore"):
+        return from_centred @ covariance @ from_centred.T
+
+
+def _translation_adjoint(offset: Array | np.ndarray) -> Array | np.ndarray:
+    """Ad of a pure translation for twists (v, ω)."""
+    xp = np if isinstance(offset, np.ndarray) else jnp
+    zero = xp.zeros_like(offset[0])
+    x, y, z = offset
+    cross = xp.stack([xp.stack([zero, -z, y]), xp.stack([z, zero, -x]), xp.stack([-y, x, zero])])
+    return xp.block([[xp.eye(3), cross], [xp.zeros((3, 3)), xp.eye(3)]])

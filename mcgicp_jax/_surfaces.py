@@ -1,0 +1,167 @@
+"""Surfaces: clouds as a method sees them, from neighbourhoods or from covariances that a cloud brings."""
+
+from __future__ import annotations
+
+from functools import partial
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from mcgicp_jax import _algebra as alg
+from mcgicp_jax._blocks import map_rows
+from mcgicp_jax._cloud import PointCloud
+from mcgicp_jax._kept import keep
+from mcgicp_jax._local import NEIGHBORHOOD_BLOCK, joined, locals_of, over_rows, share_a_body, split
+from mcgicp_jax._methods import AbstractMethod
+from mcgicp_jax._neighborhoods import gatherer
+from mcgicp_jax._observability import channel_observability
+from mcgicp_jax._pose import AnyArray, is_concrete
+from mcgicp_jax._search import Rows
+from mcgicp_jax._statistics import namespace
+from mcgicp_jax._surface import Local, Neighborhoods, Surface, Table
+from mcgicp_jax._threads import side_by_side
+
+
+def surfaces_of(
+    method: AbstractMethod,
+    source: PointCloud,
+    target: PointCloud,
+    *,
+    observed: bool,
+    num_threads: int | None = 1,
+) -> tuple[AbstractMethod, Surface, Surface]:
+    """The method with its open numbers chosen from the data, and both clouds as it sees them.
+
+    On the host where everything is concrete, in blocks; what depends on one cloud alone is kept as long as the cloud is
+    used. Inside transformations clouds of one size share one body.
+
+    Args:
+        observed: whether observability is wanted: to `register`, not to a cost of given matches.
+        num_threads: on the host, at most; None for as many as there is use for.
+    """
+    is_open = method.is_open(source, target)
+    locals: tuple[Any, Any] = (None, None)
+    if observed or is_open or (source.neighbors is not None and target.neighbors is not None):
+        locals = locals_of(source, target, method.uses_channels, num_threads)
+    if is_open:
+        method = method.chosen(source, target, locals)
+    sides = list(zip((source, target), locals, strict=True))
+    if is_concrete(method, source, target):
+        calls = [partial(surface_on_host, method, cloud, local, observed, num_threads) for cloud, local in sides[::-1]]
+        found_target, found_source = side_by_side(calls, num_threads)
+        return method, found_source, found_target
+    rows = [searchable(method, cloud) for cloud in (source, target)]
+    found = _traced(method, source, target, locals, observed)
+    seen, there = (Surface(row, *each) for row, each in zip(rows, found, strict=True))
+    return method, seen, there
+
+
+def searchable(method: AbstractMethod, cloud: PointCloud) -> Rows:
+    """The cloud as a search sees it: positions and α · channel."""
+    xp = namespace(method, cloud)
+    points, channels = xp.asarray(cloud.points), xp.asarray(cloud.channels)
+    weights = method.weights(channels.shape[-1])
+    if weights is None:
+        return Rows(points, xp.zeros((points.shape[0], 0), points.dtype), xp.asarray(cloud.valid))
+    weights, penalty = xp.asarray(weights), None
+    if cloud.channel_valid is not None:
+        # The expected square of the difference in a true match: a match is then neither nearer nor further for what is
+        # not known of it.
+        expected = weights**2 * xp.asarray(method.missing_variances(channels.shape[-1]))
+        penalty = xp.where(xp.asarray(cloud.channel_valid), 0, expected.astype(points.dtype))
+    return Rows(points, channels * weights.astype(points.dtype), xp.asarray(cloud.valid), penalty)
+
+
+def surface_on_host(
+    method: AbstractMethod, cloud: PointCloud, local: Local | None, observed: bool, num_threads: int | None
+) -> Surface:
+    """The surface of a concrete cloud, kept as long as the cloud is used with this method; NumPy arrays."""
+
+    def make() -> Surface:
+        block = partial(_block, method, cloud, local, observed)
+        table, details = map_rows(block(), cloud.points.shape[0], NEIGHBORHOOD_BLOCK, num_threads)
+        return Surface(searchable(method, cloud), table, details)
+
+    leaves, structure = jax.tree.flatten(method)
+    key = (structure, *(np.asarray(leaf).tobytes() for leaf in leaves), observed)
+    return keep(cloud, "surface", key, make)
+
+
+def _block(method: AbstractMethod, cloud: PointCloud, local: Local | None, observed: bool) -> Any:
+    gather = None if local is None else gatherer(cloud, method.uses_channels, np)
+    points, given = np.asarray(cloud.points), cloud.covariances
+    given = None if given is None else np.asarray(given)
+
+    def table(rows: Any) -> tuple[Any, Any]:
+        around = None if gather is None else gather(rows)
+        here = None if local is None else jax.tree.map(lambda array: array[rows], local)
+        return _tables(method, points[rows], None if given is None else given[rows], around, here, observed)
+
+    return table
+
+
+def _traced(
+    method: AbstractMethod,
+    source: PointCloud,
+    target: PointCloud,
+    locals: tuple[Local | None, Local | None],
+    observed: bool,
+) -> Any:
+    """Table and details of each cloud; one body for both, unless they differ in what they bring."""
+    alike = None not in locals and (source.covariances is None) == (target.covariances is None)
+    if not alike or not share_a_body(source, target):
+        sides = zip((source, target), locals, strict=True)
+        return [_rows_of(method, cloud, cloud.covariances, local, observed) for cloud, local in sides]
+    cloud = joined(source, target, method.uses_channels)
+    local = jax.tree.map(lambda *rows: jnp.concatenate(rows), *locals)
+    given = None
+    if source.covariances is not None:
+        given = jnp.concatenate([jnp.asarray(cloud.covariances) for cloud in (source, target)])
+    return split(_rows_of(method, cloud, given, local, observed), source.points.shape[0])
+
+
+def _rows_of(method: AbstractMethod, cloud: PointCloud, given: Any, local: Local | None, observed: bool) -> Any:
+    gather = None if local is None else gatherer(cloud, method.uses_channels, jnp)
+    points, given = jnp.asarray(cloud.points), None if given is None else jnp.asarray(given)
+
+    def table(rows: Any) -> Any:
+        around = None if gather is None else gather(rows)
+        here = None if local is None else jax.tree.map(lambda array: jnp.asarray(array)[rows], local)
+        return tables(method, points[rows], None if given is None else given[rows], around, here, observed)
+
+    return over_rows(table, points.shape[0])
+
+
+def tables(
+    method: AbstractMethod,
+    points: Float[AnyArray, "n 3"],
+    given: Float[AnyArray, "n 3 3"] | None,
+    around: Neighborhoods | None,
+    local: Local | None,
+    observed: bool,
+) -> tuple[Table, Float[Array, "n 6"] | None]:
+    """Rows of `Surface.table`, as columns apart, and of `Surface.details`."""
+    points = jnp.asarray(points).T
+    covariances = None if given is None else alg.symmetric_from_matrix(jnp.asarray(given))
+    columns = [points, method.covariance(points, around, local, covariances)]
+    if not observed or local is None:
+        return tuple(column.T for column in columns), None
+    noise = jnp.zeros_like(points[0])
+    columns.append(local.geometry)
+    if method.uses_channels and local.num_channels:
+        weights = jnp.asarray(jax.lax.stop_gradient(method.weights(local.num_channels)), points.dtype)
+        channels, noise = channel_observability(local, weights)
+        columns.append(channels)
+    details = jnp.concatenate([noise[None], local.normal, local.roughness[None], local.reach[None]])
+    # Observability is constant to autodiff.
+    fixed = [jax.lax.stop_gradient(column) for column in columns[2:]]
+    return tuple(column.T for column in (*columns[:2], *fixed)), jax.lax.stop_gradient(details).T
+
+
+@partial(jax.jit, static_argnums=5)
+def _tables(*arguments: Any) -> tuple[Float[Array, "n L"], Float[Array, "n 6"] | None]:
+    columns, details = tables(*arguments)
+    return jnp.concatenate(columns, axis=1), details

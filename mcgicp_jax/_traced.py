@@ -1,0 +1,207 @@
+"""The loop inside transformations: one program, whose shapes are the user's.
+
+Find matches at this pose; sum their forces; update the pose; stop when it no longer moves. Matches come from a
+callback, or from XLA alone (`DenseSearch`). Pose and matches are constants to autodiff; the derivative is attached to
+the pose that the loop returns.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import partial
+from typing import Any, TypeAlias
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import jaxlie
+from jaxtyping import Array, Float, Int
+
+from mcgicp_jax._deferred import Deferred
+from mcgicp_jax._kernels import AbstractKernel
+from mcgicp_jax._methods import AbstractMethod
+from mcgicp_jax._result import Status
+from mcgicp_jax._search import AbstractSearch, Correspondences, Rows
+from mcgicp_jax._solve import root_near, with_derivative
+from mcgicp_jax._statistics import sampled_rows
+from mcgicp_jax._step import (
+    RECORDED,
+    SETTLED,
+    Assessment,
+    Problem,
+    Settings,
+    State,
+    constraints_of,
+    covariance_of_pose,
+    history_of,
+    rotation_and_translation,
+    update,
+)
+from mcgicp_jax._sums import Matched, Sums, matched_rows, move_rows, sums_of, within
+from mcgicp_jax._surface import Surface, gathered
+from mcgicp_jax._uncertainty import Details, discount_rows, discounts, scatter_of, scores_of
+
+# Where the loop stands, its matches, and the records so far.
+Carry: TypeAlias = tuple[State, Correspondences, Float[Array, "... 5"]]
+# Matches at a pose, or those before, and the sums over them.
+Measure: TypeAlias = Callable[[jaxlie.SE3, Int[Array, ""], Int[Array, ""], Correspondences], Any]
+
+
+@partial(jax.jit, static_argnames="max_iterations")
+def register_traced(
+    problem: Problem, search: AbstractSearch, max_iterations: int
+) -> tuple[State, Correspondences, dict[str, Array]]:
+    """The loop of `register`."""
+    carry = begin(problem, search, max_iterations)
+    state, matches, records = jax.lax.while_loop(
+        lambda carry: carry[0].status < 0, partial(_step, measure=_measuring(problem, search), problem=problem), carry
+    )
+    return state, cleaned(matches), history_of(records)
+
+
+def cleaned(matches: Correspondences) -> Correspondences:
+    """Row 0 instead of −1 where there is no match: such rows are not valid."""
+    return eqx.tree_at(lambda matches: matches.indices, matches, jnp.maximum(matches.indices, 0))
+
+
+@partial(jax.jit, static_argnames="max_iterations")
+def align_traced(
+    start: jaxlie.SE3,
+    source: Surface,
+    target: Surface,
+    matches: Correspondences,
+    temperature: Float[Array, ""] | None,
+    method: AbstractMethod,
+    robust: AbstractKernel | None,
+    settings: Settings,
+    max_iterations: int,
+) -> tuple[State, dict[str, Array]]:
+    """The loop of `align`: matches stay. Its pose carries the derivative."""
+    matched = matched_rows(source, target, matches, temperature)
+    start, fixed, method_fixed, robust_fixed, settings = jax.lax.stop_gradient(
+        (start, matched, method, robust, settings)
+    )
+    problem = Problem(start, source, target, method_fixed, robust_fixed, settings)
+
+    def measure(
+        pose: jaxlie.SE3, status: Int[Array, ""], num_iterations: Int[Array, ""], before: Correspondences
+    ) -> tuple[Correspondences, Sums]:
+        moving = rotation_and_translation(pose, pose.wxyz_xyz.dtype)
+        return before, sums_of(*moving, fixed, method_fixed, robust_fixed)
+
+    carry = _begin(problem, measure, jax.tree.map(jnp.asarray, matches), max_iterations)
+    state, _, records = jax.lax.while_loop(
+        lambda carry: carry[0].status < 0, partial(_step, measure=measure, problem=problem), carry
+    )
+    return differentiable(state, matched, method, robust), history_of(records)
+
+
+@jax.jit
+def differentiable(state: State, matched: Matched, method: AbstractMethod, robust: AbstractKernel | None) -> State:
+    """The state of a loop that has ended, whose pose carries the derivative of the root next to it."""
+    usable = (state.status == Status.CONVERGED) | (state.status == Status.MAX_ITERATIONS)
+    if state.directions is not None:
+        # The root of g would slide along a direction that the loop has left alone.
+        usable = usable & jnp.all(state.directions.held)
+    with jax.default_matmul_precision("highest"):
+        root = jax.lax.stop_gradient(root_near(state.sums, usable))
+        pose = with_derivative(jax.lax.stop_gradient(state.pose.wxyz_xyz), root, (matched, method, robust))
+    return eqx.tree_at(lambda state: state.pose.wxyz_xyz, state, pose)
+
+
+@jax.jit
+def assess(state: State, problem: Problem, matched: Matched, matches: Correspondences) -> Assessment:
+    """Constraints and covariance of a loop that has ended."""
+    dtype = state.pose.wxyz_xyz.dtype
+    pose = rotation_and_translation(state.pose, dtype)
+    details, discount = None, jnp.ones(2, dtype)
+    source, target = problem.source, problem.target
+    if source.details is not None and target.details is not None and matched.num_candidates == 1:
+        details = Details(source.details, jnp.asarray(target.details)[matches.indices])
+        rows, counts = sampled_rows(source.rows.valid)
+        some = Matched(gathered(matched.source, rows), gathered(matched.target, rows), matched.valid[rows] & counts)
+        discount = discounts(
+            discount_rows(
+                *pose,
+                some,
+                jax.tree.map(lambda table: table[rows], details),
+                jax.tree.map(lambda array: array[rows], source.rows),
+                jax.tree.map(lambda array: array[matches.indices[rows]], target.rows),
+            ),
+            jnp.sum(jnp.any(source.rows.descriptors != 0, axis=0)),
+        )
+    num_cells = matched.valid.size
+    scores = scores_of(
+        pose,
+        state.sums.center,
+        state.sums.radius,
+        matched,
+        details,
+        discount,
+        num_cells,
+        problem.method,
+        problem.robust,
+    )
+    covariance = covariance_of_pose(state, scores.answer, scores.pull, *scatter_of(scores, num_cells))
+    return Assessment(Deferred.of(constraints_of(state)), Deferred.of(covariance))
+
+
+def begin(problem: Problem, search: AbstractSearch, max_iterations: int) -> Carry:
+    """The loop of `register` before its first step, with room for all of its history."""
+    size, dtype = problem.source.rows.valid.size, problem.start.wxyz_xyz.dtype
+    nothing = Correspondences(jnp.full(size, -1, jnp.int32), jnp.zeros(size, dtype), jnp.zeros(size, bool))
+    return _begin(problem, _measuring(problem, search), nothing, max_iterations)
+
+
+def step_of_lane(carry: Carry, problem: Problem, search: AbstractSearch) -> Carry:
+    """One step of one lane."""
+    return _step(carry, _measuring(problem, search), problem)
+
+
+def _begin(problem: Problem, measure: Measure, matches: Correspondences, max_iterations: int) -> Carry:
+    first, zero = problem.settings.first_status(), jnp.int32(0)
+
+    def shapes() -> State:
+        return update(problem.start, first, zero, measure(problem.start, first, zero, matches)[1], problem.settings)
+
+    state = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), jax.eval_shape(shapes))
+    state = eqx.tree_at(lambda state: (state.pose, state.status), state, (problem.start, first))
+    # One for each update, and one for the measurement at the end.
+    return state, matches, jnp.full((max_iterations + 1, len(RECORDED)), jnp.nan, state.record.dtype)
+
+
+def _step(carry: Carry, measure: Measure, problem: Problem) -> Carry:
+    before, matches, records = carry
+    count = before.num_iterations
+    matches, sums = measure(before.pose, before.status, count, matches)
+    state = update(before.pose, before.status, count, sums, problem.settings)
+    return state, matches, records.at[count].set(state.record)
+
+
+def _measuring(problem: Problem, search: AbstractSearch) -> Measure:
+    def measure(
+        pose: jaxlie.SE3, status: Int[Array, ""], num_iterations: Int[Array, ""], before: Correspondences
+    ) -> tuple[Correspondences, Sums]:
+        settings, source, target = problem.settings, problem.source, problem.target
+        # Finished lanes of a batch run the body, too.
+        running = (status < 0) & (status != SETTLED)
+        rows = _every(settings.stride(status, num_iterations), source.rows)
+        found = search.nearest_traced(pose.wxyz_xyz, rows, target.rows, settings.max_distance, running)[0]
+        indices = jnp.where(running, found, before.indices)
+        moving = rotation_and_translation(pose, pose.wxyz_xyz.dtype)
+        here, matched_target = indices >= 0, gathered(jax.tree.map(jnp.asarray, target.table), jnp.maximum(indices, 0))
+        here = here & source.rows.valid & jnp.asarray(target.rows.valid)[jnp.maximum(indices, 0)]
+        moved = move_rows(*moving, source.table)
+        valid, distances = within(moved, matched_target, here, settings.gate(status))
+        matched = Matched(jax.tree.map(jnp.asarray, source.table), matched_target, valid)
+        sums = sums_of(*moving, matched, problem.method, problem.robust)
+        # −1 stands for none until the loop ends.
+        return Correspondences(indices, distances, valid), sums
+
+    return measure
+
+
+def _every(stride: Int[Array, ""], source: Rows) -> Rows:
+    """Every so many-th row; the others match nothing."""
+    chosen = jnp.arange(source.valid.size) % stride == 0
+    return eqx.tree_at(lambda rows: rows.valid, source, source.valid & chosen)
