@@ -19,8 +19,22 @@ import pytest
 DATA = pathlib.Path(os.environ.get("MCGICP_DATA", pathlib.Path(__file__).parents[2] / "shared" / "data"))
 
 
+# Where numbers are at stake, tests run in float64 too; elsewhere the other precision shows nothing new.
+_IN_FLOAT64 = (
+    *("channels", "cost", "covariance", "extensions", "large_coordinates", "methods", "metrics", "reference"),
+    *("register", "repeatable", "search", "solve", "transformations", "uncertainty"),
+)
+
+
+def pytest_collection_modifyitems(config, items):
+    if jax.config.jax_enable_x64:
+        modules = {f"test_{name}.py" for name in _IN_FLOAT64}
+        config.hook.pytest_deselected(items=[item for item in items if item.path.name not in modules])
+        items[:] = [item for item in items if item.path.name in modules]
+
+
 # Each compiled program is mapped into memory in dozens of pieces, of which Linux grants a process 65,530: the compiler
-# aborts at more, and this suite meets as many.
+# aborts at more. Tests of transformations compile for many shapes.
 _MAPS = pathlib.Path("/proc/self/maps")
 _MANY_MAPS = 30_000
 

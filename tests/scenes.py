@@ -1,8 +1,13 @@
 """Small synthetic clouds with known motion, shared by the tests: few sizes, since every size compiles."""
 
+from types import SimpleNamespace
+
 import numpy as np
 
 import mcgicp_jax as mcg
+from mcgicp_jax._local import local_on_host
+from mcgicp_jax._surface import covariance_of
+from mcgicp_jax._surfaces import surface_on_host, surfaces_of
 
 
 def motion(twist=(0.05, -0.03, 0.04, 0.02, -0.03, 0.05)) -> np.ndarray:
@@ -46,3 +51,21 @@ def pair(scene=room_corner, size: int = 2000, truth: np.ndarray | None = None, *
     source = mcg.PointCloud((points - truth[:3, 3]) @ truth[:3, :3], channels)
     target = mcg.PointCloud(*scene(size, seed=2, **settings))
     return mcg.preprocess(source), mcg.preprocess(target), truth
+
+
+def prepare(method, cloud, observed=False):
+    """The surface that a resolved method sees in one concrete cloud."""
+    local = None if cloud.neighbors is None else local_on_host(cloud, method.uses_channels)
+    surface = surface_on_host(method, cloud, local, observed, 1)
+    return SimpleNamespace(
+        table=surface.table,
+        details=surface.details,
+        covariance=covariance_of(surface.table),
+        **{name: getattr(surface.rows, name) for name in ("points", "descriptors", "valid", "penalty")},
+    )
+
+
+def covariances(method, cloud):
+    """(6, N) symmetric matrices of a resolved method; traced clouds too."""
+    _, surface, _ = surfaces_of(method, cloud, cloud, observed=False)
+    return covariance_of(surface.table)

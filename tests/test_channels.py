@@ -72,7 +72,9 @@ def test_gain_and_offset_are_undone(present):
     points, channels = ref.scene(500, 3)
     mask = None if present is None else np.random.default_rng(0).random(channels.shape) < present
     target = preprocess(PointCloud(points, channels, channel_valid=mask))
-    source = target.replace(channels=target.channels * np.array([0.5, 3.0, 1.0]) + np.array([7.0, 0.0, -1.0]))
+    source = target.replace(
+        channels=np.asarray(target.channels) * np.array([0.5, 3.0, 1.0]) + np.array([7.0, 0.0, -1.0])
+    )
     matched = with_channels_matched(source, target)
     np.testing.assert_allclose(matched.channels[:500], target.channels[:500], atol=ref.tolerance(2e-5, 1e-12))
 

@@ -32,7 +32,7 @@ def raw(**kwargs):
 
 
 def ready(cloud=None):
-    return preprocess(raw(covariances=covariances()) if cloud is None else cloud, num_neighbors=4)
+    return preprocess(raw(covariances=covariances()) if cloud is None else cloud, num_neighbors=4).pad(160)
 
 
 def leaves(cloud):
@@ -235,7 +235,7 @@ def test_stack():
     clouds = [ready(), ready(raw(covariances=covariances()).transform(T))]
     clouds[1] = preprocess(clouds[1].unpad(), num_neighbors=4).pad(200)
     stacked = PointCloud.stack(clouds)
-    assert stacked.points.shape == (2, 240, 3)
+    assert stacked.points.shape == (2, 256, 3)
     for i, cloud in enumerate(clouds):
         lane = jax.tree.map(lambda leaf, i=i: leaf[i], stacked)
         assert_same(lane.unpad(), cloud.unpad())
@@ -252,7 +252,7 @@ def test_stack_of_whole_and_partial_channels():
         for i, cloud in enumerate(order):
             mask = np.ones((150, 2), bool) if cloud.channel_valid is None else partial()
             np.testing.assert_array_equal(stacked.channel_valid[i, :150], mask)
-            np.testing.assert_array_equal(stacked.channels[i], cloud.channels)
+            np.testing.assert_array_equal(stacked.channels[i, :160], cloud.channels)
 
 
 def test_stack_keeps_large_origins():
@@ -292,7 +292,7 @@ def test_a_cloud_goes_through_jit():
     assert_same(jax.tree.unflatten(structure, flat), cloud)
 
 
-def test_clouds_of_one_size_class_share_a_program():
+def test_padded_clouds_of_one_size_share_a_program():
     traced = []
 
     @jax.jit
@@ -301,7 +301,7 @@ def test_clouds_of_one_size_class_share_a_program():
         return jnp.sum(cloud.points)
 
     for num_points in (129, 140, 160):
-        total(preprocess(PointCloud(np.resize(POINTS, (num_points, 3))), num_neighbors=4))
+        total(preprocess(PointCloud(np.resize(POINTS, (num_points, 3))), num_neighbors=4).pad())
     assert len(traced) == 1
 
 

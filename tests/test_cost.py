@@ -24,8 +24,8 @@ from mcgicp_jax import (
     mahalanobis_cost,
     preprocess,
 )
-from mcgicp_jax._cost import evaluate_pairs, moments
-from mcgicp_jax._methods import prepare
+from mcgicp_jax._sums import matched_rows, sums_of
+from mcgicp_jax._surfaces import surfaces_of
 from tests import reference as ref
 from tests.reference import tolerance
 
@@ -49,7 +49,7 @@ def problem():
     """Two clouds, their neighbours, and matches of which some are none."""
     raw = [ref.scene(N, 3, seed) for seed in (0, 1)]
     neighbors = [ref.nearest(points, points, K) for points, _ in raw]
-    clouds = [preprocess(PointCloud(*arrays), num_neighbors=K) for arrays in raw]
+    clouds = [preprocess(PointCloud(*arrays), num_neighbors=K).pad(ROWS) for arrays in raw]
     (a, ca), (b, cb) = raw
     matched = ref.match(a, b, T, 0.3, ca, cb, 0.2)
     assert 30 < np.sum(matched >= 0) < 140
@@ -142,7 +142,7 @@ def test_every_form_of_pose(form):
 def test_at_large_coordinates_the_cost_is_the_same(kernel):
     utm = np.array([512_345.6, 5_403_210.9, 312.3])
     raw, _, _, matches, _ = problem()
-    clouds = [preprocess(PointCloud(points + utm, channels), num_neighbors=K) for points, channels in raw]
+    clouds = [preprocess(PointCloud(points + utm, channels), num_neighbors=K).pad(ROWS) for points, channels in raw]
     shift, back = np.eye(4), np.eye(4)
     shift[:3, 3], back[:3, 3] = utm, -utm
     robust = None if kernel is None else Cauchy(SCALE)
@@ -282,7 +282,7 @@ def test_rows_without_a_match_add_nothing():
 def test_not_even_nan_where_there_is_no_match():
     _, _, (source, target), matches, matched = problem()
     free = np.flatnonzero(matched < 0)[:5]
-    points = source.points.at[free].set(jnp.nan)
+    points = jnp.asarray(source.points).at[free].set(jnp.nan)
 
     def cost(points):
         return mahalanobis_cost(T, source.replace(points=points), target, matches, PointToPoint(), robust=Huber(SCALE))
@@ -298,7 +298,9 @@ def test_padding_of_given_covariances_adds_nothing():
     _, _, clouds, matches, _ = problem()
     given = np.tile(np.diag([1.0, 1.0, 0.01]), (N, 1, 1))
     source, target = (
-        preprocess(PointCloud(cloud.unpad().points, cloud.unpad().channels, covariances=given), num_neighbors=K)
+        preprocess(PointCloud(cloud.unpad().points, cloud.unpad().channels, covariances=given), num_neighbors=K).pad(
+            ROWS
+        )
         for cloud in clouds
     )
 
@@ -343,15 +345,15 @@ def test_a_batch_is_its_lanes():
 
 
 @pytest.mark.parametrize("kernel", [None, "huber"])
-def test_the_moments_say_what_the_pairs_say(kernel):
+def test_the_sums_say_what_the_correspondences_say(kernel):
     """e − 2⟨D, G⟩ + ⟨D, Q(D)⟩ = Σ w (d − D h)ᵀ M (d − D h) for any D."""
     _, _, (source, target), matches, matched = problem()
     dtype = source.points.dtype
     method = METHODS["MultiChannelGICP"]
-    surfaces = prepare(method, source), prepare(method, target)
+    _, *surfaces = surfaces_of(method, source, target, observed=False)
     R, t = jnp.asarray(T[:3, :3], dtype), jnp.asarray(T[:3, 3], dtype)
     robust = None if kernel is None else Huber(SCALE)
-    found = jax.jit(lambda: moments(evaluate_pairs(R, t, *surfaces, matches, method, robust, None)))()
+    found = jax.jit(lambda: sums_of(R, t, matched_rows(*surfaces, matches), method, robust))()
 
     raw, neighbors, _, _, _ = problem()
     pair_information = information("MultiChannelGICP", *raw, neighbors)
@@ -377,6 +379,6 @@ def test_the_moments_say_what_the_pairs_say(kernel):
         for column, (k, l) in enumerate(zip(*four, strict=True)):
             for p, q in {(i, j), (j, i)}:
                 for r, s in {(k, l), (l, k)}:
-                    Q[p, r, q, s] = found.Q[row, column]
-    actual = float(found.e) - 2 * np.sum(D * np.asarray(found.G)) + np.einsum("ij,ijkl,kl", D, Q, D)
+                    Q[p, r, q, s] = found.stiffness[row, column]
+    actual = float(found.constant) - 2 * np.sum(D * np.asarray(found.first)) + np.einsum("ij,ijkl,kl", D, Q, D)
     assert actual == pytest.approx(expected, rel=tolerance(1e-4, 1e-10))

@@ -27,13 +27,13 @@ T = ref.pose([0.1, -0.2, 0.3], [0.05, 0.1, -0.02])
 def rows(points, descriptors=None, valid=None, absence=None):
     descriptors = np.zeros((len(points), 0)) if descriptors is None else descriptors
     valid = np.ones(len(points), bool) if valid is None else valid
-    arrays = (np.asarray(array, np.float32) for array in (points.T, descriptors))
+    arrays = (np.asarray(array, np.float32) for array in (points, descriptors))
     return Rows(*arrays, valid, None if absence is None else np.asarray(absence, np.float32))
 
 
 def query(search, source, target, num_candidates=1):
     at_rest = np.array([1, 0, 0, 0, 0, 0, 0], np.float32)
-    return np.asarray(search.index(target).nearest(at_rest, source, np.asarray(np.inf), num_candidates))
+    return np.asarray(search.index(target).nearest(at_rest, source, np.inf, num_candidates))
 
 
 @settings(max_examples=25, deadline=None)

@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import mcgicp_jax as mcg
-from mcgicp_jax import datasets, metrics
+from mcgicp_jax import _odometry, datasets, metrics
 from tests.scenes import motion
 
 
@@ -62,13 +62,13 @@ def test_frames_are_taken_one_by_one(room):
 def test_each_pair_starts_from_the_motion_before(room, monkeypatch):
     frames, _ = room
     starts = []
-    register = mcg.register
+    register = _odometry.register_with
 
-    def spy(*args, init, **options):
+    def spy(source, target, method, init, options):
         starts.append(init)
-        return register(*args, init=init, **options)
+        return register(source, target, method, init, options)
 
-    monkeypatch.setattr("mcgicp_jax._odometry.register", spy)
+    monkeypatch.setattr(_odometry, "register_with", spy)
     guess = motion((0.05, 0, 0, 0, 0, 0.05))
     steps = list(mcg.odometry(frames[:4], mcg.GICP(), max_distance=0.5, init=guess, max_iterations=30))
     np.testing.assert_array_equal(starts[0], guess)

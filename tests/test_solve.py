@@ -7,9 +7,10 @@ import pytest
 import scipy.optimize
 from scipy.spatial.transform import Rotation
 
-from mcgicp_jax import _covariance as cov
-from mcgicp_jax import _solve
-from mcgicp_jax._cost import Pairs, moments
+from mcgicp_jax import GICP, _solve
+from mcgicp_jax import _algebra as cov
+from mcgicp_jax._forces import weighed
+from mcgicp_jax._sums import Matched, sums_of
 
 X64 = jax.config.jax_enable_x64
 N = 2000
@@ -33,17 +34,18 @@ def random_pairs(seed: int, scale: float = 1.0, offset: float = 0.0, noise: floa
 
 
 def solve(moved, residual, information, weight, valid):
-    pairs = Pairs(
-        moved=jnp.asarray(moved.T, float),
-        residual=jnp.asarray(residual.T, float),
-        information=cov.symmetric_from_matrix(jnp.asarray(information, float)),
-        valid=jnp.asarray(valid),
-        weight=jnp.asarray(weight, float),
-        cost=jnp.zeros(N),
-        share=jnp.asarray(valid, float),
-    )
-    measured = jax.jit(moments)(pairs)
-    return measured, jax.jit(_solve.solve_update)(measured, measured.radius, jnp.eye(6))
+    class Given(GICP):
+        """Forces of given weight matrices."""
+
+        def forces(self, source, target, moved, rotation, valid, robust):
+            matrices = cov.symmetric_from_matrix(jnp.asarray(information, float))
+            found = weighed(jnp.where(valid, target[:, :3].T - moved, 0), matrices, robust)
+            return found.scaled(jnp.asarray(weight, float))
+
+    tables = [np.pad(rows, [(0, 0), (0, 6)]) for rows in (moved, moved + residual)]
+    matched = Matched(*(jnp.asarray(table, float) for table in tables), jnp.asarray(valid))
+    measured = jax.jit(lambda: sums_of(jnp.eye(3), jnp.zeros(3), matched, Given(), None))()
+    return measured, jax.jit(_solve.solve_update)(measured, jnp.eye(6))
 
 
 def whitened(twist, moved, residual, information, weight, center):
@@ -81,7 +83,8 @@ def test_information_is_the_sum_of_jacobians(scale):
         jacobian[:, :, 3 + axis] = np.cross(np.eye(3)[axis], arm)
     expected = np.einsum("n,nia,nij,njb->ab", weight, jacobian, information, jacobian)
     units = 1 / np.array([1, 1, 1, scale, scale, scale])
-    actual = np.asarray(update.information, float) * np.outer(units, units)
+    lengths = np.repeat([1, float(measured.radius)], 3)
+    actual = np.asarray(update.information, float) * np.outer(lengths * units, lengths * units)
     expected = expected * np.outer(units, units)
     np.testing.assert_allclose(actual, expected, atol=np.abs(expected).max() * (1e-12 if X64 else 1e-5))
 

@@ -24,6 +24,8 @@ CASES = {
     "color-icp": (mcg.ColorICP(0.3), None),
 }
 CONVERGED = {"translation_tolerance": 1e-12, "rotation_tolerance": 1e-12, "max_iterations": 200}
+# Differences over 4e-7 need poses to the last digit: updates go on until the iterations run out.
+TO_ROUNDING = {"translation_tolerance": 1e-15, "rotation_tolerance": 1e-15, "max_iterations": 60}
 
 
 @pytest.fixture(scope="module")
@@ -77,7 +79,7 @@ def directional_errors(loss, inputs, gradient):
                 return float(loss(inputs | {name: jax.tree.unflatten(structure, moved)}))
 
             # Short, so that no pair crosses the kink of a kernel.
-            step = 2e-7
+            step = 5e-7
             expected = (8 * (at(step) - at(-step)) - (at(2 * step) - at(-2 * step))) / (12 * step)
             actual = float(jnp.sum(jax.tree.leaves(gradient[name])[i] * direction))
             yield f"{name}[{i}]", actual, expected
@@ -110,7 +112,7 @@ def test_align_has_the_gradient_of_its_answer(name, noisy):
 
     def loss(inputs):
         clouds = clouds_with(inputs, source, target)
-        result = mcg.align(*clouds, matches, inputs["method"], robust=inputs["robust"], init=start, **CONVERGED)
+        result = mcg.align(*clouds, matches, inputs["method"], robust=inputs["robust"], init=start, **TO_ROUNDING)
         return weigh(result.matrix)
 
     check_gradient(loss, inputs_of(source, target, method, robust))
@@ -132,7 +134,7 @@ def test_align_has_the_gradient_where_channels_are_missing(name, noisy):
 
     def loss(inputs):
         clouds = clouds_with(inputs, source, target)
-        settings = {"robust": inputs["robust"], "init": start, "temperature": 0.1, **CONVERGED}
+        settings = {"robust": inputs["robust"], "init": start, "temperature": 0.1, **TO_ROUNDING}
         return weigh(mcg.align(*clouds, matches, inputs["method"], **settings).matrix)
 
     inputs = inputs_of(source, target, method, robust)
@@ -161,7 +163,7 @@ def test_align_has_the_gradient_of_given_covariances(noisy):
 
     def loss(inputs):
         clouds = clouds_with(inputs, source, target)
-        result = mcg.align(*clouds, matches, inputs["method"], robust=inputs["robust"], init=motion(), **CONVERGED)
+        result = mcg.align(*clouds, matches, inputs["method"], robust=inputs["robust"], init=motion(), **TO_ROUNDING)
         return weigh(result.matrix)
 
     check_gradient(loss, inputs_of(source, target, method, robust))
@@ -179,7 +181,7 @@ def test_register_has_the_gradient_of_its_answer(name, noisy):
     def result_of(inputs):
         clouds = clouds_with(inputs, source, target)
         return mcg.register(
-            *clouds, inputs["method"], robust=inputs["robust"], init=start.matrix, max_distance=GATE, **CONVERGED
+            *clouds, inputs["method"], robust=inputs["robust"], init=start.matrix, max_distance=GATE, **TO_ROUNDING
         )
 
     inputs = inputs_of(source, target, method, robust)
@@ -224,20 +226,23 @@ def test_implicit_gradient_is_that_of_the_unrolled_loop(noisy):
     """Differentiating through 60 updates with M renewed each time reaches the same number, at many times the cost."""
     source, target, _ = noisy
     method, _ = CASES["gicp"]
-    from mcgicp_jax import _loop, _solve
-    from mcgicp_jax._methods import prepare
+    from mcgicp_jax import _solve
     from mcgicp_jax._pose import se3_from_matrix
+    from mcgicp_jax._step import rotation_and_translation
+    from mcgicp_jax._sums import matched_rows, sums_of
+    from mcgicp_jax._surfaces import surfaces_of
 
     matches = mcg.find_correspondences(source, target, motion(), method, max_distance=GATE)
 
     def unrolled(points):
-        surfaces = prepare(method, source.replace(points=points)), prepare(method, target)
+        _, *surfaces = surfaces_of(method, source.replace(points=points), target, observed=False)
+        matched = matched_rows(*surfaces, matches)
 
         def body(pose, _):
-            measured = _loop.measure(pose, (*surfaces, matches, method, None, None), None)
-            information, gradient = _normal_equations(measured.moments)
+            sums = sums_of(*rotation_and_translation(pose, points.dtype), matched, method, None)
+            information, gradient = _normal_equations(sums)
             twist = jnp.linalg.solve(information, gradient)
-            return _solve.move_pose(pose, twist, measured.moments.center), None
+            return _solve.move_pose(pose, twist, sums.center), None
 
         pose, _ = jax.lax.scan(body, se3_from_matrix(motion(), points.dtype), length=60)
         return weigh(pose.as_matrix())
@@ -251,12 +256,12 @@ def test_implicit_gradient_is_that_of_the_unrolled_loop(noisy):
     np.testing.assert_allclose(actual, expected, atol=1e-8 * np.abs(expected).max())
 
 
-def _normal_equations(moments):
-    """Gauss-Newton's information and right-hand side of a (v, ω) twist, from the 73 numbers."""
+def _normal_equations(sums):
+    """Gauss-Newton's information and right-hand side of a (v, ω) twist, from the sums."""
     from mcgicp_jax import _solve
 
-    tangent = jnp.asarray(_solve._TANGENT, moments.e.dtype)
-    form = _solve._quadratic_form(moments, jnp.ones_like(moments.radius))
+    tangent = jnp.asarray(_solve._TANGENT, sums.first.dtype)
+    form = _solve._quadratic_form(sums, jnp.ones_like(sums.radius))
     return tangent.T @ form[:12, :12] @ tangent, -tangent.T @ form[:12, 12]
 
 
@@ -290,6 +295,7 @@ def test_padding_has_no_gradient_and_degenerate_neighborhoods_a_finite_one():
         np.testing.assert_array_equal(gradient[400:], 0)
 
 
+@needs_x64
 def test_no_pairs_give_no_gradient_and_say_why(noisy):
     source, target, _ = noisy
     method, _ = CASES["mc-gicp"]
@@ -303,6 +309,7 @@ def test_no_pairs_give_no_gradient_and_say_why(noisy):
     assert result.status is Status.TOO_FEW_CORRESPONDENCES
 
 
+@needs_x64
 def test_identical_clouds_have_a_finite_gradient(noisy):
     source, _, _ = noisy
     method, _ = CASES["mc-gicp"]
@@ -315,6 +322,7 @@ def test_identical_clouds_have_a_finite_gradient(noisy):
     assert value < 1e-5 and np.isfinite(gradient).all()
 
 
+@needs_x64
 @pytest.mark.timeout(240)
 def test_the_traced_loop_is_the_host_loop(noisy):
     source, target, _ = noisy
@@ -328,8 +336,7 @@ def test_the_traced_loop_is_the_host_loop(noisy):
     inside = traced(source, target, method, robust)
     assert inside.status is host.status and inside.num_iterations == host.num_iterations
     assert inside.num_inliers == host.num_inliers
-    # Inside, the pose is refined to the root that carries the gradient.
-    np.testing.assert_allclose(inside.matrix, host.matrix, atol=2e-4)
+    np.testing.assert_allclose(inside.matrix, host.matrix, atol=1e-9 if X64 else 1e-6)
     np.testing.assert_allclose(inside.history["cost"][: host.num_iterations], host.history["cost"][:-1], rtol=1e-3)
     assert np.isnan(inside.history["cost"][host.num_iterations + 1 :]).all()
     # jit inside jit, and grad of jit of jit.
@@ -337,6 +344,7 @@ def test_the_traced_loop_is_the_host_loop(noisy):
     assert np.isfinite(jax.grad(nested)(source.points)).all()
 
 
+@needs_x64
 @pytest.mark.timeout(240)
 def test_a_batch_is_its_lanes(noisy):
     source, target, _ = noisy
@@ -419,26 +427,6 @@ def test_nothing_dead_locks():
     assert np.isfinite(gradient).all()
 
 
-def test_one_compilation_per_size_and_none_per_call():
-    method = mcg.GICP()
-    counts = {}
-
-    def counted(event, duration, **_):
-        if event == "/jax/core/compile/backend_compile_duration":
-            counts[event] = counts.get(event, 0) + 1
-
-    clouds = [pair(size=size, noise=0.013) for size in (330, 340, 350)]
-    mcg.register(*clouds[0][:2], method, max_distance=GATE)
-    jax.monitoring.register_event_duration_secs_listener(counted)
-    try:
-        # 330, 340 and 350 points share a size class; numbers may change as well.
-        for i, (source, target, _) in enumerate(clouds):
-            mcg.register(source, target, mcg.GICP(1e-3 * (i + 1)), max_distance=GATE + 0.01 * i, max_iterations=9 + i)
-    finally:
-        jax.monitoring.clear_event_listeners()
-    assert counts == {}
-
-
 # --- Soft matches
 
 
@@ -461,7 +449,7 @@ def test_soft_matches_give_every_number_a_gradient(noisy):
             robust=inputs["robust"],
             init=start,
             temperature=temperature,
-            **CONVERGED,
+            **TO_ROUNDING,
         )
         return weigh(result.matrix)
 

@@ -8,23 +8,22 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import mcgicp_jax as mcg
-from mcgicp_jax import _covariance as cov
+from mcgicp_jax import _algebra as cov
 from mcgicp_jax import datasets
-from mcgicp_jax._evidence import look
-from mcgicp_jax._uncertainty import Felt, find_directions
+from mcgicp_jax._directions import find_directions
+from mcgicp_jax._sums import Sums
+from mcgicp_jax._surface import observability_of
 
-from .scenes import motion, pair, room_corner, wall
+from .scenes import motion, pair, prepare, room_corner, wall
 
 
 def matrices(symmetric):
-    return np.asarray(cov.matrix_from_symmetric(symmetric), np.float64)
+    return np.asarray(cov.matrix_from_symmetric(jnp.asarray(symmetric)), np.float64)
 
 
 def mean_evidence(cloud, method):
-    _, found = look(method, cloud)
-    keep = np.asarray(cloud.valid)
-    channels = None if found.channels is None else matrices(found.channels)[keep].mean(axis=0)
-    return matrices(found.geometry)[keep].mean(axis=0), channels
+    geometry, *channels = observability_of(prepare(method, cloud, observed=True).table)
+    return matrices(geometry).mean(axis=0), matrices(channels[0]).mean(axis=0) if channels else None
 
 
 # Evidence
@@ -88,10 +87,10 @@ def test_directions_are_the_eigenvectors_of_the_share_of_motion(seed, held, radi
     matrices = np.einsum("ni,nj->nij", normals, normals) * (held / 6)
     hh = np.einsum("in,jn->ijn", *[np.concatenate([p, np.ones((1, 200))])] * 2)[np.triu_indices(4)]
     upper = matrices[:, *np.triu_indices(3)].T
-    felt = Felt(
-        geometry=jnp.asarray((weight * upper) @ hh.T, float), channels=None, mass=jnp.asarray(hh @ weight, float)
-    )
-    found = jax.jit(find_directions)(felt, jnp.zeros(3), jnp.asarray(radius, float))
+    second = np.concatenate([np.zeros((6, 10)), [hh @ weight], (weight * upper) @ hh.T])
+    totals = np.array([200, 200 * radius**2, 0, 0, 0, 200])
+    arrays = (np.zeros(3), totals, np.zeros((3, 4)), second)
+    found = jax.jit(find_directions)(Sums(*(jnp.asarray(array, float) for array in arrays)))
     arms = p.T / radius
     jacobians = np.concatenate([np.tile(np.eye(3), (200, 1, 1)), -np.cross(arms[:, None, :], np.eye(3)[None])], axis=2)
     jacobians[:, :, 3:] = np.stack([np.cross(axis, arms) for axis in np.eye(3)], axis=2)

@@ -1,0 +1,133 @@
+"""Clouds of every size run the same few programs: compilations are counted."""
+
+import contextlib
+
+import jax
+import numpy as np
+import pytest
+
+import mcgicp_jax as mcg
+from tests.scenes import room_corner
+
+METHODS = {
+    "mc-gicp": mcg.MultiChannelGICP(),
+    "gicp": mcg.GICP(),
+    "color-icp": mcg.ColorICP(0.3),
+    "point-to-plane": mcg.PointToPlane(),
+    "point-to-point": mcg.PointToPoint(),
+}
+SIZES = (37, 900, 1024, 1500, 2600, 9000)
+
+
+@contextlib.contextmanager
+def compilations():
+    """The durations of the compilations within; empty if there are none."""
+    found = []
+
+    def listen(event, duration, **_):
+        if event == "/jax/core/compile/backend_compile_duration":
+            found.append(duration)
+
+    jax.monitoring.register_event_duration_secs_listener(listen)
+    try:
+        yield found
+    finally:
+        jax.monitoring.unregister_event_duration_listener(listen)
+
+
+def clouds(size, names=("red", "green"), more=0, seed=0):
+    """Two raw clouds of about that size, with channels that no method uses if there are `more`."""
+    raw = []
+    for i, number in enumerate((size, size + size // 7)):
+        points, channels = room_corner(number, seed=2 * seed + i)
+        channels = np.hstack([channels, np.ones((number, more))])
+        raw.append(mcg.PointCloud(points, channels, channel_names=(*names, *(f"other_{j}" for j in range(more)))))
+    return raw
+
+
+def everything(method, raw):
+    """Each function that is called outside of transformations, and everything that a result can be asked."""
+    source, target = (mcg.preprocess(cloud) for cloud in raw)
+    mcg.find_correspondences(source, target, np.eye(4), method, max_distance=0.5)
+    result = mcg.register(source, target, method, max_distance=0.5)
+    results = [result, mcg.register(*raw, method)]
+    results += mcg.register_batch([source, target], [target, source], method, max_distance=0.5)
+    results += [result for _, result in mcg.register_as_completed(raw, raw[::-1], method)]
+    results += [step.registration for step in mcg.odometry(raw, method)][1:]
+    for found in results:
+        assert found.covariance.shape == found.information.shape == (6, 6)
+        assert repr(found) and found.matrix.shape == (4, 4)
+
+
+@pytest.mark.parametrize("name", METHODS)
+def test_other_sizes_and_names_compile_nothing(name):
+    method = METHODS[name]
+    everything(method, clouds(400))
+    for i, size in enumerate(SIZES):
+        with compilations() as found:
+            everything(method, clouds(size, names=(f"x{i}", f"y{i}"), seed=i))
+        assert not found, size
+
+
+@pytest.mark.parametrize("name", ["gicp", "point-to-plane", "point-to-point"])
+def test_channels_that_a_method_does_not_use_compile_nothing(name):
+    everything(METHODS[name], clouds(400))
+    with compilations() as found:
+        everything(METHODS[name], clouds(500, more=1))
+        everything(METHODS[name], clouds(400, more=4))
+    assert not found
+
+
+def test_numbers_compile_nothing():
+    source, target = (mcg.preprocess(cloud) for cloud in clouds(400))
+    mcg.register(source, target, mcg.GICP(), robust=mcg.Cauchy(1.0))
+    with compilations() as found:
+        for i in range(3):
+            options = {"max_distance": 0.4 + 0.01 * i, "max_iterations": 9 + i, "robust": mcg.Cauchy(0.5 + i)}
+            mcg.register(source, target, mcg.GICP(1e-3 * (i + 1)), hold_free_directions=i > 1, **options)
+    assert not found
+
+
+def test_a_cloud_is_prepared_once(monkeypatch):
+    """Its tree and its local statistics are kept as long as it is used."""
+    from mcgicp_jax import KDTreeSearch, _local
+
+    built, described = [], []
+    build, gatherer = KDTreeSearch.build, _local.gatherer
+    monkeypatch.setattr(KDTreeSearch, "build", lambda self, points: built.append(len(points)) or build(self, points))
+    monkeypatch.setattr(_local, "gatherer", lambda cloud, *rest: described.append(len(cloud)) or gatherer(cloud, *rest))
+    first, second, third = (mcg.preprocess(room_corner(size, seed=size)[0]) for size in (300, 310, 320))
+    built.clear()
+    for _ in range(3):
+        mcg.register(first, second, mcg.GICP())
+    assert built == [310] and sorted(described) == [300, 310]
+    mcg.register(second, third, mcg.GICP())
+    assert built == [310, 320] and sorted(described) == [300, 310, 320]
+    mcg.register_batch([first, third], second, mcg.GICP(), search=KDTreeSearch())
+    assert built == [310, 320]
+    # Of another cloud nothing is taken, though all but its points are the same.
+    moved = first.replace(points=first.points + np.float32(0.01))
+    result = mcg.register(moved, second, mcg.GICP())
+    assert sorted(described) == [300, 300, 310, 320]
+    assert np.abs(result.matrix - mcg.register(first, second, mcg.GICP()).matrix).max() > 5e-3
+
+
+def test_what_is_kept_of_a_cloud_goes_with_it():
+    from mcgicp_jax import _kept
+
+    source, target = (mcg.preprocess(room_corner(300, seed=seed)[0]) for seed in (0, 1))
+    numbers = id(source), id(target)
+    mcg.register(source, target, mcg.GICP())
+    kept = _kept.keep.__self__._kept
+    assert set(numbers) <= set(kept)
+    del source, target
+    assert not set(numbers) & set(kept)
+
+
+def test_find_correspondences_computes_nothing_that_it_does_not_use():
+    source, target = (mcg.preprocess(cloud) for cloud in clouds(400))
+    jax.clear_caches()
+    with compilations() as found:
+        mcg.find_correspondences(source, target, None, mcg.GICP(), max_distance=0.5)
+        mcg.find_correspondences(source, target, None, mcg.ColorICP(0.3), max_distance=0.5)
+    assert not found
