@@ -23,8 +23,8 @@ import jax
 import numpy as np
 
 import mcgicp_jax as mcg
-from mcgicp_jax import _kdtree
-from mcgicp_jax._cloud import size_class
+from mcgicp_jax import _trees
+from mcgicp_jax._sizes import size_class
 from tests.scenes import room_corner
 
 _METHODS = ((mcg.GICP(), None), (mcg.MultiChannelGICP(), mcg.Huber(1.0)))
@@ -93,7 +93,7 @@ def main() -> None:
             result = mcg.register(source, target, method, max_distance=0.5, robust=robust)
             outcomes[result.status.name] += 1
         if (turn + 1) % (options.registrations // _REPORTS) == 0:
-            trees = len(_kdtree._index_cache._indices)
+            trees = len(_trees._index_cache._indices)
             print(
                 f"| {turn + 1:13,} | {resident_mib():13.0f} | {num_maps():6,} | {compilations.count:12,} | {trees:10} "
                 f"| {time.perf_counter() - begin:5.0f} s |",

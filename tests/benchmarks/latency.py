@@ -1,0 +1,196 @@
+"""What users wait for: first calls, clouds of other sizes, gradients, batches, the command line.
+
+Run `python -m tests.benchmarks.latency`; see README.md. Every part runs in fresh processes with a cache folder of its
+own; compilations are counted with `jax.monitoring`.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import pathlib
+import shutil
+import subprocess
+import sys
+import tempfile
+import textwrap
+import time
+
+DATA = pathlib.Path(os.environ.get("MCGICP_DATA", pathlib.Path(__file__).parents[3] / "shared" / "data"))
+ROOT = pathlib.Path(__file__).parents[2]
+
+_COMMON = f"""
+    import json, sys, time
+    import jax, numpy as np
+    import mcgicp_jax as mcg
+    sys.path.insert(0, {str(ROOT)!r})
+    from tests.scenes import room_corner
+
+    compiled = []
+    def listen(event, duration, **_):
+        if event == "/jax/core/compile/backend_compile_duration":
+            compiled.append(duration)
+    jax.monitoring.register_event_duration_secs_listener(listen)
+
+    def clouds(size, seed=0):
+        return [mcg.PointCloud(*room_corner(size, seed=2 * seed + i, channels=3)) for i in (0, 1)]
+
+    def timed(function):
+        count, begin = len(compiled), time.perf_counter()
+        answer = function()
+        return time.perf_counter() - begin, len(compiled) - count, answer
+
+    def maps():
+        try:
+            return len(open("/proc/self/maps").readlines())
+        except OSError:
+            return 0
+"""
+
+_FIRST = """
+    method = getattr(mcg, sys.argv[1])()
+    for size in (6000, 6000, 5000, 5000):
+        raw = clouds(size)
+        seconds, count, result = timed(lambda: mcg.register(*raw, method, max_distance=0.3))
+        print(json.dumps([size, seconds, count]))
+    seconds, count, _ = timed(lambda: (result.covariance, repr(result)))
+    print(json.dumps(["covariance and repr", seconds, count]))
+"""
+
+_GRADIENT = """
+    import jax.numpy as jnp
+    source, target = (mcg.preprocess(cloud) for cloud in clouds(int(sys.argv[2])))
+
+    def loss(channels):
+        result = mcg.register(source.replace(channels=channels), target, mcg.MultiChannelGICP(), max_distance=0.2)
+        translation, rotation = mcg.metrics.pose_error(result.matrix, np.eye(4))
+        return translation + rotation
+
+    channels = jnp.asarray(source.channels)
+    if sys.argv[1] == "grad":
+        function = jax.jit(jax.grad(loss))
+    else:
+        function = jax.jit(jax.vmap(jax.value_and_grad(loss)))
+        channels = jnp.stack([channels * (1 + 0.01 * i) for i in range(16)])
+    seconds, _, program = timed(lambda: function.lower(channels).compile())
+    jax.block_until_ready(program(channels))
+    times = [timed(lambda: jax.block_until_ready(program(channels)))[0] for _ in range(9)]
+    print(json.dumps([seconds, float(np.median(times))]))
+"""
+
+_BATCH = """
+    scan = mcg.io.read(sys.argv[1])
+    other = mcg.io.read(sys.argv[2])
+    rng = np.random.default_rng(0)
+
+    def some(cloud, size):
+        return mcg.PointCloud(np.asarray(cloud.points)[np.sort(rng.choice(len(cloud.points), size, replace=False))])
+
+    sizes = rng.integers(2000, 20_000, 60)
+    pairs = [(some(scan, size), some(other, size)) for size in sizes]
+    for turn in range(2):
+        seconds, count, results = timed(
+            lambda: mcg.register_batch(*zip(*pairs, strict=True), mcg.GICP(), max_distance=1.0)
+        )
+        converged = sum(bool(result.converged) for result in results)
+        print(json.dumps([seconds, count, converged, maps()]))
+"""
+
+_STREAM = """
+    sizes = np.random.default_rng(0).permutation(np.arange(300, 800))
+    methods = mcg.GICP(), mcg.MultiChannelGICP()
+    for i, size in enumerate(sizes):
+        source, target = clouds(int(size), seed=i)
+        mcg.register(source, target, methods[i % 2], max_distance=0.5).covariance
+    print(json.dumps([len(sizes), len(compiled), maps()]))
+"""
+
+
+def _run(code: str, *arguments: str, cache: pathlib.Path | None = None) -> list[list]:
+    environment = {name: value for name, value in os.environ.items() if name != "JAX_COMPILATION_CACHE_DIR"}
+    if cache is not None:
+        environment |= {
+            "JAX_COMPILATION_CACHE_DIR": str(cache),
+            "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0",
+            "JAX_PERSISTENT_CACHE_MIN_ENTRY_SIZE_BYTES": "-1",
+        }
+    code = textwrap.dedent(_COMMON) + textwrap.dedent(code)
+    done = subprocess.run(
+        [sys.executable, "-c", code, *arguments], env=environment, capture_output=True, text=True, check=False
+    )
+    if done.returncode:
+        raise RuntimeError(done.stderr)
+    return [json.loads(line) for line in done.stdout.splitlines() if line.startswith("[")]
+
+
+def first() -> None:
+    for method in ("GICP", "MultiChannelGICP"):
+        with tempfile.TemporaryDirectory() as folder:
+            for state in ("empty", "filled"):
+                print(f"\nfirst `register` of a process, {method}, cache {state}: s, compilations")
+                for what, seconds, count in _run(_FIRST, method, cache=pathlib.Path(folder)):
+                    print(f"{what:>20}  {seconds:7.3f}  {count:4}", flush=True)
+
+
+def gradients() -> None:
+    for name, what, size in (
+        ("jit(grad(register)), 9,000 points", "grad", "9000"),
+        ("jit(vmap(value_and_grad(register))), 16 pairs of 600 points", "vmap", "600"),
+    ):
+        ((seconds, run),) = _run(_GRADIENT, what, size)
+        print(f"{name}: compile {seconds:.1f} s, run {1e3 * run:.0f} ms", flush=True)
+
+
+def batch() -> None:
+    files = [str(DATA / "lidar_pair" / f"{name}.ply") for name in ("source", "target")]
+    with tempfile.TemporaryDirectory() as folder:
+        turns = _run(_BATCH, *files, cache=pathlib.Path(folder))
+    for turn, (seconds, count, converged, maps) in zip(("first", "again"), turns, strict=True):
+        print(f"60 pairs of 2,000 to 20,000 points, {turn}: {seconds:.1f} s, {count} compilations,", end=" ")
+        print(f"{converged} converged, {maps} memory maps", flush=True)
+    ((size, count, maps),) = _run(_STREAM)
+    print(f"{size} pairs of {size} sizes, GICP and MC-GICP: {count} compilations, {maps} memory maps", flush=True)
+
+
+def commands() -> None:
+    scans = sorted((DATA / "kitti" / "sequences" / "04" / "velodyne").glob("*.bin"))
+    pair = [str(DATA / "lidar_pair" / f"{name}.ply") for name in ("source", "target")]
+    with tempfile.TemporaryDirectory() as folder:
+        clouds = pathlib.Path(folder) / "clouds"
+        clouds.mkdir()
+        for scan in scans[:5]:
+            shutil.copy(scan, clouds)
+        lines = {
+            "mcgicp odometry kitti, 10 frames": ["odometry", "kitti", str(DATA / "kitti" / "sequences" / "04")],
+            "mcgicp batch, 4 pairs": ["batch", str(clouds), "--voxel-size", "0.5", "--output", "OUT.csv"],
+            "mcgicp register on lidar_pair": ["register", *pair],
+        }
+        for name, arguments in lines.items():
+            cache = tempfile.mkdtemp(dir=folder)
+            seconds = []
+            for turn in range(3):
+                given = [argument.replace("OUT", f"{folder}/{turn}") for argument in arguments]
+                begin = time.perf_counter()
+                subprocess.run(
+                    [sys.executable, "-m", "mcgicp_jax", *given],
+                    env=os.environ | {"JAX_COMPILATION_CACHE_DIR": cache},
+                    capture_output=True,
+                    check=False,
+                )
+                seconds.append(time.perf_counter() - begin)
+            print(f"{name}: first {seconds[0]:.1f} s, again {min(seconds[1:]):.1f} s", flush=True)
+
+
+def main() -> None:
+    parts = {"first": first, "gradients": gradients, "batch": batch, "commands": commands}
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("parts", nargs="*", help=f"which of {', '.join(parts)}; all by default")
+    print(f"{os.cpu_count()} cores, load {os.getloadavg()[0]:.1f} before")
+    for name in parser.parse_args().parts or parts:
+        parts[name]()
+    print(f"load {os.getloadavg()[0]:.1f} after")
+
+
+if __name__ == "__main__":
+    main()
