@@ -109,12 +109,13 @@ def align(
     robust: AbstractKernel | None = None,
     temperature: ArrayLike | None = None,
 ) -> Registration:
-    """The pose that balances given matches: updates with M renewed, until the pose rests. Pure JAX.
+    """The pose that balances given matches: updates with M renewed, until the pose no longer moves. Pure JAX.
 
-    Works under `jit`, `vmap`, `grad` and `jvp`. The returned pose is refined to the root of Σ w JᵀM(R) d = 0, and its
-    derivative is that of the root: exact for fixed matches and neighbours, with respect to points, channels, given
-    covariances, the method's numbers and the robust scale; zero with respect to `init`, on which a root does not
-    depend.
+    Works under `jit`, `vmap`, `grad` and `jvp`. The derivative is that of the root of Σ w JᵀM(R) d = 0 next to the
+    returned pose: exact for fixed matches and neighbours, with respect to points, channels, given covariances, the
+    method's numbers and the robust scale; zero with respect to `init`, on which a root does not depend. It is zero,
+    never NaN, where there is no such root: without enough matches, where a direction is not constrained, and where
+    Newton's method does not find it from the returned pose.
 
     Args:
         source, target: preprocessed clouds.
@@ -170,8 +171,9 @@ def register(
 
     Of a large source, some thousands of points find the pose until it is nearly at rest; then all of them do.
 
-    With numbers it runs on the host, between compiled steps. Inside `jit`, `vmap` or `grad` it is one loop whose
-    matches come from a callback; its derivatives are those of `align` at the final matches.
+    With concrete arrays (outside `jit`, `vmap`, `grad`) the loop runs on the host, between compiled programs whose
+    shapes do not depend on the sizes of the clouds. Inside a transformation it is one program whose matches come from a
+    callback: the same pose, to rounding, and the derivative of `align` at the final matches.
 
     Args:
         source, target: clouds from `preprocess`. Raw clouds and (N, 3) arrays are preprocessed with its defaults, and

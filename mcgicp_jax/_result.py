@@ -50,8 +50,7 @@ class Registration(eqx.Module):
     """The outcome of `register` or `align`; a pytree. Everything in it belongs to the returned pose.
 
     After a host call the numbers are NumPy's; inside a transformation, and with a batch dimension, they are arrays.
-    There, and from `align`, the pose alone is refined further, by about a tolerance at most, and it alone carries a
-    gradient: to differentiate a cost, call `mahalanobis_cost` at the pose.
+    There the pose alone carries a gradient: to differentiate a cost, call `mahalanobis_cost` at the pose.
 
     Attributes:
         T_target_source: maps source coordinates into the target's frame, b ≈ T a. Its precision is that of the clouds;

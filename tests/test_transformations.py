@@ -10,163 +10,19 @@ import pytest
 
 import mcgicp_jax as mcg
 from mcgicp_jax import Status
+from tests.differences import (
+    CASES,
+    CONVERGED,
+    GATE,
+    TO_ROUNDING,
+    X64,
+    clouds_with,
+    directional_errors,
+    inputs_of,
+    needs_x64,
+    weigh,
+)
 from tests.scenes import motion, pair
-
-X64 = bool(jax.config.jax_enable_x64)
-needs_x64 = pytest.mark.skipif(not X64, reason="finite differences need float64: JAX_ENABLE_X64=1")
-GATE = 0.4
-# (method, robust kernel): every number in them is differentiated.
-CASES = {
-    "mc-gicp": (mcg.MultiChannelGICP([[0.05, 0.01], [0.01, 0.08]], 0.3, epsilon=1e-2), mcg.Cauchy(0.5)),
-    "gicp": (mcg.GICP(1e-2), mcg.Huber(0.3)),
-    "point-to-plane": (mcg.PointToPlane(), mcg.GemanMcClure(0.5)),
-    "point-to-point": (mcg.PointToPoint(), mcg.Tukey(1.0)),
-    "color-icp": (mcg.ColorICP(0.3), None),
-}
-CONVERGED = {"translation_tolerance": 1e-12, "rotation_tolerance": 1e-12, "max_iterations": 200}
-# Differences over 4e-7 need poses to the last digit: updates go on until the iterations run out.
-TO_ROUNDING = {"translation_tolerance": 1e-15, "rotation_tolerance": 1e-15, "max_iterations": 60}
-
-
-@pytest.fixture(scope="module")
-def noisy():
-    """5 cm of noise on a 2 m cloud: what is neglected in a gradient shows."""
-    return pair(size=400, noise=0.05, channel_noise=0.05)
-
-
-def weigh(matrix):
-    """One number of a pose, into which all of its entries go."""
-    return jnp.sum(jnp.asarray(np.random.default_rng(0).normal(size=(3, 4))) * matrix[:3])
-
-
-def inputs_of(source, target, method, robust):
-    """Everything that a pose can be differentiated with respect to, by name."""
-    inputs = {
-        "source points": source.points,
-        "target points": target.points,
-        "source channels": source.channels,
-        "target channels": target.channels,
-        "method": method,
-        "robust": robust,
-    }
-    if source.covariances is not None:
-        inputs |= {"source covariances": source.covariances, "target covariances": target.covariances}
-    return inputs
-
-
-def clouds_with(inputs, source, target):
-    def filled(name, cloud):
-        arrays = {key.split()[1]: value for key, value in inputs.items() if key.startswith(name)}
-        return cloud.replace(**arrays)
-
-    return filled("source", source), filled("target", target)
-
-
-def directional_errors(loss, inputs, gradient):
-    """Relative error of the gradient along a random direction in each input, against a fourth-order difference."""
-    rng = np.random.default_rng(1)
-    for name, value in inputs.items():
-        leaves, structure = jax.tree.flatten(value)
-        for i, leaf in enumerate(leaves):
-            direction = rng.normal(size=leaf.shape)
-            if name == "method" and leaf.ndim == 2:
-                direction = direction + direction.T
-            if name == "method" or name == "robust":
-                direction = direction * np.abs(np.asarray(leaf))
-
-            def at(step, name=name, leaves=leaves, structure=structure, i=i, leaf=leaf, direction=direction):
-                moved = [*leaves[:i], leaf + step * direction, *leaves[i + 1 :]]
-                return float(loss(inputs | {name: jax.tree.unflatten(structure, moved)}))
-
-            # Short, so that no pair crosses the kink of a kernel.
-            step = 5e-7
-            expected = (8 * (at(step) - at(-step)) - (at(2 * step) - at(-2 * step))) / (12 * step)
-            actual = float(jnp.sum(jax.tree.leaves(gradient[name])[i] * direction))
-            yield f"{name}[{i}]", actual, expected
-
-
-def check_gradient(loss, inputs):
-    """Against differences and forward mode; returns the compiled value and gradient, for more of them."""
-    # One program for value and gradient: compiling is what takes time here.
-    compiled = jax.jit(jax.value_and_grad(loss))
-    _, gradient = compiled(inputs)
-    scale = 1e-3
-    for name, actual, expected in directional_errors(lambda moved: compiled(moved)[0], inputs, gradient):
-        assert np.isfinite(actual)
-        assert abs(actual - expected) <= 1e-6 * max(abs(expected), scale), name
-    # Forward mode, along one direction through everything.
-    tangent = jax.tree.map(lambda leaf: jnp.asarray(np.random.default_rng(2).normal(size=leaf.shape)), inputs)
-    _, forward = jax.jit(lambda i, t: jax.jvp(loss, (i,), (t,)))(inputs, tangent)
-    reverse = sum(jax.tree.leaves(jax.tree.map(lambda a, b: jnp.sum(a * b), gradient, tangent)))
-    np.testing.assert_allclose(forward, reverse, rtol=1e-9, atol=1e-12)
-    return compiled
-
-
-@needs_x64
-@pytest.mark.parametrize("name", CASES)
-def test_align_has_the_gradient_of_its_answer(name, noisy):
-    source, target, _ = noisy
-    method, robust = CASES[name]
-    start = mcg.register(source, target, method, robust=robust, max_distance=GATE).matrix
-    matches = mcg.find_correspondences(source, target, start, method, max_distance=GATE)
-
-    def loss(inputs):
-        clouds = clouds_with(inputs, source, target)
-        result = mcg.align(*clouds, matches, inputs["method"], robust=inputs["robust"], init=start, **TO_ROUNDING)
-        return weigh(result.matrix)
-
-    check_gradient(loss, inputs_of(source, target, method, robust))
-
-
-@needs_x64
-@pytest.mark.parametrize("name", ["mc-gicp", "color-icp"])
-def test_align_has_the_gradient_where_channels_are_missing(name, noisy):
-    source, target, _ = noisy
-    method, robust = CASES[name]
-    clouds = []
-    for i, cloud in enumerate((source, target)):
-        mask = np.random.default_rng(i).random(cloud.channels.shape) < 0.7
-        clouds.append(cloud.replace(channel_valid=mask))
-    source, target = clouds
-    method = method.resolve(source, target)
-    start = mcg.register(source, target, method, robust=robust, max_distance=GATE).matrix
-    matches = mcg.find_correspondences(source, target, start, method, max_distance=GATE, num_candidates=2)
-
-    def loss(inputs):
-        clouds = clouds_with(inputs, source, target)
-        settings = {"robust": inputs["robust"], "init": start, "temperature": 0.1, **TO_ROUNDING}
-        return weigh(mcg.align(*clouds, matches, inputs["method"], **settings).matrix)
-
-    inputs = inputs_of(source, target, method, robust)
-    value_and_gradient = check_gradient(loss, inputs)
-    # What stands where nothing is, NaN for one, is not seen.
-    for side, cloud in (("source", source), ("target", target)):
-        inputs[f"{side} channels"] = jnp.where(cloud.channel_valid, cloud.channels, jnp.nan)
-    _, gradient = value_and_gradient(inputs)
-    for side, cloud in (("source", source), ("target", target)):
-        assert np.isfinite(gradient[f"{side} channels"]).all()
-        np.testing.assert_array_equal(gradient[f"{side} channels"][~np.asarray(cloud.channel_valid)], 0)
-
-
-@needs_x64
-def test_align_has_the_gradient_of_given_covariances(noisy):
-    source, target, _ = noisy
-    method, robust = CASES["gicp"]
-    rng = np.random.default_rng(0)
-    clouds = []
-    for cloud in (source, target):
-        factor = rng.normal(size=(cloud.points.shape[0], 3, 3))
-        covariances = factor @ factor.swapaxes(1, 2) / 3 + 0.1 * np.eye(3)
-        clouds.append(cloud.replace(covariances=jnp.asarray(covariances)))
-    source, target = clouds
-    matches = mcg.find_correspondences(source, target, motion(), method, max_distance=GATE)
-
-    def loss(inputs):
-        clouds = clouds_with(inputs, source, target)
-        result = mcg.align(*clouds, matches, inputs["method"], robust=inputs["robust"], init=motion(), **TO_ROUNDING)
-        return weigh(result.matrix)
-
-    check_gradient(loss, inputs_of(source, target, method, robust))
 
 
 @needs_x64
@@ -205,20 +61,6 @@ def test_register_has_the_gradient_of_its_answer(name, noisy):
     _, forward = jax.jvp(lambda inputs: weigh(result_of(inputs).matrix), (inputs,), (tangent,))
     reverse = sum(jax.tree.leaves(jax.tree.map(lambda a, b: jnp.sum(a * b), gradient, tangent)))
     np.testing.assert_allclose(forward, reverse, rtol=1e-6)
-
-
-@needs_x64
-def test_jacobians_agree_forward_and_backward(noisy):
-    source, target, _ = noisy
-    method, _ = CASES["gicp"]
-    matches = mcg.find_correspondences(source, target, motion(), method, max_distance=GATE)
-
-    def pose(epsilon):
-        return mcg.align(source, target, matches, mcg.GICP(epsilon), init=motion(), **CONVERGED).matrix
-
-    forward, backward = (jax.jit(jacobian(pose))(jnp.asarray(1e-2)) for jacobian in (jax.jacfwd, jax.jacrev))
-    assert np.abs(forward).max() > 1e-3
-    np.testing.assert_allclose(forward, backward, rtol=1e-9, atol=1e-12)
 
 
 @needs_x64
@@ -425,37 +267,6 @@ def test_nothing_dead_locks():
     for _ in range(100):
         gradient = jax.block_until_ready(batched(batch))
     assert np.isfinite(gradient).all()
-
-
-# --- Soft matches
-
-
-@needs_x64
-def test_soft_matches_give_every_number_a_gradient(noisy):
-    source, target, _ = noisy
-    method = mcg.MultiChannelGICP([[0.05, 0.01], [0.01, 0.08]], [0.3, 0.2], epsilon=1e-2)
-    robust = mcg.Cauchy(0.5)
-    start = mcg.register(source, target, method, robust=robust, max_distance=GATE).matrix
-    matches = mcg.find_correspondences(source, target, start, method, max_distance=GATE, num_candidates=4)
-    assert matches.indices.shape == (4, source.points.shape[0])
-
-    def loss(inputs):
-        clouds = clouds_with(inputs, source, target)
-        temperature = inputs["temperature"]
-        result = mcg.align(
-            *clouds,
-            matches,
-            inputs["method"],
-            robust=inputs["robust"],
-            init=start,
-            temperature=temperature,
-            **TO_ROUNDING,
-        )
-        return weigh(result.matrix)
-
-    inputs = inputs_of(source, target, method, robust) | {"temperature": jnp.asarray(0.1)}
-    _, gradient = check_gradient(loss, inputs)(inputs)
-    assert np.abs(gradient["method"].channel_weights).min() > 1e-4
 
 
 def test_towards_zero_temperature_the_nearest_counts_alone(noisy):

@@ -1,0 +1,91 @@
+"""Derivatives against finite differences: shared by the tests of transformations."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import mcgicp_jax as mcg
+
+X64 = bool(jax.config.jax_enable_x64)
+needs_x64 = pytest.mark.skipif(not X64, reason="finite differences need float64: JAX_ENABLE_X64=1")
+GATE = 0.4
+# (method, robust kernel): every number in them is differentiated.
+CASES = {
+    "mc-gicp": (mcg.MultiChannelGICP([[0.05, 0.01], [0.01, 0.08]], 0.3, epsilon=1e-2), mcg.Cauchy(0.5)),
+    "gicp": (mcg.GICP(1e-2), mcg.Huber(0.3)),
+    "point-to-plane": (mcg.PointToPlane(), mcg.GemanMcClure(0.5)),
+    "point-to-point": (mcg.PointToPoint(), mcg.Tukey(1.0)),
+    "color-icp": (mcg.ColorICP(0.3), None),
+}
+CONVERGED = {"translation_tolerance": 1e-12, "rotation_tolerance": 1e-12, "max_iterations": 200}
+# Differences over 4e-7 need poses to the last digit: updates go on until the iterations run out.
+TO_ROUNDING = {"translation_tolerance": 1e-15, "rotation_tolerance": 1e-15, "max_iterations": 60}
+
+
+def weigh(matrix):
+    """One number of a pose, into which all of its entries go."""
+    return jnp.sum(jnp.asarray(np.random.default_rng(0).normal(size=(3, 4))) * matrix[:3])
+
+
+def inputs_of(source, target, method, robust):
+    """Everything that a pose can be differentiated with respect to, by name."""
+    inputs = {
+        "source points": source.points,
+        "target points": target.points,
+        "source channels": source.channels,
+        "target channels": target.channels,
+        "method": method,
+        "robust": robust,
+    }
+    if source.covariances is not None:
+        inputs |= {"source covariances": source.covariances, "target covariances": target.covariances}
+    return inputs
+
+
+def clouds_with(inputs, source, target):
+    def filled(name, cloud):
+        arrays = {key.split()[1]: value for key, value in inputs.items() if key.startswith(name)}
+        return cloud.replace(**arrays)
+
+    return filled("source", source), filled("target", target)
+
+
+def directional_errors(loss, inputs, gradient):
+    """Relative error of the gradient along a random direction in each input, against a fourth-order difference."""
+    rng = np.random.default_rng(1)
+    for name, value in inputs.items():
+        leaves, structure = jax.tree.flatten(value)
+        for i, leaf in enumerate(leaves):
+            direction = rng.normal(size=leaf.shape)
+            if name == "method" and leaf.ndim == 2:
+                direction = direction + direction.T
+            if name == "method" or name == "robust":
+                direction = direction * np.abs(np.asarray(leaf))
+
+            def at(step, name=name, leaves=leaves, structure=structure, i=i, leaf=leaf, direction=direction):
+                moved = [*leaves[:i], leaf + step * direction, *leaves[i + 1 :]]
+                return float(loss(inputs | {name: jax.tree.unflatten(structure, moved)}))
+
+            # Short, so that no pair crosses the kink of a kernel.
+            step = 5e-7
+            expected = (8 * (at(step) - at(-step)) - (at(2 * step) - at(-2 * step))) / (12 * step)
+            actual = float(jnp.sum(jax.tree.leaves(gradient[name])[i] * direction))
+            yield f"{name}[{i}]", actual, expected
+
+
+def check_gradient(loss, inputs):
+    """Against differences and forward mode; returns the compiled value and gradient, for more of them."""
+    # One program for value and gradient: compiling is what takes time here.
+    compiled = jax.jit(jax.value_and_grad(loss))
+    _, gradient = compiled(inputs)
+    scale = 1e-3
+    for name, actual, expected in directional_errors(lambda moved: compiled(moved)[0], inputs, gradient):
+        assert np.isfinite(actual)
+        assert abs(actual - expected) <= 1e-6 * max(abs(expected), scale), name
+    # Forward mode, along one direction through everything.
+    tangent = jax.tree.map(lambda leaf: jnp.asarray(np.random.default_rng(2).normal(size=leaf.shape)), inputs)
+    _, forward = jax.jit(lambda i, t: jax.jvp(loss, (i,), (t,)))(inputs, tangent)
+    reverse = sum(jax.tree.leaves(jax.tree.map(lambda a, b: jnp.sum(a * b), gradient, tangent)))
+    np.testing.assert_allclose(forward, reverse, rtol=1e-9, atol=1e-12)
+    return compiled

@@ -1,0 +1,129 @@
+"""Gradients of `align` against finite differences, with respect to everything that a pose depends on."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import mcgicp_jax as mcg
+from tests.differences import (
+    CASES,
+    CONVERGED,
+    GATE,
+    TO_ROUNDING,
+    check_gradient,
+    clouds_with,
+    inputs_of,
+    needs_x64,
+    weigh,
+)
+from tests.scenes import motion
+
+
+@needs_x64
+@pytest.mark.parametrize("name", CASES)
+def test_align_has_the_gradient_of_its_answer(name, noisy):
+    source, target, _ = noisy
+    method, robust = CASES[name]
+    start = mcg.register(source, target, method, robust=robust, max_distance=GATE).matrix
+    matches = mcg.find_correspondences(source, target, start, method, max_distance=GATE)
+
+    def loss(inputs):
+        clouds = clouds_with(inputs, source, target)
+        result = mcg.align(*clouds, matches, inputs["method"], robust=inputs["robust"], init=start, **TO_ROUNDING)
+        return weigh(result.matrix)
+
+    check_gradient(loss, inputs_of(source, target, method, robust))
+
+
+@needs_x64
+@pytest.mark.parametrize("name", ["mc-gicp", "color-icp"])
+def test_align_has_the_gradient_where_channels_are_missing(name, noisy):
+    source, target, _ = noisy
+    method, robust = CASES[name]
+    clouds = []
+    for i, cloud in enumerate((source, target)):
+        mask = np.random.default_rng(i).random(cloud.channels.shape) < 0.7
+        clouds.append(cloud.replace(channel_valid=mask))
+    source, target = clouds
+    method = method.resolve(source, target)
+    start = mcg.register(source, target, method, robust=robust, max_distance=GATE).matrix
+    matches = mcg.find_correspondences(source, target, start, method, max_distance=GATE, num_candidates=2)
+
+    def loss(inputs):
+        clouds = clouds_with(inputs, source, target)
+        settings = {"robust": inputs["robust"], "init": start, "temperature": 0.1, **TO_ROUNDING}
+        return weigh(mcg.align(*clouds, matches, inputs["method"], **settings).matrix)
+
+    inputs = inputs_of(source, target, method, robust)
+    value_and_gradient = check_gradient(loss, inputs)
+    # What stands where nothing is, NaN for one, is not seen.
+    for side, cloud in (("source", source), ("target", target)):
+        inputs[f"{side} channels"] = jnp.where(cloud.channel_valid, cloud.channels, jnp.nan)
+    _, gradient = value_and_gradient(inputs)
+    for side, cloud in (("source", source), ("target", target)):
+        assert np.isfinite(gradient[f"{side} channels"]).all()
+        np.testing.assert_array_equal(gradient[f"{side} channels"][~np.asarray(cloud.channel_valid)], 0)
+
+
+@needs_x64
+def test_align_has_the_gradient_of_given_covariances(noisy):
+    source, target, _ = noisy
+    method, robust = CASES["gicp"]
+    rng = np.random.default_rng(0)
+    clouds = []
+    for cloud in (source, target):
+        factor = rng.normal(size=(cloud.points.shape[0], 3, 3))
+        covariances = factor @ factor.swapaxes(1, 2) / 3 + 0.1 * np.eye(3)
+        clouds.append(cloud.replace(covariances=jnp.asarray(covariances)))
+    source, target = clouds
+    matches = mcg.find_correspondences(source, target, motion(), method, max_distance=GATE)
+
+    def loss(inputs):
+        clouds = clouds_with(inputs, source, target)
+        result = mcg.align(*clouds, matches, inputs["method"], robust=inputs["robust"], init=motion(), **TO_ROUNDING)
+        return weigh(result.matrix)
+
+    check_gradient(loss, inputs_of(source, target, method, robust))
+
+
+@needs_x64
+def test_soft_matches_give_every_number_a_gradient(noisy):
+    source, target, _ = noisy
+    method = mcg.MultiChannelGICP([[0.05, 0.01], [0.01, 0.08]], [0.3, 0.2], epsilon=1e-2)
+    robust = mcg.Cauchy(0.5)
+    start = mcg.register(source, target, method, robust=robust, max_distance=GATE).matrix
+    matches = mcg.find_correspondences(source, target, start, method, max_distance=GATE, num_candidates=4)
+    assert matches.indices.shape == (4, source.points.shape[0])
+
+    def loss(inputs):
+        clouds = clouds_with(inputs, source, target)
+        temperature = inputs["temperature"]
+        result = mcg.align(
+            *clouds,
+            matches,
+            inputs["method"],
+            robust=inputs["robust"],
+            init=start,
+            temperature=temperature,
+            **TO_ROUNDING,
+        )
+        return weigh(result.matrix)
+
+    inputs = inputs_of(source, target, method, robust) | {"temperature": jnp.asarray(0.1)}
+    _, gradient = check_gradient(loss, inputs)(inputs)
+    assert np.abs(gradient["method"].channel_weights).min() > 1e-4
+
+
+@needs_x64
+def test_jacobians_agree_forward_and_backward(noisy):
+    source, target, _ = noisy
+    method, _ = CASES["gicp"]
+    matches = mcg.find_correspondences(source, target, motion(), method, max_distance=GATE)
+
+    def pose(epsilon):
+        return mcg.align(source, target, matches, mcg.GICP(epsilon), init=motion(), **CONVERGED).matrix
+
+    forward, backward = (jax.jit(jacobian(pose))(jnp.asarray(1e-2)) for jacobian in (jax.jacfwd, jax.jacrev))
+    assert np.abs(forward).max() > 1e-3
+    np.testing.assert_allclose(forward, backward, rtol=1e-9, atol=1e-12)
