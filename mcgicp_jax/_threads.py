@@ -3,13 +3,19 @@
 from __future__ import annotations
 
 import collections
+import contextlib
 import functools
 import os
 from collections.abc import Callable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor, wait
-from typing import TypeVar
+from typing import Any, TypeVar
+
+import jax
 
 Answer = TypeVar("Answer")
+
+# What can be set for a block of code, and changes what is computed in it.
+_SETTINGS: tuple[Any, ...] = (jax.enable_x64, jax.default_device, jax.default_matmul_precision, jax.debug_nans)
 
 
 def num_cores() -> int:
@@ -40,7 +46,9 @@ def side_by_side(calls: Sequence[Callable[[], Answer]], most: int | None = None)
                 return
             answers[i] = call()
 
-    helpers = [_submit(work) for _ in range(min(len(calls), most or len(calls)) - 1)]
+    count = min(len(calls), most or len(calls)) - 1
+    elsewhere = _with_settings(work) if count else work
+    helpers = [_submit(elsewhere) for _ in range(count)]
     try:
         answers[first] = call()
         work()
@@ -52,6 +60,19 @@ def side_by_side(calls: Sequence[Callable[[], Answer]], most: int | None = None)
     for helper in begun:
         helper.result()
     return [answers[i] for i in range(len(calls))]
+
+
+def _with_settings(work: Callable[[], None]) -> Callable[[], None]:
+    """The same in another thread: what a user has set for a block of code holds in that block's thread alone."""
+    values = [(setting, setting.value) for setting in _SETTINGS]
+
+    def run() -> None:
+        with contextlib.ExitStack() as stack:
+            for setting, value in values:
+                stack.enter_context(setting(value))
+            work()
+
+    return run
 
 
 def _submit(work: Callable[[], None]) -> Future[None]:

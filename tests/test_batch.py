@@ -41,7 +41,7 @@ def prepared(raw):
 
 
 def batch(sources, targets, **settings):
-    return mcg.register_batch(sources, targets, METHOD, max_distance=0.5, **settings)
+    return mcg.register_batch(sources, targets, METHOD, **{"max_distance": 0.5} | settings)
 
 
 @pytest.fixture(scope="module")
@@ -68,6 +68,13 @@ def test_each_pair_is_as_if_it_were_alone(raw, alone):
         assert max(pose_error(result.matrix, truth)) < 0.02
     # Matches of one of them circle.
     assert sum(result.converged for result in results) >= 5
+
+
+def test_every_option_of_register_is_one_of_a_batch(raw):
+    options = {"match_channels": True, "scales": (0.2,), "robust": mcg.Huber(1.0), "max_iterations": 20}
+    source, target = (mcg.preprocess(cloud) for cloud in raw[0][:2])
+    expected = mcg.register(source, target, METHOD, **options)
+    assert_same(batch([source], [target], max_distance=None, **options), [expected])
 
 
 @pytest.mark.slow

@@ -1,6 +1,7 @@
 """Clouds of every size run the same few programs: compilations are counted."""
 
 import contextlib
+import gc
 
 import jax
 import numpy as np
@@ -116,12 +117,31 @@ def test_what_is_kept_of_a_cloud_goes_with_it():
     from mcgicp_jax import _kept
 
     source, target = (mcg.preprocess(room_corner(300, seed=seed)[0]) for seed in (0, 1))
-    numbers = id(source), id(target)
     mcg.register(source, target, mcg.GICP())
     kept = _kept.keep.__self__._kept
-    assert set(numbers) <= set(kept)
+    alive = [kept[id(cloud)][0] for cloud in (source, target)]
+    assert all(reference() is not None for reference in alive)
     del source, target
-    assert not set(numbers) & set(kept)
+    gc.collect()
+    assert all(reference() is None for reference in alive)
+    # With the next lookup.
+    other = mcg.preprocess(room_corner(300, seed=2)[0])
+    mcg.register(other, other, mcg.GICP())
+    assert all(reference() is not None for reference, _, _ in kept.values())
+
+
+def test_settings_of_a_block_of_code_hold_in_all_threads():
+    """Nine blocks, of which other threads take some."""
+    points = room_corner(9000)[0]
+    with jax.enable_x64(True):
+        cloud, other = (mcg.preprocess(points + shift) for shift in (0, 0.01))
+        result = mcg.register(cloud, other, mcg.GICP(), max_distance=0.3)
+    alone = mcg.KDTreeSearch(workers=1)
+    with jax.enable_x64(True):
+        cloud, other = (mcg.preprocess(points + shift, search=alone) for shift in (0, 0.01))
+        expected = mcg.register(cloud, other, mcg.GICP(), max_distance=0.3, search=alone)
+    assert cloud.points.dtype == np.float64
+    np.testing.assert_array_equal(result.matrix, expected.matrix)
 
 
 def test_find_correspondences_computes_nothing_that_it_does_not_use():

@@ -2,11 +2,10 @@
 
     python -m tests.benchmarks.soak [--registrations 10000]
 
-Clouds of 100 to 288 points, five size classes, each of another size than the last, by GICP and by MC-GICP with a
-robust kernel, every fifth pair at UTM coordinates, every hundredth inside `jax.jit`. Printed are the memory of the
-process (resident, after a garbage collection), the pieces that it is mapped in (Linux grants 65,530), what JAX has
-compiled, and how many trees are kept for callbacks. Once all pairs of size classes have been met, nothing should grow
-but the trees, up to their limit.
+Clouds of 100 to 288 points, each of another size than the last, by GICP and by MC-GICP with a robust kernel, every
+fifth pair at UTM coordinates, every hundredth inside `jax.jit`. Printed are the memory of the process (resident, after
+a garbage collection), the pieces that it is mapped in (Linux grants 65,530), what JAX has compiled, and how many trees
+are kept for callbacks. Nothing should grow but the trees, up to their limit.
 """
 
 from __future__ import annotations
