@@ -26,7 +26,9 @@ from tests.scenes import motion, pair
 
 
 @needs_x64
-@pytest.mark.parametrize("name", CASES)
+@pytest.mark.parametrize(
+    "name", [name if "gicp" in name else pytest.param(name, marks=pytest.mark.slow) for name in CASES]
+)
 def test_register_has_the_gradient_of_its_answer(name, noisy):
     """Where no match flips within the step of the difference, which is checked."""
     source, target, _ = noisy
