@@ -37,6 +37,8 @@ _LEAST_PART, _PARTS_PER_THREAD = 1000, 8
 # A tree of more points falls out of a processor's caches, and is searched faster by queries that lie side by side: a
 # million points in half the time.
 _LARGEST_UNORDERED = 50_000
+# Bytes of an array that JAX copies on the spot for a callback: below 100 KiB in jaxlib 0.10.2.
+_LARGEST_PIECE = 64 * 1024
 # Rows of all trees that are kept for callbacks: hundreds of scans, some hundred megabytes.
 _CACHED_ROWS = 2_000_000
 
@@ -84,13 +86,13 @@ class AbstractTreeSearch(AbstractSearch):
         running: Bool[Array, ""],
         num_candidates: int = 1,
     ) -> Int[Array, "m N"]:
-        arguments = (pose, source, target, max_distance, running)
-        dimensions = tuple(leaf.ndim for leaf in jax.tree.leaves(arguments))
+        arguments = jax.tree.map(_pieces, (pose, source, target, max_distance, running))
         return jax.pure_callback(
-            partial(_nearest_callback, self, num_candidates, dimensions),
+            partial(_nearest_callback, self, num_candidates),
             jax.ShapeDtypeStruct((num_candidates, source.valid.shape[0]), jnp.int32),
             *arguments,
-            vmap_method="expand_dims",
+            # One lane at a time: a batch of pieces would be large again.
+            vmap_method="sequential",
         )
 
     def neighbors(self, points: Float[np.ndarray, "N 3"], num_neighbors: int) -> Int[np.ndarray, "N k"]:
@@ -317,28 +319,31 @@ class _IndexCache:
 _index_cache = _IndexCache(_CACHED_ROWS)
 
 
-def _nearest_callback(
-    search: AbstractTreeSearch, num_candidates: int, dimensions: tuple[int, ...], *arguments: Any
-) -> Int[np.ndarray, "*batch m N"]:
-    """`nearest` over any leading batch dimensions, some of them 1 where an argument has no batch.
+def _pieces(array: Any) -> list[Any]:
+    """An array cut along its rows, for a callback.
 
-    Args:
-        dimensions: how many each array has without the batch.
-        arguments: those of `AbstractSearch.nearest_traced`.
+    JAX copies what a callback is given, and large arrays by a thread of the pool that programs run on. Where callbacks
+    of as many programs as there are threads wait for that, all wait for ever (seen with two programs on two cores).
     """
-    leaves, structure = jax.tree.flatten(arguments)
-    arrays = [np.asarray(leaf) for leaf in leaves]
-    own = [array.shape[array.ndim - n :] for array, n in zip(arrays, dimensions, strict=True)]
-    batch = np.broadcast_shapes(*(array.shape[: array.ndim - n] for array, n in zip(arrays, dimensions, strict=True)))
-    lanes = [np.broadcast_to(array, batch + shape) for array, shape in zip(arrays, own, strict=True)]
-    num_rows = arguments[1].valid.shape[-1]
-    indices = np.full((*batch, num_candidates, num_rows), -1, np.int32)
-    for lane in np.ndindex(batch):
-        pose, source, target, max_distance, running = jax.tree.unflatten(structure, [array[lane] for array in lanes])
-        if running:
-            index = _index_cache.get(search, target)
-            indices[lane] = index.nearest(pose, source, float(max_distance), num_candidates)
-    return indices
+    array = jnp.asarray(array)
+    count = -(-array.nbytes // _LARGEST_PIECE)
+    return [array] if count <= 1 else jnp.array_split(array, count)
+
+
+def _nearest_callback(search: AbstractTreeSearch, num_candidates: int, *arguments: Any) -> Int[np.ndarray, "m N"]:
+    """`nearest` of arguments in pieces, which are those of `AbstractSearch.nearest_traced`."""
+    whole = jax.tree.map(
+        lambda pieces: (
+            np.concatenate([np.asarray(piece) for piece in pieces]) if len(pieces) > 1 else np.asarray(pieces[0])
+        ),
+        arguments,
+        is_leaf=lambda node: isinstance(node, list),
+    )
+    pose, source, target, max_distance, running = whole
+    if not running:
+        return np.full((num_candidates, source.valid.size), -1, np.int32)
+    index = _index_cache.get(search, target)
+    return index.nearest(pose, source, float(max_distance), num_candidates)
 
 
 def _moved(pose: Float[ArrayLike, "7"], points: Float[np.ndarray, "N 3"]) -> Float[np.ndarray, "N 3"]:
