@@ -41,6 +41,8 @@ class AbstractMethod(Numbers):
     """
 
     uses_channels: ClassVar[bool] = False
+    # Whether `covariance` looks at neighbours one by one, beyond their local statistics.
+    uses_neighborhoods: ClassVar[bool] = False
 
     def is_open(self, source: PointCloud, target: PointCloud) -> bool:
         """Whether a number has been left to be chosen from the data."""
@@ -67,7 +69,8 @@ class AbstractMethod(Numbers):
         """Symmetric 3×3 matrices of some points, whose meaning is the method's affair.
 
         Args:
-            around, local: neighbourhoods and their statistics; None for clouds that were not preprocessed.
+            around: neighbourhoods; None unless the method says `uses_neighborhoods`.
+            local: their statistics; None for clouds that were not preprocessed.
             given: covariances that the cloud brings; None if it brings none.
         """
 
@@ -237,6 +240,7 @@ class MultiChannelGICP(AbstractGeneralized):
     """
 
     uses_channels: ClassVar[bool] = True
+    uses_neighborhoods: ClassVar[bool] = True
 
     channel_covariance: Float[Array, "..."] | None
     channel_weights: Float[Array, "..."] | None

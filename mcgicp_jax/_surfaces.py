@@ -91,7 +91,7 @@ def surface_on_host(
 
 
 def _block(method: AbstractMethod, cloud: PointCloud, local: Local | None, observed: bool) -> Any:
-    gather = None if local is None else gatherer(cloud, method.uses_channels, np)
+    gather = gatherer(cloud, method.uses_channels, np) if local is not None and method.uses_neighborhoods else None
     points, given = np.asarray(cloud.points), cloud.covariances
     given = None if given is None else np.asarray(given)
 
@@ -124,7 +124,7 @@ def _traced(
 
 
 def _rows_of(method: AbstractMethod, cloud: PointCloud, given: Any, local: Local | None, observed: bool) -> Any:
-    gather = None if local is None else gatherer(cloud, method.uses_channels, jnp)
+    gather = gatherer(cloud, method.uses_channels, jnp) if local is not None and method.uses_neighborhoods else None
     points, given = jnp.asarray(cloud.points), None if given is None else jnp.asarray(given)
 
     def table(rows: Any) -> Any:
