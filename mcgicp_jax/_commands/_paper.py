@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, TypeAlias
 
+import jax.numpy as jnp
 import numpy as np
 import tyro
 from jaxtyping import Float, Int
@@ -245,7 +246,9 @@ def _figure_1(output: Path) -> Iterator[str]:
     drawn = _spread(np.asarray(cloud.points)[np.asarray(cloud.valid), :2], 0.06)
     methods = {"GICP": mcg.GICP(), "MC-GICP, colour": mcg.MultiChannelGICP()}
     covariances = {
-        name: matrix_from_symmetric(covariance_of(surfaces_of(method, cloud, cloud, observed=False)[1].table))
+        name: matrix_from_symmetric(
+            jnp.asarray(covariance_of(surfaces_of(method, cloud, cloud, observed=False)[1].table))
+        )
         for name, method in methods.items()
     }
     plot.surface_covariances(cloud, covariances, indices=drawn, path=output / "figure_1.png")
