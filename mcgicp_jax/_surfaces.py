@@ -36,7 +36,7 @@ def surfaces_of(
     """The method with its open numbers chosen from the data, and both clouds as it sees them.
 
     On the host where everything is concrete, in blocks; what depends on one cloud alone is kept as long as the cloud is
-    used. Inside transformations clouds of one size share one body.
+    used. Inside transformations both clouds share one compiled body, unless they are large.
 
     Args:
         observed: whether observability is wanted: to `register`, not to a cost of given matches.
