@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import os
 import sys
 import warnings
@@ -48,6 +49,8 @@ def main(args: Sequence[str] | None = None) -> int:
         print(f"mcgicp {VERSION}")
         return 0
     _keep_compiled_programs()
+    # Imported modules stay: looking through them for garbage again and again took a tenth of a short command.
+    gc.freeze()
     commands: dict[str, Callable[..., int]] = {
         "demo": demo,
         "register": register,

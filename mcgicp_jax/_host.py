@@ -45,9 +45,6 @@ from mcgicp_jax._uncertainty import Details, Scores, discount_rows, discounts, s
 
 # Rotation and translation of a pose.
 Moving: TypeAlias = tuple[Float[AnyArray, "3 3"], Float[AnyArray, "3"]]
-# Rows of a block of correspondences. One size for all, so that few programs are compiled: small clouds fill little of a
-# large block, and large clouds pay some 0.1 ms for the call of each small one.
-CORRESPONDENCE_BLOCK = 2048
 
 
 def register_on_host(
@@ -123,7 +120,7 @@ def _measure(pose: jaxlie.SE3, matches: _Matches, gate: Float[AnyScalar, ""], pr
     def sums(index: Any) -> Sums:
         return _sums(moving, *matches.block(index), gate, problem.method, problem.robust)
 
-    parts = map_blocks(sums, matches.size, CORRESPONDENCE_BLOCK)
+    parts = map_blocks(sums, matches.size)
     return combine([part for _, part in parts], matches.source.table.dtype)
 
 
@@ -167,7 +164,7 @@ def _covariance(
         )
         return _discount_rows(moving, *matches.rows_at(rows), gate, matches.details(rows), *sides)
 
-    rows = map_rows(discount, some.size, CORRESPONDENCE_BLOCK, num_threads)
+    rows = map_rows(discount, some.size, num_threads)
     num_channels = np.sum(np.any(source.rows.descriptors != 0, axis=0))
     discount_of_all = discounts(np.where(counts[:, None], rows, np.nan), num_channels)
 
@@ -175,7 +172,7 @@ def _covariance(
         weighing = (problem.method, problem.robust, discount_of_all, np.int32(matches.size))
         return _scores(moving, state.sums, *matches.block(index), gate, matches.details(index), *weighing)
 
-    parts = map_blocks(scores, matches.size, CORRESPONDENCE_BLOCK, num_threads)
+    parts = map_blocks(scores, matches.size, num_threads)
     answer, pull = (
         np.sum([np.asarray(getattr(part, name), np.float64) for _, part in parts], axis=0)
         for name in ("answer", "pull")

@@ -20,8 +20,6 @@ from mcgicp_jax._threads import side_by_side
 
 Tree = TypeVar("Tree")
 
-# Rows of a block of neighbourhoods. Measured: 1,024 take as long as the whole array in one program, or less.
-NEIGHBORHOOD_BLOCK = 1024
 # Neighbourhoods of more points than that are gone through block by block inside transformations, too: on CPUs XLA sums
 # over the first axis of tables of more columns column by column, which is twenty times slower.
 _LARGEST_WHOLE = 16_000
@@ -52,7 +50,7 @@ def local_on_host(cloud: PointCloud, with_channels: bool, num_threads: int | Non
 
     def make() -> Local:
         gather = gatherer(cloud, with_channels, np)
-        return map_rows(lambda rows: _describe(gather(rows)), cloud.points.shape[0], NEIGHBORHOOD_BLOCK, num_threads)
+        return map_rows(lambda rows: _describe(gather(rows)), cloud.points.shape[0], num_threads)
 
     return keep(cloud, "local", with_channels, make)
 

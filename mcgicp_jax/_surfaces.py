@@ -14,7 +14,7 @@ from mcgicp_jax import _algebra as alg
 from mcgicp_jax._blocks import map_rows
 from mcgicp_jax._cloud import PointCloud
 from mcgicp_jax._kept import keep
-from mcgicp_jax._local import NEIGHBORHOOD_BLOCK, joined, locals_of, over_rows, share_a_body, split
+from mcgicp_jax._local import joined, locals_of, over_rows, share_a_body, split
 from mcgicp_jax._methods import AbstractMethod
 from mcgicp_jax._neighborhoods import gatherer
 from mcgicp_jax._observability import channel_observability
@@ -82,7 +82,7 @@ def surface_on_host(
 
     def make() -> Surface:
         block = partial(_block, method, cloud, local, observed)
-        table, details = map_rows(block(), cloud.points.shape[0], NEIGHBORHOOD_BLOCK, num_threads)
+        table, details = map_rows(block(), cloud.points.shape[0], num_threads)
         return Surface(searchable(method, cloud), table, details)
 
     leaves, structure = jax.tree.flatten(method)

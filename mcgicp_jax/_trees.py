@@ -27,10 +27,15 @@ from mcgicp_jax._pose import rotation_from_quaternion
 from mcgicp_jax._search import AbstractIndex, AbstractSearch, Rows, on_host
 from mcgicp_jax._threads import num_cores, side_by_side
 
-# Candidates that are looked at, at most, to break a tie by row number: a multiple of those asked for, and at least so
-# many. Beyond, which of equal rows is taken is up to the tree.
+# Candidates that a tree is asked for, at most, to break a tie by row number: a multiple of those wanted, and at least so
+# many. Lattices stay below; above, ties come from points that coincide, which are then searched as one.
 _TIE_CANDIDATES = 8
 _LEAST_TIE_CANDIDATES = 64
+# Trees of one index, at most, for sets of channels that matches have in common: two cameras that see a point or not.
+_MOST_TREES = 16
+# With more of such sets: how many points near in position are looked at first, and of how many pairs at a time.
+_FIRST_NEAR = 32
+_PAIRS_AT_ONCE = 200_000
 # Queries that are worth being given to another thread, and how many such parts there are, at most, for each thread:
 # several, since a thread may come late. At 2,000 to 100,000 queries, a factor of two in either hardly matters.
 _LEAST_PART, _PARTS_PER_THREAD = 1000, 8
@@ -99,7 +104,7 @@ class AbstractTreeSearch(AbstractSearch):
         tree = self.build(points)
         # In the order of the leaves, each query finds in the processor's caches what the one before has read.
         order = self.leaf_order(tree, len(points))
-        found, _ = _nearest(self, tree, len(points), points[order], num_neighbors)
+        found, _ = _nearest(self, tree, points, points[order], num_neighbors)
         neighbors = np.full((len(points), num_neighbors), -1, np.int32)
         neighbors[order, : found.shape[1]] = found
         return neighbors
@@ -127,21 +132,28 @@ class KDTreeSearch(AbstractTreeSearch):
 
 
 class TreeIndex(AbstractIndex):
-    """A tree of the finite rows; where rows lack channels, one for each set of channels that matches have in common."""
+    """A tree of the finite rows; where rows lack channels, one for each set of channels that matches have in common.
+
+    Where there are many of such sets, the nearest points in position are looked at one by one instead.
+    """
 
     def __init__(self, search: AbstractTreeSearch, target: Rows):
         points = np.hstack([target.points, target.descriptors])
         # A tree refuses what is not finite; the sums at the pose will say NON_FINITE.
         self._rows = np.flatnonzero(target.valid & np.isfinite(points).all(axis=1)).astype(np.int32)
         self._points = points[self._rows]
-        self._penalty = None if target.penalty is None else target.penalty[self._rows]
+        penalty = np.zeros_like(target.descriptors) if target.penalty is None else target.penalty
+        self._penalty = penalty[self._rows]
+        self._patterns, self._which = _patterns(self._penalty)
         self._search = search
         # Trees are built when first asked for. Threads that ask at the same time build the same.
         self._parts: dict[bytes, list[_Part]] = {}
+        self._positions: Any = None
 
     @property
     def num_rows(self) -> int:
-        return self._rows.size
+        """Those of all its trees."""
+        return self._rows.size * max(1, len(self._parts) + (self._positions is not None))
 
     def nearest(
         self, pose: Float[ArrayLike, "7"], source: Rows, max_distance: float, num_candidates: int = 1
@@ -175,16 +187,22 @@ class TreeIndex(AbstractIndex):
         # With descriptors, the nearest may lie beyond the gate while a match within it is further in all dimensions:
         # then the whole space is searched. The margin covers rounding; the gate itself is applied to the position.
         bound = np.inf if queries.shape[1] > 3 else 1.001 * max_distance
+        rows = np.arange(len(queries))[active]
         if penalty is None:
-            groups = [(np.zeros(queries.shape[1] - 3), active)]
+            patterns, which = np.zeros((1, queries.shape[1] - 3)), np.zeros(rows.size, np.intp)
         else:
-            # Few, since a sensor sees a point or does not.
-            patterns, which = np.unique(penalty[active], axis=0, return_inverse=True)
-            rows = np.arange(len(queries))[active]
-            groups = [(pattern, rows[which.ravel() == i]) for i, pattern in enumerate(patterns)]
-        for pattern, alike in groups:
-            found, slack[alike] = self._nearest(queries[alike], pattern, k, bound)
-            indices[alike, : found.shape[1]] = found
+            patterns, which = _patterns(penalty[active])
+        if len(patterns) * len(self._patterns) > _MOST_TREES:
+            groups = [active]
+            answers = [self._near_in_position(queries[active], patterns[which], k)]
+        else:
+            groups = [active] if len(patterns) == 1 else [rows[which == i] for i in range(len(patterns))]
+            answers = [
+                self._nearest(queries[alike], pattern, k, bound)
+                for pattern, alike in zip(patterns, groups, strict=True)
+            ]
+        for alike, (found, free) in zip(groups, answers, strict=True):
+            indices[alike, : found.shape[1]], slack[alike] = found, free
         return indices, slack
 
     def _nearest(
@@ -192,28 +210,91 @@ class TreeIndex(AbstractIndex):
     ) -> tuple[Int[np.ndarray, "N m"], Float[np.ndarray, "N"]]:
         """`nearest_of` for queries that lack the same channels."""
         parts = self._parts_for(penalty)
-        answers = [part.nearest(queries, k, bound) for part in parts]
-        found = [each for each, _ in answers]
         if len(parts) == 1:
-            return parts[0].rows[found[0]], answers[0][1]
-        rows = np.hstack([part.rows[each] for part, each in zip(parts, found, strict=True)])
-        squares = np.hstack([part.squares(queries, each) for part, each in zip(parts, found, strict=True)])
-        nearest = np.take_along_axis(rows, np.lexsort((rows, squares), axis=1)[:, :k], axis=1)
-        return nearest, np.zeros(len(queries))
+            found, slack = parts[0].nearest(queries, k, bound)
+            return parts[0].rows[found], slack
+        # The second nearest tells how far a query may move.
+        each = [part.nearest(queries, k + 1, bound)[0] for part in parts]
+        rows = np.hstack([part.rows[found] for part, found in zip(parts, each, strict=True)])
+        squares = np.hstack([part.squares(queries, found) for part, found in zip(parts, each, strict=True)])
+        rows, squares = _ordered(rows, squares, k + 1)
+        return rows[:, :k], _slack(*np.sqrt(squares[:, [0, -1]]).T)
+
+    def _near_in_position(
+        self, queries: Float[np.ndarray, "N D"], penalty: Float[np.ndarray, "N C"], k: int
+    ) -> tuple[Int[np.ndarray, "N m"], Float[np.ndarray, "N"]]:
+        """`nearest_of` for queries and points that lack many different sets of channels.
+
+        More and more points near in position are looked at, until all others are too far away in position alone.
+        """
+        if self._positions is None:
+            self._positions = self._search.build(self._points[:, :3])
+        size = self._rows.size
+        found, slack = np.empty((len(queries), min(k, size)), np.int32), np.empty(len(queries))
+        # What any match adds to the squared distance.
+        least = penalty.sum(axis=1)
+        open, asked = np.arange(len(queries)), min(max(_FIRST_NEAR, k + 1), size)
+        while open.size:
+            unsure = []
+            for some in np.array_split(open, -(-open.size * asked // _PAIRS_AT_ONCE)):
+                distances, near = _query(self._search, self._positions, queries[some, :3], asked, np.inf)
+                rows, squares = _ordered(self._rows[near], self._squares(queries[some], penalty[some], near), k + 1)
+                found[some] = rows[:, :k]
+                # A part in a billion covers rounding.
+                others = (1 - 1e-9) * (distances[:, -1] ** 2 + least[some]) if asked < size else np.inf
+                slack[some] = _slack(*np.sqrt([squares[:, 0], np.minimum(squares[:, -1], others)]))
+                unsure.append(some[~(squares[:, min(k, size) - 1] < others)])
+            open, asked = np.concatenate(unsure) if asked < size else open[:0], min(4 * asked, size)
+        return found, slack
+
+    def _squares(
+        self, queries: Float[np.ndarray, "N D"], penalty: Float[np.ndarray, "N C"], near: Int[np.ndarray, "N m"]
+    ) -> Float[np.ndarray, "N m"]:
+        """Squared distances to rows, with the penalties of the channels that are missing; metres²."""
+        difference = queries[:, None] - self._points[near]
+        missing = np.maximum(penalty[:, None], self._penalty[near])
+        difference[..., 3:][missing > 0] = 0
+        return np.sum(difference * difference, axis=2) + missing.sum(axis=2)
 
     def _parts_for(self, penalty: Float[np.ndarray, "C"]) -> list[_Part]:
         key = penalty.tobytes()
         if key not in self._parts:
-            if self._penalty is None:
-                self._parts[key] = [_Part(self._search, self._points, self._rows, penalty)]
-            else:
-                patterns, which = np.unique(np.maximum(self._penalty, penalty), axis=0, return_inverse=True)
-                groups = [which.ravel() == i for i in range(len(patterns))]
-                self._parts[key] = [
-                    _Part(self._search, self._points[group], self._rows[group], pattern)
-                    for group, pattern in zip(groups, patterns, strict=True)
-                ]
+            common, alike = _patterns(np.maximum(self._patterns, penalty))
+            which = alike[self._which]
+            groups = [slice(None) if len(common) == 1 else which == i for i in range(len(common))]
+            self._parts[key] = [
+                _Part(self._search, self._points[group], self._rows[group], pattern)
+                for group, pattern in zip(groups, common, strict=True)
+            ]
         return self._parts[key]
+
+
+def _patterns(penalty: Float[np.ndarray, "N C"]) -> tuple[Float[np.ndarray, "P C"], Int[np.ndarray, "N"]]:
+    """The different rows of penalties, and which of them each row is."""
+    which = np.zeros(len(penalty), np.intp)
+    # Numbers stay below twice the number of rows, whatever the number of channels. No sorting: that takes most of the
+    # time of a search.
+    for column in (penalty > 0).T:
+        which = 2 * which + column
+        which = (np.cumsum(np.bincount(which) > 0) - 1)[which]
+    example = np.zeros(which.max(initial=-1) + 1, np.intp)
+    example[which] = np.arange(len(penalty))
+    return penalty[example], which
+
+
+def _ordered(
+    rows: Int[np.ndarray, "N m"], squares: Float[np.ndarray, "N m"], k: int
+) -> tuple[Int[np.ndarray, "N k"], Float[np.ndarray, "N k"]]:
+    """The first k by squared distance, equal ones by row."""
+    order = np.lexsort((rows, squares), axis=1)[:, :k]
+    return np.take_along_axis(rows, order, axis=1), np.take_along_axis(squares, order, axis=1)
+
+
+def _slack(first: Float[np.ndarray, "N"], second: Float[np.ndarray, "N"]) -> Float[np.ndarray, "N"]:
+    """Half the gap between the distances of the nearest and the second nearest, metres: so far may a query move."""
+    # A part in a million covers rounding. A single row has no second, and infinity less infinity no meaning.
+    with np.errstate(invalid="ignore"):
+        return 0.5 * (1 - 1e-6) * np.nan_to_num(second - first, neginf=0.0)
 
 
 class _Part:
@@ -242,7 +323,7 @@ class _Part:
 
         And how far each query may move before its nearest is another one.
         """
-        return _nearest(self._search, self._tree, len(self._points), queries[:, self._columns], k, bound)
+        return _nearest(self._search, self._tree, self._points, queries[:, self._columns], k, bound)
 
     def squares(self, queries: Float[np.ndarray, "N D"], found: Int[np.ndarray, "N m"]) -> Float[np.ndarray, "N m"]:
         """Squared distances to rows of this part, with the penalties of the channels that are missing; metres²."""
@@ -356,38 +437,68 @@ def _moved(pose: Float[ArrayLike, "7"], points: Float[np.ndarray, "N 3"]) -> Flo
 def _nearest(
     search: AbstractTreeSearch,
     tree: Any,
-    num_points: int,
+    points: Float[np.ndarray, "M D"],
     queries: Float[np.ndarray, "N D"],
     k: int,
     bound: float = np.inf,
 ) -> tuple[Int[np.ndarray, "N k"], Float[np.ndarray, "N"]]:
-    """Tree indices of the k nearest, ordered by (distance, row); `num_points` where nothing lies within `bound`.
+    """Tree indices of the k nearest, ordered by (distance, row); the number of points where none lies within `bound`.
 
     And half the gap between the nearest and the second, which lies at the bound if there is none within; 0 without any.
     Trees leave the order of equal distances to chance. One neighbour more than needed shows where there are any.
     """
-    k = min(k, num_points)
-    asked = min(k + 1, num_points)
-    most = min(max(_TIE_CANDIDATES * (k + 1), _LEAST_TIE_CANDIDATES), num_points)
+    k = min(k, len(points))
+    asked = min(k + 1, len(points))
+    most = min(max(_TIE_CANDIDATES * (k + 1), _LEAST_TIE_CANDIDATES), len(points))
     distances, rows = _query(search, tree, queries, asked, bound)
     nearest = rows[:, :k].astype(np.int32)
-    # A part in a million covers rounding. A single row has no second, and infinity less infinity no meaning.
-    second = np.minimum(distances[:, min(1, asked - 1)], bound)
-    with np.errstate(invalid="ignore"):
-        slack = 0.5 * (1 - 1e-6) * np.nan_to_num(second - distances[:, 0], neginf=0.0)
+    slack = _slack(distances[:, 0], np.minimum(distances[:, min(1, asked - 1)], bound))
     tied = np.flatnonzero((distances[:, 1:] == distances[:, :-1]).any(axis=1) & np.isfinite(distances[:, 0]))
     distances, rows = distances[tied], rows[tied]
     while tied.size:
         order = np.lexsort((rows, distances), axis=1)
         nearest[tied] = np.take_along_axis(rows, order, axis=1)[:, :k]
-        if asked == most:
-            break
         # A tie that the last candidate shares may go on beyond it.
         tied = tied[np.isfinite(distances[:, -1]) & (distances[:, k - 1] == distances[:, -1])]
+        if asked == most:
+            break
         asked = min(2 * asked, most)
         if tied.size:
             distances, rows = _query(search, tree, queries[tied], asked, bound)
+    if tied.size and asked < len(points):
+        nearest[tied] = _nearest_of_coincident(search, points, queries[tied], k, bound)
     return nearest, slack
+
+
+def _nearest_of_coincident(
+    search: AbstractTreeSearch,
+    points: Float[np.ndarray, "M D"],
+    queries: Float[np.ndarray, "N D"],
+    k: int,
+    bound: float,
+) -> Int[np.ndarray, "N k"]:
+    """`_nearest` where many points are equally far away, as where a sensor writes zeros for what it did not see.
+
+    Points that coincide are searched as one, and so are queries.
+    """
+    places, which, counts = np.unique(points, axis=0, return_inverse=True, return_counts=True)
+    by_place = np.split(np.argsort(which.ravel(), kind="stable"), np.cumsum(counts)[:-1])
+    tree = search.build(places)
+    queries, whose = np.unique(queries, axis=0, return_inverse=True)
+    nearest = np.empty((len(queries), k), np.int32)
+    for i, query in enumerate(queries):
+        asked, sure = min(k + 1, len(places)), False
+        while not sure:
+            distances, near = search.query(tree, query[None], asked, bound)
+            near, distances = near[0][np.isfinite(distances[0])], distances[0][np.isfinite(distances[0])]
+            # Of each place the first k rows; further places only where their distance is among the k smallest.
+            rows = np.concatenate([by_place[place][:k] for place in near])
+            apart = np.repeat(distances, np.minimum(counts[near], k))
+            order = np.lexsort((rows, apart))[:k]
+            sure = asked == len(places) or len(near) < asked or distances[-1] > apart[order[-1]]
+            asked = min(2 * asked, len(places))
+        nearest[i] = np.append(rows[order], np.full(k - order.size, len(points)))
+    return nearest[whose.ravel()]
 
 
 def _query(

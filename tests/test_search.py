@@ -66,11 +66,28 @@ def test_ties_do_not_depend_on_the_number_of_threads(workers):
     np.testing.assert_array_equal(found, ref.nearest(points, points, 8))
 
 
-@pytest.mark.parametrize("copies", [4, 16])
+@pytest.mark.parametrize("copies", [4, 16, 300])
 def test_ties_among_copies_of_one_point(copies):
     rng = np.random.default_rng(0)
     target = np.repeat(rng.normal(size=(3, 3)), copies, axis=0)[rng.permutation(3 * copies)]
     np.testing.assert_array_equal(query(np.eye(4), target, target)[0], ref.nearest(target, target)[:, 0])
+
+
+@settings(max_examples=10, deadline=None)
+@given(seed=st.integers(0, 2**31), k=st.integers(1, 25))
+def test_many_equal_distances(seed, k):
+    """Zeros for what a sensor did not see, and a sphere about one point: more than any lattice has."""
+    rng = np.random.default_rng(seed)
+    sphere = np.array([x for x in np.ndindex(21, 21, 21) if np.sum((np.array(x) - 10) ** 2) == 81]) - 10.0
+    points = np.concatenate([np.zeros((300, 3)), sphere, rng.integers(-2, 3, (40, 3))])[
+        rng.permutation(340 + len(sphere))
+    ]
+    np.testing.assert_array_equal(KDTreeSearch().neighbors(points, k), ref.nearest(points, points, k))
+    far = points[np.any(points, axis=1)]
+    queries = np.concatenate([np.zeros((5, 3)), far[:20]])
+    np.testing.assert_array_equal(
+        query(np.eye(4), queries, sphere, num_candidates=k).T, ref.nearest(queries, sphere, k)
+    )
 
 
 def test_the_point_itself_comes_first():
@@ -129,6 +146,40 @@ def test_nearest_with_missing_channels(seed, share, k, missing):
     found = KDTreeSearch().index(whole).nearest(still, source, np.inf, k)
     expected = ref.match_partial(rows[0], np.hstack([rows[1][:, :3], whole.descriptors]), masks[0], True, absence, k)
     np.testing.assert_array_equal(found.T, expected)
+
+
+class CountingSearch(KDTreeSearch):
+    """Counts the trees that it builds."""
+
+    built = []
+
+    def build(self, points):
+        self.built.append(len(points))
+        return super().build(points)
+
+
+@pytest.mark.parametrize("k", [1, 3])
+@pytest.mark.parametrize("high", [3, 50])
+def test_many_sets_of_missing_channels_need_few_trees(k, high):
+    """Eight channels, each there or not at random: by brute force."""
+    rows = [integers((size, 11), high, i) for i, size in enumerate((150, 200))]
+    masks = np.split(np.random.default_rng(0).random((350, 8)) < 0.6, [150])
+    absence = np.arange(1.0, 9.0)
+    source, target = (
+        Rows(row[:, :3], np.where(mask, row[:, 3:], 0), np.ones(len(row), bool), np.where(mask, 0, absence))
+        for row, mask in zip(rows, masks, strict=True)
+    )
+    CountingSearch.built.clear()
+    index = CountingSearch().index(target)
+    still = np.array([1.0, 0, 0, 0, 0, 0, 0])
+    expected = ref.match_partial(*rows, *masks, absence, k)
+    np.testing.assert_array_equal(index.nearest(still, source, np.inf, k).T, expected)
+    assert len(CountingSearch.built) == 1
+    # From pose to pose, too, where what is known from the pose before is used.
+    follow = index.follow(source, np.inf)
+    for i in range(8):
+        pose = np.array([1.0, 0, 0, 0, 0.3 * 0.5**i, 0, 0])
+        np.testing.assert_array_equal(follow(pose), index.nearest(pose, source, np.inf)[0])
 
 
 def partial_clouds(share=0.5, num_channels=3):
@@ -291,15 +342,18 @@ def test_channels_that_do_not_fit():
     step=st.sampled_from([0.0, 1e-4, 0.01, 0.3]),
     num_channels=st.sampled_from([0, 2]),
     max_distance=st.sampled_from([0.2, 0.5]),
+    lacking=st.booleans(),
 )
-def test_matches_that_are_followed_are_those_found_anew(seed, step, num_channels, max_distance):
+def test_matches_that_are_followed_are_those_found_anew(seed, step, num_channels, max_distance, lacking):
     """At every pose of a walk, of small steps and large, ties and points without a match among them."""
     rng = np.random.default_rng(seed)
     clouds = []
     for size in (60, 50):
         points = np.where(rng.random((size, 1)) < 0.5, rng.random((size, 3)), rng.integers(0, 3, (size, 3)) / 2)
         valid = rng.random(size) < 0.9
-        clouds.append(Rows(points, rng.integers(0, 2, (size, num_channels)) * 0.1, valid))
+        channels = rng.integers(0, 2, (size, num_channels)) * 0.1
+        penalty = 0.01 * (rng.random(channels.shape) < 0.3) if lacking else None
+        clouds.append(Rows(points, channels, valid, penalty))
     limit = max_distance
     index = KDTreeSearch().index(clouds[1])
     nearest = index.follow(clouds[0], limit)
