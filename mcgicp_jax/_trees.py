@@ -27,8 +27,8 @@ from mcgicp_jax._pose import rotation_from_quaternion
 from mcgicp_jax._search import AbstractIndex, AbstractSearch, Rows, on_host
 from mcgicp_jax._threads import num_cores, side_by_side
 
-# Candidates that a tree is asked for, at most, to break a tie by row number: a multiple of those wanted, and at least so
-# many. Lattices stay below; above, ties come from points that coincide, which are then searched as one.
+# Candidates that a tree is asked for, at most, to break a tie by row number: a multiple of those wanted, and at least
+# this many. Longer ties are mostly those of coincident points, which are then searched as one.
 _TIE_CANDIDATES = 8
 _LEAST_TIE_CANDIDATES = 64
 # Trees of one index, at most, for sets of channels that matches have in common: two cameras that see a point or not.
