@@ -16,6 +16,7 @@ from concurrent.futures import (
 )
 from concurrent.futures import wait as wait_for
 from dataclasses import dataclass, replace
+from functools import partial
 from multiprocessing import get_context
 from typing import Any, TypeAlias
 
@@ -37,7 +38,7 @@ from mcgicp_jax._result import Registration, Status, computed
 from mcgicp_jax._search import AbstractSearch
 from mcgicp_jax._sizes import size_class
 from mcgicp_jax._step import Problem
-from mcgicp_jax._threads import num_cores
+from mcgicp_jax._threads import num_cores, with_settings
 
 Cloud: TypeAlias = "PointCloud | Values | Callable[[], PointCloud | Values]"
 
@@ -198,7 +199,7 @@ class _Job:
             rejected: list[_Outcome] = []
 
             def problems() -> Iterator[tuple[_Problem, Problem]]:
-                for problem in _ahead(threads, self.problem, pairs, 2 * num_threads):
+                for problem in _ahead(threads, with_settings(self.problem), pairs, 2 * num_threads):
                     if isinstance(problem, _Outcome):
                         rejected.append(problem)
                     else:
@@ -298,19 +299,22 @@ class _Shipping:
     """
 
     def __init__(self, job: _Job, executor: Executor):
-        self._job = job
         self._executor = executor
         self._replacement: Executor | None = None
+        self._pickled = not isinstance(executor, ThreadPoolExecutor)
+        if self._pickled:
+            job = _as_numpy(job)
+        self._register = with_settings(partial(_register_chunk, job), pickled=self._pickled)
         self._suspects: collections.deque[_Pair] = collections.deque()
         self.under_way: dict[Future[list[_Outcome]], list[_Pair]] = {}
 
     def send(self, chunk: list[_Pair]) -> None:
+        sent = [_as_numpy(pair) for pair in chunk] if self._pickled else chunk
         try:
-            future = self._executor.submit(_register_chunk, self._job, chunk)
+            future = self._executor.submit(self._register, sent)
         except BrokenExecutor:
-            # A pool of processes dies with any of them; another takes its place.
-            self._replacement = self._executor = ProcessPoolExecutor(mp_context=get_context("spawn"))
-            future = self._executor.submit(_register_chunk, self._job, chunk)
+            self._replacement = self._executor = _like(self._executor)
+            future = self._executor.submit(self._register, sent)
         self.under_way[future] = chunk
 
     def receive(self) -> Iterator[tuple[int, Registration]]:
@@ -346,6 +350,35 @@ class _Shipping:
             future.cancel()
         if self._replacement is not None:
             self._replacement.shutdown(cancel_futures=True)
+
+
+def _like(executor: Executor) -> Executor:
+    """Another pool of processes in place of a broken one: a pool dies with any of its processes."""
+    return ProcessPoolExecutor(
+        getattr(executor, "_max_workers", None),
+        getattr(executor, "_mp_context", None) or get_context("spawn"),
+        getattr(executor, "_initializer", None),
+        getattr(executor, "_initargs", ()),
+    )
+
+
+def _as_numpy(sent: Any) -> Any:
+    """A dataclass to be pickled, JAX arrays in its fields made NumPy's.
+
+    JAX arrays of float64 become float32 where they are unpickled before x64 is switched on.
+    """
+
+    def convert(value: Any) -> Any:
+        return np.asarray(value) if isinstance(value, jax.Array) else value
+
+    fields = {name: getattr(sent, name) for name in sent.__dataclass_fields__}
+    return replace(
+        sent,
+        **{
+            name: _as_numpy(value) if isinstance(value, Options) else jax.tree.map(convert, value)
+            for name, value in fields.items()
+        },
+    )
 
 
 def _report(outcome: _Outcome) -> tuple[int, Registration]:

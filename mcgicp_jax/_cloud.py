@@ -69,7 +69,7 @@ class PointCloud(eqx.Module):
     To put other values in, as when a network makes the channels, use `cloud.replace(channels=...)`.
 
     Attributes:
-        points: (N, 3), metres, relative to `origin`.
+        points: (N, 3), metres, relative to `origin`, which is 0 for raw clouds; see `coordinates`.
         channels: (N, C), in the unit that the user gives; C may be 0.
         channel_valid: (N, C), False where a point has no such channel, as outside of a camera's view; its value there
             is 0 and takes part in nothing. None: all points have all channels.
@@ -174,6 +174,11 @@ class PointCloud(eqx.Module):
             fields["channels"] = _blank(fields["channels"], fields["channel_valid"])
         return _build(**fields)
 
+    @property
+    def coordinates(self) -> Float[np.ndarray, "*batch N 3"]:
+        """(N, 3) float64: the positions in the user's frame, metres: `points` with `origin` put back."""
+        return np.asarray(self.points, np.float64) + np.asarray(self.origin, np.float64)[..., None, :]
+
     def __len__(self) -> int:
         """The number of points, padding not counted."""
         return int(np.sum(np.asarray(self.valid)))
@@ -205,9 +210,7 @@ class PointCloud(eqx.Module):
             # A plain copy takes a tenth of the time.
             return None if array is None else np.array(array) if whole else np.asarray(array)[keep]
 
-        points = kept(self.points)
-        if np.any(self.origin):
-            points = points.astype(np.float64) + np.asarray(self.origin)
+        points = kept(self.coordinates if np.any(self.origin) else self.points)
         return PointCloud(
             points,
             kept(self.channels),
@@ -260,14 +263,22 @@ class PointCloud(eqx.Module):
         return _build(**vars(self) | arrays)
 
     def transform(self, pose: Pose) -> PointCloud:
-        """The cloud moved by a pose: points p become R p + t, covariances C become R C Rᵀ."""
+        """The cloud moved by a pose: points p become R p + t, covariances C become R C Rᵀ.
+
+        A raw cloud that ends up far from zero has float64 points; a preprocessed one keeps its precision, and moves its
+        `origin`: read `coordinates`.
+        """
         matrix = pose_matrix(pose, "pose")
         xp = np if isinstance(self.points, np.ndarray) and is_concrete(matrix) else jnp
         rotation = xp.asarray(matrix[:3, :3], self.points.dtype)
         points = self.points @ rotation.T
         covariances = None if self.covariances is None else rotation @ self.covariances @ rotation.T
         offset, origin = matrix[:3, :3] @ self.origin + matrix[:3, 3], self.origin
-        if is_concrete(points, offset) and is_far(np.asarray(offset), float(np.abs(points).max(initial=0))):
+        far = is_concrete(points, offset) and is_far(np.asarray(offset), float(np.abs(points).max(initial=0)))
+        if far and self.neighbors is None:
+            moved = self.coordinates @ np.asarray(matrix[:3, :3], np.float64).T + np.asarray(matrix[:3, 3])
+            return self.replace_rows(points=moved, covariances=covariances, origin=np.zeros(3))
+        if far:
             # The large part of a motion stays in float64.
             origin = np.asarray(offset, np.float64)
         else:

@@ -63,7 +63,7 @@ def mahalanobis_cost(
         raise ValueError(f"log_determinant: expected a method with covariances, got {type(method).__name__}")
     method, *surfaces = surfaces_of(method, source, target, observed=False)
     dtype = source.points.dtype
-    matrix = centred_pose(pose_matrix(pose, "pose"), source, target)
+    matrix = centred_pose(pose, source, target, "pose")
     rotation, translation = jnp.asarray(matrix[:3, :3], dtype), jnp.asarray(matrix[:3, 3], dtype)
     temperature = None if temperature is None else jnp.asarray(temperature, dtype)
     return _total_cost(rotation, translation, *surfaces, matches, method, robust, temperature, log_determinant)
@@ -101,8 +101,17 @@ def check_matches(matches: Correspondences, source: PointCloud, temperature: Arr
         raise ValueError(f"temperature: expected a positive number of metres, got {temperature!r}")
 
 
-def centred_pose(matrix: Array | np.ndarray, source: PointCloud, target: PointCloud) -> Array | np.ndarray:
-    """The same motion between the clouds' own origins: T(−o_t) · T · T(o_s), in the precision that it comes in."""
+def centred_pose(pose: Pose | None, source: PointCloud, target: PointCloud, name: str = "init") -> Array | np.ndarray:
+    """The same motion between the clouds' own origins: T(−o_t) · T · T(o_s), in the precision that it comes in.
+
+    Raises:
+        ValueError: as `pose_matrix`; `name` is that of the argument.
+    """
+    distance = 0.0
+    if is_concrete(source.origin, source.points) and np.any(source.origin):
+        radius = np.abs(np.asarray(source.points)).max(initial=0.0)
+        distance = float(np.linalg.norm(source.origin) / max(radius, np.finfo(np.float64).tiny))
+    matrix = pose_matrix(pose, name, distance)
     rotation, translation = matrix[:3, :3], matrix[:3, 3]
     # In this order two far origins cancel before they meet the rotation.
     shifted = (rotation - np.eye(3)) @ source.origin + (source.origin - target.origin) + translation

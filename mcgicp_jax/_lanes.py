@@ -23,6 +23,9 @@ Ended: TypeAlias = tuple[Key, State, Assessment, dict[str, np.ndarray]]
 # Of one device. On a CPU the lanes that wait for others cost as much as those that work.
 _LANES = 64
 _LANES_ON_CPU = 4
+# Problems of other shapes, at most, that a problem waits for before its lanes run half empty: results of a stream come
+# out while it goes on, and lanes that nobody needs give their memory back.
+_PATIENCE = 256
 # Of every lane, before those that have ended give way to others: few registrations take less, and a slow one then
 # keeps one lane busy, not all.
 _STEPS = 4
@@ -37,13 +40,20 @@ def run_problems(
     else there is to do. With several local devices the lanes are spread over them.
     """
     groups: dict[Any, _Group[Key]] = {}
-    for key, problem in problems:
+    last: dict[Any, int] = {}
+    for number, (key, problem) in enumerate(problems):
         leaves, structure = jax.tree.flatten(problem)
         kind = structure, tuple((leaf.shape, leaf.dtype) for leaf in leaves)
-        group = groups.setdefault(kind, _Group(problem, search, max_iterations))
-        group.add(key, problem)
-        while group.is_full():
-            yield from group.run()
+        if kind not in groups:
+            groups[kind] = _Group(problem, search, max_iterations)
+        last[kind] = number
+        groups[kind].add(key, problem)
+        while groups[kind].is_full():
+            yield from groups[kind].run()
+        for waiting in [kind for kind in groups if number - last[kind] > _PATIENCE]:
+            while groups[waiting].is_busy():
+                yield from groups[waiting].run()
+            del groups[waiting]
     for group in groups.values():
         while group.is_busy():
             yield from group.run()

@@ -12,10 +12,10 @@ from jaxtyping import Float
 from mcgicp_jax._cloud import PointCloud, Values
 from mcgicp_jax._methods import AbstractMethod
 from mcgicp_jax._options import Options, check_method
-from mcgicp_jax._pose import Pose, pose_matrix
+from mcgicp_jax._pose import Pose, nearest_rotation, pose_matrix
 from mcgicp_jax._preprocess import check_preprocessing, preprocess
 from mcgicp_jax._register import register_with
-from mcgicp_jax._result import Registration, Status, computed
+from mcgicp_jax._result import Registration, computed, is_usable
 from mcgicp_jax.datasets import Frame
 
 # Voxel numbers are packed into one 64-bit key, 21 bits each, from −2²⁰ on.
@@ -86,9 +86,10 @@ def odometry(
             yield Step(cloud, pose, None)
         else:
             result = register_with(cloud, before, method, motion, chosen)
-            if result.status not in (Status.TOO_FEW_CORRESPONDENCES, Status.NON_FINITE):
+            if is_usable(result):
                 motion = np.asarray(result.matrix)
-            pose = _rigid(pose @ motion)
+            # Products of thousands of rounded rotations would drift from being one.
+            pose = nearest_rotation(pose @ motion)
             yield Step(cloud, pose, computed(result))
         before = cloud
 
@@ -164,11 +165,3 @@ def _merge(keys: np.ndarray, rows: Float[np.ndarray, "N D"]) -> tuple[np.ndarray
     keys = keys[order]
     starts = np.flatnonzero(np.concatenate([np.ones(min(len(keys), 1), bool), keys[1:] != keys[:-1]]))
     return keys[starts], np.add.reduceat(rows[order], starts, axis=0) if len(starts) else rows
-
-
-def _rigid(pose: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, "4 4"]:
-    """The nearest rotation: products of thousands of rounded ones would drift from being one."""
-    left, _, right = np.linalg.svd(pose[:3, :3])
-    pose = pose.copy()
-    pose[:3, :3] = left @ right
-    return pose

@@ -22,13 +22,13 @@ Distance: TypeAlias = ArrayLike | tuple[ArrayLike, ArrayLike]
 class Options:
     """Options of `register`, which explains them; every function that registers takes them all.
 
-    The tolerances are in metres and radians. Nearest-neighbour matches often end in a small cycle; real scans were seen
-    to circle within 0.2 mm and 0.4 mrad.
+    The tolerances are in metres and radians. Nearest-neighbour matches often end in a small cycle; real scans with a
+    spacing of 0.1 m were seen to circle within 0.2 mm and 0.4 mrad.
     """
 
     max_distance: Distance | None = None
     max_iterations: int = 64
-    translation_tolerance: ArrayLike = 5e-4
+    translation_tolerance: ArrayLike | None = None
     rotation_tolerance: ArrayLike = 5e-4
     robust: AbstractKernel | None = None
     search: AbstractSearch | None = None
@@ -43,7 +43,7 @@ class Options:
             raise ValueError(f"max_iterations: expected at least 1, got {self.max_iterations!r}")
         for name in ("translation_tolerance", "rotation_tolerance"):
             value = getattr(self, name)
-            if is_concrete(value) and not (_is_number(value) and np.asarray(value) >= 0):
+            if value is not None and is_concrete(value) and not (_is_number(value) and np.asarray(value) >= 0):
                 raise ValueError(f"{name}: expected a number of at least 0, got {value!r}")
 
 

@@ -8,14 +8,16 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import jaxlie
 import numpy as np
 from jaxtyping import Array
 
 from mcgicp_jax._cloud import PointCloud
 from mcgicp_jax._deferred import Deferred
 from mcgicp_jax._directions import Directions
-from mcgicp_jax._pose import is_concrete, se3_from_matrix
+from mcgicp_jax._pose import AnyArray, is_concrete, rotation_from_quaternion, se3_from_matrix
 from mcgicp_jax._result import Registration, pose_in_user_frame
+from mcgicp_jax._statistics import namespace
 from mcgicp_jax._step import Assessment, State
 
 
@@ -54,7 +56,7 @@ def registration_of(
         target_origin=target.origin,
         centred=pose,
         constraints=_later(lambda: _constraints(assessment, source.origin), concrete),
-        uncertainty=_later(lambda: _covariance(assessment, source.origin), concrete),
+        uncertainty=_later(lambda: _uncertainty(assessment, pose, state.sums.center, source.origin), concrete),
         **numbers,
     )
 
@@ -84,14 +86,29 @@ def _constraints(assessment: Assessment, origin: Any) -> tuple[Any, Directions |
         return to_centred.T @ information @ to_centred, directions
 
 
-def _covariance(assessment: Assessment, origin: Any) -> Any:
-    """The covariance in the frame of the user's source."""
+def _uncertainty(assessment: Assessment, pose: jaxlie.SE3, center: AnyArray, origin: Any) -> tuple[Any, Any]:
+    """The covariance in the frame of the user's source, and the deviations at the centroid of the matched points.
+
+    Args:
+        pose: between the clouds' origins.
+        center: the centroid, moved by the pose.
+    """
     covariance = _read(assessment.covariance)
-    if is_concrete(origin) and not np.any(origin):
-        return covariance
-    from_centred = _translation_adjoint(origin)
+    xp = namespace(covariance, pose, center)
     with np.errstate(invalid="ignore", over="ignore"):
-        return from_centred @ covariance @ from_centred.T
+        rotation: Any
+        if xp is np:
+            parameters = np.asarray(pose.wxyz_xyz, np.float64)
+            rotation, offset = rotation_from_quaternion(parameters[:4]), parameters[4:] - np.asarray(center)
+        else:
+            rotation, offset = pose.rotation().as_matrix().astype(covariance.dtype), pose.translation() - center
+        # In the target's axes T exp(ξ) turns by R ω, and moves the centre c by R v + (t − c) × R ω.
+        to_center = _translation_adjoint(offset) @ xp.kron(xp.eye(2), rotation)
+        deviations = xp.sqrt(xp.diagonal(to_center @ covariance @ to_center.T)).astype(covariance.dtype)
+        if is_concrete(origin) and not np.any(origin):
+            return covariance, deviations
+        from_centred = _translation_adjoint(origin)
+        return from_centred @ covariance @ from_centred.T, deviations
 
 
 def _translation_adjoint(offset: Array | np.ndarray) -> Array | np.ndarray:

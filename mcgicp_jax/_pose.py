@@ -23,8 +23,10 @@ else:
 
 Pose: TypeAlias = "jaxlie.SE3 | Float[Array, '*batch 4 4'] | Float[np.ndarray, '*batch 4 4']"
 
-# A matrix that a user typed with a few digits is still a rotation; one that mirrors or scales is not.
+# Largest entry of R Rᵀ − I: a matrix that a user typed with four digits is still a rotation.
 _ROTATION_TOLERANCE = 1e-3
+# In radii of a cloud: by how much the digits of a rotation may displace a cloud that lies far from zero.
+_DISPLACEMENT_TOLERANCE = 0.1
 
 
 def is_concrete(*trees: object) -> bool:
@@ -46,10 +48,20 @@ def canonical_float() -> Any:
     return jax.dtypes.canonicalize_dtype(np.float64)
 
 
-def pose_matrix(pose: Pose | None, name: str = "init") -> Float[np.ndarray, "4 4"] | Float[Array, "4 4"]:
+def pose_matrix(
+    pose: Pose | None, name: str = "init", distance: float = 0.0
+) -> Float[np.ndarray, "4 4"] | Float[Array, "4 4"]:
     """The (4, 4) matrix of a pose, in the precision that it came in (float64 for NumPy); `None` is the identity.
 
-    Raises `ValueError`, where the values are concrete, if the shape is wrong or the matrix is no rigid motion.
+    A concrete matrix gets the nearest rotation, so that it does not scale what it moves.
+
+    Args:
+        name: of the argument, for messages.
+        distance: from zero of the cloud that the pose will move, in radii of that cloud.
+
+    Raises:
+        ValueError: where the values are concrete, if the shape is wrong, the matrix is no rigid motion, or its digits
+            are too few for a cloud at that distance.
     """
     if pose is None:
         return np.eye(4)
@@ -65,12 +77,30 @@ def pose_matrix(pose: Pose | None, name: str = "init") -> Float[np.ndarray, "4 4
     if matrix.shape != (4, 4):
         raise ValueError(f"{name}: expected a jaxlie.SE3 or a (4, 4) matrix, got shape {matrix.shape}")
     rotation = matrix[:3, :3]
+    off = np.abs(rotation @ rotation.T - np.eye(3)).max()
     # Written so that NaN fails as well.
-    rigid = np.abs(rotation @ rotation.T - np.eye(3)).max() <= _ROTATION_TOLERANCE and np.linalg.det(rotation) > 0
+    rigid = off <= _ROTATION_TOLERANCE and np.linalg.det(rotation) > 0
     if not (rigid and np.isfinite(matrix).all() and np.array_equal(matrix[3], [0.0, 0.0, 0.0, 1.0])):
         raise ValueError(
             f"{name}: expected a rigid motion (rotation of determinant 1, last row 0 0 0 1), got\n{matrix}"
         )
+    if off * distance > _DISPLACEMENT_TOLERANCE:
+        raise ValueError(
+            f"{name}: expected a rotation with more digits: R Rᵀ differs from the identity by {off:.1g}, which "
+            f"displaces a cloud so far from the origin by {off * distance:.1g} of its radius"
+        )
+    return nearest_rotation(matrix)
+
+
+def nearest_rotation(matrix: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, "4 4"]:
+    """The rigid motion whose rotation is the nearest one to that of a matrix (Frobenius norm); the same translation."""
+    rotation = matrix[:3, :3]
+    # A rotation to the last bits stays as it is.
+    if np.abs(rotation @ rotation.T - np.eye(3)).max() <= 1e-14:
+        return matrix
+    left, _, right = np.linalg.svd(rotation)
+    matrix = matrix.copy()
+    matrix[:3, :3] = left @ right
     return matrix
 
 

@@ -23,9 +23,9 @@ from mcgicp_jax._methods import AbstractMethod, MultiChannelGICP, PointToPoint
 from mcgicp_jax._neighborhoods import check_neighbors
 from mcgicp_jax._options import Distance, Options, check_method, check_positive
 from mcgicp_jax._outcome import registration_of
-from mcgicp_jax._pose import Pose, computed_now, is_concrete, pose_matrix, se3_from_matrix
+from mcgicp_jax._pose import Pose, computed_now, is_concrete, se3_from_matrix
 from mcgicp_jax._preprocess import preprocess
-from mcgicp_jax._result import Registration, pose_in_user_frame
+from mcgicp_jax._result import Registration, is_usable, pose_in_user_frame
 from mcgicp_jax._search import AbstractIndex, AbstractSearch, Correspondences
 from mcgicp_jax._statistics import constant, namespace
 from mcgicp_jax._step import Assessment, Problem, Settings, State
@@ -36,6 +36,8 @@ from mcgicp_jax._traced import align_traced, assess, differentiable, register_tr
 # Gates as multiples of the target's spacing. With the wide one the pose is found from a start several points away;
 # converged, its matches across edges and across the border of the overlap pull, and the narrow one leaves those out.
 _COARSE_SPACINGS, _FINE_SPACINGS = 10.0, 2.5
+# The default tolerance as a multiple of the target's spacing: 0.5 mm at 0.1 m. See `Options` for what limits it.
+_TOLERANCE_IN_SPACINGS = 0.005
 # Rows of the source, at least, that take part in the coarse phase.
 _COARSE_ROWS = 4096
 
@@ -69,7 +71,7 @@ def find_correspondences(
     check_positive("max_distance", max_distance)
     if num_candidates < 1:
         raise ValueError(f"num_candidates: expected at least 1, got {num_candidates}")
-    matrix = centred_pose(pose_matrix(pose, "pose"), source, target)
+    matrix = centred_pose(pose, source, target, "pose")
     matrix, max_distance, method = constant((matrix, max_distance, method))
     rows, target_rows = (searchable(method, constant(cloud)) for cloud in (source, target))
     dtype = rows.points.dtype
@@ -104,7 +106,7 @@ def align(
     *,
     init: Pose | None = None,
     max_iterations: int = Options.max_iterations,
-    translation_tolerance: ArrayLike = Options.translation_tolerance,
+    translation_tolerance: ArrayLike | None = None,
     rotation_tolerance: ArrayLike = Options.rotation_tolerance,
     robust: AbstractKernel | None = None,
     temperature: ArrayLike | None = None,
@@ -122,7 +124,8 @@ def align(
         matches: from `find_correspondences`.
         method: open numbers are chosen from the data.
         init: T_target_source to start from; the identity by default.
-        translation_tolerance, rotation_tolerance: metres and radians; the update that is below both is the last.
+        translation_tolerance, rotation_tolerance: metres and radians; the update that is below both is the last. None:
+            as in `register`.
         robust: kernel of each pair's Mahalanobis distance.
         temperature: metres; softens several candidates per source point, as in `mahalanobis_cost`.
 
@@ -141,9 +144,9 @@ def align(
     _check_clouds(source, target, method)
     method, seen, there = surfaces_of(method, source, target, observed=False)
     dtype = source.points.dtype
-    start = se3_from_matrix(centred_pose(pose_matrix(init), source, target), dtype)
+    start = se3_from_matrix(centred_pose(init, source, target), dtype)
     softness = None if temperature is None else jnp.asarray(temperature, dtype)
-    settings = _settings(options, np.inf, 1, dtype)
+    settings = _settings(options, target, 1, dtype)
     state, history = align_traced(start, seen, there, matches, softness, method, robust, settings, max_iterations)
     fixed, softness = jax.lax.stop_gradient((Problem(start, seen, there, method, robust, settings), softness))
     matched = matched_rows(fixed.source, fixed.target, matches, softness)
@@ -159,7 +162,7 @@ def register(
     init: Pose | None = None,
     max_distance: Distance | None = None,
     max_iterations: int = Options.max_iterations,
-    translation_tolerance: ArrayLike = Options.translation_tolerance,
+    translation_tolerance: ArrayLike | None = None,
     rotation_tolerance: ArrayLike = Options.rotation_tolerance,
     robust: AbstractKernel | None = None,
     search: AbstractSearch | None = None,
@@ -185,7 +188,7 @@ def register(
             between neighbouring points of the target. A start that is further off needs more.
         max_iterations: how often, at most, matches are found and the pose is updated.
         translation_tolerance, rotation_tolerance: metres (at the centroid of the pairs) and radians; the update that is
-            below both is the last.
+            below both is the last. None: 0.5 % of the median distance between neighbouring points of the target.
         robust: kernel of each pair's Mahalanobis distance: `Huber`, `Cauchy`, `GemanMcClure`, `Tukey`.
         search: how matches are found; by default SciPy's k-d tree, on an accelerator `DenseSearch`.
         hold_free_directions: leave the pose where `init` has it in the directions that nothing holds, neither the shape
@@ -228,13 +231,15 @@ def register_with(
     """`register`, with its options in one object."""
     check_method(method)
     source, target = _ready("source", source), _ready("target", target)
+    if options.scales and not (source.covariances is None and target.covariances is None):
+        raise ValueError("scales: expected none for clouds with covariances, which cannot be averaged in voxels")
     if options.match_channels:
         source = _matched(source, target, method)
     for voxel_size in options.scales:
         coarse, coarse_target = (_coarser(cloud, voxel_size) for cloud in (source, target))
         once = replace(options, max_distance=None, match_channels=False, scales=())
         found = register_with(coarse, coarse_target, method, init, once)
-        init = found.matrix if found.converged else init
+        init = found.matrix if is_usable(found) else init
     search = options.search or default_search()
     problem = pose_problem(source, target, method, init, options, search.num_threads)
     state, finish = _run(problem, target, search, options.max_iterations)
@@ -278,14 +283,21 @@ def pose_problem(
     _check_clouds(source, target, method)
     method, seen, there = surfaces_of(method, source, target, observed=True, num_threads=num_threads)
     dtype = source.points.dtype
-    distances = _usual_distances(target) if options.max_distance is None else options.max_distance
     xp = namespace(source.valid)
     stride = xp.maximum(xp.sum(xp.asarray(source.valid)) // _COARSE_ROWS, 1)
-    start = se3_from_matrix(centred_pose(pose_matrix(init), source, target), dtype)
-    return Problem(start, seen, there, method, options.robust, _settings(options, distances, stride, dtype))
+    start = se3_from_matrix(centred_pose(init, source, target), dtype)
+    return Problem(start, seen, there, method, options.robust, _settings(options, target, stride, dtype))
 
 
-def _settings(options: Options, max_distance: Any, stride: Any, dtype: Any) -> Settings:
+def _settings(options: Options, target: PointCloud, stride: Any, dtype: Any) -> Settings:
+    max_distance: Any = options.max_distance
+    tolerance: Any = options.translation_tolerance
+    if max_distance is None or tolerance is None:
+        # Of a cloud that is differentiated, too: an option is a constant.
+        spacing = constant(point_spacing(target))
+        max_distance = (spacing * _COARSE_SPACINGS, spacing * _FINE_SPACINGS) if max_distance is None else max_distance
+        tolerance = spacing * _TOLERANCE_IN_SPACINGS if tolerance is None else tolerance
+
     def number(value: Any, kind: Any) -> Any:
         xp = namespace(value)
         return xp.asarray(value, kind)
@@ -295,7 +307,7 @@ def _settings(options: Options, max_distance: Any, stride: Any, dtype: Any) -> S
         max_distance=number(coarse, dtype),
         fine_distance=number(fine, dtype),
         coarse_stride=number(stride, np.int32),
-        translation_tolerance=number(options.translation_tolerance, dtype),
+        translation_tolerance=number(tolerance, dtype),
         rotation_tolerance=number(options.rotation_tolerance, dtype),
         max_iterations=number(options.max_iterations, np.int32),
         hold_free_directions=number(options.hold_free_directions, bool),
@@ -329,12 +341,7 @@ def _nearest_points(
 
 
 def _coarser(cloud: PointCloud, voxel_size: float) -> PointCloud:
-    return preprocess(cloud.replace(covariances=None), voxel_size, check_neighbors(cloud).shape[-1])
-
-
-def _usual_distances(target: PointCloud) -> Any:
-    spacing = point_spacing(target)
-    return spacing * _COARSE_SPACINGS, spacing * _FINE_SPACINGS
+    return preprocess(cloud, voxel_size, check_neighbors(cloud).shape[-1])
 
 
 def _ready(name: str, cloud: PointCloud | Values) -> PointCloud:

@@ -68,7 +68,8 @@ class Registration(eqx.Module):
             Inside a transformation the length is fixed, and NaN fills what was not needed.
         source_origin, target_origin: what the clouds had taken off, `PointCloud.origin`.
         centred: the pose between those origins, which `matrix` is made from.
-        constraints, uncertainty: `information`, `directions` and `covariance`, computed when they are first read.
+        constraints, uncertainty: `information` and `directions`, `covariance` and `deviations`, computed when they are
+            first read.
     """
 
     T_target_source: jaxlie.SE3
@@ -83,7 +84,7 @@ class Registration(eqx.Module):
     target_origin: Float[Array, "*batch 3"] | Float[np.ndarray, "*batch 3"]
     centred: jaxlie.SE3
     constraints: Deferred[tuple[Any, Directions | None]]
-    uncertainty: Deferred[Any]
+    uncertainty: Deferred[tuple[Any, Any]]
 
     @classmethod
     def build(cls, **fields: Any) -> Registration:
@@ -111,7 +112,7 @@ class Registration(eqx.Module):
             target_origin=np.zeros(3),
             centred=nowhere,
             constraints=Deferred.of((np.zeros((6, 6)), None)),
-            uncertainty=Deferred.of(np.full((6, 6), np.nan)),
+            uncertainty=Deferred.of((np.full((6, 6), np.nan), np.full(6, np.nan))),
         )
 
     @property
@@ -133,12 +134,24 @@ class Registration(eqx.Module):
         """(6, 6) of ξ, in the same order and frame as `information`, estimated from how the matches disagree (see
         `_uncertainty`).
 
+        ξ turns about the origin of the source's coordinates. Where that is far from the points, as with UTM, a small
+        rotation displaces them far, and the first three variances are large: `deviations` refer to the points.
+
         It covers the noise and the sampling of the points. It does not know of a wrong minimum, of errors that all
         points share (calibration, motion during a scan), or of things that moved. A direction that nothing constrains
         has a standard deviation of 10 times the radius of the matched points. NaN where there is no pose, or too few
         matches to tell.
         """
-        return self.uncertainty.value
+        return self.uncertainty.value[0]
+
+    @property
+    def deviations(self) -> Float[AnyArray, "*batch 6"]:
+        """(6,) standard deviations along and about the target's axes: of the position of the centroid of the matched
+        points, metres, and of the rotation, radians.
+
+        From `covariance`, with what is said there.
+        """
+        return self.uncertainty.value[1]
 
     @property
     def status(self) -> Any:
@@ -188,6 +201,14 @@ class Registration(eqx.Module):
             f"{self.num_iterations} iterations, {self.num_inliers} inliers ({self.overlap:.0%}), "
             f"rmse {np.asarray(self.rmse):.4g} m{'; free by geometry: ' if free else ''}{free})"
         )
+
+
+def is_usable(result: Registration) -> bool:
+    """Whether the pose may start another registration: it comes from matches, and is finite.
+
+    So it does with the status DEGENERATE, where free directions are as they were at the start, and MAX_ITERATIONS.
+    """
+    return result.status in (Status.CONVERGED, Status.DEGENERATE, Status.MAX_ITERATIONS)
 
 
 def computed(result: Registration) -> Registration:

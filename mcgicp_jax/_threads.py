@@ -47,7 +47,7 @@ def side_by_side(calls: Sequence[Callable[[], Answer]], most: int | None = None)
             answers[i] = call()
 
     count = min(len(calls), most or len(calls)) - 1
-    elsewhere = _with_settings(work) if count else work
+    elsewhere = with_settings(work) if count else work
     helpers = [_submit(elsewhere) for _ in range(count)]
     try:
         answers[first] = call()
@@ -62,17 +62,23 @@ def side_by_side(calls: Sequence[Callable[[], Answer]], most: int | None = None)
     return [answers[i] for i in range(len(calls))]
 
 
-def _with_settings(work: Callable[[], None]) -> Callable[[], None]:
-    """The same in another thread: what a user has set for a block of code holds in that block's thread alone."""
-    values = [(setting, setting.value) for setting in _SETTINGS]
+def with_settings(work: Callable[..., Answer], *, pickled: bool = False) -> Callable[..., Answer]:
+    """The function with JAX's settings of this thread, to be called in another one: settings belong to a thread.
 
-    def run() -> None:
-        with contextlib.ExitStack() as stack:
-            for setting, value in values:
-                stack.enter_context(setting(value))
-            work()
+    Args:
+        pickled: for another process, which has no such device; it takes the first of the same platform.
+    """
+    values: list[Any] = [setting.value for setting in _SETTINGS]
+    if pickled:
+        values = [value.platform if isinstance(value, jax.Device) else value for value in values]
+    return functools.partial(_run_with, values, work)
 
-    return run
+
+def _run_with(values: list[Any], work: Callable[..., Answer], *arguments: Any) -> Answer:
+    with contextlib.ExitStack() as stack:
+        for setting, value in zip(_SETTINGS, values, strict=True):
+            stack.enter_context(setting(value))
+        return work(*arguments)
 
 
 def _submit(work: Callable[[], None]) -> Future[None]:

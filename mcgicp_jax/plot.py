@@ -420,7 +420,7 @@ def surface_covariances(
     raw, rows = _drawable(cloud), np.asarray(indices, int)
     view = _view(np.asarray(raw.points), _MAP_PIXELS)
     # The cloud as the covariances go by, and what its picture is painted from.
-    centers = np.asarray(cloud.points, float)[rows] + np.asarray(cloud.origin)
+    centers = cloud.coordinates[rows]
     places = ((centers - view.center) @ view.axes)[:, :2] - view.low
     room = 2 * _room(centers, float(np.ptp(np.asarray(raw.points), axis=0).max()))
     picture = np.nan_to_num(_paint(view, np.asarray(raw.points), _shades(raw, view)), nan=1)
@@ -507,7 +507,7 @@ def covariances(
         raise ValueError(f"covariances: expected shape ({size}, 3, 3), got {matrices.shape}")
     if rows.ndim != 1 or rows.size == 0 or rows.min() < 0 or rows.max() >= size:
         raise ValueError(f"indices: expected rows of the cloud, from 0 to {size - 1}, got {indices}")
-    centers = np.asarray(cloud.points, float)[rows] + np.asarray(cloud.origin)
+    centers = cloud.coordinates[rows]
     extent = float(np.ptp(_drawable(cloud).points, axis=0).max())
     figure = _figure(graphs)
     figure.add_trace(_scatter(graphs, cloud, "points", "#a0a0a0", min(1.0, _MOST_POINTS / max(len(cloud), 1))))

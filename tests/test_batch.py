@@ -16,6 +16,7 @@ import pytest
 
 import mcgicp_jax as mcg
 from mcgicp_jax import Status
+from mcgicp_jax._batch import _like
 from mcgicp_jax.metrics import pose_error
 from tests.scenes import motion, room_corner
 
@@ -261,7 +262,7 @@ class Unlucky(Executor):
     def __init__(self, deadly, times, at_submit=False):
         self.deadly, self.times, self.sent = deadly, times, []
 
-    def submit(self, function, job, chunk):
+    def submit(self, function, chunk):
         future = Future()
         numbers = [pair.index for pair in chunk]
         self.sent.append(numbers)
@@ -269,7 +270,7 @@ class Unlucky(Executor):
             self.times -= 1
             future.set_exception(BrokenExecutor("a worker died"))
         else:
-            future.set_result(function(job, chunk))
+            future.set_result(function(chunk))
         return future
 
 
@@ -305,6 +306,12 @@ def test_spawned_processes_and_one_that_is_killed(raw, alone, tmp_path):
     context = multiprocessing.get_context("spawn")
     with ProcessPoolExecutor(1, mp_context=context) as processes:
         assert_same(batch(sources, targets, executor=processes), alone)
+        # What is set for a block of code holds in the other processes, too.
+        with jax.enable_x64(True):
+            again = [[cloud.unpad() for cloud in side] for side in (sources, targets)]
+            results = batch(*again, executor=processes)
+            assert results[0].T_target_source.wxyz_xyz.dtype == again[0][0].points.dtype
+            assert_same(results, batch(*again))
         with pytest.warns(UserWarning, match="BrokenProcessPool"):
             results = batch([partial(die, tmp_path / "marker"), *sources], [targets[0], *targets], executor=processes)
     assert results[0].converged
@@ -350,3 +357,26 @@ def test_everything_survives_pickle_and_deepcopy(raw, alone):
             assert type(twin) is type(thing)
             assert_same([twin], [thing])
             assert repr(twin) == repr(thing)
+
+
+def test_workers_have_the_settings_of_the_caller(raw):
+    """Such as `jax.enable_x64`, which belong to a thread."""
+    source, target, _ = raw[0]
+    seen = []
+
+    def make():
+        seen.append((jax.enable_x64.value, jax.default_matmul_precision.value))
+        return source
+
+    with jax.enable_x64(True), jax.default_matmul_precision("highest"):
+        (result,) = batch([make], [target])
+    assert seen == [(True, "highest")]
+    assert result.T_target_source.wxyz_xyz.dtype == np.float64
+
+
+def test_another_pool_in_place_of_a_broken_one_is_like_it():
+    context = multiprocessing.get_context("spawn")
+    pool = ProcessPoolExecutor(3, context, initializer=os.putenv, initargs=("NAME", "value"))
+    with pool, _like(pool) as other:
+        for name in ("_max_workers", "_mp_context", "_initializer", "_initargs"):
+            assert getattr(other, name) == getattr(pool, name)

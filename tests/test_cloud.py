@@ -327,3 +327,24 @@ def test_repr_inside_a_transformation():
     seen = []
     jax.jit(lambda cloud: seen.append(repr(cloud)) or cloud.points)(ready())
     assert "160" in seen[0]
+
+
+def test_transform_by_kilometres_moves_the_points_of_a_raw_cloud():
+    far = T.copy()
+    far[:3, 3] += UTM
+    expected = POINTS @ far[:3, :3].T + far[:3, 3]
+    moved = raw().transform(far)
+    np.testing.assert_allclose(moved.points, expected, rtol=0, atol=1e-8)
+    assert not np.any(moved.origin)
+    # A preprocessed one keeps its precision, and says where it is.
+    np.testing.assert_allclose(
+        ready().transform(far).coordinates[:150], expected, rtol=0, atol=ref.tolerance(2e-6, 1e-8)
+    )
+
+
+def test_a_rotation_of_few_digits_becomes_one():
+    typed = np.round(T, 4)
+    assert np.abs(typed[:3, :3] @ typed[:3, :3].T - np.eye(3)).max() > 1e-6
+    moved = raw().transform(typed)
+    apart = [np.linalg.norm(points[1:] - points[:-1], axis=1) for points in (np.asarray(moved.points), POINTS)]
+    np.testing.assert_allclose(*apart, rtol=1e-6)

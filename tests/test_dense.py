@@ -13,7 +13,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import mcgicp_jax as mcg
-from mcgicp_jax import DenseSearch, KDTreeSearch, Status
+from mcgicp_jax import DenseSearch, KDTreeSearch, Status, _lanes
 from mcgicp_jax._dense import _nearest
 from mcgicp_jax._search import Rows
 from mcgicp_jax.metrics import pose_error
@@ -212,3 +212,16 @@ def test_lanes_are_spread_over_the_devices(clouds, tmp_path):
     found = np.load(tmp_path / "poses.npy")
     settled = [0, 2, 3, 4, 5]
     np.testing.assert_allclose(found[settled], expected[settled], atol=1e-5)
+
+
+def test_a_rare_size_does_not_wait_for_the_end(clouds, monkeypatch):
+    monkeypatch.setattr(_lanes, "_PATIENCE", 2)
+    # 500 points fill the larger size class, the others the smaller.
+    rare, usual = 2, [0, 1, 3, 5] * 3
+    order = [rare, *usual]
+    completed = mcg.register_as_completed(
+        *([side[i] for i in order] for side in clouds), METHOD, max_distance=0.5, search=DenseSearch()
+    )
+    ended = [number for number, _ in completed]
+    assert sorted(ended) == list(range(len(order)))
+    assert ended.index(0) < len(order) - 4

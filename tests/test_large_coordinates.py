@@ -48,6 +48,14 @@ def assert_as_near(matrix, near):
     assert np.abs(moved - expected).max() < 1e-4
 
 
+def test_a_start_of_too_few_digits_is_refused():
+    source, target = scene(UTM)
+    typed = UTM_TRUTH.copy()
+    typed[:3, :3] = np.round(typed[:3, :3], 6)
+    with pytest.raises(ValueError, match="init: expected a rotation with more digits"):
+        mcg.register(source, target, mcg.GICP(), init=typed)
+
+
 def test_register_from_raw_clouds_and_arrays(near):
     source, target = scene(UTM)
     result = mcg.register(source, target, mcg.MultiChannelGICP(), max_distance=0.5)

@@ -475,3 +475,43 @@ def test_results_repeat_and_survive_pickle(room):
         assert result.status is results[0].status and result.cost == results[0].cost
     for method in METHODS.values():
         assert repr(pickle.loads(pickle.dumps(method))) == repr(method)
+
+
+def test_scales_start_from_a_pose_that_is_degenerate():
+    """Geometry holds the wall's distance and tilt; the coarse pose must not be thrown away for what slides."""
+    truth = motion((0.0, 0.0, 0.25, 0.12, 0.0, 0.0))
+    source, target, _ = pair(wall, truth=truth)
+    result = mcg.register(source, target, mcg.GICP(), max_distance=0.06, scales=(0.2,))
+    assert result.status is Status.DEGENERATE
+    # Across the wall the pose is found, though the fine gate alone would see nothing.
+    normal = np.asarray(result.matrix) @ np.linalg.inv(truth)
+    assert abs(normal[2, 3]) < 0.01 and np.degrees(np.arccos(normal[2, 2])) < 1
+    assert mcg.register(source, target, mcg.GICP(), max_distance=0.06).num_inliers < result.num_inliers
+
+
+def test_scales_refuse_covariances_that_are_given(room):
+    source, target, _ = room
+    given = target.replace(covariances=np.broadcast_to(np.eye(3), (*target.points.shape, 3)))
+    with pytest.raises(ValueError, match="scales: expected none for clouds with covariances"):
+        mcg.register(source, given, mcg.GICP(), scales=(0.2,))
+
+
+def test_jit_gives_the_pose_of_the_host_before_it_has_converged(room):
+    source, target, _ = room
+    options = {"max_distance": 0.5, "max_iterations": 1}
+    host = mcg.register(source, target, mcg.GICP(), **options)
+    inside = jax.jit(lambda source: mcg.register(source, target, mcg.GICP(), **options))(source)
+    assert host.status is inside.status is Status.MAX_ITERATIONS
+    np.testing.assert_allclose(inside.matrix, host.matrix, atol=1e-9 if X64 else 1e-5)
+
+
+@pytest.mark.parametrize("unit", [1e-2, 1e3])
+def test_the_unit_of_length_does_not_matter(unit, room):
+    """A small part is registered as closely, relative to its size, as a room."""
+    source, target, _ = room
+    expected = mcg.register(source, target, mcg.GICP())
+    scaled = [mcg.preprocess(np.asarray(cloud.points, np.float64) * unit) for cloud in (source, target)]
+    result = mcg.register(*scaled, mcg.GICP())
+    assert result.num_iterations == expected.num_iterations and result.status is expected.status
+    np.testing.assert_allclose(result.matrix[:3, 3] / unit, expected.matrix[:3, 3], atol=1e-10 if X64 else 1e-5)
+    np.testing.assert_allclose(result.matrix[:3, :3], expected.matrix[:3, :3], atol=1e-10 if X64 else 1e-5)

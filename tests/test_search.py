@@ -9,6 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
+import mcgicp_jax as mcg
 from mcgicp_jax import (
     ColorICP,
     KDTreeSearch,
@@ -19,6 +20,7 @@ from mcgicp_jax import (
     preprocess,
 )
 from mcgicp_jax._search import Rows
+from mcgicp_jax._trees import TreeIndex
 from tests import reference as ref
 
 SIZES = {"source": 150, "target": 140}
@@ -367,3 +369,24 @@ def test_a_pose_that_is_not_a_number_matches_nothing():
     assert (nearest(np.full(7, np.nan)) == -1).all()
     assert (nearest(np.array([1.0, 0, 0, 0, np.inf, 0, 0])) == -1).all()
     assert (nearest(np.array([1.0, 0, 0, 0, 0, 0, 0])) >= 0).any()
+
+
+def test_lanes_that_have_ended_are_not_searched(monkeypatch):
+    """In a batched loop the body runs for them, too."""
+    (source, target), _ = clouds()
+    poses = jnp.stack([jnp.eye(4), jnp.asarray(ref.pose([0.08, -0.05, 0.1], [0.02, 0.05, -0.03]))]).astype(
+        source.points.dtype
+    )
+    asked, nearest = [], TreeIndex.nearest
+    monkeypatch.setattr(TreeIndex, "nearest", lambda *arguments: asked.append(1) or nearest(*arguments))
+
+    def register(init):
+        return mcg.register(
+            source, target, PointToPoint(), init=init, max_distance=0.3, max_iterations=30
+        ).num_iterations
+
+    single = [int(jax.jit(register)(pose)) for pose in poses]
+    alone = len(asked)
+    assert abs(single[0] - single[1]) > 1
+    assert list(jax.block_until_ready(jax.jit(jax.vmap(register))(poses))) == single
+    assert len(asked) == 2 * alone

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
 
 import mcgicp_jax as mcg
 from mcgicp_jax import _algebra as cov
@@ -266,6 +267,10 @@ def test_the_covariance_follows_the_unit_of_length():
 def test_what_nothing_holds_is_not_known(flat):
     source, target, _ = flat
     result = mcg.register(source, target, mcg.GICP(), max_distance=0.3)
+    points = np.asarray(source.points)[: len(source)]
+    radius = np.sqrt(np.mean(np.sum((points - points.mean(axis=0)) ** 2, axis=1)))
+    # Ten radii along the wall, and ten radians about its normal.
+    np.testing.assert_allclose(result.deviations[[0, 1, 5]], [10 * radius, 10 * radius, 10], rtol=0.01)
     for direction in result.free_directions:
         deviation = np.sqrt(direction.twist @ np.linalg.pinv(np.asarray(result.information)) @ direction.twist)
         assert np.isfinite(deviation)
@@ -297,6 +302,9 @@ def test_large_coordinates_keep_the_covariance_of_the_points():
     brought = to_near @ far.covariance @ to_near.T
     np.testing.assert_allclose(np.diagonal(brought), np.diagonal(near.covariance), rtol=0.5)
     assert far.free_directions == near.free_directions == ()
+    # Of the points themselves, wherever zero is.
+    np.testing.assert_allclose(far.deviations, near.deviations, rtol=0.3)
+    assert far.deviations.max() < 5e-3 < np.sqrt(far.covariance[0, 0])
 
 
 def test_traced_and_batched_results_carry_the_same():
@@ -335,3 +343,18 @@ def test_the_corner_of_a_room_is_what_it_says():
     cloud = mcg.preprocess(mcg.PointCloud(*room_corner(2000)))
     geometry, channels = mean_evidence(cloud, mcg.MultiChannelGICP().resolve(cloud, cloud))
     assert np.linalg.eigvalsh(geometry).min() > 0.2 and np.linalg.eigvalsh(channels).min() > 0.05
+
+
+def test_deviations_are_those_of_the_matched_points():
+    """By sampling: poses drawn from the covariance move the centroid, and turn, as much as the deviations say."""
+    source, target, _ = pair(truth=motion((0.1, -0.2, 0.05, 0.3, 0.2, 1.2)))
+    result = mcg.register(source, target, mcg.GICP(), init=motion((0.1, -0.2, 0.05, 0.3, 0.2, 1.2)), max_distance=0.5)
+    matches = mcg.find_correspondences(source, target, result.matrix, mcg.GICP(), max_distance=0.5)
+    centroid = np.append(np.asarray(source.points, np.float64)[np.asarray(matches.valid)].mean(axis=0), 1)
+    draws = np.random.default_rng(0).multivariate_normal(np.zeros(6), np.asarray(result.covariance, float), 4000)
+    moved = [result.matrix @ motion(draw) for draw in draws]
+    shifts = [pose @ centroid - result.matrix @ centroid for pose in moved]
+    turns = [Rotation.from_matrix(pose[:3, :3] @ result.matrix[:3, :3].T).as_rotvec() for pose in moved]
+    np.testing.assert_allclose(result.deviations, [*np.std(shifts, axis=0)[:3], *np.std(turns, axis=0)], rtol=0.06)
+    inside = jax.jit(lambda source: mcg.register(source, target, mcg.GICP(), init=result.matrix, max_distance=0.5))
+    np.testing.assert_allclose(inside(source).deviations, result.deviations, rtol=0.05)

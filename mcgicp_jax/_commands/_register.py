@@ -131,8 +131,8 @@ def register(
     plural = "" if result.num_iterations == 1 else "s"
     print(f"status:    {words(result)} after {result.num_iterations} iteration{plural}")
     print(f"inliers:   {result.num_inliers:,} of {len(pair.source):,} ({result.overlap:.0%}), rmse {result.rmse:.4g} m")
-    if result.converged and np.all(np.isfinite(result.covariance)):
-        x, y, z, *angles = np.sqrt(np.diagonal(result.covariance))
+    if result.converged and np.all(np.isfinite(result.deviations)):
+        x, y, z, *angles = result.deviations
         roll, pitch, yaw = np.degrees(angles)
         print(f"deviation: x {x:.2g}, y {y:.2g}, z {z:.2g} m; about x {roll:.2g}, y {pitch:.2g}, z {yaw:.2g} degrees")
     if result.free_directions:

@@ -157,8 +157,9 @@ def our_worker(
 
     method = getattr(mcg, method_name)()
     moving, fixed = (mcg.preprocess(mcg.PointCloud(*cloud)) for cloud in (source, target))
-    size, rows = len(moving), moving.points.shape[0]
-    assert len(fixed) < fixed.points.shape[0], "the target has no padding to stamp"
+    # A row of padding in the target, to be stamped.
+    fixed = fixed.pad(len(fixed) + 1)
+    stamped = jax.numpy.asarray(fixed.points)
 
     def loss(points: Any, target_points: Any) -> Any:
         result = mcg.register(moving.replace(points=points), fixed.replace(points=target_points), method, **settings)
@@ -177,9 +178,8 @@ def our_worker(
         nonlocal stamp
         # Trees are kept by the content of the target: a number in its padding makes every call build its own.
         stamp += 1
-        target_points = jax.block_until_ready(fixed.points.at[-1, 0].set(stamp))
-        start = moving.points if points is None else np.pad(points, [(0, rows - size), (0, 0)])
-        start = jax.block_until_ready(jax.numpy.asarray(start))
+        target_points = jax.block_until_ready(stamped.at[-1, 0].set(stamp))
+        start = jax.block_until_ready(jax.numpy.asarray(moving.points if points is None else points))
 
         def run() -> Any:
             return jax.block_until_ready(compiled[kind](start, target_points))
