@@ -289,13 +289,22 @@ def pose_problem(
     return Problem(start, seen, there, method, options.robust, _settings(options, target, stride, dtype))
 
 
+def default_distances(target: PointCloud) -> tuple[Any, Any]:
+    """The coarse and the fine `max_distance` for a preprocessed target, metres."""
+    return _distances(point_spacing(target))
+
+
+def _distances(spacing: Any) -> tuple[Any, Any]:
+    return spacing * _COARSE_SPACINGS, spacing * _FINE_SPACINGS
+
+
 def _settings(options: Options, target: PointCloud, stride: Any, dtype: Any) -> Settings:
     max_distance: Any = options.max_distance
     tolerance: Any = options.translation_tolerance
     if max_distance is None or tolerance is None:
         # Of a cloud that is differentiated, too: an option is a constant.
         spacing = constant(point_spacing(target))
-        max_distance = (spacing * _COARSE_SPACINGS, spacing * _FINE_SPACINGS) if max_distance is None else max_distance
+        max_distance = _distances(spacing) if max_distance is None else max_distance
         tolerance = spacing * _TOLERANCE_IN_SPACINGS if tolerance is None else tolerance
 
     def number(value: Any, kind: Any) -> Any:

@@ -2,6 +2,7 @@
 
 import csv
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -203,3 +204,23 @@ def test_control_c_is_noticed_where_python_loses_it(folder, tmp_path, capsys, mo
     assert len(table(output)) == 2 and "interrupted" in capsys.readouterr().err
     monkeypatch.undo()
     assert run_folder(folder, output) == 0 and len(table(output)) == NUM_FILES - 1
+
+
+def test_rows_of_other_options_or_files_are_not_taken_for_done(folder, tmp_path, capsys):
+    scans, output = tmp_path / "scans", tmp_path / "results.csv"
+    shutil.copytree(folder, scans)
+
+    def run(*options):
+        assert run_folder(scans, output, *options) == 0
+        return "registered again" in capsys.readouterr().out, table(output)
+
+    _, first = run()
+    assert run() == (False, first)
+    again, second = run("--robust", "huber", "1.0")
+    assert (
+        again and len(second) == len(first) and all(a["cost"] != b["cost"] for a, b in zip(first, second, strict=True))
+    )
+    # A file that has changed: the two pairs that it is part of.
+    os.utime(scans / "scan_1.ply", (1, 1))
+    again, third = run("--robust", "huber", "1.0")
+    assert again and sum(row in second for row in third) == len(first) - 2

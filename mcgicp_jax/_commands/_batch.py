@@ -5,6 +5,7 @@ from __future__ import annotations
 import collections
 import contextlib
 import csv
+import hashlib
 import itertools
 import signal
 import sys
@@ -16,8 +17,9 @@ from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from types import FrameType
-from typing import Annotated, Any, Literal, TypeAlias
+from typing import Annotated, Any, TypeAlias
 
+import jax
 import numpy as np
 import tyro
 from jaxtyping import Float
@@ -31,13 +33,12 @@ from mcgicp_jax._commands._options import (
     Options,
     check_outputs,
     listed,
-    scales,
     status_of,
+    voxel_size_for,
     weights_from,
     with_channels,
 )
 from mcgicp_jax._commands._table import COLUMNS, POSE, Row, Table, pose_of
-from mcgicp_jax._methods import AbstractMethod
 
 Pairs: TypeAlias = Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="PAIRS")]
 Names: TypeAlias = Annotated[tuple[str, ...], tyro.conf.arg(metavar="NAMES", help_behavior_hint="(default: all)")]
@@ -68,48 +69,50 @@ def batch(
     method: MethodName = "mc-gicp",
     glob: str = "*",
     channels: Names = (),
-    voxel_size: float | Literal["auto", "off"] = "auto",
-    max_distance: float | Literal["auto"] = "auto",
-    num_neighbors: int = 20,
-    max_iterations: int = 64,
+    *,
+    shared: Options,
 ) -> int:
     """Register many pairs of clouds, and write a table of their poses T_target_source.
 
     PAIRS is a CSV file with the columns source and target, files relative to its folder, and, if wanted, m00 m01 ...
     m23 for the pose to start from; or a folder, each file of which is registered to the one before it in the order of
-    names. A row is written as soon as its pair is done, and pairs that are in the table already are left out: after
-    Ctrl-C, or with more pairs, run the same command again. The exit code is 0 only if all pairs converged.
+    names. A row is written as soon as its pair is done, and pairs that are in the table already are left out, if their
+    files and all options are the same: after Ctrl-C, or with more pairs, run the same command again. The exit code is 0
+    only if all pairs converged.
 
     Args:
         pairs: CSV file or folder.
         output: Table to write or to complete, .csv or .npz: source, target, status, iterations, inliers, cost, rmse,
-            the upper three rows of the pose, and the reason why a pair could not be registered.
+            the upper three rows of the pose, the reason why a pair could not be registered, and a fingerprint of files
+            and options.
         method: mc-gicp and color-icp use channels (intensity, colours, ...), the others geometry alone.
         glob: Which files of a folder, such as "*.ply".
         channels: Channels to use, such as intensity, or red green blue. By default those that both clouds of the first
             pair have; every cloud must have them.
-        voxel_size: Metres, off, or auto, as for mcgicp register, chosen by the first pair.
-        max_distance: Metres, or auto, as for mcgicp register, chosen by the first pair.
-        num_neighbors: Neighbours that the covariance of a point is computed from.
-        max_iterations: Of finding matches and updating the pose.
     """
-    options = Options(voxel_size, max_distance, num_neighbors, max_iterations)
-    options.check()
+    shared.check()
+    shared.check_method(method)
     check_outputs(output)
     everything = _pairs_of_folder(pairs, glob) if pairs.is_dir() else _pairs_of_table(pairs)
     table = Table(output)
     rows = {(row["source"], row["target"]): row for row in table.read()}
+    settings = _settings(everything, method, channels, shared)
+    known = [pair for pair in everything if pair.key in rows]
+    outdated = [pair.key for pair in known if rows[pair.key]["fingerprint"] != _fingerprint(pair, settings)]
+    if outdated:
+        print(f"outdated:  {len(outdated):,} in {output}, by other options or files; they are registered again")
+        rows = {key: row for key, row in rows.items() if key not in set(outdated)}
+        table.rewrite(list(rows.values()))
     missing = [pair for pair in everything if pair.key not in rows]
     finished = len(everything) - len(missing)
     print(f"pairs:     {len(everything):,}" + (f", of which {finished:,} are in {output}" if finished else ""))
     interrupted = False
     if missing:
-        settings = _settings(missing, METHODS[method], channels, options)
         begin = time.perf_counter()
         with (
             table.appending() as append,
             tqdm(total=len(everything), initial=finished, unit="pair", disable=None) as bar,
-            contextlib.closing(_rows(missing, settings | {"max_iterations": max_iterations}, bar)) as completed,
+            contextlib.closing(_rows(missing, settings, bar)) as completed,
             _interrupts() as pressed,
         ):
             try:
@@ -198,10 +201,9 @@ def _checked(path: Path, pairs: list[Pair]) -> list[Pair]:
     return pairs
 
 
-def _settings(
-    pairs: Sequence[Pair], kind: type[AbstractMethod], channels: Sequence[str], options: Options
-) -> dict[str, Any]:
+def _settings(pairs: Sequence[Pair], name: MethodName, channels: Sequence[str], options: Options) -> dict[str, Any]:
     """What all pairs have in common, chosen by the first one that can be read."""
+    kind = METHODS[name]
     for pair in pairs:
         try:
             clouds = [io.read(path) for path in pair.paths()]
@@ -215,23 +217,29 @@ def _settings(
     names = tuple(channels) or tuple(name for name in first if name in second)
     if kind.uses_channels and not names:
         raise ValueError("expected clouds with channels in common, got none; use gicp instead (--method gicp)")
-    voxel_size, max_distance = scales(clouds, options)
-    voxels = "all kept" if voxel_size is None else f"voxels of {voxel_size:g} m"
-    print(f"points:    {voxels}; pairs up to {max_distance:g} m apart")
+    voxel_size = voxel_size_for(clouds, options)
+    print(f"points:    {'all kept' if voxel_size is None else f'voxels of {voxel_size:g} m'}")
     print(f"channels:  {listed(names)}")
-    numbers = {}
-    if kind is mcg.ColorICP:
+    numbers = options.numbers_of(name)
+    if kind is mcg.ColorICP and not numbers:
         source, target = (
             mcg.preprocess(with_channels(cloud, names), voxel_size, options.num_neighbors) for cloud in clouds
         )
         numbers["channel_weights"] = weights_from(source, target)
-    return {
+    return options.registration() | {
         "method": kind(**numbers),
         "channels": names,
-        "max_distance": max_distance,
         "voxel_size": voxel_size,
         "num_neighbors": options.num_neighbors,
     }
+
+
+def _fingerprint(pair: Pair, settings: dict[str, Any]) -> str:
+    """Of all that the result of a pair depends on: options, start, and the sizes and times of its files."""
+    files = [(path.stat().st_size, path.stat().st_mtime_ns) if path.exists() else None for path in pair.paths()]
+    numbers = [np.asarray(leaf).tolist() for leaf in jax.tree.leaves((settings["method"], settings.get("robust")))]
+    start = None if pair.init is None else pair.init.tolist()
+    return hashlib.sha256(repr((sorted(settings.items(), key=str), numbers, files, start)).encode()).hexdigest()[:16]
 
 
 def _rows(pairs: Sequence[Pair], settings: dict[str, Any], bar: tqdm) -> Generator[tuple[Pair, Row], None, None]:
@@ -255,7 +263,8 @@ def _rows(pairs: Sequence[Pair], settings: dict[str, Any], bar: tqdm) -> Generat
         warnings.simplefilter("always", mcg.PairWarning)
         warnings.showwarning = keep
         for index, result in completed:
-            yield pairs[index], _row(pairs[index], result, reasons.pop(index, ""))
+            pair = pairs[index]
+            yield pair, _row(pair, result, reasons.pop(index, ""), _fingerprint(pair, settings))
 
 
 def _read(path: Path, channels: Sequence[str]) -> mcg.PointCloud:
@@ -265,10 +274,10 @@ def _read(path: Path, channels: Sequence[str]) -> mcg.PointCloud:
         raise error if str(path) in str(error) else ValueError(f"{path}: {error}") from error
 
 
-def _row(pair: Pair, result: mcg.Registration, reason: str) -> Row:
+def _row(pair: Pair, result: mcg.Registration, reason: str, fingerprint: str) -> Row:
     numbers = (result.num_iterations, result.num_inliers, result.cost, result.rmse, *result.matrix[:3].ravel())
     values = (np.asarray(number).item() for number in numbers)
-    texts = (*pair.key, _word(status_of(result)), *map(repr, values), " ".join(reason.split()))
+    texts = (*pair.key, _word(status_of(result)), *map(repr, values), " ".join(reason.split()), fingerprint)
     return dict(zip(COLUMNS, texts, strict=True))
 
 

@@ -56,10 +56,10 @@ _KITTI_LENGTHS = np.arange(100.0, 900, 100)
 def odometry(
     dataset: Dataset,
     path: Folder = Path(),
+    *,
+    shared: Options,
     method: MethodName = "mc-gicp",
     channels: Names = (),
-    voxel_size: float | Literal["auto", "off"] = "auto",
-    max_distance: float | Literal["auto"] = "auto",
     num_frames: int | Literal["all"] = "all",
     output: File = None,
     map: File = None,
@@ -71,16 +71,16 @@ def odometry(
     poster-wall, which are made up and need none. Where the truth is known, the errors are printed. The exit code is 0
     only if all registrations converged; output files are written in any case.
 
+    The defaults of --voxel-size are those of the sensor: 0.25 for kitti and ford, 0.2 for street, 0.03 for tum and
+    7-scenes, off for the others. Those of --max-distance allow for the motion between two frames: 2.5 and 0.6 for kitti
+    and ford, 2 and 0.5 for street, 0.5 and 0.25 for corridor and box-room, 0.2 and 0.06 for tum and 7-scenes, 0.1 and
+    0.04 for poster-wall.
+
     Args:
         dataset: Form of the data set, or a scene.
         path: Folder of the sequence, such as sequences/04.
         method: mc-gicp and color-icp use channels, the others geometry alone.
         channels: Channels to use, such as intensity, or red green blue.
-        voxel_size: Metres; the points of one voxel are averaged. auto: 0.25 for kitti and ford, 0.2 for street, 0.03
-            for tum and 7-scenes, off for the others.
-        max_distance: Metres; points further apart make no pair. auto: 2.5 for kitti and ford, 2 for street, 0.5 for
-            corridor and box-room, 0.2 for tum and 7-scenes, 0.1 for poster-wall; and a quarter to a half of it to
-            refine a pose that has come to rest.
         num_frames: How many, from the start; all of a scene are 20.
         output: File for the poses, sensor to world: the upper three rows of each matrix in one row (KITTI).
         map: File for the map in the world, such as map.ply, thinned to voxels: those of the registration, or else such
@@ -88,18 +88,22 @@ def odometry(
         plot: Picture to draw of the way from above, such as way.png.
     """
     check_outputs(output, cloud=map, picture=plot)
-    Options(voxel_size, max_distance).check()
+    shared.check()
+    shared.check_method(method)
     frames, usual_voxel, usual_distance = _open(dataset, path, num_frames)
-    voxel = usual_voxel if voxel_size == "auto" else None if voxel_size == "off" else voxel_size
-    distance = usual_distance if max_distance == "auto" else max_distance
+    given = shared.voxel_size
+    voxel = given if not isinstance(given, str) else usual_voxel if given == "auto" else None
+    options = {"max_distance": usual_distance} | shared.registration()
     first = frames[0]
     names = channels or first.cloud.channel_names
     print(f"frames:    {len(frames)} of {dataset}, {len(first.cloud):,} points in the first")
     print(f"channels:  {listed(names)}")
     truth: list[Float[np.ndarray, "4 4"] | None] = []
     clouds = _clouds(frames, names, truth)
-    chosen = _method(method, frames, names, voxel)
-    steps = mcg.odometry(clouds, chosen, voxel_size=voxel, max_distance=distance, start=first.pose)
+    chosen = _method(method, shared.numbers_of(method), frames, names, voxel)
+    steps = mcg.odometry(
+        clouds, chosen, voxel_size=voxel, num_neighbors=shared.num_neighbors, start=first.pose, **options
+    )
     poses, ends = [], []
 
     def followed() -> Iterator[tuple[mcg.PointCloud, Float[np.ndarray, "4 4"]]]:
@@ -154,15 +158,18 @@ def _clouds(
 
 
 def _method(
-    name: MethodName, frames: datasets.AbstractFrames, channels: tuple[str, ...], voxel_size: float | None
+    name: MethodName,
+    numbers: dict[str, Any],
+    frames: datasets.AbstractFrames,
+    channels: tuple[str, ...],
+    voxel_size: float | None,
 ) -> AbstractMethod:
     kind = METHODS[name]
-    if kind is not mcg.ColorICP:
-        return kind()
+    if kind is not mcg.ColorICP or numbers:
+        return kind(**numbers)
     # Its weights from the first pair, as mc-gicp would choose them.
     first, second = (mcg.preprocess(with_channels(frame.cloud, channels), voxel_size) for frame in frames[:2])
-    numbers: dict[str, Any] = {"channel_weights": weights_from(second, first)}
-    return mcg.ColorICP(**numbers)
+    return kind(channel_weights=weights_from(second, first))
 
 
 def _report(

@@ -16,13 +16,20 @@ import tyro
 import mcgicp_jax as mcg
 from mcgicp_jax import plot
 from mcgicp_jax._formats import READERS, WRITERS, by_suffix
+from mcgicp_jax._kernels import AbstractKernel
 from mcgicp_jax._methods import AbstractMethod
 from mcgicp_jax._options import Options as Chosen
 from mcgicp_jax._preprocess import check_preprocessing
+from mcgicp_jax._register import default_distances
 
 MethodName: TypeAlias = Literal["mc-gicp", "gicp", "color-icp", "point-to-plane", "point-to-point"]
 File: TypeAlias = Annotated[Path | None, tyro.conf.arg(metavar="FILE", help_behavior_hint="")]
 Numbers: TypeAlias = Annotated[tuple[float, ...], tyro.conf.arg(help_behavior_hint="(default: from the data)")]
+Gates: TypeAlias = Annotated[tuple[float, ...], tyro.conf.arg(help_behavior_hint="(default: 10 and 2.5 spacings)")]
+Tolerance: TypeAlias = Annotated[
+    float | None, tyro.conf.arg(metavar="FLOAT", help_behavior_hint="(default: 0.005 spacings)")
+]
+KernelName: TypeAlias = Literal["huber", "cauchy", "geman-mcclure", "tukey"]
 Epsilon: TypeAlias = Annotated[float | None, tyro.conf.arg(metavar="FLOAT", help_behavior_hint="(default: 0.001)")]
 
 VERSION = mcg.__version__
@@ -33,8 +40,14 @@ METHODS: dict[MethodName, type[AbstractMethod]] = {
     "point-to-plane": mcg.PointToPlane,
     "point-to-point": mcg.PointToPoint,
 }
+# Points that a cloud is thinned to by default: registered in a tenth of a second.
 _MOST_POINTS = 20_000
-_VOXELS_PER_DISTANCE = 6
+_KERNELS: dict[KernelName, type[AbstractKernel]] = {
+    "huber": mcg.Huber,
+    "cauchy": mcg.Cauchy,
+    "geman-mcclure": mcg.GemanMcClure,
+    "tukey": mcg.Tukey,
+}
 ADVICE = {
     mcg.Status.MAX_ITERATIONS: "the pose was still moving when the iterations ran out; "
     "try a larger --max-iterations, or --init with a pose nearer to the answer",
@@ -48,42 +61,55 @@ ADVICE = {
 
 @dataclass(frozen=True)
 class Options:
-    """How the clouds are prepared, matched and drawn.
+    """How clouds are prepared and registered.
 
     Attributes:
         voxel_size: Metres; the points of one voxel are averaged. auto: the smallest of 1, 1.5, 2, 3, 5, 7, 10, ...
             times a power of ten that leaves neither cloud more than 20,000 points; all points are kept if neither has
             more. off: all points are kept.
-        max_distance: Metres; points further apart make no pair. auto: 6 voxel sizes; if all points are kept, 6 of such
-            voxels as would leave at most half of the larger cloud.
         num_neighbors: Neighbours that the covariance of a point is computed from.
-        max_iterations: Of finding matches and updating the pose.
-        init: The pose to start from, T_target_source: a 4x4 matrix, or 12 numbers (KITTI) or 8 (TUM) in one row. The
-            identity if not given.
+        max_distance: Metres; points further apart do not match. Two numbers: one to find the pose with, and a smaller
+            one to refine it with.
+        max_iterations: Largest number of updates of the pose.
+        translation_tolerance: Metres; an update below this and the rotation tolerance is the last.
+        rotation_tolerance: Radians.
+        robust: Robust kernel and its scale, such as huber 1.0, in units of the Mahalanobis distance.
+        hold_free_directions: Leave the pose where it starts in directions that neither shape nor channels constrain.
+        match_channels: Scale and shift the channels of the source to be distributed like those of the target.
+        scales: Voxel sizes in metres, coarse to fine, to register in first, for a start that is far off.
         channel_covariance: For mc-gicp: one variance for all channels, or one for each; channel units squared.
         channel_weights: For mc-gicp and color-icp: one weight for all channels, or one for each; metres per channel
             unit.
         epsilon: For mc-gicp and gicp: variance across the surface relative to that within it.
-        plot: Picture to draw of the clouds before and after, such as out.png.
     """
 
     voxel_size: float | Literal["auto", "off"] = "auto"
-    max_distance: float | Literal["auto"] = "auto"
     num_neighbors: int = 20
-    max_iterations: int = 64
-    init: File = None
+    max_distance: Gates = ()
+    max_iterations: int = Chosen.max_iterations
+    translation_tolerance: Tolerance = None
+    rotation_tolerance: float = 5e-4
+    robust: Annotated[tuple[KernelName, float] | None, tyro.conf.arg(metavar="KERNEL SCALE", help_behavior_hint="")] = (
+        None
+    )
+    hold_free_directions: bool = True
+    match_channels: bool = False
+    scales: Annotated[tuple[float, ...], tyro.conf.arg(help_behavior_hint="(default: none)")] = ()
     channel_covariance: Numbers = ()
     channel_weights: Numbers = ()
     epsilon: Epsilon = None
-    plot: File = None
 
     def check(self) -> None:
         """Raise `ValueError` or `OSError` for what no clouds would fit, before any is read."""
         check_preprocessing(None if isinstance(self.voxel_size, str) else self.voxel_size, self.num_neighbors)
-        distance = None if self.max_distance == "auto" else self.max_distance
         mcg.MultiChannelGICP(**self.numbers())
-        Chosen(max_distance=distance, max_iterations=self.max_iterations)
-        check_outputs(picture=self.plot)
+        Chosen(**self.registration())
+
+    def check_method(self, name: MethodName) -> None:
+        """Raise `ValueError` for a number that the method does not have."""
+        unknown = self.numbers().keys() - METHODS[name].__dataclass_fields__.keys()
+        if unknown:
+            raise ValueError(f"{name} has no {' and no '.join(sorted(unknown))}")
 
     def numbers(self) -> dict[str, Any]:
         """The methods' numbers that were given."""
@@ -92,6 +118,41 @@ class Options:
             if values := getattr(self, name):
                 given[name] = values[0] if len(values) == 1 else values
         return given
+
+    def numbers_of(self, name: MethodName) -> dict[str, Any]:
+        """Those of them that a method has."""
+        return {field: value for field, value in self.numbers().items() if field in METHODS[name].__dataclass_fields__}
+
+    def registration(self) -> dict[str, Any]:
+        """The options of `mcgicp_jax.register`."""
+        if len(self.max_distance) > 2:
+            raise ValueError(f"max_distance: expected one or two numbers, got {self.max_distance}")
+        names = ("max_iterations", "translation_tolerance", "rotation_tolerance", "hold_free_directions")
+        options = {name: getattr(self, name) for name in (*names, "match_channels", "scales")}
+        if self.max_distance:
+            options["max_distance"] = self.max_distance if len(self.max_distance) == 2 else self.max_distance[0]
+        if self.robust is not None:
+            name, scale = self.robust
+            options["robust"] = _KERNELS[name](scale)
+        return options
+
+
+@dataclass(frozen=True)
+class PairOptions(Options):
+    """The same for two clouds.
+
+    Attributes:
+        init: The pose to start from, T_target_source: a 4x4 matrix, or 12 numbers (KITTI) or 8 (TUM) in one row. The
+            identity if not given.
+        plot: Picture to draw of the clouds before and after, such as out.png.
+    """
+
+    init: File = None
+    plot: File = None
+
+    def check(self) -> None:
+        super().check()
+        check_outputs(picture=self.plot)
 
 
 def check_outputs(*files: Path | None, cloud: Path | None = None, picture: Path | None = None) -> None:
@@ -114,17 +175,19 @@ def check_inputs(*clouds: Path) -> None:
         path.stat()
 
 
-def scales(clouds: Sequence[mcg.PointCloud], options: Options) -> tuple[float | None, float]:
-    """The voxel size, if any, and the largest distance of a pair, by the rules in the help; metres."""
-    size, distance = options.voxel_size, options.max_distance
-    largest = max(map(len, clouds))
+def voxel_size_for(clouds: Sequence[mcg.PointCloud], options: Options) -> float | None:
+    """The voxel size, if any, by the rule in the help; metres."""
+    if not isinstance(options.voxel_size, str):
+        return options.voxel_size
     # Covariances cannot be averaged.
-    few = largest <= _MOST_POINTS or any(cloud.covariances is not None for cloud in clouds)
-    if size == "off" or (size == "auto" and few):
-        return None, _VOXELS_PER_DISTANCE * round_voxel_size(clouds, largest // 2) if distance == "auto" else distance
-    if size == "auto":
-        size = round_voxel_size(clouds, _MOST_POINTS)
-    return size, _VOXELS_PER_DISTANCE * size if distance == "auto" else distance
+    few = max(map(len, clouds)) <= _MOST_POINTS or any(cloud.covariances is not None for cloud in clouds)
+    return None if options.voxel_size == "off" or few else round_voxel_size(clouds, _MOST_POINTS)
+
+
+def described_distance(options: Options, target: mcg.PointCloud) -> str:
+    """How far apart two matched points may be, in words."""
+    distances = options.max_distance or tuple(default_distances(target))
+    return " m, then ".join(f"{float(distance):.3g}" for distance in distances) + " m"
 
 
 def round_voxel_size(clouds: Sequence[mcg.PointCloud], most: int) -> float:

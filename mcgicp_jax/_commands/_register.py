@@ -19,13 +19,14 @@ from mcgicp_jax._commands._options import (
     METHODS,
     File,
     MethodName,
-    Options,
+    PairOptions,
     check_inputs,
     check_outputs,
     described,
+    described_distance,
     listed,
-    scales,
     status_of,
+    voxel_size_for,
     weights_from,
     with_channels,
     words,
@@ -40,7 +41,7 @@ Target: TypeAlias = Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar=
 class Pair:
     """Two clouds with their common channels, ready to register."""
 
-    def __init__(self, source: Path, target: Path, options: Options):
+    def __init__(self, source: Path, target: Path, options: PairOptions):
         options.check()
         check_inputs(source, target)
         self.options = options
@@ -49,7 +50,7 @@ class Pair:
         names = [cloud.channel_names for cloud in self.whole]
         self.channels = [name for name in names[0] if name in names[1]]
         self.difference = f"{source} has {listed(names[0])}, {target} has {listed(names[1])}"
-        voxel_size, self.max_distance = scales(self.whole, options)
+        voxel_size = voxel_size_for(self.whole, options)
         self.source, self.target = (
             _preprocess(path, cloud, self.channels, voxel_size, options.num_neighbors)
             for path, cloud in zip((source, target), self.whole, strict=True)
@@ -59,7 +60,7 @@ class Pair:
         ]
         voxels = "all kept" if voxel_size is None else f"voxels of {voxel_size:g} m"
         print(f"points:    source {counts[0]}, target {counts[1]} ({voxels})")
-        print(f"pairs:     up to {self.max_distance:g} m apart")
+        print(f"matches:   up to {described_distance(options, self.target)} apart")
         # Where none are in common, that is an error or of no concern.
         difference = f" ({self.difference})" if self.channels and names[0] != names[1] else ""
         print(f"channels:  {listed(self.channels)}{difference}")
@@ -71,8 +72,7 @@ class Pair:
             raise ValueError(
                 f"{name} needs channels in common, but {self.difference}; use gicp instead (--method gicp)"
             )
-        fields = kind.__dataclass_fields__
-        numbers = {field: value for field, value in self.options.numbers().items() if field in fields}
+        numbers = self.options.numbers_of(name)
         if kind is mcg.ColorICP and not numbers:
             numbers = {"channel_weights": weights_from(self.source, self.target)}
         return kind(**numbers).resolve(self.source, self.target)
@@ -84,14 +84,7 @@ class Pair:
         return f"{1e3 * float(translation):9.2f}  {np.degrees(rotation):11.3f}"
 
     def register(self, method: AbstractMethod) -> mcg.Registration:
-        return mcg.register(
-            self.source,
-            self.target,
-            method,
-            init=self.start,
-            max_distance=self.max_distance,
-            max_iterations=self.options.max_iterations,
-        )
+        return mcg.register(self.source, self.target, method, init=self.start, **self.options.registration())
 
     def draw(self, results: dict[MethodName, mcg.Registration]) -> None:
         if self.options.plot is not None:
@@ -103,7 +96,7 @@ class Pair:
 def register(
     source: Source,
     target: Target,
-    shared: Options,
+    shared: PairOptions,
     method: MethodName = "mc-gicp",
     output: File = None,
     aligned: File = None,
@@ -120,9 +113,7 @@ def register(
         output: File for the pose: the upper three rows of its matrix, in one row (KITTI).
         aligned: File for the moved source cloud, all its points, such as out.ply.
     """
-    unknown = shared.numbers().keys() - METHODS[method].__dataclass_fields__.keys()
-    if unknown:
-        raise ValueError(f"{method} has no {' and no '.join(sorted(unknown))}")
+    shared.check_method(method)
     check_outputs(output, cloud=aligned)
     pair = Pair(source, target, shared)
     chosen = pair.method(method)
@@ -150,7 +141,7 @@ def register(
     return _verdict({method: result})
 
 
-def compare(source: Source, target: Target, shared: Options, truth: File = None) -> int:
+def compare(source: Source, target: Target, shared: PairOptions, truth: File = None) -> int:
     """Register SOURCE to TARGET with every method, and print a table.
 
     Methods that use channels are left out where there are none. The exit code is 0 only if all others converged.
@@ -177,7 +168,7 @@ def demo(output: Path = Path("mcgicp_demo")) -> int:
     io.write(source_file, source.cloud)
     io.write(target_file, target.cloud)
     io.write_poses(truth_file, [np.linalg.inv(frames.path(0)) @ frames.path(1)])
-    options = Options(voxel_size="off", max_distance=0.08, plot=output / "before_after.png")
+    options = PairOptions(voxel_size="off", plot=output / "before_after.png")
     _compare(source_file, target_file, options, truth_file)
     print(
         "Geometry leaves a flat wall free to slide: gicp, point-to-plane and point-to-point say so (degenerate) and"
@@ -188,7 +179,9 @@ def demo(output: Path = Path("mcgicp_demo")) -> int:
     return 0
 
 
-def _compare(source: Path, target: Path, options: Options, truth: Path | None) -> dict[MethodName, mcg.Registration]:
+def _compare(
+    source: Path, target: Path, options: PairOptions, truth: Path | None
+) -> dict[MethodName, mcg.Registration]:
     true_pose = None if truth is None else _read_pose(truth)
     pair = Pair(source, target, options)
     results: dict[MethodName, mcg.Registration] = {}

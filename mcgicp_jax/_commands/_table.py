@@ -16,8 +16,8 @@ Row: TypeAlias = dict[str, str]
 
 # The upper three rows of a pose.
 POSE = tuple(f"m{row}{column}" for row in range(3) for column in range(4))
-COLUMNS = ("source", "target", "status", "iterations", "inliers", "cost", "rmse", *POSE, "reason")
-_TEXTS = ("source", "target", "status", "reason")
+COLUMNS = ("source", "target", "status", "iterations", "inliers", "cost", "rmse", *POSE, "reason", "fingerprint")
+_TEXTS = ("source", "target", "status", "reason", "fingerprint")
 
 
 class Table:
@@ -50,6 +50,17 @@ class Table:
                 file.flush()
 
             yield append
+
+    def rewrite(self, rows: Sequence[Row]) -> None:
+        """Keep these rows alone."""
+        temporary = self._rows.with_name(f".{self._rows.name}.{os.getpid()}")
+        with open(temporary, "w", newline="", encoding="utf-8") as file:
+            writer = csv.DictWriter(file, COLUMNS, lineterminator="\n")
+            writer.writeheader()
+            writer.writerows(rows)
+        os.replace(temporary, self._rows)
+        if self._rows != self._path:
+            self._path.unlink(missing_ok=True)
 
     def finish(self, rows: Sequence[Row]) -> None:
         """Write the arrays of an .npz, in the order of the rows."""
