@@ -118,7 +118,7 @@ def register_as_completed(
     check_preprocessing(voxel_size, num_neighbors)
     _check_executor(executor)
     job = _Job(method, Options(**options), voxel_size, num_neighbors)
-    return _gather(job, _pairs(job, sources, targets, init), executor)
+    return _run(job, _pairs(job, sources, targets, init), executor)
 
 
 class PairWarning(UserWarning):
@@ -259,7 +259,7 @@ def _ahead(executor: Executor, function: Callable[[_Pair], Any], pairs: Iterable
         yield futures.popleft().result()
 
 
-def _gather(
+def _run(
     job: _Job, pairs: Iterator[_Pair], executor: Executor | None
 ) -> Generator[tuple[int, Registration], None, None]:
     num_workers = num_cores()

@@ -173,18 +173,18 @@ def _covariance(
         return _scores(moving, state.sums, *matches.block(index), gate, matches.details(index), *weighing)
 
     parts = map_blocks(scores, matches.size, num_threads)
-    answer, pull = (
+    jacobian, bias = (
         np.sum([np.asarray(getattr(part, name), np.float64) for _, part in parts], axis=0)
-        for name in ("answer", "pull")
+        for name in ("jacobian", "bias")
     )
     rows, cells = (
         np.concatenate([getattr(part, name)[: rows.stop - rows.start] for rows, part in parts])
         for name in ("rows", "cells")
     )
-    scatter, num_cells = scatter_of(Scores(rows, cells, answer, pull), matches.size)
+    scatter, num_cells = scatter_of(Scores(rows, cells, jacobian, bias), matches.size)
     dtype = source.table.dtype
     with np.errstate(invalid="ignore", over="ignore"):
-        numbers = (answer.astype(dtype), pull.astype(dtype), scatter.astype(dtype))
+        numbers = (jacobian.astype(dtype), bias.astype(dtype), scatter.astype(dtype))
     return covariance_of_pose(state, *numbers, np.int32(num_cells))
 
 

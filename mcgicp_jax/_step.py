@@ -173,8 +173,8 @@ def constraints_of(state: State) -> tuple[Float[Array, "6 6"], Directions | None
 @jax.jit
 def covariance_of_pose(
     state: State,
-    answer: Float[Array, "6 10"],
-    pull: Float[Array, "6"],
+    jacobian: Float[Array, "6 10"],
+    bias: Float[Array, "6"],
     scatter: Float[Array, "6 6"],
     num_cells: Int[Array, ""],
 ) -> Float[Array, "6 6"]:
@@ -184,7 +184,7 @@ def covariance_of_pose(
         found = found & (state.status != Status.DEGENERATE)
     center, radius = state.sums.center, state.sums.radius
     with jax.default_matmul_precision("highest"):
-        covariance = sandwich(state.pose, center, radius, answer, pull, scatter, num_cells, state.directions)
+        covariance = sandwich(state.pose, center, radius, jacobian, bias, scatter, num_cells, state.directions)
     return jnp.where(found, covariance, jnp.nan)
 
 

@@ -142,7 +142,7 @@ def assess(state: State, problem: Problem, matched: Matched, matches: Correspond
         problem.method,
         problem.robust,
     )
-    covariance = covariance_of_pose(state, scores.answer, scores.pull, *scatter_of(scores, num_cells))
+    covariance = covariance_of_pose(state, scores.jacobian, scores.bias, *scatter_of(scores, num_cells))
     return Assessment(Deferred.of(constraints_of(state)), Deferred.of(covariance))
 
 

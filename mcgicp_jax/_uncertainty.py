@@ -2,8 +2,8 @@
 
 The sandwich A⁻¹ (Σ_c u_c u_cᵀ) A⁻¹ of a root of g = Σ w JᵀMd (Huber 1967). The scores of neighbouring correspondences
 are not independent, since they share targets and covariances: u_c is their sum over a cell about as large as a
-neighbourhood. A is how g answers to a motion. Of M as a whole, only the fraction K that observability leaves takes
-part, since matches follow: A = Σ JᵀMKJ. What the rest, M(I − K)d, sums up to is a pull of the nearest neighbours upon
+neighbourhood. A is the Jacobian of g with respect to the pose. Of M as a whole, only the fraction K that observability leaves takes
+part, since matches follow: A = Σ JᵀMKJ. What the rest, M(I − K)d, sums up to is a bias of the nearest neighbours upon
 the whole cloud; it counts as one more score. (The derivative of M with respect to the rotation was tried in A; it made
 no difference of 1 %.)
 
@@ -108,14 +108,14 @@ class Scores(NamedTuple):
     Attributes:
         rows: (n, 7) force and torque of each, lengths in units of the radius, and whether it counts.
         cells: (n,) number of the cell that each falls into; None: every correspondence is a cell of its own.
-        answer: (6, 10) Σ (M K) ⊗ h hᵀ about the centre.
-        pull: (6,) Σ of the forces and torques that observability leaves out.
+        jacobian: (6, 10) Σ (M K) ⊗ h hᵀ about the centre.
+        bias: (6,) Σ of the forces and torques that observability leaves out.
     """
 
     rows: Float[AnyArray, "n 7"]
     cells: Int[AnyArray, "n"] | None
-    answer: Float[AnyArray, "6 10"]
-    pull: Float[AnyArray, "6"]
+    jacobian: Float[AnyArray, "6 10"]
+    bias: Float[AnyArray, "6"]
 
 
 def scores_of(
@@ -143,7 +143,7 @@ def scores_of(
     stiffness = (
         forces.stiffness if robust is None else _tangent_stiffness(pose[0], moved, matched, counts, method, robust)
     )
-    pull, cells = jnp.zeros(6, moved.dtype), None
+    bias, cells = jnp.zeros(6, moved.dtype), None
     if details is not None:
         geometry, *channels = mean_observability(pose[0], matched)
         shown = discount[0] * geometry
@@ -152,12 +152,12 @@ def scores_of(
             trace = each[0] + each[3] + each[5]
             shown = shown + discount[1] * each / (1 - (1 - discount[1]) * jnp.clip(trace, 0, 1))
         left_out = forces.force - alg.multiply(forces.stiffness, alg.multiply(shown, forces.residual))
-        pull = jnp.sum(_wrench(arms, left_out), axis=1)
+        bias = jnp.sum(_wrench(arms, left_out), axis=1)
         stiffness = alg.symmetric_product(stiffness, shown)
         size = _CELL * 0.5 * (reach_of(details.source) + reach_of(details.target))
         cells = _cells(moved, matched.valid, size, num_cells)
     rows = jnp.concatenate([_wrench(arms, forces.force), matched.valid[None].astype(moved.dtype)]).T
-    return Scores(rows, cells, jnp.dot(stiffness, powers(arms * radius).T, precision="highest"), pull)
+    return Scores(rows, cells, jnp.dot(stiffness, powers(arms * radius).T, precision="highest"), bias)
 
 
 def _wrench(arms: Float[Array, "3 N"], force: Float[Array, "3 N"]) -> Float[Array, "6 N"]:
@@ -215,8 +215,8 @@ def sandwich(
     pose: jaxlie.SE3,
     center: Float[Array, "3"],
     radius: Float[Array, ""],
-    answer: Float[Array, "6 10"],
-    pull: Float[Array, "6"],
+    jacobian: Float[Array, "6 10"],
+    bias: Float[Array, "6"],
     scatter: Float[Array, "6 6"],
     num_cells: Int[Array, ""],
     directions: Directions | None,
@@ -224,8 +224,8 @@ def sandwich(
     """Covariance of ξ in T exp(ξ), metres and radians."""
     # Six of the cells' freedoms went into the pose.
     count = num_cells.astype(scatter.dtype)
-    scatter = scatter * count / jnp.where(count > 6, count - 6, jnp.nan) + jnp.outer(pull, pull)
-    response = twist_form(answer, radius) * radius
+    scatter = scatter * count / jnp.where(count > 6, count - 6, jnp.nan) + jnp.outer(bias, bias)
+    response = twist_form(jacobian, radius) * radius
     basis, held = jnp.eye(6, dtype=scatter.dtype), jnp.ones(6, bool)
     if directions is not None:
         basis, held = jnp.asarray(directions.twists).T, jnp.asarray(directions.held)

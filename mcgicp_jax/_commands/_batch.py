@@ -47,7 +47,7 @@ _INTERRUPTED = 130
 
 
 @dataclass(frozen=True)
-class Pair:
+class FilePair:
     """Two files, relative to `folder`, and where to start."""
 
     folder: Path
@@ -162,7 +162,7 @@ def _interrupts() -> Iterator[list[int]]:
         signal.signal(signal.SIGINT, before)
 
 
-def _pairs_of_table(path: Path) -> list[Pair]:
+def _pairs_of_table(path: Path) -> list[FilePair]:
     with open(path, newline="", encoding="utf-8") as file:
         try:
             lines = file.readlines()
@@ -183,16 +183,16 @@ def _pairs_of_table(path: Path) -> list[Pair]:
                 raise ValueError(
                     f"{path}: line {reader.line_num}: expected numbers in m00 ... m23, got {row}"
                 ) from error
-            pairs.append(Pair(path.parent, row["source"], row["target"], start))
+            pairs.append(FilePair(path.parent, row["source"], row["target"], start))
     return _checked(path, pairs)
 
 
-def _pairs_of_folder(folder: Path, glob: str) -> list[Pair]:
+def _pairs_of_folder(folder: Path, glob: str) -> list[FilePair]:
     names = sorted(path.name for path in folder.glob(glob) if path.is_file())
-    return _checked(folder, [Pair(folder, source, target) for target, source in itertools.pairwise(names)])
+    return _checked(folder, [FilePair(folder, source, target) for target, source in itertools.pairwise(names)])
 
 
-def _checked(path: Path, pairs: list[Pair]) -> list[Pair]:
+def _checked(path: Path, pairs: list[FilePair]) -> list[FilePair]:
     if not pairs:
         raise ValueError(f"{path}: expected pairs of clouds, got none")
     repeated = [key for key, count in collections.Counter(pair.key for pair in pairs).items() if count > 1]
@@ -201,7 +201,7 @@ def _checked(path: Path, pairs: list[Pair]) -> list[Pair]:
     return pairs
 
 
-def _settings(pairs: Sequence[Pair], name: MethodName, channels: Sequence[str], options: Options) -> dict[str, Any]:
+def _settings(pairs: Sequence[FilePair], name: MethodName, channels: Sequence[str], options: Options) -> dict[str, Any]:
     """What all pairs have in common, chosen by the first one that can be read."""
     kind = METHODS[name]
     for pair in pairs:
@@ -234,7 +234,7 @@ def _settings(pairs: Sequence[Pair], name: MethodName, channels: Sequence[str], 
     }
 
 
-def _fingerprint(pair: Pair, settings: dict[str, Any]) -> str:
+def _fingerprint(pair: FilePair, settings: dict[str, Any]) -> str:
     """Of all that the result of a pair depends on: options, start, and the sizes and times of its files."""
     files = [(path.stat().st_size, path.stat().st_mtime_ns) if path.exists() else None for path in pair.paths()]
     numbers = [np.asarray(leaf).tolist() for leaf in jax.tree.leaves((settings["method"], settings.get("robust")))]
@@ -242,7 +242,7 @@ def _fingerprint(pair: Pair, settings: dict[str, Any]) -> str:
     return hashlib.sha256(repr((sorted(settings.items(), key=str), numbers, files, start)).encode()).hexdigest()[:16]
 
 
-def _rows(pairs: Sequence[Pair], settings: dict[str, Any], bar: tqdm) -> Generator[tuple[Pair, Row], None, None]:
+def _rows(pairs: Sequence[FilePair], settings: dict[str, Any], bar: tqdm) -> Generator[tuple[FilePair, Row], None, None]:
     """The row of each pair, as it finishes; the reasons of those that fail go there and to stderr."""
     reasons: dict[int, str] = {}
     show = warnings.showwarning
@@ -274,7 +274,7 @@ def _read(path: Path, channels: Sequence[str]) -> mcg.PointCloud:
         raise error if str(path) in str(error) else ValueError(f"{path}: {error}") from error
 
 
-def _row(pair: Pair, result: mcg.Registration, reason: str, fingerprint: str) -> Row:
+def _row(pair: FilePair, result: mcg.Registration, reason: str, fingerprint: str) -> Row:
     numbers = (result.num_iterations, result.num_inliers, result.cost, result.rmse, *result.matrix[:3].ravel())
     values = (np.asarray(number).item() for number in numbers)
     texts = (*pair.key, _word(status_of(result)), *map(repr, values), " ".join(reason.split()), fingerprint)

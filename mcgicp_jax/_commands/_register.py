@@ -38,7 +38,7 @@ Source: TypeAlias = Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar=
 Target: TypeAlias = Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="TARGET")]
 
 
-class Pair:
+class PreparedPair:
     """Two clouds with their common channels, ready to register."""
 
     def __init__(self, source: Path, target: Path, options: PairOptions):
@@ -115,7 +115,7 @@ def register(
     """
     shared.check_method(method)
     check_outputs(output, cloud=aligned)
-    pair = Pair(source, target, shared)
+    pair = PreparedPair(source, target, shared)
     chosen = pair.method(method)
     print(f"method:    {method}{described(chosen)}")
     result = pair.register(chosen)
@@ -183,7 +183,7 @@ def _compare(
     source: Path, target: Path, options: PairOptions, truth: Path | None
 ) -> dict[MethodName, mcg.Registration]:
     true_pose = None if truth is None else _read_pose(truth)
-    pair = Pair(source, target, options)
+    pair = PreparedPair(source, target, options)
     results: dict[MethodName, mcg.Registration] = {}
     measures = "inliers      rmse, m" if true_pose is None else "error, mm   error, deg"
     print(f"\n{'method':15}  {measures:>22}  iterations  time, ms  status")
