@@ -21,7 +21,7 @@ from mcgicp_jax._commands._register import compare, demo, register
 
 
 def _keep_compiled_programs() -> None:
-    """So that a second run starts fast. A folder that the user gave JAX is taken; without one to write to, none."""
+    """Cache compiled programs on disk, in JAX's cache folder if one is set; do without if none can be written."""
     if "JAX_COMPILATION_CACHE_DIR" not in os.environ:
         try:
             folder = platformdirs.user_cache_path("mcgicp_jax", ensure_exists=True)
@@ -43,13 +43,13 @@ def _explanation(error: Exception) -> str:
 
 
 def main(args: Sequence[str] | None = None) -> int:
-    """Returns the exit code: 0, 1 if a registration did not converge, 2 if the input was wrong."""
+    """Run a command and return the exit code: 0, 1 if a registration did not converge, 2 for invalid input."""
     args = sys.argv[1:] if args is None else args
     if list(args) == ["--version"]:
         print(f"mcgicp {VERSION}")
         return 0
     _keep_compiled_programs()
-    # Imported modules stay: looking through them for garbage again and again took a tenth of a short command.
+    # Exclude imported modules from garbage collection, which took a tenth of the time of a short command.
     gc.freeze()
     commands: dict[str, Callable[..., int]] = {
         "demo": demo,

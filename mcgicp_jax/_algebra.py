@@ -1,8 +1,8 @@
-"""Closed-form algebra of symmetric 3×3 and 2×2 matrices, one for each point, with gradients that are never NaN.
+"""Closed-form algebra of symmetric 3×3 and 2×2 matrices, one per point, with gradients that are never NaN.
 
 Arrays are laid out as structures of arrays: vectors (3, N), symmetric 3×3 matrices (6, N) in the order xx, xy, xz, yy,
-yz, zz, and symmetric 2×2 matrices (3, N) as xx, xy, yy. The compiler then vectorises along N. There is no LAPACK call
-per point: besides being slow, two batched ones at once can dead-lock XLA's thread pool on CPUs (jax 0.10.2).
+yz, zz, and symmetric 2×2 matrices (3, N) as xx, xy, yy. The compiler then vectorises along N. LAPACK is not called: it
+is slow for small matrices, and two concurrent batched calls can deadlock XLA's thread pool on CPUs (jax 0.10.2).
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ def matrix_from_symmetric(symmetric: Float[Array, "6 N"]) -> Float[Array, "N 3 3
 
 
 def multiply(symmetric: Float[Array, "6 N"], vector: Float[Array, "3 N"]) -> Float[Array, "3 N"]:
-    """Matrix times vector, row by row."""
+    """A v for each point."""
     xx, xy, xz, yy, yz, zz = symmetric
     x, y, z = vector
     return jnp.stack([xx * x + xy * y + xz * z, xy * x + yy * y + yz * z, xz * x + yz * y + zz * z])
@@ -41,16 +41,16 @@ def rotate(rotation: Float[Array, "3 3"], symmetric: Float[Array, "6 N"]) -> Flo
 
 
 def inner(a: Float[Array, "3 N"], b: Float[Array, "3 N"]) -> Float[Array, "N"]:
-    """aᵀ b, row by row. Written out for the pairs of a whole cloud, since sums over a first axis are slow there.
+    """aᵀ b for each point, for the correspondences of a whole cloud, where `jnp.sum` over a first axis is slow on CPUs.
 
-    Not for neighbourhoods: there sums keep XLA from computing what they are made of again for each use, and are faster.
+    Programs over neighbourhoods use `jnp.sum`: it keeps XLA from recomputing its operands for each use, and is faster.
     """
     x, y, z = a * b
     return x + y + z
 
 
 def inverse(symmetric: Float[Array, "6 N"]) -> Float[Array, "6 N"]:
-    """The inverse by cofactors; the matrices must be regular."""
+    """The inverse by cofactors; the matrices must be nonsingular."""
     xx, xy, xz, yy, yz, zz = symmetric
     cxx, cxy, cxz = yy * zz - yz * yz, xz * yz - xy * zz, xy * yz - xz * yy
     determinant = xx * cxx + xy * cxy + xz * cxz
@@ -89,16 +89,16 @@ def smallest_eigenvector(symmetric: Float[Array, "6 N"]) -> Float[Array, "3 N"]:
     """The unit eigenvector of the smallest eigenvalue: the normal of a neighbourhood with this covariance.
 
     Closed form, after Eberly, A Robust Eigensolver for 3×3 Symmetric Matrices (Geometric Tools, 2014): first the
-    eigenvector of the eigenvalue that stands apart from the other two, then the rest in the plane across it. Its
-    derivative is written in terms of the gaps between the eigenvalues and is zero where there is none (an isotropic
-    neighbourhood has no normal that could move).
+    eigenvector of the best separated eigenvalue, then the others in the plane orthogonal to it. The derivative depends
+    on the gaps between the smallest eigenvalue and the others, and is zero where one of them vanishes (neighbours along
+    a line or isotropic, whose normal is undetermined).
     """
     return _smallest_eigenvector(symmetric)
 
 
 @jax.custom_jvp
 def _smallest_eigenvector(symmetric: Float[Array, "6 N"]) -> Float[Array, "3 N"]:
-    # On scalars, coordinate by coordinate: XLA makes few loops of them, and many of stacked arrays.
+    # Written out by coordinate: XLA fuses this into few loops, and stacked arrays into many.
     xx, xy, xz, yy, yz, zz = _scale_to_one(symmetric)
     mean = (xx + yy + zz) / 3
     ax, ay, az = xx - mean, yy - mean, zz - mean
@@ -108,16 +108,16 @@ def _smallest_eigenvector(symmetric: Float[Array, "6 N"]) -> Float[Array, "3 N"]
     # The matrix B = (A − mean)/spread has the eigenvalues 2 cos(φ + 2πk/3).
     xx, xy, xz, yy, yz, zz = ax * scale, xy * scale, xz * scale, ay * scale, yz * scale, az * scale
     half_determinant = 0.5 * (xx * (yy * zz - yz * yz) + xy * (xz * yz - xy * zz) + xz * (xy * yz - xz * yy))
-    # The largest stands apart where the determinant is positive, the smallest where it is negative: of −B, the largest.
+    # The best separated eigenvalue: the largest if the determinant is positive, else the smallest (the largest of −B).
     positive = half_determinant >= 0
     apart = 2 * jnp.cos(jnp.arccos(jnp.minimum(jnp.abs(half_determinant), 1)) / 3)
     apart = jnp.where(positive, apart, -apart)
     first = _null_vector(xx - apart, xy, xz, yy - apart, yz, zz - apart)
-    # Where the smallest eigenvalue stands apart that is the answer. Elsewhere it is in the plane across.
+    # If that eigenvalue is the smallest, `first` is the normal; otherwise the normal is orthogonal to `first`.
     u, v = _basis(*first)
     bu, bv = (_times((xx, xy, xz, yy, yz, zz), axis) for axis in (u, v))
     a, b, c = _dot(u, bu), _dot(u, bv), _dot(v, bv)
-    # The eigenvector of [[a, b], [b, c]] for its smaller eigenvalue, of two forms the one without cancellation.
+    # Eigenvector of [[a, b], [b, c]] for its smaller eigenvalue, in the one of two forms that is free of cancellation.
     half = 0.5 * (a - c)
     radius = jnp.sqrt(half * half + b * b)
     along, across = jnp.where(half >= 0, -b, half - radius), jnp.where(half >= 0, radius + half, b)
@@ -129,7 +129,7 @@ def _smallest_eigenvector(symmetric: Float[Array, "6 N"]) -> Float[Array, "3 N"]
     return jnp.stack([jnp.where(isotropic, default, axis) for axis, default in zip(chosen, (0, 0, 1), strict=True)])
 
 
-# Vectors and matrices whose entries are arrays of one number for each point.
+# Vectors and matrices given by their entries, each an array of one number per point.
 Entries: TypeAlias = tuple[Array, ...]
 
 
@@ -148,7 +148,7 @@ def _cross(a: Entries, b: Entries) -> Entries:
 
 
 def _scale_to_one(symmetric: Float[Array, "6 N"]) -> Entries:
-    """Divided by the trace: 1e-6 m or 1e6 m apart, products of entries stay within float32."""
+    """The matrix divided by its trace: products of entries stay in the range of float32 from 1e-6 m to 1e6 m."""
     xx, xy, xz, yy, yz, zz = symmetric
     trace = xx + yy + zz
     scale = 1 / jnp.where(trace > 0, trace, 1)
@@ -174,7 +174,7 @@ def _null_vector(xx: Array, xy: Array, xz: Array, yy: Array, yz: Array, zz: Arra
 def _smallest_eigenvector_jvp(
     primals: tuple[Float[Array, "6 N"]], tangents: tuple[Float[Array, "6 N"]]
 ) -> tuple[Float[Array, "3 N"], Float[Array, "3 N"]]:
-    """dn = −B (Bᵀ A B − λ)⁻¹ Bᵀ dA n, with B a basis of the plane across n and λ = nᵀ A n."""
+    """dn = −B (Bᵀ A B − λ)⁻¹ Bᵀ dA n, with B a basis of the plane orthogonal to n and λ = nᵀ A n."""
     (symmetric,), (tangent,) = primals, tangents
     normal = _smallest_eigenvector(symmetric)
     trace = symmetric[0] + symmetric[3] + symmetric[5]
@@ -184,8 +184,8 @@ def _smallest_eigenvector_jvp(
     a, b, c = project(scaled, u, v)
     eigenvalue = jnp.sum(normal * multiply(scaled, normal), axis=0)
     a, c = a - eigenvalue, c - eigenvalue
-    # The product of the two gaps and their sum tell the smaller one: where it is lost in rounding there is no
-    # derivative, and the answer is zero rather than NaN.
+    # The product of the two gaps over their sum is about the smaller gap. Where it is below rounding (64 eps of the
+    # trace), the derivative is undefined and set to zero.
     determinant = a * c - b * b
     gap = determinant > 64 * jnp.finfo(symmetric.dtype).eps * (a + c)
     determinant = jnp.where(gap, determinant, 1)
@@ -223,7 +223,7 @@ def sandwich(outside: Float[Array, "3 N"], inside: Float[Array, "3 N"]) -> Float
 
 
 def floor_eigenvalues(symmetric: Float[Array, "3 N"], floor: Float[Array, ""]) -> Float[Array, "3 N"]:
-    """Raise the eigenvalues of 2×2 matrices to at least `floor`; matrices above it stay as they are, bit by bit."""
+    """Raise the eigenvalues of 2×2 matrices to at least `floor`; matrices above it are returned bit for bit."""
     a, b, c = symmetric
     mean, half = 0.5 * (a + c), 0.5 * (a - c)
     square = half * half + b * b

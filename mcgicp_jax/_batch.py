@@ -1,4 +1,4 @@
-"""Many pairs: each is registered on its own, by threads or by any executor, and none spoils another."""
+"""Registration of many pairs of clouds, independently of each other, by threads, lanes or any executor."""
 
 from __future__ import annotations
 
@@ -40,9 +40,9 @@ from mcgicp_jax._sizes import size_class
 from mcgicp_jax._step import Problem
 from mcgicp_jax._threads import num_cores, with_settings
 
-Cloud: TypeAlias = "PointCloud | Values | Callable[[], PointCloud | Values]"
+Cloud: TypeAlias = PointCloud | Values | Callable[[], PointCloud | Values]
 
-# Pairs sent at a time to workers that are not threads, and how many such chunks are under way at most.
+# Number of pairs per chunk sent to a worker that is not a thread, and maximum number of submitted chunks.
 _CHUNK = 8
 _CHUNKS_UNDER_WAY = 64
 
@@ -58,9 +58,9 @@ def register_batch(
     executor: Executor | None = None,
     **options: Any,
 ) -> list[Registration]:
-    """Register many pairs of clouds of any sizes: one `Registration` per pair, in their order.
+    """Register many pairs of clouds of any sizes and return one `Registration` per pair, in the order of the pairs.
 
-    As `register_as_completed`, which explains the arguments, but waits for all.
+    Waits for all pairs; arguments, errors and warnings are those of `register_as_completed`.
     """
     completed = register_as_completed(
         sources,
@@ -86,33 +86,33 @@ def register_as_completed(
     executor: Executor | None = None,
     **options: Any,
 ) -> Generator[tuple[int, Registration], None, None]:
-    """Register many pairs of clouds, and hand out each result as soon as it is there.
+    """Register many pairs of clouds of any sizes and yield each result as soon as it is computed.
 
-    Every pair is a registration of its own: its result is the same, bit for bit, whatever the other pairs, their order
-    and the number of workers, and a slow pair holds nobody. What `register` raises as an error of a pair becomes the
-    status `INVALID_INPUT` and a warning. Clouds are taken from iterators only as they are needed.
+    Pairs are independent: a result is bitwise the same whatever the other pairs, their order and the number of workers,
+    and a slow pair does not delay others. Invalid pairs (too few finite points, mismatched channels, unreadable file)
+    get the status `INVALID_INPUT` and a warning. Iterators are consumed lazily.
 
     Args:
-        sources, targets: iterables of equal length of clouds from `preprocess`, raw clouds or (N, 3) arrays; or one
-            cloud for all pairs on one side. In place of a cloud, a function without arguments that makes it, such as
-            `functools.partial(mcgicp_jax.io.read, path)`: it is called by the worker.
-        method: as in `register`; numbers left open are chosen for each pair from its data.
-        init: T_target_source to start from: one for all, or an iterable of one per pair.
-        voxel_size, num_neighbors: as in `preprocess`, for raw clouds; the workers prepare them.
-        executor: who does the work: any `concurrent.futures.Executor`, such as a `ProcessPoolExecutor` with the start
-            method "spawn" or Dask's `Client.get_executor()`; by default threads, one per core. A pair whose worker
-            dies is sent once more, and gets the status `LOST` and a warning if that fails too.
-        options: any option of `register`. `search` is also how neighbours are found; by default SciPy's k-d tree, one
-            thread per pair. With `DenseSearch`, the default on an accelerator, many pairs are the lanes of one compiled
-            program, which are spread over all local devices (unless `match_channels` or `scales` are given).
+        sources, targets: iterables of equal length, of clouds from `preprocess`, raw clouds or (N, 3) arrays, metres;
+            one side may be a single cloud for all pairs. An item may also be a function without arguments that returns
+            a cloud, such as `functools.partial(mcgicp_jax.io.read, path)`, which the worker calls.
+        method: as in `register`; parameters left None are estimated for each pair.
+        init: T_target_source to start from: one for all pairs, or an iterable with one per pair; None is the identity.
+        voxel_size, num_neighbors: as in `preprocess`, for raw clouds, which the workers preprocess.
+        executor: any `concurrent.futures.Executor`, such as a `ProcessPoolExecutor` with the start method "spawn" or
+            Dask's `Client.get_executor()`; by default one thread per core. A pair whose worker dies is sent once more,
+            and gets the status `LOST` and a warning if that fails too.
+        options: any option of `register`. `search` is also used to preprocess; by default SciPy's k-d tree with one
+            thread per pair. With `DenseSearch`, the default on accelerators, pairs run as lanes of one vectorised
+            program, spread over all local devices (not with `match_channels` or `scales`).
 
     Returns:
-        A generator of the number of the pair, from 0, and its `Registration`.
+        A generator of the index of the pair, from 0, and its `Registration`.
 
     Raises:
-        ValueError: if an argument that concerns all pairs does not fit, or one side has fewer clouds than the other.
+        ValueError: if an argument common to all pairs is malformed, or the iterables differ in length.
     Warns:
-        PairWarning: for each pair with the status `INVALID_INPUT` or `LOST`, why; a `UserWarning`.
+        PairWarning: the reason for each pair with the status `INVALID_INPUT` or `LOST`; a `UserWarning`.
     """
     check_method(method)
     check_preprocessing(voxel_size, num_neighbors)
@@ -122,14 +122,14 @@ def register_as_completed(
 
 
 class PairWarning(UserWarning):
-    """Why a pair of a batch has no pose.
+    """A pair of a batch could not be registered.
 
     Attributes:
-        index: number of the pair, from 0.
-        reason: what is wrong with it.
+        index: of the pair, from 0.
+        reason: why the pair has no pose.
     """
 
-    # Set afterwards: whoever catches, copies or repeats warnings may make them of a message alone.
+    # Not arguments of the constructor: code that copies or repeats warnings may construct them from a message alone.
     index: int | None = None
     reason: str = ""
 
@@ -144,7 +144,7 @@ class _Pair:
 
 @dataclass(frozen=True)
 class _Job:
-    """What all pairs have in common."""
+    """Settings common to all pairs."""
 
     method: AbstractMethod
     options: Options
@@ -152,17 +152,17 @@ class _Job:
     num_neighbors: int
 
     def chosen_search(self) -> AbstractSearch:
-        """That of the machine where the pair is registered, if none was asked for."""
+        """The requested search, or the default of the machine that registers the pair."""
         return self.options.search or default_search(workers=1)
 
     @property
     def uses_lanes(self) -> bool:
-        """Whether pairs are the lanes of one program."""
+        """Whether pairs run as lanes of one vectorised program."""
         several = self.options.match_channels or len(self.options.scales) > 0
         return isinstance(self.chosen_search(), DenseSearch) and not several
 
     def ready(self, name: str, cloud: Cloud) -> PointCloud:
-        """The cloud, prepared if it was not; a `ValueError` names it."""
+        """The cloud, read and preprocessed if necessary; errors become a `ValueError` that starts with `name`."""
         try:
             if not isinstance(cloud, PointCloud) and callable(cloud):
                 cloud = cloud()
@@ -184,7 +184,7 @@ class _Job:
         return _Outcome(pair.index, computed(result))
 
     def problem(self, pair: _Pair) -> _Outcome | tuple[_Problem, Problem]:
-        """The pair as a lane takes it: both surfaces of one size class, so that few programs serve all."""
+        """The pair as input of a lane, both surfaces padded to one size class so that few programs are compiled."""
         try:
             source, target = self.ready("source", pair.source), self.ready("target", pair.target)
             problem = pose_problem(source, target, self.method, pair.init, self.options, num_threads=1)
@@ -194,7 +194,7 @@ class _Job:
         return _Problem(pair.index, source, target), problem
 
     def register_all(self, pairs: Iterable[_Pair], num_threads: int) -> Iterator[_Outcome]:
-        """All that there are on this machine, in lanes; threads prepare them."""
+        """Register pairs in lanes on this machine; threads preprocess them."""
         with ThreadPoolExecutor(num_threads, thread_name_prefix="mcgicp") as threads:
             rejected: list[_Outcome] = []
 
@@ -213,7 +213,7 @@ class _Job:
 
 
 def _padded(problem: Problem, size: int) -> Problem:
-    """Both surfaces with rows that match nothing, `size` in all."""
+    """Pad both surfaces to `size` rows; padding matches nothing."""
 
     def grow(array: np.ndarray) -> np.ndarray:
         return np.pad(array, [(0, size - len(array))] + [(0, 0)] * (array.ndim - 1))
@@ -224,7 +224,7 @@ def _padded(problem: Problem, size: int) -> Problem:
 
 @dataclass(frozen=True)
 class _Problem:
-    """What is needed once the problem is solved."""
+    """A pair in a lane: its index and its preprocessed clouds."""
 
     index: int
     source: PointCloud
@@ -249,7 +249,7 @@ def _register_chunk(job: _Job, chunk: list[_Pair]) -> list[_Outcome]:
 
 
 def _ahead(executor: Executor, function: Callable[[_Pair], Any], pairs: Iterable[_Pair], most: int) -> Iterator[Any]:
-    """The function of each pair, in order, up to `most` of them computed ahead."""
+    """Yield `function(pair)` in order, with at most `most` calls computed ahead."""
     futures: collections.deque[Future[Any]] = collections.deque()
     for pair in pairs:
         futures.append(executor.submit(function, pair))
@@ -277,7 +277,7 @@ def _run(
 def _dispatch(
     shipping: _Shipping, pairs: Iterator[_Pair], chunk_size: int, most: int
 ) -> Iterator[tuple[int, Registration]]:
-    """Send chunks, `most` of them under way at a time, and hand out what comes back."""
+    """Submit chunks, at most `most` at a time, and yield their results."""
     try:
         while chunk := list(itertools.islice(pairs, chunk_size)):
             shipping.send(chunk)
@@ -291,11 +291,10 @@ def _dispatch(
 
 
 class _Shipping:
-    """Chunks on their way through an executor.
+    """Chunks submitted to an executor, and pairs to retry.
 
-    A chunk that fails, mostly because its worker died, is a suspect: it may have killed the worker, or been beside
-    the one that did. Suspects are sent again at the end, pair by pair and each alone, so that only the pair that is to
-    blame is given up.
+    A chunk may fail because one of its pairs killed the worker, or because another chunk broke the pool. The pairs of
+    failed chunks are suspects, submitted again at the end one by one, so that only those that fail alone become `LOST`.
     """
 
     def __init__(self, job: _Job, executor: Executor):
@@ -318,7 +317,7 @@ class _Shipping:
         self.under_way[future] = chunk
 
     def receive(self) -> Iterator[tuple[int, Registration]]:
-        """Wait until something has come back."""
+        """Wait for at least one chunk and yield its results; the pairs of failed chunks become suspects."""
         done, _ = wait_for(self.under_way, return_when=FIRST_COMPLETED)
         for future in done:
             chunk = self.under_way.pop(future)
@@ -326,13 +325,14 @@ class _Shipping:
                 outcomes = future.result()
             except Exception as error:
                 numbers = ", ".join(str(pair.index) for pair in chunk)
-                message = f"the worker of the pairs {numbers} failed ({_words(error)}); they are sent again"
+                message = f"the worker of the pairs {numbers} failed ({_words(error)}); they are submitted again"
                 warnings.warn(message, UserWarning, stacklevel=2)
                 self._suspects.extend(chunk)
             else:
                 yield from map(_report, outcomes)
 
     def receive_suspects(self) -> Iterator[tuple[int, Registration]]:
+        """Submit suspects one by one and yield their results."""
         while self._suspects:
             pair = self._suspects.popleft()
             self.send([pair])
@@ -345,7 +345,7 @@ class _Shipping:
             yield from map(_report, outcomes)
 
     def stop(self) -> None:
-        """Take back what has not begun."""
+        """Cancel chunks that have not started."""
         for future in self.under_way:
             future.cancel()
         if self._replacement is not None:
@@ -353,7 +353,7 @@ class _Shipping:
 
 
 def _like(executor: Executor) -> Executor:
-    """Another pool of processes in place of a broken one: a pool dies with any of its processes."""
+    """A new process pool like a broken one: the death of any worker breaks its pool."""
     return ProcessPoolExecutor(
         getattr(executor, "_max_workers", None),
         getattr(executor, "_mp_context", None) or get_context("spawn"),
@@ -363,9 +363,9 @@ def _like(executor: Executor) -> Executor:
 
 
 def _as_numpy(sent: Any) -> Any:
-    """A dataclass to be pickled, JAX arrays in its fields made NumPy's.
+    """Convert the JAX arrays in the fields of a dataclass to NumPy, for pickling.
 
-    JAX arrays of float64 become float32 where they are unpickled before x64 is switched on.
+    float64 JAX arrays would become float32 if unpickled before x64 is switched on.
     """
 
     def convert(value: Any) -> Any:
@@ -399,11 +399,11 @@ def _pairs(
     targets: Iterable[Cloud] | Cloud,
     init: Iterable[Pose | None] | Pose | None,
 ) -> Iterator[_Pair]:
-    """The pairs, made as they are asked for; what concerns all of them is checked at once."""
+    """Iterate lazily over the pairs; arguments common to all are checked immediately."""
     sides: dict[str, Any] = {"sources": sources, "targets": targets, "init": init}
     one_for_all = {"sources": _is_one_cloud(sources), "targets": _is_one_cloud(targets), "init": _is_one_pose(init)}
     if one_for_all["sources"] and one_for_all["targets"]:
-        raise ValueError("sources: expected several clouds on one side at least, got one on each; call register")
+        raise ValueError("sources: expected several clouds on at least one side, got one on each; call register")
     for name in sides:
         if one_for_all[name]:
             one = pose_matrix(sides[name]) if name == "init" else job.ready(name, sides[name])
@@ -448,6 +448,6 @@ def _check_executor(executor: Executor | None) -> None:
     context = getattr(executor, "_mp_context", None)
     if isinstance(executor, ProcessPoolExecutor) and context is not None and context.get_start_method() == "fork":
         raise ValueError(
-            "executor: expected processes that are spawned, got forked ones, in which JAX may hang; "
+            "executor: expected the start method spawn, got fork, with which JAX may hang; "
             'use ProcessPoolExecutor(mp_context=multiprocessing.get_context("spawn"))'
         )

@@ -1,9 +1,8 @@
 """Execution on the host: compiled programs over blocks of rows.
 
-JAX compiles a program for every shape of its arguments. So that clouds of every size run the same programs, whatever
-works point by point is called with blocks of a fixed number of rows. What comes out is rows, written in place, or sums,
-which the caller adds in float64 in the order of the blocks: results are the same to the last bit for any number of
-threads. Knows nothing of clouds or mathematics.
+JAX compiles a program for every shape of its arguments. So that clouds of every size run the same programs, pointwise
+computations are called with blocks of a fixed number of rows. They return either rows, which are concatenated, or sums,
+which the caller adds in float64 in the order of the blocks: results are bitwise identical for any number of threads.
 """
 
 from __future__ import annotations
@@ -19,8 +18,8 @@ from jaxtyping import Int
 from mcgicp_jax._pose import computed_now
 from mcgicp_jax._threads import side_by_side
 
-# Rows of a block. One size for all, so that few programs are compiled. Measured with 34,000 rows: blocks of 2,048 to
-# 8,192 rows take equally long, blocks of 1,024 a fifth more. Small clouds waste what they do not fill.
+# Rows of a block. One size for all clouds, so that few programs are compiled. Measured with 34,000 rows: blocks of
+# 2,048 to 8,192 rows take equally long, blocks of 1,024 a fifth more. Larger blocks mean more padding for small clouds.
 BLOCK = 2048
 
 Block = tuple[slice, slice | Int[np.ndarray, "BLOCK"]]
@@ -30,8 +29,8 @@ def blocks(num_rows: int) -> list[Block]:
     """Cut rows into blocks.
 
     Returns:
-        For each block, which rows it stands for, and what to index arrays with to get exactly `BLOCK` rows: in the last
-        block, the last row is repeated.
+        For each block, the slice of rows that it covers, and an index that selects exactly `BLOCK` rows: the last block
+        is padded by repeating the last row.
     """
     cut: list[Block] = []
     for start in range(0, num_rows, BLOCK):
@@ -44,27 +43,33 @@ def blocks(num_rows: int) -> list[Block]:
 
 
 def map_blocks(function: Callable[[Any], Any], num_rows: int, num_threads: int | None = 1) -> list[tuple[slice, Any]]:
-    """Results of a function for each block of rows, as NumPy arrays, in order.
+    """Call a function on each block of rows.
 
     Args:
-        function: takes what `blocks` says to index arrays with.
-        num_threads: how many threads call it, at most; None for one per block.
+        function: maps an index of `BLOCK` rows (see `blocks`) to a pytree of arrays.
+        num_threads: largest number of threads that call it; None for one per block.
+
+    Returns:
+        For each block, in order, the slice of rows that it covers and the result as NumPy arrays.
     """
     cut = blocks(num_rows)
 
-    # Other threads know nothing of a transformation that this one is tracing.
+    # Worker threads run outside a trace that is active in this thread; this thread leaves it for the same results.
     with computed_now():
         results = side_by_side([partial(function, index) for _, index in cut], num_threads) if cut else []
-    # A program runs while the arrays of the next one are gathered: nobody waits for it before all have begun.
+    # Programs are dispatched asynchronously and run while the next block is gathered; wait only once all have started.
     return [(rows, jax.tree.map(np.asarray, result)) for (rows, _), result in zip(cut, results, strict=True)]
 
 
 def map_rows(function: Callable[[Any], Any], num_rows: int, num_threads: int | None = 1) -> Any:
-    """The rows that a function returns for each block, put together: a pytree of arrays of `num_rows` rows.
+    """Call a function on each block of rows and concatenate the rows that it returns.
 
     Args:
-        function: takes what `blocks` says to index arrays with; its arrays have `BLOCK` rows as their first dimension.
+        function: maps an index of `BLOCK` rows (see `blocks`) to a pytree of arrays with `BLOCK` rows.
         num_threads: as in `map_blocks`.
+
+    Returns:
+        A pytree of NumPy arrays with `num_rows` rows, at least 1.
     """
     results = map_blocks(function, num_rows, num_threads)
     leaves = [jax.tree.leaves(result) for _, result in results]

@@ -1,6 +1,6 @@
-"""What the channels of clouds are like: their noise, the spacing of the points that carry them, gain and offset.
+"""Statistics of the data that methods are adapted to: channel noise, point spacing, and gain and offset of channels.
 
-Each is computed with NumPy where the clouds are concrete, and with JAX where they are traced.
+They are computed with NumPy for concrete clouds and with JAX for traced ones.
 """
 
 from __future__ import annotations
@@ -18,19 +18,22 @@ from mcgicp_jax._search import Correspondences
 from mcgicp_jax._statistics import constant, median, namespace, sampled_rows
 from mcgicp_jax._surface import Local
 
-# Quantiles of the values that gain and offset are read off: robust against what only one of the clouds sees.
-_QUANTILES = tuple(share / 20 for share in range(1, 20))
+# Quantiles (5 to 95 %) from which gain and offset are estimated: robust against parts that only one cloud sees.
+_QUANTILES = tuple(step / 20 for step in range(1, 20))
 
 
 def channel_noise(
     source: PointCloud, target: PointCloud, locals: tuple[Local, Local]
 ) -> tuple[Float[AnyArray, "C"], Bool[AnyArray, "C"], Float[AnyScalar, ""]]:
-    """σ per channel, which channels are uniform (theirs is 1), and the variance of points across the surface, λ₀."""
+    """Noise σ per channel, which channels are uniform (σ = 1), and the variance λ₀ along the normal, metres².
+
+    Both are medians over both clouds: σ of the residuals of linear fits, λ₀ of the variances of the neighbours.
+    """
     xp = namespace(source, target, locals)
     residuals, values, across = [], [], []
     for cloud, local in zip((source, target), locals, strict=True):
         valid = xp.asarray(cloud.valid)
-        # Where points lack channels, few may have one.
+        # Where points lack channels, a sample might contain too few that have one.
         rows, counts = (xp.arange(valid.size), valid) if cloud.channel_valid is not None else sampled_rows(valid)
         variances = [local.fit(channel)[2][rows] for channel in range(local.num_channels)]
         deviations = xp.sqrt(xp.stack(variances)) if variances else xp.zeros((0, rows.size), local.shape.dtype)
@@ -40,17 +43,17 @@ def channel_noise(
     sigma = median(xp.concatenate(residuals, axis=1))
     everything = xp.concatenate(values)
     with warnings.catch_warnings():
-        # A channel that nobody has.
+        # No point may have a channel; its statistics are then NaN.
         warnings.simplefilter("ignore", RuntimeWarning)
         spread = xp.nanstd(everything, axis=0)
         largest = xp.nanmax(xp.abs(everything), axis=0, initial=0)
     uniform = ~(spread > 1e3 * xp.finfo(spread.dtype).eps * largest)
-    # Rendered channels have no noise; a thousandth of their spread keeps Λ and α finite.
+    # Rendered channels have no noise; a floor of a thousandth of their standard deviation keeps α finite and Λ regular.
     return xp.where(uniform, 1, xp.fmax(sigma, 1e-3 * spread)), uniform, median(xp.concatenate(across))
 
 
 def _smallest_variance(local: Local, xp: Any) -> Float[AnyArray, "N"]:
-    """nᵀ C n."""
+    """λ₀ = nᵀ C n, the variance of the neighbours along the normal, metres²."""
     xx, xy, xz, yy, yz, zz = local.covariance
     x, y, z = local.normal
     with np.errstate(over="ignore", invalid="ignore"):
@@ -58,7 +61,7 @@ def _smallest_variance(local: Local, xp: Any) -> Float[AnyArray, "N"]:
 
 
 def _known_values(cloud: PointCloud) -> Float[AnyArray, "N C"]:
-    """Channels, NaN where there are none."""
+    """Channels, NaN where a point lacks them or is padding."""
     xp = namespace(cloud)
     valid = xp.asarray(cloud.valid)[:, None]
     if cloud.channel_valid is not None:
@@ -67,7 +70,7 @@ def _known_values(cloud: PointCloud) -> Float[AnyArray, "N C"]:
 
 
 def point_spacing(cloud: PointCloud) -> Float[AnyScalar, ""]:
-    """Median distance to the nearest neighbour that lies elsewhere, metres; 0 if all lie in one place.
+    """Median nearest-neighbour distance, metres, ignoring coincident neighbours; 0 if all neighbours coincide.
 
     Some files hold points twice, and some scanners report each beam without an echo as a point at the origin.
     """
@@ -77,7 +80,7 @@ def point_spacing(cloud: PointCloud) -> Float[AnyScalar, ""]:
     neighbors = xp.asarray(cloud.neighbors)[rows]
     present = counts[:, None] & (neighbors >= 0)
     square = xp.zeros(neighbors.shape, cloud.points.dtype)
-    # Overflow makes infinity, which is no distance.
+    # Distances that overflow become infinite and are ignored.
     with np.errstate(over="ignore", invalid="ignore"):
         for coordinate in xp.asarray(cloud.points).T:
             square = square + (coordinate[xp.maximum(neighbors, 0)] - coordinate[rows, None]) ** 2
@@ -86,29 +89,30 @@ def point_spacing(cloud: PointCloud) -> Float[AnyScalar, ""]:
 
 
 def with_channels_matched(source: PointCloud, target: PointCloud, matches: Correspondences | None = None) -> PointCloud:
-    """The source, each channel scaled and shifted so that its values are distributed like the target's.
+    """The source with a gain and an offset applied to each channel, so that its distribution matches the target's.
 
-    By the quantiles from 5 to 95 %: robust against what only one of the clouds sees, as long as that is little; with
-    matches, by the matched points alone. Not match by match: noise, and matches across edges, would make the gain too
-    small. Gain and offset are constants to autodiff.
+    Gain and offset equalise mean and standard deviation of the quantiles from 5 to 95 %, which is robust against small
+    parts that only one cloud sees. Regression over matches is not used: noise, and matches across edges, would bias the
+    gain towards 0. With `matches`, only values of valid matches are used. Gain and offset are constants to autodiff;
+    they are 1 and 0 for channels without usable spread.
     """
     xp = namespace(source, target, matches)
     values = [_known_values(constant(cloud)) for cloud in (source, target)]
     values = [xp.asarray(each) for each in values]
     if matches is not None:
         values[1] = values[1][xp.asarray(matches.indices)]
-        paired = xp.asarray(matches.valid)[:, None] & xp.isfinite(values[0]) & xp.isfinite(values[1])
-        # A few points tell no distribution.
-        paired = paired & (xp.sum(paired, axis=0) > len(_QUANTILES))
-        values = [xp.where(paired, each, xp.nan) for each in values]
-    shares = xp.asarray(_QUANTILES, values[0].dtype)
+        matched = xp.asarray(matches.valid)[:, None] & xp.isfinite(values[0]) & xp.isfinite(values[1])
+        # Too few points do not determine a distribution.
+        matched = matched & (xp.sum(matched, axis=0) > len(_QUANTILES))
+        values = [xp.where(matched, each, xp.nan) for each in values]
+    levels = xp.asarray(_QUANTILES, values[0].dtype)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", RuntimeWarning)
-        quantiles = [xp.nanquantile(each, shares, axis=0) for each in values]
+        quantiles = [xp.nanquantile(each, levels, axis=0) for each in values]
     means = [xp.mean(each, axis=0) for each in quantiles]
     spreads = [xp.std(each, axis=0) for each in quantiles]
-    telling = (spreads[0] > 0) & (spreads[1] > 0)
-    gain = xp.where(telling, spreads[1] / xp.where(telling, spreads[0], 1), 1)
+    varying = (spreads[0] > 0) & (spreads[1] > 0)
+    gain = xp.where(varying, spreads[1] / xp.where(varying, spreads[0], 1), 1)
     offset = means[1] - gain * means[0]
     known = xp.isfinite(gain) & xp.isfinite(offset)
     gain, offset = (xp.where(known, each, other) for each, other in ((gain, 1), (offset, 0)))

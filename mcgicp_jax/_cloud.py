@@ -1,4 +1,4 @@
-"""The point cloud: positions, channels, and what is derived from them once."""
+"""The point cloud: positions, channels, and the neighbours and covariances computed from them."""
 
 from __future__ import annotations
 
@@ -15,20 +15,21 @@ from jaxtyping import Array, Bool, Float, Int
 from mcgicp_jax._pose import Pose, is_concrete, pose_matrix
 from mcgicp_jax._sizes import size_class
 
-# What a user may hand in: an array of any library, or rows in lists.
+# Array input: NumPy, JAX or any array-like, or nested lists.
 Values: TypeAlias = ArrayLike | Sequence[Any]
 
-# In sizes of the cloud: from here on its origin is kept apart, in float64.
+# Distance from zero, in cloud sizes, beyond which the origin is kept apart in float64: float32 coordinates would lose
+# more than log2(8) = 3 of their 24 significant bits.
 _FAR = 8.0
 
 
 def is_far(offset: Float[np.ndarray, "3"], size: float) -> bool:
-    """Whether a cloud of this size, metres, lies so far from zero that float32 would lose its shape."""
+    """Whether a cloud of `size` metres lies so far from zero that float32 coordinates lose too much precision."""
     return bool(np.linalg.norm(offset) > _FAR * size)
 
 
 def _as_float(name: str, values: Values) -> Any:
-    """A floating-point array; NumPy stays NumPy, and float64, until an origin has been taken off."""
+    """Convert to a floating-point array. NumPy input stays NumPy: float64 is needed until the origin is subtracted."""
     if isinstance(values, jax.Array):
         if jnp.issubdtype(values.dtype, jnp.complexfloating):
             raise ValueError(f"{name}: expected real numbers, got dtype {values.dtype}")
@@ -43,7 +44,7 @@ def _as_float(name: str, values: Values) -> Any:
 
 
 def _as_mask(values: Values, shape: tuple[int, ...]) -> Any:
-    """`channel_valid` for channels of this shape; a single channel may come as a vector."""
+    """Check `channel_valid` against the shape of the channels; a single channel may have a 1-D mask."""
     mask = values if isinstance(values, jax.Array) else np.asarray(values)
     if mask.dtype != bool:
         raise ValueError(f"channel_valid: expected booleans, got dtype {mask.dtype}")
@@ -55,29 +56,30 @@ def _as_mask(values: Values, shape: tuple[int, ...]) -> Any:
 
 
 def _blank(channels: Any, channel_valid: Any) -> Any:
-    """Channels with 0 where there are none: what is missing, mostly NaN, never reaches arithmetic."""
+    """Set missing channel values, often NaN, to 0, so that they never enter arithmetic."""
     xp = np if isinstance(channels, np.ndarray) and isinstance(channel_valid, np.ndarray) else jnp
     return xp.where(channel_valid, channels, 0)
 
 
 class PointCloud(eqx.Module):
-    """Points with channels; a pytree whose arrays may all carry leading batch dimensions.
+    """Points with channels; a pytree whose arrays may all have leading batch dimensions.
 
-    `preprocess` makes from a raw cloud one that is ready to register, with neighbours. Both have NumPy arrays of as
-    many rows as there are points. What is computed of a cloud is kept as long as the cloud is used, so its arrays must
-    not be changed in place. Rows that are not `valid` are padding, see `pad`, and take part in nothing.
-    To put other values in, as when a network makes the channels, use `cloud.replace(channels=...)`.
+    A cloud built from arrays is *raw*; `preprocess` returns one that is ready to register, with neighbours. Both hold
+    NumPy arrays with one row per point. Quantities derived from a cloud are cached while the cloud is in use, so do
+    not modify its arrays in place. To exchange values, such as channels computed by a network, use
+    `cloud.replace(channels=...)`. Rows that are not `valid` are padding (see `pad`) and are ignored everywhere.
 
     Attributes:
-        points: (N, 3), metres, relative to `origin`, which is 0 for raw clouds; see `coordinates`.
-        channels: (N, C), in the unit that the user gives; C may be 0.
-        channel_valid: (N, C), False where a point has no such channel, as outside of a camera's view; its value there
-            is 0 and takes part in nothing. None: all points have all channels.
+        points: (N, 3), metres, relative to `origin` (0 for raw clouds); see `coordinates`.
+        channels: (N, C), in the user's unit; C may be 0.
+        channel_valid: (N, C), False where the point lacks the channel, as outside a camera's view; the value there is
+            0 and is ignored. None: all points have all channels.
         valid: (N,), False for padding.
-        neighbors: (N, k) row numbers of the k nearest points, the point itself among them; −1 where there are fewer.
-        covariances: (N, 3, 3), or None: if given, the methods take these instead of computing their own.
-        origin: (3,) float64, taken off the points to keep float32 exact at large (UTM) coordinates; 0 otherwise.
-        channel_names: C names, such as ("intensity",) or ("red", "green", "blue"); files are written by them.
+        neighbors: (N, k) row indices of the k nearest points, including the point itself; −1 where there are fewer.
+        covariances: (N, 3, 3), dimensionless, or None. If given, methods use them instead of computing their own.
+        origin: (3,) float64, metres, subtracted from the points so that float32 stays precise at large (UTM)
+            coordinates; 0 otherwise.
+        channel_names: C names, such as ("intensity",) or ("red", "green", "blue"); used as column names in files.
     """
 
     points: Float[Array, "*batch N 3"] | Float[np.ndarray, "*batch N 3"]
@@ -98,18 +100,18 @@ class PointCloud(eqx.Module):
         covariances: Values | None = None,
         channel_names: Sequence[str] | None = None,
     ):
-        """A raw cloud.
+        """Create a raw cloud.
 
         Args:
-            points: (N, 3), metres. Lists, any real dtype, NumPy or JAX.
-            channels: (N, C), or (N,) for a single one.
-            channel_valid: booleans in the shape of `channels`, False where a point has no such channel; its value may
-                then be anything, NaN too. None: all are there.
-            covariances: (N, 3, 3), dimensionless as GICP's are (1 in the surface, ε across it).
-            channel_names: one name per channel.
+            points: (N, 3), metres: nested lists or arrays of any real dtype, NumPy or JAX.
+            channels: (N, C), or (N,) for a single channel, in any unit; none by default.
+            channel_valid: booleans in the shape of `channels`, False where a point lacks the channel; the value there
+                is ignored and may be NaN. None: all points have all channels.
+            covariances: (N, 3, 3), dimensionless as in GICP (1 in the tangent plane, ε along the normal).
+            channel_names: one name per channel; "channel_0", "channel_1", ... by default.
 
         Raises:
-            ValueError: where a shape or dtype does not fit; the message names the argument.
+            ValueError: if a shape or dtype does not fit; the message names the argument.
         """
         self.points = _as_float("points", points)
         if self.points.ndim != 2 or self.points.shape[1] != 3:
@@ -140,15 +142,18 @@ class PointCloud(eqx.Module):
         self.origin = np.zeros(3)
 
     def replace(self, **arrays: Any) -> PointCloud:
-        """The cloud with some of its arrays exchanged (`points`, `channels`, `covariances`, ...); shapes must agree.
+        """Return a copy with the given fields replaced (`points`, `channels`, `covariances`, ...).
 
-        Points keep the channels that they have: where there is `channel_valid`, it holds for other `channels` too.
-        Neighbours stay as they are: to autodiff they are constants.
+        An existing `channel_valid` also applies to new `channels`. Neighbours are not recomputed: to autodiff they are
+        constants.
+
+        Raises:
+            ValueError: if a field does not exist, or a shape or dtype does not fit the cloud.
         """
         fields = dict(vars(self))
         unknown = arrays.keys() - fields.keys()
         if unknown:
-            raise ValueError(f"replace: no field named {', '.join(sorted(unknown))}; there are {', '.join(fields)}")
+            raise ValueError(f"replace: unknown field {', '.join(sorted(unknown))}; expected {', '.join(fields)}")
         shapes = {
             "points": np.shape(self.points),
             "valid": np.shape(self.valid),
@@ -176,11 +181,11 @@ class PointCloud(eqx.Module):
 
     @property
     def coordinates(self) -> Float[np.ndarray, "*batch N 3"]:
-        """(N, 3) float64: the positions in the user's frame, metres: `points` with `origin` put back."""
+        """Positions in the user's frame, (N, 3) float64, metres: `points` + `origin`."""
         return np.asarray(self.points, np.float64) + np.asarray(self.origin, np.float64)[..., None, :]
 
     def __len__(self) -> int:
-        """The number of points, padding not counted."""
+        """The number of points, without padding."""
         return int(np.sum(np.asarray(self.valid)))
 
     def __repr__(self) -> str:
@@ -192,8 +197,8 @@ class PointCloud(eqx.Module):
             size = f"{len(self)} points padded to {self.points.shape[0]}"
         names = list(self.channel_names)
         if self.channel_valid is not None and is_concrete(self) and self.points.ndim == 2:
-            shares = np.mean(np.asarray(self.channel_valid)[np.asarray(self.valid)], axis=0)
-            names = [f"{name} ({share:.0%})" for name, share in zip(names, shares, strict=True)]
+            fractions = np.mean(np.asarray(self.channel_valid)[np.asarray(self.valid)], axis=0)
+            names = [f"{name} ({fraction:.0%})" for name, fraction in zip(names, fractions, strict=True)]
         parts = [size, f"channels: {', '.join(names) or 'none'}", str(self.points.dtype)]
         if self.neighbors is not None:
             parts.append(f"{self.neighbors.shape[-1]} neighbors")
@@ -202,12 +207,12 @@ class PointCloud(eqx.Module):
         return f"PointCloud({', '.join(parts)})"
 
     def unpad(self) -> PointCloud:
-        """A raw cloud: the valid rows alone, NumPy arrays in the user's frame, float64 if an origin was taken off."""
+        """Return the valid rows as a raw cloud: NumPy arrays in the user's frame, float64 if `origin` is not 0."""
         keep = np.asarray(self.valid)
         whole = bool(keep.all())
 
         def kept(array: Any) -> Any:
-            # A plain copy takes a tenth of the time.
+            # A plain copy takes a tenth of the time of boolean indexing.
             return None if array is None else np.array(array) if whole else np.asarray(array)[keep]
 
         points = kept(self.coordinates if np.any(self.origin) else self.points)
@@ -220,32 +225,34 @@ class PointCloud(eqx.Module):
         )
 
     def pad(self, size: int | None = None) -> PointCloud:
-        """The cloud with rows of padding added at the end, `size` in all.
+        """Append padding rows until the cloud has `size` rows.
 
-        For functions that you compile: inside `jax.jit`, clouds of one size share a program. By default the size is
-        the smallest of 128, 256, 512, ... that holds the cloud.
+        Inside your own `jax.jit`, clouds padded to the same size share one compiled program.
+
+        Args:
+            size: number of rows; by default the smallest of 128, 256, 512, ... that holds the cloud.
 
         Raises:
-            ValueError: if the cloud has more rows.
+            ValueError: if the cloud has more than `size` rows.
         """
         size = size_class(self.points.shape[0]) if size is None else size
         missing = size - self.points.shape[0]
         if missing < 0:
-            raise ValueError(f"size: expected at least {self.points.shape[0]}, the cloud's rows, got {size}")
+            raise ValueError(f"size: expected at least {self.points.shape[0]}, the rows of the cloud, got {size}")
 
         def grow(array: Any, fill: int = 0) -> Any:
             if array is None:
                 return None
             if not isinstance(array, np.ndarray):
                 return jnp.pad(array, [(0, missing)] + [(0, 0)] * (array.ndim - 1), constant_values=fill)
-            # A tenth of the time that `np.pad` takes.
+            # Takes a tenth of the time of `np.pad`.
             grown = np.full((size, *array.shape[1:]), fill, array.dtype)
             grown[: len(array)] = array
             return grown
 
         covariances = grow(self.covariances)
         if covariances is not None:
-            # Padding is weighed and left out: its covariances must have inverses.
+            # Padded rows are computed and then masked, so their covariances must be invertible.
             xp = np if isinstance(covariances, np.ndarray) else jnp
             padding = xp.arange(size)[:, None, None] >= size - missing
             covariances = xp.where(padding, xp.eye(3, dtype=covariances.dtype), covariances)
@@ -259,14 +266,20 @@ class PointCloud(eqx.Module):
         )
 
     def replace_rows(self, **arrays: Any) -> PointCloud:
-        """The cloud with another number of rows; nothing is checked."""
+        """Replace fields without checks; the number of rows may change."""
         return _build(**vars(self) | arrays)
 
     def transform(self, pose: Pose) -> PointCloud:
-        """The cloud moved by a pose: points p become R p + t, covariances C become R C Rᵀ.
+        """Transform the cloud by a pose: points p become R p + t, covariances C become R C Rᵀ.
 
-        A raw cloud that ends up far from zero has float64 points; a preprocessed one keeps its precision, and moves its
-        `origin`: read `coordinates`.
+        If the result lies far from zero, a raw cloud gets float64 points; a preprocessed one keeps its dtype and
+        changes its `origin`, so read `coordinates`.
+
+        Args:
+            pose: `jaxlie.SE3` or (4, 4), translation in metres.
+
+        Raises:
+            ValueError: if a concrete pose is no rigid motion or has another shape.
         """
         matrix = pose_matrix(pose, "pose")
         xp = np if isinstance(self.points, np.ndarray) and is_concrete(matrix) else jnp
@@ -279,7 +292,7 @@ class PointCloud(eqx.Module):
             moved = self.coordinates @ np.asarray(matrix[:3, :3], np.float64).T + np.asarray(matrix[:3, 3])
             return self.replace_rows(points=moved, covariances=covariances, origin=np.zeros(3))
         if far:
-            # The large part of a motion stays in float64.
+            # The large offset stays in float64.
             origin = np.asarray(offset, np.float64)
         else:
             points = points + xp.asarray(offset, points.dtype)
@@ -288,7 +301,11 @@ class PointCloud(eqx.Module):
 
     @staticmethod
     def stack(clouds: Sequence[PointCloud]) -> PointCloud:
-        """One cloud with a leading batch dimension, for `jax.vmap`; padded to the size class of the largest."""
+        """Stack clouds along a new leading batch dimension for `jax.vmap`, padded to the size class of the largest.
+
+        Raises:
+            ValueError: if there are no clouds, or their channel names differ.
+        """
         if not clouds:
             raise ValueError("clouds: expected at least one, got none")
         size = max(size_class(cloud.points.shape[0]) for cloud in clouds)
@@ -308,7 +325,7 @@ class PointCloud(eqx.Module):
 
 
 def _build(**fields: Any) -> PointCloud:
-    """A cloud from finished fields, past the conversions and checks of its constructor."""
+    """Build a cloud from fields, bypassing the conversions and checks of the constructor."""
     cloud = object.__new__(PointCloud)
     for name, value in fields.items():
         object.__setattr__(cloud, name, value)

@@ -1,4 +1,4 @@
-"""The Mahalanobis cost of given matches, for losses and loops of one's own. Pure JAX."""
+"""The Mahalanobis cost of given matches, for losses and custom loops. Pure JAX."""
 
 from __future__ import annotations
 
@@ -32,31 +32,32 @@ def mahalanobis_cost(
     temperature: ArrayLike | None = None,
     log_determinant: bool = False,
 ) -> Float[Array, ""]:
-    """F(T) = Σ ρ(dᵀ M d) with d = b − T a and M = (C^B + R C^A Rᵀ)⁻¹ (Servos & Waslander 2014, eq. 3, whose inverse is
-    missing in print).
+    """Compute the cost F(T) = Σ ρ(dᵀ M d) of given matches, with d = b − T a and M = (C^B + R C^A Rᵀ)⁻¹ (Servos &
+    Waslander 2014, eq. 3, which omits the inverse); M = I or n nᵀ for the methods without covariances.
 
-    Pure JAX, differentiable in everything but the matches. M follows the rotation here, so that F is the cost itself;
-    the pose that `align` returns holds M during an update, as every GICP does, and is not exactly F's minimum.
+    Pure JAX, differentiable with respect to everything but the matches. M is a function of the rotation R here. `align`
+    holds M fixed during each update, as every GICP does, so its pose is not exactly the minimum of F.
 
     Args:
         pose: T_target_source, `jaxlie.SE3` or (4, 4).
         source, target: preprocessed clouds.
         matches: from `find_correspondences`.
-        method: which covariances; open numbers are chosen from the data.
-        robust: kernel of each pair's Mahalanobis distance.
-        temperature: metres; with several candidates per source point (`num_candidates`), each pair counts by a softmax
-            of −½ (distance / temperature)², distances in position and α · channel. This gives α a gradient. Towards 0
-            the nearest candidate alone counts.
-        log_determinant: add Σ log det (C^B + R C^A Rᵀ). Together with the squared distance that is a Gaussian
-            likelihood; without it, a loss that learns covariances (or ε, or Λ) is lowered by inflating them. For `GICP`
-            and `MultiChannelGICP`.
+        method: defines M; parameters left None are estimated from the clouds.
+        robust: kernel ρ applied to the Mahalanobis distance of each match; None for ρ(s²) = s².
+        temperature: metres. Weighs the candidates of each source point (`num_candidates`) by a softmax of
+            −½ (distance / temperature)², with distances in position and α · channel; this gives α a gradient. As it
+            tends to 0, only the nearest candidate counts. Required if there are several candidates.
+        log_determinant: add Σ log det (C^B + R C^A Rᵀ), which makes F (for squared distances) twice a Gaussian negative
+            log-likelihood. Without it, a loss that learns covariances (or ε, or Λ) falls as these are inflated. For
+            `GICP` and `MultiChannelGICP`.
 
     Returns:
-        The cost; metres² for the methods with M = I, otherwise in units of GICP's relative covariances.
+        F, a scalar. For dimensionless covariances, as GICP's are, in metres².
 
     Raises:
-        ValueError: if the matches do not belong to the source, a cloud lacks the neighbours that the method needs, or
-            the method has no determinant.
+        ValueError: if `pose` is not a rigid motion, the shape of `matches` does not fit the source, `temperature` is
+            missing or not positive, a cloud lacks the neighbours that the method needs, or `log_determinant` is set for
+            a method without covariances.
     """
     check_matches(matches, source, temperature)
     if log_determinant and not isinstance(method, AbstractGeneralized):
@@ -91,7 +92,7 @@ def _total_cost(
 
 
 def check_matches(matches: Correspondences, source: PointCloud, temperature: ArrayLike | None) -> None:
-    """Raise `ValueError` unless there is a match, or a softened choice of candidates, for every source row."""
+    """Raise `ValueError` unless there is one match per source row, or several and a positive `temperature`."""
     rows = source.points.shape[0]
     if matches.indices.ndim > 2 or matches.indices.shape[-1] != rows:
         raise ValueError(f"matches: expected one per source row ({rows}), got shape {matches.indices.shape}")
@@ -102,18 +103,18 @@ def check_matches(matches: Correspondences, source: PointCloud, temperature: Arr
 
 
 def centred_pose(pose: Pose | None, source: PointCloud, target: PointCloud, name: str = "init") -> Array | np.ndarray:
-    """The same motion between the clouds' own origins: T(−o_t) · T · T(o_s), in the precision that it comes in.
+    """T(−o_t) · T · T(o_s), (4, 4): the pose between coordinates relative to the clouds' origins, in its own precision.
 
     Raises:
-        ValueError: as `pose_matrix`; `name` is that of the argument.
+        ValueError: as `pose_matrix`; `name` is the argument's name for the message.
     """
     distance = 0.0
     if is_concrete(source.origin, source.points) and np.any(source.origin):
-        radius = np.abs(np.asarray(source.points)).max(initial=0.0)
-        distance = float(np.linalg.norm(source.origin) / max(radius, np.finfo(np.float64).tiny))
+        radius = float(np.abs(np.asarray(source.points)).max(initial=0))
+        distance = float(np.linalg.norm(source.origin)) / radius if radius > 0 else 0.0
     matrix = pose_matrix(pose, name, distance)
     rotation, translation = matrix[:3, :3], matrix[:3, 3]
-    # In this order two far origins cancel before they meet the rotation.
+    # In this form two far origins cancel exactly, before the rotation is applied to either.
     shifted = (rotation - np.eye(3)) @ source.origin + (source.origin - target.origin) + translation
     if isinstance(shifted, np.ndarray) and isinstance(matrix, np.ndarray):
         result = matrix.copy()

@@ -1,4 +1,4 @@
-"""Results that are computed when they are first read."""
+"""Lazily computed parts of results."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ Value = TypeVar("Value")
 
 @jax.tree_util.register_pytree_node_class
 class Deferred(Generic[Value]):
-    """A pytree that is computed when it is first read: by `value`, or when it is flattened, copied or pickled."""
+    """A pytree that is computed on first access: by `value`, or when it is flattened, copied or pickled."""
 
     def __init__(self, compute: Callable[[], Value]):
         self._compute: Callable[[], Value] | None = compute
@@ -24,7 +24,7 @@ class Deferred(Generic[Value]):
 
     @classmethod
     def of(cls, value: Value) -> Deferred[Value]:
-        """What is known already."""
+        """A `Deferred` whose value is known already."""
         return cls.tree_unflatten(None, (value,))
 
     @property
@@ -33,7 +33,7 @@ class Deferred(Generic[Value]):
             if self._compute is not None:
                 with computed_now():
                     self._value = self._compute()
-                # And with it what it was to be computed from.
+                # Frees the arrays that the closure holds.
                 self._compute = None
         return self._value
 

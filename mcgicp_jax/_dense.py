@@ -1,7 +1,4 @@
-"""Nearest neighbours by comparing every point with every other, in XLA alone: for accelerators.
-
-And the choice of a search where none is asked for.
-"""
+"""Brute-force nearest-neighbour search in XLA, for accelerators; and the default search of each platform."""
 
 from __future__ import annotations
 
@@ -22,17 +19,17 @@ from mcgicp_jax._trees import KDTreeSearch
 
 
 def default_search(workers: int = -1) -> AbstractSearch:
-    """`DenseSearch` where JAX computes on an accelerator, `KDTreeSearch` on a CPU."""
+    """`DenseSearch` if JAX's default backend is an accelerator, else `KDTreeSearch(workers)`."""
     return KDTreeSearch(workers) if jax.default_backend() == "cpu" else DenseSearch()
 
 
 class DenseSearch(AbstractSearch):
-    """Exact search that compares all points with all, for GPUs and TPUs; equal distances are ordered by row.
+    """Brute-force search for GPUs and TPUs, exact up to rounding; ties are broken by row.
 
-    Distances are sums of squared differences, reduced as they are computed, so that no table of pairs is ever stored.
-    (As a product of matrices, |a|² − 2ab + |b|², such a table would have to be written and read, and in float32 it
-    would lose a near neighbour's distance to cancellation.) They are those of the clouds' precision, where
-    `KDTreeSearch` computes in float64: where two distances agree to the last digits, another point may be chosen.
+    Squared differences are summed and reduced at once, so that the N × M table of distances is never stored. (A matrix
+    product for |a|² − 2ab + |b|² would have to store it, and in float32 would lose the distances of near neighbours to
+    cancellation.) Distances are computed in the clouds' precision, in `KDTreeSearch` in float64: the two may choose
+    different points where two distances agree to rounding.
     """
 
     def index(self, target: Rows) -> DenseIndex:
@@ -51,12 +48,12 @@ class DenseSearch(AbstractSearch):
 
     def neighbors(self, points: Float[np.ndarray, "N 3"], num_neighbors: int) -> Int[np.ndarray, "N k"]:
         rows = Rows(points, np.zeros((len(points), 0), points.dtype), np.ones(len(points), bool))
-        at_rest = np.array([1, 0, 0, 0, 0, 0, 0], points.dtype)
-        return self.index(rows).nearest(at_rest, rows, np.inf, num_neighbors).T
+        identity = np.array([1, 0, 0, 0, 0, 0, 0], points.dtype)
+        return self.index(rows).nearest(identity, rows, np.inf, num_neighbors).T
 
 
 class DenseIndex(AbstractIndex):
-    """The target as it is, padded to a size class: there is nothing to lay out."""
+    """The target's rows, padded to a size class; brute force needs no data structure."""
 
     def __init__(self, target: Rows):
         self._target = _padded(target)
@@ -73,7 +70,7 @@ class DenseIndex(AbstractIndex):
 
 
 def _padded(rows: Rows) -> Rows:
-    """In a size class, so that clouds of every size run few programs."""
+    """The rows padded to their size class, so that clouds of all sizes run few programs."""
     rows = on_host(rows)
     missing = size_class(rows.valid.size) - rows.valid.size
     return jax.tree.map(lambda array: np.pad(array, [(0, missing)] + [(0, 0)] * (array.ndim - 1)), rows)
@@ -89,14 +86,13 @@ def _nearest(pose: Float[Array, "7"], source: Rows, target: Rows, num_candidates
     def following(
         before: tuple[Float[Array, "N"], Int[Array, "N"]], _: None
     ) -> tuple[tuple[Float[Array, "N"], Int[Array, "N"]], Int[Array, "N"]]:
-        """The nearest of those that come after `before` in the order of distance and row."""
-        # The barrier, or else the compiler takes the distances, which are always the same, out of the loop, and stores
-        # a table of them.
+        """For each query, the target row next after `before` in the order of (squared distance, row)."""
+        # Without the barrier the compiler would hoist the loop-invariant distances out of the loop and store them.
         before, *again = jax.lax.optimization_barrier((before, queries, target, rows))
         square = _squares(*again[:2])
         numbers = jnp.broadcast_to(again[2], square.shape)
         distance, row = (values[:, None] for values in before)
-        # False for what is not a number.
+        # False where the distance is NaN.
         after = (square > distance) | ((square == distance) & (numbers > row))
         least, nearest = jax.lax.reduce(
             (jnp.where(after & target.valid, square, jnp.inf), numbers),
@@ -111,7 +107,7 @@ def _nearest(pose: Float[Array, "7"], source: Rows, target: Rows, num_candidates
 
 
 def _squares(source: Rows, target: Rows) -> Float[Array, "N M"]:
-    """Squared distance of every source row to every target row, metres²; never stored if it is reduced at once."""
+    """Squared search distance of every source row to every target row, metres²; not stored if reduced at once."""
     square = jnp.zeros((source.valid.size, target.valid.size), jnp.asarray(source.points).dtype)
     for query, point in zip(source.points.T, target.points.T, strict=True):
         square = square + (query[:, None] - point) ** 2

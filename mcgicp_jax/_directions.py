@@ -1,7 +1,7 @@
-"""Which directions of motion constrain a pose: for the loop, and in words for people.
+"""Constrained and unconstrained directions of motion of a pose, for the loop and as text.
 
-Inside, twists ξ = (v, ω) turn about the centroid of the matched points, in the target's frame, and their lengths are in
-units of the points' radius.
+In the loop, twists ξ = (v, ω) turn about the centroid of the matched points, in the target's frame, with lengths in
+units of the radius of the matched points (`Sums.radius`).
 """
 
 from __future__ import annotations
@@ -19,25 +19,25 @@ from jaxtyping import Array, Bool, Float
 from mcgicp_jax._solve import adjoint_to_source, twist_form, units
 from mcgicp_jax._sums import Sums
 
-# Shares of the points' motion below which a direction is not held. The geometry of flat scenes (posters on a wall, a
-# road, a table with 2 mm noise) came to less than 0.0016, that of others to 0.1 and more; GICP's fake pull within the
-# surface is as strong as a true share of ε, 0.001 by default. Noise alone made 0.003 of the channels, the markings of
-# a road 0.008 and more.
+# Least observed fraction of the points' squared motion for a direction to count as constrained. Geometry: measured
+# below 0.0016 in flat scenes (posters on a wall, a road, a table with 2 mm noise) and from 0.1 on in others; GICP's
+# artificial in-plane stiffness equals a true fraction of ε, 0.001 by default. Channels: 0.003 from noise alone, from
+# 0.008 on with the markings of a road.
 GEOMETRY_HOLDS, CHANNELS_HOLD = 2e-3, 5e-3
 _IDENTITY = np.array([1, 0, 0, 1, 0, 1])
-# A direction counts as a translation where turning moves its points less than this share of what moves them in all.
+# A direction is named a translation if its rotation causes at most this fraction of the points' motion (rms).
 _PURE = 0.3
 
 
 class Directions(eqx.Module):
-    """Six directions in which a pose could move, and by what each is held.
+    """Six directions of motion of a pose, and how well geometry and channels observe each.
 
     Attributes:
-        twists: (6, 6), a direction in each row, scaled so that the matched points move by 1 (root mean square).
-        geometry: (6,) share of that motion that the shape of the surfaces holds.
-        channels: (6,) share that the channels hold; told for the directions that geometry leaves free, 0 for others.
+        twists: (6, 6), one direction per row, scaled so that the matched points move by 1 (root mean square).
+        geometry: (6,) fraction of that squared motion that the shape of the surfaces observes, 0 to 1.
+        channels: (6,) fraction that the channels observe; 0 for the directions that geometry constrains.
         center: (3,) centroid of the matched source points, metres.
-        radius: their root mean square distance from it, metres.
+        radius: root mean square distance of these points from it, metres.
     """
 
     twists: Float[Array, "*batch 6 6"] | Float[np.ndarray, "*batch 6 6"]
@@ -48,26 +48,25 @@ class Directions(eqx.Module):
 
     @property
     def free(self) -> Bool[Array, "*batch 6"] | Bool[np.ndarray, "*batch 6"]:
-        """Whether geometry leaves the direction free."""
+        """Which directions geometry does not constrain."""
         return ~(self.geometry >= GEOMETRY_HOLDS)
 
     @property
     def held(self) -> Bool[Array, "*batch 6"] | Bool[np.ndarray, "*batch 6"]:
-        """Whether anything holds the direction: geometry, or else the channels."""
+        """Which directions are constrained, by geometry or by the channels."""
         return ~self.free | (self.channels >= CHANNELS_HOLD)
 
 
 def find_directions(sums: Sums) -> Directions:
-    """Eigenvectors of the fraction of the points' motion that shows in the geometry; where none does, in the channels.
-
-    A fraction of motion knows no unit: metres and radians, or another origin, change nothing.
+    """Eigenvectors of the observed fraction of the points' motion: by the geometry, and among the directions that
+    geometry does not constrain, by the channels. Fractions do not depend on units or on the origin.
     """
     center, radius, observed = sums.center, sums.radius, sums.observability
     total = jnp.where(sums.mass[9] > 0, sums.mass[9], 1)
     motion = twist_form(jnp.outer(_IDENTITY.astype(total.dtype), sums.mass / total), radius)
     geometry = twist_form(observed[0] / total, radius)
-    # One decomposition waits for the other: two batched LAPACK calls at once can dead-lock XLA's thread pool.
-    # Points on a line do not move when they turn about it: what does not move is not held.
+    # Each decomposition needs the result of the last: concurrent batched LAPACK calls can deadlock XLA's thread pool.
+    # The floor: points on a line do not move when they turn about it, so that rotation is not observed.
     values, vectors = jnp.linalg.eigh(motion)
     floor = 1e-5 * jnp.max(values)
     basis = vectors / jnp.sqrt(jnp.maximum(values, jnp.where(floor > 0, floor, 1)))
@@ -77,7 +76,7 @@ def find_directions(sums: Sums) -> Directions:
     if len(observed) == 1:
         channels = jnp.zeros_like(shares)
         return Directions(twists=basis.T, geometry=shares, channels=channels, center=center, radius=radius)
-    # Among the free directions, those that the channels tell apart; 2, beyond any share, keeps the others aside.
+    # Diagonalise the channels within the free directions; 2, above any fraction, sorts the other directions last.
     among = jnp.outer(free, free)
     channels = jnp.where(among, basis.T @ twist_form(observed[1] / total, radius) @ basis, jnp.diag(2.0 * ~free))
     held, turn = jnp.linalg.eigh(channels)
@@ -88,7 +87,7 @@ def find_directions(sums: Sums) -> Directions:
 
 
 def directions_at_source(directions: Directions, pose: jaxlie.SE3) -> Directions:
-    """With twists ξ of T exp(ξ), metres and radians, that move the points by 1 m (root mean square)."""
+    """The directions as twists ξ of T exp(ξ), metres and radians, that move the matched points by 1 m (rms)."""
     center, radius = jnp.asarray(directions.center), jnp.asarray(directions.radius)
     change = adjoint_to_source(pose, center) * units(radius) / radius
     center = pose.inverse() @ center
@@ -97,14 +96,14 @@ def directions_at_source(directions: Directions, pose: jaxlie.SE3) -> Directions
 
 @dataclass(frozen=True, eq=False)
 class FreeDirection:
-    """A motion that the shape of the clouds allows.
+    """A direction of motion that the shape of the clouds does not constrain.
 
     Attributes:
         twist: (6,) ξ = (v, ω) of T exp(ξ), metres and radians, scaled so that the matched points move by 1 m (root mean
             square).
-        held_by_channels: whether the channels hold it; if not, nothing does.
-        axis: (3,) unit vector, in the source's frame: along it for a translation, about it for a rotation.
-        is_rotation: which of the two; a free direction that is neither alone is called by its larger part.
+        held_by_channels: whether the channels constrain the direction; if False, it is unconstrained.
+        axis: (3,) unit vector in the source's frame: direction of the translation, or axis of the rotation.
+        is_rotation: False if the direction is named a translation: rotation causes at most 0.3 of the points' motion.
     """
 
     twist: Float[np.ndarray, "6"]
@@ -113,19 +112,19 @@ class FreeDirection:
     is_rotation: bool
 
     def __repr__(self) -> str:
-        held = "held by the channels" if self.held_by_channels else "held by nothing"
+        held = "constrained by channels" if self.held_by_channels else "unconstrained"
         return f"{self.name} ({held})"
 
     @property
     def name(self) -> str:
-        """Such as "translation along (1, 0, 0)"."""
+        """For instance "translation along (1, 0, 0)"; the axis in the source's frame."""
         axis = self.axis * np.sign(self.axis[np.argmax(np.abs(self.axis))])
         x, y, z = np.round(axis, 2) + 0.0
         return f"{'rotation about' if self.is_rotation else 'translation along'} ({x:g}, {y:g}, {z:g})"
 
 
 def free_directions(directions: Directions) -> tuple[FreeDirection, ...]:
-    """Of a single registration: those that nothing holds before those that the channels do, translations first."""
+    """Free directions of one registration: unconstrained before constrained by channels, translations first."""
     free, held = np.asarray(directions.free), np.asarray(directions.held)
     motions = _motions(directions)
     found: list[FreeDirection] = []
@@ -136,20 +135,20 @@ def free_directions(directions: Directions) -> tuple[FreeDirection, ...]:
 
 
 def shares(directions: Directions) -> list[tuple[str, float, float]]:
-    """Name, share of geometry and share of the channels of six directions: the free ones first."""
+    """Name and fractions observed by geometry and by channels for each of the six directions, free ones first."""
     free, motions = np.asarray(directions.free), _motions(directions)
     geometry, channels = np.asarray(directions.geometry), np.asarray(directions.channels)
     found: list[tuple[str, float, float]] = []
     for group in (free, ~free):
         mixing = _separate(motions[group])
         names = [_named(motion, directions, False).name for motion in mixing @ motions[group]]
-        # The shares are eigenvalues, and the mixing is orthogonal.
+        # Squared weights: the forms are diagonal, but for that of geometry among the free directions, which is tiny.
         found += zip(names, mixing**2 @ geometry[group], mixing**2 @ channels[group], strict=True)
     return [(name, float(by_geometry), float(by_channels)) for name, by_geometry, by_channels in found]
 
 
 def _motions(directions: Directions) -> Float[np.ndarray, "6 6"]:
-    """How the points move, root mean square: with their centroid, and by turning about it."""
+    """(6, 6) motion of each direction: of the centroid, and by rotation about it, both in metres of rms motion."""
     twists = np.asarray(directions.twists, np.float64)
     center, radius = np.asarray(directions.center, np.float64), np.asarray(directions.radius)
     return np.concatenate([twists[:, :3] + np.cross(twists[:, 3:], center), radius * twists[:, 3:]], axis=1)
@@ -168,9 +167,9 @@ def _named(motion: Float[np.ndarray, "6"], directions: Directions, by_channels: 
 
 
 def _separate(motions: Float[np.ndarray, "m 6"]) -> Float[np.ndarray, "m m"]:
-    """How to mix motions so that translations come first, along the axes of the frame as far as there is a choice.
+    """Orthogonal matrix that mixes motions so that translations come first, along coordinate axes where possible.
 
-    Orthogonal, since the motions are, in the mean motion of the points.
+    Orthogonal mixing keeps the motions orthogonal in the mean motion of the points.
     """
     if not len(motions):
         return np.zeros((0, 0))
@@ -185,15 +184,15 @@ def _separate(motions: Float[np.ndarray, "m 6"]) -> Float[np.ndarray, "m m"]:
 
 
 def describe(found: Sequence[FreeDirection]) -> str:
-    """All of them, and what holds which; empty if there are none."""
+    """The names of free directions and which of them the channels constrain; "" if there are none."""
     if not found:
         return ""
     held = [direction for direction in found if direction.held_by_channels]
     everything = ", ".join(direction.name for direction in found)
     if not held:
-        verdict = "held by nothing"
+        verdict = "constrained by channels: none"
     elif len(held) == len(found):
-        verdict = "held by the channels: all"
+        verdict = "constrained by channels: all"
     else:
-        verdict = "held by the channels: " + ", ".join(direction.name for direction in held)
+        verdict = "constrained by channels: " + ", ".join(direction.name for direction in held)
     return f"{everything}; {verdict}"

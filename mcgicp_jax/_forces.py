@@ -1,7 +1,7 @@
-"""Force, stiffness and cost of each correspondence: all that update, root, observability and covariance know of it.
+"""Force, stiffness and cost of each correspondence: the interface between methods and pose estimation.
 
-Any residual that is linear in T a to first order can be written so: a force is minus the gradient of half its cost with
-respect to the moved point T a, a stiffness the Gauss-Newton Hessian.
+The force is minus the gradient of half the cost with respect to the moved point T a, and the stiffness the Gauss-Newton
+Hessian of half the cost. Any residual that is linear in T a to first order has this form.
 """
 
 from __future__ import annotations
@@ -15,15 +15,15 @@ from mcgicp_jax._kernels import AbstractKernel
 
 
 class Forces(eqx.Module):
-    """What each of n correspondences does to a pose. Terms add.
+    """Forces, stiffnesses and costs of n correspondences. Several terms are combined by `+`.
 
     Attributes:
         force: (3, n) w M d, with the residual d = b − T a.
         stiffness: (6, n) w M, symmetric.
         cost: (n,) ρ(dᵀ M d).
-        weight: (n,) w, the robust weight; of the first term, where several were added.
-        residual: (3, n) d, metres; likewise.
-        information: (6, n) M, symmetric; likewise.
+        weight: (n,) w, the robust weight; of the first term of a sum, as are `residual` and `information`.
+        residual: (3, n) d, metres.
+        information: (6, n) M, symmetric.
     """
 
     force: Float[Array, "3 n"]
@@ -44,7 +44,7 @@ class Forces(eqx.Module):
         )
 
     def scaled(self, factor: Float[Array, "n"]) -> Forces:
-        """Each correspondence counts so many times; 0 for none."""
+        """Force, stiffness, cost and weight of each correspondence multiplied by a factor."""
         return Forces(
             factor * self.force,
             factor * self.stiffness,
@@ -56,8 +56,8 @@ class Forces(eqx.Module):
 
 
 def weighed(residual: Float[Array, "3 n"], information: Float[Array, "6 n"], robust: AbstractKernel | None) -> Forces:
-    """Forces of residuals d with weight matrices M: cost ρ(dᵀ M d), weight w = ρ′."""
-    pull = alg.multiply(information, residual)
-    square = alg.inner(residual, pull)
+    """Forces of residuals d with information matrices M: cost ρ(dᵀ M d), weight w = ρ′(dᵀ M d); None: ρ(s²) = s²."""
+    gradient = alg.multiply(information, residual)
+    square = alg.inner(residual, gradient)
     weight, cost = (jnp.ones_like(square), square) if robust is None else (robust.weight(square), robust.rho(square))
-    return Forces(weight * pull, weight * information, cost, weight, residual, information)
+    return Forces(weight * gradient, weight * information, cost, weight, residual, information)

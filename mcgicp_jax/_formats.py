@@ -1,7 +1,7 @@
-"""The file formats of `mcgicp_jax.io`: one reader and one writer each, by means of the libraries kept for them.
+"""Readers and writers of the file formats of `mcgicp_jax.io`, based on one third-party library per format.
 
-A file is only as large as it is, whatever its header claims: each reader compares the two before it lets a third-party
-library allocate anything.
+Headers of damaged files can claim arbitrary sizes. Each reader therefore compares the claimed size with that of the
+file before a third-party library allocates memory.
 """
 
 from __future__ import annotations
@@ -37,13 +37,16 @@ _NOT_CHANNELS = re.compile(
     "[xyz_]|rgba?|a|(diffuse_)?alpha|n[xyz]|normal_[xyz]|curvature|vp_[xyz]|label|class|classification|object|instance|"
     "id|index|ring|line|tag|row|column|range|t|time|timestamp|gps_time|offset_time"
 )
-_KITTI_LIMIT = 1e5  # metres; float32 resolves 8 mm there
+# Metres: float32 resolves 8 mm at this distance; larger coordinates are not written, nor accepted as a KITTI scan.
+_KITTI_LIMIT = 1e5
+# Points per chunk: bounds the memory that laspy needs beyond the columns that are kept.
 _LAS_ROWS_AT_ONCE = 100_000
-# LASzip's layers of a point, each preceded by its length, by point format; earlier formats have none.
+# Number of LASzip layers per point format, each stored with its length; formats below 6 have no layers.
 _LAZ_LAYERS = {6: 9, 7: 10, 8: 11, 9: 10, 10: 12}
+# Bytes searched for the end of a PLY header, far more than the header of a cloud needs.
 _PLY_HEADER_BYTES = 2**20
-_LZF_RATIO = 100  # three bytes stand for at most 264
-_DEFLATE_RATIO = 1032
+# Bounds on the compression ratios of the formats: three bytes of LZF expand to at most 264; deflate reaches 1032.
+_LZF_RATIO, _DEFLATE_RATIO = 100, 1032
 
 
 def _extra(module: str, use: str) -> Any:
@@ -59,7 +62,7 @@ def _check_room(claimed: int, size: int) -> None:
 
 
 def _channel_name(column: str) -> str | None:
-    """The channel that a file's column is; None for what is no channel."""
+    """The name of the channel that a column holds; None if the column is not a channel."""
     bare = column.removeprefix("channel_")
     if bare != column and _channel_name(bare) != bare:
         return bare
@@ -68,15 +71,15 @@ def _channel_name(column: str) -> str | None:
 
 
 def _cloud(columns: Columns) -> PointCloud:
-    """A cloud from the named columns of a file, x, y, z among them."""
+    """Build a cloud from the named columns of a file, which must include x, y and z."""
     columns = {column: values for column, values in columns.items() if values.dtype.kind in "fiu"}
     axes = {column.lower(): values for column, values in columns.items() if column.lower() in ("x", "y", "z")}
     if len(axes) < 3:
-        raise ValueError(f"it has no numbers x, y, z; there are {', '.join(columns) or 'no columns'}")
+        raise ValueError(f"it has no numeric columns x, y, z; found {', '.join(columns) or 'no numeric columns'}")
     points = np.column_stack([axes[axis] for axis in "xyz"])
     points = points if points.dtype.kind == "f" else points.astype(np.float64)
     channels: dict[str, np.ndarray] = {}
-    # "intensity" itself comes before what may stand for it: a file can have both intensity and reflectivity.
+    # Exact names before aliases: if a file has intensity and reflectivity, the former becomes "intensity".
     for column in sorted(columns, key=lambda column: column not in _ORDER and _channel_name(column) in _ORDER):
         name = _channel_name(column)
         if name is not None:
@@ -86,7 +89,7 @@ def _cloud(columns: Columns) -> PointCloud:
 
 
 def _channel(name: str, values: Shaped[np.ndarray, "N"], dtype: np.dtype) -> Float[np.ndarray, "N"]:
-    """Floating-point values, no less exact than the file's; integer colours scaled to 0..1."""
+    """Convert to floating point without loss of precision; integer colours are scaled to 0..1."""
     if values.dtype.kind == "f":
         return values
     scale = 1 if name not in _COLOURS else 65535 if values.dtype.itemsize == 2 else 255
@@ -94,12 +97,12 @@ def _channel(name: str, values: Shaped[np.ndarray, "N"], dtype: np.dtype) -> Flo
 
 
 def _columns(cloud: PointCloud) -> Columns:
-    """The named columns that a cloud is in a file; colours as uint8 if that loses nothing."""
+    """The named columns to write for a cloud; colours as uint8 if that is lossless."""
     names = cloud.channel_names
     for name in names:
         if not re.fullmatch(r"[A-Za-z0-9_.\-]+", name) or names.count(name) > 1:
             raise ValueError(
-                f"channel_names: {name!r} is no column name (letters, digits, _ . -; once); .npz can hold it"
+                f"channel_names: expected unique names of letters, digits, _ . -, got {name!r}; .npz can hold it"
             )
     columns = dict(zip("xyz", cloud.points.T, strict=True))
     columns |= {_column_name(name): values for name, values in zip(names, cloud.channels.T, strict=True)}
@@ -120,7 +123,7 @@ def _read_ply(file: BinaryIO, size: int) -> PointCloud:
     if not end:
         raise ValueError("no PLY header")
     text = (head + end).decode("ascii").replace("\r\n", "\n").replace("\r", "\n") + "\n"
-    # plyfile allocates what the header claims: first it reads the header alone, with every count 0.
+    # plyfile allocates what the header claims, so the header is first parsed alone, with all counts set to 0.
     element = re.compile(r"^(\s*element\s+\S+\s+)(\S+)", re.MULTILINE)
     counts = [int(count) for _, count in element.findall(text)]
     layout = plyfile.PlyData.read(io.BytesIO(element.sub(r"\g<1>0", text).encode()))
@@ -130,12 +133,12 @@ def _read_ply(file: BinaryIO, size: int) -> PointCloud:
         raise ValueError("it has no vertices")
     file.seek(0)
     with io.TextIOWrapper(file, "ascii") if layout.text else file as stream:
-        vertex: Any = np.array(plyfile.PlyData.read(stream)["vertex"].data)  # a copy, not the file itself in memory
+        vertex: Any = np.array(plyfile.PlyData.read(stream)["vertex"].data)  # copied, since plyfile maps the file
     return _cloud({name: vertex[name] for name in vertex.dtype.names})
 
 
 def _ply_row_bytes(element: Any, text: bool) -> int:
-    """The fewest bytes that one row can have: lists are empty, numbers in text have one digit."""
+    """The smallest size of one row in bytes: empty lists; in text, one digit and one separator per number."""
     if text:
         return 2 * len(element.properties)
     return sum(np.dtype(getattr(prop, "len_dtype", prop.val_dtype)).itemsize for prop in element.properties)
@@ -158,7 +161,7 @@ def _read_pcd(file: BinaryIO, size: int) -> PointCloud:
     widths = [width * count for width, count in zip(metadata.size, metadata.count, strict=True)]
     if metadata.data == pypcd4.Encoding.ASCII:
         _check_room(2 * metadata.points * sum(metadata.count), size + 1)
-        # pypcd4 itself takes one space, and no other white space, between numbers.
+        # pypcd4's own ASCII reader accepts only single spaces between numbers.
         rows = np.loadtxt(file, metadata.build_dtype(), ndmin=1)
     else:
         if metadata.data == pypcd4.Encoding.BINARY:
@@ -169,7 +172,7 @@ def _read_pcd(file: BinaryIO, size: int) -> PointCloud:
         rows = pypcd4.PointCloud.from_fileobj(file).pc_data
     if len(rows) != metadata.points:
         raise ValueError(f"the header claims {metadata.points} points, the file has {len(rows)}")
-    # pypcd4 calls padding "#" and something random; it splits what has several values per point into other names.
+    # pypcd4 names padding fields "#" plus a random suffix, and renames fields with several values per point.
     names = [name for name in metadata.fields if name in rows.dtype.names and not name.startswith("#")]
     columns = {name: rows[name] for name in names}
     for packed in columns.keys() & {"rgb"} or columns.keys() & {"rgba"}:
@@ -179,7 +182,7 @@ def _read_pcd(file: BinaryIO, size: int) -> PointCloud:
 
 
 def _pcd_header(file: BinaryIO) -> list[str]:
-    """The lines up to the data, as pypcd4 takes them: without comments, ten at most."""
+    """The header lines in the form that pypcd4 parses: at most ten, without comments."""
     lines: list[str] = []
     while len(lines) < 10 and not (lines and lines[-1].startswith("DATA")):
         line = file.readline()
@@ -190,12 +193,12 @@ def _pcd_header(file: BinaryIO) -> list[str]:
 
 
 def _check_lzf(file: BinaryIO, claimed: int, size: int) -> None:
-    """A compressed block starts with its two lengths; pypcd4 would allocate the second unseen."""
+    """Check the two lengths at the start of a compressed block; pypcd4 allocates the second without a check."""
     compressed, raw = struct.unpack("<II", file.read(8))
     _check_room(compressed, size - file.tell())
     _check_room(raw, _LZF_RATIO * compressed)
     if raw != claimed:
-        raise ValueError(f"the header claims {claimed} bytes of points, the data {raw}")
+        raise ValueError(f"the header claims {claimed} bytes of points, the compressed data {raw}")
 
 
 def _write_pcd(file: BinaryIO, cloud: PointCloud) -> None:
@@ -215,7 +218,7 @@ def _read_las(file: BinaryIO, size: int) -> PointCloud:
     if len(head) < 104 or head[:4] != b"LASF":
         raise ValueError("no LAS header")
     start, records = struct.unpack_from("<II", head, 96)
-    # laspy reads as many of these records, 54 bytes and more each, as the header claims, there or not.
+    # laspy reads as many variable-length records as the header claims, at least 54 bytes each, even past the end.
     _check_room(max(start, 54 * records), size)
     file.seek(0)
     with laspy.open(file, closefd=False, read_evlrs=False, laz_backend=laspy.LazBackend.Lazrs) as reader:
@@ -240,15 +243,15 @@ def _read_las(file: BinaryIO, size: int) -> PointCloud:
 
 
 def _check_laz(file: BinaryIO, header: Any, size: int) -> None:
-    """lazrs allocates what the tables of a file claim, and ends the process where it cannot."""
+    """Check the chunk table: lazrs allocates the sizes claimed there and aborts the process if it cannot."""
     lazrs = _extra("lazrs", "reading .laz")
     item_bytes = lazrs.LazVlr(header.vlrs.get("LasZipVlr")[0].record_data).item_size()
     start, row_bytes = header.offset_to_point_data, header.point_format.size
     if item_bytes != row_bytes:
-        raise ValueError(f"its points have {row_bytes} bytes, or else {item_bytes}")
+        raise ValueError(f"the LAS header claims {row_bytes} bytes per point, the LASzip record {item_bytes}")
     file.seek(start)
     (table,) = struct.unpack("<q", file.read(8))
-    if table == -1:  # written as a stream: the place of the table stands at the end
+    if table == -1:  # written to a stream: the offset of the table is at the end of the file
         file.seek(size - 8)
         (table,) = struct.unpack("<q", file.read(8))
     file.seek(table)
@@ -276,10 +279,10 @@ def _write_las(file: BinaryIO, cloud: PointCloud, compress: bool) -> None:
     names = set(cloud.channel_names)
     if len(names) < len(cloud.channel_names) or names not in (set(), {"intensity"}, set(_COLOURS), set(_ORDER)):
         raise ValueError(
-            f"channel_names: LAS holds intensity and red, green, blue, not {cloud.channel_names}; .ply can"
+            f"channel_names: LAS holds intensity and red, green, blue, got {cloud.channel_names}; .ply holds others"
         )
     if not np.isfinite(cloud.points).all():
-        raise ValueError("points: LAS holds finite coordinates alone; .ply holds the others")
+        raise ValueError("points: LAS holds only finite coordinates; .ply also holds NaN and infinity")
     points = cloud.points.astype(np.float64)
     columns = dict(zip(cloud.channel_names, cloud.channels.T, strict=True))
     header = laspy.LasHeader(version="1.2", point_format=2 if "red" in names else 0)
@@ -291,7 +294,7 @@ def _write_las(file: BinaryIO, cloud: PointCloud, compress: bool) -> None:
     for name, values in columns.items():
         las[name] = _las_integers(name, values)
     if "red" in names and 0 < max(las[name].max() for name in _COLOURS) < 256:
-        raise ValueError("channels: colours this dark read as 8-bit ones in LAS; .ply holds them")
+        raise ValueError("channels: colours this dark would be read as 8-bit values from LAS; .ply holds them")
     las.write(file, do_compress=compress, laz_backend=laspy.LazBackend.Lazrs)
 
 
@@ -308,9 +311,9 @@ def _read_kitti(file: BinaryIO, size: int) -> PointCloud:
     if size % 16:
         raise ValueError(f"expected rows of four float32 values, got {size} bytes")
     rows = np.frombuffer(data, "<f4").reshape(-1, 4)
-    # The format has no mark of its own. Text is told by its bytes, other files mostly by their enormous numbers.
+    # The format has no signature. Text is recognised by its bytes, most other files by implausibly large coordinates.
     if (data.isascii() and b"\0" not in data) or _beyond_kitti(rows[:, :3]):
-        raise ValueError("these are no float32 coordinates in metres")
+        raise ValueError("it does not hold float32 coordinates in metres")
     rows = rows.astype(np.float32)
     return PointCloud(rows[:, :3], rows[:, 3], channel_names=["intensity"])
 
@@ -356,7 +359,7 @@ def _read_npz(file: BinaryIO, size: int) -> PointCloud:
 
         names = [name.removesuffix(".npy") for name in archive.namelist()]
         if "points" not in names:
-            raise ValueError(f"it has no array 'points'; there are {', '.join(names)}")
+            raise ValueError(f"it has no array 'points'; found {', '.join(names)}")
         points = np.asarray(PointCloud(load("points")).points)
         if "channels" in names:
             return PointCloud(
@@ -400,7 +403,7 @@ def _read_text(file: BinaryIO, size: int) -> PointCloud:
 
 
 def _text_start(text: io.TextIOWrapper) -> tuple[list[str], str, list[str]]:
-    """The names of the columns, if there are any; the first line of numbers, and its numbers."""
+    """The column names, if given, the first line of numbers, and its cells."""
     names: list[str] = []
     for line in text:
         comment = line.startswith(("#", "//"))
@@ -410,7 +413,7 @@ def _text_start(text: io.TextIOWrapper) -> tuple[list[str], str, list[str]]:
         if {"x", "y", "z"} <= {cell.lower() for cell in cells}:
             names = cells
         elif not comment and cells != [""]:
-            raise ValueError(f"neither numbers nor column names with x, y, z: {line.strip()[:60]!r}")
+            raise ValueError(f"expected numbers or column names with x, y, z, got {line.strip()[:60]!r}")
     raise ValueError("it has no row of numbers")
 
 
@@ -425,17 +428,17 @@ def _is_number(cell: str) -> bool:
 def _write_text(file: BinaryIO, cloud: PointCloud, delimiter: str, mark: str) -> None:
     _columns(cloud)
     names = ["x", "y", "z", *map(_column_name, cloud.channel_names)]
-    # Widened first, since "%s" prints the shortest number that gives the same one back in its own precision.
+    # "%s" prints the shortest number that is exact in its own dtype, so all values are converted to float64 first.
     table = np.column_stack([cloud.points, cloud.channels]).astype(np.float64)
     np.savetxt(file, table, fmt="%s", delimiter=delimiter, header=delimiter.join(names), comments=mark)
 
 
 def by_suffix(table: dict[str, Callable[..., Any]], path: Path) -> Callable[..., Any]:
-    """The reader or writer of a file; raises `ValueError` for a suffix that is in no table."""
+    """The reader or writer for the suffix of a path; raises `ValueError` for an unknown suffix."""
     try:
         return table[path.suffix.lower()]
     except KeyError:
-        raise ValueError(f"{path}: unknown suffix {path.suffix!r}; there are {', '.join(table)}") from None
+        raise ValueError(f"{path}: unknown suffix {path.suffix!r}; expected one of {', '.join(table)}") from None
 
 
 READERS: dict[str, Callable[[BinaryIO, int], PointCloud]] = {

@@ -1,13 +1,13 @@
-"""The loop on the host: compiled programs over blocks of rows, matches from an index between them.
+"""The registration loop on the host: compiled programs over blocks of rows, with searches for matches in between.
 
-A point's way from `PointCloud` to `Registration`, in ten sentences. `preprocess` gives it k neighbours. `describe`
-computes a row of local statistics from these, whatever the method. `method.covariance` and the local statistics give it
-a row of a surface: position, covariance, observability. A search finds, at the current pose, its nearest target point
-in position and α · channel. NumPy gathers the target's row beside its own. `method.forces` says what the two do to the
-pose: force, stiffness and cost. `sums_of` adds these up over a block of correspondences, and `combine` over all blocks.
-`update` computes the next pose from the sums, and the steps repeat until the pose no longer moves. `scores_of` says,
-once more for each point, what its force tells of the covariance of the pose. `Registration` holds the pose, how the
-loop ended, and that covariance.
+The way of a source point from `PointCloud` to `Registration`, in ten sentences. `preprocess` finds the k nearest
+neighbours of the point. `describe` computes local statistics from the neighbourhood: covariance, normal, channel fits.
+`method.covariance` and `channel_observability` turn these into the point's row of a `Surface`: position, covariance,
+observability. The search finds the target point nearest to the moved point in position and α · channel. NumPy gathers
+the surface row of this target point. `method.forces` computes force, stiffness and cost of the correspondence from the
+two rows. `sums_of` adds them over a block of correspondences, and `combine` adds the blocks. `update` computes the next
+pose from the sums, and search, sums and update repeat until the pose converges. At the final pose, `scores_of` computes
+the contribution of each correspondence to the covariance. `Registration` holds the pose, its status and its covariance.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ from mcgicp_jax._sums import Matched, Sums, combine, move_rows, sums_of, within
 from mcgicp_jax._surface import Surface
 from mcgicp_jax._uncertainty import Details, Scores, discount_rows, discounts, scatter_of, scores_of
 
-# Rotation and translation of a pose.
+# Rotation matrix and translation (metres) of a pose.
 Moving: TypeAlias = tuple[Float[AnyArray, "3 3"], Float[AnyArray, "3"]]
 
 
@@ -77,12 +77,12 @@ def register_on_host(
 
 
 def _every(stride: int, source: Surface) -> Surface:
-    """Every so many-th row of a surface."""
+    """Every `stride`-th row of a surface."""
     return source if stride == 1 else jax.tree.map(lambda array: np.ascontiguousarray(array[::stride]), source)
 
 
 class _Matches:
-    """Source rows, and the target row that each has been matched with."""
+    """Source rows, the target row matched with each, and whether there is one."""
 
     def __init__(self, source: Surface, target: Surface, indices: Int[np.ndarray, "N"]):
         self.source, self.target = source, target
@@ -91,11 +91,11 @@ class _Matches:
         self.size = indices.size
 
     def rows_at(self, index: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Source and target rows, and which have a match."""
+        """Table rows of source and target, and which source rows have a match."""
         return self.source.table[index], self.target.table[self.rows[index]], self.found[index]
 
     def block(self, index: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """The same of a block; rows that are repeated to fill it have no match."""
+        """`rows_at` for a block; rows repeated to fill the last block count as unmatched."""
         source, target, found = self.rows_at(index)
         if not isinstance(index, slice):
             found[self.size - index[0] :] = False
@@ -108,13 +108,13 @@ class _Matches:
 
 
 def _moving(pose: jaxlie.SE3, dtype: Any) -> Moving:
-    """Rotation and translation of a pose, with NumPy."""
+    """Rotation matrix and translation of a pose, computed with NumPy."""
     parameters = np.asarray(pose.wxyz_xyz)
     return rotation_from_quaternion(parameters[:4].astype(np.float64)).astype(dtype), parameters[4:]
 
 
 def _measure(pose: jaxlie.SE3, matches: _Matches, gate: Float[AnyScalar, ""], problem: Problem) -> Sums:
-    """The sums at a pose over the matches within a gate, metres."""
+    """The sums at a pose over the matches within the maximum correspondence distance `gate`, metres."""
     moving = _moving(pose, matches.source.table.dtype)
 
     def sums(index: Any) -> Sums:
@@ -151,7 +151,7 @@ def _matched(
 def _covariance(
     state: State, matches: _Matches, gate: Float[AnyScalar, ""], problem: Problem, num_threads: int | None
 ) -> Float[Array, "6 6"]:
-    """The covariance of the pose of a loop that has ended."""
+    """Covariance of the final pose."""
     source, target = matches.source, matches.target
     moving = _moving(state.pose, source.table.dtype)
     some, counts = sampled_rows(source.rows.valid)
@@ -223,7 +223,7 @@ def _scores(
 def correspondences_at(
     matrix: Float[np.ndarray, "4 4"], source: Rows, target: Rows, indices: Int[np.ndarray, "m N"], gate: float
 ) -> Correspondences:
-    """Matches within a gate, metres of position; NumPy, so that nothing is compiled."""
+    """Matches at a pose, valid within `gate` metres of position; NumPy, so that nothing is compiled."""
     rows, dtype = np.maximum(indices, 0), source.points.dtype
     with np.errstate(invalid="ignore"):
         moved = source.points.astype(np.float64) @ matrix[:3, :3].T + matrix[:3, 3]

@@ -1,4 +1,4 @@
-"""What has been computed of a cloud is kept as long as the cloud is used."""
+"""A cache of quantities computed from a cloud, such as its surface, which lives no longer than the cloud."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ from mcgicp_jax._cloud import PointCloud
 
 Value = TypeVar("Value")
 
-# Rows of the clouds that something is kept of: hundreds of scans, some hundred megabytes.
+# Total number of rows of the clouds in the cache: hundreds of scans, some hundred megabytes.
 _KEPT_ROWS = 2_000_000
-# What is kept of one cloud for each kind of thing, such as surfaces of different methods.
+# Number of values kept per cloud and kind, such as its surfaces for two methods.
 _KEPT_EACH = 2
 
 
 class _Keeper:
-    """What has been computed of clouds, by the identity of the cloud; of the least recently used, it goes first."""
+    """Values computed from clouds, by identity of the cloud; the least recently used clouds are evicted first."""
 
     def __init__(self, rows: int):
         self._rows = rows
@@ -27,11 +27,11 @@ class _Keeper:
         self._kept: collections.OrderedDict[int, tuple[Any, int, dict[str, dict[Hashable, Any]]]] = (
             collections.OrderedDict()
         )
-        # Identities of clouds that are no more. Their end may come at any moment, as in the middle of a lookup.
+        # Identities of collected clouds. Weak references report them at any moment, even during a lookup.
         self._gone: collections.deque[int] = collections.deque()
 
     def get(self, cloud: PointCloud, kind: str, key: Hashable, make: Callable[[], Value]) -> Value:
-        """What was made before for this cloud, kind and key, or else what `make` returns."""
+        """The cached value for this cloud, kind and key, or else the result of `make`, which is then cached."""
         number = id(cloud)
         with self._lock:
             self._forget_gone()

@@ -1,4 +1,4 @@
-"""Robust kernels of the Mahalanobis distance of one correspondence."""
+"""Robust kernels: costs and weights as functions of the Mahalanobis distance of one correspondence."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from mcgicp_jax._pose import canonical_float, is_concrete
 
 
 class Numbers(eqx.Module):
-    """A module of a few numbers, whose `repr` shows them."""
+    """An equinox module with numeric fields, whose `repr` shows their values."""
 
     def __repr__(self) -> str:
         parts = []
@@ -30,17 +30,17 @@ class Numbers(eqx.Module):
 
 
 class AbstractKernel(Numbers):
-    """A robust kernel ρ of the squared Mahalanobis distance s² of one correspondence; ρ(s²) ≈ s² for small distances.
+    """A robust kernel: cost ρ(s²) and weight dρ/d(s²) of a correspondence with Mahalanobis distance s; ρ ≈ s² near 0.
 
     Attributes:
-        scale: k, the Mahalanobis distance from which a correspondence counts less; metres, as GICP's covariances are
-            relative (1 within the surface).
+        scale: k, the Mahalanobis distance beyond which a correspondence is downweighted; in metres, since the
+            covariances of GICP are dimensionless (1 within the surface).
     """
 
     scale: Float[Array, ""]
 
     def __init__(self, scale: ArrayLike):
-        """Raises `ValueError` unless the scale is positive."""
+        """`scale` is k. Raises `ValueError` unless it is one positive, finite number."""
         known = is_concrete(scale)
         self.scale = jax.device_put(np.asarray(scale, canonical_float())) if known else jnp.asarray(scale)
         if self.scale.shape != () or (is_concrete(self.scale) and not 0 < float(self.scale) < np.inf):
@@ -53,16 +53,16 @@ class AbstractKernel(Numbers):
     def _weight(self, square: Float[Array, "N"], scale: Float[Array, ""]) -> Float[Array, "N"]: ...
 
     def rho(self, square: Float[Array, "N"]) -> Float[Array, "N"]:
-        """The cost of correspondences with squared distance s²."""
+        """ρ(s²), the cost of each correspondence; `square` is s², metres²."""
         return self._rho(square, self.scale.astype(square.dtype))
 
     def weight(self, square: Float[Array, "N"]) -> Float[Array, "N"]:
-        """dρ/d(s²): the weight of a correspondence."""
+        """dρ/d(s²), the weight of each correspondence, 1 at s = 0; `square` is s², metres²."""
         return self._weight(square, self.scale.astype(square.dtype))
 
 
 class Huber(AbstractKernel):
-    """s² up to k, 2ks − k² beyond."""
+    """Huber kernel: ρ = s² for s up to k, 2ks − k² beyond."""
 
     def _rho(self, square: Float[Array, "N"], scale: Float[Array, ""]) -> Float[Array, "N"]:
         beyond = square > scale**2
@@ -75,7 +75,7 @@ class Huber(AbstractKernel):
 
 
 class Cauchy(AbstractKernel):
-    """k² log(1 + s²/k²)."""
+    """Cauchy kernel: ρ = k² log(1 + s²/k²)."""
 
     def _rho(self, square: Float[Array, "N"], scale: Float[Array, ""]) -> Float[Array, "N"]:
         return scale**2 * jnp.log1p(square / scale**2)
@@ -85,7 +85,7 @@ class Cauchy(AbstractKernel):
 
 
 class GemanMcClure(AbstractKernel):
-    """s² / (1 + s²/k²)."""
+    """Geman-McClure kernel: ρ = s² / (1 + s²/k²)."""
 
     def _rho(self, square: Float[Array, "N"], scale: Float[Array, ""]) -> Float[Array, "N"]:
         return square / (1 + square / scale**2)
@@ -95,7 +95,7 @@ class GemanMcClure(AbstractKernel):
 
 
 class Tukey(AbstractKernel):
-    """k²/3 (1 − (1 − s²/k²)³) up to k, constant beyond: such correspondences have no weight."""
+    """Tukey's biweight kernel: ρ = k²/3 (1 − (1 − s²/k²)³) for s up to k; constant beyond, with weight 0."""
 
     def _rho(self, square: Float[Array, "N"], scale: Float[Array, ""]) -> Float[Array, "N"]:
         return scale**2 / 3 * (1 - jnp.maximum(1 - square / scale**2, 0) ** 3)

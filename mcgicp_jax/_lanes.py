@@ -1,4 +1,7 @@
-"""Many registrations as the lanes of one compiled program, without callbacks: for accelerators."""
+"""Many registrations as lanes of one vectorised program without callbacks, for accelerators.
+
+A lane is one registration of the vectorised batch. When it ends, another problem takes its place.
+"""
 
 from __future__ import annotations
 
@@ -20,24 +23,23 @@ from mcgicp_jax._traced import Carry, assess, begin, cleaned, step_of_lane
 Key = TypeVar("Key")
 Ended: TypeAlias = tuple[Key, State, Assessment, dict[str, np.ndarray]]
 
-# Of one device. On a CPU the lanes that wait for others cost as much as those that work.
+# Lanes per device; few on a CPU, where finished lanes that wait for the others cost as much as active ones.
 _LANES = 64
 _LANES_ON_CPU = 4
-# Problems of other shapes, at most, that a problem waits for before its lanes run half empty: results of a stream come
-# out while it goes on, and lanes that nobody needs give their memory back.
+# A group of lanes runs partly filled after this many problems of other shapes: a stream of problems yields results
+# while it goes on, and unused groups free their memory.
 _PATIENCE = 256
-# Of every lane, before those that have ended give way to others: few registrations take less, and a slow one then
-# keeps one lane busy, not all.
+# Loop steps of all lanes between two refills. Few registrations take less, and a slow one blocks only its own lane.
 _STEPS = 4
 
 
 def run_problems(
     problems: Iterable[tuple[Key, Problem]], search: AbstractSearch, max_iterations: int
 ) -> Iterator[Ended[Key]]:
-    """Run the loop of `register` on problems, many at a time; hand out how each has ended, as soon as it has.
+    """Run the loop of `register` on many problems at a time, and yield each result as soon as it is known.
 
-    Problems of the same shapes share a program. Its number of lanes is fixed, so that a result does not depend on what
-    else there is to do. With several local devices the lanes are spread over them.
+    Problems of the same shapes share a program. Its number of lanes is fixed, so that a result does not depend on the
+    other problems. The lanes are spread over all local devices. Yields key, final state, assessment and history.
     """
     groups: dict[Any, _Group[Key]] = {}
     last: dict[Any, int] = {}
@@ -60,7 +62,7 @@ def run_problems(
 
 
 class _Group(Generic[Key]):
-    """Lanes of problems that have the same shapes."""
+    """Lanes for problems of the same shapes."""
 
     def __init__(self, example: Problem, search: AbstractSearch, max_iterations: int):
         self._search = search
@@ -71,7 +73,7 @@ class _Group(Generic[Key]):
         sharding = NamedSharding(Mesh(np.array(devices), ("lanes",)), PartitionSpec("lanes"))
         self._put = jax.jit(_put, donate_argnums=0, out_shardings=sharding)
         lane = example, begin_lane(example, search, max_iterations)
-        # A status of zero is one that has ended.
+        # Empty lanes have status 0, which counts as finished.
         stack = partial(jax.tree.map, lambda leaf: jnp.zeros((len(self._keys), *leaf.shape), leaf.dtype))
         self._lanes: tuple[Problem, Carry] = jax.jit(stack, out_shardings=sharding)(lane)
 
@@ -87,11 +89,11 @@ class _Group(Generic[Key]):
         self._lanes = self._put(self._lanes, (problem, begin_lane(problem, self._search, self._max_iterations)), free)
 
     def run(self) -> Iterator[Ended[Key]]:
-        """Some steps of all lanes; those that have ended are handed out, and free."""
+        """Run `_STEPS` steps of all lanes; yield the results of finished lanes and free these lanes."""
         problems, carries = self._lanes
         carries = run_lanes(problems, carries, self._search, _STEPS)
         self._lanes = problems, carries
-        # Not the matches: they stay where they are.
+        # The matches are not copied to the host.
         ended = np.asarray(carries[0].status) >= 0
         if not any(ended[lane] and key is not None for lane, key in enumerate(self._keys)):
             return
@@ -100,7 +102,7 @@ class _Group(Generic[Key]):
             if key is not None and ended[lane]:
                 self._keys[lane] = None
                 state, assessed = jax.tree.map(lambda leaf, lane=lane: leaf[lane], (states, assessments))
-                # Of the measurements that were made, one more than updates.
+                # One history entry per update, and one at the returned pose.
                 count = int(state.num_iterations) + 1
                 yield key, state, assessed, history_of(records[lane, :count])
 
@@ -111,13 +113,13 @@ def _put(lanes: tuple[Problem, Carry], lane: tuple[Problem, Carry], number: Int[
 
 @partial(jax.jit, static_argnames="max_iterations")
 def begin_lane(problem: Problem, search: AbstractSearch, max_iterations: int) -> Carry:
-    """The loop of `register` before its first step."""
+    """Initial carry of the loop of `register`, compiled."""
     return begin(problem, search, max_iterations)
 
 
 @partial(jax.jit, static_argnames="num_steps")
 def run_lanes(problems: Problem, carries: Carry, search: AbstractSearch, num_steps: int) -> Carry:
-    """Some steps of many loops at once, whose arrays are stacked; those that have ended stay as they are."""
+    """Run at most `num_steps` steps of many stacked loops; finished loops do not change."""
 
     def run(problem: Problem, carry: Carry) -> Carry:
         return jax.lax.while_loop(
@@ -131,7 +133,7 @@ def run_lanes(problems: Problem, carries: Carry, search: AbstractSearch, num_ste
 
 @jax.jit
 def assess_lanes(problems: Problem, carries: Carry) -> Assessment:
-    """Covariance and directions of loops that have ended."""
+    """Information matrices, directions and covariances of stacked loops, at their current poses."""
 
     def of_lane(problem: Problem, carry: Carry) -> Assessment:
         state, matches, _ = carry

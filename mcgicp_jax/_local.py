@@ -20,9 +20,10 @@ from mcgicp_jax._threads import side_by_side
 
 Tree = TypeVar("Tree")
 
-# Neighbourhoods of more points than that are gone through block by block inside transformations, too: on CPUs XLA sums
-# over the first axis of tables of more columns column by column, which is twenty times slower.
+# Points. Inside transformations, neighbourhoods of more points are processed in blocks, too: on CPUs XLA sums over the
+# first axis of a wider table column by column, which is twenty times slower.
 _LARGEST_WHOLE = 16_000
+# Largest number of points in such a block; below the limit above.
 _LARGEST_BLOCK = 8192
 
 
@@ -32,21 +33,24 @@ def locals_of(
     """Local statistics of two preprocessed clouds.
 
     Args:
-        with_channels: whether the method uses the channels; otherwise they select no program.
-        num_threads: on the host, at most; None for as many as there is use for.
+        with_channels: whether the method uses the channels; if not, the programs do not depend on their number.
+        num_threads: largest number of threads on the host; None for no limit.
+
+    Returns:
+        Statistics of the source and of the target.
     """
     if is_concrete(source, target):
         calls = [partial(local_on_host, cloud, with_channels, num_threads) for cloud in (target, source)]
         found_target, found_source = side_by_side(calls, num_threads)
         return found_source, found_target
-    # Of a concrete cloud beside a traced one as well: that costs no program of its own.
+    # A concrete cloud beside a traced one is traced as well, which needs no program of its own.
     if not share_a_body(source, target):
         return _traced(source, with_channels), _traced(target, with_channels)
     return split(_traced(joined(source, target, with_channels), with_channels), source.points.shape[0])
 
 
 def local_on_host(cloud: PointCloud, with_channels: bool, num_threads: int | None = 1) -> Local:
-    """Local statistics of a concrete cloud, kept as long as it is used; NumPy arrays."""
+    """Local statistics of a concrete cloud as NumPy arrays, cached with the cloud."""
 
     def make() -> Local:
         gather = gatherer(cloud, with_channels, np)
@@ -64,15 +68,15 @@ def _traced(cloud: PointCloud, with_channels: bool) -> Local:
 
 
 def share_a_body(source: PointCloud, target: PointCloud) -> bool:
-    """Whether both clouds go through one compiled body, row beside row: unless that costs more than it saves."""
+    """Whether both clouds are concatenated for one compiled body; for large clouds this costs more than it saves."""
     return source.points.shape[0] + target.points.shape[0] <= _LARGEST_WHOLE
 
 
 def over_rows(function: Callable[[Any], Tree], num_rows: int) -> Tree:
-    """What a function makes of rows, inside transformations; many rows are gone through block by block.
+    """The result of a function for all rows, inside transformations; many rows are processed in blocks.
 
     Args:
-        function: takes a slice or row numbers; its arrays have the rows as their first dimension.
+        function: maps a slice or an array of row numbers to a pytree of arrays whose first axis are these rows.
     """
     if num_rows <= _LARGEST_WHOLE:
         return function(slice(None))
@@ -84,7 +88,7 @@ def over_rows(function: Callable[[Any], Tree], num_rows: int) -> Tree:
 
 
 def joined(source: PointCloud, target: PointCloud, with_channels: bool) -> PointCloud:
-    """Both clouds in one, so that one compiled body serves both; of arrays for neighbourhoods alone."""
+    """Both clouds concatenated, for one compiled body; with only the arrays that neighbourhoods need."""
     size = source.points.shape[0]
 
     def both(name: str) -> Any:
@@ -114,5 +118,5 @@ def joined(source: PointCloud, target: PointCloud, with_channels: bool) -> Point
 
 
 def split(both: Tree, size: int) -> tuple[Tree, Tree]:
-    """The rows of the source, and those of the target."""
+    """The rows of the source (the first `size`) and of the target, after `joined`."""
     return jax.tree.map(lambda rows: rows[:size], both), jax.tree.map(lambda rows: rows[size:], both)

@@ -1,4 +1,4 @@
-"""The five methods as settings of one machine: which covariance a point has, and in which space matches are sought."""
+"""The five registration methods: their covariances and information matrices, and the space of the search."""
 
 from __future__ import annotations
 
@@ -24,36 +24,43 @@ from mcgicp_jax._pose import AnyArray, canonical_float, is_concrete
 from mcgicp_jax._statistics import constant, namespace
 from mcgicp_jax._surface import Local, Neighborhoods, Table, covariance_of, points_of
 
-# Between aligned real scans (RGB-D and LiDAR), the standard deviation of the channels' differences was 0.9 to 2.6 times
-# what the noise within each scan gives, in the geometric mean this.
+# Ratio. Between aligned real scans (RGB-D and LiDAR), the standard deviation of the channels' differences was 0.9 to
+# 2.6 times the value expected from the noise within each scan; this is the geometric mean.
 _SPREAD = 1.5
-# In spacings of the target.
-_REACH = 2.5
-# The least floor of Ω, and the variance of a match along each axis of a surface whose points lie at random, spacing².
+# In spacings of the target: α σ, the position offset that weighs as much as one σ of a channel.
+_OFFSET_PER_SIGMA = 2.5
+# Floor of Ω's eigenvalues, relative to GICP's in-plane variance of 1: default, and least value chosen from the data.
 _MIN_EIGENVALUE = 5e-3
+# Variance of a match along each tangent axis, spacing²: 1/(2 ln 2) for randomly placed points (Poisson process), whose
+# squared nearest-neighbour distance r² has the mean E and the median E ln 2.
 _MATCH_VARIANCE = 0.72
 
 
 class AbstractMethod(Numbers):
-    """A registration method. Its numbers are arrays, so that gradients can be taken with respect to a method.
+    """A registration method. Its parameters are arrays, so that gradients can be taken with respect to them.
 
-    A subclass says which covariance a point has, and how a correspondence is weighed with those of its two points.
+    A subclass defines the covariance of a point, and the information matrix of a correspondence given those of its two
+    points. Parameters that are None are chosen from the data by `resolve`.
     """
 
     uses_channels: ClassVar[bool] = False
-    # Whether `covariance` looks at neighbours one by one, beyond their local statistics.
+    # Whether `covariance` needs the individual neighbours, beyond their local statistics.
     uses_neighborhoods: ClassVar[bool] = False
 
     def is_open(self, source: PointCloud, target: PointCloud) -> bool:
-        """Whether a number has been left to be chosen from the data."""
+        """Whether a parameter is to be chosen from the data of these clouds."""
         return False
 
     def chosen(self, source: PointCloud, target: PointCloud, locals: tuple[Local, Local]) -> AbstractMethod:
-        """The method with every open number chosen from the data, given the local statistics of both clouds."""
+        """The method with every unset parameter chosen from the data, given the local statistics of both clouds."""
         return self
 
     def resolve(self, source: PointCloud, target: PointCloud) -> AbstractMethod:
-        """The method with every open number chosen from the data of two preprocessed clouds; constants to autodiff."""
+        """The method with every unset parameter chosen from two preprocessed clouds; constants to autodiff.
+
+        Raises:
+            ValueError: if a parameter is unset and a cloud was not preprocessed.
+        """
         if not self.is_open(source, target):
             return self
         return self.chosen(source, target, locals_of(source, target, with_channels=True))
@@ -66,19 +73,27 @@ class AbstractMethod(Numbers):
         local: Local | None,
         given: Float[Array, "6 n"] | None,
     ) -> Float[Array, "6 n"]:
-        """Symmetric 3×3 matrices of some points, whose meaning is the method's affair.
+        """A symmetric 3×3 matrix for each of n points (positions in metres): the input of `information`.
 
         Args:
-            around: neighbourhoods; None unless the method says `uses_neighborhoods`.
-            local: their statistics; None for clouds that were not preprocessed.
-            given: covariances that the cloud brings; None if it brings none.
+            around: neighbourhoods of the points; None unless the method `uses_neighborhoods`.
+            local: their local statistics; None for a cloud that was not preprocessed.
+            given: covariances given with the cloud; None if there are none.
+
+        Raises:
+            ValueError: if the method needs neighbours or a parameter that are missing.
         """
 
     @abc.abstractmethod
     def information(
         self, target: Float[Array, "6 N"], source: Float[Array, "6 N"], rotation: Float[Array, "3 3"]
     ) -> Float[Array, "6 N"]:
-        """M of each correspondence, the weight matrix of its residual b − T a, in the target's frame."""
+        """M of each correspondence: the information matrix of its residual b − T a, in the target's frame.
+
+        Args:
+            target, source: matrices from `covariance` of the matched points, each in the frame of its own cloud.
+            rotation: of T_target_source.
+        """
 
     def forces(
         self,
@@ -89,28 +104,30 @@ class AbstractMethod(Numbers):
         valid: Bool[Array, "N"],
         robust: AbstractKernel | None,
     ) -> Forces:
-        """What each correspondence does to a pose. Terms add: `super().forces(...) + more`.
+        """Force, stiffness and cost of each correspondence. A subclass can add terms: `super().forces(...) + more`.
 
         Args:
             source, target: matched rows of the surfaces' tables, see `_surface`.
-            moved: T a.
+            moved: T a, the moved source points, metres.
+            rotation: of T_target_source.
             valid: which correspondences count; the residual of the others is 0.
+            robust: kernel of the Mahalanobis distance; None for the squared distance.
         """
         residual = jnp.where(valid, points_of(target) - moved, 0)
         information = self.information(covariance_of(target), covariance_of(source), rotation)
         return weighed(residual, information, robust)
 
     def weights(self, num_channels: int) -> Float[AnyArray, "C"] | None:
-        """α of each channel, metres per channel unit; None where a method matches by position alone."""
+        """α of each channel, metres per channel unit; None if the method searches in position alone."""
         return None
 
     def missing_variances(self, num_channels: int) -> Float[AnyArray, "C"]:
-        """The variance of a channel's difference in a true match, channel units², for channels that points lack."""
+        """Expected squared difference of each channel in a true match, channel units²: for missing channels."""
         raise NotImplementedError
 
 
 class AbstractOneSided(AbstractMethod):
-    """Methods whose weight matrix M is known from the target alone."""
+    """Methods whose information matrix M depends on the target alone."""
 
     def information(
         self, target: Float[Array, "6 N"], source: Float[Array, "6 N"], rotation: Float[Array, "3 3"]
@@ -132,7 +149,7 @@ class PointToPoint(AbstractOneSided):
 
 
 class PointToPlane(AbstractOneSided):
-    """Point-to-plane ICP (Chen & Medioni 1991): M = n nᵀ with the target's normals."""
+    """Point-to-plane ICP (Chen & Medioni 1991): M = n nᵀ with the normals n of the target."""
 
     def covariance(
         self,
@@ -149,8 +166,8 @@ class ColorICP(AbstractOneSided):
 
     Attributes:
         channel_weights: α, scalar or (C,), metres per channel unit.
-        missing_variance: (C,), channel units²: how far the search takes a channel to differ, squared, where one point
-            of a correspondence lacks it. None: from the data if points do, see `chosen`.
+        missing_variance: scalar or (C,), channel units²: the squared difference that the search assumes for a channel
+            if a point of a correspondence lacks it. None: chosen from the data if points lack channels, see `chosen`.
     """
 
     uses_channels: ClassVar[bool] = True
@@ -159,7 +176,7 @@ class ColorICP(AbstractOneSided):
     missing_variance: Float[Array, "..."] | None
 
     def __init__(self, channel_weights: Values):
-        """Raises `ValueError` if a weight is negative or not finite."""
+        """Raises `ValueError` if a weight is negative or not finite, or has the wrong shape."""
         self.channel_weights = _weights(channel_weights)
         self.missing_variance = None
 
@@ -168,8 +185,7 @@ class ColorICP(AbstractOneSided):
         return lacking and self.missing_variance is None
 
     def chosen(self, source: PointCloud, target: PointCloud, locals: tuple[Local, Local]) -> ColorICP:
-        """Where points lack channels: the variance of a difference between two measurements of one spot, the Λ that
-        `MultiChannelGICP` chooses. Constant to autodiff."""
+        """The method with `missing_variance` set to the Λ that `MultiChannelGICP` chooses; constant to autodiff."""
         variance = MultiChannelGICP(channel_weights=0.0).chosen(source, target, locals).channel_covariance
         return eqx.tree_at(lambda method: method.missing_variance, self, variance, is_leaf=lambda leaf: leaf is None)
 
@@ -183,16 +199,16 @@ class ColorICP(AbstractOneSided):
         return _identity(points)
 
     def weights(self, num_channels: int) -> Float[AnyArray, "C"]:
-        return _spread_out(self.channel_weights, num_channels)
+        return _per_channel("channel_weights", self.channel_weights, num_channels)
 
     def missing_variances(self, num_channels: int) -> Float[AnyArray, "C"]:
         if self.missing_variance is None:
             raise ValueError("missing_variance: not chosen yet; call method.resolve(source, target) first")
-        return _spread_out(self.missing_variance, num_channels)
+        return _per_channel("missing_variance", self.missing_variance, num_channels)
 
 
 class AbstractGeneralized(AbstractMethod):
-    """Methods that weigh a correspondence with the covariances of both of its points: M = (C^B + R C^A Rᵀ)⁻¹."""
+    """Methods that use the covariances of both points of a correspondence: M = (C^B + R C^A Rᵀ)⁻¹."""
 
     def information(
         self, target: Float[Array, "6 N"], source: Float[Array, "6 N"], rotation: Float[Array, "3 3"]
@@ -204,7 +220,7 @@ class GICP(AbstractGeneralized):
     """Generalized ICP (Segal, Haehnel & Thrun 2009), plane to plane.
 
     Attributes:
-        epsilon: ε, the variance across the surface relative to that within it.
+        epsilon: ε, the variance along the normal, relative to the variance of 1 within the surface.
     """
 
     epsilon: Float[Array, ""]
@@ -226,17 +242,17 @@ class GICP(AbstractGeneralized):
 class MultiChannelGICP(AbstractGeneralized):
     """Multi-channel generalized ICP (Servos & Waslander, ICRA 2014).
 
-    The covariance of a point is ε across its surface and Ω within it (eqs. 6-10): small in the directions in which the
-    channels tell the point from its neighbours. Matches are nearest in position and α · channel.
+    The covariance of a point is ε along the normal and Ω within the surface (eqs. 6-10): small in the directions in
+    which the channels distinguish the point from its neighbours. Matches are nearest in position and α · channel.
 
     Attributes:
-        channel_covariance: Λ of eq. 7, scalar or (C,) variances or (C, C), channel units²; how far the channel values
-            of two measurements of one and the same spot lie apart. None: from the data, see `chosen`.
-        channel_weights: α, scalar or (C,), metres per channel unit. None: from the data, see `chosen`.
+        channel_covariance: Λ of eq. 7, scalar or (C,) variances or (C, C), channel units²: the covariance of the
+            difference of two measurements of the same spot. None: chosen from the data, see `chosen`.
+        channel_weights: α, scalar or (C,), metres per channel unit. None: chosen from the data, see `chosen`.
         epsilon: ε, as in `GICP`.
-        min_eigenvalue: floor of Ω's eigenvalues, where nothing nearby looks alike. A match is one of the samples, and
-            no sample lies just where it should: within the surface it cannot hold as well as across it. None: chosen
-            along with Λ, see `chosen`; 0.005 with a Λ that is given.
+        min_eigenvalue: floor of Ω's eigenvalues, reached where no neighbour has similar channels. Since the target is
+            sampled, a match is less accurate within the surface than along the normal, whatever the channels. None:
+            chosen along with Λ, see `chosen`; 0.005 if Λ is given.
     """
 
     uses_channels: ClassVar[bool] = True
@@ -254,7 +270,8 @@ class MultiChannelGICP(AbstractGeneralized):
         epsilon: ArrayLike = 1e-3,
         min_eigenvalue: ArrayLike | None = None,
     ):
-        """Raises `ValueError` if Λ is not positive definite, a weight is negative, or ε or the floor not positive."""
+        """Raises `ValueError` unless Λ is symmetric and positive definite, α finite and not negative, ε positive and
+        large enough for the precision, and the floor positive; or if a shape is wrong."""
         self.channel_covariance = None if channel_covariance is None else _covariance(channel_covariance)
         self.channel_weights = None if channel_weights is None else _weights(channel_weights)
         self.epsilon = _epsilon(epsilon)
@@ -264,18 +281,19 @@ class MultiChannelGICP(AbstractGeneralized):
         return self.channel_covariance is None or self.channel_weights is None
 
     def chosen(self, source: PointCloud, target: PointCloud, locals: tuple[Local, Local]) -> MultiChannelGICP:
-        """Λ and α from the data, where they were left open; constants to autodiff.
+        """The method with unset parameters chosen from the data; constants to autodiff.
 
-        σ, the noise of a channel, is the median residual of a linear fit of the channel over the tangent plane of each
-        neighbourhood, over both clouds. A difference of two measurements has twice its variance, and is 1.5 times as
-        wide in all, edges and whatever moved between the two with it: Λ = 2 (1.5 σ)². α = 2.5 spacing/σ, with the
-        median distance between neighbouring target points: one σ weighs as much as the radius within which matches end
-        up, so that channels choose among the points there. A channel that is constant says nothing: its α is 0.
+        The noise σ of a channel is the median residual of its linear fits over the tangent planes of the neighbourhoods
+        of both clouds. The difference of two measurements has variance 2 σ² from noise, and 1.5 times that standard
+        deviation in real scans, which includes edges and changes between the scans: Λ = 2 (1.5 σ)². α = 2.5 spacing/σ,
+        with the median distance between neighbouring target points: a difference of one σ then weighs as much as the
+        radius within which matches end up, so that channels choose among the points there. For constant channels α = 0.
 
-        The floor goes with Λ: along an axis within the surface a match is off by a variance of 0.72 spacing², where
-        points lie at random, and across the surface by 2 λ₀, the median smallest eigenvalue of the neighbourhoods
-        being λ₀. It is ε times their ratio, from 0.005 to 1. As λ₀ has the bends of the surface in it, the ratio is at
-        least that: it can raise the floor, as for rendered scenes, and not lower it.
+        The floor is chosen if neither it nor Λ is given. Along each axis within the surface, a match has the variance
+        0.72 spacing² for randomly placed points, and along the normal 2 λ₀, with the median smallest eigenvalue λ₀ of
+        the neighbourhoods. The floor is ε times the ratio of the two, limited to 0.005 to 1. As λ₀ includes the
+        curvature of the surface, the true ratio may be larger, so the estimate is used to raise the floor above 0.005
+        (as for rendered scenes), but not to lower it.
         """
         source, target, locals, epsilon = constant((source, target, locals, self.epsilon))
         xp = namespace(source, target, locals, epsilon)
@@ -285,7 +303,7 @@ class MultiChannelGICP(AbstractGeneralized):
             within = xp.asarray(epsilon, spacing.dtype) * _MATCH_VARIANCE * spacing**2
             smooth = ~(2 * across > within)
             floor = xp.where(smooth, 1, xp.maximum(within / xp.where(smooth, 1, 2 * across), _MIN_EIGENVALUE))
-            numbers = [2 * (_SPREAD * sigma) ** 2, xp.where(uniform, 0, _REACH * spacing / sigma), floor]
+            numbers = [2 * (_SPREAD * sigma) ** 2, xp.where(uniform, 0, _OFFSET_PER_SIGMA * spacing / sigma), floor]
         covariance, weights, floor = (jax.device_put(xp.asarray(number, epsilon.dtype)) for number in numbers)
         if self.channel_covariance is not None or self.min_eigenvalue is not None:
             floor = self.min_eigenvalue
@@ -324,14 +342,15 @@ class MultiChannelGICP(AbstractGeneralized):
     def weights(self, num_channels: int) -> Float[AnyArray, "C"]:
         if self.channel_weights is None:
             raise ValueError("channel_weights: not chosen yet; call method.resolve(source, target) first")
-        return _spread_out(self.channel_weights, num_channels)
+        return _per_channel("channel_weights", self.channel_weights, num_channels)
 
     def missing_variances(self, num_channels: int) -> Float[AnyArray, "C"]:
         if self.channel_covariance is None:
             raise ValueError("channel_covariance: not chosen yet; call method.resolve(source, target) first")
         xp = namespace(self.channel_covariance)
         covariance = xp.asarray(self.channel_covariance)
-        return _spread_out(xp.diagonal(covariance) if covariance.ndim == 2 else covariance, num_channels)
+        _check_covariance_fits(covariance, num_channels)
+        return xp.broadcast_to(xp.diagonal(covariance) if covariance.ndim == 2 else covariance, (num_channels,))
 
 
 def _identity(points: Float[Array, "3 n"]) -> Float[Array, "6 n"]:
@@ -345,11 +364,11 @@ def _known(local: Local | None) -> Local:
     return local
 
 
-def _spread_out(numbers: Float[AnyArray, "..."], num_channels: int) -> Float[AnyArray, "C"]:
-    """One number per channel."""
+def _per_channel(name: str, numbers: Float[AnyArray, "..."], num_channels: int) -> Float[AnyArray, "C"]:
+    """The numbers broadcast to one per channel; `name` is that of the parameter, for the error message."""
     if numbers.shape not in ((), (num_channels,)):
         raise ValueError(
-            f"channel_weights: expected a scalar or shape ({num_channels},), for clouds of {num_channels} channels, "
+            f"{name}: expected a scalar or shape ({num_channels},), for clouds of {num_channels} channels, "
             f"got {numbers.shape}"
         )
     xp = namespace(numbers)
@@ -366,7 +385,7 @@ def _check_covariance_fits(covariance: Float[AnyArray, "..."], count: int) -> No
 
 def _number(name: str, value: Values) -> Array:
     try:
-        # By way of NumPy, which compiles nothing.
+        # NumPy converts concrete values without compiling a program.
         return jax.device_put(np.asarray(value, canonical_float())) if is_concrete(value) else jnp.asarray(value)
     except (TypeError, ValueError) as error:
         raise ValueError(f"{name}: expected numbers, got {value!r}") from error
@@ -381,7 +400,7 @@ def _positive_scalar(name: str, value: ArrayLike) -> Float[Array, ""]:
 
 def _epsilon(value: ArrayLike) -> Float[Array, ""]:
     epsilon = _positive_scalar("epsilon", value)
-    # 1 − (1 − ε) loses ε to rounding, and the covariance its inverse.
+    # For smaller ε, 1 − (1 − ε) loses it to rounding, and the covariance becomes singular.
     least = 100 * float(jnp.finfo(epsilon.dtype).eps)
     if is_concrete(epsilon) and float(epsilon) < least:
         raise ValueError(f"epsilon: expected at least {least:.2g} in {epsilon.dtype}, got {value!r}")

@@ -17,27 +17,29 @@ from mcgicp_jax._observability import geometry_observability
 from mcgicp_jax._pose import AnyArray
 from mcgicp_jax._surface import Local, Neighborhoods
 
-# Which neighbour tells how rough a surface is: the very nearest lie near because their heights are alike, far ones may
-# be higher because the surface bends.
+# Rank of the neighbour that roughness is measured with (0 is the point itself). The nearest neighbours are selected for
+# similar heights, and the heights of far ones include the curvature of the surface.
 _ROUGHNESS_RANK = 5
+# Added to the diagonal of Σ_w scaled to trace 1, so that it is nonsingular for collinear neighbours. Much larger values
+# would bias small eigenvalues of Ω; with this one, rounding in float32 leaves two digits of Ω along a line.
+_REGULARISATION = 1e-6
 
 # One (k, N) array per coordinate. Kept apart on purpose: jaxlib 0.10.2 on CPUs miscompiles, in float32, the reduction
 # of a (3, k, N) array over its middle axis where the result is broadcast back and subtracted.
 Offsets: TypeAlias = tuple[Float[Array, "k N"], Float[Array, "k N"], Float[Array, "k N"]]
 
-
 NO_NEIGHBORS = "cloud: expected one with neighbors or covariances; make it with mcgicp_jax.preprocess"
 
 
 def check_neighbors(cloud: PointCloud) -> AnyArray:
-    """The neighbours of a cloud that has some."""
+    """The (N, k) neighbours of a cloud; raises `ValueError` if it was not preprocessed."""
     if cloud.neighbors is None:
         raise ValueError(NO_NEIGHBORS)
     return cloud.neighbors
 
 
 def gatherer(cloud: PointCloud, with_channels: bool, xp: ModuleType) -> Callable[[Any], Neighborhoods]:
-    """A function from rows (a slice or an array of row numbers) to their gathered neighbourhoods.
+    """A function that maps rows (a slice or an array of row numbers) to their neighbourhoods.
 
     Args:
         xp: NumPy on the host, `jax.numpy` where the rows may be traced.
@@ -68,7 +70,7 @@ def gatherer(cloud: PointCloud, with_channels: bool, xp: ModuleType) -> Callable
 
 
 def describe(around: Neighborhoods) -> Local:
-    """The statistics of neighbourhoods, whatever the method."""
+    """Local statistics of neighbourhoods, which do not depend on the method."""
     offsets = _offsets(around)
     covariance = weighted_covariance(offsets, around.present.astype(offsets[0].dtype))
     normal = alg.smallest_eigenvector(covariance)
@@ -79,7 +81,7 @@ def describe(around: Neighborhoods) -> Local:
 def _observed(
     around: Neighborhoods, offsets: Offsets, covariance: Float[Array, "6 n"], normal: Float[Array, "3 n"]
 ) -> list[Array]:
-    """What observability needs: geometry, roughness, reach, and the fit of each channel."""
+    """The columns of `Local.observed`: observability from geometry, roughness, reach, and the fit of each channel."""
     around, offsets, covariance, normal = jax.lax.stop_gradient((around, offsets, covariance, normal))
     count = jnp.maximum(jnp.sum(around.present, axis=0), 1).astype(normal.dtype)
     basis = alg.orthonormal_basis(normal)
@@ -113,7 +115,7 @@ def _offsets(around: Neighborhoods) -> Offsets:
 
 
 def weighted_covariance(offsets: Offsets, weights: Float[Array, "k N"]) -> Float[Array, "6 N"]:
-    """Covariance about the weighted mean; zero where all weights are."""
+    """Weighted covariance about the weighted mean; zero where all weights are zero."""
     total = jnp.sum(weights, axis=0)
     weights = weights / jnp.where(total > 0, total, 1)
     x, y, z = (offset - jnp.sum(weights * offset, axis=0) for offset in offsets)
@@ -122,12 +124,13 @@ def weighted_covariance(offsets: Offsets, weights: Float[Array, "k N"]) -> Float
 
 
 class LinearFit(NamedTuple):
-    """Of values over a plane, by weighted least squares.
+    """Linear fit of values over a plane, by weighted least squares.
 
     Attributes:
-        gradient: of the values along x and y; 0 where the points lie on a line.
+        gradient: derivatives of the values along x and y; 0 where the points lie on a line.
         residual: variance of the values about the fit; meaningless for three points or fewer.
-        inverse: (3, N) symmetric; times `residual` it is the covariance of the gradient. 0 on a line.
+        inverse: (3, N) inverse normal matrix (symmetric): times `residual`, the covariance of the gradient. 0 on a
+            line.
         weight: sum of the weights.
     """
 
@@ -141,7 +144,7 @@ class LinearFit(NamedTuple):
 def fit_linear(
     x: Float[Array, "k N"], y: Float[Array, "k N"], values: Float[Array, "k N"], weights: Float[Array, "k N"]
 ) -> LinearFit:
-    """Fit a + b x + c y to the values of each neighbourhood; weights are 1 or, for what does not count, 0."""
+    """Fit a + b x + c y to the values of each neighbourhood; weights are 1, or 0 for values to ignore."""
     count = jnp.sum(weights, axis=0)
 
     def centred(values: Float[Array, "k N"]) -> Float[Array, "k N"]:
@@ -160,16 +163,16 @@ def fit_linear(
 
 
 def channel_kernel(around: Neighborhoods, covariance: Float[Array, "..."]) -> Float[Array, "k n"]:
-    """How alike each neighbour and its point look: exp(−½ Δᵀ Λ⁻¹ Δ) (Servos & Waslander 2014, eq. 7).
+    """Channel similarity λ_j of each neighbour and its point: exp(−½ Δᵀ Λ⁻¹ Δ) (Servos & Waslander 2014, eq. 7).
 
-    Where points lack channels: over those that both have, with the marginal of Λ on them. A channel that a neighbour
-    lacks counts as it does, on average, with the neighbours that have it. A factor of 1 would say that the neighbour
-    looks the same, and draw Ω out across the border of a camera's view; leaving the neighbour out would cut Ω off
-    there. Measured at such borders, drawn through scans whose channels were all known, this choice leaves Ω the least
-    biased.
+    Where points lack channels, Δ is restricted to the channels that both have, with the marginal of Λ. For each channel
+    that a neighbour lacks, λ_j is multiplied by the mean single-channel kernel of the neighbours that have it (1 if
+    none has). A factor of 1 would treat the neighbour as similar, and stretch Ω across the border of a camera's view;
+    ignoring the neighbour would shrink Ω there. Measured at artificial borders through scans with complete channels,
+    this choice leaves Ω the least biased.
 
     Args:
-        covariance: Λ, scalar or (C,) or (C, C), channel units².
+        covariance: Λ, scalar or (C,) variances or (C, C), channel units².
     """
     count = around.num_channels
     differences = [around.difference(channel) for channel in range(count)]
@@ -194,9 +197,9 @@ def _marginal_square(
     covariance: Float[Array, "C C"],
     correlated: bool,
 ) -> Float[Array, "k N"]:
-    """Δᵀ Λ⁻¹ Δ over the common channels: rows and columns of the others are those of the identity, and their Δ is 0.
+    """Δᵀ Λ⁻¹ Δ over the common channels: for the others, Λ is replaced by the identity and Δ must be 0.
 
-    By Cholesky's recurrence, written out over the channels: no LAPACK call.
+    Solved by the Cholesky recurrence, unrolled over the channels, so that LAPACK is not called.
     """
     if not correlated:
         squares = [difference * difference / covariance[i, i] for i, difference in enumerate(differences)]
@@ -215,15 +218,10 @@ def _marginal_square(
     return sum((y * y for y in solution[1:]), start=solution[0] * solution[0])
 
 
-# Relative to the trace: what keeps the square root of a collinear neighbourhood's 2×2 covariance regular. Much more
-# would be seen in Ω where it is small; as it is, rounding in float32 leaves Ω two digits along a line.
-_REGULARISATION = 1e-6
-
-
 def plane_covariance(local: Local, epsilon: Float[Array, ""]) -> Float[Array, "6 N"]:
-    """GICP's covariance I − (1−ε) n nᵀ: 1 in the surface, ε across it (Segal et al., Generalized-ICP, RSS 2009).
+    """GICP's covariance I − (1−ε) n nᵀ: 1 within the surface, ε along n (Segal et al., Generalized-ICP, RSS 2009).
 
-    Neighbours that all coincide span no surface: the identity.
+    It is the identity where all neighbours coincide, so that there is no normal.
     """
     covariance = local.covariance
     spread = covariance[0] + covariance[3] + covariance[5] > 0
@@ -238,14 +236,14 @@ def multichannel_covariance(
     epsilon: Float[Array, ""],
     min_eigenvalue: Float[Array, ""],
 ) -> Float[Array, "6 N"]:
-    """Ω in the tangent plane and ε across it (Servos & Waslander 2014, eqs. 6-10).
+    """MC-GICP's covariance: Ω in the tangent plane, ε along the normal (Servos & Waslander 2014, eqs. 6-10).
 
     Args:
-        kernel: λ_j of the neighbours.
-        min_eigenvalue: floor for the eigenvalues of Ω, which reach 0 where only the point itself looks like it.
+        kernel: λ_j of the neighbours, from `channel_kernel`.
+        min_eigenvalue: floor for the eigenvalues of Ω, which approach 0 where no neighbour has similar channels.
 
-    Ω = Σ_w^{-1/2} Σ_t Σ_w^{-1/2} is written as I + Σ_w^{-1/2} (Σ_t − Σ_w) Σ_w^{-1/2}: uniform channels then give
-    GICP's covariance to rounding, whatever the neighbourhood.
+    Ω = Σ_w^{-1/2} Σ_t Σ_w^{-1/2} is computed as I + Σ_w^{-1/2} (Σ_t − Σ_w) Σ_w^{-1/2}, so that uniform channels give
+    GICP's covariance to rounding for any neighbourhood.
     """
     alike = weighted_covariance(_offsets(around), jnp.where(around.present, kernel, 0))
     u, v = alg.orthonormal_basis(local.normal)

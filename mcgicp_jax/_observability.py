@@ -1,9 +1,10 @@
-"""Observability: which motions of a point would show, by the shape of the surface around it and by its channels.
+"""Observability: per-point evidence of which motions are constrained, from surface shape and from channels.
 
-GICP's in-plane variance of 1 makes every correspondence constrain every direction a little, and nearest neighbours do
-pull; but when the pose slides along a plane, so do the matches, and nothing constrains it. Observability leaves such
-pulls out. It is a symmetric 3×3 matrix K for each point: xᵀ K x is the fraction, 0 to 1, of a motion along the unit
-vector x that shows. Single points may be a little below 0: noise is taken off on average.
+With GICP's in-plane variance of 1, every correspondence constrains every direction a little. But when the pose slides
+along a plane, the matches slide with it, and the plane constrains nothing in that direction. Observability excludes
+this apparent information. It is a symmetric 3×3 matrix O per point: for a motion of the point along the unit vector x,
+xᵀ O x is the fraction, 0 to 1, that changes the residual instead of the match. As the expected contribution of noise is
+subtracted, values of single points may be slightly negative.
 """
 
 from __future__ import annotations
@@ -22,14 +23,17 @@ Basis: TypeAlias = tuple[Float[Array, "3 N"], Float[Array, "3 N"]]
 def geometry_observability(
     covariance: Float[Array, "6 N"], normal: Float[Array, "3 N"], basis: Basis, count: Float[Array, "N"]
 ) -> Float[Array, "6 N"]:
-    """n nᵀ less the variance of n.
+    """Observability from the normal: (1 − tr V) (n nᵀ − V), where V is the covariance of the estimated normal n.
 
     The eigenvector of the smallest eigenvalue λ₀ of a sample covariance has the variance λ₀ λ / (k (λ − λ₀)²) towards
-    the eigenvector of λ (Anderson 1963): large for a line of points, where the normal may point anywhere across it.
-    Saturated, λ₀ λ / (k (λ − λ₀)² + λ₀ λ), it stays a fraction; and a normal that is poorly known counts little.
+    the eigenvector of λ (Anderson 1963). It is large for points on a line, whose normal is undetermined about the line.
+    The saturated form λ₀ λ / (k (λ − λ₀)² + λ₀ λ), used here, is at most 1. The factor 1 − tr V, at least 0,
+    downweights uncertain normals.
 
     Args:
-        covariance: of the neighbours about their mean, metres².
+        covariance: covariance of the neighbours about their mean, metres².
+        normal: n, the unit eigenvector of its smallest eigenvalue.
+        basis: orthonormal basis of the tangent plane.
         count: k, the number of neighbours.
     """
     smallest = jnp.maximum(jnp.sum(normal * alg.multiply(covariance, normal), axis=0), 0)
@@ -44,7 +48,7 @@ def geometry_observability(
     determinant = p * r - q * q
     known = determinant > 64 * jnp.finfo(covariance.dtype).eps * (p + r) ** 2
     inverse = jnp.stack([r, -q, p]) / jnp.where(known, determinant, 1)
-    # Polynomials of one and the same matrix commute, so that their product is symmetric.
+    # Both factors are polynomials of the same matrix; they commute, so that their product is symmetric.
     x, y, z = noise
     i, j, k = inverse
     variance = jnp.stack([x * i + y * j, x * j + y * k, y * j + z * k])
@@ -53,17 +57,18 @@ def geometry_observability(
 
 
 def channel_observability(local: Local, weights: Float[Array, "C"]) -> tuple[Float[Array, "6 N"], Float[Array, "N"]]:
-    """How far a match in position and α · channel gives way when its point moves within the surface.
+    """Observability of motions within the surface, from the gradients g of the descriptors α · channel.
 
-    Where α · channel has the gradients g, the nearest target point to one that has moved by x lies at (I + A)⁻¹ x, with
-    A = Σ g gᵀ: the fraction A (I + A)⁻¹ of the motion shows; written A / (1 + tr A), which is the same for one
-    gradient, and less for several. The variance of a fitted gradient is taken off A.
+    If a point moves by x within the surface, its nearest target point in position and descriptors moves by (I + A)⁻¹ x,
+    with A = Σ g gᵀ, and the residual changes by the rest, A (I + A)⁻¹ x. A / (1 + tr A) is used instead, which is equal
+    for one channel and smaller for several. The variance of the fitted gradients is subtracted from A in the numerator.
 
     Args:
         weights: α, metres per channel unit.
 
     Returns:
-        Symmetric matrices, and the variance of the descriptors about their linear fits, metres².
+        Symmetric (6, N) matrices, and the (N,) variance of the descriptors about their linear fits, metres², summed
+        over the channels.
     """
     total = jnp.zeros((3, local.observed.shape[0]), local.observed.dtype)
     uncertain, noise = total, total[0]
@@ -74,6 +79,6 @@ def channel_observability(local: Local, weights: Float[Array, "C"]) -> tuple[Flo
         total = total + square * jnp.stack([gx * gx, gx * gy, gy * gy])
         uncertain = uncertain + residual * jnp.stack(inverse)
         noise = noise + residual
-    # The tangent basis of the fits.
+    # The same tangent basis as in the linear fits.
     basis = alg.orthonormal_basis(local.normal)
     return alg.embed((total - uncertain) / (1 + total[0] + total[2]), *basis), noise

@@ -1,4 +1,4 @@
-"""Odometry: each frame of a sequence registered to the one before; and the map that the frames make."""
+"""Odometry by registration of consecutive frames, and maps aggregated from the registered frames."""
 
 from __future__ import annotations
 
@@ -18,18 +18,18 @@ from mcgicp_jax._register import register_with
 from mcgicp_jax._result import Registration, computed, is_usable
 from mcgicp_jax.datasets import Frame
 
-# Voxel numbers are packed into one 64-bit key, 21 bits each, from −2²⁰ on.
+# Voxels from the world's origin along each axis: three 21-bit indices, from −2²⁰, are packed into one 64-bit key.
 _HALF_RANGE = 2**20
 
 
 @dataclass(frozen=True, eq=False)
 class Step:
-    """One frame of an odometry.
+    """The result of `odometry` for one frame.
 
     Attributes:
-        cloud: as it was registered: preprocessed, in the sensor's frame.
-        pose: (4, 4) float64, sensor to world.
-        registration: to the frame before, None for the first; look at its `converged`.
+        cloud: the preprocessed cloud, in the sensor's frame.
+        pose: (4, 4) float64, sensor to world, metres.
+        registration: registration of this frame to the previous one, None for the first; check its `converged`.
     """
 
     cloud: PointCloud
@@ -47,26 +47,26 @@ def odometry(
     start: Pose | None = None,
     **options: Any,
 ) -> Iterator[Step]:
-    """Register each frame to the one before, starting from the motion before (constant velocity).
+    """Register each frame to the previous one, starting from the previous motion (constant velocity).
 
-    Lazy: frames are taken one by one and none but the last is kept, so that a sequence may be longer than memory.
-    `tqdm.tqdm(odometry(frames, ...), total=len(frames))` shows the progress. A registration that ends with too few
-    pairs or without finite numbers is replaced by the motion before; its `registration` says so.
+    Frames are processed lazily and only the latest is kept, so a sequence may be larger than memory. For a progress
+    bar, use `tqdm.tqdm(odometry(frames, ...), total=len(frames))`. If a registration ends with too few matches or
+    non-finite values, the previous motion is used instead; `Step.registration` keeps the failed result.
 
     Args:
-        frames: frames of a data set, clouds or (N, 3) arrays; what is preprocessed already is taken as it is.
-        method: numbers that it leaves open are chosen from the data of every pair.
-        voxel_size, num_neighbors: for `preprocess`.
-        init: T_target_source to start the first pair from, whose motion is not yet known; the identity by default, and
-            then `max_distance` must be more than the motion.
+        frames: frames of a data set, clouds or (N, 3) arrays in metres. Preprocessed clouds are used unchanged.
+        method: registration method; parameters that it leaves open are chosen from the data of each pair of frames.
+        voxel_size, num_neighbors: arguments of `preprocess`.
+        init: T_target_source from which the registration of the second frame to the first starts. The default is the
+            identity; `max_distance` must then exceed the motion.
         start: pose of the first frame in the world; the identity by default.
-        options: any option of `register`.
+        options: options of `register`.
 
     Yields:
-        A step for every frame, the first among them.
+        One `Step` per frame, including the first.
 
     Raises:
-        ValueError: if a cloud or an argument does not fit.
+        ValueError: if a cloud or an argument is invalid; for a cloud the message names the frame.
     """
     check_preprocessing(voxel_size, num_neighbors)
     check_method(method)
@@ -88,28 +88,29 @@ def odometry(
             result = register_with(cloud, before, method, motion, chosen)
             if is_usable(result):
                 motion = np.asarray(result.matrix)
-            # Products of thousands of rounded rotations would drift from being one.
+            # The product of thousands of rounded rotations would drift away from a rotation.
             pose = nearest_rotation(pose @ motion)
             yield Step(cloud, pose, computed(result))
         before = cloud
 
 
 def aggregate(clouds: Iterable[PointCloud | Values], poses: Iterable[Pose], voxel_size: float) -> PointCloud:
-    """One map of many clouds: the mean of all points, and of their channels, in each voxel of the world.
+    """Merge clouds into one map: the mean of all points, and of their channels, per voxel of the world.
 
-    Clouds are taken one by one; memory grows with the map, not with their number.
+    Clouds are processed one by one; memory grows with the size of the map, not with the number of clouds.
 
     Args:
-        clouds: or (N, 3) arrays, in their sensors' frames, with the same channels.
-        poses: one for each, sensor to world.
+        clouds: clouds or (N, 3) arrays in metres, in their sensor frames, with the same channels. Points with a
+            non-finite coordinate or channel are ignored.
+        poses: one pose per cloud, sensor to world.
         voxel_size: metres.
 
     Returns:
-        A raw cloud in the world, float64.
+        Raw float64 cloud in the world frame.
 
     Raises:
-        ValueError: if there are no clouds or not one pose for each, their channels differ, or the map is wider than
-            2²⁰ voxels from the world's origin.
+        ValueError: if there are no clouds, the number of poses differs, a pose is no rigid motion, the channels
+            differ, or a point lies more than 2²⁰ voxels from the world's origin along an axis.
     """
     if not 0 < voxel_size < np.inf:
         raise ValueError(f"voxel_size: expected a positive number of metres, got {voxel_size!r}")
@@ -141,7 +142,7 @@ def aggregate(clouds: Iterable[PointCloud | Values], poses: Iterable[Pose], voxe
 
 
 def _valid_channels(cloud: PointCloud) -> tuple[Float[np.ndarray, "N C"], Float[np.ndarray, "N C"]]:
-    """Channels, 0 where there are none; and 1 or 0 for whether there are."""
+    """Channels, 0 where missing, and their mask as 1 or 0."""
     channels = np.asarray(cloud.channels, np.float64)
     if cloud.channel_valid is None:
         return channels, np.ones_like(channels)
@@ -149,18 +150,19 @@ def _valid_channels(cloud: PointCloud) -> tuple[Float[np.ndarray, "N C"], Float[
 
 
 def _voxels(points: Float[np.ndarray, "N 3"], voxel_size: float) -> np.ndarray:
+    """One integer key per point for the voxel that contains it."""
     cells = np.floor(points / voxel_size)
     if np.abs(cells).max(initial=0) >= _HALF_RANGE:
         raise ValueError(
             f"voxel_size: {voxel_size} m puts points {np.abs(cells).max():.0f} voxels from the origin, expected fewer "
-            f"than {_HALF_RANGE}; choose a larger one, or poses that start nearer to it"
+            f"than {_HALF_RANGE}; choose a larger size, or poses nearer to the origin"
         )
     x, y, z = (cells.astype(np.int64) + _HALF_RANGE).T
     return (x << 42) | (y << 21) | z
 
 
 def _merge(keys: np.ndarray, rows: Float[np.ndarray, "N D"]) -> tuple[np.ndarray, Float[np.ndarray, "M D"]]:
-    """Rows of one key added up."""
+    """Unique keys, sorted, and the sum of the rows of each key."""
     order = np.argsort(keys, kind="stable")
     keys = keys[order]
     starts = np.flatnonzero(np.concatenate([np.ones(min(len(keys), 1), bool), keys[1:] != keys[:-1]]))

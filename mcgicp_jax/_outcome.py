@@ -1,4 +1,4 @@
-"""From the end of the loop to a `Registration` in the user's frames."""
+"""Convert the final state of the loop to a `Registration` in the user's frames."""
 
 from __future__ import annotations
 
@@ -28,10 +28,10 @@ def registration_of(
     source: PointCloud,
     target: PointCloud,
 ) -> Registration:
-    """The result in the user's frames; NumPy where everything is concrete."""
+    """Build the `Registration` of a final state, in the user's frames; NumPy where everything is concrete."""
     concrete = is_concrete(state, history)
     if concrete:
-        # NumPy's numbers, which cost no program to be read.
+        # Reading NumPy arrays compiles nothing.
         state, history = jax.tree.map(np.asarray, (state, history))
     pose = state.pose
     matrix = pose_in_user_frame(pose, source.origin, target.origin)
@@ -45,7 +45,7 @@ def registration_of(
     }
     valid = source.valid
     if is_concrete(numbers, valid):
-        # NumPy's scalars, rather than arrays without dimensions, print as numbers.
+        # NumPy scalars print as numbers, arrays without dimensions do not.
         numbers, valid = jax.tree.map(lambda number: np.asarray(number)[()], (numbers, valid))
     numbers["num_inliers"] = numbers["num_inliers"].astype(np.int32)
     numbers["overlap"] = (numbers["num_inliers"] / valid.sum()).astype(numbers["rmse"].dtype)
@@ -62,23 +62,23 @@ def registration_of(
 
 
 def _later(compute: Callable[[], Any], concrete: bool) -> Deferred[Any]:
-    """Read when it is asked for; what is traced must be read before the trace ends."""
+    """Deferred where concrete; traced values must be computed before the trace ends."""
     return Deferred(compute) if concrete else Deferred.of(compute())
 
 
 def _read(deferred: Deferred[Any]) -> Any:
-    """With NumPy arrays where it is concrete: a large origin is float64."""
+    """The value, as NumPy arrays where concrete: arithmetic with a large origin needs float64."""
     value = deferred.value
     return jax.tree.map(np.asarray, value) if is_concrete(value) else value
 
 
 def _constraints(assessment: Assessment, origin: Any) -> tuple[Any, Directions | None]:
-    """Information and directions in the frame of the user's source."""
+    """Information matrix and directions in the frame of the user's source."""
     information, directions = _read(assessment.constraints)
     if is_concrete(origin) and not np.any(origin):
         return information, directions
     to_centred, from_centred = _translation_adjoint(-origin), _translation_adjoint(origin)
-    # What was not finite stays so, and the status says it.
+    # Non-finite values belong to the status NON_FINITE; NumPy need not warn of them.
     with np.errstate(invalid="ignore", over="ignore"):
         if directions is not None:
             moved = directions.twists @ from_centred.T, directions.center + origin
@@ -87,11 +87,11 @@ def _constraints(assessment: Assessment, origin: Any) -> tuple[Any, Directions |
 
 
 def _uncertainty(assessment: Assessment, pose: jaxlie.SE3, center: AnyArray, origin: Any) -> tuple[Any, Any]:
-    """The covariance in the frame of the user's source, and the deviations at the centroid of the matched points.
+    """Covariance in the frame of the user's source, and standard deviations at the centroid of the matched points.
 
     Args:
-        pose: between the clouds' origins.
-        center: the centroid, moved by the pose.
+        pose: between coordinates relative to the clouds' origins.
+        center: (3,) centroid of the moved, matched source points, metres.
     """
     covariance = _read(assessment.covariance)
     xp = namespace(covariance, pose, center)
@@ -112,7 +112,7 @@ def _uncertainty(assessment: Assessment, pose: jaxlie.SE3, center: AnyArray, ori
 
 
 def _translation_adjoint(offset: Array | np.ndarray) -> Array | np.ndarray:
-    """Ad of a pure translation for twists (v, ω)."""
+    """Adjoint (6, 6) of a translation by `offset`, for twists (v, ω)."""
     xp = np if isinstance(offset, np.ndarray) else jnp
     zero = xp.zeros_like(offset[0])
     x, y, z = offset

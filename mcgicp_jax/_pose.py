@@ -1,4 +1,4 @@
-"""Poses at the border: what a user may hand in, and what every module inside receives."""
+"""Poses: validation of user input, and conversion between matrices and `jaxlie.SE3`."""
 
 from __future__ import annotations
 
@@ -13,31 +13,33 @@ import numpy as np
 from jax.typing import ArrayLike, DTypeLike
 from jaxtyping import Array, Float
 
-# Arrays of NumPy, outside of transformations, or of JAX; and single numbers of either.
+# NumPy arrays (outside transformations) or JAX arrays, and scalars of either kind.
 if TYPE_CHECKING:
     AnyArray: TypeAlias = Any
     AnyScalar: TypeAlias = Any
+    # A pose that a user passes.
+    Pose: TypeAlias = jaxlie.SE3 | Array | np.ndarray
 else:
     AnyArray = Array | np.ndarray
     AnyScalar = ArrayLike
+    # Not checked at run time: `pose_matrix` has better messages.
+    Pose = Any
 
-Pose: TypeAlias = "jaxlie.SE3 | Float[Array, '*batch 4 4'] | Float[np.ndarray, '*batch 4 4']"
-
-# Largest entry of R Rᵀ − I: a matrix that a user typed with four digits is still a rotation.
+# Tolerance on the largest entry of R Rᵀ − I: a matrix typed with four digits still counts as a rotation.
 _ROTATION_TOLERANCE = 1e-3
-# In radii of a cloud: by how much the digits of a rotation may displace a cloud that lies far from zero.
+# Largest displacement, in radii of the cloud, that rounding of R may cause for a cloud far from the origin.
 _DISPLACEMENT_TOLERANCE = 0.1
 
 
 def is_concrete(*trees: object) -> bool:
-    """Whether every array in the trees holds numbers now, rather than standing for them under a transformation."""
+    """Whether every array in the trees is concrete, that is, none is a tracer of a JAX transformation."""
     return not any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(trees))
 
 
 def computed_now() -> contextlib.AbstractContextManager[None]:
-    """What is computed within is computed now, even while a caller's `jit` is traced, of which it would become a part.
+    """Context in which concrete arrays are computed at once, even while a caller's `jit` is being traced.
 
-    Only then: what JAX evaluates at compile time is evaluated operation by operation.
+    Outside a trace it does nothing, since `jax.ensure_compile_time_eval` evaluates operation by operation.
     """
     staged = isinstance(jnp.array(np.zeros(())), jax.core.Tracer)
     return jax.ensure_compile_time_eval() if staged else contextlib.nullcontext()
@@ -51,17 +53,18 @@ def canonical_float() -> Any:
 def pose_matrix(
     pose: Pose | None, name: str = "init", distance: float = 0.0
 ) -> Float[np.ndarray, "4 4"] | Float[Array, "4 4"]:
-    """The (4, 4) matrix of a pose, in the precision that it came in (float64 for NumPy); `None` is the identity.
+    """The (4, 4) matrix of a pose: in float64 if the pose is concrete, in its own precision if it is traced.
 
-    A concrete matrix gets the nearest rotation, so that it does not scale what it moves.
+    The rotation of a concrete matrix is replaced by the nearest exact one, so that the pose does not scale the cloud.
 
     Args:
-        name: of the argument, for messages.
-        distance: from zero of the cloud that the pose will move, in radii of that cloud.
+        pose: `jaxlie.SE3` or (4, 4) matrix; None is the identity.
+        name: name of the argument, for error messages.
+        distance: distance of the cloud that the pose will move from the origin, in radii of that cloud.
 
     Raises:
-        ValueError: where the values are concrete, if the shape is wrong, the matrix is no rigid motion, or its digits
-            are too few for a cloud at that distance.
+        ValueError: if the shape is wrong; or, for a concrete pose, if the matrix is not a rigid motion or its rotation
+            has too few digits for a cloud at that distance.
     """
     if pose is None:
         return np.eye(4)
@@ -93,9 +96,9 @@ def pose_matrix(
 
 
 def nearest_rotation(matrix: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, "4 4"]:
-    """The rigid motion whose rotation is the nearest one to that of a matrix (Frobenius norm); the same translation."""
+    """The matrix with its upper left 3×3 block replaced by the nearest rotation (Frobenius norm)."""
     rotation = matrix[:3, :3]
-    # A rotation to the last bits stays as it is.
+    # A matrix that is a rotation to rounding is returned unchanged, so that the function is idempotent.
     if np.abs(rotation @ rotation.T - np.eye(3)).max() <= 1e-14:
         return matrix
     left, _, right = np.linalg.svd(rotation)
@@ -105,7 +108,7 @@ def nearest_rotation(matrix: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, "4 4
 
 
 def se3_from_matrix(matrix: Float[ArrayLike, "4 4"], dtype: DTypeLike) -> jaxlie.SE3:
-    """`jaxlie.SE3` in the given precision, its quaternion normalised; of NumPy arrays where the matrix is concrete."""
+    """`jaxlie.SE3` in the given precision with a unit quaternion; a concrete matrix gives one of NumPy arrays."""
     if not is_concrete(matrix):
         return _se3_from_traced(matrix, dtype)
     matrix = np.asarray(matrix, np.float64)
@@ -113,7 +116,7 @@ def se3_from_matrix(matrix: Float[ArrayLike, "4 4"], dtype: DTypeLike) -> jaxlie
         return se3(np.full(7, np.nan, dtype))
     xyzw = np.array([0.0, 0, 0, 1])
     if np.any(matrix[:3, :3] != np.eye(3)):
-        # Imported where it is needed: it takes a fifth of the time that the package takes.
+        # Imported late: it takes a fifth of the import time of the package.
         from scipy.spatial.transform import Rotation
 
         xyzw = Rotation.from_matrix(matrix[:3, :3]).as_quat(canonical=True)
@@ -127,22 +130,22 @@ def _se3_from_traced(matrix: Float[Array, "4 4"], dtype: DTypeLike) -> jaxlie.SE
 
 
 def se3(parameters: AnyArray) -> jaxlie.SE3:
-    """A pose of NumPy's numbers, too: (7,) quaternion wxyz and translation."""
+    """`jaxlie.SE3` from (7,) parameters, quaternion wxyz and translation; NumPy arrays stay NumPy arrays."""
     return jaxlie.SE3(parameters)
 
 
 def cast_pose(pose: jaxlie.SE3, dtype: DTypeLike) -> jaxlie.SE3:
-    """jaxlie computes some constants in the default precision; this undoes the promotion."""
+    """The pose in the given precision: undoes the promotion by constants that jaxlie computes in the default one."""
     return jaxlie.SE3(pose.wxyz_xyz.astype(dtype))
 
 
 def rotation_from_quaternion(wxyz: Float[np.ndarray, "*batch 4"]) -> Float[np.ndarray, "*batch 3 3"]:
-    """In float64 from the outset: jaxlie would compute it in float32 where x64 is off."""
+    """Rotation matrices of quaternions, in the precision of the input: jaxlie would use float32 where x64 is off."""
     w, x, y, z = (wxyz / np.sqrt(np.sum(wxyz * wxyz, axis=-1, keepdims=True))).T
     rows = [
         [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
         [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
         [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
     ]
-    # The batch comes last here, and in reverse, as do rows and columns once transposed.
+    # The entries are stacked as (3, 3, reversed batch); the transpose restores the batch and the order of the rows.
     return np.array(rows).swapaxes(0, 1).T

@@ -1,4 +1,4 @@
-"""From a raw cloud to one that is ready to register."""
+"""Preprocessing of raw clouds: finite points, voxel downsampling, origin and neighbours."""
 
 from __future__ import annotations
 
@@ -13,9 +13,11 @@ from mcgicp_jax._dense import default_search
 from mcgicp_jax._pose import is_concrete
 from mcgicp_jax._search import AbstractSearch
 
+# Fewest finite points of a cloud: four points are the fewest that are not always coplanar.
 MIN_POINTS = 4
-# Voxel numbers are packed into one 63-bit key.
+# Voxels along one axis: three 21-bit indices fit one 63-bit key.
 _VOXELS_PER_AXIS = 2**21
+# Largest magnitude of a value, in its own unit: larger ones overflow float32.
 _LARGEST = np.finfo(np.float32).max
 
 
@@ -26,31 +28,33 @@ def preprocess(
     *,
     search: AbstractSearch | None = None,
 ) -> PointCloud:
-    """Make a cloud ready to register: finite rows, voxel-downsampled, with neighbours.
+    """Prepare a cloud for registration: drop non-finite points, downsample to voxels, find neighbours.
 
-    Do this once per cloud, and register it as often as needed. Runs on the host.
+    Preprocess each cloud once and register it as often as needed. Runs on the host.
 
     Args:
-        cloud: raw cloud, or an (N, 3) array. A cloud that is padded already is unpadded first.
-        voxel_size: metres; points and channels of one voxel are averaged, each channel over the points that have it.
+        cloud: raw cloud, or (N, 3) array in metres. Padding and old neighbours are dropped first.
+        voxel_size: metres. Points and channels are averaged per voxel, each channel over the points that have it.
             None keeps every point.
-        num_neighbors: k, the neighbours (the point itself among them) that a covariance is computed from; at least 3.
-            Fewer are used where the cloud has fewer points.
-        search: how neighbours are found; by default SciPy's k-d tree, on an accelerator `DenseSearch`.
+        num_neighbors: number k of neighbours, including the point itself, from which a covariance is computed; at
+            least 3. All points are used if the cloud has fewer.
+        search: neighbour search; by default SciPy's k-d tree, or `DenseSearch` on an accelerator.
 
     Returns:
-        Read-only NumPy arrays, float32 or, where JAX's x64 is on and the input has it, float64. Coordinates far from
-        zero for the cloud's size lose their origin, which `PointCloud.origin` keeps.
+        Cloud with read-only NumPy arrays, float64 if the input is and JAX's x64 is on, else float32. If the
+        coordinates are large relative to the cloud's size, they are centred and `PointCloud.origin` keeps the offset.
 
     Raises:
-        ValueError: for fewer than four finite points, or arguments that make no sense.
+        ValueError: if fewer than four points are finite (or remain after downsampling), the cloud is traced, a cloud
+            with covariances is to be downsampled, or an argument is out of range.
+
     Warns:
-        UserWarning: once per call, if rows with NaN or infinity were left out.
+        UserWarning: once per call, if points with NaN or infinity were left out.
     """
     if not isinstance(cloud, PointCloud):
         cloud = PointCloud(cloud)
     if not is_concrete(cloud):
-        raise ValueError("cloud: expected numbers, got tracers; preprocess outside of jit, grad and vmap")
+        raise ValueError("cloud: expected concrete arrays, got tracers; preprocess outside of jit, grad and vmap")
     check_preprocessing(voxel_size, num_neighbors)
     cloud = _finite(cloud.unpad())
     points = np.asarray(cloud.points)
@@ -62,18 +66,18 @@ def preprocess(
         points, channels, channel_valid = _downsample(points, channels, channel_valid, voxel_size)
         if len(points) < MIN_POINTS:
             raise ValueError(
-                f"voxel_size: expected one that leaves at least {MIN_POINTS} points, got {voxel_size} m, "
+                f"voxel_size: expected a size that leaves at least {MIN_POINTS} points, got {voxel_size} m, "
                 f"which leaves {len(points)}"
             )
     dtype = jax.dtypes.canonicalize_dtype(points.dtype)
     origin = _far_origin(points)
     points = (points - origin).astype(dtype)
-    # Searched as they will be used, after rounding.
+    # Neighbours are searched among the rounded coordinates, which are those of the registration.
     neighbors = (search or default_search()).neighbors(points, num_neighbors)
     arrays = {
         "points": points,
         "channels": channels.astype(dtype),
-        # Clouds that lack nothing share the programs of those that never could.
+        # Without missing channels the mask is None, so that all complete clouds share compiled programs.
         "channel_valid": None if channel_valid is None or channel_valid.all() else channel_valid,
         "valid": np.ones(len(points), bool),
         "neighbors": neighbors.astype(np.int32, copy=False),
@@ -82,13 +86,13 @@ def preprocess(
     }
     for array in arrays.values():
         if array is not None:
-            # What is computed of the cloud is kept beside it.
+            # Quantities derived from these arrays are cached, so the arrays must not change.
             array.setflags(write=False)
     return cloud.replace_rows(**arrays)
 
 
 def check_preprocessing(voxel_size: float | None, num_neighbors: int) -> None:
-    """Raise `ValueError` for what is wrong with `preprocess`'s arguments whatever the cloud."""
+    """Check the arguments of `preprocess` other than the cloud; raises `ValueError`."""
     if voxel_size is not None and (isinstance(voxel_size, str) or not 0 < voxel_size < np.inf):
         raise ValueError(f"voxel_size: expected a positive number of metres or None, got {voxel_size!r}")
     if num_neighbors < 3:
@@ -96,10 +100,11 @@ def check_preprocessing(voxel_size: float | None, num_neighbors: int) -> None:
 
 
 def _finite(cloud: PointCloud) -> PointCloud:
+    """Drop rows with a NaN or infinity in any array; warns if there are any."""
     arrays = [array for array in (cloud.points, cloud.channels, cloud.covariances) if array is not None]
-    # Beyond float32 is beyond all bounds: what is written as 1e300 or 1e39 stands for no number.
+    # Values such as 1e39 or 1e300 overflow float32 and count as infinite.
     finite = [np.abs(array) <= _LARGEST for array in arrays]
-    # Most clouds are whole, and asking for all at once is far quicker than for each row.
+    # Most clouds are finite throughout, and one check of all values is much faster than one per row.
     if len(cloud.points) >= MIN_POINTS and all(each.all() for each in finite):
         return cloud
     keep = np.all([each.all(axis=tuple(range(1, each.ndim))) for each in finite], axis=0)
@@ -121,8 +126,8 @@ def _downsample(
     channel_valid: Bool[np.ndarray, "N C"] | None,
     voxel_size: float,
 ) -> tuple[Float[np.ndarray, "M 3"], Float[np.ndarray, "M C"], Bool[np.ndarray, "M C"] | None]:
-    """The mean of each voxel, in float64, and which channels it has; voxels in lexical order of their position."""
-    # Column by column: a third of the time that rows take.
+    """Mean points and channels per voxel and the mask of its channels; summed in float64, sorted by voxel index."""
+    # Working by columns takes a third of the time of working by rows.
     columns = np.ascontiguousarray(points.T, np.float64)
     key, largest = np.zeros(len(points), np.int64), 1
     for column in columns:
@@ -131,8 +136,8 @@ def _downsample(
         along = cell.max() + 1
         if along > _VOXELS_PER_AXIS:
             raise ValueError(
-                f"voxel_size: {voxel_size} m divides the cloud into {along:.0f} voxels along an axis, "
-                f"expected at most {_VOXELS_PER_AXIS}; choose a larger one"
+                f"voxel_size: expected at most {_VOXELS_PER_AXIS} voxels along an axis, got {along:.0f} "
+                f"with {voxel_size} m; choose a larger size"
             )
         key = key * int(along) + cell.astype(np.int64)
         largest *= int(along)
@@ -148,24 +153,24 @@ def _downsample(
     means = (total(columns.T) / counts).astype(points.dtype)
     if channel_valid is None:
         return means, (total(channels) / counts).astype(channels.dtype), None
-    # What is missing is stored as 0, so a sum over all is one over those that are there.
+    # Missing values are stored as 0 and do not add to the sum.
     counts = total(channel_valid)
     return means, (total(channels) / np.maximum(counts, 1)).astype(channels.dtype), counts > 0
 
 
 def _stable_order(key: Int[np.ndarray, "N"], largest: int) -> Int[np.ndarray, "N"]:
-    """What sorts the keys, which are below `largest`; equal ones stay in their order."""
+    """Indices of a stable sort of keys in [0, `largest`)."""
     bits = (len(key) - 1).bit_length()
     if (largest - 1).bit_length() + bits > 63:
         return np.argsort(key, kind="stable")
-    # Plain numbers are sorted several times faster than an order is found.
+    # Sorting keys with the row index in their low bits is several times faster than argsort.
     return np.sort((key << bits) | np.arange(len(key))) & ((1 << bits) - 1)
 
 
 def _far_origin(points: Float[np.ndarray, "N 3"]) -> Float[np.ndarray, "3"]:
-    """Zero for clouds about the origin; the centre of those far away, where float32 would lose their shape."""
+    """Offset to subtract: the cloud's centre if `is_far` from zero, else zero."""
     low, high = points.min(axis=0).astype(np.float64), points.max(axis=0).astype(np.float64)
     center = 0.5 * (low + high)
-    # A number that float32 holds, so that it stays the same inside a transformation.
+    # Rounded to float32, so that the origin has the same value inside a transformation.
     center = center.astype(np.float32).astype(np.float64)
     return center if is_far(center, float(np.linalg.norm(high - low))) else np.zeros(3)

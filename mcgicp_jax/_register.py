@@ -1,4 +1,4 @@
-"""Registration of two clouds: what users call."""
+"""Registration of two clouds: `register`, and its parts `find_correspondences` and `align`."""
 
 from __future__ import annotations
 
@@ -33,12 +33,13 @@ from mcgicp_jax._sums import matched_rows, move_rows, within
 from mcgicp_jax._surfaces import searchable, surfaces_of
 from mcgicp_jax._traced import align_traced, assess, differentiable, register_traced
 
-# Gates as multiples of the target's spacing. With the wide one the pose is found from a start several points away;
-# converged, its matches across edges and across the border of the overlap pull, and the narrow one leaves those out.
+# Default maximum correspondence distances of the coarse and the fine phase, in spacings of the target. The larger one
+# converges from starts several spacings away; near convergence its matches across edges and the border of the overlap
+# would bias the pose, and the smaller one rejects them.
 _COARSE_SPACINGS, _FINE_SPACINGS = 10.0, 2.5
-# The default tolerance as a multiple of the target's spacing: 0.5 mm at 0.1 m. See `Options` for what limits it.
+# Default translation tolerance, in spacings of the target: 0.5 mm at 0.1 m. `Options` says what limits it.
 _TOLERANCE_IN_SPACINGS = 0.005
-# Rows of the source, at least, that take part in the coarse phase.
+# Least number of source points in a subsampled coarse phase: enough to find a pose nearly as well as all.
 _COARSE_ROWS = 4096
 
 
@@ -52,18 +53,23 @@ def find_correspondences(
     num_candidates: int = 1,
     search: AbstractSearch | None = None,
 ) -> Correspondences:
-    """The match of every source point at a pose: nearest in position and α · channel (Servos & Waslander 2014, IV-A).
+    """Find the target point nearest to each moved source point in position and α · channel (Servos & Waslander, IV-A).
 
     Args:
         source, target: preprocessed clouds.
         pose: T_target_source, `jaxlie.SE3` or (4, 4); None is the identity.
-        method: its channel weights span the space that is searched.
-        max_distance: metres of position; pairs further apart do not count.
-        num_candidates: m, how many target points to find for each source point; more than one for the soft matches of
-            `align` and `mahalanobis_cost`. The arrays are then (m, N), nearest first.
+        method: defines α, the channel weights of the search; without α the search is in position alone.
+        max_distance: maximum correspondence distance, metres of position; matches beyond it are not `valid`.
+        num_candidates: m, number of target points to find for each source point; more than one for the soft assignment
+            of `align` and `mahalanobis_cost`.
+        search: nearest-neighbour search; by default SciPy's k-d tree on CPUs and `DenseSearch` on accelerators.
+
+    Returns:
+        One match per source row; for m > 1 arrays of shape (m, N), nearest first. Constant to autodiff.
 
     Raises:
-        ValueError: if `max_distance` is not positive or the clouds' channels do not fit each other or the method.
+        ValueError: if `max_distance` is not positive, `num_candidates` is below 1, `pose` is not a rigid motion, or
+            channels or dtypes do not fit.
     """
     search = search or default_search()
     _check_clouds(source, target, method)
@@ -111,26 +117,29 @@ def align(
     robust: AbstractKernel | None = None,
     temperature: ArrayLike | None = None,
 ) -> Registration:
-    """The pose that balances given matches: updates with M renewed, until the pose no longer moves. Pure JAX.
+    """Compute the pose for fixed matches: update the pose, recompute M, and repeat until it converges. Pure JAX.
 
-    Works under `jit`, `vmap`, `grad` and `jvp`. The derivative is that of the root of Σ w JᵀM(R) d = 0 next to the
-    returned pose: exact for fixed matches and neighbours, with respect to points, channels, given covariances, the
-    method's numbers and the robust scale; zero with respect to `init`, on which a root does not depend. It is zero,
-    never NaN, where there is no such root: without enough matches, where a direction is not constrained, and where
-    Newton's method does not find it from the returned pose.
+    Works under `jit`, `vmap`, `grad` and `jvp`. The derivative is that of the root of Σ w JᵀM(R) d = 0 near the
+    returned pose (implicit function theorem): for fixed matches and neighbours, it is exact with respect to points,
+    channels, given covariances, the parameters of the method and the robust scale, and zero with respect to `init`, on
+    which a root does not depend. It is zero, never NaN, if there is no such root: with too few matches, with an
+    unconstrained direction, or where Newton's method does not converge from the returned pose.
 
     Args:
         source, target: preprocessed clouds.
         matches: from `find_correspondences`.
-        method: open numbers are chosen from the data.
-        init: T_target_source to start from; the identity by default.
-        translation_tolerance, rotation_tolerance: metres and radians; the update that is below both is the last. None:
-            as in `register`.
-        robust: kernel of each pair's Mahalanobis distance.
-        temperature: metres; softens several candidates per source point, as in `mahalanobis_cost`.
+        method: as in `register`.
+        init: T_target_source to start from, `jaxlie.SE3` or (4, 4); the identity by default.
+        max_iterations: maximum number of pose updates.
+        translation_tolerance, rotation_tolerance: metres and radians, as in `register`.
+        robust: kernel ρ applied to the Mahalanobis distance of each match.
+        temperature: metres; soft assignment of several candidates per source point, as in `mahalanobis_cost`.
+
+    Returns:
+        The pose with its status; check `converged`. `directions` is None.
 
     Raises:
-        ValueError: if an argument does not fit; outcomes of well-formed input are told by `Registration.status`.
+        ValueError: if an argument is malformed; failures on well-formed input show in `Registration.status`.
     """
     options = Options(
         max_distance=np.inf,
@@ -170,42 +179,49 @@ def register(
     match_channels: bool = False,
     scales: Sequence[float] = (),
 ) -> Registration:
-    """Register two clouds: find matches, update the pose, repeat until it rests.
+    """Register two clouds: find matches at the current pose, update the pose, and repeat until it converges.
 
-    Of a large source, some thousands of points find the pose until it is nearly at rest; then all of them do.
+    A coarse phase uses every n-th point of a source of 8,192 points or more (at least 4,096 of them) and the larger
+    `max_distance`. Near convergence, a fine phase with all points and the smaller `max_distance` takes over.
 
-    With concrete arrays (outside `jit`, `vmap`, `grad`) the loop runs on the host, between compiled programs whose
-    shapes do not depend on the sizes of the clouds. Inside a transformation it is one program whose matches come from a
-    callback: the same pose, to rounding, and the derivative of `align` at the final matches.
+    With concrete arrays (outside `jit`, `vmap`, `grad`) the loop runs on the host and calls compiled programs whose
+    shapes do not depend on the sizes of the clouds. Inside a transformation it is one program, which finds matches by
+    host callbacks (with `DenseSearch`, in XLA). The pose is the same up to rounding; its derivative is that of `align`
+    at the final matches.
 
     Args:
-        source, target: clouds from `preprocess`. Raw clouds and (N, 3) arrays are preprocessed with its defaults, and
-            without voxels.
-        method: `MultiChannelGICP()`, `GICP()`, `PointToPlane()`, `PointToPoint()` or `ColorICP(...)`.
+        source, target: clouds from `preprocess`. Raw clouds and (N, 3) arrays, metres, are preprocessed with its
+            default arguments.
+        method: `MultiChannelGICP()`, `GICP()`, `PointToPlane()`, `PointToPoint()` or `ColorICP(...)`. Parameters left
+            None are estimated from the clouds.
         init: T_target_source to start from, `jaxlie.SE3` or (4, 4); the identity by default.
-        max_distance: metres of position; pairs further apart do not count. Two numbers are one to find the pose with,
-            and a smaller one to refine it with once it is nearly at rest. None: 10 and 2.5 times the median distance
-            between neighbouring points of the target. A start that is further off needs more.
-        max_iterations: how often, at most, matches are found and the pose is updated.
-        translation_tolerance, rotation_tolerance: metres (at the centroid of the pairs) and radians; the update that is
-            below both is the last. None: 0.5 % of the median distance between neighbouring points of the target.
-        robust: kernel of each pair's Mahalanobis distance: `Huber`, `Cauchy`, `GemanMcClure`, `Tukey`.
-        search: how matches are found; by default SciPy's k-d tree, on an accelerator `DenseSearch`.
-        hold_free_directions: leave the pose where `init` has it in the directions that nothing holds, neither the shape
-            of the clouds nor, for the methods that use them, their channels. If False it goes where the nearest
-            neighbours pull it. The status is DEGENERATE either way.
-        match_channels: whether the source's channels are scaled and shifted to be distributed like the target's, as
-            where exposures differ: at first by all points, and once a pose is found, by those that both clouds see
-            there; the pose is then found anew from there.
-        scales: voxel sizes, metres, coarse to fine, for a start that is far off: the clouds are registered in each of
-            them first, with its own default of `max_distance`, and each pose that is found starts the next. With
-            numbers alone, outside of transformations.
+        max_distance: maximum correspondence distance, metres of position; matches beyond it are rejected. Two numbers
+            apply to the coarse and to the fine phase. None: 10 and 2.5 times the spacing of the target (its median
+            nearest-neighbour distance). A start that displaces the points further needs a larger value.
+        max_iterations: maximum number of pose updates in both phases together.
+        translation_tolerance, rotation_tolerance: metres (at the centroid of the matches) and radians; the loop has
+            converged when an update is below both. `translation_tolerance` None: 0.5 % of the spacing of the target.
+        robust: kernel ρ applied to the Mahalanobis distance of each match: `Huber`, `Cauchy`, `GemanMcClure`, `Tukey`.
+        search: nearest-neighbour search; by default SciPy's k-d tree on CPUs and `DenseSearch` on accelerators.
+        hold_free_directions: keep the pose as it is in `init` along directions of motion that neither the shape of the
+            clouds nor the channels (if the method uses them) constrain. If False, arbitrary nearest-neighbour matches
+            decide there. The status is DEGENERATE in either case.
+        match_channels: scale and shift each channel of the source to the distribution of the target's, for scans with
+            different exposure or gain: first from the values of all points, then, in a second registration that starts
+            at the pose of the first, from those of matched points.
+        scales: voxel sizes, metres, from coarse to fine, for a start that is far off: the clouds are first registered
+            at each voxel size, with its own default `max_distance`, each time from the pose before. Not available
+            inside transformations.
 
     Returns:
-        The pose and how it ended: see `Registration`; check `converged`.
+        The pose with its status, quality of the fit and uncertainty; check `converged`.
 
     Raises:
-        ValueError: if an argument does not fit: shapes, dtypes, channel counts, fewer than four finite points.
+        ValueError: if an argument is malformed, for instance in shape or dtype, clouds differ in their number of
+            channels or have fewer than four finite points, or `init` is not a rigid motion. The message names the
+            argument. Failures to register well-formed clouds show in `Registration.status`.
+    Warns:
+        UserWarning: if points with NaN or infinity are left out, or `MultiChannelGICP` gets clouds without channels.
     """
     options = Options(
         max_distance=max_distance,
@@ -228,7 +244,7 @@ def register_with(
     init: Pose | None,
     options: Options,
 ) -> Registration:
-    """`register`, with its options in one object."""
+    """`register` with its options as one object."""
     check_method(method)
     source, target = _ready("source", source), _ready("target", target)
     if options.scales and not (source.covariances is None and target.covariances is None):
@@ -253,13 +269,13 @@ def register_with(
 
 
 def _run(problem: Problem, target: PointCloud, search: AbstractSearch, max_iterations: int) -> Any:
-    """The loop; and what finishes it: state with derivative, covariance and directions, history."""
+    """Run the loop. Returns its final state and a function for state with derivative, assessment and history."""
     if is_concrete(problem):
         index = _index(search, problem.method, target)
         with computed_now():
             state, assessment, history = register_on_host(problem, index, search.num_threads)
         return state, lambda: (state, assessment, history)
-    # Outside of the compiled functions, so that autodiff never looks into them.
+    # Stopped out here, so that autodiff does not trace into the compiled functions.
     fixed = jax.lax.stop_gradient(problem)
     state, matches, history = register_traced(fixed, search, max_iterations)
 
@@ -279,7 +295,7 @@ def pose_problem(
     options: Options,
     num_threads: int | None,
 ) -> Problem:
-    """Inputs of the loop, for prepared clouds; NumPy arrays where everything is concrete."""
+    """Inputs of the loop for preprocessed clouds; NumPy arrays where everything is concrete."""
     _check_clouds(source, target, method)
     method, seen, there = surfaces_of(method, source, target, observed=True, num_threads=num_threads)
     dtype = source.points.dtype
@@ -290,7 +306,7 @@ def pose_problem(
 
 
 def default_distances(target: PointCloud) -> tuple[Any, Any]:
-    """The coarse and the fine `max_distance` for a preprocessed target, metres."""
+    """Default `max_distance` of the coarse and the fine phase for a preprocessed target, metres."""
     return _distances(point_spacing(target))
 
 
@@ -302,7 +318,7 @@ def _settings(options: Options, target: PointCloud, stride: Any, dtype: Any) -> 
     max_distance: Any = options.max_distance
     tolerance: Any = options.translation_tolerance
     if max_distance is None or tolerance is None:
-        # Of a cloud that is differentiated, too: an option is a constant.
+        # Options are constants to autodiff, even if they are derived from a differentiated cloud.
         spacing = constant(point_spacing(target))
         max_distance = _distances(spacing) if max_distance is None else max_distance
         tolerance = spacing * _TOLERANCE_IN_SPACINGS if tolerance is None else tolerance
@@ -324,7 +340,7 @@ def _settings(options: Options, target: PointCloud, stride: Any, dtype: Any) -> 
 
 
 def _index(search: AbstractSearch, method: AbstractMethod, target: PointCloud) -> AbstractIndex:
-    """The target laid out for searching, kept as long as it is used."""
+    """Search index of the target, cached as long as the cloud is used."""
     count = target.channels.shape[-1]
     numbers = [] if method.weights(count) is None else [method.weights(count)]
     if numbers and target.channel_valid is not None:
@@ -343,7 +359,7 @@ def _matched(
 def _nearest_points(
     source: PointCloud, target: PointCloud, problem: Problem, state: State, search: AbstractSearch
 ) -> Correspondences:
-    """Which points both clouds see at a pose, whatever their channels."""
+    """Nearest matches in position at the pose of a state."""
     pose = constant(pose_in_user_frame(state.pose, source.origin, target.origin))
     distance = problem.settings.fine_distance
     return find_correspondences(source, target, pose, PointToPoint(), max_distance=distance, search=search)
@@ -365,7 +381,7 @@ def _ready(name: str, cloud: PointCloud | Values) -> PointCloud:
 
 
 def _check_clouds(source: PointCloud, target: PointCloud, method: AbstractMethod) -> None:
-    """Raise `ValueError` unless the clouds fit each other and the method."""
+    """Raise `ValueError` unless both are single clouds, of one dtype, with channels that fit the method."""
     check_method(method)
     for name, cloud in (("source", source), ("target", target)):
         if cloud.points.ndim != 2:
@@ -375,7 +391,7 @@ def _check_clouds(source: PointCloud, target: PointCloud, method: AbstractMethod
     if method.uses_channels:
         _check_channels(source, target, method)
         if isinstance(method, MultiChannelGICP) and source.channels.shape[-1] == 0:
-            warnings.warn("the clouds have no channels: MultiChannelGICP is GICP then", UserWarning, stacklevel=5)
+            warnings.warn("the clouds have no channels: MultiChannelGICP equals GICP", UserWarning, stacklevel=5)
     if source.points.dtype != target.points.dtype:
         raise ValueError(
             f"points: expected one precision in both clouds, got {source.points.dtype} in the source and "

@@ -1,4 +1,4 @@
-"""What a registration says: the pose, how it ended, and how good the fit is."""
+"""The result of a registration: pose, status, quality of the fit and uncertainty."""
 
 from __future__ import annotations
 
@@ -19,18 +19,18 @@ from mcgicp_jax._pose import AnyArray, canonical_float, is_concrete, rotation_fr
 
 
 class Status(enum.IntEnum):
-    """How a registration ended. Only CONVERGED is success.
+    """Outcome of a registration. Only CONVERGED is success.
 
     Attributes:
-        CONVERGED: the last update moved the pose by less than both tolerances, and the pairs hold every direction.
-        MAX_ITERATIONS: the pose was still moving when the iterations ran out.
-        TOO_FEW_CORRESPONDENCES: fewer than four of the source points that were looked for have a match within
-            `max_distance`: no overlap, or a start too far away.
-        DEGENERATE: the pose came to rest, but nothing holds at least one direction: see
-            `Registration.free_directions`. There it is where the start had it, unless `hold_free_directions` was off.
-        NON_FINITE: the numbers overflowed or became NaN.
-        INVALID_INPUT: the pair is one that `register` raises an error for; in a batch only. Its pose is NaN.
-        LOST: the worker that had the pair died or failed, and another one too; in a batch only. Its pose is NaN.
+        CONVERGED: the last update was below both tolerances, and every direction of motion is constrained.
+        MAX_ITERATIONS: the updates were still above the tolerances after `max_iterations` updates.
+        TOO_FEW_CORRESPONDENCES: fewer than four of the searched source points have a match within `max_distance`: the
+            clouds do not overlap, or the start is too far off.
+        DEGENERATE: the last update was below both tolerances, but at least one direction of motion is unconstrained
+            (see `Registration.free_directions`). Along it `register` keeps the start, if `hold_free_directions`.
+        NON_FINITE: the pose or the sums overflowed or became NaN.
+        INVALID_INPUT: `register` would raise a `ValueError` for this pair. Only in batches; the pose is NaN.
+        LOST: the worker of this pair failed, and so did a second attempt. Only in batches; the pose is NaN.
     """
 
     CONVERGED = 0
@@ -41,35 +41,36 @@ class Status(enum.IntEnum):
     INVALID_INPUT = 5
     LOST = 6
 
-    # Printed by name, which an IntEnum is not.
+    # Print the name: an IntEnum prints its number.
     __str__ = enum.Enum.__str__
-    __format__ = enum.Enum.__format__  # type: ignore[assignment]
+    __format__ = enum.Enum.__format__
 
 
 class Registration(eqx.Module):
-    """The outcome of `register` or `align`; a pytree. Everything in it belongs to the returned pose.
+    """Result of `register` or `align`; a pytree. All fields are evaluated at the returned pose.
 
-    After a host call the numbers are NumPy's; inside a transformation, and with a batch dimension, they are arrays.
-    There the pose alone carries a gradient: to differentiate a cost, call `mahalanobis_cost` at the pose.
+    Outside of transformations the fields are NumPy scalars and arrays; inside, and for a batch, they are JAX arrays.
+    Only the pose carries a gradient: to differentiate a cost, call `mahalanobis_cost` at the pose.
 
     Attributes:
-        T_target_source: maps source coordinates into the target's frame, b ≈ T a. Its precision is that of the clouds;
-            at large (UTM) coordinates use `matrix`, or inside a transformation in float32 `centred`.
+        T_target_source: maps source coordinates into the target's frame, b ≈ T a; in the precision of the clouds. At
+            large (UTM) coordinates use `matrix`, or `centred` inside a float32 transformation.
         status_code: value of the `Status`.
-        num_iterations: updates of the pose.
-        num_inliers: pairs within `max_distance`.
-        cost: Σ ρ(dᵀ M d) over them.
-        rmse: root mean square distance of the pairs, metres; mostly the spacing of the points. NaN without pairs.
-        overlap: share of the source points that have a match, 0 to 1; the others are rejected, as too far away. Little
-            overlap, or a share below what is known of the scene, is the one sign that a wrong minimum gives of itself.
-        history: before each update, and last at the returned pose: "cost", "rmse", "num_inliers", and the length of
-            the update from there, "translation_step" (metres, at the centroid of the pairs) and "rotation_step"
-            (radians). Of a large source, the first entries are of the points that find the pose (see `register`).
-            Inside a transformation the length is fixed, and NaN fills what was not needed.
-        source_origin, target_origin: what the clouds had taken off, `PointCloud.origin`.
-        centred: the pose between those origins, which `matrix` is made from.
-        constraints, uncertainty: `information` and `directions`, `covariance` and `deviations`, computed when they are
-            first read.
+        num_iterations: number of pose updates.
+        num_inliers: number of source points with a match within `max_distance` (the smaller one, if there are two).
+        cost: Σ ρ(dᵀ M d) over the matches.
+        rmse: root mean square correspondence distance, metres. Usually of the order of the point spacing, as no target
+            point lies just where a source point does. NaN without matches.
+        overlap: fraction of the source points that have a match, 0 to 1. A value below the known overlap of the scans
+            is the only sign of a wrong local minimum in this result.
+        history: arrays with one entry before each update and one at the returned pose: "cost", "rmse", "num_inliers",
+            and the size of the update computed there: "translation_step" (metres, at the centroid of the matches) and
+            "rotation_step" (radians). In the coarse phase (see `register`) they cover the subsampled source. Inside a
+            transformation the length is `max_iterations` + 1, and unused entries are NaN.
+        source_origin, target_origin: (3,) `PointCloud.origin` of both clouds, metres.
+        centred: the pose between coordinates relative to these origins.
+        constraints, uncertainty: deferred values of `information` and `directions`, and of `covariance` and
+            `deviations`, computed on first access.
     """
 
     T_target_source: jaxlie.SE3
@@ -88,7 +89,7 @@ class Registration(eqx.Module):
 
     @classmethod
     def build(cls, **fields: Any) -> Registration:
-        """A result of finished fields, past equinox's constructor, which would compute what is deferred."""
+        """Construct from fields without equinox's constructor, which would compute the deferred ones."""
         result = object.__new__(cls)
         for name, value in fields.items():
             object.__setattr__(result, name, value)
@@ -96,7 +97,7 @@ class Registration(eqx.Module):
 
     @classmethod
     def without_pose(cls, status: Status) -> Registration:
-        """What stands for a pair that was not registered: every number that cannot be had is NaN."""
+        """The result of a pair that could not be registered: pose, cost, rmse and covariance are NaN."""
         nowhere = se3(np.full(7, np.nan, canonical_float()))
         nan = np.full((), np.nan)[()]
         return cls.build(
@@ -117,45 +118,45 @@ class Registration(eqx.Module):
 
     @property
     def information(self) -> Float[AnyArray, "*batch 6 6"]:
-        """(6, 6) Σ Jᵀ M J for the twist ξ = (v, ω) of T exp(ξ), metres and radians, in the source's frame.
+        """(6, 6) Σ w Jᵀ M J for the twist ξ = (v, ω) of T exp(ξ), metres and radians, in the source's frame.
 
-        It weighs directions against each other; its scale is that of GICP's relative covariances, so its inverse is
+        Its scale is that of GICP's relative covariances, so it compares directions with each other, but its inverse is
         *not* a covariance of the pose.
         """
         return self.constraints.value[0]
 
     @property
     def directions(self) -> Directions | None:
-        """Six directions and what constrains each, see `free_directions`; None from `align`."""
+        """Six directions of motion and what constrains each, see `free_directions`; None from `align`."""
         return self.constraints.value[1]
 
     @property
     def covariance(self) -> Float[AnyArray, "*batch 6 6"]:
-        """(6, 6) of ξ, in the same order and frame as `information`, estimated from how the matches disagree (see
-        `_uncertainty`).
+        """(6, 6) covariance of ξ, in the order and frame of `information`: a sandwich estimate from the scatter of the
+        matches (Huber 1967; see `_uncertainty`).
 
-        ξ turns about the origin of the source's coordinates. Where that is far from the points, as with UTM, a small
-        rotation displaces them far, and the first three variances are large: `deviations` refer to the points.
+        ξ rotates about the origin of the source's coordinates. If that is far from the points, as in UTM coordinates, a
+        small rotation moves the points far and the first three variances are large: use `deviations` there.
 
-        It covers the noise and the sampling of the points. It does not know of a wrong minimum, of errors that all
-        points share (calibration, motion during a scan), or of things that moved. A direction that nothing constrains
-        has a standard deviation of 10 times the radius of the matched points. NaN where there is no pose, or too few
-        matches to tell.
+        The estimate covers the noise and the sampling of the points. It does not cover a wrong local minimum, errors
+        common to all points (calibration, motion during a scan), or moving objects. An unconstrained direction gets a
+        standard deviation of 10 times the radius of the matched points. NaN if the status is TOO_FEW_CORRESPONDENCES or
+        NON_FINITE, if an alignment is degenerate, or if the matches are too few for an estimate.
         """
         return self.uncertainty.value[0]
 
     @property
     def deviations(self) -> Float[AnyArray, "*batch 6"]:
-        """(6,) standard deviations along and about the target's axes: of the position of the centroid of the matched
-        points, metres, and of the rotation, radians.
+        """(6,) standard deviations along the target's axes of the centroid of the matched points, metres, then about
+        these axes of the rotation, radians.
 
-        From `covariance`, with what is said there.
+        Derived from `covariance`, with the same limitations.
         """
         return self.uncertainty.value[1]
 
     @property
     def status(self) -> Any:
-        """The `Status`; an array of its values inside a transformation or for a batch."""
+        """The `Status`; inside a transformation or for a batch, the array `status_code`."""
         if is_concrete(self.status_code) and np.ndim(self.status_code) == 0:
             return Status(int(np.asarray(self.status_code)))
         return self.status_code
@@ -167,15 +168,17 @@ class Registration(eqx.Module):
 
     @property
     def matrix(self) -> Float[np.ndarray, "*batch 4 4"] | Float[Array, "*batch 4 4"]:
-        """T_target_source as (4, 4); float64 NumPy outside a transformation, with all digits at large coordinates."""
+        """T_target_source as (4, 4); outside of transformations float64 NumPy, exact also at large coordinates."""
         return pose_in_user_frame(self.centred, self.source_origin, self.target_origin)
 
     @property
     def free_directions(self) -> tuple[FreeDirection, ...]:
-        """The directions in which the shape of the clouds lets the pose slide, and whether the channels hold it.
+        """Directions of motion that the shape of the clouds does not constrain, and whether the channels do.
 
-        Empty where geometry holds all six, and for `align`. For one registration outside of transformations; inside,
-        and for a batch, use `directions`.
+        Empty if geometry constrains all six directions, and for `align`.
+
+        Raises:
+            ValueError: inside a transformation or for a batch; use `directions` there.
         """
         if not is_concrete(self.directions) or np.ndim(self.status_code):
             raise ValueError("free_directions: expected a single registration outside of jit; use directions")
@@ -187,7 +190,7 @@ class Registration(eqx.Module):
         if not is_concrete(self.centred, self.history) or np.ndim(self.status_code):
             return f"Registration(batch of shape {np.shape(self.status_code)})"
         if np.any(self.source_origin):
-            # Far from zero, the translation says little: it is the motion of a point that is nowhere near.
+            # Far from zero the translation column is the motion of a far point: print that of the source's origin.
             origin = np.append(self.source_origin, 1)
             moved, where = (np.asarray(self.matrix) @ origin - origin)[:3], "of the source's origin "
         else:
@@ -204,26 +207,26 @@ class Registration(eqx.Module):
 
 
 def is_usable(result: Registration) -> bool:
-    """Whether the pose may start another registration: it comes from matches, and is finite.
+    """Whether the pose may start another registration: it is finite and based on enough matches.
 
-    So it does with the status DEGENERATE, where free directions are as they were at the start, and MAX_ITERATIONS.
+    This includes MAX_ITERATIONS, and DEGENERATE, where unconstrained directions are as they were at the start.
     """
     return result.status in (Status.CONVERGED, Status.DEGENERATE, Status.MAX_ITERATIONS)
 
 
 def computed(result: Registration) -> Registration:
-    """The result with everything computed: it holds nothing of its clouds any more."""
+    """The result with its deferred fields computed, so that it no longer references the clouds."""
     return jax.tree.map(lambda leaf: leaf, result)
 
 
 def pose_in_user_frame(
     centred: jaxlie.SE3, source_origin: Array | np.ndarray, target_origin: Array | np.ndarray
 ) -> Array | np.ndarray:
-    """T(o_t) · T · T(−o_s)."""
+    """T(o_t) · T · T(−o_s) as (4, 4), with translations T(o) by the origins; float64 NumPy for concrete arrays."""
     if is_concrete(centred, source_origin, target_origin):
         parameters = np.asarray(centred.wxyz_xyz, np.float64)
         rotation = rotation_from_quaternion(parameters[..., :4])
-        # Origins that come out of `jit` are float32, exactly; what is made from them here must not be.
+        # Origins returned by `jit` are float32 (exactly so); the arithmetic with them must be float64.
         start, end = np.asarray(source_origin, np.float64), np.asarray(target_origin, np.float64)
         offset = end - start - np.einsum("...ij,...j->...i", rotation - np.eye(3), start)
         matrix = np.zeros((*rotation.shape[:-2], 4, 4))

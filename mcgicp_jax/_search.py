@@ -1,4 +1,4 @@
-"""Correspondences, and what finds them: a search lays out target points and answers for the source's nearest ones."""
+"""Correspondences and the interface of nearest-neighbour searches."""
 
 from __future__ import annotations
 
@@ -16,14 +16,15 @@ from mcgicp_jax._pose import AnyArray
 
 
 class Rows(NamedTuple):
-    """The points of a cloud as a search sees them; NumPy or JAX arrays.
+    """The points of a cloud, as input to a search; NumPy or JAX arrays.
 
     Attributes:
         points: (N, 3), metres.
         descriptors: (N, D), channels in metres (α · channel), searched along with the position; D may be 0.
-        valid: (N,), False for rows that match nothing and are no match.
-        penalty: (N, D), metres²: 0 where a row has the channel of a descriptor; where it lacks it, what the descriptor
-            adds to the squared search distance, the same for all rows. None: no row lacks a channel.
+        valid: (N,), False for rows to ignore, both as queries and as matches.
+        penalty: (N, D), metres²: 0 where a row has the channel; else the penalty for the missing channel, which
+            replaces the squared difference of the descriptors in the squared search distance. It is the same for all
+            rows that lack the channel. None: no row lacks a channel.
     """
 
     points: Float[AnyArray, "*batch N 3"]
@@ -35,12 +36,13 @@ class Rows(NamedTuple):
 class Correspondences(eqx.Module):
     """For each source point, its match in the target; a pytree.
 
-    To autodiff the row numbers are constants: gradients are taken with the matches held.
+    The indices are constants to autodiff: gradients are taken with the matches held fixed.
 
     Attributes:
-        indices: (N,) rows of the target; or (m, N), nearest first, if several candidates were asked for.
-        distances: (N,) metres between the moved source point and its match (position only, not channels).
-        valid: (N,) whether the match counts: both points exist and lie within `max_distance` of each other.
+        indices: (N,) rows of the target, meaningless where `valid` is False; (m, N), nearest first, if
+            `num_candidates` m > 1 were requested. `distances` and `valid` have the same shape.
+        distances: correspondence distances, metres: from the moved source point to its match, in position only.
+        valid: whether the match counts: both points are valid and at most `max_distance` apart.
     """
 
     indices: Int[AnyArray, "*batch N"]
@@ -52,41 +54,43 @@ class Correspondences(eqx.Module):
 
 
 class AbstractIndex(abc.ABC):
-    """Target points, laid out to be searched."""
+    """An index over target points, such as a k-d tree."""
 
     @abc.abstractmethod
     def nearest(
         self, pose: Float[ArrayLike, "7"], source: Rows, max_distance: float, num_candidates: int = 1
     ) -> Int[np.ndarray, "m N"]:
-        """Rows of the m nearest target points of each source point, moved by a pose; descriptors do not move.
+        """The target rows nearest to each source point in position and descriptors, the positions moved by a pose.
 
         Args:
-            pose: quaternion wxyz and translation, as in `jaxlie.SE3.wxyz_xyz`.
-            max_distance: metres; −1 may stand for a target point that lies further away.
+            pose: T_target_source as (7,) quaternion wxyz and translation, like `jaxlie.SE3.wxyz_xyz`.
+            source: the N query points.
+            max_distance: metres of position; matches further apart may be reported as −1.
+            num_candidates: m, the number of target rows per source row.
 
         Returns:
-            Nearest first; −1 where there is none.
+            (m, N) target rows, nearest first; −1 where there is none.
         """
 
     @abc.abstractmethod
     def follow(self, source: Rows, max_distance: float) -> Callable[[Float[ArrayLike, "7"]], Int[np.ndarray, "N"]]:
-        """For one registration: a function that finds the nearest target row of each source row, pose after pose.
+        """A function that maps a pose to the nearest target row of each source row, for one registration.
 
-        Its answers are those of `nearest`; it may use what it knows from the pose before.
+        It returns the same rows as `nearest` with one candidate, and may reuse the results of earlier poses.
         """
 
 
 class AbstractSearch(eqx.Module):
-    """A way to find nearest neighbours."""
+    """An algorithm for nearest-neighbour search."""
 
     @property
     def num_threads(self) -> int | None:
-        """How many threads of the host one registration may keep busy; None for as many as it has use for."""
+        """Largest number of host threads that one registration may use; None for no limit."""
         return None
 
     @abc.abstractmethod
     def index(self, target: Rows) -> AbstractIndex:
-        """Lay out the valid target rows for searching; concrete arrays."""
+        """Build an index over the valid rows of a target of concrete arrays."""
 
     @abc.abstractmethod
     def nearest_traced(
@@ -98,16 +102,21 @@ class AbstractSearch(eqx.Module):
         running: Bool[Array, ""],
         num_candidates: int = 1,
     ) -> Int[Array, "m N"]:
-        """`AbstractIndex.nearest` inside a transformation.
+        """`AbstractIndex.nearest` for traced arrays.
 
-        Where not `running`, as in a lane that has finished, the answer is not used and may be anything.
+        Args:
+            target: the points to search; the other arguments and the result are those of `AbstractIndex.nearest`.
+            running: False if the result will not be used, as in a finished lane; it may then be arbitrary.
         """
 
     @abc.abstractmethod
     def neighbors(self, points: Float[np.ndarray, "N 3"], num_neighbors: int) -> Int[np.ndarray, "N k"]:
-        """The k nearest points of every point, itself among them, nearest first; −1 where there are fewer."""
+        """Rows of the k nearest neighbours of every point, nearest first, including the point itself.
+
+        The points are finite, in metres. The row is −1 where there are fewer than k points.
+        """
 
 
 def on_host(tree: Rows) -> Rows:
-    """The same with NumPy arrays."""
+    """The rows as NumPy arrays."""
     return jax.tree.map(np.asarray, tree)

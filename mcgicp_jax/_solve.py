@@ -1,4 +1,4 @@
-"""One pose update from the sums over correspondences, and the derivative of the pose as a root."""
+"""The pose update from sums over correspondences, and the derivative of the pose as the root of g(T) = 0."""
 
 from __future__ import annotations
 
@@ -18,16 +18,17 @@ from mcgicp_jax._methods import AbstractMethod
 from mcgicp_jax._pose import cast_pose
 from mcgicp_jax._sums import Matched, Sums, forces_at
 
-# optimistix starts at damping 1: the form is scaled so that this is small beside its eigenvalues.
+# Mean eigenvalue that the information matrix is scaled to, dimensionless: large beside 1, the damping that optimistix
+# starts with.
 _HESSIAN_SCALE = 1e4
-# Steps of Levenberg-Marquardt, of which at most 16 were seen, at noisy data; and of Newton's method from a pose of the
-# loop, which converges quadratically, in 3 or 4.
+# Iteration limits. Levenberg-Marquardt was seen to take at most 16, with noisy data; Newton's method, which starts at
+# the pose of the loop and converges quadratically, takes 3 or 4.
 _MAX_STEPS = 32
 _MAX_NEWTON_STEPS = 8
 # Row and column of each stored entry of the symmetric 3×3 and 4×4 matrices.
 _SYMMETRIC_3 = ((0, 1, 2), (1, 3, 4), (2, 4, 5))
 _SYMMETRIC_4 = ((0, 1, 2, 3), (1, 4, 5, 6), (2, 5, 7, 8), (3, 6, 8, 9))
-# dD/dξ at the identity, (12, 6): D = [ω× | v] by rows, ξ = (v, ω).
+# (12, 6) derivative at the identity of vec D by ξ = (v, ω): D = [ω× | v], flattened row by row.
 _TANGENT = (
     (0, 0, 0, 0, 0, 0),
     (0, 0, 0, 0, 0, -1),
@@ -45,12 +46,12 @@ _TANGENT = (
 
 
 class Update(eqx.Module):
-    """What one update found.
+    """Result of one pose update.
 
     Attributes:
-        twist: (6,) ξ = (v, ω), metres and radians: points turn by exp(ω) about the centre and move by v.
-        information: (6, 6) Σ JᵀMJ in the same twist, lengths in units of the radius.
-        degenerate: whether a direction is constrained by nothing.
+        twist: (6,) ξ = (v, ω), metres and radians: the moved points turn by exp(ω) about the centre and shift by v.
+        information: (6, 6) Σ JᵀKJ for ξ, lengths in units of the radius.
+        degenerate: whether `information` is singular to rounding.
     """
 
     twist: Float[Array, "6"]
@@ -59,15 +60,16 @@ class Update(eqx.Module):
 
 
 def solve_update(sums: Sums, basis: Float[Array, "6 6"]) -> Update:
-    """Minimise e − 2⟨D, G⟩ + ⟨D, Q(D)⟩ = Σ w (d − D h)ᵀ M (d − D h) over the change of pose D = [ΔR − I | Δt], M held,
-    to full convergence.
+    """Minimise Σ w (d − D h)ᵀ M (d − D h) = e − 2⟨D, G⟩ + ⟨D, Q(D)⟩ over the pose change D = [ΔR − I | Δt], to full
+    convergence, with M and w held fixed.
 
-    Levenberg-Marquardt on 13 residuals, a square root of the (13, 13) quadratic form in (D, 1): its cost does not
-    depend on the number of points. Lengths are measured in units of the points' radius, so that translations and
-    rotations, millimetres and kilometres, weigh alike.
+    Levenberg-Marquardt runs on 13 residuals, a square root of the (13, 13) quadratic form in (vec D, 1), so its cost
+    does not depend on the number of points. Lengths are in units of `Sums.radius`, which puts translation and rotation
+    on the same scale for clouds of any size.
 
     Args:
-        basis: the twists, in units of the radius, that the pose may move along: columns; those to be held are zero.
+        basis: (6, 6), columns: twists along which the pose may move, lengths in units of the radius. Zero columns
+            keep the pose fixed along their directions.
     """
     radius, dtype = sums.radius, sums.totals.dtype
     eps = float(jnp.finfo(dtype).eps)
@@ -75,10 +77,10 @@ def solve_update(sums: Sums, basis: Float[Array, "6 6"]) -> Update:
     unit_information = twist_form(sums.stiffness, radius)
     trace = jnp.trace(unit_information)
     scale = _HESSIAN_SCALE / jnp.where(trace > 0, trace / 6, 1)
-    # Both square roots in one loop, for the sake of compilation.
+    # Both square roots in one loop, which compiles faster.
     padded = jnp.zeros_like(form).at[:6, :6].set(unit_information)
     roots, pivots = jax.vmap(_semidefinite_root)(jnp.stack([form * scale, padded]))
-    # optimistix computes its step sizes in the default precision, and wants no other beside it.
+    # optimistix keeps its step sizes in the default precision, and fails on float32 data where x64 is on.
     root, columns = roots[0].astype(float), basis.astype(float)
     twist = basis @ _least_squares(root, columns).value.astype(dtype)
     return Update(
@@ -89,8 +91,8 @@ def solve_update(sums: Sums, basis: Float[Array, "6 6"]) -> Update:
 
 
 def _least_squares(root: Float[Array, "13 13"], basis: Float[Array, "6 6"]) -> optx.Solution:
-    # The residuals are sums of numbers up to the root of the scale, 100, and rounded accordingly: with less, steps
-    # of the last digits would go on for ever.
+    # The residuals are sums of terms up to √_HESSIAN_SCALE = 100 and rounded accordingly: with a smaller tolerance the
+    # steps would never fall below it.
     tolerance = 64 * float(jnp.finfo(root.dtype).eps)
     solver: optx.LevenbergMarquardt = optx.LevenbergMarquardt(
         rtol=tolerance, atol=tolerance, linear_solver=lx.Normal(lx.Cholesky())
@@ -100,11 +102,11 @@ def _least_squares(root: Float[Array, "13 13"], basis: Float[Array, "6 6"]) -> o
 
 
 class _TrustRegion(optx.AbstractSearch):
-    """optimistix's trust region, and steps that change the cost by no more than rounding are taken.
+    """optimistix's trust region, which here also accepts steps that change the cost by no more than rounding.
 
-    At the minimum it is chance whether a step lowers the rounded cost. Where it came out low, no other step would be,
-    and shorter and shorter ones would be tried and refused, some twenty of them. (Conn, Gould & Toint, Trust-Region
-    Methods, 2000, section 17.4.2.)
+    At the minimum, rounding decides whether a step lowers the computed cost. Where the current cost was rounded down,
+    some twenty ever shorter steps would be rejected in vain. (Conn, Gould & Toint, Trust-Region Methods, 2000, section
+    17.4.2.)
     """
 
     inner: Any
@@ -118,14 +120,14 @@ class _TrustRegion(optx.AbstractSearch):
         size, accept, result, after = self.inner.step(first_step, y, y_eval, f_info, f_eval_info, state)
         cost = f_info.as_min()
         level = jnp.abs(f_eval_info.as_min() - cost) <= 8 * jnp.finfo(cost.dtype).eps * cost
-        # A refusal would have raised the damping.
+        # A rejected step would have raised the damping: restore it.
         before = state.step_size, state
         size, after = jax.tree.map(partial(jnp.where, level & ~accept), before, (size, after))
         return size, accept | level, result, after
 
 
 def _quadratic_form(sums: Sums, radius: Float[Array, ""]) -> Float[Array, "13 13"]:
-    """The form in (vec D, 1), lengths in units of the radius; M keeps its unit."""
+    """The cost of `solve_update` as a form in (vec D, 1), divided by radius²; lengths in units of the radius."""
     quadratic, lengths = _unit_quadratic(sums.stiffness, radius), _unit_lengths(radius)
     linear = (sums.first * lengths / radius).reshape(12)
     constant = sums.constant / radius**2
@@ -141,20 +143,20 @@ def _unit_quadratic(second: Float[Array, "6 10"], radius: Float[Array, ""]) -> F
 
 
 def _unit_lengths(radius: Float[Array, ""]) -> Float[Array, "4"]:
-    """What h = (p, 1) is divided by: lengths in units of the radius."""
+    """Factors that express h = (p, 1) in units of the radius."""
     return jnp.stack([1 / radius, 1 / radius, 1 / radius, jnp.ones_like(radius)])
 
 
 def twist_form(second: Float[Array, "6 10"], radius: Float[Array, ""]) -> Float[Array, "6 6"]:
-    """Σ JᵀKJ from Σ K ⊗ h hᵀ of any symmetric K, for twists with lengths in units of the radius."""
+    """Σ JᵀKJ from Σ K ⊗ h hᵀ, for symmetric K and twists ξ = (v, ω) with lengths in units of the radius."""
     tangent = jnp.asarray(_TANGENT, second.dtype)
     return tangent.T @ _unit_quadratic(second, radius) @ tangent
 
 
 def _semidefinite_root(form: Float[Array, "D D"]) -> tuple[Float[Array, "D D"], Float[Array, "D"]]:
-    """L with L Lᵀ = form and the pivots, by Cholesky's recurrence; a pivot lost to rounding leaves its column zero.
+    """Cholesky factor L with L Lᵀ = form, and its pivots; a pivot lost to rounding leaves a zero column.
 
-    Written out, because LAPACK's answer for a semidefinite matrix is NaN, and because its batched calls are avoided.
+    Not LAPACK's Cholesky, which returns NaN for semidefinite matrices, and whose batched calls can deadlock.
     """
     size = form.shape[0]
     floor = size * jnp.finfo(form.dtype).eps * jnp.diagonal(form)
@@ -164,21 +166,22 @@ def _semidefinite_root(form: Float[Array, "D D"]) -> tuple[Float[Array, "D D"], 
         form, root, pivots = carry
         pivot = form[i, i]
         regular = pivot > floor[i]
-        # Rows above the pivot hold what rounding left of the zeros there.
+        # Rows above the pivot are zero but for rounding errors.
         column = jnp.where(regular & (rows >= i), form[:, i] / jnp.sqrt(jnp.where(regular, pivot, 1)), 0)
         return form - jnp.outer(column, column), root.at[:, i].set(column), pivots.at[i].set(pivot)
 
-    # A loop rather than an unrolled chain: it compiles four times faster.
+    # A loop compiles four times faster than the unrolled recurrence.
     _, root, pivots = jax.lax.fori_loop(0, size, eliminate, (form, jnp.zeros_like(form), jnp.zeros_like(floor)))
     return root, pivots
 
 
 @jax.jit
 def _residuals(along: Float[Array, "6"], args: tuple[Float[Array, "13 13"], Float[Array, "6 6"]]) -> Float[Array, "13"]:
-    """Square roots of the terms of the cost, whose rotation is given by half of its Rodrigues vector s = tan(θ/2) a.
+    """13 residuals whose squares sum to the quadratic form. The rotation is parametrised by 2 s, with the Rodrigues
+    vector s = tan(θ/2) a of angle θ and axis a; to first order, 2 s is the rotation vector.
 
-    ΔR − I = 2 (S + S²) / (1 + s·s) with S = [s]× (Cayley): without the square roots and cases of the exponential map,
-    whose derivatives would be half of what an update compiles. To first order 2 s is the rotation vector.
+    ΔR − I = 2 (S + S²) / (1 + s·s) with S = [s]× (Cayley). The exponential map, with square roots and special cases,
+    would double what an update compiles.
     """
     root, basis = args
     twist = basis @ along
@@ -190,7 +193,7 @@ def _residuals(along: Float[Array, "6"], args: tuple[Float[Array, "13 13"], Floa
 
 
 def _rotation_vector(twice: Float[Array, "3"]) -> Float[Array, "3"]:
-    """Axis times angle, of twice half the Rodrigues vector."""
+    """Rotation vector θ a of `twice` = 2 s, twice the Rodrigues vector s = tan(θ/2) a."""
     square = 0.25 * (twice @ twice)
     turned = square > 0
     tangent = jnp.sqrt(jnp.where(turned, square, 1))
@@ -198,7 +201,7 @@ def _rotation_vector(twice: Float[Array, "3"]) -> Float[Array, "3"]:
 
 
 def move_pose(pose: jaxlie.SE3, twist: Float[Array, "6"], center: Float[Array, "3"]) -> jaxlie.SE3:
-    """The pose whose points p = T a have gone to c + exp(ω)(p − c) + v."""
+    """The pose that maps a to c + exp(ω)(T a − c) + v; v in metres, ω in radians."""
     turn = jaxlie.SO3.exp(twist[3:])
     rotation = (turn @ pose.rotation()).normalize()
     translation = center + turn @ (pose.translation() - center) + twist[:3]
@@ -206,32 +209,32 @@ def move_pose(pose: jaxlie.SE3, twist: Float[Array, "6"], center: Float[Array, "
 
 
 def adjoint_to_center(pose: jaxlie.SE3, center: Float[Array, "3"]) -> Float[Array, "6 6"]:
-    """From ξ of T exp(ξ), the twist of the source's frame, to the twist about the centre in the target's frame."""
+    """(6, 6) matrix from ξ of T exp(ξ), in the source's frame, to the twist about the centre in the target's frame."""
     to_center = jaxlie.SE3.from_rotation_and_translation(jaxlie.SO3.identity(), -center) @ pose
     return to_center.adjoint().astype(pose.wxyz_xyz.dtype)
 
 
 def adjoint_to_source(pose: jaxlie.SE3, center: Float[Array, "3"]) -> Float[Array, "6 6"]:
-    """The way back."""
+    """Inverse of `adjoint_to_center`."""
     to_center = jaxlie.SE3.from_rotation_and_translation(jaxlie.SO3.identity(), -center) @ pose
     return to_center.inverse().adjoint().astype(pose.wxyz_xyz.dtype)
 
 
 def units(radius: Float[Array, ""]) -> Float[Array, "6"]:
-    """Metres and radians of a twist whose lengths are in units of the radius."""
+    """Factors that convert a twist from units of the radius to metres; radians stay."""
     return jnp.stack([radius] * 3 + [jnp.ones_like(radius)] * 3)
 
 
 class Root(eqx.Module):
-    """Where the derivative of a pose is taken: the pose is the root of g(T) = Σ w Jᵀ M(R) d near it.
+    """Scaling of g(T) = Σ w Jᵀ M(R) d = 0, the equation that defines the pose and its derivative.
 
-    Every GICP renews M between updates, so its answer is the root of g, not the minimum of F: derivatives of the pose
-    follow from g with the dependence of M and of the weights on the pose kept.
+    Every GICP recomputes M between updates, so the loop converges to a root of g, not to a minimum of the cost F. The
+    derivative of the pose follows from g, including the dependence of M and w on the pose.
 
     Attributes:
-        center, radius: metres, of the sums at the pose.
-        scale: of g, so that a tolerance on it means something.
-        usable: whether there is a root; where there is none, the derivative is zero.
+        center, radius: `Sums.center` and `Sums.radius` at the returned pose, metres.
+        scale: tr(Σ K) · radius²; g is divided by it to be dimensionless.
+        usable: whether a root is to be searched; if False, the derivative is zero.
     """
 
     center: Float[Array, "3"]
@@ -241,9 +244,9 @@ class Root(eqx.Module):
 
 
 def root_near(sums: Sums, usable: Bool[Array, ""]) -> Root:
-    """What the derivative needs to know of the sums at a pose."""
+    """The scaling of g from the sums at the returned pose."""
     radius = jnp.where(usable, sums.radius, 1)
-    # The trace of Σ w M, in the unit of g.
+    # The trace of Σ K, in the unit of g.
     scale = jnp.sum(sums.stiffness[jnp.array([0, 3, 5]), 9]) * radius**2
     return Root(
         center=jnp.where(usable, sums.center, 0), radius=radius, scale=jnp.where(usable, scale, 1), usable=usable
@@ -255,15 +258,14 @@ Model: TypeAlias = tuple[Matched, AbstractMethod, AbstractKernel | None]
 
 @jax.custom_jvp
 def with_derivative(pose: Float[Array, "7"], root: Root, model: Model) -> Float[Array, "7"]:
-    """The pose, whose derivative is that of the root of g next to it: −(∂g/∂ξ)⁻¹ ∂g/∂θ, by the implicit function
-    theorem.
+    """Return the pose, with the derivative −(∂g/∂ξ)⁻¹ ∂g/∂θ of the nearby root of g (implicit function theorem).
 
-    Newton's method goes from the pose to the root, where the derivative is taken; the pose itself stays what the loop
-    has found. Where the root is not usable, or Newton's method does not reach it, the derivative is zero.
+    The derivative is evaluated at the root, which Newton's method finds from the pose. It is zero if `root.usable` is
+    False or Newton's method does not converge.
 
     Args:
         pose: `jaxlie.SE3.wxyz_xyz`; a constant to autodiff.
-        model: matched rows, method and kernel, by which everything differentiable comes in.
+        model: θ: matched rows, method and robust kernel, which carry everything that is differentiated.
     """
     return pose
 
@@ -295,7 +297,7 @@ with_derivative.defjvp(_with_derivative_jvp, symbolic_zeros=True)
 
 
 def _along(pose: Float[Array, "7"], twist: Float[Array, "6"], center: Float[Array, "3"]) -> Float[Array, "7"]:
-    """How the parameters of a pose change along a twist about a centre, to first order; linear in the twist."""
+    """First-order change of the pose parameters `wxyz_xyz` along a twist about a centre; linear in the twist."""
     rotation = jaxlie.SO3(jnp.append(jnp.zeros(1, twist.dtype), 0.5 * twist[3:])) @ jaxlie.SO3(pose[:4])
     translation = twist[:3] + jnp.cross(twist[3:], pose[4:] - center)
     return jnp.concatenate([rotation.wxyz.astype(pose.dtype), translation])
@@ -308,7 +310,7 @@ def _is_symbolic_zero(tangent: object) -> bool:
 def _newton(
     pose: Float[Array, "7"], root: Root, model: Model
 ) -> tuple[Float[Array, "7"], Float[Array, "6 6"], Bool[Array, ""]]:
-    """The root of g next to a pose, the inverse of ∂g/∂ξ there, and whether it was reached."""
+    """The root of g near a pose, (∂g/∂ξ)⁻¹ before the last step, and whether Newton's method converged."""
     eps = float(jnp.finfo(pose.dtype).eps)
     identity = jnp.eye(6, dtype=pose.dtype)
 
@@ -324,7 +326,7 @@ def _newton(
 
     def unfinished(carry: tuple[Array, Array, Array, Array]) -> Bool[Array, ""]:
         count, _, _, size = carry
-        # Newton's method squares the error: after a step of the root of a rounding error, the rest is rounding.
+        # Convergence is quadratic: after a step below √eps the remaining error is rounding.
         return (count < _MAX_NEWTON_STEPS) & ~(size <= jnp.sqrt(eps))
 
     start = jnp.int32(0), pose, identity, jnp.asarray(jnp.inf, pose.dtype)
@@ -333,13 +335,13 @@ def _newton(
 
 
 def _balance(twist: Float[Array, "6"], pose: Float[Array, "7"], root: Root, model: Model) -> Float[Array, "6"]:
-    """g at a pose moved along a twist, to first order in it; lengths in units of the radius: forces and torques."""
+    """g / scale, sums of forces and torques, at a pose moved to first order along a twist (in units of the radius)."""
     matched, method, robust = model
     rotation = jaxlie.SO3(pose[:4]).as_matrix().astype(pose.dtype)
     v, omega = twist[:3] * root.radius, twist[3:]
     turned = rotation + jnp.cross(omega[:, None], rotation, axis=0)
     translation = pose[4:] + v + jnp.cross(omega, pose[4:] - root.center)
-    # Where there is no root to be found, no correspondence keeps every number and derivative finite.
+    # Without a usable root, ignoring all correspondences keeps values and derivatives finite.
     matched = eqx.tree_at(lambda matched: matched.valid, matched, matched.valid & root.usable)
     moved, forces, _ = forces_at(turned, translation, matched, method, robust)
     arms = jnp.where(matched.valid, moved - root.center[:, None], 0)

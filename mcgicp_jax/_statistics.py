@@ -1,4 +1,4 @@
-"""Medians of sampled rows, on the host with NumPy and inside transformations with JAX."""
+"""Medians of sampled rows, with NumPy for concrete arrays and with JAX inside transformations."""
 
 from __future__ import annotations
 
@@ -12,31 +12,31 @@ from jaxtyping import Array, Bool, Float, Int
 
 from mcgicp_jax._pose import is_concrete
 
-# Rows that a median is taken of, at most: the median of 4,096 normal variates has a standard error of 2 % of σ.
+# Largest sample for a median, rows: the median of 4,096 normal variates has a standard error of 2 % of σ.
 MEDIAN_ROWS = 4096
 
 
 def namespace(*trees: object) -> ModuleType:
-    """NumPy where every array is concrete, so that nothing is compiled; `jax.numpy` where one is traced.
+    """NumPy if every array is concrete, so that nothing is compiled; `jax.numpy` if one is traced.
 
-    The few formulas that are needed on both sides are written once, for the namespace that their arguments ask for.
+    It lets formulas that run both on the host and inside transformations be written once.
     """
     return np if is_concrete(*trees) else jnp
 
 
 def constant(tree: Any) -> Any:
-    """The same, constant to autodiff; what is concrete is so already, and stays NumPy."""
+    """The tree with gradients stopped; concrete arrays carry none and are returned unchanged (NumPy stays NumPy)."""
     return tree if is_concrete(tree) else jax.lax.stop_gradient(tree)
 
 
 def sampled_rows(valid: Any) -> tuple[Any, Any]:
-    """Rows to take a median of, evenly spaced among the valid ones, and which of them count.
+    """Evenly spaced rows of a cloud, as the sample for a median.
 
     Args:
         valid: (N,) booleans; False for padding, which comes last.
 
     Returns:
-        (n,) rows and (n,) booleans, n at most `MEDIAN_ROWS`.
+        (n,) row numbers, n at most `MEDIAN_ROWS`, and (n,) booleans: which of them are valid.
     """
     xp = namespace(valid)
     count = min(valid.size, MEDIAN_ROWS)
@@ -47,7 +47,7 @@ def sampled_rows(valid: Any) -> tuple[Any, Any]:
 
 
 def median(values: Any) -> Any:
-    """Median over the last axis without NaNs; NaN where there is nothing else. Constant to autodiff."""
+    """Median over the last axis, ignoring NaNs; NaN where all values are. Not meant to be differentiated."""
     if not is_concrete(values):
         return _traced_median(values)
     values = np.asarray(values)
@@ -60,7 +60,7 @@ def median(values: Any) -> Any:
 
 
 def _traced_median(values: Float[Array, "*batch n"]) -> Float[Array, "*batch"]:
-    """Sorted as integers of the same order: on CPUs XLA takes five times as long to sort floats."""
+    """Sorts the floats as integers of the same order: XLA on CPUs takes five times as long to sort floats."""
     kind = jnp.int32 if values.dtype == jnp.float32 else jnp.int64
     largest = jnp.iinfo(kind).max
 
@@ -69,7 +69,7 @@ def _traced_median(values: Float[Array, "*batch n"]) -> Float[Array, "*batch"]:
         return jnp.where(bits < 0, bits ^ largest, bits)
 
     missing: Bool[Array, "*batch n"] = jnp.isnan(values)
-    # A single bit pattern of NaN, which sorts last.
+    # One canonical bit pattern for NaN, which sorts last.
     bits = jax.lax.bitcast_convert_type(jnp.where(missing, jnp.nan, values), kind)
     ordered = jax.lax.bitcast_convert_type(reordered(jnp.sort(reordered(bits))), values.dtype)
     count = jnp.sum(~missing, axis=-1, keepdims=True)

@@ -1,4 +1,4 @@
-"""One step of the loop of registration: from the sums at a pose to the next pose, or to an outcome."""
+"""One step of the registration loop: from the sums at a pose to the next pose, or to a final status."""
 
 from __future__ import annotations
 
@@ -22,29 +22,29 @@ from mcgicp_jax._sums import Sums
 from mcgicp_jax._surface import Surface
 from mcgicp_jax._uncertainty import sandwich
 
-# The pose still moves: in the coarse phase with far matches too, and with every n-th source point; then, nearly
-# converged, with the near matches of all. Or its last update was below the tolerances, and one measurement more ends
-# the loop.
+# Statuses while the loop runs. COARSE: the coarse phase, with every `coarse_stride`-th source point and the larger
+# maximum correspondence distance. RUNNING: the fine phase, with all points and the smaller distance. SETTLED: the last
+# update was below the tolerances; the sums at its pose are still to be measured.
 COARSE, RUNNING, SETTLED = -3, -1, -2
-# An update below so many tolerances, that moves the points by less than this fraction of the narrow gate, ends the
-# coarse phase, whose pose will not be the last.
+# The coarse phase ends with an update below 10 times the tolerances that moves the points by at most 0.25 of the fine
+# maximum correspondence distance. It need not converge further: the fine phase starts from its pose.
 _NEARLY_CONVERGED, _FRACTION_OF_GATE = 10.0, 0.25
-# Three points hold a pose; with a fourth their distances can disagree.
+# Three points determine a pose; a fourth makes residuals possible.
 _MIN_CORRESPONDENCES = 4
+# Entries of `Registration.history`.
 RECORDED = ("cost", "rmse", "num_inliers", "translation_step", "rotation_step")
 
 
 class Settings(eqx.Module):
-    """Numbers of the loop, as arrays: changing one compiles nothing.
+    """Numerical settings of the loop, as arrays, so that changing one does not recompile.
 
     Attributes:
-        max_distance: metres; matches further apart do not count.
-        fine_distance: metres; the same after the coarse phase.
-        coarse_stride: every so many-th source point takes part in the coarse phase: some thousands find a pose nearly
-            as well as all.
-        translation_tolerance, rotation_tolerance: metres and radians, of the update that is the last.
-        max_iterations: in both phases together.
-        hold_free_directions: whether the pose stays as it is along directions that nothing constrains.
+        max_distance: maximum correspondence distance in the coarse phase, metres.
+        fine_distance: the same in the fine phase, metres; at most `max_distance`.
+        coarse_stride: the coarse phase uses every `coarse_stride`-th source point.
+        translation_tolerance, rotation_tolerance: an update below both is the last; metres and radians.
+        max_iterations: maximum number of updates, both phases together.
+        hold_free_directions: whether the pose is kept fixed along unconstrained directions.
     """
 
     max_distance: Float[AnyArray, "*batch"]
@@ -56,11 +56,11 @@ class Settings(eqx.Module):
     hold_free_directions: Bool[AnyArray, "*batch"]
 
     def gate(self, status: Int[AnyScalar, ""]) -> Float[AnyScalar, ""]:
-        """How far apart matches may lie at this status, metres."""
+        """Maximum correspondence distance at this status, metres."""
         return jnp.where(status == COARSE, self.max_distance, self.fine_distance)
 
     def stride(self, status: Int[AnyScalar, ""], num_iterations: Int[AnyScalar, ""]) -> Int[AnyScalar, ""]:
-        """Every so many-th point takes part now. What is measured last is measured with all."""
+        """Stride of the source points at this status. Once `max_iterations` are done, all points are measured."""
         return jnp.where((status == COARSE) & (num_iterations < self.max_iterations), self.coarse_stride, 1)
 
     def first_status(self) -> Int[AnyScalar, ""]:
@@ -80,16 +80,16 @@ class Problem(eqx.Module):
 
 
 class State(eqx.Module):
-    """Where the loop stands.
+    """State of the loop after one step.
 
     Attributes:
-        pose: the next pose while the loop goes on; the one that was measured when it ends.
-        status: value of a `Status`, `COARSE`, `RUNNING` or `SETTLED`.
-        num_iterations: updates so far.
-        sums: at the pose before.
-        information: (6, 6) at the pose before, about the centroid, lengths in units of the radius.
-        directions: at the pose before, about the centroid; None for matches that were given.
-        record: one number per entry of `Registration.history`, in the order of `RECORDED`.
+        pose: the updated pose; once the loop has ended, the pose at which `sums` were measured.
+        status: `COARSE`, `RUNNING` or `SETTLED` (negative) while the loop runs, then the value of a `Status`.
+        num_iterations: number of updates so far.
+        sums: at the pose before the update.
+        information: (6, 6) at the pose before the update, about the centroid, lengths in units of the radius.
+        directions: at the pose before the update, about the centroid; None for `align`.
+        record: one number for each history entry in `RECORDED`.
     """
 
     pose: jaxlie.SE3
@@ -102,7 +102,7 @@ class State(eqx.Module):
 
 
 class Assessment(NamedTuple):
-    """What is told of a loop that has ended: information and directions of its pose, and its covariance."""
+    """Deferred results at the final pose: information matrix and directions, and covariance."""
 
     constraints: Deferred[tuple[Float[AnyArray, "6 6"], Directions | None]]
     covariance: Deferred[Float[AnyArray, "6 6"]]
@@ -112,14 +112,14 @@ class Assessment(NamedTuple):
 def update(
     pose: jaxlie.SE3, status: Int[Array, ""], num_iterations: Int[Array, ""], sums: Sums, settings: Settings
 ) -> State:
-    """Update the pose, unless it has converged. Compiled once, whatever the clouds."""
+    """Update the pose, or end the loop with a status. Its program does not depend on the size of the clouds."""
     directions, basis = None, jnp.eye(6, dtype=sums.totals.dtype)
     degenerate: AnyScalar = np.bool_(False)
     with jax.default_matmul_precision("highest"):
         if sums.observability:
             directions = find_directions(sums)
             degenerate = ~jnp.all(directions.held)
-            # What nothing constrains would follow the nearest neighbours' pull: it stays where the start has it.
+            # Along unconstrained directions an update would only follow arbitrary nearest-neighbour matches.
             basis = jnp.asarray(directions.twists).T * (directions.held | ~settings.hold_free_directions)
         change = solve_update(sums, basis)
     moved = move_pose(pose, change.twist, sums.center)
@@ -149,7 +149,7 @@ def update(
     status = jnp.select(list(conditions), [np.int32(code) for code in codes], np.int32(RUNNING))
     record = (sums.cost, sums.rmse, sums.num_inliers, translation_step, rotation_step)
     return State(
-        # The pose that all this was measured at is the one that is returned.
+        # The loop returns the pose at which sums, information and directions were measured.
         pose=jaxlie.SE3(jnp.where(status < 0, moved.wxyz_xyz, pose.wxyz_xyz)),
         status=status,
         num_iterations=num_iterations + (status < 0),
@@ -162,7 +162,7 @@ def update(
 
 @jax.jit
 def constraints_of(state: State) -> tuple[Float[Array, "6 6"], Directions | None]:
-    """Of a loop that has ended: information and directions of ξ in T exp(ξ), metres and radians."""
+    """Information matrix and directions at the final pose, for ξ in T exp(ξ), metres and radians."""
     sums, directions = state.sums, state.directions
     with jax.default_matmul_precision("highest"):
         adjoint = adjoint_to_center(state.pose, sums.center) / units(sums.radius)[:, None]
@@ -178,7 +178,7 @@ def covariance_of_pose(
     scatter: Float[Array, "6 6"],
     num_cells: Int[Array, ""],
 ) -> Float[Array, "6 6"]:
-    """Of a loop that has ended: the covariance of its pose, NaN where there is none to be had."""
+    """Covariance of the final pose, for ξ in T exp(ξ), metres and radians; NaN if the status allows none."""
     found = (state.status != Status.TOO_FEW_CORRESPONDENCES) & (state.status != Status.NON_FINITE)
     if state.directions is None:
         found = found & (state.status != Status.DEGENERATE)
@@ -189,7 +189,7 @@ def covariance_of_pose(
 
 
 def history_of(records: Float[AnyArray, "*batch T 5"]) -> dict[str, Any]:
-    """By name."""
+    """The columns of the records by name, for `Registration.history`."""
     return {name: records[..., i] for i, name in enumerate(RECORDED)}
 
 

@@ -1,7 +1,8 @@
-"""Everything that a pose needs of its correspondences is a sum over them.
+"""Sums over correspondences: a pose update needs nothing else of the points.
 
-Per correspondence there are a force f (3), a stiffness K (3×3) and a cost. About a centre c, with p = T a − c and
-h = (p, 1), the sums are G = Σ f hᵀ (12 numbers), Q = Σ K ⊗ h hᵀ (60) and e = Σ dᵀ f; observability adds Σ w O ⊗ h hᵀ.
+Each correspondence has a force f = w M d (3), a stiffness K = w M (3×3) and a cost. About a centre c, with p = T a − c
+and h = (p, 1), the sums are G = Σ f hᵀ (12 numbers), Q = Σ K ⊗ h hᵀ (60) and e = Σ dᵀ f. Observability O (3×3 per
+correspondence, see `_observability`) adds Σ w O ⊗ h hᵀ.
 """
 
 from __future__ import annotations
@@ -27,13 +28,13 @@ _UPPER = np.triu_indices(4)
 
 
 class Matched(eqx.Module):
-    """Rows of correspondences, gathered; with m candidates per source point, candidate by candidate.
+    """Gathered table rows of both sides of n correspondences; n = m N for m candidates of N source points.
 
     Attributes:
-        source, target: (n, L) rows of the surfaces' tables.
-        valid: (n,) which correspondences count.
-        apart: (n,) squared distance of the descriptors, metres²; for soft matches only.
-        temperature: metres; for soft matches only.
+        source, target: (n, L) rows of the surfaces' tables; the first candidates of all source points come first.
+        valid: (n,) False for correspondences to ignore.
+        apart: (n,) squared distance of the descriptors α · channel, metres²; only for soft assignment.
+        temperature: of the soft assignment, metres; None otherwise.
         num_candidates: m.
     """
 
@@ -48,7 +49,7 @@ class Matched(eqx.Module):
 def matched_rows(
     source: Surface, target: Surface, matches: Correspondences, temperature: Float[Array, ""] | None = None
 ) -> Matched:
-    """The rows that matches bring together; pure JAX."""
+    """Gather the source and target rows of the matches; pure JAX."""
     candidates = jnp.asarray(matches.indices).reshape(-1, source.rows.valid.size)
     indices, valid = candidates.reshape(-1), jnp.asarray(matches.valid).reshape(-1)
     tiled = (
@@ -76,8 +77,8 @@ def move_rows(rotation: Float[Array, "3 3"], translation: Float[Array, "3"], tab
 def within(
     moved: Float[Array, "3 n"], target: Table, found: Bool[AnyArray, "n"], max_distance: Float[Array, ""]
 ) -> tuple[Bool[Array, "n"], Float[Array, "n"]]:
-    """Which matches lie within `max_distance`, metres of position, and how far apart they are: channels choose a
-    match, but do not gate it."""
+    """Which matches lie within `max_distance`, and the distance of each, both in metres of position: channels affect
+    which match is found, but not whether it is accepted."""
     apart = points_of(target) - moved
     distances = jnp.sqrt(alg.inner(apart, apart))
     return found & (distances <= max_distance), distances
@@ -90,7 +91,7 @@ def forces_at(
     method: AbstractMethod,
     robust: AbstractKernel | None,
 ) -> tuple[Float[Array, "3 n"], Forces, Float[Array, "n"]]:
-    """T a, the forces at a pose, and the soft-assignment weight of each correspondence (1 or 0 for hard matches)."""
+    """T a, the forces at a pose, and the soft-assignment weights (1 for valid and 0 for invalid hard matches)."""
     moved = move_rows(rotation, translation, matched.source)
     forces = method.forces(matched.source, matched.target, moved, rotation, matched.valid, robust)
     counts = jnp.asarray(matched.valid).astype(moved.dtype)
@@ -102,7 +103,7 @@ def forces_at(
 
 
 def _softmax(logits: Float[Array, "m N"], valid: Bool[Array, "m N"]) -> Float[Array, "n"]:
-    """Over the valid candidates of each source point; 0 where it has none."""
+    """Softmax over the valid candidates of each source point; 0 for source points without any."""
     highest = jax.lax.stop_gradient(jnp.max(jnp.where(valid, logits, -jnp.inf), axis=0))
     shifted = jnp.where(valid, logits - jnp.where(jnp.isfinite(highest), highest, 0), 0)
     exponentials = jnp.where(valid, jnp.exp(shifted), 0)
@@ -111,16 +112,16 @@ def _softmax(logits: Float[Array, "m N"], valid: Bool[Array, "m N"]) -> Float[Ar
 
 
 class Sums(NamedTuple):
-    """Sums over correspondences, about the centroid of the moved source points that have a match.
+    """Sums over correspondences, see the module. The centre c is the centroid of the moved, matched source points.
 
-    Relative to the centre and about the current pose, no digits are lost in float32.
+    Being relative to this centre and to the current pose, the sums lose no digits in float32.
 
     Attributes:
-        center: (3,) metres.
-        totals: (6,) correspondences; Σ |p|²; e; Σ cost; Σ |d|²; source points with a match.
+        center: (3,) c, metres.
+        totals: (6,) number of correspondences, Σ |p|², e, Σ cost, Σ |d|², number of source points with a match.
         first: (3, 4) G.
-        second: (6, 10), (13, 10) or (19, 10): Q; where observability is known, Σ w h hᵀ, and then Σ w O ⊗ h hᵀ of
-            geometry and of the channels. All symmetric, stored by their upper triangles.
+        second: (6, 10), (13, 10) or (19, 10): Q; where observability is known, followed by Σ w h hᵀ and by
+            Σ w O ⊗ h hᵀ for the geometry and, if used, the channels. Symmetric factors are stored as upper triangles.
     """
 
     center: Float[AnyArray, "*batch 3"]
@@ -130,7 +131,7 @@ class Sums(NamedTuple):
 
     @property
     def radius(self) -> Float[AnyScalar, ""]:
-        """Root mean square distance of the matched points from the centre, metres; 1 where that is 0."""
+        """Root mean square distance of the moved, matched points from the centre, metres; 1 if it is 0."""
         square = self.totals[1] / jnp.maximum(self.totals[0], 1)
         return jnp.where(square > 0, jnp.sqrt(jnp.where(square > 0, square, 1)), 1)
 
@@ -145,12 +146,12 @@ class Sums(NamedTuple):
 
     @property
     def num_inliers(self) -> Int[Array, ""]:
-        """Source points with a match; sums below 2²⁴ are exact in float32."""
+        """Number of source points with a match; exact in float32 up to 2²⁴."""
         return self.totals[5].astype(jnp.int32)
 
     @property
     def rmse(self) -> Float[AnyScalar, ""]:
-        """Root mean square distance of the matches, metres; NaN without any."""
+        """Root mean square correspondence distance, metres; NaN without matches."""
         return jnp.sqrt(self.totals[4] / self.totals[5])
 
     @property
@@ -164,7 +165,7 @@ class Sums(NamedTuple):
 
     @property
     def observability(self) -> list[Float[AnyArray, "6 10"]]:
-        """Of geometry, and of the channels: as many as are known."""
+        """Σ w O ⊗ h hᵀ for the geometry and for the channels, or as many of these as are known."""
         return [self.second[start : start + 6] for start in range(7, self.second.shape[0], 6)]
 
 
@@ -175,7 +176,7 @@ def sums_of(
     method: AbstractMethod,
     robust: AbstractKernel | None,
 ) -> Sums:
-    """The sums at a pose, in one pass over the correspondences: the only part of a step that touches the points."""
+    """Compute the sums at a pose in one pass over the correspondences, the only part of a step that touches points."""
     moved, forces, counts = forces_at(rotation, translation, matched, method, robust)
     mask = jnp.asarray(matched.valid).astype(moved.dtype)
     count = jnp.sum(mask)
@@ -204,7 +205,7 @@ def sums_of(
 
 
 def mean_observability(rotation: Float[Array, "3 3"], matched: Matched) -> list[Float[Array, "6 n"]]:
-    """The mean of what the two points of each correspondence know, in the target's frame: geometry, channels."""
+    """O per correspondence, in the target's frame: mean over its two points; of the geometry, then of the channels."""
     sides = zip(observability_of(matched.source), observability_of(matched.target), strict=True)
     return [0.5 * (alg.rotate(rotation, source) + target) for source, target in sides]
 
@@ -216,12 +217,12 @@ def powers(p: Float[Array, "3 N"]) -> Float[Array, "10 N"]:
 
 
 def combine(parts: Sequence[Sums], dtype: Any) -> Sums:
-    """One sum of the sums of blocks: added in float64 in their order, about the centroid of all. NumPy."""
+    """Add the sums of blocks, in float64 and in block order, after moving them to the common centroid. NumPy."""
     centers, totals, first, second = (
         np.stack([np.asarray(getattr(part, name), np.float64) for part in parts])
         for name in ("center", "totals", "first", "second")
     )
-    # What is not finite stays so, and the status says it.
+    # Non-finite values propagate into the status NON_FINITE; NumPy need not warn of them.
     with np.errstate(invalid="ignore", over="ignore"):
         center = totals[:, 0] @ centers / max(totals[:, 0].sum(), 1)
         if len(parts) > 1:

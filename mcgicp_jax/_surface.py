@@ -1,8 +1,8 @@
-"""What registration knows of a cloud, as tables with a row for each point.
+"""Local surfaces of a cloud, as tables with one row per point.
 
-A point's way: `Neighborhoods` (it and its neighbours, gathered) → `Local` (covariance, normal, fits of the channels:
-no method takes part) → `Surface` (as one method sees it). Rows come first, since matched rows are gathered; inside,
-formulas work on structures of arrays, which the properties and functions here give.
+They are computed in three steps: `Neighborhoods` (gathered neighbours) → `Local` (covariance, normal and channel fits,
+independent of the method) → `Surface` (the input of one method). Tables are row-major, so that matched rows can be
+gathered; formulas work on structures of arrays, (columns, N), which the properties and functions here return.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from mcgicp_jax._search import Rows
 
 # Columns of a surface's table.
 _POINTS, _COVARIANCE, _GEOMETRY, _CHANNELS = slice(0, 3), slice(3, 9), slice(9, 15), slice(15, 21)
-# Columns of `Local.observed`: geometry, roughness, reach; then six for each channel.
+# Number of columns of `Local.observed`: for geometry (6), roughness and reach; and for each channel.
 _FIXED, _PER_CHANNEL = 8, 6
 
 
@@ -29,19 +29,19 @@ else:
 
 
 class Neighborhoods(NamedTuple):
-    """Some points of a cloud and their nearest neighbours, gathered.
+    """Positions and channels of n points of a cloud and of their k nearest neighbours.
 
-    Positions and channels are kept apart, so that a derivative with respect to one does not go through the other.
+    Positions and channels are separate arrays, so that a derivative with respect to one does not involve the other.
 
     Attributes:
         own: (3, n) positions of the points, metres.
-        near: (3, k, n) those of their neighbours.
+        near: (3, k, n) positions of their neighbours, metres, nearest first; the point itself is one of them.
         own_channels: (C, n) channels of the points; C is 0 where channels are not used.
-        near_channels: (C, k, n) those of their neighbours.
-        present: (k, n) which neighbours there are.
+        near_channels: (C, k, n) channels of their neighbours.
+        present: (k, n) which neighbours exist.
         own_known: (C, n) which channels the points have; None if no point lacks any.
-        near_known: (C, k, n) which channels both a point and its neighbour have; None likewise.
-        other: (k, n) which neighbours are not the point itself; None likewise.
+        near_known: (C, k, n) which channels both a point and its neighbour have; None if no point lacks any.
+        other: (k, n) which neighbours exist and are not the point itself; None if no point lacks a channel.
     """
 
     own: Float[AnyArray, "3 n"]
@@ -58,21 +58,21 @@ class Neighborhoods(NamedTuple):
         return self.own_channels.shape[0]
 
     def offset(self, axis: int) -> Float[AnyArray, "k n"]:
-        """Neighbour less point, metres; 0 where there is no neighbour."""
+        """Coordinate of each neighbour minus that of the point, metres; 0 where there is no neighbour."""
         return jnp.where(self.present, self.near[axis] - self.own[axis], 0)
 
     def difference(self, channel: int) -> Float[AnyArray, "k n"]:
-        """Neighbour less point; 0 where there is no neighbour."""
+        """Channel of each neighbour minus that of the point, channel units; 0 where there is no neighbour."""
         return jnp.where(self.present, self.near_channels[channel] - self.own_channels[channel], 0)
 
 
 class Local(NamedTuple):
-    """Statistics of neighbourhoods, whatever the method.
+    """Statistics of neighbourhoods that do not depend on the method.
 
     Attributes:
-        shape: (N, 9): covariance of the neighbours about their mean (symmetric, metres²), and normal, the unit
+        shape: (N, 9): covariance of the neighbours about their mean (symmetric, metres²), and the normal, the unit
             eigenvector of its smallest eigenvalue.
-        observed: (N, 8 + 6 C), constant to autodiff: see the properties.
+        observed: (N, 8 + 6 C): inputs of observability and pose covariance, see the properties; constant to autodiff.
     """
 
     shape: Float[AnyArray, "*batch N 9"]
@@ -92,12 +92,12 @@ class Local(NamedTuple):
 
     @property
     def geometry(self) -> Float[AnyArray, "6 N"]:
-        """Observability by the normal, symmetric, see `_observability`."""
+        """Observability from the shape of the surface, symmetric 3×3, see `_observability`."""
         return self.observed[:, :6].T
 
     @property
     def roughness(self) -> Float[AnyArray, "N"]:
-        """Half the squared height of a neighbour over the point, across the surface, metres²."""
+        """Roughness, metres²: half the squared height difference along the normal between the point and a neighbour."""
         return self.observed[:, 6]
 
     @property
@@ -106,23 +106,23 @@ class Local(NamedTuple):
         return self.observed[:, 7]
 
     def fit(self, channel: int) -> Float[AnyArray, "6 N"]:
-        """Linear fit of a channel over the tangent plane: gradient (2), residual variance (1), inverse (3) of the
-        normal equations; the residual is NaN, the rest 0, where too few neighbours have the channel."""
+        """Linear fit of a channel over the tangent plane: gradient (2), residual variance (1), and inverse of the
+        normal matrix (3). Where too few neighbours have the channel, the variance is NaN and the rest 0."""
         start = _FIXED + _PER_CHANNEL * channel
         return self.observed[:, start : start + _PER_CHANNEL].T
 
 
 class Surface(NamedTuple):
-    """A cloud as a method sees it.
+    """A cloud as the input of one method.
 
     Attributes:
-        rows: what a search sees.
-        table: columns of each point, 9, 15 or 21: position, covariance (symmetric; its meaning is the method's
-            affair), and where observability is known, that of geometry and of the channels (symmetric). On the host
-            in one array, so that matched rows are gathered at once; inside transformations (N, 3), (N, 6), ..., so
-            that a derivative goes through nothing but what moves.
-        details: (N, 6) for the covariance of the pose: variance of the descriptors about their linear fits (metres²),
-            normal (3), roughness, reach; None where observability is not known.
+        rows: input of the search.
+        table: per point 9, 15 or 21 numbers: position (3), covariance (6; its meaning depends on the method), and if
+            computed, observability from geometry (6) and from channels (6); matrices are symmetric. On the host one
+            array, so that matched rows are gathered at once; inside transformations a tuple (N, 3), (N, 6), ..., so
+            that derivatives involve only the columns that depend on the differentiated input.
+        details: (N, 6), for the covariance of the pose: variance of the descriptors about their linear fits (metres²),
+            normal (3), roughness (metres²), reach (metres); None if observability is not computed.
     """
 
     rows: Rows
@@ -139,7 +139,7 @@ def covariance_of(table: Table) -> Float[AnyArray, "6 N"]:
 
 
 def observability_of(table: Table) -> list[Float[AnyArray, "6 N"]]:
-    """Of geometry, and of the channels: as many as the table knows."""
+    """Observability from geometry and from channels, each if the table contains it."""
     if isinstance(table, tuple):
         return [columns.T for columns in table[2:]]
     return [table[:, columns].T for columns in (_GEOMETRY, _CHANNELS) if columns.stop <= table.shape[1]]

@@ -1,4 +1,4 @@
-"""Surfaces: clouds as a method sees them, from neighbourhoods or from covariances that a cloud brings."""
+"""Surfaces of clouds for one method, computed from neighbourhoods or from covariances given with a cloud."""
 
 from __future__ import annotations
 
@@ -33,14 +33,17 @@ def surfaces_of(
     observed: bool,
     num_threads: int | None = 1,
 ) -> tuple[AbstractMethod, Surface, Surface]:
-    """The method with its open numbers chosen from the data, and both clouds as it sees them.
+    """The method with its unset parameters chosen from the data, and the surfaces of both clouds.
 
-    On the host where everything is concrete, in blocks; what depends on one cloud alone is kept as long as the cloud is
-    used. Inside transformations both clouds share one compiled body, unless they are large.
+    Concrete clouds are processed on the host in blocks, and the results cached with each cloud. Inside transformations
+    both clouds share one compiled body, unless they are large.
 
     Args:
-        observed: whether observability is wanted: to `register`, not to a cost of given matches.
-        num_threads: on the host, at most; None for as many as there is use for.
+        observed: whether to compute observability, which `register` needs and the cost of given matches does not.
+        num_threads: largest number of threads on the host; None for no limit.
+
+    Returns:
+        The resolved method, the surface of the source, and that of the target.
     """
     is_open = method.is_open(source, target)
     locals: tuple[Any, Any] = (None, None)
@@ -60,7 +63,7 @@ def surfaces_of(
 
 
 def searchable(method: AbstractMethod, cloud: PointCloud) -> Rows:
-    """The cloud as a search sees it: positions and α · channel."""
+    """The cloud as the input of a search: positions, descriptors α · channel, and penalties for missing channels."""
     xp = namespace(method, cloud)
     points, channels = xp.asarray(cloud.points), xp.asarray(cloud.channels)
     weights = method.weights(channels.shape[-1])
@@ -68,8 +71,8 @@ def searchable(method: AbstractMethod, cloud: PointCloud) -> Rows:
         return Rows(points, xp.zeros((points.shape[0], 0), points.dtype), xp.asarray(cloud.valid))
     weights, penalty = xp.asarray(weights), None
     if cloud.channel_valid is not None:
-        # The expected square of the difference in a true match: a match is then neither nearer nor further for what is
-        # not known of it.
+        # The expected squared difference in a true match: on average, a missing channel makes a match neither nearer
+        # nor farther.
         expected = weights**2 * xp.asarray(method.missing_variances(channels.shape[-1]))
         penalty = xp.where(xp.asarray(cloud.channel_valid), 0, expected.astype(points.dtype))
     return Rows(points, channels * weights.astype(points.dtype), xp.asarray(cloud.valid), penalty)
@@ -78,7 +81,7 @@ def searchable(method: AbstractMethod, cloud: PointCloud) -> Rows:
 def surface_on_host(
     method: AbstractMethod, cloud: PointCloud, local: Local | None, observed: bool, num_threads: int | None
 ) -> Surface:
-    """The surface of a concrete cloud, kept as long as the cloud is used with this method; NumPy arrays."""
+    """The surface of a concrete cloud as NumPy arrays, cached for this cloud and method."""
 
     def make() -> Surface:
         block = partial(_block, method, cloud, local, observed)
@@ -110,7 +113,7 @@ def _traced(
     locals: tuple[Local | None, Local | None],
     observed: bool,
 ) -> Any:
-    """Table and details of each cloud; one body for both, unless they differ in what they bring."""
+    """Table and details of each cloud, from one compiled body if both have the same inputs and are not large."""
     alike = None not in locals and (source.covariances is None) == (target.covariances is None)
     if not alike or not share_a_body(source, target):
         sides = zip((source, target), locals, strict=True)
@@ -143,7 +146,10 @@ def tables(
     local: Local | None,
     observed: bool,
 ) -> tuple[Table, Float[Array, "n 6"] | None]:
-    """Rows of `Surface.table`, as columns apart, and of `Surface.details`."""
+    """`Surface.table` as a tuple of column groups, and `Surface.details` (None without observability), for n points.
+
+    The arguments are those of `AbstractMethod.covariance`; `observed` is that of `surfaces_of`.
+    """
     points = jnp.asarray(points).T
     covariances = None if given is None else alg.symmetric_from_matrix(jnp.asarray(given))
     columns = [points, method.covariance(points, around, local, covariances)]

@@ -1,4 +1,4 @@
-"""Threads that stay, for work that lets go of Python's lock: queries of trees, compiled programs."""
+"""A persistent thread pool for work that releases Python's global lock: tree queries and compiled programs."""
 
 from __future__ import annotations
 
@@ -14,24 +14,26 @@ import jax
 
 Answer = TypeVar("Answer")
 
-# What can be set for a block of code, and changes what is computed in it.
+# JAX settings that are local to a thread and change what a program computes.
 _SETTINGS: tuple[Any, ...] = (jax.enable_x64, jax.default_device, jax.default_matmul_precision, jax.debug_nans)
 
 
 def num_cores() -> int:
-    """Those that this process may use."""
+    """Number of cores that this process may use."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def side_by_side(calls: Sequence[Callable[[], Answer]], most: int | None = None) -> list[Answer]:
-    """The answers of calls, of which this thread makes the first and others take their share of the rest.
+    """Run calls in parallel and return their results in order. The calling thread runs the first call itself.
 
-    The others are those of the whole process. They stay, since a new thread begins on the core of the one that started
-    it, and most queries are over before it is given another. Whoever is ready takes the next call, so that nobody waits
-    for threads that come late, or that wait themselves.
+    The other threads belong to a pool of the whole process. They are kept because a new thread starts on its parent's
+    core, and most queries are over before the scheduler moves it to another. Each idle thread takes the next call from
+    a queue, so that no call has to wait for a thread that is late or blocked. An error of a call is raised once all
+    calls that have started have ended.
 
     Args:
-        most: threads at work, this one among them; as many as there are calls by default.
+        calls: at least one function without arguments.
+        most: largest number of threads, including the calling one; as many as there are calls by default.
     """
     answers: dict[int, Answer] = {}
     waiting = collections.deque(enumerate(calls))
@@ -42,7 +44,7 @@ def side_by_side(calls: Sequence[Callable[[], Answer]], most: int | None = None)
             try:
                 i, call = waiting.popleft()
             except IndexError:
-                # Another one was quicker.
+                # Another thread took the last call.
                 return
             answers[i] = call()
 
@@ -53,7 +55,7 @@ def side_by_side(calls: Sequence[Callable[[], Answer]], most: int | None = None)
         answers[first] = call()
         work()
     finally:
-        # After an error nobody goes on.
+        # After an error in this thread, calls still in the queue are dropped.
         waiting.clear()
         begun = [helper for helper in helpers if not helper.cancel()]
         wait(begun)
@@ -63,10 +65,11 @@ def side_by_side(calls: Sequence[Callable[[], Answer]], most: int | None = None)
 
 
 def with_settings(work: Callable[..., Answer], *, pickled: bool = False) -> Callable[..., Answer]:
-    """The function with JAX's settings of this thread, to be called in another one: settings belong to a thread.
+    """The function bound to the JAX settings of this thread, for calls in another one: settings are thread-local.
 
     Args:
-        pickled: for another process, which has no such device; it takes the first of the same platform.
+        pickled: whether the function goes to another process. Devices cannot be sent there, so that process uses the
+            first device of the same platform.
     """
     values: list[Any] = [setting.value for setting in _SETTINGS]
     if pickled:
@@ -85,7 +88,7 @@ def _submit(work: Callable[[], None]) -> Future[None]:
     try:
         return _threads().submit(work)
     except RuntimeError:
-        # No new thread can be had, as while the interpreter shuts down: what nobody begins can be cancelled.
+        # No thread is available, e.g. at interpreter shutdown: a future that never starts can be cancelled.
         return Future()
 
 
@@ -94,6 +97,6 @@ def _threads() -> ThreadPoolExecutor:
     return ThreadPoolExecutor(max(1, num_cores() - 1), thread_name_prefix="mcgicp")
 
 
-# A forked process has none of its parent's threads.
+# A forked process does not inherit its parent's threads.
 if hasattr(os, "register_at_fork"):
     os.register_at_fork(after_in_child=_threads.cache_clear)

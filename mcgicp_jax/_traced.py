@@ -1,8 +1,8 @@
-"""The loop inside transformations: one program, whose shapes are the user's.
+"""The registration loop inside transformations: one program, compiled for the shapes of the clouds.
 
-Find matches at this pose; sum their forces; update the pose; stop when it no longer moves. Matches come from a
-callback, or from XLA alone (`DenseSearch`). Pose and matches are constants to autodiff; the derivative is attached to
-the pose that the loop returns.
+Find matches at this pose; sum their forces; update the pose; stop when it no longer moves. Matches come from a host
+callback, or from XLA alone (`DenseSearch`). Pose and matches are constants to autodiff within the loop; the implicit
+derivative is attached to the pose that the loop returns.
 """
 
 from __future__ import annotations
@@ -41,9 +41,9 @@ from mcgicp_jax._sums import Matched, Sums, matched_rows, move_rows, sums_of, wi
 from mcgicp_jax._surface import Surface, gathered
 from mcgicp_jax._uncertainty import Details, discount_rows, discounts, scatter_of, scores_of
 
-# Where the loop stands, its matches, and the records so far.
+# State of the loop, its matches, and the history so far.
 Carry: TypeAlias = tuple[State, Correspondences, Float[Array, "... 5"]]
-# Matches at a pose, or those before, and the sums over them.
+# From pose, status, number of updates and last matches: the matches at the pose, and the sums over them.
 Measure: TypeAlias = Callable[[jaxlie.SE3, Int[Array, ""], Int[Array, ""], Correspondences], Any]
 
 
@@ -51,7 +51,7 @@ Measure: TypeAlias = Callable[[jaxlie.SE3, Int[Array, ""], Int[Array, ""], Corre
 def register_traced(
     problem: Problem, search: AbstractSearch, max_iterations: int
 ) -> tuple[State, Correspondences, dict[str, Array]]:
-    """The loop of `register`."""
+    """The loop of `register`: final state, matches and history."""
     carry = begin(problem, search, max_iterations)
     state, matches, records = jax.lax.while_loop(
         lambda carry: carry[0].status < 0, partial(_step, measure=_measuring(problem, search), problem=problem), carry
@@ -60,7 +60,7 @@ def register_traced(
 
 
 def cleaned(matches: Correspondences) -> Correspondences:
-    """Row 0 instead of −1 where there is no match: such rows are not valid."""
+    """Replace index −1 (no match) by 0; `valid` is False there."""
     return eqx.tree_at(lambda matches: matches.indices, matches, jnp.maximum(matches.indices, 0))
 
 
@@ -76,7 +76,7 @@ def align_traced(
     settings: Settings,
     max_iterations: int,
 ) -> tuple[State, dict[str, Array]]:
-    """The loop of `align`: matches stay. Its pose carries the derivative."""
+    """The loop of `align`, with fixed matches: final state, whose pose carries the derivative, and history."""
     matched = matched_rows(source, target, matches, temperature)
     start, fixed, method_fixed, robust_fixed, settings = jax.lax.stop_gradient(
         (start, matched, method, robust, settings)
@@ -98,10 +98,10 @@ def align_traced(
 
 @jax.jit
 def differentiable(state: State, matched: Matched, method: AbstractMethod, robust: AbstractKernel | None) -> State:
-    """The state of a loop that has ended, whose pose carries the derivative of the root next to it."""
+    """Attach the implicit derivative to the pose of a final state; see `with_derivative`."""
     usable = (state.status == Status.CONVERGED) | (state.status == Status.MAX_ITERATIONS)
     if state.directions is not None:
-        # The root of g would slide along a direction that the loop has left alone.
+        # Along an unconstrained direction, which the loop holds fixed, the root of g is arbitrary.
         usable = usable & jnp.all(state.directions.held)
     with jax.default_matmul_precision("highest"):
         root = jax.lax.stop_gradient(root_near(state.sums, usable))
@@ -111,7 +111,7 @@ def differentiable(state: State, matched: Matched, method: AbstractMethod, robus
 
 @jax.jit
 def assess(state: State, problem: Problem, matched: Matched, matches: Correspondences) -> Assessment:
-    """Constraints and covariance of a loop that has ended."""
+    """Information matrix, directions and covariance at the final pose."""
     dtype = state.pose.wxyz_xyz.dtype
     pose = rotation_and_translation(state.pose, dtype)
     details, discount = None, jnp.ones(2, dtype)
@@ -147,14 +147,14 @@ def assess(state: State, problem: Problem, matched: Matched, matches: Correspond
 
 
 def begin(problem: Problem, search: AbstractSearch, max_iterations: int) -> Carry:
-    """The loop of `register` before its first step, with room for all of its history."""
+    """Initial carry of the loop of `register`, with arrays for `max_iterations` + 1 history entries."""
     size, dtype = problem.source.rows.valid.size, problem.start.wxyz_xyz.dtype
     nothing = Correspondences(jnp.full(size, -1, jnp.int32), jnp.zeros(size, dtype), jnp.zeros(size, bool))
     return _begin(problem, _measuring(problem, search), nothing, max_iterations)
 
 
 def step_of_lane(carry: Carry, problem: Problem, search: AbstractSearch) -> Carry:
-    """One step of one lane."""
+    """One step of the loop of `register`, for a lane of a batch."""
     return _step(carry, _measuring(problem, search), problem)
 
 
@@ -166,7 +166,7 @@ def _begin(problem: Problem, measure: Measure, matches: Correspondences, max_ite
 
     state = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), jax.eval_shape(shapes))
     state = eqx.tree_at(lambda state: (state.pose, state.status), state, (problem.start, first))
-    # One for each update, and one for the measurement at the end.
+    # One entry per update, and one at the returned pose.
     return state, matches, jnp.full((max_iterations + 1, len(RECORDED)), jnp.nan, state.record.dtype)
 
 
@@ -183,7 +183,7 @@ def _measuring(problem: Problem, search: AbstractSearch) -> Measure:
         pose: jaxlie.SE3, status: Int[Array, ""], num_iterations: Int[Array, ""], before: Correspondences
     ) -> tuple[Correspondences, Sums]:
         settings, source, target = problem.settings, problem.source, problem.target
-        # Finished lanes of a batch run the body, too.
+        # Under `vmap` the body also runs for finished lanes: no search for them.
         running = (status < 0) & (status != SETTLED)
         rows = _every(settings.stride(status, num_iterations), source.rows)
         found = search.nearest_traced(pose.wxyz_xyz, rows, target.rows, settings.max_distance, running)[0]
@@ -195,13 +195,13 @@ def _measuring(problem: Problem, search: AbstractSearch) -> Measure:
         valid, distances = within(moved, matched_target, here, settings.gate(status))
         matched = Matched(jax.tree.map(jnp.asarray, source.table), matched_target, valid)
         sums = sums_of(*moving, matched, problem.method, problem.robust)
-        # −1 stands for none until the loop ends.
+        # Index −1 marks a missing match until the loop ends, see `cleaned`.
         return Correspondences(indices, distances, valid), sums
 
     return measure
 
 
 def _every(stride: Int[Array, ""], source: Rows) -> Rows:
-    """Every so many-th row; the others match nothing."""
+    """Mark all but every `stride`-th row as invalid, so that they match nothing."""
     chosen = jnp.arange(source.valid.size) % stride == 0
     return eqx.tree_at(lambda rows: rows.valid, source, source.valid & chosen)

@@ -1,8 +1,8 @@
 """Nearest neighbours by trees on the host.
 
-`AbstractTreeSearch` owns what every tree needs: ties, padding, missing channels, threads, following a source from pose
-to pose, the callback inside transformations and its cache. A tree is `build` and `query`; `KDTreeSearch` is SciPy's.
-What a callback runs is NumPy alone.
+`AbstractTreeSearch` handles what is common to all trees: ties, padding, missing channels, threads, reuse of matches
+from pose to pose, and the callback with its cache inside transformations. A subclass implements `build` and `query`;
+`KDTreeSearch` uses SciPy's tree. Callbacks run NumPy code only.
 """
 
 from __future__ import annotations
@@ -27,52 +27,61 @@ from mcgicp_jax._pose import rotation_from_quaternion
 from mcgicp_jax._search import AbstractIndex, AbstractSearch, Rows, on_host
 from mcgicp_jax._threads import num_cores, side_by_side
 
-# Candidates that a tree is asked for, at most, to break a tie by row number: a multiple of those wanted, and at least
-# this many. Longer ties are mostly those of coincident points, which are then searched as one.
+# Largest number of candidates per query with which a tie is broken by row: a multiple of the neighbours wanted, but at
+# least the second number. Longer ties are mostly due to coincident points, which are then merged and searched again.
 _TIE_CANDIDATES = 8
 _LEAST_TIE_CANDIDATES = 64
-# Trees of one index, at most, for sets of channels that matches have in common: two cameras that see a point or not.
+# Largest number of combinations of missing channels (of the queries × of the target) for which a tree each is built:
+# two cameras, each of which sees a point or not, make 4 × 4.
 _MOST_TREES = 16
-# With more of such sets: how many points near in position are looked at first, and of how many pairs at a time.
+# With more combinations: number of neighbours in position that are examined first, and number of (query, neighbour)
+# differences in memory at a time.
 _FIRST_NEAR = 32
 _PAIRS_AT_ONCE = 200_000
-# Queries that are worth being given to another thread, and how many such parts there are, at most, for each thread:
-# several, since a thread may come late. At 2,000 to 100,000 queries, a factor of two in either hardly matters.
+# Smallest number of queries that a thread is given at a time, and largest number of such parts per thread: several,
+# since a thread may start late. With 2,000 to 100,000 queries, a factor of two in either hardly matters.
 _LEAST_PART, _PARTS_PER_THREAD = 1000, 8
-# A tree of more points falls out of a processor's caches, and is searched faster by queries that lie side by side: a
-# million points in half the time.
+# Points. A larger tree does not fit into a processor's caches; queries are then sorted so that neighbours follow each
+# other, which halves the time at a million points.
 _LARGEST_UNORDERED = 50_000
-# Bytes of an array that JAX copies on the spot for a callback: below 100 KiB in jaxlib 0.10.2.
+# Bytes. JAX (jaxlib 0.10.2) copies smaller arrays for a callback in the calling thread, up to 100 KiB; see `_pieces`.
 _LARGEST_PIECE = 64 * 1024
-# Rows of all trees that are kept for callbacks: hundreds of scans, some hundred megabytes.
+# Total number of rows of the trees cached for callbacks: hundreds of scans, some hundred megabytes.
 _CACHED_ROWS = 2_000_000
 
 
 class AbstractTreeSearch(AbstractSearch):
-    """Exact search with a tree on the host. Equal distances are ordered by row, so that results repeat.
+    """Exact search with a tree on the host. Ties are broken by row, so that results are reproducible.
 
     Attributes:
-        workers: threads of one registration, at most; −1 takes all cores.
+        workers: largest number of threads per registration; −1 uses all cores.
     """
 
     workers: int = eqx.field(static=True, default=-1)
 
     @abc.abstractmethod
     def build(self, points: Float[np.ndarray, "M D"]) -> Any:
-        """A tree of finite points, at least one; D is 3 or more."""
+        """A tree of (M, D) finite points, metres; M is at least 1, D at least 3."""
 
     @abc.abstractmethod
     def query(
         self, tree: Any, queries: Float[np.ndarray, "N D"], k: int, bound: float
     ) -> tuple[Float[np.ndarray, "N k"], Int[np.ndarray, "N k"]]:
-        """Distances and rows of the k nearest points of finite queries, nearest first, equal ones in any order.
+        """The k nearest points of each query. Several threads may call this function at once.
 
-        Where fewer than k points lie within the bound, the distance is infinite and the row the number of points.
-        Called by several threads at once.
+        Args:
+            tree: from `build`, of M points.
+            queries: (N, D) finite points, metres.
+            k: number of neighbours, at most M.
+            bound: metres in all D dimensions; only neighbours nearer than this are reported.
+
+        Returns:
+            (N, k) distances in metres and rows, nearest first, ties in any order. Where fewer than k points lie within
+            the bound, the distance is infinite and the row is M.
         """
 
     def leaf_order(self, tree: Any, num_points: int) -> Int[np.ndarray, "M"]:
-        """An order of the tree's points in which neighbours follow each other: queries in it are quicker."""
+        """An order of the tree's points in which neighbouring points follow each other, for faster queries."""
         return np.arange(num_points)
 
     @property
@@ -96,13 +105,13 @@ class AbstractTreeSearch(AbstractSearch):
             partial(_nearest_callback, self, num_candidates),
             jax.ShapeDtypeStruct((num_candidates, source.valid.shape[0]), jnp.int32),
             *arguments,
-            # One lane at a time: a batch of pieces would be large again.
+            # One lane at a time: a batch of small pieces would again be a large array, see `_pieces`.
             vmap_method="sequential",
         )
 
     def neighbors(self, points: Float[np.ndarray, "N 3"], num_neighbors: int) -> Int[np.ndarray, "N k"]:
         tree = self.build(points)
-        # In the order of the leaves, each query finds in the processor's caches what the one before has read.
+        # In the order of the leaves, each query finds the nodes it needs in the processor's caches.
         order = self.leaf_order(tree, len(points))
         found, _ = _nearest(self, tree, points, points[order], num_neighbors)
         neighbors = np.full((len(points), num_neighbors), -1, np.int32)
@@ -111,15 +120,15 @@ class AbstractTreeSearch(AbstractSearch):
 
 
 class KDTreeSearch(AbstractTreeSearch):
-    """Exact search with SciPy's k-d tree on the host. Equal distances are ordered by row, so that results repeat.
+    """Exact search with SciPy's k-d tree on the host. Ties are broken by row, so that results are reproducible.
 
     Attributes:
-        workers: threads of one registration, at most; −1 takes all cores.
+        workers: largest number of threads per registration; −1 uses all cores.
     """
 
     def build(self, points: Float[np.ndarray, "M D"]) -> scipy.spatial.cKDTree:
-        # Unbalanced trees build faster and are searched as fast; compact nodes pay for themselves with 20 neighbours,
-        # and with one from the second query on. Leaves of 32 are a few percent faster than SciPy's of 16.
+        # Unbalanced trees are built faster and searched as fast. Compact nodes pay off for 20 neighbours, and for one
+        # neighbour from the second query on. Leaves of 32 points are a few percent faster than SciPy's default of 16.
         return scipy.spatial.cKDTree(points, leafsize=32, balanced_tree=False, compact_nodes=True)
 
     def query(
@@ -132,27 +141,27 @@ class KDTreeSearch(AbstractTreeSearch):
 
 
 class TreeIndex(AbstractIndex):
-    """A tree of the finite rows; where rows lack channels, one for each set of channels that matches have in common.
+    """An index over the finite rows: one tree, or where rows lack channels, one per set of channels in common.
 
-    Where there are many of such sets, the nearest points in position are looked at one by one instead.
+    With many such sets, a tree of positions yields candidates instead, whose search distances are then computed.
     """
 
     def __init__(self, search: AbstractTreeSearch, target: Rows):
         points = np.hstack([target.points, target.descriptors])
-        # A tree refuses what is not finite; the sums at the pose will say NON_FINITE.
+        # Trees reject non-finite points; the sums at the pose lead to the status NON_FINITE.
         self._rows = np.flatnonzero(target.valid & np.isfinite(points).all(axis=1)).astype(np.int32)
         self._points = points[self._rows]
         penalty = np.zeros_like(target.descriptors) if target.penalty is None else target.penalty
         self._penalty = penalty[self._rows]
         self._patterns, self._which = _patterns(self._penalty)
         self._search = search
-        # Trees are built when first asked for. Threads that ask at the same time build the same.
+        # Trees are built on demand. Threads that need the same tree at once may each build it.
         self._parts: dict[bytes, list[_Part]] = {}
         self._positions: Any = None
 
     @property
     def num_rows(self) -> int:
-        """Those of all its trees."""
+        """Total number of rows in all trees, as a measure of memory."""
         return self._rows.size * max(1, len(self._parts) + (self._positions is not None))
 
     def nearest(
@@ -173,19 +182,24 @@ class TreeIndex(AbstractIndex):
         max_distance: float,
         k: int,
     ) -> tuple[Int[np.ndarray, "N k"], Float[np.ndarray, "N"]]:
-        """Rows of the k nearest, −1 for none, and how far a query may move, metres, before the nearest is another one.
+        """The k nearest rows of each query.
 
         Args:
-            queries: positions and descriptors; nothing is near to a row that is not finite.
+            queries: positions and descriptors, metres; rows that are not finite have no neighbours.
+            penalty: as in `Rows`, for the queries.
+
+        Returns:
+            (N, k) target rows, −1 for none; and (N,) the slack: the distance, metres, that a query may move before its
+            nearest row can change.
         """
         indices, slack = np.full((len(queries), k), -1, np.int32), np.zeros(len(queries))
         if not self._rows.size:
             return indices, slack
         finite = np.isfinite(queries)
-        # Most often all are: asking for all at once is quicker than for each row, and a slice copies nothing.
+        # Usually all are finite: then `all()` is quicker than a test by row, and a slice copies nothing.
         active: slice | Int[np.ndarray, "n"] = slice(None) if finite.all() else np.flatnonzero(finite.all(axis=1))
-        # With descriptors, the nearest may lie beyond the gate while a match within it is further in all dimensions:
-        # then the whole space is searched. The margin covers rounding; the gate itself is applied to the position.
+        # The maximum correspondence distance refers to the position and is applied by the caller; the margin covers
+        # rounding. With descriptors it does not bound the search distance, so the whole space is searched.
         bound = np.inf if queries.shape[1] > 3 else 1.001 * max_distance
         rows = np.arange(len(queries))[active]
         if penalty is None:
@@ -213,7 +227,7 @@ class TreeIndex(AbstractIndex):
         if len(parts) == 1:
             found, slack = parts[0].nearest(queries, k, bound)
             return parts[0].rows[found], slack
-        # The second nearest tells how far a query may move.
+        # The slack depends on the second nearest row.
         each = [part.nearest(queries, k + 1, bound)[0] for part in parts]
         rows = np.hstack([part.rows[found] for part, found in zip(parts, each, strict=True)])
         squares = np.hstack([part.squares(queries, found) for part, found in zip(parts, each, strict=True)])
@@ -225,13 +239,13 @@ class TreeIndex(AbstractIndex):
     ) -> tuple[Int[np.ndarray, "N m"], Float[np.ndarray, "N"]]:
         """`nearest_of` for queries and points that lack many different sets of channels.
 
-        More and more points near in position are looked at, until all others are too far away in position alone.
+        The number of neighbours in position grows until all other points are too far away in position alone.
         """
         if self._positions is None:
             self._positions = self._search.build(self._points[:, :3])
         size = self._rows.size
         found, slack = np.empty((len(queries), min(k, size)), np.int32), np.empty(len(queries))
-        # What any match adds to the squared distance.
+        # Penalties that every match of a query incurs: a lower bound on the squared distance beside the position.
         least = penalty.sum(axis=1)
         open, asked = np.arange(len(queries)), min(max(_FIRST_NEAR, k + 1), size)
         while open.size:
@@ -240,7 +254,7 @@ class TreeIndex(AbstractIndex):
                 distances, near = _query(self._search, self._positions, queries[some, :3], asked, np.inf)
                 rows, squares = _ordered(self._rows[near], self._squares(queries[some], penalty[some], near), k + 1)
                 found[some] = rows[:, :k]
-                # A part in a billion covers rounding.
+                # The margin of 1e-9 covers rounding in float64.
                 others = (1 - 1e-9) * (distances[:, -1] ** 2 + least[some]) if asked < size else np.inf
                 slack[some] = _slack(*np.sqrt([squares[:, 0], np.minimum(squares[:, -1], others)]))
                 unsure.append(some[~(squares[:, min(k, size) - 1] < others)])
@@ -250,7 +264,7 @@ class TreeIndex(AbstractIndex):
     def _squares(
         self, queries: Float[np.ndarray, "N D"], penalty: Float[np.ndarray, "N C"], near: Int[np.ndarray, "N m"]
     ) -> Float[np.ndarray, "N m"]:
-        """Squared distances to rows, with the penalties of the channels that are missing; metres²."""
+        """Squared search distances to points, including the penalties for missing channels; metres²."""
         difference = queries[:, None] - self._points[near]
         missing = np.maximum(penalty[:, None], self._penalty[near])
         difference[..., 3:][missing > 0] = 0
@@ -270,10 +284,10 @@ class TreeIndex(AbstractIndex):
 
 
 def _patterns(penalty: Float[np.ndarray, "N C"]) -> tuple[Float[np.ndarray, "P C"], Int[np.ndarray, "N"]]:
-    """The different rows of penalties, and which of them each row is."""
+    """The distinct rows of penalties (sets of missing channels), and the number of its set for each row."""
     which = np.zeros(len(penalty), np.intp)
-    # Numbers stay below twice the number of rows, whatever the number of channels. No sorting: that takes most of the
-    # time of a search.
+    # Sets are renumbered after each channel, so that numbers stay below twice the number of rows. `np.unique` would
+    # sort the rows, which takes most of the time of a search.
     for column in (penalty > 0).T:
         which = 2 * which + column
         which = (np.cumsum(np.bincount(which) > 0) - 1)[which]
@@ -285,20 +299,20 @@ def _patterns(penalty: Float[np.ndarray, "N C"]) -> tuple[Float[np.ndarray, "P C
 def _ordered(
     rows: Int[np.ndarray, "N m"], squares: Float[np.ndarray, "N m"], k: int
 ) -> tuple[Int[np.ndarray, "N k"], Float[np.ndarray, "N k"]]:
-    """The first k by squared distance, equal ones by row."""
+    """The first k rows by squared distance, ties by row, and their squared distances."""
     order = np.lexsort((rows, squares), axis=1)[:, :k]
     return np.take_along_axis(rows, order, axis=1), np.take_along_axis(squares, order, axis=1)
 
 
 def _slack(first: Float[np.ndarray, "N"], second: Float[np.ndarray, "N"]) -> Float[np.ndarray, "N"]:
-    """Half the gap between the distances of the nearest and the second nearest, metres: so far may a query move."""
-    # A part in a million covers rounding. A single row has no second, and infinity less infinity no meaning.
+    """Distance that a query may move before its nearest row can change: half the gap to the second, metres."""
+    # The margin of 1e-6 covers rounding. Without a nearest row the gap is NaN or −inf, and the slack 0.
     with np.errstate(invalid="ignore"):
         return 0.5 * (1 - 1e-6) * np.nan_to_num(second - first, neginf=0.0)
 
 
 class _Part:
-    """A tree of target rows that all have the same channels in common with a query."""
+    """A tree of the target rows that share one set of channels with a query."""
 
     def __init__(
         self,
@@ -319,30 +333,27 @@ class _Part:
     def nearest(
         self, queries: Float[np.ndarray, "N D"], k: int, bound: float
     ) -> tuple[Int[np.ndarray, "N m"], Float[np.ndarray, "N"]]:
-        """Tree indices, nearest first, no more than there are; the number of rows beyond the bound.
-
-        And how far each query may move before its nearest is another one.
-        """
+        """Tree indices of the k nearest (fewer if the tree has fewer), and the slack, as from `_nearest`."""
         return _nearest(self._search, self._tree, self._points, queries[:, self._columns], k, bound)
 
     def squares(self, queries: Float[np.ndarray, "N D"], found: Int[np.ndarray, "N m"]) -> Float[np.ndarray, "N m"]:
-        """Squared distances to rows of this part, with the penalties of the channels that are missing; metres²."""
+        """Squared search distances to tree indices, including the penalties for missing channels; metres²."""
         difference = queries[:, None, self._columns] - self._points[np.minimum(found, len(self._points) - 1)]
         apart = np.sum(difference * difference, axis=2) + self._penalty
         return np.where(found < len(self._points), apart, np.inf)
 
 
 class _Follower:
-    """Matches of one source, pose after pose.
+    """Nearest target rows of one source, for a sequence of poses.
 
-    A match stands, exactly, as long as its point has moved by less than half the gap between its nearest and its second
-    nearest target point, since it was looked for. After the first poses that holds for most.
+    A match is provably unchanged while its source point has moved by less than half the gap between its nearest and its
+    second nearest target point since the last search. After the first poses this holds for most points.
     """
 
     def __init__(self, index: TreeIndex, search: AbstractTreeSearch, source: Rows, max_distance: float):
         self._index = index
         self._max_distance = max_distance
-        # Valid source rows, close ones one after the other where that pays. All arrays below are in this order.
+        # Valid source rows, for large clouds sorted by neighbourhood. All arrays below are in this order.
         order: Int[np.ndarray, "n"] = np.flatnonzero(source.valid)
         if order.size > _LARGEST_UNORDERED:
             points = np.nan_to_num(source.points[order], posinf=0, neginf=0)
@@ -351,7 +362,7 @@ class _Follower:
         self._points = np.asarray(source.points[order], np.float64)
         self._descriptors = source.descriptors[order]
         self._penalty = None if source.penalty is None else source.penalty[order]
-        # Where each point was when its match was looked for, and how far it may move from there.
+        # Position of each point at its last search, and the distance that it may move from there.
         self._asked: Float[np.ndarray, "n 3"] = np.full((order.size, 3), np.nan)
         self._slack: Float[np.ndarray, "n"] = np.zeros(order.size)
         self._rows: Int[np.ndarray, "N"] = np.full(source.valid.size, -1, np.int32)
@@ -359,20 +370,20 @@ class _Follower:
     def nearest(self, pose: Float[ArrayLike, "7"]) -> Int[np.ndarray, "N"]:
         moved = _moved(pose, self._points)
         shift = moved - self._asked
-        # Written so that NaN is looked for.
+        # Written so that NaN, which marks points not yet searched for, counts as stale.
         stale = np.flatnonzero(~(np.einsum("ij,ij->i", shift, shift) < self._slack**2))
         queries = np.hstack([moved[stale], self._descriptors[stale]])
         penalty = None if self._penalty is None else self._penalty[stale]
         found, self._slack[stale] = self._index.nearest_of(queries, penalty, self._max_distance, 1)
         self._asked[stale] = moved[stale]
-        # What was handed out before stays as it was.
+        # Arrays returned earlier must not change.
         self._rows = self._rows.copy()
         self._rows[self._order[stale]] = found[:, 0]
         return self._rows
 
 
 class _IndexCache:
-    """The trees of the targets seen last, by content: a callback that is pure still builds each tree only once."""
+    """Least-recently-used cache of trees by content: a pure callback keeps no state, yet builds each tree only once."""
 
     def __init__(self, rows: int):
         self._rows = rows
@@ -401,10 +412,10 @@ _index_cache = _IndexCache(_CACHED_ROWS)
 
 
 def _pieces(array: Any) -> list[Any]:
-    """An array cut along its rows, for a callback.
+    """An array split along its rows into pieces that are small enough to be passed to a callback without a deadlock.
 
-    JAX copies what a callback is given, and large arrays by a thread of the pool that programs run on. Where callbacks
-    of as many programs as there are threads wait for that, all wait for ever (seen with two programs on two cores).
+    JAX copies the arguments of a callback, large arrays in a thread of the pool that also runs programs. If callbacks
+    of as many programs as there are threads wait for such copies, they deadlock (seen with two programs on two cores).
     """
     array = jnp.asarray(array)
     count = -(-array.nbytes // _LARGEST_PIECE)
@@ -412,7 +423,7 @@ def _pieces(array: Any) -> list[Any]:
 
 
 def _nearest_callback(search: AbstractTreeSearch, num_candidates: int, *arguments: Any) -> Int[np.ndarray, "m N"]:
-    """`nearest` of arguments in pieces, which are those of `AbstractSearch.nearest_traced`."""
+    """`TreeIndex.nearest` for the arguments of `AbstractSearch.nearest_traced`, each split by `_pieces`."""
     whole = jax.tree.map(
         lambda pieces: (
             np.concatenate([np.asarray(piece) for piece in pieces]) if len(pieces) > 1 else np.asarray(pieces[0])
@@ -429,7 +440,7 @@ def _nearest_callback(search: AbstractTreeSearch, num_candidates: int, *argument
 
 def _moved(pose: Float[ArrayLike, "7"], points: Float[np.ndarray, "N 3"]) -> Float[np.ndarray, "N 3"]:
     pose = np.asarray(pose, np.float64)
-    # A pose that is not finite moves points to nowhere; the sums will say so.
+    # A non-finite pose gives NaN; the status of the registration reports it.
     with np.errstate(invalid="ignore"):
         return points @ rotation_from_quaternion(pose[:4]).T + pose[4:]
 
@@ -442,10 +453,13 @@ def _nearest(
     k: int,
     bound: float = np.inf,
 ) -> tuple[Int[np.ndarray, "N k"], Float[np.ndarray, "N"]]:
-    """Tree indices of the k nearest, ordered by (distance, row); the number of points where none lies within `bound`.
+    """The k nearest points of each query (all points if there are fewer), ordered by distance and then row.
 
-    And half the gap between the nearest and the second, which lies at the bound if there is none within; 0 without any.
-    Trees leave the order of equal distances to chance. One neighbour more than needed shows where there are any.
+    Trees return ties in any order. Searching for k + 1 neighbours reveals ties, which are then resolved.
+
+    Returns:
+        Tree indices, the number of points standing for none within `bound`; and the slack: half the gap between the
+        nearest and the second nearest, which is taken to lie at the bound if none is within it; 0 without a nearest.
     """
     k = min(k, len(points))
     asked = min(k + 1, len(points))
@@ -458,7 +472,7 @@ def _nearest(
     while tied.size:
         order = np.lexsort((rows, distances), axis=1)
         nearest[tied] = np.take_along_axis(rows, order, axis=1)[:, :k]
-        # A tie that the last candidate shares may go on beyond it.
+        # A tie that includes the last candidate may extend beyond it.
         tied = tied[np.isfinite(distances[:, -1]) & (distances[:, k - 1] == distances[:, -1])]
         if asked == most:
             break
@@ -477,9 +491,9 @@ def _nearest_of_coincident(
     k: int,
     bound: float,
 ) -> Int[np.ndarray, "N k"]:
-    """`_nearest` where many points are equally far away, as where a sensor writes zeros for what it did not see.
+    """Tree indices as from `_nearest`, for long ties, e.g. where a sensor reports missing echoes as zeros.
 
-    Points that coincide are searched as one, and so are queries.
+    Coincident points are merged before the search, and so are coincident queries.
     """
     places, which, counts = np.unique(points, axis=0, return_inverse=True, return_counts=True)
     by_place = np.split(np.argsort(which.ravel(), kind="stable"), np.cumsum(counts)[:-1])
@@ -491,7 +505,7 @@ def _nearest_of_coincident(
         while not sure:
             distances, near = search.query(tree, query[None], asked, bound)
             near, distances = near[0][np.isfinite(distances[0])], distances[0][np.isfinite(distances[0])]
-            # Of each place the first k rows; further places only where their distance is among the k smallest.
+            # The first k rows at each place suffice. The search is complete once the next place is farther than all k.
             rows = np.concatenate([by_place[place][:k] for place in near])
             apart = np.repeat(distances, np.minimum(counts[near], k))
             order = np.lexsort((rows, apart))[:k]

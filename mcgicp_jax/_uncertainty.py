@@ -1,14 +1,14 @@
-"""Covariance of a pose, from the scatter of the forces that the correspondences exert.
+"""Covariance of a pose, from the scatter of the scores (force and torque) of its correspondences.
 
-The sandwich A⁻¹ (Σ_c u_c u_cᵀ) A⁻¹ of a root of g = Σ w JᵀMd (Huber 1967). The scores of neighbouring correspondences
-are not independent, since they share targets and covariances: u_c is their sum over a cell about as large as a
-neighbourhood. A is the Jacobian of g with respect to the pose. Of M as a whole, only the fraction K that observability leaves takes
-part, since matches follow: A = Σ JᵀMKJ. What the rest, M(I − K)d, sums up to is a bias of the nearest neighbours upon
-the whole cloud; it counts as one more score. (The derivative of M with respect to the rotation was tried in A; it made
-no difference of 1 %.)
+The sandwich estimate A⁻¹ (Σ_c u_c u_cᵀ) A⁻ᵀ for the root of g = Σ w JᵀMd (Huber 1967). Scores of neighbouring
+correspondences are correlated, since they share targets and covariances, so u_c is the sum of the scores in a cell
+about as large as a neighbourhood. A is the Jacobian of g with respect to the pose. When the pose moves, the matches
+follow along the surface, so only the observable fraction O of a motion changes the residuals: A = Σ w JᵀMOJ. The rest
+of the forces, w M(I − O)d, sums to a bias of nearest-neighbour matching, which enters as one more score. (Including the
+derivative of M with respect to the rotation in A changed the result by less than 1 %.)
 
-Three steps: medians over sampled rows (`discounts`), scores of all rows (`scores_of`), and 6×6 algebra
-(`sandwich`). The first two work row by row, in blocks or over whole arrays.
+Three steps: medians over sampled rows (`discounts`), scores of all rows (`scores_of`), and 6×6 algebra (`sandwich`).
+The first two work row by row, in blocks or over whole arrays.
 """
 
 from __future__ import annotations
@@ -32,20 +32,20 @@ from mcgicp_jax._statistics import median, namespace
 from mcgicp_jax._sums import Matched, forces_at, mean_observability, move_rows, powers
 from mcgicp_jax._surface import noise_of, normal_of, points_of, reach_of, roughness_of
 
-# Scores are summed over cells of this many distances to the farthest neighbour: 1 to 4 hardly differ.
+# Edge of a cell in distances to the farthest neighbour; values from 1 to 4 hardly differ.
 _CELL = 2.0
-# Radii of the matched points: the standard deviation of a direction that nothing constrains.
+# Standard deviation of an unconstrained direction, in radii of the matched points: large beside their extent.
 _UNKNOWN = 10.0
-# Least fraction of a motion that is taken to show: medians of few rows may come out as 0.
+# Lower bound of the factors that reduce observability, dimensionless: medians of few rows may be 0.
 _LEAST_FRACTION = 0.2
-# Medians of the square of a normal variate, and of the mean of two such squares.
+# Medians of the square of a standard normal variate, and of the mean of two such squares.
 _MEDIAN_SQUARE, _MEDIAN_MEAN_OF_TWO = 0.455, 0.693
-# Multipliers of the hash of a cell: primes of Teschner et al. 2003, and one more.
+# Multipliers of the spatial hash: the primes of Teschner et al. 2003 for the coordinates, and one for the cell size.
 _HASH = np.array([73856093, 19349663, 83492791, 50331653], np.int32)
 
 
 class Details(NamedTuple):
-    """`Surface.details` of correspondences: rows of the source, and the matched rows of the target."""
+    """Rows of `Surface.details` of both sides of n correspondences."""
 
     source: Float[AnyArray, "n 6"]
     target: Float[AnyArray, "n 6"]
@@ -59,11 +59,14 @@ def discount_rows(
     source: Rows,
     target: Rows,
 ) -> Float[Array, "n 3"]:
-    """What `discounts` takes medians of: squared residual across the surface, what roughness lets expect of it, and the
-    squared difference of the descriptors by what their noise lets expect of it. NaN without a match.
+    """Per match, the statistics whose medians `discounts` takes; NaN where there is no match.
 
     Args:
-        source, target: matched rows, as a search sees them.
+        source, target: matched rows with descriptors; channels that a point lacks invalidate the third column.
+
+    Returns:
+        Columns: squared residual along the normal, metres²; its variance expected from roughness, metres²; squared
+        descriptor difference divided by its variance expected from channel noise.
     """
     residual = points_of(matched.target) - move_rows(rotation, translation, matched.source)
     across = jnp.dot(rotation, normal_of(details.source), precision="highest")
@@ -75,41 +78,42 @@ def discount_rows(
             complete = complete & jnp.all(penalty == 0, axis=1)
     noise = noise_of(details.source) + noise_of(details.target)
     difference = source.descriptors - target.descriptors
-    # Match by match, since edges are noisier than what lies between them.
+    # A quotient per match rather than one of medians: noise is higher at edges.
     quotient = jnp.sum(difference * difference, axis=1) / jnp.where(noise > 0, noise, jnp.nan)
     columns = (jnp.where(matched.valid, seen, jnp.nan), jnp.where(matched.valid, expected, jnp.nan))
     return jnp.stack([*columns, jnp.where(complete, quotient, jnp.nan)], axis=1)
 
 
 def discounts(rows: Float[AnyArray, "n 3"], num_channels: Int[AnyScalar, ""]) -> Float[AnyArray, "2"]:
-    """By how much less of a motion shows than observability says: across the surface, and in the channels; 0.2 to 1.
+    """(2,) factors, 0.2 to 1, by which observability must be reduced: of the geometry and of the channels.
 
-    Across the surface: among rough neighbours the nearest is one whose height is much like that of the point. If
-    heights b = βa + e of matches follow those of their points so, and both are as rough as each other, then the
-    variance of b − a is 1 − β of what the two roughnesses add up to; and when the point moves, its match makes up for
-    β of it. Likewise among neighbours with noisy channels. Medians, since planes do not fit at edges.
+    On a rough surface the nearest neighbour is one whose height resembles that of the point. If the heights of matches
+    are b = βa + e with equal roughness on both sides, the variance of b − a is 1 − β times the sum of both roughnesses,
+    and when the point moves, its match follows by β of the motion: so 1 − β is both the ratio of observed to expected
+    variance, estimated here, and the observable fraction. The same holds for noisy channels. Medians, since the plane
+    fits fail at edges.
 
     Args:
-        rows: of `discount_rows`.
-        num_channels: how many channels weigh anything.
+        rows: from `discount_rows`.
+        num_channels: number of channels with a nonzero weight α.
     """
     xp = namespace(rows, num_channels)
     seen, expected, quotient = median(xp.asarray(rows).T)
     geometry = (seen / _MEDIAN_SQUARE) / (xp.where(expected > 0, expected, xp.nan) / _MEDIAN_MEAN_OF_TWO)
-    # The median of a sum of C squares of normal variates, divided by C (Wilson & Hilferty 1931).
+    # Divided by the median of χ²/C with C degrees of freedom, after Wilson & Hilferty 1931.
     channels = quotient / (1 - 2 / (9 * xp.maximum(num_channels, 1))) ** 3
     ratios = xp.stack([geometry, channels])
     return xp.where(xp.isfinite(ratios), xp.clip(ratios, _LEAST_FRACTION, 1), 1).astype(rows.dtype)
 
 
 class Scores(NamedTuple):
-    """What `sandwich` needs of correspondences.
+    """Scores of n correspondences, and the sums over them that `sandwich` needs.
 
     Attributes:
-        rows: (n, 7) force and torque of each, lengths in units of the radius, and whether it counts.
-        cells: (n,) number of the cell that each falls into; None: every correspondence is a cell of its own.
-        jacobian: (6, 10) Σ (M K) ⊗ h hᵀ about the centre.
-        bias: (6,) Σ of the forces and torques that observability leaves out.
+        rows: (n, 7) force, torque (arms in units of the radius), and 1 for valid correspondences or 0.
+        cells: (n,) cell number of each; None: every correspondence is a cell of its own.
+        jacobian: (6, 10) Σ (K O) ⊗ h hᵀ about the centre, K O symmetrised; K = w M, or the tangent of a robust force.
+        bias: (6,) Σ of force and torque of w M(I − O)d; 0 where observability is not known.
     """
 
     rows: Float[AnyArray, "n 7"]
@@ -133,10 +137,10 @@ def scores_of(
 
     Args:
         pose: rotation and translation.
-        center, radius: metres, of the sums over all correspondences.
-        details: None where observability is not known; all of a stiffness counts then.
-        discount: of `discounts`.
-        num_cells: cells of space share so many numbers.
+        center, radius: `Sums.center` and `Sums.radius` over all correspondences, metres.
+        details: None where observability is not known; then O = I.
+        discount: from `discounts`.
+        num_cells: size of the hash table of cells.
     """
     moved, forces, counts = forces_at(*pose, matched, method, robust)
     arms = jnp.where(matched.valid, (moved - center[:, None]) / radius, 0)
@@ -148,7 +152,7 @@ def scores_of(
         geometry, *channels = mean_observability(pose[0], matched)
         shown = discount[0] * geometry
         for each in channels:
-            # K = A (I + A)⁻¹ with an A that is smaller by the discount.
+            # A / (1 + tr A) of `channel_observability`, with A multiplied by the discount.
             trace = each[0] + each[3] + each[5]
             shown = shown + discount[1] * each / (1 - (1 - discount[1]) * jnp.clip(trace, 0, 1))
         left_out = forces.force - alg.multiply(forces.stiffness, alg.multiply(shown, forces.residual))
@@ -161,7 +165,7 @@ def scores_of(
 
 
 def _wrench(arms: Float[Array, "3 N"], force: Float[Array, "3 N"]) -> Float[Array, "6 N"]:
-    """Force and torque."""
+    """Force and torque of forces acting at the ends of arms."""
     return jnp.concatenate([force, jnp.cross(arms, force, axis=0)])
 
 
@@ -173,7 +177,7 @@ def _tangent_stiffness(
     method: AbstractMethod,
     robust: AbstractKernel,
 ) -> Float[Array, "6 N"]:
-    """How a force answers to a shift of its point: a robust weight falls as its correspondence is pulled apart."""
+    """−∂f/∂(T a) of robust correspondences, symmetrised: includes the decrease of w with the residual."""
 
     def force(shift: Float[Array, "3"]) -> Float[Array, "3 N"]:
         shifted = moved + shift[:, None]
@@ -187,8 +191,9 @@ def _tangent_stiffness(
 def _cells(
     moved: Float[Array, "3 N"], valid: Bool[Array, "N"], size: Float[Array, "N"], num_cells: Int[AnyScalar, ""]
 ) -> Int[Array, "N"]:
-    """The number of the cell that each point lies in. Sizes are rounded to powers of two: cells are small where points
-    are dense. Two cells may share a number by chance, which does no harm: being independent, they do not correlate.
+    """Hash of the cell that contains each point. Cell sizes follow the point density, rounded to powers of two.
+
+    Collisions do no harm: scores of different cells are independent, so their products cancel on average.
     """
     level = jnp.round(jnp.log2(jnp.where(valid & (size > 0), size, 1)))
     cell = jnp.floor(jnp.where(valid, moved / 2.0**level, 0)).astype(jnp.int32)
@@ -197,14 +202,14 @@ def _cells(
 
 
 def scatter_of(scores: Scores, num_cells: int) -> tuple[Float[AnyArray, "6 6"], Int[AnyScalar, ""]]:
-    """Σ_c u_c u_cᵀ, and how many cells there are."""
+    """Σ_c u_c u_cᵀ, and the number of cells that contain valid correspondences."""
     xp = namespace(scores)
     rows = scores.rows
     if scores.cells is not None and xp is np:
         columns = [np.bincount(scores.cells, column, num_cells) for column in rows.T]
         rows = np.stack(columns, axis=1)
     elif scores.cells is not None:
-        # In rows, so that what is scattered is seven numbers at a time.
+        # Row-major, so that one scatter adds seven numbers.
         rows = jnp.zeros_like(rows, shape=(num_cells, 7)).at[scores.cells].add(rows)
     sums = rows[:, :6]
     product = sums.T @ sums if xp is np else jnp.dot(sums.T, sums, precision="highest")
@@ -221,8 +226,8 @@ def sandwich(
     num_cells: Int[Array, ""],
     directions: Directions | None,
 ) -> Float[Array, "6 6"]:
-    """Covariance of ξ in T exp(ξ), metres and radians."""
-    # Six of the cells' freedoms went into the pose.
+    """(6, 6) covariance of ξ = (v, ω) in T exp(ξ), metres and radians; NaN with six cells or fewer."""
+    # Small-sample correction: the pose takes six of the cells' degrees of freedom.
     count = num_cells.astype(scatter.dtype)
     scatter = scatter * count / jnp.where(count > 6, count - 6, jnp.nan) + jnp.outer(bias, bias)
     response = twist_form(jacobian, radius) * radius
@@ -232,7 +237,7 @@ def sandwich(
     both = jnp.outer(held, held)
     response = jnp.where(both, basis.T @ response @ basis, jnp.diag(1.0 * ~held))
     scatter = jnp.where(both, basis.T @ scatter @ basis, jnp.diag(_UNKNOWN**2 * ~held))
-    # One LAPACK call, and no second beside it.
+    # A single LAPACK call: two batched ones at once can deadlock.
     inverse = jnp.linalg.inv(response)
     covariance = basis @ inverse @ scatter @ inverse.T @ basis.T
     change = adjoint_to_source(pose, center) * units(radius)

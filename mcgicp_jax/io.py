@@ -1,4 +1,4 @@
-"""Point clouds and poses, read from files and written to them."""
+"""Reading and writing of point clouds and poses."""
 
 from __future__ import annotations
 
@@ -18,35 +18,37 @@ from mcgicp_jax._pose import pose_matrix
 
 
 def read(path: str | os.PathLike[str]) -> PointCloud:
-    """Reads a raw cloud; the suffix of the path, in any case, says which format it is.
+    """Read a raw cloud from a file.
 
-    `.ply`, `.pcd`, `.las`, `.laz`, `.bin` (KITTI), `.npy`, `.npz`, `.xyz`, `.txt`, `.csv`.
+    Every numeric column with one value per point becomes a channel, except coordinates, normals and per-point metadata
+    (label, ring, time, index and the like). The channels are, in this order:
 
-    Channels are every numeric column of the file with one value per point, except coordinates, normals, and what only
-    numbers or describes the points (label, ring, time, index and the like). They come in this order:
+    - "intensity", in the file's unit; aliases such as reflectance, reflectivity and remission are recognised;
+    - "red", "green", "blue", also from r, g, b, diffuse_* or packed rgb; integers are scaled to 0..1 (divided by 65535
+      if 16-bit, else by 255), floating-point colours are unchanged;
+    - all other columns under their own names, in file order. A column `channel_NAME`, as `write` uses it, is read as
+      NAME where a column NAME would be skipped or renamed.
 
-    - "intensity", also found as reflectance, reflectivity, remission, ...; in the file's unit;
-    - "red", "green", "blue", also found as r, g, b, diffuse_* and packed rgb; integers are scaled to 0..1 (by 65535
-      if 16-bit, else by 255), floating-point colours stay as they are;
-    - all others under their own names, in the order of the file. `channel_NAME` is NAME where NAME alone would not be
-      read as such; `write` makes use of it.
+    LAS: an intensity of 0 everywhere means that the file has none, by definition of the format. Colours that are all
+    below 256 are taken as 8-bit values that the exporter failed to scale to 16 bits, a common mistake. Text: colours
+    are integers if the column holds whole numbers without a decimal point; a first line may name the columns, which
+    are otherwise x, y, z, channel_0, ... as in `.npy` (N, 3 + C). `.npz`: `points` (N, 3), with `channels` (N, C) and
+    `channel_names`, or with `intensity` (N,) and `rgb` or `colors` (N, 3).
 
-    LAS gives its 16-bit colours, and its intensity unless that is 0 everywhere, which the format defines as absent. LAS
-    colours that are all below 256 are taken as 8-bit ones that were not scaled up, a common mistake of exporters. In
-    text, colours in a column of whole numbers without a decimal point count as integers; columns are named in a first
-    line, or else are x, y, z, channel_0, ... as in `.npy`, (N, 3 + C). `.npz` holds `points` (N, 3), and `channels`
-    (N, C) with `channel_names`, or `intensity` (N,) and `rgb` or `colors` (N, 3).
+    In every format, NaN in a channel means that the point lacks the channel; see `PointCloud.channel_valid`.
 
-    NaN in a channel says, in every format, that the point has no such channel: `PointCloud.channel_valid`.
+    Args:
+        path: the suffix, in any case, selects the format: `.ply`, `.pcd`, `.las`, `.laz`, `.bin` (KITTI), `.npy`,
+            `.npz`, `.xyz`, `.txt` or `.csv`.
 
     Returns:
-        A cloud of NumPy arrays: points (N, 3), metres, as float64 where the file holds them so (always in LAS and
-        text); channels (N, C). Rows whose coordinates are not finite are kept.
+        Cloud of NumPy arrays: points (N, 3), metres, float64 if the file stores float64 (always for LAS and text);
+        channels (N, C). Points with non-finite coordinates are kept.
 
     Raises:
         OSError: if the file cannot be opened.
         ImportError: if the format needs a package that is not installed.
-        ValueError: if the file is no cloud, is damaged, or has no points; the message starts with the path.
+        ValueError: if the file is not a valid cloud or has no points; the message starts with the path.
     """
     path = Path(path)
     reader = by_suffix(READERS, path)
@@ -64,31 +66,32 @@ def read(path: str | os.PathLike[str]) -> PointCloud:
         except ImportError:
             raise
         except BaseException as error:
-            # The libraries raise whatever comes to them, lazrs even a panic of Rust's, which is no Exception.
+            # The libraries raise arbitrary exceptions; lazrs raises Rust's PanicException, a BaseException.
             if not isinstance(error, Exception) and type(error).__name__ != "PanicException":
                 raise
-            reason = "it is no text" if isinstance(error, UnicodeError) else str(error) or type(error).__name__
+            reason = "it is not text" if isinstance(error, UnicodeError) else str(error) or type(error).__name__
             raise ValueError(f"{path}: cannot be read as {path.suffix.lower()}: {reason}") from error
     return cloud
 
 
 def write(path: str | os.PathLike[str], cloud: PointCloud) -> None:
-    """Writes the valid rows of a cloud in the user's frame; the suffix of the path says which format.
+    """Write the valid points of a cloud, in the user's frame, to a file.
 
-    `read` gives the same cloud back, with what the format can hold: float32 and float64 stay as they are in PLY, PCD
-    and NPZ, colours that are whole 255ths are stored as 8-bit integers; `.npy` keeps no names, `.npz` alone keeps the
-    order of the channels and the covariances; KITTI holds float32. LAS rounds coordinates to a power of ten, at worst
-    5·10⁻⁹ of the cloud's extent, and colours to 16 bits. Channels that a point does not have become NaN, which LAS
-    cannot hold. A failed write leaves an existing file as it was.
+    `read` restores the cloud within the limits of the format. PLY, PCD and NPZ preserve float32 and float64; colours
+    that are all multiples of 1/255 are stored as 8-bit integers. Only `.npz` preserves the channel order and the
+    covariances; `.npy` has no channel names; KITTI is float32. LAS rounds coordinates to a power of ten, with an error
+    of at most 5·10⁻⁹ of the cloud's extent, and colours to 16 bits. Missing channels are written as NaN, which LAS
+    cannot represent. A failed write leaves an existing file unchanged.
 
     Args:
-        path: `.ply`, `.pcd`, `.las`, `.laz`, `.bin` (KITTI), `.npy`, `.npz`, `.xyz`, `.txt` or `.csv`.
+        path: the suffix selects the format: `.ply`, `.pcd`, `.las`, `.laz`, `.bin` (KITTI), `.npy`, `.npz`, `.xyz`,
+            `.txt` or `.csv`.
         cloud: one cloud, raw or preprocessed; points in metres.
 
     Raises:
         OSError: if the file cannot be written.
         ImportError: if the format needs a package that is not installed.
-        ValueError: if the cloud is empty or a batch, or has what the format cannot hold.
+        ValueError: if the cloud is empty, is a batch, or cannot be represented in the format.
     """
     path = Path(path)
     writer = by_suffix(WRITERS, path)
@@ -105,25 +108,26 @@ def write(path: str | os.PathLike[str], cloud: PointCloud) -> None:
 
 
 def read_poses(path: str | os.PathLike[str]) -> Float[np.ndarray, "N 4 4"]:
-    """Reads poses from text; the number of columns says which form it is.
+    """Read poses from a text file.
 
-    12: KITTI, the upper three rows of the matrix. 8: TUM, `timestamp tx ty tz qx qy qz qw`; 7: the same without the
-    timestamp. Four rows of 4: one matrix.
+    Args:
+        path: the number of columns selects the format. 12: KITTI, the upper three rows of the matrix. 8: TUM,
+            `timestamp tx ty tz qx qy qz qw`; 7: the same without timestamp. Four rows of 4: a single matrix.
 
     Returns:
         (N, 4, 4) float64, translations in metres.
 
     Raises:
         OSError: if the file cannot be opened.
-        ValueError: if the file holds no poses, or one is no rigid motion; the message starts with the path.
+        ValueError: if the file has another format, or a pose is no rigid motion; the message starts with the path.
     """
     with open(path, encoding="utf-8-sig") as file:
         try:
-            # loadtxt only warns of a file without numbers.
+            # Blank lines and comments are removed because loadtxt warns if no data remain.
             lines = [line for line in file if line.split("#")[0].strip()]
             rows = np.loadtxt(lines, ndmin=2) if lines else np.empty((0, 0))
         except ValueError as error:
-            reason = "it is no text" if isinstance(error, UnicodeError) else error
+            reason = "it is not text" if isinstance(error, UnicodeError) else error
             raise ValueError(f"{path}: cannot be read as poses: {reason}") from error
     poses = np.tile(np.eye(4), (len(rows), 1, 1))
     if rows.shape == (4, 4):
@@ -145,16 +149,16 @@ def write_poses(
     poses: Float[np.ndarray, "N 4 4"] | Sequence[Any],
     timestamps: Float[np.ndarray, "N"] | Sequence[float] | None = None,
 ) -> None:
-    """Writes poses in KITTI's form, or in TUM's if there are timestamps.
+    """Write poses to a text file in the KITTI format, or in the TUM format if timestamps are given.
 
     Args:
-        path: any name.
-        poses: (N, 4, 4) or a sequence of poses, metres.
+        path: any file name.
+        poses: (N, 4, 4), or a sequence of `jaxlie.SE3` or (4, 4); translations in metres.
         timestamps: (N,), seconds.
 
     Raises:
         OSError: if the file cannot be written.
-        ValueError: if a pose is no rigid motion, or there is not one timestamp for each.
+        ValueError: if a pose is no rigid motion, or the number of timestamps differs from that of the poses.
     """
     matrices = np.array([pose_matrix(pose, f"poses[{i}]") for i, pose in enumerate(poses)]).reshape(-1, 4, 4)
     rows = matrices[:, :3].reshape(-1, 12)
@@ -168,7 +172,7 @@ def write_poses(
 
 
 def _rotations(quaternions: Float[np.ndarray, "N 4"]) -> Float[np.ndarray, "N 3 3"]:
-    """Of x y z w, in any scale; NaN for 0. (jaxlie would round to float32 unless x64 is on.)"""
+    """Rotations from quaternions (x, y, z, w) of any norm; NaN for norm 0. (jaxlie rounds to float32 without x64.)"""
     with np.errstate(invalid="ignore"):
         unit = quaternions / np.linalg.norm(quaternions, axis=1, keepdims=True)
     cross = np.cross(np.eye(3), unit[:, None, :3])
@@ -176,7 +180,7 @@ def _rotations(quaternions: Float[np.ndarray, "N 4"]) -> Float[np.ndarray, "N 3 
 
 
 def _quaternions(rotations: Float[np.ndarray, "N 3 3"]) -> Float[np.ndarray, "N 4"]:
-    """x y z w, w ≥ 0: the longest column of 4 q qᵀ, which the rotation gives without a root."""
+    """Unit quaternions (x, y, z, w), w ≥ 0: the longest column of 4 q qᵀ, which is linear in the rotation matrix."""
     trace = np.trace(rotations, axis1=1, axis2=2)[:, None]
     outer = np.empty((len(rotations), 4, 4))
     outer[:, :3, :3] = rotations + rotations.swapaxes(1, 2) + (1 - trace[..., None]) * np.eye(3)
@@ -191,7 +195,7 @@ def _quaternions(rotations: Float[np.ndarray, "N 3 3"]) -> Float[np.ndarray, "N 
 
 @contextlib.contextmanager
 def _named(path: Path) -> Iterator[None]:
-    """Errors name the file as the user knows it."""
+    """Re-raise `OSError` with the user's path instead of that of the temporary file."""
     try:
         yield
     except OSError as error:
@@ -200,7 +204,7 @@ def _named(path: Path) -> Iterator[None]:
 
 @contextlib.contextmanager
 def _replacing(path: Path) -> Iterator[BinaryIO]:
-    """A file that takes the name `path` once it is complete."""
+    """Open a temporary file that replaces `path` when the block succeeds."""
     temporary = path.with_name(f".{uuid.uuid4().hex}.tmp")
     try:
         with _named(path):

@@ -1,4 +1,4 @@
-"""How far a pose, or a trajectory, is from the truth."""
+"""Errors of poses and trajectories against the ground truth."""
 
 from __future__ import annotations
 
@@ -17,28 +17,28 @@ from mcgicp_jax._pose import Pose, is_concrete, pose_matrix
 Scalar: TypeAlias = float | Float[Array, ""]
 Poses: TypeAlias = Float[np.ndarray, "N 4 4"] | Sequence[Any]
 
-# Metres: the lengths of path of the KITTI benchmark.
+# Metres: the segment lengths of the KITTI odometry benchmark.
 _KITTI_LENGTHS = (100.0, 200.0, 300.0, 400.0, 500.0, 600.0, 700.0, 800.0)
 
 
 def pose_error(T: Pose, T_true: Pose, *, at: ArrayLike | None = None) -> tuple[Scalar, Scalar]:
-    """How far the pose takes a point from where it belongs, and the angle of the rotation that is left over.
+    """Translation and rotation error of a pose: |T p − T_true p| at a point p, and the angle of `T_true⁻¹ T`.
 
-    Concrete poses are compared in float64. Under `jit`, `grad` and `vmap` the errors have the precision of the traced
-    pose; both are differentiable, with gradient 0 where the error itself is 0.
+    Concrete poses are compared in float64. Inside `jit`, `grad` and `vmap` the errors have the precision of the traced
+    pose; both are differentiable, with gradient 0 where the error is 0.
 
     Args:
-        T: `jaxlie.SE3` or (4, 4).
-        T_true: `jaxlie.SE3` or (4, 4).
-        at: (3,), metres, the point in the source's frame; the origin by default, whose error is that of the
-            translations, and the length of `T_true⁻¹ T`. Take one in the cloud, such as its centroid, where that lies
-            far from the origin: at UTM coordinates 1e-8 rad move the origin by 5 cm, and the cloud by nothing.
+        T: estimated pose, `jaxlie.SE3` or (4, 4).
+        T_true: true pose, `jaxlie.SE3` or (4, 4).
+        at: (3,), metres, the point p in the source frame. By default the origin, where the error is the distance
+            between the translations. If the cloud lies far from the origin, use a point in it, such as its centroid:
+            at UTM coordinates a rotation of 1e-8 rad about the cloud moves the origin by 5 cm, but the cloud by ≈ 0.
 
     Returns:
-        Translation in metres and rotation in radians, 0 to π: plain floats, or JAX scalars where a pose is traced.
+        Translation in metres and rotation in radians, 0 to π: Python floats, or JAX scalars if an argument is traced.
 
     Raises:
-        ValueError: if a pose has another shape or is no rigid motion, or the point another shape; the message names it.
+        ValueError: if an argument has the wrong shape or a pose is no rigid motion; the message names the argument.
     """
     matrix, true = pose_matrix(T, "T"), pose_matrix(T_true, "T_true")
     point: Any = np.zeros(3) if at is None else at
@@ -53,18 +53,19 @@ def pose_error(T: Pose, T_true: Pose, *, at: ArrayLike | None = None) -> tuple[S
 
 
 def ate(poses: Poses, true_poses: Poses, alignment: Literal["umeyama", "first"] = "umeyama") -> float:
-    """Absolute trajectory error (Sturm et al. 2012): root mean square distance of the positions from the true ones.
+    """Absolute trajectory error (Sturm et al. 2012): root mean square distance between estimated and true positions.
 
     Args:
-        poses, true_poses: N of each, sensor to world, in worlds of their own.
-        alignment: what brings the two worlds together. "umeyama": the rigid motion (no scale) that makes the error
-            smallest, in closed form; "first": the first pose.
+        poses, true_poses: N poses each, sensor to world; the two world frames may differ.
+        alignment: how the world frames are aligned. "umeyama": by the rigid motion (no scale) that minimises the
+            error, in closed form (Umeyama 1991); "first": so that the first poses coincide.
 
     Returns:
         Metres.
 
     Raises:
-        ValueError: if there are not as many poses as true ones, or one is no rigid motion.
+        ValueError: if the trajectories are empty or differ in length, a pose is no rigid motion, or the alignment is
+            unknown.
     """
     estimated, true = _trajectories(poses, true_poses)
     if alignment not in ("umeyama", "first"):
@@ -82,13 +83,15 @@ def rpe(poses: Poses, true_poses: Poses, delta: int = 1) -> tuple[Float[np.ndarr
     """Relative pose errors (Sturm et al. 2012): `pose_error` of every motion from frame i to frame i + `delta`.
 
     Args:
-        poses, true_poses: N of each, sensor to world, in worlds of their own.
+        poses, true_poses: N poses each, sensor to world; the two world frames may differ.
+        delta: number of frames, 1 to N − 1.
 
     Returns:
-        Translations in metres and rotations in radians, N − `delta` of each.
+        Translations in metres and rotations in radians, (N − `delta`,) each.
 
     Raises:
-        ValueError: if there are not as many poses as true ones, or no more than `delta`, or one is no rigid motion.
+        ValueError: if the trajectories are empty or differ in length, `delta` is out of range, or a pose is no rigid
+            motion.
     """
     estimated, true = _trajectories(poses, true_poses)
     if not 1 <= delta < len(true):
@@ -100,33 +103,34 @@ def rpe(poses: Poses, true_poses: Poses, delta: int = 1) -> tuple[Float[np.ndarr
 def kitti_errors(
     poses: Poses, true_poses: Poses, *, lengths: Sequence[float] = _KITTI_LENGTHS, step: int = 10
 ) -> tuple[float, float]:
-    """The errors of the KITTI odometry benchmark (Geiger et al. 2012): drift over stretches of path.
+    """The errors of the KITTI odometry benchmark (Geiger et al. 2012): mean drift over segments of the path.
 
-    A stretch starts at every `step`-th frame and ends with the first that is further along the true path than a length.
-    The mean is over all stretches of all lengths.
+    A segment of each length starts at every `step`-th frame and ends at the first frame that is further than that
+    length along the true path. The mean is over all segments of all lengths.
 
     Args:
-        poses, true_poses: N of each, sensor to world, in worlds of their own.
-        lengths: metres.
+        poses, true_poses: N poses each, sensor to world; the two world frames may differ.
+        lengths: segment lengths, metres.
+        step: number of frames between the starts of segments.
 
     Returns:
-        Translation, percent of the length, and rotation, degrees per metre.
+        Translation error in percent of the segment length, and rotation error in degrees per metre.
 
     Raises:
-        ValueError: if there are not as many poses as true ones, one is no rigid motion, or the path is shorter than the
-            shortest length.
+        ValueError: if the trajectories are empty or differ in length, a pose is no rigid motion, or the path is no
+            longer than the shortest segment.
     """
     estimated, true = _trajectories(poses, true_poses)
     along = np.concatenate([[0], np.linalg.norm(np.diff(true[:, :3, 3], axis=0), axis=1).cumsum()])
     first, length = (part.ravel() for part in np.meshgrid(np.arange(0, len(true), step), np.asarray(lengths, float)))
     last = np.searchsorted(along, along[first] + length, side="right")
-    there = last < len(true)
-    if not there.any():
+    complete = last < len(true)
+    if not complete.any():
         raise ValueError(f"lengths: expected one below {along[-1]:.1f} m, the length of the path, got {tuple(lengths)}")
-    translation, rotation = _relative_errors(estimated, true, first[there], last[there])
+    translation, rotation = _relative_errors(estimated, true, first[complete], last[complete])
     return (
-        float(100 * np.mean(translation / length[there])),
-        float(np.degrees(np.mean(rotation / length[there]))),
+        float(100 * np.mean(translation / length[complete])),
+        float(np.degrees(np.mean(rotation / length[complete]))),
     )
 
 
@@ -152,25 +156,25 @@ def _relative_errors(
 
 
 def _best_rotation(points: Float[np.ndarray, "N 3"], onto: Float[np.ndarray, "N 3"]) -> Float[np.ndarray, "3 3"]:
-    """The rotation that fits centred points onto others best (Umeyama 1991)."""
+    """The least-squares rotation between two sets of points about their centroids (Umeyama 1991)."""
     left, _, right = np.linalg.svd((onto - onto.mean(axis=0)).T @ (points - points.mean(axis=0)))
     sign = np.sign(np.linalg.det(left) * np.linalg.det(right))
     return left @ np.diag([1, 1, sign]) @ right
 
 
 def _errors(matrix: Any, true: Any, point: Any, numpy: ModuleType) -> tuple[Any, Any]:
-    """For float arrays of `numpy`, which is NumPy or `jax.numpy`."""
+    """Translation and rotation error at a point; `numpy` is NumPy or `jax.numpy`."""
     left = true[:3, :3].T @ matrix[:3, :3]
-    # sin(angle) · axis and cos(angle): unlike either alone, the two together are accurate at every angle.
+    # sin(angle) · axis and cos(angle): arctan2 of the two is accurate at every angle, unlike arcsin or arccos.
     sine = numpy.stack([left[2, 1] - left[1, 2], left[0, 2] - left[2, 0], left[1, 0] - left[0, 1]]) / 2
     cosine = (numpy.trace(left) - 1) / 2
-    # Differences first: at large coordinates each of the two moved points alone has lost digits.
+    # Subtract the matrices first: at large coordinates each transformed point alone has lost digits.
     shift = matrix[:3, 3] - true[:3, 3] + (matrix[:3, :3] - true[:3, :3]) @ point
     return _norm(shift, numpy), numpy.arctan2(_norm(sine, numpy), cosine)
 
 
 def _norm(vector: Any, numpy: ModuleType) -> Any:
-    """The Euclidean norm, whose gradient at 0 is 0 rather than NaN."""
+    """Euclidean norm with gradient 0, rather than NaN, at 0."""
     squared = (vector**2).sum()
     positive = squared > 0
     return numpy.where(positive, numpy.sqrt(numpy.where(positive, squared, 1)), 0)

@@ -1,6 +1,6 @@
-"""Figures of clouds and registrations: matplotlib to print, plotly to turn in 3-D. Both are imported on demand.
+"""Figures of clouds and registrations: 2-D with matplotlib, interactive 3-D with plotly, both imported on demand.
 
-Every function returns its figure; none shows a window or changes matplotlib's state.
+Every function returns its figure; none opens a window or changes matplotlib's global state.
 """
 
 from __future__ import annotations
@@ -28,36 +28,39 @@ Points: TypeAlias = Float[np.ndarray, "N 3"]
 Picture: TypeAlias = Float[np.ndarray, "height width 3"]
 Map: TypeAlias = Float[np.ndarray, "height width"]
 
+# The constants of this module affect only how figures look.
 _CLOUD_COLORS = ("#1f77d0", "#e8741c", "#2b9c5a", "#b03a8c", "#7a5230", "#707070")
+# Points drawn in one 3-D figure.
 _MOST_POINTS = 50_000
 
-# before_after: inches at most, all panels across and one panel up; pixels and tiles along the longer side of a panel;
-# the share of a side that the detail shows.
+# before_after: maximum width of a row and height of a panel, inches; pixels and tiles along the longer side of a panel;
+# fraction of each side that the detail shows.
 _WIDEST, _HIGHEST, _PIXELS, _TILES, _DETAIL = 12, 4.5, 500, 12, 0.25
 # Pixels along the longer side of a map.
 _MAP_PIXELS = 1400
-# Pixels are this much finer than the points lie apart, as far as _PIXELS allows.
+# Pixels per point spacing, unless the limit on the pixels of a picture makes them coarser.
 _PIXELS_PER_SPACING = 3
 
 
 def before_after(
     source: PointCloud, target: PointCloud, poses: Mapping[str, Pose], *, path: str | os.PathLike[str] | None = None
 ) -> matplotlib.figure.Figure:
-    """What each pose makes of the source, seen in the direction in which the target is thinnest; a row per pose.
+    """Compare poses: one row per pose shows the transformed source with the target, along the target's thinnest axis.
 
-    Clouds whose points all have the channels red, green and blue alternate like the squares of a chess board, target
-    beside moved source: a pattern that runs through unbroken is one that fits. Next to it is the difference of the
-    colours. Other clouds are laid over each other, the target in blue and the source in orange: black is where both
-    are. What stands upright is drawn dark and what lies flat pale, since the rings that a LiDAR draws on the ground
-    move with it. The detail shows where the poses differ most.
+    If all points have the channels red, green and blue, target and source alternate in a checkerboard, in which
+    patterns continue across tiles where the pose is right; a further panel shows the colour difference. Otherwise the
+    clouds are overlaid, the target in blue and the source in orange, black where both are. Upright surfaces are drawn
+    dark and flat ones pale, since the rings of a LiDAR on the ground move with the sensor. The detail shows the region
+    where the poses differ most.
 
     Args:
-        poses: `T_target_source` by the name of its method. The first row is the identity, "start", or the poses' own
-            "start" if they have one.
-        path: a file to save the figure in; its ending tells the format.
+        source, target: clouds in their own frames.
+        poses: `T_target_source` by name, such as that of the method. The first row, "start", is the identity unless
+            `poses` has a "start".
+        path: file to save the figure to; its suffix selects the format.
 
     Raises:
-        ValueError: if a pose is no pose, or the target has fewer than 3 points.
+        ValueError: if a pose is no rigid motion, or the target has fewer than 3 points.
         ImportError: if matplotlib is missing.
     """
     figures = _module("matplotlib.figure")
@@ -94,7 +97,7 @@ def before_after(
 def _draw_row(panels: np.ndarray, name: str, picture: Picture, difference: Map, detail: tuple[slice, slice]) -> None:
     columns, rows = detail
     left, right, bottom, top = columns.start, columns.stop, rows.start, rows.stop
-    # Pixel i reaches from i to i + 1, as the slices count.
+    # Pixel i extends from i to i + 1, in agreement with the slices.
     options = {"origin": "lower", "interpolation": "nearest", "extent": (0, picture.shape[1], 0, picture.shape[0])}
     for panel in panels[:2]:
         panel.imshow(picture, **options)
@@ -111,7 +114,15 @@ def _draw_row(panels: np.ndarray, name: str, picture: Picture, difference: Map, 
 
 @dataclass(frozen=True)
 class _View:
-    """A picture plane: points become pixels, and heights above the plane."""
+    """An orthographic projection of points to the pixels of a plane.
+
+    Attributes:
+        center: (3,), metres, a point of the plane.
+        axes: (3, 3), columns: right, up, and the normal towards the viewer.
+        low: (2,), metres, the lower left corner in the plane.
+        pixel: side of a pixel, metres.
+        width, height: pixels.
+    """
 
     center: Float[np.ndarray, "3"]
     axes: Float[np.ndarray, "3 3"]
@@ -121,7 +132,7 @@ class _View:
     height: int
 
     def project(self, points: Points) -> tuple[Int[np.ndarray, "N"], Float[np.ndarray, "N"]]:
-        """For each point the pixel, numbered along the rows, −1 if it is outside; and the height in metres."""
+        """The row-major pixel index of each point, −1 if outside, and its height above the plane in metres."""
         local = (points - self.center) @ self.axes
         column, row = np.floor((local[:, :2] - self.low) / self.pixel).astype(int).T
         inside = (column >= 0) & (column < self.width) & (row >= 0) & (row < self.height)
@@ -133,7 +144,7 @@ def _view(
     most_pixels: int = _PIXELS,
     limits: Float[np.ndarray, "2 2"] | None = None,
 ) -> _View:
-    """The two longest principal axes of the points, seen from the side of the origin: of the sensor, mostly."""
+    """The view onto the two longest principal axes of the points, from the side of the origin (usually the sensor)."""
     center = points.mean(axis=0)
     _, vectors = np.linalg.eigh(np.cov((points - center).T))
     normal, right = vectors[:, 0], vectors[:, 2]
@@ -158,7 +169,7 @@ def _chess_boards(
     moved: Sequence[Points],
     source_colors: Points,
 ) -> list[tuple[Picture, Map]]:
-    """For each moved source alternate tiles in one picture, and the difference of colour, NaN where one is unseen."""
+    """For each moved source a checkerboard picture, and the colour difference, NaN where either cloud has no points."""
     tile = max(view.width, view.height) // _TILES + 1
     row, column = np.mgrid[: view.height, : view.width] // tile
     target_tiles = ((row + column) % 2 == 0)[..., None]
@@ -172,7 +183,7 @@ def _chess_boards(
 
 
 def _paint(view: _View, points: Points, colors: Points) -> Picture:
-    """The mean colour of the points in each pixel, spread over the gaps between them; NaN further away."""
+    """The mean colour of the points in each pixel, extended into the gaps between points; NaN further away."""
     pixels, _ = view.project(points)
     size = view.height * view.width
     inside = pixels >= 0
@@ -188,32 +199,32 @@ def _paint(view: _View, points: Points, colors: Points) -> Picture:
 
 
 def _shifted(picture: Picture, shift: int, axis: int) -> Picture:
-    """The picture moved by one pixel, the last row or column staying."""
+    """The picture shifted by one pixel, with the edge row or column repeated."""
     rows = np.clip(np.arange(picture.shape[axis]) - shift, 0, picture.shape[axis] - 1)
     return np.take(picture, rows, axis)
 
 
 def _smooth(picture: Picture) -> Picture:
-    """The mean over squares a little larger than the points lie apart: what is left of a difference is not sampling."""
-    reach = _PIXELS_PER_SPACING // 2 + 1
-    padded = np.pad(picture, ((reach, reach), (reach, reach), (0, 0)), mode="edge")
-    return np.lib.stride_tricks.sliding_window_view(padded, (2 * reach + 1,) * 2, (0, 1)).mean(axis=(-1, -2))
+    """Mean over a window a little larger than the point spacing, so that differences do not show the sampling."""
+    half = _PIXELS_PER_SPACING // 2 + 1
+    padded = np.pad(picture, ((half, half), (half, half), (0, 0)), mode="edge")
+    return np.lib.stride_tricks.sliding_window_view(padded, (2 * half + 1,) * 2, (0, 1)).mean(axis=(-1, -2))
 
 
 def _overlays(view: _View, target: Float[np.ndarray, "M 3"], moved: Sequence[Points]) -> list[tuple[Picture, Map]]:
-    """For each moved source both clouds in one picture, and the difference of their inks."""
+    """For each moved source a picture of both clouds, and the difference of their inks."""
     ours = _ink(view, target)
     overlays = []
     for points in moved:
         theirs = _ink(view, points)
-        # Ink takes light away: the target all of the red, the source all of the blue, each half of the green.
+        # Subtractive colours: the target removes all red, the source all blue, and each half of the green.
         picture = 1 - np.stack([ours, 0.5 * ours + 0.5 * theirs, theirs], axis=-1)
         overlays.append((picture, np.abs(ours - theirs)))
     return overlays
 
 
 def _ink(view: _View, points: Points) -> Map:
-    """From 0 to 1: none without points, little where they lie flat, full where they stand four pixels high."""
+    """Ink per pixel: 0 without points, 0.15 on flat surfaces, 1 where the points are at least four pixels high."""
     pixels, height = view.project(points)
     lowest, highest = np.full(view.height * view.width, np.inf), np.full(view.height * view.width, -np.inf)
     inside = pixels >= 0
@@ -224,7 +235,7 @@ def _ink(view: _View, points: Points) -> Map:
 
 
 def _where_they_differ(differences: Sequence[Map]) -> tuple[slice, slice]:
-    """The columns and rows of the detail: where the poses with most and with least difference are furthest apart."""
+    """Columns and rows of the detail: the window whose summed difference varies most between the poses."""
     shape = np.array(differences[0].shape)
     size = np.maximum((_DETAIL * shape).astype(int), 1)
     sums = []
@@ -239,11 +250,11 @@ def _where_they_differ(differences: Sequence[Map]) -> tuple[slice, slice]:
 def convergence(
     histories: Mapping[str, Sequence[float] | ArrayLike], *, ylabel: str = "cost"
 ) -> matplotlib.figure.Figure:
-    """How cost or rmse fell, by method.
+    """Plot the cost or RMSE per iteration, on a logarithmic scale.
 
     Args:
-        histories: one number per iteration, by the name of its method.
-        ylabel: what the numbers are, with their unit.
+        histories: one number per iteration, by the name of the method.
+        ylabel: label of the y axis: the quantity and its unit.
 
     Raises:
         ValueError: if a history is not one-dimensional.
@@ -265,21 +276,22 @@ def convergence(
 
 
 def localizability(result: Registration, *, path: str | os.PathLike[str] | None = None) -> matplotlib.figure.Figure:
-    """What holds each of six directions: the share of the points' motion that geometry feels, and that channels do.
+    """Plot how well each of six directions is constrained: the observed fraction of squared motion.
 
-    Dashed are the shares from which on a direction counts as held. The channels' share is told of the directions that
-    geometry leaves free.
+    The fraction refers to the motion of the matched points. One bar is for the geometry and one for the channels, which
+    count only in directions that the geometry leaves free. Dashed lines mark the fractions above which a direction
+    counts as constrained.
 
     Args:
-        result: of `register`, a single one.
-        path: a file to save the figure in; its ending tells the format.
+        result: a single result of `register`.
+        path: file to save the figure to; its suffix selects the format.
 
     Raises:
-        ValueError: if the result has no directions, as one of `align`.
+        ValueError: if the result is a batch or has no directions, such as a result of `align`.
         ImportError: if matplotlib is missing.
     """
     if result.directions is None or np.ndim(result.status_code):
-        raise ValueError("result: expected a single one of `register`, got one without directions, or a batch")
+        raise ValueError("result: expected a single result of `register`, got a batch or one without directions")
     figures = _module("matplotlib.figure")
     figure = figures.Figure((7.5, 3.2), layout="constrained")
     panel = figure.subplots()
@@ -293,7 +305,7 @@ def localizability(result: Registration, *, path: str | os.PathLike[str] | None 
     for name, share, threshold, color, offset in bars:
         panel.barh(rows + offset, np.maximum(share, lowest) - lowest, 0.38, lowest, color=color, label=name)
         panel.axvline(threshold, color=color, linestyle="--", linewidth=1)
-    panel.set(xscale="log", xlim=(lowest, 1), xlabel="share of the points' motion that is felt")
+    panel.set(xscale="log", xlim=(lowest, 1), xlabel="observed fraction of the points' squared motion")
     panel.set_yticks(rows, names)
     panel.invert_yaxis()
     panel.set_title(result.status.name, loc="left", fontsize="medium")
@@ -308,14 +320,14 @@ def trajectories(
     *,
     path: str | os.PathLike[str] | None = None,
 ) -> matplotlib.figure.Figure:
-    """The ways that poses take, laid over each other in the plane in which the first of them is widest.
+    """Plot trajectories in the principal plane of the first one.
 
     Args:
-        trajectories: poses, sensor to one world, by name.
-        path: a file to save the figure in; its ending tells the format.
+        trajectories: poses by name, sensor to a common world, metres.
+        path: file to save the figure to; its suffix selects the format.
 
     Raises:
-        ValueError: if there are no poses under a name, or one is no pose.
+        ValueError: if a trajectory is empty, or a pose is no rigid motion.
         ImportError: if matplotlib is missing.
     """
     figures = _module("matplotlib.figure")
@@ -323,15 +335,15 @@ def trajectories(
     panel = figure.subplots()
     plane, start = None, None
     for name, poses in trajectories.items():
-        places = np.array([pose_matrix(pose, f"trajectories[{name!r}][{i}]")[:3, 3] for i, pose in enumerate(poses)])
-        if not len(places):
+        positions = np.array([pose_matrix(pose, f"trajectories[{name!r}][{i}]")[:3, 3] for i, pose in enumerate(poses)])
+        if not len(positions):
             raise ValueError(f"trajectories[{name!r}]: expected at least one pose, got none")
         if plane is None or start is None:
-            start = places[0]
-            plane = np.linalg.svd(places - places.mean(axis=0))[2][:2]
-            # The first axis the way that the sensor goes.
-            plane[0] *= 1 if (places[-1] - start) @ plane[0] >= 0 else -1
-        along, across = plane @ (places - start).T
+            start = positions[0]
+            plane = np.linalg.svd(positions - positions.mean(axis=0))[2][:2]
+            # The first axis points in the direction of travel.
+            plane[0] *= 1 if (positions[-1] - start) @ plane[0] >= 0 else -1
+        along, across = plane @ (positions - start).T
         panel.plot(along, across, marker=".", markersize=4, linewidth=1, label=name)
     panel.set(xlabel="metres", ylabel="metres", aspect="equal", adjustable="datalim")
     panel.grid(alpha=0.3)
@@ -347,24 +359,24 @@ def maps(
     limits: Float[np.ndarray, "2 2"] | None = None,
     path: str | os.PathLike[str] | None = None,
 ) -> matplotlib.figure.Figure:
-    """Clouds in one world, a panel for each, seen in the direction in which the first of them is thinnest.
+    """Draw clouds of a common world, one panel each, along the thinnest principal axis of the first cloud.
 
-    Clouds with the channels red, green and blue are drawn in these; others in grey, by their intensity or height.
+    Clouds with the channels red, green and blue are drawn in colour; others in grey, by intensity or height.
 
     Args:
-        maps: clouds, as from `aggregate`, by name.
-        limits: from where to where, along the two axes of the picture, in metres from the middle of the first cloud;
-            by default all of it.
-        path: a file to save the figure in; its ending tells the format.
+        maps: clouds by name, such as those of `aggregate`.
+        limits: (2, 2), rows: lower and upper limit along the horizontal and vertical axis of the picture, in metres
+            from the centroid of the first cloud; by default 96 % of its points along each axis, plus a margin.
+        path: file to save the figure to; its suffix selects the format.
 
     Raises:
-        ValueError: if there is none, or the first has fewer than 3 points.
+        ValueError: if there are no clouds, or the first has fewer than 3 points.
         ImportError: if matplotlib is missing.
     """
     figures = _module("matplotlib.figure")
     drawn = {name: _drawable(cloud) for name, cloud in maps.items()}
     if not drawn or len(next(iter(drawn.values()))) < 3:
-        raise ValueError("maps: expected at least one, the first of at least 3 points")
+        raise ValueError("maps: expected at least one cloud, the first with at least 3 points")
     view = _view(np.asarray(next(iter(drawn.values())).points), _MAP_PIXELS, limits)
     wide = view.width > 1.5 * view.height
     shape = (len(drawn), 1) if wide else (1, len(drawn))
@@ -383,7 +395,7 @@ def maps(
 
 
 def _shades(cloud: PointCloud, view: _View) -> Points:
-    """The colours of a cloud, or grey."""
+    """Colours of the points from red, green and blue if present, else grey from intensity or height."""
     colors = _rgb(cloud)
     if colors is not None:
         return np.nan_to_num(colors, nan=0.5)
@@ -403,25 +415,26 @@ def surface_covariances(
     indices: Sequence[int] | Int[np.ndarray, "M"],
     path: str | os.PathLike[str] | None = None,
 ) -> matplotlib.figure.Figure:
-    """Covariances within a flat surface as ellipses over its picture, a panel for each name.
+    """Draw covariances in a flat surface as ellipses over its picture, one panel per name.
 
-    All are drawn to one scale, at which a standard deviation of 1 just has room among the others.
+    All ellipses have the same scale, at which those with a standard deviation of 1 just do not overlap.
 
     Args:
-        covariances: (N, 3, 3) for the rows of `cloud.points`, by name.
-        indices: the rows to draw.
-        path: a file to save the figure in; its ending tells the format.
+        cloud: points on a nearly flat surface.
+        covariances: (N, 3, 3) for the rows of `cloud.points`, dimensionless, by name.
+        indices: rows to draw.
+        path: file to save the figure to; its suffix selects the format.
 
     Raises:
-        ValueError: if covariances have another shape.
+        ValueError: if covariances have the wrong shape.
         ImportError: if matplotlib is missing.
     """
-    figures, collections = _module("matplotlib.figure"), _module("matplotlib.collections")
+    figures = _module("matplotlib.figure")
     raw, rows = _drawable(cloud), np.asarray(indices, int)
     view = _view(np.asarray(raw.points), _MAP_PIXELS)
-    # The cloud as the covariances go by, and what its picture is painted from.
+    # The indices refer to the rows of `cloud`; `raw`, which the picture shows, lacks padding and non-finite points.
     centers = cloud.coordinates[rows]
-    places = ((centers - view.center) @ view.axes)[:, :2] - view.low
+    offsets = ((centers - view.center) @ view.axes)[:, :2] - view.low
     room = 2 * _room(centers, float(np.ptp(np.asarray(raw.points), axis=0).max()))
     picture = np.nan_to_num(_paint(view, np.asarray(raw.points), _shades(raw, view)), nan=1)
     width = _WIDEST / len(covariances)
@@ -434,22 +447,8 @@ def surface_covariances(
                 f"covariances[{name!r}]: expected shape ({cloud.points.shape[0]}, 3, 3), got {matrices.shape}"
             )
         flat = view.axes[:, :2].T @ matrices[rows] @ view.axes[:, :2]
-        sizes, vectors = np.linalg.eigh(flat)
-        lengths = room * np.sqrt(np.maximum(sizes, 0))
-        angles = np.degrees(np.arctan2(vectors[:, 1, 1], vectors[:, 0, 1]))
-        ellipses = collections.EllipseCollection(
-            lengths[:, 1],
-            lengths[:, 0],
-            angles,
-            units="xy",
-            offsets=places,
-            transOffset=panel.transData,
-            facecolors="none",
-            edgecolors="black",
-            linewidths=1.2,
-        )
         panel.imshow(picture, origin="lower", extent=(0, view.width * view.pixel, 0, view.height * view.pixel))
-        panel.add_collection(ellipses)
+        _add_ellipses(panel, offsets, flat, room)
         panel.set_title(name, fontsize="medium")
         panel.set(xticks=[], yticks=[], xlim=(0, view.width * view.pixel), ylim=(0, view.height * view.pixel))
     if path is not None:
@@ -457,19 +456,40 @@ def surface_covariances(
     return figure
 
 
+def _add_ellipses(
+    panel: Any, offsets: Float[np.ndarray, "M 2"], covariances: Float[np.ndarray, "M 2 2"], scale: float
+) -> None:
+    """Draw ellipses at `offsets`, metres, whose axes are `scale` metres long per standard deviation."""
+    sizes, vectors = np.linalg.eigh(covariances)
+    lengths = scale * np.sqrt(np.maximum(sizes, 0))
+    ellipses = _module("matplotlib.collections").EllipseCollection(
+        lengths[:, 1],
+        lengths[:, 0],
+        np.degrees(np.arctan2(vectors[:, 1, 1], vectors[:, 0, 1])),
+        units="xy",
+        offsets=offsets,
+        transOffset=panel.transData,
+        facecolors="none",
+        edgecolors="black",
+        linewidths=1.2,
+    )
+    panel.add_collection(ellipses)
+
+
 # In three dimensions
 
 
 def clouds(*clouds: PointCloud, names: Sequence[str] | None = None) -> plotly.graph_objects.Figure:
-    """Clouds in one 3-D view, in their own colours (red, green, blue), else by intensity, else in a colour per cloud.
+    """Show clouds in one 3-D view, coloured by red, green and blue, else by intensity, else in one colour per cloud.
 
-    Of more than 50,000 points in all, so many are drawn, chosen at random but always the same.
+    If the clouds have more than 50,000 points in total, a reproducible random subset of that size is drawn.
 
     Args:
+        clouds: clouds in a common frame.
         names: one per cloud, for the legend.
 
     Raises:
-        ValueError: if there are not as many names as clouds.
+        ValueError: if the number of names differs from that of the clouds.
         ImportError: if plotly is missing.
     """
     graphs = _module("plotly.graph_objects")
@@ -477,27 +497,28 @@ def clouds(*clouds: PointCloud, names: Sequence[str] | None = None) -> plotly.gr
         names = [f"cloud {i}" for i in range(len(clouds))]
     if len(names) != len(clouds):
         raise ValueError(f"names: expected {len(clouds)}, one per cloud, got {len(names)}")
-    share = min(1.0, _MOST_POINTS / max(sum(len(cloud) for cloud in clouds), 1))
+    fraction = min(1.0, _MOST_POINTS / max(sum(len(cloud) for cloud in clouds), 1))
     figure = _figure(graphs)
     for i, (cloud, name) in enumerate(zip(clouds, names, strict=True)):
-        figure.add_trace(_scatter(graphs, cloud, name, _CLOUD_COLORS[i % len(_CLOUD_COLORS)], share))
+        figure.add_trace(_scatter(graphs, cloud, name, _CLOUD_COLORS[i % len(_CLOUD_COLORS)], fraction))
     return figure
 
 
 def covariances(
     cloud: PointCloud, covariances: Float[ArrayLike, "N 3 3"], *, indices: Sequence[int] | Int[np.ndarray, "M"]
 ) -> plotly.graph_objects.Figure:
-    """Covariances as ellipsoids about some of the points, as in the paper's Fig. 1.
+    """Show covariances of selected points as ellipsoids, as in Fig. 1 of Servos & Waslander (2014).
 
-    An ellipsoid's semi-axes are the standard deviations, all of them drawn to one scale at which neighbours among the
-    ellipsoids just have room.
+    The semi-axes are proportional to the standard deviations, with a common scale at which neighbouring ellipsoids
+    just do not overlap.
 
     Args:
-        covariances: (N, 3, 3), for the rows of `cloud.points`.
-        indices: the rows to draw.
+        cloud: raw or preprocessed cloud.
+        covariances: (N, 3, 3) for the rows of `cloud.points`, dimensionless.
+        indices: rows to draw.
 
     Raises:
-        ValueError: if the covariances have another shape, or an index is out of range.
+        ValueError: if the covariances have the wrong shape, or an index is out of range.
         ImportError: if plotly is missing.
     """
     graphs = _module("plotly.graph_objects")
@@ -520,9 +541,10 @@ def _figure(graphs: Any) -> plotly.graph_objects.Figure:
     return graphs.Figure(layout=layout)
 
 
-def _scatter(graphs: Any, cloud: PointCloud, name: str, color: str, share: float) -> Any:
+def _scatter(graphs: Any, cloud: PointCloud, name: str, color: str, fraction: float) -> Any:
+    """Draw a reproducible random fraction of the points, in `color` if the cloud has neither colours nor intensity."""
     cloud = _drawable(cloud)
-    kept = np.random.default_rng(0).permutation(len(cloud))[: round(share * len(cloud))]
+    kept = np.random.default_rng(0).permutation(len(cloud))[: round(fraction * len(cloud))]
     rgb = _rgb(cloud)
     marker: dict[str, Any] = {"size": 1.5, "color": color}
     if rgb is not None:
@@ -538,7 +560,7 @@ def _scatter(graphs: Any, cloud: PointCloud, name: str, color: str, share: float
 def _ellipsoids(
     graphs: Any, centers: Float[np.ndarray, "M 3"], matrices: Float[np.ndarray, "M 3 3"], room: float
 ) -> Any:
-    """One mesh of them all, the longest semi-axis `room` metres."""
+    """One mesh of all ellipsoids, scaled so that the longest semi-axis has `room` metres."""
     sphere, faces = _sphere()
     values, vectors = np.linalg.eigh(matrices)
     axes = vectors * np.sqrt(np.maximum(values, 0))[:, None, :]
@@ -552,14 +574,14 @@ def _ellipsoids(
 
 
 def _room(centers: Float[np.ndarray, "M 3"], extent: float) -> float:
-    """Half the median distance from a centre to the next, but no more than a tenth of the extent; metres."""
+    """Half the median distance from a centre to its nearest neighbour, at most a tenth of `extent`; metres."""
     distances = np.linalg.norm(centers[:, None] - centers, axis=-1)
     np.fill_diagonal(distances, np.inf)
     return min(float(np.median(distances.min(axis=1))) / 2, extent / 10)
 
 
 def _sphere(rings: int = 8, segments: int = 16) -> tuple[Float[np.ndarray, "V 3"], Int[np.ndarray, "F 3"]]:
-    """Vertices on the unit sphere, and triangles between them."""
+    """Vertices and triangles of a mesh of the unit sphere."""
     polar, azimuth = np.meshgrid(
         np.linspace(0, np.pi, rings + 1), np.linspace(0, 2 * np.pi, segments, endpoint=False), indexing="ij"
     )
@@ -593,7 +615,7 @@ def _everywhere(cloud: PointCloud, names: tuple[str, ...]) -> bool:
 
 
 def _rgb(cloud: PointCloud) -> Points | None:
-    """Colours in 0..1 from channels in 0..1, 0..255 or 0..65535; None if not every point has one."""
+    """Colours in 0..1 from channels in 0..1, 0..255 or 0..65535; None unless every point has a colour."""
     names = ("red", "green", "blue")
     if not _everywhere(cloud, names):
         return None
@@ -604,11 +626,11 @@ def _rgb(cloud: PointCloud) -> Points | None:
 
 
 def check_picture(path: str | os.PathLike[str]) -> None:
-    """Raise `ValueError` for a file that no picture can be saved in, by its ending."""
+    """Raise `ValueError` if matplotlib cannot save figures to a file with this suffix."""
     kinds = _module("matplotlib.figure").Figure().canvas.get_supported_filetypes()
     suffix = os.path.splitext(path)[1]
     if suffix.lower().removeprefix(".") not in kinds:
-        raise ValueError(f"{os.fspath(path)}: unknown suffix {suffix!r}; there are .{', .'.join(kinds)}")
+        raise ValueError(f"{os.fspath(path)}: unknown suffix {suffix!r}; expected one of .{', .'.join(kinds)}")
 
 
 def _module(name: str) -> Any:

@@ -1,11 +1,11 @@
-"""Shapes are executed: every annotated function of the package is checked by beartype while the tests run."""
+"""Fixtures, and run-time checks of annotated shapes: beartype checks every call into the package during the tests."""
 
 import os
 import pathlib
 
 from jaxtyping import install_import_hook
 
-# Compiled programs are kept between runs: compilation is most of what the tests cost.
+# Keep compiled programs between runs: compilation takes most of the tests' time.
 os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(pathlib.Path(__file__).parent.parent / ".jax_cache"))
 os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0.2")
 
@@ -19,7 +19,7 @@ import pytest
 DATA = pathlib.Path(os.environ.get("MCGICP_DATA", pathlib.Path(__file__).parents[2] / "shared" / "data"))
 
 
-# Where numbers are at stake, tests run in float64 too; elsewhere the other precision shows nothing new.
+# Modules that depend on the precision; only these run in float64 too.
 _IN_FLOAT64 = (
     *("align_gradients", "cost", "covariance", "large_coordinates", "methods", "reference", "register", "solve"),
     "transformations",
@@ -33,8 +33,8 @@ def pytest_collection_modifyitems(config, items):
         items[:] = [item for item in items if item.path.name in modules]
 
 
-# Each compiled program is mapped into memory in dozens of pieces, of which Linux grants a process 65,530: the compiler
-# aborts at more. Tests of transformations compile for many shapes.
+# Each compiled program takes dozens of memory maps. Linux allows a process 65,530, and beyond that the compiler aborts;
+# tests of transformations compile for many shapes.
 _MAPS = pathlib.Path("/proc/self/maps")
 _MANY_MAPS = 30_000
 
@@ -48,7 +48,7 @@ def programs_are_let_go():
 
 @pytest.fixture(scope="session")
 def data() -> pathlib.Path:
-    """The folder of real clouds; tests that need it are skipped where it is not."""
+    """Folder of the real clouds; skips the test if there is none."""
     if not DATA.is_dir():
         pytest.skip(f"no real data in {DATA} (set MCGICP_DATA)")
     return DATA
@@ -56,7 +56,7 @@ def data() -> pathlib.Path:
 
 @pytest.fixture(scope="module")
 def noisy():
-    """5 cm of noise on a 2 m cloud: what is neglected in a gradient shows."""
+    """A pair with 5 cm of noise on a 2 m cloud, so that terms missing from a gradient show."""
     from tests.scenes import pair
 
     return pair(size=400, noise=0.05, channel_noise=0.05)

@@ -1,4 +1,4 @@
-"""Derivatives against finite differences: shared by the tests of transformations."""
+"""Comparison of derivatives with finite differences, shared by the tests of transformations."""
 
 import jax
 import jax.numpy as jnp
@@ -10,7 +10,7 @@ import mcgicp_jax as mcg
 X64 = bool(jax.config.jax_enable_x64)
 needs_x64 = pytest.mark.skipif(not X64, reason="finite differences need float64: JAX_ENABLE_X64=1")
 GATE = 0.4
-# (method, robust kernel): every number in them is differentiated.
+# (method, robust kernel): the tests differentiate with respect to all their parameters.
 CASES = {
     "mc-gicp": (mcg.MultiChannelGICP([[0.05, 0.01], [0.01, 0.08]], 0.3, epsilon=1e-2), mcg.Cauchy(0.5)),
     "gicp": (mcg.GICP(1e-2), mcg.Huber(0.3)),
@@ -19,17 +19,17 @@ CASES = {
     "color-icp": (mcg.ColorICP(0.3), None),
 }
 CONVERGED = {"translation_tolerance": 1e-12, "rotation_tolerance": 1e-12, "max_iterations": 200}
-# Differences over 4e-7 need poses to the last digit: updates go on until the iterations run out.
+# Differences over 4e-7 need poses to the last digit: no update is below these tolerances.
 TO_ROUNDING = {"translation_tolerance": 1e-15, "rotation_tolerance": 1e-15, "max_iterations": 60}
 
 
 def weigh(matrix):
-    """One number of a pose, into which all of its entries go."""
+    """A scalar that depends on all entries of a pose."""
     return jnp.sum(jnp.asarray(np.random.default_rng(0).normal(size=(3, 4))) * matrix[:3])
 
 
 def inputs_of(source, target, method, robust):
-    """Everything that a pose can be differentiated with respect to, by name."""
+    """All inputs with respect to which a pose can be differentiated, by name."""
     inputs = {
         "source points": source.points,
         "target points": target.points,
@@ -52,7 +52,7 @@ def clouds_with(inputs, source, target):
 
 
 def directional_errors(loss, inputs, gradient):
-    """Relative error of the gradient along a random direction in each input, against a fourth-order difference."""
+    """Yield name, derivative and fourth-order difference along a random direction in each input."""
     rng = np.random.default_rng(1)
     for name, value in inputs.items():
         leaves, structure = jax.tree.flatten(value)
@@ -67,7 +67,7 @@ def directional_errors(loss, inputs, gradient):
                 moved = [*leaves[:i], leaf + step * direction, *leaves[i + 1 :]]
                 return float(loss(inputs | {name: jax.tree.unflatten(structure, moved)}))
 
-            # Short, so that no pair crosses the kink of a kernel.
+            # Short, so that no match crosses the kink of a kernel.
             step = 5e-7
             expected = (8 * (at(step) - at(-step)) - (at(2 * step) - at(-2 * step))) / (12 * step)
             actual = float(jnp.sum(jax.tree.leaves(gradient[name])[i] * direction))
@@ -75,15 +75,15 @@ def directional_errors(loss, inputs, gradient):
 
 
 def check_gradient(loss, inputs):
-    """Against differences and forward mode; returns the compiled value and gradient, for more of them."""
-    # One program for value and gradient: compiling is what takes time here.
+    """Compare the gradient with differences and forward mode; return the compiled value and gradient."""
+    # One program for value and gradient, since compilation takes most of the time.
     compiled = jax.jit(jax.value_and_grad(loss))
     _, gradient = compiled(inputs)
     scale = 1e-3
     for name, actual, expected in directional_errors(lambda moved: compiled(moved)[0], inputs, gradient):
         assert np.isfinite(actual)
         assert abs(actual - expected) <= 1e-6 * max(abs(expected), scale), name
-    # Forward mode, along one direction through everything.
+    # Forward mode, along one random direction in all inputs.
     tangent = jax.tree.map(lambda leaf: jnp.asarray(np.random.default_rng(2).normal(size=leaf.shape)), inputs)
     _, forward = jax.jit(lambda i, t: jax.jvp(loss, (i,), (t,)))(inputs, tangent)
     reverse = sum(jax.tree.leaves(jax.tree.map(lambda a, b: jnp.sum(a * b), gradient, tangent)))

@@ -1,4 +1,4 @@
-"""The mathematics once more, point by point, in NumPy and float64: what the package is compared with.
+"""Reference implementation in NumPy and float64, point by point, with which the tests compare the package.
 
 Nothing here is fast, batched or differentiable, and nothing is imported from the package. Inputs are plain arrays;
 `neighbors` is (N, k) with the point itself among its neighbours and −1 where there is none.
@@ -9,12 +9,12 @@ import numpy as np
 
 
 def tolerance(f32: float, f64: float) -> float:
-    """The first in float32 runs, the second where JAX_ENABLE_X64=1."""
+    """Returns `f32`, or `f64` under JAX_ENABLE_X64=1."""
     return f64 if jax.config.jax_enable_x64 else f32
 
 
 def scene(num_points: int, num_channels: int = 0, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
-    """A wavy sheet of 4 × 4 m with channels that have edges, slopes and noise; float64 numbers that float32 holds."""
+    """A wavy sheet of 4 × 4 m with channels that have edges, slopes and noise; values are exact in float32."""
     rng = np.random.default_rng(seed)
     x, y = rng.uniform(-2, 2, (2, num_points))
     points = np.stack([x, y, 0.3 * np.sin(1.3 * x) * np.cos(y) + rng.normal(scale=0.01, size=num_points)], axis=1)
@@ -25,7 +25,7 @@ def scene(num_points: int, num_channels: int = 0, seed: int = 0) -> tuple[np.nda
 
 
 def symmetric(packed) -> np.ndarray:
-    """(6, N) as xx, xy, xz, yy, yz, zz, or (3, N) as xx, xy, yy, to (N, 3, 3) or (N, 2, 2)."""
+    """Unpack (6, N) as xx, xy, xz, yy, yz, zz, or (3, N) as xx, xy, yy, to (N, 3, 3) or (N, 2, 2)."""
     packed = np.asarray(packed, float)
     size = {6: 3, 3: 2}[len(packed)]
     matrices = np.zeros((packed.shape[1], size, size))
@@ -75,8 +75,8 @@ def nearest(queries, targets, k: int = 1) -> np.ndarray:
 
 
 def match(source, target, T, max_distance, source_channels=None, target_channels=None, weights=0.0):
-    """The nearest target of every moved source point in position and weighted channels; −1 beyond the gate, which is
-    in metres of position and is applied to the match that was found."""
+    """Index of the nearest target of every moved source point in position and weighted channels; −1 if the match found
+    is further away than `max_distance` in position (metres)."""
     T = np.asarray(T, float)
     moved = np.asarray(source, float) @ T[:3, :3].T + T[:3, 3]
     a, b = moved, np.asarray(target, float)
@@ -88,20 +88,20 @@ def match(source, target, T, max_distance, source_channels=None, target_channels
     return np.where(apart <= max_distance, index, -1)
 
 
-def match_partial(source, target, source_present, target_present, absence, k: int = 1) -> np.ndarray:
-    """The k nearest targets, ties by index, of rows of positions and descriptors, (N, 3 + D): a descriptor that either
-    row lacks adds its `absence`, (D,), to the squared distance."""
+def match_partial(source, target, source_present, target_present, penalty, k: int = 1) -> np.ndarray:
+    """Indices of the k nearest targets, ties by index, of rows of positions and descriptors, (N, 3 + D). A descriptor
+    missing in either row adds its `penalty`, (D,), to the squared distance."""
     found = []
     for row, present in zip(source, source_present, strict=True):
         both = present & target_present
         squared = ((target[:, :3] - row[:3]) ** 2).sum(axis=1)
-        squared = squared + np.where(both, (target[:, 3:] - row[3:]) ** 2, absence).sum(axis=1)
+        squared = squared + np.where(both, (target[:, 3:] - row[3:]) ** 2, penalty).sum(axis=1)
         found.append(np.lexsort((np.arange(len(target)), squared))[:k])
     return np.array(found)
 
 
 def voxel_means(rows, points, size: float) -> np.ndarray:
-    """The mean row of every occupied cell of a grid, sorted."""
+    """Mean row of every occupied voxel, sorted."""
     cells: dict[tuple, list] = {}
     for row, point in zip(np.asarray(rows, float), np.asarray(points, float), strict=True):
         cells.setdefault(tuple(np.floor(point / size)), []).append(row)
@@ -129,21 +129,22 @@ def gicp_covariances(points, neighbors, epsilon: float) -> np.ndarray:
 
 
 def power(matrix, exponent: float) -> np.ndarray:
-    """A symmetric matrix to a real power, by its eigenvalues."""
+    """Real power of a symmetric matrix, by its eigenvalues."""
     values, vectors = np.linalg.eigh(matrix)
     return vectors @ np.diag(values**exponent) @ vectors.T
 
 
 def full_covariance(value, num_channels: int) -> np.ndarray:
-    """Λ as (C, C), from a variance, one variance per channel, or itself."""
+    """Λ as (C, C), given as one variance, one per channel, or a full matrix."""
     value = np.asarray(value, float)
     return value if value.ndim == 2 else np.diag(np.broadcast_to(value, (num_channels,)))
 
 
 def kernel(apart, common, others, channel_covariance) -> np.ndarray:
-    """Eq. 7 for one point's neighbours, whose channels differ from it by `apart`, (k, C), where `common`.
+    """Eq. 7 for the neighbours of one point, given channel differences `apart`, (k, C), valid where `common`.
 
-    The marginal of Λ on the common channels; for another, the mean factor over those `others` that have it.
+    Uses the marginal of Λ on the common channels. For a missing channel, the factor is the mean over the `others`
+    (the neighbours without the point itself) that have it.
     """
     full = full_covariance(channel_covariance, apart.shape[1])
     result = np.ones(len(apart))
@@ -160,7 +161,7 @@ def kernel(apart, common, others, channel_covariance) -> np.ndarray:
 def omega(members, kernel, regularisation=0.0):
     """Eqs. 6-10 for one point: Ω, the tangent basis (3, 2) and the normal.
 
-    `regularisation` is what is added to Σ_w, relative to its trace; Ω is then I + Σ_w^{-1/2} (Σ_t − Σ_w) Σ_w^{-1/2}.
+    `regularisation` times the trace of Σ_w is added to its diagonal; Ω is then I + Σ_w^{-1/2} (Σ_t − Σ_w) Σ_w^{-1/2}.
     """
     members = np.asarray(members, float)
     _, vectors = np.linalg.eigh(local_covariance(members))
@@ -176,7 +177,7 @@ def omega(members, kernel, regularisation=0.0):
 def multi_channel_covariances(
     points, channels, neighbors, channel_covariance, epsilon, floor=0.0, regularisation=0.0, present=None
 ) -> np.ndarray:
-    """Ω in the tangent plane + ε n nᵀ; Ω's eigenvalues are raised to `floor`."""
+    """Ω in the tangent plane + ε n nᵀ, with the eigenvalues of Ω raised to at least `floor`."""
     points, channels = np.asarray(points, float), np.asarray(channels, float)
     present = np.ones(channels.shape, bool) if present is None else present
     result = []
@@ -201,7 +202,7 @@ ROBUST = {
 
 
 def cost(T, source, target, matches, information, rho=None) -> float:
-    """Σ ρ(dᵀ M d), d = b − T a, over the matched pairs. `information(i, j, R)` gives M of source i and target j."""
+    """Σ ρ(dᵀ M d), d = b − T a, over the matches. `information(i, j, R)` gives M of source i and target j."""
     T, source, target = np.asarray(T, float), np.asarray(source, float), np.asarray(target, float)
     total = 0.0
     for i, j in enumerate(matches):

@@ -1,4 +1,4 @@
-"""Small synthetic clouds with known motion, shared by the tests: few sizes, since every size compiles."""
+"""Small synthetic clouds with known motion, shared by the tests; of few sizes, since every size compiles."""
 
 from types import SimpleNamespace
 
@@ -11,7 +11,7 @@ from mcgicp_jax._surfaces import surface_on_host, surfaces_of
 
 
 def motion(twist=(0.05, -0.03, 0.04, 0.02, -0.03, 0.05)) -> np.ndarray:
-    """A rigid motion, (4, 4) float64: the translation, and the rotation vector."""
+    """A rigid motion, (4, 4) float64, from its translation and rotation vector."""
     *translation, x, y, z = twist
     angle = np.linalg.norm([x, y, z])
     cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
@@ -23,7 +23,7 @@ def motion(twist=(0.05, -0.03, 0.04, 0.02, -0.03, 0.05)) -> np.ndarray:
 
 
 def room_corner(size: int, noise: float = 0.01, channel_noise: float = 0.02, seed: int = 0, channels: int = 2):
-    """Points on three faces of a 2 m cube, and smooth channels painted on them: (N, 3), (N, C)."""
+    """Points (N, 3) on three faces of a 2 m cube, with channels (N, C) that vary smoothly over them."""
     rng = np.random.default_rng(seed)
     face = rng.integers(0, 3, size)
     points = rng.random((size, 3)) * 2
@@ -36,7 +36,7 @@ def room_corner(size: int, noise: float = 0.01, channel_noise: float = 0.02, see
 
 
 def wall(size: int, noise: float = 0.002, seed: int = 0):
-    """Points on a flat 2 m wall, and three smooth channels painted on it."""
+    """Points on a flat 2 m wall, with three channels that vary smoothly over it."""
     rng = np.random.default_rng(seed)
     x, y = 2 * rng.random((2, size))
     points = np.stack([x, y, noise * rng.normal(size=size)], axis=1)
@@ -45,7 +45,7 @@ def wall(size: int, noise: float = 0.002, seed: int = 0):
 
 
 def pair(scene=room_corner, size: int = 2000, truth: np.ndarray | None = None, **settings):
-    """Source and target, preprocessed, sampled independently; and T_target_source."""
+    """Preprocessed source and target, sampled independently, and the true T_target_source."""
     truth = motion() if truth is None else truth
     points, channels = scene(size, seed=1, **settings)
     source = mcg.PointCloud((points - truth[:3, 3]) @ truth[:3, :3], channels)
@@ -54,7 +54,7 @@ def pair(scene=room_corner, size: int = 2000, truth: np.ndarray | None = None, *
 
 
 def prepare(method, cloud, observed=False):
-    """The surface that a resolved method sees in one concrete cloud."""
+    """Per-point rows and covariances that a resolved method computes for one concrete cloud."""
     local = None if cloud.neighbors is None else local_on_host(cloud, method.uses_channels)
     surface = surface_on_host(method, cloud, local, observed, 1)
     return SimpleNamespace(
@@ -66,6 +66,6 @@ def prepare(method, cloud, observed=False):
 
 
 def covariances(method, cloud):
-    """(6, N) symmetric matrices of a resolved method; traced clouds too."""
+    """Packed covariances (6, N) of a resolved method, for concrete and traced clouds."""
     _, surface, _ = surfaces_of(method, cloud, cloud, observed=False)
     return covariance_of(surface.table)

@@ -54,11 +54,14 @@ def test_channels_without_noise_have_a_covariance_that_can_be_inverted():
 @pytest.mark.parametrize(
     "make, message",
     [
-        (lambda clouds: (clouds, POSES[:2]), "poses: expected one for each of two clouds or more, got 2 for 3"),
-        (lambda clouds: (clouds[:1], POSES[:1]), "poses: expected one for each of two clouds or more, got 1 for 1"),
+        (lambda clouds: (clouds, POSES[:2]), "poses: expected one per cloud and at least two, got 2 for 3"),
+        (lambda clouds: (clouds[:1], POSES[:1]), "poses: expected one per cloud and at least two, got 1 for 1"),
         (lambda clouds: (clouds[:2], [np.eye(4), 2 * np.eye(4)]), r"poses\[1\]: expected a rigid motion"),
         (lambda clouds: ([clouds[0], PointCloud(POSES[0][:, :3])], POSES[:2]), r"clouds\[1\]: expected the channels"),
-        (lambda clouds: (clouds[:2], POSES[1:]), "clouds: expected 10 spots or more .* 'channel_0'"),
+        (
+            lambda clouds: (clouds[:2], POSES[1:]),
+            "clouds: expected at least 10 matches per channel, got .* 'channel_0'",
+        ),
     ],
     ids=["one pose short", "one cloud", "scale", "channels", "no overlap"],
 )

@@ -752,7 +752,7 @@ def test_what_a_library_raises(tmp_path, monkeypatch):
 
 def test_no_coordinates(tmp_path):
     write_ply(tmp_path / "c.ply", structured(x=np.ones(3), y=np.ones(3), intensity=np.ones(3)))
-    refuses(tmp_path / "c.ply", r"no numbers x, y, z; there are x, y, intensity")
+    refuses(tmp_path / "c.ply", r"no numeric columns x, y, z; found x, y, intensity")
     plyfile.PlyData([plyfile.PlyElement.describe(structured(a=np.ones(3)), "face")]).write(tmp_path / "c.ply")
     refuses(tmp_path / "c.ply", "no vertices")
 

@@ -145,7 +145,7 @@ def test_pairs_that_fail_are_told_apart(folder, tmp_path, capsys):
             ",".join(["source,target", *POSE]) + "\nx.ply,y.ply" + 12 * ",a",
             "line 2: expected numbers in m00",
         ),
-        ("\x80\xff", "pairs.csv: expected a CSV file or a folder; it is no text"),
+        ("\x80\xff", "pairs.csv: expected a CSV file or a folder; the file is not text"),
     ],
 )
 def test_a_list_that_makes_no_sense(tmp_path, capsys, content, message):

@@ -255,7 +255,7 @@ def test_localizability_has_two_bars_per_direction_and_names_the_free_ones_first
     geometry, channels = widths
     assert np.all(geometry[:3] < 2e-3) and np.all(geometry[3:] > 0.9) and np.all(channels[:3] > 5e-3)
     assert (tmp_path / "held.png").stat().st_size > 1000
-    with pytest.raises(ValueError, match="result: expected a single one of `register`"):
+    with pytest.raises(ValueError, match="result: expected a single result of `register`"):
         plot.localizability(result.without_pose(result.status))
 
 

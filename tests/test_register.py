@@ -395,7 +395,7 @@ def test_matched_channels_are_not_fooled_by_what_one_cloud_sees():
 
 def test_without_channels_it_says_that_it_is_gicp(room):
     bare = [cloud.replace(channels=np.zeros((*cloud.points.shape[:1], 0))) for cloud in room[:2]]
-    with pytest.warns(UserWarning, match="no channels: MultiChannelGICP is GICP then"):
+    with pytest.warns(UserWarning, match="no channels: MultiChannelGICP equals GICP"):
         result = mcg.register(*bare, mcg.MultiChannelGICP())
     np.testing.assert_allclose(result.matrix, mcg.register(*bare, mcg.GICP()).matrix, atol=1e-6)
 

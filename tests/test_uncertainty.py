@@ -123,7 +123,7 @@ def test_geometry_slides_on_a_wall_and_stays_where_it_started(flat):
     centroid = result.directions.center
     assert np.linalg.norm((result.matrix[:3, :3] @ centroid + result.matrix[:3, 3] - centroid)[:2]) < 2e-3
     assert abs(result.matrix[1, 0]) < 1e-3
-    assert "held by nothing" in repr(result)
+    assert "constrained by channels: none" in repr(result)
 
 
 def test_without_the_hold_the_nearest_neighbours_pull(flat):
@@ -143,7 +143,7 @@ def test_the_channels_hold_what_geometry_leaves_free(flat):
     assert result.converged and len(result.free_directions) == 3
     assert all(direction.held_by_channels for direction in result.free_directions)
     assert mcg.metrics.pose_error(result.matrix, truth)[0] < 0.01
-    assert repr(result).count("held by the channels: all") == 1
+    assert repr(result).count("constrained by channels: all") == 1
 
 
 def test_nothing_is_free_in_a_corner():

@@ -1,1 +1,1 @@
-"""The commands of `mcgicp`, one file for each or for a few that belong together."""
+"""The commands of `mcgicp`, one file for each or for a few related ones."""

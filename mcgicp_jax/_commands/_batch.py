@@ -1,4 +1,4 @@
-"""`mcgicp batch PAIRS`."""
+"""`mcgicp batch PAIRS`: register many pairs of files and write a table of poses."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ _INTERRUPTED = 130
 
 @dataclass(frozen=True)
 class FilePair:
-    """Two files, relative to `folder`, and where to start."""
+    """Two cloud files, relative to `folder`, and the initial pose, if given."""
 
     folder: Path
     source: str
@@ -72,23 +72,22 @@ def batch(
     *,
     shared: Options,
 ) -> int:
-    """Register many pairs of clouds, and write a table of their poses T_target_source.
+    """Register many pairs of clouds and write a table of their poses T_target_source.
 
-    PAIRS is a CSV file with the columns source and target, files relative to its folder, and, if wanted, m00 m01 ...
-    m23 for the pose to start from; or a folder, each file of which is registered to the one before it in the order of
-    names. A row is written as soon as its pair is done, and pairs that are in the table already are left out, if their
-    files and all options are the same: after Ctrl-C, or with more pairs, run the same command again. The exit code is 0
-    only if all pairs converged.
+    PAIRS is a CSV file or a folder. The CSV file has the columns source and target, with paths relative to its folder,
+    and optionally m00 m01 ... m23, the upper three rows of the initial pose. In a folder, each file is registered to
+    the one before it in order of name. To resume after Ctrl-C, or to add pairs, run the same command again: it skips
+    pairs in the table whose files and options are unchanged. The exit code is 0 only if all pairs converged.
 
     Args:
         pairs: CSV file or folder.
-        output: Table to write or to complete, .csv or .npz: source, target, status, iterations, inliers, cost, rmse,
-            the upper three rows of the pose, the reason why a pair could not be registered, and a fingerprint of files
-            and options.
+        output: Table to write or to resume, .csv or .npz, a row per pair: source, target, status, iterations, inliers,
+            cost, rmse, the upper three rows of the pose, the reason if it could not be registered, and a fingerprint
+            of files and options.
         method: mc-gicp and color-icp use channels (intensity, colours, ...), the others geometry alone.
-        glob: Which files of a folder, such as "*.ply".
-        channels: Channels to use, such as intensity, or red green blue. By default those that both clouds of the first
-            pair have; every cloud must have them.
+        glob: Pattern for the files of a folder, such as "*.ply".
+        channels: Channels to use, such as intensity, or red green blue; every cloud must have them. By default those
+            common to both clouds of the first pair.
     """
     shared.check()
     shared.check_method(method)
@@ -100,38 +99,18 @@ def batch(
     known = [pair for pair in everything if pair.key in rows]
     outdated = [pair.key for pair in known if rows[pair.key]["fingerprint"] != _fingerprint(pair, settings)]
     if outdated:
-        print(f"outdated:  {len(outdated):,} in {output}, by other options or files; they are registered again")
+        print(f"outdated:  {len(outdated):,} in {output} with other options or files; registered again")
         rows = {key: row for key, row in rows.items() if key not in set(outdated)}
         table.rewrite(list(rows.values()))
     missing = [pair for pair in everything if pair.key not in rows]
     finished = len(everything) - len(missing)
     print(f"pairs:     {len(everything):,}" + (f", of which {finished:,} are in {output}" if finished else ""))
-    interrupted = False
-    if missing:
-        begin = time.perf_counter()
-        with (
-            table.appending() as append,
-            tqdm(total=len(everything), initial=finished, unit="pair", disable=None) as bar,
-            contextlib.closing(_rows(missing, settings, bar)) as completed,
-            _interrupts() as pressed,
-        ):
-            try:
-                for pair, row in completed:
-                    append(row)
-                    rows[pair.key] = row
-                    bar.update()
-                    if pressed:
-                        raise KeyboardInterrupt
-            except KeyboardInterrupt:
-                interrupted = True
-        done = sum(pair.key in rows for pair in missing)
-        rate = done / (time.perf_counter() - begin)
-        print(f"done:      {done:,} of {len(missing):,}, {rate:.3g} pairs per second")
+    interrupted = bool(missing) and _register_missing(missing, settings, table, rows, finished)
     table.finish(list(rows.values()))
     counts = collections.Counter(rows[pair.key]["status"] for pair in everything if pair.key in rows)
     print("status:    " + ", ".join(f"{count:,} {name}" for name, count in counts.most_common()))
     if interrupted:
-        print("mcgicp: interrupted; run the same command again for the rest", file=sys.stderr)
+        print("mcgicp: interrupted; run the same command again to continue", file=sys.stderr)
         return _INTERRUPTED
     failed = counts.total() - counts[_word(mcg.Status.CONVERGED)]
     if failed:
@@ -139,11 +118,36 @@ def batch(
     return 1 if failed else 0
 
 
+def _register_missing(
+    pairs: Sequence[FilePair], settings: dict[str, Any], table: Table, rows: dict[tuple[str, str], Row], finished: int
+) -> bool:
+    """Register pairs, adding their rows to the table and to `rows`; return whether Ctrl-C stopped it."""
+    interrupted, begin = False, time.perf_counter()
+    with (
+        table.appending() as append,
+        tqdm(total=finished + len(pairs), initial=finished, unit="pair", disable=None) as bar,
+        contextlib.closing(_rows(pairs, settings, bar)) as completed,
+        _interrupts() as pressed,
+    ):
+        try:
+            for pair, row in completed:
+                append(row)
+                rows[pair.key] = row
+                bar.update()
+                if pressed:
+                    raise KeyboardInterrupt
+        except KeyboardInterrupt:
+            interrupted = True
+    done = sum(pair.key in rows for pair in pairs)
+    print(f"done:      {done:,} of {len(pairs):,}, {done / (time.perf_counter() - begin):.3g} pairs per second")
+    return interrupted
+
+
 @contextlib.contextmanager
 def _interrupts() -> Iterator[list[int]]:
-    """One entry for each Ctrl-C, which interrupts as it always does.
+    """Record each Ctrl-C in a list, besides raising `KeyboardInterrupt`.
 
-    Python loses an interrupt that comes while a callback of the garbage collector runs, and JAX has one.
+    Python swallows the exception during a callback of the garbage collector, and JAX installs one.
     """
     pressed: list[int] = []
 
@@ -152,7 +156,7 @@ def _interrupts() -> Iterator[list[int]]:
         signal.default_int_handler(number, frame)
 
     if threading.current_thread() is not threading.main_thread():
-        # Interrupts do not come here.
+        # Python delivers signals to the main thread only.
         yield pressed
         return
     before = signal.signal(signal.SIGINT, notice)
@@ -167,7 +171,7 @@ def _pairs_of_table(path: Path) -> list[FilePair]:
         try:
             lines = file.readlines()
         except UnicodeError as error:
-            raise ValueError(f"{path}: expected a CSV file or a folder; it is no text") from error
+            raise ValueError(f"{path}: expected a CSV file or a folder; the file is not text") from error
         reader = csv.DictReader(lines)
         columns = reader.fieldnames or []
         if not {"source", "target"} <= set(columns):
@@ -197,12 +201,12 @@ def _checked(path: Path, pairs: list[FilePair]) -> list[FilePair]:
         raise ValueError(f"{path}: expected pairs of clouds, got none")
     repeated = [key for key, count in collections.Counter(pair.key for pair in pairs).items() if count > 1]
     if repeated:
-        raise ValueError(f"{path}: expected each pair once, got {' '.join(repeated[0])} more often")
+        raise ValueError(f"{path}: expected each pair once, got {' '.join(repeated[0])} several times")
     return pairs
 
 
 def _settings(pairs: Sequence[FilePair], name: MethodName, channels: Sequence[str], options: Options) -> dict[str, Any]:
-    """What all pairs have in common, chosen by the first one that can be read."""
+    """Options common to all pairs, with defaults chosen from the first pair whose files can be read."""
     kind = METHODS[name]
     for pair in pairs:
         try:
@@ -235,15 +239,17 @@ def _settings(pairs: Sequence[FilePair], name: MethodName, channels: Sequence[st
 
 
 def _fingerprint(pair: FilePair, settings: dict[str, Any]) -> str:
-    """Of all that the result of a pair depends on: options, start, and the sizes and times of its files."""
+    """Hash of the options, the initial pose, and the sizes and modification times of a pair's files."""
     files = [(path.stat().st_size, path.stat().st_mtime_ns) if path.exists() else None for path in pair.paths()]
     numbers = [np.asarray(leaf).tolist() for leaf in jax.tree.leaves((settings["method"], settings.get("robust")))]
     start = None if pair.init is None else pair.init.tolist()
     return hashlib.sha256(repr((sorted(settings.items(), key=str), numbers, files, start)).encode()).hexdigest()[:16]
 
 
-def _rows(pairs: Sequence[FilePair], settings: dict[str, Any], bar: tqdm) -> Generator[tuple[FilePair, Row], None, None]:
-    """The row of each pair, as it finishes; the reasons of those that fail go there and to stderr."""
+def _rows(
+    pairs: Sequence[FilePair], settings: dict[str, Any], bar: tqdm
+) -> Generator[tuple[FilePair, Row], None, None]:
+    """Yield each pair and its row as it finishes. Reasons for failure go into the row and to stderr."""
     reasons: dict[int, str] = {}
     show = warnings.showwarning
 

@@ -1,4 +1,4 @@
-"""`mcgicp odometry DATASET PATH`."""
+"""`mcgicp odometry DATASET PATH`: register each frame of a sequence to the one before it."""
 
 from __future__ import annotations
 
@@ -28,22 +28,23 @@ from mcgicp_jax._commands._options import (
     with_channels,
 )
 from mcgicp_jax._methods import AbstractMethod
+from mcgicp_jax._odometry import Step
 
 DatasetName: TypeAlias = Literal["kitti", "ford", "tum", "7-scenes", "street", "corridor", "box-room", "poster-wall"]
 Dataset: TypeAlias = Annotated[DatasetName, tyro.conf.Positional, tyro.conf.arg(metavar="DATASET")]
 Folder: TypeAlias = Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="PATH", help_behavior_hint="")]
-Gates: TypeAlias = tuple[float, float]
+Distances: TypeAlias = tuple[float, float]
 Names: TypeAlias = Annotated[tuple[str, ...], tyro.conf.arg(metavar="NAMES", help_behavior_hint="(default: all)")]
 
-# What opens it, from a folder or for a number of frames; voxels, and how far two matched points may lie apart, first
-# and when the pose is refined; metres.
-_READERS: dict[str, tuple[Callable[[Path], datasets.AbstractFrames], float, Gates]] = {
+# Function of a folder or of a number of frames; defaults of voxel size and of max_distance (at first, and when the pose
+# is refined) that suit the sensor and its motion; metres.
+_READERS: dict[str, tuple[Callable[[Path], datasets.AbstractFrames], float, Distances]] = {
     "kitti": (datasets.kitti, 0.25, (2.5, 0.6)),
     "ford": (datasets.ford_campus, 0.25, (2.5, 0.6)),
     "tum": (datasets.tum_rgbd, 0.03, (0.2, 0.06)),
     "7-scenes": (datasets.seven_scenes, 0.03, (0.2, 0.06)),
 }
-_SCENES: dict[str, tuple[Callable[[int], datasets.AbstractFrames], float | None, Gates]] = {
+_SCENES: dict[str, tuple[Callable[[int], datasets.AbstractFrames], float | None, Distances]] = {
     "street": (datasets.street, 0.2, (2.0, 0.5)),
     "corridor": (datasets.corridor, None, (0.5, 0.25)),
     "box-room": (datasets.box_room, None, (0.5, 0.25)),
@@ -65,27 +66,26 @@ def odometry(
     map: File = None,
     plot: File = None,
 ) -> int:
-    """Follow the sensor through a sequence: each frame is registered to the one before.
+    """Estimate the sensor's trajectory by registering each frame of a sequence to the one before it.
 
-    DATASET is kitti, ford, tum or 7-scenes, whose sequence is the folder PATH; or street, corridor, box-room or
-    poster-wall, which are made up and need none. Where the truth is known, the errors are printed. The exit code is 0
-    only if all registrations converged; output files are written in any case.
+    DATASET is kitti, ford, tum or 7-scenes, with the sequence in the folder PATH; or a simulated scene (street,
+    corridor, box-room or poster-wall), which needs no PATH. Errors are printed if the true poses are known. The exit
+    code is 0 only if all registrations converged; output files are written in any case.
 
-    The defaults of --voxel-size are those of the sensor: 0.25 for kitti and ford, 0.2 for street, 0.03 for tum and
-    7-scenes, off for the others. Those of --max-distance allow for the motion between two frames: 2.5 and 0.6 for kitti
-    and ford, 2 and 0.5 for street, 0.5 and 0.25 for corridor and box-room, 0.2 and 0.06 for tum and 7-scenes, 0.1 and
-    0.04 for poster-wall.
+    Defaults of --voxel-size: 0.25 for kitti and ford, 0.2 for street, 0.03 for tum and 7-scenes, off for the others.
+    Defaults of --max-distance: 2.5 and 0.6 for kitti and ford, 2 and 0.5 for street, 0.5 and 0.25 for corridor and
+    box-room, 0.2 and 0.06 for tum and 7-scenes, 0.1 and 0.04 for poster-wall.
 
     Args:
-        dataset: Form of the data set, or a scene.
+        dataset: Format of the data set, or simulated scene.
         path: Folder of the sequence, such as sequences/04.
         method: mc-gicp and color-icp use channels, the others geometry alone.
         channels: Channels to use, such as intensity, or red green blue.
-        num_frames: How many, from the start; all of a scene are 20.
-        output: File for the poses, sensor to world: the upper three rows of each matrix in one row (KITTI).
-        map: File for the map in the world, such as map.ply, thinned to voxels: those of the registration, or else such
-            as would leave at most half of the first cloud.
-        plot: Picture to draw of the way from above, such as way.png.
+        num_frames: Number of frames to use, from the start; all means 20 for a simulated scene.
+        output: File for the poses, sensor to world, in KITTI format: the upper three rows of each matrix on one line.
+        map: File for the map in the world frame, such as map.ply. Its voxels have the size used for registration; if
+            that is off, a size that keeps at most half of the first cloud.
+        plot: File for a picture of the trajectory from above, such as way.png.
     """
     check_outputs(output, cloud=map, picture=plot)
     shared.check()
@@ -93,49 +93,32 @@ def odometry(
     frames, usual_voxel, usual_distance = _open(dataset, path, num_frames)
     given = shared.voxel_size
     voxel = given if not isinstance(given, str) else usual_voxel if given == "auto" else None
-    options = {"max_distance": usual_distance} | shared.registration()
+    options: dict[str, Any] = {
+        "max_distance": usual_distance,
+        "num_neighbors": shared.num_neighbors,
+    } | shared.registration()
     first = frames[0]
     names = channels or first.cloud.channel_names
     print(f"frames:    {len(frames)} of {dataset}, {len(first.cloud):,} points in the first")
     print(f"channels:  {listed(names)}")
     truth: list[Float[np.ndarray, "4 4"] | None] = []
-    clouds = _clouds(frames, names, truth)
     chosen = _method(method, shared.numbers_of(method), frames, names, voxel)
-    steps = mcg.odometry(
-        clouds, chosen, voxel_size=voxel, num_neighbors=shared.num_neighbors, start=first.pose, **options
-    )
-    poses, ends = [], []
-
-    def followed() -> Iterator[tuple[mcg.PointCloud, Float[np.ndarray, "4 4"]]]:
-        for step in tqdm(steps, total=len(frames), unit="frame", disable=None):
-            poses.append(step.pose)
-            if step.registration is not None:
-                ends.append(step.registration)
-            yield step.cloud, step.pose
-
-    if map is None:
-        collections.deque(followed(), maxlen=0)
-    else:
-        thinned = round_voxel_size([first.cloud], len(first.cloud) // 2) if voxel is None else voxel
-        # Cloud by cloud: none is kept once it is in the map.
-        clouds_again, poses_again = itertools.tee(followed())
-        world = mcg.aggregate((cloud for cloud, _ in clouds_again), (pose for _, pose in poses_again), thinned)
-        io.write(map, world)
-        print(f"map:       {map}, {len(world):,} points, voxels of {thinned:g} m")
-    _report(poses, truth, ends)
+    steps = mcg.odometry(_clouds(frames, names, truth), chosen, voxel_size=voxel, start=first.pose, **options)
+    map_voxel = round_voxel_size([first.cloud], len(first.cloud) // 2) if map and voxel is None else voxel
+    poses, results = _follow(steps, len(frames), map, map_voxel)
+    _report(poses, truth, results)
     if output is not None:
         io.write_poses(output, poses)
     if plot is not None:
         _draw(plot, method, poses, truth)
-    failed = sum(not result.converged for result in ends)
-    if failed:
-        print(f"mcgicp: {failed} of {len(ends)} registrations did not converge", file=sys.stderr)
+    if failed := sum(not result.converged for result in results):
+        print(f"mcgicp: {failed} of {len(results)} registrations did not converge", file=sys.stderr)
     return 1 if failed else 0
 
 
 def _open(
     dataset: DatasetName, path: Path, num_frames: int | Literal["all"]
-) -> tuple[datasets.AbstractFrames, float | None, Gates]:
+) -> tuple[datasets.AbstractFrames, float | None, Distances]:
     if num_frames != "all" and num_frames < 2:
         raise ValueError(f"num_frames: expected at least 2, got {num_frames}")
     if dataset in _SCENES:
@@ -148,10 +131,34 @@ def _open(
     return frames if num_frames == "all" else frames[:num_frames], voxel, distance
 
 
+def _follow(
+    steps: Iterator[Step], num_frames: int, map: Path | None, voxel_size: float | None
+) -> tuple[list[Float[np.ndarray, "4 4"]], list[mcg.Registration]]:
+    """Run the odometry, write the map if it has a file, and return the poses and the registrations."""
+    poses, results = [], []
+
+    def followed() -> Iterator[tuple[mcg.PointCloud, Float[np.ndarray, "4 4"]]]:
+        for step in tqdm(steps, total=num_frames, unit="frame", disable=None):
+            poses.append(step.pose)
+            if step.registration is not None:
+                results.append(step.registration)
+            yield step.cloud, step.pose
+
+    if map is None or voxel_size is None:
+        collections.deque(followed(), maxlen=0)
+    else:
+        # A stream: no cloud is kept once it is in the map.
+        with_clouds, with_poses = itertools.tee(followed())
+        world = mcg.aggregate((cloud for cloud, _ in with_clouds), (pose for _, pose in with_poses), voxel_size)
+        io.write(map, world)
+        print(f"map:       {map}, {len(world):,} points, voxels of {voxel_size:g} m")
+    return poses, results
+
+
 def _clouds(
     frames: datasets.AbstractFrames, names: tuple[str, ...], truth: list[Float[np.ndarray, "4 4"] | None]
 ) -> Iterator[mcg.PointCloud]:
-    """One cloud after another; their poses are set aside."""
+    """Yield the cloud of each frame, and append its true pose to `truth`."""
     for frame in frames:
         truth.append(frame.pose)
         yield with_channels(frame.cloud, names)
@@ -167,7 +174,7 @@ def _method(
     kind = METHODS[name]
     if kind is not mcg.ColorICP or numbers:
         return kind(**numbers)
-    # Its weights from the first pair, as mc-gicp would choose them.
+    # Channel weights from the first two frames, as mc-gicp would choose them.
     first, second = (mcg.preprocess(with_channels(frame.cloud, channels), voxel_size) for frame in frames[:2])
     return kind(channel_weights=weights_from(second, first))
 
@@ -179,22 +186,24 @@ def _report(
 ) -> None:
     iterations = np.mean([np.asarray(result.num_iterations) for result in results])
     converged = sum(bool(result.converged) for result in results)
-    print(f"pairs:     {converged} of {len(results)} converged, {iterations:.1f} iterations in the mean")
+    print(f"pairs:     {converged} of {len(results)} converged, {iterations:.1f} iterations on average")
     known = [row for row, pose in enumerate(truth) if pose is not None]
     if len(known) < 2:
-        print("errors:    the truth is not known")
+        print("errors:    unknown, since there are no true poses")
         return
     estimated, true = [poses[row] for row in known], [truth[row] for row in known]
     translation, rotation = metrics.rpe(estimated, true)
-    print(f"per pair:  {1e3 * translation.mean():.1f} mm, {np.degrees(rotation.mean()):.3f} deg in the mean")
+    print(f"per pair:  {1e3 * translation.mean():.1f} mm, {np.degrees(rotation.mean()):.3f} deg on average")
     whole = metrics.ate(estimated, true)
     first = metrics.ate(estimated, true, alignment="first")
-    print(f"ATE:       {1e3 * whole:.1f} mm rms after the best alignment, {1e3 * first:.1f} mm from the first pose")
+    print(
+        f"ATE:       {1e3 * whole:.1f} mm rms after the best alignment, {1e3 * first:.1f} mm aligned at the first pose"
+    )
     length = float(np.linalg.norm(np.diff(np.array(true)[:, :3, 3], axis=0), axis=1).sum())
-    stretches = _KITTI_LENGTHS[length > _KITTI_LENGTHS] if length > _KITTI_LENGTHS[0] else np.array([length / 2])
-    percent, degrees = metrics.kitti_errors(estimated, true, lengths=stretches.tolist(), step=1)
-    shown = ", ".join(f"{stretch:.3g}" for stretch in stretches)
-    print(f"drift:     {percent:.2f} %, {degrees:.4f} deg/m over stretches of {shown} m")
+    segments = _KITTI_LENGTHS[length > _KITTI_LENGTHS] if length > _KITTI_LENGTHS[0] else np.array([length / 2])
+    percent, degrees = metrics.kitti_errors(estimated, true, lengths=segments.tolist(), step=1)
+    shown = ", ".join(f"{segment:.3g}" for segment in segments)
+    print(f"drift:     {percent:.2f} %, {degrees:.4f} deg/m over segments of {shown} m")
 
 
 def _draw(

@@ -1,4 +1,4 @@
-"""What the commands share: methods by name, options, voxels chosen from the clouds, outcomes in words."""
+"""Shared by the commands: methods by name, options, checks of files, the choice of voxel sizes, statuses in words."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from mcgicp_jax._register import default_distances
 MethodName: TypeAlias = Literal["mc-gicp", "gicp", "color-icp", "point-to-plane", "point-to-point"]
 File: TypeAlias = Annotated[Path | None, tyro.conf.arg(metavar="FILE", help_behavior_hint="")]
 Numbers: TypeAlias = Annotated[tuple[float, ...], tyro.conf.arg(help_behavior_hint="(default: from the data)")]
-Gates: TypeAlias = Annotated[tuple[float, ...], tyro.conf.arg(help_behavior_hint="(default: 10 and 2.5 spacings)")]
+Distances: TypeAlias = Annotated[tuple[float, ...], tyro.conf.arg(help_behavior_hint="(default: 10 and 2.5 spacings)")]
 Tolerance: TypeAlias = Annotated[
     float | None, tyro.conf.arg(metavar="FLOAT", help_behavior_hint="(default: 0.005 spacings)")
 ]
@@ -40,7 +40,7 @@ METHODS: dict[MethodName, type[AbstractMethod]] = {
     "point-to-plane": mcg.PointToPlane,
     "point-to-point": mcg.PointToPoint,
 }
-# Points that a cloud is thinned to by default: registered in a tenth of a second.
+# Larger clouds are downsampled to at most this many points by default: registered in a tenth of a second.
 _MOST_POINTS = 20_000
 _KERNELS: dict[KernelName, type[AbstractKernel]] = {
     "huber": mcg.Huber,
@@ -49,43 +49,43 @@ _KERNELS: dict[KernelName, type[AbstractKernel]] = {
     "tukey": mcg.Tukey,
 }
 ADVICE = {
-    mcg.Status.MAX_ITERATIONS: "the pose was still moving when the iterations ran out; "
-    "try a larger --max-iterations, or --init with a pose nearer to the answer",
+    mcg.Status.MAX_ITERATIONS: "the pose was still changing after the last iteration; "
+    "try a larger --max-iterations, or --init with a better initial pose",
     mcg.Status.TOO_FEW_CORRESPONDENCES: "fewer than four points have a match; "
     "try --init with a pose at which the clouds overlap, or a larger --max-distance",
-    mcg.Status.DEGENERATE: "nothing holds the pose in at least one direction; "
+    mcg.Status.DEGENERATE: "the pose is unconstrained in at least one direction; "
     "try clouds that show more of the scene, or mc-gicp if they have channels",
-    mcg.Status.NON_FINITE: "the numbers overflowed; are the coordinates metres?",
+    mcg.Status.NON_FINITE: "numerical overflow; are the coordinates in metres?",
 }
 
 
 @dataclass(frozen=True)
 class Options:
-    """How clouds are prepared and registered.
+    """Options of preprocessing and registration.
 
     Attributes:
-        voxel_size: Metres; the points of one voxel are averaged. auto: the smallest of 1, 1.5, 2, 3, 5, 7, 10, ...
-            times a power of ten that leaves neither cloud more than 20,000 points; all points are kept if neither has
-            more. off: all points are kept.
-        num_neighbors: Neighbours that the covariance of a point is computed from.
-        max_distance: Metres; points further apart do not match. Two numbers: one to find the pose with, and a smaller
-            one to refine it with.
-        max_iterations: Largest number of updates of the pose.
-        translation_tolerance: Metres; an update below this and the rotation tolerance is the last.
+        voxel_size: Metres; the points of each voxel are averaged. auto: all points are kept in clouds of up to 20,000
+            points; otherwise the smallest of 1, 1.5, 2, 3, 5, 7, 10, ... times a power of ten that leaves at most
+            20,000 in each cloud. off: all points are kept.
+        num_neighbors: Number of neighbours from which the covariance of a point is computed.
+        max_distance: Metres; largest distance between matched points. Two numbers: one to find the pose, and a smaller
+            one to refine it.
+        max_iterations: Largest number of pose updates.
+        translation_tolerance: Metres; registration has converged once an update is below both tolerances.
         rotation_tolerance: Radians.
-        robust: Robust kernel and its scale, such as huber 1.0, in units of the Mahalanobis distance.
-        hold_free_directions: Leave the pose where it starts in directions that neither shape nor channels constrain.
-        match_channels: Scale and shift the channels of the source to be distributed like those of the target.
-        scales: Voxel sizes in metres, coarse to fine, to register in first, for a start that is far off.
+        robust: Robust kernel and its scale in units of the Mahalanobis distance, such as huber 1.0.
+        hold_free_directions: Keep the initial pose in directions that neither geometry nor channels constrain.
+        match_channels: Scale and shift the channels of the source to the distribution of those of the target.
+        scales: Voxel sizes in metres, coarse to fine, at which to register first if the initial pose is far off.
         channel_covariance: For mc-gicp: one variance for all channels, or one for each; channel units squared.
         channel_weights: For mc-gicp and color-icp: one weight for all channels, or one for each; metres per channel
             unit.
-        epsilon: For mc-gicp and gicp: variance across the surface relative to that within it.
+        epsilon: For mc-gicp and gicp: variance along the normal relative to that within the surface.
     """
 
     voxel_size: float | Literal["auto", "off"] = "auto"
     num_neighbors: int = 20
-    max_distance: Gates = ()
+    max_distance: Distances = ()
     max_iterations: int = Chosen.max_iterations
     translation_tolerance: Tolerance = None
     rotation_tolerance: float = 5e-4
@@ -100,19 +100,19 @@ class Options:
     epsilon: Epsilon = None
 
     def check(self) -> None:
-        """Raise `ValueError` or `OSError` for what no clouds would fit, before any is read."""
+        """Raise `ValueError` or `OSError` for invalid options, before any cloud is read."""
         check_preprocessing(None if isinstance(self.voxel_size, str) else self.voxel_size, self.num_neighbors)
         mcg.MultiChannelGICP(**self.numbers())
         Chosen(**self.registration())
 
     def check_method(self, name: MethodName) -> None:
-        """Raise `ValueError` for a number that the method does not have."""
+        """Raise `ValueError` if a parameter is given that the method does not have."""
         unknown = self.numbers().keys() - METHODS[name].__dataclass_fields__.keys()
         if unknown:
             raise ValueError(f"{name} has no {' and no '.join(sorted(unknown))}")
 
     def numbers(self) -> dict[str, Any]:
-        """The methods' numbers that were given."""
+        """The method parameters that the user gave."""
         given: dict[str, Any] = {} if self.epsilon is None else {"epsilon": self.epsilon}
         for name in ("channel_covariance", "channel_weights"):
             if values := getattr(self, name):
@@ -120,11 +120,11 @@ class Options:
         return given
 
     def numbers_of(self, name: MethodName) -> dict[str, Any]:
-        """Those of them that a method has."""
+        """The method parameters that the user gave and that this method has."""
         return {field: value for field, value in self.numbers().items() if field in METHODS[name].__dataclass_fields__}
 
     def registration(self) -> dict[str, Any]:
-        """The options of `mcgicp_jax.register`."""
+        """Keyword arguments of `mcgicp_jax.register`."""
         if len(self.max_distance) > 2:
             raise ValueError(f"max_distance: expected one or two numbers, got {self.max_distance}")
         names = ("max_iterations", "translation_tolerance", "rotation_tolerance", "hold_free_directions")
@@ -139,12 +139,12 @@ class Options:
 
 @dataclass(frozen=True)
 class PairOptions(Options):
-    """The same for two clouds.
+    """Options for one pair of clouds.
 
     Attributes:
-        init: The pose to start from, T_target_source: a 4x4 matrix, or 12 numbers (KITTI) or 8 (TUM) in one row. The
-            identity if not given.
-        plot: Picture to draw of the clouds before and after, such as out.png.
+        init: File with the initial pose T_target_source: a 4x4 matrix, or 12 numbers (KITTI) or 8 (TUM) on one line. By
+            default the identity.
+        plot: File for a picture of the clouds before and after registration, such as out.png.
     """
 
     init: File = None
@@ -156,7 +156,7 @@ class PairOptions(Options):
 
 
 def check_outputs(*files: Path | None, cloud: Path | None = None, picture: Path | None = None) -> None:
-    """Raise `ValueError` or `OSError` for files that could not be written in the end, before the work is done."""
+    """Raise `ValueError` or `OSError` for files that cannot be written, before any work is done."""
     for path in (*files, cloud, picture):
         if path is not None and path.is_dir():
             raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), str(path))
@@ -169,29 +169,29 @@ def check_outputs(*files: Path | None, cloud: Path | None = None, picture: Path 
 
 
 def check_inputs(*clouds: Path) -> None:
-    """The same for clouds that could not be read, before the first of them is."""
+    """Raise `ValueError` or `OSError` for files that are missing or of unknown format, before any is read."""
     for path in clouds:
         by_suffix(READERS, path)
         path.stat()
 
 
 def voxel_size_for(clouds: Sequence[mcg.PointCloud], options: Options) -> float | None:
-    """The voxel size, if any, by the rule in the help; metres."""
+    """The voxel size in metres by the rule of `Options`, or None to keep all points."""
     if not isinstance(options.voxel_size, str):
         return options.voxel_size
-    # Covariances cannot be averaged.
+    # `preprocess` cannot average covariances.
     few = max(map(len, clouds)) <= _MOST_POINTS or any(cloud.covariances is not None for cloud in clouds)
     return None if options.voxel_size == "off" or few else round_voxel_size(clouds, _MOST_POINTS)
 
 
 def described_distance(options: Options, target: mcg.PointCloud) -> str:
-    """How far apart two matched points may be, in words."""
+    """`max_distance` in words, by default from the spacing of the target."""
     distances = options.max_distance or tuple(default_distances(target))
     return " m, then ".join(f"{float(distance):.3g}" for distance in distances) + " m"
 
 
 def round_voxel_size(clouds: Sequence[mcg.PointCloud], most: int) -> float:
-    """The smallest of 1, 1.5, 2, 3, 5, 7, 10, ... times a power of ten that leaves each `most` points; metres."""
+    """The smallest of 1, 1.5, 2, 3, 5, 7, 10, ... times a power of ten that leaves at most `most` points; metres."""
     finite = [np.asarray(cloud.points, np.float64)[np.isfinite(cloud.points).all(axis=1)] for cloud in clouds]
     extent = max((np.ptp(points, axis=0).max() for points in finite if len(points)), default=0.0)
     if extent == 0:
@@ -201,7 +201,7 @@ def round_voxel_size(clouds: Sequence[mcg.PointCloud], most: int) -> float:
 
     def occupied(size: float) -> int:
         cells = [np.floor(points / size) for points in finite if len(points)]
-        # Each voxel as one number, as distinct as it needs to be
+        # One integer key per voxel, 21 bits per axis
         numbers = [(cell - cell.min(axis=0)).astype(np.int64) @ [1, 2**21, 2**42] for cell in cells]
         return max(len(np.unique(number)) for number in numbers)
 
@@ -209,7 +209,7 @@ def round_voxel_size(clouds: Sequence[mcg.PointCloud], most: int) -> float:
 
 
 def with_channels(cloud: mcg.PointCloud, names: Sequence[str]) -> mcg.PointCloud:
-    """The cloud with some of its channels."""
+    """The cloud with only the named channels, in this order."""
     missing = [name for name in names if name not in cloud.channel_names]
     if missing:
         raise ValueError(f"no channel {', '.join(missing)}; there are {listed(cloud.channel_names)}")
@@ -224,7 +224,7 @@ def with_channels(cloud: mcg.PointCloud, names: Sequence[str]) -> mcg.PointCloud
 
 
 def weights_from(source: mcg.PointCloud, target: mcg.PointCloud) -> Any:
-    """α from the data, as mc-gicp chooses it."""
+    """Channel weights α from the data, as mc-gicp chooses them."""
     chosen: Any = mcg.MultiChannelGICP().resolve(source, target)
     return chosen.channel_weights
 

@@ -1,4 +1,4 @@
-"""`mcgicp paper`: the experiments of Servos & Waslander (2014), section V, and a report of them."""
+"""`mcgicp paper`: run the experiments of Servos & Waslander (2014), section V, and write a report."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ Folder: TypeAlias = Annotated[Path | None, tyro.conf.arg(metavar="PATH", help_be
 
 _COLORS = ("red", "green", "blue")
 _COMBINED = ("intensity", *_COLORS)
-# The translation errors of Table I, on Ford Campus, and their standard deviations; metres.
+# Table I, on Ford Campus: means and standard deviations of the translation error; metres.
 _PAPER = {
     "Color ICP": (0.5106, 0.3280),
     "GICP": (0.3082, 0.1446),
@@ -34,21 +34,21 @@ _PAPER = {
     "MC-GICP, combined": (0.2891, 0.1387),
 }
 _MEASURED = "MC-GICP, combined, Λ measured"
-# Metres: how far apart two matched points may lie, while the pose is being found and when it is refined.
-_Gates: TypeAlias = tuple[float, float]
+# max_distance while the pose is being found and when it is refined; metres.
+_Distances: TypeAlias = tuple[float, float]
 _STREET_VOXEL, _KITTI_VOXEL = 0.2, 0.25
-_STREET_DISTANCE: _Gates = (2.0, 0.5)
-_KITTI_DISTANCE: _Gates = (2.5, 0.6)
-# Frames that Λ is measured from, of another street.
+_STREET_DISTANCE: _Distances = (2.0, 0.5)
+_KITTI_DISTANCE: _Distances = (2.5, 0.6)
+# Number of frames, of another street, from which Λ is measured.
 _TRAINING = 4
-# Voxels of the map; what is shown of it, along the street and across it.
+# Voxel size of the map, and the limits of the part shown, along and across the street; metres.
 _STREET_MAP, _SHOWN = 0.07, np.array([[-20.0, 20.0], [-9.5, 9.5]])
-# The road alone: metres above and below it, to either side, and from the sensor; and how far ahead the start is.
+# Points of the road: within this height, distance to either side, and range. Initial pose: this far ahead. Metres.
 _ROAD, _ROAD_VOXEL, _ROAD_START = (0.06, 6.0, 25.0), 0.1, 0.3
-_ROAD_DISTANCE: _Gates = (0.6, 0.15)
+_ROAD_DISTANCE: _Distances = (0.6, 0.15)
 _WALL_FRAMES, _WALL_POINTS, _WALL_STEP, _WALL_MAP = 100, 12_000, 0.066, 0.006
-_WALL_DISTANCE: _Gates = (0.15, 0.04)
-# Of the wall, to draw covariances on.
+_WALL_DISTANCE: _Distances = (0.15, 0.04)
+# Number of points of the wall in Fig. 1, and of iterations in Fig. 4
 _FINE_POINTS = 40_000
 _ITERATIONS = 24
 
@@ -70,7 +70,7 @@ class _Row:
 
 @dataclass(frozen=True, eq=False)
 class _Errors:
-    """Of all pairs: metres, radians, updates of the pose, whether it converged."""
+    """For each pair: errors in metres and radians, number of pose updates, whether it converged."""
 
     translation: Float[np.ndarray, "N"]
     rotation: Float[np.ndarray, "N"]
@@ -83,19 +83,19 @@ def paper(
 ) -> int:
     """Run the experiments of the paper, Table I and Figs. 1 to 4, and write a report with pictures.
 
-    They run on scenes that are made up, since the paper's own data are not at hand: a street for a LiDAR with a camera,
-    and a wall of posters for a Kinect.
+    The paper's own data are not available, so they run on simulated scenes: a street seen by a LiDAR with a camera, and
+    a wall of posters seen by a Kinect.
 
     Args:
         output: Folder for report.md and its pictures.
-        kitti: Folder of a sequence of the KITTI odometry data set, such as sequences/04, for Table I on real scans too.
-        num_frames: Frames of the street.
-        points_per_frame: Of the street.
+        kitti: Folder of a KITTI odometry sequence, such as sequences/04, to run Table I on real scans too.
+        num_frames: Number of frames of the street.
+        points_per_frame: Number of points in each frame of the street.
     """
     if num_frames < 3:
         raise ValueError(f"num_frames: expected at least 3, got {num_frames}")
     if kitti is not None:
-        # Before minutes of work, that of the street.
+        # Without true poses, fail before the minutes that the street takes.
         _known(datasets.kitti(kitti)[0])
     output.mkdir(parents=True, exist_ok=True)
     street = datasets.street(num_frames, points_per_frame=points_per_frame)
@@ -121,18 +121,18 @@ def _tables(street: datasets.SyntheticFrames, street_points: int, kitti: Path | 
     rows = _rows(_measure(datasets.street(_TRAINING, points_per_frame=street_points, seed=1), _STREET_VOXEL))
     yield "## Table I"
     errors = _evaluate(street, rows, _STREET_VOXEL, _STREET_DISTANCE, "street")
-    yield f"The street: {len(street)} frames, every pair of consecutive ones from the identity, 1 m apart."
+    yield f"The street: all pairs of consecutive frames of {len(street)}, 1 m apart, starting from the identity."
     yield _table(rows, errors)
     yield _order(rows, errors)
     road = [datasets.Frame(_road(frame), frame.pose) for frame in street]
     errors = _evaluate(road, rows, _ROAD_VOXEL, _ROAD_DISTANCE, "road", ahead=_ROAD_START)
-    yield f"The same frames, of which only the road is left: a plane. Starts {_ROAD_START} m ahead of the truth."
+    yield f"The same frames cropped to the road, a plane, starting {_ROAD_START} m ahead of the true pose."
     yield _table(rows, errors)
     yield _order(rows, errors)
     if kitti is not None:
         frames = datasets.kitti(kitti)
         errors = _evaluate(frames, rows, _KITTI_VOXEL, _KITTI_DISTANCE, "kitti")
-        yield f"KITTI, {kitti.name}: {len(frames)} frames; colours where the camera sees a point, a sixth of them."
+        yield f"KITTI, {kitti.name}: {len(frames)} frames. A sixth of the points, in view of the camera, have colours."
         yield _table(rows, errors)
         yield _order(rows, errors)
     yield _WHERE_IT_DIFFERS
@@ -151,7 +151,7 @@ def _rows(channel_covariance: Float[np.ndarray, "C C"] | None = None) -> list[_R
 
 
 def _measure(street: datasets.SyntheticFrames, voxel_size: float) -> Float[np.ndarray, "C C"]:
-    """Λ with its cross terms, as the paper has it for combined channels (IV-C)."""
+    """Λ with its cross terms, as in the paper for combined channels (IV-C)."""
     clouds = [mcg.preprocess(with_channels(frame.cloud, _COMBINED), voxel_size) for frame in street]
     return mcg.estimate_channel_covariance(clouds, [_known(frame) for frame in street])
 
@@ -175,11 +175,11 @@ def _evaluate(
     frames: Sequence[datasets.Frame],
     rows: Sequence[_Row],
     voxel_size: float,
-    max_distance: _Gates,
+    max_distance: _Distances,
     name: str,
     ahead: float = 0.0,
 ) -> list[_Errors]:
-    """Each pair of consecutive frames by each row, from the identity or from `ahead` of the truth, metres."""
+    """Errors of each row on all consecutive pairs, from the identity or from `ahead` metres ahead of the truth."""
     numbers: list[list[tuple[float, float, int, bool]]] = [[] for _ in rows]
     before: dict[tuple[str, ...], mcg.PointCloud] = {}
     pose_before = None
@@ -209,7 +209,7 @@ def _evaluate(
 def _register(
     source: mcg.PointCloud, target: mcg.PointCloud, method: AbstractMethod, **options: Any
 ) -> mcg.Registration:
-    """As in the paper, whose methods do not know which directions nothing holds."""
+    """Register without detection of unconstrained directions, as in the paper."""
     return mcg.register(source, target, method, hold_free_directions=False, **options)
 
 
@@ -230,7 +230,7 @@ def _table(rows: Sequence[_Row], errors: Sequence[_Errors]) -> str:
 
 
 def _order(rows: Sequence[_Row], errors: Sequence[_Errors]) -> str:
-    """Whether the paper's order holds, in words."""
+    """Say whether the methods come in the paper's order."""
     means = {row.name: each.translation.mean() for row, each in zip(rows, errors, strict=True) if row.name in _PAPER}
     ours, theirs = (" < ".join(sorted(means, key=order)) for order in (means.__getitem__, lambda name: _PAPER[name][0]))
     verdict = "The paper's order holds" if ours == theirs else "The paper's order does not hold"
@@ -255,14 +255,14 @@ def _figure_1(output: Path) -> Iterator[str]:
     yield "## Figure 1"
     yield "![Covariances](figure_1.png)"
     yield (
-        "Covariances within the surface, one standard deviation, on a wall of posters. GICP's are circles everywhere. "
-        "MC-GICP's are thin across an edge of colour: there a point cannot be mistaken for one further on; and round "
-        "where the colour is the same all around."
+        "Covariances within the surface of a wall of posters, one standard deviation. GICP's are circles everywhere. "
+        "MC-GICP's are thin across an edge between colours, where the colour tells a point from its neighbours, and "
+        "round where the colour is uniform."
     )
 
 
 def _spread(points: Float[np.ndarray, "N 2"], distance: float) -> Int[np.ndarray, "M"]:
-    """One point of each cell of a grid."""
+    """Index of one point in each cell of a grid."""
     cells = np.floor(points / distance).astype(int)
     return np.sort(np.unique(cells, axis=0, return_index=True)[1])
 
@@ -279,8 +279,8 @@ def _figure_2(output: Path, street: datasets.SyntheticFrames) -> Iterator[str]:
     yield "## Figure 2"
     yield "![Maps of the street](figure_2.png)"
     yield (
-        f"The street from above, {len(street)} frames laid together by odometry alone; the middle 40 m. Root mean "
-        f"square error of the positions, from the first pose: {', '.join(ends)}."
+        f"The middle 40 m of the street from above: {len(street)} frames merged by odometry alone. Root mean square "
+        f"position error, aligned at the first pose: {', '.join(ends)}."
     )
 
 
@@ -303,15 +303,15 @@ def _figure_3(output: Path) -> Iterator[str]:
     yield "![Maps of the wall](figure_3.png)"
     yield (
         f"A camera moves from right to left along a flat wall, {(_WALL_FRAMES - 1) * _WALL_STEP:.1f} m in "
-        f"{_WALL_FRAMES} frames. Geometry says nothing of this motion: GICP piles the frames up. Root mean square "
-        f"error of the positions, from the first pose: {', '.join(ends)}. (The posters repeat after 3.36 m.)"
+        f"{_WALL_FRAMES} frames. Geometry does not constrain this motion, so GICP piles the frames up. Root mean "
+        f"square position error, aligned at the first pose: {', '.join(ends)}. (The posters repeat every 3.36 m.)"
     )
 
 
 def _follow(
-    frames: Sequence[datasets.Frame], row: _Row, voxel_size: float | None, max_distance: _Gates
+    frames: Sequence[datasets.Frame], row: _Row, voxel_size: float | None, max_distance: _Distances
 ) -> list[Float[np.ndarray, "4 4"]]:
-    """The poses of an odometry."""
+    """Poses of the frames by odometry."""
     clouds = (with_channels(frame.cloud, row.channels) for frame in frames)
     first, second = (mcg.preprocess(with_channels(frame.cloud, row.channels), voxel_size) for frame in frames[:2])
     steps = mcg.odometry(
@@ -354,9 +354,9 @@ def _figure_4(output: Path, street: datasets.SyntheticFrames) -> Iterator[str]:
     yield "## Figure 4"
     yield "![Convergence](figure_4.png)"
     yield (
-        f"One pair of each scene. Updates until the pose moves by less than 0.5 mm and 0.5 mrad: {'; '.join(counts)}. "
-        "The residual, which the paper draws, is mostly the distance between the points: it tells how soon a method "
-        "comes to rest, not how near the truth that is. So the error of the pose is drawn beside it."
+        f"One pair of each scene. Updates until one is below 0.5 mm and 0.5 mrad: {'; '.join(counts)}. The residual, "
+        "which the paper plots, is mostly due to the spacing of the points: it shows how soon a method converges, not "
+        "how close to the truth. The pose error is therefore plotted beside it."
     )
 
 
@@ -364,10 +364,10 @@ def _error_by_iteration(
     source: mcg.PointCloud,
     target: mcg.PointCloud,
     method: AbstractMethod,
-    max_distance: _Gates,
+    max_distance: _Distances,
     truth: Float[np.ndarray, "4 4"],
 ) -> Float[np.ndarray, "I"]:
-    """Metres, at the start and after each update, until the pose rests."""
+    """Translation error at the start and after each update until convergence; metres."""
     errors = [float(metrics.pose_error(np.eye(4), truth)[0])]
     for most in range(1, _ITERATIONS + 1):
         result = _register(source, target, method, max_distance=max_distance, max_iterations=most)
@@ -384,7 +384,7 @@ def _draw_figure_4(lines: dict[tuple[str, str], tuple[Any, Any]], path: Path) ->
     figure = matplotlib.figure.Figure((9, 3.2 * len(scenes)), layout="constrained")
     panels = figure.subplots(len(scenes), 2, squeeze=False)
     for (scene, name), (residual, error) in lines.items():
-        labels = "rms distance of the pairs, m", "error of the pose, m"
+        labels = "rms distance of the matches, m", "pose error, m"
         for panel, values, label in zip(panels[scenes.index(scene)], (residual, error), labels, strict=True):
             panel.plot(values[: _ITERATIONS + 1], marker="o", markersize=3, label=name)
             panel.set(title=scene, xlabel="iteration", ylabel=label, yscale="log")
@@ -393,21 +393,20 @@ def _draw_figure_4(lines: dict[tuple[str, str], tuple[Any, Any]], path: Path) ->
     figure.savefig(path, dpi=120)
 
 
-# What the report says about them
+# Text of the report
 
-_INTRODUCTION = """Servos & Waslander, *Multi Channel Generalized-ICP*, ICRA 2014, section V, run anew. The paper used
-Ford Campus scans and Kinect frames of its own; this report uses made-up scenes whose truth is exact, a street (LiDAR
-with a panoramic camera) and a wall of posters (Kinect). All methods get the same points and start from the same pose,
-and every number of theirs comes from the data: Λ and α as `MultiChannelGICP()` chooses them, Color ICP with the same α.
-As in the paper, a pose is not held in directions that nothing holds (`hold_free_directions=False`)."""
+_INTRODUCTION = """Servos & Waslander, *Multi Channel Generalized-ICP*, ICRA 2014, section V, repeated. The paper used
+Ford Campus scans and Kinect frames of its own; this report uses simulated scenes whose true poses are exact: a street
+(LiDAR with a panoramic camera) and a wall of posters (Kinect). All methods get the same points and the same initial
+pose, and their parameters come from the data: Λ and α as `MultiChannelGICP()` chooses them, Color ICP with the same α.
+As in the paper, unconstrained directions are not held at the initial pose (`hold_free_directions=False`)."""
 
-_WHERE_IT_DIFFERS = """Where these numbers differ from the paper's, and why. On the street with all its things, the
-paper's errors are some two hundred times larger than GICP's here, and its methods differ by less than their standard
-deviations: whatever sets that level, it is common to all methods. Likely it is the truth itself (a GPS), the motion
-of the car during a scan, and things that move; none of these is in this street. Without them geometry alone, held
-from all sides by kerbs, cars, poles and the reveals of windows, gives millimetres, and channels cannot better that.
-They can do harm: the covariances of MC-GICP are smaller than GICP's along a surface, so that a match that is half a
-metre off because the rings of two scans lie elsewhere counts for more. Where geometry leaves a direction free, as on
-the road alone, the channels decide it: with colours MC-GICP is far nearer the truth than GICP, by more than in the
-paper. Intensity alone does not get there in the iterations that it has: most of what it could hold on to runs along
-the road."""
+_WHERE_IT_DIFFERS = """Where these numbers differ from the paper's, and why. On the whole street, the paper's errors are
+some two hundred times larger than GICP's here, and its methods differ by less than their standard deviations, so the
+cause is common to all methods. It is likely the truth itself (GPS), the motion of the car during a scan, and moving
+objects; this street has none of these. Without them geometry alone, constrained in all directions by kerbs, cars,
+poles and the reveals of windows, reaches millimetres, and channels cannot improve on that. They can do harm:
+MC-GICP's covariances are smaller than GICP's along a surface, which gives more weight to a match that is half a metre
+off because the rings of two scans lie elsewhere. Where geometry leaves a direction unconstrained, as on the road
+alone, the channels decide: with colours MC-GICP is far closer to the truth than GICP, by more than in the paper.
+Intensity alone does not converge within the iterations allowed: most of its edges run along the road."""

@@ -39,7 +39,7 @@ Target: TypeAlias = Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar=
 
 
 class PreparedPair:
-    """Two clouds with their common channels, ready to register."""
+    """Two preprocessed clouds with the channels that they have in common."""
 
     def __init__(self, source: Path, target: Path, options: PairOptions):
         options.check()
@@ -61,12 +61,12 @@ class PreparedPair:
         voxels = "all kept" if voxel_size is None else f"voxels of {voxel_size:g} m"
         print(f"points:    source {counts[0]}, target {counts[1]} ({voxels})")
         print(f"matches:   up to {described_distance(options, self.target)} apart")
-        # Where none are in common, that is an error or of no concern.
+        # Without common channels, `method` raises an error if the method needs any.
         difference = f" ({self.difference})" if self.channels and names[0] != names[1] else ""
         print(f"channels:  {listed(self.channels)}{difference}")
 
     def method(self, name: MethodName) -> AbstractMethod:
-        """The method, with its numbers from the options or else from the data."""
+        """The method with parameters from the options or else from the data."""
         kind = METHODS[name]
         if kind.uses_channels and not self.channels:
             raise ValueError(
@@ -78,9 +78,9 @@ class PreparedPair:
         return kind(**numbers).resolve(self.source, self.target)
 
     def errors(self, pose: Float[np.ndarray, "4 4"], true_pose: Float[np.ndarray, "4 4"]) -> str:
-        """In millimetres, of the middle of the source, and degrees."""
-        middle = np.asarray(self.source.unpad().points, np.float64).mean(axis=0)
-        translation, rotation = metrics.pose_error(pose, true_pose, at=middle)
+        """Translation error in mm at the centroid of the source, and rotation error in degrees, as two columns."""
+        centroid = np.asarray(self.source.unpad().points, np.float64).mean(axis=0)
+        translation, rotation = metrics.pose_error(pose, true_pose, at=centroid)
         return f"{1e3 * float(translation):9.2f}  {np.degrees(rotation):11.3f}"
 
     def register(self, method: AbstractMethod) -> mcg.Registration:
@@ -101,7 +101,7 @@ def register(
     output: File = None,
     aligned: File = None,
 ) -> int:
-    """Find the pose T_target_source that moves SOURCE onto TARGET.
+    """Estimate the pose T_target_source that moves SOURCE onto TARGET.
 
     Clouds are .ply, .pcd, .las, .laz, .bin (KITTI), .npy, .npz, .xyz, .txt or .csv files. The exit code is 0 only if
     the registration converged; output files are written in any case.
@@ -110,8 +110,8 @@ def register(
         source: Cloud to move.
         target: Cloud that stays.
         method: mc-gicp and color-icp use channels (intensity, colours, ...), the others geometry alone.
-        output: File for the pose: the upper three rows of its matrix, in one row (KITTI).
-        aligned: File for the moved source cloud, all its points, such as out.ply.
+        output: File for the pose in KITTI format: the upper three rows of its matrix on one line.
+        aligned: File for the whole source cloud moved by the pose, such as out.ply.
     """
     shared.check_method(method)
     check_outputs(output, cloud=aligned)
@@ -129,7 +129,7 @@ def register(
     if result.free_directions:
         print(f"free:      {describe(result.free_directions)}")
     print("T_target_source:")
-    # At large coordinates the eighth decimal of a rotation is centimetres.
+    # At UTM coordinates, 1e-8 in a rotation entry moves a point by centimetres.
     form = "22.14f" if np.any(pair.source.origin) else "15.8f"
     for row in result.matrix:
         print("".join(f" {number:{form}}" for number in row))
@@ -142,21 +142,22 @@ def register(
 
 
 def compare(source: Source, target: Target, shared: PairOptions, truth: File = None) -> int:
-    """Register SOURCE to TARGET with every method, and print a table.
+    """Register SOURCE to TARGET with every method and print a table.
 
-    Methods that use channels are left out where there are none. The exit code is 0 only if all others converged.
+    Methods that use channels are skipped if the clouds have none in common. The exit code is 0 only if all methods that
+    ran converged.
 
     Args:
         source: Cloud to move.
         target: Cloud that stays.
-        truth: The true pose T_target_source, for the errors: how far the centroid of SOURCE is from where it belongs,
-            and the angle.
+        truth: File with the true pose T_target_source, to print errors: of the position of the centroid of SOURCE, and
+            of the rotation.
     """
     return _verdict(_compare(source, target, shared, truth))
 
 
 def demo(output: Path = Path("mcgicp_demo")) -> int:
-    """Register two views of a flat wall of posters, made up as a noisy RGB-D camera sees it, with every method.
+    """Register two simulated views of a flat wall of posters by a noisy RGB-D camera, with every method.
 
     Args:
         output: Folder for the two clouds, the true pose and a picture.
@@ -171,9 +172,9 @@ def demo(output: Path = Path("mcgicp_demo")) -> int:
     options = PairOptions(voxel_size="off", plot=output / "before_after.png")
     _compare(source_file, target_file, options, truth_file)
     print(
-        "Geometry leaves a flat wall free to slide: gicp, point-to-plane and point-to-point say so (degenerate) and"
-        "\nstay where they started along it; in their rows of the picture the posters do not fit. The channels red,"
-        "\ngreen and blue hold the other two."
+        "Geometry does not constrain motion along a flat wall: gicp, point-to-plane and point-to-point report it"
+        "\n(degenerate) and keep the initial pose along it, so in their rows of the picture the posters do not fit."
+        "\nmc-gicp and color-icp are constrained by the channels red, green and blue."
         f"\nThe clouds are in {output}; try: mcgicp register {source_file} {target_file}"
     )
     return 0
@@ -191,7 +192,7 @@ def _compare(
         print(f"{'(start)':15}  {pair.errors(pair.start, true_pose)}")
     for name, kind in METHODS.items():
         if kind.uses_channels and not pair.channels:
-            print(f"{name:15}  left out, needs channels in common")
+            print(f"{name:15}  left out: no channels in common")
             continue
         method = pair.method(name)
         pair.register(method)
@@ -202,7 +203,7 @@ def _compare(
         if true_pose is not None:
             values = pair.errors(np.asarray(result.matrix), true_pose)
         print(f"{name:15}  {values}  {result.num_iterations:10}  {milliseconds:8.0f}  {words(result)}")
-    print("(time of a second call: without compiling, preparing the clouds, choosing numbers)\n")
+    print("(times do not include compilation, preprocessing and the choice of parameters)\n")
     pair.draw(results)
     return results
 
@@ -224,7 +225,7 @@ def _preprocess(
 
 
 def _verdict(results: dict[MethodName, mcg.Registration]) -> int:
-    """The exit code; what did not converge goes to stderr."""
+    """Return the exit code, and print to stderr which methods did not converge."""
     failed = {name: result for name, result in results.items() if not result.converged}
     for name, result in failed.items():
         advice = ADVICE[status_of(result)]

@@ -1,4 +1,4 @@
-"""The table that `mcgicp batch` writes row by row, and completes when it is run again."""
+"""The result table of `mcgicp batch`, written row by row so that a later run can resume it."""
 
 from __future__ import annotations
 
@@ -14,29 +14,29 @@ from jaxtyping import Float
 
 Row: TypeAlias = dict[str, str]
 
-# The upper three rows of a pose.
+# Columns of the upper three rows of the pose matrix
 POSE = tuple(f"m{row}{column}" for row in range(3) for column in range(4))
 COLUMNS = ("source", "target", "status", "iterations", "inliers", "cost", "rmse", *POSE, "reason", "fingerprint")
 _TEXTS = ("source", "target", "status", "reason", "fingerprint")
 
 
 class Table:
-    """Results in a file: rows of a .csv, or arrays of an .npz, whose rows gather in a .csv beside it until the end."""
+    """Rows in a .csv file, or arrays in an .npz file, whose rows are collected in a .csv beside it until the end."""
 
     def __init__(self, path: Path):
         if path.suffix.lower() not in (".csv", ".npz"):
-            raise ValueError(f"output: expected a file .csv or .npz, got {path}")
+            raise ValueError(f"output: expected a .csv or .npz file, got {path}")
         self._path = path
         self._rows = path if path.suffix.lower() == ".csv" else path.with_name(f"{path.name}.csv")
 
     def read(self) -> list[Row]:
-        """The rows so far."""
+        """Return the rows written so far."""
         rows = self._read_arrays() if self._rows != self._path and self._path.exists() else []
         return rows + (self._read_rows() if self._rows.exists() else [])
 
     @contextlib.contextmanager
     def appending(self) -> Iterator[Callable[[Row], None]]:
-        """A function that adds a row, which is in the file when it returns."""
+        """Yield a function that appends a row and flushes it to the file."""
         begun = self._rows.exists() and self._rows.stat().st_size > 0
         if begun:
             self._drop_torn_line()
@@ -52,7 +52,7 @@ class Table:
             yield append
 
     def rewrite(self, rows: Sequence[Row]) -> None:
-        """Keep these rows alone."""
+        """Replace all rows."""
         temporary = self._rows.with_name(f".{self._rows.name}.{os.getpid()}")
         with open(temporary, "w", newline="", encoding="utf-8") as file:
             writer = csv.DictWriter(file, COLUMNS, lineterminator="\n")
@@ -63,7 +63,7 @@ class Table:
             self._path.unlink(missing_ok=True)
 
     def finish(self, rows: Sequence[Row]) -> None:
-        """Write the arrays of an .npz, in the order of the rows."""
+        """Write the arrays of an .npz in the order of `rows`; a .csv is complete already."""
         if self._rows == self._path or not rows:
             return
         arrays: dict[str, Any] = {name: np.array([row[name] for row in rows]) for name in _TEXTS}
@@ -78,7 +78,7 @@ class Table:
     def _read_rows(self) -> list[Row]:
         with open(self._rows, newline="", encoding="utf-8") as file:
             lines = file.readlines()
-        # A process that was killed may have left half a line.
+        # A killed process may have left an incomplete last line.
         reader = csv.DictReader(line for line in lines if line.endswith("\n"))
         if lines and tuple(reader.fieldnames or ()) != COLUMNS:
             raise ValueError(f"{self._rows}: expected a table of mcgicp batch, got the columns {reader.fieldnames}")

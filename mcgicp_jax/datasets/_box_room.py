@@ -1,4 +1,4 @@
-"""A furnished room: geometry holds a pose in it from every side."""
+"""A furnished room, whose geometry constrains all six degrees of freedom."""
 
 from __future__ import annotations
 
@@ -17,16 +17,19 @@ from mcgicp_jax.datasets._frame import (
 )
 from mcgicp_jax.datasets._raycast import Box, cast, patches, random_rays, swaying_rotation
 
-# Metres: length, width and height of the room, and how thick its walls are.
+# The constants of this module define the scene.
+# Metres: length, width and height of the room, and the thickness of its walls.
 _SIZE, _WALL = np.array([8.0, 6.0, 2.8]), 0.2
 _NUM_BOXES = 14
-# Metres: the sensor goes round on a circle at this height, above the furniture.
+# Metres: height of the sensor, above the furniture; radius of its circle; maximum height of the furniture.
 _SENSOR_HEIGHT, _RADIUS, _HIGHEST_BOX = 1.7, 1.6, 1.4
-# Radians: the sensor is tilted, each time in another direction.
+# Radians: the tilt of the sensor, and the rotation of the tilt axis from frame to frame.
 _TILT, _TILT_PHASE = np.deg2rad(2.0), 0.7
+# Standard deviations: metres, and colour from 0 to 1.
 _POINT_NOISE, _COLOR_NOISE = 0.01, 0.02
+# Seconds between frames.
 _PERIOD = 0.1
-# Patches of each width, metres, how strong they are; and what colour they have.
+# Width of the patches, metres, and amplitude, per layer; and the effect of the pattern on red, green and blue.
 _PAINT = ((0.6, 0.12), (0.2, 0.08))
 _PAINT_COLOR = np.array([1.0, 0.6, -0.5])
 
@@ -40,23 +43,25 @@ def box_room(
     along_rays: bool = False,
     seed: int = 0,
 ) -> SyntheticFrames:
-    """A sensor walks round in a closed room, 8 × 6 × 2.8 m, with boxes for furniture; walls and boxes are painted.
+    """A sensor moves through a closed room, 8 × 6 × 2.8 m, furnished with boxes; all surfaces have a colour pattern.
 
-    It sees in all directions alike; every frame has fresh rays, so that no two hit the same points. From frame to frame
-    it moves by `step` on a circle of radius 1.6 m, turns as the circle does, and sways by up to 2°.
+    The rays are uniform over the sphere and drawn anew for every frame, so that no two frames sample the same points.
+    From frame to frame the sensor moves by `step` on a circle of radius 1.6 m, keeps its heading tangential to the
+    circle, and tilts by 2° in varying directions.
 
     Args:
-        points_per_frame: exactly.
+        num_frames: number of frames.
+        points_per_frame: exact number of points of each frame.
         step: metres between consecutive frames.
-        noise: scales the standard deviations: 0.01 m of the points, 0.02 of each colour. 0 for none.
-        along_rays: whether points are moved along their rays alone, rather than in all directions alike.
-        seed: the same seed gives the same room, path, rays and noise. `observe` draws the latter two anew.
+        noise: factor on the standard deviations, 0.01 m of the points and 0.02 of each colour; 0 for none.
+        along_rays: whether the noise displaces points only along their rays, rather than isotropically.
+        seed: determines the room, path, rays and noise. `observe` draws the latter two anew.
 
     Returns:
         Frames whose clouds have the channels red, green and blue, from 0 to 1. The world's z axis points up.
 
     Raises:
-        ValueError: if a number is out of its range.
+        ValueError: if `num_frames`, `points_per_frame` or `noise` is out of range.
     """
     check_noise(noise)
     check_points_per_frame(points_per_frame, 10_000_000)
@@ -99,7 +104,7 @@ def _observe(
 
 
 def _shell() -> list[Box]:
-    """Floor, ceiling and four walls, whose edges overlap."""
+    """Floor, ceiling and four walls, overlapping at their edges."""
     shell = []
     for axis in range(3):
         for side in (0.0, _SIZE[axis]):
@@ -110,7 +115,7 @@ def _shell() -> list[Box]:
 
 
 def _furniture(rng: np.random.Generator) -> list[Box]:
-    """Boxes on the floor, most of them against the walls as furniture is, some over one another."""
+    """Boxes on the floor, most of them against the walls; they may intersect."""
     boxes = []
     for _ in range(_NUM_BOXES):
         size = rng.uniform((0.3, 0.3, 0.3), (1.6, 1.0, _HIGHEST_BOX))

@@ -1,4 +1,4 @@
-"""A long corridor: its walls hold a pose across it, and nothing but what is painted on them holds it along."""
+"""A long corridor, whose geometry leaves the direction along it unobservable; only the intensity constrains it."""
 
 from __future__ import annotations
 
@@ -17,13 +17,18 @@ from mcgicp_jax.datasets._frame import (
 )
 from mcgicp_jax.datasets._raycast import Box, cast, patches, random_cells, random_rays, swaying_rotation
 
-# Metres: half of the width, and the height; how far the sensor sees, and where it is.
+# The constants of this module define the scene.
+# Metres: half width and height of the corridor, thickness of its walls.
 _HALF_WIDTH, _HEIGHT, _WALL = 1.2, 2.5, 0.2
-_REACH, _SENSOR_HEIGHT, _SWAY = 12.0, 1.3, 0.3
+# Metres: maximum range and height of the sensor, amplitude of its sideways motion.
+_MAX_RANGE, _SENSOR_HEIGHT, _SWAY = 12.0, 1.3, 0.3
+# Radians: tilt, rotation of the tilt axis from frame to frame, amplitude of the heading.
 _TILT, _TILT_PHASE, _YAW = np.deg2rad(2.0), 0.7, np.deg2rad(3.0)
+# Standard deviations: range, metres, and intensity from 0 to 1.
 _RANGE_NOISE, _INTENSITY_NOISE = 0.01, 0.02
+# Seconds between frames.
 _PERIOD = 0.1
-# Metres: patches of paint, and panels of the walls.
+# Width of the patches, metres, and amplitude, per layer; size of the wall panels along x, y and z, metres.
 _PATCHES, _PANEL = ((1.0, 0.15), (0.3, 0.12)), np.array([0.9, 2 * _HALF_WIDTH, 1.25])
 
 
@@ -36,24 +41,25 @@ def corridor(
     noise: float = 1.0,
     seed: int = 0,
 ) -> SyntheticFrames:
-    """A sensor moves along a corridor without doors or ends, 2.4 m wide and 2.5 m high.
+    """A sensor moves along an endless corridor, 2.4 m wide and 2.5 m high.
 
-    Its shape is the same everywhere along the axis x, so that geometry alone leaves that direction free, exactly. It
-    sees in all directions alike, up to 12 m; every frame has fresh rays. From frame to frame it moves by `step` along
-    the axis, by at most a third of that across it, and sways by some degrees.
+    The cross-section is constant along the x axis, so the geometry leaves exactly that direction unobservable. The rays
+    are uniform over the sphere, up to 12 m long, and drawn anew for every frame. From frame to frame the sensor moves
+    by `step` along the axis and by at most a third of that across it, and rotates by a few degrees.
 
     Args:
-        points_per_frame: rays; the few that reach further than 12 m give no point.
+        num_frames: number of frames.
+        points_per_frame: number of rays; the few that hit nothing within 12 m give no point.
         step: metres along the axis between consecutive frames.
-        textured: whether the intensity tells one place of the walls from another, or is the same everywhere.
-        noise: scales the standard deviations: 0.01 m of the range, 0.02 of the intensity. 0 for none.
-        seed: the same seed gives the same paint, path, rays and noise. `observe` draws the latter two anew.
+        textured: whether the intensity varies over the surfaces; otherwise it is constant.
+        noise: factor on the standard deviations, 0.01 m of the range and 0.02 of the intensity; 0 for none.
+        seed: determines the pattern, path, rays and noise. `observe` draws the latter two anew.
 
     Returns:
         Frames whose clouds have the channel intensity, from 0 to 1. The world's z axis points up.
 
     Raises:
-        ValueError: if a number is out of its range.
+        ValueError: if `num_frames`, `points_per_frame` or `noise` is out of range.
     """
     check_noise(noise)
     check_points_per_frame(points_per_frame, 10_000_000)
@@ -65,7 +71,7 @@ def corridor(
 
 
 def _pose(step: float, sway: float, yaw: float, tilt: float, index: int) -> Float[np.ndarray, "4 4"]:
-    # The sideways speed is largest where the cosine is steepest.
+    # The sideways motion per frame is at most _SWAY times the phase increment, a third of `step`.
     phase = index * step / 3 / _SWAY
     pose = np.eye(4)
     heading = rotation_from_vector(np.array([0, 0, _YAW * np.sin(yaw + index / 3)]))
@@ -78,11 +84,11 @@ def _observe(
     pattern: int | None, size: int, noise: float, rng: np.random.Generator, pose: Float[np.ndarray, "4 4"]
 ) -> PointCloud:
     rotation, center = pose[:3, :3], pose[:3, 3]
-    hits = cast(center, random_rays(rng, size) @ rotation.T, _walls(center[0]), _REACH)
+    hits = cast(center, random_rays(rng, size) @ rotation.T, _walls(center[0]), _MAX_RANGE)
     intensity = np.full(len(hits.points), 0.5)
     if pattern is not None:
         intensity += patches(hits.points, _PATCHES, pattern)
-        # From just inside the wall, so that no panel ends in the wall itself.
+        # Hits are moved just into the wall, so that rounding does not scatter them over two panels.
         panel = np.floor((hits.points - 1e-6 * hits.normals) / _PANEL + 0.5).astype(int)
         intensity += 0.3 * (random_cells(panel, pattern + len(_PATCHES)) - 0.5)
     distance = hits.distance + noise * _RANGE_NOISE * rng.normal(size=hits.distance.shape)
@@ -91,8 +97,8 @@ def _observe(
 
 
 def _walls(along: float) -> list[Box]:
-    """Floor, ceiling and walls as far as the sensor sees."""
-    start, end = along - 2 * _REACH, along + 2 * _REACH
+    """Floor, ceiling and walls within the maximum range of the sensor."""
+    start, end = along - 2 * _MAX_RANGE, along + 2 * _MAX_RANGE
     y, z = _HALF_WIDTH, _HEIGHT
     corners = [
         ((-y, -_WALL), (y, 0)),

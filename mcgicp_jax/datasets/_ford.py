@@ -13,28 +13,30 @@ from mcgicp_jax._cloud import PointCloud
 from mcgicp_jax.datasets._frame import AbstractFrames, Frame
 from mcgicp_jax.datasets._images import look_up, read_image
 
-# x, y, z in metres and roll, pitch, yaw: the laser in the vehicle.
+# Pose of the laser in the vehicle's frame: x, y, z in metres; roll, pitch, yaw in radians.
 _LASER_IN_VEHICLE = np.array([2.4, -0.01, -2.3, np.pi, 0, np.pi / 2])
+# Seconds: the unit of the time stamps.
 _MICROSECOND = 1e-6
-# Seconds: the cameras take about eight images a second.
+# Seconds between a scan and its images: half the interval of the cameras, which take about eight images a second.
 _MAX_DIFFERENCE = 0.0625
 
 
 def ford_campus(folder: str | os.PathLike[str]) -> FordFrames:
     """A run of the Ford Campus data set (Pandey, McBride & Eustice 2011), such as `IJRR-Dataset-1`.
 
-    It has `SCANS/Scan####.mat`, and may have `IMAGES/Cam{0..4}/image####.ppm` with `Timestamp.log`, which tells the
-    images by their time.
+    Args:
+        folder: contains `SCANS/Scan####.mat` and, for colours, `IMAGES/Cam{0..4}/image####.ppm` with `Timestamp.log`,
+            the times of the images.
 
     Returns:
         Frames of the Velodyne with the channels red, green and blue, from 0 to 1, valid where one of the five cameras
-        saw the point, and none valid for a scan without images within 62 ms. Scans that were made again from the raw
-        data, with reflectance, have the channel intensity before these, in the file's unit. Poses are those of the
-        laser in the world (North, East, down), made from the vehicle's.
+        saw the point; none is valid if no images were taken within 62 ms of the scan. Scans regenerated from the raw
+        data with reflectance have the channel intensity before these, in the file's unit. Poses are those of the laser
+        in the world (North, East, down), computed from those of the vehicle.
 
     Raises:
-        OSError: if a file is missing; a scan when its frame is read.
-        ValueError: if there are no scans, or a file is no such file.
+        OSError: if a file is missing; for a scan or image, when its frame is read.
+        ValueError: if there are no scans, or a file has the wrong format.
     """
     return FordFrames(Path(folder))
 
@@ -48,7 +50,7 @@ class FordFrames(AbstractFrames):
         if not self._scans:
             raise ValueError(f"{folder}: expected scans in SCANS/Scan*.mat, found none")
         log = folder / "Timestamp.log"
-        # Number and time, microseconds, of every image.
+        # Number and time in microseconds of each image.
         self._images = _read_log(log) if log.is_file() else np.empty((0, 2))
 
     def __len__(self) -> int:
@@ -68,7 +70,7 @@ class FordFrames(AbstractFrames):
             colors, seen = self._paint(len(points), cameras, image)
         except OSError:
             raise
-        except Exception as error:  # SciPy raises whatever comes to it.
+        except Exception as error:  # SciPy raises arbitrary exceptions for malformed files.
             raise ValueError(f"{path}: cannot be read as a scan of Ford Campus: {error!r}") from error
         channels, valid, names = colors, np.repeat(seen[:, None], 3, axis=1), ["red", "green", "blue"]
         if "reflectivity" in scan:
@@ -82,7 +84,7 @@ class FordFrames(AbstractFrames):
         return Frame(cloud, _pose(vehicle) @ _pose(_LASER_IN_VEHICLE), _MICROSECOND * time)
 
     def _image_number(self, time: float) -> int | None:
-        """The image nearest to a camera's time stamp, microseconds. (The scan's own `image_index` is always 0.)"""
+        """The image nearest in time, in microseconds, if near enough. (The `image_index` of the scans is always 0.)"""
         if not len(self._images):
             return None
         difference = np.abs(self._images[:, 1] - time)
@@ -92,7 +94,7 @@ class FordFrames(AbstractFrames):
     def _paint(
         self, size: int, cameras: list[dict[str, Any]], image: int | None
     ) -> tuple[Float[np.ndarray, "N 3"], np.ndarray]:
-        """Colours of the points, and which have one; of several cameras the first counts."""
+        """Colours of the points and the mask of coloured points; the first camera that saw a point determines it."""
         colors, seen = np.zeros((size, 3)), np.zeros(size, bool)
         if image is None:
             return colors, seen
@@ -102,7 +104,7 @@ class FordFrames(AbstractFrames):
                 continue
             rows = np.asarray(camera["points_index"], int).reshape(-1) - 1
             pixels = np.asarray(camera["pixels"], float).reshape(2, -1).T
-            # MATLAB counts from 1, and the images are stored at half of their height.
+            # MATLAB indices start at 1, and the images are stored at half their height.
             found, inside = look_up(read_image(path), np.stack([pixels[:, 0] - 1, pixels[:, 1] / 2 - 0.75], axis=1))
             new = inside & ~seen[rows]
             colors[rows[new]], seen[rows[new]] = found[new], True
@@ -112,12 +114,12 @@ class FordFrames(AbstractFrames):
 def _read_log(path: Path) -> Float[np.ndarray, "N 2"]:
     rows = [line.split()[:2] for line in path.read_text().splitlines() if line[:1].isdigit()]
     if not rows:
-        raise ValueError(f"{path}: expected rows of an image's number and its time stamp, found none")
+        raise ValueError(f"{path}: expected rows of image number and time stamp, found none")
     return np.array(rows, float)
 
 
 def _pose(numbers: Float[np.ndarray, "6"]) -> Float[np.ndarray, "4 4"]:
-    """From x, y, z and roll, pitch, yaw: first rolled about x, then pitched about y, then turned about z."""
+    """The pose Rz(yaw) Ry(pitch) Rx(roll) from x, y, z in metres and roll, pitch, yaw in radians."""
     (a, b, c), (d, e, f) = np.cos(numbers[3:]), np.sin(numbers[3:])
     pose = np.eye(4)
     pose[:3, :3] = (

@@ -1,4 +1,4 @@
-"""What a sensor saw, and sequences of it that are made or read only when asked for."""
+"""Frames of a sensor, and lazy sequences of frames."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ from mcgicp_jax._cloud import PointCloud
 
 @dataclass(frozen=True, eq=False)
 class Frame:
-    """What a sensor saw, and from where.
+    """A cloud with the pose and the time of the sensor.
 
-    Two frames give the true relative pose: `T_target_source = inv(target.pose) @ source.pose`.
+    The true relative pose of two frames is `T_target_source = inv(target.pose) @ source.pose`.
 
     Attributes:
         cloud: in the sensor's frame, metres.
-        pose: (4, 4), sensor to world; None where it is not known.
-        time: seconds, from any start; None where it is not known.
+        pose: (4, 4), sensor to world, metres; None if unknown.
+        time: seconds from an arbitrary start; None if unknown.
     """
 
     cloud: PointCloud
@@ -32,9 +32,9 @@ class Frame:
 
 
 class AbstractFrames(Sequence[Frame]):
-    """A sequence of frames, each made or read when it is asked for and not kept.
+    """A lazy sequence of frames: each is generated or read on access and not kept.
 
-    It has a length, is indexed from either end and iterated over; a slice of it is as lazy.
+    It supports `len`, iteration, negative indices, and slices, which are lazy too.
     """
 
     @abc.abstractmethod
@@ -42,7 +42,7 @@ class AbstractFrames(Sequence[Frame]):
 
     @abc.abstractmethod
     def _frame(self, index: int) -> Frame:
-        """Frame `index`, which is from 0 to the length."""
+        """Frame `index`, 0 ≤ `index` < length."""
 
     @overload
     def __getitem__(self, index: int) -> Frame: ...
@@ -51,13 +51,13 @@ class AbstractFrames(Sequence[Frame]):
     def __getitem__(self, index: slice) -> AbstractFrames: ...
 
     def __getitem__(self, index: int | slice) -> Frame | AbstractFrames:
-        """Raises `IndexError` beyond the ends."""
+        """Frame `index`, or a lazy slice; raises `IndexError` if the index is out of range."""
         if isinstance(index, slice):
             return _Slice(self, range(len(self))[index])
         return self._frame(self._row(index))
 
     def _row(self, index: int) -> int:
-        """The index counted from the start."""
+        """The non-negative index that is equivalent to `index`."""
         row = operator.index(index)
         if not -len(self) <= row < len(self):
             raise IndexError(f"index: expected {-len(self)} to {len(self) - 1}, got {row}")
@@ -79,15 +79,15 @@ class _Slice(AbstractFrames):
 
 
 class SyntheticFrames(AbstractFrames):
-    """Frames of a made-up scene: their truth is exact, and each can be observed again with fresh noise.
+    """Frames of a synthetic scene: the poses are exact, and each frame can be observed again with fresh noise.
 
-    Frame i is the same however many there are.
+    Frame i does not depend on the number of frames.
 
     Attributes:
-        path: the pose of frame i, (4, 4), sensor to world.
-        observer: what the sensor sees from a pose; rays and noise come from the generator.
+        path: function from the index i to the pose of frame i, (4, 4), sensor to world, metres.
+        observer: function from a random generator, for rays and noise, and a pose to the observed cloud.
         period: seconds between frames.
-        seed: of the rays and the noise of every frame.
+        seed: seed of the rays and the noise of all frames.
     """
 
     def __init__(
@@ -110,13 +110,17 @@ class SyntheticFrames(AbstractFrames):
         return self.observe(index)
 
     def observe(self, index: int, noise_seed: int | None = None) -> Frame:
-        """Frame `index` again: the same scene from the same pose, with rays and noise of their own for every seed.
+        """Observe frame `index` again: the same scene and pose, with other rays and noise.
 
         Args:
-            noise_seed: 0 or more; the same number gives the same cloud. None gives `frames[index]`.
+            index: index of the frame, negative to count from the end.
+            noise_seed: seed of the rays and the noise, 0 or more. None gives `frames[index]`.
+
+        Returns:
+            The frame, with the true pose and time.
 
         Raises:
-            IndexError: beyond the ends.
+            IndexError: if the index is out of range.
         """
         row = self._row(index)
         key = (_FIRST_FRAME + row,) if noise_seed is None else (_FIRST_FRAME + row, noise_seed)
@@ -125,28 +129,30 @@ class SyntheticFrames(AbstractFrames):
         return Frame(self.observer(rng, pose), pose, row * self.period)
 
 
-# The streams of a seed: what the scene is made from, where the sensor goes, and one per frame.
+# Independent random streams of one seed: the scene, the path of the sensor, and one per frame.
 _SCENE, _PATH, _FIRST_FRAME = 0, 1, 2
 
 
 def scene_and_path_rng(seed: int) -> tuple[np.random.Generator, np.random.Generator]:
-    """Generators for the scene and for the sensor's path, independent of those of the frames."""
+    """Random generators of the scene and of the sensor's path, independent of those of the frames."""
     scene, path = (np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(key,))) for key in (_SCENE, _PATH))
     return scene, path
 
 
 def check_noise(noise: float) -> None:
+    """Raise `ValueError` for a negative or NaN noise scale."""
     if not noise >= 0:
         raise ValueError(f"noise: expected 0 or more, got {noise}")
 
 
 def check_points_per_frame(points: int, most: int) -> None:
+    """Raise `ValueError` unless 1 ≤ `points` ≤ `most`."""
     if not 1 <= points <= most:
         raise ValueError(f"points_per_frame: expected 1 to {most}, got {points}")
 
 
 def rotation_from_vector(vector: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3 3"]:
-    """Rodrigues' formula."""
+    """The rotation by |vector| radians about the vector (Rodrigues' formula)."""
     angle = np.linalg.norm(vector)
     if angle == 0:
         return np.eye(3)

@@ -1,4 +1,4 @@
-"""Images of cameras: reading them, and looking colours up in them."""
+"""Reading of colour and depth images, colour look-up and back-projection."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ Picture: TypeAlias = UInt8[np.ndarray, "height width 3"]
 
 
 def read_image(path: str | os.PathLike[str]) -> Picture:
-    """Any image as 8-bit red, green and blue."""
+    """Read an image as 8-bit red, green and blue."""
     return np.asarray(_open(path).convert("RGB"))
 
 
 def read_depth(path: str | os.PathLike[str]) -> UInt16[np.ndarray, "height width"]:
-    """A 16-bit depth image, in its own unit."""
+    """Read a 16-bit depth image, in the unit of the file; raises `ValueError` for another kind of image."""
     depth = np.asarray(_open(path))
     if depth.ndim != 2 or depth.dtype != np.uint16:
         raise ValueError(f"{path}: expected a 16-bit depth image, got {depth.dtype} of shape {depth.shape}")
@@ -25,9 +25,12 @@ def read_depth(path: str | os.PathLike[str]) -> UInt16[np.ndarray, "height width
 
 
 def look_up(image: Picture, pixels: Float[np.ndarray, "N 2"]) -> tuple[Float[np.ndarray, "N 3"], Bool[np.ndarray, "N"]]:
-    """Colours from 0 to 1 at pixels (column, row; the first centre is 0, 0), bilinear; and which of them are inside."""
+    """Bilinear colours from 0 to 1, and the mask of pixels inside the image.
+
+    Pixels are (column, row); the centre of the first is (0, 0).
+    """
     height, width, _ = image.shape
-    # Written so that NaN is outside.
+    # NaN compares false and is outside.
     inside = np.all((pixels >= 0) & (pixels <= (width - 1, height - 1)), axis=1)
     column, row = np.where(inside[:, None], pixels, 0).T
     left, top = np.floor(column).astype(int), np.floor(row).astype(int)
@@ -41,7 +44,7 @@ def look_up(image: Picture, pixels: Float[np.ndarray, "N 2"]) -> tuple[Float[np.
 def back_project(
     depth: Float[np.ndarray, "height width"], focal: tuple[float, float], center: tuple[float, float]
 ) -> tuple[Float[np.ndarray, "N 3"], Float[np.ndarray, "N 2"]]:
-    """Points that a pinhole camera (x right, y down, z ahead) saw, and their pixels; depth in metres, 0 for none."""
+    """Points of a pinhole camera (x right, y down, z ahead), and their pixels; depth in metres, 0 if missing."""
     row, column = np.nonzero(depth > 0)
     pixels = np.stack([column, row], axis=1).astype(float)
     distance = depth[row, column, None]

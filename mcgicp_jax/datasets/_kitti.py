@@ -17,18 +17,19 @@ from mcgicp_jax.datasets._images import look_up, read_image
 def kitti(folder: str | os.PathLike[str]) -> KITTIFrames:
     """A sequence of the KITTI odometry data set (Geiger et al. 2012), such as `dataset/sequences/04`.
 
-    It has `velodyne/*.bin`, `calib.txt`, `times.txt`, and may have `image_2/*.png`, the left colour camera; the poses
-    are in `dataset/poses/04.txt`, where they are known.
+    Args:
+        folder: contains `velodyne/*.bin`, `calib.txt`, `times.txt` and optionally `image_2/*.png`, the left colour
+            camera. Known poses are in `dataset/poses/04.txt`.
 
     Returns:
-        Frames of the Velodyne (x ahead, y left, z up) with the channel intensity, from 0 to 0.99, and if there are
-        images red, green and blue, from 0 to 1. Colours are valid where a point lies in the image, about a sixth of a
-        scan; a point that something nearer hides from the camera alone is not recognised. Poses are those of the
-        Velodyne in the world, which is camera 0 at the start.
+        Frames of the Velodyne (x ahead, y left, z up) with the channel intensity, from 0 to 0.99, and, if there are
+        images, red, green and blue, from 0 to 1. Colours are valid where a point projects into the image, about a sixth
+        of a scan; points occluded from the camera are not detected. Poses are those of the Velodyne in the world, the
+        frame of camera 0 at the start.
 
     Raises:
-        OSError: if a file is missing; a scan or an image when its frame is read.
-        ValueError: if there are no scans, or a file is no such file.
+        OSError: if a file is missing; for a scan or image, when its frame is read.
+        ValueError: if there are no scans, or a file has the wrong format.
     """
     return KITTIFrames(Path(folder))
 
@@ -38,12 +39,12 @@ class KITTIFrames(AbstractFrames):
 
     def __init__(self, folder: Path):
         self.folder = folder
-        # Scans, images, times and poses go by number, of which a copy may have some alone.
+        # Scans, images, times and poses are matched by number, since a copy may contain only some of the scans.
         self._scans = sorted(scan for scan in (folder / "velodyne").glob("*.bin") if scan.stem.isdecimal())
         if not self._scans:
             raise ValueError(f"{folder}: expected scans in velodyne/*.bin, found none")
         calibration = _read_calibration(folder / "calib.txt")
-        # From the Velodyne to camera 0, and on to the pixels of camera 2.
+        # Transform from the Velodyne to camera 0, and projection to the pixels of camera 2.
         self._to_camera = np.vstack([calibration["Tr"], [0, 0, 0, 1]])
         self._projection = calibration["P2"] @ self._to_camera
         self._times = _read_times(folder / "times.txt")
@@ -67,6 +68,7 @@ class KITTIFrames(AbstractFrames):
         return Frame(cloud, pose, time)
 
     def _paint(self, cloud: PointCloud, image: Path) -> PointCloud:
+        """Append the colours of the image as channels."""
         homogeneous = cloud.points @ self._projection[:, :3].T + self._projection[:, 3]
         ahead = homogeneous[:, 2:] > 0
         pixels = np.where(ahead, homogeneous[:, :2] / np.where(ahead, homogeneous[:, 2:], 1), -1)
@@ -81,7 +83,7 @@ class KITTIFrames(AbstractFrames):
 
 
 def _read_times(path: Path) -> Float[np.ndarray, "N"]:
-    """Seconds, one in each line."""
+    """Read the times in seconds, one per line."""
     try:
         return np.array(path.read_text().split(), float)
     except ValueError as error:
@@ -89,7 +91,7 @@ def _read_times(path: Path) -> Float[np.ndarray, "N"]:
 
 
 def _read_calibration(path: Path) -> dict[str, Float[np.ndarray, "3 4"]]:
-    """The 3×4 matrices of calib.txt by their names."""
+    """Read the 3×4 matrices of calib.txt by name."""
     matrices = {}
     for line in path.read_text().splitlines():
         name, _, numbers = line.partition(":")

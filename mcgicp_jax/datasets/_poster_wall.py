@@ -1,4 +1,4 @@
-"""A flat wall of posters before a noisy RGB-D camera: geometry slides along it, colour does not."""
+"""A flat wall of posters seen by a noisy RGB-D camera: only the colours constrain motion along the wall."""
 
 from __future__ import annotations
 
@@ -18,24 +18,27 @@ from mcgicp_jax.datasets._frame import (
     scene_and_path_rng,
 )
 
-# The first Kinect: pixels, and the focal length in pixels.
+# The constants of this module define the scene and the camera.
+# First-generation Kinect: image size and focal length, pixels.
 _WIDTH, _HEIGHT, _FOCAL = 640, 480, 525.0
+# Standard deviation of each colour, from 0 to 1.
 _COLOR_NOISE = 0.02
 # Seconds between frames.
 _PERIOD = 1 / 30
 
-# Metres from the wall, and how far the camera sways about that.
+# Metres: mean distance from the wall, and the amplitude of its variation.
 _DISTANCE, _DISTANCE_SWAY = 1.35, 0.12
-# Radians: the tilt sways on a circle, in steps that turn the camera by 1.5° from frame to frame.
+# Radians: the tilt vector moves on a circle of this radius, by a phase that rotates the camera by 1.5° per frame.
 _TILT, _TILT_PHASE = np.deg2rad(2.0), 2 * np.arcsin(0.375)
 
-# Metres: a texel is finer than the 2.3 mm that a pixel covers on a wall 1.2 m away.
+# Metres: finer than the 2.3 mm that a pixel covers on a wall 1.2 m away.
 _TEXEL = 0.0015
-# Metres: the wall is divided into cells, one poster in each, and repeats beyond them.
+# Metres and counts: the wall is a periodic grid of cells with one poster each.
 _CELL_WIDTH, _CELL_HEIGHT, _COLUMNS, _ROWS = 0.84, 0.75, 4, 3
+# Metres: frame around each poster.
 _BORDER = 0.015
 _WALL_COLOR = np.array([0.72, 0.70, 0.66])
-# Away from 0 and 1, so that noise is rarely clipped.
+# Colours away from 0 and 1, so that noise is rarely clipped.
 _PALETTE = np.array(
     [
         [0.85, 0.20, 0.18],
@@ -65,27 +68,28 @@ def poster_wall(
     noise: float = 1.0,
     seed: int = 0,
 ) -> SyntheticFrames:
-    """A camera moves along a flat wall of posters; only the colours tell how far.
+    """A camera moves along a flat wall of posters; only the colours constrain the motion along the wall.
 
     The wall is the plane z = 0 of the world; the camera (x right, y down, z ahead; 640 × 480 pixels, focal length 525)
-    looks at it from 1.23 to 1.47 m. From frame to frame it moves by `step` in one direction along the wall, by at most
-    0.3 `step` across it, and turns by 1.5°. The rays of every frame fall between those of the others. The posters
-    repeat after 3.36 m sideways and 2.25 m upwards.
+    looks at it from 1.23 to 1.47 m. From frame to frame it moves by `step` in a constant direction along the wall and
+    by at most 0.3 `step` across it, and rotates by 1.5°. Every frame has its own rays. The posters repeat every 3.36 m
+    horizontally and 2.25 m vertically.
 
     Args:
-        points_per_frame: approximately; the rays cover the whole image, 1 to 307,200 of them.
+        num_frames: number of frames.
+        points_per_frame: approximate number of points, spread over the whole image; 1 to 307,200.
         step: metres along the wall between consecutive frames.
-        heading: radians from the right, clockwise: π moves from right to left, as in Fig. 3 of Servos & Waslander
-            (2014). None: any, by the seed.
-        noise: 1 for a Kinect, 0 for none. Scales the standard deviations: of depth, 0.0012 + 0.0019 (z − 0.4)²
-            metres, which moves a point along its ray; and of each colour, 0.02.
-        seed: the same seed gives the same posters, path, rays and noise. `observe` draws the latter two anew.
+        heading: direction of motion in radians, clockwise from the right: π moves from right to left, as in Fig. 3 of
+            Servos & Waslander (2014). None: random, determined by the seed.
+        noise: factor on the standard deviations, 1 for a Kinect, 0 for none: 0.0012 + 0.0019 (z − 0.4)² metres of the
+            depth, along the ray, and 0.02 of each colour.
+        seed: determines the posters, path, rays and noise. `observe` draws the latter two anew.
 
     Returns:
         Frames whose clouds have the channels red, green and blue, from 0 to 1.
 
     Raises:
-        ValueError: if a number is out of its range.
+        ValueError: if `num_frames`, `points_per_frame` or `noise` is out of range.
     """
     check_points_per_frame(points_per_frame, _WIDTH * _HEIGHT)
     check_noise(noise)
@@ -140,7 +144,7 @@ def _observe(
 
 
 def _rays(rng: np.random.Generator, size: int) -> Float[np.ndarray, "N 3"]:
-    """Rays (x, y, 1) on a regular grid of the image, the grid shifted at random and each ray anywhere in its pixel."""
+    """Rays (x, y, 1) on a regular image grid with a random offset, each jittered within its pixel."""
     columns = max(round(np.sqrt(size * _WIDTH / _HEIGHT)), 1)
     rows = max(round(size / columns), 1)
     u, v = np.meshgrid(np.arange(columns) + rng.uniform(), np.arange(rows) + rng.uniform())
@@ -151,7 +155,7 @@ def _rays(rng: np.random.Generator, size: int) -> Float[np.ndarray, "N 3"]:
 
 
 def _sample(wall: Image, texels: Float[np.ndarray, "N 2"]) -> Float[np.ndarray, "N 3"]:
-    """Bilinear; the wall repeats in both directions."""
+    """Bilinear colours of the wall, which is periodic in both directions."""
     height, width, _ = wall.shape
     x0, y0 = np.floor(texels).astype(int).T
     right, down = (texels - np.floor(texels)).T[..., None]
@@ -187,15 +191,15 @@ def _poster(rng: np.random.Generator, design: Callable[..., Image], size: Int[np
 
 
 def _gradient(rng: np.random.Generator, x: Grid, y: Grid, colors: Colors) -> Image:
-    """From one colour to another and on to a third."""
+    """A linear gradient through three colours."""
     angle = rng.uniform(0, 2 * np.pi)
     along = np.cos(angle) * x + np.sin(angle) * y
-    share = (along - along.min()) / np.ptp(along)
-    return np.stack([np.interp(share, [0, 0.5, 1], channel) for channel in colors[:3].T], axis=-1)
+    fraction = (along - along.min()) / np.ptp(along)
+    return np.stack([np.interp(fraction, [0, 0.5, 1], channel) for channel in colors[:3].T], axis=-1)
 
 
 def _stripes(rng: np.random.Generator, x: Grid, y: Grid, colors: Colors) -> Image:
-    """Bands of uneven width, in any direction."""
+    """Bands of uneven width in a random direction."""
     angle = rng.uniform(0, 2 * np.pi)
     return colors[_bands(rng, np.cos(angle) * x + np.sin(angle) * y, 0.02, 0.10) % 4]
 
@@ -206,7 +210,7 @@ def _diamonds(rng: np.random.Generator, x: Grid, y: Grid, colors: Colors) -> Ima
 
 
 def _discs(rng: np.random.Generator, x: Grid, y: Grid, colors: Colors) -> Image:
-    """Discs over one another on a plain ground."""
+    """Overlapping discs on a plain background."""
     label = np.zeros(x.shape, int)
     for i in range(14):
         radius = rng.uniform(0.03, 0.12)
@@ -216,7 +220,7 @@ def _discs(rng: np.random.Generator, x: Grid, y: Grid, colors: Colors) -> Image:
 
 
 def _text(rng: np.random.Generator, x: Grid, y: Grid, colors: Colors) -> Image:
-    """Lines of words, blocks of one colour each, under a headline of larger ones."""
+    """Lines of words, drawn as solid blocks, below a larger headline."""
     ink, paper = sorted(colors[:4], key=np.sum)[::3]
     letters = np.zeros(x.shape, bool)
     top, height = 0.04, 0.07
@@ -229,7 +233,7 @@ def _text(rng: np.random.Generator, x: Grid, y: Grid, colors: Colors) -> Image:
 
 
 def _bands(rng: np.random.Generator, along: Grid, narrowest: float, widest: float) -> Int[np.ndarray, "h w"]:
-    """Numbers the bands of random width that a coordinate passes through."""
+    """Partition a coordinate into bands of random width and return the index of the band."""
     count = int(np.ptp(along) / narrowest) + 1
     edges = along.min() + np.cumsum(rng.uniform(narrowest, widest, count))
     return np.searchsorted(edges, along)

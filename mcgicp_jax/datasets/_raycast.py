@@ -1,4 +1,4 @@
-"""Rays cast into scenes of boxes and upright cylinders, and patterns to paint them with."""
+"""Ray casting into scenes of boxes and upright cylinders, rays of sensors, and random surface patterns."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from mcgicp_jax.datasets._frame import rotation_from_vector
 
 
 class AbstractSolid(abc.ABC):
-    """A solid that the sensor is outside of."""
+    """A solid; the sensor must be outside of it."""
 
     @property
     @abc.abstractmethod
@@ -24,12 +24,12 @@ class AbstractSolid(abc.ABC):
     def meet(
         self, origin: Float[np.ndarray, "3"], rays: Float[np.ndarray, "N 3"]
     ) -> tuple[Float[np.ndarray, "N"], Float[np.ndarray, "N 3"]]:
-        """Where rays of unit length enter it: metres along the ray, infinite where they miss; and the unit normals."""
+        """Distance along unit rays to their entry into the solid, metres, infinite if they miss; and unit normals."""
 
 
 @dataclass(frozen=True, eq=False)
 class Box(AbstractSolid):
-    """An axis-aligned box, from its lowest corner to its highest, metres."""
+    """An axis-aligned box between its lowest and highest corner, (3,), metres."""
 
     low: Float[np.ndarray, "3"]
     high: Float[np.ndarray, "3"]
@@ -41,7 +41,7 @@ class Box(AbstractSolid):
     def meet(
         self, origin: Float[np.ndarray, "3"], rays: Float[np.ndarray, "N 3"]
     ) -> tuple[Float[np.ndarray, "N"], Float[np.ndarray, "N 3"]]:
-        # A ray along a face divides by zero: infinities of the right sign, or NaN, which is no hit.
+        # A ray parallel to a face divides by zero: the result is an infinity of the right sign, or NaN, a miss.
         with np.errstate(divide="ignore", invalid="ignore"):
             first, second = (self.low - origin) / rays, (self.high - origin) / rays
         near, far = np.minimum(first, second), np.maximum(first, second)
@@ -54,10 +54,11 @@ class Box(AbstractSolid):
 
 @dataclass(frozen=True, eq=False)
 class Cylinder(AbstractSolid):
-    """The mantle of an upright cylinder; metres.
+    """The lateral surface of an upright cylinder.
 
     Attributes:
-        foot: (3,), centre of its lower end.
+        foot: (3,), metres, centre of the lower end.
+        radius, height: metres.
     """
 
     foot: Float[np.ndarray, "3"]
@@ -84,14 +85,14 @@ class Cylinder(AbstractSolid):
 
 @dataclass(frozen=True, eq=False)
 class Hits:
-    """Where rays end; those that meet nothing are left out.
+    """The hits of rays on solids, without the rays that miss.
 
     Attributes:
         rays: (N, 3), unit directions in the world.
-        distance: (N,), metres.
+        distance: (N,), metres along the ray.
         points: (N, 3), in the world, metres.
         normals: (N, 3), unit, towards the sensor.
-        solid: (N,), which of the solids.
+        solid: (N,), index of the solid.
     """
 
     rays: Float[np.ndarray, "N 3"]
@@ -102,14 +103,14 @@ class Hits:
 
 
 def cast(
-    origin: Float[np.ndarray, "3"], rays: Float[np.ndarray, "M 3"], solids: Sequence[AbstractSolid], reach: float
+    origin: Float[np.ndarray, "3"], rays: Float[np.ndarray, "M 3"], solids: Sequence[AbstractSolid], max_range: float
 ) -> Hits:
-    """The nearest hit of every ray within `reach` metres; of two as near, that of the first solid."""
-    distance = np.full(len(rays), reach)
+    """The nearest hit of each ray within `max_range` metres; ties go to the first solid."""
+    distance = np.full(len(rays), max_range)
     normals = np.zeros_like(rays)
     solid = np.full(len(rays), -1)
     for number, candidate in enumerate(solids):
-        rows = _towards(candidate, origin, rays, reach)
+        rows = _towards(candidate, origin, rays, max_range)
         entry, facing = candidate.meet(origin, rays[rows])
         nearer = entry < distance[rows]
         rows = rows[nearer]
@@ -120,13 +121,13 @@ def cast(
 
 
 def _towards(
-    solid: AbstractSolid, origin: Float[np.ndarray, "3"], rays: Float[np.ndarray, "M 3"], reach: float
+    solid: AbstractSolid, origin: Float[np.ndarray, "3"], rays: Float[np.ndarray, "M 3"], max_range: float
 ) -> Int[np.ndarray, "K"]:
-    """The rays within the cone about a sphere around the solid."""
+    """Indices of the rays that may hit the solid: those in the cone around its bounding sphere."""
     low, high = solid.bounds
     center, radius = (low + high) / 2 - origin, np.linalg.norm(high - low) / 2
     away = np.linalg.norm(center)
-    if away - radius > reach:
+    if away - radius > max_range:
         return np.empty(0, int)
     if away <= radius:
         return np.arange(len(rays))
@@ -137,7 +138,7 @@ def _towards(
 
 
 def random_rays(rng: np.random.Generator, size: int) -> Float[np.ndarray, "N 3"]:
-    """Unit rays in all directions alike."""
+    """Random unit rays, uniform over the sphere."""
     rays = rng.normal(size=(size, 3))
     return rays / np.linalg.norm(rays, axis=1, keepdims=True)
 
@@ -145,9 +146,9 @@ def random_rays(rng: np.random.Generator, size: int) -> Float[np.ndarray, "N 3"]
 def spinning_rays(
     rng: np.random.Generator, size: int, beams: int, lowest: float, highest: float
 ) -> Float[np.ndarray, "N 3"]:
-    """One turn of a LiDAR, about `size` unit rays: x ahead, z up, beams between two elevations in radians.
+    """About `size` unit rays of one turn of a LiDAR: x ahead, z up, beams between two elevations in radians.
 
-    The turn starts anywhere, and the beams look in directions a little apart, as they do in a real one.
+    The turn starts at a random azimuth, and each beam has its own azimuth offset, as in a real LiDAR.
     """
     columns = max(round(size / beams), 1)
     beam = np.arange(beams)
@@ -167,14 +168,14 @@ def swaying_rotation(tilt: float, phase: float) -> Float[np.ndarray, "3 3"]:
 
 
 def value_noise(points: Float[np.ndarray, "N D"], cell: float, seed: int) -> Float[np.ndarray, "N"]:
-    """A smooth random pattern in space, from −1 to 1, whose patches are about `cell` metres wide; D is 1, 2 or 3."""
+    """Value noise: a smooth random pattern from −1 to 1 with patches about `cell` metres wide; D is 1, 2 or 3."""
     scaled = np.asarray(points, float) / cell
     corner = np.floor(scaled).astype(np.int64)
-    share = scaled - corner
-    share = share * share * (3 - 2 * share)
+    fraction = scaled - corner
+    fraction = fraction * fraction * (3 - 2 * fraction)
     total = np.zeros(len(scaled))
     for bits in np.ndindex(*(2,) * scaled.shape[1]):
-        weight = np.prod(np.where(bits, share, 1 - share), axis=1)
+        weight = np.prod(np.where(bits, fraction, 1 - fraction), axis=1)
         total += weight * random_cells(corner + bits, seed)
     return 2 * total - 1
 
@@ -182,7 +183,7 @@ def value_noise(points: Float[np.ndarray, "N D"], cell: float, seed: int) -> Flo
 def patches(
     points: Float[np.ndarray, "N D"], layers: Sequence[tuple[float, float]], seed: int
 ) -> Float[np.ndarray, "N"]:
-    """Layers of `value_noise`, each of a width of its patches (metres) and a strength."""
+    """Sum of layers of `value_noise`, each given by the width of its patches (metres) and its amplitude."""
     total = np.zeros(len(points))
     for number, (cell, strength) in enumerate(layers):
         total += strength * value_noise(points, cell, seed + number)
@@ -190,7 +191,7 @@ def patches(
 
 
 def random_cells(cells: Int[np.ndarray, "N D"], seed: int) -> Float[np.ndarray, "N"]:
-    """A random number from 0 to 1 for each cell of an endless grid (SplitMix64 as a hash)."""
+    """A random number from 0 to 1 for each cell of an infinite grid, by hashing its index with SplitMix64."""
     mixed = np.full(len(cells), seed, np.uint64)
     for column in cells.T:
         mixed = (mixed ^ column.astype(np.uint64)) + np.uint64(0x9E3779B97F4A7C15)

@@ -12,11 +12,11 @@ from mcgicp_jax._cloud import PointCloud
 from mcgicp_jax.datasets._frame import AbstractFrames, Frame
 from mcgicp_jax.datasets._images import back_project, look_up, read_depth, read_image
 
-# Pixels: focal lengths of depth and colour, and the centre of both.
+# Pixels: focal lengths of the depth and colour cameras, and their common principal point.
 _DEPTH_FOCAL, _COLOR_FOCAL, _CENTER = 585.0, 525.0, (320.0, 240.0)
-# From the depth camera to the colour camera, which the data set leaves out: the calibration of a Kinect that is in
-# general use with it (LIRIS). With it the colours of two frames at their true poses differ by 24 % less than if colour
-# and depth are taken to fit pixel by pixel.
+# Transform from the depth to the colour camera, (3, 4), metres, which the data set does not include: the calibration of
+# a Kinect that is generally used with it (LIRIS). With it the colours of two frames at their true poses differ by 24 %
+# less than if depth and colour images are taken to be aligned pixel by pixel.
 _TO_COLOR = np.array(
     [
         [9.9996518012567637e-01, 2.6765126468950343e-03, -7.9041012313000904e-03, -2.5558943178152542e-02],
@@ -24,23 +24,27 @@ _TO_COLOR = np.array(
         [7.8819942130445332e-03, 8.1718328771890631e-03, 9.9993554558014031e-01, 2.0318321729487039e-03],
     ]
 )
+# Seconds between frames.
 _PERIOD = 1 / 30
+# Value of pixels without depth.
 _NO_DEPTH = 65535
 
 
 def seven_scenes(folder: str | os.PathLike[str]) -> SevenScenesFrames:
     """A sequence of 7-Scenes (Shotton et al. 2013), such as `redkitchen/seq-03`.
 
-    It has `frame-XXXXXX.depth.png`, `.color.png` (or `.jpg`) and `.pose.txt`; time goes by the number, 30 a second.
+    Args:
+        folder: contains `frame-XXXXXX.depth.png`, `.color.png` (or `.jpg`) and `.pose.txt`. Times follow from the
+            frame number at 30 Hz.
 
     Returns:
-        Frames of the depth camera (x right, y down, z ahead), all pixels with a depth, channels red, green and blue
-        from 0 to 1. The colour camera stands 26 mm aside; the colours are looked up by a general calibration of this
-        sensor, good to some pixels, and valid where a point lies in the colour image.
+        Frames of the depth camera (x right, y down, z ahead), one point per pixel with a depth, with the channels red,
+        green and blue, from 0 to 1. The colour camera is offset by 26 mm; colours are looked up with a generic
+        calibration of the sensor, accurate to a few pixels, and valid where a point projects into the colour image.
 
     Raises:
         OSError: if a file is missing, when its frame is read.
-        ValueError: if there are no frames, or a file is no such file.
+        ValueError: if there are no frames, or a file has the wrong format.
     """
     return SevenScenesFrames(Path(folder))
 

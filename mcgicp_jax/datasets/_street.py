@@ -1,4 +1,4 @@
-"""A street as a spinning LiDAR with a panoramic camera sees it."""
+"""A street of houses, seen by a spinning LiDAR with a panoramic camera."""
 
 from __future__ import annotations
 
@@ -30,19 +30,22 @@ from mcgicp_jax.datasets._raycast import (
     swaying_rotation,
 )
 
-# The LiDAR: Velodyne's HDL-64E, on the roof of a car; metres, radians and seconds.
+# The constants of this module define the scene and the sensor.
+# The LiDAR, a Velodyne HDL-64E on the roof of a car: beams and their elevations, radians; range and height, metres;
+# period, seconds.
 _BEAMS, _LOWEST, _HIGHEST = 64, np.deg2rad(-24.8), np.deg2rad(2.0)
-_REACH, _SENSOR_HEIGHT, _PERIOD = 80.0, 1.9, 0.1
-# How the car sways: sideways about the middle of its lane, in heading, and in roll and pitch.
+_MAX_RANGE, _SENSOR_HEIGHT, _PERIOD = 80.0, 1.9, 0.1
+# Path of the car: middle of its lane and amplitude of the sideways motion, metres; amplitudes of heading and of tilt,
+# radians.
 _LANE, _SWAY, _YAW, _TILT = -1.6, 0.25, np.deg2rad(1.5), np.deg2rad(0.8)
-# Standard deviations: of the range, metres; of the intensity, its own and relative to it; of the colours.
+# Standard deviations: range, metres; intensity, absolute and relative; colours.
 _RANGE_NOISE, _INTENSITY_NOISE, _INTENSITY_SPECKLE, _COLOR_NOISE = 0.02, 0.01, 0.05, 0.02
-# Metres: at this range the intensity has fallen to half.
+# Metres: range at which the intensity has fallen to half.
 _HALF_INTENSITY = 40.0
 
-# Metres from the middle of the street: parked cars, kerb, façades; and how high the kerb is.
-_PARKING, _KERB, _FACADE, _KERB_HEIGHT = 3.0, 5.0, 8.5, 0.12
-_DEPTH = 12.0
+# Metres from the middle of the street: parking bays, kerb, façades; height of the kerb; depth of the buildings.
+_PARKING, _KERB, _FACADE, _KERB_HEIGHT, _DEPTH = 3.0, 5.0, 8.5, 0.12, 12.0
+# Direction towards the sun, and colours: red, green and blue from 0 to 1.
 _SUN = np.array([0.35, -0.5, 0.79])
 _PALETTE = np.array(
     [[0.72, 0.45, 0.36], [0.80, 0.74, 0.62], [0.62, 0.60, 0.58], [0.86, 0.82, 0.76], [0.55, 0.36, 0.30]]
@@ -64,13 +67,12 @@ class _Kind(enum.IntEnum):
 
 @dataclass(frozen=True, eq=False)
 class _Thing:
-    """Something that stands in the street.
+    """An object of the scene.
 
     Attributes:
-        color: (3,), without its pattern.
-        reflectance: of the laser, without its pattern.
-        windows: of a building: their pitch along the façade and upwards, width, height, and how far they are set back;
-            metres.
+        color: (3,), red, green and blue without the pattern.
+        reflectance: at the wavelength of the laser, 0 to 1, without the pattern.
+        windows: for buildings: pitch along the façade, pitch upwards, width, height and recess; metres.
     """
 
     kind: _Kind
@@ -90,28 +92,30 @@ def street(
 ) -> SyntheticFrames:
     """A car drives along a street of houses with a spinning 64-beam LiDAR and a panoramic camera on its roof.
 
-    Ground with markings, kerbs, façades with windows set back in them, parked cars, poles and bins. From frame to frame
-    the car moves by `step` along the axis x of the world, by at most a sixth of that across it, and sways a little in
-    every direction. The camera is taken to be where the LiDAR is, and gives every point its colour.
+    The scene has a road with markings, kerbs, façades with recessed windows, parked cars, poles and bins. From frame to
+    frame the car moves by `step` along the world's x axis and by at most a sixth of that across it, with small
+    rotations about all axes. Camera and LiDAR have the same centre, so every point has a colour.
 
     Args:
-        points_per_frame: rays, a multiple of the 64 beams; the few that meet nothing within 80 m give no point.
+        num_frames: number of frames.
+        points_per_frame: number of rays, rounded to a multiple of the 64 beams; the few that hit nothing within 80 m
+            give no point.
         step: metres along the street between consecutive frames.
-        noise: scales the standard deviations: 0.02 m of the range; of the intensity 0.01, and 5 % of it; 0.02 of each
-            colour. 0 for none.
-        seed: the same seed gives the same street, path, rays and noise. `observe` draws the latter two anew.
+        noise: factor on the standard deviations: 0.02 m of the range; of the intensity, 0.01 and 5 % of its value; 0.02
+            of each colour. 0 for none.
+        seed: determines the street, path, rays and noise. `observe` draws the latter two anew.
 
     Returns:
-        Frames whose clouds have the channels intensity, red, green and blue, from 0 to 1. The intensity falls with
-        range and with the angle of incidence. The world's z axis points up, the sensor's x axis ahead.
+        Frames whose clouds have the channels intensity, red, green and blue, from 0 to 1. The intensity decreases with
+        range and angle of incidence. The world's z axis points up, the sensor's x axis ahead.
 
     Raises:
-        ValueError: if a number is out of its range.
+        ValueError: if `num_frames`, `points_per_frame` or `noise` is out of range.
     """
     check_noise(noise)
     check_points_per_frame(points_per_frame, 10_000_000)
     scene_rng, path_rng = scene_and_path_rng(seed)
-    things = _things(scene_rng, -2 * _REACH, num_frames * step + 2 * _REACH)
+    things = _things(scene_rng, -2 * _MAX_RANGE, num_frames * step + 2 * _MAX_RANGE)
     observer = partial(_observe, things, int(scene_rng.integers(2**31)), points_per_frame, noise)
     path = partial(_pose, step, *path_rng.uniform(0, 2 * np.pi, 3))
     return SyntheticFrames(num_frames, path, observer, _PERIOD, seed)
@@ -138,7 +142,7 @@ def _observe(
 ) -> PointCloud:
     rotation, center = pose[:3, :3], pose[:3, 3]
     rays = spinning_rays(rng, size, _BEAMS, _LOWEST, _HIGHEST) @ rotation.T
-    hits = cast(center, rays, [thing.solid for thing in things], _REACH)
+    hits = cast(center, rays, [thing.solid for thing in things], _MAX_RANGE)
     hits, glass = _into_windows(hits, things)
     colors, reflectance = _paint(hits, glass, things, pattern)
     incidence = np.abs(np.sum(hits.rays * hits.normals, axis=1))
@@ -159,7 +163,7 @@ def _observe(
 
 
 def _things(rng: np.random.Generator, start: float, end: float) -> list[_Thing]:
-    """From one end to the other, one after another: a longer street begins like a shorter one."""
+    """The objects of the street, each kind in order of x, so that a longer street begins like a shorter one."""
     road = Box(np.array([start, -60.0, -1.0]), np.array([end, 60.0, 0.0]))
     things = [_Thing(_Kind.GROUND, road, np.full(3, 0.33), 0.2)]
     for side, side_rng in zip((-1, 1), rng.spawn(2), strict=True):
@@ -171,7 +175,7 @@ def _things(rng: np.random.Generator, start: float, end: float) -> list[_Thing]:
 
 
 def _box(low: Float[np.ndarray, "3"], high: Float[np.ndarray, "3"], side: int) -> Box:
-    """A box on the left of the street (side 1), or its image on the right (−1)."""
+    """A box on the left of the street (side 1), or its mirror image on the right (−1)."""
     mirror = np.array([1, side, 1])
     return Box(np.minimum(mirror * low, mirror * high), np.maximum(mirror * low, mirror * high))
 
@@ -181,7 +185,7 @@ def _buildings(rng: np.random.Generator, side: int, start: float, end: float) ->
     while x < end:
         width, height, setback = rng.uniform((7, 6, 0), (16, 15, 0.8))
         pitch, opening = rng.uniform((1.8, 2.9), (3.2, 3.5)), rng.uniform((0.8, 1.3), (1.4, 1.9))
-        # A whole number of windows and storeys: no window is cut off.
+        # Fit a whole number of windows and storeys, so that no window is cut off.
         pitch = np.array([width, height]) / np.round((width, height) / pitch)
         low, high = np.array([x, _FACADE + setback, 0.0]), np.array([x + width, _FACADE + setback + _DEPTH, height])
         yield _Thing(
@@ -191,7 +195,7 @@ def _buildings(rng: np.random.Generator, side: int, start: float, end: float) ->
             rng.uniform(0.25, 0.55),
             np.array([*pitch, *opening, rng.uniform(0.08, 0.25)]),
         )
-        # Side by side, with a passage between them, or at a side street.
+        # The next building is adjacent, behind a passage, or across a side street.
         x += width + rng.choice([0, rng.uniform(1.5, 4), 9], p=[0.7, 0.2, 0.1])
 
 
@@ -228,18 +232,18 @@ def _bins(rng: np.random.Generator, side: int, start: float, end: float) -> Iter
 
 
 def _into_windows(hits: Hits, things: list[_Thing]) -> tuple[Hits, Bool[np.ndarray, "N"]]:
-    """Hits on the plane of a window moved on, to the glass or to the reveal; and which of them are on glass."""
+    """Move hits in the opening of a window on to the glass or the reveal, and return the mask of hits on glass."""
     kinds = np.array([thing.kind for thing in things])
     front = np.flatnonzero((kinds[hits.solid] == _Kind.BUILDING) & (hits.normals[:, 1] != 0))
     pitch, opening, recess = np.split(_windows(things)[hits.solid[front]], [2, 4], axis=1)
     corner = np.array([thing.solid.bounds[0] for thing in things])[hits.solid[front]]
-    # Along the façade and upwards, from the middle of a window.
+    # Offset from the centre of the window, along the façade and upwards.
     offset = (hits.points[front] - corner)[:, [0, 2]] % pitch - pitch / 2
     within = (np.abs(offset) < opening / 2).all(axis=1)
     front, offset, opening, recess = front[within], offset[within], opening[within], recess[within, 0]
     rays = hits.rays[front]
     with np.errstate(divide="ignore"):
-        # How much further to the plane of the glass, and to the two sides that the ray is heading for.
+        # Remaining distance to the plane of the glass, and to the two sides that the ray approaches.
         to_glass = recess / np.abs(rays[:, 1])
         to_sides = (np.sign(rays[:, [0, 2]]) * opening / 2 - offset) / rays[:, [0, 2]]
     further = np.column_stack([to_glass, to_sides])
@@ -257,23 +261,24 @@ def _into_windows(hits: Hits, things: list[_Thing]) -> tuple[Hits, Bool[np.ndarr
 
 
 def _windows(things: list[_Thing]) -> Float[np.ndarray, "B 5"]:
-    """Of every thing; NaN where it is no building."""
+    """The window parameters of every object; NaN if it is not a building."""
     none = np.full(5, np.nan)
     return np.array([none if thing.windows is None else thing.windows for thing in things])
 
 
-# How it is painted
+# Surface patterns
 
+# Width of the patches, metres, and amplitude, per layer.
 _ASPHALT = ((2.5, 0.035), (0.5, 0.03), (0.12, 0.02))
 _PLASTER = ((3.0, 0.06), (0.5, 0.05), (0.15, 0.03))
-# Metres: slabs of the pavement, mended pieces of the road, shop signs.
+# Metres: sizes of the slabs of the pavement, the repaired pieces of the road, and the shop signs.
 _SLAB, _PIECE, _SIGN = 0.6, np.array([3.1, 1.55]), 3.7
 
 
 def _paint(
     hits: Hits, glass: Bool[np.ndarray, "N"], things: list[_Thing], pattern: int
 ) -> tuple[Float[np.ndarray, "N 3"], Float[np.ndarray, "N"]]:
-    """Colour, and reflectance for the laser, of the surface at every hit."""
+    """Colour and laser reflectance of the surface at each hit."""
     kinds = np.array([thing.kind for thing in things])[hits.solid]
     colors = np.array([thing.color for thing in things])[hits.solid]
     reflectance = np.array([thing.reflectance for thing in things])[hits.solid]
@@ -308,7 +313,7 @@ def _paint(
 
 
 def _is_marked(ground: Float[np.ndarray, "N 2"], pattern: int) -> Bool[np.ndarray, "N"]:
-    """White paint: a dashed line in the middle, parking bays along the kerbs, a crossing here and there."""
+    """The mask of white paint: a dashed centre line, parking bays along the kerbs, and occasional crossings."""
     x, y = ground.T
     dashes = (np.abs(y) < 0.08) & (x % 9 < 4)
     bays = (np.abs(np.abs(y) - _PARKING) < 0.06) & (x % 6 < 5.4)

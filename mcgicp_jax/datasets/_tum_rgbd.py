@@ -14,33 +14,37 @@ from mcgicp_jax._cloud import PointCloud
 from mcgicp_jax.datasets._frame import AbstractFrames, Frame
 from mcgicp_jax.datasets._images import back_project, look_up, read_depth, read_image
 
-# Focal lengths and centre, pixels, of the three cameras and of others with the drivers' default.
+# Pixels: focal lengths and principal point of the three calibrated cameras, and the default of the camera driver.
 _CAMERAS = {
     "1": ((517.3, 516.5), (318.6, 255.3)),
     "2": ((520.9, 521.0), (325.1, 249.7)),
     "3": ((535.4, 539.2), (320.1, 247.6)),
 }
 _OTHER_CAMERA = ((525.0, 525.0), (319.5, 239.5))
+# Metres per unit of the depth images.
 _DEPTH_UNIT = 1 / 5000
-# Seconds: between a depth image and its colour image; and between the poses on either side of it.
+# Seconds: maximum difference between a depth image and its colour image, and maximum gap between two measured poses.
 _MAX_DIFFERENCE, _MAX_GAP = 0.02, 0.1
 
 
 def tum_rgbd(folder: str | os.PathLike[str]) -> TUMFrames:
     """A sequence of the TUM RGB-D data set (Sturm et al. 2012), such as `rgbd_dataset_freiburg1_xyz`.
 
-    It has `depth.txt` and `rgb.txt`, lines of a time stamp and the name of a file, and may have `groundtruth.txt`. To
-    every depth image belongs the colour image nearest in time; depth images without one within 20 ms are left out. The
-    pose is interpolated between the two measured around it, and None where they are more than 0.1 s apart. The camera
-    is told by freiburg1, 2 or 3 in the name of the folder; otherwise it is the drivers' default.
+    Each depth image is combined with the colour image nearest in time; depth images without one within 20 ms are left
+    out. The pose is interpolated between the measured poses before and after it, and None if these are more than 0.1 s
+    apart.
+
+    Args:
+        folder: contains `depth.txt` and `rgb.txt`, lines of time stamp and file name, and optionally `groundtruth.txt`.
+            freiburg1, 2 or 3 in its name selects the camera calibration; otherwise it is the default of the driver.
 
     Returns:
-        Frames of the camera (x right, y down, z ahead), all pixels with a depth, channels red, green and blue from 0 to
-        1. Colour images of this data set fit the depth images pixel by pixel.
+        Frames of the camera (x right, y down, z ahead), one point per pixel with a depth, with the channels red, green
+        and blue, from 0 to 1. Colour and depth images of this data set are aligned pixel by pixel.
 
     Raises:
-        OSError: if a file is missing; an image when its frame is read.
-        ValueError: if no two images belong together, or a file is no such file.
+        OSError: if a file is missing; for an image, when its frame is read.
+        ValueError: if no depth image has a colour image, or a file has the wrong format.
     """
     return TUMFrames(Path(folder))
 
@@ -62,7 +66,7 @@ class TUMFrames(AbstractFrames):
         self._depths = [self._depths[row] for row in np.flatnonzero(together)]
         self._colors = [colors[row] for row in nearest[together]]
         truth = folder / "groundtruth.txt"
-        # Poses are read first: they name the file where it is none.
+        # read_poses runs before loadtxt because its errors name the file.
         poses = io.read_poses(truth) if truth.is_file() else None
         self._truth = None if poses is None else (np.loadtxt(truth, usecols=0, ndmin=1), poses)
 
@@ -77,6 +81,7 @@ class TUMFrames(AbstractFrames):
         return Frame(cloud, self._pose(self._times[index]), float(self._times[index]))
 
     def _pose(self, time: float) -> Float[np.ndarray, "4 4"] | None:
+        """The measured pose interpolated to a time in seconds; None if unknown."""
         if self._truth is None:
             return None
         times, poses = self._truth
@@ -85,16 +90,16 @@ class TUMFrames(AbstractFrames):
             return poses[after]
         if not 0 < after < len(times) or times[after] - times[after - 1] > _MAX_GAP:
             return None
-        share = (time - times[after - 1]) / (times[after] - times[after - 1])
-        pose = (1 - share) * poses[after - 1] + share * poses[after]
-        # The rotation nearest to the mean of two: within a tenth of a second, the one in between.
+        fraction = (time - times[after - 1]) / (times[after] - times[after - 1])
+        pose = (1 - fraction) * poses[after - 1] + fraction * poses[after]
+        # Projecting the mean matrix to the nearest rotation is accurate for the small motion within 0.1 s.
         left, _, right = np.linalg.svd(pose[:3, :3])
         pose[:3, :3] = left @ right
         return pose
 
 
 def _read_list(path: Path) -> tuple[Float[np.ndarray, "N"], list[str]]:
-    """Time stamps, and the files beside them."""
+    """Read the time stamps and the file names."""
     rows = [line.split() for line in path.read_text().splitlines() if line.strip() and not line.startswith("#")]
     try:
         return np.array([float(time) for time, _ in rows]), [name for _, name in rows]

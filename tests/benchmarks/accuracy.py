@@ -1,12 +1,11 @@
-"""Translation errors on real and made-up pairs whose truth is known: every method as it comes, and Open3D.
+"""Translation errors in mm on real and simulated pairs with known truth: every method with its defaults, and Open3D.
 
     python -m tests.benchmarks.accuracy [--only flat recorded ...]
 
-All start from the identity (the road: 0.3 m ahead of the truth) and get the same downsampled clouds. Ours have no
-settings at all, but for Color ICP, which is given the α that MC-GICP chooses. Open3D's colored ICP has its documented
-ones: λ 0.968, normals of 30 neighbours; at three scales voxels of 4, 2 and 1 times the size and gates of twice that, at
-one a gate of ten voxels, as wide as ours.
-Millimetres.
+All start from the identity (the road: 0.3 m ahead of the truth) on the same downsampled clouds. Our methods have
+default settings, except that Color ICP gets the α that MC-GICP chooses. Open3D's colored ICP has documented settings:
+λ 0.968, normals from 30 neighbours. At three scales it has voxels of 4, 2 and 1 times the size and a max_distance of
+twice that; at one scale a max_distance of ten voxels, as large as ours.
 """
 
 from __future__ import annotations
@@ -83,7 +82,7 @@ def road() -> Iterator[Pair]:
 
 
 def ground(cloud: mcg.PointCloud) -> mcg.PointCloud:
-    """What lies within 25 m, 6 m to the sides and 6 cm of the ground plane, found by sampling planes."""
+    """Points within 25 m, 6 m to the sides, and 6 cm of the ground plane, which is found by sampling planes."""
     points = np.asarray(cloud.points, float)
     near = (np.hypot(*points[:, :2].T) < 25) & (np.abs(points[:, 1]) < 6) & (points[:, 2] < -1)
     low, rng = points[near], np.random.default_rng(0)
@@ -119,7 +118,7 @@ def wall(gain: float) -> Iterator[Pair]:
         yield Pair(dark, pair.target, pair.truth, pair.start)
 
 
-# Name: pairs, voxel in metres, further arguments of `register`.
+# Name: pairs, voxel size in metres, further arguments of `register`.
 SETS: dict[str, tuple[Callable[[], Iterator[Pair]], float | None, dict[str, Any]]] = {
     "flat": (lambda: table("_flat"), 0.01, {}),
     "recorded": (lambda: table(""), 0.01, {}),
@@ -154,7 +153,7 @@ def colored_icp(scales: tuple[int, ...]) -> Callable[..., np.ndarray]:
             pair = [cloud.voxel_down_sample(scale * voxel) if scale > 1 else cloud for cloud in clouds]
             for cloud in pair:
                 cloud.estimate_normals(open3d.geometry.KDTreeSearchParamKNN(30))
-            # It raises where it finds no pairs; the pose is then left as it is.
+            # Open3D raises if it finds no matches; keep the pose then.
             with contextlib.suppress(RuntimeError):
                 start = registration.registration_colored_icp(
                     *pair,
@@ -178,9 +177,9 @@ def as_open3d(cloud: mcg.PointCloud) -> Any:
 
 
 def cramer_rao(seed: int, blur: float) -> float:
-    """The least root mean square translation error of an unbiased estimate, metres: from the depth noise of all points
-    across the wall and their colour noise along it, both of two frames, if the wall's picture is known but for details
-    finer than `blur`, metres."""
+    """Lower bound in metres of the rms translation error of an unbiased estimate, from the depth noise across the wall
+    and the colour noise along it in both frames, if the picture on the wall is known down to details of `blur` metres.
+    """
     target = datasets.poster_wall(2, step=STEPS[seed % len(STEPS)], seed=seed)[1]
     picture = posters._paint_wall(scene_and_path_rng(seed)[0])
     rays = np.asarray(target.cloud.points, float)

@@ -1,7 +1,6 @@
-"""Many pairs: pairs per second beside small_gicp in as many processes as there are cores, and the memory of a stream.
+"""Pairs per second of `register_batch` and of small_gicp with one process per core, and the memory used by a stream.
 
-Run `python -m tests.benchmarks.batch`; see README.md. Libraries take turns, and what is compared is compared within one
-turn.
+Run `python -m tests.benchmarks.batch`; see README.md. Libraries take turns; ratios are computed within one turn.
 """
 
 from __future__ import annotations
@@ -22,15 +21,15 @@ from scipy.spatial.transform import Rotation
 
 DATA = pathlib.Path(os.environ.get("MCGICP_DATA", pathlib.Path(__file__).parents[3] / "shared" / "data"))
 NUM_TURNS = 5
-GATE = 1.0
-# Those of small_gicp's defaults, for both.
+MAX_DISTANCE = 1.0
+# small_gicp's defaults, used for both
 TOLERANCES = {"translation_tolerance": 1e-3, "rotation_tolerance": np.radians(0.1)}
 
 Pair = tuple[np.ndarray, np.ndarray, np.ndarray]
 
 
 def lidar_pairs(count: int, keep: float, thinned: float | None) -> list[Pair]:
-    """Resamplings and random rigid moves of one pair of scans, thinned first: source, target and the true pose."""
+    """Random resamplings and rigid motions of one pair of downsampled scans: source, target and the true pose."""
     import mcgicp_jax as mcg
 
     folder = DATA / "lidar_pair"
@@ -53,7 +52,9 @@ def ours(pairs: list[Pair], voxel: float | None) -> list[np.ndarray]:
     import mcgicp_jax as mcg
 
     sources, targets = ([pair[side].astype(np.float32) for pair in pairs] for side in (0, 1))
-    results = mcg.register_batch(sources, targets, mcg.GICP(), max_distance=GATE, voxel_size=voxel, **TOLERANCES)
+    results = mcg.register_batch(
+        sources, targets, mcg.GICP(), max_distance=MAX_DISTANCE, voxel_size=voxel, **TOLERANCES
+    )
     return [np.asarray(result.matrix) for result in results]
 
 
@@ -63,7 +64,7 @@ def theirs(pairs: list[Pair], voxel: float | None) -> list[np.ndarray]:
     poses = []
     for source, target, _ in pairs:
         (a, _), (b, tree) = (_prepared(cloud.astype(float), voxel) for cloud in (source, target))
-        result = small_gicp.align(b, a, tree, np.eye(4), max_correspondence_distance=GATE, num_threads=1)
+        result = small_gicp.align(b, a, tree, np.eye(4), max_correspondence_distance=MAX_DISTANCE, num_threads=1)
         poses.append(np.asarray(result.T_target_source))
     return poses
 
@@ -86,7 +87,7 @@ def _serve(connection: Any, pairs: list[Pair], voxel: float | None) -> None:
 
 
 class Processes:
-    """small_gicp in several processes, each with its share of the pairs."""
+    """small_gicp in several processes that divide the pairs among them."""
 
     def __init__(self, pairs: list[Pair], voxel: float | None, count: int):
         context = multiprocessing.get_context("spawn")
@@ -101,10 +102,10 @@ class Processes:
     def __call__(self) -> list[np.ndarray]:
         for connection in self._connections:
             connection.send(True)
-        shares = [connection.recv() for connection in self._connections]
-        poses: list[Any] = [None] * sum(map(len, shares))
-        for i, share in enumerate(shares):
-            poses[i :: len(shares)] = share
+        parts = [connection.recv() for connection in self._connections]
+        poses: list[Any] = [None] * sum(map(len, parts))
+        for i, part in enumerate(parts):
+            poses[i :: len(parts)] = part
         return poses
 
     def close(self) -> None:
@@ -113,7 +114,7 @@ class Processes:
 
 
 def _timed(function: Callable[[], Any]) -> tuple[float, float, Any]:
-    """Wall time, and processor time of this process alone."""
+    """Wall time, processor time of this process alone, and the return value."""
     wall, cpu = time.perf_counter(), time.process_time()
     answer = function()
     return time.perf_counter() - wall, time.process_time() - cpu, answer
@@ -151,7 +152,7 @@ def _size(pair: Pair, voxel: float | None) -> int:
 
 
 def memory() -> None:
-    """Peak memory of streams of clouds that are made as they are consumed."""
+    """Peak memory of streams of clouds that are generated as they are consumed."""
     import mcgicp_jax as mcg
 
     rng = np.random.default_rng(0)

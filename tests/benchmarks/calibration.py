@@ -1,12 +1,12 @@
-"""Whether the covariance of a pose can be believed: errors of simulated registrations beside what was claimed.
+"""Calibration of the covariance of a pose: errors of simulated registrations compared with their covariances.
 
     python -m tests.benchmarks.calibration [--pairs 84]
 
 Three scenes with exact truth (a furnished room, a street, a wall of posters), two noise levels, fresh rays and noise
-for every pair. Printed is the normalised estimation error squared per degree of freedom, eᵀ C⁻¹ e / d, averaged over
-the pairs: 1 where the claims are right, above where they are too bold, below where they are too modest. d counts the
-directions that are held. Beside `Registration.covariance` stand those of the same poses by the inverse Hessian: bare,
-scaled by the variance of the residuals, and small_gicp's for the same clouds.
+for every pair. The table has the normalised estimation error squared per degree of freedom, eᵀ C⁻¹ e / d, averaged over
+the pairs: 1 if C is right, above if too small, below if too large. d is the number of constrained directions.
+For comparison with `Registration.covariance`, C is also the inverse Hessian: unscaled, scaled by the variance of the
+residuals, and small_gicp's for the same clouds.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ def wall(noise: float) -> datasets.SyntheticFrames:
     return datasets.poster_wall(2, noise=noise)
 
 
-# Scene, largest distance of a pair in metres
+# Scene, max_distance in metres
 SCENES: dict[str, tuple[Callable[[float], datasets.SyntheticFrames], float]] = {
     "box room": (box_room, 0.5),
     "street": (street, 1.5),
@@ -54,7 +54,7 @@ def twist_error(matrix: np.ndarray, truth: np.ndarray) -> np.ndarray:
 
 
 def normalised(error: np.ndarray, covariance: np.ndarray, directions: Directions) -> float:
-    """eᵀ C⁻¹ e / d among the directions that are held."""
+    """eᵀ C⁻¹ e / d in the subspace of the constrained directions."""
     coefficients = np.linalg.inv(np.asarray(directions.twists, np.float64).T)[np.asarray(directions.held)]
     error, covariance = coefficients @ error, coefficients @ covariance @ coefficients.T
     return float(error @ np.linalg.solve(covariance, error) / len(error))
@@ -63,13 +63,13 @@ def normalised(error: np.ndarray, covariance: np.ndarray, directions: Directions
 def peers_hessian(
     source: np.ndarray, target: np.ndarray, truth: np.ndarray, max_distance: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """small_gicp's error and H⁻¹ in the same twist, ξ = (v, ω)."""
+    """Error and H⁻¹ of small_gicp for the twist ξ = (v, ω)."""
     clouds = [small_gicp.preprocess_points(points, 0.001, num_neighbors=20)[0] for points in (target, source)]
     tree = small_gicp.KdTree(clouds[0])
     result = small_gicp.align(
         *clouds, tree, init_T_target_source=truth, registration_type="GICP", max_correspondence_distance=max_distance
     )
-    # Its twist is (ω, v).
+    # small_gicp orders the twist as (ω, v).
     order = [3, 4, 5, 0, 1, 2]
     return twist_error(result.T_target_source, truth), np.linalg.inv(result.H[np.ix_(order, order)])
 

@@ -1,17 +1,16 @@
-"""The readers of `mcgicp_jax.io` under mutated files: by the hundred thousand, each answered by a cloud or an error.
+"""Fuzz test of the readers of `mcgicp_jax.io`: every mutated file must give a cloud or a proper error.
 
     python -m tests.benchmarks.fuzz [--minutes 10] [--seed 0] [--findings FOLDER]
 
-Seeds are valid files of every format and encoding, the heads of real scans among them where there are any. Their bytes
-are flipped, cut, spliced and exchanged, and the numbers in their headers become enormous. A file is a finding if its
-reader
+Seeds are valid files of every format and encoding, and the heads of real scans if there are any. Mutations flip, cut,
+splice and exchange bytes, and put enormous numbers into headers. A file is a finding if its reader
 
-- raises anything but `ValueError` or `OSError`, or an error without the path;
-- ran out of memory, where it may take 1 GiB, or made the process larger by more than 256 MiB;
-- needs more than 20 seconds, or ends the process;
-- runs code: unpickles something, starts a process, imports or executes what was not there before.
+- raises anything but `ValueError` or `OSError`, or an error that does not name the path;
+- runs out of 1 GiB of memory, or makes the process grow by more than 256 MiB;
+- takes more than 20 seconds, or ends the process;
+- runs code: unpickles an object, starts a process, or loads marshalled code.
 
-Findings are kept as files. They are read in a process of its own, so that nothing that happens there is missed.
+Findings are saved as files. A separate process reads the files, so that crashes are findings too.
 """
 
 from __future__ import annotations
@@ -43,7 +42,7 @@ from tests.conftest import DATA
 _SECONDS = 20
 _MEMORY = 2**30
 _GROWTH_KIB = 2**18
-# Raised by what runs code, or by what could.
+# Audit events of operations that run code, or could
 _EVENTS = (
     "pickle.find_class",
     "os.system",
@@ -91,7 +90,7 @@ def bytes_of_las(folder: pathlib.Path, point_format: int) -> bytes:
 
 
 def real_heads(folder: pathlib.Path) -> Seeds:
-    """The headers that other programs wrote, made to fit the first 40 points."""
+    """The heads of files written by other programs: the first 40 points, with a header adapted to them."""
     rows = 40
     files: Seeds = []
     for path in [*DATA.glob("lidar_pair/*.ply"), *DATA.glob("lidar_pair/*.pcd")]:
@@ -108,7 +107,7 @@ def real_heads(folder: pathlib.Path) -> Seeds:
 
 
 def mutated(content: bytes, others: list[bytes], rng: np.random.Generator) -> bytes:
-    """The file after one to five changes, most of them in the first 600 bytes."""
+    """The file after one to five mutations, most of them in the first 600 bytes."""
     for _ in range(rng.integers(1, 6)):
         change = MUTATIONS[rng.integers(len(MUTATIONS))]
         within = min(len(content), 600) if rng.random() < 0.7 else len(content)
@@ -137,7 +136,7 @@ def _put_word(content: bytes, at: int, others: list[bytes], rng: np.random.Gener
 
 
 def _lie(content: bytes, at: int, others: list[bytes], rng: np.random.Generator) -> bytes:
-    """Another number in a text header."""
+    """Replace a number in a text header."""
     number = b"%d" % _NUMBERS[rng.integers(len(_NUMBERS))]
     return content[:at] + re.sub(rb"\d+", number, content[at:], count=1)
 
@@ -166,7 +165,7 @@ def _splice(content: bytes, at: int, others: list[bytes], rng: np.random.Generat
 
 
 def _within_zip(content: bytes, at: int, others: list[bytes], rng: np.random.Generator) -> bytes:
-    """An .npz whose checksums are right and whose arrays are not."""
+    """Mutate an array inside an .npz, whose checksums stay right."""
     try:
         with zipfile.ZipFile(BytesIO(content)) as archive:
             parts = [(name, archive.read(name)) for name in archive.namelist()]
@@ -189,7 +188,7 @@ MUTATIONS: list[Callable[[bytes, int, list[bytes], np.random.Generator], bytes]]
 
 
 def files(valid: Seeds, seed: int, first: int) -> Iterator[tuple[int, str, bytes]]:
-    """File after file, without end."""
+    """Endless mutated files: number, suffix and content."""
     for number in itertools.count(first):
         rng = np.random.default_rng((seed, number))
         suffix, content = valid[number % len(valid)]
@@ -198,10 +197,10 @@ def files(valid: Seeds, seed: int, first: int) -> Iterator[tuple[int, str, bytes
 
 
 def read_all(seed: int, first: int, folder: str, progress: Any, findings: Any) -> None:
-    """In a process of its own: reads until it is ended."""
+    """Read mutated files until the process is killed; runs in a separate process."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     warnings.simplefilter("ignore")
-    # What libraries import with their first file, they import now.
+    # Let libraries do now what they import with their first file.
     valid = seeds()
     for suffix, content in valid:
         path = pathlib.Path(folder, f"file{suffix}")
@@ -240,7 +239,7 @@ def read_all(seed: int, first: int, folder: str, progress: Any, findings: Any) -
 
 
 def read(path: pathlib.Path) -> str:
-    """What became of a file."""
+    """Read a file; return "a cloud", "an error" or the finding."""
     try:
         io.read(path)
     except (ValueError, OSError) as error:
@@ -259,7 +258,7 @@ def main() -> None:
     parser.add_argument("--findings", type=pathlib.Path, default=pathlib.Path("fuzz_findings"))
     options = parser.parse_args()
     context = mp.get_context("spawn")
-    # Number of the file, whether it is being read; clouds and errors so far.
+    # Number of the file, whether it is being read, clouds so far, errors so far
     progress, findings = context.Array("q", 4), context.Queue()
     kept: list[tuple[str, str, bytes]] = []
     end, first = time.monotonic() + 60 * options.minutes, 0
@@ -286,7 +285,7 @@ def main() -> None:
 
 
 def watch_over(worker: Any, progress: Any, end: float) -> str:
-    """Returns when the time is up, with nothing, or what the reader did instead of going on."""
+    """Return "" when the time is up, or the finding if the reader crashes or hangs."""
     since, last = time.monotonic(), -1
     while time.monotonic() < end:
         worker.join(0.5)

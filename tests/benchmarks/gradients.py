@@ -1,7 +1,7 @@
-"""What a gradient costs: against the unrolled autograd of PyPose's ICP, and against registration without a gradient.
+"""Cost of a gradient, compared with unrolled autograd of PyPose's ICP and with registration without a gradient.
 
-Run `python -m tests.benchmarks.gradients`; see README.md. Every library and size lives in a process of its own, which
-waits while another runs; libraries take turns, run by run, and what is compared is compared within one turn.
+Run `python -m tests.benchmarks.gradients`; see README.md. Every library and size has its own process, which waits while
+another runs; libraries take turns, and ratios are computed within one turn.
 """
 
 from __future__ import annotations
@@ -21,12 +21,12 @@ from typing import Any
 
 import numpy as np
 
-# Points and runs: PyPose takes seconds for 5,000.
+# Numbers of points and runs: PyPose takes seconds for 5,000.
 AGAINST_PYPOSE = {1000: 7, 2000: 7, 5000: 3}
 AGAINST_PLAIN = {2000: 15, 6000: 15, 20000: 9}
-# PyPose keeps every pair, so must we: the scene is 2 m wide.
+# max_distance, metres. PyPose rejects no match, nor do we at 10 m: the scene is 2 m wide.
 KEEP_ALL = 10.0
-GATE = 0.4
+MAX_DISTANCE = 0.4
 NOISE = 0.02
 STEP = 1e-6
 NUM_DIFFERENCES = 30
@@ -38,7 +38,7 @@ Worker = Callable[..., dict[str, Any]]
 
 
 def _status(name: str) -> float:
-    """A line of /proc/self/status, MB; elsewhere than on Linux the largest memory so far."""
+    """Value of a line of /proc/self/status in MB; the peak memory on systems other than Linux."""
     with contextlib.suppress(OSError), open("/proc/self/status", encoding="ascii") as lines:
         for line in lines:
             if line.startswith(name):
@@ -47,9 +47,9 @@ def _status(name: str) -> float:
 
 
 def _peak(function: Callable[[], Any]) -> float:
-    """By how much a call raises the memory of this process at its peak, MB."""
+    """Peak memory of this process during a call, above that before it; MB."""
     gc.collect()
-    # What earlier calls and the compiler have freed goes back to the system first, and the peak is forgotten.
+    # Return freed memory to the system, and reset the peak.
     with contextlib.suppress(OSError, AttributeError):
         ctypes.CDLL("libc.so.6").malloc_trim(0)
     with contextlib.suppress(OSError), open("/proc/self/clear_refs", "w", encoding="ascii") as file:
@@ -69,7 +69,7 @@ def _timed(function: Callable[[], Any]) -> tuple[float, Any]:
 
 
 class Process:
-    """A library with its clouds, compiled and warm, that runs when it is asked to."""
+    """A process with one library and its clouds, compiled and warm, that computes on request."""
 
     def __init__(self, build: Callable[..., Worker], *args: Any):
         context = multiprocessing.get_context("spawn")
@@ -96,7 +96,7 @@ def _serve(connection: Any, build: Callable[..., Worker], args: tuple[Any, ...])
 
 
 def pypose_worker(source: np.ndarray, target: np.ndarray, truth: np.ndarray) -> Worker:
-    """PyPose's ICP, as many iterations as it is told, and the gradient that autograd finds through all of them."""
+    """PyPose's ICP with a given number of iterations, and the gradient by autograd through all of them."""
     import torch
     from pypose.module import ICP
     from pypose.utils import ReduceToBason
@@ -107,7 +107,7 @@ def pypose_worker(source: np.ndarray, target: np.ndarray, truth: np.ndarray) -> 
     def pose_of(T: Any, reader: str) -> Any:
         if reader == "matrix":
             return T.matrix()
-        # From the numbers of the quaternion, past PyPose's own operations: see README.md.
+        # From the quaternion's entries, without PyPose's own operations: see README.md.
         x, y, z, w = T.tensor()[3:]
         rotation = [
             *(1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)),
@@ -117,7 +117,7 @@ def pypose_worker(source: np.ndarray, target: np.ndarray, truth: np.ndarray) -> 
         return torch.cat([torch.stack(rotation).reshape(3, 3), T.tensor()[:3, None]], dim=1)
 
     def value_and_gradient(points: Any, iterations: int, reader: str) -> tuple[Any, Any, Any]:
-        # No loss is small enough to stop at, and patience does not end.
+        # Never stop early: zero tolerance, and more patience than iterations.
         icp = ICP(stepper=ReduceToBason(steps=iterations, patience=iterations + 1, tol=0))
         points = points.requires_grad_()
         matrix = pose_of(icp(points, fixed), reader)
@@ -148,7 +148,7 @@ def our_worker(
     settings: dict[str, Any],
     plain: bool = False,
 ) -> Worker:
-    """`register` with its gradient, and, if `plain`, the jitted call and the host call without one."""
+    """`register` with its gradient, and, if `plain`, the jitted and the host call without a gradient."""
     os.environ["JAX_PLATFORMS"] = "cpu"
     os.environ["JAX_ENABLE_X64"] = str(int(source[0].dtype == np.float64))
     import jax
@@ -157,7 +157,7 @@ def our_worker(
 
     method = getattr(mcg, method_name)()
     moving, fixed = (mcg.preprocess(mcg.PointCloud(*cloud)) for cloud in (source, target))
-    # A row of padding in the target, to be stamped.
+    # A row of padding in the target, changed in every call.
     fixed = fixed.pad(len(fixed) + 1)
     stamped = jax.numpy.asarray(fixed.points)
 
@@ -176,7 +176,7 @@ def our_worker(
 
     def answer(points: np.ndarray | None = None, kind: str = "gradient", memory: bool = False) -> dict[str, Any]:
         nonlocal stamp
-        # Trees are kept by the content of the target: a number in its padding makes every call build its own.
+        # Trees are cached by the content of the target: changing its padding makes every call build a tree.
         stamp += 1
         target_points = jax.block_until_ready(stamped.at[-1, 0].set(stamp))
         start = jax.block_until_ready(jax.numpy.asarray(moving.points if points is None else points))
@@ -208,7 +208,7 @@ def our_worker(
 
 
 def _clouds(size: int, dtype: type) -> tuple[tuple[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray], np.ndarray]:
-    """Two samples of a room's corner, independent and noisy, and the motion between them."""
+    """Two independent noisy samples of a room's corner, and the motion between them."""
     from tests.scenes import motion, room_corner
 
     truth = motion()
@@ -232,7 +232,7 @@ def _table(title: str, names: list[str], rows: list[list[str]]) -> None:
 
 
 def against_pypose() -> None:
-    """Time and memory of value and gradient, point-to-point ICP, as many iterations for both."""
+    """Time and memory of value and gradient, point-to-point ICP, with the same number of iterations."""
     times, memories = [], []
     for size, runs in AGAINST_PYPOSE.items():
         source, target, truth = _clouds(size, np.float32)
@@ -277,12 +277,12 @@ def against_pypose() -> None:
 
 
 def against_plain() -> None:
-    """What a gradient adds to a registration."""
+    """Cost of value and gradient relative to registration without a gradient."""
     rows = []
     for method in ("GICP", "MultiChannelGICP"):
         for size, runs in AGAINST_PLAIN.items():
             source, target, truth = _clouds(size, np.float32)
-            ours = Process(our_worker, method, source, target, truth, {"max_distance": GATE}, True)
+            ours = Process(our_worker, method, source, target, truth, {"max_distance": MAX_DISTANCE}, True)
             turns = [{kind: ours(None, kind) for kind in ("gradient", "plain", "host")} for _ in range(runs)]
             memory = ours(None, "gradient", True)
             ours.close()
@@ -311,7 +311,7 @@ def against_plain() -> None:
 
 
 def correctness(with_pypose: bool) -> None:
-    """Gradients against central differences of each library's own pose error, float64, for some coordinates."""
+    """Gradients against central differences of each library's own pose error in some coordinates, float64."""
     import scipy.spatial
 
     source, target, truth = _clouds(300, np.float64)
@@ -335,7 +335,7 @@ def correctness(with_pypose: bool) -> None:
     rows = []
     for name, evaluate in cases.items():
         found = evaluate(source[0])
-        at_rest = matches(source[0], found["matrix"])
+        unperturbed = matches(source[0], found["matrix"])
         differences, changed = [], 0
         for coordinate in chosen:
             values = []
@@ -343,7 +343,7 @@ def correctness(with_pypose: bool) -> None:
                 points = source[0].copy()
                 points.flat[coordinate] += step
                 moved = evaluate(points)
-                changed += np.any(matches(points, moved["matrix"]) != at_rest)
+                changed += np.any(matches(points, moved["matrix"]) != unperturbed)
                 values.append(moved["loss"])
             differences.append((values[0] - values[1]) / (2 * STEP))
         error = _relative(found["gradient"].flat[chosen], np.array(differences))
@@ -368,7 +368,7 @@ def main() -> None:
     with_pypose = importlib.util.find_spec("pypose") is not None
     print(f"{os.cpu_count()} cores, load {os.getloadavg()[0]:.1f} before")
     if not with_pypose:
-        print("PyPose is not installed: what needs it is skipped")
+        print("PyPose is not installed: its parts are skipped")
     seconds, _ = _timed(lambda: _run(chosen, with_pypose))
     print(f"load {os.getloadavg()[0]:.1f} after {seconds:.0f} s")
 

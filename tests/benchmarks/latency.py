@@ -1,7 +1,7 @@
-"""What users wait for: first calls, clouds of other sizes, gradients, batches, the command line.
+"""Latency for users: first calls, clouds of new sizes, gradients, batches, the command line.
 
-Run `python -m tests.benchmarks.latency`; see README.md. Every part runs in fresh processes with a cache folder of its
-own; compilations are counted with `jax.monitoring`.
+Run `python -m tests.benchmarks.latency`; see README.md. Every part runs in new processes with its own cache
+folder; compilations are counted with `jax.monitoring`.
 """
 
 from __future__ import annotations

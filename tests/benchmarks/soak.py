@@ -1,11 +1,11 @@
-"""Many registrations in one process: does it grow?
+"""Memory of one process over many registrations.
 
     python -m tests.benchmarks.soak [--registrations 10000]
 
-Clouds of 100 to 288 points, each of another size than the last, by GICP and by MC-GICP with a robust kernel, every
-fifth pair at UTM coordinates, every hundredth inside `jax.jit`. Printed are the memory of the process (resident, after
-a garbage collection), the pieces that it is mapped in (Linux grants 65,530), what JAX has compiled, and how many trees
-are kept for callbacks. Nothing should grow but the trees, up to their limit.
+Registers clouds of 100 to 288 points of random sizes by GICP, and by MC-GICP with a robust kernel; every fifth pair is
+at UTM coordinates, every hundredth inside `jax.jit`. Prints resident memory after a garbage collection, the number of
+memory maps (Linux allows 65,530), of compilations, and of trees cached for callbacks. Only the trees should grow, up to
+their limit.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ _UTM = np.array([4.5e5, 5.2e6, 300.0])
 
 
 class Compilations(logging.Handler):
-    """Counts what JAX compiles, by its own log."""
+    """Count compilations from JAX's log."""
 
     def __init__(self) -> None:
         super().__init__(logging.WARNING)

@@ -1,7 +1,7 @@
-"""One pair at a time, beside small_gicp and Open3D: preprocessing, alignment and the whole, over sizes of clouds.
+"""Time to preprocess and align one pair, compared with small_gicp and Open3D, for clouds of several sizes.
 
-Run `python -m tests.benchmarks.speed`; see README.md. All libraries get the same clouds and take turns in one process,
-and what is compared is compared within one turn. Open3D is left out where it is not installed.
+Run `python -m tests.benchmarks.speed`; see README.md. All libraries get the same clouds and take turns in one process;
+ratios are computed within one turn. Open3D is left out if it is not installed.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ import mcgicp_jax as mcg
 
 DATA = pathlib.Path(os.environ.get("MCGICP_DATA", pathlib.Path(__file__).parents[3] / "shared" / "data"))
 NUM_TURNS = 9
-# Of small_gicp by default, for all.
+# small_gicp's defaults, used for all
 TOLERANCES = {"translation_tolerance": 1e-3, "rotation_tolerance": np.radians(0.1)}
 MAX_ITERATIONS = 20
 NUM_NEIGHBORS = 20
@@ -47,7 +47,7 @@ def kitti() -> tuple[np.ndarray, np.ndarray]:
 
 
 def million() -> tuple[np.ndarray, np.ndarray]:
-    """A rolling landscape of a million points, twice, half a metre apart."""
+    """Two samples of an undulating surface, a million points each, 0.4 m apart."""
     clouds = []
     for seed in (0, 1):
         x, y = np.random.default_rng(seed).random((2, 1_000_000)) * 200
@@ -65,14 +65,14 @@ CASES: dict[str, tuple[Callable[[], tuple[np.ndarray, np.ndarray]], float | None
 }
 
 
-def ours(source: np.ndarray, target: np.ndarray, voxel: float | None, gate: float) -> Stages:
+def ours(source: np.ndarray, target: np.ndarray, voxel: float | None, max_distance: float) -> Stages:
     begin = time.perf_counter()
-    # Two clouds side by side, as one would where there is more than one core.
+    # Preprocess the two clouds in parallel.
     clouds = list(
         THREADS.map(lambda cloud: mcg.preprocess(cloud.astype(np.float32), voxel, NUM_NEIGHBORS), (source, target))
     )
     ready = time.perf_counter()
-    result = mcg.register(*clouds, mcg.GICP(), max_distance=gate, max_iterations=MAX_ITERATIONS, **TOLERANCES)
+    result = mcg.register(*clouds, mcg.GICP(), max_distance=max_distance, max_iterations=MAX_ITERATIONS, **TOLERANCES)
     return ready - begin, time.perf_counter() - ready, np.asarray(result.matrix)
 
 
@@ -87,7 +87,7 @@ def small(num_threads: int) -> Callable[..., Stages]:
         small_gicp.estimate_covariances(cloud, tree, NUM_NEIGHBORS, num_threads)
         return cloud, tree
 
-    def run(source: np.ndarray, target: np.ndarray, voxel: float | None, gate: float) -> Stages:
+    def run(source: np.ndarray, target: np.ndarray, voxel: float | None, max_distance: float) -> Stages:
         begin = time.perf_counter()
         (a, _), (b, tree) = (prepared(cloud, voxel) for cloud in (source, target))
         ready = time.perf_counter()
@@ -96,7 +96,7 @@ def small(num_threads: int) -> Callable[..., Stages]:
             a,
             tree,
             np.eye(4),
-            max_correspondence_distance=gate,
+            max_correspondence_distance=max_distance,
             num_threads=num_threads,
             max_iterations=MAX_ITERATIONS,
         )
@@ -105,7 +105,7 @@ def small(num_threads: int) -> Callable[..., Stages]:
     return run
 
 
-def open3d(source: np.ndarray, target: np.ndarray, voxel: float | None, gate: float) -> Stages:
+def open3d(source: np.ndarray, target: np.ndarray, voxel: float | None, max_distance: float) -> Stages:
     import open3d as o3d
 
     pipeline = o3d.pipelines.registration
@@ -119,7 +119,7 @@ def open3d(source: np.ndarray, target: np.ndarray, voxel: float | None, gate: fl
     ready = time.perf_counter()
     result = pipeline.registration_generalized_icp(
         *clouds,
-        gate,
+        max_distance,
         np.eye(4),
         pipeline.TransformationEstimationForGeneralizedICP(),
         pipeline.ICPConvergenceCriteria(max_iteration=MAX_ITERATIONS),
@@ -128,7 +128,7 @@ def open3d(source: np.ndarray, target: np.ndarray, voxel: float | None, gate: fl
 
 
 def colored() -> None:
-    """MC-GICP as it comes beside Open3D's colored ICP at one scale: six pairs of a flat table, from raw clouds."""
+    """MC-GICP with its defaults and Open3D's colored ICP at one scale, on six raw pairs of a flat table."""
     import open3d as o3d
 
     from tests.benchmarks import accuracy
@@ -177,7 +177,7 @@ def turns(chart: pathlib.Path | None, chosen: list[str]) -> None:
     print(f"{'clouds':>20} {'points':>9}{header} {ratios_header}")
     drawn: dict[str, list[tuple[int, float]]] = {name: [] for name in libraries}
     for case in chosen:
-        load, voxel, gate, count = CASES[case]
+        load, voxel, max_distance, count = CASES[case]
         source, target = load()
         times: dict[str, list[tuple[float, float]]] = {name: [] for name in libraries}
         work: dict[str, list[float]] = {name: [] for name in libraries}
@@ -185,8 +185,8 @@ def turns(chart: pathlib.Path | None, chosen: list[str]) -> None:
         for turn in range(count + 1):
             for name, run in libraries.items():
                 begin = time.process_time()
-                *stages, poses[name] = run(source, target, voxel, gate)
-                # The first turn compiles and warms.
+                *stages, poses[name] = run(source, target, voxel, max_distance)
+                # The first turn compiles and warms caches.
                 if turn:
                     times[name].append((stages[0], stages[1]))
                     work[name].append(time.process_time() - begin)
@@ -212,7 +212,7 @@ def turns(chart: pathlib.Path | None, chosen: list[str]) -> None:
 
 
 def _ratio(times: dict[str, list[tuple[float, float]]], stage: slice) -> float:
-    """Ours over the better of small_gicp with one and two threads, turn by turn."""
+    """Median ratio, within turns, of our time to the better of small_gicp with one and two threads."""
     rows = zip(times["ours"], times["small 1"], times["small 2"], strict=True)
     return statistics.median(sum(a[stage]) / min(sum(b[stage]), sum(c[stage])) for a, b, c in rows)
 
@@ -246,7 +246,7 @@ print(imported - begin, time.perf_counter() - imported)
 
 
 def starts(folder: pathlib.Path) -> None:
-    """Import, first call, and first call of a second process, in fresh processes; seconds."""
+    """Seconds to import, for a first call, and for a first call with cached programs, each in a new process."""
 
     def run(code: str, **environment: str) -> list[float]:
         text = subprocess.run(
