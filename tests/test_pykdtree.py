@@ -1,0 +1,81 @@
+"""pykdtree in place of SciPy's tree: the same matches, bit for bit."""
+
+import itertools
+
+import jax
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+import mcgicp_jax as mcg
+from mcgicp_jax import _pykdtree
+from mcgicp_jax._pykdtree import PyKDTree
+from mcgicp_jax._search import Rows
+
+pytest.importorskip("pykdtree")
+SCIPY, PYKDTREE = (mcg.KDTreeSearch(backend=name) for name in ("scipy", "pykdtree"))
+STILL = np.array([1.0, 0, 0, 0, 0, 0, 0])
+
+
+@settings(max_examples=60, deadline=None)
+@given(
+    seed=st.integers(0, 2**31),
+    size=st.integers(4, 300),
+    k=st.integers(1, 25),
+    num_channels=st.integers(0, 3),
+    high=st.sampled_from([3, 50, None]),
+    max_distance=st.sampled_from([0.7, 3.0, np.inf]),
+)
+def test_it_finds_the_same(seed, size, k, num_channels, high, max_distance):
+    """Few integers, so that most distances are shared and points coincide; and random numbers."""
+    rng = np.random.default_rng(seed)
+
+    def draw(count, columns):
+        return (
+            rng.normal(size=(count, columns)) if high is None else rng.integers(0, high, (count, columns)).astype(float)
+        )
+
+    points = draw(size, 3)
+    np.testing.assert_array_equal(PYKDTREE.neighbors(points, k), SCIPY.neighbors(points, k))
+    source, target = (Rows(draw(n, 3), draw(n, num_channels), np.ones(n, bool)) for n in (40, size))
+    found = [search.index(target).nearest(STILL, source, max_distance, 2) for search in (PYKDTREE, SCIPY)]
+    np.testing.assert_array_equal(*found)
+
+
+def test_it_is_used_where_it_wins(monkeypatch):
+    points = np.random.default_rng(0).normal(size=(50, 6))
+    for search in (mcg.KDTreeSearch(), PYKDTREE):
+        assert isinstance(search.build(points[:, :3]), PyKDTree)
+        assert not isinstance(search.build(points), PyKDTree)
+    assert not isinstance(SCIPY.build(points[:, :3]), PyKDTree)
+    monkeypatch.setattr("mcgicp_jax._trees.has_pykdtree", lambda: False)
+    assert not isinstance(mcg.KDTreeSearch().build(points[:, :3]), PyKDTree)
+    with pytest.raises(ValueError, match=r"pip install 'mcgicp_jax\[fast\]'"):
+        mcg.KDTreeSearch(backend="pykdtree")
+    with pytest.raises(ValueError, match="backend: expected"):
+        mcg.KDTreeSearch(backend="nanoflann")
+
+
+def test_more_neighbors_than_it_is_good_at():
+    points = np.random.default_rng(0).normal(size=(400, 3))
+    most = _pykdtree.MOST_NEIGHBORS
+    for k in (most - 1, most, most + 20):
+        np.testing.assert_array_equal(PYKDTREE.neighbors(points, k), SCIPY.neighbors(points, k))
+
+
+@pytest.mark.slow
+def test_real_scans_have_the_same_poses(data):
+    pair = [mcg.io.read(data / "lidar_pair" / f"{name}.ply") for name in ("source", "target")]
+    frames = mcg.datasets.kitti(data / "kitti" / "sequences" / "04")
+    clouds = [frame.cloud for frame in frames[:4]]
+    pairs = [(*pair, 0.1), (*pair, 0.5), *((later, sooner, 0.25) for sooner, later in itertools.pairwise(clouds))]
+    for source, target, voxel_size in pairs:
+        results = []
+        for search in (SCIPY, PYKDTREE):
+            clouds = [mcg.preprocess(cloud, voxel_size, search=search) for cloud in (source, target)]
+            results += [
+                [mcg.register(*clouds, method, search=search) for method in (mcg.GICP(), mcg.MultiChannelGICP())]
+            ]
+        for one, other in zip(*map(jax.tree.leaves, results), strict=True):
+            np.testing.assert_array_equal(np.asarray(one), np.asarray(other))
