@@ -1,4 +1,4 @@
-"""The point cloud: positions, channels, and the neighbours and covariances computed from them."""
+"""The point cloud: positions, channels, and optionally neighbours and given covariances."""
 
 from __future__ import annotations
 
@@ -144,8 +144,8 @@ class PointCloud(eqx.Module):
     def replace(self, **arrays: Any) -> PointCloud:
         """Return a copy with the given fields replaced (`points`, `channels`, `covariances`, ...).
 
-        An existing `channel_valid` also applies to new `channels`. Neighbours are not recomputed: to autodiff they are
-        constants.
+        An existing `channel_valid` also applies to new `channels`. `points` are relative to `origin`; `neighbors` stay
+        as they were, constants to autodiff.
 
         Raises:
             ValueError: if a field does not exist, or a shape or dtype does not fit the cloud.
@@ -301,7 +301,7 @@ class PointCloud(eqx.Module):
 
     @staticmethod
     def stack(clouds: Sequence[PointCloud]) -> PointCloud:
-        """Stack clouds along a new leading batch dimension for `jax.vmap`, padded to the size class of the largest.
+        """Stack clouds along a new leading batch dimension for `jax.vmap`, padded as `pad()` pads the largest.
 
         Raises:
             ValueError: if there are no clouds, or their channel names differ.

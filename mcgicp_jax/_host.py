@@ -4,10 +4,11 @@ The way of a source point from `PointCloud` to `Registration`, in ten sentences.
 neighbours of the point. `describe` computes local statistics from the neighbourhood: covariance, normal, channel fits.
 `method.covariance` and `channel_observability` turn these into the point's row of a `Surface`: position, covariance,
 observability. The search finds the target point nearest to the moved point in position and α · channel. NumPy gathers
-the surface row of this target point. `method.forces` computes force, stiffness and cost of the correspondence from the
-two rows. `sums_of` adds them over a block of correspondences, and `combine` adds the blocks. `update` computes the next
-pose from the sums, and search, sums and update repeat until the pose converges. At the final pose, `scores_of` computes
-the contribution of each correspondence to the covariance. `Registration` holds the pose, its status and its covariance.
+the surface row of this target point. `method.forces` computes from the two rows the cost of the correspondence, its
+force (−gradient/2) and stiffness (Hessian/2). `sums_of` adds them over a block of correspondences, and `combine` adds
+the blocks. `update` computes the next pose from the sums, and search, sums and update repeat until the pose converges.
+At the final pose, `scores_of` computes the contribution of each correspondence to the covariance. `Registration` holds
+the pose, its status and its covariance.
 """
 
 from __future__ import annotations

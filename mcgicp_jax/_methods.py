@@ -167,7 +167,7 @@ class ColorICP(AbstractOneSided):
     Attributes:
         channel_weights: α, scalar or (C,), metres per channel unit.
         missing_variance: scalar or (C,), channel units²: the squared difference that the search assumes for a channel
-            if a point of a correspondence lacks it. None: chosen from the data if points lack channels, see `chosen`.
+            if a point of a correspondence lacks it. Not an argument: set by `chosen` if points lack channels.
     """
 
     uses_channels: ClassVar[bool] = True
@@ -283,15 +283,15 @@ class MultiChannelGICP(AbstractGeneralized):
     def chosen(self, source: PointCloud, target: PointCloud, locals: tuple[Local, Local]) -> MultiChannelGICP:
         """The method with unset parameters chosen from the data; constants to autodiff.
 
-        The noise σ of a channel is the median residual of its linear fits over the tangent planes of the neighbourhoods
-        of both clouds. The difference of two measurements has variance 2 σ² from noise, and 1.5 times that standard
-        deviation in real scans, which includes edges and changes between the scans: Λ = 2 (1.5 σ)². α = 2.5 spacing/σ,
-        with the median distance between neighbouring target points: a difference of one σ then weighs as much as the
-        radius within which matches end up, so that channels choose among the points there. For constant channels α = 0.
+        σ, the noise of a channel, is the median over both clouds' points of the residual deviation of linear fits in
+        the tangent plane. Noise alone gives the difference of two measurements the variance 2 σ². In real scans its
+        standard deviation is 1.5 times that, because of edges and changes: Λ = 2 (1.5 σ)². α = 2.5 spacing/σ; the
+        spacing is the target's median nearest-neighbour distance. A difference of one σ then weighs as much as 2.5
+        spacings, the fine `max_distance`, so that channels choose among the points within it. Constant channels get α = 0.
 
-        The floor is chosen if neither it nor Λ is given. Along each axis within the surface, a match has the variance
-        0.72 spacing² for randomly placed points, and along the normal 2 λ₀, with the median smallest eigenvalue λ₀ of
-        the neighbourhoods. The floor is ε times the ratio of the two, limited to 0.005 to 1. As λ₀ includes the
+        The floor is chosen if neither it nor Λ is given. Between randomly placed points, a match has the variance 0.72
+        spacing² along each tangent axis, and 2 λ₀ along the normal, where λ₀ is the median smallest eigenvalue of the
+        neighbourhoods. The floor is ε times the ratio of the two, limited to 0.005 to 1. As λ₀ includes the
         curvature of the surface, the true ratio may be larger, so the estimate is used to raise the floor above 0.005
         (as for rendered scenes), but not to lower it.
         """

@@ -122,8 +122,8 @@ def align(
     Works under `jit`, `vmap`, `grad` and `jvp`. The derivative is that of the root of Σ w JᵀM(R) d = 0 near the
     returned pose (implicit function theorem): for fixed matches and neighbours, it is exact with respect to points,
     channels, given covariances, the parameters of the method and the robust scale, and zero with respect to `init`, on
-    which a root does not depend. It is zero, never NaN, if there is no such root: with too few matches, with an
-    unconstrained direction, or where Newton's method does not converge from the returned pose.
+    which a root does not depend. It is zero, never NaN, if there is no such root: with too few matches, with singular
+    information, or where Newton's method does not converge from the returned pose.
 
     Args:
         source, target: preprocessed clouds.
@@ -136,7 +136,8 @@ def align(
         temperature: metres; soft assignment of several candidates per source point, as in `mahalanobis_cost`.
 
     Returns:
-        The pose with its status; check `converged`. `directions` is None.
+        The pose with its status; check `converged`. `directions` is None: sliding, as of GICP along a plane, is not
+        detected.
 
     Raises:
         ValueError: if an argument is malformed; failures on well-formed input show in `Registration.status`.
@@ -181,8 +182,8 @@ def register(
 ) -> Registration:
     """Register two clouds: find matches at the current pose, update the pose, and repeat until it converges.
 
-    A coarse phase uses every n-th point of a source of 8,192 points or more (at least 4,096 of them) and the larger
-    `max_distance`. Near convergence, a fine phase with all points and the smaller `max_distance` takes over.
+    A coarse phase uses the larger `max_distance`, and of a source of 8,192 points or more an even subset of at least
+    4,096. Near convergence, a fine phase with all points and the smaller `max_distance` takes over.
 
     With concrete arrays (outside `jit`, `vmap`, `grad`) the loop runs on the host and calls compiled programs whose
     shapes do not depend on the sizes of the clouds. Inside a transformation it is one program, which finds matches by
@@ -190,8 +191,8 @@ def register(
     at the final matches.
 
     Args:
-        source, target: clouds from `preprocess`. Raw clouds and (N, 3) arrays, metres, are preprocessed with its
-            default arguments.
+        source, target: clouds from `preprocess`. Raw clouds and (N, 3) arrays, metres, are preprocessed with the
+            defaults of `preprocess`; not inside `jit`.
         method: `MultiChannelGICP()`, `GICP()`, `PointToPlane()`, `PointToPoint()` or `ColorICP(...)`. Parameters left
             None are estimated from the clouds.
         init: T_target_source to start from, `jaxlie.SE3` or (4, 4); the identity by default.
@@ -201,24 +202,26 @@ def register(
         max_iterations: maximum number of pose updates in both phases together.
         translation_tolerance, rotation_tolerance: metres (at the centroid of the matches) and radians; the loop has
             converged when an update is below both. `translation_tolerance` None: 0.5 % of the spacing of the target.
-        robust: kernel ρ applied to the Mahalanobis distance of each match: `Huber`, `Cauchy`, `GemanMcClure`, `Tukey`.
+        robust: kernel of each match's Mahalanobis distance, with a scale in the same unit: `Huber`, `Cauchy`,
+            `GemanMcClure`, `Tukey`.
         search: nearest-neighbour search; by default SciPy's k-d tree on CPUs and `DenseSearch` on accelerators.
-        hold_free_directions: keep the pose as it is in `init` along directions of motion that neither the shape of the
+        hold_free_directions: do not update the pose along unconstrained directions, which neither the shape of the
             clouds nor the channels (if the method uses them) constrain. If False, arbitrary nearest-neighbour matches
             decide there. The status is DEGENERATE in either case.
         match_channels: scale and shift each channel of the source to the distribution of the target's, for scans with
             different exposure or gain: first from the values of all points, then, in a second registration that starts
             at the pose of the first, from those of matched points.
         scales: voxel sizes, metres, from coarse to fine, for a start that is far off: the clouds are first registered
-            at each voxel size, with its own default `max_distance`, each time from the pose before. Not available
+            at each voxel size, in this order, each time from the pose before and with the default `max_distance`; the
+            one given is for the last registration. Not available
             inside transformations.
 
     Returns:
         The pose with its status, quality of the fit and uncertainty; check `converged`.
 
     Raises:
-        ValueError: if an argument is malformed, for instance in shape or dtype, clouds differ in their number of
-            channels or have fewer than four finite points, or `init` is not a rigid motion. The message names the
+        ValueError: if an argument is malformed, for instance in shape or dtype, numbers of channels differ where they
+            are used, a cloud has fewer than four finite points, or `init` is not a rigid motion. The message names the
             argument. Failures to register well-formed clouds show in `Registration.status`.
     Warns:
         UserWarning: if points with NaN or infinity are left out, or `MultiChannelGICP` gets clouds without channels.
@@ -269,13 +272,13 @@ def register_with(
 
 
 def _run(problem: Problem, target: PointCloud, search: AbstractSearch, max_iterations: int) -> Any:
-    """Run the loop. Returns its final state and a function for state with derivative, assessment and history."""
+    """Run the loop. Returns the final state, and a function for the differentiable state, assessment and history."""
     if is_concrete(problem):
         index = _index(search, problem.method, target)
         with computed_now():
             state, assessment, history = register_on_host(problem, index, search.num_threads)
         return state, lambda: (state, assessment, history)
-    # Stopped out here, so that autodiff does not trace into the compiled functions.
+    # Gradients stop here, so that autodiff does not enter the compiled functions.
     fixed = jax.lax.stop_gradient(problem)
     state, matches, history = register_traced(fixed, search, max_iterations)
 
@@ -340,7 +343,7 @@ def _settings(options: Options, target: PointCloud, stride: Any, dtype: Any) -> 
 
 
 def _index(search: AbstractSearch, method: AbstractMethod, target: PointCloud) -> AbstractIndex:
-    """Search index of the target, cached as long as the cloud is used."""
+    """Search index of the target, cached while the cloud lives."""
     count = target.channels.shape[-1]
     numbers = [] if method.weights(count) is None else [method.weights(count)]
     if numbers and target.channel_valid is not None:

@@ -60,10 +60,10 @@ class Update(eqx.Module):
 
 
 def solve_update(sums: Sums, basis: Float[Array, "6 6"]) -> Update:
-    """Minimise Σ w (d − D h)ᵀ M (d − D h) = e − 2⟨D, G⟩ + ⟨D, Q(D)⟩ over the pose change D = [ΔR − I | Δt], to full
-    convergence, with M and w held fixed.
+    """Minimise Σ w (d − D h)ᵀ M (d − D h) = e − 2⟨D, G⟩ + ⟨D, Q(D)⟩ (letters as in `_sums`) over the pose change D =
+    [ΔR − I | Δt], with M and w fixed.
 
-    Levenberg-Marquardt runs on 13 residuals, a square root of the (13, 13) quadratic form in (vec D, 1), so its cost
+    Levenberg-Marquardt runs on 13 residuals, a square root of the (13, 13) quadratic form in (vec D, 1), so its time
     does not depend on the number of points. Lengths are in units of `Sums.radius`, which puts translation and rotation
     on the same scale for clouds of any size.
 
@@ -120,7 +120,7 @@ class _TrustRegion(optx.AbstractSearch):
         size, accept, result, after = self.inner.step(first_step, y, y_eval, f_info, f_eval_info, state)
         cost = f_info.as_min()
         level = jnp.abs(f_eval_info.as_min() - cost) <= 8 * jnp.finfo(cost.dtype).eps * cost
-        # A rejected step would have raised the damping: restore it.
+        # The inner rejection raised the damping: restore it.
         before = state.step_size, state
         size, after = jax.tree.map(partial(jnp.where, level & ~accept), before, (size, after))
         return size, accept | level, result, after
