@@ -287,7 +287,8 @@ class MultiChannelGICP(AbstractGeneralized):
         the tangent plane. Noise alone gives the difference of two measurements the variance 2 σ². In real scans its
         standard deviation is 1.5 times that, because of edges and changes: Λ = 2 (1.5 σ)². α = 2.5 spacing/σ; the
         spacing is the target's median nearest-neighbour distance. A difference of one σ then weighs as much as 2.5
-        spacings, the fine `max_distance`, so that channels choose among the points within it. Constant channels get α = 0.
+        spacings, the fine `max_distance`, so that channels choose among the points within it. Constant channels get α =
+        0.
 
         The floor is chosen if neither it nor Λ is given. Between randomly placed points, a match has the variance 0.72
         spacing² along each tangent axis, and 2 λ₀ along the normal, where λ₀ is the median smallest eigenvalue of the
