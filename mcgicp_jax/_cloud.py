@@ -145,7 +145,7 @@ class PointCloud(eqx.Module):
         """Return a copy with the given fields replaced (`points`, `channels`, `covariances`, ...).
 
         An existing `channel_valid` also applies to new `channels`. `points` are relative to `origin`; `neighbors` stay
-        as they were, constants to autodiff.
+        as they were, constants to autodiff: after moves comparable to the spacing, preprocess again.
 
         Raises:
             ValueError: if a field does not exist, or a shape or dtype does not fit the cloud.

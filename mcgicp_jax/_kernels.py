@@ -33,8 +33,9 @@ class AbstractKernel(Numbers):
     """A robust kernel: cost ρ(s²) and weight dρ/d(s²) of a correspondence with Mahalanobis distance s; ρ ≈ s² near 0.
 
     Attributes:
-        scale: k, the Mahalanobis distance beyond which a correspondence is downweighted; in metres, since the
-            covariances of GICP are dimensionless (1 within the surface).
+        scale: k, the Mahalanobis distance at which weights fall (`Huber`: beyond it). Covariances of GICP are
+            dimensionless, 1 within the surface and ε = 0.001 across it: k = 1 is 1.4 m within the surface, but 4.5 cm
+            across it.
     """
 
     scale: Float[Array, ""]

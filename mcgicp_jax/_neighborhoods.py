@@ -242,8 +242,8 @@ def multichannel_covariance(
         kernel: λ_j of the neighbours, from `channel_kernel`.
         min_eigenvalue: floor for the eigenvalues of Ω, which approach 0 where no neighbour has similar channels.
 
-    Ω = Σ_w^{-1/2} Σ_t Σ_w^{-1/2} is computed as I + Σ_w^{-1/2} (Σ_t − Σ_w) Σ_w^{-1/2}, so that uniform channels give
-    GICP's covariance to rounding for any neighbourhood.
+    Ω = Σ_w^{-1/2} Σ_t Σ_w^{-1/2} (Σ_t weighted by λ, Σ_w unweighted) is computed as I + Σ_w^{-1/2} (Σ_t − Σ_w)
+    Σ_w^{-1/2}, to give GICP's covariance for uniform channels.
     """
     alike = weighted_covariance(_offsets(around), jnp.where(around.present, kernel, 0))
     u, v = alg.orthonormal_basis(local.normal)

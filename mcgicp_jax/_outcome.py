@@ -8,16 +8,15 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import jaxlie
 import numpy as np
 from jaxtyping import Array
 
 from mcgicp_jax._cloud import PointCloud
 from mcgicp_jax._deferred import Deferred
 from mcgicp_jax._directions import Directions
-from mcgicp_jax._pose import AnyArray, is_concrete, rotation_from_quaternion, se3_from_matrix
+from mcgicp_jax._pose import is_concrete, rotation_from_quaternion, se3_from_matrix
 from mcgicp_jax._result import Registration, pose_in_user_frame
-from mcgicp_jax._statistics import namespace
+from mcgicp_jax._statistics import constant, namespace
 from mcgicp_jax._step import Assessment, State
 
 
@@ -56,7 +55,7 @@ def registration_of(
         target_origin=target.origin,
         centred=pose,
         constraints=_later(lambda: _constraints(assessment, source.origin), concrete),
-        uncertainty=_later(lambda: _uncertainty(assessment, pose, state.sums.center, source.origin), concrete),
+        uncertainty=_later(lambda: _uncertainty(assessment, state, source.origin), concrete),
         **numbers,
     )
 
@@ -86,13 +85,9 @@ def _constraints(assessment: Assessment, origin: Any) -> tuple[Any, Directions |
         return to_centred.T @ information @ to_centred, directions
 
 
-def _uncertainty(assessment: Assessment, pose: jaxlie.SE3, center: AnyArray, origin: Any) -> tuple[Any, Any]:
-    """Covariance in the frame of the user's source, and standard deviations at the centroid of the matched points.
-
-    Args:
-        pose: between coordinates relative to the clouds' origins.
-        center: (3,) centroid of the moved, matched source points, metres.
-    """
+def _uncertainty(assessment: Assessment, state: State, origin: Any) -> tuple[Any, Any]:
+    """The covariance in the frame of the user's source, and the deviations at the centroid of the matched points."""
+    pose, center = constant((state.pose, state.sums.center))
     covariance = _read(assessment.covariance)
     xp = namespace(covariance, pose, center)
     with np.errstate(invalid="ignore", over="ignore"):

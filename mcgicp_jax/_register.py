@@ -62,7 +62,7 @@ def find_correspondences(
         max_distance: maximum correspondence distance, metres of position; matches beyond it are not `valid`.
         num_candidates: m, number of target points to find for each source point; more than one for the soft assignment
             of `align` and `mahalanobis_cost`.
-        search: nearest-neighbour search; by default SciPy's k-d tree on CPUs and `DenseSearch` on accelerators.
+        search: nearest-neighbour search; by default `KDTreeSearch` on CPUs and `DenseSearch` on accelerators.
 
     Returns:
         One match per source row; for m > 1 arrays of shape (m, N), nearest first. Constant to autodiff.
@@ -119,11 +119,12 @@ def align(
 ) -> Registration:
     """Compute the pose for fixed matches: update the pose, recompute M, and repeat until it converges. Pure JAX.
 
-    Works under `jit`, `vmap`, `grad` and `jvp`. The derivative is that of the root of Σ w JᵀM(R) d = 0 near the
-    returned pose (implicit function theorem): for fixed matches and neighbours, it is exact with respect to points,
-    channels, given covariances, the parameters of the method and the robust scale, and zero with respect to `init`, on
-    which a root does not depend. It is zero, never NaN, if there is no such root: with too few matches, with singular
-    information, or where Newton's method does not converge from the returned pose.
+    Works under `jit`, `vmap`, `grad` and `jvp`. The first derivative is that of the root of Σ w JᵀM d = 0 near the
+    returned pose (d = b − T a, J = ∂(T a)/∂ξ, robust weight w), by the implicit function theorem. Matches, neighbours
+    and estimated parameters are constants. It is exact with respect to points, channels, given covariances, given
+    parameters of the method (α: only with `temperature`) and the robust scale, and zero with respect to `init`, on
+    which a root does not depend. All of it is zero, never NaN, with too few matches, with singular `information`, or if
+    Newton's method does not converge from the returned pose. Second derivatives raise `NotImplementedError`.
 
     Args:
         source, target: preprocessed clouds.
@@ -186,8 +187,9 @@ def register(
     4,096. Near convergence, a fine phase with all points and the smaller `max_distance` takes over.
 
     With concrete arrays (outside `jit`, `vmap`, `grad`) the loop runs on the host and calls compiled programs whose
-    shapes do not depend on the sizes of the clouds. Inside a transformation it is one program, which finds matches by
-    host callbacks (with `DenseSearch`, in XLA). The pose is the same up to rounding; its derivative is that of `align`
+    shapes do not depend on the sizes of the clouds. Inside, it is one program per size of clouds, whose matches come
+    from host callbacks, one batch element at a time (with `DenseSearch`, from XLA). The pose is the same up to
+    rounding; its derivative is that of `align`
     at the final matches.
 
     Args:
@@ -196,15 +198,14 @@ def register(
         method: `MultiChannelGICP()`, `GICP()`, `PointToPlane()`, `PointToPoint()` or `ColorICP(...)`. Parameters left
             None are estimated from the clouds.
         init: T_target_source to start from, `jaxlie.SE3` or (4, 4); the identity by default.
-        max_distance: maximum correspondence distance, metres of position; matches beyond it are rejected. Two numbers
-            apply to the coarse and to the fine phase. None: 10 and 2.5 times the spacing of the target (its median
-            nearest-neighbour distance). A start that displaces the points further needs a larger value.
+        max_distance: maximum correspondence distance, metres of position; matches beyond it are rejected. One number,
+            or two, for the coarse and the fine phase. None: 10 and 2.5 times the spacing of the target (its median
+            nearest-neighbour distance). If `init` is further off, pass a larger value.
         max_iterations: maximum number of pose updates in both phases together.
         translation_tolerance, rotation_tolerance: metres (at the centroid of the matches) and radians; the loop has
             converged when an update is below both. `translation_tolerance` None: 0.5 % of the spacing of the target.
-        robust: kernel of each match's Mahalanobis distance, with a scale in the same unit: `Huber`, `Cauchy`,
-            `GemanMcClure`, `Tukey`.
-        search: nearest-neighbour search; by default SciPy's k-d tree on CPUs and `DenseSearch` on accelerators.
+        robust: kernel of each match's Mahalanobis distance: `Huber`, `Cauchy`, `GemanMcClure`, `Tukey`.
+        search: nearest-neighbour search; by default `KDTreeSearch` on CPUs and `DenseSearch` on accelerators.
         hold_free_directions: do not update the pose along unconstrained directions, which neither the shape of the
             clouds nor the channels (if the method uses them) constrain. If False, arbitrary nearest-neighbour matches
             decide there. The status is DEGENERATE in either case.

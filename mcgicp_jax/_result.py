@@ -24,8 +24,8 @@ class Status(enum.IntEnum):
     Attributes:
         CONVERGED: the last update was below both tolerances, and every direction of motion is constrained.
         MAX_ITERATIONS: the updates were still above the tolerances after `max_iterations` updates.
-        TOO_FEW_CORRESPONDENCES: fewer than four of the searched source points have a match within `max_distance`: the
-            clouds do not overlap, or the start is too far off.
+        TOO_FEW_CORRESPONDENCES: fewer than four source points (in the coarse phase: of the subset) have a match within
+            `max_distance`: the clouds do not overlap, or the start is too far off.
         DEGENERATE: the last update was below both tolerances, but at least one direction of motion is unconstrained
             (see `Registration.free_directions`). Along it `register` keeps the start, if `hold_free_directions`.
         NON_FINITE: the pose or the sums overflowed or became NaN.
@@ -49,15 +49,15 @@ class Status(enum.IntEnum):
 class Registration(eqx.Module):
     """Result of `register` or `align`; a pytree. All fields are evaluated at the returned pose.
 
-    Outside of transformations the fields are NumPy scalars and arrays; inside, and for a batch, they are JAX arrays.
-    Only the pose carries a gradient: to differentiate a cost, call `mahalanobis_cost` at the pose.
+    Fields are NumPy scalars and arrays; inside `jit`, `vmap` or `grad`, and when returned by these, JAX arrays.
+    Only the pose carries a gradient; for that of a cost, call `mahalanobis_cost` at the pose.
 
     Attributes:
         T_target_source: maps source coordinates into the target's frame, b ≈ T a; in the precision of the clouds. At
-            large (UTM) coordinates use `matrix`, or `centred` inside a float32 transformation.
+            large (UTM) coordinates use `matrix`, or in float32 under `jit`, `centred`.
         status_code: value of the `Status`.
         num_iterations: number of pose updates.
-        num_inliers: number of source points with a match within `max_distance` (the smaller one, if there are two).
+        num_inliers: number of source points used in the last phase with a match within its `max_distance`.
         cost: Σ ρ(dᵀ M d) over the matches.
         rmse: root mean square correspondence distance, metres. Usually of the order of the point spacing, as no target
             point lies just where a source point does. NaN without matches.
@@ -118,9 +118,9 @@ class Registration(eqx.Module):
 
     @property
     def information(self) -> Float[AnyArray, "*batch 6 6"]:
-        """(6, 6) Σ w Jᵀ M J for the twist ξ = (v, ω) of T exp(ξ), metres and radians, in the source's frame.
+        """(6, 6) Σ w Jᵀ M J, the Gauss-Newton Hessian of half the cost in ξ.
 
-        Its scale is that of GICP's relative covariances, so it compares directions with each other, but its inverse is
+        ξ = (v, ω) is the twist of T exp(ξ), in the source's frame, metres and radians. The scale of the matrix is that of GICP's relative covariances, so it compares directions with each other, but its inverse is
         *not* a covariance of the pose.
         """
         return self.constraints.value[0]
@@ -147,8 +147,8 @@ class Registration(eqx.Module):
 
     @property
     def deviations(self) -> Float[AnyArray, "*batch 6"]:
-        """(6,) standard deviations along the target's axes of the centroid of the matched points, metres, then about
-        these axes of the rotation, radians.
+        """(6,) standard deviations in the target's axes: of the position of the matched points' centroid, metres, then
+        of the rotation, radians.
 
         Derived from `covariance`, with the same limitations.
         """

@@ -261,7 +261,7 @@ def with_derivative(pose: Float[Array, "7"], root: Root, model: Model) -> Float[
     """Return the pose, with the derivative −(∂g/∂ξ)⁻¹ ∂g/∂θ of the nearby root of g (implicit function theorem).
 
     The derivative is evaluated at the root, which Newton's method finds from the pose. It is zero if `root.usable` is
-    False or Newton's method does not converge.
+    False or Newton's method does not converge. A second derivative raises `NotImplementedError`.
 
     Args:
         pose: `jaxlie.SE3.wxyz_xyz`; a constant to autodiff.
@@ -279,6 +279,7 @@ def _with_derivative_jvp(
     moving = [i for i, slope in enumerate(slopes) if not _is_symbolic_zero(slope)]
     if not moving:
         return pose, jnp.zeros_like(pose)
+    leaves = [_once(leaf) if jnp.issubdtype(leaf.dtype, jnp.inexact) else leaf for leaf in leaves]
     constants = jax.lax.stop_gradient((pose, root, leaves))
     at_root, inverse, found = _newton(constants[0], constants[1], jax.tree.unflatten(structure, constants[2]))
 
@@ -294,6 +295,21 @@ def _with_derivative_jvp(
 
 
 with_derivative.defjvp(_with_derivative_jvp, symbolic_zeros=True)
+
+
+@jax.custom_jvp
+def _once(value: Array) -> Array:
+    """The value, which a derivative has been computed at: a second derivative would be wrong, and is refused."""
+    return value
+
+
+def _once_jvp(primals: tuple[Array], tangents: tuple[Any]) -> tuple[Array, Any]:
+    if not _is_symbolic_zero(tangents[0]):
+        raise NotImplementedError("poses of register and align have first derivatives only, not second ones")
+    return primals[0], jnp.zeros_like(primals[0])
+
+
+_once.defjvp(_once_jvp, symbolic_zeros=True)
 
 
 def _along(pose: Float[Array, "7"], twist: Float[Array, "6"], center: Float[Array, "3"]) -> Float[Array, "7"]:

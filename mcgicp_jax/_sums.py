@@ -1,8 +1,8 @@
 """Sums over correspondences: a pose update needs nothing else of the points.
 
-Each correspondence has a force f = w M d (3), a stiffness K = w M (3×3) and a cost. About a centre c, with p = T a − c
-and h = (p, 1), the sums are G = Σ f hᵀ (12 numbers), Q = Σ K ⊗ h hᵀ (60) and e = Σ dᵀ f. Observability O (3×3 per
-correspondence, see `_observability`) adds Σ w O ⊗ h hᵀ.
+With the residual d = b − T a and the robust weight w, each correspondence has a force f = w M d (3), a stiffness
+K = w M (3×3) and a cost. About a centre c, with p = T a − c and h = (p, 1), the sums are G = Σ f hᵀ (12 numbers),
+Q = Σ K ⊗ h hᵀ (60) and e = Σ dᵀ f. Observability O (3×3 per correspondence, see `_observability`) adds Σ w O ⊗ h hᵀ.
 """
 
 from __future__ import annotations
@@ -114,7 +114,7 @@ def _softmax(logits: Float[Array, "m N"], valid: Bool[Array, "m N"]) -> Float[Ar
 class Sums(NamedTuple):
     """Sums over correspondences, see the module. The centre c is the centroid of the moved, matched source points.
 
-    Being relative to this centre and to the current pose, the sums lose no digits in float32.
+    Taken about this centre and at the current pose, the sums remain precise in float32.
 
     Attributes:
         center: (3,) c, metres.

@@ -21,7 +21,7 @@ from mcgicp_jax._observability import channel_observability
 from mcgicp_jax._pose import AnyArray, is_concrete
 from mcgicp_jax._search import Rows
 from mcgicp_jax._statistics import namespace
-from mcgicp_jax._surface import Local, Neighborhoods, Surface, Table
+from mcgicp_jax._surface import Local, Neighborhoods, Surface, Table, covariance_of
 from mcgicp_jax._threads import side_by_side
 
 
@@ -60,6 +60,12 @@ def surfaces_of(
     found = _traced(method, source, target, locals, observed)
     seen, there = (Surface(row, *each) for row, each in zip(rows, found, strict=True))
     return method, seen, there
+
+
+def covariances_of(method: AbstractMethod, cloud: PointCloud) -> Float[np.ndarray, "N 3 3"]:
+    """Covariances of a method at the points of a concrete cloud; unset parameters are chosen from the cloud."""
+    _, surface, _ = surfaces_of(method, cloud, cloud, observed=False)
+    return np.asarray(alg.matrix_from_symmetric(jnp.asarray(covariance_of(surface.table))))
 
 
 def searchable(method: AbstractMethod, cloud: PointCloud) -> Rows:

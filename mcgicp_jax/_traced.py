@@ -101,7 +101,7 @@ def differentiable(state: State, matched: Matched, method: AbstractMethod, robus
     """Attach the implicit derivative to the pose of a final state; see `with_derivative`."""
     usable = (state.status == Status.CONVERGED) | (state.status == Status.MAX_ITERATIONS)
     if state.directions is not None:
-        # Along an unconstrained direction, which the loop holds fixed, the root of g is arbitrary.
+        # Along an unconstrained direction the root of g (see `_solve.Root`) is arbitrary.
         usable = usable & jnp.all(state.directions.held)
     with jax.default_matmul_precision("highest"):
         root = jax.lax.stop_gradient(root_near(state.sums, usable))

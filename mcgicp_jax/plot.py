@@ -17,8 +17,10 @@ from jaxtyping import Float, Int
 
 from mcgicp_jax._cloud import PointCloud
 from mcgicp_jax._directions import CHANNELS_HOLD, GEOMETRY_HOLDS, shares
+from mcgicp_jax._methods import AbstractMethod
 from mcgicp_jax._pose import Pose, pose_matrix
 from mcgicp_jax._result import Registration
+from mcgicp_jax._surfaces import covariances_of
 
 if TYPE_CHECKING:
     import matplotlib.figure
@@ -410,9 +412,10 @@ def _shades(cloud: PointCloud, view: _View) -> Points:
 
 def surface_covariances(
     cloud: PointCloud,
-    covariances: Mapping[str, Float[ArrayLike, "N 3 3"]],
+    covariances: Mapping[str, AbstractMethod | Float[ArrayLike, "N 3 3"]],
     *,
     indices: Sequence[int] | Int[np.ndarray, "M"],
+    limits: Float[np.ndarray, "2 2"] | None = None,
     path: str | os.PathLike[str] | None = None,
 ) -> matplotlib.figure.Figure:
     """Draw covariances in a flat surface as ellipses over its picture, one panel per name.
@@ -421,8 +424,10 @@ def surface_covariances(
 
     Args:
         cloud: points on a nearly flat surface.
-        covariances: (N, 3, 3) for the rows of `cloud.points`, dimensionless, by name.
+        covariances: by name, (N, 3, 3) for the rows of `cloud.points`, dimensionless; or a method that computes them
+            from the preprocessed cloud.
         indices: rows to draw.
+        limits: (2, 2), the part of the surface to draw, as in `maps`.
         path: file to save the figure to; its suffix selects the format.
 
     Raises:
@@ -431,7 +436,7 @@ def surface_covariances(
     """
     figures = _module("matplotlib.figure")
     raw, rows = _drawable(cloud), np.asarray(indices, int)
-    view = _view(np.asarray(raw.points), _MAP_PIXELS)
+    view = _view(np.asarray(raw.points), _MAP_PIXELS, limits)
     # The indices refer to the rows of `cloud`; `raw`, which the picture shows, lacks padding and non-finite points.
     centers = cloud.coordinates[rows]
     offsets = ((centers - view.center) @ view.axes)[:, :2] - view.low
@@ -441,7 +446,9 @@ def surface_covariances(
     figure = figures.Figure((_WIDEST, width * view.height / view.width + 0.35), layout="constrained")
     panels = figure.subplots(1, len(covariances), squeeze=False)[0]
     for panel, (name, values) in zip(panels, covariances.items(), strict=True):
-        matrices = np.asarray(values, float)
+        matrices = np.asarray(
+            covariances_of(values, cloud) if isinstance(values, AbstractMethod) else values, np.float64
+        )
         if matrices.shape != (cloud.points.shape[0], 3, 3):
             raise ValueError(
                 f"covariances[{name!r}]: expected shape ({cloud.points.shape[0]}, 3, 3), got {matrices.shape}"

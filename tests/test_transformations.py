@@ -284,3 +284,27 @@ def test_the_determinant_keeps_learned_covariances_from_growing(noisy):
     assert likelihood[0] < 0 < likelihood[-1]
     with pytest.raises(ValueError, match="log_determinant: expected a method with covariances, got PointToPlane"):
         mcg.mahalanobis_cost(np.eye(4), source, target, matches, mcg.PointToPlane(), log_determinant=True)
+
+
+@pytest.mark.parametrize("outer", [jax.jacfwd, jax.grad])
+def test_second_derivatives_are_refused(outer, noisy):
+    source, target, _ = noisy
+    matches = mcg.find_correspondences(source, target, motion(), mcg.GICP(1e-2), max_distance=GATE)
+
+    def loss(shift):
+        moved = source.replace(points=jnp.asarray(source.points) + shift * jnp.arange(3.0))
+        return weigh(mcg.align(moved, target, matches, mcg.GICP(1e-2)).matrix)
+
+    assert np.isfinite(jax.grad(loss)(0.1))
+    with pytest.raises(NotImplementedError, match="first derivatives only"):
+        outer(jax.grad(loss))(0.1)
+
+
+def test_the_pose_alone_carries_a_gradient(noisy):
+    source, target, _ = noisy
+
+    def others(points):
+        result = mcg.register(source.replace(points=points), target, mcg.GICP(1e-2), max_distance=GATE)
+        return jnp.sum(result.deviations) + jnp.sum(result.covariance) + result.cost + result.rmse
+
+    np.testing.assert_array_equal(jax.grad(others)(jnp.asarray(source.points)), 0)

@@ -7,7 +7,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, TypeAlias
 
-import jax.numpy as jnp
 import numpy as np
 import tyro
 from jaxtyping import Float, Int
@@ -15,11 +14,8 @@ from tqdm import tqdm
 
 import mcgicp_jax as mcg
 from mcgicp_jax import datasets, metrics, plot
-from mcgicp_jax._algebra import matrix_from_symmetric
 from mcgicp_jax._commands._options import weights_from, with_channels
 from mcgicp_jax._methods import AbstractMethod
-from mcgicp_jax._surface import covariance_of
-from mcgicp_jax._surfaces import surfaces_of
 
 Folder: TypeAlias = Annotated[Path | None, tyro.conf.arg(metavar="PATH", help_behavior_hint="")]
 
@@ -245,13 +241,7 @@ def _figure_1(output: Path) -> Iterator[str]:
     cloud = mcg.preprocess(frame.cloud, num_neighbors=40)
     drawn = _spread(np.asarray(cloud.points)[np.asarray(cloud.valid), :2], 0.06)
     methods = {"GICP": mcg.GICP(), "MC-GICP, colour": mcg.MultiChannelGICP()}
-    covariances = {
-        name: matrix_from_symmetric(
-            jnp.asarray(covariance_of(surfaces_of(method, cloud, cloud, observed=False)[1].table))
-        )
-        for name, method in methods.items()
-    }
-    plot.surface_covariances(cloud, covariances, indices=drawn, path=output / "figure_1.png")
+    plot.surface_covariances(cloud, methods, indices=drawn, path=output / "figure_1.png")
     yield "## Figure 1"
     yield "![Covariances](figure_1.png)"
     yield (
