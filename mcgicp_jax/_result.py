@@ -120,8 +120,9 @@ class Registration(eqx.Module):
     def information(self) -> Float[AnyArray, "*batch 6 6"]:
         """(6, 6) Σ w Jᵀ M J, the Gauss-Newton Hessian of half the cost in ξ.
 
-        ξ = (v, ω) is the twist of T exp(ξ), in the source's frame, metres and radians. The scale of the matrix is that of GICP's relative covariances, so it compares directions with each other, but its inverse is
-        *not* a covariance of the pose.
+        ξ = (v, ω) is the twist of T exp(ξ), in the source's frame, metres and radians. The scale of the matrix is that
+        of GICP's relative covariances: it compares directions with each other, but its inverse is *not* a covariance of
+        the pose.
         """
         return self.constraints.value[0]
 
