@@ -79,7 +79,8 @@ def searchable(method: AbstractMethod, cloud: PointCloud) -> Rows:
     if cloud.channel_valid is not None:
         # The expected squared difference in a true match: on average, a missing channel makes a match neither nearer
         # nor farther.
-        expected = weights**2 * xp.asarray(method.missing_variances(channels.shape[-1]))
+        with np.errstate(over="ignore", invalid="ignore"):
+            expected = weights**2 * xp.asarray(method.missing_variances(channels.shape[-1]))
         penalty = xp.where(xp.asarray(cloud.channel_valid), 0, expected.astype(points.dtype))
     return Rows(points, channels * weights.astype(points.dtype), xp.asarray(cloud.valid), penalty)
 

@@ -295,9 +295,9 @@ def test_second_derivatives_are_refused(outer, noisy):
         moved = source.replace(points=jnp.asarray(source.points) + shift * jnp.arange(3.0))
         return weigh(mcg.align(moved, target, matches, mcg.GICP(1e-2)).matrix)
 
-    assert np.isfinite(jax.grad(loss)(0.1))
+    jax.make_jaxpr(jax.grad(loss))(0.1)
     with pytest.raises(NotImplementedError, match="first derivatives only"):
-        outer(jax.grad(loss))(0.1)
+        jax.make_jaxpr(outer(jax.grad(loss)))(0.1)
 
 
 def test_the_pose_alone_carries_a_gradient(noisy):
