@@ -493,6 +493,7 @@ def _nearest(
     distances, rows = _query(search, tree, queries, asked, bound)
     nearest = rows[:, :k].astype(np.int32)
     slack = _slack(distances[:, 0], np.minimum(distances[:, min(1, asked - 1)], bound))
+    farthest = distances[:, k - 1]
     tied = np.flatnonzero((distances[:, 1:] == distances[:, :-1]).any(axis=1) & np.isfinite(distances[:, 0]))
     distances, rows = distances[tied], rows[tied]
     while tied.size:
@@ -506,38 +507,31 @@ def _nearest(
         if tied.size:
             distances, rows = _query(search, tree, queries[tied], asked, bound)
     if tied.size and asked < len(points):
-        nearest[tied] = _nearest_of_coincident(search, points, queries[tied], k, bound)
+        nearest[tied] = _nearest_in_all(points, queries[tied], farthest[tied], k)
     return nearest, slack
 
 
-def _nearest_of_coincident(
-    search: AbstractTreeSearch,
+def _nearest_in_all(
     points: Float[np.ndarray, "M D"],
     queries: Float[np.ndarray, "N D"],
+    farthest: Float[np.ndarray, "N"],
     k: int,
-    bound: float,
 ) -> Int[np.ndarray, "N k"]:
-    """Tree indices as from `_nearest`, for long ties, e.g. where a sensor reports missing echoes as zeros.
+    """The k nearest by brute force, for queries with long ties, e.g. where a sensor reports missing echoes as zeros.
 
-    Coincident points are merged before the search, and so are coincident queries.
+    Args:
+        farthest: distance of the k-th neighbour, metres.
     """
-    places, which, counts = np.unique(points, axis=0, return_inverse=True, return_counts=True)
-    by_place = np.split(np.argsort(which.ravel(), kind="stable"), np.cumsum(counts)[:-1])
-    tree = search.build(places)
-    queries, whose = np.unique(queries, axis=0, return_inverse=True)
+    # Such queries mostly coincide, too.
+    queries, first, whose = np.unique(queries, axis=0, return_index=True, return_inverse=True)
     nearest = np.empty((len(queries), k), np.int32)
-    for i, query in enumerate(queries):
-        asked, sure = min(k + 1, len(places)), False
-        while not sure:
-            distances, near = search.query(tree, query[None], asked, bound)
-            near, distances = near[0][np.isfinite(distances[0])], distances[0][np.isfinite(distances[0])]
-            # The first k rows at each place suffice. The search is complete once the next place is farther than all k.
-            rows = np.concatenate([by_place[place][:k] for place in near])
-            apart = np.repeat(distances, np.minimum(counts[near], k))
-            order = np.lexsort((rows, apart))[:k]
-            sure = asked == len(places) or len(near) < asked or distances[-1] > apart[order[-1]]
-            asked = min(2 * asked, len(places))
-        nearest[i] = np.append(rows[order], np.full(k - order.size, len(points)))
+    for i, (query, limit) in enumerate(zip(queries, farthest[first], strict=True)):
+        squares = np.zeros(len(points))
+        for column, value in zip(points.T, query, strict=True):
+            squares += (column - value) ** 2
+        # A part in a billion covers rounding.
+        near = np.flatnonzero(squares <= limit**2 * (1 + 1e-9))
+        nearest[i] = near[np.lexsort((near, squares[near]))[:k]]
     return nearest[whose.ravel()]
 
 
