@@ -527,7 +527,8 @@ def _nearest_in_all(
     nearest = np.empty((len(queries), k), np.int32)
     for i, (query, limit) in enumerate(zip(queries, farthest[first], strict=True)):
         squares = np.zeros(len(points))
-        for column, value in zip(points.T, query, strict=True):
+        # In float64, as trees compute.
+        for column, value in zip(points.T.astype(np.float64), query, strict=True):
             squares += (column - value) ** 2
         # A part in a billion covers rounding.
         near = np.flatnonzero(squares <= limit**2 * (1 + 1e-9))

@@ -85,6 +85,10 @@ def test_many_equal_distances(seed, k):
         rng.permutation(340 + len(sphere))
     ]
     np.testing.assert_array_equal(KDTreeSearch().neighbors(points, k), ref.nearest(points, points, k))
+    # In float32, and where the distances of the tie are not whole numbers.
+    tilted = (points @ Rotation.from_rotvec([0.3, 0.2, 0.1]).as_matrix() + [0.1, 0.2, 0.3]).astype(np.float32)
+    coincident = np.concatenate([tilted, np.zeros((300, 3), np.float32)])
+    np.testing.assert_array_equal(KDTreeSearch().neighbors(coincident, k), ref.nearest(coincident, coincident, k))
     far = points[np.any(points, axis=1)]
     queries = np.concatenate([np.zeros((5, 3)), far[:20]])
     np.testing.assert_array_equal(
