@@ -188,11 +188,11 @@ def our_worker(
             program = analysis.temp_size_in_bytes + analysis.argument_size_in_bytes + analysis.output_size_in_bytes
             return {"peak": _peak(run), "program": program / 2**20}
         seconds, found = _timed(run)
-        (value, (matrix, iterations, status)), gradient = found if kind == "gradient" else (found, np.zeros((size, 3)))
+        (value, (matrix, iterations, status)), gradient = found if kind == "gradient" else (found, np.zeros((len(moving), 3)))
         return {
             "seconds": seconds,
             "loss": float(value),
-            "gradient": np.asarray(gradient)[:size],
+            "gradient": np.asarray(gradient),
             "matrix": np.asarray(matrix, np.float64),
             "iterations": int(iterations),
             "status": mcg.Status(int(status)).name,
