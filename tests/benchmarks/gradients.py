@@ -188,7 +188,8 @@ def our_worker(
             program = analysis.temp_size_in_bytes + analysis.argument_size_in_bytes + analysis.output_size_in_bytes
             return {"peak": _peak(run), "program": program / 2**20}
         seconds, found = _timed(run)
-        (value, (matrix, iterations, status)), gradient = found if kind == "gradient" else (found, np.zeros((len(moving), 3)))
+        no_gradient = np.zeros((len(moving), 3))
+        (value, (matrix, iterations, status)), gradient = found if kind == "gradient" else (found, no_gradient)
         return {
             "seconds": seconds,
             "loss": float(value),
