@@ -11,7 +11,7 @@ ROOT = pathlib.Path(mcgicp_jax.__file__).parent
 LAYERS = {
     "algebra": ("_pose", "_algebra", "_statistics", "_kernels", "_sizes", "_deferred"),
     "running": ("_threads", "_blocks"),
-    "search": ("_search", "_pykdtree", "_trees", "_dense"),
+    "search": ("_search", "_nearest", "_tree_index", "_pykdtree", "_trees", "_dense"),
     "data": ("_cloud", "_kept", "_preprocess", "_formats", "io", "metrics", "datasets"),
     "local surfaces": ("_surface", "_observability", "_neighborhoods", "_local", "_channels"),
     "correspondences": ("_forces", "_methods", "_surfaces", "_sums"),

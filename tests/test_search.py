@@ -20,7 +20,7 @@ from mcgicp_jax import (
     preprocess,
 )
 from mcgicp_jax._search import Rows
-from mcgicp_jax._trees import TreeIndex
+from mcgicp_jax._tree_index import TreeIndex
 from tests import reference as ref
 
 SIZES = {"source": 150, "target": 140}
