@@ -73,9 +73,9 @@ class _Group(Generic[Key]):
         sharding = NamedSharding(Mesh(np.array(devices), ("lanes",)), PartitionSpec("lanes"))
         self._put = jax.jit(_put, donate_argnums=0, out_shardings=sharding)
         lane = example, begin_lane(example, search, max_iterations)
-        # Empty lanes have status 0, which counts as finished.
-        stack = partial(jax.tree.map, lambda leaf: jnp.zeros((len(self._keys), *leaf.shape), leaf.dtype))
-        self._lanes: tuple[Problem, Carry] = jax.jit(stack, out_shardings=sharding)(lane)
+        self._lanes: tuple[Problem, Carry] = jax.jit(_empty, static_argnums=1, out_shardings=sharding)(
+            lane, len(self._keys)
+        )
 
     def is_full(self) -> bool:
         return None not in self._keys
@@ -105,6 +105,11 @@ class _Group(Generic[Key]):
                 # One history entry per update, and one at the returned pose.
                 count = int(state.num_iterations) + 1
                 yield key, state, assessed, history_of(records[lane, :count])
+
+
+def _empty(lane: tuple[Problem, Carry], count: int) -> tuple[Problem, Carry]:
+    """Lanes without a problem: their status is 0, which counts as finished."""
+    return jax.tree.map(lambda leaf: jnp.zeros((count, *leaf.shape), leaf.dtype), lane)
 
 
 def _put(lanes: tuple[Problem, Carry], lane: tuple[Problem, Carry], number: Int[Array, ""]) -> tuple[Problem, Carry]:
