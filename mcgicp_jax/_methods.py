@@ -122,8 +122,11 @@ class AbstractMethod(Numbers):
         return None
 
     def missing_variances(self, num_channels: int) -> Float[AnyArray, "C"]:
-        """Expected squared difference of each channel in a true match, channel units²: for missing channels."""
-        raise NotImplementedError
+        """Expected squared difference of each channel in a true match, channel units²: the penalty for a missing one.
+
+        A subclass that defines `weights` defines this too.
+        """
+        raise NotImplementedError(f"{type(self).__name__} defines weights, but not missing_variances")
 
 
 class AbstractOneSided(AbstractMethod):
@@ -287,8 +290,8 @@ class MultiChannelGICP(AbstractGeneralized):
         the tangent plane. Noise alone gives the difference of two measurements the variance 2 σ². In real scans its
         standard deviation is 1.5 times that, because of edges and changes: Λ = 2 (1.5 σ)². α = 2.5 spacing/σ; the
         spacing is the target's median nearest-neighbour distance. A difference of one σ then weighs as much as 2.5
-        spacings, the fine `max_distance`, so that channels choose among the points within it. Constant channels get α =
-        0.
+        spacings, the fine `max_distance`, so that channels choose among the points within it. The α of constant
+        channels is 0.
 
         The floor is chosen if neither it nor Λ is given. Between randomly placed points, a match has the variance 0.72
         spacing² along each tangent axis, and 2 λ₀ along the normal, where λ₀ is the median smallest eigenvalue of the

@@ -14,7 +14,7 @@ from jaxtyping import Array
 from mcgicp_jax._cloud import PointCloud
 from mcgicp_jax._deferred import Deferred
 from mcgicp_jax._directions import Directions
-from mcgicp_jax._pose import is_concrete, rotation_from_quaternion, se3_from_matrix
+from mcgicp_jax._pose import is_concrete, se3_from_matrix
 from mcgicp_jax._result import Registration, pose_in_user_frame
 from mcgicp_jax._statistics import constant, namespace
 from mcgicp_jax._step import Assessment, State
@@ -91,14 +91,9 @@ def _uncertainty(assessment: Assessment, state: State, origin: Any) -> tuple[Any
     covariance = _read(assessment.covariance)
     xp = namespace(covariance, pose, center)
     with np.errstate(invalid="ignore", over="ignore"):
-        rotation: Any
-        if xp is np:
-            parameters = np.asarray(pose.wxyz_xyz, np.float64)
-            rotation, offset = rotation_from_quaternion(parameters[:4]), parameters[4:] - np.asarray(center)
-        else:
-            rotation, offset = pose.rotation().as_matrix().astype(covariance.dtype), pose.translation() - center
+        matrix = pose_in_user_frame(pose, np.zeros(3), np.zeros(3))
         # In the target's axes T exp(ξ) turns by R ω, and moves the centre c by R v + (t − c) × R ω.
-        to_center = _translation_adjoint(offset) @ xp.kron(xp.eye(2), rotation)
+        to_center = _translation_adjoint(matrix[:3, 3] - center) @ xp.kron(xp.eye(2), matrix[:3, :3])
         deviations = xp.sqrt(xp.diagonal(to_center @ covariance @ to_center.T)).astype(covariance.dtype)
         if is_concrete(origin) and not np.any(origin):
             return covariance, deviations

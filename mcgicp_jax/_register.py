@@ -33,11 +33,11 @@ from mcgicp_jax._sums import matched_rows, move_rows, within
 from mcgicp_jax._surfaces import searchable, surfaces_of
 from mcgicp_jax._traced import align_traced, assess, differentiable, register_traced
 
-# Default maximum correspondence distances of the coarse and the fine phase, in spacings of the target. The larger one
-# converges from starts several spacings away; near convergence its matches across edges and the border of the overlap
-# would bias the pose, and the smaller one rejects them.
+# Default maximum correspondence distances of the coarse and the fine phase, in spacings of the target. With the larger
+# one, starts several spacings off converge, but matches across edges and the border of the overlap bias the final pose;
+# the smaller one rejects these.
 _COARSE_SPACINGS, _FINE_SPACINGS = 10.0, 2.5
-# Default translation tolerance, in spacings of the target: 0.5 mm at 0.1 m. `Options` says what limits it.
+# Default translation tolerance, in spacings of the target: 0.5 mm at 0.1 m, chosen like `ROTATION_TOLERANCE`.
 _TOLERANCE_IN_SPACINGS = 0.005
 # Least number of source points in a subsampled coarse phase: enough to find a pose nearly as well as all.
 _COARSE_ROWS = 4096
@@ -189,8 +189,7 @@ def register(
     With concrete arrays (outside `jit`, `vmap`, `grad`) the loop runs on the host and calls compiled programs whose
     shapes do not depend on the sizes of the clouds. Inside, it is one program per size of clouds, whose matches come
     from host callbacks, one batch element at a time (with `DenseSearch`, from XLA). The pose is the same up to
-    rounding; its derivative is that of `align`
-    at the final matches.
+    rounding; its derivative is that of `align` at the final matches.
 
     Args:
         source, target: clouds from `preprocess`. Raw clouds and (N, 3) arrays, metres, are preprocessed with the
@@ -214,8 +213,7 @@ def register(
             at the pose of the first, from those of matched points.
         scales: voxel sizes, metres, from coarse to fine, for a start that is far off: the clouds are first registered
             at each voxel size, in this order, each time from the pose before and with the default `max_distance`; the
-            one given is for the last registration. Not available
-            inside transformations.
+            one given is for the last registration. Not available inside transformations.
 
     Returns:
         The pose with its status, quality of the fit and uncertainty; check `converged`.

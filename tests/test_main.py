@@ -9,6 +9,7 @@ import matplotlib.image
 import numpy as np
 import platformdirs
 import pytest
+import scipy.spatial
 
 import mcgicp_jax as mcg
 from mcgicp_jax import io, metrics, plot
@@ -75,7 +76,7 @@ def test_register_writes_its_files(files, tmp_path, capsys):
     np.testing.assert_allclose(moved.points, source.points @ written[:3, :3].T + written[:3, 3], atol=1e-6)
     np.testing.assert_array_equal(moved.channels, source.channels)
     assert matplotlib.image.imread(picture).ndim == 3 and str(picture) in text
-    # The pose is one to start from.
+    # The pose is one to start from: few updates are needed.
     again = ["register", files["source"], files["target"], "--init", str(pose), "--max-iterations", "4"]
     assert main(again) == 0
 
@@ -187,8 +188,12 @@ def test_voxels_are_chosen_from_the_data(tmp_path, capsys):
         assert voxels in first
         distances = [float(part.split()[0]) for part in second.split("up to ")[1].split("then")]
         assert used == rows if voxels == "all kept" else 8000 < used <= 20_000
-        # The room has 12 m² of surface: the spacing of random points is about half the square root of the area of each.
-        np.testing.assert_allclose(distances, [10 * size * 0.5 * np.sqrt(12 / used), distances[0] / 4], rtol=0.6)
+        chosen = None if voxels == "all kept" else float(first.split(voxels)[1].split()[0])
+        kept = mcg.preprocess(io.read(whole), chosen).points
+        assert len(kept) == used
+        spacing = np.median(scipy.spatial.cKDTree(kept).query(kept, k=2)[0][:, 1])
+        # Printed with three digits.
+        np.testing.assert_allclose(distances, [10 * spacing, 2.5 * spacing], rtol=5e-3)
 
 
 def test_clouds_with_covariances_keep_their_points(tmp_path, capsys):

@@ -168,9 +168,10 @@ def test_the_traced_loop_is_the_host_loop(noisy):
 
 @needs_x64
 @pytest.mark.timeout(240)
-def test_a_batch_is_its_lanes(noisy):
+@pytest.mark.parametrize("name", ["gicp", pytest.param("mc-gicp", marks=pytest.mark.slow)])
+def test_a_batch_is_its_lanes(name, noisy):
     source, target, _ = noisy
-    method, _ = CASES["gicp"]
+    method, _ = CASES[name]
     starts = jnp.asarray(np.stack([motion(), motion((50, 0, 0, 0, 0, 0)), np.eye(4)]), source.points.dtype)
 
     def lane(start, points):

@@ -18,6 +18,7 @@ from mcgicp_jax import plot
 from mcgicp_jax._formats import READERS, WRITERS, by_suffix
 from mcgicp_jax._kernels import AbstractKernel
 from mcgicp_jax._methods import AbstractMethod
+from mcgicp_jax._options import ROTATION_TOLERANCE
 from mcgicp_jax._options import Options as Chosen
 from mcgicp_jax._preprocess import check_preprocessing
 from mcgicp_jax._register import default_distances
@@ -88,7 +89,7 @@ class Options:
     max_distance: Distances = ()
     max_iterations: int = Chosen.max_iterations
     translation_tolerance: Tolerance = None
-    rotation_tolerance: float = 5e-4
+    rotation_tolerance: float = ROTATION_TOLERANCE
     robust: Annotated[tuple[KernelName, float] | None, tyro.conf.arg(metavar="KERNEL SCALE", help_behavior_hint="")] = (
         None
     )

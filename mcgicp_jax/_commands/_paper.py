@@ -344,8 +344,8 @@ def _figure_4(output: Path, street: datasets.SyntheticFrames) -> Iterator[str]:
     yield "## Figure 4"
     yield "![Convergence](figure_4.png)"
     yield (
-        f"One pair of each scene. Updates until one is below 0.5 mm and 0.5 mrad: {'; '.join(counts)}. The residual, "
-        "which the paper plots, is mostly due to the spacing of the points: it shows how soon a method converges, not "
+        f"One pair of each scene. Updates until one is below the tolerances: {'; '.join(counts)}. The residual, which "
+        "the paper plots, is mostly due to the spacing of the points: it shows how soon a method converges, not "
         "how close to the truth. The pose error is therefore plotted beside it."
     )
 
