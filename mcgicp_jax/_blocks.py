@@ -46,17 +46,14 @@ def map_blocks(function: Callable[[Any], Any], num_rows: int, num_threads: int |
     """Call a function on each block of rows.
 
     Args:
-        function: maps an index of `BLOCK` rows (see `blocks`) to a pytree of arrays.
+        function: maps an index of `BLOCK` rows (see `blocks`) to a pytree of arrays; called outside of traces.
         num_threads: largest number of threads that call it; None for one per block.
 
     Returns:
         For each block, in order, the slice of rows that it covers and the result as NumPy arrays.
     """
     cut = blocks(num_rows)
-
-    # Worker threads run outside a trace that is active in this thread; this thread leaves it for the same results.
-    with computed_now():
-        results = side_by_side([partial(function, index) for _, index in cut], num_threads) if cut else []
+    results = side_by_side([partial(function, index) for _, index in cut], num_threads) if cut else []
     # Programs are dispatched asynchronously and run while the next block is gathered; wait only once all have started.
     return [(rows, jax.tree.map(np.asarray, result)) for (rows, _), result in zip(cut, results, strict=True)]
 
@@ -71,7 +68,9 @@ def map_rows(function: Callable[[Any], Any], num_rows: int, num_threads: int | N
     Returns:
         A pytree of NumPy arrays with `num_rows` rows, at least 1.
     """
-    results = map_blocks(function, num_rows, num_threads)
+    # Worker threads run outside a trace that is active in this thread; this thread leaves it for the same results.
+    with computed_now():
+        results = map_blocks(function, num_rows, num_threads)
     leaves = [jax.tree.leaves(result) for _, result in results]
     structure = jax.tree.structure(results[0][1])
     whole = [np.empty((num_rows, *leaf.shape[1:]), leaf.dtype) for leaf in leaves[0]]

@@ -35,44 +35,70 @@ class Trees(Protocol):
     def leaf_order(self, tree: Any, num_points: int) -> Int[np.ndarray, "M"]: ...
 
 
-def nearest_points(
-    trees: Trees,
-    tree: Any,
-    points: Float[np.ndarray, "M D"],
-    queries: Float[np.ndarray, "N D"],
-    k: int,
-    bound: float = np.inf,
-) -> tuple[Int[np.ndarray, "N k"], Float[np.ndarray, "N"]]:
-    """The k nearest points of each query (all points if there are fewer), ordered by distance and then row.
+class Tree:
+    """A tree of points that finds the same neighbours whatever its kind: ordered by distance, ties by row.
 
-    Trees return ties in any order. Searching for k + 1 neighbours reveals ties, which are then resolved.
-
-    Returns:
-        Tree indices, the number of points standing for none within `bound`; and the slack: half the gap between the
-        nearest and the second nearest, which is taken to lie at the bound if none is within it; 0 without a nearest.
+    Attributes:
+        points: (M, D) finite points, metres.
     """
-    k = min(k, len(points))
-    asked = min(k + 1, len(points))
-    most = min(max(_TIE_CANDIDATES * (k + 1), _LEAST_TIE_CANDIDATES), len(points))
-    distances, rows = query_side_by_side(trees, tree, queries, asked, bound)
-    nearest = rows[:, :k].astype(np.int32)
-    slack = slack_of(distances[:, 0], np.minimum(distances[:, min(1, asked - 1)], bound))
-    farthest = distances[:, k - 1]
-    tied = np.flatnonzero((distances[:, 1:] == distances[:, :-1]).any(axis=1) & np.isfinite(distances[:, 0]))
-    distances, rows = distances[tied], rows[tied]
-    while tied.size:
-        order = np.lexsort((rows, distances), axis=1)
-        nearest[tied] = np.take_along_axis(rows, order, axis=1)[:, :k]
-        # A tie that includes the last candidate may extend beyond it.
-        tied = tied[np.isfinite(distances[:, -1]) & (distances[:, k - 1] == distances[:, -1])]
-        if asked == most:
-            break
-        asked = min(2 * asked, most)
-        if tied.size:
-            distances, rows = query_side_by_side(trees, tree, queries[tied], asked, bound)
-    if tied.size and asked < len(points):
-        nearest[tied] = _nearest_in_all(points, queries[tied], farthest[tied], k)
-    return nearest, slack
+
+    def __init__(self, trees: Trees, points: Float[np.ndarray, "M D"]):
+        self.points = points
+        self._trees, self._tree = trees, trees.build(points)
+        # equinox creates an object whenever it binds a method.
+        self._query = trees.query
+        self._threads = num_cores() if trees.workers == -1 else trees.workers
+
+    def leaf_order(self) -> Int[np.ndarray, "M"]:
+        """An order of the points in which neighbouring points follow each other."""
+        return self._trees.leaf_order(self._tree, len(self.points))
+
+    def query(
+        self, queries: Float[np.ndarray, "N D"], k: int, bound: float = np.inf
+    ) -> tuple[Float[np.ndarray, "N k"], Int[np.ndarray, "N k"]]:
+        """Distances and rows of the k nearest points as from `AbstractTreeSearch.query`, on several threads."""
+        count = 1 if self._threads == 1 else min(_PARTS_PER_THREAD * self._threads, len(queries) // _LEAST_PART)
+        if count <= 1:
+            return self._query(self._tree, queries, k, bound)
+        parts = np.array_split(queries, count)
+        calls = [partial(self._query, self._tree, part, k, bound) for part in parts]
+        distances, rows = zip(*side_by_side(calls, self._threads), strict=True)
+        return np.concatenate(distances), np.concatenate(rows)
+
+    def nearest(
+        self, queries: Float[np.ndarray, "N D"], k: int, bound: float = np.inf
+    ) -> tuple[Int[np.ndarray, "N k"], Float[np.ndarray, "N"]]:
+        """The k nearest points of each query (all points if there are fewer), ordered by distance and then row.
+
+        Trees return ties in any order. Searching for k + 1 neighbours reveals ties, which are then resolved.
+
+        Returns:
+            Rows of `points`, M standing for none within `bound`; and the slack: half the gap between the nearest and
+            the second nearest, which is taken to lie at the bound if none is within it; 0 without a nearest.
+        """
+        size = len(self.points)
+        k = min(k, size)
+        asked = min(k + 1, size)
+        most = min(max(_TIE_CANDIDATES * (k + 1), _LEAST_TIE_CANDIDATES), size)
+        distances, rows = self.query(queries, asked, bound)
+        nearest = rows[:, :k].astype(np.int32)
+        slack = slack_of(distances[:, 0], np.minimum(distances[:, min(1, asked - 1)], bound))
+        farthest = distances[:, k - 1]
+        tied = np.flatnonzero((distances[:, 1:] == distances[:, :-1]).any(axis=1) & np.isfinite(distances[:, 0]))
+        distances, rows = distances[tied], rows[tied]
+        while tied.size:
+            order = np.lexsort((rows, distances), axis=1)
+            nearest[tied] = np.take_along_axis(rows, order, axis=1)[:, :k]
+            # A tie that includes the last candidate may extend beyond it.
+            tied = tied[np.isfinite(distances[:, -1]) & (distances[:, k - 1] == distances[:, -1])]
+            if asked == most:
+                break
+            asked = min(2 * asked, most)
+            if tied.size:
+                distances, rows = self.query(queries[tied], asked, bound)
+        if tied.size and asked < size:
+            nearest[tied] = _nearest_in_all(self.points, queries[tied], farthest[tied], k)
+        return nearest, slack
 
 
 def _nearest_in_all(
@@ -98,19 +124,6 @@ def _nearest_in_all(
         near = np.flatnonzero(squares <= limit**2 * (1 + 1e-9))
         nearest[i] = near[np.lexsort((near, squares[near]))[:k]]
     return nearest[whose.ravel()]
-
-
-def query_side_by_side(
-    trees: Trees, tree: Any, queries: Float[np.ndarray, "N D"], k: int, bound: float
-) -> tuple[Float[np.ndarray, "N k"], Int[np.ndarray, "N k"]]:
-    most = num_cores() if trees.workers == -1 else trees.workers
-    count = 1 if most == 1 else min(_PARTS_PER_THREAD * most, len(queries) // _LEAST_PART)
-    if count <= 1:
-        return trees.query(tree, queries, k, bound)
-    parts = np.array_split(queries, count)
-    answers = side_by_side([partial(trees.query, tree, part, k, bound) for part in parts], most)
-    distances, rows = zip(*answers, strict=True)
-    return np.concatenate(distances), np.concatenate(rows)
 
 
 def slack_of(first: Float[np.ndarray, "N"], second: Float[np.ndarray, "N"]) -> Float[np.ndarray, "N"]:

@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
 
 import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Float, Int
 
-from mcgicp_jax._nearest import Trees, nearest_points, query_side_by_side, slack_of
+from mcgicp_jax._nearest import Tree, Trees, slack_of
 from mcgicp_jax._pose import rotation_from_quaternion
 from mcgicp_jax._search import AbstractIndex, Rows, on_host
 
@@ -42,7 +41,7 @@ class TreeIndex(AbstractIndex):
         self._trees = trees
         # Trees are built on demand. Threads that need the same tree at once may each build it.
         self._parts: dict[bytes, list[_Part]] = {}
-        self._positions: Any = None
+        self._positions: Tree | None = None
 
     @property
     def num_rows(self) -> int:
@@ -127,7 +126,7 @@ class TreeIndex(AbstractIndex):
         The number of neighbours in position grows until all other points are too far away in position alone.
         """
         if self._positions is None:
-            self._positions = self._trees.build(self._points[:, :3])
+            self._positions = Tree(self._trees, self._points[:, :3])
         size = self._rows.size
         found, slack = np.empty((len(queries), min(k, size)), np.int32), np.empty(len(queries))
         # Penalties that every match of a query incurs: a lower bound on the squared distance beside the position.
@@ -136,7 +135,7 @@ class TreeIndex(AbstractIndex):
         while open.size:
             unsure = []
             for some in np.array_split(open, -(-open.size * asked // _DIFFERENCES_AT_ONCE)):
-                distances, near = query_side_by_side(self._trees, self._positions, queries[some, :3], asked, np.inf)
+                distances, near = self._positions.query(queries[some, :3], asked)
                 rows, squares = _ordered(self._rows[near], self._squares(queries[some], penalty[some], near), k + 1)
                 found[some] = rows[:, :k]
                 # The margin of 1e-9 covers rounding in float64.
@@ -182,22 +181,21 @@ class _Part:
         # Maps tree indices to cloud rows; the last entry is −1 (no neighbour).
         self.rows = np.append(rows, np.int32(-1))
         self._columns = slice(None) if common.all() else np.flatnonzero(common)
-        self._points = points[:, self._columns]
         self._penalty = penalty.sum()
-        self._trees = trees
-        self._tree = trees.build(self._points)
+        self._tree = Tree(trees, points[:, self._columns])
 
     def nearest(
         self, queries: Float[np.ndarray, "N D"], k: int, bound: float
     ) -> tuple[Int[np.ndarray, "N m"], Float[np.ndarray, "N"]]:
         """Tree indices of the k nearest (fewer if the tree has fewer), and the slack, as from `_nearest`."""
-        return nearest_points(self._trees, self._tree, self._points, queries[:, self._columns], k, bound)
+        return self._tree.nearest(queries[:, self._columns], k, bound)
 
     def squares(self, queries: Float[np.ndarray, "N D"], found: Int[np.ndarray, "N m"]) -> Float[np.ndarray, "N m"]:
         """Squared search distances to tree indices, including the penalties for missing channels; metres²."""
-        difference = queries[:, None, self._columns] - self._points[np.minimum(found, len(self._points) - 1)]
+        points = self._tree.points
+        difference = queries[:, None, self._columns] - points[np.minimum(found, len(points) - 1)]
         apart = np.sum(difference * difference, axis=2) + self._penalty
-        return np.where(found < len(self._points), apart, np.inf)
+        return np.where(found < len(points), apart, np.inf)
 
 
 class _Follower:
@@ -214,7 +212,7 @@ class _Follower:
         order: Int[np.ndarray, "n"] = np.flatnonzero(source.valid)
         if order.size > LARGEST_UNORDERED:
             points = np.nan_to_num(source.points[order], posinf=0, neginf=0)
-            order = order[trees.leaf_order(trees.build(points), order.size)]
+            order = order[Tree(trees, points).leaf_order()]
         self._order = order
         self._points = np.asarray(source.points[order], np.float64)
         self._descriptors = source.descriptors[order]

@@ -21,7 +21,7 @@ import numpy as np
 import scipy.spatial
 from jaxtyping import Array, Bool, Float, Int
 
-from mcgicp_jax._nearest import nearest_points
+from mcgicp_jax._nearest import Tree
 from mcgicp_jax._pykdtree import MOST_DIMENSIONS, PyKDTree, has_pykdtree
 from mcgicp_jax._search import AbstractSearch, Rows, on_host
 from mcgicp_jax._tree_index import LARGEST_UNORDERED, TreeIndex
@@ -92,10 +92,10 @@ class AbstractTreeSearch(AbstractSearch):
         )
 
     def neighbors(self, points: Float[np.ndarray, "N 3"], num_neighbors: int) -> Int[np.ndarray, "N k"]:
-        tree = self.build(points)
+        tree = Tree(self, points)
         # In the order of the leaves, each query finds the nodes it needs in the processor's caches.
-        order = self.leaf_order(tree, len(points))
-        found, _ = nearest_points(self, tree, points, points[order], num_neighbors)
+        order = tree.leaf_order()
+        found, _ = tree.nearest(points[order], num_neighbors)
         neighbors = np.full((len(points), num_neighbors), -1, np.int32)
         neighbors[order, : found.shape[1]] = found
         return neighbors
