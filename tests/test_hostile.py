@@ -108,8 +108,8 @@ def clouds(draw, channels=True):
     return points, LAYOUTS[draw(st.sampled_from(["plain", "columns", "read-only"]))](values), draw(st.booleans())
 
 
-def cloud_of(points, channels, told):
-    return mcg.PointCloud(points, channels, channel_valid=np.isfinite(channels) if told else None)
+def cloud_of(points, channels, masked):
+    return mcg.PointCloud(points, channels, channel_valid=np.isfinite(channels) if masked else None)
 
 
 def outcome(function):

@@ -255,7 +255,7 @@ def test_a_missing_package_is_named(files, monkeypatch, capsys):
     assert "pip install 'mcgicp_jax[io]'" in capsys.readouterr().err
 
 
-def test_points_left_out_are_told_in_one_line(files, tmp_path, capsys):
+def test_points_left_out_are_reported_in_one_line(files, tmp_path, capsys):
     cloud = io.read(files["bare"])
     points = np.vstack([cloud.points, [[np.nan, 0, 0]]])
     assert main(["register", save(tmp_path / "nan.npz", points), files["target"], "--method", "gicp"]) == 0

@@ -108,7 +108,7 @@ def test_arrays_instead_of_rows(folder, tmp_path):
         assert run_folder(folder, output) == 0
 
 
-def test_pairs_that_fail_are_told_apart(folder, tmp_path, capsys):
+def test_pairs_that_fail_have_messages_of_their_own(folder, tmp_path, capsys):
     far = [float(x) for x in motion((50.0, 0, 0, 0, 0, 0))[:3].ravel()]
     start = [float(x) for x in np.eye(4)[:3].ravel()]
     pairs = write_pairs(

@@ -35,7 +35,7 @@ def errors(*means):
     return [_paper._Errors(np.array([mean]), np.zeros(1), np.ones(1), np.ones(1)) for mean in means]
 
 
-def test_the_order_is_told_as_it_is():
+def test_the_order_is_reported_as_it_is():
     rows = _paper._rows()
     assert _paper._order(rows, errors(5.0, 3.0, 4.0, 2.0, 1.0, 9.0)).startswith("The paper's order holds.")
     other = _paper._order(rows, errors(5.0, 1.0, 2.0, 3.0, 4.0, 0.5))

@@ -150,7 +150,7 @@ def test_what_makes_no_map_is_refused_by_name(room):
             mcg.aggregate(*arguments)
 
 
-def test_a_frame_that_is_no_cloud_is_told_by_its_number(room):
+def test_a_frame_that_is_no_cloud_is_named_by_its_number(room):
     frames, _ = room
     steps = mcg.odometry([frames[0], np.zeros((2, 3))], mcg.GICP())
     next(steps)

@@ -16,7 +16,7 @@ from tests.scenes import motion
 
 
 def ramp(height, width):
-    """An image that tells its pixels: red goes with the column, green with the row; blue is 51."""
+    """An image whose values identify its pixels: red goes with the column, green with the row; blue is 51."""
     row, column = np.mgrid[:height, :width]
     return np.stack([255 * column / (width - 1), 255 * row / (height - 1), np.full(row.shape, 51)], axis=-1)
 

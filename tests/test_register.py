@@ -179,7 +179,7 @@ def with_value(array, where, value):
     return changed
 
 
-def test_overflow_is_told(room):
+def test_overflow_is_reported(room):
     # In float32, also where x64 is on: its range is soon left.
     source, target = (mcg.preprocess(np.asarray(cloud.unpad().points, np.float32)) for cloud in room[:2])
     huge = source.replace(points=with_value(source.points, 0, 1e30))
@@ -188,7 +188,7 @@ def test_overflow_is_told(room):
 
 
 @pytest.mark.parametrize("value", [np.nan, np.inf])
-def test_points_that_are_not_finite_are_told(value, room):
+def test_points_that_are_not_finite_are_reported(value, room):
     source, target, _ = room
     broken = source.replace(points=with_value(source.points, (3, 0), value))
     assert mcg.register(broken, target, mcg.PointToPoint(), max_distance=0.5).status is Status.NON_FINITE

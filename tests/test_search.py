@@ -134,23 +134,23 @@ def test_nearest_with_missing_channels(seed, share, k, missing):
     """By brute force, with ties: integers everywhere."""
     rows = [integers((size, 5), 4, seed + i) for i, size in enumerate((40, 50))]
     masks = np.split(np.random.default_rng(seed).random((90, 2)) < share, [40])
-    absence = np.array([float(missing), 2.0])
+    squares = np.array([float(missing), 2.0])
     source, target = (
         Rows(
             points=row[:, :3],
             descriptors=np.where(mask, row[:, 3:], 0),
             valid=np.ones(len(row), bool),
-            penalty=np.where(mask, 0, absence),
+            penalty=np.where(mask, 0, squares),
         )
         for row, mask in zip(rows, masks, strict=True)
     )
     still = np.array([1.0, 0, 0, 0, 0, 0, 0])
     found = KDTreeSearch().index(target).nearest(still, source, np.inf, k)
-    np.testing.assert_array_equal(found.T, ref.match_partial(*rows, *masks, absence, k))
+    np.testing.assert_array_equal(found.T, ref.match_partial(*rows, *masks, squares, k))
     # One of the two clouds may lack nothing.
     whole = eqx.tree_at(lambda rows: rows.penalty, target, None)
     found = KDTreeSearch().index(whole).nearest(still, source, np.inf, k)
-    expected = ref.match_partial(rows[0], np.hstack([rows[1][:, :3], whole.descriptors]), masks[0], True, absence, k)
+    expected = ref.match_partial(rows[0], np.hstack([rows[1][:, :3], whole.descriptors]), masks[0], True, squares, k)
     np.testing.assert_array_equal(found.T, expected)
 
 
@@ -162,14 +162,14 @@ def test_many_sets_of_missing_channels_need_few_trees(k, high, monkeypatch):
     monkeypatch.setattr(KDTreeSearch, "build", lambda self, points: trees.append(build(self, points)) or trees[-1])
     rows = [integers((size, 11), high, i) for i, size in enumerate((150, 200))]
     masks = np.split(np.random.default_rng(0).random((350, 8)) < 0.6, [150])
-    absence = np.arange(1.0, 9.0)
+    squares = np.arange(1.0, 9.0)
     source, target = (
-        Rows(row[:, :3], np.where(mask, row[:, 3:], 0), np.ones(len(row), bool), np.where(mask, 0, absence))
+        Rows(row[:, :3], np.where(mask, row[:, 3:], 0), np.ones(len(row), bool), np.where(mask, 0, squares))
         for row, mask in zip(rows, masks, strict=True)
     )
     index = KDTreeSearch().index(target)
     still = np.array([1.0, 0, 0, 0, 0, 0, 0])
-    expected = ref.match_partial(*rows, *masks, absence, k)
+    expected = ref.match_partial(*rows, *masks, squares, k)
     np.testing.assert_array_equal(index.nearest(still, source, np.inf, k).T, expected)
     assert len(trees) == 1
     # From pose to pose, too, where what is known from the pose before is used.
@@ -308,7 +308,7 @@ def test_traced_and_batched_it_finds_the_same():
 @pytest.mark.parametrize("what", ["points", "channels"])
 @pytest.mark.parametrize("which", ["source", "target"])
 def test_values_that_are_not_finite_match_nothing(which, what):
-    """As when a network returns NaN: an outcome to be told, not an exception from inside the tree."""
+    """As when a network returns NaN: a status reports it, not an exception from inside the tree."""
     pair = dict(zip(("source", "target"), clouds()[0], strict=True))
     array = getattr(pair[which], what)
     pair[which] = pair[which].replace(**{what: jnp.asarray(array).at[3, 1].set(jnp.nan)})

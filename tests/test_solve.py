@@ -114,7 +114,7 @@ def test_rounding_at_the_minimum_costs_no_steps():
 
 
 @pytest.mark.parametrize("missing", ["no pairs", "one direction"])
-def test_free_directions_are_told_and_stay_put(missing):
+def test_free_directions_are_named_and_held(missing):
     moved, residual, information, weight, valid = random_pairs(3)
     if missing == "no pairs":
         valid[:], weight[:], residual[:] = False, 0, 0

@@ -54,7 +54,7 @@ def test_a_line_is_felt_across_alone_and_a_single_spot_not_at_all():
 
 
 def test_channels_are_felt_along_their_gradient():
-    """A ramp of slope g is felt by α²g²/(1 + α²g²) along it, and not at all across."""
+    """A ramp of slope g is observed by α²g²/(1 + α²g²) along it, and not at all across."""
     points, _ = wall(2000, noise=0.0)
     cloud = mcg.preprocess(mcg.PointCloud(points, 3 * points[:, :1]))
     method = mcg.MultiChannelGICP(channel_covariance=1.0, channel_weights=0.5)
