@@ -246,7 +246,7 @@ def _figure_1(output: Path) -> Iterator[str]:
     yield "![Covariances](figure_1.png)"
     yield (
         "Covariances within the surface of a wall of posters, one standard deviation. GICP's are circles everywhere. "
-        "MC-GICP's are thin across an edge between colours, where the colour distinguishes a point from its neighbours, "
+        "MC-GICP's are thin across a colour edge, where the colour distinguishes a point from its neighbours, "
         "and round where the colour is uniform."
     )
 
