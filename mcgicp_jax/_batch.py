@@ -445,6 +445,8 @@ def _is_one_pose(given: object) -> bool:
 
 
 def _check_executor(executor: Executor | None) -> None:
+    if executor is not None and not hasattr(executor, "submit"):
+        raise ValueError(f"executor: expected a concurrent.futures.Executor or None, got {executor!r}")
     context = getattr(executor, "_mp_context", None)
     if isinstance(executor, ProcessPoolExecutor) and context is not None and context.get_start_method() == "fork":
         raise ValueError(

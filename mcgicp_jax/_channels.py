@@ -20,6 +20,9 @@ from mcgicp_jax._surface import Local
 
 # Quantiles (5 to 95 %) from which gain and offset are estimated: robust against parts that only one cloud sees.
 _QUANTILES = tuple(step / 20 for step in range(1, 20))
+# Ratio of the ranges of a channel in two clouds above which its units probably differ: files hold intensities from 0 to
+# 1, 255 or 65,535, whereas exposures differ by less.
+_OTHER_UNIT = 10.0
 
 
 def channel_noise(
@@ -50,6 +53,26 @@ def channel_noise(
     uniform = ~(spread > 1e3 * xp.finfo(spread.dtype).eps * largest)
     # Rendered channels have no noise; a floor of a thousandth of their standard deviation keeps α finite and Λ regular.
     return xp.where(uniform, 1, xp.fmax(sigma, 1e-3 * spread)), uniform, median(xp.concatenate(across))
+
+
+def warn_of_units(source: PointCloud, target: PointCloud) -> None:
+    """Warn of channels of two concrete clouds whose values are so different that their units probably are, too."""
+    ranges = []
+    for cloud in (source, target):
+        rows, counts = sampled_rows(np.asarray(cloud.valid))
+        values = np.where(counts[:, None], np.asarray(_known_values(cloud))[rows], np.nan)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", RuntimeWarning)
+            ranges.append(np.nanquantile(values, [_QUANTILES[0], _QUANTILES[-1]], axis=0).T)
+    for name, (low, high), (first, last) in zip(source.channel_names, *ranges, strict=False):
+        narrow, wide = sorted([high - low, last - first])
+        if high < first or last < low or wide > _OTHER_UNIT * narrow > 0:
+            warnings.warn(
+                f"channel {name}: most values lie between {low:.3g} and {high:.3g} in the source, but between "
+                f"{first:.3g} and {last:.3g} in the target; if their units differ, scale one, or use match_channels",
+                UserWarning,
+                stacklevel=4,
+            )
 
 
 def _smallest_variance(local: Local, xp: Any) -> Float[AnyArray, "N"]:

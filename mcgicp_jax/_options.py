@@ -38,14 +38,29 @@ class Options:
     def __post_init__(self) -> None:
         if self.max_distance is not None:
             _check_distances(self.max_distance)
-        if not _is_number(self.max_iterations) or self.max_iterations < 1:
-            raise ValueError(f"max_iterations: expected at least 1, got {self.max_iterations!r}")
+        if not isinstance(self.max_iterations, int | np.integer) or self.max_iterations < 1:
+            raise ValueError(f"max_iterations: expected an integer of at least 1, got {self.max_iterations!r}")
         for name in ("translation_tolerance", "rotation_tolerance"):
             value = getattr(self, name)
             if name == "translation_tolerance" and value is None:
                 continue
             if is_concrete(value) and not (_is_number(value) and np.asarray(value) >= 0):
                 raise ValueError(f"{name}: expected a number of at least 0, got {value!r}")
+        for name, kind, example in (
+            ("robust", AbstractKernel, "Huber(1.0)"),
+            ("search", AbstractSearch, "KDTreeSearch()"),
+        ):
+            value = getattr(self, name)
+            if value is not None and not isinstance(value, kind):
+                raise ValueError(f"{name}: expected an object such as {example}, or None, got {value!r}")
+        for name in ("hold_free_directions", "match_channels"):
+            value = getattr(self, name)
+            if is_concrete(value) and np.asarray(value).dtype != bool:
+                raise ValueError(f"{name}: expected True or False, got {value!r}")
+        if isinstance(self.scales, str) or np.ndim(self.scales) != 1:
+            raise ValueError(f"scales: expected a sequence of voxel sizes in metres, got {self.scales!r}")
+        for size in self.scales:
+            check_positive("scales", size)
 
 
 def check_method(method: AbstractMethod) -> None:

@@ -47,7 +47,7 @@ def preprocess(
 
     Raises:
         ValueError: if fewer than four points are finite (or remain after downsampling), the cloud is traced, a cloud
-            with covariances is to be downsampled, or an argument is out of range.
+            with covariances is to be downsampled, the cloud is a batch, or an argument is out of range.
 
     Warns:
         UserWarning: once per call, if points with NaN or infinity were left out.
@@ -56,6 +56,8 @@ def preprocess(
         cloud = PointCloud(cloud)
     if not is_concrete(cloud):
         raise ValueError("cloud: expected concrete arrays, got tracers; preprocess outside of jit, grad and vmap")
+    if cloud.points.ndim != 2:
+        raise ValueError(f"cloud: expected a single cloud, got a batch of shape {cloud.points.shape}")
     check_preprocessing(voxel_size, num_neighbors)
     cloud = _finite(cloud.unpad())
     if voxel_size is not None:

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.typing import ArrayLike
 
-from mcgicp_jax._channels import point_spacing, with_channels_matched
+from mcgicp_jax._channels import point_spacing, warn_of_units, with_channels_matched
 from mcgicp_jax._cloud import PointCloud, Values
 from mcgicp_jax._cost import centred_pose, check_matches
 from mcgicp_jax._dense import default_search
@@ -21,7 +21,7 @@ from mcgicp_jax._kept import keep
 from mcgicp_jax._kernels import AbstractKernel
 from mcgicp_jax._methods import AbstractMethod, MultiChannelGICP, PointToPoint
 from mcgicp_jax._neighborhoods import check_neighbors
-from mcgicp_jax._options import Distance, Options, check_method, check_positive
+from mcgicp_jax._options import ROTATION_TOLERANCE, Distance, Options, check_method, check_positive
 from mcgicp_jax._outcome import registration_of
 from mcgicp_jax._pose import Pose, computed_now, is_concrete, se3_from_matrix
 from mcgicp_jax._preprocess import preprocess
@@ -39,6 +39,9 @@ from mcgicp_jax._traced import align_traced, assess, differentiable, register_tr
 _COARSE_SPACINGS, _FINE_SPACINGS = 10.0, 2.5
 # Default translation tolerance, in spacings of the target: 0.5 mm at 0.1 m, chosen like `ROTATION_TOLERANCE`.
 _TOLERANCE_IN_SPACINGS = 0.005
+# Tolerances of the coarse phase, in tolerances, of which the default ones are the least: with tighter ones, the small
+# cycles of matching would keep the coarse phase from ending.
+_COARSE_TOLERANCE = 10.0
 # Least number of source points in a subsampled coarse phase: enough to find a pose nearly as well as all.
 _COARSE_ROWS = 4096
 
@@ -223,7 +226,8 @@ def register(
             are used, a cloud has fewer than four finite points, or `init` is not a rigid motion. The message names the
             argument. Failures to register well-formed clouds show in `Registration.status`.
     Warns:
-        UserWarning: if points with NaN or infinity are left out, or `MultiChannelGICP` gets clouds without channels.
+        UserWarning: if points with NaN or infinity are left out, `MultiChannelGICP` gets clouds without channels, or
+            the values of a channel are so different in the two clouds that their units probably are, too.
     """
     options = Options(
         max_distance=max_distance,
@@ -253,6 +257,8 @@ def register_with(
         raise ValueError("scales: expected none for clouds with covariances, which cannot be averaged in voxels")
     if options.match_channels:
         source = _matched(source, target, method)
+    elif method.uses_channels and is_concrete(source, target):
+        warn_of_units(source, target)
     for voxel_size in options.scales:
         coarse, coarse_target = (_coarser(cloud, voxel_size) for cloud in (source, target))
         once = replace(options, max_distance=None, match_channels=False, scales=())
@@ -319,15 +325,18 @@ def _distances(spacing: Any) -> tuple[Any, Any]:
 def _settings(options: Options, target: PointCloud, stride: Any, dtype: Any) -> Settings:
     max_distance: Any = options.max_distance
     tolerance: Any = options.translation_tolerance
-    if max_distance is None or tolerance is None:
-        # Options are constants to autodiff, even if they are derived from a differentiated cloud.
-        spacing = constant(point_spacing(target))
-        max_distance = _distances(spacing) if max_distance is None else max_distance
-        tolerance = spacing * _TOLERANCE_IN_SPACINGS if tolerance is None else tolerance
+    # Options are constants to autodiff, even if they are derived from a differentiated cloud.
+    spacing = constant(point_spacing(target))
+    max_distance = _distances(spacing) if max_distance is None else max_distance
+    least = spacing * _TOLERANCE_IN_SPACINGS
+    tolerance = least if tolerance is None else tolerance
 
     def number(value: Any, kind: Any) -> Any:
         xp = namespace(value)
         return xp.asarray(value, kind)
+
+    def coarse_tolerance(value: Any, least: Any) -> Any:
+        return number(_COARSE_TOLERANCE * namespace(value, least).maximum(value, least), dtype)
 
     coarse, fine = max_distance if isinstance(max_distance, tuple) or np.shape(max_distance) else [max_distance] * 2
     return Settings(
@@ -336,6 +345,8 @@ def _settings(options: Options, target: PointCloud, stride: Any, dtype: Any) -> 
         coarse_stride=number(stride, np.int32),
         translation_tolerance=number(tolerance, dtype),
         rotation_tolerance=number(options.rotation_tolerance, dtype),
+        coarse_translation_tolerance=coarse_tolerance(tolerance, least),
+        coarse_rotation_tolerance=coarse_tolerance(options.rotation_tolerance, ROTATION_TOLERANCE),
         max_iterations=number(options.max_iterations, np.int32),
         hold_free_directions=number(options.hold_free_directions, bool),
     )

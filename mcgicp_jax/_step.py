@@ -26,9 +26,9 @@ from mcgicp_jax._uncertainty import sandwich
 # maximum correspondence distance. RUNNING: the fine phase, with all points and the smaller distance. SETTLED: the last
 # update was below the tolerances; the sums at its pose are still to be measured.
 COARSE, RUNNING, SETTLED = -3, -1, -2
-# The coarse phase ends with an update below 10 times the tolerances that moves the points by at most 0.25 of the fine
+# The coarse phase ends with an update below its tolerances that moves the points by at most this fraction of the fine
 # maximum correspondence distance. It need not converge further: the fine phase starts from its pose.
-_NEARLY_CONVERGED, _FRACTION_OF_GATE = 10.0, 0.25
+_FRACTION_OF_GATE = 0.25
 # Three points determine a pose; a fourth makes residuals possible.
 _MIN_CORRESPONDENCES = 4
 # Entries of `Registration.history`.
@@ -43,6 +43,7 @@ class Settings(eqx.Module):
         fine_distance: the same in the fine phase, metres; at most `max_distance`.
         coarse_stride: the coarse phase uses every `coarse_stride`-th source point.
         translation_tolerance, rotation_tolerance: an update below both is the last; metres and radians.
+        coarse_translation_tolerance, coarse_rotation_tolerance: an update below both ends the coarse phase.
         max_iterations: maximum number of updates, both phases together.
         hold_free_directions: whether the pose is kept fixed along unconstrained directions.
     """
@@ -52,6 +53,8 @@ class Settings(eqx.Module):
     coarse_stride: Int[AnyArray, "*batch"]
     translation_tolerance: Float[AnyArray, "*batch"]
     rotation_tolerance: Float[AnyArray, "*batch"]
+    coarse_translation_tolerance: Float[AnyArray, "*batch"]
+    coarse_rotation_tolerance: Float[AnyArray, "*batch"]
     max_iterations: Int[AnyArray, "*batch"]
     hold_free_directions: Bool[AnyArray, "*batch"]
 
@@ -127,14 +130,13 @@ def update(
     translation_step = jnp.linalg.norm(change.twist[:3])
     rotation_step = jnp.linalg.norm(change.twist[3:])
 
-    def below(times: float) -> Bool[Array, ""]:
-        return (translation_step <= times * settings.translation_tolerance) & (
-            rotation_step <= times * settings.rotation_tolerance
-        )
+    def below(translation: Float[AnyScalar, ""], rotation: Float[AnyScalar, ""]) -> Bool[Array, ""]:
+        return (translation_step <= translation) & (rotation_step <= rotation)
 
     motion = translation_step + sums.radius * rotation_step
-    nearly = below(_NEARLY_CONVERGED) & (motion <= _FRACTION_OF_GATE * settings.fine_distance)
-    converged = below(1.0) | (coarse & nearly)
+    nearly = below(settings.coarse_translation_tolerance, settings.coarse_rotation_tolerance)
+    nearly = nearly & (motion <= _FRACTION_OF_GATE * settings.fine_distance)
+    converged = below(settings.translation_tolerance, settings.rotation_tolerance) | (coarse & nearly)
     finite = jnp.isfinite(sums.constant) & jnp.all(jnp.isfinite(moved.wxyz_xyz))
     outcomes: tuple[tuple[Array, int], ...] = (
         (sums.num_inliers < _MIN_CORRESPONDENCES, Status.TOO_FEW_CORRESPONDENCES),

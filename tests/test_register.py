@@ -515,3 +515,31 @@ def test_the_unit_of_length_does_not_matter(unit, room):
     assert result.num_iterations == expected.num_iterations and result.status is expected.status
     np.testing.assert_allclose(result.matrix[:3, 3] / unit, expected.matrix[:3, 3], atol=1e-10 if X64 else 1e-5)
     np.testing.assert_allclose(result.matrix[:3, :3], expected.matrix[:3, :3], atol=1e-10 if X64 else 1e-5)
+
+
+@pytest.mark.parametrize("gain, offset, warned", [(1, 0, False), (3, 0.1, False), (255, 0, True), (1, 50, True)])
+def test_channels_in_other_units_are_reported(gain, offset, warned, room):
+    source, target, _ = room
+    changed = source.replace(channels=gain * source.channels + offset)
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        mcg.register(changed, target, mcg.MultiChannelGICP(0.05, 0.3), max_distance=0.5, max_iterations=1)
+        mcg.register(changed, target, mcg.GICP(), max_distance=0.5, max_iterations=1)
+        mcg.register(changed, target, mcg.MultiChannelGICP(0.05, 0.3), match_channels=True, max_iterations=1)
+    messages = [str(each.message) for each in caught]
+    assert any("units differ" in message for message in messages) == warned
+    assert len(messages) <= source.channels.shape[1]
+
+
+def test_tight_tolerances_do_not_keep_the_coarse_phase_from_ending(room):
+    source, target, _ = room
+    usual, tight = (mcg.register(source, target, mcg.GICP(), **options) for options in ({}, TIGHT))
+    exact = mcg.register(source, target, mcg.GICP(), translation_tolerance=0.0, rotation_tolerance=0.0)
+    assert exact.num_inliers == tight.num_inliers == usual.num_inliers
+    np.testing.assert_allclose(exact.matrix, tight.matrix, atol=1e-6)
+
+
+def test_a_batch_of_clouds_is_refused(room):
+    source, target, _ = room
+    with pytest.raises(ValueError, match=r"source: .*expected a single cloud"):
+        mcg.register(mcg.PointCloud.stack([source.unpad(), source.unpad()]), target, mcg.GICP())

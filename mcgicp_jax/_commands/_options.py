@@ -55,7 +55,7 @@ ADVICE = {
     mcg.Status.TOO_FEW_CORRESPONDENCES: "fewer than four points have a match; "
     "try --init with a pose at which the clouds overlap, or a larger --max-distance",
     mcg.Status.DEGENERATE: "the pose is unconstrained in at least one direction; "
-    "try clouds that show more of the scene, or mc-gicp if they have channels",
+    "try clouds that show more of the scene, or have channels that mc-gicp can use",
     mcg.Status.NON_FINITE: "numerical overflow; are the coordinates in metres?",
 }
 
