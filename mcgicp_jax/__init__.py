@@ -9,8 +9,10 @@ from mcgicp_jax._channel_covariance import estimate_channel_covariance
 from mcgicp_jax._cloud import PointCloud
 from mcgicp_jax._cost import mahalanobis_cost
 from mcgicp_jax._dense import DenseSearch
-from mcgicp_jax._kernels import AbstractKernel, Cauchy, GemanMcClure, Huber, Tukey
+from mcgicp_jax._gaussians import cell_moments, gaussians, voxel_cells
+from mcgicp_jax._kernels import AbstractKernel, Cauchy, GemanMcClure, Huber, Tukey, Welsch
 from mcgicp_jax._methods import GICP, AbstractMethod, ColorICP, MultiChannelGICP, PointToPlane, PointToPoint
+from mcgicp_jax._ndt import D2DNDT, NDT, ColorNDT
 from mcgicp_jax._odometry import aggregate, odometry
 from mcgicp_jax._preprocess import preprocess
 from mcgicp_jax._register import align, find_correspondences, register
@@ -19,13 +21,16 @@ from mcgicp_jax._search import AbstractSearch, Correspondences
 from mcgicp_jax._trees import AbstractTreeSearch, KDTreeSearch
 
 __all__ = [
+    "D2DNDT",
     "GICP",
+    "NDT",
     "AbstractKernel",
     "AbstractMethod",
     "AbstractSearch",
     "AbstractTreeSearch",
     "Cauchy",
     "ColorICP",
+    "ColorNDT",
     "Correspondences",
     "DenseSearch",
     "GemanMcClure",
@@ -39,11 +44,14 @@ __all__ = [
     "Registration",
     "Status",
     "Tukey",
+    "Welsch",
     "aggregate",
     "align",
+    "cell_moments",
     "datasets",
     "estimate_channel_covariance",
     "find_correspondences",
+    "gaussians",
     "io",
     "mahalanobis_cost",
     "metrics",
@@ -53,5 +61,6 @@ __all__ = [
     "register",
     "register_as_completed",
     "register_batch",
+    "voxel_cells",
 ]
 __version__ = "0.1.0"

@@ -222,7 +222,7 @@ def sandwich(outside: Float[Array, "3 N"], inside: Float[Array, "3 N"]) -> Float
     )
 
 
-def floor_eigenvalues(symmetric: Float[Array, "3 N"], floor: Float[Array, ""]) -> Float[Array, "3 N"]:
+def floor_eigenvalues(symmetric: Float[Array, "3 N"], floor: Float[Array, "*N"]) -> Float[Array, "3 N"]:
     """Raise the eigenvalues of 2×2 matrices to at least `floor`; matrices above it are returned bit for bit."""
     a, b, c = symmetric
     mean, half = 0.5 * (a + c), 0.5 * (a - c)

@@ -43,7 +43,7 @@ def mahalanobis_cost(
         source, target: preprocessed clouds.
         matches: from `find_correspondences`.
         method: defines M; parameters left None are estimated from the clouds.
-        robust: kernel ρ applied to the Mahalanobis distance of each match; None for ρ(s²) = s².
+        robust: kernel ρ applied to the Mahalanobis distance of each match, as in `register`; without any, ρ(s²) = s².
         temperature: metres. Weighs the candidates of each source point (`num_candidates`) by a softmax of
             −½ (distance / temperature)², with distances in position and α · channel; this gives α a gradient. As it
             tends to 0, only the nearest candidate counts. Required if there are several candidates.
@@ -67,6 +67,7 @@ def mahalanobis_cost(
     matrix = centred_pose(pose, source, target, "pose")
     rotation, translation = jnp.asarray(matrix[:3, :3], dtype), jnp.asarray(matrix[:3, 3], dtype)
     temperature = None if temperature is None else jnp.asarray(temperature, dtype)
+    robust = method.default_kernel() if robust is None else robust
     return _total_cost(rotation, translation, *surfaces, matches, method, robust, temperature, log_determinant)
 
 

@@ -95,6 +95,16 @@ class GemanMcClure(AbstractKernel):
         return 1 / (1 + square / scale**2) ** 2
 
 
+class Welsch(AbstractKernel):
+    """Welsch kernel: ρ = k² (1 − exp(−s²/k²)). The score of an NDT is a sum of such terms."""
+
+    def _rho(self, square: Float[Array, "N"], scale: Float[Array, ""]) -> Float[Array, "N"]:
+        return -(scale**2) * jnp.expm1(-square / scale**2)
+
+    def _weight(self, square: Float[Array, "N"], scale: Float[Array, ""]) -> Float[Array, "N"]:
+        return jnp.exp(-square / scale**2)
+
+
 class Tukey(AbstractKernel):
     """Tukey's biweight kernel: ρ = k²/3 (1 − (1 − s²/k²)³) for s up to k; constant beyond, with weight 0."""
 

@@ -1,8 +1,9 @@
-"""The five registration methods: their covariances and information matrices, and the space of the search."""
+"""Registration methods: their covariances and information matrices, and the space of the search."""
 
 from __future__ import annotations
 
 import abc
+from collections.abc import Iterator, Sequence
 from typing import ClassVar
 
 import equinox as eqx
@@ -19,8 +20,9 @@ from mcgicp_jax._forces import Forces, weighed
 from mcgicp_jax._kernels import AbstractKernel, Numbers
 from mcgicp_jax._local import locals_of
 from mcgicp_jax._neighborhoods import NO_NEIGHBORS as _NO_NEIGHBORS
-from mcgicp_jax._neighborhoods import channel_kernel, multichannel_covariance, plane_covariance
+from mcgicp_jax._neighborhoods import channel_kernel, check_neighbors, multichannel_covariance, plane_covariance
 from mcgicp_jax._pose import AnyArray, canonical_float, is_concrete
+from mcgicp_jax._preprocess import preprocess
 from mcgicp_jax._statistics import constant, namespace
 from mcgicp_jax._surface import Local, Neighborhoods, Table, covariance_of, points_of
 
@@ -46,6 +48,8 @@ class AbstractMethod(Numbers):
     uses_channels: ClassVar[bool] = False
     # Whether `covariance` needs the individual neighbours, beyond their local statistics.
     uses_neighborhoods: ClassVar[bool] = False
+    # Which of "source" and "target" must have covariances, as from `gaussians`.
+    needs_covariances: ClassVar[tuple[str, ...]] = ()
 
     def is_open(self, source: PointCloud, target: PointCloud) -> bool:
         """Whether a parameter is to be chosen from the data of these clouds."""
@@ -117,6 +121,27 @@ class AbstractMethod(Numbers):
         information = self.information(covariance_of(target), covariance_of(source), rotation)
         return weighed(residual, information, robust)
 
+    def stages(
+        self, source: PointCloud, target: PointCloud, scales: Sequence[float]
+    ) -> Iterator[tuple[AbstractMethod, PointCloud, PointCloud]]:
+        """Method, source and target of each registration for the option `scales`; the last one gives the result.
+
+        Args:
+            source, target: preprocessed clouds; also raw ones if the method `needs_covariances`.
+            scales: voxel sizes, metres, coarse to fine.
+        """
+        for voxel_size in scales:
+            yield self, _coarser(source, voxel_size), _coarser(target, voxel_size)
+        yield self, source, target
+
+    def default_kernel(self) -> AbstractKernel | None:
+        """The robust kernel where the caller gives none."""
+        return None
+
+    def described(self, local: Local, given: Float[Array, "6 n"] | None) -> Local:
+        """The local statistics of points, given those of their neighbourhoods and the covariances of the cloud."""
+        return local
+
     def weights(self, num_channels: int) -> Float[AnyArray, "C"] | None:
         """α of each channel, metres per channel unit; None if the method searches in position alone."""
         return None
@@ -148,7 +173,7 @@ class PointToPoint(AbstractOneSided):
         local: Local | None,
         given: Float[Array, "6 n"] | None,
     ) -> Float[Array, "6 n"]:
-        return _identity(points)
+        return identity(points)
 
 
 class PointToPlane(AbstractOneSided):
@@ -199,7 +224,7 @@ class ColorICP(AbstractOneSided):
         local: Local | None,
         given: Float[Array, "6 n"] | None,
     ) -> Float[Array, "6 n"]:
-        return _identity(points)
+        return identity(points)
 
     def weights(self, num_channels: int) -> Float[AnyArray, "C"]:
         return _per_channel("channel_weights", self.channel_weights, num_channels)
@@ -357,7 +382,11 @@ class MultiChannelGICP(AbstractGeneralized):
         return xp.broadcast_to(xp.diagonal(covariance) if covariance.ndim == 2 else covariance, (num_channels,))
 
 
-def _identity(points: Float[Array, "3 n"]) -> Float[Array, "6 n"]:
+def _coarser(cloud: PointCloud, voxel_size: float) -> PointCloud:
+    return preprocess(cloud, voxel_size, check_neighbors(cloud).shape[-1])
+
+
+def identity(points: Float[Array, "3 n"]) -> Float[Array, "6 n"]:
     identity = jnp.array([[1.0], [0.0], [0.0], [1.0], [0.0], [1.0]], points.dtype)
     return jnp.broadcast_to(identity, (6, points.shape[1]))
 

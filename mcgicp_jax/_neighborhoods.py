@@ -15,7 +15,7 @@ from mcgicp_jax import _algebra as alg
 from mcgicp_jax._cloud import PointCloud
 from mcgicp_jax._observability import geometry_observability
 from mcgicp_jax._pose import AnyArray
-from mcgicp_jax._surface import Local, Neighborhoods
+from mcgicp_jax._surface import Local, Neighborhoods, local_of
 
 # Rank of the neighbour that roughness is measured with (0 is the point itself). The nearest neighbours are selected for
 # similar heights, and the heights of far ones include the curvature of the surface.
@@ -74,29 +74,24 @@ def describe(around: Neighborhoods) -> Local:
     offsets = _offsets(around)
     covariance = weighted_covariance(offsets, around.present.astype(offsets[0].dtype))
     normal = alg.smallest_eigenvector(covariance)
-    observed = [jnp.atleast_2d(columns) for columns in _observed(around, offsets, covariance, normal)]
-    return Local(jnp.concatenate([covariance, normal]).T, jnp.concatenate(observed).T)
+    return local_of(covariance, normal, *_observed(around, offsets, covariance, normal))
 
 
 def _observed(
     around: Neighborhoods, offsets: Offsets, covariance: Float[Array, "6 n"], normal: Float[Array, "3 n"]
-) -> list[Array]:
-    """The columns of `Local.observed`: observability from geometry, roughness, reach, and the fit of each channel."""
+) -> tuple[Array, Array, Array, Array]:
+    """Observability from geometry, roughness, reach, and the fits of the channels, of `Local`; constant to autodiff."""
     around, offsets, covariance, normal = jax.lax.stop_gradient((around, offsets, covariance, normal))
     count = jnp.maximum(jnp.sum(around.present, axis=0), 1).astype(normal.dtype)
     basis = alg.orthonormal_basis(normal)
     rank = min(_ROUGHNESS_RANK, offsets[0].shape[0] - 1)
     height = sum(offset[rank] * axis for offset, axis in zip(offsets, normal, strict=True))
-    columns = [
-        geometry_observability(covariance, normal, basis, count),
-        0.5 * height**2,
-        jnp.sqrt(jnp.max(sum(offset * offset for offset in offsets), axis=0)),
-    ]
+    fits = jnp.zeros((0, height.size), height.dtype)
     if around.num_channels:
         x, y = (sum(offset * b for offset, b in zip(offsets, axis, strict=True)) for axis in basis)
-        for channel in range(around.num_channels):
-            columns.append(_channel_fit(around, x, y, channel))
-    return columns
+        fits = jnp.concatenate([_channel_fit(around, x, y, channel) for channel in range(around.num_channels)])
+    reach = jnp.sqrt(jnp.max(sum(offset * offset for offset in offsets), axis=0))
+    return geometry_observability(covariance, normal, basis, count), 0.5 * height**2, reach, fits.T
 
 
 def _channel_fit(

@@ -52,14 +52,8 @@ def preprocess(
     Warns:
         UserWarning: once per call, if points with NaN or infinity were left out.
     """
-    if not isinstance(cloud, PointCloud):
-        cloud = PointCloud(cloud)
-    if not is_concrete(cloud):
-        raise ValueError("cloud: expected concrete arrays, got tracers; preprocess outside of jit, grad and vmap")
-    if cloud.points.ndim != 2:
-        raise ValueError(f"cloud: expected a single cloud, got a batch of shape {cloud.points.shape}")
     check_preprocessing(voxel_size, num_neighbors)
-    cloud = _finite(cloud.unpad())
+    cloud = finite_rows(cloud)
     if voxel_size is not None:
         cloud = _downsampled(cloud, voxel_size)
     points, channel_valid, covariances = np.asarray(cloud.points), cloud.channel_valid, cloud.covariances
@@ -93,8 +87,15 @@ def check_preprocessing(voxel_size: float | None, num_neighbors: int) -> None:
         raise ValueError(f"num_neighbors: expected at least 3, got {num_neighbors}")
 
 
-def _finite(cloud: PointCloud) -> PointCloud:
-    """Drop rows with a NaN or infinity in any array; warns if there are any."""
+def finite_rows(cloud: PointCloud | Values) -> PointCloud:
+    """A raw cloud without padding and without rows that have a NaN or infinity in any array; warns of the latter."""
+    if not isinstance(cloud, PointCloud):
+        cloud = PointCloud(cloud)
+    if not is_concrete(cloud):
+        raise ValueError("cloud: expected concrete arrays, got tracers; preprocess outside of jit, grad and vmap")
+    if cloud.points.ndim != 2:
+        raise ValueError(f"cloud: expected a single cloud, got a batch of shape {cloud.points.shape}")
+    cloud = cloud.unpad()
     arrays = [array for array in (cloud.points, cloud.channels, cloud.covariances) if array is not None]
     # Values such as 1e39 or 1e300 overflow float32 and count as infinite.
     finite = [np.abs(array) <= _LARGEST for array in arrays]
@@ -120,7 +121,7 @@ def _downsampled(cloud: PointCloud, voxel_size: float) -> PointCloud:
         raise ValueError("voxel_size: expected None for a cloud with covariances, which cannot be averaged")
     # Working by columns takes a third of the time of working by rows.
     columns = np.ascontiguousarray(np.asarray(cloud.points).T, np.float64)
-    order, starts = _voxels(columns, voxel_size)
+    order, starts = voxels(columns, voxel_size)
     if len(starts) < MIN_POINTS:
         raise ValueError(
             f"voxel_size: expected a size that leaves at least {MIN_POINTS} points, got {voxel_size} m, "
@@ -143,7 +144,7 @@ def _downsampled(cloud: PointCloud, voxel_size: float) -> PointCloud:
     return PointCloud(means, channels, channel_valid=channel_valid, channel_names=names)
 
 
-def _voxels(columns: Float[np.ndarray, "3 N"], voxel_size: float) -> tuple[Int[np.ndarray, "N"], Int[np.ndarray, "M"]]:
+def voxels(columns: Float[np.ndarray, "3 N"], voxel_size: float) -> tuple[Int[np.ndarray, "N"], Int[np.ndarray, "M"]]:
     """An order that sorts points by voxel, and where each of the M occupied voxels starts in it."""
     key, largest = np.zeros(columns.shape[1], np.int64), 1
     for column in columns:

@@ -20,7 +20,6 @@ from mcgicp_jax._host import correspondences_at, register_on_host
 from mcgicp_jax._kept import keep
 from mcgicp_jax._kernels import AbstractKernel
 from mcgicp_jax._methods import AbstractMethod, MultiChannelGICP, PointToPoint
-from mcgicp_jax._neighborhoods import check_neighbors
 from mcgicp_jax._options import ROTATION_TOLERANCE, Distance, Options, check_method, check_positive
 from mcgicp_jax._outcome import registration_of
 from mcgicp_jax._pose import Pose, computed_now, is_concrete, se3_from_matrix
@@ -136,7 +135,7 @@ def align(
         init: T_target_source to start from, `jaxlie.SE3` or (4, 4); the identity by default.
         max_iterations: maximum number of pose updates.
         translation_tolerance, rotation_tolerance: metres and radians, as in `register`.
-        robust: kernel ρ applied to the Mahalanobis distance of each match.
+        robust: kernel ρ applied to the Mahalanobis distance of each match, as in `register`.
         temperature: metres; soft assignment of several candidates per source point, as in `mahalanobis_cost`.
 
     Returns:
@@ -158,6 +157,7 @@ def align(
     _check_clouds(source, target, method)
     method, seen, there = surfaces_of(method, source, target, observed=False)
     dtype = source.points.dtype
+    robust = method.default_kernel() if robust is None else robust
     start = se3_from_matrix(centred_pose(init, source, target), dtype)
     softness = None if temperature is None else jnp.asarray(temperature, dtype)
     settings = _settings(options, target, 1, dtype)
@@ -197,8 +197,8 @@ def register(
     Args:
         source, target: clouds from `preprocess`. Raw clouds and (N, 3) arrays, metres, are preprocessed with the
             defaults of `preprocess`; not inside `jit`.
-        method: `MultiChannelGICP()`, `GICP()`, `PointToPlane()`, `PointToPoint()` or `ColorICP(...)`. Parameters left
-            None are estimated from the clouds.
+        method: `MultiChannelGICP()`, `GICP()`, `PointToPlane()`, `PointToPoint()`, `ColorICP(...)`; for clouds of
+            `gaussians` or with `scales`, `NDT()`, `ColorNDT(...)`, `D2DNDT()`. Parameters left None are estimated.
         init: T_target_source to start from, `jaxlie.SE3` or (4, 4); the identity by default.
         max_distance: maximum correspondence distance, metres of position; matches beyond it are rejected. One number,
             or two, for the coarse and the fine phase. None: 10 and 2.5 times the spacing of the target (its median
@@ -206,7 +206,8 @@ def register(
         max_iterations: maximum number of pose updates in both phases together.
         translation_tolerance, rotation_tolerance: metres (at the centroid of the matches) and radians; the loop has
             converged when an update is below both. `translation_tolerance` None: 0.5 % of the spacing of the target.
-        robust: kernel of each match's Mahalanobis distance: `Huber`, `Cauchy`, `GemanMcClure`, `Tukey`.
+        robust: kernel of each match's Mahalanobis distance: `Huber`, `Cauchy`, `GemanMcClure`, `Tukey`, `Welsch`. None:
+            that of the method (NDT: `Welsch`), or none.
         search: nearest-neighbour search; by default `KDTreeSearch` on CPUs and `DenseSearch` on accelerators.
         hold_free_directions: do not update the pose along unconstrained directions, which neither the shape of the
             clouds nor the channels (if the method uses them) constrain. If False, arbitrary nearest-neighbour matches
@@ -216,7 +217,8 @@ def register(
             at the pose of the first, from those of matched points.
         scales: voxel sizes, metres, from coarse to fine, for a start that is far off: the clouds are first registered
             at each voxel size, in this order, each time from the pose before and with the default `max_distance`; the
-            one given is for the last registration. Not available inside transformations.
+            one given is for the last registration. For NDT, the sizes of its cells: the clouds are raw ones, and the
+            last size gives the result. Not available inside transformations.
 
     Returns:
         The pose with its status, quality of the fit and uncertainty; check `converged`.
@@ -252,18 +254,22 @@ def register_with(
 ) -> Registration:
     """`register` with its options as one object."""
     check_method(method)
-    source, target = _ready("source", source), _ready("target", target)
+    source, target = (
+        _ready(name, cloud, raw=bool(options.scales and method.needs_covariances))
+        for name, cloud in (("source", source), ("target", target))
+    )
     if options.scales and not (source.covariances is None and target.covariances is None):
         raise ValueError("scales: expected none for clouds with covariances, which cannot be averaged in voxels")
     if options.match_channels:
         source = _matched(source, target, method)
     elif method.uses_channels and is_concrete(source, target):
         warn_of_units(source, target)
-    for voxel_size in options.scales:
-        coarse, coarse_target = (_coarser(cloud, voxel_size) for cloud in (source, target))
-        once = replace(options, max_distance=None, match_channels=False, scales=())
-        found = register_with(coarse, coarse_target, method, init, once)
+    *before, (method, source, target) = method.stages(source, target, options.scales)
+    once = replace(options, max_distance=None, match_channels=False, scales=())
+    for coarse_method, coarse, coarse_target in before:
+        found = register_with(coarse, coarse_target, coarse_method, init, once)
         init = found.matrix if is_usable(found) else init
+    source = _ready("source", source)
     search = options.search or default_search()
     problem = pose_problem(source, target, method, init, options, search.num_threads)
     state, finish = _run(problem, target, search, options.max_iterations)
@@ -310,7 +316,8 @@ def pose_problem(
     xp = namespace(source.valid)
     stride = xp.maximum(xp.sum(xp.asarray(source.valid)) // _COARSE_ROWS, 1)
     start = se3_from_matrix(centred_pose(init, source, target), dtype)
-    return Problem(start, seen, there, method, options.robust, _settings(options, target, stride, dtype))
+    robust = method.default_kernel() if options.robust is None else options.robust
+    return Problem(start, seen, there, method, robust, _settings(options, target, stride, dtype))
 
 
 def default_distances(target: PointCloud) -> tuple[Any, Any]:
@@ -378,15 +385,12 @@ def _nearest_points(
     return find_correspondences(source, target, pose, PointToPoint(), max_distance=distance, search=search)
 
 
-def _coarser(cloud: PointCloud, voxel_size: float) -> PointCloud:
-    return preprocess(cloud, voxel_size, check_neighbors(cloud).shape[-1])
-
-
-def _ready(name: str, cloud: PointCloud | Values) -> PointCloud:
+def _ready(name: str, cloud: PointCloud | Values, raw: bool = False) -> PointCloud:
+    """The cloud, preprocessed unless it may be `raw`."""
     try:
         if not isinstance(cloud, PointCloud):
             cloud = PointCloud(cloud)
-        if cloud.neighbors is None:
+        if cloud.neighbors is None and not raw:
             cloud = preprocess(cloud)
     except ValueError as error:
         raise ValueError(f"{name}: {error}") from error
@@ -400,6 +404,12 @@ def _check_clouds(source: PointCloud, target: PointCloud, method: AbstractMethod
         if cloud.points.ndim != 2:
             raise ValueError(
                 f"{name}: expected a single cloud, got shape {cloud.points.shape}; use jax.vmap for a batch"
+            )
+    for name, cloud in (("source", source), ("target", target)):
+        if name in method.needs_covariances and cloud.covariances is None:
+            raise ValueError(
+                f"{name}: expected a cloud with covariances for {type(method).__name__}; make it with "
+                "mcgicp_jax.gaussians, or pass scales to register"
             )
     if method.uses_channels:
         _check_channels(source, target, method)

@@ -105,6 +105,11 @@ class Local(NamedTuple):
         """Distance to the farthest neighbour, metres."""
         return self.observed[:, 7]
 
+    @property
+    def fits(self) -> Float[AnyArray, "N _"]:
+        """The columns of `fit` of all channels."""
+        return self.observed[:, _FIXED:]
+
     def fit(self, channel: int) -> Float[AnyArray, "6 N"]:
         """Linear fit of a channel over the tangent plane: gradient (2), residual variance (1), and inverse of the
         normal matrix (3). Where too few neighbours have the channel, the variance is NaN and the rest 0."""
@@ -128,6 +133,19 @@ class Surface(NamedTuple):
     rows: Rows
     table: Table
     details: Float[AnyArray, "*batch N 6"] | None
+
+
+def local_of(
+    covariance: Float[AnyArray, "6 n"],
+    normal: Float[AnyArray, "3 n"],
+    geometry: Float[AnyArray, "6 n"],
+    roughness: Float[AnyArray, "n"],
+    reach: Float[AnyArray, "n"],
+    fits: Float[AnyArray, "n _"],
+) -> Local:
+    """`Local` from its parts; `fits` are the columns of all channels."""
+    observed = jnp.concatenate([geometry.T, roughness[:, None], reach[:, None], fits], axis=1)
+    return Local(jnp.concatenate([covariance, normal]).T, observed)
 
 
 def points_of(table: Table) -> Float[AnyArray, "3 N"]:

@@ -159,6 +159,7 @@ def tables(
     """
     points = jnp.asarray(points).T
     covariances = None if given is None else alg.symmetric_from_matrix(jnp.asarray(given))
+    local = None if local is None else method.described(local, covariances)
     columns = [points, method.covariance(points, around, local, covariances)]
     if not observed or local is None:
         return tuple(column.T for column in columns), None

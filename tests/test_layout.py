@@ -14,7 +14,7 @@ LAYERS = {
     "search": ("_search", "_nearest", "_tree_index", "_pykdtree", "_trees", "_dense"),
     "data": ("_cloud", "_kept", "_preprocess", "_formats", "io", "metrics", "datasets"),
     "local surfaces": ("_surface", "_observability", "_neighborhoods", "_local", "_channels"),
-    "correspondences": ("_forces", "_methods", "_surfaces", "_sums"),
+    "correspondences": ("_forces", "_methods", "_surfaces", "_sums", "_gaussians", "_ndt"),
     "pose": ("_solve", "_directions", "_uncertainty", "_result", "_step"),
     "loops": ("_host", "_traced", "_lanes"),
     "use": ("_options", "_cost", "_outcome", "_register", "_channel_covariance", "_batch", "_odometry"),

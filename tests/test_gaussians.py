@@ -1,0 +1,204 @@
+"""Voxel Gaussians: their statistics, and registration to them."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import mcgicp_jax as mcg
+from mcgicp_jax.metrics import pose_error
+from tests.differences import GATE, TO_ROUNDING, X64, check_gradient, needs_x64, weigh
+from tests.scenes import motion, room_corner, wall
+
+SIZE = 0.4
+
+
+def raw_pair(size=6000, truth=None, scene=room_corner):
+    truth = motion() if truth is None else truth
+    points, channels = scene(size, seed=1)
+    source = mcg.PointCloud((points - truth[:3, 3]) @ truth[:3, :3], channels)
+    return source, mcg.PointCloud(*scene(size, seed=2)), truth
+
+
+@pytest.fixture(scope="module")
+def raw():
+    return raw_pair()
+
+
+def test_statistics_are_those_of_numpy():
+    points, channels = room_corner(3000)
+    cloud = mcg.PointCloud(points + 100.0, channels)
+    cells = mcg.voxel_cells(cloud, SIZE)
+    found = mcg.gaussians(cloud, SIZE, min_ratio=0.0)
+    assert len(found) == cells.max() + 1 > 20 and found.neighbors is not None
+    expected = [np.cov(points[cells == i].T) for i in range(len(found))]
+    tolerance = 1e-12 if X64 else 1e-7
+    np.testing.assert_allclose(found.covariances, expected, atol=tolerance)
+    means = [np.mean(points[cells == i] + 100.0, axis=0) for i in range(len(found))]
+    np.testing.assert_allclose(found.coordinates, means, atol=1e-12 if X64 else 1e-5)
+    values = [np.mean(channels[cells == i], axis=0) for i in range(len(found))]
+    np.testing.assert_allclose(found.channels, values, atol=1e-12 if X64 else 1e-6)
+    # Cells are voxels: no two have points in the same one.
+    voxels = np.floor((points + 100.0) / SIZE).astype(int)
+    assert all(len(np.unique(voxels[cells == i], axis=0)) == 1 for i in range(len(found)))
+    assert np.bincount(cells[cells >= 0]).min() >= 6
+
+
+def test_flat_cells_are_kept():
+    points, _ = wall(3000, noise=0.0)
+    found = mcg.gaussians(points, SIZE, min_ratio=0.02)
+    assert len(found) == mcg.voxel_cells(points, SIZE).max() + 1
+    values = np.linalg.eigvalsh(found.covariances)
+    np.testing.assert_allclose(values[:, 0], 0.02 * values[:, 2], rtol=1e-5)
+
+
+def test_cells_of_one_colour():
+    points, _ = wall(4000)
+    colours = (points[:, :1] > 1.1).astype(float)
+    whole, split = (mcg.gaussians(mcg.PointCloud(points, colours), SIZE, channel_size=size) for size in (None, 0.5))
+    assert np.any((whole.channels > 0.05) & (whole.channels < 0.95))
+    assert set(np.unique(split.channels)) == {0.0, 1.0}
+    assert len(split) > len(whole)
+    # A channel of infinite size does not split.
+    np.testing.assert_array_equal(
+        mcg.gaussians(mcg.PointCloud(points, colours - 0.5), SIZE, channel_size=np.inf).points, whole.points
+    )
+
+
+def test_missing_channels():
+    points, channels = room_corner(4000)
+    known = points[:, 0] > 0.5
+    cloud = mcg.PointCloud(points, channels, channel_valid=np.repeat(known[:, None], 2, axis=1))
+    cells = mcg.voxel_cells(cloud, SIZE)
+    found = mcg.gaussians(cloud, SIZE)
+    for i in range(len(found)):
+        inside = (cells == i) & known
+        assert np.all(found.channel_valid[i] == inside.any())
+        if inside.any():
+            np.testing.assert_allclose(found.channels[i], channels[inside].mean(axis=0), rtol=1e-5)
+    assert len(mcg.gaussians(cloud, SIZE, channel_size=100.0)) >= len(found)
+
+
+def test_means_of_covariances():
+    """Voxelised GICP: the covariances are dimensionless, and GICP uses them beside its own."""
+    source, target, truth = raw_pair()
+    cells = mcg.gaussians(target, SIZE, of="covariances")
+    values = np.linalg.eigvalsh(cells.covariances)
+    assert values.min() >= 1e-3 and values.max() < 1.0001
+    result = mcg.register(source, cells, mcg.GICP(), max_distance=1.0)
+    assert result.converged and max(pose_error(result.matrix, truth)) < 0.02
+    given = mcg.preprocess(target)
+    given = given.replace(covariances=np.tile(np.eye(3), (len(given), 1, 1)))
+    np.testing.assert_allclose(mcg.gaussians(given, SIZE, of="covariances").covariances[3], np.eye(3), atol=1e-6)
+
+
+def test_moments_in_jax():
+    points, channels = room_corner(3000)
+    cloud = mcg.PointCloud(points, channels)
+    cells, expected = mcg.voxel_cells(cloud, SIZE), mcg.gaussians(cloud, SIZE)
+    dtype = expected.points.dtype
+    moments = jax.jit(lambda points, channels: mcg.cell_moments(points, channels, cells))
+    means, values, covariances = moments(points.astype(dtype), channels.astype(dtype))
+    assert means.dtype == covariances.dtype == dtype
+    tolerance = 1e-12 if X64 else 2e-6
+    np.testing.assert_allclose(means, expected.points, atol=tolerance)
+    np.testing.assert_allclose(values, expected.channels, atol=tolerance)
+    np.testing.assert_allclose(covariances, expected.covariances, atol=tolerance)
+
+
+@needs_x64
+@pytest.mark.parametrize("name", ["ndt", "d2d-ndt"])
+def test_gradients_reach_the_points(name, raw):
+    source, target, _ = raw
+    method = {"ndt": mcg.NDT(), "d2d-ndt": mcg.D2DNDT()}[name]
+    numbers = [mcg.voxel_cells(cloud, SIZE) for cloud in (source, target)]
+    cells = [mcg.gaussians(cloud, SIZE) for cloud in (source, target)]
+    start = mcg.register(*cells, method, max_distance=GATE, **TO_ROUNDING).matrix
+    matches = mcg.find_correspondences(*cells, start, method, max_distance=GATE)
+
+    def loss(inputs):
+        clouds = []
+        for side, cloud, number, gaussians in zip(("source", "target"), (source, target), numbers, cells, strict=True):
+            means, channels, spread = mcg.cell_moments(inputs[side], cloud.channels, number)
+            clouds.append(gaussians.replace(points=means, channels=channels, covariances=spread))
+        return weigh(mcg.align(*clouds, matches, inputs["method"], init=start, **TO_ROUNDING).matrix)
+
+    check_gradient(loss, {"source": jnp.asarray(source.points), "target": jnp.asarray(target.points), "method": method})
+
+
+@pytest.mark.parametrize("method", [mcg.NDT(), mcg.D2DNDT(), mcg.ColorNDT(0.1)], ids=["ndt", "d2d-ndt", "colour"])
+def test_the_pose_is_found(method, raw):
+    source, target, truth = raw
+    cells = mcg.gaussians(target, SIZE)
+    moving = source if method.needs_covariances == ("target",) else mcg.gaussians(source, SIZE)
+    result = mcg.register(moving, cells, method)
+    assert result.converged and np.isfinite(result.covariance).all()
+    assert max(pose_error(result.matrix, truth)) < (0.02 if isinstance(method, mcg.D2DNDT) else 0.01)
+    if mcg.preprocess(moving).channels.shape == cells.channels.shape:
+        inside = jax.jit(lambda a, b: mcg.register(a, b, method).matrix)(mcg.preprocess(moving), cells)
+        np.testing.assert_allclose(inside, result.matrix, atol=1e-9 if X64 else 1e-4)
+
+
+def test_scales_make_the_cells(raw):
+    source, target, truth = raw
+    far = motion((0.15, -0.1, 0.1, 0.05, -0.05, 0.1))
+    moved = source.transform(np.linalg.inv(far))
+    thinned = mcg.preprocess(moved, 0.05)
+    for moving, method in ((moved, mcg.D2DNDT()), (thinned, mcg.NDT())):
+        result = mcg.register(moving, target, method, scales=(0.8, SIZE))
+        assert result.converged and max(pose_error(result.matrix, truth @ far)) < 0.02
+        # The last scale is the result.
+        cells = mcg.gaussians(target, SIZE)
+        end = mcg.gaussians(moved, SIZE) if isinstance(method, mcg.D2DNDT) else thinned
+        again = mcg.register(end, cells, method, init=result.matrix)
+        np.testing.assert_allclose(again.matrix, result.matrix, atol=1e-3)
+        assert again.num_inliers == result.num_inliers
+
+
+@pytest.mark.parametrize("method", [mcg.NDT(), mcg.D2DNDT()], ids=["ndt", "d2d-ndt"])
+def test_the_unit_of_length_does_not_matter(method, raw):
+    source, target, _ = raw
+    results = []
+    for unit in (1.0, 1000.0):
+        clouds = [mcg.gaussians(mcg.PointCloud(unit * cloud.points), unit * SIZE) for cloud in (source, target)]
+        results.append(mcg.register(*clouds, method).matrix)
+    results[1][:3, 3] /= 1000.0
+    np.testing.assert_allclose(results[0], results[1], atol=1e-9 if X64 else 2e-5)
+
+
+def test_colours_hold_what_geometry_does_not():
+    source, target, truth = raw_pair(8000, motion((0.02, -0.015, 0.0, 0.0, 0.0, 0.01)), wall)
+    weights = 0.2
+    size = SIZE / weights / 2
+    cells = mcg.gaussians(target, SIZE, channel_size=size)
+    colour = mcg.register(source, cells, mcg.ColorNDT(weights))
+    assert colour.converged and max(pose_error(colour.matrix, truth)) < 0.01
+    plain = mcg.register(source, mcg.gaussians(target, SIZE), mcg.NDT())
+    assert plain.status == mcg.Status.DEGENERATE
+
+
+def test_what_is_wrong_is_named(raw):
+    source, target, _ = raw
+    cells = mcg.gaussians(target, SIZE)
+    with pytest.raises(ValueError, match=r"target: expected .* covariances for NDT; make it with .*gaussians"):
+        mcg.register(source, target, mcg.NDT())
+    with pytest.raises(ValueError, match="source: expected a cloud with covariances for D2DNDT"):
+        mcg.register(source, cells, mcg.D2DNDT())
+    with pytest.raises(ValueError, match="scales: expected none for clouds with covariances"):
+        mcg.register(source, cells, mcg.NDT(), scales=(1.0,))
+    with pytest.raises(
+        ValueError, match="target: voxel_size: expected a size that leaves at least 4 cells of 6 points"
+    ):
+        mcg.register(source, target, mcg.NDT(), scales=(1e-3,))
+    for arguments, name in (
+        ({"voxel_size": -1.0}, "voxel_size"),
+        ({"voxel_size": np.nan}, "voxel_size"),
+        ({"min_points": 2}, "min_points"),
+        ({"min_ratio": 2.0}, "min_ratio"),
+        ({"channel_size": 0.0}, "channel_size"),
+        ({"channel_size": [1.0, 2.0, 3.0]}, "channel_size"),
+    ):
+        with pytest.raises(ValueError, match=f"^{name}: expected"):
+            mcg.gaussians(target, **({"voxel_size": SIZE} | arguments))
+    with pytest.raises(ValueError, match="cloud: expected concrete arrays"):
+        jax.jit(lambda points: mcg.gaussians(target.replace(points=points), SIZE).points)(target.points)
