@@ -11,9 +11,10 @@ from mcgicp_jax._cost import mahalanobis_cost
 from mcgicp_jax._dense import DenseSearch
 from mcgicp_jax._gaussians import cell_moments, gaussians, voxel_cells
 from mcgicp_jax._kernels import AbstractKernel, Cauchy, GemanMcClure, Huber, Tukey, Welsch
+from mcgicp_jax._map import aggregate
 from mcgicp_jax._methods import GICP, AbstractMethod, ColorICP, MultiChannelGICP, PointToPlane, PointToPoint
 from mcgicp_jax._ndt import D2DNDT, NDT, ColorNDT
-from mcgicp_jax._odometry import aggregate, odometry
+from mcgicp_jax._odometry import odometry
 from mcgicp_jax._preprocess import preprocess
 from mcgicp_jax._register import align, find_correspondences, register
 from mcgicp_jax._result import Registration, Status

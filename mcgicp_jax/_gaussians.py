@@ -20,6 +20,9 @@ from mcgicp_jax._surfaces import covariances_of
 # Fewest points in a cell, and smallest ratio of its eigenvalues: the values of Magnusson's NDT (2009, section 6.2.1)
 # are 5 and 0.001, those of the Point Cloud Library 6 and 0.01.
 _MIN_POINTS, _MIN_RATIO = 6, 0.01
+# Smallest standard deviation of the points in a cell, in voxels. Some scanners report each beam without an echo as a
+# point at the origin; such a cell is no surface.
+_LEAST_EXTENT = 1e-4
 
 
 def gaussians(
@@ -39,7 +42,7 @@ def gaussians(
     Args:
         cloud: raw or preprocessed cloud, or (N, 3) array in metres, of all points: not downsampled.
         voxel_size: edge of a voxel, metres.
-        min_points: cells with fewer points are left out; at least 3.
+        min_points: cells with fewer points are left out, as are those whose points coincide; at least 3.
         min_ratio: eigenvalues of a covariance below this fraction of its largest one are raised to it, so that the
             cells of planes and lines are kept; 0 to 1.
         channel_size: splits each voxel by its channels into cells of this size, in channel units, one number or one per
@@ -119,7 +122,10 @@ def voxel_cells(
     cells[order] = np.cumsum(np.bincount(starts, minlength=len(order))) - 1
     if channel_size is not None:
         cells = _split(cells, cloud, channel_size)
-    kept = np.bincount(cells) >= min_points
+    grouped = _Cells(cells, np)
+    _, spread = grouped.moments(cloud.coordinates)
+    extended = spread[:, 0] + spread[:, 3] + spread[:, 5] > (_LEAST_EXTENT * voxel_size) ** 2
+    kept = (grouped.counts[:, 0] >= min_points) & extended
     return np.where(kept, np.cumsum(kept) - 1, -1)[cells].astype(np.int32)
 
 
@@ -195,7 +201,7 @@ class _Cells:
         means = self.mean(points)
         x, y, z = (points - means[self._number]).T
         products = self._xp.stack([x * x, x * y, x * z, y * y, y * z, z * z], axis=1)
-        return means, self.sum(products) / (self.counts - 1).astype(points.dtype)
+        return means, self.sum(products) / np.maximum(self.counts - 1, 1).astype(points.dtype)
 
 
 def _floored(symmetric: Float[np.ndarray, "M 6"], min_ratio: float) -> Float[np.ndarray, "M 3 3"]:

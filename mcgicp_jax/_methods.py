@@ -21,7 +21,7 @@ from mcgicp_jax._kernels import AbstractKernel, Numbers
 from mcgicp_jax._local import locals_of
 from mcgicp_jax._neighborhoods import NO_NEIGHBORS as _NO_NEIGHBORS
 from mcgicp_jax._neighborhoods import channel_kernel, check_neighbors, multichannel_covariance, plane_covariance
-from mcgicp_jax._pose import AnyArray, canonical_float, is_concrete
+from mcgicp_jax._pose import AnyArray, AnyScalar, canonical_float, is_concrete
 from mcgicp_jax._preprocess import preprocess
 from mcgicp_jax._statistics import constant, namespace
 from mcgicp_jax._surface import Local, Neighborhoods, Table, covariance_of, points_of
@@ -133,6 +133,10 @@ class AbstractMethod(Numbers):
         for voxel_size in scales:
             yield self, _coarser(source, voxel_size), _coarser(target, voxel_size)
         yield self, source, target
+
+    def spacing(self, target: PointCloud) -> Float[AnyScalar, ""]:
+        """The distance, metres, in units of which the default maximum correspondence distances are chosen."""
+        return point_spacing(target)
 
     def default_kernel(self) -> AbstractKernel | None:
         """The robust kernel where the caller gives none."""

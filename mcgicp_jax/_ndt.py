@@ -18,7 +18,9 @@ from mcgicp_jax._gaussians import gaussians
 from mcgicp_jax._kernels import AbstractKernel, Welsch
 from mcgicp_jax._methods import AbstractGeneralized, AbstractMethod, AbstractOneSided, ColorICP, identity
 from mcgicp_jax._observability import geometry_observability
+from mcgicp_jax._pose import AnyScalar
 from mcgicp_jax._preprocess import preprocess
+from mcgicp_jax._statistics import median, namespace, sampled_rows
 from mcgicp_jax._surface import Local, Neighborhoods, local_of
 
 # Scale of the kernel, standard deviations: that of Biber & Strasser's score with the usual ratio of outliers, 0.55, and
@@ -28,7 +30,9 @@ _NDT_SCALE, _D2D_SCALE = 2.15, 6.3
 # `min_ratio` of all scales but the last. Rounder cells can be found from further off: on KITTI, from 4 m and 20°, 12 of
 # 12 starts converge to the truth with 0.1, and 4 with 0.01.
 _COARSE_RATIO = 0.1
-# Number of points that the normal of a cell is taken to be estimated from: as in a neighbourhood, as counts are not kept.
+# Square of the edge of a cell over the trace of its covariance, if it is a square filled uniformly: 2 edge²/12.
+_SQUARE_EDGE = 6.0
+# Number of points that the normal of a cell is taken to be estimated from: that of a neighbourhood.
 _COUNT = 20
 
 
@@ -40,6 +44,15 @@ class AbstractNDT(AbstractMethod):
     """
 
     kernel: AbstractKernel | None
+
+    def spacing(self, target: PointCloud) -> Float[AnyScalar, ""]:
+        """The median edge of the cells. (Where a plane lies between two layers of voxels, cells lie close together.)"""
+        if target.covariances is None:
+            return super().spacing(target)
+        xp = namespace(target)
+        rows, counts = sampled_rows(xp.asarray(target.valid))
+        traces = xp.trace(xp.asarray(target.covariances)[rows], axis1=1, axis2=2)
+        return median(xp.where(counts, xp.sqrt(_SQUARE_EDGE * traces), xp.nan))
 
     def default_kernel(self) -> AbstractKernel | None:
         return self.kernel
@@ -53,8 +66,7 @@ class AbstractNDT(AbstractMethod):
         basis = alg.orthonormal_basis(normal)
         across = alg.inner(normal, alg.multiply(given, normal))
         count = jnp.full_like(across, _COUNT)
-        # Half the edge of a cell that is filled uniformly, along its longer axis at least: λ = edge²/12 per axis.
-        reach = jnp.sqrt(1.5 * (given[0] + given[3] + given[5]))
+        reach = 0.5 * jnp.sqrt(_SQUARE_EDGE * (given[0] + given[3] + given[5]))
         geometry = geometry_observability(given, normal, basis, count)
         return local_of(given, normal, geometry, across, reach, local.fits)
 

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.typing import ArrayLike
 
-from mcgicp_jax._channels import point_spacing, warn_of_units, with_channels_matched
+from mcgicp_jax._channels import warn_of_units, with_channels_matched
 from mcgicp_jax._cloud import PointCloud, Values
 from mcgicp_jax._cost import centred_pose, check_matches
 from mcgicp_jax._dense import default_search
@@ -160,7 +160,7 @@ def align(
     robust = method.default_kernel() if robust is None else robust
     start = se3_from_matrix(centred_pose(init, source, target), dtype)
     softness = None if temperature is None else jnp.asarray(temperature, dtype)
-    settings = _settings(options, target, 1, dtype)
+    settings = _settings(options, method, target, 1, dtype)
     state, history = align_traced(start, seen, there, matches, softness, method, robust, settings, max_iterations)
     fixed, softness = jax.lax.stop_gradient((Problem(start, seen, there, method, robust, settings), softness))
     matched = matched_rows(fixed.source, fixed.target, matches, softness)
@@ -202,7 +202,7 @@ def register(
         init: T_target_source to start from, `jaxlie.SE3` or (4, 4); the identity by default.
         max_distance: maximum correspondence distance, metres of position; matches beyond it are rejected. One number,
             or two, for the coarse and the fine phase. None: 10 and 2.5 times the spacing of the target (its median
-            nearest-neighbour distance). If `init` is further off, pass a larger value.
+            nearest-neighbour distance; the edge of its cells). If `init` is further off, pass a larger value.
         max_iterations: maximum number of pose updates in both phases together.
         translation_tolerance, rotation_tolerance: metres (at the centroid of the matches) and radians; the loop has
             converged when an update is below both. `translation_tolerance` None: 0.5 % of the spacing of the target.
@@ -317,23 +317,23 @@ def pose_problem(
     stride = xp.maximum(xp.sum(xp.asarray(source.valid)) // _COARSE_ROWS, 1)
     start = se3_from_matrix(centred_pose(init, source, target), dtype)
     robust = method.default_kernel() if options.robust is None else options.robust
-    return Problem(start, seen, there, method, robust, _settings(options, target, stride, dtype))
+    return Problem(start, seen, there, method, robust, _settings(options, method, target, stride, dtype))
 
 
-def default_distances(target: PointCloud) -> tuple[Any, Any]:
+def default_distances(method: AbstractMethod, target: PointCloud) -> tuple[Any, Any]:
     """Default `max_distance` of the coarse and the fine phase for a preprocessed target, metres."""
-    return _distances(point_spacing(target))
+    return _distances(method.spacing(target))
 
 
 def _distances(spacing: Any) -> tuple[Any, Any]:
     return spacing * _COARSE_SPACINGS, spacing * _FINE_SPACINGS
 
 
-def _settings(options: Options, target: PointCloud, stride: Any, dtype: Any) -> Settings:
+def _settings(options: Options, method: AbstractMethod, target: PointCloud, stride: Any, dtype: Any) -> Settings:
     max_distance: Any = options.max_distance
     tolerance: Any = options.translation_tolerance
     # Options are constants to autodiff, even if they are derived from a differentiated cloud.
-    spacing = constant(point_spacing(target))
+    spacing = constant(method.spacing(target))
     max_distance = _distances(spacing) if max_distance is None else max_distance
     least = spacing * _TOLERANCE_IN_SPACINGS
     tolerance = least if tolerance is None else tolerance

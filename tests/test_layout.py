@@ -12,7 +12,7 @@ LAYERS = {
     "algebra": ("_pose", "_algebra", "_statistics", "_kernels", "_sizes", "_deferred"),
     "running": ("_threads", "_blocks"),
     "search": ("_search", "_nearest", "_tree_index", "_pykdtree", "_trees", "_dense"),
-    "data": ("_cloud", "_kept", "_preprocess", "_formats", "io", "metrics", "datasets"),
+    "data": ("_cloud", "_kept", "_preprocess", "_map", "_formats", "io", "metrics", "datasets"),
     "local surfaces": ("_surface", "_observability", "_neighborhoods", "_local", "_channels"),
     "correspondences": ("_forces", "_methods", "_surfaces", "_sums", "_gaussians", "_ndt"),
     "pose": ("_solve", "_directions", "_uncertainty", "_result", "_step"),

@@ -156,3 +156,42 @@ def test_a_frame_that_is_no_cloud_is_named_by_its_number(room):
     next(steps)
     with pytest.raises(ValueError, match=r"frames\[1\]: cloud: expected at least 4 finite points"):
         next(steps)
+
+
+def test_a_map_drifts_less():
+    frames = datasets.box_room(10, points_per_frame=2000, step=0.08)
+    truth = [frames.path(i) for i in range(10)]
+    options = {"max_distance": 0.5, "start": truth[0], "voxel_size": 0.05}
+    steps = list(mcg.odometry(frames, mcg.GICP(), against="map", **options))
+    assert all(step.registration.converged for step in steps[1:])
+    # The registration is that to the map, in the world's frame.
+    np.testing.assert_allclose(steps[-1].registration.matrix, steps[-1].pose, atol=1e-6)
+    pairs = list(mcg.odometry(frames, mcg.GICP(), **options))
+    errors = [metrics.ate([step.pose for step in each], truth, alignment="first") for each in (steps, pairs)]
+    assert errors[0] < 0.8 * errors[1]
+    cells = list(mcg.odometry(frames, mcg.NDT(), against="map", scales=(0.5,), **options | {"max_distance": 1.0}))
+    assert all(step.registration.converged for step in cells[1:])
+    assert metrics.ate([step.pose for step in cells], truth, alignment="first") < 0.03
+
+
+def test_the_map_slides(room):
+    frames, _ = room
+    sizes = []
+    preprocess = _odometry.preprocess
+
+    def counted(cloud, *arguments, **options):
+        sizes.append(len(cloud))
+        return preprocess(cloud, *arguments, **options)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(_odometry, "preprocess", counted)
+        for radius in (None, 1.0):
+            list(mcg.odometry(frames[:3], mcg.GICP(), max_distance=0.5, against="map", map_radius=radius))
+    # Two maps each, after the frames' own clouds.
+    assert sizes[9] < sizes[4]
+
+
+def test_what_is_wrong_with_a_map_is_named(room):
+    frames, _ = room
+    with pytest.raises(ValueError, match="^map_radius: expected"):
+        list(mcg.odometry(frames, mcg.GICP(), against="map", map_radius=-1.0))

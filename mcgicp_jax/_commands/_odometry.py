@@ -62,11 +62,13 @@ def odometry(
     method: MethodName = "mc-gicp",
     channels: Names = (),
     num_frames: int | Literal["all"] = "all",
+    against: Literal["previous", "map"] = "previous",
+    map_radius: Annotated[float | None, tyro.conf.arg(metavar="FLOAT", help_behavior_hint="")] = None,
     output: File = None,
     map: File = None,
     plot: File = None,
 ) -> int:
-    """Estimate the sensor's trajectory by registering each frame of a sequence to the one before it.
+    """Estimate the sensor's trajectory by registering each frame of a sequence to the one before it, or to a map.
 
     DATASET is kitti, ford, tum or 7-scenes, with the sequence in the folder PATH; or a simulated scene (street,
     corridor, box-room or poster-wall), which needs no PATH. Errors are printed if the true poses are known. The exit
@@ -82,6 +84,8 @@ def odometry(
         method: mc-gicp and color-icp use channels, the others geometry alone.
         channels: Channels to use, such as intensity, or red green blue.
         num_frames: Number of frames to use, from the start; all means 20 for a simulated scene.
+        against: Register each frame to the one before it, or to a map of all frames before it, which drifts less.
+        map_radius: Metres; points further from the sensor leave the map. By default the range of the first frame.
         output: File for the poses, sensor to world, in KITTI format: the upper three rows of each matrix on one line.
         map: File for the map in the world frame, such as map.ply. Its voxels have the size used for registration; if
             that is off, a size that keeps at most half of the first cloud.
@@ -96,6 +100,8 @@ def odometry(
     options: dict[str, Any] = {
         "max_distance": usual_distance,
         "num_neighbors": shared.num_neighbors,
+        "against": against,
+        "map_radius": map_radius,
     } | shared.registration()
     first = frames[0]
     names = channels or first.cloud.channel_names

@@ -23,7 +23,7 @@ from mcgicp_jax._options import Options as Chosen
 from mcgicp_jax._preprocess import check_preprocessing
 from mcgicp_jax._register import default_distances
 
-MethodName: TypeAlias = Literal["mc-gicp", "gicp", "color-icp", "point-to-plane", "point-to-point"]
+MethodName: TypeAlias = Literal["mc-gicp", "gicp", "color-icp", "point-to-plane", "point-to-point", "ndt", "d2d-ndt"]
 File: TypeAlias = Annotated[Path | None, tyro.conf.arg(metavar="FILE", help_behavior_hint="")]
 Numbers: TypeAlias = Annotated[tuple[float, ...], tyro.conf.arg(help_behavior_hint="(default: from the data)")]
 Distances: TypeAlias = Annotated[tuple[float, ...], tyro.conf.arg(help_behavior_hint="(default: 10 and 2.5 spacings)")]
@@ -40,6 +40,8 @@ METHODS: dict[MethodName, type[AbstractMethod]] = {
     "color-icp": mcg.ColorICP,
     "point-to-plane": mcg.PointToPlane,
     "point-to-point": mcg.PointToPoint,
+    "ndt": mcg.NDT,
+    "d2d-ndt": mcg.D2DNDT,
 }
 # Larger clouds are downsampled to at most this many points by default: registered in a tenth of a second.
 _MOST_POINTS = 20_000
@@ -77,7 +79,8 @@ class Options:
         robust: Robust kernel and its scale in units of the Mahalanobis distance, such as huber 1.0.
         hold_free_directions: Keep the initial pose in directions that neither geometry nor channels constrain.
         match_channels: Scale and shift the channels of the source to the distribution of those of the target.
-        scales: Voxel sizes in metres, coarse to fine, at which to register first if the initial pose is far off.
+        scales: Voxel sizes in metres, coarse to fine, at which to register first if the initial pose is far off. For
+            ndt and d2d-ndt the sizes of the cells; by default 32, 16 and 8 times the spacing of the points.
         channel_covariance: For mc-gicp: one variance for all channels, or one for each; channel units squared.
         channel_weights: For mc-gicp and color-icp: one weight for all channels, or one for each; metres per channel
             unit.
@@ -187,7 +190,7 @@ def voxel_size_for(clouds: Sequence[mcg.PointCloud], options: Options) -> float 
 
 def described_distance(options: Options, target: mcg.PointCloud) -> str:
     """`max_distance` in words, by default from the spacing of the target."""
-    distances = options.max_distance or tuple(default_distances(target))
+    distances = options.max_distance or tuple(default_distances(mcg.GICP(), target))
     return " m, then ".join(f"{float(distance):.3g}" for distance in distances) + " m"
 
 

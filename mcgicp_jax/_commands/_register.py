@@ -84,7 +84,18 @@ class PreparedPair:
         return f"{1e3 * float(translation):9.2f}  {np.degrees(rotation):11.3f}"
 
     def register(self, method: AbstractMethod) -> mcg.Registration:
-        return mcg.register(self.source, self.target, method, init=self.start, **self.options.registration())
+        source, target, options = self.source, self.target, self.options.registration()
+        if method.needs_covariances:
+            # Cells are made of all points.
+            source = self.whole[0] if "source" in method.needs_covariances else source
+            target = self.whole[1]
+            options["scales"] = self.cells(method)
+        return mcg.register(source, target, method, init=self.start, **options)
+
+    def cells(self, method: AbstractMethod) -> tuple[float, ...]:
+        """Sizes of the cells, metres, for methods that need any: with 8 spacings, a cell has some tens of points."""
+        spacing = float(method.spacing(self.target))
+        return self.options.scales or tuple(float(f"{times * spacing:.2g}") for times in (32, 16, 8))
 
     def draw(self, results: dict[MethodName, mcg.Registration]) -> None:
         if self.options.plot is not None:
@@ -118,6 +129,8 @@ def register(
     pair = PreparedPair(source, target, shared)
     chosen = pair.method(method)
     print(f"method:    {method}{described(chosen)}")
+    if chosen.needs_covariances:
+        print(f"cells:     of {', '.join(f'{size:g}' for size in pair.cells(chosen))} m")
     result = pair.register(chosen)
     plural = "" if result.num_iterations == 1 else "s"
     print(f"status:    {words(result)} after {result.num_iterations} iteration{plural}")
