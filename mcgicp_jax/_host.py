@@ -19,7 +19,7 @@ from typing import Any, TypeAlias
 import jax
 import jaxlie
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Bool, Float, Int
 
 from mcgicp_jax._blocks import map_blocks, map_rows
 from mcgicp_jax._deferred import Deferred
@@ -151,8 +151,8 @@ def _matched(
 
 def _covariance(
     state: State, matches: _Matches, gate: Float[AnyScalar, ""], problem: Problem, num_threads: int | None
-) -> Float[Array, "6 6"]:
-    """Covariance of the final pose."""
+) -> Float[np.ndarray, "6 6"]:
+    """Covariance of the final pose, float64."""
     source, target = matches.source, matches.target
     moving = _moving(state.pose, source.table.dtype)
     some, counts = sampled_rows(source.rows.valid)
@@ -183,10 +183,17 @@ def _covariance(
         for name in ("rows", "cells")
     )
     scatter, num_cells = scatter_of(Scores(rows, cells, jacobian, bias), matches.size)
-    dtype = source.table.dtype
-    with np.errstate(invalid="ignore", over="ignore"):
-        numbers = (jacobian.astype(dtype), bias.astype(dtype), scatter.astype(dtype))
-    return covariance_of_pose(state, *numbers, np.int32(num_cells))
+    # In float64: beside the variances of unconstrained directions, those of the others would be lost to rounding.
+    with jax.enable_x64(True):
+        return np.asarray(covariance_of_pose(_as_float64(state), jacobian, bias, scatter, np.int32(num_cells)))
+
+
+def _as_float64(tree: Any) -> Any:
+    def convert(leaf: Any) -> np.ndarray:
+        array = np.asarray(leaf)
+        return array.astype(np.float64) if array.dtype == np.float32 else array
+
+    return jax.tree.map(convert, tree)
 
 
 @jax.jit

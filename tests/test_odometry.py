@@ -193,5 +193,5 @@ def test_the_map_slides(room):
 
 def test_what_is_wrong_with_a_map_is_named(room):
     frames, _ = room
-    with pytest.raises(ValueError, match="^map_radius: expected"):
+    with pytest.raises(ValueError, match=r"^map_radius: expected"):
         list(mcg.odometry(frames, mcg.GICP(), against="map", map_radius=-1.0))

@@ -79,6 +79,20 @@ def test_channels_that_a_method_does_not_use_compile_nothing(name):
     assert not found
 
 
+def test_cells_of_other_sizes_compile_nothing():
+    def everything(seed, points, voxel_size):
+        source, target = (mcg.PointCloud(*room_corner(points, seed=2 * seed + i)) for i in (0, 1))
+        cells = mcg.gaussians(target, voxel_size)
+        results = [mcg.register(source, cells, mcg.NDT()), mcg.register(source, target, mcg.NDT(), scales=(0.8, 0.5))]
+        results.append(mcg.register(mcg.gaussians(source, voxel_size), cells, mcg.D2DNDT()))
+        assert all(result.covariance.shape == (6, 6) for result in results)
+
+    everything(0, 3000, 0.4)
+    with compilations() as found:
+        everything(1, 5000, 0.3)
+    assert not found
+
+
 def test_numbers_compile_nothing():
     source, target = (mcg.preprocess(cloud) for cloud in clouds(400))
     mcg.register(source, target, mcg.GICP(), robust=mcg.Cauchy(1.0))

@@ -14,6 +14,7 @@ from mcgicp_jax import datasets
 from mcgicp_jax._directions import find_directions
 from mcgicp_jax._sums import Sums
 from mcgicp_jax._surface import observability_of
+from tests.scenes import motion, wall
 
 from .scenes import motion, pair, prepare, room_corner, wall
 
@@ -358,3 +359,16 @@ def test_deviations_are_those_of_the_matched_points():
     np.testing.assert_allclose(result.deviations, [*np.std(shifts, axis=0)[:3], *np.std(turns, axis=0)], rtol=0.06)
     inside = jax.jit(lambda source: mcg.register(source, target, mcg.GICP(), init=result.matrix, max_distance=0.5))
     np.testing.assert_allclose(inside(source).deviations, result.deviations, rtol=0.05)
+
+
+def test_constrained_directions_keep_their_variances_beside_free_ones():
+    """In float32, variances of square millimetres would vanish beside those of 100 m² along free directions."""
+    points, _ = wall(3000)
+    turned = motion((0, 0, 0, 0.3, -0.2, 0.1))
+    source, target = (mcg.preprocess(wall(3000, seed=seed)[0] @ turned[:3, :3].T) for seed in (1, 2))
+    result = mcg.register(source, target, mcg.GICP(), max_distance=0.3)
+    assert result.status == mcg.Status.DEGENERATE and result.covariance.dtype == np.float64
+    held = np.linalg.inv(np.asarray(result.directions.twists, np.float64).T)[np.asarray(result.directions.held)]
+    values = np.linalg.eigvalsh(held @ result.covariance @ held.T)
+    assert len(values) == 3 and values.min() > 0 and np.sqrt(values.max()) < 1e-3
+    assert np.linalg.eigvalsh(result.covariance).max() > 1

@@ -34,13 +34,13 @@ def wall(noise: float) -> datasets.SyntheticFrames:
     return datasets.poster_wall(2, noise=noise)
 
 
-# Scene, max_distance in metres
-SCENES: dict[str, tuple[Callable[[float], datasets.SyntheticFrames], float]] = {
-    "box room": (box_room, 0.5),
-    "street": (street, 1.5),
-    "poster wall": (wall, 0.08),
+# Scene, max_distance and size of cells in metres
+SCENES: dict[str, tuple[Callable[[float], datasets.SyntheticFrames], float, float]] = {
+    "box room": (box_room, 0.5, 0.5),
+    "street": (street, 1.5, 1.0),
+    "poster wall": (wall, 0.08, 0.2),
 }
-METHODS = {"GICP": mcg.GICP(), "MC-GICP": mcg.MultiChannelGICP()}
+METHODS = {"GICP": mcg.GICP(), "MC-GICP": mcg.MultiChannelGICP(), "NDT": mcg.NDT(), "D2D-NDT": mcg.D2DNDT()}
 
 
 def twist_error(matrix: np.ndarray, truth: np.ndarray) -> np.ndarray:
@@ -75,7 +75,7 @@ def peers_hessian(
 
 
 def calibrate(scene: str, noise: float, pairs: int) -> dict[str, list[float]]:
-    make, max_distance = SCENES[scene]
+    make, max_distance, cell = SCENES[scene]
     frames = make(noise)
     claims: dict[str, list[float]] = {}
     for seed in range(pairs):
@@ -83,7 +83,12 @@ def calibrate(scene: str, noise: float, pairs: int) -> dict[str, list[float]]:
         truth = np.linalg.inv(target.pose) @ source.pose
         clouds = [mcg.preprocess(frame.cloud) for frame in (source, target)]
         for name, method in METHODS.items():
-            result = mcg.register(*clouds, method, init=truth, max_distance=max_distance)
+            if method.needs_covariances:
+                cells = [mcg.gaussians(frame.cloud, cell) for frame in (source, target)]
+                moving = cells[0] if "source" in method.needs_covariances else clouds[0]
+                result = mcg.register(moving, cells[1], method, init=truth)
+            else:
+                result = mcg.register(*clouds, method, init=truth, max_distance=max_distance)
             error = twist_error(result.matrix, truth)
             held = result.directions
             variance = float(result.cost) / (3 * int(result.num_inliers))
