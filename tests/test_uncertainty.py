@@ -14,7 +14,6 @@ from mcgicp_jax import datasets
 from mcgicp_jax._directions import find_directions
 from mcgicp_jax._sums import Sums
 from mcgicp_jax._surface import observability_of
-from tests.scenes import motion, wall
 
 from .scenes import motion, pair, prepare, room_corner, wall
 
@@ -363,7 +362,6 @@ def test_deviations_are_those_of_the_matched_points():
 
 def test_constrained_directions_keep_their_variances_beside_free_ones():
     """In float32, variances of square millimetres would vanish beside those of 100 m² along free directions."""
-    points, _ = wall(3000)
     turned = motion((0, 0, 0, 0.3, -0.2, 0.1))
     source, target = (mcg.preprocess(wall(3000, seed=seed)[0] @ turned[:3, :3].T) for seed in (1, 2))
     result = mcg.register(source, target, mcg.GICP(), max_distance=0.3)
