@@ -76,7 +76,8 @@ class PointCloud(eqx.Module):
             0 and is ignored. None: all points have all channels.
         valid: (N,), False for padding.
         neighbors: (N, k) row indices of the k nearest points, including the point itself; −1 where there are fewer.
-        covariances: (N, 3, 3), dimensionless, or None. If given, methods use them instead of computing their own.
+        covariances: (N, 3, 3), or None. If given, methods use them instead of computing their own: dimensionless for
+            GICP and MC-GICP, m² for NDT (from `gaussians`; the scale of a kernel is then in standard deviations).
         origin: (3,) float64, metres, subtracted from the points so that float32 stays precise at large (UTM)
             coordinates; 0 otherwise.
         channel_names: C names, such as ("intensity",) or ("red", "green", "blue"); used as column names in files.
@@ -107,7 +108,8 @@ class PointCloud(eqx.Module):
             channels: (N, C), or (N,) for a single channel, in any unit; none by default.
             channel_valid: booleans in the shape of `channels`, False where a point lacks the channel; the value there
                 is ignored and may be NaN. None: all points have all channels.
-            covariances: (N, 3, 3), dimensionless as in GICP (1 in the tangent plane, ε along the normal).
+            covariances: (N, 3, 3), dimensionless as in GICP (1 in the tangent plane, ε along the normal), or m² as for
+                NDT.
             channel_names: one name per channel; "channel_0", "channel_1", ... by default.
 
         Raises:

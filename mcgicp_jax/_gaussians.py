@@ -17,8 +17,7 @@ from mcgicp_jax._pose import AnyArray
 from mcgicp_jax._preprocess import MIN_POINTS, finite_rows, preprocess, voxels
 from mcgicp_jax._surfaces import covariances_of
 
-# Fewest points in a cell, and smallest ratio of its eigenvalues: the values of Magnusson's NDT (2009, section 6.2.1)
-# are 5 and 0.001, those of the Point Cloud Library 6 and 0.01.
+# Fewest points in a cell, and smallest ratio of its eigenvalues: those of the Point Cloud Library.
 _MIN_POINTS, _MIN_RATIO = 6, 0.01
 # Smallest standard deviation of the points in a cell, in voxels. Some scanners report each beam without an echo as a
 # point at the origin; such a cell is no surface.
