@@ -139,6 +139,20 @@ def ours(method: Callable[..., Any], settings: dict[str, Any]) -> Callable[..., 
     return run
 
 
+def cells(method: Callable[..., Any]) -> Callable[..., np.ndarray]:
+    """With cells of 16, 8 and 4 voxels."""
+
+    def run(source: mcg.PointCloud, target: mcg.PointCloud, start: np.ndarray, voxel: float) -> np.ndarray:
+        scales = tuple(times * voxel for times in (16, 8, 4))
+        return mcg.register(source, target, method(source, target), init=start, scales=scales).matrix
+
+    return run
+
+
+def color_ndt(source: mcg.PointCloud, target: mcg.PointCloud) -> Any:
+    return mcg.ColorNDT(mcg.MultiChannelGICP().resolve(source, target).channel_weights)
+
+
 def color_icp(source: mcg.PointCloud, target: mcg.PointCloud) -> Any:
     return mcg.ColorICP(mcg.MultiChannelGICP().resolve(source, target).channel_weights)
 
@@ -223,6 +237,9 @@ def main() -> None:
             "MC-GICP": ours(lambda *_: mcg.MultiChannelGICP(), settings),
             "GICP": ours(lambda *_: mcg.GICP(), {}),
             "Color ICP": ours(color_icp, settings),
+            "NDT": cells(lambda *_: mcg.NDT()),
+            "colour NDT": cells(color_ndt),
+            "D2D-NDT": cells(lambda *_: mcg.D2DNDT()),
         }
         if open3d is not None:
             methods |= {"Open3D, one scale": colored_icp((1,)), "Open3D, three scales": colored_icp((4, 2, 1))}

@@ -1,0 +1,73 @@
+"""Odometry over the KITTI frames beside KISS-ICP, at their defaults: frames per second and trajectory error.
+
+Run `python -m tests.benchmarks.odometry`; see README.md. The methods take turns; compilation is not counted.
+"""
+
+from __future__ import annotations
+
+import os
+import pathlib
+import statistics
+import time
+from collections.abc import Callable
+
+import numpy as np
+from kiss_icp.config import load_config
+from kiss_icp.kiss_icp import KissICP
+
+import mcgicp_jax as mcg
+from mcgicp_jax import metrics
+
+DATA = pathlib.Path(os.environ.get("MCGICP_DATA", pathlib.Path(__file__).parents[3] / "shared" / "data"))
+NUM_TURNS = 5
+VOXEL = 0.25
+
+
+def ours(method: mcg.AbstractMethod, **options: object) -> Callable[[list[mcg.datasets.Frame]], list[np.ndarray]]:
+    def run(frames: list[mcg.datasets.Frame]) -> list[np.ndarray]:
+        steps = mcg.odometry(frames, method, voxel_size=VOXEL, max_distance=(2.5, 0.6), **options)
+        return [step.pose for step in steps]
+
+    return run
+
+
+def kiss(frames: list[mcg.datasets.Frame]) -> list[np.ndarray]:
+    config = load_config(None)
+    # The frames are without motion distortion already.
+    config.data.deskew = False
+    pipeline, poses = KissICP(config), []
+    for frame in frames:
+        pipeline.register_frame(np.asarray(frame.cloud.points, np.float64), np.zeros(0))
+        poses.append(np.array(pipeline.last_pose))
+    return poses
+
+
+def main() -> None:
+    frames = list(mcg.datasets.kitti(DATA / "kitti" / "sequences" / "04"))
+    truth = [frame.pose for frame in frames]
+    methods = {
+        "GICP": ours(mcg.GICP()),
+        "GICP, against the map": ours(mcg.GICP(), against="map"),
+        "MC-GICP": ours(mcg.MultiChannelGICP()),
+        "NDT, against the map": ours(mcg.NDT(), against="map", scales=(2.0, 1.0)),
+        "KISS-ICP": kiss,
+    }
+    rates: dict[str, list[float]] = {name: [] for name in methods}
+    poses = {}
+    for turn in range(NUM_TURNS + 1):
+        for name, run in methods.items():
+            started = time.perf_counter()
+            poses[name] = run(frames)
+            if turn:
+                rates[name].append(len(frames) / (time.perf_counter() - started))
+    print(f"{len(frames)} frames, load {os.getloadavg()[0]:.1f}")
+    print(f"{'':>24} {'frames/s':>9} {'/ KISS-ICP':>11} {'ATE, mm':>8} {'drift per frame, mm':>20}")
+    for name, found in poses.items():
+        ratio = statistics.median(a / b for a, b in zip(rates[name], rates["KISS-ICP"], strict=True))
+        error = 1e3 * metrics.ate(found, truth)
+        drift = 1e3 * float(np.mean(metrics.rpe(found, truth)[0]))
+        print(f"{name:>24} {statistics.median(rates[name]):9.1f} {ratio:11.2f} {error:8.1f} {drift:20.1f}")
+
+
+if __name__ == "__main__":
+    main()
