@@ -192,8 +192,8 @@ def test_voxels_are_chosen_from_the_data(tmp_path, capsys):
         kept = mcg.preprocess(io.read(whole), chosen).points
         assert len(kept) == used
         spacing = np.median(scipy.spatial.cKDTree(kept).query(kept, k=2)[0][:, 1])
-        # Printed with three digits.
-        np.testing.assert_allclose(distances, [10 * spacing, 2.5 * spacing], rtol=5e-3)
+        # The command takes the median of 4,096 points, whose standard error is 1 %.
+        np.testing.assert_allclose(distances, [10 * spacing, 2.5 * spacing], rtol=0.03)
 
 
 def test_clouds_with_covariances_keep_their_points(tmp_path, capsys):
