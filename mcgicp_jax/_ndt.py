@@ -27,7 +27,7 @@ from mcgicp_jax._surface import Local, Neighborhoods, local_of
 # cells of 1 m, for the mixture of a Gaussian and a uniform distribution (Magnusson 2009, eqs. 6.7 and 6.8); and that of
 # Stoyanov et al. (2012), whose d₂ is 0.05. The original formula depends on the unit of length.
 _NDT_SCALE, _D2D_SCALE = 2.15, 6.3
-# `min_ratio` of all scales but the last. Rounder cells can be found from further off: on KITTI, from 4 m and 20°, 12 of
+# `min_ratio` of all scales but the last. Rounder cells can be found from further off: on KITTI, from 4 m and 20°, 10 of
 # 12 starts converge to the truth with 0.1, and 4 with 0.01.
 _COARSE_RATIO = 0.1
 # Square of the edge of a cell over the trace of its covariance, if it is a square filled uniformly: 2 edge²/12.
