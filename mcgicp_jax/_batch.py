@@ -168,9 +168,7 @@ class _Job:
                 cloud = cloud()
             if not isinstance(cloud, PointCloud):
                 cloud = PointCloud(cloud)
-            # With scales, cells are made of all points.
-            raw = bool(self.options.scales) and name in self.method.needs_covariances
-            if cloud.neighbors is None and not raw:
+            if cloud.neighbors is None and not self.options.takes_raw(self.method, name):
                 cloud = preprocess(cloud, self.voxel_size, self.num_neighbors, search=self.chosen_search())
         except (ValueError, OSError) as error:
             raise ValueError(f"{name}: {error}") from error

@@ -46,7 +46,7 @@ def map_blocks(function: Callable[[Any], Any], num_rows: int, num_threads: int |
     """Call a function on each block of rows.
 
     Args:
-        function: maps an index of `BLOCK` rows (see `blocks`) to a pytree of arrays; called outside of traces.
+        function: maps an index of `BLOCK` rows (see `blocks`) to a pytree of arrays; no trace may be active.
         num_threads: largest number of threads that call it; None for one per block.
 
     Returns:

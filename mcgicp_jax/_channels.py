@@ -6,12 +6,14 @@ They are computed with NumPy for concrete clouds and with JAX for traced ones.
 from __future__ import annotations
 
 import warnings
+from functools import partial
 from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float
 
 from mcgicp_jax._cloud import PointCloud
+from mcgicp_jax._kept import keep
 from mcgicp_jax._neighborhoods import check_neighbors
 from mcgicp_jax._pose import AnyArray, AnyScalar
 from mcgicp_jax._search import Correspondences
@@ -57,13 +59,7 @@ def channel_noise(
 
 def warn_of_units(source: PointCloud, target: PointCloud) -> None:
     """Warn of channels of two concrete clouds whose values are so different that their units probably are, too."""
-    ranges = []
-    for cloud in (source, target):
-        rows, counts = sampled_rows(np.asarray(cloud.valid))
-        values = np.where(counts[:, None], np.asarray(_known_values(cloud))[rows], np.nan)
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", RuntimeWarning)
-            ranges.append(np.nanquantile(values, [_QUANTILES[0], _QUANTILES[-1]], axis=0).T)
+    ranges = [keep(cloud, "ranges", None, partial(_ranges, cloud)) for cloud in (source, target)]
     for name, (low, high), (first, last) in zip(source.channel_names, *ranges, strict=False):
         narrow, wide = sorted([high - low, last - first])
         if high < first or last < low or wide > _OTHER_UNIT * narrow > 0:
@@ -73,6 +69,20 @@ def warn_of_units(source: PointCloud, target: PointCloud) -> None:
                 UserWarning,
                 stacklevel=4,
             )
+
+
+def _ranges(cloud: PointCloud) -> list[tuple[float, float]]:
+    """For each channel, the values between which most of a sample lie (5 to 95 %); NaN if no point has it."""
+    rows, counts = sampled_rows(np.asarray(cloud.valid))
+    rows = rows[counts]
+    channels, known = np.asarray(cloud.channels)[rows], np.isfinite(np.asarray(cloud.channels)[rows])
+    if cloud.channel_valid is not None:
+        known &= np.asarray(cloud.channel_valid)[rows]
+    ranges = []
+    for values in (column[there] for column, there in zip(channels.T, known.T, strict=True)):
+        low, high = np.quantile(values, [_QUANTILES[0], _QUANTILES[-1]]) if values.size else (np.nan, np.nan)
+        ranges.append((float(low), float(high)))
+    return ranges
 
 
 def _smallest_variance(local: Local, xp: Any) -> Float[AnyArray, "N"]:

@@ -8,7 +8,7 @@ from typing import Literal
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from mcgicp_jax import _algebra as alg
 from mcgicp_jax._cloud import PointCloud, Values
@@ -63,27 +63,24 @@ def gaussians(
     cloud = finite_rows(cloud)
     if of == "covariances" and cloud.covariances is None:
         cloud = cloud.replace(covariances=covariances_of(GICP(), preprocess(cloud)).astype(cloud.points.dtype))
-    cells = voxel_cells(cloud, voxel_size, min_points=min_points, channel_size=channel_size)
-    if cells.max(initial=-1) + 1 < MIN_POINTS:
+    cells, kept, means, spread = _grouped(cloud, voxel_size, min_points, channel_size)
+    if kept.sum() < MIN_POINTS:
         raise ValueError(
             f"voxel_size: expected a size that leaves at least {MIN_POINTS} cells of {min_points} points, got "
-            f"{voxel_size} m, which leaves {cells.max(initial=-1) + 1}"
+            f"{voxel_size} m, which leaves {kept.sum()}"
         )
-    grouped = _Cells(cells, np)
-    means, spread = grouped.moments(cloud.coordinates[grouped.rows])
     if of == "covariances":
-        given = np.asarray(cloud.covariances, np.float64)[grouped.rows].reshape(-1, 9)
-        matrices = grouped.mean(given).reshape(-1, 3, 3)
+        matrices = cells.mean(np.asarray(cloud.covariances, np.float64).reshape(-1, 9))[kept].reshape(-1, 3, 3)
     else:
-        matrices = _floored(spread, min_ratio)
+        matrices = _floored(spread[kept], min_ratio)
     known = np.ones(cloud.channels.shape, bool) if cloud.channel_valid is None else np.asarray(cloud.channel_valid)
     # Missing values are stored as 0 and do not add to the sum.
-    counts = grouped.sum(known[grouped.rows].astype(np.float64))
-    channels = grouped.sum(np.asarray(cloud.channels, np.float64)[grouped.rows]) / np.maximum(counts, 1)
+    counts = cells.sum(known.astype(np.float64))[kept]
+    channels = cells.sum(np.asarray(cloud.channels, np.float64))[kept] / np.maximum(counts, 1)
     dtype = cloud.points.dtype
     return preprocess(
         PointCloud(
-            means.astype(dtype),
+            means[kept].astype(dtype),
             channels.astype(dtype),
             channel_valid=None if cloud.channel_valid is None else counts > 0,
             covariances=matrices.astype(dtype),
@@ -112,20 +109,27 @@ def voxel_cells(
         ValueError: if an argument is out of range.
     """
     cloud = cloud if isinstance(cloud, PointCloud) else PointCloud(cloud)
+    cells, kept, _, _ = _grouped(cloud, voxel_size, min_points, channel_size)
+    return np.where(kept, np.cumsum(kept) - 1, -1)[cells.number].astype(np.int32)
+
+
+def _grouped(
+    cloud: PointCloud, voxel_size: float, min_points: int, channel_size: Values | None
+) -> tuple[_Cells, Bool[np.ndarray, "M"], Float[np.ndarray, "M 3"], Float[np.ndarray, "M 6"]]:
+    """All cells, which of them are kept, and their moments."""
     if not 0 < voxel_size < np.inf:
         raise ValueError(f"voxel_size: expected a positive number of metres, got {voxel_size!r}")
     if min_points < 3:
         raise ValueError(f"min_points: expected at least 3, got {min_points!r}")
     order, starts = voxels(np.ascontiguousarray(cloud.coordinates.T), voxel_size)
-    cells = np.empty(len(order), np.int64)
-    cells[order] = np.cumsum(np.bincount(starts, minlength=len(order))) - 1
+    number = np.empty(len(order), np.int64)
+    number[order] = np.cumsum(np.bincount(starts, minlength=len(order))) - 1
     if channel_size is not None:
-        cells = _split(cells, cloud, channel_size)
-    grouped = _Cells(cells, np)
-    _, spread = grouped.moments(cloud.coordinates)
+        number = _split(number, cloud, channel_size)
+    cells = _Cells(number, np)
+    means, spread = cells.moments(cloud.coordinates)
     extended = spread[:, 0] + spread[:, 3] + spread[:, 5] > (_LEAST_EXTENT * voxel_size) ** 2
-    kept = (grouped.counts[:, 0] >= min_points) & extended
-    return np.where(kept, np.cumsum(kept) - 1, -1)[cells].astype(np.int32)
+    return cells, (cells.counts[:, 0] >= min_points) & extended, means, spread
 
 
 def _split(cells: Int[np.ndarray, "N"], cloud: PointCloud, channel_size: Values) -> Int[np.ndarray, "N"]:
@@ -159,8 +163,9 @@ def cell_moments(
         cells: from `voxel_cells`; concrete.
         min_ratio: as in `gaussians`.
     """
-    grouped = _Cells(np.asarray(cells), jnp)
-    points, channels = (jnp.asarray(array)[grouped.rows] for array in (points, channels))
+    inside = np.flatnonzero(cells >= 0)
+    grouped = _Cells(cells[inside], jnp)
+    points, channels = (jnp.asarray(array)[inside] for array in (points, channels))
     means, spread = grouped.moments(points)
     symmetric = spread.T
     normal = alg.smallest_eigenvector(symmetric)
@@ -176,20 +181,18 @@ def cell_moments(
 
 
 class _Cells:
-    """The points of each cell, without those of cell −1, and sums over them by NumPy or JAX."""
+    """The cell number of each point, and sums over the points of each cell by NumPy or JAX."""
 
-    def __init__(self, cells: Int[np.ndarray, "N"], xp: ModuleType):
+    def __init__(self, number: Int[np.ndarray, "n"], xp: ModuleType):
         self._xp = xp
-        self.rows = np.flatnonzero(cells >= 0)
-        self._number = cells[self.rows]
-        self._size = int(cells.max(initial=-1)) + 1
-        self.counts = np.bincount(self._number, minlength=self._size)[:, None]
+        self.number = number
+        self._size = int(number.max(initial=-1)) + 1
+        self.counts = np.bincount(number, minlength=self._size)[:, None]
 
     def sum(self, values: Float[AnyArray, "n D"]) -> Float[AnyArray, "M D"]:
-        """Sums over the points of each cell, given the values at `rows`."""
         if self._xp is jnp:
-            return jax.ops.segment_sum(values, self._number, self._size)
-        sums = [np.bincount(self._number, weights=column, minlength=self._size) for column in values.T]
+            return jax.ops.segment_sum(values, self.number, self._size)
+        sums = [np.bincount(self.number, weights=column, minlength=self._size) for column in values.T]
         return np.stack(sums, axis=1) if sums else np.zeros((self._size, 0))
 
     def mean(self, values: Float[AnyArray, "n D"]) -> Float[AnyArray, "M D"]:
@@ -198,17 +201,13 @@ class _Cells:
     def moments(self, points: Float[AnyArray, "n 3"]) -> tuple[Float[AnyArray, "M 3"], Float[AnyArray, "M 6"]]:
         """Means, and covariances as columns xx, xy, xz, yy, yz, zz. A single pass would lose digits far from zero."""
         means = self.mean(points)
-        x, y, z = (points - means[self._number]).T
+        x, y, z = (points - means[self.number]).T
         products = self._xp.stack([x * x, x * y, x * z, y * y, y * z, z * z], axis=1)
         return means, self.sum(products) / np.maximum(self.counts - 1, 1).astype(points.dtype)
 
 
 def _floored(symmetric: Float[np.ndarray, "M 6"], min_ratio: float) -> Float[np.ndarray, "M 3 3"]:
     """Matrices whose eigenvalues are at least `min_ratio` times the largest one."""
-    values, vectors = np.linalg.eigh(_matrices(symmetric))
+    values, vectors = np.linalg.eigh(symmetric[:, [0, 1, 2, 1, 3, 4, 2, 4, 5]].reshape(-1, 3, 3))
     raised = np.maximum(values, min_ratio * values[:, -1:])
     return np.einsum("mij,mj,mkj->mik", vectors, raised, vectors)
-
-
-def _matrices(symmetric: Float[np.ndarray, "M 6"]) -> Float[np.ndarray, "M 3 3"]:
-    return symmetric[:, [0, 1, 2, 1, 3, 4, 2, 4, 5]].reshape(-1, 3, 3)

@@ -35,9 +35,7 @@ def aggregate(clouds: Iterable[PointCloud | Values], poses: Iterable[Pose], voxe
     world = VoxelMap(voxel_size)
     for i, (cloud, pose) in enumerate(zip(clouds, poses, strict=True)):
         cloud = cloud if isinstance(cloud, PointCloud) else PointCloud(cloud)
-        if world.names not in (None, cloud.channel_names):
-            raise ValueError(f"clouds[{i}]: expected the channels {world.names}, got {cloud.channel_names}")
-        world.add(cloud, np.asarray(pose_matrix(pose, f"poses[{i}]")))
+        world.add(f"clouds[{i}]", cloud, np.asarray(pose_matrix(pose, f"poses[{i}]")))
     return world.cloud()
 
 
@@ -51,11 +49,13 @@ class VoxelMap:
         # Keys of the voxels, sorted; and for each the number of points, and sums of positions, channels and masks.
         self._keys = np.empty(0, np.int64)
         self._sums: np.ndarray | None = None
-        self.names: tuple[str, ...] | None = None
+        self._names: tuple[str, ...] | None = None
 
-    def add(self, cloud: PointCloud, pose: Float[np.ndarray, "4 4"]) -> None:
-        """Add the finite points of a cloud in its sensor frame, moved by its pose."""
-        cloud, self.names = cloud.unpad(), cloud.channel_names
+    def add(self, name: str, cloud: PointCloud, pose: Float[np.ndarray, "4 4"]) -> None:
+        """Add the finite points of a cloud in its sensor frame, moved by its pose; `name` is for error messages."""
+        if self._names not in (None, cloud.channel_names):
+            raise ValueError(f"{name}: expected the channels {self._names}, got {cloud.channel_names}")
+        cloud, self._names = cloud.unpad(), cloud.channel_names
         points = np.asarray(cloud.points, np.float64) @ pose[:3, :3].T + pose[:3, 3]
         rows = np.hstack([np.ones((len(points), 1)), points, *_valid_channels(cloud)])
         finite = np.isfinite(rows).all(axis=1)
@@ -81,7 +81,7 @@ class VoxelMap:
             points,
             values / np.maximum(counts, 1),
             channel_valid=None if valid.all() else valid,
-            channel_names=self.names,
+            channel_names=self._names,
         )
 
 

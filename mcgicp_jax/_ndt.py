@@ -23,9 +23,9 @@ from mcgicp_jax._preprocess import preprocess
 from mcgicp_jax._statistics import median, namespace, sampled_rows
 from mcgicp_jax._surface import Local, Neighborhoods, local_of
 
-# Scale of the kernel, standard deviations: that of Biber & Strasser's score with the usual ratio of outliers, 0.55, and
-# cells of 1 m, for the mixture of a Gaussian and a uniform distribution (Magnusson 2009, eqs. 6.7 and 6.8); and that of
-# Stoyanov et al. (2012), whose d₂ is 0.05. The original formula depends on the unit of length.
+# Scale k of the kernel, standard deviations. The usual score is −exp(−d₂ s²/2), so that k² = 2/d₂. Magnusson's formula
+# for d₂ (2009) depends on the unit of length; with the usual 55 % of outliers and cells of 1 m it gives k = 2.15.
+# Stoyanov et al. (2012) use d₂ = 0.05.
 _NDT_SCALE, _D2D_SCALE = 2.15, 6.3
 # `min_ratio` of all scales but the last. Rounder cells can be found from further off: on KITTI, from 4 m and 20°, 10 of
 # 12 starts converge to the truth with 0.1, and 4 with 0.01.
@@ -44,6 +44,16 @@ class AbstractNDT(AbstractMethod):
     """
 
     kernel: AbstractKernel | None
+
+    def covariance(
+        self,
+        points: Float[Array, "3 n"],
+        around: Neighborhoods | None,
+        local: Local | None,
+        given: Float[Array, "6 n"] | None,
+    ) -> Float[Array, "6 n"]:
+        """The covariances given; those of points are not used."""
+        return identity(points) if given is None else given
 
     def spacing(self, target: PointCloud) -> Float[AnyScalar, ""]:
         """The median edge of the cells. (Where a plane lies between two layers of voxels, cells lie close together.)"""
@@ -114,15 +124,10 @@ class NDT(AbstractNDT, AbstractOneSided):
         """Raises `ValueError` unless `scale` is positive."""
         self.kernel = _welsch(scale)
 
-    def covariance(
-        self,
-        points: Float[Array, "3 n"],
-        around: Neighborhoods | None,
-        local: Local | None,
-        given: Float[Array, "6 n"] | None,
-    ) -> Float[Array, "6 n"]:
-        # That of the source is not used.
-        return identity(points) if given is None else alg.inverse(given)
+    def information(
+        self, target: Float[Array, "6 N"], source: Float[Array, "6 N"], rotation: Float[Array, "3 3"]
+    ) -> Float[Array, "6 N"]:
+        return alg.inverse(target)
 
 
 class ColorNDT(NDT, ColorICP):
@@ -158,15 +163,6 @@ class D2DNDT(AbstractNDT, AbstractGeneralized):
     def __init__(self, scale: ArrayLike | None = _D2D_SCALE):
         """Raises `ValueError` unless `scale` is positive."""
         self.kernel = _welsch(scale)
-
-    def covariance(
-        self,
-        points: Float[Array, "3 n"],
-        around: Neighborhoods | None,
-        local: Local | None,
-        given: Float[Array, "6 n"] | None,
-    ) -> Float[Array, "6 n"]:
-        return identity(points) if given is None else given
 
 
 def _welsch(scale: Any) -> Welsch | None:

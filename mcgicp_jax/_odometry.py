@@ -102,7 +102,7 @@ def odometry(
                 world = VoxelMap(voxel_size or float(point_spacing(cloud)))
                 farthest = float(np.linalg.norm(cloud.coordinates, axis=1).max())
                 radius = farthest if map_radius is None else map_radius
-            world.add(cloud, pose)
+            world.add(f"frames[{i}]", cloud, pose)
             world.forget(pose[:3, 3], radius)
         before = cloud
         yield Step(cloud, pose, None if result is None else computed(result))
@@ -116,5 +116,5 @@ def _prepared(frame: Frame | PointCloud | Values, voxel_size: float | None, num_
 
 def _target(world: VoxelMap, method: AbstractMethod, options: Options, num_neighbors: int) -> PointCloud:
     """The map as a target; raw if the method makes cells of it."""
-    raw = options.scales and method.needs_covariances
-    return world.cloud() if raw else preprocess(world.cloud(), num_neighbors=num_neighbors)
+    cloud = world.cloud()
+    return cloud if options.takes_raw(method, "target") else preprocess(cloud, num_neighbors=num_neighbors)

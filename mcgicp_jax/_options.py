@@ -40,12 +40,9 @@ class Options:
             _check_distances(self.max_distance)
         if not isinstance(self.max_iterations, int | np.integer) or self.max_iterations < 1:
             raise ValueError(f"max_iterations: expected an integer of at least 1, got {self.max_iterations!r}")
-        for name in ("translation_tolerance", "rotation_tolerance"):
-            value = getattr(self, name)
-            if name == "translation_tolerance" and value is None:
-                continue
-            if is_concrete(value) and not (_is_number(value) and np.asarray(value) >= 0):
-                raise ValueError(f"{name}: expected a number of at least 0, got {value!r}")
+        if self.translation_tolerance is not None:
+            _check_tolerance("translation_tolerance", self.translation_tolerance)
+        _check_tolerance("rotation_tolerance", self.rotation_tolerance)
         for name, kind, example in (
             ("robust", AbstractKernel, "Huber(1.0)"),
             ("search", AbstractSearch, "KDTreeSearch()"),
@@ -62,6 +59,10 @@ class Options:
         for size in self.scales:
             check_positive("scales", size)
 
+    def takes_raw(self, method: AbstractMethod, name: str) -> bool:
+        """Whether the method makes its cells of the cloud "source" or "target" itself, of all points."""
+        return len(self.scales) > 0 and name in method.needs_covariances
+
 
 def check_method(method: AbstractMethod) -> None:
     if not isinstance(method, AbstractMethod):
@@ -71,6 +72,11 @@ def check_method(method: AbstractMethod) -> None:
 def check_positive(name: str, value: ArrayLike) -> None:
     if is_concrete(value) and not (_is_number(value) and np.asarray(value) > 0):
         raise ValueError(f"{name}: expected a positive number, got {value!r}")
+
+
+def _check_tolerance(name: str, value: Any) -> None:
+    if is_concrete(value) and not (_is_number(value) and np.asarray(value) >= 0):
+        raise ValueError(f"{name}: expected a number of at least 0, got {value!r}")
 
 
 def _check_distances(distances: Any) -> None:

@@ -64,17 +64,17 @@ def preprocess(
     neighbors = (search or default_search()).neighbors(points, num_neighbors)
     arrays = {
         "points": points,
-        "channels": np.array(cloud.channels, dtype),
+        "channels": np.asarray(cloud.channels, dtype),
         # Without missing channels the mask is None, so that all complete clouds share compiled programs.
-        "channel_valid": None if channel_valid is None or np.all(channel_valid) else np.array(channel_valid),
+        "channel_valid": None if channel_valid is None or np.all(channel_valid) else np.asarray(channel_valid),
         "valid": np.ones(len(points), bool),
         "neighbors": neighbors.astype(np.int32, copy=False),
-        "covariances": None if covariances is None else np.array(covariances, dtype),
+        "covariances": None if covariances is None else np.asarray(covariances, dtype),
         "origin": origin,
     }
     for array in arrays.values():
         if array is not None:
-            # Quantities derived from these arrays are cached, so the arrays must not change; the caller's may.
+            # Quantities derived from these arrays are cached, so the arrays must not change. They are copies.
             array.setflags(write=False)
     return cloud.replace_rows(**arrays)
 

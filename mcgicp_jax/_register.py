@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -255,8 +255,7 @@ def register_with(
     """`register` with its options as one object."""
     check_method(method)
     source, target = (
-        _ready(name, cloud, raw=bool(options.scales and method.needs_covariances))
-        for name, cloud in (("source", source), ("target", target))
+        _ready(name, cloud, options.takes_raw(method, name)) for name, cloud in (("source", source), ("target", target))
     )
     if options.scales and not (source.covariances is None and target.covariances is None):
         raise ValueError("scales: expected none for clouds with covariances, which cannot be averaged in voxels")
@@ -265,21 +264,31 @@ def register_with(
     elif method.uses_channels and is_concrete(source, target):
         warn_of_units(source, target)
     *before, (method, source, target) = method.stages(source, target, options.scales)
-    once = replace(options, max_distance=None, match_channels=False, scales=())
-    for coarse_method, coarse, coarse_target in before:
-        found = register_with(coarse, coarse_target, coarse_method, init, once)
-        init = found.matrix if is_usable(found) else init
-    source = _ready("source", source)
     search = options.search or default_search()
-    problem = pose_problem(source, target, method, init, options, search.num_threads)
-    state, finish = _run(problem, target, search, options.max_iterations)
+    once = replace(options, max_distance=None)
+    for coarse_method, coarse, coarse_target in before:
+        _, state, finish = _solved(coarse, coarse_target, coarse_method, init, once, search)
+        found = registration_of(*finish(), coarse, coarse_target)
+        init = found.matrix if is_usable(found) else init
+    problem, state, finish = _solved(source, target, method, init, options, search)
     if options.match_channels:
         source = _matched(source, target, method, _nearest_points(source, target, problem, state, search))
         init = constant(pose_in_user_frame(state.pose, source.origin, target.origin))
-        problem = pose_problem(source, target, method, init, options, search.num_threads)
-        state, finish = _run(problem, target, search, options.max_iterations)
-    state, assessment, history = finish()
-    return registration_of(state, assessment, history, source, target)
+        _, _, finish = _solved(source, target, method, init, options, search)
+    return registration_of(*finish(), source, target)
+
+
+def _solved(
+    source: PointCloud,
+    target: PointCloud,
+    method: AbstractMethod,
+    init: Pose | None,
+    options: Options,
+    search: AbstractSearch,
+) -> tuple[Problem, State, Callable[[], tuple[State, Assessment, dict[str, Any]]]]:
+    """Pose and run the problem: it, the final state, and a function for the arguments of `registration_of`."""
+    problem = pose_problem(source, target, method, init, options, search.num_threads)
+    return problem, *_run(problem, target, search, options.max_iterations)
 
 
 def _run(problem: Problem, target: PointCloud, search: AbstractSearch, max_iterations: int) -> Any:
@@ -320,12 +329,8 @@ def pose_problem(
     return Problem(start, seen, there, method, robust, _settings(options, method, target, stride, dtype))
 
 
-def default_distances(method: AbstractMethod, target: PointCloud) -> tuple[Any, Any]:
-    """Default `max_distance` of the coarse and the fine phase for a preprocessed target, metres."""
-    return _distances(method.spacing(target))
-
-
-def _distances(spacing: Any) -> tuple[Any, Any]:
+def default_distances(spacing: Any) -> tuple[Any, Any]:
+    """Default `max_distance` of the coarse and the fine phase, metres, for a target with this spacing."""
     return spacing * _COARSE_SPACINGS, spacing * _FINE_SPACINGS
 
 
@@ -334,7 +339,7 @@ def _settings(options: Options, method: AbstractMethod, target: PointCloud, stri
     tolerance: Any = options.translation_tolerance
     # Options are constants to autodiff, even if they are derived from a differentiated cloud.
     spacing = constant(method.spacing(target))
-    max_distance = _distances(spacing) if max_distance is None else max_distance
+    max_distance = default_distances(spacing) if max_distance is None else max_distance
     least = spacing * _TOLERANCE_IN_SPACINGS
     tolerance = least if tolerance is None else tolerance
 

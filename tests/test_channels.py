@@ -103,7 +103,7 @@ def test_what_only_one_cloud_sees_does_not_count_with_matches(present):
     assert np.abs(fooled.channels[:300] - target.channels[:300]).max() > 0.3
 
 
-def test_a_few_matches_tell_nothing():
+def test_a_few_matches_change_nothing():
     cloud = preprocess(PointCloud(*ref.scene(500, 3)))
     rows = jnp.arange(len(cloud.points), dtype=jnp.int32)
     for count in (0, 3):

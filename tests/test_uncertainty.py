@@ -32,7 +32,7 @@ def mean_evidence(cloud, method):
 
 @pytest.mark.parametrize("turn", [(0, 0, 0, 0, 0, 0), (1, 2, 3, 0.4, -0.7, 0.2)])
 @pytest.mark.parametrize("size", [1e-3, 1, 1e3])
-def test_a_flat_wall_is_felt_along_its_normal_alone(size, turn):
+def test_a_flat_wall_is_observed_along_its_normal_alone(size, turn):
     points, _ = wall(2000, noise=0.005)
     pose = motion(turn)
     cloud = mcg.preprocess(size * (points @ pose[:3, :3].T + pose[:3, 3]))
@@ -43,7 +43,7 @@ def test_a_flat_wall_is_felt_along_its_normal_alone(size, turn):
     assert np.abs(np.linalg.eigvalsh(geometry[:2, :2])).max() < 5e-4
 
 
-def test_a_line_is_felt_across_alone_and_a_single_spot_not_at_all():
+def test_a_line_is_observed_across_alone_and_a_single_spot_not_at_all():
     rng = np.random.default_rng(0)
     along = np.array([1, 2, 3]) / np.sqrt(14)
     line = np.outer(rng.uniform(high=4, size=2000), along) + 1e-3 * rng.normal(size=(2000, 3))
@@ -53,7 +53,7 @@ def test_a_line_is_felt_across_alone_and_a_single_spot_not_at_all():
     np.testing.assert_allclose(geometry, 0, atol=1e-6)
 
 
-def test_channels_are_felt_along_their_gradient():
+def test_channels_are_observed_along_their_gradient():
     """A ramp of slope g is observed by α²g²/(1 + α²g²) along it, and not at all across."""
     points, _ = wall(2000, noise=0.0)
     cloud = mcg.preprocess(mcg.PointCloud(points, 3 * points[:, :1]))
@@ -95,9 +95,9 @@ def test_directions_are_the_eigenvectors_of_the_share_of_motion(seed, held, radi
     arms = p.T / radius
     jacobians = np.concatenate([np.tile(np.eye(3), (200, 1, 1)), -np.cross(arms[:, None, :], np.eye(3)[None])], axis=2)
     jacobians[:, :, 3:] = np.stack([np.cross(axis, arms) for axis in np.eye(3)], axis=2)
-    felt_motion = np.einsum("n,nai,nab,nbj->ij", weight, jacobians, matrices, jacobians)
+    observed_motion = np.einsum("n,nai,nab,nbj->ij", weight, jacobians, matrices, jacobians)
     all_motion = np.einsum("n,nai,naj->ij", weight, jacobians, jacobians)
-    expected = scipy.linalg.eigvalsh(felt_motion, all_motion)
+    expected = scipy.linalg.eigvalsh(observed_motion, all_motion)
     np.testing.assert_allclose(found.geometry, expected, atol=2e-4)
     twists = np.asarray(found.twists, np.float64)
     np.testing.assert_allclose(twists @ all_motion @ twists.T / weight.sum(), np.eye(6), atol=2e-3)

@@ -41,7 +41,8 @@ Target: TypeAlias = Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar=
 class PreparedPair:
     """Two preprocessed clouds with the channels that they have in common."""
 
-    def __init__(self, source: Path, target: Path, options: PairOptions):
+    def __init__(self, source: Path, target: Path, options: PairOptions, *, cells: bool = False):
+        """Read, preprocess and print; `cells`: only for a method that matches cells, not points."""
         options.check()
         check_inputs(source, target)
         self.options = options
@@ -60,7 +61,8 @@ class PreparedPair:
         ]
         voxels = "all kept" if voxel_size is None else f"voxels of {voxel_size:g} m"
         print(f"points:    source {counts[0]}, target {counts[1]} ({voxels})")
-        print(f"matches:   up to {described_distance(options, self.target)} apart")
+        if not cells:
+            print(f"matches:   up to {described_distance(options, self.target)} apart")
         # Without common channels, `method` raises an error if the method needs any.
         difference = f" ({self.difference})" if self.channels and names[0] != names[1] else ""
         print(f"channels:  {listed(self.channels)}{difference}")
@@ -126,7 +128,7 @@ def register(
     """
     shared.check_method(method)
     check_outputs(output, cloud=aligned)
-    pair = PreparedPair(source, target, shared)
+    pair = PreparedPair(source, target, shared, cells=bool(METHODS[method].needs_covariances))
     chosen = pair.method(method)
     print(f"method:    {method}{described(chosen)}")
     if chosen.needs_covariances:
