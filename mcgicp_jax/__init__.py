@@ -10,11 +10,13 @@ from mcgicp_jax._cloud import PointCloud
 from mcgicp_jax._cost import mahalanobis_cost
 from mcgicp_jax._dense import DenseSearch
 from mcgicp_jax._gaussians import cell_moments, gaussians, voxel_cells
+from mcgicp_jax._graph import PoseGraphResult, optimize_poses
 from mcgicp_jax._kernels import AbstractKernel, Cauchy, GemanMcClure, Huber, Tukey, Welsch
 from mcgicp_jax._map import aggregate
 from mcgicp_jax._methods import GICP, AbstractMethod, ColorICP, MultiChannelGICP, PointToPlane, PointToPoint
 from mcgicp_jax._ndt import D2DNDT, NDT, ColorNDT
 from mcgicp_jax._odometry import odometry
+from mcgicp_jax._pose_graph import Edge, PoseGraph
 from mcgicp_jax._preprocess import preprocess
 from mcgicp_jax._register import align, find_correspondences, register
 from mcgicp_jax._result import Registration, Status
@@ -34,6 +36,7 @@ __all__ = [
     "ColorNDT",
     "Correspondences",
     "DenseSearch",
+    "Edge",
     "GemanMcClure",
     "Huber",
     "KDTreeSearch",
@@ -42,6 +45,8 @@ __all__ = [
     "PointCloud",
     "PointToPlane",
     "PointToPoint",
+    "PoseGraph",
+    "PoseGraphResult",
     "Registration",
     "Status",
     "Tukey",
@@ -57,6 +62,7 @@ __all__ = [
     "mahalanobis_cost",
     "metrics",
     "odometry",
+    "optimize_poses",
     "plot",
     "preprocess",
     "register",

@@ -25,7 +25,7 @@ BLOCK = 2048
 Block = tuple[slice, slice | Int[np.ndarray, "BLOCK"]]
 
 
-def blocks(num_rows: int) -> list[Block]:
+def blocks(num_rows: int, size: int = BLOCK) -> list[Block]:
     """Cut rows into blocks.
 
     Returns:
@@ -33,8 +33,8 @@ def blocks(num_rows: int) -> list[Block]:
         is padded by repeating the last row.
     """
     cut: list[Block] = []
-    for start in range(0, num_rows, BLOCK):
-        stop = start + BLOCK
+    for start in range(0, num_rows, size):
+        stop = start + size
         if stop <= num_rows:
             cut.append((slice(start, stop), slice(start, stop)))
         else:
@@ -42,35 +42,40 @@ def blocks(num_rows: int) -> list[Block]:
     return cut
 
 
-def map_blocks(function: Callable[[Any], Any], num_rows: int, num_threads: int | None = 1) -> list[tuple[slice, Any]]:
+def map_blocks(
+    function: Callable[[Any], Any], num_rows: int, num_threads: int | None = 1, size: int = BLOCK
+) -> list[tuple[slice, Any]]:
     """Call a function on each block of rows.
 
     Args:
-        function: maps an index of `BLOCK` rows (see `blocks`) to a pytree of arrays; no trace may be active.
+        function: maps an index of `size` rows (see `blocks`) to a pytree of arrays; no trace may be active.
         num_threads: largest number of threads that call it; None for one per block.
+        size: number of rows of a block; another size needs other programs.
 
     Returns:
         For each block, in order, the slice of rows that it covers and the result as NumPy arrays.
     """
-    cut = blocks(num_rows)
+    cut = blocks(num_rows, size)
     results = side_by_side([partial(function, index) for _, index in cut], num_threads) if cut else []
     # Programs are dispatched asynchronously and run while the next block is gathered; wait only once all have started.
     return [(rows, jax.tree.map(np.asarray, result)) for (rows, _), result in zip(cut, results, strict=True)]
 
 
-def map_rows(function: Callable[[Any], Any], num_rows: int, num_threads: int | None = 1) -> Any:
+def map_rows(
+    function: Callable[[Any], Any], num_rows: int, num_threads: int | None = 1, size: int = BLOCK
+) -> Any:
     """Call a function on each block of rows and concatenate the rows that it returns.
 
     Args:
-        function: maps an index of `BLOCK` rows (see `blocks`) to a pytree of arrays with `BLOCK` rows.
-        num_threads: as in `map_blocks`.
+        function: maps an index of `size` rows (see `blocks`) to a pytree of arrays with `size` rows.
+        num_threads, size: as in `map_blocks`.
 
     Returns:
         A pytree of NumPy arrays with `num_rows` rows, at least 1.
     """
     # Worker threads run outside a trace that is active in this thread; this thread leaves it for the same results.
     with computed_now():
-        results = map_blocks(function, num_rows, num_threads)
+        results = map_blocks(function, num_rows, num_threads, size)
     leaves = [jax.tree.leaves(result) for _, result in results]
     structure = jax.tree.structure(results[0][1])
     whole = [np.empty((num_rows, *leaf.shape[1:]), leaf.dtype) for leaf in leaves[0]]

@@ -114,13 +114,28 @@ def se3_from_matrix(matrix: Float[ArrayLike, "4 4"], dtype: DTypeLike) -> jaxlie
     matrix = np.asarray(matrix, np.float64)
     if not np.isfinite(matrix).all():
         return se3(np.full(7, np.nan, dtype))
-    xyzw = np.array([0.0, 0, 0, 1])
-    if np.any(matrix[:3, :3] != np.eye(3)):
-        # Imported late: it takes a fifth of the import time of the package.
-        from scipy.spatial.transform import Rotation
+    if np.all(matrix[:3, :3] == np.eye(3)):
+        return se3(np.concatenate([[1.0, 0, 0, 0], matrix[:3, 3]]).astype(dtype))
+    return se3(parameters_of(matrix).astype(dtype))
 
-        xyzw = Rotation.from_matrix(matrix[:3, :3]).as_quat(canonical=True)
-    return se3(np.concatenate([xyzw[3:], xyzw[:3], matrix[:3, 3]]).astype(dtype))
+
+def parameters_of(matrices: Float[np.ndarray, "*batch 4 4"]) -> Float[np.ndarray, "*batch 7"]:
+    """Unit quaternions wxyz and translations of rigid motions; float64."""
+    # Imported late: it takes a fifth of the import time of the package.
+    from scipy.spatial.transform import Rotation
+
+    xyzw = Rotation.from_matrix(matrices[..., :3, :3].reshape(-1, 3, 3)).as_quat(canonical=True)
+    xyzw = xyzw.reshape(*matrices.shape[:-2], 4)
+    return np.concatenate([xyzw[..., 3:], xyzw[..., :3], matrices[..., :3, 3]], axis=-1)
+
+
+def matrices_of(parameters: Float[np.ndarray, "*batch 7"]) -> Float[np.ndarray, "*batch 4 4"]:
+    """Rigid motions as matrices from `parameters_of`."""
+    matrices = np.zeros((*parameters.shape[:-1], 4, 4))
+    matrices[..., :3, :3] = rotation_from_quaternion(parameters[..., :4])
+    matrices[..., :3, 3] = parameters[..., 4:]
+    matrices[..., 3, 3] = 1
+    return matrices
 
 
 @partial(jax.jit, static_argnames="dtype")

@@ -15,7 +15,7 @@ from jaxtyping import Array, Float, Int
 
 from mcgicp_jax._deferred import Deferred
 from mcgicp_jax._directions import Directions, FreeDirection, describe, free_directions
-from mcgicp_jax._pose import AnyArray, canonical_float, is_concrete, rotation_from_quaternion, se3
+from mcgicp_jax._pose import AnyArray, canonical_float, is_concrete, matrices_of, rotation_from_quaternion, se3
 
 
 class Status(enum.IntEnum):
@@ -232,10 +232,8 @@ def pose_in_user_frame(
         # Origins returned by `jit` are float32 (exactly so); the arithmetic with them must be float64.
         start, end = np.asarray(source_origin, np.float64), np.asarray(target_origin, np.float64)
         offset = end - start - np.einsum("...ij,...j->...i", rotation - np.eye(3), start)
-        matrix = np.zeros((*rotation.shape[:-2], 4, 4))
-        matrix[..., :3, :3] = rotation
-        matrix[..., :3, 3] = parameters[..., 4:] + offset
-        matrix[..., 3, 3] = 1
+        matrix = matrices_of(parameters)
+        matrix[..., :3, 3] += offset
         return matrix
     traced = centred.as_matrix().astype(centred.wxyz_xyz.dtype)
     turned = jnp.einsum("...ij,...j->...i", traced[..., :3, :3] - jnp.eye(3), source_origin, precision="highest")

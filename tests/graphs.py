@@ -1,0 +1,113 @@
+"""Generated pose graphs with exact truth, shaped like the usual benchmarks."""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+import mcgicp_jax as mcg
+
+
+def moved(poses, twists):
+    """T exp(ξ)-like motions: (v, ω) applied as translation and rotation vector."""
+    change = np.tile(np.eye(4), (len(twists), 1, 1))
+    change[:, :3, :3] = Rotation.from_rotvec(twists[:, 3:]).as_matrix()
+    change[:, :3, 3] = twists[:, :3]
+    return poses @ change
+
+
+def pose(position, rotation_vector):
+    matrix = np.eye(4)
+    matrix[:3, :3] = Rotation.from_rotvec(rotation_vector).as_matrix()
+    matrix[:3, 3] = position
+    return matrix
+
+
+def sphere(turns=50, per_turn=50, radius=50.0):
+    """A spiral over a sphere; loops to the pose one turn before."""
+    poses = []
+    n = turns * per_turn
+    for k in range(n):
+        latitude, longitude = np.pi * ((k + 0.5) / n - 0.5), 2 * np.pi * k / per_turn
+        up = np.array(
+            [np.cos(latitude) * np.cos(longitude), np.cos(latitude) * np.sin(longitude), np.sin(latitude)]
+        )
+        ahead = np.array([-np.sin(longitude), np.cos(longitude), 0])
+        matrix = np.eye(4)
+        matrix[:3] = np.column_stack([ahead, np.cross(up, ahead), up, radius * up])
+        poses.append(matrix)
+    return np.array(poses), [(k, k + per_turn) for k in range(n - per_turn)]
+
+
+def grid(side=5, step=1.0):
+    """A path through all cells of a cube, back and forth; loops to most neighbours."""
+    rng = np.random.default_rng(5)
+    cells = []
+    for z in range(side):
+        for y in range(side)[:: 1 if z % 2 == 0 else -1]:
+            cells += [(x, y, z) for x in range(side)[:: 1 if (y + z) % 2 == 0 else -1]]
+    cells = np.array(cells)
+    poses = np.array([pose(step * cell, 0.5 * rng.normal(size=3)) for cell in cells])
+    apart = np.abs(cells[:, None] - cells).sum(axis=2)
+    return poses, [(i, j) for i, j in np.argwhere(apart == 1) if j > i + 1 and rng.random() < 0.9]
+
+
+def garage(floors=4, per_floor=400, size=(60.0, 30.0)):
+    """A car drives round on each floor of a garage, ramps between; loops to the same place one and two floors down."""
+    poses = []
+    for k in range(floors * per_floor):
+        angle = 2 * np.pi * k / per_floor
+        place = np.array([size[0] * np.cos(angle), size[1] * np.sin(angle), 3.0 * k / per_floor])
+        poses.append(pose(place, [0, 0, np.arctan2(size[1] * np.cos(angle), -size[0] * np.sin(angle))]))
+    n = len(poses)
+    return np.array(poses), [(k, k + per_floor + d) for k in range(n - per_floor) for d in (-1, 0, 1) if k + per_floor + d < n]
+
+
+def measured(poses, loops, deviations=(0.05, 0.02), seed=0, false=0.0):
+    """A graph with noisy odometry and loops, started from odometry, and which edges are true.
+
+    Args:
+        false: fraction of the loops that are wrong, added to the true ones.
+    """
+    rng = np.random.default_rng(seed)
+    sigma = np.repeat(deviations, 3)
+    i, j = np.array([(k, k + 1) for k in range(len(poses) - 1)] + list(loops)).T
+    motions = moved(np.linalg.inv(poses[i]) @ poses[j], sigma * rng.normal(size=(len(i), 6)))
+    number = round(len(loops) * false / (1 - false))
+    a = rng.integers(0, len(poses), number)
+    b = (a + rng.integers(2, len(poses) - 2, number)) % len(poses)
+    extent = np.ptp(poses[:, :3, 3], axis=0).max()
+    wrong = moved(np.tile(np.eye(4), (number, 1, 1)), np.repeat([0.3 * extent, 1.0], 3) * rng.normal(size=(number, 6)))
+    edges = mcg.Edge(
+        np.concatenate([i, a]),
+        np.concatenate([j, b]),
+        np.concatenate([motions, wrong]),
+        np.tile(np.diag(sigma**-2.0), (len(i) + number, 1, 1)),
+        loop=np.arange(len(i) + number) >= len(poses) - 1,
+    )
+    start = [poses[0]]
+    for motion in motions[: len(poses) - 1]:
+        start.append(start[-1] @ motion)
+    return mcg.PoseGraph(np.array(start), edges), np.arange(len(edges)) < len(i)
+
+
+def with_gtsam(graph, weights=None):
+    """Poses and cost at the minimum of gtsam's Levenberg-Marquardt from the same start; with seconds that it took."""
+    import time
+
+    import gtsam
+
+    factors, values, edges = gtsam.NonlinearFactorGraph(), gtsam.Values(), graph.edges
+    for k, matrix in enumerate(graph.poses):
+        values.insert(k, gtsam.Pose3(matrix))
+    # gtsam's tangent has the rotation first.
+    order = [3, 4, 5, 0, 1, 2]
+    for k in range(len(edges)) if weights is None else np.flatnonzero(weights):
+        noise = gtsam.noiseModel.Gaussian.Information(edges.information[k][np.ix_(order, order)])
+        factors.add(gtsam.BetweenFactorPose3(int(edges.i[k]), int(edges.j[k]), gtsam.Pose3(edges.T_i_j[k]), noise))
+    factors.add(gtsam.NonlinearEqualityPose3(0, gtsam.Pose3(graph.poses[0])))
+    start = time.perf_counter()
+    optimizer = gtsam.LevenbergMarquardtOptimizer(factors, values)
+    found = optimizer.optimize()
+    seconds = time.perf_counter() - start
+    return np.array([found.atPose3(k).matrix() for k in range(len(graph.poses))]), factors.error(found), seconds
