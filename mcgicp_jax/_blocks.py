@@ -61,9 +61,7 @@ def map_blocks(
     return [(rows, jax.tree.map(np.asarray, result)) for (rows, _), result in zip(cut, results, strict=True)]
 
 
-def map_rows(
-    function: Callable[[Any], Any], num_rows: int, num_threads: int | None = 1, size: int = BLOCK
-) -> Any:
+def map_rows(function: Callable[[Any], Any], num_rows: int, num_threads: int | None = 1, size: int = BLOCK) -> Any:
     """Call a function on each block of rows and concatenate the rows that it returns.
 
     Args:

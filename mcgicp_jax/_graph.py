@@ -6,13 +6,15 @@ import contextlib
 from typing import Any
 
 import equinox as eqx
+import jax.numpy as jnp
 import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float, Int
 
 from mcgicp_jax._deferred import Deferred
+from mcgicp_jax._graph_traced import optimize_traced
 from mcgicp_jax._normal_equations import (
-    LEAST_DAMPING,
+    UNCONSTRAINED,
     Minimum,
     NormalEquations,
     factored,
@@ -33,8 +35,6 @@ _CHOICES = 5
 # Rejected loops are looked at again if their squared residual is below this multiple of the threshold: other edges
 # alone would have to know the motion half as well as the loop.
 _NEAR = 4.0
-# A direction of motion is unconstrained if its information is less than this fraction of that of a typical edge.
-_UNCONSTRAINED = 10 * LEAST_DAMPING
 # Inverse iterations for the least constrained direction: unconstrained ones stand out by factors of 1e3 and more.
 _INVERSE_ITERATIONS = 4
 # Columns of the inverse computed at once, to bound memory.
@@ -115,13 +115,16 @@ def optimize_poses(graph: PoseGraph, *, robust: bool = True, max_iterations: int
     """Find the poses that agree best with all edges: the minimum of Σ rᵀΛr, r = log(T_i_j⁻¹ T_i⁻¹ T_j).
 
     By Levenberg-Marquardt from the poses of the graph; the first pose is held. With concrete arrays it runs on the host
-    by sparse factorisation, in programs that do not depend on the size of the graph.
+    by sparse factorisation, in programs that do not depend on the size of the graph. Inside transformations it is one
+    dense program per size of graph, for some hundreds of poses. The poses are then differentiable by the motions and
+    the information of the edges (implicit function theorem; 0 if the loop does not converge), not by the start.
 
     Args:
         graph: poses and edges.
         robust: whether edges with `loop` may be rejected, by graduated non-convexity (Yang et al. 2020) with truncated
             squares: those that end more than 4.1 standard deviations off (χ² of 99 %, six degrees of freedom). The
-            threshold has this meaning if the information of the edges is right.
+            threshold has this meaning if the information of the edges is right. Not inside transformations: optimise
+            once outside, and pass `edges[result.kept]` there.
         max_iterations: largest number of steps of the last minimisation.
 
     Returns:
@@ -134,20 +137,42 @@ def optimize_poses(graph: PoseGraph, *, robust: bool = True, max_iterations: int
         raise ValueError(f"graph: expected a PoseGraph, got {type(graph).__name__}")
     if not isinstance(max_iterations, int | np.integer) or max_iterations < 1:
         raise ValueError(f"max_iterations: expected an integer of at least 1, got {max_iterations!r}")
+    if not is_concrete(graph):
+        return _traced(graph, robust, int(max_iterations))
     edges, start = graph.edges, parameters_of(np.asarray(graph.poses))
-    equations = NormalEquations(edges, start)
     loops = np.asarray(edges.loop) & bool(robust)
+    # Overflow is a status.
     with np.errstate(over="ignore", invalid="ignore"):
+        equations = NormalEquations(edges, start)
         found, weights = _robust_minimum(equations, start, loops, int(max_iterations))
+        status, cost = _status(equations, found, weights), found.terms.cost(weights)
     return PoseGraphResult.build(
         poses=matrices_of(found.poses),
         edges=edges,
-        status_code=np.int32(_status(equations, found, weights)),
+        status_code=np.int32(status),
         num_iterations=np.int32(found.num_iterations),
-        cost=np.float64(found.terms.cost(weights)),
+        cost=np.float64(cost),
         residuals=np.sqrt(np.maximum(found.terms.squares, 0)),
         weights=weights,
         uncertainty=Deferred(lambda: Certainty(equations, found, weights).covariances()),
+    )
+
+
+def _traced(graph: PoseGraph, robust: bool, max_iterations: int) -> PoseGraphResult:
+    if robust:
+        raise ValueError(
+            "robust: expected False inside transformations; optimize once outside, and pass the kept edges"
+        )
+    found = optimize_traced(graph.poses, graph.edges, max_iterations)
+    return PoseGraphResult.build(
+        poses=found.poses,
+        edges=graph.edges,
+        status_code=found.status,
+        num_iterations=found.num_iterations,
+        cost=0.5 * jnp.sum(found.squares),
+        residuals=jnp.sqrt(jnp.maximum(found.squares, 0)),
+        weights=jnp.ones_like(found.squares),
+        uncertainty=Deferred.of(found.covariance),
     )
 
 
@@ -229,7 +254,7 @@ def _is_degenerate(equations: NormalEquations, found: Minimum, weights: Float[np
         pushed = equations.metric @ vector
         vector = found.solve(pushed / np.sqrt(vector @ pushed))
     matrix = equations.weighted(found.terms, weights)
-    return bool(vector @ (matrix @ vector) < _UNCONSTRAINED * (vector @ (equations.metric @ vector)))
+    return bool(vector @ (matrix @ vector) < UNCONSTRAINED * (vector @ (equations.metric @ vector)))
 
 
 class Certainty:

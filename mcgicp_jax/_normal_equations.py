@@ -28,13 +28,15 @@ _BLOCK = 256
 # Damping, as a fraction of the information of a typical edge: at the start, least, and the factor by which it changes.
 # The least one leaves what no edge measures 3e4 times as uncertain as a typical edge, and the factorisation half of
 # the digits of float64.
-_START_DAMPING, LEAST_DAMPING, _DAMPING_FACTOR = 1e-4, 1e-9, 10.0
+START_DAMPING, LEAST_DAMPING, DAMPING_FACTOR = 1e-4, 1e-9, 10.0
 _MOST_DAMPING = 1e12
+# A direction of motion is unconstrained if its information is less than this fraction of that of a typical edge.
+UNCONSTRAINED = 10 * LEAST_DAMPING
 # A step is the last one if it lowers the cost by less than this fraction, as predicted. Next to the minimum of noisy
 # graphs a step was seen to lower it by 1e-2 to 1e-3 of what the one before did: the cost is then right to 1e-8.
-_TOLERANCE = 1e-6
+TOLERANCE = 1e-6
 # The same in σ², for graphs without contradiction: a step of a millionth of a standard deviation.
-_LEAST_DECREASE = 1e-12
+LEAST_DECREASE = 1e-12
 
 
 def residual_of(
@@ -51,7 +53,9 @@ def residual_of(
     def moved(twist: Float[Array, "6"]) -> Float[Array, "6"]:
         return (error @ jaxlie.SE3.exp(twist)).log()
 
-    return error.log(), jax.jacfwd(moved)(jnp.zeros_like(start[:6])), -motion.inverse().adjoint()
+    dtype = start.dtype
+    by_end, change = jax.jacfwd(moved)(jnp.zeros_like(start[:6])), -motion.inverse().adjoint()
+    return error.log().astype(dtype), by_end.astype(dtype), change.astype(dtype)
 
 
 @jax.jit
@@ -172,7 +176,9 @@ class NormalEquations:
             return Terms(np.zeros(0), np.zeros((0, 2, 6)), np.zeros((0, 3, 6, 6)))
         a, b, measured = self._i, self._j, self._measured
         with jax.enable_x64(True):
-            found = map_rows(lambda k: _terms(poses[a[k]], poses[b[k]], measured[k], information[k]), len(a), None, _BLOCK)
+            found = map_rows(
+                lambda k: _terms(poses[a[k]], poses[b[k]], measured[k], information[k]), len(a), None, _BLOCK
+            )
         return Terms(*found)
 
     def gradient(self, terms: Terms, weights: Float[np.ndarray, "m"]) -> Float[np.ndarray, "size"]:
@@ -293,7 +299,7 @@ class Minimum(NamedTuple):
     terms: Terms
     num_iterations: int = 0
     converged: bool = False
-    damping: float = _START_DAMPING
+    damping: float = START_DAMPING
     solve: Callable[[np.ndarray], np.ndarray] | None = None
 
 
@@ -313,7 +319,7 @@ def minimize(
         try:
             solve = factored(equations.damped(system, damping))
         except RuntimeError:
-            damping *= _DAMPING_FACTOR
+            damping *= DAMPING_FACTOR
             continue
         step = -solve(gradient)
         decrease = -0.5 * float(gradient @ step)
@@ -321,12 +327,12 @@ def minimize(
         there = equations.terms(trial)
         after = there.cost(weights)
         # At the minimum, rounding decides whether the computed cost becomes lower.
-        if after <= cost * (1 + 1e-14) + _LEAST_DECREASE:
-            small = decrease <= _TOLERANCE * cost + _LEAST_DECREASE
+        if after <= cost * (1 + 1e-14) + LEAST_DECREASE:
+            small = decrease <= TOLERANCE * cost + LEAST_DECREASE
             poses, terms, cost, system = trial, there, after, None
-            damping = max(damping / _DAMPING_FACTOR, LEAST_DAMPING)
+            damping = max(damping / DAMPING_FACTOR, LEAST_DAMPING)
             if small:
                 return Minimum(poses, terms, count, True, damping, solve)
         else:
-            damping *= _DAMPING_FACTOR
+            damping *= DAMPING_FACTOR
     return Minimum(poses, terms, count, False, damping, solve)

@@ -21,7 +21,17 @@ DATA = pathlib.Path(os.environ.get("MCGICP_DATA", pathlib.Path(__file__).parents
 
 # Modules that depend on the precision; only these run in float64 too.
 _IN_FLOAT64 = (
-    *("align_gradients", "cost", "covariance", "large_coordinates", "methods", "reference", "register", "solve"),
+    *(
+        "align_gradients",
+        "cost",
+        "covariance",
+        "graph",
+        "large_coordinates",
+        "methods",
+        "reference",
+        "register",
+        "solve",
+    ),
     "transformations",
 )
 

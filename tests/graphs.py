@@ -29,9 +29,7 @@ def sphere(turns=50, per_turn=50, radius=50.0):
     n = turns * per_turn
     for k in range(n):
         latitude, longitude = np.pi * ((k + 0.5) / n - 0.5), 2 * np.pi * k / per_turn
-        up = np.array(
-            [np.cos(latitude) * np.cos(longitude), np.cos(latitude) * np.sin(longitude), np.sin(latitude)]
-        )
+        up = np.array([np.cos(latitude) * np.cos(longitude), np.cos(latitude) * np.sin(longitude), np.sin(latitude)])
         ahead = np.array([-np.sin(longitude), np.cos(longitude), 0])
         matrix = np.eye(4)
         matrix[:3] = np.column_stack([ahead, np.cross(up, ahead), up, radius * up])
@@ -60,7 +58,9 @@ def garage(floors=4, per_floor=400, size=(60.0, 30.0)):
         place = np.array([size[0] * np.cos(angle), size[1] * np.sin(angle), 3.0 * k / per_floor])
         poses.append(pose(place, [0, 0, np.arctan2(size[1] * np.cos(angle), -size[0] * np.sin(angle))]))
     n = len(poses)
-    return np.array(poses), [(k, k + per_floor + d) for k in range(n - per_floor) for d in (-1, 0, 1) if k + per_floor + d < n]
+    return np.array(poses), [
+        (k, k + per_floor + d) for k in range(n - per_floor) for d in (-1, 0, 1) if k + per_floor + d < n
+    ]
 
 
 def measured(poses, loops, deviations=(0.05, 0.02), seed=0, false=0.0):

@@ -16,7 +16,7 @@ LAYERS = {
     "local surfaces": ("_surface", "_observability", "_neighborhoods", "_local", "_channels"),
     "correspondences": ("_forces", "_methods", "_surfaces", "_sums", "_gaussians", "_ndt"),
     "pose": ("_solve", "_directions", "_uncertainty", "_result", "_step"),
-    "loops": ("_host", "_traced", "_lanes", "_normal_equations"),
+    "loops": ("_host", "_traced", "_lanes", "_normal_equations", "_graph_traced"),
     "use": ("_options", "_cost", "_outcome", "_register", "_channel_covariance", "_batch", "_graph", "_odometry"),
     "faces": ("plot", "_commands", "__main__"),
 }
