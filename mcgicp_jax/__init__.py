@@ -14,6 +14,7 @@ from mcgicp_jax._graph import PoseGraphResult, optimize_poses
 from mcgicp_jax._kernels import AbstractKernel, Cauchy, GemanMcClure, Huber, Tukey, Welsch
 from mcgicp_jax._map import aggregate
 from mcgicp_jax._methods import GICP, AbstractMethod, ColorICP, MultiChannelGICP, PointToPlane, PointToPoint
+from mcgicp_jax._multiway import Multiway, multiway
 from mcgicp_jax._ndt import D2DNDT, NDT, ColorNDT
 from mcgicp_jax._odometry import odometry
 from mcgicp_jax._pose_graph import Edge, PoseGraph
@@ -41,6 +42,7 @@ __all__ = [
     "Huber",
     "KDTreeSearch",
     "MultiChannelGICP",
+    "Multiway",
     "PairWarning",
     "PointCloud",
     "PointToPlane",
@@ -61,6 +63,7 @@ __all__ = [
     "io",
     "mahalanobis_cost",
     "metrics",
+    "multiway",
     "odometry",
     "optimize_poses",
     "plot",

@@ -106,8 +106,8 @@ class PoseGraphResult(eqx.Module):
             return f"PoseGraphResult({len(self.poses)} poses, traced)"
         rejected = int((~np.asarray(self.kept)).sum())
         return (
-            f"PoseGraphResult({self.status.name}: {len(self.poses)} poses, {len(self.edges)} edges, {rejected} rejected,"
-            f" cost {np.asarray(self.cost):.4g}, {self.num_iterations} iterations)"
+            f"PoseGraphResult({self.status.name}: {len(self.poses)} poses, {len(self.edges)} edges, "
+            f"{rejected} rejected, cost {np.asarray(self.cost):.4g}, {self.num_iterations} iterations)"
         )
 
 
@@ -156,6 +156,15 @@ def optimize_poses(graph: PoseGraph, *, robust: bool = True, max_iterations: int
         weights=weights,
         uncertainty=Deferred(lambda: Certainty(equations, found, weights).covariances()),
     )
+
+
+def certainty_of(graph: PoseGraph) -> Certainty:
+    """Certainty at the poses of the graph, taken to be its minimum; of the edges that fit there."""
+    poses = parameters_of(np.asarray(graph.poses))
+    equations = NormalEquations(graph.edges, poses)
+    terms = equations.terms(poses)
+    weights = np.where(np.asarray(graph.edges.loop), 1.0 * (terms.squares <= LARGEST_SQUARE), 1)
+    return Certainty(equations, Minimum(poses, terms), weights)
 
 
 def _traced(graph: PoseGraph, robust: bool, max_iterations: int) -> PoseGraphResult:

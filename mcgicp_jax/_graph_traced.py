@@ -20,13 +20,16 @@ from mcgicp_jax._normal_equations import (
     LEAST_DAMPING,
     LEAST_DECREASE,
     START_DAMPING,
-    TOLERANCE,
     UNCONSTRAINED,
     residual_of,
 )
 from mcgicp_jax._pose import AnyArray
 from mcgicp_jax._pose_graph import Edge
 from mcgicp_jax._result import Status
+
+
+# Tolerance of the loop on the host, in units of the precision: derivatives are right to the root of it at least.
+_TOLERANCE_IN_EPS = 10.0
 
 
 class _Edges(NamedTuple):
@@ -75,8 +78,8 @@ def optimize_traced(matrices: Float[AnyArray, "n 4 4"], edges: Edge, max_iterati
         state = _minimized(start, fixed, max_iterations)
         gradient = _summed(_forces(state.poses, given), given, n)
         step = _solved(_assembled(_force_derivatives(state.poses, fixed), fixed, n), gradient)
-        # A step of zero length that has the derivative; none where the loop did not converge.
-        step = jnp.where(state.converged, step - jax.lax.stop_gradient(step), 0)
+        # No derivative where the loop did not converge.
+        step = jnp.where(state.converged, step, 0)
         matrix, metric = state.sums.matrix, state.sums.metric
         blocks = jnp.linalg.inv(matrix + LEAST_DAMPING * metric).reshape(n - 1, 6, n - 1, 6)
         free = jnp.arange(n - 1)
@@ -99,7 +102,8 @@ def _status(state: _State) -> Int[Array, ""]:
 
 
 def _minimized(start: Float[Array, "n 7"], edges: _Edges, max_iterations: int) -> _State:
-    rounding = 4 * float(jnp.finfo(start.dtype).eps) * len(edges.i)
+    eps = float(jnp.finfo(start.dtype).eps)
+    rounding = 4 * eps * len(edges.i)
     size = 6 * len(start) - 6
 
     def goes_on(state: _State) -> Any:
@@ -111,7 +115,7 @@ def _minimized(start: Float[Array, "n 7"], edges: _Edges, max_iterations: int) -
         poses = _moved(state.poses, move)
         there = _sums(poses, edges)
         accepted = there.cost <= sums.cost * (1 + rounding) + LEAST_DECREASE
-        small = -0.5 * jnp.sum(sums.gradient * move) <= TOLERANCE * sums.cost + LEAST_DECREASE
+        small = -0.5 * jnp.sum(sums.gradient * move) <= _TOLERANCE_IN_EPS * eps * sums.cost + LEAST_DECREASE
         factor = jnp.where(accepted & (state.count > 0), 1 / DAMPING_FACTOR, jnp.where(accepted, 1, DAMPING_FACTOR))
         damping = jnp.maximum(state.damping * factor, LEAST_DAMPING)
         poses, sums = jax.tree.map(

@@ -59,7 +59,7 @@ class VoxelMap:
         points = np.asarray(cloud.points, np.float64) @ pose[:3, :3].T + pose[:3, 3]
         rows = np.hstack([np.ones((len(points), 1)), points, *_valid_channels(cloud)])
         finite = np.isfinite(rows).all(axis=1)
-        keys = np.concatenate([self._keys, _voxels(points[finite], self._voxel_size)])
+        keys = np.concatenate([self._keys, voxels(points[finite], self._voxel_size)])
         sums = rows[finite] if self._sums is None else np.concatenate([self._sums, rows[finite]])
         self._keys, self._sums = _merge(keys, sums)
 
@@ -93,7 +93,7 @@ def _valid_channels(cloud: PointCloud) -> tuple[Float[np.ndarray, "N C"], Float[
     return channels, np.asarray(cloud.channel_valid, np.float64)
 
 
-def _voxels(points: Float[np.ndarray, "N 3"], voxel_size: float) -> np.ndarray:
+def voxels(points: Float[np.ndarray, "N 3"], voxel_size: float) -> np.ndarray:
     """One integer key per point for the voxel that contains it."""
     cells = np.floor(points / voxel_size)
     if np.abs(cells).max(initial=0) >= _HALF_RANGE:

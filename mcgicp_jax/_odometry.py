@@ -11,10 +11,12 @@ from jaxtyping import Float
 
 from mcgicp_jax._channels import point_spacing
 from mcgicp_jax._cloud import PointCloud, Values
+from mcgicp_jax._loops import Trajectory
 from mcgicp_jax._map import VoxelMap
 from mcgicp_jax._methods import AbstractMethod
 from mcgicp_jax._options import Options, check_method, check_positive
 from mcgicp_jax._pose import Pose, nearest_rotation, pose_matrix
+from mcgicp_jax._pose_graph import PoseGraph
 from mcgicp_jax._preprocess import check_preprocessing, preprocess
 from mcgicp_jax._register import register_with
 from mcgicp_jax._result import Registration, computed, is_usable
@@ -30,11 +32,14 @@ class Step:
         pose: (4, 4) float64, sensor to world, metres.
         registration: registration of this frame to the previous one (or with `against="map"` to the map, in the
             world's frame), None for the first; check its `converged`.
+        graph: with `loops`, the poses of all frames so far, corrected by the loops, and the edges between them; see
+            `optimize_poses` for their covariances. None otherwise.
     """
 
     cloud: PointCloud
     pose: Float[np.ndarray, "4 4"]
     registration: Registration | None
+    graph: PoseGraph | None = None
 
 
 def odometry(
@@ -47,11 +52,12 @@ def odometry(
     start: Pose | None = None,
     against: Literal["previous", "map"] = "previous",
     map_radius: float | None = None,
+    loops: bool = False,
     **options: Any,
 ) -> Iterator[Step]:
     """Register each frame to the previous one, or to a map, starting from the previous motion (constant velocity).
 
-    Frames are processed lazily and only the latest is kept, so a sequence may be larger than memory. For a progress
+    Frames are processed lazily and without `loops` only the latest is kept, so a sequence may be larger than memory. For a progress
     bar, use `tqdm.tqdm(odometry(frames, ...), total=len(frames))`. If a registration ends with too few matches or
     non-finite values, the previous motion is used instead; `Step.registration` keeps the failed result.
 
@@ -65,6 +71,9 @@ def odometry(
         against: "previous": register to the previous frame. "map": to the points of all frames before that lie within
             `map_radius` of the last pose, averaged per voxel. Errors then accumulate more slowly.
         map_radius: metres; by default the distance of the farthest point of the first frame from its sensor.
+        loops: whether to look for frames that see again what an earlier one saw, within the uncertainty of the poses,
+            register the two, and correct all poses; the poses of `Step.graph` of the last step are then better than
+            those of the single steps. Keeps all clouds.
         options: options of `register`.
 
     Yields:
@@ -79,7 +88,10 @@ def odometry(
         raise ValueError(f'against: expected "previous" or "map", got {against!r}')
     if map_radius is not None:
         check_positive("map_radius", map_radius)
+    if loops and against == "map":
+        raise ValueError('loops: expected against="previous", whose registrations become the edges of a graph')
     chosen = Options(**options)
+    trajectory = Trajectory(method, chosen) if loops else None
     motion = pose_matrix(init)
     pose = np.asarray(pose_matrix(start, "start"))
     before: PointCloud | None = None
@@ -105,7 +117,10 @@ def odometry(
             world.add(f"frames[{i}]", cloud, pose)
             world.forget(pose[:3, 3], radius)
         before = cloud
-        yield Step(cloud, pose, None if result is None else computed(result))
+        if trajectory is not None:
+            pose = trajectory.add(cloud, pose, result)
+        graph = None if trajectory is None else trajectory.graph
+        yield Step(cloud, pose, None if result is None else computed(result), graph)
 
 
 def _prepared(frame: Frame | PointCloud | Values, voxel_size: float | None, num_neighbors: int) -> PointCloud:

@@ -17,7 +17,18 @@ LAYERS = {
     "correspondences": ("_forces", "_methods", "_surfaces", "_sums", "_gaussians", "_ndt"),
     "pose": ("_solve", "_directions", "_uncertainty", "_result", "_step"),
     "loops": ("_host", "_traced", "_lanes", "_normal_equations", "_graph_traced"),
-    "use": ("_options", "_cost", "_outcome", "_register", "_channel_covariance", "_batch", "_graph", "_odometry"),
+    "use": (
+        "_options",
+        "_cost",
+        "_outcome",
+        "_register",
+        "_channel_covariance",
+        "_batch",
+        "_graph",
+        "_loops",
+        "_odometry",
+        "_multiway",
+    ),
     "faces": ("plot", "_commands", "__main__"),
 }
 LAYER = {module: rank for rank, modules in enumerate(LAYERS.values()) for module in modules}

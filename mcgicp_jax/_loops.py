@@ -1,0 +1,140 @@
+"""Edges from registrations, and loops found as a sensor returns to where it has been."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from mcgicp_jax._cloud import PointCloud
+from mcgicp_jax._graph import certainty_of, optimize_poses
+from mcgicp_jax._methods import AbstractMethod
+from mcgicp_jax._options import Options
+from mcgicp_jax._pose_graph import Edge, PoseGraph
+from mcgicp_jax._register import default_distances, register_with
+from mcgicp_jax._result import Registration, Status
+
+# Least overlap of a pair that makes an edge: with less, a wrong local minimum looks like a right one.
+LEAST_OVERLAP = 0.4
+# Two frames may close a loop if the sensor was within this fraction of the median range of the points (closer than the
+# surfaces that it sees, so that most of them are in both clouds), give or take the deviations of 99 % (χ² with three
+# degrees of freedom).
+_NEAR, _DEVIATIONS = 0.5, 3.37
+# A loop is looked for if the graph knows the motion between two frames worse than a registration: the variances, in the
+# geometric mean of the six directions, are larger by this factor.
+_GAIN = 4.0
+# Frames whose certainty is computed, the nearest ones, and of these, registrations tried per frame.
+_CANDIDATES, _TRIES = 16, 2
+
+
+def edge_from(i: int, j: int, result: Registration, *, loop: bool = False) -> Edge | None:
+    """The edge that a registration of cloud j to cloud i measures; None unless it has come to rest with an overlap.
+
+    Its information is the inverse of `Registration.covariance` within the constrained directions and zero along the
+    others, so that DEGENERATE results, too, tell what they know.
+    """
+    if result.status not in (Status.CONVERGED, Status.DEGENERATE) or result.overlap < LEAST_OVERLAP:
+        return None
+    covariance, directions = np.asarray(result.covariance, np.float64), result.directions
+    if directions is None or not np.isfinite(covariance).all():
+        return None
+    held = np.asarray(directions.held)
+    # Along the constrained directions, as coordinates; those of the others are independent of them.
+    coordinates = np.linalg.inv(np.asarray(directions.twists, np.float64).T)[held]
+    inner = coordinates @ covariance @ coordinates.T
+    if not held.any() or np.linalg.cond(inner) > 1 / np.finfo(float).eps:
+        return None
+    information = coordinates.T @ np.linalg.solve(inner, coordinates)
+    return Edge(i, j, result.matrix, 0.5 * (information + information.T), loop=loop)
+
+
+class Trajectory:
+    """The poses of a sensor, its clouds, and the edges between them, as they come in.
+
+    Attributes:
+        graph: the poses so far, corrected by the loops, and the edges.
+    """
+
+    def __init__(self, method: AbstractMethod, options: Options):
+        self._method, self._options = method, options
+        self._clouds: list[PointCloud] = []
+        self._poses: list[Float[np.ndarray, "4 4"]] = []
+        self._edges: list[Edge] = []
+
+    @property
+    def graph(self) -> PoseGraph:
+        return PoseGraph(self._poses, self._edges)
+
+    def add(
+        self, cloud: PointCloud, pose: Float[np.ndarray, "4 4"], result: Registration | None
+    ) -> Float[np.ndarray, "4 4"]:
+        """Add a frame with its registration to the one before, close loops with earlier ones, and return its pose."""
+        number = len(self._clouds)
+        self._clouds.append(cloud)
+        self._poses.append(pose)
+        if result is not None:
+            edge = edge_from(number - 1, number, result)
+            if edge is None:
+                # Without a measurement the motion that was assumed stays, as information of next to nothing.
+                edge = Edge(number - 1, number, np.linalg.inv(self._poses[-2]) @ pose, np.zeros((6, 6)))
+            self._edges.append(edge)
+            loops = self._loops(number)
+            if loops:
+                self._edges += loops
+                self._poses = list(np.asarray(optimize_poses(self.graph).poses))
+        return self._poses[-1]
+
+    def _loops(self, number: int) -> list[Edge]:
+        """At most one edge to an earlier frame, of which the motion is known worse than by registration."""
+        positions = np.array(self._poses)[:, :3, 3]
+        distances = np.linalg.norm(positions[: number - 1] - positions[number], axis=1)
+        nearest = np.argsort(distances, kind="stable")[:_CANDIDATES]
+        if not len(nearest):
+            return []
+        tried = 0
+        covariances = certainty_of(self.graph).between(nearest, np.full(len(nearest), number))
+        for i, covariance in zip(*self._worthwhile(number, nearest, distances[nearest], covariances), strict=True):
+            tried += 1
+            edge = self._registered(int(i), number, covariance)
+            if edge is not None:
+                return [edge]
+            if tried == _TRIES:
+                break
+        return []
+
+    def _worthwhile(
+        self,
+        number: int,
+        frames: Int[np.ndarray, "k"],
+        distances: Float[np.ndarray, "k"],
+        covariances: Float[np.ndarray, "k 6 6"],
+    ) -> tuple[Int[np.ndarray, "m"], Float[np.ndarray, "m 6 6"]]:
+        """Frames that may see the same place and whose motion is known badly, nearest first."""
+        sigma = np.sqrt(np.maximum(np.linalg.eigvalsh(covariances[:, :3, :3])[:, -1], 0))
+        reach = _NEAR * float(np.median(np.linalg.norm(self._clouds[number].coordinates, axis=1)))
+        within = distances <= reach + _DEVIATIONS * sigma
+        last = next((edge for edge in reversed(self._edges) if np.any(edge.information)), None)
+        known = np.zeros(len(frames)) if last is None else _log_volume(covariances) + _log_volume_of_information(last)
+        chosen = within & (known > 6 * np.log(_GAIN))
+        return frames[chosen], covariances[chosen]
+
+    def _registered(self, i: int, j: int, covariance: Float[np.ndarray, "6 6"]) -> Edge | None:
+        init = np.linalg.inv(self._poses[i]) @ self._poses[j]
+        sigma = float(np.sqrt(np.linalg.eigvalsh(covariance[:3, :3])[-1]))
+        given = self._options.max_distance
+        if given is None:
+            given = default_distances(self._method.spacing(self._clouds[i]))
+        coarse, fine = given if np.ndim(given) else (given, given)
+        options = replace(self._options, max_distance=(max(float(coarse), _DEVIATIONS * sigma), float(fine)))
+        return edge_from(i, j, register_with(self._clouds[j], self._clouds[i], self._method, init, options), loop=True)
+
+
+def _log_volume(covariances: Float[np.ndarray, "k 6 6"]) -> Float[np.ndarray, "k"]:
+    return np.linalg.slogdet(covariances)[1]
+
+
+def _log_volume_of_information(edge: Edge) -> float:
+    """log det of the information within the directions of which the edge knows."""
+    values = np.linalg.eigvalsh(np.asarray(edge.information))
+    return float(np.log(values[values > 1e-9 * values[-1]]).sum())
