@@ -14,6 +14,7 @@ import platformdirs
 import tyro
 
 from mcgicp_jax._commands._batch import batch
+from mcgicp_jax._commands._multiway import multiway
 from mcgicp_jax._commands._odometry import odometry
 from mcgicp_jax._commands._options import VERSION
 from mcgicp_jax._commands._paper import paper
@@ -56,6 +57,7 @@ def main(args: Sequence[str] | None = None) -> int:
         "register": register,
         "compare": compare,
         "odometry": odometry,
+        "multiway": multiway,
         "batch": batch,
         "paper": paper,
     }

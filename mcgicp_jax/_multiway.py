@@ -63,7 +63,7 @@ def multiway(
     method: AbstractMethod,
     pairs: Sequence[tuple[int, int]] | None = None,
     *,
-    init: Sequence[Pose] | None = None,
+    init: Sequence[Pose] | Float[np.ndarray, "n 4 4"] | None = None,
     voxel_size: float | None = None,
     num_neighbors: int = 20,
     executor: Executor | None = None,
@@ -124,7 +124,10 @@ def multiway(
 
 
 def _start(
-    clouds: list[PointCloud], method: AbstractMethod, init: Sequence[Pose] | None, options: dict[str, Any]
+    clouds: list[PointCloud],
+    method: AbstractMethod,
+    init: Sequence[Pose] | Float[np.ndarray, "n 4 4"] | None,
+    options: dict[str, Any],
 ) -> tuple[Float[np.ndarray, "n 4 4"], dict[tuple[int, int], Registration]]:
     """Poses to start from, and what was registered to find them."""
     if init is None:

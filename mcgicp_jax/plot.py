@@ -17,6 +17,7 @@ from jaxtyping import Float, Int
 
 from mcgicp_jax._cloud import PointCloud
 from mcgicp_jax._directions import CHANNELS_HOLD, GEOMETRY_HOLDS, shares
+from mcgicp_jax._graph import PoseGraphResult
 from mcgicp_jax._methods import AbstractMethod
 from mcgicp_jax._pose import Pose, pose_matrix
 from mcgicp_jax._result import Registration
@@ -38,6 +39,8 @@ _MOST_POINTS = 50_000
 # before_after: maximum width of a row and height of a panel, inches; pixels and tiles along the longer side of a panel;
 # fraction of each side that the detail shows.
 _WIDEST, _HIGHEST, _PIXELS, _TILES, _DETAIL = 12, 4.5, 500, 12, 0.25
+# Residual at the end of the colour scale of a graph, standard deviations: that beyond which loops are rejected.
+_LARGEST_RESIDUAL = 4.1
 # Pixels along the longer side of a map.
 _MAP_PIXELS = 1400
 # Pixels per point spacing, unless the limit on the pixels of a picture makes them coarser.
@@ -350,6 +353,42 @@ def trajectories(
     panel.set(xlabel="metres", ylabel="metres", aspect="equal", adjustable="datalim")
     panel.grid(alpha=0.3)
     panel.legend()
+    if path is not None:
+        figure.savefig(path, dpi=120)
+    return figure
+
+
+def graph(graph: PoseGraphResult, *, path: str | os.PathLike[str] | None = None) -> matplotlib.figure.Figure:
+    """Plot the poses of a graph in their principal plane, and its edges coloured by residual in standard deviations.
+
+    Rejected loops are dashed.
+
+    Args:
+        graph: result of `optimize_poses`, such as `Multiway.graph`.
+        path: file to save the figure to; its suffix selects the format.
+
+    Raises:
+        ImportError: if matplotlib is missing.
+    """
+    figures, collections = _module("matplotlib.figure"), _module("matplotlib.collections")
+    positions = np.asarray(graph.poses)[:, :3, 3]
+    centred = positions - positions.mean(axis=0)
+    flat = centred @ np.linalg.svd(centred, full_matrices=False)[2][:2].T
+    flat = flat if flat.shape[1] == 2 else np.column_stack([flat, np.zeros(len(flat))])
+    kept, residuals = np.asarray(graph.kept), np.asarray(graph.residuals)
+    segments = np.stack([flat[np.asarray(graph.edges.i)], flat[np.asarray(graph.edges.j)]], axis=1)
+    figure = figures.Figure((7, 5), layout="constrained")
+    panel = figure.subplots()
+    for chosen, style in ((kept, "solid"), (~kept, "dashed")):
+        lines = collections.LineCollection(segments[chosen], linestyles=style, linewidths=1, cmap="viridis")
+        lines.set_array(residuals[chosen])
+        lines.set_clim(0, _LARGEST_RESIDUAL)
+        panel.add_collection(lines)
+        if style == "solid":
+            figure.colorbar(lines, ax=panel, label="residual, standard deviations", extend="max")
+    panel.plot(*flat.T, marker=".", markersize=4, linestyle="none", color="black")
+    panel.set(xlabel="metres", ylabel="metres", aspect="equal", adjustable="datalim")
+    panel.grid(alpha=0.3)
     if path is not None:
         figure.savefig(path, dpi=120)
     return figure

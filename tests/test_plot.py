@@ -7,8 +7,10 @@ import matplotlib.image
 import numpy as np
 import pytest
 
+import mcgicp_jax as mcg
 from mcgicp_jax import MultiChannelGICP, PointCloud, aggregate, plot, preprocess, register
 from mcgicp_jax.datasets import poster_wall
+from tests.graphs import grid, measured
 from tests.scenes import motion
 
 
@@ -307,3 +309,13 @@ def test_covariances_within_a_surface_are_drawn_as_they_are():
     np.testing.assert_allclose(np.diff(first.get_offsets()[:, 0]), 0.5)
     with pytest.raises(ValueError, match=r"covariances\['short'\]: expected shape \(200, 3, 3\)"):
         plot.surface_covariances(cloud, {"short": along[:5]}, indices=[0])
+
+
+def test_graphs_show_poses_and_edges(tmp_path):
+    found = mcg.optimize_poses(measured(*grid(3), false=0.2)[0])
+    figure = plot.graph(found, path=tmp_path / "graph.png")
+    kept, rejected = figure.axes[0].collections
+    assert len(kept.get_segments()) == found.kept.sum() and len(rejected.get_segments()) == (~found.kept).sum() > 0
+    np.testing.assert_allclose(kept.get_array(), found.residuals[found.kept])
+    assert (tmp_path / "graph.png").stat().st_size > 1000
+    assert len(plot.graph(mcg.optimize_poses(mcg.PoseGraph([np.eye(4)], []))).axes[0].lines) == 1

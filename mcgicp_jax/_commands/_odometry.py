@@ -64,6 +64,7 @@ def odometry(
     num_frames: int | Literal["all"] = "all",
     against: Literal["previous", "map"] = "previous",
     map_radius: Annotated[float | None, tyro.conf.arg(metavar="FLOAT", help_behavior_hint="")] = None,
+    loops: bool = False,
     output: File = None,
     map: File = None,
     plot: File = None,
@@ -86,6 +87,7 @@ def odometry(
         num_frames: Number of frames to use, from the start; all means 20 for a simulated scene.
         against: Register each frame to the one before it, or to a map of all frames before it, which drifts less.
         map_radius: Metres; points further from the sensor leave the map. By default the range of the first frame.
+        loops: Register frames with earlier ones that saw the same place, and correct all poses.
         output: File for the poses, sensor to world, in KITTI format: the upper three rows of each matrix on one line.
         map: File for the map in the world frame, such as map.ply. Its voxels have the size used for registration; if
             that is off, a size that keeps at most half of the first cloud.
@@ -102,6 +104,7 @@ def odometry(
         "num_neighbors": shared.num_neighbors,
         "against": against,
         "map_radius": map_radius,
+        "loops": loops,
     } | shared.registration()
     first = frames[0]
     names = channels or first.cloud.channel_names
@@ -111,7 +114,8 @@ def odometry(
     chosen = _method(method, shared.numbers_of(method), frames, names, voxel)
     steps = mcg.odometry(_clouds(frames, names, truth), chosen, voxel_size=voxel, start=first.pose, **options)
     map_voxel = round_voxel_size([first.cloud], len(first.cloud) // 2) if map and voxel is None else voxel
-    poses, results = _follow(steps, len(frames), map, map_voxel)
+    follow = _follow_loops if loops else _follow
+    poses, results = follow(steps, len(frames), map, map_voxel)
     _report(poses, truth, results)
     if output is not None:
         io.write_poses(output, poses)
@@ -156,9 +160,25 @@ def _follow(
         # A stream: no cloud is kept once it is in the map.
         with_clouds, with_poses = itertools.tee(followed())
         world = mcg.aggregate((cloud for cloud, _ in with_clouds), (pose for _, pose in with_poses), voxel_size)
-        io.write(map, world)
-        print(f"map:       {map}, {len(world):,} points, voxels of {voxel_size:g} m")
+        _write_map(map, world, voxel_size)
     return poses, results
+
+
+def _follow_loops(
+    steps: Iterator[Step], num_frames: int, map: Path | None, voxel_size: float | None
+) -> tuple[list[Float[np.ndarray, "4 4"]], list[mcg.Registration]]:
+    """As `_follow`, with the poses as the last loop left them."""
+    followed = list(tqdm(steps, total=num_frames, unit="frame", disable=None))
+    graph: Any = followed[-1].graph
+    print(f"loops:     {int(np.asarray(graph.edges.loop).sum())} closed")
+    if map is not None and voxel_size is not None:
+        _write_map(map, mcg.aggregate((step.cloud for step in followed), graph.poses, voxel_size), voxel_size)
+    return list(graph.poses), [step.registration for step in followed if step.registration is not None]
+
+
+def _write_map(path: Path, world: mcg.PointCloud, voxel_size: float) -> None:
+    io.write(path, world)
+    print(f"map:       {path}, {len(world):,} points, voxels of {voxel_size:g} m")
 
 
 def _clouds(

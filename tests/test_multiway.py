@@ -1,0 +1,127 @@
+"""Edges from registrations, loops of a sensor, and many clouds registered with each other."""
+
+import numpy as np
+import pytest
+
+import mcgicp_jax as mcg
+from mcgicp_jax import datasets, io, metrics
+from mcgicp_jax.__main__ import main
+from mcgicp_jax._loops import edge_from
+from tests.scenes import motion, pair, wall
+
+
+@pytest.fixture(scope="module")
+def room():
+    """Once round and a little further."""
+    frames = datasets.box_room(14, points_per_frame=1500, step=2 * np.pi * 1.6 / 12)
+    return list(frames), np.array([frames.path(k) for k in range(14)])
+
+
+def test_an_edge_is_what_a_registration_measured():
+    source, target, _ = pair(size=2000)
+    result = mcg.register(source, target, mcg.GICP(), max_distance=0.3)
+    edge = edge_from(3, 5, result, loop=True)
+    assert (edge.i, edge.j, edge.loop) == (3, 5, True)
+    np.testing.assert_array_equal(edge.T_i_j, result.matrix)
+    np.testing.assert_allclose(edge.information @ result.covariance, np.eye(6), atol=1e-6)
+
+
+def test_an_edge_knows_next_to_nothing_of_free_directions():
+    source, target, _ = pair(wall, 2000, motion((0.01, 0.01, 0.0, 0, 0, 0.01)))
+    result = mcg.register(source, target, mcg.GICP(), max_distance=0.3)
+    assert result.status == mcg.Status.DEGENERATE
+    edge = edge_from(0, 1, result)
+    held = np.asarray(result.directions.held)
+    along = [twist @ edge.information @ twist for twist in np.asarray(result.directions.twists)]
+    assert np.max(np.array(along)[~held]) < 1e-2 * np.min(np.array(along)[held])
+    channels = mcg.register(source, target, mcg.MultiChannelGICP(), max_distance=0.3)
+    assert channels.converged
+    known = edge_from(0, 1, channels).information
+    assert np.linalg.eigvalsh(known)[0] > 100 * np.linalg.eigvalsh(edge.information)[0]
+
+
+def test_what_failed_makes_no_edge():
+    source, target, _ = pair(size=500)
+    assert edge_from(0, 1, mcg.register(source, target, mcg.GICP(), max_distance=0.3, max_iterations=1)) is None
+    assert edge_from(0, 1, mcg.register(source, target, mcg.GICP(), max_distance=1e-6)) is None
+    assert edge_from(0, 1, mcg.Registration.without_pose(mcg.Status.LOST)) is None
+
+
+def test_odometry_closes_loops(room):
+    frames, truth = room
+    plain = [step.pose for step in mcg.odometry(frames, mcg.GICP(), max_distance=1.0, start=truth[0])]
+    steps = list(mcg.odometry(frames, mcg.GICP(), max_distance=1.0, start=truth[0], loops=True))
+    graph = steps[-1].graph
+    assert steps[0].graph is not None and len(graph.poses) == len(frames) and graph.edges.loop.any()
+    np.testing.assert_array_equal(steps[-1].pose, graph.poses[-1])
+    error, before = (metrics.ate(poses, truth, alignment="first") for poses in (graph.poses, plain))
+    assert error < 0.75 * before
+    with pytest.raises(ValueError, match="loops: expected against="):
+        next(mcg.odometry(frames, mcg.GICP(), loops=True, against="map"))
+
+
+def test_a_frame_that_is_lost_leaves_the_graph_whole(room):
+    frames, _ = room
+    lost = mcg.PointCloud(frames[0].cloud.points + 1000, frames[0].cloud.channels)
+    clouds = [frames[0].cloud, frames[1].cloud, lost, frames[2].cloud]
+    steps = list(mcg.odometry(clouds, mcg.GICP(), max_distance=1.0, loops=True))
+    assert np.isfinite(steps[-1].graph.poses).all() and len(steps[-1].graph.poses) == 4
+
+
+def test_many_clouds_get_one_map(room):
+    frames, truth = room
+    found = mcg.multiway([frame.cloud for frame in frames], mcg.GICP(), max_distance=1.0)
+    assert found.converged and found.graph.kept.mean() > 0.9 and found.graph.edges.loop.any()
+    assert {(k, k + 1) for k in range(len(frames) - 1)} <= found.registrations.keys()
+    plain = [step.pose for step in mcg.odometry(found.clouds, mcg.GICP(), max_distance=1.0)]
+    assert metrics.ate(found.poses, truth) < metrics.ate(plain, truth)
+    np.testing.assert_allclose(found.poses[0], np.eye(4), atol=1e-12)
+    assert 0 < len(found.map) < sum(len(cloud) for cloud in found.clouds)
+
+
+def test_pairs_and_starts_can_be_given(room):
+    frames, truth = room
+    clouds = [frame.cloud for frame in frames[:3]]
+    found = mcg.multiway(clouds, mcg.GICP(), [(0, 1), (0, 2)], init=truth[:3], max_distance=1.0)
+    assert found.converged and set(found.registrations) == {(0, 1), (0, 2)}
+    np.testing.assert_allclose(found.poses[2], truth[0] @ found.registrations[0, 2].matrix, atol=1e-6)
+    apart = mcg.multiway(clouds, mcg.GICP(), [(0, 1)], init=truth[:3], max_distance=1.0)
+    assert apart.graph.status == mcg.Status.DEGENERATE
+    np.testing.assert_allclose(apart.poses[2], truth[2], atol=1e-12)
+
+
+def test_what_is_wrong_is_named(room):
+    cloud = room[0][0].cloud
+    for arguments, message in (
+        (([], mcg.GICP()), "clouds: expected at least one"),
+        (([cloud, np.zeros((2, 3))], mcg.GICP()), r"clouds\[1\]: "),
+        (([cloud, cloud], mcg.GICP(), [(0, 2)]), r"pairs\[0\]: expected two different rows from 0 to 1"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            mcg.multiway(*arguments)
+    with pytest.raises(ValueError, match="init: expected one pose per cloud, 2, got 1"):
+        mcg.multiway([cloud, cloud], mcg.GICP(), init=[np.eye(4)])
+
+
+def test_the_command(room, tmp_path, capsys):
+    frames, _ = room
+    folder = tmp_path / "clouds"
+    folder.mkdir()
+    for k in range(3):
+        io.write(folder / f"{k}.ply", frames[k].cloud)
+    files = {name: str(tmp_path / name) for name in ("poses.txt", "map.ply", "graph.g2o", "graph.png")}
+    options = ["--method", "gicp", "--max-distance", "1.0", "--output", files["poses.txt"], "--map", files["map.ply"]]
+    assert main(["multiway", str(folder), *options, "--graph", files["graph.g2o"], "--plot", files["graph.png"]]) == 0
+    text, errors = capsys.readouterr()
+    assert errors == "" and "clouds:    3" in text and "poses:     CONVERGED" in text
+    assert len(io.read_poses(files["poses.txt"])) == len(io.read_g2o(files["graph.g2o"]).poses) == 3
+    assert len(io.read(files["map.ply"])) > 1000
+    assert main(["multiway", str(tmp_path / "clouds"), "--glob", "*.las"]) == 2
+    assert "expected at least 2 clouds *.las, found 0" in capsys.readouterr().err
+
+
+def test_the_command_of_odometry(tmp_path, capsys):
+    map = tmp_path / "map.ply"
+    options = ["--num-frames", "3", "--method", "gicp", "--loops", "--map", str(map)]
+    assert main(["odometry", "box-room", *options]) == 0
+    assert "loops:     " in capsys.readouterr().out and len(io.read(map)) > 1000
