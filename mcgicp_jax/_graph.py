@@ -270,7 +270,8 @@ class Certainty:
     """Covariances at a minimum, from one factorisation."""
 
     def __init__(self, equations: NormalEquations, found: Minimum, weights: Float[np.ndarray, "m"]):
-        self._equations, self._poses, self._solve = equations, found.poses, None
+        self._equations, self._poses = equations, found.poses
+        self._solve: Any = None
         if equations.size:
             with contextlib.suppress(RuntimeError):
                 self._solve = factored(equations.damped(equations.weighted(found.terms, weights)))

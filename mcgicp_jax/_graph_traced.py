@@ -27,7 +27,6 @@ from mcgicp_jax._pose import AnyArray
 from mcgicp_jax._pose_graph import Edge
 from mcgicp_jax._result import Status
 
-
 # Tolerance of the loop on the host, in units of the precision: derivatives are right to the root of it at least.
 _TOLERANCE_IN_EPS = 10.0
 
@@ -64,7 +63,7 @@ class _State(NamedTuple):
     poses: Float[Array, "n 7"]
     sums: _Sums
     damping: Float[Array, ""]
-    count: Int[Array, ""]
+    steps: Int[Array, ""]
     converged: Any
 
 
@@ -88,7 +87,7 @@ def optimize_traced(matrices: Float[AnyArray, "n 4 4"], edges: Edge, max_iterati
             jaxlie.SE3(_moved(state.poses, step)).as_matrix().astype(dtype),
             jnp.einsum("mi,mij,mj->m", residuals, fixed.information, residuals),
             _status(state),
-            state.count,
+            state.steps,
             jnp.zeros((n, 6, 6), dtype).at[1:].set(blocks[free, :, free]),
         )
 
@@ -107,7 +106,7 @@ def _minimized(start: Float[Array, "n 7"], edges: _Edges, max_iterations: int) -
     size = 6 * len(start) - 6
 
     def goes_on(state: _State) -> Any:
-        return ~state.converged & (state.count < max_iterations)
+        return ~state.converged & (state.steps < max_iterations)
 
     def step(state: _State) -> _State:
         sums = state.sums
@@ -116,19 +115,19 @@ def _minimized(start: Float[Array, "n 7"], edges: _Edges, max_iterations: int) -
         there = _sums(poses, edges)
         accepted = there.cost <= sums.cost * (1 + rounding) + LEAST_DECREASE
         small = -0.5 * jnp.sum(sums.gradient * move) <= _TOLERANCE_IN_EPS * eps * sums.cost + LEAST_DECREASE
-        factor = jnp.where(accepted & (state.count > 0), 1 / DAMPING_FACTOR, jnp.where(accepted, 1, DAMPING_FACTOR))
+        factor = jnp.where(accepted & (state.steps > 0), 1 / DAMPING_FACTOR, jnp.where(accepted, 1, DAMPING_FACTOR))
         damping = jnp.maximum(state.damping * factor, LEAST_DAMPING)
         poses, sums = jax.tree.map(
             lambda new, old: jnp.where(accepted, new, old), (poses, there), (state.poses, state.sums)
         )
-        return _State(poses, sums, damping, state.count + 1, accepted & small & (state.count > 0))
+        return _State(poses, sums, damping, state.steps + 1, accepted & small & (state.steps > 0))
 
     # The first step has no length: it evaluates the sums at the start. Written so, the loop compiles them once.
     zero, one = jnp.zeros((size, size), start.dtype), jnp.eye(size, dtype=start.dtype)
     before = _Sums(jnp.asarray(jnp.inf, start.dtype), zero[:, 0] if size else zero.reshape(-1), one, zero)
     damping = jnp.asarray(START_DAMPING, start.dtype)
     state = jax.lax.while_loop(goes_on, step, _State(start, before, damping, jnp.int32(0), jnp.bool_(False)))
-    return state._replace(count=state.count - 1)
+    return state._replace(steps=state.steps - 1)
 
 
 @partial(jax.vmap, in_axes=(0, None))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -38,7 +39,8 @@ def edge_from(i: int, j: int, result: Registration, *, loop: bool = False) -> Ed
     Its information is the inverse of `Registration.covariance` within the constrained directions and next to nothing
     along the others, so that DEGENERATE results, too, tell what they know.
     """
-    if result.status not in (Status.CONVERGED, Status.DEGENERATE) or result.overlap < LEAST_OVERLAP:
+    overlap = float(np.asarray(result.overlap))
+    if result.status not in (Status.CONVERGED, Status.DEGENERATE) or overlap < LEAST_OVERLAP:
         return None
     covariance, directions = np.asarray(result.covariance, np.float64), result.directions
     if directions is None or not np.isfinite(covariance).all():
@@ -99,15 +101,12 @@ class Trajectory:
         nearest = np.argsort(distances, kind="stable")[:_CANDIDATES]
         if not len(nearest):
             return []
-        tried = 0
         covariances = certainty_of(self.graph).between(nearest, np.full(len(nearest), number))
-        for i, covariance in zip(*self._worthwhile(number, nearest, distances[nearest], covariances), strict=True):
-            tried += 1
+        rows, certainties = self._worthwhile(number, nearest, distances[nearest], covariances)
+        for i, covariance in list(zip(rows, certainties, strict=True))[:_TRIES]:
             edge = self._registered(int(i), number, covariance)
             if edge is not None:
                 return [edge]
-            if tried == _TRIES:
-                break
         return []
 
     def _worthwhile(
@@ -129,7 +128,7 @@ class Trajectory:
     def _registered(self, i: int, j: int, covariance: Float[np.ndarray, "6 6"]) -> Edge | None:
         init = np.linalg.inv(self._poses[i]) @ self._poses[j]
         sigma = float(np.sqrt(np.linalg.eigvalsh(covariance[:3, :3])[-1]))
-        given = self._options.max_distance
+        given: Any = self._options.max_distance
         if given is None:
             given = default_distances(self._method.spacing(self._clouds[i]))
         coarse, fine = given if np.ndim(given) else (given, given)

@@ -17,8 +17,8 @@ from mcgicp_jax._graph import PoseGraphResult, optimize_poses
 from mcgicp_jax._loops import LEAST_OVERLAP, edge_from
 from mcgicp_jax._map import aggregate, voxels
 from mcgicp_jax._methods import AbstractMethod
-from mcgicp_jax._options import Options, check_method
 from mcgicp_jax._odometry import odometry
+from mcgicp_jax._options import Options, check_method
 from mcgicp_jax._pose import Pose, pose_matrix
 from mcgicp_jax._pose_graph import PoseGraph
 from mcgicp_jax._preprocess import check_preprocessing, preprocess
@@ -153,12 +153,15 @@ def _graph(poses: Float[np.ndarray, "n 4 4"], found: dict[tuple[int, int], Regis
 
 def _overlapping(clouds: list[PointCloud], poses: Float[np.ndarray, "n 4 4"], cell: float) -> list[tuple[int, int]]:
     """Every cloud with the one before it, and with those of largest overlap among ever more distant ones before."""
-    cells = [np.unique(voxels(cloud.coordinates @ T[:3, :3].T + T[:3, 3], cell)) for cloud, T in zip(clouds, poses)]
+    cells = [
+        np.unique(voxels(cloud.coordinates @ T[:3, :3].T + T[:3, 3], cell))
+        for cloud, T in zip(clouds, poses, strict=True)
+    ]
     pairs = []
     for j in range(1, len(clouds)):
         pairs.append((j - 1, j))
-        for first, last in ((j + 1 - 2 * gap, j - gap) for gap in 2 ** np.arange(1, j.bit_length())):
-            rows = range(max(first, 0), last + 1)
+        for gap in (2**octave for octave in range(1, j.bit_length())):
+            rows = range(max(j + 1 - 2 * gap, 0), j + 1 - gap)
             overlaps = [
                 len(np.intersect1d(cells[i], cells[j], assume_unique=True)) / min(len(cells[i]), len(cells[j]))
                 for i in rows

@@ -57,9 +57,9 @@ def odometry(
 ) -> Iterator[Step]:
     """Register each frame to the previous one, or to a map, starting from the previous motion (constant velocity).
 
-    Frames are processed lazily and without `loops` only the latest is kept, so a sequence may be larger than memory. For a progress
-    bar, use `tqdm.tqdm(odometry(frames, ...), total=len(frames))`. If a registration ends with too few matches or
-    non-finite values, the previous motion is used instead; `Step.registration` keeps the failed result.
+    Frames are processed lazily and without `loops` only the latest is kept, so a sequence may be larger than memory.
+    For a progress bar, use `tqdm.tqdm(odometry(frames, ...), total=len(frames))`. If a registration ends with too few
+    matches or non-finite values, the previous motion is used instead; `Step.registration` keeps the failed result.
 
     Args:
         frames: frames of a data set, clouds or (N, 3) arrays in metres. Preprocessed clouds are used unchanged.

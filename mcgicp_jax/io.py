@@ -203,7 +203,8 @@ def read_g2o(path: str | os.PathLike[str]) -> PoseGraph:
             upper = np.triu_indices(6)
             information[:, *upper] = information[:, *upper[::-1]] = edges[:, 9:]
             loop = np.abs(np.diff(edges[:, :2], axis=1)[:, 0]) != 1
-            motions = Edge(*rows.T, _poses_from(edges[:, 2:9]), information, loop=loop)
+            i, j = rows.T
+            motions = Edge(i, j, _poses_from(edges[:, 2:9]), information, loop=loop)
             return PoseGraph(_poses_from(vertices[first, 1:]), motions)
         except ValueError as error:
             reason = "it is not text" if isinstance(error, UnicodeError) else error

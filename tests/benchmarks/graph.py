@@ -34,7 +34,8 @@ SMALLER = {"grid": grid(5), "sphere": sphere(12, 20), "garage": garage(4, 60)}
 def sizes() -> None:
     """Cost and time of the minimum, from odometry."""
     print(
-        f"{'':>8} {'poses':>6} {'edges':>6} {'steps':>6} {'ours, s':>8} {'gtsam, s':>9} {'ratio':>6} {'cost':>8} relative"
+        f"{'':>8} {'poses':>6} {'edges':>6} {'steps':>6} {'ours, s':>8} {'gtsam, s':>9} {'ratio':>6} {'cost':>8} "
+        "relative"
     )
     for name, make in GRAPHS.items():
         graph, _ = measured(*make())
@@ -94,9 +95,9 @@ def scenes() -> None:
             for poses in ([s.pose for s in steps], found.poses, identity.poses)
         ]
         print(
-            f"{name}: ATE {1e3 * errors[0]:.1f} mm by odometry, {1e3 * errors[1]:.1f} with {found.kept[edges.loop].sum()} of "
-            f"{edges.loop.sum()} loops, {1e3 * errors[2]:.1f} with the identity as information; NEES per dof {nees(found, truth):.2f}; "
-            f"{found}",
+            f"{name}: ATE {1e3 * errors[0]:.1f} mm by odometry, {1e3 * errors[1]:.1f} with "
+            f"{found.kept[edges.loop].sum()} of {edges.loop.sum()} loops, {1e3 * errors[2]:.1f} with the identity as "
+            f"information; NEES per dof {nees(found, truth):.2f}; {found}",
             flush=True,
         )
 
@@ -132,10 +133,10 @@ def corridor() -> None:
     across = [np.trace(edge.information[:3, :3]) for edge in edges]
     found = mcg.optimize_poses(mcg.PoseGraph(start, [*edges, end]))
     print(f"corridor: information along / across {max(np.array(told) / across):.1e}; {found}")
-    for name, poses in (("start", start), ("optimised", found.poses)):
-        print(
-            f"{name:>10}: ATE {1e3 * metrics.ate(poses, truth, alignment='first'):.1f} mm, {1e3 * np.abs(np.asarray(poses) - truth)[:, :3, 3].max(axis=0)} mm at most"
-        )
+    for name, poses in (("start", start), ("optimised", np.asarray(found.poses))):
+        error = 1e3 * metrics.ate(poses, truth, alignment="first")
+        most = 1e3 * np.abs(poses - truth)[:, :3, 3].max(axis=0)
+        print(f"{name:>10}: ATE {error:.1f} mm, at most {most.round(1)} mm along the axes")
 
 
 def rgbd() -> None:
