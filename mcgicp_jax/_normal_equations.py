@@ -140,7 +140,8 @@ class NormalEquations:
         from scipy.sparse.csgraph import connected_components
 
         num_poses = len(poses)
-        self._i, self._j, self._measured = np.asarray(edges.i), np.asarray(edges.j), parameters_of(np.asarray(edges.T_i_j))
+        self._i, self._j = np.asarray(edges.i), np.asarray(edges.j)
+        self._measured = parameters_of(np.asarray(edges.T_i_j))
         self.information = np.asarray(edges.information)
         graph = coo_array((np.ones(len(edges)), (self._i, self._j)), (num_poses, num_poses))
         _, self.parts = connected_components(graph, directed=False)

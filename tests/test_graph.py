@@ -104,10 +104,17 @@ def se3s(matrices):
     return jaxlie.SE3.from_matrix(jnp.asarray(matrices))
 
 
-def test_covariances_are_blocks_of_the_inverse(monkeypatch):
-    graph, _ = measured(*SMALL["garage"])
-    found = mcg.optimize_poses(graph, robust=False)
-    dense = jax.jit(lambda graph: mcg.optimize_poses(graph, robust=False).covariance)(graph)
+@pytest.fixture(scope="module")
+def both():
+    """A graph, its result, and that of a compiled program."""
+    graph, _ = measured(*SMALL["grid"])
+    compiled = jax.jit(lambda graph: mcg.optimize_poses(graph, robust=False))
+    return graph, mcg.optimize_poses(graph, robust=False), compiled(graph)
+
+
+def test_covariances_are_blocks_of_the_inverse(both, monkeypatch):
+    graph, found, inside = both
+    dense = np.asarray(inside.covariance)
     deviations = np.sqrt(np.diagonal(found.covariance, 0, 1, 2))[1:]
     difference = (found.covariance - dense)[1:] / deviations[:, :, None] / deviations[:, None]
     assert np.abs(difference).max() < (1e-4 if X64 else 0.05)
@@ -146,10 +153,8 @@ def test_other_sizes_compile_nothing():
     assert not found
 
 
-def test_transformations_give_the_same_poses():
-    graph, _ = measured(*SMALL["grid"])
-    expected = mcg.optimize_poses(graph, robust=False)
-    found = jax.jit(lambda graph: mcg.optimize_poses(graph, robust=False))(graph)
+def test_transformations_give_the_same_poses(both):
+    graph, expected, found = both
     assert found.converged and found.status == mcg.Status.CONVERGED
     np.testing.assert_allclose(found.poses, expected.poses, atol=2e-3)
     np.testing.assert_allclose(found.residuals, expected.residuals, atol=0.05)
