@@ -38,7 +38,7 @@ _CHOICES = 5
 _NEAR = 4.0
 # Inverse iterations for the least constrained direction: unconstrained ones stand out by factors of 1e3 and more.
 _INVERSE_ITERATIONS = 4
-# Unknowns up to which covariances come from the dense inverse: for 300 poses it is ten times as quick as SuperLU.
+# Unknowns up to which covariances come from the dense inverse: for 300 poses it is seven times as quick as SuperLU.
 _DENSE = 1800
 # Columns of the inverse computed at once, to bound memory.
 _COLUMNS = 252
