@@ -10,6 +10,7 @@ from mcgicp_jax._cloud import PointCloud
 from mcgicp_jax._cost import mahalanobis_cost
 from mcgicp_jax._dense import DenseSearch
 from mcgicp_jax._gaussians import cell_moments, gaussians, voxel_cells
+from mcgicp_jax._global import GlobalPose, global_pose
 from mcgicp_jax._kernels import AbstractKernel, Cauchy, GemanMcClure, Huber, Tukey, Welsch
 from mcgicp_jax._map import aggregate
 from mcgicp_jax._methods import GICP, AbstractMethod, ColorICP, MultiChannelGICP, PointToPlane, PointToPoint
@@ -35,6 +36,7 @@ __all__ = [
     "Correspondences",
     "DenseSearch",
     "GemanMcClure",
+    "GlobalPose",
     "Huber",
     "KDTreeSearch",
     "MultiChannelGICP",
@@ -53,6 +55,7 @@ __all__ = [
     "estimate_channel_covariance",
     "find_correspondences",
     "gaussians",
+    "global_pose",
     "io",
     "mahalanobis_cost",
     "metrics",

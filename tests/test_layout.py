@@ -13,11 +13,11 @@ LAYERS = {
     "running": ("_threads", "_blocks"),
     "search": ("_search", "_nearest", "_tree_index", "_pykdtree", "_trees", "_dense"),
     "data": ("_cloud", "_kept", "_preprocess", "_map", "_formats", "io", "metrics", "datasets"),
-    "local surfaces": ("_surface", "_observability", "_neighborhoods", "_local", "_channels"),
+    "local surfaces": ("_surface", "_observability", "_neighborhoods", "_local", "_channels", "_features"),
     "correspondences": ("_forces", "_methods", "_surfaces", "_sums", "_gaussians", "_ndt"),
-    "pose": ("_solve", "_directions", "_uncertainty", "_result", "_step"),
+    "pose": ("_solve", "_hypotheses", "_directions", "_uncertainty", "_result", "_step"),
     "loops": ("_host", "_traced", "_lanes"),
-    "use": ("_options", "_cost", "_outcome", "_register", "_channel_covariance", "_batch", "_odometry"),
+    "use": ("_options", "_cost", "_outcome", "_register", "_global", "_channel_covariance", "_batch", "_odometry"),
     "faces": ("plot", "_commands", "__main__"),
 }
 LAYER = {module: rank for rank, modules in enumerate(LAYERS.values()) for module in modules}

@@ -1,0 +1,402 @@
+"""Registration from any start: `global_pose`."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any, NamedTuple, TypeAlias
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
+
+from mcgicp_jax._blocks import BLOCK, blocks
+from mcgicp_jax._cloud import PointCloud, Values
+from mcgicp_jax._features import NUM_NEIGHBORS, comparable, histograms_of, normals_of, statistics_of
+from mcgicp_jax._hypotheses import APART, NUM_MATCHES, TOLERANCE, Matches, Poses, hypotheses, refined
+from mcgicp_jax._methods import GICP, MultiChannelGICP
+from mcgicp_jax._options import Options, check_positive
+from mcgicp_jax._pose import AnyArray, computed_now, nearest_rotation
+from mcgicp_jax._preprocess import MIN_POINTS, finite_rows, preprocess, voxels
+from mcgicp_jax._register import register_with
+from mcgicp_jax._result import is_usable
+from mcgicp_jax._search import Rows
+from mcgicp_jax._trees import KDTreeSearch
+
+# Rows of the source and rows of the target that match.
+RowMatches: TypeAlias = tuple[Any, Any]
+
+# Voxels of the smaller cloud, of the larger one, and largest fraction of the points: with 5,000 a scene has a thousand
+# mutual matches, and 20,000 bound the time. One voxel has two points on average, so that it is not finer than they are.
+_VOXELS, _MOST_VOXELS, _FRACTION = 5000, 20_000, 0.5
+# Voxel sizes are 2^(j/4) metres, the same for all pairs; this many steps below the extent of the clouds are tried.
+_STEPS_PER_OCTAVE, _NUM_STEPS = 4, 60
+# Maximum correspondence distances of the registration that verifies a pose, in voxels, and its number of iterations.
+_VERIFIED_WITHIN, _VERIFIED_ITERATIONS = (4.0, TOLERANCE), 40
+# Number of neighbours for that registration, the default of `preprocess`.
+_NUM_NEIGHBORS = 20
+# Fewest inliers of a success: this many, and this many times √n of n matches. In 250 pairs of different scenes, the
+# best pose has up to 0.95 √n inliers, and in real pairs that overlap 2.5 √n or more.
+_MIN_INLIERS, _MIN_INLIERS_PER_ROOT = 10, 1.5
+# A pose with at least this fraction of the inliers of the best one is a rival, which makes the result ambiguous. In
+# real pairs the runner-up has up to a tenth.
+_RIVAL = 0.5
+
+
+@dataclass(frozen=True, eq=False)
+class Candidate:
+    """One pose found by `global_pose`, after the registration that verifies it.
+
+    Attributes:
+        matrix: (4, 4) float64, T_target_source, metres.
+        num_inliers: number of matches that it maps to within 1.5 voxels of each other.
+        overlap: fraction of the source's voxels with a voxel of the target within 1.5 voxels.
+    """
+
+    matrix: Float[np.ndarray, "4 4"]
+    num_inliers: int
+    overlap: float
+
+
+@dataclass(frozen=True, eq=False)
+class GlobalPose:
+    """Result of `global_pose`.
+
+    Attributes:
+        matrix: (4, 4) float64, T_target_source, metres; accurate to a fraction of a voxel. The identity if no pose was
+            found.
+        success: whether the clouds match: more inliers than wrong matches have by chance, and not `ambiguous`.
+        ambiguous: whether the runner-up is about as good, as in symmetric or repetitive scenes. False where
+            no pose has enough inliers.
+        num_inliers, overlap: those of the best pose, see `Candidate`.
+        num_matches: number of matches of which these are the inliers.
+        runner_up: the best different pose, by more than five voxels; None if no other has half as many inliers.
+        voxel_size: metres; that of the features.
+    """
+
+    matrix: Float[np.ndarray, "4 4"]
+    success: bool
+    ambiguous: bool
+    num_inliers: int
+    num_matches: int
+    overlap: float
+    runner_up: Candidate | None
+    voxel_size: float
+
+    def __repr__(self) -> str:
+        verdict = "success" if self.success else "ambiguous" if self.ambiguous else "no success"
+        return (
+            f"GlobalPose({verdict}: {self.num_inliers} inliers of {self.num_matches} matches, overlap "
+            f"{self.overlap:.0%}, voxels of {self.voxel_size:.3g} m)"
+        )
+
+
+def global_pose(
+    source: PointCloud | Values,
+    target: PointCloud | Values,
+    *,
+    voxel_size: float | None = None,
+    correspondences: RowMatches | None = None,
+) -> GlobalPose:
+    """Estimate the pose of two clouds from any start, by local features. Start `register` from its `matrix`.
+
+    Voxels are described by FPFH (Rusu et al. 2009) and, if both clouds have the same number of channels, by means and
+    standard deviations of the channels around them. Of the matches, mutual nearest neighbours in these features, most
+    may be wrong. Poses are computed from triplets of matches that agree with each other, refined by graduated
+    non-convexity (Yang et al. 2020), and verified by a coarse registration, with channels. The same clouds give the
+    same result, to the last bit. Runs on the host, with programs whose shapes do not depend on the clouds.
+
+    Args:
+        source, target: raw or preprocessed clouds, or (N, 3) arrays in metres; they may lie anywhere, in any rotation.
+        voxel_size: metres. None: the smallest that leaves 5,000 voxels of the smaller cloud and 20,000 of the larger,
+            and half the points of each.
+        correspondences: two arrays of rows, of the source and of the target, which replace the matches by features,
+            such as those of `image_matches`. At most 1,024 are used, evenly spaced; any number of them may be wrong.
+
+    Returns:
+        The pose, and whether to trust it.
+
+    Raises:
+        ValueError: if a cloud has fewer than four finite points, or an argument is malformed. Failures on well-formed
+            clouds show in `success`.
+    Warns:
+        UserWarning: if points with NaN or infinity are left out.
+    """
+    if voxel_size is not None:
+        check_positive("voxel_size", voxel_size)
+    pair = source, target = tuple(_cloud(name, cloud) for name, cloud in (("source", source), ("target", target)))
+    chosen = None if correspondences is None else _checked(correspondences, source, target)
+    clouds, centers = zip(*(_centred(name, cloud) for name, cloud in zip(("source", "target"), pair, strict=True)))
+    if clouds[0].channels.shape[1] != clouds[1].channels.shape[1]:
+        clouds = tuple(PointCloud(cloud.points) for cloud in clouds)
+    size = _voxel_size(clouds) if voxel_size is None else float(voxel_size)
+    prepared = None if size is None else _prepared(clouds, size)
+    if prepared is None or size is None:
+        return GlobalPose(np.eye(4), False, False, 0, 0, 0.0, None, 0.0 if size is None else size)
+    with computed_now():
+        if chosen is None:
+            matches = _matches_of_features(*prepared, size)
+        else:
+            matches = _given_matches(source, target, chosen, centers)
+        return _answer(matches, prepared, centers, size)
+
+
+def _cloud(name: str, cloud: PointCloud | Values) -> PointCloud:
+    try:
+        return cloud if isinstance(cloud, PointCloud) else PointCloud(cloud)
+    except ValueError as error:
+        raise ValueError(f"{name}: {error}") from error
+
+
+def _checked(correspondences: RowMatches, source: PointCloud, target: PointCloud) -> Int[np.ndarray, "2 n"]:
+    try:
+        rows = np.stack([np.asarray(each) for each in correspondences])
+    except (TypeError, ValueError) as error:
+        raise ValueError("correspondences: expected two arrays of rows, of one length") from error
+    sizes = np.array([[source.points.shape[0]], [target.points.shape[0]]])
+    if rows.ndim != 2 or rows.shape[0] != 2 or rows.dtype.kind not in "iu" or np.any((rows < 0) | (rows >= sizes)):
+        raise ValueError(
+            f"correspondences: expected integer rows (source_rows, target_rows) of clouds of {sizes[0, 0]} and "
+            f"{sizes[1, 0]} points, got shape {rows.shape} of {rows.dtype}"
+        )
+    return rows
+
+
+def _centred(name: str, cloud: PointCloud) -> tuple[PointCloud, Float[np.ndarray, "3"]]:
+    """The finite points, in float32 about the middle of their extent, as a raw cloud; and that middle, metres."""
+    try:
+        cloud = finite_rows(cloud.replace_rows(covariances=None))
+    except ValueError as error:
+        raise ValueError(f"{name}: {error}") from error
+    points = cloud.coordinates
+    center = 0.5 * (points.min(axis=0) + points.max(axis=0))
+    channels = np.asarray(cloud.channels, np.float32)
+    valid = None if cloud.channel_valid is None else np.asarray(cloud.channel_valid)
+    return PointCloud((points - center).astype(np.float32), channels, channel_valid=valid), center
+
+
+def _voxel_size(clouds: tuple[PointCloud, ...]) -> float | None:
+    """The smallest size with few enough voxels, metres; None if a cloud has no extent."""
+    columns = [np.ascontiguousarray(np.asarray(cloud.points, np.float64).T) for cloud in clouds]
+    extent = max(float(np.ptp(each, axis=1).max()) for each in columns)
+    if not 0 < extent < np.inf:
+        return None
+    largest = int(np.ceil(_STEPS_PER_OCTAVE * np.log2(extent)))
+
+    def few(step: int) -> bool:
+        counts = [len(voxels(each, 2.0 ** (step / _STEPS_PER_OCTAVE))[1]) for each in columns]
+        most = [max(min(_MOST_VOXELS, _FRACTION * each.shape[1]), 8) for each in columns]
+        return min(counts) <= _VOXELS and all(count <= limit for count, limit in zip(counts, most, strict=True))
+
+    low, high = largest - _NUM_STEPS, largest + 1
+    while high - low > 1:
+        middle = (low + high) // 2
+        low, high = (low, middle) if few(middle) else (middle, high)
+    return float(2.0 ** (high / _STEPS_PER_OCTAVE))
+
+
+def _prepared(clouds: tuple[PointCloud, ...], voxel_size: float) -> tuple[PointCloud, PointCloud] | None:
+    """The voxels with their neighbours; None if a cloud has too few."""
+    try:
+        found = [preprocess(cloud, voxel_size, NUM_NEIGHBORS) for cloud in clouds]
+    except ValueError:
+        return None
+    return found[0], found[1]
+
+
+def _matches_of_features(source: PointCloud, target: PointCloud, voxel_size: float) -> Matches:
+    """The mutual nearest neighbours among the features; the most distinct ones, if there are many."""
+    clouds = source, target
+    normals = [normals_of(cloud, voxel_size) for cloud in clouds]
+    histograms = [histograms_of(cloud, each, voxel_size) for cloud, each in zip(clouds, normals, strict=True)]
+    statistics = None
+    if source.channels.shape[1]:
+        statistics = statistics_of(source, voxel_size), statistics_of(target, voxel_size)
+    features = comparable((histograms[0], histograms[1]), statistics)
+    rows, target_rows = mutual_nearest(*features)
+    return _padded(
+        np.asarray(source.points)[rows],
+        np.asarray(target.points)[target_rows],
+        normals[0][rows],
+        normals[1][target_rows],
+    )
+
+
+def _given_matches(
+    source: PointCloud, target: PointCloud, rows: Int[np.ndarray, "2 n"], centers: tuple[np.ndarray, ...]
+) -> Matches:
+    points = [
+        cloud.coordinates[each] - center for cloud, each, center in zip((source, target), rows, centers, strict=True)
+    ]
+    finite = np.flatnonzero(np.isfinite(points).all(axis=(0, 2)))
+    if finite.size > NUM_MATCHES:
+        finite = finite[np.arange(NUM_MATCHES) * finite.size // NUM_MATCHES]
+    unknown = np.zeros((finite.size, 3), np.float32)
+    return _padded(*(each[finite].astype(np.float32) for each in points), unknown, unknown)
+
+
+def _padded(*columns: Float[np.ndarray, "n 3"]) -> Matches:
+    """The first `NUM_MATCHES` matches."""
+    count = min(len(columns[0]), NUM_MATCHES)
+    padded = np.zeros((4, NUM_MATCHES, 3), np.float32)
+    for array, column in zip(padded, columns, strict=True):
+        array[:count] = column[:count]
+    return Matches(*padded, np.arange(NUM_MATCHES) < count)
+
+
+def mutual_nearest(
+    source: Float[np.ndarray, "N L"], target: Float[np.ndarray, "M L"]
+) -> tuple[Int[np.ndarray, "n"], Int[np.ndarray, "n"]]:
+    """Rows of features that are nearest to each other, ties to the first row; the most distinct ones first.
+
+    Distinct are those whose squared distance is small relative to that of the second nearest target. All pairs of rows
+    are compared in blocks: trees are no faster in so many dimensions.
+    """
+    nearest, back = _Nearest(len(source)), _Nearest(len(target))
+    for rows, index in blocks(len(source)):
+        for columns, other in blocks(len(target)):
+            counted = _counted(index), _counted(other)
+            found = _nearest(source[index], target[other], *counted)
+            nearest.update(rows, columns.start, *(np.asarray(each) for each in found[:3]))
+            back.update(columns, rows.start, *(np.asarray(each) for each in found[3:]))
+    mutual = np.flatnonzero(back.row[nearest.row] == np.arange(len(source)))
+    ratio = nearest.square[mutual] / np.maximum(nearest.second[mutual], 1)
+    mutual = mutual[np.argsort(ratio, kind="stable")]
+    return mutual, nearest.row[mutual]
+
+
+def _counted(index: Any) -> Bool[np.ndarray, "BLOCK"]:
+    """False for rows that are repeated to fill the last block."""
+    return np.ones(BLOCK, bool) if isinstance(index, slice) else np.append(True, index[1:] != index[:-1])
+
+
+class _Nearest:
+    """The nearest row of each of N rows, with the squared distances of it and of the second nearest."""
+
+    def __init__(self, size: int):
+        self.row = np.zeros(size, np.int64)
+        self.square, self.second = np.full((2, size), np.inf, np.float32)
+
+    def update(self, rows: slice, start: int, square: Any, row: Any, second: Any) -> None:
+        """Take account of a block of candidates that begins with row `start`."""
+        square, row, second = (each[: rows.stop - rows.start] for each in (square, row, second))
+        before = self.square[rows]
+        closer = square < before
+        self.second[rows] = np.minimum(np.maximum(square, before), np.minimum(second, self.second[rows]))
+        self.row[rows] = np.where(closer, row + start, self.row[rows])
+        self.square[rows] = np.where(closer, square, before)
+
+
+@jax.jit
+def _nearest(
+    source: Float[AnyArray, "n L"],
+    target: Float[AnyArray, "n L"],
+    source_counted: Bool[AnyArray, "n"],
+    target_counted: Bool[AnyArray, "n"],
+) -> tuple[Array, ...]:
+    """For each source row: smallest squared distance, its target row, the second smallest; and the reverse."""
+    lengths = [jnp.sum(each * each, axis=1) for each in (source, target)]
+    product = jnp.matmul(source, target.T, precision="highest")
+    square = lengths[0][:, None] + lengths[1] - 2 * product
+    square = jnp.where(source_counted[:, None] & target_counted, square, jnp.inf)
+    found: list[Array] = []
+    for axis in (1, 0):
+        row = jnp.argmin(square, axis=axis)
+        smallest = jnp.min(square, axis=axis)
+        here = jnp.arange(BLOCK)[None if axis == 1 else slice(None), slice(None) if axis == 1 else None]
+        others = jnp.where(here == jnp.expand_dims(row, axis), jnp.inf, square)
+        found += [smallest, row, jnp.min(others, axis=axis)]
+    return tuple(found)
+
+
+class _Verified(NamedTuple):
+    """A pose between the centred clouds, after registration."""
+
+    matrix: Float[np.ndarray, "4 4"]
+    num_inliers: int
+    overlap: float
+
+
+def _answer(
+    matches: Matches, clouds: tuple[PointCloud, PointCloud], centers: tuple[np.ndarray, ...], voxel_size: float
+) -> GlobalPose:
+    points = np.asarray(clouds[0].points, np.float64)
+    # The root mean square distance from the centre, about which the poses turn.
+    radius = float(np.sqrt(np.mean(np.sum(points * points, axis=1))))
+    poses = hypotheses(matches, np.float32(voxel_size), np.float32(radius))
+    poses = jax.tree.map(np.asarray, refined(poses, matches, np.float32(voxel_size)))
+    found = sorted(_verified(poses, matches, clouds, voxel_size, radius), key=lambda pose: -pose.num_inliers)
+    num_matches = int(matches.valid.sum())
+    if not found:
+        return GlobalPose(np.eye(4), False, False, 0, num_matches, 0.0, None, voxel_size)
+    best, *others = (Candidate(_moved(pose.matrix, centers), pose.num_inliers, pose.overlap) for pose in found)
+    rivals = [other for other in others if other.num_inliers >= _RIVAL * best.num_inliers]
+    enough = best.num_inliers >= max(_MIN_INLIERS, _MIN_INLIERS_PER_ROOT * np.sqrt(num_matches))
+    numbers = (best.num_inliers, num_matches, best.overlap)
+    runner_up = rivals[0] if rivals else None
+
+
+def _moved(matrix: Float[np.ndarray, "4 4"], centers: tuple[np.ndarray, ...]) -> Float[np.ndarray, "4 4"]:
+    """The pose between the user's frames."""
+    matrix = matrix.copy()
+    matrix[:3, 3] += centers[1] - matrix[:3, :3] @ centers[0]
+    return matrix
+
+
+def _verified(
+    poses: Poses, matches: Matches, clouds: tuple[PointCloud, PointCloud], voxel_size: float, radius: float
+) -> list[_Verified]:
+    """The best pose and its rivals, registered; without repetitions."""
+    near = [np.ascontiguousarray(np.asarray(cloud.neighbors)[:, :_NUM_NEIGHBORS]) for cloud in clouds]
+    source, target = (cloud.replace_rows(neighbors=rows) for cloud, rows in zip(clouds, near, strict=True))
+    method = MultiChannelGICP() if source.channels.shape[1] else GICP()
+    options = Options(
+        max_distance=(_VERIFIED_WITHIN[0] * voxel_size, _VERIFIED_WITHIN[1] * voxel_size),
+        max_iterations=_VERIFIED_ITERATIONS,
+    )
+    found: list[_Verified] = []
+    started: list[np.ndarray] = []
+    for matrix in _rivals(poses):
+        if any(_same(matrix, other, voxel_size, radius) for other in started):
+            continue
+        started.append(matrix)
+        result = register_with(source, target, method, matrix, options)
+        # A registration that fails, as of clouds with a few coincident points, is no evidence against the matches.
+        matrix = np.asarray(result.matrix) if is_usable(result) else matrix
+        if not any(_same(matrix, other.matrix, voxel_size, radius) for other in found):
+            overlap = _overlap(matrix, source, target, voxel_size)
+            found.append(_Verified(matrix, _num_inliers(matrix, matches, voxel_size), overlap))
+    return found
+
+
+def _rivals(poses: Poses) -> Iterator[Float[np.ndarray, "4 4"]]:
+    order = np.argsort(-poses.score, kind="stable")
+    for i in order:
+        if poses.score[i] > 0 and poses.score[i] >= _RIVAL * poses.score[order[0]]:
+            matrix = np.eye(4)
+            matrix[:3, :3], matrix[:3, 3] = poses.rotation[i], poses.translation[i]
+            yield nearest_rotation(matrix)
+
+
+def _same(a: Float[np.ndarray, "4 4"], b: Float[np.ndarray, "4 4"], voxel_size: float, radius: float) -> bool:
+    square = np.sum((a - b)[:3, 3] ** 2) + 0.5 * radius**2 * np.sum((a - b)[:3, :3] ** 2)
+    return bool(square <= (APART * voxel_size) ** 2)
+
+
+def _num_inliers(matrix: Float[np.ndarray, "4 4"], matches: Matches, voxel_size: float) -> int:
+    moved = np.asarray(matches.source, np.float64) @ matrix[:3, :3].T + matrix[:3, 3]
+    distances = np.linalg.norm(moved - matches.target, axis=1)
+    return int(np.sum(np.asarray(matches.valid) & (distances <= TOLERANCE * voxel_size)))
+
+
+def _overlap(matrix: Float[np.ndarray, "4 4"], source: PointCloud, target: PointCloud, voxel_size: float) -> float:
+    moved = np.asarray(source.points, np.float64) @ matrix[:3, :3].T + matrix[:3, 3]
+    rows = [
+        Rows(points=np.asarray(points), descriptors=np.zeros((len(points), 0)), valid=np.ones(len(points), bool))
+        for points in (moved, np.asarray(target.points))
+    ]
+    limit = TOLERANCE * voxel_size
+    (nearest,) = KDTreeSearch().index(rows[1]).nearest(np.array([1.0, 0, 0, 0, 0, 0, 0]), rows[0], limit)
+    distances = np.linalg.norm(np.asarray(target.points)[nearest] - moved, axis=1)
+    return float(np.mean((nearest >= 0) & (distances <= limit)))
