@@ -74,7 +74,7 @@ def comparable(
     Each statistic of a channel is divided by its standard deviation in both clouds, so that the unit of the channel
     does not matter. Missing ones are set to the mean.
     """
-    deviation = max(float(np.concatenate(histograms).astype(np.float64).std()), np.finfo(np.float32).tiny)
+    deviation = max(float(np.concatenate(histograms).astype(np.float64).std()), float(np.finfo(np.float32).tiny))
     scale = _DEVIATION / deviation
     center = np.concatenate(histograms).mean(axis=0, dtype=np.float64)
     found = [[scale * (each - center)] for each in histograms]

@@ -3,22 +3,22 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
-from typing import Any, NamedTuple, TypeAlias
+from dataclasses import dataclass, replace
+from typing import Any, TypeAlias
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from mcgicp_jax._blocks import BLOCK, blocks
+from mcgicp_jax._blocks import BLOCK, blocks, map_rows
 from mcgicp_jax._cloud import PointCloud, Values
 from mcgicp_jax._features import NUM_NEIGHBORS, comparable, histograms_of, normals_of, statistics_of
 from mcgicp_jax._hypotheses import APART, NUM_MATCHES, TOLERANCE, Matches, Poses, hypotheses, refined
 from mcgicp_jax._methods import GICP, MultiChannelGICP
 from mcgicp_jax._options import Options, check_positive
 from mcgicp_jax._pose import AnyArray, computed_now, nearest_rotation
-from mcgicp_jax._preprocess import MIN_POINTS, finite_rows, preprocess, voxels
+from mcgicp_jax._preprocess import finite_rows, preprocess, voxels
 from mcgicp_jax._register import register_with
 from mcgicp_jax._result import is_usable
 from mcgicp_jax._search import Rows
@@ -27,21 +27,22 @@ from mcgicp_jax._trees import KDTreeSearch
 # Rows of the source and rows of the target that match.
 RowMatches: TypeAlias = tuple[Any, Any]
 
-# Voxels of the smaller cloud, of the larger one, and largest fraction of the points: with 5,000 a scene has a thousand
-# mutual matches, and 20,000 bound the time. One voxel has two points on average, so that it is not finer than they are.
-_VOXELS, _MOST_VOXELS, _FRACTION = 5000, 20_000, 0.5
-# Voxel sizes are 2^(j/4) metres, the same for all pairs; this many steps below the extent of the clouds are tried.
-_STEPS_PER_OCTAVE, _NUM_STEPS = 4, 60
+# Voxels of the smaller cloud, of the larger one, and largest fraction of the points: with 6,000 voxels a scene has about
+# a thousand mutual matches, and 20,000 bound the time. With 5,000 to 8,000 the same real pairs are found. Half of the
+# points: voxels must not be finer than the points.
+_VOXELS, _MOST_VOXELS, _FRACTION = 6000, 20_000, 0.5
+# Voxel sizes are 2^(j/8) metres, the same for all pairs; this many steps below the extent of the clouds are tried.
+_STEPS_PER_OCTAVE, _NUM_STEPS = 8, 120
 # Maximum correspondence distances of the registration that verifies a pose, in voxels, and its number of iterations.
 _VERIFIED_WITHIN, _VERIFIED_ITERATIONS = (4.0, TOLERANCE), 40
 # Number of neighbours for that registration, the default of `preprocess`.
 _NUM_NEIGHBORS = 20
-# Fewest inliers of a success: this many, and this many times √n of n matches. In 250 pairs of different scenes, the
-# best pose has up to 0.95 √n inliers, and in real pairs that overlap 2.5 √n or more.
-_MIN_INLIERS, _MIN_INLIERS_PER_ROOT = 10, 1.5
-# A pose with at least this fraction of the inliers of the best one is a rival, which makes the result ambiguous. In
-# real pairs the runner-up has up to a tenth.
-_RIVAL = 0.5
+# A success has at least this evidence (inliers × overlap) per √n of n matches, and this many inliers. Different scenes
+# have up to 1.2 √n (streets of the same kind); real pairs that overlap have 1.6 √n or more, without channels.
+_LEAST_EVIDENCE, _MIN_INLIERS = 1.4, 10
+# A pose with at least these fractions of the inliers and the overlap of the best one is a rival, which makes the result
+# ambiguous. Scans of a road have up to 0.75 of the inliers, with 0.83 of the overlap, at another place along it.
+_RIVAL, _RIVAL_OVERLAP = 0.5, 0.9
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,6 +59,15 @@ class Candidate:
     num_inliers: int
     overlap: float
 
+    @property
+    def evidence(self) -> float:
+        """Inliers × overlap, by which poses are ranked."""
+        return self.num_inliers * self.overlap
+
+    def rivals(self, best: Candidate) -> bool:
+        """Whether this pose is about as good as the best one."""
+        return self.num_inliers >= _RIVAL * best.num_inliers and self.overlap >= _RIVAL_OVERLAP * best.overlap
+
 
 @dataclass(frozen=True, eq=False)
 class GlobalPose:
@@ -66,12 +76,14 @@ class GlobalPose:
     Attributes:
         matrix: (4, 4) float64, T_target_source, metres; accurate to a fraction of a voxel. The identity if no pose was
             found.
-        success: whether the clouds match: more inliers than wrong matches have by chance, and not `ambiguous`.
+        success: whether the clouds match: inliers and overlap are larger than different scenes have by chance, and the
+            result is not `ambiguous`.
         ambiguous: whether the runner-up is about as good, as in symmetric or repetitive scenes. False where
             no pose has enough inliers.
         num_inliers, overlap: those of the best pose, see `Candidate`.
         num_matches: number of matches of which these are the inliers.
-        runner_up: the best different pose, by more than five voxels; None if no other has half as many inliers.
+        runner_up: the best pose that differs by more than five voxels; None if no other had half as many inliers before
+            it was verified.
         voxel_size: metres; that of the features.
     """
 
@@ -125,11 +137,12 @@ def global_pose(
     """
     if voxel_size is not None:
         check_positive("voxel_size", voxel_size)
-    pair = source, target = tuple(_cloud(name, cloud) for name, cloud in (("source", source), ("target", target)))
+    source, target = _cloud("source", source), _cloud("target", target)
     chosen = None if correspondences is None else _checked(correspondences, source, target)
-    clouds, centers = zip(*(_centred(name, cloud) for name, cloud in zip(("source", "target"), pair, strict=True)))
-    if clouds[0].channels.shape[1] != clouds[1].channels.shape[1]:
-        clouds = tuple(PointCloud(cloud.points) for cloud in clouds)
+    (one, from_center), (other, to_center) = _centred("source", source), _centred("target", target)
+    if one.channels.shape[1] != other.channels.shape[1]:
+        one, other = PointCloud(one.points), PointCloud(other.points)
+    clouds, centers = (one, other), (from_center, to_center)
     size = _voxel_size(clouds) if voxel_size is None else float(voxel_size)
     prepared = None if size is None else _prepared(clouds, size)
     if prepared is None or size is None:
@@ -242,7 +255,8 @@ def _padded(*columns: Float[np.ndarray, "n 3"]) -> Matches:
     padded = np.zeros((4, NUM_MATCHES, 3), np.float32)
     for array, column in zip(padded, columns, strict=True):
         array[:count] = column[:count]
-    return Matches(*padded, np.arange(NUM_MATCHES) < count)
+    points, targets, normals, target_normals = padded
+    return Matches(points, targets, normals, target_normals, np.arange(NUM_MATCHES) < count)
 
 
 def mutual_nearest(
@@ -253,69 +267,49 @@ def mutual_nearest(
     Distinct are those whose squared distance is small relative to that of the second nearest target. All pairs of rows
     are compared in blocks: trees are no faster in so many dimensions.
     """
-    nearest, back = _Nearest(len(source)), _Nearest(len(target))
-    for rows, index in blocks(len(source)):
-        for columns, other in blocks(len(target)):
-            counted = _counted(index), _counted(other)
-            found = _nearest(source[index], target[other], *counted)
-            nearest.update(rows, columns.start, *(np.asarray(each) for each in found[:3]))
-            back.update(columns, rows.start, *(np.asarray(each) for each in found[3:]))
-    mutual = np.flatnonzero(back.row[nearest.row] == np.arange(len(source)))
-    ratio = nearest.square[mutual] / np.maximum(nearest.second[mutual], 1)
+    nearest, squares = _two_nearest(source, target)
+    back, _ = _two_nearest(target, source)
+    mutual = np.flatnonzero(back[nearest[:, 0], 0] == np.arange(len(source)))
+    ratio = squares[mutual, 0] / np.maximum(squares[mutual, 1], 1)
     mutual = mutual[np.argsort(ratio, kind="stable")]
-    return mutual, nearest.row[mutual]
+    return mutual, nearest[mutual, 0]
 
 
-def _counted(index: Any) -> Bool[np.ndarray, "BLOCK"]:
+def _two_nearest(
+    queries: Float[np.ndarray, "N L"], rows: Float[np.ndarray, "M L"]
+) -> tuple[Int[np.ndarray, "N 2"], Float[np.ndarray, "N 2"]]:
+    """The two nearest rows of each query, the first one first where distances tie; and the squared distances."""
+    counted = [
+        np.ones(BLOCK, bool) if isinstance(index, slice) else _unrepeated(index) for _, index in blocks(len(rows))
+    ]
+
+    def search(index: Any) -> list[tuple[Array, Array]]:
+        parts = zip(blocks(len(rows)), counted, strict=True)
+        return [_nearest(queries[index], rows[other], known) for (_, other), known in parts]
+
+    found = map_rows(search, len(queries), None)
+    squares = np.hstack([square for square, _ in found])
+    numbers = np.hstack([number + i * BLOCK for i, (_, number) in enumerate(found)])
+    best = np.argsort(squares, axis=1, kind="stable")[:, :2]
+    return np.take_along_axis(numbers, best, axis=1), np.take_along_axis(squares, best, axis=1)
+
+
+def _unrepeated(index: Int[np.ndarray, "BLOCK"]) -> Bool[np.ndarray, "BLOCK"]:
     """False for rows that are repeated to fill the last block."""
-    return np.ones(BLOCK, bool) if isinstance(index, slice) else np.append(True, index[1:] != index[:-1])
-
-
-class _Nearest:
-    """The nearest row of each of N rows, with the squared distances of it and of the second nearest."""
-
-    def __init__(self, size: int):
-        self.row = np.zeros(size, np.int64)
-        self.square, self.second = np.full((2, size), np.inf, np.float32)
-
-    def update(self, rows: slice, start: int, square: Any, row: Any, second: Any) -> None:
-        """Take account of a block of candidates that begins with row `start`."""
-        square, row, second = (each[: rows.stop - rows.start] for each in (square, row, second))
-        before = self.square[rows]
-        closer = square < before
-        self.second[rows] = np.minimum(np.maximum(square, before), np.minimum(second, self.second[rows]))
-        self.row[rows] = np.where(closer, row + start, self.row[rows])
-        self.square[rows] = np.where(closer, square, before)
+    return np.append(True, index[1:] != index[:-1])
 
 
 @jax.jit
 def _nearest(
-    source: Float[AnyArray, "n L"],
-    target: Float[AnyArray, "n L"],
-    source_counted: Bool[AnyArray, "n"],
-    target_counted: Bool[AnyArray, "n"],
-) -> tuple[Array, ...]:
-    """For each source row: smallest squared distance, its target row, the second smallest; and the reverse."""
-    lengths = [jnp.sum(each * each, axis=1) for each in (source, target)]
-    product = jnp.matmul(source, target.T, precision="highest")
-    square = lengths[0][:, None] + lengths[1] - 2 * product
-    square = jnp.where(source_counted[:, None] & target_counted, square, jnp.inf)
-    found: list[Array] = []
-    for axis in (1, 0):
-        row = jnp.argmin(square, axis=axis)
-        smallest = jnp.min(square, axis=axis)
-        here = jnp.arange(BLOCK)[None if axis == 1 else slice(None), slice(None) if axis == 1 else None]
-        others = jnp.where(here == jnp.expand_dims(row, axis), jnp.inf, square)
-        found += [smallest, row, jnp.min(others, axis=axis)]
-    return tuple(found)
-
-
-class _Verified(NamedTuple):
-    """A pose between the centred clouds, after registration."""
-
-    matrix: Float[np.ndarray, "4 4"]
-    num_inliers: int
-    overlap: float
+    queries: Float[AnyArray, "n L"], rows: Float[AnyArray, "n L"], counted: Bool[AnyArray, "n"]
+) -> tuple[Float[Array, "n 2"], Int[Array, "n 2"]]:
+    """Squared distances and numbers of the two nearest rows. Of integers, all terms are exact."""
+    squares = [jnp.sum(each * each, axis=1) for each in (queries, rows)]
+    product = jnp.matmul(queries, rows.T, precision="highest")
+    square = squares[0][:, None] + jnp.where(counted, squares[1], jnp.inf) - 2 * product
+    # XLA's top_k takes a third of the time of its argmin.
+    nearest, numbers = jax.lax.top_k(-square, 2)
+    return -nearest, numbers
 
 
 def _answer(
@@ -326,15 +320,24 @@ def _answer(
     radius = float(np.sqrt(np.mean(np.sum(points * points, axis=1))))
     poses = hypotheses(matches, np.float32(voxel_size), np.float32(radius))
     poses = jax.tree.map(np.asarray, refined(poses, matches, np.float32(voxel_size)))
-    found = sorted(_verified(poses, matches, clouds, voxel_size, radius), key=lambda pose: -pose.num_inliers)
+    found = _verified(poses, matches, clouds, voxel_size, radius)
     num_matches = int(matches.valid.sum())
     if not found:
         return GlobalPose(np.eye(4), False, False, 0, num_matches, 0.0, None, voxel_size)
-    best, *others = (Candidate(_moved(pose.matrix, centers), pose.num_inliers, pose.overlap) for pose in found)
-    rivals = [other for other in others if other.num_inliers >= _RIVAL * best.num_inliers]
-    enough = best.num_inliers >= max(_MIN_INLIERS, _MIN_INLIERS_PER_ROOT * np.sqrt(num_matches))
-    numbers = (best.num_inliers, num_matches, best.overlap)
-    runner_up = rivals[0] if rivals else None
+    best, *others = sorted(found, key=lambda pose: -pose.evidence)
+    best, *others = (replace(pose, matrix=_moved(pose.matrix, centers)) for pose in (best, *others))
+    enough = best.num_inliers >= _MIN_INLIERS and best.evidence >= _LEAST_EVIDENCE * np.sqrt(num_matches)
+    rivals = any(other.rivals(best) for other in others)
+    return GlobalPose(
+        matrix=best.matrix,
+        success=bool(enough and not rivals),
+        ambiguous=bool(enough and rivals),
+        num_inliers=best.num_inliers,
+        num_matches=num_matches,
+        overlap=best.overlap,
+        runner_up=others[0] if others else None,
+        voxel_size=voxel_size,
+    )
 
 
 def _moved(matrix: Float[np.ndarray, "4 4"], centers: tuple[np.ndarray, ...]) -> Float[np.ndarray, "4 4"]:
@@ -346,7 +349,7 @@ def _moved(matrix: Float[np.ndarray, "4 4"], centers: tuple[np.ndarray, ...]) ->
 
 def _verified(
     poses: Poses, matches: Matches, clouds: tuple[PointCloud, PointCloud], voxel_size: float, radius: float
-) -> list[_Verified]:
+) -> list[Candidate]:
     """The best pose and its rivals, registered; without repetitions."""
     near = [np.ascontiguousarray(np.asarray(cloud.neighbors)[:, :_NUM_NEIGHBORS]) for cloud in clouds]
     source, target = (cloud.replace_rows(neighbors=rows) for cloud, rows in zip(clouds, near, strict=True))
@@ -355,7 +358,7 @@ def _verified(
         max_distance=(_VERIFIED_WITHIN[0] * voxel_size, _VERIFIED_WITHIN[1] * voxel_size),
         max_iterations=_VERIFIED_ITERATIONS,
     )
-    found: list[_Verified] = []
+    found: list[Candidate] = []
     started: list[np.ndarray] = []
     for matrix in _rivals(poses):
         if any(_same(matrix, other, voxel_size, radius) for other in started):
@@ -366,7 +369,7 @@ def _verified(
         matrix = np.asarray(result.matrix) if is_usable(result) else matrix
         if not any(_same(matrix, other.matrix, voxel_size, radius) for other in found):
             overlap = _overlap(matrix, source, target, voxel_size)
-            found.append(_Verified(matrix, _num_inliers(matrix, matches, voxel_size), overlap))
+            found.append(Candidate(matrix, _num_inliers(matrix, matches, voxel_size), overlap))
     return found
 
 

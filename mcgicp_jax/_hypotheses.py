@@ -79,7 +79,7 @@ def fit_pose(
     normal = alg.smallest_eigenvector(alg.symmetric_from_matrix(square[None]))
     p, q = (axis[:, 0] for axis in alg.orthonormal_basis(normal))
     moved = [jnp.sum(product * axis, axis=1) for axis in (p, q)]
-    across = jnp.cross(*moved)
+    across = jnp.cross(moved[0], moved[1])
     length = jnp.sqrt(jnp.sum(across * across))
     regular = length > 0
     across = jnp.where(regular, across / jnp.where(regular, length, 1), normal[:, 0])
@@ -118,7 +118,7 @@ def hypotheses(matches: Matches, voxel_size: Float[AnyScalar, ""], radius: Float
     translation = b - jnp.sum(rotation * a[:, None, :], axis=-1)
     agree = (support[first, second] > 0) & (support[first, third] > 0) & (support[second, third] > 0)
     edges = [matches.source[rows] - matches.source[first] for rows in (second, third)]
-    area = jnp.sqrt(jnp.sum(jnp.cross(*edges) ** 2, axis=-1))
+    area = jnp.sqrt(jnp.sum(jnp.cross(edges[0], edges[1]) ** 2, axis=-1))
     agree = agree & (area > (_SHORTEST_EDGE * voxel_size) ** 2)
     score = jnp.where(agree, _scores(rotation, translation, matches, voxel_size), 0)
     return _different(Poses(rotation, translation, score), voxel_size, radius)
