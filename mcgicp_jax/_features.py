@@ -9,6 +9,8 @@ without channels, and as many with channels.
 
 from __future__ import annotations
 
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -18,7 +20,7 @@ from mcgicp_jax import _algebra as alg
 from mcgicp_jax._blocks import map_rows
 from mcgicp_jax._cloud import PointCloud
 from mcgicp_jax._neighborhoods import Offsets, gatherer, weighted_covariance
-from mcgicp_jax._pose import AnyArray, AnyScalar
+from mcgicp_jax._pose import AnyScalar
 from mcgicp_jax._surface import Neighborhoods
 
 # Radii in voxels, of neighbours for normals and for histograms: those of Open3D's examples.
@@ -53,7 +55,7 @@ def histograms_of(cloud: PointCloud, normals: Float[np.ndarray, "N 3"], voxel_si
     simple, weights = map_rows(lambda rows: _simple_histograms(gather(rows), radius), size, None)
     neighbors = np.maximum(np.asarray(cloud.neighbors), 0)
 
-    def smoothed(rows: AnyArray) -> Float[Array, "n 33"]:
+    def smoothed(rows: Any) -> Float[Array, "n 33"]:
         return _smoothed(simple[rows], simple[neighbors[rows]], weights[rows])
 
     return map_rows(smoothed, size, None)

@@ -27,9 +27,9 @@ from mcgicp_jax._trees import KDTreeSearch
 # Rows of the source and rows of the target that match.
 RowMatches: TypeAlias = tuple[Any, Any]
 
-# Voxels of the smaller cloud, of the larger one, and largest fraction of the points: with 6,000 voxels a scene has about
-# a thousand mutual matches, and 20,000 bound the time. With 5,000 to 8,000 the same real pairs are found. Half of the
-# points: voxels must not be finer than the points.
+# Voxels of the smaller cloud, of the larger one, and largest fraction of the points: with 6,000 voxels a scene has
+# about a thousand mutual matches, and 20,000 bound the time. With 5,000 to 8,000 the same real pairs are found. Half of
+# the points: voxels must not be finer than the points.
 _VOXELS, _MOST_VOXELS, _FRACTION = 6000, 20_000, 0.5
 # Voxel sizes are 2^(j/8) metres, the same for all pairs; this many steps below the extent of the clouds are tried.
 _STEPS_PER_OCTAVE, _NUM_STEPS = 8, 120

@@ -61,7 +61,7 @@ class Poses(NamedTuple):
 
 
 def fit_pose(
-    source: Float[Array, "M 3"], target: Float[Array, "M 3"], weights: Float[Array, "M"]
+    source: Float[AnyArray, "M 3"], target: Float[AnyArray, "M 3"], weights: Float[AnyArray, "M"]
 ) -> tuple[Float[Array, "3 3"], Float[Array, "3"]]:
     """Rotation R and translation t that minimise Σ w |R a + t − b|², in closed form.
 
