@@ -1,8 +1,8 @@
-"""Registration from any start: `global_pose`."""
+"""Poses from any start: matches of features, hypotheses, and their verification; what `global_pose` does."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from typing import Any, TypeAlias
 
@@ -15,17 +15,18 @@ from mcgicp_jax._blocks import BLOCK, blocks, map_rows
 from mcgicp_jax._cloud import PointCloud, Values
 from mcgicp_jax._features import NUM_NEIGHBORS, comparable, histograms_of, normals_of, statistics_of
 from mcgicp_jax._hypotheses import APART, NUM_MATCHES, TOLERANCE, Matches, Poses, hypotheses, refined
-from mcgicp_jax._methods import GICP, MultiChannelGICP
+from mcgicp_jax._methods import GICP, AbstractMethod, MultiChannelGICP
 from mcgicp_jax._options import Options, check_positive
-from mcgicp_jax._pose import AnyArray, computed_now, nearest_rotation
+from mcgicp_jax._pose import AnyArray, Pose, computed_now, nearest_rotation
 from mcgicp_jax._preprocess import finite_rows, preprocess, voxels
-from mcgicp_jax._register import register_with
-from mcgicp_jax._result import is_usable
+from mcgicp_jax._result import Registration, is_usable
 from mcgicp_jax._search import Rows
 from mcgicp_jax._trees import KDTreeSearch
 
 # Rows of the source and rows of the target that match.
 RowMatches: TypeAlias = tuple[Any, Any]
+# `register_with`.
+Registering: TypeAlias = Callable[[PointCloud, PointCloud, AbstractMethod, Pose, Options], Registration]
 
 # Voxels of the smaller cloud, of the larger one, and largest fraction of the points: with 6,000 voxels a scene has
 # about a thousand mutual matches, and 20,000 bound the time. With 5,000 to 8,000 the same real pairs are found. Half of
@@ -104,37 +105,14 @@ class GlobalPose:
         )
 
 
-def global_pose(
+def find_pose(
     source: PointCloud | Values,
     target: PointCloud | Values,
-    *,
-    voxel_size: float | None = None,
-    correspondences: RowMatches | None = None,
+    voxel_size: float | None,
+    correspondences: RowMatches | None,
+    register: Registering,
 ) -> GlobalPose:
-    """Estimate the pose of two clouds from any start, by local features. Start `register` from its `matrix`.
-
-    Voxels are described by FPFH (Rusu et al. 2009) and, if both clouds have the same number of channels, by means and
-    standard deviations of the channels around them. Of the matches, mutual nearest neighbours in these features, most
-    may be wrong. Poses are computed from triplets of matches that agree with each other, refined by graduated
-    non-convexity (Yang et al. 2020), and verified by a coarse registration, with channels. The same clouds give the
-    same result, to the last bit. Runs on the host, with programs whose shapes do not depend on the clouds.
-
-    Args:
-        source, target: raw or preprocessed clouds, or (N, 3) arrays in metres; they may lie anywhere, in any rotation.
-        voxel_size: metres. None: the smallest that leaves 5,000 voxels of the smaller cloud and 20,000 of the larger,
-            and half the points of each.
-        correspondences: two arrays of rows, of the source and of the target, which replace the matches by features,
-            such as those of `image_matches`. At most 1,024 are used, evenly spaced; any number of them may be wrong.
-
-    Returns:
-        The pose, and whether to trust it.
-
-    Raises:
-        ValueError: if a cloud has fewer than four finite points, or an argument is malformed. Failures on well-formed
-            clouds show in `success`.
-    Warns:
-        UserWarning: if points with NaN or infinity are left out.
-    """
+    """`global_pose`, with the function that registers two clouds from the poses to verify."""
     if voxel_size is not None:
         check_positive("voxel_size", voxel_size)
     source, target = _cloud("source", source), _cloud("target", target)
@@ -152,7 +130,7 @@ def global_pose(
             matches = _matches_of_features(*prepared, size)
         else:
             matches = _given_matches(source, target, chosen, centers)
-        return _answer(matches, prepared, centers, size)
+        return _answer(matches, prepared, centers, size, register)
 
 
 def _cloud(name: str, cloud: PointCloud | Values) -> PointCloud:
@@ -313,14 +291,18 @@ def _nearest(
 
 
 def _answer(
-    matches: Matches, clouds: tuple[PointCloud, PointCloud], centers: tuple[np.ndarray, ...], voxel_size: float
+    matches: Matches,
+    clouds: tuple[PointCloud, PointCloud],
+    centers: tuple[np.ndarray, ...],
+    voxel_size: float,
+    register: Registering,
 ) -> GlobalPose:
     points = np.asarray(clouds[0].points, np.float64)
     # The root mean square distance from the centre, about which the poses turn.
     radius = float(np.sqrt(np.mean(np.sum(points * points, axis=1))))
     poses = hypotheses(matches, np.float32(voxel_size), np.float32(radius))
     poses = jax.tree.map(np.asarray, refined(poses, matches, np.float32(voxel_size)))
-    found = _verified(poses, matches, clouds, voxel_size, radius)
+    found = _verified(poses, matches, clouds, voxel_size, radius, register)
     num_matches = int(matches.valid.sum())
     if not found:
         return GlobalPose(np.eye(4), False, False, 0, num_matches, 0.0, None, voxel_size)
@@ -348,7 +330,12 @@ def _moved(matrix: Float[np.ndarray, "4 4"], centers: tuple[np.ndarray, ...]) ->
 
 
 def _verified(
-    poses: Poses, matches: Matches, clouds: tuple[PointCloud, PointCloud], voxel_size: float, radius: float
+    poses: Poses,
+    matches: Matches,
+    clouds: tuple[PointCloud, PointCloud],
+    voxel_size: float,
+    radius: float,
+    register: Registering,
 ) -> list[Candidate]:
     """The best pose and its rivals, registered; without repetitions."""
     near = [np.ascontiguousarray(np.asarray(cloud.neighbors)[:, :_NUM_NEIGHBORS]) for cloud in clouds]
@@ -364,7 +351,7 @@ def _verified(
         if any(_same(matrix, other, voxel_size, radius) for other in started):
             continue
         started.append(matrix)
-        result = register_with(source, target, method, matrix, options)
+        result = register(source, target, method, matrix, options)
         # A registration that fails, as of clouds with a few coincident points, is no evidence against the matches.
         matrix = np.asarray(result.matrix) if is_usable(result) else matrix
         if not any(_same(matrix, other.matrix, voxel_size, radius) for other in found):

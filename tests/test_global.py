@@ -13,6 +13,7 @@ from scipy.spatial.transform import Rotation
 import mcgicp_jax as mcg
 from mcgicp_jax import _features as features
 from mcgicp_jax import datasets
+from mcgicp_jax.__main__ import main
 from mcgicp_jax._global import mutual_nearest
 from mcgicp_jax._hypotheses import NUM_MATCHES, Matches, Poses, fit_pose, hypotheses, refined
 from mcgicp_jax.metrics import pose_error
@@ -349,3 +350,93 @@ def test_the_same_bits_on_one_core_in_another_process():
     done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=300)
     assert done.returncode == 0, done.stderr
     assert {*expected, *done.stdout.split()} == {expected[0]}
+
+
+# Uses
+
+
+def test_register_starts_from_anywhere():
+    source, target, truth = rooms()
+    result = mcg.register(source, target, mcg.GICP(), init="global")
+    assert result.converged and found(result, truth, source)
+    other = datasets.box_room(1, points_per_frame=6000, seed=1)[0].cloud
+    lost = mcg.register(source, other, mcg.GICP(), init="global")
+    assert lost.status == mcg.Status.TOO_FEW_CORRESPONDENCES and np.isnan(lost.matrix[:3]).all()
+    with pytest.raises(ValueError, match=r'^init: expected a pose, "global" or None'):
+        mcg.register(source, target, mcg.GICP(), init="local")
+    ready = mcg.preprocess(source)
+    with pytest.raises(ValueError, match=r"^init: expected a pose inside"):
+        jax.jit(lambda points: mcg.register(ready.replace(points=points), ready, mcg.GICP(), init="global").cost)(
+            ready.points
+        )
+
+
+@pytest.mark.parametrize("against", ["previous", "map"])
+def test_a_lost_frame_is_found_in_the_map(against):
+    """The sensor is carried away, looks at nothing it knows, and comes back turned round."""
+    frames = list(datasets.box_room(6, points_per_frame=4000, step=0.08))
+    away = np.eye(4)
+    away[:3, :3] = Rotation.from_euler("xyz", [100, 10, 140], degrees=True).as_matrix()
+    away[:3, 3] = (3, -2, 1)
+    elsewhere = datasets.box_room(1, points_per_frame=4000, seed=5)[0].cloud
+    elsewhere = elsewhere.replace(points=elsewhere.points + 100)
+    turned = [frame.cloud.transform(away) for frame in frames[1:3]]
+    clouds = [frame.cloud for frame in frames[:4]] + [elsewhere, *turned]
+    options = {"max_distance": 0.5, "start": frames[0].pose, "against": against}
+    steps = list(mcg.odometry(clouds, mcg.GICP(), recover=True, **options))
+    assert steps[4].registration.status == mcg.Status.TOO_FEW_CORRESPONDENCES
+    for step, frame in zip(steps[5:], frames[1:3], strict=True):
+        assert step.registration.converged
+        translation, rotation = pose_error(step.pose, frame.pose @ np.linalg.inv(away))
+        assert translation < 0.05 and rotation < 0.01
+    drifting = list(mcg.odometry(clouds, mcg.GICP(), **options))
+    assert pose_error(drifting[-1].pose, frames[2].pose @ np.linalg.inv(away))[0] > 0.5
+
+
+def test_the_command_line_starts_from_anywhere(tmp_path, capsys):
+    source, target, truth = rooms()
+    names = [str(tmp_path / name) for name in ("source.npz", "target.npz", "pose.txt")]
+    for name, cloud in zip(names, (source, target), strict=False):
+        mcg.io.write(name, cloud)
+    assert main(["register", *names[:2], "--method", "gicp", "--init", "global", "--output", names[2]]) == 0
+    assert "start:     found, " in capsys.readouterr().out
+    assert pose_error(mcg.io.read_poses(names[2])[0], truth, at=np.mean(source.coordinates, axis=0))[0] < 0.05
+    mcg.io.write(names[1], bare(datasets.box_room(1, points_per_frame=6000, seed=1)[0].cloud))
+    assert main(["register", *names[:2], "--method", "gicp", "--init", "global"]) != 0
+    assert "--init global: found no pose, too few features match" in capsys.readouterr().err
+
+
+def seen(shift, seed=0):
+    """A frame of a picture on a plane 2 m away, moved sideways by a number of pixels of 4 mm."""
+    rng = np.random.default_rng(seed)
+    picture = np.kron(rng.integers(0, 255, (40, 50, 3)), np.ones((6, 6, 1)))[:160, shift : shift + 200].astype(np.uint8)
+    row, column = (each.ravel() for each in np.mgrid[:160, :200])
+    points = np.column_stack([0.004 * column, 0.004 * row, np.full(row.size, 2.0)])
+    return datasets.Frame(mcg.PointCloud(points), image=picture, pixels=np.column_stack([column, row]).astype(float))
+
+
+def test_images_match_points_that_are_the_same():
+    pytest.importorskip("cv2")
+    source, target = seen(0), seen(20)
+    rows, matched = mcg.image_matches(source, target)
+    offsets = target.cloud.points[matched] - source.cloud.points[rows]
+    good = np.linalg.norm(offsets - (-0.08, 0, 0), axis=1) < 0.006
+    assert len(rows) > 40 and good.mean() > 0.8
+    # A plane without channels is found by its picture.
+    result = mcg.global_pose(source.cloud, target.cloud, correspondences=(rows, matched))
+    assert result.success and np.abs(result.matrix[:3, 3] - (-0.08, 0, 0)).max() < 0.02
+    unseen = datasets.Frame(source.cloud, image=source.image, pixels=np.full_like(source.pixels, np.nan))
+    assert len(mcg.image_matches(unseen, target)[0]) == 0
+    blank = datasets.Frame(source.cloud, image=np.zeros_like(source.image), pixels=source.pixels)
+    assert len(mcg.image_matches(source, blank)[0]) == 0
+    with pytest.raises(ValueError, match=r"^target: expected a frame with an image"):
+        mcg.image_matches(source, datasets.Frame(source.cloud))
+
+
+def test_images_of_real_frames(data):
+    pytest.importorskip("cv2")
+    frames = datasets.seven_scenes(data / "sevenscenes_redkitchen")
+    source, target = frames[4], frames[0]
+    truth = np.linalg.inv(target.pose) @ source.pose
+    result = mcg.global_pose(source.cloud, target.cloud, correspondences=mcg.image_matches(source, target))
+    assert result.success and found(result, truth, source.cloud)

@@ -17,7 +17,17 @@ LAYERS = {
     "correspondences": ("_forces", "_methods", "_surfaces", "_sums", "_gaussians", "_ndt"),
     "pose": ("_solve", "_hypotheses", "_directions", "_uncertainty", "_result", "_step"),
     "loops": ("_host", "_traced", "_lanes"),
-    "use": ("_options", "_cost", "_outcome", "_register", "_global", "_channel_covariance", "_batch", "_odometry"),
+    "use": (
+        "_options",
+        "_cost",
+        "_outcome",
+        "_register",
+        "_global",
+        "_channel_covariance",
+        "_batch",
+        "_odometry",
+        "_image_matches",
+    ),
     "faces": ("plot", "_commands", "__main__"),
 }
 LAYER = {module: rank for rank, modules in enumerate(LAYERS.values()) for module in modules}
