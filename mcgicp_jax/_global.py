@@ -32,6 +32,8 @@ Registering: TypeAlias = Callable[[PointCloud, PointCloud, AbstractMethod, Pose,
 # about a thousand mutual matches, and 20,000 bound the time. With 5,000 to 8,000 the same real pairs are found. Half of
 # the points: voxels must not be finer than the points.
 _VOXELS, _MOST_VOXELS, _FRACTION = 6000, 20_000, 0.5
+# Stride of the points of which voxels are counted first.
+_SAMPLE = 4
 # Voxel sizes are 2^(j/8) metres, the same for all pairs; this many steps below the extent of the clouds are tried.
 _STEPS_PER_OCTAVE, _NUM_STEPS = 8, 120
 # Maximum correspondence distances of the registration that verifies a pose, in voxels, and its number of iterations.
@@ -173,17 +175,20 @@ def _voxel_size(clouds: tuple[PointCloud, ...]) -> float | None:
     extent = max(float(np.ptp(each, axis=1).max()) for each in columns)
     if not 0 < extent < np.inf:
         return None
-    largest = int(np.ceil(_STEPS_PER_OCTAVE * np.log2(extent)))
+    most = [max(min(_MOST_VOXELS, _FRACTION * len(cloud)), 8) for cloud in clouds]
 
-    def few(step: int) -> bool:
-        counts = [len(voxels(each, 2.0 ** (step / _STEPS_PER_OCTAVE))[1]) for each in columns]
-        most = [max(min(_MOST_VOXELS, _FRACTION * each.shape[1]), 8) for each in columns]
+    def few(step: int, stride: int) -> bool:
+        counts = [len(voxels(each[:, ::stride], 2.0 ** (step / _STEPS_PER_OCTAVE))[1]) for each in columns]
         return min(counts) <= _VOXELS and all(count <= limit for count, limit in zip(counts, most, strict=True))
 
-    low, high = largest - _NUM_STEPS, largest + 1
+    high = int(np.ceil(_STEPS_PER_OCTAVE * np.log2(extent))) + 1
+    low = high - _NUM_STEPS
+    # Some of the points have fewer voxels, so that the size is not larger; a few sizes more are counted exactly.
     while high - low > 1:
         middle = (low + high) // 2
-        low, high = (low, middle) if few(middle) else (middle, high)
+        low, high = (low, middle) if few(middle, _SAMPLE) else (middle, high)
+    while not few(high, 1):
+        high += 1
     return float(2.0 ** (high / _STEPS_PER_OCTAVE))
 
 
