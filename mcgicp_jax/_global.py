@@ -251,8 +251,10 @@ def mutual_nearest(
     are compared in blocks: trees are no faster in so many dimensions.
     """
     nearest, squares = _two_nearest(source, target)
-    back, _ = _two_nearest(target, source)
-    mutual = np.flatnonzero(back[nearest[:, 0], 0] == np.arange(len(source)))
+    # Only targets that are nearest to any source need be searched for.
+    hit, number = np.unique(nearest[:, 0], return_inverse=True)
+    back, _ = _two_nearest(target[hit], source)
+    mutual = np.flatnonzero(back[number, 0] == np.arange(len(source)))
     ratio = squares[mutual, 0] / np.maximum(squares[mutual, 1], 1)
     mutual = mutual[np.argsort(ratio, kind="stable")]
     return mutual, nearest[mutual, 0]

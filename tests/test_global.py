@@ -266,19 +266,30 @@ def test_different_rooms_do_not_match():
         assert not mcg.global_pose(*clouds).success
 
 
+def box(size, seed):
+    """Points on the faces of a box."""
+    rng, size = np.random.default_rng(seed), np.array(size)
+    points = rng.uniform(-1, 1, (9000, 3)) * size
+    rows, face = np.arange(9000), rng.integers(0, 3, 9000)
+    points[rows, face] = size[face] * np.sign(points[rows, face])
+    return points + 0.005 * rng.normal(size=points.shape)
+
+
+def test_two_boxes_do_not_match():
+    source = mcg.PointCloud(box((2, 1.2, 1), 1)).transform(anywhere(6))
+    for size in ((1.5, 1.4, 0.7), (2.2, 1.2, 1)):
+        assert not mcg.global_pose(source, box(size, 2)).success
+
+
 def test_a_symmetric_scene_is_ambiguous():
-    """A box whose painted walls are the same after half a turn."""
-    size = np.array([2, 1.2, 1])
+    """A box, or hall, whose painted walls are the same after half a turn."""
 
     def seen(seed):
-        rng = np.random.default_rng(seed)
-        points = rng.uniform(-1, 1, (9000, 3)) * size
-        rows, face = np.arange(9000), rng.integers(0, 3, 9000)
-        points[rows, face] = size[face] * np.sign(points[rows, face])
+        points = box((2, 1.2, 1), seed)
         x, y, z = points.T
         # The same at (−x, −y, z).
         paint = np.stack([np.sin(3 * x * y + 2 * z), np.cos(2 * x * y - z) + np.sin(3 * x * x - y * y)], axis=1)
-        return mcg.PointCloud(points + 0.005 * rng.normal(size=points.shape), paint)
+        return mcg.PointCloud(points, paint)
 
     result = mcg.global_pose(seen(1).transform(anywhere(5)), seen(2))
     assert result.ambiguous and not result.success and result.runner_up is not None
@@ -427,6 +438,10 @@ def test_images_match_points_that_are_the_same():
     assert result.success and np.abs(result.matrix[:3, 3] - (-0.08, 0, 0)).max() < 0.02
     unseen = datasets.Frame(source.cloud, image=source.image, pixels=np.full_like(source.pixels, np.nan))
     assert len(mcg.image_matches(unseen, target)[0]) == 0
+    left = np.where(source.pixels[:, :1] < 100, source.pixels, np.nan)
+    few, matched = mcg.image_matches(datasets.Frame(source.cloud, image=source.image, pixels=left), target)
+    offsets = target.cloud.points[matched] - source.cloud.points[few]
+    assert 10 < len(few) < len(rows) and np.mean(np.linalg.norm(offsets - (-0.08, 0, 0), axis=1) < 0.02) > 0.8
     blank = datasets.Frame(source.cloud, image=np.zeros_like(source.image), pixels=source.pixels)
     assert len(mcg.image_matches(source, blank)[0]) == 0
     with pytest.raises(ValueError, match=r"^target: expected a frame with an image"):
