@@ -1,6 +1,6 @@
 """Poses found from any start, and wrong ones that call themselves a success: `global_pose` and peers.
 
-    python -m tests.benchmarks.global_pose [--only kitti rgbd flat different]
+    python -m tests.benchmarks.global_pose [--only kitti rgbd parts flat different]
 
 The source is moved away: LiDAR scans by a yaw and 10 m, RGB-D frames by any rotation and 10 m, flat surfaces by any
 rotation within the plane and 0.5 m. A pose is found if `register` (MC-GICP, or GICP without channels) ends within a
@@ -119,6 +119,27 @@ def kitti() -> Iterator[Pair]:
 def rgbd() -> Iterator[Pair]:
     for name, frames in (("7-Scenes", kitchen()), ("living room", living_room()), ("TUM", desk())):
         yield from all_gaps(name, frames, level=False)
+
+
+def parts() -> Iterator[Pair]:
+    """The left 60 % of the source's view and the right 60 % of the target's, at all gaps."""
+    generator = np.random.default_rng(3)
+    for name, frames in (("7-Scenes", kitchen()), ("living room", living_room()), ("TUM", desk())):
+        for target, source in itertools.combinations(frames, 2):
+            cut = [
+                datasets.Frame(part(frame.cloud, *shares), frame.pose)
+                for frame, shares in ((source, (0, 60)), (target, (40, 100)))
+            ]
+            yield moved(f"{name}, parts", *cut, displaced(generator, Rotation.random(random_state=generator), 10.0))
+
+
+def part(cloud: mcg.PointCloud, first: float, last: float) -> mcg.PointCloud:
+    """The points between two percentiles of the view, from left to right."""
+    slope = cloud.coordinates[:, 0] / cloud.coordinates[:, 2]
+    low, high = np.percentile(slope, [first, last])
+    kept = (slope >= low) & (slope <= high)
+    valid = None if cloud.channel_valid is None else cloud.channel_valid[kept]
+    return mcg.PointCloud(cloud.coordinates[kept], cloud.channels[kept], channel_valid=valid)
 
 
 def flat() -> Iterator[Pair]:
@@ -286,7 +307,7 @@ def count_wrong() -> None:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
-    sets = {"kitti": kitti, "rgbd": rgbd, "flat": flat}
+    sets = {"kitti": kitti, "rgbd": rgbd, "parts": parts, "flat": flat}
     parser.add_argument("--only", nargs="*", choices=[*sets, "different"], default=[*sets, "different"])
     for name in parser.parse_args().only:
         count_wrong() if name == "different" else compare(sets[name]())
