@@ -66,9 +66,8 @@ class PreparedPair:
         # Without common channels, `method` raises an error if the method needs any.
         difference = f" ({self.difference})" if self.channels and names[0] != names[1] else ""
         print(f"channels:  {listed(self.channels)}{difference}")
-        self.start = (
-            _found(self.whole, self.channels) if options.init == "global" else np.eye(4) if given is None else given
-        )
+        if options.init == "global":
+            self.start = _found(self.whole, self.channels)
 
     def method(self, name: MethodName) -> AbstractMethod:
         """The method with parameters from the options or else from the data."""
