@@ -3,8 +3,8 @@
 FPFH (Rusu, Blodow & Beetz, Fast Point Feature Histograms for 3D Registration, ICRA 2009) depends on the side of the
 surface to which the normals point, which is known of single scans at best. Here the normal of a neighbour is turned to
 the side of the point's own normal, and histograms are averaged over both signs of the latter, so that the features do
-not depend on it. With normals turned towards the sensor, real scans have about 1.4 times as many correct matches
-without channels, and as many with channels.
+not depend on it. (Normals turned towards the sensor gave about 1.4 times as many correct matches on nine real pairs
+without channels.)
 """
 
 from __future__ import annotations
@@ -31,8 +31,8 @@ _CHANNEL_RADII = (1.5, 3.0, 5.0)
 NUM_NEIGHBORS = 100
 # Bins of each of three angles, as in the paper.
 NUM_BINS = 11
-# Standard deviation of all statistics of the channels together, relative to that of the histogram. From 0.25 to 1 the
-# numbers of correct matches differ by less than a tenth.
+# Standard deviation of all statistics of the channels together, relative to that of the histogram: with half the weight,
+# real scans have 30 to 50 % more inliers than without channels.
 _CHANNEL_WEIGHT = 0.5
 # Features are rounded to integers up to this magnitude, and the standard deviation of a bin of the histograms to this
 # number. Sums of products of up to 1,000 such integers are exact in float32, in any order and on any device.

@@ -20,8 +20,8 @@ from mcgicp_jax._register import global_pose, register_with
 from mcgicp_jax._result import Registration, computed, is_usable
 from mcgicp_jax.datasets import Frame
 
-# A registration with less than this fraction of the overlap of the one before has lost the way. At the same speed it
-# varies by less than a tenth.
+# A registration with less than this fraction of the overlap of the one before has lost the way: an order of magnitude,
+# since at constant speed the overlap hardly changes.
 _LOST = 0.5
 
 
