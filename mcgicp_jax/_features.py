@@ -31,8 +31,8 @@ _CHANNEL_RADII = (1.5, 3.0, 5.0)
 NUM_NEIGHBORS = 100
 # Bins of each of three angles, as in the paper.
 NUM_BINS = 11
-# Standard deviation of all statistics of the channels together, relative to that of the histogram: with half the weight,
-# real scans have 30 to 50 % more inliers than without channels.
+# Standard deviation of all statistics of the channels together, relative to that of the histogram: at one half, real
+# scans have 30 to 50 % more inliers than without channels.
 _CHANNEL_WEIGHT = 0.5
 # Features are rounded to integers up to this magnitude, and the standard deviation of a bin of the histograms to this
 # number. Sums of products of up to 1,000 such integers are exact in float32, in any order and on any device.

@@ -118,8 +118,8 @@ class AbstractNDT(AbstractMethod):
 class NDT(AbstractNDT, AbstractOneSided):
     """Normal-distributions transform (Biber & Strasser 2003; Magnusson 2009): points against cells, M = C⁻¹.
 
-    C is the covariance of the target's cell, from `gaussians`. Each point is matched to the nearest cell. With `scales`,
-    all registrations but the last are of cells against cells, as by `D2DNDT`.
+    C is the covariance of the target's cell, from `gaussians`. Each point is matched to the nearest cell. With
+    `scales`, all registrations but the last are of cells against cells, as by `D2DNDT`.
 
     Args:
         scale: k of the Welsch kernel, in standard deviations, if `register` is not given another kernel; None: none.

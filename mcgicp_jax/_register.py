@@ -63,8 +63,8 @@ def global_pose(
 
     Args:
         source, target: raw or preprocessed clouds, or (N, 3) arrays in metres; they may lie anywhere, in any rotation.
-        voxel_size: metres. None: the smallest that leaves at most 6,000 voxels of the smaller cloud, 20,000 of the larger,
-            and half as many as points of each.
+        voxel_size: metres. None: the smallest that leaves at most 6,000 voxels of the smaller cloud, 20,000 of the
+            larger, and half as many voxels of each as points.
         correspondences: two arrays of rows, of the source and of the target, which replace the matches by features,
             such as those of `image_matches`. At most 1,024 are used, evenly spaced; any number of them may be wrong.
 
