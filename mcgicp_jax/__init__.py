@@ -10,7 +10,9 @@ from mcgicp_jax._cloud import PointCloud
 from mcgicp_jax._cost import mahalanobis_cost
 from mcgicp_jax._dense import DenseSearch
 from mcgicp_jax._gaussians import cell_moments, gaussians, voxel_cells
+from mcgicp_jax._global import GlobalPose
 from mcgicp_jax._graph import PoseGraphResult, optimize_poses
+from mcgicp_jax._image_matches import image_matches
 from mcgicp_jax._kernels import AbstractKernel, Cauchy, GemanMcClure, Huber, Tukey, Welsch
 from mcgicp_jax._map import aggregate
 from mcgicp_jax._methods import GICP, AbstractMethod, ColorICP, MultiChannelGICP, PointToPlane, PointToPoint
@@ -19,7 +21,7 @@ from mcgicp_jax._ndt import D2DNDT, NDT, ColorNDT
 from mcgicp_jax._odometry import odometry
 from mcgicp_jax._pose_graph import Edge, PoseGraph
 from mcgicp_jax._preprocess import preprocess
-from mcgicp_jax._register import align, find_correspondences, register
+from mcgicp_jax._register import align, find_correspondences, global_pose, register
 from mcgicp_jax._result import Registration, Status
 from mcgicp_jax._search import AbstractSearch, Correspondences
 from mcgicp_jax._trees import AbstractTreeSearch, KDTreeSearch
@@ -39,6 +41,7 @@ __all__ = [
     "DenseSearch",
     "Edge",
     "GemanMcClure",
+    "GlobalPose",
     "Huber",
     "KDTreeSearch",
     "MultiChannelGICP",
@@ -60,6 +63,8 @@ __all__ = [
     "estimate_channel_covariance",
     "find_correspondences",
     "gaussians",
+    "global_pose",
+    "image_matches",
     "io",
     "mahalanobis_cost",
     "metrics",

@@ -17,7 +17,7 @@ from mcgicp_jax._kept import keep
 from mcgicp_jax._neighborhoods import check_neighbors
 from mcgicp_jax._pose import AnyArray, AnyScalar
 from mcgicp_jax._search import Correspondences
-from mcgicp_jax._statistics import constant, median, namespace, sampled_rows
+from mcgicp_jax._statistics import constant, median, namespace, of_known, sampled_rows
 from mcgicp_jax._surface import Local
 
 # Quantiles (5 to 95 %) from which gain and offset are estimated: robust against parts that only one cloud sees.
@@ -47,11 +47,8 @@ def channel_noise(
         across.append(xp.where(counts, _smallest_variance(local, xp)[rows], xp.nan))
     sigma = median(xp.concatenate(residuals, axis=1))
     everything = xp.concatenate(values)
-    with warnings.catch_warnings():
-        # No point may have a channel; its statistics are then NaN.
-        warnings.simplefilter("ignore", RuntimeWarning)
-        spread = xp.nanstd(everything, axis=0)
-        largest = xp.nanmax(xp.abs(everything), axis=0, initial=0)
+    spread = of_known(partial(xp.nanstd, axis=0), everything)
+    largest = of_known(partial(xp.nanmax, axis=0), xp.abs(everything))
     uniform = ~(spread > 1e3 * xp.finfo(spread.dtype).eps * largest)
     # Rendered channels have no noise; a floor of a thousandth of their standard deviation keeps α finite and Λ regular.
     return xp.where(uniform, 1, xp.fmax(sigma, 1e-3 * spread)), uniform, median(xp.concatenate(across))
@@ -139,9 +136,7 @@ def with_channels_matched(source: PointCloud, target: PointCloud, matches: Corre
         matched = matched & (xp.sum(matched, axis=0) > len(_QUANTILES))
         values = [xp.where(matched, each, xp.nan) for each in values]
     levels = xp.asarray(_QUANTILES, values[0].dtype)
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", RuntimeWarning)
-        quantiles = [xp.nanquantile(each, levels, axis=0) for each in values]
+    quantiles = [of_known(partial(xp.nanquantile, q=levels, axis=0), each) for each in values]
     means = [xp.mean(each, axis=0) for each in quantiles]
     spreads = [xp.std(each, axis=0) for each in quantiles]
     varying = (spreads[0] > 0) & (spreads[1] > 0)

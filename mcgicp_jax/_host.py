@@ -183,6 +183,7 @@ def _covariance(
         for name in ("rows", "cells")
     )
     scatter, num_cells = scatter_of(Scores(rows, cells, jacobian, bias), matches.size)
+    scatter = None if problem.method.knows_residuals else scatter
     # In float64: beside the variances of unconstrained directions, those of the others would be lost to rounding.
     with jax.enable_x64(True):
         return np.asarray(covariance_of_pose(_as_float64(state), jacobian, bias, scatter, np.int32(num_cells)))

@@ -43,6 +43,8 @@ class AbstractNDT(AbstractMethod):
         kernel: robust kernel, its scale in standard deviations, if `register` is not given another one.
     """
 
+    matches_slide: ClassVar[bool] = False
+
     kernel: AbstractKernel | None
 
     def covariance(
@@ -88,13 +90,17 @@ class AbstractNDT(AbstractMethod):
             yield self, source, target
         for i, voxel_size in enumerate(scales):
             last = i == len(scales) - 1
-            method = self if last else eqx.tree_at(lambda method: method.kernel, self, None)
+            method = self if last else self._coarse()
             options: dict[str, Any] = {} if last else {"min_ratio": _COARSE_RATIO}
             coarse, coarse_target = (
-                self._at_scale(name, cloud, voxel_size, options)
+                method._at_scale(name, cloud, voxel_size, options)
                 for name, cloud in (("source", source), ("target", target))
             )
             yield method, coarse, coarse_target
+
+    def _coarse(self) -> AbstractNDT:
+        """The method of all scales but the last."""
+        return eqx.tree_at(lambda method: method.kernel, self, None)
 
     def _at_scale(self, name: str, cloud: PointCloud, voxel_size: float, options: dict[str, Any]) -> PointCloud:
         try:
@@ -112,7 +118,8 @@ class AbstractNDT(AbstractMethod):
 class NDT(AbstractNDT, AbstractOneSided):
     """Normal-distributions transform (Biber & Strasser 2003; Magnusson 2009): points against cells, M = C⁻¹.
 
-    C is the covariance of the target's cell, from `gaussians`. Each point is matched to the nearest cell.
+    C is the covariance of the target's cell, from `gaussians`. Each point is matched to the nearest cell. With
+    `scales`, all registrations but the last are of cells against cells, as by `D2DNDT`.
 
     Args:
         scale: k of the Welsch kernel, in standard deviations, if `register` is not given another kernel; None: none.
@@ -128,6 +135,9 @@ class NDT(AbstractNDT, AbstractOneSided):
         self, target: Float[Array, "6 N"], source: Float[Array, "6 N"], rotation: Float[Array, "3 3"]
     ) -> Float[Array, "6 N"]:
         return alg.inverse(target)
+
+    def _coarse(self) -> AbstractNDT:
+        return D2DNDT(None)
 
 
 class ColorNDT(NDT, ColorICP):
@@ -159,6 +169,10 @@ class D2DNDT(AbstractNDT, AbstractGeneralized):
     """
 
     needs_covariances: ClassVar[tuple[str, ...]] = ("source", "target")
+    # Within the surface, the mean of a cell lies anywhere in it, as far as the covariance of the cell says, since the
+    # voxels of the two clouds are not aligned. These residuals are common to all cells of a wall, so their scatter
+    # from cell to cell is too small by a factor of 3 to 7.
+    knows_residuals: ClassVar[bool] = True
 
     def __init__(self, scale: ArrayLike | None = _D2D_SCALE):
         """Raises `ValueError` unless `scale` is positive."""

@@ -18,20 +18,24 @@ from mcgicp_jax._options import Options, check_method, check_positive
 from mcgicp_jax._pose import Pose, nearest_rotation, pose_matrix
 from mcgicp_jax._pose_graph import PoseGraph
 from mcgicp_jax._preprocess import check_preprocessing, preprocess
-from mcgicp_jax._register import register_with
+from mcgicp_jax._register import global_pose, register_with
 from mcgicp_jax._result import Registration, computed, is_usable
 from mcgicp_jax.datasets import Frame
+
+# A registration with less than this fraction of the overlap of the one before has lost the way: an order of magnitude,
+# since at constant speed the overlap hardly changes.
+_LOST = 0.5
 
 
 @dataclass(frozen=True, eq=False)
 class Step:
-    """The result of `odometry` for one frame.
+    """One frame of `odometry`.
 
     Attributes:
         cloud: the preprocessed cloud, in the sensor's frame.
         pose: (4, 4) float64, sensor to world, metres.
-        registration: registration of this frame to the previous one (or with `against="map"` to the map, in the
-            world's frame), None for the first; check its `converged`.
+        registration: registration of this frame to the previous one (or with `against="map"`, or after a recovery, to
+            the map, in the world's frame), None for the first; check its `converged`.
         graph: with `loops`, the poses of all frames so far, corrected by the loops, and the edges between them; see
             `optimize_poses` for their covariances. None otherwise.
     """
@@ -52,28 +56,32 @@ def odometry(
     start: Pose | None = None,
     against: Literal["previous", "map"] = "previous",
     map_radius: float | None = None,
+    recover: bool = False,
     loops: bool = False,
     **options: Any,
 ) -> Iterator[Step]:
     """Register each frame to the previous one, or to a map, starting from the previous motion (constant velocity).
 
-    Frames are processed lazily and without `loops` only the latest is kept, so a sequence may be larger than memory.
-    For a progress bar, use `tqdm.tqdm(odometry(frames, ...), total=len(frames))`. If a registration ends with too few
-    matches or non-finite values, the previous motion is used instead; `Step.registration` keeps the failed result.
+    If a registration has too few matches or non-finite values, the pose continues with the previous motion.
 
     Args:
-        frames: frames of a data set, clouds or (N, 3) arrays in metres. Preprocessed clouds are used unchanged.
-        method: registration method; parameters that it leaves open are chosen from the data of each pair of frames.
-        voxel_size, num_neighbors: arguments of `preprocess`.
-        init: T_target_source from which the registration of the second frame to the first starts. The default is the
-            identity; `max_distance` must then exceed the motion.
-        start: pose of the first frame in the world; the identity by default.
+        frames: iterable of `datasets.Frame`, `PointCloud` or (N, 3) arrays in metres; consumed lazily. Preprocessed
+            clouds are used unchanged.
+        method: registration method.
+        voxel_size, num_neighbors: arguments of `preprocess`. `voxel_size` is also that of the map; by default the point
+            spacing of the first frame.
+        init: motion of the sensor between the first two frames, to start from, `jaxlie.SE3` or (4, 4); the identity by
+            default.
+        start: pose of the first frame, sensor to world; the identity by default.
         against: "previous": register to the previous frame. "map": to the points of all frames before that lie within
             `map_radius` of the last pose, averaged per voxel. Errors then accumulate more slowly.
         map_radius: metres; by default the distance of the farthest point of the first frame from its sensor.
+        recover: find a frame that is lost, as after a jump, by `global_pose` in a map of all frames before, which is
+            then kept in memory. A frame is lost if its registration has too few matches, non-finite values, or half
+            the overlap of the one before; so are the next ones, until one is found. Lost frames do not enter the map.
         loops: whether to look for frames that see again what an earlier one saw, within the uncertainty of the poses,
             register the two, and correct all poses; the poses of `Step.graph` of the last step are then better than
-            those of the single steps. Keeps all clouds.
+            those of the single steps. Keeps all clouds. Not with `against="map"` or `recover`.
         options: options of `register`.
 
     Yields:
@@ -88,39 +96,116 @@ def odometry(
         raise ValueError(f'against: expected "previous" or "map", got {against!r}')
     if map_radius is not None:
         check_positive("map_radius", map_radius)
-    if loops and against == "map":
-        raise ValueError('loops: expected against="previous", whose registrations become the edges of a graph')
-    chosen = Options(**options)
-    trajectory = Trajectory(method, chosen) if loops else None
-    motion = pose_matrix(init)
-    pose = np.asarray(pose_matrix(start, "start"))
-    before: PointCloud | None = None
-    world: VoxelMap | None = None
+    if loops and (against == "map" or recover):
+        raise ValueError(
+            'loops: expected against="previous" and no recover: registrations to the previous frame become edges'
+        )
+    sensor = _Sensor(
+        method, Options(**options), num_neighbors, pose_matrix(init), np.asarray(pose_matrix(start, "start"))
+    )
     for i, frame in enumerate(frames):
         try:
             cloud = _prepared(frame, voxel_size, num_neighbors)
         except ValueError as error:
             raise ValueError(f"frames[{i}]: {error}") from error
-        result = None
-        if before is not None:
-            target = before if world is None else _target(world, method, chosen, num_neighbors)
-            result = register_with(cloud, target, method, motion if world is None else pose @ motion, chosen)
-            if is_usable(result):
-                motion = np.asarray(result.matrix) if world is None else np.linalg.solve(pose, result.matrix)
-            # The product of thousands of rounded rotations would drift away from a rotation.
-            pose = nearest_rotation(pose @ motion)
-        if against == "map":
-            if world is None:
-                world = VoxelMap(voxel_size or float(point_spacing(cloud)))
-                farthest = float(np.linalg.norm(cloud.coordinates, axis=1).max())
-                radius = farthest if map_radius is None else map_radius
-            world.add(f"frames[{i}]", cloud, pose)
-            world.forget(pose[:3, 3], radius)
-        before = cloud
-        if trajectory is not None:
-            pose = trajectory.add(cloud, pose, result)
-        graph = None if trajectory is None else trajectory.graph
-        yield Step(cloud, pose, None if result is None else computed(result), graph)
+        if i == 0:
+            voxel = voxel_size or float(point_spacing(cloud))
+            farthest = float(np.linalg.norm(cloud.coordinates, axis=1).max())
+            sensor.world = VoxelMap(voxel) if against == "map" else None
+            sensor.radius = farthest if map_radius is None else map_radius
+            sensor.places = _Places(voxel) if recover else None
+            sensor.trajectory = Trajectory(method, sensor.options) if loops else None
+        yield sensor.add(f"frames[{i}]", cloud)
+
+
+@dataclass
+class _Sensor:
+    """The sensor at its last frame, and what is kept of the frames before.
+
+    Attributes:
+        motion: (4, 4), between the last two frames.
+        pose: (4, 4), sensor to world.
+        cloud: the last frame; None before the first.
+        world: the map that frames are registered to; None: they are registered to the previous frame.
+        radius: metres around the sensor beyond which points leave the map.
+        places: the map in which lost frames are found; None: they are not.
+        trajectory: poses and edges, with loops; None: no loops are closed.
+    """
+
+    method: AbstractMethod
+    options: Options
+    num_neighbors: int
+    motion: Any
+    pose: Float[np.ndarray, "4 4"]
+    cloud: PointCloud | None = None
+    world: VoxelMap | None = None
+    radius: float = np.inf
+    places: _Places | None = None
+    trajectory: Trajectory | None = None
+
+    def add(self, name: str, cloud: PointCloud) -> Step:
+        """Locate the sensor at the next frame, and remember the frame."""
+        result = None if self.cloud is None else self._located(cloud, self.cloud)
+        if self.places is not None:
+            self.places.add(name, cloud, self.pose)
+        if self.world is not None:
+            self.world.add(name, cloud, self.pose)
+            self.world.forget(self.pose[:3, 3], self.radius)
+        if self.trajectory is not None:
+            self.pose = self.trajectory.add(cloud, self.pose, result)
+        self.cloud = cloud
+        graph = None if self.trajectory is None else self.trajectory.graph
+        return Step(cloud, self.pose, None if result is None else computed(result), graph)
+
+    def _located(self, cloud: PointCloud, before: PointCloud) -> Registration:
+        """Update motion and pose by a registration."""
+        if self.world is None:
+            result = register_with(cloud, before, self.method, self.motion, self.options)
+        else:
+            target = _target(self.world.cloud(), self.method, self.options, self.num_neighbors)
+            result = register_with(cloud, target, self.method, self.pose @ self.motion, self.options)
+        found = None
+        if self.places is not None and self.places.lose(result):
+            found = self.places.find(cloud, self.method, self.options, self.num_neighbors)
+        elif is_usable(result):
+            relative = self.world is None
+            self.motion = np.asarray(result.matrix) if relative else np.linalg.solve(self.pose, result.matrix)
+        # The product of thousands of rounded rotations would drift away from a rotation.
+        self.pose = nearest_rotation(self.pose @ self.motion if found is None else np.asarray(found.matrix))
+        return result if found is None else found
+
+
+class _Places:
+    """A map of all frames whose poses are known, in which a lost frame is found again."""
+
+    def __init__(self, voxel_size: float):
+        self._world = VoxelMap(voxel_size)
+        self._overlap = 0.0
+        self._lost = False
+
+    def lose(self, result: Registration) -> bool:
+        """Whether the frame is lost by this registration, or one before was and is not found yet."""
+        overlap = float(np.asarray(result.overlap))
+        self._lost = self._lost or not is_usable(result) or overlap < _LOST * self._overlap
+        if not self._lost:
+            self._overlap = overlap
+        return self._lost
+
+    def find(
+        self, cloud: PointCloud, method: AbstractMethod, options: Options, num_neighbors: int
+    ) -> Registration | None:
+        """The registration of a lost frame to the map, in the world's frame; None if it is not found."""
+        known = self._world.cloud()
+        start = global_pose(cloud, known)
+        if not start.success:
+            return None
+        result = register_with(cloud, _target(known, method, options, num_neighbors), method, start.matrix, options)
+        self._lost = not is_usable(result)
+        return None if self._lost else result
+
+    def add(self, name: str, cloud: PointCloud, pose: Float[np.ndarray, "4 4"]) -> None:
+        if not self._lost:
+            self._world.add(name, cloud, pose)
 
 
 def _prepared(frame: Frame | PointCloud | Values, voxel_size: float | None, num_neighbors: int) -> PointCloud:
@@ -129,7 +214,6 @@ def _prepared(frame: Frame | PointCloud | Values, voxel_size: float | None, num_
     return cloud if cloud.neighbors is not None else preprocess(cloud, voxel_size, num_neighbors)
 
 
-def _target(world: VoxelMap, method: AbstractMethod, options: Options, num_neighbors: int) -> PointCloud:
+def _target(cloud: PointCloud, method: AbstractMethod, options: Options, num_neighbors: int) -> PointCloud:
     """The map as a target; raw if the method makes cells of it."""
-    cloud = world.cloud()
     return cloud if options.takes_raw(method, "target") else preprocess(cloud, num_neighbors=num_neighbors)

@@ -1,11 +1,11 @@
-"""Registration of two clouds: `register`, and its parts `find_correspondences` and `align`."""
+"""Registration of two clouds: `register`, its start `global_pose`, and its parts `find_correspondences` and `align`."""
 
 from __future__ import annotations
 
 import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from typing import Any
+from typing import Any, Literal
 
 import jax
 import jax.numpy as jnp
@@ -16,6 +16,7 @@ from mcgicp_jax._channels import warn_of_units, with_channels_matched
 from mcgicp_jax._cloud import PointCloud, Values
 from mcgicp_jax._cost import centred_pose, check_matches
 from mcgicp_jax._dense import default_search
+from mcgicp_jax._global import GlobalPose, RowMatches, find_pose
 from mcgicp_jax._host import correspondences_at, register_on_host
 from mcgicp_jax._kept import keep
 from mcgicp_jax._kernels import AbstractKernel
@@ -24,7 +25,7 @@ from mcgicp_jax._options import ROTATION_TOLERANCE, Distance, Options, check_met
 from mcgicp_jax._outcome import registration_of
 from mcgicp_jax._pose import Pose, computed_now, is_concrete, se3_from_matrix
 from mcgicp_jax._preprocess import preprocess
-from mcgicp_jax._result import Registration, is_usable, pose_in_user_frame
+from mcgicp_jax._result import Registration, Status, is_usable, pose_in_user_frame
 from mcgicp_jax._search import AbstractIndex, AbstractSearch, Correspondences
 from mcgicp_jax._statistics import constant, namespace
 from mcgicp_jax._step import Assessment, Problem, Settings, State
@@ -43,6 +44,40 @@ _TOLERANCE_IN_SPACINGS = 0.005
 _COARSE_TOLERANCE = 10.0
 # Least number of source points in a subsampled coarse phase: enough to find a pose nearly as well as all.
 _COARSE_ROWS = 4096
+
+
+def global_pose(
+    source: PointCloud | Values,
+    target: PointCloud | Values,
+    *,
+    voxel_size: float | None = None,
+    correspondences: RowMatches | None = None,
+) -> GlobalPose:
+    """Estimate the pose of two clouds from any start, by local features. Start `register` from its `matrix`.
+
+    Voxels are described by FPFH (Rusu et al. 2009) and, if both clouds have the same number of channels, by means and
+    standard deviations of the channels around them. Of the matches, mutual nearest neighbours in these features, most
+    may be wrong. Poses are computed from triplets of matches that agree with each other, refined by graduated
+    non-convexity (Yang et al. 2020), and verified by a coarse registration, with channels. The same clouds give the
+    same result, to the last bit. Runs on the host, with programs whose shapes do not depend on the clouds.
+
+    Args:
+        source, target: raw or preprocessed clouds, or (N, 3) arrays in metres; they may lie anywhere, in any rotation.
+        voxel_size: metres. None: the smallest that leaves at most 6,000 voxels of the smaller cloud, 20,000 of the
+            larger, and half as many voxels of each as points.
+        correspondences: two arrays of rows, of the source and of the target, which replace the matches by features,
+            such as those of `image_matches`. At most 1,024 are used, evenly spaced; any number of them may be wrong.
+
+    Returns:
+        The pose, and whether to trust it.
+
+    Raises:
+        ValueError: if a cloud has fewer than four finite points, or an argument is malformed. Failures on well-formed
+            clouds show in `success`.
+    Warns:
+        UserWarning: if points with NaN or infinity are left out.
+    """
+    return find_pose(source, target, voxel_size, correspondences, register_with)
 
 
 def find_correspondences(
@@ -173,7 +208,7 @@ def register(
     target: PointCloud | Values,
     method: AbstractMethod,
     *,
-    init: Pose | None = None,
+    init: Pose | Literal["global"] | None = None,
     max_distance: Distance | None = None,
     max_iterations: int = Options.max_iterations,
     translation_tolerance: ArrayLike | None = None,
@@ -199,7 +234,9 @@ def register(
             defaults of `preprocess`; not inside `jit`.
         method: `MultiChannelGICP()`, `GICP()`, `PointToPlane()`, `PointToPoint()`, `ColorICP(...)`; for clouds of
             `gaussians` or with `scales`, `NDT()`, `ColorNDT(...)`, `D2DNDT()`. Parameters left None are estimated.
-        init: T_target_source to start from, `jaxlie.SE3` or (4, 4); the identity by default.
+        init: T_target_source to start from, `jaxlie.SE3` or (4, 4); the identity by default. "global": the result of
+            `global_pose`; without its `success` the status is TOO_FEW_CORRESPONDENCES, and the pose NaN. Not available
+            inside transformations.
         max_distance: maximum correspondence distance, metres of position; matches beyond it are rejected. One number,
             or two, for the coarse and the fine phase. None: 10 and 2.5 times the spacing of the target (its median
             nearest-neighbour distance; the edge of its cells). If `init` is further off, pass a larger value.
@@ -242,6 +279,16 @@ def register(
         match_channels=match_channels,
         scales=scales,
     )
+    if isinstance(init, str):
+        if init != "global":
+            raise ValueError(f'init: expected a pose, "global" or None, got {init!r}')
+        if not is_concrete(source, target):
+            raise ValueError('init: expected a pose inside transformations, got "global"')
+        check_method(method)
+        start = global_pose(source, target)
+        if not start.success:
+            return Registration.without_pose(Status.TOO_FEW_CORRESPONDENCES)
+        init = start.matrix
     return register_with(source, target, method, init, options)
 
 

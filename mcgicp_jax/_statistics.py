@@ -1,7 +1,8 @@
-"""Medians of sampled rows, with NumPy for concrete arrays and with JAX inside transformations."""
+"""Statistics of rows, with NumPy for concrete arrays and with JAX inside transformations."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from types import ModuleType
 from typing import Any
 
@@ -10,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from mcgicp_jax._pose import is_concrete
+from mcgicp_jax._pose import AnyArray, is_concrete
 
 # Largest sample for a median, rows: the median of 4,096 normal variates has a standard error of 2 % of σ.
 MEDIAN_ROWS = 4096
@@ -57,6 +58,16 @@ def median(values: Any) -> Any:
         if known.size:
             result[place] = np.median(known)
     return result[()]
+
+
+def of_known(statistic: Callable[[Any], Any], values: Float[AnyArray, "n C"]) -> Float[AnyArray, "*some C"]:
+    """A statistic over the first axis that ignores NaN, such as `nanstd`; NaN for columns without a number.
+
+    NumPy would warn of these columns, and its warning cannot be suppressed in one thread alone.
+    """
+    xp = namespace(values)
+    missing = xp.all(xp.isnan(values), axis=0)
+    return xp.where(missing, xp.nan, statistic(xp.where(missing, 0, values)))
 
 
 def _traced_median(values: Float[Array, "*batch n"]) -> Float[Array, "*batch"]:

@@ -142,7 +142,9 @@ def assess(state: State, problem: Problem, matched: Matched, matches: Correspond
         problem.method,
         problem.robust,
     )
-    covariance = covariance_of_pose(state, scores.jacobian, scores.bias, *scatter_of(scores, num_cells))
+    scatter, num_cells = scatter_of(scores, num_cells)
+    scatter = None if problem.method.knows_residuals else scatter
+    covariance = covariance_of_pose(state, scores.jacobian, scores.bias, scatter, num_cells)
     return Assessment(Deferred.of(constraints_of(state)), Deferred.of(covariance))
 
 

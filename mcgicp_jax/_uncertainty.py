@@ -4,8 +4,10 @@ The sandwich estimate A⁻¹ (Σ_c u_c u_cᵀ) A⁻ᵀ for the root of g = Σ w 
 correspondences are correlated, since they share targets and covariances, so u_c is the sum of the scores in a cell
 about as large as a neighbourhood. A is the Jacobian of g with respect to the pose. When the pose moves, the matches
 follow along the surface, so only the observable fraction O of a motion changes the residuals: A = Σ w JᵀMOJ. The rest
-of the forces, w M(I − O)d, sums to a bias of nearest-neighbour matching, which enters as one more score. (Including the
-derivative of M with respect to the rotation in A changed the result by less than 1 %.)
+of the forces, w M(I − O)d, sums to a bias of nearest-neighbour matching, which enters as one more score. Cells of
+`gaussians` stand still instead: A = Σ w JᵀMJ (`matches_slide`). For D2D-NDT, Σ JᵀMJ also replaces the scatter of the
+scores (`knows_residuals`). (Including the derivative of M with respect to the rotation in A changed the result by less
+than 1 %.)
 
 Three steps: medians over sampled rows (`discounts`), scores of all rows (`scores_of`), and 6×6 algebra (`sandwich`).
 The first two work row by row, in blocks or over whole arrays.
@@ -157,7 +159,8 @@ def scores_of(
             shown = shown + discount[1] * each / (1 - (1 - discount[1]) * jnp.clip(trace, 0, 1))
         left_out = forces.force - alg.multiply(forces.stiffness, alg.multiply(shown, forces.residual))
         bias = jnp.sum(_wrench(arms, left_out), axis=1)
-        stiffness = alg.symmetric_product(stiffness, shown)
+        if method.matches_slide:
+            stiffness = alg.symmetric_product(stiffness, shown)
         size = _CELL * 0.5 * (reach_of(details.source) + reach_of(details.target))
         cells = _cells(moved, matched.valid, size, num_cells)
     rows = jnp.concatenate([_wrench(arms, forces.force), matched.valid[None].astype(moved.dtype)]).T
@@ -222,15 +225,20 @@ def sandwich(
     radius: Float[Array, ""],
     jacobian: Float[Array, "6 10"],
     bias: Float[Array, "6"],
-    scatter: Float[Array, "6 6"],
+    scatter: Float[Array, "6 6"] | None,
     num_cells: Int[Array, ""],
     directions: Directions | None,
 ) -> Float[Array, "6 6"]:
-    """(6, 6) covariance of ξ = (v, ω) in T exp(ξ), metres and radians; NaN with six cells or fewer."""
+    """(6, 6) covariance of ξ = (v, ω) in T exp(ξ), metres and radians; NaN with six cells or fewer.
+
+    Without `scatter` it is A⁻¹, as if each force had the covariance that its information matrix states.
+    """
+    information = twist_form(jacobian, radius)
+    response = information * radius
     # Small-sample correction: the pose takes six of the cells' degrees of freedom.
-    count = num_cells.astype(scatter.dtype)
-    scatter = scatter * count / jnp.where(count > 6, count - 6, jnp.nan) + jnp.outer(bias, bias)
-    response = twist_form(jacobian, radius) * radius
+    count = num_cells.astype(response.dtype)
+    correction = count / jnp.where(count > 6, count - 6, jnp.nan)
+    scatter = information * correction if scatter is None else scatter * correction + jnp.outer(bias, bias)
     basis, held = jnp.eye(6, dtype=scatter.dtype), jnp.ones(6, bool)
     if directions is not None:
         basis, held = jnp.asarray(directions.twists).T, jnp.asarray(directions.held)

@@ -5,11 +5,13 @@ import pathlib
 
 from jaxtyping import install_import_hook
 
+import tests.checks  # noqa: F401
+
 # Keep compiled programs between runs: compilation takes most of the tests' time.
 os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(pathlib.Path(__file__).parent.parent / ".jax_cache"))
 os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0.2")
 
-with install_import_hook("mcgicp_jax", "beartype.beartype"):
+with install_import_hook("mcgicp_jax", "tests.checks.checked"):
     import mcgicp_jax
     import mcgicp_jax.__main__  # noqa: F401
 

@@ -322,15 +322,19 @@ def test_traced_and_batched_results_carry_the_same():
         )
 
 
-def test_the_claims_hold_on_average():
+@pytest.mark.parametrize("method", [mcg.GICP(), mcg.NDT(), mcg.D2DNDT()], ids=["gicp", "ndt", "d2d-ndt"])
+def test_the_claims_hold_on_average(method):
     """A few simulated pairs: enough to see a covariance that is wrong by a factor of two in standard deviation."""
-    room = datasets.box_room(2, points_per_frame=2000)
+    room = datasets.box_room(2, points_per_frame=2000 if method.needs_covariances == () else 5000)
     squares = []
     for seed in range(20):
         target, source = (room.observe(i, noise_seed=2 * seed + i) for i in (0, 1))
         truth = np.linalg.inv(target.pose) @ source.pose
-        clouds = [mcg.preprocess(frame.cloud) for frame in (source, target)]
-        result = mcg.register(*clouds, mcg.GICP(), init=truth, max_distance=0.5)
+        clouds = [
+            mcg.gaussians(frame.cloud, 0.5) if name in method.needs_covariances else mcg.preprocess(frame.cloud)
+            for name, frame in (("source", source), ("target", target))
+        ]
+        result = mcg.register(*clouds, method, init=truth, max_distance=0.5)
         left = np.linalg.inv(truth) @ result.matrix
         error = np.append(left[:3, 3], [left[2, 1] - left[1, 2], left[0, 2] - left[2, 0], left[1, 0] - left[0, 1]])
         error[3:] *= 0.5

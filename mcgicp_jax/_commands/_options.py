@@ -26,6 +26,9 @@ from mcgicp_jax._register import default_distances
 
 MethodName: TypeAlias = Literal["mc-gicp", "gicp", "color-icp", "point-to-plane", "point-to-point", "ndt", "d2d-ndt"]
 File: TypeAlias = Annotated[Path | None, tyro.conf.arg(metavar="FILE", help_behavior_hint="")]
+Start: TypeAlias = Annotated[
+    Literal["global"] | Path | None, tyro.conf.arg(metavar="{FILE,global}", help_behavior_hint="")
+]
 Numbers: TypeAlias = Annotated[tuple[float, ...], tyro.conf.arg(help_behavior_hint="(default: from the data)")]
 Distances: TypeAlias = Annotated[tuple[float, ...], tyro.conf.arg(help_behavior_hint="(default: 10 and 2.5 spacings)")]
 Tolerance: TypeAlias = Annotated[
@@ -148,11 +151,11 @@ class PairOptions(Options):
 
     Attributes:
         init: File with the initial pose T_target_source: a 4x4 matrix, or 12 numbers (KITTI) or 8 (TUM) on one line. By
-            default the identity.
+            default the identity. global: the pose is found from any start by local features.
         plot: File for a picture of the clouds before and after registration, such as out.png.
     """
 
-    init: File = None
+    init: Start = None
     plot: File = None
 
     def check(self) -> None:

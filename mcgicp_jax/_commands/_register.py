@@ -46,7 +46,7 @@ class PreparedPair:
         options.check()
         check_inputs(source, target)
         self.options = options
-        self.start = np.eye(4) if options.init is None else _read_pose(options.init)
+        self.start = np.eye(4) if options.init in (None, "global") else _read_pose(Path(options.init))
         self.whole = io.read(source), io.read(target)
         names = [cloud.channel_names for cloud in self.whole]
         self.channels = [name for name in names[0] if name in names[1]]
@@ -66,6 +66,8 @@ class PreparedPair:
         # Without common channels, `method` raises an error if the method needs any.
         difference = f" ({self.difference})" if self.channels and names[0] != names[1] else ""
         print(f"channels:  {listed(self.channels)}{difference}")
+        if options.init == "global":
+            self.start = _found(self.whole, self.channels)
 
     def method(self, name: MethodName) -> AbstractMethod:
         """The method with parameters from the options or else from the data."""
@@ -228,6 +230,16 @@ def _read_pose(path: Path) -> Float[np.ndarray, "4 4"]:
     if len(poses) != 1:
         raise ValueError(f"{path}: expected one pose, got {len(poses)}")
     return poses[0]
+
+
+def _found(clouds: Sequence[mcg.PointCloud], channels: Sequence[str]) -> Float[np.ndarray, "4 4"]:
+    """The pose from any start; raises `ValueError` if it cannot be trusted."""
+    result = mcg.global_pose(*(with_channels(cloud, channels) for cloud in clouds))
+    if not result.success:
+        reason = "several poses fit about equally well" if result.ambiguous else "too few features match"
+        raise ValueError(f"--init global: found no pose, {reason} ({result}); try --init with a file")
+    print(f"start:     found, {result.num_inliers:,} of {result.num_matches:,} features match")
+    return result.matrix
 
 
 def _preprocess(

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from typing import overload
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, UInt8
 
 from mcgicp_jax._cloud import PointCloud
 
@@ -24,11 +24,15 @@ class Frame:
         cloud: in the sensor's frame, metres.
         pose: (4, 4), sensor to world, metres; None if unknown.
         time: seconds from an arbitrary start; None if unknown.
+        image: (height, width, 3) red, green and blue from 0 to 255; None if there is none.
+        pixels: (N, 2) column and row of each point in the image, NaN where it is outside; None without an image.
     """
 
     cloud: PointCloud
     pose: Float[np.ndarray, "4 4"] | None = None
     time: float | None = None
+    image: UInt8[np.ndarray, "height width 3"] | None = None
+    pixels: Float[np.ndarray, "N 2"] | None = None
 
 
 class AbstractFrames(Sequence[Frame]):

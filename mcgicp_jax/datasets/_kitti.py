@@ -11,7 +11,7 @@ from jaxtyping import Float
 from mcgicp_jax import io
 from mcgicp_jax._cloud import PointCloud
 from mcgicp_jax.datasets._frame import AbstractFrames, Frame
-from mcgicp_jax.datasets._images import look_up, read_image
+from mcgicp_jax.datasets._images import Picture, look_up, read_image
 
 
 def kitti(folder: str | os.PathLike[str]) -> KITTIFrames:
@@ -59,27 +59,30 @@ class KITTIFrames(AbstractFrames):
         scan = self._scans[index]
         number = int(scan.stem)
         cloud = io.read(scan)
+        image = pixels = None
         if self._colored:
-            cloud = self._paint(cloud, self.folder / "image_2" / f"{scan.stem}.png")
+            image = read_image(self.folder / "image_2" / f"{scan.stem}.png")
+            cloud, pixels = self._paint(cloud, image)
         pose = None
         if self._poses is not None and number < len(self._poses):
             pose = np.linalg.inv(self._to_camera) @ self._poses[number] @ self._to_camera
         time = float(self._times[number]) if number < len(self._times) else None
-        return Frame(cloud, pose, time)
+        return Frame(cloud, pose, time, image, pixels)
 
-    def _paint(self, cloud: PointCloud, image: Path) -> PointCloud:
-        """Append the colours of the image as channels."""
+    def _paint(self, cloud: PointCloud, image: Picture) -> tuple[PointCloud, Float[np.ndarray, "N 2"]]:
+        """Append the colours of the image as channels; with the pixels, NaN outside of the image."""
         homogeneous = cloud.points @ self._projection[:, :3].T + self._projection[:, 3]
         ahead = homogeneous[:, 2:] > 0
         pixels = np.where(ahead, homogeneous[:, :2] / np.where(ahead, homogeneous[:, 2:], 1), -1)
-        colors, inside = look_up(read_image(image), pixels)
+        colors, inside = look_up(image, pixels)
         valid = np.column_stack([np.ones(len(inside), bool), *[inside] * 3])
-        return PointCloud(
+        painted = PointCloud(
             cloud.points,
             np.hstack([cloud.channels, colors.astype(np.float32)]),
             channel_valid=valid,
             channel_names=("intensity", "red", "green", "blue"),
         )
+        return painted, np.where(inside[:, None], pixels, np.nan)
 
 
 def _read_times(path: Path) -> Float[np.ndarray, "N"]:

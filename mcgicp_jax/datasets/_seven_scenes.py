@@ -68,8 +68,9 @@ class SevenScenesFrames(AbstractFrames):
         points, _ = back_project(metres, (_DEPTH_FOCAL, _DEPTH_FOCAL), _CENTER)
         in_camera = points @ _TO_COLOR[:, :3].T + _TO_COLOR[:, 3]
         pixels = _COLOR_FOCAL * in_camera[:, :2] / in_camera[:, 2:] + _CENTER
-        image = path.with_name(f"{name}.color.png")
-        colors, inside = look_up(read_image(image if image.is_file() else image.with_suffix(".jpg")), pixels)
+        file = path.with_name(f"{name}.color.png")
+        image = read_image(file if file.is_file() else file.with_suffix(".jpg"))
+        colors, inside = look_up(image, pixels)
         cloud = PointCloud(
             points.astype(np.float32),
             colors.astype(np.float32),
@@ -77,4 +78,5 @@ class SevenScenesFrames(AbstractFrames):
             channel_names=("red", "green", "blue"),
         )
         poses = io.read_poses(path.with_name(f"{name}.pose.txt"))
-        return Frame(cloud, poses[0], _PERIOD * int(name.removeprefix("frame-")))
+        time = _PERIOD * int(name.removeprefix("frame-"))
+        return Frame(cloud, poses[0], time, image, np.where(inside[:, None], pixels, np.nan))

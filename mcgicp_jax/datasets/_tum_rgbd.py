@@ -76,9 +76,10 @@ class TUMFrames(AbstractFrames):
     def _frame(self, index: int) -> Frame:
         depth = read_depth(self.folder / self._depths[index]) * _DEPTH_UNIT
         points, pixels = back_project(depth, self._focal, self._center)
-        colors, _ = look_up(read_image(self.folder / self._colors[index]), pixels)
+        image = read_image(self.folder / self._colors[index])
+        colors, _ = look_up(image, pixels)
         cloud = PointCloud(points.astype(np.float32), colors.astype(np.float32), channel_names=("red", "green", "blue"))
-        return Frame(cloud, self._pose(self._times[index]), float(self._times[index]))
+        return Frame(cloud, self._pose(self._times[index]), float(self._times[index]), image, pixels)
 
     def _pose(self, time: float) -> Float[np.ndarray, "4 4"] | None:
         """The measured pose interpolated to a time in seconds; None if unknown."""

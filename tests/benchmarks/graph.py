@@ -119,7 +119,7 @@ def corridor() -> None:
     truth = np.array([frame.pose for frame in frames])
     start = truth.copy()
     start[:, 0, 3] *= 1.05
-    # The sensor sees its start from the end: measured by channels against the cloud of the first frame.
+    # The loop from the end to the start: the true motion, a millimetre uncertain.
     edges = []
     for k in range(number):
         init = np.linalg.inv(start[k]) @ start[k + 1]

@@ -1,0 +1,457 @@
+"""Poses from any start: features against plain loops, poses against SciPy, honest verdicts, and no compilations."""
+
+import os
+import subprocess
+import sys
+
+import jax
+import numpy as np
+import pytest
+from scipy.spatial import cKDTree
+from scipy.spatial.transform import Rotation
+
+import mcgicp_jax as mcg
+from mcgicp_jax import _features as features
+from mcgicp_jax import datasets
+from mcgicp_jax.__main__ import main
+from mcgicp_jax._global import mutual_nearest
+from mcgicp_jax._hypotheses import NUM_MATCHES, Matches, Poses, fit_pose, hypotheses, refined
+from mcgicp_jax.metrics import pose_error
+from tests.scenes import room_corner, wall
+from tests.test_programs import compilations
+
+VOXEL = 0.2
+
+
+def anywhere(seed=0, distance=10.0):
+    rng = np.random.default_rng(seed)
+    pose = np.eye(4)
+    pose[:3, :3] = Rotation.random(random_state=rng).as_matrix()
+    pose[:3, 3] = distance * rng.normal(size=3)
+    return pose
+
+
+def rooms(first=0, second=2, seed=0):
+    """Two frames of a simulated room, the source moved far away, and the true pose."""
+    frames = datasets.box_room(3, points_per_frame=6000, seed=0)
+    away = anywhere(seed)
+    truth = np.linalg.inv(frames[first].pose) @ frames[second].pose @ np.linalg.inv(away)
+    return frames[second].cloud.transform(away), frames[first].cloud, truth
+
+
+def bare(cloud):
+    return mcg.PointCloud(cloud.points)
+
+
+def found(result, truth, source):
+    translation, rotation = pose_error(result.matrix, truth, at=np.mean(source.coordinates, axis=0))
+    return translation < 0.05 and rotation < 0.01
+
+
+# Features
+
+
+@pytest.fixture(scope="module")
+def small():
+    points, channels = room_corner(300, noise=0.02, seed=3)
+    cloud = mcg.preprocess(mcg.PointCloud(points, channels), num_neighbors=50)
+    return cloud, features.normals_of(cloud, VOXEL)
+
+
+def angles(p, n, q, m):
+    """Rusu's α, φ, θ, with the point whose normal is closer to the line first; None where undefined."""
+    if n @ m < 0:
+        m = -m
+    d = (q - p) / np.linalg.norm(q - p)
+    if abs(n @ d) < abs(m @ d):
+        n, m, d = m, n, -d
+    v = np.cross(d, n)
+    if np.linalg.norm(v) <= 1e-6:
+        return None
+    v /= np.linalg.norm(v)
+    w = np.cross(n, v)
+    return v @ m, n @ d, np.arctan2(w @ m, n @ m)
+
+
+def test_histograms_are_those_of_plain_loops(small):
+    cloud, normals = small
+    points = np.asarray(cloud.points, float)
+    near = [
+        [j for j in rows if 0 < np.linalg.norm(points[j] - points[i]) <= 5 * VOXEL]
+        for i, rows in enumerate(cloud.neighbors)
+    ]
+    simple = np.zeros((len(points), 3, 11))
+    for i, rows in enumerate(near):
+        measured = [angles(points[i], normals[i], points[j], normals[j]) for j in rows]
+        measured = [each for each in measured if each is not None]
+        for alpha, phi, theta in measured:
+            for sign in (1, -1):
+                parts = ((alpha + 1) / 2, (sign * phi + 1) / 2, (sign * theta + np.pi / 2) / np.pi)
+                for histogram, part in zip(simple[i], parts, strict=True):
+                    histogram[min(int(11 * part), 10)] += 0.5 / len(measured)
+    expected = simple.copy()
+    for i, rows in enumerate(near):
+        weights = np.array([1 / np.sum((points[j] - points[i]) ** 2) for j in rows])
+        if rows:
+            expected[i] += np.tensordot(weights / weights.sum(), simple[rows], axes=1)
+    made = features.histograms_of(cloud, normals, VOXEL).reshape(-1, 3, 11)
+    np.testing.assert_allclose(made.sum(axis=2), expected.sum(axis=2), atol=1e-5)
+    # Angles at the edge of two bins may fall into either one.
+    assert np.quantile(np.abs(made - expected).max(axis=(1, 2)), 0.7) < 1e-5
+    assert np.abs(made - expected).max() < 0.2
+
+
+def test_normals_are_those_of_the_neighbours(small):
+    cloud, normals = small
+    points = np.asarray(cloud.points, float)
+    for i in range(0, len(points), 7):
+        near = points[np.linalg.norm(points - points[i], axis=1) <= 2 * VOXEL]
+        values, vectors = np.linalg.eigh(np.cov(near.T, bias=True)) if len(near) > 5 else (None, None)
+        if values is not None and values[1] > 3 * values[0]:
+            assert abs(vectors[:, 0] @ normals[i]) > 0.999
+
+
+def test_statistics_are_those_of_the_neighbours_that_have_the_channel(small):
+    cloud, _ = small
+    valid = np.random.default_rng(0).random(cloud.channels.shape) < 0.7
+    cloud = cloud.replace(channel_valid=valid)
+    made = features.statistics_of(cloud, VOXEL)
+    points = np.asarray(cloud.points, float)
+    for i in range(0, len(points), 5):
+        expected = []
+        for channel in range(2):
+            for radius in (1.5, 3.0, 5.0):
+                near = np.linalg.norm(points - points[i], axis=1) <= radius * VOXEL
+                near[np.setdiff1d(np.arange(len(points)), cloud.neighbors[i])] = False
+                values = np.asarray(cloud.channels)[near & valid[:, channel], channel]
+                expected += [values.mean(), values.std()] if valid[i, channel] else [np.nan] * 2
+        np.testing.assert_allclose(made[i], expected, atol=1e-4)
+
+
+def test_a_motion_does_not_change_features(small):
+    cloud, normals = small
+    pose = anywhere(1, 0.3)
+    moved = cloud.transform(pose).replace_rows(neighbors=cloud.neighbors)
+    again = features.normals_of(moved, VOXEL)
+    flips = np.where(np.arange(len(normals)) % 2, -1, 1)[:, None]
+    first = features.histograms_of(cloud, normals, VOXEL)
+    for turned in (again, again * flips):
+        second = features.histograms_of(moved, turned.astype(np.float32), VOXEL)
+        assert np.median(np.abs(first - second).max(axis=1)) < 0.05
+
+
+def test_units_of_channels_do_not_matter(small):
+    cloud, normals = small
+    histograms = features.histograms_of(cloud, normals, VOXEL)
+    made = []
+    for gain in (1.0, 255.0):
+        scaled = cloud.replace(channels=cloud.channels * gain)
+        statistics = features.statistics_of(scaled, VOXEL)
+        made.append(features.comparable((histograms, histograms), (statistics, statistics))[0])
+    assert np.mean(made[0] != made[1]) < 0.01 and np.abs(made[0]).max() <= 127
+    np.testing.assert_array_equal(made[0], np.rint(made[0]))
+
+
+def test_mutual_neighbours_are_those_of_a_tree():
+    rng = np.random.default_rng(0)
+    source, target = (rng.integers(-127, 128, (size, 6)).astype(np.float32) for size in (2500, 4200))
+    rows, matched = mutual_nearest(source, target)
+    (distances, nearest), (back, row) = cKDTree(target).query(source, 2), cKDTree(source).query(target)
+    # Of rows at the same distance, the tree may find another one.
+    matched_distances = np.linalg.norm(source[rows].astype(float) - target[matched], axis=1)
+    np.testing.assert_allclose(matched_distances, distances[rows, 0], rtol=1e-12)
+    np.testing.assert_allclose(matched_distances, back[matched], rtol=1e-12)
+    expected = np.flatnonzero(row[nearest[:, 0]] == np.arange(2500))
+    assert len(np.intersect1d(expected, rows)) > 0.98 * len(expected)
+    ratios = (distances[rows, 0] / np.maximum(distances[rows, 1], 1)) ** 2
+    assert np.all(np.diff(ratios) >= -1e-6)
+
+
+# Poses
+
+
+@pytest.mark.parametrize("kind", ["any", "plane", "three", "mirrored"])
+def test_poses_are_those_of_scipy(kind):
+    rng = np.random.default_rng(4)
+    for _ in range(20):
+        source = rng.normal(size=(3 if kind == "three" else 30, 3)) * (1, 0.7, 0 if kind == "plane" else 0.4)
+        truth = anywhere(int(rng.integers(1000)), 2.0)
+        target = source @ truth[:3, :3].T + truth[:3, 3] + 0.05 * rng.normal(size=source.shape)
+        if kind == "mirrored":
+            target = target * (1, 1, -1)
+        weights = rng.random(len(source))
+        rotation, translation = (
+            np.asarray(each) for each in fit_pose(*(np.asarray(each, np.float32) for each in (source, target, weights)))
+        )
+        means = [np.average(each, axis=0, weights=weights) for each in (source, target)]
+        expected, _ = Rotation.align_vectors(target - means[1], source - means[0], weights)
+        # For mirrored points, two poses may fit about equally well.
+        error = np.sum(weights * np.sum((source @ rotation.T + translation - target) ** 2, axis=1))
+        moved = (source - means[0]) @ expected.as_matrix().T + means[1]
+        assert error <= np.sum(weights * np.sum((moved - target) ** 2, axis=1)) * (1 + 1e-3) + 1e-8
+        if kind != "mirrored":
+            np.testing.assert_allclose(rotation, expected.as_matrix(), atol=2e-3)
+        np.testing.assert_allclose(rotation @ rotation.T, np.eye(3), atol=1e-5)
+        assert np.linalg.det(rotation) > 0.99
+
+
+def test_ninety_percent_of_wrong_matches_do_not_matter():
+    rng = np.random.default_rng(5)
+    truth = anywhere(2, 1.0)
+    source = rng.uniform(-2, 2, (NUM_MATCHES, 3))
+    target = source @ truth[:3, :3].T + truth[:3, 3] + 0.02 * rng.normal(size=source.shape)
+    wrong = rng.random(NUM_MATCHES) < 0.9
+    target[wrong] = rng.uniform(-2, 2, (wrong.sum(), 3)) @ truth[:3, :3].T + truth[:3, 3]
+    none = np.zeros((NUM_MATCHES, 3), np.float32)
+    matches = Matches(source.astype(np.float32), target.astype(np.float32), none, none, np.ones(NUM_MATCHES, bool))
+    poses = refined(hypotheses(matches, np.float32(0.05), np.float32(2.0)), matches, np.float32(0.05))
+    best = int(np.argmax(poses.score))
+    assert isinstance(poses, Poses)
+    np.testing.assert_allclose(poses.rotation[best], truth[:3, :3], atol=0.01)
+    np.testing.assert_allclose(poses.translation[best], truth[:3, 3], atol=0.01)
+
+
+# Clouds
+
+
+@pytest.mark.parametrize("channels", [True, False])
+def test_a_room_is_found_from_anywhere(channels):
+    source, target, truth = rooms()
+    clouds = (source, target) if channels else (bare(source), bare(target))
+    result = mcg.global_pose(*clouds)
+    assert result.success and not result.ambiguous and found(result, truth, source)
+    assert "success" in repr(result) and result.num_inliers <= result.num_matches
+    registered = mcg.register(*clouds, mcg.GICP(), init=result.matrix)
+    assert registered.converged and found(registered, truth, source)
+
+
+def test_on_a_plane_channels_decide():
+    away = anywhere(3)
+    source, target = mcg.PointCloud(*wall(8000, seed=1)).transform(away), mcg.PointCloud(*wall(8000, seed=2))
+    truth = np.linalg.inv(away)
+    result = mcg.global_pose(source, target)
+    assert result.success and found(result, truth, source)
+    alone = mcg.global_pose(bare(source), bare(target))
+    assert not alone.success and not alone.ambiguous
+
+
+def test_given_matches_replace_features():
+    points, _ = wall(3000, seed=1)
+    away = anywhere(4)
+    source, target = mcg.PointCloud(points).transform(away), mcg.PointCloud(points)
+    rng = np.random.default_rng(0)
+    rows = rng.permutation(3000)[:60]
+    matched = np.where(np.arange(60) < 30, rows, rng.integers(0, 3000, 60))
+    result = mcg.global_pose(source, target, correspondences=(rows, matched))
+    assert result.success and found(result, np.linalg.inv(away), source) and result.num_matches == 60
+    many = np.tile(rows, 100)
+    assert mcg.global_pose(source, target, correspondences=(many, many)).num_matches == NUM_MATCHES
+    assert not mcg.global_pose(source, target, correspondences=(rows[:0], rows[:0])).success
+
+
+def test_large_coordinates_lose_nothing():
+    source, target, truth = rooms()
+    far = np.eye(4)
+    far[:3, 3] = (5e5, 5.4e6, 100)
+    result = mcg.global_pose(source, target.transform(far))
+    assert result.success and found(result, far @ truth, source)
+
+
+# Verdicts
+
+
+def test_different_rooms_do_not_match():
+    first, second = (datasets.box_room(1, points_per_frame=6000, seed=seed)[0].cloud for seed in (0, 1))
+    for clouds in ((first, second), (bare(first), bare(second))):
+        assert not mcg.global_pose(*clouds).success
+
+
+def box(size, seed):
+    """Points on the faces of a box."""
+    rng, size = np.random.default_rng(seed), np.array(size)
+    points = rng.uniform(-1, 1, (9000, 3)) * size
+    rows, face = np.arange(9000), rng.integers(0, 3, 9000)
+    points[rows, face] = size[face] * np.sign(points[rows, face])
+    return points + 0.005 * rng.normal(size=points.shape)
+
+
+def test_two_boxes_do_not_match():
+    source = mcg.PointCloud(box((2, 1.2, 1), 1)).transform(anywhere(6))
+    for size in ((1.5, 1.4, 0.7), (2.2, 1.2, 1)):
+        assert not mcg.global_pose(source, box(size, 2)).success
+
+
+def test_a_symmetric_scene_is_ambiguous():
+    """A box, or hall, whose painted walls are the same after half a turn."""
+
+    def seen(seed):
+        points = box((2, 1.2, 1), seed)
+        x, y, z = points.T
+        # The same at (−x, −y, z).
+        paint = np.stack([np.sin(3 * x * y + 2 * z), np.cos(2 * x * y - z) + np.sin(3 * x * x - y * y)], axis=1)
+        return mcg.PointCloud(points, paint)
+
+    result = mcg.global_pose(seen(1).transform(anywhere(5)), seen(2))
+    assert result.ambiguous and not result.success and result.runner_up is not None
+    assert "ambiguous" in repr(result)
+
+
+@pytest.mark.filterwarnings("ignore:left out")
+@pytest.mark.parametrize("kind", ["ten", "line", "coincident", "noise", "nan", "huge", "tiny"])
+def test_hopeless_clouds_have_no_success(kind):
+    rng = np.random.default_rng(0)
+    points = rng.normal(size=(10 if kind == "ten" else 600, 3))
+    if kind == "line":
+        points *= (1, 0, 0)
+    if kind == "coincident":
+        points *= 0
+    if kind == "nan":
+        points[rng.random(600) < 0.9] = np.nan
+    points = points * {"huge": 1e30, "tiny": 1e-30}.get(kind, 1)
+    other = rng.permutation(points) if kind in ("line", "coincident") else points + rng.normal(size=points.shape)
+    result = mcg.global_pose(points, other)
+    assert not result.success and np.isfinite(result.matrix).all()
+    np.testing.assert_allclose(result.matrix[:3, :3] @ result.matrix[:3, :3].T, np.eye(3), atol=1e-6)
+
+
+def test_malformed_arguments_are_named():
+    source, target, _ = rooms()
+    with pytest.raises(ValueError, match=r"^voxel_size"):
+        mcg.global_pose(source, target, voxel_size=0.0)
+    with pytest.raises(ValueError, match=r"^target: cloud: expected at least 4 finite"):
+        mcg.global_pose(source, np.zeros((3, 3)))
+    with pytest.raises(ValueError, match=r"^source: points: expected shape"):
+        mcg.global_pose(np.zeros(3), target)
+    for rows in (([0, 1], [0]), ([0.5], [1.0]), ([0], [10**6])):
+        with pytest.raises(ValueError, match=r"^correspondences"):
+            mcg.global_pose(source, target, correspondences=rows)
+
+
+# Execution
+
+
+def test_other_sizes_compile_nothing():
+    def pair(size, seed):
+        return [mcg.PointCloud(*room_corner(size + size // 7 * i, seed=seed + i)) for i in (0, 1)]
+
+    for clouds in (pair(3000, 0), [bare(cloud) for cloud in pair(3000, 0)]):
+        mcg.global_pose(*clouds)
+    with compilations() as found:
+        for size in (300, 5000, 30_000):
+            for clouds in (pair(size, size), [bare(cloud) for cloud in pair(size, size)]):
+                mcg.global_pose(*clouds)
+        mcg.global_pose(*pair(2000, 5), correspondences=(np.arange(50), np.arange(50)))
+    assert not found
+
+
+_IN_ANOTHER_PROCESS = """
+import os
+if hasattr(os, "sched_setaffinity"):
+    os.sched_setaffinity(0, [min(os.sched_getaffinity(0))])
+from tests.test_global import rooms
+import mcgicp_jax as mcg
+print(mcg.global_pose(*rooms()[:2]).matrix.tobytes().hex())
+"""
+
+
+def test_the_same_bits_on_one_core_in_another_process():
+    expected = [mcg.global_pose(*rooms()[:2]).matrix.tobytes().hex() for _ in range(2)]
+    environment = os.environ | {"JAX_ENABLE_X64": str(int(jax.config.jax_enable_x64))}
+    command = [sys.executable, "-c", _IN_ANOTHER_PROCESS]
+    done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=300)
+    assert done.returncode == 0, done.stderr
+    assert {*expected, *done.stdout.split()} == {expected[0]}
+
+
+# Uses
+
+
+def test_register_starts_from_anywhere():
+    source, target, truth = rooms()
+    result = mcg.register(source, target, mcg.GICP(), init="global")
+    assert result.converged and found(result, truth, source)
+    other = datasets.box_room(1, points_per_frame=6000, seed=1)[0].cloud
+    lost = mcg.register(source, other, mcg.GICP(), init="global")
+    assert lost.status == mcg.Status.TOO_FEW_CORRESPONDENCES and np.isnan(lost.matrix[:3]).all()
+    with pytest.raises(ValueError, match=r'^init: expected a pose, "global" or None'):
+        mcg.register(source, target, mcg.GICP(), init="local")
+    ready = mcg.preprocess(source)
+    with pytest.raises(ValueError, match=r"^init: expected a pose inside"):
+        jax.jit(lambda points: mcg.register(ready.replace(points=points), ready, mcg.GICP(), init="global").cost)(
+            ready.points
+        )
+
+
+@pytest.mark.parametrize("against", ["previous", "map"])
+def test_a_lost_frame_is_found_in_the_map(against):
+    """The sensor is carried away, looks at nothing it knows, and comes back turned round."""
+    frames = list(datasets.box_room(6, points_per_frame=4000, step=0.08))
+    away = np.eye(4)
+    away[:3, :3] = Rotation.from_euler("xyz", [100, 10, 140], degrees=True).as_matrix()
+    away[:3, 3] = (3, -2, 1)
+    elsewhere = datasets.box_room(1, points_per_frame=4000, seed=5)[0].cloud
+    elsewhere = elsewhere.replace(points=elsewhere.points + 100)
+    turned = [frame.cloud.transform(away) for frame in frames[1:3]]
+    clouds = [frame.cloud for frame in frames[:4]] + [elsewhere, *turned]
+    options = {"max_distance": 0.5, "start": frames[0].pose, "against": against}
+    steps = list(mcg.odometry(clouds, mcg.GICP(), recover=True, **options))
+    assert steps[4].registration.status == mcg.Status.TOO_FEW_CORRESPONDENCES
+    for step, frame in zip(steps[5:], frames[1:3], strict=True):
+        assert step.registration.converged
+        translation, rotation = pose_error(step.pose, frame.pose @ np.linalg.inv(away))
+        assert translation < 0.05 and rotation < 0.01
+    drifting = list(mcg.odometry(clouds, mcg.GICP(), **options))
+    assert pose_error(drifting[-1].pose, frames[2].pose @ np.linalg.inv(away))[0] > 0.5
+
+
+def test_the_command_line_starts_from_anywhere(tmp_path, capsys):
+    source, target, truth = rooms()
+    names = [str(tmp_path / name) for name in ("source.npz", "target.npz", "pose.txt")]
+    for name, cloud in zip(names, (source, target), strict=False):
+        mcg.io.write(name, cloud)
+    assert main(["register", *names[:2], "--method", "gicp", "--init", "global", "--output", names[2]]) == 0
+    assert "start:     found, " in capsys.readouterr().out
+    assert pose_error(mcg.io.read_poses(names[2])[0], truth, at=np.mean(source.coordinates, axis=0))[0] < 0.05
+    mcg.io.write(names[1], bare(datasets.box_room(1, points_per_frame=6000, seed=1)[0].cloud))
+    assert main(["register", *names[:2], "--method", "gicp", "--init", "global"]) != 0
+    assert "--init global: found no pose, too few features match" in capsys.readouterr().err
+
+
+def seen(shift, seed=0):
+    """A frame of a picture on a plane 2 m away, moved sideways by a number of pixels of 4 mm."""
+    rng = np.random.default_rng(seed)
+    picture = np.kron(rng.integers(0, 255, (40, 50, 3)), np.ones((6, 6, 1)))[:160, shift : shift + 200].astype(np.uint8)
+    row, column = (each.ravel() for each in np.mgrid[:160, :200])
+    points = np.column_stack([0.004 * column, 0.004 * row, np.full(row.size, 2.0)])
+    return datasets.Frame(mcg.PointCloud(points), image=picture, pixels=np.column_stack([column, row]).astype(float))
+
+
+def test_images_match_points_that_are_the_same():
+    pytest.importorskip("cv2")
+    source, target = seen(0), seen(20)
+    rows, matched = mcg.image_matches(source, target)
+    offsets = target.cloud.points[matched] - source.cloud.points[rows]
+    good = np.linalg.norm(offsets - (-0.08, 0, 0), axis=1) < 0.006
+    assert len(rows) > 40 and good.mean() > 0.8
+    # A plane without channels is found by its picture.
+    result = mcg.global_pose(source.cloud, target.cloud, correspondences=(rows, matched))
+    assert result.success and np.abs(result.matrix[:3, 3] - (-0.08, 0, 0)).max() < 0.02
+    unseen = datasets.Frame(source.cloud, image=source.image, pixels=np.full_like(source.pixels, np.nan))
+    assert len(mcg.image_matches(unseen, target)[0]) == 0
+    left = np.where(source.pixels[:, :1] < 100, source.pixels, np.nan)
+    few, matched = mcg.image_matches(datasets.Frame(source.cloud, image=source.image, pixels=left), target)
+    offsets = target.cloud.points[matched] - source.cloud.points[few]
+    assert 10 < len(few) < len(rows) and np.mean(np.linalg.norm(offsets - (-0.08, 0, 0), axis=1) < 0.02) > 0.8
+    blank = datasets.Frame(source.cloud, image=np.zeros_like(source.image), pixels=source.pixels)
+    assert len(mcg.image_matches(source, blank)[0]) == 0
+    with pytest.raises(ValueError, match=r"^target: expected a frame with an image"):
+        mcg.image_matches(source, datasets.Frame(source.cloud))
+
+
+def test_images_of_real_frames(data):
+    pytest.importorskip("cv2")
+    frames = datasets.seven_scenes(data / "sevenscenes_redkitchen")
+    source, target = frames[4], frames[0]
+    truth = np.linalg.inv(target.pose) @ source.pose
+    result = mcg.global_pose(source.cloud, target.cloud, correspondences=mcg.image_matches(source, target))
+    assert result.success and found(result, truth, source.cloud)
