@@ -400,6 +400,8 @@ def _pairs(
     init: Iterable[Pose | None] | Pose | None,
 ) -> Iterator[_Pair]:
     """Iterate lazily over the pairs; arguments common to all are checked immediately."""
+    if isinstance(init, str):
+        raise ValueError(f"init: expected a pose, or one per pair, got {init!r}; call global_pose for each pair")
     sides: dict[str, Any] = {"sources": sources, "targets": targets, "init": init}
     one_for_all = {"sources": _is_one_cloud(sources), "targets": _is_one_cloud(targets), "init": _is_one_pose(init)}
     if one_for_all["sources"] and one_for_all["targets"]:

@@ -119,7 +119,7 @@ def register(
     """Estimate the pose T_target_source that moves SOURCE onto TARGET.
 
     Clouds are .ply, .pcd, .las, .laz, .bin (KITTI), .npy, .npz, .xyz, .txt or .csv files. The exit code is 0 only if
-    the registration converged; output files are written in any case.
+    the registration converged; output files are written in any case, unless --init global finds no pose.
 
     Args:
         source: Cloud to move.
@@ -189,8 +189,8 @@ def demo(output: Path = Path("mcgicp_demo")) -> int:
     options = PairOptions(voxel_size="off", plot=output / "before_after.png")
     _compare(source_file, target_file, options, truth_file)
     print(
-        "Geometry does not constrain motion along a flat wall: gicp, point-to-plane and point-to-point report it"
-        "\n(degenerate) and keep the initial pose along it, so in their rows of the picture the posters do not fit."
+        "Geometry does not constrain motion along a flat wall: methods that use it alone report it (degenerate) and"
+        "\nkeep the initial pose along it, so in their rows of the picture the posters do not fit."
         "\nmc-gicp and color-icp are constrained by the channels red, green and blue."
         f"\nThe clouds are in {output}; try: mcgicp register {source_file} {target_file}"
     )
@@ -226,6 +226,8 @@ def _compare(
 
 
 def _read_pose(path: Path) -> Float[np.ndarray, "4 4"]:
+    if not path.is_file():
+        raise ValueError(f"--init: expected a file with a pose, or global; {path} is no file")
     poses = io.read_poses(path)
     if len(poses) != 1:
         raise ValueError(f"{path}: expected one pose, got {len(poses)}")
