@@ -7,6 +7,7 @@ import mcgicp_jax as mcg
 from mcgicp_jax import datasets, io, metrics
 from mcgicp_jax.__main__ import main
 from mcgicp_jax._loops import edge_from
+from mcgicp_jax._multiway import _overlapping
 from tests.scenes import motion, pair, wall
 
 
@@ -77,6 +78,19 @@ def test_many_clouds_get_one_map(room):
     assert metrics.ate(found.poses, truth) < metrics.ate(plain, truth)
     np.testing.assert_allclose(found.poses[0], np.eye(4), atol=1e-12)
     assert 0 < len(found.map) < sum(len(cloud) for cloud in found.clouds)
+
+
+def test_pairs_are_those_of_largest_overlap_at_ever_larger_gaps():
+    side = np.arange(0.025, 1, 0.05)
+    cube = np.stack(np.meshgrid(side, side, side), axis=-1).reshape(-1, 3)
+    clouds = [mcg.PointCloud(cube)] * 7 + [mcg.PointCloud(cube[(cube < 0.3).all(axis=1)])]
+    poses = np.tile(np.eye(4), (8, 1, 1))
+    # Where the cubes begin. The overlap of the third with the first, 0.3, is too small. The last cube is a small one
+    # within the others.
+    poses[:, 0, 3] = [0, 0.4, 0.7, 0, 0.4, 5, 0.3, 0.5]
+    consecutive = [(k, k + 1) for k in range(7)]
+    expected = [*consecutive, (0, 3), (1, 4), (0, 4), (4, 6), (1, 6), (4, 7), (0, 7)]
+    assert sorted(_overlapping(clouds, poses, 0.1)) == sorted(expected)
 
 
 def test_pairs_and_starts_can_be_given(room):
