@@ -62,7 +62,8 @@ def odometry(
 ) -> Iterator[Step]:
     """Register each frame to the previous one, or to a map, starting from the previous motion (constant velocity).
 
-    If a registration has too few matches or non-finite values, the pose continues with the previous motion.
+    If a registration has too few matches or non-finite values, its result is not used: the sensor is taken to repeat
+    the previous motion.
 
     Args:
         frames: iterable of `datasets.Frame`, `PointCloud` or (N, 3) arrays in metres; consumed lazily. Preprocessed
@@ -76,19 +77,22 @@ def odometry(
         against: "previous": register to the previous frame. "map": to the points of all frames before that lie within
             `map_radius` of the last pose, averaged per voxel. Errors then accumulate more slowly.
         map_radius: metres; by default the distance of the farthest point of the first frame from its sensor.
-        recover: find a frame that is lost, as after a jump, by `global_pose` in a map of all frames before, which is
-            then kept in memory. A frame is lost if its registration has too few matches, non-finite values, or half
-            the overlap of the one before; so are the next ones, until one is found. Lost frames do not enter the map.
-        loops: whether to look for frames that see again what an earlier one saw, within the uncertainty of the poses,
-            register the two, and correct all poses; the poses of `Step.graph` of the last step are then better than
-            those of the single steps. Keeps all clouds. Not with `against="map"` or `recover`.
+        recover: whether to locate lost frames, as after a jump of the sensor, by `global_pose` in a map of all frames
+            before, which is kept in memory. A frame is lost if its registration has too few matches, non-finite values,
+            or less than half the overlap of the one before. All frames after it count as lost until one is located.
+            Lost frames do not enter the map.
+        loops: whether to close loops. A frame whose pose lies near that of an earlier one, within the uncertainty of
+            the poses, is registered to it, and all poses are corrected by `optimize_poses`. Earlier steps keep the pose
+            known at their time, so use the poses in `Step.graph` of the last step. All clouds are kept in memory. Not
+            with `against="map"` or `recover`.
         options: options of `register`.
 
     Yields:
         One `Step` per frame, including the first.
 
     Raises:
-        ValueError: if a cloud or an argument is invalid; for a cloud the message names the frame.
+        ValueError: while the steps are iterated, if a cloud or an argument is invalid; for a cloud the message names the
+            frame.
     """
     check_preprocessing(voxel_size, num_neighbors)
     check_method(method)
