@@ -91,8 +91,7 @@ def odometry(
         One `Step` per frame, including the first.
 
     Raises:
-        ValueError: while the steps are iterated, if a cloud or an argument is invalid; for a cloud the message names the
-            frame.
+        ValueError: on iteration, if a cloud or an argument is invalid; for a cloud the message names the frame.
     """
     check_preprocessing(voxel_size, num_neighbors)
     check_method(method)
