@@ -17,7 +17,7 @@ from mcgicp_jax._graph import certainty_of
 from mcgicp_jax._normal_equations import Minimum, NormalEquations
 from mcgicp_jax._pose import parameters_of
 from tests.differences import X64, needs_x64
-from tests.graphs import garage, grid, measured, moved, sphere, with_gtsam
+from tests.graphs import garage, grid, measured, moved, pose, sphere, with_gtsam
 from tests.test_programs import compilations
 
 SMALL = {"sphere": sphere(6, 10), "grid": grid(3), "garage": garage(2, 40)}
@@ -144,21 +144,26 @@ def test_rejected_loops_leave_no_trace():
     np.testing.assert_allclose(found.covariance, expected.covariance, rtol=1e-2, atol=1e-9)
 
 
-def test_a_loop_is_rejected_only_beyond_its_own_uncertainty_and_that_of_the_others():
+def test_a_loop_is_rejected_only_beyond_its_own_uncertainty_and_that_of_the_others(monkeypatch):
     """Edges of variances 1 and 1 that contradict each other by d: d² alone, d²/2 together."""
     squares = np.array([20.0, 30.0, 40.0, 60.0, 80.0])
-    ends = np.arange(1, 6)
-    motions = np.tile(np.eye(4), (10, 1, 1))
+    motions = np.tile(pose((0, 10, 0), np.zeros(3)), (10, 1, 1))
+    poses = np.concatenate([np.eye(4)[None], motions[:5]])
     motions[5:, 0, 3] = np.sqrt(squares)
     edges = mcg.Edge(
-        np.zeros(10, int), np.tile(ends, 2), motions, np.tile(np.eye(6), (10, 1, 1)), loop=np.arange(10) >= 5
+        np.zeros(10, int), np.tile(np.arange(1, 6), 2), motions, np.tile(np.eye(6), (10, 1, 1)), loop=np.arange(10) >= 5
     )
-    poses = parameters_of(np.tile(np.eye(4), (6, 1, 1)))
-    equations = NormalEquations(edges, poses)
-    terms = equations.terms(poses)
+    parameters = parameters_of(poses)
+    equations = NormalEquations(edges, parameters)
+    terms = equations.terms(parameters)
     np.testing.assert_allclose(terms.squares[5:], squares)
-    again = _graph._wrongly_rejected(equations, Minimum(poses, terms), 1.0 * (np.arange(10) < 5))
+    again = _graph._wrongly_rejected(equations, Minimum(parameters, terms), 1.0 * (np.arange(10) < 5))
     np.testing.assert_array_equal(again, [5, 6])
+    # Rejected at first, these two are kept in the end, and half of what contradicts is left in both edges.
+    monkeypatch.setattr(_graph, "_truncated_weights", lambda found, _: 1.0 * (found <= _graph.LARGEST_SQUARE))
+    found = mcg.optimize_poses(mcg.PoseGraph(poses, edges))
+    np.testing.assert_array_equal(np.flatnonzero(~found.kept), [7, 8, 9])
+    np.testing.assert_allclose(found.cost, squares[:2].sum() / 4, rtol=1e-6)
 
 
 def se3s(matrices):
@@ -336,6 +341,9 @@ def test_what_no_edge_measures_is_spread_evenly():
     assert found.status == mcg.Status.DEGENERATE and found.kept.all()
     np.testing.assert_allclose(found.poses[:, 0, 3], 1.1 * np.arange(n), atol=1e-3)
     np.testing.assert_allclose(found.poses[:, 1:3, 3], 0, atol=1e-6)
+    end[1, 3] = 5
+    rejected = mcg.optimize_poses(mcg.PoseGraph(poses[:2], [edges[0], mcg.Edge(0, 1, end, sure, loop=True)]))
+    assert rejected.status == mcg.Status.DEGENERATE and not rejected.kept.all()
 
 
 def test_double_edges_count_twice():
