@@ -79,15 +79,15 @@ class GlobalPose:
     Attributes:
         matrix: (4, 4) float64, T_target_source, metres; accurate to a fraction of a voxel. The identity if no pose was
             found.
-        success: whether the clouds match: inliers and overlap are larger than different scenes have by chance, and the
-            result is not `ambiguous`.
-        ambiguous: whether the runner-up is about as good, as in symmetric or repetitive scenes. False where
-            no pose has enough inliers.
-        num_inliers, overlap: those of the best pose, see `Candidate`.
-        num_matches: number of matches of which these are the inliers.
-        runner_up: the best pose that differs by more than five voxels; None if no other had half as many inliers before
-            it was verified.
-        voxel_size: metres; that of the features.
+        success: whether to trust the pose: it has more inliers and overlap than clouds of different scenes reach by
+            chance, and the result is not `ambiguous`.
+        ambiguous: whether another pose is about as good as the best one, as in symmetric or repetitive scenes. False if
+            the best pose has too few inliers.
+        num_inliers, overlap: number of inliers and overlap of the best pose; see `Candidate`.
+        num_matches: number of matches, inliers and outliers.
+        runner_up: the second-best pose, among those that differ from the best one by more than five voxels. None if no
+            such pose had at least half as many inliers as the best one before the verification.
+        voxel_size: metres; size of the voxels from which features are computed.
     """
 
     matrix: Float[np.ndarray, "4 4"]

@@ -48,11 +48,11 @@ class PoseGraphResult(eqx.Module):
     """Result of `optimize_poses`; a pytree.
 
     Attributes:
-        poses: (n, 4, 4), sensor to world, metres; the first is that of the graph.
-        edges: those of the graph.
-        status_code: value of the `Status`.
+        poses: (n, 4, 4), sensor to world, metres; the first one is that of the graph.
+        edges: the m edges of the graph, rejected ones included.
+        status_code: integer value of `status`.
         num_iterations: number of Levenberg-Marquardt steps.
-        cost: ½ Σ w rᵀΛr, with r = log(T_i_j⁻¹ T_i⁻¹ T_j) and w = `weights`.
+        cost: ½ Σ w rᵀΛr, with r = log(T_i_j⁻¹ T_i⁻¹ T_j), the information Λ of each edge, and w = `weights`.
         residuals: (m,) √(rᵀΛr), the Mahalanobis distance of each edge, in standard deviations.
         weights: (m,) 1 for edges that were used and 0 for loops that were rejected.
         uncertainty: deferred value of `covariance`.
@@ -84,8 +84,9 @@ class PoseGraphResult(eqx.Module):
     def covariance(self) -> Float[Array, "n 6 6"] | Float[np.ndarray, "n 6 6"]:
         """(n, 6, 6) covariance of every pose relative to the first: of ξ = (v, ω) in T exp(ξ), metres and radians.
 
-        As certain as the information of the edges is. It does not cover loops wrongly kept or rejected. Computed when
-        first read. Infinite for poses that no edges connect with the first.
+        The inverse of the Gauss-Newton matrix of the edges that were used. It is right if the information of the edges
+        is, and does not cover the risk that a false loop was kept or a true one rejected. Computed when first read. The
+        diagonal is infinite for poses that no edges connect with the first.
         """
         return self.uncertainty.value
 
@@ -93,9 +94,9 @@ class PoseGraphResult(eqx.Module):
     def status(self) -> Any:
         """The `Status`; inside a transformation the array `status_code`.
 
-        CONVERGED; MAX_ITERATIONS; DEGENERATE: the edges leave a direction of motion of at least one pose unconstrained,
-        or do not connect all poses: there the motion from pose to pose stays as near as possible to that of the start;
-        NON_FINITE.
+        CONVERGED; MAX_ITERATIONS; NON_FINITE: poses or residuals overflow; DEGENERATE: the edges do not connect all
+        poses, or leave a direction of motion of at least one pose unconstrained. Along unconstrained directions the
+        motion between poses stays near that of the start.
         """
         return Status(int(np.asarray(self.status_code))) if is_concrete(self.status_code) else self.status_code
 
@@ -115,26 +116,28 @@ class PoseGraphResult(eqx.Module):
 
 
 def optimize_poses(graph: PoseGraph, *, robust: bool = True, max_iterations: int = 100) -> PoseGraphResult:
-    """Find the poses that agree best with all edges: the minimum of Σ rᵀΛr, r = log(T_i_j⁻¹ T_i⁻¹ T_j).
+    """Find the poses that minimise Σ rᵀΛr over the edges, with r = log(T_i_j⁻¹ T_i⁻¹ T_j) and their information Λ.
 
-    By Levenberg-Marquardt from the poses of the graph; the first pose is held. With concrete arrays it runs on the host
-    by sparse factorisation, in programs that do not depend on the size of the graph. Inside transformations it is one
-    dense program per size of graph, for some hundreds of poses. The poses are then differentiable by the motions and
-    the information of the edges (implicit function theorem; 0 if the loop does not converge), not by the start.
+    Runs Levenberg-Marquardt from the poses of the graph; the first pose is held. Concrete graphs are solved on the host
+    by sparse factorisation, and graphs of other sizes compile nothing new. Inside transformations the solver is dense
+    and compiles for every size, which suits some hundreds of poses. The poses are then differentiable with respect to
+    the motions and the information of the edges, by the implicit function theorem, but not with respect to the start.
+    The derivative is 0 if the solver does not converge.
 
     Args:
         graph: poses and edges.
-        robust: whether edges with `loop` may be rejected, by graduated non-convexity (Yang et al. 2020) with truncated
-            squares: those that end more than 4.1 standard deviations off (χ² of 99 %, six degrees of freedom). The
-            threshold has this meaning if the information of the edges is right. Not inside transformations: optimise
-            once outside, and pass `edges[result.kept]` there.
-        max_iterations: largest number of steps of the last minimisation.
+        robust: whether edges with `loop` may be rejected as outliers: those with a Mahalanobis distance above 4.1 at
+            the minimum (99 % of χ² with six degrees of freedom). They are found by graduated non-convexity with
+            truncated squares (Yang et al. 2020). The threshold presumes that the information of the edges is right.
+            Inside transformations `robust` must be False: optimise once outside, and pass `edges[result.kept]`.
+        max_iterations: largest number of steps, at least 1. Steps of the graduated non-convexity are not limited by it.
 
     Returns:
-        The poses with status, covariances, and residual and weight of each edge.
+        The poses with status and covariances, and the residual and weight of each edge.
 
     Raises:
-        ValueError: if an argument is malformed. Failures on well-formed graphs show in the status.
+        ValueError: if `graph` is not a `PoseGraph`, `max_iterations` is not an integer of at least 1, or `robust` is
+            true inside a transformation. Failures on well-formed graphs show in the status.
     """
     if not isinstance(graph, PoseGraph):
         raise ValueError(f"graph: expected a PoseGraph, got {type(graph).__name__}")

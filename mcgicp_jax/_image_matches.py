@@ -19,16 +19,18 @@ _NEAR = 4.0
 
 
 def image_matches(source: Frame, target: Frame) -> tuple[Int[np.ndarray, "n"], Int[np.ndarray, "n"]]:
-    """Match the images of two frames, and lift the matched pixels to points: `correspondences` for `global_pose`.
+    """Match points of two frames by features of their images, as `correspondences` for `global_pose`.
 
-    SIFT features (Lowe 2004) that are nearest to each other in both images and pass the ratio test; each belongs to the
-    point that is nearest in its image, within four pixels. Many may be wrong. Needs the extra `images`.
+    SIFT features (Lowe 2004) match if they are mutual nearest neighbours and pass the ratio test. Each matched pixel is
+    replaced by the point whose image is nearest, within four pixels; pixels without such a point are left out. Many
+    matches may be wrong. Needs the extra `images`.
 
     Args:
-        source, target: frames with images, as from `datasets.kitti`, `tum_rgbd` and `seven_scenes`.
+        source, target: frames with `image` and `pixels`, as from `datasets.kitti`, `datasets.tum_rgbd` and
+            `datasets.seven_scenes`.
 
     Returns:
-        Rows of the source's cloud and of the target's that match, one per match.
+        Rows (n,) of the source's cloud and rows (n,) of the target's, one of each per match.
 
     Raises:
         ValueError: if a frame has no image.

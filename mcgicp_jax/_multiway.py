@@ -36,10 +36,12 @@ class Multiway:
     """The result of `multiway`.
 
     Attributes:
-        clouds: n preprocessed clouds, in their own frames.
-        graph: poses of the clouds, their status and covariances, and the edges.
-        registrations: by pair (i, j), that of cloud j to cloud i; those that did not converge have no edge.
-        map: all clouds in one frame, averaged in voxels of the size used for registration.
+        clouds: the n preprocessed clouds, each in its own frame.
+        graph: result of `optimize_poses`: the poses of the clouds with status and covariances, and the edges.
+        registrations: maps each pair (i, j) to the registration of cloud j to cloud i. Registrations that failed or
+            overlap by less than 40 % are listed here, but have no edge in `graph`.
+        map: all clouds in the world's frame, averaged per voxel; the voxel size is `voxel_size`, or the median point
+            spacing of the clouds if none was given.
     """
 
     clouds: list[PointCloud]
@@ -54,7 +56,7 @@ class Multiway:
 
     @property
     def converged(self) -> bool:
-        """Whether the graph is."""
+        """Whether the optimisation of the graph converged."""
         return bool(self.graph.converged)
 
 
@@ -71,27 +73,29 @@ def multiway(
 ) -> Multiway:
     """Register many clouds of one scene with each other and find one pose for each.
 
-    Pairs that overlap are registered and become the edges of a pose graph, see `optimize_poses`, with the covariances
-    of the registrations; at the poses found, other pairs may overlap, which are registered in turn, until there are no
-    more. Edges between consecutive clouds are trusted, the others may be rejected.
+    Pairs of overlapping clouds are registered, and the registrations with their covariances become the edges of a pose
+    graph, which `optimize_poses` solves. Clouds may overlap at the new poses that did not before: these pairs are
+    registered next, in up to five rounds. Edges between consecutive clouds are trusted; all others may be rejected.
 
     Args:
         clouds: n clouds or (N, 3) arrays, metres. Preprocessed clouds are used unchanged.
         method: registration method.
-        pairs: (i, j), rows of the clouds to register, all at once. By default those that overlap at the current poses:
-            every cloud with the one before it, and with the earlier one of largest overlap among those 2 to 3 places
-            before it, 4 to 7, 8 to 15, and so on: edges of one cloud are not independent, and many tell little more.
-        init: n poses to start from, cloud to world. By default consecutive clouds are registered in order, each from
-            the motion before, as by `odometry`.
+        pairs: pairs (i, j) of rows of the clouds to register; no others are. By default each cloud is paired with the
+            one before it, and with the earlier cloud of largest overlap among those 2 to 3 places before it, among
+            those 4 to 7 places before it, 8 to 15, and so on, if that overlap is at least 40 %. More pairs would add
+            little: the errors of edges that share a cloud are not independent.
+        init: n poses to start from, cloud to world, `jaxlie.SE3` or (4, 4), metres. By default the start is that of
+            `odometry`: consecutive clouds are registered in order, each from the previous motion.
         voxel_size, num_neighbors: arguments of `preprocess`.
-        executor: as in `register_batch`, with which pairs are registered.
+        executor: see `register_batch`, which registers the pairs.
         options: options of `register`.
 
     Returns:
         Clouds, poses, registrations and map.
 
     Raises:
-        ValueError: if an argument is malformed; the message names it. Failures to register show in the status.
+        ValueError: if there is no cloud, or a cloud or an argument is invalid; the message names it. Failures to
+            register show in the status of the graph and of the registrations.
     """
     check_method(method)
     check_preprocessing(voxel_size, num_neighbors)

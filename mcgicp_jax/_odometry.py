@@ -63,7 +63,8 @@ def odometry(
 ) -> Iterator[Step]:
     """Register each frame to the previous one, or to a map, starting from the previous motion (constant velocity).
 
-    If a registration has too few matches or non-finite values, the pose continues with the previous motion.
+    If a registration has too few matches or non-finite values, its result is not used: the sensor is taken to repeat
+    the previous motion.
 
     Args:
         frames: iterable of `datasets.Frame`, `PointCloud` or (N, 3) arrays in metres; consumed lazily. Preprocessed
@@ -81,16 +82,17 @@ def odometry(
             This is tried if a registration does not converge or its overlap drops by a fifth. Frames that are not found
             and whose registration has too few matches, or half the overlap of the one before, are lost: until a frame
             is found, the pose continues with the previous motion, and the map stays as it is.
-        loops: whether to look for frames that see again what an earlier one saw, within the uncertainty of the poses,
-            register the two, and correct all poses; the poses of `Step.graph` of the last step are then better than
-            those of the single steps. Keeps all clouds. Not with `against="map"` or `recover`.
+        loops: whether to close loops. A frame whose pose lies near that of an earlier one, within the uncertainty of
+            the poses, is registered to it, and all poses are corrected by `optimize_poses`. Earlier steps keep the pose
+            known at their time, so use the poses in `Step.graph` of the last step. All clouds are kept in memory. Not
+            with `against="map"` or `recover`.
         options: options of `register`.
 
     Yields:
         One `Step` per frame, including the first.
 
     Raises:
-        ValueError: if a cloud or an argument is invalid; for a cloud the message names the frame.
+        ValueError: on iteration, if a cloud or an argument is invalid; for a cloud the message names the frame.
     """
     check_preprocessing(voxel_size, num_neighbors)
     check_method(method)

@@ -21,16 +21,16 @@ _ROUNDING = 1e-6
 
 
 class Edge(eqx.Module):
-    """A measured motion between two poses of a graph, with its certainty; a pytree.
+    """A measured motion between two poses of a graph, with its information matrix; a pytree.
 
-    All fields may have a leading axis: then the object stands for as many edges.
+    If all fields have a leading axis of length m, one `Edge` holds m edges.
 
     Attributes:
-        i, j: rows of the two poses.
+        i, j: rows of the two poses in `PoseGraph.poses`, integers.
         T_i_j: (4, 4), the measured T_i⁻¹ T_j, which maps coordinates of frame j to frame i; metres.
         information: (6, 6), inverse covariance of ξ = (v, ω) in T_i_j exp(ξ), the tangent of `Registration.covariance`,
-            metres and radians; symmetric, positive semidefinite. Zero along directions of which the edge knows nothing.
-        loop: whether the edge may be wrong as a whole, so that `optimize_poses` may reject it.
+            metres and radians; symmetric, positive semidefinite. Zero along directions that were not measured.
+        loop: whether the measurement may be an outlier, so that `optimize_poses` may reject the edge.
     """
 
     i: Int[Array, "*batch"] | Int[np.ndarray, "*batch"]
@@ -49,15 +49,15 @@ class Edge(eqx.Module):
         covariance: ArrayLike | None = None,
         loop: ArrayLike = False,
     ):
-        """Create an edge, or with a leading axis on all arguments (but for `loop`) several.
+        """Create one edge, or several from arguments with a leading axis (a single `loop` then holds for all).
 
         Args:
-            i, j, T_i_j, information, loop: see the class; a pose may be a `jaxlie.SE3`.
-            covariance: (6, 6), inverse of `information`, instead of it.
+            i, j, T_i_j, information, loop: see the class. `T_i_j` may be a `jaxlie.SE3`.
+            covariance: (6, 6), positive definite; its inverse becomes the information. Give this or `information`.
 
         Raises:
             ValueError: if not exactly one of `information` and `covariance` is given, if a covariance is not positive
-                definite, or if the shapes do not fit.
+                definite, if `i` or `j` is not an integer, or if the shapes do not fit.
         """
         if (information is None) == (covariance is None):
             raise ValueError("information: expected either an information or a covariance matrix, got both or neither")
@@ -83,8 +83,8 @@ class PoseGraph(eqx.Module):
     """Poses of a sensor and measured motions between them; a pytree.
 
     Attributes:
-        poses: (n, 4, 4), sensor to world, metres: the start of `optimize_poses`, which keeps the first one.
-        edges: an `Edge` whose fields have a leading axis, m.
+        poses: (n, 4, 4), sensor to world, metres. `optimize_poses` starts from these poses and holds the first one.
+        edges: the m measured motions: one `Edge` whose fields have a leading axis of length m.
     """
 
     poses: Float[Array, "n 4 4"] | Float[np.ndarray, "n 4 4"]
@@ -94,13 +94,13 @@ class PoseGraph(eqx.Module):
         """Create a graph.
 
         Args:
-            poses: n poses, `jaxlie.SE3` or (4, 4), or one array.
-            edges: a sequence of `Edge`, or one with a leading axis. Several edges may join the same poses.
+            poses: an array (n, 4, 4), or a sequence of n `jaxlie.SE3` or (4, 4) matrices.
+            edges: a sequence of single edges, or one `Edge` with a leading axis. Several edges may join the same poses.
 
         Raises:
-            ValueError: if there is no pose, a pose or measurement is not a rigid motion, an edge joins a pose to itself
-                or to one that is not in the graph, or an information matrix is not finite, symmetric and positive
-                semidefinite. (Of traced arrays only the shapes are checked.)
+            ValueError: if there is no pose, a pose or a measured motion is not rigid, an edge joins a pose to itself or
+                to a row outside of the graph, or an information matrix is not finite, symmetric and positive
+                semidefinite. Of traced arrays, only the shapes are checked.
         """
         if not isinstance(poses, jax.Array):
             poses = np.array([pose_matrix(pose, f"poses[{k}]") for k, pose in enumerate(poses)])  # type: ignore

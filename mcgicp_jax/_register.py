@@ -53,23 +53,24 @@ def global_pose(
     voxel_size: float | None = None,
     correspondences: RowMatches | None = None,
 ) -> GlobalPose:
-    """Estimate the pose of two clouds from any start, by local features. Start `register` from its `matrix`.
+    """Estimate the pose between two clouds without an initial pose. To refine it, pass its `matrix` to `register`.
 
-    Voxels are described by FPFH (Rusu et al. 2009) and, if both clouds have the same number of channels, by means and
-    standard deviations of the channels around them. Of the matches, mutual nearest neighbours in these features, most
-    may be wrong. Poses are computed from triplets of matches that agree with each other, refined by graduated
-    non-convexity (Yang et al. 2020), and verified by a coarse registration, with channels. The same clouds give the
-    same result, to the last bit. Runs on the host, with programs whose shapes do not depend on the clouds.
+    The steps are: (1) describe each voxel by FPFH (Rusu et al. 2009) and, if both clouds have the same number of
+    channels, by the means and standard deviations of the channels around it; (2) match voxels that are mutual nearest
+    neighbours in these features, of which most may be wrong; (3) compute poses from triplets of matches that agree with
+    each other; (4) refine them by graduated non-convexity (Yang et al. 2020); (5) verify the best by a coarse
+    registration, which uses the channels. The same clouds give the same result, to the last bit. Runs on the host, with
+    programs whose shapes do not depend on the clouds.
 
     Args:
         source, target: raw or preprocessed clouds, or (N, 3) arrays in metres; they may lie anywhere, in any rotation.
-        voxel_size: metres. None: the smallest that leaves at most 6,000 voxels of the smaller cloud, 20,000 of the
-            larger, and half as many voxels of each as points.
-        correspondences: two arrays of rows, of the source and of the target, which replace the matches by features,
-            such as those of `image_matches`. At most 1,024 are used, evenly spaced; any number of them may be wrong.
+        voxel_size: metres. By default the smallest size at which the smaller cloud has at most 6,000 voxels, the larger
+            one at most 20,000, and each at most half as many voxels as points.
+        correspondences: integer arrays (n,) of source rows and (n,) of target rows that replace steps 1 and 2, such as
+            those of `image_matches`. At most 1,024 matches are used, evenly spaced; most may be wrong.
 
     Returns:
-        The pose, and whether to trust it.
+        The pose, with `success` to tell whether to trust it.
 
     Raises:
         ValueError: if a cloud has fewer than four finite points, or an argument is malformed. Failures on well-formed

@@ -13,8 +13,11 @@ from scipy.stats import chi2
 
 import mcgicp_jax as mcg
 from mcgicp_jax import _graph, metrics
+from mcgicp_jax._graph import certainty_of
+from mcgicp_jax._normal_equations import Minimum, NormalEquations
+from mcgicp_jax._pose import parameters_of
 from tests.differences import X64, needs_x64
-from tests.graphs import garage, grid, measured, moved, sphere, with_gtsam
+from tests.graphs import garage, grid, measured, moved, pose, sphere, with_gtsam
 from tests.test_programs import compilations
 
 SMALL = {"sphere": sphere(6, 10), "grid": grid(3), "garage": garage(2, 40)}
@@ -33,6 +36,12 @@ def correlated(graph, seed=1, rank=3):
 
 def dense_minimum(graph):
     """Cost at the minimum by SciPy, with rotation vectors of its own and numerical derivatives."""
+    start = np.zeros(6 * len(graph.poses) - 6)
+    return least_squares(whitened(graph), start, xtol=1e-12, ftol=1e-12, gtol=1e-12).cost
+
+
+def whitened(graph):
+    """Residuals of the edges in standard deviations, as a function of the motions of all poses but the first."""
     edges = graph.edges
     roots = [np.linalg.cholesky(each + 1e-9 * np.eye(6)).T for each in edges.information]
 
@@ -43,8 +52,13 @@ def dense_minimum(graph):
         shifts = [_log_translation(turn, shift) for turn, shift in zip(turns, errors[:, :3, 3], strict=True)]
         return np.concatenate([root @ [*v, *w] for root, v, w in zip(roots, shifts, turns, strict=True)])
 
-    found = least_squares(residuals, np.zeros(6 * len(graph.poses) - 6), xtol=1e-12, ftol=1e-12, gtol=1e-12)
-    return found.cost
+    return residuals
+
+
+def jacobian(function, size, step=1e-5):
+    """Central differences at 0."""
+    steps = step * np.eye(size)
+    return np.array([(function(each) - function(-each)) / (2 * step) for each in steps]).T
 
 
 def _log_translation(turn, shift):
@@ -100,20 +114,94 @@ def test_covariances_are_those_of_simulation():
     np.testing.assert_array_equal(found.covariance[0], np.zeros((6, 6)))
 
 
+def test_covariances_are_those_of_finite_differences():
+    """Of the poses and of the motions between them, by the edges that are kept."""
+    graph = correlated(measured(*grid(2), false=0.3)[0], rank=6)
+    found = mcg.optimize_poses(graph)
+    assert 0 < found.kept.sum() < len(graph.edges)
+    kept = mcg.PoseGraph(found.poses, graph.edges[found.kept])
+    size = 6 * len(graph.poses) - 6
+    derivative = jacobian(whitened(kept), size)
+    covariance = np.linalg.inv(derivative.T @ derivative)
+    expected = covariance.reshape(size // 6, 6, size // 6, 6)[np.arange(size // 6), :, np.arange(size // 6)]
+    np.testing.assert_allclose(found.covariance[1:], expected, atol=1e-3 * expected.max())
+    # An edge of information 1 between two poses has their motion for its residual.
+    i, j = np.array([3, 6, 0, 5]), np.array([7, 1, 4, 0])
+    between = mcg.Edge(i, j, np.linalg.inv(found.poses[i]) @ found.poses[j], np.tile(np.eye(6), (4, 1, 1)))
+    motions = jacobian(whitened(mcg.PoseGraph(found.poses, between)), size).reshape(4, 6, size)
+    expected = motions @ covariance @ motions.swapaxes(1, 2)
+    certainty = certainty_of(mcg.PoseGraph(found.poses, graph.edges))
+    np.testing.assert_allclose(certainty.between(i, j), expected, atol=1e-3 * expected.max())
+
+
+def test_rejected_loops_leave_no_trace():
+    graph, _ = measured(*grid(2), false=0.3)
+    found = mcg.optimize_poses(graph)
+    assert not found.kept.all()
+    expected = mcg.optimize_poses(mcg.PoseGraph(found.poses, graph.edges[found.kept]), robust=False)
+    np.testing.assert_allclose(found.cost, expected.cost, rtol=1e-6)
+    np.testing.assert_allclose(found.poses, expected.poses, atol=1e-4)
+    np.testing.assert_allclose(found.covariance, expected.covariance, rtol=1e-2, atol=1e-9)
+
+
+def test_a_loop_is_rejected_only_beyond_its_own_uncertainty_and_that_of_the_others(monkeypatch):
+    """Edges of variances 1 and 1 that contradict each other by d: d² alone, d²/2 together."""
+    squares = np.array([20.0, 30.0, 40.0, 60.0, 80.0])
+    motions = np.tile(pose((0, 10, 0), np.zeros(3)), (10, 1, 1))
+    poses = np.concatenate([np.eye(4)[None], motions[:5]])
+    motions[5:, 0, 3] = np.sqrt(squares)
+    edges = mcg.Edge(
+        np.zeros(10, int), np.tile(np.arange(1, 6), 2), motions, np.tile(np.eye(6), (10, 1, 1)), loop=np.arange(10) >= 5
+    )
+    parameters = parameters_of(poses)
+    equations = NormalEquations(edges, parameters)
+    terms = equations.terms(parameters)
+    np.testing.assert_allclose(terms.squares[5:], squares)
+    again = _graph._wrongly_rejected(equations, Minimum(parameters, terms), 1.0 * (np.arange(10) < 5))
+    np.testing.assert_array_equal(again, [5, 6])
+    # Rejected at first, these two are kept in the end, and half of what contradicts is left in both edges.
+    monkeypatch.setattr(_graph, "_truncated_weights", lambda found, _: 1.0 * (found <= _graph.LARGEST_SQUARE))
+    found = mcg.optimize_poses(mcg.PoseGraph(poses, edges))
+    np.testing.assert_array_equal(np.flatnonzero(~found.kept), [7, 8, 9])
+    np.testing.assert_allclose(found.cost, squares[:2].sum() / 4, rtol=1e-6)
+
+
 def se3s(matrices):
     return jaxlie.SE3.from_matrix(jnp.asarray(matrices))
 
 
+@jax.jit
+def differentiated(graph, twists, change):
+    """The result of a compiled program, and its derivative as motions move by twists and information changes."""
+
+    def at(step):
+        edges = graph.edges
+        motions = edges.T_i_j @ jax.vmap(lambda x: jaxlie.SE3.exp(x).as_matrix())(step * twists)
+        information = edges.information + step * change
+        moving = mcg.PoseGraph(graph.poses, mcg.Edge(edges.i, edges.j, motions, information))
+        found = mcg.optimize_poses(moving, robust=False)
+        return found.poses, found
+
+    _, slope, found = jax.jvp(at, (0.0,), (1.0,), has_aux=True)
+    return found, slope
+
+
 @pytest.fixture(scope="module")
 def both():
-    """A graph, its result, and that of a compiled program."""
+    """A graph, its result, and that of a compiled program with its derivative in some direction."""
     graph, _ = measured(*SMALL["grid"])
-    compiled = jax.jit(lambda graph: mcg.optimize_poses(graph, robust=False))
-    return graph, mcg.optimize_poses(graph, robust=False), compiled(graph)
+    return graph, mcg.optimize_poses(graph, robust=False), *differentiated(graph, *direction(graph))
+
+
+def direction(graph):
+    rng = np.random.default_rng(3)
+    change = rng.normal(size=(len(graph.edges), 6, 6))
+    twists = rng.normal(size=(len(graph.edges), 6))
+    return 0.1 * twists, 20 * (change + change.swapaxes(1, 2))
 
 
 def test_covariances_are_blocks_of_the_inverse(both, monkeypatch):
-    graph, found, inside = both
+    graph, found, inside, _ = both
     dense = np.asarray(inside.covariance)
     deviations = np.sqrt(np.diagonal(found.covariance, 0, 1, 2))[1:]
     difference = (found.covariance - dense)[1:] / deviations[:, :, None] / deviations[:, None]
@@ -155,12 +243,43 @@ def test_other_sizes_compile_nothing():
 
 
 def test_transformations_give_the_same_poses(both):
-    graph, expected, found = both
+    graph, expected, found, _ = both
     assert found.converged and found.status == mcg.Status.CONVERGED
+    np.testing.assert_allclose(found.cost, expected.cost, rtol=1e-4)
     np.testing.assert_allclose(found.poses, expected.poses, atol=2e-3)
     np.testing.assert_allclose(found.residuals, expected.residuals, atol=0.05)
     with pytest.raises(ValueError, match="robust: expected False inside transformations"):
         jax.jit(mcg.optimize_poses)(graph)
+
+
+def test_the_derivative_is_that_of_finite_differences(both):
+    graph, _, _, slope = both
+    twists, change = direction(graph)
+    edges, h = graph.edges, 0.02
+
+    def poses(step):
+        motions = edges.T_i_j @ np.asarray(se3s_of(step * twists))
+        moving = mcg.Edge(edges.i, edges.j, motions, edges.information + step * change)
+        return mcg.optimize_poses(mcg.PoseGraph(graph.poses, moving), robust=False).poses
+
+    expected = (poses(h) - poses(-h)) / (2 * h)
+    np.testing.assert_allclose(slope, expected, atol=0.005 * np.abs(expected).max())
+
+
+def se3s_of(twists):
+    return jax.vmap(lambda x: jaxlie.SE3.exp(x).as_matrix())(jnp.asarray(twists))
+
+
+def test_failures_inside_transformations_are_statuses(both):
+    graph = both[0]
+    edges, last = graph.edges, len(graph.poses) - 1
+    apart = (edges.i != last) & (edges.j != last)
+    cut = mcg.Edge(edges.i, edges.j, edges.T_i_j, apart[:, None, None] * edges.information)
+    found, _ = differentiated(mcg.PoseGraph(graph.poses, cut), *direction(graph))
+    assert found.status == mcg.Status.DEGENERATE and not found.converged
+    twists, change = direction(graph)
+    found, slope = differentiated(graph, twists, np.nan * change)
+    assert found.status == mcg.Status.NON_FINITE and not np.any(slope)
 
 
 @pytest.mark.slow
@@ -222,6 +341,9 @@ def test_what_no_edge_measures_is_spread_evenly():
     assert found.status == mcg.Status.DEGENERATE and found.kept.all()
     np.testing.assert_allclose(found.poses[:, 0, 3], 1.1 * np.arange(n), atol=1e-3)
     np.testing.assert_allclose(found.poses[:, 1:3, 3], 0, atol=1e-6)
+    end[1, 3] = 5
+    rejected = mcg.optimize_poses(mcg.PoseGraph(poses[:2], [edges[0], mcg.Edge(0, 1, end, sure, loop=True)]))
+    assert rejected.status == mcg.Status.DEGENERATE and not rejected.kept.all()
 
 
 def test_double_edges_count_twice():
@@ -238,6 +360,8 @@ def test_what_is_wrong_is_named():
     indefinite = np.diag([1.0, 1, 1, 1, 1, -1])
     for edges, message in (
         ([edge, mcg.Edge(0, 2, eye, np.eye(6))], r"edges\[1\]: j: expected a row from 0 to 1, got 2"),
+        ([mcg.Edge(-1, 1, eye, np.eye(6))], r"edges\[0\]: i: expected a row from 0 to 1, got -1"),
+        (edge, r"edges: expected one leading axis, got shape \(\)"),
         ([mcg.Edge(1, 1, eye, np.eye(6))], r"edges\[0\]: expected two different poses, got 1"),
         ([mcg.Edge(0, 1, 2 * eye, np.eye(6))], r"edges\[0\].T_i_j: expected a rigid motion"),
         ([edge, mcg.Edge(0, 1, eye, indefinite)], r"edges\[1\]: information: expected a positive semidefinite"),
@@ -249,8 +373,13 @@ def test_what_is_wrong_is_named():
             mcg.PoseGraph([eye, eye], edges)
     with pytest.raises(ValueError, match="poses: expected at least one pose"):
         mcg.PoseGraph([], [])
-    with pytest.raises(ValueError, match="information: expected either"):
-        mcg.Edge(0, 1, eye)
+    with pytest.raises(ValueError, match=r"poses: expected at least one pose of shape \(4, 4\), got shape \(4, 4\)"):
+        mcg.PoseGraph(jnp.eye(4), [])
+    for matrices in ({}, {"information": np.eye(6), "covariance": np.eye(6)}):
+        with pytest.raises(ValueError, match="information: expected either"):
+            mcg.Edge(0, 1, eye, **matrices)
+    with pytest.raises(ValueError, match=r"covariance: expected shape \(6, 6\), got \(3, 3\)"):
+        mcg.Edge(0, 1, eye, covariance=np.eye(3))
     with pytest.raises(ValueError, match="covariance: expected a finite positive definite"):
         mcg.Edge(0, 1, eye, covariance=indefinite)
     with pytest.raises(ValueError, match=r"information: expected shape \(6, 6\), got \(3, 3\)"):
@@ -259,6 +388,28 @@ def test_what_is_wrong_is_named():
         mcg.Edge(0.5, 1, eye, np.eye(6))
     with pytest.raises(ValueError, match="max_iterations: expected an integer of at least 1"):
         mcg.optimize_poses(mcg.PoseGraph([eye], []), max_iterations=0)
+
+
+def test_an_edge_takes_what_describes_it():
+    rng = np.random.default_rng(0)
+    root = rng.normal(size=(6, 6)) + 3 * np.eye(6)
+    covariance, transform = root @ root.T, moved(np.eye(4)[None], rng.normal(size=(1, 6)))[0]
+    edge = mcg.Edge(1, 0, jaxlie.SE3.from_matrix(jnp.asarray(transform)), covariance=covariance)
+    np.testing.assert_allclose(edge.information @ covariance, np.eye(6), atol=1e-12)
+    np.testing.assert_array_equal(edge.information, edge.information.T)
+    np.testing.assert_allclose(edge.T_i_j, transform, atol=1e-6)
+    assert not edge.loop
+    inside = jax.jit(lambda values: mcg.Edge(1, 0, transform, covariance=values).information)(covariance)
+    np.testing.assert_allclose(inside, edge.information, atol=1e-4)
+    # Asymmetry within rounding, as in files, is removed.
+    rounded = edge.information + 1e-8 * np.triu(np.ones((6, 6)), 1)
+    graph = mcg.PoseGraph([np.eye(4)] * 2, [edge, mcg.Edge(0, 1, transform, rounded, loop=True)])
+    np.testing.assert_allclose(graph.edges.information[1], edge.information, atol=1e-7)
+    np.testing.assert_array_equal(graph.edges.information, graph.edges.information.swapaxes(1, 2))
+    np.testing.assert_array_equal(graph.edges.loop, [False, True])
+    asymmetric = edge.information + 1e-4 * np.triu(np.ones((6, 6)), 1)
+    with pytest.raises(ValueError, match=r"edges\[0\]: information: expected a symmetric"):
+        mcg.PoseGraph([np.eye(4)] * 2, [mcg.Edge(0, 1, transform, asymmetric)])
 
 
 def test_overflow_and_too_few_iterations_are_statuses():
@@ -289,9 +440,39 @@ def test_files(tmp_path):
     for text, message in (
         ("EDGE_SE3:QUAT 0 1 1 0 0 0 0 0 1" + 21 * " 1", "expected a vertex for each end"),
         ("VERTEX_SE3:QUAT 0 1 0 0 0 0 0", "cannot be read as a pose graph"),
-        ("VERTEX_SE3:QUAT 0 1 0 0 0 0 0 0", "quaternions other than 0"),
+        ("VERTEX_SE3:QUAT 0 1 0 0 0 0 0 1\nEDGE_SE3:QUAT 0 2 1 0 0 0 0 0 1" + 21 * " 1", "a vertex for each end"),
+        ("VERTEX_SE3:QUAT 0 1 0 0 0 0 0 0", r"c\.g2o: .*quaternions other than 0"),
         ("", "expected a vertex"),
     ):
         (tmp_path / "c.g2o").write_text(text)
         with pytest.raises(ValueError, match=message):
             mcg.io.read_g2o(tmp_path / "c.g2o")
+
+
+def test_files_are_those_of_others(tmp_path):
+    """Vertices in any order and with any numbers, a quaternion of any length, and distinct numbers everywhere."""
+    upper = [100, 1, 2, 3, 4, 5, 200, 6, 7, 8, 9, 300, 10, 11, 12, 400, 13, 14, 500, 15, 600]
+    lines = [
+        "VERTEX_SE3:QUAT 7 1 2 3 0 0 1 1",
+        "FIX 3",
+        "VERTEX_SE3:QUAT 3 4 5 6 0.2 0 0 0",
+        "VERTEX_SE3:QUAT 4 0 0 0 0 0 0 1",
+        "EDGE_SE3:QUAT 3 7 7 8 9 0 0.6 0 0.8 " + " ".join(map(str, upper)),
+        "EDGE_SE3:QUAT 4 3 0 0 0 0 0 0 1 " + " ".join(map(str, upper)),
+    ]
+    (tmp_path / "a.g2o").write_text("\n".join(lines))
+    graph = mcg.io.read_g2o(tmp_path / "a.g2o")
+    turned = [[[1, 0, 0, 4], [0, -1, 0, 5], [0, 0, -1, 6]], np.eye(3, 4), [[0, -1, 0, 1], [1, 0, 0, 2], [0, 0, 1, 3]]]
+    np.testing.assert_allclose(graph.poses[:, :3], turned, atol=1e-15)
+    np.testing.assert_allclose(graph.edges.T_i_j[0, :3], [[0.28, 0, 0.96, 7], [0, 1, 0, 8], [-0.96, 0, 0.28, 9]])
+    for field, expected in (("i", [0, 1]), ("j", [2, 0]), ("loop", [True, False])):
+        np.testing.assert_array_equal(getattr(graph.edges, field), expected)
+    information = graph.edges.information[0]
+    np.testing.assert_array_equal(np.diag(information), [100, 200, 300, 400, 500, 600])
+    np.testing.assert_array_equal(information[0, 1:], [1, 2, 3, 4, 5])
+    np.testing.assert_array_equal(information, information.T)
+    mcg.io.write_g2o(tmp_path / "b.g2o", graph)
+    vertex, *_, edge, _ = (tmp_path / "b.g2o").read_text().splitlines()
+    assert vertex.split()[0] == "VERTEX_SE3:QUAT" and edge.split()[0] == "EDGE_SE3:QUAT"
+    np.testing.assert_allclose(np.array(vertex.split()[1:], float), [0, 4, 5, 6, 1, 0, 0, 0], atol=1e-15)
+    np.testing.assert_allclose(np.array(edge.split()[1:], float), [0, 2, 7, 8, 9, 0, 0.6, 0, 0.8, *upper], rtol=1e-12)

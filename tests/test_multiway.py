@@ -4,9 +4,12 @@ import numpy as np
 import pytest
 
 import mcgicp_jax as mcg
-from mcgicp_jax import datasets, io, metrics
+from mcgicp_jax import _loops, datasets, io, metrics
 from mcgicp_jax.__main__ import main
-from mcgicp_jax._loops import edge_from
+from mcgicp_jax._loops import Trajectory, edge_from
+from mcgicp_jax._multiway import _overlapping
+from mcgicp_jax._options import Options
+from tests.graphs import pose
 from tests.scenes import motion, pair, wall
 
 
@@ -60,6 +63,55 @@ def test_odometry_closes_loops(room):
         next(mcg.odometry(frames, mcg.GICP(), loops=True, against="map"))
 
 
+def trajectory(**options):
+    """One with frames along x, a metre apart; their points have a median range of 1 m."""
+    found = Trajectory(mcg.GICP(), Options(**options))
+    found._clouds = [mcg.PointCloud(np.eye(3) * [0.5, 1, 2] + [0, 0, 1e-9 * k]) for k in range(5)]
+    found._poses = [pose((k, 0, 0), (0, 0, 0.1 * k)) for k in range(5)]
+    return found
+
+
+def test_loops_are_sought_where_they_may_be_and_help():
+    found = trajectory()
+    sure, blind = 1e4 * np.eye(6), np.zeros((6, 6))
+    found._edges = [mcg.Edge(0, 1, np.eye(4), sure), mcg.Edge(1, 2, np.eye(4), blind)]
+    # By row: distance, and deviation of its motion in units of that of a registration.
+    cases = [(1.9, 3), (2.1, 3), (2.1, 4), (1.9, 1.9), (0.0, 5), (99, 5), (1.0, 2.1)]
+    distances, factors = np.array(cases).T
+    frames, covariances = found._worthwhile(
+        4, np.arange(10, 17), distances, 1e-4 * factors[:, None, None] ** 2 * np.eye(6)
+    )
+    np.testing.assert_array_equal(frames, [14, 12, 10, 11, 16])
+    np.testing.assert_allclose(covariances[:, 0, 0], 1e-4 * np.array([5, 4, 3, 3, 2.1]) ** 2)
+
+
+def test_a_loop_is_registered_from_the_poses_within_their_uncertainty(monkeypatch):
+    calls = []
+    monkeypatch.setattr(_loops, "register_with", lambda *arguments: calls.append(arguments))
+    monkeypatch.setattr(_loops, "edge_from", lambda i, j, _, *, loop: mcg.Edge(i, j, np.eye(4), np.eye(6), loop=loop))
+    for sigma, given, expected in (
+        (1.0, (2.0, 0.5), (3.37, 0.5)),
+        (0.1, (2.0, 0.5), (2.0, 0.5)),
+        (0.1, 0.7, (0.7, 0.7)),
+    ):
+        found = trajectory(max_distance=given)
+        edge = found._registered(1, 4, sigma**2 * np.eye(6))
+        assert (edge.i, edge.j, edge.loop) == (1, 4, True)
+        source, target, _, init, options = calls.pop()
+        assert source is found._clouds[4] and target is found._clouds[1]
+        np.testing.assert_allclose(found._poses[1] @ init, found._poses[4], atol=1e-12)
+        np.testing.assert_allclose(options.max_distance, expected)
+
+
+def test_a_lost_frame_is_joined_by_an_edge_without_information():
+    found = trajectory()
+    found._clouds, found._poses, end = found._clouds[:1], found._poses[:1], found._poses[1]
+    found.add(mcg.PointCloud(np.eye(3)), end, mcg.Registration.without_pose(mcg.Status.LOST))
+    edges = found.graph.edges
+    assert (edges.i, edges.j, edges.loop) == (0, 1, False) and not np.any(edges.information)
+    np.testing.assert_allclose(found._poses[0] @ edges.T_i_j[0], end, atol=1e-12)
+
+
 def test_a_frame_that_is_lost_leaves_the_graph_whole(room):
     frames, _ = room
     lost = mcg.PointCloud(frames[0].cloud.points + 1000, frames[0].cloud.channels)
@@ -79,6 +131,19 @@ def test_many_clouds_get_one_map(room):
     assert 0 < len(found.map) < sum(len(cloud) for cloud in found.clouds)
 
 
+def test_pairs_are_those_of_largest_overlap_at_ever_larger_gaps():
+    side = np.arange(0.025, 1, 0.05)
+    cube = np.stack(np.meshgrid(side, side, side), axis=-1).reshape(-1, 3)
+    clouds = [mcg.PointCloud(cube)] * 7 + [mcg.PointCloud(cube[(cube < 0.3).all(axis=1)])]
+    poses = np.tile(np.eye(4), (8, 1, 1))
+    # Where the cubes begin. The overlap of the third with the first, 0.3, is too small. The last cube is a small one
+    # within the others.
+    poses[:, 0, 3] = [0, 0.4, 0.7, 0, 0.4, 5, 0.3, 0.5]
+    consecutive = [(k, k + 1) for k in range(7)]
+    expected = [*consecutive, (0, 3), (1, 4), (0, 4), (4, 6), (1, 6), (4, 7), (0, 7)]
+    assert sorted(_overlapping(clouds, poses, 0.1)) == sorted(expected)
+
+
 def test_pairs_and_starts_can_be_given(room):
     frames, truth = room
     clouds = [frame.cloud for frame in frames[:3]]
@@ -90,17 +155,33 @@ def test_pairs_and_starts_can_be_given(room):
     np.testing.assert_allclose(apart.poses[2], truth[2], atol=1e-12)
 
 
+def test_clouds_are_preprocessed_once_and_mapped_in_voxels():
+    points = np.random.default_rng(0).uniform(-1, 1, (300, 3))
+    start = pose((5, 0, 0), (0, 0, 1.0))
+    found = mcg.multiway([points], mcg.GICP(), init=[start], voxel_size=0.2, num_neighbors=7)
+    assert found.converged and found.registrations == {} and found.clouds[0].neighbors.shape[1] == 7
+    expected = mcg.aggregate(found.clouds, [start], 0.2)
+    np.testing.assert_allclose(found.map.coordinates, expected.coordinates, atol=1e-9)
+    again = mcg.multiway(found.clouds, mcg.GICP(), init=[start], voxel_size=1.0)
+    assert again.clouds[0] is found.clouds[0] and len(again.map) < 0.3 * len(found.map)
+
+
 def test_what_is_wrong_is_named(room):
     cloud = room[0][0].cloud
     for arguments, message in (
         (([], mcg.GICP()), "clouds: expected at least one"),
         (([cloud, np.zeros((2, 3))], mcg.GICP()), r"clouds\[1\]: "),
-        (([cloud, cloud], mcg.GICP(), [(0, 2)]), r"pairs\[0\]: expected two different rows from 0 to 1"),
+        *(
+            (([cloud, cloud], mcg.GICP(), [(0, 1), wrong]), r"pairs\[1\]: expected two different rows from 0 to 1")
+            for wrong in ((0, 2), (-1, 0), (1, 1))
+        ),
     ):
         with pytest.raises(ValueError, match=message):
             mcg.multiway(*arguments)
     with pytest.raises(ValueError, match="init: expected one pose per cloud, 2, got 1"):
         mcg.multiway([cloud, cloud], mcg.GICP(), init=[np.eye(4)])
+    with pytest.raises(ValueError, match=r"init\[1\]: expected a rigid motion"):
+        mcg.multiway([cloud, cloud], mcg.GICP(), init=[np.eye(4), 2 * np.eye(4)])
 
 
 def test_the_command(room, tmp_path, capsys):
