@@ -104,18 +104,38 @@ def point_spacing(cloud: PointCloud) -> Float[AnyScalar, ""]:
 
     Some files hold points twice, and some scanners report each beam without an echo as a point at the origin.
     """
+    distances = _neighbor_distances(cloud)
+    xp = namespace(distances)
+    nearest = xp.min(xp.where(distances > 0, distances, xp.inf), axis=1)
+    return xp.nan_to_num(median(xp.where(xp.isfinite(nearest), nearest, xp.nan)))
+
+
+def grid_spacing(cloud: PointCloud) -> Float[AnyScalar, ""]:
+    """Spacing of a square grid with the density of the points, metres: √(π/k) times the median distance of the k-th
+    neighbour.
+
+    Where points lie on scan lines, it is larger than `point_spacing`, which is the spacing along the lines.
+    """
+    distances = _neighbor_distances(cloud)
+    xp = namespace(distances)
+    known = xp.isfinite(distances)
+    count = xp.sum(known, axis=1)
+    grid = xp.max(xp.where(known, distances, 0), axis=1) * xp.sqrt(xp.pi / xp.maximum(count, 1))
+    return xp.nan_to_num(median(xp.where(count > 1, grid, xp.nan))).astype(distances.dtype)
+
+
+def _neighbor_distances(cloud: PointCloud) -> Float[AnyArray, "n k"]:
+    """Distances between sampled points and their neighbours, metres; infinite where there is none."""
     check_neighbors(cloud)
     xp = namespace(cloud)
     rows, counts = sampled_rows(xp.asarray(cloud.valid))
     neighbors = xp.asarray(cloud.neighbors)[rows]
-    present = counts[:, None] & (neighbors >= 0)
     square = xp.zeros(neighbors.shape, cloud.points.dtype)
     # Distances that overflow become infinite and are ignored.
     with np.errstate(over="ignore", invalid="ignore"):
         for coordinate in xp.asarray(cloud.points).T:
             square = square + (coordinate[xp.maximum(neighbors, 0)] - coordinate[rows, None]) ** 2
-    nearest = xp.min(xp.where(present & (square > 0), square, xp.inf), axis=1)
-    return xp.nan_to_num(median(xp.where(xp.isfinite(nearest), xp.sqrt(nearest), xp.nan)))
+    return xp.sqrt(xp.where(counts[:, None] & (neighbors >= 0) & xp.isfinite(square), square, xp.inf))
 
 
 def with_channels_matched(source: PointCloud, target: PointCloud, matches: Correspondences | None = None) -> PointCloud:

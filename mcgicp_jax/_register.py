@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.typing import ArrayLike
 
-from mcgicp_jax._channels import warn_of_units, with_channels_matched
+from mcgicp_jax._channels import grid_spacing, warn_of_units, with_channels_matched
 from mcgicp_jax._cloud import PointCloud, Values
 from mcgicp_jax._cost import centred_pose, check_matches
 from mcgicp_jax._dense import default_search
@@ -35,7 +35,8 @@ from mcgicp_jax._traced import align_traced, assess, differentiable, register_tr
 
 # Default maximum correspondence distances of the coarse and the fine phase, in spacings of the target. With the larger
 # one, starts several spacings off converge, but matches across edges and the border of the overlap bias the final pose;
-# the smaller one rejects these.
+# the smaller one rejects these. The coarse phase needs the spacing between scan lines, too: with that along the lines
+# alone, raw scans of KITTI, 1.3 m apart, stayed at the identity.
 _COARSE_SPACINGS, _FINE_SPACINGS = 10.0, 2.5
 # Default translation tolerance, in spacings of the target: 0.5 mm at 0.1 m, chosen like `ROTATION_TOLERANCE`.
 _TOLERANCE_IN_SPACINGS = 0.005
@@ -240,7 +241,9 @@ def register(
             inside transformations.
         max_distance: maximum correspondence distance, metres of position; matches beyond it are rejected. One number,
             or two, for the coarse and the fine phase. None: 10 and 2.5 times the spacing of the target (its median
-            nearest-neighbour distance; the edge of its cells). If `init` is further off, pass a larger value.
+            nearest-neighbour distance; the edge of its cells), and the first at least 10 times the spacing of a square
+            grid as dense as the target, which in LiDAR scans reaches from line to line. If `init` is further off, pass
+            a larger value.
         max_iterations: maximum number of pose updates in both phases together.
         translation_tolerance, rotation_tolerance: metres (at the centroid of the matches) and radians; the loop has
             converged when an update is below both. `translation_tolerance` None: 0.5 % of the spacing of the target.
@@ -377,9 +380,12 @@ def pose_problem(
     return Problem(start, seen, there, method, robust, _settings(options, method, target, stride, dtype))
 
 
-def default_distances(spacing: Any) -> tuple[Any, Any]:
-    """Default `max_distance` of the coarse and the fine phase, metres, for a target with this spacing."""
-    return spacing * _COARSE_SPACINGS, spacing * _FINE_SPACINGS
+def default_distances(method: AbstractMethod, target: PointCloud) -> tuple[Any, Any]:
+    """Default `max_distance` of the coarse and the fine phase, metres."""
+    spacing = constant(method.spacing(target))
+    # Cells have the spacing of their grid.
+    between = spacing if target.covariances is not None else constant(grid_spacing(target))
+    return _COARSE_SPACINGS * namespace(spacing, between).maximum(spacing, between), _FINE_SPACINGS * spacing
 
 
 def _settings(options: Options, method: AbstractMethod, target: PointCloud, stride: Any, dtype: Any) -> Settings:
@@ -387,7 +393,7 @@ def _settings(options: Options, method: AbstractMethod, target: PointCloud, stri
     tolerance: Any = options.translation_tolerance
     # Options are constants to autodiff, even if they are derived from a differentiated cloud.
     spacing = constant(method.spacing(target))
-    max_distance = default_distances(spacing) if max_distance is None else max_distance
+    max_distance = default_distances(method, target) if max_distance is None else max_distance
     least = spacing * _TOLERANCE_IN_SPACINGS
     tolerance = least if tolerance is None else tolerance
 

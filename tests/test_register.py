@@ -338,15 +338,35 @@ def test_some_of_the_points_find_the_pose_and_all_settle_it(room, monkeypatch):
 
 def test_the_default_distances_come_from_the_spacing(room):
     source, target, truth = room
-    rows = np.asarray(target.neighbors)[: len(target), 1]
+    rows = np.asarray(target.neighbors)[: len(target)]
     points = np.asarray(target.points)
-    spacing = np.median(np.linalg.norm(points[rows] - points[: len(target)], axis=1))
+    spacing, last = np.median(np.linalg.norm(points[rows[:, [1, 19]]] - points[: len(target), None], axis=2), axis=0)
+    grid = np.sqrt(np.pi / 20) * last
     method = METHODS["mc-gicp"]
     result = mcg.register(source, target, method)
-    given = mcg.register(source, target, method, max_distance=(10 * spacing, 2.5 * spacing))
+    given = mcg.register(source, target, method, max_distance=(10 * max(spacing, grid), 2.5 * spacing))
+    assert grid > 1.2 * spacing
     assert result.converged and difference(result.matrix, truth) < 4e-3
     assert difference(result.matrix, given.matrix) < 1e-6
     assert difference(jax.jit(lambda s: mcg.register(s, target, method).matrix)(source), result.matrix) < 2e-4
+
+
+def test_scan_lines_do_not_keep_the_pose_at_its_start():
+    """Points 2 cm apart along lines that are 14 cm apart; the start is off by several lines."""
+    rng = np.random.default_rng(0)
+
+    def scan():
+        along, line = np.meshgrid(np.arange(-2, 2, 0.02), np.arange(-2, 2, 0.14))
+        flat = np.stack([along, line + 0.14 * rng.random(), np.zeros_like(along)], axis=-1).reshape(-1, 3)
+        walls = [np.roll(flat, i, axis=1) + shift for i, shift in enumerate(([0, 0, 0], [-2, 0, 2], [0, 2, 2]))]
+        return mcg.preprocess(np.concatenate(walls) + 0.003 * rng.normal(size=(3 * len(flat), 3)))
+
+    source, target = scan(), scan()
+    start = motion((0.4, -0.4, 0.4, 0.0, 0.0, 0.05))
+    result = mcg.register(source, target, mcg.GICP(), init=start)
+    assert result.converged and difference(result.matrix, np.eye(4)) < 5e-3
+    near = mcg.register(source, target, mcg.GICP(), init=start, max_distance=(0.2, 0.05))
+    assert difference(near.matrix, np.eye(4)) > 0.1
 
 
 @pytest.mark.slow
