@@ -22,7 +22,7 @@ from mcgicp_jax._normal_equations import (
     relative_twists,
 )
 from mcgicp_jax._pose import is_concrete, matrices_of, parameters_of
-from mcgicp_jax._pose_graph import Edge, PoseGraph
+from mcgicp_jax._pose_graph import WORLD, Edge, PoseGraph
 from mcgicp_jax._result import Status
 
 # Squared Mahalanobis distance beyond which a loop is rejected: the 99 % quantile of χ² with six degrees of freedom.
@@ -48,7 +48,7 @@ class PoseGraphResult(eqx.Module):
     """Result of `optimize_poses`; a pytree.
 
     Attributes:
-        poses: (n, 4, 4), sensor to world, metres; the first one is that of the graph.
+        poses: (n, 4, 4), sensor to world, metres; without priors, the first one is that of the graph.
         edges: the m edges of the graph, rejected ones included.
         status_code: integer value of `status`.
         num_iterations: number of Levenberg-Marquardt steps.
@@ -82,11 +82,12 @@ class PoseGraphResult(eqx.Module):
 
     @property
     def covariance(self) -> Float[Array, "n 6 6"] | Float[np.ndarray, "n 6 6"]:
-        """(n, 6, 6) covariance of every pose relative to the first: of ξ = (v, ω) in T exp(ξ), metres and radians.
+        """(n, 6, 6) covariance of every pose: of ξ = (v, ω) in T exp(ξ), metres and radians.
 
+        It is relative to the first pose or, with priors, to the world.
         The inverse of the Gauss-Newton matrix of the edges that were used. It is right if the information of the edges
         is, and does not cover the risk that a false loop was kept or a true one rejected. Computed when first read. The
-        diagonal is infinite for poses that no edges connect with the first.
+        diagonal is infinite for poses that no edges connect with the first pose or, with priors, the world.
         """
         return self.uncertainty.value
 
@@ -95,8 +96,8 @@ class PoseGraphResult(eqx.Module):
         """The `Status`; inside a transformation the array `status_code`.
 
         CONVERGED; MAX_ITERATIONS; NON_FINITE: poses or residuals overflow; DEGENERATE: the edges do not connect all
-        poses, or leave a direction of motion of at least one pose unconstrained. Along unconstrained directions the
-        motion between poses stays near that of the start.
+        poses with each other or with the world, or leave a direction of motion of at least one pose unconstrained.
+        Along unconstrained directions the motion between poses stays near that of the start.
         """
         return Status(int(np.asarray(self.status_code))) if is_concrete(self.status_code) else self.status_code
 
@@ -118,11 +119,11 @@ class PoseGraphResult(eqx.Module):
 def optimize_poses(graph: PoseGraph, *, robust: bool = True, max_iterations: int = 100) -> PoseGraphResult:
     """Find the poses that minimise Σ rᵀΛr over the edges, with r = log(T_i_j⁻¹ T_i⁻¹ T_j) and their information Λ.
 
-    Runs Levenberg-Marquardt from the poses of the graph; the first pose is held. Concrete graphs are solved on the host
-    by sparse factorisation, and graphs of other sizes compile nothing new. Inside transformations the solver is dense
-    and compiles for every size, which suits some hundreds of poses. The poses are then differentiable with respect to
-    the motions and the information of the edges, by the implicit function theorem, but not with respect to the start.
-    The derivative is 0 if the solver does not converge.
+    Runs Levenberg-Marquardt from the poses of the graph. The first pose is held, unless there are edges from the world
+    (priors). Concrete graphs are solved on the host by sparse factorisation, and graphs of other sizes compile nothing
+    new. Inside transformations the solver is dense and compiles for every size, which suits some hundreds of poses. The
+    poses are then differentiable with respect to the motions and the information of the edges, by the implicit function
+    theorem, but not with respect to the start. The derivative is 0 if the solver does not converge.
 
     Args:
         graph: poses and edges.
@@ -145,7 +146,7 @@ def optimize_poses(graph: PoseGraph, *, robust: bool = True, max_iterations: int
         raise ValueError(f"max_iterations: expected an integer of at least 1, got {max_iterations!r}")
     if not is_concrete(graph):
         return _traced(graph, robust, int(max_iterations))
-    edges, start = graph.edges, parameters_of(np.asarray(graph.poses))
+    edges, start = graph.edges, _start(graph)
     loops = np.asarray(edges.loop) & bool(robust)
     # Overflow is a status.
     with np.errstate(over="ignore", invalid="ignore"):
@@ -153,20 +154,26 @@ def optimize_poses(graph: PoseGraph, *, robust: bool = True, max_iterations: int
         found, weights = _robust_minimum(equations, start, loops, int(max_iterations))
         status, cost = _status(equations, found, weights), found.terms.cost(weights)
     return PoseGraphResult.build(
-        poses=matrices_of(found.poses),
+        poses=matrices_of(found.poses[: len(graph.poses)]),
         edges=edges,
         status_code=np.int32(status),
         num_iterations=np.int32(found.num_iterations),
         cost=np.float64(cost),
         residuals=np.sqrt(np.maximum(found.terms.squares, 0)),
         weights=weights,
-        uncertainty=Deferred(lambda: Certainty(equations, found, weights).covariances()),
+        uncertainty=Deferred(lambda: Certainty(equations, found, weights).covariances()[: len(graph.poses)]),
     )
+
+
+def _start(graph: PoseGraph) -> Float[np.ndarray, "_ 7"]:
+    """Parameters of the poses; with priors, those of the world are the last ones."""
+    poses = np.asarray(graph.poses)
+    return parameters_of(np.concatenate([poses, np.eye(4)[None]]) if np.any(graph.edges.i == WORLD) else poses)
 
 
 def certainty_of(graph: PoseGraph) -> Certainty:
     """Certainty at the poses of the graph, taken to be its minimum; of the edges that fit there."""
-    poses = parameters_of(np.asarray(graph.poses))
+    poses = _start(graph)
     equations = NormalEquations(graph.edges, poses)
     terms = equations.terms(poses)
     weights = np.where(np.asarray(graph.edges.loop), 1.0 * (terms.squares <= LARGEST_SQUARE), 1)
@@ -260,7 +267,7 @@ def _is_degenerate(equations: NormalEquations, found: Minimum, weights: Float[np
 
     By inverse iteration with the last factorisation of the minimisation.
     """
-    if np.any(equations.parts != equations.parts[0]):
+    if np.any(equations.parts != equations.parts[equations.root]):
         return True
     if not equations.size or found.solve is None:
         return False
@@ -285,7 +292,7 @@ class Certainty:
                 self._solve = np.linalg.inv(matrix.toarray()).__matmul__ if small else factored(matrix)
 
     def covariances(self) -> Float[np.ndarray, "n 6 6"]:
-        """Of every pose, relative to the first."""
+        """Of every pose, relative to the root."""
         equations = self._equations
         covariances = np.zeros((len(self._poses), 6, 6))
         if self._solve is None and equations.size:
@@ -302,7 +309,7 @@ class Certainty:
         free = ~equations.held
         covariances[free] = equations.spread(found.reshape(-1, 6))[free]
         covariances = 0.5 * (covariances + covariances.swapaxes(1, 2))
-        covariances[equations.parts != equations.parts[0]] = np.diag(np.full(6, np.inf))
+        covariances[equations.parts != equations.parts[equations.root]] = np.diag(np.full(6, np.inf))
         return covariances
 
     def between(self, i: Int[np.ndarray, "k"], j: Int[np.ndarray, "k"]) -> Float[np.ndarray, "k 6 6"]:

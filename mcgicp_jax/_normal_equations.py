@@ -21,7 +21,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from mcgicp_jax._blocks import map_rows
 from mcgicp_jax._pose import parameters_of
-from mcgicp_jax._pose_graph import Edge
+from mcgicp_jax._pose_graph import WORLD, Edge
 
 # Edges or poses of a block: small, since most graphs are. Blocks of 2,048 take 4 times as long for 300 edges.
 _BLOCK = 256
@@ -124,12 +124,14 @@ class Terms:
 class NormalEquations:
     """The sparse equations (H + λD) ξ = −g of a graph.
 
-    The first pose of every connected part is held. The order of elimination is found once, by minimum degree on the
+    Edges from the world start at the last pose, the identity, which is then held. Of every other connected part, the
+    first pose is held. The order of elimination is found once, by minimum degree on the
     graph of poses, and so is the place of every block in the matrix.
 
     Attributes:
         held: which poses do not move.
         parts: number of the connected part of each pose.
+        root: the held pose to which covariances refer: the first one, or the world.
         information: Λ of every edge.
         metric: the sparse matrix D of the damping, at the poses given.
     """
@@ -139,19 +141,21 @@ class NormalEquations:
         from scipy.sparse import coo_array
         from scipy.sparse.csgraph import connected_components
 
-        num_poses = len(poses)
-        self._i, self._j = np.asarray(edges.i), np.asarray(edges.j)
+        num_poses, of_world = len(poses), np.asarray(edges.i) == WORLD
+        self.root = num_poses - 1 if of_world.any() else 0
+        self._i, self._j = np.where(of_world, self.root, edges.i), np.asarray(edges.j)
         self._measured = parameters_of(np.asarray(edges.T_i_j))
         self.information = np.asarray(edges.information)
         graph = coo_array((np.ones(len(edges)), (self._i, self._j)), (num_poses, num_poses))
         _, self.parts = connected_components(graph, directed=False)
+        held = np.unique(self.parts, return_index=True)[1]
+        held[self.parts[self.root]] = self.root
         self.held = np.zeros(num_poses, bool)
-        self.held[np.unique(self.parts, return_index=True)[1]] = True
+        self.held[held] = True
         self._place = np.full(num_poses, -1)
         self._place[~self.held] = _elimination_order(graph, self.held)
         self._lay_out()
-        typical = np.broadcast_to(_typical(self.information), self.information.shape)
-        self.metric = self.matrix(self._evaluated(poses, typical).blocks)
+        self.metric = self.matrix(self._evaluated(poses, _typical(self.information, of_world)).blocks)
 
     @property
     def size(self) -> int:
@@ -260,11 +264,20 @@ def factored(matrix: Any) -> Callable[[np.ndarray], np.ndarray]:
     return splu(matrix, permc_spec="NATURAL", diag_pivot_thresh=0.0, options=options).solve
 
 
-def _typical(information: Float[np.ndarray, "m 6 6"]) -> Float[np.ndarray, "6 6"]:
-    """S: the median over edges of the mean information, of translation and of rotation, on the diagonal."""
+def _typical(information: Float[np.ndarray, "m 6 6"], of_world: Bool[np.ndarray, "m"]) -> Float[np.ndarray, "m 6 6"]:
+    """S of every edge: on the diagonal, the median over edges of the mean information, of translation and of rotation.
+
+    Edges from the world have their own: next to motions that are known to millimetres, positions known to metres would
+    else look unconstrained.
+    """
     diagonal = np.diagonal(information, axis1=1, axis2=2).reshape(-1, 2, 3).mean(axis=2)
-    found = [np.median(values[values > 0]) if (values > 0).any() else 1.0 for values in diagonal.T]
-    return np.diag(np.repeat(found, 3))
+    typical = np.ones_like(diagonal)
+    for counted, edges in ((~of_world, slice(None)), (of_world, of_world)):
+        for kind, values in enumerate(diagonal.T):
+            known = values[counted & (values > 0)]
+            if len(known):
+                typical[edges, kind] = np.median(known)
+    return np.repeat(typical, 3, axis=1)[:, :, None] * np.eye(6)
 
 
 def _elimination_order(graph: Any, held: Bool[np.ndarray, "n"]) -> Int[np.ndarray, "k"]:
