@@ -151,7 +151,7 @@ def optimize_poses(graph: PoseGraph, *, robust: bool = True, max_iterations: int
     # Overflow is a status.
     with np.errstate(over="ignore", invalid="ignore"):
         equations = NormalEquations(edges, start)
-        found, weights = _robust_minimum(equations, start, loops, int(max_iterations))
+        equations, found, weights = _robust_minimum(equations, start, loops, int(max_iterations))
         status, cost = _status(equations, found, weights), found.terms.cost(weights)
     return PoseGraphResult.build(
         poses=matrices_of(found.poses[: len(graph.poses)]),
@@ -177,7 +177,7 @@ def certainty_of(graph: PoseGraph) -> Certainty:
     equations = NormalEquations(graph.edges, poses)
     terms = equations.terms(poses)
     weights = np.where(np.asarray(graph.edges.loop), 1.0 * (terms.squares <= LARGEST_SQUARE), 1)
-    return Certainty(equations, Minimum(poses, terms), weights)
+    return Certainty(equations.restricted(weights > 0), Minimum(poses, terms), weights)
 
 
 def _traced(graph: PoseGraph, robust: bool, max_iterations: int) -> PoseGraphResult:
@@ -200,8 +200,8 @@ def _traced(graph: PoseGraph, robust: bool, max_iterations: int) -> PoseGraphRes
 
 def _robust_minimum(
     equations: NormalEquations, start: Float[np.ndarray, "n 7"], loops: Bool[np.ndarray, "m"], max_iterations: int
-) -> tuple[Minimum, Float[np.ndarray, "m"]]:
-    """The minimum and the weights of the edges.
+) -> tuple[NormalEquations, Minimum, Float[np.ndarray, "m"]]:
+    """The equations of the edges that are kept, the minimum, and the weights of all edges.
 
     Truncated squares min(r², c²) are approached from a function of which the largest residual is in the convex part.
     """
@@ -209,22 +209,24 @@ def _robust_minimum(
     largest = found.terms.squares[loops].max(initial=0)
     if not largest > LARGEST_SQUARE:
         weights = np.ones(len(loops))
-        return minimize(equations, found, weights, max_iterations), weights
+        return equations, minimize(equations, found, weights, max_iterations), weights
     control = LARGEST_SQUARE / (2 * largest - LARGEST_SQUARE)
     while True:
         weights = np.where(loops, _truncated_weights(found.terms.squares, control), 1)
         if np.all((weights == 0) | (weights == 1)):
             break
+        equations = equations.restricted(weights > 0)
         found = minimize(equations, found, weights, _STEPS)
         control *= _GROWTH
+    chosen = weights
     for _ in range(_CHOICES):
+        weights, equations = chosen, equations.restricted(chosen > 0)
         found = minimize(equations, found, weights, max_iterations)
         chosen = np.where(loops, 1.0 * (found.terms.squares <= LARGEST_SQUARE), 1)
         chosen[_wrongly_rejected(equations, found, weights)] = 1
         if np.array_equal(chosen, weights):
             break
-        weights = chosen
-    return found, weights
+    return equations, found, weights
 
 
 def _wrongly_rejected(

@@ -128,7 +128,10 @@ class NormalEquations:
     first pose is held. The order of elimination is found once, by minimum degree on the
     graph of poses, and so is the place of every block in the matrix.
 
+    Only edges in use have a place: false loops between distant poses would fill the factors with numbers.
+
     Attributes:
+        used: which edges are in use.
         held: which poses do not move.
         parts: number of the connected part of each pose.
         root: the held pose to which covariances refer: the first one, or the world.
@@ -136,17 +139,20 @@ class NormalEquations:
         metric: the sparse matrix D of the damping, at the poses given.
     """
 
-    def __init__(self, edges: Edge, poses: Float[np.ndarray, "n 7"]):
+    def __init__(self, edges: Edge, poses: Float[np.ndarray, "n 7"], used: Bool[np.ndarray, "m"] | None = None):
         # Imported late, as SciPy's sparse matrices take a tenth of the import time of the package.
         from scipy.sparse import coo_array
         from scipy.sparse.csgraph import connected_components
 
+        self._edges, self._start = edges, poses
+        self.used = np.ones(len(edges), bool) if used is None else used
         num_poses, of_world = len(poses), np.asarray(edges.i) == WORLD
         self.root = num_poses - 1 if of_world.any() else 0
         self._i, self._j = np.where(of_world, self.root, edges.i), np.asarray(edges.j)
         self._measured = parameters_of(np.asarray(edges.T_i_j))
         self.information = np.asarray(edges.information)
-        graph = coo_array((np.ones(len(edges)), (self._i, self._j)), (num_poses, num_poses))
+        ends = self._i[self.used], self._j[self.used]
+        graph = coo_array((np.ones(len(ends[0])), ends), (num_poses, num_poses))
         _, self.parts = connected_components(graph, directed=False)
         held = np.unique(self.parts, return_index=True)[1]
         held[self.parts[self.root]] = self.root
@@ -161,6 +167,10 @@ class NormalEquations:
     def size(self) -> int:
         """Number of unknowns."""
         return 6 * int((~self.held).sum())
+
+    def restricted(self, used: Bool[np.ndarray, "m"]) -> NormalEquations:
+        """The equations of some of the edges."""
+        return self if np.array_equal(used, self.used) else NormalEquations(self._edges, self._start, used)
 
     def terms(self, poses: Float[np.ndarray, "n 7"]) -> Terms:
         """Evaluate all edges."""
@@ -233,7 +243,7 @@ class NormalEquations:
         """Places of the contributions of the edges in the compressed columns of the matrix."""
         a, b = self._place[self._i], self._place[self._j]
         rows, columns = np.concatenate([a, b, a, b]), np.concatenate([a, b, b, a])
-        inside = np.flatnonzero((rows >= 0) & (columns >= 0))
+        inside = np.flatnonzero((rows >= 0) & (columns >= 0) & np.tile(self.used, 4))
         self._order = inside[np.lexsort((rows[inside], columns[inside]))]
         rows, columns = rows[self._order], columns[self._order]
         new = np.ones(len(rows), bool)
@@ -320,7 +330,10 @@ class Minimum(NamedTuple):
 def minimize(
     equations: NormalEquations, start: Minimum, weights: Float[np.ndarray, "m"], max_iterations: int
 ) -> Minimum:
-    """Lower ½ Σ w rᵀΛr by Levenberg-Marquardt steps until one lowers it by no more than tolerance and rounding."""
+    """Lower ½ Σ w rᵀΛr by Levenberg-Marquardt steps until one lowers it by no more than tolerance and rounding.
+
+    The weights of edges that are not in use are 0.
+    """
     poses, terms, count, _, damping, solve = start
     cost, system = terms.cost(weights), None
     end = count + max_iterations
