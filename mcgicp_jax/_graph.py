@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import contextlib
 from typing import Any
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.typing import ArrayLike
@@ -24,6 +24,7 @@ from mcgicp_jax._normal_equations import (
 from mcgicp_jax._pose import is_concrete, matrices_of, parameters_of
 from mcgicp_jax._pose_graph import WORLD, Edge, PoseGraph
 from mcgicp_jax._result import Status
+from mcgicp_jax._sparse_inverse import inverse_blocks
 
 # Squared Mahalanobis distance beyond which a loop is rejected: the 99 % quantile of χ² with six degrees of freedom.
 LARGEST_SQUARE = 16.811893829770927
@@ -38,10 +39,6 @@ _CHOICES = 5
 _NEAR = 4.0
 # Inverse iterations for the least constrained direction: unconstrained ones stand out by factors of 1e3 and more.
 _INVERSE_ITERATIONS = 4
-# Unknowns up to which covariances come from the dense inverse: for 300 poses it is seven times as quick as SuperLU.
-_DENSE = 1800
-# Columns of the inverse computed at once, to bound memory.
-_COLUMNS = 252
 
 
 class PoseGraphResult(eqx.Module):
@@ -161,7 +158,7 @@ def optimize_poses(graph: PoseGraph, *, robust: bool = True, max_iterations: int
         cost=np.float64(cost),
         residuals=np.sqrt(np.maximum(found.terms.squares, 0)),
         weights=weights,
-        uncertainty=Deferred(lambda: Certainty(equations, found, weights).covariances()[: len(graph.poses)]),
+        uncertainty=Deferred(lambda: _covariances(equations, found, weights)[: len(graph.poses)]),
     )
 
 
@@ -171,13 +168,18 @@ def _start(graph: PoseGraph) -> Float[np.ndarray, "_ 7"]:
     return parameters_of(np.concatenate([poses, np.eye(4)[None]]) if np.any(graph.edges.i == WORLD) else poses)
 
 
-def certainty_of(graph: PoseGraph) -> Certainty:
-    """Certainty at the poses of the graph, taken to be its minimum; of the edges that fit there."""
-    poses = _start(graph)
-    equations = NormalEquations(graph.edges, poses)
-    terms = equations.terms(poses)
-    weights = np.where(np.asarray(graph.edges.loop), 1.0 * (terms.squares <= LARGEST_SQUARE), 1)
-    return Certainty(equations.restricted(weights > 0), Minimum(poses, terms), weights)
+def motion_covariances(
+    graph: PoseGraph, i: Int[np.ndarray, "k"], j: Int[np.ndarray, "k"]
+) -> Float[np.ndarray, "k 6 6"]:
+    """Covariances of ξ in T_i⁻¹ T_j exp(ξ), at the poses of the graph, taken to be its minimum.
+
+    Loops that do not fit there do not count.
+    """
+    poses, edges = _start(graph), graph.edges
+    squares = NormalEquations(edges, poses).terms(poses).squares
+    weights = np.where(np.asarray(edges.loop), 1.0 * (squares <= LARGEST_SQUARE), 1)
+    none = np.zeros((len(i), 6, 6))
+    return _motion_covariances(edges, poses, weights, Edge(i, j, none[:, :4, :4], none))
 
 
 def _traced(graph: PoseGraph, robust: bool, max_iterations: int) -> PoseGraphResult:
@@ -237,10 +239,10 @@ def _wrongly_rejected(
     """
     squares = found.terms.squares
     near = np.flatnonzero((weights == 0) & (squares > LARGEST_SQUARE) & (squares <= _NEAR * LARGEST_SQUARE))
-    certainty = Certainty(equations, found, weights) if len(near) else None
-    if certainty is None:
+    if not len(near):
         return near
-    residuals, between = equations.residuals(found.poses, near), certainty.between(*equations.ends(near))
+    residuals = equations.residuals(found.poses, near)
+    between = _motion_covariances(equations.edges, found.poses, weights, equations.edges[near])
     # rᵀ(Λ⁻¹ + Σ)⁻¹r without the inverse of Λ, which may be singular.
     information = equations.information[near]
     inner = np.linalg.solve(np.eye(6) + information @ between, information @ residuals[..., None])[..., 0]
@@ -281,47 +283,43 @@ def _is_degenerate(equations: NormalEquations, found: Minimum, weights: Float[np
     return bool(vector @ (matrix @ vector) < UNCONSTRAINED * (vector @ (equations.metric @ vector)))
 
 
-class Certainty:
-    """Covariances at a minimum, from one factorisation."""
+def _covariances(
+    equations: NormalEquations, found: Minimum, weights: Float[np.ndarray, "m"]
+) -> Float[np.ndarray, "n 6 6"]:
+    """Of every pose, relative to the root."""
+    covariances = _of_poses_and_edges(equations, found, weights, np.zeros(0, int))[0]
+    covariances[equations.parts != equations.parts[equations.root]] = np.diag(np.full(6, np.inf))
+    return covariances
 
-    def __init__(self, equations: NormalEquations, found: Minimum, weights: Float[np.ndarray, "m"]):
-        self._equations, self._poses = equations, found.poses
-        self._solve: Any = None
-        if equations.size:
-            matrix = equations.damped(equations.weighted(found.terms, weights))
-            with contextlib.suppress(RuntimeError, np.linalg.LinAlgError):
-                small = equations.size <= _DENSE
-                self._solve = np.linalg.inv(matrix.toarray()).__matmul__ if small else factored(matrix)
 
-    def covariances(self) -> Float[np.ndarray, "n 6 6"]:
-        """Of every pose, relative to the root."""
-        equations = self._equations
-        covariances = np.zeros((len(self._poses), 6, 6))
-        if self._solve is None and equations.size:
-            return np.full_like(covariances, np.nan)
-        rows = np.arange(equations.size).reshape(-1, 6)
-        found = np.zeros_like(rows[:, None] + np.zeros((6, 1)))
-        for first in range(0, equations.size, _COLUMNS):
-            columns = np.arange(first, min(first + _COLUMNS, equations.size))
-            right = np.zeros((equations.size, len(columns)))
-            right[columns, columns - first] = 1
-            blocks = self._solve(right).reshape(-1, 6, len(columns) // 6, 6)
-            here = np.arange(len(columns) // 6)
-            found[first // 6 + here] = blocks[first // 6 + here, :, here]
-        free = ~equations.held
-        covariances[free] = equations.spread(found.reshape(-1, 6))[free]
-        covariances = 0.5 * (covariances + covariances.swapaxes(1, 2))
-        covariances[equations.parts != equations.parts[equations.root]] = np.diag(np.full(6, np.inf))
-        return covariances
+def _motion_covariances(
+    edges: Edge, poses: Float[np.ndarray, "n 7"], weights: Float[np.ndarray, "m"], asked: Edge
+) -> Float[np.ndarray, "k 6 6"]:
+    """Of ξ in T_i⁻¹ T_j exp(ξ), between the ends of the edges that are asked for; their information does not count."""
+    used, number = edges[weights > 0], len(asked)
+    asked = Edge(asked.i, asked.j, np.tile(np.eye(4), (number, 1, 1)), np.zeros((number, 6, 6)))
+    every = jax.tree.map(lambda *values: np.concatenate(values), used, asked)
+    equations = NormalEquations(every, poses)
+    found = Minimum(poses, equations.terms(poses))
+    weights = np.concatenate([weights[weights > 0], np.ones(number)])
+    return _of_poses_and_edges(equations, found, weights, np.arange(len(used), len(every)))[1]
 
-    def between(self, i: Int[np.ndarray, "k"], j: Int[np.ndarray, "k"]) -> Float[np.ndarray, "k 6 6"]:
-        """Of the motion between poses: of ξ in T_i⁻¹ T_j exp(ξ)."""
-        change = relative_twists(self._poses[i], self._poses[j])
-        right = np.zeros((len(self._poses), 6, 6 * len(i)))
-        columns = np.arange(6 * len(i)).reshape(-1, 6)
-        for k in range(len(i)):
-            right[i[k], :, columns[k]] = change[k]
-            right[j[k], :, columns[k]] = np.eye(6)
-        vector = self._equations.gathered(right).reshape(self._equations.size, -1)
-        products = vector.T @ self._solve(vector)
-        return np.array([products[np.ix_(rows, rows)] for rows in columns])
+
+def _of_poses_and_edges(
+    equations: NormalEquations, found: Minimum, weights: Float[np.ndarray, "m"], rows: Int[np.ndarray, "k"]
+) -> tuple[Float[np.ndarray, "n 6 6"], Float[np.ndarray, "k 6 6"]]:
+    """Covariances of the poses and of the motions along some edges; NaN if the matrix is singular."""
+    covariances, (i, j) = np.zeros((len(found.poses), 6, 6)), equations.ends(rows)
+    crossed = np.zeros((len(rows), 6, 6))
+    if equations.size:
+        both = ~equations.held[i] & ~equations.held[j]
+        pairs = np.column_stack([equations.place[i], equations.place[j]])[both]
+        try:
+            factor = factored(equations.damped(equations.weighted(found.terms, weights)))
+            blocks, crossed[both] = inverse_blocks(factor, pairs)
+        except (RuntimeError, np.linalg.LinAlgError):
+            return np.full_like(covariances, np.nan), np.full_like(crossed, np.nan)
+        covariances[~equations.held] = blocks[equations.place[~equations.held]]
+    change = relative_twists(found.poses[i], found.poses[j]) if len(rows) else crossed
+    mixed, turned = change @ crossed, change.swapaxes(1, 2)
+    return covariances, change @ covariances[i] @ turned + covariances[j] + mixed + mixed.swapaxes(1, 2)

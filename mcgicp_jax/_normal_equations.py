@@ -131,7 +131,9 @@ class NormalEquations:
     Only edges in use have a place: false loops between distant poses would fill the factors with numbers.
 
     Attributes:
+        edges: all edges.
         used: which edges are in use.
+        place: place of each pose in the order of elimination; -1 for those that are held.
         held: which poses do not move.
         parts: number of the connected part of each pose.
         root: the held pose to which covariances refer: the first one, or the world.
@@ -144,7 +146,7 @@ class NormalEquations:
         from scipy.sparse import coo_array
         from scipy.sparse.csgraph import connected_components
 
-        self._edges, self._start = edges, poses
+        self.edges, self._start = edges, poses
         self.used = np.ones(len(edges), bool) if used is None else used
         num_poses, of_world = len(poses), np.asarray(edges.i) == WORLD
         self.root = num_poses - 1 if of_world.any() else 0
@@ -158,8 +160,8 @@ class NormalEquations:
         held[self.parts[self.root]] = self.root
         self.held = np.zeros(num_poses, bool)
         self.held[held] = True
-        self._place = np.full(num_poses, -1)
-        self._place[~self.held] = _elimination_order(graph, self.held)
+        self.place = np.full(num_poses, -1)
+        self.place[~self.held] = _elimination_order(graph, self.held)
         self._lay_out()
         self.metric = self.matrix(self._evaluated(poses, _typical(self.information, of_world)).blocks)
 
@@ -170,7 +172,7 @@ class NormalEquations:
 
     def restricted(self, used: Bool[np.ndarray, "m"]) -> NormalEquations:
         """The equations of some of the edges."""
-        return self if np.array_equal(used, self.used) else NormalEquations(self._edges, self._start, used)
+        return self if np.array_equal(used, self.used) else NormalEquations(self.edges, self._start, used)
 
     def terms(self, poses: Float[np.ndarray, "n 7"]) -> Terms:
         """Evaluate all edges."""
@@ -198,7 +200,7 @@ class NormalEquations:
 
     def gradient(self, terms: Terms, weights: Float[np.ndarray, "m"]) -> Float[np.ndarray, "size"]:
         """g, in the order of elimination."""
-        total = np.zeros((len(self._place), 6))
+        total = np.zeros((len(self.place), 6))
         for side, rows in enumerate((self._i, self._j)):
             for axis in range(6):
                 total[:, axis] += np.bincount(rows, weights * terms.gradient[:, side, axis], len(total))
@@ -208,13 +210,13 @@ class NormalEquations:
         """Rows of the poses as a vector of the unknowns."""
         free = ~self.held
         vector = np.empty((free.sum(), *rows.shape[1:]))
-        vector[self._place[free]] = rows[free]
+        vector[self.place[free]] = rows[free]
         return vector.reshape(-1)
 
     def spread(self, vector: Float[np.ndarray, "size *k"]) -> Float[np.ndarray, "n 6 *k"]:
         """A vector of the unknowns as rows of the poses, 0 for those that are held."""
-        rows = np.zeros((len(self._place), 6, *vector.shape[1:]))
-        rows[~self.held] = vector.reshape(-1, *rows.shape[1:])[self._place[~self.held]]
+        rows = np.zeros((len(self.place), 6, *vector.shape[1:]))
+        rows[~self.held] = vector.reshape(-1, *rows.shape[1:])[self.place[~self.held]]
         return rows
 
     def matrix(self, blocks: Float[np.ndarray, "m 3 6 6"]) -> Any:
@@ -241,7 +243,7 @@ class NormalEquations:
 
     def _lay_out(self) -> None:
         """Places of the contributions of the edges in the compressed columns of the matrix."""
-        a, b = self._place[self._i], self._place[self._j]
+        a, b = self.place[self._i], self.place[self._j]
         rows, columns = np.concatenate([a, b, a, b]), np.concatenate([a, b, b, a])
         inside = np.flatnonzero((rows >= 0) & (columns >= 0) & np.tile(self.used, 4))
         self._order = inside[np.lexsort((rows[inside], columns[inside]))]
@@ -262,8 +264,8 @@ class NormalEquations:
         self._pointers = np.append(starts.reshape(-1), len(self._where)).astype(np.int32)
 
 
-def factored(matrix: Any) -> Callable[[np.ndarray], np.ndarray]:
-    """Solver of a sparse symmetric positive definite system whose unknowns are in the order of elimination.
+def factored(matrix: Any) -> Any:
+    """`SuperLU` of a sparse symmetric positive definite matrix whose unknowns are in the order of elimination.
 
     Raises:
         RuntimeError: if the matrix is singular.
@@ -271,7 +273,7 @@ def factored(matrix: Any) -> Callable[[np.ndarray], np.ndarray]:
     from scipy.sparse.linalg import splu
 
     options = {"SymmetricMode": True}
-    return splu(matrix, permc_spec="NATURAL", diag_pivot_thresh=0.0, options=options).solve
+    return splu(matrix, permc_spec="NATURAL", diag_pivot_thresh=0.0, options=options)
 
 
 def _typical(information: Float[np.ndarray, "m 6 6"], of_world: Bool[np.ndarray, "m"]) -> Float[np.ndarray, "m 6 6"]:
@@ -344,7 +346,7 @@ def minimize(
             gradient, system = equations.gradient(terms, weights), equations.weighted(terms, weights)
         count += 1
         try:
-            solve = factored(equations.damped(system, damping))
+            solve = factored(equations.damped(system, damping)).solve
         except RuntimeError:
             damping *= DAMPING_FACTOR
             continue

@@ -16,7 +16,7 @@ LAYERS = {
     "local surfaces": ("_surface", "_observability", "_neighborhoods", "_local", "_channels", "_features"),
     "correspondences": ("_forces", "_methods", "_surfaces", "_sums", "_gaussians", "_ndt"),
     "pose": ("_solve", "_hypotheses", "_directions", "_uncertainty", "_result", "_step"),
-    "loops": ("_host", "_traced", "_lanes", "_normal_equations", "_graph_traced"),
+    "loops": ("_host", "_traced", "_lanes", "_normal_equations", "_sparse_inverse", "_graph_traced"),
     "use": (
         "_options",
         "_cost",
