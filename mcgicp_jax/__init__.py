@@ -19,7 +19,7 @@ from mcgicp_jax._methods import GICP, AbstractMethod, ColorICP, MultiChannelGICP
 from mcgicp_jax._multiway import Multiway, multiway
 from mcgicp_jax._ndt import D2DNDT, NDT, ColorNDT
 from mcgicp_jax._odometry import odometry
-from mcgicp_jax._pose_graph import Edge, PoseGraph
+from mcgicp_jax._pose_graph import WORLD, Edge, PoseGraph
 from mcgicp_jax._preprocess import preprocess
 from mcgicp_jax._register import align, find_correspondences, global_pose, register
 from mcgicp_jax._result import Registration, Status
@@ -30,6 +30,7 @@ __all__ = [
     "D2DNDT",
     "GICP",
     "NDT",
+    "WORLD",
     "AbstractKernel",
     "AbstractMethod",
     "AbstractSearch",

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import contextlib
 from typing import Any
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.typing import ArrayLike
@@ -22,8 +22,9 @@ from mcgicp_jax._normal_equations import (
     relative_twists,
 )
 from mcgicp_jax._pose import is_concrete, matrices_of, parameters_of
-from mcgicp_jax._pose_graph import Edge, PoseGraph
+from mcgicp_jax._pose_graph import WORLD, Edge, PoseGraph
 from mcgicp_jax._result import Status
+from mcgicp_jax._sparse_inverse import inverse_blocks
 
 # Squared Mahalanobis distance beyond which a loop is rejected: the 99 % quantile of χ² with six degrees of freedom.
 LARGEST_SQUARE = 16.811893829770927
@@ -38,17 +39,13 @@ _CHOICES = 5
 _NEAR = 4.0
 # Inverse iterations for the least constrained direction: unconstrained ones stand out by factors of 1e3 and more.
 _INVERSE_ITERATIONS = 4
-# Unknowns up to which covariances come from the dense inverse: for 300 poses it is seven times as quick as SuperLU.
-_DENSE = 1800
-# Columns of the inverse computed at once, to bound memory.
-_COLUMNS = 252
 
 
 class PoseGraphResult(eqx.Module):
     """Result of `optimize_poses`; a pytree.
 
     Attributes:
-        poses: (n, 4, 4), sensor to world, metres; the first one is that of the graph.
+        poses: (n, 4, 4), sensor to world, metres; without priors, the first one is that of the graph.
         edges: the m edges of the graph, rejected ones included.
         status_code: integer value of `status`.
         num_iterations: number of Levenberg-Marquardt steps.
@@ -82,11 +79,12 @@ class PoseGraphResult(eqx.Module):
 
     @property
     def covariance(self) -> Float[Array, "n 6 6"] | Float[np.ndarray, "n 6 6"]:
-        """(n, 6, 6) covariance of every pose relative to the first: of ξ = (v, ω) in T exp(ξ), metres and radians.
+        """(n, 6, 6) covariance of every pose: of ξ = (v, ω) in T exp(ξ), metres and radians.
 
+        It is relative to the first pose or, with priors, to the world.
         The inverse of the Gauss-Newton matrix of the edges that were used. It is right if the information of the edges
         is, and does not cover the risk that a false loop was kept or a true one rejected. Computed when first read. The
-        diagonal is infinite for poses that no edges connect with the first.
+        diagonal is infinite for poses that no edges connect with the first pose or, with priors, the world.
         """
         return self.uncertainty.value
 
@@ -95,8 +93,8 @@ class PoseGraphResult(eqx.Module):
         """The `Status`; inside a transformation the array `status_code`.
 
         CONVERGED; MAX_ITERATIONS; NON_FINITE: poses or residuals overflow; DEGENERATE: the edges do not connect all
-        poses, or leave a direction of motion of at least one pose unconstrained. Along unconstrained directions the
-        motion between poses stays near that of the start.
+        poses with each other or with the world, or leave a direction of motion of at least one pose unconstrained.
+        Along unconstrained directions the motion between poses stays near that of the start.
         """
         return Status(int(np.asarray(self.status_code))) if is_concrete(self.status_code) else self.status_code
 
@@ -118,11 +116,11 @@ class PoseGraphResult(eqx.Module):
 def optimize_poses(graph: PoseGraph, *, robust: bool = True, max_iterations: int = 100) -> PoseGraphResult:
     """Find the poses that minimise Σ rᵀΛr over the edges, with r = log(T_i_j⁻¹ T_i⁻¹ T_j) and their information Λ.
 
-    Runs Levenberg-Marquardt from the poses of the graph; the first pose is held. Concrete graphs are solved on the host
-    by sparse factorisation, and graphs of other sizes compile nothing new. Inside transformations the solver is dense
-    and compiles for every size, which suits some hundreds of poses. The poses are then differentiable with respect to
-    the motions and the information of the edges, by the implicit function theorem, but not with respect to the start.
-    The derivative is 0 if the solver does not converge.
+    Runs Levenberg-Marquardt from the poses of the graph. The first pose is held, unless there are edges from the world
+    (priors). Concrete graphs are solved on the host by sparse factorisation, and graphs of other sizes compile nothing
+    new. Inside transformations the solver is dense and compiles for every size, which suits some hundreds of poses. The
+    poses are then differentiable with respect to the motions and the information of the edges, by the implicit function
+    theorem, but not with respect to the start. The derivative is 0 if the solver does not converge.
 
     Args:
         graph: poses and edges.
@@ -145,32 +143,43 @@ def optimize_poses(graph: PoseGraph, *, robust: bool = True, max_iterations: int
         raise ValueError(f"max_iterations: expected an integer of at least 1, got {max_iterations!r}")
     if not is_concrete(graph):
         return _traced(graph, robust, int(max_iterations))
-    edges, start = graph.edges, parameters_of(np.asarray(graph.poses))
+    edges, start = graph.edges, _start(graph)
     loops = np.asarray(edges.loop) & bool(robust)
     # Overflow is a status.
     with np.errstate(over="ignore", invalid="ignore"):
         equations = NormalEquations(edges, start)
-        found, weights = _robust_minimum(equations, start, loops, int(max_iterations))
+        equations, found, weights = _robust_minimum(equations, start, loops, int(max_iterations))
         status, cost = _status(equations, found, weights), found.terms.cost(weights)
     return PoseGraphResult.build(
-        poses=matrices_of(found.poses),
+        poses=matrices_of(found.poses[: len(graph.poses)]),
         edges=edges,
         status_code=np.int32(status),
         num_iterations=np.int32(found.num_iterations),
         cost=np.float64(cost),
         residuals=np.sqrt(np.maximum(found.terms.squares, 0)),
         weights=weights,
-        uncertainty=Deferred(lambda: Certainty(equations, found, weights).covariances()),
+        uncertainty=Deferred(lambda: _covariances(equations, found, weights)[: len(graph.poses)]),
     )
 
 
-def certainty_of(graph: PoseGraph) -> Certainty:
-    """Certainty at the poses of the graph, taken to be its minimum; of the edges that fit there."""
-    poses = parameters_of(np.asarray(graph.poses))
-    equations = NormalEquations(graph.edges, poses)
-    terms = equations.terms(poses)
-    weights = np.where(np.asarray(graph.edges.loop), 1.0 * (terms.squares <= LARGEST_SQUARE), 1)
-    return Certainty(equations, Minimum(poses, terms), weights)
+def _start(graph: PoseGraph) -> Float[np.ndarray, "_ 7"]:
+    """Parameters of the poses; with priors, those of the world are the last ones."""
+    poses = np.asarray(graph.poses)
+    return parameters_of(np.concatenate([poses, np.eye(4)[None]]) if np.any(graph.edges.i == WORLD) else poses)
+
+
+def motion_covariances(
+    graph: PoseGraph, i: Int[np.ndarray, "k"], j: Int[np.ndarray, "k"]
+) -> Float[np.ndarray, "k 6 6"]:
+    """Covariances of ξ in T_i⁻¹ T_j exp(ξ), at the poses of the graph, taken to be its minimum.
+
+    Loops that do not fit there do not count.
+    """
+    poses, edges = _start(graph), graph.edges
+    squares = NormalEquations(edges, poses).terms(poses).squares
+    weights = np.where(np.asarray(edges.loop), 1.0 * (squares <= LARGEST_SQUARE), 1)
+    none = np.zeros((len(i), 6, 6))
+    return _motion_covariances(edges, poses, weights, Edge(i, j, none[:, :4, :4], none))
 
 
 def _traced(graph: PoseGraph, robust: bool, max_iterations: int) -> PoseGraphResult:
@@ -193,8 +202,8 @@ def _traced(graph: PoseGraph, robust: bool, max_iterations: int) -> PoseGraphRes
 
 def _robust_minimum(
     equations: NormalEquations, start: Float[np.ndarray, "n 7"], loops: Bool[np.ndarray, "m"], max_iterations: int
-) -> tuple[Minimum, Float[np.ndarray, "m"]]:
-    """The minimum and the weights of the edges.
+) -> tuple[NormalEquations, Minimum, Float[np.ndarray, "m"]]:
+    """The equations of the edges that are kept, the minimum, and the weights of all edges.
 
     Truncated squares min(r², c²) are approached from a function of which the largest residual is in the convex part.
     """
@@ -202,22 +211,24 @@ def _robust_minimum(
     largest = found.terms.squares[loops].max(initial=0)
     if not largest > LARGEST_SQUARE:
         weights = np.ones(len(loops))
-        return minimize(equations, found, weights, max_iterations), weights
+        return equations, minimize(equations, found, weights, max_iterations), weights
     control = LARGEST_SQUARE / (2 * largest - LARGEST_SQUARE)
     while True:
         weights = np.where(loops, _truncated_weights(found.terms.squares, control), 1)
         if np.all((weights == 0) | (weights == 1)):
             break
+        equations = equations.restricted(weights > 0)
         found = minimize(equations, found, weights, _STEPS)
         control *= _GROWTH
+    chosen = weights
     for _ in range(_CHOICES):
+        weights, equations = chosen, equations.restricted(chosen > 0)
         found = minimize(equations, found, weights, max_iterations)
         chosen = np.where(loops, 1.0 * (found.terms.squares <= LARGEST_SQUARE), 1)
         chosen[_wrongly_rejected(equations, found, weights)] = 1
         if np.array_equal(chosen, weights):
             break
-        weights = chosen
-    return found, weights
+    return equations, found, weights
 
 
 def _wrongly_rejected(
@@ -228,10 +239,10 @@ def _wrongly_rejected(
     """
     squares = found.terms.squares
     near = np.flatnonzero((weights == 0) & (squares > LARGEST_SQUARE) & (squares <= _NEAR * LARGEST_SQUARE))
-    certainty = Certainty(equations, found, weights) if len(near) else None
-    if certainty is None:
+    if not len(near):
         return near
-    residuals, between = equations.residuals(found.poses, near), certainty.between(*equations.ends(near))
+    residuals = equations.residuals(found.poses, near)
+    between = _motion_covariances(equations.edges, found.poses, weights, equations.edges[near])
     # rᵀ(Λ⁻¹ + Σ)⁻¹r without the inverse of Λ, which may be singular.
     information = equations.information[near]
     inner = np.linalg.solve(np.eye(6) + information @ between, information @ residuals[..., None])[..., 0]
@@ -260,7 +271,7 @@ def _is_degenerate(equations: NormalEquations, found: Minimum, weights: Float[np
 
     By inverse iteration with the last factorisation of the minimisation.
     """
-    if np.any(equations.parts != equations.parts[0]):
+    if np.any(equations.parts != equations.parts[equations.root]):
         return True
     if not equations.size or found.solve is None:
         return False
@@ -272,47 +283,43 @@ def _is_degenerate(equations: NormalEquations, found: Minimum, weights: Float[np
     return bool(vector @ (matrix @ vector) < UNCONSTRAINED * (vector @ (equations.metric @ vector)))
 
 
-class Certainty:
-    """Covariances at a minimum, from one factorisation."""
+def _covariances(
+    equations: NormalEquations, found: Minimum, weights: Float[np.ndarray, "m"]
+) -> Float[np.ndarray, "n 6 6"]:
+    """Of every pose, relative to the root."""
+    covariances = _of_poses_and_edges(equations, found, weights, np.zeros(0, int))[0]
+    covariances[equations.parts != equations.parts[equations.root]] = np.diag(np.full(6, np.inf))
+    return covariances
 
-    def __init__(self, equations: NormalEquations, found: Minimum, weights: Float[np.ndarray, "m"]):
-        self._equations, self._poses = equations, found.poses
-        self._solve: Any = None
-        if equations.size:
-            matrix = equations.damped(equations.weighted(found.terms, weights))
-            with contextlib.suppress(RuntimeError, np.linalg.LinAlgError):
-                small = equations.size <= _DENSE
-                self._solve = np.linalg.inv(matrix.toarray()).__matmul__ if small else factored(matrix)
 
-    def covariances(self) -> Float[np.ndarray, "n 6 6"]:
-        """Of every pose, relative to the first."""
-        equations = self._equations
-        covariances = np.zeros((len(self._poses), 6, 6))
-        if self._solve is None and equations.size:
-            return np.full_like(covariances, np.nan)
-        rows = np.arange(equations.size).reshape(-1, 6)
-        found = np.zeros_like(rows[:, None] + np.zeros((6, 1)))
-        for first in range(0, equations.size, _COLUMNS):
-            columns = np.arange(first, min(first + _COLUMNS, equations.size))
-            right = np.zeros((equations.size, len(columns)))
-            right[columns, columns - first] = 1
-            blocks = self._solve(right).reshape(-1, 6, len(columns) // 6, 6)
-            here = np.arange(len(columns) // 6)
-            found[first // 6 + here] = blocks[first // 6 + here, :, here]
-        free = ~equations.held
-        covariances[free] = equations.spread(found.reshape(-1, 6))[free]
-        covariances = 0.5 * (covariances + covariances.swapaxes(1, 2))
-        covariances[equations.parts != equations.parts[0]] = np.diag(np.full(6, np.inf))
-        return covariances
+def _motion_covariances(
+    edges: Edge, poses: Float[np.ndarray, "n 7"], weights: Float[np.ndarray, "m"], asked: Edge
+) -> Float[np.ndarray, "k 6 6"]:
+    """Of ξ in T_i⁻¹ T_j exp(ξ), between the ends of the edges that are asked for; their information does not count."""
+    used, number = edges[weights > 0], len(asked)
+    asked = Edge(asked.i, asked.j, np.tile(np.eye(4), (number, 1, 1)), np.zeros((number, 6, 6)))
+    every = jax.tree.map(lambda *values: np.concatenate(values), used, asked)
+    equations = NormalEquations(every, poses)
+    found = Minimum(poses, equations.terms(poses))
+    weights = np.concatenate([weights[weights > 0], np.ones(number)])
+    return _of_poses_and_edges(equations, found, weights, np.arange(len(used), len(every)))[1]
 
-    def between(self, i: Int[np.ndarray, "k"], j: Int[np.ndarray, "k"]) -> Float[np.ndarray, "k 6 6"]:
-        """Of the motion between poses: of ξ in T_i⁻¹ T_j exp(ξ)."""
-        change = relative_twists(self._poses[i], self._poses[j])
-        right = np.zeros((len(self._poses), 6, 6 * len(i)))
-        columns = np.arange(6 * len(i)).reshape(-1, 6)
-        for k in range(len(i)):
-            right[i[k], :, columns[k]] = change[k]
-            right[j[k], :, columns[k]] = np.eye(6)
-        vector = self._equations.gathered(right).reshape(self._equations.size, -1)
-        products = vector.T @ self._solve(vector)
-        return np.array([products[np.ix_(rows, rows)] for rows in columns])
+
+def _of_poses_and_edges(
+    equations: NormalEquations, found: Minimum, weights: Float[np.ndarray, "m"], rows: Int[np.ndarray, "k"]
+) -> tuple[Float[np.ndarray, "n 6 6"], Float[np.ndarray, "k 6 6"]]:
+    """Covariances of the poses and of the motions along some edges; NaN if the matrix is singular."""
+    covariances, (i, j) = np.zeros((len(found.poses), 6, 6)), equations.ends(rows)
+    crossed = np.zeros((len(rows), 6, 6))
+    if equations.size:
+        both = ~equations.held[i] & ~equations.held[j]
+        pairs = np.column_stack([equations.place[i], equations.place[j]])[both]
+        try:
+            factor = factored(equations.damped(equations.weighted(found.terms, weights)))
+            blocks, crossed[both] = inverse_blocks(factor, pairs)
+        except (RuntimeError, np.linalg.LinAlgError):
+            return np.full_like(covariances, np.nan), np.full_like(crossed, np.nan)
+        covariances[~equations.held] = blocks[equations.place[~equations.held]]
+    change = relative_twists(found.poses[i], found.poses[j]) if len(rows) else crossed
+    mixed, turned = change @ crossed, change.swapaxes(1, 2)
+    return covariances, change @ covariances[i] @ turned + covariances[j] + mixed + mixed.swapaxes(1, 2)

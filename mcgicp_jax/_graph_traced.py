@@ -1,6 +1,8 @@
 """Pose graphs inside transformations: one dense program per size of graph, and the derivative of the minimum.
 
-The loop is that of `_normal_equations`. The poses are the root of g = ∂(½ Σ rᵀΛr)/∂ξ, so their derivative is
+The loop is that of `_normal_equations`. The world is one more pose, the last one, which is held. Whether an edge starts
+there may not be known when the program is compiled; if none does, the first pose is held too: its rows and columns of
+all matrices are those of the identity. The poses are the root of g = ∂(½ Σ rᵀΛr)/∂ξ, so their derivative is
 −(∂g/∂ξ)⁻¹ ∂g/∂θ with the full Hessian: that of one Newton step from the minimum in which all but g is a constant.
 """
 
@@ -13,7 +15,7 @@ import jax
 import jax.numpy as jnp
 import jaxlie
 from jax.typing import DTypeLike
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from mcgicp_jax._normal_equations import (
     DAMPING_FACTOR,
@@ -24,7 +26,7 @@ from mcgicp_jax._normal_equations import (
     residual_of,
 )
 from mcgicp_jax._pose import AnyArray
-from mcgicp_jax._pose_graph import Edge
+from mcgicp_jax._pose_graph import WORLD, Edge
 from mcgicp_jax._result import Status
 
 # Tolerance of the loop on the host, in units of the precision: derivatives are right to the root of it at least.
@@ -32,12 +34,13 @@ _TOLERANCE_IN_EPS = 10.0
 
 
 class _Edges(NamedTuple):
-    """Edges with motions as quaternions wxyz and translations."""
+    """Edges with motions as quaternions wxyz and translations; `i` is the number of poses for edges from the world."""
 
     i: Int[Array, "m"]
     j: Int[Array, "m"]
     motions: Float[Array, "m 7"]
     information: Float[Array, "m 6 6"]
+    of_world: Bool[Array, "m"]
 
 
 class Found(NamedTuple):
@@ -51,7 +54,7 @@ class Found(NamedTuple):
 
 
 class _Sums(NamedTuple):
-    """½ Σ rᵀΛr, its gradient g, the Gauss-Newton matrix H and the metric D, without the first pose, which is held."""
+    """½ Σ rᵀΛr, its gradient g, the Gauss-Newton matrix H and the metric D, without the world."""
 
     cost: Float[Array, ""]
     gradient: Float[Array, "k"]
@@ -71,24 +74,31 @@ def optimize_traced(matrices: Float[AnyArray, "n 4 4"], edges: Edge, max_iterati
     """Minimise Σ rᵀΛr from the given poses; differentiable by the edges, not by the start."""
     dtype, n = jnp.result_type(matrices, edges.T_i_j, edges.information), len(matrices)
     with jax.default_matmul_precision("highest"):
-        information = jnp.asarray(edges.information, dtype)
-        given = _Edges(jnp.asarray(edges.i), jnp.asarray(edges.j), _parameters(edges.T_i_j, dtype), information)
-        start, fixed = jax.lax.stop_gradient((_parameters(matrices, dtype), given))
+        of_world = jnp.asarray(edges.i) == WORLD
+        given = _Edges(
+            jnp.where(of_world, n, edges.i),
+            jnp.asarray(edges.j),
+            _parameters(edges.T_i_j, dtype),
+            jnp.asarray(edges.information, dtype),
+            of_world,
+        )
+        whole = jnp.concatenate([jnp.asarray(matrices, dtype), jnp.eye(4, dtype=dtype)[None]])
+        start, fixed = jax.lax.stop_gradient((_parameters(whole, dtype), given))
         state = _minimized(start, fixed, max_iterations)
         gradient = _summed(_forces(state.poses, given), given, n)
         step = _solved(_assembled(_force_derivatives(state.poses, fixed), fixed, n), gradient)
         # No derivative where the loop did not converge.
         step = jnp.where(state.converged, step, 0)
         matrix, metric = state.sums.matrix, state.sums.metric
-        blocks = jnp.linalg.inv(matrix + LEAST_DAMPING * metric).reshape(n - 1, 6, n - 1, 6)
-        free = jnp.arange(n - 1)
+        blocks = jnp.linalg.inv(matrix + LEAST_DAMPING * metric).reshape(n, 6, n, 6)
+        rows = jnp.arange(n)
         residuals = _residuals(state.poses, fixed)
         return Found(
-            jaxlie.SE3(_moved(state.poses, step)).as_matrix().astype(dtype),
+            jaxlie.SE3(_moved(state.poses, step)[:n]).as_matrix().astype(dtype),
             jnp.einsum("mi,mij,mj->m", residuals, fixed.information, residuals),
             _status(state),
             state.steps,
-            jnp.zeros((n, 6, 6), dtype).at[1:].set(blocks[free, :, free]),
+            jnp.where(_moves(fixed, n)[:, None, None], blocks[rows, :, rows], 0),
         )
 
 
@@ -124,7 +134,7 @@ def _minimized(start: Float[Array, "n 7"], edges: _Edges, max_iterations: int) -
 
     # The first step has no length: it evaluates the sums at the start. Written so, the loop compiles them once.
     zero, one = jnp.zeros((size, size), start.dtype), jnp.eye(size, dtype=start.dtype)
-    before = _Sums(jnp.asarray(jnp.inf, start.dtype), zero[:, 0] if size else zero.reshape(-1), one, zero)
+    before = _Sums(jnp.asarray(jnp.inf, start.dtype), zero[:, 0], one, zero)
     damping = jnp.asarray(START_DAMPING, start.dtype)
     state = jax.lax.while_loop(goes_on, step, _State(start, before, damping, jnp.int32(0), jnp.bool_(False)))
     return state._replace(steps=state.steps - 1)
@@ -148,12 +158,12 @@ def _sums(poses: Float[Array, "n 7"], edges: _Edges) -> _Sums:
     residuals, by_end, change = _linearized(poses, edges)
     jacobians = jnp.concatenate([by_end @ change, by_end], axis=2)
     forces = jnp.einsum("mij,mj->mi", edges.information, residuals)
-    gradient = jnp.einsum("mia,mi->ma", jacobians, forces)
+    gradient, n = jnp.einsum("mia,mi->ma", jacobians, forces), len(poses) - 1
     matrix, metric = (
-        _assembled(jnp.einsum("mia,mij,mjb->mab", jacobians, each, jacobians), edges, len(poses))
-        for each in (edges.information, jnp.broadcast_to(_typical(edges.information), edges.information.shape))
+        _assembled(jnp.einsum("mia,mij,mjb->mab", jacobians, each, jacobians), edges, n)
+        for each in (edges.information, _typical(edges))
     )
-    return _Sums(0.5 * jnp.sum(residuals * forces), _summed(gradient, edges, len(poses)), matrix, metric)
+    return _Sums(0.5 * jnp.sum(residuals * forces), _summed(gradient, edges, n), matrix, metric)
 
 
 def _forces(poses: Float[Array, "n 7"], edges: _Edges) -> Float[Array, "m 12"]:
@@ -185,25 +195,36 @@ def _force_derivatives(poses: Float[Array, "n 7"], edges: _Edges) -> Float[Array
     return jax.vmap(push, out_axes=-1)(jnp.eye(12, dtype=poses.dtype))
 
 
-def _typical(information: Float[Array, "m 6 6"]) -> Float[Array, "6 6"]:
-    """S of the damping: the median information of the edges."""
-    diagonal = jnp.diagonal(information, axis1=1, axis2=2).reshape(-1, 2, 3).mean(axis=2)
-    found = jnp.nanmedian(jnp.where(diagonal > 0, diagonal, jnp.nan), axis=0)
-    return jnp.diag(jnp.repeat(jnp.where(jnp.isfinite(found), found, 1), 3))
+def _typical(edges: _Edges) -> Float[Array, "m 6 6"]:
+    """S of the damping, as on the host: the median information of the edges, and that of those from the world."""
+    diagonal = jnp.diagonal(edges.information, axis1=1, axis2=2).reshape(-1, 2, 3).mean(axis=2)
+    typical = jnp.ones_like(diagonal)
+    for counted, chosen in ((~edges.of_world, True), (edges.of_world, edges.of_world)):
+        known = counted[:, None] & (diagonal > 0)
+        found = jnp.nanmedian(jnp.where(known, diagonal, jnp.nan), axis=0)
+        typical = jnp.where(jnp.isfinite(found) & jnp.asarray(chosen)[..., None], found, typical)
+    return jnp.repeat(typical, 3, axis=1)[:, :, None] * jnp.eye(6, dtype=typical.dtype)
+
+
+def _moves(edges: _Edges, num_poses: int) -> Bool[Array, "n"]:
+    """Which poses are not held."""
+    return (jnp.arange(num_poses) > 0) | jnp.any(edges.of_world)
 
 
 def _summed(rows: Float[Array, "m 12"], edges: _Edges, num_poses: int) -> Float[Array, "k"]:
-    """Rows of the edges added up by pose, without the first."""
-    total = jnp.zeros((num_poses, 6), rows.dtype).at[edges.i].add(rows[:, :6]).at[edges.j].add(rows[:, 6:])
-    return total[1:].reshape(-1)
+    """Rows of the edges added up by pose, 0 for those that are held, without the world."""
+    total = jnp.zeros((num_poses + 1, 6), rows.dtype).at[edges.i].add(rows[:, :6]).at[edges.j].add(rows[:, 6:])
+    return jnp.where(_moves(edges, num_poses)[:, None], total[:-1], 0).reshape(-1)
 
 
 def _assembled(blocks: Float[Array, "m 12 12"], edges: _Edges, num_poses: int) -> Float[Array, "k k"]:
-    """The dense matrix of the 12×12 blocks of all edges, without the first pose."""
+    """The dense matrix of the 12×12 blocks of all edges, without the world."""
     ends = jnp.stack([edges.i, edges.j], axis=1)
     places = (6 * ends[:, :, None] + jnp.arange(6)).reshape(-1, 12)
-    whole = jnp.zeros((6 * num_poses, 6 * num_poses), blocks.dtype)
-    return whole.at[places[:, :, None], places[:, None, :]].add(blocks)[6:, 6:]
+    whole = jnp.zeros((6 * num_poses + 6, 6 * num_poses + 6), blocks.dtype)
+    whole = whole.at[places[:, :, None], places[:, None, :]].add(blocks)[:-6, :-6]
+    moves = jnp.repeat(_moves(edges, num_poses), 6)
+    return jnp.where(moves[:, None] & moves, whole, jnp.eye(len(whole), dtype=whole.dtype) * ~moves)
 
 
 def _solved(matrix: Float[Array, "k k"], gradient: Float[Array, "k"]) -> Float[Array, "k"]:
@@ -217,4 +238,4 @@ def _moved_by(pose: Float[Array, "7"], twist: Float[Array, "6"]) -> Float[Array,
 
 
 def _moved(poses: Float[Array, "n 7"], twists: Float[Array, "k"]) -> Float[Array, "n 7"]:
-    return _moved_by(poses, jnp.concatenate([jnp.zeros((1, 6), twists.dtype), twists.reshape(-1, 6)]))
+    return _moved_by(poses, jnp.concatenate([twists.reshape(-1, 6), jnp.zeros((1, 6), twists.dtype)]))

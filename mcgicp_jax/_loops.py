@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from mcgicp_jax._cloud import PointCloud
-from mcgicp_jax._graph import certainty_of, optimize_poses
+from mcgicp_jax._graph import motion_covariances, optimize_poses
 from mcgicp_jax._methods import AbstractMethod
 from mcgicp_jax._options import Options
 from mcgicp_jax._pose_graph import Edge, PoseGraph
@@ -101,7 +101,7 @@ class Trajectory:
         nearest = np.argsort(distances, kind="stable")[:_CANDIDATES]
         if not len(nearest):
             return []
-        covariances = certainty_of(self.graph).between(nearest, np.full(len(nearest), number))
+        covariances = motion_covariances(self.graph, nearest, np.full(len(nearest), number))
         rows, certainties = self._worthwhile(number, nearest, distances[nearest], covariances)
         for i, covariance in list(zip(rows, certainties, strict=True))[:_TRIES]:
             edge = self._registered(int(i), number, covariance)

@@ -21,7 +21,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from mcgicp_jax._blocks import map_rows
 from mcgicp_jax._pose import parameters_of
-from mcgicp_jax._pose_graph import Edge
+from mcgicp_jax._pose_graph import WORLD, Edge
 
 # Edges or poses of a block: small, since most graphs are. Blocks of 2,048 take 4 times as long for 300 edges.
 _BLOCK = 256
@@ -124,39 +124,55 @@ class Terms:
 class NormalEquations:
     """The sparse equations (H + λD) ξ = −g of a graph.
 
-    The first pose of every connected part is held. The order of elimination is found once, by minimum degree on the
+    Edges from the world start at the last pose, the identity, which is then held. Of every other connected part, the
+    first pose is held. The order of elimination is found once, by minimum degree on the
     graph of poses, and so is the place of every block in the matrix.
 
+    Only edges in use have a place: false loops between distant poses would fill the factors with numbers.
+
     Attributes:
+        edges: all edges.
+        used: which edges are in use.
+        place: place of each pose in the order of elimination; -1 for those that are held.
         held: which poses do not move.
         parts: number of the connected part of each pose.
+        root: the held pose to which covariances refer: the first one, or the world.
         information: Λ of every edge.
         metric: the sparse matrix D of the damping, at the poses given.
     """
 
-    def __init__(self, edges: Edge, poses: Float[np.ndarray, "n 7"]):
+    def __init__(self, edges: Edge, poses: Float[np.ndarray, "n 7"], used: Bool[np.ndarray, "m"] | None = None):
         # Imported late, as SciPy's sparse matrices take a tenth of the import time of the package.
         from scipy.sparse import coo_array
         from scipy.sparse.csgraph import connected_components
 
-        num_poses = len(poses)
-        self._i, self._j = np.asarray(edges.i), np.asarray(edges.j)
+        self.edges, self._start = edges, poses
+        self.used = np.ones(len(edges), bool) if used is None else used
+        num_poses, of_world = len(poses), np.asarray(edges.i) == WORLD
+        self.root = num_poses - 1 if of_world.any() else 0
+        self._i, self._j = np.where(of_world, self.root, edges.i), np.asarray(edges.j)
         self._measured = parameters_of(np.asarray(edges.T_i_j))
         self.information = np.asarray(edges.information)
-        graph = coo_array((np.ones(len(edges)), (self._i, self._j)), (num_poses, num_poses))
+        ends = self._i[self.used], self._j[self.used]
+        graph = coo_array((np.ones(len(ends[0])), ends), (num_poses, num_poses))
         _, self.parts = connected_components(graph, directed=False)
+        held = np.unique(self.parts, return_index=True)[1]
+        held[self.parts[self.root]] = self.root
         self.held = np.zeros(num_poses, bool)
-        self.held[np.unique(self.parts, return_index=True)[1]] = True
-        self._place = np.full(num_poses, -1)
-        self._place[~self.held] = _elimination_order(graph, self.held)
+        self.held[held] = True
+        self.place = np.full(num_poses, -1)
+        self.place[~self.held] = _elimination_order(graph, self.held)
         self._lay_out()
-        typical = np.broadcast_to(_typical(self.information), self.information.shape)
-        self.metric = self.matrix(self._evaluated(poses, typical).blocks)
+        self.metric = self.matrix(self._evaluated(poses, _typical(self.information, of_world)).blocks)
 
     @property
     def size(self) -> int:
         """Number of unknowns."""
         return 6 * int((~self.held).sum())
+
+    def restricted(self, used: Bool[np.ndarray, "m"]) -> NormalEquations:
+        """The equations of some of the edges."""
+        return self if np.array_equal(used, self.used) else NormalEquations(self.edges, self._start, used)
 
     def terms(self, poses: Float[np.ndarray, "n 7"]) -> Terms:
         """Evaluate all edges."""
@@ -184,7 +200,7 @@ class NormalEquations:
 
     def gradient(self, terms: Terms, weights: Float[np.ndarray, "m"]) -> Float[np.ndarray, "size"]:
         """g, in the order of elimination."""
-        total = np.zeros((len(self._place), 6))
+        total = np.zeros((len(self.place), 6))
         for side, rows in enumerate((self._i, self._j)):
             for axis in range(6):
                 total[:, axis] += np.bincount(rows, weights * terms.gradient[:, side, axis], len(total))
@@ -194,13 +210,13 @@ class NormalEquations:
         """Rows of the poses as a vector of the unknowns."""
         free = ~self.held
         vector = np.empty((free.sum(), *rows.shape[1:]))
-        vector[self._place[free]] = rows[free]
+        vector[self.place[free]] = rows[free]
         return vector.reshape(-1)
 
     def spread(self, vector: Float[np.ndarray, "size *k"]) -> Float[np.ndarray, "n 6 *k"]:
         """A vector of the unknowns as rows of the poses, 0 for those that are held."""
-        rows = np.zeros((len(self._place), 6, *vector.shape[1:]))
-        rows[~self.held] = vector.reshape(-1, *rows.shape[1:])[self._place[~self.held]]
+        rows = np.zeros((len(self.place), 6, *vector.shape[1:]))
+        rows[~self.held] = vector.reshape(-1, *rows.shape[1:])[self.place[~self.held]]
         return rows
 
     def matrix(self, blocks: Float[np.ndarray, "m 3 6 6"]) -> Any:
@@ -227,9 +243,9 @@ class NormalEquations:
 
     def _lay_out(self) -> None:
         """Places of the contributions of the edges in the compressed columns of the matrix."""
-        a, b = self._place[self._i], self._place[self._j]
+        a, b = self.place[self._i], self.place[self._j]
         rows, columns = np.concatenate([a, b, a, b]), np.concatenate([a, b, b, a])
-        inside = np.flatnonzero((rows >= 0) & (columns >= 0))
+        inside = np.flatnonzero((rows >= 0) & (columns >= 0) & np.tile(self.used, 4))
         self._order = inside[np.lexsort((rows[inside], columns[inside]))]
         rows, columns = rows[self._order], columns[self._order]
         new = np.ones(len(rows), bool)
@@ -248,8 +264,8 @@ class NormalEquations:
         self._pointers = np.append(starts.reshape(-1), len(self._where)).astype(np.int32)
 
 
-def factored(matrix: Any) -> Callable[[np.ndarray], np.ndarray]:
-    """Solver of a sparse symmetric positive definite system whose unknowns are in the order of elimination.
+def factored(matrix: Any) -> Any:
+    """`SuperLU` of a sparse symmetric positive definite matrix whose unknowns are in the order of elimination.
 
     Raises:
         RuntimeError: if the matrix is singular.
@@ -257,14 +273,23 @@ def factored(matrix: Any) -> Callable[[np.ndarray], np.ndarray]:
     from scipy.sparse.linalg import splu
 
     options = {"SymmetricMode": True}
-    return splu(matrix, permc_spec="NATURAL", diag_pivot_thresh=0.0, options=options).solve
+    return splu(matrix, permc_spec="NATURAL", diag_pivot_thresh=0.0, options=options)
 
 
-def _typical(information: Float[np.ndarray, "m 6 6"]) -> Float[np.ndarray, "6 6"]:
-    """S: the median over edges of the mean information, of translation and of rotation, on the diagonal."""
+def _typical(information: Float[np.ndarray, "m 6 6"], of_world: Bool[np.ndarray, "m"]) -> Float[np.ndarray, "m 6 6"]:
+    """S of every edge: on the diagonal, the median over edges of the mean information, of translation and of rotation.
+
+    Edges from the world have their own: next to motions that are known to millimetres, positions known to metres would
+    else look unconstrained.
+    """
     diagonal = np.diagonal(information, axis1=1, axis2=2).reshape(-1, 2, 3).mean(axis=2)
-    found = [np.median(values[values > 0]) if (values > 0).any() else 1.0 for values in diagonal.T]
-    return np.diag(np.repeat(found, 3))
+    typical = np.ones_like(diagonal)
+    for counted, edges in ((~of_world, slice(None)), (of_world, of_world)):
+        for kind, values in enumerate(diagonal.T):
+            known = values[counted & (values > 0)]
+            if len(known):
+                typical[edges, kind] = np.median(known)
+    return np.repeat(typical, 3, axis=1)[:, :, None] * np.eye(6)
 
 
 def _elimination_order(graph: Any, held: Bool[np.ndarray, "n"]) -> Int[np.ndarray, "k"]:
@@ -307,7 +332,10 @@ class Minimum(NamedTuple):
 def minimize(
     equations: NormalEquations, start: Minimum, weights: Float[np.ndarray, "m"], max_iterations: int
 ) -> Minimum:
-    """Lower ½ Σ w rᵀΛr by Levenberg-Marquardt steps until one lowers it by no more than tolerance and rounding."""
+    """Lower ½ Σ w rᵀΛr by Levenberg-Marquardt steps until one lowers it by no more than tolerance and rounding.
+
+    The weights of edges that are not in use are 0.
+    """
     poses, terms, count, _, damping, solve = start
     cost, system = terms.cost(weights), None
     end = count + max_iterations
@@ -318,7 +346,7 @@ def minimize(
             gradient, system = equations.gradient(terms, weights), equations.weighted(terms, weights)
         count += 1
         try:
-            solve = factored(equations.damped(system, damping))
+            solve = factored(equations.damped(system, damping)).solve
         except RuntimeError:
             damping *= DAMPING_FACTOR
             continue

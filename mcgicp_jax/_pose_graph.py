@@ -15,6 +15,9 @@ from jaxtyping import Array, Bool, Float, Int
 
 from mcgicp_jax._pose import Pose, is_concrete, pose_matrix
 
+# What `Edge.i` is for a measurement in the world's frame. Unlike −1, it is not a row of any array.
+WORLD = -(2**31)
+
 # Largest negative eigenvalue of an information matrix that counts as rounding, as a fraction of the largest one; and
 # largest asymmetry. g2o files have six digits.
 _ROUNDING = 1e-6
@@ -23,11 +26,13 @@ _ROUNDING = 1e-6
 class Edge(eqx.Module):
     """A measured motion between two poses of a graph, with its information matrix; a pytree.
 
-    If all fields have a leading axis of length m, one `Edge` holds m edges.
+    If all fields have a leading axis of length m, one `Edge` holds m edges. A prior on a pose, such as a known start or
+    a position from GNSS, is an edge from the world: `Edge(WORLD, j, T_world_j, covariance=...)`.
 
     Attributes:
-        i, j: rows of the two poses in `PoseGraph.poses`, integers.
-        T_i_j: (4, 4), the measured T_i⁻¹ T_j, which maps coordinates of frame j to frame i; metres.
+        i, j: rows of the two poses in `PoseGraph.poses`, integers. `i` may be `WORLD`.
+        T_i_j: (4, 4), the measured T_i⁻¹ T_j, which maps coordinates of frame j to frame i; metres. For a position
+            without a rotation give the rotation of the start, and no information about it.
         information: (6, 6), inverse covariance of ξ = (v, ω) in T_i_j exp(ξ), the tangent of `Registration.covariance`,
             metres and radians; symmetric, positive semidefinite. Zero along directions that were not measured.
         loop: whether the measurement may be an outlier, so that `optimize_poses` may reject the edge.
@@ -62,9 +67,8 @@ class Edge(eqx.Module):
         if (information is None) == (covariance is None):
             raise ValueError("information: expected either an information or a covariance matrix, got both or neither")
         self.i, self.j = _rows("i", i), _rows("j", j)
-        transform = T_i_j.as_matrix() if isinstance(T_i_j, jaxlie.SE3) else T_i_j
-        self.T_i_j = transform if isinstance(transform, jax.Array) else np.asarray(transform, np.float64)
-        self.information = _inverse(covariance) if information is None else _as_float(information)
+        self.T_i_j = _as_float("T_i_j", T_i_j.as_matrix() if isinstance(T_i_j, jaxlie.SE3) else T_i_j)
+        self.information = _inverse(covariance) if information is None else _as_float("information", information)
         shape = np.shape(self.i)
         self.loop = loop if isinstance(loop, jax.Array) else np.broadcast_to(np.asarray(loop, bool), shape)
         for name, tail in (("i", ()), ("j", ()), ("T_i_j", (4, 4)), ("information", (6, 6)), ("loop", ())):
@@ -83,18 +87,22 @@ class PoseGraph(eqx.Module):
     """Poses of a sensor and measured motions between them; a pytree.
 
     Attributes:
-        poses: (n, 4, 4), sensor to world, metres. `optimize_poses` starts from these poses and holds the first one.
+        poses: (n, 4, 4), sensor to world, metres. `optimize_poses` starts from these poses. It holds the first one,
+            unless there are edges from the world.
         edges: the m measured motions: one `Edge` whose fields have a leading axis of length m.
     """
 
     poses: Float[Array, "n 4 4"] | Float[np.ndarray, "n 4 4"]
     edges: Edge
 
-    def __init__(self, poses: ArrayLike | Sequence[Pose], edges: Sequence[Edge] | Edge):
+    def __init__(self, poses: ArrayLike | Sequence[Pose] | None, edges: Sequence[Edge] | Edge):
         """Create a graph.
 
         Args:
-            poses: an array (n, 4, 4), or a sequence of n `jaxlie.SE3` or (4, 4) matrices.
+            poses: an array (n, 4, 4), or a sequence of n `jaxlie.SE3` or (4, 4) matrices. With None, the motions along
+                a spanning tree of the edges are composed, which takes loops only if no other edges connect a pose, and
+                edges without information on some direction last. Each part of the graph that has no prior then begins
+                at the identity.
             edges: a sequence of single edges, or one `Edge` with a leading axis. Several edges may join the same poses.
 
         Raises:
@@ -102,14 +110,16 @@ class PoseGraph(eqx.Module):
                 to a row outside of the graph, or an information matrix is not finite, symmetric and positive
                 semidefinite. Of traced arrays, only the shapes are checked.
         """
-        if not isinstance(poses, jax.Array):
+        self.edges = edges if isinstance(edges, Edge) else _stacked(edges)
+        if np.ndim(self.edges.i) != 1:
+            raise ValueError(f"edges: expected one leading axis, got shape {np.shape(self.edges.i)}")
+        if poses is None:
+            poses = _composed(self.edges)
+        elif not isinstance(poses, jax.Array):
             poses = np.array([pose_matrix(pose, f"poses[{k}]") for k, pose in enumerate(poses)])  # type: ignore
         if np.ndim(poses) != 3 or np.shape(poses)[1:] != (4, 4):
             raise ValueError(f"poses: expected at least one pose of shape (4, 4), got shape {np.shape(poses)}")
         self.poses = poses
-        self.edges = edges if isinstance(edges, Edge) else _stacked(edges)
-        if np.ndim(self.edges.i) != 1:
-            raise ValueError(f"edges: expected one leading axis, got shape {np.shape(self.edges.i)}")
         if is_concrete(self.edges):
             self.edges = _checked(self.edges, len(poses))
 
@@ -121,14 +131,19 @@ def _rows(name: str, values: ArrayLike) -> Any:
     return array
 
 
-def _as_float(values: ArrayLike) -> Any:
-    return values if isinstance(values, jax.Array) else np.asarray(values, np.float64)
+def _as_float(name: str, values: Any) -> Any:
+    if isinstance(values, jax.Array):
+        return values
+    try:
+        return np.asarray(values, np.float64)
+    except (TypeError, ValueError) as error:
+        raise ValueError(f"{name}: expected an array of numbers, got {values!r}") from error
 
 
 def _inverse(covariance: Any) -> Any:
     if not is_concrete(covariance):
         return jnp.linalg.inv(covariance)
-    covariance = np.asarray(covariance, np.float64)
+    covariance = np.asarray(_as_float("covariance", covariance))
     if covariance.shape[-2:] != (6, 6):
         raise ValueError(f"covariance: expected shape (6, 6), got {covariance.shape}")
     try:
@@ -150,11 +165,42 @@ def _stacked(edges: Sequence[Edge]) -> Edge:
     return jax.tree.map(lambda *values: xp.stack(values), *edges)
 
 
+def _composed(edges: Edge) -> Float[np.ndarray, "n 4 4"]:
+    """Poses along a minimum spanning tree from the world, which is the last node."""
+    from scipy.sparse import coo_array
+    from scipy.sparse.csgraph import breadth_first_order, minimum_spanning_tree
+
+    if not is_concrete(edges) or not len(edges):
+        raise ValueError("poses: expected poses, since the edges are none or traced")
+    n = int(max(np.max(edges.i), np.max(edges.j))) + 1
+    edges = _checked(edges, n)
+    # One more edge to each pose, of the identity, keeps parts that have no prior.
+    i = np.concatenate([np.where(edges.i == WORLD, n, edges.i), np.full(n, n)])
+    j = np.concatenate([edges.j, np.arange(n)])
+    motions = np.concatenate([edges.T_i_j, np.tile(np.eye(4), (n, 1, 1))])
+    values = np.linalg.eigvalsh(edges.information)
+    blind = values[:, 0] <= _ROUNDING * values[:, -1]
+    order = np.argsort(np.concatenate([edges.loop + 2 * blind, np.full(n, 4)]), kind="stable")
+    # Of several edges between two poses, the first in this order.
+    _, first = np.unique((np.minimum(i, j) * (n + 1) + np.maximum(i, j))[order], return_index=True)
+    rows = order[first]
+    tree = minimum_spanning_tree(coo_array((first + 1.0, (i[rows], j[rows])), (n + 1, n + 1))).tocoo()
+    used = {frozenset(ends): order[int(place) - 1] for *ends, place in zip(tree.row, tree.col, tree.data, strict=True)}
+    nodes, before = breadth_first_order(tree.tocsr(), n, directed=False)
+    poses = np.tile(np.eye(4), (n + 1, 1, 1))
+    for node in nodes[1:]:
+        edge = used[frozenset((before[node], node))]
+        motion = motions[edge] if j[edge] == node else np.linalg.inv(motions[edge])
+        poses[node] = poses[before[node]] @ motion
+    return poses[:n]
+
+
 def _checked(edges: Edge, num_poses: int) -> Edge:
     """The edges as NumPy arrays, with exact rotations and symmetric information."""
     i, j = np.asarray(edges.i), np.asarray(edges.j)
-    for name, rows in (("i", i), ("j", j)):
-        _refuse(f"{name}: expected a row from 0 to {num_poses - 1}", (rows < 0) | (rows >= num_poses), rows)
+    for name, rows, other in (("i", i, i == WORLD), ("j", j, False)):
+        outside = ((rows < 0) | (rows >= num_poses)) & ~np.asarray(other)
+        _refuse(f"{name}: expected a row from 0 to {num_poses - 1}", outside, rows)
     _refuse("expected two different poses", i == j, i)
     transforms = np.asarray(edges.T_i_j, np.float64)
     transforms = np.array([pose_matrix(each, f"edges[{k}].T_i_j") for k, each in enumerate(transforms)])

@@ -14,10 +14,9 @@ from jaxtyping import Float
 
 from mcgicp_jax._cloud import PointCloud
 from mcgicp_jax._formats import READERS, WRITERS, by_suffix
-from mcgicp_jax._pose import matrices_of, parameters_of, pose_matrix
+from mcgicp_jax._g2o import graph_of, lines_of
+from mcgicp_jax._pose import pose_matrix
 from mcgicp_jax._pose_graph import Edge, PoseGraph
-
-_VERTEX, _EDGE = "VERTEX_SE3:QUAT", "EDGE_SE3:QUAT"
 
 
 def read(path: str | os.PathLike[str]) -> PointCloud:
@@ -175,14 +174,14 @@ def write_poses(
 
 
 def read_g2o(path: str | os.PathLike[str]) -> PoseGraph:
-    """Read a pose graph of `VERTEX_SE3:QUAT` and `EDGE_SE3:QUAT` lines; others are ignored.
+    """Read a pose graph of `VERTEX_SE3:QUAT`, `EDGE_SE3:QUAT` and `EDGE_SE3_PRIOR` lines; others are ignored.
 
     Numbers are x y z qx qy qz qw, and the upper triangle of the information. As in GTSAM and Ceres, the information is
     taken to be that of ξ = (v, ω); g2o itself means the vector part of the quaternion, which is half of ω.
 
     Args:
         path: the file. Vertices may have any numbers; they become rows in ascending order. Edges between vertices whose
-            numbers are not consecutive are loops.
+            numbers are not consecutive are loops. Priors become edges from the world.
 
     Raises:
         OSError: if the file cannot be opened.
@@ -190,22 +189,7 @@ def read_g2o(path: str | os.PathLike[str]) -> PoseGraph:
     """
     with open(path, encoding="utf-8-sig") as file:
         try:
-            lines = [line.split() for line in file]
-            vertices, edges = (
-                np.array([line[1:] for line in lines if line and line[0] == tag], float).reshape(-1, width)
-                for tag, width in ((_VERTEX, 8), (_EDGE, 30))
-            )
-            numbers, first = np.unique(vertices[:, 0], return_index=True)
-            rows = np.searchsorted(numbers, edges[:, :2]).clip(max=max(len(numbers) - 1, 0))
-            if not len(numbers) or not np.array_equal(numbers[rows], edges[:, :2]):
-                raise ValueError("expected a vertex for each end of an edge")
-            information = np.zeros((len(edges), 6, 6))
-            upper = np.triu_indices(6)
-            information[:, *upper] = information[:, *upper[::-1]] = edges[:, 9:]
-            loop = np.abs(np.diff(edges[:, :2], axis=1)[:, 0]) != 1
-            i, j = rows.T
-            motions = Edge(i, j, _poses_from(edges[:, 2:9]), information, loop=loop)
-            return PoseGraph(_poses_from(vertices[first, 1:]), motions)
+            return graph_of(file)
         except ValueError as error:
             reason = "it is not text" if isinstance(error, UnicodeError) else error
             raise ValueError(f"{path}: cannot be read as a pose graph: {reason}") from error
@@ -216,27 +200,13 @@ def write_g2o(path: str | os.PathLike[str], graph: PoseGraph | Any) -> None:
 
     Raises:
         OSError: if the file cannot be written.
+        ValueError: if `graph` is neither.
     """
-    kept = np.asarray(getattr(graph, "kept", np.ones(len(graph.edges), bool)))
-    edges = graph.edges[kept]
-    upper = np.asarray(edges.information)[:, *np.triu_indices(6)]
+    if not isinstance(getattr(graph, "edges", None), Edge):
+        raise ValueError(f"graph: expected a PoseGraph or a PoseGraphResult, got {type(graph).__name__}")
     with _replacing(Path(path)) as file:
-        for tag, ends, poses, rest in (
-            (_VERTEX, np.arange(len(graph.poses))[:, None], graph.poses, None),
-            (_EDGE, np.column_stack([edges.i, edges.j]), edges.T_i_j, upper),
-        ):
-            parameters = parameters_of(np.asarray(poses, np.float64))
-            numbers = [parameters[:, 4:], parameters[:, 1:4], parameters[:, :1], *([] if rest is None else [rest])]
-            form = " ".join([tag, *["%d"] * ends.shape[1], *["%.17g"] * sum(each.shape[1] for each in numbers)])
-            np.savetxt(file, np.column_stack([ends, *numbers]), fmt=form)
-
-
-def _poses_from(rows: Float[np.ndarray, "N 7"]) -> Float[np.ndarray, "N 4 4"]:
-    """Poses from x y z qx qy qz qw, with quaternions of any norm."""
-    lengths = np.linalg.norm(rows[:, 3:], axis=1, keepdims=True)
-    if not np.isfinite(rows).all() or not lengths.all():
-        raise ValueError("expected finite numbers and quaternions other than 0")
-    return matrices_of(np.concatenate([rows[:, 6:] / lengths, rows[:, 3:6] / lengths, rows[:, :3]], axis=1))
+        for form, rows in lines_of(graph):
+            np.savetxt(file, rows, fmt=form)
 
 
 def _rotations(quaternions: Float[np.ndarray, "N 4"]) -> Float[np.ndarray, "N 3 3"]:

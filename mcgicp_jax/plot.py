@@ -20,6 +20,7 @@ from mcgicp_jax._directions import CHANNELS_HOLD, GEOMETRY_HOLDS, shares
 from mcgicp_jax._graph import PoseGraphResult
 from mcgicp_jax._methods import AbstractMethod
 from mcgicp_jax._pose import Pose, pose_matrix
+from mcgicp_jax._pose_graph import WORLD
 from mcgicp_jax._result import Registration
 from mcgicp_jax._surfaces import covariances_of
 
@@ -361,7 +362,7 @@ def trajectories(
 def graph(graph: PoseGraphResult, *, path: str | os.PathLike[str] | None = None) -> matplotlib.figure.Figure:
     """Plot the poses of a graph in their principal plane, and its edges coloured by residual in standard deviations.
 
-    Rejected loops are dashed.
+    Rejected loops are dashed. A prior is drawn from the position that it measured.
 
     Args:
         graph: result of `optimize_poses`, such as `Multiway.graph`.
@@ -372,11 +373,13 @@ def graph(graph: PoseGraphResult, *, path: str | os.PathLike[str] | None = None)
     """
     figures, collections = _module("matplotlib.figure"), _module("matplotlib.collections")
     positions = np.asarray(graph.poses)[:, :3, 3]
-    centred = positions - positions.mean(axis=0)
-    flat = centred @ np.linalg.svd(centred, full_matrices=False)[2][:2].T
-    flat = flat if flat.shape[1] == 2 else np.column_stack([flat, np.zeros(len(flat))])
-    kept, residuals = np.asarray(graph.kept), np.asarray(graph.residuals)
-    segments = np.stack([flat[np.asarray(graph.edges.i)], flat[np.asarray(graph.edges.j)]], axis=1)
+    centre = positions.mean(axis=0)
+    # The eigenvectors of the two largest eigenvalues, which come last.
+    axes = np.linalg.eigh((positions - centre).T @ (positions - centre))[1][:, :0:-1]
+    kept, residuals, i = np.asarray(graph.kept), np.asarray(graph.residuals), np.asarray(graph.edges.i)
+    priors = (i == WORLD)[:, None]
+    starts = np.where(priors, np.asarray(graph.edges.T_i_j)[:, :3, 3], positions[np.where(priors[:, 0], 0, i)])
+    segments = (np.stack([starts, positions[np.asarray(graph.edges.j)]], axis=1) - centre) @ axes
     figure = figures.Figure((7, 5), layout="constrained")
     panel = figure.subplots()
     for chosen, style in ((kept, "solid"), (~kept, "dashed")):
@@ -386,7 +389,7 @@ def graph(graph: PoseGraphResult, *, path: str | os.PathLike[str] | None = None)
         panel.add_collection(lines)
         if style == "solid":
             figure.colorbar(lines, ax=panel, label="residual, standard deviations", extend="max")
-    panel.plot(*flat.T, marker=".", markersize=4, linestyle="none", color="black")
+    panel.plot(*((positions - centre) @ axes).T, marker=".", markersize=4, linestyle="none", color="black")
     panel.set(xlabel="metres", ylabel="metres", aspect="equal", adjustable="datalim")
     panel.grid(alpha=0.3)
     if path is not None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import jax
 import numpy as np
 from scipy.spatial.transform import Rotation
 
@@ -91,8 +92,28 @@ def measured(poses, loops, deviations=(0.05, 0.02), seed=0, false=0.0):
     return mcg.PoseGraph(np.array(start), edges), np.arange(len(edges)) < len(i)
 
 
-def with_gtsam(graph, weights=None):
-    """Poses and cost at the minimum of gtsam's Levenberg-Marquardt from the same start; with seconds that it took."""
+def with_priors(graph, truth, seed=7):
+    """The graph with positions of every other pose, without rotations, and one full prior; 0.1 m and 0.05 rad."""
+    rng = np.random.default_rng(seed)
+    sigma = np.repeat((0.1, 0.05), 3)
+    rows = np.append(np.arange(1, len(truth), 2), len(truth) - 1)
+    information = np.tile(np.diag(sigma**-2.0), (len(rows), 1, 1))
+    information[:-1, 3:] = 0
+    priors = mcg.Edge(
+        np.full(len(rows), mcg.WORLD), rows, moved(truth[rows], sigma * rng.normal(size=(len(rows), 6))), information
+    )
+    return mcg.PoseGraph(graph.poses, joined(graph.edges, priors))
+
+
+def joined(*edges):
+    return jax.tree.map(lambda *values: np.concatenate(values), *edges)
+
+
+def with_gtsam(graph, weights=None, covariances=False):
+    """Poses and cost at the minimum of gtsam's Levenberg-Marquardt from the same start, and seconds that it took.
+
+    With `covariances`, those of the poses instead of the seconds.
+    """
     import time
 
     import gtsam
@@ -104,10 +125,20 @@ def with_gtsam(graph, weights=None):
     order = [3, 4, 5, 0, 1, 2]
     for k in range(len(edges)) if weights is None else np.flatnonzero(weights):
         noise = gtsam.noiseModel.Gaussian.Information(edges.information[k][np.ix_(order, order)])
-        factors.add(gtsam.BetweenFactorPose3(int(edges.i[k]), int(edges.j[k]), gtsam.Pose3(edges.T_i_j[k]), noise))
-    factors.add(gtsam.NonlinearEqualityPose3(0, gtsam.Pose3(graph.poses[0])))
+        motion, j = gtsam.Pose3(edges.T_i_j[k]), int(edges.j[k])
+        if edges.i[k] == mcg.WORLD:
+            factors.add(gtsam.PriorFactorPose3(j, motion, noise))
+        else:
+            factors.add(gtsam.BetweenFactorPose3(int(edges.i[k]), j, motion, noise))
+    if not np.any(edges.i == mcg.WORLD):
+        factors.add(gtsam.NonlinearEqualityPose3(0, gtsam.Pose3(graph.poses[0])))
     start = time.perf_counter()
     optimizer = gtsam.LevenbergMarquardtOptimizer(factors, values)
     found = optimizer.optimize()
     seconds = time.perf_counter() - start
-    return np.array([found.atPose3(k).matrix() for k in range(len(graph.poses))]), factors.error(found), seconds
+    poses = np.array([found.atPose3(k).matrix() for k in range(len(graph.poses))])
+    if covariances:
+        marginals = gtsam.Marginals(factors, found)
+        own = [np.ix_(order, order)] * len(poses)
+        return poses, factors.error(found), np.array([marginals.marginalCovariance(k)[o] for k, o in enumerate(own)])
+    return poses, factors.error(found), seconds

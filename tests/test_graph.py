@@ -8,16 +8,18 @@ import jaxlie
 import numpy as np
 import pytest
 from scipy.optimize import least_squares
+from scipy.sparse import csc_array
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
 import mcgicp_jax as mcg
 from mcgicp_jax import _graph, metrics
-from mcgicp_jax._graph import certainty_of
-from mcgicp_jax._normal_equations import Minimum, NormalEquations
+from mcgicp_jax._graph import motion_covariances
+from mcgicp_jax._normal_equations import Minimum, NormalEquations, factored
 from mcgicp_jax._pose import parameters_of
+from mcgicp_jax._sparse_inverse import inverse_blocks
 from tests.differences import X64, needs_x64
-from tests.graphs import garage, grid, measured, moved, pose, sphere, with_gtsam
+from tests.graphs import garage, grid, joined, measured, moved, pose, sphere, with_gtsam, with_priors
 from tests.test_programs import compilations
 
 SMALL = {"sphere": sphere(6, 10), "grid": grid(3), "garage": garage(2, 40)}
@@ -90,6 +92,98 @@ def test_the_minimum_is_that_of_dense_least_squares():
     np.testing.assert_allclose(found.poses[0], graph.poses[0], atol=1e-15)
 
 
+def test_priors_give_the_minimum_and_the_covariances_of_gtsam():
+    pytest.importorskip("gtsam")
+    poses, loops = SMALL["garage"]
+    clean, _ = measured(poses, loops)
+    # As gtsam cannot take singular information, positions get some information about rotations.
+    graph = with_priors(clean, poses)
+    edges = graph.edges
+    known = edges.information + 1e-2 * np.diag([0, 0, 0, 1, 1, 1])
+    graph = mcg.PoseGraph(graph.poses, mcg.Edge(edges.i, edges.j, edges.T_i_j, known))
+    found = mcg.optimize_poses(graph)
+    expected, cost, covariances = with_gtsam(graph, covariances=True)
+    assert found.converged and len(found.poses) == len(poses)
+    np.testing.assert_allclose(found.cost, cost, rtol=1e-6)
+    np.testing.assert_allclose(found.poses, expected, atol=1e-4)
+    np.testing.assert_allclose(found.covariance, covariances, atol=1e-3 * np.abs(covariances).max())
+    assert np.abs(found.poses[0] - graph.poses[0]).max() > 1e-3
+
+
+def test_a_prior_alone_moves_the_graph_and_makes_it_uncertain():
+    """Next to motions known to a millimetre, a start known to 100 m: no pose is held, and no digit is lost."""
+    graph, _ = measured(*grid(2), deviations=(1e-3, 1e-3))
+    start = pose((3e5, 5e6, 100), (0.1, 0.2, -2.0))
+    covariance = np.diag([1e4, 1e4, 1e4, 0.1, 0.1, 0.2])
+    prior = mcg.Edge(mcg.WORLD, 0, start, covariance=covariance)
+    found = mcg.optimize_poses(mcg.PoseGraph(None, joined(graph.edges, prior[None])))
+    alone = mcg.optimize_poses(graph)
+    assert found.converged
+    np.testing.assert_allclose(found.cost, alone.cost, rtol=1e-6)
+    np.testing.assert_allclose(found.poses[0], start, atol=1e-3)
+    inner, expected = (np.linalg.inv(poses[0]) @ poses for poses in (found.poses, alone.poses))
+    np.testing.assert_allclose(inner, expected, atol=1e-5)
+    deviations = np.sqrt(np.diag(covariance))
+    np.testing.assert_allclose(found.covariance[0] / deviations / deviations[:, None], np.eye(6), atol=1e-3)
+    # A position alone leaves the direction open.
+    free = mcg.Edge(mcg.WORLD, 0, start, np.diag([1e-4, 1e-4, 1e-4, 0, 0, 0]))
+    turning = mcg.optimize_poses(mcg.PoseGraph(None, joined(graph.edges, free[None])))
+    assert turning.status == mcg.Status.DEGENERATE
+
+
+def test_parts_that_have_priors_are_well_defined():
+    poses, loops = SMALL["grid"]
+    graph, _ = measured(poses, loops)
+    apart = graph.edges[(graph.edges.i < 13) == (graph.edges.j < 13)]
+    covariance = np.diag([1e-4] * 6)
+    priors = [mcg.Edge(mcg.WORLD, k, poses[k], covariance=covariance)[None] for k in (3, 20)]
+    found = mcg.optimize_poses(mcg.PoseGraph(graph.poses, joined(apart, *priors)))
+    assert found.converged and np.isfinite(found.covariance).all()
+    np.testing.assert_allclose(found.poses[[3, 20]], poses[[3, 20]], atol=1e-4)
+    np.testing.assert_allclose(found.covariance[[3, 20]], np.array([covariance] * 2), rtol=1e-4, atol=1e-9)
+    one = mcg.optimize_poses(mcg.PoseGraph(graph.poses, joined(apart, priors[1])))
+    assert one.status == mcg.Status.DEGENERATE
+    assert np.all(np.isinf(np.diagonal(one.covariance[:13], 0, 1, 2))) and np.all(np.isfinite(one.covariance[13:]))
+    # A wrong prior is rejected like a loop.
+    wrong = mcg.Edge(mcg.WORLD, 5, pose((50, 0, 0), (0, 0, 1)), covariance=covariance, loop=True)[None]
+    again = mcg.optimize_poses(mcg.PoseGraph(graph.poses, joined(apart, *priors, wrong)))
+    assert not again.kept[-1]
+    np.testing.assert_array_equal(again.kept[:-1], found.kept)
+    np.testing.assert_allclose(again.poses, found.poses, atol=1e-6)
+
+
+def test_a_start_is_composed_from_the_edges():
+    poses, loops = SMALL["garage"]
+    graph, _ = measured(poses, loops)
+    rng = np.random.default_rng(0)
+    # Odometry comes first, in whatever order and direction the edges are given.
+    edges, order = graph.edges, rng.permutation(len(graph.edges))
+    turned = rng.random(len(edges)) < 0.5
+    i, j = np.where(turned, edges.j, edges.i), np.where(turned, edges.i, edges.j)
+    motions = np.where(turned[:, None, None], np.linalg.inv(edges.T_i_j), edges.T_i_j)
+    mixed = mcg.Edge(i, j, motions, edges.information, loop=edges.loop)[order]
+    expected = np.linalg.inv(graph.poses[0]) @ graph.poses
+    np.testing.assert_allclose(mcg.PoseGraph(None, mixed).poses, expected, atol=1e-9)
+    # Across a gap by a loop, and into the world by a prior.
+    gap = (mixed.i < 30) == (mixed.j < 30)
+    prior = mcg.Edge(mcg.WORLD, 40, poses[40], np.eye(6))
+    exact = mcg.Edge(
+        mixed.i, mixed.j, np.linalg.inv(poses[mixed.i]) @ poses[mixed.j], mixed.information, loop=mixed.loop
+    )
+    np.testing.assert_allclose(
+        mcg.PoseGraph(None, joined(exact[gap | mixed.loop], prior[None])).poses, poses, atol=1e-9
+    )
+    # What has no prior begins at the identity; an edge that knows no heading comes last.
+    apart = mcg.PoseGraph(None, joined(exact[gap], prior[None])).poses
+    np.testing.assert_allclose(apart[:30], np.linalg.inv(poses[0]) @ poses[:30], atol=1e-9)
+    np.testing.assert_allclose(apart[30:], poses[30:], atol=1e-9)
+    blind = mcg.Edge(0, 1, pose((9, 9, 9), (0, 0, 1)), np.diag([1.0, 1, 1, 1, 1, 0]))
+    sure = mcg.Edge(0, 1, pose((1, 0, 0), (0, 0, 0)), np.eye(6), loop=True)
+    np.testing.assert_allclose(mcg.PoseGraph(None, [blind, sure]).poses[1], sure.T_i_j, atol=1e-12)
+    with pytest.raises(ValueError, match="poses: expected poses, since the edges are none or traced"):
+        mcg.PoseGraph(None, [])
+
+
 def test_an_exact_graph_ends_at_the_truth():
     poses, loops = SMALL["sphere"]
     graph, _ = measured(poses, loops, deviations=(0.05, 0.02))
@@ -130,8 +224,8 @@ def test_covariances_are_those_of_finite_differences():
     between = mcg.Edge(i, j, np.linalg.inv(found.poses[i]) @ found.poses[j], np.tile(np.eye(6), (4, 1, 1)))
     motions = jacobian(whitened(mcg.PoseGraph(found.poses, between)), size).reshape(4, 6, size)
     expected = motions @ covariance @ motions.swapaxes(1, 2)
-    certainty = certainty_of(mcg.PoseGraph(found.poses, graph.edges))
-    np.testing.assert_allclose(certainty.between(i, j), expected, atol=1e-3 * expected.max())
+    covariances = motion_covariances(mcg.PoseGraph(found.poses, graph.edges), i, j)
+    np.testing.assert_allclose(covariances, expected, atol=1e-3 * expected.max())
 
 
 def test_rejected_loops_leave_no_trace():
@@ -200,16 +294,26 @@ def direction(graph):
     return 0.1 * twists, 20 * (change + change.swapaxes(1, 2))
 
 
-def test_covariances_are_blocks_of_the_inverse(both, monkeypatch):
-    graph, found, inside, _ = both
+def test_covariances_are_blocks_of_the_inverse(both):
+    _, found, inside, _ = both
     dense = np.asarray(inside.covariance)
     deviations = np.sqrt(np.diagonal(found.covariance, 0, 1, 2))[1:]
     difference = (found.covariance - dense)[1:] / deviations[:, :, None] / deviations[:, None]
     assert np.abs(difference).max() < (1e-4 if X64 else 0.05)
-    monkeypatch.setattr(_graph, "_COLUMNS", 18)
-    monkeypatch.setattr(_graph, "_DENSE", 0)
-    again = mcg.optimize_poses(graph, robust=False)
-    np.testing.assert_allclose(again.covariance, found.covariance, rtol=1e-6, atol=1e-12)
+
+
+def test_blocks_of_a_sparse_inverse_are_those_of_the_dense_one():
+    rng = np.random.default_rng(0)
+    number = 25
+    linked = rng.random((number, number)) < 0.08
+    pattern = np.kron(linked | linked.T | np.eye(number, dtype=bool), np.ones((6, 6)))
+    matrix = pattern * rng.normal(size=pattern.shape)
+    matrix = matrix + matrix.T + np.diag(np.abs(matrix).sum(axis=1) * 2)
+    pairs = np.argwhere(linked & ~np.eye(number, dtype=bool))
+    dense = np.linalg.inv(matrix).reshape(number, 6, number, 6)
+    diagonal, others = inverse_blocks(factored(csc_array(matrix)), pairs)
+    np.testing.assert_allclose(diagonal, dense[np.arange(number), :, np.arange(number)], atol=1e-12)
+    np.testing.assert_allclose(others, dense[pairs[:, 0], :, pairs[:, 1]], atol=1e-12)
 
 
 @pytest.mark.parametrize("name", SMALL)
@@ -254,6 +358,25 @@ def test_transformations_give_the_same_poses(both):
 
 def test_the_derivative_is_that_of_finite_differences(both):
     graph, _, _, slope = both
+    check_slope(graph, slope)
+
+
+def test_priors_give_the_same_inside_transformations(both):
+    """In the same program: some of the edges are priors now."""
+    edges, poses = both[0].edges, SMALL["grid"][0]
+    i, motions = edges.i.copy(), edges.T_i_j.copy()
+    i[-4:] = mcg.WORLD
+    motions[-4:] = moved(poses[edges.j[-4:]], np.repeat((0.05, 0.02), 3) * np.random.default_rng(4).normal(size=(4, 6)))
+    graph = mcg.PoseGraph(both[0].poses, mcg.Edge(i, edges.j, motions, edges.information))
+    found, slope = differentiated(graph, *direction(graph))
+    expected = mcg.optimize_poses(graph, robust=False)
+    assert found.converged and expected.converged
+    np.testing.assert_allclose(found.poses, expected.poses, atol=2e-3)
+    np.testing.assert_allclose(found.covariance, expected.covariance, atol=1e-3 * expected.covariance.max())
+    check_slope(graph, slope)
+
+
+def check_slope(graph, slope):
     twists, change = direction(graph)
     edges, h = graph.edges, 0.02
 
@@ -284,8 +407,10 @@ def test_failures_inside_transformations_are_statuses(both):
 
 @pytest.mark.slow
 @needs_x64
-def test_gradients_reach_motions_and_informations():
+@pytest.mark.parametrize("priors", [False, True])
+def test_gradients_reach_motions_and_informations(priors):
     graph = correlated(measured(*grid(2))[0])
+    graph = with_priors(graph, grid(2)[0]) if priors else graph
     rng = np.random.default_rng(2)
     scale = rng.normal(size=(len(graph.poses), 3, 4))
     edges, m = graph.edges, len(graph.edges)
@@ -375,6 +500,10 @@ def test_what_is_wrong_is_named():
         mcg.PoseGraph([], [])
     with pytest.raises(ValueError, match=r"poses: expected at least one pose of shape \(4, 4\), got shape \(4, 4\)"):
         mcg.PoseGraph(jnp.eye(4), [])
+    for name in ("T_i_j", "information", "covariance"):
+        numbers = {"T_i_j": eye, **({} if name == "covariance" else {"information": np.eye(6)})}
+        with pytest.raises(ValueError, match=f"{name}: expected an array of numbers, got array"):
+            mcg.Edge(0, 1, **numbers | {name: np.array("a")})
     for matrices in ({}, {"information": np.eye(6), "covariance": np.eye(6)}):
         with pytest.raises(ValueError, match="information: expected either"):
             mcg.Edge(0, 1, eye, **matrices)
@@ -437,16 +566,42 @@ def test_files(tmp_path):
         assert factors.size() == len(graph.edges)
         own = 0.5 * np.sum(mcg.optimize_poses(graph, robust=False, max_iterations=1).residuals ** 2)
         assert own <= factors.error(values)
+    vertex = "VERTEX_SE3:QUAT 0 1 0 0 0 0 0 1\n"
     for text, message in (
-        ("EDGE_SE3:QUAT 0 1 1 0 0 0 0 0 1" + 21 * " 1", "expected a vertex for each end"),
-        ("VERTEX_SE3:QUAT 0 1 0 0 0 0 0", "cannot be read as a pose graph"),
-        ("VERTEX_SE3:QUAT 0 1 0 0 0 0 0 1\nEDGE_SE3:QUAT 0 2 1 0 0 0 0 0 1" + 21 * " 1", "a vertex for each end"),
-        ("VERTEX_SE3:QUAT 0 1 0 0 0 0 0 0", r"c\.g2o: .*quaternions other than 0"),
-        ("", "expected a vertex"),
+        ("EDGE_SE3:QUAT 0 1 1 0 0 0 0 0 1" + 21 * " 1", "got EDGE_SE3:QUAT"),
+        (
+            "\nVERTEX_SE3:QUAT 0 1 0 0 0 0 0",
+            r"c\.g2o: cannot be read as a pose graph: line 2: expected 8 numbers .* got 7",
+        ),
+        (vertex + "VERTEX_SE3:QUAT 1 1 0 0 0 0 x 1", "line 2: could not convert string to float: 'x'"),
+        (
+            vertex + "EDGE_SE3:QUAT 0 2 1 0 0 0 0 0 1" + 21 * " 1",
+            "line 2: expected a vertex for each end, got none of number 2",
+        ),
+        ("VERTEX_SE3:QUAT 0 1 0 0 0 0 0 0", "line 1: expected finite numbers and a quaternion other than 0"),
+        ("VERTEX_SE2 0 1 0 0\nEDGE_SE2 0 1 1 0 0 1 0 0 1 0 1", "poses in space, got EDGE_SE2, VERTEX_SE2"),
+        (
+            vertex + "PARAMS_SE3OFFSET 0 1 0 0 0 0 0 1\nEDGE_SE3_PRIOR 0 0 0 0 0 0 0 0 1" + 21 * " 1",
+            "got PARAMS_SE3OFFSET",
+        ),
+        ("", "expected lines VERTEX_SE3:QUAT, poses in space, got none"),
     ):
         (tmp_path / "c.g2o").write_text(text)
         with pytest.raises(ValueError, match=message):
             mcg.io.read_g2o(tmp_path / "c.g2o")
+
+
+def test_files_hold_priors(tmp_path):
+    poses, loops = SMALL["grid"]
+    graph = with_priors(measured(poses, loops)[0], poses)
+    mcg.io.write_g2o(tmp_path / "a.g2o", graph)
+    again = mcg.io.read_g2o(tmp_path / "a.g2o")
+    for name in ("i", "j", "T_i_j", "information"):
+        np.testing.assert_allclose(getattr(again.edges, name), getattr(graph.edges, name), atol=1e-12)
+    prior = again.edges.i == mcg.WORLD
+    assert prior.sum() == 14 and not again.edges.loop[prior].any()
+    with pytest.raises(ValueError, match="graph: expected a PoseGraph or a PoseGraphResult, got NoneType"):
+        mcg.io.write_g2o(tmp_path / "b.g2o", None)
 
 
 def test_files_are_those_of_others(tmp_path):

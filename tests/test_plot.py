@@ -318,4 +318,7 @@ def test_graphs_show_poses_and_edges(tmp_path):
     assert len(kept.get_segments()) == found.kept.sum() and len(rejected.get_segments()) == (~found.kept).sum() > 0
     np.testing.assert_allclose(kept.get_array(), found.residuals[found.kept])
     assert (tmp_path / "graph.png").stat().st_size > 1000
+    prior = mcg.Edge(mcg.WORLD, 0, np.eye(4), np.eye(6))
+    lines = plot.graph(mcg.optimize_poses(mcg.PoseGraph([np.eye(4)], [prior]))).axes[0].collections
+    assert [len(each.get_segments()) for each in lines] == [1, 0]
     assert len(plot.graph(mcg.optimize_poses(mcg.PoseGraph([np.eye(4)], []))).axes[0].lines) == 1
