@@ -3,7 +3,7 @@
 A tie point has the residual b − T a. A prior P on the pose has six: of E = P⁻¹ T the translation, and the rotation
 vector to first order, ½ (E − Eᵀ) as a vector: the sine of the angle times the axis. All are linear in the entries of
 the pose. Let D = [ΔR − I | Δt] be the change from a fixed pose T₀ about a fixed centre c: T a − c = ΔR (T₀ a − c) + Δt.
-Then the cost is e − 2 ⟨D, G⟩ + ⟨D, Q D⟩ with a constant (12, 12) matrix Q and 12 numbers G, for any number of tie points.
+Then the cost is e − 2 ⟨D, G⟩ + ⟨D, Q D⟩ with constant Q (12, 12) and G (12), for any number of tie points.
 """
 
 from __future__ import annotations

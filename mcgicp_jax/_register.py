@@ -13,6 +13,7 @@ import numpy as np
 from jax.typing import ArrayLike
 
 from mcgicp_jax._channels import warn_of_units, with_channels_matched
+from mcgicp_jax._checks import check_integer, check_positive
 from mcgicp_jax._cloud import PointCloud, Values
 from mcgicp_jax._cost import centred_pose, check_matches
 from mcgicp_jax._dense import default_search
@@ -21,7 +22,7 @@ from mcgicp_jax._host import correspondences_at, register_on_host
 from mcgicp_jax._kept import keep
 from mcgicp_jax._kernels import AbstractKernel
 from mcgicp_jax._methods import AbstractMethod, MultiChannelGICP, PointToPoint
-from mcgicp_jax._options import ROTATION_TOLERANCE, Distance, Options, check_method, check_positive
+from mcgicp_jax._options import ROTATION_TOLERANCE, Distance, Options, check_method
 from mcgicp_jax._outcome import registration_of
 from mcgicp_jax._pose import Pose, computed_now, is_concrete, se3_from_matrix
 from mcgicp_jax._preprocess import preprocess
@@ -115,8 +116,7 @@ def find_correspondences(
     _check_clouds(source, target, method)
     method = method.resolve(source, target)
     check_positive("max_distance", max_distance)
-    if num_candidates < 1:
-        raise ValueError(f"num_candidates: expected at least 1, got {num_candidates}")
+    check_integer("num_candidates", num_candidates, 1)
     matrix = centred_pose(pose, source, target, "pose")
     matrix, max_distance, method = constant((matrix, max_distance, method))
     rows, target_rows = (searchable(method, constant(cloud)) for cloud in (source, target))
@@ -296,16 +296,6 @@ def register(
         match_channels=match_channels,
         scales=scales,
     )
-    if isinstance(init, str):
-        if init != "global":
-            raise ValueError(f'init: expected a pose, "global" or None, got {init!r}')
-        if not is_concrete(source, target):
-            raise ValueError('init: expected a pose inside transformations, got "global"')
-        check_method(method)
-        start = global_pose(source, target)
-        if not start.success:
-            return Registration.without_pose(Status.TOO_FEW_CORRESPONDENCES)
-        init = start.matrix
     if tie_points is None and prior is None:
         return register_with(source, target, method, init, options)
     if not hold_free_directions:
@@ -317,13 +307,18 @@ def register_with(
     source: PointCloud | Values,
     target: PointCloud | Values,
     method: AbstractMethod,
-    init: Pose | None,
+    init: Any,
     options: Options,
     tie_points: GivenTiePoints | None = None,
     prior: GivenPrior | None = None,
 ) -> Registration:
     """`register` with its options as one object."""
     check_method(method)
+    if isinstance(init, str):
+        start = start_from_anywhere(init, source, target)
+        if not start.success:
+            return Registration.without_pose(Status.TOO_FEW_CORRESPONDENCES)
+        return register_with(source, target, method, start.matrix, options, tie_points, prior)
     source, target = (
         _ready(name, cloud, options.takes_raw(method, name)) for name, cloud in (("source", source), ("target", target))
     )
@@ -353,6 +348,15 @@ def register_with(
         problem = replace(run.problem, start=constant(run.state.pose), fusion=fusion)
         run = _run(problem, target, search, options.max_iterations)
     return registration_of(*run.finish(), source, target)
+
+
+def start_from_anywhere(init: str, source: PointCloud | Values, target: PointCloud | Values) -> GlobalPose:
+    """The start of a registration with `init="global"`."""
+    if init != "global":
+        raise ValueError(f'init: expected a pose, "global" or None, got {init!r}')
+    if not is_concrete(source, target):
+        raise ValueError('init: expected a pose inside transformations, got "global"')
+    return global_pose(source, target)
 
 
 class _Run(NamedTuple):

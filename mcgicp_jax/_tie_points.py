@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any, TypeAlias
+from typing import TYPE_CHECKING, Any, TypeAlias, cast
 
 import equinox as eqx
 import jax
@@ -13,6 +13,7 @@ from jaxtyping import Float
 
 from mcgicp_jax._cloud import PointCloud
 from mcgicp_jax._cost import centred_pose
+from mcgicp_jax._directions import Directions
 from mcgicp_jax._fusion import fuse
 from mcgicp_jax._host import as_float64
 from mcgicp_jax._outcome import translation_adjoint
@@ -64,7 +65,7 @@ def fusion_of(state: State, moments: Moments, ties: TiePoints | None, prior: Pri
     """The equation of the pose with tie points and prior, from the final state of a registration without them."""
     state, moments = constant((state, moments))
     dtype, matrix = state.pose.wxyz_xyz.dtype, _matrix_of(state.pose)
-    center, directions = state.sums.center, state.directions
+    center, directions = state.sums.center, cast(Directions, state.directions)
     if is_concrete(state):
         # Reading NumPy arrays compiles nothing.
         center, directions = jax.tree.map(np.asarray, (center, directions))

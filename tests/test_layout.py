@@ -9,7 +9,7 @@ import mcgicp_jax
 ROOT = pathlib.Path(mcgicp_jax.__file__).parent
 # From the ground up: a module knows those of its own layer and of the layers below.
 LAYERS = {
-    "algebra": ("_pose", "_algebra", "_statistics", "_kernels", "_sizes", "_deferred"),
+    "algebra": ("_pose", "_algebra", "_statistics", "_kernels", "_sizes", "_deferred", "_checks"),
     "running": ("_threads", "_blocks"),
     "search": ("_search", "_nearest", "_tree_index", "_pykdtree", "_trees", "_dense"),
     "data": ("_cloud", "_kept", "_preprocess", "_map", "_formats", "_pose_graph", "io", "metrics", "datasets"),
