@@ -18,7 +18,7 @@ from concurrent.futures import wait as wait_for
 from dataclasses import dataclass, replace
 from functools import partial
 from multiprocessing import get_context
-from typing import Any, TypeAlias
+from typing import Any, Literal, TypeAlias
 
 import equinox as eqx
 import jax
@@ -29,11 +29,11 @@ from mcgicp_jax._cloud import PointCloud, Values
 from mcgicp_jax._dense import DenseSearch, default_search
 from mcgicp_jax._lanes import run_problems
 from mcgicp_jax._methods import AbstractMethod
-from mcgicp_jax._options import Options, check_method
+from mcgicp_jax._options import Options, check_method, options_of
 from mcgicp_jax._outcome import registration_of
 from mcgicp_jax._pose import Pose, pose_matrix
 from mcgicp_jax._preprocess import check_preprocessing, preprocess
-from mcgicp_jax._register import pose_problem, register_with
+from mcgicp_jax._register import pose_problem, register_with, start_from_anywhere
 from mcgicp_jax._result import Registration, Status, computed
 from mcgicp_jax._search import AbstractSearch
 from mcgicp_jax._sizes import size_class
@@ -52,7 +52,7 @@ def register_batch(
     targets: Iterable[Cloud] | Cloud,
     method: AbstractMethod,
     *,
-    init: Iterable[Pose | None] | Pose | None = None,
+    init: Iterable[Pose | Literal["global"] | None] | Pose | Literal["global"] | None = None,
     voxel_size: float | None = None,
     num_neighbors: int = 20,
     executor: Executor | None = None,
@@ -80,7 +80,7 @@ def register_as_completed(
     targets: Iterable[Cloud] | Cloud,
     method: AbstractMethod,
     *,
-    init: Iterable[Pose | None] | Pose | None = None,
+    init: Iterable[Pose | Literal["global"] | None] | Pose | Literal["global"] | None = None,
     voxel_size: float | None = None,
     num_neighbors: int = 20,
     executor: Executor | None = None,
@@ -97,7 +97,8 @@ def register_as_completed(
             one side may be a single cloud for all pairs. An item may also be a function without arguments that returns
             a cloud, such as `functools.partial(mcgicp_jax.io.read, path)`, which the worker calls.
         method: as in `register`; parameters left None are estimated for each pair.
-        init: T_target_source to start from: one for all pairs, or an iterable with one per pair; None is the identity.
+        init: T_target_source to start from: one for all pairs, or an iterable with one per pair; None is the identity,
+            and "global" finds it by `global_pose`.
         voxel_size, num_neighbors: as in `preprocess`, for raw clouds, which the workers preprocess.
         executor: any `concurrent.futures.Executor`, such as a `ProcessPoolExecutor` with the start method "spawn" or
             Dask's `Client.get_executor()`; by default one thread per core. A pair whose worker dies is sent once more,
@@ -117,7 +118,7 @@ def register_as_completed(
     check_method(method)
     check_preprocessing(voxel_size, num_neighbors)
     _check_executor(executor)
-    job = _Job(method, Options(**options), voxel_size, num_neighbors)
+    job = _Job(method, options_of(register_batch, options), voxel_size, num_neighbors)
     return _run(job, _pairs(job, sources, targets, init), executor)
 
 
@@ -139,7 +140,7 @@ class _Pair:
     index: int
     source: Cloud
     target: Cloud
-    init: Pose | None
+    init: Pose | Literal["global"] | None
 
 
 @dataclass(frozen=True)
@@ -187,7 +188,13 @@ class _Job:
         """The pair as input of a lane, both surfaces padded to one size class so that few programs are compiled."""
         try:
             source, target = self.ready("source", pair.source), self.ready("target", pair.target)
-            problem = pose_problem(source, target, self.method, pair.init, self.options, num_threads=1)
+            init = pair.init
+            if isinstance(init, str):
+                start = start_from_anywhere(init, source, target)
+                if not start.success:
+                    return _Outcome(pair.index, Registration.without_pose(Status.TOO_FEW_CORRESPONDENCES))
+                init = start.matrix
+            problem = pose_problem(source, target, self.method, init, self.options, num_threads=1)
             problem = _padded(problem, size_class(max(len(source.points), len(target.points))))
         except ValueError as error:
             return _invalid(pair, error)
@@ -397,19 +404,22 @@ def _pairs(
     job: _Job,
     sources: Iterable[Cloud] | Cloud,
     targets: Iterable[Cloud] | Cloud,
-    init: Iterable[Pose | None] | Pose | None,
+    init: Iterable[Pose | Literal["global"] | None] | Pose | Literal["global"] | None,
 ) -> Iterator[_Pair]:
     """Iterate lazily over the pairs; arguments common to all are checked immediately."""
-    if isinstance(init, str):
-        raise ValueError(f"init: expected a pose, or one per pair, got {init!r}; call global_pose for each pair")
+    if isinstance(init, str) and init != "global":
+        raise ValueError(f'init: expected a pose, "global", or one per pair, got {init!r}')
     sides: dict[str, Any] = {"sources": sources, "targets": targets, "init": init}
     one_for_all = {"sources": _is_one_cloud(sources), "targets": _is_one_cloud(targets), "init": _is_one_pose(init)}
     if one_for_all["sources"] and one_for_all["targets"]:
         raise ValueError("sources: expected several clouds on at least one side, got one on each; call register")
     for name in sides:
         if one_for_all[name]:
-            one = pose_matrix(sides[name]) if name == "init" else job.ready(name, sides[name])
-            sides[name] = itertools.repeat(one)
+            if name != "init":
+                sides[name] = job.ready(name, sides[name])
+            elif not isinstance(init, str):
+                sides[name] = pose_matrix(sides[name])
+            sides[name] = itertools.repeat(sides[name])
         elif isinstance(sides[name], jaxlie.SE3):
             sides[name] = np.asarray(sides[name].as_matrix())
         elif not isinstance(sides[name], Iterable):
@@ -443,7 +453,7 @@ def _is_one_cloud(given: object) -> bool:
 def _is_one_pose(given: object) -> bool:
     if isinstance(given, jaxlie.SE3):
         return given.wxyz_xyz.ndim == 1
-    return given is None or getattr(given, "ndim", None) == 2
+    return given is None or isinstance(given, str) or getattr(given, "ndim", None) == 2
 
 
 def _check_executor(executor: Executor | None) -> None:

@@ -24,6 +24,9 @@ from mcgicp_jax._sums import Sums
 # artificial in-plane stiffness equals a true fraction of ε, 0.001 by default. Channels: 0.003 from noise alone, from
 # 0.008 on with the markings of a road.
 GEOMETRY_HOLDS, CHANNELS_HOLD = 2e-3, 5e-3
+# Least information of tie points and prior for a direction to count as constrained: a standard deviation of one radius
+# of the matched points. Useful ones are far above it.
+_TIES_HOLD = 1.0
 _IDENTITY = np.array([1, 0, 0, 1, 0, 1])
 # A direction is named a translation if its rotation causes at most this fraction of the points' motion (rms).
 _PURE = 0.3
@@ -36,6 +39,8 @@ class Directions(eqx.Module):
         twists: (6, 6), one direction per row, scaled so that the matched points move by 1 (root mean square).
         geometry: (6,) fraction of that squared motion that the shape of the surfaces observes, 0 to 1.
         channels: (6,) fraction that the channels observe; 0 for the directions that geometry constrains.
+        ties: (6,) information of tie points and prior, one over the squared standard deviation in radii of that motion;
+            0 for the directions that geometry or channels constrain. None without tie points and prior.
         center: (3,) centroid of the matched source points, metres.
         radius: root mean square distance of these points from it, metres.
     """
@@ -45,6 +50,7 @@ class Directions(eqx.Module):
     channels: Float[Array, "*batch 6"] | Float[np.ndarray, "*batch 6"]
     center: Float[Array, "*batch 3"] | Float[np.ndarray, "*batch 3"]
     radius: Float[ArrayLike, "*batch"]
+    ties: Float[Array, "*batch 6"] | Float[np.ndarray, "*batch 6"] | None = None
 
     @property
     def free(self) -> Bool[Array, "*batch 6"] | Bool[np.ndarray, "*batch 6"]:
@@ -52,9 +58,14 @@ class Directions(eqx.Module):
         return ~(self.geometry >= GEOMETRY_HOLDS)
 
     @property
-    def held(self) -> Bool[Array, "*batch 6"] | Bool[np.ndarray, "*batch 6"]:
-        """Which directions are constrained, by geometry or by the channels."""
+    def held_by_matches(self) -> Bool[Array, "*batch 6"] | Bool[np.ndarray, "*batch 6"]:
+        """Which directions are constrained by geometry or by the channels."""
         return ~self.free | (self.channels >= CHANNELS_HOLD)
+
+    @property
+    def held(self) -> Bool[Array, "*batch 6"] | Bool[np.ndarray, "*batch 6"]:
+        """Which directions are constrained, by geometry, by the channels, or by tie points and prior."""
+        return self.held_by_matches if self.ties is None else self.held_by_matches | (self.ties >= _TIES_HOLD)
 
 
 def find_directions(sums: Sums) -> Directions:
@@ -101,7 +112,8 @@ class FreeDirection:
     Attributes:
         twist: (6,) ξ = (v, ω) of T exp(ξ), metres and radians, scaled so that the matched points move by 1 m (root mean
             square).
-        held_by_channels: whether the channels constrain the direction; if False, it is unconstrained.
+        held_by_channels: whether the channels constrain the direction.
+        held_by_ties: whether tie points or a prior do. If neither is True, the direction is unconstrained.
         axis: (3,) unit vector in the source's frame: direction of the translation, or axis of the rotation.
         is_rotation: False if the direction is named a translation: rotation causes at most 0.3 of the points' motion.
     """
@@ -110,9 +122,11 @@ class FreeDirection:
     held_by_channels: bool
     axis: Float[np.ndarray, "3"]
     is_rotation: bool
+    held_by_ties: bool = False
 
     def __repr__(self) -> str:
-        held = "constrained by channels" if self.held_by_channels else "unconstrained"
+        by_ties = "constrained by tie points or prior" if self.held_by_ties else "unconstrained"
+        held = "constrained by channels" if self.held_by_channels else by_ties
         return f"{self.name} ({held})"
 
     @property
@@ -125,12 +139,14 @@ class FreeDirection:
 
 def free_directions(directions: Directions) -> tuple[FreeDirection, ...]:
     """Free directions of one registration: unconstrained before constrained by channels, translations first."""
-    free, held = np.asarray(directions.free), np.asarray(directions.held)
+    free, held, by_matches = (
+        np.asarray(each) for each in (directions.free, directions.held, directions.held_by_matches)
+    )
     motions = _motions(directions)
     found: list[FreeDirection] = []
-    for by_channels in (False, True):
-        group = motions[free & (held == by_channels)]
-        found += [_named(motion, directions, by_channels) for motion in _separate(group) @ group]
+    for by_channels, by_ties in ((False, False), (False, True), (True, False)):
+        group = motions[free & (by_matches == by_channels) & ((held & ~by_matches) == by_ties)]
+        found += [_named(motion, directions, by_channels, by_ties) for motion in _separate(group) @ group]
     return tuple(found)
 
 
@@ -141,7 +157,7 @@ def shares(directions: Directions) -> list[tuple[str, float, float]]:
     found: list[tuple[str, float, float]] = []
     for group in (free, ~free):
         mixing = _separate(motions[group])
-        names = [_named(motion, directions, False).name for motion in mixing @ motions[group]]
+        names = [_named(motion, directions).name for motion in mixing @ motions[group]]
         # Squared weights: the forms are diagonal, but for that of geometry among the free directions, which is tiny.
         found += zip(names, mixing**2 @ geometry[group], mixing**2 @ channels[group], strict=True)
     return [(name, float(by_geometry), float(by_channels)) for name, by_geometry, by_channels in found]
@@ -154,7 +170,9 @@ def _motions(directions: Directions) -> Float[np.ndarray, "6 6"]:
     return np.concatenate([twists[:, :3] + np.cross(twists[:, 3:], center), radius * twists[:, 3:]], axis=1)
 
 
-def _named(motion: Float[np.ndarray, "6"], directions: Directions, by_channels: bool) -> FreeDirection:
+def _named(
+    motion: Float[np.ndarray, "6"], directions: Directions, by_channels: bool = False, by_ties: bool = False
+) -> FreeDirection:
     center, radius = np.asarray(directions.center, np.float64), np.asarray(directions.radius)
     turning = np.linalg.norm(motion[3:]) > _PURE * np.linalg.norm(motion)
     axis, omega = motion[3:] if turning else motion[:3], motion[3:] / radius
@@ -163,6 +181,7 @@ def _named(motion: Float[np.ndarray, "6"], directions: Directions, by_channels: 
         held_by_channels=by_channels,
         axis=axis / np.linalg.norm(axis),
         is_rotation=bool(turning),
+        held_by_ties=by_ties,
     )
 
 
@@ -195,4 +214,5 @@ def describe(found: Sequence[FreeDirection]) -> str:
         verdict = "constrained by channels: all"
     else:
         verdict = "constrained by channels: " + ", ".join(direction.name for direction in held)
-    return f"{everything}; {verdict}"
+    tied = ", ".join(direction.name for direction in found if direction.held_by_ties)
+    return f"{everything}; {verdict}{'; by tie points or prior: ' if tied else ''}{tied}"

@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from mcgicp_jax import _algebra as alg
+from mcgicp_jax._checks import check_integer, check_positive, is_number
 from mcgicp_jax._cloud import PointCloud, Values
 from mcgicp_jax._methods import GICP
 from mcgicp_jax._pose import AnyArray
@@ -58,7 +59,7 @@ def gaussians(
     """
     if of not in ("points", "covariances"):
         raise ValueError(f'of: expected "points" or "covariances", got {of!r}')
-    if not 0 <= min_ratio <= 1:
+    if not (is_number(min_ratio) and 0 <= min_ratio <= 1):
         raise ValueError(f"min_ratio: expected a number from 0 to 1, got {min_ratio!r}")
     cloud = finite_rows(cloud)
     if of == "covariances" and cloud.covariances is None:
@@ -117,10 +118,8 @@ def _grouped(
     cloud: PointCloud, voxel_size: float, min_points: int, channel_size: Values | None
 ) -> tuple[_Cells, Bool[np.ndarray, "M"], Float[np.ndarray, "M 3"], Float[np.ndarray, "M 6"]]:
     """All cells, which of them are kept, and their moments."""
-    if not 0 < voxel_size < np.inf:
-        raise ValueError(f"voxel_size: expected a positive number of metres, got {voxel_size!r}")
-    if min_points < 3:
-        raise ValueError(f"min_points: expected at least 3, got {min_points!r}")
+    check_positive("voxel_size", voxel_size)
+    check_integer("min_points", min_points, 3)
     order, starts = voxels(np.ascontiguousarray(cloud.coordinates.T), voxel_size)
     number = np.empty(len(order), np.int64)
     number[order] = np.cumsum(np.bincount(starts, minlength=len(order))) - 1

@@ -12,11 +12,12 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from mcgicp_jax._blocks import BLOCK, blocks, map_rows
+from mcgicp_jax._checks import check_positive
 from mcgicp_jax._cloud import PointCloud, Values
 from mcgicp_jax._features import NUM_NEIGHBORS, comparable, histograms_of, normals_of, statistics_of
 from mcgicp_jax._hypotheses import APART, NUM_MATCHES, TOLERANCE, Matches, Poses, hypotheses, refined
 from mcgicp_jax._methods import GICP, AbstractMethod, MultiChannelGICP
-from mcgicp_jax._options import Options, check_positive
+from mcgicp_jax._options import Options
 from mcgicp_jax._pose import AnyArray, Pose, computed_now, nearest_rotation
 from mcgicp_jax._preprocess import finite_rows, preprocess, voxels
 from mcgicp_jax._result import Registration, is_usable

@@ -11,6 +11,7 @@ import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float, Int
 
+from mcgicp_jax._checks import check_integer
 from mcgicp_jax._deferred import Deferred
 from mcgicp_jax._graph_traced import optimize_traced
 from mcgicp_jax._normal_equations import (
@@ -139,8 +140,7 @@ def optimize_poses(graph: PoseGraph, *, robust: bool = True, max_iterations: int
     """
     if not isinstance(graph, PoseGraph):
         raise ValueError(f"graph: expected a PoseGraph, got {type(graph).__name__}")
-    if not isinstance(max_iterations, int | np.integer) or max_iterations < 1:
-        raise ValueError(f"max_iterations: expected an integer of at least 1, got {max_iterations!r}")
+    check_integer("max_iterations", max_iterations, 1)
     if not is_concrete(graph):
         return _traced(graph, robust, int(max_iterations))
     edges, start = graph.edges, _start(graph)

@@ -42,7 +42,7 @@ from mcgicp_jax._step import (
 )
 from mcgicp_jax._sums import Matched, Sums, combine, move_rows, sums_of, within
 from mcgicp_jax._surface import Surface
-from mcgicp_jax._uncertainty import Details, Scores, discount_rows, discounts, scatter_of, scores_of
+from mcgicp_jax._uncertainty import Details, Moments, Scores, discount_rows, discounts, scatter_of, scores_of
 
 # Rotation matrix and translation (metres) of a pose.
 Moving: TypeAlias = tuple[Float[AnyArray, "3 3"], Float[AnyArray, "3"]]
@@ -50,8 +50,11 @@ Moving: TypeAlias = tuple[Float[AnyArray, "3 3"], Float[AnyArray, "3"]]
 
 def register_on_host(
     problem: Problem, index: AbstractIndex, num_threads: int | None
-) -> tuple[State, Assessment, dict[str, np.ndarray]]:
-    """Find matches at this pose; sum their forces; update the pose; stop when it no longer moves."""
+) -> tuple[State, Assessment, dict[str, np.ndarray], Deferred[Moments]]:
+    """Find matches at this pose; sum their forces; update the pose; stop when it no longer moves.
+
+    Returns final state, information matrix and covariance, history, and sums over the scores.
+    """
     pose, settings, records = problem.start, problem.settings, []
     coarse = settings.fine_distance < settings.max_distance or settings.coarse_stride > 1
     status: Any = np.int32(COARSE if coarse else RUNNING)
@@ -67,14 +70,14 @@ def register_on_host(
             matches = _Matches(source, problem.target, nearest(pose.wxyz_xyz))
         gate = settings.max_distance if status == COARSE else settings.fine_distance
         sums = _measure(pose, matches, gate, problem)
-        state = update(pose, status, num_iterations, sums, settings)
+        state = update(pose, status, num_iterations, sums, settings, problem.fusion)
         pose, num_iterations, status = state.pose, np.asarray(state.num_iterations), np.asarray(state.status)
         records.append(state.record)
+    moments = Deferred(partial(_moments, state, matches, gate, problem, num_threads))
     assessment = Assessment(
-        Deferred(partial(constraints_of, state)),
-        Deferred(partial(_covariance, state, matches, gate, problem, num_threads)),
+        Deferred(partial(constraints_of, state)), Deferred(partial(_covariance, state, moments, problem))
     )
-    return state, assessment, history_of(np.stack([np.asarray(record) for record in records]))
+    return state, assessment, history_of(np.stack([np.asarray(record) for record in records])), moments
 
 
 def _every(stride: int, source: Surface) -> Surface:
@@ -149,10 +152,18 @@ def _matched(
     return Matched(source, target, valid)
 
 
-def _covariance(
-    state: State, matches: _Matches, gate: Float[AnyScalar, ""], problem: Problem, num_threads: int | None
-) -> Float[np.ndarray, "6 6"]:
+def _covariance(state: State, moments: Deferred[Moments], problem: Problem) -> Float[np.ndarray, "6 6"]:
     """Covariance of the final pose, float64."""
+    known = moments.value if problem.fusion is None else problem.fusion
+    # In float64: beside the variances of unconstrained directions, those of the others would be lost to rounding.
+    with jax.enable_x64(True):
+        return np.asarray(covariance_of_pose(*as_float64((state, known))))
+
+
+def _moments(
+    state: State, matches: _Matches, gate: Float[AnyScalar, ""], problem: Problem, num_threads: int | None
+) -> Moments:
+    """Sums over the scores of all correspondences at the final pose, float64."""
     source, target = matches.source, matches.target
     moving = _moving(state.pose, source.table.dtype)
     some, counts = sampled_rows(source.rows.valid)
@@ -183,13 +194,10 @@ def _covariance(
         for name in ("rows", "cells")
     )
     scatter, num_cells = scatter_of(Scores(rows, cells, jacobian, bias), matches.size)
-    scatter = None if problem.method.knows_residuals else scatter
-    # In float64: beside the variances of unconstrained directions, those of the others would be lost to rounding.
-    with jax.enable_x64(True):
-        return np.asarray(covariance_of_pose(_as_float64(state), jacobian, bias, scatter, np.int32(num_cells)))
+    return Moments(jacobian, bias, None if problem.method.knows_residuals else scatter, np.int32(num_cells))
 
 
-def _as_float64(tree: Any) -> Any:
+def as_float64(tree: Any) -> Any:
     def convert(leaf: Any) -> np.ndarray:
         array = np.asarray(leaf)
         return array.astype(np.float64) if array.dtype == np.float32 else array

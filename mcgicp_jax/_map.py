@@ -7,6 +7,7 @@ from collections.abc import Iterable
 import numpy as np
 from jaxtyping import Float
 
+from mcgicp_jax._checks import check_positive
 from mcgicp_jax._cloud import PointCloud, Values
 from mcgicp_jax._pose import Pose, pose_matrix
 
@@ -43,8 +44,7 @@ class VoxelMap:
     """The sums of positions and channels in each voxel of the world."""
 
     def __init__(self, voxel_size: float):
-        if not 0 < voxel_size < np.inf:
-            raise ValueError(f"voxel_size: expected a positive number of metres, got {voxel_size!r}")
+        check_positive("voxel_size", voxel_size)
         self._voxel_size = voxel_size
         # Keys of the voxels, sorted; and for each the number of points, and sums of positions, channels and masks.
         self._keys = np.empty(0, np.int64)

@@ -18,7 +18,7 @@ from mcgicp_jax._loops import LEAST_OVERLAP, edge_from
 from mcgicp_jax._map import aggregate, voxels
 from mcgicp_jax._methods import AbstractMethod
 from mcgicp_jax._odometry import odometry
-from mcgicp_jax._options import Options, check_method
+from mcgicp_jax._options import check_method, options_of
 from mcgicp_jax._pose import Pose, pose_matrix
 from mcgicp_jax._pose_graph import PoseGraph
 from mcgicp_jax._preprocess import check_preprocessing, preprocess
@@ -99,7 +99,7 @@ def multiway(
     """
     check_method(method)
     check_preprocessing(voxel_size, num_neighbors)
-    Options(**options)
+    options_of(multiway, options)
     ready = [_ready(k, cloud, voxel_size, num_neighbors) for k, cloud in enumerate(clouds)]
     if not ready:
         raise ValueError("clouds: expected at least one, got none")

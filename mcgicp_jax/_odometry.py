@@ -10,11 +10,12 @@ import numpy as np
 from jaxtyping import Float
 
 from mcgicp_jax._channels import point_spacing
+from mcgicp_jax._checks import check_positive
 from mcgicp_jax._cloud import PointCloud, Values
 from mcgicp_jax._loops import Trajectory
 from mcgicp_jax._map import VoxelMap
 from mcgicp_jax._methods import AbstractMethod
-from mcgicp_jax._options import Options, check_method, check_positive
+from mcgicp_jax._options import Options, check_method, options_of
 from mcgicp_jax._pose import Pose, nearest_rotation, pose_matrix
 from mcgicp_jax._pose_graph import PoseGraph
 from mcgicp_jax._preprocess import check_preprocessing, preprocess
@@ -105,7 +106,7 @@ def odometry(
             'loops: expected against="previous" and no recover: registrations to the previous frame become edges'
         )
     sensor = _Sensor(
-        method, Options(**options), num_neighbors, pose_matrix(init), np.asarray(pose_matrix(start, "start"))
+        method, options_of(odometry, options), num_neighbors, pose_matrix(init), np.asarray(pose_matrix(start, "start"))
     )
     for i, frame in enumerate(frames):
         try:

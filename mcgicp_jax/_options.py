@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+import difflib
+import inspect
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, fields
 from typing import Any, TypeAlias
 
 import numpy as np
 from jax.typing import ArrayLike
 
+from mcgicp_jax._checks import check_integer, check_positive, is_number
 from mcgicp_jax._kernels import AbstractKernel
 from mcgicp_jax._methods import AbstractMethod
 from mcgicp_jax._pose import is_concrete
@@ -38,8 +41,7 @@ class Options:
     def __post_init__(self) -> None:
         if self.max_distance is not None:
             _check_distances(self.max_distance)
-        if not isinstance(self.max_iterations, int | np.integer) or self.max_iterations < 1:
-            raise ValueError(f"max_iterations: expected an integer of at least 1, got {self.max_iterations!r}")
+        check_integer("max_iterations", self.max_iterations, 1)
         if self.translation_tolerance is not None:
             _check_tolerance("translation_tolerance", self.translation_tolerance)
         _check_tolerance("rotation_tolerance", self.rotation_tolerance)
@@ -64,18 +66,23 @@ class Options:
         return len(self.scales) > 0 and name in method.needs_covariances
 
 
+def options_of(function: Callable[..., Any], given: dict[str, Any]) -> Options:
+    """The options of `register` that another function was given; raises `TypeError` for a name that neither has."""
+    names = [*(field.name for field in fields(Options)), *inspect.signature(function).parameters]
+    for name in given.keys() - names:
+        close = difflib.get_close_matches(name, names)
+        known = f"did you mean {' or '.join(close)}?" if close else f"expected one of {', '.join(sorted(names))}"
+        raise TypeError(f"{function.__name__}: got an unexpected argument {name!r}; {known}")
+    return Options(**given)
+
+
 def check_method(method: AbstractMethod) -> None:
     if not isinstance(method, AbstractMethod):
         raise ValueError(f"method: expected a method such as MultiChannelGICP(), got {method!r}")
 
 
-def check_positive(name: str, value: ArrayLike) -> None:
-    if is_concrete(value) and not (_is_number(value) and np.asarray(value) > 0):
-        raise ValueError(f"{name}: expected a positive number, got {value!r}")
-
-
 def _check_tolerance(name: str, value: Any) -> None:
-    if is_concrete(value) and not (_is_number(value) and np.asarray(value) >= 0):
+    if is_concrete(value) and not (is_number(value) and np.asarray(value) >= 0):
         raise ValueError(f"{name}: expected a number of at least 0, got {value!r}")
 
 
@@ -84,9 +91,5 @@ def _check_distances(distances: Any) -> None:
         check_positive("max_distance", distances)
     elif is_concrete(distances):
         coarse, fine = distances
-        if not (_is_number(coarse) and _is_number(fine) and coarse >= fine > 0):
+        if not (is_number(coarse) and is_number(fine) and coarse >= fine > 0):
             raise ValueError(f"max_distance: expected two positive numbers, the larger one first, got {distances!r}")
-
-
-def _is_number(value: object) -> bool:
-    return np.ndim(value) == 0 and np.asarray(value).dtype.kind in "fiu"  # type: ignore[arg-type]

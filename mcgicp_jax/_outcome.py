@@ -76,7 +76,7 @@ def _constraints(assessment: Assessment, origin: Any) -> tuple[Any, Directions |
     information, directions = _read(assessment.constraints)
     if is_concrete(origin) and not np.any(origin):
         return information, directions
-    to_centred, from_centred = _translation_adjoint(-origin), _translation_adjoint(origin)
+    to_centred, from_centred = translation_adjoint(-origin), translation_adjoint(origin)
     # Non-finite values belong to the status NON_FINITE; NumPy need not warn of them.
     with np.errstate(invalid="ignore", over="ignore"):
         if directions is not None:
@@ -93,15 +93,15 @@ def _uncertainty(assessment: Assessment, state: State, origin: Any) -> tuple[Any
     with np.errstate(invalid="ignore", over="ignore"):
         matrix = pose_in_user_frame(pose, np.zeros(3), np.zeros(3))
         # In the target's axes T exp(ξ) turns by R ω, and moves the centre c by R v + (t − c) × R ω.
-        to_center = _translation_adjoint(matrix[:3, 3] - center) @ xp.kron(xp.eye(2), matrix[:3, :3])
+        to_center = translation_adjoint(matrix[:3, 3] - center) @ xp.kron(xp.eye(2), matrix[:3, :3])
         deviations = xp.sqrt(xp.diagonal(to_center @ covariance @ to_center.T)).astype(covariance.dtype)
         if is_concrete(origin) and not np.any(origin):
             return covariance, deviations
-        from_centred = _translation_adjoint(origin)
+        from_centred = translation_adjoint(origin)
         return from_centred @ covariance @ from_centred.T, deviations
 
 
-def _translation_adjoint(offset: Array | np.ndarray) -> Array | np.ndarray:
+def translation_adjoint(offset: Array | np.ndarray) -> Array | np.ndarray:
     """Adjoint (6, 6) of a translation by `offset`, for twists (v, ω)."""
     xp = np if isinstance(offset, np.ndarray) else jnp
     zero = xp.zeros_like(offset[0])

@@ -9,6 +9,7 @@ import jax
 import numpy as np
 from jaxtyping import Float, Int
 
+from mcgicp_jax._checks import check_integer, check_positive
 from mcgicp_jax._cloud import PointCloud, Values, is_far
 from mcgicp_jax._dense import default_search
 from mcgicp_jax._pose import is_concrete
@@ -81,10 +82,9 @@ def preprocess(
 
 def check_preprocessing(voxel_size: float | None, num_neighbors: int) -> None:
     """Check the arguments of `preprocess` other than the cloud; raises `ValueError`."""
-    if voxel_size is not None and (isinstance(voxel_size, str) or not 0 < voxel_size < np.inf):
-        raise ValueError(f"voxel_size: expected a positive number of metres or None, got {voxel_size!r}")
-    if num_neighbors < 3:
-        raise ValueError(f"num_neighbors: expected at least 3, got {num_neighbors}")
+    if voxel_size is not None:
+        check_positive("voxel_size", voxel_size)
+    check_integer("num_neighbors", num_neighbors, 3)
 
 
 def finite_rows(cloud: PointCloud | Values) -> PointCloud:

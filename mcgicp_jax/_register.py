@@ -5,7 +5,7 @@ from __future__ import annotations
 import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -13,6 +13,7 @@ import numpy as np
 from jax.typing import ArrayLike
 
 from mcgicp_jax._channels import grid_spacing, warn_of_units, with_channels_matched
+from mcgicp_jax._checks import check_integer, check_positive
 from mcgicp_jax._cloud import PointCloud, Values
 from mcgicp_jax._cost import centred_pose, check_matches
 from mcgicp_jax._dense import default_search
@@ -21,7 +22,7 @@ from mcgicp_jax._host import correspondences_at, register_on_host
 from mcgicp_jax._kept import keep
 from mcgicp_jax._kernels import AbstractKernel
 from mcgicp_jax._methods import AbstractMethod, MultiChannelGICP, PointToPoint
-from mcgicp_jax._options import ROTATION_TOLERANCE, Distance, Options, check_method, check_positive
+from mcgicp_jax._options import ROTATION_TOLERANCE, Distance, Options, check_method
 from mcgicp_jax._outcome import registration_of
 from mcgicp_jax._pose import Pose, computed_now, is_concrete, se3_from_matrix
 from mcgicp_jax._preprocess import preprocess
@@ -31,7 +32,9 @@ from mcgicp_jax._statistics import constant, namespace
 from mcgicp_jax._step import Assessment, Problem, Settings, State
 from mcgicp_jax._sums import matched_rows, move_rows, within
 from mcgicp_jax._surfaces import searchable, surfaces_of
-from mcgicp_jax._traced import align_traced, assess, differentiable, register_traced
+from mcgicp_jax._tie_points import GivenPrior, GivenTiePoints, fusion_of, known
+from mcgicp_jax._traced import align_traced, assess, differentiable, moments_of, register_traced
+from mcgicp_jax._uncertainty import Moments
 
 # Default maximum correspondence distances of the coarse and the fine phase, in spacings of the target. With the larger
 # one, starts several spacings off converge, but matches across edges and the border of the overlap bias the final pose;
@@ -114,8 +117,7 @@ def find_correspondences(
     _check_clouds(source, target, method)
     method = method.resolve(source, target)
     check_positive("max_distance", max_distance)
-    if num_candidates < 1:
-        raise ValueError(f"num_candidates: expected at least 1, got {num_candidates}")
+    check_integer("num_candidates", num_candidates, 1)
     matrix = centred_pose(pose, source, target, "pose")
     matrix, max_distance, method = constant((matrix, max_distance, method))
     rows, target_rows = (searchable(method, constant(cloud)) for cloud in (source, target))
@@ -220,6 +222,8 @@ def register(
     hold_free_directions: bool = True,
     match_channels: bool = False,
     scales: Sequence[float] = (),
+    tie_points: GivenTiePoints | None = None,
+    prior: GivenPrior | None = None,
 ) -> Registration:
     """Register two clouds: find matches at the current pose, update the pose, and repeat until it converges.
 
@@ -260,6 +264,18 @@ def register(
             at each voxel size, in this order, each time from the pose before and with the default `max_distance`; the
             one given is for the last registration. For NDT, the sizes of its cells: the clouds are raw ones, and the
             last size gives the result. Not available inside transformations.
+        tie_points: (source_points, target_points, covariances), metres: points (n, 3) known to be the same, such as
+            surveyed targets or image features (Huhle & Jenke 2008), and the covariances (n, 3, 3) of b − T a, in the
+            target's axes. n may be 1 or 2.
+        prior: (pose, covariance): a measurement of T_target_source, as by GNSS or an IMU, `jaxlie.SE3` or (4, 4), and
+            its covariance (6, 6), metres and radians, of ξ = (v, ω) in T = pose · exp(ξ): in the order and frame of
+            `Registration.covariance`. Give what it does not tell a large variance. Without `init` it is the start.
+
+    With tie points or a prior, a first registration without them measures the covariance of the matches, and a second
+    one weighs all by their covariances; `covariance` includes them, and so does `information`, in the unit of the
+    matches. They constrain directions that the clouds leave free (`FreeDirection.held_by_ties`). Both are
+    differentiable; the weights of the matches are constants. A wrong tie point, or a wrong start, remains wrong:
+    compare `overlap`.
 
     Returns:
         The pose with its status, quality of the fit and uncertainty; check `converged`.
@@ -283,28 +299,29 @@ def register(
         match_channels=match_channels,
         scales=scales,
     )
-    if isinstance(init, str):
-        if init != "global":
-            raise ValueError(f'init: expected a pose, "global" or None, got {init!r}')
-        if not is_concrete(source, target):
-            raise ValueError('init: expected a pose inside transformations, got "global"')
-        check_method(method)
-        start = global_pose(source, target)
-        if not start.success:
-            return Registration.without_pose(Status.TOO_FEW_CORRESPONDENCES)
-        init = start.matrix
-    return register_with(source, target, method, init, options)
+    if tie_points is None and prior is None:
+        return register_with(source, target, method, init, options)
+    if not hold_free_directions:
+        raise ValueError("hold_free_directions: expected True with tie_points or prior, got False")
+    return register_with(source, target, method, init, options, tie_points, prior)
 
 
 def register_with(
     source: PointCloud | Values,
     target: PointCloud | Values,
     method: AbstractMethod,
-    init: Pose | None,
+    init: Any,
     options: Options,
+    tie_points: GivenTiePoints | None = None,
+    prior: GivenPrior | None = None,
 ) -> Registration:
     """`register` with its options as one object."""
     check_method(method)
+    if isinstance(init, str):
+        start = start_from_anywhere(init, source, target)
+        if not start.success:
+            return Registration.without_pose(Status.TOO_FEW_CORRESPONDENCES)
+        return register_with(source, target, method, start.matrix, options, tie_points, prior)
     source, target = (
         _ready(name, cloud, options.takes_raw(method, name)) for name, cloud in (("source", source), ("target", target))
     )
@@ -315,18 +332,49 @@ def register_with(
     elif method.uses_channels and is_concrete(source, target):
         warn_of_units(source, target)
     *before, (method, source, target) = method.stages(source, target, options.scales)
+    ties, belief = known(tie_points, prior, source, target)
+    if init is None and prior is not None:
+        init = prior[0]
     search = options.search or default_search()
     once = replace(options, max_distance=None)
     for coarse_method, coarse, coarse_target in before:
-        _, state, finish = _solved(coarse, coarse_target, coarse_method, init, once, search)
-        found = registration_of(*finish(), coarse, coarse_target)
+        run = _solved(coarse, coarse_target, coarse_method, init, once, search)
+        found = registration_of(*run.finish(), coarse, coarse_target)
         init = found.matrix if is_usable(found) else init
-    problem, state, finish = _solved(source, target, method, init, options, search)
+    run = _solved(source, target, method, init, options, search)
     if options.match_channels:
-        source = _matched(source, target, method, _nearest_points(source, target, problem, state, search))
-        init = constant(pose_in_user_frame(state.pose, source.origin, target.origin))
-        _, _, finish = _solved(source, target, method, init, options, search)
-    return registration_of(*finish(), source, target)
+        source = _matched(source, target, method, _nearest_points(source, target, run, search))
+        init = constant(pose_in_user_frame(run.state.pose, source.origin, target.origin))
+        run = _solved(source, target, method, init, options, search)
+    if not (ties is None and belief is None):
+        fusion = fusion_of(run.state, run.moments(), ties, belief)
+        problem = replace(run.problem, start=constant(run.state.pose), fusion=fusion)
+        run = _run(problem, target, search, options.max_iterations)
+    return registration_of(*run.finish(), source, target)
+
+
+def start_from_anywhere(init: str, source: PointCloud | Values, target: PointCloud | Values) -> GlobalPose:
+    """The start of a registration with `init="global"`."""
+    if init != "global":
+        raise ValueError(f'init: expected a pose, "global" or None, got {init!r}')
+    if not is_concrete(source, target):
+        raise ValueError('init: expected a pose inside transformations, got "global"')
+    return global_pose(source, target)
+
+
+class _Run(NamedTuple):
+    """A problem that has been run.
+
+    Attributes:
+        state: the final one, a constant to autodiff.
+        finish: function for the arguments of `registration_of`: the differentiable state, assessment and history.
+        moments: function for the sums over the scores.
+    """
+
+    problem: Problem
+    state: State
+    finish: Callable[[], tuple[State, Assessment, dict[str, Any]]]
+    moments: Callable[[], Moments]
 
 
 def _solved(
@@ -336,19 +384,19 @@ def _solved(
     init: Pose | None,
     options: Options,
     search: AbstractSearch,
-) -> tuple[Problem, State, Callable[[], tuple[State, Assessment, dict[str, Any]]]]:
-    """Pose and run the problem: it, the final state, and a function for the arguments of `registration_of`."""
+) -> _Run:
+    """Pose and run the problem."""
     problem = pose_problem(source, target, method, init, options, search.num_threads)
-    return problem, *_run(problem, target, search, options.max_iterations)
+    return _run(problem, target, search, options.max_iterations)
 
 
-def _run(problem: Problem, target: PointCloud, search: AbstractSearch, max_iterations: int) -> Any:
-    """Run the loop. Returns the final state, and a function for the differentiable state, assessment and history."""
+def _run(problem: Problem, target: PointCloud, search: AbstractSearch, max_iterations: int) -> _Run:
+    """Run the loop."""
     if is_concrete(problem):
         index = _index(search, problem.method, target)
         with computed_now():
-            state, assessment, history = register_on_host(problem, index, search.num_threads)
-        return state, lambda: (state, assessment, history)
+            state, assessment, history, sums = register_on_host(problem, index, search.num_threads)
+        return _Run(problem, state, lambda: (state, assessment, history), lambda: sums.value)
     # Gradients stop here, so that autodiff does not enter the compiled functions.
     fixed = jax.lax.stop_gradient(problem)
     state, matches, history = register_traced(fixed, search, max_iterations)
@@ -356,9 +404,12 @@ def _run(problem: Problem, target: PointCloud, search: AbstractSearch, max_itera
     def finish() -> tuple[State, Assessment, dict[str, Any]]:
         assessment = assess(state, fixed, matched_rows(fixed.source, fixed.target, matches), matches)
         matched = matched_rows(problem.source, problem.target, matches)
-        return differentiable(state, matched, problem.method, problem.robust), assessment, history
+        return differentiable(state, matched, problem.method, problem.robust, problem.fusion), assessment, history
 
-    return state, finish
+    def moments() -> Moments:
+        return moments_of(state, fixed, matched_rows(fixed.source, fixed.target, matches), matches)
+
+    return _Run(problem, state, finish, moments)
 
 
 def pose_problem(
@@ -435,12 +486,10 @@ def _matched(
     return with_channels_matched(source, target, matches)
 
 
-def _nearest_points(
-    source: PointCloud, target: PointCloud, problem: Problem, state: State, search: AbstractSearch
-) -> Correspondences:
-    """Nearest matches in position at the pose of a state."""
-    pose = constant(pose_in_user_frame(state.pose, source.origin, target.origin))
-    distance = problem.settings.fine_distance
+def _nearest_points(source: PointCloud, target: PointCloud, run: _Run, search: AbstractSearch) -> Correspondences:
+    """Nearest matches in position at the final pose."""
+    pose = constant(pose_in_user_frame(run.state.pose, source.origin, target.origin))
+    distance = run.problem.settings.fine_distance
     return find_correspondences(source, target, pose, PointToPoint(), max_distance=distance, search=search)
 
 

@@ -16,6 +16,7 @@ from jaxtyping import Array, Bool, Float, Int
 from mcgicp_jax._kernels import AbstractKernel
 from mcgicp_jax._methods import AbstractMethod
 from mcgicp_jax._pose import cast_pose
+from mcgicp_jax._pose_form import Fusion
 from mcgicp_jax._sums import Matched, Sums, forces_at
 
 # Mean eigenvalue that the information matrix is scaled to, dimensionless: large beside 1, the damping that optimistix
@@ -153,6 +154,11 @@ def twist_form(second: Float[Array, "6 10"], radius: Float[Array, ""]) -> Float[
     return tangent.T @ _unit_quadratic(second, radius) @ tangent
 
 
+def wrench(first: Float[Array, "3 4"], radius: Float[Array, ""]) -> Float[Array, "6"]:
+    """Σ of force and torque from Σ f hᵀ, arms in units of the radius."""
+    return jnp.asarray(_TANGENT, first.dtype).T @ (first * _unit_lengths(radius)).reshape(12)
+
+
 def _semidefinite_root(form: Float[Array, "D D"]) -> tuple[Float[Array, "D D"], Float[Array, "D"]]:
     """Cholesky factor L with L Lᵀ = form, and its pivots; a pivot lost to rounding leaves a zero column.
 
@@ -243,8 +249,11 @@ class Root(eqx.Module):
     usable: Bool[Array, ""]
 
 
-def root_near(sums: Sums, usable: Bool[Array, ""]) -> Root:
-    """The scaling of g from the sums at the returned pose."""
+def root_near(sums: Sums, usable: Bool[Array, ""], fusion: Fusion | None) -> Root:
+    """The scaling of g from the sums at the returned pose, or that of the score in `Fusion`."""
+    if fusion is not None:
+        radius = jnp.asarray(fusion.radius)
+        return Root(center=jnp.asarray(fusion.center), radius=radius, scale=radius, usable=usable)
     radius = jnp.where(usable, sums.radius, 1)
     # The trace of Σ K, in the unit of g.
     scale = jnp.sum(sums.stiffness[jnp.array([0, 3, 5]), 9]) * radius**2
@@ -253,7 +262,7 @@ def root_near(sums: Sums, usable: Bool[Array, ""]) -> Root:
     )
 
 
-Model: TypeAlias = tuple[Matched, AbstractMethod, AbstractKernel | None]
+Model: TypeAlias = tuple[Matched, AbstractMethod, AbstractKernel | None, Fusion | None]
 
 
 @jax.custom_jvp
@@ -265,7 +274,8 @@ def with_derivative(pose: Float[Array, "7"], root: Root, model: Model) -> Float[
 
     Args:
         pose: `jaxlie.SE3.wxyz_xyz`; a constant to autodiff.
-        model: θ: matched rows, method and robust kernel, which carry everything that is differentiated.
+        model: θ: matched rows, method, robust kernel, and tie points and prior, which carry everything that is
+            differentiated.
     """
     return pose
 
@@ -351,8 +361,11 @@ def _newton(
 
 
 def _balance(twist: Float[Array, "6"], pose: Float[Array, "7"], root: Root, model: Model) -> Float[Array, "6"]:
-    """g / scale, sums of forces and torques, at a pose moved to first order along a twist (in units of the radius)."""
-    matched, method, robust = model
+    """g / scale, sums of forces and torques, at a pose moved to first order along a twist (in units of the radius).
+
+    With tie points or a prior, that of `Fusion`.
+    """
+    matched, method, robust, fusion = model
     rotation = jaxlie.SO3(pose[:4]).as_matrix().astype(pose.dtype)
     v, omega = twist[:3] * root.radius, twist[3:]
     turned = rotation + jnp.cross(omega[:, None], rotation, axis=0)
@@ -362,4 +375,5 @@ def _balance(twist: Float[Array, "6"], pose: Float[Array, "7"], root: Root, mode
     moved, forces, _ = forces_at(turned, translation, matched, method, robust)
     arms = jnp.where(matched.valid, moved - root.center[:, None], 0)
     torque = jnp.cross(arms, forces.force, axis=0)
-    return jnp.concatenate([jnp.sum(forces.force, axis=1) * root.radius, jnp.sum(torque, axis=1)]) / root.scale
+    score = jnp.concatenate([jnp.sum(forces.force, axis=1) * root.radius, jnp.sum(torque, axis=1)]) / root.scale
+    return score if fusion is None else fusion.balance(score, turned, translation)

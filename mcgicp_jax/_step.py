@@ -13,14 +13,16 @@ from jaxtyping import Array, Bool, Float, Int
 
 from mcgicp_jax._deferred import Deferred
 from mcgicp_jax._directions import Directions, directions_at_source, find_directions
+from mcgicp_jax._fusion import fused_covariance, fused_update
 from mcgicp_jax._kernels import AbstractKernel
 from mcgicp_jax._methods import AbstractMethod
 from mcgicp_jax._pose import AnyArray, AnyScalar
+from mcgicp_jax._pose_form import Fusion
 from mcgicp_jax._result import Status
 from mcgicp_jax._solve import adjoint_to_center, move_pose, solve_update, units
 from mcgicp_jax._sums import Sums
 from mcgicp_jax._surface import Surface
-from mcgicp_jax._uncertainty import sandwich
+from mcgicp_jax._uncertainty import Moments, sandwich
 
 # Statuses while the loop runs. COARSE: the coarse phase, with every `coarse_stride`-th source point and the larger
 # maximum correspondence distance. RUNNING: the fine phase, with all points and the smaller distance. SETTLED: the last
@@ -72,7 +74,7 @@ class Settings(eqx.Module):
 
 
 class Problem(eqx.Module):
-    """Inputs of the registration loop."""
+    """Inputs of the registration loop; `fusion` with tie points or a prior, after a registration without them."""
 
     start: jaxlie.SE3
     source: Surface
@@ -80,6 +82,7 @@ class Problem(eqx.Module):
     method: AbstractMethod
     robust: AbstractKernel | None
     settings: Settings
+    fusion: Fusion | None = None
 
 
 class State(eqx.Module):
@@ -113,7 +116,12 @@ class Assessment(NamedTuple):
 
 @jax.jit
 def update(
-    pose: jaxlie.SE3, status: Int[Array, ""], num_iterations: Int[Array, ""], sums: Sums, settings: Settings
+    pose: jaxlie.SE3,
+    status: Int[Array, ""],
+    num_iterations: Int[Array, ""],
+    sums: Sums,
+    settings: Settings,
+    fusion: Fusion | None = None,
 ) -> State:
     """Update the pose, or end the loop with a status. Its program does not depend on the size of the clouds."""
     directions, basis = None, jnp.eye(6, dtype=sums.totals.dtype)
@@ -124,7 +132,11 @@ def update(
             degenerate = ~jnp.all(directions.held)
             # Along unconstrained directions an update would only follow arbitrary nearest-neighbour matches.
             basis = jnp.asarray(directions.twists).T * (directions.held | ~settings.hold_free_directions)
-        change = solve_update(sums, basis)
+        if fusion is None or directions is None:
+            change = solve_update(sums, basis)
+        else:
+            directions, change = fused_update(pose, sums, directions, fusion)
+            degenerate = ~jnp.all(directions.held)
     moved = move_pose(pose, change.twist, sums.center)
     coarse, settled = status == COARSE, status == SETTLED
     translation_step = jnp.linalg.norm(change.twist[:3])
@@ -173,20 +185,21 @@ def constraints_of(state: State) -> tuple[Float[Array, "6 6"], Directions | None
 
 
 @jax.jit
-def covariance_of_pose(
-    state: State,
-    jacobian: Float[Array, "6 10"],
-    bias: Float[Array, "6"],
-    scatter: Float[Array, "6 6"] | None,
-    num_cells: Int[Array, ""],
-) -> Float[Array, "6 6"]:
-    """Covariance of the final pose, for ξ in T exp(ξ), metres and radians; NaN if the status allows none."""
+def covariance_of_pose(state: State, known: Moments | Fusion) -> Float[Array, "6 6"]:
+    """Covariance of the final pose, for ξ in T exp(ξ), metres and radians; NaN if the status allows none.
+
+    Args:
+        known: sums over the scores; with tie points or a prior, those of the registration before, in `Fusion`.
+    """
     found = (state.status != Status.TOO_FEW_CORRESPONDENCES) & (state.status != Status.NON_FINITE)
     if state.directions is None:
         found = found & (state.status != Status.DEGENERATE)
     center, radius = state.sums.center, state.sums.radius
     with jax.default_matmul_precision("highest"):
-        covariance = sandwich(state.pose, center, radius, jacobian, bias, scatter, num_cells, state.directions)
+        if isinstance(known, Fusion):
+            covariance = fused_covariance(state.pose, known)
+        else:
+            covariance = sandwich(state.pose, center, radius, known, state.directions)
     return jnp.where(found, covariance, jnp.nan)
 
 

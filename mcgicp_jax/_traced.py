@@ -20,6 +20,7 @@ from jaxtyping import Array, Float, Int
 from mcgicp_jax._deferred import Deferred
 from mcgicp_jax._kernels import AbstractKernel
 from mcgicp_jax._methods import AbstractMethod
+from mcgicp_jax._pose_form import Fusion
 from mcgicp_jax._result import Status
 from mcgicp_jax._search import AbstractSearch, Correspondences, Rows
 from mcgicp_jax._solve import root_near, with_derivative
@@ -39,7 +40,7 @@ from mcgicp_jax._step import (
 )
 from mcgicp_jax._sums import Matched, Sums, matched_rows, move_rows, sums_of, within
 from mcgicp_jax._surface import Surface, gathered
-from mcgicp_jax._uncertainty import Details, discount_rows, discounts, scatter_of, scores_of
+from mcgicp_jax._uncertainty import Details, Moments, discount_rows, discounts, scatter_of, scores_of
 
 # State of the loop, its matches, and the history so far.
 Carry: TypeAlias = tuple[State, Correspondences, Float[Array, "... 5"]]
@@ -97,21 +98,37 @@ def align_traced(
 
 
 @jax.jit
-def differentiable(state: State, matched: Matched, method: AbstractMethod, robust: AbstractKernel | None) -> State:
+def differentiable(
+    state: State,
+    matched: Matched,
+    method: AbstractMethod,
+    robust: AbstractKernel | None,
+    fusion: Fusion | None = None,
+) -> State:
     """Attach the implicit derivative to the pose of a final state; see `with_derivative`."""
     usable = (state.status == Status.CONVERGED) | (state.status == Status.MAX_ITERATIONS)
     if state.directions is not None:
         # Along an unconstrained direction the root of g (see `_solve.Root`) is arbitrary.
         usable = usable & jnp.all(state.directions.held)
+    if fusion is not None:
+        usable = usable & jnp.all(fusion.held)
     with jax.default_matmul_precision("highest"):
-        root = jax.lax.stop_gradient(root_near(state.sums, usable))
-        pose = with_derivative(jax.lax.stop_gradient(state.pose.wxyz_xyz), root, (matched, method, robust))
+        root = jax.lax.stop_gradient(root_near(state.sums, usable, fusion))
+        model = (matched, method, robust, fusion)
+        pose = with_derivative(jax.lax.stop_gradient(state.pose.wxyz_xyz), root, model)
     return eqx.tree_at(lambda state: state.pose.wxyz_xyz, state, pose)
 
 
 @jax.jit
 def assess(state: State, problem: Problem, matched: Matched, matches: Correspondences) -> Assessment:
     """Information matrix, directions and covariance at the final pose."""
+    known = moments_of(state, problem, matched, matches) if problem.fusion is None else problem.fusion
+    return Assessment(Deferred.of(constraints_of(state)), Deferred.of(covariance_of_pose(state, known)))
+
+
+@jax.jit
+def moments_of(state: State, problem: Problem, matched: Matched, matches: Correspondences) -> Moments:
+    """Sums over the scores of all correspondences at the final pose."""
     dtype = state.pose.wxyz_xyz.dtype
     pose = rotation_and_translation(state.pose, dtype)
     details, discount = None, jnp.ones(2, dtype)
@@ -143,9 +160,7 @@ def assess(state: State, problem: Problem, matched: Matched, matches: Correspond
         problem.robust,
     )
     scatter, num_cells = scatter_of(scores, num_cells)
-    scatter = None if problem.method.knows_residuals else scatter
-    covariance = covariance_of_pose(state, scores.jacobian, scores.bias, scatter, num_cells)
-    return Assessment(Deferred.of(constraints_of(state)), Deferred.of(covariance))
+    return Moments(scores.jacobian, scores.bias, None if problem.method.knows_residuals else scatter, num_cells)
 
 
 def begin(problem: Problem, search: AbstractSearch, max_iterations: int) -> Carry:
@@ -164,7 +179,8 @@ def _begin(problem: Problem, measure: Measure, matches: Correspondences, max_ite
     first, zero = problem.settings.first_status(), jnp.int32(0)
 
     def shapes() -> State:
-        return update(problem.start, first, zero, measure(problem.start, first, zero, matches)[1], problem.settings)
+        sums = measure(problem.start, first, zero, matches)[1]
+        return update(problem.start, first, zero, sums, problem.settings, problem.fusion)
 
     state = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), jax.eval_shape(shapes))
     state = eqx.tree_at(lambda state: (state.pose, state.status), state, (problem.start, first))
@@ -176,7 +192,7 @@ def _step(carry: Carry, measure: Measure, problem: Problem) -> Carry:
     before, matches, records = carry
     count = before.num_iterations
     matches, sums = measure(before.pose, before.status, count, matches)
-    state = update(before.pose, before.status, count, sums, problem.settings)
+    state = update(before.pose, before.status, count, sums, problem.settings, problem.fusion)
     return state, matches, records.at[count].set(state.record)
 
 

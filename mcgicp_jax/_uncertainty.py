@@ -37,7 +37,7 @@ from mcgicp_jax._surface import noise_of, normal_of, points_of, reach_of, roughn
 # Edge of a cell in distances to the farthest neighbour; values from 1 to 4 hardly differ.
 _CELL = 2.0
 # Standard deviation of an unconstrained direction, in radii of the matched points: large beside their extent.
-_UNKNOWN = 10.0
+UNKNOWN = 10.0
 # Lower bound of the factors that reduce observability, dimensionless: medians of few rows may be 0.
 _LEAST_FRACTION = 0.2
 # Medians of the square of a standard normal variate, and of the mean of two such squares.
@@ -219,32 +219,48 @@ def scatter_of(scores: Scores, num_cells: int) -> tuple[Float[AnyArray, "6 6"], 
     return product, xp.sum(rows[:, 6] > 0)
 
 
+class Moments(NamedTuple):
+    """Sums over the scores of all correspondences.
+
+    Attributes:
+        jacobian, bias: see `Scores`.
+        scatter: Σ_c u_c u_cᵀ; None: as if each force had the covariance that its information matrix states.
+        num_cells: number of cells with valid correspondences.
+    """
+
+    jacobian: Float[AnyArray, "6 10"]
+    bias: Float[AnyArray, "6"]
+    scatter: Float[AnyArray, "6 6"] | None
+    num_cells: Int[AnyArray, ""]
+
+
+def response_and_scatter(moments: Moments, radius: Float[Array, ""]) -> tuple[Float[Array, "6 6"], Float[Array, "6 6"]]:
+    """A and the covariance B of the score, lengths in units of the radius; B is NaN with six cells or fewer."""
+    information = twist_form(moments.jacobian, radius)
+    response = information * radius
+    # Small-sample correction: the pose takes six of the cells' degrees of freedom.
+    count = moments.num_cells.astype(response.dtype)
+    correction = count / jnp.where(count > 6, count - 6, jnp.nan)
+    if moments.scatter is None:
+        return response, information * correction
+    return response, moments.scatter * correction + jnp.outer(moments.bias, moments.bias)
+
+
 def sandwich(
     pose: jaxlie.SE3,
     center: Float[Array, "3"],
     radius: Float[Array, ""],
-    jacobian: Float[Array, "6 10"],
-    bias: Float[Array, "6"],
-    scatter: Float[Array, "6 6"] | None,
-    num_cells: Int[Array, ""],
+    moments: Moments,
     directions: Directions | None,
 ) -> Float[Array, "6 6"]:
-    """(6, 6) covariance of ξ = (v, ω) in T exp(ξ), metres and radians; NaN with six cells or fewer.
-
-    Without `scatter` it is A⁻¹, as if each force had the covariance that its information matrix states.
-    """
-    information = twist_form(jacobian, radius)
-    response = information * radius
-    # Small-sample correction: the pose takes six of the cells' degrees of freedom.
-    count = num_cells.astype(response.dtype)
-    correction = count / jnp.where(count > 6, count - 6, jnp.nan)
-    scatter = information * correction if scatter is None else scatter * correction + jnp.outer(bias, bias)
+    """(6, 6) covariance of ξ = (v, ω) in T exp(ξ), metres and radians; NaN with six cells or fewer."""
+    response, scatter = response_and_scatter(moments, radius)
     basis, held = jnp.eye(6, dtype=scatter.dtype), jnp.ones(6, bool)
     if directions is not None:
         basis, held = jnp.asarray(directions.twists).T, jnp.asarray(directions.held)
     both = jnp.outer(held, held)
     response = jnp.where(both, basis.T @ response @ basis, jnp.diag(1.0 * ~held))
-    scatter = jnp.where(both, basis.T @ scatter @ basis, jnp.diag(_UNKNOWN**2 * ~held))
+    scatter = jnp.where(both, basis.T @ scatter @ basis, jnp.diag(UNKNOWN**2 * ~held))
     # A single LAPACK call: two batched ones at once can deadlock.
     inverse = jnp.linalg.inv(response)
     covariance = basis @ inverse @ scatter @ inverse.T @ basis.T

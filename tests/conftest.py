@@ -33,6 +33,7 @@ _IN_FLOAT64 = (
         "reference",
         "register",
         "solve",
+        "tie_points",
     ),
     "transformations",
 )

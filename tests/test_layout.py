@@ -9,18 +9,19 @@ import mcgicp_jax
 ROOT = pathlib.Path(mcgicp_jax.__file__).parent
 # From the ground up: a module knows those of its own layer and of the layers below.
 LAYERS = {
-    "algebra": ("_pose", "_algebra", "_statistics", "_kernels", "_sizes", "_deferred"),
+    "algebra": ("_pose", "_algebra", "_statistics", "_kernels", "_sizes", "_deferred", "_checks"),
     "running": ("_threads", "_blocks"),
     "search": ("_search", "_nearest", "_tree_index", "_pykdtree", "_trees", "_dense"),
     "data": ("_cloud", "_kept", "_preprocess", "_map", "_formats", "_pose_graph", "_g2o", "io", "metrics", "datasets"),
     "local surfaces": ("_surface", "_observability", "_neighborhoods", "_local", "_channels", "_features"),
     "correspondences": ("_forces", "_methods", "_surfaces", "_sums", "_gaussians", "_ndt"),
-    "pose": ("_solve", "_hypotheses", "_directions", "_uncertainty", "_result", "_step"),
+    "pose": ("_solve", "_pose_form", "_fusion", "_hypotheses", "_directions", "_uncertainty", "_result", "_step"),
     "loops": ("_host", "_traced", "_lanes", "_normal_equations", "_sparse_inverse", "_graph_traced"),
     "use": (
         "_options",
         "_cost",
         "_outcome",
+        "_tie_points",
         "_register",
         "_global",
         "_image_matches",

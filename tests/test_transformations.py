@@ -265,7 +265,7 @@ def test_candidates_need_a_temperature(noisy):
         mcg.align(source, target, matches, method)
     with pytest.raises(ValueError, match="temperature: expected a positive number"):
         mcg.mahalanobis_cost(np.eye(4), source, target, matches, method, temperature=0.0)
-    with pytest.raises(ValueError, match="num_candidates: expected at least 1, got 0"):
+    with pytest.raises(ValueError, match="num_candidates: expected an integer of at least 1, got 0"):
         mcg.find_correspondences(source, target, None, method, max_distance=GATE, num_candidates=0)
 
 

@@ -1,0 +1,354 @@
+"""Tie points and priors: against plain sums, SciPy and Gaussian fusion; what they constrain; derivatives; honesty."""
+
+import jax
+import jax.numpy as jnp
+import jaxlie
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+import mcgicp_jax as mcg
+from mcgicp_jax import datasets
+from mcgicp_jax._pose_form import Fusion, Prior, TiePoints, form_at, inverse_3, inverse_6
+from tests.differences import TO_ROUNDING, check_gradient, needs_x64, weigh
+from tests.scenes import motion, pair
+from tests.test_programs import compilations
+
+OPTIONS = {"max_distance": 0.5}
+
+
+def covariance(rng, size, deviation):
+    root = rng.normal(size=(size, size))
+    return deviation**2 * (root @ root.T / size + 0.3 * np.eye(size))
+
+
+def tie_points(truth, points, deviation, count=6, seed=0):
+    """Some of the points and where they are in the target, with errors."""
+    rng = np.random.default_rng(seed)
+    points = np.asarray(points, float)[rng.permutation(len(points))[:count]]
+    covariances = np.array([covariance(rng, 3, deviation) for _ in range(count)]).reshape(count, 3, 3)
+    errors = [rng.multivariate_normal(np.zeros(3), each) for each in covariances]
+    return points, points @ truth[:3, :3].T + truth[:3, 3] + np.reshape(errors, (count, 3)), covariances
+
+
+def measured(truth, deviations, seed=0):
+    """A measurement P of a pose T = P exp(ξ), and its covariance."""
+    given = np.diag(np.square(deviations))
+    return truth @ motion(-np.random.default_rng(seed).normal(size=6) * deviations), given
+
+
+def twist_error(matrix, truth):
+    left = np.linalg.inv(truth) @ matrix
+    return np.append(left[:3, 3], Rotation.from_matrix(left[:3, :3]).as_rotvec())
+
+
+@pytest.fixture(scope="module")
+def corner():
+    return pair()
+
+
+@pytest.fixture(scope="module")
+def hall():
+    """Two clouds of a bare corridor, the true pose, and the direction of its axis in the source's frame."""
+    target, source = datasets.corridor(2, textured=False)
+    truth = np.linalg.inv(target.pose) @ source.pose
+    clouds = [mcg.preprocess(frame.cloud) for frame in (source, target)]
+    return *clouds, truth, source.pose[:3, :3].T @ [1, 0, 0]
+
+
+# Algebra
+
+
+def test_inverses_are_those_of_numpy():
+    rng = np.random.default_rng(0)
+    for deviation in (1e-4, 1.0, 1e3):
+        given = np.array([covariance(rng, 3, deviation) for _ in range(5)])
+        np.testing.assert_allclose(inverse_3(given), np.linalg.inv(given), rtol=1e-9)
+    scale = np.outer(*[[1e-3, 1e-3, 1e3, 1e-4, 1e2, 1e-4]] * 2)
+    given = covariance(rng, 6, 1.0) * scale
+    np.testing.assert_allclose(inverse_6(given) * scale, np.linalg.inv(given / scale), rtol=1e-8, atol=1e-8)
+
+
+@pytest.mark.parametrize("kind", ["tie points", "prior"])
+def test_the_form_is_the_cost(kind):
+    """The force and the stiffness of plain sums, at a pose that is not the one to which the form refers."""
+    rng = np.random.default_rng(1)
+    start, pose, center, radius = motion(0.3 * rng.normal(size=6)), motion(0.3 * rng.normal(size=6)), np.ones(3), 2.0
+    ties = TiePoints(*rng.normal(size=(2, 4, 3)), np.array([covariance(rng, 3, 0.3) for _ in range(4)]))
+    belief = motion(0.2 * rng.normal(size=6)), covariance(rng, 6, 0.3)
+    prior = Prior(belief[0][:3, :3], belief[0][:3, 3], belief[1])
+    ties, prior = (ties, None) if kind == "tie points" else (None, prior)
+
+    def residuals(twist):
+        turn = motion([0, 0, 0, *twist[3:]])[:3, :3]
+        rotation = turn @ pose[:3, :3]
+        translation = center + turn @ (pose[:3, 3] - center) + radius * twist[:3]
+        if ties is not None:
+            apart = ties.target - ties.source @ rotation.T - translation
+            return np.concatenate(
+                [np.linalg.cholesky(np.linalg.inv(c)).T @ d for c, d in zip(ties.covariances, apart, strict=True)]
+            )
+        left = belief[0][:3, :3].T @ rotation
+        vector = 0.5 * np.array([left[2, 1] - left[1, 2], left[0, 2] - left[2, 0], left[1, 0] - left[0, 1]])
+        error = np.append(belief[0][:3, :3].T @ (translation - belief[0][:3, 3]), vector)
+        return np.linalg.cholesky(np.linalg.inv(belief[1])).T @ error
+
+    slope = np.stack([(residuals(1e-5 * e) - residuals(-1e-5 * e)) / 2e-5 for e in np.eye(6)], axis=1)
+    form = form_at(start[:3, :3], start[:3, 3], center, radius, ties, prior)
+    nothing = np.zeros((6, 6))
+    fusion = Fusion(start[:3, :3], start[:3, 3], center, radius, form, np.eye(6), nothing, nothing, np.ones(6, bool))
+    with jax.enable_x64(True):
+        pull, stiffness = fusion.pull(jnp.asarray(pose[:3, :3]), jnp.asarray(pose[:3, 3]))
+    np.testing.assert_allclose(pull, -slope.T @ residuals(np.zeros(6)), rtol=1e-6)
+    np.testing.assert_allclose(stiffness, slope.T @ slope, rtol=1e-6)
+
+
+# Fusion
+
+
+def test_precise_tie_points_decide(corner):
+    """Against SciPy's fit, a few millimetres from where the clouds alone would be."""
+    source, target, truth = corner
+    points, targets, _ = tie_points(motion((0.004, -0.003, 0.002, 0.002, 0.001, -0.002)) @ truth, source.points, 1e-3)
+    precise = np.tile(1e-12 * np.eye(3), (6, 1, 1))
+    result = mcg.register(source, target, mcg.GICP(), tie_points=(points, targets, precise), **OPTIONS)
+    means = targets.mean(axis=0), points.mean(axis=0)
+    expected, _ = Rotation.align_vectors(targets - means[0], points - means[1])
+    np.testing.assert_allclose(result.matrix[:3, :3], expected.as_matrix(), atol=2e-5)
+    np.testing.assert_allclose(result.matrix[:3, 3], means[0] - expected.apply(means[1]), atol=4e-5)
+    assert result.converged and result.deviations.max() < 1e-5
+
+
+@pytest.mark.parametrize("name", ["gicp", "mc-gicp", "point-to-plane", "d2d-ndt"])
+def test_a_prior_is_weighed_by_its_covariance(corner, name):
+    """The product of two Gaussians: that of the registration alone, and the prior."""
+    source, target, _ = corner
+    methods = {"gicp": mcg.GICP(), "mc-gicp": mcg.MultiChannelGICP(), "point-to-plane": mcg.PointToPlane()}
+    method = methods.get(name, mcg.D2DNDT())
+    options = OPTIONS | {"translation_tolerance": 1e-5, "rotation_tolerance": 1e-5}
+    if name == "d2d-ndt":
+        source, target = (mcg.gaussians(cloud, 0.2) for cloud in (source, target))
+    alone = mcg.register(source, target, method, **options)
+    prior = measured(alone.matrix, 3 * np.sqrt(np.diagonal(alone.covariance)), seed=2)
+    result = mcg.register(source, target, method, prior=prior, **options)
+    information = np.linalg.inv(np.asarray(alone.covariance)), np.linalg.inv(prior[1])
+    covariance = np.linalg.inv(sum(information))
+    expected = covariance @ information[1] @ twist_error(prior[0], alone.matrix)
+    deviations = np.sqrt(np.diagonal(covariance))
+    # Other matches at another pose, and the loop stops when updates are small.
+    assert np.all(np.abs(twist_error(result.matrix, alone.matrix) - expected) < 0.25 * deviations)
+    np.testing.assert_allclose(np.sqrt(np.diagonal(result.covariance)), deviations, rtol=0.02)
+    added = np.asarray(result.information) - np.asarray(alone.information)
+    assert np.all(np.linalg.eigvalsh(added) > -0.05 * np.linalg.norm(added))
+
+
+def test_tie_points_that_tell_nothing_change_nothing(corner):
+    source, target, truth = corner
+    alone = mcg.register(source, target, mcg.GICP(), **OPTIONS)
+    for given in (tie_points(truth, source.points, 1e4), tie_points(truth, source.points, 1.0, count=0)):
+        result = mcg.register(source, target, mcg.GICP(), tie_points=given, **OPTIONS)
+        assert result.converged and np.abs(twist_error(result.matrix, alone.matrix)).max() < 5e-4
+        np.testing.assert_allclose(result.deviations, alone.deviations, rtol=0.01)
+        np.testing.assert_allclose(result.information, alone.information, rtol=0.02, atol=30)
+
+
+def test_tie_points_far_from_the_clouds_leave_no_matches(corner):
+    source, target, truth = corner
+    away = motion((30, 0, 0, 0, 0, 0)) @ truth
+    result = mcg.register(source, target, mcg.GICP(), tie_points=tie_points(away, source.points, 1e-6), **OPTIONS)
+    assert result.status is mcg.Status.TOO_FEW_CORRESPONDENCES and np.isnan(result.covariance).all()
+
+
+def test_large_coordinates_lose_nothing(corner):
+    """Precise measurements decide the pose, with a source far from its origin and a target at UTM coordinates."""
+    source, target, truth = corner
+    moves = motion((500, 300, 10, 0, 0, 0.5)), motion((4e5, 5e6, 0, 0.3, 0, 0))
+    clouds = [
+        np.asarray(cloud.points, np.float64) @ move[:3, :3].T + move[:3, 3]
+        for cloud, move in zip((source, target), moves, strict=True)
+    ]
+    there = moves[1] @ truth @ np.linalg.inv(moves[0])
+    points, targets, covariances = tie_points(there, clouds[0], 1e-4)
+    result = mcg.register(*clouds, mcg.GICP(), init=there, tie_points=(points, targets, covariances), **OPTIONS)
+    moved = points @ result.matrix[:3, :3].T + result.matrix[:3, 3]
+    assert result.converged and np.abs(moved - targets).max() < 5e-4
+    pose, given = measured(truth, np.repeat([1e-4, 5e-5], 3))
+    # ξ turns about the origin of the source's coordinates.
+    with jax.enable_x64(True):
+        change = np.asarray(jaxlie.SE3.from_matrix(jnp.asarray(moves[0])).adjoint())
+    prior = moves[1] @ pose @ np.linalg.inv(moves[0]), change @ given @ change.T
+    result = mcg.register(*clouds, mcg.GICP(), init=there, prior=prior, **OPTIONS)
+    found = np.linalg.inv(moves[1]) @ result.matrix @ moves[0]
+    assert result.converged and np.abs(twist_error(found, pose)).max() < 5e-5
+    back = np.linalg.inv(change)
+    np.testing.assert_allclose(np.diagonal(back @ result.covariance @ back.T), np.diagonal(given), rtol=0.1)
+
+
+# What geometry leaves free
+
+
+def test_a_tie_point_holds_the_axis_of_a_corridor(hall):
+    source, target, truth, axis = hall
+    start = truth.copy()
+    start[:3, 3] += 0.1 * truth[:3, :3] @ axis
+    options = OPTIONS | {"init": start}
+    alone = mcg.register(source, target, mcg.GICP(), **options)
+    assert alone.status is mcg.Status.DEGENERATE and alone.deviations.max() > 1
+    one = tie_points(truth, source.points, 0.01, count=1)
+    result = mcg.register(source, target, mcg.GICP(), tie_points=one, **options)
+    assert result.converged and result.deviations.max() < 0.03
+    (direction,) = result.free_directions
+    assert direction.held_by_ties and not direction.held_by_channels and abs(direction.axis @ axis) > 0.995
+    assert "constrained by tie points or prior" in repr(direction) and "by tie points or prior" in repr(result)
+    error = twist_error(result.matrix, truth)
+    assert abs(error[:3] @ axis) < 0.03
+    # A prior across the corridor alone does not tell the way along it.
+    across = (np.eye(3) - np.outer(axis, axis)) * 1e-4 + 1e6 * np.outer(axis, axis)
+    given = np.block([[across, np.zeros((3, 3))], [np.zeros((3, 3)), 1e-4 * np.eye(3)]])
+    result = mcg.register(source, target, mcg.GICP(), prior=(start, given), **OPTIONS)
+    assert result.status is mcg.Status.DEGENERATE
+    assert abs(twist_error(result.matrix, start)[:3] @ axis) < 5e-3
+
+
+def test_a_prior_is_the_start(corner):
+    source, target, truth = corner
+    away = motion((7, 0, 0, 0, 0, 0))
+    moved = mcg.preprocess(np.asarray(source.points) + np.float32(7))
+    shift = np.eye(4)
+    shift[:3, 3] = -7
+    result = mcg.register(moved, target, mcg.GICP(), prior=(truth @ shift, np.eye(6)), **OPTIONS)
+    assert result.converged and np.abs(twist_error(result.matrix @ np.linalg.inv(shift), truth)).max() < 0.01
+    lost = mcg.register(moved, target, mcg.GICP(), init=away, prior=(truth @ shift, 1e-6 * np.eye(6)), **OPTIONS)
+    assert lost.status is mcg.Status.TOO_FEW_CORRESPONDENCES
+
+
+# Derivatives
+
+
+@needs_x64
+@pytest.mark.parametrize("scene", ["corner", pytest.param("corridor", marks=pytest.mark.slow)])
+def test_gradients_of_tie_points_and_prior(scene, noisy, hall):
+    source, target, truth = noisy if scene == "corner" else hall[:3]
+    weak = 0.02 if scene == "corner" else 0.05
+    points, targets, covariances = tie_points(truth, source.points, weak)
+    pose, given = measured(truth, np.repeat([weak, 0.5 * weak], 3), seed=3)
+    # Variances are about 1, so that one step of the differences suits all inputs.
+    size = weak**2
+
+    def loss(inputs):
+        ties, spread = inputs["ties"], inputs["covariance"]
+        ties = *ties[:2], size * 0.5 * (ties[2] + ties[2].swapaxes(1, 2))
+        prior = jaxlie.SE3.from_matrix(pose) @ jaxlie.SE3.exp(inputs["twist"]), size * 0.5 * (spread + spread.T)
+        options = {"init": truth, "tie_points": ties, "prior": prior, "max_distance": 0.4}
+        return weigh(mcg.register(source, target, mcg.GICP(1e-2), **options, **TO_ROUNDING).matrix)
+
+    inputs = {"ties": (points, targets, covariances / size), "twist": np.zeros(6), "covariance": given / size}
+    check_gradient(loss, jax.tree.map(jnp.asarray, inputs))
+
+
+def test_batches_of_tie_points(corner):
+    """Under vmap and jit, the answers are those of the host."""
+    source, target, truth = corner
+    several = [tie_points(truth, source.points, 2e-3, seed=seed) for seed in range(2)]
+
+    def pose(given):
+        result = mcg.register(source, target, mcg.GICP(), tie_points=given, **OPTIONS)
+        return result.matrix, result.deviations, result.status_code
+
+    matrices, deviations, codes = jax.jit(jax.vmap(pose))(jax.tree.map(lambda *each: jnp.stack(each), *several))
+    for i, given in enumerate(several):
+        expected = mcg.register(source, target, mcg.GICP(), tie_points=given, **OPTIONS)
+        np.testing.assert_allclose(matrices[i], expected.matrix, atol=5e-5)
+        np.testing.assert_allclose(deviations[i], expected.deviations, rtol=0.02)
+        assert codes[i] == expected.status
+
+
+# Use
+
+
+def test_other_numbers_of_tie_points_compile_nothing(corner):
+    source, target, truth = corner
+    mcg.register(source, target, mcg.GICP(), tie_points=tie_points(truth, source.points, 0.01), **OPTIONS)
+    with compilations() as found:
+        for count in (1, 4, 300):
+            given = tie_points(truth, source.points, 0.01, count=count)
+            result = mcg.register(source, target, mcg.GICP(), tie_points=given, **OPTIONS)
+            prior = measured(truth, np.full(6, 0.1 / count))
+            mcg.register(source, target, mcg.GICP(), tie_points=given, prior=prior, **OPTIONS)
+            assert result.covariance.shape == (6, 6)
+    assert not found
+
+
+def test_malformed_arguments_are_named(corner):
+    source, target, truth = corner
+    points, targets, covariances = tie_points(truth, source.points, 0.01)
+    negative, skewed = covariances.copy(), covariances.copy()
+    negative[1] *= -1
+    skewed[2, 0, 1] += 1e-3
+    cases = {
+        r"^tie_points: expected \(source_points": (points, targets),
+        r"^tie_points\[0\]: expected numbers of shape": ("abc", targets, covariances),
+        r"^tie_points\[0\]: expected shape \(6, 3\)": (points[:, :2], targets, covariances),
+        r"^tie_points\[1\]: expected shape \(6, 3\)": (points, targets[:4], covariances),
+        r"^tie_points\[1\]: expected finite": (points, targets * np.nan, covariances),
+        r"^tie_points\[2\]: expected finite": (points, targets, covariances * np.inf),
+        r"^tie_points\[2\]: expected shape \(6, 3, 3\)": (points, targets, 0.1),
+        r"^tie_points\[2\]: expected symmetric positive definite": (points, targets, negative),
+        r"^tie_points\[2\]: expected symmetric": (points, targets, skewed),
+    }
+    for message, given in cases.items():
+        with pytest.raises(ValueError, match=message):
+            mcg.register(source, target, mcg.GICP(), tie_points=given)
+    cases = {
+        r"^prior: expected \(pose, covariance\)": truth,
+        r"^prior\[0\]: expected a rigid motion": (2 * truth, np.eye(6)),
+        r"^prior\[1\]: expected shape \(6, 6\)": (truth, np.eye(3)),
+        r"^prior\[1\]: expected symmetric positive": (truth, np.zeros((6, 6))),
+        r"^prior\[1\]: expected finite": (truth, np.full((6, 6), np.nan)),
+    }
+    for message, given in cases.items():
+        with pytest.raises(ValueError, match=message):
+            mcg.register(source, target, mcg.GICP(), prior=given)
+    with pytest.raises(ValueError, match=r"^hold_free_directions: expected True with"):
+        mcg.register(source, target, mcg.GICP(), prior=(truth, np.eye(6)), hold_free_directions=False)
+
+
+# Calibration
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("scene", ["room", "corridor"])
+def test_covariances_are_right(scene):
+    """40 simulated pairs: normalised error squared, and errors smaller than those of each source alone."""
+    make = datasets.box_room(2, points_per_frame=5000) if scene == "room" else datasets.corridor(2, textured=False)
+    near, deviations = (2e-3, (7e-4, 4e-4)) if scene == "room" else (0.01, (3e-3, 1e-3))
+    squares, nees = {}, {}
+    for seed in range(40):
+        target, source = (make.observe(i, noise_seed=2 * seed + i) for i in (0, 1))
+        truth = np.linalg.inv(target.pose) @ source.pose
+        clouds = [mcg.preprocess(frame.cloud) for frame in (source, target)]
+        ties = tie_points(truth, source.cloud.points, near, seed=seed)
+        prior = measured(truth, np.repeat(deviations, 3), seed=1000 + seed)
+        start = truth @ motion(np.random.default_rng(seed).normal(size=6) * (0.03, 0.03, 0.03, 0, 0, 0))
+        given = {"nothing": {}, "ties": {"tie_points": ties}, "prior": {"prior": prior}}
+        for name, options in given.items():
+            result = mcg.register(*clouds, mcg.GICP(), init=start, **options, **OPTIONS)
+            coordinates = np.linalg.inv(np.asarray(result.directions.twists, float).T)
+            held = np.asarray(result.directions.held)
+            error = coordinates @ twist_error(result.matrix, truth)
+            spread = coordinates @ np.asarray(result.covariance) @ coordinates.T
+            value = error[held] @ np.linalg.solve(spread[np.ix_(held, held)], error[held]) / held.sum()
+            nees.setdefault(name, []).append(value)
+            squares.setdefault(name, []).append(error @ error)
+            if name != "nothing":
+                assert result.converged
+        means = ties[1].mean(axis=0), ties[0].mean(axis=0)
+        fit = np.eye(4)
+        fit[:3, :3] = Rotation.align_vectors(ties[1] - means[0], ties[0] - means[1])[0].as_matrix()
+        fit[:3, 3] = means[0] - fit[:3, :3] @ means[1]
+        for name, matrix in (("ties alone", fit), ("prior alone", prior[0])):
+            squares.setdefault(name, []).append(np.sum((coordinates @ twist_error(matrix, truth)) ** 2))
+    errors = {name: np.sqrt(np.mean(each)) for name, each in squares.items()}
+    assert all(0.5 < np.mean(each) < 2 for each in nees.values()), nees
+    for name in ("ties", "prior"):
+        assert errors[name] < min(errors["nothing"], errors[f"{name} alone"]), errors
