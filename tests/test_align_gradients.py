@@ -37,7 +37,7 @@ def test_align_has_the_gradient_of_its_answer(name, noisy):
 
 
 @needs_x64
-@pytest.mark.parametrize("name", ["mc-gicp", "color-icp"])
+@pytest.mark.parametrize("name", [pytest.param("mc-gicp", marks=pytest.mark.slow), "color-icp"])
 def test_align_has_the_gradient_where_channels_are_missing(name, noisy):
     source, target, _ = noisy
     method, robust = CASES[name]
@@ -118,12 +118,13 @@ def test_soft_matches_give_every_number_a_gradient(noisy):
 @needs_x64
 def test_jacobians_agree_forward_and_backward(noisy):
     source, target, _ = noisy
-    method, _ = CASES["gicp"]
+    method, _ = CASES["point-to-point"]
     matches = mcg.find_correspondences(source, target, motion(), method, max_distance=GATE)
 
-    def pose(epsilon):
-        return mcg.align(source, target, matches, mcg.GICP(epsilon), init=motion(), **CONVERGED).matrix
+    def pose(scale):
+        moved = source.replace(points=source.points * scale)
+        return mcg.align(moved, target, matches, method, init=motion(), **CONVERGED).matrix
 
-    forward, backward = (jax.jit(jacobian(pose))(jnp.asarray(1e-2)) for jacobian in (jax.jacfwd, jax.jacrev))
+    forward, backward = (jax.jit(jacobian(pose))(jnp.ones(3)) for jacobian in (jax.jacfwd, jax.jacrev))
     assert np.abs(forward).max() > 1e-3
     np.testing.assert_allclose(forward, backward, rtol=1e-9, atol=1e-12)
