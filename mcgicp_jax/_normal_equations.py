@@ -36,8 +36,8 @@ UNCONSTRAINED = 10 * LEAST_DAMPING
 # A step is the last one if it lowers the cost by less than this fraction, as predicted. Next to the minimum of noisy
 # graphs a step was seen to lower it by 1e-2 to 1e-3 of what the one before did: the cost is then right to 1e-8.
 TOLERANCE = 1e-6
-# Entries of the factors per entry of the matrix beyond which conjugate gradients are quicker: from 10 to 15 with half of
-# the loops false, in the sphere of 2,500 and the garage of 1,600 poses. Without false loops they have 6 and 2.
+# Entries of the factors per entry of the matrix beyond which conjugate gradients are quicker: 10 to 15 with half of the
+# loops false, in the sphere of 2,500 and the garage of 1,600 poses. Without false loops they have 6 and 2.
 _LARGEST_FILL = 10.0
 # Relative residual of conjugate gradients, which serve for steps far from the minimum, and largest number of products.
 _RESIDUAL, _MOST_PRODUCTS = 1e-2, 300

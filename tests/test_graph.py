@@ -152,6 +152,20 @@ def test_parts_that_have_priors_are_well_defined():
     np.testing.assert_allclose(again.poses, found.poses, atol=1e-6)
 
 
+def test_a_start_from_trusted_loops_is_near_the_minimum():
+    """Where odometry alone leads to another minimum."""
+    graph, _ = measured(*grid(4), deviations=(0.2, 0.3))
+    edges = mcg.Edge(graph.edges.i, graph.edges.j, graph.edges.T_i_j, graph.edges.information)
+    start = mcg.PoseGraph(None, edges).poses
+    np.testing.assert_allclose(start[0], np.eye(4), atol=1e-9)
+    np.testing.assert_allclose(np.linalg.det(start[:, :3, :3]), 1, atol=1e-9)
+    found = mcg.optimize_poses(mcg.PoseGraph(start, edges))
+    truth = mcg.optimize_poses(mcg.PoseGraph(grid(4)[0], edges))
+    odometry = mcg.optimize_poses(mcg.PoseGraph(graph.poses, edges))
+    np.testing.assert_allclose(found.cost, truth.cost, rtol=1e-6)
+    assert found.num_iterations < odometry.num_iterations and odometry.cost > 1.1 * found.cost
+
+
 def test_a_start_is_composed_from_the_edges():
     poses, loops = SMALL["garage"]
     graph, _ = measured(poses, loops)
