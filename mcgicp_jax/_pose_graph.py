@@ -13,6 +13,7 @@ import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float, Int
 
+from mcgicp_jax._initial_poses import initial_poses
 from mcgicp_jax._pose import Pose, is_concrete, pose_matrix
 
 # What `Edge.i` is for a measurement in the world's frame. Unlike −1, it is not a row of any array.
@@ -99,10 +100,10 @@ class PoseGraph(eqx.Module):
         """Create a graph.
 
         Args:
-            poses: an array (n, 4, 4), or a sequence of n `jaxlie.SE3` or (4, 4) matrices. With None, the motions along
-                a spanning tree of the edges are composed, which takes loops only if no other edges connect a pose, and
-                edges without information on some direction last. Each part of the graph that has no prior then begins
-                at the identity.
+            poses: an array (n, 4, 4), or a sequence of n `jaxlie.SE3` or (4, 4) matrices. With None, they are found
+                from the edges by chordal relaxation (Carlone et al. 2015). Loops, which may be false, and edges without
+                information on some direction only connect what others do not. Each part of the graph that has no prior
+                then begins at the identity.
             edges: a sequence of single edges, or one `Edge` with a leading axis. Several edges may join the same poses.
 
         Raises:
@@ -114,7 +115,7 @@ class PoseGraph(eqx.Module):
         if np.ndim(self.edges.i) != 1:
             raise ValueError(f"edges: expected one leading axis, got shape {np.shape(self.edges.i)}")
         if poses is None:
-            poses = _composed(self.edges)
+            poses = _initial(self.edges)
         elif not isinstance(poses, jax.Array):
             poses = np.array([pose_matrix(pose, f"poses[{k}]") for k, pose in enumerate(poses)])  # type: ignore
         if np.ndim(poses) != 3 or np.shape(poses)[1:] != (4, 4):
@@ -165,34 +166,13 @@ def _stacked(edges: Sequence[Edge]) -> Edge:
     return jax.tree.map(lambda *values: xp.stack(values), *edges)
 
 
-def _composed(edges: Edge) -> Float[np.ndarray, "n 4 4"]:
-    """Poses along a minimum spanning tree from the world, which is the last node."""
-    from scipy.sparse import coo_array
-    from scipy.sparse.csgraph import breadth_first_order, minimum_spanning_tree
-
+def _initial(edges: Edge) -> Float[np.ndarray, "n 4 4"]:
     if not is_concrete(edges) or not len(edges):
         raise ValueError("poses: expected poses, since the edges are none or traced")
-    n = int(max(np.max(edges.i), np.max(edges.j))) + 1
-    edges = _checked(edges, n)
-    # One more edge to each pose, of the identity, keeps parts that have no prior.
-    i = np.concatenate([np.where(edges.i == WORLD, n, edges.i), np.full(n, n)])
-    j = np.concatenate([edges.j, np.arange(n)])
-    motions = np.concatenate([edges.T_i_j, np.tile(np.eye(4), (n, 1, 1))])
-    values = np.linalg.eigvalsh(edges.information)
-    blind = values[:, 0] <= _ROUNDING * values[:, -1]
-    order = np.argsort(np.concatenate([edges.loop + 2 * blind, np.full(n, 4)]), kind="stable")
-    # Of several edges between two poses, the first in this order.
-    _, first = np.unique((np.minimum(i, j) * (n + 1) + np.maximum(i, j))[order], return_index=True)
-    rows = order[first]
-    tree = minimum_spanning_tree(coo_array((first + 1.0, (i[rows], j[rows])), (n + 1, n + 1))).tocoo()
-    used = {frozenset(ends): order[int(place) - 1] for *ends, place in zip(tree.row, tree.col, tree.data, strict=True)}
-    nodes, before = breadth_first_order(tree.tocsr(), n, directed=False)
-    poses = np.tile(np.eye(4), (n + 1, 1, 1))
-    for node in nodes[1:]:
-        edge = used[frozenset((before[node], node))]
-        motion = motions[edge] if j[edge] == node else np.linalg.inv(motions[edge])
-        poses[node] = poses[before[node]] @ motion
-    return poses[:n]
+    number = int(max(np.max(edges.i), np.max(edges.j))) + 1
+    edges = _checked(edges, number)
+    i, j, loop = np.where(edges.i == WORLD, number, edges.i), np.asarray(edges.j), np.asarray(edges.loop)
+    return initial_poses(i, j, np.asarray(edges.T_i_j), np.asarray(edges.information), loop, number)
 
 
 def _checked(edges: Edge, num_poses: int) -> Edge:
