@@ -164,7 +164,9 @@ def _centred(name: str, cloud: PointCloud) -> tuple[PointCloud, Float[np.ndarray
     except ValueError as error:
         raise ValueError(f"{name}: {error}") from error
     points = cloud.coordinates
-    center = 0.5 * (points.min(axis=0) + points.max(axis=0))
+    # Working by columns takes a tenth of the time.
+    columns = np.ascontiguousarray(points.T)
+    center = 0.5 * (columns.min(axis=1) + columns.max(axis=1))
     channels = np.asarray(cloud.channels, np.float32)
     valid = None if cloud.channel_valid is None else np.asarray(cloud.channel_valid)
     return PointCloud((points - center).astype(np.float32), channels, channel_valid=valid), center
@@ -211,7 +213,7 @@ def _matches_of_features(source: PointCloud, target: PointCloud, voxel_size: flo
     if source.channels.shape[1]:
         statistics = statistics_of(source, voxel_size), statistics_of(target, voxel_size)
     features = comparable((histograms[0], histograms[1]), statistics)
-    rows, target_rows = mutual_nearest(*features)
+    rows, target_rows = mutual_nearest(*features, NUM_MATCHES)
     return _padded(
         np.asarray(source.points)[rows],
         np.asarray(target.points)[target_rows],
@@ -244,21 +246,30 @@ def _padded(*columns: Float[np.ndarray, "n 3"]) -> Matches:
 
 
 def mutual_nearest(
-    source: Float[np.ndarray, "N L"], target: Float[np.ndarray, "M L"]
+    source: Float[np.ndarray, "N L"], target: Float[np.ndarray, "M L"], most: int
 ) -> tuple[Int[np.ndarray, "n"], Int[np.ndarray, "n"]]:
     """Rows of features that are nearest to each other, ties to the first row; the most distinct ones first.
+
+    All of them, or at least the first `most`.
 
     Distinct are those whose squared distance is small relative to that of the second nearest target. All pairs of rows
     are compared in blocks: trees are no faster in so many dimensions.
     """
     nearest, squares = _two_nearest(source, target)
-    # Only targets that are nearest to any source need be searched for.
-    hit, number = np.unique(nearest[:, 0], return_inverse=True)
-    back, _ = _two_nearest(target[hit], source)
-    mutual = np.flatnonzero(back[number, 0] == np.arange(len(source)))
-    ratio = squares[mutual, 0] / np.maximum(squares[mutual, 1], 1)
-    mutual = mutual[np.argsort(ratio, kind="stable")]
-    return mutual, nearest[mutual, 0]
+    order = np.argsort(squares[:, 0] / np.maximum(squares[:, 1], 1), kind="stable")
+    matched = nearest[order, 0]
+    # Targets that are nearest to any source, in this order: those of the most distinct matches may be enough.
+    hit, first, number = np.unique(matched, return_index=True, return_inverse=True)
+    wanted = np.argsort(first)
+    back = np.full(len(hit), -1)
+    for start in range(0, len(hit), BLOCK):
+        rows = wanted[start : start + BLOCK]
+        back[rows] = _two_nearest(target[hit[rows]], source)[0][:, 0]
+        known = first[wanted[start + BLOCK]] if start + BLOCK < len(hit) else len(order)
+        mutual = np.flatnonzero(back[number[:known]] == order[:known])
+        if len(mutual) >= most:
+            break
+    return order[mutual], matched[mutual]
 
 
 def _two_nearest(

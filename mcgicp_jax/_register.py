@@ -271,11 +271,12 @@ def register(
             its covariance (6, 6), metres and radians, of ξ = (v, ω) in T = pose · exp(ξ): in the order and frame of
             `Registration.covariance`. Give what it does not tell a large variance. Without `init` it is the start.
 
-    With tie points or a prior, a first registration without them measures the covariance of the matches, and a second
-    one weighs all by their covariances; `covariance` includes them, and so does `information`, in the unit of the
-    matches. They constrain directions that the clouds leave free (`FreeDirection.held_by_ties`). Both are
-    differentiable; the weights of the matches are constants. A wrong tie point, or a wrong start, remains wrong:
-    compare `overlap`.
+    With tie points or a prior, a first registration without them measures the covariance of the score of the matches,
+    and a second one, which starts at its pose, weighs all by their covariances (Hansen 1982, generalised method of
+    moments). The result is that of the second one; its `covariance` and `information` include tie points and prior.
+    They also constrain directions that the clouds leave free (`FreeDirection.held_by_ties`). The pose is differentiable
+    with respect to points, pose and covariances; the weights of the matches are constants to autodiff. Contradictions
+    are averaged, not detected: look at `overlap`.
 
     Returns:
         The pose with its status, quality of the fit and uncertainty; check `converged`.

@@ -27,7 +27,8 @@ class Status(enum.IntEnum):
         TOO_FEW_CORRESPONDENCES: fewer than four source points (in the coarse phase: of the subset) have a match within
             `max_distance`: the clouds do not overlap, or the start is too far off.
         DEGENERATE: the last update was below both tolerances, but at least one direction of motion is unconstrained
-            (see `Registration.free_directions`). Along it `register` keeps the start, if `hold_free_directions`.
+            (see `Registration.free_directions`). Along it `register` keeps the start, if `hold_free_directions`. Tie
+            points or a prior constrain a direction if its standard deviation is then below the radius of the clouds.
         NON_FINITE: the pose or the sums overflowed or became NaN.
         INVALID_INPUT: `register` would raise a `ValueError` for this pair. Only in batches; the pose is NaN.
         LOST: the worker of this pair failed, and so did a second attempt. Only in batches; the pose is NaN.
@@ -122,7 +123,7 @@ class Registration(eqx.Module):
 
         ξ = (v, ω) is the twist of T exp(ξ), in the source's frame, metres and radians. The scale of the matrix is that
         of GICP's relative covariances: it compares directions with each other, but its inverse is *not* a covariance of
-        the pose.
+        the pose. The information of tie points and a prior is converted to this scale and added.
         """
         return self.constraints.value[0]
 
@@ -176,7 +177,7 @@ class Registration(eqx.Module):
 
     @property
     def free_directions(self) -> tuple[FreeDirection, ...]:
-        """Directions of motion that the shape of the clouds does not constrain, and whether the channels do.
+        """Directions of motion that the shape of the clouds does not constrain, and whether channels or tie points do.
 
         Empty if geometry constrains all six directions, and for `align`.
 
