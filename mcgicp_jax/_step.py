@@ -177,7 +177,7 @@ def covariance_of_pose(
     state: State,
     jacobian: Float[Array, "6 10"],
     bias: Float[Array, "6"],
-    scatter: Float[Array, "6 6"] | None,
+    scatter: Float[Array, "6 6"],
     num_cells: Int[Array, ""],
 ) -> Float[Array, "6 6"]:
     """Covariance of the final pose, for ξ in T exp(ξ), metres and radians; NaN if the status allows none."""

@@ -5,9 +5,8 @@ correspondences are correlated, since they share targets and covariances, so u_c
 about as large as a neighbourhood. A is the Jacobian of g with respect to the pose. When the pose moves, the matches
 follow along the surface, so only the observable fraction O of a motion changes the residuals: A = Σ w JᵀMOJ. The rest
 of the forces, w M(I − O)d, sums to a bias of nearest-neighbour matching, which enters as one more score. Cells of
-`gaussians` stand still instead: A = Σ w JᵀMJ (`matches_slide`). For D2D-NDT, Σ JᵀMJ also replaces the scatter of the
-scores (`knows_residuals`). (Including the derivative of M with respect to the rotation in A changed the result by less
-than 1 %.)
+`gaussians` stand still instead: A = Σ w JᵀMJ (`matches_slide`). (Including the derivative of M with respect to the
+rotation in A changed the result by less than 1 %.)
 
 Three steps: medians over sampled rows (`discounts`), scores of all rows (`scores_of`), and 6×6 algebra (`sandwich`).
 The first two work row by row, in blocks or over whole arrays.
@@ -225,20 +224,16 @@ def sandwich(
     radius: Float[Array, ""],
     jacobian: Float[Array, "6 10"],
     bias: Float[Array, "6"],
-    scatter: Float[Array, "6 6"] | None,
+    scatter: Float[Array, "6 6"],
     num_cells: Int[Array, ""],
     directions: Directions | None,
 ) -> Float[Array, "6 6"]:
-    """(6, 6) covariance of ξ = (v, ω) in T exp(ξ), metres and radians; NaN with six cells or fewer.
-
-    Without `scatter` it is A⁻¹, as if each force had the covariance that its information matrix states.
-    """
-    information = twist_form(jacobian, radius)
-    response = information * radius
+    """(6, 6) covariance of ξ = (v, ω) in T exp(ξ), metres and radians; NaN with six cells or fewer."""
+    response = twist_form(jacobian, radius) * radius
     # Small-sample correction: the pose takes six of the cells' degrees of freedom.
     count = num_cells.astype(response.dtype)
     correction = count / jnp.where(count > 6, count - 6, jnp.nan)
-    scatter = information * correction if scatter is None else scatter * correction + jnp.outer(bias, bias)
+    scatter = scatter * correction + jnp.outer(bias, bias)
     basis, held = jnp.eye(6, dtype=scatter.dtype), jnp.ones(6, bool)
     if directions is not None:
         basis, held = jnp.asarray(directions.twists).T, jnp.asarray(directions.held)
