@@ -46,7 +46,8 @@ def mahalanobis_cost(
         robust: kernel ρ applied to the Mahalanobis distance of each match, as in `register`; without any, ρ(s²) = s².
         temperature: metres. Weighs the candidates of each source point (`num_candidates`) by a softmax of
             −½ (distance / temperature)², with distances in position and α · channel; this gives α a gradient. As it
-            tends to 0, only the nearest candidate counts. Required if there are several candidates.
+            tends to 0, only the nearest candidate counts. Required if there are several candidates, but for NDT, whose
+            cost is the sum over all of them.
         log_determinant: add Σ log det (C^B + R C^A Rᵀ), which makes F (for squared distances) twice a Gaussian negative
             log-likelihood. Without it, a loss that learns covariances (or ε, or Λ) falls as these are inflated. For
             `GICP` and `MultiChannelGICP`.
@@ -59,7 +60,7 @@ def mahalanobis_cost(
             missing or not positive, a cloud lacks the neighbours that the method needs, or `log_determinant` is set for
             a method without covariances.
     """
-    check_matches(matches, source, temperature)
+    check_matches(matches, source, method, temperature)
     if log_determinant and not isinstance(method, AbstractGeneralized):
         raise ValueError(f"log_determinant: expected a method with covariances, got {type(method).__name__}")
     method, *surfaces = surfaces_of(method, source, target, observed=False)
@@ -92,12 +93,15 @@ def _total_cost(
     return cost
 
 
-def check_matches(matches: Correspondences, source: PointCloud, temperature: ArrayLike | None) -> None:
-    """Raise `ValueError` unless there is one match per source row, or several and a positive `temperature`."""
+def check_matches(
+    matches: Correspondences, source: PointCloud, method: AbstractMethod, temperature: ArrayLike | None
+) -> None:
+    """Raise `ValueError` unless there is one match per source row, or several and a positive `temperature` or a method
+    that uses several."""
     rows = source.points.shape[0]
     if matches.indices.ndim > 2 or matches.indices.shape[-1] != rows:
         raise ValueError(f"matches: expected one per source row ({rows}), got shape {matches.indices.shape}")
-    if matches.indices.ndim == 2 and temperature is None:
+    if matches.indices.ndim == 2 and temperature is None and method.num_candidates == 1:
         raise ValueError(f"temperature: expected metres to go with {matches.indices.shape[0]} candidates, got None")
     if temperature is not None and is_concrete(temperature) and not np.asarray(temperature) > 0:
         raise ValueError(f"temperature: expected a positive number of metres, got {temperature!r}")

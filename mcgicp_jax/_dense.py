@@ -65,8 +65,10 @@ class DenseIndex(AbstractIndex):
         found = _nearest(jnp.asarray(pose, source.points.dtype), padded, self._target, num_candidates)
         return np.asarray(found)[:, :size]
 
-    def follow(self, source: Rows, max_distance: float) -> Callable[[Float[ArrayLike, "7"]], Int[np.ndarray, "N"]]:
-        return lambda pose: self.nearest(pose, source, max_distance)[0]
+    def follow(
+        self, source: Rows, max_distance: float, num_candidates: int = 1
+    ) -> Callable[[Float[ArrayLike, "7"]], Int[np.ndarray, "m N"]]:
+        return lambda pose: self.nearest(pose, source, max_distance, num_candidates)
 
 
 def _padded(rows: Rows) -> Rows:

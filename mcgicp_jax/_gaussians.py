@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from types import ModuleType
-from typing import Literal
+from collections.abc import Callable
+from typing import Any, Literal, overload
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Float, Int, Shaped
 
 from mcgicp_jax import _algebra as alg
 from mcgicp_jax._checks import check_integer, check_positive, is_number
@@ -16,6 +16,7 @@ from mcgicp_jax._cloud import PointCloud, Values
 from mcgicp_jax._methods import GICP
 from mcgicp_jax._pose import AnyArray
 from mcgicp_jax._preprocess import MIN_POINTS, finite_rows, preprocess, voxels
+from mcgicp_jax._statistics import namespace
 from mcgicp_jax._surfaces import covariances_of
 
 # Fewest points in a cell, and smallest ratio of its eigenvalues: those of the Point Cloud Library.
@@ -23,6 +24,32 @@ _MIN_POINTS, _MIN_RATIO = 6, 0.01
 # Smallest standard deviation of the points in a cell, in voxels. Some scanners report each beam without an echo as a
 # point at the origin; such a cell is no surface.
 _LEAST_EXTENT = 1e-4
+
+
+@overload
+def gaussians(
+    cloud: PointCloud | Values,
+    voxel_size: float,
+    *,
+    min_points: int = ...,
+    min_ratio: float = ...,
+    channel_size: Values | None = ...,
+    of: Literal["points", "covariances"] = ...,
+    return_counts: Literal[False] = ...,
+) -> PointCloud: ...
+
+
+@overload
+def gaussians(
+    cloud: PointCloud | Values,
+    voxel_size: float,
+    *,
+    min_points: int = ...,
+    min_ratio: float = ...,
+    channel_size: Values | None = ...,
+    of: Literal["points", "covariances"] = ...,
+    return_counts: Literal[True],
+) -> tuple[PointCloud, Int[np.ndarray, "M"]]: ...
 
 
 def gaussians(
@@ -33,7 +60,8 @@ def gaussians(
     min_ratio: float = _MIN_RATIO,
     channel_size: Values | None = None,
     of: Literal["points", "covariances"] = "points",
-) -> PointCloud:
+    return_counts: bool = False,
+) -> PointCloud | tuple[PointCloud, Int[np.ndarray, "M"]]:
     """Replace the points of each voxel by one Gaussian: their mean position and channels, and a covariance.
 
     The result is the input of `NDT` and `D2DNDT`, or with `of="covariances"` that of voxelised GICP (Koide et al.
@@ -50,9 +78,11 @@ def gaussians(
             (2008). The points of a cell have or lack the same channels. None: one cell per voxel.
         of: "points": the covariance of the points (m², n − 1). "covariances": the mean of the covariances of the
             points, dimensionless: those given with the cloud, or GICP's.
+        return_counts: also return the number of points in each cell.
 
     Returns:
-        Preprocessed cloud with one point per cell, and its covariances.
+        Preprocessed cloud with one point per cell, and its covariances. With `return_counts`, a tuple of it and the
+        numbers of points, (M,) integers.
 
     Raises:
         ValueError: if an argument is out of range, the cloud is traced, or fewer than four cells are left.
@@ -64,30 +94,33 @@ def gaussians(
     cloud = finite_rows(cloud)
     if of == "covariances" and cloud.covariances is None:
         cloud = cloud.replace(covariances=covariances_of(GICP(), preprocess(cloud)).astype(cloud.points.dtype))
-    cells, kept, means, spread = _grouped(cloud, voxel_size, min_points, channel_size)
+    cells = _Cells(cloud, voxel_size, min_points, channel_size)
+    kept = cells.kept
     if kept.sum() < MIN_POINTS:
         raise ValueError(
             f"voxel_size: expected a size that leaves at least {MIN_POINTS} cells of {min_points} points, got "
             f"{voxel_size} m, which leaves {kept.sum()}"
         )
     if of == "covariances":
-        matrices = cells.mean(np.asarray(cloud.covariances, np.float64).reshape(-1, 9))[kept].reshape(-1, 3, 3)
+        matrices = (cells.sum(np.asarray(cloud.covariances).reshape(-1, 9)) / cells.counts).T.reshape(-1, 3, 3)[kept]
     else:
-        matrices = _floored(spread[kept], min_ratio)
-    known = np.ones(cloud.channels.shape, bool) if cloud.channel_valid is None else np.asarray(cloud.channel_valid)
+        matrices = _floored(cells.spread[:, kept], min_ratio)
+    known, counts = cloud.channel_valid, cells.counts
+    if known is not None:
+        counts = cells.sum(known)
     # Missing values are stored as 0 and do not add to the sum.
-    counts = cells.sum(known.astype(np.float64))[kept]
-    channels = cells.sum(np.asarray(cloud.channels, np.float64))[kept] / np.maximum(counts, 1)
+    channels = cells.sum(cloud.channels) / np.maximum(counts, 1)
     dtype = cloud.points.dtype
-    return preprocess(
+    made = preprocess(
         PointCloud(
-            means[kept].astype(dtype),
-            channels.astype(dtype),
-            channel_valid=None if cloud.channel_valid is None else counts > 0,
+            cells.means[:, kept].T.astype(dtype),
+            channels[:, kept].T.astype(dtype),
+            channel_valid=None if known is None else counts[:, kept].T > 0,
             covariances=matrices.astype(dtype),
             channel_names=cloud.channel_names,
         )
     )
+    return (made, cells.counts[kept]) if return_counts else made
 
 
 def voxel_cells(
@@ -110,40 +143,67 @@ def voxel_cells(
         ValueError: if an argument is out of range.
     """
     cloud = cloud if isinstance(cloud, PointCloud) else PointCloud(cloud)
-    cells, kept, _, _ = _grouped(cloud, voxel_size, min_points, channel_size)
-    return np.where(kept, np.cumsum(kept) - 1, -1)[cells.number].astype(np.int32)
+    cells = _Cells(cloud, voxel_size, min_points, channel_size)
+    number = np.empty(len(cells.order), np.int32)
+    number[cells.order] = np.repeat(np.where(cells.kept, np.cumsum(cells.kept) - 1, -1), cells.counts)
+    return number
 
 
-def _grouped(
-    cloud: PointCloud, voxel_size: float, min_points: int, channel_size: Values | None
-) -> tuple[_Cells, Bool[np.ndarray, "M"], Float[np.ndarray, "M 3"], Float[np.ndarray, "M 6"]]:
-    """All cells, which of them are kept, and their moments."""
-    check_positive("voxel_size", voxel_size)
-    check_integer("min_points", min_points, 3)
-    order, starts = voxels(np.ascontiguousarray(cloud.coordinates.T), voxel_size)
-    number = np.empty(len(order), np.int64)
-    number[order] = np.cumsum(np.bincount(starts, minlength=len(order))) - 1
-    if channel_size is not None:
-        number = _split(number, cloud, channel_size)
-    cells = _Cells(number, np)
-    means, spread = cells.moments(cloud.coordinates)
-    extended = spread[:, 0] + spread[:, 3] + spread[:, 5] > (_LEAST_EXTENT * voxel_size) ** 2
-    return cells, (cells.counts[:, 0] >= min_points) & extended, means, spread
+class _Cells:
+    """The points of a cloud sorted by cell, and the moments of each cell.
+
+    Attributes:
+        order: (N,) point numbers, sorted by cell.
+        counts: (M,) number of points in each cell.
+        kept: (M,) False for cells that are left out.
+        means, spread: (3, M) and (6, M), see `_moments`.
+    """
+
+    def __init__(self, cloud: PointCloud, voxel_size: float, min_points: int, channel_size: Values | None):
+        check_positive("voxel_size", voxel_size)
+        check_integer("min_points", min_points, 3)
+        # Working by columns takes a third of the time of working by rows.
+        points = _columns(cloud.coordinates if np.any(cloud.origin) else cloud.points)
+        self.order, self._starts = voxels(points, voxel_size)
+        if channel_size is not None:
+            self.order, self._starts = _split(self.order, self._starts, cloud, channel_size)
+        self.counts = np.diff(self._starts, append=len(self.order))
+        self.means, self.spread = _moments(
+            np.take(points, self.order, axis=1),
+            self.counts,
+            self._reduced,
+            lambda values: np.repeat(values, self.counts, axis=1),
+        )
+        extended = self.spread[[0, 3, 5]].sum(axis=0) > (_LEAST_EXTENT * voxel_size) ** 2
+        self.kept = (self.counts >= min_points) & extended
+
+    def _reduced(self, columns: Float[np.ndarray, "D N"]) -> Float[np.ndarray, "D M"]:
+        return np.add.reduceat(columns, self._starts, axis=1)
+
+    def sum(self, rows: Shaped[AnyArray, "N D"]) -> Float[np.ndarray, "D M"]:
+        """Sums over the points of each cell, in float64."""
+        return self._reduced(np.take(_columns(rows), self.order, axis=1))
 
 
-def _split(cells: Int[np.ndarray, "N"], cloud: PointCloud, channel_size: Values) -> Int[np.ndarray, "N"]:
-    """Cells split by the channels of their points."""
+def _columns(rows: Shaped[AnyArray, "N D"]) -> Float[np.ndarray, "D N"]:
+    return np.ascontiguousarray(np.asarray(rows).T, np.float64)
+
+
+def _split(
+    order: Int[np.ndarray, "N"], starts: Int[np.ndarray, "M"], cloud: PointCloud, channel_size: Values
+) -> tuple[Int[np.ndarray, "N"], Int[np.ndarray, "M2"]]:
+    """Split cells by the channels of their points."""
     sizes = np.asarray(channel_size, np.float64)
     if sizes.shape not in ((), (cloud.channels.shape[1],)) or not np.all(sizes > 0):
         raise ValueError(f"channel_size: expected one positive number, or one per channel, got {channel_size!r}")
-    levels = np.floor(np.asarray(cloud.channels, np.float64) / sizes)
+    levels = np.floor(np.asarray(cloud.channels, np.float64)[order] / sizes)
     if cloud.channel_valid is not None:
-        # NaN is a level of its own, and sorts last.
-        levels = np.where(np.asarray(cloud.channel_valid), levels, np.nan)
-    for column in levels.T:
-        values, level = np.unique(column, return_inverse=True)
-        _, cells = np.unique(cells * len(values) + level, return_inverse=True)
-    return cells
+        # A level of its own.
+        levels = np.where(np.asarray(cloud.channel_valid)[order], levels, -np.inf)
+    columns = [np.cumsum(np.bincount(starts, minlength=len(order))), *levels.T]
+    again = np.lexsort(columns[::-1])
+    changes = np.any([column[again][1:] != column[again][:-1] for column in columns], axis=0)
+    return order[again], np.flatnonzero(np.append(True, changes))
 
 
 def cell_moments(
@@ -163,10 +223,14 @@ def cell_moments(
         min_ratio: as in `gaussians`.
     """
     inside = np.flatnonzero(cells >= 0)
-    grouped = _Cells(cells[inside], jnp)
-    points, channels = (jnp.asarray(array)[inside] for array in (points, channels))
-    means, spread = grouped.moments(points)
-    symmetric = spread.T
+    number = cells[inside]
+    counts = np.bincount(number)
+
+    def sum_of(columns: Float[Array, "D n"]) -> Float[Array, "D M"]:
+        return jax.ops.segment_sum(columns.T, number, len(counts)).T
+
+    columns, values = (jnp.asarray(array)[inside].T for array in (points, channels))
+    means, symmetric = _moments(columns, counts, sum_of, lambda values: values[:, number])
     normal = alg.smallest_eigenvector(symmetric)
     u, v = alg.orthonormal_basis(normal)
     within = alg.project(symmetric, u, v)
@@ -176,37 +240,30 @@ def cell_moments(
     least = min_ratio * (0.5 * (a + c) + radius)
     across = jnp.maximum(jnp.sum(normal * alg.multiply(symmetric, normal), axis=0), least)
     raised = alg.embed(alg.floor_eigenvalues(within, least), u, v) + across * alg.outer(normal)
-    return means, grouped.mean(channels), alg.matrix_from_symmetric(raised)
+    return means.T, (sum_of(values) / counts.astype(values.dtype)).T, alg.matrix_from_symmetric(raised)
 
 
-class _Cells:
-    """The cell number of each point, and sums over the points of each cell by NumPy or JAX."""
+def _moments(
+    points: Float[AnyArray, "3 n"],
+    counts: Int[np.ndarray, "M"],
+    sum_of: Callable[[Any], Any],
+    each: Callable[[Any], Any],
+) -> tuple[Float[AnyArray, "3 M"], Float[AnyArray, "6 M"]]:
+    """Means, and covariances as rows xx, xy, xz, yy, yz, zz. A single pass would lose digits far from zero.
 
-    def __init__(self, number: Int[np.ndarray, "n"], xp: ModuleType):
-        self._xp = xp
-        self.number = number
-        self._size = int(number.max(initial=-1)) + 1
-        self.counts = np.bincount(number, minlength=self._size)[:, None]
-
-    def sum(self, values: Float[AnyArray, "n D"]) -> Float[AnyArray, "M D"]:
-        if self._xp is jnp:
-            return jax.ops.segment_sum(values, self.number, self._size)
-        sums = [np.bincount(self.number, weights=column, minlength=self._size) for column in values.T]
-        return np.stack(sums, axis=1) if sums else np.zeros((self._size, 0))
-
-    def mean(self, values: Float[AnyArray, "n D"]) -> Float[AnyArray, "M D"]:
-        return self.sum(values) / self.counts.astype(values.dtype)
-
-    def moments(self, points: Float[AnyArray, "n 3"]) -> tuple[Float[AnyArray, "M 3"], Float[AnyArray, "M 6"]]:
-        """Means, and covariances as columns xx, xy, xz, yy, yz, zz. A single pass would lose digits far from zero."""
-        means = self.mean(points)
-        x, y, z = (points - means[self.number]).T
-        products = self._xp.stack([x * x, x * y, x * z, y * y, y * z, z * z], axis=1)
-        return means, self.sum(products) / np.maximum(self.counts - 1, 1).astype(points.dtype)
+    Args:
+        counts: number of points in each cell.
+        sum_of: from values of the points, (D, n), to their sums over each cell, (D, M).
+        each: from values of the cells, (D, M), to those of the cell of each point, (D, n).
+    """
+    means = sum_of(points) / counts.astype(points.dtype)
+    x, y, z = points - each(means)
+    products = namespace(points).stack([x * x, x * y, x * z, y * y, y * z, z * z])
+    return means, sum_of(products) / np.maximum(counts - 1, 1).astype(points.dtype)
 
 
-def _floored(symmetric: Float[np.ndarray, "M 6"], min_ratio: float) -> Float[np.ndarray, "M 3 3"]:
+def _floored(symmetric: Float[np.ndarray, "6 M"], min_ratio: float) -> Float[np.ndarray, "M 3 3"]:
     """Matrices whose eigenvalues are at least `min_ratio` times the largest one."""
-    values, vectors = np.linalg.eigh(symmetric[:, [0, 1, 2, 1, 3, 4, 2, 4, 5]].reshape(-1, 3, 3))
+    values, vectors = np.linalg.eigh(symmetric[[0, 1, 2, 1, 3, 4, 2, 4, 5]].T.reshape(-1, 3, 3))
     raised = np.maximum(values, min_ratio * values[:, -1:])
-    return np.einsum("mij,mj,mkj->mik", vectors, raised, vectors)
+    return (vectors * raised[:, None]) @ vectors.swapaxes(1, 2)

@@ -17,9 +17,10 @@ from functools import partial
 from typing import Any, TypeAlias
 
 import jax
+import jax.numpy as jnp
 import jaxlie
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from mcgicp_jax._blocks import map_blocks, map_rows
 from mcgicp_jax._deferred import Deferred
@@ -65,7 +66,7 @@ def register_on_host(
         stride = int(settings.coarse_stride) if status == COARSE and not last else 1
         if status != SETTLED and stride != followed:
             followed, source = stride, _every(stride, problem.source)
-            nearest = index.follow(source.rows, float(settings.max_distance))
+            nearest = index.follow(source.rows, float(settings.max_distance), problem.method.num_candidates)
         if status != SETTLED:
             matches = _Matches(source, problem.target, nearest(pose.wxyz_xyz))
         gate = settings.max_distance if status == COARSE else settings.fine_distance
@@ -86,29 +87,34 @@ def _every(stride: int, source: Surface) -> Surface:
 
 
 class _Matches:
-    """Source rows, the target row matched with each, and whether there is one."""
+    """Source rows, the m target rows matched with each, and whether there are any."""
 
-    def __init__(self, source: Surface, target: Surface, indices: Int[np.ndarray, "N"]):
-        self.source, self.target = source, target
+    def __init__(self, source: Surface, target: Surface, indices: Int[np.ndarray, "m N"]):
+        self.source, self.target, self.indices = source, target, indices
         self.rows = np.maximum(indices, 0)
         self.found = (indices >= 0) & source.rows.valid & target.rows.valid[self.rows]
-        self.size = indices.size
+        self.size = indices.shape[1]
+
+    def first(self) -> _Matches:
+        """The first candidate of each source row alone."""
+        return _Matches(self.source, self.target, self.indices[:1])
 
     def rows_at(self, index: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Table rows of source and target, and which source rows have a match."""
-        return self.source.table[index], self.target.table[self.rows[index]], self.found[index]
+        """Table rows of source and target, and which of the latter are matches."""
+        return self.source.table[index], self.target.table[self.rows[:, index]], self.found[:, index]
 
     def block(self, index: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """`rows_at` for a block; rows repeated to fill the last block count as unmatched."""
         source, target, found = self.rows_at(index)
         if not isinstance(index, slice):
-            found[self.size - index[0] :] = False
+            found[:, self.size - index[0] :] = False
         return source, target, found
 
-    def details(self, index: Any) -> Details:
+    def details(self, index: Any) -> tuple[np.ndarray, np.ndarray]:
+        """Rows of `Surface.details` of source and target."""
         source: Any = self.source.details
         target: Any = self.target.details
-        return Details(source[index], target[self.rows[index]])
+        return source[index], target[self.rows[:, index]]
 
 
 def _moving(pose: jaxlie.SE3, dtype: Any) -> Moving:
@@ -132,8 +138,8 @@ def _measure(pose: jaxlie.SE3, matches: _Matches, gate: Float[AnyScalar, ""], pr
 def _sums(
     moving: Moving,
     source: Float[AnyArray, "n L"],
-    target: Float[AnyArray, "n L"],
-    found: Bool[AnyArray, "n"],
+    target: Float[AnyArray, "m n L"],
+    found: Bool[AnyArray, "m n"],
     gate: Float[AnyScalar, ""],
     method: AbstractMethod,
     robust: AbstractKernel | None,
@@ -144,12 +150,20 @@ def _sums(
 def _matched(
     moving: Moving,
     source: Float[AnyArray, "n L"],
-    target: Float[AnyArray, "n L"],
-    found: Bool[AnyArray, "n"],
+    target: Float[AnyArray, "m n L"],
+    found: Bool[AnyArray, "m n"],
     gate: Float[AnyScalar, ""],
 ) -> Matched:
-    valid, _ = within(move_rows(*moving, source), target, found, gate)
-    return Matched(source, target, valid)
+    sides = _flat(source, target)
+    valid, _ = within(move_rows(*moving, sides[0]), sides[1], found.reshape(-1), gate)
+    return Matched(*sides, valid, num_candidates=len(found))
+
+
+def _flat(
+    source: Float[AnyArray, "n L"], target: Float[AnyArray, "m n L"]
+) -> tuple[Float[Array, "p L"], Float[Array, "p L"]]:
+    """One row per correspondence, p = m n; the first candidates of all source rows come first."""
+    return jnp.tile(source, (len(target), 1)), jnp.reshape(target, (-1, target.shape[-1]))
 
 
 def _covariance(state: State, moments: Deferred[Moments], problem: Problem) -> Float[np.ndarray, "6 6"]:
@@ -164,7 +178,7 @@ def _moments(
     state: State, matches: _Matches, gate: Float[AnyScalar, ""], problem: Problem, num_threads: int | None
 ) -> Moments:
     """Sums over the scores of all correspondences at the final pose, float64."""
-    source, target = matches.source, matches.target
+    source, target, nearest = matches.source, matches.target, matches.first()
     moving = _moving(state.pose, source.table.dtype)
     some, counts = sampled_rows(source.rows.valid)
 
@@ -172,9 +186,9 @@ def _moments(
         rows = some[index]
         sides = (
             jax.tree.map(lambda array: array[rows], source.rows),
-            jax.tree.map(lambda array: array[matches.rows[rows]], target.rows),
+            jax.tree.map(lambda array: array[nearest.rows[0, rows]], target.rows),
         )
-        return _discount_rows(moving, *matches.rows_at(rows), gate, matches.details(rows), *sides)
+        return _discount_rows(moving, *nearest.rows_at(rows), gate, nearest.details(rows), *sides)
 
     rows = map_rows(discount, some.size, num_threads)
     num_channels = np.sum(np.any(source.rows.descriptors != 0, axis=0))
@@ -189,12 +203,10 @@ def _moments(
         np.sum([np.asarray(getattr(part, name), np.float64) for _, part in parts], axis=0)
         for name in ("jacobian", "bias")
     )
-    rows, cells = (
-        np.concatenate([getattr(part, name)[: rows.stop - rows.start] for rows, part in parts])
-        for name in ("rows", "cells")
-    )
+    # Rows that pad the last block have no matches; their scores are 0.
+    rows, cells = (np.concatenate([getattr(part, name) for _, part in parts]) for name in ("rows", "cells"))
     scatter, num_cells = scatter_of(Scores(rows, cells, jacobian, bias), matches.size)
-    return Moments(jacobian, bias, None if problem.method.knows_residuals else scatter, np.int32(num_cells))
+    return Moments(jacobian, bias, scatter, np.int32(num_cells))
 
 
 def as_float64(tree: Any) -> Any:
@@ -209,14 +221,15 @@ def as_float64(tree: Any) -> Any:
 def _discount_rows(
     moving: Moving,
     source: Float[AnyArray, "n L"],
-    target: Float[AnyArray, "n L"],
-    found: Bool[AnyArray, "n"],
+    target: Float[AnyArray, "m n L"],
+    found: Bool[AnyArray, "m n"],
     gate: Float[AnyScalar, ""],
-    details: Details,
+    details: tuple[Float[AnyArray, "n 6"], Float[AnyArray, "m n 6"]],
     source_rows: Rows,
     target_rows: Rows,
 ) -> Float[AnyArray, "n 3"]:
-    return discount_rows(*moving, _matched(moving, source, target, found, gate), details, source_rows, target_rows)
+    matched = _matched(moving, source, target, found, gate)
+    return discount_rows(*moving, matched, Details(*_flat(*details)), source_rows, target_rows)
 
 
 @jax.jit
@@ -224,17 +237,18 @@ def _scores(
     moving: Moving,
     sums: Sums,
     source: Float[AnyArray, "n L"],
-    target: Float[AnyArray, "n L"],
-    found: Bool[AnyArray, "n"],
+    target: Float[AnyArray, "m n L"],
+    found: Bool[AnyArray, "m n"],
     gate: Float[AnyScalar, ""],
-    details: Details,
+    details: tuple[Float[AnyArray, "n 6"], Float[AnyArray, "m n 6"]],
     method: AbstractMethod,
     robust: AbstractKernel | None,
     discount: Float[AnyArray, "2"],
     num_cells: Int[AnyScalar, ""],
 ) -> Scores:
     matched = _matched(moving, source, target, found, gate)
-    return scores_of(moving, sums.center, sums.radius, matched, details, discount, num_cells, method, robust)
+    flat = Details(*_flat(*details))
+    return scores_of(moving, sums.center, sums.radius, matched, flat, discount, num_cells, method, robust)
 
 
 def correspondences_at(

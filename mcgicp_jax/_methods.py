@@ -48,13 +48,12 @@ class AbstractMethod(Numbers):
     uses_channels: ClassVar[bool] = False
     # Whether `covariance` needs the individual neighbours, beyond their local statistics.
     uses_neighborhoods: ClassVar[bool] = False
+    # Number of target points that a source point is matched with. The cost of the source point is the sum over them.
+    num_candidates: ClassVar[int] = 1
     # Which of "source" and "target" must have covariances, as from `gaussians`.
     needs_covariances: ClassVar[tuple[str, ...]] = ()
     # Whether matches follow along the surface when the pose moves, as those of points do, and those of cells do not.
     matches_slide: ClassVar[bool] = True
-    # Whether M is the inverse of the actual covariance of a residual, so that the covariance of the pose follows from
-    # M instead of from the scatter of the residuals.
-    knows_residuals: ClassVar[bool] = False
 
     def is_open(self, source: PointCloud, target: PointCloud) -> bool:
         """Whether a parameter is to be chosen from the data of these clouds."""

@@ -73,8 +73,8 @@ class Tree:
         Trees return ties in any order. Searching for k + 1 neighbours reveals ties, which are then resolved.
 
         Returns:
-            Rows of `points`, M standing for none within `bound`; and the slack: half the gap between the nearest and
-            the second nearest, which is taken to lie at the bound if none is within it; 0 without a nearest.
+            Rows of `points`, M standing for none within `bound`; and the slack: half the gap between the k-th nearest
+            and the next, which is taken to lie at the bound if none is within it; 0 without a k-th nearest.
         """
         size = len(self.points)
         k = min(k, size)
@@ -82,8 +82,8 @@ class Tree:
         most = min(max(_TIE_CANDIDATES * (k + 1), _LEAST_TIE_CANDIDATES), size)
         distances, rows = self.query(queries, asked, bound)
         nearest = rows[:, :k].astype(np.int32)
-        slack = slack_of(distances[:, 0], np.minimum(distances[:, min(1, asked - 1)], bound))
         farthest = distances[:, k - 1]
+        slack = slack_of(farthest, np.minimum(distances[:, asked - 1], bound))
         tied = np.flatnonzero((distances[:, 1:] == distances[:, :-1]).any(axis=1) & np.isfinite(distances[:, 0]))
         distances, rows = distances[tied], rows[tied]
         while tied.size:
@@ -126,8 +126,9 @@ def _nearest_in_all(
     return nearest[whose.ravel()]
 
 
-def slack_of(first: Float[np.ndarray, "N"], second: Float[np.ndarray, "N"]) -> Float[np.ndarray, "N"]:
-    """Distance that a query may move before its nearest row can change: half the gap to the second, metres."""
-    # The margin of 1e-6 covers rounding. Without a nearest row the gap is NaN or −inf, and the slack 0.
+def slack_of(farthest: Float[np.ndarray, "N"], following: Float[np.ndarray, "N"]) -> Float[np.ndarray, "N"]:
+    """Distance, metres, that a query may move before its k nearest rows can change: half the gap between the distances
+    of the k-th and the following row."""
+    # The margin of 1e-6 covers rounding. Without a k-th nearest row the gap is NaN or −inf, and the slack 0.
     with np.errstate(invalid="ignore"):
-        return 0.5 * (1 - 1e-6) * np.nan_to_num(second - first, neginf=0.0)
+        return 0.5 * (1 - 1e-6) * np.nan_to_num(following - farthest, neginf=0.0)

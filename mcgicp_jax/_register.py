@@ -92,7 +92,7 @@ def find_correspondences(
     method: AbstractMethod,
     *,
     max_distance: ArrayLike,
-    num_candidates: int = 1,
+    num_candidates: int | None = None,
     search: AbstractSearch | None = None,
 ) -> Correspondences:
     """Find the target point nearest to each moved source point in position and α · channel (Servos & Waslander, IV-A).
@@ -103,7 +103,7 @@ def find_correspondences(
         method: defines α, the channel weights of the search; without α the search is in position alone.
         max_distance: maximum correspondence distance, metres of position; matches beyond it are not `valid`.
         num_candidates: m, number of target points to find for each source point; more than one for the soft assignment
-            of `align` and `mahalanobis_cost`.
+            of `align` and `mahalanobis_cost`. None: as many as the method matches, one but for NDT.
         search: nearest-neighbour search; by default `KDTreeSearch` on CPUs and `DenseSearch` on accelerators.
 
     Returns:
@@ -117,6 +117,7 @@ def find_correspondences(
     _check_clouds(source, target, method)
     method = method.resolve(source, target)
     check_positive("max_distance", max_distance)
+    num_candidates = method.num_candidates if num_candidates is None else num_candidates
     check_integer("num_candidates", num_candidates, 1)
     matrix = centred_pose(pose, source, target, "pose")
     matrix, max_distance, method = constant((matrix, max_distance, method))
@@ -192,7 +193,7 @@ def align(
         hold_free_directions=False,
         robust=robust,
     )
-    check_matches(matches, source, temperature)
+    check_matches(matches, source, method, temperature)
     _check_clouds(source, target, method)
     method, seen, there = surfaces_of(method, source, target, observed=False)
     dtype = source.points.dtype

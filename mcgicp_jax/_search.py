@@ -73,10 +73,13 @@ class AbstractIndex(abc.ABC):
         """
 
     @abc.abstractmethod
-    def follow(self, source: Rows, max_distance: float) -> Callable[[Float[ArrayLike, "7"]], Int[np.ndarray, "N"]]:
-        """A function that maps a pose to the nearest target row of each source row, for one registration.
+    def follow(
+        self, source: Rows, max_distance: float, num_candidates: int = 1
+    ) -> Callable[[Float[ArrayLike, "7"]], Int[np.ndarray, "m N"]]:
+        """A function that maps a pose to the nearest target rows of each source row, for one registration.
 
-        It returns the same rows as `nearest` with one candidate, and may reuse the results of earlier poses.
+        It returns the same rows as `nearest`, several candidates in any order, and may reuse the results of earlier
+        poses.
         """
 
 

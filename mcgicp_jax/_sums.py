@@ -118,7 +118,8 @@ class Sums(NamedTuple):
 
     Attributes:
         center: (3,) c, metres.
-        totals: (6,) number of correspondences, Σ |p|², e, Σ cost, Σ |d|², number of source points with a match.
+        totals: (6,) number of correspondences, Σ |p|², e, Σ cost, Σ |d|² (of the mean over the candidates of a source
+            point), number of source points with a match.
         first: (3, 4) G.
         second: (6, 10), (13, 10) or (19, 10): Q; where observability is known, followed by Σ w h hᵀ and by
             Σ w O ⊗ h hᵀ for the geometry and, if used, the channels. Symmetric factors are stored as upper triangles.
@@ -193,7 +194,7 @@ def sums_of(
         jnp.sum(p * p),
         jnp.sum(forces.residual * forces.force),
         jnp.sum(forces.cost),
-        jnp.sum(counts * alg.inner(forces.residual, forces.residual)),
+        jnp.sum(_share(counts, matched.num_candidates) * alg.inner(forces.residual, forces.residual)),
         num_inliers.astype(moved.dtype),
     )
     return Sums(
@@ -202,6 +203,13 @@ def sums_of(
         first=jnp.dot(forces.force, h.T, precision="highest"),
         second=jnp.dot(jnp.concatenate(rows), powers(p).T, precision="highest"),
     )
+
+
+def _share(counts: Float[Array, "n"], num_candidates: int) -> Float[Array, "n"]:
+    """The weights of the candidates of each source point, divided by their sum; 0 for points without any."""
+    each = counts.reshape(num_candidates, -1)
+    total = jnp.sum(each, axis=0)
+    return (each / jnp.where(total > 0, total, 1)).reshape(-1)
 
 
 def mean_observability(rotation: Float[Array, "3 3"], matched: Matched) -> list[Float[Array, "6 n"]]:

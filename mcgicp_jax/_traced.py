@@ -133,9 +133,11 @@ def moments_of(state: State, problem: Problem, matched: Matched, matches: Corres
     pose = rotation_and_translation(state.pose, dtype)
     details, discount = None, jnp.ones(2, dtype)
     source, target = problem.source, problem.target
-    if source.details is not None and target.details is not None and matched.num_candidates == 1:
-        details = Details(source.details, jnp.asarray(target.details)[matches.indices])
+    if source.details is not None and target.details is not None:
+        indices = matches.indices.reshape(-1)
+        details = Details(jnp.tile(source.details, (matched.num_candidates, 1)), jnp.asarray(target.details)[indices])
         rows, counts = sampled_rows(source.rows.valid)
+        # Of the nearest candidates, which come first.
         some = Matched(gathered(matched.source, rows), gathered(matched.target, rows), matched.valid[rows] & counts)
         discount = discounts(
             discount_rows(
@@ -143,11 +145,11 @@ def moments_of(state: State, problem: Problem, matched: Matched, matches: Corres
                 some,
                 jax.tree.map(lambda table: table[rows], details),
                 jax.tree.map(lambda array: array[rows], source.rows),
-                jax.tree.map(lambda array: array[matches.indices[rows]], target.rows),
+                jax.tree.map(lambda array: array[indices[rows]], target.rows),
             ),
             jnp.sum(jnp.any(source.rows.descriptors != 0, axis=0)),
         )
-    num_cells = matched.valid.size
+    num_cells = source.rows.valid.size
     scores = scores_of(
         pose,
         state.sums.center,
@@ -160,13 +162,13 @@ def moments_of(state: State, problem: Problem, matched: Matched, matches: Corres
         problem.robust,
     )
     scatter, num_cells = scatter_of(scores, num_cells)
-    return Moments(scores.jacobian, scores.bias, None if problem.method.knows_residuals else scatter, num_cells)
+    return Moments(scores.jacobian, scores.bias, scatter, num_cells)
 
 
 def begin(problem: Problem, search: AbstractSearch, max_iterations: int) -> Carry:
     """Initial carry of the loop of `register`, with arrays for `max_iterations` + 1 history entries."""
-    size, dtype = problem.source.rows.valid.size, problem.start.wxyz_xyz.dtype
-    nothing = Correspondences(jnp.full(size, -1, jnp.int32), jnp.zeros(size, dtype), jnp.zeros(size, bool))
+    shape, dtype = (problem.method.num_candidates, problem.source.rows.valid.size), problem.start.wxyz_xyz.dtype
+    nothing = Correspondences(jnp.full(shape, -1, jnp.int32), jnp.zeros(shape, dtype), jnp.zeros(shape, bool))
     return _begin(problem, _measuring(problem, search), nothing, max_iterations)
 
 
@@ -204,15 +206,18 @@ def _measuring(problem: Problem, search: AbstractSearch) -> Measure:
         # Under `vmap` the body also runs for finished lanes: no search for them.
         running = (status < 0) & (status != SETTLED)
         rows = _every(settings.stride(status, num_iterations), source.rows)
-        found = search.nearest_traced(pose.wxyz_xyz, rows, target.rows, settings.max_distance, running)[0]
+        limit, count = settings.max_distance, problem.method.num_candidates
+        found = search.nearest_traced(pose.wxyz_xyz, rows, target.rows, limit, running, count)
         indices = jnp.where(running, found, before.indices)
         moving = rotation_and_translation(pose, pose.wxyz_xyz.dtype)
-        here, matched_target = indices >= 0, gathered(jax.tree.map(jnp.asarray, target.table), jnp.maximum(indices, 0))
-        here = here & source.rows.valid & jnp.asarray(target.rows.valid)[jnp.maximum(indices, 0)]
-        moved = move_rows(*moving, source.table)
-        valid, distances = within(moved, matched_target, here, settings.gate(status))
-        matched = Matched(jax.tree.map(jnp.asarray, source.table), matched_target, valid)
+        here = jnp.maximum(indices, 0)
+        there = (indices >= 0) & source.rows.valid & jnp.asarray(target.rows.valid)[here]
+        matched = matched_rows(source, target, Correspondences(here, before.distances, there))
+        moved = move_rows(*moving, matched.source)
+        valid, distances = within(moved, matched.target, matched.valid, settings.gate(status))
+        matched = eqx.tree_at(lambda matched: matched.valid, matched, valid)
         sums = sums_of(*moving, matched, problem.method, problem.robust)
+        valid, distances = valid.reshape(indices.shape), distances.reshape(indices.shape)
         # Index −1 marks a missing match until the loop ends, see `cleaned`.
         return Correspondences(indices, distances, valid), sums
 

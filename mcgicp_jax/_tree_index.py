@@ -56,8 +56,10 @@ class TreeIndex(AbstractIndex):
         queries[~source.valid] = np.nan
         return self.nearest_of(queries, source.penalty, max_distance, num_candidates)[0].T
 
-    def follow(self, source: Rows, max_distance: float) -> Callable[[Float[ArrayLike, "7"]], Int[np.ndarray, "N"]]:
-        return _Follower(self, self._trees, on_host(source), max_distance).nearest
+    def follow(
+        self, source: Rows, max_distance: float, num_candidates: int = 1
+    ) -> Callable[[Float[ArrayLike, "7"]], Int[np.ndarray, "m N"]]:
+        return _Follower(self, self._trees, on_host(source), max_distance, num_candidates).nearest
 
     def nearest_of(
         self,
@@ -74,7 +76,7 @@ class TreeIndex(AbstractIndex):
 
         Returns:
             (N, k) target rows, −1 for none; and (N,) the slack: the distance, metres, that a query may move before its
-            nearest row can change.
+            k nearest rows can change, but for their order.
         """
         indices, slack = np.full((len(queries), k), -1, np.int32), np.zeros(len(queries))
         if not self._rows.size:
@@ -111,12 +113,12 @@ class TreeIndex(AbstractIndex):
         if len(parts) == 1:
             found, slack = parts[0].nearest(queries, k, bound)
             return parts[0].rows[found], slack
-        # The slack depends on the second nearest row.
+        # The slack depends on the next nearest row.
         each = [part.nearest(queries, k + 1, bound)[0] for part in parts]
         rows = np.hstack([part.rows[found] for part, found in zip(parts, each, strict=True)])
         squares = np.hstack([part.squares(queries, found) for part, found in zip(parts, each, strict=True)])
         rows, squares = _ordered(rows, squares, k + 1)
-        return rows[:, :k], slack_of(*np.sqrt(squares[:, [0, -1]]).T)
+        return rows[:, :k], slack_of(*np.sqrt(squares[:, [min(k, squares.shape[1]) - 1, -1]]).T)
 
     def _near_in_position(
         self, queries: Float[np.ndarray, "N D"], penalty: Float[np.ndarray, "N C"], k: int
@@ -140,8 +142,9 @@ class TreeIndex(AbstractIndex):
                 found[some] = rows[:, :k]
                 # The margin of 1e-9 covers rounding in float64.
                 others = (1 - 1e-9) * (distances[:, -1] ** 2 + least[some]) if asked < size else np.inf
-                slack[some] = slack_of(*np.sqrt([squares[:, 0], np.minimum(squares[:, -1], others)]))
-                unsure.append(some[~(squares[:, min(k, size) - 1] < others)])
+                farthest = squares[:, min(k, size) - 1]
+                slack[some] = slack_of(*np.sqrt([farthest, np.minimum(squares[:, -1], others)]))
+                unsure.append(some[~(farthest < others)])
             open, asked = np.concatenate(unsure) if asked < size else open[:0], min(4 * asked, size)
         return found, slack
 
@@ -199,13 +202,13 @@ class _Part:
 
 
 class _Follower:
-    """Nearest target rows of one source, for a sequence of poses.
+    """The k nearest target rows of each row of one source, for a sequence of poses.
 
-    A match is provably unchanged while its source point has moved by less than half the gap between its nearest and its
-    second nearest target point since the last search. After the first poses this holds for most points.
+    Matches are provably unchanged while their source point has moved by less than half the gap between its k-th and its
+    next nearest target point since the last search. After the first poses this holds for most points.
     """
 
-    def __init__(self, index: TreeIndex, trees: Trees, source: Rows, max_distance: float):
+    def __init__(self, index: TreeIndex, trees: Trees, source: Rows, max_distance: float, k: int):
         self._index = index
         self._max_distance = max_distance
         # Valid source rows, for large clouds sorted by neighbourhood. All arrays below are in this order.
@@ -220,20 +223,20 @@ class _Follower:
         # Position of each point at its last search, and the distance that it may move from there.
         self._asked: Float[np.ndarray, "n 3"] = np.full((order.size, 3), np.nan)
         self._slack: Float[np.ndarray, "n"] = np.zeros(order.size)
-        self._rows: Int[np.ndarray, "N"] = np.full(source.valid.size, -1, np.int32)
+        self._rows: Int[np.ndarray, "k N"] = np.full((k, source.valid.size), -1, np.int32)
 
-    def nearest(self, pose: Float[ArrayLike, "7"]) -> Int[np.ndarray, "N"]:
+    def nearest(self, pose: Float[ArrayLike, "7"]) -> Int[np.ndarray, "k N"]:
         moved = _moved(pose, self._points)
         shift = moved - self._asked
         # Written so that NaN, which marks points not yet searched for, counts as stale.
         stale = np.flatnonzero(~(np.einsum("ij,ij->i", shift, shift) < self._slack**2))
         queries = np.hstack([moved[stale], self._descriptors[stale]])
         penalty = None if self._penalty is None else self._penalty[stale]
-        found, self._slack[stale] = self._index.nearest_of(queries, penalty, self._max_distance, 1)
+        found, self._slack[stale] = self._index.nearest_of(queries, penalty, self._max_distance, len(self._rows))
         self._asked[stale] = moved[stale]
         # Arrays returned earlier must not change.
         self._rows = self._rows.copy()
-        self._rows[self._order[stale]] = found[:, 0]
+        self._rows[:, self._order[stale]] = found.T
         return self._rows
 
 

@@ -5,9 +5,8 @@ correspondences are correlated, since they share targets and covariances, so u_c
 about as large as a neighbourhood. A is the Jacobian of g with respect to the pose. When the pose moves, the matches
 follow along the surface, so only the observable fraction O of a motion changes the residuals: A = Σ w JᵀMOJ. The rest
 of the forces, w M(I − O)d, sums to a bias of nearest-neighbour matching, which enters as one more score. Cells of
-`gaussians` stand still instead: A = Σ w JᵀMJ (`matches_slide`). For D2D-NDT, Σ JᵀMJ also replaces the scatter of the
-scores (`knows_residuals`). (Including the derivative of M with respect to the rotation in A changed the result by less
-than 1 %.)
+`gaussians` stand still instead: A = Σ w JᵀMJ (`matches_slide`). (Including the derivative of M with respect to the
+rotation in A changed the result by less than 1 %.)
 
 Three steps: medians over sampled rows (`discounts`), scores of all rows (`scores_of`), and 6×6 algebra (`sandwich`).
 The first two work row by row, in blocks or over whole arrays.
@@ -224,25 +223,22 @@ class Moments(NamedTuple):
 
     Attributes:
         jacobian, bias: see `Scores`.
-        scatter: Σ_c u_c u_cᵀ; None: as if each force had the covariance that its information matrix states.
+        scatter: Σ_c u_c u_cᵀ.
         num_cells: number of cells with valid correspondences.
     """
 
     jacobian: Float[AnyArray, "6 10"]
     bias: Float[AnyArray, "6"]
-    scatter: Float[AnyArray, "6 6"] | None
+    scatter: Float[AnyArray, "6 6"]
     num_cells: Int[AnyArray, ""]
 
 
 def response_and_scatter(moments: Moments, radius: Float[Array, ""]) -> tuple[Float[Array, "6 6"], Float[Array, "6 6"]]:
     """A and the covariance B of the score, lengths in units of the radius; B is NaN with six cells or fewer."""
-    information = twist_form(moments.jacobian, radius)
-    response = information * radius
+    response = twist_form(moments.jacobian, radius) * radius
     # Small-sample correction: the pose takes six of the cells' degrees of freedom.
     count = moments.num_cells.astype(response.dtype)
     correction = count / jnp.where(count > 6, count - 6, jnp.nan)
-    if moments.scatter is None:
-        return response, information * correction
     return response, moments.scatter * correction + jnp.outer(moments.bias, moments.bias)
 
 

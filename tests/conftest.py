@@ -27,6 +27,7 @@ _IN_FLOAT64 = (
         "align_gradients",
         "cost",
         "covariance",
+        "gaussians",
         "graph",
         "large_coordinates",
         "methods",

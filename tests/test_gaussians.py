@@ -44,6 +44,14 @@ def test_statistics_are_those_of_numpy():
     assert np.bincount(cells[cells >= 0]).min() >= 6
 
 
+def test_counts():
+    points, _ = room_corner(3000)
+    cloud, counts = mcg.gaussians(points, SIZE, return_counts=True)
+    cells = mcg.voxel_cells(points, SIZE)
+    np.testing.assert_array_equal(counts, np.unique(cells[cells >= 0], return_counts=True)[1])
+    np.testing.assert_array_equal(cloud.points, mcg.gaussians(points, SIZE).points)
+
+
 def test_flat_cells_are_kept():
     points, _ = wall(3000, noise=0.0)
     found = mcg.gaussians(points, SIZE, min_ratio=0.02)
@@ -166,6 +174,66 @@ def test_the_unit_of_length_does_not_matter(method, raw):
         results.append(mcg.register(*clouds, method).matrix)
     results[1][:3, 3] /= 1000.0
     np.testing.assert_allclose(results[0], results[1], atol=1e-9 if X64 else 2e-5)
+
+
+def cells_of(raw):
+    return [mcg.gaussians(cloud, SIZE) for cloud in raw[:2]]
+
+
+def test_the_cost_is_the_sum_over_the_nearest_cells(raw):
+    """By brute force: each of four cells with its own residual, information and Welsch weight."""
+    source, target = cells_of(raw)
+    method, gate = mcg.D2DNDT(2.0), 3 * SIZE
+    pose = motion((0.06, -0.02, 0.03, 0.03, -0.02, 0.04))
+    moved = np.asarray(source.points, float) @ pose[:3, :3].T + pose[:3, 3]
+    apart = np.linalg.norm(moved[:, None] - target.points, axis=2)
+    rows = np.argsort(apart, axis=1)[:, :4]
+    cost, square = 0.0, 0.0
+    for i in range(len(moved)):
+        near = [j for j in rows[i] if apart[i, j] <= gate]
+        for j in near:
+            d = target.points[j] - moved[i]
+            spread = target.covariances[j] + pose[:3, :3] @ source.covariances[i] @ pose[:3, :3].T
+            cost += 4 * (1 - np.exp(-d @ np.linalg.solve(spread, d) / 4))
+        square += np.mean([apart[i, j] ** 2 for j in near])
+    matches = mcg.find_correspondences(source, target, pose, method, max_distance=gate)
+    np.testing.assert_array_equal(np.sort(matches.indices.T, axis=1), np.sort(rows, axis=1))
+    rtol = 1e-9 if X64 else 1e-3
+    np.testing.assert_allclose(mcg.mahalanobis_cost(pose, source, target, matches, method), cost, rtol=rtol)
+    result = mcg.register(source, target, method, init=pose, max_distance=gate, max_iterations=1)
+    np.testing.assert_allclose(result.history["cost"][0], cost, rtol=rtol)
+    np.testing.assert_allclose(result.history["rmse"][0], np.sqrt(square / len(moved)), rtol=rtol)
+    assert result.history["num_inliers"][0] == len(moved) and result.overlap <= 1
+
+
+def test_the_sum_is_more_accurate_than_the_nearest_cell():
+    errors = []
+    for i in range(4):
+        source, target, truth = raw_pair(truth=motion(0.3 * np.random.default_rng(i).normal(size=6)))
+        clouds = [mcg.gaussians(cloud, SIZE) for cloud in (source, target)]
+        each = [mcg.register(*clouds, mcg.D2DNDT(num_candidates=k), init=truth) for k in (1, 4)]
+        errors.append([float(pose_error(result.matrix, truth)[0]) for result in each])
+    one, four = np.mean(errors, axis=0)
+    assert four < 0.6 * one and four < 0.005
+
+
+def test_the_sum_is_the_same_everywhere(raw):
+    """On the host, inside `jit`, in batches, in lanes, and in the alignment to its final matches."""
+    source, target = cells_of(raw)
+    method, atol = mcg.D2DNDT(), 1e-9 if X64 else 1e-4
+    alone = mcg.register(source, target, method, max_distance=1.0)
+    inside = jax.jit(lambda a, b: mcg.register(a, b, method, max_distance=1.0))(source, target)
+    np.testing.assert_allclose(inside.matrix, alone.matrix, atol=atol)
+    np.testing.assert_allclose(inside.covariance, alone.covariance, rtol=1e-6 if X64 else 0.05, atol=1e-9)
+    lanes = mcg.register_batch([source] * 2, target, method, max_distance=1.0, search=mcg.DenseSearch())
+    for result in (*mcg.register_batch([source], target, method, max_distance=1.0), *lanes):
+        np.testing.assert_allclose(result.matrix, alone.matrix, atol=atol)
+        assert result.num_inliers == alone.num_inliers
+    matches = mcg.find_correspondences(source, target, alone.matrix, method, max_distance=1.0)
+    aligned = mcg.align(source, target, matches, method, init=alone.matrix)
+    np.testing.assert_allclose(aligned.matrix, alone.matrix, atol=1e-3)
+    with pytest.raises(ValueError, match="temperature: expected metres to go with 4 candidates"):
+        mcg.align(source, target, matches, mcg.NDT())
 
 
 def test_colours_hold_what_geometry_does_not():
