@@ -25,7 +25,7 @@ LAYERS = {
         "datasets",
     ),
     "local surfaces": ("_surface", "_observability", "_neighborhoods", "_local", "_channels", "_features"),
-    "correspondences": ("_forces", "_methods", "_surfaces", "_sums", "_gaussians", "_ndt"),
+    "correspondences": ("_forces", "_photometric", "_methods", "_surfaces", "_sums", "_gaussians", "_ndt"),
     "pose": ("_solve", "_hypotheses", "_directions", "_uncertainty", "_result", "_step"),
     "loops": ("_host", "_traced", "_lanes", "_normal_equations", "_graph_traced"),
     "use": (
