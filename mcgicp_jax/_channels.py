@@ -155,14 +155,25 @@ def with_channels_matched(source: PointCloud, target: PointCloud, matches: Corre
         # Too few points do not determine a distribution.
         matched = matched & (xp.sum(matched, axis=0) > len(_QUANTILES))
         values = [xp.where(matched, each, xp.nan) for each in values]
-    levels = xp.asarray(_QUANTILES, values[0].dtype)
-    quantiles = [of_known(partial(xp.nanquantile, q=levels, axis=0), each) for each in values]
+    gain, offset = gain_and_offset(*values)
+    dtype = source.channels.dtype
+    return source.replace(channels=xp.asarray(source.channels) * gain.astype(dtype) + offset.astype(dtype))
+
+
+def gain_and_offset(
+    values: Float[AnyArray, "n C"], wanted: Float[AnyArray, "m C"]
+) -> tuple[Float[AnyArray, "C"], Float[AnyArray, "C"]]:
+    """Gain and offset of each channel that equalise mean and standard deviation of its quantiles with those wanted.
+
+    NaNs are ignored; 1 and 0 for channels without usable spread.
+    """
+    xp = namespace(values, wanted)
+    levels = xp.asarray(_QUANTILES, values.dtype)
+    quantiles = [of_known(partial(xp.nanquantile, q=levels, axis=0), each) for each in (values, wanted)]
     means = [xp.mean(each, axis=0) for each in quantiles]
     spreads = [xp.std(each, axis=0) for each in quantiles]
     varying = (spreads[0] > 0) & (spreads[1] > 0)
     gain = xp.where(varying, spreads[1] / xp.where(varying, spreads[0], 1), 1)
     offset = means[1] - gain * means[0]
     known = xp.isfinite(gain) & xp.isfinite(offset)
-    gain, offset = (xp.where(known, each, other) for each, other in ((gain, 1), (offset, 0)))
-    dtype = source.channels.dtype
-    return source.replace(channels=xp.asarray(source.channels) * gain.astype(dtype) + offset.astype(dtype))
+    return xp.where(known, gain, 1), xp.where(known, offset, 0)

@@ -16,7 +16,7 @@ from mcgicp_jax._kernels import AbstractKernel
 from mcgicp_jax._methods import AbstractGeneralized, AbstractMethod
 from mcgicp_jax._pose import Pose, is_concrete, pose_matrix
 from mcgicp_jax._search import Correspondences
-from mcgicp_jax._sums import forces_at, matched_rows
+from mcgicp_jax._sums import estimates_at, forces_at, matched_rows
 from mcgicp_jax._surface import Surface
 from mcgicp_jax._surfaces import surfaces_of
 
@@ -85,6 +85,7 @@ def _total_cost(
     log_determinant: bool,
 ) -> Float[Array, ""]:
     matched = matched_rows(source, target, matches, temperature)
+    method = method.with_estimates(estimates_at(rotation, translation, matched, source.rows.valid, method))
     _, forces, counts = forces_at(rotation, translation, matched, method, robust)
     cost = jnp.sum(forces.cost)
     if log_determinant:

@@ -13,6 +13,8 @@ the pose, its status and its covariance.
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from dataclasses import replace
 from functools import partial
 from typing import Any, TypeAlias
 
@@ -27,7 +29,7 @@ from mcgicp_jax._deferred import Deferred
 from mcgicp_jax._kernels import AbstractKernel
 from mcgicp_jax._methods import AbstractMethod
 from mcgicp_jax._pose import AnyArray, AnyScalar, rotation_from_quaternion
-from mcgicp_jax._search import AbstractIndex, Correspondences, Rows
+from mcgicp_jax._search import AbstractIndex, Correspondences, Rows, by_position
 from mcgicp_jax._statistics import sampled_rows
 from mcgicp_jax._step import (
     COARSE,
@@ -42,7 +44,7 @@ from mcgicp_jax._step import (
     update,
 )
 from mcgicp_jax._sums import Matched, Sums, combine, move_rows, sums_of, within
-from mcgicp_jax._surface import Surface
+from mcgicp_jax._surface import Surface, Table, gathered
 from mcgicp_jax._uncertainty import Details, Moments, Scores, discount_rows, discounts, scatter_of, scores_of
 
 # Rotation matrix and translation (metres) of a pose.
@@ -50,26 +52,35 @@ Moving: TypeAlias = tuple[Float[AnyArray, "3 3"], Float[AnyArray, "3"]]
 
 
 def register_on_host(
-    problem: Problem, index: AbstractIndex, num_threads: int | None
+    problem: Problem, index_of: Callable[[bool], AbstractIndex], num_threads: int | None
 ) -> tuple[State, Assessment, dict[str, np.ndarray], Deferred[Moments]]:
     """Find matches at this pose; sum their forces; update the pose; stop when it no longer moves.
 
-    Returns final state, information matrix and covariance, history, and sums over the scores.
+    Args:
+        index_of: the index of the target, for a search in position alone if called with True.
+
+    Returns:
+        Final state, information matrix and covariance, history, and sums over the scores.
     """
     pose, settings, records = problem.start, problem.settings, []
-    coarse = settings.fine_distance < settings.max_distance or settings.coarse_stride > 1
+    estimates = problem.method.estimates is not None
+    coarse = settings.fine_distance < settings.max_distance or settings.coarse_stride > 1 or estimates
     status: Any = np.int32(COARSE if coarse else RUNNING)
     num_iterations: Any = np.int32(0)
-    followed: int | None = None
+    followed: tuple[int, bool] | None = None
     while status < 0:
         last = num_iterations >= settings.max_iterations
         stride = int(settings.coarse_stride) if status == COARSE and not last else 1
-        if status != SETTLED and stride != followed:
-            followed, source = stride, _every(stride, problem.source)
-            nearest = index.follow(source.rows, float(settings.max_distance), problem.method.num_candidates)
+        alone = estimates and status != COARSE
+        if status != SETTLED and (stride, alone) != followed:
+            followed, source = (stride, alone), _every(stride, problem.source)
+            rows = by_position(source.rows) if alone else source.rows
+            nearest = index_of(alone).follow(rows, float(settings.max_distance), problem.method.num_candidates)
         if status != SETTLED:
             matches = _Matches(source, problem.target, nearest(pose.wxyz_xyz))
         gate = settings.max_distance if status == COARSE else settings.fine_distance
+        if estimates and status == RUNNING:
+            problem = replace(problem, method=_estimated(pose, matches, gate, problem.method))
         sums = _measure(pose, matches, gate, problem)
         state = update(pose, status, num_iterations, sums, settings, problem.fusion)
         pose, num_iterations, status = state.pose, np.asarray(state.num_iterations), np.asarray(state.status)
@@ -99,11 +110,15 @@ class _Matches:
         """The first candidate of each source row alone."""
         return _Matches(self.source, self.target, self.indices[:1])
 
-    def rows_at(self, index: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def rows_at(self, index: Any) -> tuple[Table, Table, np.ndarray]:
         """Table rows of source and target, and which of the latter are matches."""
-        return self.source.table[index], self.target.table[self.rows[:, index]], self.found[:, index]
+        return (
+            gathered(self.source.table, index),
+            gathered(self.target.table, self.rows[:, index]),
+            self.found[:, index],
+        )
 
-    def block(self, index: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def block(self, index: Any) -> tuple[Table, Table, np.ndarray]:
         """`rows_at` for a block; rows repeated to fill the last block count as unmatched."""
         source, target, found = self.rows_at(index)
         if not isinstance(index, slice):
@@ -125,20 +140,45 @@ def _moving(pose: jaxlie.SE3, dtype: Any) -> Moving:
 
 def _measure(pose: jaxlie.SE3, matches: _Matches, gate: Float[AnyScalar, ""], problem: Problem) -> Sums:
     """The sums at a pose over the matches within the maximum correspondence distance `gate`, metres."""
-    moving = _moving(pose, matches.source.table.dtype)
+    dtype = matches.source.rows.points.dtype
+    moving = _moving(pose, dtype)
 
     def sums(index: Any) -> Sums:
         return _sums(moving, *matches.block(index), gate, problem.method, problem.robust)
 
     parts = map_blocks(sums, matches.size)
-    return combine([part for _, part in parts], matches.source.table.dtype)
+    return combine([part for _, part in parts], dtype)
+
+
+def _estimated(
+    pose: jaxlie.SE3, matches: _Matches, gate: Float[AnyScalar, ""], method: AbstractMethod
+) -> AbstractMethod:
+    """The method with its estimates from a sample of the matches at a pose."""
+    moving = _moving(pose, matches.source.rows.points.dtype)
+    some, counts = sampled_rows(matches.source.rows.valid)
+    rows = map_rows(lambda index: _evidence(moving, *matches.rows_at(some[index]), gate, method), some.size)
+    return method.with_estimates(method.estimated(rows, counts, matches.source.rows.valid))
+
+
+@jax.jit
+def _evidence(
+    moving: Moving,
+    source: Table,
+    target: Table,
+    found: Bool[AnyArray, "n"],
+    gate: Float[AnyScalar, ""],
+    method: AbstractMethod,
+) -> Float[AnyArray, "n L"]:
+    matched = _matched(moving, source, target, found, gate)
+    moved = move_rows(*moving, matched.source)
+    return method.evidence(matched.source, matched.target, moved, moving[0], matched.valid)
 
 
 @jax.jit
 def _sums(
     moving: Moving,
-    source: Float[AnyArray, "n L"],
-    target: Float[AnyArray, "m n L"],
+    source: Table,
+    target: Table,
     found: Bool[AnyArray, "m n"],
     gate: Float[AnyScalar, ""],
     method: AbstractMethod,
@@ -149,8 +189,8 @@ def _sums(
 
 def _matched(
     moving: Moving,
-    source: Float[AnyArray, "n L"],
-    target: Float[AnyArray, "m n L"],
+    source: Table,
+    target: Table,
     found: Bool[AnyArray, "m n"],
     gate: Float[AnyScalar, ""],
 ) -> Matched:
@@ -159,11 +199,11 @@ def _matched(
     return Matched(*sides, valid, num_candidates=len(found))
 
 
-def _flat(
-    source: Float[AnyArray, "n L"], target: Float[AnyArray, "m n L"]
-) -> tuple[Float[Array, "p L"], Float[Array, "p L"]]:
-    """One row per correspondence, p = m n; the first candidates of all source rows come first."""
-    return jnp.tile(source, (len(target), 1)), jnp.reshape(target, (-1, target.shape[-1]))
+def _flat(source: Table, target: Table) -> tuple[Table, Table]:
+    """Rows (n, L) and (m, n, L) as one row per correspondence, m n; the first candidates of all source rows come first."""
+    num_candidates = len(jax.tree.leaves(target)[0])
+    tiled = jax.tree.map(lambda rows: jnp.tile(rows, (num_candidates, 1)), source)
+    return tiled, jax.tree.map(lambda rows: jnp.reshape(rows, (-1, rows.shape[-1])), target)
 
 
 def _covariance(state: State, moments: Deferred[Moments], problem: Problem) -> Float[np.ndarray, "6 6"]:
@@ -179,7 +219,7 @@ def _moments(
 ) -> Moments:
     """Sums over the scores of all correspondences at the final pose, float64."""
     source, target, nearest = matches.source, matches.target, matches.first()
-    moving = _moving(state.pose, source.table.dtype)
+    moving = _moving(state.pose, source.rows.points.dtype)
     some, counts = sampled_rows(source.rows.valid)
 
     def discount(index: Any) -> Any:
@@ -220,8 +260,8 @@ def as_float64(tree: Any) -> Any:
 @jax.jit
 def _discount_rows(
     moving: Moving,
-    source: Float[AnyArray, "n L"],
-    target: Float[AnyArray, "m n L"],
+    source: Table,
+    target: Table,
     found: Bool[AnyArray, "m n"],
     gate: Float[AnyScalar, ""],
     details: tuple[Float[AnyArray, "n 6"], Float[AnyArray, "m n 6"]],
@@ -236,8 +276,8 @@ def _discount_rows(
 def _scores(
     moving: Moving,
     sums: Sums,
-    source: Float[AnyArray, "n L"],
-    target: Float[AnyArray, "m n L"],
+    source: Table,
+    target: Table,
     found: Bool[AnyArray, "m n"],
     gate: Float[AnyScalar, ""],
     details: tuple[Float[AnyArray, "n 6"], Float[AnyArray, "m n 6"]],

@@ -6,6 +6,7 @@ A lane is one registration of the vectorised batch. When it ends, another proble
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
+from dataclasses import replace
 from functools import partial
 from typing import Any, Generic, TypeAlias, TypeVar
 
@@ -141,8 +142,9 @@ def assess_lanes(problems: Problem, carries: Carry) -> Assessment:
     """Information matrices, directions and covariances of stacked loops, at their current poses."""
 
     def of_lane(problem: Problem, carry: Carry) -> Assessment:
-        state, matches, _ = carry
+        state, matches, _, estimates = carry
         matches = cleaned(matches)
+        problem = replace(problem, method=problem.method.with_estimates(estimates))
         return assess(state, problem, matched_rows(problem.source, problem.target, matches), matches)
 
     return jax.vmap(of_lane)(problems, carries)

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import abc
 from collections.abc import Iterator, Sequence
-from typing import ClassVar
+from dataclasses import replace
+from functools import partial
+from typing import Any, ClassVar
 
 import equinox as eqx
 import jax
@@ -21,6 +23,7 @@ from mcgicp_jax._kernels import AbstractKernel, Numbers
 from mcgicp_jax._local import locals_of
 from mcgicp_jax._neighborhoods import NO_NEIGHBORS as _NO_NEIGHBORS
 from mcgicp_jax._neighborhoods import channel_kernel, check_neighbors, multichannel_covariance, plane_covariance
+from mcgicp_jax._photometric import Term, features_of_points
 from mcgicp_jax._pose import AnyArray, AnyScalar, canonical_float, is_concrete
 from mcgicp_jax._preprocess import preprocess
 from mcgicp_jax._statistics import constant, namespace
@@ -124,6 +127,53 @@ class AbstractMethod(Numbers):
         residual = jnp.where(valid, points_of(target) - moved, 0)
         information = self.information(covariance_of(target), covariance_of(source), rotation)
         return weighed(residual, information, robust)
+
+    def features(self, around: Neighborhoods | None, local: Local | None) -> Float[Array, "L n"] | None:
+        """Further numbers of each point that `forces` needs (`_surface.features_of`); None if there are none."""
+        return None
+
+    @property
+    def estimates(self) -> Any:
+        """Numbers that are estimated from the residuals at each pose of the fine phase; None if there are none.
+
+        With such numbers, a coarse phase without them always precedes the fine phase, whose matches are the nearest in
+        position alone. They are constants to autodiff.
+        """
+        return None
+
+    def with_estimates(self, estimates: Any) -> AbstractMethod:
+        """The method with other `estimates`."""
+        return self
+
+    def evidence(
+        self,
+        source: Table,
+        target: Table,
+        moved: Float[Array, "3 N"],
+        rotation: Float[Array, "3 3"],
+        valid: Bool[Array, "N"],
+    ) -> Float[Array, "N L"]:
+        """One row per correspondence, from which `estimated` computes `estimates`; arguments as of `forces`."""
+        raise NotImplementedError(f"{type(self).__name__} has estimates, but no evidence for them")
+
+    def estimated(self, rows: Float[AnyArray, "n L"], counts: Bool[AnyArray, "n"], valid: Bool[AnyArray, "N"]) -> Any:
+        """New `estimates` from rows of `evidence`; with NumPy where these are concrete.
+
+        Args:
+            rows: of an even sample of the source points, see `sampled_rows`.
+            counts: which of these rows to use.
+            valid: which of all source points are no padding.
+        """
+        raise NotImplementedError(f"{type(self).__name__} has estimates, but does not compute them")
+
+    @property
+    def compensates(self) -> bool:
+        """Whether `estimates` include gains and offsets of the channels, for the option `match_channels`."""
+        return False
+
+    def compensating(self) -> AbstractMethod:
+        """The method that `compensates`, if it can."""
+        return self
 
     def stages(
         self, source: PointCloud, target: PointCloud, scales: Sequence[float]
@@ -289,6 +339,12 @@ class MultiChannelGICP(AbstractGeneralized):
         min_eigenvalue: floor of Ω's eigenvalues, reached where no neighbour has similar channels. Since the target is
             sampled, a match is less accurate within the surface than along the normal, whatever the channels. None:
             chosen along with Λ, see `chosen`; 0.005 if Λ is given.
+        photometric: whether the fine phase compares channels interpolated at the points, see `_photometric`. Ω and α
+            then find the pose of the coarse phase, and have no part in the fine one: its matches are nearest in
+            position, it takes from the channels only the residuals of their fits, and across the surface the residual
+            along the normals, so that no information counts twice. All residuals are in standard deviations, and so are
+            the scale of a kernel `robust`, which acts in the fine phase only, and `information`.
+        term: numbers of the photometric term, estimated during registration. Not an argument.
     """
 
     uses_channels: ClassVar[bool] = True
@@ -298,6 +354,8 @@ class MultiChannelGICP(AbstractGeneralized):
     channel_weights: Float[Array, "..."] | None
     epsilon: Float[Array, ""]
     min_eigenvalue: Float[Array, ""] | None
+    photometric: bool = eqx.field(static=True)
+    term: Term | None
 
     def __init__(
         self,
@@ -305,6 +363,7 @@ class MultiChannelGICP(AbstractGeneralized):
         channel_weights: Values | None = None,
         epsilon: ArrayLike = 1e-3,
         min_eigenvalue: ArrayLike | None = None,
+        photometric: bool = False,
     ):
         """Raises `ValueError` unless Λ is symmetric and positive definite, α finite and not negative, ε positive and
         large enough for the precision, and the floor positive; or if a shape is wrong."""
@@ -312,9 +371,11 @@ class MultiChannelGICP(AbstractGeneralized):
         self.channel_weights = None if channel_weights is None else _weights(channel_weights)
         self.epsilon = _epsilon(epsilon)
         self.min_eigenvalue = None if min_eigenvalue is None else _positive_scalar("min_eigenvalue", min_eigenvalue)
+        self.photometric, self.term = photometric, None
 
     def is_open(self, source: PointCloud, target: PointCloud) -> bool:
-        return self.channel_covariance is None or self.channel_weights is None
+        without_term = self.photometric and self.term is None
+        return self.channel_covariance is None or self.channel_weights is None or without_term
 
     def chosen(self, source: PointCloud, target: PointCloud, locals: tuple[Local, Local]) -> MultiChannelGICP:
         """The method with unset parameters chosen from the data; constants to autodiff.
@@ -353,6 +414,73 @@ class MultiChannelGICP(AbstractGeneralized):
             self,
             (covariance, weights, floor),
             is_leaf=lambda leaf: leaf is None,
+        )._with_term(spacing, source.channels.shape[-1])
+
+    def _with_term(self, spacing: Float[AnyScalar, ""], num_channels: int) -> MultiChannelGICP:
+        if not self.photometric or num_channels == 0:
+            return self
+        return self.with_estimates(Term.off(spacing, num_channels))
+
+    @property
+    def estimates(self) -> Term | None:
+        return self.term
+
+    def with_estimates(self, estimates: Term | None) -> MultiChannelGICP:
+        return eqx.tree_at(lambda method: method.term, self, estimates, is_leaf=lambda leaf: leaf is None)
+
+    @property
+    def compensates(self) -> bool:
+        return self.term is not None and self.term.compensates
+
+    def compensating(self) -> MultiChannelGICP:
+        return self if self.term is None else self.with_estimates(replace(self.term, compensates=True))
+
+    def features(self, around: Neighborhoods | None, local: Local | None) -> Float[Array, "L n"] | None:
+        if not self.photometric:
+            return None
+        if around is None:
+            raise ValueError(_NO_NEIGHBORS)
+        return features_of_points(around, _known(local).normal) if around.num_channels else None
+
+    def evidence(
+        self,
+        source: Table,
+        target: Table,
+        moved: Float[Array, "3 N"],
+        rotation: Float[Array, "3 3"],
+        valid: Bool[Array, "N"],
+    ) -> Float[Array, "N L"]:
+        residuals = self._known_term().residuals(source, target, moved, rotation, valid)
+        return jnp.stack([*residuals.rows, *jnp.where(valid, moved, 0)], axis=1)
+
+    def estimated(self, rows: Float[AnyArray, "n L"], counts: Bool[AnyArray, "n"], valid: Bool[AnyArray, "N"]) -> Term:
+        xp = namespace(counts, valid)
+        fraction = xp.sum(counts) / xp.maximum(xp.sum(valid), 1)
+        return self._known_term().adapted(xp.where(counts[:, None], rows, xp.nan), fraction)
+
+    def _known_term(self) -> Term:
+        if self.term is None:
+            raise ValueError("photometric: not resolved yet; call method.resolve(source, target) first")
+        return self.term
+
+    def forces(
+        self,
+        source: Table,
+        target: Table,
+        moved: Float[Array, "3 N"],
+        rotation: Float[Array, "3 3"],
+        valid: Bool[Array, "N"],
+        robust: AbstractKernel | None,
+    ) -> Forces:
+        plain = super().forces
+        if self.term is None:
+            return plain(source, target, moved, rotation, valid, robust)
+        matched = (source, target, moved, rotation, valid)
+        return jax.lax.cond(
+            self.term.is_on,
+            lambda term: term.forces(term.residuals(*matched), points_of(target) - moved, robust),
+            lambda _: plain(*matched, None),
+            self.term,
         )
 
     def covariance(

@@ -201,7 +201,10 @@ def align(
     start = se3_from_matrix(centred_pose(init, source, target), dtype)
     softness = None if temperature is None else jnp.asarray(temperature, dtype)
     settings = _settings(options, method, target, 1, dtype)
-    state, history = align_traced(start, seen, there, matches, softness, method, robust, settings, max_iterations)
+    state, history, estimates = align_traced(
+        start, seen, there, matches, softness, method, robust, settings, max_iterations
+    )
+    method = method.with_estimates(estimates)
     fixed, softness = jax.lax.stop_gradient((Problem(start, seen, there, method, robust, settings), softness))
     matched = matched_rows(fixed.source, fixed.target, matches, softness)
     assessment = assess(jax.lax.stop_gradient(state), fixed, matched, matches)
@@ -344,7 +347,7 @@ def register_with(
         found = registration_of(*run.finish(), coarse, coarse_target)
         init = found.matrix if is_usable(found) else init
     run = _solved(source, target, method, init, options, search)
-    if options.match_channels:
+    if options.match_channels and not run.problem.method.compensates:
         source = _matched(source, target, method, _nearest_points(source, target, run, search))
         init = constant(pose_in_user_frame(run.state.pose, source.origin, target.origin))
         run = _solved(source, target, method, init, options, search)
@@ -395,21 +398,27 @@ def _solved(
 def _run(problem: Problem, target: PointCloud, search: AbstractSearch, max_iterations: int) -> _Run:
     """Run the loop."""
     if is_concrete(problem):
-        index = _index(search, problem.method, target)
+
+        def index_of(position_alone: bool) -> AbstractIndex:
+            return _index(search, PointToPoint() if position_alone else problem.method, target)
+
         with computed_now():
-            state, assessment, history, sums = register_on_host(problem, index, search.num_threads)
+            state, assessment, history, sums = register_on_host(problem, index_of, search.num_threads)
         return _Run(problem, state, lambda: (state, assessment, history), lambda: sums.value)
     # Gradients stop here, so that autodiff does not enter the compiled functions.
     fixed = jax.lax.stop_gradient(problem)
-    state, matches, history = register_traced(fixed, search, max_iterations)
+    state, matches, history, estimates = register_traced(fixed, search, max_iterations)
+    method = problem.method.with_estimates(estimates)
+
+    found = replace(fixed, method=jax.lax.stop_gradient(method))
 
     def finish() -> tuple[State, Assessment, dict[str, Any]]:
-        assessment = assess(state, fixed, matched_rows(fixed.source, fixed.target, matches), matches)
+        assessment = assess(state, found, matched_rows(fixed.source, fixed.target, matches), matches)
         matched = matched_rows(problem.source, problem.target, matches)
-        return differentiable(state, matched, problem.method, problem.robust, problem.fusion), assessment, history
+        return differentiable(state, matched, method, problem.robust, problem.fusion), assessment, history
 
     def moments() -> Moments:
-        return moments_of(state, fixed, matched_rows(fixed.source, fixed.target, matches), matches)
+        return moments_of(state, found, matched_rows(fixed.source, fixed.target, matches), matches)
 
     return _Run(problem, state, finish, moments)
 
@@ -425,6 +434,7 @@ def pose_problem(
     """Inputs of the loop for preprocessed clouds; NumPy arrays where everything is concrete."""
     _check_clouds(source, target, method)
     method, seen, there = surfaces_of(method, source, target, observed=True, num_threads=num_threads)
+    method = method.compensating() if options.match_channels else method
     dtype = source.points.dtype
     xp = namespace(source.valid)
     stride = xp.maximum(xp.sum(xp.asarray(source.valid)) // _COARSE_ROWS, 1)

@@ -33,6 +33,11 @@ class Rows(NamedTuple):
     penalty: Float[AnyArray, "*batch N D"] | None = None
 
 
+def by_position(rows: Rows) -> Rows:
+    """The rows for a search in position alone."""
+    return Rows(rows.points, rows.descriptors[:, :0], rows.valid)
+
+
 class Correspondences(eqx.Module):
     """For each source point, its match in the target; a pytree.
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from types import ModuleType
 from typing import Any
 
@@ -11,10 +11,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from mcgicp_jax._pose import AnyArray, is_concrete
+from mcgicp_jax._pose import AnyArray, AnyScalar, is_concrete
 
 # Largest sample for a median, rows: the median of 4,096 normal variates has a standard error of 2 % of σ.
 MEDIAN_ROWS = 4096
+# Multipliers of the spatial hash: the primes of Teschner et al. 2003 for the coordinates, and one for the cell size.
+_HASH = np.array([73856093, 19349663, 83492791, 50331653], np.int32)
 
 
 def namespace(*trees: object) -> ModuleType:
@@ -86,3 +88,13 @@ def _traced_median(values: Float[Array, "*batch n"]) -> Float[Array, "*batch"]:
     count = jnp.sum(~missing, axis=-1, keepdims=True)
     middle = jnp.concatenate([jnp.maximum(count - 1, 0) // 2, count // 2], axis=-1)
     return jnp.mean(jnp.take_along_axis(ordered, middle, axis=-1), axis=-1)
+
+
+def cell_numbers(keys: Sequence[Int[AnyArray, "n"]], num_cells: Int[AnyScalar, ""] | int) -> Int[AnyArray, "n"]:
+    """Hash of integer cell coordinates, below `num_cells`.
+
+    Collisions do no harm: scores of different cells are independent, so their products cancel on average.
+    """
+    xp = namespace(keys, num_cells)
+    products = [xp.asarray(key, np.int32) * prime for key, prime in zip(keys, _HASH, strict=False)]
+    return xp.abs(sum(products[1:], start=products[0])) % num_cells

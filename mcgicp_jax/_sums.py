@@ -22,6 +22,7 @@ from mcgicp_jax._kernels import AbstractKernel
 from mcgicp_jax._methods import AbstractMethod
 from mcgicp_jax._pose import AnyArray, AnyScalar
 from mcgicp_jax._search import Correspondences, Rows
+from mcgicp_jax._statistics import sampled_rows
 from mcgicp_jax._surface import Surface, Table, gathered, observability_of, points_of
 
 _UPPER = np.triu_indices(4)
@@ -82,6 +83,28 @@ def within(
     apart = points_of(target) - moved
     distances = jnp.sqrt(alg.inner(apart, apart))
     return found & (distances <= max_distance), distances
+
+
+def estimates_at(
+    rotation: Float[Array, "3 3"],
+    translation: Float[Array, "3"],
+    matched: Matched,
+    valid: Bool[AnyArray, "N"],
+    method: AbstractMethod,
+) -> Any:
+    """`AbstractMethod.estimates` from the residuals at a pose; constant to autodiff, and None if there are none.
+
+    Args:
+        valid: which source points are no padding.
+    """
+    if method.estimates is None:
+        return None
+    rows, counts = sampled_rows(valid)
+    source, target = gathered(matched.source, rows), gathered(matched.target, rows)
+    evidence = method.evidence(
+        source, target, move_rows(rotation, translation, source), rotation, jnp.asarray(matched.valid)[rows]
+    )
+    return jax.lax.stop_gradient(method.estimated(evidence, counts, valid))
 
 
 def forces_at(

@@ -22,10 +22,22 @@ _POINTS, _COVARIANCE, _GEOMETRY, _CHANNELS = slice(0, 3), slice(3, 9), slice(9, 
 _FIXED, _PER_CHANNEL = 8, 6
 
 
+class Extended(NamedTuple):
+    """A table with further columns that a method needs for its forces, see `AbstractMethod.features`.
+
+    Attributes:
+        table: `Surface.table` of a method without them.
+        features: (N, L).
+    """
+
+    table: Any
+    features: Float[AnyArray, "*batch N L"]
+
+
 if TYPE_CHECKING:
     Table: TypeAlias = Any
 else:
-    Table = Float[AnyArray, "*batch N L"] | tuple[Float[AnyArray, "*batch N _"], ...]
+    Table = Float[AnyArray, "*batch N L"] | tuple[Float[AnyArray, "*batch N _"], ...] | Extended
 
 
 class Neighborhoods(NamedTuple):
@@ -125,7 +137,8 @@ class Surface(NamedTuple):
         table: per point 9, 15 or 21 numbers: position (3), covariance (6; its meaning depends on the method), and if
             computed, observability from geometry (6) and from channels (6); matrices are symmetric. On the host one
             array, so that matched rows are gathered at once; inside transformations a tuple (N, 3), (N, 6), ..., so
-            that derivatives involve only the columns that depend on the differentiated input.
+            that derivatives involve only the columns that depend on the differentiated input. `Extended` by the
+            features of the method, if it has any.
         details: (N, 6), for the covariance of the pose: variance of the descriptors about their linear fits (metres²),
             normal (3), roughness (metres²), reach (metres); None if observability is not computed.
     """
@@ -149,18 +162,29 @@ def local_of(
 
 
 def points_of(table: Table) -> Float[AnyArray, "3 N"]:
+    table = _plain(table)
     return table[0].T if isinstance(table, tuple) else table[:, _POINTS].T
 
 
 def covariance_of(table: Table) -> Float[AnyArray, "6 N"]:
+    table = _plain(table)
     return table[1].T if isinstance(table, tuple) else table[:, _COVARIANCE].T
 
 
 def observability_of(table: Table) -> list[Float[AnyArray, "6 N"]]:
     """Observability from geometry and from channels, each if the table contains it."""
+    table = _plain(table)
     if isinstance(table, tuple):
         return [columns.T for columns in table[2:]]
     return [table[:, columns].T for columns in (_GEOMETRY, _CHANNELS) if columns.stop <= table.shape[1]]
+
+
+def features_of(table: Extended) -> Float[AnyArray, "L N"]:
+    return table.features.T
+
+
+def _plain(table: Table) -> Any:
+    return table.table if isinstance(table, Extended) else table
 
 
 def gathered(table: Table, rows: Any) -> Any:

@@ -21,7 +21,7 @@ from mcgicp_jax._observability import channel_observability
 from mcgicp_jax._pose import AnyArray, is_concrete
 from mcgicp_jax._search import Rows
 from mcgicp_jax._statistics import namespace
-from mcgicp_jax._surface import Local, Neighborhoods, Surface, Table, covariance_of
+from mcgicp_jax._surface import Extended, Local, Neighborhoods, Surface, Table, covariance_of
 from mcgicp_jax._threads import side_by_side
 
 
@@ -95,7 +95,8 @@ def surface_on_host(
         table, details = map_rows(block(), cloud.points.shape[0], num_threads)
         return Surface(searchable(method, cloud), table, details)
 
-    leaves, structure = jax.tree.flatten(method)
+    # A surface does not depend on numbers that are estimated from matches.
+    leaves, structure = jax.tree.flatten(method.with_estimates(None))
     key = (structure, *(np.asarray(leaf).tobytes() for leaf in leaves), observed)
     return keep(cloud, "surface", key, make)
 
@@ -161,8 +162,14 @@ def tables(
     covariances = None if given is None else alg.symmetric_from_matrix(jnp.asarray(given))
     local = None if local is None else method.described(local, covariances)
     columns = [points, method.covariance(points, around, local, covariances)]
+    features = method.features(around, local)
+
+    def table(*columns: Any) -> Table:
+        plain = tuple(column.T for column in columns)
+        return plain if features is None else Extended(plain, features.T)
+
     if not observed or local is None:
-        return tuple(column.T for column in columns), None
+        return table(*columns), None
     noise = jnp.zeros_like(points[0])
     columns.append(local.geometry)
     if method.uses_channels and local.num_channels:
@@ -172,10 +179,12 @@ def tables(
     details = jnp.concatenate([noise[None], local.normal, local.roughness[None], local.reach[None]])
     # Observability is constant to autodiff.
     fixed = [jax.lax.stop_gradient(column) for column in columns[2:]]
-    return tuple(column.T for column in (*columns[:2], *fixed)), jax.lax.stop_gradient(details).T
+    return table(*columns[:2], *fixed), jax.lax.stop_gradient(details).T
 
 
 @partial(jax.jit, static_argnums=5)
-def _tables(*arguments: Any) -> tuple[Float[Array, "n L"], Float[Array, "n 6"] | None]:
-    columns, details = tables(*arguments)
-    return jnp.concatenate(columns, axis=1), details
+def _tables(*arguments: Any) -> tuple[Table, Float[Array, "n 6"] | None]:
+    table, details = tables(*arguments)
+    if isinstance(table, Extended):
+        return Extended(jnp.concatenate(table.table, axis=1), table.features), details
+    return jnp.concatenate(table, axis=1), details

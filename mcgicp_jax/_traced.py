@@ -26,7 +26,9 @@ from mcgicp_jax._search import AbstractSearch, Correspondences, Rows
 from mcgicp_jax._solve import root_near, with_derivative
 from mcgicp_jax._statistics import sampled_rows
 from mcgicp_jax._step import (
+    COARSE,
     RECORDED,
+    RUNNING,
     SETTLED,
     Assessment,
     Problem,
@@ -38,26 +40,27 @@ from mcgicp_jax._step import (
     rotation_and_translation,
     update,
 )
-from mcgicp_jax._sums import Matched, Sums, matched_rows, move_rows, sums_of, within
+from mcgicp_jax._sums import Matched, Sums, estimates_at, matched_rows, move_rows, sums_of, within
 from mcgicp_jax._surface import Surface, gathered
 from mcgicp_jax._uncertainty import Details, Moments, discount_rows, discounts, scatter_of, scores_of
 
-# State of the loop, its matches, and the history so far.
-Carry: TypeAlias = tuple[State, Correspondences, Float[Array, "... 5"]]
-# From pose, status, number of updates and last matches: the matches at the pose, and the sums over them.
-Measure: TypeAlias = Callable[[jaxlie.SE3, Int[Array, ""], Int[Array, ""], Correspondences], Any]
+# State of the loop, its matches, the history so far, and `AbstractMethod.estimates`.
+Carry: TypeAlias = tuple[State, Correspondences, Float[Array, "... 5"], Any]
+# From pose, status, number of updates, last matches and estimates: the matches at the pose, the sums over them, and the
+# estimates from them.
+Measure: TypeAlias = Callable[[jaxlie.SE3, Int[Array, ""], Int[Array, ""], Correspondences, Any], Any]
 
 
 @partial(jax.jit, static_argnames="max_iterations")
 def register_traced(
     problem: Problem, search: AbstractSearch, max_iterations: int
-) -> tuple[State, Correspondences, dict[str, Array]]:
-    """The loop of `register`: final state, matches and history."""
+) -> tuple[State, Correspondences, dict[str, Array], Any]:
+    """The loop of `register`: final state, matches, history and estimates."""
     carry = begin(problem, search, max_iterations)
-    state, matches, records = jax.lax.while_loop(
+    state, matches, records, estimates = jax.lax.while_loop(
         lambda carry: carry[0].status < 0, partial(_step, measure=_measuring(problem, search), problem=problem), carry
     )
-    return state, cleaned(matches), history_of(records)
+    return state, cleaned(matches), history_of(records), estimates
 
 
 def cleaned(matches: Correspondences) -> Correspondences:
@@ -76,8 +79,8 @@ def align_traced(
     robust: AbstractKernel | None,
     settings: Settings,
     max_iterations: int,
-) -> tuple[State, dict[str, Array]]:
-    """The loop of `align`, with fixed matches: final state, whose pose carries the derivative, and history."""
+) -> tuple[State, dict[str, Array], Any]:
+    """The loop of `align`, with fixed matches: final state, whose pose carries the derivative, history, estimates."""
     matched = matched_rows(source, target, matches, temperature)
     start, fixed, method_fixed, robust_fixed, settings = jax.lax.stop_gradient(
         (start, matched, method, robust, settings)
@@ -85,16 +88,23 @@ def align_traced(
     problem = Problem(start, source, target, method_fixed, robust_fixed, settings)
 
     def measure(
-        pose: jaxlie.SE3, status: Int[Array, ""], num_iterations: Int[Array, ""], before: Correspondences
-    ) -> tuple[Correspondences, Sums]:
+        pose: jaxlie.SE3,
+        status: Int[Array, ""],
+        num_iterations: Int[Array, ""],
+        before: Correspondences,
+        estimates: Any,
+    ) -> tuple[Correspondences, Sums, Any]:
         moving = rotation_and_translation(pose, pose.wxyz_xyz.dtype)
-        return before, sums_of(*moving, fixed, method_fixed, robust_fixed)
+        estimates = _renewed(status, estimates, estimates_at(*moving, fixed, source.rows.valid, method_fixed))
+        now = method_fixed.with_estimates(estimates)
+        return before, sums_of(*moving, fixed, now, robust_fixed), estimates
 
-    carry = _begin(problem, measure, jax.tree.map(jnp.asarray, matches), max_iterations)
-    state, _, records = jax.lax.while_loop(
+    carry = _begin(problem, settings.first_status(), measure, jax.tree.map(jnp.asarray, matches), max_iterations)
+    state, _, records, estimates = jax.lax.while_loop(
         lambda carry: carry[0].status < 0, partial(_step, measure=measure, problem=problem), carry
     )
-    return differentiable(state, matched, method, robust), history_of(records)
+    method = method.with_estimates(estimates)
+    return differentiable(state, matched, method, robust), history_of(records), estimates
 
 
 @jax.jit
@@ -169,7 +179,9 @@ def begin(problem: Problem, search: AbstractSearch, max_iterations: int) -> Carr
     """Initial carry of the loop of `register`, with arrays for `max_iterations` + 1 history entries."""
     shape, dtype = (problem.method.num_candidates, problem.source.rows.valid.size), problem.start.wxyz_xyz.dtype
     nothing = Correspondences(jnp.full(shape, -1, jnp.int32), jnp.zeros(shape, dtype), jnp.zeros(shape, bool))
-    return _begin(problem, _measuring(problem, search), nothing, max_iterations)
+    settings = problem.settings
+    first = settings.first_status() if problem.method.estimates is None else jnp.int32(COARSE)
+    return _begin(problem, first, _measuring(problem, search), nothing, max_iterations)
 
 
 def step_of_lane(carry: Carry, problem: Problem, search: AbstractSearch) -> Carry:
@@ -177,37 +189,50 @@ def step_of_lane(carry: Carry, problem: Problem, search: AbstractSearch) -> Carr
     return _step(carry, _measuring(problem, search), problem)
 
 
-def _begin(problem: Problem, measure: Measure, matches: Correspondences, max_iterations: int) -> Carry:
-    first, zero = problem.settings.first_status(), jnp.int32(0)
+def _begin(
+    problem: Problem, first: Int[AnyScalar, ""], measure: Measure, matches: Correspondences, max_iterations: int
+) -> Carry:
+    zero, estimates = jnp.int32(0), jax.tree.map(jnp.asarray, problem.method.estimates)
 
     def shapes() -> State:
-        sums = measure(problem.start, first, zero, matches)[1]
+        sums = measure(problem.start, first, zero, matches, estimates)[1]
         return update(problem.start, first, zero, sums, problem.settings, problem.fusion)
 
     state = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), jax.eval_shape(shapes))
     state = eqx.tree_at(lambda state: (state.pose, state.status), state, (problem.start, first))
     # One entry per update, and one at the returned pose.
-    return state, matches, jnp.full((max_iterations + 1, len(RECORDED)), jnp.nan, state.record.dtype)
+    return state, matches, jnp.full((max_iterations + 1, len(RECORDED)), jnp.nan, state.record.dtype), estimates
 
 
 def _step(carry: Carry, measure: Measure, problem: Problem) -> Carry:
-    before, matches, records = carry
+    before, matches, records, estimates = carry
     count = before.num_iterations
-    matches, sums = measure(before.pose, before.status, count, matches)
+    matches, sums, estimates = measure(before.pose, before.status, count, matches, estimates)
     state = update(before.pose, before.status, count, sums, problem.settings, problem.fusion)
-    return state, matches, records.at[count].set(state.record)
+    return state, matches, records.at[count].set(state.record), estimates
+
+
+def _renewed(status: Int[Array, ""], before: Any, estimates: Any) -> Any:
+    """The new estimates in the fine phase, else those before."""
+    return jax.tree.map(partial(jnp.where, status == RUNNING), estimates, before)
 
 
 def _measuring(problem: Problem, search: AbstractSearch) -> Measure:
     def measure(
-        pose: jaxlie.SE3, status: Int[Array, ""], num_iterations: Int[Array, ""], before: Correspondences
-    ) -> tuple[Correspondences, Sums]:
+        pose: jaxlie.SE3,
+        status: Int[Array, ""],
+        num_iterations: Int[Array, ""],
+        before: Correspondences,
+        estimates: Any,
+    ) -> tuple[Correspondences, Sums, Any]:
         settings, source, target = problem.settings, problem.source, problem.target
         # Under `vmap` the body also runs for finished lanes: no search for them.
         running = (status < 0) & (status != SETTLED)
-        rows = _every(settings.stride(status, num_iterations), source.rows)
-        limit, count = settings.max_distance, problem.method.num_candidates
-        found = search.nearest_traced(pose.wxyz_xyz, rows, target.rows, limit, running, count)
+        rows, target_rows = _every(settings.stride(status, num_iterations), source.rows), target.rows
+        if estimates is not None:
+            rows, target_rows = (_searched(status, each) for each in (rows, target_rows))
+        limit, num_candidates = settings.max_distance, problem.method.num_candidates
+        found = search.nearest_traced(pose.wxyz_xyz, rows, target_rows, limit, running, num_candidates)
         indices = jnp.where(running, found, before.indices)
         moving = rotation_and_translation(pose, pose.wxyz_xyz.dtype)
         here = jnp.maximum(indices, 0)
@@ -216,12 +241,20 @@ def _measuring(problem: Problem, search: AbstractSearch) -> Measure:
         moved = move_rows(*moving, matched.source)
         valid, distances = within(moved, matched.target, matched.valid, settings.gate(status))
         matched = eqx.tree_at(lambda matched: matched.valid, matched, valid)
-        sums = sums_of(*moving, matched, problem.method, problem.robust)
+        estimates = _renewed(status, estimates, estimates_at(*moving, matched, source.rows.valid, problem.method))
+        sums = sums_of(*moving, matched, problem.method.with_estimates(estimates), problem.robust)
         valid, distances = valid.reshape(indices.shape), distances.reshape(indices.shape)
         # Index −1 marks a missing match until the loop ends, see `cleaned`.
-        return Correspondences(indices, distances, valid), sums
+        return Correspondences(indices, distances, valid), sums, estimates
 
     return measure
+
+
+def _searched(status: Int[Array, ""], rows: Rows) -> Rows:
+    """The rows for a search in position alone after the coarse phase: without descriptors, none is missing either."""
+    factor = (status == COARSE).astype(rows.points.dtype)
+    penalty = None if rows.penalty is None else factor * rows.penalty
+    return Rows(rows.points, factor * rows.descriptors, rows.valid, penalty)
 
 
 def _every(stride: Int[Array, ""], source: Rows) -> Rows:

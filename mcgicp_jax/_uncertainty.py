@@ -29,7 +29,7 @@ from mcgicp_jax._methods import AbstractMethod
 from mcgicp_jax._pose import AnyArray, AnyScalar
 from mcgicp_jax._search import Rows
 from mcgicp_jax._solve import adjoint_to_source, twist_form, units
-from mcgicp_jax._statistics import median, namespace
+from mcgicp_jax._statistics import cell_numbers, median, namespace
 from mcgicp_jax._sums import Matched, forces_at, mean_observability, move_rows, powers
 from mcgicp_jax._surface import noise_of, normal_of, points_of, reach_of, roughness_of
 
@@ -41,8 +41,6 @@ UNKNOWN = 10.0
 _LEAST_FRACTION = 0.2
 # Medians of the square of a standard normal variate, and of the mean of two such squares.
 _MEDIAN_SQUARE, _MEDIAN_MEAN_OF_TWO = 0.455, 0.693
-# Multipliers of the spatial hash: the primes of Teschner et al. 2003 for the coordinates, and one for the cell size.
-_HASH = np.array([73856093, 19349663, 83492791, 50331653], np.int32)
 
 
 class Details(NamedTuple):
@@ -152,12 +150,16 @@ def scores_of(
     if details is not None:
         geometry, *channels = mean_observability(pose[0], matched)
         shown = discount[0] * geometry
+        if method.estimates is not None:
+            # Interpolated channels change with every motion within the surface, whichever samples match.
+            channels, within = [], alg.outer(normal_of(details.target))
+            shown = shown + jnp.array([[1.0], [0.0], [0.0], [1.0], [0.0], [1.0]], within.dtype) - within
         for each in channels:
             # A / (1 + tr A) of `channel_observability`, with A multiplied by the discount.
             trace = each[0] + each[3] + each[5]
             shown = shown + discount[1] * each / (1 - (1 - discount[1]) * jnp.clip(trace, 0, 1))
         left_out = forces.force - alg.multiply(forces.stiffness, alg.multiply(shown, forces.residual))
-        bias = jnp.sum(_wrench(arms, left_out), axis=1)
+        bias = jnp.sum(_wrench(arms, left_out), axis=1) if method.estimates is None else bias
         if method.matches_slide:
             stiffness = alg.symmetric_product(stiffness, shown)
         size = _CELL * 0.5 * (reach_of(details.source) + reach_of(details.target))
@@ -193,14 +195,10 @@ def _tangent_stiffness(
 def _cells(
     moved: Float[Array, "3 N"], valid: Bool[Array, "N"], size: Float[Array, "N"], num_cells: Int[AnyScalar, ""]
 ) -> Int[Array, "N"]:
-    """Hash of the cell that contains each point. Cell sizes follow the point density, rounded to powers of two.
-
-    Collisions do no harm: scores of different cells are independent, so their products cancel on average.
-    """
+    """Hash of the cell that contains each point. Cell sizes follow the point density, rounded to powers of two."""
     level = jnp.round(jnp.log2(jnp.where(valid & (size > 0), size, 1)))
     cell = jnp.floor(jnp.where(valid, moved / 2.0**level, 0)).astype(jnp.int32)
-    keys = (*cell, level.astype(jnp.int32))
-    return jnp.abs(sum((key * prime for key, prime in zip(keys, _HASH, strict=True)), jnp.int32(0))) % num_cells
+    return cell_numbers((*cell, level.astype(jnp.int32)), num_cells)
 
 
 def scatter_of(scores: Scores, num_cells: int) -> tuple[Float[AnyArray, "6 6"], Int[AnyScalar, ""]]:

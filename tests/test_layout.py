@@ -16,6 +16,7 @@ LAYERS = {
         "_cloud",
         "_kept",
         "_preprocess",
+        "_spaces",
         "_map",
         "_formats",
         "_initial_poses",
@@ -26,7 +27,7 @@ LAYERS = {
         "datasets",
     ),
     "local surfaces": ("_surface", "_observability", "_neighborhoods", "_local", "_channels", "_features"),
-    "correspondences": ("_forces", "_methods", "_surfaces", "_sums", "_gaussians", "_ndt"),
+    "correspondences": ("_forces", "_photometric", "_methods", "_surfaces", "_sums", "_gaussians", "_ndt"),
     "pose": ("_solve", "_pose_form", "_fusion", "_hypotheses", "_directions", "_uncertainty", "_result", "_step"),
     "loops": ("_host", "_traced", "_lanes", "_normal_equations", "_sparse_inverse", "_graph_traced"),
     "use": (

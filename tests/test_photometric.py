@@ -1,0 +1,201 @@
+"""The photometric term: residuals, estimates, gradients, and what it does for a pose."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import mcgicp_jax as mcg
+from mcgicp_jax._statistics import median
+from mcgicp_jax._sums import estimates_at, matched_rows, move_rows
+from mcgicp_jax._surfaces import surfaces_of
+from tests.differences import GATE, TO_ROUNDING, check_gradient, clouds_with, inputs_of, needs_x64, weigh
+from tests.scenes import motion, pair, wall
+
+PHOTOMETRIC = mcg.MultiChannelGICP(photometric=True)
+SMALL = motion((0.03, -0.02, 0.01, 0.01, -0.01, 0.02))
+
+
+class Held(mcg.MultiChannelGICP):
+    """The term with its numbers as they are."""
+
+    @property
+    def estimates(self):
+        return None
+
+    def with_estimates(self, estimates):
+        return self
+
+
+def held(source, target, method, pose, matches):
+    """The method with its numbers from the matches at a pose, held; and those numbers."""
+    method, seen, there = surfaces_of(method, source, target, observed=False)
+    matched = matched_rows(seen, there, matches)
+    pose = jnp.asarray(pose, source.points.dtype)
+    term = estimates_at(pose[:3, :3], pose[:3, 3], matched, source.valid, method)
+    result = Held(method.channel_covariance, method.channel_weights, photometric=True)
+    object.__setattr__(result, "term", term)
+    return result, term
+
+
+def raised(size, **settings):
+    """The wall in the middle of a layer of cells; at their border, the cells would sort points by their noise."""
+    points, channels = wall(size, **settings)
+    return points + 0.09, channels
+
+
+def at_truth(scene=wall, size=900, truth=SMALL, **settings):
+    source, target, truth = pair(scene, size, truth=truth, **settings)
+    matches = mcg.find_correspondences(source, target, truth, mcg.PointToPoint(), max_distance=0.1)
+    return source, target, truth, matches
+
+
+def test_samples_are_interpolated():
+    """On a smooth picture the error is far below the spacing, with which that of matched samples grows."""
+    source, target, truth = pair(wall, 900, truth=SMALL)
+    plain, fine = (mcg.register(source, target, method) for method in (mcg.MultiChannelGICP(), PHOTOMETRIC))
+    errors = [mcg.metrics.pose_error(result.matrix, truth)[0] for result in (plain, fine)]
+    assert plain.converged and fine.converged
+    assert errors[1] < 3e-4 < 2e-3 < errors[0]
+    assert all(direction.held_by_channels for direction in fine.free_directions)
+
+
+def test_transformations_find_the_same_pose():
+    source, target, _ = pair(wall, 900, truth=SMALL)
+    outside = mcg.register(source, target, PHOTOMETRIC)
+    inside = jax.jit(lambda s, t: mcg.register(s, t, PHOTOMETRIC))(source, target.pad(1024))
+    np.testing.assert_allclose(inside.matrix, outside.matrix, atol=2e-6)
+    assert inside.status == outside.status and inside.num_iterations == outside.num_iterations
+    np.testing.assert_allclose(
+        inside.information, outside.information, rtol=1e-2, atol=1e-3 * outside.information.max()
+    )
+    np.testing.assert_allclose(inside.covariance, outside.covariance, rtol=0.05, atol=0.02 * outside.covariance.max())
+
+
+def test_forces_are_the_gradient_of_the_cost():
+    source, target, truth, matches = at_truth()
+    method, term = held(source, target, PHOTOMETRIC, truth, matches)
+    _, seen, there = surfaces_of(method, source, target, observed=False)
+    matched = matched_rows(seen, there, matches)
+    rotation = jnp.asarray(truth[:3, :3], jnp.float32)
+    moved = move_rows(rotation, jnp.asarray(truth[:3, 3], jnp.float32), matched.source)
+
+    def of(moved, name):
+        return getattr(method.forces(matched.source, matched.target, moved, rotation, matched.valid, None), name)
+
+    gradient = jax.jit(jax.grad(lambda moved: jnp.sum(of(moved, "cost"))))(moved)
+    force = jax.jit(lambda moved: of(moved, "force"))(moved)
+    np.testing.assert_allclose(force, -0.5 * gradient, atol=1e-4 * np.abs(force).max())
+    # The stiffness is the Gauss-Newton Hessian: close to the true one where weights hardly fall.
+    axis = jnp.array([1.0, 0.0, 0.0])[:, None] * jnp.ones_like(moved)
+    change = jax.jit(lambda moved: jax.jvp(lambda moved: of(moved, "force"), (moved,), (axis,))[1])(moved)
+    stiffness = jax.jit(lambda moved: of(moved, "stiffness"))(moved)
+    np.testing.assert_allclose(np.sum(stiffness[0]), -np.sum(change[0]), rtol=0.15)
+
+
+def test_estimates_are_scales_and_correlations_of_the_residuals():
+    source, target, truth, matches = at_truth(raised, size=2500)
+    method, term = held(source, target, PHOTOMETRIC, truth, matches)
+    _, seen, there = surfaces_of(method, source, target, observed=False)
+    matched = matched_rows(seen, there, matches)
+    rotation = jnp.asarray(truth[:3, :3], jnp.float32)
+    moved = move_rows(rotation, jnp.asarray(truth[:3, 3], jnp.float32), matched.source)
+    residuals = term.residuals(matched.source, matched.target, moved, rotation, matched.valid)
+    for k, values in enumerate(residuals.values):
+        scatter = 1.4826 * median(np.abs(np.asarray(values) - median(np.asarray(values))))
+        np.testing.assert_allclose(term.deviations[k], scatter, rtol=1e-4)
+    # By definition, cell by cell, with the weights of the default kernel.
+    cells = np.floor(np.asarray(moved) / (10 * float(term.spacing))).astype(int)
+    _, cell = np.unique(cells, axis=1, return_inverse=True)
+    for k in range(4):
+        valid = ~np.isnan(residuals.values[k])
+        z = np.where(valid, residuals.values[k], 0) / term.deviations[k]
+        slope = np.asarray(residuals.slopes[k]) / term.deviations[k]
+        weights = 1 / (1 + z**2 / 20)
+        sums = np.stack([np.bincount(cell.ravel(), weights * z * axis) for axis in slope])
+        design = max(np.sum(sums**2) / np.sum(weights * np.sum(slope**2, axis=0)), 1)
+        # Some cells share a number.
+        np.testing.assert_allclose(term.designs[k], design, rtol=0.3)
+
+
+def test_a_sample_has_the_design_effect_of_all():
+    """Twice as many samples of one picture are not worth twice as much."""
+    from mcgicp_jax._photometric import Term
+
+    rng = np.random.default_rng(0)
+    moved = np.concatenate([rng.random((40_000, 2)), np.zeros((40_000, 1))], axis=1)
+    # Errors that neighbours share, and noise.
+    shared = rng.normal(size=(50, 50))[tuple((50 * moved[:, :2]).astype(int).T)]
+    values = np.stack([rng.normal(size=40_000), 0.5 * shared + rng.normal(size=40_000)], axis=1)
+    slopes = np.tile([0, 0, 1.0, 1.0, 0, 0], (40_000, 1))
+    rows = np.concatenate([values, slopes, values[:, 1:], moved], axis=1)
+    whole = Term.off(np.float64(0.01), 1).adapted(rows, 1.0)
+    sample = Term.off(np.float64(0.01), 1).adapted(rows[::3], 1 / 3)
+    assert whole.designs[0] < 1.3 and whole.designs[1] > 3
+    np.testing.assert_allclose(sample.designs[1], whole.designs[1], rtol=0.3)
+
+
+@needs_x64
+def test_align_has_the_gradient_of_its_answer(noisy):
+    """With its numbers held, as autodiff holds them."""
+    source, target, _ = noisy
+    start = mcg.register(source, target, PHOTOMETRIC, max_distance=GATE).matrix
+    matches = mcg.find_correspondences(source, target, start, mcg.PointToPoint(), max_distance=GATE)
+    method, _ = held(source, target, PHOTOMETRIC, start, matches)
+    start = mcg.align(source, target, matches, method, init=start, **TO_ROUNDING).matrix
+
+    def loss(inputs):
+        clouds = clouds_with(inputs, source, target)
+        return weigh(mcg.align(*clouds, matches, method, init=start, **TO_ROUNDING).matrix)
+
+    inputs = inputs_of(source, target, method, None)
+    inputs = {name: value for name, value in inputs.items() if name not in ("method", "robust")}
+    check_gradient(loss, inputs)
+
+
+def test_missing_channels_and_padding_have_no_gradient():
+    source, target, truth = pair(wall, 400, truth=SMALL)
+    known = np.random.default_rng(0).random(source.channels.shape) < 0.7
+    source = source.replace(channel_valid=known).pad(512)
+    matches = mcg.find_correspondences(source, target, truth, mcg.PointToPoint(), max_distance=0.1)
+
+    def loss(points, channels):
+        moved = source.replace(points=points, channels=channels)
+        return weigh(mcg.align(moved, target, matches, PHOTOMETRIC).matrix)
+
+    for gradient in jax.jit(jax.grad(loss, argnums=(0, 1)))(source.points, source.channels):
+        assert np.isfinite(gradient).all() and np.abs(gradient[:400]).max() > 0
+        np.testing.assert_array_equal(gradient[400:], 0)
+    np.testing.assert_array_equal(gradient[:400][~known], 0)
+
+
+@pytest.mark.parametrize("change", ["units", "noise"])
+def test_units_and_useless_channels_hardly_matter(change):
+    source, target, _ = pair(wall, 2000, truth=SMALL)
+    before = mcg.register(source, target, PHOTOMETRIC)
+    rng, clouds = np.random.default_rng(0), []
+    for cloud in (source, target):
+        channels = np.asarray(cloud.channels)
+        noise = rng.normal(size=(len(channels), 1)).astype(np.float32)
+        channels = 255 * channels if change == "units" else np.concatenate([channels, noise], axis=1)
+        clouds.append(mcg.preprocess(mcg.PointCloud(cloud.points, channels)))
+    after = mcg.register(*clouds, PHOTOMETRIC)
+    assert after.converged and mcg.metrics.pose_error(after.matrix, before.matrix)[0] < 2e-4
+
+
+def test_gain_and_offset_are_estimated_with_the_pose():
+    source, target, truth = pair(wall, 2000, truth=SMALL)
+    darker = source.replace(channels=np.float32(0.7) * source.channels - np.float32(0.2))
+    without, matched = (mcg.register(darker, target, PHOTOMETRIC, match_channels=match) for match in (False, True))
+    errors = [mcg.metrics.pose_error(result.matrix, truth)[0] for result in (without, matched)]
+    assert matched.converged and errors[1] < 1e-3 < 5e-3 < errors[0]
+    inside = jax.jit(lambda s: mcg.register(s, target, PHOTOMETRIC, match_channels=True).matrix)(darker)
+    np.testing.assert_allclose(inside, matched.matrix, atol=1e-5)
+
+
+def test_without_channels_the_term_is_off():
+    source, target, _ = pair(size=400)
+    bare = [mcg.preprocess(mcg.PointCloud(cloud.points)) for cloud in (source, target)]
+    with pytest.warns(UserWarning, match="no channels"):
+        result = mcg.register(*bare, PHOTOMETRIC)
+    np.testing.assert_array_equal(result.matrix, mcg.register(*bare, mcg.GICP()).matrix)
