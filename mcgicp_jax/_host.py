@@ -16,7 +16,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
-from typing import Any, TypeAlias
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 import jax
 import jax.numpy as jnp
@@ -44,8 +44,14 @@ from mcgicp_jax._step import (
     update,
 )
 from mcgicp_jax._sums import Matched, Sums, combine, move_rows, sums_of, within
-from mcgicp_jax._surface import Surface, Table, gathered
+from mcgicp_jax._surface import Extended, Surface, Table, gathered
 from mcgicp_jax._uncertainty import Details, Moments, Scores, discount_rows, discounts, scatter_of, scores_of
+
+if TYPE_CHECKING:
+    Candidates: TypeAlias = Any
+else:
+    # Table rows of the m candidates of each of N points.
+    Candidates = Float[AnyArray, "m N L"] | Extended
 
 # Rotation matrix and translation (metres) of a pose.
 Moving: TypeAlias = tuple[Float[AnyArray, "3 3"], Float[AnyArray, "3"]]
@@ -110,7 +116,7 @@ class _Matches:
         """The first candidate of each source row alone."""
         return _Matches(self.source, self.target, self.indices[:1])
 
-    def rows_at(self, index: Any) -> tuple[Table, Table, np.ndarray]:
+    def rows_at(self, index: Any) -> tuple[Table, Candidates, np.ndarray]:
         """Table rows of source and target, and which of the latter are matches."""
         return (
             gathered(self.source.table, index),
@@ -118,7 +124,7 @@ class _Matches:
             self.found[:, index],
         )
 
-    def block(self, index: Any) -> tuple[Table, Table, np.ndarray]:
+    def block(self, index: Any) -> tuple[Table, Candidates, np.ndarray]:
         """`rows_at` for a block; rows repeated to fill the last block count as unmatched."""
         source, target, found = self.rows_at(index)
         if not isinstance(index, slice):
@@ -164,8 +170,8 @@ def _estimated(
 def _evidence(
     moving: Moving,
     source: Table,
-    target: Table,
-    found: Bool[AnyArray, "n"],
+    target: Candidates,
+    found: Bool[AnyArray, "m N"],
     gate: Float[AnyScalar, ""],
     method: AbstractMethod,
 ) -> Float[AnyArray, "n L"]:
@@ -178,8 +184,8 @@ def _evidence(
 def _sums(
     moving: Moving,
     source: Table,
-    target: Table,
-    found: Bool[AnyArray, "m n"],
+    target: Candidates,
+    found: Bool[AnyArray, "m N"],
     gate: Float[AnyScalar, ""],
     method: AbstractMethod,
     robust: AbstractKernel | None,
@@ -190,8 +196,8 @@ def _sums(
 def _matched(
     moving: Moving,
     source: Table,
-    target: Table,
-    found: Bool[AnyArray, "m n"],
+    target: Candidates,
+    found: Bool[AnyArray, "m N"],
     gate: Float[AnyScalar, ""],
 ) -> Matched:
     sides = _flat(source, target)
@@ -199,8 +205,8 @@ def _matched(
     return Matched(*sides, valid, num_candidates=len(found))
 
 
-def _flat(source: Table, target: Table) -> tuple[Table, Table]:
-    """Rows (n, L) and (m, n, L) as one row per correspondence, m n; the first candidates of all source rows come first."""
+def _flat(source: Any, target: Any) -> tuple[Any, Any]:
+    """Rows (N, L) and (m, N, L) as one row per correspondence, m N; first candidates of all source rows come first."""
     num_candidates = len(jax.tree.leaves(target)[0])
     tiled = jax.tree.map(lambda rows: jnp.tile(rows, (num_candidates, 1)), source)
     return tiled, jax.tree.map(lambda rows: jnp.reshape(rows, (-1, rows.shape[-1])), target)
@@ -261,8 +267,8 @@ def as_float64(tree: Any) -> Any:
 def _discount_rows(
     moving: Moving,
     source: Table,
-    target: Table,
-    found: Bool[AnyArray, "m n"],
+    target: Candidates,
+    found: Bool[AnyArray, "m N"],
     gate: Float[AnyScalar, ""],
     details: tuple[Float[AnyArray, "n 6"], Float[AnyArray, "m n 6"]],
     source_rows: Rows,
@@ -277,8 +283,8 @@ def _scores(
     moving: Moving,
     sums: Sums,
     source: Table,
-    target: Table,
-    found: Bool[AnyArray, "m n"],
+    target: Candidates,
+    found: Bool[AnyArray, "m N"],
     gate: Float[AnyScalar, ""],
     details: tuple[Float[AnyArray, "n 6"], Float[AnyArray, "m n 6"]],
     method: AbstractMethod,
