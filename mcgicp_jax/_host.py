@@ -112,9 +112,12 @@ class _Matches:
         self.found = (indices >= 0) & source.rows.valid & target.rows.valid[self.rows]
         self.size = indices.shape[1]
 
-    def first(self) -> _Matches:
-        """The first candidate of each source row alone."""
-        return _Matches(self.source, self.target, self.indices[:1])
+    def nearest(self, moving: Moving) -> _Matches:
+        """Of each source row the nearest candidate alone; they are followed from pose to pose in any order."""
+        rotation, translation = moving
+        apart = self.target.rows.points[self.rows] - (self.source.rows.points @ rotation.T + translation)
+        order = np.argmin(np.where(self.found, np.einsum("mni,mni->mn", apart, apart), np.inf), axis=0)
+        return _Matches(self.source, self.target, np.take_along_axis(self.indices, order[None], axis=0))
 
     def rows_at(self, index: Any) -> tuple[Table, Candidates, np.ndarray]:
         """Table rows of source and target, and which of the latter are matches."""
@@ -224,8 +227,9 @@ def _moments(
     state: State, matches: _Matches, gate: Float[AnyScalar, ""], problem: Problem, num_threads: int | None
 ) -> Moments:
     """Sums over the scores of all correspondences at the final pose, float64."""
-    source, target, nearest = matches.source, matches.target, matches.first()
+    source, target = matches.source, matches.target
     moving = _moving(state.pose, source.rows.points.dtype)
+    nearest = matches.nearest(moving)
     some, counts = sampled_rows(source.rows.valid)
 
     def discount(index: Any) -> Any:

@@ -138,6 +138,8 @@ def _start(
         steps = list(odometry(clouds, method, **options))
         found = {(k - 1, k): step.registration for k, step in enumerate(steps) if step.registration is not None}
         return np.array([step.pose for step in steps]), found
+    if isinstance(init, str):
+        raise ValueError(f"init: expected one pose per cloud, got {init!r}; global_pose finds poses of pairs")
     if len(init) != len(clouds):
         raise ValueError(f"init: expected one pose per cloud, {len(clouds)}, got {len(init)}")
     return np.array([pose_matrix(pose, f"init[{k}]") for k, pose in enumerate(init)]), {}

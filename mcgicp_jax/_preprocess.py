@@ -51,12 +51,20 @@ def preprocess(
             with covariances is to be downsampled, the cloud is a batch, or an argument is out of range.
 
     Warns:
-        UserWarning: once per call, if points with NaN or infinity were left out.
+        UserWarning: once per call, if points with NaN or infinity were left out, and if downsampling leaves fewer
+            points than `num_neighbors`.
     """
     check_preprocessing(voxel_size, num_neighbors)
     cloud = finite_rows(cloud)
     if voxel_size is not None:
-        cloud = _downsampled(cloud, voxel_size)
+        before, cloud = len(cloud), _downsampled(cloud, voxel_size)
+        if len(cloud) < min(before, num_neighbors):
+            warnings.warn(
+                f"voxel_size: {voxel_size} m leaves {len(cloud)} of {before} points, fewer than the {num_neighbors} "
+                "neighbours from which a covariance is computed; choose a smaller size",
+                UserWarning,
+                stacklevel=2,
+            )
     points, channel_valid, covariances = np.asarray(cloud.points), cloud.channel_valid, cloud.covariances
     dtype = jax.dtypes.canonicalize_dtype(points.dtype)
     origin = _far_origin(points)

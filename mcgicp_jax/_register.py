@@ -21,14 +21,14 @@ from mcgicp_jax._global import GlobalPose, RowMatches, find_pose
 from mcgicp_jax._host import correspondences_at, register_on_host
 from mcgicp_jax._kept import keep
 from mcgicp_jax._kernels import AbstractKernel
-from mcgicp_jax._methods import AbstractMethod, MultiChannelGICP, PointToPoint
+from mcgicp_jax._methods import GICP, AbstractMethod, MultiChannelGICP, PointToPoint
 from mcgicp_jax._options import ROTATION_TOLERANCE, Distance, Options, check_method
 from mcgicp_jax._outcome import registration_of
 from mcgicp_jax._pose import Pose, computed_now, is_concrete, se3_from_matrix
 from mcgicp_jax._preprocess import preprocess
 from mcgicp_jax._result import Registration, Status, is_usable, pose_in_user_frame
 from mcgicp_jax._search import AbstractIndex, AbstractSearch, Correspondences
-from mcgicp_jax._statistics import constant, namespace
+from mcgicp_jax._statistics import constant, median, namespace, sampled_rows
 from mcgicp_jax._step import Assessment, Problem, Settings, State
 from mcgicp_jax._sums import matched_rows, move_rows, within
 from mcgicp_jax._surfaces import searchable, surfaces_of
@@ -41,6 +41,9 @@ from mcgicp_jax._uncertainty import Moments
 # the smaller one rejects these. The coarse phase needs the spacing between scan lines, too: with that along the lines
 # alone, raw scans of KITTI, 1.3 m apart, stayed at the identity.
 _COARSE_SPACINGS, _FINE_SPACINGS = 10.0, 2.5
+# Smallest and largest trace, relative to that of GICP's covariances (2: they are 1 within the surface), of covariances
+# given with one of the clouds, for which no warning is issued. That of cells in m² is a sixth of their squared edge.
+_LEAST_TRACE, _LARGEST_TRACE = 0.25, 4.0
 # Default translation tolerance, in spacings of the target: 0.5 mm at 0.1 m, chosen like `ROTATION_TOLERANCE`.
 _TOLERANCE_IN_SPACINGS = 0.005
 # Tolerances of the coarse phase, in tolerances, of which the default ones are the least: with tighter ones, the small
@@ -290,8 +293,9 @@ def register(
             are used, a cloud has fewer than four finite points, or `init` is not a rigid motion. The message names the
             argument. Failures to register well-formed clouds show in `Registration.status`.
     Warns:
-        UserWarning: if points with NaN or infinity are left out, `MultiChannelGICP` gets clouds without channels, or
-            the values of a channel are so different in the two clouds that their units probably are, too.
+        UserWarning: if points with NaN or infinity are left out, `MultiChannelGICP` gets clouds without channels, the
+            values of a channel are so different in the two clouds that their units probably are, too, or `GICP` gets
+            one cloud with covariances that are not dimensionless.
     """
     options = Options(
         max_distance=max_distance,
@@ -332,6 +336,8 @@ def register_with(
     )
     if options.scales and not (source.covariances is None and target.covariances is None):
         raise ValueError("scales: expected none for clouds with covariances, which cannot be averaged in voxels")
+    if isinstance(method, GICP) and is_concrete(source, target):
+        _warn_of_covariances(source, target)
     if options.match_channels:
         source = _matched(source, target, method)
     elif method.uses_channels and is_concrete(source, target):
@@ -380,6 +386,21 @@ class _Run(NamedTuple):
     state: State
     finish: Callable[[], tuple[State, Assessment, dict[str, Any]]]
     moments: Callable[[], Moments]
+
+
+def _warn_of_covariances(source: PointCloud, target: PointCloud) -> None:
+    """Warn if one cloud brings covariances whose unit is not that of GICP's, which the other one gets."""
+    for name, cloud, other in (("source", source, target), ("target", target, source)):
+        if cloud.covariances is not None and other.covariances is None:
+            rows, _ = sampled_rows(cloud.valid)
+            trace = float(median(np.trace(np.asarray(cloud.covariances)[rows], axis1=1, axis2=2)))
+            if not _LEAST_TRACE <= trace / 2 <= _LARGEST_TRACE:
+                warnings.warn(
+                    f"{name}: its covariances have a median trace of {trace:.2g}, those of GICP are dimensionless and "
+                    'have 2; for cells in m² use NDT or D2DNDT, or make them by gaussians(..., of="covariances")',
+                    UserWarning,
+                    stacklevel=4,
+                )
 
 
 def _solved(

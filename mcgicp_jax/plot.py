@@ -37,9 +37,9 @@ _CLOUD_COLORS = ("#1f77d0", "#e8741c", "#2b9c5a", "#b03a8c", "#7a5230", "#707070
 # Points drawn in one 3-D figure.
 _MOST_POINTS = 50_000
 
-# before_after: maximum width of a row and height of a panel, inches; pixels and tiles along the longer side of a panel;
-# fraction of each side that the detail shows.
-_WIDEST, _HIGHEST, _PIXELS, _TILES, _DETAIL = 12, 4.5, 500, 12, 0.25
+# before_after: most rows below each other; maximum width of a row and height of a panel, inches; pixels and tiles along
+# the longer side of a panel; fraction of each side that the detail shows.
+_MOST_ROWS, _WIDEST, _HIGHEST, _PIXELS, _TILES, _DETAIL = 5, 12, 4.5, 500, 12, 0.25
 # Residual at the end of the colour scale of a graph, standard deviations: that beyond which loops are rejected.
 _LARGEST_RESIDUAL = 4.1
 # Pixels along the longer side of a map.
@@ -52,6 +52,8 @@ def before_after(
     source: PointCloud, target: PointCloud, poses: Mapping[str, Pose], *, path: str | os.PathLike[str] | None = None
 ) -> matplotlib.figure.Figure:
     """Compare poses: one row per pose shows the transformed source with the target, along the target's thinnest axis.
+
+    More than five rows are laid out side by side.
 
     If all points have the channels red, green and blue, target and source alternate in a checkerboard, in which
     patterns continue across tiles where the pose is right; a further panel shows the colour difference. Otherwise the
@@ -89,12 +91,18 @@ def before_after(
 
     width = min(_WIDEST / len(headings), _HIGHEST * view.width / view.height)
     height = width * view.height / view.width + 0.3
-    figure = figures.Figure((len(headings) * width + 0.3, len(rows) * height + 0.3), layout="constrained")
-    panels = figure.subplots(len(rows), len(headings), squeeze=False)
-    for panel, heading in zip(panels[0], headings, strict=True):
-        panel.set_title(heading)
-    for row, name, (picture, difference) in zip(panels, named, rows, strict=True):
+    beside = -(-len(rows) // _MOST_ROWS)
+    below = -(-len(rows) // beside)
+    figure = figures.Figure((beside * (len(headings) * width + 0.3), below * height + 0.3), layout="constrained")
+    columns = figure.subplots(below, beside * len(headings), squeeze=False)
+    panels = np.concatenate(np.split(columns, beside, axis=1))
+    for first in panels[::below]:
+        for panel, heading in zip(first, headings, strict=True):
+            panel.set_title(heading)
+    for row, name, (picture, difference) in zip(panels, named, rows, strict=False):
         _draw_row(row, name, picture, difference, detail)
+    for panel in panels[len(rows) :].flat:
+        panel.set_visible(False)
     if path is not None:
         figure.savefig(path, dpi=120)
     return figure

@@ -1,5 +1,7 @@
 """Voxel Gaussians: their statistics, and registration to them."""
 
+import warnings
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -101,6 +103,18 @@ def test_means_of_covariances():
     given = mcg.preprocess(target)
     given = given.replace(covariances=np.tile(np.eye(3), (len(given), 1, 1)))
     np.testing.assert_allclose(mcg.gaussians(given, SIZE, of="covariances").covariances[3], np.eye(3), atol=1e-6)
+
+
+def test_covariances_in_square_metres_beside_those_of_gicp():
+    source, target, _ = raw_pair(2000)
+    cells = mcg.gaussians(target, SIZE)
+    for clouds, name in (((source, cells), "target"), ((cells, source), "source")):
+        with pytest.warns(UserWarning, match=f'^{name}: its covariances have a median trace .*of="covariances"'):
+            mcg.register(*clouds, mcg.GICP())
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        mcg.register(cells, cells, mcg.GICP())
+        mcg.register(source, mcg.gaussians(target, SIZE, of="covariances"), mcg.GICP())
 
 
 def test_moments_in_jax():

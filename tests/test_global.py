@@ -154,14 +154,14 @@ def test_units_of_channels_do_not_matter(small):
 
 def test_mutual_neighbours_are_those_of_a_tree():
     rng = np.random.default_rng(0)
-    source, target = (rng.integers(-127, 128, (size, 6)).astype(np.float32) for size in (2500, 4200))
-    rows, matched = mutual_nearest(source, target, 2500)
+    source, target = (rng.integers(-127, 128, (size, 6)).astype(np.float32) for size in (5000, 6000))
+    rows, matched = mutual_nearest(source, target, 5000)
     (distances, nearest), (back, row) = cKDTree(target).query(source, 2), cKDTree(source).query(target)
     # Of rows at the same distance, the tree may find another one.
     matched_distances = np.linalg.norm(source[rows].astype(float) - target[matched], axis=1)
     np.testing.assert_allclose(matched_distances, distances[rows, 0], rtol=1e-12)
     np.testing.assert_allclose(matched_distances, back[matched], rtol=1e-12)
-    expected = np.flatnonzero(row[nearest[:, 0]] == np.arange(2500))
+    expected = np.flatnonzero(row[nearest[:, 0]] == np.arange(5000))
     assert len(np.intersect1d(expected, rows)) > 0.98 * len(expected)
     ratios = (distances[rows, 0] / np.maximum(distances[rows, 1], 1)) ** 2
     assert np.all(np.diff(ratios) >= -1e-6)

@@ -180,6 +180,8 @@ def test_what_is_wrong_is_named(room):
             mcg.multiway(*arguments)
     with pytest.raises(ValueError, match="init: expected one pose per cloud, 2, got 1"):
         mcg.multiway([cloud, cloud], mcg.GICP(), init=[np.eye(4)])
+    with pytest.raises(ValueError, match="init: expected one pose per cloud, got 'global'"):
+        mcg.multiway([cloud, cloud], mcg.GICP(), init="global")
     with pytest.raises(ValueError, match=r"init\[1\]: expected a rigid motion"):
         mcg.multiway([cloud, cloud], mcg.GICP(), init=[np.eye(4), 2 * np.eye(4)])
 

@@ -140,6 +140,16 @@ def test_padding_and_origin_change_nothing(wall):
     assert difference.mean() < 1e-3
 
 
+def test_many_poses_are_laid_out_side_by_side(rooms, tmp_path):
+    source, target, truth = rooms
+    figure = plot.before_after(source, target, {f"pose {i}": truth for i in range(8)})
+    width, height = figure.get_size_inches()
+    assert width > height
+    names = [panel.get_ylabel() for panel in figure.axes if panel.get_ylabel()]
+    assert sorted(names) == ["pose 0", "pose 1", "pose 2", "pose 3", "pose 4", "pose 5", "pose 6", "pose 7", "start"]
+    assert sum(not panel.get_visible() for panel in figure.axes) == 2
+
+
 def test_before_after_refuses_what_it_cannot_draw(wall):
     source, target, _ = wall
     with pytest.raises(ValueError, match=r"poses\['mirror'\]: .*rigid"):

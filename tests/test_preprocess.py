@@ -283,3 +283,13 @@ def test_malformed_input_is_turned_away_by_name(case):
 def test_points_inside_a_transformation_cannot_be_preprocessed():
     with pytest.raises(ValueError, match="tracers"):
         jax.jit(lambda points: ready(points).points)(jnp.asarray(POINTS))
+
+
+def test_too_few_voxels_for_the_neighbours():
+    points = np.random.default_rng(0).random((500, 3))
+    with pytest.warns(UserWarning, match=r"^voxel_size: 0.5 m leaves 8 of 500 points, fewer than the 20 neighbours"):
+        preprocess(points, 0.5)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        preprocess(points, 0.5, num_neighbors=5)
+        preprocess(points[:8])

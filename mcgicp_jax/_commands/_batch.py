@@ -84,7 +84,7 @@ def batch(
         output: Table to write or to resume, .csv or .npz, a row per pair: source, target, status, iterations, inliers,
             cost, rmse, the upper three rows of the pose, the reason if it could not be registered, and a fingerprint
             of files and options.
-        method: mc-gicp and color-icp use channels (intensity, colours, ...), the others geometry alone.
+        method: mc-gicp, color-icp and color-ndt use channels (intensity, colours, ...), the others geometry alone.
         glob: Pattern for the files of a folder, such as "*.ply".
         channels: Channels to use, such as intensity, or red green blue, or lab, hsv or yuv computed from these three;
             every cloud must have them. By default those common to both clouds of the first pair.
@@ -225,7 +225,7 @@ def _settings(pairs: Sequence[FilePair], name: MethodName, channels: Sequence[st
     print(f"points:    {'all kept' if voxel_size is None else f'voxels of {voxel_size:g} m'}")
     print(f"channels:  {listed(names)}")
     numbers = options.numbers_of(name)
-    if kind is mcg.ColorICP and not numbers:
+    if issubclass(kind, mcg.ColorICP) and not numbers:
         source, target = (
             mcg.preprocess(with_channels(cloud, names), voxel_size, options.num_neighbors) for cloud in clouds
         )

@@ -50,7 +50,7 @@ def multiway(
 
     Args:
         folder: Folder of clouds of one scene; in order of name, each should overlap the one before it.
-        method: mc-gicp and color-icp use channels (intensity, colours, ...), the others geometry alone.
+        method: mc-gicp, color-icp and color-ndt use channels (intensity, colours, ...), the others geometry alone.
         glob: Pattern for the files of the folder, such as "*.ply".
         channels: Channels to use, such as intensity, or red green blue, or lab, hsv or yuv computed from these three;
             every cloud must have them. By default those common to the first two clouds.
@@ -94,7 +94,7 @@ def multiway(
 
 def _method(name: MethodName, shared: Options, clouds: list[mcg.PointCloud]) -> AbstractMethod:
     kind, numbers = METHODS[name], shared.numbers_of(name)
-    if kind is mcg.ColorICP and not numbers:
+    if issubclass(kind, mcg.ColorICP) and not numbers:
         numbers = {"channel_weights": weights_from(clouds[1], clouds[0])}
     return kind(**numbers)
 

@@ -82,7 +82,7 @@ def odometry(
     Args:
         dataset: Format of the data set, or simulated scene.
         path: Folder of the sequence, such as sequences/04.
-        method: mc-gicp and color-icp use channels, the others geometry alone.
+        method: mc-gicp, color-icp and color-ndt use channels, the others geometry alone.
         channels: Channels to use, such as intensity, or red green blue, or lab, hsv or yuv computed from these three.
         num_frames: Number of frames to use, from the start; all means 20 for a simulated scene.
         against: Register each frame to the one before it, or to a map of all frames before it, which drifts less.
@@ -198,7 +198,7 @@ def _method(
     voxel_size: float | None,
 ) -> AbstractMethod:
     kind = METHODS[name]
-    if kind is not mcg.ColorICP or numbers:
+    if numbers or not issubclass(kind, mcg.ColorICP):
         return kind(**numbers)
     # Channel weights from the first two frames, as mc-gicp would choose them.
     first, second = (mcg.preprocess(with_channels(frame.cloud, channels), voxel_size) for frame in frames[:2])

@@ -23,7 +23,9 @@ from mcgicp_jax._options import Options as Chosen
 from mcgicp_jax._preprocess import check_preprocessing
 from mcgicp_jax._register import default_distances
 
-MethodName: TypeAlias = Literal["mc-gicp", "gicp", "color-icp", "point-to-plane", "point-to-point", "ndt", "d2d-ndt"]
+MethodName: TypeAlias = Literal[
+    "mc-gicp", "gicp", "color-icp", "point-to-plane", "point-to-point", "ndt", "color-ndt", "d2d-ndt"
+]
 File: TypeAlias = Annotated[Path | None, tyro.conf.arg(metavar="FILE", help_behavior_hint="")]
 Start: TypeAlias = Annotated[
     Literal["global"] | Path | None, tyro.conf.arg(metavar="{FILE,global}", help_behavior_hint="")
@@ -47,6 +49,7 @@ METHODS: dict[MethodName, type[AbstractMethod]] = {
     "point-to-plane": mcg.PointToPlane,
     "point-to-point": mcg.PointToPoint,
     "ndt": mcg.NDT,
+    "color-ndt": mcg.ColorNDT,
     "d2d-ndt": mcg.D2DNDT,
 }
 _RGB = ("red", "green", "blue")
@@ -89,10 +92,10 @@ class Options:
         hold_free_directions: Keep the initial pose in directions that neither geometry nor channels constrain.
         match_channels: Scale and shift the channels of the source to the distribution of those of the target.
         scales: Voxel sizes in metres, coarse to fine, at which to register first if the initial pose is far off. For
-            ndt and d2d-ndt the sizes of the cells; by default 32, 16 and 8 times the spacing of the points.
+            ndt, color-ndt and d2d-ndt the sizes of the cells; by default 32, 16 and 8 times the spacing of the points.
         channel_covariance: For mc-gicp: one variance for all channels, or one for each; channel units squared.
-        channel_weights: For mc-gicp and color-icp: one weight for all channels, or one for each; metres per channel
-            unit.
+        channel_weights: For mc-gicp, color-icp and color-ndt: one weight for all channels, or one for each; metres per
+            channel unit.
         epsilon: For mc-gicp and gicp: variance along the normal relative to that within the surface.
     """
 

@@ -78,7 +78,7 @@ class PreparedPair:
                 f"{name} needs channels in common, but {self.difference}; use gicp instead (--method gicp)"
             )
         numbers = self.options.numbers_of(name)
-        if kind is mcg.ColorICP and not numbers:
+        if issubclass(kind, mcg.ColorICP) and not numbers:
             numbers = {"channel_weights": weights_from(self.source, self.target)}
         return kind(**numbers).resolve(self.source, self.target)
 
@@ -92,8 +92,9 @@ class PreparedPair:
         source, target, options = self.source, self.target, self.options.registration()
         if method.needs_covariances:
             # Cells are made of all points.
-            source = self.whole[0] if "source" in method.needs_covariances else source
-            target = self.whole[1]
+            whole = [with_channels(cloud, self.channels) for cloud in self.whole]
+            source = whole[0] if "source" in method.needs_covariances else source
+            target = whole[1]
             options["scales"] = self.cells(method)
         return mcg.register(source, target, method, init=self.start, **options)
 
@@ -125,7 +126,7 @@ def register(
     Args:
         source: Cloud to move.
         target: Cloud that stays.
-        method: mc-gicp and color-icp use channels (intensity, colours, ...), the others geometry alone.
+        method: mc-gicp, color-icp and color-ndt use channels (intensity, colours, ...), the others geometry alone.
         output: File for the pose in KITTI format: the upper three rows of its matrix on one line.
         aligned: File for the whole source cloud moved by the pose, such as out.ply.
     """
@@ -192,7 +193,7 @@ def demo(output: Path = Path("mcgicp_demo")) -> int:
     print(
         "Geometry does not constrain motion along a flat wall: methods that use it alone report it (degenerate) and"
         "\nkeep the initial pose along it, so in their rows of the picture the posters do not fit."
-        "\nmc-gicp and color-icp are constrained by the channels red, green and blue."
+        "\nmc-gicp, color-icp and color-ndt are constrained by the channels red, green and blue."
         f"\nThe clouds are in {output}; try: mcgicp register {source_file} {target_file}"
     )
     return 0

@@ -21,21 +21,24 @@ import numpy as np
 import mcgicp_jax as mcg
 from mcgicp_jax import datasets, metrics
 from mcgicp_jax._loops import edge_from
+from tests.benchmarks.global_pose import desk
 from tests.graphs import garage, grid, measured, moved, sphere, with_gtsam
 
 DATA = pathlib.Path(os.environ.get("MCGICP_DATA", pathlib.Path(__file__).parents[3] / "shared" / "data"))
 GRAPHS = {"grid": grid, "sphere": sphere, "garage": garage}
 NUM_TURNS = 5
-# Of the false loops: their fill makes a factorisation of the larger graphs take minutes. Sides of the grid, turns of
-# the sphere and poses per turn, floors of the garage and poses per floor.
-SMALLER = {"grid": grid(5), "sphere": sphere(12, 20), "garage": garage(4, 60)}
+# Ten small graphs of each kind with false loops, and one large one. Sides of the grid, turns of the sphere and poses in
+# each, floors of the garage and poses on each.
+SMALL = {"grid": grid(5), "sphere": sphere(12, 20), "garage": garage(4, 60)}
+# Noise of the starts: metres, radians.
+NOISES = ((0.05, 0.02), (0.1, 0.1), (0.2, 0.3))
 
 
 def sizes() -> None:
     """Cost and time of the minimum, from odometry."""
     print(
         f"{'':>8} {'poses':>6} {'edges':>6} {'steps':>6} {'ours, s':>8} {'gtsam, s':>9} {'ratio':>6} {'cost':>8} "
-        "relative"
+        "relative, covariances, s"
     )
     for name, make in GRAPHS.items():
         graph, _ = measured(*make())
@@ -50,15 +53,34 @@ def sizes() -> None:
             costs.append(found.cost / cost - 1)
         ours, theirs, ratio = (statistics.median(each) for each in zip(*times, strict=True))
         size = f"{len(graph.poses):6d} {len(graph.edges):6d} {found.num_iterations:6d}"
-        print(f"{name:>8} {size} {ours:8.3f} {theirs:9.3f} {ratio:6.1f} {found.cost:8.1f} {costs[0]:.0e}", flush=True)
+        start = time.perf_counter()
+        found.covariance  # noqa: B018
+        spent = time.perf_counter() - start
+        numbers = f"{ours:8.3f} {theirs:9.3f} {ratio:6.1f} {found.cost:8.1f} {costs[0]:.0e} {spent:.1f}"
+        print(f"{name:>8} {size} {numbers}", flush=True)
+
+
+def first_poses() -> None:
+    """Steps and cost from odometry, and from the edges alone where loops are trusted."""
+    for (name, make), deviations in itertools.product(GRAPHS.items(), NOISES):
+        graph, _ = measured(*make(), deviations=deviations)
+        edges = graph.edges
+        trusted = mcg.Edge(edges.i, edges.j, edges.T_i_j, edges.information)
+        cells = []
+        for poses in (graph.poses, None):
+            found = mcg.optimize_poses(mcg.PoseGraph(poses, trusted), robust=False)
+            cells.append(f"{found.status.name}, {found.num_iterations} steps, cost {found.cost:.0f}")
+        print(f"{name:>8} {deviations}: odometry {cells[0]}; relaxation {cells[1]}", flush=True)
 
 
 def false_loops() -> None:
-    """Share of loops kept rightly, and the error of the poses, with false loops added; of ten graphs each."""
-    print(f"{'':>8} {'false':>6} {'ATE / clean':>12} {'precision':>10} {'recall':>8} {'s':>6}")
-    for (name, (poses, loops)), fraction in itertools.product(SMALLER.items(), (0.1, 0.3, 0.5)):
+    """Share of loops kept rightly, and the error of the poses, with false loops added."""
+    print(f"{'':>8} {'poses':>6} {'false':>6} {'ATE / clean':>12} {'precision':>10} {'recall':>8} {'s':>6}")
+    large = [(name, make(), 1) for name, make in GRAPHS.items() if name != "grid"]
+    graphs = [*((name, made, 10) for name, made in SMALL.items()), *large]
+    for (name, (poses, loops), number), fraction in itertools.product(graphs, (0.1, 0.3, 0.5)):
         rows = []
-        for seed in range(10):
+        for seed in range(number):
             clean, _ = measured(poses, loops, seed=seed)
             best = metrics.ate(mcg.optimize_poses(clean).poses, poses, alignment="first")
             graph, true = measured(poses, loops, seed=seed, false=fraction)
@@ -70,7 +92,7 @@ def false_loops() -> None:
             rows.append((error / best, (kept & right).sum() / kept.sum(), (kept & right).sum() / right.sum(), spent))
         ratio, precision, recall, spent = np.array(rows).T
         numbers = f"{ratio.max():12.3f} {precision.mean():10.4f} {recall.mean():8.4f} {spent.mean():6.1f}"
-        print(f"{name:>8} {fraction:6.0%} {numbers}", flush=True)
+        print(f"{name:>8} {len(poses):6d} {fraction:6.0%} {numbers}", flush=True)
 
 
 def scenes() -> None:
@@ -148,18 +170,21 @@ def rgbd() -> None:
     sets = {
         "7-Scenes": kitchen,
         "ICL": list(zip(room, mcg.io.read_poses(DATA / "icl_livingroom1" / "poses.txt"), strict=True)),
+        "TUM": [(frame.cloud, frame.pose) for frame in desk()],
     }
     for name, frames in sets.items():
         raw, truth = zip(*frames, strict=True)
         clouds = [mcg.preprocess(cloud, 0.03) for cloud in raw]
+        # Two positions fit each other after any rotation.
+        alignment = "umeyama" if len(truth) > 2 else "first"
         cells = []
         for method in (mcg.GICP(), mcg.MultiChannelGICP()):
             steps = [step.pose for step in mcg.odometry(clouds, method)]
             found = mcg.multiway(clouds, method)
-            errors = [1e3 * metrics.ate(poses, truth) for poses in (steps, found.poses)]
+            errors = [1e3 * metrics.ate(poses, truth, alignment) for poses in (steps, found.poses)]
             cells.append(f"{type(method).__name__} {errors[0]:.3f} by odometry, {errors[1]:.3f} by multiway")
         if importlib.util.find_spec("open3d"):
-            cells.append(f"Open3D {1e3 * metrics.ate(open3d_multiway(clouds, 0.03), truth):.3f}")
+            cells.append(f"Open3D {1e3 * metrics.ate(open3d_multiway(clouds, 0.03), truth, alignment):.3f}")
         print(f"{name}, {len(clouds)} frames, ATE in mm: " + "; ".join(cells), flush=True)
 
 
@@ -196,6 +221,7 @@ def open3d_multiway(clouds: Sequence[mcg.PointCloud], voxel_size: float) -> list
 def main() -> None:
     parts: dict[str, Callable[[], None]] = {
         "sizes": sizes,
+        "first-poses": first_poses,
         "false-loops": false_loops,
         "scenes": scenes,
         "corridor": corridor,

@@ -135,7 +135,7 @@ def solvers_for(voxel: float) -> dict[str, Solver]:
         "MC-GICP, scales 8, 4, 2": ours(voxel, mcg.MultiChannelGICP(), 8, 4, 2),
         "NDT, scales 32 to 2": ours(voxel, mcg.NDT(), *cells),
         "D2D-NDT, scales 32 to 2": ours(voxel, mcg.D2DNDT(), *cells),
-        "D2D-NDT, scale 2": ours(voxel, mcg.D2DNDT(), 2),
+        "D2D-NDT, scale 12": ours(voxel, mcg.D2DNDT(), 12),
     }
     if importlib.util.find_spec("small_gicp"):
         solvers |= {f"small_gicp, {kind}": small_gicp(voxel, kind) for kind in ("GICP", "VGICP")}
