@@ -24,6 +24,7 @@ from mcgicp_jax._preprocess import preprocess
 from mcgicp_jax._register import align, find_correspondences, global_pose, register
 from mcgicp_jax._result import Registration, Status
 from mcgicp_jax._search import AbstractSearch, Correspondences
+from mcgicp_jax._spaces import rgb_to_hsv, rgb_to_lab, rgb_to_yuv
 from mcgicp_jax._trees import AbstractTreeSearch, KDTreeSearch
 
 __all__ = [
@@ -77,6 +78,9 @@ __all__ = [
     "register",
     "register_as_completed",
     "register_batch",
+    "rgb_to_hsv",
+    "rgb_to_lab",
+    "rgb_to_yuv",
     "voxel_cells",
 ]
 __version__ = "0.1.0"

@@ -16,6 +16,7 @@ LAYERS = {
         "_cloud",
         "_kept",
         "_preprocess",
+        "_spaces",
         "_map",
         "_formats",
         "_initial_poses",

@@ -86,8 +86,8 @@ def batch(
             of files and options.
         method: mc-gicp, color-icp and color-ndt use channels (intensity, colours, ...), the others geometry alone.
         glob: Pattern for the files of a folder, such as "*.ply".
-        channels: Channels to use, such as intensity, or red green blue; every cloud must have them. By default those
-            common to both clouds of the first pair.
+        channels: Channels to use, such as intensity, or red green blue, or lab, hsv or yuv computed from these three;
+            every cloud must have them. By default those common to both clouds of the first pair.
     """
     shared.check()
     shared.check_method(method)

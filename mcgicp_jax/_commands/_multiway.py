@@ -52,8 +52,8 @@ def multiway(
         folder: Folder of clouds of one scene; in order of name, each should overlap the one before it.
         method: mc-gicp, color-icp and color-ndt use channels (intensity, colours, ...), the others geometry alone.
         glob: Pattern for the files of the folder, such as "*.ply".
-        channels: Channels to use, such as intensity, or red green blue; every cloud must have them. By default those
-            common to the first two clouds.
+        channels: Channels to use, such as intensity, or red green blue, or lab, hsv or yuv computed from these three;
+            every cloud must have them. By default those common to the first two clouds.
         init: File with a pose to start from for each cloud: 12 numbers (KITTI) or 8 (TUM) on each line.
         output: File for the poses, cloud to world, in KITTI format.
         map: File for the map in the frame of the first cloud, such as map.ply.

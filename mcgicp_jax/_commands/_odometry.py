@@ -83,7 +83,7 @@ def odometry(
         dataset: Format of the data set, or simulated scene.
         path: Folder of the sequence, such as sequences/04.
         method: mc-gicp, color-icp and color-ndt use channels, the others geometry alone.
-        channels: Channels to use, such as intensity, or red green blue.
+        channels: Channels to use, such as intensity, or red green blue, or lab, hsv or yuv computed from these three.
         num_frames: Number of frames to use, from the start; all means 20 for a simulated scene.
         against: Register each frame to the one before it, or to a map of all frames before it, which drifts less.
         map_radius: Metres; points further from the sensor leave the map. By default the range of the first frame.

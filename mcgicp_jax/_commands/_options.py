@@ -5,7 +5,7 @@ from __future__ import annotations
 import bisect
 import errno
 import os
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeAlias
@@ -37,6 +37,9 @@ Tolerance: TypeAlias = Annotated[
 ]
 KernelName: TypeAlias = Literal["huber", "cauchy", "geman-mcclure", "tukey"]
 Epsilon: TypeAlias = Annotated[float | None, tyro.conf.arg(metavar="FLOAT", help_behavior_hint="(default: 0.001)")]
+CommonNames: TypeAlias = Annotated[
+    tuple[str, ...], tyro.conf.arg(metavar="NAMES", help_behavior_hint="(default: all in common)")
+]
 
 VERSION = mcg.__version__
 METHODS: dict[MethodName, type[AbstractMethod]] = {
@@ -49,6 +52,9 @@ METHODS: dict[MethodName, type[AbstractMethod]] = {
     "color-ndt": mcg.ColorNDT,
     "d2d-ndt": mcg.D2DNDT,
 }
+_RGB = ("red", "green", "blue")
+# Channels that are computed from red, green and blue.
+_SPACES: dict[str, Callable[..., Any]] = {"lab": mcg.rgb_to_lab, "hsv": mcg.rgb_to_hsv, "yuv": mcg.rgb_to_yuv}
 # Larger clouds are downsampled to at most this many points by default: registered in a tenth of a second.
 _MOST_POINTS = 20_000
 _KERNELS: dict[KernelName, type[AbstractKernel]] = {
@@ -154,10 +160,12 @@ class PairOptions(Options):
     Attributes:
         init: File with the initial pose T_target_source: a 4x4 matrix, or 12 numbers (KITTI) or 8 (TUM) on one line. By
             default the identity. global: the pose is found from any start by local features.
+        channels: Channels to use, such as intensity, or red green blue, or lab, hsv or yuv computed from these three.
         plot: File for a picture of the clouds before and after registration, such as out.png.
     """
 
     init: Start = None
+    channels: CommonNames = ()
     plot: File = None
 
     def check(self) -> None:
@@ -219,17 +227,23 @@ def round_voxel_size(clouds: Sequence[mcg.PointCloud], most: int) -> float:
 
 
 def with_channels(cloud: mcg.PointCloud, names: Sequence[str]) -> mcg.PointCloud:
-    """The cloud with only the named channels, in this order."""
-    missing = [name for name in names if name not in cloud.channel_names]
+    """The cloud with only the named channels, in this order; lab, hsv and yuv are computed from red, green and blue."""
+    needed = [name for each in names for name in (_RGB if each in _SPACES else (each,))]
+    missing = [name for name in dict.fromkeys(needed) if name not in cloud.channel_names]
     if missing:
         raise ValueError(f"no channel {', '.join(missing)}; there are {listed(cloud.channel_names)}")
-    columns = [cloud.channel_names.index(name) for name in names]
+    columns = [cloud.channel_names.index(name) for name in needed]
+    channels, known, chosen = np.asarray(cloud.channels)[:, columns], cloud.channel_valid, list[str]()
+    known = None if known is None else np.asarray(known)[:, columns]
+    for name in names:
+        here = slice(len(chosen), len(chosen) + len(_RGB))
+        if name in _SPACES:
+            channels[:, here] = _SPACES[name](channels[:, here])
+            if known is not None:
+                known[:, here] = known[:, here].all(axis=1, keepdims=True)
+        chosen += [f"{name}_{i}" for i in range(len(_RGB))] if name in _SPACES else [name]
     return mcg.PointCloud(
-        cloud.points,
-        np.asarray(cloud.channels)[:, columns],
-        channel_valid=None if cloud.channel_valid is None else np.asarray(cloud.channel_valid)[:, columns],
-        covariances=cloud.covariances,
-        channel_names=names,
+        cloud.points, channels, channel_valid=known, covariances=cloud.covariances, channel_names=chosen
     )
 
 

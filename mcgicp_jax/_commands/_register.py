@@ -49,7 +49,7 @@ class PreparedPair:
         self.start = np.eye(4) if options.init in (None, "global") else _read_pose(Path(options.init))
         self.whole = io.read(source), io.read(target)
         names = [cloud.channel_names for cloud in self.whole]
-        self.channels = [name for name in names[0] if name in names[1]]
+        self.channels = list(options.channels) or [name for name in names[0] if name in names[1]]
         self.difference = f"{source} has {listed(names[0])}, {target} has {listed(names[1])}"
         voxel_size = voxel_size_for(self.whole, options)
         self.source, self.target = (
@@ -64,7 +64,8 @@ class PreparedPair:
         if not cells:
             print(f"matches:   up to {described_distance(options, self.target)} apart")
         # Without common channels, `method` raises an error if the method needs any.
-        difference = f" ({self.difference})" if self.channels and names[0] != names[1] else ""
+        unused = self.channels and names[0] != names[1] and not options.channels
+        difference = f" ({self.difference})" if unused else ""
         print(f"channels:  {listed(self.channels)}{difference}")
         if options.init == "global":
             self.start = _found(self.whole, self.channels)
