@@ -37,8 +37,8 @@ UNCONSTRAINED = 10 * LEAST_DAMPING
 # graphs a step was seen to lower it by 1e-2 to 1e-3 of what the one before did: the cost is then right to 1e-8.
 TOLERANCE = 1e-6
 # Entries of the factors per entry of the matrix beyond which conjugate gradients are quicker. With half of the loops
-# false there are 53 in the sphere of 2,500 poses and 38 in the garage of 1,600: conjugate gradients then take a tenth
-# of the time. At 12 to 20 they take as long as the factorisation. Without false loops there are 6 and 2.
+# false, the sphere of 2,500 poses has 53 and the garage of 1,600 has 38: conjugate gradients then take a tenth of the
+# time. At 12 to 20 they take as long as the factorisation. Without false loops they have 6 and 2.
 _LARGEST_FILL = 20.0
 # Relative residual of conjugate gradients, which serve for steps far from the minimum, and largest number of products.
 _RESIDUAL, _MOST_PRODUCTS = 1e-2, 300
