@@ -83,7 +83,7 @@ def register_on_host(
         records.append(state.record)
     assessment = Assessment(
         Deferred(partial(constraints_of, state)),
-        Deferred(partial(_covariance, state, matches, gate, problem, num_threads)),
+        Deferred(partial(_covariance, state, matches, gate, problem, index_of, num_threads)),
     )
     return state, assessment, history_of(np.stack([np.asarray(record) for record in records]))
 
@@ -185,7 +185,12 @@ def _matched(
 
 
 def _covariance(
-    state: State, matches: _Matches, gate: Float[AnyScalar, ""], problem: Problem, num_threads: int | None
+    state: State,
+    matches: _Matches,
+    gate: Float[AnyScalar, ""],
+    problem: Problem,
+    index_of: Callable[[bool], AbstractIndex],
+    num_threads: int | None,
 ) -> Float[np.ndarray, "6 6"]:
     """Covariance of the final pose, float64."""
     source, target = matches.source, matches.target
@@ -204,8 +209,10 @@ def _covariance(
     num_channels = np.sum(np.any(source.rows.descriptors != 0, axis=0))
     discount_of_all = discounts(np.where(counts[:, None], rows, np.nan), num_channels)
 
+    responding = None if problem.method.estimates is None else _responding(state.pose, matches, gate, problem, index_of)
+
     def scores(index: Any) -> Scores:
-        weighing = (problem.method, problem.robust, discount_of_all, np.int32(matches.size))
+        weighing = (problem.method, problem.robust, discount_of_all, np.int32(matches.size), responding)
         return _scores(moving, state.sums, *matches.block(index), gate, matches.details(index), *weighing)
 
     parts = map_blocks(scores, matches.size, num_threads)
@@ -259,9 +266,36 @@ def _scores(
     robust: AbstractKernel | None,
     discount: Float[AnyArray, "2"],
     num_cells: Int[AnyScalar, ""],
+    responding: AbstractMethod | None,
 ) -> Scores:
     matched = _matched(moving, source, target, found, gate)
-    return scores_of(moving, sums.center, sums.radius, matched, details, discount, num_cells, method, robust)
+    return scores_of(
+        moving, sums.center, sums.radius, matched, details, discount, num_cells, method, robust, responding
+    )
+
+
+def _responding(
+    pose: jaxlie.SE3,
+    matches: _Matches,
+    gate: Float[AnyScalar, ""],
+    problem: Problem,
+    index_of: Callable[[bool], AbstractIndex],
+) -> AbstractMethod:
+    """`AbstractMethod.responding` for a sample of the source points."""
+    some, counts = sampled_rows(matches.source.rows.valid)
+    source = jax.tree.map(lambda array: array[some], matches.source)
+    rotation, translation = _moving(pose, source.rows.points.dtype)
+    found = []
+    for shift in np.asarray(problem.method.shifts):
+        moved = np.concatenate([np.asarray(pose.wxyz_xyz)[:4], translation + shift])
+        (indices,) = index_of(True).nearest(moved, by_position(source.rows), float(gate))
+        again = _Matches(source, problem.target, indices)
+        again.found &= counts
+        moving = (rotation, translation + shift)
+        found.append(
+            map_rows(lambda i, a=again, m=moving: _evidence(m, *a.rows_at(i), gate, problem.method), some.size)
+        )
+    return problem.method.responding(np.stack(found))
 
 
 def correspondences_at(

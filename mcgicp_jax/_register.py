@@ -359,7 +359,7 @@ def _run(problem: Problem, target: PointCloud, search: AbstractSearch, max_itera
 
     def finish() -> tuple[State, Assessment, dict[str, Any]]:
         found = replace(fixed, method=jax.lax.stop_gradient(method))
-        assessment = assess(state, found, matched_rows(fixed.source, fixed.target, matches), matches)
+        assessment = assess(state, found, matched_rows(fixed.source, fixed.target, matches), matches, search)
         matched = matched_rows(problem.source, problem.target, matches)
         return differentiable(state, matched, method, problem.robust), assessment, history
 
