@@ -180,10 +180,10 @@ class AbstractMethod(Numbers):
         return self
 
     def channel_observability(
-        self, source: Table, target: Table, rotation: Float[Array, "3 3"]
-    ) -> Float[Array, "6 N"] | None:
-        """Observability of correspondences by the channels, see `_observability`; None: the mean of their points'."""
-        return None
+        self, mean: Float[Array, "6 N"], source: Table, target: Table, rotation: Float[Array, "3 3"]
+    ) -> Float[Array, "6 N"]:
+        """Observability of correspondences by the channels, see `_observability`, given the mean of their points'."""
+        return mean
 
     @property
     def compensates(self) -> bool:
@@ -485,11 +485,13 @@ class MultiChannelGICP(AbstractGeneralized):
         return self.with_estimates(self._known_term().responding(rows))
 
     def channel_observability(
-        self, source: Table, target: Table, rotation: Float[Array, "3 3"]
-    ) -> Float[Array, "6 N"] | None:
+        self, mean: Float[Array, "6 N"], source: Table, target: Table, rotation: Float[Array, "3 3"]
+    ) -> Float[Array, "6 N"]:
         if self.term is None:
-            return None
-        return correlated_slopes(source, target, rotation, self.weights(self.term.gains.shape[0]))
+            return mean
+        # Far from the pose, slopes of matched points have nothing to do with each other.
+        correlated = correlated_slopes(source, target, rotation, self.weights(self.term.gains.shape[0]))
+        return jnp.where(self.term.is_on, correlated, mean)
 
     def _known_term(self) -> Term:
         if self.term is None:

@@ -232,9 +232,9 @@ def mean_observability(
 ) -> list[Float[Array, "6 n"]]:
     """O per correspondence, in the target's frame: mean over its two points; of the geometry, then of the channels."""
     sides = zip(observability_of(matched.source), observability_of(matched.target), strict=True)
-    found = [0.5 * (alg.rotate(rotation, source) + target) for source, target in sides]
-    channels = method.channel_observability(matched.source, matched.target, rotation)
-    return found if channels is None else [found[0], channels]
+    geometry, *channels = [0.5 * (alg.rotate(rotation, source) + target) for source, target in sides]
+    matches = matched.source, matched.target, rotation
+    return [geometry, *(method.channel_observability(mean, *matches) for mean in channels)]
 
 
 def powers(p: Float[Array, "3 N"]) -> Float[Array, "10 N"]:
