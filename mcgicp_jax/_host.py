@@ -143,8 +143,19 @@ def _estimated(
     """The method with its estimates from a sample of the matches at a pose."""
     moving = _moving(pose, matches.source.rows.points.dtype)
     some, counts = sampled_rows(matches.source.rows.valid)
-    rows = map_rows(lambda index: _evidence(moving, *matches.rows_at(some[index]), gate, method), some.size)
+    rows = _evidence_at(moving, matches, some, gate, method)
     return method.with_estimates(method.estimated(rows, counts, matches.source.rows.valid))
+
+
+def _evidence_at(
+    moving: Moving, matches: _Matches, rows: Int[np.ndarray, "n"], gate: Float[AnyScalar, ""], method: AbstractMethod
+) -> Float[np.ndarray, "n L"]:
+    """`AbstractMethod.evidence` for some source points."""
+
+    def evidence(index: Any) -> Any:
+        return _evidence(moving, *matches.rows_at(rows[index]), gate, method)
+
+    return map_rows(evidence, rows.size)
 
 
 @jax.jit
@@ -291,10 +302,8 @@ def _responding(
         (indices,) = index_of(True).nearest(moved, by_position(source.rows), float(gate))
         again = _Matches(source, problem.target, indices)
         again.found &= counts
-        moving = (rotation, translation + shift)
-        found.append(
-            map_rows(lambda i, a=again, m=moving: _evidence(m, *a.rows_at(i), gate, problem.method), some.size)
-        )
+        everything = np.arange(some.size)
+        found.append(_evidence_at((rotation, translation + shift), again, everything, gate, problem.method))
     return problem.method.responding(np.stack(found))
 
 

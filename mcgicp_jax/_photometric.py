@@ -126,7 +126,8 @@ class Term(eqx.Module):
             robust: kernel of each residual in standard deviations. Each has its own weight: a reflection is an outlier
                 of the channels, but not of the geometry.
         """
-        kernel = Cauchy(_KERNEL_SCALE) if robust is None else robust
+        scale: Any = _KERNEL_SCALE
+        kernel = Cauchy(scale) if robust is None else robust
         terms = []
         for k, (value, slope) in enumerate(zip(residuals.values, residuals.slopes, strict=True)):
             counts = (self.deviations[k] > 0) & ~jnp.isnan(value)
@@ -177,9 +178,8 @@ class Term(eqx.Module):
         alone = xp.sum((scores**2).sum(axis=1), axis=1)
         expected = xp.where(expected > 0, expected, 1)
         designs = xp.maximum((alone + (seen - alone) / fraction) / expected, 1)
-        dtype = self.spacing.dtype
-        numbers = (each.astype(dtype) for each in (deviations, designs, gains, offsets))
-        return Term(self.spacing, *numbers, self.compensates)
+        numbers = {"deviations": deviations, "designs": designs, "gains": gains, "offsets": offsets}
+        return replace(self, **{name: array.astype(self.spacing.dtype) for name, array in numbers.items()})
 
     @property
     def shifts(self) -> Float[AnyArray, "6 3"]:
@@ -238,7 +238,7 @@ def _squared_sums(scores: Float[AnyArray, "K 3 n"], cells: Int[AnyArray, "n"]) -
     """Σ_c |u_c|², with u_c the sum of the scores in a cell."""
     columns = scores.reshape(-1, scores.shape[-1])
     if namespace(scores, cells) is np:
-        sums = np.stack([np.bincount(cells, column) for column in columns], axis=1)
+        sums: Any = np.stack([np.bincount(cells, column) for column in columns], axis=1)
     else:
         sums = jnp.zeros_like(columns.T).at[cells].add(columns.T)
     return (sums**2).sum(axis=0).reshape(scores.shape[:2]).sum(axis=1)

@@ -36,10 +36,10 @@ def rgb_to_lab(rgb: Values) -> Float[AnyArray, "*batch 3"]:
     Raises:
         ValueError: if the last axis does not have three entries.
     """
-    rgb, xp = _colors(rgb)
-    power = rgb > _SRGB_LIMIT
-    base = (xp.where(power, rgb, 1) + _SRGB_OFFSET) / (1 + _SRGB_OFFSET)
-    linear = xp.where(power, base**_SRGB_POWER, rgb / _SRGB_SLOPE)
+    colors, xp = _colors(rgb)
+    power = colors > _SRGB_LIMIT
+    base = (xp.where(power, colors, 1) + _SRGB_OFFSET) / (1 + _SRGB_OFFSET)
+    linear = xp.where(power, base**_SRGB_POWER, colors / _SRGB_SLOPE)
     xyz = xp.stack([_weighted(row, linear) for row in _XYZ_OF_WHITE], -1)
     root = xyz > _LAB_LIMIT
     x, y, z = _parts(xp.where(root, xp.cbrt(xp.where(root, xyz, 1)), _LAB_SLOPE * xyz + _LAB_OFFSET))
@@ -61,8 +61,8 @@ def rgb_to_hsv(rgb: Values) -> Float[AnyArray, "*batch 3"]:
     Raises:
         ValueError: if the last axis does not have three entries.
     """
-    rgb, xp = _colors(rgb)
-    red, green, blue = _parts(rgb)
+    colors, xp = _colors(rgb)
+    red, green, blue = _parts(colors)
     value = xp.maximum(xp.maximum(red, green), blue)
     chroma = value - xp.minimum(xp.minimum(red, green), blue)
     colored, bright = chroma > 0, value > 0
@@ -90,9 +90,9 @@ def rgb_to_yuv(rgb: Values) -> Float[AnyArray, "*batch 3"]:
     Raises:
         ValueError: if the last axis does not have three entries.
     """
-    rgb, xp = _colors(rgb)
-    luma = _weighted(_LUMA, rgb)
-    red, _, blue = _parts(rgb)
+    colors, xp = _colors(rgb)
+    luma = _weighted(_LUMA, colors)
+    red, _, blue = _parts(colors)
     return xp.stack([luma, _BLUE * (blue - luma), _RED * (red - luma)], -1)
 
 
