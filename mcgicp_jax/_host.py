@@ -22,7 +22,7 @@ import jax
 import jax.numpy as jnp
 import jaxlie
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Bool, Float, Int
 
 from mcgicp_jax._blocks import map_blocks, map_rows
 from mcgicp_jax._deferred import Deferred
@@ -91,7 +91,7 @@ def register_on_host(
         state = update(pose, status, num_iterations, sums, settings, problem.fusion)
         pose, num_iterations, status = state.pose, np.asarray(state.num_iterations), np.asarray(state.status)
         records.append(state.record)
-    moments = Deferred(partial(_moments, state, matches, gate, problem, num_threads))
+    moments = Deferred(partial(_moments, state, matches, gate, problem, index_of, num_threads))
     assessment = Assessment(
         Deferred(partial(constraints_of, state)), Deferred(partial(_covariance, state, moments, problem))
     )
@@ -165,8 +165,19 @@ def _estimated(
     """The method with its estimates from a sample of the matches at a pose."""
     moving = _moving(pose, matches.source.rows.points.dtype)
     some, counts = sampled_rows(matches.source.rows.valid)
-    rows = map_rows(lambda index: _evidence(moving, *matches.rows_at(some[index]), gate, method), some.size)
+    rows = _evidence_at(moving, matches, some, gate, method)
     return method.with_estimates(method.estimated(rows, counts, matches.source.rows.valid))
+
+
+def _evidence_at(
+    moving: Moving, matches: _Matches, rows: Int[np.ndarray, "n"], gate: Float[AnyScalar, ""], method: AbstractMethod
+) -> Float[np.ndarray, "n L"]:
+    """`AbstractMethod.evidence` for some source points."""
+
+    def evidence(index: Any) -> Any:
+        return _evidence(moving, *matches.rows_at(rows[index]), gate, method)
+
+    return map_rows(evidence, rows.size)
 
 
 @jax.jit
@@ -224,7 +235,12 @@ def _covariance(state: State, moments: Deferred[Moments], problem: Problem) -> F
 
 
 def _moments(
-    state: State, matches: _Matches, gate: Float[AnyScalar, ""], problem: Problem, num_threads: int | None
+    state: State,
+    matches: _Matches,
+    gate: Float[AnyScalar, ""],
+    problem: Problem,
+    index_of: Callable[[bool], AbstractIndex],
+    num_threads: int | None,
 ) -> Moments:
     """Sums over the scores of all correspondences at the final pose, float64."""
     source, target = matches.source, matches.target
@@ -244,8 +260,10 @@ def _moments(
     num_channels = np.sum(np.any(source.rows.descriptors != 0, axis=0))
     discount_of_all = discounts(np.where(counts[:, None], rows, np.nan), num_channels)
 
+    responding = None if problem.method.estimates is None else _responding(state.pose, matches, gate, problem, index_of)
+
     def scores(index: Any) -> Scores:
-        weighing = (problem.method, problem.robust, discount_of_all, np.int32(matches.size))
+        weighing = (problem.method, problem.robust, discount_of_all, np.int32(matches.size), responding)
         return _scores(moving, state.sums, *matches.block(index), gate, matches.details(index), *weighing)
 
     parts = map_blocks(scores, matches.size, num_threads)
@@ -295,10 +313,33 @@ def _scores(
     robust: AbstractKernel | None,
     discount: Float[AnyArray, "2"],
     num_cells: Int[AnyScalar, ""],
+    responding: AbstractMethod | None,
 ) -> Scores:
     matched = _matched(moving, source, target, found, gate)
     flat = Details(*_flat(*details))
-    return scores_of(moving, sums.center, sums.radius, matched, flat, discount, num_cells, method, robust)
+    return scores_of(moving, sums.center, sums.radius, matched, flat, discount, num_cells, method, robust, responding)
+
+
+def _responding(
+    pose: jaxlie.SE3,
+    matches: _Matches,
+    gate: Float[AnyScalar, ""],
+    problem: Problem,
+    index_of: Callable[[bool], AbstractIndex],
+) -> AbstractMethod:
+    """`AbstractMethod.responding` for a sample of the source points."""
+    some, counts = sampled_rows(matches.source.rows.valid)
+    source = jax.tree.map(lambda array: array[some], matches.source)
+    rotation, translation = _moving(pose, source.rows.points.dtype)
+    found = []
+    for shift in np.asarray(problem.method.shifts):
+        moved = np.concatenate([np.asarray(pose.wxyz_xyz)[:4], translation + shift])
+        indices = index_of(True).nearest(moved, by_position(source.rows), float(gate))
+        again = _Matches(source, problem.target, indices)
+        again.found &= counts
+        everything = np.arange(some.size)
+        found.append(_evidence_at((rotation, translation + shift), again, everything, gate, problem.method))
+    return problem.method.responding(np.stack(found))
 
 
 def correspondences_at(

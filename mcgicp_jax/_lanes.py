@@ -98,7 +98,9 @@ class _Group(Generic[Key]):
         ended = np.asarray(carries[0].status) >= 0
         if not any(ended[lane] and key is not None for lane, key in enumerate(self._keys)):
             return
-        states, records, assessments = jax.device_get((carries[0], carries[2], assess_lanes(problems, carries)))
+        states, records, assessments = jax.device_get(
+            (carries[0], carries[2], assess_lanes(problems, carries, self._search))
+        )
         for lane, key in enumerate(self._keys):
             if key is not None and ended[lane]:
                 self._keys[lane] = None
@@ -138,13 +140,13 @@ def run_lanes(problems: Problem, carries: Carry, search: AbstractSearch, num_ste
 
 
 @jax.jit
-def assess_lanes(problems: Problem, carries: Carry) -> Assessment:
+def assess_lanes(problems: Problem, carries: Carry, search: AbstractSearch) -> Assessment:
     """Information matrices, directions and covariances of stacked loops, at their current poses."""
 
     def of_lane(problem: Problem, carry: Carry) -> Assessment:
         state, matches, _, estimates = carry
         matches = cleaned(matches)
         problem = replace(problem, method=problem.method.with_estimates(estimates))
-        return assess(state, problem, matched_rows(problem.source, problem.target, matches), matches)
+        return assess(state, problem, matched_rows(problem.source, problem.target, matches), matches, search)
 
     return jax.vmap(of_lane)(problems, carries)

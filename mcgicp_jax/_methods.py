@@ -5,7 +5,6 @@ from __future__ import annotations
 import abc
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
-from functools import partial
 from typing import Any, ClassVar
 
 import equinox as eqx
@@ -23,7 +22,7 @@ from mcgicp_jax._kernels import AbstractKernel, Numbers
 from mcgicp_jax._local import locals_of
 from mcgicp_jax._neighborhoods import NO_NEIGHBORS as _NO_NEIGHBORS
 from mcgicp_jax._neighborhoods import channel_kernel, check_neighbors, multichannel_covariance, plane_covariance
-from mcgicp_jax._photometric import Term, features_of_points
+from mcgicp_jax._photometric import Term, correlated_slopes, features_of_points
 from mcgicp_jax._pose import AnyArray, AnyScalar, canonical_float, is_concrete
 from mcgicp_jax._preprocess import preprocess
 from mcgicp_jax._statistics import constant, namespace
@@ -165,6 +164,25 @@ class AbstractMethod(Numbers):
             valid: which of all source points are no padding.
         """
         raise NotImplementedError(f"{type(self).__name__} has estimates, but does not compute them")
+
+    @property
+    def shifts(self) -> Float[AnyArray, "S 3"]:
+        """Shifts of the points, metres, from which `responding` measures how the forces respond to motion."""
+        raise NotImplementedError(f"{type(self).__name__} has estimates, but no shifts")
+
+    def responding(self, rows: Float[AnyArray, "S n L"]) -> AbstractMethod:
+        """The method whose stiffness is the actual change of the forces when points move and match anew.
+
+        Args:
+            rows: of `evidence` with all source points moved by each of the `shifts`, and matched anew.
+        """
+        return self
+
+    def channel_observability(
+        self, mean: Float[Array, "6 N"], source: Table, target: Table, rotation: Float[Array, "3 3"]
+    ) -> Float[Array, "6 N"]:
+        """Observability of correspondences by the channels, see `_observability`, given the mean of their points'."""
+        return mean
 
     @property
     def compensates(self) -> bool:
@@ -457,6 +475,22 @@ class MultiChannelGICP(AbstractGeneralized):
         xp = namespace(counts, valid)
         fraction = xp.sum(counts) / xp.maximum(xp.sum(valid), 1)
         return self._known_term().adapted(xp.where(counts[:, None], rows, xp.nan), fraction)
+
+    @property
+    def shifts(self) -> Float[AnyArray, "S 3"]:
+        return self._known_term().shifts
+
+    def responding(self, rows: Float[AnyArray, "S n L"]) -> MultiChannelGICP:
+        return self.with_estimates(self._known_term().responding(rows))
+
+    def channel_observability(
+        self, mean: Float[Array, "6 N"], source: Table, target: Table, rotation: Float[Array, "3 3"]
+    ) -> Float[Array, "6 N"]:
+        if self.term is None:
+            return mean
+        # Far from the pose, slopes of matched points have nothing to do with each other.
+        correlated = correlated_slopes(source, target, rotation, self.weights(self.term.gains.shape[0]))
+        return jnp.where(self.term.is_on, correlated, mean)
 
     def _known_term(self) -> Term:
         if self.term is None:

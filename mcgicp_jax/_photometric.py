@@ -25,7 +25,8 @@ These numbers are constants to autodiff.
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from dataclasses import replace
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -51,6 +52,10 @@ _CELL = 10.0
 _REACH = 5.0
 # Least σ, as an offset in spacings: rendered scenes leave no residuals.
 _LEAST_OFFSET = 1e-4
+# Shift of the points to measure the response, spacings: less than the details that points resolve.
+_SHIFT = 0.25
+# Lower bound of the response, dimensionless: sampled, it may be 0 by chance.
+_LEAST_RESPONSE = 0.1
 # Standard deviation of a normal variate over its median absolute deviation.
 _PER_MEDIAN = 1.4826
 # Columns of the features of a point: normal, then for each channel value and gradient.
@@ -121,7 +126,8 @@ class Term(eqx.Module):
             robust: kernel of each residual in standard deviations. Each has its own weight: a reflection is an outlier
                 of the channels, but not of the geometry.
         """
-        kernel = Cauchy(_KERNEL_SCALE) if robust is None else robust
+        scale: Any = _KERNEL_SCALE
+        kernel = Cauchy(scale) if robust is None else robust
         terms = []
         for k, (value, slope) in enumerate(zip(residuals.values, residuals.slopes, strict=True)):
             counts = (self.deviations[k] > 0) & ~jnp.isnan(value)
@@ -172,16 +178,67 @@ class Term(eqx.Module):
         alone = xp.sum((scores**2).sum(axis=1), axis=1)
         expected = xp.where(expected > 0, expected, 1)
         designs = xp.maximum((alone + (seen - alone) / fraction) / expected, 1)
-        dtype = self.spacing.dtype
-        numbers = (each.astype(dtype) for each in (deviations, designs, gains, offsets))
-        return Term(self.spacing, *numbers, self.compensates)
+        numbers = {"deviations": deviations, "designs": designs, "gains": gains, "offsets": offsets}
+        return replace(self, **{name: array.astype(self.spacing.dtype) for name, array in numbers.items()})
+
+    @property
+    def shifts(self) -> Float[AnyArray, "6 3"]:
+        """Along +x, −x, +y, −y, +z, −z, metres."""
+        xp = namespace(self)
+        signs = np.repeat(np.eye(3), 2, axis=0) * np.array([[1], [-1]] * 3)
+        return _SHIFT * xp.asarray(self.spacing) * signs.astype(self.spacing.dtype)
+
+    def responding(self, rows: Float[AnyArray, "6 n L"]) -> Term:
+        """The term with designs divided by the response κ of each residual, so that its stiffness is the true one.
+
+        A fitted slope is the steepest nearby: when points move and match anew, the sum of the forces changes by a
+        fraction κ of what the slopes predict (half in pictures with sharp edges, nearly all of it in smooth ones).
+
+        Args:
+            rows: of `Residuals.rows` for the points moved by each of the `shifts` and matched anew.
+        """
+        xp, count = namespace(self, rows), self.designs.shape[0]
+        rows = xp.asarray(rows)
+        values, slopes = rows[..., :count], rows[..., count : 4 * count].reshape(*rows.shape[:2], count, 3)
+        known = ~xp.isnan(values) & (self.deviations > 0)
+        scale = xp.where(self.deviations > 0, self.deviations, 1)
+        scaled, slopes = xp.where(known, values, 0) / scale, xp.where(known[..., None], slopes, 0) / scale[:, None]
+        weights = 1 / (1 + scaled**2 / _KERNEL_SCALE**2)
+        forces = xp.sum((weights * scaled)[..., None] * slopes, axis=1)
+        change = sum(forces[2 * axis, :, axis] - forces[2 * axis + 1, :, axis] for axis in range(3)) / (
+            2 * _SHIFT * self.spacing
+        )
+        predicted = xp.sum(weights * xp.sum(slopes**2, axis=3), axis=(0, 1)) / len(rows)
+        response = change / xp.where(predicted > 0, predicted, 1)
+        response = xp.where(predicted > 0, xp.clip(response, _LEAST_RESPONSE, 1), 1)
+        return replace(self, designs=self.designs / response.astype(self.designs.dtype))
+
+
+def correlated_slopes(
+    source: Table, target: Table, rotation: Float[Array, "3 3"], weights: Float[Array, "C"]
+) -> Float[Array, "6 n"]:
+    """Observability of correspondences by the channels: A / (1 + mean of both traces), A = Σ α² (g_B g_Aᵀ + g_A g_Bᵀ)/2
+
+    Noise of the slopes is independent in the two clouds, so that it does not contribute on average. (To subtract its
+    variance from one cloud's slopes instead, as `_observability` does, also subtracts what sharp edges leave.)
+    """
+    here, there = features_of(source), features_of(target)
+    total: Any = 0.0
+    length: Any = 0.0
+    for channel in range(weights.shape[0]):
+        start = _NORMAL + _PER_CHANNEL * channel + 1
+        a = weights[channel] * jnp.dot(rotation, here[start : start + 3], precision="highest")
+        b = weights[channel] * there[start : start + 3]
+        total = total + 0.5 * (alg.outer(a + b) - alg.outer(a) - alg.outer(b))
+        length = length + 0.5 * (alg.inner(a, a) + alg.inner(b, b))
+    return total / (1 + length)
 
 
 def _squared_sums(scores: Float[AnyArray, "K 3 n"], cells: Int[AnyArray, "n"]) -> Float[AnyArray, "K"]:
     """Σ_c |u_c|², with u_c the sum of the scores in a cell."""
     columns = scores.reshape(-1, scores.shape[-1])
     if namespace(scores, cells) is np:
-        sums = np.stack([np.bincount(cells, column) for column in columns], axis=1)
+        sums: Any = np.stack([np.bincount(cells, column) for column in columns], axis=1)
     else:
         sums = jnp.zeros_like(columns.T).at[cells].add(columns.T)
     return (sums**2).sum(axis=0).reshape(scores.shape[:2]).sum(axis=1)

@@ -434,12 +434,12 @@ def _run(problem: Problem, target: PointCloud, search: AbstractSearch, max_itera
     found = replace(fixed, method=jax.lax.stop_gradient(method))
 
     def finish() -> tuple[State, Assessment, dict[str, Any]]:
-        assessment = assess(state, found, matched_rows(fixed.source, fixed.target, matches), matches)
+        assessment = assess(state, found, matched_rows(fixed.source, fixed.target, matches), matches, search)
         matched = matched_rows(problem.source, problem.target, matches)
         return differentiable(state, matched, method, problem.robust, problem.fusion), assessment, history
 
     def moments() -> Moments:
-        return moments_of(state, found, matched_rows(fixed.source, fixed.target, matches), matches)
+        return moments_of(state, found, matched_rows(fixed.source, fixed.target, matches), matches, search)
 
     return _Run(problem, state, finish, moments)
 

@@ -61,8 +61,8 @@ def rgb_to_hsv(rgb: Values) -> Float[AnyArray, "*batch 3"]:
     Raises:
         ValueError: if the last axis does not have three entries.
     """
-    rgb, xp = _colors(rgb)
-    red, green, blue = _parts(rgb)
+    colors, xp = _colors(rgb)
+    red, green, blue = _parts(colors)
     value = xp.maximum(xp.maximum(red, green), blue)
     chroma = value - xp.minimum(xp.minimum(red, green), blue)
     colored, bright = chroma > 0, value > 0
@@ -90,9 +90,9 @@ def rgb_to_yuv(rgb: Values) -> Float[AnyArray, "*batch 3"]:
     Raises:
         ValueError: if the last axis does not have three entries.
     """
-    rgb, xp = _colors(rgb)
-    luma = _weighted(_LUMA, rgb)
-    red, _, blue = _parts(rgb)
+    colors, xp = _colors(rgb)
+    luma = _weighted(_LUMA, colors)
+    red, _, blue = _parts(colors)
     return xp.stack([luma, _BLUE * (blue - luma), _RED * (red - luma)], -1)
 
 

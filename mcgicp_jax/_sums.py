@@ -210,7 +210,7 @@ def sums_of(
     rows = [forces.stiffness]
     if observability_of(matched.source):
         rows.append(forces.weight[None])
-        rows += [forces.weight * mean for mean in mean_observability(rotation, matched)]
+        rows += [forces.weight * mean for mean in mean_observability(rotation, matched, method)]
     num_inliers = jnp.sum(jnp.any(jnp.asarray(matched.valid).reshape(matched.num_candidates, -1), axis=0))
     totals = (
         count,
@@ -235,10 +235,14 @@ def _share(counts: Float[Array, "n"], num_candidates: int) -> Float[Array, "n"]:
     return (each / jnp.where(total > 0, total, 1)).reshape(-1)
 
 
-def mean_observability(rotation: Float[Array, "3 3"], matched: Matched) -> list[Float[Array, "6 n"]]:
+def mean_observability(
+    rotation: Float[Array, "3 3"], matched: Matched, method: AbstractMethod
+) -> list[Float[Array, "6 n"]]:
     """O per correspondence, in the target's frame: mean over its two points; of the geometry, then of the channels."""
     sides = zip(observability_of(matched.source), observability_of(matched.target), strict=True)
-    return [0.5 * (alg.rotate(rotation, source) + target) for source, target in sides]
+    geometry, *channels = [0.5 * (alg.rotate(rotation, source) + target) for source, target in sides]
+    matches = matched.source, matched.target, rotation
+    return [geometry, *(method.channel_observability(mean, *matches) for mean in channels)]
 
 
 def powers(p: Float[Array, "3 N"]) -> Float[Array, "10 N"]:

@@ -22,7 +22,7 @@ from mcgicp_jax._kernels import AbstractKernel
 from mcgicp_jax._methods import AbstractMethod
 from mcgicp_jax._pose_form import Fusion
 from mcgicp_jax._result import Status
-from mcgicp_jax._search import AbstractSearch, Correspondences, Rows
+from mcgicp_jax._search import AbstractSearch, Correspondences, Rows, by_position
 from mcgicp_jax._solve import root_near, with_derivative
 from mcgicp_jax._statistics import sampled_rows
 from mcgicp_jax._step import (
@@ -130,15 +130,19 @@ def differentiable(
 
 
 @jax.jit
-def assess(state: State, problem: Problem, matched: Matched, matches: Correspondences) -> Assessment:
-    """Information matrix, directions and covariance at the final pose."""
-    known = moments_of(state, problem, matched, matches) if problem.fusion is None else problem.fusion
+def assess(
+    state: State, problem: Problem, matched: Matched, matches: Correspondences, search: AbstractSearch | None = None
+) -> Assessment:
+    """Information matrix, directions and covariance at the final pose; `search` is None if the matches are fixed."""
+    known = moments_of(state, problem, matched, matches, search) if problem.fusion is None else problem.fusion
     return Assessment(Deferred.of(constraints_of(state)), Deferred.of(covariance_of_pose(state, known)))
 
 
 @jax.jit
-def moments_of(state: State, problem: Problem, matched: Matched, matches: Correspondences) -> Moments:
-    """Sums over the scores of all correspondences at the final pose."""
+def moments_of(
+    state: State, problem: Problem, matched: Matched, matches: Correspondences, search: AbstractSearch | None = None
+) -> Moments:
+    """Sums over the scores of all correspondences at the final pose; `search` is None if the matches are fixed."""
     dtype = state.pose.wxyz_xyz.dtype
     pose = rotation_and_translation(state.pose, dtype)
     details, discount = None, jnp.ones(2, dtype)
@@ -170,9 +174,32 @@ def moments_of(state: State, problem: Problem, matched: Matched, matches: Corres
         num_cells,
         problem.method,
         problem.robust,
+        None if search is None or problem.method.estimates is None else _responding(pose, state, problem, search),
     )
     scatter, num_cells = scatter_of(scores, num_cells)
     return Moments(scores.jacobian, scores.bias, scatter, num_cells)
+
+
+def _responding(
+    pose: tuple[Float[Array, "3 3"], Float[Array, "3"]], state: State, problem: Problem, search: AbstractSearch
+) -> AbstractMethod:
+    """`AbstractMethod.responding` for a sample of the source points."""
+    source, target, method = problem.source, problem.target, problem.method
+    rows, counts = sampled_rows(source.rows.valid)
+    some, table = jax.tree.map(lambda array: jnp.asarray(array)[rows], (by_position(source.rows), source.table))
+    gate = problem.settings.fine_distance
+
+    def evidence(shift: Float[Array, "3"]) -> Float[Array, "n L"]:
+        moving = pose[0], pose[1] + shift
+        shifted = state.pose.wxyz_xyz.at[4:].add(shift)
+        found = search.nearest_traced(shifted, some, by_position(target.rows), gate, jnp.bool_(True))[0]
+        here = jnp.maximum(found, 0)
+        there = gathered(jax.tree.map(jnp.asarray, target.table), here)
+        moved = move_rows(*moving, table)
+        valid, _ = within(moved, there, (found >= 0) & counts & some.valid & jnp.asarray(target.rows.valid)[here], gate)
+        return method.evidence(table, there, moved, moving[0], valid)
+
+    return method.responding(jax.lax.map(evidence, jnp.asarray(method.shifts)))
 
 
 def begin(problem: Problem, search: AbstractSearch, max_iterations: int) -> Carry:

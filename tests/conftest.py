@@ -31,6 +31,7 @@ _IN_FLOAT64 = (
         "graph",
         "large_coordinates",
         "methods",
+        "photometric",
         "reference",
         "register",
         "solve",

@@ -74,7 +74,7 @@ def test_transformations_find_the_same_pose():
 
 def test_forces_are_the_gradient_of_the_cost():
     source, target, truth, matches = at_truth()
-    method, term = held(source, target, PHOTOMETRIC, truth, matches)
+    method, _ = held(source, target, PHOTOMETRIC, truth, matches)
     _, seen, there = surfaces_of(method, source, target, observed=False)
     matched = matched_rows(seen, there, matches)
     rotation = jnp.asarray(truth[:3, :3], jnp.float32)

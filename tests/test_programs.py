@@ -12,6 +12,7 @@ from tests.scenes import room_corner
 
 METHODS = {
     "mc-gicp": mcg.MultiChannelGICP(),
+    "photometric": mcg.MultiChannelGICP(photometric=True),
     "gicp": mcg.GICP(),
     "color-icp": mcg.ColorICP(0.3),
     "point-to-plane": mcg.PointToPlane(),

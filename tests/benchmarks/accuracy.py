@@ -1,6 +1,6 @@
 """Translation errors in mm on real and simulated pairs with known truth: every method with its defaults, and Open3D.
 
-    python -m tests.benchmarks.accuracy [--only flat recorded ...]
+    python -m tests.benchmarks.accuracy [--only flat recorded ...] [--methods MC-GICP ...] [--space lab]
 
 All start from the identity (the road: 0.3 m ahead of the truth) on the same downsampled clouds. Our methods have
 default settings, except that Color ICP gets the α that MC-GICP chooses. Open3D's colored ICP has documented settings:
@@ -32,6 +32,7 @@ except ImportError:
 
 DATA = pathlib.Path(os.environ.get("MCGICP_DATA", pathlib.Path(__file__).parents[3] / "shared" / "data"))
 RGB = ("red", "green", "blue")
+SPACES: dict[str, Callable[..., Any]] = {"lab": mcg.rgb_to_lab, "hsv": mcg.rgb_to_hsv, "yuv": mcg.rgb_to_yuv}
 STEPS = (0.01, 0.02, 0.03, 0.04, 0.05)
 
 
@@ -116,6 +117,11 @@ def wall(gain: float) -> Iterator[Pair]:
         pair = pair_of(source, target)
         dark = pair.source.replace(channels=np.asarray(pair.source.channels) * gain)
         yield Pair(dark, pair.target, pair.truth, pair.start)
+
+
+def converted(cloud: mcg.PointCloud, space: Callable[..., Any] | None) -> mcg.PointCloud:
+    """The cloud with its colours in another space."""
+    return cloud if space is None else cloud.replace(channels=space(np.asarray(cloud.channels)))
 
 
 # Name: pairs, voxel size in metres, further arguments of `register`.
@@ -220,7 +226,10 @@ def cross(vectors: np.ndarray) -> np.ndarray:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--only", nargs="*", choices=SETS, default=list(SETS))
-    chosen = parser.parse_args().only
+    parser.add_argument("--methods", nargs="*", help="such as MC-GICP; by default all")
+    parser.add_argument("--space", choices=SPACES, help="colour space to convert the channels to")
+    arguments = parser.parse_args()
+    chosen, space = arguments.only, SPACES.get(arguments.space)
     print(
         "|                    set | pairs |               method |   mean |    rms | median |    max |\n"
         + "|---:" * 7
@@ -229,12 +238,17 @@ def main() -> None:
     for name in chosen:
         make, voxel, settings = SETS[name]
         pairs = [
-            (mcg.preprocess(pair.source, voxel), mcg.preprocess(pair.target, voxel), pair.truth, pair.start)
+            (
+                *(mcg.preprocess(converted(cloud, space), voxel) for cloud in (pair.source, pair.target)),
+                pair.truth,
+                pair.start,
+            )
             for pair in make()
         ]
         spacing = voxel or 0.013
         methods: dict[str, Callable[..., np.ndarray]] = {
             "MC-GICP": ours(lambda *_: mcg.MultiChannelGICP(), settings),
+            "MC-GICP, photometric": ours(lambda *_: mcg.MultiChannelGICP(photometric=True), settings),
             "GICP": ours(lambda *_: mcg.GICP(), {}),
             "Color ICP": ours(color_icp, settings),
             "NDT": cells(lambda *_: mcg.NDT()),
@@ -243,7 +257,8 @@ def main() -> None:
         }
         if open3d is not None:
             methods |= {"Open3D, one scale": colored_icp((1,)), "Open3D, three scales": colored_icp((4, 2, 1))}
-        for label, run in methods.items():
+        for label in arguments.methods or methods:
+            run = methods[label]
             errors = 1e3 * np.array(
                 [mcg.metrics.pose_error(run(s, t, start, spacing), truth)[0] for s, t, truth, start in pairs]
             )

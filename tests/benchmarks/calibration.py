@@ -40,7 +40,13 @@ SCENES: dict[str, tuple[Callable[[float], datasets.SyntheticFrames], float, floa
     "street": (street, 1.5, 1.0),
     "poster wall": (wall, 0.08, 0.2),
 }
-METHODS = {"GICP": mcg.GICP(), "MC-GICP": mcg.MultiChannelGICP(), "NDT": mcg.NDT(), "D2D-NDT": mcg.D2DNDT()}
+METHODS = {
+    "GICP": mcg.GICP(),
+    "MC-GICP": mcg.MultiChannelGICP(),
+    "photometric": mcg.MultiChannelGICP(photometric=True),
+    "NDT": mcg.NDT(),
+    "D2D-NDT": mcg.D2DNDT(),
+}
 
 
 def twist_error(matrix: np.ndarray, truth: np.ndarray) -> np.ndarray:
