@@ -259,14 +259,16 @@ def register(
         translation_tolerance, rotation_tolerance: metres (at the centroid of the matches) and radians; the loop has
             converged when an update is below both. `translation_tolerance` None: 0.5 % of the spacing of the target.
         robust: kernel of each match's Mahalanobis distance: `Huber`, `Cauchy`, `GemanMcClure`, `Tukey`, `Welsch`. None:
-            that of the method (NDT: `Welsch`), or none.
+            that of the method (NDT: `Welsch`), or none. With `photometric=True` of each residual in
+            standard deviations.
         search: nearest-neighbour search; by default `KDTreeSearch` on CPUs and `DenseSearch` on accelerators.
         hold_free_directions: do not update the pose along unconstrained directions, which neither the shape of the
             clouds nor the channels (if the method uses them) constrain. If False, arbitrary nearest-neighbour matches
             decide there. The status is DEGENERATE in either case.
         match_channels: scale and shift each channel of the source to the distribution of the target's, for scans with
             different exposure or gain: first from the values of all points, then, in a second registration that starts
-            at the pose of the first, from those of matched points.
+            at the pose of the first, from those of matched points. With `MultiChannelGICP(photometric=True)` gains and
+            offsets are estimated with the pose instead, from interpolated channels.
         scales: voxel sizes, metres, from coarse to fine, for a start that is far off: the clouds are first registered
             at each voxel size, in this order, each time from the pose before and with the default `max_distance`; the
             one given is for the last registration. For NDT, the sizes of its cells: the clouds are raw ones, and the
