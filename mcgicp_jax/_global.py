@@ -19,7 +19,7 @@ from mcgicp_jax._hypotheses import APART, NUM_MATCHES, TOLERANCE, Matches, Poses
 from mcgicp_jax._methods import GICP, AbstractMethod, MultiChannelGICP
 from mcgicp_jax._options import Options
 from mcgicp_jax._pose import AnyArray, Pose, computed_now, nearest_rotation
-from mcgicp_jax._preprocess import finite_rows, preprocess, voxels
+from mcgicp_jax._preprocess import finite_rows, voxels, with_neighbors
 from mcgicp_jax._result import Registration, is_usable
 from mcgicp_jax._search import Rows
 from mcgicp_jax._trees import KDTreeSearch
@@ -198,7 +198,7 @@ def _voxel_size(clouds: tuple[PointCloud, ...]) -> float | None:
 def _prepared(clouds: tuple[PointCloud, ...], voxel_size: float) -> tuple[PointCloud, PointCloud] | None:
     """The voxels with their neighbours; None if a cloud has too few."""
     try:
-        found = [preprocess(cloud, voxel_size, NUM_NEIGHBORS) for cloud in clouds]
+        found = [with_neighbors(cloud, voxel_size, NUM_NEIGHBORS) for cloud in clouds]
     except ValueError:
         return None
     return found[0], found[1]

@@ -56,15 +56,23 @@ def preprocess(
     """
     check_preprocessing(voxel_size, num_neighbors)
     cloud = finite_rows(cloud)
+    found = with_neighbors(cloud, voxel_size, num_neighbors, search)
+    if len(found) < min(len(cloud), num_neighbors):
+        warnings.warn(
+            f"voxel_size: {voxel_size} m leaves {len(found)} of {len(cloud)} points, fewer than the {num_neighbors} "
+            "neighbours from which a covariance is computed; choose a smaller size",
+            UserWarning,
+            stacklevel=2,
+        )
+    return found
+
+
+def with_neighbors(
+    cloud: PointCloud, voxel_size: float | None, num_neighbors: int, search: AbstractSearch | None = None
+) -> PointCloud:
+    """`preprocess` for a cloud of `finite_rows`."""
     if voxel_size is not None:
-        before, cloud = len(cloud), _downsampled(cloud, voxel_size)
-        if len(cloud) < min(before, num_neighbors):
-            warnings.warn(
-                f"voxel_size: {voxel_size} m leaves {len(cloud)} of {before} points, fewer than the {num_neighbors} "
-                "neighbours from which a covariance is computed; choose a smaller size",
-                UserWarning,
-                stacklevel=2,
-            )
+        cloud = _downsampled(cloud, voxel_size)
     points, channel_valid, covariances = np.asarray(cloud.points), cloud.channel_valid, cloud.covariances
     dtype = jax.dtypes.canonicalize_dtype(points.dtype)
     origin = _far_origin(points)
