@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Iterator, Sequence
 from typing import Any, ClassVar
 
@@ -16,10 +17,10 @@ from mcgicp_jax import _algebra as alg
 from mcgicp_jax._cloud import PointCloud, Values
 from mcgicp_jax._gaussians import gaussians
 from mcgicp_jax._kernels import AbstractKernel, Welsch
-from mcgicp_jax._methods import AbstractGeneralized, AbstractMethod, AbstractOneSided, ColorICP, identity
+from mcgicp_jax._methods import GICP, AbstractGeneralized, AbstractMethod, AbstractOneSided, ColorICP, identity
 from mcgicp_jax._observability import geometry_observability
 from mcgicp_jax._pose import AnyScalar
-from mcgicp_jax._preprocess import preprocess
+from mcgicp_jax._preprocess import finite_rows, with_neighbors
 from mcgicp_jax._statistics import median, namespace, sampled_rows
 from mcgicp_jax._surface import Local, Neighborhoods, local_of
 
@@ -33,11 +34,11 @@ _SCALE = 2.15
 # with 7. For points against cells, a sum over seven changes nothing (16 mm with one, 4 or 7), and with cells of one
 # colour it costs accuracy (10.7 mm with one and 18.8 with 7 on a flat table).
 _NUM_CANDIDATES = 4
-# All scales but the last: `min_ratio`, scale of the kernel and number of candidates. Rounder cells, a wide kernel and
-# many candidates find poses from further off: on KITTI, from 5 m and 30°, D2D-NDT finds 10 of 12 with these values, 4
-# with 4 candidates, 7 with 4 and a scale of 30, 8 without a kernel and with one; NDT finds 9, 7 with a scale of 6.3,
-# and 8 without a kernel. From 4 m and 20°, without a kernel, 10 converge with a ratio of 0.1 and 4 with 0.01.
-_COARSE_RATIO, _COARSE_SCALE, _COARSE_CANDIDATES = 0.1, 15.0, 7
+# Edge of the voxels, per edge of a cell, at all scales but the last, where GICP registers the clouds. At these scales
+# cells against cells pull clouds that overlap in part over each other: from 1.3 m and 10° off, two views of a yard with
+# an overlap of three quarters ended 4 m off, and end at 0 m by GICP. On KITTI, from 5 m and 30° off, GICP leads to 7 of 8
+# poses, cells to 4.
+_COARSE_VOXEL = 0.25
 # Square of the edge of a cell over the trace of its covariance, if it is a square filled uniformly: 2 edge²/12.
 _SQUARE_EDGE = 6.0
 # Number of points that the normal of a cell is taken to be estimated from: that of a neighbourhood.
@@ -93,38 +94,46 @@ class AbstractNDT(AbstractMethod):
     def stages(
         self, source: PointCloud, target: PointCloud, scales: Sequence[float]
     ) -> Iterator[tuple[AbstractMethod, PointCloud, PointCloud]]:
-        """One registration per scale, at which cells are made: all but the last of rounder cells, by `D2DNDT`."""
+        """One registration per scale, the last one to cells of this size, the others by `GICP` in smaller voxels."""
         if not scales:
             yield self, source, target
-        for i, voxel_size in enumerate(scales):
+        for i, size in enumerate(scales):
             last = i == len(scales) - 1
-            method = self if last else D2DNDT(_COARSE_SCALE, _COARSE_CANDIDATES)
-            options: dict[str, Any] = {} if last else {"min_ratio": _COARSE_RATIO}
-            coarse, coarse_target = (
-                method._at_scale(name, cloud, voxel_size, options)
+            sides = [
+                self._in_cells(name, cloud, size) if last else _in_voxels(name, cloud, _COARSE_VOXEL * size)
                 for name, cloud in (("source", source), ("target", target))
-            )
-            yield method, coarse, coarse_target
+            ]
+            yield self if last else GICP(), sides[0], sides[1]
 
-    def _at_scale(self, name: str, cloud: PointCloud, voxel_size: float, options: dict[str, Any]) -> PointCloud:
-        try:
-            if name in self.needs_covariances:
-                return gaussians(cloud, voxel_size, channel_size=self._channel_size(cloud, voxel_size), **options)
-            # At a coarse scale, the mean points of the voxels suffice.
-            return preprocess(cloud, voxel_size) if options else cloud
-        except ValueError as error:
-            raise ValueError(f"{name}: {error}") from error
+    def _in_cells(self, name: str, cloud: PointCloud, size: float) -> PointCloud:
+        if name not in self.needs_covariances:
+            return cloud
+        with _named(name):
+            return gaussians(cloud, size, channel_size=self._channel_size(cloud, size))
 
     def _channel_size(self, cloud: PointCloud, voxel_size: float) -> Any:
         return None
+
+
+def _in_voxels(name: str, cloud: PointCloud, size: float) -> PointCloud:
+    with _named(name):
+        return with_neighbors(finite_rows(cloud), size, _COUNT)
+
+
+@contextlib.contextmanager
+def _named(name: str) -> Iterator[None]:
+    """Begin messages of errors with the name of the cloud."""
+    try:
+        yield
+    except ValueError as error:
+        raise ValueError(f"{name}: {error}") from error
 
 
 class NDT(AbstractNDT, AbstractOneSided):
     """Normal-distributions transform (Biber & Strasser 2003; Magnusson 2009): points against cells, M = C⁻¹.
 
     C is the covariance of the target's cell, from `gaussians`. Each point is matched to the nearest cell: the sum over
-    several cells takes longer and is no more accurate. With `scales`, all registrations but the last are of cells
-    against cells, as by `D2DNDT`.
+    several cells takes longer and is no more accurate. With `scales`, all registrations but the last are by `GICP`.
 
     Args:
         scale: k of the Welsch kernel, in standard deviations, if `register` is not given another kernel; None: none.

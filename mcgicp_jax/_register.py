@@ -271,8 +271,9 @@ def register(
             offsets are estimated with the pose instead, from interpolated channels.
         scales: voxel sizes, metres, from coarse to fine, for a start that is far off: the clouds are first registered
             at each voxel size, in this order, each time from the pose before and with the default `max_distance`; the
-            one given is for the last registration. For NDT, the sizes of its cells: the clouds are raw ones, and the
-            last size gives the result. Not available inside transformations.
+            one given is for the last registration. For NDT, the sizes of its cells: the clouds are raw ones, the last
+            size gives the result, and at the others `GICP` registers voxels of a quarter of the size. Not available
+            inside transformations.
         tie_points: (source_points, target_points, covariances), metres: points (n, 3) known to be the same, such as
             surveyed targets or image features (Huhle & Jenke 2008), and the covariances (n, 3, 3) of b − T a, in the
             target's axes. n may be 1 or 2.

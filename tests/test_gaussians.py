@@ -180,6 +180,24 @@ def test_scales_make_the_cells(raw):
 
 
 @pytest.mark.parametrize("method", [mcg.NDT(), mcg.D2DNDT()], ids=["ndt", "d2d-ndt"])
+def test_views_that_overlap_in_part_are_not_pulled_over_each_other(method):
+    """A yard with a ground, two walls and a box; each view ends where the other one goes on."""
+    rng = np.random.default_rng(0)
+
+    def view(keep):
+        ground, wall = (rng.random((6000, 3)) * size for size in ([20, 16, 0], [20, 0, 5]))
+        side, box = (rng.random((3000, 3)) * size for size in ([0, 16, 4], [3, 0, 2.5]))
+        wall += np.array([0, 16, 0])
+        boxes = np.concatenate([box, box[:, [1, 0, 2]]]) + np.array([6, 5, 0])
+        points = np.concatenate([ground, wall, side, boxes])
+        return mcg.PointCloud(points[keep(points[:, 0])] + 0.01 * rng.normal(size=(np.sum(keep(points[:, 0])), 3)))
+
+    target, source = view(lambda x: x < 15), view(lambda x: x > 3)
+    result = mcg.register(source, target, method, scales=(2.0, 1.0), init=motion((1.0, 0.8, 0, 0, 0, 0.15)))
+    assert result.converged and np.linalg.norm(result.matrix[:3, 3]) < 0.1
+
+
+@pytest.mark.parametrize("method", [mcg.NDT(), mcg.D2DNDT()], ids=["ndt", "d2d-ndt"])
 def test_the_unit_of_length_does_not_matter(method, raw):
     source, target, _ = raw
     results = []
