@@ -36,8 +36,8 @@ _SCALE = 2.15
 _NUM_CANDIDATES = 4
 # Edge of the voxels, per edge of a cell, at all scales but the last, where GICP registers the clouds. At these scales
 # cells against cells pull clouds that overlap in part over each other: from 1.3 m and 10° off, two views of a yard with
-# an overlap of three quarters ended 4 m off, and end at 0 m by GICP. On KITTI, from 5 m and 30° off, GICP leads to 7 of 8
-# poses, cells to 4.
+# an overlap of three quarters ended 4 m off, and end at 0 m by GICP. On KITTI, from 5 m and 30° off, GICP leads to 7
+# of 8 poses, cells to 4.
 _COARSE_VOXEL = 0.25
 # Square of the edge of a cell over the trace of its covariance, if it is a square filled uniformly: 2 edge²/12.
 _SQUARE_EDGE = 6.0

@@ -161,7 +161,9 @@ def row(solver: Solver, pairs: list[Pair], voxel: float, starts: tuple[tuple[flo
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--only", nargs="*", choices=list(SETS), default=list(SETS))
-    for name in parser.parse_args().only:
+    parser.add_argument("--methods", nargs="*", default=[""], help="first words of their rows")
+    arguments = parser.parse_args()
+    for name in arguments.only:
         chosen = SETS[name]
         pairs = [(*map(without_colour_of_few, pair[:2]), pair[2]) for pair in chosen.pairs()]
         print(f"\n{name}: found of {len(pairs)} by the start's error; median error where found, mm; time per pair, ms")
@@ -171,6 +173,8 @@ def main() -> None:
             + " |"
         )
         for label, solver in solvers_for(chosen.voxel).items():
+            if not label.startswith(tuple(arguments.methods)):
+                continue
             print(f"| {label} | " + " | ".join(row(solver, pairs, chosen.voxel, chosen.starts)) + " |", flush=True)
 
 
