@@ -202,9 +202,9 @@ def test_voxels_are_chosen_from_the_data(tmp_path, capsys):
         chosen = None if voxels == "all kept" else float(first.split(voxels)[1].split()[0])
         kept = mcg.preprocess(io.read(whole), chosen).points
         assert len(kept) == used
-        spacing = np.median(scipy.spatial.cKDTree(kept).query(kept, k=2)[0][:, 1])
+        near, far = np.median(scipy.spatial.cKDTree(kept).query(kept, k=(2, 20))[0], axis=0)
         # The command takes the median of 4,096 points, whose standard error is 1 %.
-        np.testing.assert_allclose(distances, [10 * spacing, 2.5 * spacing], rtol=0.03)
+        np.testing.assert_allclose(distances, [10 * max(near, np.sqrt(np.pi / 20) * far), 2.5 * near], rtol=0.03)
 
 
 def test_clouds_with_covariances_keep_their_points(tmp_path, capsys):

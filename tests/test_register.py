@@ -374,9 +374,9 @@ def test_scales_find_a_start_that_is_far_off():
     truth = motion((2, 1.5, -1, 0.1, 0.1, -0.4))
     source, target, _ = pair(truth=truth, noise=0.003)
     method = METHODS["mc-gicp"]
-    near = mcg.register(source, target, method)
+    near = mcg.register(source, target, method, max_distance=(0.4, 0.1))
     assert difference(near.matrix, truth) > 1
-    far = mcg.register(source, target, method, scales=(0.3, 0.15))
+    far = mcg.register(source, target, method, max_distance=(0.4, 0.1), scales=(0.3, 0.15))
     assert far.converged and difference(far.matrix, truth) < 4e-3
     with pytest.raises(ValueError, match="tracers"):
         jax.jit(lambda s: mcg.register(s, target, method, scales=(0.2,)).matrix)(source)
