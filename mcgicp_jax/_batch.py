@@ -103,9 +103,10 @@ def register_as_completed(
         executor: any `concurrent.futures.Executor`, such as a `ProcessPoolExecutor` with the start method "spawn" or
             Dask's `Client.get_executor()`; by default one thread per core. A pair whose worker dies is sent once more,
             and gets the status `LOST` and a warning if that fails too.
-        options: any option of `register`. `search` is also used to preprocess; by default SciPy's k-d tree with one
-            thread per pair. With `DenseSearch`, the default on accelerators, pairs run as lanes of one vectorised
-            program, spread over all local devices (not with `match_channels` or `scales`).
+        options: options of `register`, except for `tie_points` and `prior`. `search` is also used to preprocess; by
+            default SciPy's k-d tree with one thread per pair. With `DenseSearch`, the default on accelerators, pairs
+            run as lanes of one vectorised program, spread over all local devices (not with `match_channels` or
+            `scales`).
 
     Returns:
         A generator of the index of the pair, from 0, and its `Registration`.

@@ -9,9 +9,9 @@ import numpy as np
 from mcgicp_jax._pose import is_concrete
 
 
-def check_positive(name: str, value: Any) -> None:
+def check_positive(name: str, value: Any, expected: str = "a positive number") -> None:
     if is_concrete(value) and not (is_number(value) and np.asarray(value) > 0):
-        raise ValueError(f"{name}: expected a positive number, got {value!r}")
+        raise ValueError(f"{name}: expected {expected}, got {value!r}")
 
 
 def check_integer(name: str, value: Any, least: int) -> None:

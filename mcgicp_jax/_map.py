@@ -5,13 +5,13 @@ from __future__ import annotations
 from collections.abc import Iterable
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from mcgicp_jax._checks import check_positive
 from mcgicp_jax._cloud import PointCloud, Values
 from mcgicp_jax._pose import Pose, pose_matrix
 
-# Voxels from the world's origin along each axis: three 21-bit indices, from −2²⁰, are packed into one 64-bit key.
+# Voxels from the first point along each axis: three 21-bit indices, from −2²⁰, are packed into one 64-bit key.
 _HALF_RANGE = 2**20
 
 
@@ -31,7 +31,7 @@ def aggregate(clouds: Iterable[PointCloud | Values], poses: Iterable[Pose], voxe
 
     Raises:
         ValueError: if there are no clouds, the number of poses differs, a pose is no rigid motion, the channels
-            differ, or a point lies more than 2²⁰ voxels from the world's origin along an axis.
+            differ, or a point lies more than 2²⁰ voxels from the first one along an axis.
     """
     world = VoxelMap(voxel_size)
     for i, (cloud, pose) in enumerate(zip(clouds, poses, strict=True)):
@@ -50,6 +50,8 @@ class VoxelMap:
         self._keys = np.empty(0, np.int64)
         self._sums: np.ndarray | None = None
         self._names: tuple[str, ...] | None = None
+        # Voxel of the first point, from which the others are counted: keys have no room for UTM coordinates.
+        self._first: Float[np.ndarray, "3"] | None = None
 
     def add(self, name: str, cloud: PointCloud, pose: Float[np.ndarray, "4 4"]) -> None:
         """Add the finite points of a cloud in its sensor frame, moved by its pose; `name` is for error messages."""
@@ -59,7 +61,9 @@ class VoxelMap:
         points = np.asarray(cloud.points, np.float64) @ pose[:3, :3].T + pose[:3, 3]
         rows = np.hstack([np.ones((len(points), 1)), points, *_valid_channels(cloud)])
         finite = np.isfinite(rows).all(axis=1)
-        keys = np.concatenate([self._keys, voxels(points[finite], self._voxel_size)])
+        if self._first is None and finite.any():
+            self._first = voxel_of(points[finite][0], self._voxel_size)
+        keys = np.concatenate([self._keys, voxels(points[finite], self._voxel_size, self._first)])
         sums = rows[finite] if self._sums is None else np.concatenate([self._sums, rows[finite]])
         self._keys, self._sums = _merge(keys, sums)
 
@@ -93,13 +97,19 @@ def _valid_channels(cloud: PointCloud) -> tuple[Float[np.ndarray, "N C"], Float[
     return channels, np.asarray(cloud.channel_valid, np.float64)
 
 
-def voxels(points: Float[np.ndarray, "N 3"], voxel_size: float) -> np.ndarray:
-    """One integer key per point for the voxel that contains it."""
-    cells = np.floor(points / voxel_size)
+def voxel_of(point: Float[np.ndarray, "3"], voxel_size: float) -> Float[np.ndarray, "3"]:
+    return np.floor(point / voxel_size)
+
+
+def voxels(
+    points: Float[np.ndarray, "N 3"], voxel_size: float, first: Float[np.ndarray, "3"] | None
+) -> Int[np.ndarray, "N"]:
+    """One integer key per point for the voxel that contains it, counted from the voxel `first`."""
+    cells = np.floor(points / voxel_size) - (0 if first is None else first)
     if np.abs(cells).max(initial=0) >= _HALF_RANGE:
         raise ValueError(
-            f"voxel_size: {voxel_size} m puts points {np.abs(cells).max():.0f} voxels from the origin, expected fewer "
-            f"than {_HALF_RANGE}; choose a larger size, or poses nearer to the origin"
+            f"voxel_size: {voxel_size} m puts points {np.abs(cells).max():.0f} voxels from the first one, expected "
+            f"fewer than {_HALF_RANGE}; choose a larger size"
         )
     x, y, z = (cells.astype(np.int64) + _HALF_RANGE).T
     return (x << 42) | (y << 21) | z

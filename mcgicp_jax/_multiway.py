@@ -15,7 +15,7 @@ from mcgicp_jax._channels import point_spacing
 from mcgicp_jax._cloud import PointCloud, Values
 from mcgicp_jax._graph import PoseGraphResult, optimize_poses
 from mcgicp_jax._loops import LEAST_OVERLAP, edge_from
-from mcgicp_jax._map import aggregate, voxels
+from mcgicp_jax._map import aggregate, voxel_of, voxels
 from mcgicp_jax._methods import AbstractMethod
 from mcgicp_jax._odometry import odometry
 from mcgicp_jax._options import check_method, options_of
@@ -88,7 +88,7 @@ def multiway(
             `odometry`: consecutive clouds are registered in order, each from the previous motion.
         voxel_size, num_neighbors: arguments of `preprocess`.
         executor: see `register_batch`, which registers the pairs.
-        options: options of `register`.
+        options: options of `register`, except for `tie_points` and `prior`.
 
     Returns:
         Clouds, poses, registrations and map.
@@ -159,10 +159,8 @@ def _graph(poses: Float[np.ndarray, "n 4 4"], found: dict[tuple[int, int], Regis
 
 def _overlapping(clouds: list[PointCloud], poses: Float[np.ndarray, "n 4 4"], cell: float) -> list[tuple[int, int]]:
     """Every cloud with the one before it, and with those of largest overlap among ever more distant ones before."""
-    cells = [
-        np.unique(voxels(cloud.coordinates @ T[:3, :3].T + T[:3, 3], cell))
-        for cloud, T in zip(clouds, poses, strict=True)
-    ]
+    moved = [cloud.coordinates @ T[:3, :3].T + T[:3, 3] for cloud, T in zip(clouds, poses, strict=True)]
+    cells = [np.unique(voxels(points, cell, voxel_of(moved[0][0], cell))) for points in moved]
     pairs = []
     for j in range(1, len(clouds)):
         pairs.append((j - 1, j))

@@ -87,7 +87,7 @@ def odometry(
             the poses, is registered to it, and all poses are corrected by `optimize_poses`. Earlier steps keep the pose
             known at their time, so use the poses in `Step.graph` of the last step. All clouds are kept in memory. Not
             with `against="map"` or `recover`.
-        options: options of `register`.
+        options: options of `register`, except for `tie_points` and `prior`.
 
     Yields:
         One `Step` per frame, including the first.

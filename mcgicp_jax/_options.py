@@ -68,7 +68,9 @@ class Options:
 
 def options_of(function: Callable[..., Any], given: dict[str, Any]) -> Options:
     """The options of `register` that another function was given; raises `TypeError` for a name that neither has."""
-    names = [*(field.name for field in fields(Options)), *inspect.signature(function).parameters]
+    parameters = inspect.signature(function).parameters.values()
+    named = [each.name for each in parameters if each.kind is not inspect.Parameter.VAR_KEYWORD]
+    names = [*(field.name for field in fields(Options)), *named]
     for name in given.keys() - names:
         close = difflib.get_close_matches(name, names)
         known = f"did you mean {' or '.join(close)}?" if close else f"expected one of {', '.join(sorted(names))}"
@@ -88,7 +90,7 @@ def _check_tolerance(name: str, value: Any) -> None:
 
 def _check_distances(distances: Any) -> None:
     if np.shape(distances) != (2,):
-        check_positive("max_distance", distances)
+        check_positive("max_distance", distances, "one or two positive numbers")
     elif is_concrete(distances):
         coarse, fine = distances
         if not (is_number(coarse) and is_number(fine) and coarse >= fine > 0):

@@ -147,10 +147,12 @@ def _inverse(covariance: Any) -> Any:
     covariance = np.asarray(_as_float("covariance", covariance))
     if covariance.shape[-2:] != (6, 6):
         raise ValueError(f"covariance: expected shape (6, 6), got {covariance.shape}")
+    if not np.isfinite(covariance).all():
+        raise ValueError("covariance: expected finite numbers, got NaN or infinity")
     try:
         np.linalg.cholesky(covariance)
     except np.linalg.LinAlgError as error:
-        raise ValueError("covariance: expected a finite positive definite matrix") from error
+        raise ValueError("covariance: expected a positive definite matrix") from error
     inverse = np.linalg.inv(covariance)
     return 0.5 * (inverse + np.swapaxes(inverse, -1, -2))
 

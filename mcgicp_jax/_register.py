@@ -276,17 +276,20 @@ def register(
             inside transformations.
         tie_points: (source_points, target_points, covariances), metres: points (n, 3) known to be the same, such as
             surveyed targets or image features (Huhle & Jenke 2008), and the covariances (n, 3, 3) of b − T a, in the
-            target's axes. n may be 1 or 2.
+            target's axes. n may be 1 or 2. They are no start: if `init` is far off, pass a better one.
         prior: (pose, covariance): a measurement of T_target_source, as by GNSS or an IMU, `jaxlie.SE3` or (4, 4), and
             its covariance (6, 6), metres and radians, of ξ = (v, ω) in T = pose · exp(ξ): in the order and frame of
-            `Registration.covariance`. Give what it does not tell a large variance. Without `init` it is the start.
+            `Registration.covariance`. ξ acts at the origin of the source, along its axes: for a covariance Σ of the
+            position along the target's axes, as from GNSS, v has Rᵀ Σ R; and far from the clouds an uncertain rotation
+            leaves their position unknown, so move clouds with UTM coordinates first. Give what the prior does not tell
+            a large finite variance. Without `init` it is the start.
 
     With tie points or a prior, a first registration without them measures the covariance of the score of the matches,
     and a second one, which starts at its pose, weighs all by their covariances (Hansen 1982, generalised method of
     moments). The result is that of the second one; its `covariance` and `information` include tie points and prior.
     They also constrain directions that the clouds leave free (`FreeDirection.held_by_ties`). The pose is differentiable
     with respect to points, pose and covariances; the weights of the matches are constants to autodiff. Contradictions
-    are averaged, not detected: look at `overlap`.
+    are averaged, not detected. Inside transformations, covariances are not checked.
 
     Returns:
         The pose with its status, quality of the fit and uncertainty; check `converged`.

@@ -62,8 +62,9 @@ class Registration(eqx.Module):
         cost: Σ ρ(dᵀ M d) over the matches.
         rmse: root mean square correspondence distance, metres. Usually of the order of the point spacing, as no target
             point lies just where a source point does. NaN without matches.
-        overlap: fraction of the source points that have a match, 0 to 1. A value below the known overlap of the scans
-            is the only sign of a wrong local minimum in this result.
+        overlap: fraction of the source points that have a match within the fine `max_distance`, 0 to 1. Where this
+            distance spans the gaps between the points, as in voxels of one size, a value below the known overlap of
+            the scans is a sign of a wrong local minimum. In raw LiDAR scans many points have no match.
         history: arrays with one entry before each update and one at the returned pose: "cost", "rmse", "num_inliers",
             and the size of the update computed there: "translation_step" (metres, at the centroid of the matches) and
             "rotation_step" (radians). In the coarse phase (see `register`) they cover the subsampled source. Inside a

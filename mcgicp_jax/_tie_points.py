@@ -46,15 +46,18 @@ def known(
 def _centred_tie_points(given: GivenTiePoints, source: PointCloud, target: PointCloud) -> TiePoints:
     points, targets, covariances = _parts("tie_points", given, "(source_points, target_points, covariances)", 3)
     count = np.shape(points)[0] if np.ndim(points) else 0
-    points, targets = (_numbers(f"tie_points[{i}]", each, (count, 3)) for i, each in enumerate((points, targets)))
-    covariances = _covariances("tie_points[2]", covariances, (count, 3, 3))
+    points, targets = (
+        _numbers(f"tie_points: {side}", each, (count, 3))
+        for side, each in (("source_points", points), ("target_points", targets))
+    )
+    covariances = _covariances("tie_points: covariances", covariances, (count, 3, 3))
     return TiePoints(points - source.origin, targets - target.origin, covariances)
 
 
 def _centred_prior(given: GivenPrior, source: PointCloud, target: PointCloud) -> Prior:
     pose, covariance = _parts("prior", given, "(pose, covariance)", 2)
-    matrix = centred_pose(pose, source, target, "prior[0]")
-    covariance = _covariances("prior[1]", covariance, (6, 6))
+    matrix = centred_pose(pose, source, target, "prior: pose")
+    covariance = _covariances("prior: covariance", covariance, (6, 6))
     if not is_concrete(source.origin) or np.any(source.origin):
         change = translation_adjoint(-source.origin)
         covariance = change @ covariance @ change.T
@@ -115,5 +118,6 @@ def _covariances(name: str, given: Any, shape: tuple[int, ...]) -> Float[AnyArra
         correlations = array / np.where(scale > 0, scale, 1)
         symmetric = np.abs(correlations - correlations.swapaxes(-1, -2)).max(initial=0) < _ASYMMETRY
         if not (symmetric and np.linalg.eigvalsh(correlations).min(initial=1) > _LEAST_EIGENVALUE):
-            raise ValueError(f"{name}: expected symmetric positive definite covariances, got others")
+            got = "one that is not positive definite" if symmetric else "one that is not symmetric"
+            raise ValueError(f"{name}: expected symmetric positive definite matrices, got {got}")
     return array

@@ -538,8 +538,10 @@ def test_what_is_wrong_is_named():
             mcg.Edge(0, 1, eye, **matrices)
     with pytest.raises(ValueError, match=r"covariance: expected shape \(6, 6\), got \(3, 3\)"):
         mcg.Edge(0, 1, eye, covariance=np.eye(3))
-    with pytest.raises(ValueError, match="covariance: expected a finite positive definite"):
+    with pytest.raises(ValueError, match="covariance: expected a positive definite matrix"):
         mcg.Edge(0, 1, eye, covariance=indefinite)
+    with pytest.raises(ValueError, match="covariance: expected finite numbers"):
+        mcg.Edge(0, 1, eye, covariance=np.full((6, 6), np.nan))
     with pytest.raises(ValueError, match=r"information: expected shape \(6, 6\), got \(3, 3\)"):
         mcg.Edge(0, 1, eye, np.eye(3))
     with pytest.raises(ValueError, match="i: expected the row of a pose"):

@@ -134,6 +134,16 @@ def test_a_map_of_the_room_is_sharp_at_the_true_poses(room):
     assert len(sharp) < len(blurred) < sum(map(len, clouds))
 
 
+def test_a_map_may_lie_at_utm_coordinates(room):
+    frames, truth = room
+    clouds, offset = [frame.cloud for frame in frames[:2]], np.array([500_000, 5_400_000, 100])
+    near, far = mcg.aggregate(clouds, truth[:2], 0.125), []
+    for pose in truth[:2]:
+        far.append(pose.copy())
+        far[-1][:3, 3] += offset
+    np.testing.assert_allclose(mcg.aggregate(clouds, far, 0.125).points - offset, near.points, atol=1e-8)
+
+
 def test_what_makes_no_map_is_refused_by_name(room):
     frames, truth = room
     clouds = [frame.cloud for frame in frames]
@@ -144,7 +154,7 @@ def test_what_makes_no_map_is_refused_by_name(room):
         ((clouds[:1], truth[:2], 0.1), "argument"),
         (([clouds[0], bare], truth[:2], 0.1), r"clouds\[1\]: expected the channels"),
         ((clouds[:1], [2 * np.eye(4)], 0.1), r"poses\[0\]"),
-        ((clouds[:1], [motion((1e6, 0, 0, 0, 0, 0))], 0.1), "voxel_size: 0.1 m puts points"),
+        ((clouds[:2], [truth[0], motion((1e6, 0, 0, 0, 0, 0))], 0.1), "voxel_size: 0.1 m puts points"),
     ):
         with pytest.raises(ValueError, match=message):
             mcg.aggregate(*arguments)

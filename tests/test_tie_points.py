@@ -288,24 +288,24 @@ def test_malformed_arguments_are_named(corner):
     skewed[2, 0, 1] += 1e-3
     cases = {
         r"^tie_points: expected \(source_points": (points, targets),
-        r"^tie_points\[0\]: expected numbers of shape": ("abc", targets, covariances),
-        r"^tie_points\[0\]: expected shape \(6, 3\)": (points[:, :2], targets, covariances),
-        r"^tie_points\[1\]: expected shape \(6, 3\)": (points, targets[:4], covariances),
-        r"^tie_points\[1\]: expected finite": (points, targets * np.nan, covariances),
-        r"^tie_points\[2\]: expected finite": (points, targets, covariances * np.inf),
-        r"^tie_points\[2\]: expected shape \(6, 3, 3\)": (points, targets, 0.1),
-        r"^tie_points\[2\]: expected symmetric positive definite": (points, targets, negative),
-        r"^tie_points\[2\]: expected symmetric": (points, targets, skewed),
+        r"^tie_points: source_points: expected numbers of shape": ("abc", targets, covariances),
+        r"^tie_points: source_points: expected shape \(6, 3\)": (points[:, :2], targets, covariances),
+        r"^tie_points: target_points: expected shape \(6, 3\)": (points, targets[:4], covariances),
+        r"^tie_points: target_points: expected finite": (points, targets * np.nan, covariances),
+        r"^tie_points: covariances: expected finite": (points, targets, covariances * np.inf),
+        r"^tie_points: covariances: expected shape \(6, 3, 3\)": (points, targets, 0.1),
+        r"^tie_points: covariances: expected symmetric positive definite": (points, targets, negative),
+        r"^tie_points: covariances: expected symmetric": (points, targets, skewed),
     }
     for message, given in cases.items():
         with pytest.raises(ValueError, match=message):
             mcg.register(source, target, mcg.GICP(), tie_points=given)
     cases = {
         r"^prior: expected \(pose, covariance\)": truth,
-        r"^prior\[0\]: expected a rigid motion": (2 * truth, np.eye(6)),
-        r"^prior\[1\]: expected shape \(6, 6\)": (truth, np.eye(3)),
-        r"^prior\[1\]: expected symmetric positive": (truth, np.zeros((6, 6))),
-        r"^prior\[1\]: expected finite": (truth, np.full((6, 6), np.nan)),
+        r"^prior: pose: expected a rigid motion": (2 * truth, np.eye(6)),
+        r"^prior: covariance: expected shape \(6, 6\)": (truth, np.eye(3)),
+        r"^prior: covariance: expected symmetric positive": (truth, np.zeros((6, 6))),
+        r"^prior: covariance: expected finite": (truth, np.full((6, 6), np.nan)),
     }
     for message, given in cases.items():
         with pytest.raises(ValueError, match=message):
