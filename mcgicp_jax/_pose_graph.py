@@ -33,8 +33,8 @@ class Edge(eqx.Module):
     Attributes:
         i, j: rows of the two poses in `PoseGraph.poses`, integers. `i` may be `WORLD`.
         T_i_j: (4, 4), the measured T_i⁻¹ T_j, which maps coordinates of frame j to frame i; metres. For a position
-            without a rotation give any rotation, such as the identity, and no information about it; v is along its
-            axes.
+            without a rotation give one near the true one, such as that of the first poses, and no information about
+            it; v is along its axes.
         information: (6, 6), inverse covariance of ξ = (v, ω) in T_i_j exp(ξ), the tangent of `Registration.covariance`,
             metres and radians; symmetric, positive semidefinite. Zero along directions that were not measured.
         loop: whether the measurement may be an outlier, so that `optimize_poses` may reject the edge.
