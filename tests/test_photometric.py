@@ -68,6 +68,7 @@ def test_a_wall_of_sharp_edges_is_constrained():
     assert result.converged and mcg.metrics.pose_error(result.matrix, truth)[0] < 1e-3
 
 
+@pytest.mark.slow
 def test_batches_on_accelerators_find_the_same_pose():
     source, target, _ = pair(wall, 400, truth=SMALL)
     alone = mcg.register(source, target, PHOTOMETRIC)
@@ -169,6 +170,7 @@ def test_align_has_the_gradient_of_its_answer(noisy):
     check_gradient(loss, inputs)
 
 
+@pytest.mark.slow
 def test_missing_channels_and_padding_have_no_gradient():
     source, target, truth = pair(wall, 400, truth=SMALL)
     known = np.random.default_rng(0).random(source.channels.shape) < 0.7

@@ -247,6 +247,7 @@ def test_gradients_of_tie_points_and_prior(scene, noisy, hall):
     check_gradient(loss, jax.tree.map(jnp.asarray, inputs))
 
 
+@pytest.mark.slow
 def test_batches_of_tie_points(corner):
     """Under vmap and jit, the answers are those of the host."""
     source, target, truth = corner
