@@ -15,7 +15,7 @@ from jaxtyping import Bool, Float
 from mcgicp_jax._cloud import PointCloud
 from mcgicp_jax._kept import keep
 from mcgicp_jax._neighborhoods import check_neighbors
-from mcgicp_jax._pose import AnyArray, AnyScalar
+from mcgicp_jax._pose import AnyArray, AnyScalar, is_concrete
 from mcgicp_jax._search import Correspondences
 from mcgicp_jax._statistics import constant, median, namespace, of_known, sampled_rows
 from mcgicp_jax._surface import Local
@@ -104,10 +104,7 @@ def point_spacing(cloud: PointCloud) -> Float[AnyScalar, ""]:
 
     Some files hold points twice, and some scanners report each beam without an echo as a point at the origin.
     """
-    distances = _neighbor_distances(cloud)
-    xp = namespace(distances)
-    nearest = xp.min(xp.where(distances > 0, distances, xp.inf), axis=1)
-    return xp.nan_to_num(median(xp.where(xp.isfinite(nearest), nearest, xp.nan)))
+    return _spacings(cloud)[0]
 
 
 def grid_spacing(cloud: PointCloud) -> Float[AnyScalar, ""]:
@@ -116,12 +113,25 @@ def grid_spacing(cloud: PointCloud) -> Float[AnyScalar, ""]:
 
     Where points lie on scan lines, it is larger than `point_spacing`, which is the spacing along the lines.
     """
+    return _spacings(cloud)[1]
+
+
+def _spacings(cloud: PointCloud) -> tuple[Float[AnyScalar, ""], Float[AnyScalar, ""]]:
+    """`point_spacing` and `grid_spacing`; cached with a concrete cloud."""
+    if is_concrete(cloud):
+        return keep(cloud, "spacings", None, lambda: _measured_spacings(cloud))
+    return _measured_spacings(cloud)
+
+
+def _measured_spacings(cloud: PointCloud) -> tuple[Float[AnyScalar, ""], Float[AnyScalar, ""]]:
     distances = _neighbor_distances(cloud)
     xp = namespace(distances)
+    nearest = xp.min(xp.where(distances > 0, distances, xp.inf), axis=1)
+    spacing = xp.nan_to_num(median(xp.where(xp.isfinite(nearest), nearest, xp.nan)))
     known = xp.isfinite(distances)
     count = xp.sum(known, axis=1)
     grid = xp.max(xp.where(known, distances, 0), axis=1) * xp.sqrt(xp.pi / xp.maximum(count, 1))
-    return xp.nan_to_num(median(xp.where(count > 1, grid, xp.nan))).astype(distances.dtype)
+    return spacing, xp.nan_to_num(median(xp.where(count > 1, grid, xp.nan))).astype(distances.dtype)
 
 
 def _neighbor_distances(cloud: PointCloud) -> Float[AnyArray, "n k"]:

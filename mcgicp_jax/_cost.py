@@ -85,7 +85,7 @@ def _total_cost(
     log_determinant: bool,
 ) -> Float[Array, ""]:
     matched = matched_rows(source, target, matches, temperature)
-    method = method.with_estimates(estimates_at(rotation, translation, matched, source.rows.valid, method))
+    method = method.with_estimates(estimates_at(rotation, translation, matched, source.rows.valid, method.estimates))
     _, forces, counts = forces_at(rotation, translation, matched, method, robust)
     cost = jnp.sum(forces.cost)
     if log_determinant:

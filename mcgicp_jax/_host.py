@@ -28,6 +28,7 @@ from mcgicp_jax._blocks import map_blocks, map_rows
 from mcgicp_jax._deferred import Deferred
 from mcgicp_jax._kernels import AbstractKernel
 from mcgicp_jax._methods import AbstractMethod
+from mcgicp_jax._photometric import Term
 from mcgicp_jax._pose import AnyArray, AnyScalar, rotation_from_quaternion
 from mcgicp_jax._search import AbstractIndex, Correspondences, Rows, by_position
 from mcgicp_jax._statistics import sampled_rows
@@ -69,15 +70,15 @@ def register_on_host(
         Final state, information matrix and covariance, history, and sums over the scores.
     """
     pose, settings, records = problem.start, problem.settings, []
-    estimates = problem.method.estimates is not None
-    coarse = settings.fine_distance < settings.max_distance or settings.coarse_stride > 1 or estimates
+    term = problem.method.estimates
+    coarse = settings.fine_distance < settings.max_distance or settings.coarse_stride > 1 or term is not None
     status: Any = np.int32(COARSE if coarse else RUNNING)
     num_iterations: Any = np.int32(0)
     followed: tuple[int, bool] | None = None
     while status < 0:
         last = num_iterations >= settings.max_iterations
         stride = int(settings.coarse_stride) if status == COARSE and not last else 1
-        alone = estimates and status != COARSE
+        alone = term is not None and status != COARSE
         if status != SETTLED and (stride, alone) != followed:
             followed, source = (stride, alone), _every(stride, problem.source)
             rows = by_position(source.rows) if alone else source.rows
@@ -85,8 +86,8 @@ def register_on_host(
         if status != SETTLED:
             matches = _Matches(source, problem.target, nearest(pose.wxyz_xyz))
         gate = settings.max_distance if status == COARSE else settings.fine_distance
-        if estimates and status == RUNNING:
-            problem = replace(problem, method=_estimated(pose, matches, gate, problem.method))
+        if term is not None and status == RUNNING:
+            problem = replace(problem, method=problem.method.with_estimates(_estimated(pose, matches, gate, term)))
         sums = _measure(pose, matches, gate, problem)
         state = update(pose, status, num_iterations, sums, settings, problem.fusion)
         pose, num_iterations, status = state.pose, np.asarray(state.num_iterations), np.asarray(state.status)
@@ -159,23 +160,20 @@ def _measure(pose: jaxlie.SE3, matches: _Matches, gate: Float[AnyScalar, ""], pr
     return combine([part for _, part in parts], dtype)
 
 
-def _estimated(
-    pose: jaxlie.SE3, matches: _Matches, gate: Float[AnyScalar, ""], method: AbstractMethod
-) -> AbstractMethod:
-    """The method with its estimates from a sample of the matches at a pose."""
+def _estimated(pose: jaxlie.SE3, matches: _Matches, gate: Float[AnyScalar, ""], term: Term) -> Term:
+    """The term with its numbers from a sample of the matches at a pose."""
     moving = _moving(pose, matches.source.rows.points.dtype)
     some, counts = sampled_rows(matches.source.rows.valid)
-    rows = _evidence_at(moving, matches, some, gate, method)
-    return method.with_estimates(method.estimated(rows, counts, matches.source.rows.valid))
+    return term.estimated(_evidence_at(moving, matches, some, gate, term), counts, matches.source.rows.valid)
 
 
 def _evidence_at(
-    moving: Moving, matches: _Matches, rows: Int[np.ndarray, "n"], gate: Float[AnyScalar, ""], method: AbstractMethod
+    moving: Moving, matches: _Matches, rows: Int[np.ndarray, "n"], gate: Float[AnyScalar, ""], term: Term
 ) -> Float[np.ndarray, "n L"]:
-    """`AbstractMethod.evidence` for some source points."""
+    """`Term.evidence` for some source points."""
 
     def evidence(index: Any) -> Any:
-        return _evidence(moving, *matches.rows_at(rows[index]), gate, method)
+        return _evidence(moving, *matches.rows_at(rows[index]), gate, term)
 
     return map_rows(evidence, rows.size)
 
@@ -187,11 +185,11 @@ def _evidence(
     target: Candidates,
     found: Bool[AnyArray, "m N"],
     gate: Float[AnyScalar, ""],
-    method: AbstractMethod,
+    term: Term,
 ) -> Float[AnyArray, "n L"]:
     matched = _matched(moving, source, target, found, gate)
     moved = move_rows(*moving, matched.source)
-    return method.evidence(matched.source, matched.target, moved, moving[0], matched.valid)
+    return term.evidence(matched.source, matched.target, moved, moving[0], matched.valid)
 
 
 @jax.jit
@@ -260,7 +258,8 @@ def _moments(
     num_channels = np.sum(np.any(source.rows.descriptors != 0, axis=0))
     discount_of_all = discounts(np.where(counts[:, None], rows, np.nan), num_channels)
 
-    responding = None if problem.method.estimates is None else _responding(state.pose, matches, gate, problem, index_of)
+    term = problem.method.estimates
+    responding = None if term is None else _responding(state.pose, matches, gate, term, index_of)
 
     def scores(index: Any) -> Scores:
         weighing = (problem.method, problem.robust, discount_of_all, np.int32(matches.size), responding)
@@ -313,7 +312,7 @@ def _scores(
     robust: AbstractKernel | None,
     discount: Float[AnyArray, "2"],
     num_cells: Int[AnyScalar, ""],
-    responding: AbstractMethod | None,
+    responding: Term | None,
 ) -> Scores:
     matched = _matched(moving, source, target, found, gate)
     flat = Details(*_flat(*details))
@@ -324,22 +323,22 @@ def _responding(
     pose: jaxlie.SE3,
     matches: _Matches,
     gate: Float[AnyScalar, ""],
-    problem: Problem,
+    term: Term,
     index_of: Callable[[bool], AbstractIndex],
-) -> AbstractMethod:
-    """`AbstractMethod.responding` for a sample of the source points."""
+) -> Term:
+    """`Term.responding` for a sample of the source points."""
     some, counts = sampled_rows(matches.source.rows.valid)
     source = jax.tree.map(lambda array: array[some], matches.source)
     rotation, translation = _moving(pose, source.rows.points.dtype)
     found = []
-    for shift in np.asarray(problem.method.shifts):
+    for shift in np.asarray(term.shifts):
         moved = np.concatenate([np.asarray(pose.wxyz_xyz)[:4], translation + shift])
         indices = index_of(True).nearest(moved, by_position(source.rows), float(gate))
-        again = _Matches(source, problem.target, indices)
+        again = _Matches(source, matches.target, indices)
         again.found &= counts
         everything = np.arange(some.size)
-        found.append(_evidence_at((rotation, translation + shift), again, everything, gate, problem.method))
-    return problem.method.responding(np.stack(found))
+        found.append(_evidence_at((rotation, translation + shift), again, everything, gate, term))
+    return term.responding(np.stack(found))
 
 
 def correspondences_at(

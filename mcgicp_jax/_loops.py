@@ -134,7 +134,7 @@ class Trajectory:
         sigma = float(np.sqrt(np.linalg.eigvalsh(covariance[:3, :3])[-1]))
         given: Any = self._options.max_distance
         if given is None:
-            given = default_distances(self._method, self._clouds[i])
+            given = default_distances(self._method.spacing(self._clouds[i]), self._clouds[i])
         coarse, fine = given if np.ndim(given) else (given, given)
         options = replace(self._options, max_distance=(max(float(coarse), _DEVIATIONS * sigma), float(fine)))
         return edge_from(i, j, register_with(self._clouds[j], self._clouds[i], self._method, init, options), loop=True)

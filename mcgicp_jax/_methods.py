@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import abc
 from collections.abc import Iterator, Sequence
-from dataclasses import replace
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import equinox as eqx
 import jax
@@ -132,7 +131,7 @@ class AbstractMethod(Numbers):
         return None
 
     @property
-    def estimates(self) -> Any:
+    def estimates(self) -> Term | None:
         """Numbers that are estimated from the residuals at each pose of the fine phase; None if there are none.
 
         With such numbers, a coarse phase without them always precedes the fine phase, whose matches are the nearest in
@@ -140,42 +139,8 @@ class AbstractMethod(Numbers):
         """
         return None
 
-    def with_estimates(self, estimates: Any) -> AbstractMethod:
+    def with_estimates(self, estimates: Term | None) -> AbstractMethod:
         """The method with other `estimates`."""
-        return self
-
-    def evidence(
-        self,
-        source: Table,
-        target: Table,
-        moved: Float[Array, "3 N"],
-        rotation: Float[Array, "3 3"],
-        valid: Bool[Array, "N"],
-    ) -> Float[Array, "N L"]:
-        """One row per correspondence, from which `estimated` computes `estimates`; arguments as of `forces`."""
-        raise NotImplementedError(f"{type(self).__name__} has estimates, but no evidence for them")
-
-    def estimated(self, rows: Float[AnyArray, "n L"], counts: Bool[AnyArray, "n"], valid: Bool[AnyArray, "N"]) -> Any:
-        """New `estimates` from rows of `evidence`; with NumPy where these are concrete.
-
-        Args:
-            rows: of an even sample of the source points, see `sampled_rows`.
-            counts: which of these rows to use.
-            valid: which of all source points are no padding.
-        """
-        raise NotImplementedError(f"{type(self).__name__} has estimates, but does not compute them")
-
-    @property
-    def shifts(self) -> Float[AnyArray, "S 3"]:
-        """Shifts of the points, metres, from which `responding` measures how the forces respond to motion."""
-        raise NotImplementedError(f"{type(self).__name__} has estimates, but no shifts")
-
-    def responding(self, rows: Float[AnyArray, "S n L"]) -> AbstractMethod:
-        """The method whose stiffness is the actual change of the forces when points move and match anew.
-
-        Args:
-            rows: of `evidence` with all source points moved by each of the `shifts`, and matched anew.
-        """
         return self
 
     def channel_observability(
@@ -183,15 +148,6 @@ class AbstractMethod(Numbers):
     ) -> Float[Array, "6 N"]:
         """Observability of correspondences by the channels, see `_observability`, given the mean of their points'."""
         return mean
-
-    @property
-    def compensates(self) -> bool:
-        """Whether `estimates` include gains and offsets of the channels, for the option `match_channels`."""
-        return False
-
-    def compensating(self) -> AbstractMethod:
-        """The method that `compensates`, if it can."""
-        return self
 
     def stages(
         self, source: PointCloud, target: PointCloud, scales: Sequence[float]
@@ -446,42 +402,12 @@ class MultiChannelGICP(AbstractGeneralized):
     def with_estimates(self, estimates: Term | None) -> MultiChannelGICP:
         return eqx.tree_at(lambda method: method.term, self, estimates, is_leaf=lambda leaf: leaf is None)
 
-    @property
-    def compensates(self) -> bool:
-        return self.term is not None and self.term.compensates
-
-    def compensating(self) -> MultiChannelGICP:
-        return self if self.term is None else self.with_estimates(replace(self.term, compensates=True))
-
     def features(self, around: Neighborhoods | None, local: Local | None) -> Float[Array, "L n"] | None:
         if not self.photometric:
             return None
         if around is None:
             raise ValueError(_NO_NEIGHBORS)
         return features_of_points(around, _known(local).normal) if around.num_channels else None
-
-    def evidence(
-        self,
-        source: Table,
-        target: Table,
-        moved: Float[Array, "3 N"],
-        rotation: Float[Array, "3 3"],
-        valid: Bool[Array, "N"],
-    ) -> Float[Array, "N L"]:
-        residuals = self._known_term().residuals(source, target, moved, rotation, valid)
-        return jnp.stack([*residuals.rows, *jnp.where(valid, moved, 0)], axis=1)
-
-    def estimated(self, rows: Float[AnyArray, "n L"], counts: Bool[AnyArray, "n"], valid: Bool[AnyArray, "N"]) -> Term:
-        xp = namespace(counts, valid)
-        fraction = xp.sum(counts) / xp.maximum(xp.sum(valid), 1)
-        return self._known_term().adapted(xp.where(counts[:, None], rows, xp.nan), fraction)
-
-    @property
-    def shifts(self) -> Float[AnyArray, "S 3"]:
-        return self._known_term().shifts
-
-    def responding(self, rows: Float[AnyArray, "S n L"]) -> MultiChannelGICP:
-        return self.with_estimates(self._known_term().responding(rows))
 
     def channel_observability(
         self, mean: Float[Array, "6 N"], source: Table, target: Table, rotation: Float[Array, "3 3"]
@@ -491,11 +417,6 @@ class MultiChannelGICP(AbstractGeneralized):
         # Far from the pose, slopes of matched points have nothing to do with each other.
         correlated = correlated_slopes(source, target, rotation, self.weights(self.term.gains.shape[0]))
         return jnp.where(self.term.is_on, correlated, mean)
-
-    def _known_term(self) -> Term:
-        if self.term is None:
-            raise ValueError("photometric: not resolved yet; call method.resolve(source, target) first")
-        return self.term
 
     def forces(
         self,
@@ -513,6 +434,7 @@ class MultiChannelGICP(AbstractGeneralized):
         return jax.lax.cond(
             self.term.is_on,
             lambda term: term.forces(term.residuals(*matched), points_of(target) - moved, robust),
+            # The scale of `robust` is that of the term's residuals.
             lambda _: plain(*matched, None),
             self.term,
         )

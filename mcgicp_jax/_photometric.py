@@ -93,6 +93,29 @@ class Term(eqx.Module):
     def is_on(self) -> Bool[AnyScalar, ""]:
         return self.deviations[0] > 0
 
+    def evidence(
+        self,
+        source: Table,
+        target: Table,
+        moved: Float[Array, "3 n"],
+        rotation: Float[Array, "3 3"],
+        valid: Bool[Array, "n"],
+    ) -> Float[Array, "n L"]:
+        """One row per correspondence, from which the numbers are estimated; arguments as of `residuals`."""
+        residuals = self.residuals(source, target, moved, rotation, valid)
+        return jnp.stack([*residuals.rows, *jnp.where(valid, moved, 0)], axis=1)
+
+    def estimated(self, rows: Float[AnyArray, "n L"], counts: Bool[AnyArray, "n"], valid: Bool[AnyArray, "N"]) -> Term:
+        """The term with its numbers estimated from rows of `evidence`; with NumPy where these are concrete.
+
+        Args:
+            rows: of an even sample of the source points, see `sampled_rows`.
+            counts: which of these rows to use.
+            valid: which of all source points are no padding.
+        """
+        xp = namespace(counts, valid)
+        return self.adapted(xp.where(counts[:, None], rows, xp.nan), xp.sum(counts) / xp.maximum(xp.sum(valid), 1))
+
     def residuals(
         self,
         source: Table,
@@ -143,7 +166,7 @@ class Term(eqx.Module):
         return sum(terms[1:], start=terms[0])
 
     def adapted(self, rows: Float[AnyArray, "n L"], fraction: Float[AnyScalar, ""]) -> Term:
-        """The term with its numbers estimated from `Residuals.rows`; with NumPy where these are concrete.
+        """The term with its numbers estimated from rows of `evidence`.
 
         Args:
             rows: of an even sample of the correspondences; NaN in rows to ignore.
@@ -197,7 +220,7 @@ class Term(eqx.Module):
         than the slope at either says where the slope is large.
 
         Args:
-            rows: of `Residuals.rows` for the points moved by each of the `shifts` and matched anew.
+            rows: of `evidence` for the points moved by each of the `shifts` and matched anew.
         """
         xp, count = namespace(self, rows), self.designs.shape[0]
         rows = xp.asarray(rows)
@@ -261,7 +284,7 @@ class Residuals(NamedTuple):
 
     @property
     def rows(self) -> list[Float[Array, "n"]]:
-        """The columns of the input of `Term.adapted`, without the moved points that follow them."""
+        """The columns of `Term.evidence`, without the moved points that follow them."""
         return [*self.values, *(axis for slope in self.slopes for axis in slope), *self.own]
 
 

@@ -359,7 +359,7 @@ def register_with(
         found = registration_of(*run.finish(), coarse, coarse_target)
         init = found.matrix if is_usable(found) else init
     run = _solved(source, target, method, init, options, search)
-    if options.match_channels and not run.problem.method.compensates:
+    if options.match_channels and run.problem.method.estimates is None:
         source = _matched(source, target, method, _nearest_points(source, target, run, search))
         init = constant(pose_in_user_frame(run.state.pose, source.origin, target.origin))
         run = _solved(source, target, method, init, options, search)
@@ -461,7 +461,8 @@ def pose_problem(
     """Inputs of the loop for preprocessed clouds; NumPy arrays where everything is concrete."""
     _check_clouds(source, target, method)
     method, seen, there = surfaces_of(method, source, target, observed=True, num_threads=num_threads)
-    method = method.compensating() if options.match_channels else method
+    if options.match_channels and method.estimates is not None:
+        method = method.with_estimates(replace(method.estimates, compensates=True))
     dtype = source.points.dtype
     xp = namespace(source.valid)
     stride = xp.maximum(xp.sum(xp.asarray(source.valid)) // _COARSE_ROWS, 1)
@@ -470,9 +471,8 @@ def pose_problem(
     return Problem(start, seen, there, method, robust, _settings(options, method, target, stride, dtype))
 
 
-def default_distances(method: AbstractMethod, target: PointCloud) -> tuple[Any, Any]:
-    """Default `max_distance` of the coarse and the fine phase, metres."""
-    spacing = constant(method.spacing(target))
+def default_distances(spacing: Any, target: PointCloud) -> tuple[Any, Any]:
+    """Default `max_distance` of the coarse and the fine phase, metres, for a target with this spacing."""
     # Cells have the spacing of their grid.
     between = spacing if target.covariances is not None else constant(grid_spacing(target))
     return _COARSE_SPACINGS * namespace(spacing, between).maximum(spacing, between), _FINE_SPACINGS * spacing
@@ -483,7 +483,7 @@ def _settings(options: Options, method: AbstractMethod, target: PointCloud, stri
     tolerance: Any = options.translation_tolerance
     # Options are constants to autodiff, even if they are derived from a differentiated cloud.
     spacing = constant(method.spacing(target))
-    max_distance = default_distances(method, target) if max_distance is None else max_distance
+    max_distance = default_distances(spacing, target) if max_distance is None else max_distance
     least = spacing * _TOLERANCE_IN_SPACINGS
     tolerance = least if tolerance is None else tolerance
 

@@ -20,6 +20,7 @@ from mcgicp_jax import _algebra as alg
 from mcgicp_jax._forces import Forces
 from mcgicp_jax._kernels import AbstractKernel
 from mcgicp_jax._methods import AbstractMethod
+from mcgicp_jax._photometric import Term
 from mcgicp_jax._pose import AnyArray, AnyScalar
 from mcgicp_jax._search import Correspondences, Rows
 from mcgicp_jax._statistics import sampled_rows
@@ -90,21 +91,21 @@ def estimates_at(
     translation: Float[Array, "3"],
     matched: Matched,
     valid: Bool[AnyArray, "N"],
-    method: AbstractMethod,
-) -> Any:
+    term: Term | None,
+) -> Term | None:
     """`AbstractMethod.estimates` from the residuals at a pose; constant to autodiff, and None if there are none.
 
     Args:
         valid: which source points are no padding.
     """
-    if method.estimates is None:
+    if term is None:
         return None
     rows, counts = sampled_rows(valid)
     source, target = gathered(matched.source, rows), gathered(matched.target, rows)
-    evidence = method.evidence(
+    evidence = term.evidence(
         source, target, move_rows(rotation, translation, source), rotation, jnp.asarray(matched.valid)[rows]
     )
-    return jax.lax.stop_gradient(method.estimated(evidence, counts, valid))
+    return jax.lax.stop_gradient(term.estimated(evidence, counts, valid))
 
 
 def forces_at(

@@ -20,6 +20,7 @@ from jaxtyping import Array, Float, Int
 from mcgicp_jax._deferred import Deferred
 from mcgicp_jax._kernels import AbstractKernel
 from mcgicp_jax._methods import AbstractMethod
+from mcgicp_jax._photometric import Term
 from mcgicp_jax._pose_form import Fusion
 from mcgicp_jax._result import Status
 from mcgicp_jax._search import AbstractSearch, Correspondences, Rows, by_position
@@ -95,7 +96,7 @@ def align_traced(
         estimates: Any,
     ) -> tuple[Correspondences, Sums, Any]:
         moving = rotation_and_translation(pose, pose.wxyz_xyz.dtype)
-        estimates = _renewed(status, estimates, estimates_at(*moving, fixed, source.rows.valid, method_fixed))
+        estimates = _renewed(status, estimates, estimates_at(*moving, fixed, source.rows.valid, method_fixed.estimates))
         now = method_fixed.with_estimates(estimates)
         return before, sums_of(*moving, fixed, now, robust_fixed), estimates
 
@@ -163,7 +164,7 @@ def moments_of(
             ),
             jnp.sum(jnp.any(source.rows.descriptors != 0, axis=0)),
         )
-    num_cells = source.rows.valid.size
+    num_cells, term = source.rows.valid.size, problem.method.estimates
     scores = scores_of(
         pose,
         state.sums.center,
@@ -174,17 +175,21 @@ def moments_of(
         num_cells,
         problem.method,
         problem.robust,
-        None if search is None or problem.method.estimates is None else _responding(pose, state, problem, search),
+        None if search is None or term is None else _responding(pose, state, problem, term, search),
     )
     scatter, num_cells = scatter_of(scores, num_cells)
     return Moments(scores.jacobian, scores.bias, scatter, num_cells)
 
 
 def _responding(
-    pose: tuple[Float[Array, "3 3"], Float[Array, "3"]], state: State, problem: Problem, search: AbstractSearch
-) -> AbstractMethod:
-    """`AbstractMethod.responding` for a sample of the source points."""
-    source, target, method = problem.source, problem.target, problem.method
+    pose: tuple[Float[Array, "3 3"], Float[Array, "3"]],
+    state: State,
+    problem: Problem,
+    term: Term,
+    search: AbstractSearch,
+) -> Term:
+    """`Term.responding` for a sample of the source points."""
+    source, target = problem.source, problem.target
     rows, counts = sampled_rows(source.rows.valid)
     some, table = jax.tree.map(lambda array: jnp.asarray(array)[rows], (by_position(source.rows), source.table))
     gate = problem.settings.fine_distance
@@ -197,9 +202,9 @@ def _responding(
         there = gathered(jax.tree.map(jnp.asarray, target.table), here)
         moved = move_rows(*moving, table)
         valid, _ = within(moved, there, (found >= 0) & counts & some.valid & jnp.asarray(target.rows.valid)[here], gate)
-        return method.evidence(table, there, moved, moving[0], valid)
+        return term.evidence(table, there, moved, moving[0], valid)
 
-    return method.responding(jax.lax.map(evidence, jnp.asarray(method.shifts)))
+    return term.responding(jax.lax.map(evidence, jnp.asarray(term.shifts)))
 
 
 def begin(problem: Problem, search: AbstractSearch, max_iterations: int) -> Carry:
@@ -268,7 +273,9 @@ def _measuring(problem: Problem, search: AbstractSearch) -> Measure:
         moved = move_rows(*moving, matched.source)
         valid, distances = within(moved, matched.target, matched.valid, settings.gate(status))
         matched = eqx.tree_at(lambda matched: matched.valid, matched, valid)
-        estimates = _renewed(status, estimates, estimates_at(*moving, matched, source.rows.valid, problem.method))
+        estimates = _renewed(
+            status, estimates, estimates_at(*moving, matched, source.rows.valid, problem.method.estimates)
+        )
         sums = sums_of(*moving, matched, problem.method.with_estimates(estimates), problem.robust)
         valid, distances = valid.reshape(indices.shape), distances.reshape(indices.shape)
         # Index −1 marks a missing match until the loop ends, see `cleaned`.

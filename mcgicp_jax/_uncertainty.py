@@ -26,6 +26,7 @@ from mcgicp_jax import _algebra as alg
 from mcgicp_jax._directions import Directions
 from mcgicp_jax._kernels import AbstractKernel
 from mcgicp_jax._methods import AbstractMethod
+from mcgicp_jax._photometric import Term
 from mcgicp_jax._pose import AnyArray, AnyScalar
 from mcgicp_jax._search import Rows
 from mcgicp_jax._solve import adjoint_to_source, twist_form, units
@@ -134,7 +135,7 @@ def scores_of(
     num_cells: Int[AnyScalar, ""],
     method: AbstractMethod,
     robust: AbstractKernel | None,
-    responding: AbstractMethod | None = None,
+    responding: Term | None = None,
 ) -> Scores:
     """The scores of correspondences at a pose.
 
@@ -144,8 +145,8 @@ def scores_of(
         details: None where observability is not known; then O = I.
         discount: from `discounts`.
         num_cells: size of the hash table of cells.
-        responding: from `AbstractMethod.responding`, whose stiffness replaces K O, and whose forces w M O d. None for
-            methods without estimates, and where matches are fixed.
+        responding: estimates from `Term.responding`. With these, the stiffness of the method replaces K O, and its
+            forces replace w M O d. None for methods without estimates, and where matches are fixed.
     """
     moved, forces, counts = forces_at(*pose, matched, method, robust)
     arms = jnp.where(matched.valid, (moved - center[:, None]) / radius, 0)
@@ -158,7 +159,7 @@ def scores_of(
         size = 0.5 * edge * (reach_of(details.source) + reach_of(details.target))
         cells = _cells(moved, matched.valid, size, num_cells)
     if responding is not None:
-        seen = forces_at(*pose, matched, responding, robust)[1]
+        seen = forces_at(*pose, matched, method.with_estimates(responding), robust)[1]
         stiffness, bias = seen.stiffness, jnp.sum(_wrench(arms, forces.force - seen.force), axis=1)
     elif details is not None:
         geometry, *channels = mean_observability(pose[0], matched, method)

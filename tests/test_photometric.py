@@ -32,7 +32,7 @@ def held(source, target, method, pose, matches):
     method, seen, there = surfaces_of(method, source, target, observed=False)
     matched = matched_rows(seen, there, matches)
     pose = jnp.asarray(pose, source.points.dtype)
-    term = estimates_at(pose[:3, :3], pose[:3, 3], matched, source.valid, method)
+    term = estimates_at(pose[:3, :3], pose[:3, 3], matched, source.valid, method.estimates)
     result = Held(method.channel_covariance, method.channel_weights, photometric=True)
     object.__setattr__(result, "term", term)
     return result, term

@@ -15,6 +15,7 @@ import tyro
 
 import mcgicp_jax as mcg
 from mcgicp_jax import plot
+from mcgicp_jax._channels import point_spacing
 from mcgicp_jax._formats import READERS, WRITERS, by_suffix
 from mcgicp_jax._kernels import AbstractKernel
 from mcgicp_jax._methods import AbstractMethod
@@ -203,8 +204,8 @@ def voxel_size_for(clouds: Sequence[mcg.PointCloud], options: Options) -> float 
 
 
 def described_distance(options: Options, target: mcg.PointCloud) -> str:
-    """`max_distance` in words; its default is that of all methods that match points."""
-    distances = options.max_distance or default_distances(mcg.GICP(), target)
+    """`max_distance` in words."""
+    distances = options.max_distance or default_distances(point_spacing(target), target)
     return " m, then ".join(f"{float(distance):.3g}" for distance in distances) + " m"
 
 
