@@ -19,6 +19,9 @@ from mcgicp_jax._search import AbstractSearch
 MIN_POINTS = 4
 # Voxels along one axis: three 21-bit indices fit one 63-bit key.
 _VOXELS_PER_AXIS = 2**21
+# Coordinates rounded to steps of more than this fraction of the spacing of the points are warned of. The error, uniform
+# over a step, then has a standard deviation of 3 % of the spacing, the noise of a good sensor.
+_LARGEST_STEP = 0.1
 # Largest magnitude of a value, in its own unit: larger ones overflow float32.
 _LARGEST = np.finfo(np.float32).max
 
@@ -51,12 +54,13 @@ def preprocess(
             with covariances is to be downsampled, the cloud is a batch, or an argument is out of range.
 
     Warns:
-        UserWarning: once per call, if points with NaN or infinity were left out, and if downsampling leaves fewer
-            points than `num_neighbors`.
+        UserWarning: once per call, if points with NaN or infinity were left out, if downsampling leaves fewer points
+            than `num_neighbors`, and if coordinates far from zero are float32 and too coarse for the points' spacing.
     """
     check_preprocessing(voxel_size, num_neighbors)
     cloud = finite_rows(cloud)
     found = with_neighbors(cloud, voxel_size, num_neighbors, search)
+    _warn_of_rounding(cloud, found)
     if len(found) < min(len(cloud), num_neighbors):
         warnings.warn(
             f"voxel_size: {voxel_size} m leaves {len(found)} of {len(cloud)} points, fewer than the {num_neighbors} "
@@ -94,6 +98,22 @@ def with_neighbors(
             # Quantities derived from these arrays are cached, so the arrays must not change. They are copies.
             array.setflags(write=False)
     return cloud.replace_rows(**arrays)
+
+
+def _warn_of_rounding(given: PointCloud, found: PointCloud) -> None:
+    """Warn if the coordinates were given in float32 and are too large for it, such as those of UTM."""
+    if given.points.dtype != np.float32 or not np.any(found.origin):
+        return
+    largest, points, neighbors = np.abs(given.points).max(), np.asarray(found.points), np.asarray(found.neighbors)
+    # Each point is its own first neighbour.
+    spacing = np.median(np.linalg.norm(points[neighbors[:, 1]] - points, axis=1))
+    if np.spacing(largest) > _LARGEST_STEP * spacing:
+        warnings.warn(
+            f"points: float32 has rounded coordinates of {largest:.0f} m to steps of {np.spacing(largest):.2g} m, and "
+            f"neighbours are {spacing:.2g} m apart; read them as float64, or subtract an offset before float32",
+            UserWarning,
+            stacklevel=3,
+        )
 
 
 def check_preprocessing(voxel_size: float | None, num_neighbors: int) -> None:

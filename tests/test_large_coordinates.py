@@ -139,3 +139,17 @@ def test_the_batch_command(files, near, capsys):
         (row,) = csv.DictReader(file)
     matrix = np.array([[float(row[f"m{i}{j}"]) for j in range(4)] for i in range(3)] + [[0, 0, 0, 1]])
     assert_as_near(matrix, near)
+
+
+def test_coordinates_that_float32_has_rounded_are_warned_of():
+    points = np.random.default_rng(0).uniform(0, 10, (500, 3))
+    with pytest.warns(UserWarning, match=r"^points: float32 has rounded coordinates of 5200010 m to steps of 0.5 m"):
+        mcg.preprocess((points + UTM).astype(np.float32))
+
+
+@pytest.mark.filterwarnings("error")
+def test_coordinates_that_float32_resolves_are_not_warned_of():
+    points = np.random.default_rng(0).uniform(0, 10, (500, 3))
+    mcg.preprocess(points + UTM)
+    mcg.preprocess((points + np.array([0, 0, 1000.0])).astype(np.float32))
+    mcg.preprocess(points.astype(np.float32))
