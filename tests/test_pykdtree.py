@@ -11,9 +11,11 @@ from hypothesis import strategies as st
 import mcgicp_jax as mcg
 from mcgicp_jax._pykdtree import PyKDTree
 from mcgicp_jax._search import Rows
+from tests.benchmarks import accuracy
 
 pytest.importorskip("pykdtree")
 SCIPY, PYKDTREE = (mcg.KDTreeSearch(backend=name) for name in ("scipy", "pykdtree"))
+METHODS = (mcg.GICP(), mcg.MultiChannelGICP(), mcg.MultiChannelGICP(photometric=True))
 STILL = np.array([1.0, 0, 0, 0, 0, 0, 0])
 
 
@@ -63,17 +65,19 @@ def test_many_neighbors():
 
 
 @pytest.mark.slow
-def test_real_scans_have_the_same_poses(data):
-    pair = [mcg.io.read(data / "lidar_pair" / f"{name}.ply") for name in ("source", "target")]
-    frames = mcg.datasets.kitti(data / "kitti" / "sequences" / "04")
-    clouds = [frame.cloud for frame in frames[:4]]
-    pairs = [(*pair, 0.1), (*pair, 0.5), *((later, sooner, 0.25) for sooner, later in itertools.pairwise(clouds))]
-    for source, target, voxel_size in pairs:
+@pytest.mark.parametrize("name", ["lidar pair", *(name for name in accuracy.SETS if "posters" not in name)])
+def test_real_pairs_have_the_same_poses(data, monkeypatch, name):
+    monkeypatch.setattr(accuracy, "DATA", data)
+    if name == "lidar pair":
+        clouds = [mcg.io.read(data / "lidar_pair" / f"{side}.ply") for side in ("source", "target")]
+        pairs, voxel_size, options = [(*clouds, np.eye(4))], 0.25, {}
+    else:
+        make, voxel_size, options = accuracy.SETS[name]
+        pairs = [(pair.source, pair.target, pair.start) for pair in itertools.islice(make(), 2)]
+    for source, target, init in pairs:
         results = []
         for search in (SCIPY, PYKDTREE):
             clouds = [mcg.preprocess(cloud, voxel_size, search=search) for cloud in (source, target)]
-            results += [
-                [mcg.register(*clouds, method, search=search) for method in (mcg.GICP(), mcg.MultiChannelGICP())]
-            ]
+            results += [[mcg.register(*clouds, method, init=init, search=search, **options) for method in METHODS]]
         for one, other in zip(*map(jax.tree.leaves, results), strict=True):
             np.testing.assert_array_equal(np.asarray(one), np.asarray(other))
