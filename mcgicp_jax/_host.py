@@ -164,7 +164,10 @@ def _estimated(pose: jaxlie.SE3, matches: _Matches, gate: Float[AnyScalar, ""], 
     """The term with its numbers from a sample of the matches at a pose."""
     moving = _moving(pose, matches.source.rows.points.dtype)
     some, counts = sampled_rows(matches.source.rows.valid)
-    return term.estimated(_evidence_at(moving, matches, some, gate, term), counts, matches.source.rows.valid)
+    evidence = _evidence_at(moving, matches, some, gate, term)
+    # Huge coordinates or channels lead to the status NON_FINITE; NumPy need not warn of them.
+    with np.errstate(over="ignore", invalid="ignore"):
+        return term.estimated(evidence, counts, matches.source.rows.valid)
 
 
 def _evidence_at(
@@ -338,7 +341,8 @@ def _responding(
         again.found &= counts
         everything = np.arange(some.size)
         found.append(_evidence_at((rotation, translation + shift), again, everything, gate, term))
-    return term.responding(np.stack(found))
+    with np.errstate(over="ignore", invalid="ignore"):
+        return term.responding(np.stack(found))
 
 
 def correspondences_at(

@@ -69,7 +69,9 @@ def of_known(statistic: Callable[[Any], Any], values: Float[AnyArray, "n C"]) ->
     """
     xp = namespace(values)
     missing = xp.all(xp.isnan(values), axis=0)
-    return xp.where(missing, xp.nan, statistic(xp.where(missing, 0, values)))
+    # Squares of huge values overflow to infinity.
+    with np.errstate(over="ignore", invalid="ignore"):
+        return xp.where(missing, xp.nan, statistic(xp.where(missing, 0, values)))
 
 
 def _traced_median(values: Float[Array, "*batch n"]) -> Float[Array, "*batch"]:

@@ -23,6 +23,7 @@ METHODS = {
     "gicp": mcg.GICP(),
     "color-icp": mcg.ColorICP(0.1),
     "mc-gicp": mcg.MultiChannelGICP(),
+    "photometric": mcg.MultiChannelGICP(photometric=True),
 }
 # All clouds fit into the smallest size class: one program per method serves them.
 MOST = 128
@@ -142,6 +143,15 @@ def assert_believable(result, init=None):
 
 def copied(values):
     return copy.deepcopy(np.asarray(values))
+
+
+@pytest.mark.parametrize("size", [1e18, 1e38])
+def test_squares_of_channels_may_overflow(size):
+    points = np.random.default_rng(0).normal(size=(8, 3))
+    channels = size * np.random.default_rng(1).uniform(-1, 1, (8, 2))
+    for name in ("mc-gicp", "photometric"):
+        cloud = mcg.PointCloud(points, channels)
+        assert_believable(outcome(lambda name=name, cloud=cloud: mcg.register(cloud, cloud, METHODS[name])))
 
 
 @settings(max_examples=80, deadline=None)
