@@ -9,7 +9,7 @@ import mcgicp_jax as mcg
 from mcgicp_jax._statistics import median
 from mcgicp_jax._sums import estimates_at, matched_rows, move_rows
 from mcgicp_jax._surfaces import surfaces_of
-from tests.differences import GATE, TO_ROUNDING, check_gradient, clouds_with, inputs_of, needs_x64, weigh
+from tests.differences import CONVERGED, GATE, TO_ROUNDING, check_gradient, clouds_with, inputs_of, needs_x64, weigh
 from tests.scenes import motion, pair, wall
 
 PHOTOMETRIC = mcg.MultiChannelGICP(photometric=True)
@@ -168,6 +168,33 @@ def test_align_has_the_gradient_of_its_answer(noisy):
     inputs = inputs_of(source, target, method, None)
     inputs = {name: value for name, value in inputs.items() if name not in ("method", "robust")}
     check_gradient(loss, inputs)
+
+
+@needs_x64
+@pytest.mark.slow
+def test_register_has_the_gradient_of_align():
+    """At the same matches, with the numbers of the term that they lead to."""
+    source, target, _ = pair(size=400, noise=0.02, channel_noise=0.02)
+    found = mcg.register(source, target, PHOTOMETRIC, max_distance=GATE, **CONVERGED)
+    assert found.converged
+    matches = mcg.find_correspondences(source, target, found.matrix, mcg.PointToPoint(), max_distance=GATE)
+    method, _ = held(source, target, PHOTOMETRIC, found.matrix, matches)
+
+    def registered(clouds):
+        return mcg.register(*clouds, PHOTOMETRIC, init=found.matrix, max_distance=GATE, **CONVERGED)
+
+    def aligned(clouds):
+        return mcg.align(*clouds, matches, method, init=found.matrix, **TO_ROUNDING)
+
+    inputs = inputs_of(source, target, method, None)
+    inputs = {name: value for name, value in inputs.items() if name not in ("method", "robust")}
+    actual, expected = (
+        jax.jit(jax.grad(lambda inputs, of=of: weigh(of(clouds_with(inputs, source, target)).matrix)))(inputs)
+        for of in (registered, aligned)
+    )
+    for name, gradient in expected.items():
+        assert np.abs(gradient).max() > 0
+        np.testing.assert_allclose(actual[name], gradient, atol=1e-6 * np.abs(gradient).max(), err_msg=name)
 
 
 @pytest.mark.slow
