@@ -58,7 +58,8 @@ def median(values: Any) -> Any:
     for place in np.ndindex(values.shape[:-1]):
         known = values[place][~np.isnan(values[place])]
         if known.size:
-            result[place] = np.median(known)
+            # In float64, in which the sum of the two middle values does not overflow.
+            result[place] = np.median(known.astype(np.float64))
     return result[()]
 
 
@@ -89,7 +90,8 @@ def _traced_median(values: Float[Array, "*batch n"]) -> Float[Array, "*batch"]:
     ordered = jax.lax.bitcast_convert_type(reordered(jnp.sort(reordered(bits))), values.dtype)
     count = jnp.sum(~missing, axis=-1, keepdims=True)
     middle = jnp.concatenate([jnp.maximum(count - 1, 0) // 2, count // 2], axis=-1)
-    return jnp.mean(jnp.take_along_axis(ordered, middle, axis=-1), axis=-1)
+    # The sum of two large values would overflow.
+    return jnp.sum(0.5 * jnp.take_along_axis(ordered, middle, axis=-1), axis=-1)
 
 
 def cell_numbers(keys: Sequence[Int[AnyArray, "n"]], num_cells: Int[AnyScalar, ""] | int) -> Int[AnyArray, "n"]:
