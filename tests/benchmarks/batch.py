@@ -14,6 +14,7 @@ import resource
 import statistics
 import time
 from collections.abc import Callable, Iterator
+from concurrent.futures import Executor, ProcessPoolExecutor
 from typing import Any
 
 import numpy as np
@@ -53,12 +54,12 @@ def lidar_pairs(count: int, keep: float | tuple[float, float], thinned: float | 
     return pairs
 
 
-def ours(pairs: list[Pair], voxel: float | None) -> list[np.ndarray]:
+def ours(pairs: list[Pair], voxel: float | None, executor: Executor | None = None) -> list[np.ndarray]:
     import mcgicp_jax as mcg
 
     sources, targets = ([pair[side].astype(np.float32) for pair in pairs] for side in (0, 1))
     results = mcg.register_batch(
-        sources, targets, mcg.GICP(), max_distance=MAX_DISTANCE, voxel_size=voxel, **TOLERANCES
+        sources, targets, mcg.GICP(), max_distance=MAX_DISTANCE, voxel_size=voxel, executor=executor, **TOLERANCES
     )
     return [np.asarray(result.matrix) for result in results]
 
@@ -128,27 +129,35 @@ def _timed(function: Callable[[], Any]) -> tuple[float, float, Any]:
 def rates() -> None:
     cores = len(os.sched_getaffinity(0))
     print(f"\nPairs per second, preprocessing included, {cores} cores, GICP, medians of {NUM_TURNS} turns")
-    print(f"{'pairs':>12} {'points':>8} {'ours':>8} {'small_gicp':>11} {'ratio':>7} {'over the turns':>15}", end="")
-    print(f" {'processor time ratio':>21} {'poses apart':>12}")
+    print(f"{'pairs':>12} {'points':>8} {'ours':>8} {'processes':>10} {'small_gicp':>11} {'ratio':>7}", end="")
+    print(f" {'over the turns':>15} {'processor time ratio':>21} {'poses apart':>12}")
+    workers = ProcessPoolExecutor(cores, multiprocessing.get_context("spawn"))
     # The last: 2,000 to 20,000 points per cloud.
     for count, voxel, keep, thinned in ((64, 0.25, 0.95, None), (256, None, 0.77, 0.5), (60, None, (0.1, 1), 0.08)):
         pairs = lidar_pairs(count, keep, thinned)
         processes = Processes(pairs, voxel, cores)
-        ours(pairs, voxel)
+        for executor in (None, workers):
+            ours(pairs, voxel, executor)
         processes()
         turns = []
         for _ in range(NUM_TURNS):
-            wall, cpu, mine = _timed(lambda pairs=pairs, voxel=voxel: ours(pairs, voxel))
+            wall, cpu, found = _timed(lambda pairs=pairs, voxel=voxel: ours(pairs, voxel))
+            wall_processes, _, _ = _timed(lambda pairs=pairs, voxel=voxel: ours(pairs, voxel, workers))
             wall_theirs, _, other = _timed(processes)
             _, cpu_theirs, _ = _timed(lambda pairs=pairs, voxel=voxel: theirs(pairs[:16], voxel))
-            turns.append((count / wall, count / wall_theirs, wall_theirs / wall, cpu_theirs * count / 16 / cpu))
-        mine_rate, rate, _, cpu_ratio = (statistics.median(column) for column in zip(*turns, strict=True))
-        ratios = sorted(turn[2] for turn in turns)
-        apart = max(np.linalg.norm(a[:3, 3] - b[:3, 3]) for a, b in zip(mine, other, strict=True))
+            rates_of_all = (count / seconds for seconds in (wall, wall_processes, wall_theirs))
+            turns.append((*rates_of_all, wall_theirs / wall, cpu_theirs * count / 16 / cpu))
+        mine, in_processes, rate, _, cpu_ratio = (statistics.median(column) for column in zip(*turns, strict=True))
+        ratios = sorted(turn[3] for turn in turns)
+        apart = max(np.linalg.norm(a[:3, 3] - b[:3, 3]) for a, b in zip(found, other, strict=True))
         processes.close()
         size = _size(pairs[0], voxel)
-        print(f"{count:12} {size:8,} {mine_rate:8.1f} {rate:11.1f} {statistics.median(ratios):7.2f}", end="")
+        print(
+            f"{count:12} {size:8,} {mine:8.1f} {in_processes:10.1f} {rate:11.1f} {statistics.median(ratios):7.2f}",
+            end="",
+        )
         print(f" {ratios[0]:6.2f} to {ratios[-1]:.2f} {cpu_ratio:20.2f} {1e3 * apart:9.2f} mm")
+    workers.shutdown()
 
 
 def _size(pair: Pair, voxel: float | None) -> int:
