@@ -66,8 +66,7 @@ def test_many_neighbors():
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["lidar pair", *(name for name in accuracy.SETS if "posters" not in name)])
-def test_real_pairs_have_the_same_poses(data, monkeypatch, name):
-    monkeypatch.setattr(accuracy, "DATA", data)
+def test_real_pairs_have_the_same_poses(data, name):
     if name == "lidar pair":
         clouds = [mcg.io.read(data / "lidar_pair" / f"{side}.ply") for side in ("source", "target")]
         pairs, voxel_size, options = [(*clouds, np.eye(4))], 0.25, {}

@@ -24,6 +24,7 @@ import mcgicp_jax as mcg
 from mcgicp_jax import datasets
 from mcgicp_jax.datasets import _poster_wall as posters
 from mcgicp_jax.datasets._frame import scene_and_path_rng
+from tests.benchmarks.global_pose import desk, living_room
 
 try:
     import open3d
@@ -101,16 +102,6 @@ def ground(cloud: mcg.PointCloud) -> mcg.PointCloud:
     return mcg.PointCloud(points[kept], np.asarray(cloud.channels)[kept], channel_names=cloud.channel_names)
 
 
-def living_room() -> Iterator[Pair]:
-    folder = DATA / "icl_livingroom1"
-    poses, frames = mcg.io.read_poses(folder / "poses.txt"), []
-    for path, pose in zip(sorted(folder.glob("*.npz")), poses, strict=False):
-        arrays = np.load(path)
-        colors = arrays["rgb"].astype(np.float32) / (255 if arrays["rgb"].dtype == np.uint8 else 1)
-        frames.append(datasets.Frame(mcg.PointCloud(arrays["points"], colors, channel_names=RGB), pose, None))
-    return consecutive(frames)
-
-
 def wall(gain: float) -> Iterator[Pair]:
     for seed in range(20):
         target, source = datasets.poster_wall(2, step=STEPS[seed % len(STEPS)], seed=seed)
@@ -129,7 +120,8 @@ SETS: dict[str, tuple[Callable[[], Iterator[Pair]], float | None, dict[str, Any]
     "flat": (lambda: table("_flat"), 0.01, {}),
     "recorded": (lambda: table(""), 0.01, {}),
     "7-scenes": (lambda: consecutive(datasets.seven_scenes(DATA / "sevenscenes_redkitchen")), 0.03, {}),
-    "living room": (living_room, 0.03, {}),
+    "living room": (lambda: consecutive(living_room()), 0.03, {}),
+    "tum": (lambda: consecutive(desk()), 0.03, {}),
     "posters": (lambda: wall(1.0), None, {}),
     "posters, 20 % darker": (lambda: wall(0.8), None, {"match_channels": True}),
     "kitti, intensity": (lambda: kitti(("intensity",)), 0.25, {}),
