@@ -4,28 +4,28 @@
 """
 
 from mcgicp_jax import datasets, io, metrics, plot
-from mcgicp_jax._batch import PairWarning, register_as_completed, register_batch
-from mcgicp_jax._channel_covariance import estimate_channel_covariance
-from mcgicp_jax._cloud import PointCloud
-from mcgicp_jax._cost import mahalanobis_cost
-from mcgicp_jax._dense import DenseSearch
-from mcgicp_jax._gaussians import cell_moments, gaussians, voxel_cells
-from mcgicp_jax._global import GlobalPose
-from mcgicp_jax._graph import PoseGraphResult, optimize_poses
-from mcgicp_jax._image_matches import image_matches
-from mcgicp_jax._kernels import AbstractKernel, Cauchy, GemanMcClure, Huber, Tukey, Welsch
-from mcgicp_jax._map import aggregate
-from mcgicp_jax._methods import GICP, AbstractMethod, ColorICP, MultiChannelGICP, PointToPlane, PointToPoint
-from mcgicp_jax._multiway import Multiway, multiway
-from mcgicp_jax._ndt import D2DNDT, NDT, ColorNDT
-from mcgicp_jax._odometry import odometry
-from mcgicp_jax._pose_graph import WORLD, Edge, PoseGraph
-from mcgicp_jax._preprocess import preprocess
-from mcgicp_jax._register import align, find_correspondences, global_pose, register
-from mcgicp_jax._result import Registration, Status
-from mcgicp_jax._search import AbstractSearch, Correspondences
-from mcgicp_jax._spaces import rgb_to_hsv, rgb_to_lab, rgb_to_yuv
-from mcgicp_jax._trees import AbstractTreeSearch, KDTreeSearch
+from mcgicp_jax._clouds.color_spaces import rgb_to_hsv, rgb_to_lab, rgb_to_yuv
+from mcgicp_jax._clouds.point_cloud import PointCloud
+from mcgicp_jax._clouds.preprocess import preprocess
+from mcgicp_jax._clouds.voxel_map import aggregate
+from mcgicp_jax._global_registration.global_pose import GlobalPose
+from mcgicp_jax._global_registration.image_matches import image_matches
+from mcgicp_jax._math.robust_kernels import AbstractKernel, Cauchy, GemanMcClure, Huber, Tukey, Welsch
+from mcgicp_jax._methods.base import GICP, AbstractMethod, ColorICP, MultiChannelGICP, PointToPlane, PointToPoint
+from mcgicp_jax._methods.channel_covariance import estimate_channel_covariance
+from mcgicp_jax._methods.ndt import D2DNDT, NDT, ColorNDT
+from mcgicp_jax._methods.voxel_gaussians import cell_moments, gaussians, voxel_cells
+from mcgicp_jax._pairs.batch import PairWarning, register_as_completed, register_batch
+from mcgicp_jax._pose_graph.graph import WORLD, Edge, PoseGraph
+from mcgicp_jax._pose_graph.optimize import PoseGraphResult, optimize_poses
+from mcgicp_jax._registration.cost import mahalanobis_cost
+from mcgicp_jax._registration.register_pair import align, find_correspondences, global_pose, register
+from mcgicp_jax._registration.result import Registration, Status
+from mcgicp_jax._search.base import AbstractSearch, Correspondences
+from mcgicp_jax._search.brute_force import DenseSearch
+from mcgicp_jax._search.kd_tree import AbstractTreeSearch, KDTreeSearch
+from mcgicp_jax._sequences.multiway import Multiway, multiway
+from mcgicp_jax._sequences.odometry import odometry
 
 __all__ = [
     "D2DNDT",

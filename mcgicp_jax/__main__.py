@@ -1,4 +1,4 @@
-"""The command line: `mcgicp --help` lists the commands, which live in `mcgicp_jax._commands`."""
+"""The command line: `mcgicp --help` lists the commands, which live in `mcgicp_jax._cli`."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ import jax
 import platformdirs
 import tyro
 
-from mcgicp_jax._commands._batch import batch
-from mcgicp_jax._commands._multiway import multiway
-from mcgicp_jax._commands._odometry import odometry
-from mcgicp_jax._commands._options import VERSION
-from mcgicp_jax._commands._paper import paper
-from mcgicp_jax._commands._register import compare, demo, register
+from mcgicp_jax._cli.batch import batch
+from mcgicp_jax._cli.multiway import multiway
+from mcgicp_jax._cli.odometry import odometry
+from mcgicp_jax._cli.options import VERSION
+from mcgicp_jax._cli.paper import paper
+from mcgicp_jax._cli.register import compare, demo, register
 
 
 def _keep_compiled_programs() -> None:

@@ -12,7 +12,8 @@ import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
-from mcgicp_jax._pose import Pose, is_concrete, pose_matrix
+from mcgicp_jax._compute.concrete import is_concrete
+from mcgicp_jax._math.poses import Pose, pose_matrix
 
 Scalar: TypeAlias = float | Float[Array, ""]
 Poses: TypeAlias = Float[np.ndarray, "N 4 4"] | Sequence[Any]

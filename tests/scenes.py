@@ -5,9 +5,9 @@ from types import SimpleNamespace
 import numpy as np
 
 import mcgicp_jax as mcg
-from mcgicp_jax._local import local_on_host
-from mcgicp_jax._surface import covariance_of
-from mcgicp_jax._surfaces import surface_on_host, surfaces_of
+from mcgicp_jax._local_geometry.local_statistics import local_on_host
+from mcgicp_jax._local_geometry.records import covariance_of
+from mcgicp_jax._methods.surface import surface_on_host, surfaces_of
 
 
 def motion(twist=(0.05, -0.03, 0.04, 0.02, -0.03, 0.05)) -> np.ndarray:

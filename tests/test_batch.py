@@ -16,7 +16,7 @@ import pytest
 
 import mcgicp_jax as mcg
 from mcgicp_jax import Status, datasets
-from mcgicp_jax._batch import _like
+from mcgicp_jax._pairs.batch import _like
 from mcgicp_jax.metrics import pose_error
 from tests.scenes import motion, room_corner
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import mcgicp_jax as mcg
-from mcgicp_jax._checks import check_integer, check_positive
+from mcgicp_jax._compute.argument_checks import check_integer, check_positive
 
 
 @pytest.mark.parametrize("value", ["x", None, [1.0], np.nan, 0, -1.0])

@@ -24,8 +24,8 @@ from mcgicp_jax import (
     mahalanobis_cost,
     preprocess,
 )
-from mcgicp_jax._sums import matched_rows, sums_of
-from mcgicp_jax._surfaces import surfaces_of
+from mcgicp_jax._methods.surface import surfaces_of
+from mcgicp_jax._pose_solver.sums import matched_rows, sums_of
 from tests import reference as ref
 from tests.reference import tolerance
 

@@ -10,12 +10,14 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from mcgicp_jax import GICP, MultiChannelGICP, PointCloud, PointToPlane, _local, _statistics, preprocess
-from mcgicp_jax import _algebra as cov
-from mcgicp_jax._channels import channel_noise
-from mcgicp_jax._local import locals_of
-from mcgicp_jax._neighborhoods import weighted_covariance
-from mcgicp_jax._surfaces import surfaces_of
+from mcgicp_jax import GICP, MultiChannelGICP, PointCloud, PointToPlane, preprocess
+from mcgicp_jax._local_geometry import local_statistics as _local
+from mcgicp_jax._local_geometry.covariances import weighted_covariance
+from mcgicp_jax._local_geometry.local_statistics import locals_of
+from mcgicp_jax._local_geometry.spacing_and_noise import channel_noise
+from mcgicp_jax._math import statistics as _statistics
+from mcgicp_jax._math import symmetric_matrices as cov
+from mcgicp_jax._methods.surface import surfaces_of
 from tests import reference as ref
 from tests import scenes
 from tests.reference import tolerance

@@ -13,9 +13,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import mcgicp_jax as mcg
-from mcgicp_jax import DenseSearch, KDTreeSearch, Status, _lanes
-from mcgicp_jax._dense import _nearest
-from mcgicp_jax._search import Rows
+from mcgicp_jax import DenseSearch, KDTreeSearch, Status
+from mcgicp_jax._registration import vectorized as _lanes
+from mcgicp_jax._search.base import Rows
+from mcgicp_jax._search.brute_force import _nearest
 from mcgicp_jax.metrics import pose_error
 from tests import reference as ref
 from tests.scenes import motion

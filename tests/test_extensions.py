@@ -5,10 +5,10 @@ import jax.numpy as jnp
 import numpy as np
 
 import mcgicp_jax as mcg
-from mcgicp_jax import _algebra as alg
-from mcgicp_jax._forces import weighed
-from mcgicp_jax._methods import AbstractOneSided
-from mcgicp_jax._surface import points_of
+from mcgicp_jax._local_geometry.records import points_of
+from mcgicp_jax._math import symmetric_matrices as alg
+from mcgicp_jax._methods.base import AbstractOneSided
+from mcgicp_jax._terms.base import weighed
 from tests.scenes import motion, pair
 
 

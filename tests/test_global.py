@@ -11,11 +11,11 @@ from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 import mcgicp_jax as mcg
-from mcgicp_jax import _features as features
 from mcgicp_jax import datasets
 from mcgicp_jax.__main__ import main
-from mcgicp_jax._global import mutual_nearest
-from mcgicp_jax._hypotheses import NUM_MATCHES, Matches, Poses, fit_pose, hypotheses, refined
+from mcgicp_jax._global_registration import fpfh as features
+from mcgicp_jax._global_registration.global_pose import mutual_nearest
+from mcgicp_jax._global_registration.robust_pose_fit import NUM_MATCHES, Matches, Poses, fit_pose, hypotheses, refined
 from mcgicp_jax.metrics import pose_error
 from tests.scenes import room_corner, wall
 from tests.test_programs import compilations

@@ -13,11 +13,13 @@ from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
 import mcgicp_jax as mcg
-from mcgicp_jax import _graph, _normal_equations, metrics
-from mcgicp_jax._graph import motion_covariances
-from mcgicp_jax._normal_equations import Minimum, NormalEquations, factored
-from mcgicp_jax._pose import parameters_of
-from mcgicp_jax._sparse_inverse import inverse_blocks
+from mcgicp_jax import metrics
+from mcgicp_jax._math.poses import parameters_of
+from mcgicp_jax._pose_graph import levenberg_marquardt as _normal_equations
+from mcgicp_jax._pose_graph import optimize as _graph
+from mcgicp_jax._pose_graph.levenberg_marquardt import Minimum, NormalEquations, factored
+from mcgicp_jax._pose_graph.marginal_covariances import inverse_blocks
+from mcgicp_jax._pose_graph.optimize import motion_covariances
 from tests.differences import X64, needs_x64
 from tests.graphs import garage, grid, joined, measured, moved, pose, sphere, with_gtsam, with_priors
 from tests.test_programs import compilations

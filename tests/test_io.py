@@ -18,7 +18,7 @@ from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 
 from mcgicp_jax import io
-from mcgicp_jax._cloud import PointCloud
+from mcgicp_jax._clouds.point_cloud import PointCloud
 
 RNG = np.random.default_rng(0)
 N = 40

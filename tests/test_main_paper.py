@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from mcgicp_jax.__main__ import main
-from mcgicp_jax._commands import _paper
+from mcgicp_jax._cli import paper as _paper
 
 
 @pytest.mark.slow

@@ -4,11 +4,12 @@ import numpy as np
 import pytest
 
 import mcgicp_jax as mcg
-from mcgicp_jax import _loops, datasets, io, metrics
+from mcgicp_jax import datasets, io, metrics
 from mcgicp_jax.__main__ import main
-from mcgicp_jax._loops import Trajectory, edge_from
-from mcgicp_jax._multiway import _overlapping
-from mcgicp_jax._options import Options
+from mcgicp_jax._registration.options import Options
+from mcgicp_jax._sequences import loop_closure as _loops
+from mcgicp_jax._sequences.loop_closure import Trajectory, edge_from
+from mcgicp_jax._sequences.multiway import _overlapping
 from tests.graphs import pose
 from tests.scenes import motion, pair, wall
 

@@ -9,7 +9,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import mcgicp_jax as mcg
-from mcgicp_jax import _odometry, datasets, metrics
+from mcgicp_jax import datasets, metrics
+from mcgicp_jax._sequences import odometry as _odometry
 from tests.scenes import motion
 
 

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 import mcgicp_jax as mcg
-from mcgicp_jax._statistics import median
-from mcgicp_jax._sums import estimates_at, matched_rows, move_rows
-from mcgicp_jax._surfaces import surfaces_of
+from mcgicp_jax._math.statistics import median
+from mcgicp_jax._methods.surface import surfaces_of
+from mcgicp_jax._pose_solver.sums import estimates_at, matched_rows, move_rows
 from tests.differences import CONVERGED, GATE, TO_ROUNDING, check_gradient, clouds_with, inputs_of, needs_x64, weigh
 from tests.scenes import motion, pair, wall
 
@@ -137,7 +137,7 @@ def test_estimates_are_scales_and_correlations_of_the_residuals():
 
 def test_a_sample_has_the_design_effect_of_all():
     """Twice as many samples of one picture are not worth twice as much."""
-    from mcgicp_jax._photometric import Term
+    from mcgicp_jax._terms.photometric import Term
 
     rng = np.random.default_rng(0)
     moved = np.concatenate([rng.random((40_000, 2)), np.zeros((40_000, 1))], axis=1)
@@ -155,7 +155,7 @@ def test_a_sample_has_the_design_effect_of_all():
 @pytest.mark.parametrize("noise", [0.0, 1.0, 100.0])
 def test_noise_of_slopes_is_discounted(noise):
     """The reliability is the share of the true slope in the squared mean of two noisy ones: s² / (s² + n²/2)."""
-    from mcgicp_jax._photometric import Term
+    from mcgicp_jax._terms.photometric import Term
 
     rng = np.random.default_rng(0)
     values, moved = rng.normal(size=(40_000, 2)), rng.random((40_000, 3))

@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from mcgicp_jax import GICP, PointCloud, preprocess
-from mcgicp_jax._sizes import size_class
+from mcgicp_jax._compute.size_classes import size_class
 from tests import reference as ref
 from tests.scenes import prepare
 

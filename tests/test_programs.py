@@ -106,7 +106,8 @@ def test_numbers_compile_nothing():
 
 def test_a_cloud_is_prepared_once(monkeypatch):
     """Its tree and its local statistics are kept as long as it is used."""
-    from mcgicp_jax import KDTreeSearch, _local
+    from mcgicp_jax import KDTreeSearch
+    from mcgicp_jax._local_geometry import local_statistics as _local
 
     built, described = [], []
     build, gatherer = KDTreeSearch.build, _local.gatherer
@@ -129,7 +130,7 @@ def test_a_cloud_is_prepared_once(monkeypatch):
 
 
 def test_what_is_kept_of_a_cloud_goes_with_it():
-    from mcgicp_jax import _kept
+    from mcgicp_jax._compute import cache as _kept
 
     source, target = (mcg.preprocess(room_corner(300, seed=seed)[0]) for seed in (0, 1))
     mcg.register(source, target, mcg.GICP())

@@ -9,8 +9,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import mcgicp_jax as mcg
-from mcgicp_jax._pykdtree import PyKDTree
-from mcgicp_jax._search import Rows
+from mcgicp_jax._search.base import Rows
+from mcgicp_jax._search.pykdtree import PyKDTree
 from tests.benchmarks import accuracy
 
 pytest.importorskip("pykdtree")
@@ -50,7 +50,7 @@ def test_it_is_used_where_it_wins(monkeypatch):
         assert isinstance(search.build(points[:, :3]), PyKDTree)
         assert not isinstance(search.build(points), PyKDTree)
     assert not isinstance(SCIPY.build(points[:, :3]), PyKDTree)
-    monkeypatch.setattr("mcgicp_jax._trees.has_pykdtree", lambda: False)
+    monkeypatch.setattr("mcgicp_jax._search.kd_tree.has_pykdtree", lambda: False)
     assert not isinstance(mcg.KDTreeSearch().build(points[:, :3]), PyKDTree)
     with pytest.raises(ValueError, match=r"pip install 'mcgicp_jax\[fast\]'"):
         mcg.KDTreeSearch(backend="pykdtree")

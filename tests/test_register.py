@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 
 import mcgicp_jax as mcg
-from mcgicp_jax import Status, _register
+from mcgicp_jax import Status
+from mcgicp_jax._registration import register_pair as _register
 from mcgicp_jax.metrics import pose_error
 from tests.scenes import motion, pair, room_corner, wall
 

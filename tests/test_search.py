@@ -19,8 +19,8 @@ from mcgicp_jax import (
     find_correspondences,
     preprocess,
 )
-from mcgicp_jax._search import Rows
-from mcgicp_jax._tree_index import TreeIndex
+from mcgicp_jax._search.base import Rows
+from mcgicp_jax._search.tree_index import TreeIndex
 from tests import reference as ref
 
 SIZES = {"source": 150, "target": 140}

@@ -7,10 +7,11 @@ import pytest
 import scipy.optimize
 from scipy.spatial.transform import Rotation
 
-from mcgicp_jax import GICP, _solve
-from mcgicp_jax import _algebra as cov
-from mcgicp_jax._forces import weighed
-from mcgicp_jax._sums import Matched, sums_of
+from mcgicp_jax import GICP
+from mcgicp_jax._math import symmetric_matrices as cov
+from mcgicp_jax._pose_solver import update as _solve
+from mcgicp_jax._pose_solver.sums import Matched, sums_of
+from mcgicp_jax._terms.base import weighed
 
 X64 = jax.config.jax_enable_x64
 N = 2000

@@ -7,8 +7,8 @@ from functools import partial
 
 import pytest
 
-from mcgicp_jax import _threads
-from mcgicp_jax._threads import side_by_side
+from mcgicp_jax._compute import threads as _threads
+from mcgicp_jax._compute.threads import side_by_side
 
 
 def test_answers_come_in_order_and_the_first_from_this_thread():

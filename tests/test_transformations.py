@@ -70,11 +70,11 @@ def test_implicit_gradient_is_that_of_the_unrolled_loop(noisy):
     """Differentiating through 60 updates with M renewed each time reaches the same number, at many times the cost."""
     source, target, _ = noisy
     method, _ = CASES["gicp"]
-    from mcgicp_jax import _solve
-    from mcgicp_jax._pose import se3_from_matrix
-    from mcgicp_jax._step import rotation_and_translation
-    from mcgicp_jax._sums import matched_rows, sums_of
-    from mcgicp_jax._surfaces import surfaces_of
+    from mcgicp_jax._math.poses import se3_from_matrix
+    from mcgicp_jax._methods.surface import surfaces_of
+    from mcgicp_jax._pose_solver import update as _solve
+    from mcgicp_jax._pose_solver.sums import matched_rows, sums_of
+    from mcgicp_jax._registration.step import rotation_and_translation
 
     matches = mcg.find_correspondences(source, target, motion(), method, max_distance=GATE)
 
@@ -102,7 +102,7 @@ def test_implicit_gradient_is_that_of_the_unrolled_loop(noisy):
 
 def _normal_equations(sums):
     """Gauss-Newton's information and right-hand side of a (v, ω) twist, from the sums."""
-    from mcgicp_jax import _solve
+    from mcgicp_jax._pose_solver import update as _solve
 
     tangent = jnp.asarray(_solve._TANGENT, sums.first.dtype)
     form = _solve._quadratic_form(sums, jnp.ones_like(sums.radius))

@@ -9,11 +9,11 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 import mcgicp_jax as mcg
-from mcgicp_jax import _algebra as cov
 from mcgicp_jax import datasets
-from mcgicp_jax._directions import find_directions
-from mcgicp_jax._sums import Sums
-from mcgicp_jax._surface import observability_of
+from mcgicp_jax._local_geometry.records import observability_of
+from mcgicp_jax._math import symmetric_matrices as cov
+from mcgicp_jax._pose_solver.degeneracy import find_directions
+from mcgicp_jax._pose_solver.sums import Sums
 
 from .scenes import motion, pair, prepare, room_corner, wall
 

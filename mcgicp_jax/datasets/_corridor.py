@@ -7,7 +7,7 @@ from functools import partial
 import numpy as np
 from jaxtyping import Float
 
-from mcgicp_jax._cloud import PointCloud
+from mcgicp_jax._clouds.point_cloud import PointCloud
 from mcgicp_jax.datasets._frame import (
     SyntheticFrames,
     check_noise,

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from mcgicp_jax._cloud import PointCloud
+from mcgicp_jax._clouds.point_cloud import PointCloud
 from mcgicp_jax.datasets._frame import AbstractFrames, Frame
 from mcgicp_jax.datasets._images import look_up, read_image
 

@@ -11,7 +11,7 @@ from typing import overload
 import numpy as np
 from jaxtyping import Float, UInt8
 
-from mcgicp_jax._cloud import PointCloud
+from mcgicp_jax._clouds.point_cloud import PointCloud
 
 
 @dataclass(frozen=True, eq=False)

@@ -9,7 +9,7 @@ from typing import TypeAlias
 import numpy as np
 from jaxtyping import Float, Int
 
-from mcgicp_jax._cloud import PointCloud
+from mcgicp_jax._clouds.point_cloud import PointCloud
 from mcgicp_jax.datasets._frame import (
     SyntheticFrames,
     check_noise,

@@ -19,7 +19,7 @@ import small_gicp
 
 import mcgicp_jax as mcg
 from mcgicp_jax import datasets
-from mcgicp_jax._directions import Directions
+from mcgicp_jax._pose_solver.degeneracy import Directions
 
 
 def box_room(noise: float) -> datasets.SyntheticFrames:

@@ -22,8 +22,8 @@ import jax
 import numpy as np
 
 import mcgicp_jax as mcg
-from mcgicp_jax import _trees
-from mcgicp_jax._sizes import size_class
+from mcgicp_jax._compute.size_classes import size_class
+from mcgicp_jax._search import kd_tree as _trees
 from tests.scenes import room_corner
 
 _METHODS = ((mcg.GICP(), None), (mcg.MultiChannelGICP(), mcg.Huber(1.0)))

@@ -1,0 +1,291 @@
+"""`mcgicp batch PAIRS`: register many pairs of files and write a table of poses."""
+
+from __future__ import annotations
+
+import collections
+import contextlib
+import csv
+import hashlib
+import itertools
+import signal
+import sys
+import threading
+import time
+import warnings
+from collections.abc import Generator, Iterator, Sequence
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from types import FrameType
+from typing import Annotated, Any, TypeAlias
+
+import jax
+import numpy as np
+import tyro
+from jaxtyping import Float
+from tqdm import tqdm
+
+import mcgicp_jax as mcg
+from mcgicp_jax import io
+from mcgicp_jax._cli.options import (
+    METHODS,
+    MethodName,
+    Options,
+    check_outputs,
+    listed,
+    status_of,
+    voxel_size_for,
+    weights_from,
+    with_channels,
+)
+from mcgicp_jax._cli.table import COLUMNS, POSE, Row, Table, pose_of
+
+Pairs: TypeAlias = Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="PAIRS")]
+Names: TypeAlias = Annotated[tuple[str, ...], tyro.conf.arg(metavar="NAMES", help_behavior_hint="(default: all)")]
+
+_INTERRUPTED = 130
+
+
+@dataclass(frozen=True)
+class FilePair:
+    """Two cloud files, relative to `folder`, and the initial pose, if given."""
+
+    folder: Path
+    source: str
+    target: str
+    init: Float[np.ndarray, "4 4"] | None = None
+
+    @property
+    def key(self) -> tuple[str, str]:
+        return self.source, self.target
+
+    def paths(self) -> tuple[Path, Path]:
+        return self.folder / self.source, self.folder / self.target
+
+
+def batch(
+    pairs: Pairs,
+    output: Path,
+    method: MethodName = "mc-gicp",
+    glob: str = "*",
+    channels: Names = (),
+    *,
+    shared: Options,
+) -> int:
+    """Register many pairs of clouds and write a table of their poses T_target_source.
+
+    PAIRS is a CSV file or a folder. The CSV file has the columns source and target, with paths relative to its folder,
+    and optionally m00 m01 ... m23, the upper three rows of the initial pose. In a folder, each file is registered to
+    the one before it in order of name. To resume after Ctrl-C, or to add pairs, run the same command again: it skips
+    pairs in the table whose files and options are unchanged. The exit code is 0 only if all pairs converged.
+
+    Args:
+        pairs: CSV file or folder.
+        output: Table to write or to resume, .csv or .npz, a row per pair: source, target, status, iterations, inliers,
+            cost, rmse, the upper three rows of the pose, the reason if it could not be registered, and a fingerprint
+            of files and options.
+        method: mc-gicp, color-icp and color-ndt use channels (intensity, colours, ...), the others geometry alone.
+        glob: Pattern for the files of a folder, such as "*.ply".
+        channels: Channels to use, such as intensity, or red green blue, or lab, hsv or yuv computed from these three;
+            every cloud must have them. By default those common to both clouds of the first pair.
+    """
+    shared.check()
+    shared.check_method(method)
+    check_outputs(output)
+    everything = _pairs_of_folder(pairs, glob) if pairs.is_dir() else _pairs_of_table(pairs)
+    table = Table(output)
+    rows = {(row["source"], row["target"]): row for row in table.read()}
+    settings = _settings(everything, method, channels, shared)
+    known = [pair for pair in everything if pair.key in rows]
+    outdated = [pair.key for pair in known if rows[pair.key]["fingerprint"] != _fingerprint(pair, settings)]
+    if outdated:
+        print(f"outdated:  {len(outdated):,} in {output} with other options or files; registered again")
+        rows = {key: row for key, row in rows.items() if key not in set(outdated)}
+        table.rewrite(list(rows.values()))
+    missing = [pair for pair in everything if pair.key not in rows]
+    finished = len(everything) - len(missing)
+    print(f"pairs:     {len(everything):,}" + (f", of which {finished:,} are in {output}" if finished else ""))
+    interrupted = bool(missing) and _register_missing(missing, settings, table, rows, finished)
+    table.finish(list(rows.values()))
+    counts = collections.Counter(rows[pair.key]["status"] for pair in everything if pair.key in rows)
+    print("status:    " + ", ".join(f"{count:,} {name}" for name, count in counts.most_common()))
+    if interrupted:
+        print("mcgicp: interrupted; run the same command again to continue", file=sys.stderr)
+        return _INTERRUPTED
+    failed = counts.total() - counts[_word(mcg.Status.CONVERGED)]
+    if failed:
+        print(f"mcgicp: {failed} of {len(everything)} pairs did not converge; see {output}", file=sys.stderr)
+    return 1 if failed else 0
+
+
+def _register_missing(
+    pairs: Sequence[FilePair], settings: dict[str, Any], table: Table, rows: dict[tuple[str, str], Row], finished: int
+) -> bool:
+    """Register pairs, adding their rows to the table and to `rows`; return whether Ctrl-C stopped it."""
+    interrupted, begin = False, time.perf_counter()
+    with (
+        table.appending() as append,
+        tqdm(total=finished + len(pairs), initial=finished, unit="pair", disable=None) as bar,
+        contextlib.closing(_rows(pairs, settings, bar)) as completed,
+        _interrupts() as pressed,
+    ):
+        try:
+            for pair, row in completed:
+                append(row)
+                rows[pair.key] = row
+                bar.update()
+                if pressed:
+                    raise KeyboardInterrupt
+        except KeyboardInterrupt:
+            interrupted = True
+    done = sum(pair.key in rows for pair in pairs)
+    print(f"done:      {done:,} of {len(pairs):,}, {done / (time.perf_counter() - begin):.3g} pairs per second")
+    return interrupted
+
+
+@contextlib.contextmanager
+def _interrupts() -> Iterator[list[int]]:
+    """Record each Ctrl-C in a list, besides raising `KeyboardInterrupt`.
+
+    Python swallows the exception during a callback of the garbage collector, and JAX installs one.
+    """
+    pressed: list[int] = []
+
+    def notice(number: int, frame: FrameType | None) -> None:
+        pressed.append(number)
+        signal.default_int_handler(number, frame)
+
+    if threading.current_thread() is not threading.main_thread():
+        # Python delivers signals to the main thread only.
+        yield pressed
+        return
+    before = signal.signal(signal.SIGINT, notice)
+    try:
+        yield pressed
+    finally:
+        signal.signal(signal.SIGINT, before)
+
+
+def _pairs_of_table(path: Path) -> list[FilePair]:
+    with open(path, newline="", encoding="utf-8") as file:
+        try:
+            lines = file.readlines()
+        except UnicodeError as error:
+            raise ValueError(f"{path}: expected a CSV file or a folder; the file is not text") from error
+        reader = csv.DictReader(lines)
+        columns = reader.fieldnames or []
+        if not {"source", "target"} <= set(columns):
+            raise ValueError(f"{path}: expected the columns source and target, got {listed(columns)}")
+        with_start = set(POSE) <= set(columns)
+        pairs = []
+        for row in reader:
+            if not row["source"] or not row["target"]:
+                raise ValueError(f"{path}: line {reader.line_num}: expected two files, got {row}")
+            try:
+                start = pose_of(row) if with_start else None
+            except (TypeError, ValueError) as error:
+                raise ValueError(
+                    f"{path}: line {reader.line_num}: expected numbers in m00 ... m23, got {row}"
+                ) from error
+            pairs.append(FilePair(path.parent, row["source"], row["target"], start))
+    return _checked(path, pairs)
+
+
+def _pairs_of_folder(folder: Path, glob: str) -> list[FilePair]:
+    names = sorted(path.name for path in folder.glob(glob) if path.is_file())
+    return _checked(folder, [FilePair(folder, source, target) for target, source in itertools.pairwise(names)])
+
+
+def _checked(path: Path, pairs: list[FilePair]) -> list[FilePair]:
+    if not pairs:
+        raise ValueError(f"{path}: expected pairs of clouds, got none")
+    repeated = [key for key, count in collections.Counter(pair.key for pair in pairs).items() if count > 1]
+    if repeated:
+        raise ValueError(f"{path}: expected each pair once, got {' '.join(repeated[0])} several times")
+    return pairs
+
+
+def _settings(pairs: Sequence[FilePair], name: MethodName, channels: Sequence[str], options: Options) -> dict[str, Any]:
+    """Options common to all pairs, with defaults chosen from the first pair whose files can be read."""
+    kind = METHODS[name]
+    for pair in pairs:
+        try:
+            clouds = [io.read(path) for path in pair.paths()]
+        except (ValueError, OSError) as error:
+            reason = error
+            continue
+        break
+    else:
+        raise reason
+    first, second = (cloud.channel_names for cloud in clouds)
+    names = tuple(channels) or tuple(name for name in first if name in second)
+    if kind.uses_channels and not names:
+        raise ValueError("expected clouds with channels in common, got none; use gicp instead (--method gicp)")
+    voxel_size = voxel_size_for(clouds, options)
+    print(f"points:    {'all kept' if voxel_size is None else f'voxels of {voxel_size:g} m'}")
+    print(f"channels:  {listed(names)}")
+    numbers = options.numbers_of(name)
+    if issubclass(kind, mcg.ColorICP) and not numbers:
+        source, target = (
+            mcg.preprocess(with_channels(cloud, names), voxel_size, options.num_neighbors) for cloud in clouds
+        )
+        numbers["channel_weights"] = weights_from(source, target)
+    return options.registration() | {
+        "method": kind(**numbers),
+        "channels": names,
+        "voxel_size": voxel_size,
+        "num_neighbors": options.num_neighbors,
+    }
+
+
+def _fingerprint(pair: FilePair, settings: dict[str, Any]) -> str:
+    """Hash of the options, the initial pose, and the sizes and modification times of a pair's files."""
+    files = [(path.stat().st_size, path.stat().st_mtime_ns) if path.exists() else None for path in pair.paths()]
+    numbers = [np.asarray(leaf).tolist() for leaf in jax.tree.leaves((settings["method"], settings.get("robust")))]
+    start = None if pair.init is None else pair.init.tolist()
+    return hashlib.sha256(repr((sorted(settings.items(), key=str), numbers, files, start)).encode()).hexdigest()[:16]
+
+
+def _rows(
+    pairs: Sequence[FilePair], settings: dict[str, Any], bar: tqdm
+) -> Generator[tuple[FilePair, Row], None, None]:
+    """Yield each pair and its row as it finishes. Reasons for failure go into the row and to stderr."""
+    reasons: dict[int, str] = {}
+    show = warnings.showwarning
+
+    def keep(message: Warning | str, *rest: Any, **options: Any) -> None:
+        if isinstance(message, mcg.PairWarning) and message.index is not None:
+            reasons[message.index] = message.reason
+            message = f"{' '.join(pairs[message.index].key)}: {message.reason}"
+        with bar.external_write_mode(file=sys.stderr):
+            show(message, *rest, **options)
+
+    arguments = settings.copy()
+    method, names = arguments.pop("method"), arguments.pop("channels")
+    sources, targets = ([partial(_read, pair.paths()[side], names) for pair in pairs] for side in (0, 1))
+    starts = [pair.init for pair in pairs]
+    completed = mcg.register_as_completed(sources, targets, method, init=starts, **arguments)
+    with warnings.catch_warnings(), contextlib.closing(completed):
+        warnings.simplefilter("always", mcg.PairWarning)
+        warnings.showwarning = keep
+        for index, result in completed:
+            pair = pairs[index]
+            yield pair, _row(pair, result, reasons.pop(index, ""), _fingerprint(pair, settings))
+
+
+def _read(path: Path, channels: Sequence[str]) -> mcg.PointCloud:
+    try:
+        return with_channels(io.read(path), channels)
+    except ValueError as error:
+        raise error if str(path) in str(error) else ValueError(f"{path}: {error}") from error
+
+
+def _row(pair: FilePair, result: mcg.Registration, reason: str, fingerprint: str) -> Row:
+    numbers = (result.num_iterations, result.num_inliers, result.cost, result.rmse, *result.matrix[:3].ravel())
+    values = (np.asarray(number).item() for number in numbers)
+    texts = (*pair.key, _word(status_of(result)), *map(repr, values), " ".join(reason.split()), fingerprint)
+    return dict(zip(COLUMNS, texts, strict=True))
+
+
+def _word(status: mcg.Status) -> str:
+    return status.name.lower()

@@ -1,0 +1,108 @@
+"""`mcgicp multiway FOLDER`: register all clouds of a folder with each other and make one map of them."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import Annotated, TypeAlias
+
+import numpy as np
+import tyro
+
+import mcgicp_jax as mcg
+from mcgicp_jax import io
+from mcgicp_jax import plot as plots
+from mcgicp_jax._cli.options import (
+    METHODS,
+    File,
+    MethodName,
+    Options,
+    check_inputs,
+    check_outputs,
+    listed,
+    voxel_size_for,
+    weights_from,
+    with_channels,
+)
+from mcgicp_jax._methods.base import AbstractMethod
+
+Folder: TypeAlias = Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="FOLDER")]
+Names: TypeAlias = Annotated[tuple[str, ...], tyro.conf.arg(metavar="NAMES", help_behavior_hint="(default: all)")]
+
+
+def multiway(
+    folder: Folder,
+    *,
+    shared: Options,
+    method: MethodName = "mc-gicp",
+    glob: str = "*",
+    channels: Names = (),
+    init: File = None,
+    output: File = None,
+    map: File = None,
+    graph: File = None,
+    plot: File = None,
+) -> int:
+    """Register the clouds of a folder with each other and find one pose for each.
+
+    Clouds that overlap are registered in pairs; a pose graph weighs the results by their covariances and rejects pairs
+    that contradict the others. The exit code is 0 only if one pose was found for each cloud.
+
+    Args:
+        folder: Folder of clouds of one scene; in order of name, each should overlap the one before it.
+        method: mc-gicp, color-icp and color-ndt use channels (intensity, colours, ...), the others geometry alone.
+        glob: Pattern for the files of the folder, such as "*.ply".
+        channels: Channels to use, such as intensity, or red green blue, or lab, hsv or yuv computed from these three;
+            every cloud must have them. By default those common to the first two clouds.
+        init: File with a pose to start from for each cloud: 12 numbers (KITTI) or 8 (TUM) on each line.
+        output: File for the poses, cloud to world, in KITTI format.
+        map: File for the map in the frame of the first cloud, such as map.ply.
+        graph: File for the poses and the pairs that were kept, in g2o format.
+        plot: File for a picture of poses and pairs from above, such as graph.png.
+    """
+    check_outputs(output, graph, cloud=map, picture=plot)
+    shared.check()
+    shared.check_method(method)
+    paths = sorted(path for path in folder.glob(glob) if path.is_file())
+    if len(paths) < 2:
+        raise ValueError(f"{folder}: expected at least 2 clouds {glob}, found {len(paths)}")
+    check_inputs(*paths)
+    raw = [io.read(path) for path in paths]
+    names = channels or tuple(name for name in raw[0].channel_names if name in raw[1].channel_names)
+    voxel = voxel_size_for(raw, shared)
+    clouds = [mcg.preprocess(with_channels(cloud, names), voxel, shared.num_neighbors) for cloud in raw]
+    print(f"clouds:    {len(clouds)}, {len(raw[0]):,} points in the first, {len(clouds[0]):,} used")
+    print(f"channels:  {listed(names)}")
+    start = None if init is None else list(io.read_poses(init))
+    chosen = _method(method, shared, clouds)
+    found = mcg.multiway(clouds, chosen, init=start, voxel_size=voxel, **shared.registration())
+    _report(found)
+    if output is not None:
+        io.write_poses(output, found.poses)
+    if map is not None:
+        io.write(map, found.map)
+        print(f"map:       {map}, {len(found.map):,} points")
+    if graph is not None:
+        io.write_g2o(graph, found.graph)
+    if plot is not None:
+        plots.graph(found.graph, path=plot)
+        print(f"picture:   {plot}")
+    if not found.converged:
+        print(f"mcgicp: the poses are {found.graph.status.name}", file=sys.stderr)
+    return 0 if found.converged else 1
+
+
+def _method(name: MethodName, shared: Options, clouds: list[mcg.PointCloud]) -> AbstractMethod:
+    kind, numbers = METHODS[name], shared.numbers_of(name)
+    if issubclass(kind, mcg.ColorICP) and not numbers:
+        numbers = {"channel_weights": weights_from(clouds[1], clouds[0])}
+    return kind(**numbers)
+
+
+def _report(found: mcg.Multiway) -> None:
+    edges, total = found.graph.edges, len(found.registrations)
+    kept = np.asarray(found.graph.kept)
+    print(f"pairs:     {total} registered, {len(edges)} with a result, {int((~kept).sum())} of them rejected")
+    deviations = np.sqrt(np.diagonal(np.asarray(found.graph.covariance), 0, 1, 2))
+    worst = deviations[:, :3].max(), np.degrees(deviations[:, 3:].max())
+    print(f"poses:     {found.graph.status.name}, at most {1e3 * worst[0]:.1f} mm and {worst[1]:.3f} deg uncertain")

@@ -1,0 +1,264 @@
+"""`mcgicp register SOURCE TARGET`, `mcgicp compare SOURCE TARGET` and `mcgicp demo`."""
+
+from __future__ import annotations
+
+import sys
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Annotated, Any, TypeAlias
+
+import numpy as np
+import tyro
+from jaxtyping import Float
+
+import mcgicp_jax as mcg
+from mcgicp_jax import datasets, io, metrics, plot
+from mcgicp_jax._cli.options import (
+    ADVICE,
+    METHODS,
+    File,
+    MethodName,
+    PairOptions,
+    check_inputs,
+    check_outputs,
+    described,
+    described_distance,
+    listed,
+    status_of,
+    voxel_size_for,
+    weights_from,
+    with_channels,
+    words,
+)
+from mcgicp_jax._methods.base import AbstractMethod
+from mcgicp_jax._pose_solver.degeneracy import describe
+
+Source: TypeAlias = Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="SOURCE")]
+Target: TypeAlias = Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="TARGET")]
+
+
+class PreparedPair:
+    """Two preprocessed clouds with the channels that they have in common."""
+
+    def __init__(self, source: Path, target: Path, options: PairOptions, *, cells: bool = False):
+        """Read, preprocess and print; `cells`: only for a method that matches cells, not points."""
+        options.check()
+        check_inputs(source, target)
+        self.options = options
+        self.start = np.eye(4) if options.init in (None, "global") else _read_pose(Path(options.init))
+        self.whole = io.read(source), io.read(target)
+        names = [cloud.channel_names for cloud in self.whole]
+        self.channels = list(options.channels) or [name for name in names[0] if name in names[1]]
+        self.difference = f"{source} has {listed(names[0])}, {target} has {listed(names[1])}"
+        voxel_size = voxel_size_for(self.whole, options)
+        self.source, self.target = (
+            _preprocess(path, cloud, self.channels, voxel_size, options.num_neighbors)
+            for path, cloud in zip((source, target), self.whole, strict=True)
+        )
+        counts = [
+            f"{len(c):,} of {len(whole):,}" for c, whole in zip((self.source, self.target), self.whole, strict=True)
+        ]
+        voxels = "all kept" if voxel_size is None else f"voxels of {voxel_size:g} m"
+        print(f"points:    source {counts[0]}, target {counts[1]} ({voxels})")
+        if not cells:
+            print(f"matches:   up to {described_distance(options, self.target)} apart")
+        # Without common channels, `method` raises an error if the method needs any.
+        unused = self.channels and names[0] != names[1] and not options.channels
+        difference = f" ({self.difference})" if unused else ""
+        print(f"channels:  {listed(self.channels)}{difference}")
+        if options.init == "global":
+            self.start = _found(self.whole, self.channels)
+
+    def method(self, name: MethodName) -> AbstractMethod:
+        """The method with parameters from the options or else from the data."""
+        kind = METHODS[name]
+        if kind.uses_channels and not self.channels:
+            raise ValueError(
+                f"{name} needs channels in common, but {self.difference}; use gicp instead (--method gicp)"
+            )
+        numbers = self.options.numbers_of(name)
+        if issubclass(kind, mcg.ColorICP) and not numbers:
+            numbers = {"channel_weights": weights_from(self.source, self.target)}
+        return kind(**numbers).resolve(self.source, self.target)
+
+    def errors(self, pose: Float[np.ndarray, "4 4"], true_pose: Float[np.ndarray, "4 4"]) -> str:
+        """Translation error in mm at the centroid of the source, and rotation error in degrees, as two columns."""
+        centroid = np.asarray(self.source.unpad().points, np.float64).mean(axis=0)
+        translation, rotation = metrics.pose_error(pose, true_pose, at=centroid)
+        return f"{1e3 * float(translation):9.2f}  {np.degrees(rotation):11.3f}"
+
+    def register(self, method: AbstractMethod) -> mcg.Registration:
+        source, target, options = self.source, self.target, self.options.registration()
+        if method.needs_covariances:
+            # Cells are made of all points.
+            whole = [with_channels(cloud, self.channels) for cloud in self.whole]
+            source = whole[0] if "source" in method.needs_covariances else source
+            target = whole[1]
+            options["scales"] = self.cells(method)
+        return mcg.register(source, target, method, init=self.start, **options)
+
+    def cells(self, method: AbstractMethod) -> tuple[float, ...]:
+        """Sizes of the cells, metres, for methods that need any: with 8 spacings, a cell has some tens of points."""
+        spacing = float(method.spacing(self.target))
+        return self.options.scales or tuple(float(f"{times * spacing:.2g}") for times in (32, 16, 8))
+
+    def draw(self, results: dict[MethodName, mcg.Registration]) -> None:
+        if self.options.plot is not None:
+            poses: dict[str, Any] = {"start": self.start, **{name: result.matrix for name, result in results.items()}}
+            plot.before_after(*self.whole, poses, path=self.options.plot)
+            print(f"picture:   {self.options.plot}")
+
+
+def register(
+    source: Source,
+    target: Target,
+    shared: PairOptions,
+    method: MethodName = "mc-gicp",
+    output: File = None,
+    aligned: File = None,
+) -> int:
+    """Estimate the pose T_target_source that moves SOURCE onto TARGET.
+
+    Clouds are .ply, .pcd, .las, .laz, .bin (KITTI), .npy, .npz, .xyz, .txt or .csv files. The exit code is 0 only if
+    the registration converged; output files are written in any case, unless --init global finds no pose.
+
+    Args:
+        source: Cloud to move.
+        target: Cloud that stays.
+        method: mc-gicp, color-icp and color-ndt use channels (intensity, colours, ...), the others geometry alone.
+        output: File for the pose in KITTI format: the upper three rows of its matrix on one line.
+        aligned: File for the whole source cloud moved by the pose, such as out.ply.
+    """
+    shared.check_method(method)
+    check_outputs(output, cloud=aligned)
+    pair = PreparedPair(source, target, shared, cells=bool(METHODS[method].needs_covariances))
+    chosen = pair.method(method)
+    print(f"method:    {method}{described(chosen)}")
+    if chosen.needs_covariances:
+        print(f"cells:     of {', '.join(f'{size:g}' for size in pair.cells(chosen))} m")
+    result = pair.register(chosen)
+    plural = "" if result.num_iterations == 1 else "s"
+    print(f"status:    {words(result)} after {result.num_iterations} iteration{plural}")
+    print(f"inliers:   {result.num_inliers:,} of {len(pair.source):,} ({result.overlap:.0%}), rmse {result.rmse:.4g} m")
+    if result.converged and np.all(np.isfinite(result.deviations)):
+        x, y, z, *angles = result.deviations
+        roll, pitch, yaw = np.degrees(angles)
+        print(f"deviation: x {x:.2g}, y {y:.2g}, z {z:.2g} m; about x {roll:.2g}, y {pitch:.2g}, z {yaw:.2g} degrees")
+    if result.free_directions:
+        print(f"free:      {describe(result.free_directions)}")
+    print("T_target_source:")
+    # At UTM coordinates, 1e-8 in a rotation entry moves a point by centimetres.
+    form = "22.14f" if np.any(pair.source.origin) else "15.8f"
+    for row in result.matrix:
+        print("".join(f" {number:{form}}" for number in row))
+    if output is not None:
+        io.write_poses(output, [result.matrix])
+    if aligned is not None:
+        io.write(aligned, pair.whole[0].transform(result.matrix))
+    pair.draw({method: result})
+    return _verdict({method: result})
+
+
+def compare(source: Source, target: Target, shared: PairOptions, truth: File = None) -> int:
+    """Register SOURCE to TARGET with every method and print a table.
+
+    Methods that use channels are skipped if the clouds have none in common. The exit code is 0 only if all methods that
+    ran converged.
+
+    Args:
+        source: Cloud to move.
+        target: Cloud that stays.
+        truth: File with the true pose T_target_source, to print errors: of the position of the centroid of SOURCE, and
+            of the rotation.
+    """
+    return _verdict(_compare(source, target, shared, truth))
+
+
+def demo(output: Path = Path("mcgicp_demo")) -> int:
+    """Register two simulated views of a flat wall of posters by a noisy RGB-D camera, with every method.
+
+    Args:
+        output: Folder for the two clouds, the true pose and a picture.
+    """
+    output.mkdir(parents=True, exist_ok=True)
+    frames = datasets.poster_wall(2)
+    target, source = frames
+    source_file, target_file, truth_file = (output / name for name in ("source.npz", "target.npz", "truth.txt"))
+    io.write(source_file, source.cloud)
+    io.write(target_file, target.cloud)
+    io.write_poses(truth_file, [np.linalg.inv(frames.path(0)) @ frames.path(1)])
+    options = PairOptions(voxel_size="off", plot=output / "before_after.png")
+    _compare(source_file, target_file, options, truth_file)
+    print(
+        "Geometry does not constrain motion along a flat wall: methods that use it alone report it (degenerate) and"
+        "\nkeep the initial pose along it, so in their rows of the picture the posters do not fit."
+        "\nmc-gicp, color-icp and color-ndt are constrained by the channels red, green and blue."
+        f"\nThe clouds are in {output}; try: mcgicp register {source_file} {target_file}"
+    )
+    return 0
+
+
+def _compare(
+    source: Path, target: Path, options: PairOptions, truth: Path | None
+) -> dict[MethodName, mcg.Registration]:
+    true_pose = None if truth is None else _read_pose(truth)
+    pair = PreparedPair(source, target, options)
+    results: dict[MethodName, mcg.Registration] = {}
+    measures = "inliers      rmse, m" if true_pose is None else "error, mm   error, deg"
+    print(f"\n{'method':15}  {measures:>22}  iterations  time, ms  status")
+    if true_pose is not None:
+        print(f"{'(start)':15}  {pair.errors(pair.start, true_pose)}")
+    for name, kind in METHODS.items():
+        if kind.uses_channels and not pair.channels:
+            print(f"{name:15}  left out: no channels in common")
+            continue
+        method = pair.method(name)
+        pair.register(method)
+        begin = time.perf_counter()
+        result = results[name] = pair.register(method)
+        milliseconds = 1e3 * (time.perf_counter() - begin)
+        values = f"{result.num_inliers:9,}  {result.rmse:11.4g}"
+        if true_pose is not None:
+            values = pair.errors(np.asarray(result.matrix), true_pose)
+        print(f"{name:15}  {values}  {result.num_iterations:10}  {milliseconds:8.0f}  {words(result)}")
+    print("(times do not include compilation, preprocessing and the choice of parameters)\n")
+    pair.draw(results)
+    return results
+
+
+def _read_pose(path: Path) -> Float[np.ndarray, "4 4"]:
+    if not path.is_file():
+        raise ValueError(f"--init: expected a file with a pose, or global; {path} is no file")
+    poses = io.read_poses(path)
+    if len(poses) != 1:
+        raise ValueError(f"{path}: expected one pose, got {len(poses)}")
+    return poses[0]
+
+
+def _found(clouds: Sequence[mcg.PointCloud], channels: Sequence[str]) -> Float[np.ndarray, "4 4"]:
+    """The pose from any start; raises `ValueError` if it cannot be trusted."""
+    result = mcg.global_pose(*(with_channels(cloud, channels) for cloud in clouds))
+    if not result.success:
+        reason = "several poses fit about equally well" if result.ambiguous else "too few features match"
+        raise ValueError(f"--init global: found no pose, {reason} ({result}); try --init with a file")
+    print(f"start:     found, {result.num_inliers:,} of {result.num_matches:,} features match")
+    return result.matrix
+
+
+def _preprocess(
+    path: Path, cloud: mcg.PointCloud, channels: Sequence[str], voxel_size: float | None, num_neighbors: int
+) -> mcg.PointCloud:
+    try:
+        return mcg.preprocess(with_channels(cloud, channels), voxel_size, num_neighbors)
+    except ValueError as error:
+        raise ValueError(f"{path}: {error}") from error
+
+
+def _verdict(results: dict[MethodName, mcg.Registration]) -> int:
+    """Return the exit code, and print to stderr which methods did not converge."""
+    failed = {name: result for name, result in results.items() if not result.converged}
+    for name, result in failed.items():
+        advice = ADVICE[status_of(result)]
+        print(f"mcgicp: {name} did not converge ({words(result)}): {advice}", file=sys.stderr)
+    return 1 if failed else 0

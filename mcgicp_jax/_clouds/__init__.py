@@ -1,0 +1,1 @@
+"""Point clouds: the type, preprocessing, voxels, maps, colour spaces."""

@@ -1,0 +1,335 @@
+"""The point cloud: positions, channels, and optionally neighbours and given covariances."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, TypeAlias
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.typing import ArrayLike
+from jaxtyping import Array, Bool, Float, Int
+
+from mcgicp_jax._compute.concrete import is_concrete
+from mcgicp_jax._compute.size_classes import size_class
+from mcgicp_jax._math.poses import Pose, pose_matrix
+
+# Array input: NumPy, JAX or any array-like, or nested lists.
+Values: TypeAlias = ArrayLike | Sequence[Any]
+
+# Distance from zero, in cloud sizes, beyond which the origin is kept apart in float64: float32 coordinates would lose
+# more than log2(8) = 3 of their 24 significant bits.
+_FAR = 8.0
+
+
+def is_far(offset: Float[np.ndarray, "3"], size: float) -> bool:
+    """Whether a cloud of `size` metres lies so far from zero that float32 coordinates lose too much precision."""
+    return bool(np.linalg.norm(offset) > _FAR * size)
+
+
+def _as_float(name: str, values: Values) -> Any:
+    """Convert to a floating-point array. NumPy input stays NumPy: float64 is needed until the origin is subtracted."""
+    if isinstance(values, jax.Array):
+        if jnp.issubdtype(values.dtype, jnp.complexfloating):
+            raise ValueError(f"{name}: expected real numbers, got dtype {values.dtype}")
+        return values if values.dtype in (jnp.float32, jnp.float64) else values.astype(float)
+    try:
+        array = np.asarray(values)
+    except ValueError as error:
+        raise ValueError(f"{name}: expected numbers in a rectangular array, got rows of unequal length") from error
+    if array.dtype.kind not in "fiub":
+        raise ValueError(f"{name}: expected real numbers, got dtype {array.dtype}")
+    return array if array.dtype in (np.float32, np.float64) else array.astype(np.float64)
+
+
+def _as_mask(values: Values, shape: tuple[int, ...]) -> Any:
+    """Check `channel_valid` against the shape of the channels; a single channel may have a 1-D mask."""
+    mask = values if isinstance(values, jax.Array) else np.asarray(values)
+    if mask.dtype != bool:
+        raise ValueError(f"channel_valid: expected booleans, got dtype {mask.dtype}")
+    if mask.shape == shape[:-1] and shape[-1] == 1:
+        mask = mask[..., None]
+    if mask.shape != shape:
+        raise ValueError(f"channel_valid: expected shape {shape} to go with channels, got {mask.shape}")
+    return mask
+
+
+def _blank(channels: Any, channel_valid: Any) -> Any:
+    """Set missing channel values, often NaN, to 0, so that they never enter arithmetic."""
+    xp = np if isinstance(channels, np.ndarray) and isinstance(channel_valid, np.ndarray) else jnp
+    return xp.where(channel_valid, channels, 0)
+
+
+class PointCloud(eqx.Module):
+    """Points with channels; a pytree whose arrays may all have leading batch dimensions.
+
+    A cloud built from arrays is *raw*; `preprocess` returns one that is ready to register, with neighbours. Both hold
+    NumPy arrays with one row per point. Quantities derived from a cloud are cached while the cloud is in use, so do
+    not modify its arrays in place. To exchange values, such as channels computed by a network, use
+    `cloud.replace(channels=...)`. Rows that are not `valid` are padding (see `pad`) and are ignored everywhere.
+
+    Attributes:
+        points: (N, 3), metres, relative to `origin` (0 for raw clouds); see `coordinates`.
+        channels: (N, C), in the user's unit; C may be 0.
+        channel_valid: (N, C), False where the point lacks the channel, as outside a camera's view; the value there is
+            0 and is ignored. None: all points have all channels.
+        valid: (N,), False for padding.
+        neighbors: (N, k) row indices of the k nearest points, including the point itself; −1 where there are fewer.
+        covariances: (N, 3, 3), or None. If given, methods use them instead of computing their own: dimensionless for
+            GICP and MC-GICP, m² for NDT (from `gaussians`; the scale of a kernel is then in standard deviations).
+        origin: (3,) float64, metres, subtracted from the points so that float32 stays precise at large (UTM)
+            coordinates; 0 otherwise.
+        channel_names: C names, such as ("intensity",) or ("red", "green", "blue"); used as column names in files.
+    """
+
+    points: Float[Array, "*batch N 3"] | Float[np.ndarray, "*batch N 3"]
+    channels: Float[Array, "*batch N C"] | Float[np.ndarray, "*batch N C"]
+    channel_valid: Bool[Array, "*batch N C"] | Bool[np.ndarray, "*batch N C"] | None
+    valid: Bool[Array, "*batch N"] | Bool[np.ndarray, "*batch N"]
+    neighbors: Int[Array, "*batch N k"] | Int[np.ndarray, "*batch N k"] | None
+    covariances: Float[Array, "*batch N 3 3"] | Float[np.ndarray, "*batch N 3 3"] | None
+    origin: Float[Array, "*batch 3"] | Float[np.ndarray, "*batch 3"]
+    channel_names: tuple[str, ...] = eqx.field(static=True)
+
+    def __init__(
+        self,
+        points: Values,
+        channels: Values | None = None,
+        *,
+        channel_valid: Values | None = None,
+        covariances: Values | None = None,
+        channel_names: Sequence[str] | None = None,
+    ):
+        """Create a raw cloud.
+
+        Args:
+            points: (N, 3), metres: nested lists or arrays of any real dtype, NumPy or JAX.
+            channels: (N, C), or (N,) for a single channel, in any unit; none by default.
+            channel_valid: booleans in the shape of `channels`, False where a point lacks the channel; the value there
+                is ignored and may be NaN. None: all points have all channels.
+            covariances: (N, 3, 3), dimensionless as in GICP (1 in the tangent plane, ε along the normal), or m² as for
+                NDT.
+            channel_names: one name per channel; "channel_0", "channel_1", ... by default.
+
+        Raises:
+            ValueError: if a shape or dtype does not fit; the message names the argument.
+        """
+        self.points = _as_float("points", points)
+        if self.points.ndim != 2 or self.points.shape[1] != 3:
+            raise ValueError(f"points: expected shape (N, 3), got {self.points.shape}")
+        size = self.points.shape[0]
+        if channels is None:
+            channels = np.zeros((size, 0), self.points.dtype)
+        self.channels = _as_float("channels", channels)
+        if self.channels.ndim == 1:
+            self.channels = self.channels[:, None]
+        if self.channels.ndim != 2 or self.channels.shape[0] != size:
+            raise ValueError(f"channels: expected shape ({size}, C) to go with points, got {self.channels.shape}")
+        self.channel_valid = None
+        if channel_valid is not None:
+            self.channel_valid = _as_mask(channel_valid, np.shape(self.channels))
+            self.channels = _blank(self.channels, self.channel_valid)
+        self.covariances = None if covariances is None else _as_float("covariances", covariances)
+        if self.covariances is not None and self.covariances.shape != (size, 3, 3):
+            raise ValueError(f"covariances: expected shape ({size}, 3, 3), got {self.covariances.shape}")
+        count = self.channels.shape[1]
+        if channel_names is None:
+            channel_names = [f"channel_{i}" for i in range(count)]
+        if len(channel_names) != count:
+            raise ValueError(f"channel_names: expected {count} names, got {len(channel_names)}")
+        self.channel_names = tuple(channel_names)
+        self.valid = np.ones(size, bool)
+        self.neighbors = None
+        self.origin = np.zeros(3)
+
+    def replace(self, **arrays: Any) -> PointCloud:
+        """Return a copy with the given fields replaced (`points`, `channels`, `covariances`, ...).
+
+        An existing `channel_valid` also applies to new `channels`. `points` are relative to `origin`; `neighbors` stay
+        as they were, constants to autodiff: after moves comparable to the spacing, preprocess again.
+
+        Raises:
+            ValueError: if a field does not exist, or a shape or dtype does not fit the cloud.
+        """
+        fields = dict(vars(self))
+        unknown = arrays.keys() - fields.keys()
+        if unknown:
+            raise ValueError(f"replace: unknown field {', '.join(sorted(unknown))}; expected {', '.join(fields)}")
+        shapes = {
+            "points": np.shape(self.points),
+            "valid": np.shape(self.valid),
+            "covariances": (*np.shape(self.points), 3),
+            "origin": np.shape(self.origin),
+        }
+        for name in arrays.keys() & {"points", "channels", "covariances"}:
+            if arrays[name] is not None:
+                arrays[name] = _as_float(name, arrays[name]).astype(self.points.dtype)
+        for name, value in arrays.items():
+            expected = shapes.get(name, np.shape(value))
+            if np.shape(value) != expected and not (name == "covariances" and value is None):
+                raise ValueError(f"{name}: expected shape {expected}, got {np.shape(value)}")
+        if "channels" in arrays:
+            channels = arrays["channels"]
+            if np.shape(channels)[:-1] != np.shape(self.points)[:-1]:
+                raise ValueError(f"channels: expected shape ({self.points.shape[-2]}, C), got {np.shape(channels)}")
+            if channels.shape[-1] != self.channels.shape[-1] and "channel_names" not in arrays:
+                arrays["channel_names"] = tuple(f"channel_{i}" for i in range(channels.shape[-1]))
+        fields |= arrays
+        if fields["channel_valid"] is not None and arrays.keys() & {"channels", "channel_valid"}:
+            fields["channel_valid"] = _as_mask(fields["channel_valid"], np.shape(fields["channels"]))
+            fields["channels"] = _blank(fields["channels"], fields["channel_valid"])
+        return _build(**fields)
+
+    @property
+    def coordinates(self) -> Float[np.ndarray, "*batch N 3"]:
+        """Positions in the user's frame, (N, 3) float64, metres: `points` + `origin`."""
+        return np.asarray(self.points, np.float64) + np.asarray(self.origin, np.float64)[..., None, :]
+
+    def __len__(self) -> int:
+        """The number of points, without padding."""
+        return int(np.sum(np.asarray(self.valid)))
+
+    def __repr__(self) -> str:
+        if not is_concrete(self) or self.points.ndim != 2:
+            size = f"shape {tuple(self.points.shape[:-1])}"
+        elif len(self) == self.points.shape[0]:
+            size = f"{len(self)} points"
+        else:
+            size = f"{len(self)} points padded to {self.points.shape[0]}"
+        names = list(self.channel_names)
+        if self.channel_valid is not None and is_concrete(self) and self.points.ndim == 2:
+            fractions = np.mean(np.asarray(self.channel_valid)[np.asarray(self.valid)], axis=0)
+            names = [f"{name} ({fraction:.0%})" for name, fraction in zip(names, fractions, strict=True)]
+        parts = [size, f"channels: {', '.join(names) or 'none'}", str(self.points.dtype)]
+        if self.neighbors is not None:
+            parts.append(f"{self.neighbors.shape[-1]} neighbors")
+        if is_concrete(self.origin) and np.any(self.origin):
+            parts.append(f"origin {np.array2string(np.asarray(self.origin), precision=1)}")
+        return f"PointCloud({', '.join(parts)})"
+
+    def unpad(self) -> PointCloud:
+        """Return the valid rows as a raw cloud: NumPy arrays in the user's frame, float64 if `origin` is not 0."""
+        keep = np.asarray(self.valid)
+        whole = bool(keep.all())
+
+        def kept(array: Any) -> Any:
+            # A plain copy takes a tenth of the time of boolean indexing.
+            return None if array is None else np.array(array) if whole else np.asarray(array)[keep]
+
+        points = kept(self.coordinates if np.any(self.origin) else self.points)
+        return PointCloud(
+            points,
+            kept(self.channels),
+            channel_valid=kept(self.channel_valid),
+            covariances=kept(self.covariances),
+            channel_names=self.channel_names,
+        )
+
+    def pad(self, size: int | None = None) -> PointCloud:
+        """Append padding rows until the cloud has `size` rows.
+
+        Inside your own `jax.jit`, clouds padded to the same size share one compiled program.
+
+        Args:
+            size: number of rows; by default the smallest of 128, 256, 512, ... that holds the cloud.
+
+        Raises:
+            ValueError: if the cloud has more than `size` rows.
+        """
+        size = size_class(self.points.shape[0]) if size is None else size
+        missing = size - self.points.shape[0]
+        if missing < 0:
+            raise ValueError(f"size: expected at least {self.points.shape[0]}, the rows of the cloud, got {size}")
+
+        def grow(array: Any, fill: int = 0) -> Any:
+            if array is None:
+                return None
+            if not isinstance(array, np.ndarray):
+                return jnp.pad(array, [(0, missing)] + [(0, 0)] * (array.ndim - 1), constant_values=fill)
+            # Takes a tenth of the time of `np.pad`.
+            grown = np.full((size, *array.shape[1:]), fill, array.dtype)
+            grown[: len(array)] = array
+            return grown
+
+        covariances = grow(self.covariances)
+        if covariances is not None:
+            # Padded rows are computed and then masked, so their covariances must be invertible.
+            xp = np if isinstance(covariances, np.ndarray) else jnp
+            padding = xp.arange(size)[:, None, None] >= size - missing
+            covariances = xp.where(padding, xp.eye(3, dtype=covariances.dtype), covariances)
+        return self.replace_rows(
+            points=grow(self.points),
+            channels=grow(self.channels),
+            channel_valid=grow(self.channel_valid),
+            valid=grow(self.valid),
+            neighbors=grow(self.neighbors, -1),
+            covariances=covariances,
+        )
+
+    def replace_rows(self, **arrays: Any) -> PointCloud:
+        """Replace fields without checks; the number of rows may change."""
+        return _build(**vars(self) | arrays)
+
+    def transform(self, pose: Pose) -> PointCloud:
+        """Transform the cloud by a pose: points p become R p + t, covariances C become R C Rᵀ.
+
+        If the result lies far from zero, a raw cloud gets float64 points; a preprocessed one keeps its dtype and
+        changes its `origin`, so read `coordinates`.
+
+        Args:
+            pose: `jaxlie.SE3` or (4, 4), translation in metres.
+
+        Raises:
+            ValueError: if a concrete pose is no rigid motion or has another shape.
+        """
+        matrix = pose_matrix(pose, "pose")
+        xp = np if isinstance(self.points, np.ndarray) and is_concrete(matrix) else jnp
+        rotation = xp.asarray(matrix[:3, :3], self.points.dtype)
+        points = self.points @ rotation.T
+        covariances = None if self.covariances is None else rotation @ self.covariances @ rotation.T
+        offset, origin = matrix[:3, :3] @ self.origin + matrix[:3, 3], self.origin
+        far = is_concrete(points, offset) and is_far(np.asarray(offset), float(np.abs(points).max(initial=0)))
+        if far and self.neighbors is None:
+            moved = self.coordinates @ np.asarray(matrix[:3, :3], np.float64).T + np.asarray(matrix[:3, 3])
+            return self.replace_rows(points=moved, covariances=covariances, origin=np.zeros(3))
+        if far:
+            # The large offset stays in float64.
+            origin = np.asarray(offset, np.float64)
+        else:
+            points = points + xp.asarray(offset, points.dtype)
+            origin = xp.zeros_like(origin)
+        return self.replace(points=points, covariances=covariances, origin=origin)
+
+    @staticmethod
+    def stack(clouds: Sequence[PointCloud]) -> PointCloud:
+        """Stack clouds along a new leading batch dimension for `jax.vmap`, padded as `pad()` pads the largest.
+
+        Raises:
+            ValueError: if there are no clouds, or their channel names differ.
+        """
+        if not clouds:
+            raise ValueError("clouds: expected at least one, got none")
+        size = max(size_class(cloud.points.shape[0]) for cloud in clouds)
+        names = clouds[0].channel_names
+        for i, cloud in enumerate(clouds):
+            if cloud.channel_names != names:
+                raise ValueError(f"clouds[{i}]: expected the channels {names}, got {cloud.channel_names}")
+        if any(cloud.channel_valid is not None for cloud in clouds):
+            everywhere = [np.ones(cloud.channels.shape, bool) for cloud in clouds]
+            clouds = [
+                cloud if cloud.channel_valid is not None else cloud.replace(channel_valid=mask)
+                for cloud, mask in zip(clouds, everywhere, strict=True)
+            ]
+        padded = [cloud.pad(size) for cloud in clouds]
+        xp = np if is_concrete(padded) else jnp
+        return jax.tree.map(lambda *rows: xp.stack([xp.asarray(row) for row in rows]), *padded)
+
+
+def _build(**fields: Any) -> PointCloud:
+    """Build a cloud from fields, bypassing the conversions and checks of the constructor."""
+    cloud = object.__new__(PointCloud)
+    for name, value in fields.items():
+        object.__setattr__(cloud, name, value)
+    return cloud

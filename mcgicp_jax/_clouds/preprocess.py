@@ -1,0 +1,217 @@
+"""Preprocessing of raw clouds: finite points, voxel downsampling, origin and neighbours."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Iterable
+
+import jax
+import numpy as np
+from jaxtyping import Float, Int
+
+from mcgicp_jax._clouds.point_cloud import PointCloud, Values, is_far
+from mcgicp_jax._compute.argument_checks import check_integer, check_positive
+from mcgicp_jax._compute.concrete import is_concrete
+from mcgicp_jax._search.base import AbstractSearch
+from mcgicp_jax._search.brute_force import default_search
+
+# Fewest finite points of a cloud: four points are the fewest that are not always coplanar.
+MIN_POINTS = 4
+# Voxels along one axis: three 21-bit indices fit one 63-bit key.
+_VOXELS_PER_AXIS = 2**21
+# Coordinates rounded to steps of more than this fraction of the spacing of the points are warned of. The error, uniform
+# over a step, then has a standard deviation of 3 % of the spacing, the noise of a good sensor.
+_LARGEST_STEP = 0.1
+# Largest magnitude of a value, in its own unit: larger ones overflow float32.
+_LARGEST = np.finfo(np.float32).max
+
+
+def preprocess(
+    cloud: PointCloud | Values,
+    voxel_size: float | None = None,
+    num_neighbors: int = 20,
+    *,
+    search: AbstractSearch | None = None,
+) -> PointCloud:
+    """Prepare a cloud for registration: drop non-finite points, downsample to voxels, find neighbours.
+
+    Preprocess each cloud once and register it as often as needed. Runs on the host.
+
+    Args:
+        cloud: raw cloud, or (N, 3) array in metres. Padding and old neighbours are dropped first.
+        voxel_size: metres. Points and channels are averaged per voxel, each channel over the points that have it.
+            None keeps every point.
+        num_neighbors: number k of neighbours, including the point itself, from which a covariance is computed; at
+            least 3. All points are used if the cloud has fewer.
+        search: neighbour search; by default SciPy's k-d tree, or `DenseSearch` on an accelerator.
+
+    Returns:
+        Cloud with read-only NumPy arrays, float64 if the input is and JAX's x64 is on, else float32. If the
+        coordinates are large relative to the cloud's size, they are centred and `PointCloud.origin` keeps the offset.
+
+    Raises:
+        ValueError: if fewer than four points are finite (or remain after downsampling), the cloud is traced, a cloud
+            with covariances is to be downsampled, the cloud is a batch, or an argument is out of range.
+
+    Warns:
+        UserWarning: once per call, if points with NaN or infinity were left out, if downsampling leaves fewer points
+            than `num_neighbors`, and if coordinates far from zero are float32 and too coarse for the points' spacing.
+    """
+    check_preprocessing(voxel_size, num_neighbors)
+    cloud = finite_rows(cloud)
+    found = with_neighbors(cloud, voxel_size, num_neighbors, search)
+    _warn_of_rounding(cloud, found)
+    if len(found) < min(len(cloud), num_neighbors):
+        warnings.warn(
+            f"voxel_size: {voxel_size} m leaves {len(found)} of {len(cloud)} points, fewer than the {num_neighbors} "
+            "neighbours from which a covariance is computed; choose a smaller size",
+            UserWarning,
+            stacklevel=2,
+        )
+    return found
+
+
+def with_neighbors(
+    cloud: PointCloud, voxel_size: float | None, num_neighbors: int, search: AbstractSearch | None = None
+) -> PointCloud:
+    """`preprocess` for a cloud of `finite_rows`."""
+    if voxel_size is not None:
+        cloud = _downsampled(cloud, voxel_size)
+    points, channel_valid, covariances = np.asarray(cloud.points), cloud.channel_valid, cloud.covariances
+    dtype = jax.dtypes.canonicalize_dtype(points.dtype)
+    origin = _far_origin(points)
+    points = (points - origin).astype(dtype)
+    # Neighbours are searched among the rounded coordinates, which are those of the registration.
+    neighbors = (search or default_search()).neighbors(points, num_neighbors)
+    arrays = {
+        "points": points,
+        "channels": np.asarray(cloud.channels, dtype),
+        # Without missing channels the mask is None, so that all complete clouds share compiled programs.
+        "channel_valid": None if channel_valid is None or np.all(channel_valid) else np.asarray(channel_valid),
+        "valid": np.ones(len(points), bool),
+        "neighbors": neighbors.astype(np.int32, copy=False),
+        "covariances": None if covariances is None else np.asarray(covariances, dtype),
+        "origin": origin,
+    }
+    for array in arrays.values():
+        if array is not None:
+            # Quantities derived from these arrays are cached, so the arrays must not change. They are copies.
+            array.setflags(write=False)
+    return cloud.replace_rows(**arrays)
+
+
+def _warn_of_rounding(given: PointCloud, found: PointCloud) -> None:
+    """Warn if the coordinates were given in float32 and are too large for it, such as those of UTM."""
+    if given.points.dtype != np.float32 or not np.any(found.origin):
+        return
+    largest, points, neighbors = np.abs(given.points).max(), np.asarray(found.points), np.asarray(found.neighbors)
+    # Each point is its own first neighbour.
+    spacing = np.median(np.linalg.norm(points[neighbors[:, 1]] - points, axis=1))
+    if np.spacing(largest) > _LARGEST_STEP * spacing:
+        warnings.warn(
+            f"points: float32 has rounded coordinates of {largest:.0f} m to steps of {np.spacing(largest):.2g} m, and "
+            f"neighbours are {spacing:.2g} m apart; read them as float64, or subtract an offset before float32",
+            UserWarning,
+            stacklevel=3,
+        )
+
+
+def check_preprocessing(voxel_size: float | None, num_neighbors: int) -> None:
+    """Check the arguments of `preprocess` other than the cloud; raises `ValueError`."""
+    if voxel_size is not None:
+        check_positive("voxel_size", voxel_size)
+    check_integer("num_neighbors", num_neighbors, 3)
+
+
+def finite_rows(cloud: PointCloud | Values) -> PointCloud:
+    """A raw cloud without padding and without rows that have a NaN or infinity in any array; warns of the latter."""
+    if not isinstance(cloud, PointCloud):
+        cloud = PointCloud(cloud)
+    if not is_concrete(cloud):
+        raise ValueError("cloud: expected concrete arrays, got tracers; preprocess outside of jit, grad and vmap")
+    if cloud.points.ndim != 2:
+        raise ValueError(f"cloud: expected a single cloud, got a batch of shape {cloud.points.shape}")
+    cloud = cloud.unpad()
+    arrays = [array for array in (cloud.points, cloud.channels, cloud.covariances) if array is not None]
+    # Values such as 1e39 or 1e300 overflow float32 and count as infinite.
+    finite = [np.abs(array) <= _LARGEST for array in arrays]
+    # Most clouds are finite throughout, and one check of all values is much faster than one per row.
+    if len(cloud.points) >= MIN_POINTS and all(each.all() for each in finite):
+        return cloud
+    keep = np.all([each.all(axis=tuple(range(1, each.ndim))) for each in finite], axis=0)
+    if keep.sum() < MIN_POINTS:
+        raise ValueError(f"cloud: expected at least {MIN_POINTS} finite points, got {keep.sum()} of {keep.size}")
+    warnings.warn(f"left out {np.sum(~keep)} of {keep.size} points with a NaN or infinity", UserWarning, stacklevel=3)
+    return PointCloud(
+        cloud.points[keep],
+        cloud.channels[keep],
+        channel_valid=None if cloud.channel_valid is None else cloud.channel_valid[keep],
+        covariances=None if cloud.covariances is None else cloud.covariances[keep],
+        channel_names=cloud.channel_names,
+    )
+
+
+def _downsampled(cloud: PointCloud, voxel_size: float) -> PointCloud:
+    """The mean points and channels of each voxel, summed in float64, sorted by voxel."""
+    if cloud.covariances is not None:
+        raise ValueError("voxel_size: expected None for a cloud with covariances, which cannot be averaged")
+    # Working by columns takes a third of the time of working by rows.
+    columns = np.ascontiguousarray(np.asarray(cloud.points).T, np.float64)
+    order, starts = voxels(columns, voxel_size)
+    if len(starts) < MIN_POINTS:
+        raise ValueError(
+            f"voxel_size: expected a size that leaves at least {MIN_POINTS} points, got {voxel_size} m, "
+            f"which leaves {len(starts)}"
+        )
+
+    def total(columns: Iterable[np.ndarray]) -> np.ndarray:
+        sums = [np.add.reduceat(column[order].astype(np.float64), starts) for column in columns]
+        return np.stack(sums, axis=1) if sums else np.zeros((len(starts), 0))
+
+    counts = np.diff(np.append(starts, len(order)))[:, None]
+    means = (total(columns) / counts).astype(cloud.points.dtype)
+    channels, names = np.asarray(cloud.channels), cloud.channel_names
+    channel_valid = None
+    if cloud.channel_valid is not None:
+        # Missing values are stored as 0 and do not add to the sum.
+        counts = total(np.asarray(cloud.channel_valid).T)
+        counts, channel_valid = np.maximum(counts, 1), counts > 0
+    channels = (total(channels.T) / counts).astype(channels.dtype)
+    return PointCloud(means, channels, channel_valid=channel_valid, channel_names=names)
+
+
+def voxels(columns: Float[np.ndarray, "3 N"], voxel_size: float) -> tuple[Int[np.ndarray, "N"], Int[np.ndarray, "M"]]:
+    """An order that sorts points by voxel, and where each of the M occupied voxels starts in it."""
+    key, largest = np.zeros(columns.shape[1], np.int64), 1
+    for column in columns:
+        cell = np.floor(column / voxel_size)
+        cell -= cell.min()
+        along = cell.max() + 1
+        if along > _VOXELS_PER_AXIS:
+            raise ValueError(
+                f"voxel_size: expected at most {_VOXELS_PER_AXIS} voxels along an axis, got {along:.0f} "
+                f"with {voxel_size} m; choose a larger size"
+            )
+        key = key * int(along) + cell.astype(np.int64)
+        largest *= int(along)
+    order = _stable_order(key, largest)
+    key = key[order]
+    return order, np.flatnonzero(np.concatenate([[True], key[1:] != key[:-1]]))
+
+
+def _stable_order(key: Int[np.ndarray, "N"], largest: int) -> Int[np.ndarray, "N"]:
+    """Indices of a stable sort of keys in [0, `largest`)."""
+    bits = (len(key) - 1).bit_length()
+    if (largest - 1).bit_length() + bits > 63:
+        return np.argsort(key, kind="stable")
+    # Sorting keys with the row index in their low bits is several times faster than argsort.
+    return np.sort((key << bits) | np.arange(len(key))) & ((1 << bits) - 1)
+
+
+def _far_origin(points: Float[np.ndarray, "N 3"]) -> Float[np.ndarray, "3"]:
+    """Offset to subtract: the cloud's centre if `is_far` from zero, else zero."""
+    low, high = points.min(axis=0).astype(np.float64), points.max(axis=0).astype(np.float64)
+    center = 0.5 * (low + high)
+    # Rounded to float32, so that the origin has the same value inside a transformation.
+    center = center.astype(np.float32).astype(np.float64)
+    return center if is_far(center, float(np.linalg.norm(high - low))) else np.zeros(3)

@@ -1,0 +1,123 @@
+"""Maps: the points of many clouds in one frame, averaged per voxel."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from mcgicp_jax._clouds.point_cloud import PointCloud, Values
+from mcgicp_jax._compute.argument_checks import check_positive
+from mcgicp_jax._math.poses import Pose, pose_matrix
+
+# Voxels from the first point along each axis: three 21-bit indices, from −2²⁰, are packed into one 64-bit key.
+_HALF_RANGE = 2**20
+
+
+def aggregate(clouds: Iterable[PointCloud | Values], poses: Iterable[Pose], voxel_size: float) -> PointCloud:
+    """Merge clouds into one map: the mean of all points, and of their channels, per voxel of the world.
+
+    Clouds are processed one by one; memory grows with the size of the map, not with the number of clouds.
+
+    Args:
+        clouds: clouds or (N, 3) arrays in metres, in their sensor frames, with the same channels. Points with a
+            non-finite coordinate or channel are ignored.
+        poses: one pose per cloud, sensor to world.
+        voxel_size: metres.
+
+    Returns:
+        Raw float64 cloud in the world frame.
+
+    Raises:
+        ValueError: if there are no clouds, the number of poses differs, a pose is no rigid motion, the channels
+            differ, or a point lies more than 2²⁰ voxels from the first one along an axis.
+    """
+    world = VoxelMap(voxel_size)
+    for i, (cloud, pose) in enumerate(zip(clouds, poses, strict=True)):
+        cloud = cloud if isinstance(cloud, PointCloud) else PointCloud(cloud)
+        world.add(f"clouds[{i}]", cloud, np.asarray(pose_matrix(pose, f"poses[{i}]")))
+    return world.cloud()
+
+
+class VoxelMap:
+    """The sums of positions and channels in each voxel of the world."""
+
+    def __init__(self, voxel_size: float):
+        check_positive("voxel_size", voxel_size)
+        self._voxel_size = voxel_size
+        # Keys of the voxels, sorted; and for each the number of points, and sums of positions, channels and masks.
+        self._keys = np.empty(0, np.int64)
+        self._sums: np.ndarray | None = None
+        self._names: tuple[str, ...] | None = None
+        # Voxel of the first point, from which the others are counted: keys have no room for UTM coordinates.
+        self._first: Float[np.ndarray, "3"] | None = None
+
+    def add(self, name: str, cloud: PointCloud, pose: Float[np.ndarray, "4 4"]) -> None:
+        """Add the finite points of a cloud in its sensor frame, moved by its pose; `name` is for error messages."""
+        if self._names not in (None, cloud.channel_names):
+            raise ValueError(f"{name}: expected the channels {self._names}, got {cloud.channel_names}")
+        cloud, self._names = cloud.unpad(), cloud.channel_names
+        points = np.asarray(cloud.points, np.float64) @ pose[:3, :3].T + pose[:3, 3]
+        rows = np.hstack([np.ones((len(points), 1)), points, *_valid_channels(cloud)])
+        finite = np.isfinite(rows).all(axis=1)
+        if self._first is None and finite.any():
+            self._first = voxel_of(points[finite][0], self._voxel_size)
+        keys = np.concatenate([self._keys, voxels(points[finite], self._voxel_size, self._first)])
+        sums = rows[finite] if self._sums is None else np.concatenate([self._sums, rows[finite]])
+        self._keys, self._sums = _merge(keys, sums)
+
+    def forget(self, center: Float[np.ndarray, "3"], radius: float) -> None:
+        """Drop the voxels whose mean point is further than `radius`, metres, from a position."""
+        if self._sums is not None:
+            means = self._sums[:, 1:4] / self._sums[:, :1]
+            near = np.linalg.norm(means - center, axis=1) <= radius
+            self._keys, self._sums = self._keys[near], self._sums[near]
+
+    def cloud(self) -> PointCloud:
+        """The mean points and channels of the voxels, as a raw float64 cloud."""
+        if self._sums is None:
+            raise ValueError("clouds: expected at least one, got none")
+        points = self._sums[:, 1:4] / self._sums[:, :1]
+        values, counts = np.split(self._sums[:, 4:], 2, axis=1)
+        valid = counts > 0
+        return PointCloud(
+            points,
+            values / np.maximum(counts, 1),
+            channel_valid=None if valid.all() else valid,
+            channel_names=self._names,
+        )
+
+
+def _valid_channels(cloud: PointCloud) -> tuple[Float[np.ndarray, "N C"], Float[np.ndarray, "N C"]]:
+    """Channels, 0 where missing, and their mask as 1 or 0."""
+    channels = np.asarray(cloud.channels, np.float64)
+    if cloud.channel_valid is None:
+        return channels, np.ones_like(channels)
+    return channels, np.asarray(cloud.channel_valid, np.float64)
+
+
+def voxel_of(point: Float[np.ndarray, "3"], voxel_size: float) -> Float[np.ndarray, "3"]:
+    return np.floor(point / voxel_size)
+
+
+def voxels(
+    points: Float[np.ndarray, "N 3"], voxel_size: float, first: Float[np.ndarray, "3"] | None
+) -> Int[np.ndarray, "N"]:
+    """One integer key per point for the voxel that contains it, counted from the voxel `first`."""
+    cells = np.floor(points / voxel_size) - (0 if first is None else first)
+    if np.abs(cells).max(initial=0) >= _HALF_RANGE:
+        raise ValueError(
+            f"voxel_size: {voxel_size} m puts points {np.abs(cells).max():.0f} voxels from the first one, expected "
+            f"fewer than {_HALF_RANGE}; choose a larger size"
+        )
+    x, y, z = (cells.astype(np.int64) + _HALF_RANGE).T
+    return (x << 42) | (y << 21) | z
+
+
+def _merge(keys: np.ndarray, rows: Float[np.ndarray, "N D"]) -> tuple[np.ndarray, Float[np.ndarray, "M D"]]:
+    """Unique keys, sorted, and the sum of the rows of each key."""
+    order = np.argsort(keys, kind="stable")
+    keys = keys[order]
+    starts = np.flatnonzero(np.concatenate([np.ones(min(len(keys), 1), bool), keys[1:] != keys[:-1]]))
+    return keys[starts], np.add.reduceat(rows[order], starts, axis=0) if len(starts) else rows

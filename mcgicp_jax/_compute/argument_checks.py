@@ -1,0 +1,23 @@
+"""Checks of numbers that users pass; the `ValueError` names the argument, what was expected and what came."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from mcgicp_jax._compute.concrete import is_concrete
+
+
+def check_positive(name: str, value: Any, expected: str = "a positive number") -> None:
+    if is_concrete(value) and not (is_number(value) and np.asarray(value) > 0):
+        raise ValueError(f"{name}: expected {expected}, got {value!r}")
+
+
+def check_integer(name: str, value: Any, least: int) -> None:
+    if not isinstance(value, int | np.integer) or value < least:
+        raise ValueError(f"{name}: expected an integer of at least {least}, got {value!r}")
+
+
+def is_number(value: Any) -> bool:
+    return np.ndim(value) == 0 and np.asarray(value).dtype.kind in "fiu"

@@ -1,0 +1,53 @@
+"""Concrete arrays, which NumPy computes with at once, and traced ones, inside JAX's transformations."""
+
+from __future__ import annotations
+
+import contextlib
+from types import ModuleType
+from typing import TYPE_CHECKING, Any, TypeAlias
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.typing import ArrayLike
+from jaxtyping import Array
+
+# NumPy arrays (outside transformations) or JAX arrays, and scalars of either kind.
+if TYPE_CHECKING:
+    AnyArray: TypeAlias = Any
+    AnyScalar: TypeAlias = Any
+else:
+    AnyArray = Array | np.ndarray
+    AnyScalar = ArrayLike
+
+
+def is_concrete(*trees: object) -> bool:
+    """Whether every array in the trees is concrete, that is, none is a tracer of a JAX transformation."""
+    return not any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(trees))
+
+
+def computed_now() -> contextlib.AbstractContextManager[None]:
+    """Context in which concrete arrays are computed at once, even while a caller's `jit` is being traced.
+
+    Outside a trace it does nothing, since `jax.ensure_compile_time_eval` evaluates operation by operation.
+    """
+    staged = isinstance(jnp.array(np.zeros(())), jax.core.Tracer)
+    return jax.ensure_compile_time_eval() if staged else contextlib.nullcontext()
+
+
+def canonical_float() -> Any:
+    """JAX's default precision: float64 where x64 is on."""
+    return jax.dtypes.canonicalize_dtype(np.float64)
+
+
+def namespace(*trees: object) -> ModuleType:
+    """NumPy if every array is concrete, so that nothing is compiled; `jax.numpy` if one is traced.
+
+    It lets formulas that run both on the host and inside transformations be written once.
+    """
+    return np if is_concrete(*trees) else jnp
+
+
+def constant(tree: Any) -> Any:
+    """The tree with gradients stopped; concrete arrays carry none and are returned unchanged (NumPy stays NumPy)."""
+    return tree if is_concrete(tree) else jax.lax.stop_gradient(tree)

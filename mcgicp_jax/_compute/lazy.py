@@ -1,0 +1,50 @@
+"""Lazily computed parts of results."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable
+from typing import Any, Generic, TypeVar
+
+import jax
+
+from mcgicp_jax._compute.concrete import computed_now
+
+Value = TypeVar("Value")
+
+
+@jax.tree_util.register_pytree_node_class
+class Deferred(Generic[Value]):
+    """A pytree that is computed on first access: by `value`, or when it is flattened, copied or pickled."""
+
+    def __init__(self, compute: Callable[[], Value]):
+        self._compute: Callable[[], Value] | None = compute
+        self._lock = threading.Lock()
+        self._value: Value
+
+    @classmethod
+    def of(cls, value: Value) -> Deferred[Value]:
+        """A `Deferred` whose value is known already."""
+        return cls.tree_unflatten(None, (value,))
+
+    @property
+    def value(self) -> Value:
+        with self._lock:
+            if self._compute is not None:
+                with computed_now():
+                    self._value = self._compute()
+                # Frees the arrays that the closure holds.
+                self._compute = None
+        return self._value
+
+    def tree_flatten(self) -> tuple[tuple[Value], None]:
+        return (self.value,), None
+
+    @classmethod
+    def tree_unflatten(cls, _: None, children: tuple[Value]) -> Deferred[Value]:
+        deferred = object.__new__(cls)
+        deferred._compute, deferred._lock, deferred._value = None, threading.Lock(), children[0]
+        return deferred
+
+    def __reduce__(self) -> Any:
+        return Deferred.of, (self.value,)

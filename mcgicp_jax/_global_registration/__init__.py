@@ -1,0 +1,1 @@
+"""Poses without an initial pose: features, matching, robust fit."""

@@ -1,0 +1,176 @@
+"""Local features of points, which a motion of the cloud does not change: FPFH, and statistics of the channels.
+
+FPFH (Rusu, Blodow & Beetz, Fast Point Feature Histograms for 3D Registration, ICRA 2009) depends on the side of the
+surface to which the normals point, which is known of single scans at best. Here the normal of a neighbour is turned to
+the side of the point's own normal, and histograms are averaged over both signs of the latter, so that the features do
+not depend on it. (Normals turned towards the sensor gave about 1.4 times as many correct matches on nine real pairs
+without channels.)
+"""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+from scipy.sparse import csr_array
+
+from mcgicp_jax._clouds.point_cloud import PointCloud
+from mcgicp_jax._compute.blocks import map_rows
+from mcgicp_jax._compute.concrete import AnyScalar
+from mcgicp_jax._local_geometry.covariances import Offsets, gatherer, weighted_covariance
+from mcgicp_jax._local_geometry.records import Neighborhoods
+from mcgicp_jax._math import symmetric_matrices as alg
+
+# Radii in voxels, of neighbours for normals and for histograms: those of Open3D's examples.
+_NORMAL_RADIUS, _RADIUS = 2.0, 5.0
+# Radii in voxels, of neighbours for statistics of the channels: from next neighbours to those of the histograms.
+_CHANNEL_RADII = (1.5, 3.0, 5.0)
+# A disc of five voxels radius on a surface has 79 voxels; there are more where the surface is rough.
+NUM_NEIGHBORS = 100
+# Bins of each of three angles, as in the paper.
+NUM_BINS = 11
+# Standard deviation of all statistics of the channels together, relative to that of the histogram: at one half, real
+# scans have 30 to 50 % more inliers than without channels.
+_CHANNEL_WEIGHT = 0.5
+# Features are rounded to integers up to this magnitude, and the standard deviation of a bin of the histograms to this
+# number. Sums of products of up to 1,000 such integers are exact in float32, in any order and on any device.
+_LARGEST, _DEVIATION = 127, 16
+
+
+def normals_of(cloud: PointCloud, voxel_size: float) -> Float[np.ndarray, "N 3"]:
+    """Unit normals of arbitrary sign, from the neighbours within two voxels."""
+    gather, radius = gatherer(cloud, False, np), np.float32(_NORMAL_RADIUS * voxel_size)
+    return map_rows(lambda rows: _normals(gather(rows), radius), cloud.points.shape[0], None)
+
+
+def histograms_of(cloud: PointCloud, normals: Float[np.ndarray, "N 3"], voxel_size: float) -> Float[np.ndarray, "N 33"]:
+    """FPFH of each point of a preprocessed cloud: eleven bins for each of the angles α, φ, θ, which add up to two.
+
+    A point that has no neighbours within five voxels has zeros.
+    """
+    size, radius = cloud.points.shape[0], np.float32(_RADIUS * voxel_size)
+    gather = gatherer(cloud.replace_rows(channels=normals, channel_valid=None), True, np)
+    simple, weights = map_rows(lambda rows: _simple_histograms(gather(rows), radius), size, None)
+    # The own histogram plus the weighted mean of those of the neighbours. Gathering them takes ten times as long.
+    neighbors = np.maximum(np.asarray(cloud.neighbors), 0)
+    starts = np.arange(size + 1) * neighbors.shape[1]
+    return simple + csr_array((weights.ravel(), neighbors.ravel(), starts), shape=(size, size)) @ simple
+
+
+def statistics_of(cloud: PointCloud, voxel_size: float) -> Float[np.ndarray, "N D"]:
+    """Mean and standard deviation of each channel within three radii of each point; NaN where no point has it."""
+    gather, voxel = gatherer(cloud, True, np), np.float32(voxel_size)
+    return map_rows(lambda rows: _statistics(gather(rows), voxel), cloud.points.shape[0], None)
+
+
+def comparable(
+    histograms: tuple[Float[np.ndarray, "N 33"], Float[np.ndarray, "M 33"]],
+    statistics: tuple[Float[np.ndarray, "N D"], Float[np.ndarray, "M D"]] | None,
+) -> tuple[Float[np.ndarray, "N L"], Float[np.ndarray, "M L"]]:
+    """Features of two clouds on one scale: small integers as float32, whose distances are exact.
+
+    Each statistic of a channel is divided by its standard deviation in both clouds, so that the unit of the channel
+    does not matter. Missing ones are set to the mean.
+    """
+    deviation = max(float(np.concatenate(histograms).astype(np.float64).std()), float(np.finfo(np.float32).tiny))
+    scale = _DEVIATION / deviation
+    center = np.concatenate(histograms).mean(axis=0, dtype=np.float64)
+    found = [[scale * (each - center)] for each in histograms]
+    if statistics is not None:
+        both = np.concatenate(statistics).astype(np.float64)
+        known = np.isfinite(both)
+        count = np.maximum(known.sum(axis=0), 1)
+        mean = np.where(known, both, 0).sum(axis=0) / count
+        spread = np.sqrt(np.where(known, (both - mean) ** 2, 0).sum(axis=0) / count)
+        varying = spread > 1e3 * np.finfo(np.float32).eps * np.abs(mean)
+        share = _CHANNEL_WEIGHT * _DEVIATION * np.sqrt(histograms[0].shape[1] / both.shape[1])
+        scales = np.where(varying, share / np.where(varying, spread, 1), 0)
+        for each, part in zip(statistics, found, strict=True):
+            part.append(np.nan_to_num((each - mean) * scales))
+    rounded = [np.clip(np.rint(np.hstack(part)), -_LARGEST, _LARGEST).astype(np.float32) for part in found]
+    return rounded[0], rounded[1]
+
+
+def _offsets(around: Neighborhoods) -> tuple[Offsets, Float[Array, "k n"]]:
+    """Vectors from the points to their neighbours, metres, and their squared lengths."""
+    x, y, z = around.offset(0), around.offset(1), around.offset(2)
+    return (x, y, z), x * x + y * y + z * z
+
+
+@jax.jit
+def _normals(around: Neighborhoods, radius: Float[AnyScalar, ""]) -> Float[Array, "n 3"]:
+    offsets, square = _offsets(around)
+    near = around.present & (square <= radius * radius)
+    return alg.smallest_eigenvector(weighted_covariance(offsets, near.astype(square.dtype))).T
+
+
+def _dot(a: list[Array], b: list[Array]) -> Array:
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+
+
+def _cross(a: list[Array], b: list[Array]) -> list[Array]:
+    return [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]]
+
+
+@jax.jit
+def _simple_histograms(
+    around: Neighborhoods, radius: Float[AnyScalar, ""]
+) -> tuple[Float[Array, "n 33"], Float[Array, "n k"]]:
+    """SPFH of points whose channels are their normals; and the weights of their neighbours in FPFH, 1/d².
+
+    For each neighbour, of the two points the one whose normal is closer to the line between them is first: with its
+    normal u, the unit vector d to the second one, v = d × u / |d × u|, w = u × v and the second one's normal n, the
+    angles are α = v·n, φ = u·d and θ = atan2(w·n, u·n).
+    """
+    offsets, square = _offsets(around)
+    near = around.present & (square > 0) & (square <= radius * radius)
+    distance = jnp.sqrt(jnp.where(near, square, 1))
+    line = [offset / distance for offset in offsets]
+    own = [normal[None] for normal in around.own_channels]
+    other = list(around.near_channels)
+    side = jnp.where(_dot(own, other) >= 0, 1, -1).astype(square.dtype)
+    other = [side * axis for axis in other]
+    along = _dot(own, line), _dot(other, line)
+    swapped = jnp.abs(along[0]) < jnp.abs(along[1])
+    u, n = ([jnp.where(swapped, b, a) for a, b in zip(*pair, strict=True)] for pair in ((own, other), (other, own)))
+    line = [jnp.where(swapped, -axis, axis) for axis in line]
+    phi = jnp.where(swapped, -along[1], along[0])
+    v = _cross(line, u)
+    length = jnp.sqrt(_dot(v, v))
+    # Where a normal is the line between the points, the frame is undefined.
+    counted = near & (length > 1e-6)
+    v = [axis / jnp.where(counted, length, 1) for axis in v]
+    w = _cross(u, v)
+    # The turned normals are at most a right angle apart.
+    theta = jnp.arctan2(_dot(w, n), _dot(u, n)) / jnp.pi
+    alpha, phi, theta = (_histogram(value, counted) for value in (0.5 + 0.5 * _dot(v, n), 0.5 + 0.5 * phi, 0.5 + theta))
+    # With the other sign of both normals, φ and θ change theirs.
+    even = [0.5 * (each + each[:, ::-1]) for each in (phi, theta)]
+    weights = jnp.where(near, 1 / jnp.where(near, square, 1), 0)
+    weights = weights / jnp.where(jnp.any(near, axis=0), jnp.sum(weights, axis=0), 1)
+    return jnp.concatenate([alpha, *even], axis=1), weights.T
+
+
+def _histogram(values: Float[Array, "k n"], counted: Array) -> Float[Array, "n 11"]:
+    """Fractions of the counted values, from 0 to 1, in each bin."""
+    index = jnp.clip(jnp.floor(NUM_BINS * values), 0, NUM_BINS - 1)
+    counts = jnp.stack([jnp.sum(counted & (index == i), axis=0) for i in range(NUM_BINS)], axis=1)
+    return counts / jnp.maximum(jnp.sum(counted, axis=0), 1)[:, None].astype(values.dtype)
+
+
+@jax.jit
+def _statistics(around: Neighborhoods, voxel_size: Float[AnyScalar, ""]) -> Float[Array, "n D"]:
+    _, square = _offsets(around)
+    columns = []
+    for channel in range(around.num_channels):
+        known = around.present if around.near_known is None else around.near_known[channel]
+        difference, own = around.difference(channel), around.own_channels[channel]
+        for radius in _CHANNEL_RADII:
+            weights = (known & (square <= (radius * voxel_size) ** 2)).astype(square.dtype)
+            total = jnp.sum(weights, axis=0)
+            count = jnp.maximum(total, 1)
+            mean = jnp.sum(weights * difference, axis=0) / count
+            variance = jnp.sum(weights * (difference - mean) ** 2, axis=0) / count
+            columns += [jnp.where(total > 0, each, jnp.nan) for each in (own + mean, jnp.sqrt(variance))]
+    return jnp.stack(columns, axis=1)

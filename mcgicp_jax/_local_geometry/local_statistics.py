@@ -1,0 +1,122 @@
+"""Local statistics of clouds: on the host in blocks, inside transformations over the whole arrays."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import partial
+from typing import Any, TypeVar
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from mcgicp_jax._clouds.point_cloud import PointCloud
+from mcgicp_jax._compute.blocks import map_rows
+from mcgicp_jax._compute.cache import keep
+from mcgicp_jax._compute.concrete import is_concrete
+from mcgicp_jax._compute.threads import side_by_side
+from mcgicp_jax._local_geometry.covariances import describe, gatherer
+from mcgicp_jax._local_geometry.records import Local
+
+Tree = TypeVar("Tree")
+
+# Points. Inside transformations, neighbourhoods of more points are processed in blocks, too: on CPUs XLA sums over the
+# first axis of a wider table column by column, which is twenty times slower.
+_LARGEST_WHOLE = 16_000
+# Largest number of points in such a block; below the limit above.
+_LARGEST_BLOCK = 8192
+
+
+def locals_of(
+    source: PointCloud, target: PointCloud, with_channels: bool, num_threads: int | None = 1
+) -> tuple[Local, Local]:
+    """Local statistics of two preprocessed clouds.
+
+    Args:
+        with_channels: whether the method uses the channels; if not, the programs do not depend on their number.
+        num_threads: largest number of threads on the host; None for no limit.
+
+    Returns:
+        Statistics of the source and of the target.
+    """
+    if is_concrete(source, target):
+        calls = [partial(local_on_host, cloud, with_channels, num_threads) for cloud in (target, source)]
+        found_target, found_source = side_by_side(calls, num_threads)
+        return found_source, found_target
+    # A concrete cloud beside a traced one is traced as well, which needs no program of its own.
+    if not share_a_body(source, target):
+        return _traced(source, with_channels), _traced(target, with_channels)
+    return split(_traced(joined(source, target, with_channels), with_channels), source.points.shape[0])
+
+
+def local_on_host(cloud: PointCloud, with_channels: bool, num_threads: int | None = 1) -> Local:
+    """Local statistics of a concrete cloud as NumPy arrays, cached with the cloud."""
+
+    def make() -> Local:
+        gather = gatherer(cloud, with_channels, np)
+        return map_rows(lambda rows: _describe(gather(rows)), cloud.points.shape[0], num_threads)
+
+    return keep(cloud, "local", with_channels, make)
+
+
+_describe = jax.jit(describe)
+
+
+def _traced(cloud: PointCloud, with_channels: bool) -> Local:
+    gather = gatherer(cloud, with_channels, jnp)
+    return over_rows(lambda rows: describe(gather(rows)), cloud.points.shape[0])
+
+
+def share_a_body(source: PointCloud, target: PointCloud) -> bool:
+    """Whether both clouds are concatenated for one compiled body; for large clouds this costs more than it saves."""
+    return source.points.shape[0] + target.points.shape[0] <= _LARGEST_WHOLE
+
+
+def over_rows(function: Callable[[Any], Tree], num_rows: int) -> Tree:
+    """The result of a function for all rows, inside transformations; many rows are processed in blocks.
+
+    Args:
+        function: maps a slice or an array of row numbers to a pytree of arrays whose first axis are these rows.
+    """
+    if num_rows <= _LARGEST_WHOLE:
+        return function(slice(None))
+    num_blocks = -(-num_rows // _LARGEST_BLOCK)
+    size = -(-num_rows // num_blocks)
+    padded = jnp.minimum(jnp.arange(num_blocks * size), num_rows - 1).reshape(num_blocks, size)
+    found = jax.lax.map(function, padded)
+    return jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:])[:num_rows], found)
+
+
+def joined(source: PointCloud, target: PointCloud, with_channels: bool) -> PointCloud:
+    """Both clouds concatenated, for one compiled body; with only the arrays that neighbourhoods need."""
+    size = source.points.shape[0]
+
+    def both(name: str) -> Any:
+        return jnp.concatenate([jnp.asarray(getattr(cloud, name)) for cloud in (source, target)])
+
+    neighbors = [jnp.asarray(cloud.neighbors) for cloud in (source, target)]
+    most = max(rows.shape[1] for rows in neighbors)
+    neighbors[1] = jnp.where(neighbors[1] >= 0, neighbors[1] + size, -1)
+    padded = [jnp.pad(rows, [(0, 0), (0, most - rows.shape[1])], constant_values=-1) for rows in neighbors]
+    valid = None
+    if with_channels and (source.channel_valid is not None or target.channel_valid is not None):
+        masks = [
+            jnp.ones(cloud.channels.shape, bool) if cloud.channel_valid is None else jnp.asarray(cloud.channel_valid)
+            for cloud in (source, target)
+        ]
+        valid = jnp.concatenate(masks)
+    return source.replace_rows(
+        points=both("points"),
+        channels=both("channels") if with_channels else jnp.zeros((both("points").shape[0], 0), source.points.dtype),
+        channel_valid=valid,
+        valid=None,
+        neighbors=jnp.concatenate(padded),
+        covariances=None,
+        origin=None,
+        channel_names=(),
+    )
+
+
+def split(both: Tree, size: int) -> tuple[Tree, Tree]:
+    """The rows of the source (the first `size`) and of the target, after `joined`."""
+    return jax.tree.map(lambda rows: rows[:size], both), jax.tree.map(lambda rows: rows[size:], both)

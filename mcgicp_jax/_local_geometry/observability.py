@@ -1,0 +1,84 @@
+"""Observability: per-point evidence of which motions are constrained, from surface shape and from channels.
+
+With GICP's in-plane variance of 1, every correspondence constrains every direction a little. But when the pose slides
+along a plane, the matches slide with it, and the plane constrains nothing in that direction. Observability excludes
+this apparent information. It is a symmetric 3×3 matrix O per point: for a motion of the point along the unit vector x,
+xᵀ O x is the fraction, 0 to 1, that changes the residual instead of the match. As the expected contribution of noise is
+subtracted, values of single points may be slightly negative.
+"""
+
+from __future__ import annotations
+
+from typing import TypeAlias
+
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from mcgicp_jax._local_geometry.records import Local
+from mcgicp_jax._math import symmetric_matrices as alg
+
+Basis: TypeAlias = tuple[Float[Array, "3 N"], Float[Array, "3 N"]]
+
+
+def geometry_observability(
+    covariance: Float[Array, "6 N"], normal: Float[Array, "3 N"], basis: Basis, count: Float[Array, "N"]
+) -> Float[Array, "6 N"]:
+    """Observability from the normal: (1 − tr V) (n nᵀ − V), where V is the covariance of the estimated normal n.
+
+    The eigenvector of the smallest eigenvalue λ₀ of a sample covariance has the variance λ₀ λ / (k (λ − λ₀)²) towards
+    the eigenvector of λ (Anderson 1963). It is large for points on a line, whose normal is undetermined about the line.
+    The saturated form λ₀ λ / (k (λ − λ₀)² + λ₀ λ), used here, is at most 1. The factor 1 − tr V, at least 0,
+    downweights uncertain normals.
+
+    Args:
+        covariance: covariance of the neighbours about their mean, metres².
+        normal: n, the unit eigenvector of its smallest eigenvalue.
+        basis: orthonormal basis of the tangent plane.
+        count: k, the number of neighbours.
+    """
+    smallest = jnp.maximum(jnp.sum(normal * alg.multiply(covariance, normal), axis=0), 0)
+    a, b, c = alg.project(covariance, *basis)
+    scale = 1 / jnp.where(a + c > 0, a + c, 1)
+    a, b, c, smallest = a * scale, b * scale, c * scale, smallest * scale
+    gap = jnp.stack([a - smallest, b, c - smallest])
+    x, y, z = gap
+    square = jnp.stack([x * x + y * y, x * y + y * z, y * y + z * z])
+    noise = smallest * jnp.stack([a, b, c])
+    p, q, r = count * square + noise
+    determinant = p * r - q * q
+    known = determinant > 64 * jnp.finfo(covariance.dtype).eps * (p + r) ** 2
+    inverse = jnp.stack([r, -q, p]) / jnp.where(known, determinant, 1)
+    # Both factors are polynomials of the same matrix; they commute, so that their product is symmetric.
+    x, y, z = noise
+    i, j, k = inverse
+    variance = jnp.stack([x * i + y * j, x * j + y * k, y * j + z * k])
+    certain = jnp.where(known, jnp.maximum(1 - variance[0] - variance[2], 0), 0)
+    return certain * (alg.outer(normal) - alg.embed(variance, *basis))
+
+
+def channel_observability(local: Local, weights: Float[Array, "C"]) -> tuple[Float[Array, "6 N"], Float[Array, "N"]]:
+    """Observability of motions within the surface, from the gradients g of the descriptors α · channel.
+
+    If a point moves by x within the surface, its nearest target point in position and descriptors moves by (I + A)⁻¹ x,
+    with A = Σ g gᵀ, and the residual changes by the rest, A (I + A)⁻¹ x. A / (1 + tr A) is used instead, which is equal
+    for one channel and smaller for several. The variance of the fitted gradients is subtracted from A in the numerator.
+
+    Args:
+        weights: α, metres per channel unit.
+
+    Returns:
+        Symmetric (6, N) matrices, and the (N,) variance of the descriptors about their linear fits, metres², summed
+        over the channels.
+    """
+    total = jnp.zeros((3, local.observed.shape[0]), local.observed.dtype)
+    uncertain, noise = total, total[0]
+    for channel in range(local.num_channels):
+        gx, gy, residual, *inverse = local.fit(channel)
+        square = weights[channel] ** 2
+        residual = square * jnp.where(jnp.isnan(residual), 0, residual)
+        total = total + square * jnp.stack([gx * gx, gx * gy, gy * gy])
+        uncertain = uncertain + residual * jnp.stack(inverse)
+        noise = noise + residual
+    # The same tangent basis as in the linear fits.
+    basis = alg.orthonormal_basis(local.normal)
+    return alg.embed((total - uncertain) / (1 + total[0] + total[2]), *basis), noise

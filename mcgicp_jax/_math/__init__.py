@@ -1,0 +1,1 @@
+"""Numbers only: symmetric matrices, poses, statistics, robust kernels."""

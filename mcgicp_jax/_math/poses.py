@@ -1,0 +1,143 @@
+"""Poses: validation of user input, and conversion between matrices and `jaxlie.SE3`."""
+
+from __future__ import annotations
+
+from functools import partial
+from typing import TYPE_CHECKING, Any, TypeAlias
+
+import jax
+import jax.numpy as jnp
+import jaxlie
+import numpy as np
+from jax.typing import ArrayLike, DTypeLike
+from jaxtyping import Array, Float
+
+from mcgicp_jax._compute.concrete import AnyArray, is_concrete
+
+if TYPE_CHECKING:
+    # A pose that a user passes.
+    Pose: TypeAlias = jaxlie.SE3 | Array | np.ndarray
+else:
+    # Not checked at run time: `pose_matrix` has better messages.
+    Pose = Any
+
+# Tolerance on the largest entry of R Rᵀ − I: a matrix typed with four digits still counts as a rotation.
+_ROTATION_TOLERANCE = 1e-3
+# Largest displacement, in radii of the cloud, that rounding of R may cause for a cloud far from the origin.
+_DISPLACEMENT_TOLERANCE = 0.1
+
+
+def pose_matrix(
+    pose: Pose | None, name: str = "init", distance: float = 0.0
+) -> Float[np.ndarray, "4 4"] | Float[Array, "4 4"]:
+    """The (4, 4) matrix of a pose: in float64 if the pose is concrete, in its own precision if it is traced.
+
+    The rotation of a concrete matrix is replaced by the nearest exact one, so that the pose does not scale the cloud.
+
+    Args:
+        pose: `jaxlie.SE3` or (4, 4) matrix; None is the identity.
+        name: name of the argument, for error messages.
+        distance: distance of the cloud that the pose will move from the origin, in radii of that cloud.
+
+    Raises:
+        ValueError: if the shape is wrong; or, for a concrete pose, if the matrix is not a rigid motion or its rotation
+            has too few digits for a cloud at that distance.
+    """
+    if pose is None:
+        return np.eye(4)
+    matrix = pose.as_matrix() if isinstance(pose, jaxlie.SE3) else pose
+    if not is_concrete(matrix):
+        if matrix.shape != (4, 4):
+            raise ValueError(f"{name}: expected a jaxlie.SE3 or a (4, 4) matrix, got shape {matrix.shape}")
+        return matrix
+    try:
+        matrix = np.asarray(matrix, dtype=np.float64)
+    except (TypeError, ValueError) as error:
+        raise ValueError(f"{name}: expected a jaxlie.SE3 or a (4, 4) matrix, got {type(pose).__name__}") from error
+    if matrix.shape != (4, 4):
+        raise ValueError(f"{name}: expected a jaxlie.SE3 or a (4, 4) matrix, got shape {matrix.shape}")
+    rotation = matrix[:3, :3]
+    off = np.abs(rotation @ rotation.T - np.eye(3)).max()
+    # Written so that NaN fails as well.
+    rigid = off <= _ROTATION_TOLERANCE and np.linalg.det(rotation) > 0
+    if not (rigid and np.isfinite(matrix).all() and np.array_equal(matrix[3], [0.0, 0.0, 0.0, 1.0])):
+        raise ValueError(
+            f"{name}: expected a rigid motion (rotation of determinant 1, last row 0 0 0 1), got\n{matrix}"
+        )
+    if off * distance > _DISPLACEMENT_TOLERANCE:
+        raise ValueError(
+            f"{name}: expected a rotation with more digits: R Rᵀ differs from the identity by {off:.1g}, which "
+            f"displaces a cloud so far from the origin by {off * distance:.1g} of its radius"
+        )
+    return nearest_rotation(matrix)
+
+
+def nearest_rotation(matrix: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, "4 4"]:
+    """The matrix with its upper left 3×3 block replaced by the nearest rotation (Frobenius norm)."""
+    rotation = matrix[:3, :3]
+    # A matrix that is a rotation to rounding is returned unchanged, so that the function is idempotent.
+    if np.abs(rotation @ rotation.T - np.eye(3)).max() <= 1e-14:
+        return matrix
+    left, _, right = np.linalg.svd(rotation)
+    matrix = matrix.copy()
+    matrix[:3, :3] = left @ right
+    return matrix
+
+
+def se3_from_matrix(matrix: Float[ArrayLike, "4 4"], dtype: DTypeLike) -> jaxlie.SE3:
+    """`jaxlie.SE3` in the given precision with a unit quaternion; a concrete matrix gives one of NumPy arrays."""
+    if not is_concrete(matrix):
+        return _se3_from_traced(matrix, dtype)
+    matrix = np.asarray(matrix, np.float64)
+    if not np.isfinite(matrix).all():
+        return se3(np.full(7, np.nan, dtype))
+    if np.all(matrix[:3, :3] == np.eye(3)):
+        return se3(np.concatenate([[1.0, 0, 0, 0], matrix[:3, 3]]).astype(dtype))
+    return se3(parameters_of(matrix).astype(dtype))
+
+
+def parameters_of(matrices: Float[np.ndarray, "*batch 4 4"]) -> Float[np.ndarray, "*batch 7"]:
+    """Unit quaternions wxyz and translations of rigid motions; float64."""
+    # Imported late: it takes a fifth of the import time of the package.
+    from scipy.spatial.transform import Rotation
+
+    xyzw = Rotation.from_matrix(matrices[..., :3, :3].reshape(-1, 3, 3)).as_quat(canonical=True)
+    xyzw = xyzw.reshape(*matrices.shape[:-2], 4)
+    return np.concatenate([xyzw[..., 3:], xyzw[..., :3], matrices[..., :3, 3]], axis=-1)
+
+
+def matrices_of(parameters: Float[np.ndarray, "*batch 7"]) -> Float[np.ndarray, "*batch 4 4"]:
+    """Rigid motions as matrices from `parameters_of`."""
+    matrices = np.zeros((*parameters.shape[:-1], 4, 4))
+    matrices[..., :3, :3] = rotation_from_quaternion(parameters[..., :4])
+    matrices[..., :3, 3] = parameters[..., 4:]
+    matrices[..., 3, 3] = 1
+    return matrices
+
+
+@partial(jax.jit, static_argnames="dtype")
+def _se3_from_traced(matrix: Float[Array, "4 4"], dtype: DTypeLike) -> jaxlie.SE3:
+    pose = jaxlie.SE3.from_matrix(jnp.asarray(matrix, dtype))
+    return cast_pose(pose.normalize(), dtype)
+
+
+def se3(parameters: AnyArray) -> jaxlie.SE3:
+    """`jaxlie.SE3` from (7,) parameters, quaternion wxyz and translation; NumPy arrays stay NumPy arrays."""
+    return jaxlie.SE3(parameters)
+
+
+def cast_pose(pose: jaxlie.SE3, dtype: DTypeLike) -> jaxlie.SE3:
+    """The pose in the given precision: undoes the promotion by constants that jaxlie computes in the default one."""
+    return jaxlie.SE3(pose.wxyz_xyz.astype(dtype))
+
+
+def rotation_from_quaternion(wxyz: Float[np.ndarray, "*batch 4"]) -> Float[np.ndarray, "*batch 3 3"]:
+    """Rotation matrices of quaternions, in the precision of the input: jaxlie would use float32 where x64 is off."""
+    w, x, y, z = (wxyz / np.sqrt(np.sum(wxyz * wxyz, axis=-1, keepdims=True))).T
+    rows = [
+        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+    ]
+    # The entries are stacked as (3, 3, reversed batch); the transpose restores the batch and the order of the rows.
+    return np.array(rows).swapaxes(0, 1).T

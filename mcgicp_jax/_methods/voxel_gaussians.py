@@ -1,0 +1,268 @@
+"""Voxel Gaussians: clouds of cells, each with the mean and the covariance of the points in it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, Literal, overload
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int, Shaped
+
+from mcgicp_jax._clouds.point_cloud import PointCloud, Values
+from mcgicp_jax._clouds.preprocess import MIN_POINTS, finite_rows, preprocess, voxels
+from mcgicp_jax._compute.argument_checks import check_integer, check_positive, is_number
+from mcgicp_jax._compute.concrete import AnyArray, namespace
+from mcgicp_jax._math import symmetric_matrices as alg
+from mcgicp_jax._methods.base import GICP
+from mcgicp_jax._methods.surface import covariances_of
+
+# Fewest points in a cell, and smallest ratio of its eigenvalues: those of the Point Cloud Library.
+_MIN_POINTS, _MIN_RATIO = 6, 0.01
+# Smallest standard deviation of the points in a cell, in voxels. Some scanners report each beam without an echo as a
+# point at the origin; such a cell is no surface.
+_LEAST_EXTENT = 1e-4
+
+
+@overload
+def gaussians(
+    cloud: PointCloud | Values,
+    voxel_size: float,
+    *,
+    min_points: int = ...,
+    min_ratio: float = ...,
+    channel_size: Values | None = ...,
+    of: Literal["points", "covariances"] = ...,
+    return_counts: Literal[False] = ...,
+) -> PointCloud: ...
+
+
+@overload
+def gaussians(
+    cloud: PointCloud | Values,
+    voxel_size: float,
+    *,
+    min_points: int = ...,
+    min_ratio: float = ...,
+    channel_size: Values | None = ...,
+    of: Literal["points", "covariances"] = ...,
+    return_counts: Literal[True],
+) -> tuple[PointCloud, Int[np.ndarray, "M"]]: ...
+
+
+def gaussians(
+    cloud: PointCloud | Values,
+    voxel_size: float,
+    *,
+    min_points: int = _MIN_POINTS,
+    min_ratio: float = _MIN_RATIO,
+    channel_size: Values | None = None,
+    of: Literal["points", "covariances"] = "points",
+    return_counts: bool = False,
+) -> PointCloud | tuple[PointCloud, Int[np.ndarray, "M"]]:
+    """Replace the points of each voxel by one Gaussian: their mean position and channels, and a covariance.
+
+    The result is the input of `NDT` and `D2DNDT`, or with `of="covariances"` that of voxelised GICP (Koide et al.
+    2021). Runs on the host, in float64.
+
+    Args:
+        cloud: raw or preprocessed cloud, or (N, 3) array in metres, of all points: not downsampled.
+        voxel_size: edge of a voxel, metres.
+        min_points: cells with fewer points are left out, as are those whose points coincide; at least 3.
+        min_ratio: eigenvalues of a covariance below this fraction of its largest one are raised to it, so that the
+            cells of planes and lines are kept; 0 to 1.
+        channel_size: splits each voxel by its channels into cells of this size, in channel units, one number or one per
+            channel (infinity: not by this one); then each Gaussian has one colour, as in the NDT of Huhle & Magnusson
+            (2008). The points of a cell have or lack the same channels. None: one cell per voxel.
+        of: "points": the covariance of the points (m², n − 1). "covariances": the mean of the covariances of the
+            points, dimensionless: those given with the cloud, or GICP's.
+        return_counts: also return the number of points in each cell.
+
+    Returns:
+        Preprocessed cloud with one point per cell, and its covariances. With `return_counts`, a tuple of it and the
+        numbers of points, (M,) integers.
+
+    Raises:
+        ValueError: if an argument is out of range, the cloud is traced, or fewer than four cells are left.
+    """
+    if of not in ("points", "covariances"):
+        raise ValueError(f'of: expected "points" or "covariances", got {of!r}')
+    if not (is_number(min_ratio) and 0 <= min_ratio <= 1):
+        raise ValueError(f"min_ratio: expected a number from 0 to 1, got {min_ratio!r}")
+    cloud = finite_rows(cloud)
+    if of == "covariances" and cloud.covariances is None:
+        cloud = cloud.replace(covariances=covariances_of(GICP(), preprocess(cloud)).astype(cloud.points.dtype))
+    cells = _Cells(cloud, voxel_size, min_points, channel_size)
+    kept = cells.kept
+    if kept.sum() < MIN_POINTS:
+        raise ValueError(
+            f"voxel_size: expected a size that leaves at least {MIN_POINTS} cells of {min_points} points, got "
+            f"{voxel_size} m, which leaves {kept.sum()}"
+        )
+    if of == "covariances":
+        matrices = (cells.sum(np.asarray(cloud.covariances).reshape(-1, 9)) / cells.counts).T.reshape(-1, 3, 3)[kept]
+    else:
+        matrices = _floored(cells.spread[:, kept], min_ratio)
+    known, counts = cloud.channel_valid, cells.counts
+    if known is not None:
+        counts = cells.sum(known)
+    # Missing values are stored as 0 and do not add to the sum.
+    channels = cells.sum(cloud.channels) / np.maximum(counts, 1)
+    dtype = cloud.points.dtype
+    made = preprocess(
+        PointCloud(
+            cells.means[:, kept].T.astype(dtype),
+            channels[:, kept].T.astype(dtype),
+            channel_valid=None if known is None else counts[:, kept].T > 0,
+            covariances=matrices.astype(dtype),
+            channel_names=cloud.channel_names,
+        )
+    )
+    return (made, cells.counts[kept]) if return_counts else made
+
+
+def voxel_cells(
+    cloud: PointCloud | Values,
+    voxel_size: float,
+    *,
+    min_points: int = _MIN_POINTS,
+    channel_size: Values | None = None,
+) -> Int[np.ndarray, "N"]:
+    """The cell of each point, as `gaussians` numbers its cells; input of `cell_moments`.
+
+    Args:
+        cloud: cloud of finite points, or (N, 3) array in metres.
+        voxel_size, min_points, channel_size: as in `gaussians`.
+
+    Returns:
+        (N,) numbers from 0; −1 for points in cells that are left out.
+
+    Raises:
+        ValueError: if an argument is out of range.
+    """
+    cloud = cloud if isinstance(cloud, PointCloud) else PointCloud(cloud)
+    cells = _Cells(cloud, voxel_size, min_points, channel_size)
+    number = np.empty(len(cells.order), np.int32)
+    number[cells.order] = np.repeat(np.where(cells.kept, np.cumsum(cells.kept) - 1, -1), cells.counts)
+    return number
+
+
+class _Cells:
+    """The points of a cloud sorted by cell, and the moments of each cell.
+
+    Attributes:
+        order: (N,) point numbers, sorted by cell.
+        counts: (M,) number of points in each cell.
+        kept: (M,) False for cells that are left out.
+        means, spread: (3, M) and (6, M), see `_moments`.
+    """
+
+    def __init__(self, cloud: PointCloud, voxel_size: float, min_points: int, channel_size: Values | None):
+        check_positive("voxel_size", voxel_size)
+        check_integer("min_points", min_points, 3)
+        # Working by columns takes a third of the time of working by rows.
+        points = _columns(cloud.coordinates if np.any(cloud.origin) else cloud.points)
+        self.order, self._starts = voxels(points, voxel_size)
+        if channel_size is not None:
+            self.order, self._starts = _split(self.order, self._starts, cloud, channel_size)
+        self.counts = np.diff(self._starts, append=len(self.order))
+        self.means, self.spread = _moments(
+            np.take(points, self.order, axis=1),
+            self.counts,
+            self._reduced,
+            lambda values: np.repeat(values, self.counts, axis=1),
+        )
+        extended = self.spread[[0, 3, 5]].sum(axis=0) > (_LEAST_EXTENT * voxel_size) ** 2
+        self.kept = (self.counts >= min_points) & extended
+
+    def _reduced(self, columns: Float[np.ndarray, "D N"]) -> Float[np.ndarray, "D M"]:
+        return np.add.reduceat(columns, self._starts, axis=1)
+
+    def sum(self, rows: Shaped[AnyArray, "N D"]) -> Float[np.ndarray, "D M"]:
+        """Sums over the points of each cell, in float64."""
+        return self._reduced(np.take(_columns(rows), self.order, axis=1))
+
+
+def _columns(rows: Shaped[AnyArray, "N D"]) -> Float[np.ndarray, "D N"]:
+    return np.ascontiguousarray(np.asarray(rows).T, np.float64)
+
+
+def _split(
+    order: Int[np.ndarray, "N"], starts: Int[np.ndarray, "M"], cloud: PointCloud, channel_size: Values
+) -> tuple[Int[np.ndarray, "N"], Int[np.ndarray, "M2"]]:
+    """Split cells by the channels of their points."""
+    sizes = np.asarray(channel_size, np.float64)
+    if sizes.shape not in ((), (cloud.channels.shape[1],)) or not np.all(sizes > 0):
+        raise ValueError(f"channel_size: expected one positive number, or one per channel, got {channel_size!r}")
+    levels = np.floor(np.asarray(cloud.channels, np.float64)[order] / sizes)
+    if cloud.channel_valid is not None:
+        # A level of its own.
+        levels = np.where(np.asarray(cloud.channel_valid)[order], levels, -np.inf)
+    columns = [np.cumsum(np.bincount(starts, minlength=len(order))), *levels.T]
+    again = np.lexsort(columns[::-1])
+    changes = np.any([column[again][1:] != column[again][:-1] for column in columns], axis=0)
+    return order[again], np.flatnonzero(np.append(True, changes))
+
+
+def cell_moments(
+    points: Float[AnyArray, "N 3"],
+    channels: Float[AnyArray, "N C"],
+    cells: Int[np.ndarray, "N"],
+    min_ratio: float = _MIN_RATIO,
+) -> tuple[Float[Array, "M 3"], Float[Array, "M C"], Float[Array, "M 3 3"]]:
+    """Mean position, mean channels and covariance (m²) of each cell, as in `gaussians`. Pure JAX, differentiable.
+
+    To let gradients reach the points of a cloud, replace `points`, `channels` and `covariances` of its `gaussians` by
+    these. The cells are constants.
+
+    Args:
+        points, channels: of the cloud; metres and channel units.
+        cells: from `voxel_cells`; concrete.
+        min_ratio: as in `gaussians`.
+    """
+    inside = np.flatnonzero(cells >= 0)
+    number = cells[inside]
+    counts = np.bincount(number)
+
+    def sum_of(columns: Float[Array, "D n"]) -> Float[Array, "D M"]:
+        return jax.ops.segment_sum(columns.T, number, len(counts)).T
+
+    columns, values = (jnp.asarray(array)[inside].T for array in (points, channels))
+    means, symmetric = _moments(columns, counts, sum_of, lambda values: values[:, number])
+    normal = alg.smallest_eigenvector(symmetric)
+    u, v = alg.orthonormal_basis(normal)
+    within = alg.project(symmetric, u, v)
+    a, b, c = within
+    square = 0.25 * (a - c) ** 2 + b * b
+    radius = jnp.where(square > 0, jnp.sqrt(jnp.where(square > 0, square, 1)), 0)
+    least = min_ratio * (0.5 * (a + c) + radius)
+    across = jnp.maximum(jnp.sum(normal * alg.multiply(symmetric, normal), axis=0), least)
+    raised = alg.embed(alg.floor_eigenvalues(within, least), u, v) + across * alg.outer(normal)
+    return means.T, (sum_of(values) / counts.astype(values.dtype)).T, alg.matrix_from_symmetric(raised)
+
+
+def _moments(
+    points: Float[AnyArray, "3 n"],
+    counts: Int[np.ndarray, "M"],
+    sum_of: Callable[[Any], Any],
+    each: Callable[[Any], Any],
+) -> tuple[Float[AnyArray, "3 M"], Float[AnyArray, "6 M"]]:
+    """Means, and covariances as rows xx, xy, xz, yy, yz, zz. A single pass would lose digits far from zero.
+
+    Args:
+        counts: number of points in each cell.
+        sum_of: from values of the points, (D, n), to their sums over each cell, (D, M).
+        each: from values of the cells, (D, M), to those of the cell of each point, (D, n).
+    """
+    means = sum_of(points) / counts.astype(points.dtype)
+    x, y, z = points - each(means)
+    products = namespace(points).stack([x * x, x * y, x * z, y * y, y * z, z * z])
+    return means, sum_of(products) / np.maximum(counts - 1, 1).astype(points.dtype)
+
+
+def _floored(symmetric: Float[np.ndarray, "6 M"], min_ratio: float) -> Float[np.ndarray, "M 3 3"]:
+    """Matrices whose eigenvalues are at least `min_ratio` times the largest one."""
+    values, vectors = np.linalg.eigh(symmetric[[0, 1, 2, 1, 3, 4, 2, 4, 5]].T.reshape(-1, 3, 3))
+    raised = np.maximum(values, min_ratio * values[:, -1:])
+    return (vectors * raised[:, None]) @ vectors.swapaxes(1, 2)

@@ -1,0 +1,1 @@
+"""Pose graphs: the graph, its optimisation, initial poses, marginal covariances."""

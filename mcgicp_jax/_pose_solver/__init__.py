@@ -1,0 +1,1 @@
+"""From sums over correspondences to a pose, its derivative and its covariance."""

@@ -1,0 +1,218 @@
+"""Constrained and unconstrained directions of motion of a pose, for the loop and as text.
+
+In the loop, twists ξ = (v, ω) turn about the centroid of the matched points, in the target's frame, with lengths in
+units of the radius of the matched points (`Sums.radius`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import equinox as eqx
+import jax.numpy as jnp
+import jaxlie
+import numpy as np
+from jax.typing import ArrayLike
+from jaxtyping import Array, Bool, Float
+
+from mcgicp_jax._pose_solver.sums import Sums
+from mcgicp_jax._pose_solver.update import adjoint_to_source, twist_form, units
+
+# Least observed fraction of the points' squared motion for a direction to count as constrained. Geometry: measured
+# below 0.0016 in flat scenes (posters on a wall, a road, a table with 2 mm noise) and from 0.1 on in others; GICP's
+# artificial in-plane stiffness equals a true fraction of ε, 0.001 by default. Channels: 0.003 from noise alone, from
+# 0.008 on with the markings of a road.
+GEOMETRY_HOLDS, CHANNELS_HOLD = 2e-3, 5e-3
+# Least information of tie points and prior for a direction to count as constrained: a standard deviation of one radius
+# of the matched points. Useful ones are far above it.
+_TIES_HOLD = 1.0
+_IDENTITY = np.array([1, 0, 0, 1, 0, 1])
+# A direction is named a translation if its rotation causes at most this fraction of the points' motion (rms).
+_PURE = 0.3
+
+
+class Directions(eqx.Module):
+    """Six directions of motion of a pose, and how well geometry and channels observe each.
+
+    Attributes:
+        twists: (6, 6), one direction per row, scaled so that the matched points move by 1 (root mean square).
+        geometry: (6,) fraction of that squared motion that the shape of the surfaces observes, 0 to 1.
+        channels: (6,) fraction that the channels observe; 0 for the directions that geometry constrains.
+        ties: (6,) information of tie points and prior, one over the squared standard deviation in radii of that motion;
+            0 for the directions that geometry or channels constrain. None without tie points and prior.
+        center: (3,) centroid of the matched source points, metres.
+        radius: root mean square distance of these points from it, metres.
+    """
+
+    twists: Float[Array, "*batch 6 6"] | Float[np.ndarray, "*batch 6 6"]
+    geometry: Float[Array, "*batch 6"] | Float[np.ndarray, "*batch 6"]
+    channels: Float[Array, "*batch 6"] | Float[np.ndarray, "*batch 6"]
+    center: Float[Array, "*batch 3"] | Float[np.ndarray, "*batch 3"]
+    radius: Float[ArrayLike, "*batch"]
+    ties: Float[Array, "*batch 6"] | Float[np.ndarray, "*batch 6"] | None = None
+
+    @property
+    def free(self) -> Bool[Array, "*batch 6"] | Bool[np.ndarray, "*batch 6"]:
+        """Which directions geometry does not constrain."""
+        return ~(self.geometry >= GEOMETRY_HOLDS)
+
+    @property
+    def held_by_matches(self) -> Bool[Array, "*batch 6"] | Bool[np.ndarray, "*batch 6"]:
+        """Which directions are constrained by geometry or by the channels."""
+        return ~self.free | (self.channels >= CHANNELS_HOLD)
+
+    @property
+    def held(self) -> Bool[Array, "*batch 6"] | Bool[np.ndarray, "*batch 6"]:
+        """Which directions are constrained, by geometry, by the channels, or by tie points and prior."""
+        return self.held_by_matches if self.ties is None else self.held_by_matches | (self.ties >= _TIES_HOLD)
+
+
+def find_directions(sums: Sums) -> Directions:
+    """Eigenvectors of the observed fraction of the points' motion: by the geometry, and among the directions that
+    geometry does not constrain, by the channels. Fractions do not depend on units or on the origin.
+    """
+    center, radius, observed = sums.center, sums.radius, sums.observability
+    total = jnp.where(sums.mass[9] > 0, sums.mass[9], 1)
+    motion = twist_form(jnp.outer(_IDENTITY.astype(total.dtype), sums.mass / total), radius)
+    geometry = twist_form(observed[0] / total, radius)
+    # Each decomposition needs the result of the last: concurrent batched LAPACK calls can deadlock XLA's thread pool.
+    # The floor: points on a line do not move when they turn about it, so that rotation is not observed.
+    values, vectors = jnp.linalg.eigh(motion)
+    floor = 1e-5 * jnp.max(values)
+    basis = vectors / jnp.sqrt(jnp.maximum(values, jnp.where(floor > 0, floor, 1)))
+    shares, turn = jnp.linalg.eigh(basis.T @ geometry @ basis)
+    basis = basis @ turn
+    free = ~(shares >= GEOMETRY_HOLDS)
+    if len(observed) == 1:
+        channels = jnp.zeros_like(shares)
+        return Directions(twists=basis.T, geometry=shares, channels=channels, center=center, radius=radius)
+    # Diagonalise the channels within the free directions; 2, above any fraction, sorts the other directions last.
+    among = jnp.outer(free, free)
+    channels = jnp.where(among, basis.T @ twist_form(observed[1] / total, radius) @ basis, jnp.diag(2.0 * ~free))
+    held, turn = jnp.linalg.eigh(channels)
+    basis = basis @ turn
+    shares = jnp.sum(basis * (geometry @ basis), axis=0)
+    channels = jnp.where(held > 1.5, 0, held)
+    return Directions(twists=basis.T, geometry=shares, channels=channels, center=center, radius=radius)
+
+
+def directions_at_source(directions: Directions, pose: jaxlie.SE3) -> Directions:
+    """The directions as twists ξ of T exp(ξ), metres and radians, that move the matched points by 1 m (rms)."""
+    center, radius = jnp.asarray(directions.center), jnp.asarray(directions.radius)
+    change = adjoint_to_source(pose, center) * units(radius) / radius
+    center = pose.inverse() @ center
+    return eqx.tree_at(lambda d: (d.twists, d.center), directions, (directions.twists @ change.T, center))
+
+
+@dataclass(frozen=True, eq=False)
+class FreeDirection:
+    """A direction of motion that the shape of the clouds does not constrain.
+
+    Attributes:
+        twist: (6,) ξ = (v, ω) of T exp(ξ), metres and radians, scaled so that the matched points move by 1 m (root mean
+            square).
+        held_by_channels: whether the channels constrain the direction.
+        held_by_ties: whether tie points or a prior do. If neither is True, the direction is unconstrained.
+        axis: (3,) unit vector in the source's frame: direction of the translation, or axis of the rotation.
+        is_rotation: False if the direction is named a translation: rotation causes at most 0.3 of the points' motion.
+    """
+
+    twist: Float[np.ndarray, "6"]
+    held_by_channels: bool
+    axis: Float[np.ndarray, "3"]
+    is_rotation: bool
+    held_by_ties: bool = False
+
+    def __repr__(self) -> str:
+        by_ties = "constrained by tie points or prior" if self.held_by_ties else "unconstrained"
+        held = "constrained by channels" if self.held_by_channels else by_ties
+        return f"{self.name} ({held})"
+
+    @property
+    def name(self) -> str:
+        """For instance "translation along (1, 0, 0)"; the axis in the source's frame."""
+        axis = self.axis * np.sign(self.axis[np.argmax(np.abs(self.axis))])
+        x, y, z = np.round(axis, 2) + 0.0
+        return f"{'rotation about' if self.is_rotation else 'translation along'} ({x:g}, {y:g}, {z:g})"
+
+
+def free_directions(directions: Directions) -> tuple[FreeDirection, ...]:
+    """Free directions of one registration: unconstrained before constrained by channels, translations first."""
+    free, held, by_matches = (
+        np.asarray(each) for each in (directions.free, directions.held, directions.held_by_matches)
+    )
+    motions = _motions(directions)
+    found: list[FreeDirection] = []
+    for by_channels, by_ties in ((False, False), (False, True), (True, False)):
+        group = motions[free & (by_matches == by_channels) & ((held & ~by_matches) == by_ties)]
+        found += [_named(motion, directions, by_channels, by_ties) for motion in _separate(group) @ group]
+    return tuple(found)
+
+
+def shares(directions: Directions) -> list[tuple[str, float, float]]:
+    """Name and fractions observed by geometry and by channels for each of the six directions, free ones first."""
+    free, motions = np.asarray(directions.free), _motions(directions)
+    geometry, channels = np.asarray(directions.geometry), np.asarray(directions.channels)
+    found: list[tuple[str, float, float]] = []
+    for group in (free, ~free):
+        mixing = _separate(motions[group])
+        names = [_named(motion, directions).name for motion in mixing @ motions[group]]
+        # Squared weights: the forms are diagonal, but for that of geometry among the free directions, which is tiny.
+        found += zip(names, mixing**2 @ geometry[group], mixing**2 @ channels[group], strict=True)
+    return [(name, float(by_geometry), float(by_channels)) for name, by_geometry, by_channels in found]
+
+
+def _motions(directions: Directions) -> Float[np.ndarray, "6 6"]:
+    """(6, 6) motion of each direction: of the centroid, and by rotation about it, both in metres of rms motion."""
+    twists = np.asarray(directions.twists, np.float64)
+    center, radius = np.asarray(directions.center, np.float64), np.asarray(directions.radius)
+    return np.concatenate([twists[:, :3] + np.cross(twists[:, 3:], center), radius * twists[:, 3:]], axis=1)
+
+
+def _named(
+    motion: Float[np.ndarray, "6"], directions: Directions, by_channels: bool = False, by_ties: bool = False
+) -> FreeDirection:
+    center, radius = np.asarray(directions.center, np.float64), np.asarray(directions.radius)
+    turning = np.linalg.norm(motion[3:]) > _PURE * np.linalg.norm(motion)
+    axis, omega = motion[3:] if turning else motion[:3], motion[3:] / radius
+    return FreeDirection(
+        twist=np.concatenate([motion[:3] - np.cross(omega, center), omega]),
+        held_by_channels=by_channels,
+        axis=axis / np.linalg.norm(axis),
+        is_rotation=bool(turning),
+        held_by_ties=by_ties,
+    )
+
+
+def _separate(motions: Float[np.ndarray, "m 6"]) -> Float[np.ndarray, "m m"]:
+    """Orthogonal matrix that mixes motions so that translations come first, along coordinate axes where possible.
+
+    Orthogonal mixing keeps the motions orthogonal in the mean motion of the points.
+    """
+    if not len(motions):
+        return np.zeros((0, 0))
+    mixing = np.linalg.svd(motions[:, 3:])[0].T[::-1]
+    ordered = mixing @ motions
+    flat = np.linalg.norm(ordered[:, 3:], axis=1) <= _PURE * np.linalg.norm(ordered, axis=1)
+    if flat.sum() == 2:
+        axis = np.argmax(np.linalg.norm(ordered[flat, :3], axis=0))
+        cosine, sine = ordered[flat, axis] / np.linalg.norm(ordered[flat, axis])
+        mixing[flat] = np.array([[cosine, sine], [-sine, cosine]]) @ mixing[flat]
+    return mixing
+
+
+def describe(found: Sequence[FreeDirection]) -> str:
+    """The names of free directions and which of them the channels constrain; "" if there are none."""
+    if not found:
+        return ""
+    held = [direction for direction in found if direction.held_by_channels]
+    everything = ", ".join(direction.name for direction in found)
+    if not held:
+        verdict = "constrained by channels: none"
+    elif len(held) == len(found):
+        verdict = "constrained by channels: all"
+    else:
+        verdict = "constrained by channels: " + ", ".join(direction.name for direction in held)
+    tied = ", ".join(direction.name for direction in found if direction.held_by_ties)
+    return f"{everything}; {verdict}{'; by tie points or prior: ' if tied else ''}{tied}"

@@ -1,0 +1,125 @@
+"""Registration with tie points and a prior: weights from a first registration, pose update, covariance."""
+
+from __future__ import annotations
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import jaxlie
+from jaxtyping import Array, Float
+
+from mcgicp_jax._pose_solver.covariance import UNKNOWN, Moments, response_and_scatter
+from mcgicp_jax._pose_solver.degeneracy import Directions
+from mcgicp_jax._pose_solver.pose_measurements import Fusion, PoseForm
+from mcgicp_jax._pose_solver.sums import Sums
+from mcgicp_jax._pose_solver.update import Update, adjoint_to_source, twist_form, units, wrench
+
+
+def held_by_pose_form(directions: Directions, information: Float[Array, "6 6"]) -> Directions:
+    """The directions with what tie points and prior tell of those that the matches leave unconstrained.
+
+    Args:
+        directions: as in the loop; those that the matches do not constrain are turned to diagonalise the information.
+        information: of tie points and prior, for twists about the centroid with lengths in units of the radius.
+    """
+    basis, free = jnp.asarray(directions.twists).T, ~jnp.asarray(directions.held_by_matches)
+    known = jnp.where(jnp.outer(free, free), basis.T @ information @ basis, 0)
+    total = jnp.trace(known)
+    scale = jnp.where(total > 0, total, 1)
+    # −1 sorts the other directions first.
+    values, turn = jnp.linalg.eigh(known / scale + jnp.diag(-1.0 * ~free))
+    squares = turn.T**2
+    return Directions(
+        twists=(basis @ turn).T,
+        geometry=squares @ directions.geometry,
+        channels=squares @ directions.channels,
+        ties=jnp.where(values < -0.5, 0, values * scale),
+        center=directions.center,
+        radius=directions.radius,
+    )
+
+
+@jax.jit
+def fuse(
+    pose: jaxlie.SE3, center: Float[Array, "3"], directions: Directions, moments: Moments, form: PoseForm
+) -> Fusion:
+    """The equation of the pose, from the final pose of a registration without tie points and prior.
+
+    Args:
+        center: `Sums.center`, metres.
+        directions: as in the loop; `radius` is `Sums.radius`.
+        moments: of the scores at that pose.
+        form: of tie points and prior, relative to that pose, about the centre.
+    """
+    radius = jnp.asarray(directions.radius)
+    rotation, translation = pose.rotation().as_matrix().astype(radius.dtype), pose.translation()
+    with jax.default_matmul_precision("highest"):
+        nothing, identity = jnp.zeros((6, 6), radius.dtype), jnp.eye(6, dtype=radius.dtype)
+        fusion = Fusion(
+            rotation, translation, center, radius, form, identity, nothing, nothing, directions.held_by_matches
+        )
+        directions = held_by_pose_form(directions, fusion.pull(rotation, translation)[1])
+        basis, by_matches = jnp.asarray(directions.twists).T, jnp.asarray(directions.held_by_matches)
+        both, others = jnp.outer(by_matches, by_matches), jnp.diag(1.0 * ~by_matches)
+        response, scatter = (
+            jnp.where(both, basis.T @ each @ basis, others) for each in response_and_scatter(moments, radius)
+        )
+        # One LAPACK call after the other: two batched ones at once can deadlock.
+        gain = jnp.where(both, response @ jnp.linalg.inv(scatter), 0)
+        information = jnp.where(both, gain @ response, 0)
+        information = 0.5 * (information + information.T)
+    return eqx.tree_at(
+        lambda fusion: (fusion.basis, fusion.gain, fusion.information, fusion.held),
+        fusion,
+        (basis, gain, information, directions.held),
+    )
+
+
+def _from_center(offset: Float[Array, "3"], radius: Float[Array, ""], other: Float[Array, ""]) -> Float[Array, "6 6"]:
+    """Twists about a point at `offset` from the centre, lengths in units of `other`, from those about the centre."""
+    cross = jnp.cross(jnp.eye(3, dtype=offset.dtype), offset[None], axis=1).T
+    top = jnp.concatenate([jnp.eye(3, dtype=offset.dtype) * radius, cross], axis=1) / other
+    return jnp.concatenate([top, jnp.eye(6, dtype=offset.dtype)[3:]])
+
+
+def fused_update(pose: jaxlie.SE3, sums: Sums, directions: Directions, fusion: Fusion) -> tuple[Directions, Update]:
+    """One step of Newton's method on P s + γ = 0, with the matches and M fixed; and what constrains the directions."""
+    radius, dtype = fusion.radius, sums.totals.dtype
+    pull, known = fusion.pull(pose.rotation().as_matrix().astype(dtype), pose.translation())
+    outwards = _from_center(sums.center - fusion.center, radius, sums.radius)
+    back = _from_center(fusion.center - sums.center, sums.radius, radius)
+    known_here = back.T @ known @ back
+    directions = held_by_pose_form(directions, known_here)
+    unit_information = twist_form(sums.stiffness, sums.radius)
+    # Force and energy of twists in units of the radius: of `fusion` on the left, of the sums on the right.
+    ratio = sums.radius / radius
+    score = outwards.T @ wrench(sums.first, sums.radius) * ratio
+    stiffness = outwards.T @ (unit_information * sums.radius**2) @ outwards / radius
+    # The solution waits for the eigenvectors of the directions: two batched LAPACK calls at once can deadlock.
+    basis, _ = jax.lax.optimization_barrier((fusion.basis, directions.twists))
+    slope = fusion.gain @ basis.T @ stiffness @ basis + basis.T @ known @ basis
+    force = fusion.gain @ (basis.T @ score) + basis.T @ pull
+    slope = jnp.where(jnp.outer(fusion.held, fusion.held), slope, jnp.diag(1.0 * ~fusion.held))
+    twist = outwards @ (basis @ jnp.linalg.solve(slope, jnp.where(fusion.held, force, 0)))
+    # The information of tie points and prior in the unit of the matches: divided by the mean of P.
+    count = jnp.sum(fusion.information.diagonal() > 0)
+    mean = jnp.trace(fusion.gain) / jnp.maximum(count, 1)
+    unit = radius / jnp.where(mean > 0, mean, 1) / sums.radius**2
+    return directions, Update(
+        twist=twist * units(sums.radius),
+        information=unit_information + unit * known_here,
+        degenerate=~jnp.all(fusion.held),
+    )
+
+
+@jax.jit
+def fused_covariance(pose: jaxlie.SE3, fusion: Fusion) -> Float[Array, "6 6"]:
+    """Covariance of the pose, for ξ in T exp(ξ), metres and radians."""
+    dtype = fusion.basis.dtype
+    with jax.default_matmul_precision("highest"):
+        _, known = fusion.pull(pose.rotation().as_matrix().astype(dtype), pose.translation())
+        basis = fusion.basis
+        total = fusion.information + basis.T @ known @ basis + jnp.diag(~fusion.held / UNKNOWN**2)
+        change = adjoint_to_source(pose, fusion.center) * units(fusion.radius) @ basis
+        covariance = change @ jnp.linalg.inv(total) @ change.T
+    return 0.5 * (covariance + covariance.T)

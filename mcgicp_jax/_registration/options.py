@@ -1,0 +1,97 @@
+"""The options of a registration, declared and checked in one place for all functions that take them."""
+
+from __future__ import annotations
+
+import difflib
+import inspect
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, fields
+from typing import Any, TypeAlias
+
+import numpy as np
+from jax.typing import ArrayLike
+
+from mcgicp_jax._compute.argument_checks import check_integer, check_positive, is_number
+from mcgicp_jax._compute.concrete import is_concrete
+from mcgicp_jax._math.robust_kernels import AbstractKernel
+from mcgicp_jax._methods.base import AbstractMethod
+from mcgicp_jax._search.base import AbstractSearch
+
+# Maximum correspondence distance in metres, or two: of the coarse and of the fine phase.
+Distance: TypeAlias = ArrayLike | tuple[ArrayLike, ArrayLike]
+# Radians. Above the small cycles in which nearest-neighbour matching often ends: with real scans of 0.1 m spacing,
+# these were seen to stay within 0.2 mm and 0.4 mrad. The default translation tolerance is chosen likewise.
+ROTATION_TOLERANCE = 5e-4
+
+
+@dataclass(frozen=True)
+class Options:
+    """Options of `register`, documented there; batches, odometry and the command line take the same ones."""
+
+    max_distance: Distance | None = None
+    max_iterations: int = 64
+    translation_tolerance: ArrayLike | None = None
+    rotation_tolerance: ArrayLike = ROTATION_TOLERANCE
+    robust: AbstractKernel | None = None
+    search: AbstractSearch | None = None
+    hold_free_directions: bool = True
+    match_channels: bool = False
+    scales: Sequence[float] = ()
+
+    def __post_init__(self) -> None:
+        if self.max_distance is not None:
+            _check_distances(self.max_distance)
+        check_integer("max_iterations", self.max_iterations, 1)
+        if self.translation_tolerance is not None:
+            _check_tolerance("translation_tolerance", self.translation_tolerance)
+        _check_tolerance("rotation_tolerance", self.rotation_tolerance)
+        for name, kind, example in (
+            ("robust", AbstractKernel, "Huber(1.0)"),
+            ("search", AbstractSearch, "KDTreeSearch()"),
+        ):
+            value = getattr(self, name)
+            if value is not None and not isinstance(value, kind):
+                raise ValueError(f"{name}: expected an object such as {example}, or None, got {value!r}")
+        for name in ("hold_free_directions", "match_channels"):
+            value = getattr(self, name)
+            if is_concrete(value) and np.asarray(value).dtype != bool:
+                raise ValueError(f"{name}: expected True or False, got {value!r}")
+        if isinstance(self.scales, str) or np.ndim(self.scales) != 1:
+            raise ValueError(f"scales: expected a sequence of voxel sizes in metres, got {self.scales!r}")
+        for size in self.scales:
+            check_positive("scales", size)
+
+    def takes_raw(self, method: AbstractMethod, name: str) -> bool:
+        """Whether the method makes its cells of the cloud "source" or "target" itself, of all points."""
+        return len(self.scales) > 0 and name in method.needs_covariances
+
+
+def options_of(function: Callable[..., Any], given: dict[str, Any]) -> Options:
+    """The options of `register` that another function was given; raises `TypeError` for a name that neither has."""
+    parameters = inspect.signature(function).parameters.values()
+    named = [each.name for each in parameters if each.kind is not inspect.Parameter.VAR_KEYWORD]
+    names = [*(field.name for field in fields(Options)), *named]
+    for name in given.keys() - names:
+        close = difflib.get_close_matches(name, names)
+        known = f"did you mean {' or '.join(close)}?" if close else f"expected one of {', '.join(sorted(names))}"
+        raise TypeError(f"{function.__name__}: got an unexpected argument {name!r}; {known}")
+    return Options(**given)
+
+
+def check_method(method: AbstractMethod) -> None:
+    if not isinstance(method, AbstractMethod):
+        raise ValueError(f"method: expected a method such as MultiChannelGICP(), got {method!r}")
+
+
+def _check_tolerance(name: str, value: Any) -> None:
+    if is_concrete(value) and not (is_number(value) and np.asarray(value) >= 0):
+        raise ValueError(f"{name}: expected a number of at least 0, got {value!r}")
+
+
+def _check_distances(distances: Any) -> None:
+    if np.shape(distances) != (2,):
+        check_positive("max_distance", distances, "one or two positive numbers")
+    elif is_concrete(distances):
+        coarse, fine = distances
+        if not (is_number(coarse) and is_number(fine) and coarse >= fine > 0):
+            raise ValueError(f"max_distance: expected two positive numbers, the larger one first, got {distances!r}")

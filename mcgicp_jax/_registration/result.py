@@ -1,0 +1,244 @@
+"""The result of a registration: pose, status, quality of the fit and uncertainty."""
+
+from __future__ import annotations
+
+import enum
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import jaxlie
+import numpy as np
+from jax.typing import ArrayLike
+from jaxtyping import Array, Float, Int
+
+from mcgicp_jax._compute.concrete import AnyArray, canonical_float, is_concrete
+from mcgicp_jax._compute.lazy import Deferred
+from mcgicp_jax._math.poses import matrices_of, rotation_from_quaternion, se3
+from mcgicp_jax._pose_solver.degeneracy import Directions, FreeDirection, describe, free_directions
+
+
+class Status(enum.IntEnum):
+    """Outcome of a registration. Only CONVERGED is success.
+
+    Attributes:
+        CONVERGED: the last update was below both tolerances, and every direction of motion is constrained.
+        MAX_ITERATIONS: the updates were still above the tolerances after `max_iterations` updates.
+        TOO_FEW_CORRESPONDENCES: fewer than four source points (in the coarse phase: of the subset) have a match within
+            `max_distance`: the clouds do not overlap, or the start is too far off.
+        DEGENERATE: the last update was below both tolerances, but at least one direction of motion is unconstrained
+            (see `Registration.free_directions`). Along it `register` keeps the start, if `hold_free_directions`. Tie
+            points or a prior constrain a direction if its standard deviation is then below the radius of the clouds.
+        NON_FINITE: the pose or the sums overflowed or became NaN.
+        INVALID_INPUT: `register` would raise a `ValueError` for this pair. Only in batches; the pose is NaN.
+        LOST: the worker of this pair failed, and so did a second attempt. Only in batches; the pose is NaN.
+    """
+
+    CONVERGED = 0
+    MAX_ITERATIONS = 1
+    TOO_FEW_CORRESPONDENCES = 2
+    DEGENERATE = 3
+    NON_FINITE = 4
+    INVALID_INPUT = 5
+    LOST = 6
+
+    # Print the name: an IntEnum prints its number.
+    __str__ = enum.Enum.__str__
+    __format__ = enum.Enum.__format__
+
+
+class Registration(eqx.Module):
+    """Result of `register` or `align`; a pytree. All fields are evaluated at the returned pose.
+
+    Fields are NumPy scalars and arrays; inside `jit`, `vmap` or `grad`, and when returned by these, JAX arrays.
+    Only the pose carries a gradient; for that of a cost, call `mahalanobis_cost` at the pose.
+
+    Attributes:
+        T_target_source: maps source coordinates into the target's frame, b ≈ T a; in the precision of the clouds. At
+            large (UTM) coordinates use `matrix`, or in float32 under `jit`, `centred`.
+        status_code: value of the `Status`.
+        num_iterations: number of pose updates.
+        num_inliers: number of source points used in the last phase with a match within its `max_distance`.
+        cost: Σ ρ(dᵀ M d) over the matches.
+        rmse: root mean square correspondence distance, metres. Usually of the order of the point spacing, as no target
+            point lies just where a source point does. NaN without matches.
+        overlap: fraction of the source points that have a match within the fine `max_distance`, 0 to 1. Where this
+            distance spans the gaps between the points, as in voxels of one size, a value below the known overlap of
+            the scans is a sign of a wrong local minimum. In raw LiDAR scans many points have no match.
+        history: arrays with one entry before each update and one at the returned pose: "cost", "rmse", "num_inliers",
+            and the size of the update computed there: "translation_step" (metres, at the centroid of the matches) and
+            "rotation_step" (radians). In the coarse phase (see `register`) they cover the subsampled source. Inside a
+            transformation the length is `max_iterations` + 1, and unused entries are NaN.
+        source_origin, target_origin: (3,) `PointCloud.origin` of both clouds, metres.
+        centred: the pose between coordinates relative to these origins.
+        constraints, uncertainty: deferred values of `information` and `directions`, and of `covariance` and
+            `deviations`, computed on first access.
+    """
+
+    T_target_source: jaxlie.SE3
+    status_code: Int[ArrayLike, "*batch"]
+    num_iterations: Int[ArrayLike, "*batch"]
+    num_inliers: Int[ArrayLike, "*batch"]
+    cost: Float[ArrayLike, "*batch"]
+    rmse: Float[ArrayLike, "*batch"]
+    overlap: Float[ArrayLike, "*batch"]
+    history: dict[str, Any]
+    source_origin: Float[Array, "*batch 3"] | Float[np.ndarray, "*batch 3"]
+    target_origin: Float[Array, "*batch 3"] | Float[np.ndarray, "*batch 3"]
+    centred: jaxlie.SE3
+    constraints: Deferred[tuple[Any, Directions | None]]
+    uncertainty: Deferred[tuple[Any, Any]]
+
+    @classmethod
+    def build(cls, **fields: Any) -> Registration:
+        """Construct from fields without equinox's constructor, which would compute the deferred ones."""
+        result = object.__new__(cls)
+        for name, value in fields.items():
+            object.__setattr__(result, name, value)
+        return result
+
+    @classmethod
+    def without_pose(cls, status: Status) -> Registration:
+        """The result of a pair that could not be registered: pose, cost, rmse and covariance are NaN."""
+        nowhere = se3(np.full(7, np.nan, canonical_float()))
+        nan = np.full((), np.nan)[()]
+        return cls.build(
+            T_target_source=nowhere,
+            status_code=np.int32(status),
+            num_iterations=np.int32(0),
+            num_inliers=np.int32(0),
+            cost=nan,
+            rmse=nan,
+            overlap=np.float64(0),
+            history={},
+            source_origin=np.zeros(3),
+            target_origin=np.zeros(3),
+            centred=nowhere,
+            constraints=Deferred.of((np.zeros((6, 6)), None)),
+            uncertainty=Deferred.of((np.full((6, 6), np.nan), np.full(6, np.nan))),
+        )
+
+    @property
+    def information(self) -> Float[AnyArray, "*batch 6 6"]:
+        """(6, 6) Σ w Jᵀ M J, the Gauss-Newton Hessian of half the cost in ξ.
+
+        ξ = (v, ω) is the twist of T exp(ξ), in the source's frame, metres and radians. The scale of the matrix is that
+        of GICP's relative covariances: it compares directions with each other, but its inverse is *not* a covariance of
+        the pose. The information of tie points and a prior is converted to this scale and added.
+        """
+        return self.constraints.value[0]
+
+    @property
+    def directions(self) -> Directions | None:
+        """Six directions of motion and what constrains each, see `free_directions`; None from `align`."""
+        return self.constraints.value[1]
+
+    @property
+    def covariance(self) -> Float[AnyArray, "*batch 6 6"]:
+        """(6, 6) covariance of ξ, in the order and frame of `information`: a sandwich estimate from the scatter of the
+        matches (Huber 1967; see `_uncertainty`).
+
+        ξ rotates about the origin of the source's coordinates. If that is far from the points, as in UTM coordinates, a
+        small rotation moves the points far and the first three variances are large: use `deviations` there.
+
+        The estimate covers the noise and the sampling of the points. It does not cover a wrong local minimum, errors
+        common to all points (calibration, motion during a scan), or moving objects. An unconstrained direction gets a
+        standard deviation of 10 times the radius of the matched points; in float32, rounding then falsifies the other
+        variances. The matrix is therefore float64, except inside transformations and from `DenseSearch` in batches. NaN
+        if the status is TOO_FEW_CORRESPONDENCES or NON_FINITE, if an alignment is degenerate, or if the matches are too
+        few for an estimate.
+        """
+        return self.uncertainty.value[0]
+
+    @property
+    def deviations(self) -> Float[AnyArray, "*batch 6"]:
+        """(6,) standard deviations in the target's axes: of the position of the matched points' centroid, metres, then
+        of the rotation, radians.
+
+        Derived from `covariance`, with the same limitations.
+        """
+        return self.uncertainty.value[1]
+
+    @property
+    def status(self) -> Any:
+        """The `Status`; inside a transformation or for a batch, the array `status_code`."""
+        if is_concrete(self.status_code) and np.ndim(self.status_code) == 0:
+            return Status(int(np.asarray(self.status_code)))
+        return self.status_code
+
+    @property
+    def converged(self) -> Any:
+        """Whether the status is CONVERGED."""
+        return self.status == Status.CONVERGED
+
+    @property
+    def matrix(self) -> Float[np.ndarray, "*batch 4 4"] | Float[Array, "*batch 4 4"]:
+        """T_target_source as (4, 4); outside of transformations float64 NumPy, exact also at large coordinates."""
+        return pose_in_user_frame(self.centred, self.source_origin, self.target_origin)
+
+    @property
+    def free_directions(self) -> tuple[FreeDirection, ...]:
+        """Directions of motion that the shape of the clouds does not constrain, and whether channels or tie points do.
+
+        Empty if geometry constrains all six directions, and for `align`.
+
+        Raises:
+            ValueError: inside a transformation or for a batch; use `directions` there.
+        """
+        if not is_concrete(self.directions) or np.ndim(self.status_code):
+            raise ValueError("free_directions: expected a single registration outside of jit; use directions")
+        if self.directions is None or self.status in (Status.TOO_FEW_CORRESPONDENCES, Status.NON_FINITE):
+            return ()
+        return free_directions(self.directions)
+
+    def __repr__(self) -> str:
+        if not is_concrete(self.centred, self.history) or np.ndim(self.status_code):
+            return f"Registration(batch of shape {np.shape(self.status_code)})"
+        if np.any(self.source_origin):
+            # Far from zero the translation column is the motion of a far point: print that of the source's origin.
+            origin = np.append(self.source_origin, 1)
+            moved, where = (np.asarray(self.matrix) @ origin - origin)[:3], "of the source's origin "
+        else:
+            moved, where = np.asarray(self.matrix)[:3, 3], ""
+        translation = np.array2string(moved, precision=4, suppress_small=True)
+        cosine = (np.trace(np.asarray(self.matrix)[:3, :3]) - 1) / 2
+        angle = np.degrees(np.arccos(np.clip(cosine, -1, 1)))
+        free = describe(self.free_directions)
+        return (
+            f"Registration({self.status.name}: translation {where}{translation} m, rotation {angle:.3f}°, "
+            f"{self.num_iterations} iterations, {self.num_inliers} inliers ({self.overlap:.0%}), "
+            f"rmse {np.asarray(self.rmse):.4g} m{'; free by geometry: ' if free else ''}{free})"
+        )
+
+
+def is_usable(result: Registration) -> bool:
+    """Whether the pose may start another registration: it is finite and based on enough matches.
+
+    This includes MAX_ITERATIONS, and DEGENERATE, where unconstrained directions are as they were at the start.
+    """
+    return result.status in (Status.CONVERGED, Status.DEGENERATE, Status.MAX_ITERATIONS)
+
+
+def computed(result: Registration) -> Registration:
+    """The result with its deferred fields computed, so that it no longer references the clouds."""
+    return jax.tree.map(lambda leaf: leaf, result)
+
+
+def pose_in_user_frame(
+    centred: jaxlie.SE3, source_origin: Array | np.ndarray, target_origin: Array | np.ndarray
+) -> Array | np.ndarray:
+    """T(o_t) · T · T(−o_s) as (4, 4), with translations T(o) by the origins; float64 NumPy for concrete arrays."""
+    if is_concrete(centred, source_origin, target_origin):
+        parameters = np.asarray(centred.wxyz_xyz, np.float64)
+        rotation = rotation_from_quaternion(parameters[..., :4])
+        # Origins returned by `jit` are float32 (exactly so); the arithmetic with them must be float64.
+        start, end = np.asarray(source_origin, np.float64), np.asarray(target_origin, np.float64)
+        offset = end - start - np.einsum("...ij,...j->...i", rotation - np.eye(3), start)
+        matrix = matrices_of(parameters)
+        matrix[..., :3, 3] += offset
+        return matrix
+    traced = centred.as_matrix().astype(centred.wxyz_xyz.dtype)
+    turned = jnp.einsum("...ij,...j->...i", traced[..., :3, :3] - jnp.eye(3), source_origin, precision="highest")
+    shift = target_origin - source_origin - turned
+    return traced.at[..., :3, 3].add(shift.astype(traced.dtype))

@@ -1,0 +1,212 @@
+"""One step of the registration loop: from the sums at a pose to the next pose, or to a final status."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import jaxlie
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
+
+from mcgicp_jax._compute.concrete import AnyArray, AnyScalar
+from mcgicp_jax._compute.lazy import Deferred
+from mcgicp_jax._local_geometry.records import Surface
+from mcgicp_jax._math.robust_kernels import AbstractKernel
+from mcgicp_jax._methods.base import AbstractMethod
+from mcgicp_jax._pose_solver.covariance import Moments, sandwich
+from mcgicp_jax._pose_solver.degeneracy import Directions, directions_at_source, find_directions
+from mcgicp_jax._pose_solver.fusion import fused_covariance, fused_update
+from mcgicp_jax._pose_solver.pose_measurements import Fusion
+from mcgicp_jax._pose_solver.sums import Sums
+from mcgicp_jax._pose_solver.update import adjoint_to_center, move_pose, solve_update, units
+from mcgicp_jax._registration.result import Status
+
+# Statuses while the loop runs. COARSE: the coarse phase, with every `coarse_stride`-th source point and the larger
+# maximum correspondence distance. RUNNING: the fine phase, with all points and the smaller distance. SETTLED: the last
+# update was below the tolerances; the sums at its pose are still to be measured.
+COARSE, RUNNING, SETTLED = -3, -1, -2
+# The coarse phase ends with an update below its tolerances that moves the points by at most this fraction of the fine
+# maximum correspondence distance. It need not converge further: the fine phase starts from its pose.
+_FRACTION_OF_GATE = 0.25
+# Three points determine a pose; a fourth makes residuals possible.
+_MIN_CORRESPONDENCES = 4
+# Entries of `Registration.history`.
+RECORDED = ("cost", "rmse", "num_inliers", "translation_step", "rotation_step")
+
+
+class Settings(eqx.Module):
+    """Numerical settings of the loop, as arrays, so that changing one does not recompile.
+
+    Attributes:
+        max_distance: maximum correspondence distance in the coarse phase, metres.
+        fine_distance: the same in the fine phase, metres; at most `max_distance`.
+        coarse_stride: the coarse phase uses every `coarse_stride`-th source point.
+        translation_tolerance, rotation_tolerance: an update below both is the last; metres and radians.
+        coarse_translation_tolerance, coarse_rotation_tolerance: an update below both ends the coarse phase.
+        max_iterations: maximum number of updates, both phases together.
+        hold_free_directions: whether the pose is kept fixed along unconstrained directions.
+    """
+
+    max_distance: Float[AnyArray, "*batch"]
+    fine_distance: Float[AnyArray, "*batch"]
+    coarse_stride: Int[AnyArray, "*batch"]
+    translation_tolerance: Float[AnyArray, "*batch"]
+    rotation_tolerance: Float[AnyArray, "*batch"]
+    coarse_translation_tolerance: Float[AnyArray, "*batch"]
+    coarse_rotation_tolerance: Float[AnyArray, "*batch"]
+    max_iterations: Int[AnyArray, "*batch"]
+    hold_free_directions: Bool[AnyArray, "*batch"]
+
+    def gate(self, status: Int[AnyScalar, ""]) -> Float[AnyScalar, ""]:
+        """Maximum correspondence distance at this status, metres."""
+        return jnp.where(status == COARSE, self.max_distance, self.fine_distance)
+
+    def stride(self, status: Int[AnyScalar, ""], num_iterations: Int[AnyScalar, ""]) -> Int[AnyScalar, ""]:
+        """Stride of the source points at this status. Once `max_iterations` are done, all points are measured."""
+        return jnp.where((status == COARSE) & (num_iterations < self.max_iterations), self.coarse_stride, 1)
+
+    def first_status(self) -> Int[AnyScalar, ""]:
+        coarse = (self.fine_distance < self.max_distance) | (self.coarse_stride > 1)
+        return jnp.where(coarse, np.int32(COARSE), np.int32(RUNNING))
+
+
+class Problem(eqx.Module):
+    """Inputs of the registration loop; `fusion` with tie points or a prior, after a registration without them."""
+
+    start: jaxlie.SE3
+    source: Surface
+    target: Surface
+    method: AbstractMethod
+    robust: AbstractKernel | None
+    settings: Settings
+    fusion: Fusion | None = None
+
+
+class State(eqx.Module):
+    """State of the loop after one step.
+
+    Attributes:
+        pose: the updated pose; once the loop has ended, the pose at which `sums` were measured.
+        status: `COARSE`, `RUNNING` or `SETTLED` (negative) while the loop runs, then the value of a `Status`.
+        num_iterations: number of updates so far.
+        sums: at the pose before the update.
+        information: (6, 6) at the pose before the update, about the centroid, lengths in units of the radius.
+        directions: at the pose before the update, about the centroid; None for `align`.
+        record: one number for each history entry in `RECORDED`.
+    """
+
+    pose: jaxlie.SE3
+    status: Int[AnyArray, "*batch"]
+    num_iterations: Int[AnyArray, "*batch"]
+    sums: Sums
+    information: Float[AnyArray, "*batch 6 6"]
+    directions: Directions | None
+    record: Float[AnyArray, "*batch 5"]
+
+
+class Assessment(NamedTuple):
+    """Deferred results at the final pose: information matrix and directions, and covariance."""
+
+    constraints: Deferred[tuple[Float[AnyArray, "6 6"], Directions | None]]
+    covariance: Deferred[Float[AnyArray, "6 6"]]
+
+
+@jax.jit
+def update(
+    pose: jaxlie.SE3,
+    status: Int[Array, ""],
+    num_iterations: Int[Array, ""],
+    sums: Sums,
+    settings: Settings,
+    fusion: Fusion | None = None,
+) -> State:
+    """Update the pose, or end the loop with a status. Its program does not depend on the size of the clouds."""
+    directions, basis = None, jnp.eye(6, dtype=sums.totals.dtype)
+    degenerate: AnyScalar = np.bool_(False)
+    with jax.default_matmul_precision("highest"):
+        if sums.observability:
+            directions = find_directions(sums)
+            degenerate = ~jnp.all(directions.held)
+            # Along unconstrained directions an update would only follow arbitrary nearest-neighbour matches.
+            basis = jnp.asarray(directions.twists).T * (directions.held | ~settings.hold_free_directions)
+        if fusion is None or directions is None:
+            change = solve_update(sums, basis)
+        else:
+            directions, change = fused_update(pose, sums, directions, fusion)
+            degenerate = ~jnp.all(directions.held)
+    moved = move_pose(pose, change.twist, sums.center)
+    coarse, settled = status == COARSE, status == SETTLED
+    translation_step = jnp.linalg.norm(change.twist[:3])
+    rotation_step = jnp.linalg.norm(change.twist[3:])
+
+    def below(translation: Float[AnyScalar, ""], rotation: Float[AnyScalar, ""]) -> Bool[Array, ""]:
+        return (translation_step <= translation) & (rotation_step <= rotation)
+
+    motion = translation_step + sums.radius * rotation_step
+    nearly = below(settings.coarse_translation_tolerance, settings.coarse_rotation_tolerance)
+    nearly = nearly & (motion <= _FRACTION_OF_GATE * settings.fine_distance)
+    converged = below(settings.translation_tolerance, settings.rotation_tolerance) | (coarse & nearly)
+    finite = jnp.isfinite(sums.constant) & jnp.all(jnp.isfinite(moved.wxyz_xyz))
+    outcomes: tuple[tuple[Array, int], ...] = (
+        (sums.num_inliers < _MIN_CORRESPONDENCES, Status.TOO_FEW_CORRESPONDENCES),
+        (~finite, Status.NON_FINITE),
+        (settled & (change.degenerate | degenerate), Status.DEGENERATE),
+        (settled, Status.CONVERGED),
+        (num_iterations >= settings.max_iterations, Status.MAX_ITERATIONS),
+        (coarse & ~converged, COARSE),
+        (converged & ~coarse, SETTLED),
+    )
+    conditions, codes = zip(*outcomes, strict=True)
+    status = jnp.select(list(conditions), [np.int32(code) for code in codes], np.int32(RUNNING))
+    record = (sums.cost, sums.rmse, sums.num_inliers, translation_step, rotation_step)
+    return State(
+        # The loop returns the pose at which sums, information and directions were measured.
+        pose=jaxlie.SE3(jnp.where(status < 0, moved.wxyz_xyz, pose.wxyz_xyz)),
+        status=status,
+        num_iterations=num_iterations + (status < 0),
+        sums=sums,
+        information=change.information,
+        directions=directions,
+        record=jnp.stack([number.astype(sums.totals.dtype) for number in record]),
+    )
+
+
+@jax.jit
+def constraints_of(state: State) -> tuple[Float[Array, "6 6"], Directions | None]:
+    """Information matrix and directions at the final pose, for ξ in T exp(ξ), metres and radians."""
+    sums, directions = state.sums, state.directions
+    with jax.default_matmul_precision("highest"):
+        adjoint = adjoint_to_center(state.pose, sums.center) / units(sums.radius)[:, None]
+        information = adjoint.T @ (state.information * sums.radius**2) @ adjoint
+        return information, None if directions is None else directions_at_source(directions, state.pose)
+
+
+@jax.jit
+def covariance_of_pose(state: State, known: Moments | Fusion) -> Float[Array, "6 6"]:
+    """Covariance of the final pose, for ξ in T exp(ξ), metres and radians; NaN if the status allows none.
+
+    Args:
+        known: sums over the scores; with tie points or a prior, those of the registration before, in `Fusion`.
+    """
+    found = (state.status != Status.TOO_FEW_CORRESPONDENCES) & (state.status != Status.NON_FINITE)
+    if state.directions is None:
+        found = found & (state.status != Status.DEGENERATE)
+    center, radius = state.sums.center, state.sums.radius
+    with jax.default_matmul_precision("highest"):
+        if isinstance(known, Fusion):
+            covariance = fused_covariance(state.pose, known)
+        else:
+            covariance = sandwich(state.pose, center, radius, known, state.directions)
+    return jnp.where(found, covariance, jnp.nan)
+
+
+def history_of(records: Float[AnyArray, "*batch T 5"]) -> dict[str, Any]:
+    """The columns of the records by name, for `Registration.history`."""
+    return {name: records[..., i] for i, name in enumerate(RECORDED)}
+
+
+def rotation_and_translation(pose: jaxlie.SE3, dtype: Any) -> tuple[Float[Array, "3 3"], Float[Array, "3"]]:
+    return pose.rotation().as_matrix().astype(dtype), pose.translation().astype(dtype)

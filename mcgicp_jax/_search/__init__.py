@@ -1,0 +1,1 @@
+"""Nearest-neighbour search: the interface, and trees and brute force behind it."""

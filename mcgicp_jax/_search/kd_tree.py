@@ -1,0 +1,202 @@
+"""Nearest neighbours by trees on the host: the interface for kinds of trees, and k-d trees.
+
+`AbstractTreeSearch` handles what is common to all trees: ties, padding, missing channels, threads, reuse of matches
+from pose to pose, and the callback with its cache inside transformations. A subclass implements `build` and `query`;
+`KDTreeSearch` uses SciPy's tree or, where it is installed and faster, pykdtree's. Callbacks run NumPy code only.
+"""
+
+from __future__ import annotations
+
+import abc
+import collections
+import hashlib
+import threading
+from functools import partial
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import scipy.spatial
+from jaxtyping import Array, Bool, Float, Int
+
+from mcgicp_jax._search.base import AbstractSearch, Rows, on_host
+from mcgicp_jax._search.nearest_with_ties import Tree
+from mcgicp_jax._search.pykdtree import MOST_DIMENSIONS, PyKDTree, has_pykdtree
+from mcgicp_jax._search.tree_index import LARGEST_UNORDERED, TreeIndex
+
+# Bytes. JAX (jaxlib 0.10.2) copies smaller arrays for a callback in the calling thread, up to 100 KiB; see `_pieces`.
+_LARGEST_PIECE = 64 * 1024
+# Total number of rows of the trees cached for callbacks: hundreds of scans, some hundred megabytes.
+_CACHED_ROWS = 2_000_000
+
+
+class AbstractTreeSearch(AbstractSearch):
+    """Exact search with a tree on the host. Ties are broken by row, so that results are reproducible.
+
+    Attributes:
+        workers: largest number of threads per registration; −1 uses all cores.
+    """
+
+    workers: int = eqx.field(static=True, default=-1)
+
+    @abc.abstractmethod
+    def build(self, points: Float[np.ndarray, "M D"]) -> Any:
+        """A tree of (M, D) finite points, metres; M is at least 1, D at least 3."""
+
+    @abc.abstractmethod
+    def query(
+        self, tree: Any, queries: Float[np.ndarray, "N D"], k: int, bound: float
+    ) -> tuple[Float[np.ndarray, "N k"], Int[np.ndarray, "N k"]]:
+        """The k nearest points of each query. Several threads may call this function at once.
+
+        Args:
+            tree: from `build`, of M points.
+            queries: (N, D) finite points, metres.
+            k: number of neighbours, at most M.
+            bound: metres in all D dimensions; only neighbours nearer than this are reported.
+
+        Returns:
+            (N, k) distances in metres and rows, nearest first, ties in any order. Where fewer than k points lie within
+            the bound, the distance is infinite and the row is M.
+        """
+
+    def leaf_order(self, tree: Any, num_points: int) -> Int[np.ndarray, "M"]:
+        """An order of the tree's points in which neighbouring points follow each other, for faster queries."""
+        return np.arange(num_points)
+
+    @property
+    def num_threads(self) -> int | None:
+        return None if self.workers == -1 else self.workers
+
+    def index(self, target: Rows) -> TreeIndex:
+        return TreeIndex(self, on_host(target))
+
+    def nearest_traced(
+        self,
+        pose: Float[Array, "7"],
+        source: Rows,
+        target: Rows,
+        max_distance: Float[Array, ""],
+        running: Bool[Array, ""],
+        num_candidates: int = 1,
+    ) -> Int[Array, "m N"]:
+        arguments = jax.tree.map(_pieces, (pose, source, target, max_distance, running))
+        return jax.pure_callback(
+            partial(_nearest_callback, self, num_candidates),
+            jax.ShapeDtypeStruct((num_candidates, source.valid.shape[0]), jnp.int32),
+            *arguments,
+            # One lane at a time: a batch of small pieces would again be a large array, see `_pieces`.
+            vmap_method="sequential",
+        )
+
+    def neighbors(self, points: Float[np.ndarray, "N 3"], num_neighbors: int) -> Int[np.ndarray, "N k"]:
+        tree = Tree(self, points)
+        # In the order of the leaves, each query finds the nodes it needs in the processor's caches.
+        order = tree.leaf_order()
+        found, _ = tree.nearest(points[order], num_neighbors)
+        neighbors = np.full((len(points), num_neighbors), -1, np.int32)
+        neighbors[order, : found.shape[1]] = found
+        return neighbors
+
+
+class KDTreeSearch(AbstractTreeSearch):
+    """Exact search with a k-d tree on the host. Ties are broken by row, so that results are reproducible.
+
+    Attributes:
+        workers: largest number of threads per registration; −1 uses all cores.
+        backend: "scipy", or "pykdtree" (the extra `fast`), which is quicker and finds the same; by default pykdtree if
+            it is installed.
+
+    Raises:
+        ValueError: if `backend` is none of these, or pykdtree is not installed.
+    """
+
+    backend: str | None = eqx.field(static=True, default=None)
+
+    def __check_init__(self) -> None:
+        if self.backend not in ("scipy", "pykdtree", None):
+            raise ValueError(f'backend: expected "scipy", "pykdtree" or None, got {self.backend!r}')
+        if self.backend == "pykdtree" and not has_pykdtree():
+            raise ValueError("backend: pykdtree is not installed; run: pip install 'mcgicp_jax[fast]'")
+
+    def build(self, points: Float[np.ndarray, "M D"]) -> scipy.spatial.cKDTree | PyKDTree:
+        if self.backend != "scipy" and has_pykdtree() and points.shape[1] <= MOST_DIMENSIONS:
+            return PyKDTree(points)
+        return _scipy_tree(points)
+
+    def query(
+        self, tree: scipy.spatial.cKDTree | PyKDTree, queries: Float[np.ndarray, "N D"], k: int, bound: float
+    ) -> tuple[Float[np.ndarray, "N k"], Int[np.ndarray, "N k"]]:
+        if isinstance(tree, PyKDTree):
+            return tree.query(queries, k, bound)
+        return tree.query(queries, k=np.arange(1, k + 1), distance_upper_bound=bound)
+
+    def leaf_order(self, tree: scipy.spatial.cKDTree | PyKDTree, num_points: int) -> Int[np.ndarray, "M"]:
+        if isinstance(tree, PyKDTree):
+            # pykdtree does not give its order; SciPy's tree takes a tenth of the time that its order saves.
+            return _scipy_tree(tree.points).indices if num_points > LARGEST_UNORDERED else np.arange(num_points)
+        return np.asarray(tree.indices)
+
+
+def _scipy_tree(points: Float[np.ndarray, "M D"]) -> scipy.spatial.cKDTree:
+    # Unbalanced trees are built faster and searched as fast. Compact nodes pay off for 20 neighbours, and for one
+    # neighbour from the second query on. Leaves of 32 points are a few percent faster than SciPy's default of 16.
+    return scipy.spatial.cKDTree(points, leafsize=32, balanced_tree=False, compact_nodes=True)
+
+
+class _IndexCache:
+    """Least-recently-used cache of trees by content: a pure callback keeps no state, yet builds each tree only once."""
+
+    def __init__(self, rows: int):
+        self._rows = rows
+        self._lock = threading.Lock()
+        self._indices: collections.OrderedDict[bytes, TreeIndex] = collections.OrderedDict()
+
+    def get(self, search: AbstractTreeSearch, target: Rows) -> TreeIndex:
+        arrays = jax.tree.leaves(target)
+        digest = hashlib.blake2b(repr([search, *((array.shape, array.dtype) for array in arrays)]).encode())
+        for array in arrays:
+            digest.update(np.ascontiguousarray(array).data)
+        key = digest.digest()
+        with self._lock:
+            if key in self._indices:
+                self._indices.move_to_end(key)
+                return self._indices[key]
+        index = TreeIndex(search, target)
+        with self._lock:
+            self._indices[key] = index
+            while len(self._indices) > 1 and sum(kept.num_rows for kept in self._indices.values()) > self._rows:
+                self._indices.popitem(last=False)
+        return index
+
+
+_index_cache = _IndexCache(_CACHED_ROWS)
+
+
+def _pieces(array: Any) -> list[Any]:
+    """An array split along its rows into pieces that are small enough to be passed to a callback without a deadlock.
+
+    JAX copies the arguments of a callback, large arrays in a thread of the pool that also runs programs. If callbacks
+    of as many programs as there are threads wait for such copies, they deadlock (seen with two programs on two cores).
+    """
+    array = jnp.asarray(array)
+    count = -(-array.nbytes // _LARGEST_PIECE)
+    return [array] if count <= 1 else jnp.array_split(array, count)
+
+
+def _nearest_callback(search: AbstractTreeSearch, num_candidates: int, *arguments: Any) -> Int[np.ndarray, "m N"]:
+    """`TreeIndex.nearest` for the arguments of `AbstractSearch.nearest_traced`, each split by `_pieces`."""
+    whole = jax.tree.map(
+        lambda pieces: (
+            np.concatenate([np.asarray(piece) for piece in pieces]) if len(pieces) > 1 else np.asarray(pieces[0])
+        ),
+        arguments,
+        is_leaf=lambda node: isinstance(node, list),
+    )
+    pose, source, target, max_distance, running = whole
+    if not running:
+        return np.full((num_candidates, source.valid.size), -1, np.int32)
+    index = _index_cache.get(search, target)
+    return index.nearest(pose, source, float(max_distance), num_candidates)

@@ -1,0 +1,268 @@
+"""An index over the rows of a target by trees: descriptors, missing channels, and matches kept from pose to pose."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+from jax.typing import ArrayLike
+from jaxtyping import Float, Int
+
+from mcgicp_jax._math.poses import rotation_from_quaternion
+from mcgicp_jax._search.base import AbstractIndex, Rows, on_host
+from mcgicp_jax._search.nearest_with_ties import Tree, Trees, slack_of
+
+# Largest number of combinations of missing channels (of the queries × of the target) for which a tree each is built:
+# two cameras, each of which sees a point or not, make 4 × 4.
+_MOST_TREES = 16
+# With more combinations: number of neighbours in position that are examined first, and number of (query, neighbour)
+# differences in memory at a time.
+_FIRST_NEAR = 32
+_DIFFERENCES_AT_ONCE = 200_000
+# Points. A larger tree does not fit into a processor's caches; queries are then sorted so that neighbours follow each
+# other: 20 neighbours of 60,000 points then take 0.6 of the time, of a million points a quarter.
+LARGEST_UNORDERED = 50_000
+
+
+class TreeIndex(AbstractIndex):
+    """An index over the finite rows: one tree, or where rows lack channels, one per set of channels in common.
+
+    With many such sets, a tree of positions yields candidates instead, whose search distances are then computed.
+    """
+
+    def __init__(self, trees: Trees, target: Rows):
+        points = np.hstack([target.points, target.descriptors])
+        # Trees reject non-finite points; the sums at the pose lead to the status NON_FINITE.
+        self._rows = np.flatnonzero(target.valid & np.isfinite(points).all(axis=1)).astype(np.int32)
+        self._points = points[self._rows]
+        penalty = np.zeros_like(target.descriptors) if target.penalty is None else target.penalty
+        self._penalty = penalty[self._rows]
+        self._patterns, self._which = _patterns(self._penalty)
+        self._trees = trees
+        # Trees are built on demand. Threads that need the same tree at once may each build it.
+        self._parts: dict[bytes, list[_Part]] = {}
+        self._positions: Tree | None = None
+
+    @property
+    def num_rows(self) -> int:
+        """Total number of rows in all trees, as a measure of memory."""
+        return self._rows.size * max(1, len(self._parts) + (self._positions is not None))
+
+    def nearest(
+        self, pose: Float[ArrayLike, "7"], source: Rows, max_distance: float, num_candidates: int = 1
+    ) -> Int[np.ndarray, "m N"]:
+        source = on_host(source)
+        queries = np.hstack([_moved(pose, np.asarray(source.points, np.float64)), source.descriptors])
+        queries[~source.valid] = np.nan
+        return self.nearest_of(queries, source.penalty, max_distance, num_candidates)[0].T
+
+    def follow(
+        self, source: Rows, max_distance: float, num_candidates: int = 1
+    ) -> Callable[[Float[ArrayLike, "7"]], Int[np.ndarray, "m N"]]:
+        return _Follower(self, self._trees, on_host(source), max_distance, num_candidates).nearest
+
+    def nearest_of(
+        self,
+        queries: Float[np.ndarray, "N D"],
+        penalty: Float[np.ndarray, "N C"] | None,
+        max_distance: float,
+        k: int,
+    ) -> tuple[Int[np.ndarray, "N k"], Float[np.ndarray, "N"]]:
+        """The k nearest rows of each query.
+
+        Args:
+            queries: positions and descriptors, metres; rows that are not finite have no neighbours.
+            penalty: as in `Rows`, for the queries.
+
+        Returns:
+            (N, k) target rows, −1 for none; and (N,) the slack: the distance, metres, that a query may move before its
+            k nearest rows can change, but for their order.
+        """
+        indices, slack = np.full((len(queries), k), -1, np.int32), np.zeros(len(queries))
+        if not self._rows.size:
+            return indices, slack
+        finite = np.isfinite(queries)
+        # Usually all are finite: then `all()` is quicker than a test by row, and a slice copies nothing.
+        active: slice | Int[np.ndarray, "n"] = slice(None) if finite.all() else np.flatnonzero(finite.all(axis=1))
+        # The maximum correspondence distance refers to the position and is applied by the caller; the margin covers
+        # rounding. With descriptors it does not bound the search distance, so the whole space is searched.
+        bound = np.inf if queries.shape[1] > 3 else 1.001 * max_distance
+        rows = np.arange(len(queries))[active]
+        if penalty is None:
+            patterns, which = np.zeros((1, queries.shape[1] - 3)), np.zeros(rows.size, np.intp)
+        else:
+            patterns, which = _patterns(penalty[active])
+        if len(patterns) * len(self._patterns) > _MOST_TREES:
+            groups = [active]
+            answers = [self._near_in_position(queries[active], patterns[which], k)]
+        else:
+            groups = [active] if len(patterns) == 1 else [rows[which == i] for i in range(len(patterns))]
+            answers = [
+                self._nearest(queries[alike], pattern, k, bound)
+                for pattern, alike in zip(patterns, groups, strict=True)
+            ]
+        for alike, (found, free) in zip(groups, answers, strict=True):
+            indices[alike, : found.shape[1]], slack[alike] = found, free
+        return indices, slack
+
+    def _nearest(
+        self, queries: Float[np.ndarray, "N D"], penalty: Float[np.ndarray, "C"], k: int, bound: float
+    ) -> tuple[Int[np.ndarray, "N m"], Float[np.ndarray, "N"]]:
+        """`nearest_of` for queries that lack the same channels."""
+        parts = self._parts_for(penalty)
+        if len(parts) == 1:
+            found, slack = parts[0].nearest(queries, k, bound)
+            return parts[0].rows[found], slack
+        # The slack depends on the next nearest row.
+        each = [part.nearest(queries, k + 1, bound)[0] for part in parts]
+        rows = np.hstack([part.rows[found] for part, found in zip(parts, each, strict=True)])
+        squares = np.hstack([part.squares(queries, found) for part, found in zip(parts, each, strict=True)])
+        rows, squares = _ordered(rows, squares, k + 1)
+        return rows[:, :k], slack_of(*np.sqrt(squares[:, [min(k, squares.shape[1]) - 1, -1]]).T)
+
+    def _near_in_position(
+        self, queries: Float[np.ndarray, "N D"], penalty: Float[np.ndarray, "N C"], k: int
+    ) -> tuple[Int[np.ndarray, "N m"], Float[np.ndarray, "N"]]:
+        """`nearest_of` for queries and points that lack many different sets of channels.
+
+        The number of neighbours in position grows until all other points are too far away in position alone.
+        """
+        if self._positions is None:
+            self._positions = Tree(self._trees, self._points[:, :3])
+        size = self._rows.size
+        found, slack = np.empty((len(queries), min(k, size)), np.int32), np.empty(len(queries))
+        # Penalties that every match of a query incurs: a lower bound on the squared distance beside the position.
+        least = penalty.sum(axis=1)
+        open, asked = np.arange(len(queries)), min(max(_FIRST_NEAR, k + 1), size)
+        while open.size:
+            unsure = []
+            for some in np.array_split(open, -(-open.size * asked // _DIFFERENCES_AT_ONCE)):
+                distances, near = self._positions.query(queries[some, :3], asked)
+                rows, squares = _ordered(self._rows[near], self._squares(queries[some], penalty[some], near), k + 1)
+                found[some] = rows[:, :k]
+                # The margin of 1e-9 covers rounding in float64.
+                others = (1 - 1e-9) * (distances[:, -1] ** 2 + least[some]) if asked < size else np.inf
+                farthest = squares[:, min(k, size) - 1]
+                slack[some] = slack_of(*np.sqrt([farthest, np.minimum(squares[:, -1], others)]))
+                unsure.append(some[~(farthest < others)])
+            open, asked = np.concatenate(unsure) if asked < size else open[:0], min(4 * asked, size)
+        return found, slack
+
+    def _squares(
+        self, queries: Float[np.ndarray, "N D"], penalty: Float[np.ndarray, "N C"], near: Int[np.ndarray, "N m"]
+    ) -> Float[np.ndarray, "N m"]:
+        """Squared search distances to points, including the penalties for missing channels; metres²."""
+        difference = queries[:, None] - self._points[near]
+        missing = np.maximum(penalty[:, None], self._penalty[near])
+        difference[..., 3:][missing > 0] = 0
+        return np.sum(difference * difference, axis=2) + missing.sum(axis=2)
+
+    def _parts_for(self, penalty: Float[np.ndarray, "C"]) -> list[_Part]:
+        key = penalty.tobytes()
+        if key not in self._parts:
+            common, alike = _patterns(np.maximum(self._patterns, penalty))
+            which = alike[self._which]
+            groups = [slice(None) if len(common) == 1 else which == i for i in range(len(common))]
+            self._parts[key] = [
+                _Part(self._trees, self._points[group], self._rows[group], pattern)
+                for group, pattern in zip(groups, common, strict=True)
+            ]
+        return self._parts[key]
+
+
+class _Part:
+    """A tree of the target rows that share one set of channels with a query."""
+
+    def __init__(
+        self,
+        trees: Trees,
+        points: Float[np.ndarray, "M D"],
+        rows: Int[np.ndarray, "M"],
+        penalty: Float[np.ndarray, "C"],
+    ):
+        common = np.concatenate([np.ones(3, bool), penalty == 0])
+        # Maps tree indices to cloud rows; the last entry is −1 (no neighbour).
+        self.rows = np.append(rows, np.int32(-1))
+        self._columns = slice(None) if common.all() else np.flatnonzero(common)
+        self._penalty = penalty.sum()
+        self._tree = Tree(trees, points[:, self._columns])
+
+    def nearest(
+        self, queries: Float[np.ndarray, "N D"], k: int, bound: float
+    ) -> tuple[Int[np.ndarray, "N m"], Float[np.ndarray, "N"]]:
+        """Tree indices of the k nearest (fewer if the tree has fewer), and the slack, as from `_nearest`."""
+        return self._tree.nearest(queries[:, self._columns], k, bound)
+
+    def squares(self, queries: Float[np.ndarray, "N D"], found: Int[np.ndarray, "N m"]) -> Float[np.ndarray, "N m"]:
+        """Squared search distances to tree indices, including the penalties for missing channels; metres²."""
+        points = self._tree.points
+        difference = queries[:, None, self._columns] - points[np.minimum(found, len(points) - 1)]
+        apart = np.sum(difference * difference, axis=2) + self._penalty
+        return np.where(found < len(points), apart, np.inf)
+
+
+class _Follower:
+    """The k nearest target rows of each row of one source, for a sequence of poses.
+
+    Matches are provably unchanged while their source point has moved by less than half the gap between its k-th and its
+    next nearest target point since the last search. After the first poses this holds for most points.
+    """
+
+    def __init__(self, index: TreeIndex, trees: Trees, source: Rows, max_distance: float, k: int):
+        self._index = index
+        self._max_distance = max_distance
+        # Valid source rows, for large clouds sorted by neighbourhood. All arrays below are in this order.
+        order: Int[np.ndarray, "n"] = np.flatnonzero(source.valid)
+        if order.size > LARGEST_UNORDERED:
+            points = np.nan_to_num(source.points[order], posinf=0, neginf=0)
+            order = order[Tree(trees, points).leaf_order()]
+        self._order = order
+        self._points = np.asarray(source.points[order], np.float64)
+        self._descriptors = source.descriptors[order]
+        self._penalty = None if source.penalty is None else source.penalty[order]
+        # Position of each point at its last search, and the distance that it may move from there.
+        self._asked: Float[np.ndarray, "n 3"] = np.full((order.size, 3), np.nan)
+        self._slack: Float[np.ndarray, "n"] = np.zeros(order.size)
+        self._rows: Int[np.ndarray, "k N"] = np.full((k, source.valid.size), -1, np.int32)
+
+    def nearest(self, pose: Float[ArrayLike, "7"]) -> Int[np.ndarray, "k N"]:
+        moved = _moved(pose, self._points)
+        shift = moved - self._asked
+        # Written so that NaN, which marks points not yet searched for, counts as stale.
+        stale = np.flatnonzero(~(np.einsum("ij,ij->i", shift, shift) < self._slack**2))
+        queries = np.hstack([moved[stale], self._descriptors[stale]])
+        penalty = None if self._penalty is None else self._penalty[stale]
+        found, self._slack[stale] = self._index.nearest_of(queries, penalty, self._max_distance, len(self._rows))
+        self._asked[stale] = moved[stale]
+        # Arrays returned earlier must not change.
+        self._rows = self._rows.copy()
+        self._rows[:, self._order[stale]] = found.T
+        return self._rows
+
+
+def _patterns(penalty: Float[np.ndarray, "N C"]) -> tuple[Float[np.ndarray, "P C"], Int[np.ndarray, "N"]]:
+    """The distinct rows of penalties (sets of missing channels), and the number of its set for each row."""
+    which = np.zeros(len(penalty), np.intp)
+    # Sets are renumbered after each channel, so that numbers stay below twice the number of rows. `np.unique` would
+    # sort the rows, which takes most of the time of a search.
+    for column in (penalty > 0).T:
+        which = 2 * which + column
+        which = (np.cumsum(np.bincount(which) > 0) - 1)[which]
+    example = np.zeros(which.max(initial=-1) + 1, np.intp)
+    example[which] = np.arange(len(penalty))
+    return penalty[example], which
+
+
+def _ordered(
+    rows: Int[np.ndarray, "N m"], squares: Float[np.ndarray, "N m"], k: int
+) -> tuple[Int[np.ndarray, "N k"], Float[np.ndarray, "N k"]]:
+    """The first k rows by squared distance, ties by row, and their squared distances."""
+    order = np.lexsort((rows, squares), axis=1)[:, :k]
+    return np.take_along_axis(rows, order, axis=1), np.take_along_axis(squares, order, axis=1)
+
+
+def _moved(pose: Float[ArrayLike, "7"], points: Float[np.ndarray, "N 3"]) -> Float[np.ndarray, "N 3"]:
+    pose = np.asarray(pose, np.float64)
+    # A non-finite pose gives NaN; the status of the registration reports it.
+    with np.errstate(invalid="ignore"):
+        return points @ rotation_from_quaternion(pose[:4]).T + pose[4:]

@@ -1,0 +1,1 @@
+"""Uses of many registrations: odometry, loop closure, multiway registration."""

@@ -1,0 +1,1 @@
+"""Residuals of correspondences, one term each."""
