@@ -24,8 +24,8 @@ from mcgicp_jax._registration.result import Registration, Status
 from mcgicp_jax._search.base import AbstractSearch, Correspondences
 from mcgicp_jax._search.brute_force import DenseSearch
 from mcgicp_jax._search.kd_tree import AbstractTreeSearch, KDTreeSearch
-from mcgicp_jax._sequences.multiway import Multiway, multiway
-from mcgicp_jax._sequences.odometry import odometry
+from mcgicp_jax._sequences.multiway import MultiwayResult, multiway
+from mcgicp_jax._sequences.odometry import OdometryStep, odometry
 
 __all__ = [
     "D2DNDT",
@@ -47,7 +47,8 @@ __all__ = [
     "Huber",
     "KDTreeSearch",
     "MultiChannelGICP",
-    "Multiway",
+    "MultiwayResult",
+    "OdometryStep",
     "PairWarning",
     "PointCloud",
     "PointToPlane",

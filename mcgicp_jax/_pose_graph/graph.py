@@ -38,14 +38,14 @@ class Edge(eqx.Module):
             it; v is along its axes.
         information: (6, 6), inverse covariance of ξ = (v, ω) in T_i_j exp(ξ), the tangent of `Registration.covariance`,
             metres and radians; symmetric, positive semidefinite. Zero along directions that were not measured.
-        loop: whether the measurement may be an outlier, so that `optimize_poses` may reject the edge.
+        uncertain: whether the measurement may be an outlier, so that `optimize_poses` may reject the edge.
     """
 
     i: Int[Array, "*batch"] | Int[np.ndarray, "*batch"]
     j: Int[Array, "*batch"] | Int[np.ndarray, "*batch"]
     T_i_j: Float[Array, "*batch 4 4"] | Float[np.ndarray, "*batch 4 4"]
     information: Float[Array, "*batch 6 6"] | Float[np.ndarray, "*batch 6 6"]
-    loop: Bool[Array, "*batch"] | Bool[np.ndarray, "*batch"]
+    uncertain: Bool[Array, "*batch"] | Bool[np.ndarray, "*batch"]
 
     def __init__(
         self,
@@ -55,12 +55,12 @@ class Edge(eqx.Module):
         information: ArrayLike | None = None,
         *,
         covariance: ArrayLike | None = None,
-        loop: ArrayLike = False,
+        uncertain: ArrayLike = False,
     ):
-        """Create one edge, or several from arguments with a leading axis (a single `loop` then holds for all).
+        """Create one edge, or several from arguments with a leading axis (a single `uncertain` then holds for all).
 
         Args:
-            i, j, T_i_j, information, loop: see the class. `T_i_j` may be a `jaxlie.SE3`.
+            i, j, T_i_j, information, uncertain: see the class. `T_i_j` may be a `jaxlie.SE3`.
             covariance: (6, 6), positive definite; its inverse becomes the information. Give this or `information`.
 
         Raises:
@@ -73,8 +73,9 @@ class Edge(eqx.Module):
         self.T_i_j = _as_float("T_i_j", T_i_j.as_matrix() if isinstance(T_i_j, jaxlie.SE3) else T_i_j)
         self.information = _inverse(covariance) if information is None else _as_float("information", information)
         shape = np.shape(self.i)
-        self.loop = loop if isinstance(loop, jax.Array) else np.broadcast_to(np.asarray(loop, bool), shape)
-        for name, tail in (("i", ()), ("j", ()), ("T_i_j", (4, 4)), ("information", (6, 6)), ("loop", ())):
+        known = not isinstance(uncertain, jax.Array)
+        self.uncertain = np.broadcast_to(np.asarray(uncertain, bool), shape) if known else uncertain
+        for name, tail in (("i", ()), ("j", ()), ("T_i_j", (4, 4)), ("information", (6, 6)), ("uncertain", ())):
             if np.shape(getattr(self, name)) != shape + tail:
                 raise ValueError(f"{name}: expected shape {shape + tail}, got {np.shape(getattr(self, name))}")
 
@@ -175,8 +176,9 @@ def _initial(edges: Edge) -> Float[np.ndarray, "n 4 4"]:
         raise ValueError("poses: expected poses, since the edges are none or traced")
     number = int(max(np.max(edges.i), np.max(edges.j))) + 1
     edges = _checked(edges, number)
-    i, j, loop = np.where(edges.i == WORLD, number, edges.i), np.asarray(edges.j), np.asarray(edges.loop)
-    return initial_poses(i, j, np.asarray(edges.T_i_j), np.asarray(edges.information), loop, number)
+    i, j = np.where(edges.i == WORLD, number, edges.i), np.asarray(edges.j)
+    uncertain = np.asarray(edges.uncertain)
+    return initial_poses(i, j, np.asarray(edges.T_i_j), np.asarray(edges.information), uncertain, number)
 
 
 def _checked(edges: Edge, num_poses: int) -> Edge:
@@ -196,7 +198,7 @@ def _checked(edges: Edge, num_poses: int) -> Edge:
     asymmetry = np.abs(information - symmetric).max(axis=(1, 2), initial=0)
     _refuse("information: expected a symmetric matrix", asymmetry > limit, information)
     _refuse("information: expected a positive semidefinite matrix; eigenvalues", values[:, 0] < -limit, values)
-    return Edge(i, j, transforms.reshape(-1, 4, 4), symmetric, loop=np.asarray(edges.loop, bool))
+    return Edge(i, j, transforms.reshape(-1, 4, 4), symmetric, uncertain=np.asarray(edges.uncertain, bool))
 
 
 def _refuse(what: str, bad: np.ndarray, values: np.ndarray) -> None:

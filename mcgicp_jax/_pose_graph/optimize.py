@@ -146,7 +146,7 @@ def optimize_poses(graph: PoseGraph, *, robust: bool = True, max_iterations: int
     check_integer("max_iterations", max_iterations, 1)
     if not is_concrete(graph):
         return _traced(graph, robust, int(max_iterations))
-    loops = np.asarray(graph.edges.loop) & bool(robust)
+    loops = np.asarray(graph.edges.uncertain) & bool(robust)
     # Overflow is a status.
     with np.errstate(over="ignore", invalid="ignore"):
         edges, start, origin = _centred(graph)
@@ -180,7 +180,7 @@ def _centred(graph: PoseGraph) -> tuple[Edge, Float[np.ndarray, "_ 7"], Float[np
     motions[of_world, :3, 3] -= origin
     if of_world.any():
         poses = np.concatenate([poses, np.eye(4)[None]])
-    return Edge(edges.i, edges.j, motions, edges.information, loop=edges.loop), parameters_of(poses), origin
+    return Edge(edges.i, edges.j, motions, edges.information, uncertain=edges.uncertain), parameters_of(poses), origin
 
 
 def motion_covariances(
@@ -192,7 +192,7 @@ def motion_covariances(
     """
     edges, poses, _ = _centred(graph)
     squares = NormalEquations(edges, poses).terms(poses).squares
-    weights = np.where(np.asarray(edges.loop), 1.0 * (squares <= LARGEST_SQUARE), 1)
+    weights = np.where(np.asarray(edges.uncertain), 1.0 * (squares <= LARGEST_SQUARE), 1)
     none = np.zeros((len(i), 6, 6))
     return _motion_covariances(edges, poses, weights, Edge(i, j, none[:, :4, :4], none))
 

@@ -181,7 +181,7 @@ def read_g2o(path: str | os.PathLike[str]) -> PoseGraph:
 
     Args:
         path: the file. Vertices may have any numbers; they become rows in ascending order. Edges between vertices whose
-            numbers are not consecutive are loops. Priors become edges from the world.
+            numbers are not consecutive are uncertain. Priors become edges from the world.
 
     Raises:
         OSError: if the file cannot be opened.
@@ -196,7 +196,7 @@ def read_g2o(path: str | os.PathLike[str]) -> PoseGraph:
 
 
 def write_g2o(path: str | os.PathLike[str], graph: PoseGraph | Any) -> None:
-    """Write a pose graph, or the result of `optimize_poses` without the loops that it rejected, as `read_g2o` reads it.
+    """Write a pose graph, or the result of `optimize_poses` without the edges that it rejected, as `read_g2o` reads it.
 
     Raises:
         OSError: if the file cannot be written.

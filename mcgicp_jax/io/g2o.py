@@ -41,9 +41,11 @@ def graph_of(lines: Iterable[str]) -> PoseGraph:
     upper, information = np.triu_indices(6), np.zeros((len(values), 6, 6))
     information[:, *upper] = information[:, *upper[::-1]] = values[:, 9:]
     of_world = np.arange(len(values)) >= len(edges)
-    loop = ~of_world & (np.abs(ends[:, 0] - ends[:, 1]) != 1)
+    uncertain = ~of_world & (np.abs(ends[:, 0] - ends[:, 1]) != 1)
     i = np.where(of_world, WORLD, rows[:, 0])
-    return PoseGraph(_poses(vertices[first, 1:]), Edge(i, rows[:, 1], _poses(values[:, 2:9]), information, loop=loop))
+    return PoseGraph(
+        _poses(vertices[first, 1:]), Edge(i, rows[:, 1], _poses(values[:, 2:9]), information, uncertain=uncertain)
+    )
 
 
 def lines_of(graph: PoseGraph | Any) -> Iterator[tuple[str, Float[np.ndarray, "N _"]]]:
