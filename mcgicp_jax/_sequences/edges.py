@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from mcgicp_jax._pose_graph.graph import Edge
+from mcgicp_jax._pose_graph.edge import Edge
 from mcgicp_jax._registration.result import Registration, Status
 
 # Least overlap of a registration that becomes an edge: with less, a wrong local minimum looks like a right one.

@@ -10,8 +10,10 @@ from jaxtyping import Float, Int
 
 from mcgicp_jax._clouds.point_cloud import PointCloud
 from mcgicp_jax._methods.base import AbstractMethod
-from mcgicp_jax._pose_graph.graph import Edge, PoseGraph
-from mcgicp_jax._pose_graph.optimize import motion_covariances, optimize_poses
+from mcgicp_jax._pose_graph.edge import Edge
+from mcgicp_jax._pose_graph.graph import PoseGraph
+from mcgicp_jax._pose_graph.optimize import optimize_poses
+from mcgicp_jax._pose_graph.solver import motion_covariances
 from mcgicp_jax._registration.options import Options
 from mcgicp_jax._registration.register_pair import default_distances, register_with
 from mcgicp_jax._registration.result import Registration

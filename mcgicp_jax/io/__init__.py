@@ -14,7 +14,8 @@ from jaxtyping import Float
 
 from mcgicp_jax._clouds.point_cloud import PointCloud
 from mcgicp_jax._math.poses import pose_matrix
-from mcgicp_jax._pose_graph.graph import Edge, PoseGraph
+from mcgicp_jax._pose_graph.edge import Edge
+from mcgicp_jax._pose_graph.graph import PoseGraph
 from mcgicp_jax.io.formats import READERS, WRITERS, by_suffix
 from mcgicp_jax.io.g2o import graph_of, lines_of
 

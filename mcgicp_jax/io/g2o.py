@@ -9,7 +9,9 @@ import numpy as np
 from jaxtyping import Float
 
 from mcgicp_jax._math.poses import matrices_of, parameters_of
-from mcgicp_jax._pose_graph.graph import WORLD, Edge, PoseGraph
+from mcgicp_jax._pose_graph.edge import Edge
+from mcgicp_jax._pose_graph.factors import WORLD
+from mcgicp_jax._pose_graph.graph import PoseGraph
 
 # Tags of the lines. A prior has a vertex and the number of the sensor's offset, which has a line of its own.
 _VERTEX, _EDGE, _PRIOR, _OFFSET = "VERTEX_SE3:QUAT", "EDGE_SE3:QUAT", "EDGE_SE3_PRIOR", "PARAMS_SE3OFFSET"

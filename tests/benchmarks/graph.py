@@ -120,8 +120,8 @@ def scenes() -> None:
         ]
         print(
             f"{name}: ATE {1e3 * errors[0]:.1f} mm by odometry, {1e3 * errors[1]:.1f} with "
-            f"{found.kept[edges.uncertain].sum()} of {edges.uncertain.sum()} loops, {1e3 * errors[2]:.1f} with the identity "
-            f"as information; NEES per dof {nees(found, truth):.2f}; {found}",
+            f"{found.kept[edges.uncertain].sum()} of {edges.uncertain.sum()} loops, {1e3 * errors[2]:.1f} with the "
+            f"identity as information; NEES per dof {nees(found, truth):.2f}; {found}",
             flush=True,
         )
 
