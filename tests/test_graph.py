@@ -1,6 +1,7 @@
 """Pose graphs against gtsam or dense least squares, finite differences, and simulation."""
 
 import importlib.util
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -14,7 +15,9 @@ from scipy.stats import chi2
 
 import mcgicp_jax as mcg
 from mcgicp_jax import metrics
+from mcgicp_jax._math.twists import logarithm
 from mcgicp_jax._pose_graph import levenberg_marquardt, outliers
+from mcgicp_jax._pose_graph.factors import AbstractFactor
 from mcgicp_jax._pose_graph.levenberg_marquardt import Minimum
 from mcgicp_jax._pose_graph.marginal_covariances import inverse_blocks
 from mcgicp_jax._pose_graph.normal_equations import NormalEquations, factored
@@ -461,6 +464,188 @@ def test_failures_inside_transformations_are_statuses(both):
     twists, change = direction(graph)
     found, slope = differentiated(graph, twists, np.nan * change)
     assert found.status == mcg.Status.NON_FINITE and not np.any(slope)
+
+
+def circle(seed, number=20, step=30.0):
+    """A closed path, with a millimetre and a milliradian of noise."""
+    angles = 2 * np.pi * np.arange(number) / number
+    poses = np.array(
+        [pose(step * number / (2 * np.pi) * np.array([np.sin(a), -np.cos(a), 0]), (0, 0, a)) for a in angles]
+    )
+    return measured(poses, [(0, number - 1)], deviations=(1e-3, 1e-3), seed=seed)[0]
+
+
+def weighted_sum(step, graph, twists, scale):
+    edges = graph.edges
+    moving = mcg.Edge(edges.i, edges.j, edges.T_i_j @ se3s_of(step * twists), edges.information)
+    return jnp.sum(scale * mcg.optimize_poses(mcg.PoseGraph(graph.poses, moving), robust=False).poses)
+
+
+compiled_gradient = jax.jit(jax.grad(weighted_sum))
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_gradients_of_precise_graphs_are_right_in_float32(seed):
+    graph, rng = circle(seed), np.random.default_rng(seed)
+    twists, scale = 1e-3 * rng.normal(size=(len(graph.edges), 6)), rng.normal(size=(len(graph.poses), 4, 4))
+
+    def poses(step):
+        edges = graph.edges
+        # Rotation vectors equal twists to first order.
+        moving = mcg.Edge(edges.i, edges.j, moved(edges.T_i_j, step * twists), edges.information)
+        return mcg.optimize_poses(mcg.PoseGraph(graph.poses, moving), robust=False).poses
+
+    expected = (poses(0.01) - poses(-0.01)) / 0.02
+    found, slope = differentiated(graph, twists, np.zeros((len(graph.edges), 6, 6)))
+    assert found.converged and found.num_iterations <= 5
+    np.testing.assert_allclose(slope, expected, atol=1e-3 * np.abs(expected).max())
+    gradient = compiled_gradient(0.0, graph, twists, scale)
+    assert gradient != 0
+    np.testing.assert_allclose(gradient, np.sum(scale * slope), atol=1e-4 * np.sum(np.abs(scale * slope)))
+
+
+def test_eager_gradients_and_batches_are_those_of_compiled_programs():
+    graph, _ = measured(*grid(2))
+    edges = graph.edges
+
+    def loss(information):
+        moving = mcg.PoseGraph(graph.poses, mcg.Edge(edges.i, edges.j, edges.T_i_j, information))
+        return jnp.sum(mcg.optimize_poses(moving).poses[-1, :3, 3])
+
+    information = jnp.asarray(edges.information) * (1 + jnp.arange(len(edges))[:, None, None] / len(edges))
+    expected = jax.jit(jax.grad(loss))(information)
+    assert np.abs(expected).max() > 0
+    np.testing.assert_allclose(jax.grad(loss)(information), expected, rtol=1e-5, atol=1e-9)
+    both = jnp.stack([information, 2 * information])
+    values, gradients = jax.jit(jax.vmap(jax.value_and_grad(loss)))(both)
+    np.testing.assert_allclose(values[0], loss(information), rtol=1e-5)
+    np.testing.assert_allclose(gradients, np.array([expected, expected / 2]), rtol=1e-3, atol=1e-9)
+    with pytest.raises(ValueError, match="do not support JVP"):
+        jax.hessian(loss)(information)
+
+
+def test_outliers_are_the_same_inside_transformations():
+    graph, _ = measured(*SMALL["grid"], false=0.3)
+    expected, found = mcg.optimize_poses(graph), jax.jit(mcg.optimize_poses)(graph)
+    assert found.converged and not expected.kept.all()
+    np.testing.assert_array_equal(found.kept, expected.kept)
+    np.testing.assert_allclose(found.poses, expected.poses, atol=1e-4)
+
+
+def test_degenerate_graphs_are_finite_inside_transformations():
+    graph, _ = measured(*grid(2))
+    position = mcg.Edge(mcg.WORLD, 0, graph.poses[0], np.diag([1.0, 1, 1, 0, 0, 0]))[None]
+    open_ended = mcg.PoseGraph(graph.poses, joined(graph.edges, position))
+    edges = graph.edges
+    apart = mcg.PoseGraph(graph.poses, edges[(edges.i < 4) == (edges.j < 4)])
+    for each in (open_ended, apart):
+        expected, (found, slope) = mcg.optimize_poses(each, robust=False), differentiated(each, *direction(each))
+        assert found.status == expected.status == mcg.Status.DEGENERATE
+        np.testing.assert_allclose(found.poses, expected.poses, atol=1e-4)
+        assert not np.any(slope)
+        np.testing.assert_array_equal(np.isinf(found.covariance), np.isinf(expected.covariance))
+    assert np.isinf(np.diagonal(expected.covariance, 0, 1, 2)[4:]).all() and np.isfinite(expected.covariance[:4]).all()
+
+
+class Distance(AbstractFactor):
+    """Distances between two positions, metres."""
+
+    rows: Any
+    information: Any
+    uncertain: Any
+    metres: Any
+
+    def linearize(self, poses):
+        between = poses[:, 1, :3, 3] - poses[:, 0, :3, 3]
+        length = np.linalg.norm(between, axis=1)
+        towards = np.einsum("mi,mkij->mkj", between / length[:, None], poses[:, :, :3, :3]) * [[[-1], [1]]]
+        jacobians = np.concatenate([towards, np.zeros_like(towards)], axis=2)
+        return (length - self.metres)[:, None], jacobians[:, :, None]
+
+
+class Height(AbstractFactor):
+    """Heights of positions in the world, metres."""
+
+    rows: Any
+    information: Any
+    uncertain: Any
+    metres: Any
+
+    def linearize(self, poses):
+        jacobians = np.zeros((len(poses), 2, 1, 6))
+        jacobians[:, 1, 0, :3] = poses[:, 1, 2, :3]
+        return poses[:, 1, 2, 3:] - self.metres[:, None], jacobians
+
+
+def with_factors():
+    """A graph anchored by a prior, with distances, the last of which is wrong, and heights; and its truth."""
+    truth, loops = grid(2)
+    graph, _ = measured(truth, loops)
+    prior = mcg.Edge(mcg.WORLD, 0, truth[0], 1e4 * np.eye(6))[None]
+    a, b = np.array([0, 1, 2]), np.array([6, 5, 7])
+    metres = np.linalg.norm(truth[a, :3, 3] - truth[b, :3, 3], axis=1) + np.array([0.003, -0.005, 2.0])
+    distances = Distance(np.stack([a, b], axis=1), np.full((3, 1, 1), 1e4), np.ones(3, bool), metres)
+    rows = np.stack([np.full(4, mcg.WORLD), np.arange(4, 8)], axis=1)
+    heights = Height(rows, np.full((4, 1, 1), 2.5e3), np.zeros(4, bool), truth[4:, 2, 3] + [0.01, -0.02, 0.01, 0.0])
+    return mcg.PoseGraph(graph.poses, joined(graph.edges, prior), [distances, heights]), truth
+
+
+def test_other_kinds_of_measurements_take_part():
+    """Against dense least squares of all residuals."""
+    graph, _ = with_factors()
+    found = mcg.optimize_poses(graph)
+    assert found.converged and len(found.residuals) == len(graph.edges)
+    np.testing.assert_array_equal(found.factor_weights[0], [1, 1, 0])
+    assert found.factor_weights[1].all() and found.factor_residuals[0][2] > np.sqrt(chi2.ppf(0.99, 1))
+    n, edges = len(graph.poses), graph.edges
+    distances, heights = graph.factors
+
+    def residuals(numbers):
+        poses = moved(graph.poses, numbers.reshape(-1, 6))
+        motions = (
+            np.linalg.inv(np.where((edges.i >= 0)[:, None, None], poses[edges.i.clip(0)], np.eye(4))) @ poses[edges.j]
+        )
+        errors = logarithm(np.linalg.inv(edges.T_i_j) @ motions)
+        between = np.linalg.norm(poses[distances.rows[:2, 0], :3, 3] - poses[distances.rows[:2, 1], :3, 3], axis=1)
+        return np.concatenate(
+            [
+                (np.sqrt(edges.information.diagonal(0, 1, 2)) * errors).reshape(-1),
+                100 * (between - distances.metres[:2]),
+                50 * (poses[4:, 2, 3] - heights.metres),
+            ]
+        )
+
+    dense = least_squares(residuals, np.zeros(6 * n), xtol=1e-12, ftol=1e-12, gtol=1e-12)
+    np.testing.assert_allclose(found.cost, dense.cost, rtol=1e-6)
+    np.testing.assert_allclose(found.poses, moved(graph.poses, dense.x.reshape(-1, 6)), atol=1e-5)
+    graph = mcg.PoseGraph(found.poses, graph.edges, graph.factors)
+    slope = jacobian(residuals, 6 * n)
+    expected = np.linalg.inv(slope.T @ slope).reshape(n, 6, n, 6)[np.arange(n), :, np.arange(n)]
+    np.testing.assert_allclose(found.covariance, expected, atol=1e-3 * expected.max())
+    with pytest.raises(ValueError, match=r"factors\[0\]: expected rows from 0 to 7 or WORLD, got 8"):
+        mcg.PoseGraph(
+            graph.poses, graph.edges, [Height(heights.rows + np.array([0, 2]), *jax.tree.leaves(heights)[1:])]
+        )
+    with pytest.raises(ValueError, match=r"factors\[0\]: expected rows \(m, k\) with k of at least 2"):
+        mcg.PoseGraph(graph.poses, graph.edges, [Height(np.arange(4), *jax.tree.leaves(heights)[1:])])
+
+
+def test_other_kinds_of_measurements_have_gradients():
+    graph, _ = with_factors()
+
+    def height(metres, change=0.0):
+        distances, heights = graph.factors
+        distances = Distance(distances.rows, distances.information + change, distances.uncertain, metres)
+        return mcg.optimize_poses(mcg.PoseGraph(graph.poses, graph.edges, [distances, heights])).poses[:, :3, 3].sum()
+
+    metres = graph.factors[0].metres
+    for k, h in ((0, 1e-3), (1, 1e-3), (2, 1e-3)):
+        step = h * np.eye(3)[k]
+        expected = (height(metres + step) - height(metres - step)) / (2 * h)
+        gradient = jax.jit(jax.grad(height))(jnp.asarray(metres))[k]
+        np.testing.assert_allclose(gradient, expected, rtol=2e-3, atol=1e-4)
+    expected = (height(metres, 10.0) - height(metres, -10.0)) / 20
+    np.testing.assert_allclose(jax.grad(height, 1)(jnp.asarray(metres), 0.0), expected, rtol=2e-3)
 
 
 @pytest.mark.slow

@@ -31,7 +31,7 @@ def call_host(function: Callable[..., Any], shapes: Any, *arguments: Any) -> Any
 
     def joined(*given: list[Any]) -> Any:
         whole = [np.concatenate([np.asarray(piece) for piece in each]) if len(each) > 1 else each[0] for each in given]
-        return function(*structure.unflatten([np.asarray(each) for each in whole]))
+        return function(*jax.tree.unflatten(structure, [np.asarray(each) for each in whole]))
 
     return jax.pure_callback(joined, shapes, *pieces, vmap_method="sequential")
 

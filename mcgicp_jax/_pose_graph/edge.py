@@ -69,14 +69,14 @@ class Edge(AbstractFactor):
         self.T_i_j = _as_float("T_i_j", T_i_j.as_matrix() if isinstance(T_i_j, jaxlie.SE3) else T_i_j)
         self.information = _inverse(covariance) if information is None else _as_float("information", information)
         shape = np.shape(self.i)
-        known = not isinstance(uncertain, jax.Array)
-        self.uncertain = np.broadcast_to(np.asarray(uncertain, bool), shape) if known else uncertain
+        traced = isinstance(uncertain, jax.Array)
+        self.uncertain = jnp.asarray(uncertain) if traced else np.broadcast_to(np.asarray(uncertain, bool), shape)
         for name, tail in (("i", ()), ("j", ()), ("T_i_j", (4, 4)), ("information", (6, 6)), ("uncertain", ())):
             if np.shape(getattr(self, name)) != shape + tail:
                 raise ValueError(f"{name}: expected shape {shape + tail}, got {np.shape(getattr(self, name))}")
 
-    @property
-    def rows(self) -> Any:
+    @property  # type: ignore[misc]
+    def rows(self) -> Any:  # type: ignore[override]
         """(m, 2), `i` and `j`."""
         return namespace(self.i, self.j).stack([self.i, self.j], axis=-1)
 

@@ -113,10 +113,10 @@ def _solved(
     dtype, n = jnp.result_type(*_floats((poses, factors))), len(poses)
 
     def on_host(poses: Any, factors: Any) -> Any:
-        solution = solve(poses, factors, robust, max_iterations)
-        count = np.int32(solution.found.num_iterations)
-        numbers = solution.poses(n), solution.residuals, solution.weights, solution.cost
-        found = Found(*(np.asarray(each, dtype) for each in numbers), np.int32(solution.status), count)
+        solution = solve(poses, factors, robust, max_iterations, exact=True)
+        numbers: Any = (solution.poses(n), solution.residuals, solution.weights, solution.cost)
+        counts: Any = (np.int32(solution.status), np.int32(solution.found.num_iterations))
+        found = Found(*(np.asarray(each, dtype) for each in numbers), *counts)
         return found, _sensitivity(solution, n, dtype) if differentiated else None
 
     if is_concrete(poses, factors):
@@ -179,7 +179,9 @@ def _by_values(factor: AbstractFactor, poses: Float[np.ndarray, "m k 4 4"]) -> l
             repeated = [np.concatenate([each] * len(steps)) for each in leaves]
             repeated[place] = (values + steps).reshape(-1, *values.shape[1:])
             many = np.concatenate([poses] * len(steps))
-            found.append(_differences(structure.unflatten(repeated), many, size).reshape(m, k, 6, *values.shape[1:]))
+            found.append(
+                _differences(jax.tree.unflatten(structure, repeated), many, size).reshape(m, k, 6, *values.shape[1:])
+            )
     return found
 
 

@@ -52,7 +52,9 @@ def propagated(
     number, d = len(rows), jacobians.shape[2]
     covariances = np.zeros((number, d, d))
     try:
-        solver = factored(equations.damped(equations.weighted(found.terms.blocks, weights))) if equations.size else None
+        solver: Any = (
+            factored(equations.damped(equations.weighted(found.terms.blocks, weights))) if equations.size else None
+        )
     except RuntimeError:
         return np.full_like(covariances, np.nan)
     step = max(_SOLVED_AT_ONCE // max(equations.size * d, 1), 1)

@@ -138,14 +138,14 @@ class NormalEquations:
 
     def matrix(self, blocks: Float[np.ndarray, "b 6 6"]) -> Any:
         """The sparse symmetric matrix of the sum of all blocks."""
-        from scipy.sparse import csc_array
+        from scipy.sparse import bsr_array, csc_array
 
         if not self.size:
             return csc_array((0, 0))
         summed = np.add.reduceat(blocks[self._order], self._starts)
-        data = np.empty(summed.size)
-        data[self._where] = summed.reshape(-1)
-        return csc_array((data, self._indices, self._pointers), (self.size, self.size))
+        rows = bsr_array((summed, self._columns, self._pointers), (self.size, self.size)).tocsr()
+        # Rows of a symmetric matrix are its columns.
+        return csc_array((rows.data, rows.indices, rows.indptr), rows.shape)
 
     def damped(self, matrix: Any, damping: float = LEAST_DAMPING) -> Any:
         """H + λD; all matrices have their entries at the same places."""
@@ -164,25 +164,16 @@ class NormalEquations:
         self._of_block = np.concatenate([np.repeat(number, rows.shape[1] ** 2) for rows, number in pairs])
 
     def _lay_out(self) -> None:
-        """Places of the blocks in the compressed columns of the matrix."""
+        """Places of the blocks in compressed rows of blocks."""
         rows, columns = self.place[self._first], self.place[self._second]
         inside = np.flatnonzero((rows >= 0) & (columns >= 0) & self.used[self._of_block])
-        self._order = inside[np.lexsort((rows[inside], columns[inside]))]
+        self._order = inside[np.lexsort((columns[inside], rows[inside]))]
         rows, columns = rows[self._order], columns[self._order]
         new = np.ones(len(rows), bool)
         new[1:] = (rows[1:] != rows[:-1]) | (columns[1:] != columns[:-1])
-        self._starts = np.flatnonzero(new)
-        rows, columns = rows[new], columns[new]
-        counts = np.bincount(columns, minlength=self.size // 6)
-        before = np.concatenate([[0], np.cumsum(counts)[:-1]]).astype(int)
-        along, across = np.arange(6)[:, None], np.arange(6)
-        inner = (np.arange(len(rows)) - before[columns])[:, None, None]
-        each = counts[columns][:, None, None]
-        self._where = (36 * before[columns][:, None, None] + 6 * each * across + 6 * inner + along).reshape(-1)
-        self._indices = np.empty(len(self._where), np.int32)
-        self._indices[self._where] = np.broadcast_to(6 * rows[:, None, None] + along, (len(rows), 6, 6)).reshape(-1)
-        starts = 36 * before[:, None] + 6 * counts[:, None] * across
-        self._pointers = np.append(starts.reshape(-1), len(self._where)).astype(np.int32)
+        self._starts, self._columns = np.flatnonzero(new), columns[new].astype(np.int32)
+        counts = np.bincount(rows[new], minlength=self.size // 6)
+        self._pointers = np.concatenate([[0], np.cumsum(counts)]).astype(np.int32)
 
 
 def factored(matrix: Any) -> Any:

@@ -123,7 +123,8 @@ def optimize_poses(graph: PoseGraph, *, robust: bool = True, max_iterations: int
     check_integer("max_iterations", max_iterations, 1)
     factors, n = (graph.edges, *graph.factors), len(graph.poses)
     if is_concrete(graph):
-        solution = solve(*jax.tree.map(np.asarray, (graph.poses, factors)), bool(robust), int(max_iterations))
+        poses, factors = jax.tree.map(np.asarray, (graph.poses, factors))
+        solution = solve(poses, factors, bool(robust), int(max_iterations))
         numbers = solution.poses(n), solution.residuals, solution.weights, np.float64(solution.cost)
         found = Found(*numbers, np.int32(solution.status), np.int32(solution.found.num_iterations))
         uncertainty = Deferred(partial(solution.covariances, n))

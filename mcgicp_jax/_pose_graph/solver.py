@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 from jaxtyping import Float, Int
 
 from mcgicp_jax._math.poses import matrices_of, parameters_of
 from mcgicp_jax._pose_graph.edge import Edge
-from mcgicp_jax._pose_graph.factors import WORLD, AbstractFactor
+from mcgicp_jax._pose_graph.factors import WORLD
 from mcgicp_jax._pose_graph.graph import PoseGraph
-from mcgicp_jax._pose_graph.levenberg_marquardt import Minimum
+from mcgicp_jax._pose_graph.levenberg_marquardt import Minimum, refine
 from mcgicp_jax._pose_graph.marginal_covariances import pose_covariances, propagated
 from mcgicp_jax._pose_graph.normal_equations import LEAST_DAMPING, NormalEquations, factored, motion_jacobians
 from mcgicp_jax._pose_graph.outliers import robust_minimum, thresholds
@@ -22,7 +22,8 @@ _UNCONSTRAINED = 10 * LEAST_DAMPING
 # Inverse iterations for the least constrained direction: unconstrained ones stand out by factors of 1e3 and more.
 _INVERSE_ITERATIONS = 4
 
-Factors = tuple[AbstractFactor, ...]
+# All measurements of a graph by kind, `AbstractFactor`s; the first are the edges.
+Factors: TypeAlias = tuple[Any, ...]
 
 
 class Solution(NamedTuple):
@@ -60,14 +61,18 @@ class Solution(NamedTuple):
         return pose_covariances(self.equations, self.found, self.weights)[:number]
 
 
-def solve(poses: Float[np.ndarray, "n 4 4"], factors: Factors, robust: bool, max_iterations: int) -> Solution:
-    """Minimise ½ Σ w rᵀΛr from the given poses; the first kind of measurement is the edges. Arrays are NumPy's."""
+def solve(
+    poses: Float[np.ndarray, "n 4 4"], factors: Factors, robust: bool, max_iterations: int, exact: bool = False
+) -> Solution:
+    """Minimise ½ Σ w rᵀΛr from the given poses, to rounding if `exact`; all arrays are NumPy's."""
     # Overflow is a status.
     with np.errstate(over="ignore", invalid="ignore"):
         poses, factors, origin = _centred(poses, factors)
         equations = NormalEquations(factors, poses)
         uncertain = np.concatenate([np.asarray(factor.uncertain) for factor in factors]) & robust
         equations, found, weights = robust_minimum(equations, poses, uncertain, max_iterations)
+        if exact and found.converged:
+            found = refine(equations, found, weights)
         status = _status(equations, found, weights)
         return Solution(equations, found, weights, origin, status, found.terms.cost(weights))
 

@@ -21,13 +21,12 @@ import numpy as np
 import scipy.spatial
 from jaxtyping import Array, Bool, Float, Int
 
+from mcgicp_jax._compute.callbacks import call_host
 from mcgicp_jax._search.base import AbstractSearch, Rows, on_host
 from mcgicp_jax._search.nearest_with_ties import Tree
 from mcgicp_jax._search.pykdtree import MOST_DIMENSIONS, PyKDTree, has_pykdtree
 from mcgicp_jax._search.tree_index import LARGEST_UNORDERED, TreeIndex
 
-# Bytes. JAX (jaxlib 0.10.2) copies smaller arrays for a callback in the calling thread, up to 100 KiB; see `_pieces`.
-_LARGEST_PIECE = 64 * 1024
 # Total number of rows of the trees cached for callbacks: hundreds of scans, some hundred megabytes.
 _CACHED_ROWS = 2_000_000
 
@@ -82,13 +81,10 @@ class AbstractTreeSearch(AbstractSearch):
         running: Bool[Array, ""],
         num_candidates: int = 1,
     ) -> Int[Array, "m N"]:
-        arguments = jax.tree.map(_pieces, (pose, source, target, max_distance, running))
-        return jax.pure_callback(
+        return call_host(
             partial(_nearest_callback, self, num_candidates),
             jax.ShapeDtypeStruct((num_candidates, source.valid.shape[0]), jnp.int32),
-            *arguments,
-            # One lane at a time: a batch of small pieces would again be a large array, see `_pieces`.
-            vmap_method="sequential",
+            *(pose, source, target, max_distance, running),
         )
 
     def neighbors(self, points: Float[np.ndarray, "N 3"], num_neighbors: int) -> Int[np.ndarray, "N k"]:
@@ -175,27 +171,16 @@ class _IndexCache:
 _index_cache = _IndexCache(_CACHED_ROWS)
 
 
-def _pieces(array: Any) -> list[Any]:
-    """An array split along its rows into pieces that are small enough to be passed to a callback without a deadlock.
-
-    JAX copies the arguments of a callback, large arrays in a thread of the pool that also runs programs. If callbacks
-    of as many programs as there are threads wait for such copies, they deadlock (seen with two programs on two cores).
-    """
-    array = jnp.asarray(array)
-    count = -(-array.nbytes // _LARGEST_PIECE)
-    return [array] if count <= 1 else jnp.array_split(array, count)
-
-
-def _nearest_callback(search: AbstractTreeSearch, num_candidates: int, *arguments: Any) -> Int[np.ndarray, "m N"]:
-    """`TreeIndex.nearest` for the arguments of `AbstractSearch.nearest_traced`, each split by `_pieces`."""
-    whole = jax.tree.map(
-        lambda pieces: (
-            np.concatenate([np.asarray(piece) for piece in pieces]) if len(pieces) > 1 else np.asarray(pieces[0])
-        ),
-        arguments,
-        is_leaf=lambda node: isinstance(node, list),
-    )
-    pose, source, target, max_distance, running = whole
+def _nearest_callback(
+    search: AbstractTreeSearch,
+    num_candidates: int,
+    pose: Any,
+    source: Rows,
+    target: Rows,
+    max_distance: Any,
+    running: Any,
+) -> Int[np.ndarray, "m N"]:
+    """`TreeIndex.nearest` for the arguments of `AbstractSearch.nearest_traced`."""
     if not running:
         return np.full((num_candidates, source.valid.size), -1, np.int32)
     index = _index_cache.get(search, target)
