@@ -501,7 +501,7 @@ def test_gradients_of_precise_graphs_are_right_in_float32(seed):
     np.testing.assert_allclose(slope, expected, atol=1e-3 * np.abs(expected).max())
     gradient = compiled_gradient(0.0, graph, twists, scale)
     assert gradient != 0
-    np.testing.assert_allclose(gradient, np.sum(scale * slope), atol=1e-4 * np.sum(np.abs(scale * slope)))
+    np.testing.assert_allclose(gradient, np.sum(scale * slope), atol=1e-3 * np.sum(np.abs(scale * slope)))
 
 
 def test_eager_gradients_and_batches_are_those_of_compiled_programs():
