@@ -141,3 +141,44 @@ def rotation_from_quaternion(wxyz: Float[np.ndarray, "*batch 4"]) -> Float[np.nd
     ]
     # The entries are stacked as (3, 3, reversed batch); the transpose restores the batch and the order of the rows.
     return np.array(rows).swapaxes(0, 1).T
+
+
+def move_pose(pose: jaxlie.SE3, twist: Float[Array, "6"], center: Float[Array, "3"]) -> jaxlie.SE3:
+    """The pose that maps a to c + exp(ω)(T a − c) + v; v in metres, ω in radians."""
+    turn = jaxlie.SO3.exp(twist[3:])
+    rotation = (turn @ pose.rotation()).normalize()
+    translation = center + turn @ (pose.translation() - center) + twist[:3]
+    return cast_pose(jaxlie.SE3.from_rotation_and_translation(rotation, translation), pose.wxyz_xyz.dtype)
+
+
+def adjoint_to_center(pose: jaxlie.SE3, center: Float[Array, "3"]) -> Float[Array, "6 6"]:
+    """(6, 6) matrix from ξ of T exp(ξ), in the source's frame, to the twist about the centre in the target's frame."""
+    to_center = jaxlie.SE3.from_rotation_and_translation(jaxlie.SO3.identity(), -center) @ pose
+    return to_center.adjoint().astype(pose.wxyz_xyz.dtype)
+
+
+def adjoint_to_source(pose: jaxlie.SE3, center: Float[Array, "3"]) -> Float[Array, "6 6"]:
+    """Inverse of `adjoint_to_center`."""
+    to_center = jaxlie.SE3.from_rotation_and_translation(jaxlie.SO3.identity(), -center) @ pose
+    return to_center.inverse().adjoint().astype(pose.wxyz_xyz.dtype)
+
+
+def units(radius: Float[Array, ""]) -> Float[Array, "6"]:
+    """Factors that convert a twist from units of the radius to metres; radians stay."""
+    return jnp.stack([radius] * 3 + [jnp.ones_like(radius)] * 3)
+
+
+def from_center(offset: Float[Array, "3"], radius: Float[Array, ""], other: Float[Array, ""]) -> Float[Array, "6 6"]:
+    """Twists about a point at `offset` from the centre, lengths in units of `other`, from those about the centre."""
+    cross = jnp.cross(jnp.eye(3, dtype=offset.dtype), offset[None], axis=1).T
+    top = jnp.concatenate([jnp.eye(3, dtype=offset.dtype) * radius, cross], axis=1) / other
+    return jnp.concatenate([top, jnp.eye(6, dtype=offset.dtype)[3:]])
+
+
+def translation_adjoint(offset: Array | np.ndarray) -> Array | np.ndarray:
+    """Adjoint (6, 6) of a translation by `offset`, for twists (v, ω)."""
+    xp = np if isinstance(offset, np.ndarray) else jnp
+    zero = xp.zeros_like(offset[0])
+    x, y, z = offset
+    cross = xp.stack([xp.stack([zero, -z, y]), xp.stack([z, zero, -x]), xp.stack([-y, x, zero])])
+    return xp.block([[xp.eye(3), cross], [xp.zeros((3, 3)), xp.eye(3)]])

@@ -13,6 +13,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from mcgicp_jax._compute.concrete import AnyArray, namespace
+
 
 def symmetric_from_matrix(matrix: Float[Array, "N 3 3"]) -> Float[Array, "6 N"]:
     matrix = 0.5 * (matrix + matrix.swapaxes(-1, -2))
@@ -247,3 +249,27 @@ def symmetric_product(a: Float[Array, "6 N"], b: Float[Array, "6 N"]) -> Float[A
     axes = jnp.eye(3, dtype=a.dtype)[:, :, None]
     columns = [multiply(a, multiply(b, jnp.broadcast_to(axis, (3, a.shape[1])))) for axis in axes]
     return jnp.stack([0.5 * (columns[j][i] + columns[i][j]) for i in range(3) for j in range(i, 3)])
+
+
+def inverse_3(matrices: Float[AnyArray, "*n 3 3"]) -> Float[AnyArray, "*n 3 3"]:
+    """Inverses of symmetric positive definite matrices, in closed form: the determinant over cross products of rows."""
+    xp = namespace(matrices)
+    matrices = 0.5 * (matrices + matrices.swapaxes(-1, -2))
+    # So that the determinant of variances of 1e-10 does not underflow float32.
+    size = xp.einsum("...ii->...", matrices)[..., None, None]
+    first, second, third = (matrices[..., i, :] / size[..., 0] for i in range(3))
+    rows = xp.stack([xp.cross(second, third), xp.cross(third, first), xp.cross(first, second)], axis=-2)
+    return rows / (xp.sum(rows[..., 0, :] * first, axis=-1)[..., None, None] * size)
+
+
+def inverse_6(matrix: Float[AnyArray, "6 6"]) -> Float[AnyArray, "6 6"]:
+    """Inverse of a symmetric positive definite matrix by blocks."""
+    xp = namespace(matrix)
+    matrix = 0.5 * (matrix + matrix.T)
+    mixed, corner = matrix[:3, 3:], inverse_3(matrix[3:, 3:])
+    ratio = mixed @ corner
+    first = inverse_3(matrix[:3, :3] - ratio @ mixed.T)
+    across = -first @ ratio
+    return xp.concatenate(
+        [xp.concatenate([first, across], axis=1), xp.concatenate([across.T, corner - ratio.T @ across], axis=1)]
+    )

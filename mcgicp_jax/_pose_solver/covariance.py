@@ -25,12 +25,13 @@ from jaxtyping import Array, Bool, Float, Int
 from mcgicp_jax._compute.concrete import AnyArray, AnyScalar, namespace
 from mcgicp_jax._local_geometry.records import noise_of, normal_of, points_of, reach_of, roughness_of
 from mcgicp_jax._math import symmetric_matrices as alg
+from mcgicp_jax._math.poses import adjoint_to_source, units
 from mcgicp_jax._math.robust_kernels import AbstractKernel
 from mcgicp_jax._math.statistics import cell_numbers, median
 from mcgicp_jax._methods.base import AbstractMethod
 from mcgicp_jax._pose_solver.degeneracy import Directions
 from mcgicp_jax._pose_solver.sums import Matched, forces_at, mean_observability, move_rows, powers
-from mcgicp_jax._pose_solver.update import adjoint_to_source, twist_form, units
+from mcgicp_jax._pose_solver.update import twist_form
 from mcgicp_jax._search.base import Rows
 from mcgicp_jax._terms.photometric import Term
 

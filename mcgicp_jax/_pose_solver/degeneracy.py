@@ -16,8 +16,9 @@ import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float
 
+from mcgicp_jax._math.poses import adjoint_to_source, units
 from mcgicp_jax._pose_solver.sums import Sums
-from mcgicp_jax._pose_solver.update import adjoint_to_source, twist_form, units
+from mcgicp_jax._pose_solver.update import twist_form
 
 # Least observed fraction of the points' squared motion for a direction to count as constrained. Geometry: measured
 # below 0.0016 in flat scenes (posters on a wall, a road, a table with 2 mm noise) and from 0.1 on in others; GICP's

@@ -13,7 +13,7 @@ import lineax as lx
 import optimistix as optx
 from jaxtyping import Array, Bool, Float, Int
 
-from mcgicp_jax._math.poses import cast_pose
+from mcgicp_jax._math.poses import units
 from mcgicp_jax._math.robust_kernels import AbstractKernel
 from mcgicp_jax._methods.base import AbstractMethod
 from mcgicp_jax._pose_solver.pose_measurements import Fusion
@@ -204,31 +204,6 @@ def _rotation_vector(twice: Float[Array, "3"]) -> Float[Array, "3"]:
     turned = square > 0
     tangent = jnp.sqrt(jnp.where(turned, square, 1))
     return twice * jnp.where(turned, jnp.arctan(tangent) / tangent, 1)
-
-
-def move_pose(pose: jaxlie.SE3, twist: Float[Array, "6"], center: Float[Array, "3"]) -> jaxlie.SE3:
-    """The pose that maps a to c + exp(ω)(T a − c) + v; v in metres, ω in radians."""
-    turn = jaxlie.SO3.exp(twist[3:])
-    rotation = (turn @ pose.rotation()).normalize()
-    translation = center + turn @ (pose.translation() - center) + twist[:3]
-    return cast_pose(jaxlie.SE3.from_rotation_and_translation(rotation, translation), pose.wxyz_xyz.dtype)
-
-
-def adjoint_to_center(pose: jaxlie.SE3, center: Float[Array, "3"]) -> Float[Array, "6 6"]:
-    """(6, 6) matrix from ξ of T exp(ξ), in the source's frame, to the twist about the centre in the target's frame."""
-    to_center = jaxlie.SE3.from_rotation_and_translation(jaxlie.SO3.identity(), -center) @ pose
-    return to_center.adjoint().astype(pose.wxyz_xyz.dtype)
-
-
-def adjoint_to_source(pose: jaxlie.SE3, center: Float[Array, "3"]) -> Float[Array, "6 6"]:
-    """Inverse of `adjoint_to_center`."""
-    to_center = jaxlie.SE3.from_rotation_and_translation(jaxlie.SO3.identity(), -center) @ pose
-    return to_center.inverse().adjoint().astype(pose.wxyz_xyz.dtype)
-
-
-def units(radius: Float[Array, ""]) -> Float[Array, "6"]:
-    """Factors that convert a twist from units of the radius to metres; radians stay."""
-    return jnp.stack([radius] * 3 + [jnp.ones_like(radius)] * 3)
 
 
 class Root(eqx.Module):

@@ -7,14 +7,12 @@ from typing import Any
 
 import equinox as eqx
 import jax
-import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array
 
 from mcgicp_jax._clouds.point_cloud import PointCloud
 from mcgicp_jax._compute.concrete import constant, is_concrete, namespace
 from mcgicp_jax._compute.lazy import Deferred
-from mcgicp_jax._math.poses import se3_from_matrix
+from mcgicp_jax._math.poses import se3_from_matrix, translation_adjoint
 from mcgicp_jax._pose_solver.degeneracy import Directions
 from mcgicp_jax._registration.result import Registration, pose_in_user_frame
 from mcgicp_jax._registration.step import Assessment, State
@@ -99,12 +97,3 @@ def _uncertainty(assessment: Assessment, state: State, origin: Any) -> tuple[Any
             return covariance, deviations
         from_centred = translation_adjoint(origin)
         return from_centred @ covariance @ from_centred.T, deviations
-
-
-def translation_adjoint(offset: Array | np.ndarray) -> Array | np.ndarray:
-    """Adjoint (6, 6) of a translation by `offset`, for twists (v, ω)."""
-    xp = np if isinstance(offset, np.ndarray) else jnp
-    zero = xp.zeros_like(offset[0])
-    x, y, z = offset
-    cross = xp.stack([xp.stack([zero, -z, y]), xp.stack([z, zero, -x]), xp.stack([-y, x, zero])])
-    return xp.block([[xp.eye(3), cross], [xp.zeros((3, 3)), xp.eye(3)]])

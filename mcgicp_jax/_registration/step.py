@@ -14,6 +14,7 @@ from jaxtyping import Array, Bool, Float, Int
 from mcgicp_jax._compute.concrete import AnyArray, AnyScalar
 from mcgicp_jax._compute.lazy import Deferred
 from mcgicp_jax._local_geometry.records import Surface
+from mcgicp_jax._math.poses import adjoint_to_center, move_pose, units
 from mcgicp_jax._math.robust_kernels import AbstractKernel
 from mcgicp_jax._methods.base import AbstractMethod
 from mcgicp_jax._pose_solver.covariance import Moments, sandwich
@@ -21,7 +22,7 @@ from mcgicp_jax._pose_solver.degeneracy import Directions, directions_at_source,
 from mcgicp_jax._pose_solver.fusion import fused_covariance, fused_update
 from mcgicp_jax._pose_solver.pose_measurements import Fusion
 from mcgicp_jax._pose_solver.sums import Sums
-from mcgicp_jax._pose_solver.update import adjoint_to_center, move_pose, solve_update, units
+from mcgicp_jax._pose_solver.update import solve_update
 from mcgicp_jax._registration.result import Status
 
 # Statuses while the loop runs. COARSE: the coarse phase, with every `coarse_stride`-th source point and the larger
