@@ -21,7 +21,7 @@ from mcgicp_jax._math.robust_kernels import AbstractKernel
 from mcgicp_jax._methods.base import AbstractMethod
 from mcgicp_jax._registration.options import ROTATION_TOLERANCE
 from mcgicp_jax._registration.options import Options as Chosen
-from mcgicp_jax._registration.register_pair import default_distances
+from mcgicp_jax._registration.settings import default_distances
 from mcgicp_jax.io.formats import READERS, WRITERS, by_suffix
 
 MethodName: TypeAlias = Literal[

@@ -33,6 +33,7 @@ from mcgicp_jax._cli.options import (
 )
 from mcgicp_jax._methods.base import AbstractMethod
 from mcgicp_jax._pose_solver.degeneracy import describe
+from mcgicp_jax._registration.settings import matching_spacing
 
 Source: TypeAlias = Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="SOURCE")]
 Target: TypeAlias = Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="TARGET")]
@@ -100,7 +101,7 @@ class PreparedPair:
 
     def cells(self, method: AbstractMethod) -> tuple[float, ...]:
         """Sizes of the cells, metres, for methods that need any: with 8 spacings, a cell has some tens of points."""
-        spacing = float(method.spacing(self.target))
+        spacing = float(matching_spacing(method, self.target))
         return self.options.scales or tuple(float(f"{times * spacing:.2g}") for times in (32, 16, 8))
 
     def draw(self, results: dict[MethodName, mcg.Registration]) -> None:

@@ -18,8 +18,8 @@ from scipy.sparse import csr_array
 from mcgicp_jax._clouds.point_cloud import PointCloud
 from mcgicp_jax._compute.blocks import map_rows
 from mcgicp_jax._compute.concrete import AnyScalar
-from mcgicp_jax._local_geometry.covariances import Offsets, gatherer, weighted_covariance
-from mcgicp_jax._local_geometry.records import Neighborhoods
+from mcgicp_jax._local_geometry.local_geometry import Offsets, weighted_covariance
+from mcgicp_jax._local_geometry.neighborhoods import Neighborhoods, gatherer
 from mcgicp_jax._math import symmetric_matrices as alg
 
 # Radii in voxels, of neighbours for normals and for histograms: those of Open3D's examples.

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from typing import Any, TypeAlias
 
@@ -26,17 +26,17 @@ from mcgicp_jax._global_registration.robust_pose_fit import (
     hypotheses,
     refined,
 )
-from mcgicp_jax._math.poses import Pose, nearest_rotation
-from mcgicp_jax._methods.base import GICP, AbstractMethod, MultiChannelGICP
+from mcgicp_jax._math.poses import nearest_rotation
+from mcgicp_jax._methods.gicp import GICP
+from mcgicp_jax._methods.multichannel_gicp import MultiChannelGICP
 from mcgicp_jax._registration.options import Options
-from mcgicp_jax._registration.result import Registration, is_usable
+from mcgicp_jax._registration.register_pair import register_pair
+from mcgicp_jax._registration.result import is_usable
 from mcgicp_jax._search.base import Rows
 from mcgicp_jax._search.kd_tree import KDTreeSearch
 
 # Rows of the source and rows of the target that match.
 RowMatches: TypeAlias = tuple[Any, Any]
-# `register_with`.
-Registering: TypeAlias = Callable[[PointCloud, PointCloud, AbstractMethod, Pose, Options], Registration]
 
 # Voxels of the smaller cloud, of the larger one, and largest fraction of the points: with 6,000 voxels a scene has
 # about a thousand mutual matches, and 20,000 bound the time. With 5,000 to 8,000 the same real pairs are found. Half of
@@ -117,14 +117,38 @@ class GlobalPose:
         )
 
 
-def find_pose(
+def global_pose(
     source: PointCloud | Values,
     target: PointCloud | Values,
-    voxel_size: float | None,
-    correspondences: RowMatches | None,
-    register: Registering,
+    *,
+    voxel_size: float | None = None,
+    correspondences: RowMatches | None = None,
 ) -> GlobalPose:
-    """`global_pose`, with the function that registers two clouds from the poses to verify."""
+    """Estimate the pose between two clouds without an initial pose. To refine it, pass its `matrix` to `register`.
+
+    The steps are: (1) describe each voxel by FPFH (Rusu et al. 2009) and, if both clouds have the same number of
+    channels, by the means and standard deviations of the channels around it; (2) match voxels that are mutual nearest
+    neighbours in these features, of which most may be wrong; (3) compute poses from triplets of matches that agree with
+    each other; (4) refine them by graduated non-convexity (Yang et al. 2020); (5) verify the best by a coarse
+    registration, which uses the channels. The same clouds give the same result, to the last bit. Runs on the host, with
+    programs whose shapes do not depend on the clouds.
+
+    Args:
+        source, target: raw or preprocessed clouds, or (N, 3) arrays in metres; they may lie anywhere, in any rotation.
+        voxel_size: metres. By default the smallest size at which the smaller cloud has at most 6,000 voxels, the larger
+            one at most 20,000, and each at most half as many voxels as points.
+        correspondences: integer arrays (n,) of source rows and (n,) of target rows that replace steps 1 and 2, such as
+            those of `image_matches`. At most 1,024 matches are used, evenly spaced; most may be wrong.
+
+    Returns:
+        The pose, with `success` to tell whether to trust it.
+
+    Raises:
+        ValueError: if a cloud has fewer than four finite points, or an argument is malformed. Failures on well-formed
+            clouds show in `success`.
+    Warns:
+        UserWarning: if points with NaN or infinity are left out.
+    """
     if voxel_size is not None:
         check_positive("voxel_size", voxel_size)
     source, target = _cloud("source", source), _cloud("target", target)
@@ -142,7 +166,7 @@ def find_pose(
             matches = _matches_of_features(*prepared, size)
         else:
             matches = _given_matches(source, target, chosen, centers)
-        return _answer(matches, prepared, centers, size, register)
+        return _answer(matches, prepared, centers, size)
 
 
 def _cloud(name: str, cloud: PointCloud | Values) -> PointCloud:
@@ -323,14 +347,13 @@ def _answer(
     clouds: tuple[PointCloud, PointCloud],
     centers: tuple[np.ndarray, ...],
     voxel_size: float,
-    register: Registering,
 ) -> GlobalPose:
     points = np.asarray(clouds[0].points, np.float64)
     # The root mean square distance from the centre, about which the poses turn.
     radius = float(np.sqrt(np.mean(np.sum(points * points, axis=1))))
     poses = hypotheses(matches, np.float32(voxel_size), np.float32(radius))
     poses = jax.tree.map(np.asarray, refined(poses, matches, np.float32(voxel_size)))
-    found = _verified(poses, matches, clouds, voxel_size, radius, register)
+    found = _verified(poses, matches, clouds, voxel_size, radius)
     num_matches = int(matches.valid.sum())
     if not found:
         return GlobalPose(np.eye(4), False, False, 0, num_matches, 0.0, None, voxel_size)
@@ -363,7 +386,6 @@ def _verified(
     clouds: tuple[PointCloud, PointCloud],
     voxel_size: float,
     radius: float,
-    register: Registering,
 ) -> list[Candidate]:
     """The best pose and its rivals, registered; without repetitions."""
     near = [np.ascontiguousarray(np.asarray(cloud.neighbors)[:, :_NUM_NEIGHBORS]) for cloud in clouds]
@@ -379,7 +401,7 @@ def _verified(
         if any(_same(matrix, other, voxel_size, radius) for other in started):
             continue
         started.append(matrix)
-        result = register(source, target, method, matrix, options)
+        result = register_pair(source, target, method, matrix, options)
         # A registration that fails, as of clouds with a few coincident points, is no evidence against the matches.
         matrix = np.asarray(result.matrix) if is_usable(result) else matrix
         if not any(_same(matrix, other.matrix, voxel_size, radius) for other in found):

@@ -15,8 +15,8 @@ from mcgicp_jax._clouds.preprocess import MIN_POINTS, finite_rows, preprocess, v
 from mcgicp_jax._compute.argument_checks import check_integer, check_positive, is_number
 from mcgicp_jax._compute.concrete import AnyArray, namespace
 from mcgicp_jax._math import symmetric_matrices as alg
-from mcgicp_jax._methods.base import GICP
-from mcgicp_jax._methods.surface import covariances_of
+from mcgicp_jax._methods.gicp import GICP
+from mcgicp_jax._methods.surfaces import covariances_of
 
 # Fewest points in a cell, and smallest ratio of its eigenvalues: those of the Point Cloud Library.
 _MIN_POINTS, _MIN_RATIO = 6, 0.01

@@ -31,9 +31,10 @@ from mcgicp_jax._compute.size_classes import size_class
 from mcgicp_jax._compute.threads import num_cores, with_settings
 from mcgicp_jax._math.poses import Pose, pose_matrix
 from mcgicp_jax._methods.base import AbstractMethod
+from mcgicp_jax._pairs.register import register_from, start_from_anywhere
+from mcgicp_jax._registration.make_result import registration_of
 from mcgicp_jax._registration.options import Options, check_method, options_of
-from mcgicp_jax._registration.outcome import registration_of
-from mcgicp_jax._registration.register_pair import pose_problem, register_with, start_from_anywhere
+from mcgicp_jax._registration.register_pair import pose_problem
 from mcgicp_jax._registration.result import Registration, Status, computed
 from mcgicp_jax._registration.step import Problem
 from mcgicp_jax._registration.vectorized import run_problems
@@ -180,7 +181,7 @@ class _Job:
         try:
             source, target = self.ready("source", pair.source), self.ready("target", pair.target)
             options = replace(self.options, search=self.chosen_search())
-            result = register_with(source, target, self.method, pair.init, options)
+            result = register_from(source, target, self.method, pair.init, options)
         except ValueError as error:
             return _invalid(pair, error)
         return _Outcome(pair.index, computed(result))
@@ -195,7 +196,7 @@ class _Job:
                 if not start.success:
                     return _Outcome(pair.index, Registration.without_pose(Status.TOO_FEW_CORRESPONDENCES))
                 init = start.matrix
-            problem = pose_problem(source, target, self.method, init, self.options, num_threads=1)
+            problem, _ = pose_problem(source, target, self.method, init, self.options, num_threads=1)
             problem = _padded(problem, size_class(max(len(source.points), len(target.points))))
         except ValueError as error:
             return _invalid(pair, error)
@@ -214,9 +215,10 @@ class _Job:
                         yield problem
 
             limit = self.options.max_iterations
-            for key, state, assessment, history in run_problems(problems(), self.chosen_search(), limit):
-                result = registration_of(state, assessment, history, key.source, key.target)
-                yield _Outcome(key.index, result)
+            for ended in run_problems(problems(), self.chosen_search(), limit):
+                pair = ended.key
+                result = registration_of(ended.state, ended.assessment, ended.history, pair.source, pair.target)
+                yield _Outcome(pair.index, result)
             yield from rejected
 
 

@@ -78,7 +78,7 @@ def fuse(
 
 def fused_update(pose: jaxlie.SE3, sums: Sums, directions: Directions, fusion: Fusion) -> tuple[Directions, Update]:
     """One step of Newton's method on P s + γ = 0, with the matches and M fixed; and what constrains the directions."""
-    radius, dtype = fusion.radius, sums.totals.dtype
+    radius, dtype = fusion.radius, sums.center.dtype
     pull, known = fusion.pull(pose.rotation().as_matrix().astype(dtype), pose.translation())
     outwards = from_center(sums.center - fusion.center, radius, sums.radius)
     back = from_center(fusion.center - sums.center, sums.radius, radius)
@@ -87,7 +87,7 @@ def fused_update(pose: jaxlie.SE3, sums: Sums, directions: Directions, fusion: F
     unit_information = twist_form(sums.stiffness, sums.radius)
     # Force and energy of twists in units of the radius: of `fusion` on the left, of the sums on the right.
     ratio = sums.radius / radius
-    score = outwards.T @ wrench(sums.first, sums.radius) * ratio
+    score = outwards.T @ wrench(sums.force, sums.radius) * ratio
     stiffness = outwards.T @ (unit_information * sums.radius**2) @ outwards / radius
     # The solution waits for the eigenvectors of the directions: two batched LAPACK calls at once can deadlock.
     basis, _ = jax.lax.optimization_barrier((fusion.basis, directions.twists))

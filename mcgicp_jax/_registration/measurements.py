@@ -11,6 +11,7 @@ import jaxlie
 import numpy as np
 from jaxtyping import Float
 
+from mcgicp_jax._clouds.origins import centred_pose
 from mcgicp_jax._clouds.point_cloud import PointCloud
 from mcgicp_jax._compute.concrete import AnyArray, computed_now, constant, is_concrete, namespace
 from mcgicp_jax._math.poses import matrices_of, translation_adjoint
@@ -18,8 +19,7 @@ from mcgicp_jax._pose_solver.covariance import Moments
 from mcgicp_jax._pose_solver.degeneracy import Directions
 from mcgicp_jax._pose_solver.fusion import fuse
 from mcgicp_jax._pose_solver.pose_measurements import Fusion, Prior, TiePoints, form_at
-from mcgicp_jax._registration.cost import centred_pose
-from mcgicp_jax._registration.on_host import as_float64
+from mcgicp_jax._registration.assessment import as_float64
 from mcgicp_jax._registration.step import State
 
 # Largest difference of two correlations of a symmetric matrix, as of float32 numbers; and the least eigenvalue of a

@@ -13,8 +13,9 @@ from mcgicp_jax._methods.base import AbstractMethod
 from mcgicp_jax._pose_graph.graph import Edge, PoseGraph
 from mcgicp_jax._pose_graph.optimize import motion_covariances, optimize_poses
 from mcgicp_jax._registration.options import Options
-from mcgicp_jax._registration.register_pair import default_distances, register_with
+from mcgicp_jax._registration.register_pair import register_pair
 from mcgicp_jax._registration.result import Registration, Status
+from mcgicp_jax._registration.settings import default_distances, matching_spacing
 
 # Least overlap of a pair that makes an edge: with less, a wrong local minimum looks like a right one.
 LEAST_OVERLAP = 0.4
@@ -134,10 +135,10 @@ class Trajectory:
         sigma = float(np.sqrt(np.linalg.eigvalsh(covariance[:3, :3])[-1]))
         given: Any = self._options.max_distance
         if given is None:
-            given = default_distances(self._method.spacing(self._clouds[i]), self._clouds[i])
+            given = default_distances(matching_spacing(self._method, self._clouds[i]), self._clouds[i])
         coarse, fine = given if np.ndim(given) else (given, given)
         options = replace(self._options, max_distance=(max(float(coarse), _DEVIATIONS * sigma), float(fine)))
-        return edge_from(i, j, register_with(self._clouds[j], self._clouds[i], self._method, init, options), loop=True)
+        return edge_from(i, j, register_pair(self._clouds[j], self._clouds[i], self._method, init, options), loop=True)
 
 
 def _log_volume(covariances: Float[np.ndarray, "k 6 6"]) -> Float[np.ndarray, "k"]:

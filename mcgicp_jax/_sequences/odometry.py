@@ -13,12 +13,13 @@ from mcgicp_jax._clouds.point_cloud import PointCloud, Values
 from mcgicp_jax._clouds.preprocess import check_preprocessing, preprocess
 from mcgicp_jax._clouds.voxel_map import VoxelMap
 from mcgicp_jax._compute.argument_checks import check_positive
+from mcgicp_jax._global_registration.global_pose import global_pose
 from mcgicp_jax._local_geometry.spacing_and_noise import point_spacing
 from mcgicp_jax._math.poses import Pose, nearest_rotation, pose_matrix
 from mcgicp_jax._methods.base import AbstractMethod
 from mcgicp_jax._pose_graph.graph import PoseGraph
 from mcgicp_jax._registration.options import Options, check_method, options_of
-from mcgicp_jax._registration.register_pair import global_pose, register_with
+from mcgicp_jax._registration.register_pair import register_pair
 from mcgicp_jax._registration.result import Registration, Status, computed, is_usable
 from mcgicp_jax._sequences.loop_closure import Trajectory
 from mcgicp_jax.datasets import Frame
@@ -165,10 +166,10 @@ class _Sensor:
     def _located(self, cloud: PointCloud, before: PointCloud) -> Registration:
         """Update motion and pose by a registration."""
         if self.world is None:
-            result = register_with(cloud, before, self.method, self.motion, self.options)
+            result = register_pair(cloud, before, self.method, self.motion, self.options)
         else:
             target = _target(self.world.cloud(), self.method, self.options, self.num_neighbors)
-            result = register_with(cloud, target, self.method, self.pose @ self.motion, self.options)
+            result = register_pair(cloud, target, self.method, self.pose @ self.motion, self.options)
         found = None
         if self.places is not None:
             found = self.places.corrected(cloud, result, self.method, self.options, self.num_neighbors)
@@ -202,7 +203,7 @@ class _Places:
         start = global_pose(cloud, known)
         if start.success:
             target = _target(known, method, options, num_neighbors)
-            found = register_with(cloud, target, method, start.matrix, options)
+            found = register_pair(cloud, target, method, start.matrix, options)
             if is_usable(found) and (self._lost or not rests or float(np.asarray(found.overlap)) > overlap):
                 self._lost = False
                 return found

@@ -18,7 +18,7 @@ from jaxtyping import Float, Int
 from mcgicp_jax._clouds.point_cloud import PointCloud
 from mcgicp_jax._math.poses import Pose, pose_matrix
 from mcgicp_jax._methods.base import AbstractMethod
-from mcgicp_jax._methods.surface import covariances_of
+from mcgicp_jax._methods.surfaces import covariances_of
 from mcgicp_jax._pose_graph.graph import WORLD
 from mcgicp_jax._pose_graph.optimize import PoseGraphResult
 from mcgicp_jax._pose_solver.degeneracy import CHANNELS_HOLD, GEOMETRY_HOLDS, shares
