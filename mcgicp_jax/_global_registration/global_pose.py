@@ -30,8 +30,7 @@ from mcgicp_jax._math.poses import Pose, nearest_rotation
 from mcgicp_jax._methods.base import GICP, AbstractMethod, MultiChannelGICP
 from mcgicp_jax._registration.options import Options
 from mcgicp_jax._registration.result import Registration, is_usable
-from mcgicp_jax._search.base import Rows
-from mcgicp_jax._search.kd_tree import KDTreeSearch
+from mcgicp_jax._search.positions import nearest_in_position
 
 # Rows of the source and rows of the target that match.
 RowMatches: TypeAlias = tuple[Any, Any]
@@ -410,11 +409,4 @@ def _num_inliers(matrix: Float[np.ndarray, "4 4"], matches: Matches, voxel_size:
 
 def _overlap(matrix: Float[np.ndarray, "4 4"], source: PointCloud, target: PointCloud, voxel_size: float) -> float:
     moved = np.asarray(source.points, np.float64) @ matrix[:3, :3].T + matrix[:3, 3]
-    rows = [
-        Rows(points=np.asarray(points), descriptors=np.zeros((len(points), 0)), valid=np.ones(len(points), bool))
-        for points in (moved, np.asarray(target.points))
-    ]
-    limit = TOLERANCE * voxel_size
-    (nearest,) = KDTreeSearch().index(rows[1]).nearest(np.array([1.0, 0, 0, 0, 0, 0, 0]), rows[0], limit)
-    distances = np.linalg.norm(np.asarray(target.points)[nearest] - moved, axis=1)
-    return float(np.mean((nearest >= 0) & (distances <= limit)))
+    return float(np.mean(nearest_in_position(moved, target.points, TOLERANCE * voxel_size) >= 0))

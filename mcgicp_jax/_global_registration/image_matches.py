@@ -7,15 +7,14 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, Int
 
-from mcgicp_jax._search.base import Rows
-from mcgicp_jax._search.kd_tree import KDTreeSearch
+from mcgicp_jax._search.positions import nearest_in_position
 from mcgicp_jax.datasets import Frame
 
 # Largest ratio of the distances to the best and the second best match (Lowe 2004).
 _RATIO = 0.8
 # Pixels: a key point belongs to the cloud's point nearest in the image, if it is as near as this. Points of a depth
 # image are a pixel apart, rings of a LiDAR up to ten.
-_NEAR = 4.0
+_MAX_PIXELS = 4.0
 
 
 def image_matches(source: Frame, target: Frame) -> tuple[Int[np.ndarray, "n"], Int[np.ndarray, "n"]]:
@@ -73,18 +72,8 @@ def _matched(
 
 def _nearest(frame: Frame, pixels: Float[np.ndarray, "n 2"]) -> Int[np.ndarray, "n"]:
     """The row of the cloud nearest to each pixel, −1 for none."""
-    places = np.asarray(frame.pixels, float)
-    seen = np.isfinite(places).all(axis=1)
-    flat = [np.column_stack([each, np.zeros(len(each))]) for each in (np.where(seen[:, None], places, 0), pixels)]
-    rows, queries = (
-        Rows(points=points, descriptors=np.zeros((len(points), 0)), valid=valid)
-        for points, valid in zip(flat, (seen, np.ones(len(pixels), bool)), strict=True)
-    )
-    if not seen.any() or not len(pixels):
-        return np.full(len(pixels), -1)
-    (nearest,) = KDTreeSearch().index(rows).nearest(np.array([1.0, 0, 0, 0, 0, 0, 0]), queries, _NEAR)
-    distances = np.linalg.norm(places[nearest] - pixels, axis=1)
-    return np.where((nearest >= 0) & (distances <= _NEAR), nearest, -1).astype(np.int64)
+    queries, points = (np.pad(np.asarray(each, float), ((0, 0), (0, 1))) for each in (pixels, frame.pixels))
+    return nearest_in_position(queries, points, _MAX_PIXELS).astype(np.int64)
 
 
 def _opencv() -> Any:

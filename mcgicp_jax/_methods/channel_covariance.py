@@ -12,8 +12,7 @@ from mcgicp_jax._clouds.point_cloud import PointCloud
 from mcgicp_jax._clouds.preprocess import preprocess
 from mcgicp_jax._local_geometry.spacing_and_noise import point_spacing
 from mcgicp_jax._math.poses import Pose, pose_matrix
-from mcgicp_jax._search.base import Rows
-from mcgicp_jax._search.kd_tree import KDTreeSearch
+from mcgicp_jax._search.positions import nearest_in_position
 
 # Fewest differences per channel: the relative standard error of a variance from n of them is √(2/n), 45 % for 10.
 _MIN_DIFFERENCES = 10
@@ -82,20 +81,13 @@ def _differences(
     """Channel differences of the matches, 0 where either value is missing, and the mask of those present."""
     matrix = np.linalg.inv(target_pose) @ source_pose
     moved, fixed = source.transform(matrix).unpad(), target.unpad()
-    rows = [
-        Rows(points=np.asarray(cloud.points), descriptors=np.zeros((len(cloud), 0)), valid=np.ones(len(cloud), bool))
-        for cloud in (moved, fixed)
-    ]
-    identity = np.array([1.0, 0, 0, 0, 0, 0, 0])
-    (nearest,) = KDTreeSearch().index(rows[1]).nearest(identity, rows[0], max_distance)
-    distances = np.linalg.norm(np.asarray(fixed.points)[nearest] - np.asarray(moved.points), axis=1)
-    near = (nearest >= 0) & (distances <= max_distance)
-    matched = [(moved, np.flatnonzero(near)), (fixed, nearest[near])]
-    known = np.ones((near.sum(), moved.channels.shape[1]), bool)
-    for cloud, chosen in matched:
+    nearest = nearest_in_position(moved.points, fixed.points, max_distance)
+    matched = [(moved, np.flatnonzero(nearest >= 0)), (fixed, nearest[nearest >= 0])]
+    known = np.ones((len(matched[0][1]), moved.channels.shape[1]), bool)
+    for cloud, rows in matched:
         if cloud.channel_valid is not None:
-            known &= np.asarray(cloud.channel_valid)[chosen]
-    values = [np.asarray(cloud.channels, np.float64)[chosen] for cloud, chosen in matched]
+            known &= np.asarray(cloud.channel_valid)[rows]
+    values = [np.asarray(cloud.channels, np.float64)[rows] for cloud, rows in matched]
     return np.where(known, values[0] - values[1], 0), known
 
 

@@ -14,7 +14,7 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float, Int
 
 from mcgicp_jax._compute.size_classes import size_class
-from mcgicp_jax._search.base import AbstractIndex, AbstractSearch, Rows, on_host
+from mcgicp_jax._search.base import IDENTITY, AbstractIndex, AbstractSearch, Rows, on_host, rows_of
 from mcgicp_jax._search.kd_tree import KDTreeSearch
 
 
@@ -47,9 +47,8 @@ class DenseSearch(AbstractSearch):
         return _nearest(pose, source, target, num_candidates)
 
     def neighbors(self, points: Float[np.ndarray, "N 3"], num_neighbors: int) -> Int[np.ndarray, "N k"]:
-        rows = Rows(points, np.zeros((len(points), 0), points.dtype), np.ones(len(points), bool))
-        identity = np.array([1, 0, 0, 0, 0, 0, 0], points.dtype)
-        return self.index(rows).nearest(identity, rows, np.inf, num_neighbors).T
+        rows = rows_of(points)
+        return self.index(rows).nearest(IDENTITY, rows, np.inf, num_neighbors).T
 
 
 class DenseIndex(AbstractIndex):

@@ -8,9 +8,7 @@ from pose to pose, and the callback with its cache inside transformations. A sub
 from __future__ import annotations
 
 import abc
-import collections
 import hashlib
-import threading
 from functools import partial
 from typing import Any
 
@@ -21,6 +19,7 @@ import numpy as np
 import scipy.spatial
 from jaxtyping import Array, Bool, Float, Int
 
+from mcgicp_jax._compute.cache import MAX_ROWS, Cache
 from mcgicp_jax._search.base import AbstractSearch, Rows, on_host
 from mcgicp_jax._search.nearest_with_ties import Tree
 from mcgicp_jax._search.pykdtree import MOST_DIMENSIONS, PyKDTree, has_pykdtree
@@ -28,8 +27,6 @@ from mcgicp_jax._search.tree_index import LARGEST_UNORDERED, TreeIndex
 
 # Bytes. JAX (jaxlib 0.10.2) copies smaller arrays for a callback in the calling thread, up to 100 KiB; see `_pieces`.
 _LARGEST_PIECE = 64 * 1024
-# Total number of rows of the trees cached for callbacks: hundreds of scans, some hundred megabytes.
-_CACHED_ROWS = 2_000_000
 
 
 class AbstractTreeSearch(AbstractSearch):
@@ -146,33 +143,16 @@ def _scipy_tree(points: Float[np.ndarray, "M D"]) -> scipy.spatial.cKDTree:
     return scipy.spatial.cKDTree(points, leafsize=32, balanced_tree=False, compact_nodes=True)
 
 
-class _IndexCache:
-    """Least-recently-used cache of trees by content: a pure callback keeps no state, yet builds each tree only once."""
-
-    def __init__(self, rows: int):
-        self._rows = rows
-        self._lock = threading.Lock()
-        self._indices: collections.OrderedDict[bytes, TreeIndex] = collections.OrderedDict()
-
-    def get(self, search: AbstractTreeSearch, target: Rows) -> TreeIndex:
-        arrays = jax.tree.leaves(target)
-        digest = hashlib.blake2b(repr([search, *((array.shape, array.dtype) for array in arrays)]).encode())
-        for array in arrays:
-            digest.update(np.ascontiguousarray(array).data)
-        key = digest.digest()
-        with self._lock:
-            if key in self._indices:
-                self._indices.move_to_end(key)
-                return self._indices[key]
-        index = TreeIndex(search, target)
-        with self._lock:
-            self._indices[key] = index
-            while len(self._indices) > 1 and sum(kept.num_rows for kept in self._indices.values()) > self._rows:
-                self._indices.popitem(last=False)
-        return index
+# Indices by content of their target: a pure callback keeps no state, yet each tree is built only once.
+_indices = Cache(MAX_ROWS, lambda index: index.num_rows)
 
 
-_index_cache = _IndexCache(_CACHED_ROWS)
+def _index_of(search: AbstractTreeSearch, target: Rows) -> TreeIndex:
+    arrays = jax.tree.leaves(target)
+    digest = hashlib.blake2b(repr([search, *((array.shape, array.dtype) for array in arrays)]).encode())
+    for array in arrays:
+        digest.update(np.ascontiguousarray(array).data)
+    return _indices.get(digest.digest(), partial(TreeIndex, search, target))
 
 
 def _pieces(array: Any) -> list[Any]:
@@ -198,5 +178,4 @@ def _nearest_callback(search: AbstractTreeSearch, num_candidates: int, *argument
     pose, source, target, max_distance, running = whole
     if not running:
         return np.full((num_candidates, source.valid.size), -1, np.int32)
-    index = _index_cache.get(search, target)
-    return index.nearest(pose, source, float(max_distance), num_candidates)
+    return _index_of(search, target).nearest(pose, source, float(max_distance), num_candidates)
