@@ -8,7 +8,7 @@ from mcgicp_jax._clouds.color_spaces import rgb_to_hsv, rgb_to_lab, rgb_to_yuv
 from mcgicp_jax._clouds.point_cloud import PointCloud
 from mcgicp_jax._clouds.preprocess import preprocess
 from mcgicp_jax._clouds.voxel_map import aggregate
-from mcgicp_jax._global_registration.global_pose import GlobalPose
+from mcgicp_jax._global_registration.global_pose import GlobalPoseResult
 from mcgicp_jax._global_registration.image_matches import image_matches
 from mcgicp_jax._math.robust_kernels import AbstractKernel, Cauchy, GemanMcClure, Huber, Tukey, Welsch
 from mcgicp_jax._methods.base import GICP, AbstractMethod, ColorICP, MultiChannelGICP, PointToPlane, PointToPoint
@@ -43,7 +43,7 @@ __all__ = [
     "DenseSearch",
     "Edge",
     "GemanMcClure",
-    "GlobalPose",
+    "GlobalPoseResult",
     "Huber",
     "KDTreeSearch",
     "MultiChannelGICP",

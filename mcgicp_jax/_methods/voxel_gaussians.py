@@ -10,8 +10,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int, Shaped
 
-from mcgicp_jax._clouds.point_cloud import PointCloud, Values
-from mcgicp_jax._clouds.preprocess import MIN_POINTS, finite_rows, preprocess, voxels
+from mcgicp_jax._clouds.point_cloud import PointCloud, Values, as_cloud
+from mcgicp_jax._clouds.preprocess import MIN_POINTS, finite_rows, preprocess
+from mcgicp_jax._clouds.voxels import voxel_order
 from mcgicp_jax._compute.argument_checks import check_integer, check_positive, is_number
 from mcgicp_jax._compute.concrete import AnyArray, namespace
 from mcgicp_jax._math import symmetric_matrices as alg
@@ -141,8 +142,7 @@ def voxel_cells(
     Raises:
         ValueError: if an argument is out of range.
     """
-    cloud = cloud if isinstance(cloud, PointCloud) else PointCloud(cloud)
-    cells = _Cells(cloud, voxel_size, min_points, channel_size)
+    cells = _Cells(as_cloud("cloud", cloud), voxel_size, min_points, channel_size)
     number = np.empty(len(cells.order), np.int32)
     number[cells.order] = np.repeat(np.where(cells.kept, np.cumsum(cells.kept) - 1, -1), cells.counts)
     return number
@@ -163,7 +163,7 @@ class _Cells:
         check_integer("min_points", min_points, 3)
         # Working by columns takes a third of the time of working by rows.
         points = _columns(cloud.coordinates if np.any(cloud.origin) else cloud.points)
-        self.order, self._starts = voxels(points, voxel_size)
+        self.order, self._starts = voxel_order(points, voxel_size)
         if channel_size is not None:
             self.order, self._starts = _split(self.order, self._starts, cloud, channel_size)
         self.counts = np.diff(self._starts, append=len(self.order))

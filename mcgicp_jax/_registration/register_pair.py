@@ -17,7 +17,7 @@ from mcgicp_jax._clouds.preprocess import preprocess
 from mcgicp_jax._compute.argument_checks import check_integer, check_positive
 from mcgicp_jax._compute.cache import keep
 from mcgicp_jax._compute.concrete import computed_now, constant, is_concrete, namespace
-from mcgicp_jax._global_registration.global_pose import GlobalPose, RowMatches, find_pose
+from mcgicp_jax._global_registration.global_pose import GlobalPoseResult, RowMatches, find_pose
 from mcgicp_jax._local_geometry.spacing_and_noise import grid_spacing, warn_of_units, with_channels_matched
 from mcgicp_jax._math.poses import Pose, se3_from_matrix
 from mcgicp_jax._math.robust_kernels import AbstractKernel
@@ -60,7 +60,7 @@ def global_pose(
     *,
     voxel_size: float | None = None,
     correspondences: RowMatches | None = None,
-) -> GlobalPose:
+) -> GlobalPoseResult:
     """Estimate the pose between two clouds without an initial pose. To refine it, pass its `matrix` to `register`.
 
     The steps are: (1) describe each voxel by FPFH (Rusu et al. 2009) and, if both clouds have the same number of
@@ -371,7 +371,7 @@ def register_with(
     return registration_of(*run.finish(), source, target)
 
 
-def start_from_anywhere(init: str, source: PointCloud | Values, target: PointCloud | Values) -> GlobalPose:
+def start_from_anywhere(init: str, source: PointCloud | Values, target: PointCloud | Values) -> GlobalPoseResult:
     """The start of a registration with `init="global"`."""
     if init != "global":
         raise ValueError(f'init: expected a pose, "global" or None, got {init!r}')
