@@ -15,7 +15,8 @@ from mcgicp_jax._methods.base import GICP, AbstractMethod, ColorICP, MultiChanne
 from mcgicp_jax._methods.channel_covariance import estimate_channel_covariance
 from mcgicp_jax._methods.ndt import D2DNDT, NDT, ColorNDT
 from mcgicp_jax._methods.voxel_gaussians import cell_moments, gaussians, voxel_cells
-from mcgicp_jax._pairs.batch import PairWarning, register_as_completed, register_batch
+from mcgicp_jax._pairs.batch import register_as_completed, register_batch
+from mcgicp_jax._pairs.batch_jobs import PairWarning
 from mcgicp_jax._pose_graph.graph import WORLD, Edge, PoseGraph
 from mcgicp_jax._pose_graph.optimize import PoseGraphResult, optimize_poses
 from mcgicp_jax._registration.cost import mahalanobis_cost
