@@ -1,4 +1,4 @@
-"""Checks of arguments; the `ValueError` names the argument, what was expected and what came."""
+"""Checks of arguments; the `ValueError` names the argument, the expected and the given value."""
 
 from __future__ import annotations
 

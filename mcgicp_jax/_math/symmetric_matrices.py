@@ -29,9 +29,7 @@ def matrix_from_symmetric(symmetric: Float[Array, "6 N"]) -> Float[Array, "N 3 3
 
 def multiply(symmetric: Float[Array, "6 N"], vector: Float[Array, "3 N"]) -> Float[Array, "3 N"]:
     """A v for each point."""
-    xx, xy, xz, yy, yz, zz = symmetric
-    x, y, z = vector
-    return jnp.stack([xx * x + xy * y + xz * z, xy * x + yy * y + yz * z, xz * x + yz * y + zz * z])
+    return jnp.stack(_times(tuple(symmetric), tuple(vector)))
 
 
 def rotate(rotation: Float[Array, "3 3"], symmetric: Float[Array, "6 N"]) -> Float[Array, "6 N"]:
@@ -113,9 +111,9 @@ def _smallest_eigenvector(symmetric: Float[Array, "6 N"]) -> Float[Array, "3 N"]
     half_determinant = 0.5 * (xx * (yy * zz - yz * yz) + xy * (xz * yz - xy * zz) + xz * (xy * yz - xz * yy))
     # The best separated eigenvalue: the largest if the determinant is positive, else the smallest (the largest of −B).
     positive = half_determinant >= 0
-    apart = 2 * jnp.cos(jnp.arccos(jnp.minimum(jnp.abs(half_determinant), 1)) / 3)
-    apart = jnp.where(positive, apart, -apart)
-    first = _null_vector(xx - apart, xy, xz, yy - apart, yz, zz - apart)
+    separated = 2 * jnp.cos(jnp.arccos(jnp.minimum(jnp.abs(half_determinant), 1)) / 3)
+    separated = jnp.where(positive, separated, -separated)
+    first = _null_vector(xx - separated, xy, xz, yy - separated, yz, zz - separated)
     # If that eigenvalue is the smallest, `first` is the normal; otherwise the normal is orthogonal to `first`.
     u, v = _basis(*first)
     bu, bv = (_times((xx, xy, xz, yy, yz, zz), axis) for axis in (u, v))
@@ -253,7 +251,7 @@ def symmetric_product(a: Float[Array, "6 N"], b: Float[Array, "6 N"]) -> Float[A
 
 
 def inverse_3(matrices: Float[AnyArray, "*n 3 3"]) -> Float[AnyArray, "*n 3 3"]:
-    """Inverses of symmetric positive definite matrices, in closed form: the determinant over cross products of rows."""
+    """Inverses of symmetric positive definite matrices: cross products of rows over the determinant."""
     xp = namespace(matrices)
     matrices = 0.5 * (matrices + matrices.swapaxes(-1, -2))
     # So that the determinant of variances of 1e-10 does not underflow float32.

@@ -95,16 +95,16 @@ def _nearest(pose: Float[Array, "7"], source: Rows, target: Rows, num_candidates
         distance, row = (values[:, None] for values in before)
         # False where the distance is NaN.
         after = (square > distance) | ((square == distance) & (numbers > row))
-        least, nearest = jax.lax.reduce(
+        smallest, nearest = jax.lax.reduce(
             (jnp.where(after & target.valid, square, jnp.inf), numbers),
             (jnp.asarray(jnp.inf, square.dtype), jnp.int32(rows.size)),
             _nearer,
             dimensions=(1,),
         )
-        return (least, nearest), jnp.where(jnp.isfinite(least) & source.valid, nearest, -1)
+        return (smallest, nearest), jnp.where(jnp.isfinite(smallest) & source.valid, nearest, -1)
 
-    nobody = (jnp.full(source.valid.size, -1, moved.dtype), jnp.full(source.valid.size, -1, jnp.int32))
-    return jax.lax.scan(following, nobody, length=num_candidates)[1]
+    start = (jnp.full(source.valid.size, -1, moved.dtype), jnp.full(source.valid.size, -1, jnp.int32))
+    return jax.lax.scan(following, start, length=num_candidates)[1]
 
 
 def _squares(source: Rows, target: Rows) -> Float[Array, "N M"]:

@@ -7,7 +7,6 @@ from pose to pose, and the callback with its cache inside transformations. A sub
 
 from __future__ import annotations
 
-import abc
 import hashlib
 from functools import partial
 from typing import Any
@@ -21,15 +20,15 @@ from jaxtyping import Array, Bool, Float, Int
 
 from mcgicp_jax._compute.cache import MAX_ROWS, Cache
 from mcgicp_jax._search.base import AbstractSearch, Rows, on_host
-from mcgicp_jax._search.nearest_with_ties import Tree
-from mcgicp_jax._search.pykdtree import MOST_DIMENSIONS, PyKDTree, has_pykdtree
+from mcgicp_jax._search.nearest_with_ties import Tree, Trees
+from mcgicp_jax._search.pykdtree import MAX_DIMENSIONS, PyKDTree, has_pykdtree
 from mcgicp_jax._search.tree_index import LARGEST_UNORDERED, TreeIndex
 
 # Bytes. JAX (jaxlib 0.10.2) copies smaller arrays for a callback in the calling thread, up to 100 KiB; see `_pieces`.
 _LARGEST_PIECE = 64 * 1024
 
 
-class AbstractTreeSearch(AbstractSearch):
+class AbstractTreeSearch(AbstractSearch, Trees):
     """Exact search with a tree on the host. Ties are broken by row, so that results are reproducible.
 
     Attributes:
@@ -37,31 +36,6 @@ class AbstractTreeSearch(AbstractSearch):
     """
 
     workers: int = eqx.field(static=True, default=-1)
-
-    @abc.abstractmethod
-    def build(self, points: Float[np.ndarray, "M D"]) -> Any:
-        """A tree of (M, D) finite points, metres; M is at least 1, D at least 3."""
-
-    @abc.abstractmethod
-    def query(
-        self, tree: Any, queries: Float[np.ndarray, "N D"], k: int, bound: float
-    ) -> tuple[Float[np.ndarray, "N k"], Int[np.ndarray, "N k"]]:
-        """The k nearest points of each query. Several threads may call this function at once.
-
-        Args:
-            tree: from `build`, of M points.
-            queries: (N, D) finite points, metres.
-            k: number of neighbours, at most M.
-            bound: metres in all D dimensions; only neighbours nearer than this are reported.
-
-        Returns:
-            (N, k) distances in metres and rows, nearest first, ties in any order. Where fewer than k points lie within
-            the bound, the distance is infinite and the row is M.
-        """
-
-    def leaf_order(self, tree: Any, num_points: int) -> Int[np.ndarray, "M"]:
-        """An order of the tree's points in which neighbouring points follow each other, for faster queries."""
-        return np.arange(num_points)
 
     @property
     def num_threads(self) -> int | None:
@@ -119,7 +93,7 @@ class KDTreeSearch(AbstractTreeSearch):
             raise ValueError("backend: pykdtree is not installed; run: pip install 'mcgicp_jax[fast]'")
 
     def build(self, points: Float[np.ndarray, "M D"]) -> scipy.spatial.cKDTree | PyKDTree:
-        if self.backend != "scipy" and has_pykdtree() and points.shape[1] <= MOST_DIMENSIONS:
+        if self.backend != "scipy" and has_pykdtree() and points.shape[1] <= MAX_DIMENSIONS:
             return PyKDTree(points)
         return _scipy_tree(points)
 
