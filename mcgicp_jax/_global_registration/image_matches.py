@@ -12,8 +12,8 @@ from mcgicp_jax.datasets import Frame
 
 # Largest ratio of the distances to the best and the second best match (Lowe 2004).
 _RATIO = 0.8
-# Pixels: a key point belongs to the cloud's point nearest in the image, if it is as near as this. Points of a depth
-# image are a pixel apart, rings of a LiDAR up to ten.
+# Largest distance, in pixels, from a key point to the image of its point of the cloud. Points of a depth image are one
+# pixel apart, rings of a LiDAR up to ten.
 _MAX_PIXELS = 4.0
 
 
@@ -38,15 +38,15 @@ def image_matches(source: Frame, target: Frame) -> tuple[Int[np.ndarray, "n"], I
     for name, frame in (("source", source), ("target", target)):
         if frame.image is None or frame.pixels is None:
             raise ValueError(f"{name}: expected a frame with an image, got one without")
-    (pixels, features), (target_pixels, target_features) = _described(source.image), _described(target.image)
+    (pixels, features), (target_pixels, target_features) = _sift(source.image), _sift(target.image)
     rows, matched = _matched(features, target_features)
     source_rows, target_rows = _nearest(source, pixels[rows]), _nearest(target, target_pixels[matched])
-    known = (source_rows >= 0) & (target_rows >= 0)
-    return source_rows[known], target_rows[known]
+    found = (source_rows >= 0) & (target_rows >= 0)
+    return source_rows[found], target_rows[found]
 
 
-def _described(image: Any) -> tuple[Float[np.ndarray, "n 2"], Float[np.ndarray, "n 128"]]:
-    """Pixels (column, row) and features of the key points."""
+def _sift(image: Any) -> tuple[Float[np.ndarray, "n 2"], Float[np.ndarray, "n 128"]]:
+    """Pixels (column, row) and SIFT features of the key points."""
     cv2 = _opencv()
     found, features = cv2.SIFT_create().detectAndCompute(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), None)
     if not found:

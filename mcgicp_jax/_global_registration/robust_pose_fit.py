@@ -71,10 +71,10 @@ def fit_pose(
     reflections (Umeyama 1991). Points on a line, or fewer than three, give some rotation that fits.
     """
     total = jnp.sum(weights)
-    share = (weights / jnp.where(total > 0, total, 1))[:, None]
-    means = [jnp.sum(share * points, axis=0) for points in (source, target)]
+    fractions = (weights / jnp.where(total > 0, total, 1))[:, None]
+    means = [jnp.sum(fractions * points, axis=0) for points in (source, target)]
     a, b = (points - mean for points, mean in zip((source, target), means, strict=True))
-    product = jnp.sum((share * b)[:, :, None] * a[:, None, :], axis=0)
+    product = jnp.sum((fractions * b)[:, :, None] * a[:, None, :], axis=0)
     square = jnp.sum(product[:, :, None] * product[:, None, :], axis=0)
     normal = alg.smallest_eigenvector(alg.symmetric_from_matrix(square[None]))
     p, q = (axis[:, 0] for axis in alg.orthonormal_basis(normal))
