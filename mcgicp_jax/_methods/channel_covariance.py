@@ -14,7 +14,7 @@ from mcgicp_jax._local_geometry.spacing_and_noise import point_spacing
 from mcgicp_jax._math.poses import Pose, pose_matrix
 from mcgicp_jax._search.positions import nearest_in_position
 
-# Smallest number of differences per channel: the relative standard error of a variance from n of them is √(2/n), 45 % for 10.
+# Smallest number n of differences per channel: the relative standard error of a variance is √(2/n), 45 % for 10.
 _MIN_DIFFERENCES = 10
 # Default maximum distance of a match, in spacings: any other target point is then more than half a spacing away.
 _SAME_SURFACE = 0.5
