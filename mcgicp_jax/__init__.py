@@ -8,7 +8,7 @@ from mcgicp_jax._clouds.color_spaces import rgb_to_hsv, rgb_to_lab, rgb_to_yuv
 from mcgicp_jax._clouds.point_cloud import PointCloud
 from mcgicp_jax._clouds.preprocess import preprocess
 from mcgicp_jax._clouds.voxel_map import aggregate
-from mcgicp_jax._global_registration.global_pose import GlobalPose, global_pose
+from mcgicp_jax._global_registration.global_pose import GlobalPoseResult, global_pose
 from mcgicp_jax._global_registration.image_matches import image_matches
 from mcgicp_jax._math.robust_kernels import AbstractKernel, Cauchy, GemanMcClure, Huber, Tukey, Welsch
 from mcgicp_jax._methods.base import AbstractMethod
@@ -18,7 +18,8 @@ from mcgicp_jax._methods.icp import ColorICP, PointToPlane, PointToPoint
 from mcgicp_jax._methods.multichannel_gicp import MultiChannelGICP
 from mcgicp_jax._methods.ndt import D2DNDT, NDT, ColorNDT
 from mcgicp_jax._methods.voxel_gaussians import cell_moments, gaussians, voxel_cells
-from mcgicp_jax._pairs.batch import PairWarning, register_as_completed, register_batch
+from mcgicp_jax._pairs.batch import register_as_completed, register_batch
+from mcgicp_jax._pairs.batch_jobs import PairWarning
 from mcgicp_jax._pairs.cost import mahalanobis_cost
 from mcgicp_jax._pairs.estimate_pose import align
 from mcgicp_jax._pairs.register import register
@@ -48,7 +49,7 @@ __all__ = [
     "DenseSearch",
     "Edge",
     "GemanMcClure",
-    "GlobalPose",
+    "GlobalPoseResult",
     "Huber",
     "KDTreeSearch",
     "MultiChannelGICP",

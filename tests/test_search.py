@@ -20,6 +20,7 @@ from mcgicp_jax import (
     preprocess,
 )
 from mcgicp_jax._search.base import Rows
+from mcgicp_jax._search.positions import nearest_in_position
 from mcgicp_jax._search.tree_index import TreeIndex
 from tests import reference as ref
 
@@ -51,6 +52,18 @@ def query(pose, source, target, max_distance=np.inf, source_channels=None, targe
 def test_neighbors_of_random_points(seed, k, num_points):
     points = np.random.default_rng(seed).normal(size=(num_points, 3))
     np.testing.assert_array_equal(KDTreeSearch().neighbors(points, k), ref.nearest(points, points, k))
+
+
+def test_nearest_in_position():
+    rng = np.random.default_rng(0)
+    queries, points = rng.random((50, 3)), rng.random((40, 3)).astype(np.float32)
+    queries[3], points[5] = np.nan, np.nan
+    distances = np.nan_to_num(np.linalg.norm(queries[:, None] - points, axis=2), nan=np.inf)
+    expected = np.where(distances.min(axis=1) <= 0.2, distances.argmin(axis=1), -1)
+    assert 0 < np.sum(expected == -1) < 50
+    np.testing.assert_array_equal(nearest_in_position(queries, points, 0.2), expected)
+    np.testing.assert_array_equal(nearest_in_position(queries, points[:0], 0.2), -1)
+    assert nearest_in_position(queries[:0], points, 0.2).shape == (0,)
 
 
 @settings(max_examples=25, deadline=None)

@@ -1,4 +1,7 @@
-"""Poses: validation of user input, and conversion between matrices and `jaxlie.SE3`."""
+"""Poses: validation of user input, conversion between matrices and `jaxlie.SE3`, and changes of frames of twists.
+
+A twist ξ = (v, ω) is a small motion: v in metres (or in units of a radius), ω in radians.
+"""
 
 from __future__ import annotations
 
@@ -152,7 +155,7 @@ def move_pose(pose: jaxlie.SE3, twist: Float[Array, "6"], center: Float[Array, "
 
 
 def adjoint_to_center(pose: jaxlie.SE3, center: Float[Array, "3"]) -> Float[Array, "6 6"]:
-    """(6, 6) matrix from ξ of T exp(ξ), in the source's frame, to the twist about the centre in the target's frame."""
+    """(6, 6) matrix from ξ of T exp(ξ), in the source's frame, to twists about the centre in the target's frame."""
     to_center = jaxlie.SE3.from_rotation_and_translation(jaxlie.SO3.identity(), -center) @ pose
     return to_center.adjoint().astype(pose.wxyz_xyz.dtype)
 
@@ -169,7 +172,12 @@ def units(radius: Float[Array, ""]) -> Float[Array, "6"]:
 
 
 def from_center(offset: Float[Array, "3"], radius: Float[Array, ""], other: Float[Array, ""]) -> Float[Array, "6 6"]:
-    """Twists about a point at `offset` from the centre, lengths in units of `other`, from those about the centre."""
+    """(6, 6) matrix from twists about a centre, lengths in units of `radius`, to twists about another one.
+
+    Args:
+        offset: from the centre to the other one, metres.
+        other: unit of length of the result, metres.
+    """
     cross = jnp.cross(jnp.eye(3, dtype=offset.dtype), offset[None], axis=1).T
     top = jnp.concatenate([jnp.eye(3, dtype=offset.dtype) * radius, cross], axis=1) / other
     return jnp.concatenate([top, jnp.eye(6, dtype=offset.dtype)[3:]])

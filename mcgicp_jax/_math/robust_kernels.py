@@ -42,8 +42,8 @@ class AbstractKernel(Numbers):
 
     def __init__(self, scale: ArrayLike):
         """`scale` is k. Raises `ValueError` unless it is one positive, finite number."""
-        known = is_concrete(scale)
-        self.scale = jax.device_put(np.asarray(scale, canonical_float())) if known else jnp.asarray(scale)
+        concrete = is_concrete(scale)
+        self.scale = jax.device_put(np.asarray(scale, canonical_float())) if concrete else jnp.asarray(scale)
         if self.scale.shape != () or (is_concrete(self.scale) and not 0 < float(self.scale) < np.inf):
             raise ValueError(f"scale: expected one positive number, got {scale!r}")
 

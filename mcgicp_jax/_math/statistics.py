@@ -42,17 +42,17 @@ def median(values: Any) -> Any:
     values = np.asarray(values)
     result = np.full(values.shape[:-1], np.nan, values.dtype)
     for place in np.ndindex(values.shape[:-1]):
-        known = values[place][~np.isnan(values[place])]
-        if known.size:
+        numbers = values[place][~np.isnan(values[place])]
+        if numbers.size:
             # In float64, in which the sum of the two middle values does not overflow.
-            result[place] = np.median(known.astype(np.float64))
+            result[place] = np.median(numbers.astype(np.float64))
     return result[()]
 
 
 def of_known(statistic: Callable[[Any], Any], values: Float[AnyArray, "n C"]) -> Float[AnyArray, "*some C"]:
-    """A statistic over the first axis that ignores NaN, such as `nanstd`; NaN for columns without a number.
+    """A statistic over the first axis that ignores NaN, such as `nanstd`; NaN for columns of NaN.
 
-    NumPy would warn of these columns, and its warning cannot be suppressed in one thread alone.
+    NumPy would warn of such columns, and its warning cannot be suppressed in one thread alone.
     """
     xp = namespace(values)
     missing = xp.all(xp.isnan(values), axis=0)

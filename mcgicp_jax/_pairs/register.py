@@ -9,7 +9,7 @@ from jax.typing import ArrayLike
 
 from mcgicp_jax._clouds.point_cloud import PointCloud, Values
 from mcgicp_jax._compute.concrete import is_concrete
-from mcgicp_jax._global_registration.global_pose import GlobalPose, global_pose
+from mcgicp_jax._global_registration.global_pose import GlobalPoseResult, global_pose
 from mcgicp_jax._math.poses import Pose
 from mcgicp_jax._math.robust_kernels import AbstractKernel
 from mcgicp_jax._methods.base import AbstractMethod
@@ -144,7 +144,7 @@ def register_from(
     return register_pair(source, target, method, init, options, tie_points, prior)
 
 
-def start_from_anywhere(init: str, source: PointCloud | Values, target: PointCloud | Values) -> GlobalPose:
+def start_from_anywhere(init: str, source: PointCloud | Values, target: PointCloud | Values) -> GlobalPoseResult:
     """The start of a registration with `init="global"`."""
     if init != "global":
         raise ValueError(f'init: expected a pose, "global" or None, got {init!r}')

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 from collections.abc import Iterator, Sequence
 from typing import Any, NamedTuple
 
@@ -10,6 +9,7 @@ import numpy as np
 
 from mcgicp_jax._clouds.point_cloud import PointCloud
 from mcgicp_jax._clouds.preprocess import finite_rows, preprocess, with_neighbors
+from mcgicp_jax._compute.argument_checks import errors_named
 from mcgicp_jax._local_geometry.neighborhoods import check_neighbors
 from mcgicp_jax._methods.base import AbstractMethod
 from mcgicp_jax._methods.gicp import GICP
@@ -68,19 +68,10 @@ def _in_cells(method: AbstractMethod, name: str, cloud: PointCloud, size: float)
         # A cell extends as far in α · channel as in position.
         with np.errstate(divide="ignore"):
             channel_size = size / np.asarray(method.weights(cloud.channels.shape[1]), np.float64)
-    with _named(name):
+    with errors_named(name):
         return gaussians(cloud, size, channel_size=channel_size)
 
 
 def _in_voxels(name: str, cloud: PointCloud, size: float) -> PointCloud:
-    with _named(name):
+    with errors_named(name):
         return with_neighbors(finite_rows(cloud), size, _NUM_NEIGHBORS)
-
-
-@contextlib.contextmanager
-def _named(name: str) -> Iterator[None]:
-    """Begin messages of errors with the name of the cloud."""
-    try:
-        yield
-    except ValueError as error:
-        raise ValueError(f"{name}: {error}") from error

@@ -9,8 +9,9 @@ from typing import NamedTuple
 import jax
 
 from mcgicp_jax._clouds.origins import centred_pose, pose_in_user_frame
-from mcgicp_jax._clouds.point_cloud import PointCloud, Values
+from mcgicp_jax._clouds.point_cloud import PointCloud, Values, as_cloud
 from mcgicp_jax._clouds.preprocess import preprocess
+from mcgicp_jax._compute.argument_checks import errors_named
 from mcgicp_jax._compute.concrete import computed_now, constant, is_concrete, namespace
 from mcgicp_jax._compute.lazy import Deferred
 from mcgicp_jax._local_geometry.channel_equalization import warn_of_units, with_channels_matched
@@ -190,11 +191,8 @@ def _nearest_points(source: PointCloud, target: PointCloud, run: _Run, search: A
 
 def _ready(name: str, cloud: PointCloud | Values, raw: bool = False) -> PointCloud:
     """The cloud, preprocessed unless it may be `raw`."""
-    try:
-        if not isinstance(cloud, PointCloud):
-            cloud = PointCloud(cloud)
-        if cloud.neighbors is None and not raw:
-            cloud = preprocess(cloud)
-    except ValueError as error:
-        raise ValueError(f"{name}: {error}") from error
-    return cloud
+    cloud = as_cloud(name, cloud)
+    if cloud.neighbors is not None or raw:
+        return cloud
+    with errors_named(name):
+        return preprocess(cloud)

@@ -32,7 +32,7 @@ class Status(enum.IntEnum):
             points or a prior constrain a direction if its standard deviation is then below the radius of the clouds.
         NON_FINITE: the pose or the sums overflowed or became NaN.
         INVALID_INPUT: `register` would raise a `ValueError` for this pair. Only in batches; the pose is NaN.
-        LOST: the worker of this pair failed, and so did a second attempt. Only in batches; the pose is NaN.
+        WORKER_FAILED: two workers in turn failed with this pair. Only in batches; the pose is NaN.
     """
 
     CONVERGED = 0
@@ -41,7 +41,7 @@ class Status(enum.IntEnum):
     DEGENERATE = 3
     NON_FINITE = 4
     INVALID_INPUT = 5
-    LOST = 6
+    WORKER_FAILED = 6
 
     # Print the name: an IntEnum prints its number.
     __str__ = enum.Enum.__str__

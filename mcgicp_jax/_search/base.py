@@ -38,6 +38,15 @@ def by_position(rows: Rows) -> Rows:
     return Rows(rows.points, rows.descriptors[:, :0], rows.valid)
 
 
+# The pose that leaves queries where they are, as the searches take it.
+IDENTITY = np.array([1.0, 0, 0, 0, 0, 0, 0])
+
+
+def rows_of(points: Float[np.ndarray, "N 3"]) -> Rows:
+    """Points for a search in position alone."""
+    return Rows(points, np.zeros((len(points), 0), points.dtype), np.ones(len(points), bool))
+
+
 class Correspondences(eqx.Module):
     """For each source point, its match in the target; a pytree.
 

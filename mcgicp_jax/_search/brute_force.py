@@ -14,7 +14,7 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float, Int
 
 from mcgicp_jax._compute.size_classes import size_class
-from mcgicp_jax._search.base import AbstractIndex, AbstractSearch, Rows, on_host
+from mcgicp_jax._search.base import IDENTITY, AbstractIndex, AbstractSearch, Rows, on_host, rows_of
 from mcgicp_jax._search.kd_tree import KDTreeSearch
 
 
@@ -47,9 +47,8 @@ class DenseSearch(AbstractSearch):
         return _nearest(pose, source, target, num_candidates)
 
     def neighbors(self, points: Float[np.ndarray, "N 3"], num_neighbors: int) -> Int[np.ndarray, "N k"]:
-        rows = Rows(points, np.zeros((len(points), 0), points.dtype), np.ones(len(points), bool))
-        identity = np.array([1, 0, 0, 0, 0, 0, 0], points.dtype)
-        return self.index(rows).nearest(identity, rows, np.inf, num_neighbors).T
+        rows = rows_of(points)
+        return self.index(rows).nearest(IDENTITY, rows, np.inf, num_neighbors).T
 
 
 class DenseIndex(AbstractIndex):
@@ -96,16 +95,16 @@ def _nearest(pose: Float[Array, "7"], source: Rows, target: Rows, num_candidates
         distance, row = (values[:, None] for values in before)
         # False where the distance is NaN.
         after = (square > distance) | ((square == distance) & (numbers > row))
-        least, nearest = jax.lax.reduce(
+        smallest, nearest = jax.lax.reduce(
             (jnp.where(after & target.valid, square, jnp.inf), numbers),
             (jnp.asarray(jnp.inf, square.dtype), jnp.int32(rows.size)),
             _nearer,
             dimensions=(1,),
         )
-        return (least, nearest), jnp.where(jnp.isfinite(least) & source.valid, nearest, -1)
+        return (smallest, nearest), jnp.where(jnp.isfinite(smallest) & source.valid, nearest, -1)
 
-    nobody = (jnp.full(source.valid.size, -1, moved.dtype), jnp.full(source.valid.size, -1, jnp.int32))
-    return jax.lax.scan(following, nobody, length=num_candidates)[1]
+    start = (jnp.full(source.valid.size, -1, moved.dtype), jnp.full(source.valid.size, -1, jnp.int32))
+    return jax.lax.scan(following, start, length=num_candidates)[1]
 
 
 def _squares(source: Rows, target: Rows) -> Float[Array, "N M"]:

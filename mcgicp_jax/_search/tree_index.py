@@ -1,4 +1,4 @@
-"""An index over the rows of a target by trees: descriptors, missing channels, and matches kept from pose to pose."""
+"""An index of target points by trees: descriptors, missing channels, and matches reused from pose to pose."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from mcgicp_jax._search.nearest_with_ties import Tree, Trees, slack_of
 
 # Largest number of combinations of missing channels (of the queries × of the target) for which a tree each is built:
 # two cameras, each of which sees a point or not, make 4 × 4.
-_MOST_TREES = 16
+_MAX_TREES = 16
 # With more combinations: number of neighbours in position that are examined first, and number of (query, neighbour)
 # differences in memory at a time.
 _FIRST_NEAR = 32
@@ -92,7 +92,7 @@ class TreeIndex(AbstractIndex):
             patterns, which = np.zeros((1, queries.shape[1] - 3)), np.zeros(rows.size, np.intp)
         else:
             patterns, which = _patterns(penalty[active])
-        if len(patterns) * len(self._patterns) > _MOST_TREES:
+        if len(patterns) * len(self._patterns) > _MAX_TREES:
             groups = [active]
             answers = [self._near_in_position(queries[active], patterns[which], k)]
         else:
@@ -132,7 +132,7 @@ class TreeIndex(AbstractIndex):
         size = self._rows.size
         found, slack = np.empty((len(queries), min(k, size)), np.int32), np.empty(len(queries))
         # Penalties that every match of a query incurs: a lower bound on the squared distance beside the position.
-        least = penalty.sum(axis=1)
+        smallest = penalty.sum(axis=1)
         open, asked = np.arange(len(queries)), min(max(_FIRST_NEAR, k + 1), size)
         while open.size:
             unsure = []
@@ -141,7 +141,7 @@ class TreeIndex(AbstractIndex):
                 rows, squares = _ordered(self._rows[near], self._squares(queries[some], penalty[some], near), k + 1)
                 found[some] = rows[:, :k]
                 # The margin of 1e-9 covers rounding in float64.
-                others = (1 - 1e-9) * (distances[:, -1] ** 2 + least[some]) if asked < size else np.inf
+                others = (1 - 1e-9) * (distances[:, -1] ** 2 + smallest[some]) if asked < size else np.inf
                 farthest = squares[:, min(k, size) - 1]
                 slack[some] = slack_of(*np.sqrt([farthest, np.minimum(squares[:, -1], others)]))
                 unsure.append(some[~(farthest < others)])
@@ -197,8 +197,8 @@ class _Part:
         """Squared search distances to tree indices, including the penalties for missing channels; metres²."""
         points = self._tree.points
         difference = queries[:, None, self._columns] - points[np.minimum(found, len(points) - 1)]
-        apart = np.sum(difference * difference, axis=2) + self._penalty
-        return np.where(found < len(points), apart, np.inf)
+        squares = np.sum(difference * difference, axis=2) + self._penalty
+        return np.where(found < len(points), squares, np.inf)
 
 
 class _Follower:
