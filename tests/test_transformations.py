@@ -70,8 +70,9 @@ def test_implicit_gradient_is_that_of_the_unrolled_loop(noisy):
     """Differentiating through 60 updates with M renewed each time reaches the same number, at many times the cost."""
     source, target, _ = noisy
     method, _ = CASES["gicp"]
-    from mcgicp_jax._math.poses import move_pose, se3_from_matrix
     from mcgicp_jax._methods.surface import surfaces_of
+
+    from mcgicp_jax._math.poses import move_pose, se3_from_matrix
     from mcgicp_jax._pose_solver.sums import matched_rows, sums_of
     from mcgicp_jax._registration.step import rotation_and_translation
 

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from mcgicp_jax._clouds.point_cloud import PointCloud
-from mcgicp_jax._compute.concrete import AnyScalar, namespace
+from mcgicp_jax._compute.concrete import AnyScalar, numpy_for
 from mcgicp_jax._local_geometry.local_geometry import LocalGeometry
 from mcgicp_jax._local_geometry.observability import geometry_observability
 from mcgicp_jax._math import symmetric_matrices as alg
@@ -22,7 +22,7 @@ _COUNT = 20
 def cell_edge(cells: PointCloud) -> Float[AnyScalar, ""]:
     """The median edge of the cells, metres. (Where a plane lies between two layers of voxels, cells lie close together,
     so that their distance is smaller.)"""
-    xp = namespace(cells)
+    xp = numpy_for(cells)
     rows, counts = sampled_rows(xp.asarray(cells.valid))
     traces = xp.trace(xp.asarray(cells.covariances)[rows], axis1=1, axis2=2)
     return median(xp.where(counts, xp.sqrt(_SQUARE_EDGE * traces), xp.nan))

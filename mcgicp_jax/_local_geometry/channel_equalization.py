@@ -9,8 +9,8 @@ import numpy as np
 from jaxtyping import Float
 
 from mcgicp_jax._clouds.point_cloud import PointCloud
-from mcgicp_jax._compute.cache import keep
-from mcgicp_jax._compute.concrete import AnyArray, constant, namespace
+from mcgicp_jax._compute.cache import cached_with
+from mcgicp_jax._compute.concrete import AnyArray, constant, numpy_for
 from mcgicp_jax._local_geometry.spacing_and_noise import known_values
 from mcgicp_jax._math.statistics import of_known, sampled_rows
 from mcgicp_jax._search.base import Correspondences
@@ -24,7 +24,7 @@ _OTHER_UNIT = 10.0
 
 def warn_of_units(source: PointCloud, target: PointCloud) -> None:
     """Warn of channels of two concrete clouds whose values are so different that their units probably are, too."""
-    ranges = [keep(cloud, "ranges", None, partial(_ranges, cloud)) for cloud in (source, target)]
+    ranges = [cached_with(cloud, "ranges", None, partial(_ranges, cloud)) for cloud in (source, target)]
     for name, (low, high), (first, last) in zip(source.channel_names, *ranges, strict=False):
         narrow, wide = sorted([high - low, last - first])
         if high < first or last < low or wide > _OTHER_UNIT * narrow > 0:
@@ -58,7 +58,7 @@ def with_channels_matched(source: PointCloud, target: PointCloud, matches: Corre
     gain towards 0. With `matches`, only values of valid matches are used. Gain and offset are constants to autodiff;
     they are 1 and 0 for channels without usable spread.
     """
-    xp = namespace(source, target, matches)
+    xp = numpy_for(source, target, matches)
     values = [known_values(constant(cloud)) for cloud in (source, target)]
     values = [xp.asarray(each) for each in values]
     if matches is not None:
@@ -79,7 +79,7 @@ def gain_and_offset(
 
     NaNs are ignored; 1 and 0 for channels without usable spread.
     """
-    xp = namespace(values, wanted)
+    xp = numpy_for(values, wanted)
     levels = xp.asarray(_QUANTILES, values.dtype)
     quantiles = [of_known(partial(xp.nanquantile, q=levels, axis=0), each) for each in (values, wanted)]
     means = [xp.mean(each, axis=0) for each in quantiles]

@@ -12,8 +12,8 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from mcgicp_jax._clouds.point_cloud import PointCloud
-from mcgicp_jax._compute.cache import keep
-from mcgicp_jax._compute.concrete import AnyArray, AnyScalar, is_concrete, namespace
+from mcgicp_jax._compute.cache import cached_with
+from mcgicp_jax._compute.concrete import AnyArray, AnyScalar, is_concrete, numpy_for
 from mcgicp_jax._local_geometry.local_geometry import LocalGeometry
 from mcgicp_jax._local_geometry.neighborhoods import check_neighbors
 from mcgicp_jax._math.statistics import median, of_known, sampled_rows
@@ -26,7 +26,7 @@ def channel_noise(
 
     Both are medians over both clouds: σ of the residuals of linear fits, λ₀ of the variances of the neighbours.
     """
-    xp = namespace(source, target, geometries)
+    xp = numpy_for(source, target, geometries)
     residuals, values, across = [], [], []
     for cloud, local in zip((source, target), geometries, strict=True):
         valid = xp.asarray(cloud.valid)
@@ -55,7 +55,7 @@ def _smallest_variance(local: LocalGeometry, xp: Any) -> Float[AnyArray, "N"]:
 
 def known_values(cloud: PointCloud) -> Float[AnyArray, "N C"]:
     """Channels, NaN where a point lacks them or is padding."""
-    xp = namespace(cloud)
+    xp = numpy_for(cloud)
     valid = xp.asarray(cloud.valid)[:, None]
     if cloud.channel_valid is not None:
         valid = valid & xp.asarray(cloud.channel_valid)
@@ -82,13 +82,13 @@ def grid_spacing(cloud: PointCloud) -> Float[AnyScalar, ""]:
 def _spacings(cloud: PointCloud) -> tuple[Float[AnyScalar, ""], Float[AnyScalar, ""]]:
     """`point_spacing` and `grid_spacing`; cached with a concrete cloud."""
     if is_concrete(cloud):
-        return keep(cloud, "spacings", None, lambda: _measured_spacings(cloud))
+        return cached_with(cloud, "spacings", None, lambda: _measured_spacings(cloud))
     return _measured_spacings(cloud)
 
 
 def _measured_spacings(cloud: PointCloud) -> tuple[Float[AnyScalar, ""], Float[AnyScalar, ""]]:
     distances = _neighbor_distances(cloud)
-    xp = namespace(distances)
+    xp = numpy_for(distances)
     nearest = xp.min(xp.where(distances > 0, distances, xp.inf), axis=1)
     spacing = xp.nan_to_num(median(xp.where(xp.isfinite(nearest), nearest, xp.nan)))
     known = xp.isfinite(distances)
@@ -100,7 +100,7 @@ def _measured_spacings(cloud: PointCloud) -> tuple[Float[AnyScalar, ""], Float[A
 def _neighbor_distances(cloud: PointCloud) -> Float[AnyArray, "n k"]:
     """Distances between sampled points and their neighbours, metres; infinite where there is none."""
     check_neighbors(cloud)
-    xp = namespace(cloud)
+    xp = numpy_for(cloud)
     rows, counts = sampled_rows(xp.asarray(cloud.valid))
     neighbors = xp.asarray(cloud.neighbors)[rows]
     square = xp.zeros(neighbors.shape, cloud.points.dtype)

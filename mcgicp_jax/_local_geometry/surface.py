@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 from jaxtyping import Float
 
 from mcgicp_jax._compute.concrete import AnyArray
-from mcgicp_jax._search.base import Rows
+from mcgicp_jax._search.base import SearchPoints
 
 
 class SurfaceNoise(NamedTuple):
@@ -48,14 +48,14 @@ class Surface(NamedTuple):
     channel_observability: Float[AnyArray, "*batch N 6"] | None
     columns: dict[str, Any]
     noise: SurfaceNoise | None = None
-    search: Rows | None = None
+    search: SearchPoints | None = None
 
     @property
     def num_points(self) -> int:
         return self.points.shape[-2]
 
 
-def searched(surface: Surface) -> Rows:
+def searched(surface: Surface) -> SearchPoints:
     """The input of the search of a surface of a whole cloud."""
     if surface.search is None:
         raise ValueError("surface: expected one with the input of the search")

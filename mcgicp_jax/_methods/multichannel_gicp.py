@@ -12,7 +12,7 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
 from mcgicp_jax._clouds.point_cloud import PointCloud, Values
-from mcgicp_jax._compute.concrete import AnyArray, constant, namespace
+from mcgicp_jax._compute.concrete import AnyArray, constant, numpy_for
 from mcgicp_jax._local_geometry.covariances import channel_kernel, multichannel_covariance, plane_covariance
 from mcgicp_jax._local_geometry.local_geometry import LocalGeometry
 from mcgicp_jax._local_geometry.local_statistics import local_geometries
@@ -114,7 +114,7 @@ class MultiChannelGICP(AbstractGeneralized):
             return self
         both = local_geometries(source, target, with_channels=True) if geometries is None else geometries()
         source, target, both, epsilon = constant((source, target, both, self.epsilon))
-        xp = namespace(source, target, both, epsilon)
+        xp = numpy_for(source, target, both, epsilon)
         sigma, uniform, across = channel_noise(source, target, both)
         spacing = point_spacing(target)
         with np.errstate(over="ignore", invalid="ignore"):
@@ -170,7 +170,7 @@ class MultiChannelGICP(AbstractGeneralized):
     def missing_variances(self, num_channels: int) -> Float[AnyArray, "C"]:
         if self.channel_covariance is None:
             raise ValueError("channel_covariance: not chosen yet; call method.resolve(source, target) first")
-        xp = namespace(self.channel_covariance)
+        xp = numpy_for(self.channel_covariance)
         covariance = xp.asarray(self.channel_covariance)
         check_covariance_fits(covariance, num_channels)
         return xp.broadcast_to(xp.diagonal(covariance) if covariance.ndim == 2 else covariance, (num_channels,))

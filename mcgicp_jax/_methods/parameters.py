@@ -9,7 +9,7 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
 from mcgicp_jax._clouds.point_cloud import Values
-from mcgicp_jax._compute.concrete import AnyArray, canonical_float, is_concrete, namespace
+from mcgicp_jax._compute.concrete import AnyArray, canonical_float, is_concrete, numpy_for
 
 
 def per_channel(name: str, numbers: Float[AnyArray, "..."], num_channels: int) -> Float[AnyArray, "C"]:
@@ -19,7 +19,7 @@ def per_channel(name: str, numbers: Float[AnyArray, "..."], num_channels: int) -
             f"{name}: expected a scalar or shape ({num_channels},), for clouds of {num_channels} channels, "
             f"got {numbers.shape}"
         )
-    xp = namespace(numbers)
+    xp = numpy_for(numbers)
     return xp.broadcast_to(xp.asarray(numbers), (num_channels,))
 
 

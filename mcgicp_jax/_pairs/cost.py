@@ -19,7 +19,7 @@ from mcgicp_jax._math.robust_kernels import AbstractKernel
 from mcgicp_jax._methods.base import AbstractGeneralized, AbstractMethod
 from mcgicp_jax._methods.surfaces import SurfacePair, surface_pair
 from mcgicp_jax._pose_solver.adaptation import adapted, sample_of_term
-from mcgicp_jax._pose_solver.matched import Matched, Motion, linearize_at, match_surfaces, rows_of
+from mcgicp_jax._pose_solver.matched import Matched, Motion, linearize_at, match_surfaces, surface_rows
 from mcgicp_jax._registration.input_checks import check_matches
 from mcgicp_jax._search.base import Correspondences
 from mcgicp_jax._terms.base import AbstractTerm
@@ -86,7 +86,7 @@ def _total_cost(
     matched = match_surfaces(pair.source, pair.target, matches, temperature)
 
     def sample(term: AbstractTerm, rows: Int[Array, "n"]) -> Any:
-        some = Matched(rows_of(matched.source, rows), rows_of(matched.target, rows), matched.valid[rows])
+        some = Matched(surface_rows(matched.source, rows), surface_rows(matched.target, rows), matched.valid[rows])
         return sample_of_term(motion, some, term)
 
     terms = adapted(pair.terms, searched(pair.source).valid, sample)

@@ -9,7 +9,7 @@ import jax
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from mcgicp_jax._compute.concrete import AnyArray, constant, namespace
+from mcgicp_jax._compute.concrete import AnyArray, constant, numpy_for
 from mcgicp_jax._math.statistics import sampled_rows
 from mcgicp_jax._pose_solver.matched import Matched, Motion
 from mcgicp_jax._terms.base import AbstractTerm
@@ -27,12 +27,12 @@ def adapted(
         sample: computes `sample_of_term` for the matches of some source points.
     """
     rows, counts = sampled_rows(valid)
-    xp = namespace(counts, valid)
+    xp = numpy_for(counts, valid)
     fraction = xp.sum(counts) / xp.maximum(xp.sum(valid), 1)
 
     def only(column: Float[AnyArray, "n *_"]) -> Float[AnyArray, "n *_"]:
         missing = np.asarray(np.nan, column.dtype)
-        return namespace(column, counts).where(counts.reshape(-1, *[1] * (column.ndim - 1)), column, missing)
+        return numpy_for(column, counts).where(counts.reshape(-1, *[1] * (column.ndim - 1)), column, missing)
 
     # Huge coordinates or channels lead to the status NON_FINITE; NumPy need not warn of them.
     with np.errstate(over="ignore", invalid="ignore"):

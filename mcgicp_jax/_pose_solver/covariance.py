@@ -22,7 +22,7 @@ import jaxlie
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from mcgicp_jax._compute.concrete import AnyArray, AnyScalar, namespace
+from mcgicp_jax._compute.concrete import AnyArray, AnyScalar, numpy_for
 from mcgicp_jax._local_geometry.surface import SurfaceNoise, searched
 from mcgicp_jax._math import symmetric_matrices as alg
 from mcgicp_jax._math.poses import adjoint_to_source, units
@@ -99,7 +99,7 @@ def discounts(sample: NoiseSample, num_channels: Int[AnyScalar, ""]) -> Float[An
         sample: of matches.
         num_channels: number of channels with a nonzero weight α.
     """
-    xp = namespace(sample, num_channels)
+    xp = numpy_for(sample, num_channels)
     seen, expected, quotient = median(xp.stack([xp.asarray(column) for column in sample]))
     geometry = (seen / _MEDIAN_SQUARE) / (xp.where(expected > 0, expected, xp.nan) / _MEDIAN_MEAN_OF_TWO)
     # Divided by the median of χ²/C with C degrees of freedom, after Wilson & Hilferty 1931.
@@ -239,7 +239,7 @@ class Moments(NamedTuple):
 
 def moments_from(scores: Scores, num_cells: int) -> Moments:
     """Sums over scores, by NumPy if they are NumPy arrays."""
-    xp = namespace(scores)
+    xp = numpy_for(scores)
     rows = xp.concatenate([scores.wrenches, scores.valid[:, None]], axis=1)
     if scores.cells is not None and xp is np:
         columns = [np.bincount(scores.cells, column, num_cells) for column in rows.T]

@@ -12,7 +12,7 @@ from jaxtyping import Array, Bool, Float, Int
 from mcgicp_jax._compute.concrete import AnyArray, AnyScalar
 from mcgicp_jax._local_geometry.surface import Surface
 from mcgicp_jax._math import symmetric_matrices as alg
-from mcgicp_jax._search.base import Correspondences, Rows
+from mcgicp_jax._search.base import Correspondences, SearchPoints
 from mcgicp_jax._terms.base import AbstractTerm, Linearization, linearize
 
 
@@ -73,10 +73,10 @@ def match_surfaces(
     if not with_search:
         tiled, target = tiled._replace(search=None), target._replace(search=None)
     tiled, target = jax.tree.map(jnp.asarray, (tiled, target))
-    return Matched(tiled, rows_of(target, indices), valid, apart, temperature, num_candidates)
+    return Matched(tiled, surface_rows(target, indices), valid, apart, temperature, num_candidates)
 
 
-def rows_of(surface: Surface, rows: Any) -> Surface:
+def surface_rows(surface: Surface, rows: Any) -> Surface:
     """Some rows of a surface."""
     return jax.tree.map(lambda array: array[rows], surface)
 
@@ -91,7 +91,9 @@ def distances_within(
     return distances, distances <= max_distance
 
 
-def _square_apart(source: Rows | None, target: Rows | None, indices: Int[Array, "n"]) -> Float[Array, "n"]:
+def _square_apart(
+    source: SearchPoints | None, target: SearchPoints | None, indices: Int[Array, "n"]
+) -> Float[Array, "n"]:
     """Squared distance of the descriptors, with the penalties for missing channels, metres²."""
     if source is None or target is None:
         raise ValueError("temperature: expected surfaces with the inputs of the search")

@@ -10,8 +10,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from mcgicp_jax._compute.concrete import AnyArray, is_concrete, namespace
-from mcgicp_jax._compute.lazy import Deferred
+from mcgicp_jax._compute.concrete import AnyArray, is_concrete, numpy_for
+from mcgicp_jax._compute.lazy import Lazy
 from mcgicp_jax._local_geometry.surface import searched
 from mcgicp_jax._math.poses import adjoint_to_center, units
 from mcgicp_jax._math.statistics import sampled_rows
@@ -37,11 +37,11 @@ from mcgicp_jax._terms.base import AbstractTerm, is_adaptive
 class Assessment(NamedTuple):
     """Certainty of the final pose, deferred where the arrays are concrete."""
 
-    constraints: Deferred[Constraints]
-    covariance: Deferred[Float[AnyArray, "*batch 6 6"]]
+    constraints: Lazy[Constraints]
+    covariance: Lazy[Float[AnyArray, "*batch 6 6"]]
 
 
-def assessment_of(executor: AbstractExecutor, loop: LoopResult, moments: Deferred[Moments] | None) -> Assessment:
+def assessment_of(executor: AbstractExecutor, loop: LoopResult, moments: Lazy[Moments] | None) -> Assessment:
     """The assessment of a loop that has ended.
 
     Args:
@@ -59,8 +59,8 @@ def assessment_of(executor: AbstractExecutor, loop: LoopResult, moments: Deferre
 
     constraints = partial(constraints_of, state)
     if is_concrete(state):
-        return Assessment(Deferred(constraints), Deferred(covariance))
-    return Assessment(Deferred.of(constraints()), Deferred.of(covariance()))
+        return Assessment(Lazy(constraints), Lazy(covariance))
+    return Assessment(Lazy.of(constraints()), Lazy.of(covariance()))
 
 
 def moments_of(executor: AbstractExecutor, loop: LoopResult, rematched: bool) -> Moments:
@@ -83,7 +83,7 @@ def moments_of(executor: AbstractExecutor, loop: LoopResult, rematched: bool) ->
 def _discounts(executor: AbstractExecutor, motion: Motion, matches: Any) -> Float[AnyArray, "2"]:
     search = searched(executor.source_of(matches))
     rows, counts = sampled_rows(search.valid)
-    xp = namespace(counts)
+    xp = numpy_for(counts)
     sample = executor.over_rows(noise_sample, motion, executor.nearest(motion, matches), rows, with_noise=True)
     sample = jax.tree.map(lambda column: xp.where(counts, column, np.asarray(np.nan, column.dtype)), sample)
     return discounts(sample, xp.sum(xp.any(search.descriptors != 0, axis=0)))

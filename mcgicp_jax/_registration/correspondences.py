@@ -11,14 +11,14 @@ from jaxtyping import Float, Int
 from mcgicp_jax._clouds.origins import centred_pose
 from mcgicp_jax._clouds.point_cloud import PointCloud
 from mcgicp_jax._compute.argument_checks import check_integer, check_positive
-from mcgicp_jax._compute.cache import keep
+from mcgicp_jax._compute.cache import cached_with
 from mcgicp_jax._compute.concrete import constant, is_concrete
 from mcgicp_jax._math.poses import Pose, se3_from_matrix
 from mcgicp_jax._methods.base import AbstractMethod
 from mcgicp_jax._methods.surfaces import searchable
 from mcgicp_jax._pose_solver.matched import Motion, distances_within
 from mcgicp_jax._registration.input_checks import check_clouds
-from mcgicp_jax._search.base import AbstractIndex, AbstractSearch, Correspondences, Rows
+from mcgicp_jax._search.base import AbstractIndex, AbstractSearch, Correspondences, SearchPoints
 from mcgicp_jax._search.brute_force import default_search
 
 
@@ -84,7 +84,11 @@ def _unless_several(matches: Correspondences, num_candidates: int) -> Correspond
 
 
 def _correspondences_at(
-    matrix: Float[np.ndarray, "4 4"], source: Rows, target: Rows, indices: Int[np.ndarray, "m N"], gate: float
+    matrix: Float[np.ndarray, "4 4"],
+    source: SearchPoints,
+    target: SearchPoints,
+    indices: Int[np.ndarray, "m N"],
+    gate: float,
 ) -> Correspondences:
     """Matches at a pose, valid within `gate` metres of position; NumPy, so that nothing is compiled."""
     rows, dtype = np.maximum(indices, 0), source.points.dtype
@@ -102,4 +106,4 @@ def index_of(search: AbstractSearch, method: AbstractMethod, target: PointCloud)
     if numbers and target.channel_valid is not None:
         numbers.append(method.missing_variances(count))
     key = (repr(search), *(np.asarray(number).tobytes() for number in numbers))
-    return keep(target, "index", key, lambda: search.index(searchable(method, target)))
+    return cached_with(target, "index", key, lambda: search.index(searchable(method, target)))

@@ -22,7 +22,7 @@ from mcgicp_jax._pose_solver.matched import Matched, Motion
 from mcgicp_jax._pose_solver.sums import Sums, combine, sums_of
 from mcgicp_jax._registration.loop import AbstractExecutor, LoopResult
 from mcgicp_jax._registration.step import COARSE, SETTLED, Problem, Record, State
-from mcgicp_jax._search.base import AbstractIndex, Rows, by_position
+from mcgicp_jax._search.base import AbstractIndex, SearchPoints, by_position
 from mcgicp_jax._terms.base import AbstractTerm
 
 
@@ -58,8 +58,8 @@ class _Gathered(NamedTuple):
     max_distance: Any
     source_noise: SurfaceNoise | None
     target_noise: SurfaceNoise | None
-    source_search: Rows | None
-    target_search: Rows | None
+    source_search: SearchPoints | None
+    target_search: SearchPoints | None
 
 
 class HostExecutor(AbstractExecutor):

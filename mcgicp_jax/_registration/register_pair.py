@@ -12,8 +12,8 @@ from mcgicp_jax._clouds.origins import centred_pose, pose_in_user_frame
 from mcgicp_jax._clouds.point_cloud import PointCloud, Values, as_cloud
 from mcgicp_jax._clouds.preprocess import preprocess
 from mcgicp_jax._compute.argument_checks import errors_named
-from mcgicp_jax._compute.concrete import computed_now, constant, is_concrete, namespace
-from mcgicp_jax._compute.lazy import Deferred
+from mcgicp_jax._compute.concrete import constant, is_concrete, numpy_for, outside_trace
+from mcgicp_jax._compute.lazy import Lazy
 from mcgicp_jax._local_geometry.channel_equalization import warn_of_units, with_channels_matched
 from mcgicp_jax._local_geometry.surface import searched
 from mcgicp_jax._math.poses import Pose, se3_from_matrix
@@ -139,9 +139,9 @@ def _run_on_host(problem: Problem, method: AbstractMethod, target: PointCloud, s
         return index_of(search, PointToPoint() if position_alone else method, target)
 
     executor = HostExecutor(problem, index, search.num_threads)
-    with computed_now():
+    with outside_trace():
         loop = iterate(executor)
-    moments = Deferred(lambda: moments_of(executor, loop, rematched=True))
+    moments = Lazy(lambda: moments_of(executor, loop, rematched=True))
     assessment = assessment_of(executor, loop, None if problem.fusion is not None else moments)
     return _Run(problem, loop, lambda: loop.state, lambda: assessment, lambda: moments.value)
 
@@ -167,7 +167,7 @@ def pose_problem(
         num_threads=num_threads,
     )
     dtype, valid = source.points.dtype, searched(pair.source).valid
-    xp = namespace(valid)
+    xp = numpy_for(valid)
     stride = xp.maximum(xp.sum(xp.asarray(valid)) // _COARSE_ROWS, 1)
     start = se3_from_matrix(centred_pose(init, source, target), dtype)
     settings = settings_for(options, pair.method, target, stride, dtype)

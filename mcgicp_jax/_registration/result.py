@@ -14,7 +14,7 @@ from jaxtyping import Array, Float, Int
 
 from mcgicp_jax._clouds.origins import pose_in_user_frame
 from mcgicp_jax._compute.concrete import AnyArray, canonical_float, is_concrete
-from mcgicp_jax._compute.lazy import Deferred
+from mcgicp_jax._compute.lazy import Lazy
 from mcgicp_jax._math.poses import se3
 from mcgicp_jax._pose_solver.degeneracy import Directions, FreeDirection, describe, free_directions
 
@@ -101,8 +101,8 @@ class Registration(eqx.Module):
     source_origin: Float[Array, "*batch 3"] | Float[np.ndarray, "*batch 3"]
     target_origin: Float[Array, "*batch 3"] | Float[np.ndarray, "*batch 3"]
     centred: jaxlie.SE3
-    constraints: Deferred[Constraints]
-    uncertainty: Deferred[Uncertainty]
+    constraints: Lazy[Constraints]
+    uncertainty: Lazy[Uncertainty]
 
     @classmethod
     def build(cls, **fields: Any) -> Registration:
@@ -129,8 +129,8 @@ class Registration(eqx.Module):
             source_origin=np.zeros(3),
             target_origin=np.zeros(3),
             centred=nowhere,
-            constraints=Deferred.of(Constraints(np.zeros((6, 6)), None)),
-            uncertainty=Deferred.of(Uncertainty(np.full((6, 6), np.nan), np.full(6, np.nan))),
+            constraints=Lazy.of(Constraints(np.zeros((6, 6)), None)),
+            uncertainty=Lazy.of(Uncertainty(np.full((6, 6), np.nan), np.full(6, np.nan))),
         )
 
     @property

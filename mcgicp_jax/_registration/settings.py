@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Float
 
 from mcgicp_jax._clouds.point_cloud import PointCloud
-from mcgicp_jax._compute.concrete import AnyScalar, constant, namespace
+from mcgicp_jax._compute.concrete import AnyScalar, constant, numpy_for
 from mcgicp_jax._local_geometry.cells import cell_edge
 from mcgicp_jax._local_geometry.spacing_and_noise import grid_spacing, point_spacing
 from mcgicp_jax._methods.base import AbstractMethod
@@ -38,7 +38,7 @@ def default_distances(spacing: Any, target: PointCloud) -> tuple[Any, Any]:
     """Default `max_distance` of the coarse and the fine phase, metres, for a target with this spacing."""
     # Cells have the spacing of their grid.
     between = spacing if target.covariances is not None else constant(grid_spacing(target))
-    return _COARSE_SPACINGS * namespace(spacing, between).maximum(spacing, between), _FINE_SPACINGS * spacing
+    return _COARSE_SPACINGS * numpy_for(spacing, between).maximum(spacing, between), _FINE_SPACINGS * spacing
 
 
 def settings_for(options: Options, method: AbstractMethod, target: PointCloud, stride: Any, dtype: Any) -> Settings:
@@ -51,11 +51,11 @@ def settings_for(options: Options, method: AbstractMethod, target: PointCloud, s
     tolerance = least if tolerance is None else tolerance
 
     def number(value: Any, kind: Any) -> Any:
-        xp = namespace(value)
+        xp = numpy_for(value)
         return xp.asarray(value, kind)
 
     def coarse_tolerance(value: Any, least: Any) -> Any:
-        return number(_COARSE_TOLERANCE * namespace(value, least).maximum(value, least), dtype)
+        return number(_COARSE_TOLERANCE * numpy_for(value, least).maximum(value, least), dtype)
 
     coarse, fine = max_distance if isinstance(max_distance, tuple) or np.shape(max_distance) else [max_distance] * 2
     return Settings(

@@ -11,7 +11,7 @@ import jaxlie
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from mcgicp_jax._compute.concrete import AnyArray, AnyScalar, namespace
+from mcgicp_jax._compute.concrete import AnyArray, AnyScalar, numpy_for
 from mcgicp_jax._local_geometry.surface import Surface
 from mcgicp_jax._math.poses import move_pose
 from mcgicp_jax._pose_solver.degeneracy import Directions, find_directions
@@ -58,17 +58,17 @@ class Settings(eqx.Module):
 
     def distance(self, status: Int[AnyScalar, ""]) -> Float[AnyScalar, ""]:
         """Maximum correspondence distance at this status, metres."""
-        return namespace(self, status).where(status == COARSE, self.max_distance, self.fine_distance)
+        return numpy_for(self, status).where(status == COARSE, self.max_distance, self.fine_distance)
 
     def stride(self, status: Int[AnyScalar, ""], num_iterations: Int[AnyScalar, ""]) -> Int[AnyScalar, ""]:
         """Stride of the source points at this status. Once `max_iterations` are done, all points are measured."""
         coarse = (status == COARSE) & (num_iterations < self.max_iterations)
-        return namespace(self, status, num_iterations).where(coarse, self.coarse_stride, 1)
+        return numpy_for(self, status, num_iterations).where(coarse, self.coarse_stride, 1)
 
     def first_status(self) -> Int[AnyScalar, ""]:
         """`COARSE` where the coarse phase differs from the fine one."""
         coarse = (self.fine_distance < self.max_distance) | (self.coarse_stride > 1)
-        return namespace(self).where(coarse, np.int32(COARSE), np.int32(RUNNING))
+        return numpy_for(self).where(coarse, np.int32(COARSE), np.int32(RUNNING))
 
 
 class Problem(eqx.Module):

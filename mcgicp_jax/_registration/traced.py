@@ -17,7 +17,7 @@ import jaxlie
 from jaxtyping import Array, Bool, Float, Int
 
 from mcgicp_jax._compute.concrete import AnyScalar
-from mcgicp_jax._compute.lazy import Deferred
+from mcgicp_jax._compute.lazy import Lazy
 from mcgicp_jax._local_geometry.surface import Surface, searched
 from mcgicp_jax._pose_solver.covariance import Moments, Scores, scores_of
 from mcgicp_jax._pose_solver.implicit_derivative import Model, root_near, with_derivative
@@ -28,7 +28,7 @@ from mcgicp_jax._registration.assessment import Assessment, assessment_of, momen
 from mcgicp_jax._registration.loop import AbstractExecutor, LoopResult, iterate
 from mcgicp_jax._registration.result import Status
 from mcgicp_jax._registration.step import COARSE, RUNNING, SETTLED, Problem, State, update
-from mcgicp_jax._search.base import AbstractSearch, Correspondences, Rows, by_position
+from mcgicp_jax._search.base import AbstractSearch, Correspondences, SearchPoints, by_position
 from mcgicp_jax._terms.base import AbstractTerm, is_adaptive
 
 
@@ -220,7 +220,7 @@ def align_traced(
 @jax.jit
 def assess(loop: LoopResult, problem: Problem, search: AbstractSearch) -> Assessment:
     """The assessment of the loop of `register`."""
-    moments = None if problem.fusion is not None else Deferred.of(moments_traced(loop, problem, search))
+    moments = None if problem.fusion is not None else Lazy.of(moments_traced(loop, problem, search))
     return assessment_of(TracedExecutor(problem, search, 0), loop, moments)
 
 
@@ -234,7 +234,7 @@ def moments_traced(loop: LoopResult, problem: Problem, search: AbstractSearch) -
 def assess_alignment(loop: LoopResult, problem: Problem, temperature: Float[Array, ""] | None) -> Assessment:
     """The assessment of the loop of `align`."""
     executor = FixedMatches(problem, loop.matches, temperature, 0)
-    return assessment_of(executor, loop, Deferred.of(moments_of(executor, loop, rematched=False)))
+    return assessment_of(executor, loop, Lazy.of(moments_of(executor, loop, rematched=False)))
 
 
 @jax.jit
@@ -261,14 +261,14 @@ def differentiable(
     return state._replace(pose=jaxlie.SE3(pose))
 
 
-def _without_descriptors(where: Bool[Array, ""], rows: Rows) -> Rows:
+def _without_descriptors(where: Bool[Array, ""], rows: SearchPoints) -> SearchPoints:
     """The rows for a search in position alone, where asked for: without descriptors, none is missing either."""
     factor = jnp.where(where, 0, 1).astype(rows.points.dtype)
     penalty = None if rows.penalty is None else factor * rows.penalty
-    return Rows(rows.points, factor * rows.descriptors, rows.valid, penalty)
+    return SearchPoints(rows.points, factor * rows.descriptors, rows.valid, penalty)
 
 
-def _every(stride: Int[Array, ""], source: Rows) -> Rows:
+def _every(stride: Int[Array, ""], source: SearchPoints) -> SearchPoints:
     """Mark all but every `stride`-th row as invalid, so that they match nothing."""
     chosen = jnp.arange(source.valid.size) % stride == 0
     return eqx.tree_at(lambda rows: rows.valid, source, source.valid & chosen)

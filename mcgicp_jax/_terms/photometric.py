@@ -40,7 +40,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from mcgicp_jax._compute.concrete import AnyArray, AnyScalar, namespace
+from mcgicp_jax._compute.concrete import AnyArray, AnyScalar, numpy_for
 from mcgicp_jax._local_geometry.channel_equalization import gain_and_offset
 from mcgicp_jax._local_geometry.channel_fits import fit_linear
 from mcgicp_jax._local_geometry.local_geometry import LocalGeometry, offsets_of
@@ -178,7 +178,7 @@ class Photometric(AbstractTerm):
         equalizes_channels: bool,
     ) -> Photometric:
         """The term before its numbers are known."""
-        xp = namespace(spacing)
+        xp = numpy_for(spacing)
         spacing = xp.asarray(spacing)
         count = 1 + channel_weights.shape[0]
         zeros, ones = (make(count, spacing.dtype) for make in (xp.zeros, xp.ones))
@@ -311,7 +311,7 @@ class Photometric(AbstractTerm):
         In a sample each cell holds fewer pairs of correlated residuals, so that the excess f − 1 of the sample is
         divided by `fraction`.
         """
-        xp = namespace(self, sample, fraction)
+        xp = numpy_for(self, sample, fraction)
         # NumPy takes two thirds of the time for contiguous columns.
         values, own, products, moved = (
             xp.asarray(each).T.copy() for each in (sample.values, sample.own, sample.products, sample.moved)
@@ -356,7 +356,7 @@ class Photometric(AbstractTerm):
     @property
     def shifts(self) -> Float[AnyArray, "6 3"]:
         """Along +x, −x, +y, −y, +z, −z, metres."""
-        xp = namespace(self)
+        xp = numpy_for(self)
         signs = np.repeat(np.eye(3), 2, axis=0) * np.array([[1], [-1]] * 3)
         return _SHIFT * xp.asarray(self.spacing) * signs.astype(self.spacing.dtype)
 
@@ -367,7 +367,7 @@ class Photometric(AbstractTerm):
         for the colours of posters, 0.5 to 0.75 in the box room, 0.75 for the normals of both. Between two matches,
         fitted values differ by less than the slope at either says where the slope is large.
         """
-        xp = namespace(self, samples)
+        xp = numpy_for(self, samples)
         values, slopes = xp.asarray(samples.values), xp.asarray(samples.slopes)
         known = ~xp.isnan(values) & (self.deviations > 0)
         scale = xp.where(self.deviations > 0, self.deviations, 1)
@@ -395,7 +395,7 @@ class _Columns(NamedTuple):
 def _squared_sums(scores: Float[AnyArray, "K 3 n"], cells: Int[AnyArray, "n"]) -> Float[AnyArray, "K"]:
     """Σ_c |u_c|², with u_c the sum of the scores in a cell."""
     columns = scores.reshape(-1, scores.shape[-1])
-    if namespace(scores, cells) is np:
+    if numpy_for(scores, cells) is np:
         sums: Any = np.stack([np.bincount(cells, column) for column in columns], axis=1)
     else:
         sums = jnp.zeros_like(columns.T).at[cells].add(columns.T)
