@@ -6,7 +6,7 @@ import threading
 import numpy as np
 
 import mcgicp_jax as mcg
-from mcgicp_jax._compute.cache import Cache, keep
+from mcgicp_jax._compute.cache import Cache, cached_with
 
 
 def test_the_least_recently_used_are_evicted_by_size():
@@ -48,12 +48,12 @@ def test_two_values_of_each_kind_are_cached_with_a_cloud():
     cloud, made = mcg.PointCloud(np.eye(3)), []
 
     def get(kind, key):
-        return keep(cloud, kind, key, lambda: made.append(key) or key)
+        return cached_with(cloud, kind, key, lambda: made.append(key) or key)
 
     assert [get("a", key) for key in (1, 2, 1, 2, 3, 1)] == [1, 2, 1, 2, 3, 1]
     assert made == [1, 2, 3, 1] and get("b", 3) == 3 and made[-1] == 3 and len(made) == 5
     same = cloud.replace()
-    assert keep(same, "a", 1, lambda: "of the other cloud") == "of the other cloud"
+    assert cached_with(same, "a", 1, lambda: "of the other cloud") == "of the other cloud"
 
 
 def test_a_new_cloud_in_the_place_of_an_old_one_has_no_values():
@@ -62,7 +62,7 @@ def test_a_new_cloud_in_the_place_of_an_old_one_has_no_values():
     for i in range(50):
         cloud = mcg.PointCloud(np.eye(3))
         numbers.add(id(cloud))
-        assert keep(cloud, "number", None, lambda i=i: i) == i
+        assert cached_with(cloud, "number", None, lambda i=i: i) == i
         del cloud
         gc.collect(0)
     assert len(numbers) < 50

@@ -60,7 +60,7 @@ class _CachedWithCloud:
 _clouds = Cache(MAX_ROWS, lambda cached: cached.num_rows)
 
 
-def keep(cloud: Any, kind: str, key: Hashable, make: Callable[[], Value]) -> Value:
+def cached_with(cloud: Any, kind: str, key: Hashable, make: Callable[[], Value]) -> Value:
     """The value cached for this cloud (by identity), kind and key, or else the result of `make`, which is then cached.
 
     Values live no longer than their cloud, any object with `points` that can be referenced weakly.

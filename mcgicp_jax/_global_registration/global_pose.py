@@ -14,7 +14,7 @@ from mcgicp_jax._clouds.point_cloud import PointCloud, Values, as_cloud
 from mcgicp_jax._clouds.preprocess import finite_rows, with_neighbors
 from mcgicp_jax._clouds.voxels import voxel_order
 from mcgicp_jax._compute.argument_checks import check_positive, errors_named
-from mcgicp_jax._compute.concrete import computed_now
+from mcgicp_jax._compute.concrete import outside_trace
 from mcgicp_jax._global_registration.feature_matching import matches_of_features, matches_of_rows
 from mcgicp_jax._global_registration.fpfh import NUM_NEIGHBORS
 from mcgicp_jax._global_registration.robust_pose_fit import (
@@ -134,7 +134,7 @@ def find_pose(
     voxels = _with_neighbors((one, other), size)
     if voxels is None:
         return _no_pose(0, size)
-    with computed_now():
+    with outside_trace():
         if rows is None:
             matches = matches_of_features(*voxels, size)
         else:

@@ -12,7 +12,7 @@ import numpy as np
 
 from mcgicp_jax._clouds.point_cloud import PointCloud
 from mcgicp_jax._compute.blocks import map_rows
-from mcgicp_jax._compute.cache import keep
+from mcgicp_jax._compute.cache import cached_with
 from mcgicp_jax._compute.concrete import is_concrete
 from mcgicp_jax._compute.threads import side_by_side
 from mcgicp_jax._local_geometry.covariances import describe, gatherer
@@ -56,7 +56,7 @@ def local_on_host(cloud: PointCloud, with_channels: bool, num_threads: int | Non
         gather = gatherer(cloud, with_channels, np)
         return map_rows(lambda rows: _describe(gather(rows)), cloud.points.shape[0], num_threads)
 
-    return keep(cloud, "local", with_channels, make)
+    return cached_with(cloud, "local", with_channels, make)
 
 
 _describe = jax.jit(describe)

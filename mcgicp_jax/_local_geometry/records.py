@@ -14,7 +14,7 @@ import jax.numpy as jnp
 from jaxtyping import Bool, Float
 
 from mcgicp_jax._compute.concrete import AnyArray
-from mcgicp_jax._search.base import Rows
+from mcgicp_jax._search.base import SearchPoints
 
 # Columns of a surface's table.
 _POINTS, _COVARIANCE, _GEOMETRY, _CHANNELS = slice(0, 3), slice(3, 9), slice(9, 15), slice(15, 21)
@@ -143,7 +143,7 @@ class Surface(NamedTuple):
             normal (3), roughness (metres²), reach (metres); None if observability is not computed.
     """
 
-    rows: Rows
+    rows: SearchPoints
     table: Table
     details: Float[AnyArray, "*batch N 6"] | None
 

@@ -13,8 +13,8 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from mcgicp_jax._clouds.point_cloud import PointCloud
-from mcgicp_jax._compute.cache import keep
-from mcgicp_jax._compute.concrete import AnyArray, AnyScalar, constant, is_concrete, namespace
+from mcgicp_jax._compute.cache import cached_with
+from mcgicp_jax._compute.concrete import AnyArray, AnyScalar, constant, is_concrete, numpy_for
 from mcgicp_jax._local_geometry.covariances import check_neighbors
 from mcgicp_jax._local_geometry.records import Local
 from mcgicp_jax._math.statistics import median, of_known, sampled_rows
@@ -34,7 +34,7 @@ def channel_noise(
 
     Both are medians over both clouds: σ of the residuals of linear fits, λ₀ of the variances of the neighbours.
     """
-    xp = namespace(source, target, locals)
+    xp = numpy_for(source, target, locals)
     residuals, values, across = [], [], []
     for cloud, local in zip((source, target), locals, strict=True):
         valid = xp.asarray(cloud.valid)
@@ -56,7 +56,7 @@ def channel_noise(
 
 def warn_of_units(source: PointCloud, target: PointCloud) -> None:
     """Warn of channels of two concrete clouds whose values are so different that their units probably are, too."""
-    ranges = [keep(cloud, "ranges", None, partial(_ranges, cloud)) for cloud in (source, target)]
+    ranges = [cached_with(cloud, "ranges", None, partial(_ranges, cloud)) for cloud in (source, target)]
     for name, (low, high), (first, last) in zip(source.channel_names, *ranges, strict=False):
         narrow, wide = sorted([high - low, last - first])
         if high < first or last < low or wide > _OTHER_UNIT * narrow > 0:
@@ -92,7 +92,7 @@ def _smallest_variance(local: Local, xp: Any) -> Float[AnyArray, "N"]:
 
 def _known_values(cloud: PointCloud) -> Float[AnyArray, "N C"]:
     """Channels, NaN where a point lacks them or is padding."""
-    xp = namespace(cloud)
+    xp = numpy_for(cloud)
     valid = xp.asarray(cloud.valid)[:, None]
     if cloud.channel_valid is not None:
         valid = valid & xp.asarray(cloud.channel_valid)
@@ -119,13 +119,13 @@ def grid_spacing(cloud: PointCloud) -> Float[AnyScalar, ""]:
 def _spacings(cloud: PointCloud) -> tuple[Float[AnyScalar, ""], Float[AnyScalar, ""]]:
     """`point_spacing` and `grid_spacing`; cached with a concrete cloud."""
     if is_concrete(cloud):
-        return keep(cloud, "spacings", None, lambda: _measured_spacings(cloud))
+        return cached_with(cloud, "spacings", None, lambda: _measured_spacings(cloud))
     return _measured_spacings(cloud)
 
 
 def _measured_spacings(cloud: PointCloud) -> tuple[Float[AnyScalar, ""], Float[AnyScalar, ""]]:
     distances = _neighbor_distances(cloud)
-    xp = namespace(distances)
+    xp = numpy_for(distances)
     nearest = xp.min(xp.where(distances > 0, distances, xp.inf), axis=1)
     spacing = xp.nan_to_num(median(xp.where(xp.isfinite(nearest), nearest, xp.nan)))
     known = xp.isfinite(distances)
@@ -137,7 +137,7 @@ def _measured_spacings(cloud: PointCloud) -> tuple[Float[AnyScalar, ""], Float[A
 def _neighbor_distances(cloud: PointCloud) -> Float[AnyArray, "n k"]:
     """Distances between sampled points and their neighbours, metres; infinite where there is none."""
     check_neighbors(cloud)
-    xp = namespace(cloud)
+    xp = numpy_for(cloud)
     rows, counts = sampled_rows(xp.asarray(cloud.valid))
     neighbors = xp.asarray(cloud.neighbors)[rows]
     square = xp.zeros(neighbors.shape, cloud.points.dtype)
@@ -156,7 +156,7 @@ def with_channels_matched(source: PointCloud, target: PointCloud, matches: Corre
     gain towards 0. With `matches`, only values of valid matches are used. Gain and offset are constants to autodiff;
     they are 1 and 0 for channels without usable spread.
     """
-    xp = namespace(source, target, matches)
+    xp = numpy_for(source, target, matches)
     values = [_known_values(constant(cloud)) for cloud in (source, target)]
     values = [xp.asarray(each) for each in values]
     if matches is not None:
@@ -177,7 +177,7 @@ def gain_and_offset(
 
     NaNs are ignored; 1 and 0 for channels without usable spread.
     """
-    xp = namespace(values, wanted)
+    xp = numpy_for(values, wanted)
     levels = xp.asarray(_QUANTILES, values.dtype)
     quantiles = [of_known(partial(xp.nanquantile, q=levels, axis=0), each) for each in (values, wanted)]
     means = [xp.mean(each, axis=0) for each in quantiles]

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from mcgicp_jax._compute.concrete import AnyArray, AnyScalar, is_concrete, namespace
+from mcgicp_jax._compute.concrete import AnyArray, AnyScalar, is_concrete, numpy_for
 
 # Largest sample for a median, rows: the median of 4,096 normal variates has a standard error of 2 % of σ.
 MEDIAN_ROWS = 4096
@@ -27,7 +27,7 @@ def sampled_rows(valid: Any) -> tuple[Any, Any]:
     Returns:
         (n,) row numbers, n at most `MEDIAN_ROWS`, and (n,) booleans: which of them are valid.
     """
-    xp = namespace(valid)
+    xp = numpy_for(valid)
     count = min(valid.size, MEDIAN_ROWS)
     rows = xp.arange(count) * (1 + xp.sum(valid) // MEDIAN_ROWS)
     inside = rows < valid.size
@@ -54,7 +54,7 @@ def of_known(statistic: Callable[[Any], Any], values: Float[AnyArray, "n C"]) ->
 
     NumPy would warn of such columns, and its warning cannot be suppressed in one thread alone.
     """
-    xp = namespace(values)
+    xp = numpy_for(values)
     missing = xp.all(xp.isnan(values), axis=0)
     # Squares of huge values overflow to infinity.
     with np.errstate(over="ignore", invalid="ignore"):
@@ -85,6 +85,6 @@ def cell_numbers(keys: Sequence[Int[AnyArray, "n"]], num_cells: Int[AnyScalar, "
 
     Collisions do no harm: scores of different cells are independent, so their products cancel on average.
     """
-    xp = namespace(keys, num_cells)
+    xp = numpy_for(keys, num_cells)
     products = [xp.asarray(key, np.int32) * prime for key, prime in zip(keys, _HASH, strict=False)]
     return xp.abs(sum(products[1:], start=products[0])) % num_cells

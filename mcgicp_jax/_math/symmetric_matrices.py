@@ -14,7 +14,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from mcgicp_jax._compute.concrete import AnyArray, namespace
+from mcgicp_jax._compute.concrete import AnyArray, numpy_for
 
 
 def symmetric_from_matrix(matrix: Float[Array, "N 3 3"]) -> Float[Array, "6 N"]:
@@ -252,7 +252,7 @@ def symmetric_product(a: Float[Array, "6 N"], b: Float[Array, "6 N"]) -> Float[A
 
 def inverse_3(matrices: Float[AnyArray, "*n 3 3"]) -> Float[AnyArray, "*n 3 3"]:
     """Inverses of symmetric positive definite matrices: cross products of rows over the determinant."""
-    xp = namespace(matrices)
+    xp = numpy_for(matrices)
     matrices = 0.5 * (matrices + matrices.swapaxes(-1, -2))
     # So that the determinant of variances of 1e-10 does not underflow float32.
     size = xp.einsum("...ii->...", matrices)[..., None, None]
@@ -263,7 +263,7 @@ def inverse_3(matrices: Float[AnyArray, "*n 3 3"]) -> Float[AnyArray, "*n 3 3"]:
 
 def inverse_6(matrix: Float[AnyArray, "6 6"]) -> Float[AnyArray, "6 6"]:
     """Inverse of a symmetric positive definite matrix by blocks."""
-    xp = namespace(matrix)
+    xp = numpy_for(matrix)
     matrix = 0.5 * (matrix + matrix.T)
     mixed, corner = matrix[:3, 3:], inverse_3(matrix[3:, 3:])
     ratio = mixed @ corner

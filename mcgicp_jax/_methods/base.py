@@ -15,7 +15,7 @@ from jaxtyping import Array, Bool, Float
 
 from mcgicp_jax._clouds.point_cloud import PointCloud, Values
 from mcgicp_jax._clouds.preprocess import preprocess
-from mcgicp_jax._compute.concrete import AnyArray, AnyScalar, canonical_float, constant, is_concrete, namespace
+from mcgicp_jax._compute.concrete import AnyArray, AnyScalar, canonical_float, constant, is_concrete, numpy_for
 from mcgicp_jax._local_geometry.covariances import NO_NEIGHBORS as _NO_NEIGHBORS
 from mcgicp_jax._local_geometry.covariances import (
     channel_kernel,
@@ -372,7 +372,7 @@ class MultiChannelGICP(AbstractGeneralized):
         (as for rendered scenes), but not to lower it.
         """
         source, target, locals, epsilon = constant((source, target, locals, self.epsilon))
-        xp = namespace(source, target, locals, epsilon)
+        xp = numpy_for(source, target, locals, epsilon)
         sigma, uniform, across = channel_noise(source, target, locals)
         spacing = point_spacing(target)
         with np.errstate(over="ignore", invalid="ignore"):
@@ -472,7 +472,7 @@ class MultiChannelGICP(AbstractGeneralized):
     def missing_variances(self, num_channels: int) -> Float[AnyArray, "C"]:
         if self.channel_covariance is None:
             raise ValueError("channel_covariance: not chosen yet; call method.resolve(source, target) first")
-        xp = namespace(self.channel_covariance)
+        xp = numpy_for(self.channel_covariance)
         covariance = xp.asarray(self.channel_covariance)
         _check_covariance_fits(covariance, num_channels)
         return xp.broadcast_to(xp.diagonal(covariance) if covariance.ndim == 2 else covariance, (num_channels,))
@@ -500,7 +500,7 @@ def _per_channel(name: str, numbers: Float[AnyArray, "..."], num_channels: int) 
             f"{name}: expected a scalar or shape ({num_channels},), for clouds of {num_channels} channels, "
             f"got {numbers.shape}"
         )
-    xp = namespace(numbers)
+    xp = numpy_for(numbers)
     return xp.broadcast_to(xp.asarray(numbers), (num_channels,))
 
 

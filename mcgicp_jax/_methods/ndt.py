@@ -15,7 +15,7 @@ from jaxtyping import Array, Float
 
 from mcgicp_jax._clouds.point_cloud import PointCloud, Values
 from mcgicp_jax._clouds.preprocess import finite_rows, with_neighbors
-from mcgicp_jax._compute.concrete import AnyScalar, namespace
+from mcgicp_jax._compute.concrete import AnyScalar, numpy_for
 from mcgicp_jax._local_geometry.observability import geometry_observability
 from mcgicp_jax._local_geometry.records import Local, Neighborhoods, local_of
 from mcgicp_jax._math import symmetric_matrices as alg
@@ -70,7 +70,7 @@ class AbstractNDT(AbstractMethod):
         """The median edge of the cells. (Where a plane lies between two layers of voxels, cells lie close together.)"""
         if target.covariances is None:
             return super().spacing(target)
-        xp = namespace(target)
+        xp = numpy_for(target)
         rows, counts = sampled_rows(xp.asarray(target.valid))
         traces = xp.trace(xp.asarray(target.covariances)[rows], axis1=1, axis2=2)
         return median(xp.where(counts, xp.sqrt(_SQUARE_EDGE * traces), xp.nan))

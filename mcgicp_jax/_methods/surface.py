@@ -12,8 +12,8 @@ from jaxtyping import Array, Float
 
 from mcgicp_jax._clouds.point_cloud import PointCloud
 from mcgicp_jax._compute.blocks import map_rows
-from mcgicp_jax._compute.cache import keep
-from mcgicp_jax._compute.concrete import AnyArray, is_concrete, namespace
+from mcgicp_jax._compute.cache import cached_with
+from mcgicp_jax._compute.concrete import AnyArray, is_concrete, numpy_for
 from mcgicp_jax._compute.threads import side_by_side
 from mcgicp_jax._local_geometry.covariances import gatherer
 from mcgicp_jax._local_geometry.local_statistics import joined, locals_of, over_rows, share_a_body, split
@@ -21,7 +21,7 @@ from mcgicp_jax._local_geometry.observability import channel_observability
 from mcgicp_jax._local_geometry.records import Extended, Local, Neighborhoods, Surface, Table, covariance_of
 from mcgicp_jax._math import symmetric_matrices as alg
 from mcgicp_jax._methods.base import AbstractMethod
-from mcgicp_jax._search.base import Rows
+from mcgicp_jax._search.base import SearchPoints
 
 
 def surfaces_of(
@@ -67,13 +67,13 @@ def covariances_of(method: AbstractMethod, cloud: PointCloud) -> Float[np.ndarra
     return np.asarray(alg.matrix_from_symmetric(jnp.asarray(covariance_of(surface.table))))
 
 
-def searchable(method: AbstractMethod, cloud: PointCloud) -> Rows:
+def searchable(method: AbstractMethod, cloud: PointCloud) -> SearchPoints:
     """The cloud as the input of a search: positions, descriptors α · channel, and penalties for missing channels."""
-    xp = namespace(method, cloud)
+    xp = numpy_for(method, cloud)
     points, channels = xp.asarray(cloud.points), xp.asarray(cloud.channels)
     weights = method.weights(channels.shape[-1])
     if weights is None:
-        return Rows(points, xp.zeros((points.shape[0], 0), points.dtype), xp.asarray(cloud.valid))
+        return SearchPoints(points, xp.zeros((points.shape[0], 0), points.dtype), xp.asarray(cloud.valid))
     weights, penalty = xp.asarray(weights), None
     if cloud.channel_valid is not None:
         # The expected squared difference in a true match: on average, a missing channel makes a match neither nearer
@@ -81,7 +81,7 @@ def searchable(method: AbstractMethod, cloud: PointCloud) -> Rows:
         with np.errstate(over="ignore", invalid="ignore"):
             expected = weights**2 * xp.asarray(method.missing_variances(channels.shape[-1]))
         penalty = xp.where(xp.asarray(cloud.channel_valid), 0, expected.astype(points.dtype))
-    return Rows(points, channels * weights.astype(points.dtype), xp.asarray(cloud.valid), penalty)
+    return SearchPoints(points, channels * weights.astype(points.dtype), xp.asarray(cloud.valid), penalty)
 
 
 def surface_on_host(
@@ -97,7 +97,7 @@ def surface_on_host(
     # A surface does not depend on numbers that are estimated from matches.
     leaves, structure = jax.tree.flatten(method.with_estimates(None))
     key = (structure, *(np.asarray(leaf).tobytes() for leaf in leaves), observed)
-    return keep(cloud, "surface", key, make)
+    return cached_with(cloud, "surface", key, make)
 
 
 def _block(method: AbstractMethod, cloud: PointCloud, local: Local | None, observed: bool) -> Any:

@@ -14,7 +14,7 @@ from mcgicp_jax._clouds.point_cloud import PointCloud, Values, as_cloud
 from mcgicp_jax._clouds.preprocess import MIN_POINTS, finite_rows, preprocess
 from mcgicp_jax._clouds.voxels import voxel_order
 from mcgicp_jax._compute.argument_checks import check_integer, check_positive, is_number
-from mcgicp_jax._compute.concrete import AnyArray, namespace
+from mcgicp_jax._compute.concrete import AnyArray, numpy_for
 from mcgicp_jax._math import symmetric_matrices as alg
 from mcgicp_jax._methods.base import GICP
 from mcgicp_jax._methods.surface import covariances_of
@@ -255,7 +255,7 @@ def _moments(
     """
     means = sum_of(points) / counts.astype(points.dtype)
     x, y, z = points - each(means)
-    products = namespace(points).stack([x * x, x * y, x * z, y * y, y * z, z * z])
+    products = numpy_for(points).stack([x * x, x * y, x * z, y * y, y * z, z * z])
     return means, sum_of(products) / np.maximum(counts - 1, 1).astype(points.dtype)
 
 

@@ -13,7 +13,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from mcgicp_jax._compute.argument_checks import check_integer
 from mcgicp_jax._compute.concrete import is_concrete
-from mcgicp_jax._compute.lazy import Deferred
+from mcgicp_jax._compute.lazy import Lazy
 from mcgicp_jax._math.poses import matrices_of, parameters_of
 from mcgicp_jax._pose_graph.differentiable import optimize_traced
 from mcgicp_jax._pose_graph.graph import WORLD, Edge, PoseGraph
@@ -66,7 +66,7 @@ class PoseGraphResult(eqx.Module):
     cost: Float[ArrayLike, ""]
     residuals: Float[Array, "m"] | Float[np.ndarray, "m"]
     weights: Float[Array, "m"] | Float[np.ndarray, "m"]
-    uncertainty: Deferred[Any]
+    uncertainty: Lazy[Any]
 
     @classmethod
     def build(cls, **fields: Any) -> PoseGraphResult:
@@ -161,7 +161,7 @@ def optimize_poses(graph: PoseGraph, *, robust: bool = True, max_iterations: int
         cost=np.float64(cost),
         residuals=np.sqrt(np.maximum(found.terms.squares, 0)),
         weights=weights,
-        uncertainty=Deferred(lambda: _covariances(equations, found, weights)[: len(graph.poses)]),
+        uncertainty=Lazy(lambda: _covariances(equations, found, weights)[: len(graph.poses)]),
     )
 
 
@@ -199,7 +199,7 @@ def _traced(graph: PoseGraph, robust: bool, max_iterations: int) -> PoseGraphRes
         cost=0.5 * jnp.sum(found.squares),
         residuals=jnp.sqrt(jnp.maximum(found.squares, 0)),
         weights=jnp.ones_like(found.squares),
-        uncertainty=Deferred.of(found.covariance),
+        uncertainty=Lazy.of(found.covariance),
     )
 
 

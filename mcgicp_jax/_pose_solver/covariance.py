@@ -22,7 +22,7 @@ import jaxlie
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from mcgicp_jax._compute.concrete import AnyArray, AnyScalar, namespace
+from mcgicp_jax._compute.concrete import AnyArray, AnyScalar, numpy_for
 from mcgicp_jax._local_geometry.records import noise_of, normal_of, points_of, reach_of, roughness_of
 from mcgicp_jax._math import symmetric_matrices as alg
 from mcgicp_jax._math.poses import adjoint_to_source, units
@@ -32,7 +32,7 @@ from mcgicp_jax._methods.base import AbstractMethod
 from mcgicp_jax._pose_solver.degeneracy import Directions
 from mcgicp_jax._pose_solver.sums import Matched, forces_at, mean_observability, move_rows, powers
 from mcgicp_jax._pose_solver.update import twist_form
-from mcgicp_jax._search.base import Rows
+from mcgicp_jax._search.base import SearchPoints
 from mcgicp_jax._terms.photometric import Term
 
 # Edge of a cell in distances to the farthest neighbour; values from 1 to 4 hardly differ.
@@ -61,8 +61,8 @@ def discount_rows(
     translation: Float[Array, "3"],
     matched: Matched,
     details: Details,
-    source: Rows,
-    target: Rows,
+    source: SearchPoints,
+    target: SearchPoints,
 ) -> Float[Array, "n 3"]:
     """Per match, the statistics whose medians `discounts` takes; NaN where there is no match.
 
@@ -102,7 +102,7 @@ def discounts(rows: Float[AnyArray, "n 3"], num_channels: Int[AnyScalar, ""]) ->
         rows: from `discount_rows`.
         num_channels: number of channels with a nonzero weight α.
     """
-    xp = namespace(rows, num_channels)
+    xp = numpy_for(rows, num_channels)
     seen, expected, quotient = median(xp.asarray(rows).T)
     geometry = (seen / _MEDIAN_SQUARE) / (xp.where(expected > 0, expected, xp.nan) / _MEDIAN_MEAN_OF_TWO)
     # Divided by the median of χ²/C with C degrees of freedom, after Wilson & Hilferty 1931.
@@ -213,7 +213,7 @@ def _cells(
 
 def scatter_of(scores: Scores, num_cells: int) -> tuple[Float[AnyArray, "6 6"], Int[AnyScalar, ""]]:
     """Σ_c u_c u_cᵀ, and the number of cells that contain valid correspondences."""
-    xp = namespace(scores)
+    xp = numpy_for(scores)
     rows = scores.rows
     if scores.cells is not None and xp is np:
         columns = [np.bincount(scores.cells, column, num_cells) for column in rows.T]

@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from mcgicp_jax._compute.concrete import AnyArray, AnyScalar, namespace
+from mcgicp_jax._compute.concrete import AnyArray, AnyScalar, numpy_for
 from mcgicp_jax._math.symmetric_matrices import inverse_3, inverse_6
 
 
@@ -51,7 +51,7 @@ def form_at(
     prior: Prior | None,
 ) -> PoseForm:
     """The form relative to the pose R, t, about a centre. NumPy where everything is concrete."""
-    xp = namespace(rotation, translation, center, radius, ties, prior)
+    xp = numpy_for(rotation, translation, center, radius, ties, prior)
     stiffness, force = xp.zeros((12, 12)), xp.zeros(12)
     if ties is not None:
         information = inverse_3(ties.covariances)
@@ -76,7 +76,7 @@ def form_at(
 def _rotation_vectors(matrices: Float[AnyArray, "k 3 3"]) -> Float[AnyArray, "k 3"]:
     """½ (M − Mᵀ)ˣ: the rotation vector of a rotation by a small angle."""
     odd = 0.5 * (matrices - matrices.swapaxes(-1, -2))
-    return namespace(matrices).stack([odd[:, 2, 1], odd[:, 0, 2], odd[:, 1, 0]], axis=-1)
+    return numpy_for(matrices).stack([odd[:, 2, 1], odd[:, 0, 2], odd[:, 1, 0]], axis=-1)
 
 
 class Fusion(eqx.Module):

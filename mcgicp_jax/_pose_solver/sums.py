@@ -22,7 +22,7 @@ from mcgicp_jax._math import symmetric_matrices as alg
 from mcgicp_jax._math.robust_kernels import AbstractKernel
 from mcgicp_jax._math.statistics import sampled_rows
 from mcgicp_jax._methods.base import AbstractMethod
-from mcgicp_jax._search.base import Correspondences, Rows
+from mcgicp_jax._search.base import Correspondences, SearchPoints
 from mcgicp_jax._terms.base import Forces
 from mcgicp_jax._terms.photometric import Term
 
@@ -62,7 +62,7 @@ def matched_rows(
     return Matched(tables[0], gathered(tables[1], indices), valid, apart, temperature, len(candidates))
 
 
-def _square_apart(source: Rows, target: Rows, indices: Int[Array, "n"]) -> Float[Array, "n"]:
+def _square_apart(source: SearchPoints, target: SearchPoints, indices: Int[Array, "n"]) -> Float[Array, "n"]:
     square = (jnp.asarray(source.descriptors) - jnp.asarray(target.descriptors)[indices]) ** 2
     penalties = (source.penalty, None if target.penalty is None else jnp.asarray(target.penalty)[indices])
     for penalty in penalties:

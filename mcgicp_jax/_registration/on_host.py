@@ -26,7 +26,7 @@ from jaxtyping import Bool, Float, Int
 
 from mcgicp_jax._compute.blocks import map_blocks, map_rows
 from mcgicp_jax._compute.concrete import AnyArray, AnyScalar
-from mcgicp_jax._compute.lazy import Deferred
+from mcgicp_jax._compute.lazy import Lazy
 from mcgicp_jax._local_geometry.records import Extended, Surface, Table, gathered
 from mcgicp_jax._math.poses import rotation_from_quaternion
 from mcgicp_jax._math.robust_kernels import AbstractKernel
@@ -46,7 +46,7 @@ from mcgicp_jax._registration.step import (
     history_of,
     update,
 )
-from mcgicp_jax._search.base import AbstractIndex, Correspondences, Rows, by_position
+from mcgicp_jax._search.base import AbstractIndex, Correspondences, SearchPoints, by_position
 from mcgicp_jax._terms.photometric import Term
 
 if TYPE_CHECKING:
@@ -61,7 +61,7 @@ Moving: TypeAlias = tuple[Float[AnyArray, "3 3"], Float[AnyArray, "3"]]
 
 def register_on_host(
     problem: Problem, index_of: Callable[[bool], AbstractIndex], num_threads: int | None
-) -> tuple[State, Assessment, dict[str, np.ndarray], Deferred[Moments]]:
+) -> tuple[State, Assessment, dict[str, np.ndarray], Lazy[Moments]]:
     """Find matches at this pose; sum their forces; update the pose; stop when it no longer moves.
 
     Args:
@@ -93,10 +93,8 @@ def register_on_host(
         state = update(pose, status, num_iterations, sums, settings, problem.fusion)
         pose, num_iterations, status = state.pose, np.asarray(state.num_iterations), np.asarray(state.status)
         records.append(state.record)
-    moments = Deferred(partial(_moments, state, matches, gate, problem, index_of, num_threads))
-    assessment = Assessment(
-        Deferred(partial(constraints_of, state)), Deferred(partial(_covariance, state, moments, problem))
-    )
+    moments = Lazy(partial(_moments, state, matches, gate, problem, index_of, num_threads))
+    assessment = Assessment(Lazy(partial(constraints_of, state)), Lazy(partial(_covariance, state, moments, problem)))
     return state, assessment, history_of(np.stack([np.asarray(record) for record in records])), moments
 
 
@@ -228,7 +226,7 @@ def _flat(source: Any, target: Any) -> tuple[Any, Any]:
     return tiled, jax.tree.map(lambda rows: jnp.reshape(rows, (-1, rows.shape[-1])), target)
 
 
-def _covariance(state: State, moments: Deferred[Moments], problem: Problem) -> Float[np.ndarray, "6 6"]:
+def _covariance(state: State, moments: Lazy[Moments], problem: Problem) -> Float[np.ndarray, "6 6"]:
     """Covariance of the final pose, float64."""
     known = moments.value if problem.fusion is None else problem.fusion
     # In float64: beside the variances of unconstrained directions, those of the others would be lost to rounding.
@@ -296,8 +294,8 @@ def _discount_rows(
     found: Bool[AnyArray, "m N"],
     gate: Float[AnyScalar, ""],
     details: tuple[Float[AnyArray, "n 6"], Float[AnyArray, "m n 6"]],
-    source_rows: Rows,
-    target_rows: Rows,
+    source_rows: SearchPoints,
+    target_rows: SearchPoints,
 ) -> Float[AnyArray, "n 3"]:
     matched = _matched(moving, source, target, found, gate)
     return discount_rows(*moving, matched, Details(*_flat(*details)), source_rows, target_rows)
@@ -347,7 +345,11 @@ def _responding(
 
 
 def correspondences_at(
-    matrix: Float[np.ndarray, "4 4"], source: Rows, target: Rows, indices: Int[np.ndarray, "m N"], gate: float
+    matrix: Float[np.ndarray, "4 4"],
+    source: SearchPoints,
+    target: SearchPoints,
+    indices: Int[np.ndarray, "m N"],
+    gate: float,
 ) -> Correspondences:
     """Matches at a pose, valid within `gate` metres of position; NumPy, so that nothing is compiled."""
     rows, dtype = np.maximum(indices, 0), source.points.dtype

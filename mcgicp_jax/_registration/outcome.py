@@ -10,8 +10,8 @@ import jax
 import numpy as np
 
 from mcgicp_jax._clouds.point_cloud import PointCloud
-from mcgicp_jax._compute.concrete import constant, is_concrete, namespace
-from mcgicp_jax._compute.lazy import Deferred
+from mcgicp_jax._compute.concrete import constant, is_concrete, numpy_for
+from mcgicp_jax._compute.lazy import Lazy
 from mcgicp_jax._math.poses import se3_from_matrix, translation_adjoint
 from mcgicp_jax._pose_solver.degeneracy import Directions
 from mcgicp_jax._registration.result import Registration, pose_in_user_frame
@@ -58,12 +58,12 @@ def registration_of(
     )
 
 
-def _later(compute: Callable[[], Any], concrete: bool) -> Deferred[Any]:
+def _later(compute: Callable[[], Any], concrete: bool) -> Lazy[Any]:
     """Deferred where concrete; traced values must be computed before the trace ends."""
-    return Deferred(compute) if concrete else Deferred.of(compute())
+    return Lazy(compute) if concrete else Lazy.of(compute())
 
 
-def _read(deferred: Deferred[Any]) -> Any:
+def _read(deferred: Lazy[Any]) -> Any:
     """The value, as NumPy arrays where concrete: arithmetic with a large origin needs float64."""
     value = deferred.value
     return jax.tree.map(np.asarray, value) if is_concrete(value) else value
@@ -87,7 +87,7 @@ def _uncertainty(assessment: Assessment, state: State, origin: Any) -> tuple[Any
     """The covariance in the frame of the user's source, and the deviations at the centroid of the matched points."""
     pose, center = constant((state.pose, state.sums.center))
     covariance = _read(assessment.covariance)
-    xp = namespace(covariance, pose, center)
+    xp = numpy_for(covariance, pose, center)
     with np.errstate(invalid="ignore", over="ignore"):
         matrix = pose_in_user_frame(pose, np.zeros(3), np.zeros(3))
         # In the target's axes T exp(ξ) turns by R ω, and moves the centre c by R v + (t − c) × R ω.

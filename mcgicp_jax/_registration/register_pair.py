@@ -15,8 +15,8 @@ from jax.typing import ArrayLike
 from mcgicp_jax._clouds.point_cloud import PointCloud, Values
 from mcgicp_jax._clouds.preprocess import preprocess
 from mcgicp_jax._compute.argument_checks import check_integer, check_positive
-from mcgicp_jax._compute.cache import keep
-from mcgicp_jax._compute.concrete import computed_now, constant, is_concrete, namespace
+from mcgicp_jax._compute.cache import cached_with
+from mcgicp_jax._compute.concrete import constant, is_concrete, numpy_for, outside_trace
 from mcgicp_jax._global_registration.global_pose import GlobalPoseResult, RowMatches, find_pose
 from mcgicp_jax._local_geometry.spacing_and_noise import grid_spacing, warn_of_units, with_channels_matched
 from mcgicp_jax._math.poses import Pose, se3_from_matrix
@@ -430,7 +430,7 @@ def _run(problem: Problem, target: PointCloud, search: AbstractSearch, max_itera
         def index_of(position_alone: bool) -> AbstractIndex:
             return _index(search, PointToPoint() if position_alone else problem.method, target)
 
-        with computed_now():
+        with outside_trace():
             state, assessment, history, sums = register_on_host(problem, index_of, search.num_threads)
         return _Run(problem, state, lambda: (state, assessment, history), lambda: sums.value)
     # Gradients stop here, so that autodiff does not enter the compiled functions.
@@ -465,7 +465,7 @@ def pose_problem(
     if options.match_channels and method.estimates is not None:
         method = method.with_estimates(replace(method.estimates, compensates=True))
     dtype = source.points.dtype
-    xp = namespace(source.valid)
+    xp = numpy_for(source.valid)
     stride = xp.maximum(xp.sum(xp.asarray(source.valid)) // _COARSE_ROWS, 1)
     start = se3_from_matrix(centred_pose(init, source, target), dtype)
     robust = method.default_kernel() if options.robust is None else options.robust
@@ -476,7 +476,7 @@ def default_distances(spacing: Any, target: PointCloud) -> tuple[Any, Any]:
     """Default `max_distance` of the coarse and the fine phase, metres, for a target with this spacing."""
     # Cells have the spacing of their grid.
     between = spacing if target.covariances is not None else constant(grid_spacing(target))
-    return _COARSE_SPACINGS * namespace(spacing, between).maximum(spacing, between), _FINE_SPACINGS * spacing
+    return _COARSE_SPACINGS * numpy_for(spacing, between).maximum(spacing, between), _FINE_SPACINGS * spacing
 
 
 def _settings(options: Options, method: AbstractMethod, target: PointCloud, stride: Any, dtype: Any) -> Settings:
@@ -489,11 +489,11 @@ def _settings(options: Options, method: AbstractMethod, target: PointCloud, stri
     tolerance = least if tolerance is None else tolerance
 
     def number(value: Any, kind: Any) -> Any:
-        xp = namespace(value)
+        xp = numpy_for(value)
         return xp.asarray(value, kind)
 
     def coarse_tolerance(value: Any, least: Any) -> Any:
-        return number(_COARSE_TOLERANCE * namespace(value, least).maximum(value, least), dtype)
+        return number(_COARSE_TOLERANCE * numpy_for(value, least).maximum(value, least), dtype)
 
     coarse, fine = max_distance if isinstance(max_distance, tuple) or np.shape(max_distance) else [max_distance] * 2
     return Settings(
@@ -516,7 +516,7 @@ def _index(search: AbstractSearch, method: AbstractMethod, target: PointCloud) -
     if numbers and target.channel_valid is not None:
         numbers.append(method.missing_variances(count))
     key = (repr(search), *(np.asarray(number).tobytes() for number in numbers))
-    return keep(target, "index", key, lambda: search.index(searchable(method, target)))
+    return cached_with(target, "index", key, lambda: search.index(searchable(method, target)))
 
 
 def _matched(

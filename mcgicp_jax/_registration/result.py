@@ -14,7 +14,7 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Float, Int
 
 from mcgicp_jax._compute.concrete import AnyArray, canonical_float, is_concrete
-from mcgicp_jax._compute.lazy import Deferred
+from mcgicp_jax._compute.lazy import Lazy
 from mcgicp_jax._math.poses import matrices_of, rotation_from_quaternion, se3
 from mcgicp_jax._pose_solver.degeneracy import Directions, FreeDirection, describe, free_directions
 
@@ -87,8 +87,8 @@ class Registration(eqx.Module):
     source_origin: Float[Array, "*batch 3"] | Float[np.ndarray, "*batch 3"]
     target_origin: Float[Array, "*batch 3"] | Float[np.ndarray, "*batch 3"]
     centred: jaxlie.SE3
-    constraints: Deferred[tuple[Any, Directions | None]]
-    uncertainty: Deferred[tuple[Any, Any]]
+    constraints: Lazy[tuple[Any, Directions | None]]
+    uncertainty: Lazy[tuple[Any, Any]]
 
     @classmethod
     def build(cls, **fields: Any) -> Registration:
@@ -115,8 +115,8 @@ class Registration(eqx.Module):
             source_origin=np.zeros(3),
             target_origin=np.zeros(3),
             centred=nowhere,
-            constraints=Deferred.of((np.zeros((6, 6)), None)),
-            uncertainty=Deferred.of((np.full((6, 6), np.nan), np.full(6, np.nan))),
+            constraints=Lazy.of((np.zeros((6, 6)), None)),
+            uncertainty=Lazy.of((np.full((6, 6), np.nan), np.full(6, np.nan))),
         )
 
     @property

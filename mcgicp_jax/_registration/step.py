@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from mcgicp_jax._compute.concrete import AnyArray, AnyScalar
-from mcgicp_jax._compute.lazy import Deferred
+from mcgicp_jax._compute.lazy import Lazy
 from mcgicp_jax._local_geometry.records import Surface
 from mcgicp_jax._math.poses import adjoint_to_center, move_pose, units
 from mcgicp_jax._math.robust_kernels import AbstractKernel
@@ -111,8 +111,8 @@ class State(eqx.Module):
 class Assessment(NamedTuple):
     """Deferred results at the final pose: information matrix and directions, and covariance."""
 
-    constraints: Deferred[tuple[Float[AnyArray, "6 6"], Directions | None]]
-    covariance: Deferred[Float[AnyArray, "6 6"]]
+    constraints: Lazy[tuple[Float[AnyArray, "6 6"], Directions | None]]
+    covariance: Lazy[Float[AnyArray, "6 6"]]
 
 
 @jax.jit

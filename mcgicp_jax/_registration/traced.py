@@ -17,7 +17,7 @@ import jax.numpy as jnp
 import jaxlie
 from jaxtyping import Array, Float, Int
 
-from mcgicp_jax._compute.lazy import Deferred
+from mcgicp_jax._compute.lazy import Lazy
 from mcgicp_jax._local_geometry.records import Surface, gathered
 from mcgicp_jax._math.robust_kernels import AbstractKernel
 from mcgicp_jax._math.statistics import sampled_rows
@@ -42,7 +42,7 @@ from mcgicp_jax._registration.step import (
     rotation_and_translation,
     update,
 )
-from mcgicp_jax._search.base import AbstractSearch, Correspondences, Rows, by_position
+from mcgicp_jax._search.base import AbstractSearch, Correspondences, SearchPoints, by_position
 from mcgicp_jax._terms.photometric import Term
 
 # State of the loop, its matches, the history so far, and `AbstractMethod.estimates`.
@@ -136,7 +136,7 @@ def assess(
 ) -> Assessment:
     """Information matrix, directions and covariance at the final pose; `search` is None if the matches are fixed."""
     known = moments_of(state, problem, matched, matches, search) if problem.fusion is None else problem.fusion
-    return Assessment(Deferred.of(constraints_of(state)), Deferred.of(covariance_of_pose(state, known)))
+    return Assessment(Lazy.of(constraints_of(state)), Lazy.of(covariance_of_pose(state, known)))
 
 
 @jax.jit
@@ -284,14 +284,14 @@ def _measuring(problem: Problem, search: AbstractSearch) -> Measure:
     return measure
 
 
-def _searched(status: Int[Array, ""], rows: Rows) -> Rows:
+def _searched(status: Int[Array, ""], rows: SearchPoints) -> SearchPoints:
     """The rows for a search in position alone after the coarse phase: without descriptors, none is missing either."""
     factor = (status == COARSE).astype(rows.points.dtype)
     penalty = None if rows.penalty is None else factor * rows.penalty
-    return Rows(rows.points, factor * rows.descriptors, rows.valid, penalty)
+    return SearchPoints(rows.points, factor * rows.descriptors, rows.valid, penalty)
 
 
-def _every(stride: Int[Array, ""], source: Rows) -> Rows:
+def _every(stride: Int[Array, ""], source: SearchPoints) -> SearchPoints:
     """Mark all but every `stride`-th row as invalid, so that they match nothing."""
     chosen = jnp.arange(source.valid.size) % stride == 0
     return eqx.tree_at(lambda rows: rows.valid, source, source.valid & chosen)

@@ -19,8 +19,8 @@ import scipy.spatial
 from jaxtyping import Array, Bool, Float, Int
 
 from mcgicp_jax._compute.cache import MAX_ROWS, Cache
-from mcgicp_jax._search.base import AbstractSearch, Rows, on_host
-from mcgicp_jax._search.nearest_with_ties import Tree, Trees
+from mcgicp_jax._search.base import AbstractSearch, SearchPoints, on_host
+from mcgicp_jax._search.nearest_with_ties import TiedTree, TreeBackend
 from mcgicp_jax._search.pykdtree import MAX_DIMENSIONS, PyKDTree, has_pykdtree
 from mcgicp_jax._search.tree_index import LARGEST_UNORDERED, TreeIndex
 
@@ -28,7 +28,7 @@ from mcgicp_jax._search.tree_index import LARGEST_UNORDERED, TreeIndex
 _LARGEST_PIECE = 64 * 1024
 
 
-class AbstractTreeSearch(AbstractSearch, Trees):
+class AbstractTreeSearch(AbstractSearch, TreeBackend):
     """Exact search with a tree on the host. Ties are broken by row, so that results are reproducible.
 
     Attributes:
@@ -41,14 +41,14 @@ class AbstractTreeSearch(AbstractSearch, Trees):
     def num_threads(self) -> int | None:
         return None if self.workers == -1 else self.workers
 
-    def index(self, target: Rows) -> TreeIndex:
+    def index(self, target: SearchPoints) -> TreeIndex:
         return TreeIndex(self, on_host(target))
 
     def nearest_traced(
         self,
         pose: Float[Array, "7"],
-        source: Rows,
-        target: Rows,
+        source: SearchPoints,
+        target: SearchPoints,
         max_distance: Float[Array, ""],
         running: Bool[Array, ""],
         num_candidates: int = 1,
@@ -63,7 +63,7 @@ class AbstractTreeSearch(AbstractSearch, Trees):
         )
 
     def neighbors(self, points: Float[np.ndarray, "N 3"], num_neighbors: int) -> Int[np.ndarray, "N k"]:
-        tree = Tree(self, points)
+        tree = TiedTree(self, points)
         # In the order of the leaves, each query finds the nodes it needs in the processor's caches.
         order = tree.leaf_order()
         found, _ = tree.nearest(points[order], num_neighbors)
@@ -121,7 +121,7 @@ def _scipy_tree(points: Float[np.ndarray, "M D"]) -> scipy.spatial.cKDTree:
 _indices = Cache(MAX_ROWS, lambda index: index.num_rows)
 
 
-def _index_of(search: AbstractTreeSearch, target: Rows) -> TreeIndex:
+def _index_of(search: AbstractTreeSearch, target: SearchPoints) -> TreeIndex:
     arrays = jax.tree.leaves(target)
     digest = hashlib.blake2b(repr([search, *((array.shape, array.dtype) for array in arrays)]).encode())
     for array in arrays:

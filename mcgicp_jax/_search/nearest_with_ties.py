@@ -20,7 +20,7 @@ _MIN_TIE_CANDIDATES = 64
 _MIN_PART, _PARTS_PER_THREAD = 1000, 8
 
 
-class Trees(abc.ABC):
+class TreeBackend(abc.ABC):
     """A kind of tree: how it is built and queried."""
 
     # Largest number of threads that query it; −1 for all cores.
@@ -52,14 +52,14 @@ class Trees(abc.ABC):
         return np.arange(num_points)
 
 
-class Tree:
+class TiedTree:
     """A tree of points that finds the same neighbours whatever its kind: ordered by distance, ties by row.
 
     Attributes:
         points: (M, D) finite points, metres.
     """
 
-    def __init__(self, trees: Trees, points: Float[np.ndarray, "M D"]):
+    def __init__(self, trees: TreeBackend, points: Float[np.ndarray, "M D"]):
         self.points = points
         self._trees, self._tree = trees, trees.build(points)
         # equinox creates an object whenever it binds a method.

@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from mcgicp_jax._compute.concrete import AnyArray
-from mcgicp_jax._search.base import IDENTITY, rows_of
+from mcgicp_jax._search.base import IDENTITY, search_points
 from mcgicp_jax._search.kd_tree import KDTreeSearch
 
 
@@ -17,6 +17,6 @@ def nearest_in_position(
     queries, points = np.asarray(queries), np.asarray(points)
     if not len(points):
         return np.full(len(queries), -1, np.int32)
-    (nearest,) = KDTreeSearch().index(rows_of(points)).nearest(IDENTITY, rows_of(queries), max_distance)
+    (nearest,) = KDTreeSearch().index(search_points(points)).nearest(IDENTITY, search_points(queries), max_distance)
     distances = np.linalg.norm(points[nearest] - queries, axis=1)
     return np.where(distances <= max_distance, nearest, -1)

@@ -39,7 +39,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from mcgicp_jax._compute.concrete import AnyArray, AnyScalar, namespace
+from mcgicp_jax._compute.concrete import AnyArray, AnyScalar, numpy_for
 from mcgicp_jax._local_geometry.covariances import fit_linear
 from mcgicp_jax._local_geometry.records import Neighborhoods, Table, features_of, points_of
 from mcgicp_jax._local_geometry.spacing_and_noise import gain_and_offset
@@ -97,7 +97,7 @@ class Term(eqx.Module):
     @staticmethod
     def off(spacing: Float[AnyScalar, ""], num_channels: int) -> Term:
         """The term before its numbers are known."""
-        xp = namespace(spacing)
+        xp = numpy_for(spacing)
         spacing = xp.asarray(spacing)
         zeros, ones = (make(1 + num_channels, spacing.dtype) for make in (xp.zeros, xp.ones))
         return Term(spacing, zeros, ones, ones[1:], zeros[1:])
@@ -126,7 +126,7 @@ class Term(eqx.Module):
             counts: which of these rows to use.
             valid: which of all source points are no padding.
         """
-        xp = namespace(counts, valid)
+        xp = numpy_for(counts, valid)
         return self.adapted(xp.where(counts[:, None], rows, xp.nan), xp.sum(counts) / xp.maximum(xp.sum(valid), 1))
 
     def residuals(
@@ -189,7 +189,7 @@ class Term(eqx.Module):
             fraction: of all correspondences that are in the sample. A cell contains fewer of their products in this
                 proportion, so that f of all exceeds 1 by f − 1 of the sample, divided by the fraction.
         """
-        xp = namespace(self, rows, fraction)
+        xp = numpy_for(self, rows, fraction)
         count = self.designs.shape[0]
         # NumPy takes two thirds of the time for contiguous columns.
         columns = xp.asarray(rows).T.copy()
@@ -230,7 +230,7 @@ class Term(eqx.Module):
     @property
     def shifts(self) -> Float[AnyArray, "6 3"]:
         """Along +x, −x, +y, −y, +z, −z, metres."""
-        xp = namespace(self)
+        xp = numpy_for(self)
         signs = np.repeat(np.eye(3), 2, axis=0) * np.array([[1], [-1]] * 3)
         return _SHIFT * xp.asarray(self.spacing) * signs.astype(self.spacing.dtype)
 
@@ -244,7 +244,7 @@ class Term(eqx.Module):
         Args:
             rows: of `evidence` for the points moved by each of the `shifts` and matched anew.
         """
-        xp, count = namespace(self, rows), self.designs.shape[0]
+        xp, count = numpy_for(self, rows), self.designs.shape[0]
         rows = xp.asarray(rows)
         values, slopes = rows[..., :count], rows[..., count : 4 * count].reshape(*rows.shape[:2], count, 3)
         known = ~xp.isnan(values) & (self.deviations > 0)
@@ -284,7 +284,7 @@ def correlated_slopes(
 def _squared_sums(scores: Float[AnyArray, "K 3 n"], cells: Int[AnyArray, "n"]) -> Float[AnyArray, "K"]:
     """Σ_c |u_c|², with u_c the sum of the scores in a cell."""
     columns = scores.reshape(-1, scores.shape[-1])
-    if namespace(scores, cells) is np:
+    if numpy_for(scores, cells) is np:
         sums: Any = np.stack([np.bincount(cells, column) for column in columns], axis=1)
     else:
         sums = jnp.zeros_like(columns.T).at[cells].add(columns.T)
