@@ -186,7 +186,7 @@ def test_a_bad_pair_spoils_no_other_lane(clouds):
 SHARDED = """
     import jax, numpy as np
     import mcgicp_jax as mcg
-    from mcgicp_jax import _lanes
+    from mcgicp_jax._registration import vectorized as _lanes
     from tests.test_batch import METHOD, SIZES, prepared, raw_pair
     assert jax.local_device_count() == 4
     clouds = prepared([raw_pair(size, seed) for seed, size in enumerate(SIZES)])

@@ -90,12 +90,12 @@ def _correspondences_at(
     indices: Int[np.ndarray, "m N"],
     gate: float,
 ) -> Correspondences:
-    """Matches at a pose, valid within `gate` metres of position; NumPy, so that nothing is compiled."""
+    """Matches at a pose, valid within `max_distance` metres of position; NumPy, so that nothing is compiled."""
     rows, dtype = np.maximum(indices, 0), source.points.dtype
     with np.errstate(invalid="ignore"):
         moved = source.points.astype(np.float64) @ matrix[:3, :3].T + matrix[:3, 3]
         distances = np.linalg.norm(target.points[rows] - moved, axis=-1).astype(dtype)
-        valid = (indices >= 0) & source.valid & target.valid[rows] & (distances <= gate)
+        valid = (indices >= 0) & source.valid & target.valid[rows] & (distances <= max_distance)
     return Correspondences(rows.astype(np.int32), distances, valid)
 
 
