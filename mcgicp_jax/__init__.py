@@ -23,15 +23,17 @@ from mcgicp_jax._pairs.batch_jobs import PairWarning
 from mcgicp_jax._pairs.cost import mahalanobis_cost
 from mcgicp_jax._pairs.estimate_pose import align
 from mcgicp_jax._pairs.register import register
-from mcgicp_jax._pose_graph.graph import WORLD, Edge, PoseGraph
+from mcgicp_jax._pose_graph.edge import Edge
+from mcgicp_jax._pose_graph.factors import WORLD
+from mcgicp_jax._pose_graph.graph import PoseGraph
 from mcgicp_jax._pose_graph.optimize import PoseGraphResult, optimize_poses
 from mcgicp_jax._registration.correspondences import find_correspondences
 from mcgicp_jax._registration.result import Registration, Status
 from mcgicp_jax._search.base import AbstractSearch, Correspondences
 from mcgicp_jax._search.brute_force import DenseSearch
 from mcgicp_jax._search.kd_tree import AbstractTreeSearch, KDTreeSearch
-from mcgicp_jax._sequences.multiway import Multiway, multiway
-from mcgicp_jax._sequences.odometry import odometry
+from mcgicp_jax._sequences.multiway import MultiwayResult, multiway
+from mcgicp_jax._sequences.odometry import OdometryStep, odometry
 
 __all__ = [
     "D2DNDT",
@@ -53,7 +55,8 @@ __all__ = [
     "Huber",
     "KDTreeSearch",
     "MultiChannelGICP",
-    "Multiway",
+    "MultiwayResult",
+    "OdometryStep",
     "PairWarning",
     "PointCloud",
     "PointToPlane",

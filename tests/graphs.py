@@ -84,7 +84,7 @@ def measured(poses, loops, deviations=(0.05, 0.02), seed=0, false=0.0):
         np.concatenate([j, b]),
         np.concatenate([motions, wrong]),
         np.tile(np.diag(sigma**-2.0), (len(i) + number, 1, 1)),
-        loop=np.arange(len(i) + number) >= len(poses) - 1,
+        uncertain=np.arange(len(i) + number) >= len(poses) - 1,
     )
     start = [poses[0]]
     for motion in motions[: len(poses) - 1]:

@@ -8,7 +8,8 @@ from mcgicp_jax import datasets, io, metrics
 from mcgicp_jax.__main__ import main
 from mcgicp_jax._registration.options import Options
 from mcgicp_jax._sequences import loop_closure as _loops
-from mcgicp_jax._sequences.loop_closure import Trajectory, edge_from
+from mcgicp_jax._sequences.edges import edge_from
+from mcgicp_jax._sequences.loop_closure import Trajectory
 from mcgicp_jax._sequences.multiway import _overlapping
 from tests.graphs import pose
 from tests.scenes import motion, pair, wall
@@ -24,8 +25,8 @@ def room():
 def test_an_edge_is_what_a_registration_measured():
     source, target, _ = pair(size=2000)
     result = mcg.register(source, target, mcg.GICP(), max_distance=0.3)
-    edge = edge_from(3, 5, result, loop=True)
-    assert (edge.i, edge.j, edge.loop) == (3, 5, True)
+    edge = edge_from(3, 5, result, uncertain=True)
+    assert (edge.i, edge.j, edge.uncertain) == (3, 5, True)
     np.testing.assert_array_equal(edge.T_i_j, result.matrix)
     np.testing.assert_allclose(edge.information @ result.covariance, np.eye(6), atol=1e-6)
 
@@ -56,7 +57,7 @@ def test_odometry_closes_loops(room):
     plain = [step.pose for step in mcg.odometry(frames, mcg.GICP(), max_distance=1.0, start=truth[0])]
     steps = list(mcg.odometry(frames, mcg.GICP(), max_distance=1.0, start=truth[0], loops=True))
     graph = steps[-1].graph
-    assert steps[0].graph is not None and len(graph.poses) == len(frames) and graph.edges.loop.any()
+    assert steps[0].graph is not None and len(graph.poses) == len(frames) and graph.edges.uncertain.any()
     np.testing.assert_array_equal(steps[-1].pose, graph.poses[-1])
     error, before = (metrics.ate(poses, truth, alignment="first") for poses in (graph.poses, plain))
     assert error < 0.75 * before
@@ -89,7 +90,7 @@ def test_loops_are_sought_where_they_may_be_and_help():
 def test_a_loop_is_registered_from_the_poses_within_their_uncertainty(monkeypatch):
     calls = []
     monkeypatch.setattr(_loops, "register_with", lambda *arguments: calls.append(arguments))
-    monkeypatch.setattr(_loops, "edge_from", lambda i, j, _, *, loop: mcg.Edge(i, j, np.eye(4), np.eye(6), loop=loop))
+    monkeypatch.setattr(_loops, "edge_from", lambda i, j, _, **options: mcg.Edge(i, j, np.eye(4), np.eye(6), **options))
     for sigma, given, expected in (
         (1.0, (2.0, 0.5), (3.37, 0.5)),
         (0.1, (2.0, 0.5), (2.0, 0.5)),
@@ -97,7 +98,7 @@ def test_a_loop_is_registered_from_the_poses_within_their_uncertainty(monkeypatc
     ):
         found = trajectory(max_distance=given)
         edge = found._registered(1, 4, sigma**2 * np.eye(6))
-        assert (edge.i, edge.j, edge.loop) == (1, 4, True)
+        assert (edge.i, edge.j, edge.uncertain) == (1, 4, True)
         source, target, _, init, options = calls.pop()
         assert source is found._clouds[4] and target is found._clouds[1]
         np.testing.assert_allclose(found._poses[1] @ init, found._poses[4], atol=1e-12)
@@ -109,7 +110,7 @@ def test_a_lost_frame_is_joined_by_an_edge_without_information():
     found._clouds, found._poses, end = found._clouds[:1], found._poses[:1], found._poses[1]
     found.add(mcg.PointCloud(np.eye(3)), end, mcg.Registration.without_pose(mcg.Status.WORKER_FAILED))
     edges = found.graph.edges
-    assert (edges.i, edges.j, edges.loop) == (0, 1, False) and not np.any(edges.information)
+    assert (edges.i, edges.j, edges.uncertain) == (0, 1, False) and not np.any(edges.information)
     np.testing.assert_allclose(found._poses[0] @ edges.T_i_j[0], end, atol=1e-12)
 
 
@@ -124,7 +125,7 @@ def test_a_frame_that_is_lost_leaves_the_graph_whole(room):
 def test_many_clouds_get_one_map(room):
     frames, truth = room
     found = mcg.multiway([frame.cloud for frame in frames], mcg.GICP(), max_distance=1.0)
-    assert found.converged and found.graph.kept.mean() > 0.9 and found.graph.edges.loop.any()
+    assert found.converged and found.graph.kept.mean() > 0.9 and found.graph.edges.uncertain.any()
     assert {(k, k + 1) for k in range(len(frames) - 1)} <= found.registrations.keys()
     plain = [step.pose for step in mcg.odometry(found.clouds, mcg.GICP(), max_distance=1.0)]
     assert metrics.ate(found.poses, truth) < metrics.ate(plain, truth)

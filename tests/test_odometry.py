@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 import mcgicp_jax as mcg
 from mcgicp_jax import datasets, metrics
 from mcgicp_jax._sequences import odometry as _odometry
+from mcgicp_jax._sequences import relocalization as _relocalization
 from tests.scenes import motion
 
 
@@ -196,6 +197,7 @@ def test_the_map_slides(room):
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(_odometry, "preprocess", counted)
+        patch.setattr(_relocalization, "preprocess", counted)
         for radius in (None, 1.0):
             list(mcg.odometry(frames[:3], mcg.GICP(), max_distance=0.5, against="map", map_radius=radius))
     # Two maps each, after the frames' own clouds.

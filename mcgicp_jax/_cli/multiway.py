@@ -99,7 +99,7 @@ def _method(name: MethodName, shared: Options, clouds: list[mcg.PointCloud]) -> 
     return kind(**numbers)
 
 
-def _report(found: mcg.Multiway) -> None:
+def _report(found: mcg.MultiwayResult) -> None:
     edges, total = found.graph.edges, len(found.registrations)
     kept = np.asarray(found.graph.kept)
     print(f"pairs:     {total} registered, {len(edges)} with a result, {int((~kept).sum())} of them rejected")

@@ -28,7 +28,7 @@ from mcgicp_jax._cli.options import (
     with_channels,
 )
 from mcgicp_jax._methods.base import AbstractMethod
-from mcgicp_jax._sequences.odometry import Step
+from mcgicp_jax._sequences.odometry import OdometryStep
 
 DatasetName: TypeAlias = Literal["kitti", "ford", "tum", "7-scenes", "street", "corridor", "box-room", "poster-wall"]
 Dataset: TypeAlias = Annotated[DatasetName, tyro.conf.Positional, tyro.conf.arg(metavar="DATASET")]
@@ -142,7 +142,7 @@ def _open(
 
 
 def _follow(
-    steps: Iterator[Step], num_frames: int, map: Path | None, voxel_size: float | None
+    steps: Iterator[OdometryStep], num_frames: int, map: Path | None, voxel_size: float | None
 ) -> tuple[list[Float[np.ndarray, "4 4"]], list[mcg.Registration]]:
     """Run the odometry, write the map if it has a file, and return the poses and the registrations."""
     poses, results = [], []
@@ -165,12 +165,12 @@ def _follow(
 
 
 def _follow_loops(
-    steps: Iterator[Step], num_frames: int, map: Path | None, voxel_size: float | None
+    steps: Iterator[OdometryStep], num_frames: int, map: Path | None, voxel_size: float | None
 ) -> tuple[list[Float[np.ndarray, "4 4"]], list[mcg.Registration]]:
     """As `_follow`, with the poses as the last loop left them."""
     followed = list(tqdm(steps, total=num_frames, unit="frame", disable=None))
     graph: Any = followed[-1].graph
-    print(f"loops:     {int(np.asarray(graph.edges.loop).sum())} closed")
+    print(f"loops:     {int(np.asarray(graph.edges.uncertain).sum())} closed")
     if map is not None and voxel_size is not None:
         _write_map(map, mcg.aggregate((step.cloud for step in followed), graph.poses, voxel_size), voxel_size)
     return list(graph.poses), [step.registration for step in followed if step.registration is not None]

@@ -14,6 +14,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from mcgicp_jax._compute.concrete import AnyArray, AnyScalar
 from mcgicp_jax._math import symmetric_matrices as alg
+from mcgicp_jax._math.robust_kernels import truncated_weights
 
 # Maximum number of matches. Real pairs of 5,000 voxels have 200 to 2,400 mutual ones.
 NUM_MATCHES = 1024
@@ -212,7 +213,7 @@ def refined(poses: PoseHypotheses, matches: PutativeMatches, voxel_size: Float[A
             square = _squared_distances(pose[0][None], pose[1][None], matches)[0]
             control = _FIRST_CONTROL * _GROWTH ** i.astype(square.dtype)
             ratio = tolerance / jnp.sqrt(jnp.maximum(square, jnp.finfo(square.dtype).tiny))
-            weights = jnp.clip(ratio * jnp.sqrt(control * (control + 1)) - control, 0, 1)
+            weights = truncated_weights(ratio, control)
             return fit_pose(matches.source, matches.target, jnp.where(matches.valid, weights, 0))
 
         return jax.lax.fori_loop(0, _NUM_STEPS, step, (rotation, translation))

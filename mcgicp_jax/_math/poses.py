@@ -15,7 +15,7 @@ import numpy as np
 from jax.typing import ArrayLike, DTypeLike
 from jaxtyping import Array, Float
 
-from mcgicp_jax._compute.concrete import AnyArray, is_concrete
+from mcgicp_jax._compute.concrete import AnyArray, is_concrete, numpy_for
 
 if TYPE_CHECKING:
     # A pose that a user passes.
@@ -183,9 +183,27 @@ def from_center(offset: Float[Array, "3"], radius: Float[Array, ""], other: Floa
     return jnp.concatenate([top, jnp.eye(6, dtype=offset.dtype)[3:]])
 
 
-def translation_adjoint(offset: Array | np.ndarray) -> Array | np.ndarray:
-    """Adjoint (6, 6) of a translation by `offset`, for twists (v, ω)."""
-    xp = np if isinstance(offset, np.ndarray) else jnp
+def inverse(matrices: Float[AnyArray, "*batch 4 4"]) -> Float[AnyArray, "*batch 4 4"]:
+    """The inverses of rigid motions."""
+    xp = numpy_for(matrices)
+    turned = xp.swapaxes(matrices[..., :3, :3], -1, -2)
+    last = xp.broadcast_to(xp.eye(4, dtype=matrices.dtype)[3:], (*matrices.shape[:-2], 1, 4))
+    return xp.concatenate([xp.concatenate([turned, -turned @ matrices[..., :3, 3:]], axis=-1), last], axis=-2)
+
+
+def adjoint(matrices: Float[AnyArray, "*batch 4 4"]) -> Float[AnyArray, "*batch 6 6"]:
+    """Adjoints of rigid motions: T exp(ξ) T⁻¹ = exp(Ad ξ), for twists ξ = (v, ω)."""
+    xp = numpy_for(matrices)
+    rotations = matrices[..., :3, :3]
+    # The columns of t × R.
+    crossed = xp.swapaxes(xp.cross(matrices[..., None, :3, 3], xp.swapaxes(rotations, -1, -2)), -1, -2)
+    below = xp.concatenate([xp.zeros_like(rotations), rotations], axis=-1)
+    return xp.concatenate([xp.concatenate([rotations, crossed], axis=-1), below], axis=-2)
+
+
+def translation_adjoint(offset: Float[AnyArray, "3"]) -> Float[AnyArray, "6 6"]:
+    """The adjoint of a translation by `offset`."""
+    xp = numpy_for(offset)
     zero = xp.zeros_like(offset[0])
     x, y, z = offset
     cross = xp.stack([xp.stack([zero, -z, y]), xp.stack([z, zero, -x]), xp.stack([-y, x, zero])])

@@ -12,7 +12,7 @@ import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
-from mcgicp_jax._compute.concrete import canonical_float, is_concrete
+from mcgicp_jax._compute.concrete import AnyArray, AnyScalar, canonical_float, is_concrete, numpy_for
 
 
 class Numbers(eqx.Module):
@@ -113,3 +113,14 @@ class Tukey(AbstractKernel):
 
     def _weight(self, square: Float[Array, "N"], scale: Float[Array, ""]) -> Float[Array, "N"]:
         return jnp.maximum(1 - square / scale**2, 0) ** 2
+
+
+def truncated_weights(ratio: Float[AnyArray, "*batch"], control: AnyScalar) -> Float[AnyArray, "*batch"]:
+    """Weights of truncated squares in graduated non-convexity (Yang et al., RA-L 2020, eq. 14).
+
+    Args:
+        ratio: threshold divided by the residual.
+        control: μ; the decline from 1 to 0 around the threshold becomes steeper as it grows.
+    """
+    xp = numpy_for(ratio, control)
+    return xp.clip(ratio * xp.sqrt(control * (control + 1)) - control, 0, 1)

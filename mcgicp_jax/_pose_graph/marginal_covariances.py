@@ -1,9 +1,10 @@
-"""Blocks of the inverse of a sparse symmetric matrix, from its factors.
+"""Covariances of poses and of functions of poses, from the factors of the sparse Gauss-Newton matrix.
 
-Takahashi's equations give the entries of the inverse where the factor L has entries, without the others. For M = L D Lᵀ
-in blocks, with N the rows of L below block k and Y = L[N, k], they are Z[N, k] = −Z[N, N] Y and
-Z[k, k] = D[k]⁻¹ − Yᵀ Z[N, k]. The first row of N, the parent of k, has all others below it, too. So Z[N, N] is known if
-the blocks are visited from the last to the first (Erisman & Tinney, CACM 1975; Kaess & Dellaert, RAS 2009).
+The diagonal blocks of the inverse follow from Takahashi's equations, which give the entries of the inverse where the
+factor L has entries. For M = L D Lᵀ in blocks, with N the rows of L below block k and Y = L[N, k], they are
+Z[N, k] = −Z[N, N] Y and Z[k, k] = D[k]⁻¹ − Yᵀ Z[N, k]. The first row of N, the parent of k, has all others below it,
+too. So Z[N, N] is known if the blocks are visited from the last to the first (Erisman & Tinney, CACM 1975; Kaess &
+Dellaert, RAS 2009).
 """
 
 from __future__ import annotations
@@ -13,18 +14,68 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, Int
 
+from mcgicp_jax._pose_graph.levenberg_marquardt import Minimum
+from mcgicp_jax._pose_graph.normal_equations import NormalEquations, factored
+
 # Unknowns of a block, a pose.
 _SIZE = 6
+# Numbers in the right-hand sides that are solved for at once: 80 MB.
+_SOLVED_AT_ONCE = 10_000_000
 
 
-def inverse_blocks(
-    factor: Any, pairs: Int[np.ndarray, "k 2"]
-) -> tuple[Float[np.ndarray, "n 6 6"], Float[np.ndarray, "k 6 6"]]:
-    """The diagonal 6×6 blocks of the inverse, and those of pairs of different blocks.
+def pose_covariances(
+    equations: NormalEquations, found: Minimum, weights: Float[np.ndarray, "m"]
+) -> Float[np.ndarray, "n 6 6"]:
+    """Covariances of all poses relative to the root; infinite if not connected with it, NaN if H is singular."""
+    covariances = np.zeros((len(found.poses), 6, 6))
+    if equations.size:
+        try:
+            factor = factored(equations.damped(equations.weighted(found.terms.blocks, weights)))
+            covariances[~equations.held] = inverse_blocks(factor)[equations.place[~equations.held]]
+        except (RuntimeError, np.linalg.LinAlgError):
+            covariances[:] = np.nan
+    covariances[equations.parts != equations.parts[equations.root]] = np.diag(np.full(6, np.inf))
+    return covariances
+
+
+def propagated(
+    equations: NormalEquations,
+    found: Minimum,
+    weights: Float[np.ndarray, "m"],
+    rows: Int[np.ndarray, "q k"],
+    jacobians: Float[np.ndarray, "q k d 6"],
+) -> Float[np.ndarray, "q d d"]:
+    """Covariances JΣJᵀ of functions of the poses in `rows`, by their Jacobians.
+
+    Infinite if the poses are not connected with each other, NaN if H is singular.
+    """
+    number, d = len(rows), jacobians.shape[2]
+    covariances = np.zeros((number, d, d))
+    try:
+        solver = factored(equations.damped(equations.weighted(found.terms.blocks, weights))) if equations.size else None
+    except RuntimeError:
+        return np.full_like(covariances, np.nan)
+    step = max(_SOLVED_AT_ONCE // max(equations.size * d, 1), 1)
+    for start in range(0, number if solver else 0, step):
+        q = slice(start, start + step)
+        columns = np.zeros((len(found.poses), 6, len(rows[q]), d))
+        each = np.arange(len(rows[q]))
+        for row, jacobian in zip(rows[q].T, jacobians[q].swapaxes(0, 1), strict=True):
+            columns[row, :, each] += jacobian.swapaxes(1, 2)
+        gathered = equations.gathered(columns.reshape(*columns.shape[:2], -1)).reshape(equations.size, -1)
+        solved = equations.spread(solver.solve(gathered)).reshape(columns.shape)
+        for row, jacobian in zip(rows[q].T, jacobians[q].swapaxes(0, 1), strict=True):
+            covariances[q] += jacobian @ solved[row, :, each]
+    apart = (equations.parts[rows] != equations.parts[rows[:, :1]]).any(axis=1)
+    covariances[apart] = np.diag(np.full(d, np.inf))
+    return covariances
+
+
+def inverse_blocks(factor: Any) -> Float[np.ndarray, "n 6 6"]:
+    """The diagonal 6×6 blocks of the inverse.
 
     Args:
         factor: `scipy.sparse.linalg.SuperLU` of a symmetric matrix in symmetric mode, with pivots on the diagonal.
-        pairs: row and column of blocks that are not 0 in the pattern of the matrix.
 
     Raises:
         RuntimeError: if pivots are not on the diagonal.
@@ -36,18 +87,14 @@ def inverse_blocks(
     number = len(place)
     lower, pivots = factor.L.tocsc(), factor.U.diagonal().reshape(-1, _SIZE)
     below = _rows_below(lower, number)
-    ends = place[pairs]
-    wanted: dict[int, list[int]] = {}
-    for pair, block in enumerate(ends.min(axis=1, initial=number)):
-        wanted.setdefault(int(block), []).append(pair)
-    diagonal, others = np.empty((number, _SIZE, _SIZE)), np.empty((len(pairs), _SIZE, _SIZE))
+    diagonal = np.empty((number, _SIZE, _SIZE))
     children = np.bincount([rows[0] for rows in below if len(rows)], minlength=number)
     fronts: dict[int, tuple[Any, Any]] = {}
+    here, there = slice(0, _SIZE), slice(_SIZE, None)
     for k in reversed(range(number)):
         rows = below[k]
         inner, outer = _panel(lower, k, rows)
         front = np.empty((_SIZE * (len(rows) + 1),) * 2)
-        here, there = slice(0, _SIZE), slice(_SIZE, None)
         front[here, here] = np.linalg.inv((inner * pivots[k]) @ inner.T)
         if len(rows):
             parent = int(rows[0])
@@ -62,18 +109,13 @@ def inverse_blocks(
             if not children[parent]:
                 del fronts[parent]
         diagonal[k] = front[here, here]
-        members = np.append(k, rows)
-        for pair in wanted.get(k, ()):
-            column = _SIZE * int(np.searchsorted(members, ends[pair].max()))
-            block = front[here, column : column + _SIZE]
-            others[pair] = block if ends[pair, 0] == k else block.T
         if children[k]:
-            fronts[k] = (members, front)
-    return diagonal[place], others
+            fronts[k] = (np.append(k, rows), front)
+    return diagonal[place]
 
 
 def _rows_below(lower: Any, number: int) -> list[Int[np.ndarray, "_"]]:
-    """Of every block, the rows of blocks below it in L; all but the first are below that one, too."""
+    """For every block, the rows of blocks below it in L; all but the first are below that one, too."""
     inherited: list[list[Any]] = [[] for _ in range(number)]
     below = []
     for k in range(number):

@@ -1,1 +1,1 @@
-"""Uses of many registrations: odometry, loop closure, multiway registration."""
+"""Uses of many registrations: odometry, relocalisation, loop closure, multiway registration."""

@@ -1,4 +1,4 @@
-"""Many clouds of one scene: registration of all pairs that overlap, and one pose for each cloud."""
+"""Multiway registration: all overlapping pairs of many clouds are registered, and a pose graph joins the results."""
 
 from __future__ import annotations
 
@@ -22,18 +22,18 @@ from mcgicp_jax._pose_graph.graph import PoseGraph
 from mcgicp_jax._pose_graph.optimize import PoseGraphResult, optimize_poses
 from mcgicp_jax._registration.options import check_method, options_of
 from mcgicp_jax._registration.result import Registration
-from mcgicp_jax._sequences.loop_closure import LEAST_OVERLAP, edge_from
+from mcgicp_jax._sequences.edges import LEAST_OVERLAP, edge_from
 from mcgicp_jax._sequences.odometry import odometry
 
-# Edge of the cells in which overlap is counted, in spacings of the points: two samples of a surface occupy nearly the
-# same cells.
+# Size of the cells in which overlap is counted, in spacings of the points: two samples of one surface then occupy
+# nearly the same cells.
 _CELL = 5.0
-# Rounds of registration: from the second on, only pairs that came to overlap as the poses moved.
+# Largest number of rounds of registration. From the second on, only newly overlapping pairs are registered.
 _ROUNDS = 5
 
 
 @dataclass(frozen=True, eq=False)
-class Multiway:
+class MultiwayResult:
     """The result of `multiway`.
 
     Attributes:
@@ -71,12 +71,12 @@ def multiway(
     num_neighbors: int = 20,
     executor: Executor | None = None,
     **options: Any,
-) -> Multiway:
+) -> MultiwayResult:
     """Register many clouds of one scene with each other and find one pose for each.
 
     Pairs of overlapping clouds are registered, and the registrations with their covariances become the edges of a pose
-    graph, which `optimize_poses` solves. Clouds may overlap at the new poses that did not before: these pairs are
-    registered next, in up to five rounds. Edges between consecutive clouds are trusted; all others may be rejected.
+    graph, which `optimize_poses` solves. Pairs that overlap only at the new poses are registered next, in up to five
+    rounds. Edges between consecutive clouds are trusted; all others are uncertain and may be rejected.
 
     Args:
         clouds: n clouds or (N, 3) arrays, metres. Preprocessed clouds are used unchanged.
@@ -125,7 +125,7 @@ def multiway(
         poses = np.asarray(graph.poses)
         if not new:
             break
-    return Multiway(ready, graph, found, aggregate(ready, poses, voxel_size or spacing))
+    return MultiwayResult(ready, graph, found, aggregate(ready, poses, voxel_size or spacing))
 
 
 def _start(
@@ -134,7 +134,7 @@ def _start(
     init: Sequence[Pose] | Float[np.ndarray, "n 4 4"] | None,
     options: dict[str, Any],
 ) -> tuple[Float[np.ndarray, "n 4 4"], dict[tuple[int, int], Registration]]:
-    """Poses to start from, and what was registered to find them."""
+    """Initial poses, and the registrations from which they were computed."""
     if init is None:
         steps = list(odometry(clouds, method, **options))
         found = {(k - 1, k): step.registration for k, step in enumerate(steps) if step.registration is not None}
@@ -154,12 +154,12 @@ def _checked(pairs: Sequence[tuple[int, int]], num_clouds: int) -> list[tuple[in
 
 
 def _graph(poses: Float[np.ndarray, "n 4 4"], found: dict[tuple[int, int], Registration]) -> PoseGraph:
-    edges = [edge_from(i, j, result, loop=abs(i - j) != 1) for (i, j), result in found.items()]
+    edges = [edge_from(i, j, result, uncertain=abs(i - j) != 1) for (i, j), result in found.items()]
     return PoseGraph(poses, [edge for edge in edges if edge is not None])
 
 
 def _overlapping(clouds: list[PointCloud], poses: Float[np.ndarray, "n 4 4"], cell: float) -> list[tuple[int, int]]:
-    """Every cloud with the one before it, and with those of largest overlap among ever more distant ones before."""
+    """Each cloud with the previous one, and with the one of largest overlap in each range of gaps 2-3, 4-7, 8-15, …"""
     moved = [cloud.coordinates @ T[:3, :3].T + T[:3, 3] for cloud, T in zip(clouds, poses, strict=True)]
     cells = [np.unique(voxel_keys(points, cell, voxel_of(moved[0][0], cell))) for points in moved]
     pairs = []

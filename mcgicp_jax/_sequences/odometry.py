@@ -1,4 +1,4 @@
-"""Odometry by registration of consecutive frames, or of each frame to a map of those before."""
+"""Odometry: registration of each frame to the previous one, or to a map of the previous frames."""
 
 from __future__ import annotations
 
@@ -13,25 +13,20 @@ from mcgicp_jax._clouds.point_cloud import PointCloud, Values
 from mcgicp_jax._clouds.preprocess import check_preprocessing, preprocess
 from mcgicp_jax._clouds.voxel_map import VoxelMap
 from mcgicp_jax._compute.argument_checks import check_positive
-from mcgicp_jax._global_registration.global_pose import global_pose
 from mcgicp_jax._local_geometry.spacing_and_noise import point_spacing
 from mcgicp_jax._math.poses import Pose, nearest_rotation, pose_matrix
 from mcgicp_jax._methods.base import AbstractMethod
 from mcgicp_jax._pose_graph.graph import PoseGraph
 from mcgicp_jax._registration.options import Options, check_method, options_of
 from mcgicp_jax._registration.register_pair import register_pair
-from mcgicp_jax._registration.result import Registration, Status, computed, is_usable
+from mcgicp_jax._registration.result import Registration, computed, is_usable
 from mcgicp_jax._sequences.loop_closure import Trajectory
+from mcgicp_jax._sequences.relocalization import Relocalizer, map_target
 from mcgicp_jax.datasets import Frame
-
-# Fractions of the overlap of the registration before. At constant speed the overlap hardly changes. After jumps in
-# simulated rooms and streets and on KITTI it was 0.5 to 0.7 of that before: below the first fraction, the frame is also
-# looked for in the map; below the second, it is lost if it is not found there.
-_DOUBTFUL, _LOST = 0.8, 0.5
 
 
 @dataclass(frozen=True, eq=False)
-class Step:
+class OdometryStep:
     """One frame of `odometry`.
 
     Attributes:
@@ -39,8 +34,8 @@ class Step:
         pose: (4, 4) float64, sensor to world, metres.
         registration: registration of this frame to the previous one (or with `against="map"`, or after a recovery, to
             the map, in the world's frame), None for the first; check its `converged`.
-        graph: with `loops`, the poses of all frames so far, corrected by the loops, and the edges between them; see
-            `optimize_poses` for their covariances. None otherwise.
+        graph: with `loops`, the poses of all frames so far, corrected by the loops, and the edges between them;
+            `optimize_poses(step.graph)` computes their covariances. None otherwise.
     """
 
     cloud: PointCloud
@@ -62,7 +57,7 @@ def odometry(
     recover: bool = False,
     loops: bool = False,
     **options: Any,
-) -> Iterator[Step]:
+) -> Iterator[OdometryStep]:
     """Register each frame to the previous one, or to a map, starting from the previous motion (constant velocity).
 
     If a registration has too few matches or non-finite values, its result is not used: the sensor is taken to repeat
@@ -72,7 +67,7 @@ def odometry(
         frames: iterable of `datasets.Frame`, `PointCloud` or (N, 3) arrays in metres; consumed lazily. Preprocessed
             clouds are used unchanged.
         method: registration method.
-        voxel_size, num_neighbors: arguments of `preprocess`. `voxel_size` is also that of the map; by default the point
+        voxel_size, num_neighbors: arguments of `preprocess`. The map has the same voxel size, by default the point
             spacing of the first frame.
         init: motion of the sensor between the first two frames, to start from, `jaxlie.SE3` or (4, 4); the identity by
             default.
@@ -80,18 +75,18 @@ def odometry(
         against: "previous": register to the previous frame. "map": to the points of all frames before that lie within
             `map_radius` of the last pose, averaged per voxel. Errors then accumulate more slowly.
         map_radius: metres; by default the distance of the farthest point of the first frame from its sensor.
-        recover: after a jump, find the frame by `global_pose` in a map of all frames before, which is kept in memory.
-            This is tried if a registration does not converge or its overlap drops by a fifth. Frames that are not found
-            and whose registration has too few matches, or half the overlap of the one before, are lost: until a frame
-            is found, the pose continues with the previous motion, and the map stays as it is.
-        loops: whether to close loops. A frame whose pose lies near that of an earlier one, within the uncertainty of
-            the poses, is registered to it, and all poses are corrected by `optimize_poses`. Earlier steps keep the pose
-            known at their time, so use the poses in `Step.graph` of the last step. All clouds are kept in memory. Not
-            with `against="map"` or `recover`.
+        recover: relocalise after a jump: if a registration does not converge or its overlap drops by a fifth, find the
+            frame by `global_pose` in a map of all previous frames, which is kept in memory. If relocalisation fails and
+            the registration has too few matches, or less than half of the previous overlap, tracking is lost: poses are
+            extrapolated with constant velocity and the map is not updated until a frame is relocalised.
+        loops: close loops: register a frame to an earlier one whose position is near, within the uncertainty of the
+            poses, and correct all poses by `optimize_poses`. Steps keep the pose known at their time; the corrected
+            poses are in the `graph` of the last step. All clouds are kept in memory. Not with `against="map"` or
+            `recover`.
         options: options of `register`, except for `tie_points` and `prior`.
 
     Yields:
-        One `Step` per frame, including the first.
+        One `OdometryStep` per frame, including the first.
 
     Raises:
         ValueError: on iteration, if a cloud or an argument is invalid; for a cloud the message names the frame.
@@ -119,23 +114,23 @@ def odometry(
             farthest = float(np.linalg.norm(cloud.coordinates, axis=1).max())
             sensor.world = VoxelMap(voxel) if against == "map" else None
             sensor.radius = farthest if map_radius is None else map_radius
-            sensor.places = _Places(voxel) if recover else None
+            sensor.places = Relocalizer(voxel) if recover else None
             sensor.trajectory = Trajectory(method, sensor.options) if loops else None
         yield sensor.add(f"frames[{i}]", cloud)
 
 
 @dataclass
 class _Sensor:
-    """The sensor at its last frame, and what is kept of the frames before.
+    """The sensor at its last frame, and the maps of the previous frames.
 
     Attributes:
         motion: (4, 4), between the last two frames.
         pose: (4, 4), sensor to world.
         cloud: the last frame; None before the first.
-        world: the map that frames are registered to; None: they are registered to the previous frame.
+        world: the map that frames are registered to; None registers them to the previous frame.
         radius: metres around the sensor beyond which points leave the map.
-        places: the map in which lost frames are found; None: they are not.
-        trajectory: poses and edges, with loops; None: no loops are closed.
+        places: the map in which lost frames are found; None without relocalisation.
+        trajectory: poses and edges; None without loop closure.
     """
 
     method: AbstractMethod
@@ -146,11 +141,11 @@ class _Sensor:
     cloud: PointCloud | None = None
     world: VoxelMap | None = None
     radius: float = np.inf
-    places: _Places | None = None
+    places: Relocalizer | None = None
     trajectory: Trajectory | None = None
 
-    def add(self, name: str, cloud: PointCloud) -> Step:
-        """Locate the sensor at the next frame, and remember the frame."""
+    def add(self, name: str, cloud: PointCloud) -> OdometryStep:
+        """Locate the sensor at the next frame, and add the frame to the maps."""
         result = None if self.cloud is None else self._located(cloud, self.cloud)
         if self.places is not None:
             self.places.add(name, cloud, self.pose)
@@ -161,14 +156,14 @@ class _Sensor:
             self.pose = self.trajectory.add(cloud, self.pose, result)
         self.cloud = cloud
         graph = None if self.trajectory is None else self.trajectory.graph
-        return Step(cloud, self.pose, None if result is None else computed(result), graph)
+        return OdometryStep(cloud, self.pose, None if result is None else computed(result), graph)
 
     def _located(self, cloud: PointCloud, before: PointCloud) -> Registration:
         """Update motion and pose by a registration."""
         if self.world is None:
             result = register_pair(cloud, before, self.method, self.motion, self.options)
         else:
-            target = _target(self.world.cloud(), self.method, self.options, self.num_neighbors)
+            target = map_target(self.world.cloud(), self.method, self.options, self.num_neighbors)
             result = register_pair(cloud, target, self.method, self.pose @ self.motion, self.options)
         found = None
         if self.places is not None:
@@ -182,50 +177,7 @@ class _Sensor:
         return result if found is None else found
 
 
-class _Places:
-    """A map of all frames whose poses are known, in which a lost frame is found again."""
-
-    def __init__(self, voxel_size: float):
-        self._world = VoxelMap(voxel_size)
-        self._overlap = 0.0
-        self._lost = False
-
-    def corrected(
-        self, cloud: PointCloud, result: Registration, method: AbstractMethod, options: Options, num_neighbors: int
-    ) -> Registration | None:
-        """The registration of a frame to the map, in the world's frame, where the given one is doubtful and worse."""
-        overlap = float(np.asarray(result.overlap))
-        rests = result.status in (Status.CONVERGED, Status.DEGENERATE)
-        if rests and not self._lost and overlap >= _DOUBTFUL * self._overlap:
-            self._overlap = overlap
-            return None
-        known = self._world.cloud()
-        start = global_pose(cloud, known)
-        if start.success:
-            target = _target(known, method, options, num_neighbors)
-            found = register_pair(cloud, target, method, start.matrix, options)
-            if is_usable(found) and (self._lost or not rests or float(np.asarray(found.overlap)) > overlap):
-                self._lost = False
-                return found
-        self._lost = self._lost or not is_usable(result) or overlap < _LOST * self._overlap
-        return None
-
-    @property
-    def is_lost(self) -> bool:
-        """Whether the last frame is lost."""
-        return self._lost
-
-    def add(self, name: str, cloud: PointCloud, pose: Float[np.ndarray, "4 4"]) -> None:
-        if not self._lost:
-            self._world.add(name, cloud, pose)
-
-
 def _prepared(frame: Frame | PointCloud | Values, voxel_size: float | None, num_neighbors: int) -> PointCloud:
     cloud = frame.cloud if isinstance(frame, Frame) else frame
     cloud = cloud if isinstance(cloud, PointCloud) else PointCloud(cloud)
     return cloud if cloud.neighbors is not None else preprocess(cloud, voxel_size, num_neighbors)
-
-
-def _target(cloud: PointCloud, method: AbstractMethod, options: Options, num_neighbors: int) -> PointCloud:
-    """The map as a target; raw if the method makes cells of it."""
-    return cloud if options.takes_raw(method, "target") else preprocess(cloud, num_neighbors=num_neighbors)

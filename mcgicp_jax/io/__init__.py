@@ -14,7 +14,8 @@ from jaxtyping import Float
 
 from mcgicp_jax._clouds.point_cloud import PointCloud
 from mcgicp_jax._math.poses import pose_matrix
-from mcgicp_jax._pose_graph.graph import Edge, PoseGraph
+from mcgicp_jax._pose_graph.edge import Edge
+from mcgicp_jax._pose_graph.graph import PoseGraph
 from mcgicp_jax.io.formats import READERS, WRITERS, by_suffix
 from mcgicp_jax.io.g2o import graph_of, lines_of
 
@@ -181,7 +182,7 @@ def read_g2o(path: str | os.PathLike[str]) -> PoseGraph:
 
     Args:
         path: the file. Vertices may have any numbers; they become rows in ascending order. Edges between vertices whose
-            numbers are not consecutive are loops. Priors become edges from the world.
+            numbers are not consecutive are uncertain. Priors become edges from the world.
 
     Raises:
         OSError: if the file cannot be opened.
@@ -196,7 +197,7 @@ def read_g2o(path: str | os.PathLike[str]) -> PoseGraph:
 
 
 def write_g2o(path: str | os.PathLike[str], graph: PoseGraph | Any) -> None:
-    """Write a pose graph, or the result of `optimize_poses` without the loops that it rejected, as `read_g2o` reads it.
+    """Write a pose graph, or the result of `optimize_poses` without the edges that it rejected, as `read_g2o` reads it.
 
     Raises:
         OSError: if the file cannot be written.

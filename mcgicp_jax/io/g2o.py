@@ -9,7 +9,9 @@ import numpy as np
 from jaxtyping import Float
 
 from mcgicp_jax._math.poses import matrices_of, parameters_of
-from mcgicp_jax._pose_graph.graph import WORLD, Edge, PoseGraph
+from mcgicp_jax._pose_graph.edge import Edge
+from mcgicp_jax._pose_graph.factors import WORLD
+from mcgicp_jax._pose_graph.graph import PoseGraph
 
 # Tags of the lines. A prior has a vertex and the number of the sensor's offset, which has a line of its own.
 _VERTEX, _EDGE, _PRIOR, _OFFSET = "VERTEX_SE3:QUAT", "EDGE_SE3:QUAT", "EDGE_SE3_PRIOR", "PARAMS_SE3OFFSET"
@@ -41,9 +43,11 @@ def graph_of(lines: Iterable[str]) -> PoseGraph:
     upper, information = np.triu_indices(6), np.zeros((len(values), 6, 6))
     information[:, *upper] = information[:, *upper[::-1]] = values[:, 9:]
     of_world = np.arange(len(values)) >= len(edges)
-    loop = ~of_world & (np.abs(ends[:, 0] - ends[:, 1]) != 1)
+    uncertain = ~of_world & (np.abs(ends[:, 0] - ends[:, 1]) != 1)
     i = np.where(of_world, WORLD, rows[:, 0])
-    return PoseGraph(_poses(vertices[first, 1:]), Edge(i, rows[:, 1], _poses(values[:, 2:9]), information, loop=loop))
+    return PoseGraph(
+        _poses(vertices[first, 1:]), Edge(i, rows[:, 1], _poses(values[:, 2:9]), information, uncertain=uncertain)
+    )
 
 
 def lines_of(graph: PoseGraph | Any) -> Iterator[tuple[str, Float[np.ndarray, "N _"]]]:

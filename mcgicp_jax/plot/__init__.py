@@ -19,7 +19,7 @@ from mcgicp_jax._clouds.point_cloud import PointCloud
 from mcgicp_jax._math.poses import Pose, pose_matrix
 from mcgicp_jax._methods.base import AbstractMethod
 from mcgicp_jax._methods.surfaces import covariances_of
-from mcgicp_jax._pose_graph.graph import WORLD
+from mcgicp_jax._pose_graph.factors import WORLD
 from mcgicp_jax._pose_graph.optimize import PoseGraphResult
 from mcgicp_jax._pose_solver.degeneracy import CHANNELS_HOLD, GEOMETRY_HOLDS, shares
 from mcgicp_jax._registration.result import Registration
@@ -40,7 +40,7 @@ _MOST_POINTS = 50_000
 # before_after: most rows below each other; maximum width of a row and height of a panel, inches; pixels and tiles along
 # the longer side of a panel; fraction of each side that the detail shows.
 _MOST_ROWS, _WIDEST, _HIGHEST, _PIXELS, _TILES, _DETAIL = 5, 12, 4.5, 500, 12, 0.25
-# Residual at the end of the colour scale of a graph, standard deviations: that beyond which loops are rejected.
+# Residual at the end of the colour scale of a graph, standard deviations: beyond it, uncertain edges are rejected.
 _LARGEST_RESIDUAL = 4.1
 # Pixels along the longer side of a map.
 _MAP_PIXELS = 1400
@@ -370,10 +370,10 @@ def trajectories(
 def graph(graph: PoseGraphResult, *, path: str | os.PathLike[str] | None = None) -> matplotlib.figure.Figure:
     """Plot the poses of a graph in their principal plane, and its edges coloured by residual in standard deviations.
 
-    Rejected loops are dashed. A prior is drawn from the position that it measured.
+    Rejected edges are dashed. A prior is drawn from the position that it measured.
 
     Args:
-        graph: result of `optimize_poses`, such as `Multiway.graph`.
+        graph: result of `optimize_poses`, such as `MultiwayResult.graph`.
         path: file to save the figure to; its suffix selects the format.
 
     Raises:

@@ -20,7 +20,7 @@ import numpy as np
 
 import mcgicp_jax as mcg
 from mcgicp_jax import datasets, metrics
-from mcgicp_jax._sequences.loop_closure import edge_from
+from mcgicp_jax._sequences.edges import edge_from
 from tests.benchmarks.global_pose import desk
 from tests.graphs import garage, grid, measured, moved, sphere, with_gtsam
 
@@ -87,7 +87,7 @@ def false_loops() -> None:
             start = time.perf_counter()
             found = mcg.optimize_poses(graph)
             spent = time.perf_counter() - start
-            kept, right = found.kept & graph.edges.loop, true & graph.edges.loop
+            kept, right = found.kept & graph.edges.uncertain, true & graph.edges.uncertain
             error = metrics.ate(found.poses, poses, alignment="first")
             rows.append((error / best, (kept & right).sum() / kept.sum(), (kept & right).sum() / right.sum(), spent))
         ratio, precision, recall, spent = np.array(rows).T
@@ -110,7 +110,9 @@ def scenes() -> None:
         looped = list(mcg.odometry(frames, mcg.GICP(), start=truth[0], loops=True, **options))[-1].graph
         found = mcg.optimize_poses(looped)
         edges = looped.edges
-        unit = mcg.Edge(edges.i, edges.j, edges.T_i_j, np.tile(np.eye(6), (len(edges), 1, 1)), loop=edges.loop)
+        unit = mcg.Edge(
+            edges.i, edges.j, edges.T_i_j, np.tile(np.eye(6), (len(edges), 1, 1)), uncertain=edges.uncertain
+        )
         identity = mcg.optimize_poses(mcg.PoseGraph(looped.poses, unit), robust=False)
         errors = [
             metrics.ate(poses, truth, alignment="first")
@@ -118,8 +120,8 @@ def scenes() -> None:
         ]
         print(
             f"{name}: ATE {1e3 * errors[0]:.1f} mm by odometry, {1e3 * errors[1]:.1f} with "
-            f"{found.kept[edges.loop].sum()} of {edges.loop.sum()} loops, {1e3 * errors[2]:.1f} with the identity as "
-            f"information; NEES per dof {nees(found, truth):.2f}; {found}",
+            f"{found.kept[edges.uncertain].sum()} of {edges.uncertain.sum()} loops, {1e3 * errors[2]:.1f} with the "
+            f"identity as information; NEES per dof {nees(found, truth):.2f}; {found}",
             flush=True,
         )
 
@@ -149,7 +151,7 @@ def corridor() -> None:
             edge_from(k, k + 1, mcg.register(clouds[k + 1], clouds[k], mcg.GICP(), init=init, max_distance=0.5))
         )
     known = np.linalg.inv(truth[0]) @ truth[-1]
-    end = mcg.Edge(0, number, moved(known[None], 1e-3 * np.ones((1, 6)))[0], 1e6 * np.eye(6), loop=True)
+    end = mcg.Edge(0, number, moved(known[None], 1e-3 * np.ones((1, 6)))[0], 1e6 * np.eye(6), uncertain=True)
     along = [(edge.T_i_j[:3, :3].T @ truth[edge.i][:3, :3].T @ [1, 0, 0]) for edge in edges]
     told = [axis @ edge.information[:3, :3] @ axis for axis, edge in zip(along, edges, strict=True)]
     across = [np.trace(edge.information[:3, :3]) for edge in edges]

@@ -1,0 +1,155 @@
+"""Edges: measurements of the motion between two poses, and priors."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import jaxlie
+import numpy as np
+from jax.typing import ArrayLike
+from jaxtyping import Array, Bool, Float, Int
+
+from mcgicp_jax._compute.concrete import is_concrete, numpy_for
+from mcgicp_jax._math.poses import Pose, adjoint, inverse, pose_matrix
+from mcgicp_jax._math.twists import logarithm, logarithm_derivative
+from mcgicp_jax._pose_graph.factors import WORLD, AbstractFactor
+
+# Largest negative eigenvalue of an information matrix that counts as rounding, as a fraction of the largest one; and
+# largest asymmetry. g2o files have six digits.
+_ROUNDING = 1e-6
+
+
+class Edge(AbstractFactor):
+    """A measured motion between two poses of a graph, with its information matrix; a pytree.
+
+    If all fields have a leading axis of length m, one `Edge` holds m edges. A prior on a pose, such as a known start or
+    a GNSS position, is an edge from the world: `Edge(WORLD, j, T_world_j, covariance=...)`.
+
+    Attributes:
+        i, j: rows of the two poses in `PoseGraph.poses`, integers. `i` may be `WORLD`.
+        T_i_j: (4, 4), the measured T_i⁻¹ T_j, which maps coordinates of frame j to frame i; metres. For a position-only
+            measurement, set the rotation to an estimate (for instance that of a nearby pose) and its rows and columns
+            of `information` to zero. v is expressed in the axes of this rotation.
+        information: (6, 6), inverse covariance of ξ = (v, ω) in T_i_j exp(ξ), the tangent of `Registration.covariance`,
+            metres and radians; symmetric, positive semidefinite. Zero along directions that were not measured.
+        uncertain: whether the measurement may be an outlier, so that `optimize_poses` may reject the edge.
+    """
+
+    i: Int[Array, "*batch"] | Int[np.ndarray, "*batch"]
+    j: Int[Array, "*batch"] | Int[np.ndarray, "*batch"]
+    T_i_j: Float[Array, "*batch 4 4"] | Float[np.ndarray, "*batch 4 4"]
+    information: Float[Array, "*batch 6 6"] | Float[np.ndarray, "*batch 6 6"]
+    uncertain: Bool[Array, "*batch"] | Bool[np.ndarray, "*batch"]
+
+    def __init__(
+        self,
+        i: ArrayLike,
+        j: ArrayLike,
+        T_i_j: Pose,
+        information: ArrayLike | None = None,
+        *,
+        covariance: ArrayLike | None = None,
+        uncertain: ArrayLike = False,
+    ):
+        """Create one edge, or several from arguments with a leading axis (a single `uncertain` then holds for all).
+
+        Args:
+            i, j, T_i_j, information, uncertain: see the class. `T_i_j` may be a `jaxlie.SE3`.
+            covariance: (6, 6), positive definite; its inverse becomes the information. Give this or `information`.
+
+        Raises:
+            ValueError: if not exactly one of `information` and `covariance` is given, if a covariance is not positive
+                definite, if `i` or `j` is not an integer, or if the shapes do not fit.
+        """
+        if (information is None) == (covariance is None):
+            raise ValueError("information: expected either an information or a covariance matrix, got both or neither")
+        self.i, self.j = _rows("i", i), _rows("j", j)
+        self.T_i_j = _as_float("T_i_j", T_i_j.as_matrix() if isinstance(T_i_j, jaxlie.SE3) else T_i_j)
+        self.information = _inverse(covariance) if information is None else _as_float("information", information)
+        shape = np.shape(self.i)
+        known = not isinstance(uncertain, jax.Array)
+        self.uncertain = np.broadcast_to(np.asarray(uncertain, bool), shape) if known else uncertain
+        for name, tail in (("i", ()), ("j", ()), ("T_i_j", (4, 4)), ("information", (6, 6)), ("uncertain", ())):
+            if np.shape(getattr(self, name)) != shape + tail:
+                raise ValueError(f"{name}: expected shape {shape + tail}, got {np.shape(getattr(self, name))}")
+
+    @property
+    def rows(self) -> Any:
+        """(m, 2), `i` and `j`."""
+        return numpy_for(self.i, self.j).stack([self.i, self.j], axis=-1)
+
+    def linearize(
+        self, poses: Float[np.ndarray, "m 2 4 4"]
+    ) -> tuple[Float[np.ndarray, "m 6"], Float[np.ndarray, "m 2 6 6"]]:
+        """r = log(T_i_j⁻¹ T_i⁻¹ T_j), and ∂r/∂ξ_i and ∂r/∂ξ_j."""
+        motion = inverse(poses[:, 0]) @ poses[:, 1]
+        residual = logarithm(inverse(np.asarray(self.T_i_j)) @ motion)
+        by_end = logarithm_derivative(residual)
+        return residual, np.stack([-by_end @ adjoint(inverse(motion)), by_end], axis=1)
+
+    def __len__(self) -> int:
+        return len(self.i)
+
+    def __getitem__(self, rows: Any) -> Edge:
+        """One edge, or those of a slice, mask or list of rows."""
+        return jax.tree.map(lambda values: values[rows], self)
+
+
+def checked_edges(edges: Edge, num_poses: int) -> Edge:
+    """The edges as NumPy arrays, with exact rotations and symmetric information."""
+    i, j = np.asarray(edges.i), np.asarray(edges.j)
+    for name, rows, other in (("i", i, i == WORLD), ("j", j, False)):
+        outside = ((rows < 0) | (rows >= num_poses)) & ~np.asarray(other)
+        _refuse(f"{name}: expected a row from 0 to {num_poses - 1}", outside, rows)
+    _refuse("expected two different poses", i == j, i)
+    transforms = np.asarray(edges.T_i_j, np.float64)
+    transforms = np.array([pose_matrix(each, f"edges[{k}].T_i_j") for k, each in enumerate(transforms)])
+    information = np.asarray(edges.information, np.float64)
+    _refuse("information: expected finite numbers", np.isnan(information.sum(axis=(1, 2)) * 0.0), information)
+    symmetric = 0.5 * (information + information.swapaxes(1, 2))
+    values = np.linalg.eigvalsh(symmetric)
+    limit = _ROUNDING * np.abs(values).max(axis=1, initial=0)
+    asymmetry = np.abs(information - symmetric).max(axis=(1, 2), initial=0)
+    _refuse("information: expected a symmetric matrix", asymmetry > limit, information)
+    _refuse("information: expected a positive semidefinite matrix; eigenvalues", values[:, 0] < -limit, values)
+    return Edge(i, j, transforms.reshape(-1, 4, 4), symmetric, uncertain=np.asarray(edges.uncertain, bool))
+
+
+def _refuse(what: str, bad: np.ndarray, values: np.ndarray) -> None:
+    if bad.any():
+        k = int(np.argmax(bad))
+        raise ValueError(f"edges[{k}]: {what}, got {values[k]}")
+
+
+def _rows(name: str, values: ArrayLike) -> Any:
+    array = values if isinstance(values, jax.Array) else np.asarray(values)
+    if array.dtype.kind not in "iu":
+        raise ValueError(f"{name}: expected the row of a pose, got {values!r}")
+    return array
+
+
+def _as_float(name: str, values: Any) -> Any:
+    if isinstance(values, jax.Array):
+        return values
+    try:
+        return np.asarray(values, np.float64)
+    except (TypeError, ValueError) as error:
+        raise ValueError(f"{name}: expected an array of numbers, got {values!r}") from error
+
+
+def _inverse(covariance: Any) -> Any:
+    if not is_concrete(covariance):
+        return jnp.linalg.inv(covariance)
+    covariance = np.asarray(_as_float("covariance", covariance))
+    if covariance.shape[-2:] != (6, 6):
+        raise ValueError(f"covariance: expected shape (6, 6), got {covariance.shape}")
+    if not np.isfinite(covariance).all():
+        raise ValueError("covariance: expected finite numbers, got NaN or infinity")
+    try:
+        np.linalg.cholesky(covariance)
+    except np.linalg.LinAlgError as error:
+        raise ValueError("covariance: expected a positive definite matrix") from error
+    inverse = np.linalg.inv(covariance)
+    return 0.5 * (inverse + np.swapaxes(inverse, -1, -2))

@@ -1,0 +1,43 @@
+"""The interface of the measurements in a pose graph."""
+
+from __future__ import annotations
+
+import abc
+
+import equinox as eqx
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
+
+# Row of the world's frame, whose pose is the identity. Unlike −1, it is not a row of any array.
+WORLD = -(2**31)
+
+
+class AbstractFactor(eqx.Module):
+    """m measurements of one kind, each a function of k ≥ 2 poses; a pytree of arrays with a leading axis of length m.
+
+    The cost of a measurement is ½ rᵀΛr. A subclass provides the fields below and `linearize`; the solver, the
+    covariances and the derivatives of the poses need nothing else.
+
+    Attributes:
+        rows: (m, k), rows of the poses that each measurement depends on. A measurement in the world's frame, such as a
+            height, has `WORLD` among them.
+        information: (m, d, d), Λ, the inverse covariance of the residual; symmetric, positive semidefinite.
+        uncertain: (m,), whether the measurement may be an outlier, so that `optimize_poses` may reject it.
+    """
+
+    rows: eqx.AbstractVar[Int[Array, "*m k"] | Int[np.ndarray, "*m k"]]
+    information: eqx.AbstractVar[Float[Array, "*m d d"] | Float[np.ndarray, "*m d d"]]
+    uncertain: eqx.AbstractVar[Bool[Array, "*m"] | Bool[np.ndarray, "*m"]]
+
+    @abc.abstractmethod
+    def linearize(
+        self, poses: Float[np.ndarray, "m k 4 4"]
+    ) -> tuple[Float[np.ndarray, "m d"], Float[np.ndarray, "m k d 6"]]:
+        """Residuals r, and their derivatives with respect to the twists ξ = (v, ω) of all poses T exp(ξ).
+
+        Called on the host with NumPy arrays in float64, also from within compiled programs: it must not call JAX.
+        Derivatives of the poses with respect to the fields are taken numerically, with steps of 1e-3.
+
+        Args:
+            poses: sensor to world, metres; the identity for `WORLD`.
+        """

@@ -1,0 +1,259 @@
+"""Sparse normal equations of a pose graph, in blocks of six unknowns per pose; SciPy factors them.
+
+The Gauss-Newton matrix is H = Σ w JᵀΛJ, for twists ξ of T exp(ξ). The damping of Levenberg-Marquardt is λD, where
+D = Σ CᵀSC measures changes Cξ of the motions between poses that share a measurement, with a typical information S.
+Damped steps are then small in *relative* motions, and directions that no measurement observes, such as the way along a
+corridor, are distributed evenly over the edges.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from mcgicp_jax._math.poses import adjoint, inverse
+from mcgicp_jax._pose_graph.factors import WORLD, AbstractFactor
+
+# Least damping, as a fraction of the information of a typical edge. Directions that no measurement observes are then
+# 3e4 times as uncertain as a typical edge, and the factorisation loses half of the digits of float64.
+LEAST_DAMPING = 1e-9
+
+
+class Terms(NamedTuple):
+    """Squared residuals, gradients and Gauss-Newton blocks of all measurements at given poses.
+
+    Attributes:
+        squares: rᵀΛr of every measurement, the squared Mahalanobis distance.
+        gradient: JᵀΛr, for every pose of every measurement.
+        blocks: of JᵀΛJ, for every pair of poses of every measurement.
+    """
+
+    squares: Float[np.ndarray, "m"]
+    gradient: Float[np.ndarray, "e 6"]
+    blocks: Float[np.ndarray, "b 6 6"]
+
+    def cost(self, weights: Float[np.ndarray, "m"]) -> float:
+        """½ Σ w rᵀΛr."""
+        return 0.5 * float(weights @ self.squares)
+
+
+class NormalEquations:
+    """The sparse equations (H + λD) ξ = −g of a graph.
+
+    If there are measurements in the world's frame, the last pose is that of the world, the identity, and is held. Of
+    every other connected part, the first pose is held. The elimination order (minimum degree on the graph of poses) and
+    the place of every block in the matrix are computed once. Measurements that are not in use have no place: false
+    loops between distant poses would fill the factors.
+
+    Attributes:
+        factors: all measurements, the edges first. Measurements are numbered in this order.
+        rows: rows of the poses of each kind of measurement.
+        used: (m,) which measurements are in use.
+        place: place of each pose in the elimination order; −1 for poses that are held.
+        fill: entries of the factors per entry of the matrix, in blocks.
+        held: which poses do not move.
+        parts: number of the connected part of each pose.
+        root: the held pose to which covariances refer: the first one, or the world.
+        metric: the sparse matrix D, at the given poses.
+    """
+
+    def __init__(
+        self,
+        factors: tuple[AbstractFactor, ...],
+        poses: Float[np.ndarray, "n 4 4"],
+        used: Bool[np.ndarray, "m"] | None = None,
+    ):
+        # Imported late, as SciPy's sparse matrices take a tenth of the import time of the package.
+        from scipy.sparse import coo_array
+        from scipy.sparse.csgraph import connected_components
+
+        self.factors, self._start, num_poses = factors, poses, len(poses)
+        given = [np.asarray(factor.rows) for factor in factors]
+        of_world = np.concatenate([(rows == WORLD).any(axis=1) for rows in given])
+        self.root = num_poses - 1 if of_world.any() else 0
+        self.rows = [np.where(rows == WORLD, self.root, rows) for rows in given]
+        self.used = np.ones(len(of_world), bool) if used is None else used
+        self._index_blocks()
+        chosen = self.used[self._of_block]
+        ends = self._first[chosen], self._second[chosen]
+        graph = coo_array((np.ones(len(ends[0])), ends), (num_poses, num_poses))
+        _, self.parts = connected_components(graph, directed=False)
+        held = np.unique(self.parts, return_index=True)[1]
+        held[self.parts[self.root]] = self.root
+        self.held = np.zeros(num_poses, bool)
+        self.held[held] = True
+        self.place = np.full(num_poses, -1)
+        self.place[~self.held], self.fill = _elimination_order(graph, self.held)
+        self._lay_out()
+        self.metric = self.matrix(_metric_blocks(poses, self.rows, _typical(factors[0], of_world)))
+
+    @property
+    def size(self) -> int:
+        """Number of unknowns."""
+        return 6 * int((~self.held).sum())
+
+    def split(self, values: np.ndarray) -> list[np.ndarray]:
+        """Values of all measurements, by kind."""
+        return np.split(values, np.cumsum([len(rows) for rows in self.rows])[:-1])
+
+    def restricted(self, used: Bool[np.ndarray, "m"]) -> NormalEquations:
+        """The equations of some of the measurements."""
+        return self if np.array_equal(used, self.used) else NormalEquations(self.factors, self._start, used)
+
+    def terms(self, poses: Float[np.ndarray, "n 4 4"]) -> Terms:
+        """Evaluate all measurements."""
+        found = []
+        for factor, rows in zip(self.factors, self.rows, strict=True):
+            residuals, jacobians = factor.linearize(poses[rows])
+            information = np.asarray(factor.information)
+            forces = (information @ residuals[..., None])[..., 0]
+            gradient = (jacobians.swapaxes(2, 3) @ forces[:, None, :, None]).reshape(-1, 6)
+            blocks = normal_blocks(jacobians, information)
+            found.append((np.einsum("mi,mi->m", residuals, forces), gradient, blocks))
+        return Terms(*(np.concatenate(each) for each in zip(*found, strict=True)))
+
+    def gradient(self, terms: Terms, weights: Float[np.ndarray, "m"]) -> Float[np.ndarray, "size"]:
+        """g, in the elimination order."""
+        weighted = weights[self._of_end, None] * terms.gradient
+        number = len(self.place)
+        return self.gathered(np.stack([np.bincount(self._ends, each, number) for each in weighted.T], axis=1))
+
+    def gathered(self, rows: Float[np.ndarray, "n *k"]) -> Float[np.ndarray, "size"]:
+        """Rows of the poses as a vector of the unknowns."""
+        vector = np.empty(((~self.held).sum(), *rows.shape[1:]))
+        vector[self.place[~self.held]] = rows[~self.held]
+        return vector.reshape(-1)
+
+    def spread(self, vector: Float[np.ndarray, "size *k"]) -> Float[np.ndarray, "n 6 *k"]:
+        """A vector of the unknowns as rows of the poses, 0 for held poses."""
+        rows = np.zeros((len(self.place), 6, *vector.shape[1:]))
+        rows[~self.held] = vector.reshape(-1, *rows.shape[1:])[self.place[~self.held]]
+        return rows
+
+    def weighted(self, blocks: Float[np.ndarray, "b 6 6"], weights: Float[np.ndarray, "m"]) -> Any:
+        """The sparse matrix of the blocks of all measurements, such as H."""
+        return self.matrix(weights[self._of_block, None, None] * blocks)
+
+    def matrix(self, blocks: Float[np.ndarray, "b 6 6"]) -> Any:
+        """The sparse symmetric matrix of the sum of all blocks."""
+        from scipy.sparse import csc_array
+
+        if not self.size:
+            return csc_array((0, 0))
+        summed = np.add.reduceat(blocks[self._order], self._starts)
+        data = np.empty(summed.size)
+        data[self._where] = summed.reshape(-1)
+        return csc_array((data, self._indices, self._pointers), (self.size, self.size))
+
+    def damped(self, matrix: Any, damping: float = LEAST_DAMPING) -> Any:
+        """H + λD; all matrices have their entries at the same places."""
+        total = matrix.copy()
+        total.data += damping * self.metric.data
+        return total
+
+    def _index_blocks(self) -> None:
+        """Poses and measurement of each row of `Terms.gradient`, and of each block."""
+        numbers = self.split(np.arange(len(self.used)))
+        pairs = list(zip(self.rows, numbers, strict=True))
+        self._ends = np.concatenate([rows.reshape(-1) for rows in self.rows])
+        self._of_end = np.concatenate([np.repeat(number, rows.shape[1]) for rows, number in pairs])
+        self._first = np.concatenate([np.repeat(rows, rows.shape[1], axis=1).reshape(-1) for rows in self.rows])
+        self._second = np.concatenate([np.tile(rows, rows.shape[1]).reshape(-1) for rows in self.rows])
+        self._of_block = np.concatenate([np.repeat(number, rows.shape[1] ** 2) for rows, number in pairs])
+
+    def _lay_out(self) -> None:
+        """Places of the blocks in the compressed columns of the matrix."""
+        rows, columns = self.place[self._first], self.place[self._second]
+        inside = np.flatnonzero((rows >= 0) & (columns >= 0) & self.used[self._of_block])
+        self._order = inside[np.lexsort((rows[inside], columns[inside]))]
+        rows, columns = rows[self._order], columns[self._order]
+        new = np.ones(len(rows), bool)
+        new[1:] = (rows[1:] != rows[:-1]) | (columns[1:] != columns[:-1])
+        self._starts = np.flatnonzero(new)
+        rows, columns = rows[new], columns[new]
+        counts = np.bincount(columns, minlength=self.size // 6)
+        before = np.concatenate([[0], np.cumsum(counts)[:-1]]).astype(int)
+        along, across = np.arange(6)[:, None], np.arange(6)
+        inner = (np.arange(len(rows)) - before[columns])[:, None, None]
+        each = counts[columns][:, None, None]
+        self._where = (36 * before[columns][:, None, None] + 6 * each * across + 6 * inner + along).reshape(-1)
+        self._indices = np.empty(len(self._where), np.int32)
+        self._indices[self._where] = np.broadcast_to(6 * rows[:, None, None] + along, (len(rows), 6, 6)).reshape(-1)
+        starts = 36 * before[:, None] + 6 * counts[:, None] * across
+        self._pointers = np.append(starts.reshape(-1), len(self._where)).astype(np.int32)
+
+
+def factored(matrix: Any) -> Any:
+    """`SuperLU` of a sparse symmetric positive definite matrix whose unknowns are in the elimination order.
+
+    Raises:
+        RuntimeError: if the matrix is singular.
+    """
+    from scipy.sparse.linalg import splu
+
+    return splu(matrix, permc_spec="NATURAL", diag_pivot_thresh=0.0, options={"SymmetricMode": True})
+
+
+def normal_blocks(
+    jacobians: Float[np.ndarray, "m k d 6"], information: Float[np.ndarray, "m d d"]
+) -> Float[np.ndarray, "b 6 6"]:
+    """The blocks of JᵀΛJ for all k² pairs of poses of every measurement."""
+    weighted = information[:, None] @ jacobians
+    return (jacobians.swapaxes(2, 3)[:, :, None] @ weighted[:, None]).reshape(-1, 6, 6)
+
+
+def motion_jacobians(poses: Float[np.ndarray, "m k 4 4"]) -> Float[np.ndarray, "m k d 6"]:
+    """Derivatives of the twists of the motions from the first pose to each other one, with respect to all twists."""
+    m, k = poses.shape[:2]
+    jacobians = np.zeros((m, k, k - 1, 6, 6))
+    jacobians[:, 0] = -adjoint(inverse(poses[:, 1:]) @ poses[:, :1])
+    jacobians[:, np.arange(1, k), np.arange(k - 1)] = np.eye(6)
+    return jacobians.reshape(m, k, 6 * (k - 1), 6)
+
+
+def _metric_blocks(
+    poses: Float[np.ndarray, "n 4 4"], rows: list[Int[np.ndarray, "_ _"]], typical: Float[np.ndarray, "m 6"]
+) -> Float[np.ndarray, "b 6 6"]:
+    """The blocks of D."""
+    scales = np.split(typical, np.cumsum([len(each) for each in rows])[:-1])
+    return np.concatenate(
+        [
+            normal_blocks(motion_jacobians(poses[each]), np.tile(scale, each.shape[1] - 1)[..., None] * np.eye(d))
+            for each, scale, d in ((r, s, 6 * (r.shape[1] - 1)) for r, s in zip(rows, scales, strict=True))
+        ]
+    )
+
+
+def _typical(edges: AbstractFactor, of_world: Bool[np.ndarray, "m"]) -> Float[np.ndarray, "m 6"]:
+    """Diagonal of S for every measurement: the median over edges of the mean information, in translation and rotation.
+
+    Measurements in the world's frame have their own: next to motions known to millimetres, positions known to metres
+    would else look unconstrained.
+    """
+    diagonal = np.diagonal(np.asarray(edges.information), axis1=1, axis2=2).reshape(-1, 2, 3).mean(axis=2)
+    typical, edges_of_world = np.ones((len(of_world), 2)), of_world[: len(diagonal)]
+    for counted, chosen in ((~edges_of_world, slice(None)), (edges_of_world, of_world)):
+        for kind, values in enumerate(diagonal.T):
+            known = values[counted & (values > 0)]
+            if len(known):
+                typical[chosen, kind] = np.median(known)
+    return np.repeat(typical, 3, axis=1)
+
+
+def _elimination_order(graph: Any, held: Bool[np.ndarray, "n"]) -> tuple[Int[np.ndarray, "k"], float]:
+    """Place of each free pose in an elimination order with little fill, minimum degree by SuperLU; and the fill."""
+    from scipy.sparse import eye_array
+    from scipy.sparse.linalg import splu
+
+    free = ~held
+    if not free.any():
+        return np.zeros(0, int), 1.0
+    pattern = graph.tocsr()[free][:, free]
+    pattern.data[:] = -1.0
+    # Diagonally dominant, so that the factorisation exists.
+    dominant = pattern + eye_array(pattern.shape[0]) * (2.0 + np.diff(pattern.indptr).max())
+    options = {"SymmetricMode": True}
+    factors = splu(dominant.tocsc(), permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options=options)
+    return factors.perm_c, factors.nnz / dominant.nnz

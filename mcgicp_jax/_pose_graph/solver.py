@@ -1,0 +1,159 @@
+"""The solver of pose graphs, on the host; NumPy and SciPy only, so that it may run inside callbacks."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from mcgicp_jax._math.poses import matrices_of, parameters_of
+from mcgicp_jax._pose_graph.edge import Edge
+from mcgicp_jax._pose_graph.factors import WORLD, AbstractFactor
+from mcgicp_jax._pose_graph.graph import PoseGraph
+from mcgicp_jax._pose_graph.levenberg_marquardt import Minimum
+from mcgicp_jax._pose_graph.marginal_covariances import pose_covariances, propagated
+from mcgicp_jax._pose_graph.normal_equations import LEAST_DAMPING, NormalEquations, factored, motion_jacobians
+from mcgicp_jax._pose_graph.outliers import robust_minimum, thresholds
+from mcgicp_jax._registration.result import Status
+
+# A direction of motion is unconstrained if its information is less than this fraction of that of a typical edge.
+_UNCONSTRAINED = 10 * LEAST_DAMPING
+# Inverse iterations for the least constrained direction: unconstrained ones stand out by factors of 1e3 and more.
+_INVERSE_ITERATIONS = 4
+
+Factors = tuple[AbstractFactor, ...]
+
+
+class Solution(NamedTuple):
+    """The solution of a graph.
+
+    Attributes:
+        equations: of the measurements that are kept.
+        found: the minimum, in the world whose origin is `origin`.
+        weights: 1 for the measurements that are kept, 0 for the others.
+        origin: metres.
+        status: CONVERGED, MAX_ITERATIONS, DEGENERATE or NON_FINITE.
+        cost: ½ Σ w rᵀΛr.
+    """
+
+    equations: NormalEquations
+    found: Minimum
+    weights: Float[np.ndarray, "m"]
+    origin: Float[np.ndarray, "3"]
+    status: Status
+    cost: float
+
+    @property
+    def residuals(self) -> Float[np.ndarray, "m"]:
+        """√(rᵀΛr) of every measurement."""
+        return np.sqrt(np.maximum(self.found.terms.squares, 0))
+
+    def poses(self, number: int) -> Float[np.ndarray, "number 4 4"]:
+        """The poses of the graph, without that of the world."""
+        poses = self.found.poses[:number].copy()
+        poses[:, :3, 3] += self.origin
+        return poses
+
+    def covariances(self, number: int) -> Float[np.ndarray, "number 6 6"]:
+        """The covariances of the poses of the graph."""
+        return pose_covariances(self.equations, self.found, self.weights)[:number]
+
+
+def solve(poses: Float[np.ndarray, "n 4 4"], factors: Factors, robust: bool, max_iterations: int) -> Solution:
+    """Minimise ½ Σ w rᵀΛr from the given poses; the first kind of measurement is the edges. Arrays are NumPy's."""
+    # Overflow is a status.
+    with np.errstate(over="ignore", invalid="ignore"):
+        poses, factors, origin = _centred(poses, factors)
+        equations = NormalEquations(factors, poses)
+        uncertain = np.concatenate([np.asarray(factor.uncertain) for factor in factors]) & robust
+        equations, found, weights = robust_minimum(equations, poses, uncertain, max_iterations)
+        status = _status(equations, found, weights)
+        return Solution(equations, found, weights, origin, status, found.terms.cost(weights))
+
+
+def covariances_at(
+    poses: Float[np.ndarray, "n 4 4"], factors: Factors, weights: Float[np.ndarray, "m"]
+) -> Float[np.ndarray, "n 6 6"]:
+    """`Solution.covariances` of a solution that is known."""
+    with np.errstate(over="ignore", invalid="ignore"):
+        centred, factors, _ = _centred(poses, factors)
+        equations = NormalEquations(factors, centred, weights > 0)
+        found = Minimum(centred, equations.terms(centred))
+        return pose_covariances(equations, found, weights)[: len(poses)]
+
+
+def motion_covariances(
+    graph: PoseGraph, i: Int[np.ndarray, "k"], j: Int[np.ndarray, "k"]
+) -> Float[np.ndarray, "k 6 6"]:
+    """Covariances of ξ in T_i⁻¹ T_j exp(ξ), at the poses of a graph, taken to be its minimum; outliers do not count.
+
+    Infinite if no measurements connect the two poses.
+    """
+    poses, factors, _ = _centred(np.asarray(graph.poses), (graph.edges, *graph.factors))
+    equations = NormalEquations(factors, poses)
+    found = Minimum(poses, equations.terms(poses))
+    rejected = found.terms.squares > thresholds(equations)
+    kept = ~(rejected & np.concatenate([np.asarray(factor.uncertain) for factor in factors]))
+    rows = np.stack([i, j], axis=1)
+    return propagated(equations.restricted(kept), found, 1.0 * kept, rows, motion_jacobians(poses[rows]))
+
+
+def _centred(
+    poses: Float[np.ndarray, "n 4 4"], factors: Factors
+) -> tuple[Float[np.ndarray, "_ 4 4"], Factors, Float[np.ndarray, "3"]]:
+    """Exact rigid poses and edges about another origin of the world, and that origin.
+
+    It is the first position or, with priors, their median: at UTM coordinates, 1e-9 m are lost to rounding, and costs
+    next to the minimum could not be told apart. Measurements of other kinds may depend on the origin, which then stays.
+    If there are measurements in the world's frame, the pose of the world is appended.
+    """
+    edges, others = factors[0], factors[1:]
+    poses, motions = _rigid(poses), _rigid(edges.T_i_j)
+    of_world = np.asarray(edges.i) == WORLD
+    origin = np.zeros(3)
+    if not others:
+        origin = np.median(motions[of_world, :3, 3] if of_world.any() else poses[:1, :3, 3], axis=0)
+    poses[:, :3, 3] -= origin
+    motions[of_world, :3, 3] -= origin
+    if any(np.any(np.asarray(factor.rows) == WORLD) for factor in factors):
+        poses = np.concatenate([poses, np.eye(4)[None]])
+    information = np.asarray(edges.information, np.float64)
+    return poses, (Edge(edges.i, edges.j, motions, information, uncertain=edges.uncertain), *others), origin
+
+
+def _rigid(matrices: np.ndarray) -> Float[np.ndarray, "_ 4 4"]:
+    """The matrices in float64 with exact rotations, of which float32 has seven digits; NaN stays."""
+    matrices = np.array(matrices, np.float64)
+    finite = np.isfinite(matrices).all(axis=(1, 2))
+    matrices[finite] = matrices_of(parameters_of(matrices[finite]))
+    return matrices
+
+
+def _status(equations: NormalEquations, found: Minimum, weights: Float[np.ndarray, "m"]) -> Status:
+    if not (np.isfinite(found.poses).all() and np.isfinite(found.terms.squares).all()):
+        return Status.NON_FINITE
+    if _is_degenerate(equations, found, weights):
+        return Status.DEGENERATE
+    return Status.CONVERGED if found.converged else Status.MAX_ITERATIONS
+
+
+def _is_degenerate(equations: NormalEquations, found: Minimum, weights: Float[np.ndarray, "m"]) -> bool:
+    """Whether poses are not connected, or the least eigenvalue of H relative to D is not above rounding and damping.
+
+    By inverse iteration with the least damping: that of the last step may be too large to tell.
+    """
+    if np.any(equations.parts != equations.parts[equations.root]):
+        return True
+    if not equations.size:
+        return False
+    matrix = equations.weighted(found.terms.blocks, weights)
+    try:
+        factors = factored(equations.damped(matrix))
+    except RuntimeError:
+        return True
+    vector = np.random.default_rng(0).normal(size=equations.size)
+    for _ in range(_INVERSE_ITERATIONS):
+        pushed = equations.metric @ vector
+        vector = factors.solve(pushed / np.sqrt(vector @ pushed))
+    return bool(vector @ (matrix @ vector) < _UNCONSTRAINED * (vector @ (equations.metric @ vector)))
