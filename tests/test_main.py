@@ -54,7 +54,9 @@ def printed_matrix(text):
     return np.array([row.split() for row in rows], float)
 
 
-@pytest.mark.parametrize("method", ["mc-gicp", "gicp", "color-icp", "point-to-plane", "point-to-point", "ndt"])
+@pytest.mark.parametrize(
+    "method", ["mc-gicp", "photometric-gicp", "gicp", "color-icp", "point-to-plane", "point-to-point", "ndt"]
+)
 def test_register_prints_the_pose(files, capsys, method):
     assert main(["register", files["source"], files["target"], "--method", method]) == 0
     text, errors = capsys.readouterr()
@@ -123,6 +125,7 @@ def test_compare(files, capsys):
     rows = {line.split()[0]: line.split()[1:] for line in lines if line.endswith("converged")}
     assert list(rows) == [
         "mc-gicp",
+        "photometric-gicp",
         "gicp",
         "color-icp",
         "point-to-plane",
@@ -141,7 +144,7 @@ def test_compare(files, capsys):
 def test_compare_without_channels_or_truth(files, capsys):
     assert main(["compare", files["bare"], files["target"]]) == 0
     text = capsys.readouterr().out
-    assert "error" not in text and text.count("left out") == 3 and text.count("converged") == 5
+    assert "error" not in text and text.count("left out") == 4 and text.count("converged") == 5
     assert main(["compare", files["bare"], files["target"], "--max-iterations", "1"]) == 1
     assert "gicp did not converge" in capsys.readouterr().err
 
@@ -154,7 +157,7 @@ def test_demo(tmp_path, capsys):
     assert errors == "" and str(folder / "before_after.png") in text
     height, width, _ = matplotlib.image.imread(folder / "before_after.png").shape
     assert width > height > 500
-    error = {line.split()[0]: float(line.split()[1]) for line in text.split("status\n")[1].splitlines()[:6]}
+    error = {line.split()[0]: float(line.split()[1]) for line in text.split("status\n")[1].splitlines()[:7]}
     assert error["mc-gicp"] < 5 and error["color-icp"] < 10
     # What the text says: geometry slides.
     assert min(error["gicp"], error["point-to-plane"], error["point-to-point"]) > 20

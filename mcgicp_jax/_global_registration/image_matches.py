@@ -7,9 +7,9 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, Int
 
+from mcgicp_jax._clouds.frame import Frame
 from mcgicp_jax._search.base import Rows
 from mcgicp_jax._search.kd_tree import KDTreeSearch
-from mcgicp_jax.datasets import Frame
 
 # Largest ratio of the distances to the best and the second best match (Lowe 2004).
 _RATIO = 0.8

@@ -113,3 +113,12 @@ class Tukey(AbstractKernel):
 
     def _weight(self, square: Float[Array, "N"], scale: Float[Array, ""]) -> Float[Array, "N"]:
         return jnp.maximum(1 - square / scale**2, 0) ** 2
+
+
+KERNELS: dict[str, type[AbstractKernel]] = {
+    "huber": Huber,
+    "cauchy": Cauchy,
+    "geman-mcclure": GemanMcClure,
+    "tukey": Tukey,
+    "welsch": Welsch,
+}

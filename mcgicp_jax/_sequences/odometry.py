@@ -9,6 +9,7 @@ from typing import Any, Literal
 import numpy as np
 from jaxtyping import Float
 
+from mcgicp_jax._clouds.frame import Frame
 from mcgicp_jax._clouds.point_cloud import PointCloud, Values
 from mcgicp_jax._clouds.preprocess import check_preprocessing, preprocess
 from mcgicp_jax._clouds.voxel_map import VoxelMap
@@ -21,7 +22,6 @@ from mcgicp_jax._registration.options import Options, check_method, options_of
 from mcgicp_jax._registration.register_pair import global_pose, register_with
 from mcgicp_jax._registration.result import Registration, Status, computed, is_usable
 from mcgicp_jax._sequences.loop_closure import Trajectory
-from mcgicp_jax.datasets import Frame
 
 # Fractions of the overlap of the registration before. At constant speed the overlap hardly changes. After jumps in
 # simulated rooms and streets and on KITTI it was 0.5 to 0.7 of that before: below the first fraction, the frame is also

@@ -8,15 +8,10 @@ from typing import TypeAlias
 
 import numpy as np
 from jaxtyping import Float, Int
+from scipy.spatial.transform import Rotation
 
 from mcgicp_jax._clouds.point_cloud import PointCloud
-from mcgicp_jax.datasets._frame import (
-    SyntheticFrames,
-    check_noise,
-    check_points_per_frame,
-    rotation_from_vector,
-    scene_and_path_rng,
-)
+from mcgicp_jax.datasets._frames import SyntheticFrames, check_scene, scene_and_path_rng
 
 # The constants of this module define the scene and the camera.
 # First-generation Kinect: image size and focal length, pixels.
@@ -91,8 +86,7 @@ def poster_wall(
     Raises:
         ValueError: if `num_frames`, `points_per_frame` or `noise` is out of range.
     """
-    check_points_per_frame(points_per_frame, _WIDTH * _HEIGHT)
-    check_noise(noise)
+    check_scene(points_per_frame, noise, _WIDTH * _HEIGHT)
     scene_rng, path_rng = scene_and_path_rng(seed)
     observer = partial(_observe, _paint_wall(scene_rng), points_per_frame, noise)
     return SyntheticFrames(num_frames, _camera_path(path_rng, step, heading), observer, _PERIOD, seed)
@@ -123,7 +117,7 @@ def _pose(
     tilt = tilt_start + index * _TILT_PHASE
     sway = sway_start + 0.3 * np.linalg.norm(move) / _DISTANCE_SWAY * index
     pose = np.eye(4)
-    pose[:3, :3] = rotation_from_vector(tilt_axes @ (_TILT * np.array([np.cos(tilt), np.sin(tilt)])))
+    pose[:3, :3] = Rotation.from_rotvec(tilt_axes @ (_TILT * np.array([np.cos(tilt), np.sin(tilt)]))).as_matrix()
     pose[:2, 3] = start + index * move
     pose[2, 3] = -_DISTANCE + _DISTANCE_SWAY * np.sin(sway)
     return pose
@@ -156,14 +150,12 @@ def _rays(rng: np.random.Generator, size: int) -> Float[np.ndarray, "N 3"]:
 
 def _sample(wall: Image, texels: Float[np.ndarray, "N 2"]) -> Float[np.ndarray, "N 3"]:
     """Bilinear colours of the wall, which is periodic in both directions."""
-    height, width, _ = wall.shape
-    x0, y0 = np.floor(texels).astype(int).T
-    right, down = (texels - np.floor(texels)).T[..., None]
-    x1, y1 = (x0 + 1) % width, (y0 + 1) % height
-    x0, y0 = x0 % width, y0 % height
-    above = (1 - right) * wall[y0, x0] + right * wall[y0, x1]
-    below = (1 - right) * wall[y1, x0] + right * wall[y1, x1]
-    return (1 - down) * above + down * below
+    from scipy.ndimage import map_coordinates
+
+    colors = [
+        map_coordinates(color, texels.T[::-1], float, order=1, mode="grid-wrap") for color in np.moveaxis(wall, 2, 0)
+    ]
+    return np.stack(colors, axis=1)
 
 
 # The wall
