@@ -5,7 +5,7 @@ from __future__ import annotations
 import collections
 import itertools
 import sys
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeAlias
 
@@ -124,7 +124,7 @@ def odometry(
     chosen = method_for(method, shared, first_two)
     steps = mcg.odometry(_clouds(frames, names, truth), chosen, voxel_size=voxel, start=first.pose, **options)
     map_voxel = round_voxel_size([first.cloud], len(first.cloud) // 2) if map and voxel is None else voxel
-    poses, results = _follow(tqdm(steps, total=len(frames), unit="frame", disable=None), loops, map, map_voxel)
+    poses, results = _follow(steps, len(frames), loops, map, map_voxel)
     _report(poses, truth, results)
     if output is not None:
         io.write_poses(output, poses)
@@ -154,14 +154,17 @@ def _clouds(frames: AbstractFrames, names: tuple[str, ...], truth: Truth) -> Ite
 
 
 def _follow(
-    steps: Iterable[Step], loops: bool, map: Path | None, voxel_size: float | None
+    steps: Iterator[Step], num_frames: int, loops: bool, map: Path | None, voxel_size: float | None
 ) -> tuple[Poses, list[mcg.Registration]]:
     """Run the odometry, write the map if it has a file, and return the poses and the registrations."""
     poses: Poses = []
     results: list[mcg.Registration] = []
+    last: Any = None
 
     def followed() -> Iterator[tuple[mcg.PointCloud, Float[np.ndarray, "4 4"]]]:
-        for step in steps:
+        for step in tqdm(steps, total=num_frames, unit="frame", disable=None):
+            nonlocal last
+            last = step
             poses.append(step.pose)
             if step.registration is not None:
                 results.append(step.registration)
@@ -171,9 +174,8 @@ def _follow(
     stream: Iterator[tuple[mcg.PointCloud, Float[np.ndarray, "4 4"]]] = followed()
     if loops:
         # The poses as the last loop left them.
-        steps = list(steps)
         clouds = [cloud for cloud, _ in followed()]
-        graph: Any = steps[-1].graph
+        graph: Any = last.graph
         print(f"loops:     {int(np.asarray(graph.edges.loop).sum())} closed")
         poses[:] = graph.poses
         stream = zip(clouds, poses, strict=True)
