@@ -755,8 +755,9 @@ def test_a_format_can_be_added(tmp_path, monkeypatch):
         file.write(b"\n".join(b"%r %r %r" % tuple(point) for point in np.asarray(cloud.points).tolist()))
 
     monkeypatch.setitem(io.FORMATS, ".toy", io.Format(lambda file, size: PointCloud(np.loadtxt(file)), write))
-    io.write(tmp_path / "c.TOY", make())
-    np.testing.assert_array_equal(io.read(tmp_path / "c.TOY").points, make().points)
+    cloud = make(dtype=np.float64)
+    io.write(tmp_path / "c.TOY", cloud)
+    np.testing.assert_array_equal(io.read(tmp_path / "c.TOY").points, cloud.points)
 
 
 def test_no_coordinates(tmp_path):

@@ -14,6 +14,11 @@ import scipy.spatial
 import mcgicp_jax as mcg
 from mcgicp_jax import io, metrics, plot
 from mcgicp_jax.__main__ import main
+from mcgicp_jax._cli.options import Options
+from mcgicp_jax._clouds.color_spaces import COLOR_SPACES
+from mcgicp_jax._math.robust_kernels import KERNELS
+from mcgicp_jax._methods.registry import METHODS
+from mcgicp_jax.datasets import DATASETS
 from tests.scenes import motion, room_corner
 
 TRUTH = motion()
@@ -295,6 +300,33 @@ def test_help(command, words, capsys):
     assert ended.value.code == 0
     assert all(word in text for word in words)
     assert "None" not in text
+
+
+def test_help_lists_the_registries(capsys):
+    """A method, kernel, colour space, format or data set that is registered is an option, with its defaults."""
+    for command, registered in (("register", (METHODS, KERNELS, COLOR_SPACES, io.FORMATS)), ("odometry", (DATASETS,))):
+        with pytest.raises(SystemExit):
+            main([command, "--help"])
+        text = " ".join(capsys.readouterr().out.replace("│", " ").split())
+        for names in registered:
+            assert not [name for name in names if name not in text]
+    for name, dataset in DATASETS.items():
+        assert f"{dataset.max_distance[0]:g} and {dataset.max_distance[1]:g} for " in text, name
+
+
+def test_every_kernel_is_an_option(files, capsys):
+    for name in KERNELS:
+        assert main(["register", files["bare"], files["target"], "--method", "gicp", "--robust", name, "2.0"]) == 0
+        assert close_to_truth(printed_matrix(capsys.readouterr().out)), name
+
+
+def test_parameters_of_registered_methods():
+    """`photometric-gicp` is MC-GICP with an argument, and takes the same parameters."""
+    assert METHODS["photometric-gicp"](epsilon=0.01).photometric and not METHODS["mc-gicp"]().photometric
+    assert Options(epsilon=0.01, channel_weights=(0.5,)).parameters_of("photometric-gicp") == {
+        "epsilon": 0.01,
+        "channel_weights": 0.5,
+    }
 
 
 @pytest.mark.parametrize("args", [[], ["align"], ["register"], ["register", "a", "b", "--method", "icp"]])

@@ -102,11 +102,11 @@ def odometry(
     """
     check_outputs(output, cloud=map, picture=plot)
     shared.check(method)
-    known, frames = DATASETS[dataset], _open(dataset, path, num_frames)
+    defaults, frames = DATASETS[dataset], _open(dataset, path, num_frames)
     given = shared.voxel_size
-    voxel = given if not isinstance(given, str) else known.voxel_size if given == "auto" else None
+    voxel = given if not isinstance(given, str) else defaults.voxel_size if given == "auto" else None
     options: dict[str, Any] = {
-        "max_distance": known.max_distance,
+        "max_distance": defaults.max_distance,
         "num_neighbors": shared.num_neighbors,
         "against": against,
         "map_radius": map_radius,

@@ -107,14 +107,29 @@ def paper(
     parts = [_INTRODUCTION]
     for title, frames, (voxel_size, max_distance), ahead in tables:
         parts += [f"## Table I: {title}", *table(rows, _errors(frames, rows, voxel_size, max_distance, ahead))]
-    colored = [row._replace(channels=_COLORS) for row in (rows[0], rows[1], rows[3])]
-    parts += _figure_1(output, 3 * wall_points)
-    parts += _maps(output / "figure_2.png", street, [*rows[:2], rows[4]], *_STREET, _STREET_MAP, _SHOWN)
-    parts += _maps(output / "figure_3.png", wall, colored, *_WALL, _WALL_MAP)
-    parts += _figure_4(output, datasets.poster_wall(2, points_per_frame=wall_points), colored, *_WALL)
+    parts += _figures(output, rows, street, wall, 3 * wall_points)
     (output / "report.md").write_text("\n\n".join(parts) + "\n", encoding="utf-8")
     print(f"report:    {output / 'report.md'}")
     return 0
+
+
+def _figures(output: Path, rows: Sequence[Row], street: Any, wall: Any, num_points: int) -> Iterator[str]:
+    (frame,) = datasets.poster_wall(1, points_per_frame=num_points)
+    cloud = mcg.preprocess(frame.cloud, num_neighbors=40)
+    cells = np.floor(np.asarray(cloud.points)[np.asarray(cloud.valid), :2] / _BETWEEN)
+    drawn = np.sort(np.unique(cells, axis=0, return_index=True)[1])
+    methods = {"GICP": mcg.GICP(), "MC-GICP, colour": mcg.MultiChannelGICP()}
+    plot.surface_covariances(cloud, methods, indices=drawn, path=output / "figure_1.png")
+    yield "## Figure 1: covariances within the surface, one standard deviation\n\n![Covariances](figure_1.png)"
+    colored = [row._replace(channels=_COLORS) for row in (rows[0], rows[1], rows[3])]
+    yield from _maps(output / "figure_2.png", street, [*rows[:2], rows[4]], *_STREET, _STREET_MAP, _SHOWN)
+    yield from _maps(output / "figure_3.png", wall, colored, *_WALL, _WALL_MAP)
+    results = {}
+    for row in colored:
+        target, source = (row.preprocess(frame, _WALL[0]) for frame in wall[:2])
+        results[row.name] = np.asarray(row.register(source, target, max_distance=_WALL[1]).history["rmse"])
+    plot.convergence(results, ylabel="rms distance of the matches, m").savefig(output / "figure_4.png")
+    yield "## Figure 4: convergence on the wall\n\n![Residual](figure_4.png)"
 
 
 def _road(frame: Any) -> datasets.Frame:
@@ -166,17 +181,6 @@ def table(rows: Sequence[Row], errors: Float[np.ndarray, "rows N 4"]) -> Iterato
     yield f"{verdict}. Here, by mean translation error: {ours}. The paper: {theirs}."
 
 
-def _figure_1(output: Path, num_points: int) -> Iterator[str]:
-    (frame,) = datasets.poster_wall(1, points_per_frame=num_points)
-    cloud = mcg.preprocess(frame.cloud, num_neighbors=40)
-    cells = np.floor(np.asarray(cloud.points)[np.asarray(cloud.valid), :2] / _BETWEEN)
-    drawn = np.sort(np.unique(cells, axis=0, return_index=True)[1])
-    methods = {"GICP": mcg.GICP(), "MC-GICP, colour": mcg.MultiChannelGICP()}
-    plot.surface_covariances(cloud, methods, indices=drawn, path=output / "figure_1.png")
-    yield "## Figure 1: covariances within the surface, one standard deviation"
-    yield "![Covariances](figure_1.png)"
-
-
 def _maps(
     path: Path, frames: Any, rows: Sequence[Row], voxel_size: Any, max_distance: Any, size: float, limits: Any = None
 ) -> Iterator[str]:
@@ -195,24 +199,6 @@ def _maps(
     yield f"## Figure {path.stem[-1]}: {len(frames)} frames merged by odometry"
     yield f"![Maps]({path.name})"
     yield f"Root mean square position error, aligned at the first pose: {', '.join(errors)}."
-
-
-def _figure_4(output: Path, wall: Any, rows: Sequence[Row], voxel_size: Any, max_distance: Any) -> Iterator[str]:
-    truth, residuals, errors = np.linalg.inv(wall[0].pose) @ wall[1].pose, {}, {}
-    for row in rows:
-        target, source = (row.preprocess(frame, voxel_size) for frame in wall)
-        result = row.register(source, target, max_distance=max_distance)
-        residuals[row.name] = np.asarray(result.history["rmse"])
-        # The pose after each update, from a registration that ends there
-        ends: Any = (
-            row.register(source, target, max_distance=max_distance, max_iterations=count + 1).matrix
-            for count in range(int(result.num_iterations))
-        )
-        errors[row.name] = np.array([metrics.pose_error(pose, truth)[0] for pose in (np.eye(4), *ends)])
-    plot.convergence(residuals, ylabel="rms distance of the matches, m").savefig(output / "figure_4.png")
-    plot.convergence(errors, ylabel="pose error, m").savefig(output / "figure_4_error.png")
-    yield "## Figure 4: convergence on the wall"
-    yield "![Residual](figure_4.png) ![Pose error](figure_4_error.png)"
 
 
 _INTRODUCTION = """# The experiments of the paper

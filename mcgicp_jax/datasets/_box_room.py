@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Float
 
 from mcgicp_jax._clouds.point_cloud import PointCloud
-from mcgicp_jax.datasets._frames import SyntheticFrames, check_scene, scene_and_path_rng
+from mcgicp_jax.datasets._frames import SyntheticFrames, check_scene, pose_of, scene_and_path_rng
 from mcgicp_jax.datasets._raycast import Box, cast, patches, random_rays, sensor_rotation
 
 # The constants of this module define the scene.
@@ -68,11 +68,9 @@ def box_room(
 
 def _pose(step: float, start: float, tilt_start: float, index: int) -> Float[np.ndarray, "4 4"]:
     angle = start + index * step / _RADIUS
-    pose = np.eye(4)
-    pose[:3, :3] = sensor_rotation(angle + np.pi / 2, _TILT, tilt_start + index * _TILT_PHASE)
-    center = _SIZE / 2
-    pose[:3, 3] = center[0] + _RADIUS * np.cos(angle), center[1] + _RADIUS * np.sin(angle), _SENSOR_HEIGHT
-    return pose
+    x, y = _SIZE[:2] / 2 + _RADIUS * np.array([np.cos(angle), np.sin(angle)])
+    rotation = sensor_rotation(angle + np.pi / 2, _TILT, tilt_start + index * _TILT_PHASE)
+    return pose_of(rotation, (x, y, _SENSOR_HEIGHT))
 
 
 def _observe(

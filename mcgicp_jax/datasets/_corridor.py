@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Float
 
 from mcgicp_jax._clouds.point_cloud import PointCloud
-from mcgicp_jax.datasets._frames import SyntheticFrames, check_scene, scene_and_path_rng
+from mcgicp_jax.datasets._frames import SyntheticFrames, check_scene, pose_of, scene_and_path_rng
 from mcgicp_jax.datasets._raycast import Box, cast, patches, random_cells, random_rays, sensor_rotation
 
 # The constants of this module define the scene.
@@ -66,10 +66,8 @@ def corridor(
 def _pose(step: float, sway: float, yaw: float, tilt: float, index: int) -> Float[np.ndarray, "4 4"]:
     # The sideways motion per frame is at most _SWAY times the phase increment, a third of `step`.
     phase = index * step / 3 / _SWAY
-    pose = np.eye(4)
-    pose[:3, :3] = sensor_rotation(_YAW * np.sin(yaw + index / 3), _TILT, tilt + index * _TILT_PHASE)
-    pose[:3, 3] = index * step, _SWAY * np.cos(sway + phase), _SENSOR_HEIGHT
-    return pose
+    rotation = sensor_rotation(_YAW * np.sin(yaw + index / 3), _TILT, tilt + index * _TILT_PHASE)
+    return pose_of(rotation, (index * step, _SWAY * np.cos(sway + phase), _SENSOR_HEIGHT))
 
 
 def _observe(

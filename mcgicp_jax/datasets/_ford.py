@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from mcgicp_jax._clouds.frame import Frame
 from mcgicp_jax._clouds.point_cloud import PointCloud
-from mcgicp_jax.datasets._frames import AbstractFrames
+from mcgicp_jax.datasets._frames import AbstractFrames, pose_of
 from mcgicp_jax.datasets._images import look_up, read_image
 
 # Pose of the laser in the vehicle's frame: x, y, z in metres; roll, pitch, yaw in radians.
@@ -122,7 +122,4 @@ def _read_log(path: Path) -> Float[np.ndarray, "N 2"]:
 
 def _pose(numbers: Float[np.ndarray, "6"]) -> Float[np.ndarray, "4 4"]:
     """The pose Rz(yaw) Ry(pitch) Rx(roll) from x, y, z in metres and roll, pitch, yaw in radians."""
-    pose = np.eye(4)
-    pose[:3, :3] = Rotation.from_euler("xyz", numbers[3:]).as_matrix()
-    pose[:3, 3] = numbers[:3]
-    return pose
+    return pose_of(Rotation.from_euler("xyz", numbers[3:]), numbers[:3])

@@ -5,10 +5,11 @@ from __future__ import annotations
 import abc
 import operator
 from collections.abc import Callable, Sequence
-from typing import overload
+from typing import Any, overload
 
 import numpy as np
 from jaxtyping import Float
+from scipy.spatial.transform import Rotation
 
 from mcgicp_jax._clouds.frame import Frame
 from mcgicp_jax._clouds.point_cloud import PointCloud
@@ -120,6 +121,12 @@ def scene_and_path_rng(seed: int) -> tuple[np.random.Generator, np.random.Genera
     """Random generators of the scene and of the sensor's path, independent of those of the frames."""
     scene, path = (np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(key,))) for key in (_SCENE, _PATH))
     return scene, path
+
+
+def pose_of(rotation: Rotation, position: Any) -> Float[np.ndarray, "4 4"]:
+    pose = np.eye(4)
+    pose[:3, :3], pose[:3, 3] = rotation.as_matrix(), position
+    return pose
 
 
 def check_scene(points_per_frame: int, noise: float, most: int = 10_000_000) -> None:

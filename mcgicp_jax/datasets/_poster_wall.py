@@ -11,7 +11,7 @@ from jaxtyping import Float, Int
 from scipy.spatial.transform import Rotation
 
 from mcgicp_jax._clouds.point_cloud import PointCloud
-from mcgicp_jax.datasets._frames import SyntheticFrames, check_scene, scene_and_path_rng
+from mcgicp_jax.datasets._frames import SyntheticFrames, check_scene, pose_of, scene_and_path_rng
 
 # The constants of this module define the scene and the camera.
 # First-generation Kinect: image size and focal length, pixels.
@@ -89,21 +89,15 @@ def poster_wall(
     check_scene(points_per_frame, noise, _WIDTH * _HEIGHT)
     scene_rng, path_rng = scene_and_path_rng(seed)
     observer = partial(_observe, _paint_wall(scene_rng), points_per_frame, noise)
-    return SyntheticFrames(num_frames, _camera_path(path_rng, step, heading), observer, _PERIOD, seed)
+    start = path_rng.uniform(0, 1, 2) * (_COLUMNS * _CELL_WIDTH, _ROWS * _CELL_HEIGHT)
+    any_heading, tilt, sway = path_rng.uniform(0, 2 * np.pi, 3)
+    tilt_axes = np.linalg.qr(path_rng.normal(size=(3, 2)))[0]
+    heading = any_heading if heading is None else heading
+    path = partial(_pose, start, step * np.array([np.cos(heading), np.sin(heading)]), tilt, tilt_axes, sway)
+    return SyntheticFrames(num_frames, path, observer, _PERIOD, seed)
 
 
 # The camera
-
-
-def _camera_path(
-    rng: np.random.Generator, step: float, heading: float | None
-) -> Callable[[int], Float[np.ndarray, "4 4"]]:
-    start = rng.uniform(0, 1, 2) * (_COLUMNS * _CELL_WIDTH, _ROWS * _CELL_HEIGHT)
-    any_heading, tilt_start, sway_start = rng.uniform(0, 2 * np.pi, 3)
-    tilt_axes = np.linalg.qr(rng.normal(size=(3, 2)))[0]
-    heading = any_heading if heading is None else heading
-    move = step * np.array([np.cos(heading), np.sin(heading)])
-    return partial(_pose, start, move, tilt_start, tilt_axes, sway_start)
 
 
 def _pose(
@@ -116,11 +110,8 @@ def _pose(
 ) -> Float[np.ndarray, "4 4"]:
     tilt = tilt_start + index * _TILT_PHASE
     sway = sway_start + 0.3 * np.linalg.norm(move) / _DISTANCE_SWAY * index
-    pose = np.eye(4)
-    pose[:3, :3] = Rotation.from_rotvec(tilt_axes @ (_TILT * np.array([np.cos(tilt), np.sin(tilt)]))).as_matrix()
-    pose[:2, 3] = start + index * move
-    pose[2, 3] = -_DISTANCE + _DISTANCE_SWAY * np.sin(sway)
-    return pose
+    rotation = Rotation.from_rotvec(tilt_axes @ (_TILT * np.array([np.cos(tilt), np.sin(tilt)])))
+    return pose_of(rotation, (*(start + index * move), -_DISTANCE + _DISTANCE_SWAY * np.sin(sway)))
 
 
 def _observe(

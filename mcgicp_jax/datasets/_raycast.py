@@ -158,10 +158,10 @@ def spinning_rays(
     return np.stack([x, y, np.sin(elevation)], axis=-1).reshape(-1, 3)
 
 
-def sensor_rotation(heading: float, tilt: float, direction: float) -> Float[np.ndarray, "3 3"]:
+def sensor_rotation(heading: float, tilt: float, direction: float) -> Rotation:
     """A turn by `heading` about z, after a tilt about the horizontal axis in a `direction`; radians."""
     tilted = Rotation.from_rotvec([tilt * np.cos(direction), tilt * np.sin(direction), 0])
-    return (Rotation.from_euler("z", heading) * tilted).as_matrix()
+    return Rotation.from_euler("z", heading) * tilted
 
 
 # Patterns

@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from mcgicp_jax._clouds.point_cloud import PointCloud
-from mcgicp_jax.datasets._frames import SyntheticFrames, check_scene, scene_and_path_rng
+from mcgicp_jax.datasets._frames import SyntheticFrames, check_scene, pose_of, scene_and_path_rng
 from mcgicp_jax.datasets._raycast import (
     AbstractSolid,
     Box,
@@ -118,10 +118,9 @@ def street(
 
 
 def _pose(step: float, sway: float, yaw: float, tilt: float, index: int) -> Float[np.ndarray, "4 4"]:
-    pose = np.eye(4)
-    pose[:3, :3] = sensor_rotation(_YAW * np.sin(yaw + index / 4), _TILT, tilt + 0.7 * index)
-    pose[:3, 3] = index * step, _LANE + _SWAY * np.sin(sway + index * step / (6 * _SWAY)), _SENSOR_HEIGHT
-    return pose
+    rotation = sensor_rotation(_YAW * np.sin(yaw + index / 4), _TILT, tilt + 0.7 * index)
+    aside = _LANE + _SWAY * np.sin(sway + index * step / (6 * _SWAY))
+    return pose_of(rotation, (index * step, aside, _SENSOR_HEIGHT))
 
 
 def _observe(

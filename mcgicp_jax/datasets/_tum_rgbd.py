@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation, Slerp
 from mcgicp_jax import io
 from mcgicp_jax._clouds.frame import Frame
 from mcgicp_jax._clouds.point_cloud import PointCloud
-from mcgicp_jax.datasets._frames import AbstractFrames
+from mcgicp_jax.datasets._frames import AbstractFrames, pose_of
 from mcgicp_jax.datasets._images import back_project, look_up, read_depth, read_image
 
 # Pixels: focal lengths and principal point of the three calibrated cameras, and the default of the camera driver.
@@ -94,10 +94,8 @@ class TUMFrames(AbstractFrames):
         if not 0 < after < len(times) or times[after] - times[after - 1] > _MAX_GAP:
             return None
         around = slice(after - 1, after + 1)
-        pose = np.eye(4)
-        pose[:3, :3] = Slerp(times[around], Rotation.from_matrix(poses[around, :3, :3]))(time).as_matrix()
-        pose[:3, 3] = [np.interp(time, times[around], values) for values in poses[around, :3, 3].T]
-        return pose
+        rotation = Slerp(times[around], Rotation.from_matrix(poses[around, :3, :3]))(time)
+        return pose_of(rotation, [np.interp(time, times[around], values) for values in poses[around, :3, 3].T])
 
 
 def _read_list(path: Path) -> tuple[Float[np.ndarray, "N"], list[str]]:

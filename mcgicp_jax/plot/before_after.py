@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING
 
 import numpy as np
 from jaxtyping import Float
@@ -13,6 +11,8 @@ from mcgicp_jax._clouds.point_cloud import PointCloud
 from mcgicp_jax._math.poses import Pose, pose_matrix
 from mcgicp_jax.plot.drawing import (
     PIXELS_PER_SPACING,
+    Figure,
+    File,
     Map,
     Picture,
     Points,
@@ -25,18 +25,13 @@ from mcgicp_jax.plot.drawing import (
     view_onto,
 )
 
-if TYPE_CHECKING:
-    import matplotlib.figure
-
 # The constants affect only how figures look.
 # Most rows below each other; maximum width of a row and height of a panel, inches; pixels and tiles along the longer
 # side of a panel; fraction of each side that the detail shows.
 _MOST_ROWS, _WIDEST, _HIGHEST, _PIXELS, _TILES, _DETAIL = 5, 12, 4.5, 500, 12, 0.25
 
 
-def before_after(
-    source: PointCloud, target: PointCloud, poses: Mapping[str, Pose], *, path: str | os.PathLike[str] | None = None
-) -> matplotlib.figure.Figure:
+def before_after(source: PointCloud, target: PointCloud, poses: Mapping[str, Pose], *, path: File = None) -> Figure:
     """Compare poses: one row per pose shows the transformed source with the target, along the target's thinnest axis.
 
     More than five rows are laid out side by side.

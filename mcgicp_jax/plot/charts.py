@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from jax.typing import ArrayLike
@@ -15,18 +14,13 @@ from mcgicp_jax._pose_graph.graph import WORLD
 from mcgicp_jax._pose_graph.optimize import PoseGraphResult
 from mcgicp_jax._pose_solver.degeneracy import CHANNELS_HOLD, GEOMETRY_HOLDS, shares
 from mcgicp_jax._registration.result import Registration
-from mcgicp_jax.plot.drawing import CLOUD_COLORS, new_figure, optional_module, saved
-
-if TYPE_CHECKING:
-    import matplotlib.figure
+from mcgicp_jax.plot.drawing import CLOUD_COLORS, Figure, File, new_figure, optional_module, saved
 
 # Residual at the end of the colour scale of a graph, standard deviations: that beyond which loops are rejected.
 _LARGEST_RESIDUAL = 4.1
 
 
-def convergence(
-    histories: Mapping[str, Sequence[float] | ArrayLike], *, ylabel: str = "cost"
-) -> matplotlib.figure.Figure:
+def convergence(histories: Mapping[str, Sequence[float] | ArrayLike], *, ylabel: str = "cost") -> Figure:
     """Plot the cost or RMSE per iteration, on a logarithmic scale.
 
     Args:
@@ -51,7 +45,7 @@ def convergence(
     return figure
 
 
-def localizability(result: Registration, *, path: str | os.PathLike[str] | None = None) -> matplotlib.figure.Figure:
+def localizability(result: Registration, *, path: File = None) -> Figure:
     """Plot how well each of six directions is constrained: the observed fraction of squared motion.
 
     The fraction refers to the motion of the matched points. One bar is for the geometry and one for the channels, which
@@ -91,8 +85,8 @@ def localizability(result: Registration, *, path: str | os.PathLike[str] | None 
 def trajectories(
     trajectories: Mapping[str, Sequence[Pose] | Float[np.ndarray, "N 4 4"]],
     *,
-    path: str | os.PathLike[str] | None = None,
-) -> matplotlib.figure.Figure:
+    path: File = None,
+) -> Figure:
     """Plot trajectories in the principal plane of the first one.
 
     Args:
@@ -123,7 +117,7 @@ def trajectories(
     return saved(figure, path)
 
 
-def graph(graph: PoseGraphResult, *, path: str | os.PathLike[str] | None = None) -> matplotlib.figure.Figure:
+def graph(graph: PoseGraphResult, *, path: File = None) -> Figure:
     """Plot the poses of a graph in their principal plane, and its edges coloured by residual in standard deviations.
 
     Rejected loops are dashed. A prior is drawn from the position that it measured.

@@ -13,8 +13,11 @@ from jaxtyping import Float, Int
 from mcgicp_jax._clouds.point_cloud import PointCloud
 
 if TYPE_CHECKING:
-    import matplotlib.figure
+    from matplotlib.figure import Figure
+else:
+    Figure = Any
 
+File: TypeAlias = str | os.PathLike[str] | None
 Points: TypeAlias = Float[np.ndarray, "N 3"]
 Picture: TypeAlias = Float[np.ndarray, "height width 3"]
 Map: TypeAlias = Float[np.ndarray, "height width"]
@@ -32,14 +35,12 @@ def optional_module(name: str) -> Any:
         raise ImportError(f"plotting needs {name.partition('.')[0]}: pip install 'mcgicp_jax[plot]'") from error
 
 
-def new_figure(width: float | int, height: float | int) -> matplotlib.figure.Figure:
+def new_figure(width: float | int, height: float | int) -> Figure:
     """An empty figure, inches, that belongs to no window."""
     return optional_module("matplotlib.figure").Figure((width, height), layout="constrained")
 
 
-def saved(
-    figure: matplotlib.figure.Figure, path: str | os.PathLike[str] | None, **options: Any
-) -> matplotlib.figure.Figure:
+def saved(figure: Figure, path: File, **options: Any) -> Figure:
     """The figure, saved to a file if `path` is one."""
     if path is not None:
         figure.savefig(path, dpi=120, **options)
@@ -81,11 +82,7 @@ class View:
         return np.where(inside, row * self.width + column, -1), local[:, 2]
 
 
-def view_onto(
-    points: Points,
-    most_pixels: int,
-    limits: Float[np.ndarray, "2 2"] | None = None,
-) -> View:
+def view_onto(points: Points, most_pixels: int, limits: Float[np.ndarray, "2 2"] | None = None) -> View:
     """The view onto the two longest principal axes of the points, from the side of the origin (usually the sensor)."""
     center = points.mean(axis=0)
     _, vectors = np.linalg.eigh(np.cov((points - center).T))
@@ -106,6 +103,8 @@ def view_onto(
 
 def paint(view: View, points: Points, colors: Points) -> Picture:
     """The mean colour of the points in each pixel, extended into the gaps between points; NaN further away."""
+    from scipy.ndimage import distance_transform_edt
+
     pixels, _ = view.project(points)
     size = view.height * view.width
     inside = pixels >= 0
@@ -113,17 +112,8 @@ def paint(view: View, points: Points, colors: Points) -> Picture:
     sums = [np.bincount(pixels[inside], channel, minlength=size) for channel in colors[inside].T]
     picture = np.stack(sums, axis=-1) / np.where(count > 0, count, np.nan)[:, None]
     picture = picture.reshape(view.height, view.width, 3)
-    for _ in range(PIXELS_PER_SPACING):
-        for axis in (0, 1):
-            for shift in (1, -1):
-                picture = np.where(np.isnan(picture), _shifted(picture, shift, axis), picture)
-    return picture
-
-
-def _shifted(picture: Picture, shift: int, axis: int) -> Picture:
-    """The picture shifted by one pixel, with the edge row or column repeated."""
-    rows = np.clip(np.arange(picture.shape[axis]) - shift, 0, picture.shape[axis] - 1)
-    return np.take(picture, rows, axis)
+    distance, (row, column) = distance_transform_edt(np.isnan(picture[..., 0]), return_indices=True)
+    return np.where(distance[..., None] <= PIXELS_PER_SPACING, picture[row, column], np.nan)
 
 
 def spacing_of(centers: Float[np.ndarray, "M 3"], extent: float) -> float:

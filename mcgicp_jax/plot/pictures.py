@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from jax.typing import ArrayLike
@@ -14,6 +13,8 @@ from mcgicp_jax._clouds.point_cloud import PointCloud
 from mcgicp_jax._methods.base import AbstractMethod
 from mcgicp_jax._methods.surface import covariances_of
 from mcgicp_jax.plot.drawing import (
+    Figure,
+    File,
     Points,
     View,
     drawable,
@@ -26,19 +27,13 @@ from mcgicp_jax.plot.drawing import (
     view_onto,
 )
 
-if TYPE_CHECKING:
-    import matplotlib.figure
-
 # These constants affect only how figures look: pixels along the longer side of a map, and width of a figure in inches.
 _PIXELS, _WIDTH = 1400, 12
 
 
 def maps(
-    maps: Mapping[str, PointCloud],
-    *,
-    limits: Float[np.ndarray, "2 2"] | None = None,
-    path: str | os.PathLike[str] | None = None,
-) -> matplotlib.figure.Figure:
+    maps: Mapping[str, PointCloud], *, limits: Float[np.ndarray, "2 2"] | None = None, path: File = None
+) -> Figure:
     """Draw clouds of a common world, one panel each, along the thinnest principal axis of the first cloud.
 
     Clouds with the channels red, green and blue are drawn in colour; others in grey, by intensity or height.
@@ -63,7 +58,7 @@ def maps(
     width = _WIDTH if wide else _WIDTH / len(drawn)
     figure = new_figure(width * shape[1], (width * aspect + 0.35) * shape[0])
     for panel, (name, cloud) in zip(figure.subplots(*shape, squeeze=False).ravel(), drawn.items(), strict=True):
-        picture = np.nan_to_num(paint(view, np.asarray(cloud.points), shades(cloud, view)), nan=1)
+        picture = np.nan_to_num(paint(view, np.asarray(cloud.points), _shades(cloud, view)), nan=1)
         extent = (0, view.width * view.pixel, 0, view.height * view.pixel)
         panel.imshow(picture, origin="lower", interpolation="nearest", extent=extent)
         panel.set_title(name, fontsize="medium")
@@ -77,8 +72,8 @@ def surface_covariances(
     *,
     indices: Sequence[int] | Int[np.ndarray, "M"],
     limits: Float[np.ndarray, "2 2"] | None = None,
-    path: str | os.PathLike[str] | None = None,
-) -> matplotlib.figure.Figure:
+    path: File = None,
+) -> Figure:
     """Draw covariances in a flat surface as ellipses over its picture, one panel per name.
 
     All ellipses have the same scale, at which those with a standard deviation of 1 just do not overlap.
@@ -101,18 +96,15 @@ def surface_covariances(
     centers = cloud.coordinates[rows]
     offsets = ((centers - view.center) @ view.axes)[:, :2] - view.low
     room = 2 * spacing_of(centers, float(np.ptp(np.asarray(raw.points), axis=0).max()))
-    picture = np.nan_to_num(paint(view, np.asarray(raw.points), shades(raw, view)), nan=1)
+    picture = np.nan_to_num(paint(view, np.asarray(raw.points), _shades(raw, view)), nan=1)
     width = _WIDTH / len(covariances)
     figure = new_figure(_WIDTH, width * view.height / view.width + 0.35)
     panels = figure.subplots(1, len(covariances), squeeze=False)[0]
     for panel, (name, values) in zip(panels, covariances.items(), strict=True):
-        matrices = np.asarray(
-            covariances_of(values, cloud) if isinstance(values, AbstractMethod) else values, np.float64
-        )
-        if matrices.shape != (cloud.points.shape[0], 3, 3):
-            raise ValueError(
-                f"covariances[{name!r}]: expected shape ({cloud.points.shape[0]}, 3, 3), got {matrices.shape}"
-            )
+        given = covariances_of(values, cloud) if isinstance(values, AbstractMethod) else values
+        matrices, size = np.asarray(given, np.float64), cloud.points.shape[0]
+        if matrices.shape != (size, 3, 3):
+            raise ValueError(f"covariances[{name!r}]: expected shape ({size}, 3, 3), got {matrices.shape}")
         flat = view.axes[:, :2].T @ matrices[rows] @ view.axes[:, :2]
         panel.imshow(picture, origin="lower", extent=(0, view.width * view.pixel, 0, view.height * view.pixel))
         _add_ellipses(panel, offsets, flat, room)
@@ -127,21 +119,13 @@ def _add_ellipses(
     """Draw ellipses at `offsets`, metres, whose axes are `scale` metres long per standard deviation."""
     sizes, vectors = np.linalg.eigh(covariances)
     lengths = scale * np.sqrt(np.maximum(sizes, 0))
-    ellipses = optional_module("matplotlib.collections").EllipseCollection(
-        lengths[:, 1],
-        lengths[:, 0],
-        np.degrees(np.arctan2(vectors[:, 1, 1], vectors[:, 0, 1])),
-        units="xy",
-        offsets=offsets,
-        transOffset=panel.transData,
-        facecolors="none",
-        edgecolors="black",
-        linewidths=1.2,
-    )
-    panel.add_collection(ellipses)
+    angles = np.degrees(np.arctan2(vectors[:, 1, 1], vectors[:, 0, 1]))
+    style = {"units": "xy", "facecolors": "none", "edgecolors": "black", "linewidths": 1.2}
+    ellipses = optional_module("matplotlib.collections").EllipseCollection
+    panel.add_collection(ellipses(*lengths.T[::-1], angles, offsets=offsets, transOffset=panel.transData, **style))
 
 
-def shades(cloud: PointCloud, view: View) -> Points:
+def _shades(cloud: PointCloud, view: View) -> Points:
     """Colours of the points from red, green and blue if present, else grey from intensity or height."""
     colors = rgb_of(cloud)
     if colors is not None:
