@@ -25,6 +25,7 @@ from mcgicp_jax._cli.options import (
     listed,
     method_for,
     round_voxel_size,
+    shown,
     with_channels,
     with_names,
 )
@@ -37,7 +38,7 @@ else:
     DatasetName = Literal[tuple(DATASETS)]
 
 Positional: TypeAlias = Annotated[DatasetName, tyro.conf.Positional, tyro.conf.arg(metavar="DATASET")]
-Folder: TypeAlias = Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="PATH", help_behavior_hint="")]
+Folder: TypeAlias = Annotated[Path, tyro.conf.Positional, shown("PATH")]
 Poses: TypeAlias = list[Float[np.ndarray, "4 4"]]
 Truth: TypeAlias = list[Float[np.ndarray, "4 4"] | None]
 
@@ -73,7 +74,7 @@ def odometry(
     method: MethodName = "mc-gicp",
     num_frames: int | Literal["all"] = "all",
     against: Literal["previous", "map"] = "previous",
-    map_radius: Annotated[float | None, tyro.conf.arg(metavar="FLOAT", help_behavior_hint="")] = None,
+    map_radius: Annotated[float | None, shown("FLOAT")] = None,
     loops: bool = False,
     output: File = None,
     map: File = None,

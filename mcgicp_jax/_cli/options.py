@@ -34,27 +34,23 @@ else:
     MethodName, KernelName = Literal[tuple(METHODS)], Literal[tuple(KERNELS)]
 
 Documented = TypeVar("Documented")
-File: TypeAlias = Annotated[Path | None, tyro.conf.arg(metavar="FILE", help_behavior_hint="")]
-Start: TypeAlias = Annotated[
-    Literal["global"] | Path | None, tyro.conf.arg(metavar="{FILE,global}", help_behavior_hint="")
-]
-Names: TypeAlias = Annotated[
-    tuple[str, ...], tyro.conf.arg(metavar="NAMES", help_behavior_hint="(default: all in common)")
-]
-Numbers: TypeAlias = Annotated[tuple[float, ...], tyro.conf.arg(help_behavior_hint="(default: from the data)")]
-Distances: TypeAlias = Annotated[tuple[float, ...], tyro.conf.arg(help_behavior_hint="(default: 10 and 2.5 spacings)")]
-Sizes: TypeAlias = Annotated[tuple[float, ...], tyro.conf.arg(help_behavior_hint="(default: none)")]
-Tolerance: TypeAlias = Annotated[
-    float | None, tyro.conf.arg(metavar="FLOAT", help_behavior_hint="(default: 0.005 spacings)")
-]
-Kernel: TypeAlias = Annotated[
-    tuple[KernelName, float] | None, tyro.conf.arg(metavar="KERNEL SCALE", help_behavior_hint="")
-]
+
+
+def shown(metavar: str | None = None, default: str = "") -> Any:
+    """How the help shows an option: its value, and what applies without it."""
+    return tyro.conf.arg(metavar=metavar, help_behavior_hint=default and f"(default: {default})")
+
+
+File: TypeAlias = Annotated[Path | None, shown("FILE")]
+Start: TypeAlias = Annotated[Literal["global"] | Path | None, shown("{FILE,global}")]
+Names: TypeAlias = Annotated[tuple[str, ...], shown("NAMES", "all in common")]
+Numbers: TypeAlias = Annotated[tuple[float, ...], shown(default="from the data")]
+Distances: TypeAlias = Annotated[tuple[float, ...], shown(default="10 and 2.5 spacings")]
+Sizes: TypeAlias = Annotated[tuple[float, ...], shown(default="none")]
+Tolerance: TypeAlias = Annotated[float | None, shown("FLOAT", "0.005 spacings")]
+Kernel: TypeAlias = Annotated[tuple[KernelName, float] | None, shown("KERNEL SCALE")]
 Epsilon: TypeAlias = Annotated[
-    float | None,
-    tyro.conf.arg(
-        metavar="FLOAT", help_behavior_hint=f"(default: {inspect.signature(mcg.GICP).parameters['epsilon'].default})"
-    ),
+    float | None, shown("FLOAT", str(inspect.signature(mcg.GICP).parameters["epsilon"].default))
 ]
 
 _RGB = ("red", "green", "blue")

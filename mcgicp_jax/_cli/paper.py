@@ -7,13 +7,12 @@ from pathlib import Path
 from typing import Annotated, Any, NamedTuple
 
 import numpy as np
-import tyro
 from jaxtyping import Float
 from tqdm import tqdm
 
 import mcgicp_jax as mcg
 from mcgicp_jax import datasets, metrics, plot
-from mcgicp_jax._cli.options import weights_from, with_channels
+from mcgicp_jax._cli.options import shown, weights_from, with_channels
 from mcgicp_jax._methods.base import AbstractMethod
 
 _COLORS = ("red", "green", "blue")
@@ -68,7 +67,7 @@ def rows_of_table(channel_covariance: Float[np.ndarray, "C C"] | None = None) ->
 
 def paper(
     output: Path = Path("mcgicp_paper"),
-    kitti: Annotated[Path | None, tyro.conf.arg(metavar="PATH", help_behavior_hint="")] = None,
+    kitti: Annotated[Path | None, shown("PATH")] = None,
     num_frames: int = 50,
     points_per_frame: int = 30_000,
     wall_frames: int = 100,
