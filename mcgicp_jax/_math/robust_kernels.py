@@ -124,3 +124,12 @@ def truncated_weights(ratio: Float[AnyArray, "*batch"], control: AnyScalar) -> F
     """
     xp = numpy_for(ratio, control)
     return xp.clip(ratio * xp.sqrt(control * (control + 1)) - control, 0, 1)
+
+
+KERNELS: dict[str, type[AbstractKernel]] = {
+    "huber": Huber,
+    "cauchy": Cauchy,
+    "geman-mcclure": GemanMcClure,
+    "tukey": Tukey,
+    "welsch": Welsch,
+}

@@ -9,6 +9,7 @@ from typing import Any, Literal
 import numpy as np
 from jaxtyping import Float
 
+from mcgicp_jax._clouds.frame import Frame
 from mcgicp_jax._clouds.point_cloud import PointCloud, Values
 from mcgicp_jax._clouds.preprocess import check_preprocessing, preprocess
 from mcgicp_jax._clouds.voxel_map import VoxelMap
@@ -22,7 +23,6 @@ from mcgicp_jax._registration.register_pair import register_pair
 from mcgicp_jax._registration.result import Registration, computed, is_usable
 from mcgicp_jax._sequences.loop_closure import Trajectory
 from mcgicp_jax._sequences.relocalization import Relocalizer, map_target
-from mcgicp_jax.datasets import Frame
 
 
 @dataclass(frozen=True, eq=False)

@@ -8,9 +8,11 @@ from typing import Any
 
 import numpy as np
 from jaxtyping import Float
+from scipy.spatial.transform import Rotation
 
+from mcgicp_jax._clouds.frame import Frame
 from mcgicp_jax._clouds.point_cloud import PointCloud
-from mcgicp_jax.datasets._frame import AbstractFrames, Frame
+from mcgicp_jax.datasets._frames import AbstractFrames, pose_of
 from mcgicp_jax.datasets._images import look_up, read_image
 
 # Pose of the laser in the vehicle's frame: x, y, z in metres; roll, pitch, yaw in radians.
@@ -120,12 +122,4 @@ def _read_log(path: Path) -> Float[np.ndarray, "N 2"]:
 
 def _pose(numbers: Float[np.ndarray, "6"]) -> Float[np.ndarray, "4 4"]:
     """The pose Rz(yaw) Ry(pitch) Rx(roll) from x, y, z in metres and roll, pitch, yaw in radians."""
-    (a, b, c), (d, e, f) = np.cos(numbers[3:]), np.sin(numbers[3:])
-    pose = np.eye(4)
-    pose[:3, :3] = (
-        np.array([[c, -f, 0], [f, c, 0], [0, 0, 1]])
-        @ np.array([[b, 0, e], [0, 1, 0], [-e, 0, b]])
-        @ np.array([[1, 0, 0], [0, a, -d], [0, d, a]])
-    )
-    pose[:3, 3] = numbers[:3]
-    return pose
+    return pose_of(Rotation.from_euler("xyz", numbers[3:]), numbers[:3])

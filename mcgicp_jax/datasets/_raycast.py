@@ -8,8 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float, Int
-
-from mcgicp_jax.datasets._frame import rotation_from_vector
+from scipy.spatial.transform import Rotation
 
 
 class AbstractSolid(abc.ABC):
@@ -159,9 +158,10 @@ def spinning_rays(
     return np.stack([x, y, np.sin(elevation)], axis=-1).reshape(-1, 3)
 
 
-def swaying_rotation(tilt: float, phase: float) -> Float[np.ndarray, "3 3"]:
-    """A rotation by `tilt` radians about a horizontal axis in the direction `phase`, radians."""
-    return rotation_from_vector(tilt * np.array([np.cos(phase), np.sin(phase), 0]))
+def sensor_rotation(heading: float, tilt: float, direction: float) -> Rotation:
+    """A turn by `heading` about z, after a tilt about the horizontal axis in a `direction`; radians."""
+    tilted = Rotation.from_rotvec([tilt * np.cos(direction), tilt * np.sin(direction), 0])
+    return Rotation.from_euler("z", heading) * tilted
 
 
 # Patterns

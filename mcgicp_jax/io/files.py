@@ -1,0 +1,54 @@
+"""Shared by readers and writers: optional packages, size checks, reasons of errors, and files that replace others."""
+
+from __future__ import annotations
+
+import contextlib
+import importlib
+import os
+import uuid
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, BinaryIO
+
+
+def optional_module(module: str, use: str) -> Any:
+    """Import a package of the extra `io`; `use` says what for, in the message if it is missing."""
+    try:
+        return importlib.import_module(module)
+    except ImportError as error:
+        raise ImportError(f"{use} files needs {module}: pip install 'mcgicp_jax[io]'") from error
+
+
+def check_size(claimed: int, size: int) -> None:
+    """Raise `ValueError` if a header claims more bytes than there are, before a library allocates them."""
+    if claimed > size:
+        raise ValueError(f"the header claims more than the file can hold ({claimed} bytes in {size})")
+
+
+def reason_of(error: BaseException) -> str:
+    return "it is not text" if isinstance(error, UnicodeError) else str(error) or type(error).__name__
+
+
+@contextlib.contextmanager
+def replacing(path: str | os.PathLike[str]) -> Iterator[BinaryIO]:
+    """Open a temporary file that replaces `path` when the block succeeds."""
+    path = Path(path)
+    temporary = path.with_name(f".{uuid.uuid4().hex}.tmp")
+    try:
+        with _errors_naming(path):
+            file = open(temporary, "x+b")  # noqa: SIM115
+        with file:
+            yield file
+        with _errors_naming(path):
+            os.replace(temporary, path)
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+@contextlib.contextmanager
+def _errors_naming(path: Path) -> Iterator[None]:
+    """Re-raise `OSError` with the user's path instead of the temporary file's."""
+    try:
+        yield
+    except OSError as error:
+        raise type(error)(error.errno, error.strerror, str(path)) from None
