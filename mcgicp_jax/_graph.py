@@ -145,16 +145,18 @@ def optimize_poses(graph: PoseGraph, *, robust: bool = True, max_iterations: int
     check_integer("max_iterations", max_iterations, 1)
     if not is_concrete(graph):
         return _traced(graph, robust, int(max_iterations))
-    edges, start = graph.edges, _start(graph)
-    loops = np.asarray(edges.loop) & bool(robust)
+    loops = np.asarray(graph.edges.loop) & bool(robust)
     # Overflow is a status.
     with np.errstate(over="ignore", invalid="ignore"):
+        edges, start, origin = _centred(graph)
         equations = NormalEquations(edges, start)
         equations, found, weights = _robust_minimum(equations, start, loops, int(max_iterations))
         status, cost = _status(equations, found, weights), found.terms.cost(weights)
+        poses = matrices_of(found.poses[: len(graph.poses)])
+        poses[:, :3, 3] += origin
     return PoseGraphResult.build(
-        poses=matrices_of(found.poses[: len(graph.poses)]),
-        edges=edges,
+        poses=poses,
+        edges=graph.edges,
         status_code=np.int32(status),
         num_iterations=np.int32(found.num_iterations),
         cost=np.float64(cost),
@@ -164,10 +166,20 @@ def optimize_poses(graph: PoseGraph, *, robust: bool = True, max_iterations: int
     )
 
 
-def _start(graph: PoseGraph) -> Float[np.ndarray, "_ 7"]:
-    """Parameters of the poses; with priors, those of the world are the last ones."""
-    poses = np.asarray(graph.poses)
-    return parameters_of(np.concatenate([poses, np.eye(4)[None]]) if np.any(graph.edges.i == WORLD) else poses)
+def _centred(graph: PoseGraph) -> tuple[Edge, Float[np.ndarray, "_ 7"], Float[np.ndarray, "3"]]:
+    """Edges and parameters of the poses about another origin of the world, and that origin.
+
+    It is the first position or, with priors, their median: at UTM coordinates, 1e-9 m are lost to rounding, and costs
+    next to the minimum could not be told apart. With priors, the last parameters are those of the world.
+    """
+    edges, of_world = graph.edges, np.asarray(graph.edges.i) == WORLD
+    poses, motions = np.array(graph.poses, np.float64), np.array(edges.T_i_j, np.float64)
+    origin = np.median(motions[of_world, :3, 3] if of_world.any() else poses[:1, :3, 3], axis=0)
+    poses[:, :3, 3] -= origin
+    motions[of_world, :3, 3] -= origin
+    if of_world.any():
+        poses = np.concatenate([poses, np.eye(4)[None]])
+    return Edge(edges.i, edges.j, motions, edges.information, loop=edges.loop), parameters_of(poses), origin
 
 
 def motion_covariances(
@@ -177,7 +189,7 @@ def motion_covariances(
 
     Loops that do not fit there do not count.
     """
-    poses, edges = _start(graph), graph.edges
+    edges, poses, _ = _centred(graph)
     squares = NormalEquations(edges, poses).terms(poses).squares
     weights = np.where(np.asarray(edges.loop), 1.0 * (squares <= LARGEST_SQUARE), 1)
     none = np.zeros((len(i), 6, 6))
@@ -271,17 +283,21 @@ def _status(equations: NormalEquations, found: Minimum, weights: Float[np.ndarra
 def _is_degenerate(equations: NormalEquations, found: Minimum, weights: Float[np.ndarray, "m"]) -> bool:
     """Whether poses are not connected, or the least eigenvalue of H relative to D is not above rounding and damping.
 
-    By inverse iteration with the last factorisation of the minimisation.
+    By inverse iteration with the least damping: that of the last step may be too large to tell.
     """
     if np.any(equations.parts != equations.parts[equations.root]):
         return True
-    if not equations.size or found.solve is None:
+    if not equations.size:
         return False
+    matrix = equations.weighted(found.terms, weights)
+    try:
+        factors = factored(equations.damped(matrix))
+    except RuntimeError:
+        return True
     vector = np.random.default_rng(0).normal(size=equations.size)
     for _ in range(_INVERSE_ITERATIONS):
         pushed = equations.metric @ vector
-        vector = found.solve(pushed / np.sqrt(vector @ pushed))
-    matrix = equations.weighted(found.terms, weights)
+        vector = factors.solve(pushed / np.sqrt(vector @ pushed))
     return bool(vector @ (matrix @ vector) < UNCONSTRAINED * (vector @ (equations.metric @ vector)))
 
 

@@ -75,14 +75,18 @@ def optimize_traced(matrices: Float[AnyArray, "n 4 4"], edges: Edge, max_iterati
     dtype, n = jnp.result_type(matrices, edges.T_i_j, edges.information), len(matrices)
     with jax.default_matmul_precision("highest"):
         of_world = jnp.asarray(edges.i) == WORLD
+        # Far from the origin, rounding would decide what the loop does.
+        origin = jax.lax.stop_gradient(jnp.asarray(matrices, dtype)[0, :3, 3])
+        matrices = jnp.asarray(matrices, dtype).at[:, :3, 3].add(-origin)
+        motions = jnp.asarray(edges.T_i_j, dtype).at[:, :3, 3].add(jnp.where(of_world[:, None], -origin, 0))
         given = _Edges(
             jnp.where(of_world, n, edges.i),
             jnp.asarray(edges.j),
-            _parameters(edges.T_i_j, dtype),
+            _parameters(motions, dtype),
             jnp.asarray(edges.information, dtype),
             of_world,
         )
-        whole = jnp.concatenate([jnp.asarray(matrices, dtype), jnp.eye(4, dtype=dtype)[None]])
+        whole = jnp.concatenate([matrices, jnp.eye(4, dtype=dtype)[None]])
         start, fixed = jax.lax.stop_gradient((_parameters(whole, dtype), given))
         state = _minimized(start, fixed, max_iterations)
         gradient = _summed(_forces(state.poses, given), given, n)
@@ -94,7 +98,7 @@ def optimize_traced(matrices: Float[AnyArray, "n 4 4"], edges: Edge, max_iterati
         rows = jnp.arange(n)
         residuals = _residuals(state.poses, fixed)
         return Found(
-            jaxlie.SE3(_moved(state.poses, step)[:n]).as_matrix().astype(dtype),
+            jaxlie.SE3(_moved(state.poses, step)[:n]).as_matrix().astype(dtype).at[:, :3, 3].add(origin),
             jnp.einsum("mi,mij,mj->m", residuals, fixed.information, residuals),
             _status(state),
             state.steps,

@@ -349,7 +349,6 @@ class Minimum(NamedTuple):
         num_iterations: number of steps, rejected ones included.
         converged: whether the last step was small.
         damping: λ for a next step.
-        solve: the last factorisation of H + λD; None before the first step.
     """
 
     poses: Float[np.ndarray, "n 7"]
@@ -357,7 +356,6 @@ class Minimum(NamedTuple):
     num_iterations: int = 0
     converged: bool = False
     damping: float = START_DAMPING
-    solve: Callable[[np.ndarray], np.ndarray] | None = None
 
 
 def minimize(
@@ -374,7 +372,7 @@ def minimize(
     """
     within = equations if core is None or equations.fill <= _LARGEST_FILL else equations.restricted(core)
     solver = partial(_solver, equations, equations if np.any(within.held != equations.held) else within)
-    poses, terms, count, _, damping, solve = start
+    poses, terms, count, _, damping = start
     cost, system = terms.cost(weights), None
     end = count + max_iterations
     if not equations.size:
@@ -384,22 +382,21 @@ def minimize(
             gradient, system = equations.gradient(terms, weights), equations.weighted(terms, weights)
         count += 1
         try:
-            solve = solver(system, terms, weights, damping)
+            step = -solver(system, terms, weights, damping)(gradient)
         except RuntimeError:
             damping *= DAMPING_FACTOR
             continue
-        step = -solve(gradient)
         decrease = -0.5 * float(gradient @ step)
         trial = moved_by(poses, equations.spread(step))
         there = equations.terms(trial)
         after = there.cost(weights)
-        # At the minimum, rounding decides whether the computed cost becomes lower.
-        if after <= cost * (1 + 1e-14) + LEAST_DECREASE:
-            small = decrease <= TOLERANCE * cost + LEAST_DECREASE
+        small = decrease <= TOLERANCE * cost + LEAST_DECREASE
+        # Rounding decides whether the computed cost becomes lower by so little.
+        if after <= cost * (1 + (TOLERANCE if small else 1e-14)) + LEAST_DECREASE:
             poses, terms, cost, system = trial, there, after, None
             damping = max(damping / DAMPING_FACTOR, LEAST_DAMPING)
             if small:
-                return Minimum(poses, terms, count, True, damping, solve)
+                return Minimum(poses, terms, count, True, damping)
         else:
             damping *= DAMPING_FACTOR
-    return Minimum(poses, terms, count, False, damping, solve)
+    return Minimum(poses, terms, count, False, damping)

@@ -36,6 +36,15 @@ def correlated(graph, seed=1, rank=3):
     )
 
 
+def shifted(graph, origin):
+    """The graph with its world's origin moved to the negative of a position."""
+    poses, motions = graph.poses.copy(), graph.edges.T_i_j.copy()
+    poses[:, :3, 3] += origin
+    motions[graph.edges.i == mcg.WORLD, :3, 3] += origin
+    edges = mcg.Edge(graph.edges.i, graph.edges.j, motions, graph.edges.information, loop=graph.edges.loop)
+    return mcg.PoseGraph(poses, edges)
+
+
 def dense_minimum(graph):
     """Cost at the minimum by SciPy, with rotation vectors of its own and numerical derivatives."""
     start = np.zeros(6 * len(graph.poses) - 6)
@@ -129,6 +138,33 @@ def test_a_prior_alone_moves_the_graph_and_makes_it_uncertain():
     free = mcg.Edge(mcg.WORLD, 0, start, np.diag([1e-4, 1e-4, 1e-4, 0, 0, 0]))
     turning = mcg.optimize_poses(mcg.PoseGraph(None, joined(graph.edges, free[None])))
     assert turning.status == mcg.Status.DEGENERATE
+
+
+@pytest.mark.parametrize("name", SMALL)
+def test_rounding_does_not_decide_the_status(name):
+    """At UTM coordinates as about the origin; with motions so precise that costs near the minimum round alike."""
+    poses, loops = SMALL[name]
+    position = mcg.Edge(mcg.WORLD, 0, poses[0], np.diag([1e-4, 1e-4, 1e-4, 0, 0, 0]))[None]
+    for seed in range(3):
+        graph, _ = measured(poses, loops, deviations=(1e-4, 1e-5), seed=seed)
+        open_ended = mcg.PoseGraph(graph.poses, joined(graph.edges, position))
+        for each in (graph, with_priors(graph, poses), open_ended):
+            near, far = (mcg.optimize_poses(g, robust=False) for g in (each, shifted(each, (3e5, 5e6, 100))))
+            status = mcg.Status.DEGENERATE if each is open_ended else mcg.Status.CONVERGED
+            assert near.status == far.status == status
+            # Positions of 5e6 m have a rounding of 1e-9 m.
+            inner, expected = (np.linalg.inv(found.poses[0]) @ found.poses for found in (far, near))
+            np.testing.assert_allclose(inner, expected, atol=1e-8)
+            np.testing.assert_allclose(far.cost, near.cost, rtol=1e-4)
+
+
+@needs_x64
+def test_rounding_does_not_decide_the_status_inside_transformations():
+    poses, loops = grid(2)
+    solve = jax.jit(lambda graph: mcg.optimize_poses(graph, robust=False).status_code)
+    for seed in range(10):
+        graph = with_priors(measured(poses, loops, deviations=(1e-3, 1e-3), seed=seed)[0], poses)
+        assert solve(shifted(graph, (3e5, 5e6, 100))) == mcg.Status.CONVERGED
 
 
 def test_parts_that_have_priors_are_well_defined():
