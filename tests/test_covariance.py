@@ -348,7 +348,9 @@ def test_on_a_line_omega_is_one_across_it():
         kernel = np.exp(-0.5 * np.sum((channels[row] - channels[i]) ** 2, axis=1) / 0.3)
         kernel /= kernel.sum()
         expected.append(kernel @ (along - kernel @ along) ** 2 / along.var())
-    np.testing.assert_allclose(line @ found @ line, np.maximum(expected, 1e-3), atol=tolerance(3e-2, 1e-4))
+    # In float32 the variance across the line is rounding: over twelve clouds and two sets of instructions the errors
+    # reach 0.029 along it and 0.13 across it.
+    np.testing.assert_allclose(line @ found @ line, np.maximum(expected, 1e-3), atol=tolerance(5e-2, 1e-4))
     across = np.trace(found, axis1=1, axis2=2) - line @ found @ line
     np.testing.assert_allclose(across, 1 + EPSILON, atol=tolerance(0.2, 1e-4))
 
