@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import abc
 from collections.abc import Callable
-from typing import ClassVar, Self, TypeAlias
+from typing import ClassVar, TypeAlias
 
 import jax.numpy as jnp
 from jaxtyping import Array, Float
@@ -78,7 +78,7 @@ class AbstractMethod(Numbers):
         source: PointCloud,
         target: PointCloud,
         geometries: Geometries | None = None,
-    ) -> Self:
+    ) -> AbstractMethod:
         """The method with every unset parameter chosen from two preprocessed clouds; constants to autodiff.
 
         Args:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import ClassVar, Self
+from typing import ClassVar
 
 import equinox as eqx
 from jaxtyping import Array, Float
@@ -56,7 +56,7 @@ class ColorICP(AbstractOneSided):
         source: PointCloud,
         target: PointCloud,
         geometries: Geometries | None = None,
-    ) -> Self:
+    ) -> ColorICP:
         """The method with `missing_variance` set to the Λ that `MultiChannelGICP` chooses, if points lack channels;
         constant to autodiff."""
         lacking = source.channel_valid is not None or target.channel_valid is not None

@@ -78,7 +78,9 @@ def surface_pair(
         locals = geometries()
     sides = list(zip((source, target), locals, strict=True))
     if is_concrete(method, source, target):
-        calls = [partial(_on_host, method, kinds, cloud, local, observed, num_threads) for cloud, local in sides[::-1]]
+        calls = [
+            partial(surface_on_host, method, kinds, cloud, local, observed, num_threads) for cloud, local in sides[::-1]
+        ]
         of_target, of_source = side_by_side(calls, num_threads)
         return SurfacePair(method, terms, of_source, of_target)
     surfaces = _traced(method, kinds, source, target, locals, observed)
@@ -112,7 +114,7 @@ def searchable(method: AbstractMethod, cloud: PointCloud) -> SearchPoints:
     return SearchPoints(points, channels * weights.astype(points.dtype), xp.asarray(cloud.valid), penalty)
 
 
-def _on_host(
+def surface_on_host(
     method: AbstractMethod,
     kinds: Kinds,
     cloud: PointCloud,

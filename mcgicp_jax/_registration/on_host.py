@@ -258,7 +258,7 @@ def _apply(
         return jax.tree.map(lambda rows: jnp.tile(rows, (count, *[1] * (rows.ndim - 1))), tree)
 
     def flat(tree: Any) -> Any:
-        return jax.tree.map(lambda rows: rows.reshape(-1, *rows.shape[2:]), tree)
+        return jax.tree.map(lambda rows: rows.reshape(len(rows) * rows.shape[1], *rows.shape[2:]), tree)
 
     source = unpacked(tiled(gathered.source), layouts[0])
     target = unpacked(flat(gathered.target), layouts[1])

@@ -7,7 +7,7 @@ Hessian of half the cost. Any residual that is linear in T a to first order has 
 from __future__ import annotations
 
 import abc
-from typing import Any, ClassVar, Self
+from typing import Any, ClassVar
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -146,7 +146,7 @@ class AbstractTerm(Numbers):
         """What `adapt` needs of each correspondence, a pytree of arrays (n, ...); arguments as of `linearize`."""
         raise NotImplementedError(f"{type(self).__name__} is adaptive, but does not define sample")
 
-    def adapt(self, sample: Any, fraction: Float[AnyScalar, ""]) -> Self:
+    def adapt(self, sample: Any, fraction: Float[AnyScalar, ""]) -> AbstractTerm:
         """The term with its numbers estimated from some correspondences; with NumPy where these are concrete.
 
         Args:
@@ -155,7 +155,7 @@ class AbstractTerm(Numbers):
         """
         return self
 
-    def with_numbers_of(self, other: Self) -> Self:
+    def with_numbers_of(self, other: AbstractTerm) -> AbstractTerm:
         """The term with the numbers that another one has adapted, as constants to autodiff."""
         return self
 
@@ -164,7 +164,7 @@ class AbstractTerm(Numbers):
         """Translations of the source, metres, at which `with_response` needs samples; by default none."""
         return jnp.zeros((0, 3))
 
-    def with_response(self, samples: Any) -> Self:
+    def with_response(self, samples: Any) -> AbstractTerm:
         """The term for the covariance of the pose: its stiffness is the change of its force when the points move and
         match anew.
 

@@ -349,7 +349,7 @@ class Photometric(AbstractTerm):
         numbers = {"deviations": deviations, "designs": designs, "gains": gains, "offsets": offsets}
         return replace(self, **{name: array.astype(self.spacing.dtype) for name, array in numbers.items()})
 
-    def with_numbers_of(self, other: Photometric) -> Photometric:
+    def with_numbers_of(self, other: AbstractTerm) -> Photometric:
         names = ("deviations", "designs", "gains", "offsets")
         return replace(self, **{name: jax.lax.stop_gradient(getattr(other, name)) for name in names})
 

@@ -77,7 +77,9 @@ def _graph_of(lines: Iterable[str]) -> PoseGraph:
     of_world = np.arange(len(values)) >= len(edges)
     loop = ~of_world & (np.abs(ends[:, 0] - ends[:, 1]) != 1)
     i = np.where(of_world, WORLD, rows[:, 0])
-    return PoseGraph(_poses(vertices[first, 1:]), Edge(i, rows[:, 1], _poses(values[:, 2:9]), information, uncertain=loop))
+    return PoseGraph(
+        _poses(vertices[first, 1:]), Edge(i, rows[:, 1], _poses(values[:, 2:9]), information, uncertain=loop)
+    )
 
 
 def _lines_of(graph: PoseGraph | Any) -> Iterator[tuple[str, Float[np.ndarray, "N _"]]]:
