@@ -51,12 +51,10 @@ class FordFrames(AbstractFrames):
         self._scans = sorted((folder / "SCANS").glob("Scan*.mat"))
         if not self._scans:
             raise ValueError(f"{folder}: expected scans in SCANS/Scan*.mat, found none")
+        super().__init__(len(self._scans))
         log = folder / "Timestamp.log"
         # Number and time in microseconds of each image.
         self._images = _read_log(log) if log.is_file() else np.empty((0, 2))
-
-    def __len__(self) -> int:
-        return len(self._scans)
 
     def _frame(self, index: int) -> Frame:
         import scipy.io

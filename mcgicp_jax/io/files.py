@@ -35,20 +35,12 @@ def replacing(path: str | os.PathLike[str]) -> Iterator[BinaryIO]:
     path = Path(path)
     temporary = path.with_name(f".{uuid.uuid4().hex}.tmp")
     try:
-        with _errors_naming(path):
-            file = open(temporary, "x+b")  # noqa: SIM115
-        with file:
+        with open(temporary, "x+b") as file:
             yield file
-        with _errors_naming(path):
-            os.replace(temporary, path)
+        os.replace(temporary, path)
+    except OSError as error:
+        if error.filename == str(temporary):
+            error.filename, error.filename2 = str(path), None
+        raise
     finally:
         temporary.unlink(missing_ok=True)
-
-
-@contextlib.contextmanager
-def _errors_naming(path: Path) -> Iterator[None]:
-    """Re-raise `OSError` with the user's path instead of the temporary file's."""
-    try:
-        yield
-    except OSError as error:
-        raise type(error)(error.errno, error.strerror, str(path)) from None
