@@ -118,7 +118,7 @@ _SCENE, _PATH, _FIRST_FRAME = 0, 1, 2
 
 
 def scene_and_path_rng(seed: int) -> tuple[np.random.Generator, np.random.Generator]:
-    """Random generators of the scene and of the sensor's path, independent of those of the frames."""
+    """Random generators of the scene and of the sensor's path, independent of the frames' generators."""
     scene, path = (np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(key,))) for key in (_SCENE, _PATH))
     return scene, path
 

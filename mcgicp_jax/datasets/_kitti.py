@@ -25,7 +25,7 @@ def kitti(folder: str | os.PathLike[str]) -> KITTIFrames:
     Returns:
         Frames of the Velodyne (x ahead, y left, z up) with the channel intensity, from 0 to 0.99, and, if there are
         images, red, green and blue, from 0 to 1. Colours are valid where a point projects into the image, about a sixth
-        of a scan; points occluded from the camera are not detected. Poses are those of the Velodyne in the world, the
+        of a scan; points occluded from the camera are not detected. Poses map the Velodyne to the world, the
         frame of camera 0 at the start.
 
     Raises:

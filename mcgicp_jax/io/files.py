@@ -12,7 +12,7 @@ from typing import Any, BinaryIO
 
 
 def optional_module(module: str, use: str) -> Any:
-    """Import a package of the extra `io`; `use` says what for, in the message if it is missing."""
+    """Import a package of the extra `io`. `use`, such as "reading .ply", is part of the error message."""
     try:
         return importlib.import_module(module)
     except ImportError as error:
@@ -39,8 +39,8 @@ def replacing(path: str | os.PathLike[str]) -> Iterator[BinaryIO]:
             yield file
         os.replace(temporary, path)
     except OSError as error:
-        if error.filename == str(temporary):
-            error.filename, error.filename2 = str(path), None
-        raise
+        if error.filename != str(temporary):
+            raise
+        raise type(error)(error.errno, error.strerror, str(path)) from None
     finally:
         temporary.unlink(missing_ok=True)

@@ -31,7 +31,7 @@ def before_after(source: PointCloud, target: PointCloud, poses: Mapping[str, Pos
 
     Args:
         source, target: clouds in their own frames.
-        poses: `T_target_source` by name, such as that of the method. The first row, "start", is the identity unless
+        poses: `T_target_source` by name, for instance of the method. The first row, "start", is the identity unless
             `poses` has a "start".
         path: file to save the figure to; its suffix selects the format.
 
