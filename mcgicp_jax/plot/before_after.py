@@ -7,9 +7,9 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from jaxtyping import Float
 
+import mcgicp_jax.plot.drawing as drawing
 from mcgicp_jax._clouds.point_cloud import PointCloud
 from mcgicp_jax._math.poses import Pose, pose_matrix
-from mcgicp_jax.plot import drawing
 from mcgicp_jax.plot.drawing import Figure, File, Map, Picture, Points, View
 
 # The constants affect only how figures look.

@@ -9,10 +9,10 @@ import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Float, Int
 
+import mcgicp_jax.plot.drawing as drawing
 from mcgicp_jax._clouds.point_cloud import PointCloud
 from mcgicp_jax._methods.base import AbstractMethod
 from mcgicp_jax._methods.surface import covariances_of
-from mcgicp_jax.plot import drawing
 from mcgicp_jax.plot.drawing import Figure, File, Points, View
 
 # These constants affect only how figures look: pixels along the longer side of a map, and width of a figure in inches.
