@@ -43,8 +43,6 @@ Poses: TypeAlias = list[Float[np.ndarray, "4 4"]]
 Truth: TypeAlias = list[Float[np.ndarray, "4 4"] | None]
 
 _FRAMES_OF_A_SCENE = 20
-# Metres: the segment lengths of the KITTI odometry benchmark.
-_KITTI_LENGTHS = np.arange(100.0, 900, 100)
 
 
 def _with_datasets(command: Callable[..., int]) -> Callable[..., int]:
@@ -207,8 +205,8 @@ def _report(poses: Poses, truth: Truth, results: list[mcg.Registration]) -> None
         f"ATE:       {1e3 * whole:.1f} mm rms after the best alignment, {1e3 * first:.1f} mm aligned at the first pose"
     )
     length = float(np.linalg.norm(np.diff(np.array(true)[:, :3, 3], axis=0), axis=1).sum())
-    segments = _KITTI_LENGTHS[length > _KITTI_LENGTHS] if length > _KITTI_LENGTHS[0] else np.array([length / 2])
-    percent, degrees = metrics.kitti_errors(estimated, true, lengths=segments.tolist(), step=1)
+    segments = [each for each in metrics.KITTI_LENGTHS if each < length] or [length / 2]
+    percent, degrees = metrics.kitti_errors(estimated, true, lengths=segments, step=1)
     shown = ", ".join(f"{segment:.3g}" for segment in segments)
     print(f"drift:     {percent:.2f} %, {degrees:.4f} deg/m over segments of {shown} m")
 

@@ -7,7 +7,7 @@ import errno
 import inspect
 import os
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeAlias, TypeVar
 
@@ -152,8 +152,8 @@ class Options:
         """Keyword arguments of `mcgicp_jax.register`."""
         if len(self.max_distance) > 2:
             raise ValueError(f"max_distance: expected one or two numbers, got {self.max_distance}")
-        names = ("max_iterations", "translation_tolerance", "rotation_tolerance", "hold_free_directions")
-        options = {name: getattr(self, name) for name in (*names, "match_channels", "scales")}
+        names = [field.name for field in fields(RegistrationOptions) if hasattr(self, field.name)]
+        options = {name: getattr(self, name) for name in names if name != "max_distance"}
         if self.max_distance:
             options["max_distance"] = self.max_distance if len(self.max_distance) == 2 else self.max_distance[0]
         if self.robust is not None:

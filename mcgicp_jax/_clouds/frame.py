@@ -1,4 +1,4 @@
-"""A cloud with what else its sensor measured."""
+"""A cloud with the pose and the time of its sensor, and an image if there is one."""
 
 from __future__ import annotations
 

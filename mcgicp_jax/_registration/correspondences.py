@@ -88,7 +88,7 @@ def _correspondences_at(
     source: SearchPoints,
     target: SearchPoints,
     indices: Int[np.ndarray, "m N"],
-    gate: float,
+    max_distance: float,
 ) -> Correspondences:
     """Matches at a pose, valid within `max_distance` metres of position; NumPy, so that nothing is compiled."""
     rows, dtype = np.maximum(indices, 0), source.points.dtype

@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Float
 
 from mcgicp_jax._clouds.point_cloud import PointCloud
-from mcgicp_jax.datasets._frames import SyntheticFrames, check_scene, pose_of, scene_and_path_rng
+from mcgicp_jax.datasets._frames import Matrix, SyntheticFrames, check_scene, pose_of, scene_and_path_rng
 from mcgicp_jax.datasets._raycast import Box, cast, patches, random_rays, sensor_rotation
 
 # The constants of this module define the scene.
@@ -66,7 +66,7 @@ def box_room(
     return SyntheticFrames(num_frames, path, observer, _PERIOD, seed)
 
 
-def _pose(step: float, start: float, tilt_start: float, index: int) -> Float[np.ndarray, "4 4"]:
+def _pose(step: float, start: float, tilt_start: float, index: int) -> Matrix:
     angle = start + index * step / _RADIUS
     x, y = _SIZE[:2] / 2 + _RADIUS * np.array([np.cos(angle), np.sin(angle)])
     rotation = sensor_rotation(angle + np.pi / 2, _TILT, tilt_start + index * _TILT_PHASE)
@@ -81,7 +81,7 @@ def _observe(
     noise: float,
     along_rays: bool,
     rng: np.random.Generator,
-    pose: Float[np.ndarray, "4 4"],
+    pose: Matrix,
 ) -> PointCloud:
     rotation, center = pose[:3, :3], pose[:3, 3]
     hits = cast(center, random_rays(rng, size) @ rotation.T, boxes, np.inf)

@@ -33,8 +33,8 @@ def ford_campus(folder: str | os.PathLike[str]) -> FordFrames:
     Returns:
         Frames of the Velodyne with the channels red, green and blue, from 0 to 1, valid where one of the five cameras
         saw the point; none is valid if no images were taken within 62 ms of the scan. Scans regenerated from the raw
-        data with reflectance have the channel intensity before these, in the file's unit. Poses are those of the laser
-        in the world (North, East, down), computed from those of the vehicle.
+        data with reflectance have the channel intensity before these, in the file's unit. Poses map the laser
+        to the world (North, East, down); they are computed from the poses of the vehicle.
 
     Raises:
         OSError: if a file is missing; for a scan or image, when its frame is read.
@@ -51,12 +51,10 @@ class FordFrames(AbstractFrames):
         self._scans = sorted((folder / "SCANS").glob("Scan*.mat"))
         if not self._scans:
             raise ValueError(f"{folder}: expected scans in SCANS/Scan*.mat, found none")
+        super().__init__(len(self._scans))
         log = folder / "Timestamp.log"
         # Number and time in microseconds of each image.
         self._images = _read_log(log) if log.is_file() else np.empty((0, 2))
-
-    def __len__(self) -> int:
-        return len(self._scans)
 
     def _frame(self, index: int) -> Frame:
         import scipy.io

@@ -5,7 +5,7 @@ from __future__ import annotations
 import abc
 import operator
 from collections.abc import Callable, Sequence
-from typing import Any, overload
+from typing import Any, TypeAlias, overload
 
 import numpy as np
 from jaxtyping import Float
@@ -14,6 +14,8 @@ from scipy.spatial.transform import Rotation
 from mcgicp_jax._clouds.frame import Frame
 from mcgicp_jax._clouds.point_cloud import PointCloud
 
+Matrix: TypeAlias = Float[np.ndarray, "4 4"]
+
 
 class AbstractFrames(Sequence[Frame]):
     """A lazy sequence of frames: each is generated or read on access and not kept.
@@ -21,8 +23,11 @@ class AbstractFrames(Sequence[Frame]):
     It supports `len`, iteration, negative indices, and slices, which are lazy too.
     """
 
-    @abc.abstractmethod
-    def __len__(self) -> int: ...
+    def __init__(self, num_frames: int):
+        self._num_frames = num_frames
+
+    def __len__(self) -> int:
+        return self._num_frames
 
     @abc.abstractmethod
     def _frame(self, index: int) -> Frame:
@@ -53,10 +58,8 @@ class AbstractFrames(Sequence[Frame]):
 
 class _Slice(AbstractFrames):
     def __init__(self, whole: AbstractFrames, rows: range):
+        super().__init__(len(rows))
         self._whole, self._rows = whole, rows
-
-    def __len__(self) -> int:
-        return len(self._rows)
 
     def _frame(self, index: int) -> Frame:
         return self._whole[self._rows[index]]
@@ -77,18 +80,15 @@ class SyntheticFrames(AbstractFrames):
     def __init__(
         self,
         num_frames: int,
-        path: Callable[[int], Float[np.ndarray, "4 4"]],
-        observer: Callable[[np.random.Generator, Float[np.ndarray, "4 4"]], PointCloud],
+        path: Callable[[int], Matrix],
+        observer: Callable[[np.random.Generator, Matrix], PointCloud],
         period: float,
         seed: int,
     ):
         if num_frames < 1:
             raise ValueError(f"num_frames: expected at least 1, got {num_frames}")
-        self._num_frames = num_frames
+        super().__init__(num_frames)
         self.path, self.observer, self.period, self.seed = path, observer, period, seed
-
-    def __len__(self) -> int:
-        return self._num_frames
 
     def _frame(self, index: int) -> Frame:
         return self.observe(index)
@@ -118,12 +118,12 @@ _SCENE, _PATH, _FIRST_FRAME = 0, 1, 2
 
 
 def scene_and_path_rng(seed: int) -> tuple[np.random.Generator, np.random.Generator]:
-    """Random generators of the scene and of the sensor's path, independent of those of the frames."""
+    """Random generators of the scene and of the sensor's path, independent of the frames' generators."""
     scene, path = (np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(key,))) for key in (_SCENE, _PATH))
     return scene, path
 
 
-def pose_of(rotation: Rotation, position: Any) -> Float[np.ndarray, "4 4"]:
+def pose_of(rotation: Rotation, position: Any) -> Matrix:
     pose = np.eye(4)
     pose[:3, :3], pose[:3, 3] = rotation.as_matrix(), position
     return pose

@@ -11,7 +11,7 @@ from jaxtyping import Float, Int
 from scipy.spatial.transform import Rotation
 
 from mcgicp_jax._clouds.point_cloud import PointCloud
-from mcgicp_jax.datasets._frames import SyntheticFrames, check_scene, pose_of, scene_and_path_rng
+from mcgicp_jax.datasets._frames import Matrix, SyntheticFrames, check_scene, pose_of, scene_and_path_rng
 
 # The constants of this module define the scene and the camera.
 # First-generation Kinect: image size and focal length, pixels.
@@ -107,16 +107,14 @@ def _pose(
     tilt_axes: Float[np.ndarray, "3 2"],
     sway_start: float,
     index: int,
-) -> Float[np.ndarray, "4 4"]:
+) -> Matrix:
     tilt = tilt_start + index * _TILT_PHASE
     sway = sway_start + 0.3 * np.linalg.norm(move) / _DISTANCE_SWAY * index
     rotation = Rotation.from_rotvec(tilt_axes @ (_TILT * np.array([np.cos(tilt), np.sin(tilt)])))
     return pose_of(rotation, (*(start + index * move), -_DISTANCE + _DISTANCE_SWAY * np.sin(sway)))
 
 
-def _observe(
-    wall: Image, size: int, noise: float, rng: np.random.Generator, pose: Float[np.ndarray, "4 4"]
-) -> PointCloud:
+def _observe(wall: Image, size: int, noise: float, rng: np.random.Generator, pose: Matrix) -> PointCloud:
     rays = _rays(rng, size)
     rotation, center = pose[:3, :3], pose[:3, 3]
     depth = -center[2] / (rays @ rotation[2])

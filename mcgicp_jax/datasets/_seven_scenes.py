@@ -57,9 +57,7 @@ class SevenScenesFrames(AbstractFrames):
         self._depths = sorted(folder.glob(f"frame-{6 * '[0-9]'}.depth.png"))
         if not self._depths:
             raise ValueError(f"{folder}: expected images frame-XXXXXX.depth.png, found none")
-
-    def __len__(self) -> int:
-        return len(self._depths)
+        super().__init__(len(self._depths))
 
     def _frame(self, index: int) -> Frame:
         path = self._depths[index]

@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from mcgicp_jax._clouds.point_cloud import PointCloud
-from mcgicp_jax.datasets._frames import SyntheticFrames, check_scene, pose_of, scene_and_path_rng
+from mcgicp_jax.datasets._frames import Matrix, SyntheticFrames, check_scene, pose_of, scene_and_path_rng
 from mcgicp_jax.datasets._raycast import (
     AbstractSolid,
     Box,
@@ -117,19 +117,14 @@ def street(
 # The sensor
 
 
-def _pose(step: float, sway: float, yaw: float, tilt: float, index: int) -> Float[np.ndarray, "4 4"]:
+def _pose(step: float, sway: float, yaw: float, tilt: float, index: int) -> Matrix:
     rotation = sensor_rotation(_YAW * np.sin(yaw + index / 4), _TILT, tilt + 0.7 * index)
     aside = _LANE + _SWAY * np.sin(sway + index * step / (6 * _SWAY))
     return pose_of(rotation, (index * step, aside, _SENSOR_HEIGHT))
 
 
 def _observe(
-    things: list[_Thing],
-    pattern: int,
-    size: int,
-    noise: float,
-    rng: np.random.Generator,
-    pose: Float[np.ndarray, "4 4"],
+    things: list[_Thing], pattern: int, size: int, noise: float, rng: np.random.Generator, pose: Matrix
 ) -> PointCloud:
     rotation, center = pose[:3, :3], pose[:3, 3]
     rays = spinning_rays(rng, size, _BEAMS, _LOWEST, _HIGHEST) @ rotation.T

@@ -65,15 +65,13 @@ class TUMFrames(AbstractFrames):
         if not together.any():
             raise ValueError(f"{folder}: expected depth and colour images within {_MAX_DIFFERENCE} s, found none")
         self._times = times[together]
+        super().__init__(len(self._times))
         self._depths = [self._depths[row] for row in np.flatnonzero(together)]
         self._colors = [colors[row] for row in nearest[together]]
         truth = folder / "groundtruth.txt"
         # read_poses runs before loadtxt because its errors name the file.
         poses = io.read_poses(truth) if truth.is_file() else None
         self._truth = None if poses is None else (np.loadtxt(truth, usecols=0, ndmin=1), poses)
-
-    def __len__(self) -> int:
-        return len(self._times)
 
     def _frame(self, index: int) -> Frame:
         depth = read_depth(self.folder / self._depths[index]) * _DEPTH_UNIT

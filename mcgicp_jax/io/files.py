@@ -12,7 +12,7 @@ from typing import Any, BinaryIO
 
 
 def optional_module(module: str, use: str) -> Any:
-    """Import a package of the extra `io`; `use` says what for, in the message if it is missing."""
+    """Import a package of the extra `io`. `use`, such as "reading .ply", is part of the error message."""
     try:
         return importlib.import_module(module)
     except ImportError as error:
@@ -35,20 +35,12 @@ def replacing(path: str | os.PathLike[str]) -> Iterator[BinaryIO]:
     path = Path(path)
     temporary = path.with_name(f".{uuid.uuid4().hex}.tmp")
     try:
-        with _errors_naming(path):
-            file = open(temporary, "x+b")  # noqa: SIM115
-        with file:
+        with open(temporary, "x+b") as file:
             yield file
-        with _errors_naming(path):
-            os.replace(temporary, path)
+        os.replace(temporary, path)
+    except OSError as error:
+        if error.filename != str(temporary):
+            raise
+        raise type(error)(error.errno, error.strerror, str(path)) from None
     finally:
         temporary.unlink(missing_ok=True)
-
-
-@contextlib.contextmanager
-def _errors_naming(path: Path) -> Iterator[None]:
-    """Re-raise `OSError` with the user's path instead of the temporary file's."""
-    try:
-        yield
-    except OSError as error:
-        raise type(error)(error.errno, error.strerror, str(path)) from None

@@ -17,15 +17,15 @@ from mcgicp_jax.io.files import reason_of, replacing
 
 # Tags of the lines. A prior has a vertex and the number of the sensor's offset, which has a line of its own.
 _VERTEX, _EDGE, _PRIOR, _OFFSET = "VERTEX_SE3:QUAT", "EDGE_SE3:QUAT", "EDGE_SE3_PRIOR", "PARAMS_SE3OFFSET"
-# How many whole numbers come first, and how many numbers there are.
+# Per tag: number of integers at the start of a line, and total number of values.
 _WIDTHS = {_VERTEX: (1, 8), _EDGE: (2, 30), _PRIOR: (2, 30), _OFFSET: (1, 8)}
 
 
 def read_g2o(path: str | os.PathLike[str]) -> PoseGraph:
     """Read a pose graph of `VERTEX_SE3:QUAT`, `EDGE_SE3:QUAT` and `EDGE_SE3_PRIOR` lines; others are ignored.
 
-    Numbers are x y z qx qy qz qw, and the upper triangle of the information. As in GTSAM and Ceres, the information is
-    taken to be that of ξ = (v, ω); g2o itself means the vector part of the quaternion, which is half of ω.
+    A line holds x y z qx qy qz qw and the upper triangle of the information matrix. As in GTSAM and Ceres, the matrix
+    refers to ξ = (v, ω). g2o itself uses the vector part of the quaternion, half of ω, in place of ω.
 
     Args:
         path: the file. Vertices may have any numbers; they become rows in ascending order. Edges between vertices whose

@@ -7,23 +7,10 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from jaxtyping import Float
 
+import mcgicp_jax.plot.drawing as drawing
 from mcgicp_jax._clouds.point_cloud import PointCloud
 from mcgicp_jax._math.poses import Pose, pose_matrix
-from mcgicp_jax.plot.drawing import (
-    PIXELS_PER_SPACING,
-    Figure,
-    File,
-    Map,
-    Picture,
-    Points,
-    View,
-    drawable,
-    new_figure,
-    paint,
-    rgb_of,
-    saved,
-    view_onto,
-)
+from mcgicp_jax.plot.drawing import Figure, File, Map, Picture, Points, View
 
 # The constants affect only how figures look.
 # Most rows below each other; maximum width of a row and height of a panel, inches; pixels and tiles along the longer
@@ -44,7 +31,7 @@ def before_after(source: PointCloud, target: PointCloud, poses: Mapping[str, Pos
 
     Args:
         source, target: clouds in their own frames.
-        poses: `T_target_source` by name, such as that of the method. The first row, "start", is the identity unless
+        poses: `T_target_source` by name, for instance of the method. The first row, "start", is the identity unless
             `poses` has a "start".
         path: file to save the figure to; its suffix selects the format.
 
@@ -53,13 +40,13 @@ def before_after(source: PointCloud, target: PointCloud, poses: Mapping[str, Pos
         ImportError: if matplotlib is missing.
     """
     named = {name: pose_matrix(pose, f"poses[{name!r}]") for name, pose in ({"start": np.eye(4)} | dict(poses)).items()}
-    source, target = drawable(source), drawable(target)
+    source, target = drawing.drawable(source), drawing.drawable(target)
     if len(target) < 3:
         raise ValueError(f"target: expected at least 3 points, got {len(target)}")
     moved = [np.asarray(source.transform(matrix).unpad().points) for matrix in named.values()]
-    source_colors, target_colors = rgb_of(source), rgb_of(target)
+    source_colors, target_colors = drawing.rgb_of(source), drawing.rgb_of(target)
     target_points = np.asarray(target.points)
-    view = view_onto(target_points, _PIXELS)
+    view = drawing.view_onto(target_points, _PIXELS)
     if source_colors is not None and target_colors is not None:
         rows = _chess_boards(view, target_points, target_colors, moved, source_colors)
         headings = ["target and source in alternate tiles", "detail", "difference of colour"]
@@ -73,7 +60,7 @@ def before_after(source: PointCloud, target: PointCloud, poses: Mapping[str, Pos
     height = width * view.height / view.width + 0.3
     beside = -(-len(rows) // _MOST_ROWS)
     below = -(-len(rows) // beside)
-    figure = new_figure(beside * (len(headings) * width + 0.3), below * height + 0.3)
+    figure = drawing.new_figure(beside * (len(headings) * width + 0.3), below * height + 0.3)
     columns = figure.subplots(below, beside * len(headings), squeeze=False)
     panels = np.concatenate(np.split(columns, beside, axis=1))
     for first in panels[::below]:
@@ -83,7 +70,7 @@ def before_after(source: PointCloud, target: PointCloud, poses: Mapping[str, Pos
         _draw_row(row, name, picture, difference, detail)
     for panel in panels[len(rows) :].flat:
         panel.set_visible(False)
-    return saved(figure, path)
+    return drawing.saved(figure, path)
 
 
 def _draw_row(panels: np.ndarray, name: str, picture: Picture, difference: Map, detail: tuple[slice, slice]) -> None:
@@ -115,10 +102,10 @@ def _chess_boards(
     tile = max(view.width, view.height) // _TILES + 1
     row, column = np.mgrid[: view.height, : view.width] // tile
     target_tiles = ((row + column) % 2 == 0)[..., None]
-    ours = paint(view, target, target_colors)
+    ours = drawing.paint(view, target, target_colors)
     ours_smooth, boards = _smooth(ours), []
     for points in moved:
-        theirs = paint(view, points, source_colors)
+        theirs = drawing.paint(view, points, source_colors)
         picture = np.nan_to_num(np.where(target_tiles, ours, theirs), nan=1)
         boards.append((picture, np.abs(ours_smooth - _smooth(theirs)).mean(axis=-1)))
     return boards
@@ -126,7 +113,7 @@ def _chess_boards(
 
 def _smooth(picture: Picture) -> Picture:
     """Mean over a window a little larger than the point spacing, so that differences do not show the sampling."""
-    half = PIXELS_PER_SPACING // 2 + 1
+    half = drawing.PIXELS_PER_SPACING // 2 + 1
     padded = np.pad(picture, ((half, half), (half, half), (0, 0)), mode="edge")
     return np.lib.stride_tricks.sliding_window_view(padded, (2 * half + 1,) * 2, (0, 1)).mean(axis=(-1, -2))
 

@@ -16,7 +16,7 @@ from mcgicp_jax._pose_solver.degeneracy import CHANNELS_HOLD, GEOMETRY_HOLDS, sh
 from mcgicp_jax._registration.result import Registration
 from mcgicp_jax.plot.drawing import CLOUD_COLORS, Figure, File, new_figure, optional_module, saved
 
-# Residual at the end of the colour scale of a graph, standard deviations: that beyond which loops are rejected.
+# Residual at the end of the colour scale of a graph, standard deviations: loops beyond it are rejected.
 _LARGEST_RESIDUAL = 4.1
 
 
@@ -49,8 +49,8 @@ def localizability(result: Registration, *, path: File = None) -> Figure:
     """Plot how well each of six directions is constrained: the observed fraction of squared motion.
 
     The fraction refers to the motion of the matched points. One bar is for the geometry and one for the channels, which
-    count only in directions that the geometry leaves free. Dashed lines mark the fractions above which a direction
-    counts as constrained.
+    count only in directions that the geometry does not constrain. Dashed lines mark the fractions above which a
+    direction counts as constrained.
 
     Args:
         result: a single result of `register`.

@@ -9,6 +9,7 @@ import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Float, Int
 
+import mcgicp_jax.plot.drawing as drawing
 from mcgicp_jax._clouds.point_cloud import PointCloud
 from mcgicp_jax._methods.base import AbstractMethod
 from mcgicp_jax._methods.surfaces import covariances_of
@@ -39,7 +40,7 @@ def maps(
     Clouds with the channels red, green and blue are drawn in colour; others in grey, by intensity or height.
 
     Args:
-        maps: clouds by name, such as those of `aggregate`.
+        maps: clouds by name, for instance maps from `aggregate`.
         limits: (2, 2), rows: lower and upper limit along the horizontal and vertical axis of the picture, in metres
             from the centroid of the first cloud; by default 96 % of its points along each axis, plus a margin.
         path: file to save the figure to; its suffix selects the format.
@@ -48,22 +49,22 @@ def maps(
         ValueError: if there are no clouds, or the first has fewer than 3 points.
         ImportError: if matplotlib is missing.
     """
-    drawn = {name: drawable(cloud) for name, cloud in maps.items()}
+    drawn = {name: drawing.drawable(cloud) for name, cloud in maps.items()}
     if not drawn or len(next(iter(drawn.values()))) < 3:
         raise ValueError("maps: expected at least one cloud, the first with at least 3 points")
-    view = view_onto(np.asarray(next(iter(drawn.values())).points), _PIXELS, limits)
+    view = drawing.view_onto(np.asarray(next(iter(drawn.values())).points), _PIXELS, limits)
     wide = view.width > 1.5 * view.height
     shape = (len(drawn), 1) if wide else (1, len(drawn))
     aspect = view.height / view.width
     width = _WIDTH if wide else _WIDTH / len(drawn)
-    figure = new_figure(width * shape[1], (width * aspect + 0.35) * shape[0])
+    figure = drawing.new_figure(width * shape[1], (width * aspect + 0.35) * shape[0])
     for panel, (name, cloud) in zip(figure.subplots(*shape, squeeze=False).ravel(), drawn.items(), strict=True):
-        picture = np.nan_to_num(paint(view, np.asarray(cloud.points), _shades(cloud, view)), nan=1)
+        picture = np.nan_to_num(drawing.paint(view, np.asarray(cloud.points), _shades(cloud, view)), nan=1)
         extent = (0, view.width * view.pixel, 0, view.height * view.pixel)
         panel.imshow(picture, origin="lower", interpolation="nearest", extent=extent)
         panel.set_title(name, fontsize="medium")
         panel.tick_params(labelsize="x-small")
-    return saved(figure, path, bbox_inches="tight")
+    return drawing.saved(figure, path, bbox_inches="tight")
 
 
 def surface_covariances(
@@ -90,15 +91,15 @@ def surface_covariances(
         ValueError: if covariances have the wrong shape.
         ImportError: if matplotlib is missing.
     """
-    raw, rows = drawable(cloud), np.asarray(indices, int)
-    view = view_onto(np.asarray(raw.points), _PIXELS, limits)
+    raw, rows = drawing.drawable(cloud), np.asarray(indices, int)
+    view = drawing.view_onto(np.asarray(raw.points), _PIXELS, limits)
     # The indices refer to the rows of `cloud`; `raw`, which the picture shows, lacks padding and non-finite points.
     centers = cloud.coordinates[rows]
     offsets = ((centers - view.center) @ view.axes)[:, :2] - view.low
-    room = 2 * spacing_of(centers, float(np.ptp(np.asarray(raw.points), axis=0).max()))
-    picture = np.nan_to_num(paint(view, np.asarray(raw.points), _shades(raw, view)), nan=1)
+    room = 2 * drawing.spacing_of(centers, float(np.ptp(np.asarray(raw.points), axis=0).max()))
+    picture = np.nan_to_num(drawing.paint(view, np.asarray(raw.points), _shades(raw, view)), nan=1)
     width = _WIDTH / len(covariances)
-    figure = new_figure(_WIDTH, width * view.height / view.width + 0.35)
+    figure = drawing.new_figure(_WIDTH, width * view.height / view.width + 0.35)
     panels = figure.subplots(1, len(covariances), squeeze=False)[0]
     for panel, (name, values) in zip(panels, covariances.items(), strict=True):
         given = covariances_of(values, cloud) if isinstance(values, AbstractMethod) else values
@@ -110,7 +111,7 @@ def surface_covariances(
         _add_ellipses(panel, offsets, flat, room)
         panel.set_title(name, fontsize="medium")
         panel.set(xticks=[], yticks=[], xlim=(0, view.width * view.pixel), ylim=(0, view.height * view.pixel))
-    return saved(figure, path)
+    return drawing.saved(figure, path)
 
 
 def _add_ellipses(
@@ -121,13 +122,13 @@ def _add_ellipses(
     lengths = scale * np.sqrt(np.maximum(sizes, 0))
     angles = np.degrees(np.arctan2(vectors[:, 1, 1], vectors[:, 0, 1]))
     style = {"units": "xy", "facecolors": "none", "edgecolors": "black", "linewidths": 1.2}
-    ellipses = optional_module("matplotlib.collections").EllipseCollection
+    ellipses = drawing.optional_module("matplotlib.collections").EllipseCollection
     panel.add_collection(ellipses(*lengths.T[::-1], angles, offsets=offsets, transOffset=panel.transData, **style))
 
 
 def _shades(cloud: PointCloud, view: View) -> Points:
     """Colours of the points from red, green and blue if present, else grey from intensity or height."""
-    colors = rgb_of(cloud)
+    colors = drawing.rgb_of(cloud)
     if colors is not None:
         return np.nan_to_num(colors, nan=0.5)
     if "intensity" in cloud.channel_names:
