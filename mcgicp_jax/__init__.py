@@ -8,20 +8,26 @@ from mcgicp_jax._clouds.color_spaces import rgb_to_hsv, rgb_to_lab, rgb_to_yuv
 from mcgicp_jax._clouds.point_cloud import PointCloud
 from mcgicp_jax._clouds.preprocess import preprocess
 from mcgicp_jax._clouds.voxel_map import aggregate
-from mcgicp_jax._global_registration.global_pose import GlobalPose
+from mcgicp_jax._global_registration.global_pose import GlobalPoseResult, global_pose
 from mcgicp_jax._global_registration.image_matches import image_matches
 from mcgicp_jax._math.robust_kernels import AbstractKernel, Cauchy, GemanMcClure, Huber, Tukey, Welsch
-from mcgicp_jax._methods.base import GICP, AbstractMethod, ColorICP, MultiChannelGICP, PointToPlane, PointToPoint
+from mcgicp_jax._methods.base import AbstractMethod
 from mcgicp_jax._methods.channel_covariance import estimate_channel_covariance
+from mcgicp_jax._methods.gicp import GICP
+from mcgicp_jax._methods.icp import ColorICP, PointToPlane, PointToPoint
+from mcgicp_jax._methods.multichannel_gicp import MultiChannelGICP
 from mcgicp_jax._methods.ndt import D2DNDT, NDT, ColorNDT
 from mcgicp_jax._methods.voxel_gaussians import cell_moments, gaussians, voxel_cells
-from mcgicp_jax._pairs.batch import PairWarning, register_as_completed, register_batch
+from mcgicp_jax._pairs.batch import register_as_completed, register_batch
+from mcgicp_jax._pairs.batch_jobs import PairWarning
+from mcgicp_jax._pairs.cost import mahalanobis_cost
+from mcgicp_jax._pairs.estimate_pose import align
+from mcgicp_jax._pairs.register import register
 from mcgicp_jax._pose_graph.edge import Edge
 from mcgicp_jax._pose_graph.factors import WORLD
 from mcgicp_jax._pose_graph.graph import PoseGraph
 from mcgicp_jax._pose_graph.optimize import PoseGraphResult, optimize_poses
-from mcgicp_jax._registration.cost import mahalanobis_cost
-from mcgicp_jax._registration.register_pair import align, find_correspondences, global_pose, register
+from mcgicp_jax._registration.correspondences import find_correspondences
 from mcgicp_jax._registration.result import Registration, Status
 from mcgicp_jax._search.base import AbstractSearch, Correspondences
 from mcgicp_jax._search.brute_force import DenseSearch
@@ -45,7 +51,7 @@ __all__ = [
     "DenseSearch",
     "Edge",
     "GemanMcClure",
-    "GlobalPose",
+    "GlobalPoseResult",
     "Huber",
     "KDTreeSearch",
     "MultiChannelGICP",

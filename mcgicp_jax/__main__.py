@@ -13,10 +13,10 @@ import jax
 import platformdirs
 import tyro
 
+from mcgicp_jax import __version__
 from mcgicp_jax._cli.batch import batch
 from mcgicp_jax._cli.multiway import multiway
 from mcgicp_jax._cli.odometry import odometry
-from mcgicp_jax._cli.options import VERSION
 from mcgicp_jax._cli.paper import paper
 from mcgicp_jax._cli.register import compare, demo, register
 
@@ -47,25 +47,17 @@ def main(args: Sequence[str] | None = None) -> int:
     """Run a command and return the exit code: 0, 1 if a registration did not converge, 2 for invalid input."""
     args = sys.argv[1:] if args is None else args
     if list(args) == ["--version"]:
-        print(f"mcgicp {VERSION}")
+        print(f"mcgicp {__version__}")
         return 0
     _keep_compiled_programs()
     # Exclude imported modules from garbage collection, which took a tenth of the time of a short command.
     gc.freeze()
-    commands: dict[str, Callable[..., int]] = {
-        "demo": demo,
-        "register": register,
-        "compare": compare,
-        "odometry": odometry,
-        "multiway": multiway,
-        "batch": batch,
-        "paper": paper,
-    }
+    commands: tuple[Callable[..., int], ...] = (demo, register, compare, odometry, multiway, batch, paper)
     with warnings.catch_warnings():
         warnings.showwarning = _show_warning
         try:
             return tyro.extras.subcommand_cli_from_dict(
-                commands,
+                {command.__name__: command for command in commands},
                 prog="mcgicp",
                 description="Registration of point clouds with channels. --version prints the version.",
                 args=args,

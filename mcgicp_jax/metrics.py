@@ -19,7 +19,7 @@ Scalar: TypeAlias = float | Float[Array, ""]
 Poses: TypeAlias = Float[np.ndarray, "N 4 4"] | Sequence[Any]
 
 # Metres: the segment lengths of the KITTI odometry benchmark.
-_KITTI_LENGTHS = (100.0, 200.0, 300.0, 400.0, 500.0, 600.0, 700.0, 800.0)
+KITTI_LENGTHS = (100.0, 200.0, 300.0, 400.0, 500.0, 600.0, 700.0, 800.0)
 
 
 def pose_error(T: Pose, T_true: Pose, *, at: ArrayLike | None = None) -> tuple[Scalar, Scalar]:
@@ -102,7 +102,7 @@ def rpe(poses: Poses, true_poses: Poses, delta: int = 1) -> tuple[Float[np.ndarr
 
 
 def kitti_errors(
-    poses: Poses, true_poses: Poses, *, lengths: Sequence[float] = _KITTI_LENGTHS, step: int = 10
+    poses: Poses, true_poses: Poses, *, lengths: Sequence[float] = KITTI_LENGTHS, step: int = 10
 ) -> tuple[float, float]:
     """The errors of the KITTI odometry benchmark (Geiger et al. 2012): mean drift over segments of the path.
 

@@ -1,13 +1,10 @@
 """Small synthetic clouds with known motion, shared by the tests; of few sizes, since every size compiles."""
 
-from types import SimpleNamespace
-
 import numpy as np
 
 import mcgicp_jax as mcg
-from mcgicp_jax._local_geometry.local_statistics import local_on_host
-from mcgicp_jax._local_geometry.records import covariance_of
-from mcgicp_jax._methods.surface import surface_on_host, surfaces_of
+from mcgicp_jax._local_geometry.local_statistics import local_geometry_on_host
+from mcgicp_jax._methods.surfaces import surface_on_host, surface_pair
 
 
 def motion(twist=(0.05, -0.03, 0.04, 0.02, -0.03, 0.05)) -> np.ndarray:
@@ -54,18 +51,11 @@ def pair(scene=room_corner, size: int = 2000, truth: np.ndarray | None = None, *
 
 
 def prepare(method, cloud, observed=False):
-    """Per-point rows and covariances that a resolved method computes for one concrete cloud."""
-    local = None if cloud.neighbors is None else local_on_host(cloud, method.uses_channels)
-    surface = surface_on_host(method, cloud, local, observed, 1)
-    return SimpleNamespace(
-        table=surface.table,
-        details=surface.details,
-        covariance=covariance_of(surface.table),
-        **{name: getattr(surface.rows, name) for name in ("points", "descriptors", "valid", "penalty")},
-    )
+    """The surface that a resolved method computes for one concrete cloud."""
+    local = None if cloud.neighbors is None else local_geometry_on_host(cloud, method.uses_channels)
+    return surface_on_host(method, (), cloud, local, observed, 1)
 
 
 def covariances(method, cloud):
     """Packed covariances (6, N) of a resolved method, for concrete and traced clouds."""
-    _, surface, _ = surfaces_of(method, cloud, cloud, observed=False)
-    return covariance_of(surface.table)
+    return surface_pair(method, cloud, cloud, observed=False).source.covariance.T

@@ -16,7 +16,7 @@ import pytest
 
 import mcgicp_jax as mcg
 from mcgicp_jax import Status, datasets
-from mcgicp_jax._pairs.batch import _like
+from mcgicp_jax._pairs.batch_executors import executor_like
 from mcgicp_jax.metrics import pose_error
 from tests.scenes import motion, room_corner
 
@@ -286,7 +286,7 @@ def test_a_pair_that_kills_its_workers_is_given_up_alone(raw, alone):
     with pytest.warns(UserWarning, match="pair 2: its worker failed twice"), warnings.catch_warnings():
         warnings.filterwarnings("ignore", "the worker of the pairs")
         results = batch(*prepared(raw), executor=Unlucky(deadly=2, times=9))
-    assert results[2].status is Status.LOST
+    assert results[2].status is Status.WORKER_FAILED
     del results[2]
     assert_same(results, alone[:2] + alone[3:])
 
@@ -377,7 +377,7 @@ def test_workers_have_the_settings_of_the_caller(raw):
 def test_another_pool_in_place_of_a_broken_one_is_like_it():
     context = multiprocessing.get_context("spawn")
     pool = ProcessPoolExecutor(3, context, initializer=os.putenv, initargs=("NAME", "value"))
-    with pool, _like(pool) as other:
+    with pool, executor_like(pool) as other:
         for name in ("_max_workers", "_mp_context", "_initializer", "_initargs"):
             assert getattr(other, name) == getattr(pool, name)
 
@@ -387,7 +387,7 @@ def test_workers_leave_the_filters_of_warnings_alone(raw, monkeypatch):
     monkeypatch.setattr(warnings, "catch_warnings", None)
     sources, targets = prepared(raw[:2])
     results = mcg.register_batch(sources, targets, mcg.MultiChannelGICP(), match_channels=True)
-    assert not {Status.INVALID_INPUT, Status.LOST} & {result.status for result in results}
+    assert not {Status.INVALID_INPUT, Status.WORKER_FAILED} & {result.status for result in results}
 
 
 @pytest.mark.parametrize("search", [None, pytest.param(mcg.DenseSearch(), marks=pytest.mark.slow)])

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from mcgicp_jax import Correspondences, PointCloud, estimate_channel_covariance, preprocess
-from mcgicp_jax._local_geometry.spacing_and_noise import point_spacing, with_channels_matched
+from mcgicp_jax._local_geometry.channel_equalization import with_channels_matched
+from mcgicp_jax._local_geometry.spacing_and_noise import point_spacing
 from tests import reference as ref
 from tests.scenes import motion
 

@@ -24,8 +24,9 @@ from mcgicp_jax import (
     mahalanobis_cost,
     preprocess,
 )
-from mcgicp_jax._methods.surface import surfaces_of
-from mcgicp_jax._pose_solver.sums import matched_rows, sums_of
+from mcgicp_jax._methods.surfaces import surface_pair
+from mcgicp_jax._pose_solver.matched import Motion, match_surfaces
+from mcgicp_jax._pose_solver.sums import sums_of
 from tests import reference as ref
 from tests.reference import tolerance
 
@@ -350,10 +351,9 @@ def test_the_sums_say_what_the_correspondences_say(kernel):
     _, _, (source, target), matches, matched = problem()
     dtype = source.points.dtype
     method = METHODS["MultiChannelGICP"]
-    _, *surfaces = surfaces_of(method, source, target, observed=False)
-    R, t = jnp.asarray(T[:3, :3], dtype), jnp.asarray(T[:3, 3], dtype)
-    robust = None if kernel is None else Huber(SCALE)
-    found = jax.jit(lambda: sums_of(R, t, matched_rows(*surfaces, matches), method, robust))()
+    pair = surface_pair(method, source, target, observed=False, robust=None if kernel is None else Huber(SCALE))
+    there = Motion(jnp.asarray(T[:3, :3], dtype), jnp.asarray(T[:3, 3], dtype))
+    found = jax.jit(lambda: sums_of(there, match_surfaces(pair.source, pair.target, matches), pair.terms))()
 
     raw, neighbors, _, _, _ = problem()
     pair_information = information("MultiChannelGICP", *raw, neighbors)

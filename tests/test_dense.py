@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 import mcgicp_jax as mcg
 from mcgicp_jax import DenseSearch, KDTreeSearch, Status
 from mcgicp_jax._registration import vectorized as _lanes
-from mcgicp_jax._search.base import Rows
+from mcgicp_jax._search.base import SearchPoints
 from mcgicp_jax._search.brute_force import _nearest
 from mcgicp_jax.metrics import pose_error
 from tests import reference as ref
@@ -30,7 +30,7 @@ def rows(points, descriptors=None, valid=None, penalty=None):
     descriptors = np.zeros((len(points), 0)) if descriptors is None else descriptors
     valid = np.ones(len(points), bool) if valid is None else valid
     arrays = (np.asarray(array, np.float32) for array in (points, descriptors))
-    return Rows(*arrays, valid, None if penalty is None else np.asarray(penalty, np.float32))
+    return SearchPoints(*arrays, valid, None if penalty is None else np.asarray(penalty, np.float32))
 
 
 def query(search, source, target, num_candidates=1):
@@ -186,7 +186,7 @@ def test_a_bad_pair_spoils_no_other_lane(clouds):
 SHARDED = """
     import jax, numpy as np
     import mcgicp_jax as mcg
-    from mcgicp_jax import _lanes
+    from mcgicp_jax._registration import vectorized as _lanes
     from tests.test_batch import METHOD, SIZES, prepared, raw_pair
     assert jax.local_device_count() == 4
     clouds = prepared([raw_pair(size, seed) for seed, size in enumerate(SIZES)])

@@ -5,30 +5,34 @@ import jax.numpy as jnp
 import numpy as np
 
 import mcgicp_jax as mcg
-from mcgicp_jax._local_geometry.records import points_of
-from mcgicp_jax._math import symmetric_matrices as alg
-from mcgicp_jax._methods.base import AbstractOneSided
-from mcgicp_jax._terms.base import weighed
+from mcgicp_jax import extend
+from mcgicp_jax.extend import symmetric_matrices as alg
 from tests.scenes import motion, pair
 
 
-class Ridge(AbstractOneSided):
+class Ridge(extend.AbstractOneSided):
     """A method: the inverse of the target's local covariance weighs a residual, as NDT's cells do."""
 
-    def covariance(self, points, around, local, given):
-        scatter = local.covariance if given is None else given
+    def covariance(self, around, local):
+        scatter = local.covariance.T if around.given is None else around.given_covariance
         floor = 1e-3 * (scatter[0] + scatter[3] + scatter[5]) + 1e-12
         return alg.inverse(scatter.at[jnp.array([0, 3, 5])].add(floor))
 
 
-class Prior(mcg.GICP):
-    """A term: besides GICP's, each correspondence exerts three times plain ICP's force."""
+class Attraction(extend.AbstractTerm):
+    """A term: three times plain ICP's force."""
 
-    def forces(self, source, target, moved, rotation, valid, robust):
-        apart = jnp.where(valid, points_of(target) - moved, 0)
+    def linearize(self, source, target, moved, rotation, valid):
+        apart = jnp.where(valid, target.points.T - moved, 0)
         one, zero = jnp.ones_like(apart[0]), jnp.zeros_like(apart[0])
-        stiffness = 3 * jnp.stack([one, zero, zero, one, zero, one])
-        return super().forces(source, target, moved, rotation, valid, robust) + weighed(apart, stiffness, None)
+        return extend.linearize_residual(apart, 3 * jnp.stack([one, zero, zero, one, zero, one]), self.robust)
+
+
+class Prior(mcg.GICP):
+    """GICP with the further term."""
+
+    def terms(self, source, target, robust, equalize_channels):
+        return (*super().terms(source, target, robust, equalize_channels), Attraction())
 
 
 class BruteForce(mcg.AbstractTreeSearch):

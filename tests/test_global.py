@@ -14,8 +14,15 @@ import mcgicp_jax as mcg
 from mcgicp_jax import datasets
 from mcgicp_jax.__main__ import main
 from mcgicp_jax._global_registration import fpfh as features
-from mcgicp_jax._global_registration.global_pose import mutual_nearest
-from mcgicp_jax._global_registration.robust_pose_fit import NUM_MATCHES, Matches, Poses, fit_pose, hypotheses, refined
+from mcgicp_jax._global_registration.feature_matching import mutual_nearest
+from mcgicp_jax._global_registration.robust_pose_fit import (
+    NUM_MATCHES,
+    PoseHypotheses,
+    PutativeMatches,
+    fit_pose,
+    hypotheses,
+    refined,
+)
 from mcgicp_jax.metrics import pose_error
 from tests.scenes import room_corner, wall
 from tests.test_programs import compilations
@@ -207,10 +214,12 @@ def test_ninety_percent_of_wrong_matches_do_not_matter():
     wrong = rng.random(NUM_MATCHES) < 0.9
     target[wrong] = rng.uniform(-2, 2, (wrong.sum(), 3)) @ truth[:3, :3].T + truth[:3, 3]
     none = np.zeros((NUM_MATCHES, 3), np.float32)
-    matches = Matches(source.astype(np.float32), target.astype(np.float32), none, none, np.ones(NUM_MATCHES, bool))
+    matches = PutativeMatches(
+        source.astype(np.float32), target.astype(np.float32), none, none, np.ones(NUM_MATCHES, bool)
+    )
     poses = refined(hypotheses(matches, np.float32(0.05), np.float32(2.0)), matches, np.float32(0.05))
     best = int(np.argmax(poses.score))
-    assert isinstance(poses, Poses)
+    assert isinstance(poses, PoseHypotheses)
     np.testing.assert_allclose(poses.rotation[best], truth[:3, :3], atol=0.01)
     np.testing.assert_allclose(poses.translation[best], truth[:3, 3], atol=0.01)
 

@@ -162,6 +162,15 @@ def test_rounding_does_not_decide_the_status(name):
             np.testing.assert_allclose(far.cost, near.cost, rtol=1e-4)
 
 
+@needs_x64
+def test_rounding_does_not_decide_the_status_inside_transformations():
+    poses, loops = grid(2)
+    solve = jax.jit(lambda graph: mcg.optimize_poses(graph, robust=False).status_code)
+    for seed in range(10):
+        graph = with_priors(measured(poses, loops, deviations=(1e-3, 1e-3), seed=seed)[0], poses)
+        assert solve(shifted(graph, (3e5, 5e6, 100))) == mcg.Status.CONVERGED
+
+
 def test_parts_that_have_priors_are_well_defined():
     poses, loops = SMALL["grid"]
     graph, _ = measured(poses, loops)

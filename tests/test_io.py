@@ -745,9 +745,19 @@ def test_what_a_library_raises(tmp_path, monkeypatch):
         def fail(file, size, error=error):
             raise error
 
-        monkeypatch.setitem(io.READERS, ".laz", fail)
+        monkeypatch.setitem(io.FORMATS, ".laz", io.FORMATS[".laz"]._replace(read=fail))
         with pytest.raises(expected):
             io.read(tmp_path / "c.laz")
+
+
+def test_a_format_can_be_added(tmp_path, monkeypatch):
+    def write(file, cloud):
+        file.write(b"\n".join(b"%r %r %r" % tuple(point) for point in np.asarray(cloud.points).tolist()))
+
+    monkeypatch.setitem(io.FORMATS, ".toy", io.Format(lambda file, size: PointCloud(np.loadtxt(file)), write))
+    cloud = make(dtype=np.float64)
+    io.write(tmp_path / "c.TOY", cloud)
+    np.testing.assert_array_equal(io.read(tmp_path / "c.TOY").points, cloud.points)
 
 
 def test_no_coordinates(tmp_path):
@@ -774,7 +784,7 @@ def test_a_failed_write_leaves_the_old_file(tmp_path, suffix, monkeypatch):
         file.write(b"half")
         raise OSError("disk full")
 
-    monkeypatch.setitem(io.WRITERS, suffix, fail)
+    monkeypatch.setitem(io.FORMATS, suffix, io.FORMATS[suffix]._replace(write=fail))
     with pytest.raises(OSError, match="disk full"):
         io.write(path, make())
     assert path.read_bytes() == b"old" and list(tmp_path.iterdir()) == [path]

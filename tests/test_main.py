@@ -14,6 +14,11 @@ import scipy.spatial
 import mcgicp_jax as mcg
 from mcgicp_jax import io, metrics, plot
 from mcgicp_jax.__main__ import main
+from mcgicp_jax._cli.options import Options
+from mcgicp_jax._clouds.color_spaces import COLOR_SPACES
+from mcgicp_jax._math.robust_kernels import KERNELS
+from mcgicp_jax._methods.registry import METHODS
+from mcgicp_jax.datasets import DATASETS
 from tests.scenes import motion, room_corner
 
 TRUTH = motion()
@@ -54,7 +59,9 @@ def printed_matrix(text):
     return np.array([row.split() for row in rows], float)
 
 
-@pytest.mark.parametrize("method", ["mc-gicp", "gicp", "color-icp", "point-to-plane", "point-to-point", "ndt"])
+@pytest.mark.parametrize(
+    "method", ["mc-gicp", "photometric-gicp", "gicp", "color-icp", "point-to-plane", "point-to-point", "ndt"]
+)
 def test_register_prints_the_pose(files, capsys, method):
     assert main(["register", files["source"], files["target"], "--method", method]) == 0
     text, errors = capsys.readouterr()
@@ -123,6 +130,7 @@ def test_compare(files, capsys):
     rows = {line.split()[0]: line.split()[1:] for line in lines if line.endswith("converged")}
     assert list(rows) == [
         "mc-gicp",
+        "photometric-gicp",
         "gicp",
         "color-icp",
         "point-to-plane",
@@ -141,7 +149,7 @@ def test_compare(files, capsys):
 def test_compare_without_channels_or_truth(files, capsys):
     assert main(["compare", files["bare"], files["target"]]) == 0
     text = capsys.readouterr().out
-    assert "error" not in text and text.count("left out") == 3 and text.count("converged") == 5
+    assert "error" not in text and text.count("left out") == 4 and text.count("converged") == 5
     assert main(["compare", files["bare"], files["target"], "--max-iterations", "1"]) == 1
     assert "gicp did not converge" in capsys.readouterr().err
 
@@ -154,7 +162,7 @@ def test_demo(tmp_path, capsys):
     assert errors == "" and str(folder / "before_after.png") in text
     height, width, _ = matplotlib.image.imread(folder / "before_after.png").shape
     assert width > height > 500
-    error = {line.split()[0]: float(line.split()[1]) for line in text.split("status\n")[1].splitlines()[:6]}
+    error = {line.split()[0]: float(line.split()[1]) for line in text.split("status\n")[1].splitlines()[:7]}
     assert error["mc-gicp"] < 5 and error["color-icp"] < 10
     # What the text says: geometry slides.
     assert min(error["gicp"], error["point-to-plane"], error["point-to-point"]) > 20
@@ -292,6 +300,33 @@ def test_help(command, words, capsys):
     assert ended.value.code == 0
     assert all(word in text for word in words)
     assert "None" not in text
+
+
+def test_help_lists_the_registries(capsys):
+    """A method, kernel, colour space, format or data set that is registered is an option, with its defaults."""
+    for command, registered in (("register", (METHODS, KERNELS, COLOR_SPACES, io.FORMATS)), ("odometry", (DATASETS,))):
+        with pytest.raises(SystemExit):
+            main([command, "--help"])
+        text = " ".join(capsys.readouterr().out.replace("│", " ").split())
+        for names in registered:
+            assert not [name for name in names if name not in text]
+    for name, dataset in DATASETS.items():
+        assert f"{dataset.max_distance[0]:g} and {dataset.max_distance[1]:g} for " in text, name
+
+
+def test_every_kernel_is_an_option(files, capsys):
+    for name in KERNELS:
+        assert main(["register", files["bare"], files["target"], "--method", "gicp", "--robust", name, "2.0"]) == 0
+        assert close_to_truth(printed_matrix(capsys.readouterr().out)), name
+
+
+def test_parameters_of_registered_methods():
+    """`photometric-gicp` is MC-GICP with an argument, and takes the same parameters."""
+    assert METHODS["photometric-gicp"](epsilon=0.01).photometric and not METHODS["mc-gicp"]().photometric
+    assert Options(epsilon=0.01, channel_weights=(0.5,)).parameters_of("photometric-gicp") == {
+        "epsilon": 0.01,
+        "channel_weights": 0.5,
+    }
 
 
 @pytest.mark.parametrize("args", [[], ["align"], ["register"], ["register", "a", "b", "--method", "icp"]])

@@ -5,14 +5,13 @@ import numpy as np
 import pytest
 
 from mcgicp_jax.__main__ import main
-from mcgicp_jax._cli import paper as _paper
+from mcgicp_jax._cli.paper import rows_of_table, table
 
 
 @pytest.mark.slow
-def test_the_report_is_written(tmp_path, monkeypatch, capsys):
-    for name, value in {"WALL_FRAMES": 3, "WALL_POINTS": 2000, "FINE_POINTS": 2000, "ITERATIONS": 2}.items():
-        monkeypatch.setattr(_paper, f"_{name}", value)
-    arguments = ["--output", str(tmp_path / "report"), "--num-frames", "3", "--points-per-frame", "6400"]
+def test_the_report_is_written(tmp_path, capsys):
+    small = {"num-frames": 3, "points-per-frame": 6400, "wall-frames": 3, "wall-points": 2000}
+    arguments = [f"--{name}={value}" for name, value in small.items()] + ["--output", str(tmp_path / "report")]
     assert main(["paper", *arguments]) == 0
     text = (tmp_path / "report" / "report.md").read_text()
     assert str(tmp_path / "report" / "report.md") in capsys.readouterr().out
@@ -31,12 +30,12 @@ def test_too_few_frames_are_refused(capsys):
     assert capsys.readouterr().err == "mcgicp: num_frames: expected at least 3, got 2\n"
 
 
-def errors(*means):
-    return [_paper._Errors(np.array([mean]), np.zeros(1), np.ones(1), np.ones(1)) for mean in means]
+def order(*means):
+    """The sentence about the order of methods with these mean errors."""
+    return list(table(rows_of_table(), np.array([[[mean, 0.0, 1.0, 1.0]] for mean in means])))[1]
 
 
 def test_the_order_is_reported_as_it_is():
-    rows = _paper._rows()
-    assert _paper._order(rows, errors(5.0, 3.0, 4.0, 2.0, 1.0, 9.0)).startswith("The paper's order holds.")
-    other = _paper._order(rows, errors(5.0, 1.0, 2.0, 3.0, 4.0, 0.5))
+    assert order(5.0, 3.0, 4.0, 2.0, 1.0, 9.0).startswith("The paper's order holds.")
+    other = order(5.0, 1.0, 2.0, 3.0, 4.0, 0.5)
     assert other.startswith("The paper's order does not hold. Here, by mean translation error: GICP < MC-GICP, intens")

@@ -49,23 +49,23 @@ def test_descriptors_are_channels_in_metres(method):
     cloud = ready()
     surface = prepare(method, cloud)
     if isinstance(method, ColorICP | MultiChannelGICP):
-        np.testing.assert_allclose(surface.descriptors, 0.1 * cloud.channels, rtol=1e-6)
+        np.testing.assert_allclose(surface.search.descriptors, 0.1 * cloud.channels, rtol=1e-6)
     else:
-        assert surface.descriptors.shape == (160, 0)
+        assert surface.search.descriptors.shape == (160, 0)
     np.testing.assert_array_equal(surface.points, cloud.points)
-    np.testing.assert_array_equal(surface.valid, cloud.valid)
+    np.testing.assert_array_equal(surface.search.valid, cloud.valid)
 
 
 def test_one_weight_per_channel():
     cloud = ready()
     weights = np.array([0.0, 0.5, 3.0])
     for method in (ColorICP(weights), MultiChannelGICP(0.3, weights)):
-        np.testing.assert_allclose(prepare(method, cloud).descriptors, cloud.channels * weights, rtol=1e-6)
+        np.testing.assert_allclose(prepare(method, cloud).search.descriptors, cloud.channels * weights, rtol=1e-6)
 
 
 @pytest.mark.parametrize("method", [PointToPoint(), ColorICP(0.1)], ids=["PointToPoint", "ColorICP"])
 def test_points_alone_weigh_alike_in_all_directions(method):
-    found = ref.symmetric(prepare(method, ready()).covariance)
+    found = ref.symmetric(prepare(method, ready()).covariance.T)
     np.testing.assert_array_equal(found, np.broadcast_to(np.eye(3), found.shape))
 
 
@@ -73,7 +73,7 @@ def test_points_alone_weigh_alike_in_all_directions(method):
 def test_given_covariances_are_taken(method):
     root = np.random.default_rng(0).normal(size=(150, 3, 3))
     given = (root @ root.swapaxes(1, 2)).astype(np.float32)
-    found = ref.symmetric(prepare(method, ready(covariances=given)).covariance)[:150]
+    found = ref.symmetric(prepare(method, ready(covariances=given)).covariance.T)[:150]
     np.testing.assert_allclose(found, given, rtol=1e-6, atol=1e-6)
 
 
@@ -81,7 +81,7 @@ def test_normals_of_given_covariances():
     root = np.random.default_rng(0).normal(size=(150, 3, 3))
     given = (root @ root.swapaxes(1, 2)).astype(np.float32).astype(float)
     normals = np.linalg.eigh(given)[1][:, :, 0]
-    found = ref.symmetric(prepare(PointToPlane(), ready(covariances=given)).covariance)[:150]
+    found = ref.symmetric(prepare(PointToPlane(), ready(covariances=given)).covariance.T)[:150]
     clear = np.diff(np.linalg.eigvalsh(given))[:, 0] > 0.1
     expected = normals[:, :, None] * normals[:, None, :]
     np.testing.assert_allclose(found[clear], expected[clear], atol=tolerance(1e-4, 1e-11))

@@ -49,7 +49,7 @@ def test_what_failed_makes_no_edge():
     source, target, _ = pair(size=500)
     assert edge_from(0, 1, mcg.register(source, target, mcg.GICP(), max_distance=0.3, max_iterations=1)) is None
     assert edge_from(0, 1, mcg.register(source, target, mcg.GICP(), max_distance=1e-6)) is None
-    assert edge_from(0, 1, mcg.Registration.without_pose(mcg.Status.LOST)) is None
+    assert edge_from(0, 1, mcg.Registration.without_pose(mcg.Status.WORKER_FAILED)) is None
 
 
 def test_odometry_closes_loops(room):
@@ -108,7 +108,7 @@ def test_a_loop_is_registered_from_the_poses_within_their_uncertainty(monkeypatc
 def test_a_lost_frame_is_joined_by_an_edge_without_information():
     found = trajectory()
     found._clouds, found._poses, end = found._clouds[:1], found._poses[:1], found._poses[1]
-    found.add(mcg.PointCloud(np.eye(3)), end, mcg.Registration.without_pose(mcg.Status.LOST))
+    found.add(mcg.PointCloud(np.eye(3)), end, mcg.Registration.without_pose(mcg.Status.WORKER_FAILED))
     edges = found.graph.edges
     assert (edges.i, edges.j, edges.uncertain) == (0, 1, False) and not np.any(edges.information)
     np.testing.assert_allclose(found._poses[0] @ edges.T_i_j[0], end, atol=1e-12)

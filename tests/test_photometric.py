@@ -1,5 +1,7 @@
 """The photometric term: residuals, estimates, gradients, and what it does for a pose."""
 
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -7,8 +9,12 @@ import pytest
 
 import mcgicp_jax as mcg
 from mcgicp_jax._math.statistics import median
-from mcgicp_jax._methods.surface import surfaces_of
-from mcgicp_jax._pose_solver.sums import estimates_at, matched_rows, move_rows
+from mcgicp_jax._methods.surfaces import surface_pair
+from mcgicp_jax._pose_solver.adaptation import adapted, sample_of_term
+from mcgicp_jax._pose_solver.matched import Matched, Motion, match_surfaces, surface_rows
+from mcgicp_jax._terms.base import AbstractTerm
+from mcgicp_jax._terms.mahalanobis import Mahalanobis
+from mcgicp_jax._terms.photometric import Photometric, Residuals
 from tests.differences import CONVERGED, GATE, TO_ROUNDING, check_gradient, clouds_with, inputs_of, needs_x64, weigh
 from tests.scenes import motion, pair, wall
 
@@ -16,26 +22,48 @@ PHOTOMETRIC = mcg.MultiChannelGICP(photometric=True)
 SMALL = motion((0.03, -0.02, 0.01, 0.01, -0.01, 0.02))
 
 
+class Still(AbstractTerm):
+    """A photometric term with its numbers as they are."""
+
+    name = "photometric"
+    columns = staticmethod(Photometric.columns)
+    term: Photometric
+
+    def linearize(self, *arguments):
+        return self.term.linearize(*arguments)
+
+
 class Held(mcg.MultiChannelGICP):
-    """The term with its numbers as they are."""
+    """The photometric term alone, with its numbers as they are."""
 
-    @property
-    def estimates(self):
-        return None
+    term: Any
 
-    def with_estimates(self, estimates):
-        return self
+    def __init__(self, method, term):
+        super().__init__(method.channel_covariance, method.channel_weights, photometric=True)
+        self.term = term
+
+    def terms(self, source, target, robust, equalize_channels):
+        return (Still(self.term, robust=robust),)
+
+
+def matched_at(source, target, method, pose, matches):
+    """The matched surfaces, the terms and the motion."""
+    both = surface_pair(method, source, target, observed=False)
+    pose = jnp.asarray(pose, source.points.dtype)
+    motion = Motion(pose[:3, :3], pose[:3, 3])
+    return match_surfaces(both.source, both.target, matches), both, motion
 
 
 def held(source, target, method, pose, matches):
-    """The method with its numbers from the matches at a pose, held; and those numbers."""
-    method, seen, there = surfaces_of(method, source, target, observed=False)
-    matched = matched_rows(seen, there, matches)
-    pose = jnp.asarray(pose, source.points.dtype)
-    term = estimates_at(pose[:3, :3], pose[:3, 3], matched, source.valid, method.estimates)
-    result = Held(method.channel_covariance, method.channel_weights, photometric=True)
-    object.__setattr__(result, "term", term)
-    return result, term
+    """The method with its numbers from the matches at a pose, held; and the term with these."""
+    matched, both, motion = matched_at(source, target, method, pose, matches)
+
+    def sample(term, rows):
+        some = Matched(surface_rows(matched.source, rows), surface_rows(matched.target, rows), matched.valid[rows])
+        return sample_of_term(motion, some, term)
+
+    (term,) = adapted(both.terms, source.valid, sample)
+    return Held(both.method, term), term
 
 
 def raised(size, **settings):
@@ -91,14 +119,12 @@ def test_transformations_find_the_same_pose():
 
 def test_forces_are_the_gradient_of_the_cost():
     source, target, truth, matches = at_truth()
-    method, _ = held(source, target, PHOTOMETRIC, truth, matches)
-    _, seen, there = surfaces_of(method, source, target, observed=False)
-    matched = matched_rows(seen, there, matches)
-    rotation = jnp.asarray(truth[:3, :3], jnp.float32)
-    moved = move_rows(rotation, jnp.asarray(truth[:3, 3], jnp.float32), matched.source)
+    _, term = held(source, target, PHOTOMETRIC, truth, matches)
+    matched, _, motion = matched_at(source, target, PHOTOMETRIC, truth, matches)
+    moved = motion.move(matched.source.points)
 
     def of(moved, name):
-        return getattr(method.forces(matched.source, matched.target, moved, rotation, matched.valid, None), name)
+        return getattr(term.linearize(matched.source, matched.target, moved, motion.rotation, matched.valid), name)
 
     gradient = jax.jit(jax.grad(lambda moved: jnp.sum(of(moved, "cost"))))(moved)
     force = jax.jit(lambda moved: of(moved, "force"))(moved)
@@ -112,22 +138,20 @@ def test_forces_are_the_gradient_of_the_cost():
 
 def test_estimates_are_scales_and_correlations_of_the_residuals():
     source, target, truth, matches = at_truth(raised, size=2500)
-    method, term = held(source, target, PHOTOMETRIC, truth, matches)
-    _, seen, there = surfaces_of(method, source, target, observed=False)
-    matched = matched_rows(seen, there, matches)
-    rotation = jnp.asarray(truth[:3, :3], jnp.float32)
-    moved = move_rows(rotation, jnp.asarray(truth[:3, 3], jnp.float32), matched.source)
-    residuals = term.residuals(matched.source, matched.target, moved, rotation, matched.valid)
-    for k, values in enumerate(residuals.values):
+    _, term = held(source, target, PHOTOMETRIC, truth, matches)
+    matched, _, motion = matched_at(source, target, PHOTOMETRIC, truth, matches)
+    moved = motion.move(matched.source.points)
+    residuals = term.sample(matched.source, matched.target, moved, motion.rotation, matched.valid)
+    for k, values in enumerate(residuals.values.T):
         scatter = 1.4826 * median(np.abs(np.asarray(values) - median(np.asarray(values))))
         np.testing.assert_allclose(term.deviations[k], scatter, rtol=1e-4)
     # By definition, cell by cell, with the weights of the default kernel.
     cells = np.floor(np.asarray(moved) / (10 * float(term.spacing))).astype(int)
     _, cell = np.unique(cells, axis=1, return_inverse=True)
     for k in range(4):
-        valid = ~np.isnan(residuals.values[k])
-        z = np.where(valid, residuals.values[k], 0) / term.deviations[k]
-        slope = np.asarray(residuals.slopes[k]) / term.deviations[k]
+        values = residuals.values[:, k]
+        z = np.where(~np.isnan(values), values, 0) / term.deviations[k]
+        slope = np.asarray(residuals.slopes[:, k]).T / term.deviations[k]
         weights = 1 / (1 + z**2 / 20)
         sums = np.stack([np.bincount(cell.ravel(), weights * z * axis) for axis in slope])
         design = max(np.sum(sums**2) / np.sum(weights * np.sum(slope**2, axis=0)), 1)
@@ -135,19 +159,23 @@ def test_estimates_are_scales_and_correlations_of_the_residuals():
         np.testing.assert_allclose(term.designs[k], design, rtol=0.3)
 
 
+def photometric(spacing):
+    """The term of one channel before its numbers are known."""
+    coarse = Mahalanobis(mcg.GICP())
+    return Photometric.before_estimate(np.float64(spacing), np.ones(1), coarse, robust=None, equalizes_channels=False)
+
+
 def test_a_sample_has_the_design_effect_of_all():
     """Twice as many samples of one picture are not worth twice as much."""
-    from mcgicp_jax._terms.photometric import Term
-
     rng = np.random.default_rng(0)
     moved = np.concatenate([rng.random((40_000, 2)), np.zeros((40_000, 1))], axis=1)
     # Errors that neighbours share, and noise.
     shared = rng.normal(size=(50, 50))[tuple((50 * moved[:, :2]).astype(int).T)]
     values = np.stack([rng.normal(size=40_000), 0.5 * shared + rng.normal(size=40_000)], axis=1)
-    slopes = np.tile([0, 0, 1.0, 1.0, 0, 0], (40_000, 1))
-    rows = np.concatenate([values, slopes, values[:, 1:], np.ones((40_000, 1)), moved], axis=1)
-    whole = Term.off(np.float64(0.01), 1).adapted(rows, 1.0)
-    sample = Term.off(np.float64(0.01), 1).adapted(rows[::3], 1 / 3)
+    slopes = np.tile([[0, 0, 1.0], [1.0, 0, 0]], (40_000, 1, 1))
+    rows = Residuals(values, slopes, values[:, 1:], np.ones((40_000, 1)), moved)
+    whole = photometric(0.01).adapt(rows, 1.0)
+    sample = photometric(0.01).adapt(Residuals(*(column[::3] for column in rows)), 1 / 3)
     assert whole.designs[0] < 1.3 and whole.designs[1] > 3
     np.testing.assert_allclose(sample.designs[1], whole.designs[1], rtol=0.3)
 
@@ -155,14 +183,12 @@ def test_a_sample_has_the_design_effect_of_all():
 @pytest.mark.parametrize("noise", [0.0, 1.0, 100.0])
 def test_noise_of_slopes_is_discounted(noise):
     """The reliability is the share of the true slope in the squared mean of two noisy ones: s² / (s² + n²/2)."""
-    from mcgicp_jax._terms.photometric import Term
-
     rng = np.random.default_rng(0)
     values, moved = rng.normal(size=(40_000, 2)), rng.random((40_000, 3))
     here, there = np.array([1.0, 0, 0]) + noise * rng.normal(size=(2, 40_000, 3)) * np.array([1, 0, 0])
     normals, products = np.tile([0, 0, 1.0], (40_000, 1)), np.sum(here * there, axis=1, keepdims=True)
-    rows = np.concatenate([values, normals, (here + there) / 2, values[:, 1:], products, moved], axis=1)
-    designs = Term.off(np.float64(0.002), 1).adapted(rows, 1.0).designs
+    slopes = np.stack([normals, (here + there) / 2], axis=1)
+    designs = photometric(0.002).adapt(Residuals(values, slopes, values[:, 1:], products, moved), 1.0).designs
     reliability = 1 / (1 + noise**2 / 2)
     np.testing.assert_allclose(designs[0] / designs[1], reliability, rtol=0.15, atol=0.03)
 

@@ -130,12 +130,12 @@ def test_a_cloud_is_prepared_once(monkeypatch):
 
 
 def test_what_is_kept_of_a_cloud_goes_with_it():
-    from mcgicp_jax._compute import cache as _kept
+    from mcgicp_jax._compute import cache
 
     source, target = (mcg.preprocess(room_corner(300, seed=seed)[0]) for seed in (0, 1))
     mcg.register(source, target, mcg.GICP())
-    kept = _kept.keep.__self__._kept
-    alive = [kept[id(cloud)][0] for cloud in (source, target)]
+    cached = cache._clouds._values
+    alive = [cached[id(cloud)].alive for cloud in (source, target)]
     assert all(reference() is not None for reference in alive)
     del source, target
     gc.collect()
@@ -143,7 +143,7 @@ def test_what_is_kept_of_a_cloud_goes_with_it():
     # With the next lookup.
     other = mcg.preprocess(room_corner(300, seed=2)[0])
     mcg.register(other, other, mcg.GICP())
-    assert all(reference() is not None for reference, _, _ in kept.values())
+    assert all(each.alive() is not None for each in cached.values())
 
 
 def test_settings_of_a_block_of_code_hold_in_all_threads():

@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import mcgicp_jax as mcg
-from mcgicp_jax._search.base import Rows
+from mcgicp_jax._search.base import SearchPoints
 from mcgicp_jax._search.pykdtree import PyKDTree
 from tests.benchmarks import accuracy
 
@@ -39,7 +39,7 @@ def test_it_finds_the_same(seed, size, k, num_channels, high, max_distance):
 
     points = draw(size, 3)
     np.testing.assert_array_equal(PYKDTREE.neighbors(points, k), SCIPY.neighbors(points, k))
-    source, target = (Rows(draw(n, 3), draw(n, num_channels), np.ones(n, bool)) for n in (40, size))
+    source, target = (SearchPoints(draw(n, 3), draw(n, num_channels), np.ones(n, bool)) for n in (40, size))
     found = [search.index(target).nearest(STILL, source, max_distance, 2) for search in (PYKDTREE, SCIPY)]
     np.testing.assert_array_equal(*found)
 

@@ -19,7 +19,8 @@ from mcgicp_jax import (
     find_correspondences,
     preprocess,
 )
-from mcgicp_jax._search.base import Rows
+from mcgicp_jax._search.base import SearchPoints
+from mcgicp_jax._search.positions import nearest_in_position
 from mcgicp_jax._search.tree_index import TreeIndex
 from tests import reference as ref
 
@@ -41,8 +42,8 @@ def query(pose, source, target, max_distance=np.inf, source_channels=None, targe
     parameters = np.concatenate([Rotation.from_matrix(pose[:3, :3]).as_quat()[[3, 0, 1, 2]], pose[:3, 3]])
     source_channels = np.zeros((len(source), 0)) if source_channels is None else source_channels
     target_channels = np.zeros((len(target), 0)) if target_channels is None else target_channels
-    index = KDTreeSearch().index(Rows(target, target_channels, np.ones(len(target), bool)))
-    source_rows = Rows(source, source_channels, np.ones(len(source), bool))
+    index = KDTreeSearch().index(SearchPoints(target, target_channels, np.ones(len(target), bool)))
+    source_rows = SearchPoints(source, source_channels, np.ones(len(source), bool))
     return index.nearest(parameters, source_rows, float(max_distance), num_candidates)
 
 
@@ -51,6 +52,18 @@ def query(pose, source, target, max_distance=np.inf, source_channels=None, targe
 def test_neighbors_of_random_points(seed, k, num_points):
     points = np.random.default_rng(seed).normal(size=(num_points, 3))
     np.testing.assert_array_equal(KDTreeSearch().neighbors(points, k), ref.nearest(points, points, k))
+
+
+def test_nearest_in_position():
+    rng = np.random.default_rng(0)
+    queries, points = rng.random((50, 3)), rng.random((40, 3)).astype(np.float32)
+    queries[3], points[5] = np.nan, np.nan
+    distances = np.nan_to_num(np.linalg.norm(queries[:, None] - points, axis=2), nan=np.inf)
+    expected = np.where(distances.min(axis=1) <= 0.2, distances.argmin(axis=1), -1)
+    assert 0 < np.sum(expected == -1) < 50
+    np.testing.assert_array_equal(nearest_in_position(queries, points, 0.2), expected)
+    np.testing.assert_array_equal(nearest_in_position(queries, points[:0], 0.2), -1)
+    assert nearest_in_position(queries[:0], points, 0.2).shape == (0,)
 
 
 @settings(max_examples=25, deadline=None)
@@ -136,7 +149,7 @@ def test_nearest_with_missing_channels(seed, share, k, missing):
     masks = np.split(np.random.default_rng(seed).random((90, 2)) < share, [40])
     squares = np.array([float(missing), 2.0])
     source, target = (
-        Rows(
+        SearchPoints(
             points=row[:, :3],
             descriptors=np.where(mask, row[:, 3:], 0),
             valid=np.ones(len(row), bool),
@@ -164,7 +177,7 @@ def test_many_sets_of_missing_channels_need_few_trees(k, high, monkeypatch):
     masks = np.split(np.random.default_rng(0).random((350, 8)) < 0.6, [150])
     squares = np.arange(1.0, 9.0)
     source, target = (
-        Rows(row[:, :3], np.where(mask, row[:, 3:], 0), np.ones(len(row), bool), np.where(mask, 0, squares))
+        SearchPoints(row[:, :3], np.where(mask, row[:, 3:], 0), np.ones(len(row), bool), np.where(mask, 0, squares))
         for row, mask in zip(rows, masks, strict=True)
     )
     index = KDTreeSearch().index(target)
@@ -351,7 +364,7 @@ def test_matches_that_are_followed_are_those_found_anew(seed, step, num_channels
         valid = rng.random(size) < 0.9
         channels = rng.integers(0, 2, (size, num_channels)) * 0.1
         penalty = 0.01 * (rng.random(channels.shape) < 0.3) if lacking else None
-        clouds.append(Rows(points, channels, valid, penalty))
+        clouds.append(SearchPoints(points, channels, valid, penalty))
     index = KDTreeSearch().index(clouds[1])
     nearest = index.follow(clouds[0], max_distance, k)
     pose = np.array([1.0, 0, 0, 0, 0, 0, 0])
@@ -369,7 +382,7 @@ def test_matches_that_are_followed_are_those_found_anew(seed, step, num_channels
 
 def test_a_pose_that_is_not_a_number_matches_nothing():
     (source, target), _ = clouds()
-    rows = [Rows(cloud.points, np.zeros((len(cloud.valid), 0)), cloud.valid) for cloud in (source, target)]
+    rows = [SearchPoints(cloud.points, np.zeros((len(cloud.valid), 0)), cloud.valid) for cloud in (source, target)]
     nearest = KDTreeSearch().index(rows[1]).follow(rows[0], 1.0, 2)
     assert (nearest(np.full(7, np.nan)) == -1).all()
     assert (nearest(np.array([1.0, 0, 0, 0, np.inf, 0, 0])) == -1).all()

@@ -7,11 +7,12 @@ import pytest
 import scipy.optimize
 from scipy.spatial.transform import Rotation
 
-from mcgicp_jax import GICP
+from mcgicp_jax._local_geometry.surface import Surface
 from mcgicp_jax._math import symmetric_matrices as cov
 from mcgicp_jax._pose_solver import update as _solve
-from mcgicp_jax._pose_solver.sums import Matched, sums_of
-from mcgicp_jax._terms.base import weighed
+from mcgicp_jax._pose_solver.matched import Matched, Motion
+from mcgicp_jax._pose_solver.sums import sums_of
+from mcgicp_jax._terms.base import AbstractTerm, linearize_residual
 
 X64 = jax.config.jax_enable_x64
 N = 2000
@@ -35,17 +36,18 @@ def random_pairs(seed: int, scale: float = 1.0, offset: float = 0.0, noise: floa
 
 
 def solve(moved, residual, information, weight, valid):
-    class Given(GICP):
+    class Given(AbstractTerm):
         """Forces of given weight matrices."""
 
-        def forces(self, source, target, moved, rotation, valid, robust):
+        def linearize(self, source, target, moved, rotation, valid):
             matrices = cov.symmetric_from_matrix(jnp.asarray(information, float))
-            found = weighed(jnp.where(valid, target[:, :3].T - moved, 0), matrices, robust)
+            found = linearize_residual(jnp.where(valid, target.points.T - moved, 0), matrices, None)
             return found.scaled(jnp.asarray(weight, float))
 
-    tables = [np.pad(rows, [(0, 0), (0, 6)]) for rows in (moved, moved + residual)]
-    matched = Matched(*(jnp.asarray(table, float) for table in tables), jnp.asarray(valid))
-    measured = jax.jit(lambda: sums_of(jnp.eye(3), jnp.zeros(3), matched, Given(), None))()
+    points = (jnp.asarray(rows, float) for rows in (moved, moved + residual))
+    surfaces = [Surface(rows, jnp.zeros((len(rows), 6)), None, None, {}) for rows in points]
+    matched = Matched(*surfaces, jnp.asarray(valid))
+    measured = jax.jit(lambda: sums_of(Motion(jnp.eye(3), jnp.zeros(3)), matched, (Given(),)))()
     return measured, jax.jit(_solve.solve_update)(measured, jnp.eye(6))
 
 

@@ -9,7 +9,8 @@ from scipy.spatial.transform import Rotation
 
 import mcgicp_jax as mcg
 from mcgicp_jax import datasets
-from mcgicp_jax._pose_solver.pose_measurements import Fusion, Prior, TiePoints, form_at, inverse_3, inverse_6
+from mcgicp_jax._math.symmetric_matrices import inverse_3, inverse_6
+from mcgicp_jax._pose_solver.pose_measurements import Fusion, Prior, TiePoints, form_at
 from tests.differences import TO_ROUNDING, check_gradient, needs_x64, weigh
 from tests.scenes import motion, pair
 from tests.test_programs import compilations

@@ -70,23 +70,22 @@ def test_implicit_gradient_is_that_of_the_unrolled_loop(noisy):
     """Differentiating through 60 updates with M renewed each time reaches the same number, at many times the cost."""
     source, target, _ = noisy
     method, _ = CASES["gicp"]
-    from mcgicp_jax._math.poses import se3_from_matrix
-    from mcgicp_jax._methods.surface import surfaces_of
-    from mcgicp_jax._pose_solver import update as _solve
-    from mcgicp_jax._pose_solver.sums import matched_rows, sums_of
-    from mcgicp_jax._registration.step import rotation_and_translation
+    from mcgicp_jax._math.poses import move_pose, se3_from_matrix
+    from mcgicp_jax._methods.surfaces import surface_pair
+    from mcgicp_jax._pose_solver.matched import Motion, match_surfaces
+    from mcgicp_jax._pose_solver.sums import sums_of
 
     matches = mcg.find_correspondences(source, target, motion(), method, max_distance=GATE)
 
     def unrolled(points):
-        _, *surfaces = surfaces_of(method, source.replace(points=points), target, observed=False)
-        matched = matched_rows(*surfaces, matches)
+        pair = surface_pair(method, source.replace(points=points), target, observed=False)
+        matched = match_surfaces(pair.source, pair.target, matches)
 
         def body(pose, _):
-            sums = sums_of(*rotation_and_translation(pose, points.dtype), matched, method, None)
+            sums = sums_of(Motion(pose.rotation().as_matrix(), pose.translation()), matched, pair.terms)
             information, gradient = _normal_equations(sums)
             twist = jnp.linalg.solve(information, gradient)
-            return _solve.move_pose(pose, twist, sums.center), None
+            return move_pose(pose, twist, sums.center), None
 
         pose, _ = jax.lax.scan(body, se3_from_matrix(motion(), points.dtype), length=60)
         return weigh(pose.as_matrix())
@@ -104,7 +103,7 @@ def _normal_equations(sums):
     """Gauss-Newton's information and right-hand side of a (v, ω) twist, from the sums."""
     from mcgicp_jax._pose_solver import update as _solve
 
-    tangent = jnp.asarray(_solve._TANGENT, sums.first.dtype)
+    tangent = jnp.asarray(_solve._TANGENT, sums.force.dtype)
     form = _solve._quadratic_form(sums, jnp.ones_like(sums.radius))
     return tangent.T @ form[:12, :12] @ tangent, -tangent.T @ form[:12, 12]
 

@@ -10,7 +10,6 @@ from scipy.spatial.transform import Rotation
 
 import mcgicp_jax as mcg
 from mcgicp_jax import datasets
-from mcgicp_jax._local_geometry.records import observability_of
 from mcgicp_jax._math import symmetric_matrices as cov
 from mcgicp_jax._pose_solver.degeneracy import find_directions
 from mcgicp_jax._pose_solver.sums import Sums
@@ -23,8 +22,9 @@ def matrices(symmetric):
 
 
 def mean_evidence(cloud, method):
-    geometry, *channels = observability_of(prepare(method, cloud, observed=True).table)
-    return matrices(geometry).mean(axis=0), matrices(channels[0]).mean(axis=0) if channels else None
+    surface = prepare(method, cloud, observed=True)
+    geometry, channels = surface.observability, surface.channel_observability
+    return matrices(geometry.T).mean(axis=0), None if channels is None else matrices(channels.T).mean(axis=0)
 
 
 # Evidence
@@ -88,10 +88,20 @@ def test_directions_are_the_eigenvectors_of_the_share_of_motion(seed, held, radi
     matrices = np.einsum("ni,nj->nij", normals, normals) * (held / 6)
     hh = np.einsum("in,jn->ijn", *[np.concatenate([p, np.ones((1, 200))])] * 2)[np.triu_indices(4)]
     upper = matrices[:, *np.triu_indices(3)].T
-    second = np.concatenate([np.zeros((6, 10)), [hh @ weight], (weight * upper) @ hh.T])
-    totals = np.array([200, 200 * radius**2, 0, 0, 0, 200])
-    arrays = (np.zeros(3), totals, np.zeros((3, 4)), second)
-    found = jax.jit(find_directions)(Sums(*(jnp.asarray(array, float) for array in arrays)))
+    sums = Sums(
+        center=np.zeros(3),
+        count=np.array(200.0),
+        square_extent=np.array(200 * radius**2),
+        energy=np.array(0.0),
+        cost=np.array(0.0),
+        square_distance=np.array(0.0),
+        num_matched=np.array(200.0),
+        force=np.zeros((3, 4)),
+        stiffness=np.zeros((6, 10)),
+        mass=hh @ weight,
+        observability=(weight * upper) @ hh.T,
+    )
+    found = jax.jit(find_directions)(jax.tree.map(lambda array: jnp.asarray(array, float), sums))
     arms = p.T / radius
     jacobians = np.concatenate([np.tile(np.eye(3), (200, 1, 1)), -np.cross(arms[:, None, :], np.eye(3)[None])], axis=2)
     jacobians[:, :, 3:] = np.stack([np.cross(axis, arms) for axis in np.eye(3)], axis=2)

@@ -28,20 +28,21 @@ from tqdm import tqdm
 import mcgicp_jax as mcg
 from mcgicp_jax import io
 from mcgicp_jax._cli.options import (
-    METHODS,
     MethodName,
     Options,
     check_outputs,
+    common_channels,
+    described_voxels,
     listed,
-    status_of,
+    method_for,
     voxel_size_for,
-    weights_from,
     with_channels,
+    with_names,
 )
 from mcgicp_jax._cli.table import COLUMNS, POSE, Row, Table, pose_of
+from mcgicp_jax._methods.registry import METHODS
 
 Pairs: TypeAlias = Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="PAIRS")]
-Names: TypeAlias = Annotated[tuple[str, ...], tyro.conf.arg(metavar="NAMES", help_behavior_hint="(default: all)")]
 
 _INTERRUPTED = 130
 
@@ -63,15 +64,8 @@ class FilePair:
         return self.folder / self.source, self.folder / self.target
 
 
-def batch(
-    pairs: Pairs,
-    output: Path,
-    method: MethodName = "mc-gicp",
-    glob: str = "*",
-    channels: Names = (),
-    *,
-    shared: Options,
-) -> int:
+@with_names
+def batch(pairs: Pairs, output: Path, method: MethodName = "mc-gicp", glob: str = "*", *, shared: Options) -> int:
     """Register many pairs of clouds and write a table of their poses T_target_source.
 
     PAIRS is a CSV file or a folder. The CSV file has the columns source and target, with paths relative to its folder,
@@ -84,24 +78,20 @@ def batch(
         output: Table to write or to resume, .csv or .npz, a row per pair: source, target, status, iterations, inliers,
             cost, rmse, the upper three rows of the pose, the reason if it could not be registered, and a fingerprint
             of files and options.
-        method: mc-gicp, color-icp and color-ndt use channels (intensity, colours, ...), the others geometry alone.
+        method: {channel_methods} use channels (intensity, colours, ...), the others geometry alone.
         glob: Pattern for the files of a folder, such as "*.ply".
-        channels: Channels to use, such as intensity, or red green blue, or lab, hsv or yuv computed from these three;
-            every cloud must have them. By default those common to both clouds of the first pair.
     """
-    shared.check()
-    shared.check_method(method)
+    shared.check(method)
     check_outputs(output)
     everything = _pairs_of_folder(pairs, glob) if pairs.is_dir() else _pairs_of_table(pairs)
     table = Table(output)
     rows = {(row["source"], row["target"]): row for row in table.read()}
-    settings = _settings(everything, method, channels, shared)
+    settings = _settings(everything, method, shared)
     known = [pair for pair in everything if pair.key in rows]
     outdated = [pair.key for pair in known if rows[pair.key]["fingerprint"] != _fingerprint(pair, settings)]
     if outdated:
         print(f"outdated:  {len(outdated):,} in {output} with other options or files; registered again")
         rows = {key: row for key, row in rows.items() if key not in set(outdated)}
-        table.rewrite(list(rows.values()))
     missing = [pair for pair in everything if pair.key not in rows]
     finished = len(everything) - len(missing)
     print(f"pairs:     {len(everything):,}" + (f", of which {finished:,} are in {output}" if finished else ""))
@@ -124,7 +114,7 @@ def _register_missing(
     """Register pairs, adding their rows to the table and to `rows`; return whether Ctrl-C stopped it."""
     interrupted, begin = False, time.perf_counter()
     with (
-        table.appending() as append,
+        table.appending(list(rows.values())) as append,
         tqdm(total=finished + len(pairs), initial=finished, unit="pair", disable=None) as bar,
         contextlib.closing(_rows(pairs, settings, bar)) as completed,
         _interrupts() as pressed,
@@ -205,9 +195,8 @@ def _checked(path: Path, pairs: list[FilePair]) -> list[FilePair]:
     return pairs
 
 
-def _settings(pairs: Sequence[FilePair], name: MethodName, channels: Sequence[str], options: Options) -> dict[str, Any]:
+def _settings(pairs: Sequence[FilePair], method: MethodName, options: Options) -> dict[str, Any]:
     """Options common to all pairs, with defaults chosen from the first pair whose files can be read."""
-    kind = METHODS[name]
     for pair in pairs:
         try:
             clouds = [io.read(path) for path in pair.paths()]
@@ -217,21 +206,18 @@ def _settings(pairs: Sequence[FilePair], name: MethodName, channels: Sequence[st
         break
     else:
         raise reason
-    first, second = (cloud.channel_names for cloud in clouds)
-    names = tuple(channels) or tuple(name for name in first if name in second)
-    if kind.uses_channels and not names:
+    names = common_channels(options, *clouds)
+    if METHODS[method].kind.uses_channels and not names:
         raise ValueError("expected clouds with channels in common, got none; use gicp instead (--method gicp)")
     voxel_size = voxel_size_for(clouds, options)
-    print(f"points:    {'all kept' if voxel_size is None else f'voxels of {voxel_size:g} m'}")
+    print(f"points:    {described_voxels(voxel_size)}")
     print(f"channels:  {listed(names)}")
-    numbers = options.numbers_of(name)
-    if issubclass(kind, mcg.ColorICP) and not numbers:
-        source, target = (
-            mcg.preprocess(with_channels(cloud, names), voxel_size, options.num_neighbors) for cloud in clouds
-        )
-        numbers["channel_weights"] = weights_from(source, target)
+
+    def preprocessed() -> list[mcg.PointCloud]:
+        return [mcg.preprocess(with_channels(cloud, names), voxel_size, options.num_neighbors) for cloud in clouds]
+
     return options.registration() | {
-        "method": kind(**numbers),
+        "method": method_for(method, options, preprocessed),
         "channels": names,
         "voxel_size": voxel_size,
         "num_neighbors": options.num_neighbors,
@@ -283,7 +269,7 @@ def _read(path: Path, channels: Sequence[str]) -> mcg.PointCloud:
 def _row(pair: FilePair, result: mcg.Registration, reason: str, fingerprint: str) -> Row:
     numbers = (result.num_iterations, result.num_inliers, result.cost, result.rmse, *result.matrix[:3].ravel())
     values = (np.asarray(number).item() for number in numbers)
-    texts = (*pair.key, _word(status_of(result)), *map(repr, values), " ".join(reason.split()), fingerprint)
+    texts = (*pair.key, _word(result.status), *map(repr, values), " ".join(reason.split()), fingerprint)
     return dict(zip(COLUMNS, texts, strict=True))
 
 

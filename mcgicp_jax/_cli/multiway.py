@@ -13,30 +13,29 @@ import mcgicp_jax as mcg
 from mcgicp_jax import io
 from mcgicp_jax import plot as plots
 from mcgicp_jax._cli.options import (
-    METHODS,
     File,
     MethodName,
     Options,
     check_inputs,
     check_outputs,
+    common_channels,
     listed,
+    method_for,
     voxel_size_for,
-    weights_from,
     with_channels,
+    with_names,
 )
-from mcgicp_jax._methods.base import AbstractMethod
 
 Folder: TypeAlias = Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="FOLDER")]
-Names: TypeAlias = Annotated[tuple[str, ...], tyro.conf.arg(metavar="NAMES", help_behavior_hint="(default: all)")]
 
 
+@with_names
 def multiway(
     folder: Folder,
     *,
     shared: Options,
     method: MethodName = "mc-gicp",
     glob: str = "*",
-    channels: Names = (),
     init: File = None,
     output: File = None,
     map: File = None,
@@ -50,10 +49,8 @@ def multiway(
 
     Args:
         folder: Folder of clouds of one scene; in order of name, each should overlap the one before it.
-        method: mc-gicp, color-icp and color-ndt use channels (intensity, colours, ...), the others geometry alone.
+        method: {channel_methods} use channels (intensity, colours, ...), the others geometry alone.
         glob: Pattern for the files of the folder, such as "*.ply".
-        channels: Channels to use, such as intensity, or red green blue, or lab, hsv or yuv computed from these three;
-            every cloud must have them. By default those common to the first two clouds.
         init: File with a pose to start from for each cloud: 12 numbers (KITTI) or 8 (TUM) on each line.
         output: File for the poses, cloud to world, in KITTI format.
         map: File for the map in the frame of the first cloud, such as map.ply.
@@ -61,20 +58,19 @@ def multiway(
         plot: File for a picture of poses and pairs from above, such as graph.png.
     """
     check_outputs(output, graph, cloud=map, picture=plot)
-    shared.check()
-    shared.check_method(method)
+    shared.check(method)
     paths = sorted(path for path in folder.glob(glob) if path.is_file())
     if len(paths) < 2:
         raise ValueError(f"{folder}: expected at least 2 clouds {glob}, found {len(paths)}")
     check_inputs(*paths)
     raw = [io.read(path) for path in paths]
-    names = channels or tuple(name for name in raw[0].channel_names if name in raw[1].channel_names)
+    names = common_channels(shared, *raw[:2])
     voxel = voxel_size_for(raw, shared)
     clouds = [mcg.preprocess(with_channels(cloud, names), voxel, shared.num_neighbors) for cloud in raw]
     print(f"clouds:    {len(clouds)}, {len(raw[0]):,} points in the first, {len(clouds[0]):,} used")
     print(f"channels:  {listed(names)}")
     start = None if init is None else list(io.read_poses(init))
-    chosen = _method(method, shared, clouds)
+    chosen = method_for(method, shared, lambda: (clouds[1], clouds[0]))
     found = mcg.multiway(clouds, chosen, init=start, voxel_size=voxel, **shared.registration())
     _report(found)
     if output is not None:
@@ -90,13 +86,6 @@ def multiway(
     if not found.converged:
         print(f"mcgicp: the poses are {found.graph.status.name}", file=sys.stderr)
     return 0 if found.converged else 1
-
-
-def _method(name: MethodName, shared: Options, clouds: list[mcg.PointCloud]) -> AbstractMethod:
-    kind, numbers = METHODS[name], shared.numbers_of(name)
-    if issubclass(kind, mcg.ColorICP) and not numbers:
-        numbers = {"channel_weights": weights_from(clouds[1], clouds[0])}
-    return kind(**numbers)
 
 
 def _report(found: mcg.MultiwayResult) -> None:

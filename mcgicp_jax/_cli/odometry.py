@@ -7,7 +7,7 @@ import itertools
 import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Annotated, Any, Literal, TypeAlias
+from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeAlias
 
 import numpy as np
 import tyro
@@ -15,55 +15,64 @@ from jaxtyping import Float
 from tqdm import tqdm
 
 import mcgicp_jax as mcg
-from mcgicp_jax import datasets, io, metrics, plot
+from mcgicp_jax import io, metrics, plot
 from mcgicp_jax._cli.options import (
-    METHODS,
     File,
     MethodName,
     Options,
     check_outputs,
+    enumerated,
     listed,
+    method_for,
     round_voxel_size,
-    weights_from,
+    shown,
     with_channels,
+    with_names,
 )
-from mcgicp_jax._methods.base import AbstractMethod
 from mcgicp_jax._sequences.odometry import OdometryStep
+from mcgicp_jax.datasets import DATASETS, AbstractFrames, Dataset
 
-DatasetName: TypeAlias = Literal["kitti", "ford", "tum", "7-scenes", "street", "corridor", "box-room", "poster-wall"]
-Dataset: TypeAlias = Annotated[DatasetName, tyro.conf.Positional, tyro.conf.arg(metavar="DATASET")]
-Folder: TypeAlias = Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="PATH", help_behavior_hint="")]
-Distances: TypeAlias = tuple[float, float]
-Names: TypeAlias = Annotated[tuple[str, ...], tyro.conf.arg(metavar="NAMES", help_behavior_hint="(default: all)")]
+if TYPE_CHECKING:
+    DatasetName: TypeAlias = str
+else:
+    DatasetName = Literal[tuple(DATASETS)]
 
-# Function of a folder or of a number of frames; defaults of voxel size and of max_distance (at first, and when the pose
-# is refined) that suit the sensor and its motion; metres.
-_READERS: dict[str, tuple[Callable[[Path], datasets.AbstractFrames], float, Distances]] = {
-    "kitti": (datasets.kitti, 0.25, (2.5, 0.6)),
-    "ford": (datasets.ford_campus, 0.25, (2.5, 0.6)),
-    "tum": (datasets.tum_rgbd, 0.03, (0.2, 0.06)),
-    "7-scenes": (datasets.seven_scenes, 0.03, (0.2, 0.06)),
-}
-_SCENES: dict[str, tuple[Callable[[int], datasets.AbstractFrames], float | None, Distances]] = {
-    "street": (datasets.street, 0.2, (2.0, 0.5)),
-    "corridor": (datasets.corridor, None, (0.5, 0.25)),
-    "box-room": (datasets.box_room, None, (0.5, 0.25)),
-    "poster-wall": (datasets.poster_wall, None, (0.1, 0.04)),
-}
+Positional: TypeAlias = Annotated[DatasetName, tyro.conf.Positional, tyro.conf.arg(metavar="DATASET")]
+Folder: TypeAlias = Annotated[Path, tyro.conf.Positional, shown("PATH")]
+Poses: TypeAlias = list[Float[np.ndarray, "4 4"]]
+Truth: TypeAlias = list[Float[np.ndarray, "4 4"] | None]
+
 _FRAMES_OF_A_SCENE = 20
-_KITTI_LENGTHS = np.arange(100.0, 900, 100)
 
 
+def _with_datasets(command: Callable[..., int]) -> Callable[..., int]:
+    """Fill the data sets and their defaults into the help text."""
+
+    def defaults(words_of: Callable[[Dataset], str]) -> str:
+        groups = itertools.groupby(DATASETS, lambda name: words_of(DATASETS[name]))
+        return ", ".join(f"{words} for {enumerated(list(names))}" for words, names in groups)
+
+    texts = {
+        "datasets": enumerated([name for name in DATASETS if not DATASETS[name].simulated], "or"),
+        "scenes": enumerated([name for name in DATASETS if DATASETS[name].simulated], "or"),
+        "voxel_sizes": defaults(lambda each: "off" if each.voxel_size is None else f"{each.voxel_size:g}"),
+        "max_distances": defaults(lambda each: "{:g} and {:g}".format(*each.max_distance)),
+    }
+    for name, text in texts.items():
+        command.__doc__ = (command.__doc__ or "").replace(f"<{name}>", text)
+    return with_names(command)
+
+
+@_with_datasets
 def odometry(
-    dataset: Dataset,
+    dataset: Positional,
     path: Folder = Path(),
     *,
     shared: Options,
     method: MethodName = "mc-gicp",
-    channels: Names = (),
     num_frames: int | Literal["all"] = "all",
     against: Literal["previous", "map"] = "previous",
-    map_radius: Annotated[float | None, tyro.conf.arg(metavar="FLOAT", help_behavior_hint="")] = None,
+    map_radius: Annotated[float | None, shown("FLOAT")] = None,
     loops: bool = False,
     output: File = None,
     map: File = None,
@@ -71,19 +80,16 @@ def odometry(
 ) -> int:
     """Estimate the sensor's trajectory by registering each frame of a sequence to the one before it, or to a map.
 
-    DATASET is kitti, ford, tum or 7-scenes, with the sequence in the folder PATH; or a simulated scene (street,
-    corridor, box-room or poster-wall), which needs no PATH. Errors are printed if the true poses are known. The exit
-    code is 0 only if all registrations converged; output files are written in any case.
+    DATASET is <datasets>, with the sequence in the folder PATH; or a simulated scene (<scenes>), which needs no PATH.
+    Errors are printed if the true poses are known. The exit code is 0 only if all registrations converged; output files
+    are written in any case.
 
-    Defaults of --voxel-size: 0.25 for kitti and ford, 0.2 for street, 0.03 for tum and 7-scenes, off for the others.
-    Defaults of --max-distance: 2.5 and 0.6 for kitti and ford, 2 and 0.5 for street, 0.5 and 0.25 for corridor and
-    box-room, 0.2 and 0.06 for tum and 7-scenes, 0.1 and 0.04 for poster-wall.
+    Defaults of --voxel-size: <voxel_sizes>. Defaults of --max-distance: <max_distances>.
 
     Args:
         dataset: Format of the data set, or simulated scene.
         path: Folder of the sequence, such as sequences/04.
-        method: mc-gicp, color-icp and color-ndt use channels, the others geometry alone.
-        channels: Channels to use, such as intensity, or red green blue, or lab, hsv or yuv computed from these three.
+        method: {channel_methods} use channels, the others geometry alone.
         num_frames: Number of frames to use, from the start; all means 20 for a simulated scene.
         against: Register each frame to the one before it, or to a map of all frames before it, which drifts less.
         map_radius: Metres; points further from the sensor leave the map. By default the range of the first frame.
@@ -94,28 +100,30 @@ def odometry(
         plot: File for a picture of the trajectory from above, such as way.png.
     """
     check_outputs(output, cloud=map, picture=plot)
-    shared.check()
-    shared.check_method(method)
-    frames, usual_voxel, usual_distance = _open(dataset, path, num_frames)
+    shared.check(method)
+    defaults, frames = DATASETS[dataset], _open(dataset, path, num_frames)
     given = shared.voxel_size
-    voxel = given if not isinstance(given, str) else usual_voxel if given == "auto" else None
+    voxel = given if not isinstance(given, str) else defaults.voxel_size if given == "auto" else None
     options: dict[str, Any] = {
-        "max_distance": usual_distance,
+        "max_distance": defaults.max_distance,
         "num_neighbors": shared.num_neighbors,
         "against": against,
         "map_radius": map_radius,
         "loops": loops,
     } | shared.registration()
     first = frames[0]
-    names = channels or first.cloud.channel_names
+    names = shared.channels or first.cloud.channel_names
     print(f"frames:    {len(frames)} of {dataset}, {len(first.cloud):,} points in the first")
     print(f"channels:  {listed(names)}")
-    truth: list[Float[np.ndarray, "4 4"] | None] = []
-    chosen = _method(method, shared.numbers_of(method), frames, names, voxel)
+
+    def first_two() -> list[mcg.PointCloud]:
+        return [mcg.preprocess(with_channels(frames[row].cloud, names), voxel) for row in (1, 0)]
+
+    truth: Truth = []
+    chosen = method_for(method, shared, first_two)
     steps = mcg.odometry(_clouds(frames, names, truth), chosen, voxel_size=voxel, start=first.pose, **options)
     map_voxel = round_voxel_size([first.cloud], len(first.cloud) // 2) if map and voxel is None else voxel
-    follow = _follow_loops if loops else _follow
-    poses, results = follow(steps, len(frames), map, map_voxel)
+    poses, results = _follow(steps, len(frames), loops, map, map_voxel)
     _report(poses, truth, results)
     if output is not None:
         io.write_poses(output, poses)
@@ -126,90 +134,61 @@ def odometry(
     return 1 if failed else 0
 
 
-def _open(
-    dataset: DatasetName, path: Path, num_frames: int | Literal["all"]
-) -> tuple[datasets.AbstractFrames, float | None, Distances]:
+def _open(dataset: DatasetName, path: Path, num_frames: int | Literal["all"]) -> AbstractFrames:
     if num_frames != "all" and num_frames < 2:
         raise ValueError(f"num_frames: expected at least 2, got {num_frames}")
-    if dataset in _SCENES:
-        scene, voxel, distance = _SCENES[dataset]
-        return scene(_FRAMES_OF_A_SCENE if num_frames == "all" else num_frames), voxel, distance
-    reader, voxel, distance = _READERS[dataset]
-    frames = reader(path)
+    if DATASETS[dataset].simulated:
+        return DATASETS[dataset].frames(_FRAMES_OF_A_SCENE if num_frames == "all" else num_frames)
+    frames = DATASETS[dataset].frames(path)
     if len(frames) < 2:
         raise ValueError(f"{path}: expected at least 2 frames, got {len(frames)}")
-    return frames if num_frames == "all" else frames[:num_frames], voxel, distance
+    return frames if num_frames == "all" else frames[:num_frames]
 
 
-def _follow(
-    steps: Iterator[OdometryStep], num_frames: int, map: Path | None, voxel_size: float | None
-) -> tuple[list[Float[np.ndarray, "4 4"]], list[mcg.Registration]]:
-    """Run the odometry, write the map if it has a file, and return the poses and the registrations."""
-    poses, results = [], []
-
-    def followed() -> Iterator[tuple[mcg.PointCloud, Float[np.ndarray, "4 4"]]]:
-        for step in tqdm(steps, total=num_frames, unit="frame", disable=None):
-            poses.append(step.pose)
-            if step.registration is not None:
-                results.append(step.registration)
-            yield step.cloud, step.pose
-
-    if map is None or voxel_size is None:
-        collections.deque(followed(), maxlen=0)
-    else:
-        # A stream: no cloud is kept once it is in the map.
-        with_clouds, with_poses = itertools.tee(followed())
-        world = mcg.aggregate((cloud for cloud, _ in with_clouds), (pose for _, pose in with_poses), voxel_size)
-        _write_map(map, world, voxel_size)
-    return poses, results
-
-
-def _follow_loops(
-    steps: Iterator[OdometryStep], num_frames: int, map: Path | None, voxel_size: float | None
-) -> tuple[list[Float[np.ndarray, "4 4"]], list[mcg.Registration]]:
-    """As `_follow`, with the poses as the last loop left them."""
-    followed = list(tqdm(steps, total=num_frames, unit="frame", disable=None))
-    graph: Any = followed[-1].graph
-    print(f"loops:     {int(np.asarray(graph.edges.uncertain).sum())} closed")
-    if map is not None and voxel_size is not None:
-        _write_map(map, mcg.aggregate((step.cloud for step in followed), graph.poses, voxel_size), voxel_size)
-    return list(graph.poses), [step.registration for step in followed if step.registration is not None]
-
-
-def _write_map(path: Path, world: mcg.PointCloud, voxel_size: float) -> None:
-    io.write(path, world)
-    print(f"map:       {path}, {len(world):,} points, voxels of {voxel_size:g} m")
-
-
-def _clouds(
-    frames: datasets.AbstractFrames, names: tuple[str, ...], truth: list[Float[np.ndarray, "4 4"] | None]
-) -> Iterator[mcg.PointCloud]:
+def _clouds(frames: AbstractFrames, names: tuple[str, ...], truth: Truth) -> Iterator[mcg.PointCloud]:
     """Yield the cloud of each frame, and append its true pose to `truth`."""
     for frame in frames:
         truth.append(frame.pose)
         yield with_channels(frame.cloud, names)
 
 
-def _method(
-    name: MethodName,
-    numbers: dict[str, Any],
-    frames: datasets.AbstractFrames,
-    channels: tuple[str, ...],
-    voxel_size: float | None,
-) -> AbstractMethod:
-    kind = METHODS[name]
-    if numbers or not issubclass(kind, mcg.ColorICP):
-        return kind(**numbers)
-    # Channel weights from the first two frames, as mc-gicp would choose them.
-    first, second = (mcg.preprocess(with_channels(frame.cloud, channels), voxel_size) for frame in frames[:2])
-    return kind(channel_weights=weights_from(second, first))
+def _follow(
+    steps: Iterator[OdometryStep], num_frames: int, loops: bool, map: Path | None, voxel_size: float | None
+) -> tuple[Poses, list[mcg.Registration]]:
+    """Run the odometry, write the map if it has a file, and return the poses and the registrations."""
+    poses: Poses = []
+    results: list[mcg.Registration] = []
+    last: Any = None
+
+    def followed() -> Iterator[tuple[mcg.PointCloud, Float[np.ndarray, "4 4"]]]:
+        for step in tqdm(steps, total=num_frames, unit="frame", disable=None):
+            nonlocal last
+            last = step
+            poses.append(step.pose)
+            if step.registration is not None:
+                results.append(step.registration)
+            yield step.cloud, step.pose
+
+    # A stream: no cloud is kept once it is in the map.
+    stream: Iterator[tuple[mcg.PointCloud, Float[np.ndarray, "4 4"]]] = followed()
+    if loops:
+        # The poses as the last loop left them.
+        clouds = [cloud for cloud, _ in followed()]
+        graph: Any = last.graph
+        print(f"loops:     {int(np.asarray(graph.edges.uncertain).sum())} closed")
+        poses[:] = graph.poses
+        stream = zip(clouds, poses, strict=True)
+    if map is None or voxel_size is None:
+        collections.deque(stream, maxlen=0)
+        return poses, results
+    with_clouds, with_poses = itertools.tee(stream)
+    world = mcg.aggregate((cloud for cloud, _ in with_clouds), (pose for _, pose in with_poses), voxel_size)
+    io.write(map, world)
+    print(f"map:       {map}, {len(world):,} points, voxels of {voxel_size:g} m")
+    return poses, results
 
 
-def _report(
-    poses: list[Float[np.ndarray, "4 4"]],
-    truth: list[Float[np.ndarray, "4 4"] | None],
-    results: list[mcg.Registration],
-) -> None:
+def _report(poses: Poses, truth: Truth, results: list[mcg.Registration]) -> None:
     iterations = np.mean([np.asarray(result.num_iterations) for result in results])
     converged = sum(bool(result.converged) for result in results)
     print(f"pairs:     {converged} of {len(results)} converged, {iterations:.1f} iterations on average")
@@ -226,18 +205,13 @@ def _report(
         f"ATE:       {1e3 * whole:.1f} mm rms after the best alignment, {1e3 * first:.1f} mm aligned at the first pose"
     )
     length = float(np.linalg.norm(np.diff(np.array(true)[:, :3, 3], axis=0), axis=1).sum())
-    segments = _KITTI_LENGTHS[length > _KITTI_LENGTHS] if length > _KITTI_LENGTHS[0] else np.array([length / 2])
-    percent, degrees = metrics.kitti_errors(estimated, true, lengths=segments.tolist(), step=1)
+    segments = [each for each in metrics.KITTI_LENGTHS if each < length] or [length / 2]
+    percent, degrees = metrics.kitti_errors(estimated, true, lengths=segments, step=1)
     shown = ", ".join(f"{segment:.3g}" for segment in segments)
     print(f"drift:     {percent:.2f} %, {degrees:.4f} deg/m over segments of {shown} m")
 
 
-def _draw(
-    path: Path,
-    method: MethodName,
-    poses: list[Float[np.ndarray, "4 4"]],
-    truth: list[Float[np.ndarray, "4 4"] | None],
-) -> None:
+def _draw(path: Path, method: MethodName, poses: Poses, truth: Truth) -> None:
     known = [pose for pose in truth if pose is not None]
     plot.trajectories(({"truth": known} if known else {}) | {method: poses}, path=path)
     print(f"picture:   {path}")

@@ -1,69 +1,63 @@
-"""Shared by the commands: methods by name, options, checks of files, the choice of voxel sizes, statuses in words."""
+"""Shared by the commands: their options, checks of files, choices that depend on the clouds, and results in words."""
 
 from __future__ import annotations
 
 import bisect
 import errno
+import inspect
 import os
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import Annotated, Any, Literal, TypeAlias
+from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeAlias, TypeVar
 
 import numpy as np
 import tyro
 
 import mcgicp_jax as mcg
 from mcgicp_jax import plot
+from mcgicp_jax._clouds.color_spaces import COLOR_SPACES
 from mcgicp_jax._clouds.preprocess import check_preprocessing
 from mcgicp_jax._local_geometry.spacing_and_noise import point_spacing
-from mcgicp_jax._math.robust_kernels import AbstractKernel
+from mcgicp_jax._math.robust_kernels import KERNELS
 from mcgicp_jax._methods.base import AbstractMethod
+from mcgicp_jax._methods.registry import METHODS
 from mcgicp_jax._registration.options import ROTATION_TOLERANCE
-from mcgicp_jax._registration.options import Options as Chosen
-from mcgicp_jax._registration.register_pair import default_distances
-from mcgicp_jax.io.formats import READERS, WRITERS, by_suffix
+from mcgicp_jax._registration.options import Options as RegistrationOptions
+from mcgicp_jax._registration.settings import default_distances
+from mcgicp_jax.io.clouds import FORMATS, format_of
 
-MethodName: TypeAlias = Literal[
-    "mc-gicp", "gicp", "color-icp", "point-to-plane", "point-to-point", "ndt", "color-ndt", "d2d-ndt"
-]
-File: TypeAlias = Annotated[Path | None, tyro.conf.arg(metavar="FILE", help_behavior_hint="")]
-Start: TypeAlias = Annotated[
-    Literal["global"] | Path | None, tyro.conf.arg(metavar="{FILE,global}", help_behavior_hint="")
-]
-Numbers: TypeAlias = Annotated[tuple[float, ...], tyro.conf.arg(help_behavior_hint="(default: from the data)")]
-Distances: TypeAlias = Annotated[tuple[float, ...], tyro.conf.arg(help_behavior_hint="(default: 10 and 2.5 spacings)")]
-Tolerance: TypeAlias = Annotated[
-    float | None, tyro.conf.arg(metavar="FLOAT", help_behavior_hint="(default: 0.005 spacings)")
-]
-KernelName: TypeAlias = Literal["huber", "cauchy", "geman-mcclure", "tukey"]
-Epsilon: TypeAlias = Annotated[float | None, tyro.conf.arg(metavar="FLOAT", help_behavior_hint="(default: 0.001)")]
-CommonNames: TypeAlias = Annotated[
-    tuple[str, ...], tyro.conf.arg(metavar="NAMES", help_behavior_hint="(default: all in common)")
+if TYPE_CHECKING:
+    MethodName: TypeAlias = str
+    KernelName: TypeAlias = str
+else:
+    MethodName, KernelName = Literal[tuple(METHODS)], Literal[tuple(KERNELS)]
+
+Documented = TypeVar("Documented")
+
+
+def shown(metavar: str | None = None, default: str = "") -> Any:
+    """How the help shows an option: its value, and what applies without it."""
+    return tyro.conf.arg(metavar=metavar, help_behavior_hint=default and f"(default: {default})")
+
+
+File: TypeAlias = Annotated[Path | None, shown("FILE")]
+Start: TypeAlias = Annotated[Literal["global"] | Path | None, shown("{FILE,global}")]
+Names: TypeAlias = Annotated[tuple[str, ...], shown("NAMES", "all in common")]
+Numbers: TypeAlias = Annotated[tuple[float, ...], shown(default="from the data")]
+Distances: TypeAlias = Annotated[tuple[float, ...], shown(default="10 and 2.5 spacings")]
+Sizes: TypeAlias = Annotated[tuple[float, ...], shown(default="none")]
+Tolerance: TypeAlias = Annotated[float | None, shown("FLOAT", "0.005 spacings")]
+Kernel: TypeAlias = Annotated[tuple[KernelName, float] | None, shown("KERNEL SCALE")]
+Epsilon: TypeAlias = Annotated[
+    float | None, shown("FLOAT", str(inspect.signature(mcg.GICP).parameters["epsilon"].default))
 ]
 
-VERSION = mcg.__version__
-METHODS: dict[MethodName, type[AbstractMethod]] = {
-    "mc-gicp": mcg.MultiChannelGICP,
-    "gicp": mcg.GICP,
-    "color-icp": mcg.ColorICP,
-    "point-to-plane": mcg.PointToPlane,
-    "point-to-point": mcg.PointToPoint,
-    "ndt": mcg.NDT,
-    "color-ndt": mcg.ColorNDT,
-    "d2d-ndt": mcg.D2DNDT,
-}
 _RGB = ("red", "green", "blue")
-# Channels that are computed from red, green and blue.
-_SPACES: dict[str, Callable[..., Any]] = {"lab": mcg.rgb_to_lab, "hsv": mcg.rgb_to_hsv, "yuv": mcg.rgb_to_yuv}
+# Parameters of methods that have an option.
+_PARAMETERS = ("channel_covariance", "channel_weights", "epsilon")
 # Larger clouds are downsampled to at most this many points by default: registered in a tenth of a second.
 _MOST_POINTS = 20_000
-_KERNELS: dict[KernelName, type[AbstractKernel]] = {
-    "huber": mcg.Huber,
-    "cauchy": mcg.Cauchy,
-    "geman-mcclure": mcg.GemanMcClure,
-    "tukey": mcg.Tukey,
-}
 ADVICE = {
     mcg.Status.MAX_ITERATIONS: "the pose was still changing after the last iteration; "
     "try a larger --max-iterations, or --init with a better initial pose",
@@ -75,11 +69,32 @@ ADVICE = {
 }
 
 
+def enumerated(names: Sequence[str], last: str = "and") -> str:
+    return f" {last} ".join(filter(None, [", ".join(names[:-1]), names[-1]]))
+
+
+def with_names(documented: Documented) -> Documented:
+    """Fill the names from the registries into the help text of a command or of its options."""
+    having = {name: [m for m in METHODS if name in METHODS[m].kind.__dataclass_fields__] for name in _PARAMETERS}
+    documented.__doc__ = (documented.__doc__ or "").format(
+        formats=enumerated(list(FORMATS), "or"),
+        spaces=enumerated(list(COLOR_SPACES), "or"),
+        kernels=enumerated(list(KERNELS), "or"),
+        channel_methods=enumerated([name for name in METHODS if METHODS[name].kind.uses_channels]),
+        cell_methods=enumerated([name for name in METHODS if METHODS[name].kind.needs_covariances]),
+        **{name: enumerated(methods) for name, methods in having.items()},
+    )
+    return documented
+
+
+@with_names
 @dataclass(frozen=True)
 class Options:
     """Options of preprocessing and registration.
 
     Attributes:
+        channels: Channels to use, such as intensity, or red green blue, or {spaces} computed from these three. By
+            default those that the first two clouds have in common.
         voxel_size: Metres; the points of each voxel are averaged. auto: all points are kept in clouds of up to 20,000
             points; otherwise the smallest of 1, 1.5, 2, 3, 5, 7, 10, ... times a power of ten that leaves at most
             20,000 in each cloud. off: all points are kept.
@@ -89,68 +104,61 @@ class Options:
         max_iterations: Largest number of pose updates.
         translation_tolerance: Metres; registration has converged once an update is below both tolerances.
         rotation_tolerance: Radians.
-        robust: Robust kernel and its scale in units of the Mahalanobis distance, such as huber 1.0.
+        robust: Robust kernel ({kernels}) and its scale in units of the Mahalanobis distance, such as huber 1.0.
         hold_free_directions: Keep the initial pose in directions that neither geometry nor channels constrain.
         match_channels: Scale and shift the channels of the source to the distribution of those of the target.
         scales: Voxel sizes in metres, coarse to fine, at which to register first if the initial pose is far off. For
-            ndt, color-ndt and d2d-ndt the sizes of the cells; by default 32, 16 and 8 times the spacing of the points.
-        channel_covariance: For mc-gicp: one variance for all channels, or one for each; channel units squared.
-        channel_weights: For mc-gicp, color-icp and color-ndt: one weight for all channels, or one for each; metres per
-            channel unit.
-        epsilon: For mc-gicp and gicp: variance along the normal relative to that within the surface.
+            {cell_methods} the sizes of the cells; by default 32, 16 and 8 times the spacing of the points.
+        channel_covariance: For {channel_covariance}: one variance for all channels, or one for each; channel units
+            squared.
+        channel_weights: For {channel_weights}: one weight for all channels, or one for each; metres per channel unit.
+        epsilon: For {epsilon}: variance along the normal relative to that within the surface.
     """
 
+    channels: Names = ()
     voxel_size: float | Literal["auto", "off"] = "auto"
     num_neighbors: int = 20
     max_distance: Distances = ()
-    max_iterations: int = Chosen.max_iterations
+    max_iterations: int = RegistrationOptions.max_iterations
     translation_tolerance: Tolerance = None
     rotation_tolerance: float = ROTATION_TOLERANCE
-    robust: Annotated[tuple[KernelName, float] | None, tyro.conf.arg(metavar="KERNEL SCALE", help_behavior_hint="")] = (
-        None
-    )
+    robust: Kernel = None
     hold_free_directions: bool = True
     match_channels: bool = False
-    scales: Annotated[tuple[float, ...], tyro.conf.arg(help_behavior_hint="(default: none)")] = ()
+    scales: Sizes = ()
     channel_covariance: Numbers = ()
     channel_weights: Numbers = ()
     epsilon: Epsilon = None
 
-    def check(self) -> None:
-        """Raise `ValueError` or `OSError` for invalid options, before any cloud is read."""
+    def check(self, method: MethodName | None = None) -> None:
+        """Raise `ValueError` or `OSError` for invalid options, or parameters that the method lacks; reads no cloud."""
         check_preprocessing(None if isinstance(self.voxel_size, str) else self.voxel_size, self.num_neighbors)
-        mcg.MultiChannelGICP(**self.numbers())
-        Chosen(**self.registration())
-
-    def check_method(self, name: MethodName) -> None:
-        """Raise `ValueError` if a parameter is given that the method does not have."""
-        unknown = self.numbers().keys() - METHODS[name].__dataclass_fields__.keys()
+        mcg.MultiChannelGICP(**self._parameters())
+        RegistrationOptions(**self.registration())
+        unknown = self._parameters().keys() - self.parameters_of(method).keys() if method else set()
         if unknown:
-            raise ValueError(f"{name} has no {' and no '.join(sorted(unknown))}")
+            raise ValueError(f"{method} has no {' and no '.join(sorted(unknown))}")
 
-    def numbers(self) -> dict[str, Any]:
-        """The method parameters that the user gave."""
-        given: dict[str, Any] = {} if self.epsilon is None else {"epsilon": self.epsilon}
-        for name in ("channel_covariance", "channel_weights"):
-            if values := getattr(self, name):
-                given[name] = values[0] if len(values) == 1 else values
-        return given
+    def parameters_of(self, method: MethodName) -> dict[str, Any]:
+        """The parameters that the user gave and that this method has."""
+        known = METHODS[method].kind.__dataclass_fields__
+        return {name: value for name, value in self._parameters().items() if name in known}
 
-    def numbers_of(self, name: MethodName) -> dict[str, Any]:
-        """The method parameters that the user gave and that this method has."""
-        return {field: value for field, value in self.numbers().items() if field in METHODS[name].__dataclass_fields__}
+    def _parameters(self) -> dict[str, Any]:
+        given = {name: getattr(self, name) for name in _PARAMETERS if getattr(self, name) not in (None, ())}
+        return {name: value[0] if np.shape(value) == (1,) else value for name, value in given.items()}
 
     def registration(self) -> dict[str, Any]:
         """Keyword arguments of `mcgicp_jax.register`."""
         if len(self.max_distance) > 2:
             raise ValueError(f"max_distance: expected one or two numbers, got {self.max_distance}")
-        names = ("max_iterations", "translation_tolerance", "rotation_tolerance", "hold_free_directions")
-        options = {name: getattr(self, name) for name in (*names, "match_channels", "scales")}
+        names = [field.name for field in fields(RegistrationOptions) if hasattr(self, field.name)]
+        options = {name: getattr(self, name) for name in names if name != "max_distance"}
         if self.max_distance:
             options["max_distance"] = self.max_distance if len(self.max_distance) == 2 else self.max_distance[0]
         if self.robust is not None:
             name, scale = self.robust
-            options["robust"] = _KERNELS[name](scale)
+            options["robust"] = KERNELS[name](scale)
         return options
 
 
@@ -161,17 +169,11 @@ class PairOptions(Options):
     Attributes:
         init: File with the initial pose T_target_source: a 4x4 matrix, or 12 numbers (KITTI) or 8 (TUM) on one line. By
             default the identity. global: the pose is found from any start by local features.
-        channels: Channels to use, such as intensity, or red green blue, or lab, hsv or yuv computed from these three.
         plot: File for a picture of the clouds before and after registration, such as out.png.
     """
 
     init: Start = None
-    channels: CommonNames = ()
     plot: File = None
-
-    def check(self) -> None:
-        super().check()
-        check_outputs(picture=self.plot)
 
 
 def check_outputs(*files: Path | None, cloud: Path | None = None, picture: Path | None = None) -> None:
@@ -182,7 +184,7 @@ def check_outputs(*files: Path | None, cloud: Path | None = None, picture: Path 
         if path is not None and not path.parent.is_dir():
             raise FileNotFoundError(errno.ENOENT, f"{os.strerror(errno.ENOENT)}: {path.parent}", str(path))
     if cloud is not None:
-        by_suffix(WRITERS, cloud)
+        format_of(cloud)
     if picture is not None:
         plot.check_picture(picture)
 
@@ -190,8 +192,22 @@ def check_outputs(*files: Path | None, cloud: Path | None = None, picture: Path 
 def check_inputs(*clouds: Path) -> None:
     """Raise `ValueError` or `OSError` for files that are missing or of unknown format, before any is read."""
     for path in clouds:
-        by_suffix(READERS, path)
+        format_of(path)
         path.stat()
+
+
+def method_for(name: MethodName, options: Options, clouds: Callable[[], Sequence[mcg.PointCloud]]) -> AbstractMethod:
+    """The method with the user's parameters. Color ICP's weights, if not given, come from two preprocessed clouds."""
+    given = options.parameters_of(name)
+    if issubclass(METHODS[name].kind, mcg.ColorICP) and not given:
+        given["channel_weights"] = weights_from(*clouds())
+    return METHODS[name](**given)
+
+
+def weights_from(source: mcg.PointCloud, target: mcg.PointCloud) -> Any:
+    """Channel weights α from the data, as mc-gicp chooses them."""
+    chosen: Any = mcg.MultiChannelGICP().resolve(source, target)
+    return chosen.channel_weights
 
 
 def voxel_size_for(clouds: Sequence[mcg.PointCloud], options: Options) -> float | None:
@@ -201,12 +217,6 @@ def voxel_size_for(clouds: Sequence[mcg.PointCloud], options: Options) -> float 
     # `preprocess` cannot average covariances.
     few = max(map(len, clouds)) <= _MOST_POINTS or any(cloud.covariances is not None for cloud in clouds)
     return None if options.voxel_size == "off" or few else round_voxel_size(clouds, _MOST_POINTS)
-
-
-def described_distance(options: Options, target: mcg.PointCloud) -> str:
-    """`max_distance` in words."""
-    distances = options.max_distance or default_distances(point_spacing(target), target)
-    return " m, then ".join(f"{float(distance):.3g}" for distance in distances) + " m"
 
 
 def round_voxel_size(clouds: Sequence[mcg.PointCloud], most: int) -> float:
@@ -227,9 +237,23 @@ def round_voxel_size(clouds: Sequence[mcg.PointCloud], most: int) -> float:
     return sizes[bisect.bisect_left(sizes, -most, key=lambda size: -occupied(size))]
 
 
+def described_distance(options: Options, target: mcg.PointCloud) -> str:
+    """`max_distance` in words."""
+    distances = options.max_distance or default_distances(point_spacing(target), target)
+    return " m, then ".join(f"{float(distance):.3g}" for distance in distances) + " m"
+
+
+def described_voxels(voxel_size: float | None) -> str:
+    return "all kept" if voxel_size is None else f"voxels of {voxel_size:g} m"
+
+
+def common_channels(options: Options, first: mcg.PointCloud, second: mcg.PointCloud) -> tuple[str, ...]:
+    return options.channels or tuple(name for name in first.channel_names if name in second.channel_names)
+
+
 def with_channels(cloud: mcg.PointCloud, names: Sequence[str]) -> mcg.PointCloud:
-    """The cloud with only the named channels, in this order; lab, hsv and yuv are computed from red, green and blue."""
-    needed = [name for each in names for name in (_RGB if each in _SPACES else (each,))]
+    """The cloud with only the named channels, in this order; a colour space is computed from red, green and blue."""
+    needed = [name for each in names for name in (_RGB if each in COLOR_SPACES else (each,))]
     missing = [name for name in dict.fromkeys(needed) if name not in cloud.channel_names]
     if missing:
         raise ValueError(f"no channel {', '.join(missing)}; there are {listed(cloud.channel_names)}")
@@ -237,36 +261,20 @@ def with_channels(cloud: mcg.PointCloud, names: Sequence[str]) -> mcg.PointCloud
     channels, known, chosen = np.asarray(cloud.channels)[:, columns], cloud.channel_valid, list[str]()
     known = None if known is None else np.asarray(known)[:, columns]
     for name in names:
-        here = slice(len(chosen), len(chosen) + len(_RGB))
-        if name in _SPACES:
-            channels[:, here] = _SPACES[name](channels[:, here])
+        three = slice(len(chosen), len(chosen) + len(_RGB))
+        if name in COLOR_SPACES:
+            channels[:, three] = COLOR_SPACES[name](channels[:, three])
             if known is not None:
-                known[:, here] = known[:, here].all(axis=1, keepdims=True)
-        chosen += [f"{name}_{i}" for i in range(len(_RGB))] if name in _SPACES else [name]
+                known[:, three] = known[:, three].all(axis=1, keepdims=True)
+        chosen += [f"{name}_{i}" for i in range(len(_RGB))] if name in COLOR_SPACES else [name]
     return mcg.PointCloud(
         cloud.points, channels, channel_valid=known, covariances=cloud.covariances, channel_names=chosen
     )
-
-
-def weights_from(source: mcg.PointCloud, target: mcg.PointCloud) -> Any:
-    """Channel weights α from the data, as mc-gicp chooses them."""
-    chosen: Any = mcg.MultiChannelGICP().resolve(source, target)
-    return chosen.channel_weights
 
 
 def listed(names: Sequence[str]) -> str:
     return ", ".join(names) if names else "no channels"
 
 
-def described(method: AbstractMethod) -> str:
-    shown = [name for name in ("channel_covariance", "channel_weights", "epsilon") if hasattr(method, name)]
-    numbers = [(name, np.atleast_1d(getattr(method, name))) for name in shown]
-    return "".join(f", {name} {' '.join(f'{value:.3g}' for value in values)}" for name, values in numbers)
-
-
-def status_of(result: mcg.Registration) -> mcg.Status:
-    return mcg.Status(int(np.asarray(result.status_code)))
-
-
 def words(result: mcg.Registration) -> str:
-    return status_of(result).name.lower().replace("_", " ")
+    return result.status.name.lower().replace("_", " ")

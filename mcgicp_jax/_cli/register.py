@@ -16,23 +16,26 @@ import mcgicp_jax as mcg
 from mcgicp_jax import datasets, io, metrics, plot
 from mcgicp_jax._cli.options import (
     ADVICE,
-    METHODS,
     File,
     MethodName,
     PairOptions,
     check_inputs,
     check_outputs,
-    described,
+    common_channels,
     described_distance,
+    described_voxels,
+    enumerated,
     listed,
-    status_of,
+    method_for,
     voxel_size_for,
-    weights_from,
     with_channels,
+    with_names,
     words,
 )
 from mcgicp_jax._methods.base import AbstractMethod
+from mcgicp_jax._methods.registry import METHODS
 from mcgicp_jax._pose_solver.degeneracy import describe
+from mcgicp_jax._registration.settings import matching_spacing
 
 Source: TypeAlias = Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="SOURCE")]
 Target: TypeAlias = Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="TARGET")]
@@ -41,46 +44,39 @@ Target: TypeAlias = Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar=
 class PreparedPair:
     """Two preprocessed clouds with the channels that they have in common."""
 
-    def __init__(self, source: Path, target: Path, options: PairOptions, *, cells: bool = False):
-        """Read, preprocess and print; `cells`: only for a method that matches cells, not points."""
-        options.check()
+    def __init__(self, source: Path, target: Path, options: PairOptions, *, with_cells: bool = False):
+        """Read, preprocess and print; `with_cells`: the only method matches cells, not points."""
         check_inputs(source, target)
         self.options = options
         self.start = np.eye(4) if options.init in (None, "global") else _read_pose(Path(options.init))
-        self.whole = io.read(source), io.read(target)
-        names = [cloud.channel_names for cloud in self.whole]
-        self.channels = list(options.channels) or [name for name in names[0] if name in names[1]]
+        self.raw = io.read(source), io.read(target)
+        names = [cloud.channel_names for cloud in self.raw]
+        self.channels = common_channels(options, *self.raw)
         self.difference = f"{source} has {listed(names[0])}, {target} has {listed(names[1])}"
-        voxel_size = voxel_size_for(self.whole, options)
+        voxel_size = voxel_size_for(self.raw, options)
         self.source, self.target = (
             _preprocess(path, cloud, self.channels, voxel_size, options.num_neighbors)
-            for path, cloud in zip((source, target), self.whole, strict=True)
+            for path, cloud in zip((source, target), self.raw, strict=True)
         )
-        counts = [
-            f"{len(c):,} of {len(whole):,}" for c, whole in zip((self.source, self.target), self.whole, strict=True)
-        ]
-        voxels = "all kept" if voxel_size is None else f"voxels of {voxel_size:g} m"
-        print(f"points:    source {counts[0]}, target {counts[1]} ({voxels})")
-        if not cells:
+        counts = (
+            f"{len(used):,} of {len(raw):,}" for used, raw in zip((self.source, self.target), self.raw, strict=True)
+        )
+        print("points:    source {}, target {} ({})".format(*counts, described_voxels(voxel_size)))
+        if not with_cells:
             print(f"matches:   up to {described_distance(options, self.target)} apart")
         # Without common channels, `method` raises an error if the method needs any.
         unused = self.channels and names[0] != names[1] and not options.channels
-        difference = f" ({self.difference})" if unused else ""
-        print(f"channels:  {listed(self.channels)}{difference}")
+        print(f"channels:  {listed(self.channels)}{f' ({self.difference})' if unused else ''}")
         if options.init == "global":
-            self.start = _found(self.whole, self.channels)
+            self.start = _found(self.raw, self.channels)
 
     def method(self, name: MethodName) -> AbstractMethod:
         """The method with parameters from the options or else from the data."""
-        kind = METHODS[name]
-        if kind.uses_channels and not self.channels:
+        if METHODS[name].kind.uses_channels and not self.channels:
             raise ValueError(
                 f"{name} needs channels in common, but {self.difference}; use gicp instead (--method gicp)"
             )
-        numbers = self.options.numbers_of(name)
-        if issubclass(kind, mcg.ColorICP) and not numbers:
-            numbers = {"channel_weights": weights_from(self.source, self.target)}
-        return kind(**numbers).resolve(self.source, self.target)
+        return method_for(name, self.options, lambda: (self.source, self.target)).resolve(self.source, self.target)
 
     def errors(self, pose: Float[np.ndarray, "4 4"], true_pose: Float[np.ndarray, "4 4"]) -> str:
         """Translation error in mm at the centroid of the source, and rotation error in degrees, as two columns."""
@@ -92,7 +88,7 @@ class PreparedPair:
         source, target, options = self.source, self.target, self.options.registration()
         if method.needs_covariances:
             # Cells are made of all points.
-            whole = [with_channels(cloud, self.channels) for cloud in self.whole]
+            whole = [with_channels(cloud, self.channels) for cloud in self.raw]
             source = whole[0] if "source" in method.needs_covariances else source
             target = whole[1]
             options["scales"] = self.cells(method)
@@ -100,16 +96,17 @@ class PreparedPair:
 
     def cells(self, method: AbstractMethod) -> tuple[float, ...]:
         """Sizes of the cells, metres, for methods that need any: with 8 spacings, a cell has some tens of points."""
-        spacing = float(method.spacing(self.target))
+        spacing = float(matching_spacing(method, self.target))
         return self.options.scales or tuple(float(f"{times * spacing:.2g}") for times in (32, 16, 8))
 
     def draw(self, results: dict[MethodName, mcg.Registration]) -> None:
         if self.options.plot is not None:
             poses: dict[str, Any] = {"start": self.start, **{name: result.matrix for name, result in results.items()}}
-            plot.before_after(*self.whole, poses, path=self.options.plot)
+            plot.before_after(*self.raw, poses, path=self.options.plot)
             print(f"picture:   {self.options.plot}")
 
 
+@with_names
 def register(
     source: Source,
     target: Target,
@@ -120,42 +117,29 @@ def register(
 ) -> int:
     """Estimate the pose T_target_source that moves SOURCE onto TARGET.
 
-    Clouds are .ply, .pcd, .las, .laz, .bin (KITTI), .npy, .npz, .xyz, .txt or .csv files. The exit code is 0 only if
-    the registration converged; output files are written in any case, unless --init global finds no pose.
+    Clouds are {formats} files. The exit code is 0 only if the registration converged; output files are written in any
+    case, unless --init global finds no pose.
 
     Args:
         source: Cloud to move.
         target: Cloud that stays.
-        method: mc-gicp, color-icp and color-ndt use channels (intensity, colours, ...), the others geometry alone.
+        method: {channel_methods} use channels (intensity, colours, ...), the others geometry alone.
         output: File for the pose in KITTI format: the upper three rows of its matrix on one line.
         aligned: File for the whole source cloud moved by the pose, such as out.ply.
     """
-    shared.check_method(method)
-    check_outputs(output, cloud=aligned)
-    pair = PreparedPair(source, target, shared, cells=bool(METHODS[method].needs_covariances))
+    shared.check(method)
+    check_outputs(output, cloud=aligned, picture=shared.plot)
+    pair = PreparedPair(source, target, shared, with_cells=bool(METHODS[method].kind.needs_covariances))
     chosen = pair.method(method)
-    print(f"method:    {method}{described(chosen)}")
+    print(f"method:    {method}{_parameters(chosen)}")
     if chosen.needs_covariances:
         print(f"cells:     of {', '.join(f'{size:g}' for size in pair.cells(chosen))} m")
     result = pair.register(chosen)
-    plural = "" if result.num_iterations == 1 else "s"
-    print(f"status:    {words(result)} after {result.num_iterations} iteration{plural}")
-    print(f"inliers:   {result.num_inliers:,} of {len(pair.source):,} ({result.overlap:.0%}), rmse {result.rmse:.4g} m")
-    if result.converged and np.all(np.isfinite(result.deviations)):
-        x, y, z, *angles = result.deviations
-        roll, pitch, yaw = np.degrees(angles)
-        print(f"deviation: x {x:.2g}, y {y:.2g}, z {z:.2g} m; about x {roll:.2g}, y {pitch:.2g}, z {yaw:.2g} degrees")
-    if result.free_directions:
-        print(f"free:      {describe(result.free_directions)}")
-    print("T_target_source:")
-    # At UTM coordinates, 1e-8 in a rotation entry moves a point by centimetres.
-    form = "22.14f" if np.any(pair.source.origin) else "15.8f"
-    for row in result.matrix:
-        print("".join(f" {number:{form}}" for number in row))
+    _report(pair, result)
     if output is not None:
         io.write_poses(output, [result.matrix])
     if aligned is not None:
-        io.write(aligned, pair.whole[0].transform(result.matrix))
+        io.write(aligned, pair.raw[0].transform(result.matrix))
     pair.draw({method: result})
     return _verdict({method: result})
 
@@ -172,6 +156,8 @@ def compare(source: Source, target: Target, shared: PairOptions, truth: File = N
         truth: File with the true pose T_target_source, to print errors: of the position of the centroid of SOURCE, and
             of the rotation.
     """
+    shared.check()
+    check_outputs(picture=shared.plot)
     return _verdict(_compare(source, target, shared, truth))
 
 
@@ -193,7 +179,8 @@ def demo(output: Path = Path("mcgicp_demo")) -> int:
     print(
         "Geometry does not constrain motion along a flat wall: methods that use it alone report it (degenerate) and"
         "\nkeep the initial pose along it, so in their rows of the picture the posters do not fit."
-        "\nmc-gicp, color-icp and color-ndt are constrained by the channels red, green and blue."
+        f"\n{enumerated([name for name in METHODS if METHODS[name].kind.uses_channels])}"
+        "\nare constrained by the channels red, green and blue."
         f"\nThe clouds are in {output}; try: mcgicp register {source_file} {target_file}"
     )
     return 0
@@ -206,12 +193,13 @@ def _compare(
     pair = PreparedPair(source, target, options)
     results: dict[MethodName, mcg.Registration] = {}
     measures = "inliers      rmse, m" if true_pose is None else "error, mm   error, deg"
-    print(f"\n{'method':15}  {measures:>22}  iterations  time, ms  status")
+    width = max(map(len, METHODS))
+    print(f"\n{'method':{width}}  {measures:>22}  iterations  time, ms  status")
     if true_pose is not None:
-        print(f"{'(start)':15}  {pair.errors(pair.start, true_pose)}")
-    for name, kind in METHODS.items():
-        if kind.uses_channels and not pair.channels:
-            print(f"{name:15}  left out: no channels in common")
+        print(f"{'(start)':{width}}  {pair.errors(pair.start, true_pose)}")
+    for name in METHODS:
+        if METHODS[name].kind.uses_channels and not pair.channels:
+            print(f"{name:{width}}  left out: no channels in common")
             continue
         method = pair.method(name)
         pair.register(method)
@@ -221,10 +209,42 @@ def _compare(
         values = f"{result.num_inliers:9,}  {result.rmse:11.4g}"
         if true_pose is not None:
             values = pair.errors(np.asarray(result.matrix), true_pose)
-        print(f"{name:15}  {values}  {result.num_iterations:10}  {milliseconds:8.0f}  {words(result)}")
+        print(f"{name:{width}}  {values}  {result.num_iterations:10}  {milliseconds:8.0f}  {words(result)}")
     print("(times do not include compilation, preprocessing and the choice of parameters)\n")
     pair.draw(results)
     return results
+
+
+def _parameters(method: AbstractMethod) -> str:
+    """The parameters of a method, as in `, epsilon 0.001`."""
+    shown = [name for name in ("channel_covariance", "channel_weights", "epsilon") if hasattr(method, name)]
+    numbers = [(name, np.atleast_1d(getattr(method, name))) for name in shown]
+    return "".join(f", {name} {' '.join(f'{value:.3g}' for value in values)}" for name, values in numbers)
+
+
+def _report(pair: PreparedPair, result: mcg.Registration) -> None:
+    plural = "" if result.num_iterations == 1 else "s"
+    print(f"status:    {words(result)} after {result.num_iterations} iteration{plural}")
+    print(f"inliers:   {result.num_inliers:,} of {len(pair.source):,} ({result.overlap:.0%}), rmse {result.rmse:.4g} m")
+    if result.converged and np.all(np.isfinite(result.deviations)):
+        x, y, z, *angles = result.deviations
+        roll, pitch, yaw = np.degrees(angles)
+        print(f"deviation: x {x:.2g}, y {y:.2g}, z {z:.2g} m; about x {roll:.2g}, y {pitch:.2g}, z {yaw:.2g} degrees")
+    if result.free_directions:
+        print(f"free:      {describe(result.free_directions)}")
+    print("T_target_source:")
+    # At UTM coordinates, 1e-8 in a rotation entry moves a point by centimetres.
+    form = "22.14f" if np.any(pair.source.origin) else "15.8f"
+    for row in result.matrix:
+        print("".join(f" {number:{form}}" for number in row))
+
+
+def _verdict(results: dict[MethodName, mcg.Registration]) -> int:
+    """Return the exit code, and print to stderr which methods did not converge."""
+    failed = {name: result for name, result in results.items() if not result.converged}
+    for name, result in failed.items():
+        print(f"mcgicp: {name} did not converge ({words(result)}): {ADVICE[result.status]}", file=sys.stderr)
+    return 1 if failed else 0
 
 
 def _read_pose(path: Path) -> Float[np.ndarray, "4 4"]:
@@ -253,12 +273,3 @@ def _preprocess(
         return mcg.preprocess(with_channels(cloud, channels), voxel_size, num_neighbors)
     except ValueError as error:
         raise ValueError(f"{path}: {error}") from error
-
-
-def _verdict(results: dict[MethodName, mcg.Registration]) -> int:
-    """Return the exit code, and print to stderr which methods did not converge."""
-    failed = {name: result for name, result in results.items() if not result.converged}
-    for name, result in failed.items():
-        advice = ADVICE[status_of(result)]
-        print(f"mcgicp: {name} did not converge ({words(result)}): {advice}", file=sys.stderr)
-    return 1 if failed else 0

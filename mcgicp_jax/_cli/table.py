@@ -4,13 +4,15 @@ from __future__ import annotations
 
 import contextlib
 import csv
-import os
-from collections.abc import Callable, Iterator, Sequence
+import io
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, TypeAlias
 
 import numpy as np
 from jaxtyping import Float
+
+from mcgicp_jax.io.files import replacing
 
 Row: TypeAlias = dict[str, str]
 
@@ -35,32 +37,18 @@ class Table:
         return rows + (self._read_rows() if self._rows.exists() else [])
 
     @contextlib.contextmanager
-    def appending(self) -> Iterator[Callable[[Row], None]]:
-        """Yield a function that appends a row and flushes it to the file."""
-        begun = self._rows.exists() and self._rows.stat().st_size > 0
-        if begun:
-            self._drop_torn_line()
-        with open(self._rows, "a", newline="", encoding="utf-8") as file:
-            writer = csv.DictWriter(file, COLUMNS, lineterminator="\n")
-            if not begun:
-                writer.writeheader()
-
-            def append(row: Row) -> None:
-                writer.writerow(row)
-                file.flush()
-
-            yield append
-
-    def rewrite(self, rows: Sequence[Row]) -> None:
-        """Replace all rows."""
-        temporary = self._rows.with_name(f".{self._rows.name}.{os.getpid()}")
-        with open(temporary, "w", newline="", encoding="utf-8") as file:
-            writer = csv.DictWriter(file, COLUMNS, lineterminator="\n")
-            writer.writeheader()
-            writer.writerows(rows)
-        os.replace(temporary, self._rows)
+    def appending(self, rows: Iterable[Row]) -> Iterator[Callable[[Row], None]]:
+        """Replace all rows, and yield a function that appends one more and flushes it to the file."""
+        with replacing(self._rows) as start:
+            start.write((",".join(COLUMNS) + "\n" + "".join(map(_line, rows))).encode())
         if self._rows != self._path:
             self._path.unlink(missing_ok=True)
+        with open(self._rows, "ab", buffering=0) as file:
+
+            def append(row: Row) -> None:
+                file.write(_line(row).encode())
+
+            yield append
 
     def finish(self, rows: Sequence[Row]) -> None:
         """Write the arrays of an .npz in the order of `rows`; a .csv is complete already."""
@@ -70,9 +58,8 @@ class Table:
         arrays |= {name: np.array([float(row[name]) for row in rows]) for name in ("cost", "rmse")}
         arrays |= {name: np.array([int(row[name]) for row in rows]) for name in ("iterations", "inliers")}
         arrays["T_target_source"] = np.stack([pose_of(row) for row in rows])
-        temporary = self._path.with_name(f".{self._path.name}.{os.getpid()}.npz")
-        np.savez_compressed(temporary, **arrays)
-        os.replace(temporary, self._path)
+        with replacing(self._path) as file:
+            np.savez_compressed(file, **arrays)
         self._rows.unlink(missing_ok=True)
 
     def _read_rows(self) -> list[Row]:
@@ -83,12 +70,6 @@ class Table:
         if lines and tuple(reader.fieldnames or ()) != COLUMNS:
             raise ValueError(f"{self._rows}: expected a table of mcgicp batch, got the columns {reader.fieldnames}")
         return list(reader)
-
-    def _drop_torn_line(self) -> None:
-        content = self._rows.read_bytes()
-        whole = content[: content.rfind(b"\n") + 1]
-        if whole != content:
-            self._rows.write_bytes(whole)
 
     def _read_arrays(self) -> list[Row]:
         with np.load(self._path, allow_pickle=False) as arrays:
@@ -105,3 +86,9 @@ def pose_of(row: Row) -> Float[np.ndarray, "4 4"]:
     matrix = np.eye(4)
     matrix[:3] = np.array([float(row[name]) for name in POSE]).reshape(3, 4)
     return matrix
+
+
+def _line(row: Row) -> str:
+    line = io.StringIO()
+    csv.DictWriter(line, COLUMNS, lineterminator="\n").writerow(row)
+    return line.getvalue()

@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Float
 
 from mcgicp_jax._clouds.point_cloud import Values
-from mcgicp_jax._compute.concrete import AnyArray, canonical_float, namespace
+from mcgicp_jax._compute.concrete import AnyArray, canonical_float, numpy_for
 
 # IEC 61966-2-1 (sRGB): below the limit the transfer function is linear, above it a power.
 _SRGB_LIMIT, _SRGB_SLOPE, _SRGB_OFFSET, _SRGB_POWER = 0.04045, 12.92, 0.055, 2.4
@@ -95,9 +95,13 @@ def rgb_to_yuv(rgb: Values) -> Float[AnyArray, "*batch 3"]:
     return xp.stack([luma, _BLUE * (blue - luma), _RED * (red - luma)], -1)
 
 
+# By the name that stands for the three channels.
+COLOR_SPACES = {"lab": rgb_to_lab, "hsv": rgb_to_hsv, "yuv": rgb_to_yuv}
+
+
 def _colors(rgb: Values) -> tuple[Any, Any]:
     """The colours as a floating-point array, and NumPy for a NumPy array or list, else `jax.numpy`."""
-    xp = namespace(rgb)
+    xp = numpy_for(rgb)
     colors: Any = xp.asarray(rgb)
     if colors.ndim == 0 or colors.shape[-1] != 3:
         raise ValueError(f"rgb: expected shape (..., 3), got {colors.shape}")

@@ -12,6 +12,7 @@ import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float, Int
 
+from mcgicp_jax._compute.argument_checks import errors_named
 from mcgicp_jax._compute.concrete import is_concrete
 from mcgicp_jax._compute.size_classes import size_class
 from mcgicp_jax._math.poses import Pose, pose_matrix
@@ -325,6 +326,14 @@ class PointCloud(eqx.Module):
         padded = [cloud.pad(size) for cloud in clouds]
         xp = np if is_concrete(padded) else jnp
         return jax.tree.map(lambda *rows: xp.stack([xp.asarray(row) for row in rows]), *padded)
+
+
+def as_cloud(name: str, cloud: PointCloud | Values) -> PointCloud:
+    """The argument `name` as a `PointCloud`. Raises `ValueError`, which starts with the name, if it cannot be one."""
+    if isinstance(cloud, PointCloud):
+        return cloud
+    with errors_named(name):
+        return PointCloud(cloud)
 
 
 def _build(**fields: Any) -> PointCloud:

@@ -7,9 +7,10 @@ from collections.abc import Iterable
 
 import jax
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float
 
-from mcgicp_jax._clouds.point_cloud import PointCloud, Values, is_far
+from mcgicp_jax._clouds.point_cloud import PointCloud, Values, as_cloud, is_far
+from mcgicp_jax._clouds.voxels import voxel_order
 from mcgicp_jax._compute.argument_checks import check_integer, check_positive
 from mcgicp_jax._compute.concrete import is_concrete
 from mcgicp_jax._search.base import AbstractSearch
@@ -17,8 +18,6 @@ from mcgicp_jax._search.brute_force import default_search
 
 # Fewest finite points of a cloud: four points are the fewest that are not always coplanar.
 MIN_POINTS = 4
-# Voxels along one axis: three 21-bit indices fit one 63-bit key.
-_VOXELS_PER_AXIS = 2**21
 # Coordinates rounded to steps of more than this fraction of the spacing of the points are warned of. The error, uniform
 # over a step, then has a standard deviation of 3 % of the spacing, the noise of a good sensor.
 _LARGEST_STEP = 0.1
@@ -125,8 +124,7 @@ def check_preprocessing(voxel_size: float | None, num_neighbors: int) -> None:
 
 def finite_rows(cloud: PointCloud | Values) -> PointCloud:
     """A raw cloud without padding and without rows that have a NaN or infinity in any array; warns of the latter."""
-    if not isinstance(cloud, PointCloud):
-        cloud = PointCloud(cloud)
+    cloud = as_cloud("cloud", cloud)
     if not is_concrete(cloud):
         raise ValueError("cloud: expected concrete arrays, got tracers; preprocess outside of jit, grad and vmap")
     if cloud.points.ndim != 2:
@@ -157,7 +155,7 @@ def _downsampled(cloud: PointCloud, voxel_size: float) -> PointCloud:
         raise ValueError("voxel_size: expected None for a cloud with covariances, which cannot be averaged")
     # Working by columns takes a third of the time of working by rows.
     columns = np.ascontiguousarray(np.asarray(cloud.points).T, np.float64)
-    order, starts = voxels(columns, voxel_size)
+    order, starts = voxel_order(columns, voxel_size)
     if len(starts) < MIN_POINTS:
         raise ValueError(
             f"voxel_size: expected a size that leaves at least {MIN_POINTS} points, got {voxel_size} m, "
@@ -178,34 +176,6 @@ def _downsampled(cloud: PointCloud, voxel_size: float) -> PointCloud:
         counts, channel_valid = np.maximum(counts, 1), counts > 0
     channels = (total(channels.T) / counts).astype(channels.dtype)
     return PointCloud(means, channels, channel_valid=channel_valid, channel_names=names)
-
-
-def voxels(columns: Float[np.ndarray, "3 N"], voxel_size: float) -> tuple[Int[np.ndarray, "N"], Int[np.ndarray, "M"]]:
-    """An order that sorts points by voxel, and where each of the M occupied voxels starts in it."""
-    key, largest = np.zeros(columns.shape[1], np.int64), 1
-    for column in columns:
-        cell = np.floor(column / voxel_size)
-        cell -= cell.min()
-        along = cell.max() + 1
-        if along > _VOXELS_PER_AXIS:
-            raise ValueError(
-                f"voxel_size: expected at most {_VOXELS_PER_AXIS} voxels along an axis, got {along:.0f} "
-                f"with {voxel_size} m; choose a larger size"
-            )
-        key = key * int(along) + cell.astype(np.int64)
-        largest *= int(along)
-    order = _stable_order(key, largest)
-    key = key[order]
-    return order, np.flatnonzero(np.concatenate([[True], key[1:] != key[:-1]]))
-
-
-def _stable_order(key: Int[np.ndarray, "N"], largest: int) -> Int[np.ndarray, "N"]:
-    """Indices of a stable sort of keys in [0, `largest`)."""
-    bits = (len(key) - 1).bit_length()
-    if (largest - 1).bit_length() + bits > 63:
-        return np.argsort(key, kind="stable")
-    # Sorting keys with the row index in their low bits is several times faster than argsort.
-    return np.sort((key << bits) | np.arange(len(key))) & ((1 << bits) - 1)
 
 
 def _far_origin(points: Float[np.ndarray, "N 3"]) -> Float[np.ndarray, "3"]:

@@ -5,14 +5,12 @@ from __future__ import annotations
 from collections.abc import Iterable
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float
 
-from mcgicp_jax._clouds.point_cloud import PointCloud, Values
+from mcgicp_jax._clouds.point_cloud import PointCloud, Values, as_cloud
+from mcgicp_jax._clouds.voxels import starts_of, voxel_keys, voxel_of
 from mcgicp_jax._compute.argument_checks import check_positive
 from mcgicp_jax._math.poses import Pose, pose_matrix
-
-# Voxels from the first point along each axis: three 21-bit indices, from −2²⁰, are packed into one 64-bit key.
-_HALF_RANGE = 2**20
 
 
 def aggregate(clouds: Iterable[PointCloud | Values], poses: Iterable[Pose], voxel_size: float) -> PointCloud:
@@ -35,8 +33,8 @@ def aggregate(clouds: Iterable[PointCloud | Values], poses: Iterable[Pose], voxe
     """
     world = VoxelMap(voxel_size)
     for i, (cloud, pose) in enumerate(zip(clouds, poses, strict=True)):
-        cloud = cloud if isinstance(cloud, PointCloud) else PointCloud(cloud)
-        world.add(f"clouds[{i}]", cloud, np.asarray(pose_matrix(pose, f"poses[{i}]")))
+        name = f"clouds[{i}]"
+        world.add(name, as_cloud(name, cloud), np.asarray(pose_matrix(pose, f"poses[{i}]")))
     return world.cloud()
 
 
@@ -63,7 +61,8 @@ class VoxelMap:
         finite = np.isfinite(rows).all(axis=1)
         if self._first is None and finite.any():
             self._first = voxel_of(points[finite][0], self._voxel_size)
-        keys = np.concatenate([self._keys, voxels(points[finite], self._voxel_size, self._first)])
+        first = 0.0 if self._first is None else self._first
+        keys = np.concatenate([self._keys, voxel_keys(points[finite], self._voxel_size, first)])
         sums = rows[finite] if self._sums is None else np.concatenate([self._sums, rows[finite]])
         self._keys, self._sums = _merge(keys, sums)
 
@@ -97,27 +96,8 @@ def _valid_channels(cloud: PointCloud) -> tuple[Float[np.ndarray, "N C"], Float[
     return channels, np.asarray(cloud.channel_valid, np.float64)
 
 
-def voxel_of(point: Float[np.ndarray, "3"], voxel_size: float) -> Float[np.ndarray, "3"]:
-    return np.floor(point / voxel_size)
-
-
-def voxels(
-    points: Float[np.ndarray, "N 3"], voxel_size: float, first: Float[np.ndarray, "3"] | None
-) -> Int[np.ndarray, "N"]:
-    """One integer key per point for the voxel that contains it, counted from the voxel `first`."""
-    cells = np.floor(points / voxel_size) - (0 if first is None else first)
-    if np.abs(cells).max(initial=0) >= _HALF_RANGE:
-        raise ValueError(
-            f"voxel_size: {voxel_size} m puts points {np.abs(cells).max():.0f} voxels from the first one, expected "
-            f"fewer than {_HALF_RANGE}; choose a larger size"
-        )
-    x, y, z = (cells.astype(np.int64) + _HALF_RANGE).T
-    return (x << 42) | (y << 21) | z
-
-
 def _merge(keys: np.ndarray, rows: Float[np.ndarray, "N D"]) -> tuple[np.ndarray, Float[np.ndarray, "M D"]]:
     """Unique keys, sorted, and the sum of the rows of each key."""
     order = np.argsort(keys, kind="stable")
-    keys = keys[order]
-    starts = np.flatnonzero(np.concatenate([np.ones(min(len(keys), 1), bool), keys[1:] != keys[:-1]]))
-    return keys[starts], np.add.reduceat(rows[order], starts, axis=0) if len(starts) else rows
+    starts = starts_of(keys[order])
+    return keys[order][starts], np.add.reduceat(rows[order], starts, axis=0) if len(starts) else rows

@@ -1,7 +1,9 @@
-"""Checks of numbers that users pass; the `ValueError` names the argument, what was expected and what came."""
+"""Checks of arguments; the `ValueError` names the argument, the expected and the given value."""
 
 from __future__ import annotations
 
+import contextlib
+from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
@@ -14,10 +16,19 @@ def check_positive(name: str, value: Any, expected: str = "a positive number") -
         raise ValueError(f"{name}: expected {expected}, got {value!r}")
 
 
-def check_integer(name: str, value: Any, least: int) -> None:
-    if not isinstance(value, int | np.integer) or value < least:
-        raise ValueError(f"{name}: expected an integer of at least {least}, got {value!r}")
+def check_integer(name: str, value: Any, minimum: int) -> None:
+    if not isinstance(value, int | np.integer) or value < minimum:
+        raise ValueError(f"{name}: expected an integer of at least {minimum}, got {value!r}")
 
 
 def is_number(value: Any) -> bool:
     return np.ndim(value) == 0 and np.asarray(value).dtype.kind in "fiu"
+
+
+@contextlib.contextmanager
+def errors_named(name: str) -> Iterator[None]:
+    """Context in which the message of a `ValueError` or `OSError` gets the name of an argument; a `ValueError`."""
+    try:
+        yield
+    except (ValueError, OSError) as error:
+        raise ValueError(f"{name}: {error}") from error

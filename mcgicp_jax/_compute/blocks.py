@@ -15,7 +15,7 @@ import jax
 import numpy as np
 from jaxtyping import Int
 
-from mcgicp_jax._compute.concrete import computed_now
+from mcgicp_jax._compute.concrete import outside_trace
 from mcgicp_jax._compute.threads import side_by_side
 
 # Rows of a block. One size for all clouds, so that few programs are compiled. Measured with 34,000 rows: blocks of
@@ -72,7 +72,7 @@ def map_rows(function: Callable[[Any], Any], num_rows: int, num_threads: int | N
         A pytree of NumPy arrays with `num_rows` rows, at least 1.
     """
     # Worker threads run outside a trace that is active in this thread; this thread leaves it for the same results.
-    with computed_now():
+    with outside_trace():
         results = map_blocks(function, num_rows, num_threads, size)
     leaves = [jax.tree.leaves(result) for _, result in results]
     structure = jax.tree.structure(results[0][1])

@@ -1,4 +1,4 @@
-"""A cache of quantities computed from a cloud, such as its surface, which lives no longer than the cloud."""
+"""Caches of bounded size, and one of quantities computed from clouds, such as surfaces."""
 
 from __future__ import annotations
 
@@ -6,55 +6,64 @@ import collections
 import threading
 import weakref
 from collections.abc import Callable, Hashable
+from functools import partial
 from typing import Any, TypeVar
 
 Value = TypeVar("Value")
 
-# Total number of rows of the clouds in the cache: hundreds of scans, some hundred megabytes.
-_KEPT_ROWS = 2_000_000
-# Number of values kept per cloud and kind, such as its surfaces for two methods.
-_KEPT_EACH = 2
+# Total number of rows of the clouds or trees in a cache: hundreds of scans, some hundred megabytes.
+MAX_ROWS = 2_000_000
+# Number of values cached per cloud and kind, such as its surfaces for two methods.
+_VALUES_PER_KIND = 2
 
 
-class _Keeper:
-    """Values computed from clouds, by identity of the cloud; the least recently used clouds are evicted first."""
+class Cache:
+    """Values by key. The least recently used are evicted while the sum of all sizes exceeds a maximum."""
 
-    def __init__(self, rows: int):
-        self._rows = rows
+    def __init__(self, max_size: int, size: Callable[[Any], int] = lambda _: 1):
+        self._max_size, self._size = max_size, size
         self._lock = threading.Lock()
-        self._kept: collections.OrderedDict[int, tuple[Any, int, dict[str, dict[Hashable, Any]]]] = (
-            collections.OrderedDict()
-        )
-        # Identities of collected clouds. Weak references report them at any moment, even during a lookup.
-        self._gone: collections.deque[int] = collections.deque()
+        self._values: collections.OrderedDict[Hashable, Any] = collections.OrderedDict()
+        self._dropped: collections.deque[Hashable] = collections.deque()
 
-    def get(self, cloud: Any, kind: str, key: Hashable, make: Callable[[], Value]) -> Value:
-        """The cached value for this cloud, kind and key, or else the result of `make`, which is then cached."""
-        number = id(cloud)
+    def get(self, key: Hashable, make: Callable[[], Value]) -> Value:
+        """The cached value, or else the result of `make`, which is then cached. Several threads may call this."""
         with self._lock:
-            self._forget_gone()
-            if number in self._kept:
-                self._kept.move_to_end(number)
-                values = self._kept[number][2].get(kind, {})
-                if key in values:
-                    return values[key]
+            while self._dropped:
+                self._values.pop(self._dropped.popleft(), None)
+            if key in self._values:
+                self._values.move_to_end(key)
+                return self._values[key]
         value = make()
         with self._lock:
-            self._forget_gone()
-            if number not in self._kept:
-                alive = weakref.ref(cloud, lambda _: self._gone.append(number))
-                self._kept[number] = alive, cloud.points.shape[0], {}
-            values = self._kept[number][2].setdefault(kind, {})
-            values[key] = value
-            while len(values) > _KEPT_EACH:
-                del values[next(iter(values))]
-            while len(self._kept) > 1 and sum(rows for _, rows, _ in self._kept.values()) > self._rows:
-                self._kept.popitem(last=False)
+            self._values[key] = value
+            while len(self._values) > 1 and sum(map(self._size, self._values.values())) > self._max_size:
+                self._values.popitem(last=False)
         return value
 
-    def _forget_gone(self) -> None:
-        while self._gone:
-            self._kept.pop(self._gone.popleft(), None)
+    def drop(self, key: Hashable) -> None:
+        """Remove a value at the next `get`. Takes no lock: weak references may call it at any moment."""
+        self._dropped.append(key)
 
 
-keep = _Keeper(_KEPT_ROWS).get
+class _CachedWithCloud:
+    """The cached values of one cloud; dropped when the cloud is collected."""
+
+    def __init__(self, cloud: Any):
+        self.num_rows = cloud.points.shape[0]
+        # Refers to the identity, not to the cloud.
+        drop = partial(_clouds.drop, id(cloud))
+        self.alive = weakref.ref(cloud, lambda _: drop())
+        self.kinds: dict[str, Cache] = {}
+
+
+_clouds = Cache(MAX_ROWS, lambda cached: cached.num_rows)
+
+
+def cached_with(cloud: Any, kind: str, key: Hashable, make: Callable[[], Value]) -> Value:
+    """The value cached for this cloud (by identity), kind and key, or else the result of `make`, which is then cached.
+
+    Values live no longer than their cloud, any object with `points` that can be referenced weakly.
+    """
+    cached = _clouds.get(id(cloud), partial(_CachedWithCloud, cloud))
+    return cached.kinds.setdefault(kind, Cache(_VALUES_PER_KIND)).get(key, make)

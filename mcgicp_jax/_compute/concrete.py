@@ -26,7 +26,7 @@ def is_concrete(*trees: object) -> bool:
     return not any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(trees))
 
 
-def computed_now() -> contextlib.AbstractContextManager[None]:
+def outside_trace() -> contextlib.AbstractContextManager[None]:
     """Context in which concrete arrays are computed at once, even while a caller's `jit` is being traced.
 
     Outside a trace it does nothing, since `jax.ensure_compile_time_eval` evaluates operation by operation.
@@ -40,7 +40,7 @@ def canonical_float() -> Any:
     return jax.dtypes.canonicalize_dtype(np.float64)
 
 
-def namespace(*trees: object) -> ModuleType:
+def numpy_for(*trees: object) -> ModuleType:
     """NumPy if every array is concrete, so that nothing is compiled; `jax.numpy` if one is traced.
 
     It lets formulas that run both on the host and inside transformations be written once.

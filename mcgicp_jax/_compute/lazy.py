@@ -8,13 +8,13 @@ from typing import Any, Generic, TypeVar
 
 import jax
 
-from mcgicp_jax._compute.concrete import computed_now
+from mcgicp_jax._compute.concrete import outside_trace
 
 Value = TypeVar("Value")
 
 
 @jax.tree_util.register_pytree_node_class
-class Deferred(Generic[Value]):
+class Lazy(Generic[Value]):
     """A pytree that is computed on first access: by `value`, or when it is flattened, copied or pickled."""
 
     def __init__(self, compute: Callable[[], Value]):
@@ -23,15 +23,15 @@ class Deferred(Generic[Value]):
         self._value: Value
 
     @classmethod
-    def of(cls, value: Value) -> Deferred[Value]:
-        """A `Deferred` whose value is known already."""
+    def of(cls, value: Value) -> Lazy[Value]:
+        """A `Lazy` whose value is known already."""
         return cls.tree_unflatten(None, (value,))
 
     @property
     def value(self) -> Value:
         with self._lock:
             if self._compute is not None:
-                with computed_now():
+                with outside_trace():
                     self._value = self._compute()
                 # Frees the arrays that the closure holds.
                 self._compute = None
@@ -41,10 +41,10 @@ class Deferred(Generic[Value]):
         return (self.value,), None
 
     @classmethod
-    def tree_unflatten(cls, _: None, children: tuple[Value]) -> Deferred[Value]:
+    def tree_unflatten(cls, _: None, children: tuple[Value]) -> Lazy[Value]:
         deferred = object.__new__(cls)
         deferred._compute, deferred._lock, deferred._value = None, threading.Lock(), children[0]
         return deferred
 
     def __reduce__(self) -> Any:
-        return Deferred.of, (self.value,)
+        return Lazy.of, (self.value,)

@@ -23,17 +23,16 @@ def num_cores() -> int:
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
-def side_by_side(calls: Sequence[Callable[[], Answer]], most: int | None = None) -> list[Answer]:
+def side_by_side(calls: Sequence[Callable[[], Answer]], max_threads: int | None = None) -> list[Answer]:
     """Run calls in parallel and return their results in order. The calling thread runs the first call itself.
 
-    The other threads belong to a pool of the whole process. They are kept because a new thread starts on its parent's
-    core, and most queries are over before the scheduler moves it to another. Each idle thread takes the next call from
-    a queue, so that no call has to wait for a thread that is late or blocked. An error of a call is raised once all
-    calls that have started have ended.
+    The other threads belong to a persistent pool of the process: a new thread starts on its parent's core, and most
+    queries end before the scheduler moves it to another. Idle threads take the next call from a queue, so that no call
+    waits for a thread that is late or blocked. An error of a call is raised once all started calls have ended.
 
     Args:
         calls: at least one function without arguments.
-        most: largest number of threads, including the calling one; as many as there are calls by default.
+        max_threads: largest number of threads, including the calling one; one per call by default.
     """
     answers: dict[int, Answer] = {}
     waiting = collections.deque(enumerate(calls))
@@ -48,7 +47,7 @@ def side_by_side(calls: Sequence[Callable[[], Answer]], most: int | None = None)
                 return
             answers[i] = call()
 
-    count = min(len(calls), most or len(calls)) - 1
+    count = min(len(calls), max_threads or len(calls)) - 1
     elsewhere = with_settings(work) if count else work
     helpers = [_submit(elsewhere) for _ in range(count)]
     try:

@@ -1,10 +1,9 @@
-"""Local features of points, which a motion of the cloud does not change: FPFH, and statistics of the channels.
+"""Local features that do not depend on the pose of the cloud: FPFH, and statistics of the channels.
 
-FPFH (Rusu, Blodow & Beetz, Fast Point Feature Histograms for 3D Registration, ICRA 2009) depends on the side of the
-surface to which the normals point, which is known of single scans at best. Here the normal of a neighbour is turned to
-the side of the point's own normal, and histograms are averaged over both signs of the latter, so that the features do
-not depend on it. (Normals turned towards the sensor gave about 1.4 times as many correct matches on nine real pairs
-without channels.)
+FPFH (Rusu, Blodow & Beetz, Fast Point Feature Histograms for 3D Registration, ICRA 2009) depends on the signs of the
+normals, which are known for single scans at best. Here the normal of each neighbour is flipped to the side of the
+point's own normal, and histograms are averaged over both signs of the latter. (Normals that point to the sensor gave
+about 1.4 times as many correct matches on nine real pairs without channels.)
 """
 
 from __future__ import annotations
@@ -18,13 +17,13 @@ from scipy.sparse import csr_array
 from mcgicp_jax._clouds.point_cloud import PointCloud
 from mcgicp_jax._compute.blocks import map_rows
 from mcgicp_jax._compute.concrete import AnyScalar
-from mcgicp_jax._local_geometry.covariances import Offsets, gatherer, weighted_covariance
-from mcgicp_jax._local_geometry.records import Neighborhoods
+from mcgicp_jax._local_geometry.local_geometry import Offsets, weighted_covariance
+from mcgicp_jax._local_geometry.neighborhoods import Neighborhoods, gatherer
 from mcgicp_jax._math import symmetric_matrices as alg
 
-# Radii in voxels, of neighbours for normals and for histograms: those of Open3D's examples.
+# Radii, in voxels, of the neighbourhoods for normals and for histograms: as in Open3D's examples.
 _NORMAL_RADIUS, _RADIUS = 2.0, 5.0
-# Radii in voxels, of neighbours for statistics of the channels: from next neighbours to those of the histograms.
+# Radii, in voxels, of the neighbourhoods for statistics of the channels: from the nearest neighbours to `_RADIUS`.
 _CHANNEL_RADII = (1.5, 3.0, 5.0)
 # A disc of five voxels radius on a surface has 79 voxels; there are more where the surface is rough.
 NUM_NEIGHBORS = 100
@@ -52,7 +51,7 @@ def histograms_of(cloud: PointCloud, normals: Float[np.ndarray, "N 3"], voxel_si
     size, radius = cloud.points.shape[0], np.float32(_RADIUS * voxel_size)
     gather = gatherer(cloud.replace_rows(channels=normals, channel_valid=None), True, np)
     simple, weights = map_rows(lambda rows: _simple_histograms(gather(rows), radius), size, None)
-    # The own histogram plus the weighted mean of those of the neighbours. Gathering them takes ten times as long.
+    # The point's histogram plus the weighted mean of its neighbours' histograms. Gathering takes ten times as long.
     neighbors = np.maximum(np.asarray(cloud.neighbors), 0)
     starts = np.arange(size + 1) * neighbors.shape[1]
     return simple + csr_array((weights.ravel(), neighbors.ravel(), starts), shape=(size, size)) @ simple
@@ -84,8 +83,8 @@ def comparable(
         mean = np.where(known, both, 0).sum(axis=0) / count
         spread = np.sqrt(np.where(known, (both - mean) ** 2, 0).sum(axis=0) / count)
         varying = spread > 1e3 * np.finfo(np.float32).eps * np.abs(mean)
-        share = _CHANNEL_WEIGHT * _DEVIATION * np.sqrt(histograms[0].shape[1] / both.shape[1])
-        scales = np.where(varying, share / np.where(varying, spread, 1), 0)
+        weight = _CHANNEL_WEIGHT * _DEVIATION * np.sqrt(histograms[0].shape[1] / both.shape[1])
+        scales = np.where(varying, weight / np.where(varying, spread, 1), 0)
         for each, part in zip(statistics, found, strict=True):
             part.append(np.nan_to_num((each - mean) * scales))
     rounded = [np.clip(np.rint(np.hstack(part)), -_LARGEST, _LARGEST).astype(np.float32) for part in found]
@@ -105,23 +104,15 @@ def _normals(around: Neighborhoods, radius: Float[AnyScalar, ""]) -> Float[Array
     return alg.smallest_eigenvector(weighted_covariance(offsets, near.astype(square.dtype))).T
 
 
-def _dot(a: list[Array], b: list[Array]) -> Array:
-    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
-
-
-def _cross(a: list[Array], b: list[Array]) -> list[Array]:
-    return [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]]
-
-
 @jax.jit
 def _simple_histograms(
     around: Neighborhoods, radius: Float[AnyScalar, ""]
 ) -> tuple[Float[Array, "n 33"], Float[Array, "n k"]]:
     """SPFH of points whose channels are their normals; and the weights of their neighbours in FPFH, 1/d².
 
-    For each neighbour, of the two points the one whose normal is closer to the line between them is first: with its
-    normal u, the unit vector d to the second one, v = d × u / |d × u|, w = u × v and the second one's normal n, the
-    angles are α = v·n, φ = u·d and θ = atan2(w·n, u·n).
+    In each pair of point and neighbour, the first point is the one whose normal is closer to the line between them.
+    Let u be its normal, d the unit vector to the second point, n the normal of the second point, v = d × u / |d × u|
+    and w = u × v. The angles are α = v·n, φ = u·d and θ = atan2(w·n, u·n).
     """
     offsets, square = _offsets(around)
     near = around.present & (square > 0) & (square <= radius * radius)
@@ -129,22 +120,24 @@ def _simple_histograms(
     line = [offset / distance for offset in offsets]
     own = [normal[None] for normal in around.own_channels]
     other = list(around.near_channels)
-    side = jnp.where(_dot(own, other) >= 0, 1, -1).astype(square.dtype)
+    side = jnp.where(alg.dot(own, other) >= 0, 1, -1).astype(square.dtype)
     other = [side * axis for axis in other]
-    along = _dot(own, line), _dot(other, line)
+    along = alg.dot(own, line), alg.dot(other, line)
     swapped = jnp.abs(along[0]) < jnp.abs(along[1])
     u, n = ([jnp.where(swapped, b, a) for a, b in zip(*pair, strict=True)] for pair in ((own, other), (other, own)))
     line = [jnp.where(swapped, -axis, axis) for axis in line]
     phi = jnp.where(swapped, -along[1], along[0])
-    v = _cross(line, u)
-    length = jnp.sqrt(_dot(v, v))
+    v = alg.cross(line, u)
+    length = jnp.sqrt(alg.dot(v, v))
     # Where a normal is the line between the points, the frame is undefined.
     counted = near & (length > 1e-6)
     v = [axis / jnp.where(counted, length, 1) for axis in v]
-    w = _cross(u, v)
-    # The turned normals are at most a right angle apart.
-    theta = jnp.arctan2(_dot(w, n), _dot(u, n)) / jnp.pi
-    alpha, phi, theta = (_histogram(value, counted) for value in (0.5 + 0.5 * _dot(v, n), 0.5 + 0.5 * phi, 0.5 + theta))
+    w = alg.cross(u, v)
+    # The angle between the flipped normals is at most π/2.
+    theta = jnp.arctan2(alg.dot(w, n), alg.dot(u, n)) / jnp.pi
+    alpha, phi, theta = (
+        _histogram(value, counted) for value in (0.5 + 0.5 * alg.dot(v, n), 0.5 + 0.5 * phi, 0.5 + theta)
+    )
     # With the other sign of both normals, φ and θ change theirs.
     even = [0.5 * (each + each[:, ::-1]) for each in (phi, theta)]
     weights = jnp.where(near, 1 / jnp.where(near, square, 1), 0)

@@ -7,15 +7,14 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, Int
 
-from mcgicp_jax._search.base import Rows
-from mcgicp_jax._search.kd_tree import KDTreeSearch
-from mcgicp_jax.datasets import Frame
+from mcgicp_jax._clouds.frame import Frame
+from mcgicp_jax._search.positions import nearest_in_position
 
 # Largest ratio of the distances to the best and the second best match (Lowe 2004).
 _RATIO = 0.8
-# Pixels: a key point belongs to the cloud's point nearest in the image, if it is as near as this. Points of a depth
-# image are a pixel apart, rings of a LiDAR up to ten.
-_NEAR = 4.0
+# Largest distance, in pixels, from a key point to the image of its point of the cloud. Points of a depth image are one
+# pixel apart, rings of a LiDAR up to ten.
+_MAX_PIXELS = 4.0
 
 
 def image_matches(source: Frame, target: Frame) -> tuple[Int[np.ndarray, "n"], Int[np.ndarray, "n"]]:
@@ -39,15 +38,15 @@ def image_matches(source: Frame, target: Frame) -> tuple[Int[np.ndarray, "n"], I
     for name, frame in (("source", source), ("target", target)):
         if frame.image is None or frame.pixels is None:
             raise ValueError(f"{name}: expected a frame with an image, got one without")
-    (pixels, features), (target_pixels, target_features) = _described(source.image), _described(target.image)
+    (pixels, features), (target_pixels, target_features) = _sift(source.image), _sift(target.image)
     rows, matched = _matched(features, target_features)
     source_rows, target_rows = _nearest(source, pixels[rows]), _nearest(target, target_pixels[matched])
-    known = (source_rows >= 0) & (target_rows >= 0)
-    return source_rows[known], target_rows[known]
+    found = (source_rows >= 0) & (target_rows >= 0)
+    return source_rows[found], target_rows[found]
 
 
-def _described(image: Any) -> tuple[Float[np.ndarray, "n 2"], Float[np.ndarray, "n 128"]]:
-    """Pixels (column, row) and features of the key points."""
+def _sift(image: Any) -> tuple[Float[np.ndarray, "n 2"], Float[np.ndarray, "n 128"]]:
+    """Pixels (column, row) and SIFT features of the key points."""
     cv2 = _opencv()
     found, features = cv2.SIFT_create().detectAndCompute(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), None)
     if not found:
@@ -73,18 +72,8 @@ def _matched(
 
 def _nearest(frame: Frame, pixels: Float[np.ndarray, "n 2"]) -> Int[np.ndarray, "n"]:
     """The row of the cloud nearest to each pixel, −1 for none."""
-    places = np.asarray(frame.pixels, float)
-    seen = np.isfinite(places).all(axis=1)
-    flat = [np.column_stack([each, np.zeros(len(each))]) for each in (np.where(seen[:, None], places, 0), pixels)]
-    rows, queries = (
-        Rows(points=points, descriptors=np.zeros((len(points), 0)), valid=valid)
-        for points, valid in zip(flat, (seen, np.ones(len(pixels), bool)), strict=True)
-    )
-    if not seen.any() or not len(pixels):
-        return np.full(len(pixels), -1)
-    (nearest,) = KDTreeSearch().index(rows).nearest(np.array([1.0, 0, 0, 0, 0, 0, 0]), queries, _NEAR)
-    distances = np.linalg.norm(places[nearest] - pixels, axis=1)
-    return np.where((nearest >= 0) & (distances <= _NEAR), nearest, -1).astype(np.int64)
+    queries, points = (np.pad(np.asarray(each, float), ((0, 0), (0, 1))) for each in (pixels, frame.pixels))
+    return nearest_in_position(queries, points, _MAX_PIXELS).astype(np.int64)
 
 
 def _opencv() -> Any:

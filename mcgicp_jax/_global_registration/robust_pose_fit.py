@@ -1,4 +1,4 @@
-"""Poses from matches of which most may be wrong: hypotheses from triplets, and graduated non-convexity.
+"""Poses from matches with many outliers: hypotheses from triplets, refined by graduated non-convexity.
 
 All programs have fixed shapes: a fixed number of matches, padded, and of hypotheses.
 """
@@ -16,28 +16,28 @@ from mcgicp_jax._compute.concrete import AnyArray, AnyScalar
 from mcgicp_jax._math import symmetric_matrices as alg
 from mcgicp_jax._math.robust_kernels import truncated_weights
 
-# Number of matches that are used. Real pairs of 5,000 voxels have 200 to 2,400 mutual ones.
+# Maximum number of matches. Real pairs of 5,000 voxels have 200 to 2,400 mutual ones.
 NUM_MATCHES = 1024
 # For each match as the first of a triplet: number of the best supported partners, and of triplets with two of them.
 _NUM_PARTNERS, _NUM_TRIPLETS = 24, 16
 # Hypotheses, all of different poses, that are refined.
 NUM_REFINED = 16
-# Voxels: largest distance of two matched points, and largest difference of the edges of matched triangles. Points
-# averaged in voxels lie half a voxel beside each other.
+# Voxels: largest distance between two matched points, and largest difference between the edges of matched triangles.
+# Mean points of voxels in two clouds are about half a voxel apart.
 TOLERANCE = 1.5
 # Voxels: shortest edge of a triangle. The pose from a shorter one is uncertain, and neighbouring points have similar
 # features, right or wrong.
 _SHORTEST_EDGE = 4.0
-# Largest difference of the cosines between two normals in the two clouds: those of real scans differ by up to 0.2.
+# Largest difference between the clouds of the cosine between two normals: in real scans it is up to 0.2.
 _NORMAL_TOLERANCE = 0.3
 # Voxels: poses that move points by less than this relative to each other are the same.
-APART = 5.0
+MIN_SEPARATION = 5.0
 # Graduated non-convexity: the control parameter μ at first, when matches count up to √5 tolerances away, its growth by
 # each step (Yang et al. 2020), and the number of steps, after which matches count up to 1.05 tolerances.
 _FIRST_CONTROL, _GROWTH, _NUM_STEPS = 0.25, 1.4, 12
 
 
-class Matches(NamedTuple):
+class PutativeMatches(NamedTuple):
     """Matched points with their normals, padded to `NUM_MATCHES`.
 
     Attributes:
@@ -53,8 +53,8 @@ class Matches(NamedTuple):
     valid: Bool[AnyArray, "M"]
 
 
-class Poses(NamedTuple):
-    """Hypotheses: R a + t; and the score of each, the number of inliers weighted by 1 − (distance / tolerance)²."""
+class PoseHypotheses(NamedTuple):
+    """Poses R a + t, and the score of each: the number of inliers, weighted by 1 − (distance / tolerance)²."""
 
     rotation: Float[AnyArray, "n 3 3"]
     translation: Float[AnyArray, "n 3"]
@@ -72,10 +72,10 @@ def fit_pose(
     reflections (Umeyama 1991). Points on a line, or fewer than three, give some rotation that fits.
     """
     total = jnp.sum(weights)
-    share = (weights / jnp.where(total > 0, total, 1))[:, None]
-    means = [jnp.sum(share * points, axis=0) for points in (source, target)]
+    fractions = (weights / jnp.where(total > 0, total, 1))[:, None]
+    means = [jnp.sum(fractions * points, axis=0) for points in (source, target)]
     a, b = (points - mean for points, mean in zip((source, target), means, strict=True))
-    product = jnp.sum((share * b)[:, :, None] * a[:, None, :], axis=0)
+    product = jnp.sum((fractions * b)[:, :, None] * a[:, None, :], axis=0)
     square = jnp.sum(product[:, :, None] * product[:, None, :], axis=0)
     normal = alg.smallest_eigenvector(alg.symmetric_from_matrix(square[None]))
     p, q = (axis[:, 0] for axis in alg.orthonormal_basis(normal))
@@ -96,13 +96,15 @@ def fit_pose(
 
 
 @jax.jit
-def hypotheses(matches: Matches, voxel_size: Float[AnyScalar, ""], radius: Float[AnyScalar, ""]) -> Poses:
-    """The best `NUM_REFINED` of the poses of 16,384 triplets of matches that keep their distances, all different.
+def hypotheses(
+    matches: PutativeMatches, voxel_size: Float[AnyScalar, ""], radius: Float[AnyScalar, ""]
+) -> PoseHypotheses:
+    """The best `NUM_REFINED` different poses among those of 16,384 triplets of matches with consistent distances.
 
-    A match supports another if both clouds have the same distance between them and the same angle between the normals.
-    The support of a pair of matches that agree is the number of matches that support both (Chen et al., SC²-PCR, CVPR
-    2022): wrong matches agree by chance, but hardly with a third one in common. Each match is joined with those with
-    which it has most support, two at a time by a fixed draw.
+    Two matches agree if the distance and the angle between their normals are the same in both clouds. The support of
+    two matches that agree is the number of matches that agree with both (Chen et al., SC²-PCR, CVPR 2022): two wrong
+    matches agree by chance, three seldom do. Each match forms triplets with two of the partners with which it has most
+    support, by a fixed draw.
 
     Args:
         radius: of the source, metres: a rotation by an angle moves points by about the angle times this.
@@ -122,10 +124,10 @@ def hypotheses(matches: Matches, voxel_size: Float[AnyScalar, ""], radius: Float
     area = jnp.sqrt(jnp.sum(jnp.cross(edges[0], edges[1]) ** 2, axis=-1))
     agree = agree & (area > (_SHORTEST_EDGE * voxel_size) ** 2)
     score = jnp.where(agree, _scores(rotation, translation, matches, voxel_size), 0)
-    return _different(Poses(rotation, translation, score), voxel_size, radius)
+    return _different(PoseHypotheses(rotation, translation, score), voxel_size, radius)
 
 
-def _support(matches: Matches, voxel_size: Float[AnyScalar, ""]) -> Float[Array, "M M"]:
+def _support(matches: PutativeMatches, voxel_size: Float[AnyScalar, ""]) -> Float[Array, "M M"]:
     lengths, cosines = [], []
     for points, normals in ((matches.source, matches.source_normals), (matches.target, matches.target_normals)):
         lengths.append(jnp.sqrt(sum((axis[:, None] - axis) ** 2 for axis in jnp.asarray(points).T)))
@@ -149,8 +151,10 @@ def _drawn() -> Int[np.ndarray, "T 2"]:
 def _triangles(
     p: Float[Array, "T 3"], q: Float[Array, "T 3"], r: Float[Array, "T 3"]
 ) -> tuple[Float[Array, "T 3 3"], Float[Array, "T 3"]]:
-    """The frame of each triangle, whose columns are the first edge, the in-plane normal of it, and the normal of both;
-    and the centroid. Meaningless for collinear points."""
+    """The frame of each triangle (columns along the first edge, across it in the plane, and normal) and its centroid.
+
+    Meaningless for collinear points.
+    """
 
     def unit(vectors: Float[Array, "T 3"]) -> Float[Array, "T 3"]:
         length = jnp.sqrt(jnp.sum(vectors * vectors, axis=-1, keepdims=True))
@@ -162,14 +166,14 @@ def _triangles(
 
 
 def _scores(
-    rotation: Float[Array, "n 3 3"], translation: Float[Array, "n 3"], matches: Matches, voxel_size: AnyScalar
+    rotation: Float[Array, "n 3 3"], translation: Float[Array, "n 3"], matches: PutativeMatches, voxel_size: AnyScalar
 ) -> Float[Array, "n"]:
     square = _squared_distances(rotation, translation, matches) / (TOLERANCE * voxel_size) ** 2
     return jnp.sum(jnp.where(matches.valid, jnp.maximum(1 - square, 0), 0), axis=-1)
 
 
 def _squared_distances(
-    rotation: Float[Array, "n 3 3"], translation: Float[Array, "n 3"], matches: Matches
+    rotation: Float[Array, "n 3 3"], translation: Float[Array, "n 3"], matches: PutativeMatches
 ) -> Float[Array, "n M"]:
     x, y, z = jnp.asarray(matches.source).T
     square = jnp.zeros((), x.dtype)
@@ -180,7 +184,7 @@ def _squared_distances(
     return square
 
 
-def _different(poses: Poses, voxel_size: AnyScalar, radius: AnyScalar) -> Poses:
+def _different(poses: PoseHypotheses, voxel_size: AnyScalar, radius: AnyScalar) -> PoseHypotheses:
     """The best pose, the best of those that differ from it, and so on."""
 
     def step(left: Float[Array, "n"], _: None) -> tuple[Float[Array, "n"], tuple[Array, Array]]:
@@ -189,18 +193,18 @@ def _different(poses: Poses, voxel_size: AnyScalar, radius: AnyScalar) -> Poses:
         turn = poses.rotation - poses.rotation[best]
         # |R − R'| = √8 sin(angle / 2), about √2 times the angle.
         square = jnp.sum(shift**2, axis=-1) + 0.5 * radius**2 * jnp.sum(turn**2, axis=(-1, -2))
-        return jnp.where(square > (APART * voxel_size) ** 2, left, 0), (best, left[best])
+        return jnp.where(square > (MIN_SEPARATION * voxel_size) ** 2, left, 0), (best, left[best])
 
     _, (rows, score) = jax.lax.scan(step, poses.score, None, NUM_REFINED)
-    return Poses(poses.rotation[rows], poses.translation[rows], score)
+    return PoseHypotheses(poses.rotation[rows], poses.translation[rows], score)
 
 
 @jax.jit
-def refined(poses: Poses, matches: Matches, voxel_size: Float[AnyScalar, ""]) -> Poses:
+def refined(poses: PoseHypotheses, matches: PutativeMatches, voxel_size: Float[AnyScalar, ""]) -> PoseHypotheses:
     """Truncated least squares over all matches by graduated non-convexity, from each pose.
 
     Yang, Antonante, Tzoumas & Carlone, Graduated Non-Convexity for Robust Spatial Perception, RA-L 2020, eq. 14. Poses
-    with a score of 0 stay.
+    with a score of 0 become the identity.
     """
     tolerance = TOLERANCE * voxel_size
 
@@ -220,4 +224,4 @@ def refined(poses: Poses, matches: Matches, voxel_size: Float[AnyScalar, ""]) ->
     rotation = jnp.where(found[:, None, None], rotation, jnp.eye(3, dtype=rotation.dtype))
     translation = jnp.where(found[:, None], translation, 0)
     score = jnp.where(found, _scores(rotation, translation, matches, voxel_size), 0)
-    return Poses(rotation, translation, score)
+    return PoseHypotheses(rotation, translation, score)

@@ -1,4 +1,4 @@
-"""Local statistics of clouds: on the host in blocks, inside transformations over the whole arrays."""
+"""Local geometry of clouds: on the host in blocks, inside transformations over the whole arrays."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ import numpy as np
 
 from mcgicp_jax._clouds.point_cloud import PointCloud
 from mcgicp_jax._compute.blocks import map_rows
-from mcgicp_jax._compute.cache import keep
+from mcgicp_jax._compute.cache import cached_with
 from mcgicp_jax._compute.concrete import is_concrete
 from mcgicp_jax._compute.threads import side_by_side
-from mcgicp_jax._local_geometry.covariances import describe, gatherer
-from mcgicp_jax._local_geometry.records import Local
+from mcgicp_jax._local_geometry.local_geometry import LocalGeometry, describe
+from mcgicp_jax._local_geometry.neighborhoods import gatherer
 
 Tree = TypeVar("Tree")
 
@@ -27,42 +27,42 @@ _LARGEST_WHOLE = 16_000
 _LARGEST_BLOCK = 8192
 
 
-def locals_of(
+def local_geometries(
     source: PointCloud, target: PointCloud, with_channels: bool, num_threads: int | None = 1
-) -> tuple[Local, Local]:
-    """Local statistics of two preprocessed clouds.
+) -> tuple[LocalGeometry, LocalGeometry]:
+    """Local geometry of two preprocessed clouds.
 
     Args:
         with_channels: whether the method uses the channels; if not, the programs do not depend on their number.
         num_threads: largest number of threads on the host; None for no limit.
 
     Returns:
-        Statistics of the source and of the target.
+        Of the source and of the target.
     """
     if is_concrete(source, target):
-        calls = [partial(local_on_host, cloud, with_channels, num_threads) for cloud in (target, source)]
-        found_target, found_source = side_by_side(calls, num_threads)
-        return found_source, found_target
+        calls = [partial(local_geometry_on_host, cloud, with_channels, num_threads) for cloud in (target, source)]
+        of_target, of_source = side_by_side(calls, num_threads)
+        return of_source, of_target
     # A concrete cloud beside a traced one is traced as well, which needs no program of its own.
     if not share_a_body(source, target):
         return _traced(source, with_channels), _traced(target, with_channels)
     return split(_traced(joined(source, target, with_channels), with_channels), source.points.shape[0])
 
 
-def local_on_host(cloud: PointCloud, with_channels: bool, num_threads: int | None = 1) -> Local:
-    """Local statistics of a concrete cloud as NumPy arrays, cached with the cloud."""
+def local_geometry_on_host(cloud: PointCloud, with_channels: bool, num_threads: int | None = 1) -> LocalGeometry:
+    """Local geometry of a concrete cloud as NumPy arrays, cached with the cloud."""
 
-    def make() -> Local:
+    def make() -> LocalGeometry:
         gather = gatherer(cloud, with_channels, np)
         return map_rows(lambda rows: _describe(gather(rows)), cloud.points.shape[0], num_threads)
 
-    return keep(cloud, "local", with_channels, make)
+    return cached_with(cloud, "local geometry", with_channels, make)
 
 
 _describe = jax.jit(describe)
 
 
-def _traced(cloud: PointCloud, with_channels: bool) -> Local:
+def _traced(cloud: PointCloud, with_channels: bool) -> LocalGeometry:
     gather = gatherer(cloud, with_channels, jnp)
     return over_rows(lambda rows: describe(gather(rows)), cloud.points.shape[0])
 

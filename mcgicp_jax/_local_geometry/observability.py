@@ -14,7 +14,8 @@ from typing import TypeAlias
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from mcgicp_jax._local_geometry.records import Local
+from mcgicp_jax._compute.concrete import AnyArray
+from mcgicp_jax._local_geometry.channel_fits import ChannelFits
 from mcgicp_jax._math import symmetric_matrices as alg
 
 Basis: TypeAlias = tuple[Float[Array, "3 N"], Float[Array, "3 N"]]
@@ -56,7 +57,9 @@ def geometry_observability(
     return certain * (alg.outer(normal) - alg.embed(variance, *basis))
 
 
-def channel_observability(local: Local, weights: Float[Array, "C"]) -> tuple[Float[Array, "6 N"], Float[Array, "N"]]:
+def channel_observability(
+    fits: ChannelFits, normal: Float[AnyArray, "N 3"], weights: Float[Array, "C"]
+) -> tuple[Float[Array, "6 N"], Float[Array, "N"]]:
     """Observability of motions within the surface, from the gradients g of the descriptors α · channel.
 
     If a point moves by x within the surface, its nearest target point in position and descriptors moves by (I + A)⁻¹ x,
@@ -70,15 +73,15 @@ def channel_observability(local: Local, weights: Float[Array, "C"]) -> tuple[Flo
         Symmetric (6, N) matrices, and the (N,) variance of the descriptors about their linear fits, metres², summed
         over the channels.
     """
-    total = jnp.zeros((3, local.observed.shape[0]), local.observed.dtype)
+    total = jnp.zeros((3, normal.shape[0]), normal.dtype)
     uncertain, noise = total, total[0]
-    for channel in range(local.num_channels):
-        gx, gy, residual, *inverse = local.fit(channel)
+    for channel in range(fits.residual.shape[1]):
+        gx, gy = fits.gradient[:, channel].T
         square = weights[channel] ** 2
-        residual = square * jnp.where(jnp.isnan(residual), 0, residual)
+        residual = square * jnp.where(jnp.isnan(fits.residual[:, channel]), 0, fits.residual[:, channel])
         total = total + square * jnp.stack([gx * gx, gx * gy, gy * gy])
-        uncertain = uncertain + residual * jnp.stack(inverse)
+        uncertain = uncertain + residual * fits.inverse[:, channel].T
         noise = noise + residual
     # The same tangent basis as in the linear fits.
-    basis = alg.orthonormal_basis(local.normal)
+    basis = alg.orthonormal_basis(normal.T)
     return alg.embed((total - uncertain) / (1 + total[0] + total[2]), *basis), noise

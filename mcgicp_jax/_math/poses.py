@@ -1,4 +1,7 @@
-"""Poses: validation of user input, and conversion between matrices and `jaxlie.SE3`."""
+"""Poses: validation of user input, conversion between matrices and `jaxlie.SE3`, and changes of frames of twists.
+
+A twist ξ = (v, ω) is a small motion: v in metres (or in units of a radius), ω in radians.
+"""
 
 from __future__ import annotations
 
@@ -12,7 +15,7 @@ import numpy as np
 from jax.typing import ArrayLike, DTypeLike
 from jaxtyping import Array, Float
 
-from mcgicp_jax._compute.concrete import AnyArray, is_concrete, namespace
+from mcgicp_jax._compute.concrete import AnyArray, is_concrete, numpy_for
 
 if TYPE_CHECKING:
     # A pose that a user passes.
@@ -143,9 +146,46 @@ def rotation_from_quaternion(wxyz: Float[np.ndarray, "*batch 4"]) -> Float[np.nd
     return np.array(rows).swapaxes(0, 1).T
 
 
+def move_pose(pose: jaxlie.SE3, twist: Float[Array, "6"], center: Float[Array, "3"]) -> jaxlie.SE3:
+    """The pose that maps a to c + exp(ω)(T a − c) + v; v in metres, ω in radians."""
+    turn = jaxlie.SO3.exp(twist[3:])
+    rotation = (turn @ pose.rotation()).normalize()
+    translation = center + turn @ (pose.translation() - center) + twist[:3]
+    return cast_pose(jaxlie.SE3.from_rotation_and_translation(rotation, translation), pose.wxyz_xyz.dtype)
+
+
+def adjoint_to_center(pose: jaxlie.SE3, center: Float[Array, "3"]) -> Float[Array, "6 6"]:
+    """(6, 6) matrix from ξ of T exp(ξ), in the source's frame, to twists about the centre in the target's frame."""
+    to_center = jaxlie.SE3.from_rotation_and_translation(jaxlie.SO3.identity(), -center) @ pose
+    return to_center.adjoint().astype(pose.wxyz_xyz.dtype)
+
+
+def adjoint_to_source(pose: jaxlie.SE3, center: Float[Array, "3"]) -> Float[Array, "6 6"]:
+    """Inverse of `adjoint_to_center`."""
+    to_center = jaxlie.SE3.from_rotation_and_translation(jaxlie.SO3.identity(), -center) @ pose
+    return to_center.inverse().adjoint().astype(pose.wxyz_xyz.dtype)
+
+
+def units(radius: Float[Array, ""]) -> Float[Array, "6"]:
+    """Factors that convert a twist from units of the radius to metres; radians stay."""
+    return jnp.stack([radius] * 3 + [jnp.ones_like(radius)] * 3)
+
+
+def from_center(offset: Float[Array, "3"], radius: Float[Array, ""], other: Float[Array, ""]) -> Float[Array, "6 6"]:
+    """(6, 6) matrix from twists about a centre, lengths in units of `radius`, to twists about another one.
+
+    Args:
+        offset: from the centre to the other one, metres.
+        other: unit of length of the result, metres.
+    """
+    cross = jnp.cross(jnp.eye(3, dtype=offset.dtype), offset[None], axis=1).T
+    top = jnp.concatenate([jnp.eye(3, dtype=offset.dtype) * radius, cross], axis=1) / other
+    return jnp.concatenate([top, jnp.eye(6, dtype=offset.dtype)[3:]])
+
+
 def inverse(matrices: Float[AnyArray, "*batch 4 4"]) -> Float[AnyArray, "*batch 4 4"]:
     """The inverses of rigid motions."""
-    xp = namespace(matrices)
+    xp = numpy_for(matrices)
     turned = xp.swapaxes(matrices[..., :3, :3], -1, -2)
     last = xp.broadcast_to(xp.eye(4, dtype=matrices.dtype)[3:], (*matrices.shape[:-2], 1, 4))
     return xp.concatenate([xp.concatenate([turned, -turned @ matrices[..., :3, 3:]], axis=-1), last], axis=-2)
@@ -153,7 +193,7 @@ def inverse(matrices: Float[AnyArray, "*batch 4 4"]) -> Float[AnyArray, "*batch 
 
 def adjoint(matrices: Float[AnyArray, "*batch 4 4"]) -> Float[AnyArray, "*batch 6 6"]:
     """Adjoints of rigid motions: T exp(ξ) T⁻¹ = exp(Ad ξ), for twists ξ = (v, ω)."""
-    xp = namespace(matrices)
+    xp = numpy_for(matrices)
     rotations = matrices[..., :3, :3]
     # The columns of t × R.
     crossed = xp.swapaxes(xp.cross(matrices[..., None, :3, 3], xp.swapaxes(rotations, -1, -2)), -1, -2)
@@ -163,7 +203,7 @@ def adjoint(matrices: Float[AnyArray, "*batch 4 4"]) -> Float[AnyArray, "*batch 
 
 def translation_adjoint(offset: Float[AnyArray, "3"]) -> Float[AnyArray, "6 6"]:
     """The adjoint of a translation by `offset`."""
-    xp = namespace(offset)
+    xp = numpy_for(offset)
     zero = xp.zeros_like(offset[0])
     x, y, z = offset
     cross = xp.stack([xp.stack([zero, -z, y]), xp.stack([z, zero, -x]), xp.stack([-y, x, zero])])

@@ -12,7 +12,7 @@ import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
-from mcgicp_jax._compute.concrete import AnyArray, AnyScalar, canonical_float, is_concrete, namespace
+from mcgicp_jax._compute.concrete import AnyArray, AnyScalar, canonical_float, is_concrete, numpy_for
 
 
 class Numbers(eqx.Module):
@@ -42,8 +42,8 @@ class AbstractKernel(Numbers):
 
     def __init__(self, scale: ArrayLike):
         """`scale` is k. Raises `ValueError` unless it is one positive, finite number."""
-        known = is_concrete(scale)
-        self.scale = jax.device_put(np.asarray(scale, canonical_float())) if known else jnp.asarray(scale)
+        concrete = is_concrete(scale)
+        self.scale = jax.device_put(np.asarray(scale, canonical_float())) if concrete else jnp.asarray(scale)
         if self.scale.shape != () or (is_concrete(self.scale) and not 0 < float(self.scale) < np.inf):
             raise ValueError(f"scale: expected one positive number, got {scale!r}")
 
@@ -122,5 +122,14 @@ def truncated_weights(ratio: Float[AnyArray, "*batch"], control: AnyScalar) -> F
         ratio: threshold divided by the residual.
         control: μ; the decline from 1 to 0 around the threshold becomes steeper as it grows.
     """
-    xp = namespace(ratio, control)
+    xp = numpy_for(ratio, control)
     return xp.clip(ratio * xp.sqrt(control * (control + 1)) - control, 0, 1)
+
+
+KERNELS: dict[str, type[AbstractKernel]] = {
+    "huber": Huber,
+    "cauchy": Cauchy,
+    "geman-mcclure": GemanMcClure,
+    "tukey": Tukey,
+    "welsch": Welsch,
+}

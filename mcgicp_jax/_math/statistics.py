@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from mcgicp_jax._compute.concrete import AnyArray, AnyScalar, is_concrete, namespace
+from mcgicp_jax._compute.concrete import AnyArray, AnyScalar, is_concrete, numpy_for
 
 # Largest sample for a median, rows: the median of 4,096 normal variates has a standard error of 2 % of σ.
 MEDIAN_ROWS = 4096
@@ -27,7 +27,7 @@ def sampled_rows(valid: Any) -> tuple[Any, Any]:
     Returns:
         (n,) row numbers, n at most `MEDIAN_ROWS`, and (n,) booleans: which of them are valid.
     """
-    xp = namespace(valid)
+    xp = numpy_for(valid)
     count = min(valid.size, MEDIAN_ROWS)
     rows = xp.arange(count) * (1 + xp.sum(valid) // MEDIAN_ROWS)
     inside = rows < valid.size
@@ -42,19 +42,19 @@ def median(values: Any) -> Any:
     values = np.asarray(values)
     result = np.full(values.shape[:-1], np.nan, values.dtype)
     for place in np.ndindex(values.shape[:-1]):
-        known = values[place][~np.isnan(values[place])]
-        if known.size:
+        numbers = values[place][~np.isnan(values[place])]
+        if numbers.size:
             # In float64, in which the sum of the two middle values does not overflow.
-            result[place] = np.median(known.astype(np.float64))
+            result[place] = np.median(numbers.astype(np.float64))
     return result[()]
 
 
 def of_known(statistic: Callable[[Any], Any], values: Float[AnyArray, "n C"]) -> Float[AnyArray, "*some C"]:
-    """A statistic over the first axis that ignores NaN, such as `nanstd`; NaN for columns without a number.
+    """A statistic over the first axis that ignores NaN, such as `nanstd`; NaN for columns of NaN.
 
-    NumPy would warn of these columns, and its warning cannot be suppressed in one thread alone.
+    NumPy would warn of such columns, and its warning cannot be suppressed in one thread alone.
     """
-    xp = namespace(values)
+    xp = numpy_for(values)
     missing = xp.all(xp.isnan(values), axis=0)
     # Squares of huge values overflow to infinity.
     with np.errstate(over="ignore", invalid="ignore"):
@@ -85,6 +85,6 @@ def cell_numbers(keys: Sequence[Int[AnyArray, "n"]], num_cells: Int[AnyScalar, "
 
     Collisions do no harm: scores of different cells are independent, so their products cancel on average.
     """
-    xp = namespace(keys, num_cells)
+    xp = numpy_for(keys, num_cells)
     products = [xp.asarray(key, np.int32) * prime for key, prime in zip(keys, _HASH, strict=False)]
     return xp.abs(sum(products[1:], start=products[0])) % num_cells

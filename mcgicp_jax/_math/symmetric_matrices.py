@@ -7,11 +7,14 @@ is slow for small matrices, and two concurrent batched calls can deadlock XLA's 
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import TypeAlias
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
+
+from mcgicp_jax._compute.concrete import AnyArray, numpy_for
 
 
 def symmetric_from_matrix(matrix: Float[Array, "N 3 3"]) -> Float[Array, "6 N"]:
@@ -26,9 +29,7 @@ def matrix_from_symmetric(symmetric: Float[Array, "6 N"]) -> Float[Array, "N 3 3
 
 def multiply(symmetric: Float[Array, "6 N"], vector: Float[Array, "3 N"]) -> Float[Array, "3 N"]:
     """A v for each point."""
-    xx, xy, xz, yy, yz, zz = symmetric
-    x, y, z = vector
-    return jnp.stack([xx * x + xy * y + xz * z, xy * x + yy * y + yz * z, xz * x + yz * y + zz * z])
+    return jnp.stack(_times(tuple(symmetric), tuple(vector)))
 
 
 def rotate(rotation: Float[Array, "3 3"], symmetric: Float[Array, "6 N"]) -> Float[Array, "6 N"]:
@@ -110,13 +111,13 @@ def _smallest_eigenvector(symmetric: Float[Array, "6 N"]) -> Float[Array, "3 N"]
     half_determinant = 0.5 * (xx * (yy * zz - yz * yz) + xy * (xz * yz - xy * zz) + xz * (xy * yz - xz * yy))
     # The best separated eigenvalue: the largest if the determinant is positive, else the smallest (the largest of −B).
     positive = half_determinant >= 0
-    apart = 2 * jnp.cos(jnp.arccos(jnp.minimum(jnp.abs(half_determinant), 1)) / 3)
-    apart = jnp.where(positive, apart, -apart)
-    first = _null_vector(xx - apart, xy, xz, yy - apart, yz, zz - apart)
+    separated = 2 * jnp.cos(jnp.arccos(jnp.minimum(jnp.abs(half_determinant), 1)) / 3)
+    separated = jnp.where(positive, separated, -separated)
+    first = _null_vector(xx - separated, xy, xz, yy - separated, yz, zz - separated)
     # If that eigenvalue is the smallest, `first` is the normal; otherwise the normal is orthogonal to `first`.
     u, v = _basis(*first)
     bu, bv = (_times((xx, xy, xz, yy, yz, zz), axis) for axis in (u, v))
-    a, b, c = _dot(u, bu), _dot(u, bv), _dot(v, bv)
+    a, b, c = dot(u, bu), dot(u, bv), dot(v, bv)
     # Eigenvector of [[a, b], [b, c]] for its smaller eigenvalue, in the one of two forms that is free of cancellation.
     half = 0.5 * (a - c)
     radius = jnp.sqrt(half * half + b * b)
@@ -130,10 +131,10 @@ def _smallest_eigenvector(symmetric: Float[Array, "6 N"]) -> Float[Array, "3 N"]
 
 
 # Vectors and matrices given by their entries, each an array of one number per point.
-Entries: TypeAlias = tuple[Array, ...]
+Entries: TypeAlias = Sequence[Array]
 
 
-def _dot(a: Entries, b: Entries) -> Array:
+def dot(a: Entries, b: Entries) -> Array:
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 
@@ -143,7 +144,7 @@ def _times(symmetric: Entries, vector: Entries) -> Entries:
     return xx * x + xy * y + xz * z, xy * x + yy * y + yz * z, xz * x + yz * y + zz * z
 
 
-def _cross(a: Entries, b: Entries) -> Entries:
+def cross(a: Entries, b: Entries) -> Entries:
     return a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
 
 
@@ -158,12 +159,12 @@ def _scale_to_one(symmetric: Float[Array, "6 N"]) -> Entries:
 def _null_vector(xx: Array, xy: Array, xz: Array, yy: Array, yz: Array, zz: Array) -> Entries:
     """Unit null vector of a symmetric matrix of rank two: the longest cross product of two of its rows."""
     rows = ((xx, xy, xz), (xy, yy, yz), (xz, yz, zz))
-    crosses = [_cross(rows[i], rows[j]) for i, j in ((0, 1), (0, 2), (1, 2))]
-    best, length = crosses[0], _dot(crosses[0], crosses[0])
-    for cross in crosses[1:]:
-        square = _dot(cross, cross)
+    crosses = [cross(rows[i], rows[j]) for i, j in ((0, 1), (0, 2), (1, 2))]
+    best, length = crosses[0], dot(crosses[0], crosses[0])
+    for other in crosses[1:]:
+        square = dot(other, other)
         longer = square > length
-        best = tuple(jnp.where(longer, new, old) for new, old in zip(cross, best, strict=True))
+        best = tuple(jnp.where(longer, new, old) for new, old in zip(other, best, strict=True))
         length = jnp.maximum(square, length)
     regular = length > 0
     root = jnp.sqrt(jnp.where(regular, length, 1))
@@ -247,3 +248,27 @@ def symmetric_product(a: Float[Array, "6 N"], b: Float[Array, "6 N"]) -> Float[A
     axes = jnp.eye(3, dtype=a.dtype)[:, :, None]
     columns = [multiply(a, multiply(b, jnp.broadcast_to(axis, (3, a.shape[1])))) for axis in axes]
     return jnp.stack([0.5 * (columns[j][i] + columns[i][j]) for i in range(3) for j in range(i, 3)])
+
+
+def inverse_3(matrices: Float[AnyArray, "*n 3 3"]) -> Float[AnyArray, "*n 3 3"]:
+    """Inverses of symmetric positive definite matrices: cross products of rows over the determinant."""
+    xp = numpy_for(matrices)
+    matrices = 0.5 * (matrices + matrices.swapaxes(-1, -2))
+    # So that the determinant of variances of 1e-10 does not underflow float32.
+    size = xp.einsum("...ii->...", matrices)[..., None, None]
+    first, second, third = (matrices[..., i, :] / size[..., 0] for i in range(3))
+    rows = xp.stack([xp.cross(second, third), xp.cross(third, first), xp.cross(first, second)], axis=-2)
+    return rows / (xp.sum(rows[..., 0, :] * first, axis=-1)[..., None, None] * size)
+
+
+def inverse_6(matrix: Float[AnyArray, "6 6"]) -> Float[AnyArray, "6 6"]:
+    """Inverse of a symmetric positive definite matrix by blocks."""
+    xp = numpy_for(matrix)
+    matrix = 0.5 * (matrix + matrix.T)
+    mixed, corner = matrix[:3, 3:], inverse_3(matrix[3:, 3:])
+    ratio = mixed @ corner
+    first = inverse_3(matrix[:3, :3] - ratio @ mixed.T)
+    across = -first @ ratio
+    return xp.concatenate(
+        [xp.concatenate([first, across], axis=1), xp.concatenate([across.T, corner - ratio.T @ across], axis=1)]
+    )

@@ -12,13 +12,12 @@ from mcgicp_jax._clouds.point_cloud import PointCloud
 from mcgicp_jax._clouds.preprocess import preprocess
 from mcgicp_jax._local_geometry.spacing_and_noise import point_spacing
 from mcgicp_jax._math.poses import Pose, pose_matrix
-from mcgicp_jax._search.base import Rows
-from mcgicp_jax._search.kd_tree import KDTreeSearch
+from mcgicp_jax._search.positions import nearest_in_position
 
-# Fewest differences per channel: the relative standard error of a variance from n of them is √(2/n), 45 % for 10.
+# Smallest number n of differences per channel: the relative standard error of a variance is √(2/n), 45 % for 10.
 _MIN_DIFFERENCES = 10
 # Default maximum distance of a match, in spacings: any other target point is then more than half a spacing away.
-_SAME_SPOT = 0.5
+_SAME_SURFACE = 0.5
 # Smallest eigenvalue of the correlation matrix, dimensionless: eight float32 epsilons keep Λ positive definite.
 _MIN_EIGENVALUE = 1e-6
 
@@ -56,17 +55,17 @@ def estimate_channel_covariance(
             raise ValueError(f"clouds[{i}]: expected the channels {names}, got {cloud.channel_names}")
     products, counts = np.zeros((len(names), len(names))), np.zeros((len(names), len(names)))
     for target, source in itertools.pairwise(zip(ready, matrices, strict=True)):
-        limit = _SAME_SPOT * float(point_spacing(target[0])) if max_distance is None else max_distance
-        differences, known = _differences(*source, *target, limit)
-        number = np.maximum(known.sum(axis=0), 1)
-        differences = np.where(known, differences - differences.sum(axis=0) / number, 0)
+        limit = _SAME_SURFACE * float(point_spacing(target[0])) if max_distance is None else max_distance
+        differences, present = _differences(*source, *target, limit)
+        number = np.maximum(present.sum(axis=0), 1)
+        differences = np.where(present, differences - differences.sum(axis=0) / number, 0)
         products += differences.T @ differences
-        counts += known.T.astype(float) @ known
+        counts += present.T.astype(float) @ present
     if counts.size and np.diagonal(counts).min() < _MIN_DIFFERENCES:
-        least = names[int(np.diagonal(counts).argmin())]
+        scarcest = names[int(np.diagonal(counts).argmin())]
         raise ValueError(
             f"clouds: expected at least {_MIN_DIFFERENCES} matches per channel, got "
-            f"{np.diagonal(counts).min():.0f} for {least!r}; check the poses, or raise max_distance"
+            f"{np.diagonal(counts).min():.0f} for {scarcest!r}; check the poses, or raise max_distance"
         )
     # The covariance of two channels that no match has in common is unknown, and set to 0.
     return _positive_definite(products / np.maximum(counts, 1))
@@ -82,21 +81,14 @@ def _differences(
     """Channel differences of the matches, 0 where either value is missing, and the mask of those present."""
     matrix = np.linalg.inv(target_pose) @ source_pose
     moved, fixed = source.transform(matrix).unpad(), target.unpad()
-    rows = [
-        Rows(points=np.asarray(cloud.points), descriptors=np.zeros((len(cloud), 0)), valid=np.ones(len(cloud), bool))
-        for cloud in (moved, fixed)
-    ]
-    identity = np.array([1.0, 0, 0, 0, 0, 0, 0])
-    (nearest,) = KDTreeSearch().index(rows[1]).nearest(identity, rows[0], max_distance)
-    distances = np.linalg.norm(np.asarray(fixed.points)[nearest] - np.asarray(moved.points), axis=1)
-    near = (nearest >= 0) & (distances <= max_distance)
-    matched = [(moved, np.flatnonzero(near)), (fixed, nearest[near])]
-    known = np.ones((near.sum(), moved.channels.shape[1]), bool)
-    for cloud, chosen in matched:
+    nearest = nearest_in_position(moved.points, fixed.points, max_distance)
+    matched = [(moved, np.flatnonzero(nearest >= 0)), (fixed, nearest[nearest >= 0])]
+    present = np.ones((len(matched[0][1]), moved.channels.shape[1]), bool)
+    for cloud, rows in matched:
         if cloud.channel_valid is not None:
-            known &= np.asarray(cloud.channel_valid)[chosen]
-    values = [np.asarray(cloud.channels, np.float64)[chosen] for cloud, chosen in matched]
-    return np.where(known, values[0] - values[1], 0), known
+            present &= np.asarray(cloud.channel_valid)[rows]
+    values = [np.asarray(cloud.channels, np.float64)[rows] for cloud, rows in matched]
+    return np.where(present, values[0] - values[1], 0), present
 
 
 def _positive_definite(covariance: Float[np.ndarray, "C C"]) -> Float[np.ndarray, "C C"]:

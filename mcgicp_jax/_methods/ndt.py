@@ -2,27 +2,21 @@
 
 from __future__ import annotations
 
-import contextlib
-from collections.abc import Iterator, Sequence
 from typing import Any, ClassVar
 
 import equinox as eqx
-import jax
-import jax.numpy as jnp
-import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
 from mcgicp_jax._clouds.point_cloud import PointCloud, Values
-from mcgicp_jax._clouds.preprocess import finite_rows, with_neighbors
-from mcgicp_jax._compute.concrete import AnyScalar, namespace
-from mcgicp_jax._local_geometry.observability import geometry_observability
-from mcgicp_jax._local_geometry.records import Local, Neighborhoods, local_of
+from mcgicp_jax._local_geometry.local_geometry import LocalGeometry
+from mcgicp_jax._local_geometry.neighborhoods import Neighborhoods
 from mcgicp_jax._math import symmetric_matrices as alg
 from mcgicp_jax._math.robust_kernels import AbstractKernel, Welsch
-from mcgicp_jax._math.statistics import median, sampled_rows
-from mcgicp_jax._methods.base import GICP, AbstractGeneralized, AbstractMethod, AbstractOneSided, ColorICP, identity
-from mcgicp_jax._methods.voxel_gaussians import gaussians
+from mcgicp_jax._methods.base import AbstractGeneralized, AbstractMethod, AbstractOneSided, identity
+from mcgicp_jax._methods.icp import ColorICP
+from mcgicp_jax._terms.base import AbstractTerm
+from mcgicp_jax._terms.mahalanobis import Mahalanobis
 
 # Scale k of the kernel, standard deviations. The usual score is −exp(−d₂ s²/2), so that k² = 2/d₂. Magnusson's formula
 # for d₂ (2009) depends on the unit of length; with the usual 55 % of outliers and cells of 1 m it gives k = 2.15. For
@@ -34,15 +28,6 @@ _SCALE = 2.15
 # with 7. For points against cells, a sum over seven changes nothing (16 mm with one, 4 or 7), and with cells of one
 # colour it costs accuracy (10.7 mm with one and 18.8 with 7 on a flat table).
 _NUM_CANDIDATES = 4
-# Edge of the voxels, per edge of a cell, at all scales but the last, where GICP registers the clouds. At these scales
-# cells against cells pull clouds that overlap in part over each other: from 1.3 m and 10° off, two views of a yard with
-# an overlap of three quarters ended 4 m off, and end at 0 m by GICP. On KITTI, from 5 m and 30° off, GICP leads to 7
-# of 8 poses, cells to 4.
-_COARSE_VOXEL = 0.25
-# Square of the edge of a cell over the trace of its covariance, if it is a square filled uniformly: 2 edge²/12.
-_SQUARE_EDGE = 6.0
-# Number of points that the normal of a cell is taken to be estimated from: that of a neighbourhood.
-_COUNT = 20
 
 
 class AbstractNDT(AbstractMethod):
@@ -52,81 +37,17 @@ class AbstractNDT(AbstractMethod):
         kernel: robust kernel, its scale in standard deviations, if `register` is not given another one.
     """
 
-    matches_slide: ClassVar[bool] = False
-
     kernel: AbstractKernel | None
 
-    def covariance(
-        self,
-        points: Float[Array, "3 n"],
-        around: Neighborhoods | None,
-        local: Local | None,
-        given: Float[Array, "6 n"] | None,
-    ) -> Float[Array, "6 n"]:
+    def covariance(self, around: Neighborhoods, local: LocalGeometry | None) -> Float[Array, "6 n"]:
         """The covariances given; those of points are not used."""
-        return identity(points) if given is None else given
+        given = around.given_covariance
+        return identity(around) if given is None else given
 
-    def spacing(self, target: PointCloud) -> Float[AnyScalar, ""]:
-        """The median edge of the cells. (Where a plane lies between two layers of voxels, cells lie close together.)"""
-        if target.covariances is None:
-            return super().spacing(target)
-        xp = namespace(target)
-        rows, counts = sampled_rows(xp.asarray(target.valid))
-        traces = xp.trace(xp.asarray(target.covariances)[rows], axis1=1, axis2=2)
-        return median(xp.where(counts, xp.sqrt(_SQUARE_EDGE * traces), xp.nan))
-
-    def default_kernel(self) -> AbstractKernel | None:
-        return self.kernel
-
-    def described(self, local: Local, given: Float[Array, "6 n"] | None) -> Local:
-        """The surface in a cell from its own covariance: its neighbours are other cells."""
-        if given is None:
-            return local
-        given = jax.lax.stop_gradient(given)
-        normal = alg.smallest_eigenvector(given)
-        basis = alg.orthonormal_basis(normal)
-        across = alg.inner(normal, alg.multiply(given, normal))
-        count = jnp.full_like(across, _COUNT)
-        reach = 0.5 * jnp.sqrt(self.num_candidates * _SQUARE_EDGE * (given[0] + given[3] + given[5]))
-        geometry = geometry_observability(given, normal, basis, count)
-        return local_of(given, normal, geometry, across, reach, local.fits)
-
-    def stages(
-        self, source: PointCloud, target: PointCloud, scales: Sequence[float]
-    ) -> Iterator[tuple[AbstractMethod, PointCloud, PointCloud]]:
-        """One registration per scale, the last one to cells of this size, the others by `GICP` in smaller voxels."""
-        if not scales:
-            yield self, source, target
-        for i, size in enumerate(scales):
-            last = i == len(scales) - 1
-            sides = [
-                self._in_cells(name, cloud, size) if last else _in_voxels(name, cloud, _COARSE_VOXEL * size)
-                for name, cloud in (("source", source), ("target", target))
-            ]
-            yield self if last else GICP(), sides[0], sides[1]
-
-    def _in_cells(self, name: str, cloud: PointCloud, size: float) -> PointCloud:
-        if name not in self.needs_covariances:
-            return cloud
-        with _named(name):
-            return gaussians(cloud, size, channel_size=self._channel_size(cloud, size))
-
-    def _channel_size(self, cloud: PointCloud, voxel_size: float) -> Any:
-        return None
-
-
-def _in_voxels(name: str, cloud: PointCloud, size: float) -> PointCloud:
-    with _named(name):
-        return with_neighbors(finite_rows(cloud), size, _COUNT)
-
-
-@contextlib.contextmanager
-def _named(name: str) -> Iterator[None]:
-    """Begin messages of errors with the name of the cloud."""
-    try:
-        yield
-    except ValueError as error:
-        raise ValueError(f"{name}: {error}") from error
+    def terms(
+        self, source: PointCloud, target: PointCloud, robust: AbstractKernel | None, equalize_channels: bool
+    ) -> tuple[AbstractTerm, ...]:
+        return (Mahalanobis(self, robust=self.kernel if robust is None else robust),)
 
 
 class NDT(AbstractNDT, AbstractOneSided):
@@ -166,10 +87,6 @@ class ColorNDT(NDT, ColorICP):
         """Raises `ValueError` if a weight is negative or not finite or of the wrong shape, or `scale` not positive."""
         ColorICP.__init__(self, channel_weights)
         self.kernel = _welsch(scale)
-
-    def _channel_size(self, cloud: PointCloud, voxel_size: float) -> Any:
-        with np.errstate(divide="ignore"):
-            return voxel_size / np.asarray(self.weights(cloud.channels.shape[1]), np.float64)
 
 
 class D2DNDT(AbstractNDT, AbstractGeneralized):

@@ -10,19 +10,20 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int, Shaped
 
-from mcgicp_jax._clouds.point_cloud import PointCloud, Values
-from mcgicp_jax._clouds.preprocess import MIN_POINTS, finite_rows, preprocess, voxels
+from mcgicp_jax._clouds.point_cloud import PointCloud, Values, as_cloud
+from mcgicp_jax._clouds.preprocess import MIN_POINTS, finite_rows, preprocess
+from mcgicp_jax._clouds.voxels import voxel_order
 from mcgicp_jax._compute.argument_checks import check_integer, check_positive, is_number
-from mcgicp_jax._compute.concrete import AnyArray, namespace
+from mcgicp_jax._compute.concrete import AnyArray, numpy_for
 from mcgicp_jax._math import symmetric_matrices as alg
-from mcgicp_jax._methods.base import GICP
-from mcgicp_jax._methods.surface import covariances_of
+from mcgicp_jax._methods.gicp import GICP
+from mcgicp_jax._methods.surfaces import covariances_of
 
-# Fewest points in a cell, and smallest ratio of its eigenvalues: those of the Point Cloud Library.
+# Smallest number of points in a cell, and smallest ratio of its eigenvalues, as in the Point Cloud Library.
 _MIN_POINTS, _MIN_RATIO = 6, 0.01
 # Smallest standard deviation of the points in a cell, in voxels. Some scanners report each beam without an echo as a
 # point at the origin; such a cell is no surface.
-_LEAST_EXTENT = 1e-4
+_MIN_EXTENT = 1e-4
 
 
 @overload
@@ -104,9 +105,7 @@ def gaussians(
         matrices = (cells.sum(np.asarray(cloud.covariances).reshape(-1, 9)) / cells.counts).T.reshape(-1, 3, 3)[kept]
     else:
         matrices = _floored(cells.spread[:, kept], min_ratio)
-    known, counts = cloud.channel_valid, cells.counts
-    if known is not None:
-        counts = cells.sum(known)
+    counts = cells.counts if cloud.channel_valid is None else cells.sum(cloud.channel_valid)
     # Missing values are stored as 0 and do not add to the sum.
     channels = cells.sum(cloud.channels) / np.maximum(counts, 1)
     dtype = cloud.points.dtype
@@ -114,7 +113,7 @@ def gaussians(
         PointCloud(
             cells.means[:, kept].T.astype(dtype),
             channels[:, kept].T.astype(dtype),
-            channel_valid=None if known is None else counts[:, kept].T > 0,
+            channel_valid=None if cloud.channel_valid is None else counts[:, kept].T > 0,
             covariances=matrices.astype(dtype),
             channel_names=cloud.channel_names,
         )
@@ -141,8 +140,7 @@ def voxel_cells(
     Raises:
         ValueError: if an argument is out of range.
     """
-    cloud = cloud if isinstance(cloud, PointCloud) else PointCloud(cloud)
-    cells = _Cells(cloud, voxel_size, min_points, channel_size)
+    cells = _Cells(as_cloud("cloud", cloud), voxel_size, min_points, channel_size)
     number = np.empty(len(cells.order), np.int32)
     number[cells.order] = np.repeat(np.where(cells.kept, np.cumsum(cells.kept) - 1, -1), cells.counts)
     return number
@@ -163,7 +161,7 @@ class _Cells:
         check_integer("min_points", min_points, 3)
         # Working by columns takes a third of the time of working by rows.
         points = _columns(cloud.coordinates if np.any(cloud.origin) else cloud.points)
-        self.order, self._starts = voxels(points, voxel_size)
+        self.order, self._starts = voxel_order(points, voxel_size)
         if channel_size is not None:
             self.order, self._starts = _split(self.order, self._starts, cloud, channel_size)
         self.counts = np.diff(self._starts, append=len(self.order))
@@ -173,7 +171,7 @@ class _Cells:
             self._reduced,
             lambda values: np.repeat(values, self.counts, axis=1),
         )
-        extended = self.spread[[0, 3, 5]].sum(axis=0) > (_LEAST_EXTENT * voxel_size) ** 2
+        extended = self.spread[[0, 3, 5]].sum(axis=0) > (_MIN_EXTENT * voxel_size) ** 2
         self.kept = (self.counts >= min_points) & extended
 
     def _reduced(self, columns: Float[np.ndarray, "D N"]) -> Float[np.ndarray, "D M"]:
@@ -197,7 +195,7 @@ def _split(
         raise ValueError(f"channel_size: expected one positive number, or one per channel, got {channel_size!r}")
     levels = np.floor(np.asarray(cloud.channels, np.float64)[order] / sizes)
     if cloud.channel_valid is not None:
-        # A level of its own.
+        # Points that lack a channel get a level of their own.
         levels = np.where(np.asarray(cloud.channel_valid)[order], levels, -np.inf)
     columns = [np.cumsum(np.bincount(starts, minlength=len(order))), *levels.T]
     again = np.lexsort(columns[::-1])
@@ -236,9 +234,9 @@ def cell_moments(
     a, b, c = within
     square = 0.25 * (a - c) ** 2 + b * b
     radius = jnp.where(square > 0, jnp.sqrt(jnp.where(square > 0, square, 1)), 0)
-    least = min_ratio * (0.5 * (a + c) + radius)
-    across = jnp.maximum(jnp.sum(normal * alg.multiply(symmetric, normal), axis=0), least)
-    raised = alg.embed(alg.floor_eigenvalues(within, least), u, v) + across * alg.outer(normal)
+    floor = min_ratio * (0.5 * (a + c) + radius)
+    across = jnp.maximum(jnp.sum(normal * alg.multiply(symmetric, normal), axis=0), floor)
+    raised = alg.embed(alg.floor_eigenvalues(within, floor), u, v) + across * alg.outer(normal)
     return means.T, (sum_of(values) / counts.astype(values.dtype)).T, alg.matrix_from_symmetric(raised)
 
 
@@ -248,16 +246,16 @@ def _moments(
     sum_of: Callable[[Any], Any],
     each: Callable[[Any], Any],
 ) -> tuple[Float[AnyArray, "3 M"], Float[AnyArray, "6 M"]]:
-    """Means, and covariances as rows xx, xy, xz, yy, yz, zz. A single pass would lose digits far from zero.
+    """Means, and covariances as rows xx, xy, xz, yy, yz, zz, in two passes: one would lose digits far from zero.
 
     Args:
         counts: number of points in each cell.
-        sum_of: from values of the points, (D, n), to their sums over each cell, (D, M).
-        each: from values of the cells, (D, M), to those of the cell of each point, (D, n).
+        sum_of: maps values of the points, (D, n), to their sums over each cell, (D, M).
+        each: maps values of the cells, (D, M), to the value of each point's cell, (D, n).
     """
     means = sum_of(points) / counts.astype(points.dtype)
     x, y, z = points - each(means)
-    products = namespace(points).stack([x * x, x * y, x * z, y * y, y * z, z * z])
+    products = numpy_for(points).stack([x * x, x * y, x * z, y * y, y * z, z * z])
     return means, sum_of(products) / np.maximum(counts - 1, 1).astype(points.dtype)
 
 

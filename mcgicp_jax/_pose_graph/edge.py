@@ -11,7 +11,7 @@ import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float, Int
 
-from mcgicp_jax._compute.concrete import is_concrete, namespace
+from mcgicp_jax._compute.concrete import is_concrete, numpy_for
 from mcgicp_jax._math.poses import Pose, adjoint, inverse, pose_matrix
 from mcgicp_jax._math.twists import logarithm, logarithm_derivative
 from mcgicp_jax._pose_graph.factors import WORLD, AbstractFactor
@@ -78,7 +78,7 @@ class Edge(AbstractFactor):
     @property  # type: ignore[misc]
     def rows(self) -> Any:  # type: ignore[override]
         """(m, 2), `i` and `j`."""
-        return namespace(self.i, self.j).stack([self.i, self.j], axis=-1)
+        return numpy_for(self.i, self.j).stack([self.i, self.j], axis=-1)
 
     def linearize(
         self, poses: Float[np.ndarray, "m 2 4 4"]

@@ -18,7 +18,7 @@ from jaxtyping import Float, Int
 
 from mcgicp_jax._compute.callbacks import call_host
 from mcgicp_jax._compute.concrete import AnyArray, is_concrete
-from mcgicp_jax._compute.lazy import Deferred
+from mcgicp_jax._compute.lazy import Lazy
 from mcgicp_jax._math.twists import exponential
 from mcgicp_jax._pose_graph.factors import WORLD, AbstractFactor
 from mcgicp_jax._pose_graph.normal_equations import factored
@@ -87,9 +87,7 @@ def _derivative(robust: bool, max_iterations: int, primals: Any, tangents: Any) 
     return found, constants._replace(poses=jnp.where(found.status == Status.CONVERGED, moved, 0))
 
 
-def covariances_traced(
-    poses: Float[AnyArray, "n 4 4"], factors: Factors, weights: Float[AnyArray, "m"]
-) -> Deferred[Any]:
+def covariances_traced(poses: Float[AnyArray, "n 4 4"], factors: Factors, weights: Float[AnyArray, "m"]) -> Lazy[Any]:
     """Covariances at a solution, (n, 6, 6), constants; `jit` leaves them out where they are not read."""
     arguments = jax.lax.stop_gradient((poses, factors, weights))
     dtype = jnp.result_type(*_floats(arguments))
@@ -98,8 +96,8 @@ def covariances_traced(
         return covariances_at(*arguments).astype(dtype)
 
     if is_concrete(arguments):
-        return Deferred(lambda: jnp.asarray(on_host(*jax.tree.map(np.asarray, arguments))))
-    return Deferred.of(call_host(on_host, jax.ShapeDtypeStruct((len(poses), 6, 6), dtype), *arguments))
+        return Lazy(lambda: jnp.asarray(on_host(*jax.tree.map(np.asarray, arguments))))
+    return Lazy.of(call_host(on_host, jax.ShapeDtypeStruct((len(poses), 6, 6), dtype), *arguments))
 
 
 def _floats(tree: Any) -> list[Any]:

@@ -14,7 +14,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from mcgicp_jax._compute.argument_checks import check_integer
 from mcgicp_jax._compute.concrete import AnyArray, is_concrete
-from mcgicp_jax._compute.lazy import Deferred
+from mcgicp_jax._compute.lazy import Lazy
 from mcgicp_jax._pose_graph.edge import Edge
 from mcgicp_jax._pose_graph.graph import PoseGraph
 from mcgicp_jax._pose_graph.implicit_derivative import Found, covariances_traced, solve_traced
@@ -49,7 +49,7 @@ class PoseGraphResult:
     weights: Float[Array, "m"] | Float[np.ndarray, "m"]
     factor_residuals: tuple[AnyArray, ...]
     factor_weights: tuple[AnyArray, ...]
-    uncertainty: Deferred[Any]
+    uncertainty: Lazy[Any]
 
     @property
     def kept(self) -> Bool[Array, "m"] | Bool[np.ndarray, "m"]:
@@ -127,7 +127,7 @@ def optimize_poses(graph: PoseGraph, *, robust: bool = True, max_iterations: int
         solution = solve(poses, factors, bool(robust), int(max_iterations))
         numbers = solution.poses(n), solution.residuals, solution.weights, np.float64(solution.cost)
         found = Found(*numbers, np.int32(solution.status), np.int32(solution.found.num_iterations))
-        uncertainty = Deferred(partial(solution.covariances, n))
+        uncertainty = Lazy(partial(solution.covariances, n))
     else:
         found = solve_traced(graph.poses, factors, bool(robust), int(max_iterations))
         uncertainty = covariances_traced(found.poses, factors, found.weights)

@@ -22,24 +22,17 @@ import jaxlie
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from mcgicp_jax._compute.concrete import AnyArray, AnyScalar, namespace
-from mcgicp_jax._local_geometry.records import noise_of, normal_of, points_of, reach_of, roughness_of
+from mcgicp_jax._compute.concrete import AnyArray, AnyScalar, numpy_for
+from mcgicp_jax._local_geometry.surface import SurfaceNoise, searched
 from mcgicp_jax._math import symmetric_matrices as alg
-from mcgicp_jax._math.robust_kernels import AbstractKernel
+from mcgicp_jax._math.poses import adjoint_to_source, units
 from mcgicp_jax._math.statistics import cell_numbers, median
-from mcgicp_jax._methods.base import AbstractMethod
 from mcgicp_jax._pose_solver.degeneracy import Directions
-from mcgicp_jax._pose_solver.sums import Matched, forces_at, mean_observability, move_rows, powers
-from mcgicp_jax._pose_solver.update import adjoint_to_source, twist_form, units
-from mcgicp_jax._search.base import Rows
-from mcgicp_jax._terms.photometric import Term
+from mcgicp_jax._pose_solver.matched import Matched, Motion, linearize_at
+from mcgicp_jax._pose_solver.sums import mean_observability, powers
+from mcgicp_jax._pose_solver.update import twist_form
+from mcgicp_jax._terms.base import AbstractTerm, linearize
 
-# Edge of a cell in distances to the farthest neighbour; values from 1 to 4 hardly differ.
-_CELL = 2.0
-# The same with the photometric term: both points of a correspondence contribute fits over their neighbourhoods. With 2,
-# 4 and 8, the squared errors on thirty walls of posters were 2.8, 1.8 and 1.6 times their variance (with half of the
-# shift in `_photometric`); with 12, where some walls have few cells, 1.7.
-_CELL_OF_FITS = 8.0
 # Standard deviation of an unconstrained direction, in radii of the matched points: large beside their extent.
 UNKNOWN = 10.0
 # Lower bound of the factors that reduce observability, dimensionless: medians of few rows may be 0.
@@ -48,133 +41,153 @@ _LEAST_FRACTION = 0.2
 _MEDIAN_SQUARE, _MEDIAN_MEAN_OF_TWO = 0.455, 0.693
 
 
-class Details(NamedTuple):
-    """Rows of `Surface.details` of both sides of n correspondences."""
-
-    source: Float[AnyArray, "n 6"]
-    target: Float[AnyArray, "n 6"]
-
-
-def discount_rows(
-    rotation: Float[Array, "3 3"],
-    translation: Float[Array, "3"],
-    matched: Matched,
-    details: Details,
-    source: Rows,
-    target: Rows,
-) -> Float[Array, "n 3"]:
+class NoiseSample(NamedTuple):
     """Per match, the statistics whose medians `discounts` takes; NaN where there is no match.
 
-    Args:
-        source, target: matched rows with descriptors; channels that a point lacks invalidate the third column.
-
-    Returns:
-        Columns: squared residual along the normal, metres²; its variance expected from roughness, metres²; squared
-        descriptor difference divided by its variance expected from channel noise.
+    Attributes:
+        residual: squared residual along the normal, metres².
+        expected: its variance expected from roughness, metres².
+        quotient: squared descriptor difference over its variance expected from channel noise; NaN also where a point
+            lacks a channel.
     """
-    residual = points_of(matched.target) - move_rows(rotation, translation, matched.source)
-    across = jnp.dot(rotation, normal_of(details.source), precision="highest")
+
+    residual: Float[AnyArray, "n"]
+    expected: Float[AnyArray, "n"]
+    quotient: Float[AnyArray, "n"]
+
+
+def noise_sample(motion: Motion, matched: Matched) -> NoiseSample:
+    """The statistics of matches whose surfaces have `noise` and `search`."""
+    source, target = matched.source, matched.target
+    noises, rows = _noises(matched), (searched(source), searched(target))
+    residual = target.points.T - motion.move(source.points)
+    across = jnp.dot(motion.rotation, noises[0].normal.T, precision="highest")
     seen = alg.inner(across, residual) ** 2
-    expected = roughness_of(details.source) + roughness_of(details.target)
+    expected = noises[0].roughness + noises[1].roughness
     complete = jnp.asarray(matched.valid)
-    for penalty in (source.penalty, target.penalty):
-        if penalty is not None:
-            complete = complete & jnp.all(penalty == 0, axis=1)
-    noise = noise_of(details.source) + noise_of(details.target)
-    difference = source.descriptors - target.descriptors
+    for side in rows:
+        if side.penalty is not None:
+            complete = complete & jnp.all(side.penalty == 0, axis=1)
+    noise = noises[0].descriptors + noises[1].descriptors
+    difference = rows[0].descriptors - rows[1].descriptors
     # A quotient per match rather than one of medians: noise is higher at edges.
     quotient = jnp.sum(difference * difference, axis=1) / jnp.where(noise > 0, noise, jnp.nan)
-    columns = (jnp.where(matched.valid, seen, jnp.nan), jnp.where(matched.valid, expected, jnp.nan))
-    return jnp.stack([*columns, jnp.where(complete, quotient, jnp.nan)], axis=1)
+    return NoiseSample(
+        jnp.where(matched.valid, seen, jnp.nan),
+        jnp.where(matched.valid, expected, jnp.nan),
+        jnp.where(complete, quotient, jnp.nan),
+    )
 
 
-def discounts(rows: Float[AnyArray, "n 3"], num_channels: Int[AnyScalar, ""]) -> Float[AnyArray, "2"]:
+def _noises(matched: Matched) -> tuple[SurfaceNoise, SurfaceNoise]:
+    source, target = matched.source.noise, matched.target.noise
+    if source is None or target is None:
+        raise ValueError("matched: expected surfaces with noise")
+    return source, target
+
+
+def discounts(sample: NoiseSample, num_channels: Int[AnyScalar, ""]) -> Float[AnyArray, "2"]:
     """(2,) factors, 0.2 to 1, by which observability must be reduced: of the geometry and of the channels.
 
-    On a rough surface the nearest neighbour is one whose height resembles that of the point. If the heights of matches
-    are b = βa + e with equal roughness on both sides, the variance of b − a is 1 − β times the sum of both roughnesses,
-    and when the point moves, its match follows by β of the motion: so 1 − β is both the ratio of observed to expected
-    variance, estimated here, and the observable fraction. The same holds for noisy channels. Medians, since the plane
-    fits fail at edges.
+    On a rough surface the nearest neighbour is one whose height resembles that of the point. Model the height b of a
+    match as b = βa + e, with equal roughness on both sides. Then var(b − a) is (1 − β) times the sum of both
+    roughnesses, and the match follows a fraction β of any motion. The ratio of observed to expected variance therefore
+    estimates the observable fraction 1 − β. The same holds for noisy channels. Medians, since the plane fits fail at
+    edges.
 
     Args:
-        rows: from `discount_rows`.
+        sample: of matches.
         num_channels: number of channels with a nonzero weight α.
     """
-    xp = namespace(rows, num_channels)
-    seen, expected, quotient = median(xp.asarray(rows).T)
+    xp = numpy_for(sample, num_channels)
+    seen, expected, quotient = median(xp.stack([xp.asarray(column) for column in sample]))
     geometry = (seen / _MEDIAN_SQUARE) / (xp.where(expected > 0, expected, xp.nan) / _MEDIAN_MEAN_OF_TWO)
     # Divided by the median of χ²/C with C degrees of freedom, after Wilson & Hilferty 1931.
     channels = quotient / (1 - 2 / (9 * xp.maximum(num_channels, 1))) ** 3
     ratios = xp.stack([geometry, channels])
-    return xp.where(xp.isfinite(ratios), xp.clip(ratios, _LEAST_FRACTION, 1), 1).astype(rows.dtype)
+    return xp.where(xp.isfinite(ratios), xp.clip(ratios, _LEAST_FRACTION, 1), 1).astype(sample.residual.dtype)
 
 
 class Scores(NamedTuple):
     """Scores of n correspondences, and the sums over them that `sandwich` needs.
 
     Attributes:
-        rows: (n, 7) force, torque (arms in units of the radius), and 1 for valid correspondences or 0.
-        cells: (n,) cell number of each; None: every correspondence is a cell of its own.
-        jacobian: (6, 10) Σ (K O) ⊗ h hᵀ about the centre, K O symmetrised; K = w M, or the tangent of a robust force.
-        bias: (6,) Σ of force and torque of w M(I − O)d; 0 where observability is not known.
+        wrenches: force, torque (arms in units of the radius).
+        valid: 1 for valid correspondences, else 0.
+        cells: number of the cell of each; None: every correspondence is a cell of its own.
+        jacobian: Σ (K O) ⊗ h hᵀ about the centre, K O symmetrised; K = w M, or the tangent of a robust force.
+        bias: Σ of force and torque of w M(I − O)d; 0 where observability is not known.
     """
 
-    rows: Float[AnyArray, "n 7"]
+    wrenches: Float[AnyArray, "n 6"]
+    valid: Float[AnyArray, "n"]
     cells: Int[AnyArray, "n"] | None
     jacobian: Float[AnyArray, "6 10"]
     bias: Float[AnyArray, "6"]
 
 
+class Frame(NamedTuple):
+    """Where torques are taken about, and what scores need besides the correspondences.
+
+    Attributes:
+        center, radius: `Sums.center` and `Sums.radius` over all correspondences, metres.
+        discount: from `discounts`.
+        num_cells: size of the hash table of cells.
+    """
+
+    center: Float[AnyArray, "3"]
+    radius: Float[AnyScalar, ""]
+    discount: Float[AnyArray, "2"]
+    num_cells: Int[AnyScalar, ""]
+
+
 def scores_of(
-    pose: tuple[Float[Array, "3 3"], Float[Array, "3"]],
-    center: Float[Array, "3"],
-    radius: Float[Array, ""],
+    motion: Motion,
     matched: Matched,
-    details: Details | None,
-    discount: Float[Array, "2"],
-    num_cells: Int[AnyScalar, ""],
-    method: AbstractMethod,
-    robust: AbstractKernel | None,
-    responding: Term | None = None,
+    frame: Frame,
+    terms: tuple[AbstractTerm, ...],
+    responding: tuple[AbstractTerm, ...] | None,
 ) -> Scores:
     """The scores of correspondences at a pose.
 
     Args:
-        pose: rotation and translation.
-        center, radius: `Sums.center` and `Sums.radius` over all correspondences, metres.
-        details: None where observability is not known; then O = I.
-        discount: from `discounts`.
-        num_cells: size of the hash table of cells.
-        responding: estimates from `Term.responding`. With these, the stiffness of the method replaces K O, and its
-            forces replace w M O d. None for methods without estimates, and where matches are fixed.
+        matched: where the surfaces have no `noise`, O = I.
+        responding: the terms with their response (`AbstractTerm.with_response`). Their stiffness replaces K O, and
+            their forces replace w M O d. None for terms that do not adapt, and where matches are fixed.
     """
-    moved, forces, counts = forces_at(*pose, matched, method, robust)
-    arms = jnp.where(matched.valid, (moved - center[:, None]) / radius, 0)
-    stiffness = (
-        forces.stiffness if robust is None else _tangent_stiffness(pose[0], moved, matched, counts, method, robust)
-    )
-    bias, cells = jnp.zeros(6, moved.dtype), None
-    if details is not None:
-        edge = _CELL if responding is None else _CELL_OF_FITS
-        size = 0.5 * edge * (reach_of(details.source) + reach_of(details.target))
-        cells = _cells(moved, matched.valid, size, num_cells)
+    moved, found, counts = linearize_at(motion, matched, terms)
+    arms = jnp.where(matched.valid, (moved - frame.center[:, None]) / frame.radius, 0)
+    bias, cells, stiffness = jnp.zeros(6, moved.dtype), None, found.stiffness
+    if matched.source.noise is not None:
+        edge = max(term.correlation_length for term in (responding or terms))
+        source, target = _noises(matched)
+        cells = _cells(moved, matched.valid, 0.5 * edge * (source.reach + target.reach), frame.num_cells)
     if responding is not None:
-        seen = forces_at(*pose, matched, method.with_estimates(responding), robust)[1]
-        stiffness, bias = seen.stiffness, jnp.sum(_wrench(arms, forces.force - seen.force), axis=1)
-    elif details is not None:
-        geometry, *channels = mean_observability(pose[0], matched, method)
-        shown = discount[0] * geometry
-        for each in channels:
-            # A / (1 + tr A) of `channel_observability`, with A multiplied by the discount.
-            trace = each[0] + each[3] + each[5]
-            shown = shown + discount[1] * each / (1 - (1 - discount[1]) * jnp.clip(trace, 0, 1))
-        left_out = forces.force - alg.multiply(forces.stiffness, alg.multiply(shown, forces.residual))
-        bias = jnp.sum(_wrench(arms, left_out), axis=1)
-        if method.matches_slide:
-            stiffness = alg.symmetric_product(stiffness, shown)
-    rows = jnp.concatenate([_wrench(arms, forces.force), matched.valid[None].astype(moved.dtype)]).T
-    return Scores(rows, cells, jnp.dot(stiffness, powers(arms * radius).T, precision="highest"), bias)
+        seen = linearize_at(motion, matched, responding)[1]
+        stiffness, bias = seen.stiffness, jnp.sum(_wrench(arms, found.force - seen.force), axis=1)
+    else:
+        if any(term.robust is not None for term in terms):
+            stiffness = _tangent_stiffness(motion, moved, matched, counts, terms)
+        if matched.source.noise is not None:
+            shown = _discounted_observability(motion, matched, frame.discount, terms)
+            left_out = found.force - alg.multiply(found.stiffness, alg.multiply(shown, found.residual))
+            bias = jnp.sum(_wrench(arms, left_out), axis=1)
+            if all(term.matches_slide for term in terms):
+                stiffness = alg.symmetric_product(stiffness, shown)
+    jacobian = jnp.dot(stiffness, powers(arms * frame.radius).T, precision="highest")
+    return Scores(_wrench(arms, found.force).T, matched.valid.astype(moved.dtype), cells, jacobian, bias)
+
+
+def _discounted_observability(
+    motion: Motion, matched: Matched, discount: Float[Array, "2"], terms: tuple[AbstractTerm, ...]
+) -> Float[Array, "6 n"]:
+    geometry, *channels = mean_observability(motion.rotation, matched, terms)
+    shown = discount[0] * geometry
+    for each in channels:
+        # A / (1 + tr A) of `channel_observability`, with A multiplied by the discount.
+        trace = each[0] + each[3] + each[5]
+        shown = shown + discount[1] * each / (1 - (1 - discount[1]) * jnp.clip(trace, 0, 1))
+    return shown
 
 
 def _wrench(arms: Float[Array, "3 N"], force: Float[Array, "3 N"]) -> Float[Array, "6 N"]:
@@ -183,18 +196,17 @@ def _wrench(arms: Float[Array, "3 N"], force: Float[Array, "3 N"]) -> Float[Arra
 
 
 def _tangent_stiffness(
-    rotation: Float[Array, "3 3"],
+    motion: Motion,
     moved: Float[Array, "3 N"],
     matched: Matched,
     counts: Float[Array, "N"],
-    method: AbstractMethod,
-    robust: AbstractKernel,
+    terms: tuple[AbstractTerm, ...],
 ) -> Float[Array, "6 N"]:
     """−∂f/∂(T a) of robust correspondences, symmetrised: includes the decrease of w with the residual."""
 
     def force(shift: Float[Array, "3"]) -> Float[Array, "3 N"]:
         shifted = moved + shift[:, None]
-        return method.forces(matched.source, matched.target, shifted, rotation, matched.valid, robust).force
+        return linearize(terms, matched.source, matched.target, shifted, motion.rotation, matched.valid).force
 
     still = jnp.zeros(3, moved.dtype)
     columns = [-counts * jax.jvp(force, (still,), (axis,))[1] for axis in jnp.eye(3, dtype=moved.dtype)]
@@ -210,21 +222,6 @@ def _cells(
     return cell_numbers((*cell, level.astype(jnp.int32)), num_cells)
 
 
-def scatter_of(scores: Scores, num_cells: int) -> tuple[Float[AnyArray, "6 6"], Int[AnyScalar, ""]]:
-    """Σ_c u_c u_cᵀ, and the number of cells that contain valid correspondences."""
-    xp = namespace(scores)
-    rows = scores.rows
-    if scores.cells is not None and xp is np:
-        columns = [np.bincount(scores.cells, column, num_cells) for column in rows.T]
-        rows = np.stack(columns, axis=1)
-    elif scores.cells is not None:
-        # Row-major, so that one scatter adds seven numbers.
-        rows = jnp.zeros_like(rows, shape=(num_cells, 7)).at[scores.cells].add(rows)
-    sums = rows[:, :6]
-    product = sums.T @ sums if xp is np else jnp.dot(sums.T, sums, precision="highest")
-    return product, xp.sum(rows[:, 6] > 0)
-
-
 class Moments(NamedTuple):
     """Sums over the scores of all correspondences.
 
@@ -238,6 +235,22 @@ class Moments(NamedTuple):
     bias: Float[AnyArray, "6"]
     scatter: Float[AnyArray, "6 6"]
     num_cells: Int[AnyArray, ""]
+
+
+def moments_from(scores: Scores, num_cells: int) -> Moments:
+    """Sums over scores, by NumPy if they are NumPy arrays."""
+    xp = numpy_for(scores)
+    rows = xp.concatenate([scores.wrenches, scores.valid[:, None]], axis=1)
+    if scores.cells is not None and xp is np:
+        columns = [np.bincount(scores.cells, column, num_cells) for column in rows.T]
+        rows = np.stack(columns, axis=1)
+    elif scores.cells is not None:
+        # Row-major, so that one scatter adds seven numbers.
+        rows = jnp.zeros_like(rows, shape=(num_cells, 7)).at[scores.cells].add(rows)
+    sums, counts = rows[:, :6], rows[:, 6]
+    product = sums.T @ sums if xp is np else jnp.dot(sums.T, sums, precision="highest")
+    number = xp.sum(counts > 0)
+    return Moments(scores.jacobian, scores.bias, product, np.int32(number) if xp is np else number)
 
 
 def response_and_scatter(moments: Moments, radius: Float[Array, ""]) -> tuple[Float[Array, "6 6"], Float[Array, "6 6"]]:

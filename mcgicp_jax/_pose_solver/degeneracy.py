@@ -16,8 +16,9 @@ import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float
 
+from mcgicp_jax._math.poses import adjoint_to_source, units
 from mcgicp_jax._pose_solver.sums import Sums
-from mcgicp_jax._pose_solver.update import adjoint_to_source, twist_form, units
+from mcgicp_jax._pose_solver.update import twist_form
 
 # Least observed fraction of the points' squared motion for a direction to count as constrained. Geometry: measured
 # below 0.0016 in flat scenes (posters on a wall, a road, a table with 2 mm noise) and from 0.1 on in others; GICP's
@@ -72,10 +73,12 @@ def find_directions(sums: Sums) -> Directions:
     """Eigenvectors of the observed fraction of the points' motion: by the geometry, and among the directions that
     geometry does not constrain, by the channels. Fractions do not depend on units or on the origin.
     """
-    center, radius, observed = sums.center, sums.radius, sums.observability
+    if sums.mass is None or sums.observability is None:
+        raise ValueError("sums: expected those of surfaces with observability")
+    center, radius = sums.center, sums.radius
     total = jnp.where(sums.mass[9] > 0, sums.mass[9], 1)
     motion = twist_form(jnp.outer(_IDENTITY.astype(total.dtype), sums.mass / total), radius)
-    geometry = twist_form(observed[0] / total, radius)
+    geometry = twist_form(sums.observability / total, radius)
     # Each decomposition needs the result of the last: concurrent batched LAPACK calls can deadlock XLA's thread pool.
     # The floor: points on a line do not move when they turn about it, so that rotation is not observed.
     values, vectors = jnp.linalg.eigh(motion)
@@ -84,12 +87,14 @@ def find_directions(sums: Sums) -> Directions:
     shares, turn = jnp.linalg.eigh(basis.T @ geometry @ basis)
     basis = basis @ turn
     free = ~(shares >= GEOMETRY_HOLDS)
-    if len(observed) == 1:
+    if sums.channel_observability is None:
         channels = jnp.zeros_like(shares)
         return Directions(twists=basis.T, geometry=shares, channels=channels, center=center, radius=radius)
     # Diagonalise the channels within the free directions; 2, above any fraction, sorts the other directions last.
     among = jnp.outer(free, free)
-    channels = jnp.where(among, basis.T @ twist_form(observed[1] / total, radius) @ basis, jnp.diag(2.0 * ~free))
+    channels = jnp.where(
+        among, basis.T @ twist_form(sums.channel_observability / total, radius) @ basis, jnp.diag(2.0 * ~free)
+    )
     held, turn = jnp.linalg.eigh(channels)
     basis = basis @ turn
     shares = jnp.sum(basis * (geometry @ basis), axis=0)

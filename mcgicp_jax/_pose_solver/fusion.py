@@ -8,11 +8,12 @@ import jax.numpy as jnp
 import jaxlie
 from jaxtyping import Array, Float
 
+from mcgicp_jax._math.poses import adjoint_to_source, from_center, units
 from mcgicp_jax._pose_solver.covariance import UNKNOWN, Moments, response_and_scatter
 from mcgicp_jax._pose_solver.degeneracy import Directions
 from mcgicp_jax._pose_solver.pose_measurements import Fusion, PoseForm
 from mcgicp_jax._pose_solver.sums import Sums
-from mcgicp_jax._pose_solver.update import Update, adjoint_to_source, twist_form, units, wrench
+from mcgicp_jax._pose_solver.update import Update, twist_form, wrench
 
 
 def held_by_pose_form(directions: Directions, information: Float[Array, "6 6"]) -> Directions:
@@ -75,25 +76,18 @@ def fuse(
     )
 
 
-def _from_center(offset: Float[Array, "3"], radius: Float[Array, ""], other: Float[Array, ""]) -> Float[Array, "6 6"]:
-    """Twists about a point at `offset` from the centre, lengths in units of `other`, from those about the centre."""
-    cross = jnp.cross(jnp.eye(3, dtype=offset.dtype), offset[None], axis=1).T
-    top = jnp.concatenate([jnp.eye(3, dtype=offset.dtype) * radius, cross], axis=1) / other
-    return jnp.concatenate([top, jnp.eye(6, dtype=offset.dtype)[3:]])
-
-
 def fused_update(pose: jaxlie.SE3, sums: Sums, directions: Directions, fusion: Fusion) -> tuple[Directions, Update]:
     """One step of Newton's method on P s + γ = 0, with the matches and M fixed; and what constrains the directions."""
-    radius, dtype = fusion.radius, sums.totals.dtype
+    radius, dtype = fusion.radius, sums.center.dtype
     pull, known = fusion.pull(pose.rotation().as_matrix().astype(dtype), pose.translation())
-    outwards = _from_center(sums.center - fusion.center, radius, sums.radius)
-    back = _from_center(fusion.center - sums.center, sums.radius, radius)
+    outwards = from_center(sums.center - fusion.center, radius, sums.radius)
+    back = from_center(fusion.center - sums.center, sums.radius, radius)
     known_here = back.T @ known @ back
     directions = held_by_pose_form(directions, known_here)
     unit_information = twist_form(sums.stiffness, sums.radius)
     # Force and energy of twists in units of the radius: of `fusion` on the left, of the sums on the right.
     ratio = sums.radius / radius
-    score = outwards.T @ wrench(sums.first, sums.radius) * ratio
+    score = outwards.T @ wrench(sums.force, sums.radius) * ratio
     stiffness = outwards.T @ (unit_information * sums.radius**2) @ outwards / radius
     # The solution waits for the eigenvectors of the directions: two batched LAPACK calls at once can deadlock.
     basis, _ = jax.lax.optimization_barrier((fusion.basis, directions.twists))

@@ -15,7 +15,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from mcgicp_jax._compute.concrete import AnyArray, AnyScalar, namespace
+from mcgicp_jax._compute.concrete import AnyArray, AnyScalar, numpy_for
+from mcgicp_jax._math.symmetric_matrices import inverse_3, inverse_6
 
 
 class TiePoints(NamedTuple):
@@ -50,7 +51,7 @@ def form_at(
     prior: Prior | None,
 ) -> PoseForm:
     """The form relative to the pose R, t, about a centre. NumPy where everything is concrete."""
-    xp = namespace(rotation, translation, center, radius, ties, prior)
+    xp = numpy_for(rotation, translation, center, radius, ties, prior)
     stiffness, force = xp.zeros((12, 12)), xp.zeros(12)
     if ties is not None:
         information = inverse_3(ties.covariances)
@@ -75,31 +76,7 @@ def form_at(
 def _rotation_vectors(matrices: Float[AnyArray, "k 3 3"]) -> Float[AnyArray, "k 3"]:
     """½ (M − Mᵀ)ˣ: the rotation vector of a rotation by a small angle."""
     odd = 0.5 * (matrices - matrices.swapaxes(-1, -2))
-    return namespace(matrices).stack([odd[:, 2, 1], odd[:, 0, 2], odd[:, 1, 0]], axis=-1)
-
-
-def inverse_3(matrices: Float[AnyArray, "*n 3 3"]) -> Float[AnyArray, "*n 3 3"]:
-    """Inverses of symmetric positive definite matrices, in closed form: the determinant over cross products of rows."""
-    xp = namespace(matrices)
-    matrices = 0.5 * (matrices + matrices.swapaxes(-1, -2))
-    # So that the determinant of variances of 1e-10 does not underflow float32.
-    size = xp.einsum("...ii->...", matrices)[..., None, None]
-    first, second, third = (matrices[..., i, :] / size[..., 0] for i in range(3))
-    rows = xp.stack([xp.cross(second, third), xp.cross(third, first), xp.cross(first, second)], axis=-2)
-    return rows / (xp.sum(rows[..., 0, :] * first, axis=-1)[..., None, None] * size)
-
-
-def inverse_6(matrix: Float[AnyArray, "6 6"]) -> Float[AnyArray, "6 6"]:
-    """Inverse of a symmetric positive definite matrix by blocks."""
-    xp = namespace(matrix)
-    matrix = 0.5 * (matrix + matrix.T)
-    mixed, corner = matrix[:3, 3:], inverse_3(matrix[3:, 3:])
-    ratio = mixed @ corner
-    first = inverse_3(matrix[:3, :3] - ratio @ mixed.T)
-    across = -first @ ratio
-    return xp.concatenate(
-        [xp.concatenate([first, across], axis=1), xp.concatenate([across.T, corner - ratio.T @ across], axis=1)]
-    )
+    return numpy_for(matrices).stack([odd[:, 2, 1], odd[:, 0, 2], odd[:, 1, 0]], axis=-1)
 
 
 class Fusion(eqx.Module):

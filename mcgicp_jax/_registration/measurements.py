@@ -11,16 +11,15 @@ import jaxlie
 import numpy as np
 from jaxtyping import Float
 
+from mcgicp_jax._clouds.origins import centred_pose
 from mcgicp_jax._clouds.point_cloud import PointCloud
-from mcgicp_jax._compute.concrete import AnyArray, computed_now, constant, is_concrete, namespace
-from mcgicp_jax._math.poses import matrices_of
+from mcgicp_jax._compute.concrete import AnyArray, constant, is_concrete, numpy_for, outside_trace
+from mcgicp_jax._math.poses import matrices_of, translation_adjoint
 from mcgicp_jax._pose_solver.covariance import Moments
 from mcgicp_jax._pose_solver.degeneracy import Directions
 from mcgicp_jax._pose_solver.fusion import fuse
 from mcgicp_jax._pose_solver.pose_measurements import Fusion, Prior, TiePoints, form_at
-from mcgicp_jax._registration.cost import centred_pose
-from mcgicp_jax._registration.on_host import as_float64
-from mcgicp_jax._registration.outcome import translation_adjoint
+from mcgicp_jax._registration.assessment import as_float64
 from mcgicp_jax._registration.step import State
 
 # Largest difference of two correlations of a symmetric matrix, as of float32 numbers; and the least eigenvalue of a
@@ -74,7 +73,7 @@ def fusion_of(state: State, moments: Moments, ties: TiePoints | None, prior: Pri
         center, directions = jax.tree.map(np.asarray, (center, directions))
     form = form_at(matrix[:3, :3], matrix[:3, 3], center, directions.radius, ties, prior)
     if is_concrete(state, moments, form):
-        with jax.enable_x64(True), computed_now():
+        with jax.enable_x64(True), outside_trace():
             fusion = fuse(*as_float64((state.pose, center, directions, moments, form)))
         return jax.tree.map(lambda array: np.asarray(array, None if array.dtype == bool else dtype), fusion)
     form = jax.tree.map(lambda array: jnp.asarray(array, dtype), form)
@@ -98,7 +97,7 @@ def _parts(name: str, given: Any, form: str, count: int) -> Any:
 def _numbers(name: str, given: Any, shape: tuple[int, ...]) -> Any:
     """The array, in float64 if it is concrete."""
     try:
-        array = namespace(given).asarray(given, np.float64 if is_concrete(given) else None)
+        array = numpy_for(given).asarray(given, np.float64 if is_concrete(given) else None)
     except (TypeError, ValueError) as error:
         raise ValueError(f"{name}: expected numbers of shape {shape}, got {type(given).__name__}") from error
     if array.shape != shape:

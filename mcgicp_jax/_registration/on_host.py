@@ -1,358 +1,283 @@
-"""The registration loop on the host: compiled programs over blocks of rows, with searches for matches in between.
-
-The way of a source point from `PointCloud` to `Registration`, in ten sentences. `preprocess` finds the k nearest
-neighbours of the point. `describe` computes local statistics from the neighbourhood: covariance, normal, channel fits.
-`method.covariance` and `channel_observability` turn these into the point's row of a `Surface`: position, covariance,
-observability. The search finds the target point nearest to the moved point in position and α · channel. NumPy gathers
-the surface row of this target point. `method.forces` computes from the two rows the cost of the correspondence, its
-force (−gradient/2) and stiffness (Hessian/2). `sums_of` adds them over a block of correspondences, and `combine` adds
-the blocks. `update` computes the next pose from the sums, and search, sums and update repeat until the pose converges.
-At the final pose, `scores_of` computes the contribution of each correspondence to the covariance. `Registration` holds
-the pose, its status and its covariance.
-"""
+"""The registration loop on the host: compiled programs over blocks of rows, with searches for matches in between."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
-from functools import partial
-from typing import TYPE_CHECKING, Any, TypeAlias
+from dataclasses import dataclass, replace
+from functools import cache, partial
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import jaxlie
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from mcgicp_jax._compute.blocks import map_blocks, map_rows
-from mcgicp_jax._compute.concrete import AnyArray, AnyScalar
-from mcgicp_jax._compute.lazy import Deferred
-from mcgicp_jax._local_geometry.records import Extended, Surface, Table, gathered
+from mcgicp_jax._compute.packing import Layout, layout_of, packed, packed_numbers, unpacked
+from mcgicp_jax._local_geometry.surface import Surface, SurfaceNoise, searched
 from mcgicp_jax._math.poses import rotation_from_quaternion
-from mcgicp_jax._math.robust_kernels import AbstractKernel
-from mcgicp_jax._math.statistics import sampled_rows
-from mcgicp_jax._methods.base import AbstractMethod
-from mcgicp_jax._pose_solver.covariance import Details, Moments, Scores, discount_rows, discounts, scatter_of, scores_of
-from mcgicp_jax._pose_solver.sums import Matched, Sums, combine, move_rows, sums_of, within
-from mcgicp_jax._registration.step import (
-    COARSE,
-    RUNNING,
-    SETTLED,
-    Assessment,
-    Problem,
-    State,
-    constraints_of,
-    covariance_of_pose,
-    history_of,
-    update,
-)
-from mcgicp_jax._search.base import AbstractIndex, Correspondences, Rows, by_position
-from mcgicp_jax._terms.photometric import Term
-
-if TYPE_CHECKING:
-    Candidates: TypeAlias = Any
-else:
-    # Table rows of the m candidates of each of N points.
-    Candidates = Float[AnyArray, "m N L"] | Extended
-
-# Rotation matrix and translation (metres) of a pose.
-Moving: TypeAlias = tuple[Float[AnyArray, "3 3"], Float[AnyArray, "3"]]
+from mcgicp_jax._pose_solver.covariance import Scores, scores_of
+from mcgicp_jax._pose_solver.matched import Matched, Motion
+from mcgicp_jax._pose_solver.sums import Sums, combine, sums_of
+from mcgicp_jax._registration.loop import AbstractExecutor, LoopResult
+from mcgicp_jax._registration.step import COARSE, SETTLED, Problem, Record, State
+from mcgicp_jax._search.base import AbstractIndex, SearchPoints, by_position
+from mcgicp_jax._terms.base import AbstractTerm
 
 
-def register_on_host(
-    problem: Problem, index_of: Callable[[bool], AbstractIndex], num_threads: int | None
-) -> tuple[State, Assessment, dict[str, np.ndarray], Deferred[Moments]]:
-    """Find matches at this pose; sum their forces; update the pose; stop when it no longer moves.
+@dataclass(frozen=True)
+class _Matches:
+    """Target rows `indices` (m, N) of the m candidates of each source row, −1 where there is none.
+
+    `found` says which of them are matches of points that are no padding; `max_distance` is applied when they are used.
+    """
+
+    source: Surface
+    target: Surface
+    indices: Int[np.ndarray, "m N"]
+    found: Bool[np.ndarray, "m N"]
+    max_distance: Any
+
+    @property
+    def rows(self) -> Int[np.ndarray, "m N"]:
+        return np.maximum(self.indices, 0)
+
+    @staticmethod
+    def of(source: Surface, target: Surface, indices: Int[np.ndarray, "m N"], max_distance: Any) -> _Matches:
+        found = (indices >= 0) & searched(source).valid & searched(target).valid[np.maximum(indices, 0)]
+        return _Matches(source, target, indices, found, max_distance)
+
+
+class _Gathered(NamedTuple):
+    """Matched rows as arguments of a compiled program: surfaces packed, see `packing`."""
+
+    source: Float[Any, "n L"]
+    target: Float[Any, "m n L"]
+    found: Bool[Any, "m n"]
+    max_distance: Any
+    source_noise: SurfaceNoise | None
+    target_noise: SurfaceNoise | None
+    source_search: SearchPoints | None
+    target_search: SearchPoints | None
+
+
+class HostExecutor(AbstractExecutor):
+    """Blocks of rows on the host for one pair of concrete clouds.
 
     Args:
-        index_of: the index of the target, for a search in position alone if called with True.
-
-    Returns:
-        Final state, information matrix and covariance, history, and sums over the scores.
+        index_of: the index of the target; for a search in position alone if called with True.
+        num_threads: largest number of threads; None for no limit.
     """
-    pose, settings, records = problem.start, problem.settings, []
-    term = problem.method.estimates
-    coarse = settings.fine_distance < settings.max_distance or settings.coarse_stride > 1 or term is not None
-    status: Any = np.int32(COARSE if coarse else RUNNING)
-    num_iterations: Any = np.int32(0)
-    followed: tuple[int, bool] | None = None
-    while status < 0:
-        last = num_iterations >= settings.max_iterations
-        stride = int(settings.coarse_stride) if status == COARSE and not last else 1
-        alone = term is not None and status != COARSE
-        if status != SETTLED and (stride, alone) != followed:
-            followed, source = (stride, alone), _every(stride, problem.source)
-            rows = by_position(source.rows) if alone else source.rows
-            nearest = index_of(alone).follow(rows, float(settings.max_distance), problem.method.num_candidates)
-        if status != SETTLED:
-            matches = _Matches(source, problem.target, nearest(pose.wxyz_xyz))
-        gate = settings.max_distance if status == COARSE else settings.fine_distance
-        if term is not None and status == RUNNING:
-            problem = replace(problem, method=problem.method.with_estimates(_estimated(pose, matches, gate, term)))
-        sums = _measure(pose, matches, gate, problem)
-        state = update(pose, status, num_iterations, sums, settings, problem.fusion)
-        pose, num_iterations, status = state.pose, np.asarray(state.num_iterations), np.asarray(state.status)
-        records.append(state.record)
-    moments = Deferred(partial(_moments, state, matches, gate, problem, index_of, num_threads))
-    assessment = Assessment(
-        Deferred(partial(constraints_of, state)), Deferred(partial(_covariance, state, moments, problem))
-    )
-    return state, assessment, history_of(np.stack([np.asarray(record) for record in records])), moments
+
+    def __init__(self, problem: Problem, index_of: Callable[[bool], AbstractIndex], num_threads: int | None):
+        super().__init__(problem)
+        self._index_of, self._num_threads = index_of, num_threads
+        # Which source rows are followed from pose to pose, and the function that finds their matches.
+        self._followed: tuple[int, bool] | None = None
+        self._source = problem.source
+        self._nearest: Callable[[Any], Int[np.ndarray, "m N"]]
+
+    def begin(self) -> LoopResult:
+        state = State(self.problem.start, np.asarray(self.first_status), np.int32(0))
+        return LoopResult(state, None, self.problem.terms, [])
+
+    def repeat(self, step: Callable[[LoopResult], LoopResult], loop: LoopResult) -> LoopResult:
+        while loop.state.status < 0:
+            loop = step(loop)
+            state = loop.state
+            # As NumPy arrays, comparing them compiles nothing.
+            state = state._replace(status=np.asarray(state.status), num_iterations=np.asarray(state.num_iterations))
+            loop = loop._replace(state=state)
+        records = [jax.tree.map(np.asarray, record) for record in loop.history]
+        return loop._replace(history=jax.tree.map(lambda *entries: np.stack(entries), *records))
+
+    def record(self, history: Any, state: State) -> list[Record]:
+        return [*history, state.record]
+
+    def motion(self, pose: jaxlie.SE3) -> Motion:
+        parameters = np.asarray(pose.wxyz_xyz)
+        rotation = rotation_from_quaternion(parameters[:4].astype(np.float64))
+        return Motion(rotation.astype(self.problem.source.points.dtype), parameters[4:])
+
+    def match(self, state: State, before: Any) -> _Matches:
+        status, settings, problem = state.status, self.problem.settings, self.problem
+        if status == SETTLED:
+            return before
+        stride = int(settings.stride(status, state.num_iterations))
+        alone = bool(status != COARSE and any(term.by_position for term in problem.terms))
+        if (stride, alone) != self._followed:
+            self._followed, self._source = (stride, alone), _every(stride, problem.source)
+            rows, limit = searched(self._source), float(settings.max_distance)
+            rows = by_position(rows) if alone else rows
+            self._nearest = self._index_of(alone).follow(rows, limit, problem.num_candidates)
+        indices = self._nearest(state.pose.wxyz_xyz)
+        return _Matches.of(self._source, problem.target, indices, settings.distance(status))
+
+    def adapt(self, state: State, matches: Any, terms: tuple[AbstractTerm, ...]) -> tuple[AbstractTerm, ...]:
+        return terms if state.status in (COARSE, SETTLED) else super().adapt(state, matches, terms)
+
+    def source_of(self, matches: _Matches) -> Surface:
+        return matches.source
+
+    def over_rematched(
+        self,
+        function: Callable[..., Any],
+        motion: Motion,
+        pose: jaxlie.SE3,
+        rows: Int[np.ndarray, "n"],
+        counts: Bool[np.ndarray, "n"],
+        *arguments: Any,
+    ) -> Any:
+        source = jax.tree.map(lambda array: array[rows], self.problem.source)
+        limit = self.problem.settings.fine_distance
+        parameters = np.concatenate([np.asarray(pose.wxyz_xyz)[:4], motion.translation])
+        indices = self._index_of(True).nearest(parameters, by_position(searched(source)), float(limit))
+        matches = _Matches.of(source, self.problem.target, indices, limit)
+        matches = replace(matches, found=matches.found & counts)
+        return self.over_rows(function, motion, matches, np.arange(rows.size), *arguments)
+
+    def nearest(self, motion: Motion, matches: _Matches) -> _Matches:
+        """Candidates are followed from pose to pose in any order."""
+        moved = matches.source.points @ motion.rotation.T + motion.translation
+        apart = matches.target.points[matches.rows] - moved
+        order = np.argmin(np.where(matches.found, np.einsum("mni,mni->mn", apart, apart), np.inf), axis=0)
+        indices = np.take_along_axis(matches.indices, order[None], axis=0)
+        return _Matches.of(matches.source, matches.target, indices, matches.max_distance)
+
+    def over_rows(
+        self,
+        function: Callable[..., Any],
+        motion: Motion,
+        matches: _Matches,
+        rows: Int[np.ndarray, "n"],
+        *arguments: Any,
+        with_noise: bool = False,
+    ) -> Any:
+        gather, layouts = _gatherer(matches, with_noise)
+
+        def block(index: Any) -> Any:
+            return _apply(function, layouts, motion, gather(rows[index]), *arguments)
+
+        return map_rows(block, rows.size, self._num_threads if with_noise else 1)
+
+    def sums(self, motion: Motion, matches: _Matches, terms: tuple[AbstractTerm, ...]) -> Sums:
+        dtype = matches.source.points.dtype
+        parts = self._over_blocks(_packed_sums, motion, matches, terms)
+        stacked = np.stack(parts).astype(np.float64)
+        layout = _layout_of_sums(
+            matches.source.observability is not None, matches.source.channel_observability is not None
+        )
+        with np.errstate(over="ignore"):
+            return jax.tree.map(lambda array: array.astype(dtype), combine(unpacked(stacked, layout)))
+
+    def scores(self, motion: Motion, matches: _Matches, *arguments: Any) -> Scores:
+        parts: list[Scores] = self._over_blocks(scores_of, motion, matches, *arguments, with_noise=True)
+        jacobian, bias = (
+            np.sum([np.asarray(getattr(part, name), np.float64) for part in parts], axis=0)
+            for name in ("jacobian", "bias")
+        )
+        # Rows that pad the last block have no matches; their scores are 0.
+        wrenches, valid, cells = (
+            np.concatenate([getattr(part, name) for part in parts]) for name in ("wrenches", "valid", "cells")
+        )
+        return Scores(wrenches, valid, cells, jacobian, bias)
+
+    def each(self, function: Callable[[Any], Any], items: Any) -> Any:
+        return jax.tree.map(lambda *results: np.stack(results), *[function(item) for item in np.asarray(items)])
+
+    def _over_blocks(
+        self,
+        function: Callable[..., Any],
+        motion: Motion,
+        matches: _Matches,
+        *arguments: Any,
+        with_noise: bool = False,
+    ) -> list[Any]:
+        """Apply a function to blocks of correspondences; those repeated to fill the last block count as unmatched."""
+        size = matches.indices.shape[1]
+        gather, layouts = _gatherer(matches, with_noise)
+
+        def block(index: Any) -> Any:
+            chosen = gather(index)
+            if not isinstance(index, slice):
+                chosen.found[:, size - index[0] :] = False
+            return _apply(function, layouts, motion, chosen, *arguments)
+
+        return [part for _, part in map_blocks(block, size, self._num_threads if with_noise else 1)]
 
 
 def _every(stride: int, source: Surface) -> Surface:
     """Every `stride`-th row of a surface."""
-    return source if stride == 1 else jax.tree.map(lambda array: np.ascontiguousarray(array[::stride]), source)
+    if stride == 1:
+        return source
+    some = jax.tree.map(lambda array: np.ascontiguousarray(array[::stride]), source)
+    columns = some._replace(noise=None, search=None)
+    return unpacked(packed(columns), layout_of(columns))._replace(noise=some.noise, search=some.search)
 
 
-class _Matches:
-    """Source rows, the m target rows matched with each, and whether there are any."""
+def _gatherer(matches: _Matches, with_noise: bool) -> tuple[Callable[[Any], _Gathered], tuple[Layout, Layout]]:
+    """A function that gathers the matched rows of some source rows, and how they are packed."""
+    source, target = (surface._replace(noise=None, search=None) for surface in (matches.source, matches.target))
+    layouts, tables = (layout_of(source), layout_of(target)), (packed(source), packed(target))
+    rows = matches.rows
 
-    def __init__(self, source: Surface, target: Surface, indices: Int[np.ndarray, "m N"]):
-        self.source, self.target, self.indices = source, target, indices
-        self.rows = np.maximum(indices, 0)
-        self.found = (indices >= 0) & source.rows.valid & target.rows.valid[self.rows]
-        self.size = indices.shape[1]
-
-    def nearest(self, moving: Moving) -> _Matches:
-        """Of each source row the nearest candidate alone; they are followed from pose to pose in any order."""
-        rotation, translation = moving
-        apart = self.target.rows.points[self.rows] - (self.source.rows.points @ rotation.T + translation)
-        order = np.argmin(np.where(self.found, np.einsum("mni,mni->mn", apart, apart), np.inf), axis=0)
-        return _Matches(self.source, self.target, np.take_along_axis(self.indices, order[None], axis=0))
-
-    def rows_at(self, index: Any) -> tuple[Table, Candidates, np.ndarray]:
-        """Table rows of source and target, and which of the latter are matches."""
-        return (
-            gathered(self.source.table, index),
-            gathered(self.target.table, self.rows[:, index]),
-            self.found[:, index],
+    def gather(index: Any) -> _Gathered:
+        chosen = rows[:, index]
+        gathered = _Gathered(
+            tables[0][index], tables[1][chosen], matches.found[:, index], matches.max_distance, None, None, None, None
+        )
+        if not with_noise:
+            return gathered
+        both = (matches.source.noise, matches.source.search), (matches.target.noise, matches.target.search)
+        source_noise, source_search = jax.tree.map(lambda array: array[index], both[0])
+        target_noise, target_search = jax.tree.map(lambda array: array[chosen], both[1])
+        return gathered._replace(
+            source_noise=source_noise,
+            source_search=source_search,
+            target_noise=target_noise,
+            target_search=target_search,
         )
 
-    def block(self, index: Any) -> tuple[Table, Candidates, np.ndarray]:
-        """`rows_at` for a block; rows repeated to fill the last block count as unmatched."""
-        source, target, found = self.rows_at(index)
-        if not isinstance(index, slice):
-            found[:, self.size - index[0] :] = False
-        return source, target, found
-
-    def details(self, index: Any) -> tuple[np.ndarray, np.ndarray]:
-        """Rows of `Surface.details` of source and target."""
-        source: Any = self.source.details
-        target: Any = self.target.details
-        return source[index], target[self.rows[:, index]]
+    return gather, layouts
 
 
-def _moving(pose: jaxlie.SE3, dtype: Any) -> Moving:
-    """Rotation matrix and translation of a pose, computed with NumPy."""
-    parameters = np.asarray(pose.wxyz_xyz)
-    return rotation_from_quaternion(parameters[:4].astype(np.float64)).astype(dtype), parameters[4:]
+@partial(jax.jit, static_argnums=(0, 1))
+def _apply(
+    function: Callable[..., Any],
+    layouts: tuple[Layout, Layout],
+    motion: Motion,
+    gathered: _Gathered,
+    *arguments: Any,
+) -> Any:
+    """A function of correspondences, for a block of rows."""
+    count = len(gathered.found)
+
+    # One row per correspondence, m N; the first candidates of all source rows come first.
+    def tiled(tree: Any) -> Any:
+        return jax.tree.map(lambda rows: jnp.tile(rows, (count, *[1] * (rows.ndim - 1))), tree)
+
+    def flat(tree: Any) -> Any:
+        return jax.tree.map(lambda rows: rows.reshape(len(rows) * rows.shape[1], *rows.shape[2:]), tree)
+
+    source = unpacked(tiled(gathered.source), layouts[0])
+    target = unpacked(flat(gathered.target), layouts[1])
+    source = source._replace(noise=tiled(gathered.source_noise), search=tiled(gathered.source_search))
+    target = target._replace(noise=flat(gathered.target_noise), search=flat(gathered.target_search))
+    matched = Matched(source, target, gathered.found.reshape(-1), num_candidates=count)
+    return function(motion, matched.within(motion.move(source.points), gathered.max_distance), *arguments)
 
 
-def _measure(pose: jaxlie.SE3, matches: _Matches, gate: Float[AnyScalar, ""], problem: Problem) -> Sums:
-    """The sums at a pose over the matches within the maximum correspondence distance `gate`, metres."""
-    dtype = matches.source.rows.points.dtype
-    moving = _moving(pose, dtype)
-
-    def sums(index: Any) -> Sums:
-        return _sums(moving, *matches.block(index), gate, problem.method, problem.robust)
-
-    parts = map_blocks(sums, matches.size)
-    return combine([part for _, part in parts], dtype)
+def _packed_sums(motion: Motion, matched: Matched, terms: tuple[AbstractTerm, ...]) -> Array:
+    return packed_numbers(sums_of(motion, matched, terms))
 
 
-def _estimated(pose: jaxlie.SE3, matches: _Matches, gate: Float[AnyScalar, ""], term: Term) -> Term:
-    """The term with its numbers from a sample of the matches at a pose."""
-    moving = _moving(pose, matches.source.rows.points.dtype)
-    some, counts = sampled_rows(matches.source.rows.valid)
-    evidence = _evidence_at(moving, matches, some, gate, term)
-    # Huge coordinates or channels lead to the status NON_FINITE; NumPy need not warn of them.
-    with np.errstate(over="ignore", invalid="ignore"):
-        return term.estimated(evidence, counts, matches.source.rows.valid)
-
-
-def _evidence_at(
-    moving: Moving, matches: _Matches, rows: Int[np.ndarray, "n"], gate: Float[AnyScalar, ""], term: Term
-) -> Float[np.ndarray, "n L"]:
-    """`Term.evidence` for some source points."""
-
-    def evidence(index: Any) -> Any:
-        return _evidence(moving, *matches.rows_at(rows[index]), gate, term)
-
-    return map_rows(evidence, rows.size)
-
-
-@jax.jit
-def _evidence(
-    moving: Moving,
-    source: Table,
-    target: Candidates,
-    found: Bool[AnyArray, "m N"],
-    gate: Float[AnyScalar, ""],
-    term: Term,
-) -> Float[AnyArray, "n L"]:
-    matched = _matched(moving, source, target, found, gate)
-    moved = move_rows(*moving, matched.source)
-    return term.evidence(matched.source, matched.target, moved, moving[0], matched.valid)
-
-
-@jax.jit
-def _sums(
-    moving: Moving,
-    source: Table,
-    target: Candidates,
-    found: Bool[AnyArray, "m N"],
-    gate: Float[AnyScalar, ""],
-    method: AbstractMethod,
-    robust: AbstractKernel | None,
-) -> Sums:
-    return sums_of(*moving, _matched(moving, source, target, found, gate), method, robust)
-
-
-def _matched(
-    moving: Moving,
-    source: Table,
-    target: Candidates,
-    found: Bool[AnyArray, "m N"],
-    gate: Float[AnyScalar, ""],
-) -> Matched:
-    sides = _flat(source, target)
-    valid, _ = within(move_rows(*moving, sides[0]), sides[1], found.reshape(-1), gate)
-    return Matched(*sides, valid, num_candidates=len(found))
-
-
-def _flat(source: Any, target: Any) -> tuple[Any, Any]:
-    """Rows (N, L) and (m, N, L) as one row per correspondence, m N; first candidates of all source rows come first."""
-    num_candidates = len(jax.tree.leaves(target)[0])
-    tiled = jax.tree.map(lambda rows: jnp.tile(rows, (num_candidates, 1)), source)
-    return tiled, jax.tree.map(lambda rows: jnp.reshape(rows, (-1, rows.shape[-1])), target)
-
-
-def _covariance(state: State, moments: Deferred[Moments], problem: Problem) -> Float[np.ndarray, "6 6"]:
-    """Covariance of the final pose, float64."""
-    known = moments.value if problem.fusion is None else problem.fusion
-    # In float64: beside the variances of unconstrained directions, those of the others would be lost to rounding.
-    with jax.enable_x64(True):
-        return np.asarray(covariance_of_pose(*as_float64((state, known))))
-
-
-def _moments(
-    state: State,
-    matches: _Matches,
-    gate: Float[AnyScalar, ""],
-    problem: Problem,
-    index_of: Callable[[bool], AbstractIndex],
-    num_threads: int | None,
-) -> Moments:
-    """Sums over the scores of all correspondences at the final pose, float64."""
-    source, target = matches.source, matches.target
-    moving = _moving(state.pose, source.rows.points.dtype)
-    nearest = matches.nearest(moving)
-    some, counts = sampled_rows(source.rows.valid)
-
-    def discount(index: Any) -> Any:
-        rows = some[index]
-        sides = (
-            jax.tree.map(lambda array: array[rows], source.rows),
-            jax.tree.map(lambda array: array[nearest.rows[0, rows]], target.rows),
-        )
-        return _discount_rows(moving, *nearest.rows_at(rows), gate, nearest.details(rows), *sides)
-
-    rows = map_rows(discount, some.size, num_threads)
-    num_channels = np.sum(np.any(source.rows.descriptors != 0, axis=0))
-    discount_of_all = discounts(np.where(counts[:, None], rows, np.nan), num_channels)
-
-    term = problem.method.estimates
-    responding = None if term is None else _responding(state.pose, matches, gate, term, index_of)
-
-    def scores(index: Any) -> Scores:
-        weighing = (problem.method, problem.robust, discount_of_all, np.int32(matches.size), responding)
-        return _scores(moving, state.sums, *matches.block(index), gate, matches.details(index), *weighing)
-
-    parts = map_blocks(scores, matches.size, num_threads)
-    jacobian, bias = (
-        np.sum([np.asarray(getattr(part, name), np.float64) for _, part in parts], axis=0)
-        for name in ("jacobian", "bias")
-    )
-    # Rows that pad the last block have no matches; their scores are 0.
-    rows, cells = (np.concatenate([getattr(part, name) for _, part in parts]) for name in ("rows", "cells"))
-    scatter, num_cells = scatter_of(Scores(rows, cells, jacobian, bias), matches.size)
-    return Moments(jacobian, bias, scatter, np.int32(num_cells))
-
-
-def as_float64(tree: Any) -> Any:
-    def convert(leaf: Any) -> np.ndarray:
-        array = np.asarray(leaf)
-        return array.astype(np.float64) if array.dtype == np.float32 else array
-
-    return jax.tree.map(convert, tree)
-
-
-@jax.jit
-def _discount_rows(
-    moving: Moving,
-    source: Table,
-    target: Candidates,
-    found: Bool[AnyArray, "m N"],
-    gate: Float[AnyScalar, ""],
-    details: tuple[Float[AnyArray, "n 6"], Float[AnyArray, "m n 6"]],
-    source_rows: Rows,
-    target_rows: Rows,
-) -> Float[AnyArray, "n 3"]:
-    matched = _matched(moving, source, target, found, gate)
-    return discount_rows(*moving, matched, Details(*_flat(*details)), source_rows, target_rows)
-
-
-@jax.jit
-def _scores(
-    moving: Moving,
-    sums: Sums,
-    source: Table,
-    target: Candidates,
-    found: Bool[AnyArray, "m N"],
-    gate: Float[AnyScalar, ""],
-    details: tuple[Float[AnyArray, "n 6"], Float[AnyArray, "m n 6"]],
-    method: AbstractMethod,
-    robust: AbstractKernel | None,
-    discount: Float[AnyArray, "2"],
-    num_cells: Int[AnyScalar, ""],
-    responding: Term | None,
-) -> Scores:
-    matched = _matched(moving, source, target, found, gate)
-    flat = Details(*_flat(*details))
-    return scores_of(moving, sums.center, sums.radius, matched, flat, discount, num_cells, method, robust, responding)
-
-
-def _responding(
-    pose: jaxlie.SE3,
-    matches: _Matches,
-    gate: Float[AnyScalar, ""],
-    term: Term,
-    index_of: Callable[[bool], AbstractIndex],
-) -> Term:
-    """`Term.responding` for a sample of the source points."""
-    some, counts = sampled_rows(matches.source.rows.valid)
-    source = jax.tree.map(lambda array: array[some], matches.source)
-    rotation, translation = _moving(pose, source.rows.points.dtype)
-    found = []
-    for shift in np.asarray(term.shifts):
-        moved = np.concatenate([np.asarray(pose.wxyz_xyz)[:4], translation + shift])
-        indices = index_of(True).nearest(moved, by_position(source.rows), float(gate))
-        again = _Matches(source, matches.target, indices)
-        again.found &= counts
-        everything = np.arange(some.size)
-        found.append(_evidence_at((rotation, translation + shift), again, everything, gate, term))
-    with np.errstate(over="ignore", invalid="ignore"):
-        return term.responding(np.stack(found))
-
-
-def correspondences_at(
-    matrix: Float[np.ndarray, "4 4"], source: Rows, target: Rows, indices: Int[np.ndarray, "m N"], gate: float
-) -> Correspondences:
-    """Matches at a pose, valid within `gate` metres of position; NumPy, so that nothing is compiled."""
-    rows, dtype = np.maximum(indices, 0), source.points.dtype
-    with np.errstate(invalid="ignore"):
-        moved = source.points.astype(np.float64) @ matrix[:3, :3].T + matrix[:3, 3]
-        distances = np.linalg.norm(target.points[rows] - moved, axis=-1).astype(dtype)
-        valid = (indices >= 0) & source.valid & target.valid[rows] & (distances <= gate)
-    return Correspondences(rows.astype(np.int32), distances, valid)
+@cache
+def _layout_of_sums(observed: bool, by_channels: bool) -> Layout:
+    number, matrix = np.zeros(()), np.zeros((6, 10))
+    sums = Sums(np.zeros(3), number, number, number, number, number, number, np.zeros((3, 4)), matrix)
+    if observed:
+        sums = sums._replace(mass=np.zeros(10), observability=matrix)
+    if by_channels:
+        sums = sums._replace(channel_observability=matrix)
+    return layout_of(sums, num_axes=0)

@@ -3,19 +3,19 @@
 from __future__ import annotations
 
 import enum
-from typing import Any
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
-import jax.numpy as jnp
 import jaxlie
 import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float, Int
 
+from mcgicp_jax._clouds.origins import pose_in_user_frame
 from mcgicp_jax._compute.concrete import AnyArray, canonical_float, is_concrete
-from mcgicp_jax._compute.lazy import Deferred
-from mcgicp_jax._math.poses import matrices_of, rotation_from_quaternion, se3
+from mcgicp_jax._compute.lazy import Lazy
+from mcgicp_jax._math.poses import se3
 from mcgicp_jax._pose_solver.degeneracy import Directions, FreeDirection, describe, free_directions
 
 
@@ -32,7 +32,7 @@ class Status(enum.IntEnum):
             points or a prior constrain a direction if its standard deviation is then below the radius of the clouds.
         NON_FINITE: the pose or the sums overflowed or became NaN.
         INVALID_INPUT: `register` would raise a `ValueError` for this pair. Only in batches; the pose is NaN.
-        LOST: the worker of this pair failed, and so did a second attempt. Only in batches; the pose is NaN.
+        WORKER_FAILED: two workers in turn failed with this pair. Only in batches; the pose is NaN.
     """
 
     CONVERGED = 0
@@ -41,11 +41,25 @@ class Status(enum.IntEnum):
     DEGENERATE = 3
     NON_FINITE = 4
     INVALID_INPUT = 5
-    LOST = 6
+    WORKER_FAILED = 6
 
     # Print the name: an IntEnum prints its number.
     __str__ = enum.Enum.__str__
     __format__ = enum.Enum.__format__
+
+
+class Constraints(NamedTuple):
+    """What constrains a pose: `RegistrationResult.information` and `directions`."""
+
+    information: Float[AnyArray, "*batch 6 6"]
+    directions: Directions | None
+
+
+class Uncertainty(NamedTuple):
+    """How uncertain a pose is: `RegistrationResult.covariance` and `deviations`."""
+
+    covariance: Float[AnyArray, "*batch 6 6"]
+    deviations: Float[AnyArray, "*batch 6"]
 
 
 class Registration(eqx.Module):
@@ -87,8 +101,8 @@ class Registration(eqx.Module):
     source_origin: Float[Array, "*batch 3"] | Float[np.ndarray, "*batch 3"]
     target_origin: Float[Array, "*batch 3"] | Float[np.ndarray, "*batch 3"]
     centred: jaxlie.SE3
-    constraints: Deferred[tuple[Any, Directions | None]]
-    uncertainty: Deferred[tuple[Any, Any]]
+    constraints: Lazy[Constraints]
+    uncertainty: Lazy[Uncertainty]
 
     @classmethod
     def build(cls, **fields: Any) -> Registration:
@@ -115,8 +129,8 @@ class Registration(eqx.Module):
             source_origin=np.zeros(3),
             target_origin=np.zeros(3),
             centred=nowhere,
-            constraints=Deferred.of((np.zeros((6, 6)), None)),
-            uncertainty=Deferred.of((np.full((6, 6), np.nan), np.full(6, np.nan))),
+            constraints=Lazy.of(Constraints(np.zeros((6, 6)), None)),
+            uncertainty=Lazy.of(Uncertainty(np.full((6, 6), np.nan), np.full(6, np.nan))),
         )
 
     @property
@@ -127,12 +141,12 @@ class Registration(eqx.Module):
         of GICP's relative covariances: it compares directions with each other, but its inverse is *not* a covariance of
         the pose. The information of tie points and a prior is converted to this scale and added.
         """
-        return self.constraints.value[0]
+        return self.constraints.value.information
 
     @property
     def directions(self) -> Directions | None:
         """Six directions of motion and what constrains each, see `free_directions`; None from `align`."""
-        return self.constraints.value[1]
+        return self.constraints.value.directions
 
     @property
     def covariance(self) -> Float[AnyArray, "*batch 6 6"]:
@@ -149,7 +163,7 @@ class Registration(eqx.Module):
         if the status is TOO_FEW_CORRESPONDENCES or NON_FINITE, if an alignment is degenerate, or if the matches are too
         few for an estimate.
         """
-        return self.uncertainty.value[0]
+        return self.uncertainty.value.covariance
 
     @property
     def deviations(self) -> Float[AnyArray, "*batch 6"]:
@@ -158,7 +172,7 @@ class Registration(eqx.Module):
 
         Derived from `covariance`, with the same limitations.
         """
-        return self.uncertainty.value[1]
+        return self.uncertainty.value.deviations
 
     @property
     def status(self) -> Any:
@@ -223,22 +237,3 @@ def is_usable(result: Registration) -> bool:
 def computed(result: Registration) -> Registration:
     """The result with its deferred fields computed, so that it no longer references the clouds."""
     return jax.tree.map(lambda leaf: leaf, result)
-
-
-def pose_in_user_frame(
-    centred: jaxlie.SE3, source_origin: Array | np.ndarray, target_origin: Array | np.ndarray
-) -> Array | np.ndarray:
-    """T(o_t) · T · T(−o_s) as (4, 4), with translations T(o) by the origins; float64 NumPy for concrete arrays."""
-    if is_concrete(centred, source_origin, target_origin):
-        parameters = np.asarray(centred.wxyz_xyz, np.float64)
-        rotation = rotation_from_quaternion(parameters[..., :4])
-        # Origins returned by `jit` are float32 (exactly so); the arithmetic with them must be float64.
-        start, end = np.asarray(source_origin, np.float64), np.asarray(target_origin, np.float64)
-        offset = end - start - np.einsum("...ij,...j->...i", rotation - np.eye(3), start)
-        matrix = matrices_of(parameters)
-        matrix[..., :3, 3] += offset
-        return matrix
-    traced = centred.as_matrix().astype(centred.wxyz_xyz.dtype)
-    turned = jnp.einsum("...ij,...j->...i", traced[..., :3, :3] - jnp.eye(3), source_origin, precision="highest")
-    shift = target_origin - source_origin - turned
-    return traced.at[..., :3, 3].add(shift.astype(traced.dtype))

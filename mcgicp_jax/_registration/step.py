@@ -11,18 +11,16 @@ import jaxlie
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from mcgicp_jax._compute.concrete import AnyArray, AnyScalar
-from mcgicp_jax._compute.lazy import Deferred
-from mcgicp_jax._local_geometry.records import Surface
-from mcgicp_jax._math.robust_kernels import AbstractKernel
-from mcgicp_jax._methods.base import AbstractMethod
-from mcgicp_jax._pose_solver.covariance import Moments, sandwich
-from mcgicp_jax._pose_solver.degeneracy import Directions, directions_at_source, find_directions
-from mcgicp_jax._pose_solver.fusion import fused_covariance, fused_update
+from mcgicp_jax._compute.concrete import AnyArray, AnyScalar, numpy_for
+from mcgicp_jax._local_geometry.surface import Surface
+from mcgicp_jax._math.poses import move_pose
+from mcgicp_jax._pose_solver.degeneracy import Directions, find_directions
+from mcgicp_jax._pose_solver.fusion import fused_update
 from mcgicp_jax._pose_solver.pose_measurements import Fusion
 from mcgicp_jax._pose_solver.sums import Sums
-from mcgicp_jax._pose_solver.update import adjoint_to_center, move_pose, solve_update, units
+from mcgicp_jax._pose_solver.update import solve_update
 from mcgicp_jax._registration.result import Status
+from mcgicp_jax._terms.base import AbstractTerm, is_adaptive
 
 # Statuses while the loop runs. COARSE: the coarse phase, with every `coarse_stride`-th source point and the larger
 # maximum correspondence distance. RUNNING: the fine phase, with all points and the smaller distance. SETTLED: the last
@@ -33,8 +31,6 @@ COARSE, RUNNING, SETTLED = -3, -1, -2
 _FRACTION_OF_GATE = 0.25
 # Three points determine a pose; a fourth makes residuals possible.
 _MIN_CORRESPONDENCES = 4
-# Entries of `Registration.history`.
-RECORDED = ("cost", "rmse", "num_inliers", "translation_step", "rotation_step")
 
 
 class Settings(eqx.Module):
@@ -60,58 +56,75 @@ class Settings(eqx.Module):
     max_iterations: Int[AnyArray, "*batch"]
     hold_free_directions: Bool[AnyArray, "*batch"]
 
-    def gate(self, status: Int[AnyScalar, ""]) -> Float[AnyScalar, ""]:
+    def distance(self, status: Int[AnyScalar, ""]) -> Float[AnyScalar, ""]:
         """Maximum correspondence distance at this status, metres."""
-        return jnp.where(status == COARSE, self.max_distance, self.fine_distance)
+        return numpy_for(self, status).where(status == COARSE, self.max_distance, self.fine_distance)
 
     def stride(self, status: Int[AnyScalar, ""], num_iterations: Int[AnyScalar, ""]) -> Int[AnyScalar, ""]:
         """Stride of the source points at this status. Once `max_iterations` are done, all points are measured."""
-        return jnp.where((status == COARSE) & (num_iterations < self.max_iterations), self.coarse_stride, 1)
+        coarse = (status == COARSE) & (num_iterations < self.max_iterations)
+        return numpy_for(self, status, num_iterations).where(coarse, self.coarse_stride, 1)
 
     def first_status(self) -> Int[AnyScalar, ""]:
+        """`COARSE` where the coarse phase differs from the fine one."""
         coarse = (self.fine_distance < self.max_distance) | (self.coarse_stride > 1)
-        return jnp.where(coarse, np.int32(COARSE), np.int32(RUNNING))
+        return numpy_for(self).where(coarse, np.int32(COARSE), np.int32(RUNNING))
 
 
 class Problem(eqx.Module):
-    """Inputs of the registration loop; `fusion` with tie points or a prior, after a registration without them."""
+    """Inputs of the registration loop.
+
+    Attributes:
+        start: the initial pose.
+        source, target: the surfaces of both clouds.
+        terms: the residuals of each correspondence, before any number is adapted.
+        fusion: tie points and prior, after a registration without them; None if there are none.
+        num_candidates: number of target points that a source point is matched with.
+    """
 
     start: jaxlie.SE3
     source: Surface
     target: Surface
-    method: AbstractMethod
-    robust: AbstractKernel | None
+    terms: tuple[AbstractTerm, ...]
     settings: Settings
     fusion: Fusion | None = None
+    num_candidates: int = eqx.field(static=True, default=1)
+
+    @property
+    def first_status(self) -> Int[AnyScalar, ""]:
+        return np.int32(COARSE) if is_adaptive(self.terms) else self.settings.first_status()
 
 
-class State(eqx.Module):
+class Record(NamedTuple):
+    """What is recorded before each update: the entries of `Registration.history`."""
+
+    cost: Float[AnyArray, "*batch"]
+    rmse: Float[AnyArray, "*batch"]
+    num_inliers: Float[AnyArray, "*batch"]
+    translation_step: Float[AnyArray, "*batch"]
+    rotation_step: Float[AnyArray, "*batch"]
+
+
+class State(NamedTuple):
     """State of the loop after one step.
 
     Attributes:
         pose: the updated pose; once the loop has ended, the pose at which `sums` were measured.
         status: `COARSE`, `RUNNING` or `SETTLED` (negative) while the loop runs, then the value of a `Status`.
         num_iterations: number of updates so far.
-        sums: at the pose before the update.
+        sums: at the pose before the update; this and the following are None before the first step on the host.
         information: (6, 6) at the pose before the update, about the centroid, lengths in units of the radius.
         directions: at the pose before the update, about the centroid; None for `align`.
-        record: one number for each history entry in `RECORDED`.
+        record: of this step.
     """
 
     pose: jaxlie.SE3
     status: Int[AnyArray, "*batch"]
     num_iterations: Int[AnyArray, "*batch"]
-    sums: Sums
-    information: Float[AnyArray, "*batch 6 6"]
-    directions: Directions | None
-    record: Float[AnyArray, "*batch 5"]
-
-
-class Assessment(NamedTuple):
-    """Deferred results at the final pose: information matrix and directions, and covariance."""
-
-    constraints: Deferred[tuple[Float[AnyArray, "6 6"], Directions | None]]
-    covariance: Deferred[Float[AnyArray, "6 6"]]
+    sums: Any = None
+    information: Any = None
+    directions: Directions | None = None
+    record: Any = None
 
 
 @jax.jit
@@ -124,10 +137,10 @@ def update(
     fusion: Fusion | None = None,
 ) -> State:
     """Update the pose, or end the loop with a status. Its program does not depend on the size of the clouds."""
-    directions, basis = None, jnp.eye(6, dtype=sums.totals.dtype)
+    directions, basis = None, jnp.eye(6, dtype=sums.center.dtype)
     degenerate: AnyScalar = np.bool_(False)
     with jax.default_matmul_precision("highest"):
-        if sums.observability:
+        if sums.observability is not None:
             directions = find_directions(sums)
             degenerate = ~jnp.all(directions.held)
             # Along unconstrained directions an update would only follow arbitrary nearest-neighbour matches.
@@ -149,7 +162,7 @@ def update(
     nearly = below(settings.coarse_translation_tolerance, settings.coarse_rotation_tolerance)
     nearly = nearly & (motion <= _FRACTION_OF_GATE * settings.fine_distance)
     converged = below(settings.translation_tolerance, settings.rotation_tolerance) | (coarse & nearly)
-    finite = jnp.isfinite(sums.constant) & jnp.all(jnp.isfinite(moved.wxyz_xyz))
+    finite = jnp.isfinite(sums.energy) & jnp.all(jnp.isfinite(moved.wxyz_xyz))
     outcomes: tuple[tuple[Array, int], ...] = (
         (sums.num_inliers < _MIN_CORRESPONDENCES, Status.TOO_FEW_CORRESPONDENCES),
         (~finite, Status.NON_FINITE),
@@ -161,7 +174,7 @@ def update(
     )
     conditions, codes = zip(*outcomes, strict=True)
     status = jnp.select(list(conditions), [np.int32(code) for code in codes], np.int32(RUNNING))
-    record = (sums.cost, sums.rmse, sums.num_inliers, translation_step, rotation_step)
+    record = Record(sums.cost, sums.rmse, sums.num_inliers, translation_step, rotation_step)
     return State(
         # The loop returns the pose at which sums, information and directions were measured.
         pose=jaxlie.SE3(jnp.where(status < 0, moved.wxyz_xyz, pose.wxyz_xyz)),
@@ -170,43 +183,5 @@ def update(
         sums=sums,
         information=change.information,
         directions=directions,
-        record=jnp.stack([number.astype(sums.totals.dtype) for number in record]),
+        record=Record(*(number.astype(sums.center.dtype) for number in record)),
     )
-
-
-@jax.jit
-def constraints_of(state: State) -> tuple[Float[Array, "6 6"], Directions | None]:
-    """Information matrix and directions at the final pose, for ξ in T exp(ξ), metres and radians."""
-    sums, directions = state.sums, state.directions
-    with jax.default_matmul_precision("highest"):
-        adjoint = adjoint_to_center(state.pose, sums.center) / units(sums.radius)[:, None]
-        information = adjoint.T @ (state.information * sums.radius**2) @ adjoint
-        return information, None if directions is None else directions_at_source(directions, state.pose)
-
-
-@jax.jit
-def covariance_of_pose(state: State, known: Moments | Fusion) -> Float[Array, "6 6"]:
-    """Covariance of the final pose, for ξ in T exp(ξ), metres and radians; NaN if the status allows none.
-
-    Args:
-        known: sums over the scores; with tie points or a prior, those of the registration before, in `Fusion`.
-    """
-    found = (state.status != Status.TOO_FEW_CORRESPONDENCES) & (state.status != Status.NON_FINITE)
-    if state.directions is None:
-        found = found & (state.status != Status.DEGENERATE)
-    center, radius = state.sums.center, state.sums.radius
-    with jax.default_matmul_precision("highest"):
-        if isinstance(known, Fusion):
-            covariance = fused_covariance(state.pose, known)
-        else:
-            covariance = sandwich(state.pose, center, radius, known, state.directions)
-    return jnp.where(found, covariance, jnp.nan)
-
-
-def history_of(records: Float[AnyArray, "*batch T 5"]) -> dict[str, Any]:
-    """The columns of the records by name, for `Registration.history`."""
-    return {name: records[..., i] for i, name in enumerate(RECORDED)}
-
-
-def rotation_and_translation(pose: jaxlie.SE3, dtype: Any) -> tuple[Float[Array, "3 3"], Float[Array, "3"]]:
-    return pose.rotation().as_matrix().astype(dtype), pose.translation().astype(dtype)

@@ -6,23 +6,25 @@ A lane is one registration of the vectorised batch. When it ends, another proble
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
-from dataclasses import replace
 from functools import partial
-from typing import Any, Generic, TypeAlias, TypeVar
+from typing import Any, Generic, NamedTuple, TypeAlias, TypeVar
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
-from jaxtyping import Array, Int
+from jaxtyping import Array, Bool, Int
 
-from mcgicp_jax._pose_solver.sums import matched_rows
-from mcgicp_jax._registration.step import Assessment, Problem, State, history_of
-from mcgicp_jax._registration.traced import Carry, assess, begin, cleaned, step_of_lane
+from mcgicp_jax._registration.assessment import Assessment
+from mcgicp_jax._registration.loop import LoopResult, step
+from mcgicp_jax._registration.step import Problem, Record, State
+from mcgicp_jax._registration.traced import TracedExecutor, assess, cleaned
 from mcgicp_jax._search.base import AbstractSearch
 
 Key = TypeVar("Key")
-Ended: TypeAlias = tuple[Key, State, Assessment, dict[str, np.ndarray]]
+
+# A problem and its loop, or many stacked ones.
+Lanes: TypeAlias = tuple[Problem, LoopResult]
 
 # Lanes per device; few on a CPU, where finished lanes that wait for the others cost as much as active ones.
 _LANES = 64
@@ -34,13 +36,22 @@ _PATIENCE = 256
 _STEPS = 4
 
 
+class Ended(NamedTuple, Generic[Key]):
+    """A registration that has ended, with the key of its problem."""
+
+    key: Key
+    state: State
+    assessment: Assessment
+    history: Record
+
+
 def run_problems(
     problems: Iterable[tuple[Key, Problem]], search: AbstractSearch, max_iterations: int
 ) -> Iterator[Ended[Key]]:
     """Run the loop of `register` on many problems at a time, and yield each result as soon as it is known.
 
     Problems of the same shapes share a program. Its number of lanes is fixed, so that a result does not depend on the
-    other problems. The lanes are spread over all local devices. Yields key, final state, assessment and history.
+    other problems. The lanes are spread over all local devices.
     """
     groups: dict[Any, _Group[Key]] = {}
     last: dict[Any, int] = {}
@@ -74,9 +85,7 @@ class _Group(Generic[Key]):
         sharding = NamedSharding(Mesh(np.array(devices), ("lanes",)), PartitionSpec("lanes"))
         self._put = jax.jit(_put, donate_argnums=0, out_shardings=sharding)
         lane = example, begin_lane(example, search, max_iterations)
-        self._lanes: tuple[Problem, Carry] = jax.jit(_empty, static_argnums=1, out_shardings=sharding)(
-            lane, len(self._keys)
-        )
+        self._lanes: Lanes = jax.jit(_empty, static_argnums=1, out_shardings=sharding)(lane, len(self._keys))
 
     def is_full(self) -> bool:
         return None not in self._keys
@@ -91,62 +100,60 @@ class _Group(Generic[Key]):
 
     def run(self) -> Iterator[Ended[Key]]:
         """Run `_STEPS` steps of all lanes; yield the results of finished lanes and free these lanes."""
-        problems, carries = self._lanes
-        carries = run_lanes(problems, carries, self._search, _STEPS)
-        self._lanes = problems, carries
+        problems, loops = self._lanes
+        loops = run_lanes(problems, loops, self._search, _STEPS)
+        self._lanes = problems, loops
         # The matches are not copied to the host.
-        ended = np.asarray(carries[0].status) >= 0
+        ended = np.asarray(loops.state.status) >= 0
         if not any(ended[lane] and key is not None for lane, key in enumerate(self._keys)):
             return
-        states, records, assessments = jax.device_get(
-            (carries[0], carries[2], assess_lanes(problems, carries, self._search))
-        )
+        found = jax.device_get((loops.state, assess_lanes(problems, loops, self._search), loops.history))
         for lane, key in enumerate(self._keys):
             if key is not None and ended[lane]:
                 self._keys[lane] = None
-                state, assessed = jax.tree.map(lambda leaf, lane=lane: leaf[lane], (states, assessments))
+                state, assessed, history = jax.tree.map(lambda leaf, lane=lane: leaf[lane], found)
                 # One history entry per update, and one at the returned pose.
                 count = int(state.num_iterations) + 1
-                yield key, state, assessed, history_of(records[lane, :count])
+                yield Ended(key, state, assessed, jax.tree.map(lambda entries, count=count: entries[:count], history))
 
 
-def _empty(lane: tuple[Problem, Carry], count: int) -> tuple[Problem, Carry]:
+def _empty(lane: Lanes, count: int) -> Lanes:
     """Lanes without a problem: their status is 0, which counts as finished."""
     return jax.tree.map(lambda leaf: jnp.zeros((count, *leaf.shape), leaf.dtype), lane)
 
 
-def _put(lanes: tuple[Problem, Carry], lane: tuple[Problem, Carry], number: Int[Array, ""]) -> tuple[Problem, Carry]:
+def _put(lanes: Lanes, lane: Lanes, number: Int[Array, ""]) -> Lanes:
     return jax.tree.map(lambda leaves, leaf: leaves.at[number].set(leaf), lanes, lane)
 
 
 @partial(jax.jit, static_argnames="max_iterations")
-def begin_lane(problem: Problem, search: AbstractSearch, max_iterations: int) -> Carry:
-    """Initial carry of the loop of `register`, compiled."""
-    return begin(problem, search, max_iterations)
+def begin_lane(problem: Problem, search: AbstractSearch, max_iterations: int) -> LoopResult:
+    """The loop before its first step, compiled."""
+    return TracedExecutor(problem, search, max_iterations).begin()
 
 
 @partial(jax.jit, static_argnames="num_steps")
-def run_lanes(problems: Problem, carries: Carry, search: AbstractSearch, num_steps: int) -> Carry:
+def run_lanes(problems: Problem, loops: LoopResult, search: AbstractSearch, num_steps: int) -> LoopResult:
     """Run at most `num_steps` steps of many stacked loops; finished loops do not change."""
 
-    def run(problem: Problem, carry: Carry) -> Carry:
+    def run(problem: Problem, loop: LoopResult) -> LoopResult:
+        executor = TracedExecutor(problem, search, 0)
+
+        def unfinished(counted: tuple[LoopResult, Int[Array, ""]]) -> Bool[Array, ""]:
+            return (counted[0].state.status < 0) & (counted[1] < num_steps)
+
         return jax.lax.while_loop(
-            lambda counted: (counted[0][0].status < 0) & (counted[1] < num_steps),
-            lambda counted: (step_of_lane(counted[0], problem, search), counted[1] + 1),
-            (carry, jnp.int32(0)),
+            unfinished, lambda counted: (step(executor, counted[0]), counted[1] + 1), (loop, jnp.int32(0))
         )[0]
 
-    return jax.vmap(run)(problems, carries)
+    return jax.vmap(run)(problems, loops)
 
 
 @jax.jit
-def assess_lanes(problems: Problem, carries: Carry, search: AbstractSearch) -> Assessment:
+def assess_lanes(problems: Problem, loops: LoopResult, search: AbstractSearch) -> Assessment:
     """Information matrices, directions and covariances of stacked loops, at their current poses."""
 
-    def of_lane(problem: Problem, carry: Carry) -> Assessment:
-        state, matches, _, estimates = carry
-        matches = cleaned(matches)
-        problem = replace(problem, method=problem.method.with_estimates(estimates))
-        return assess(state, problem, matched_rows(problem.source, problem.target, matches), matches, search)
+    def of_lane(problem: Problem, loop: LoopResult) -> Assessment:
+        return assess(loop._replace(matches=cleaned(loop.matches)), problem, search)
 
-    return jax.vmap(of_lane)(problems, carries)
+    return jax.vmap(of_lane)(problems, loops)

@@ -15,7 +15,7 @@ from jaxtyping import Array, Bool, Float, Int
 from mcgicp_jax._compute.concrete import AnyArray
 
 
-class Rows(NamedTuple):
+class SearchPoints(NamedTuple):
     """The points of a cloud, as input to a search; NumPy or JAX arrays.
 
     Attributes:
@@ -33,9 +33,18 @@ class Rows(NamedTuple):
     penalty: Float[AnyArray, "*batch N D"] | None = None
 
 
-def by_position(rows: Rows) -> Rows:
+def by_position(rows: SearchPoints) -> SearchPoints:
     """The rows for a search in position alone."""
-    return Rows(rows.points, rows.descriptors[:, :0], rows.valid)
+    return SearchPoints(rows.points, rows.descriptors[:, :0], rows.valid)
+
+
+# The pose that leaves queries where they are, as the searches take it.
+IDENTITY = np.array([1.0, 0, 0, 0, 0, 0, 0])
+
+
+def search_points(points: Float[np.ndarray, "N 3"]) -> SearchPoints:
+    """Points for a search in position alone."""
+    return SearchPoints(points, np.zeros((len(points), 0), points.dtype), np.ones(len(points), bool))
 
 
 class Correspondences(eqx.Module):
@@ -63,7 +72,7 @@ class AbstractIndex(abc.ABC):
 
     @abc.abstractmethod
     def nearest(
-        self, pose: Float[ArrayLike, "7"], source: Rows, max_distance: float, num_candidates: int = 1
+        self, pose: Float[ArrayLike, "7"], source: SearchPoints, max_distance: float, num_candidates: int = 1
     ) -> Int[np.ndarray, "m N"]:
         """The target rows nearest to each source point in position and descriptors, the positions moved by a pose.
 
@@ -79,7 +88,7 @@ class AbstractIndex(abc.ABC):
 
     @abc.abstractmethod
     def follow(
-        self, source: Rows, max_distance: float, num_candidates: int = 1
+        self, source: SearchPoints, max_distance: float, num_candidates: int = 1
     ) -> Callable[[Float[ArrayLike, "7"]], Int[np.ndarray, "m N"]]:
         """A function that maps a pose to the nearest target rows of each source row, for one registration.
 
@@ -97,15 +106,15 @@ class AbstractSearch(eqx.Module):
         return None
 
     @abc.abstractmethod
-    def index(self, target: Rows) -> AbstractIndex:
+    def index(self, target: SearchPoints) -> AbstractIndex:
         """Build an index over the valid rows of a target of concrete arrays."""
 
     @abc.abstractmethod
     def nearest_traced(
         self,
         pose: Float[Array, "7"],
-        source: Rows,
-        target: Rows,
+        source: SearchPoints,
+        target: SearchPoints,
         max_distance: Float[Array, ""],
         running: Bool[Array, ""],
         num_candidates: int = 1,
@@ -125,6 +134,6 @@ class AbstractSearch(eqx.Module):
         """
 
 
-def on_host(tree: Rows) -> Rows:
+def on_host(tree: SearchPoints) -> SearchPoints:
     """The rows as NumPy arrays."""
     return jax.tree.map(np.asarray, tree)

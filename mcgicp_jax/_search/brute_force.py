@@ -14,7 +14,7 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float, Int
 
 from mcgicp_jax._compute.size_classes import size_class
-from mcgicp_jax._search.base import AbstractIndex, AbstractSearch, Rows, on_host
+from mcgicp_jax._search.base import IDENTITY, AbstractIndex, AbstractSearch, SearchPoints, on_host, search_points
 from mcgicp_jax._search.kd_tree import KDTreeSearch
 
 
@@ -32,14 +32,14 @@ class DenseSearch(AbstractSearch):
     different points where two distances agree to rounding.
     """
 
-    def index(self, target: Rows) -> DenseIndex:
+    def index(self, target: SearchPoints) -> DenseIndex:
         return DenseIndex(target)
 
     def nearest_traced(
         self,
         pose: Float[Array, "7"],
-        source: Rows,
-        target: Rows,
+        source: SearchPoints,
+        target: SearchPoints,
         max_distance: Float[Array, ""],
         running: Bool[Array, ""],
         num_candidates: int = 1,
@@ -47,31 +47,30 @@ class DenseSearch(AbstractSearch):
         return _nearest(pose, source, target, num_candidates)
 
     def neighbors(self, points: Float[np.ndarray, "N 3"], num_neighbors: int) -> Int[np.ndarray, "N k"]:
-        rows = Rows(points, np.zeros((len(points), 0), points.dtype), np.ones(len(points), bool))
-        identity = np.array([1, 0, 0, 0, 0, 0, 0], points.dtype)
-        return self.index(rows).nearest(identity, rows, np.inf, num_neighbors).T
+        rows = search_points(points)
+        return self.index(rows).nearest(IDENTITY, rows, np.inf, num_neighbors).T
 
 
 class DenseIndex(AbstractIndex):
     """The target's rows, padded to a size class; brute force needs no data structure."""
 
-    def __init__(self, target: Rows):
+    def __init__(self, target: SearchPoints):
         self._target = _padded(target)
 
     def nearest(
-        self, pose: Float[ArrayLike, "7"], source: Rows, max_distance: float, num_candidates: int = 1
+        self, pose: Float[ArrayLike, "7"], source: SearchPoints, max_distance: float, num_candidates: int = 1
     ) -> Int[np.ndarray, "m N"]:
         size, padded = source.valid.size, _padded(source)
         found = _nearest(jnp.asarray(pose, source.points.dtype), padded, self._target, num_candidates)
         return np.asarray(found)[:, :size]
 
     def follow(
-        self, source: Rows, max_distance: float, num_candidates: int = 1
+        self, source: SearchPoints, max_distance: float, num_candidates: int = 1
     ) -> Callable[[Float[ArrayLike, "7"]], Int[np.ndarray, "m N"]]:
         return lambda pose: self.nearest(pose, source, max_distance, num_candidates)
 
 
-def _padded(rows: Rows) -> Rows:
+def _padded(rows: SearchPoints) -> SearchPoints:
     """The rows padded to their size class, so that clouds of all sizes run few programs."""
     rows = on_host(rows)
     missing = size_class(rows.valid.size) - rows.valid.size
@@ -79,7 +78,9 @@ def _padded(rows: Rows) -> Rows:
 
 
 @partial(jax.jit, static_argnames="num_candidates")
-def _nearest(pose: Float[Array, "7"], source: Rows, target: Rows, num_candidates: int) -> Int[Array, "m N"]:
+def _nearest(
+    pose: Float[Array, "7"], source: SearchPoints, target: SearchPoints, num_candidates: int
+) -> Int[Array, "m N"]:
     rotation = jaxlie.SO3(pose[:4]).as_matrix().astype(pose.dtype)
     moved = jnp.dot(source.points, rotation.T, precision="highest") + pose[4:]
     queries = eqx.tree_at(lambda rows: rows.points, source, moved)
@@ -96,19 +97,19 @@ def _nearest(pose: Float[Array, "7"], source: Rows, target: Rows, num_candidates
         distance, row = (values[:, None] for values in before)
         # False where the distance is NaN.
         after = (square > distance) | ((square == distance) & (numbers > row))
-        least, nearest = jax.lax.reduce(
+        smallest, nearest = jax.lax.reduce(
             (jnp.where(after & target.valid, square, jnp.inf), numbers),
             (jnp.asarray(jnp.inf, square.dtype), jnp.int32(rows.size)),
             _nearer,
             dimensions=(1,),
         )
-        return (least, nearest), jnp.where(jnp.isfinite(least) & source.valid, nearest, -1)
+        return (smallest, nearest), jnp.where(jnp.isfinite(smallest) & source.valid, nearest, -1)
 
-    nobody = (jnp.full(source.valid.size, -1, moved.dtype), jnp.full(source.valid.size, -1, jnp.int32))
-    return jax.lax.scan(following, nobody, length=num_candidates)[1]
+    start = (jnp.full(source.valid.size, -1, moved.dtype), jnp.full(source.valid.size, -1, jnp.int32))
+    return jax.lax.scan(following, start, length=num_candidates)[1]
 
 
-def _squares(source: Rows, target: Rows) -> Float[Array, "N M"]:
+def _squares(source: SearchPoints, target: SearchPoints) -> Float[Array, "N M"]:
     """Squared search distance of every source row to every target row, metres²; not stored if reduced at once."""
     square = jnp.zeros((source.valid.size, target.valid.size), jnp.asarray(source.points).dtype)
     for query, point in zip(source.points.T, target.points.T, strict=True):

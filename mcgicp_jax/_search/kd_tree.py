@@ -7,10 +7,7 @@ from pose to pose, and the callback with its cache inside transformations. A sub
 
 from __future__ import annotations
 
-import abc
-import collections
 import hashlib
-import threading
 from functools import partial
 from typing import Any
 
@@ -21,17 +18,15 @@ import numpy as np
 import scipy.spatial
 from jaxtyping import Array, Bool, Float, Int
 
+from mcgicp_jax._compute.cache import MAX_ROWS, Cache
 from mcgicp_jax._compute.callbacks import call_host
-from mcgicp_jax._search.base import AbstractSearch, Rows, on_host
-from mcgicp_jax._search.nearest_with_ties import Tree
-from mcgicp_jax._search.pykdtree import MOST_DIMENSIONS, PyKDTree, has_pykdtree
+from mcgicp_jax._search.base import AbstractSearch, SearchPoints, on_host
+from mcgicp_jax._search.nearest_with_ties import TiedTree, TreeBackend
+from mcgicp_jax._search.pykdtree import MAX_DIMENSIONS, PyKDTree, has_pykdtree
 from mcgicp_jax._search.tree_index import LARGEST_UNORDERED, TreeIndex
 
-# Total number of rows of the trees cached for callbacks: hundreds of scans, some hundred megabytes.
-_CACHED_ROWS = 2_000_000
 
-
-class AbstractTreeSearch(AbstractSearch):
+class AbstractTreeSearch(AbstractSearch, TreeBackend):
     """Exact search with a tree on the host. Ties are broken by row, so that results are reproducible.
 
     Attributes:
@@ -40,43 +35,18 @@ class AbstractTreeSearch(AbstractSearch):
 
     workers: int = eqx.field(static=True, default=-1)
 
-    @abc.abstractmethod
-    def build(self, points: Float[np.ndarray, "M D"]) -> Any:
-        """A tree of (M, D) finite points, metres; M is at least 1, D at least 3."""
-
-    @abc.abstractmethod
-    def query(
-        self, tree: Any, queries: Float[np.ndarray, "N D"], k: int, bound: float
-    ) -> tuple[Float[np.ndarray, "N k"], Int[np.ndarray, "N k"]]:
-        """The k nearest points of each query. Several threads may call this function at once.
-
-        Args:
-            tree: from `build`, of M points.
-            queries: (N, D) finite points, metres.
-            k: number of neighbours, at most M.
-            bound: metres in all D dimensions; only neighbours nearer than this are reported.
-
-        Returns:
-            (N, k) distances in metres and rows, nearest first, ties in any order. Where fewer than k points lie within
-            the bound, the distance is infinite and the row is M.
-        """
-
-    def leaf_order(self, tree: Any, num_points: int) -> Int[np.ndarray, "M"]:
-        """An order of the tree's points in which neighbouring points follow each other, for faster queries."""
-        return np.arange(num_points)
-
     @property
     def num_threads(self) -> int | None:
         return None if self.workers == -1 else self.workers
 
-    def index(self, target: Rows) -> TreeIndex:
+    def index(self, target: SearchPoints) -> TreeIndex:
         return TreeIndex(self, on_host(target))
 
     def nearest_traced(
         self,
         pose: Float[Array, "7"],
-        source: Rows,
-        target: Rows,
+        source: SearchPoints,
+        target: SearchPoints,
         max_distance: Float[Array, ""],
         running: Bool[Array, ""],
         num_candidates: int = 1,
@@ -88,7 +58,7 @@ class AbstractTreeSearch(AbstractSearch):
         )
 
     def neighbors(self, points: Float[np.ndarray, "N 3"], num_neighbors: int) -> Int[np.ndarray, "N k"]:
-        tree = Tree(self, points)
+        tree = TiedTree(self, points)
         # In the order of the leaves, each query finds the nodes it needs in the processor's caches.
         order = tree.leaf_order()
         found, _ = tree.nearest(points[order], num_neighbors)
@@ -118,7 +88,7 @@ class KDTreeSearch(AbstractTreeSearch):
             raise ValueError("backend: pykdtree is not installed; run: pip install 'mcgicp_jax[fast]'")
 
     def build(self, points: Float[np.ndarray, "M D"]) -> scipy.spatial.cKDTree | PyKDTree:
-        if self.backend != "scipy" and has_pykdtree() and points.shape[1] <= MOST_DIMENSIONS:
+        if self.backend != "scipy" and has_pykdtree() and points.shape[1] <= MAX_DIMENSIONS:
             return PyKDTree(points)
         return _scipy_tree(points)
 
@@ -142,46 +112,28 @@ def _scipy_tree(points: Float[np.ndarray, "M D"]) -> scipy.spatial.cKDTree:
     return scipy.spatial.cKDTree(points, leafsize=32, balanced_tree=False, compact_nodes=True)
 
 
-class _IndexCache:
-    """Least-recently-used cache of trees by content: a pure callback keeps no state, yet builds each tree only once."""
-
-    def __init__(self, rows: int):
-        self._rows = rows
-        self._lock = threading.Lock()
-        self._indices: collections.OrderedDict[bytes, TreeIndex] = collections.OrderedDict()
-
-    def get(self, search: AbstractTreeSearch, target: Rows) -> TreeIndex:
-        arrays = jax.tree.leaves(target)
-        digest = hashlib.blake2b(repr([search, *((array.shape, array.dtype) for array in arrays)]).encode())
-        for array in arrays:
-            digest.update(np.ascontiguousarray(array).data)
-        key = digest.digest()
-        with self._lock:
-            if key in self._indices:
-                self._indices.move_to_end(key)
-                return self._indices[key]
-        index = TreeIndex(search, target)
-        with self._lock:
-            self._indices[key] = index
-            while len(self._indices) > 1 and sum(kept.num_rows for kept in self._indices.values()) > self._rows:
-                self._indices.popitem(last=False)
-        return index
+# Indices by content of their target: a pure callback keeps no state, yet each tree is built only once.
+_indices = Cache(MAX_ROWS, lambda index: index.num_rows)
 
 
-_index_cache = _IndexCache(_CACHED_ROWS)
+def _index_of(search: AbstractTreeSearch, target: SearchPoints) -> TreeIndex:
+    arrays = jax.tree.leaves(target)
+    digest = hashlib.blake2b(repr([search, *((array.shape, array.dtype) for array in arrays)]).encode())
+    for array in arrays:
+        digest.update(np.ascontiguousarray(array).data)
+    return _indices.get(digest.digest(), partial(TreeIndex, search, target))
 
 
 def _nearest_callback(
     search: AbstractTreeSearch,
     num_candidates: int,
     pose: Any,
-    source: Rows,
-    target: Rows,
+    source: SearchPoints,
+    target: SearchPoints,
     max_distance: Any,
     running: Any,
 ) -> Int[np.ndarray, "m N"]:
     """`TreeIndex.nearest` for the arguments of `AbstractSearch.nearest_traced`."""
     if not running:
         return np.full((num_candidates, source.valid.size), -1, np.int32)
-    index = _index_cache.get(search, target)
-    return index.nearest(pose, source, float(max_distance), num_candidates)
+    return _index_of(search, target).nearest(pose, source, float(max_distance), num_candidates)

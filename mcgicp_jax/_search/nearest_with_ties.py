@@ -1,9 +1,10 @@
-"""The k nearest points of each query by a tree, ordered by distance and then row, on several threads."""
+"""The k nearest points of each query by any kind of tree, ordered by distance and then row, on several threads."""
 
 from __future__ import annotations
 
+import abc
 from functools import partial
-from typing import Any, Protocol, runtime_checkable
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -13,36 +14,52 @@ from mcgicp_jax._compute.threads import num_cores, side_by_side
 # Largest number of candidates per query with which the tree breaks a tie by row: a multiple of the neighbours wanted,
 # but at least the second number. Longer ties are mostly due to coincident points, and are left to brute force.
 _TIE_CANDIDATES = 8
-_LEAST_TIE_CANDIDATES = 64
+_MIN_TIE_CANDIDATES = 64
 # Smallest number of queries that a thread is given at a time, and largest number of such parts per thread: several,
 # since a thread may start late. With 2,000 to 100,000 queries, a factor of two in either hardly matters.
-_LEAST_PART, _PARTS_PER_THREAD = 1000, 8
+_MIN_PART, _PARTS_PER_THREAD = 1000, 8
 
 
-@runtime_checkable
-class Trees(Protocol):
-    """A kind of tree: the part of `AbstractTreeSearch` that indices use."""
+class TreeBackend(abc.ABC):
+    """A kind of tree: how it is built and queried."""
 
-    @property
-    def workers(self) -> int: ...
+    # Largest number of threads that query it; −1 for all cores.
+    workers: int
 
-    def build(self, points: Float[np.ndarray, "M D"]) -> Any: ...
+    @abc.abstractmethod
+    def build(self, points: Float[np.ndarray, "M D"]) -> Any:
+        """A tree of (M, D) finite points, metres; M is at least 1, D at least 3."""
 
+    @abc.abstractmethod
     def query(
         self, tree: Any, queries: Float[np.ndarray, "N D"], k: int, bound: float
-    ) -> tuple[Float[np.ndarray, "N k"], Int[np.ndarray, "N k"]]: ...
+    ) -> tuple[Float[np.ndarray, "N k"], Int[np.ndarray, "N k"]]:
+        """The k nearest points of each query. Several threads may call this function at once.
 
-    def leaf_order(self, tree: Any, num_points: int) -> Int[np.ndarray, "M"]: ...
+        Args:
+            tree: from `build`, of M points.
+            queries: (N, D) finite points, metres.
+            k: number of neighbours, at most M.
+            bound: metres in all D dimensions; only neighbours nearer than this are reported.
+
+        Returns:
+            (N, k) distances in metres and rows, nearest first, ties in any order. Where fewer than k points lie within
+            the bound, the distance is infinite and the row is M.
+        """
+
+    def leaf_order(self, tree: Any, num_points: int) -> Int[np.ndarray, "M"]:
+        """An order of the tree's points in which neighbouring points follow each other, for faster queries."""
+        return np.arange(num_points)
 
 
-class Tree:
+class TiedTree:
     """A tree of points that finds the same neighbours whatever its kind: ordered by distance, ties by row.
 
     Attributes:
         points: (M, D) finite points, metres.
     """
 
-    def __init__(self, trees: Trees, points: Float[np.ndarray, "M D"]):
+    def __init__(self, trees: TreeBackend, points: Float[np.ndarray, "M D"]):
         self.points = points
         self._trees, self._tree = trees, trees.build(points)
         # equinox creates an object whenever it binds a method.
@@ -57,7 +74,7 @@ class Tree:
         self, queries: Float[np.ndarray, "N D"], k: int, bound: float = np.inf
     ) -> tuple[Float[np.ndarray, "N k"], Int[np.ndarray, "N k"]]:
         """Distances and rows of the k nearest points as from `AbstractTreeSearch.query`, on several threads."""
-        count = 1 if self._threads == 1 else min(_PARTS_PER_THREAD * self._threads, len(queries) // _LEAST_PART)
+        count = 1 if self._threads == 1 else min(_PARTS_PER_THREAD * self._threads, len(queries) // _MIN_PART)
         if count <= 1:
             return self._query(self._tree, queries, k, bound)
         parts = np.array_split(queries, count)
@@ -79,7 +96,7 @@ class Tree:
         size = len(self.points)
         k = min(k, size)
         asked = min(k + 1, size)
-        most = min(max(_TIE_CANDIDATES * (k + 1), _LEAST_TIE_CANDIDATES), size)
+        max_asked = min(max(_TIE_CANDIDATES * (k + 1), _MIN_TIE_CANDIDATES), size)
         distances, rows = self.query(queries, asked, bound)
         nearest = rows[:, :k].astype(np.int32)
         farthest = distances[:, k - 1]
@@ -91,9 +108,9 @@ class Tree:
             nearest[tied] = np.take_along_axis(rows, order, axis=1)[:, :k]
             # A tie that includes the last candidate may extend beyond it.
             tied = tied[np.isfinite(distances[:, -1]) & (distances[:, k - 1] == distances[:, -1])]
-            if asked == most:
+            if asked == max_asked:
                 break
-            asked = min(2 * asked, most)
+            asked = min(2 * asked, max_asked)
             if tied.size:
                 distances, rows = self.query(queries[tied], asked, bound)
         if tied.size and asked < size:

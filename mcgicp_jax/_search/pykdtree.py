@@ -13,7 +13,7 @@ from jaxtyping import Float, Int
 # three dimensions, 0.5 to 1 in four, and 0.7 to 1.7 in six; 20 neighbours 0.7 to 0.9 in three dimensions. (100 take up
 # to 1.5 of the time and 300 up to 3.4, but so many are only asked for to break ties.) Up to seven dimensions the
 # distances of both agree to the last bit, since both add the squared differences in the same order.
-MOST_DIMENSIONS = 4
+MAX_DIMENSIONS = 4
 
 
 @functools.cache

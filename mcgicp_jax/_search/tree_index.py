@@ -1,4 +1,4 @@
-"""An index over the rows of a target by trees: descriptors, missing channels, and matches kept from pose to pose."""
+"""An index of target points by trees: descriptors, missing channels, and matches reused from pose to pose."""
 
 from __future__ import annotations
 
@@ -9,12 +9,12 @@ from jax.typing import ArrayLike
 from jaxtyping import Float, Int
 
 from mcgicp_jax._math.poses import rotation_from_quaternion
-from mcgicp_jax._search.base import AbstractIndex, Rows, on_host
-from mcgicp_jax._search.nearest_with_ties import Tree, Trees, slack_of
+from mcgicp_jax._search.base import AbstractIndex, SearchPoints, on_host
+from mcgicp_jax._search.nearest_with_ties import TiedTree, TreeBackend, slack_of
 
 # Largest number of combinations of missing channels (of the queries × of the target) for which a tree each is built:
 # two cameras, each of which sees a point or not, make 4 × 4.
-_MOST_TREES = 16
+_MAX_TREES = 16
 # With more combinations: number of neighbours in position that are examined first, and number of (query, neighbour)
 # differences in memory at a time.
 _FIRST_NEAR = 32
@@ -30,7 +30,7 @@ class TreeIndex(AbstractIndex):
     With many such sets, a tree of positions yields candidates instead, whose search distances are then computed.
     """
 
-    def __init__(self, trees: Trees, target: Rows):
+    def __init__(self, trees: TreeBackend, target: SearchPoints):
         points = np.hstack([target.points, target.descriptors])
         # Trees reject non-finite points; the sums at the pose lead to the status NON_FINITE.
         self._rows = np.flatnonzero(target.valid & np.isfinite(points).all(axis=1)).astype(np.int32)
@@ -40,8 +40,8 @@ class TreeIndex(AbstractIndex):
         self._patterns, self._which = _patterns(self._penalty)
         self._trees = trees
         # Trees are built on demand. Threads that need the same tree at once may each build it.
-        self._parts: dict[bytes, list[_Part]] = {}
-        self._positions: Tree | None = None
+        self._parts: dict[bytes, list[_TreeForChannels]] = {}
+        self._positions: TiedTree | None = None
 
     @property
     def num_rows(self) -> int:
@@ -49,7 +49,7 @@ class TreeIndex(AbstractIndex):
         return self._rows.size * max(1, len(self._parts) + (self._positions is not None))
 
     def nearest(
-        self, pose: Float[ArrayLike, "7"], source: Rows, max_distance: float, num_candidates: int = 1
+        self, pose: Float[ArrayLike, "7"], source: SearchPoints, max_distance: float, num_candidates: int = 1
     ) -> Int[np.ndarray, "m N"]:
         source = on_host(source)
         queries = np.hstack([_moved(pose, np.asarray(source.points, np.float64)), source.descriptors])
@@ -57,9 +57,9 @@ class TreeIndex(AbstractIndex):
         return self.nearest_of(queries, source.penalty, max_distance, num_candidates)[0].T
 
     def follow(
-        self, source: Rows, max_distance: float, num_candidates: int = 1
+        self, source: SearchPoints, max_distance: float, num_candidates: int = 1
     ) -> Callable[[Float[ArrayLike, "7"]], Int[np.ndarray, "m N"]]:
-        return _Follower(self, self._trees, on_host(source), max_distance, num_candidates).nearest
+        return _MatchTracker(self, self._trees, on_host(source), max_distance, num_candidates).nearest
 
     def nearest_of(
         self,
@@ -72,7 +72,7 @@ class TreeIndex(AbstractIndex):
 
         Args:
             queries: positions and descriptors, metres; rows that are not finite have no neighbours.
-            penalty: as in `Rows`, for the queries.
+            penalty: as in `SearchPoints`, for the queries.
 
         Returns:
             (N, k) target rows, −1 for none; and (N,) the slack: the distance, metres, that a query may move before its
@@ -92,7 +92,7 @@ class TreeIndex(AbstractIndex):
             patterns, which = np.zeros((1, queries.shape[1] - 3)), np.zeros(rows.size, np.intp)
         else:
             patterns, which = _patterns(penalty[active])
-        if len(patterns) * len(self._patterns) > _MOST_TREES:
+        if len(patterns) * len(self._patterns) > _MAX_TREES:
             groups = [active]
             answers = [self._near_in_position(queries[active], patterns[which], k)]
         else:
@@ -128,11 +128,11 @@ class TreeIndex(AbstractIndex):
         The number of neighbours in position grows until all other points are too far away in position alone.
         """
         if self._positions is None:
-            self._positions = Tree(self._trees, self._points[:, :3])
+            self._positions = TiedTree(self._trees, self._points[:, :3])
         size = self._rows.size
         found, slack = np.empty((len(queries), min(k, size)), np.int32), np.empty(len(queries))
         # Penalties that every match of a query incurs: a lower bound on the squared distance beside the position.
-        least = penalty.sum(axis=1)
+        smallest = penalty.sum(axis=1)
         open, asked = np.arange(len(queries)), min(max(_FIRST_NEAR, k + 1), size)
         while open.size:
             unsure = []
@@ -141,7 +141,7 @@ class TreeIndex(AbstractIndex):
                 rows, squares = _ordered(self._rows[near], self._squares(queries[some], penalty[some], near), k + 1)
                 found[some] = rows[:, :k]
                 # The margin of 1e-9 covers rounding in float64.
-                others = (1 - 1e-9) * (distances[:, -1] ** 2 + least[some]) if asked < size else np.inf
+                others = (1 - 1e-9) * (distances[:, -1] ** 2 + smallest[some]) if asked < size else np.inf
                 farthest = squares[:, min(k, size) - 1]
                 slack[some] = slack_of(*np.sqrt([farthest, np.minimum(squares[:, -1], others)]))
                 unsure.append(some[~(farthest < others)])
@@ -157,25 +157,25 @@ class TreeIndex(AbstractIndex):
         difference[..., 3:][missing > 0] = 0
         return np.sum(difference * difference, axis=2) + missing.sum(axis=2)
 
-    def _parts_for(self, penalty: Float[np.ndarray, "C"]) -> list[_Part]:
+    def _parts_for(self, penalty: Float[np.ndarray, "C"]) -> list[_TreeForChannels]:
         key = penalty.tobytes()
         if key not in self._parts:
             common, alike = _patterns(np.maximum(self._patterns, penalty))
             which = alike[self._which]
             groups = [slice(None) if len(common) == 1 else which == i for i in range(len(common))]
             self._parts[key] = [
-                _Part(self._trees, self._points[group], self._rows[group], pattern)
+                _TreeForChannels(self._trees, self._points[group], self._rows[group], pattern)
                 for group, pattern in zip(groups, common, strict=True)
             ]
         return self._parts[key]
 
 
-class _Part:
+class _TreeForChannels:
     """A tree of the target rows that share one set of channels with a query."""
 
     def __init__(
         self,
-        trees: Trees,
+        trees: TreeBackend,
         points: Float[np.ndarray, "M D"],
         rows: Int[np.ndarray, "M"],
         penalty: Float[np.ndarray, "C"],
@@ -185,7 +185,7 @@ class _Part:
         self.rows = np.append(rows, np.int32(-1))
         self._columns = slice(None) if common.all() else np.flatnonzero(common)
         self._penalty = penalty.sum()
-        self._tree = Tree(trees, points[:, self._columns])
+        self._tree = TiedTree(trees, points[:, self._columns])
 
     def nearest(
         self, queries: Float[np.ndarray, "N D"], k: int, bound: float
@@ -197,25 +197,25 @@ class _Part:
         """Squared search distances to tree indices, including the penalties for missing channels; metres²."""
         points = self._tree.points
         difference = queries[:, None, self._columns] - points[np.minimum(found, len(points) - 1)]
-        apart = np.sum(difference * difference, axis=2) + self._penalty
-        return np.where(found < len(points), apart, np.inf)
+        squares = np.sum(difference * difference, axis=2) + self._penalty
+        return np.where(found < len(points), squares, np.inf)
 
 
-class _Follower:
+class _MatchTracker:
     """The k nearest target rows of each row of one source, for a sequence of poses.
 
     Matches are provably unchanged while their source point has moved by less than half the gap between its k-th and its
     next nearest target point since the last search. After the first poses this holds for most points.
     """
 
-    def __init__(self, index: TreeIndex, trees: Trees, source: Rows, max_distance: float, k: int):
+    def __init__(self, index: TreeIndex, trees: TreeBackend, source: SearchPoints, max_distance: float, k: int):
         self._index = index
         self._max_distance = max_distance
         # Valid source rows, for large clouds sorted by neighbourhood. All arrays below are in this order.
         order: Int[np.ndarray, "n"] = np.flatnonzero(source.valid)
         if order.size > LARGEST_UNORDERED:
             points = np.nan_to_num(source.points[order], posinf=0, neginf=0)
-            order = order[Tree(trees, points).leaf_order()]
+            order = order[TiedTree(trees, points).leaf_order()]
         self._order = order
         self._points = np.asarray(source.points[order], np.float64)
         self._descriptors = source.descriptors[order]

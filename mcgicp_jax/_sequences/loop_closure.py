@@ -15,8 +15,9 @@ from mcgicp_jax._pose_graph.graph import PoseGraph
 from mcgicp_jax._pose_graph.optimize import optimize_poses
 from mcgicp_jax._pose_graph.solver import motion_covariances
 from mcgicp_jax._registration.options import Options
-from mcgicp_jax._registration.register_pair import default_distances, register_with
+from mcgicp_jax._registration.register_pair import register_pair
 from mcgicp_jax._registration.result import Registration
+from mcgicp_jax._registration.settings import default_distances, matching_spacing
 from mcgicp_jax._sequences.edges import edge_from
 
 # Two frames may close a loop if their distance is at most this many median ranges of the points, plus this many
@@ -104,10 +105,10 @@ class Trajectory:
         sigma = float(np.sqrt(np.linalg.eigvalsh(covariance[:3, :3])[-1]))
         given: Any = self._options.max_distance
         if given is None:
-            given = default_distances(self._method.spacing(self._clouds[i]), self._clouds[i])
+            given = default_distances(matching_spacing(self._method, self._clouds[i]), self._clouds[i])
         coarse, fine = given if np.ndim(given) else (given, given)
         options = replace(self._options, max_distance=(max(float(coarse), _DEVIATIONS * sigma), float(fine)))
-        result = register_with(self._clouds[j], self._clouds[i], self._method, init, options)
+        result = register_pair(self._clouds[j], self._clouds[i], self._method, init, options)
         return edge_from(i, j, result, uncertain=True)
 
 

@@ -12,7 +12,8 @@ from jaxtyping import Float
 
 from mcgicp_jax._clouds.point_cloud import PointCloud, Values
 from mcgicp_jax._clouds.preprocess import check_preprocessing, preprocess
-from mcgicp_jax._clouds.voxel_map import aggregate, voxel_of, voxels
+from mcgicp_jax._clouds.voxel_map import aggregate
+from mcgicp_jax._clouds.voxels import voxel_keys, voxel_of
 from mcgicp_jax._local_geometry.spacing_and_noise import point_spacing
 from mcgicp_jax._math.poses import Pose, pose_matrix
 from mcgicp_jax._methods.base import AbstractMethod
@@ -160,7 +161,7 @@ def _graph(poses: Float[np.ndarray, "n 4 4"], found: dict[tuple[int, int], Regis
 def _overlapping(clouds: list[PointCloud], poses: Float[np.ndarray, "n 4 4"], cell: float) -> list[tuple[int, int]]:
     """Each cloud with the previous one, and with the one of largest overlap in each range of gaps 2-3, 4-7, 8-15, …"""
     moved = [cloud.coordinates @ T[:3, :3].T + T[:3, 3] for cloud, T in zip(clouds, poses, strict=True)]
-    cells = [np.unique(voxels(points, cell, voxel_of(moved[0][0], cell))) for points in moved]
+    cells = [np.unique(voxel_keys(points, cell, voxel_of(moved[0][0], cell))) for points in moved]
     pairs = []
     for j in range(1, len(clouds)):
         pairs.append((j - 1, j))

@@ -9,6 +9,7 @@ from typing import Any, Literal
 import numpy as np
 from jaxtyping import Float
 
+from mcgicp_jax._clouds.frame import Frame
 from mcgicp_jax._clouds.point_cloud import PointCloud, Values
 from mcgicp_jax._clouds.preprocess import check_preprocessing, preprocess
 from mcgicp_jax._clouds.voxel_map import VoxelMap
@@ -18,11 +19,10 @@ from mcgicp_jax._math.poses import Pose, nearest_rotation, pose_matrix
 from mcgicp_jax._methods.base import AbstractMethod
 from mcgicp_jax._pose_graph.graph import PoseGraph
 from mcgicp_jax._registration.options import Options, check_method, options_of
-from mcgicp_jax._registration.register_pair import register_with
+from mcgicp_jax._registration.register_pair import register_pair
 from mcgicp_jax._registration.result import Registration, computed, is_usable
 from mcgicp_jax._sequences.loop_closure import Trajectory
 from mcgicp_jax._sequences.relocalization import Relocalizer, map_target
-from mcgicp_jax.datasets import Frame
 
 
 @dataclass(frozen=True, eq=False)
@@ -161,10 +161,10 @@ class _Sensor:
     def _located(self, cloud: PointCloud, before: PointCloud) -> Registration:
         """Update motion and pose by a registration."""
         if self.world is None:
-            result = register_with(cloud, before, self.method, self.motion, self.options)
+            result = register_pair(cloud, before, self.method, self.motion, self.options)
         else:
             target = map_target(self.world.cloud(), self.method, self.options, self.num_neighbors)
-            result = register_with(cloud, target, self.method, self.pose @ self.motion, self.options)
+            result = register_pair(cloud, target, self.method, self.pose @ self.motion, self.options)
         found = None
         if self.places is not None:
             found = self.places.corrected(cloud, result, self.method, self.options, self.num_neighbors)

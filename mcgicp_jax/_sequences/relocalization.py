@@ -8,9 +8,10 @@ from jaxtyping import Float
 from mcgicp_jax._clouds.point_cloud import PointCloud
 from mcgicp_jax._clouds.preprocess import preprocess
 from mcgicp_jax._clouds.voxel_map import VoxelMap
+from mcgicp_jax._global_registration.global_pose import global_pose
 from mcgicp_jax._methods.base import AbstractMethod
 from mcgicp_jax._registration.options import Options
-from mcgicp_jax._registration.register_pair import global_pose, register_with
+from mcgicp_jax._registration.register_pair import register_pair
 from mcgicp_jax._registration.result import Registration, Status, is_usable
 
 # Fractions of the previous overlap. At constant speed the overlap hardly changes; after jumps in simulated rooms and
@@ -44,7 +45,7 @@ class Relocalizer:
         start = global_pose(cloud, known)
         if start.success:
             target = map_target(known, method, options, num_neighbors)
-            found = register_with(cloud, target, method, start.matrix, options)
+            found = register_pair(cloud, target, method, start.matrix, options)
             if is_usable(found) and (self.is_lost or not settled or float(np.asarray(found.overlap)) > overlap):
                 self.is_lost = False
                 return found

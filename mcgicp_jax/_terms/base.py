@@ -1,27 +1,34 @@
-"""Force, stiffness and cost of each correspondence: the interface between methods and pose estimation.
+"""The interface of terms: what each correspondence adds to the cost, and the force and stiffness that follow from it.
 
 The force is minus the gradient of half the cost with respect to the moved point T a, and the stiffness the Gauss-Newton
-Hessian of half the cost. Any residual that is linear in T a to first order has this form.
+Hessian of half the cost. Any residual that is linear in T a to first order has this form, and terms add.
 """
 
 from __future__ import annotations
 
+import abc
+from typing import Any, ClassVar
+
 import equinox as eqx
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
+from mcgicp_jax._compute.concrete import AnyArray, AnyScalar
+from mcgicp_jax._local_geometry.local_geometry import LocalGeometry
+from mcgicp_jax._local_geometry.neighborhoods import Neighborhoods
+from mcgicp_jax._local_geometry.surface import Surface
 from mcgicp_jax._math import symmetric_matrices as alg
-from mcgicp_jax._math.robust_kernels import AbstractKernel
+from mcgicp_jax._math.robust_kernels import AbstractKernel, Numbers
 
 
-class Forces(eqx.Module):
-    """Forces, stiffnesses and costs of n correspondences. Several terms are combined by `+`.
+class Linearization(eqx.Module):
+    """Forces, stiffnesses and costs of n correspondences. Terms are combined by `+`.
 
     Attributes:
         force: (3, n) w M d, with the residual d = b − T a.
         stiffness: (6, n) w M, symmetric.
         cost: (n,) ρ(dᵀ M d).
-        weight: (n,) w, the robust weight; of the first term of a sum, as are `residual` and `information`.
+        weight: (n,) robust weight w. In a sum of terms, `weight`, `residual` and `information` are those of the first.
         residual: (3, n) d, metres.
         information: (6, n) M, symmetric.
     """
@@ -33,8 +40,8 @@ class Forces(eqx.Module):
     residual: Float[Array, "3 n"]
     information: Float[Array, "6 n"]
 
-    def __add__(self, other: Forces) -> Forces:
-        return Forces(
+    def __add__(self, other: Linearization) -> Linearization:
+        return Linearization(
             self.force + other.force,
             self.stiffness + other.stiffness,
             self.cost + other.cost,
@@ -43,9 +50,9 @@ class Forces(eqx.Module):
             self.information,
         )
 
-    def scaled(self, factor: Float[Array, "n"]) -> Forces:
+    def scaled(self, factor: Float[Array, "n"]) -> Linearization:
         """Force, stiffness, cost and weight of each correspondence multiplied by a factor."""
-        return Forces(
+        return Linearization(
             factor * self.force,
             factor * self.stiffness,
             factor * self.cost,
@@ -55,9 +62,143 @@ class Forces(eqx.Module):
         )
 
 
-def weighed(residual: Float[Array, "3 n"], information: Float[Array, "6 n"], robust: AbstractKernel | None) -> Forces:
-    """Forces of residuals d with information matrices M: cost ρ(dᵀ M d), weight w = ρ′(dᵀ M d); None: ρ(s²) = s²."""
+def linearize_residual(
+    residual: Float[Array, "3 n"], information: Float[Array, "6 n"], robust: AbstractKernel | None
+) -> Linearization:
+    """Linearization of the cost ρ(dᵀ M d) of residuals d with information matrices M; None: ρ(s²) = s²."""
     gradient = alg.multiply(information, residual)
     square = alg.inner(residual, gradient)
     weight, cost = (jnp.ones_like(square), square) if robust is None else (robust.weight(square), robust.rho(square))
-    return Forces(weight * gradient, weight * information, cost, weight, residual, information)
+    return Linearization(weight * gradient, weight * information, cost, weight, residual, information)
+
+
+class AbstractTerm(Numbers):
+    """A residual of each correspondence. A subclass defines `linearize`; the other members do nothing by default.
+
+    A term may estimate numbers from the residuals (`adapt`), such as their scale. It then defines `sample`, too. The
+    numbers are estimated anew at each pose of the fine phase, which a coarse phase with the term as it is at first
+    always precedes. They are constants to autodiff.
+
+    Attributes:
+        robust: kernel of the residuals; None for squares.
+    """
+
+    # Key of `columns`, of terms that have any.
+    name: ClassVar[str] = ""
+    # Whether `adapt` estimates numbers.
+    is_adaptive: ClassVar[bool] = False
+    # Whether its matches are nearest in position alone in the fine phase, even if the method searches in channels, too.
+    by_position: ClassVar[bool] = False
+    # Edge of the cells within which scores are taken to be correlated, distances to the farthest neighbour; values from
+    # 1 to 4 hardly change the covariance of a pose.
+    correlation_length: ClassVar[float] = 2.0
+
+    robust: AbstractKernel | None = eqx.field(default=None, kw_only=True)
+
+    @staticmethod
+    def columns(around: Neighborhoods, local: LocalGeometry | None) -> Any:
+        """What the term needs to know of each point besides its `Surface`: a pytree of arrays (n, ...), or None. It is
+        found in `Surface.columns[name]`."""
+        return None
+
+    @property
+    def estimates_gains(self) -> bool:
+        """Whether gains and offsets of the channels are among the numbers that it estimates."""
+        return False
+
+    @property
+    def matches_slide(self) -> bool:
+        """Whether the matches of a point follow along the surface when the pose moves."""
+        return True
+
+    @abc.abstractmethod
+    def linearize(
+        self,
+        source: Surface,
+        target: Surface,
+        moved: Float[Array, "3 n"],
+        rotation: Float[Array, "3 3"],
+        valid: Bool[Array, "n"],
+    ) -> Linearization:
+        """Force, stiffness and cost of each correspondence.
+
+        Args:
+            source, target: the surfaces at the matched points, in the frame of each cloud.
+            moved: T a, the moved source points, metres.
+            rotation: of T_target_source.
+            valid: which correspondences count; the residual of the others is 0.
+        """
+
+    def observability(
+        self, mean: Float[Array, "6 n"], source: Surface, target: Surface, rotation: Float[Array, "3 3"]
+    ) -> Float[Array, "6 n"]:
+        """Observability of correspondences by the channels, given the mean of that of their points."""
+        return mean
+
+    def sample(
+        self,
+        source: Surface,
+        target: Surface,
+        moved: Float[Array, "3 n"],
+        rotation: Float[Array, "3 3"],
+        valid: Bool[Array, "n"],
+    ) -> Any:
+        """What `adapt` needs of each correspondence, a pytree of arrays (n, ...); arguments as of `linearize`."""
+        raise NotImplementedError(f"{type(self).__name__} is adaptive, but does not define sample")
+
+    def adapt(self, sample: Any, fraction: Float[AnyScalar, ""]) -> AbstractTerm:
+        """The term with its numbers estimated from some correspondences; with NumPy where these are concrete.
+
+        Args:
+            sample: result of `sample` for an even sample of the source points, NaN for those without a match.
+            fraction: of all source points that are in the sample and have a match.
+        """
+        return self
+
+    def with_numbers_of(self, other: AbstractTerm) -> AbstractTerm:
+        """The term with the numbers that another one has adapted, as constants to autodiff."""
+        return self
+
+    @property
+    def shifts(self) -> Float[AnyArray, "s 3"]:
+        """Translations of the source, metres, at which `with_response` needs samples; by default none."""
+        return jnp.zeros((0, 3))
+
+    def with_response(self, samples: Any) -> AbstractTerm:
+        """The term for the covariance of the pose: its stiffness is the change of its force when the points move and
+        match anew.
+
+        Args:
+            samples: results of `sample` at each of the `shifts`, with new matches, stacked.
+        """
+        return self
+
+
+def is_adaptive(terms: tuple[AbstractTerm, ...]) -> bool:
+    return any(term.is_adaptive for term in terms)
+
+
+def linearize(
+    terms: tuple[AbstractTerm, ...],
+    source: Surface,
+    target: Surface,
+    moved: Float[Array, "3 n"],
+    rotation: Float[Array, "3 3"],
+    valid: Bool[Array, "n"],
+) -> Linearization:
+    """Sum of the terms; arguments as of `AbstractTerm.linearize`."""
+    first, *others = (term.linearize(source, target, moved, rotation, valid) for term in terms)
+    return sum(others, start=first)
+
+
+def channel_observability(
+    terms: tuple[AbstractTerm, ...],
+    mean: Float[Array, "6 n"],
+    source: Surface,
+    target: Surface,
+    rotation: Float[Array, "3 3"],
+) -> Float[Array, "6 n"]:
+    """`AbstractTerm.observability` with each term in turn."""
+    for term in terms:
+        mean = term.observability(mean, source, target, rotation)
+    return mean

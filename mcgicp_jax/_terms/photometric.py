@@ -11,7 +11,7 @@ Both points contribute the fitted value v, not their sample: a sample beside a s
 neighbourhood is biased at edges. v averages the neighbours, moved to the point along g, with weights that decrease with
 the squared distance (Epanechnikov): at edges, a neighbour then changes v less as it enters the neighbourhood. The
 negative log-likelihood is Σ_k q_k/f_k Σ_i ρ(r_k²/σ_k²), so that all residuals count in standard deviations and no
-weight is set by hand. At each pose of the fine phase, `Term.adapted` estimates from the residuals themselves
+weight is set by hand. At each pose of the fine phase, `adapt` estimates from the residuals themselves
 
 - σ_k, one scale per residual: 1.4826 times the median absolute deviation. It contains the noise of both samples, that
   of the fits, and what interpolation leaves; channels that disagree, as of a camera that is out of step, get a large
@@ -32,21 +32,24 @@ These numbers are constants to autodiff.
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from mcgicp_jax._compute.concrete import AnyArray, AnyScalar, namespace
-from mcgicp_jax._local_geometry.covariances import fit_linear
-from mcgicp_jax._local_geometry.records import Neighborhoods, Table, features_of, points_of
-from mcgicp_jax._local_geometry.spacing_and_noise import gain_and_offset
+from mcgicp_jax._compute.concrete import AnyArray, AnyScalar, numpy_for
+from mcgicp_jax._local_geometry.channel_equalization import gain_and_offset
+from mcgicp_jax._local_geometry.channel_fits import fit_linear
+from mcgicp_jax._local_geometry.local_geometry import LocalGeometry, offsets_of
+from mcgicp_jax._local_geometry.neighborhoods import NO_NEIGHBORS, Neighborhoods
+from mcgicp_jax._local_geometry.surface import Surface
 from mcgicp_jax._math import symmetric_matrices as alg
 from mcgicp_jax._math.robust_kernels import AbstractKernel, Cauchy
 from mcgicp_jax._math.statistics import cell_numbers, median
-from mcgicp_jax._terms.base import Forces
+from mcgicp_jax._terms.base import AbstractTerm, Linearization
 
 # Scale of the default kernel in standard deviations: weights are those of Student's t with k² = 20 degrees of freedom.
 # Errors on RGB-D pairs with 10 instead of 20: 1 % less to 11 % more on four sets, a quarter less (0.06 mm) on rendered
@@ -72,131 +75,250 @@ _LEAST_RESPONSE = 0.1
 _LEAST_RELIABILITY = 1e-3
 # Standard deviation of a normal variate over its median absolute deviation.
 _PER_MEDIAN = 1.4826
-# Columns of the features of a point: normal, then for each channel value and gradient.
-_NORMAL, _PER_CHANNEL = 3, 4
 
 
-class Term(eqx.Module):
-    """Numbers of the photometric term, for 1 + C residuals; constants to autodiff.
+class FittedChannels(NamedTuple):
+    """What the term needs of each point.
+
+    Attributes:
+        normal: unit normal.
+        value: channel at the point by its linear fit; NaN where unknown.
+        gradient: of that fit, channel units per metre, in the tangent plane; 0 where unknown.
+    """
+
+    normal: Float[AnyArray, "n 3"]
+    value: Float[AnyArray, "n C"]
+    gradient: Float[AnyArray, "n C 3"]
+
+
+class Residuals(NamedTuple):
+    """The 1 + C = K residuals of n correspondences; NaN and slope 0 where there is none.
+
+    Attributes:
+        values: r_k, metres and channel units.
+        slopes: derivatives of the residuals with respect to T a.
+        own: fitted channels of the source points.
+        products: g_Bᵀ R g_A, the gradient of the source multiplied by its gain.
+        moved: T a, metres; 0 where there is no match.
+    """
+
+    values: Float[AnyArray, "*some n K"]
+    slopes: Float[AnyArray, "*some n K 3"]
+    own: Float[AnyArray, "*some n C"]
+    products: Float[AnyArray, "*some n C"]
+    moved: Float[AnyArray, "*some n 3"]
+
+
+def fitted_channels(around: Neighborhoods, local: LocalGeometry | None) -> FittedChannels:
+    """Fit each channel over the tangent plane of each point. Differentiable with respect to points and channels."""
+    if local is None:
+        raise ValueError(NO_NEIGHBORS)
+    normal = local.normal.T
+    offsets = offsets_of(around)
+    basis = alg.orthonormal_basis(normal)
+    x, y = (sum(offset * b for offset, b in zip(offsets, axis, strict=True)) for axis in basis)
+    square: Any = sum(offset * offset for offset in offsets)
+    farthest = _VALUE_RADIUS**2 * jnp.max(square, axis=0)
+    kernel = 1 - square / jnp.where(farthest > 0, farthest, 1)
+    fitted, gradients = [], []
+    for channel in range(around.num_channels):
+        known, values = around.known(channel), around.difference(channel)
+        fit = fit_linear(x, y, values, known.astype(x.dtype))
+        gx, gy = fit.gradient
+        weights = jnp.where(known, kernel, 0)
+        total = jnp.sum(weights, axis=0)
+        value = jnp.sum(weights * (values - gx * x - gy * y), axis=0) / jnp.where(total > 0, total, 1)
+        enough = (fit.weight > 3) & (fit.inverse[0] > 0)
+        if around.own_known is not None:
+            enough = enough & around.own_known[channel]
+        fitted.append(jnp.where(enough, around.own_channels[channel] + value, jnp.nan))
+        gradients.append(jnp.where(enough, gx * basis[0] + gy * basis[1], 0))
+    return FittedChannels(local.normal, jnp.stack(fitted, axis=1), jnp.stack(gradients).transpose(2, 0, 1))
+
+
+class Photometric(AbstractTerm):
+    """The photometric term, see the module. Its numbers are constants to autodiff.
 
     Attributes:
         spacing: of the target, metres.
-        deviations: σ of each residual, metres and channel units; all 0 while the term is off.
+        channel_weights: α of each channel, metres per channel unit, for the observability.
+        deviations: σ of each residual, metres and channel units; 0 before the first estimate.
         designs: f/q, design effect over reliability, of each residual.
-        gains, offsets: applied to the fitted values of the source's channels; 1 and 0 unless `compensates`.
-        compensates: whether gains and offsets are estimated.
+        gains, offsets: applied to the fitted values of the source's channels; 1 and 0 unless `equalizes_channels`.
+        coarse: the term until the numbers are known: that of the coarse phase.
+        robust: kernel of each residual in standard deviations; None: Cauchy's with k² = 20. Each residual has its own
+            weight: a reflection is an outlier of the channels, but not of the geometry.
+        equalizes_channels: whether gains and offsets are estimated.
     """
 
+    name: ClassVar[str] = "photometric"
+    is_adaptive: ClassVar[bool] = True
+    by_position: ClassVar[bool] = True
+    # Both points of a correspondence contribute fits over their neighbourhoods. With 2, 4 and 8, the squared errors on
+    # thirty walls of posters were 2.8, 1.8 and 1.6 times their variance (with half of the shift below); with 12, where
+    # some walls have few cells, 1.7.
+    correlation_length: ClassVar[float] = 8.0
+
     spacing: Float[AnyArray, "*batch"]
+    channel_weights: Float[AnyArray, "*batch C"]
     deviations: Float[AnyArray, "*batch K"]
     designs: Float[AnyArray, "*batch K"]
     gains: Float[AnyArray, "*batch C"]
     offsets: Float[AnyArray, "*batch C"]
-    compensates: bool = eqx.field(static=True, default=False)
+    coarse: AbstractTerm
+    equalizes_channels: bool = eqx.field(static=True, default=False)
+
+    @classmethod
+    def before_estimate(
+        cls,
+        spacing: Float[AnyScalar, ""],
+        channel_weights: Float[AnyArray, "C"],
+        coarse: AbstractTerm,
+        robust: AbstractKernel | None,
+        equalizes_channels: bool,
+    ) -> Photometric:
+        """The term before its numbers are known."""
+        xp = numpy_for(spacing)
+        spacing = xp.asarray(spacing)
+        count = 1 + channel_weights.shape[0]
+        zeros, ones = (make(count, spacing.dtype) for make in (xp.zeros, xp.ones))
+        return cls(
+            spacing, channel_weights, zeros, ones, ones[1:], zeros[1:], coarse, equalizes_channels, robust=robust
+        )
 
     @staticmethod
-    def off(spacing: Float[AnyScalar, ""], num_channels: int) -> Term:
-        """The term before its numbers are known."""
-        xp = namespace(spacing)
-        spacing = xp.asarray(spacing)
-        zeros, ones = (make(1 + num_channels, spacing.dtype) for make in (xp.zeros, xp.ones))
-        return Term(spacing, zeros, ones, ones[1:], zeros[1:])
+    def columns(around: Neighborhoods, local: LocalGeometry | None) -> FittedChannels:
+        return fitted_channels(around, local)
 
     @property
-    def is_on(self) -> Bool[AnyScalar, ""]:
+    def is_known(self) -> Bool[AnyScalar, ""]:
+        """Whether the numbers have been estimated."""
         return self.deviations[0] > 0
 
-    def evidence(
+    @property
+    def estimates_gains(self) -> bool:
+        return self.equalizes_channels
+
+    def linearize(
         self,
-        source: Table,
-        target: Table,
+        source: Surface,
+        target: Surface,
         moved: Float[Array, "3 n"],
         rotation: Float[Array, "3 3"],
         valid: Bool[Array, "n"],
-    ) -> Float[Array, "n L"]:
-        """One row per correspondence, from which the numbers are estimated; arguments as of `residuals`."""
-        residuals = self.residuals(source, target, moved, rotation, valid)
-        return jnp.stack([*residuals.rows, *jnp.where(valid, moved, 0)], axis=1)
+    ) -> Linearization:
+        matched = (source, target, moved, rotation, valid)
+        return jax.lax.cond(
+            self.is_known,
+            lambda term: term._linearize(*matched),
+            lambda term: term.coarse.linearize(*matched),
+            self,
+        )
 
-    def estimated(self, rows: Float[AnyArray, "n L"], counts: Bool[AnyArray, "n"], valid: Bool[AnyArray, "N"]) -> Term:
-        """The term with its numbers estimated from rows of `evidence`; with NumPy where these are concrete.
-
-        Args:
-            rows: of an even sample of the source points, see `sampled_rows`.
-            counts: which of these rows to use.
-            valid: which of all source points are no padding.
-        """
-        xp = namespace(counts, valid)
-        return self.adapted(xp.where(counts[:, None], rows, xp.nan), xp.sum(counts) / xp.maximum(xp.sum(valid), 1))
-
-    def residuals(
+    def _linearize(
         self,
-        source: Table,
-        target: Table,
+        source: Surface,
+        target: Surface,
         moved: Float[Array, "3 n"],
         rotation: Float[Array, "3 3"],
         valid: Bool[Array, "n"],
-    ) -> Residuals:
-        """The residuals of matched rows of the surfaces' tables; T a = `moved`, metres."""
-        offset = jnp.where(valid, moved - points_of(target), 0)
-        here, there = features_of(source), features_of(target)
-        normal = _mean_direction(jnp.dot(rotation, here[:_NORMAL], precision="highest"), there[:_NORMAL])
-        near = valid & (alg.inner(offset, offset) <= (_REACH * self.spacing) ** 2)
-        values, slopes = [jnp.where(valid, alg.inner(normal, offset), jnp.nan)], [jnp.where(valid, normal, 0)]
-        own, products = [], []
-        for channel in range(self.gains.shape[0]):
-            start = _NORMAL + _PER_CHANNEL * channel
-            a, b = here[start : start + _PER_CHANNEL], there[start : start + _PER_CHANNEL]
-            known = near & ~jnp.isnan(a[0]) & ~jnp.isnan(b[0])
-            turned = self.gains[channel] * jnp.dot(rotation, a[1:], precision="highest")
-            slope = 0.5 * (b[1:] + turned)
-            fitted = jnp.where(known, a[0], 0)
-            predicted = jnp.where(known, b[0], 0) + alg.inner(slope, offset)
-            values.append(jnp.where(known, predicted - self.gains[channel] * fitted - self.offsets[channel], jnp.nan))
-            slopes.append(jnp.where(known, slope, 0))
-            own.append(jnp.where(known, fitted, jnp.nan))
-            products.append(jnp.where(known, alg.inner(turned, b[1:]), 0))
-        return Residuals(values, slopes, own, products)
-
-    def forces(self, residuals: Residuals, offset: Float[Array, "3 n"], robust: AbstractKernel | None) -> Forces:
-        """Sum of the forces of all residuals.
-
-        Args:
-            offset: d = b − T a, metres.
-            robust: kernel of each residual in standard deviations. Each has its own weight: a reflection is an outlier
-                of the channels, but not of the geometry.
-        """
+    ) -> Linearization:
+        residuals = self._residuals(source, target, moved, rotation, valid)
+        residual = target.points.T - moved
         scale: Any = _KERNEL_SCALE
-        kernel = Cauchy(scale) if robust is None else robust
-        terms = []
+        robust = Cauchy(scale) if self.robust is None else self.robust
+        parts = []
         for k, (value, slope) in enumerate(zip(residuals.values, residuals.slopes, strict=True)):
             counts = (self.deviations[k] > 0) & ~jnp.isnan(value)
             deviation = jnp.where(self.deviations[k] > 0, self.deviations[k], 1)
             share = jnp.where(counts, 1 / self.designs[k], 0)
             scaled, direction = jnp.where(counts, value, 0) / deviation, slope / deviation
-            weight = kernel.weight(scaled**2)
+            weight = robust.weight(scaled**2)
             information = share * alg.outer(direction)
             force = -share * weight * scaled * direction
-            cost = share * kernel.rho(scaled**2)
-            terms.append(Forces(force, weight * information, cost, weight, offset, information))
-        return sum(terms[1:], start=terms[0])
+            cost = share * robust.rho(scaled**2)
+            parts.append(Linearization(force, weight * information, cost, weight, residual, information))
+        return sum(parts[1:], start=parts[0])
 
-    def adapted(self, rows: Float[AnyArray, "n L"], fraction: Float[AnyScalar, ""]) -> Term:
-        """The term with its numbers estimated from rows of `evidence`.
+    def _residuals(
+        self,
+        source: Surface,
+        target: Surface,
+        moved: Float[Array, "3 n"],
+        rotation: Float[Array, "3 3"],
+        valid: Bool[Array, "n"],
+    ) -> _Columns:
+        offset = jnp.where(valid, moved - target.points.T, 0)
+        a, b = source.columns[self.name], target.columns[self.name]
+        normal = _mean_direction(jnp.dot(rotation, a.normal.T, precision="highest"), b.normal.T)
+        near = valid & (alg.inner(offset, offset) <= (_REACH * self.spacing) ** 2)
+        values, slopes = [jnp.where(valid, alg.inner(normal, offset), jnp.nan)], [jnp.where(valid, normal, 0)]
+        own, products = [], []
+        for channel in range(self.gains.shape[0]):
+            here, there = a.value[:, channel], b.value[:, channel]
+            known = near & ~jnp.isnan(here) & ~jnp.isnan(there)
+            turned = self.gains[channel] * jnp.dot(rotation, a.gradient[:, channel].T, precision="highest")
+            gradient = b.gradient[:, channel].T
+            slope = 0.5 * (gradient + turned)
+            fitted = jnp.where(known, here, 0)
+            predicted = jnp.where(known, there, 0) + alg.inner(slope, offset)
+            values.append(jnp.where(known, predicted - self.gains[channel] * fitted - self.offsets[channel], jnp.nan))
+            slopes.append(jnp.where(known, slope, 0))
+            own.append(jnp.where(known, fitted, jnp.nan))
+            products.append(jnp.where(known, alg.inner(turned, gradient), 0))
+        return _Columns(values, slopes, own, products)
 
-        Args:
-            rows: of an even sample of the correspondences; NaN in rows to ignore.
-            fraction: of all correspondences that are in the sample. A cell contains fewer of their products in this
-                proportion, so that f of all exceeds 1 by f − 1 of the sample, divided by the fraction.
+    def observability(
+        self, mean: Float[Array, "6 n"], source: Surface, target: Surface, rotation: Float[Array, "3 3"]
+    ) -> Float[Array, "6 n"]:
+        """A / (1 + mean of both traces) with A = Σ α² (g_B g_Aᵀ + g_A g_Bᵀ)/2.
+
+        Noise of the slopes is independent in the two clouds, so that it does not contribute on average. (To subtract
+        its variance from one cloud's slopes instead, as `_local_geometry.observability` does, also subtracts what sharp
+        edges leave.)
         """
-        xp = namespace(self, rows, fraction)
-        count = self.designs.shape[0]
+        total: Any = 0.0
+        length: Any = 0.0
+        for channel in range(self.channel_weights.shape[0]):
+            weight = self.channel_weights[channel]
+            slope = source.columns[self.name].gradient[:, channel].T
+            a = weight * jnp.dot(rotation, slope, precision="highest")
+            b = weight * target.columns[self.name].gradient[:, channel].T
+            total = total + 0.5 * (alg.outer(a + b) - alg.outer(a) - alg.outer(b))
+            length = length + 0.5 * (alg.inner(a, a) + alg.inner(b, b))
+        # Before the numbers are known the pose is rough, so that slopes of matched points are unrelated.
+        return jnp.where(self.is_known, total / (1 + length), mean)
+
+    def sample(
+        self,
+        source: Surface,
+        target: Surface,
+        moved: Float[Array, "3 n"],
+        rotation: Float[Array, "3 3"],
+        valid: Bool[Array, "n"],
+    ) -> Residuals:
+        found = self._residuals(source, target, moved, rotation, valid)
+        own, products = (
+            jnp.stack(each, axis=1) if each else jnp.zeros((valid.size, 0), moved.dtype)
+            for each in (found.own, found.products)
+        )
+        slopes = jnp.stack(found.slopes).transpose(2, 0, 1)
+        return Residuals(jnp.stack(found.values, axis=1), slopes, own, products, jnp.where(valid, moved, 0).T)
+
+    def adapt(self, sample: Residuals, fraction: Float[AnyScalar, ""]) -> Photometric:
+        """The term with its numbers estimated from the residuals of an even sample of the correspondences.
+
+        In a sample each cell holds fewer pairs of correlated residuals, so that the excess f − 1 of the sample is
+        divided by `fraction`.
+        """
+        xp = numpy_for(self, sample, fraction)
         # NumPy takes two thirds of the time for contiguous columns.
-        columns = xp.asarray(rows).T.copy()
-        values, slopes, own, products, moved = xp.split(columns, np.cumsum([count, 3 * count, count - 1, count - 1]))
-        slopes = slopes.reshape(count, 3, -1)
+        values, own, products, moved = (
+            xp.asarray(each).T.copy() for each in (sample.values, sample.own, sample.products, sample.moved)
+        )
+        slopes = xp.asarray(sample.slopes).transpose(1, 2, 0).copy()
         gains, offsets = self.gains, self.offsets
-        if self.compensates:
+        if self.equalizes_channels:
             predicted = values[1:] + gains[:, None] * own + offsets[:, None]
             gains, offsets = gain_and_offset(own.T, predicted.T)
             values = xp.concatenate([values[:1], predicted - gains[:, None] * own - offsets[:, None]])
@@ -214,7 +336,7 @@ class Term(eqx.Module):
         scores = (weights * scaled / scale)[:, None] * slopes
         expected = xp.sum(weights * lengths / scale**2, axis=1)
         size = xp.where(self.spacing > 0, _CELL * self.spacing, 1)
-        cells = cell_numbers(tuple(xp.nan_to_num(xp.floor(moved / size)).astype(np.int32)), rows.shape[0])
+        cells = cell_numbers(tuple(xp.nan_to_num(xp.floor(moved / size)).astype(np.int32)), moved.shape[1])
         seen = _squared_sums(scores, cells)
         # Of independent scores, `expected` without the factor.
         alone = xp.sum((scores**2).sum(axis=1), axis=1)
@@ -227,26 +349,26 @@ class Term(eqx.Module):
         numbers = {"deviations": deviations, "designs": designs, "gains": gains, "offsets": offsets}
         return replace(self, **{name: array.astype(self.spacing.dtype) for name, array in numbers.items()})
 
+    def with_numbers_of(self, other: AbstractTerm) -> Photometric:
+        names = ("deviations", "designs", "gains", "offsets")
+        return replace(self, **{name: jax.lax.stop_gradient(getattr(other, name)) for name in names})
+
     @property
     def shifts(self) -> Float[AnyArray, "6 3"]:
         """Along +x, −x, +y, −y, +z, −z, metres."""
-        xp = namespace(self)
+        xp = numpy_for(self)
         signs = np.repeat(np.eye(3), 2, axis=0) * np.array([[1], [-1]] * 3)
         return _SHIFT * xp.asarray(self.spacing) * signs.astype(self.spacing.dtype)
 
-    def responding(self, rows: Float[AnyArray, "6 n L"]) -> Term:
+    def with_response(self, samples: Residuals) -> Photometric:
         """The term with designs divided by the response κ of each residual, so that its stiffness is the true one.
 
         When points move and match anew, the sum of the forces changes by a fraction κ of what the slopes predict: 0.5
         for the colours of posters, 0.5 to 0.75 in the box room, 0.75 for the normals of both. Between two matches,
         fitted values differ by less than the slope at either says where the slope is large.
-
-        Args:
-            rows: of `evidence` for the points moved by each of the `shifts` and matched anew.
         """
-        xp, count = namespace(self, rows), self.designs.shape[0]
-        rows = xp.asarray(rows)
-        values, slopes = rows[..., :count], rows[..., count : 4 * count].reshape(*rows.shape[:2], count, 3)
+        xp = numpy_for(self, samples)
+        values, slopes = xp.asarray(samples.values), xp.asarray(samples.slopes)
         known = ~xp.isnan(values) & (self.deviations > 0)
         scale = xp.where(self.deviations > 0, self.deviations, 1)
         scaled, slopes = xp.where(known, values, 0) / scale, xp.where(known[..., None], slopes, 0) / scale[:, None]
@@ -255,89 +377,29 @@ class Term(eqx.Module):
         change = sum(forces[2 * axis, :, axis] - forces[2 * axis + 1, :, axis] for axis in range(3)) / (
             2 * _SHIFT * self.spacing
         )
-        predicted = xp.sum(weights * xp.sum(slopes**2, axis=3), axis=(0, 1)) / len(rows)
+        predicted = xp.sum(weights * xp.sum(slopes**2, axis=3), axis=(0, 1)) / len(values)
         response = change / xp.where(predicted > 0, predicted, 1)
         response = xp.where(predicted > 0, xp.clip(response, _LEAST_RESPONSE, 1), 1)
         return replace(self, designs=self.designs / response.astype(self.designs.dtype))
 
 
-def correlated_slopes(
-    source: Table, target: Table, rotation: Float[Array, "3 3"], weights: Float[Array, "C"]
-) -> Float[Array, "6 n"]:
-    """Observability of correspondences by the channels: A / (1 + mean of both traces), A = Σ α² (g_B g_Aᵀ + g_A g_Bᵀ)/2
-
-    Noise of the slopes is independent in the two clouds, so that it does not contribute on average. (To subtract its
-    variance from one cloud's slopes instead, as `_observability` does, also subtracts what sharp edges leave.)
-    """
-    here, there = features_of(source), features_of(target)
-    total: Any = 0.0
-    length: Any = 0.0
-    for channel in range(weights.shape[0]):
-        start = _NORMAL + _PER_CHANNEL * channel + 1
-        a = weights[channel] * jnp.dot(rotation, here[start : start + 3], precision="highest")
-        b = weights[channel] * there[start : start + 3]
-        total = total + 0.5 * (alg.outer(a + b) - alg.outer(a) - alg.outer(b))
-        length = length + 0.5 * (alg.inner(a, a) + alg.inner(b, b))
-    return total / (1 + length)
-
-
-def _squared_sums(scores: Float[AnyArray, "K 3 n"], cells: Int[AnyArray, "n"]) -> Float[AnyArray, "K"]:
-    """Σ_c |u_c|², with u_c the sum of the scores in a cell."""
-    columns = scores.reshape(-1, scores.shape[-1])
-    if namespace(scores, cells) is np:
-        sums: Any = np.stack([np.bincount(cells, column) for column in columns], axis=1)
-    else:
-        sums = jnp.zeros_like(columns.T).at[cells].add(columns.T)
-    return (sums**2).sum(axis=0).reshape(scores.shape[:2]).sum(axis=1)
-
-
-class Residuals(NamedTuple):
-    """Residuals of n correspondences; NaN and slope 0 where there is none.
-
-    Attributes:
-        values: 1 + C arrays (n,) r_k, metres and channel units.
-        slopes: 1 + C arrays (3, n), derivatives of the residuals with respect to T a.
-        own: C arrays (n,), fitted channels of the source points.
-        products: C arrays (n,), g_Bᵀ R g_A, that of the source multiplied by its gain.
-    """
+class _Columns(NamedTuple):
+    """`Residuals` as one array per residual and channel, (n,) or (3, n)."""
 
     values: list[Float[Array, "n"]]
     slopes: list[Float[Array, "3 n"]]
     own: list[Float[Array, "n"]]
     products: list[Float[Array, "n"]]
 
-    @property
-    def rows(self) -> list[Float[Array, "n"]]:
-        """The columns of `Term.evidence`, without the moved points that follow them."""
-        return [*self.values, *(axis for slope in self.slopes for axis in slope), *self.own, *self.products]
 
-
-def features_of_points(around: Neighborhoods, normal: Float[Array, "3 n"]) -> Float[Array, "L n"]:
-    """Normal, and for each channel its value at the point (NaN where unknown) and the gradient of its linear fit.
-
-    The gradient, per metre, lies in the tangent plane. Differentiable with respect to points and channels.
-    """
-    offsets = [around.offset(axis) for axis in range(3)]
-    basis = alg.orthonormal_basis(normal)
-    x, y = (sum(offset * b for offset, b in zip(offsets, axis, strict=True)) for axis in basis)
-    square: Any = sum(offset * offset for offset in offsets)
-    farthest = _VALUE_RADIUS**2 * jnp.max(square, axis=0)
-    kernel = 1 - square / jnp.where(farthest > 0, farthest, 1)
-    columns = [normal]
-    for channel in range(around.num_channels):
-        known = around.present if around.near_known is None else around.near_known[channel]
-        values = around.difference(channel)
-        fit = fit_linear(x, y, values, known.astype(x.dtype))
-        gx, gy = fit.gradient
-        weights = jnp.where(known, kernel, 0)
-        total = jnp.sum(weights, axis=0)
-        value = jnp.sum(weights * (values - gx * x - gy * y), axis=0) / jnp.where(total > 0, total, 1)
-        enough = (fit.weight > 3) & (fit.inverse[0] > 0)
-        if around.own_known is not None:
-            enough = enough & around.own_known[channel]
-        value = jnp.where(enough, around.own_channels[channel] + value, jnp.nan)
-        columns += [value[None], jnp.where(enough, gx * basis[0] + gy * basis[1], 0)]
-    return jnp.concatenate(columns)
+def _squared_sums(scores: Float[AnyArray, "K 3 n"], cells: Int[AnyArray, "n"]) -> Float[AnyArray, "K"]:
+    """Σ_c |u_c|², with u_c the sum of the scores in a cell."""
+    columns = scores.reshape(-1, scores.shape[-1])
+    if numpy_for(scores, cells) is np:
+        sums: Any = np.stack([np.bincount(cells, column) for column in columns], axis=1)
+    else:
+        sums = jnp.zeros_like(columns.T).at[cells].add(columns.T)
+    return (sums**2).sum(axis=0).reshape(scores.shape[:2]).sum(axis=1)
 
 
 def _mean_direction(a: Float[Array, "3 n"], b: Float[Array, "3 n"]) -> Float[Array, "3 n"]:

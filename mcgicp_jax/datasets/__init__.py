@@ -1,17 +1,21 @@
 """Sequences of frames: synthetic scenes with exact poses, and readers of public data sets."""
 
+from mcgicp_jax._clouds.frame import Frame
 from mcgicp_jax.datasets._box_room import box_room
 from mcgicp_jax.datasets._corridor import corridor
 from mcgicp_jax.datasets._ford import ford_campus
-from mcgicp_jax.datasets._frame import AbstractFrames, Frame, SyntheticFrames
+from mcgicp_jax.datasets._frames import AbstractFrames, SyntheticFrames
 from mcgicp_jax.datasets._kitti import kitti
 from mcgicp_jax.datasets._poster_wall import poster_wall
+from mcgicp_jax.datasets._registry import DATASETS, Dataset
 from mcgicp_jax.datasets._seven_scenes import seven_scenes
 from mcgicp_jax.datasets._street import street
 from mcgicp_jax.datasets._tum_rgbd import tum_rgbd
 
 __all__ = [
+    "DATASETS",
     "AbstractFrames",
+    "Dataset",
     "Frame",
     "SyntheticFrames",
     "box_room",

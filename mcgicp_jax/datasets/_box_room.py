@@ -8,14 +8,8 @@ import numpy as np
 from jaxtyping import Float
 
 from mcgicp_jax._clouds.point_cloud import PointCloud
-from mcgicp_jax.datasets._frame import (
-    SyntheticFrames,
-    check_noise,
-    check_points_per_frame,
-    rotation_from_vector,
-    scene_and_path_rng,
-)
-from mcgicp_jax.datasets._raycast import Box, cast, patches, random_rays, swaying_rotation
+from mcgicp_jax.datasets._frames import Matrix, SyntheticFrames, check_scene, pose_of, scene_and_path_rng
+from mcgicp_jax.datasets._raycast import Box, cast, patches, random_rays, sensor_rotation
 
 # The constants of this module define the scene.
 # Metres: length, width and height of the room, and the thickness of its walls.
@@ -63,8 +57,7 @@ def box_room(
     Raises:
         ValueError: if `num_frames`, `points_per_frame` or `noise` is out of range.
     """
-    check_noise(noise)
-    check_points_per_frame(points_per_frame, 10_000_000)
+    check_scene(points_per_frame, noise)
     scene_rng, path_rng = scene_and_path_rng(seed)
     boxes = [*_shell(), *_furniture(scene_rng)]
     colors = scene_rng.uniform(0.25, 0.75, (len(boxes), 3))
@@ -73,14 +66,11 @@ def box_room(
     return SyntheticFrames(num_frames, path, observer, _PERIOD, seed)
 
 
-def _pose(step: float, start: float, tilt_start: float, index: int) -> Float[np.ndarray, "4 4"]:
+def _pose(step: float, start: float, tilt_start: float, index: int) -> Matrix:
     angle = start + index * step / _RADIUS
-    pose = np.eye(4)
-    turn = rotation_from_vector(np.array([0, 0, angle + np.pi / 2]))
-    pose[:3, :3] = turn @ swaying_rotation(_TILT, tilt_start + index * _TILT_PHASE)
-    center = _SIZE / 2
-    pose[:3, 3] = center[0] + _RADIUS * np.cos(angle), center[1] + _RADIUS * np.sin(angle), _SENSOR_HEIGHT
-    return pose
+    x, y = _SIZE[:2] / 2 + _RADIUS * np.array([np.cos(angle), np.sin(angle)])
+    rotation = sensor_rotation(angle + np.pi / 2, _TILT, tilt_start + index * _TILT_PHASE)
+    return pose_of(rotation, (x, y, _SENSOR_HEIGHT))
 
 
 def _observe(
@@ -91,7 +81,7 @@ def _observe(
     noise: float,
     along_rays: bool,
     rng: np.random.Generator,
-    pose: Float[np.ndarray, "4 4"],
+    pose: Matrix,
 ) -> PointCloud:
     rotation, center = pose[:3, :3], pose[:3, 3]
     hits = cast(center, random_rays(rng, size) @ rotation.T, boxes, np.inf)

@@ -5,17 +5,10 @@ from __future__ import annotations
 from functools import partial
 
 import numpy as np
-from jaxtyping import Float
 
 from mcgicp_jax._clouds.point_cloud import PointCloud
-from mcgicp_jax.datasets._frame import (
-    SyntheticFrames,
-    check_noise,
-    check_points_per_frame,
-    rotation_from_vector,
-    scene_and_path_rng,
-)
-from mcgicp_jax.datasets._raycast import Box, cast, patches, random_cells, random_rays, swaying_rotation
+from mcgicp_jax.datasets._frames import Matrix, SyntheticFrames, check_scene, pose_of, scene_and_path_rng
+from mcgicp_jax.datasets._raycast import Box, cast, patches, random_cells, random_rays, sensor_rotation
 
 # The constants of this module define the scene.
 # Metres: half width and height of the corridor, thickness of its walls.
@@ -61,8 +54,7 @@ def corridor(
     Raises:
         ValueError: if `num_frames`, `points_per_frame` or `noise` is out of range.
     """
-    check_noise(noise)
-    check_points_per_frame(points_per_frame, 10_000_000)
+    check_scene(points_per_frame, noise)
     scene_rng, path_rng = scene_and_path_rng(seed)
     pattern = int(scene_rng.integers(2**31)) if textured else None
     observer = partial(_observe, pattern, points_per_frame, noise)
@@ -70,19 +62,14 @@ def corridor(
     return SyntheticFrames(num_frames, path, observer, _PERIOD, seed)
 
 
-def _pose(step: float, sway: float, yaw: float, tilt: float, index: int) -> Float[np.ndarray, "4 4"]:
+def _pose(step: float, sway: float, yaw: float, tilt: float, index: int) -> Matrix:
     # The sideways motion per frame is at most _SWAY times the phase increment, a third of `step`.
     phase = index * step / 3 / _SWAY
-    pose = np.eye(4)
-    heading = rotation_from_vector(np.array([0, 0, _YAW * np.sin(yaw + index / 3)]))
-    pose[:3, :3] = heading @ swaying_rotation(_TILT, tilt + index * _TILT_PHASE)
-    pose[:3, 3] = index * step, _SWAY * np.cos(sway + phase), _SENSOR_HEIGHT
-    return pose
+    rotation = sensor_rotation(_YAW * np.sin(yaw + index / 3), _TILT, tilt + index * _TILT_PHASE)
+    return pose_of(rotation, (index * step, _SWAY * np.cos(sway + phase), _SENSOR_HEIGHT))
 
 
-def _observe(
-    pattern: int | None, size: int, noise: float, rng: np.random.Generator, pose: Float[np.ndarray, "4 4"]
-) -> PointCloud:
+def _observe(pattern: int | None, size: int, noise: float, rng: np.random.Generator, pose: Matrix) -> PointCloud:
     rotation, center = pose[:3, :3], pose[:3, 3]
     hits = cast(center, random_rays(rng, size) @ rotation.T, _walls(center[0]), _MAX_RANGE)
     intensity = np.full(len(hits.points), 0.5)

@@ -8,9 +8,11 @@ from typing import Any
 
 import numpy as np
 from jaxtyping import Float
+from scipy.spatial.transform import Rotation
 
+from mcgicp_jax._clouds.frame import Frame
 from mcgicp_jax._clouds.point_cloud import PointCloud
-from mcgicp_jax.datasets._frame import AbstractFrames, Frame
+from mcgicp_jax.datasets._frames import AbstractFrames, pose_of
 from mcgicp_jax.datasets._images import look_up, read_image
 
 # Pose of the laser in the vehicle's frame: x, y, z in metres; roll, pitch, yaw in radians.
@@ -31,8 +33,8 @@ def ford_campus(folder: str | os.PathLike[str]) -> FordFrames:
     Returns:
         Frames of the Velodyne with the channels red, green and blue, from 0 to 1, valid where one of the five cameras
         saw the point; none is valid if no images were taken within 62 ms of the scan. Scans regenerated from the raw
-        data with reflectance have the channel intensity before these, in the file's unit. Poses are those of the laser
-        in the world (North, East, down), computed from those of the vehicle.
+        data with reflectance have the channel intensity before these, in the file's unit. Poses map the laser
+        to the world (North, East, down); they are computed from the poses of the vehicle.
 
     Raises:
         OSError: if a file is missing; for a scan or image, when its frame is read.
@@ -49,12 +51,10 @@ class FordFrames(AbstractFrames):
         self._scans = sorted((folder / "SCANS").glob("Scan*.mat"))
         if not self._scans:
             raise ValueError(f"{folder}: expected scans in SCANS/Scan*.mat, found none")
+        super().__init__(len(self._scans))
         log = folder / "Timestamp.log"
         # Number and time in microseconds of each image.
         self._images = _read_log(log) if log.is_file() else np.empty((0, 2))
-
-    def __len__(self) -> int:
-        return len(self._scans)
 
     def _frame(self, index: int) -> Frame:
         import scipy.io
@@ -120,12 +120,4 @@ def _read_log(path: Path) -> Float[np.ndarray, "N 2"]:
 
 def _pose(numbers: Float[np.ndarray, "6"]) -> Float[np.ndarray, "4 4"]:
     """The pose Rz(yaw) Ry(pitch) Rx(roll) from x, y, z in metres and roll, pitch, yaw in radians."""
-    (a, b, c), (d, e, f) = np.cos(numbers[3:]), np.sin(numbers[3:])
-    pose = np.eye(4)
-    pose[:3, :3] = (
-        np.array([[c, -f, 0], [f, c, 0], [0, 0, 1]])
-        @ np.array([[b, 0, e], [0, 1, 0], [-e, 0, b]])
-        @ np.array([[1, 0, 0], [0, a, -d], [0, d, a]])
-    )
-    pose[:3, 3] = numbers[:3]
-    return pose
+    return pose_of(Rotation.from_euler("xyz", numbers[3:]), numbers[:3])

@@ -29,16 +29,14 @@ def look_up(image: Picture, pixels: Float[np.ndarray, "N 2"]) -> tuple[Float[np.
 
     Pixels are (column, row); the centre of the first is (0, 0).
     """
+    from scipy.ndimage import map_coordinates
+
     height, width, _ = image.shape
     # NaN compares false and is outside.
     inside = np.all((pixels >= 0) & (pixels <= (width - 1, height - 1)), axis=1)
-    column, row = np.where(inside[:, None], pixels, 0).T
-    left, top = np.floor(column).astype(int), np.floor(row).astype(int)
-    right, bottom = np.minimum(left + 1, width - 1), np.minimum(top + 1, height - 1)
-    across, down = (column - left)[:, None], (row - top)[:, None]
-    above = (1 - across) * image[top, left] + across * image[top, right]
-    below = (1 - across) * image[bottom, left] + across * image[bottom, right]
-    return ((1 - down) * above + down * below) / 255, inside
+    places = np.where(inside[:, None], pixels, 0).T[::-1]
+    colors = [map_coordinates(color, places, float, order=1, mode="nearest") for color in np.moveaxis(image, 2, 0)]
+    return np.stack(colors, axis=1) / 255, inside
 
 
 def back_project(

@@ -9,8 +9,9 @@ import numpy as np
 from jaxtyping import Float
 
 from mcgicp_jax import io
+from mcgicp_jax._clouds.frame import Frame
 from mcgicp_jax._clouds.point_cloud import PointCloud
-from mcgicp_jax.datasets._frame import AbstractFrames, Frame
+from mcgicp_jax.datasets._frames import AbstractFrames
 from mcgicp_jax.datasets._images import Picture, look_up, read_image
 
 
@@ -24,7 +25,7 @@ def kitti(folder: str | os.PathLike[str]) -> KITTIFrames:
     Returns:
         Frames of the Velodyne (x ahead, y left, z up) with the channel intensity, from 0 to 0.99, and, if there are
         images, red, green and blue, from 0 to 1. Colours are valid where a point projects into the image, about a sixth
-        of a scan; points occluded from the camera are not detected. Poses are those of the Velodyne in the world, the
+        of a scan; points occluded from the camera are not detected. Poses map the Velodyne to the world, the
         frame of camera 0 at the start.
 
     Raises:
@@ -43,6 +44,7 @@ class KITTIFrames(AbstractFrames):
         self._scans = sorted(scan for scan in (folder / "velodyne").glob("*.bin") if scan.stem.isdecimal())
         if not self._scans:
             raise ValueError(f"{folder}: expected scans in velodyne/*.bin, found none")
+        super().__init__(len(self._scans))
         calibration = _read_calibration(folder / "calib.txt")
         # Transform from the Velodyne to camera 0, and projection to the pixels of camera 2.
         self._to_camera = np.vstack([calibration["Tr"], [0, 0, 0, 1]])
@@ -51,9 +53,6 @@ class KITTIFrames(AbstractFrames):
         poses = folder.absolute().parents[1] / "poses" / f"{folder.absolute().name}.txt"
         self._poses = io.read_poses(poses) if poses.is_file() else None
         self._colored = (folder / "image_2").is_dir()
-
-    def __len__(self) -> int:
-        return len(self._scans)
 
     def _frame(self, index: int) -> Frame:
         scan = self._scans[index]

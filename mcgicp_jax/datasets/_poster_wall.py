@@ -8,15 +8,10 @@ from typing import TypeAlias
 
 import numpy as np
 from jaxtyping import Float, Int
+from scipy.spatial.transform import Rotation
 
 from mcgicp_jax._clouds.point_cloud import PointCloud
-from mcgicp_jax.datasets._frame import (
-    SyntheticFrames,
-    check_noise,
-    check_points_per_frame,
-    rotation_from_vector,
-    scene_and_path_rng,
-)
+from mcgicp_jax.datasets._frames import Matrix, SyntheticFrames, check_scene, pose_of, scene_and_path_rng
 
 # The constants of this module define the scene and the camera.
 # First-generation Kinect: image size and focal length, pixels.
@@ -91,25 +86,18 @@ def poster_wall(
     Raises:
         ValueError: if `num_frames`, `points_per_frame` or `noise` is out of range.
     """
-    check_points_per_frame(points_per_frame, _WIDTH * _HEIGHT)
-    check_noise(noise)
+    check_scene(points_per_frame, noise, _WIDTH * _HEIGHT)
     scene_rng, path_rng = scene_and_path_rng(seed)
     observer = partial(_observe, _paint_wall(scene_rng), points_per_frame, noise)
-    return SyntheticFrames(num_frames, _camera_path(path_rng, step, heading), observer, _PERIOD, seed)
+    start = path_rng.uniform(0, 1, 2) * (_COLUMNS * _CELL_WIDTH, _ROWS * _CELL_HEIGHT)
+    any_heading, tilt, sway = path_rng.uniform(0, 2 * np.pi, 3)
+    tilt_axes = np.linalg.qr(path_rng.normal(size=(3, 2)))[0]
+    heading = any_heading if heading is None else heading
+    path = partial(_pose, start, step * np.array([np.cos(heading), np.sin(heading)]), tilt, tilt_axes, sway)
+    return SyntheticFrames(num_frames, path, observer, _PERIOD, seed)
 
 
 # The camera
-
-
-def _camera_path(
-    rng: np.random.Generator, step: float, heading: float | None
-) -> Callable[[int], Float[np.ndarray, "4 4"]]:
-    start = rng.uniform(0, 1, 2) * (_COLUMNS * _CELL_WIDTH, _ROWS * _CELL_HEIGHT)
-    any_heading, tilt_start, sway_start = rng.uniform(0, 2 * np.pi, 3)
-    tilt_axes = np.linalg.qr(rng.normal(size=(3, 2)))[0]
-    heading = any_heading if heading is None else heading
-    move = step * np.array([np.cos(heading), np.sin(heading)])
-    return partial(_pose, start, move, tilt_start, tilt_axes, sway_start)
 
 
 def _pose(
@@ -119,19 +107,14 @@ def _pose(
     tilt_axes: Float[np.ndarray, "3 2"],
     sway_start: float,
     index: int,
-) -> Float[np.ndarray, "4 4"]:
+) -> Matrix:
     tilt = tilt_start + index * _TILT_PHASE
     sway = sway_start + 0.3 * np.linalg.norm(move) / _DISTANCE_SWAY * index
-    pose = np.eye(4)
-    pose[:3, :3] = rotation_from_vector(tilt_axes @ (_TILT * np.array([np.cos(tilt), np.sin(tilt)])))
-    pose[:2, 3] = start + index * move
-    pose[2, 3] = -_DISTANCE + _DISTANCE_SWAY * np.sin(sway)
-    return pose
+    rotation = Rotation.from_rotvec(tilt_axes @ (_TILT * np.array([np.cos(tilt), np.sin(tilt)])))
+    return pose_of(rotation, (*(start + index * move), -_DISTANCE + _DISTANCE_SWAY * np.sin(sway)))
 
 
-def _observe(
-    wall: Image, size: int, noise: float, rng: np.random.Generator, pose: Float[np.ndarray, "4 4"]
-) -> PointCloud:
+def _observe(wall: Image, size: int, noise: float, rng: np.random.Generator, pose: Matrix) -> PointCloud:
     rays = _rays(rng, size)
     rotation, center = pose[:3, :3], pose[:3, 3]
     depth = -center[2] / (rays @ rotation[2])
@@ -156,14 +139,12 @@ def _rays(rng: np.random.Generator, size: int) -> Float[np.ndarray, "N 3"]:
 
 def _sample(wall: Image, texels: Float[np.ndarray, "N 2"]) -> Float[np.ndarray, "N 3"]:
     """Bilinear colours of the wall, which is periodic in both directions."""
-    height, width, _ = wall.shape
-    x0, y0 = np.floor(texels).astype(int).T
-    right, down = (texels - np.floor(texels)).T[..., None]
-    x1, y1 = (x0 + 1) % width, (y0 + 1) % height
-    x0, y0 = x0 % width, y0 % height
-    above = (1 - right) * wall[y0, x0] + right * wall[y0, x1]
-    below = (1 - right) * wall[y1, x0] + right * wall[y1, x1]
-    return (1 - down) * above + down * below
+    from scipy.ndimage import map_coordinates
+
+    colors = [
+        map_coordinates(color, texels.T[::-1], float, order=1, mode="grid-wrap") for color in np.moveaxis(wall, 2, 0)
+    ]
+    return np.stack(colors, axis=1)
 
 
 # The wall

@@ -5,11 +5,15 @@ from __future__ import annotations
 import abc
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import TypeAlias
 
 import numpy as np
 from jaxtyping import Float, Int
+from scipy.spatial.transform import Rotation
 
-from mcgicp_jax.datasets._frame import rotation_from_vector
+Vector: TypeAlias = Float[np.ndarray, "3"]
+Rays: TypeAlias = Float[np.ndarray, "N 3"]
+Distances: TypeAlias = Float[np.ndarray, "N"]
 
 
 class AbstractSolid(abc.ABC):
@@ -17,13 +21,11 @@ class AbstractSolid(abc.ABC):
 
     @property
     @abc.abstractmethod
-    def bounds(self) -> tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3"]]:
+    def bounds(self) -> tuple[Vector, Vector]:
         """Lowest and highest coordinates, metres."""
 
     @abc.abstractmethod
-    def meet(
-        self, origin: Float[np.ndarray, "3"], rays: Float[np.ndarray, "N 3"]
-    ) -> tuple[Float[np.ndarray, "N"], Float[np.ndarray, "N 3"]]:
+    def meet(self, origin: Vector, rays: Rays) -> tuple[Distances, Rays]:
         """Distance along unit rays to their entry into the solid, metres, infinite if they miss; and unit normals."""
 
 
@@ -31,16 +33,14 @@ class AbstractSolid(abc.ABC):
 class Box(AbstractSolid):
     """An axis-aligned box between its lowest and highest corner, (3,), metres."""
 
-    low: Float[np.ndarray, "3"]
-    high: Float[np.ndarray, "3"]
+    low: Vector
+    high: Vector
 
     @property
-    def bounds(self) -> tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3"]]:
+    def bounds(self) -> tuple[Vector, Vector]:
         return self.low, self.high
 
-    def meet(
-        self, origin: Float[np.ndarray, "3"], rays: Float[np.ndarray, "N 3"]
-    ) -> tuple[Float[np.ndarray, "N"], Float[np.ndarray, "N 3"]]:
+    def meet(self, origin: Vector, rays: Rays) -> tuple[Distances, Rays]:
         # A ray parallel to a face divides by zero: the result is an infinity of the right sign, or NaN, a miss.
         with np.errstate(divide="ignore", invalid="ignore"):
             first, second = (self.low - origin) / rays, (self.high - origin) / rays
@@ -61,18 +61,16 @@ class Cylinder(AbstractSolid):
         radius, height: metres.
     """
 
-    foot: Float[np.ndarray, "3"]
+    foot: Vector
     radius: float
     height: float
 
     @property
-    def bounds(self) -> tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3"]]:
+    def bounds(self) -> tuple[Vector, Vector]:
         around = np.array([self.radius, self.radius, 0])
         return self.foot - around, self.foot + around + (0, 0, self.height)
 
-    def meet(
-        self, origin: Float[np.ndarray, "3"], rays: Float[np.ndarray, "N 3"]
-    ) -> tuple[Float[np.ndarray, "N"], Float[np.ndarray, "N 3"]]:
+    def meet(self, origin: Vector, rays: Rays) -> tuple[Distances, Rays]:
         offset = origin - self.foot
         square, product = (rays[:, :2] ** 2).sum(axis=1), rays[:, :2] @ offset[:2]
         discriminant = product**2 - square * (offset[:2] @ offset[:2] - self.radius**2)
@@ -95,16 +93,14 @@ class Hits:
         solid: (N,), index of the solid.
     """
 
-    rays: Float[np.ndarray, "N 3"]
-    distance: Float[np.ndarray, "N"]
-    points: Float[np.ndarray, "N 3"]
-    normals: Float[np.ndarray, "N 3"]
+    rays: Rays
+    distance: Distances
+    points: Rays
+    normals: Rays
     solid: Int[np.ndarray, "N"]
 
 
-def cast(
-    origin: Float[np.ndarray, "3"], rays: Float[np.ndarray, "M 3"], solids: Sequence[AbstractSolid], max_range: float
-) -> Hits:
+def cast(origin: Vector, rays: Rays, solids: Sequence[AbstractSolid], max_range: float) -> Hits:
     """The nearest hit of each ray within `max_range` metres; ties go to the first solid."""
     distance = np.full(len(rays), max_range)
     normals = np.zeros_like(rays)
@@ -120,9 +116,7 @@ def cast(
     return Hits(rays[met], distance[met], points, normals[met], solid[met])
 
 
-def _towards(
-    solid: AbstractSolid, origin: Float[np.ndarray, "3"], rays: Float[np.ndarray, "M 3"], max_range: float
-) -> Int[np.ndarray, "K"]:
+def _towards(solid: AbstractSolid, origin: Vector, rays: Rays, max_range: float) -> Int[np.ndarray, "K"]:
     """Indices of the rays that may hit the solid: those in the cone around its bounding sphere."""
     low, high = solid.bounds
     center, radius = (low + high) / 2 - origin, np.linalg.norm(high - low) / 2
@@ -137,15 +131,13 @@ def _towards(
 # Sensors
 
 
-def random_rays(rng: np.random.Generator, size: int) -> Float[np.ndarray, "N 3"]:
+def random_rays(rng: np.random.Generator, size: int) -> Rays:
     """Random unit rays, uniform over the sphere."""
     rays = rng.normal(size=(size, 3))
     return rays / np.linalg.norm(rays, axis=1, keepdims=True)
 
 
-def spinning_rays(
-    rng: np.random.Generator, size: int, beams: int, lowest: float, highest: float
-) -> Float[np.ndarray, "N 3"]:
+def spinning_rays(rng: np.random.Generator, size: int, beams: int, lowest: float, highest: float) -> Rays:
     """About `size` unit rays of one turn of a LiDAR: x ahead, z up, beams between two elevations in radians.
 
     The turn starts at a random azimuth, and each beam has its own azimuth offset, as in a real LiDAR.
@@ -159,15 +151,16 @@ def spinning_rays(
     return np.stack([x, y, np.sin(elevation)], axis=-1).reshape(-1, 3)
 
 
-def swaying_rotation(tilt: float, phase: float) -> Float[np.ndarray, "3 3"]:
-    """A rotation by `tilt` radians about a horizontal axis in the direction `phase`, radians."""
-    return rotation_from_vector(tilt * np.array([np.cos(phase), np.sin(phase), 0]))
+def sensor_rotation(heading: float, tilt: float, direction: float) -> Rotation:
+    """A turn by `heading` about z, after a tilt about the horizontal axis in a `direction`; radians."""
+    tilted = Rotation.from_rotvec([tilt * np.cos(direction), tilt * np.sin(direction), 0])
+    return Rotation.from_euler("z", heading) * tilted
 
 
 # Patterns
 
 
-def value_noise(points: Float[np.ndarray, "N D"], cell: float, seed: int) -> Float[np.ndarray, "N"]:
+def value_noise(points: Float[np.ndarray, "N D"], cell: float, seed: int) -> Distances:
     """Value noise: a smooth random pattern from −1 to 1 with patches about `cell` metres wide; D is 1, 2 or 3."""
     scaled = np.asarray(points, float) / cell
     corner = np.floor(scaled).astype(np.int64)
@@ -180,9 +173,7 @@ def value_noise(points: Float[np.ndarray, "N D"], cell: float, seed: int) -> Flo
     return 2 * total - 1
 
 
-def patches(
-    points: Float[np.ndarray, "N D"], layers: Sequence[tuple[float, float]], seed: int
-) -> Float[np.ndarray, "N"]:
+def patches(points: Float[np.ndarray, "N D"], layers: Sequence[tuple[float, float]], seed: int) -> Distances:
     """Sum of layers of `value_noise`, each given by the width of its patches (metres) and its amplitude."""
     total = np.zeros(len(points))
     for number, (cell, strength) in enumerate(layers):
@@ -190,7 +181,7 @@ def patches(
     return total
 
 
-def random_cells(cells: Int[np.ndarray, "N D"], seed: int) -> Float[np.ndarray, "N"]:
+def random_cells(cells: Int[np.ndarray, "N D"], seed: int) -> Distances:
     """A random number from 0 to 1 for each cell of an infinite grid, by hashing its index with SplitMix64."""
     mixed = np.full(len(cells), seed, np.uint64)
     for column in cells.T:

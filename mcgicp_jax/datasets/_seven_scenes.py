@@ -8,8 +8,9 @@ from pathlib import Path
 import numpy as np
 
 from mcgicp_jax import io
+from mcgicp_jax._clouds.frame import Frame
 from mcgicp_jax._clouds.point_cloud import PointCloud
-from mcgicp_jax.datasets._frame import AbstractFrames, Frame
+from mcgicp_jax.datasets._frames import AbstractFrames
 from mcgicp_jax.datasets._images import back_project, look_up, read_depth, read_image
 
 # Pixels: focal lengths of the depth and colour cameras, and their common principal point.
@@ -56,9 +57,7 @@ class SevenScenesFrames(AbstractFrames):
         self._depths = sorted(folder.glob(f"frame-{6 * '[0-9]'}.depth.png"))
         if not self._depths:
             raise ValueError(f"{folder}: expected images frame-XXXXXX.depth.png, found none")
-
-    def __len__(self) -> int:
-        return len(self._depths)
+        super().__init__(len(self._depths))
 
     def _frame(self, index: int) -> Frame:
         path = self._depths[index]

@@ -11,13 +11,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from mcgicp_jax._clouds.point_cloud import PointCloud
-from mcgicp_jax.datasets._frame import (
-    SyntheticFrames,
-    check_noise,
-    check_points_per_frame,
-    rotation_from_vector,
-    scene_and_path_rng,
-)
+from mcgicp_jax.datasets._frames import Matrix, SyntheticFrames, check_scene, pose_of, scene_and_path_rng
 from mcgicp_jax.datasets._raycast import (
     AbstractSolid,
     Box,
@@ -26,8 +20,8 @@ from mcgicp_jax.datasets._raycast import (
     cast,
     patches,
     random_cells,
+    sensor_rotation,
     spinning_rays,
-    swaying_rotation,
 )
 
 # The constants of this module define the scene and the sensor.
@@ -112,8 +106,7 @@ def street(
     Raises:
         ValueError: if `num_frames`, `points_per_frame` or `noise` is out of range.
     """
-    check_noise(noise)
-    check_points_per_frame(points_per_frame, 10_000_000)
+    check_scene(points_per_frame, noise)
     scene_rng, path_rng = scene_and_path_rng(seed)
     things = _things(scene_rng, -2 * _MAX_RANGE, num_frames * step + 2 * _MAX_RANGE)
     observer = partial(_observe, things, int(scene_rng.integers(2**31)), points_per_frame, noise)
@@ -124,21 +117,14 @@ def street(
 # The sensor
 
 
-def _pose(step: float, sway: float, yaw: float, tilt: float, index: int) -> Float[np.ndarray, "4 4"]:
-    pose = np.eye(4)
-    heading = rotation_from_vector(np.array([0, 0, _YAW * np.sin(yaw + index / 4)]))
-    pose[:3, :3] = heading @ swaying_rotation(_TILT, tilt + 0.7 * index)
-    pose[:3, 3] = index * step, _LANE + _SWAY * np.sin(sway + index * step / (6 * _SWAY)), _SENSOR_HEIGHT
-    return pose
+def _pose(step: float, sway: float, yaw: float, tilt: float, index: int) -> Matrix:
+    rotation = sensor_rotation(_YAW * np.sin(yaw + index / 4), _TILT, tilt + 0.7 * index)
+    aside = _LANE + _SWAY * np.sin(sway + index * step / (6 * _SWAY))
+    return pose_of(rotation, (index * step, aside, _SENSOR_HEIGHT))
 
 
 def _observe(
-    things: list[_Thing],
-    pattern: int,
-    size: int,
-    noise: float,
-    rng: np.random.Generator,
-    pose: Float[np.ndarray, "4 4"],
+    things: list[_Thing], pattern: int, size: int, noise: float, rng: np.random.Generator, pose: Matrix
 ) -> PointCloud:
     rotation, center = pose[:3, :3], pose[:3, 3]
     rays = spinning_rays(rng, size, _BEAMS, _LOWEST, _HIGHEST) @ rotation.T

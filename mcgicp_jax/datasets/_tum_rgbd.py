@@ -8,10 +8,12 @@ from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float
+from scipy.spatial.transform import Rotation, Slerp
 
 from mcgicp_jax import io
+from mcgicp_jax._clouds.frame import Frame
 from mcgicp_jax._clouds.point_cloud import PointCloud
-from mcgicp_jax.datasets._frame import AbstractFrames, Frame
+from mcgicp_jax.datasets._frames import AbstractFrames, pose_of
 from mcgicp_jax.datasets._images import back_project, look_up, read_depth, read_image
 
 # Pixels: focal lengths and principal point of the three calibrated cameras, and the default of the camera driver.
@@ -63,15 +65,13 @@ class TUMFrames(AbstractFrames):
         if not together.any():
             raise ValueError(f"{folder}: expected depth and colour images within {_MAX_DIFFERENCE} s, found none")
         self._times = times[together]
+        super().__init__(len(self._times))
         self._depths = [self._depths[row] for row in np.flatnonzero(together)]
         self._colors = [colors[row] for row in nearest[together]]
         truth = folder / "groundtruth.txt"
         # read_poses runs before loadtxt because its errors name the file.
         poses = io.read_poses(truth) if truth.is_file() else None
         self._truth = None if poses is None else (np.loadtxt(truth, usecols=0, ndmin=1), poses)
-
-    def __len__(self) -> int:
-        return len(self._times)
 
     def _frame(self, index: int) -> Frame:
         depth = read_depth(self.folder / self._depths[index]) * _DEPTH_UNIT
@@ -91,12 +91,9 @@ class TUMFrames(AbstractFrames):
             return poses[after]
         if not 0 < after < len(times) or times[after] - times[after - 1] > _MAX_GAP:
             return None
-        fraction = (time - times[after - 1]) / (times[after] - times[after - 1])
-        pose = (1 - fraction) * poses[after - 1] + fraction * poses[after]
-        # Projecting the mean matrix to the nearest rotation is accurate for the small motion within 0.1 s.
-        left, _, right = np.linalg.svd(pose[:3, :3])
-        pose[:3, :3] = left @ right
-        return pose
+        around = slice(after - 1, after + 1)
+        rotation = Slerp(times[around], Rotation.from_matrix(poses[around, :3, :3]))(time)
+        return pose_of(rotation, [np.interp(time, times[around], values) for values in poses[around, :3, 3].T])
 
 
 def _read_list(path: Path) -> tuple[Float[np.ndarray, "N"], list[str]]:

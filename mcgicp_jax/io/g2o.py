@@ -1,7 +1,8 @@
-"""Pose graphs as lines of g2o files."""
+"""Pose graphs as g2o files."""
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterable, Iterator
 from typing import Any
 
@@ -12,19 +13,50 @@ from mcgicp_jax._math.poses import matrices_of, parameters_of
 from mcgicp_jax._pose_graph.edge import Edge
 from mcgicp_jax._pose_graph.factors import WORLD
 from mcgicp_jax._pose_graph.graph import PoseGraph
+from mcgicp_jax.io.files import reason_of, replacing
 
 # Tags of the lines. A prior has a vertex and the number of the sensor's offset, which has a line of its own.
 _VERTEX, _EDGE, _PRIOR, _OFFSET = "VERTEX_SE3:QUAT", "EDGE_SE3:QUAT", "EDGE_SE3_PRIOR", "PARAMS_SE3OFFSET"
-# How many whole numbers come first, and how many numbers there are.
+# Per tag: number of integers at the start of a line, and total number of values.
 _WIDTHS = {_VERTEX: (1, 8), _EDGE: (2, 30), _PRIOR: (2, 30), _OFFSET: (1, 8)}
 
 
-def graph_of(lines: Iterable[str]) -> PoseGraph:
-    """Read a graph, see `io.read_g2o`.
+def read_g2o(path: str | os.PathLike[str]) -> PoseGraph:
+    """Read a pose graph of `VERTEX_SE3:QUAT`, `EDGE_SE3:QUAT` and `EDGE_SE3_PRIOR` lines; others are ignored.
+
+    A line holds x y z qx qy qz qw and the upper triangle of the information matrix. As in GTSAM and Ceres, the matrix
+    refers to ξ = (v, ω). g2o itself uses the vector part of the quaternion, half of ω, in place of ω.
+
+    Args:
+        path: the file. Vertices may have any numbers; they become rows in ascending order. Edges between vertices whose
+            numbers are not consecutive are loops. Priors become edges from the world.
 
     Raises:
-        ValueError: if a line has the wrong format or the graph is not valid; the message names the line.
+        OSError: if the file cannot be opened.
+        ValueError: if a line has the wrong format, or the graph is not valid; the message starts with the path.
     """
+    with open(path, encoding="utf-8-sig") as file:
+        try:
+            return _graph_of(file)
+        except ValueError as error:
+            raise ValueError(f"{path}: cannot be read as a pose graph: {reason_of(error)}") from error
+
+
+def write_g2o(path: str | os.PathLike[str], graph: PoseGraph | Any) -> None:
+    """Write a pose graph, or the result of `optimize_poses` without the loops that it rejected, as `read_g2o` reads it.
+
+    Raises:
+        OSError: if the file cannot be written.
+        ValueError: if `graph` is neither.
+    """
+    if not isinstance(getattr(graph, "edges", None), Edge):
+        raise ValueError(f"graph: expected a PoseGraph or a PoseGraphResult, got {type(graph).__name__}")
+    with replacing(path) as file:
+        for form, rows in _lines_of(graph):
+            np.savetxt(file, rows, fmt=form)
+
+
+def _graph_of(lines: Iterable[str]) -> PoseGraph:
     words = [(number, line.split()) for number, line in enumerate(lines, 1)]
     found = {tag: _rows(words, tag) for tag in _WIDTHS}
     (_, vertices), (edge_lines, edges), (prior_lines, priors), (_, offsets) = found.values()
@@ -43,14 +75,14 @@ def graph_of(lines: Iterable[str]) -> PoseGraph:
     upper, information = np.triu_indices(6), np.zeros((len(values), 6, 6))
     information[:, *upper] = information[:, *upper[::-1]] = values[:, 9:]
     of_world = np.arange(len(values)) >= len(edges)
-    uncertain = ~of_world & (np.abs(ends[:, 0] - ends[:, 1]) != 1)
+    loop = ~of_world & (np.abs(ends[:, 0] - ends[:, 1]) != 1)
     i = np.where(of_world, WORLD, rows[:, 0])
     return PoseGraph(
-        _poses(vertices[first, 1:]), Edge(i, rows[:, 1], _poses(values[:, 2:9]), information, uncertain=uncertain)
+        _poses(vertices[first, 1:]), Edge(i, rows[:, 1], _poses(values[:, 2:9]), information, uncertain=loop)
     )
 
 
-def lines_of(graph: PoseGraph | Any) -> Iterator[tuple[str, Float[np.ndarray, "N _"]]]:
+def _lines_of(graph: PoseGraph | Any) -> Iterator[tuple[str, Float[np.ndarray, "N _"]]]:
     """Format and numbers of the lines of a graph, of each kind."""
     edges, poses = graph.edges[np.asarray(getattr(graph, "kept", np.ones(len(graph.edges), bool)))], graph.poses
     i, j, motions = np.asarray(edges.i), np.asarray(edges.j), np.asarray(edges.T_i_j)

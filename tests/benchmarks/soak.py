@@ -92,7 +92,7 @@ def main() -> None:
             result = mcg.register(source, target, method, max_distance=0.5, robust=robust)
             outcomes[result.status.name] += 1
         if (turn + 1) % (options.registrations // _REPORTS) == 0:
-            trees = len(_trees._index_cache._indices)
+            trees = len(_trees._indices._values)
             print(
                 f"| {turn + 1:13,} | {resident_mib():13.0f} | {num_maps():6,} | {compilations.count:12,} | {trees:10} "
                 f"| {time.perf_counter() - begin:5.0f} s |",

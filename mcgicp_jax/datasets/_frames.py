@@ -1,38 +1,20 @@
-"""Frames of a sensor, and lazy sequences of frames."""
+"""Lazy sequences of frames."""
 
 from __future__ import annotations
 
 import abc
 import operator
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
-from typing import overload
+from typing import Any, TypeAlias, overload
 
 import numpy as np
-from jaxtyping import Float, UInt8
+from jaxtyping import Float
+from scipy.spatial.transform import Rotation
 
+from mcgicp_jax._clouds.frame import Frame
 from mcgicp_jax._clouds.point_cloud import PointCloud
 
-
-@dataclass(frozen=True, eq=False)
-class Frame:
-    """A cloud with the pose and the time of the sensor.
-
-    The true relative pose of two frames is `T_target_source = inv(target.pose) @ source.pose`.
-
-    Attributes:
-        cloud: in the sensor's frame, metres.
-        pose: (4, 4), sensor to world, metres; None if unknown.
-        time: seconds from an arbitrary start; None if unknown.
-        image: (height, width, 3) red, green and blue from 0 to 255; None if there is none.
-        pixels: (N, 2) column and row of each point in the image, NaN where it is outside; None without an image.
-    """
-
-    cloud: PointCloud
-    pose: Float[np.ndarray, "4 4"] | None = None
-    time: float | None = None
-    image: UInt8[np.ndarray, "height width 3"] | None = None
-    pixels: Float[np.ndarray, "N 2"] | None = None
+Matrix: TypeAlias = Float[np.ndarray, "4 4"]
 
 
 class AbstractFrames(Sequence[Frame]):
@@ -41,8 +23,11 @@ class AbstractFrames(Sequence[Frame]):
     It supports `len`, iteration, negative indices, and slices, which are lazy too.
     """
 
-    @abc.abstractmethod
-    def __len__(self) -> int: ...
+    def __init__(self, num_frames: int):
+        self._num_frames = num_frames
+
+    def __len__(self) -> int:
+        return self._num_frames
 
     @abc.abstractmethod
     def _frame(self, index: int) -> Frame:
@@ -73,10 +58,8 @@ class AbstractFrames(Sequence[Frame]):
 
 class _Slice(AbstractFrames):
     def __init__(self, whole: AbstractFrames, rows: range):
+        super().__init__(len(rows))
         self._whole, self._rows = whole, rows
-
-    def __len__(self) -> int:
-        return len(self._rows)
 
     def _frame(self, index: int) -> Frame:
         return self._whole[self._rows[index]]
@@ -97,18 +80,15 @@ class SyntheticFrames(AbstractFrames):
     def __init__(
         self,
         num_frames: int,
-        path: Callable[[int], Float[np.ndarray, "4 4"]],
-        observer: Callable[[np.random.Generator, Float[np.ndarray, "4 4"]], PointCloud],
+        path: Callable[[int], Matrix],
+        observer: Callable[[np.random.Generator, Matrix], PointCloud],
         period: float,
         seed: int,
     ):
         if num_frames < 1:
             raise ValueError(f"num_frames: expected at least 1, got {num_frames}")
-        self._num_frames = num_frames
+        super().__init__(num_frames)
         self.path, self.observer, self.period, self.seed = path, observer, period, seed
-
-    def __len__(self) -> int:
-        return self._num_frames
 
     def _frame(self, index: int) -> Frame:
         return self.observe(index)
@@ -138,28 +118,20 @@ _SCENE, _PATH, _FIRST_FRAME = 0, 1, 2
 
 
 def scene_and_path_rng(seed: int) -> tuple[np.random.Generator, np.random.Generator]:
-    """Random generators of the scene and of the sensor's path, independent of those of the frames."""
+    """Random generators of the scene and of the sensor's path, independent of the frames' generators."""
     scene, path = (np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(key,))) for key in (_SCENE, _PATH))
     return scene, path
 
 
-def check_noise(noise: float) -> None:
-    """Raise `ValueError` for a negative or NaN noise scale."""
+def pose_of(rotation: Rotation, position: Any) -> Matrix:
+    pose = np.eye(4)
+    pose[:3, :3], pose[:3, 3] = rotation.as_matrix(), position
+    return pose
+
+
+def check_scene(points_per_frame: int, noise: float, most: int = 10_000_000) -> None:
+    """Raise `ValueError` unless 1 ≤ `points_per_frame` ≤ `most`, and `noise` is 0 or more."""
     if not noise >= 0:
         raise ValueError(f"noise: expected 0 or more, got {noise}")
-
-
-def check_points_per_frame(points: int, most: int) -> None:
-    """Raise `ValueError` unless 1 ≤ `points` ≤ `most`."""
-    if not 1 <= points <= most:
-        raise ValueError(f"points_per_frame: expected 1 to {most}, got {points}")
-
-
-def rotation_from_vector(vector: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3 3"]:
-    """The rotation by |vector| radians about the vector (Rodrigues' formula)."""
-    angle = np.linalg.norm(vector)
-    if angle == 0:
-        return np.eye(3)
-    x, y, z = vector / angle
-    cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
-    return np.eye(3) + np.sin(angle) * cross + (1 - np.cos(angle)) * cross @ cross
+    if not 1 <= points_per_frame <= most:
+        raise ValueError(f"points_per_frame: expected 1 to {most}, got {points_per_frame}")

@@ -3,23 +3,26 @@
 from __future__ import annotations
 
 from functools import partial
+from typing import Any
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jax.typing import ArrayLike
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
+from mcgicp_jax._clouds.origins import centred_pose
 from mcgicp_jax._clouds.point_cloud import PointCloud
-from mcgicp_jax._compute.concrete import is_concrete
-from mcgicp_jax._local_geometry.records import Surface
+from mcgicp_jax._local_geometry.surface import searched
 from mcgicp_jax._math import symmetric_matrices as alg
-from mcgicp_jax._math.poses import Pose, pose_matrix
+from mcgicp_jax._math.poses import Pose
 from mcgicp_jax._math.robust_kernels import AbstractKernel
 from mcgicp_jax._methods.base import AbstractGeneralized, AbstractMethod
-from mcgicp_jax._methods.surface import surfaces_of
-from mcgicp_jax._pose_solver.sums import estimates_at, forces_at, matched_rows
+from mcgicp_jax._methods.surfaces import SurfacePair, surface_pair
+from mcgicp_jax._pose_solver.adaptation import adapted, sample_of_term
+from mcgicp_jax._pose_solver.matched import Matched, Motion, linearize_at, match_surfaces, surface_rows
+from mcgicp_jax._registration.input_checks import check_matches
 from mcgicp_jax._search.base import Correspondences
+from mcgicp_jax._terms.base import AbstractTerm
 
 
 def mahalanobis_cost(
@@ -64,67 +67,32 @@ def mahalanobis_cost(
     check_matches(matches, source, method, temperature)
     if log_determinant and not isinstance(method, AbstractGeneralized):
         raise ValueError(f"log_determinant: expected a method with covariances, got {type(method).__name__}")
-    method, *surfaces = surfaces_of(method, source, target, observed=False)
+    pair = surface_pair(method, source, target, observed=False, robust=robust)
     dtype = source.points.dtype
     matrix = centred_pose(pose, source, target, "pose")
     rotation, translation = jnp.asarray(matrix[:3, :3], dtype), jnp.asarray(matrix[:3, 3], dtype)
     temperature = None if temperature is None else jnp.asarray(temperature, dtype)
-    robust = method.default_kernel() if robust is None else robust
-    return _total_cost(rotation, translation, *surfaces, matches, method, robust, temperature, log_determinant)
+    return _total_cost(Motion(rotation, translation), pair, matches, temperature, log_determinant)
 
 
 @partial(jax.jit, static_argnames="log_determinant")
 def _total_cost(
-    rotation: Float[Array, "3 3"],
-    translation: Float[Array, "3"],
-    source: Surface,
-    target: Surface,
+    motion: Motion,
+    pair: SurfacePair,
     matches: Correspondences,
-    method: AbstractMethod,
-    robust: AbstractKernel | None,
     temperature: Float[Array, ""] | None,
     log_determinant: bool,
 ) -> Float[Array, ""]:
-    matched = matched_rows(source, target, matches, temperature)
-    method = method.with_estimates(estimates_at(rotation, translation, matched, source.rows.valid, method.estimates))
-    _, forces, counts = forces_at(rotation, translation, matched, method, robust)
-    cost = jnp.sum(forces.cost)
+    matched = match_surfaces(pair.source, pair.target, matches, temperature)
+
+    def sample(term: AbstractTerm, rows: Int[Array, "n"]) -> Any:
+        some = Matched(surface_rows(matched.source, rows), surface_rows(matched.target, rows), matched.valid[rows])
+        return sample_of_term(motion, some, term)
+
+    terms = adapted(pair.terms, searched(pair.source).valid, sample)
+    _, found, counts = linearize_at(motion, matched, terms)
+    cost = jnp.sum(found.cost)
     if log_determinant:
-        determinant = jnp.where(matched.valid, alg.determinant(forces.information), 1)
+        determinant = jnp.where(matched.valid, alg.determinant(found.information), 1)
         cost = cost - jnp.sum(counts * jnp.log(determinant))
     return cost
-
-
-def check_matches(
-    matches: Correspondences, source: PointCloud, method: AbstractMethod, temperature: ArrayLike | None
-) -> None:
-    """Raise `ValueError` unless there is one match per source row, or several and a positive `temperature` or a method
-    that uses several."""
-    rows = source.points.shape[0]
-    if matches.indices.ndim > 2 or matches.indices.shape[-1] != rows:
-        raise ValueError(f"matches: expected one per source row ({rows}), got shape {matches.indices.shape}")
-    if matches.indices.ndim == 2 and temperature is None and method.num_candidates == 1:
-        raise ValueError(f"temperature: expected metres to go with {matches.indices.shape[0]} candidates, got None")
-    if temperature is not None and is_concrete(temperature) and not np.asarray(temperature) > 0:
-        raise ValueError(f"temperature: expected a positive number of metres, got {temperature!r}")
-
-
-def centred_pose(pose: Pose | None, source: PointCloud, target: PointCloud, name: str = "init") -> Array | np.ndarray:
-    """T(−o_t) · T · T(o_s), (4, 4): the pose between coordinates relative to the clouds' origins, in its own precision.
-
-    Raises:
-        ValueError: as `pose_matrix`; `name` is the argument's name for the message.
-    """
-    distance = 0.0
-    if is_concrete(source.origin, source.points) and np.any(source.origin):
-        radius = float(np.abs(np.asarray(source.points)).max(initial=0))
-        distance = float(np.linalg.norm(source.origin)) / radius if radius > 0 else 0.0
-    matrix = pose_matrix(pose, name, distance)
-    rotation, translation = matrix[:3, :3], matrix[:3, 3]
-    # In this form two far origins cancel exactly, before the rotation is applied to either.
-    shifted = (rotation - np.eye(3)) @ source.origin + (source.origin - target.origin) + translation
-    if isinstance(shifted, np.ndarray) and isinstance(matrix, np.ndarray):
-        result = matrix.copy()
-        result[:3, 3] = shifted
-        return result
-    return jnp.asarray(matrix).at[:3, 3].set(shifted)

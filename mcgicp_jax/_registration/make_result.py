@@ -7,27 +7,27 @@ from typing import Any
 
 import equinox as eqx
 import jax
-import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array
 
+from mcgicp_jax._clouds.origins import pose_in_user_frame
 from mcgicp_jax._clouds.point_cloud import PointCloud
-from mcgicp_jax._compute.concrete import constant, is_concrete, namespace
-from mcgicp_jax._compute.lazy import Deferred
-from mcgicp_jax._math.poses import se3_from_matrix
-from mcgicp_jax._pose_solver.degeneracy import Directions
-from mcgicp_jax._registration.result import Registration, pose_in_user_frame
-from mcgicp_jax._registration.step import Assessment, State
+from mcgicp_jax._compute.concrete import constant, is_concrete, numpy_for
+from mcgicp_jax._compute.lazy import Lazy
+from mcgicp_jax._math.poses import se3_from_matrix, translation_adjoint
+from mcgicp_jax._registration.assessment import Assessment
+from mcgicp_jax._registration.result import Constraints, Registration, Uncertainty
+from mcgicp_jax._registration.step import Record, State
 
 
 def registration_of(
     state: State,
     assessment: Assessment,
-    history: dict[str, Any],
+    records: Record,
     source: PointCloud,
     target: PointCloud,
 ) -> Registration:
     """Build the `Registration` of a final state, in the user's frames; NumPy where everything is concrete."""
+    history: dict[str, Any] = records._asdict()
     concrete = is_concrete(state, history)
     if concrete:
         # Reading NumPy arrays compiles nothing.
@@ -37,9 +37,9 @@ def registration_of(
     numbers: Any = {
         "status_code": state.status,
         "num_iterations": state.num_iterations,
-        "num_inliers": state.record[..., 2],
-        "cost": state.record[..., 0],
-        "rmse": state.record[..., 1],
+        "num_inliers": state.record.num_inliers,
+        "cost": state.record.cost,
+        "rmse": state.record.rmse,
         "history": history,
     }
     valid = source.valid
@@ -60,51 +60,42 @@ def registration_of(
     )
 
 
-def _later(compute: Callable[[], Any], concrete: bool) -> Deferred[Any]:
+def _later(compute: Callable[[], Any], concrete: bool) -> Lazy[Any]:
     """Deferred where concrete; traced values must be computed before the trace ends."""
-    return Deferred(compute) if concrete else Deferred.of(compute())
+    return Lazy(compute) if concrete else Lazy.of(compute())
 
 
-def _read(deferred: Deferred[Any]) -> Any:
+def _read(deferred: Lazy[Any]) -> Any:
     """The value, as NumPy arrays where concrete: arithmetic with a large origin needs float64."""
     value = deferred.value
     return jax.tree.map(np.asarray, value) if is_concrete(value) else value
 
 
-def _constraints(assessment: Assessment, origin: Any) -> tuple[Any, Directions | None]:
+def _constraints(assessment: Assessment, origin: Any) -> Constraints:
     """Information matrix and directions in the frame of the user's source."""
     information, directions = _read(assessment.constraints)
     if is_concrete(origin) and not np.any(origin):
-        return information, directions
+        return Constraints(information, directions)
     to_centred, from_centred = translation_adjoint(-origin), translation_adjoint(origin)
     # Non-finite values belong to the status NON_FINITE; NumPy need not warn of them.
     with np.errstate(invalid="ignore", over="ignore"):
         if directions is not None:
             moved = directions.twists @ from_centred.T, directions.center + origin
             directions = eqx.tree_at(lambda d: (d.twists, d.center), directions, moved)
-        return to_centred.T @ information @ to_centred, directions
+        return Constraints(to_centred.T @ information @ to_centred, directions)
 
 
-def _uncertainty(assessment: Assessment, state: State, origin: Any) -> tuple[Any, Any]:
+def _uncertainty(assessment: Assessment, state: State, origin: Any) -> Uncertainty:
     """The covariance in the frame of the user's source, and the deviations at the centroid of the matched points."""
     pose, center = constant((state.pose, state.sums.center))
     covariance = _read(assessment.covariance)
-    xp = namespace(covariance, pose, center)
+    xp = numpy_for(covariance, pose, center)
     with np.errstate(invalid="ignore", over="ignore"):
         matrix = pose_in_user_frame(pose, np.zeros(3), np.zeros(3))
         # In the target's axes T exp(ξ) turns by R ω, and moves the centre c by R v + (t − c) × R ω.
         to_center = translation_adjoint(matrix[:3, 3] - center) @ xp.kron(xp.eye(2), matrix[:3, :3])
         deviations = xp.sqrt(xp.diagonal(to_center @ covariance @ to_center.T)).astype(covariance.dtype)
         if is_concrete(origin) and not np.any(origin):
-            return covariance, deviations
+            return Uncertainty(covariance, deviations)
         from_centred = translation_adjoint(origin)
-        return from_centred @ covariance @ from_centred.T, deviations
-
-
-def translation_adjoint(offset: Array | np.ndarray) -> Array | np.ndarray:
-    """Adjoint (6, 6) of a translation by `offset`, for twists (v, ω)."""
-    xp = np if isinstance(offset, np.ndarray) else jnp
-    zero = xp.zeros_like(offset[0])
-    x, y, z = offset
-    cross = xp.stack([xp.stack([zero, -z, y]), xp.stack([z, zero, -x]), xp.stack([-y, x, zero])])
-    return xp.block([[xp.eye(3), cross], [xp.zeros((3, 3)), xp.eye(3)]])
+        return Uncertainty(from_centred @ covariance @ from_centred.T, deviations)

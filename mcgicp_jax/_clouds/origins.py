@@ -1,0 +1,52 @@
+"""Poses between coordinates relative to the origins of two clouds, and between the user's coordinates."""
+
+from __future__ import annotations
+
+import jax.numpy as jnp
+import jaxlie
+import numpy as np
+from jaxtyping import Array
+
+from mcgicp_jax._clouds.point_cloud import PointCloud
+from mcgicp_jax._compute.concrete import is_concrete
+from mcgicp_jax._math.poses import Pose, matrices_of, pose_matrix, rotation_from_quaternion
+
+
+def centred_pose(pose: Pose | None, source: PointCloud, target: PointCloud, name: str = "init") -> Array | np.ndarray:
+    """T(−o_t) · T · T(o_s), (4, 4): the pose between coordinates relative to the clouds' origins, in its own precision.
+
+    Raises:
+        ValueError: as `pose_matrix`; `name` is the argument's name for the message.
+    """
+    distance = 0.0
+    if is_concrete(source.origin, source.points) and np.any(source.origin):
+        radius = float(np.abs(np.asarray(source.points)).max(initial=0))
+        distance = float(np.linalg.norm(source.origin)) / radius if radius > 0 else 0.0
+    matrix = pose_matrix(pose, name, distance)
+    rotation, translation = matrix[:3, :3], matrix[:3, 3]
+    # In this form two far origins cancel exactly, before the rotation is applied to either.
+    shifted = (rotation - np.eye(3)) @ source.origin + (source.origin - target.origin) + translation
+    if isinstance(shifted, np.ndarray) and isinstance(matrix, np.ndarray):
+        result = matrix.copy()
+        result[:3, 3] = shifted
+        return result
+    return jnp.asarray(matrix).at[:3, 3].set(shifted)
+
+
+def pose_in_user_frame(
+    centred: jaxlie.SE3, source_origin: Array | np.ndarray, target_origin: Array | np.ndarray
+) -> Array | np.ndarray:
+    """T(o_t) · T · T(−o_s) as (4, 4), with translations T(o) by the origins; float64 NumPy for concrete arrays."""
+    if is_concrete(centred, source_origin, target_origin):
+        parameters = np.asarray(centred.wxyz_xyz, np.float64)
+        rotation = rotation_from_quaternion(parameters[..., :4])
+        # Origins returned by `jit` are float32 (exactly so); the arithmetic with them must be float64.
+        start, end = np.asarray(source_origin, np.float64), np.asarray(target_origin, np.float64)
+        offset = end - start - np.einsum("...ij,...j->...i", rotation - np.eye(3), start)
+        matrix = matrices_of(parameters)
+        matrix[..., :3, 3] += offset
+        return matrix
+    traced = centred.as_matrix().astype(centred.wxyz_xyz.dtype)
+    turned = jnp.einsum("...ij,...j->...i", traced[..., :3, :3] - jnp.eye(3), source_origin, precision="highest")
+    shift = target_origin - source_origin - turned
+    return traced.at[..., :3, 3].add(shift.astype(traced.dtype))

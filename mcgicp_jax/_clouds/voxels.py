@@ -1,0 +1,71 @@
+"""Voxels: cubes of space with a corner at the origin, numbered by one integer key each."""
+
+from __future__ import annotations
+
+import numpy as np
+from jaxtyping import Float, Int
+
+# Number of voxels along an axis: three 21-bit indices fit into one 63-bit key.
+_VOXELS_PER_AXIS = 2**21
+
+
+def voxel_of(points: Float[np.ndarray, "*N 3"], voxel_size: float) -> Float[np.ndarray, "*N 3"]:
+    """Integer coordinates of the voxels that contain the points."""
+    return np.floor(points / voxel_size)
+
+
+def voxel_keys(
+    points: Float[np.ndarray, "N 3"], voxel_size: float, first: Float[np.ndarray, "3"] | float = 0.0
+) -> Int[np.ndarray, "N"]:
+    """Keys of the voxels that contain the points, the same in every call with the same voxel `first`.
+
+    Raises:
+        ValueError: if a point lies 2²⁰ or more voxels from `first` along an axis.
+    """
+    cells = voxel_of(points, voxel_size) - first
+    if np.abs(cells).max(initial=0) >= _VOXELS_PER_AXIS // 2:
+        raise ValueError(
+            f"voxel_size: {voxel_size} m puts points {np.abs(cells).max():.0f} voxels from the first one, expected "
+            f"fewer than {_VOXELS_PER_AXIS // 2}; choose a larger size"
+        )
+    x, y, z = (cells.astype(np.int64) + _VOXELS_PER_AXIS // 2).T
+    return (x << 42) | (y << 21) | z
+
+
+def voxel_order(
+    columns: Float[np.ndarray, "3 N"], voxel_size: float
+) -> tuple[Int[np.ndarray, "N"], Int[np.ndarray, "M"]]:
+    """An order that sorts points by voxel, and where each of the M occupied voxels starts in it.
+
+    Raises:
+        ValueError: if the points extend over more than 2²¹ voxels along an axis.
+    """
+    # Unlike in `voxel_keys`, the indices take no more bits than the extent of the points needs: see `_stable_order`.
+    key, num_keys = np.zeros(columns.shape[1], np.int64), 1
+    for column in columns:
+        cell = np.floor(column / voxel_size)
+        cell -= cell.min()
+        extent = cell.max() + 1
+        if extent > _VOXELS_PER_AXIS:
+            raise ValueError(
+                f"voxel_size: expected at most {_VOXELS_PER_AXIS} voxels along an axis, got {extent:.0f} "
+                f"with {voxel_size} m; choose a larger size"
+            )
+        key = key * int(extent) + cell.astype(np.int64)
+        num_keys *= int(extent)
+    order = _stable_order(key, num_keys)
+    return order, starts_of(key[order])
+
+
+def starts_of(sorted_keys: Int[np.ndarray, "N"]) -> Int[np.ndarray, "M"]:
+    """Positions at which a new key starts."""
+    return np.flatnonzero(np.diff(sorted_keys, prepend=sorted_keys[:1] - 1))
+
+
+def _stable_order(key: Int[np.ndarray, "N"], num_keys: int) -> Int[np.ndarray, "N"]:
+    """Indices of a stable sort of keys in [0, `num_keys`)."""
+    bits = (len(key) - 1).bit_length()
+    if (num_keys - 1).bit_length() + bits > 63:
+        return np.argsort(key, kind="stable")
+    # Sorting keys with the row index in their low bits is several times faster than argsort.
+    return np.sort((key << bits) | np.arange(len(key))) & ((1 << bits) - 1)

@@ -1,0 +1,91 @@
+"""Gain and offset of the channels of two clouds, and a warning of units that differ."""
+
+from __future__ import annotations
+
+import warnings
+from functools import partial
+
+import numpy as np
+from jaxtyping import Float
+
+from mcgicp_jax._clouds.point_cloud import PointCloud
+from mcgicp_jax._compute.cache import cached_with
+from mcgicp_jax._compute.concrete import AnyArray, constant, numpy_for
+from mcgicp_jax._local_geometry.spacing_and_noise import known_values
+from mcgicp_jax._math.statistics import of_known, sampled_rows
+from mcgicp_jax._search.base import Correspondences
+
+# Quantiles (5 to 95 %) from which gain and offset are estimated: robust against parts that only one cloud sees.
+_QUANTILES = tuple(step / 20 for step in range(1, 20))
+# Ratio of the ranges of a channel in two clouds above which its units probably differ: files hold intensities from 0 to
+# 1, 255 or 65,535, whereas exposures differ by less.
+_OTHER_UNIT = 10.0
+
+
+def warn_of_units(source: PointCloud, target: PointCloud) -> None:
+    """Warn of channels of two concrete clouds whose values are so different that their units probably are, too."""
+    ranges = [cached_with(cloud, "ranges", None, partial(_ranges, cloud)) for cloud in (source, target)]
+    for name, (low, high), (first, last) in zip(source.channel_names, *ranges, strict=False):
+        narrow, wide = sorted([high - low, last - first])
+        if high < first or last < low or wide > _OTHER_UNIT * narrow > 0:
+            warnings.warn(
+                f"channel {name}: most values lie between {low:.3g} and {high:.3g} in the source, but between "
+                f"{first:.3g} and {last:.3g} in the target; if their units differ, scale one, or use match_channels",
+                UserWarning,
+                stacklevel=4,
+            )
+
+
+def _ranges(cloud: PointCloud) -> list[tuple[float, float]]:
+    """For each channel, the values between which most of a sample lie (5 to 95 %); NaN if no point has it."""
+    rows, counts = sampled_rows(np.asarray(cloud.valid))
+    rows = rows[counts]
+    channels, known = np.asarray(cloud.channels)[rows], np.isfinite(np.asarray(cloud.channels)[rows])
+    if cloud.channel_valid is not None:
+        known &= np.asarray(cloud.channel_valid)[rows]
+    ranges = []
+    for values in (column[there] for column, there in zip(channels.T, known.T, strict=True)):
+        low, high = np.quantile(values, [_QUANTILES[0], _QUANTILES[-1]]) if values.size else (np.nan, np.nan)
+        ranges.append((float(low), float(high)))
+    return ranges
+
+
+def with_channels_matched(source: PointCloud, target: PointCloud, matches: Correspondences | None = None) -> PointCloud:
+    """The source with a gain and an offset applied to each channel, so that its distribution matches the target's.
+
+    Gain and offset equalise mean and standard deviation of the quantiles from 5 to 95 %, which is robust against small
+    parts that only one cloud sees. Regression over matches is not used: noise, and matches across edges, would bias the
+    gain towards 0. With `matches`, only values of valid matches are used. Gain and offset are constants to autodiff;
+    they are 1 and 0 for channels without usable spread.
+    """
+    xp = numpy_for(source, target, matches)
+    values = [known_values(constant(cloud)) for cloud in (source, target)]
+    values = [xp.asarray(each) for each in values]
+    if matches is not None:
+        values[1] = values[1][xp.asarray(matches.indices)]
+        matched = xp.asarray(matches.valid)[:, None] & xp.isfinite(values[0]) & xp.isfinite(values[1])
+        # Too few points do not determine a distribution.
+        matched = matched & (xp.sum(matched, axis=0) > len(_QUANTILES))
+        values = [xp.where(matched, each, xp.nan) for each in values]
+    gain, offset = gain_and_offset(*values)
+    dtype = source.channels.dtype
+    return source.replace(channels=xp.asarray(source.channels) * gain.astype(dtype) + offset.astype(dtype))
+
+
+def gain_and_offset(
+    values: Float[AnyArray, "n C"], wanted: Float[AnyArray, "m C"]
+) -> tuple[Float[AnyArray, "C"], Float[AnyArray, "C"]]:
+    """Gain and offset of each channel that equalise mean and standard deviation of its quantiles with those wanted.
+
+    NaNs are ignored; 1 and 0 for channels without usable spread.
+    """
+    xp = numpy_for(values, wanted)
+    levels = xp.asarray(_QUANTILES, values.dtype)
+    quantiles = [of_known(partial(xp.nanquantile, q=levels, axis=0), each) for each in (values, wanted)]
+    means = [xp.mean(each, axis=0) for each in quantiles]
+    spreads = [xp.std(each, axis=0) for each in quantiles]
+    varying = (spreads[0] > 0) & (spreads[1] > 0)
+    gain = xp.where(varying, spreads[1] / xp.where(varying, spreads[0], 1), 1)
+    offset = means[1] - gain * means[0]
+    known = xp.isfinite(gain) & xp.isfinite(offset)
+    return xp.where(known, gain, 1), xp.where(known, offset, 0)

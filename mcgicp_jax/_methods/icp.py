@@ -1,0 +1,77 @@
+"""ICP: point to point, point to plane, and with matches that are nearest in colour, too."""
+
+from __future__ import annotations
+
+from typing import ClassVar
+
+import equinox as eqx
+from jaxtyping import Array, Float
+
+from mcgicp_jax._clouds.point_cloud import PointCloud, Values
+from mcgicp_jax._compute.concrete import AnyArray
+from mcgicp_jax._local_geometry.local_geometry import LocalGeometry
+from mcgicp_jax._local_geometry.neighborhoods import Neighborhoods
+from mcgicp_jax._math import symmetric_matrices as alg
+from mcgicp_jax._methods.base import AbstractOneSided, Geometries, identity, known_geometry
+from mcgicp_jax._methods.multichannel_gicp import MultiChannelGICP
+from mcgicp_jax._methods.parameters import per_channel, weights_of
+
+
+class PointToPoint(AbstractOneSided):
+    """Plain ICP (Besl & McKay 1992): M = I."""
+
+    def covariance(self, around: Neighborhoods, local: LocalGeometry | None) -> Float[Array, "6 n"]:
+        return identity(around)
+
+
+class PointToPlane(AbstractOneSided):
+    """Point-to-plane ICP (Chen & Medioni 1991): M = n nᵀ with the normals n of the target."""
+
+    def covariance(self, around: Neighborhoods, local: LocalGeometry | None) -> Float[Array, "6 n"]:
+        given = around.given_covariance
+        return alg.outer(known_geometry(local).normal.T if given is None else alg.smallest_eigenvector(given))
+
+
+class ColorICP(AbstractOneSided):
+    """ICP whose matches are nearest in position and channels (Johnson & Kang 1999): M = I.
+
+    Attributes:
+        channel_weights: α, scalar or (C,), metres per channel unit.
+        missing_variance: scalar or (C,), channel units²: the squared difference that the search assumes for a channel
+            if a point of a correspondence lacks it. Not an argument: set by `resolve` if points lack channels.
+    """
+
+    uses_channels: ClassVar[bool] = True
+
+    channel_weights: Float[Array, "..."]
+    missing_variance: Float[Array, "..."] | None
+
+    def __init__(self, channel_weights: Values):
+        """Raises `ValueError` if a weight is negative or not finite, or has the wrong shape."""
+        self.channel_weights = weights_of(channel_weights)
+        self.missing_variance = None
+
+    def resolve(
+        self,
+        source: PointCloud,
+        target: PointCloud,
+        geometries: Geometries | None = None,
+    ) -> ColorICP:
+        """The method with `missing_variance` set to the Λ that `MultiChannelGICP` chooses, if points lack channels;
+        constant to autodiff."""
+        lacking = source.channel_valid is not None or target.channel_valid is not None
+        if not lacking or self.missing_variance is not None:
+            return self
+        variance = MultiChannelGICP(channel_weights=0.0).resolve(source, target, geometries).channel_covariance
+        return eqx.tree_at(lambda method: method.missing_variance, self, variance, is_leaf=lambda leaf: leaf is None)
+
+    def covariance(self, around: Neighborhoods, local: LocalGeometry | None) -> Float[Array, "6 n"]:
+        return identity(around)
+
+    def weights(self, num_channels: int) -> Float[AnyArray, "C"]:
+        return per_channel("channel_weights", self.channel_weights, num_channels)
+
+    def missing_variances(self, num_channels: int) -> Float[AnyArray, "C"]:
+        if self.missing_variance is None:
+            raise ValueError("missing_variance: not chosen yet; call method.resolve(source, target) first")
+        return per_channel("missing_variance", self.missing_variance, num_channels)

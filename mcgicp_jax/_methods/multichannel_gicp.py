@@ -1,0 +1,176 @@
+"""Multi-channel generalized ICP."""
+
+from __future__ import annotations
+
+from typing import ClassVar
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.typing import ArrayLike
+from jaxtyping import Array, Float
+
+from mcgicp_jax._clouds.point_cloud import PointCloud, Values
+from mcgicp_jax._compute.concrete import AnyArray, constant, numpy_for
+from mcgicp_jax._local_geometry.covariances import channel_kernel, multichannel_covariance, plane_covariance
+from mcgicp_jax._local_geometry.local_geometry import LocalGeometry
+from mcgicp_jax._local_geometry.local_statistics import local_geometries
+from mcgicp_jax._local_geometry.neighborhoods import NO_NEIGHBORS, Neighborhoods
+from mcgicp_jax._local_geometry.spacing_and_noise import channel_noise, point_spacing
+from mcgicp_jax._math.robust_kernels import AbstractKernel
+from mcgicp_jax._methods.base import AbstractGeneralized, Geometries, known_geometry
+from mcgicp_jax._methods.parameters import (
+    check_covariance_fits,
+    covariance_of,
+    epsilon_of,
+    per_channel,
+    positive_scalar,
+    weights_of,
+)
+from mcgicp_jax._terms.base import AbstractTerm
+from mcgicp_jax._terms.mahalanobis import Mahalanobis
+from mcgicp_jax._terms.photometric import Photometric
+
+# Ratio. Between aligned real scans (RGB-D and LiDAR), the standard deviation of the channels' differences was 0.9 to
+# 2.6 times the value expected from the noise within each scan; this is the geometric mean.
+_SPREAD = 1.5
+# In spacings of the target: α σ, the position offset that weighs as much as one σ of a channel.
+_OFFSET_PER_SIGMA = 2.5
+# Floor of Ω's eigenvalues, relative to GICP's in-plane variance of 1: default, and least value chosen from the data.
+_MIN_EIGENVALUE = 5e-3
+# Variance of a match along each tangent axis, spacing²: 1/(2 ln 2) for randomly placed points (Poisson process), whose
+# squared nearest-neighbour distance r² has the mean E and the median E ln 2.
+_MATCH_VARIANCE = 0.72
+
+
+class MultiChannelGICP(AbstractGeneralized):
+    """Multi-channel generalized ICP (Servos & Waslander, ICRA 2014).
+
+    The covariance of a point is ε along the normal and Ω within the surface (eqs. 6-10): small in the directions in
+    which the channels distinguish the point from its neighbours. Matches are nearest in position and α · channel.
+
+    Attributes:
+        channel_covariance: Λ of eq. 7, scalar or (C,) variances or (C, C), channel units²: the covariance of the
+            difference of two measurements of the same spot. None: chosen from the data, see `resolve`.
+        channel_weights: α, scalar or (C,), metres per channel unit. None: chosen from the data, see `resolve`.
+        epsilon: ε, as in `GICP`.
+        min_eigenvalue: floor of Ω's eigenvalues, reached where no neighbour has similar channels. Since the target is
+            sampled, a match is less accurate within the surface than along the normal, whatever the channels. None:
+            chosen along with Λ, see `resolve`; 0.005 if Λ is given.
+        photometric: if True, Ω and α are used in the coarse phase only. The fine phase matches by position and
+            minimises point-to-plane residuals and differences of interpolated channels, each divided by its estimated
+            standard deviation (see `_terms.photometric`). A kernel `robust` then acts in the fine phase only. Its scale
+            and `information` are in standard deviations.
+    """
+
+    uses_channels: ClassVar[bool] = True
+    uses_neighborhoods: ClassVar[bool] = True
+
+    channel_covariance: Float[Array, "..."] | None
+    channel_weights: Float[Array, "..."] | None
+    epsilon: Float[Array, ""]
+    min_eigenvalue: Float[Array, ""] | None
+    photometric: bool = eqx.field(static=True)
+
+    def __init__(
+        self,
+        channel_covariance: Values | None = None,
+        channel_weights: Values | None = None,
+        epsilon: ArrayLike = 1e-3,
+        min_eigenvalue: ArrayLike | None = None,
+        photometric: bool = False,
+    ):
+        """Raises `ValueError` unless Λ is symmetric and positive definite, α finite and not negative, ε positive and
+        large enough for the precision, and the floor positive; or if a shape is wrong."""
+        self.channel_covariance = None if channel_covariance is None else covariance_of(channel_covariance)
+        self.channel_weights = None if channel_weights is None else weights_of(channel_weights)
+        self.epsilon = epsilon_of(epsilon)
+        self.min_eigenvalue = None if min_eigenvalue is None else positive_scalar("min_eigenvalue", min_eigenvalue)
+        self.photometric = photometric
+
+    def resolve(
+        self,
+        source: PointCloud,
+        target: PointCloud,
+        geometries: Geometries | None = None,
+    ) -> MultiChannelGICP:
+        """The method with unset parameters chosen from the data; constants to autodiff.
+
+        σ, the noise of a channel, is the median over both clouds' points of the residual deviation of linear fits in
+        the tangent plane. Noise alone gives the difference of two measurements the variance 2 σ². In real scans its
+        standard deviation is 1.5 times that, because of edges and changes: Λ = 2 (1.5 σ)². α = 2.5 spacing/σ; the
+        spacing is the target's median nearest-neighbour distance. A difference of one σ then weighs as much as 2.5
+        spacings, the fine `max_distance`, so that channels choose among the points within it. The α of constant
+        channels is 0.
+
+        The floor is chosen if neither it nor Λ is given. Between randomly placed points, a match has the variance 0.72
+        spacing² along each tangent axis, and 2 λ₀ along the normal, where λ₀ is the median smallest eigenvalue of the
+        neighbourhoods. The floor is ε times the ratio of the two, limited to 0.005 to 1. As λ₀ includes the
+        curvature of the surface, the true ratio may be larger, so the estimate is used to raise the floor above 0.005
+        (as for rendered scenes), but not to lower it.
+        """
+        if self.channel_covariance is not None and self.channel_weights is not None:
+            return self
+        both = local_geometries(source, target, with_channels=True) if geometries is None else geometries()
+        source, target, both, epsilon = constant((source, target, both, self.epsilon))
+        xp = numpy_for(source, target, both, epsilon)
+        sigma, uniform, across = channel_noise(source, target, both)
+        spacing = point_spacing(target)
+        with np.errstate(over="ignore", invalid="ignore"):
+            within = xp.asarray(epsilon, spacing.dtype) * _MATCH_VARIANCE * spacing**2
+            smooth = ~(2 * across > within)
+            floor = xp.where(smooth, 1, xp.maximum(within / xp.where(smooth, 1, 2 * across), _MIN_EIGENVALUE))
+            numbers = [2 * (_SPREAD * sigma) ** 2, xp.where(uniform, 0, _OFFSET_PER_SIGMA * spacing / sigma), floor]
+        covariance, weights, floor = (jax.device_put(xp.asarray(number, epsilon.dtype)) for number in numbers)
+        if self.channel_covariance is not None or self.min_eigenvalue is not None:
+            floor = self.min_eigenvalue
+        if self.channel_covariance is not None:
+            covariance = self.channel_covariance
+        if self.channel_weights is not None:
+            weights = self.channel_weights
+        return eqx.tree_at(
+            lambda method: (method.channel_covariance, method.channel_weights, method.min_eigenvalue),
+            self,
+            (covariance, weights, floor),
+            is_leaf=lambda leaf: leaf is None,
+        )
+
+    def terms(
+        self, source: PointCloud, target: PointCloud, robust: AbstractKernel | None, equalize_channels: bool
+    ) -> tuple[AbstractTerm, ...]:
+        count = source.channels.shape[-1]
+        if not self.photometric or count == 0:
+            return super().terms(source, target, robust, equalize_channels)
+        spacing, weights = constant((point_spacing(target), self.weights(count)))
+        # The scale of `robust` is that of the photometric residuals, not of the Mahalanobis distance.
+        return (Photometric.before_estimate(spacing, weights, Mahalanobis(self), robust, equalize_channels),)
+
+    def covariance(self, around: Neighborhoods, local: LocalGeometry | None) -> Float[Array, "6 n"]:
+        given = around.given_covariance
+        if given is not None:
+            return given
+        if self.channel_covariance is None:
+            raise ValueError("channel_covariance: not chosen yet; call method.resolve(source, target) first")
+        if around.near is None:
+            raise ValueError(NO_NEIGHBORS)
+        local, dtype = known_geometry(local), around.own.dtype
+        epsilon, covariance = self.epsilon.astype(dtype), self.channel_covariance.astype(dtype)
+        check_covariance_fits(covariance, around.num_channels)
+        if around.num_channels == 0:
+            return plane_covariance(local, epsilon)
+        floor = jnp.asarray(_MIN_EIGENVALUE if self.min_eigenvalue is None else self.min_eigenvalue, dtype)
+        return multichannel_covariance(around, local, channel_kernel(around, covariance), epsilon, floor)
+
+    def weights(self, num_channels: int) -> Float[AnyArray, "C"]:
+        if self.channel_weights is None:
+            raise ValueError("channel_weights: not chosen yet; call method.resolve(source, target) first")
+        return per_channel("channel_weights", self.channel_weights, num_channels)
+
+    def missing_variances(self, num_channels: int) -> Float[AnyArray, "C"]:
+        if self.channel_covariance is None:
+            raise ValueError("channel_covariance: not chosen yet; call method.resolve(source, target) first")
+        xp = numpy_for(self.channel_covariance)
+        covariance = xp.asarray(self.channel_covariance)
+        check_covariance_fits(covariance, num_channels)
+        return xp.broadcast_to(xp.diagonal(covariance) if covariance.ndim == 2 else covariance, (num_channels,))

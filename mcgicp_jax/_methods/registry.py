@@ -1,0 +1,36 @@
+"""All registration methods by name."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from types import MappingProxyType
+from typing import Any, NamedTuple
+
+from mcgicp_jax._methods.base import AbstractMethod
+from mcgicp_jax._methods.gicp import GICP
+from mcgicp_jax._methods.icp import ColorICP, PointToPlane, PointToPoint
+from mcgicp_jax._methods.multichannel_gicp import MultiChannelGICP
+from mcgicp_jax._methods.ndt import D2DNDT, NDT, ColorNDT
+
+
+class RegisteredMethod(NamedTuple):
+    """A class of methods, with the arguments that make it the one of that name."""
+
+    kind: type[AbstractMethod]
+    arguments: Mapping[str, Any] = MappingProxyType({})
+
+    def __call__(self, **parameters: Any) -> AbstractMethod:
+        return self.kind(**self.arguments, **parameters)
+
+
+METHODS = {
+    "mc-gicp": RegisteredMethod(MultiChannelGICP),
+    "photometric-gicp": RegisteredMethod(MultiChannelGICP, {"photometric": True}),
+    "gicp": RegisteredMethod(GICP),
+    "color-icp": RegisteredMethod(ColorICP),
+    "point-to-plane": RegisteredMethod(PointToPlane),
+    "point-to-point": RegisteredMethod(PointToPoint),
+    "ndt": RegisteredMethod(NDT),
+    "color-ndt": RegisteredMethod(ColorNDT),
+    "d2d-ndt": RegisteredMethod(D2DNDT),
+}

@@ -1,0 +1,219 @@
+"""Surfaces of clouds for one method, computed from neighbourhoods or from covariances given with a cloud."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import cache, partial
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float
+
+from mcgicp_jax._clouds.point_cloud import PointCloud
+from mcgicp_jax._compute.blocks import map_rows
+from mcgicp_jax._compute.cache import cached_with
+from mcgicp_jax._compute.concrete import is_concrete, numpy_for
+from mcgicp_jax._compute.packing import layout_of, packed, unpacked
+from mcgicp_jax._compute.threads import side_by_side
+from mcgicp_jax._local_geometry.cells import geometry_of_cells
+from mcgicp_jax._local_geometry.local_geometry import LocalGeometry
+from mcgicp_jax._local_geometry.local_statistics import joined, local_geometries, over_rows, share_a_body, split
+from mcgicp_jax._local_geometry.neighborhoods import Neighborhoods, gatherer, points_alone
+from mcgicp_jax._local_geometry.observability import channel_observability
+from mcgicp_jax._local_geometry.surface import Surface, SurfaceNoise
+from mcgicp_jax._math import symmetric_matrices as alg
+from mcgicp_jax._math.robust_kernels import AbstractKernel
+from mcgicp_jax._methods.base import AbstractMethod
+from mcgicp_jax._search.base import SearchPoints
+from mcgicp_jax._terms.base import AbstractTerm
+
+# The terms that need columns of their own, by class: columns do not depend on the numbers of a term.
+Kinds = tuple[type[AbstractTerm], ...]
+
+
+class SurfacePair(NamedTuple):
+    """Two clouds as the input of a registration.
+
+    Attributes:
+        method: with its unset parameters chosen from the data.
+        terms: the residuals of each correspondence.
+        source, target: the surfaces of both clouds.
+    """
+
+    method: AbstractMethod
+    terms: tuple[AbstractTerm, ...]
+    source: Surface
+    target: Surface
+
+
+def surface_pair(
+    method: AbstractMethod,
+    source: PointCloud,
+    target: PointCloud,
+    *,
+    observed: bool,
+    robust: AbstractKernel | None = None,
+    equalize_channels: bool = False,
+    num_threads: int | None = 1,
+) -> SurfacePair:
+    """Choose unset parameters from two clouds, and compute their surfaces.
+
+    Concrete clouds are processed on the host in blocks, and the results cached with each cloud. Inside transformations
+    both clouds share one compiled body, unless they are large.
+
+    Args:
+        observed: whether to compute observability, which `register` needs and the cost of given matches does not.
+        robust, equalize_channels: as in `AbstractMethod.terms`.
+        num_threads: largest number of threads on the host; None for no limit.
+    """
+    geometries = cache(partial(local_geometries, source, target, method.uses_channels, num_threads))
+    method = method.resolve(source, target, geometries)
+    terms = method.terms(source, target, robust, equalize_channels)
+    kinds = tuple(type(term) for term in terms if term.name)
+    locals: tuple[Any, Any] = (None, None)
+    # Raises an error if observability is needed and a cloud has no neighbours.
+    if observed or (source.neighbors is not None and target.neighbors is not None):
+        locals = geometries()
+    sides = list(zip((source, target), locals, strict=True))
+    if is_concrete(method, source, target):
+        calls = [
+            partial(surface_on_host, method, kinds, cloud, local, observed, num_threads) for cloud, local in sides[::-1]
+        ]
+        of_target, of_source = side_by_side(calls, num_threads)
+        return SurfacePair(method, terms, of_source, of_target)
+    surfaces = _traced(method, kinds, source, target, locals, observed)
+    of_source, of_target = (
+        surface._replace(search=searchable(method, cloud))
+        for surface, cloud in zip(surfaces, (source, target), strict=True)
+    )
+    return SurfacePair(method, terms, of_source, of_target)
+
+
+def covariances_of(method: AbstractMethod, cloud: PointCloud) -> Float[np.ndarray, "N 3 3"]:
+    """Covariances of a method at the points of a concrete cloud; unset parameters are chosen from the cloud."""
+    surface = surface_pair(method, cloud, cloud, observed=False).source
+    return np.asarray(alg.matrix_from_symmetric(jnp.asarray(surface.covariance.T)))
+
+
+def searchable(method: AbstractMethod, cloud: PointCloud) -> SearchPoints:
+    """The cloud as the input of a search: positions, descriptors α · channel, and penalties for missing channels."""
+    xp = numpy_for(method, cloud)
+    points, channels = xp.asarray(cloud.points), xp.asarray(cloud.channels)
+    weights = method.weights(channels.shape[-1])
+    if weights is None:
+        return SearchPoints(points, xp.zeros((points.shape[0], 0), points.dtype), xp.asarray(cloud.valid))
+    weights, penalty = xp.asarray(weights), None
+    if cloud.channel_valid is not None:
+        # The expected squared difference in a true match: on average, a missing channel makes a match neither nearer
+        # nor farther.
+        with np.errstate(over="ignore", invalid="ignore"):
+            expected = weights**2 * xp.asarray(method.missing_variances(channels.shape[-1]))
+        penalty = xp.where(xp.asarray(cloud.channel_valid), 0, expected.astype(points.dtype))
+    return SearchPoints(points, channels * weights.astype(points.dtype), xp.asarray(cloud.valid), penalty)
+
+
+def surface_on_host(
+    method: AbstractMethod,
+    kinds: Kinds,
+    cloud: PointCloud,
+    local: LocalGeometry | None,
+    observed: bool,
+    num_threads: int | None,
+) -> Surface:
+    """The surface of a concrete cloud as NumPy arrays, cached for this cloud and method."""
+
+    def make() -> Surface:
+        gather = _gatherer(method, cloud, local is not None, np)
+
+        def block(rows: Any) -> Surface:
+            here = None if local is None else jax.tree.map(lambda array: array[rows], local)
+            return _surface_of_block(method, kinds, gather(rows), here, observed)
+
+        surface = map_rows(block, cloud.points.shape[0], num_threads)
+        # Side by side in one array, from which the executor on the host gathers rows.
+        columns = surface._replace(noise=None)
+        columns = unpacked(packed(columns), layout_of(columns))
+        return columns._replace(noise=surface.noise, search=searchable(method, cloud))
+
+    leaves, structure = jax.tree.flatten(method)
+    key = (structure, *(np.asarray(leaf).tobytes() for leaf in leaves), kinds, observed)
+    return cached_with(cloud, "surface", key, make)
+
+
+def _gatherer(method: AbstractMethod, cloud: PointCloud, preprocessed: bool, xp: Any) -> Callable[[Any], Neighborhoods]:
+    if method.uses_neighborhoods and preprocessed:
+        return gatherer(cloud, method.uses_channels, xp, with_given=True)
+    return points_alone(cloud, xp)
+
+
+def _traced(
+    method: AbstractMethod,
+    kinds: Kinds,
+    source: PointCloud,
+    target: PointCloud,
+    locals: tuple[LocalGeometry | None, LocalGeometry | None],
+    observed: bool,
+) -> tuple[Surface, Surface]:
+    """Both surfaces, from one compiled body if both clouds have the same inputs and are not large."""
+    alike = None not in locals and (source.covariances is None) == (target.covariances is None)
+    if not alike or not share_a_body(source, target):
+        of_source, of_target = (
+            _whole(method, kinds, cloud, local, observed) for cloud, local in zip((source, target), locals, strict=True)
+        )
+        return of_source, of_target
+    cloud = joined(source, target, method.uses_channels)
+    if source.covariances is not None:
+        given = jnp.concatenate([jnp.asarray(cloud.covariances) for cloud in (source, target)])
+        cloud = cloud.replace_rows(covariances=given)
+    local = jax.tree.map(lambda *rows: jnp.concatenate(rows), *locals)
+    return split(_whole(method, kinds, cloud, local, observed), source.points.shape[0])
+
+
+def _whole(
+    method: AbstractMethod, kinds: Kinds, cloud: PointCloud, local: LocalGeometry | None, observed: bool
+) -> Surface:
+    gather = _gatherer(method, cloud, local is not None, jnp)
+
+    def surface(rows: Any) -> Surface:
+        here = None if local is None else jax.tree.map(lambda array: jnp.asarray(array)[rows], local)
+        return surface_of(method, kinds, gather(rows), here, observed)
+
+    return over_rows(surface, cloud.points.shape[0])
+
+
+def surface_of(
+    method: AbstractMethod, kinds: Kinds, around: Neighborhoods, local: LocalGeometry | None, observed: bool
+) -> Surface:
+    """The surface at n points, without `search`.
+
+    Args:
+        around, local: as of `AbstractMethod.covariance`.
+        observed: as of `surface_pair`.
+    """
+    given = around.given_covariance
+    if local is not None and method.needs_covariances and given is not None:
+        local = geometry_of_cells(local, given, method.num_candidates)
+    surface = Surface(
+        points=jnp.asarray(around.own).T,
+        covariance=method.covariance(around, local).T,
+        observability=None,
+        channel_observability=None,
+        columns={kind.name: kind.columns(around, local) for kind in kinds},
+    )
+    if not observed or local is None:
+        return surface
+    by_channels, noise = None, jnp.zeros_like(around.own[0])
+    if method.uses_channels and local.fits.residual.shape[1]:
+        weights = jax.lax.stop_gradient(method.weights(local.fits.residual.shape[1]))
+        by_channels, noise = channel_observability(local.fits, local.normal, jnp.asarray(weights, around.own.dtype))
+        by_channels = by_channels.T
+    # Observability is constant to autodiff.
+    by_shape, by_channels, details = jax.lax.stop_gradient(
+        (local.observability, by_channels, SurfaceNoise(noise, local.normal, local.roughness, local.reach))
+    )
+    return surface._replace(observability=by_shape, channel_observability=by_channels, noise=details)
+
+
+_surface_of_block = partial(jax.jit, static_argnums=(1, 4))(surface_of)

@@ -1,0 +1,189 @@
+"""One pair of a batch: how it is prepared and registered, alone or as a lane of a vectorised program."""
+
+from __future__ import annotations
+
+import collections
+import warnings
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import Executor, Future, ThreadPoolExecutor
+from dataclasses import dataclass, replace
+from typing import Any, Literal, TypeAlias
+
+import equinox as eqx
+import jax
+import numpy as np
+
+from mcgicp_jax._clouds.point_cloud import PointCloud, Values
+from mcgicp_jax._clouds.preprocess import preprocess
+from mcgicp_jax._compute.argument_checks import errors_named
+from mcgicp_jax._compute.size_classes import size_class
+from mcgicp_jax._compute.threads import with_settings
+from mcgicp_jax._math.poses import Pose
+from mcgicp_jax._methods.base import AbstractMethod
+from mcgicp_jax._pairs.register import register_from, start_from_anywhere
+from mcgicp_jax._registration.make_result import registration_of
+from mcgicp_jax._registration.options import Options
+from mcgicp_jax._registration.register_pair import pose_problem
+from mcgicp_jax._registration.result import Registration, Status, computed
+from mcgicp_jax._registration.step import Problem
+from mcgicp_jax._registration.vectorized import run_problems
+from mcgicp_jax._search.base import AbstractSearch
+from mcgicp_jax._search.brute_force import DenseSearch, default_search
+
+Cloud: TypeAlias = PointCloud | Values | Callable[[], PointCloud | Values]
+
+
+class PairWarning(UserWarning):
+    """A pair of a batch could not be registered.
+
+    Attributes:
+        index: of the pair, from 0.
+        reason: why the pair has no pose.
+    """
+
+    # Not arguments of the constructor: code that copies or repeats warnings may construct them from a message alone.
+    index: int | None = None
+    reason: str = ""
+
+
+@dataclass(frozen=True)
+class Pair:
+    """The arguments of one pair of the batch."""
+
+    index: int
+    source: Cloud
+    target: Cloud
+    init: Pose | Literal["global"] | None
+
+
+@dataclass(frozen=True)
+class PairResult:
+    """The result of one pair, and why it has no pose (None: it has one, or the status tells)."""
+
+    index: int
+    registration: Registration
+    reason: str | None = None
+
+    def with_warning(self) -> tuple[int, Registration]:
+        """Index and result; issues the `PairWarning`, if there is a reason."""
+        if self.reason is not None:
+            warning = PairWarning(f"pair {self.index}: {self.reason}")
+            warning.index, warning.reason = self.index, self.reason
+            warnings.warn(warning, stacklevel=2)
+        return self.index, self.registration
+
+
+@dataclass(frozen=True)
+class _LanePair:
+    """A pair in a lane: its index and its preprocessed clouds."""
+
+    index: int
+    source: PointCloud
+    target: PointCloud
+
+
+@dataclass(frozen=True)
+class BatchJob:
+    """The settings common to all pairs, and the work on one pair or on several."""
+
+    method: AbstractMethod
+    options: Options
+    voxel_size: float | None
+    num_neighbors: int
+
+    @property
+    def search(self) -> AbstractSearch:
+        """The requested search, or the default of the machine that registers the pair."""
+        return self.options.search or default_search(workers=1)
+
+    @property
+    def uses_lanes(self) -> bool:
+        """Whether pairs run as lanes of one vectorised program."""
+        repeated = self.options.match_channels or len(self.options.scales) > 0
+        return isinstance(self.search, DenseSearch) and not repeated
+
+    def ready(self, name: str, cloud: Cloud) -> PointCloud:
+        """The cloud, read and preprocessed if necessary; errors become a `ValueError` that starts with `name`."""
+        with errors_named(name):
+            if not isinstance(cloud, PointCloud) and callable(cloud):
+                cloud = cloud()
+            if not isinstance(cloud, PointCloud):
+                cloud = PointCloud(cloud)
+            if cloud.neighbors is None and not self.options.takes_raw(self.method, name):
+                cloud = preprocess(cloud, self.voxel_size, self.num_neighbors, search=self.search)
+            return cloud
+
+    def register_chunk(self, chunk: list[Pair]) -> list[PairResult]:
+        """Register the pairs one after the other, or in lanes."""
+        return list(self.register_in_lanes(chunk, 1)) if self.uses_lanes else [self._register(pair) for pair in chunk]
+
+    def register_in_lanes(self, pairs: Iterable[Pair], num_threads: int) -> Iterator[PairResult]:
+        """Register the pairs as lanes on this machine; threads preprocess them."""
+        with ThreadPoolExecutor(num_threads, thread_name_prefix="mcgicp") as threads:
+            rejected: list[PairResult] = []
+
+            def problems() -> Iterator[tuple[_LanePair, Problem]]:
+                for problem in _computed_ahead(threads, with_settings(self._problem), pairs, 2 * num_threads):
+                    if isinstance(problem, PairResult):
+                        rejected.append(problem)
+                    else:
+                        yield problem
+
+            limit = self.options.max_iterations
+            for ended in run_problems(problems(), self.search, limit):
+                pair = ended.key
+                result = registration_of(ended.state, ended.assessment, ended.history, pair.source, pair.target)
+                yield PairResult(pair.index, result)
+            yield from rejected
+
+    def _register(self, pair: Pair) -> PairResult:
+        try:
+            source, target = self.ready("source", pair.source), self.ready("target", pair.target)
+            options = replace(self.options, search=self.search)
+            result = register_from(source, target, self.method, pair.init, options)
+        except ValueError as error:
+            return _invalid(pair, error)
+        return PairResult(pair.index, computed(result))
+
+    def _problem(self, pair: Pair) -> PairResult | tuple[_LanePair, Problem]:
+        """The pair as input of a lane, both surfaces padded to one size class so that few programs are compiled."""
+        try:
+            source, target = self.ready("source", pair.source), self.ready("target", pair.target)
+            init = pair.init
+            if isinstance(init, str):
+                start = start_from_anywhere(init, source, target)
+                if not start.success:
+                    return PairResult(pair.index, Registration.without_pose(Status.TOO_FEW_CORRESPONDENCES))
+                init = start.matrix
+            problem, _ = pose_problem(source, target, self.method, init, self.options, num_threads=1)
+            problem = _padded(problem, size_class(max(len(source.points), len(target.points))))
+        except ValueError as error:
+            return _invalid(pair, error)
+        return _LanePair(pair.index, source, target), problem
+
+
+def _invalid(pair: Pair, error: ValueError) -> PairResult:
+    return PairResult(pair.index, Registration.without_pose(Status.INVALID_INPUT), str(error))
+
+
+def _padded(problem: Problem, size: int) -> Problem:
+    """Pad both surfaces to `size` rows; padding matches nothing."""
+
+    def grow(array: np.ndarray) -> np.ndarray:
+        return np.pad(array, [(0, size - len(array))] + [(0, 0)] * (array.ndim - 1))
+
+    source, target = (jax.tree.map(grow, surface) for surface in (problem.source, problem.target))
+    return eqx.tree_at(lambda problem: (problem.source, problem.target), problem, (source, target))
+
+
+def _computed_ahead(
+    executor: Executor, function: Callable[[Pair], Any], pairs: Iterable[Pair], count: int
+) -> Iterator[Any]:
+    """Yield `function(pair)` in order, with at most `count` calls computed ahead."""
+    futures: collections.deque[Future[Any]] = collections.deque()
+    for pair in pairs:
+        futures.append(executor.submit(function, pair))
+        if len(futures) > count:
+            yield futures.popleft().result()
+    while futures:
+        yield futures.popleft().result()

@@ -1,0 +1,172 @@
+"""The derivative of a pose, as that of a root of g(T) = Σ w JᵀM d = 0, by the implicit function theorem."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import jaxlie
+from jaxtyping import Array, Bool, Float
+
+from mcgicp_jax._math.poses import units
+from mcgicp_jax._pose_solver.matched import Matched, Motion, linearize_at
+from mcgicp_jax._pose_solver.pose_measurements import Fusion
+from mcgicp_jax._pose_solver.sums import Sums
+from mcgicp_jax._terms.base import AbstractTerm
+
+# Iteration limit. Newton's method, which starts at the pose of the loop and converges quadratically, takes 3 or 4.
+_MAX_NEWTON_STEPS = 8
+
+
+class ImplicitRoot(eqx.Module):
+    """Scaling of g(T) = Σ w Jᵀ M(R) d = 0, the equation that defines the pose and its derivative.
+
+    Every GICP recomputes M between updates, so the loop converges to a root of g, not to a minimum of the cost F. The
+    derivative of the pose follows from g, including the dependence of M and w on the pose.
+
+    Attributes:
+        center, radius: `Sums.center` and `Sums.radius` at the returned pose, metres.
+        scale: tr(Σ K) · radius²; g is divided by it to be dimensionless.
+        usable: whether a root is to be searched; if False, the derivative is zero.
+    """
+
+    center: Float[Array, "3"]
+    radius: Float[Array, ""]
+    scale: Float[Array, ""]
+    usable: Bool[Array, ""]
+
+
+def root_near(sums: Sums, usable: Bool[Array, ""], fusion: Fusion | None) -> ImplicitRoot:
+    """The scaling of g from the sums at the returned pose, or that of the score in `Fusion`."""
+    if fusion is not None:
+        radius = jnp.asarray(fusion.radius)
+        return ImplicitRoot(center=jnp.asarray(fusion.center), radius=radius, scale=radius, usable=usable)
+    radius = jnp.where(usable, sums.radius, 1)
+    # The trace of Σ K, in the unit of g.
+    scale = jnp.sum(sums.stiffness[jnp.array([0, 3, 5]), 9]) * radius**2
+    return ImplicitRoot(
+        center=jnp.where(usable, sums.center, 0), radius=radius, scale=jnp.where(usable, scale, 1), usable=usable
+    )
+
+
+class Model(NamedTuple):
+    """All that g depends on and that is differentiated; `fusion` with tie points or a prior."""
+
+    matched: Matched
+    terms: tuple[AbstractTerm, ...]
+    fusion: Fusion | None
+
+
+@jax.custom_jvp
+def with_derivative(pose: Float[Array, "7"], root: ImplicitRoot, model: Model) -> Float[Array, "7"]:
+    """Return the pose, with the derivative −(∂g/∂ξ)⁻¹ ∂g/∂θ of the nearby root of g (implicit function theorem).
+
+    The derivative is evaluated at the root, which Newton's method finds from the pose. It is zero if `root.usable` is
+    False or Newton's method does not converge. A second derivative raises `NotImplementedError`.
+
+    Args:
+        pose: `jaxlie.SE3.wxyz_xyz`; a constant to autodiff.
+        model: θ, which carries everything that is differentiated.
+    """
+    return pose
+
+
+def _with_derivative_jvp(
+    primals: tuple[Float[Array, "7"], ImplicitRoot, Model], tangents: tuple[Any, Any, Any]
+) -> tuple[Float[Array, "7"], Float[Array, "7"]]:
+    pose, root, model = primals
+    leaves, structure = jax.tree.flatten(model)
+    slopes = jax.tree.leaves(tangents[2], is_leaf=_is_symbolic_zero)
+    moving = [i for i, slope in enumerate(slopes) if not _is_symbolic_zero(slope)]
+    if not moving:
+        return pose, jnp.zeros_like(pose)
+    leaves = [_once(leaf) if jnp.issubdtype(leaf.dtype, jnp.inexact) else leaf for leaf in leaves]
+    constants = jax.lax.stop_gradient((pose, root, leaves))
+    at_root, inverse, found = _newton(constants[0], constants[1], jax.tree.unflatten(structure, constants[2]))
+
+    def balance_of(values: list[Array]) -> Float[Array, "6"]:
+        changed = list(constants[2])
+        for i, value in zip(moving, values, strict=True):
+            changed[i] = value
+        return _balance(jnp.zeros_like(at_root[:6]), at_root, constants[1], jax.tree.unflatten(structure, changed))
+
+    _, change = jax.jvp(balance_of, ([leaves[i] for i in moving],), ([slopes[i] for i in moving],))
+    twist = jnp.where(found, -inverse @ change, 0) * units(constants[1].radius)
+    return pose, _along(constants[0], twist, constants[1].center)
+
+
+with_derivative.defjvp(_with_derivative_jvp, symbolic_zeros=True)
+
+
+@jax.custom_jvp
+def _once(value: Array) -> Array:
+    """The value, which a derivative has been computed at: a second derivative would be wrong, and is refused."""
+    return value
+
+
+def _once_jvp(primals: tuple[Array], tangents: tuple[Any]) -> tuple[Array, Any]:
+    if not _is_symbolic_zero(tangents[0]):
+        raise NotImplementedError("poses of register and align have first derivatives only, not second ones")
+    return primals[0], jnp.zeros_like(primals[0])
+
+
+_once.defjvp(_once_jvp, symbolic_zeros=True)
+
+
+def _along(pose: Float[Array, "7"], twist: Float[Array, "6"], center: Float[Array, "3"]) -> Float[Array, "7"]:
+    """First-order change of the pose parameters `wxyz_xyz` along a twist about a centre; linear in the twist."""
+    rotation = jaxlie.SO3(jnp.append(jnp.zeros(1, twist.dtype), 0.5 * twist[3:])) @ jaxlie.SO3(pose[:4])
+    translation = twist[:3] + jnp.cross(twist[3:], pose[4:] - center)
+    return jnp.concatenate([rotation.wxyz.astype(pose.dtype), translation])
+
+
+def _is_symbolic_zero(tangent: object) -> bool:
+    return isinstance(tangent, jax.custom_derivatives.SymbolicZero)
+
+
+def _newton(
+    pose: Float[Array, "7"], root: ImplicitRoot, model: Model
+) -> tuple[Float[Array, "7"], Float[Array, "6 6"], Bool[Array, ""]]:
+    """The root of g near a pose, (∂g/∂ξ)⁻¹ before the last step, and whether Newton's method converged."""
+    eps = float(jnp.finfo(pose.dtype).eps)
+    identity = jnp.eye(6, dtype=pose.dtype)
+
+    def step(carry: tuple[Array, Array, Array, Array]) -> tuple[Array, Array, Array, Array]:
+        count, pose, _, _ = carry
+        balance, push = jax.linearize(lambda twist: _balance(twist, pose, root, model), jnp.zeros_like(pose[:6]))
+        jacobian = jnp.where(root.usable, jax.vmap(push, out_axes=1)(identity), identity)
+        inverse = jnp.linalg.inv(jacobian)
+        twist = jnp.where(root.usable, -inverse @ balance, 0)
+        moved = pose + _along(pose, twist * units(root.radius), root.center)
+        moved = moved.at[:4].divide(jnp.sqrt(jnp.sum(moved[:4] ** 2)))
+        return count + 1, moved, inverse, jnp.max(jnp.abs(twist))
+
+    def unfinished(carry: tuple[Array, Array, Array, Array]) -> Bool[Array, ""]:
+        count, _, _, size = carry
+        # Convergence is quadratic: after a step below √eps the remaining error is rounding.
+        return (count < _MAX_NEWTON_STEPS) & ~(size <= jnp.sqrt(eps))
+
+    start = jnp.int32(0), pose, identity, jnp.asarray(jnp.inf, pose.dtype)
+    _, at_root, inverse, size = jax.lax.while_loop(unfinished, step, start)
+    return at_root, inverse, root.usable & (size <= jnp.sqrt(eps))
+
+
+def _balance(twist: Float[Array, "6"], pose: Float[Array, "7"], root: ImplicitRoot, model: Model) -> Float[Array, "6"]:
+    """g / scale, sums of forces and torques, at a pose moved to first order along a twist (in units of the radius).
+
+    With tie points or a prior, that of `Fusion`.
+    """
+    matched, terms, fusion = model
+    rotation = jaxlie.SO3(pose[:4]).as_matrix().astype(pose.dtype)
+    v, omega = twist[:3] * root.radius, twist[3:]
+    turned = rotation + jnp.cross(omega[:, None], rotation, axis=0)
+    translation = pose[4:] + v + jnp.cross(omega, pose[4:] - root.center)
+    # Without a usable root, ignoring all correspondences keeps values and derivatives finite.
+    matched = eqx.tree_at(lambda matched: matched.valid, matched, matched.valid & root.usable)
+    moved, found, _ = linearize_at(Motion(turned, translation), matched, terms)
+    arms = jnp.where(matched.valid, moved - root.center[:, None], 0)
+    torque = jnp.cross(arms, found.force, axis=0)
+    score = jnp.concatenate([jnp.sum(found.force, axis=1) * root.radius, jnp.sum(torque, axis=1)]) / root.scale
+    return score if fusion is None else fusion.balance(score, turned, translation)

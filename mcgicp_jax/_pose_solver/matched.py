@@ -1,0 +1,128 @@
+"""Matched points: the rows of both surfaces side by side."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+from mcgicp_jax._compute.concrete import AnyArray, AnyScalar
+from mcgicp_jax._local_geometry.surface import Surface
+from mcgicp_jax._math import symmetric_matrices as alg
+from mcgicp_jax._search.base import Correspondences, SearchPoints
+from mcgicp_jax._terms.base import AbstractTerm, Linearization, linearize
+
+
+class Motion(NamedTuple):
+    """A pose as the matrix and the vector that points are moved by.
+
+    Attributes:
+        rotation, translation: of T_target_source; the latter in metres.
+    """
+
+    rotation: Float[AnyArray, "3 3"]
+    translation: Float[AnyArray, "3"]
+
+    def move(self, points: Float[AnyArray, "n 3"]) -> Float[Array, "3 n"]:
+        """T a for each point, metres."""
+        return jnp.dot(self.rotation, jnp.asarray(points).T, precision="highest") + self.translation[:, None]
+
+
+class Matched(eqx.Module):
+    """Both sides of n correspondences; n = m N for m candidates of N source points.
+
+    Attributes:
+        source, target: rows of the surfaces; the first candidates of all source points come first.
+        valid: (n,) False for correspondences to ignore.
+        apart: (n,) squared distance of the descriptors α · channel, metres²; only for soft assignment.
+        temperature: of the soft assignment, metres; None otherwise.
+        num_candidates: m.
+    """
+
+    source: Surface
+    target: Surface
+    valid: Bool[AnyArray, "n"]
+    apart: Float[AnyArray, "n"] | None = None
+    temperature: Float[AnyScalar, ""] | None = None
+    num_candidates: int = eqx.field(static=True, default=1)
+
+    def within(self, moved: Float[Array, "3 n"], max_distance: Float[Array, ""]) -> Matched:
+        """Without the matches that are further apart; `moved` is T a."""
+        _, near = distances_within(moved, self.target.points, max_distance)
+        return eqx.tree_at(lambda matched: matched.valid, self, self.valid & near)
+
+
+def match_surfaces(
+    source: Surface,
+    target: Surface,
+    matches: Correspondences,
+    temperature: Float[Array, ""] | None = None,
+    with_search: bool = False,
+) -> Matched:
+    """Gather the matched rows of both surfaces; pure JAX. Without the inputs of the search, unless asked for."""
+    size = source.num_points
+    indices, valid = jnp.asarray(matches.indices).reshape(-1), jnp.asarray(matches.valid).reshape(-1)
+    num_candidates = indices.size // size
+    tiled = source
+    if num_candidates > 1:
+        tiled = jax.tree.map(lambda rows: jnp.concatenate([rows] * num_candidates), source)
+    apart = None if temperature is None else _square_apart(tiled.search, target.search, indices)
+    if not with_search:
+        tiled, target = tiled._replace(search=None), target._replace(search=None)
+    tiled, target = jax.tree.map(jnp.asarray, (tiled, target))
+    return Matched(tiled, surface_rows(target, indices), valid, apart, temperature, num_candidates)
+
+
+def surface_rows(surface: Surface, rows: Any) -> Surface:
+    """Some rows of a surface."""
+    return jax.tree.map(lambda array: array[rows], surface)
+
+
+def distances_within(
+    moved: Float[Array, "3 n"], target: Float[Array, "n 3"], max_distance: Float[Array, ""]
+) -> tuple[Float[Array, "n"], Bool[Array, "n"]]:
+    """Distance of each match, and whether it is at most `max_distance`, both in metres of position: channels affect
+    which match is found, but not whether it is accepted."""
+    apart = target.T - moved
+    distances = jnp.sqrt(alg.inner(apart, apart))
+    return distances, distances <= max_distance
+
+
+def _square_apart(
+    source: SearchPoints | None, target: SearchPoints | None, indices: Int[Array, "n"]
+) -> Float[Array, "n"]:
+    """Squared distance of the descriptors, with the penalties for missing channels, metres²."""
+    if source is None or target is None:
+        raise ValueError("temperature: expected surfaces with the inputs of the search")
+    square = (jnp.asarray(source.descriptors) - jnp.asarray(target.descriptors)[indices]) ** 2
+    penalties = (source.penalty, None if target.penalty is None else jnp.asarray(target.penalty)[indices])
+    for penalty in penalties:
+        if penalty is not None:
+            square = jnp.where(penalty > 0, penalty, square)
+    return jnp.sum(square, axis=1)
+
+
+def linearize_at(
+    motion: Motion, matched: Matched, terms: tuple[AbstractTerm, ...]
+) -> tuple[Float[Array, "3 n"], Linearization, Float[Array, "n"]]:
+    """T a, the sum of the terms at a pose, and the soft-assignment weights (1 for valid and 0 for invalid matches)."""
+    moved = motion.move(matched.source.points)
+    found = linearize(terms, matched.source, matched.target, moved, motion.rotation, matched.valid)
+    counts = jnp.asarray(matched.valid).astype(moved.dtype)
+    if matched.temperature is not None and matched.apart is not None:
+        far = alg.inner(found.residual, found.residual) + matched.apart
+        shape = (matched.num_candidates, -1)
+        counts = _softmax((-0.5 * far / matched.temperature**2).reshape(shape), matched.valid.reshape(shape))
+    return moved, found.scaled(counts), counts
+
+
+def _softmax(logits: Float[Array, "m N"], valid: Bool[Array, "m N"]) -> Float[Array, "n"]:
+    """Softmax over the valid candidates of each source point; 0 for source points without any."""
+    highest = jax.lax.stop_gradient(jnp.max(jnp.where(valid, logits, -jnp.inf), axis=0))
+    shifted = jnp.where(valid, logits - jnp.where(jnp.isfinite(highest), highest, 0), 0)
+    exponentials = jnp.where(valid, jnp.exp(shifted), 0)
+    total = jnp.sum(exponentials, axis=0)
+    return (exponentials / jnp.where(total > 0, total, 1)).reshape(-1)

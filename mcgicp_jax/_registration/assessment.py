@@ -1,0 +1,144 @@
+"""Certainty of the final pose: information matrix, unconstrained directions and covariance."""
+
+from __future__ import annotations
+
+from functools import partial
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from mcgicp_jax._compute.concrete import AnyArray, is_concrete, numpy_for
+from mcgicp_jax._compute.lazy import Lazy
+from mcgicp_jax._local_geometry.surface import searched
+from mcgicp_jax._math.poses import adjoint_to_center, units
+from mcgicp_jax._math.statistics import sampled_rows
+from mcgicp_jax._pose_solver.adaptation import sample_of_term
+from mcgicp_jax._pose_solver.covariance import (
+    Frame,
+    Moments,
+    discounts,
+    moments_from,
+    noise_sample,
+    sandwich,
+)
+from mcgicp_jax._pose_solver.degeneracy import directions_at_source
+from mcgicp_jax._pose_solver.fusion import fused_covariance
+from mcgicp_jax._pose_solver.matched import Motion
+from mcgicp_jax._pose_solver.pose_measurements import Fusion
+from mcgicp_jax._registration.loop import AbstractExecutor, LoopResult
+from mcgicp_jax._registration.result import Constraints, Status
+from mcgicp_jax._registration.step import State
+from mcgicp_jax._terms.base import AbstractTerm, is_adaptive
+
+
+class Assessment(NamedTuple):
+    """Certainty of the final pose, deferred where the arrays are concrete."""
+
+    constraints: Lazy[Constraints]
+    covariance: Lazy[Float[AnyArray, "*batch 6 6"]]
+
+
+def assessment_of(executor: AbstractExecutor, loop: LoopResult, moments: Lazy[Moments] | None) -> Assessment:
+    """The assessment of a loop that has ended.
+
+    Args:
+        moments: `moments_of` the loop; None for a problem with tie points or a prior, which brings its own.
+    """
+    state, fusion = loop.state, executor.problem.fusion
+
+    def covariance() -> Float[AnyArray, "6 6"]:
+        known: Any = fusion if moments is None else moments.value
+        if not is_concrete(state, known):
+            return covariance_of_pose(state, known)
+        # In float64: beside the variances of unconstrained directions, those of the others would be lost to rounding.
+        with jax.enable_x64(True):
+            return np.asarray(covariance_of_pose(*as_float64((state._replace(record=None), known))))
+
+    constraints = partial(constraints_of, state)
+    if is_concrete(state):
+        return Assessment(Lazy(constraints), Lazy(covariance))
+    return Assessment(Lazy.of(constraints()), Lazy.of(covariance()))
+
+
+def moments_of(executor: AbstractExecutor, loop: LoopResult, rematched: bool) -> Moments:
+    """Sums over the scores of all correspondences at the final pose.
+
+    Args:
+        rematched: whether matches follow when the pose moves; False if they are fixed.
+    """
+    problem, state = executor.problem, loop.state
+    motion, surface = executor.motion(state.pose), executor.source_of(loop.matches)
+    size = surface.num_points
+    frame = Frame(state.sums.center, state.sums.radius, np.ones(2, surface.points.dtype), np.int32(size))
+    if surface.noise is not None and problem.target.noise is not None:
+        frame = frame._replace(discount=_discounts(executor, motion, loop.matches))
+    responding = _responding(executor, motion, loop) if rematched and is_adaptive(loop.terms) else None
+    scores = executor.scores(motion, loop.matches, frame, loop.terms, responding)
+    return moments_from(scores, size)
+
+
+def _discounts(executor: AbstractExecutor, motion: Motion, matches: Any) -> Float[AnyArray, "2"]:
+    search = searched(executor.source_of(matches))
+    rows, counts = sampled_rows(search.valid)
+    xp = numpy_for(counts)
+    sample = executor.over_rows(noise_sample, motion, executor.nearest(motion, matches), rows, with_noise=True)
+    sample = jax.tree.map(lambda column: xp.where(counts, column, np.asarray(np.nan, column.dtype)), sample)
+    return discounts(sample, xp.sum(xp.any(search.descriptors != 0, axis=0)))
+
+
+def _responding(executor: AbstractExecutor, motion: Motion, loop: LoopResult) -> tuple[AbstractTerm, ...]:
+    """The terms with their response, from a sample of the source points that is shifted and matched anew."""
+    rows, counts = sampled_rows(searched(executor.problem.source).valid)
+
+    def responding(term: AbstractTerm) -> AbstractTerm:
+        def sample(shift: Float[AnyArray, "3"]) -> Any:
+            shifted = motion._replace(translation=motion.translation + shift)
+            return executor.over_rematched(sample_of_term, shifted, loop.state.pose, rows, counts, term)
+
+        return term.with_response(executor.each(sample, term.shifts))
+
+    with np.errstate(over="ignore", invalid="ignore"):
+        return tuple(responding(term) if term.is_adaptive else term for term in loop.terms)
+
+
+def as_float64(tree: Any) -> Any:
+    """The arrays as NumPy arrays, float64 instead of float32."""
+
+    def convert(leaf: Any) -> np.ndarray:
+        array = np.asarray(leaf)
+        return array.astype(np.float64) if array.dtype == np.float32 else array
+
+    return jax.tree.map(convert, tree)
+
+
+@jax.jit
+def constraints_of(state: State) -> Constraints:
+    """Information matrix and directions at the final pose, for ξ in T exp(ξ), metres and radians."""
+    sums, directions = state.sums, state.directions
+    with jax.default_matmul_precision("highest"):
+        adjoint = adjoint_to_center(state.pose, sums.center) / units(sums.radius)[:, None]
+        information = adjoint.T @ (state.information * sums.radius**2) @ adjoint
+        at_source = None if directions is None else directions_at_source(directions, state.pose)
+        return Constraints(information, at_source)
+
+
+@jax.jit
+def covariance_of_pose(state: State, known: Moments | Fusion) -> Float[Array, "6 6"]:
+    """Covariance of the final pose, for ξ in T exp(ξ), metres and radians; NaN if the status allows none.
+
+    Args:
+        known: sums over the scores; with tie points or a prior, those of the registration before, in `Fusion`.
+    """
+    found = (state.status != Status.TOO_FEW_CORRESPONDENCES) & (state.status != Status.NON_FINITE)
+    if state.directions is None:
+        found = found & (state.status != Status.DEGENERATE)
+    center, radius = state.sums.center, state.sums.radius
+    with jax.default_matmul_precision("highest"):
+        if isinstance(known, Fusion):
+            covariance = fused_covariance(state.pose, known)
+        else:
+            covariance = sandwich(state.pose, center, radius, known, state.directions)
+    return jnp.where(found, covariance, jnp.nan)

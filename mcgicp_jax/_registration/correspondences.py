@@ -1,0 +1,109 @@
+"""Matches at a pose, and the search index of a cloud."""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.typing import ArrayLike
+from jaxtyping import Float, Int
+
+from mcgicp_jax._clouds.origins import centred_pose
+from mcgicp_jax._clouds.point_cloud import PointCloud
+from mcgicp_jax._compute.argument_checks import check_integer, check_positive
+from mcgicp_jax._compute.cache import cached_with
+from mcgicp_jax._compute.concrete import constant, is_concrete
+from mcgicp_jax._math.poses import Pose, se3_from_matrix
+from mcgicp_jax._methods.base import AbstractMethod
+from mcgicp_jax._methods.surfaces import searchable
+from mcgicp_jax._pose_solver.matched import Motion, distances_within
+from mcgicp_jax._registration.input_checks import check_clouds
+from mcgicp_jax._search.base import AbstractIndex, AbstractSearch, Correspondences, SearchPoints
+from mcgicp_jax._search.brute_force import default_search
+
+
+def find_correspondences(
+    source: PointCloud,
+    target: PointCloud,
+    pose: Pose | None,
+    method: AbstractMethod,
+    *,
+    max_distance: ArrayLike,
+    num_candidates: int | None = None,
+    search: AbstractSearch | None = None,
+) -> Correspondences:
+    """Find the target point nearest to each moved source point in position and α · channel (Servos & Waslander, IV-A).
+
+    Args:
+        source, target: preprocessed clouds.
+        pose: T_target_source, `jaxlie.SE3` or (4, 4); None is the identity.
+        method: defines α, the channel weights of the search; without α the search is in position alone.
+        max_distance: maximum correspondence distance, metres of position; matches beyond it are not `valid`.
+        num_candidates: m, number of target points to find for each source point; more than one for the soft assignment
+            of `align` and `mahalanobis_cost`. None: as many as the method matches, one but for NDT.
+        search: nearest-neighbour search; by default `KDTreeSearch` on CPUs and `DenseSearch` on accelerators.
+
+    Returns:
+        One match per source row; for m > 1 arrays of shape (m, N), nearest first. Constant to autodiff.
+
+    Raises:
+        ValueError: if `max_distance` is not positive, `num_candidates` is below 1, `pose` is not a rigid motion, or
+            channels or dtypes do not fit.
+    """
+    search = search or default_search()
+    check_clouds(source, target, method)
+    method = method.resolve(source, target)
+    check_positive("max_distance", max_distance)
+    num_candidates = method.num_candidates if num_candidates is None else num_candidates
+    check_integer("num_candidates", num_candidates, 1)
+    matrix = centred_pose(pose, source, target, "pose")
+    matrix, max_distance, method = constant((matrix, max_distance, method))
+    rows, target_rows = (searchable(method, constant(cloud)) for cloud in (source, target))
+    dtype = rows.points.dtype
+    start = se3_from_matrix(matrix, dtype).wxyz_xyz
+    if is_concrete(matrix, max_distance, rows, target_rows):
+        gate = float(np.asarray(max_distance))
+        nearest = index_of(search, method, target).nearest(np.asarray(start), rows, gate, num_candidates)
+        matches = _correspondences_at(np.asarray(matrix), rows, target_rows, nearest, gate)
+        return _unless_several(matches, num_candidates)
+    limit = jnp.asarray(max_distance, dtype)
+    found = search.nearest_traced(start, rows, target_rows, limit, jnp.bool_(True), num_candidates)
+    here = jnp.maximum(found, 0)
+    moved = Motion(jnp.asarray(matrix[:3, :3], dtype), jnp.asarray(matrix[:3, 3], dtype)).move(rows.points)
+    there = (found >= 0) & rows.valid & jnp.asarray(target_rows.valid)[here]
+    targets = jnp.asarray(target_rows.points)[here]
+    distances, near = (
+        jnp.stack(each) for each in zip(*(distances_within(moved, some, limit) for some in targets), strict=True)
+    )
+    valid = there & near
+    return _unless_several(Correspondences(here, distances, valid), num_candidates)
+
+
+def _unless_several(matches: Correspondences, num_candidates: int) -> Correspondences:
+    return matches if num_candidates > 1 else jax.tree.map(lambda rows: rows[0], matches)
+
+
+def _correspondences_at(
+    matrix: Float[np.ndarray, "4 4"],
+    source: SearchPoints,
+    target: SearchPoints,
+    indices: Int[np.ndarray, "m N"],
+    max_distance: float,
+) -> Correspondences:
+    """Matches at a pose, valid within `max_distance` metres of position; NumPy, so that nothing is compiled."""
+    rows, dtype = np.maximum(indices, 0), source.points.dtype
+    with np.errstate(invalid="ignore"):
+        moved = source.points.astype(np.float64) @ matrix[:3, :3].T + matrix[:3, 3]
+        distances = np.linalg.norm(target.points[rows] - moved, axis=-1).astype(dtype)
+        valid = (indices >= 0) & source.valid & target.valid[rows] & (distances <= max_distance)
+    return Correspondences(rows.astype(np.int32), distances, valid)
+
+
+def index_of(search: AbstractSearch, method: AbstractMethod, target: PointCloud) -> AbstractIndex:
+    """Search index of the target, cached while the cloud lives."""
+    count = target.channels.shape[-1]
+    numbers = [] if method.weights(count) is None else [method.weights(count)]
+    if numbers and target.channel_valid is not None:
+        numbers.append(method.missing_variances(count))
+    key = (repr(search), *(np.asarray(number).tobytes() for number in numbers))
+    return cached_with(target, "index", key, lambda: search.index(searchable(method, target)))

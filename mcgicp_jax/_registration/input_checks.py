@@ -1,0 +1,82 @@
+"""Checks of the clouds and matches of a registration."""
+
+from __future__ import annotations
+
+import warnings
+
+import numpy as np
+from jax.typing import ArrayLike
+
+from mcgicp_jax._clouds.point_cloud import PointCloud
+from mcgicp_jax._compute.concrete import is_concrete
+from mcgicp_jax._math.statistics import median, sampled_rows
+from mcgicp_jax._methods.base import AbstractMethod
+from mcgicp_jax._methods.multichannel_gicp import MultiChannelGICP
+from mcgicp_jax._registration.options import check_method
+from mcgicp_jax._search.base import Correspondences
+
+# Smallest and largest trace, relative to that of GICP's covariances (2: they are 1 within the surface), of covariances
+# given with one of the clouds, for which no warning is issued. That of cells in m² is a sixth of their squared edge.
+_LEAST_TRACE, _LARGEST_TRACE = 0.25, 4.0
+
+
+def check_clouds(source: PointCloud, target: PointCloud, method: AbstractMethod) -> None:
+    """Raise `ValueError` unless both are single clouds, of one dtype, with channels that fit the method."""
+    check_method(method)
+    for name, cloud in (("source", source), ("target", target)):
+        if cloud.points.ndim != 2:
+            raise ValueError(
+                f"{name}: expected a single cloud, got shape {cloud.points.shape}; use jax.vmap for a batch"
+            )
+    for name, cloud in (("source", source), ("target", target)):
+        if name in method.needs_covariances and cloud.covariances is None:
+            raise ValueError(
+                f"{name}: expected a cloud with covariances for {type(method).__name__}; make it with "
+                "mcgicp_jax.gaussians, or pass scales to register"
+            )
+    if method.uses_channels:
+        check_channels(source, target, method)
+        if isinstance(method, MultiChannelGICP) and source.channels.shape[-1] == 0:
+            warnings.warn("the clouds have no channels: MultiChannelGICP equals GICP", UserWarning, stacklevel=5)
+    if source.points.dtype != target.points.dtype:
+        raise ValueError(
+            f"points: expected one precision in both clouds, got {source.points.dtype} in the source and "
+            f"{target.points.dtype} in the target; make them alike before preprocess, as by points.astype(np.float32)"
+        )
+
+
+def check_channels(source: PointCloud, target: PointCloud, method: AbstractMethod) -> None:
+    if source.channels.shape[-1] != target.channels.shape[-1]:
+        raise ValueError(
+            f"channels: expected as many in the source as in the target for {type(method).__name__}, "
+            f"got {source.channels.shape[-1]} and {target.channels.shape[-1]}"
+        )
+
+
+def check_matches(
+    matches: Correspondences, source: PointCloud, method: AbstractMethod, temperature: ArrayLike | None
+) -> None:
+    """Raise `ValueError` unless there is one match per source row, or several and a positive `temperature` or a method
+    that uses several."""
+    rows = source.points.shape[0]
+    if matches.indices.ndim > 2 or matches.indices.shape[-1] != rows:
+        raise ValueError(f"matches: expected one per source row ({rows}), got shape {matches.indices.shape}")
+    if matches.indices.ndim == 2 and temperature is None and method.num_candidates == 1:
+        raise ValueError(f"temperature: expected metres to go with {matches.indices.shape[0]} candidates, got None")
+    if temperature is not None and is_concrete(temperature) and not np.asarray(temperature) > 0:
+        raise ValueError(f"temperature: expected a positive number of metres, got {temperature!r}")
+
+
+def warn_of_covariances(source: PointCloud, target: PointCloud) -> None:
+    """Warn if one cloud brings covariances whose unit is not that of GICP's, which the other one gets."""
+    for name, cloud, other in (("source", source, target), ("target", target, source)):
+        if cloud.covariances is not None and other.covariances is None:
+            rows, _ = sampled_rows(cloud.valid)
+            trace = float(median(np.trace(np.asarray(cloud.covariances)[rows], axis1=1, axis2=2)))
+            if not _LEAST_TRACE <= trace / 2 <= _LARGEST_TRACE:
+                warnings.warn(
+                    f"{name}: its covariances have a median trace of {trace:.2g}, those of GICP are dimensionless and "
+                    'have 2; for cells in m² use NDT or D2DNDT, or make them by gaussians(..., of="covariances")',
+                    UserWarning,
+                    stacklevel=4,
+                )

@@ -1,0 +1,44 @@
+"""All data sets and simulated scenes by name."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+from mcgicp_jax.datasets._box_room import box_room
+from mcgicp_jax.datasets._corridor import corridor
+from mcgicp_jax.datasets._ford import ford_campus
+from mcgicp_jax.datasets._frames import AbstractFrames
+from mcgicp_jax.datasets._kitti import kitti
+from mcgicp_jax.datasets._poster_wall import poster_wall
+from mcgicp_jax.datasets._seven_scenes import seven_scenes
+from mcgicp_jax.datasets._street import street
+from mcgicp_jax.datasets._tum_rgbd import tum_rgbd
+
+
+class Dataset(NamedTuple):
+    """A data set, or a simulated scene, with options of `odometry` that suit its sensor and its motion.
+
+    Attributes:
+        frames: function of the folder of a sequence; of the number of frames if `simulated`.
+        voxel_size: metres; None to keep all points.
+        max_distance: metres, while the pose is being found and when it is refined.
+        simulated: whether it is a simulated scene.
+    """
+
+    frames: Callable[[Any], AbstractFrames]
+    voxel_size: float | None
+    max_distance: tuple[float, float]
+    simulated: bool = False
+
+
+DATASETS = {
+    "kitti": Dataset(kitti, 0.25, (2.5, 0.6)),
+    "ford": Dataset(ford_campus, 0.25, (2.5, 0.6)),
+    "tum": Dataset(tum_rgbd, 0.03, (0.2, 0.06)),
+    "7-scenes": Dataset(seven_scenes, 0.03, (0.2, 0.06)),
+    "street": Dataset(street, 0.2, (2.0, 0.5), simulated=True),
+    "corridor": Dataset(corridor, None, (0.5, 0.25), simulated=True),
+    "box-room": Dataset(box_room, None, (0.5, 0.25), simulated=True),
+    "poster-wall": Dataset(poster_wall, None, (0.1, 0.04), simulated=True),
+}

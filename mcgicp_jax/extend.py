@@ -1,0 +1,55 @@
+"""What somebody needs who adds a method, a term, a search, a robust kernel, a reader of files or a factor.
+
+Each is one class or function:
+
+- a method: a subclass of `AbstractMethod`, or of `AbstractOneSided` or `AbstractGeneralized`, which define M;
+- a term, a further residual of each correspondence: a subclass of `AbstractTerm`, listed in `AbstractMethod.terms`;
+- a search on the host: a subclass of `AbstractTreeSearch` with `build` and `query`; any other: of `AbstractSearch`;
+- a robust kernel: a subclass of `AbstractKernel`;
+- a factor of a pose graph: a subclass of `AbstractFactor`;
+- a format of files: a function in `FORMATS`, by the ending of the name.
+
+The registries `METHODS`, `KERNELS`, `FORMATS`, `DATASETS` and `COLOR_SPACES` are what the command line offers.
+"""
+
+from mcgicp_jax._clouds.color_spaces import COLOR_SPACES
+from mcgicp_jax._local_geometry.local_geometry import LocalGeometry
+from mcgicp_jax._local_geometry.neighborhoods import Neighborhoods
+from mcgicp_jax._local_geometry.surface import Surface
+from mcgicp_jax._math import symmetric_matrices
+from mcgicp_jax._math.robust_kernels import KERNELS, AbstractKernel
+from mcgicp_jax._methods.base import AbstractGeneralized, AbstractMethod, AbstractOneSided
+from mcgicp_jax._methods.registry import METHODS
+from mcgicp_jax._pose_graph.factors import AbstractFactor
+from mcgicp_jax._search.base import AbstractIndex, AbstractSearch, Correspondences, SearchPoints
+from mcgicp_jax._search.kd_tree import AbstractTreeSearch
+from mcgicp_jax._terms.base import AbstractTerm, Linearization, linearize_residual
+from mcgicp_jax._terms.mahalanobis import Mahalanobis
+from mcgicp_jax.datasets import DATASETS
+from mcgicp_jax.io.clouds import FORMATS
+
+__all__ = [
+    "COLOR_SPACES",
+    "DATASETS",
+    "FORMATS",
+    "KERNELS",
+    "METHODS",
+    "AbstractFactor",
+    "AbstractGeneralized",
+    "AbstractIndex",
+    "AbstractKernel",
+    "AbstractMethod",
+    "AbstractOneSided",
+    "AbstractSearch",
+    "AbstractTerm",
+    "AbstractTreeSearch",
+    "Correspondences",
+    "Linearization",
+    "LocalGeometry",
+    "Mahalanobis",
+    "Neighborhoods",
+    "SearchPoints",
+    "Surface",
+    "linearize_residual",
+    "symmetric_matrices",
+]

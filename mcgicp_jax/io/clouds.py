@@ -1,0 +1,144 @@
+"""Point clouds as files; the suffix selects the format."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+from typing import BinaryIO, NamedTuple
+
+import numpy as np
+
+from mcgicp_jax._clouds.point_cloud import PointCloud
+from mcgicp_jax.io.arrays import read_kitti, read_npy, read_npz, write_kitti, write_npy, write_npz
+from mcgicp_jax.io.files import reason_of, replacing
+from mcgicp_jax.io.las import read_las, write_las
+from mcgicp_jax.io.pcd import read_pcd, write_pcd
+from mcgicp_jax.io.ply import read_ply, write_ply
+from mcgicp_jax.io.text import read_text, write_text
+
+
+class Format(NamedTuple):
+    """Functions of a file format.
+
+    Attributes:
+        read: reads a cloud from an open file, given its size in bytes.
+        write: writes a cloud without padding, with NaN for missing channels, to an open file.
+    """
+
+    read: Callable[[BinaryIO, int], PointCloud]
+    write: Callable[[BinaryIO, PointCloud], None]
+
+
+_SPACES = Format(read_text, partial(write_text, delimiter=" ", mark="# "))
+# By lower-case suffix.
+FORMATS = {
+    ".ply": Format(read_ply, write_ply),
+    ".pcd": Format(read_pcd, write_pcd),
+    ".las": Format(read_las, partial(write_las, compress=False)),
+    ".laz": Format(read_las, partial(write_las, compress=True)),
+    ".bin": Format(read_kitti, write_kitti),
+    ".npy": Format(read_npy, write_npy),
+    ".npz": Format(read_npz, write_npz),
+    ".xyz": _SPACES,
+    ".txt": _SPACES,
+    ".csv": Format(read_text, partial(write_text, delimiter=",", mark="")),
+}
+
+
+def format_of(path: Path) -> Format:
+    """The format for the suffix of a path; raises `ValueError` for an unknown suffix."""
+    try:
+        return FORMATS[path.suffix.lower()]
+    except KeyError:
+        raise ValueError(f"{path}: unknown suffix {path.suffix!r}; expected one of {', '.join(FORMATS)}") from None
+
+
+def read(path: str | os.PathLike[str]) -> PointCloud:
+    """Read a raw cloud from a file.
+
+    Every numeric column with one value per point becomes a channel, except coordinates, normals and per-point metadata
+    (label, ring, time, index and the like). The channels are, in this order:
+
+    - "intensity", in the file's unit; aliases such as reflectance, reflectivity and remission are recognised;
+    - "red", "green", "blue", also from r, g, b, diffuse_* or packed rgb; integers are scaled to 0..1 (divided by 65535
+      if 16-bit, else by 255), floating-point colours are unchanged;
+    - all other columns under their own names, in file order. A column `channel_NAME`, as `write` uses it, is read as
+      NAME where a column NAME would be skipped or renamed.
+
+    LAS: an intensity of 0 everywhere means that the file has none, by definition of the format. Colours that are all
+    below 256 are taken as 8-bit values that the exporter failed to scale to 16 bits, a common mistake. Text: colours
+    are integers if the column holds whole numbers without a decimal point; a first line may name the columns, which
+    are otherwise x, y, z, channel_0, ... as in `.npy` (N, 3 + C). `.npz`: `points` (N, 3), with `channels` (N, C) and
+    `channel_names`, or with `intensity` (N,) and `rgb` or `colors` (N, 3).
+
+    In every format, NaN in a channel means that the point lacks the channel; see `PointCloud.channel_valid`.
+
+    Args:
+        path: the suffix, in any case, selects the format: `.ply`, `.pcd`, `.las`, `.laz`, `.bin` (KITTI), `.npy`,
+            `.npz`, `.xyz`, `.txt` or `.csv`.
+
+    Returns:
+        Cloud of NumPy arrays: points (N, 3), metres, float64 if the file stores float64 (always for LAS and text);
+        channels (N, C). Points with non-finite coordinates are kept.
+
+    Raises:
+        OSError: if the file cannot be opened.
+        ImportError: if the format needs a package that is not installed.
+        ValueError: if the file is not a valid cloud or has no points; the message starts with the path.
+    """
+    path = Path(path)
+    reader = format_of(path).read
+    with open(path, "rb") as file:
+        try:
+            size = os.fstat(file.fileno()).st_size
+            if size == 0:
+                raise ValueError("the file is empty")
+            cloud = reader(file, size)
+            if len(cloud) == 0:
+                raise ValueError("it has no points")
+            missing = np.isnan(cloud.channels)
+            if missing.any():
+                cloud = cloud.replace(channel_valid=~missing)
+        except ImportError:
+            raise
+        except BaseException as error:
+            # The libraries raise arbitrary exceptions; lazrs raises Rust's PanicException, a BaseException.
+            if not isinstance(error, Exception) and type(error).__name__ != "PanicException":
+                raise
+            raise ValueError(f"{path}: cannot be read as {path.suffix.lower()}: {reason_of(error)}") from error
+    return cloud
+
+
+def write(path: str | os.PathLike[str], cloud: PointCloud) -> None:
+    """Write the valid points of a cloud, in the user's frame, to a file.
+
+    `read` restores the cloud within the limits of the format. PLY, PCD and NPZ preserve float32 and float64; colours
+    that are all multiples of 1/255 are stored as 8-bit integers. Only `.npz` preserves the channel order and the
+    covariances; `.npy` has no channel names; KITTI is float32. LAS rounds coordinates to a power of ten, with an error
+    of at most 5·10⁻⁹ of the cloud's extent, and colours to 16 bits. Missing channels are written as NaN, which LAS
+    cannot represent. A failed write leaves an existing file unchanged.
+
+    Args:
+        path: the suffix selects the format: `.ply`, `.pcd`, `.las`, `.laz`, `.bin` (KITTI), `.npy`, `.npz`, `.xyz`,
+            `.txt` or `.csv`.
+        cloud: one cloud, raw or preprocessed; points in metres.
+
+    Raises:
+        OSError: if the file cannot be written.
+        ImportError: if the format needs a package that is not installed.
+        ValueError: if the cloud is empty, is a batch, or cannot be represented in the format.
+    """
+    path = Path(path)
+    writer = format_of(path).write
+    if cloud.points.ndim != 2:
+        raise ValueError(f"cloud: expected a single cloud, got points of shape {tuple(cloud.points.shape)}")
+    if len(cloud) == 0:
+        raise ValueError("cloud: expected at least one point to write, got none")
+    cloud = cloud.unpad()
+    if cloud.channel_valid is not None:
+        channels = np.where(cloud.channel_valid, cloud.channels, np.nan)
+        cloud = cloud.replace(channels=channels, channel_valid=None)
+    with replacing(path) as file:
+        writer(file, cloud)

@@ -1,0 +1,74 @@
+"""PCD files, by pypcd4."""
+
+from __future__ import annotations
+
+import struct
+from typing import BinaryIO
+
+import numpy as np
+
+from mcgicp_jax._clouds.point_cloud import PointCloud
+from mcgicp_jax.io.columns import COLORS, cloud_of, columns_of
+from mcgicp_jax.io.files import check_size, optional_module
+
+# Bound on the compression ratio of LZF, whose blocks of three bytes expand to at most 264.
+_LZF_RATIO = 100
+
+
+def read_pcd(file: BinaryIO, size: int) -> PointCloud:
+    pypcd4 = optional_module("pypcd4", "reading .pcd")
+    metadata = pypcd4.MetaData.parse_header(_pcd_header(file))
+    if metadata.points == 0:
+        raise ValueError("it has no points")
+    widths = [width * count for width, count in zip(metadata.size, metadata.count, strict=True)]
+    if metadata.data == pypcd4.Encoding.ASCII:
+        check_size(2 * metadata.points * sum(metadata.count), size + 1)
+        # pypcd4's own ASCII reader accepts only single spaces between numbers.
+        rows = np.loadtxt(file, metadata.build_dtype(), ndmin=1)
+    else:
+        if metadata.data == pypcd4.Encoding.BINARY:
+            check_size(metadata.points * sum(widths), size - file.tell())
+        else:
+            _check_lzf(file, metadata.points * sum(widths), size)
+        file.seek(0)
+        rows = pypcd4.PointCloud.from_fileobj(file).pc_data
+    if len(rows) != metadata.points:
+        raise ValueError(f"the header claims {metadata.points} points, the file has {len(rows)}")
+    # pypcd4 names padding fields "#" plus a random suffix, and renames fields with several values per point.
+    names = [name for name in metadata.fields if name in rows.dtype.names and not name.startswith("#")]
+    columns = {name: rows[name] for name in names}
+    for packed in columns.keys() & {"rgb"} or columns.keys() & {"rgba"}:
+        colours = pypcd4.PointCloud.decode_rgb(columns.pop(packed))
+        columns |= dict(zip(COLORS, colours.T, strict=True))
+    return cloud_of(columns)
+
+
+def _pcd_header(file: BinaryIO) -> list[str]:
+    """The header lines in the form that pypcd4 parses: at most ten, without comments."""
+    lines: list[str] = []
+    while len(lines) < 10 and not (lines and lines[-1].startswith("DATA")):
+        line = file.readline()
+        if not line:
+            raise ValueError("no complete PCD header")
+        lines += [text for text in [line.decode().strip()] if text and not text.startswith("#")]
+    return lines
+
+
+def _check_lzf(file: BinaryIO, claimed: int, size: int) -> None:
+    """Check the two lengths at the start of a compressed block; pypcd4 allocates the second without a check."""
+    compressed, raw = struct.unpack("<II", file.read(8))
+    check_size(compressed, size - file.tell())
+    check_size(raw, _LZF_RATIO * compressed)
+    if raw != claimed:
+        raise ValueError(f"the header claims {claimed} bytes of points, the compressed data {raw}")
+
+
+def write_pcd(file: BinaryIO, cloud: PointCloud) -> None:
+    pypcd4 = optional_module("pypcd4", "writing .pcd")
+    columns = columns_of(cloud)
+    if all(name in columns and columns[name].dtype == np.uint8 for name in COLORS):
+        colours = np.column_stack([columns.pop(name) for name in COLORS])
+        columns["rgb"] = pypcd4.PointCloud.encode_rgb(colours)
+    values = list(columns.values())
+    pcd = pypcd4.PointCloud.from_points(values, list(columns), [column.dtype for column in values])
+    pcd.save(file, pypcd4.Encoding.BINARY)

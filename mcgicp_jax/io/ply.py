@@ -1,0 +1,52 @@
+"""PLY files, by plyfile."""
+
+from __future__ import annotations
+
+import io
+import re
+from typing import Any, BinaryIO
+
+import numpy as np
+
+from mcgicp_jax._clouds.point_cloud import PointCloud
+from mcgicp_jax.io.columns import cloud_of, columns_of
+from mcgicp_jax.io.files import check_size, optional_module
+
+# Bytes searched for the end of a PLY header, far more than the header of a cloud needs.
+_PLY_HEADER_BYTES = 2**20
+
+
+def read_ply(file: BinaryIO, size: int) -> PointCloud:
+    plyfile = optional_module("plyfile", "reading .ply")
+    head, end, _ = file.read(_PLY_HEADER_BYTES).partition(b"end_header")
+    if not end:
+        raise ValueError("no PLY header")
+    text = (head + end).decode("ascii").replace("\r\n", "\n").replace("\r", "\n") + "\n"
+    # plyfile allocates what the header claims, so the header is first parsed alone, with all counts set to 0.
+    element = re.compile(r"^(\s*element\s+\S+\s+)(\S+)", re.MULTILINE)
+    counts = [int(count) for _, count in element.findall(text)]
+    layout = plyfile.PlyData.read(io.BytesIO(element.sub(r"\g<1>0", text).encode()))
+    claimed = sum(count * _ply_row_bytes(part, layout.text) for count, part in zip(counts, layout, strict=True))
+    check_size(claimed, size - len(head))
+    if "vertex" not in layout:
+        raise ValueError("it has no vertices")
+    file.seek(0)
+    with io.TextIOWrapper(file, "ascii") if layout.text else file as stream:
+        vertex: Any = np.array(plyfile.PlyData.read(stream)["vertex"].data)  # copied, since plyfile maps the file
+    return cloud_of({name: vertex[name] for name in vertex.dtype.names})
+
+
+def _ply_row_bytes(element: Any, text: bool) -> int:
+    """The smallest size of one row in bytes: empty lists; in text, one digit and one separator per number."""
+    if text:
+        return 2 * len(element.properties)
+    return sum(np.dtype(getattr(prop, "len_dtype", prop.val_dtype)).itemsize for prop in element.properties)
+
+
+def write_ply(file: BinaryIO, cloud: PointCloud) -> None:
+    plyfile = optional_module("plyfile", "writing .ply")
+    columns = columns_of(cloud)
+    rows = np.empty(len(cloud), [(name, values.dtype) for name, values in columns.items()])
+    for name, values in columns.items():
+        rows[name] = values
+    plyfile.PlyData([plyfile.PlyElement.describe(rows, "vertex")], byte_order="<").write(file)

@@ -1,0 +1,153 @@
+"""Charts: convergence, directions that are constrained, trajectories and pose graphs."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from jax.typing import ArrayLike
+from jaxtyping import Float
+
+from mcgicp_jax._math.poses import Pose, pose_matrix
+from mcgicp_jax._pose_graph.factors import WORLD
+from mcgicp_jax._pose_graph.optimize import PoseGraphResult
+from mcgicp_jax._pose_solver.degeneracy import CHANNELS_HOLD, GEOMETRY_HOLDS, shares
+from mcgicp_jax._registration.result import Registration
+from mcgicp_jax.plot.drawing import CLOUD_COLORS, Figure, File, new_figure, optional_module, saved
+
+# Residual at the end of the colour scale of a graph, standard deviations: loops beyond it are rejected.
+_LARGEST_RESIDUAL = 4.1
+
+
+def convergence(histories: Mapping[str, Sequence[float] | ArrayLike], *, ylabel: str = "cost") -> Figure:
+    """Plot the cost or RMSE per iteration, on a logarithmic scale.
+
+    Args:
+        histories: one number per iteration, by the name of the method.
+        ylabel: label of the y axis: the quantity and its unit.
+
+    Raises:
+        ValueError: if a history is not one-dimensional.
+        ImportError: if matplotlib is missing.
+    """
+    figure = new_figure(6, 4)
+    panel: Any = figure.subplots()
+    for name, history in histories.items():
+        values = np.asarray(history)
+        if values.ndim != 1:
+            raise ValueError(f"histories[{name!r}]: expected one number per iteration, got shape {values.shape}")
+        panel.plot(values, marker="o", markersize=3, label=name)
+    panel.set(xlabel="iteration", ylabel=ylabel, yscale="log")
+    panel.xaxis.get_major_locator().set_params(integer=True)
+    panel.grid(alpha=0.3)
+    panel.legend()
+    return figure
+
+
+def localizability(result: Registration, *, path: File = None) -> Figure:
+    """Plot how well each of six directions is constrained: the observed fraction of squared motion.
+
+    The fraction refers to the motion of the matched points. One bar is for the geometry and one for the channels, which
+    count only in directions that the geometry does not constrain. Dashed lines mark the fractions above which a
+    direction counts as constrained.
+
+    Args:
+        result: a single result of `register`.
+        path: file to save the figure to; its suffix selects the format.
+
+    Raises:
+        ValueError: if the result is a batch or has no directions, such as a result of `align`.
+        ImportError: if matplotlib is missing.
+    """
+    if result.directions is None or np.ndim(result.status_code):
+        raise ValueError("result: expected a single result of `register`, got a batch or one without directions")
+    figure = new_figure(7.5, 3.2)
+    panel = figure.subplots()
+    lowest = 1e-4
+    rows = np.arange(6)
+    names, *values = zip(*shares(result.directions), strict=True)
+    bars = (
+        ("geometry", values[0], GEOMETRY_HOLDS, CLOUD_COLORS[0], -0.2),
+        ("channels", values[1], CHANNELS_HOLD, CLOUD_COLORS[1], 0.2),
+    )
+    for name, share, threshold, color, offset in bars:
+        panel.barh(rows + offset, np.maximum(share, lowest) - lowest, 0.38, lowest, color=color, label=name)
+        panel.axvline(threshold, color=color, linestyle="--", linewidth=1)
+    panel.set(xscale="log", xlim=(lowest, 1), xlabel="observed fraction of the points' squared motion")
+    panel.set_yticks(rows, names)
+    panel.invert_yaxis()
+    panel.set_title(result.status.name, loc="left", fontsize="medium")
+    figure.legend(loc="outside upper right", ncols=2, frameon=False)
+    return saved(figure, path)
+
+
+def trajectories(
+    trajectories: Mapping[str, Sequence[Pose] | Float[np.ndarray, "N 4 4"]],
+    *,
+    path: File = None,
+) -> Figure:
+    """Plot trajectories in the principal plane of the first one.
+
+    Args:
+        trajectories: poses by name, sensor to a common world, metres.
+        path: file to save the figure to; its suffix selects the format.
+
+    Raises:
+        ValueError: if a trajectory is empty, or a pose is no rigid motion.
+        ImportError: if matplotlib is missing.
+    """
+    figure = new_figure(7, 5)
+    panel = figure.subplots()
+    plane, start = None, None
+    for name, poses in trajectories.items():
+        positions = np.array([pose_matrix(pose, f"trajectories[{name!r}][{i}]")[:3, 3] for i, pose in enumerate(poses)])
+        if not len(positions):
+            raise ValueError(f"trajectories[{name!r}]: expected at least one pose, got none")
+        if plane is None or start is None:
+            start = positions[0]
+            plane = np.linalg.svd(positions - positions.mean(axis=0))[2][:2]
+            # The first axis points in the direction of travel.
+            plane[0] *= 1 if (positions[-1] - start) @ plane[0] >= 0 else -1
+        along, across = plane @ (positions - start).T
+        panel.plot(along, across, marker=".", markersize=4, linewidth=1, label=name)
+    panel.set(xlabel="metres", ylabel="metres", aspect="equal", adjustable="datalim")
+    panel.grid(alpha=0.3)
+    panel.legend()
+    return saved(figure, path)
+
+
+def graph(graph: PoseGraphResult, *, path: File = None) -> Figure:
+    """Plot the poses of a graph in their principal plane, and its edges coloured by residual in standard deviations.
+
+    Rejected loops are dashed. A prior is drawn from the position that it measured.
+
+    Args:
+        graph: result of `optimize_poses`, such as `MultiwayResult.graph`.
+        path: file to save the figure to; its suffix selects the format.
+
+    Raises:
+        ImportError: if matplotlib is missing.
+    """
+    collections = optional_module("matplotlib.collections")
+    positions = np.asarray(graph.poses)[:, :3, 3]
+    centre = positions.mean(axis=0)
+    # The eigenvectors of the two largest eigenvalues, which come last.
+    axes = np.linalg.eigh((positions - centre).T @ (positions - centre))[1][:, :0:-1]
+    kept, residuals, i = np.asarray(graph.kept), np.asarray(graph.residuals), np.asarray(graph.edges.i)
+    priors = (i == WORLD)[:, None]
+    starts = np.where(priors, np.asarray(graph.edges.T_i_j)[:, :3, 3], positions[np.where(priors[:, 0], 0, i)])
+    segments = (np.stack([starts, positions[np.asarray(graph.edges.j)]], axis=1) - centre) @ axes
+    figure = new_figure(7, 5)
+    panel = figure.subplots()
+    for chosen, style in ((kept, "solid"), (~kept, "dashed")):
+        lines = collections.LineCollection(segments[chosen], linestyles=style, linewidths=1, cmap="viridis")
+        lines.set_array(residuals[chosen])
+        lines.set_clim(0, _LARGEST_RESIDUAL)
+        panel.add_collection(lines)
+        if style == "solid":
+            figure.colorbar(lines, ax=panel, label="residual, standard deviations", extend="max")
+    panel.plot(*((positions - centre) @ axes).T, marker=".", markersize=4, linestyle="none", color="black")
+    panel.set(xlabel="metres", ylabel="metres", aspect="equal", adjustable="datalim")
+    panel.grid(alpha=0.3)
+    return saved(figure, path)

@@ -1,0 +1,155 @@
+"""Shared by the figures: optional packages, files, projections of clouds to pixels, and colours of points."""
+
+from __future__ import annotations
+
+import importlib
+import os
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, TypeAlias
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from mcgicp_jax._clouds.point_cloud import PointCloud
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+else:
+    Figure = Any
+
+File: TypeAlias = str | os.PathLike[str] | None
+Points: TypeAlias = Float[np.ndarray, "N 3"]
+Picture: TypeAlias = Float[np.ndarray, "height width 3"]
+Map: TypeAlias = Float[np.ndarray, "height width"]
+
+# These constants affect only how figures look.
+CLOUD_COLORS = ("#1f77d0", "#e8741c", "#2b9c5a", "#b03a8c", "#7a5230", "#707070")
+# Pixels per point spacing, unless the limit on the pixels of a picture makes them coarser.
+PIXELS_PER_SPACING = 3
+
+
+def optional_module(name: str) -> Any:
+    try:
+        return importlib.import_module(name)
+    except ImportError as error:
+        raise ImportError(f"plotting needs {name.partition('.')[0]}: pip install 'mcgicp_jax[plot]'") from error
+
+
+def new_figure(width: float | int, height: float | int) -> Figure:
+    """An empty figure, inches, that belongs to no window."""
+    return optional_module("matplotlib.figure").Figure((width, height), layout="constrained")
+
+
+def saved(figure: Figure, path: File, **options: Any) -> Figure:
+    """The figure, saved to a file if `path` is one."""
+    if path is not None:
+        figure.savefig(path, dpi=120, **options)
+    return figure
+
+
+def check_picture(path: str | os.PathLike[str]) -> None:
+    """Raise `ValueError` if matplotlib cannot save figures to a file with this suffix."""
+    kinds = optional_module("matplotlib.figure").Figure().canvas.get_supported_filetypes()
+    suffix = os.path.splitext(path)[1]
+    if suffix.lower().removeprefix(".") not in kinds:
+        raise ValueError(f"{os.fspath(path)}: unknown suffix {suffix!r}; expected one of .{', .'.join(kinds)}")
+
+
+@dataclass(frozen=True)
+class View:
+    """An orthographic projection of points to the pixels of a plane.
+
+    Attributes:
+        center: (3,), metres, a point of the plane.
+        axes: (3, 3), columns: right, up, and the normal towards the viewer.
+        low: (2,), metres, the lower left corner in the plane.
+        pixel: side of a pixel, metres.
+        width, height: pixels.
+    """
+
+    center: Float[np.ndarray, "3"]
+    axes: Float[np.ndarray, "3 3"]
+    low: Float[np.ndarray, "2"]
+    pixel: float
+    width: int
+    height: int
+
+    def project(self, points: Points) -> tuple[Int[np.ndarray, "N"], Float[np.ndarray, "N"]]:
+        """The row-major pixel index of each point, −1 if outside, and its height above the plane in metres."""
+        local = (points - self.center) @ self.axes
+        column, row = np.floor((local[:, :2] - self.low) / self.pixel).astype(int).T
+        inside = (column >= 0) & (column < self.width) & (row >= 0) & (row < self.height)
+        return np.where(inside, row * self.width + column, -1), local[:, 2]
+
+
+def view_onto(points: Points, most_pixels: int, limits: Float[np.ndarray, "2 2"] | None = None) -> View:
+    """The view onto the two longest principal axes of the points, from the side of the origin (usually the sensor)."""
+    center = points.mean(axis=0)
+    _, vectors = np.linalg.eigh(np.cov((points - center).T))
+    normal, right = vectors[:, 0], vectors[:, 2]
+    normal = normal if normal @ center < 0 else -normal
+    right = right if right[np.argmax(np.abs(right))] > 0 else -right
+    axes = np.stack([right, np.cross(normal, right), normal], axis=1)
+    low, high = np.percentile(((points - center) @ axes)[:, :2], [2, 98], axis=0)
+    if limits is not None:
+        low, high = limits.T
+    margin = np.maximum(0.02 * (high - low), 1e-6)
+    low, extent = low - margin, high - low + 2 * margin
+    spacing = np.sqrt(extent.prod() / len(points))
+    pixel = max(spacing / PIXELS_PER_SPACING, extent.max() / most_pixels)
+    width, height = np.ceil(extent / pixel).astype(int)
+    return View(center, axes, low, float(pixel), int(width), int(height))
+
+
+def paint(view: View, points: Points, colors: Points) -> Picture:
+    """The mean colour of the points in each pixel, extended into the gaps between points; NaN further away."""
+    from scipy.ndimage import distance_transform_edt
+
+    pixels, _ = view.project(points)
+    size = view.height * view.width
+    inside = pixels >= 0
+    count = np.bincount(pixels[inside], minlength=size)
+    sums = [np.bincount(pixels[inside], channel, minlength=size) for channel in colors[inside].T]
+    picture = np.stack(sums, axis=-1) / np.where(count > 0, count, np.nan)[:, None]
+    picture = picture.reshape(view.height, view.width, 3)
+    distance, (row, column) = distance_transform_edt(np.isnan(picture[..., 0]), return_indices=True)
+    return np.where(distance[..., None] <= PIXELS_PER_SPACING, picture[row, column], np.nan)
+
+
+def spacing_of(centers: Float[np.ndarray, "M 3"], extent: float) -> float:
+    """Half the median distance from a centre to its nearest neighbour, at most a tenth of `extent`; metres."""
+    distances = np.linalg.norm(centers[:, None] - centers, axis=-1)
+    np.fill_diagonal(distances, np.inf)
+    return min(float(np.median(distances.min(axis=1))) / 2, extent / 10)
+
+
+def drawable(cloud: PointCloud) -> PointCloud:
+    """The finite points and their channels, as NumPy arrays in float64."""
+    cloud = cloud.unpad()
+    points = np.asarray(cloud.points, np.float64)
+    finite = np.isfinite(points).all(axis=1)
+    return PointCloud(
+        points[finite],
+        np.asarray(cloud.channels)[finite],
+        channel_valid=None if cloud.channel_valid is None else np.asarray(cloud.channel_valid)[finite],
+        channel_names=cloud.channel_names,
+    )
+
+
+def has_everywhere(cloud: PointCloud, names: tuple[str, ...]) -> bool:
+    """Whether every point has all of these channels."""
+    if not set(names) <= set(cloud.channel_names):
+        return False
+    columns = [cloud.channel_names.index(name) for name in names]
+    return cloud.channel_valid is None or bool(np.asarray(cloud.channel_valid)[:, columns].all())
+
+
+def rgb_of(cloud: PointCloud) -> Points | None:
+    """Colours in 0..1 from channels in 0..1, 0..255 or 0..65535; None unless every point has a colour."""
+    names = ("red", "green", "blue")
+    if not has_everywhere(cloud, names):
+        return None
+    channels = np.asarray(cloud.channels, float)[:, [cloud.channel_names.index(name) for name in names]]
+    largest = channels.max(initial=0)
+    full_scale = next((scale for scale in (1, 255) if largest <= scale), 65535)
+    return np.clip(channels / full_scale, 0, 1)
