@@ -89,7 +89,7 @@ def test_loops_are_sought_where_they_may_be_and_help():
 
 def test_a_loop_is_registered_from_the_poses_within_their_uncertainty(monkeypatch):
     calls = []
-    monkeypatch.setattr(_loops, "register_with", lambda *arguments: calls.append(arguments))
+    monkeypatch.setattr(_loops, "register_pair", lambda *arguments: calls.append(arguments))
     monkeypatch.setattr(_loops, "edge_from", lambda i, j, _, **options: mcg.Edge(i, j, np.eye(4), np.eye(6), **options))
     for sigma, given, expected in (
         (1.0, (2.0, 0.5), (3.37, 0.5)),

@@ -64,13 +64,13 @@ def test_frames_are_taken_one_by_one(room):
 def test_each_pair_starts_from_the_motion_before(room, monkeypatch):
     frames, _ = room
     starts = []
-    register = _odometry.register_with
+    register = _odometry.register_pair
 
     def spy(source, target, method, init, options):
         starts.append(init)
         return register(source, target, method, init, options)
 
-    monkeypatch.setattr(_odometry, "register_with", spy)
+    monkeypatch.setattr(_odometry, "register_pair", spy)
     guess = motion((0.05, 0, 0, 0, 0, 0.05))
     steps = list(mcg.odometry(frames[:4], mcg.GICP(), max_distance=0.5, init=guess, max_iterations=30))
     np.testing.assert_array_equal(starts[0], guess)
