@@ -18,14 +18,6 @@ from mcgicp_jax.plot.drawing import (
     File,
     Points,
     View,
-    drawable,
-    new_figure,
-    optional_module,
-    paint,
-    rgb_of,
-    saved,
-    spacing_of,
-    view_onto,
 )
 
 # These constants affect only how figures look: pixels along the longer side of a map, and width of a figure in inches.
