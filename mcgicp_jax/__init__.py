@@ -7,7 +7,7 @@ from mcgicp_jax import datasets, io, metrics, plot
 from mcgicp_jax._clouds.color_spaces import rgb_to_hsv, rgb_to_lab, rgb_to_yuv
 from mcgicp_jax._clouds.point_cloud import PointCloud
 from mcgicp_jax._clouds.preprocess import preprocess
-from mcgicp_jax._clouds.voxel_map import aggregate
+from mcgicp_jax._clouds.voxel_map import merge_clouds
 from mcgicp_jax._global_registration.global_pose import GlobalPoseResult, global_pose
 from mcgicp_jax._global_registration.image_matches import image_matches
 from mcgicp_jax._math.robust_kernels import AbstractKernel, Cauchy, GemanMcClure, Huber, Tukey, Welsch
@@ -17,18 +17,18 @@ from mcgicp_jax._methods.gicp import GICP
 from mcgicp_jax._methods.icp import ColorICP, PointToPlane, PointToPoint
 from mcgicp_jax._methods.multichannel_gicp import MultiChannelGICP
 from mcgicp_jax._methods.ndt import D2DNDT, NDT, ColorNDT
-from mcgicp_jax._methods.voxel_gaussians import cell_moments, gaussians, voxel_cells
+from mcgicp_jax._methods.voxel_gaussians import voxel_gaussians
 from mcgicp_jax._pairs.batch import register_as_completed, register_batch
 from mcgicp_jax._pairs.batch_jobs import PairWarning
 from mcgicp_jax._pairs.cost import mahalanobis_cost
-from mcgicp_jax._pairs.estimate_pose import align
+from mcgicp_jax._pairs.estimate_pose import estimate_pose
 from mcgicp_jax._pairs.register import register
 from mcgicp_jax._pose_graph.edge import Edge
 from mcgicp_jax._pose_graph.factors import WORLD
 from mcgicp_jax._pose_graph.graph import PoseGraph
 from mcgicp_jax._pose_graph.optimize import PoseGraphResult, optimize_poses
 from mcgicp_jax._registration.correspondences import find_correspondences
-from mcgicp_jax._registration.result import Registration, Status
+from mcgicp_jax._registration.result import RegistrationResult, Status
 from mcgicp_jax._search.base import AbstractSearch, Correspondences
 from mcgicp_jax._search.brute_force import DenseSearch
 from mcgicp_jax._search.kd_tree import AbstractTreeSearch, KDTreeSearch
@@ -63,21 +63,19 @@ __all__ = [
     "PointToPoint",
     "PoseGraph",
     "PoseGraphResult",
-    "Registration",
+    "RegistrationResult",
     "Status",
     "Tukey",
     "Welsch",
-    "aggregate",
-    "align",
-    "cell_moments",
     "datasets",
     "estimate_channel_covariance",
+    "estimate_pose",
     "find_correspondences",
-    "gaussians",
     "global_pose",
     "image_matches",
     "io",
     "mahalanobis_cost",
+    "merge_clouds",
     "metrics",
     "multiway",
     "odometry",
@@ -90,6 +88,6 @@ __all__ = [
     "rgb_to_hsv",
     "rgb_to_lab",
     "rgb_to_yuv",
-    "voxel_cells",
+    "voxel_gaussians",
 ]
 __version__ = "0.1.0"

@@ -9,6 +9,8 @@ Each is one class or function:
 - a factor of a pose graph: a subclass of `AbstractFactor`;
 - a format of files: a function in `FORMATS`, by the ending of the name.
 
+`voxel_cells` and `cell_moments` are the parts of `mcgicp_jax.voxel_gaussians`, in pure JAX.
+
 The registries `METHODS`, `KERNELS`, `FORMATS`, `DATASETS` and `COLOR_SPACES` are what the command line offers.
 """
 
@@ -20,6 +22,7 @@ from mcgicp_jax._math import symmetric_matrices
 from mcgicp_jax._math.robust_kernels import KERNELS, AbstractKernel
 from mcgicp_jax._methods.base import AbstractGeneralized, AbstractMethod, AbstractOneSided
 from mcgicp_jax._methods.registry import METHODS
+from mcgicp_jax._methods.voxel_gaussians import cell_moments, voxel_cells
 from mcgicp_jax._pose_graph.factors import AbstractFactor
 from mcgicp_jax._search.base import AbstractIndex, AbstractSearch, Correspondences, SearchPoints
 from mcgicp_jax._search.kd_tree import AbstractTreeSearch
@@ -50,6 +53,8 @@ __all__ = [
     "Neighborhoods",
     "SearchPoints",
     "Surface",
+    "cell_moments",
     "linearize_residual",
     "symmetric_matrices",
+    "voxel_cells",
 ]

@@ -27,7 +27,7 @@ _IN_FLOAT64 = (
         "align_gradients",
         "cost",
         "covariance",
-        "gaussians",
+        "voxel_gaussians",
         "graph",
         "large_coordinates",
         "methods",

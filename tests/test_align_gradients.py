@@ -1,4 +1,4 @@
-"""Gradients of `align` against finite differences, with respect to everything that a pose depends on."""
+"""Gradients of `estimate_pose` against finite differences, with respect to everything that a pose depends on."""
 
 import jax
 import jax.numpy as jnp
@@ -30,7 +30,9 @@ def test_align_has_the_gradient_of_its_answer(name, noisy):
 
     def loss(inputs):
         clouds = clouds_with(inputs, source, target)
-        result = mcg.align(*clouds, matches, inputs["method"], robust=inputs["robust"], init=start, **TO_ROUNDING)
+        result = mcg.estimate_pose(
+            *clouds, matches, inputs["method"], robust=inputs["robust"], init=start, **TO_ROUNDING
+        )
         return weigh(result.matrix)
 
     check_gradient(loss, inputs_of(source, target, method, robust))
@@ -53,7 +55,7 @@ def test_align_has_the_gradient_where_channels_are_missing(name, noisy):
     def loss(inputs):
         clouds = clouds_with(inputs, source, target)
         settings = {"robust": inputs["robust"], "init": start, "temperature": 0.1, **TO_ROUNDING}
-        return weigh(mcg.align(*clouds, matches, inputs["method"], **settings).matrix)
+        return weigh(mcg.estimate_pose(*clouds, matches, inputs["method"], **settings).matrix)
 
     inputs = inputs_of(source, target, method, robust)
     value_and_gradient = check_gradient(loss, inputs)
@@ -81,7 +83,9 @@ def test_align_has_the_gradient_of_given_covariances(noisy):
 
     def loss(inputs):
         clouds = clouds_with(inputs, source, target)
-        result = mcg.align(*clouds, matches, inputs["method"], robust=inputs["robust"], init=motion(), **TO_ROUNDING)
+        result = mcg.estimate_pose(
+            *clouds, matches, inputs["method"], robust=inputs["robust"], init=motion(), **TO_ROUNDING
+        )
         return weigh(result.matrix)
 
     check_gradient(loss, inputs_of(source, target, method, robust))
@@ -99,7 +103,7 @@ def test_soft_matches_give_every_number_a_gradient(noisy):
     def loss(inputs):
         clouds = clouds_with(inputs, source, target)
         temperature = inputs["temperature"]
-        result = mcg.align(
+        result = mcg.estimate_pose(
             *clouds,
             matches,
             inputs["method"],
@@ -123,7 +127,7 @@ def test_jacobians_agree_forward_and_backward(noisy):
 
     def pose(scale):
         moved = source.replace(points=source.points * scale)
-        return mcg.align(moved, target, matches, method, init=motion(), **CONVERGED).matrix
+        return mcg.estimate_pose(moved, target, matches, method, init=motion(), **CONVERGED).matrix
 
     forward, backward = (jax.jit(jacobian(pose))(jnp.ones(3)) for jacobian in (jax.jacfwd, jax.jacrev))
     assert np.abs(forward).max() > 1e-3

@@ -72,7 +72,7 @@ def test_each_pair_is_as_if_it_were_alone(raw, alone):
 
 
 def test_every_option_of_register_is_one_of_a_batch(raw):
-    options = {"match_channels": True, "scales": (0.2,), "robust": mcg.Huber(1.0), "max_iterations": 20}
+    options = {"equalize_channels": True, "voxel_sizes": (0.2,), "robust": mcg.Huber(1.0), "max_iterations": 20}
     source, target = (mcg.preprocess(cloud) for cloud in raw[0][:2])
     expected = mcg.register(source, target, METHOD, **options)
     assert_same(batch([source], [target], max_distance=None, **options), [expected])
@@ -386,7 +386,7 @@ def test_workers_leave_the_filters_of_warnings_alone(raw, monkeypatch):
     """Threads share them: a worker that changed them would hide the warnings of others."""
     monkeypatch.setattr(warnings, "catch_warnings", None)
     sources, targets = prepared(raw[:2])
-    results = mcg.register_batch(sources, targets, mcg.MultiChannelGICP(), match_channels=True)
+    results = mcg.register_batch(sources, targets, mcg.MultiChannelGICP(), equalize_channels=True)
     assert not {Status.INVALID_INPUT, Status.WORKER_FAILED} & {result.status for result in results}
 
 

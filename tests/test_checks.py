@@ -27,5 +27,7 @@ def test_unknown_options_are_named(function):
     ):
         list(function(*given, max_distanc=1.0).__iter__())
     # Only one pair can have tie points.
-    with pytest.raises(TypeError, match=rf"^{name}: got an unexpected argument 'tie_points'; expected one of .*scales"):
+    with pytest.raises(
+        TypeError, match=rf"^{name}: got an unexpected argument 'tie_points'; expected one of .*voxel_sizes"
+    ):
         list(function(*given, tie_points=None).__iter__())

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 import mcgicp_jax as mcg
+from mcgicp_jax import extend
 from mcgicp_jax.metrics import pose_error
 from tests.differences import GATE, TO_ROUNDING, X64, check_gradient, needs_x64, weigh
 from tests.scenes import motion, room_corner, wall
@@ -30,8 +31,8 @@ def raw():
 def test_statistics_are_those_of_numpy():
     points, channels = room_corner(3000)
     cloud = mcg.PointCloud(points + 100.0, channels)
-    cells = mcg.voxel_cells(cloud, SIZE)
-    found = mcg.gaussians(cloud, SIZE, min_ratio=0.0)
+    cells = extend.voxel_cells(cloud, SIZE)
+    found = mcg.voxel_gaussians(cloud, SIZE, min_ratio=0.0)
     assert len(found) == cells.max() + 1 > 20 and found.neighbors is not None
     expected = [np.cov(points[cells == i].T) for i in range(len(found))]
     tolerance = 1e-12 if X64 else 1e-7
@@ -48,16 +49,16 @@ def test_statistics_are_those_of_numpy():
 
 def test_counts():
     points, _ = room_corner(3000)
-    cloud, counts = mcg.gaussians(points, SIZE, return_counts=True)
-    cells = mcg.voxel_cells(points, SIZE)
+    cloud, counts = mcg.voxel_gaussians(points, SIZE, return_counts=True)
+    cells = extend.voxel_cells(points, SIZE)
     np.testing.assert_array_equal(counts, np.unique(cells[cells >= 0], return_counts=True)[1])
-    np.testing.assert_array_equal(cloud.points, mcg.gaussians(points, SIZE).points)
+    np.testing.assert_array_equal(cloud.points, mcg.voxel_gaussians(points, SIZE).points)
 
 
 def test_flat_cells_are_kept():
     points, _ = wall(3000, noise=0.0)
-    found = mcg.gaussians(points, SIZE, min_ratio=0.02)
-    assert len(found) == mcg.voxel_cells(points, SIZE).max() + 1
+    found = mcg.voxel_gaussians(points, SIZE, min_ratio=0.02)
+    assert len(found) == extend.voxel_cells(points, SIZE).max() + 1
     values = np.linalg.eigvalsh(found.covariances)
     np.testing.assert_allclose(values[:, 0], 0.02 * values[:, 2], rtol=1e-5)
 
@@ -65,13 +66,15 @@ def test_flat_cells_are_kept():
 def test_cells_of_one_colour():
     points, _ = wall(4000)
     colours = (points[:, :1] > 1.1).astype(float)
-    whole, split = (mcg.gaussians(mcg.PointCloud(points, colours), SIZE, channel_size=size) for size in (None, 0.5))
+    whole, split = (
+        mcg.voxel_gaussians(mcg.PointCloud(points, colours), SIZE, channel_size=size) for size in (None, 0.5)
+    )
     assert np.any((whole.channels > 0.05) & (whole.channels < 0.95))
     assert set(np.unique(split.channels)) == {0.0, 1.0}
     assert len(split) > len(whole)
     # A channel of infinite size does not split.
     np.testing.assert_array_equal(
-        mcg.gaussians(mcg.PointCloud(points, colours - 0.5), SIZE, channel_size=np.inf).points, whole.points
+        mcg.voxel_gaussians(mcg.PointCloud(points, colours - 0.5), SIZE, channel_size=np.inf).points, whole.points
     )
 
 
@@ -79,15 +82,15 @@ def test_missing_channels():
     points, channels = room_corner(4000)
     known = points[:, 0] > 0.5
     cloud = mcg.PointCloud(points, channels, channel_valid=np.repeat(known[:, None], 2, axis=1))
-    cells = mcg.voxel_cells(cloud, SIZE)
-    found = mcg.gaussians(cloud, SIZE)
+    cells = extend.voxel_cells(cloud, SIZE)
+    found = mcg.voxel_gaussians(cloud, SIZE)
     for i in range(len(found)):
         inside = (cells == i) & known
         assert np.all(found.channel_valid[i] == inside.any())
         if inside.any():
             np.testing.assert_allclose(found.channels[i], channels[inside].mean(axis=0), rtol=1e-5)
     # Split by channels, the points of a cell have or lack the same ones.
-    split = mcg.voxel_cells(cloud, SIZE, channel_size=100.0)
+    split = extend.voxel_cells(cloud, SIZE, channel_size=100.0)
     assert any(len(set(known[cells == i])) == 2 for i in range(cells.max() + 1))
     assert all(len(set(known[split == i])) == 1 for i in range(split.max() + 1))
 
@@ -95,34 +98,34 @@ def test_missing_channels():
 def test_means_of_covariances():
     """Voxelised GICP: the covariances are dimensionless, and GICP uses them beside its own."""
     source, target, truth = raw_pair()
-    cells = mcg.gaussians(target, SIZE, of="covariances")
+    cells = mcg.voxel_gaussians(target, SIZE, of="covariances")
     values = np.linalg.eigvalsh(cells.covariances)
     assert values.min() >= 1e-3 and values.max() < 1.0001
     result = mcg.register(source, cells, mcg.GICP(), max_distance=1.0)
     assert result.converged and max(pose_error(result.matrix, truth)) < 0.02
     given = mcg.preprocess(target)
     given = given.replace(covariances=np.tile(np.eye(3), (len(given), 1, 1)))
-    np.testing.assert_allclose(mcg.gaussians(given, SIZE, of="covariances").covariances[3], np.eye(3), atol=1e-6)
+    np.testing.assert_allclose(mcg.voxel_gaussians(given, SIZE, of="covariances").covariances[3], np.eye(3), atol=1e-6)
 
 
 def test_covariances_in_square_metres_beside_those_of_gicp():
     source, target, _ = raw_pair(2000)
-    cells = mcg.gaussians(target, SIZE)
+    cells = mcg.voxel_gaussians(target, SIZE)
     for clouds, name in (((source, cells), "target"), ((cells, source), "source")):
         with pytest.warns(UserWarning, match=f'^{name}: its covariances have a median trace .*of="covariances"'):
             mcg.register(*clouds, mcg.GICP())
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         mcg.register(cells, cells, mcg.GICP())
-        mcg.register(source, mcg.gaussians(target, SIZE, of="covariances"), mcg.GICP())
+        mcg.register(source, mcg.voxel_gaussians(target, SIZE, of="covariances"), mcg.GICP())
 
 
 def test_moments_in_jax():
     points, channels = room_corner(3000)
     cloud = mcg.PointCloud(points, channels)
-    cells, expected = mcg.voxel_cells(cloud, SIZE), mcg.gaussians(cloud, SIZE)
+    cells, expected = extend.voxel_cells(cloud, SIZE), mcg.voxel_gaussians(cloud, SIZE)
     dtype = expected.points.dtype
-    moments = jax.jit(lambda points, channels: mcg.cell_moments(points, channels, cells))
+    moments = jax.jit(lambda points, channels: extend.cell_moments(points, channels, cells))
     means, values, covariances = moments(points.astype(dtype), channels.astype(dtype))
     assert means.dtype == covariances.dtype == dtype
     tolerance = 1e-12 if X64 else 2e-6
@@ -136,17 +139,17 @@ def test_moments_in_jax():
 def test_gradients_reach_the_points(name, raw):
     source, target, _ = raw
     method = {"ndt": mcg.NDT(), "d2d-ndt": mcg.D2DNDT()}[name]
-    numbers = [mcg.voxel_cells(cloud, SIZE) for cloud in (source, target)]
-    cells = [mcg.gaussians(cloud, SIZE) for cloud in (source, target)]
+    numbers = [extend.voxel_cells(cloud, SIZE) for cloud in (source, target)]
+    cells = [mcg.voxel_gaussians(cloud, SIZE) for cloud in (source, target)]
     start = mcg.register(*cells, method, max_distance=GATE, **TO_ROUNDING).matrix
     matches = mcg.find_correspondences(*cells, start, method, max_distance=GATE)
 
     def loss(inputs):
         clouds = []
         for side, cloud, number, gaussians in zip(("source", "target"), (source, target), numbers, cells, strict=True):
-            means, channels, spread = mcg.cell_moments(inputs[side], cloud.channels, number)
+            means, channels, spread = extend.cell_moments(inputs[side], cloud.channels, number)
             clouds.append(gaussians.replace(points=means, channels=channels, covariances=spread))
-        return weigh(mcg.align(*clouds, matches, inputs["method"], init=start, **TO_ROUNDING).matrix)
+        return weigh(mcg.estimate_pose(*clouds, matches, inputs["method"], init=start, **TO_ROUNDING).matrix)
 
     check_gradient(loss, {"source": jnp.asarray(source.points), "target": jnp.asarray(target.points), "method": method})
 
@@ -154,8 +157,8 @@ def test_gradients_reach_the_points(name, raw):
 @pytest.mark.parametrize("method", [mcg.NDT(), mcg.D2DNDT(), mcg.ColorNDT(0.1)], ids=["ndt", "d2d-ndt", "colour"])
 def test_the_pose_is_found(method, raw):
     source, target, truth = raw
-    cells = mcg.gaussians(target, SIZE)
-    moving = source if method.needs_covariances == ("target",) else mcg.gaussians(source, SIZE)
+    cells = mcg.voxel_gaussians(target, SIZE)
+    moving = source if method.needs_covariances == ("target",) else mcg.voxel_gaussians(source, SIZE)
     result = mcg.register(moving, cells, method)
     assert result.converged and np.isfinite(result.covariance).all()
     assert max(pose_error(result.matrix, truth)) < (0.02 if isinstance(method, mcg.D2DNDT) else 0.01)
@@ -169,11 +172,11 @@ def test_scales_make_the_cells(raw):
     moved = source.transform(np.linalg.inv(far))
     thinned = mcg.preprocess(moved, 0.05)
     for moving, method in ((moved, mcg.D2DNDT()), (thinned, mcg.NDT())):
-        result = mcg.register(moving, target, method, scales=(0.8, SIZE))
+        result = mcg.register(moving, target, method, voxel_sizes=(0.8, SIZE))
         assert result.converged and max(pose_error(result.matrix, truth @ far)) < 0.03
         # The last scale is the result.
-        cells = mcg.gaussians(target, SIZE)
-        end = mcg.gaussians(moved, SIZE) if isinstance(method, mcg.D2DNDT) else thinned
+        cells = mcg.voxel_gaussians(target, SIZE)
+        end = mcg.voxel_gaussians(moved, SIZE) if isinstance(method, mcg.D2DNDT) else thinned
         again = mcg.register(end, cells, method, init=result.matrix)
         np.testing.assert_allclose(again.matrix, result.matrix, atol=1e-3)
         assert again.num_inliers == result.num_inliers
@@ -193,7 +196,7 @@ def test_views_that_overlap_in_part_are_not_pulled_over_each_other(method):
         return mcg.PointCloud(points[keep(points[:, 0])] + 0.01 * rng.normal(size=(np.sum(keep(points[:, 0])), 3)))
 
     target, source = view(lambda x: x < 15), view(lambda x: x > 3)
-    result = mcg.register(source, target, method, scales=(2.0, 1.0), init=motion((1.0, 0.8, 0, 0, 0, 0.15)))
+    result = mcg.register(source, target, method, voxel_sizes=(2.0, 1.0), init=motion((1.0, 0.8, 0, 0, 0, 0.15)))
     assert result.converged and np.linalg.norm(result.matrix[:3, 3]) < 0.1
 
 
@@ -202,14 +205,14 @@ def test_the_unit_of_length_does_not_matter(method, raw):
     source, target, _ = raw
     results = []
     for unit in (1.0, 1000.0):
-        clouds = [mcg.gaussians(mcg.PointCloud(unit * cloud.points), unit * SIZE) for cloud in (source, target)]
+        clouds = [mcg.voxel_gaussians(mcg.PointCloud(unit * cloud.points), unit * SIZE) for cloud in (source, target)]
         results.append(mcg.register(*clouds, method).matrix)
     results[1][:3, 3] /= 1000.0
     np.testing.assert_allclose(results[0], results[1], atol=1e-9 if X64 else 2e-5)
 
 
 def cells_of(raw):
-    return [mcg.gaussians(cloud, SIZE) for cloud in raw[:2]]
+    return [mcg.voxel_gaussians(cloud, SIZE) for cloud in raw[:2]]
 
 
 def test_the_cost_is_the_sum_over_the_nearest_cells(raw):
@@ -242,7 +245,7 @@ def test_the_sum_is_more_accurate_than_the_nearest_cell():
     errors = []
     for i in range(4):
         source, target, truth = raw_pair(truth=motion(0.3 * np.random.default_rng(i).normal(size=6)))
-        clouds = [mcg.gaussians(cloud, SIZE) for cloud in (source, target)]
+        clouds = [mcg.voxel_gaussians(cloud, SIZE) for cloud in (source, target)]
         each = [mcg.register(*clouds, mcg.D2DNDT(num_candidates=k), init=truth) for k in (1, 4)]
         errors.append([float(pose_error(result.matrix, truth)[0]) for result in each])
     one, four = np.mean(errors, axis=0)
@@ -262,35 +265,35 @@ def test_the_sum_is_the_same_everywhere(raw):
         np.testing.assert_allclose(result.matrix, alone.matrix, atol=atol)
         assert result.num_inliers == alone.num_inliers
     matches = mcg.find_correspondences(source, target, alone.matrix, method, max_distance=1.0)
-    aligned = mcg.align(source, target, matches, method, init=alone.matrix)
+    aligned = mcg.estimate_pose(source, target, matches, method, init=alone.matrix)
     np.testing.assert_allclose(aligned.matrix, alone.matrix, atol=1e-3)
     with pytest.raises(ValueError, match="temperature: expected metres to go with 4 candidates"):
-        mcg.align(source, target, matches, mcg.NDT())
+        mcg.estimate_pose(source, target, matches, mcg.NDT())
 
 
 def test_colours_hold_what_geometry_does_not():
     source, target, truth = raw_pair(8000, motion((0.02, -0.015, 0.0, 0.0, 0.0, 0.01)), wall)
     weights = 0.2
-    cells = mcg.gaussians(target, 0.2, channel_size=1.0)
+    cells = mcg.voxel_gaussians(target, 0.2, channel_size=1.0)
     colour = mcg.register(source, cells, mcg.ColorNDT(weights))
     assert colour.converged and max(pose_error(colour.matrix, truth)) < 0.01
-    plain = mcg.register(source, mcg.gaussians(target, SIZE), mcg.NDT())
+    plain = mcg.register(source, mcg.voxel_gaussians(target, SIZE), mcg.NDT())
     assert plain.status == mcg.Status.DEGENERATE
 
 
 def test_what_is_wrong_is_named(raw):
     source, target, _ = raw
-    cells = mcg.gaussians(target, SIZE)
+    cells = mcg.voxel_gaussians(target, SIZE)
     with pytest.raises(ValueError, match=r"target: expected .* covariances for NDT; make it with .*gaussians"):
         mcg.register(source, target, mcg.NDT())
     with pytest.raises(ValueError, match="source: expected a cloud with covariances for D2DNDT"):
         mcg.register(source, cells, mcg.D2DNDT())
-    with pytest.raises(ValueError, match="scales: expected none for clouds with covariances"):
-        mcg.register(source, cells, mcg.NDT(), scales=(1.0,))
+    with pytest.raises(ValueError, match="voxel_sizes: expected none for clouds with covariances"):
+        mcg.register(source, cells, mcg.NDT(), voxel_sizes=(1.0,))
     with pytest.raises(
         ValueError, match="target: voxel_size: expected a size that leaves at least 4 cells of 6 points"
     ):
-        mcg.register(source, target, mcg.NDT(), scales=(1e-3,))
+        mcg.register(source, target, mcg.NDT(), voxel_sizes=(1e-3,))
     for arguments, name in (
         ({"voxel_size": -1.0}, "voxel_size"),
         ({"voxel_size": np.nan}, "voxel_size"),
@@ -300,6 +303,6 @@ def test_what_is_wrong_is_named(raw):
         ({"channel_size": [1.0, 2.0, 3.0]}, "channel_size"),
     ):
         with pytest.raises(ValueError, match=f"^{name}: expected"):
-            mcg.gaussians(target, **({"voxel_size": SIZE} | arguments))
+            mcg.voxel_gaussians(target, **({"voxel_size": SIZE} | arguments))
     with pytest.raises(ValueError, match="cloud: expected concrete arrays"):
-        jax.jit(lambda points: mcg.gaussians(target.replace(points=points), SIZE).points)(target.points)
+        jax.jit(lambda points: mcg.voxel_gaussians(target.replace(points=points), SIZE).points)(target.points)

@@ -26,6 +26,7 @@ LAYERS = (
     "io",
     "datasets",
     "plot",
+    "extend",
     "_cli",
     "__main__",
 )

@@ -49,7 +49,7 @@ def test_what_failed_makes_no_edge():
     source, target, _ = pair(size=500)
     assert edge_from(0, 1, mcg.register(source, target, mcg.GICP(), max_distance=0.3, max_iterations=1)) is None
     assert edge_from(0, 1, mcg.register(source, target, mcg.GICP(), max_distance=1e-6)) is None
-    assert edge_from(0, 1, mcg.Registration.without_pose(mcg.Status.WORKER_FAILED)) is None
+    assert edge_from(0, 1, mcg.RegistrationResult.without_pose(mcg.Status.WORKER_FAILED)) is None
 
 
 def test_odometry_closes_loops(room):
@@ -108,7 +108,7 @@ def test_a_loop_is_registered_from_the_poses_within_their_uncertainty(monkeypatc
 def test_a_lost_frame_is_joined_by_an_edge_without_information():
     found = trajectory()
     found._clouds, found._poses, end = found._clouds[:1], found._poses[:1], found._poses[1]
-    found.add(mcg.PointCloud(np.eye(3)), end, mcg.Registration.without_pose(mcg.Status.WORKER_FAILED))
+    found.add(mcg.PointCloud(np.eye(3)), end, mcg.RegistrationResult.without_pose(mcg.Status.WORKER_FAILED))
     edges = found.graph.edges
     assert (edges.i, edges.j, edges.uncertain) == (0, 1, False) and not np.any(edges.information)
     np.testing.assert_allclose(found._poses[0] @ edges.T_i_j[0], end, atol=1e-12)
@@ -162,7 +162,7 @@ def test_clouds_are_preprocessed_once_and_mapped_in_voxels():
     start = pose((5, 0, 0), (0, 0, 1.0))
     found = mcg.multiway([points], mcg.GICP(), init=[start], voxel_size=0.2, num_neighbors=7)
     assert found.converged and found.registrations == {} and found.clouds[0].neighbors.shape[1] == 7
-    expected = mcg.aggregate(found.clouds, [start], 0.2)
+    expected = mcg.merge_clouds(found.clouds, [start], 0.2)
     np.testing.assert_allclose(found.map.coordinates, expected.coordinates, atol=1e-9)
     again = mcg.multiway(found.clouds, mcg.GICP(), init=[start], voxel_size=1.0)
     assert again.clouds[0] is found.clouds[0] and len(again.map) < 0.3 * len(found.map)

@@ -115,7 +115,7 @@ def test_a_map_is_the_mean_of_each_voxel(seed, count, voxel_size, partial):
         for i, point in enumerate(world):
             values = np.where(valid[i], channels[i], np.nan) if partial else channels[i]
             voxels[tuple(np.floor(point / voxel_size))].append(np.concatenate([point, values]))
-    made = mcg.aggregate(iter(clouds), iter(poses), voxel_size)
+    made = mcg.merge_clouds(iter(clouds), iter(poses), voxel_size)
     assert len(made) == len(voxels) and made.channel_names == ("a", "b")
     for point, channel, row in zip(made.points, made.channels, range(len(made)), strict=True):
         members = np.array(voxels[tuple(np.floor(point / voxel_size))])
@@ -131,19 +131,19 @@ def test_a_map_is_the_mean_of_each_voxel(seed, count, voxel_size, partial):
 def test_a_map_of_the_room_is_sharp_at_the_true_poses(room):
     frames, truth = room
     clouds = [frame.cloud for frame in frames]
-    sharp = mcg.aggregate(clouds, truth, 0.05)
-    blurred = mcg.aggregate(clouds, [pose @ motion((0, 0, 0, 0.1 * i, 0, 0)) for i, pose in enumerate(truth)], 0.05)
+    sharp = mcg.merge_clouds(clouds, truth, 0.05)
+    blurred = mcg.merge_clouds(clouds, [pose @ motion((0, 0, 0, 0.1 * i, 0, 0)) for i, pose in enumerate(truth)], 0.05)
     assert len(sharp) < len(blurred) < sum(map(len, clouds))
 
 
 def test_a_map_may_lie_at_utm_coordinates(room):
     frames, truth = room
     clouds, offset = [frame.cloud for frame in frames[:2]], np.array([500_000, 5_400_000, 100])
-    near, far = mcg.aggregate(clouds, truth[:2], 0.125), []
+    near, far = mcg.merge_clouds(clouds, truth[:2], 0.125), []
     for pose in truth[:2]:
         far.append(pose.copy())
         far[-1][:3, 3] += offset
-    np.testing.assert_allclose(mcg.aggregate(clouds, far, 0.125).points - offset, near.points, atol=1e-8)
+    np.testing.assert_allclose(mcg.merge_clouds(clouds, far, 0.125).points - offset, near.points, atol=1e-8)
 
 
 def test_what_makes_no_map_is_refused_by_name(room):
@@ -159,7 +159,7 @@ def test_what_makes_no_map_is_refused_by_name(room):
         ((clouds[:2], [truth[0], motion((1e6, 0, 0, 0, 0, 0))], 0.1), "voxel_size: 0.1 m puts points"),
     ):
         with pytest.raises(ValueError, match=message):
-            mcg.aggregate(*arguments)
+            mcg.merge_clouds(*arguments)
 
 
 def test_a_frame_that_is_no_cloud_is_named_by_its_number(room):
@@ -181,7 +181,7 @@ def test_a_map_drifts_less():
     pairs = list(mcg.odometry(frames, mcg.GICP(), **options))
     errors = [metrics.ate([step.pose for step in each], truth, alignment="first") for each in (steps, pairs)]
     assert errors[0] < 0.8 * errors[1]
-    cells = list(mcg.odometry(frames, mcg.NDT(), against="map", scales=(0.5,), **options | {"max_distance": 1.0}))
+    cells = list(mcg.odometry(frames, mcg.NDT(), against="map", voxel_sizes=(0.5,), **options | {"max_distance": 1.0}))
     assert all(step.registration.converged for step in cells[1:])
     assert metrics.ate([step.pose for step in cells], truth, alignment="first") < 0.03
 

@@ -85,7 +85,7 @@ def test_samples_are_interpolated():
     errors = [mcg.metrics.pose_error(result.matrix, truth)[0] for result in (plain, fine)]
     assert plain.converged and fine.converged
     assert errors[1] < 3e-4 < 2e-3 < errors[0]
-    assert all(direction.held_by_channels for direction in fine.free_directions)
+    assert all(direction.held_by_channels for direction in fine.unconstrained_directions)
 
 
 def test_a_wall_of_sharp_edges_is_constrained():
@@ -200,11 +200,11 @@ def test_align_has_the_gradient_of_its_answer(noisy):
     start = mcg.register(source, target, PHOTOMETRIC, max_distance=GATE).matrix
     matches = mcg.find_correspondences(source, target, start, mcg.PointToPoint(), max_distance=GATE)
     method, _ = held(source, target, PHOTOMETRIC, start, matches)
-    start = mcg.align(source, target, matches, method, init=start, **TO_ROUNDING).matrix
+    start = mcg.estimate_pose(source, target, matches, method, init=start, **TO_ROUNDING).matrix
 
     def loss(inputs):
         clouds = clouds_with(inputs, source, target)
-        return weigh(mcg.align(*clouds, matches, method, init=start, **TO_ROUNDING).matrix)
+        return weigh(mcg.estimate_pose(*clouds, matches, method, init=start, **TO_ROUNDING).matrix)
 
     inputs = inputs_of(source, target, method, None)
     inputs = {name: value for name, value in inputs.items() if name not in ("method", "robust")}
@@ -225,7 +225,7 @@ def test_register_has_the_gradient_of_align():
         return mcg.register(*clouds, PHOTOMETRIC, init=found.matrix, max_distance=GATE, **CONVERGED)
 
     def aligned(clouds):
-        return mcg.align(*clouds, matches, method, init=found.matrix, **TO_ROUNDING)
+        return mcg.estimate_pose(*clouds, matches, method, init=found.matrix, **TO_ROUNDING)
 
     inputs = inputs_of(source, target, method, None)
     inputs = {name: value for name, value in inputs.items() if name not in ("method", "robust")}
@@ -247,7 +247,7 @@ def test_missing_channels_and_padding_have_no_gradient():
 
     def loss(points, channels):
         moved = source.replace(points=points, channels=channels)
-        return weigh(mcg.align(moved, target, matches, PHOTOMETRIC).matrix)
+        return weigh(mcg.estimate_pose(moved, target, matches, PHOTOMETRIC).matrix)
 
     for gradient in jax.jit(jax.grad(loss, argnums=(0, 1)))(source.points, source.channels):
         assert np.isfinite(gradient).all() and np.abs(gradient[:400]).max() > 0
@@ -272,10 +272,10 @@ def test_units_and_useless_channels_do_not_matter(change):
 def test_gain_and_offset_are_estimated_with_the_pose():
     source, target, truth = pair(wall, 2000, truth=SMALL)
     darker = source.replace(channels=np.float32(0.7) * source.channels - np.float32(0.2))
-    without, matched = (mcg.register(darker, target, PHOTOMETRIC, match_channels=match) for match in (False, True))
+    without, matched = (mcg.register(darker, target, PHOTOMETRIC, equalize_channels=match) for match in (False, True))
     errors = [mcg.metrics.pose_error(result.matrix, truth)[0] for result in (without, matched)]
     assert matched.converged and errors[1] < 1e-3 < 5e-3 < errors[0]
-    inside = jax.jit(lambda s: mcg.register(s, target, PHOTOMETRIC, match_channels=True).matrix)(darker)
+    inside = jax.jit(lambda s: mcg.register(s, target, PHOTOMETRIC, equalize_channels=True).matrix)(darker)
     np.testing.assert_allclose(inside, matched.matrix, atol=1e-5)
 
 

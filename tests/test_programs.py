@@ -83,9 +83,12 @@ def test_channels_that_a_method_does_not_use_compile_nothing(name):
 def test_cells_of_other_sizes_compile_nothing():
     def everything(seed, points, voxel_size):
         source, target = (mcg.PointCloud(*room_corner(points, seed=2 * seed + i)) for i in (0, 1))
-        cells = mcg.gaussians(target, voxel_size)
-        results = [mcg.register(source, cells, mcg.NDT()), mcg.register(source, target, mcg.NDT(), scales=(0.8, 0.5))]
-        results.append(mcg.register(mcg.gaussians(source, voxel_size), cells, mcg.D2DNDT()))
+        cells = mcg.voxel_gaussians(target, voxel_size)
+        results = [
+            mcg.register(source, cells, mcg.NDT()),
+            mcg.register(source, target, mcg.NDT(), voxel_sizes=(0.8, 0.5)),
+        ]
+        results.append(mcg.register(mcg.voxel_gaussians(source, voxel_size), cells, mcg.D2DNDT()))
         assert all(result.covariance.shape == (6, 6) for result in results)
 
     everything(0, 3000, 0.4)
@@ -100,7 +103,7 @@ def test_numbers_compile_nothing():
     with compilations() as found:
         for i in range(3):
             options = {"max_distance": 0.4 + 0.01 * i, "max_iterations": 9 + i, "robust": mcg.Cauchy(0.5 + i)}
-            mcg.register(source, target, mcg.GICP(1e-3 * (i + 1)), hold_free_directions=i > 1, **options)
+            mcg.register(source, target, mcg.GICP(1e-3 * (i + 1)), hold_unconstrained=i > 1, **options)
     assert not found
 
 

@@ -124,8 +124,8 @@ def test_align_reaches_the_balance_of_forces(room):
     matches = mcg.find_correspondences(source, target, truth, method, max_distance=0.5)
     tolerance = 1e-11 if X64 else 1e-6
     tight = {"translation_tolerance": tolerance, "rotation_tolerance": tolerance}
-    result = mcg.align(source, target, matches, method, **tight)
-    again = mcg.align(source, target, matches, method, init=result.matrix, max_iterations=1, **tight)
+    result = mcg.estimate_pose(source, target, matches, method, **tight)
+    again = mcg.estimate_pose(source, target, matches, method, init=result.matrix, max_iterations=1, **tight)
     assert result.converged and again.converged
     assert difference(result.matrix, again.matrix) < (1e-10 if X64 else 2e-6)
 
@@ -377,18 +377,18 @@ def test_scales_find_a_start_that_is_far_off():
     method = METHODS["mc-gicp"]
     near = mcg.register(source, target, method, max_distance=(0.4, 0.1))
     assert difference(near.matrix, truth) > 1
-    far = mcg.register(source, target, method, max_distance=(0.4, 0.1), scales=(0.3, 0.15))
+    far = mcg.register(source, target, method, max_distance=(0.4, 0.1), voxel_sizes=(0.3, 0.15))
     assert far.converged and difference(far.matrix, truth) < 4e-3
     with pytest.raises(ValueError, match="tracers"):
-        jax.jit(lambda s: mcg.register(s, target, method, scales=(0.2,)).matrix)(source)
+        jax.jit(lambda s: mcg.register(s, target, method, voxel_sizes=(0.2,)).matrix)(source)
 
 
 def test_matched_channels_undo_gain_and_offset():
     source, target, truth = pair(wall)
     other = source.replace(channels=source.channels * np.array([0.8, 1.3, 0.5]) + np.array([0.1, -0.2, 0.3]))
     method = mcg.MultiChannelGICP()
-    expected = mcg.register(source, target, method, match_channels=True)
-    result = mcg.register(other, target, method, match_channels=True)
+    expected = mcg.register(source, target, method, equalize_channels=True)
+    result = mcg.register(other, target, method, equalize_channels=True)
     assert result.converged and difference(result.matrix, expected.matrix) < 1e-5
     assert difference(result.matrix, truth) < 6e-3
     plain = mcg.register(other, target, method)
@@ -406,11 +406,11 @@ def test_matched_channels_are_not_fooled_by_what_one_cloud_sees():
     method = mcg.MultiChannelGICP()
     right = mcg.PointCloud(points[:2000], (channels[:2000] - 0.1) / 0.8)
     expected = mcg.register(mcg.preprocess(right), target, method)
-    result = mcg.register(source, target, method, match_channels=True)
+    result = mcg.register(source, target, method, equalize_channels=True)
     assert result.converged and difference(result.matrix, truth) < 6e-3
     assert difference(result.matrix, expected.matrix) < 2e-3
     assert len(result.history["cost"]) == result.num_iterations + 1
-    jitted = jax.jit(lambda source: mcg.register(source, target, method, match_channels=True).matrix)(source)
+    jitted = jax.jit(lambda source: mcg.register(source, target, method, equalize_channels=True).matrix)(source)
     assert difference(jitted, result.matrix) < 2e-4
 
 
@@ -502,7 +502,7 @@ def test_scales_start_from_a_pose_that_is_degenerate():
     """Geometry holds the wall's distance and tilt; the coarse pose must not be thrown away for what slides."""
     truth = motion((0.0, 0.0, 0.25, 0.12, 0.0, 0.0))
     source, target, _ = pair(wall, truth=truth)
-    result = mcg.register(source, target, mcg.GICP(), max_distance=0.06, scales=(0.2,))
+    result = mcg.register(source, target, mcg.GICP(), max_distance=0.06, voxel_sizes=(0.2,))
     assert result.status is Status.DEGENERATE
     # Across the wall the pose is found, though the fine gate alone would see nothing.
     normal = np.asarray(result.matrix) @ np.linalg.inv(truth)
@@ -513,8 +513,8 @@ def test_scales_start_from_a_pose_that_is_degenerate():
 def test_scales_refuse_covariances_that_are_given(room):
     source, target, _ = room
     given = target.replace(covariances=np.broadcast_to(np.eye(3), (*target.points.shape, 3)))
-    with pytest.raises(ValueError, match="scales: expected none for clouds with covariances"):
-        mcg.register(source, given, mcg.GICP(), scales=(0.2,))
+    with pytest.raises(ValueError, match="voxel_sizes: expected none for clouds with covariances"):
+        mcg.register(source, given, mcg.GICP(), voxel_sizes=(0.2,))
 
 
 def test_jit_gives_the_pose_of_the_host_before_it_has_converged(room):
@@ -546,7 +546,7 @@ def test_channels_in_other_units_are_reported(gain, offset, warned, room):
         warnings.simplefilter("always")
         mcg.register(changed, target, mcg.MultiChannelGICP(0.05, 0.3), max_distance=0.5, max_iterations=1)
         mcg.register(changed, target, mcg.GICP(), max_distance=0.5, max_iterations=1)
-        mcg.register(changed, target, mcg.MultiChannelGICP(0.05, 0.3), match_channels=True, max_iterations=1)
+        mcg.register(changed, target, mcg.MultiChannelGICP(0.05, 0.3), equalize_channels=True, max_iterations=1)
     messages = [str(each.message) for each in caught]
     assert any("units differ" in message for message in messages) == warned
     assert len(messages) <= source.channels.shape[1]

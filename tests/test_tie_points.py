@@ -128,7 +128,7 @@ def test_a_prior_is_weighed_by_its_covariance(corner, name):
     method = methods.get(name, mcg.D2DNDT())
     options = OPTIONS | {"translation_tolerance": 1e-5, "rotation_tolerance": 1e-5}
     if name == "d2d-ndt":
-        source, target = (mcg.gaussians(cloud, 0.2) for cloud in (source, target))
+        source, target = (mcg.voxel_gaussians(cloud, 0.2) for cloud in (source, target))
     alone = mcg.register(source, target, method, **options)
     prior = measured(alone.matrix, 3 * np.sqrt(np.diagonal(alone.covariance)), seed=2)
     result = mcg.register(source, target, method, prior=prior, **options)
@@ -199,7 +199,7 @@ def test_a_tie_point_holds_the_axis_of_a_corridor(hall):
     one = tie_points(truth, source.points, 0.01, count=1)
     result = mcg.register(source, target, mcg.GICP(), tie_points=one, **options)
     assert result.converged and result.deviations.max() < 0.03
-    (direction,) = result.free_directions
+    (direction,) = result.unconstrained_directions
     assert direction.held_by_ties and not direction.held_by_channels and abs(direction.axis @ axis) > 0.995
     assert "constrained by tie points or prior" in repr(direction) and "by tie points or prior" in repr(result)
     error = twist_error(result.matrix, truth)
@@ -312,8 +312,8 @@ def test_malformed_arguments_are_named(corner):
     for message, given in cases.items():
         with pytest.raises(ValueError, match=message):
             mcg.register(source, target, mcg.GICP(), prior=given)
-    with pytest.raises(ValueError, match=r"^hold_free_directions: expected True with"):
-        mcg.register(source, target, mcg.GICP(), prior=(truth, np.eye(6)), hold_free_directions=False)
+    with pytest.raises(ValueError, match=r"^hold_unconstrained: expected True with"):
+        mcg.register(source, target, mcg.GICP(), prior=(truth, np.eye(6)), hold_unconstrained=False)
 
 
 # Calibration

@@ -92,7 +92,7 @@ def test_implicit_gradient_is_that_of_the_unrolled_loop(noisy):
 
     def implicit(points):
         return weigh(
-            mcg.align(source.replace(points=points), target, matches, method, init=motion(), **CONVERGED).matrix
+            mcg.estimate_pose(source.replace(points=points), target, matches, method, init=motion(), **CONVERGED).matrix
         )
 
     expected, actual = jax.jit(jax.grad(unrolled))(source.points), jax.jit(jax.grad(implicit))(source.points)
@@ -112,7 +112,7 @@ def test_the_start_has_no_influence_on_the_answer(noisy):
     source, target, _ = noisy
     method, _ = CASES["gicp"]
     matches = mcg.find_correspondences(source, target, motion(), method, max_distance=GATE)
-    gradient = jax.grad(lambda init: weigh(mcg.align(source, target, matches, method, init=init).matrix))
+    gradient = jax.grad(lambda init: weigh(mcg.estimate_pose(source, target, matches, method, init=init).matrix))
     np.testing.assert_array_equal(gradient(jnp.asarray(motion(), source.points.dtype)), 0)
 
 
@@ -251,8 +251,8 @@ def test_towards_zero_temperature_the_nearest_counts_alone(noisy):
     assert costs[0] > costs[1] > costs[2] * (1 + 1e-3)
     np.testing.assert_allclose(costs[2], cost, rtol=1e-4)
     # At a pose that the hard matches balance, so do the soft ones.
-    soft = mcg.align(source, target, many, method, init=start, temperature=1e-4)
-    aligned = mcg.align(source, target, hard, method, init=start)
+    soft = mcg.estimate_pose(source, target, many, method, init=start, temperature=1e-4)
+    aligned = mcg.estimate_pose(source, target, hard, method, init=start)
     np.testing.assert_allclose(soft.matrix, aligned.matrix, atol=1e-6 if X64 else 1e-4)
 
 
@@ -261,7 +261,7 @@ def test_candidates_need_a_temperature(noisy):
     method, _ = CASES["gicp"]
     matches = mcg.find_correspondences(source, target, None, method, max_distance=GATE, num_candidates=2)
     with pytest.raises(ValueError, match="temperature: expected metres to go with 2 candidates, got None"):
-        mcg.align(source, target, matches, method)
+        mcg.estimate_pose(source, target, matches, method)
     with pytest.raises(ValueError, match="temperature: expected a positive number"):
         mcg.mahalanobis_cost(np.eye(4), source, target, matches, method, temperature=0.0)
     with pytest.raises(ValueError, match="num_candidates: expected an integer of at least 1, got 0"):
@@ -292,7 +292,7 @@ def test_second_derivatives_are_refused(outer, noisy):
 
     def loss(shift):
         moved = source.replace(points=jnp.asarray(source.points) + shift * jnp.arange(3.0))
-        return weigh(mcg.align(moved, target, matches, mcg.GICP(1e-2)).matrix)
+        return weigh(mcg.estimate_pose(moved, target, matches, mcg.GICP(1e-2)).matrix)
 
     jax.make_jaxpr(jax.grad(loss))(0.1)
     with pytest.raises(NotImplementedError, match="first derivatives only"):

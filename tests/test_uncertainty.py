@@ -122,11 +122,11 @@ def test_geometry_slides_on_a_wall_and_stays_where_it_started(flat):
     source, target, truth = flat
     result = mcg.register(source, target, mcg.GICP(), max_distance=0.3)
     assert result.status is mcg.Status.DEGENERATE and not result.converged
-    kinds = [(direction.is_rotation, direction.held_by_channels) for direction in result.free_directions]
+    kinds = [(direction.is_rotation, direction.held_by_channels) for direction in result.unconstrained_directions]
     assert kinds == [(False, False), (False, False), (True, False)]
-    for direction in result.free_directions[:2]:
+    for direction in result.unconstrained_directions[:2]:
         assert abs(direction.axis[2]) < 0.05
-    assert abs(result.free_directions[2].axis[2]) > 0.99
+    assert abs(result.unconstrained_directions[2].axis[2]) > 0.99
     # What is held is found: height and tilt. What is not stays: the way along the wall, and the turn about its normal.
     left = np.linalg.inv(truth) @ result.matrix
     assert abs(left[2, 3]) < 2e-3 and np.abs(left[:2, 2]).max() < 2e-3
@@ -138,7 +138,7 @@ def test_geometry_slides_on_a_wall_and_stays_where_it_started(flat):
 
 def test_without_the_hold_the_nearest_neighbours_pull(flat):
     source, target, _ = flat
-    options = {"max_distance": 0.3, "hold_free_directions": False}
+    options = {"max_distance": 0.3, "hold_unconstrained": False}
     result = mcg.register(source, target, mcg.GICP(), **options)
     (batched,) = mcg.register_batch([source], [target], mcg.GICP(), **options)
     np.testing.assert_array_equal(batched.matrix, result.matrix)
@@ -150,8 +150,8 @@ def test_without_the_hold_the_nearest_neighbours_pull(flat):
 def test_the_channels_hold_what_geometry_leaves_free(flat):
     source, target, truth = flat
     result = mcg.register(source, target, mcg.MultiChannelGICP(), max_distance=0.3)
-    assert result.converged and len(result.free_directions) == 3
-    assert all(direction.held_by_channels for direction in result.free_directions)
+    assert result.converged and len(result.unconstrained_directions) == 3
+    assert all(direction.held_by_channels for direction in result.unconstrained_directions)
     assert mcg.metrics.pose_error(result.matrix, truth)[0] < 0.01
     assert repr(result).count("constrained by channels: all") == 1
 
@@ -159,7 +159,7 @@ def test_the_channels_hold_what_geometry_leaves_free(flat):
 def test_nothing_is_free_in_a_corner():
     source, target, _ = pair()
     result = mcg.register(source, target, mcg.GICP(), max_distance=0.5)
-    assert result.converged and result.free_directions == () and "free" not in repr(result)
+    assert result.converged and result.unconstrained_directions == () and "free" not in repr(result)
 
 
 @pytest.mark.parametrize("textured", [True, False])
@@ -168,7 +168,7 @@ def test_a_corridor_is_free_along_its_axis(textured):
     truth = np.linalg.inv(target.pose) @ source.pose
     clouds = [mcg.preprocess(frame.cloud) for frame in (source, target)]
     result = mcg.register(*clouds, mcg.MultiChannelGICP(), max_distance=0.5)
-    (direction,) = result.free_directions
+    (direction,) = result.unconstrained_directions
     assert not direction.is_rotation and direction.held_by_channels == textured
     axis = source.pose[:3, :3].T @ [1, 0, 0]
     assert abs(direction.axis @ axis) > 0.995
@@ -215,18 +215,20 @@ def test_real_scenes(data):
 
     result = mcg.register(*table, mcg.GICP(), max_distance=0.1)
     assert result.status is mcg.Status.DEGENERATE
-    assert [direction.is_rotation for direction in result.free_directions] == [False, False, True]
+    assert [direction.is_rotation for direction in result.unconstrained_directions] == [False, False, True]
     result = mcg.register(*table, mcg.MultiChannelGICP(), max_distance=0.1)
-    assert result.converged and [direction.held_by_channels for direction in result.free_directions] == [True] * 3
+    assert (
+        result.converged and [direction.held_by_channels for direction in result.unconstrained_directions] == [True] * 3
+    )
 
     result = mcg.register(*road, mcg.GICP(), init=motion((1.3, 0, 0, 0, 0, 0)), max_distance=0.5)
     assert result.status is mcg.Status.DEGENERATE
-    forward, sideways, yaw = result.free_directions
+    forward, sideways, yaw = result.unconstrained_directions
     assert abs(forward.axis[0]) > 0.99 and abs(sideways.axis[1]) > 0.99
     assert yaw.is_rotation and abs(yaw.axis[2]) > 0.99
 
     result = mcg.register(*street, mcg.GICP(), max_distance=1.5)
-    assert result.converged and result.free_directions == ()
+    assert result.converged and result.unconstrained_directions == ()
 
 
 def on_the_road(scan):
@@ -249,7 +251,7 @@ def test_the_covariance_is_a_covariance():
     for result in (
         mcg.register(source, target, mcg.GICP(), max_distance=0.5),
         mcg.register(source, target, mcg.MultiChannelGICP(), max_distance=0.5, robust=mcg.Cauchy(0.3)),
-        mcg.align(source, target, matches, mcg.GICP(), init=motion()),
+        mcg.estimate_pose(source, target, matches, mcg.GICP(), init=motion()),
     ):
         covariance = np.asarray(result.covariance)
         np.testing.assert_array_equal(covariance, covariance.T)
@@ -281,7 +283,7 @@ def test_what_nothing_holds_is_not_known(flat):
     radius = np.sqrt(np.mean(np.sum((points - points.mean(axis=0)) ** 2, axis=1)))
     # Ten radii along the wall, and ten radians about its normal.
     np.testing.assert_allclose(result.deviations[[0, 1, 5]], [10 * radius, 10 * radius, 10], rtol=0.01)
-    for direction in result.free_directions:
+    for direction in result.unconstrained_directions:
         deviation = np.sqrt(direction.twist @ np.linalg.pinv(np.asarray(result.information)) @ direction.twist)
         assert np.isfinite(deviation)
         # A motion of one metre, of ten times the radius
@@ -296,7 +298,7 @@ def test_what_nothing_holds_is_not_known(flat):
 def test_without_a_pose_there_is_no_covariance():
     source, target, _ = pair()
     result = mcg.register(source, target, mcg.GICP(), init=motion((50, 0, 0, 0, 0, 0)), max_distance=0.5)
-    assert np.all(np.isnan(result.covariance)) and result.free_directions == () and result.overlap == 0
+    assert np.all(np.isnan(result.covariance)) and result.unconstrained_directions == () and result.overlap == 0
 
 
 def test_large_coordinates_keep_the_covariance_of_the_points():
@@ -311,7 +313,7 @@ def test_large_coordinates_keep_the_covariance_of_the_points():
     to_near[:3, 3:] = -np.cross(np.eye(3), offset)
     brought = to_near @ far.covariance @ to_near.T
     np.testing.assert_allclose(np.diagonal(brought), np.diagonal(near.covariance), rtol=0.5)
-    assert far.free_directions == near.free_directions == ()
+    assert far.unconstrained_directions == near.unconstrained_directions == ()
     # Of the points themselves, wherever zero is.
     np.testing.assert_allclose(far.deviations, near.deviations, rtol=0.3)
     assert far.deviations.max() < 5e-3 < np.sqrt(far.covariance[0, 0])
@@ -322,8 +324,8 @@ def test_traced_and_batched_results_carry_the_same():
     stacked = [mcg.PointCloud.stack([clouds[i][which] for i in range(3)]) for which in (0, 1)]
     run = jax.jit(jax.vmap(lambda s, t: mcg.register(s, t, mcg.GICP(), max_distance=0.5)))
     batch = run(*stacked)
-    with pytest.raises(ValueError, match="free_directions"):
-        _ = batch.free_directions
+    with pytest.raises(ValueError, match="unconstrained_directions"):
+        _ = batch.unconstrained_directions
     for i, (source, target) in enumerate(clouds):
         alone = mcg.register(source, target, mcg.GICP(), max_distance=0.5)
         np.testing.assert_allclose(batch.directions.geometry[i], alone.directions.geometry, atol=1e-3)
@@ -341,7 +343,7 @@ def test_the_claims_hold_on_average(method):
         target, source = (room.observe(i, noise_seed=2 * seed + i) for i in (0, 1))
         truth = np.linalg.inv(target.pose) @ source.pose
         clouds = [
-            mcg.gaussians(frame.cloud, 0.5) if name in method.needs_covariances else mcg.preprocess(frame.cloud)
+            mcg.voxel_gaussians(frame.cloud, 0.5) if name in method.needs_covariances else mcg.preprocess(frame.cloud)
             for name, frame in (("source", source), ("target", target))
         ]
         result = mcg.register(*clouds, method, init=truth, max_distance=0.5)

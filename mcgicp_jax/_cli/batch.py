@@ -266,7 +266,7 @@ def _read(path: Path, channels: Sequence[str]) -> mcg.PointCloud:
         raise error if str(path) in str(error) else ValueError(f"{path}: {error}") from error
 
 
-def _row(pair: FilePair, result: mcg.Registration, reason: str, fingerprint: str) -> Row:
+def _row(pair: FilePair, result: mcg.RegistrationResult, reason: str, fingerprint: str) -> Row:
     numbers = (result.num_iterations, result.num_inliers, result.cost, result.rmse, *result.matrix[:3].ravel())
     values = (np.asarray(number).item() for number in numbers)
     texts = (*pair.key, _word(result.status), *map(repr, values), " ".join(reason.split()), fingerprint)

@@ -154,10 +154,10 @@ def _clouds(frames: AbstractFrames, names: tuple[str, ...], truth: Truth) -> Ite
 
 def _follow(
     steps: Iterator[OdometryStep], num_frames: int, loops: bool, map: Path | None, voxel_size: float | None
-) -> tuple[Poses, list[mcg.Registration]]:
+) -> tuple[Poses, list[mcg.RegistrationResult]]:
     """Run the odometry, write the map if it has a file, and return the poses and the registrations."""
     poses: Poses = []
-    results: list[mcg.Registration] = []
+    results: list[mcg.RegistrationResult] = []
     last: Any = None
 
     def followed() -> Iterator[tuple[mcg.PointCloud, Float[np.ndarray, "4 4"]]]:
@@ -182,13 +182,13 @@ def _follow(
         collections.deque(stream, maxlen=0)
         return poses, results
     with_clouds, with_poses = itertools.tee(stream)
-    world = mcg.aggregate((cloud for cloud, _ in with_clouds), (pose for _, pose in with_poses), voxel_size)
+    world = mcg.merge_clouds((cloud for cloud, _ in with_clouds), (pose for _, pose in with_poses), voxel_size)
     io.write(map, world)
     print(f"map:       {map}, {len(world):,} points, voxels of {voxel_size:g} m")
     return poses, results
 
 
-def _report(poses: Poses, truth: Truth, results: list[mcg.Registration]) -> None:
+def _report(poses: Poses, truth: Truth, results: list[mcg.RegistrationResult]) -> None:
     iterations = np.mean([np.asarray(result.num_iterations) for result in results])
     converged = sum(bool(result.converged) for result in results)
     print(f"pairs:     {converged} of {len(results)} converged, {iterations:.1f} iterations on average")

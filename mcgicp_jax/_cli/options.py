@@ -105,10 +105,10 @@ class Options:
         translation_tolerance: Metres; registration has converged once an update is below both tolerances.
         rotation_tolerance: Radians.
         robust: Robust kernel ({kernels}) and its scale in units of the Mahalanobis distance, such as huber 1.0.
-        hold_free_directions: Keep the initial pose in directions that neither geometry nor channels constrain.
-        match_channels: Scale and shift the channels of the source to the distribution of those of the target.
-        scales: Voxel sizes in metres, coarse to fine, at which to register first if the initial pose is far off. For
-            {cell_methods} the sizes of the cells; by default 32, 16 and 8 times the spacing of the points.
+        hold_unconstrained: Keep the initial pose in directions that neither geometry nor channels constrain.
+        equalize_channels: Scale and shift the channels of the source to the distribution of those of the target.
+        voxel_sizes: Voxel sizes in metres, coarse to fine, at which to register first if the initial pose is far off.
+            For {cell_methods} the sizes of the cells; by default 32, 16 and 8 times the spacing of the points.
         channel_covariance: For {channel_covariance}: one variance for all channels, or one for each; channel units
             squared.
         channel_weights: For {channel_weights}: one weight for all channels, or one for each; metres per channel unit.
@@ -123,9 +123,9 @@ class Options:
     translation_tolerance: Tolerance = None
     rotation_tolerance: float = ROTATION_TOLERANCE
     robust: Kernel = None
-    hold_free_directions: bool = True
-    match_channels: bool = False
-    scales: Sizes = ()
+    hold_unconstrained: bool = True
+    equalize_channels: bool = False
+    voxel_sizes: Sizes = ()
     channel_covariance: Numbers = ()
     channel_weights: Numbers = ()
     epsilon: Epsilon = None
@@ -276,5 +276,5 @@ def listed(names: Sequence[str]) -> str:
     return ", ".join(names) if names else "no channels"
 
 
-def words(result: mcg.Registration) -> str:
+def words(result: mcg.RegistrationResult) -> str:
     return result.status.name.lower().replace("_", " ")

@@ -50,7 +50,7 @@ class Row(NamedTuple):
 
     def register(self, source: mcg.PointCloud, target: mcg.PointCloud, **options: Any) -> Any:
         """Register without detection of unconstrained directions, as in the paper."""
-        return mcg.register(source, target, self.method_for(source, target), hold_free_directions=False, **options)
+        return mcg.register(source, target, self.method_for(source, target), hold_unconstrained=False, **options)
 
 
 def rows_of_table(channel_covariance: Float[np.ndarray, "C C"] | None = None) -> list[Row]:
@@ -185,14 +185,14 @@ def _maps(
 ) -> Iterator[str]:
     """Maps, with voxels of a size in metres, of frames merged by odometry alone; and the errors of the trajectories."""
     truth, errors = [frame.pose for frame in frames], []
-    maps = {"truth": mcg.aggregate((frame.cloud for frame in frames), truth, size)}
-    options: Any = {"voxel_size": voxel_size, "max_distance": max_distance, "hold_free_directions": False}
+    maps = {"truth": mcg.merge_clouds((frame.cloud for frame in frames), truth, size)}
+    options: Any = {"voxel_size": voxel_size, "max_distance": max_distance, "hold_unconstrained": False}
     for row in rows:
         method = row.method_for(row.preprocess(frames[1], voxel_size), row.preprocess(frames[0], voxel_size))
         clouds = (with_channels(frame.cloud, row.channels) for frame in frames)
         steps = mcg.odometry(clouds, method, start=truth[0], **options)
         poses = [step.pose for step in tqdm(steps, total=len(frames), desc=row.name, unit="frame", disable=None)]
-        maps[row.name] = mcg.aggregate((frame.cloud for frame in frames), poses, size)
+        maps[row.name] = mcg.merge_clouds((frame.cloud for frame in frames), poses, size)
         errors.append(f"{row.name} {1e3 * metrics.ate(poses, truth, alignment='first'):.0f} mm")
     plot.maps(maps, limits=limits, path=path)
     yield f"## Figure {path.stem[-1]}: {len(frames)} frames merged by odometry"

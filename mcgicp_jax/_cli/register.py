@@ -84,22 +84,22 @@ class PreparedPair:
         translation, rotation = metrics.pose_error(pose, true_pose, at=centroid)
         return f"{1e3 * float(translation):9.2f}  {np.degrees(rotation):11.3f}"
 
-    def register(self, method: AbstractMethod) -> mcg.Registration:
+    def register(self, method: AbstractMethod) -> mcg.RegistrationResult:
         source, target, options = self.source, self.target, self.options.registration()
         if method.needs_covariances:
             # Cells are made of all points.
             whole = [with_channels(cloud, self.channels) for cloud in self.raw]
             source = whole[0] if "source" in method.needs_covariances else source
             target = whole[1]
-            options["scales"] = self.cells(method)
+            options["voxel_sizes"] = self.cells(method)
         return mcg.register(source, target, method, init=self.start, **options)
 
     def cells(self, method: AbstractMethod) -> tuple[float, ...]:
         """Sizes of the cells, metres, for methods that need any: with 8 spacings, a cell has some tens of points."""
         spacing = float(matching_spacing(method, self.target))
-        return self.options.scales or tuple(float(f"{times * spacing:.2g}") for times in (32, 16, 8))
+        return self.options.voxel_sizes or tuple(float(f"{times * spacing:.2g}") for times in (32, 16, 8))
 
-    def draw(self, results: dict[MethodName, mcg.Registration]) -> None:
+    def draw(self, results: dict[MethodName, mcg.RegistrationResult]) -> None:
         if self.options.plot is not None:
             poses: dict[str, Any] = {"start": self.start, **{name: result.matrix for name, result in results.items()}}
             plot.before_after(*self.raw, poses, path=self.options.plot)
@@ -188,10 +188,10 @@ def demo(output: Path = Path("mcgicp_demo")) -> int:
 
 def _compare(
     source: Path, target: Path, options: PairOptions, truth: Path | None
-) -> dict[MethodName, mcg.Registration]:
+) -> dict[MethodName, mcg.RegistrationResult]:
     true_pose = None if truth is None else _read_pose(truth)
     pair = PreparedPair(source, target, options)
-    results: dict[MethodName, mcg.Registration] = {}
+    results: dict[MethodName, mcg.RegistrationResult] = {}
     measures = "inliers      rmse, m" if true_pose is None else "error, mm   error, deg"
     width = max(map(len, METHODS))
     print(f"\n{'method':{width}}  {measures:>22}  iterations  time, ms  status")
@@ -222,7 +222,7 @@ def _parameters(method: AbstractMethod) -> str:
     return "".join(f", {name} {' '.join(f'{value:.3g}' for value in values)}" for name, values in numbers)
 
 
-def _report(pair: PreparedPair, result: mcg.Registration) -> None:
+def _report(pair: PreparedPair, result: mcg.RegistrationResult) -> None:
     plural = "" if result.num_iterations == 1 else "s"
     print(f"status:    {words(result)} after {result.num_iterations} iteration{plural}")
     print(f"inliers:   {result.num_inliers:,} of {len(pair.source):,} ({result.overlap:.0%}), rmse {result.rmse:.4g} m")
@@ -230,8 +230,8 @@ def _report(pair: PreparedPair, result: mcg.Registration) -> None:
         x, y, z, *angles = result.deviations
         roll, pitch, yaw = np.degrees(angles)
         print(f"deviation: x {x:.2g}, y {y:.2g}, z {z:.2g} m; about x {roll:.2g}, y {pitch:.2g}, z {yaw:.2g} degrees")
-    if result.free_directions:
-        print(f"free:      {describe(result.free_directions)}")
+    if result.unconstrained_directions:
+        print(f"free:      {describe(result.unconstrained_directions)}")
     print("T_target_source:")
     # At UTM coordinates, 1e-8 in a rotation entry moves a point by centimetres.
     form = "22.14f" if np.any(pair.source.origin) else "15.8f"
@@ -239,7 +239,7 @@ def _report(pair: PreparedPair, result: mcg.Registration) -> None:
         print("".join(f" {number:{form}}" for number in row))
 
 
-def _verdict(results: dict[MethodName, mcg.Registration]) -> int:
+def _verdict(results: dict[MethodName, mcg.RegistrationResult]) -> int:
     """Return the exit code, and print to stderr which methods did not converge."""
     failed = {name: result for name, result in results.items() if not result.converged}
     for name, result in failed.items():

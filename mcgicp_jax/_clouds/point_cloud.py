@@ -79,7 +79,7 @@ class PointCloud(eqx.Module):
         valid: (N,), False for padding.
         neighbors: (N, k) row indices of the k nearest points, including the point itself; −1 where there are fewer.
         covariances: (N, 3, 3), or None. If given, methods use them instead of computing their own: dimensionless for
-            GICP and MC-GICP, m² for NDT (from `gaussians`; the scale of a kernel is then in standard deviations).
+            GICP and MC-GICP, m² for NDT (from `voxel_gaussians`; the scale of a kernel is then in standard deviations).
         origin: (3,) float64, metres, subtracted from the points so that float32 stays precise at large (UTM)
             coordinates; 0 otherwise.
         channel_names: C names, such as ("intensity",) or ("red", "green", "blue"); used as column names in files.

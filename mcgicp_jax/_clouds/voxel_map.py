@@ -13,7 +13,7 @@ from mcgicp_jax._compute.argument_checks import check_positive
 from mcgicp_jax._math.poses import Pose, pose_matrix
 
 
-def aggregate(clouds: Iterable[PointCloud | Values], poses: Iterable[Pose], voxel_size: float) -> PointCloud:
+def merge_clouds(clouds: Iterable[PointCloud | Values], poses: Iterable[Pose], voxel_size: float) -> PointCloud:
     """Merge clouds into one map: the mean of all points, and of their channels, per voxel of the world.
 
     Clouds are processed one by one; memory grows with the size of the map, not with the number of clouds.

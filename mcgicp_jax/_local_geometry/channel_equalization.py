@@ -30,7 +30,7 @@ def warn_of_units(source: PointCloud, target: PointCloud) -> None:
         if high < first or last < low or wide > _OTHER_UNIT * narrow > 0:
             warnings.warn(
                 f"channel {name}: most values lie between {low:.3g} and {high:.3g} in the source, but between "
-                f"{first:.3g} and {last:.3g} in the target; if their units differ, scale one, or use match_channels",
+                f"{first:.3g} and {last:.3g} in the target; if their units differ, scale one, or use equalize_channels",
                 UserWarning,
                 stacklevel=4,
             )

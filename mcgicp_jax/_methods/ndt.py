@@ -31,7 +31,7 @@ _NUM_CANDIDATES = 4
 
 
 class AbstractNDT(AbstractMethod):
-    """Methods for clouds of `gaussians`, whose covariances are in m².
+    """Methods for clouds of `voxel_gaussians`, whose covariances are in m².
 
     Attributes:
         kernel: robust kernel, its scale in standard deviations, if `register` is not given another one.
@@ -53,8 +53,9 @@ class AbstractNDT(AbstractMethod):
 class NDT(AbstractNDT, AbstractOneSided):
     """Normal-distributions transform (Biber & Strasser 2003; Magnusson 2009): points against cells, M = C⁻¹.
 
-    C is the covariance of the target's cell, from `gaussians`. Each point is matched to the nearest cell: the sum over
-    several cells takes longer and is no more accurate. With `scales`, all registrations but the last are by `GICP`.
+    C is the covariance of the target's cell, from `voxel_gaussians`. Each point is matched to the nearest cell: the sum
+    over several cells takes longer and is no more accurate. With `voxel_sizes`, all registrations but the last are by
+    `GICP`.
 
     Args:
         scale: k of the Welsch kernel, in standard deviations, if `register` is not given another kernel; None: none.
@@ -75,7 +76,7 @@ class NDT(AbstractNDT, AbstractOneSided):
 class ColorNDT(NDT, ColorICP):
     """NDT whose matches are nearest in position and channels, as the colour NDT of Huhle & Magnusson (2008).
 
-    For cells of one colour each: `gaussians` with `channel_size`. With `scales`, a cell extends as far in
+    For cells of one colour each: `voxel_gaussians` with `channel_size`. With `voxel_sizes`, a cell extends as far in
     α · channel as in position.
 
     Args:

@@ -27,7 +27,7 @@ _MIN_EXTENT = 1e-4
 
 
 @overload
-def gaussians(
+def voxel_gaussians(
     cloud: PointCloud | Values,
     voxel_size: float,
     *,
@@ -40,7 +40,7 @@ def gaussians(
 
 
 @overload
-def gaussians(
+def voxel_gaussians(
     cloud: PointCloud | Values,
     voxel_size: float,
     *,
@@ -52,7 +52,7 @@ def gaussians(
 ) -> tuple[PointCloud, Int[np.ndarray, "M"]]: ...
 
 
-def gaussians(
+def voxel_gaussians(
     cloud: PointCloud | Values,
     voxel_size: float,
     *,
@@ -128,11 +128,11 @@ def voxel_cells(
     min_points: int = _MIN_POINTS,
     channel_size: Values | None = None,
 ) -> Int[np.ndarray, "N"]:
-    """The cell of each point, as `gaussians` numbers its cells; input of `cell_moments`.
+    """The cell of each point, as `voxel_gaussians` numbers its cells; input of `cell_moments`.
 
     Args:
         cloud: cloud of finite points, or (N, 3) array in metres.
-        voxel_size, min_points, channel_size: as in `gaussians`.
+        voxel_size, min_points, channel_size: as in `voxel_gaussians`.
 
     Returns:
         (N,) numbers from 0; −1 for points in cells that are left out.
@@ -209,15 +209,15 @@ def cell_moments(
     cells: Int[np.ndarray, "N"],
     min_ratio: float = _MIN_RATIO,
 ) -> tuple[Float[Array, "M 3"], Float[Array, "M C"], Float[Array, "M 3 3"]]:
-    """Mean position, mean channels and covariance (m²) of each cell, as in `gaussians`. Pure JAX, differentiable.
+    """Mean position, mean channels and covariance (m²) of each cell, as in `voxel_gaussians`. Pure JAX, differentiable.
 
-    To let gradients reach the points of a cloud, replace `points`, `channels` and `covariances` of its `gaussians` by
-    these. The cells are constants.
+    To let gradients reach the points of a cloud, replace `points`, `channels` and `covariances` of its
+    `voxel_gaussians` by these. The cells are constants.
 
     Args:
         points, channels: of the cloud; metres and channel units.
         cells: from `voxel_cells`; concrete.
-        min_ratio: as in `gaussians`.
+        min_ratio: as in `voxel_gaussians`.
     """
     inside = np.flatnonzero(cells >= 0)
     number = cells[inside]

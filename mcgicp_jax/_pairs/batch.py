@@ -17,7 +17,7 @@ from mcgicp_jax._methods.base import AbstractMethod
 from mcgicp_jax._pairs.batch_executors import check_executor, run
 from mcgicp_jax._pairs.batch_jobs import BatchJob, Cloud, Pair
 from mcgicp_jax._registration.options import check_method, options_of
-from mcgicp_jax._registration.result import Registration
+from mcgicp_jax._registration.result import RegistrationResult
 
 
 def register_batch(
@@ -30,8 +30,9 @@ def register_batch(
     num_neighbors: int = 20,
     executor: Executor | None = None,
     **options: Any,
-) -> list[Registration]:
-    """Register many pairs of clouds of any sizes and return one `Registration` per pair, in the order of the pairs.
+) -> list[RegistrationResult]:
+    """Register many pairs of clouds of any sizes and return one `RegistrationResult` per pair, in the order of the
+    pairs.
 
     Waits for all pairs; arguments, errors and warnings are those of `register_as_completed`.
     """
@@ -58,7 +59,7 @@ def register_as_completed(
     num_neighbors: int = 20,
     executor: Executor | None = None,
     **options: Any,
-) -> Generator[tuple[int, Registration], None, None]:
+) -> Generator[tuple[int, RegistrationResult], None, None]:
     """Register many pairs of clouds of any sizes and yield each result as soon as it is computed.
 
     Pairs are independent: a result is bitwise the same whatever the other pairs, their order and the number of workers,
@@ -78,11 +79,11 @@ def register_as_completed(
             and gets the status `WORKER_FAILED` and a warning if that fails too.
         options: options of `register`, except for `tie_points` and `prior`. `search` is also used to preprocess; by
             default SciPy's k-d tree with one thread per pair. With `DenseSearch`, the default on accelerators, pairs
-            run as lanes of one vectorised program, spread over all local devices (not with `match_channels` or
-            `scales`).
+            run as lanes of one vectorised program, spread over all local devices (not with `equalize_channels` or
+            `voxel_sizes`).
 
     Returns:
-        A generator of the index of the pair, from 0, and its `Registration`.
+        A generator of the index of the pair, from 0, and its `RegistrationResult`.
 
     Raises:
         ValueError: if an argument common to all pairs is malformed, or the iterables differ in length.

@@ -25,7 +25,7 @@ import numpy as np
 from mcgicp_jax._compute.threads import num_cores, with_settings
 from mcgicp_jax._pairs.batch_jobs import BatchJob, Pair, PairResult
 from mcgicp_jax._registration.options import Options
-from mcgicp_jax._registration.result import Registration, Status
+from mcgicp_jax._registration.result import RegistrationResult, Status
 
 # Number of pairs per chunk for a worker that is not a thread, and maximum number of submitted chunks.
 _CHUNK_SIZE, _MAX_SUBMITTED = 8, 64
@@ -45,7 +45,7 @@ def check_executor(executor: Executor | None) -> None:
 
 def run(
     job: BatchJob, pairs: Iterator[Pair], executor: Executor | None
-) -> Generator[tuple[int, Registration], None, None]:
+) -> Generator[tuple[int, RegistrationResult], None, None]:
     """Register the pairs and yield index and result of each as soon as it is computed; see `register_as_completed`."""
     num_workers = num_cores()
     if executor is None and job.uses_lanes:
@@ -75,7 +75,9 @@ class ChunkedExecutor:
         self._suspects: collections.deque[Pair] = collections.deque()
         self._submitted: dict[Future[list[PairResult]], list[Pair]] = {}
 
-    def run(self, pairs: Iterator[Pair], chunk_size: int, max_submitted: int) -> Iterator[tuple[int, Registration]]:
+    def run(
+        self, pairs: Iterator[Pair], chunk_size: int, max_submitted: int
+    ) -> Iterator[tuple[int, RegistrationResult]]:
         """Submit chunks, at most `max_submitted` at a time, and yield their results."""
         try:
             while chunk := list(itertools.islice(pairs, chunk_size)):
@@ -101,7 +103,7 @@ class ChunkedExecutor:
             future = self._executor.submit(self._register, sent)
         self._submitted[future] = chunk
 
-    def _receive(self) -> Iterator[tuple[int, Registration]]:
+    def _receive(self) -> Iterator[tuple[int, RegistrationResult]]:
         """Wait for at least one chunk and yield its results; the pairs of failed chunks become suspects."""
         done, _ = wait_for(self._submitted, return_when=FIRST_COMPLETED)
         for future in done:
@@ -116,14 +118,14 @@ class ChunkedExecutor:
             else:
                 yield from map(PairResult.with_warning, results)
 
-    def _retried(self, pair: Pair) -> tuple[int, Registration]:
+    def _retried(self, pair: Pair) -> tuple[int, RegistrationResult]:
         """Submit a suspect alone and wait for its result."""
         self._submit([pair])
         future, _ = self._submitted.popitem()
         try:
             (result,) = future.result()
         except Exception as error:
-            failed = Registration.without_pose(Status.WORKER_FAILED)
+            failed = RegistrationResult.without_pose(Status.WORKER_FAILED)
             result = PairResult(pair.index, failed, f"its worker failed twice ({_words(error)})")
         return result.with_warning()
 

@@ -24,7 +24,7 @@ from mcgicp_jax._pairs.register import register_from, start_from_anywhere
 from mcgicp_jax._registration.make_result import registration_of
 from mcgicp_jax._registration.options import Options
 from mcgicp_jax._registration.register_pair import pose_problem
-from mcgicp_jax._registration.result import Registration, Status, computed
+from mcgicp_jax._registration.result import RegistrationResult, Status, computed
 from mcgicp_jax._registration.step import Problem
 from mcgicp_jax._registration.vectorized import run_problems
 from mcgicp_jax._search.base import AbstractSearch
@@ -61,10 +61,10 @@ class PairResult:
     """The result of one pair, and why it has no pose (None: it has one, or the status tells)."""
 
     index: int
-    registration: Registration
+    registration: RegistrationResult
     reason: str | None = None
 
-    def with_warning(self) -> tuple[int, Registration]:
+    def with_warning(self) -> tuple[int, RegistrationResult]:
         """Index and result; issues the `PairWarning`, if there is a reason."""
         if self.reason is not None:
             warning = PairWarning(f"pair {self.index}: {self.reason}")
@@ -99,7 +99,7 @@ class BatchJob:
     @property
     def uses_lanes(self) -> bool:
         """Whether pairs run as lanes of one vectorised program."""
-        repeated = self.options.match_channels or len(self.options.scales) > 0
+        repeated = self.options.equalize_channels or len(self.options.voxel_sizes) > 0
         return isinstance(self.search, DenseSearch) and not repeated
 
     def ready(self, name: str, cloud: Cloud) -> PointCloud:
@@ -153,7 +153,7 @@ class BatchJob:
             if isinstance(init, str):
                 start = start_from_anywhere(init, source, target)
                 if not start.success:
-                    return PairResult(pair.index, Registration.without_pose(Status.TOO_FEW_CORRESPONDENCES))
+                    return PairResult(pair.index, RegistrationResult.without_pose(Status.TOO_FEW_CORRESPONDENCES))
                 init = start.matrix
             problem, _ = pose_problem(source, target, self.method, init, self.options, num_threads=1)
             problem = _padded(problem, size_class(max(len(source.points), len(target.points))))
@@ -163,7 +163,7 @@ class BatchJob:
 
 
 def _invalid(pair: Pair, error: ValueError) -> PairResult:
-    return PairResult(pair.index, Registration.without_pose(Status.INVALID_INPUT), str(error))
+    return PairResult(pair.index, RegistrationResult.without_pose(Status.INVALID_INPUT), str(error))
 
 
 def _padded(problem: Problem, size: int) -> Problem:

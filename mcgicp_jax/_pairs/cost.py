@@ -39,8 +39,8 @@ def mahalanobis_cost(
     """Compute the cost F(T) = Σ ρ(dᵀ M d) of given matches, with d = b − T a and M = (C^B + R C^A Rᵀ)⁻¹ (Servos &
     Waslander 2014, eq. 3, which omits the inverse); M = I or n nᵀ for the methods without covariances.
 
-    Pure JAX, differentiable with respect to everything but the matches. M is a function of the rotation R here. `align`
-    holds M fixed during each update, as every GICP does, so its pose is not exactly the minimum of F.
+    Pure JAX, differentiable with respect to everything but the matches. M is a function of the rotation R here.
+    `estimate_pose` holds M fixed during each update, as every GICP does, so its pose is not exactly the minimum of F.
 
     Args:
         pose: T_target_source, `jaxlie.SE3` or (4, 4).

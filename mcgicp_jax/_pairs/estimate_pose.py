@@ -17,14 +17,14 @@ from mcgicp_jax._pose_solver.matched import match_surfaces
 from mcgicp_jax._registration.input_checks import check_clouds, check_matches
 from mcgicp_jax._registration.make_result import registration_of
 from mcgicp_jax._registration.options import Options
-from mcgicp_jax._registration.result import Registration
+from mcgicp_jax._registration.result import RegistrationResult
 from mcgicp_jax._registration.settings import settings_for
 from mcgicp_jax._registration.step import Problem
-from mcgicp_jax._registration.traced import align_traced, assess_alignment, differentiable
+from mcgicp_jax._registration.traced import assess_alignment, differentiable, estimate_pose_traced
 from mcgicp_jax._search.base import Correspondences
 
 
-def align(
+def estimate_pose(
     source: PointCloud,
     target: PointCloud,
     matches: Correspondences,
@@ -36,7 +36,7 @@ def align(
     rotation_tolerance: ArrayLike = Options.rotation_tolerance,
     robust: AbstractKernel | None = None,
     temperature: ArrayLike | None = None,
-) -> Registration:
+) -> RegistrationResult:
     """Compute the pose for fixed matches: update the pose, recompute M, and repeat until it converges. Pure JAX.
 
     Works under `jit`, `vmap`, `grad` and `jvp`. The first derivative is that of the root of Σ w JᵀM d = 0 near the
@@ -61,14 +61,14 @@ def align(
         detected.
 
     Raises:
-        ValueError: if an argument is malformed; failures on well-formed input show in `Registration.status`.
+        ValueError: if an argument is malformed; failures on well-formed input show in `RegistrationResult.status`.
     """
     options = Options(
         max_distance=np.inf,
         max_iterations=max_iterations,
         translation_tolerance=translation_tolerance,
         rotation_tolerance=rotation_tolerance,
-        hold_free_directions=False,
+        hold_unconstrained=False,
         robust=robust,
     )
     check_matches(matches, source, method, temperature)
@@ -80,7 +80,7 @@ def align(
     settings = settings_for(options, pair.method, target, 1, dtype)
     problem = Problem(start, pair.source, pair.target, pair.terms, settings)
     fixed, fixed_softness = jax.lax.stop_gradient((problem, softness))
-    loop = align_traced(fixed, matches, fixed_softness, max_iterations)
+    loop = estimate_pose_traced(fixed, matches, fixed_softness, max_iterations)
     matched = match_surfaces(pair.source, pair.target, matches, softness)
     state = differentiable(loop, matched, pair.terms)
     return registration_of(state, assess_alignment(loop, fixed, fixed_softness), loop.history, source, target)

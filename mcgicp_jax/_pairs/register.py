@@ -16,7 +16,7 @@ from mcgicp_jax._methods.base import AbstractMethod
 from mcgicp_jax._registration.measurements import GivenPrior, GivenTiePoints
 from mcgicp_jax._registration.options import Distance, Options, check_method
 from mcgicp_jax._registration.register_pair import register_pair
-from mcgicp_jax._registration.result import Registration, Status
+from mcgicp_jax._registration.result import RegistrationResult, Status
 from mcgicp_jax._search.base import AbstractSearch
 
 
@@ -32,12 +32,12 @@ def register(
     rotation_tolerance: ArrayLike = Options.rotation_tolerance,
     robust: AbstractKernel | None = None,
     search: AbstractSearch | None = None,
-    hold_free_directions: bool = True,
-    match_channels: bool = False,
-    scales: Sequence[float] = (),
+    hold_unconstrained: bool = True,
+    equalize_channels: bool = False,
+    voxel_sizes: Sequence[float] = (),
     tie_points: GivenTiePoints | None = None,
     prior: GivenPrior | None = None,
-) -> Registration:
+) -> RegistrationResult:
     """Register two clouds: find matches at the current pose, update the pose, and repeat until it converges.
 
     A coarse phase uses the larger `max_distance`, and of a source of 8,192 points or more an even subset of at least
@@ -46,13 +46,14 @@ def register(
     With concrete arrays (outside `jit`, `vmap`, `grad`) the loop runs on the host and calls compiled programs whose
     shapes do not depend on the sizes of the clouds. Inside, it is one program per size of clouds, whose matches come
     from host callbacks, one batch element at a time (with `DenseSearch`, from XLA). The pose is the same up to
-    rounding; its derivative is that of `align` at the final matches.
+    rounding; its derivative is that of `estimate_pose` at the final matches.
 
     Args:
         source, target: clouds from `preprocess`. Raw clouds and (N, 3) arrays, metres, are preprocessed with the
             defaults of `preprocess`; not inside `jit`.
         method: `MultiChannelGICP()`, `GICP()`, `PointToPlane()`, `PointToPoint()`, `ColorICP(...)`; for clouds of
-            `gaussians` or with `scales`, `NDT()`, `ColorNDT(...)`, `D2DNDT()`. Parameters left None are estimated.
+            `voxel_gaussians` or with `voxel_sizes`, `NDT()`, `ColorNDT(...)`, `D2DNDT()`. Parameters left None are
+            estimated.
         init: T_target_source to start from, `jaxlie.SE3` or (4, 4); the identity by default. "global": the result of
             `global_pose`; without its `success` the status is TOO_FEW_CORRESPONDENCES, and the pose NaN. Not available
             inside transformations.
@@ -68,34 +69,34 @@ def register(
             that of the method (NDT: `Welsch`), or none. With `photometric=True` of each residual in
             standard deviations.
         search: nearest-neighbour search; by default `KDTreeSearch` on CPUs and `DenseSearch` on accelerators.
-        hold_free_directions: do not update the pose along unconstrained directions, which neither the shape of the
+        hold_unconstrained: do not update the pose along unconstrained directions, which neither the shape of the
             clouds nor the channels (if the method uses them) constrain. If False, arbitrary nearest-neighbour matches
             decide there. The status is DEGENERATE in either case.
-        match_channels: scale and shift each channel of the source to the distribution of the target's, for scans with
-            different exposure or gain: first from the values of all points, then, in a second registration that starts
-            at the pose of the first, from those of matched points. With `MultiChannelGICP(photometric=True)` gains and
-            offsets are estimated with the pose instead, from interpolated channels.
-        scales: voxel sizes, metres, from coarse to fine, for a start that is far off: the clouds are first registered
-            at each voxel size, in this order, each time from the pose before and with the default `max_distance`; the
-            one given is for the last registration. For NDT, the sizes of its cells: the clouds are raw ones, the last
-            size gives the result, and at the others `GICP` registers voxels of a quarter of the size. Not available
-            inside transformations.
+        equalize_channels: scale and shift each channel of the source to the distribution of the target's, for scans
+            with different exposure or gain: first from the values of all points, then, in a second registration that
+            starts at the pose of the first, from those of matched points. With `MultiChannelGICP(photometric=True)`
+            gains and offsets are estimated with the pose instead, from interpolated channels.
+        voxel_sizes: voxel sizes, metres, from coarse to fine, for a start that is far off: the clouds are first
+            registered at each voxel size, in this order, each time from the pose before and with the default
+            `max_distance`; the one given is for the last registration. For NDT, the sizes of its cells: the clouds are
+            raw ones, the last size gives the result, and at the others `GICP` registers voxels of a quarter of the
+            size. Not available inside transformations.
         tie_points: (source_points, target_points, covariances), metres: points (n, 3) known to be the same, such as
             surveyed targets or image features (Huhle & Jenke 2008), and the covariances (n, 3, 3) of b − T a, in the
             target's axes. n may be 1 or 2. They are no start: if `init` is far off, pass a better one.
         prior: (pose, covariance): a measurement of T_target_source, as by GNSS or an IMU, `jaxlie.SE3` or (4, 4), and
             its covariance (6, 6), metres and radians, of ξ = (v, ω) in T = pose · exp(ξ): in the order and frame of
-            `Registration.covariance`. ξ acts at the origin of the source, along its axes: for a covariance Σ of the
-            position along the target's axes, as from GNSS, v has Rᵀ Σ R; and far from the clouds an uncertain rotation
-            leaves their position unknown, so move clouds with UTM coordinates first. Give what the prior does not tell
-            a large finite variance. Without `init` it is the start.
+            `RegistrationResult.covariance`. ξ acts at the origin of the source, along its axes: for a covariance Σ of
+            the position along the target's axes, as from GNSS, v has Rᵀ Σ R; and far from the clouds an uncertain
+            rotation leaves their position unknown, so move clouds with UTM coordinates first. Give what the prior does
+            not tell a large finite variance. Without `init` it is the start.
 
     With tie points or a prior, a first registration without them measures the covariance of the score of the matches,
     and a second one, which starts at its pose, weighs all by their covariances (Hansen 1982, generalised method of
     moments). The result is that of the second one; its `covariance` and `information` include tie points and prior.
-    They also constrain directions that the clouds leave free (`FreeDirection.held_by_ties`). The pose is differentiable
-    with respect to points, pose and covariances; the weights of the matches are constants to autodiff. Contradictions
-    are averaged, not detected. Inside transformations, covariances are not checked.
+    They also constrain directions that the clouds leave free (`UnconstrainedDirection.held_by_ties`). The pose is
+    differentiable with respect to points, pose and covariances; the weights of the matches are constants to autodiff.
+    Contradictions are averaged, not detected. Inside transformations, covariances are not checked.
 
     Returns:
         The pose with its status, quality of the fit and uncertainty; check `converged`.
@@ -103,7 +104,7 @@ def register(
     Raises:
         ValueError: if an argument is malformed, for instance in shape or dtype, numbers of channels differ where they
             are used, a cloud has fewer than four finite points, or `init` is not a rigid motion. The message names the
-            argument. Failures to register well-formed clouds show in `Registration.status`.
+            argument. Failures to register well-formed clouds show in `RegistrationResult.status`.
     Warns:
         UserWarning: if points with NaN or infinity are left out, `MultiChannelGICP` gets clouds without channels, the
             values of a channel are so different in the two clouds that their units probably are, too, or `GICP` gets
@@ -116,12 +117,12 @@ def register(
         rotation_tolerance=rotation_tolerance,
         robust=robust,
         search=search,
-        hold_free_directions=hold_free_directions,
-        match_channels=match_channels,
-        scales=scales,
+        hold_unconstrained=hold_unconstrained,
+        equalize_channels=equalize_channels,
+        voxel_sizes=voxel_sizes,
     )
-    if not (tie_points is None and prior is None) and not hold_free_directions:
-        raise ValueError("hold_free_directions: expected True with tie_points or prior, got False")
+    if not (tie_points is None and prior is None) and not hold_unconstrained:
+        raise ValueError("hold_unconstrained: expected True with tie_points or prior, got False")
     return register_from(source, target, method, init, options, tie_points, prior)
 
 
@@ -133,13 +134,13 @@ def register_from(
     options: Options,
     tie_points: GivenTiePoints | None = None,
     prior: GivenPrior | None = None,
-) -> Registration:
+) -> RegistrationResult:
     """`register` with its options as one object."""
     check_method(method)
     if isinstance(init, str):
         start = start_from_anywhere(init, source, target)
         if not start.success:
-            return Registration.without_pose(Status.TOO_FEW_CORRESPONDENCES)
+            return RegistrationResult.without_pose(Status.TOO_FEW_CORRESPONDENCES)
         init = start.matrix
     return register_pair(source, target, method, init, options, tie_points, prior)
 

@@ -32,8 +32,9 @@ class Edge(AbstractFactor):
         T_i_j: (4, 4), the measured T_i⁻¹ T_j, which maps coordinates of frame j to frame i; metres. For a position-only
             measurement, set the rotation to an estimate (for instance that of a nearby pose) and its rows and columns
             of `information` to zero. v is expressed in the axes of this rotation.
-        information: (6, 6), inverse covariance of ξ = (v, ω) in T_i_j exp(ξ), the tangent of `Registration.covariance`,
-            metres and radians; symmetric, positive semidefinite. Zero along directions that were not measured.
+        information: (6, 6), inverse covariance of ξ = (v, ω) in T_i_j exp(ξ), the tangent of
+            `RegistrationResult.covariance`, metres and radians; symmetric, positive semidefinite. Zero along directions
+            that were not measured.
         uncertain: whether the measurement may be an outlier, so that `optimize_poses` may reject the edge.
     """
 

@@ -5,8 +5,8 @@ correspondences are correlated, since they share targets and covariances, so u_c
 about as large as a neighbourhood. A is the Jacobian of g with respect to the pose. When the pose moves, the matches
 follow along the surface, so only the observable fraction O of a motion changes the residuals: A = Σ w JᵀMOJ. The rest
 of the forces, w M(I − O)d, sums to a bias of nearest-neighbour matching, which enters as one more score. Cells of
-`gaussians` stand still instead: A = Σ w JᵀMJ (`matches_slide`). (Including the derivative of M with respect to the
-rotation in A changed the result by less than 1 %.)
+`voxel_gaussians` stand still instead: A = Σ w JᵀMJ (`matches_slide`). (Including the derivative of M with respect to
+the rotation in A changed the result by less than 1 %.)
 
 Three steps: medians over sampled rows (`discounts`), scores of all rows (`scores_of`), and 6×6 algebra (`sandwich`).
 The first two work row by row, in blocks or over whole arrays.

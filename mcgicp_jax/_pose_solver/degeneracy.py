@@ -111,7 +111,7 @@ def directions_at_source(directions: Directions, pose: jaxlie.SE3) -> Directions
 
 
 @dataclass(frozen=True, eq=False)
-class FreeDirection:
+class UnconstrainedDirection:
     """A direction of motion that the shape of the clouds does not constrain.
 
     Attributes:
@@ -142,13 +142,13 @@ class FreeDirection:
         return f"{'rotation about' if self.is_rotation else 'translation along'} ({x:g}, {y:g}, {z:g})"
 
 
-def free_directions(directions: Directions) -> tuple[FreeDirection, ...]:
+def unconstrained_directions(directions: Directions) -> tuple[UnconstrainedDirection, ...]:
     """Free directions of one registration: unconstrained before constrained by channels, translations first."""
     free, held, by_matches = (
         np.asarray(each) for each in (directions.free, directions.held, directions.held_by_matches)
     )
     motions = _motions(directions)
-    found: list[FreeDirection] = []
+    found: list[UnconstrainedDirection] = []
     for by_channels, by_ties in ((False, False), (False, True), (True, False)):
         group = motions[free & (by_matches == by_channels) & ((held & ~by_matches) == by_ties)]
         found += [_named(motion, directions, by_channels, by_ties) for motion in _separate(group) @ group]
@@ -177,11 +177,11 @@ def _motions(directions: Directions) -> Float[np.ndarray, "6 6"]:
 
 def _named(
     motion: Float[np.ndarray, "6"], directions: Directions, by_channels: bool = False, by_ties: bool = False
-) -> FreeDirection:
+) -> UnconstrainedDirection:
     center, radius = np.asarray(directions.center, np.float64), np.asarray(directions.radius)
     turning = np.linalg.norm(motion[3:]) > _PURE * np.linalg.norm(motion)
     axis, omega = motion[3:] if turning else motion[:3], motion[3:] / radius
-    return FreeDirection(
+    return UnconstrainedDirection(
         twist=np.concatenate([motion[:3] - np.cross(omega, center), omega]),
         held_by_channels=by_channels,
         axis=axis / np.linalg.norm(axis),
@@ -207,7 +207,7 @@ def _separate(motions: Float[np.ndarray, "m 6"]) -> Float[np.ndarray, "m m"]:
     return mixing
 
 
-def describe(found: Sequence[FreeDirection]) -> str:
+def describe(found: Sequence[UnconstrainedDirection]) -> str:
     """The names of free directions and which of them the channels constrain; "" if there are none."""
     if not found:
         return ""

@@ -108,7 +108,7 @@ def _once(value: Array) -> Array:
 
 def _once_jvp(primals: tuple[Array], tangents: tuple[Any]) -> tuple[Array, Any]:
     if not _is_symbolic_zero(tangents[0]):
-        raise NotImplementedError("poses of register and align have first derivatives only, not second ones")
+        raise NotImplementedError("poses of register and estimate_pose have first derivatives only, not second ones")
     return primals[0], jnp.zeros_like(primals[0])
 
 

@@ -40,7 +40,7 @@ def find_correspondences(
         method: defines α, the channel weights of the search; without α the search is in position alone.
         max_distance: maximum correspondence distance, metres of position; matches beyond it are not `valid`.
         num_candidates: m, number of target points to find for each source point; more than one for the soft assignment
-            of `align` and `mahalanobis_cost`. None: as many as the method matches, one but for NDT.
+            of `estimate_pose` and `mahalanobis_cost`. None: as many as the method matches, one but for NDT.
         search: nearest-neighbour search; by default `KDTreeSearch` on CPUs and `DenseSearch` on accelerators.
 
     Returns:

@@ -32,7 +32,7 @@ def check_clouds(source: PointCloud, target: PointCloud, method: AbstractMethod)
         if name in method.needs_covariances and cloud.covariances is None:
             raise ValueError(
                 f"{name}: expected a cloud with covariances for {type(method).__name__}; make it with "
-                "mcgicp_jax.gaussians, or pass scales to register"
+                "mcgicp_jax.voxel_gaussians, or pass voxel_sizes to register"
             )
     if method.uses_channels:
         check_channels(source, target, method)
@@ -76,7 +76,7 @@ def warn_of_covariances(source: PointCloud, target: PointCloud) -> None:
             if not _LEAST_TRACE <= trace / 2 <= _LARGEST_TRACE:
                 warnings.warn(
                     f"{name}: its covariances have a median trace of {trace:.2g}, those of GICP are dimensionless and "
-                    'have 2; for cells in m² use NDT or D2DNDT, or make them by gaussians(..., of="covariances")',
+                    'have 2; for cells in m² use NDT or D2DNDT, or make them by voxel_gaussians(..., of="covariances")',
                     UserWarning,
                     stacklevel=4,
                 )

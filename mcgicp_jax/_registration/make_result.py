@@ -1,4 +1,4 @@
-"""Convert the final state of the loop to a `Registration` in the user's frames."""
+"""Convert the final state of the loop to a `RegistrationResult` in the user's frames."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from mcgicp_jax._compute.concrete import constant, is_concrete, numpy_for
 from mcgicp_jax._compute.lazy import Lazy
 from mcgicp_jax._math.poses import se3_from_matrix, translation_adjoint
 from mcgicp_jax._registration.assessment import Assessment
-from mcgicp_jax._registration.result import Constraints, Registration, Uncertainty
+from mcgicp_jax._registration.result import Constraints, RegistrationResult, Uncertainty
 from mcgicp_jax._registration.step import Record, State
 
 
@@ -25,8 +25,8 @@ def registration_of(
     records: Record,
     source: PointCloud,
     target: PointCloud,
-) -> Registration:
-    """Build the `Registration` of a final state, in the user's frames; NumPy where everything is concrete."""
+) -> RegistrationResult:
+    """Build the `RegistrationResult` of a final state, in the user's frames; NumPy where everything is concrete."""
     history: dict[str, Any] = records._asdict()
     concrete = is_concrete(state, history)
     if concrete:
@@ -49,7 +49,7 @@ def registration_of(
     numbers["num_inliers"] = numbers["num_inliers"].astype(np.int32)
     numbers["overlap"] = (numbers["num_inliers"] / valid.sum()).astype(numbers["rmse"].dtype)
     far = not is_concrete(source.origin, target.origin) or np.any(source.origin) or np.any(target.origin)
-    return Registration.build(
+    return RegistrationResult.build(
         T_target_source=se3_from_matrix(matrix, pose.wxyz_xyz.dtype) if far else pose,
         source_origin=source.origin,
         target_origin=target.origin,

@@ -13,7 +13,7 @@ from mcgicp_jax._compute.argument_checks import errors_named
 from mcgicp_jax._local_geometry.neighborhoods import check_neighbors
 from mcgicp_jax._methods.base import AbstractMethod
 from mcgicp_jax._methods.gicp import GICP
-from mcgicp_jax._methods.voxel_gaussians import gaussians
+from mcgicp_jax._methods.voxel_gaussians import voxel_gaussians
 
 # Edge of the voxels, per edge of a cell, at all scales but the last, where GICP registers the clouds. At these scales
 # cells against cells pull clouds that overlap in part over each other: from 1.3 m and 10° off, two views of a yard with
@@ -69,7 +69,7 @@ def _in_cells(method: AbstractMethod, name: str, cloud: PointCloud, size: float)
         with np.errstate(divide="ignore"):
             channel_size = size / np.asarray(method.weights(cloud.channels.shape[1]), np.float64)
     with errors_named(name):
-        return gaussians(cloud, size, channel_size=channel_size)
+        return voxel_gaussians(cloud, size, channel_size=channel_size)
 
 
 def _in_voxels(name: str, cloud: PointCloud, size: float) -> PointCloud:

@@ -34,9 +34,9 @@ class Options:
     rotation_tolerance: ArrayLike = ROTATION_TOLERANCE
     robust: AbstractKernel | None = None
     search: AbstractSearch | None = None
-    hold_free_directions: bool = True
-    match_channels: bool = False
-    scales: Sequence[float] = ()
+    hold_unconstrained: bool = True
+    equalize_channels: bool = False
+    voxel_sizes: Sequence[float] = ()
 
     def __post_init__(self) -> None:
         if self.max_distance is not None:
@@ -52,18 +52,18 @@ class Options:
             value = getattr(self, name)
             if value is not None and not isinstance(value, kind):
                 raise ValueError(f"{name}: expected an object such as {example}, or None, got {value!r}")
-        for name in ("hold_free_directions", "match_channels"):
+        for name in ("hold_unconstrained", "equalize_channels"):
             value = getattr(self, name)
             if is_concrete(value) and np.asarray(value).dtype != bool:
                 raise ValueError(f"{name}: expected True or False, got {value!r}")
-        if isinstance(self.scales, str) or np.ndim(self.scales) != 1:
-            raise ValueError(f"scales: expected a sequence of voxel sizes in metres, got {self.scales!r}")
-        for size in self.scales:
-            check_positive("scales", size)
+        if isinstance(self.voxel_sizes, str) or np.ndim(self.voxel_sizes) != 1:
+            raise ValueError(f"voxel_sizes: expected a sequence of voxel sizes in metres, got {self.voxel_sizes!r}")
+        for size in self.voxel_sizes:
+            check_positive("voxel_sizes", size)
 
     def takes_raw(self, method: AbstractMethod, name: str) -> bool:
         """Whether the method makes its cells of the cloud "source" or "target" itself, of all points."""
-        return len(self.scales) > 0 and name in method.needs_covariances
+        return len(self.voxel_sizes) > 0 and name in method.needs_covariances
 
 
 def options_of(function: Callable[..., Any], given: dict[str, Any]) -> Options:

@@ -32,7 +32,7 @@ from mcgicp_jax._registration.measurements import GivenPrior, GivenTiePoints, fu
 from mcgicp_jax._registration.multi_scale import stages_of
 from mcgicp_jax._registration.on_host import HostExecutor
 from mcgicp_jax._registration.options import Options, check_method
-from mcgicp_jax._registration.result import Registration, is_usable
+from mcgicp_jax._registration.result import RegistrationResult, is_usable
 from mcgicp_jax._registration.settings import settings_for
 from mcgicp_jax._registration.step import Problem, State
 from mcgicp_jax._registration.traced import assess, differentiable, moments_traced, register_traced
@@ -51,21 +51,21 @@ def register_pair(
     options: Options,
     tie_points: GivenTiePoints | None = None,
     prior: GivenPrior | None = None,
-) -> Registration:
+) -> RegistrationResult:
     """`register` from a given initial pose, with its options as one object."""
     check_method(method)
     source, target = (
         _ready(name, cloud, options.takes_raw(method, name)) for name, cloud in (("source", source), ("target", target))
     )
-    if options.scales and not (source.covariances is None and target.covariances is None):
-        raise ValueError("scales: expected none for clouds with covariances, which cannot be averaged in voxels")
+    if options.voxel_sizes and not (source.covariances is None and target.covariances is None):
+        raise ValueError("voxel_sizes: expected none for clouds with covariances, which cannot be averaged in voxels")
     if isinstance(method, GICP) and is_concrete(source, target):
         warn_of_covariances(source, target)
-    if options.match_channels:
+    if options.equalize_channels:
         source = _equalized(source, target, method)
     elif method.uses_channels and is_concrete(source, target):
         warn_of_units(source, target)
-    *before, (method, source, target) = stages_of(method, source, target, options.scales)
+    *before, (method, source, target) = stages_of(method, source, target, options.voxel_sizes)
     ties, belief = known(tie_points, prior, source, target)
     if init is None and prior is not None:
         init = prior[0]
@@ -76,7 +76,7 @@ def register_pair(
         found = registration_of(run.state(), run.assessment(), run.loop.history, stage.source, stage.target)
         init = found.matrix if is_usable(found) else init
     run = _solved(source, target, method, init, options, search)
-    if options.match_channels and not any(term.estimates_gains for term in run.problem.terms):
+    if options.equalize_channels and not any(term.estimates_gains for term in run.problem.terms):
         source = _equalized(source, target, method, _nearest_points(source, target, run, search))
         init = constant(pose_in_user_frame(run.loop.state.pose, source.origin, target.origin))
         run = _solved(source, target, method, init, options, search)
@@ -163,7 +163,7 @@ def pose_problem(
         target,
         observed=True,
         robust=options.robust,
-        equalize_channels=options.match_channels,
+        equalize_channels=options.equalize_channels,
         num_threads=num_threads,
     )
     dtype, valid = source.points.dtype, searched(pair.source).valid

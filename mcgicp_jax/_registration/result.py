@@ -16,7 +16,7 @@ from mcgicp_jax._clouds.origins import pose_in_user_frame
 from mcgicp_jax._compute.concrete import AnyArray, canonical_float, is_concrete
 from mcgicp_jax._compute.lazy import Lazy
 from mcgicp_jax._math.poses import se3
-from mcgicp_jax._pose_solver.degeneracy import Directions, FreeDirection, describe, free_directions
+from mcgicp_jax._pose_solver.degeneracy import Directions, UnconstrainedDirection, describe, unconstrained_directions
 
 
 class Status(enum.IntEnum):
@@ -28,8 +28,9 @@ class Status(enum.IntEnum):
         TOO_FEW_CORRESPONDENCES: fewer than four source points (in the coarse phase: of the subset) have a match within
             `max_distance`: the clouds do not overlap, or the start is too far off.
         DEGENERATE: the last update was below both tolerances, but at least one direction of motion is unconstrained
-            (see `Registration.free_directions`). Along it `register` keeps the start, if `hold_free_directions`. Tie
-            points or a prior constrain a direction if its standard deviation is then below the radius of the clouds.
+            (see `RegistrationResult.unconstrained_directions`). Along it `register` keeps the start, if
+            `hold_unconstrained`. Tie points or a prior constrain a direction if its standard deviation is then below
+            the radius of the clouds.
         NON_FINITE: the pose or the sums overflowed or became NaN.
         INVALID_INPUT: `register` would raise a `ValueError` for this pair. Only in batches; the pose is NaN.
         WORKER_FAILED: two workers in turn failed with this pair. Only in batches; the pose is NaN.
@@ -62,8 +63,8 @@ class Uncertainty(NamedTuple):
     deviations: Float[AnyArray, "*batch 6"]
 
 
-class Registration(eqx.Module):
-    """Result of `register` or `align`; a pytree. All fields are evaluated at the returned pose.
+class RegistrationResult(eqx.Module):
+    """Result of `register` or `estimate_pose`; a pytree. All fields are evaluated at the returned pose.
 
     Fields are NumPy scalars and arrays; inside `jit`, `vmap` or `grad`, and when returned by these, JAX arrays.
     Only the pose carries a gradient; for that of a cost, call `mahalanobis_cost` at the pose.
@@ -105,7 +106,7 @@ class Registration(eqx.Module):
     uncertainty: Lazy[Uncertainty]
 
     @classmethod
-    def build(cls, **fields: Any) -> Registration:
+    def build(cls, **fields: Any) -> RegistrationResult:
         """Construct from fields without equinox's constructor, which would compute the deferred ones."""
         result = object.__new__(cls)
         for name, value in fields.items():
@@ -113,7 +114,7 @@ class Registration(eqx.Module):
         return result
 
     @classmethod
-    def without_pose(cls, status: Status) -> Registration:
+    def without_pose(cls, status: Status) -> RegistrationResult:
         """The result of a pair that could not be registered: pose, cost, rmse and covariance are NaN."""
         nowhere = se3(np.full(7, np.nan, canonical_float()))
         nan = np.full((), np.nan)[()]
@@ -145,7 +146,8 @@ class Registration(eqx.Module):
 
     @property
     def directions(self) -> Directions | None:
-        """Six directions of motion and what constrains each, see `free_directions`; None from `align`."""
+        """Six directions of motion and what constrains each, see `unconstrained_directions`; None from
+        `estimate_pose`."""
         return self.constraints.value.directions
 
     @property
@@ -192,23 +194,23 @@ class Registration(eqx.Module):
         return pose_in_user_frame(self.centred, self.source_origin, self.target_origin)
 
     @property
-    def free_directions(self) -> tuple[FreeDirection, ...]:
+    def unconstrained_directions(self) -> tuple[UnconstrainedDirection, ...]:
         """Directions of motion that the shape of the clouds does not constrain, and whether channels or tie points do.
 
-        Empty if geometry constrains all six directions, and for `align`.
+        Empty if geometry constrains all six directions, and for `estimate_pose`.
 
         Raises:
             ValueError: inside a transformation or for a batch; use `directions` there.
         """
         if not is_concrete(self.directions) or np.ndim(self.status_code):
-            raise ValueError("free_directions: expected a single registration outside of jit; use directions")
+            raise ValueError("unconstrained_directions: expected a single registration outside of jit; use directions")
         if self.directions is None or self.status in (Status.TOO_FEW_CORRESPONDENCES, Status.NON_FINITE):
             return ()
-        return free_directions(self.directions)
+        return unconstrained_directions(self.directions)
 
     def __repr__(self) -> str:
         if not is_concrete(self.centred, self.history) or np.ndim(self.status_code):
-            return f"Registration(batch of shape {np.shape(self.status_code)})"
+            return f"RegistrationResult(batch of shape {np.shape(self.status_code)})"
         if np.any(self.source_origin):
             # Far from zero the translation column is the motion of a far point: print that of the source's origin.
             origin = np.append(self.source_origin, 1)
@@ -218,15 +220,15 @@ class Registration(eqx.Module):
         translation = np.array2string(moved, precision=4, suppress_small=True)
         cosine = (np.trace(np.asarray(self.matrix)[:3, :3]) - 1) / 2
         angle = np.degrees(np.arccos(np.clip(cosine, -1, 1)))
-        free = describe(self.free_directions)
+        free = describe(self.unconstrained_directions)
         return (
-            f"Registration({self.status.name}: translation {where}{translation} m, rotation {angle:.3f}°, "
+            f"RegistrationResult({self.status.name}: translation {where}{translation} m, rotation {angle:.3f}°, "
             f"{self.num_iterations} iterations, {self.num_inliers} inliers ({self.overlap:.0%}), "
-            f"rmse {np.asarray(self.rmse):.4g} m{'; free by geometry: ' if free else ''}{free})"
+            f"rmse {np.asarray(self.rmse):.4g} m{'; unconstrained by geometry: ' if free else ''}{free})"
         )
 
 
-def is_usable(result: Registration) -> bool:
+def is_usable(result: RegistrationResult) -> bool:
     """Whether the pose may start another registration: it is finite and based on enough matches.
 
     This includes MAX_ITERATIONS, and DEGENERATE, where unconstrained directions are as they were at the start.
@@ -234,6 +236,6 @@ def is_usable(result: Registration) -> bool:
     return result.status in (Status.CONVERGED, Status.DEGENERATE, Status.MAX_ITERATIONS)
 
 
-def computed(result: Registration) -> Registration:
+def computed(result: RegistrationResult) -> RegistrationResult:
     """The result with its deferred fields computed, so that it no longer references the clouds."""
     return jax.tree.map(lambda leaf: leaf, result)

@@ -67,5 +67,5 @@ def settings_for(options: Options, method: AbstractMethod, target: PointCloud, s
         coarse_translation_tolerance=coarse_tolerance(tolerance, least),
         coarse_rotation_tolerance=coarse_tolerance(options.rotation_tolerance, ROTATION_TOLERANCE),
         max_iterations=number(options.max_iterations, np.int32),
-        hold_free_directions=number(options.hold_free_directions, bool),
+        hold_unconstrained=number(options.hold_unconstrained, bool),
     )

@@ -43,7 +43,7 @@ class Settings(eqx.Module):
         translation_tolerance, rotation_tolerance: an update below both is the last; metres and radians.
         coarse_translation_tolerance, coarse_rotation_tolerance: an update below both ends the coarse phase.
         max_iterations: maximum number of updates, both phases together.
-        hold_free_directions: whether the pose is kept fixed along unconstrained directions.
+        hold_unconstrained: whether the pose is kept fixed along unconstrained directions.
     """
 
     max_distance: Float[AnyArray, "*batch"]
@@ -54,7 +54,7 @@ class Settings(eqx.Module):
     coarse_translation_tolerance: Float[AnyArray, "*batch"]
     coarse_rotation_tolerance: Float[AnyArray, "*batch"]
     max_iterations: Int[AnyArray, "*batch"]
-    hold_free_directions: Bool[AnyArray, "*batch"]
+    hold_unconstrained: Bool[AnyArray, "*batch"]
 
     def distance(self, status: Int[AnyScalar, ""]) -> Float[AnyScalar, ""]:
         """Maximum correspondence distance at this status, metres."""
@@ -96,7 +96,7 @@ class Problem(eqx.Module):
 
 
 class Record(NamedTuple):
-    """What is recorded before each update: the entries of `Registration.history`."""
+    """What is recorded before each update: the entries of `RegistrationResult.history`."""
 
     cost: Float[AnyArray, "*batch"]
     rmse: Float[AnyArray, "*batch"]
@@ -114,7 +114,7 @@ class State(NamedTuple):
         num_iterations: number of updates so far.
         sums: at the pose before the update; this and the following are None before the first step on the host.
         information: (6, 6) at the pose before the update, about the centroid, lengths in units of the radius.
-        directions: at the pose before the update, about the centroid; None for `align`.
+        directions: at the pose before the update, about the centroid; None for `estimate_pose`.
         record: of this step.
     """
 
@@ -144,7 +144,7 @@ def update(
             directions = find_directions(sums)
             degenerate = ~jnp.all(directions.held)
             # Along unconstrained directions an update would only follow arbitrary nearest-neighbour matches.
-            basis = jnp.asarray(directions.twists).T * (directions.held | ~settings.hold_free_directions)
+            basis = jnp.asarray(directions.twists).T * (directions.held | ~settings.hold_unconstrained)
         if fusion is None or directions is None:
             change = solve_update(sums, basis)
         else:

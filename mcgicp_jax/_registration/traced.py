@@ -170,7 +170,7 @@ class TracedExecutor(AbstractExecutor):
 
 
 class FixedMatches(TracedExecutor):
-    """Matches that do not change with the pose, as of `align`, and no coarse phase.
+    """Matches that do not change with the pose, as of `estimate_pose`, and no coarse phase.
 
     Args:
         matches: used at every pose.
@@ -210,10 +210,10 @@ def register_traced(problem: Problem, search: AbstractSearch, max_iterations: in
 
 
 @partial(jax.jit, static_argnames="max_iterations")
-def align_traced(
+def estimate_pose_traced(
     problem: Problem, matches: Correspondences, temperature: Float[Array, ""] | None, max_iterations: int
 ) -> LoopResult:
-    """The loop of `align`, with fixed matches."""
+    """The loop of `estimate_pose`, with fixed matches."""
     return iterate(FixedMatches(problem, matches, temperature, max_iterations))
 
 
@@ -232,7 +232,7 @@ def moments_traced(loop: LoopResult, problem: Problem, search: AbstractSearch) -
 
 @jax.jit
 def assess_alignment(loop: LoopResult, problem: Problem, temperature: Float[Array, ""] | None) -> Assessment:
-    """The assessment of the loop of `align`."""
+    """The assessment of the loop of `estimate_pose`."""
     executor = FixedMatches(problem, loop.matches, temperature, 0)
     return assessment_of(executor, loop, Lazy.of(moments_of(executor, loop, rematched=False)))
 

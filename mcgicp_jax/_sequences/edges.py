@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from mcgicp_jax._pose_graph.edge import Edge
-from mcgicp_jax._registration.result import Registration, Status
+from mcgicp_jax._registration.result import RegistrationResult, Status
 
 # Least overlap of a registration that becomes an edge: with less, a wrong local minimum looks like a right one.
 LEAST_OVERLAP = 0.4
@@ -17,7 +17,7 @@ LEAST_OVERLAP = 0.4
 _UNCONSTRAINED_RATIO = 1e-4
 
 
-def edge_from(i: int, j: int, result: Registration, *, uncertain: bool = False) -> Edge | None:
+def edge_from(i: int, j: int, result: RegistrationResult, *, uncertain: bool = False) -> Edge | None:
     """The edge that a registration of cloud j to cloud i measures.
 
     The information matrix is the inverse covariance within the constrained directions, and a small fraction of it along

@@ -16,7 +16,7 @@ from mcgicp_jax._pose_graph.optimize import optimize_poses
 from mcgicp_jax._pose_graph.solver import motion_covariances
 from mcgicp_jax._registration.options import Options
 from mcgicp_jax._registration.register_pair import register_pair
-from mcgicp_jax._registration.result import Registration
+from mcgicp_jax._registration.result import RegistrationResult
 from mcgicp_jax._registration.settings import default_distances, matching_spacing
 from mcgicp_jax._sequences.edges import edge_from
 
@@ -49,7 +49,7 @@ class Trajectory:
         return PoseGraph(self._poses, self._edges)
 
     def add(
-        self, cloud: PointCloud, pose: Float[np.ndarray, "4 4"], result: Registration | None
+        self, cloud: PointCloud, pose: Float[np.ndarray, "4 4"], result: RegistrationResult | None
     ) -> Float[np.ndarray, "4 4"]:
         """Add a frame with its registration to the previous one, close loops with earlier ones, and return its pose."""
         number = len(self._clouds)

@@ -12,7 +12,7 @@ from jaxtyping import Float
 
 from mcgicp_jax._clouds.point_cloud import PointCloud, Values
 from mcgicp_jax._clouds.preprocess import check_preprocessing, preprocess
-from mcgicp_jax._clouds.voxel_map import aggregate
+from mcgicp_jax._clouds.voxel_map import merge_clouds
 from mcgicp_jax._clouds.voxels import voxel_keys, voxel_of
 from mcgicp_jax._local_geometry.spacing_and_noise import point_spacing
 from mcgicp_jax._math.poses import Pose, pose_matrix
@@ -21,7 +21,7 @@ from mcgicp_jax._pairs.batch import register_batch
 from mcgicp_jax._pose_graph.graph import PoseGraph
 from mcgicp_jax._pose_graph.optimize import PoseGraphResult, optimize_poses
 from mcgicp_jax._registration.options import check_method, options_of
-from mcgicp_jax._registration.result import Registration
+from mcgicp_jax._registration.result import RegistrationResult
 from mcgicp_jax._sequences.edges import LEAST_OVERLAP, edge_from
 from mcgicp_jax._sequences.odometry import odometry
 
@@ -47,7 +47,7 @@ class MultiwayResult:
 
     clouds: list[PointCloud]
     graph: PoseGraphResult
-    registrations: dict[tuple[int, int], Registration]
+    registrations: dict[tuple[int, int], RegistrationResult]
     map: PointCloud
 
     @property
@@ -125,7 +125,7 @@ def multiway(
         poses = np.asarray(graph.poses)
         if not new:
             break
-    return MultiwayResult(ready, graph, found, aggregate(ready, poses, voxel_size or spacing))
+    return MultiwayResult(ready, graph, found, merge_clouds(ready, poses, voxel_size or spacing))
 
 
 def _start(
@@ -133,7 +133,7 @@ def _start(
     method: AbstractMethod,
     init: Sequence[Pose] | Float[np.ndarray, "n 4 4"] | None,
     options: dict[str, Any],
-) -> tuple[Float[np.ndarray, "n 4 4"], dict[tuple[int, int], Registration]]:
+) -> tuple[Float[np.ndarray, "n 4 4"], dict[tuple[int, int], RegistrationResult]]:
     """Initial poses, and the registrations from which they were computed."""
     if init is None:
         steps = list(odometry(clouds, method, **options))
@@ -153,7 +153,7 @@ def _checked(pairs: Sequence[tuple[int, int]], num_clouds: int) -> list[tuple[in
     return [(int(i), int(j)) for i, j in pairs]
 
 
-def _graph(poses: Float[np.ndarray, "n 4 4"], found: dict[tuple[int, int], Registration]) -> PoseGraph:
+def _graph(poses: Float[np.ndarray, "n 4 4"], found: dict[tuple[int, int], RegistrationResult]) -> PoseGraph:
     edges = [edge_from(i, j, result, uncertain=abs(i - j) != 1) for (i, j), result in found.items()]
     return PoseGraph(poses, [edge for edge in edges if edge is not None])
 

@@ -20,7 +20,7 @@ from mcgicp_jax._methods.base import AbstractMethod
 from mcgicp_jax._pose_graph.graph import PoseGraph
 from mcgicp_jax._registration.options import Options, check_method, options_of
 from mcgicp_jax._registration.register_pair import register_pair
-from mcgicp_jax._registration.result import Registration, computed, is_usable
+from mcgicp_jax._registration.result import RegistrationResult, computed, is_usable
 from mcgicp_jax._sequences.loop_closure import Trajectory
 from mcgicp_jax._sequences.relocalization import Relocalizer, map_target
 
@@ -40,7 +40,7 @@ class OdometryStep:
 
     cloud: PointCloud
     pose: Float[np.ndarray, "4 4"]
-    registration: Registration | None
+    registration: RegistrationResult | None
     graph: PoseGraph | None = None
 
 
@@ -158,7 +158,7 @@ class _Sensor:
         graph = None if self.trajectory is None else self.trajectory.graph
         return OdometryStep(cloud, self.pose, None if result is None else computed(result), graph)
 
-    def _located(self, cloud: PointCloud, before: PointCloud) -> Registration:
+    def _located(self, cloud: PointCloud, before: PointCloud) -> RegistrationResult:
         """Update motion and pose by a registration."""
         if self.world is None:
             result = register_pair(cloud, before, self.method, self.motion, self.options)

@@ -12,7 +12,7 @@ from mcgicp_jax._global_registration.global_pose import global_pose
 from mcgicp_jax._methods.base import AbstractMethod
 from mcgicp_jax._registration.options import Options
 from mcgicp_jax._registration.register_pair import register_pair
-from mcgicp_jax._registration.result import Registration, Status, is_usable
+from mcgicp_jax._registration.result import RegistrationResult, Status, is_usable
 
 # Fractions of the previous overlap. At constant speed the overlap hardly changes; after jumps in simulated rooms and
 # streets and on KITTI it fell to 0.5 to 0.7 of the previous one. Below the first fraction, the frame is also looked for
@@ -33,8 +33,13 @@ class Relocalizer:
         self.is_lost = False
 
     def corrected(
-        self, cloud: PointCloud, result: Registration, method: AbstractMethod, options: Options, num_neighbors: int
-    ) -> Registration | None:
+        self,
+        cloud: PointCloud,
+        result: RegistrationResult,
+        method: AbstractMethod,
+        options: Options,
+        num_neighbors: int,
+    ) -> RegistrationResult | None:
         """The registration of a frame to the map, in the world's frame, if the given one is doubtful and worse."""
         overlap = float(np.asarray(result.overlap))
         settled = result.status in (Status.CONVERGED, Status.DEGENERATE)

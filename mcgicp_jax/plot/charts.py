@@ -13,7 +13,7 @@ from mcgicp_jax._math.poses import Pose, pose_matrix
 from mcgicp_jax._pose_graph.factors import WORLD
 from mcgicp_jax._pose_graph.optimize import PoseGraphResult
 from mcgicp_jax._pose_solver.degeneracy import CHANNELS_HOLD, GEOMETRY_HOLDS, shares
-from mcgicp_jax._registration.result import Registration
+from mcgicp_jax._registration.result import RegistrationResult
 from mcgicp_jax.plot.drawing import CLOUD_COLORS, Figure, File, new_figure, optional_module, saved
 
 # Residual at the end of the colour scale of a graph, standard deviations: loops beyond it are rejected.
@@ -45,7 +45,7 @@ def convergence(histories: Mapping[str, Sequence[float] | ArrayLike], *, ylabel:
     return figure
 
 
-def localizability(result: Registration, *, path: File = None) -> Figure:
+def localizability(result: RegistrationResult, *, path: File = None) -> Figure:
     """Plot how well each of six directions is constrained: the observed fraction of squared motion.
 
     The fraction refers to the motion of the matched points. One bar is for the geometry and one for the channels, which
@@ -57,7 +57,7 @@ def localizability(result: Registration, *, path: File = None) -> Figure:
         path: file to save the figure to; its suffix selects the format.
 
     Raises:
-        ValueError: if the result is a batch or has no directions, such as a result of `align`.
+        ValueError: if the result is a batch or has no directions, such as a result of `estimate_pose`.
         ImportError: if matplotlib is missing.
     """
     if result.directions is None or np.ndim(result.status_code):

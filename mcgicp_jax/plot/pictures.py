@@ -32,7 +32,7 @@ def maps(
     Clouds with the channels red, green and blue are drawn in colour; others in grey, by intensity or height.
 
     Args:
-        maps: clouds by name, for instance maps from `aggregate`.
+        maps: clouds by name, for instance maps from `merge_clouds`.
         limits: (2, 2), rows: lower and upper limit along the horizontal and vertical axis of the picture, in metres
             from the centroid of the first cloud; by default 96 % of its points along each axis, plus a margin.
         path: file to save the figure to; its suffix selects the format.

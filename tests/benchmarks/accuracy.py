@@ -123,7 +123,7 @@ SETS: dict[str, tuple[Callable[[], Iterator[Pair]], float | None, dict[str, Any]
     "living room": (lambda: consecutive(living_room()), 0.03, {}),
     "tum": (lambda: consecutive(desk()), 0.03, {}),
     "posters": (lambda: wall(1.0), None, {}),
-    "posters, 20 % darker": (lambda: wall(0.8), None, {"match_channels": True}),
+    "posters, 20 % darker": (lambda: wall(0.8), None, {"equalize_channels": True}),
     "kitti, intensity": (lambda: kitti(("intensity",)), 0.25, {}),
     "kitti, intensity + rgb": (lambda: kitti(("intensity", *RGB)), 0.25, {}),
     "kitti road": (road, 0.1, {}),
@@ -142,7 +142,7 @@ def cells(method: Callable[..., Any]) -> Callable[..., np.ndarray]:
 
     def run(source: mcg.PointCloud, target: mcg.PointCloud, start: np.ndarray, voxel: float) -> np.ndarray:
         scales = tuple(times * voxel for times in (16, 8, 4))
-        return mcg.register(source, target, method(source, target), init=start, scales=scales).matrix
+        return mcg.register(source, target, method(source, target), init=start, voxel_sizes=scales).matrix
 
     return run
 
@@ -155,7 +155,7 @@ def color_icp(source: mcg.PointCloud, target: mcg.PointCloud) -> Any:
     return mcg.ColorICP(mcg.MultiChannelGICP().resolve(source, target).channel_weights)
 
 
-def colored_icp(scales: tuple[int, ...]) -> Callable[..., np.ndarray]:
+def colored_icp(voxel_sizes: tuple[int, ...]) -> Callable[..., np.ndarray]:
     def run(source: mcg.PointCloud, target: mcg.PointCloud, start: np.ndarray, voxel: float) -> np.ndarray:
         registration = open3d.pipelines.registration
         clouds = [

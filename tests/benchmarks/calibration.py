@@ -5,8 +5,8 @@
 Three scenes with exact truth (a furnished room, a street, a wall of posters), two noise levels, fresh rays and noise
 for every pair. The table has the normalised estimation error squared per degree of freedom, eᵀ C⁻¹ e / d, averaged over
 the pairs: 1 if C is right, above if too small, below if too large. d is the number of constrained directions.
-For comparison with `Registration.covariance`, C is also the inverse Hessian: unscaled, scaled by the variance of the
-residuals, and small_gicp's for the same clouds.
+For comparison with `RegistrationResult.covariance`, C is also the inverse Hessian: unscaled, scaled by the variance of
+the residuals, and small_gicp's for the same clouds.
 """
 
 from __future__ import annotations
@@ -90,7 +90,7 @@ def calibrate(scene: str, noise: float, pairs: int) -> dict[str, list[float]]:
         clouds = [mcg.preprocess(frame.cloud) for frame in (source, target)]
         for name, method in METHODS.items():
             if method.needs_covariances:
-                cells = [mcg.gaussians(frame.cloud, cell) for frame in (source, target)]
+                cells = [mcg.voxel_gaussians(frame.cloud, cell) for frame in (source, target)]
                 moving = cells[0] if "source" in method.needs_covariances else clouds[0]
                 result = mcg.register(moving, cells[1], method, init=truth)
             else:

@@ -49,7 +49,7 @@ def main() -> None:
         "GICP": ours(mcg.GICP()),
         "GICP, against the map": ours(mcg.GICP(), against="map"),
         "MC-GICP": ours(mcg.MultiChannelGICP()),
-        "NDT, against the map": ours(mcg.NDT(), against="map", scales=(2.0, 1.0)),
+        "NDT, against the map": ours(mcg.NDT(), against="map", voxel_sizes=(2.0, 1.0)),
         "KISS-ICP": kiss,
     }
     rates: dict[str, list[float]] = {name: [] for name in methods}

@@ -77,7 +77,9 @@ def ours(voxel: float, method: mcg.AbstractMethod, *scales: float) -> Solver:
             cloud if name in method.needs_covariances else mcg.preprocess(cloud, voxel)
             for name, cloud in (("source", source), ("target", target))
         ]
-        return np.asarray(mcg.register(*clouds, method, init=start, scales=[voxel * scale for scale in scales]).matrix)
+        return np.asarray(
+            mcg.register(*clouds, method, init=start, voxel_sizes=[voxel * scale for scale in scales]).matrix
+        )
 
     return run
 
