@@ -90,4 +90,4 @@ __all__ = [
     "rgb_to_yuv",
     "voxel_gaussians",
 ]
-__version__ = "0.1.0"
+__version__ = "0.2.0"

@@ -27,7 +27,7 @@ _IN_FLOAT64 = (
         "align_gradients",
         "cost",
         "covariance",
-        "voxel_gaussians",
+        "gaussians",
         "graph",
         "large_coordinates",
         "methods",
