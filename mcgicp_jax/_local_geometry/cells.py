@@ -13,15 +13,15 @@ from mcgicp_jax._local_geometry.observability import geometry_observability
 from mcgicp_jax._math import symmetric_matrices as alg
 from mcgicp_jax._math.statistics import median, sampled_rows
 
-# Square of the edge of a cell over the trace of its covariance, if it is a square filled uniformly: 2 edge²/12.
+# Squared edge of a cell over the trace of its covariance, for a uniformly filled square: the trace is 2 edge²/12.
 _SQUARE_EDGE = 6.0
-# Number of points that the normal of a cell is taken to be estimated from: that of a neighbourhood.
+# Assumed number of points from which the normal of a cell was estimated: the size of a neighbourhood.
 _COUNT = 20
 
 
 def cell_edge(cells: PointCloud) -> Float[AnyScalar, ""]:
-    """The median edge of the cells, metres. (Where a plane lies between two layers of voxels, cells lie close together,
-    so that their distance is smaller.)"""
+    """The median edge of the cells, metres. (The median distance of cells may be smaller: where a plane lies between
+    two layers of voxels, cells are close together.)"""
     xp = numpy_for(cells)
     rows, counts = sampled_rows(xp.asarray(cells.valid))
     traces = xp.trace(xp.asarray(cells.covariances)[rows], axis1=1, axis2=2)
@@ -29,12 +29,12 @@ def cell_edge(cells: PointCloud) -> Float[AnyScalar, ""]:
 
 
 def geometry_of_cells(local: LocalGeometry, given: Float[Array, "6 n"], num_candidates: int) -> LocalGeometry:
-    """Local geometry of cells: the fits of the channels of their neighbourhoods, and the rest from their covariances.
+    """Local geometry of cells: channel fits from their neighbourhoods, everything else from their covariances.
 
     Args:
         local: of the neighbourhoods.
         given: covariances of the cells, metres².
-        num_candidates: number of cells that a point or cell is matched with.
+        num_candidates: number of cells matched with each point or cell.
     """
     given = jax.lax.stop_gradient(given)
     normal = alg.smallest_eigenvector(given)

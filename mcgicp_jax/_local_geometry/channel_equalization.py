@@ -23,7 +23,7 @@ _OTHER_UNIT = 10.0
 
 
 def warn_of_units(source: PointCloud, target: PointCloud) -> None:
-    """Warn of channels of two concrete clouds whose values are so different that their units probably are, too."""
+    """Warn of channels whose values differ so much between two concrete clouds that their units probably differ."""
     ranges = [cached_with(cloud, "ranges", None, partial(_ranges, cloud)) for cloud in (source, target)]
     for name, (low, high), (first, last) in zip(source.channel_names, *ranges, strict=False):
         narrow, wide = sorted([high - low, last - first])
@@ -37,7 +37,7 @@ def warn_of_units(source: PointCloud, target: PointCloud) -> None:
 
 
 def _ranges(cloud: PointCloud) -> list[tuple[float, float]]:
-    """For each channel, the values between which most of a sample lie (5 to 95 %); NaN if no point has it."""
+    """The 5 and 95 % quantiles of a sample of each channel; NaN if no point has the channel."""
     rows, counts = sampled_rows(np.asarray(cloud.valid))
     rows = rows[counts]
     channels, known = np.asarray(cloud.channels)[rows], np.isfinite(np.asarray(cloud.channels)[rows])
@@ -75,7 +75,7 @@ def with_channels_matched(source: PointCloud, target: PointCloud, matches: Corre
 def gain_and_offset(
     values: Float[AnyArray, "n C"], wanted: Float[AnyArray, "m C"]
 ) -> tuple[Float[AnyArray, "C"], Float[AnyArray, "C"]]:
-    """Gain and offset of each channel that equalise mean and standard deviation of its quantiles with those wanted.
+    """Gain and offset of each channel that give its quantiles the mean and standard deviation of the wanted ones.
 
     NaNs are ignored; 1 and 0 for channels without usable spread.
     """

@@ -14,8 +14,8 @@ from mcgicp_jax._local_geometry.neighborhoods import Neighborhoods
 from mcgicp_jax._local_geometry.observability import geometry_observability
 from mcgicp_jax._math import symmetric_matrices as alg
 
-# Rank of the neighbour that roughness is measured with (0 is the point itself). The nearest neighbours are selected for
-# similar heights, and the heights of far ones include the curvature of the surface.
+# Rank of the neighbour from which roughness is measured (0 is the point itself). The nearest neighbours are biased
+# towards similar heights, and the heights of far ones include the curvature of the surface.
 _ROUGHNESS_RANK = 5
 # One (k, N) array per coordinate. Kept apart on purpose: jaxlib 0.10.2 on CPUs miscompiles, in float32, the reduction
 # of a (3, k, N) array over its middle axis where the result is broadcast back and subtracted.

@@ -27,7 +27,7 @@ class SurfaceNoise(NamedTuple):
 
 
 class Surface(NamedTuple):
-    """The points of a cloud with what one method needs to know of each; one row per point.
+    """The points of a cloud with the values that one method needs of each; one row per point.
 
     Rows come first, so that those of matched points can be gathered; formulas work on the transposes. Symmetric 3×3
     matrices are stored as upper triangles.
@@ -37,7 +37,7 @@ class Surface(NamedTuple):
         covariance: result of `AbstractMethod.covariance`.
         observability: by the shape of the surface, see `_local_geometry.observability`; None if not needed.
         channel_observability: by the channels; None if not needed, or if the method does not use channels.
-        columns: `AbstractTerm.columns` by name of the term; only of terms that have any.
+        columns: `AbstractTerm.columns` by name of the term, for terms that define them.
         noise: for the covariance of the pose; None if not needed.
         search: the points as input to the search; None for matched rows where it is not needed.
     """

@@ -32,7 +32,7 @@ class AbstractMethod(Numbers):
     uses_channels: ClassVar[bool] = False
     # Whether `covariance` needs the individual neighbours, beyond their local geometry.
     uses_neighborhoods: ClassVar[bool] = False
-    # Number of target points that a source point is matched with. The cost of the source point is the sum over them.
+    # Number of target points matched with each source point, whose cost is the sum over them.
     num_candidates: ClassVar[int] = 1
     # Which of "source" and "target" must be clouds of `voxel_gaussians`.
     needs_covariances: ClassVar[tuple[str, ...]] = ()
@@ -42,12 +42,12 @@ class AbstractMethod(Numbers):
         """A symmetric 3×3 matrix for each of n points: the input of `information`.
 
         Args:
-            around: the points with the covariances given with the cloud, if any; with their neighbours if the method
+            around: the points, and the covariances given with the cloud, if any; with neighbours only if the method
                 `uses_neighborhoods`.
             local: their local geometry; None for a cloud that was not preprocessed.
 
         Raises:
-            ValueError: if the method needs neighbours or a parameter that are missing.
+            ValueError: if neighbours or a parameter that the method needs are missing.
         """
 
     @abc.abstractmethod
@@ -68,8 +68,8 @@ class AbstractMethod(Numbers):
 
         Args:
             source, target: preprocessed clouds.
-            robust: kernel of the user's choice; None: that of the method, if it has any.
-            equalize_channels: whether the user asks for gains and offsets of the channels, which a term may estimate.
+            robust: kernel given by the user; None: the kernel of the method, if it has any.
+            equalize_channels: option of `register`; a term may estimate gains and offsets of the channels itself.
         """
         return (Mahalanobis(self, robust=robust),)
 
@@ -82,7 +82,7 @@ class AbstractMethod(Numbers):
         """The method with every unset parameter chosen from two preprocessed clouds; constants to autodiff.
 
         Args:
-            geometries: computes the local geometry of both clouds, where a caller needs it, too.
+            geometries: computes the local geometry of both clouds; given by callers that need it too.
 
         Raises:
             ValueError: if a parameter is unset and a cloud was not preprocessed.

@@ -1,4 +1,4 @@
-"""ICP: point to point, point to plane, and with matches that are nearest in colour, too."""
+"""ICP: point to point, point to plane, and with matches that are nearest in position and colour."""
 
 from __future__ import annotations
 

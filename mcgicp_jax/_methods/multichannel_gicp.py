@@ -52,7 +52,7 @@ class MultiChannelGICP(AbstractGeneralized):
 
     Attributes:
         channel_covariance: Λ of eq. 7, scalar or (C,) variances or (C, C), channel units²: the covariance of the
-            difference of two measurements of the same spot. None: chosen from the data, see `resolve`.
+            difference between two measurements of one surface point. None: chosen from the data, see `resolve`.
         channel_weights: α, scalar or (C,), metres per channel unit. None: chosen from the data, see `resolve`.
         epsilon: ε, as in `GICP`.
         min_eigenvalue: floor of Ω's eigenvalues, reached where no neighbour has similar channels. Since the target is

@@ -20,8 +20,8 @@ from mcgicp_jax._terms.mahalanobis import Mahalanobis
 
 # Scale k of the kernel, standard deviations. The usual score is −exp(−d₂ s²/2), so that k² = 2/d₂. Magnusson's formula
 # for d₂ (2009) depends on the unit of length; with the usual 55 % of outliers and cells of 1 m it gives k = 2.15. For
-# cells against cells Stoyanov et al. (2012) use d₂ = 0.05, k = 6.3; in a sum over several cells, far ones then pull too
-# strongly: the error on KITTI with cells of 1 m is 14 mm with 2.15, 15 with 3, 18 with 4 and 28 with 6.3.
+# cells against cells Stoyanov et al. (2012) use d₂ = 0.05, k = 6.3; in a sum over several cells, distant ones then have
+# too much weight: the error on KITTI with cells of 1 m is 14 mm with 2.15, 15 with 3, 18 with 4 and 28 with 6.3.
 _SCALE = 2.15
 # Number of the target's cells that a cell is matched with. The voxels of the two clouds are not aligned, and the pose
 # follows the nearest cells of the other grid: on KITTI with cells of 1 m, the error is 60 mm with one, 14 with 4 and 14
@@ -40,7 +40,7 @@ class AbstractNDT(AbstractMethod):
     kernel: AbstractKernel | None
 
     def covariance(self, around: Neighborhoods, local: LocalGeometry | None) -> Float[Array, "6 n"]:
-        """The covariances given; those of points are not used."""
+        """The covariances given with the cloud."""
         given = around.given_covariance
         return identity(around) if given is None else given
 

@@ -13,7 +13,7 @@ from mcgicp_jax._compute.concrete import AnyArray, canonical_float, is_concrete,
 
 
 def per_channel(name: str, numbers: Float[AnyArray, "..."], num_channels: int) -> Float[AnyArray, "C"]:
-    """The numbers broadcast to one per channel; `name` is that of the parameter, for the error message."""
+    """The numbers broadcast to one per channel; `name` is the name of the parameter, for the error message."""
     if numbers.shape not in ((), (num_channels,)):
         raise ValueError(
             f"{name}: expected a scalar or shape ({num_channels},), for clouds of {num_channels} channels, "

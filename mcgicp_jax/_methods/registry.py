@@ -14,7 +14,7 @@ from mcgicp_jax._methods.ndt import D2DNDT, NDT, ColorNDT
 
 
 class RegisteredMethod(NamedTuple):
-    """A class of methods, with the arguments that make it the one of that name."""
+    """A class of methods, and the arguments of its constructor that select the method of this name."""
 
     kind: type[AbstractMethod]
     arguments: Mapping[str, Any] = MappingProxyType({})

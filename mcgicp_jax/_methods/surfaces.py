@@ -29,7 +29,7 @@ from mcgicp_jax._methods.base import AbstractMethod
 from mcgicp_jax._search.base import SearchPoints
 from mcgicp_jax._terms.base import AbstractTerm
 
-# The terms that need columns of their own, by class: columns do not depend on the numbers of a term.
+# Terms that define `columns`, by class: columns do not depend on the numbers of a term.
 Kinds = tuple[type[AbstractTerm], ...]
 
 
@@ -60,8 +60,8 @@ def surface_pair(
 ) -> SurfacePair:
     """Choose unset parameters from two clouds, and compute their surfaces.
 
-    Concrete clouds are processed on the host in blocks, and the results cached with each cloud. Inside transformations
-    both clouds share one compiled body, unless they are large.
+    Concrete clouds are processed on the host in blocks, and the results are cached with each cloud. Inside
+    transformations both clouds share one compiled body, unless they are large.
 
     Args:
         observed: whether to compute observability, which `register` needs and the cost of given matches does not.
@@ -189,8 +189,8 @@ def surface_of(
     """The surface at n points, without `search`.
 
     Args:
-        around, local: as of `AbstractMethod.covariance`.
-        observed: as of `surface_pair`.
+        around, local: as in `AbstractMethod.covariance`.
+        observed: as in `surface_pair`.
     """
     given = around.given_covariance
     if local is not None and method.needs_covariances and given is not None:

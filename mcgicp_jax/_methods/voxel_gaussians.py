@@ -64,8 +64,8 @@ def voxel_gaussians(
 ) -> PointCloud | tuple[PointCloud, Int[np.ndarray, "M"]]:
     """Replace the points of each voxel by one Gaussian: their mean position and channels, and a covariance.
 
-    The result is the input of `NDT` and `D2DNDT`, or with `of="covariances"` that of voxelised GICP (Koide et al.
-    2021). Runs on the host, in float64.
+    The result is the input of `NDT` and `D2DNDT`, or with `of="covariances"` the input of voxelised GICP (`GICP`; Koide
+    et al. 2021). Runs on the host, in float64.
 
     Args:
         cloud: raw or preprocessed cloud, or (N, 3) array in metres, of all points: not downsampled.
@@ -73,16 +73,16 @@ def voxel_gaussians(
         min_points: cells with fewer points are left out, as are those whose points coincide; at least 3.
         min_ratio: eigenvalues of a covariance below this fraction of its largest one are raised to it, so that the
             cells of planes and lines are kept; 0 to 1.
-        channel_size: splits each voxel by its channels into cells of this size, in channel units, one number or one per
-            channel (infinity: not by this one); then each Gaussian has one colour, as in the NDT of Huhle & Magnusson
-            (2008). The points of a cell have or lack the same channels. None: one cell per voxel.
-        of: "points": the covariance of the points (m², n − 1). "covariances": the mean of the covariances of the
-            points, dimensionless: those given with the cloud, or GICP's.
+        channel_size: splits each voxel by its channels into cells of this size, in channel units: one number, or one
+            per channel (infinity: no split by this channel). Each Gaussian then has one colour, as in the NDT of Huhle
+            & Magnusson (2008). All points of a cell have the same channels. None: one cell per voxel.
+        of: "points": sample covariance of the points, m². "covariances": mean of the covariances of the points, either
+            given with the cloud or GICP's; dimensionless.
         return_counts: also return the number of points in each cell.
 
     Returns:
-        Preprocessed cloud with one point per cell, and its covariances. With `return_counts`, a tuple of it and the
-        numbers of points, (M,) integers.
+        Preprocessed cloud with one point and one covariance per cell. With `return_counts`, a tuple of this cloud and
+        the number of points of each cell, (M,) integers.
 
     Raises:
         ValueError: if an argument is out of range, the cloud is traced, or fewer than four cells are left.

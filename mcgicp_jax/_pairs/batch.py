@@ -31,10 +31,9 @@ def register_batch(
     executor: Executor | None = None,
     **options: Any,
 ) -> list[RegistrationResult]:
-    """Register many pairs of clouds of any sizes and return one `RegistrationResult` per pair, in the order of the
-    pairs.
+    """Register many pairs of clouds of any sizes; return one `RegistrationResult` per pair, in the order of the pairs.
 
-    Waits for all pairs; arguments, errors and warnings are those of `register_as_completed`.
+    Waits for all pairs. See `register_as_completed` for arguments, errors and warnings.
     """
     completed = register_as_completed(
         sources,
@@ -62,8 +61,8 @@ def register_as_completed(
 ) -> Generator[tuple[int, RegistrationResult], None, None]:
     """Register many pairs of clouds of any sizes and yield each result as soon as it is computed.
 
-    Pairs are independent: a result is bitwise the same whatever the other pairs, their order and the number of workers,
-    and a slow pair does not delay others. Invalid pairs (too few finite points, mismatched channels, unreadable file)
+    Pairs are independent: a result is bitwise the same for any other pairs, any order and any number of workers, and a
+    slow pair does not delay others. Invalid pairs (too few finite points, mismatched channels, unreadable file)
     get the status `INVALID_INPUT` and a warning. Iterators are consumed lazily.
 
     Args:
@@ -71,8 +70,8 @@ def register_as_completed(
             one side may be a single cloud for all pairs. An item may also be a function without arguments that returns
             a cloud, such as `functools.partial(mcgicp_jax.io.read, path)`, which the worker calls.
         method: as in `register`; parameters left None are estimated for each pair.
-        init: T_target_source to start from: one for all pairs, or an iterable with one per pair; None is the identity,
-            and "global" finds it by `global_pose`.
+        init: initial T_target_source: one for all pairs, or an iterable with one per pair. None is the identity, and
+            "global" the pose found by `global_pose`.
         voxel_size, num_neighbors: as in `preprocess`, for raw clouds, which the workers preprocess.
         executor: any `concurrent.futures.Executor`, such as a `ProcessPoolExecutor` with the start method "spawn" or
             Dask's `Client.get_executor()`; by default one thread per core. A pair whose worker dies is sent once more,

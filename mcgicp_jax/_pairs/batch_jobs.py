@@ -58,7 +58,7 @@ class Pair:
 
 @dataclass(frozen=True)
 class PairResult:
-    """The result of one pair, and why it has no pose (None: it has one, or the status tells)."""
+    """The result of one pair, and the reason if it has no pose (None: it has one, or the status is the reason)."""
 
     index: int
     registration: RegistrationResult

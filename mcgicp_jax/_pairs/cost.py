@@ -39,8 +39,8 @@ def mahalanobis_cost(
     """Compute the cost F(T) = Σ ρ(dᵀ M d) of given matches, with d = b − T a and M = (C^B + R C^A Rᵀ)⁻¹ (Servos &
     Waslander 2014, eq. 3, which omits the inverse); M = I or n nᵀ for the methods without covariances.
 
-    Pure JAX, differentiable with respect to everything but the matches. M is a function of the rotation R here.
-    `estimate_pose` holds M fixed during each update, as every GICP does, so its pose is not exactly the minimum of F.
+    Pure JAX, differentiable with respect to all inputs but the matches. Here M is a function of the rotation R, whereas
+    `estimate_pose`, like every GICP, holds M fixed during each update: its pose is not exactly the minimum of F.
 
     Args:
         pose: T_target_source, `jaxlie.SE3` or (4, 4).
@@ -50,14 +50,14 @@ def mahalanobis_cost(
         robust: kernel ρ applied to the Mahalanobis distance of each match, as in `register`; without any, ρ(s²) = s².
         temperature: metres. Weighs the candidates of each source point (`num_candidates`) by a softmax of
             −½ (distance / temperature)², with distances in position and α · channel; this gives α a gradient. As it
-            tends to 0, only the nearest candidate counts. Required if there are several candidates, but for NDT, whose
-            cost is the sum over all of them.
+            tends to 0, only the nearest candidate counts. Required if there are several candidates, except for methods
+            that sum over them (`D2DNDT`).
         log_determinant: add Σ log det (C^B + R C^A Rᵀ), which makes F (for squared distances) twice a Gaussian negative
             log-likelihood. Without it, a loss that learns covariances (or ε, or Λ) falls as these are inflated. For
             `GICP` and `MultiChannelGICP`.
 
     Returns:
-        F, a scalar. For dimensionless covariances, as GICP's are, in metres².
+        F, a scalar; in metres² for dimensionless covariances such as GICP's.
 
     Raises:
         ValueError: if `pose` is not a rigid motion, the shape of `matches` does not fit the source, `temperature` is

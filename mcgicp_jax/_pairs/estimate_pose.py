@@ -37,28 +37,29 @@ def estimate_pose(
     robust: AbstractKernel | None = None,
     temperature: ArrayLike | None = None,
 ) -> RegistrationResult:
-    """Compute the pose for fixed matches: update the pose, recompute M, and repeat until it converges. Pure JAX.
+    """Compute the pose for fixed matches: update the pose, recompute M, and repeat until the pose converges. Pure JAX.
 
-    Works under `jit`, `vmap`, `grad` and `jvp`. The first derivative is that of the root of Σ w JᵀM d = 0 near the
-    returned pose (d = b − T a, J = ∂(T a)/∂ξ, robust weight w), by the implicit function theorem. Matches, neighbours
-    and estimated parameters are constants. It is exact with respect to points, channels, given covariances, given
-    parameters of the method (α: only with `temperature`) and the robust scale, and zero with respect to `init`, on
-    which a root does not depend. All of it is zero, never NaN, with too few matches, with singular `information`, or if
-    Newton's method does not converge from the returned pose. Second derivatives raise `NotImplementedError`.
+    Works under `jit`, `vmap`, `grad` and `jvp`. The first derivative follows from the implicit function theorem for
+    the root of Σ w JᵀM d = 0 near the returned pose (d = b − T a, J = ∂(T a)/∂ξ, robust weight w). Matches, neighbours
+    and estimated parameters are constants. The derivative is exact with respect to points, channels, given covariances,
+    given parameters of the method (α: only with `temperature`) and the robust scale. It is zero with respect to `init`,
+    because the root does not depend on it. It is zero, never NaN, if there are too few matches, if `information` is
+    singular, or if Newton's method does not converge from the returned pose. Second derivatives raise
+    `NotImplementedError`.
 
     Args:
         source, target: preprocessed clouds.
         matches: from `find_correspondences`.
         method: as in `register`.
-        init: T_target_source to start from, `jaxlie.SE3` or (4, 4); the identity by default.
+        init: initial T_target_source, `jaxlie.SE3` or (4, 4); the identity by default.
         max_iterations: maximum number of pose updates.
         translation_tolerance, rotation_tolerance: metres and radians, as in `register`.
         robust: kernel ρ applied to the Mahalanobis distance of each match, as in `register`.
         temperature: metres; soft assignment of several candidates per source point, as in `mahalanobis_cost`.
 
     Returns:
-        The pose with its status; check `converged`. `directions` is None: sliding, as of GICP along a plane, is not
-        detected.
+        The pose with its status; check `converged`. `directions` is None: unconstrained directions, such as motion
+        along a plane, are not detected.
 
     Raises:
         ValueError: if an argument is malformed; failures on well-formed input show in `RegistrationResult.status`.

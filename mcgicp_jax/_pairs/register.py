@@ -1,4 +1,4 @@
-"""`register`, the front door: one pair of clouds, from a given pose or from anywhere."""
+"""`register`: one pair of clouds, from a given initial pose or from any."""
 
 from __future__ import annotations
 
@@ -54,47 +54,48 @@ def register(
         method: `MultiChannelGICP()`, `GICP()`, `PointToPlane()`, `PointToPoint()`, `ColorICP(...)`; for clouds of
             `voxel_gaussians` or with `voxel_sizes`, `NDT()`, `ColorNDT(...)`, `D2DNDT()`. Parameters left None are
             estimated.
-        init: T_target_source to start from, `jaxlie.SE3` or (4, 4); the identity by default. "global": the result of
-            `global_pose`; without its `success` the status is TOO_FEW_CORRESPONDENCES, and the pose NaN. Not available
-            inside transformations.
+        init: initial T_target_source, `jaxlie.SE3` or (4, 4); the identity by default. "global": the pose found by
+            `global_pose`; if it does not succeed, the status is TOO_FEW_CORRESPONDENCES and the pose NaN. "global" is
+            not available inside transformations.
         max_distance: maximum correspondence distance, metres of position; matches beyond it are rejected. One number,
-            or two, for the coarse and the fine phase. None: 10 and 2.5 times the spacing of the target (its median
-            nearest-neighbour distance; the edge of its cells), and the first at least 10 times the spacing of a square
-            grid as dense as the target, which in LiDAR scans reaches from line to line. If `init` is further off, pass
-            a larger value.
+            or two: for the coarse and for the fine phase. None: 10 and 2.5 times the spacing of the target (its median
+            nearest-neighbour distance, or the edge of its cells). The first is also at least 10 times the spacing of a
+            square grid with the density of the target, since in LiDAR scans the lines are further apart than the points
+            of a line. If `init` is further off, pass a larger value.
         max_iterations: maximum number of pose updates in both phases together.
         translation_tolerance, rotation_tolerance: metres (at the centroid of the matches) and radians; the loop has
             converged when an update is below both. `translation_tolerance` None: 0.5 % of the spacing of the target.
-        robust: kernel of each match's Mahalanobis distance: `Huber`, `Cauchy`, `GemanMcClure`, `Tukey`, `Welsch`. None:
-            that of the method (NDT: `Welsch`), or none. With `photometric=True` of each residual in
-            standard deviations.
+        robust: kernel applied to the Mahalanobis distance of each match: `Huber`, `Cauchy`, `GemanMcClure`, `Tukey` or
+            `Welsch`. None: the kernel of the method (NDT: `Welsch`), if it has any. With `photometric=True` the kernel
+            is applied to each residual in standard deviations.
         search: nearest-neighbour search; by default `KDTreeSearch` on CPUs and `DenseSearch` on accelerators.
-        hold_unconstrained: do not update the pose along unconstrained directions, which neither the shape of the
-            clouds nor the channels (if the method uses them) constrain. If False, arbitrary nearest-neighbour matches
-            decide there. The status is DEGENERATE in either case.
+        hold_unconstrained: if True, the pose is not updated along directions that neither the shape of the clouds nor
+            the channels (if the method uses them) constrain. If False, arbitrary nearest-neighbour matches determine
+            it there. The status is DEGENERATE in either case.
         equalize_channels: scale and shift each channel of the source to the distribution of the target's, for scans
-            with different exposure or gain: first from the values of all points, then, in a second registration that
-            starts at the pose of the first, from those of matched points. With `MultiChannelGICP(photometric=True)`
-            gains and offsets are estimated with the pose instead, from interpolated channels.
-        voxel_sizes: voxel sizes, metres, from coarse to fine, for a start that is far off: the clouds are first
-            registered at each voxel size, in this order, each time from the pose before and with the default
-            `max_distance`; the one given is for the last registration. For NDT, the sizes of its cells: the clouds are
-            raw ones, the last size gives the result, and at the others `GICP` registers voxels of a quarter of the
-            size. Not available inside transformations.
+            with different exposure or gain. A first registration uses the distributions of all points, and a second
+            one, which starts at the pose of the first, those of matched points. With
+            `MultiChannelGICP(photometric=True)`, gains and offsets are instead estimated from interpolated channels,
+            together with the pose.
+        voxel_sizes: voxel sizes in metres, coarse to fine, for multi-scale registration. Each scale starts from the
+            pose of the previous one with the default `max_distance`; a given `max_distance` applies to the final
+            registration at full resolution. For NDT these are cell sizes and the clouds must be raw: the last size
+            gives the result, and at the others `GICP` registers voxels of a quarter of the size. Not available inside
+            transformations.
         tie_points: (source_points, target_points, covariances), metres: points (n, 3) known to be the same, such as
             surveyed targets or image features (Huhle & Jenke 2008), and the covariances (n, 3, 3) of b − T a, in the
-            target's axes. n may be 1 or 2. They are no start: if `init` is far off, pass a better one.
+            target's axes. n may be 1 or 2. They do not replace the initial pose: if `init` is far off, pass a better
+            one.
         prior: (pose, covariance): a measurement of T_target_source, as by GNSS or an IMU, `jaxlie.SE3` or (4, 4), and
             its covariance (6, 6), metres and radians, of ξ = (v, ω) in T = pose · exp(ξ): in the order and frame of
-            `RegistrationResult.covariance`. ξ acts at the origin of the source, along its axes: for a covariance Σ of
-            the position along the target's axes, as from GNSS, v has Rᵀ Σ R; and far from the clouds an uncertain
-            rotation leaves their position unknown, so move clouds with UTM coordinates first. Give what the prior does
-            not tell a large finite variance. Without `init` it is the start.
+            `RegistrationResult.covariance`. ξ is expressed at the origin and in the axes of the source. A GNSS
+            covariance Σ in the target's axes becomes Rᵀ Σ R. For UTM coordinates, shift the clouds to the origin first.
+            Use a large finite variance for unmeasured directions. The prior is also the initial pose if `init` is None.
 
-    With tie points or a prior, a first registration without them measures the covariance of the score of the matches,
-    and a second one, which starts at its pose, weighs all by their covariances (Hansen 1982, generalised method of
-    moments). The result is that of the second one; its `covariance` and `information` include tie points and prior.
-    They also constrain directions that the clouds leave free (`UnconstrainedDirection.held_by_ties`). The pose is
+    With tie points or a prior, a first registration without them measures the covariance of the score of the matches.
+    A second one starts at its pose and weighs matches, tie points and prior by their covariances (Hansen 1982,
+    generalised method of moments). It is the result; its `covariance` and `information` include tie points and prior.
+    They also constrain directions that the clouds do not (`UnconstrainedDirection.held_by_ties`). The pose is
     differentiable with respect to points, pose and covariances; the weights of the matches are constants to autodiff.
     Contradictions are averaged, not detected. Inside transformations, covariances are not checked.
 
@@ -146,7 +147,7 @@ def register_from(
 
 
 def start_from_anywhere(init: str, source: PointCloud | Values, target: PointCloud | Values) -> GlobalPoseResult:
-    """The start of a registration with `init="global"`."""
+    """The initial pose of a registration with `init="global"`."""
     if init != "global":
         raise ValueError(f'init: expected a pose, "global" or None, got {init!r}')
     if not is_concrete(source, target):

@@ -33,9 +33,9 @@ from mcgicp_jax._pose_solver.sums import mean_observability, powers
 from mcgicp_jax._pose_solver.update import twist_form
 from mcgicp_jax._terms.base import AbstractTerm, linearize
 
-# Standard deviation of an unconstrained direction, in radii of the matched points: large beside their extent.
+# Standard deviation of an unconstrained direction, in radii of the matched points: large compared with their extent.
 UNKNOWN = 10.0
-# Lower bound of the factors that reduce observability, dimensionless: medians of few rows may be 0.
+# Lower bound of the factors that reduce observability, dimensionless: a median of few rows may be 0.
 _LEAST_FRACTION = 0.2
 # Medians of the square of a standard normal variate, and of the mean of two such squares.
 _MEDIAN_SQUARE, _MEDIAN_MEAN_OF_TWO = 0.455, 0.693
@@ -112,9 +112,9 @@ class Scores(NamedTuple):
     """Scores of n correspondences, and the sums over them that `sandwich` needs.
 
     Attributes:
-        wrenches: force, torque (arms in units of the radius).
+        wrenches: force and torque (arms in units of the radius).
         valid: 1 for valid correspondences, else 0.
-        cells: number of the cell of each; None: every correspondence is a cell of its own.
+        cells: number of the cell of each correspondence; None: each is a cell of its own.
         jacobian: Σ (K O) ⊗ h hᵀ about the centre, K O symmetrised; K = w M, or the tangent of a robust force.
         bias: Σ of force and torque of w M(I − O)d; 0 where observability is not known.
     """
@@ -127,7 +127,7 @@ class Scores(NamedTuple):
 
 
 class Frame(NamedTuple):
-    """Where torques are taken about, and what scores need besides the correspondences.
+    """Centre of the torques, and the other inputs of the scores besides the correspondences.
 
     Attributes:
         center, radius: `Sums.center` and `Sums.radius` over all correspondences, metres.

@@ -20,13 +20,13 @@ from mcgicp_jax._math.poses import adjoint_to_source, units
 from mcgicp_jax._pose_solver.sums import Sums
 from mcgicp_jax._pose_solver.update import twist_form
 
-# Least observed fraction of the points' squared motion for a direction to count as constrained. Geometry: measured
+# Smallest observed fraction of the points' squared motion for a direction to count as constrained. Geometry: measured
 # below 0.0016 in flat scenes (posters on a wall, a road, a table with 2 mm noise) and from 0.1 on in others; GICP's
 # artificial in-plane stiffness equals a true fraction of ε, 0.001 by default. Channels: 0.003 from noise alone, from
 # 0.008 on with the markings of a road.
 GEOMETRY_HOLDS, CHANNELS_HOLD = 2e-3, 5e-3
-# Least information of tie points and prior for a direction to count as constrained: a standard deviation of one radius
-# of the matched points. Useful ones are far above it.
+# Smallest information of tie points and prior for a direction to count as constrained: a standard deviation of one
+# radius of the matched points. Useful tie points and priors are far above it.
 _TIES_HOLD = 1.0
 _IDENTITY = np.array([1, 0, 0, 1, 0, 1])
 # A direction is named a translation if its rotation causes at most this fraction of the points' motion (rms).
@@ -143,7 +143,7 @@ class UnconstrainedDirection:
 
 
 def unconstrained_directions(directions: Directions) -> tuple[UnconstrainedDirection, ...]:
-    """Free directions of one registration: unconstrained before constrained by channels, translations first."""
+    """Directions that geometry does not constrain: unconstrained ones first, translations before rotations."""
     free, held, by_matches = (
         np.asarray(each) for each in (directions.free, directions.held, directions.held_by_matches)
     )

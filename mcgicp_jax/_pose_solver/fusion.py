@@ -17,10 +17,10 @@ from mcgicp_jax._pose_solver.update import Update, twist_form, wrench
 
 
 def held_by_pose_form(directions: Directions, information: Float[Array, "6 6"]) -> Directions:
-    """The directions with what tie points and prior tell of those that the matches leave unconstrained.
+    """Add to `directions` how well tie points and prior constrain the directions that the matches do not.
 
     Args:
-        directions: as in the loop; those that the matches do not constrain are turned to diagonalise the information.
+        directions: as in the loop; those that the matches do not constrain are rotated to diagonalise the information.
         information: of tie points and prior, for twists about the centroid with lengths in units of the radius.
     """
     basis, free = jnp.asarray(directions.twists).T, ~jnp.asarray(directions.held_by_matches)
@@ -77,7 +77,7 @@ def fuse(
 
 
 def fused_update(pose: jaxlie.SE3, sums: Sums, directions: Directions, fusion: Fusion) -> tuple[Directions, Update]:
-    """One step of Newton's method on P s + γ = 0, with the matches and M fixed; and what constrains the directions."""
+    """One Newton step on P s + γ = 0, with the matches and M fixed; and the directions with tie points and prior."""
     radius, dtype = fusion.radius, sums.center.dtype
     pull, known = fusion.pull(pose.rotation().as_matrix().astype(dtype), pose.translation())
     outwards = from_center(sums.center - fusion.center, radius, sums.radius)

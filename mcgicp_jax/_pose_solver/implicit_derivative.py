@@ -1,4 +1,4 @@
-"""The derivative of a pose, as that of a root of g(T) = Σ w JᵀM d = 0, by the implicit function theorem."""
+"""The derivative of a pose by the implicit function theorem: the pose is a root of g(T) = Σ w JᵀM d = 0."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ class ImplicitRoot(eqx.Module):
 
 
 def root_near(sums: Sums, usable: Bool[Array, ""], fusion: Fusion | None) -> ImplicitRoot:
-    """The scaling of g from the sums at the returned pose, or that of the score in `Fusion`."""
+    """The scaling of g, from the sums at the returned pose or from `Fusion`."""
     if fusion is not None:
         radius = jnp.asarray(fusion.radius)
         return ImplicitRoot(center=jnp.asarray(fusion.center), radius=radius, scale=radius, usable=usable)
@@ -52,7 +52,7 @@ def root_near(sums: Sums, usable: Bool[Array, ""], fusion: Fusion | None) -> Imp
 
 
 class Model(NamedTuple):
-    """All that g depends on and that is differentiated; `fusion` with tie points or a prior."""
+    """The differentiable inputs of g; `fusion` with tie points or a prior."""
 
     matched: Matched
     terms: tuple[AbstractTerm, ...]
@@ -68,7 +68,7 @@ def with_derivative(pose: Float[Array, "7"], root: ImplicitRoot, model: Model) -
 
     Args:
         pose: `jaxlie.SE3.wxyz_xyz`; a constant to autodiff.
-        model: θ, which carries everything that is differentiated.
+        model: θ, the differentiable inputs.
     """
     return pose
 
@@ -102,7 +102,7 @@ with_derivative.defjvp(_with_derivative_jvp, symbolic_zeros=True)
 
 @jax.custom_jvp
 def _once(value: Array) -> Array:
-    """The value, which a derivative has been computed at: a second derivative would be wrong, and is refused."""
+    """The value. Its derivative raises, because second derivatives of the pose would be wrong."""
     return value
 
 
@@ -156,7 +156,7 @@ def _newton(
 def _balance(twist: Float[Array, "6"], pose: Float[Array, "7"], root: ImplicitRoot, model: Model) -> Float[Array, "6"]:
     """g / scale, sums of forces and torques, at a pose moved to first order along a twist (in units of the radius).
 
-    With tie points or a prior, that of `Fusion`.
+    With tie points or a prior, `Fusion.balance`.
     """
     matched, terms, fusion = model
     rotation = jaxlie.SO3(pose[:4]).as_matrix().astype(pose.dtype)

@@ -17,10 +17,10 @@ from mcgicp_jax._terms.base import AbstractTerm, Linearization, linearize
 
 
 class Motion(NamedTuple):
-    """A pose as the matrix and the vector that points are moved by.
+    """A pose as rotation matrix and translation vector.
 
     Attributes:
-        rotation, translation: of T_target_source; the latter in metres.
+        rotation, translation: parts of T_target_source; the latter in metres.
     """
 
     rotation: Float[AnyArray, "3 3"]
@@ -50,7 +50,7 @@ class Matched(eqx.Module):
     num_candidates: int = eqx.field(static=True, default=1)
 
     def within(self, moved: Float[Array, "3 n"], max_distance: Float[Array, ""]) -> Matched:
-        """Without the matches that are further apart; `moved` is T a."""
+        """The matches within `max_distance` metres; `moved` is T a."""
         _, near = distances_within(moved, self.target.points, max_distance)
         return eqx.tree_at(lambda matched: matched.valid, self, self.valid & near)
 
@@ -62,7 +62,7 @@ def match_surfaces(
     temperature: Float[Array, ""] | None = None,
     with_search: bool = False,
 ) -> Matched:
-    """Gather the matched rows of both surfaces; pure JAX. Without the inputs of the search, unless asked for."""
+    """Gather the matched rows of both surfaces, with the inputs of the search if `with_search`; pure JAX."""
     size = source.num_points
     indices, valid = jnp.asarray(matches.indices).reshape(-1), jnp.asarray(matches.valid).reshape(-1)
     num_candidates = indices.size // size

@@ -1,9 +1,10 @@
-"""What is known of a pose besides the clouds, tie points and a prior, as a quadratic form in the entries of the pose.
+"""Tie points and a pose prior as one quadratic cost in the entries of the pose.
 
-A tie point has the residual b − T a. A prior P on the pose has six: of E = P⁻¹ T the translation, and the rotation
-vector to first order, ½ (E − Eᵀ) as a vector: the sine of the angle times the axis. All are linear in the entries of
-the pose. Let D = [ΔR − I | Δt] be the change from a fixed pose T₀ about a fixed centre c: T a − c = ΔR (T₀ a − c) + Δt.
-Then the cost is e − 2 ⟨D, G⟩ + ⟨D, Q D⟩ with constant Q (12, 12) and G (12), for any number of tie points.
+A tie point has the residual b − T a. A prior P has six residuals: with E = P⁻¹ T, the translation of E, and its
+rotation vector to first order, ½ (E − Eᵀ) as a vector (the sine of the angle times the axis). All are linear in the
+entries of the pose. Let D = [ΔR − I | Δt] be the change from a fixed pose T₀ about a fixed centre c:
+T a − c = ΔR (T₀ a − c) + Δt. Then the cost is e − 2 ⟨D, G⟩ + ⟨D, Q D⟩ with constant Q (12, 12) and G (12), for any
+number of tie points.
 """
 
 from __future__ import annotations
@@ -83,7 +84,7 @@ class Fusion(eqx.Module):
     """The equation of a pose with tie points or a prior: P s(T) + γ(T) = 0.
 
     s(T) is the score of the matches, force and torque, γ the force of tie points and prior. In a first registration
-    without them the score has the Jacobian A and the covariance B (see `_uncertainty`), and P = A B⁻¹: the solution
+    without them the score has the Jacobian A and the covariance B (see `covariance`), and P = A B⁻¹: the solution
     minimises sᵀ B⁻¹ s and the cost of tie points and prior together, both in squared standard deviations (generalised
     method of moments, Hansen 1982). M itself is no inverse covariance, so s and γ cannot simply be added. Along
     directions that the matches do not constrain, P is zero. Constants to autodiff: all but `form`.

@@ -1,8 +1,9 @@
-"""Sums over correspondences: a pose update needs nothing else of the points.
+"""Sums over correspondences, the only input of a pose update that depends on the points.
 
 With the residual d = b − T a and the robust weight w, each correspondence has a force f = w M d (3), a stiffness
 K = w M (3×3) and a cost. About a centre c, with p = T a − c and h = (p, 1), the sums are G = Σ f hᵀ (12 numbers),
-Q = Σ K ⊗ h hᵀ (60) and e = Σ dᵀ f. Observability O (3×3 per correspondence, see `_observability`) adds Σ w O ⊗ h hᵀ.
+Q = Σ K ⊗ h hᵀ (60) and e = Σ dᵀ f. With the observability O of each correspondence (3×3, see
+`_local_geometry.observability`), Σ w O ⊗ h hᵀ is added.
 """
 
 from __future__ import annotations
@@ -29,7 +30,7 @@ class Sums(NamedTuple):
 
     Attributes:
         center: c, metres.
-        count: number of correspondences; with several candidates, of all of them.
+        count: number of correspondences; every candidate counts.
         square_extent: Σ |p|², metres².
         energy: e.
         cost: Σ ρ.

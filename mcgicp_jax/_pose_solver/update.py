@@ -14,8 +14,8 @@ from jaxtyping import Array, Bool, Float, Int
 
 from mcgicp_jax._pose_solver.sums import Sums
 
-# Mean eigenvalue that the information matrix is scaled to, dimensionless: large beside 1, the damping that optimistix
-# starts with.
+# Mean eigenvalue to which the information matrix is scaled, dimensionless: large compared with 1, optimistix's initial
+# damping.
 _HESSIAN_SCALE = 1e4
 # Iteration limit. Levenberg-Marquardt was seen to take at most 16, with noisy data.
 _MAX_STEPS = 32
@@ -54,7 +54,7 @@ class Update(eqx.Module):
 
 
 def solve_update(sums: Sums, basis: Float[Array, "6 6"]) -> Update:
-    """Minimise Σ w (d − D h)ᵀ M (d − D h) = e − 2⟨D, G⟩ + ⟨D, Q(D)⟩ (letters as in `_sums`) over the pose change D =
+    """Minimise Σ w (d − D h)ᵀ M (d − D h) = e − 2⟨D, G⟩ + ⟨D, Q(D)⟩ (symbols as in `sums`) over the pose change D =
     [ΔR − I | Δt], with M and w fixed.
 
     Levenberg-Marquardt runs on 13 residuals, a square root of the (13, 13) quadratic form in (vec D, 1), so its time

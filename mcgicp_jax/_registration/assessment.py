@@ -45,7 +45,7 @@ def assessment_of(executor: AbstractExecutor, loop: LoopResult, moments: Lazy[Mo
     """The assessment of a loop that has ended.
 
     Args:
-        moments: `moments_of` the loop; None for a problem with tie points or a prior, which brings its own.
+        moments: `moments_of` the loop; None for a problem with tie points or a prior, which contains its own.
     """
     state, fusion = loop.state, executor.problem.fusion
 
@@ -53,7 +53,7 @@ def assessment_of(executor: AbstractExecutor, loop: LoopResult, moments: Lazy[Mo
         known: Any = fusion if moments is None else moments.value
         if not is_concrete(state, known):
             return covariance_of_pose(state, known)
-        # In float64: beside the variances of unconstrained directions, those of the others would be lost to rounding.
+        # In float64: unconstrained directions have large variances, next to which others would be lost to rounding.
         with jax.enable_x64(True):
             return np.asarray(covariance_of_pose(*as_float64((state._replace(record=None), known))))
 
@@ -130,7 +130,7 @@ def covariance_of_pose(state: State, known: Moments | Fusion) -> Float[Array, "6
     """Covariance of the final pose, for ξ in T exp(ξ), metres and radians; NaN if the status allows none.
 
     Args:
-        known: sums over the scores; with tie points or a prior, those of the registration before, in `Fusion`.
+        known: sums over the scores; with tie points or a prior, `Fusion` from the first registration.
     """
     found = (state.status != Status.TOO_FEW_CORRESPONDENCES) & (state.status != Status.NON_FINITE)
     if state.directions is None:

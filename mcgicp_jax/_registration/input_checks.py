@@ -15,8 +15,8 @@ from mcgicp_jax._methods.multichannel_gicp import MultiChannelGICP
 from mcgicp_jax._registration.options import check_method
 from mcgicp_jax._search.base import Correspondences
 
-# Smallest and largest trace, relative to that of GICP's covariances (2: they are 1 within the surface), of covariances
-# given with one of the clouds, for which no warning is issued. That of cells in m² is a sixth of their squared edge.
+# Bounds of the trace of covariances given with one of the clouds, relative to the trace of GICP's (2: they are 1 within
+# the surface); beyond them a warning is issued. The trace of cells in m² is a sixth of their squared edge.
 _LEAST_TRACE, _LARGEST_TRACE = 0.25, 4.0
 
 
@@ -56,8 +56,8 @@ def check_channels(source: PointCloud, target: PointCloud, method: AbstractMetho
 def check_matches(
     matches: Correspondences, source: PointCloud, method: AbstractMethod, temperature: ArrayLike | None
 ) -> None:
-    """Raise `ValueError` unless there is one match per source row, or several and a positive `temperature` or a method
-    that uses several."""
+    """Raise `ValueError` unless there is one match per source row, or several with a positive `temperature` or for a
+    method that uses several."""
     rows = source.points.shape[0]
     if matches.indices.ndim > 2 or matches.indices.shape[-1] != rows:
         raise ValueError(f"matches: expected one per source row ({rows}), got shape {matches.indices.shape}")
@@ -68,15 +68,15 @@ def check_matches(
 
 
 def warn_of_covariances(source: PointCloud, target: PointCloud) -> None:
-    """Warn if one cloud brings covariances whose unit is not that of GICP's, which the other one gets."""
+    """Warn if one cloud has covariances in another unit than GICP's, which are computed for the other cloud."""
     for name, cloud, other in (("source", source, target), ("target", target, source)):
         if cloud.covariances is not None and other.covariances is None:
             rows, _ = sampled_rows(cloud.valid)
             trace = float(median(np.trace(np.asarray(cloud.covariances)[rows], axis1=1, axis2=2)))
             if not _LEAST_TRACE <= trace / 2 <= _LARGEST_TRACE:
                 warnings.warn(
-                    f"{name}: its covariances have a median trace of {trace:.2g}, those of GICP are dimensionless and "
-                    'have 2; for cells in m² use NDT or D2DNDT, or make them by voxel_gaussians(..., of="covariances")',
+                    f"{name}: covariances look like m² (median trace {trace:.2g}; GICP's are dimensionless with trace "
+                    '2). For voxel cells use NDT or D2DNDT, or voxel_gaussians(..., of="covariances")',
                     UserWarning,
                     stacklevel=4,
                 )

@@ -83,7 +83,7 @@ class AbstractExecutor(abc.ABC):
 
     @abc.abstractmethod
     def match(self, state: State, before: Any) -> Any:
-        """The matches at the pose of a state; those `before`, if its status is `SETTLED`."""
+        """The matches at the pose of a state. If its status is `SETTLED`, the previous matches, `before`."""
 
     @abc.abstractmethod
     def nearest(self, motion: Motion, matches: Any) -> Any:
@@ -103,7 +103,7 @@ class AbstractExecutor(abc.ABC):
         *arguments: Any,
         with_noise: bool = False,
     ) -> Result:
-        """Apply a function that returns one row per correspondence, to the matches of some source points.
+        """Apply a function that returns one row per correspondence to the matches of some source points.
 
         Args:
             rows: of `source_of` the matches.
@@ -120,7 +120,7 @@ class AbstractExecutor(abc.ABC):
         counts: Bool[AnyArray, "n"],
         *arguments: Any,
     ) -> Result:
-        """As `over_rows`, with matches that are nearest in position alone at another pose.
+        """As `over_rows`, for new matches at another pose, nearest in position alone.
 
         Args:
             motion: the other pose, with the rotation of `pose`.
@@ -149,7 +149,7 @@ class AbstractExecutor(abc.ABC):
 
 
 def iterate(executor: AbstractExecutor) -> LoopResult:
-    """Find matches at this pose; sum their forces; update the pose; stop when it no longer moves."""
+    """Run the loop: find matches at this pose; sum their forces; update the pose; stop when it no longer moves."""
     return executor.repeat(partial(step, executor), executor.begin())
 
 

@@ -22,8 +22,8 @@ from mcgicp_jax._pose_solver.pose_measurements import Fusion, Prior, TiePoints, 
 from mcgicp_jax._registration.assessment import as_float64
 from mcgicp_jax._registration.step import State
 
-# Largest difference of two correlations of a symmetric matrix, as of float32 numbers; and the least eigenvalue of a
-# matrix of correlations, of which the inverse keeps four digits in float64.
+# Largest asymmetry of a correlation matrix, as rounding to float32 causes; and smallest eigenvalue with which the
+# inverse of a correlation matrix keeps four digits in float64.
 _ASYMMETRY, _LEAST_EIGENVALUE = 1e-5, 1e-12
 # Source points (n, 3), target points (n, 3) and covariances (n, 3, 3); pose and covariance (6, 6).
 if TYPE_CHECKING:

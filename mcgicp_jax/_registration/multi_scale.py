@@ -15,10 +15,10 @@ from mcgicp_jax._methods.base import AbstractMethod
 from mcgicp_jax._methods.gicp import GICP
 from mcgicp_jax._methods.voxel_gaussians import voxel_gaussians
 
-# Edge of the voxels, per edge of a cell, at all scales but the last, where GICP registers the clouds. At these scales
-# cells against cells pull clouds that overlap in part over each other: from 1.3 m and 10° off, two views of a yard with
-# an overlap of three quarters ended 4 m off, and end at 0 m by GICP. On KITTI, from 5 m and 30° off, GICP leads to 7
-# of 8 poses, cells to 4.
+# Edge of the voxels in edges of a cell, at all scales but the last, where GICP registers the voxels. Cells against cells
+# would pull partially overlapping clouds over each other: from 1.3 m and 10° off, two views of a yard with an
+# overlap of three quarters ended 4 m off, and GICP ends at 0 m. On KITTI, from 5 m and 30° off, GICP found 7 of 8
+# poses, cells 4.
 _COARSE_VOXEL = 0.25
 # Neighbours of a voxel, the default of `preprocess`.
 _NUM_NEIGHBORS = 20
@@ -37,8 +37,8 @@ def stages_of(
 ) -> Iterator[Stage]:
     """The registrations for these voxel sizes, metres; the last one gives the result.
 
-    Methods that need cells have one registration per size: the last one to cells of this size, the others by GICP in
-    smaller voxels. Other methods register the voxels of each size, and then the clouds.
+    Methods that need cells use cells of the last size; for the other sizes, GICP registers smaller voxels. Other
+    methods register the voxels of each size, and then the clouds.
 
     Args:
         source, target: preprocessed clouds; raw ones where the method needs cells.

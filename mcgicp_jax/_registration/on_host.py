@@ -138,7 +138,7 @@ class HostExecutor(AbstractExecutor):
         return self.over_rows(function, motion, matches, np.arange(rows.size), *arguments)
 
     def nearest(self, motion: Motion, matches: _Matches) -> _Matches:
-        """Candidates are followed from pose to pose in any order."""
+        """Followed candidates are in any order, so the nearest one is searched."""
         moved = matches.source.points @ motion.rotation.T + motion.translation
         apart = matches.target.points[matches.rows] - moved
         order = np.argmin(np.where(matches.found, np.einsum("mni,mni->mn", apart, apart), np.inf), axis=0)

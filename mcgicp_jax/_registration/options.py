@@ -17,7 +17,7 @@ from mcgicp_jax._math.robust_kernels import AbstractKernel
 from mcgicp_jax._methods.base import AbstractMethod
 from mcgicp_jax._search.base import AbstractSearch
 
-# Maximum correspondence distance in metres, or two: of the coarse and of the fine phase.
+# Maximum correspondence distance in metres, or two: for the coarse and for the fine phase.
 Distance: TypeAlias = ArrayLike | tuple[ArrayLike, ArrayLike]
 # Radians. Above the small cycles in which nearest-neighbour matching often ends: with real scans of 0.1 m spacing,
 # these were seen to stay within 0.2 mm and 0.4 mrad. The default translation tolerance is chosen likewise.
@@ -67,7 +67,7 @@ class Options:
 
 
 def options_of(function: Callable[..., Any], given: dict[str, Any]) -> Options:
-    """The options of `register` that another function was given; raises `TypeError` for a name that neither has."""
+    """The options of `register` given to another function; raises `TypeError` for a name that neither function has."""
     parameters = inspect.signature(function).parameters.values()
     named = [each.name for each in parameters if each.kind is not inspect.Parameter.VAR_KEYWORD]
     names = [*(field.name for field in fields(Options)), *named]

@@ -39,7 +39,7 @@ from mcgicp_jax._registration.traced import assess, differentiable, moments_trac
 from mcgicp_jax._search.base import AbstractIndex, AbstractSearch, Correspondences
 from mcgicp_jax._search.brute_force import default_search
 
-# Least number of source points in a subsampled coarse phase: enough to find a pose nearly as well as all.
+# Smallest number of source points in a subsampled coarse phase: enough for nearly the pose of all points.
 _COARSE_ROWS = 4096
 
 

@@ -26,10 +26,10 @@ class Status(enum.IntEnum):
         CONVERGED: the last update was below both tolerances, and every direction of motion is constrained.
         MAX_ITERATIONS: the updates were still above the tolerances after `max_iterations` updates.
         TOO_FEW_CORRESPONDENCES: fewer than four source points (in the coarse phase: of the subset) have a match within
-            `max_distance`: the clouds do not overlap, or the start is too far off.
+            `max_distance`: the clouds do not overlap, or the initial pose is too far off.
         DEGENERATE: the last update was below both tolerances, but at least one direction of motion is unconstrained
-            (see `RegistrationResult.unconstrained_directions`). Along it `register` keeps the start, if
-            `hold_unconstrained`. Tie points or a prior constrain a direction if its standard deviation is then below
+            (see `RegistrationResult.unconstrained_directions`). With `hold_unconstrained`, `register` keeps the initial
+            pose along it. Tie points or a prior constrain a direction if its standard deviation is then below
             the radius of the clouds.
         NON_FINITE: the pose or the sums overflowed or became NaN.
         INVALID_INPUT: `register` would raise a `ValueError` for this pair. Only in batches; the pose is NaN.
@@ -50,14 +50,14 @@ class Status(enum.IntEnum):
 
 
 class Constraints(NamedTuple):
-    """What constrains a pose: `RegistrationResult.information` and `directions`."""
+    """Values of `RegistrationResult.information` and `directions`."""
 
     information: Float[AnyArray, "*batch 6 6"]
     directions: Directions | None
 
 
 class Uncertainty(NamedTuple):
-    """How uncertain a pose is: `RegistrationResult.covariance` and `deviations`."""
+    """Values of `RegistrationResult.covariance` and `deviations`."""
 
     covariance: Float[AnyArray, "*batch 6 6"]
     deviations: Float[AnyArray, "*batch 6"]
@@ -67,7 +67,7 @@ class RegistrationResult(eqx.Module):
     """Result of `register` or `estimate_pose`; a pytree. All fields are evaluated at the returned pose.
 
     Fields are NumPy scalars and arrays; inside `jit`, `vmap` or `grad`, and when returned by these, JAX arrays.
-    Only the pose carries a gradient; for that of a cost, call `mahalanobis_cost` at the pose.
+    Only the pose carries a gradient; for the gradient of a cost, call `mahalanobis_cost` at the pose.
 
     Attributes:
         T_target_source: maps source coordinates into the target's frame, b ≈ T a; in the precision of the clouds. At
@@ -76,8 +76,8 @@ class RegistrationResult(eqx.Module):
         num_iterations: number of pose updates.
         num_inliers: number of source points used in the last phase with a match within its `max_distance`.
         cost: Σ ρ(dᵀ M d) over the matches.
-        rmse: root mean square correspondence distance, metres. Usually of the order of the point spacing, as no target
-            point lies just where a source point does. NaN without matches.
+        rmse: root mean square correspondence distance, metres. Usually of the order of the point spacing, because the
+            two clouds sample different points of the surface. NaN without matches.
         overlap: fraction of the source points that have a match within the fine `max_distance`, 0 to 1. Where this
             distance spans the gaps between the points, as in voxels of one size, a value below the known overlap of
             the scans is a sign of a wrong local minimum. In raw LiDAR scans many points have no match.
@@ -138,22 +138,21 @@ class RegistrationResult(eqx.Module):
     def information(self) -> Float[AnyArray, "*batch 6 6"]:
         """(6, 6) Σ w Jᵀ M J, the Gauss-Newton Hessian of half the cost in ξ.
 
-        ξ = (v, ω) is the twist of T exp(ξ), in the source's frame, metres and radians. The scale of the matrix is that
-        of GICP's relative covariances: it compares directions with each other, but its inverse is *not* a covariance of
+        ξ = (v, ω) is the twist of T exp(ξ), in the source's frame, metres and radians. The matrix has the scale of
+        GICP's relative covariances: it compares directions with each other, but its inverse is *not* a covariance of
         the pose. The information of tie points and a prior is converted to this scale and added.
         """
         return self.constraints.value.information
 
     @property
     def directions(self) -> Directions | None:
-        """Six directions of motion and what constrains each, see `unconstrained_directions`; None from
-        `estimate_pose`."""
+        """Six directions of motion and how well each is constrained; None from `estimate_pose`."""
         return self.constraints.value.directions
 
     @property
     def covariance(self) -> Float[AnyArray, "*batch 6 6"]:
         """(6, 6) covariance of ξ, in the order and frame of `information`: a sandwich estimate from the scatter of the
-        matches (Huber 1967; see `_uncertainty`).
+        matches (Huber 1967; see `_pose_solver.covariance`).
 
         ξ rotates about the origin of the source's coordinates. If that is far from the points, as in UTM coordinates, a
         small rotation moves the points far and the first three variances are large: use `deviations` there.
@@ -169,8 +168,7 @@ class RegistrationResult(eqx.Module):
 
     @property
     def deviations(self) -> Float[AnyArray, "*batch 6"]:
-        """(6,) standard deviations in the target's axes: of the position of the matched points' centroid, metres, then
-        of the rotation, radians.
+        """(6,) standard deviations in the target's axes: position of the centroid of the matches (m), rotation (rad).
 
         Derived from `covariance`, with the same limitations.
         """
@@ -212,7 +210,7 @@ class RegistrationResult(eqx.Module):
         if not is_concrete(self.centred, self.history) or np.ndim(self.status_code):
             return f"RegistrationResult(batch of shape {np.shape(self.status_code)})"
         if np.any(self.source_origin):
-            # Far from zero the translation column is the motion of a far point: print that of the source's origin.
+            # The translation column is the motion of a far point; print the motion of the source's origin instead.
             origin = np.append(self.source_origin, 1)
             moved, where = (np.asarray(self.matrix) @ origin - origin)[:3], "of the source's origin "
         else:
@@ -231,7 +229,7 @@ class RegistrationResult(eqx.Module):
 def is_usable(result: RegistrationResult) -> bool:
     """Whether the pose may start another registration: it is finite and based on enough matches.
 
-    This includes MAX_ITERATIONS, and DEGENERATE, where unconstrained directions are as they were at the start.
+    This includes MAX_ITERATIONS and DEGENERATE, where unconstrained directions may still have their initial values.
     """
     return result.status in (Status.CONVERGED, Status.DEGENERATE, Status.MAX_ITERATIONS)
 

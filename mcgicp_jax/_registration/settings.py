@@ -16,20 +16,20 @@ from mcgicp_jax._registration.options import ROTATION_TOLERANCE, Options
 from mcgicp_jax._registration.step import Settings
 
 # Default maximum correspondence distances of the coarse and the fine phase, in spacings of the target. With the larger
-# one, starts several spacings off converge, but matches across edges and the border of the overlap bias the final pose;
-# the smaller one rejects these. The coarse phase needs the spacing between scan lines, too: with that along the lines
-# alone, raw scans of KITTI, 1.3 m apart, stayed at the identity.
+# one, initial poses several spacings off converge, but matches across edges and the border of the overlap bias the
+# final pose; the smaller one rejects these. The coarse phase also considers the spacing between scan lines: with the
+# spacing along the lines alone, raw scans of KITTI, 1.3 m apart, stayed at the identity.
 _COARSE_SPACINGS, _FINE_SPACINGS = 10.0, 2.5
 # Default translation tolerance, in spacings of the target: 0.5 mm at 0.1 m, chosen like `ROTATION_TOLERANCE`.
 _TOLERANCE_IN_SPACINGS = 0.005
-# Tolerances of the coarse phase, in tolerances, of which the default ones are the least: with tighter ones, the small
-# cycles of matching would keep the coarse phase from ending.
+# Tolerances of the coarse phase, as a multiple of the tolerances or of their defaults, whichever is larger. With
+# smaller ones, the small cycles of nearest-neighbour matching would keep the coarse phase from ending.
 _COARSE_TOLERANCE = 10.0
 
 
 def matching_spacing(method: AbstractMethod, target: PointCloud) -> Float[AnyScalar, ""]:
-    """The distance, metres, in units of which the default maximum correspondence distances are chosen: the edge of the
-    cells for a method that matches voxel Gaussians, else the spacing of the points."""
+    """Unit of the default maximum correspondence distances, metres: the edge of the cells for a method that matches
+    voxel Gaussians, else the spacing of the points."""
     cells = method.needs_covariances and target.covariances is not None
     return cell_edge(target) if cells else point_spacing(target)
 

@@ -24,7 +24,7 @@ from mcgicp_jax._terms.base import AbstractTerm, is_adaptive
 
 # Statuses while the loop runs. COARSE: the coarse phase, with every `coarse_stride`-th source point and the larger
 # maximum correspondence distance. RUNNING: the fine phase, with all points and the smaller distance. SETTLED: the last
-# update was below the tolerances; the sums at its pose are still to be measured.
+# update was below the tolerances; the sums at its pose remain to be computed.
 COARSE, RUNNING, SETTLED = -3, -1, -2
 # The coarse phase ends with an update below its tolerances that moves the points by at most this fraction of the fine
 # maximum correspondence distance. It need not converge further: the fine phase starts from its pose.
@@ -78,7 +78,7 @@ class Problem(eqx.Module):
         start: the initial pose.
         source, target: the surfaces of both clouds.
         terms: the residuals of each correspondence, before any number is adapted.
-        fusion: tie points and prior, after a registration without them; None if there are none.
+        fusion: tie points and prior, weighted after a registration without them; None if there are none.
         num_candidates: number of target points that a source point is matched with.
     """
 
@@ -96,7 +96,7 @@ class Problem(eqx.Module):
 
 
 class Record(NamedTuple):
-    """What is recorded before each update: the entries of `RegistrationResult.history`."""
+    """Entries of `RegistrationResult.history`, recorded before each update."""
 
     cost: Float[AnyArray, "*batch"]
     rmse: Float[AnyArray, "*batch"]
@@ -143,7 +143,7 @@ def update(
         if sums.observability is not None:
             directions = find_directions(sums)
             degenerate = ~jnp.all(directions.held)
-            # Along unconstrained directions an update would only follow arbitrary nearest-neighbour matches.
+            # Along unconstrained directions an update would follow arbitrary nearest-neighbour matches.
             basis = jnp.asarray(directions.twists).T * (directions.held | ~settings.hold_unconstrained)
         if fusion is None or directions is None:
             change = solve_update(sums, basis)

@@ -100,7 +100,7 @@ class TracedExecutor(AbstractExecutor):
     def _within(
         self, motion: Motion, source: Surface, indices: Int[Array, "m N"], max_distance: Float[Array, ""]
     ) -> Correspondences:
-        """The matches, valid at most `max_distance` apart."""
+        """The matches, valid up to a distance of `max_distance`."""
         target = self.problem.target
         rows = jnp.maximum(indices, 0)
         moved, points = motion.move(source.points), jnp.asarray(target.points)
@@ -170,7 +170,7 @@ class TracedExecutor(AbstractExecutor):
 
 
 class FixedMatches(TracedExecutor):
-    """Matches that do not change with the pose, as of `estimate_pose`, and no coarse phase.
+    """Matches that do not change with the pose, as in `estimate_pose`; there is no coarse phase.
 
     Args:
         matches: used at every pose.
@@ -253,7 +253,7 @@ def differentiable(
         usable = usable & jnp.all(state.directions.held)
     if fusion is not None:
         usable = usable & jnp.all(fusion.held)
-    # What the terms adapted is constant to autodiff.
+    # The numbers that the terms estimated are constants to autodiff.
     terms = tuple(term.with_numbers_of(last) for term, last in zip(terms, loop.terms, strict=True))
     with jax.default_matmul_precision("highest"):
         root = jax.lax.stop_gradient(root_near(state.sums, usable, fusion))
@@ -262,7 +262,7 @@ def differentiable(
 
 
 def _without_descriptors(where: Bool[Array, ""], rows: SearchPoints) -> SearchPoints:
-    """The rows for a search in position alone, where asked for: without descriptors, none is missing either."""
+    """Where `where` is True, the rows for a search in position alone: descriptors and penalties are set to 0."""
     factor = jnp.where(where, 0, 1).astype(rows.points.dtype)
     penalty = None if rows.penalty is None else factor * rows.penalty
     return SearchPoints(rows.points, factor * rows.descriptors, rows.valid, penalty)

@@ -1,4 +1,4 @@
-"""The interface of terms: what each correspondence adds to the cost, and the force and stiffness that follow from it.
+"""The interface of terms: the cost of each correspondence, and the force and stiffness that follow from it.
 
 The force is minus the gradient of half the cost with respect to the moved point T a, and the stiffness the Gauss-Newton
 Hessian of half the cost. Any residual that is linear in T a to first order has this form, and terms add.
@@ -28,7 +28,7 @@ class Linearization(eqx.Module):
         force: (3, n) w M d, with the residual d = b − T a.
         stiffness: (6, n) w M, symmetric.
         cost: (n,) ρ(dᵀ M d).
-        weight: (n,) robust weight w. In a sum of terms, `weight`, `residual` and `information` are those of the first.
+        weight: (n,) robust weight w. In a sum, `weight`, `residual` and `information` are those of the first term.
         residual: (3, n) d, metres.
         information: (6, n) M, symmetric.
     """
@@ -76,39 +76,39 @@ class AbstractTerm(Numbers):
     """A residual of each correspondence. A subclass defines `linearize`; the other members do nothing by default.
 
     A term may estimate numbers from the residuals (`adapt`), such as their scale. It then defines `sample`, too. The
-    numbers are estimated anew at each pose of the fine phase, which a coarse phase with the term as it is at first
-    always precedes. They are constants to autodiff.
+    numbers are estimated again at each pose of the fine phase, and are constants to autodiff. A registration with such
+    a term always starts with a coarse phase, in which the term has its initial numbers.
 
     Attributes:
         robust: kernel of the residuals; None for squares.
     """
 
-    # Key of `columns`, of terms that have any.
+    # Key in `Surface.columns`, for terms that define `columns`.
     name: ClassVar[str] = ""
     # Whether `adapt` estimates numbers.
     is_adaptive: ClassVar[bool] = False
-    # Whether its matches are nearest in position alone in the fine phase, even if the method searches in channels, too.
+    # Whether matches in the fine phase are nearest in position alone, even if the method also searches in channels.
     by_position: ClassVar[bool] = False
-    # Edge of the cells within which scores are taken to be correlated, distances to the farthest neighbour; values from
-    # 1 to 4 hardly change the covariance of a pose.
+    # Edge of the cells within which scores are treated as correlated, in distances to the farthest neighbour; values
+    # from 1 to 4 hardly change the covariance of a pose.
     correlation_length: ClassVar[float] = 2.0
 
     robust: AbstractKernel | None = eqx.field(default=None, kw_only=True)
 
     @staticmethod
     def columns(around: Neighborhoods, local: LocalGeometry | None) -> Any:
-        """What the term needs to know of each point besides its `Surface`: a pytree of arrays (n, ...), or None. It is
-        found in `Surface.columns[name]`."""
+        """Further values of each point, which `linearize` finds in `Surface.columns[name]`: a pytree of arrays
+        (n, ...), or None."""
         return None
 
     @property
     def estimates_gains(self) -> bool:
-        """Whether gains and offsets of the channels are among the numbers that it estimates."""
+        """Whether the term estimates gains and offsets of the channels."""
         return False
 
     @property
     def matches_slide(self) -> bool:
-        """Whether the matches of a point follow along the surface when the pose moves."""
+        """True if nearest neighbours slide along the surface with the pose (points); False if they stay (cells)."""
         return True
 
     @abc.abstractmethod
@@ -132,7 +132,7 @@ class AbstractTerm(Numbers):
     def observability(
         self, mean: Float[Array, "6 n"], source: Surface, target: Surface, rotation: Float[Array, "3 3"]
     ) -> Float[Array, "6 n"]:
-        """Observability of correspondences by the channels, given the mean of that of their points."""
+        """Observability of correspondences by the channels, given the mean observability of their two points."""
         return mean
 
     def sample(
@@ -143,20 +143,20 @@ class AbstractTerm(Numbers):
         rotation: Float[Array, "3 3"],
         valid: Bool[Array, "n"],
     ) -> Any:
-        """What `adapt` needs of each correspondence, a pytree of arrays (n, ...); arguments as of `linearize`."""
+        """Input of `adapt` for each correspondence, a pytree of arrays (n, ...); arguments as in `linearize`."""
         raise NotImplementedError(f"{type(self).__name__} is adaptive, but does not define sample")
 
     def adapt(self, sample: Any, fraction: Float[AnyScalar, ""]) -> AbstractTerm:
-        """The term with its numbers estimated from some correspondences; with NumPy where these are concrete.
+        """The term with its numbers estimated from some correspondences, computed by NumPy if these are concrete.
 
         Args:
-            sample: result of `sample` for an even sample of the source points, NaN for those without a match.
-            fraction: of all source points that are in the sample and have a match.
+            sample: result of `sample` for an even sample of the source points, NaN for points without a match.
+            fraction: fraction of all source points that are in the sample and have a match.
         """
         return self
 
     def with_numbers_of(self, other: AbstractTerm) -> AbstractTerm:
-        """The term with the numbers that another one has adapted, as constants to autodiff."""
+        """The term with the estimated numbers of another one, as constants to autodiff."""
         return self
 
     @property
@@ -165,8 +165,8 @@ class AbstractTerm(Numbers):
         return jnp.zeros((0, 3))
 
     def with_response(self, samples: Any) -> AbstractTerm:
-        """The term for the covariance of the pose: its stiffness is the change of its force when the points move and
-        match anew.
+        """The term for the covariance of the pose, whose stiffness is the change of the force when the points move and
+        are matched again.
 
         Args:
             samples: results of `sample` at each of the `shifts`, with new matches, stacked.
@@ -186,7 +186,7 @@ def linearize(
     rotation: Float[Array, "3 3"],
     valid: Bool[Array, "n"],
 ) -> Linearization:
-    """Sum of the terms; arguments as of `AbstractTerm.linearize`."""
+    """Sum of the terms; arguments as in `AbstractTerm.linearize`."""
     first, *others = (term.linearize(source, target, moved, rotation, valid) for term in terms)
     return sum(others, start=first)
 

@@ -13,7 +13,7 @@ from mcgicp_jax._terms.base import AbstractTerm, Linearization, linearize_residu
 
 @runtime_checkable
 class HasInformation(Protocol):
-    """What the term uses of an `AbstractMethod`."""
+    """The members of an `AbstractMethod` that the term uses."""
 
     @property
     def needs_covariances(self) -> tuple[str, ...]: ...
@@ -34,7 +34,7 @@ class Mahalanobis(AbstractTerm):
 
     @property
     def matches_slide(self) -> bool:
-        """True of points. Voxel cells stay where they are."""
+        """True for points, False for voxel cells."""
         return not self.method.needs_covariances
 
     def linearize(

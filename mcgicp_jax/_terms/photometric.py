@@ -1,30 +1,31 @@
-"""A photometric term: the channels of matched points are compared where the points are, not where samples are.
+"""A photometric term: the channels of matched points are interpolated to a common position and compared.
 
-A match is a sample and lies up to half a spacing beside the spot that it stands for. A local linear fit v + gᵀx of each
-channel over the tangent plane predicts the channel between samples (Park, Zhou & Koltun, Colored Point Cloud
-Registration Revisited, ICCV 2017). With p = T a and e = p − b, each correspondence has 1 + C residuals:
+A matched target point lies up to half a spacing from the surface point that the source measured. A local linear fit v +
+gᵀx of each channel over the tangent plane predicts the channel between samples (Park, Zhou & Koltun, Colored Point
+Cloud Registration Revisited, ICCV 2017). With p = T a and e = p − b, each correspondence has 1 + C residuals:
 
     r₀ = nᵀe                            metres, n the unit mean of both normals (Rusinkiewicz 2019)
     r_c = v_c^B + h_cᵀe − v_c^A         channel units, h_c = (g_c^B + R g_c^A) / 2, exact at the midpoint of p and b
 
-Both points contribute the fitted value v, not their sample: a sample beside a slope that was smoothed over a
-neighbourhood is biased at edges. v averages the neighbours, moved to the point along g, with weights that decrease with
-the squared distance (Epanechnikov): at edges, a neighbour then changes v less as it enters the neighbourhood. The
-negative log-likelihood is Σ_k q_k/f_k Σ_i ρ(r_k²/σ_k²), so that all residuals count in standard deviations and no
-weight is set by hand. At each pose of the fine phase, `adapt` estimates from the residuals themselves
+Both points contribute the fitted value v instead of the measured one, since a measured value combined with a slope that
+is smoothed over a neighbourhood is biased at edges. v is the mean of the neighbours' values, extrapolated to the point
+along g, with weights that decrease with the squared distance (Epanechnikov). At edges, a neighbour that enters the
+neighbourhood then changes v less. The negative log-likelihood is Σ_k q_k/f_k Σ_i ρ(r_k²/σ_k²), so that all residuals
+count in standard deviations and no weight is set by hand. At each pose of the fine phase, `adapt` estimates from the
+residuals themselves
 
-- σ_k, one scale per residual: 1.4826 times the median absolute deviation. It contains the noise of both samples, that
-  of the fits, and what interpolation leaves; channels that disagree, as of a camera that is out of step, get a large
-  one.
-- f_k, the design effect (Kish 1965): by how much the variance of the summed scores exceeds that of independent ones.
-  Residuals of neighbours share samples, exposure and relief, so that n of them are worth n/f_k. With the forces summed
-  over cells, u_c: f_k = Σ_c |u_c|² / Σ_i w_i |h_i|²/σ_k², at least 1. (The mean eigenvalue of H^{-1/2} (Σ u uᵀ)
+- σ_k, one scale per residual: 1.4826 times the median absolute deviation. It contains the noise of both measurements,
+  the noise of the fits and the error of the interpolation. Channels that disagree, as from a camera that is not
+  synchronised, get a large σ.
+- f_k, the design effect (Kish 1965): the variance of the summed scores over the variance of independent ones. Residuals
+  of neighbours share samples, exposure and relief, so that n of them count as n/f_k. With the forces summed over cells,
+  u_c: f_k = Σ_c |u_c|² / Σ_i w_i |h_i|²/σ_k², at least 1. (The mean eigenvalue of H^{-1/2} (Σ u uᵀ)
   H^{-1/2} over forces and torques differs by a third and changed errors by at most 3 %.)
 - q_k, the reliability of the slopes (Fuller, Measurement Error Models, 1987): Σ w g_Bᵀ R g_A / Σ w |h|², at most 1.
-  Noise of the gradients is independent in the two clouds, so that the numerator contains the true slopes alone. A
-  motion changes the force by the fraction q of its stiffness; the pose that a channel alone would give has the variance
-  f/q² times the inverse stiffness, and multiplying the channel by q combines such poses with minimal variance. A
-  channel of pure noise has q ≈ 0. Normals are taken as reliable, q_0 = 1.
+  The noise of the gradients is independent in the two clouds, so that the numerator contains the true slopes alone. A
+  motion changes the force by the fraction q of its stiffness. The pose from one channel alone has a covariance of f/q²
+  times the inverse stiffness; multiplying each channel by q combines such poses with minimal variance. A channel of
+  pure noise has q ≈ 0. Normals count as reliable, q_0 = 1.
 
 These numbers are constants to autodiff.
 """
@@ -52,8 +53,8 @@ from mcgicp_jax._math.statistics import cell_numbers, median
 from mcgicp_jax._terms.base import AbstractTerm, Linearization
 
 # Scale of the default kernel in standard deviations: weights are those of Student's t with k² = 20 degrees of freedom.
-# Errors on RGB-D pairs with 10 instead of 20: 1 % less to 11 % more on four sets, a quarter less (0.06 mm) on rendered
-# ones; with 5, a fifth more on the recorded table.
+# Errors on RGB-D pairs with 10 instead of 20: from 1 % less to 11 % more on four sets, a quarter less (0.06 mm) on
+# rendered ones; with 5, a fifth more on the recorded table.
 _KERNEL_SCALE = 20**0.5
 # Edge of the cells of the design effect, spacings. 5 to 20 made little difference.
 _CELL = 10.0
@@ -69,16 +70,16 @@ _LEAST_OFFSET = 1e-4
 # 0.75 and 1, the squared errors on thirty walls of posters were 1.31, 1.07 and 0.85 times their variance, those of the
 # box room (84 pairs) 1.19, 1.03 and 0.85 times.
 _SHIFT = 0.75
-# Lower bound of the response, dimensionless: sampled, it may be 0 by chance.
+# Lower bound of the response, dimensionless: its estimate may be 0 by chance.
 _LEAST_RESPONSE = 0.1
-# Lower bound of the reliability, dimensionless: sampled, that of noise may be 0, and a design effect must be finite.
+# Lower bound of the reliability, dimensionless: its estimate for noise may be 0, and f/q must be finite.
 _LEAST_RELIABILITY = 1e-3
 # Standard deviation of a normal variate over its median absolute deviation.
 _PER_MEDIAN = 1.4826
 
 
 class FittedChannels(NamedTuple):
-    """What the term needs of each point.
+    """The columns of the term: fitted channels of each point.
 
     Attributes:
         normal: unit normal.
@@ -145,7 +146,7 @@ class Photometric(AbstractTerm):
         deviations: σ of each residual, metres and channel units; 0 before the first estimate.
         designs: f/q, design effect over reliability, of each residual.
         gains, offsets: applied to the fitted values of the source's channels; 1 and 0 unless `equalizes_channels`.
-        coarse: the term until the numbers are known: that of the coarse phase.
+        coarse: the term of the coarse phase, used until the numbers are known.
         robust: kernel of each residual in standard deviations; None: Cauchy's with k² = 20. Each residual has its own
             weight: a reflection is an outlier of the channels, but not of the geometry.
         equalizes_channels: whether gains and offsets are estimated.
@@ -273,9 +274,9 @@ class Photometric(AbstractTerm):
     ) -> Float[Array, "6 n"]:
         """A / (1 + mean of both traces) with A = Σ α² (g_B g_Aᵀ + g_A g_Bᵀ)/2.
 
-        Noise of the slopes is independent in the two clouds, so that it does not contribute on average. (To subtract
-        its variance from one cloud's slopes instead, as `_local_geometry.observability` does, also subtracts what sharp
-        edges leave.)
+        The noise of the slopes is independent in the two clouds, so that it does not contribute on average.
+        (Subtracting its variance from the slopes of one cloud instead, as `_local_geometry.observability` does, would
+        also subtract the misfit at sharp edges.)
         """
         total: Any = 0.0
         length: Any = 0.0
@@ -286,7 +287,7 @@ class Photometric(AbstractTerm):
             b = weight * target.columns[self.name].gradient[:, channel].T
             total = total + 0.5 * (alg.outer(a + b) - alg.outer(a) - alg.outer(b))
             length = length + 0.5 * (alg.inner(a, a) + alg.inner(b, b))
-        # Before the numbers are known the pose is rough, so that slopes of matched points are unrelated.
+        # Before the numbers are known the pose is inaccurate, so that slopes of matched points are unrelated.
         return jnp.where(self.is_known, total / (1 + length), mean)
 
     def sample(
@@ -363,9 +364,9 @@ class Photometric(AbstractTerm):
     def with_response(self, samples: Residuals) -> Photometric:
         """The term with designs divided by the response κ of each residual, so that its stiffness is the true one.
 
-        When points move and match anew, the sum of the forces changes by a fraction κ of what the slopes predict: 0.5
-        for the colours of posters, 0.5 to 0.75 in the box room, 0.75 for the normals of both. Between two matches,
-        fitted values differ by less than the slope at either says where the slope is large.
+        When points move and are matched again, the sum of the forces changes by a fraction κ of the change that the
+        slopes predict: 0.5 for the colours of posters, 0.5 to 0.75 in the box room, 0.75 for the normals of both. Where
+        slopes are large, the fitted values of two neighbouring matches differ by less than the slopes predict.
         """
         xp = numpy_for(self, samples)
         values, slopes = xp.asarray(samples.values), xp.asarray(samples.slopes)
