@@ -15,8 +15,8 @@ from mcgicp_jax._methods.base import AbstractMethod
 from mcgicp_jax._methods.gicp import GICP
 from mcgicp_jax._methods.voxel_gaussians import voxel_gaussians
 
-# Edge of the voxels in edges of a cell, at all scales but the last, where GICP registers the voxels. Cells against cells
-# would pull partially overlapping clouds over each other: from 1.3 m and 10° off, two views of a yard with an
+# Edge of the voxels in edges of a cell, at all scales but the last, where GICP registers the voxels. Cells against
+# cells would pull partially overlapping clouds over each other: from 1.3 m and 10° off, two views of a yard with an
 # overlap of three quarters ended 4 m off, and GICP ends at 0 m. On KITTI, from 5 m and 30° off, GICP found 7 of 8
 # poses, cells 4.
 _COARSE_VOXEL = 0.25
