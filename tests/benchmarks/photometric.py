@@ -72,7 +72,7 @@ def channels() -> None:
 
 def basin() -> None:
     print(f"\nStarts {FAR[0]} to {FAR[-1]} m along the wall from which the error falls below {1e3 * FOUND:.0f} mm")
-    for label, scales in (("one scale", ()), ("voxel_sizes", (0.1, 0.05))):
+    for label, scales in (("one scale", ()), ("three scales", (0.1, 0.05))):
         for name, method in METHODS.items():
             found = 0
             for seed, far in itertools.product(FAR_WALLS, FAR):
@@ -82,7 +82,7 @@ def basin() -> None:
                 start[:3, 3] += far * target.pose[0, :3]
                 result = mcg.register(pair.source, pair.target, method, init=start, voxel_sizes=scales)
                 found += mcg.metrics.pose_error(result.matrix, pair.truth)[0] < FOUND
-            print(f"{label:>10}, {name:>7}: {found} of {len(FAR_WALLS) * len(FAR)}")
+            print(f"{label:>12}, {name:>7}: {found} of {len(FAR_WALLS) * len(FAR)}")
 
 
 def times() -> None:
