@@ -1,17 +1,19 @@
-"""What somebody needs who adds a method, a term, a search, a robust kernel, a reader of files or a factor.
+"""Base classes and registries for those who add a method, a term, a search, a kernel, a format, a data set or a factor.
 
 Each is one class or function:
 
 - a method: a subclass of `AbstractMethod`, or of `AbstractOneSided` or `AbstractGeneralized`, which define M;
 - a term, a further residual of each correspondence: a subclass of `AbstractTerm`, listed in `AbstractMethod.terms`;
 - a search on the host: a subclass of `AbstractTreeSearch` with `build` and `query`; any other: of `AbstractSearch`;
-- a robust kernel: a subclass of `AbstractKernel`;
-- a factor of a pose graph: a subclass of `AbstractFactor`;
-- a format of files: a function in `FORMATS`, by the ending of the name.
+- a robust kernel: a subclass of `AbstractKernel` with `_rho` and `_weight`;
+- a file format: two functions in a `mcgicp_jax.io.Format`, registered by the suffix;
+- a data set: a subclass of `mcgicp_jax.datasets.AbstractFrames` with `_frame`, in a `mcgicp_jax.datasets.Dataset`;
+- a factor of a pose graph: a subclass of `AbstractFactor`.
 
-`voxel_cells` and `cell_moments` are the parts of `mcgicp_jax.voxel_gaussians`, in pure JAX.
+`voxel_cells` and `cell_moments` are the parts of `mcgicp_jax.voxel_gaussians`; `cell_moments` is differentiable.
 
-The registries `METHODS`, `KERNELS`, `FORMATS`, `DATASETS` and `COLOR_SPACES` are what the command line offers.
+The command line offers the entries that the registries `METHODS` (each a `RegisteredMethod`), `KERNELS`, `FORMATS`,
+`DATASETS` and `COLOR_SPACES` have when `mcgicp_jax.__main__` is imported.
 """
 
 from mcgicp_jax._clouds.color_spaces import COLOR_SPACES
@@ -21,7 +23,7 @@ from mcgicp_jax._local_geometry.surface import Surface
 from mcgicp_jax._math import symmetric_matrices
 from mcgicp_jax._math.robust_kernels import KERNELS, AbstractKernel
 from mcgicp_jax._methods.base import AbstractGeneralized, AbstractMethod, AbstractOneSided
-from mcgicp_jax._methods.registry import METHODS
+from mcgicp_jax._methods.registry import METHODS, RegisteredMethod
 from mcgicp_jax._methods.voxel_gaussians import cell_moments, voxel_cells
 from mcgicp_jax._pose_graph.factors import AbstractFactor
 from mcgicp_jax._search.base import AbstractIndex, AbstractSearch, Correspondences, SearchPoints
@@ -51,6 +53,7 @@ __all__ = [
     "LocalGeometry",
     "Mahalanobis",
     "Neighborhoods",
+    "RegisteredMethod",
     "SearchPoints",
     "Surface",
     "cell_moments",

@@ -1,13 +1,21 @@
-"""What is added to the package is one new thing: a method, a term, a tree; none needs an edit anywhere else."""
+"""A toy of every kind of extension, each in one place and without an import of a private module."""
+
+import pathlib
+import subprocess
+import sys
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 
 import mcgicp_jax as mcg
 from mcgicp_jax import extend
 from mcgicp_jax.extend import symmetric_matrices as alg
 from tests.scenes import motion, pair
+
+ROOT = pathlib.Path(__file__).parent.parent
 
 
 class Ridge(extend.AbstractOneSided):
@@ -50,6 +58,56 @@ class BruteForce(mcg.AbstractTreeSearch):
         return np.where(near, distances, np.inf), np.where(near, rows, len(tree))
 
 
+class PseudoHuber(mcg.AbstractKernel):
+    """A robust kernel: ρ = 2k² (√(1 + s²/k²) − 1)."""
+
+    def _rho(self, square, scale):
+        return 2 * scale**2 * (jnp.sqrt(1 + square / scale**2) - 1)
+
+    def _weight(self, square, scale):
+        return 1 / jnp.sqrt(1 + square / scale**2)
+
+
+def read_toy(file, size):
+    """A file format: coordinates as text."""
+    return mcg.PointCloud(np.loadtxt(file))
+
+
+def write_toy(file, cloud):
+    np.savetxt(file, cloud.points)
+
+
+TOY = mcg.io.Format(read_toy, write_toy)
+
+
+class Folder(mcg.datasets.AbstractFrames):
+    """A data set: the clouds of a folder, without poses."""
+
+    def __init__(self, folder):
+        self.paths = sorted(folder.iterdir())
+        super().__init__(len(self.paths))
+
+    def _frame(self, index):
+        return mcg.datasets.Frame(mcg.io.read(self.paths[index]))
+
+
+class Inclination(extend.AbstractFactor):
+    """A graph factor: the vertical as a sensor measures it in its own frame, unit vectors (m, 3)."""
+
+    rows: Any
+    information: Any
+    uncertain: Any
+    vertical: Any
+
+    def linearize(self, poses):
+        found = poses[:, 1, 2, :3]
+        x, y, z = found.T
+        jacobians = np.zeros((len(poses), 2, 3, 6))
+        # T exp(ξ) turns the vertical in the sensor's frame by −ω.
+        jacobians[:, 1, :, 3:] = np.moveaxis(np.array([[0 * x, -z, y], [z, 0 * x, -x], [-y, x, 0 * x]]), 2, 0)
+        return found - self.vertical, jacobians
+
+
 def test_a_method():
     source, target, truth = pair(size=400)
     result = mcg.register(source, target, Ridge(), max_distance=0.3)
@@ -89,3 +147,81 @@ def test_a_tree():
         np.testing.assert_array_equal(results[0].matrix, results[1].matrix)
     traced = jax.jit(lambda s, t: mcg.register(s, t, mcg.GICP(), search=BruteForce()).matrix)(source, target)
     np.testing.assert_allclose(traced, mcg.register(source, target, mcg.GICP(), search=BruteForce()).matrix, atol=1e-6)
+
+
+def test_a_robust_kernel():
+    source, target, truth = pair(size=400)
+    squares = jnp.linspace(0, 9, 7)
+    slopes = jax.vmap(jax.grad(lambda square: PseudoHuber(1.5).rho(square[None])[0]))(squares)
+    np.testing.assert_allclose(PseudoHuber(1.5).weight(squares), slopes, rtol=1e-5)
+    # A tenth of the source is off by 0.2 m.
+    points = np.array(source.points)
+    points[::10] += 0.2
+    errors = []
+    for robust in (None, PseudoHuber(0.02)):
+        result = mcg.register(
+            source.replace(points=points), target, mcg.PointToPoint(), robust=robust, max_distance=1.0, init=truth
+        )
+        assert result.converged
+        errors.append(mcg.metrics.pose_error(result.matrix, truth)[0])
+    assert errors[1] < 0.7 * errors[0]
+
+
+def test_a_file_format(tmp_path, monkeypatch):
+    monkeypatch.setitem(extend.FORMATS, ".toy", TOY)
+    cloud = mcg.PointCloud(np.random.default_rng(0).normal(size=(40, 3)))
+    mcg.io.write(tmp_path / "cloud.TOY", cloud)
+    np.testing.assert_allclose(mcg.io.read(tmp_path / "cloud.TOY").points, cloud.points, rtol=1e-12)
+
+
+def test_a_data_set(tmp_path):
+    source, target, truth = pair(size=400)
+    for name, cloud in (("0.npy", target), ("1.npy", source)):
+        mcg.io.write(tmp_path / name, cloud)
+    frames = Folder(tmp_path)
+    assert len(frames) == len(frames[:]) == 2 and "Folder(2 frames)" in repr(frames)
+    _, second = mcg.odometry(frames, mcg.GICP(), max_distance=0.3)
+    assert second.registration.converged and max(mcg.metrics.pose_error(second.pose, truth)) < 0.02
+
+
+def test_a_graph_factor():
+    truth, start = motion((1, 2, 0.5, 0.1, -0.2, 0.3)), motion((1.1, 2, 0.6, 0.3, 0, 0.2))
+    prior = mcg.Edge(mcg.WORLD, 0, np.eye(4), 1e4 * np.eye(6))
+    # It does not measure rotations about x and y.
+    edge = mcg.Edge(0, 1, truth, 1e4 * np.diag([1.0, 1, 1, 0, 0, 1]))
+    level = Inclination(np.array([[mcg.WORLD, 1]]), 1e4 * np.eye(3)[None], np.zeros(1, bool), truth[None, 2, :3])
+    alone, both = (
+        mcg.optimize_poses(mcg.PoseGraph([np.eye(4), start], [prior, edge], factors)) for factors in ([], [level])
+    )
+    assert alone.status == mcg.Status.DEGENERATE and both.converged
+    np.testing.assert_allclose(both.poses, [np.eye(4), truth], atol=1e-6)
+    assert both.factor_weights[0] == 1 and both.factor_residuals[0] < 1e-3 and np.isfinite(both.covariance).all()
+
+
+@pytest.mark.slow
+def test_the_command_line_has_what_is_registered(tmp_path):
+    """If it is registered before the commands are imported."""
+    source, target, _ = pair(size=400)
+    scans = tmp_path / "scans"
+    scans.mkdir()
+    for name, cloud in (("0.toy", target), ("1.toy", source)):
+        with open(scans / name, "wb") as file:
+            write_toy(file, cloud)
+    script = f"""
+import sys
+import mcgicp_jax as mcg
+from mcgicp_jax import extend
+from tests.test_extensions import TOY, Folder, PseudoHuber, Ridge
+
+extend.METHODS["ridge"] = extend.RegisteredMethod(Ridge)
+extend.KERNELS["pseudo-huber"] = PseudoHuber
+extend.FORMATS[".toy"] = TOY
+extend.DATASETS["folder"] = mcg.datasets.Dataset(Folder, None, (0.3, 0.3))
+from mcgicp_jax.__main__ import main
+
+options = ["--method", "ridge", "--robust", "pseudo-huber", "1.0", "--output", {str(tmp_path / "poses.txt")!r}]
+sys.exit(main(["odometry", "folder", {str(scans)!r}, *options]))
+"""
+    ended = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, cwd=ROOT)
+    assert ended.returncode == 0, ended.stderr
+    assert len(mcg.io.read_poses(tmp_path / "poses.txt")) == 2

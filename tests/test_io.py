@@ -750,16 +750,6 @@ def test_what_a_library_raises(tmp_path, monkeypatch):
             io.read(tmp_path / "c.laz")
 
 
-def test_a_format_can_be_added(tmp_path, monkeypatch):
-    def write(file, cloud):
-        file.write(b"\n".join(b"%r %r %r" % tuple(point) for point in np.asarray(cloud.points).tolist()))
-
-    monkeypatch.setitem(io.FORMATS, ".toy", io.Format(lambda file, size: PointCloud(np.loadtxt(file)), write))
-    cloud = make(dtype=np.float64)
-    io.write(tmp_path / "c.TOY", cloud)
-    np.testing.assert_array_equal(io.read(tmp_path / "c.TOY").points, cloud.points)
-
-
 def test_no_coordinates(tmp_path):
     write_ply(tmp_path / "c.ply", structured(x=np.ones(3), y=np.ones(3), intensity=np.ones(3)))
     refuses(tmp_path / "c.ply", r"no numeric columns x, y, z; found x, y, intensity")
