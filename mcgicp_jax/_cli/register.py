@@ -231,7 +231,7 @@ def _report(pair: PreparedPair, result: mcg.RegistrationResult) -> None:
         roll, pitch, yaw = np.degrees(angles)
         print(f"deviation: x {x:.2g}, y {y:.2g}, z {z:.2g} m; about x {roll:.2g}, y {pitch:.2g}, z {yaw:.2g} degrees")
     if result.unconstrained_directions:
-        print(f"free:      {describe(result.unconstrained_directions)}")
+        print(f"unconstr.: {describe(result.unconstrained_directions)}")
     print("T_target_source:")
     # At UTM coordinates, 1e-8 in a rotation entry moves a point by centimetres.
     form = "22.14f" if np.any(pair.source.origin) else "15.8f"
