@@ -287,7 +287,7 @@ def test_trajectories_are_drawn_in_their_plane(tmp_path):
 
 def test_maps_show_the_same_part_of_the_world():
     frames = poster_wall(2, points_per_frame=2000)
-    whole = merge_clouds([frame.cloud for frame in frames], [frame.pose for frame in frames], 0.01)
+    whole = mcg.merge_clouds([frame.cloud for frame in frames], [frame.pose for frame in frames], 0.01)
     moved = whole.transform(motion((0.3, 0, 0, 0, 0, 0)))
     bare = PointCloud(whole.points)
     figure = plot.maps({"one": whole, "moved": moved, "bare": bare})

@@ -155,7 +155,7 @@ def color_icp(source: mcg.PointCloud, target: mcg.PointCloud) -> Any:
     return mcg.ColorICP(mcg.MultiChannelGICP().resolve(source, target).channel_weights)
 
 
-def colored_icp(voxel_sizes: tuple[int, ...]) -> Callable[..., np.ndarray]:
+def colored_icp(scales: tuple[int, ...]) -> Callable[..., np.ndarray]:
     def run(source: mcg.PointCloud, target: mcg.PointCloud, start: np.ndarray, voxel: float) -> np.ndarray:
         registration = open3d.pipelines.registration
         clouds = [
