@@ -71,7 +71,7 @@ def write_pcd(path, encoding=pypcd4.Encoding.BINARY, counts=None, **columns):
 
 def las_data(point_format=2, num_points=N, **columns):
     header = laspy.LasHeader(point_format=point_format)
-    header.voxel_sizes, header.offsets = np.full(3, 1e-3), np.array([500_000.0, 5_400_000.0, 100.0])
+    header.scales, header.offsets = np.full(3, 1e-3), np.array([500_000.0, 5_400_000.0, 100.0])
     las = laspy.LasData(header)
     las.xyz = header.offsets + RNG.integers(0, 10**6, (num_points, 3)) * 1e-3
     for name, values in columns.items():

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import mcgicp_jax as mcg
-from mcgicp_jax import MultiChannelGICP, PointCloud, plot, preprocess, register
+from mcgicp_jax import MultiChannelGICP, PointCloud, merge_clouds, plot, preprocess, register
 from mcgicp_jax.datasets import poster_wall
 from tests.graphs import grid, measured
 from tests.scenes import motion

@@ -39,7 +39,7 @@ def read_las(file: BinaryIO, size: int) -> PointCloud:
         raise ValueError("it has no points")
     columns = {name: np.concatenate([chunk[name] for chunk in chunks]) for name in names}
     with np.errstate(over="raise"):
-        for axis, scale, offset in zip("XYZ", header.voxel_sizes, header.offsets, strict=True):
+        for axis, scale, offset in zip("XYZ", header.scales, header.offsets, strict=True):
             columns[axis] = columns[axis] * scale + offset
     if not columns["intensity"].any():
         del columns["intensity"]
@@ -94,7 +94,7 @@ def write_las(file: BinaryIO, cloud: PointCloud, compress: bool) -> None:
     header = laspy.LasHeader(version="1.2", point_format=2 if "red" in names else 0)
     header.offsets = np.floor(points.min(axis=0))
     extent = np.maximum(points.max(axis=0) - header.offsets, 1)
-    header.voxel_sizes = 10.0 ** np.ceil(np.log10(extent / (2**31 - 1)))
+    header.scales = 10.0 ** np.ceil(np.log10(extent / (2**31 - 1)))
     las = laspy.LasData(header)
     las.xyz = points
     for name, values in columns.items():
