@@ -28,7 +28,7 @@ from mcgicp_jax._methods.voxel_gaussians import cell_moments, voxel_cells
 from mcgicp_jax._pose_graph.factors import AbstractFactor
 from mcgicp_jax._search.base import AbstractIndex, AbstractSearch, Correspondences, SearchPoints
 from mcgicp_jax._search.kd_tree import AbstractTreeSearch
-from mcgicp_jax._terms.base import AbstractTerm, Linearization, linearize_residual
+from mcgicp_jax._terms.base import AbstractTerm, Linearization, PosedMatches, linearize_residual
 from mcgicp_jax._terms.mahalanobis import Mahalanobis
 from mcgicp_jax.datasets import DATASETS
 from mcgicp_jax.io.clouds import FORMATS
@@ -53,6 +53,7 @@ __all__ = [
     "LocalGeometry",
     "Mahalanobis",
     "Neighborhoods",
+    "PosedMatches",
     "RegisteredMethod",
     "SearchPoints",
     "Surface",

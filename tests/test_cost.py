@@ -380,5 +380,5 @@ def test_the_sums_say_what_the_correspondences_say(kernel):
             for p, q in {(i, j), (j, i)}:
                 for r, s in {(k, l), (l, k)}:
                     Q[p, r, q, s] = found.stiffness[row, column]
-    actual = float(found.constant) - 2 * np.sum(D * np.asarray(found.first)) + np.einsum("ij,ijkl,kl", D, Q, D)
+    actual = float(found.energy) - 2 * np.sum(D * np.asarray(found.force)) + np.einsum("ij,ijkl,kl", D, Q, D)
     assert actual == pytest.approx(expected, rel=tolerance(1e-4, 1e-10))

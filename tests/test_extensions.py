@@ -30,10 +30,11 @@ class Ridge(extend.AbstractOneSided):
 class Attraction(extend.AbstractTerm):
     """A term: three times plain ICP's force."""
 
-    def linearize(self, source, target, moved, rotation, valid):
-        apart = jnp.where(valid, target.points.T - moved, 0)
-        one, zero = jnp.ones_like(apart[0]), jnp.zeros_like(apart[0])
-        return extend.linearize_residual(apart, 3 * jnp.stack([one, zero, zero, one, zero, one]), self.robust)
+    def linearize(self, matches):
+        one, zero = jnp.ones_like(matches.moved[0]), jnp.zeros_like(matches.moved[0])
+        return extend.linearize_residual(
+            matches.residual, 3 * jnp.stack([one, zero, zero, one, zero, one]), self.robust
+        )
 
 
 class Prior(mcg.GICP):

@@ -29,8 +29,8 @@ class Still(AbstractTerm):
     columns = staticmethod(Photometric.columns)
     term: Photometric
 
-    def linearize(self, *arguments):
-        return self.term.linearize(*arguments)
+    def linearize(self, matches):
+        return self.term.linearize(matches)
 
 
 class Held(mcg.MultiChannelGICP):
@@ -124,7 +124,7 @@ def test_forces_are_the_gradient_of_the_cost():
     moved = motion.move(matched.source.points)
 
     def of(moved, name):
-        return getattr(term.linearize(matched.source, matched.target, moved, motion.rotation, matched.valid), name)
+        return getattr(term.linearize(matched.at(motion)._replace(moved=moved)), name)
 
     gradient = jax.jit(jax.grad(lambda moved: jnp.sum(of(moved, "cost"))))(moved)
     force = jax.jit(lambda moved: of(moved, "force"))(moved)
@@ -141,7 +141,7 @@ def test_estimates_are_scales_and_correlations_of_the_residuals():
     _, term = held(source, target, PHOTOMETRIC, truth, matches)
     matched, _, motion = matched_at(source, target, PHOTOMETRIC, truth, matches)
     moved = motion.move(matched.source.points)
-    residuals = term.sample(matched.source, matched.target, moved, motion.rotation, matched.valid)
+    residuals = term.sample(matched.at(motion))
     for k, values in enumerate(residuals.values.T):
         scatter = 1.4826 * median(np.abs(np.asarray(values) - median(np.asarray(values))))
         np.testing.assert_allclose(term.deviations[k], scatter, rtol=1e-4)

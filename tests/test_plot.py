@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import mcgicp_jax as mcg
-from mcgicp_jax import MultiChannelGICP, PointCloud, plot, preprocess, register
+from mcgicp_jax import MultiChannelGICP, PointCloud, merge_clouds, plot, preprocess, register
 from mcgicp_jax.datasets import poster_wall
 from tests.graphs import grid, measured
 from tests.scenes import motion
@@ -287,7 +287,7 @@ def test_trajectories_are_drawn_in_their_plane(tmp_path):
 
 def test_maps_show_the_same_part_of_the_world():
     frames = poster_wall(2, points_per_frame=2000)
-    whole = mcg.merge_clouds([frame.cloud for frame in frames], [frame.pose for frame in frames], 0.01)
+    whole = merge_clouds([frame.cloud for frame in frames], [frame.pose for frame in frames], 0.01)
     moved = whole.transform(motion((0.3, 0, 0, 0, 0, 0)))
     bare = PointCloud(whole.points)
     figure = plot.maps({"one": whole, "moved": moved, "bare": bare})

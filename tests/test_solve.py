@@ -39,9 +39,9 @@ def solve(moved, residual, information, weight, valid):
     class Given(AbstractTerm):
         """Forces of given weight matrices."""
 
-        def linearize(self, source, target, moved, rotation, valid):
+        def linearize(self, matches):
             matrices = cov.symmetric_from_matrix(jnp.asarray(information, float))
-            found = linearize_residual(jnp.where(valid, target.points.T - moved, 0), matrices, None)
+            found = linearize_residual(matches.residual, matrices, None)
             return found.scaled(jnp.asarray(weight, float))
 
     points = (jnp.asarray(rows, float) for rows in (moved, moved + residual))

@@ -84,7 +84,7 @@ def over_rows(function: Callable[[Any], Tree], num_rows: int) -> Tree:
     size = -(-num_rows // num_blocks)
     padded = jnp.minimum(jnp.arange(num_blocks * size), num_rows - 1).reshape(num_blocks, size)
     found = jax.lax.map(function, padded)
-    return jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:])[:num_rows], found)
+    return jax.tree.map(lambda leaf: leaf.reshape(padded.size, *leaf.shape[2:])[:num_rows], found)
 
 
 def joined(source: PointCloud, target: PointCloud, with_channels: bool) -> PointCloud:

@@ -44,5 +44,4 @@ def adapted(
 
 def sample_of_term(motion: Motion, matched: Matched, term: AbstractTerm) -> Any:
     """`AbstractTerm.sample` of matched points."""
-    moved = motion.move(matched.source.points)
-    return term.sample(matched.source, matched.target, moved, motion.rotation, matched.valid)
+    return term.sample(matched.at(motion))

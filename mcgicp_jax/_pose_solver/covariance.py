@@ -31,7 +31,7 @@ from mcgicp_jax._pose_solver.degeneracy import Directions
 from mcgicp_jax._pose_solver.matched import Matched, Motion, linearize_at
 from mcgicp_jax._pose_solver.sums import mean_observability, powers
 from mcgicp_jax._pose_solver.update import twist_form
-from mcgicp_jax._terms.base import AbstractTerm, linearize
+from mcgicp_jax._terms.base import AbstractTerm, PosedMatches, linearize
 
 # Standard deviation of an unconstrained direction, in radii of the matched points: large compared with their extent.
 UNKNOWN = 10.0
@@ -155,7 +155,8 @@ def scores_of(
         responding: the terms with their response (`AbstractTerm.with_response`). Their stiffness replaces K O, and
             their forces replace w M O d. None for terms that do not adapt, and where matches are fixed.
     """
-    moved, found, counts = linearize_at(motion, matched, terms)
+    posed, found, counts = linearize_at(motion, matched, terms)
+    moved = posed.moved
     arms = jnp.where(matched.valid, (moved - frame.center[:, None]) / frame.radius, 0)
     bias, cells, stiffness = jnp.zeros(6, moved.dtype), None, found.stiffness
     if matched.source.noise is not None:
@@ -167,9 +168,9 @@ def scores_of(
         stiffness, bias = seen.stiffness, jnp.sum(_wrench(arms, found.force - seen.force), axis=1)
     else:
         if any(term.robust is not None for term in terms):
-            stiffness = _tangent_stiffness(motion, moved, matched, counts, terms)
+            stiffness = _tangent_stiffness(posed, counts, terms)
         if matched.source.noise is not None:
-            shown = _discounted_observability(motion, matched, frame.discount, terms)
+            shown = _discounted_observability(posed, frame.discount, terms)
             left_out = found.force - alg.multiply(found.stiffness, alg.multiply(shown, found.residual))
             bias = jnp.sum(_wrench(arms, left_out), axis=1)
             if all(term.matches_slide for term in terms):
@@ -179,9 +180,9 @@ def scores_of(
 
 
 def _discounted_observability(
-    motion: Motion, matched: Matched, discount: Float[Array, "2"], terms: tuple[AbstractTerm, ...]
+    posed: PosedMatches, discount: Float[Array, "2"], terms: tuple[AbstractTerm, ...]
 ) -> Float[Array, "6 n"]:
-    geometry, *channels = mean_observability(motion.rotation, matched, terms)
+    geometry, *channels = mean_observability(posed, terms)
     shown = discount[0] * geometry
     for each in channels:
         # A / (1 + tr A) of `channel_observability`, with A multiplied by the discount.
@@ -196,20 +197,15 @@ def _wrench(arms: Float[Array, "3 N"], force: Float[Array, "3 N"]) -> Float[Arra
 
 
 def _tangent_stiffness(
-    motion: Motion,
-    moved: Float[Array, "3 N"],
-    matched: Matched,
-    counts: Float[Array, "N"],
-    terms: tuple[AbstractTerm, ...],
+    posed: PosedMatches, counts: Float[Array, "N"], terms: tuple[AbstractTerm, ...]
 ) -> Float[Array, "6 N"]:
     """−∂f/∂(T a) of robust correspondences, symmetrised: includes the decrease of w with the residual."""
 
     def force(shift: Float[Array, "3"]) -> Float[Array, "3 N"]:
-        shifted = moved + shift[:, None]
-        return linearize(terms, matched.source, matched.target, shifted, motion.rotation, matched.valid).force
+        return linearize(terms, posed._replace(moved=posed.moved + shift[:, None])).force
 
-    still = jnp.zeros(3, moved.dtype)
-    columns = [-counts * jax.jvp(force, (still,), (axis,))[1] for axis in jnp.eye(3, dtype=moved.dtype)]
+    still = jnp.zeros(3, posed.moved.dtype)
+    columns = [-counts * jax.jvp(force, (still,), (axis,))[1] for axis in jnp.eye(3, dtype=still.dtype)]
     return jnp.stack([0.5 * (columns[j][i] + columns[i][j]) for i in range(3) for j in range(i, 3)])
 
 

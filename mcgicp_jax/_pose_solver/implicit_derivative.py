@@ -165,8 +165,8 @@ def _balance(twist: Float[Array, "6"], pose: Float[Array, "7"], root: ImplicitRo
     translation = pose[4:] + v + jnp.cross(omega, pose[4:] - root.center)
     # Without a usable root, ignoring all correspondences keeps values and derivatives finite.
     matched = eqx.tree_at(lambda matched: matched.valid, matched, matched.valid & root.usable)
-    moved, found, _ = linearize_at(Motion(turned, translation), matched, terms)
-    arms = jnp.where(matched.valid, moved - root.center[:, None], 0)
+    posed, found, _ = linearize_at(Motion(turned, translation), matched, terms)
+    arms = jnp.where(matched.valid, posed.moved - root.center[:, None], 0)
     torque = jnp.cross(arms, found.force, axis=0)
     score = jnp.concatenate([jnp.sum(found.force, axis=1) * root.radius, jnp.sum(torque, axis=1)]) / root.scale
     return score if fusion is None else fusion.balance(score, turned, translation)

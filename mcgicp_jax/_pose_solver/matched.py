@@ -13,7 +13,7 @@ from mcgicp_jax._compute.concrete import AnyArray, AnyScalar
 from mcgicp_jax._local_geometry.surface import Surface
 from mcgicp_jax._math import symmetric_matrices as alg
 from mcgicp_jax._search.base import Correspondences, SearchPoints
-from mcgicp_jax._terms.base import AbstractTerm, Linearization, linearize
+from mcgicp_jax._terms.base import AbstractTerm, Linearization, PosedMatches, linearize
 
 
 class Motion(NamedTuple):
@@ -48,6 +48,11 @@ class Matched(eqx.Module):
     apart: Float[AnyArray, "n"] | None = None
     temperature: Float[AnyScalar, ""] | None = None
     num_candidates: int = eqx.field(static=True, default=1)
+
+    def at(self, motion: Motion) -> PosedMatches:
+        """The matches at a pose."""
+        moved = motion.move(self.source.points)
+        return PosedMatches(self.source, self.target, moved, motion.rotation, self.valid)
 
     def within(self, moved: Float[Array, "3 n"], max_distance: Float[Array, ""]) -> Matched:
         """The matches within `max_distance` metres; `moved` is T a."""
@@ -107,16 +112,16 @@ def _square_apart(
 
 def linearize_at(
     motion: Motion, matched: Matched, terms: tuple[AbstractTerm, ...]
-) -> tuple[Float[Array, "3 n"], Linearization, Float[Array, "n"]]:
-    """T a, the sum of the terms at a pose, and the soft-assignment weights (1 for valid and 0 for invalid matches)."""
-    moved = motion.move(matched.source.points)
-    found = linearize(terms, matched.source, matched.target, moved, motion.rotation, matched.valid)
-    counts = jnp.asarray(matched.valid).astype(moved.dtype)
+) -> tuple[PosedMatches, Linearization, Float[Array, "n"]]:
+    """The matches at a pose, the sum of the terms, and soft-assignment weights (1 for valid, 0 for invalid matches)."""
+    posed = matched.at(motion)
+    found = linearize(terms, posed)
+    counts = jnp.asarray(matched.valid).astype(posed.moved.dtype)
     if matched.temperature is not None and matched.apart is not None:
         far = alg.inner(found.residual, found.residual) + matched.apart
         shape = (matched.num_candidates, -1)
         counts = _softmax((-0.5 * far / matched.temperature**2).reshape(shape), matched.valid.reshape(shape))
-    return moved, found.scaled(counts), counts
+    return posed, found.scaled(counts), counts
 
 
 def _softmax(logits: Float[Array, "m N"], valid: Bool[Array, "m N"]) -> Float[Array, "n"]:

@@ -17,7 +17,7 @@ from jaxtyping import Array, Float, Int
 from mcgicp_jax._compute.concrete import AnyArray, AnyScalar
 from mcgicp_jax._math import symmetric_matrices as alg
 from mcgicp_jax._pose_solver.matched import Matched, Motion, linearize_at
-from mcgicp_jax._terms.base import AbstractTerm, channel_observability
+from mcgicp_jax._terms.base import AbstractTerm, PosedMatches, channel_observability
 
 _UPPER = np.triu_indices(4)
 
@@ -75,13 +75,14 @@ class Sums(NamedTuple):
 
 def sums_of(motion: Motion, matched: Matched, terms: tuple[AbstractTerm, ...]) -> Sums:
     """Compute the sums at a pose in one pass over the correspondences, the only part of a step that touches points."""
-    moved, found, counts = linearize_at(motion, matched, terms)
+    posed, found, counts = linearize_at(motion, matched, terms)
+    moved = posed.moved
     mask = jnp.asarray(matched.valid).astype(moved.dtype)
     count = jnp.sum(mask)
     center = jnp.sum(mask * moved, axis=1) / jnp.maximum(count, 1)
     p = mask * (moved - center[:, None])
     h = jnp.concatenate([p, jnp.ones_like(p[:1])])
-    shown = mean_observability(motion.rotation, matched, terms)
+    shown = mean_observability(posed, terms)
     # One product for all sums over h hᵀ.
     rows = [found.stiffness]
     if shown:
@@ -113,17 +114,15 @@ def _share(counts: Float[Array, "n"], num_candidates: int) -> Float[Array, "n"]:
     return (each / jnp.where(total > 0, total, 1)).reshape(-1)
 
 
-def mean_observability(
-    rotation: Float[Array, "3 3"], matched: Matched, terms: tuple[AbstractTerm, ...]
-) -> list[Float[Array, "6 n"]]:
+def mean_observability(posed: PosedMatches, terms: tuple[AbstractTerm, ...]) -> list[Float[Array, "6 n"]]:
     """O per correspondence, in the target's frame: mean over its two points; by shape, then by channels if known."""
-    source, target = matched.source, matched.target
+    source, target, rotation = posed.source, posed.target, posed.rotation
     if source.observability is None or target.observability is None:
         return []
     found = [0.5 * (alg.rotate(rotation, source.observability.T) + target.observability.T)]
     if source.channel_observability is not None and target.channel_observability is not None:
         mean = 0.5 * (alg.rotate(rotation, source.channel_observability.T) + target.channel_observability.T)
-        found.append(channel_observability(terms, mean, source, target, rotation))
+        found.append(channel_observability(terms, mean, posed))
     return found
 
 

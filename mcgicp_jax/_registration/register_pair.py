@@ -83,7 +83,7 @@ def register_pair(
     if not (ties is None and belief is None):
         fusion = fusion_of(run.loop.state, run.moments(), ties, belief)
         problem = replace(run.problem, start=constant(run.loop.state.pose), fusion=fusion)
-        run = _run(problem, method, target, search, options.max_iterations)
+        run = _run(problem, run.method, target, search, options.max_iterations)
     return registration_of(run.state(), run.assessment(), run.loop.history, source, target)
 
 
@@ -91,12 +91,14 @@ class _Run(NamedTuple):
     """A problem that has been run.
 
     Attributes:
+        method: with its unset parameters chosen.
         loop: its end, constant to autodiff.
         state: computes the final state, whose pose is differentiable.
         assessment, moments: compute these of the final pose.
     """
 
     problem: Problem
+    method: AbstractMethod
     loop: LoopResult
     state: Callable[[], State]
     assessment: Callable[[], Assessment]
@@ -131,7 +133,9 @@ def _run(
         matched = match_surfaces(source_surface, target_surface, loop.matches)
         return differentiable(loop, matched, problem.terms, problem.fusion)
 
-    return _Run(problem, loop, state, lambda: assess(loop, fixed, search), lambda: moments_traced(loop, fixed, search))
+    return _Run(
+        problem, method, loop, state, lambda: assess(loop, fixed, search), lambda: moments_traced(loop, fixed, search)
+    )
 
 
 def _run_on_host(problem: Problem, method: AbstractMethod, target: PointCloud, search: AbstractSearch) -> _Run:
@@ -143,7 +147,7 @@ def _run_on_host(problem: Problem, method: AbstractMethod, target: PointCloud, s
         loop = iterate(executor)
     moments = Lazy(lambda: moments_of(executor, loop, rematched=True))
     assessment = assessment_of(executor, loop, None if problem.fusion is not None else moments)
-    return _Run(problem, loop, lambda: loop.state, lambda: assessment, lambda: moments.value)
+    return _Run(problem, method, loop, lambda: loop.state, lambda: assessment, lambda: moments.value)
 
 
 def pose_problem(

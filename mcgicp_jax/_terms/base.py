@@ -7,7 +7,7 @@ Hessian of half the cost. Any residual that is linear in T a to first order has 
 from __future__ import annotations
 
 import abc
-from typing import Any, ClassVar
+from typing import Any, ClassVar, NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -72,6 +72,28 @@ def linearize_residual(
     return Linearization(weight * gradient, weight * information, cost, weight, residual, information)
 
 
+class PosedMatches(NamedTuple):
+    """n matched points at a pose.
+
+    Attributes:
+        source, target: the surfaces at the matched points, in the frame of each cloud.
+        moved: T a, the moved source points, metres.
+        rotation: of T_target_source.
+        valid: which correspondences count; the residual of the others is 0.
+    """
+
+    source: Surface
+    target: Surface
+    moved: Float[Array, "3 n"]
+    rotation: Float[Array, "3 3"]
+    valid: Bool[AnyArray, "n"]
+
+    @property
+    def residual(self) -> Float[Array, "3 n"]:
+        """d = b − T a, metres."""
+        return jnp.where(self.valid, self.target.points.T - self.moved, 0)
+
+
 class AbstractTerm(Numbers):
     """A residual of each correspondence. A subclass defines `linearize`; the other members do nothing by default.
 
@@ -112,38 +134,15 @@ class AbstractTerm(Numbers):
         return True
 
     @abc.abstractmethod
-    def linearize(
-        self,
-        source: Surface,
-        target: Surface,
-        moved: Float[Array, "3 n"],
-        rotation: Float[Array, "3 3"],
-        valid: Bool[Array, "n"],
-    ) -> Linearization:
-        """Force, stiffness and cost of each correspondence.
+    def linearize(self, matches: PosedMatches) -> Linearization:
+        """Force, stiffness and cost of each correspondence."""
 
-        Args:
-            source, target: the surfaces at the matched points, in the frame of each cloud.
-            moved: T a, the moved source points, metres.
-            rotation: of T_target_source.
-            valid: which correspondences count; the residual of the others is 0.
-        """
-
-    def observability(
-        self, mean: Float[Array, "6 n"], source: Surface, target: Surface, rotation: Float[Array, "3 3"]
-    ) -> Float[Array, "6 n"]:
+    def observability(self, mean: Float[Array, "6 n"], matches: PosedMatches) -> Float[Array, "6 n"]:
         """Observability of correspondences by the channels, given the mean observability of their two points."""
         return mean
 
-    def sample(
-        self,
-        source: Surface,
-        target: Surface,
-        moved: Float[Array, "3 n"],
-        rotation: Float[Array, "3 3"],
-        valid: Bool[Array, "n"],
-    ) -> Any:
-        """Input of `adapt` for each correspondence, a pytree of arrays (n, ...); arguments as in `linearize`."""
+    def sample(self, matches: PosedMatches) -> Any:
+        """Input of `adapt` for each correspondence, a pytree of arrays (n, ...)."""
         raise NotImplementedError(f"{type(self).__name__} is adaptive, but does not define sample")
 
     def adapt(self, sample: Any, fraction: Float[AnyScalar, ""]) -> AbstractTerm:
@@ -178,27 +177,16 @@ def is_adaptive(terms: tuple[AbstractTerm, ...]) -> bool:
     return any(term.is_adaptive for term in terms)
 
 
-def linearize(
-    terms: tuple[AbstractTerm, ...],
-    source: Surface,
-    target: Surface,
-    moved: Float[Array, "3 n"],
-    rotation: Float[Array, "3 3"],
-    valid: Bool[Array, "n"],
-) -> Linearization:
-    """Sum of the terms; arguments as in `AbstractTerm.linearize`."""
-    first, *others = (term.linearize(source, target, moved, rotation, valid) for term in terms)
+def linearize(terms: tuple[AbstractTerm, ...], matches: PosedMatches) -> Linearization:
+    """Sum of the terms."""
+    first, *others = (term.linearize(matches) for term in terms)
     return sum(others, start=first)
 
 
 def channel_observability(
-    terms: tuple[AbstractTerm, ...],
-    mean: Float[Array, "6 n"],
-    source: Surface,
-    target: Surface,
-    rotation: Float[Array, "3 3"],
+    terms: tuple[AbstractTerm, ...], mean: Float[Array, "6 n"], matches: PosedMatches
 ) -> Float[Array, "6 n"]:
     """`AbstractTerm.observability` with each term in turn."""
     for term in terms:
-        mean = term.observability(mean, source, target, rotation)
+        mean = term.observability(mean, matches)
     return mean

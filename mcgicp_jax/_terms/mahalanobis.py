@@ -4,11 +4,9 @@ from __future__ import annotations
 
 from typing import Protocol, runtime_checkable
 
-import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Float
 
-from mcgicp_jax._local_geometry.surface import Surface
-from mcgicp_jax._terms.base import AbstractTerm, Linearization, linearize_residual
+from mcgicp_jax._terms.base import AbstractTerm, Linearization, PosedMatches, linearize_residual
 
 
 @runtime_checkable
@@ -37,14 +35,7 @@ class Mahalanobis(AbstractTerm):
         """True for points, False for voxel cells."""
         return not self.method.needs_covariances
 
-    def linearize(
-        self,
-        source: Surface,
-        target: Surface,
-        moved: Float[Array, "3 n"],
-        rotation: Float[Array, "3 3"],
-        valid: Bool[Array, "n"],
-    ) -> Linearization:
-        residual = jnp.where(valid, target.points.T - moved, 0)
-        information = self.method.information(target.covariance.T, source.covariance.T, rotation)
-        return linearize_residual(residual, information, self.robust)
+    def linearize(self, matches: PosedMatches) -> Linearization:
+        target, source = matches.target.covariance.T, matches.source.covariance.T
+        information = self.method.information(target, source, matches.rotation)
+        return linearize_residual(matches.residual, information, self.robust)

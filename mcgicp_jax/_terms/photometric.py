@@ -46,11 +46,10 @@ from mcgicp_jax._local_geometry.channel_equalization import gain_and_offset
 from mcgicp_jax._local_geometry.channel_fits import fit_linear
 from mcgicp_jax._local_geometry.local_geometry import LocalGeometry, offsets_of
 from mcgicp_jax._local_geometry.neighborhoods import NO_NEIGHBORS, Neighborhoods
-from mcgicp_jax._local_geometry.surface import Surface
 from mcgicp_jax._math import symmetric_matrices as alg
 from mcgicp_jax._math.robust_kernels import AbstractKernel, Cauchy
 from mcgicp_jax._math.statistics import cell_numbers, median
-from mcgicp_jax._terms.base import AbstractTerm, Linearization
+from mcgicp_jax._terms.base import AbstractTerm, Linearization, PosedMatches
 
 # Scale of the default kernel in standard deviations: weights are those of Student's t with k² = 20 degrees of freedom.
 # Errors on RGB-D pairs with 10 instead of 20: from 1 % less to 11 % more on four sets, a quarter less (0.06 mm) on
@@ -200,55 +199,28 @@ class Photometric(AbstractTerm):
     def estimates_gains(self) -> bool:
         return self.equalizes_channels
 
-    def linearize(
-        self,
-        source: Surface,
-        target: Surface,
-        moved: Float[Array, "3 n"],
-        rotation: Float[Array, "3 3"],
-        valid: Bool[Array, "n"],
-    ) -> Linearization:
-        matched = (source, target, moved, rotation, valid)
-        return jax.lax.cond(
-            self.is_known,
-            lambda term: term._linearize(*matched),
-            lambda term: term.coarse.linearize(*matched),
-            self,
-        )
+    def linearize(self, matches: PosedMatches) -> Linearization:
+        def known() -> Linearization:
+            residuals, residual = self._residuals(matches), matches.target.points.T - matches.moved
+            scale: Any = _KERNEL_SCALE
+            robust = Cauchy(scale) if self.robust is None else self.robust
+            parts = []
+            for k, (value, slope) in enumerate(zip(residuals.values, residuals.slopes, strict=True)):
+                counts = (self.deviations[k] > 0) & ~jnp.isnan(value)
+                deviation = jnp.where(self.deviations[k] > 0, self.deviations[k], 1)
+                share = jnp.where(counts, 1 / self.designs[k], 0)
+                scaled, direction = jnp.where(counts, value, 0) / deviation, slope / deviation
+                weight = robust.weight(scaled**2)
+                information = share * alg.outer(direction)
+                force = -share * weight * scaled * direction
+                cost = share * robust.rho(scaled**2)
+                parts.append(Linearization(force, weight * information, cost, weight, residual, information))
+            return sum(parts[1:], start=parts[0])
 
-    def _linearize(
-        self,
-        source: Surface,
-        target: Surface,
-        moved: Float[Array, "3 n"],
-        rotation: Float[Array, "3 3"],
-        valid: Bool[Array, "n"],
-    ) -> Linearization:
-        residuals = self._residuals(source, target, moved, rotation, valid)
-        residual = target.points.T - moved
-        scale: Any = _KERNEL_SCALE
-        robust = Cauchy(scale) if self.robust is None else self.robust
-        parts = []
-        for k, (value, slope) in enumerate(zip(residuals.values, residuals.slopes, strict=True)):
-            counts = (self.deviations[k] > 0) & ~jnp.isnan(value)
-            deviation = jnp.where(self.deviations[k] > 0, self.deviations[k], 1)
-            share = jnp.where(counts, 1 / self.designs[k], 0)
-            scaled, direction = jnp.where(counts, value, 0) / deviation, slope / deviation
-            weight = robust.weight(scaled**2)
-            information = share * alg.outer(direction)
-            force = -share * weight * scaled * direction
-            cost = share * robust.rho(scaled**2)
-            parts.append(Linearization(force, weight * information, cost, weight, residual, information))
-        return sum(parts[1:], start=parts[0])
+        return jax.lax.cond(self.is_known, known, lambda: self.coarse.linearize(matches))
 
-    def _residuals(
-        self,
-        source: Surface,
-        target: Surface,
-        moved: Float[Array, "3 n"],
-        rotation: Float[Array, "3 3"],
-        valid: Bool[Array, "n"],
-    ) -> _Columns:
+    def _residuals(self, matches: PosedMatches) -> _Columns:
+        source, target, moved, rotation, valid = matches
         offset = jnp.where(valid, moved - target.points.T, 0)
         a, b = source.columns[self.name], target.columns[self.name]
         normal = _mean_direction(jnp.dot(rotation, a.normal.T, precision="highest"), b.normal.T)
@@ -269,9 +241,7 @@ class Photometric(AbstractTerm):
             products.append(jnp.where(known, alg.inner(turned, gradient), 0))
         return _Columns(values, slopes, own, products)
 
-    def observability(
-        self, mean: Float[Array, "6 n"], source: Surface, target: Surface, rotation: Float[Array, "3 3"]
-    ) -> Float[Array, "6 n"]:
+    def observability(self, mean: Float[Array, "6 n"], matches: PosedMatches) -> Float[Array, "6 n"]:
         """A / (1 + mean of both traces) with A = Σ α² (g_B g_Aᵀ + g_A g_Bᵀ)/2.
 
         The noise of the slopes is independent in the two clouds, so that it does not contribute on average.
@@ -282,29 +252,24 @@ class Photometric(AbstractTerm):
         length: Any = 0.0
         for channel in range(self.channel_weights.shape[0]):
             weight = self.channel_weights[channel]
-            slope = source.columns[self.name].gradient[:, channel].T
-            a = weight * jnp.dot(rotation, slope, precision="highest")
-            b = weight * target.columns[self.name].gradient[:, channel].T
+            slope = matches.source.columns[self.name].gradient[:, channel].T
+            a = weight * jnp.dot(matches.rotation, slope, precision="highest")
+            b = weight * matches.target.columns[self.name].gradient[:, channel].T
             total = total + 0.5 * (alg.outer(a + b) - alg.outer(a) - alg.outer(b))
             length = length + 0.5 * (alg.inner(a, a) + alg.inner(b, b))
         # Before the numbers are known the pose is inaccurate, so that slopes of matched points are unrelated.
         return jnp.where(self.is_known, total / (1 + length), mean)
 
-    def sample(
-        self,
-        source: Surface,
-        target: Surface,
-        moved: Float[Array, "3 n"],
-        rotation: Float[Array, "3 3"],
-        valid: Bool[Array, "n"],
-    ) -> Residuals:
-        found = self._residuals(source, target, moved, rotation, valid)
+    def sample(self, matches: PosedMatches) -> Residuals:
+        found = self._residuals(matches)
         own, products = (
-            jnp.stack(each, axis=1) if each else jnp.zeros((valid.size, 0), moved.dtype)
+            jnp.stack(each, axis=1) if each else jnp.zeros((matches.valid.size, 0), matches.moved.dtype)
             for each in (found.own, found.products)
         )
         slopes = jnp.stack(found.slopes).transpose(2, 0, 1)
-        return Residuals(jnp.stack(found.values, axis=1), slopes, own, products, jnp.where(valid, moved, 0).T)
+        return Residuals(
+            jnp.stack(found.values, axis=1), slopes, own, products, jnp.where(matches.valid, matches.moved, 0).T
+        )
 
     def adapt(self, sample: Residuals, fraction: Float[AnyScalar, ""]) -> Photometric:
         """The term with its numbers estimated from the residuals of an even sample of the correspondences.
