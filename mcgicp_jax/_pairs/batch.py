@@ -5,7 +5,7 @@ from __future__ import annotations
 import itertools
 from collections.abc import Generator, Iterable, Iterator
 from concurrent.futures import Executor
-from typing import Any, Literal
+from typing import Any, Literal, Unpack
 
 import jaxlie
 import numpy as np
@@ -16,7 +16,7 @@ from mcgicp_jax._math.poses import Pose, pose_matrix
 from mcgicp_jax._methods.base import AbstractMethod
 from mcgicp_jax._pairs.batch_executors import check_executor, run
 from mcgicp_jax._pairs.batch_jobs import BatchJob, Cloud, Pair
-from mcgicp_jax._registration.options import check_method, options_of
+from mcgicp_jax._registration.options import GivenOptions, check_method, options_of
 from mcgicp_jax._registration.result import RegistrationResult
 
 
@@ -29,7 +29,7 @@ def register_batch(
     voxel_size: float | None = None,
     num_neighbors: int = 20,
     executor: Executor | None = None,
-    **options: Any,
+    **options: Unpack[GivenOptions],
 ) -> list[RegistrationResult]:
     """Register many pairs of clouds of any sizes; return one `RegistrationResult` per pair, in the order of the pairs.
 
@@ -57,7 +57,7 @@ def register_as_completed(
     voxel_size: float | None = None,
     num_neighbors: int = 20,
     executor: Executor | None = None,
-    **options: Any,
+    **options: Unpack[GivenOptions],
 ) -> Generator[tuple[int, RegistrationResult], None, None]:
     """Register many pairs of clouds of any sizes and yield each result as soon as it is computed.
 

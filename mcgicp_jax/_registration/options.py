@@ -6,7 +6,7 @@ import difflib
 import inspect
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields
-from typing import Any, TypeAlias
+from typing import Any, TypeAlias, TypedDict
 
 import numpy as np
 from jax.typing import ArrayLike
@@ -66,7 +66,21 @@ class Options:
         return len(self.voxel_sizes) > 0 and name in method.needs_covariances
 
 
-def options_of(function: Callable[..., Any], given: dict[str, Any]) -> Options:
+class GivenOptions(TypedDict, total=False):
+    """`Options` as keyword arguments of batches, odometry and multiway registration, for editors and type checkers."""
+
+    max_distance: Distance | None
+    max_iterations: int
+    translation_tolerance: ArrayLike | None
+    rotation_tolerance: ArrayLike
+    robust: AbstractKernel | None
+    search: AbstractSearch | None
+    hold_unconstrained: bool
+    equalize_channels: bool
+    voxel_sizes: Sequence[float]
+
+
+def options_of(function: Callable[..., Any], given: Any) -> Options:
     """The options of `register` given to another function; raises `TypeError` for a name that neither function has."""
     parameters = inspect.signature(function).parameters.values()
     named = [each.name for each in parameters if each.kind is not inspect.Parameter.VAR_KEYWORD]

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Unpack
 
 import numpy as np
 from jaxtyping import Float
@@ -20,7 +20,7 @@ from mcgicp_jax._methods.base import AbstractMethod
 from mcgicp_jax._pairs.batch import register_batch
 from mcgicp_jax._pose_graph.graph import PoseGraph
 from mcgicp_jax._pose_graph.optimize import PoseGraphResult, optimize_poses
-from mcgicp_jax._registration.options import check_method, options_of
+from mcgicp_jax._registration.options import GivenOptions, check_method, options_of
 from mcgicp_jax._registration.result import RegistrationResult
 from mcgicp_jax._sequences.edges import LEAST_OVERLAP, edge_from
 from mcgicp_jax._sequences.odometry import odometry
@@ -70,7 +70,7 @@ def multiway(
     voxel_size: float | None = None,
     num_neighbors: int = 20,
     executor: Executor | None = None,
-    **options: Any,
+    **options: Unpack[GivenOptions],
 ) -> MultiwayResult:
     """Register many clouds of one scene with each other and find one pose for each.
 
@@ -132,7 +132,7 @@ def _start(
     clouds: list[PointCloud],
     method: AbstractMethod,
     init: Sequence[Pose] | Float[np.ndarray, "n 4 4"] | None,
-    options: dict[str, Any],
+    options: GivenOptions,
 ) -> tuple[Float[np.ndarray, "n 4 4"], dict[tuple[int, int], RegistrationResult]]:
     """Initial poses, and the registrations from which they were computed."""
     if init is None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any, Literal, Unpack
 
 import numpy as np
 from jaxtyping import Float
@@ -18,7 +18,7 @@ from mcgicp_jax._local_geometry.spacing_and_noise import point_spacing
 from mcgicp_jax._math.poses import Pose, nearest_rotation, pose_matrix
 from mcgicp_jax._methods.base import AbstractMethod
 from mcgicp_jax._pose_graph.graph import PoseGraph
-from mcgicp_jax._registration.options import Options, check_method, options_of
+from mcgicp_jax._registration.options import GivenOptions, Options, check_method, options_of
 from mcgicp_jax._registration.register_pair import register_pair
 from mcgicp_jax._registration.result import RegistrationResult, computed, is_usable
 from mcgicp_jax._sequences.loop_closure import Trajectory
@@ -56,7 +56,7 @@ def odometry(
     map_radius: float | None = None,
     recover: bool = False,
     loops: bool = False,
-    **options: Any,
+    **options: Unpack[GivenOptions],
 ) -> Iterator[OdometryStep]:
     """Register each frame to the previous one, or to a map, starting from the previous motion (constant velocity).
 
