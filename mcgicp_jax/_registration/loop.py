@@ -140,8 +140,12 @@ class AbstractExecutor(abc.ABC):
     def each(self, function: Callable[[Any], Result], items: Any) -> Result:
         """The results of a function for each item along the first axis, stacked."""
 
-    def adapt(self, state: State, matches: Any, terms: tuple[AbstractTerm, ...]) -> tuple[AbstractTerm, ...]:
-        """The terms with their numbers estimated at the pose of a state, from a sample of the matches."""
+    def adapt(self, state: State, matches: Any, before: tuple[AbstractTerm, ...]) -> tuple[AbstractTerm, ...]:
+        """The terms with their numbers estimated at the pose of a state, from a sample of the matches.
+
+        They are estimated anew, not from those `before`, which an executor keeps outside the fine phase.
+        """
+        terms = self.problem.terms
         if not is_adaptive(terms):
             return terms
         motion, valid = self.motion(state.pose), searched(self.source_of(matches)).valid

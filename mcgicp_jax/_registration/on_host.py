@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import cache, partial
+from functools import cache, cached_property, partial
 from typing import Any, NamedTuple
 
 import jax
@@ -26,6 +26,26 @@ from mcgicp_jax._search.base import AbstractIndex, SearchPoints, by_position
 from mcgicp_jax._terms.base import AbstractTerm
 
 
+class _Packed(NamedTuple):
+    """A surface whose rows lie side by side in one array, so that they are gathered at once, see `packing`."""
+
+    surface: Surface
+    table: Float[np.ndarray, "N L"]
+    layout: Layout
+
+    @staticmethod
+    def of(surface: Surface) -> _Packed:
+        columns = surface._replace(noise=None, search=None)
+        return _Packed(surface, packed(columns), layout_of(columns))
+
+    def every(self, stride: int) -> _Packed:
+        """Every `stride`-th row."""
+        if stride == 1:
+            return self
+        some = jax.tree.map(lambda array: np.ascontiguousarray(array[::stride]), self.surface)
+        return _Packed(some, np.ascontiguousarray(self.table[::stride]), self.layout)
+
+
 @dataclass(frozen=True)
 class _Matches:
     """Target rows `indices` (m, N) of the m candidates of each source row, −1 where there is none.
@@ -33,19 +53,41 @@ class _Matches:
     `found` says which of them are matches of points that are no padding; `max_distance` is applied when they are used.
     """
 
-    source: Surface
-    target: Surface
+    source: _Packed
+    target: _Packed
     indices: Int[np.ndarray, "m N"]
     found: Bool[np.ndarray, "m N"]
     max_distance: Any
 
     @property
+    def layouts(self) -> tuple[Layout, Layout]:
+        return self.source.layout, self.target.layout
+
+    @cached_property
     def rows(self) -> Int[np.ndarray, "m N"]:
         return np.maximum(self.indices, 0)
 
+    def gathered(self, index: Any, with_noise: bool) -> _Gathered:
+        """The matched rows of some source rows."""
+        chosen = self.rows[:, index]
+        tables = self.source.table[index], self.target.table[chosen]
+        gathered = _Gathered(*tables, self.found[:, index], self.max_distance)
+        if not with_noise:
+            return gathered
+        source, target = self.source.surface, self.target.surface
+        source_noise, source_search = jax.tree.map(lambda array: array[index], (source.noise, source.search))
+        target_noise, target_search = jax.tree.map(lambda array: array[chosen], (target.noise, target.search))
+        return gathered._replace(
+            source_noise=source_noise,
+            source_search=source_search,
+            target_noise=target_noise,
+            target_search=target_search,
+        )
+
     @staticmethod
-    def of(source: Surface, target: Surface, indices: Int[np.ndarray, "m N"], max_distance: Any) -> _Matches:
-        found = (indices >= 0) & searched(source).valid & searched(target).valid[np.maximum(indices, 0)]
+    def of(source: _Packed, target: _Packed, indices: Int[np.ndarray, "m N"], max_distance: Any) -> _Matches:
+        valid, among = searched(source.surface).valid, searched(target.surface).valid
+        found = (indices >= 0) & valid & among[np.maximum(indices, 0)]
         return _Matches(source, target, indices, found, max_distance)
 
 
@@ -56,10 +98,10 @@ class _Gathered(NamedTuple):
     target: Float[Any, "m n L"]
     found: Bool[Any, "m n"]
     max_distance: Any
-    source_noise: SurfaceNoise | None
-    target_noise: SurfaceNoise | None
-    source_search: SearchPoints | None
-    target_search: SearchPoints | None
+    source_noise: SurfaceNoise | None = None
+    target_noise: SurfaceNoise | None = None
+    source_search: SearchPoints | None = None
+    target_search: SearchPoints | None = None
 
 
 class HostExecutor(AbstractExecutor):
@@ -75,7 +117,8 @@ class HostExecutor(AbstractExecutor):
         self._index_of, self._num_threads = index_of, num_threads
         # Which source rows are followed from pose to pose, and the function that finds their matches.
         self._followed: tuple[int, bool] | None = None
-        self._source = problem.source
+        self._whole, self._target = _Packed.of(problem.source), _Packed.of(problem.target)
+        self._source = self._whole
         self._nearest: Callable[[Any], Int[np.ndarray, "m N"]]
 
     def begin(self) -> LoopResult:
@@ -107,18 +150,18 @@ class HostExecutor(AbstractExecutor):
         stride = int(settings.stride(status, state.num_iterations))
         alone = bool(status != COARSE and any(term.by_position for term in problem.terms))
         if (stride, alone) != self._followed:
-            self._followed, self._source = (stride, alone), _every(stride, problem.source)
-            rows, limit = searched(self._source), float(settings.max_distance)
+            self._followed, self._source = (stride, alone), self._whole.every(stride)
+            rows, limit = searched(self._source.surface), float(settings.max_distance)
             rows = by_position(rows) if alone else rows
             self._nearest = self._index_of(alone).follow(rows, limit, problem.num_candidates)
         indices = self._nearest(state.pose.wxyz_xyz)
-        return _Matches.of(self._source, problem.target, indices, settings.distance(status))
+        return _Matches.of(self._source, self._target, indices, settings.distance(status))
 
-    def adapt(self, state: State, matches: Any, terms: tuple[AbstractTerm, ...]) -> tuple[AbstractTerm, ...]:
-        return terms if state.status in (COARSE, SETTLED) else super().adapt(state, matches, terms)
+    def adapt(self, state: State, matches: Any, before: tuple[AbstractTerm, ...]) -> tuple[AbstractTerm, ...]:
+        return before if state.status in (COARSE, SETTLED) else super().adapt(state, matches, before)
 
     def source_of(self, matches: _Matches) -> Surface:
-        return matches.source
+        return matches.source.surface
 
     def over_rematched(
         self,
@@ -133,14 +176,14 @@ class HostExecutor(AbstractExecutor):
         limit = self.problem.settings.fine_distance
         parameters = np.concatenate([np.asarray(pose.wxyz_xyz)[:4], motion.translation])
         indices = self._index_of(True).nearest(parameters, by_position(searched(source)), float(limit))
-        matches = _Matches.of(source, self.problem.target, indices, limit)
+        matches = _Matches.of(_Packed.of(source), self._target, indices, limit)
         matches = replace(matches, found=matches.found & counts)
         return self.over_rows(function, motion, matches, np.arange(rows.size), *arguments)
 
     def nearest(self, motion: Motion, matches: _Matches) -> _Matches:
         """Followed candidates are in any order, so the nearest one is searched."""
-        moved = matches.source.points @ motion.rotation.T + motion.translation
-        apart = matches.target.points[matches.rows] - moved
+        moved = matches.source.surface.points @ motion.rotation.T + motion.translation
+        apart = matches.target.surface.points[matches.rows] - moved
         order = np.argmin(np.where(matches.found, np.einsum("mni,mni->mn", apart, apart), np.inf), axis=0)
         indices = np.take_along_axis(matches.indices, order[None], axis=0)
         return _Matches.of(matches.source, matches.target, indices, matches.max_distance)
@@ -154,20 +197,15 @@ class HostExecutor(AbstractExecutor):
         *arguments: Any,
         with_noise: bool = False,
     ) -> Any:
-        gather, layouts = _gatherer(matches, with_noise)
-
         def block(index: Any) -> Any:
-            return _apply(function, layouts, motion, gather(rows[index]), *arguments)
+            return _apply(function, matches.layouts, motion, matches.gathered(rows[index], with_noise), *arguments)
 
         return map_rows(block, rows.size, self._num_threads if with_noise else 1)
 
     def sums(self, motion: Motion, matches: _Matches, terms: tuple[AbstractTerm, ...]) -> Sums:
-        dtype = matches.source.points.dtype
-        parts = self._over_blocks(_packed_sums, motion, matches, terms)
-        stacked = np.stack(parts).astype(np.float64)
-        layout = _layout_of_sums(
-            matches.source.observability is not None, matches.source.channel_observability is not None
-        )
+        source, parts = matches.source.surface, self._over_blocks(_packed_sums, motion, matches, terms)
+        stacked, dtype = np.stack(parts).astype(np.float64), source.points.dtype
+        layout = _layout_of_sums(source.observability is not None, source.channel_observability is not None)
         with np.errstate(over="ignore"):
             return jax.tree.map(lambda array: array.astype(dtype), combine(unpacked(stacked, layout)))
 
@@ -196,50 +234,14 @@ class HostExecutor(AbstractExecutor):
     ) -> list[Any]:
         """Apply a function to blocks of correspondences; those repeated to fill the last block count as unmatched."""
         size = matches.indices.shape[1]
-        gather, layouts = _gatherer(matches, with_noise)
 
         def block(index: Any) -> Any:
-            chosen = gather(index)
+            chosen = matches.gathered(index, with_noise)
             if not isinstance(index, slice):
                 chosen.found[:, size - index[0] :] = False
-            return _apply(function, layouts, motion, chosen, *arguments)
+            return _apply(function, matches.layouts, motion, chosen, *arguments)
 
         return [part for _, part in map_blocks(block, size, self._num_threads if with_noise else 1)]
-
-
-def _every(stride: int, source: Surface) -> Surface:
-    """Every `stride`-th row of a surface."""
-    if stride == 1:
-        return source
-    some = jax.tree.map(lambda array: np.ascontiguousarray(array[::stride]), source)
-    columns = some._replace(noise=None, search=None)
-    return unpacked(packed(columns), layout_of(columns))._replace(noise=some.noise, search=some.search)
-
-
-def _gatherer(matches: _Matches, with_noise: bool) -> tuple[Callable[[Any], _Gathered], tuple[Layout, Layout]]:
-    """A function that gathers the matched rows of some source rows, and how they are packed."""
-    source, target = (surface._replace(noise=None, search=None) for surface in (matches.source, matches.target))
-    layouts, tables = (layout_of(source), layout_of(target)), (packed(source), packed(target))
-    rows = matches.rows
-
-    def gather(index: Any) -> _Gathered:
-        chosen = rows[:, index]
-        gathered = _Gathered(
-            tables[0][index], tables[1][chosen], matches.found[:, index], matches.max_distance, None, None, None, None
-        )
-        if not with_noise:
-            return gathered
-        both = (matches.source.noise, matches.source.search), (matches.target.noise, matches.target.search)
-        source_noise, source_search = jax.tree.map(lambda array: array[index], both[0])
-        target_noise, target_search = jax.tree.map(lambda array: array[chosen], both[1])
-        return gathered._replace(
-            source_noise=source_noise,
-            source_search=source_search,
-            target_noise=target_noise,
-            target_search=target_search,
-        )
-
-    return gather, layouts
 
 
 @partial(jax.jit, static_argnums=(0, 1))

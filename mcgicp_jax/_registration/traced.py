@@ -108,11 +108,10 @@ class TracedExecutor(AbstractExecutor):
         valid = (indices >= 0) & searched(source).valid & jnp.asarray(searched(target).valid)[rows] & near
         return Correspondences(indices, distances, valid)
 
-    def adapt(self, state: State, matches: Any, terms: tuple[AbstractTerm, ...]) -> tuple[AbstractTerm, ...]:
-        if not is_adaptive(terms):
-            return terms
-        fine = state.status == RUNNING
-        return jax.tree.map(partial(jnp.where, fine), super().adapt(state, matches, terms), terms)
+    def adapt(self, state: State, matches: Any, before: tuple[AbstractTerm, ...]) -> tuple[AbstractTerm, ...]:
+        if not is_adaptive(before):
+            return before
+        return jax.tree.map(partial(jnp.where, state.status == RUNNING), super().adapt(state, matches, before), before)
 
     def over_rematched(
         self,
