@@ -44,7 +44,7 @@ def unpacked(array: Any, layout: Layout) -> Any:
     leaves, start = [], 0
     for shape in layout.shapes:
         stop = start + int(np.prod(shape))
-        leaves.append(array[..., start:stop].reshape(*array.shape[:-1], *shape))
+        leaves.append(array[..., start:stop].reshape((*array.shape[:-1], *shape)))
         start = stop
     return jax.tree.unflatten(layout.structure, leaves)
 

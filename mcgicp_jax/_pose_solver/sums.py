@@ -20,6 +20,8 @@ from mcgicp_jax._pose_solver.matched import Matched, Motion, linearize_at
 from mcgicp_jax._terms.base import AbstractTerm, PosedMatches, channel_observability
 
 _UPPER = np.triu_indices(4)
+# Fields of `Sums` that are sums over h hᵀ.
+_SECOND_MOMENTS = ("stiffness", "mass", "observability", "channel_observability")
 
 
 class Sums(NamedTuple):
@@ -140,8 +142,7 @@ def combine(parts: Sums) -> Sums:
     # Non-finite values propagate into the status NON_FINITE; NumPy need not warn of them.
     with np.errstate(invalid="ignore", over="ignore"):
         center = parts.count @ parts.center / max(parts.count.sum(), 1)
-        if len(parts.count) > 1:
-            parts = _about(center, parts)
+        parts = _about(center, parts)
         added = {name: None if each is None else each.sum(axis=0) for name, each in parts._asdict().items()}
         return Sums(**added | {"center": center})
 
@@ -152,19 +153,17 @@ def _about(center: Float[np.ndarray, "3"], parts: Sums) -> Sums:
     shift = np.tile(np.eye(4), (len(offset), 1, 1))
     shift[:, :3, 3] = offset
 
-    def moved(sums: Float[np.ndarray, "b *rows 10"] | None) -> Float[np.ndarray, "b *rows 10"] | None:
-        if sums is None:
-            return None
-        full = np.empty((*sums.shape[:-1], 4, 4))
-        full[..., _UPPER[0], _UPPER[1]] = full[..., _UPPER[1], _UPPER[0]] = sums
-        turn = shift.reshape(len(shift), *[1] * (sums.ndim - 2), 4, 4)
-        return (turn @ full @ turn.swapaxes(-1, -2))[..., _UPPER[0], _UPPER[1]]
-
+    # All sums over h hᵀ at once.
+    names = [name for name in _SECOND_MOMENTS if getattr(parts, name) is not None]
+    rows = [getattr(parts, name).reshape(len(offset), -1, 10) for name in names]
+    sums = np.concatenate(rows, axis=1)
+    full = np.empty((*sums.shape[:2], 4, 4))
+    full[..., _UPPER[0], _UPPER[1]] = full[..., _UPPER[1], _UPPER[0]] = sums
+    full = shift[:, None] @ full @ shift[:, None].swapaxes(-1, -2)
+    moved = np.split(full[..., _UPPER[0], _UPPER[1]], np.cumsum([each.shape[1] for each in rows])[:-1], axis=1)
+    shaped = {name: each.reshape(getattr(parts, name).shape) for name, each in zip(names, moved, strict=True)}
     return parts._replace(
         square_extent=parts.square_extent + parts.count * np.einsum("bi,bi->b", offset, offset),
         force=np.einsum("bij,bkj->bik", parts.force, shift),
-        stiffness=moved(parts.stiffness),
-        mass=moved(parts.mass),
-        observability=moved(parts.observability),
-        channel_observability=moved(parts.channel_observability),
+        **shaped,
     )

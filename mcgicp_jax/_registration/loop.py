@@ -132,6 +132,11 @@ class AbstractExecutor(abc.ABC):
     def sums(self, motion: Motion, matches: Any, terms: tuple[AbstractTerm, ...]) -> Sums:
         """`sums_of` all correspondences."""
 
+    def update(self, state: State, sums: Sums) -> State:
+        """The state after an update of the pose, without the sums."""
+        problem = self.problem
+        return update(state.pose, state.status, state.num_iterations, sums, problem.settings, problem.fusion)
+
     @abc.abstractmethod
     def scores(self, motion: Motion, matches: Any, *arguments: Any) -> Scores:
         """`scores_of` all correspondences; further arguments are those of that function."""
@@ -159,9 +164,11 @@ def iterate(executor: AbstractExecutor) -> LoopResult:
 
 def step(executor: AbstractExecutor, loop: LoopResult) -> LoopResult:
     """One step of the loop."""
-    state, problem = loop.state, executor.problem
+    state = loop.state
     matches = executor.match(state, loop.matches)
     terms = executor.adapt(state, matches, loop.terms)
     sums = executor.sums(executor.motion(state.pose), matches, terms)
-    state = update(state.pose, state.status, state.num_iterations, sums, problem.settings, problem.fusion)
+    state = executor.update(state, sums)
+    # Not an output of the compiled update, which would copy the sums.
+    state = state._replace(sums=sums)
     return LoopResult(state, matches, terms, executor.record(loop.history, state))

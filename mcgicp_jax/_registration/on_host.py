@@ -21,7 +21,7 @@ from mcgicp_jax._pose_solver.covariance import Scores, scores_of
 from mcgicp_jax._pose_solver.matched import Matched, Motion
 from mcgicp_jax._pose_solver.sums import Sums, combine, sums_of
 from mcgicp_jax._registration.loop import AbstractExecutor, LoopResult
-from mcgicp_jax._registration.step import COARSE, SETTLED, Problem, Record, State
+from mcgicp_jax._registration.step import COARSE, SETTLED, Problem, Record, State, update
 from mcgicp_jax._search.base import AbstractIndex, SearchPoints, by_position
 from mcgicp_jax._terms.base import AbstractTerm
 
@@ -120,6 +120,8 @@ class HostExecutor(AbstractExecutor):
         self._whole, self._target = _Packed.of(problem.source), _Packed.of(problem.target)
         self._source = self._whole
         self._nearest: Callable[[Any], Int[np.ndarray, "m N"]]
+        # The last sums, packed.
+        self._sums: tuple[Layout, Float[np.ndarray, "L"]]
 
     def begin(self) -> LoopResult:
         state = State(self.problem.start, np.asarray(self.first_status), np.int32(0))
@@ -197,17 +199,30 @@ class HostExecutor(AbstractExecutor):
         *arguments: Any,
         with_noise: bool = False,
     ) -> Any:
+        program = _program(function, matches.layouts)
+
         def block(index: Any) -> Any:
-            return _apply(function, matches.layouts, motion, matches.gathered(rows[index], with_noise), *arguments)
+            return program(motion, matches.gathered(rows[index], with_noise), *arguments)
 
         return map_rows(block, rows.size, self._num_threads if with_noise else 1)
 
     def sums(self, motion: Motion, matches: _Matches, terms: tuple[AbstractTerm, ...]) -> Sums:
         source, parts = matches.source.surface, self._over_blocks(_packed_sums, motion, matches, terms)
-        stacked, dtype = np.stack(parts).astype(np.float64), source.points.dtype
         layout = _layout_of_sums(source.observability is not None, source.channel_observability is not None)
+        (total,) = parts if len(parts) == 1 else (self._combined(np.stack(parts), layout),)
+        self._sums = layout, total
+        return unpacked(total, layout)
+
+    def _combined(self, parts: Float[np.ndarray, "b L"], layout: Layout) -> Float[np.ndarray, "L"]:
         with np.errstate(over="ignore"):
-            return jax.tree.map(lambda array: array.astype(dtype), combine(unpacked(stacked, layout)))
+            sums = combine(unpacked(parts.astype(np.float64), layout))
+            return np.concatenate([each.ravel() for each in jax.tree.leaves(sums)]).astype(parts.dtype)
+
+    def update(self, state: State, sums: Sums) -> State:
+        # In one array: to pass a dozen to a program takes longer than to use them.
+        layout, total = self._sums
+        problem = self.problem
+        return _update(layout, state.pose, state.status, state.num_iterations, total, problem.settings, problem.fusion)
 
     def scores(self, motion: Motion, matches: _Matches, *arguments: Any) -> Scores:
         parts: list[Scores] = self._over_blocks(scores_of, motion, matches, *arguments, with_noise=True)
@@ -233,29 +248,33 @@ class HostExecutor(AbstractExecutor):
         with_noise: bool = False,
     ) -> list[Any]:
         """Apply a function to blocks of correspondences; those repeated to fill the last block count as unmatched."""
-        size = matches.indices.shape[1]
+        size, program = matches.indices.shape[1], _program(function, matches.layouts)
 
         def block(index: Any) -> Any:
             chosen = matches.gathered(index, with_noise)
             if not isinstance(index, slice):
                 chosen.found[:, size - index[0] :] = False
-            return _apply(function, matches.layouts, motion, chosen, *arguments)
+            return program(motion, chosen, *arguments)
 
         return [part for _, part in map_blocks(block, size, self._num_threads if with_noise else 1)]
 
 
-@partial(jax.jit, static_argnums=(0, 1))
-def _apply(
-    function: Callable[..., Any],
-    layouts: tuple[Layout, Layout],
-    motion: Motion,
-    gathered: _Gathered,
-    *arguments: Any,
-) -> Any:
-    """A function of correspondences, for a block of rows."""
+@cache
+def _program(function: Callable[..., Any], layouts: tuple[Layout, Layout]) -> Callable[..., Any]:
+    """A function of correspondences as a compiled program for gathered rows."""
+
+    @jax.jit
+    def program(motion: Motion, gathered: _Gathered, *arguments: Any) -> Any:
+        matched = _matched(gathered, layouts)
+        return function(motion, matched.within(motion.move(matched.source.points), gathered.max_distance), *arguments)
+
+    return program
+
+
+def _matched(gathered: _Gathered, layouts: tuple[Layout, Layout]) -> Matched:
+    """One row per correspondence, m N; the first candidates of all source rows come first."""
     count = len(gathered.found)
 
-    # One row per correspondence, m N; the first candidates of all source rows come first.
     def tiled(tree: Any) -> Any:
         return jax.tree.map(lambda rows: jnp.tile(rows, (count, *[1] * (rows.ndim - 1))), tree)
 
@@ -266,12 +285,17 @@ def _apply(
     target = unpacked(flat(gathered.target), layouts[1])
     source = source._replace(noise=tiled(gathered.source_noise), search=tiled(gathered.source_search))
     target = target._replace(noise=flat(gathered.target_noise), search=flat(gathered.target_search))
-    matched = Matched(source, target, gathered.found.reshape(-1), num_candidates=count)
-    return function(motion, matched.within(motion.move(source.points), gathered.max_distance), *arguments)
+    return Matched(source, target, gathered.found.reshape(-1), num_candidates=count)
 
 
 def _packed_sums(motion: Motion, matched: Matched, terms: tuple[AbstractTerm, ...]) -> Array:
     return packed_numbers(sums_of(motion, matched, terms))
+
+
+@partial(jax.jit, static_argnums=0)
+def _update(layout: Layout, pose: jaxlie.SE3, status: Any, num_iterations: Any, sums: Array, *others: Any) -> State:
+    """`update` with packed sums."""
+    return update(pose, status, num_iterations, unpacked(sums, layout), *others)
 
 
 @cache

@@ -58,17 +58,24 @@ class Settings(eqx.Module):
 
     def distance(self, status: Int[AnyScalar, ""]) -> Float[AnyScalar, ""]:
         """Maximum correspondence distance at this status, metres."""
-        return numpy_for(self, status).where(status == COARSE, self.max_distance, self.fine_distance)
+        return _either(status == COARSE, self.max_distance, self.fine_distance)
 
     def stride(self, status: Int[AnyScalar, ""], num_iterations: Int[AnyScalar, ""]) -> Int[AnyScalar, ""]:
         """Stride of the source points at this status. Once `max_iterations` are done, all points are measured."""
         coarse = (status == COARSE) & (num_iterations < self.max_iterations)
-        return numpy_for(self, status, num_iterations).where(coarse, self.coarse_stride, 1)
+        return _either(coarse, self.coarse_stride, np.int32(1))
 
     def first_status(self) -> Int[AnyScalar, ""]:
         """`COARSE` where the coarse phase differs from the fine one."""
         coarse = (self.fine_distance < self.max_distance) | (self.coarse_stride > 1)
         return numpy_for(self).where(coarse, np.int32(COARSE), np.int32(RUNNING))
+
+
+def _either(condition: Bool[AnyScalar, ""], one: AnyScalar, other: AnyScalar) -> AnyScalar:
+    """One number or the other; on the host without a call of NumPy, which would take longer than the rest."""
+    if isinstance(condition, np.bool_):
+        return one if condition else other
+    return jnp.where(condition, one, other)
 
 
 class Problem(eqx.Module):
@@ -180,7 +187,6 @@ def update(
         pose=jaxlie.SE3(jnp.where(status < 0, moved.wxyz_xyz, pose.wxyz_xyz)),
         status=status,
         num_iterations=num_iterations + (status < 0),
-        sums=sums,
         information=change.information,
         directions=directions,
         record=Record(*(number.astype(sums.center.dtype) for number in record)),

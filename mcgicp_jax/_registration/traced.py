@@ -27,7 +27,7 @@ from mcgicp_jax._pose_solver.sums import Sums, sums_of
 from mcgicp_jax._registration.assessment import Assessment, assessment_of, moments_of
 from mcgicp_jax._registration.loop import AbstractExecutor, LoopResult, iterate
 from mcgicp_jax._registration.result import Status
-from mcgicp_jax._registration.step import COARSE, RUNNING, SETTLED, Problem, State, update
+from mcgicp_jax._registration.step import COARSE, RUNNING, SETTLED, Problem, State
 from mcgicp_jax._search.base import AbstractSearch, Correspondences, SearchPoints, by_position
 from mcgicp_jax._terms.base import AbstractTerm, is_adaptive
 
@@ -68,8 +68,7 @@ class TracedExecutor(AbstractExecutor):
         state = loop.state
         matches = self.match(state, loop.matches)
         sums = self.sums(self.motion(state.pose), matches, loop.terms)
-        settings, fusion = self.problem.settings, self.problem.fusion
-        return update(state.pose, state.status, state.num_iterations, sums, settings, fusion)
+        return self.update(state, sums)._replace(sums=sums)
 
     def repeat(self, step: Callable[[LoopResult], LoopResult], loop: LoopResult) -> LoopResult:
         loop = jax.lax.while_loop(lambda loop: loop.state.status < 0, step, loop)
