@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any, NamedTuple
 
 import jax
@@ -31,7 +32,7 @@ def packed(tree: Any) -> np.ndarray:
     """(N, L): the arrays of a tree, each with N rows, side by side; not copied if they are views of such an array."""
     leaves = jax.tree.leaves(tree)
     base = leaves[0].base
-    widths = [int(np.prod(leaf.shape[1:])) for leaf in leaves]
+    widths = [math.prod(leaf.shape[1:]) for leaf in leaves]
     if base is not None and base.shape == (len(leaves[0]), sum(widths)) and base.flags.c_contiguous:
         starts = np.cumsum([0, *widths[:-1]]) * base.itemsize + base.ctypes.data
         if all(leaf.base is base and leaf.ctypes.data == start for leaf, start in zip(leaves, starts, strict=True)):
@@ -43,7 +44,7 @@ def unpacked(array: Any, layout: Layout) -> Any:
     """The tree with this layout from (..., L); views of a NumPy array where its last axis is split only."""
     leaves, start = [], 0
     for shape in layout.shapes:
-        stop = start + int(np.prod(shape))
+        stop = start + math.prod(shape)
         leaves.append(array[..., start:stop].reshape((*array.shape[:-1], *shape)))
         start = stop
     return jax.tree.unflatten(layout.structure, leaves)
