@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from types import MappingProxyType
-from typing import Any, NamedTuple
+from dataclasses import dataclass, field
+from typing import Any
 
 from mcgicp_jax._methods.base import AbstractMethod
 from mcgicp_jax._methods.gicp import GICP
@@ -13,11 +13,12 @@ from mcgicp_jax._methods.multichannel_gicp import MultiChannelGICP
 from mcgicp_jax._methods.ndt import D2DNDT, NDT, ColorNDT
 
 
-class RegisteredMethod(NamedTuple):
+@dataclass(frozen=True)
+class RegisteredMethod:
     """A class of methods, and the arguments of its constructor that select the method of this name."""
 
     kind: type[AbstractMethod]
-    arguments: Mapping[str, Any] = MappingProxyType({})
+    arguments: Mapping[str, Any] = field(default_factory=dict)
 
     def __call__(self, **parameters: Any) -> AbstractMethod:
         return self.kind(**self.arguments, **parameters)

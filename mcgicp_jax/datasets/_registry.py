@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from dataclasses import dataclass
+from typing import Any
 
 from mcgicp_jax.datasets._box_room import box_room
 from mcgicp_jax.datasets._corridor import corridor
@@ -16,7 +17,8 @@ from mcgicp_jax.datasets._street import street
 from mcgicp_jax.datasets._tum_rgbd import tum_rgbd
 
 
-class Dataset(NamedTuple):
+@dataclass(frozen=True)
+class Dataset:
     """A data set, or a simulated scene, with options of `odometry` that suit its sensor and its motion.
 
     Attributes:

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import BinaryIO, NamedTuple
+from typing import BinaryIO
 
 import numpy as np
 
@@ -19,7 +20,8 @@ from mcgicp_jax.io.ply import read_ply, write_ply
 from mcgicp_jax.io.text import read_text, write_text
 
 
-class Format(NamedTuple):
+@dataclass(frozen=True)
+class Format:
     """Functions of a file format.
 
     Attributes:
