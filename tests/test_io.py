@@ -1,5 +1,6 @@
 """Files: what is written comes back, what others write is understood, and what is broken says so in one ValueError."""
 
+import dataclasses
 import io as stdio
 import pathlib
 import pickle
@@ -745,7 +746,7 @@ def test_what_a_library_raises(tmp_path, monkeypatch):
         def fail(file, size, error=error):
             raise error
 
-        monkeypatch.setitem(io.FORMATS, ".laz", io.FORMATS[".laz"]._replace(read=fail))
+        monkeypatch.setitem(io.FORMATS, ".laz", dataclasses.replace(io.FORMATS[".laz"], read=fail))
         with pytest.raises(expected):
             io.read(tmp_path / "c.laz")
 
@@ -774,7 +775,7 @@ def test_a_failed_write_leaves_the_old_file(tmp_path, suffix, monkeypatch):
         file.write(b"half")
         raise OSError("disk full")
 
-    monkeypatch.setitem(io.FORMATS, suffix, io.FORMATS[suffix]._replace(write=fail))
+    monkeypatch.setitem(io.FORMATS, suffix, dataclasses.replace(io.FORMATS[suffix], write=fail))
     with pytest.raises(OSError, match="disk full"):
         io.write(path, make())
     assert path.read_bytes() == b"old" and list(tmp_path.iterdir()) == [path]
