@@ -14,9 +14,10 @@ from mcgicp_jax._clouds.point_cloud import PointCloud
 from mcgicp_jax._compute.blocks import map_rows
 from mcgicp_jax._compute.cache import cached_with
 from mcgicp_jax._compute.concrete import is_concrete
+from mcgicp_jax._compute.packing import Packed
 from mcgicp_jax._compute.threads import side_by_side
 from mcgicp_jax._local_geometry.local_geometry import LocalGeometry, describe
-from mcgicp_jax._local_geometry.neighborhoods import gatherer
+from mcgicp_jax._local_geometry.neighborhoods import Neighborhoods, gatherer
 
 Tree = TypeVar("Tree")
 
@@ -54,12 +55,15 @@ def local_geometry_on_host(cloud: PointCloud, with_channels: bool, num_threads: 
 
     def make() -> LocalGeometry:
         gather = gatherer(cloud, with_channels, np)
-        return map_rows(lambda rows: _describe(gather(rows)), cloud.points.shape[0], num_threads)
+        return map_rows(lambda rows: _describe(gather(rows)), cloud.points.shape[0], num_threads).tree
 
     return cached_with(cloud, "local geometry", with_channels, make)
 
 
-_describe = jax.jit(describe)
+@jax.jit
+def _describe(around: Neighborhoods) -> Packed[LocalGeometry]:
+    """`describe` as one array: to return many takes longer than to use them."""
+    return Packed.of(describe(around))
 
 
 def _traced(cloud: PointCloud, with_channels: bool) -> LocalGeometry:

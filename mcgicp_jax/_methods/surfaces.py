@@ -15,7 +15,7 @@ from mcgicp_jax._clouds.point_cloud import PointCloud
 from mcgicp_jax._compute.blocks import map_rows
 from mcgicp_jax._compute.cache import cached_with
 from mcgicp_jax._compute.concrete import is_concrete, numpy_for
-from mcgicp_jax._compute.packing import layout_of, packed, unpacked
+from mcgicp_jax._compute.packing import Packed
 from mcgicp_jax._compute.threads import side_by_side
 from mcgicp_jax._local_geometry.cells import geometry_of_cells
 from mcgicp_jax._local_geometry.local_geometry import LocalGeometry
@@ -126,16 +126,16 @@ def surface_on_host(
 
     def make() -> Surface:
         gather = _gatherer(method, cloud, local is not None, np)
+        statistics = None if local is None else Packed.of(local)
 
-        def block(rows: Any) -> Surface:
-            here = None if local is None else jax.tree.map(lambda array: array[rows], local)
+        def block(rows: Any) -> tuple[Packed[Surface], Packed[SurfaceNoise] | None]:
+            here = None if statistics is None else statistics.rows(rows)
             return _surface_of_block(method, kinds, gather(rows), here, observed)
 
-        surface = map_rows(block, cloud.points.shape[0], num_threads)
-        # Side by side in one array, from which the executor on the host gathers rows.
-        columns = surface._replace(noise=None)
-        columns = unpacked(packed(columns), layout_of(columns))
-        return columns._replace(noise=surface.noise, search=searchable(method, cloud))
+        columns, noise = map_rows(block, cloud.points.shape[0], num_threads)
+        # Views of one array, from which the executor on the host gathers rows.
+        surface = columns.tree
+        return surface._replace(noise=None if noise is None else noise.tree, search=searchable(method, cloud))
 
     leaves, structure = jax.tree.flatten(method)
     key = (structure, *(np.asarray(leaf).tobytes() for leaf in leaves), kinds, observed)
@@ -216,4 +216,10 @@ def surface_of(
     return surface._replace(observability=by_shape, channel_observability=by_channels, noise=details)
 
 
-_surface_of_block = partial(jax.jit, static_argnums=(1, 4))(surface_of)
+@partial(jax.jit, static_argnums=(1, 4))
+def _surface_of_block(
+    method: AbstractMethod, kinds: Kinds, around: Neighborhoods, local: Packed[LocalGeometry] | None, observed: bool
+) -> tuple[Packed[Surface], Packed[SurfaceNoise] | None]:
+    """`surface_of` as two arrays: the columns that a step of the loop uses, and the noise."""
+    surface = surface_of(method, kinds, around, None if local is None else local.tree, observed)
+    return Packed.of(surface._replace(noise=None)), None if surface.noise is None else Packed.of(surface.noise)

@@ -4,46 +4,42 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import cache, cached_property, partial
+from functools import cache, cached_property
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import jaxlie
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Bool, Int
 
 from mcgicp_jax._compute.blocks import map_blocks, map_rows
-from mcgicp_jax._compute.packing import Layout, layout_of, packed, packed_numbers, unpacked
+from mcgicp_jax._compute.packing import Packed
 from mcgicp_jax._local_geometry.surface import Surface, SurfaceNoise, searched
 from mcgicp_jax._math.poses import rotation_from_quaternion
 from mcgicp_jax._pose_solver.covariance import Scores, scores_of
 from mcgicp_jax._pose_solver.matched import Matched, Motion
+from mcgicp_jax._pose_solver.pose_measurements import Fusion
 from mcgicp_jax._pose_solver.sums import Sums, combine, sums_of
 from mcgicp_jax._registration.loop import AbstractExecutor, LoopResult
-from mcgicp_jax._registration.step import COARSE, SETTLED, Problem, Record, State, update
+from mcgicp_jax._registration.step import COARSE, SETTLED, Problem, Record, Settings, State, update
 from mcgicp_jax._search.base import AbstractIndex, SearchPoints, by_position
 from mcgicp_jax._terms.base import AbstractTerm
 
 
-class _Packed(NamedTuple):
-    """A surface whose rows lie side by side in one array, so that they are gathered at once, see `packing`."""
+class _Rows(NamedTuple):
+    """The rows of a surface, and those that a step of the loop uses in one array, so that they are gathered at once."""
 
     surface: Surface
-    table: Float[np.ndarray, "N L"]
-    layout: Layout
+    columns: Packed[Surface]
 
     @staticmethod
-    def of(surface: Surface) -> _Packed:
-        columns = surface._replace(noise=None, search=None)
-        return _Packed(surface, packed(columns), layout_of(columns))
+    def of(surface: Surface) -> _Rows:
+        return _Rows(surface, Packed.of(surface._replace(noise=None, search=None)))
 
-    def every(self, stride: int) -> _Packed:
+    def every(self, stride: int) -> _Rows:
         """Every `stride`-th row."""
-        if stride == 1:
-            return self
-        some = jax.tree.map(lambda array: np.ascontiguousarray(array[::stride]), self.surface)
-        return _Packed(some, np.ascontiguousarray(self.table[::stride]), self.layout)
+        return self if stride == 1 else jax.tree.map(lambda array: np.ascontiguousarray(array[::stride]), self)
 
 
 @dataclass(frozen=True)
@@ -53,15 +49,11 @@ class _Matches:
     `found` says which of them are matches of points that are no padding; `max_distance` is applied when they are used.
     """
 
-    source: _Packed
-    target: _Packed
+    source: _Rows
+    target: _Rows
     indices: Int[np.ndarray, "m N"]
     found: Bool[np.ndarray, "m N"]
     max_distance: Any
-
-    @property
-    def layouts(self) -> tuple[Layout, Layout]:
-        return self.source.layout, self.target.layout
 
     @cached_property
     def rows(self) -> Int[np.ndarray, "m N"]:
@@ -70,8 +62,8 @@ class _Matches:
     def gathered(self, index: Any, with_noise: bool) -> _Gathered:
         """The matched rows of some source rows."""
         chosen = self.rows[:, index]
-        tables = self.source.table[index], self.target.table[chosen]
-        gathered = _Gathered(*tables, self.found[:, index], self.max_distance)
+        columns = self.source.columns.rows(index), self.target.columns.rows(chosen)
+        gathered = _Gathered(*columns, self.found[:, index], self.max_distance)
         if not with_noise:
             return gathered
         source, target = self.source.surface, self.target.surface
@@ -85,17 +77,17 @@ class _Matches:
         )
 
     @staticmethod
-    def of(source: _Packed, target: _Packed, indices: Int[np.ndarray, "m N"], max_distance: Any) -> _Matches:
+    def of(source: _Rows, target: _Rows, indices: Int[np.ndarray, "m N"], max_distance: Any) -> _Matches:
         valid, among = searched(source.surface).valid, searched(target.surface).valid
         found = (indices >= 0) & valid & among[np.maximum(indices, 0)]
         return _Matches(source, target, indices, found, max_distance)
 
 
 class _Gathered(NamedTuple):
-    """Matched rows as arguments of a compiled program: surfaces packed, see `packing`."""
+    """Matched rows as arguments of a compiled program: n of the source, (m, n) of the target."""
 
-    source: Float[Any, "n L"]
-    target: Float[Any, "m n L"]
+    source: Packed[Surface]
+    target: Packed[Surface]
     found: Bool[Any, "m n"]
     max_distance: Any
     source_noise: SurfaceNoise | None = None
@@ -117,11 +109,12 @@ class HostExecutor(AbstractExecutor):
         self._index_of, self._num_threads = index_of, num_threads
         # Which source rows are followed from pose to pose, and the function that finds their matches.
         self._followed: tuple[int, bool] | None = None
-        self._whole, self._target = _Packed.of(problem.source), _Packed.of(problem.target)
+        self._whole, self._target = _Rows.of(problem.source), _Rows.of(problem.target)
         self._source = self._whole
         self._nearest: Callable[[Any], Int[np.ndarray, "m N"]]
-        # The last sums, packed.
-        self._sums: tuple[Layout, Float[np.ndarray, "L"]]
+        self._settings = Packed.of(problem.settings, num_axes=0)
+        # The last sums.
+        self._sums: Packed[Sums]
 
     def begin(self) -> LoopResult:
         state = State(self.problem.start, np.asarray(self.first_status), np.int32(0))
@@ -130,12 +123,7 @@ class HostExecutor(AbstractExecutor):
     def repeat(self, step: Callable[[LoopResult], LoopResult], loop: LoopResult) -> LoopResult:
         while loop.state.status < 0:
             loop = step(loop)
-            state = loop.state
-            # As NumPy arrays, comparing them compiles nothing.
-            state = state._replace(status=np.asarray(state.status), num_iterations=np.asarray(state.num_iterations))
-            loop = loop._replace(state=state)
-        records = [jax.tree.map(np.asarray, record) for record in loop.history]
-        return loop._replace(history=jax.tree.map(lambda *entries: np.stack(entries), *records))
+        return loop._replace(history=jax.tree.map(lambda *entries: np.stack(entries), *loop.history))
 
     def record(self, history: Any, state: State) -> list[Record]:
         return [*history, state.record]
@@ -178,7 +166,7 @@ class HostExecutor(AbstractExecutor):
         limit = self.problem.settings.fine_distance
         parameters = np.concatenate([np.asarray(pose.wxyz_xyz)[:4], motion.translation])
         indices = self._index_of(True).nearest(parameters, by_position(searched(source)), float(limit))
-        matches = _Matches.of(_Packed.of(source), self._target, indices, limit)
+        matches = _Matches.of(_Rows.of(source), self._target, indices, limit)
         matches = replace(matches, found=matches.found & counts)
         return self.over_rows(function, motion, matches, np.arange(rows.size), *arguments)
 
@@ -199,7 +187,7 @@ class HostExecutor(AbstractExecutor):
         *arguments: Any,
         with_noise: bool = False,
     ) -> Any:
-        program = _program(function, matches.layouts)
+        program = _program(function)
 
         def block(index: Any) -> Any:
             return program(motion, matches.gathered(rows[index], with_noise), *arguments)
@@ -207,22 +195,16 @@ class HostExecutor(AbstractExecutor):
         return map_rows(block, rows.size, self._num_threads if with_noise else 1)
 
     def sums(self, motion: Motion, matches: _Matches, terms: tuple[AbstractTerm, ...]) -> Sums:
-        source, parts = matches.source.surface, self._over_blocks(_packed_sums, motion, matches, terms)
-        layout = _layout_of_sums(source.observability is not None, source.channel_observability is not None)
-        (total,) = parts if len(parts) == 1 else (self._combined(np.stack(parts), layout),)
-        self._sums = layout, total
-        return unpacked(total, layout)
-
-    def _combined(self, parts: Float[np.ndarray, "b L"], layout: Layout) -> Float[np.ndarray, "L"]:
-        with np.errstate(over="ignore"):
-            sums = combine(unpacked(parts.astype(np.float64), layout))
-            return np.concatenate([each.ravel() for each in jax.tree.leaves(sums)]).astype(parts.dtype)
+        parts: list[Packed[Sums]] = self._over_blocks(_packed_sums, motion, matches, terms)
+        self._sums = parts[0] if len(parts) == 1 else _combined(parts)
+        return self._sums.tree
 
     def update(self, state: State, sums: Sums) -> State:
-        # In one array: to pass a dozen to a program takes longer than to use them.
-        layout, total = self._sums
-        problem = self.problem
-        return _update(layout, state.pose, state.status, state.num_iterations, total, problem.settings, problem.fusion)
+        # With the packed sums: to pass and to return dozens of arrays takes longer than to use them.
+        updated = _update(
+            state.pose, state.status, state.num_iterations, self._sums, self._settings, self.problem.fusion
+        )
+        return Packed(np.asarray(updated.table), updated.layout).tree
 
     def scores(self, motion: Motion, matches: _Matches, *arguments: Any) -> Scores:
         parts: list[Scores] = self._over_blocks(scores_of, motion, matches, *arguments, with_noise=True)
@@ -248,7 +230,7 @@ class HostExecutor(AbstractExecutor):
         with_noise: bool = False,
     ) -> list[Any]:
         """Apply a function to blocks of correspondences; those repeated to fill the last block count as unmatched."""
-        size, program = matches.indices.shape[1], _program(function, matches.layouts)
+        size, program = matches.indices.shape[1], _program(function)
 
         def block(index: Any) -> Any:
             chosen = matches.gathered(index, with_noise)
@@ -260,18 +242,18 @@ class HostExecutor(AbstractExecutor):
 
 
 @cache
-def _program(function: Callable[..., Any], layouts: tuple[Layout, Layout]) -> Callable[..., Any]:
+def _program(function: Callable[..., Any]) -> Callable[..., Any]:
     """A function of correspondences as a compiled program for gathered rows."""
 
     @jax.jit
     def program(motion: Motion, gathered: _Gathered, *arguments: Any) -> Any:
-        matched = _matched(gathered, layouts)
+        matched = _matched(gathered)
         return function(motion, matched.within(motion.move(matched.source.points), gathered.max_distance), *arguments)
 
     return program
 
 
-def _matched(gathered: _Gathered, layouts: tuple[Layout, Layout]) -> Matched:
+def _matched(gathered: _Gathered) -> Matched:
     """One row per correspondence, m N; the first candidates of all source rows come first."""
     count = len(gathered.found)
 
@@ -281,29 +263,33 @@ def _matched(gathered: _Gathered, layouts: tuple[Layout, Layout]) -> Matched:
     def flat(tree: Any) -> Any:
         return jax.tree.map(lambda rows: rows.reshape(len(rows) * rows.shape[1], *rows.shape[2:]), tree)
 
-    source = unpacked(tiled(gathered.source), layouts[0])
-    target = unpacked(flat(gathered.target), layouts[1])
+    source, target = tiled(gathered.source).tree, flat(gathered.target).tree
     source = source._replace(noise=tiled(gathered.source_noise), search=tiled(gathered.source_search))
     target = target._replace(noise=flat(gathered.target_noise), search=flat(gathered.target_search))
     return Matched(source, target, gathered.found.reshape(-1), num_candidates=count)
 
 
-def _packed_sums(motion: Motion, matched: Matched, terms: tuple[AbstractTerm, ...]) -> Array:
-    return packed_numbers(sums_of(motion, matched, terms))
+def _packed_sums(motion: Motion, matched: Matched, terms: tuple[AbstractTerm, ...]) -> Packed[Sums]:
+    return Packed.of(sums_of(motion, matched, terms), num_axes=0)
 
 
-@partial(jax.jit, static_argnums=0)
-def _update(layout: Layout, pose: jaxlie.SE3, status: Any, num_iterations: Any, sums: Array, *others: Any) -> State:
-    """`update` with packed sums."""
-    return update(pose, status, num_iterations, unpacked(sums, layout), *others)
+def _combined(parts: list[Packed[Sums]]) -> Packed[Sums]:
+    """The sums of all blocks."""
+    tables, dtype = np.stack([part.table for part in parts]), parts[0].table.dtype
+    with np.errstate(over="ignore"):
+        sums = combine(Packed(tables.astype(np.float64), parts[0].layout).tree)
+        table = np.concatenate([each.ravel() for each in jax.tree.leaves(sums)]).astype(dtype)
+    return Packed(table, parts[0].layout)
 
 
-@cache
-def _layout_of_sums(observed: bool, by_channels: bool) -> Layout:
-    number, matrix = np.zeros(()), np.zeros((6, 10))
-    sums = Sums(np.zeros(3), number, number, number, number, number, number, np.zeros((3, 4)), matrix)
-    if observed:
-        sums = sums._replace(mass=np.zeros(10), observability=matrix)
-    if by_channels:
-        sums = sums._replace(channel_observability=matrix)
-    return layout_of(sums, num_axes=0)
+@jax.jit
+def _update(
+    pose: jaxlie.SE3,
+    status: Any,
+    num_iterations: Any,
+    sums: Packed[Sums],
+    settings: Packed[Settings],
+    fusion: Fusion | None,
+) -> Packed[State]:
+    """`update` with packed arguments and result."""
+    return Packed.of(update(pose, status, num_iterations, sums.tree, settings.tree, fusion), num_axes=0)

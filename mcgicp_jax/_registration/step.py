@@ -33,7 +33,7 @@ _FRACTION_OF_GATE = 0.25
 _MIN_CORRESPONDENCES = 4
 
 
-class Settings(eqx.Module):
+class Settings(NamedTuple):
     """Numerical settings of the loop, as arrays, so that changing one does not recompile.
 
     Attributes:
