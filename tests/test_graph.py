@@ -885,3 +885,48 @@ def test_files_are_those_of_others(tmp_path):
     assert vertex.split()[0] == "VERTEX_SE3:QUAT" and edge.split()[0] == "EDGE_SE3:QUAT"
     np.testing.assert_allclose(np.array(vertex.split()[1:], float), [0, 4, 5, 6, 1, 0, 0, 0], atol=1e-15)
     np.testing.assert_allclose(np.array(edge.split()[1:], float), [0, 2, 7, 8, 9, 0, 0.6, 0, 0.8, *upper], rtol=1e-12)
+
+
+def partly_blind(seed, kind, number=8):
+    """A ring of poses with loops; edges know nothing of x or, in a corridor, of its direction seen to 0.02 rad."""
+    rng, sigma = np.random.default_rng(seed), np.repeat([0.05, 0.02], 3)
+    angles = 2 * np.pi * np.arange(number) / number * (kind == "ring")
+    poses = np.array([pose((10 * np.cos(a), 10 * np.sin(a), k), (0, 0, a)) for k, a in enumerate(angles)])
+    i, j = np.array([(k, k + step) for step in (1, 2, number - 1) for k in range(number - step)]).T
+    motions = moved(np.linalg.inv(poses[i]) @ poses[j], sigma * rng.normal(size=(len(i), 6)))
+    information = np.tile(np.diag(sigma**-2.0), (len(i), 1, 1))
+    for each in information:
+        along = Rotation.from_rotvec(0.02 * rng.normal(size=3) * (kind == "corridor")).apply([1.0, 0, 0])
+        others = np.eye(6)
+        others[:3, :3] -= np.outer(along, along)
+        each[:] = others @ each @ others
+    start = [poses[0]]
+    for motion in motions[: number - 1]:
+        start.append(start[-1] @ motion)
+    return mcg.PoseGraph(np.array(start), mcg.Edge(i, j, motions, information)), poses
+
+
+@pytest.mark.parametrize("kind", ["ring", "corridor"])
+def test_poses_do_not_slide_along_what_edges_do_not_measure(kind):
+    for seed in range(5):
+        graph, truth = partly_blind(seed, kind)
+        found = mcg.optimize_poses(graph)
+        before, after = (np.linalg.norm((each - truth)[:, :3, 3], axis=1).max() for each in (graph.poses, found.poses))
+        assert found.status == mcg.Status.DEGENERATE
+        assert after < max(before, 1.0)
+        # What is measured is no further from the measurements than the noise.
+        assert found.cost < 3 * len(graph.edges)
+
+
+def test_directions_that_only_some_edges_measure_do_not_depend_on_the_start():
+    poses, loops = grid(2)
+    graph, _ = measured(poses, loops)
+    edges = graph.edges
+    information = edges.information.copy()
+    information[::2, 0] = information[::2, :, 0] = 0
+    found = mcg.optimize_poses(mcg.PoseGraph(poses, mcg.Edge(edges.i, edges.j, edges.T_i_j, information)))
+    away = moved(poses, 0.3 * np.random.default_rng(1).normal(size=(len(poses), 6)))
+    away[0] = poses[0]
+    other = mcg.optimize_poses(mcg.PoseGraph(away, mcg.Edge(edges.i, edges.j, edges.T_i_j, information)))
+    assert found.converged and other.converged
+    np.testing.assert_allclose(other.poses, found.poses, atol=1e-4)

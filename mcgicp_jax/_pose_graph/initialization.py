@@ -12,8 +12,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-# Information below this fraction of an edge's largest is none: it has no weight in comparison with others.
-_BLIND = 1e-6
+from mcgicp_jax._pose_graph.unmeasured import BLIND
 
 
 def initial_poses(
@@ -33,7 +32,7 @@ def initial_poses(
     i, j = np.concatenate([i, np.full(number, number)]), np.concatenate([j, np.arange(number)])
     motions = np.concatenate([motions, np.tile(np.eye(4), (number, 1, 1))])
     values = np.linalg.eigvalsh(information)
-    rank = np.concatenate([loop + 2 * (values[:, 0] <= _BLIND * values[:, -1]), np.full(number, 4)])
+    rank = np.concatenate([loop + 2 * (values[:, 0] <= BLIND * values[:, -1]), np.full(number, 4)])
     poses, used = _along_tree(i, j, motions, rank, number)
     used |= rank == 0
     if used.sum() > number:

@@ -87,7 +87,7 @@ class NormalEquations:
         self.place = np.full(num_poses, -1)
         self.place[~self.held], self.fill = _elimination_order(graph, self.held)
         self._lay_out()
-        self.metric = self.matrix(_metric_blocks(poses, self.rows, _typical(factors[0], of_world)))
+        self.metric = self.matrix(_metric_blocks(poses, self.rows, typical_information(*factors)))
 
     @property
     def size(self) -> int:
@@ -217,13 +217,14 @@ def _metric_blocks(
     )
 
 
-def _typical(edges: AbstractFactor, of_world: Bool[np.ndarray, "m"]) -> Float[np.ndarray, "m 6"]:
+def typical_information(*factors: AbstractFactor) -> Float[np.ndarray, "m 6"]:
     """Diagonal of S for every measurement: the median over edges of the mean information, in translation and rotation.
 
     Measurements in the world's frame have their own: next to motions known to millimetres, positions known to metres
     would else look unconstrained.
     """
-    diagonal = np.diagonal(np.asarray(edges.information), axis1=1, axis2=2).reshape(-1, 2, 3).mean(axis=2)
+    of_world = np.concatenate([(np.asarray(factor.rows) == WORLD).any(axis=1) for factor in factors])
+    diagonal = np.diagonal(np.asarray(factors[0].information), axis1=1, axis2=2).reshape(-1, 2, 3).mean(axis=2)
     typical, edges_of_world = np.ones((len(of_world), 2)), of_world[: len(diagonal)]
     for counted, chosen in ((~edges_of_world, slice(None)), (edges_of_world, of_world)):
         for kind, values in enumerate(diagonal.T):

@@ -73,6 +73,7 @@ class PoseGraphResult:
 
         CONVERGED; MAX_ITERATIONS; NON_FINITE: poses or residuals overflow; DEGENERATE: the measurements do not connect
         all poses with each other or with the world, or leave a direction of motion of at least one pose unconstrained.
+        Along such directions, relative motions stay near those of the initial poses.
         """
         return Status(int(np.asarray(self.status_code))) if is_concrete(self.status_code) else self.status_code
 

@@ -5,20 +5,27 @@ from __future__ import annotations
 from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 
 from mcgicp_jax._math.poses import matrices_of, parameters_of
 from mcgicp_jax._pose_graph.edge import Edge
 from mcgicp_jax._pose_graph.factors import WORLD
 from mcgicp_jax._pose_graph.graph import PoseGraph
-from mcgicp_jax._pose_graph.levenberg_marquardt import Minimum, refine
+from mcgicp_jax._pose_graph.levenberg_marquardt import Minimum, minimize, refine
 from mcgicp_jax._pose_graph.marginal_covariances import pose_covariances, propagated
-from mcgicp_jax._pose_graph.normal_equations import LEAST_DAMPING, NormalEquations, factored, motion_jacobians
+from mcgicp_jax._pose_graph.normal_equations import (
+    NormalEquations,
+    factored,
+    motion_jacobians,
+    normal_blocks,
+    typical_information,
+)
 from mcgicp_jax._pose_graph.outliers import robust_minimum, thresholds
+from mcgicp_jax._pose_graph.unmeasured import unmeasured
 from mcgicp_jax._registration.result import Status
 
-# A direction of motion is unconstrained if its information is less than this fraction of that of a typical edge.
-_UNCONSTRAINED = 10 * LEAST_DAMPING
+# A direction of motion is unconstrained if its information is less than this multiple of the least damping.
+_UNCONSTRAINED = 10.0
 # Inverse iterations for the least constrained direction: unconstrained ones stand out by factors of 1e3 and more.
 _INVERSE_ITERATIONS = 4
 
@@ -68,13 +75,29 @@ def solve(
     # Overflow is a status.
     with np.errstate(over="ignore", invalid="ignore"):
         poses, factors, origin = _centred(poses, factors)
-        equations = NormalEquations(factors, poses)
         uncertain = np.concatenate([np.asarray(factor.uncertain) for factor in factors]) & robust
-        equations, found, weights = robust_minimum(equations, poses, uncertain, max_iterations)
+        held = unmeasured(factors[0], poses, typical_information(*factors)[: len(factors[0])])
+        equations, found, weights = _minimum(poses, factors, held, uncertain, max_iterations)
         if exact and found.converged:
             found = refine(equations, found, weights)
-        status = _status(equations, found, weights)
+        status = _status(equations, found, weights, held)
         return Solution(equations, found, weights, origin, status, found.terms.cost(weights))
+
+
+def _minimum(
+    poses: Float[np.ndarray, "n 4 4"], factors: Factors, held: Edge, uncertain: Bool[np.ndarray, "m"], limit: int
+) -> tuple[NormalEquations, Minimum, Float[np.ndarray, "m"]]:
+    """`robust_minimum`; with the edges of `held` if the measurements do not constrain all poses without them."""
+    if not held.information.any():
+        return robust_minimum(NormalEquations(factors, poses), poses, uncertain, limit)
+    both = NormalEquations((*factors, held), poses)
+    _, found, weights = robust_minimum(both, poses, np.append(uncertain, held.uncertain), limit)
+    weights = weights[: len(uncertain)]
+    equations = NormalEquations(factors, poses, weights > 0)
+    found = found._replace(terms=equations.terms(found.poses))
+    if not _is_degenerate(equations, found, weights, held):
+        found = minimize(equations, found, weights, limit)
+    return equations, found, weights
 
 
 def covariances_at(
@@ -135,16 +158,16 @@ def _rigid(matrices: np.ndarray) -> Float[np.ndarray, "_ 4 4"]:
     return matrices
 
 
-def _status(equations: NormalEquations, found: Minimum, weights: Float[np.ndarray, "m"]) -> Status:
+def _status(equations: NormalEquations, found: Minimum, weights: Float[np.ndarray, "m"], held: Edge) -> Status:
     if not (np.isfinite(found.poses).all() and np.isfinite(found.terms.squares).all()):
         return Status.NON_FINITE
-    if _is_degenerate(equations, found, weights):
+    if _is_degenerate(equations, found, weights, held):
         return Status.DEGENERATE
     return Status.CONVERGED if found.converged else Status.MAX_ITERATIONS
 
 
-def _is_degenerate(equations: NormalEquations, found: Minimum, weights: Float[np.ndarray, "m"]) -> bool:
-    """Whether poses are not connected, or the least eigenvalue of H relative to D is not above rounding and damping.
+def _is_degenerate(equations: NormalEquations, found: Minimum, weights: Float[np.ndarray, "m"], held: Edge) -> bool:
+    """Whether poses are not connected, or H along some direction is less than `held`, or than rounding and damping.
 
     By inverse iteration with the least damping: that of the last step may be too large to tell.
     """
@@ -153,12 +176,16 @@ def _is_degenerate(equations: NormalEquations, found: Minimum, weights: Float[np
     if not equations.size:
         return False
     matrix = equations.weighted(found.terms.blocks, weights)
+    blocks = np.zeros_like(found.terms.blocks)
+    known = normal_blocks(motion_jacobians(found.poses[equations.rows[0]]), held.information)
+    blocks[: len(known)] = known / _UNCONSTRAINED
+    least = equations.damped(equations.weighted(blocks, weights))
     try:
-        factors = factored(equations.damped(matrix))
+        factors = factored(matrix + least)
     except RuntimeError:
         return True
     vector = np.random.default_rng(0).normal(size=equations.size)
     for _ in range(_INVERSE_ITERATIONS):
-        pushed = equations.metric @ vector
+        pushed = least @ vector
         vector = factors.solve(pushed / np.sqrt(vector @ pushed))
-    return bool(vector @ (matrix @ vector) < _UNCONSTRAINED * (vector @ (equations.metric @ vector)))
+    return bool(vector @ (matrix @ vector) < _UNCONSTRAINED * (vector @ (least @ vector)))
