@@ -10,6 +10,7 @@ from scipy.spatial.transform import Rotation
 import mcgicp_jax as mcg
 from mcgicp_jax import datasets
 from mcgicp_jax._math.symmetric_matrices import inverse_3, inverse_6
+from mcgicp_jax._math.twists import logarithm
 from mcgicp_jax._pose_solver.pose_measurements import Fusion, Prior, TiePoints, form_at
 from tests.differences import TO_ROUNDING, check_gradient, needs_x64, weigh
 from tests.scenes import motion, pair
@@ -77,7 +78,7 @@ def test_the_form_is_the_cost(kind):
     start, pose, center, radius = motion(0.3 * rng.normal(size=6)), motion(0.3 * rng.normal(size=6)), np.ones(3), 2.0
     ties = TiePoints(*rng.normal(size=(2, 4, 3)), np.array([covariance(rng, 3, 0.3) for _ in range(4)]))
     belief = motion(0.2 * rng.normal(size=6)), covariance(rng, 6, 0.3)
-    prior = Prior(belief[0][:3, :3], belief[0][:3, 3], belief[1])
+    prior = Prior(belief[0][:3, :3], belief[0][:3, 3], np.linalg.inv(belief[1]))
     ties, prior = (ties, None) if kind == "tie points" else (None, prior)
 
     def residuals(twist):
@@ -89,10 +90,9 @@ def test_the_form_is_the_cost(kind):
             return np.concatenate(
                 [np.linalg.cholesky(np.linalg.inv(c)).T @ d for c, d in zip(ties.covariances, apart, strict=True)]
             )
-        left = belief[0][:3, :3].T @ rotation
-        vector = 0.5 * np.array([left[2, 1] - left[1, 2], left[0, 2] - left[2, 0], left[1, 0] - left[0, 1]])
-        error = np.append(belief[0][:3, :3].T @ (translation - belief[0][:3, 3]), vector)
-        return np.linalg.cholesky(np.linalg.inv(belief[1])).T @ error
+        moved = np.eye(4)
+        moved[:3, :3], moved[:3, 3] = rotation, translation
+        return np.linalg.cholesky(np.linalg.inv(belief[1])).T @ logarithm(np.linalg.inv(belief[0]) @ moved)
 
     slope = np.stack([(residuals(1e-5 * e) - residuals(-1e-5 * e)) / 2e-5 for e in np.eye(6)], axis=1)
     form = form_at(start[:3, :3], start[:3, 3], center, radius, ties, prior)
@@ -355,3 +355,38 @@ def test_covariances_are_right(scene):
     assert all(0.5 < np.mean(each) < 2 for each in nees.values()), nees
     for name in ("ties", "prior"):
         assert errors[name] < min(errors["nothing"], errors[f"{name} alone"]), errors
+
+
+@pytest.mark.parametrize("degrees", [80, 150])
+def test_a_prior_is_reached_from_far_off(degrees):
+    """A round room, whose yaw only the prior knows."""
+    rng = np.random.default_rng(0)
+    angles, radii = rng.uniform(0, 2 * np.pi, 3000), np.append(np.full(1500, 2.0), 2 * np.sqrt(rng.uniform(size=1500)))
+    heights = np.where(radii == 2, rng.uniform(0, 2, 3000), 0)
+    clouds = []
+    for _ in range(2):
+        angles = rng.permutation(angles)
+        points = np.stack([radii * np.cos(angles), radii * np.sin(angles), heights], axis=1)
+        clouds.append(mcg.preprocess(points + 0.002 * rng.normal(size=points.shape)))
+    start = motion([0, 0, 0, 0, 0, np.radians(degrees)])
+    prior = np.eye(4), 4e-4 * np.eye(6)
+    result = mcg.register(*clouds, mcg.GICP(), init=start, prior=prior, **OPTIONS)
+    assert result.converged and np.abs(twist_error(result.matrix, np.eye(4))).max() < 2e-3
+
+
+@pytest.mark.parametrize("far", [1e5, 5e6])
+def test_a_result_is_a_prior_wherever_it_is(corner, far):
+    source, target, truth = corner
+    move = motion((0.1 * far, far, 10, 0, 0, 0))
+    clouds = [np.asarray(cloud.points, np.float64) + move[:3, 3] for cloud in (source, target)]
+    there = move @ truth @ np.linalg.inv(move)
+    alone = mcg.register(*clouds, mcg.GICP(), init=there, **OPTIONS)
+    both = mcg.register(*clouds, mcg.GICP(), init=there, prior=(alone.matrix, alone.covariance), **OPTIONS)
+    assert both.converged
+    found, expected = (np.linalg.inv(move) @ result.matrix @ move for result in (both, alone))
+    assert np.abs(twist_error(found, expected)).max() < 1e-4
+    np.testing.assert_allclose(both.deviations, alone.deviations / np.sqrt(2), rtol=0.02)
+    # Independent deviations at the far origin: at the clouds, rotation and position are strongly correlated.
+    weak = mcg.register(*clouds, mcg.GICP(), init=there, prior=(there, 1e-4 * np.eye(6)), **OPTIONS)
+    error = twist_error(np.linalg.inv(move) @ weak.matrix @ move, truth)
+    assert weak.converged and np.all(np.abs(error) < 5 * alone.deviations.max())

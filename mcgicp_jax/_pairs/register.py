@@ -89,8 +89,9 @@ def register(
         prior: (pose, covariance): a measurement of T_target_source, as by GNSS or an IMU, `jaxlie.SE3` or (4, 4), and
             its covariance (6, 6), metres and radians, of ξ = (v, ω) in T = pose · exp(ξ): in the order and frame of
             `RegistrationResult.covariance`. ξ is expressed at the origin and in the axes of the source. A GNSS
-            covariance Σ in the target's axes becomes Rᵀ Σ R. For UTM coordinates, shift the clouds to the origin first.
-            Use a large finite variance for unmeasured directions. The prior is also the initial pose if `init` is None.
+            covariance Σ in the target's axes becomes Rᵀ Σ R. At UTM coordinates, that of a pose measured at the cloud
+            must be transported to their origin. Use a large finite variance for unmeasured directions. The prior is
+            also the initial pose if `init` is None.
 
     With tie points or a prior, a first registration without them measures the covariance of the score of the matches.
     A second one starts at its pose and weighs matches, tie points and prior by their covariances (Hansen 1982,

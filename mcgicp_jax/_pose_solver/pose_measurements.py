@@ -1,10 +1,9 @@
-"""Tie points and a pose prior as one quadratic cost in the entries of the pose.
+"""Tie points and a pose prior as costs of the pose, in squared standard deviations.
 
-A tie point has the residual b − T a. A prior P has six residuals: with E = P⁻¹ T, the translation of E, and its
-rotation vector to first order, ½ (E − Eᵀ) as a vector (the sine of the angle times the axis). All are linear in the
-entries of the pose. Let D = [ΔR − I | Δt] be the change from a fixed pose T₀ about a fixed centre c:
-T a − c = ΔR (T₀ a − c) + Δt. Then the cost is e − 2 ⟨D, G⟩ + ⟨D, Q D⟩ with constant Q (12, 12) and G (12), for any
-number of tie points.
+A tie point has the residual b − T a. Let D = [ΔR − I | Δt] be the change from a fixed pose T₀ about a fixed centre c:
+T a − c = ΔR (T₀ a − c) + Δt. Then the cost of all tie points is e − 2 ⟨D, G⟩ + ⟨D, Q D⟩ with constant Q (12, 12) and
+G (12), for any number of them. A prior P has the residual ξ = log(P⁻¹ T), a twist about any fixed source point: here
+the one at c, so that far origins do not enter the arithmetic.
 """
 
 from __future__ import annotations
@@ -12,12 +11,14 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
-import numpy as np
+import jaxlie
 from jaxtyping import Array, Bool, Float
 
 from mcgicp_jax._compute.concrete import AnyArray, AnyScalar, numpy_for
-from mcgicp_jax._math.symmetric_matrices import inverse_3, inverse_6
+from mcgicp_jax._math.poses import translation_adjoint
+from mcgicp_jax._math.symmetric_matrices import inverse_3
 
 
 class TiePoints(NamedTuple):
@@ -29,18 +30,25 @@ class TiePoints(NamedTuple):
 
 
 class Prior(NamedTuple):
-    """The pose is R, t times exp(ξ) with ξ = (v, ω) of the given covariance, metres and radians."""
+    """The pose is R, t times exp(ξ) with ξ = (v, ω) of the given information, metres and radians."""
 
     rotation: Float[AnyArray, "3 3"]
     translation: Float[AnyArray, "3"]
-    covariance: Float[AnyArray, "6 6"]
+    information: Float[AnyArray, "6 6"]
 
 
 class PoseForm(NamedTuple):
-    """Q and G of the cost, in squared standard deviations; D is flattened row by row, Δt in units of the radius."""
+    """Costs of tie points and of a prior.
+
+    Attributes:
+        stiffness, force: Q and G, with D flattened row by row and Δt in units of the radius.
+        prior: relative to the source point at c and to c, lengths in units of the radius; without one its information
+            is 0.
+    """
 
     stiffness: Float[AnyArray, "12 12"]
     force: Float[AnyArray, "12"]
+    prior: Prior
 
 
 def form_at(
@@ -51,7 +59,7 @@ def form_at(
     ties: TiePoints | None,
     prior: Prior | None,
 ) -> PoseForm:
-    """The form relative to the pose R, t, about a centre. NumPy where everything is concrete."""
+    """The costs relative to the pose R, t, about a centre. NumPy where everything is concrete."""
     xp = numpy_for(rotation, translation, center, radius, ties, prior)
     stiffness, force = xp.zeros((12, 12)), xp.zeros(12)
     if ties is not None:
@@ -61,23 +69,13 @@ def form_at(
         pull = xp.einsum("nij,nj->ni", information, ties.target - moved)
         stiffness = stiffness + xp.einsum("nij,nk,nl->ikjl", information, arms, arms).reshape(12, 12)
         force = force + xp.einsum("ni,nk->ik", pull, arms).reshape(12)
-    if prior is not None:
-        changes = np.eye(12).reshape(12, 3, 4)
-        turned = xp.einsum("ji,kjl,lm->kim", prior.rotation, changes[:, :, :3], rotation)
-        shifts = changes[:, :, :3] @ (translation - center) + changes[:, :, 3] * radius
-        slope = xp.concatenate([shifts @ prior.rotation, _rotation_vectors(turned)], axis=1)
-        apart = (translation - prior.translation) @ prior.rotation
-        residual = xp.concatenate([apart, _rotation_vectors((prior.rotation.T @ rotation)[None])[0]])
-        information = inverse_6(prior.covariance)
-        stiffness = stiffness + slope @ information @ slope.T
-        force = force - slope @ (information @ residual)
-    return PoseForm(stiffness, force)
-
-
-def _rotation_vectors(matrices: Float[AnyArray, "k 3 3"]) -> Float[AnyArray, "k 3"]:
-    """½ (M − Mᵀ)ˣ: the rotation vector of a rotation by a small angle."""
-    odd = 0.5 * (matrices - matrices.swapaxes(-1, -2))
-    return numpy_for(matrices).stack([odd[:, 2, 1], odd[:, 0, 2], odd[:, 1, 0]], axis=-1)
+    if prior is None:
+        return PoseForm(stiffness, force, Prior(rotation, xp.zeros(3), xp.zeros((6, 6))))
+    point = rotation.T @ (center - translation)
+    apart = (prior.rotation @ point + prior.translation - center) / radius
+    # ξ about the origin of the source from ξ about the point, with lengths in units of the radius.
+    change = translation_adjoint(point) * xp.concatenate([xp.broadcast_to(radius, 3), xp.ones(3)])
+    return PoseForm(stiffness, force, Prior(prior.rotation, apart, change.T @ prior.information @ change))
 
 
 class Fusion(eqx.Module):
@@ -122,7 +120,20 @@ class Fusion(eqx.Module):
         about = jnp.cross(axes[:, :, None], now[None], axis=1)
         slope = jnp.concatenate([along, about]).reshape(6, 12)
         change = (now - jnp.eye(3, 4, dtype=now.dtype)).reshape(12)
-        return slope @ (self.form.force - self.form.stiffness @ change), slope @ self.form.stiffness @ slope.T
+        prior = self.form.prior
+
+        def apart(twist: Float[Array, "6"]) -> Float[Array, "6"]:
+            turned = rotation + jnp.cross(twist[3:, None], rotation, axis=0)
+            moved = (shift + jnp.cross(twist[3:], shift)) / self.radius + twist[:3]
+            error = jaxlie.SE3.from_rotation_and_translation(
+                jaxlie.SO3.from_matrix(prior.rotation.T @ turned), prior.rotation.T @ (moved - prior.translation)
+            )
+            return error.log().astype(now.dtype)
+
+        residual, push = jax.linearize(apart, jnp.zeros(6, now.dtype))
+        rows = jax.vmap(push)(jnp.eye(6, dtype=now.dtype))
+        pull = slope @ (self.form.force - self.form.stiffness @ change) - rows @ prior.information @ residual
+        return pull, slope @ self.form.stiffness @ slope.T + rows @ prior.information @ rows.T
 
     def balance(
         self, score: Float[Array, "6"], rotation: Float[Array, "3 3"], translation: Float[Array, "3"]

@@ -15,6 +15,7 @@ from mcgicp_jax._clouds.origins import centred_pose
 from mcgicp_jax._clouds.point_cloud import PointCloud
 from mcgicp_jax._compute.concrete import AnyArray, constant, is_concrete, numpy_for, outside_trace
 from mcgicp_jax._math.poses import matrices_of, translation_adjoint
+from mcgicp_jax._math.symmetric_matrices import inverse_6
 from mcgicp_jax._pose_solver.covariance import Moments
 from mcgicp_jax._pose_solver.degeneracy import Directions
 from mcgicp_jax._pose_solver.fusion import fuse
@@ -25,6 +26,8 @@ from mcgicp_jax._registration.step import State
 # Largest asymmetry of a correlation matrix, as rounding to float32 causes; and smallest eigenvalue with which the
 # inverse of a correlation matrix keeps four digits in float64.
 _ASYMMETRY, _LEAST_EIGENVALUE = 1e-5, 1e-12
+# Largest rounding of the information of a prior, with lengths in units of the cloud: a standard deviation of 3 %.
+_LARGEST_ERROR = 1e3
 # Source points (n, 3), target points (n, 3) and covariances (n, 3, 3); pose and covariance (6, 6).
 if TYPE_CHECKING:
     GivenTiePoints: TypeAlias = tuple[Any, Any, Any]
@@ -56,11 +59,34 @@ def _centred_tie_points(given: GivenTiePoints, source: PointCloud, target: Point
 def _centred_prior(given: GivenPrior, source: PointCloud, target: PointCloud) -> Prior:
     pose, covariance = _parts("prior", given, "(pose, covariance)", 2)
     matrix = centred_pose(pose, source, target, "prior: pose")
-    covariance = _covariances("prior: covariance", covariance, (6, 6))
-    if not is_concrete(source.origin) or np.any(source.origin):
-        change = translation_adjoint(-source.origin)
-        covariance = change @ covariance @ change.T
-    return Prior(matrix[:3, :3], matrix[:3, 3], covariance)
+    covariance = _numbers("prior: covariance", covariance, (6, 6))
+    if is_concrete(covariance, source.points, source.origin):
+        return Prior(matrix[:3, :3], matrix[:3, 3], _information(covariance, source))
+    change = translation_adjoint(-source.origin)
+    return Prior(matrix[:3, :3], matrix[:3, 3], inverse_6(change @ covariance @ change.T))
+
+
+def _information(covariance: Float[np.ndarray, "6 6"], source: PointCloud) -> Float[np.ndarray, "6 6"]:
+    """Information of ξ about the origin of the cloud, from its covariance about that of the user's coordinates.
+
+    One of the two has correlations that rounding does not spoil: the first for a pose that was measured at the cloud,
+    the second for one measured at a far origin. A root of the information has twice the digits of the information.
+    """
+    known = []
+    for offset in (source.origin, np.zeros(3)):
+        change = translation_adjoint(-np.asarray(offset, np.float64))
+        there = change @ covariance @ change.T
+        scale, correlations = _correlations(0.5 * (there + there.T))
+        values, vectors = np.linalg.eigh(correlations)
+        known.append((values[0], offset, (vectors / np.sqrt(np.maximum(values, _LEAST_EIGENVALUE))).T / scale))
+    least, offset, root = max(known, key=lambda each: each[0])
+    _require_positive("prior: covariance", _correlations(covariance)[1], least)
+    points = np.asarray(source.points)
+    lengths = np.repeat([max(float(np.abs(points).max(initial=0)), 1e-30), 1.0], 3)
+    _, values, vectors = np.linalg.svd(root @ translation_adjoint(source.origin - offset) * lengths)
+    # The rounding of more precise directions would spoil the others.
+    rows = np.minimum(values, np.sqrt(_LARGEST_ERROR / np.finfo(points.dtype).eps))[:, None] * vectors / lengths
+    return rows.T @ rows
 
 
 def fusion_of(state: State, moments: Moments, ties: TiePoints | None, prior: Prior | None) -> Fusion:
@@ -111,12 +137,20 @@ def _covariances(name: str, given: Any, shape: tuple[int, ...]) -> Float[AnyArra
     """The array, checked to be symmetric and positive definite if it is concrete."""
     array = _numbers(name, given, shape)
     if is_concrete(array):
-        deviations = np.sqrt(np.maximum(np.einsum("...ii->...i", array), 0))
-        scale = deviations[..., :, None] * deviations[..., None, :]
-        # Correlations, so that metres and radians may be of any size.
-        correlations = array / np.where(scale > 0, scale, 1)
-        symmetric = np.abs(correlations - correlations.swapaxes(-1, -2)).max(initial=0) < _ASYMMETRY
-        if not (symmetric and np.linalg.eigvalsh(correlations).min(initial=1) > _LEAST_EIGENVALUE):
-            got = "one that is not positive definite" if symmetric else "one that is not symmetric"
-            raise ValueError(f"{name}: expected symmetric positive definite matrices, got {got}")
+        _, correlations = _correlations(array)
+        _require_positive(name, correlations, np.linalg.eigvalsh(correlations).min(initial=1))
     return array
+
+
+def _correlations(covariances: Float[np.ndarray, "*n d d"]) -> tuple[np.ndarray, np.ndarray]:
+    """Standard deviations and correlations, in which metres and radians may be of any size."""
+    deviations = np.sqrt(np.maximum(np.einsum("...ii->...i", covariances), 0))
+    deviations = np.where(deviations > 0, deviations, 1)
+    return deviations, covariances / (deviations[..., :, None] * deviations[..., None, :])
+
+
+def _require_positive(name: str, correlations: Float[np.ndarray, "*n d d"], least: float) -> None:
+    symmetric = np.abs(correlations - correlations.swapaxes(-1, -2)).max(initial=0) < _ASYMMETRY
+    if not (symmetric and least > _LEAST_EIGENVALUE):
+        got = "one that is not positive definite" if symmetric else "one that is not symmetric"
+        raise ValueError(f"{name}: expected symmetric positive definite matrices, got {got}")
