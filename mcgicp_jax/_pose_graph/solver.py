@@ -177,7 +177,7 @@ def _is_degenerate(equations: NormalEquations, found: Minimum, weights: Float[np
         return False
     matrix = equations.weighted(found.terms.blocks, weights)
     blocks = np.zeros_like(found.terms.blocks)
-    known = normal_blocks(motion_jacobians(found.poses[equations.rows[0]]), held.information)
+    known = normal_blocks(motion_jacobians(found.poses[equations.rows[0]]), np.asarray(held.information))
     blocks[: len(known)] = known / _UNCONSTRAINED
     least = equations.damped(equations.weighted(blocks, weights))
     try:
