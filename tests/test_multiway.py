@@ -65,51 +65,59 @@ def test_odometry_closes_loops(room):
         next(mcg.odometry(frames, mcg.GICP(), loops=True, against="map"))
 
 
-def trajectory(**options):
+def trajectory(number=5, **options):
     """One with frames along x, a metre apart; their points have a median range of 1 m."""
     found = Trajectory(mcg.GICP(), Options(**options))
-    found._clouds = [mcg.PointCloud(np.eye(3) * [0.5, 1, 2] + [0, 0, 1e-9 * k]) for k in range(5)]
-    found._poses = [pose((k, 0, 0), (0, 0, 0.1 * k)) for k in range(5)]
+    found._clouds = [mcg.PointCloud(np.eye(3) * [0.5, 1, 2] + [0, 0, 1e-9 * k]) for k in range(number)]
+    found._poses = np.array([pose((k, 0, 0), (0, 0, 0.1 * k)) for k in range(number)])
     return found
 
 
-def test_loops_are_sought_where_they_may_be_and_help():
-    found = trajectory()
-    sure, blind = 1e4 * np.eye(6), np.zeros((6, 6))
-    found._edges = [mcg.Edge(0, 1, np.eye(4), sure), mcg.Edge(1, 2, np.eye(4), blind)]
-    # By row: distance, and deviation of its motion in units of that of a registration.
-    cases = [(1.9, 3), (2.1, 3), (2.1, 4), (1.9, 1.9), (0.0, 5), (99, 5), (1.0, 2.1)]
-    distances, factors = np.array(cases).T
-    frames, covariances = found._worthwhile(
-        4, np.arange(10, 17), distances, 1e-4 * factors[:, None, None] ** 2 * np.eye(6)
-    )
-    np.testing.assert_array_equal(frames, [14, 12, 10, 11, 16])
-    np.testing.assert_allclose(covariances[:, 0, 0], 1e-4 * np.array([5, 4, 3, 3, 2.1]) ** 2)
+def test_loops_are_sought_in_each_range_of_gaps_where_the_motion_is_uncertain():
+    """Of a slow sensor, the nearest frames are the last ones; frame 3 is at the old place."""
+    number = 40
+    distances = np.abs(np.arange(number) - (number - 1)) * 0.03
+    distances[:8] = 0.1 * np.abs(np.arange(8) - 3)
+    variances = np.arange(number)[::-1] * 1.0
+    assert _loops._candidates(variances > 4, distances, variances) == [3, 23, 31, 34]
+    assert _loops._candidates(variances > 20, distances, variances) == [3, 18]
 
 
 def test_a_loop_is_registered_from_the_poses_within_their_uncertainty(monkeypatch):
     calls = []
     monkeypatch.setattr(_loops, "register_pair", lambda *arguments: calls.append(arguments))
     monkeypatch.setattr(_loops, "edge_from", lambda i, j, _, **options: mcg.Edge(i, j, np.eye(4), np.eye(6), **options))
-    for sigma, given, expected in (
-        (1.0, (2.0, 0.5), (3.37, 0.5)),
-        (0.1, (2.0, 0.5), (2.0, 0.5)),
-        (0.1, 0.7, (0.7, 0.7)),
-    ):
-        found = trajectory(max_distance=given)
-        edge = found._registered(1, 4, sigma**2 * np.eye(6))
-        assert (edge.i, edge.j, edge.uncertain) == (1, 4, True)
-        source, target, _, init, options = calls.pop()
-        assert source is found._clouds[4] and target is found._clouds[1]
-        np.testing.assert_allclose(found._poses[1] @ init, found._poses[4], atol=1e-12)
-        np.testing.assert_allclose(options.max_distance, expected)
+    found = trajectory(max_distance=(2.0, 0.5))
+    found._poses[:, 0, 3] *= 0.5
+    for k in range(4):
+        found._connect(mcg.Edge(k, k + 1, np.linalg.inv(found._poses[k]) @ found._poses[k + 1], 100 * np.eye(6)))
+    edge = found._loop(4)
+    # No frame is more than four edges away.
+    assert edge is None and not calls
+    found._variances[0] *= 4
+    edge = found._loop(4)
+    assert (edge.i, edge.j, edge.uncertain) == (0, 4, True)
+    source, target, _, init, options = calls.pop()
+    assert source is found._clouds[4] and target is found._clouds[0]
+    np.testing.assert_allclose(found._poses[0] @ init, found._poses[4], atol=1e-12)
+    # Four edges of 0.1 m and 0.1 rad with arms of 0 to 1.5 m.
+    expected = 3.37 * np.sqrt(4 * 0.01 + 0.01 * (0 + 0.25 + 1 + 2.25))
+    np.testing.assert_allclose(options.reach, expected, rtol=0.05)
+    assert options.max_distance == (2.0, 0.5)
+
+
+def test_loops_close_with_cells(room):
+    """The default distances are those of the cells."""
+    frames, truth = room
+    steps = list(mcg.odometry(frames, mcg.NDT(), voxel_sizes=(0.8,), start=truth[0], loops=True))
+    assert steps[-1].graph.edges.uncertain.sum() >= 3
 
 
 def test_a_lost_frame_is_joined_by_an_edge_without_information():
     found = trajectory()
     found._clouds, found._poses, end = found._clouds[:1], found._poses[:1], found._poses[1]
     found.add(mcg.PointCloud(np.eye(3)), end, mcg.RegistrationResult.without_pose(mcg.Status.WORKER_FAILED))
-    edges = found.graph.edges
+    edges = found.graph().edges
     assert (edges.i, edges.j, edges.uncertain) == (0, 1, False) and not np.any(edges.information)
     np.testing.assert_allclose(found._poses[0] @ edges.T_i_j[0], end, atol=1e-12)
 
@@ -210,3 +218,29 @@ def test_the_command_of_odometry(tmp_path, capsys):
     options = ["--num-frames", "3", "--method", "gicp", "--loops", "--map", str(map)]
     assert main(["odometry", "box-room", *options]) == 0
     assert "loops:     " in capsys.readouterr().out and len(io.read(map)) > 1000
+
+
+def test_a_cloud_of_another_place_leaves_the_others_where_they_are():
+    size = {"points_per_frame": 1500, "step": 0.4}
+    frames, other = datasets.box_room(6, seed=3, **size), datasets.box_room(6, seed=1003, **size)
+    clouds = [mcg.PointCloud(frame.cloud.points) for frame in frames]
+    clouds[4] = mcg.PointCloud(other[4].cloud.points)
+    found = mcg.multiway(clouds, mcg.GICP(), max_distance=1.0)
+    others = [0, 1, 2, 3, 5]
+    truth = np.array([frames.path(k) for k in others])
+    np.testing.assert_allclose(
+        np.linalg.inv(found.poses[0]) @ found.poses[others], np.linalg.inv(truth[0]) @ truth, atol=0.05
+    )
+    assert not found.converged and found.statuses[4] != mcg.Status.CONVERGED
+    assert all(found.statuses[k] == mcg.Status.CONVERGED for k in others)
+
+
+def test_a_far_point_costs_no_registrations():
+    clouds = [frame.cloud for frame in datasets.box_room(3, points_per_frame=800)]
+    points = np.array(clouds[1].points)
+    points[0] = 1e8
+    clouds[1] = mcg.PointCloud(points, clouds[1].channels, channel_names=clouds[0].channel_names)
+    found = mcg.multiway(clouds, mcg.GICP(), max_distance=1.0)
+    assert np.isfinite(found.poses).all() and len(found.registrations) >= 2
+    with pytest.raises(ValueError, match=r"clouds\[1\]: .* voxels of"):
+        _ = found.map

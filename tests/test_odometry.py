@@ -156,7 +156,10 @@ def test_what_makes_no_map_is_refused_by_name(room):
         ((clouds[:1], truth[:2], 0.1), "argument"),
         (([clouds[0], bare], truth[:2], 0.1), r"clouds\[1\]: expected the channels"),
         ((clouds[:1], [2 * np.eye(4)], 0.1), r"poses\[0\]"),
-        ((clouds[:2], [truth[0], motion((1e6, 0, 0, 0, 0, 0))], 0.1), "voxel_size: 0.1 m puts points"),
+        (
+            (clouds[:2], [truth[0], motion((1e6, 0, 0, 0, 0, 0))], 0.1),
+            "clouds\\[1\\]: the point .* lies 10000011 voxels of 0.1 m",
+        ),
     ):
         with pytest.raises(ValueError, match=message):
             mcg.merge_clouds(*arguments)
@@ -208,3 +211,41 @@ def test_what_is_wrong_with_a_map_is_named(room):
     frames, _ = room
     with pytest.raises(ValueError, match=r"^map_radius: expected"):
         list(mcg.odometry(frames, mcg.GICP(), against="map", map_radius=-1.0))
+
+
+def test_the_frames_after_an_invalid_one_go_on(room):
+    frames, truth = room
+    broken = [frames[0], frames[1], mcg.PointCloud(np.zeros((2, 3))), frames[2], frames[3]]
+    steps = mcg.odometry(broken, mcg.GICP(), max_distance=0.5, start=truth[0])
+    poses = [next(steps).pose for _ in range(2)]
+    with pytest.raises(ValueError, match=r"^frames\[2\]: "):
+        next(steps)
+    poses += [step.pose for step in steps]
+    assert len(poses) == 4 and metrics.ate(poses, truth[:4], alignment="first") < 0.03
+
+
+def test_a_sensor_that_moves_on_after_a_rest_is_not_lost(monkeypatch):
+    """Its overlap falls once; only that frame is looked for in the map."""
+    frames, searches = datasets.box_room(4, points_per_frame=1500, step=1.2), []
+    clouds = [mcg.preprocess(frame.cloud) for frame in frames]
+    search = _relocalization.global_pose
+    monkeypatch.setattr(_relocalization, "global_pose", lambda *clouds: searches.append(1) or search(*clouds))
+    steps = list(mcg.odometry([clouds[0], clouds[0], *clouds[1:]], mcg.GICP(), recover=True, max_distance=(2.0, 0.2)))
+    overlaps = [float(step.registration.overlap) for step in steps[1:]]
+    assert overlaps[0] == 1 and max(overlaps[1:]) < 0.8
+    assert len(searches) == 1 and not any(step.lost for step in steps)
+
+
+def test_lost_frames_are_named_and_follow_each_other(room):
+    """In another, larger room, poses follow an extrapolated one until the first is seen again."""
+    frames, truth = room
+    others = datasets.box_room(3, points_per_frame=2000, step=0.02, seed=5)
+    away = [frame.cloud.replace(points=4 * frame.cloud.points) for frame in others]
+    clouds = [frames[0].cloud, frames[1].cloud, *away, frames[2].cloud]
+    steps = list(mcg.odometry(clouds, mcg.GICP(), start=truth[0], recover=True))
+    assert [step.lost for step in steps] == [False, False, True, True, True, False]
+    for k in (3, 4):
+        motion_found = np.linalg.inv(steps[k - 1].pose) @ steps[k].pose
+        np.testing.assert_allclose(motion_found, steps[k].registration.matrix, atol=1e-6)
+        assert steps[k].registration.converged
+    np.testing.assert_allclose(steps[-1].pose[:3, 3], truth[2][:3, 3], atol=0.05)

@@ -9,7 +9,7 @@ from jaxtyping import Float
 
 from mcgicp_jax._clouds.point_cloud import PointCloud, Values, as_cloud
 from mcgicp_jax._clouds.voxels import starts_of, voxel_keys, voxel_of
-from mcgicp_jax._compute.argument_checks import check_positive
+from mcgicp_jax._compute.argument_checks import check_positive, errors_named
 from mcgicp_jax._math.poses import Pose, pose_matrix
 
 
@@ -62,7 +62,8 @@ class VoxelMap:
         if self._first is None and finite.any():
             self._first = voxel_of(points[finite][0], self._voxel_size)
         first = 0.0 if self._first is None else self._first
-        keys = np.concatenate([self._keys, voxel_keys(points[finite], self._voxel_size, first)])
+        with errors_named(name):
+            keys = np.concatenate([self._keys, voxel_keys(points[finite], self._voxel_size, first)])
         sums = rows[finite] if self._sums is None else np.concatenate([self._sums, rows[finite]])
         self._keys, self._sums = _merge(keys, sums)
 

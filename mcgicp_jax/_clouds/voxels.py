@@ -24,11 +24,18 @@ def voxel_keys(
     """
     cells = voxel_of(points, voxel_size) - first
     if np.abs(cells).max(initial=0) >= _VOXELS_PER_AXIS // 2:
+        worst = points[np.argmax(np.abs(cells).max(axis=1))]
         raise ValueError(
-            f"voxel_size: {voxel_size} m puts points {np.abs(cells).max():.0f} voxels from the first one, expected "
-            f"fewer than {_VOXELS_PER_AXIS // 2}; choose a larger size"
+            f"the point {worst} lies {np.abs(cells).max():.0f} voxels of {voxel_size:g} m from the first one, expected "
+            f"fewer than {_VOXELS_PER_AXIS // 2}; leave far points out, or choose a larger voxel_size"
         )
     x, y, z = (cells.astype(np.int64) + _VOXELS_PER_AXIS // 2).T
+    return (x << 42) | (y << 21) | z
+
+
+def wrapped_keys(points: Float[np.ndarray, "N 3"], voxel_size: float) -> Int[np.ndarray, "N"]:
+    """Keys of the voxels that contain the points; voxels that are multiples of 2²¹ voxels apart have the same."""
+    x, y, z = np.mod(voxel_of(points, voxel_size), _VOXELS_PER_AXIS).astype(np.int64).T
     return (x << 42) | (y << 21) | z
 
 

@@ -26,6 +26,8 @@ else:
 
 # Tolerance on the largest entry of R Rᵀ − I: a matrix typed with four digits still counts as a rotation.
 _ROTATION_TOLERANCE = 1e-3
+# The same of a rotation that is exact to rounding.
+_EXACT = 1e-14
 # Largest displacement, in radii of the cloud, that rounding of R may cause for a cloud far from the origin.
 _DISPLACEMENT_TOLERANCE = 0.1
 
@@ -75,11 +77,29 @@ def pose_matrix(
     return nearest_rotation(matrix)
 
 
+def pose_matrices(poses: Any, name: str = "poses[{}]") -> Float[np.ndarray, "n 4 4"]:
+    """`pose_matrix` of each of several concrete poses; `name` has a place for the number in error messages."""
+    if not isinstance(poses, np.ndarray | jax.Array):
+        poses = [pose_matrix(pose, name.format(k)) for k, pose in enumerate(poses)]
+    matrices = np.array(poses, np.float64)
+    if matrices.ndim != 3 or matrices.shape[1:] != (4, 4) or not len(matrices):
+        raise ValueError(
+            f"{name.split('[')[0]}: expected at least one pose of shape (4, 4), got shape {matrices.shape}"
+        )
+    with np.errstate(invalid="ignore", over="ignore"):
+        off = np.abs(matrices[:, :3, :3] @ matrices[:, :3, :3].swapaxes(1, 2) - np.eye(3)).max(axis=(1, 2))
+        exact = (off <= _EXACT) & (np.linalg.det(matrices[:, :3, :3]) > 0)
+    exact &= np.isfinite(matrices).all(axis=(1, 2)) & (matrices[:, 3] == [0, 0, 0, 1]).all(axis=1)
+    for k in np.flatnonzero(~exact):
+        matrices[k] = pose_matrix(matrices[k], name.format(k))
+    return matrices
+
+
 def nearest_rotation(matrix: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, "4 4"]:
     """The matrix with its upper left 3×3 block replaced by the nearest rotation (Frobenius norm)."""
     rotation = matrix[:3, :3]
     # A matrix that is a rotation to rounding is returned unchanged, so that the function is idempotent.
-    if np.abs(rotation @ rotation.T - np.eye(3)).max() <= 1e-14:
+    if np.abs(rotation @ rotation.T - np.eye(3)).max() <= _EXACT:
         return matrix
     left, _, right = np.linalg.svd(rotation)
     matrix = matrix.copy()

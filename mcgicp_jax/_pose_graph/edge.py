@@ -12,7 +12,7 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float, Int
 
 from mcgicp_jax._compute.concrete import is_concrete, numpy_for
-from mcgicp_jax._math.poses import Pose, adjoint, inverse, pose_matrix
+from mcgicp_jax._math.poses import Pose, adjoint, inverse, pose_matrices
 from mcgicp_jax._math.twists import logarithm, logarithm_derivative
 from mcgicp_jax._pose_graph.factors import WORLD, AbstractFactor
 
@@ -105,8 +105,7 @@ def checked_edges(edges: Edge, num_poses: int) -> Edge:
         outside = ((rows < 0) | (rows >= num_poses)) & ~np.asarray(other)
         _refuse(f"{name}: expected a row from 0 to {num_poses - 1}", outside, rows)
     _refuse("expected two different poses", i == j, i)
-    transforms = np.asarray(edges.T_i_j, np.float64)
-    transforms = np.array([pose_matrix(each, f"edges[{k}].T_i_j") for k, each in enumerate(transforms)])
+    transforms = pose_matrices(edges.T_i_j, "edges[{}].T_i_j") if len(i) else np.zeros((0, 4, 4))
     information = np.asarray(edges.information, np.float64)
     _refuse("information: expected finite numbers", np.isnan(information.sum(axis=(1, 2)) * 0.0), information)
     symmetric = 0.5 * (information + information.swapaxes(1, 2))
@@ -115,7 +114,7 @@ def checked_edges(edges: Edge, num_poses: int) -> Edge:
     asymmetry = np.abs(information - symmetric).max(axis=(1, 2), initial=0)
     _refuse("information: expected a symmetric matrix", asymmetry > limit, information)
     _refuse("information: expected a positive semidefinite matrix; eigenvalues", values[:, 0] < -limit, values)
-    return Edge(i, j, transforms.reshape(-1, 4, 4), symmetric, uncertain=np.asarray(edges.uncertain, bool))
+    return Edge(i, j, transforms, symmetric, uncertain=np.asarray(edges.uncertain, bool))
 
 
 def _refuse(what: str, bad: np.ndarray, values: np.ndarray) -> None:
@@ -148,6 +147,9 @@ def _inverse(covariance: Any) -> Any:
         raise ValueError(f"covariance: expected shape (6, 6), got {covariance.shape}")
     if not np.isfinite(covariance).all():
         raise ValueError("covariance: expected finite numbers, got NaN or infinity")
+    scale = np.sqrt(np.abs(np.diagonal(covariance, 0, -2, -1)))
+    if np.any(np.abs(covariance - covariance.swapaxes(-1, -2)) > _ROUNDING * scale[..., :, None] * scale[..., None, :]):
+        raise ValueError(f"covariance: expected a symmetric matrix, got {covariance}")
     try:
         np.linalg.cholesky(covariance)
     except np.linalg.LinAlgError as error:

@@ -41,3 +41,10 @@ class AbstractFactor(eqx.Module):
         Args:
             poses: sensor to world, metres; the identity for `WORLD`.
         """
+
+
+def check_rows(name: str, rows: Int[np.ndarray, "m k"], num_poses: int) -> None:
+    """Raise `ValueError` for rows of poses outside of the graph."""
+    outside = ((rows < 0) & (rows != WORLD)) | (rows >= num_poses)
+    if outside.any():
+        raise ValueError(f"{name}: expected rows from 0 to {num_poses - 1} or WORLD, got {rows[outside][0]}")

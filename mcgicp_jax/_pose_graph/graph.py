@@ -13,9 +13,9 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
 from mcgicp_jax._compute.concrete import is_concrete
-from mcgicp_jax._math.poses import Pose, pose_matrix
+from mcgicp_jax._math.poses import Pose, pose_matrices
 from mcgicp_jax._pose_graph.edge import Edge, checked_edges
-from mcgicp_jax._pose_graph.factors import WORLD, AbstractFactor
+from mcgicp_jax._pose_graph.factors import WORLD, AbstractFactor, check_rows
 from mcgicp_jax._pose_graph.initialization import initial_poses
 
 
@@ -59,15 +59,15 @@ class PoseGraph(eqx.Module):
             raise ValueError(f"edges: expected one leading axis, got shape {np.shape(self.edges.i)}")
         if poses is None:
             poses = _initial(self.edges)
-        elif not isinstance(poses, jax.Array):
-            poses = np.array([pose_matrix(pose, f"poses[{k}]") for k, pose in enumerate(poses)])  # type: ignore
-        if np.ndim(poses) != 3 or np.shape(poses)[1:] != (4, 4):
-            raise ValueError(f"poses: expected at least one pose of shape (4, 4), got shape {np.shape(poses)}")
-        self.poses = poses
+        elif is_concrete(poses):
+            poses = pose_matrices(poses)
+        if np.ndim(poses) != 3 or np.shape(poses)[1:] != (4, 4):  # type: ignore
+            raise ValueError(f"poses: expected at least one pose of shape (4, 4), got shape {np.shape(poses)}")  # type: ignore
+        self.poses = poses  # type: ignore
         if is_concrete(self.edges):
-            self.edges = checked_edges(self.edges, len(poses))
+            self.edges = checked_edges(self.edges, len(self.poses))
         for k, factor in enumerate(factors):
-            _check_factor(f"factors[{k}]", factor, len(poses))
+            _check_factor(f"factors[{k}]", factor, len(self.poses))
         self.factors = tuple(factors)
 
 
@@ -101,6 +101,4 @@ def _check_factor(name: str, factor: Any, num_poses: int) -> None:
             f"{name}: expected rows (m, k) with k of at least 2 and information (m, d, d), got {rows} and {information}"
         )
     if is_concrete(factor.rows):
-        outside = ((factor.rows < 0) & (factor.rows != WORLD)) | (factor.rows >= num_poses)
-        if outside.any():
-            raise ValueError(f"{name}: expected rows from 0 to {num_poses - 1} or WORLD, got {factor.rows[outside][0]}")
+        check_rows(name, np.asarray(factor.rows), num_poses)

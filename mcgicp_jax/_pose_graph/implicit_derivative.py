@@ -20,7 +20,7 @@ from mcgicp_jax._compute.callbacks import call_host
 from mcgicp_jax._compute.concrete import AnyArray, is_concrete
 from mcgicp_jax._compute.lazy import Lazy
 from mcgicp_jax._math.twists import exponential
-from mcgicp_jax._pose_graph.factors import WORLD, AbstractFactor
+from mcgicp_jax._pose_graph.factors import WORLD, AbstractFactor, check_rows
 from mcgicp_jax._pose_graph.normal_equations import factored
 from mcgicp_jax._pose_graph.solver import Factors, Solution, covariances_at, solve
 from mcgicp_jax._registration.result import Status
@@ -111,6 +111,9 @@ def _solved(
     dtype, n = jnp.result_type(*_floats((poses, factors))), len(poses)
 
     def on_host(poses: Any, factors: Any) -> Any:
+        for k, factor in enumerate(factors):
+            # Indices of traced arrays are not known before.
+            check_rows(f"factors[{k - 1}]" if k else "edges", np.asarray(factor.rows), n)
         solution = solve(poses, factors, robust, max_iterations, exact=True)
         numbers: Any = (solution.poses(n), solution.residuals, solution.weights, solution.cost)
         counts: Any = (np.int32(solution.status), np.int32(solution.found.num_iterations))

@@ -5,14 +5,13 @@ from __future__ import annotations
 from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float
 
 from mcgicp_jax._math.poses import matrices_of, parameters_of
 from mcgicp_jax._pose_graph.edge import Edge
 from mcgicp_jax._pose_graph.factors import WORLD
-from mcgicp_jax._pose_graph.graph import PoseGraph
 from mcgicp_jax._pose_graph.levenberg_marquardt import Minimum, minimize, refine
-from mcgicp_jax._pose_graph.marginal_covariances import pose_covariances, propagated
+from mcgicp_jax._pose_graph.marginal_covariances import pose_covariances
 from mcgicp_jax._pose_graph.normal_equations import (
     NormalEquations,
     factored,
@@ -20,7 +19,7 @@ from mcgicp_jax._pose_graph.normal_equations import (
     normal_blocks,
     typical_information,
 )
-from mcgicp_jax._pose_graph.outliers import robust_minimum, thresholds
+from mcgicp_jax._pose_graph.outliers import robust_minimum
 from mcgicp_jax._pose_graph.unmeasured import unmeasured
 from mcgicp_jax._registration.result import Status
 
@@ -109,22 +108,6 @@ def covariances_at(
         equations = NormalEquations(factors, centred, weights > 0)
         found = Minimum(centred, equations.terms(centred))
         return pose_covariances(equations, found, weights)[: len(poses)]
-
-
-def motion_covariances(
-    graph: PoseGraph, i: Int[np.ndarray, "k"], j: Int[np.ndarray, "k"]
-) -> Float[np.ndarray, "k 6 6"]:
-    """Covariances of ξ in T_i⁻¹ T_j exp(ξ), at the poses of a graph, taken to be its minimum; outliers do not count.
-
-    Infinite if no measurements connect the two poses.
-    """
-    poses, factors, _ = _centred(np.asarray(graph.poses), (graph.edges, *graph.factors))
-    equations = NormalEquations(factors, poses)
-    found = Minimum(poses, equations.terms(poses))
-    rejected = found.terms.squares > thresholds(equations)
-    kept = ~(rejected & np.concatenate([np.asarray(factor.uncertain) for factor in factors]))
-    rows = np.stack([i, j], axis=1)
-    return propagated(equations.restricted(kept), found, 1.0 * kept, rows, motion_jacobians(poses[rows]))
 
 
 def _centred(

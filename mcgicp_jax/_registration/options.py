@@ -5,7 +5,7 @@ from __future__ import annotations
 import difflib
 import inspect
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from typing import Any, TypeAlias, TypedDict
 
 import numpy as np
@@ -26,7 +26,11 @@ ROTATION_TOLERANCE = 5e-4
 
 @dataclass(frozen=True)
 class Options:
-    """Options of `register`, documented there; batches, odometry and the command line take the same ones."""
+    """Options of `register`, documented there; batches, odometry and the command line take the same ones.
+
+    Attributes:
+        reach: least coarse `max_distance` at all scales, metres: for initial poses known to be that far off.
+    """
 
     max_distance: Distance | None = None
     max_iterations: int = 64
@@ -37,6 +41,7 @@ class Options:
     hold_unconstrained: bool = True
     equalize_channels: bool = False
     voxel_sizes: Sequence[float] = ()
+    reach: float = 0.0
 
     def __post_init__(self) -> None:
         if self.max_distance is not None:
@@ -84,7 +89,7 @@ def options_of(function: Callable[..., Any], given: Any) -> Options:
     """The options of `register` given to another function; raises `TypeError` for a name that neither function has."""
     parameters = inspect.signature(function).parameters.values()
     named = [each.name for each in parameters if each.kind is not inspect.Parameter.VAR_KEYWORD]
-    names = [*(field.name for field in fields(Options)), *named]
+    names = [*GivenOptions.__annotations__, *named]
     for name in given.keys() - names:
         close = difflib.get_close_matches(name, names)
         known = f"did you mean {' or '.join(close)}?" if close else f"expected one of {', '.join(sorted(names))}"

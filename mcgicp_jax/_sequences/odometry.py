@@ -4,16 +4,18 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
+from functools import partial
 from typing import Any, Literal, Unpack
 
 import numpy as np
 from jaxtyping import Float
 
 from mcgicp_jax._clouds.frame import Frame
-from mcgicp_jax._clouds.point_cloud import PointCloud, Values
+from mcgicp_jax._clouds.point_cloud import PointCloud, Values, as_cloud
 from mcgicp_jax._clouds.preprocess import check_preprocessing, preprocess
 from mcgicp_jax._clouds.voxel_map import VoxelMap
-from mcgicp_jax._compute.argument_checks import check_positive
+from mcgicp_jax._compute.argument_checks import check_positive, errors_named
+from mcgicp_jax._compute.lazy import Lazy
 from mcgicp_jax._local_geometry.spacing_and_noise import point_spacing
 from mcgicp_jax._math.poses import Pose, nearest_rotation, pose_matrix
 from mcgicp_jax._methods.base import AbstractMethod
@@ -32,16 +34,27 @@ class OdometryStep:
     Attributes:
         cloud: the preprocessed cloud, in the sensor's frame.
         pose: (4, 4) float64, sensor to world, metres.
-        registration: registration of this frame to the previous one (or with `against="map"`, or after a recovery, to
-            the map, in the world's frame), None for the first; check its `converged`.
-        graph: with `loops`, the poses of all frames so far, corrected by the loops, and the edges between them;
-            `optimize_poses(step.graph)` computes their covariances. None otherwise.
+        registration: registration of this frame, None for the first; check its `converged`. Its matrix maps to the
+            previous frame, or with `against="map"`, or where the frame was found again by `recover`, to the world. Of a
+            lost frame, it maps to the previous frame, and that of the first lost one was not used.
+        lost: with `recover`, whether the pose in the world is not known: it was extrapolated, or follows an
+            extrapolated one by registrations to the previous frame.
+        deferred_graph: value of `graph`.
     """
 
     cloud: PointCloud
     pose: Float[np.ndarray, "4 4"]
     registration: RegistrationResult | None
-    graph: PoseGraph | None = None
+    lost: bool = False
+    deferred_graph: Lazy[PoseGraph] | None = None
+
+    @property
+    def graph(self) -> PoseGraph | None:
+        """With `loops`, the poses of all frames so far and the edges between them, made when first read; else None.
+
+        Loops that were closed until then have corrected the poses. `optimize_poses(step.graph)` computes covariances.
+        """
+        return None if self.deferred_graph is None else self.deferred_graph.value
 
 
 def odometry(
@@ -77,19 +90,21 @@ def odometry(
         map_radius: metres; by default the distance of the farthest point of the first frame from its sensor.
         recover: relocalise after a jump: if a registration does not converge or its overlap drops by a fifth, find the
             frame by `global_pose` in a map of all previous frames, which is kept in memory. If relocalisation fails and
-            the registration has too few matches, or less than half of the previous overlap, tracking is lost: poses are
-            extrapolated with constant velocity and the map is not updated until a frame is relocalised.
+            the registration has too few matches, or less than half of the previous overlap, tracking is lost: the pose
+            is extrapolated with constant velocity, and the next frames follow it, registered to the previous frame,
+            outside of the map, until one is relocalised.
         loops: close loops: register a frame to an earlier one whose position is near, within the uncertainty of the
             poses, and correct all poses by `optimize_poses`. Steps keep the pose known at their time; the corrected
             poses are in the `graph` of the last step. All clouds are kept in memory. Not with `against="map"` or
             `recover`.
         options: options of `register`, except for `tie_points` and `prior`.
 
-    Yields:
-        One `OdometryStep` per frame, including the first.
+    Returns:
+        Iterator over one `OdometryStep` per frame, including the first.
 
     Raises:
-        ValueError: on iteration, if a cloud or an argument is invalid; for a cloud the message names the frame.
+        ValueError: if an argument is invalid; on iteration, if a cloud is. The message names the frame, and the
+            iteration may go on with the next one: that one is registered to the last valid frame.
     """
     check_preprocessing(voxel_size, num_neighbors)
     check_method(method)
@@ -101,83 +116,94 @@ def odometry(
         raise ValueError(
             'loops: expected against="previous" and no recover: registrations to the previous frame become edges'
         )
-    sensor = _Sensor(
-        method, options_of(odometry, options), num_neighbors, pose_matrix(init), np.asarray(pose_matrix(start, "start"))
+    return _Sensor(
+        frames=enumerate(frames),
+        method=method,
+        options=options_of(odometry, options),
+        preprocessing=(voxel_size, num_neighbors),
+        motion=pose_matrix(init),
+        pose=np.asarray(pose_matrix(start, "start")),
+        against_map=against == "map",
+        radius=map_radius,
+        recover=recover,
+        trajectory=Trajectory(method, options_of(odometry, options)) if loops else None,
     )
-    for i, frame in enumerate(frames):
-        try:
-            cloud = _prepared(frame, voxel_size, num_neighbors)
-        except ValueError as error:
-            raise ValueError(f"frames[{i}]: {error}") from error
-        if i == 0:
-            voxel = voxel_size or float(point_spacing(cloud))
-            farthest = float(np.linalg.norm(cloud.coordinates, axis=1).max())
-            sensor.world = VoxelMap(voxel) if against == "map" else None
-            sensor.radius = farthest if map_radius is None else map_radius
-            sensor.places = Relocalizer(voxel) if recover else None
-            sensor.trajectory = Trajectory(method, sensor.options) if loops else None
-        yield sensor.add(f"frames[{i}]", cloud)
 
 
 @dataclass
-class _Sensor:
-    """The sensor at its last frame, and the maps of the previous frames.
+class _Sensor(Iterator[OdometryStep]):
+    """The sensor at its last frame, and the maps of the previous frames. A class, as generators end when they raise.
 
     Attributes:
+        preprocessing: voxel size and number of neighbours.
         motion: (4, 4), between the last two frames.
         pose: (4, 4), sensor to world.
+        radius: metres around the sensor beyond which points leave the map.
+        trajectory: poses and edges; None without loop closure.
         cloud: the last frame; None before the first.
         world: the map that frames are registered to; None registers them to the previous frame.
-        radius: metres around the sensor beyond which points leave the map.
         places: the map in which lost frames are found; None without relocalisation.
-        trajectory: poses and edges; None without loop closure.
     """
 
+    frames: Iterator[tuple[int, Frame | PointCloud | Values]]
     method: AbstractMethod
     options: Options
-    num_neighbors: int
+    preprocessing: tuple[float | None, int]
     motion: Any
     pose: Float[np.ndarray, "4 4"]
+    against_map: bool
+    radius: Any
+    recover: bool
+    trajectory: Trajectory | None
     cloud: PointCloud | None = None
-    world: VoxelMap | None = None
-    radius: float = np.inf
+    world: Any = None
     places: Relocalizer | None = None
-    trajectory: Trajectory | None = None
 
-    def add(self, name: str, cloud: PointCloud) -> OdometryStep:
+    @property
+    def is_lost(self) -> bool:
+        return self.places is not None and self.places.is_lost
+
+    def __next__(self) -> OdometryStep:
         """Locate the sensor at the next frame, and add the frame to the maps."""
+        number, frame = next(self.frames)
+        name = f"frames[{number}]"
+        cloud = as_cloud(name, frame.cloud if isinstance(frame, Frame) else frame)
+        if cloud.neighbors is None:
+            with errors_named(name):
+                cloud = preprocess(cloud, *self.preprocessing)
+        if self.cloud is None:
+            voxel = self.preprocessing[0] or float(point_spacing(cloud))
+            self.world = VoxelMap(voxel) if self.against_map else None
+            self.places = Relocalizer(voxel) if self.recover else None
+            if self.radius is None:
+                self.radius = float(np.linalg.norm(cloud.coordinates, axis=1).max())
         result = None if self.cloud is None else self._located(cloud, self.cloud)
-        if self.places is not None:
-            self.places.add(name, cloud, self.pose)
+        for known in (self.places, self.world):
+            if known is not None and not self.is_lost:
+                known.add(name, cloud, self.pose)
         if self.world is not None:
-            self.world.add(name, cloud, self.pose)
             self.world.forget(self.pose[:3, 3], self.radius)
+        graph = None
         if self.trajectory is not None:
             self.pose = self.trajectory.add(cloud, self.pose, result)
+            graph = Lazy(partial(self.trajectory.graph, *self.trajectory.size))
         self.cloud = cloud
-        graph = None if self.trajectory is None else self.trajectory.graph
-        return OdometryStep(cloud, self.pose, None if result is None else computed(result), graph)
+        return OdometryStep(cloud, self.pose, None if result is None else computed(result), self.is_lost, graph)
 
     def _located(self, cloud: PointCloud, before: PointCloud) -> RegistrationResult:
         """Update motion and pose by a registration."""
-        if self.world is None:
+        follows = self.world is None or self.is_lost
+        if follows:
             result = register_pair(cloud, before, self.method, self.motion, self.options)
         else:
-            target = map_target(self.world.cloud(), self.method, self.options, self.num_neighbors)
+            target = map_target(self.world.cloud(), self.method, self.options, self.preprocessing[1])
             result = register_pair(cloud, target, self.method, self.pose @ self.motion, self.options)
-        found = None
+        known, found = not self.is_lost, None
         if self.places is not None:
-            found = self.places.corrected(cloud, result, self.method, self.options, self.num_neighbors)
-        lost = self.places is not None and self.places.is_lost
-        if found is None and not lost and is_usable(result):
-            relative = self.world is None
-            self.motion = np.asarray(result.matrix) if relative else np.linalg.solve(self.pose, result.matrix)
+            found = self.places.corrected(cloud, result, self.method, self.options, self.preprocessing[1])
+        # The result with which tracking is lost is not used, those of the frames that follow are.
+        if found is None and not (known and self.is_lost) and is_usable(result):
+            self.motion = np.asarray(result.matrix) if follows else np.linalg.solve(self.pose, result.matrix)
         # The product of thousands of rounded rotations would drift away from a rotation.
         self.pose = nearest_rotation(self.pose @ self.motion if found is None else np.asarray(found.matrix))
         return result if found is None else found
-
-
-def _prepared(frame: Frame | PointCloud | Values, voxel_size: float | None, num_neighbors: int) -> PointCloud:
-    cloud = frame.cloud if isinstance(frame, Frame) else frame
-    cloud = cloud if isinstance(cloud, PointCloud) else PointCloud(cloud)
-    return cloud if cloud.neighbors is not None else preprocess(cloud, voxel_size, num_neighbors)

@@ -55,12 +55,14 @@ class Relocalizer:
                 self.is_lost = False
                 return found
         self.is_lost = self.is_lost or not is_usable(result) or overlap < _LOST * self._overlap
+        if not self.is_lost:
+            # Else every frame after a rest of the sensor would be looked for in the map.
+            self._overlap = overlap
         return None
 
     def add(self, name: str, cloud: PointCloud, pose: Float[np.ndarray, "4 4"]) -> None:
-        """Add a frame to the map, unless it is lost; `name` is for error messages."""
-        if not self.is_lost:
-            self._world.add(name, cloud, pose)
+        """Add a frame to the map; `name` is for error messages."""
+        self._world.add(name, cloud, pose)
 
 
 def map_target(cloud: PointCloud, method: AbstractMethod, options: Options, num_neighbors: int) -> PointCloud:
