@@ -50,10 +50,15 @@ def test_no_more_threads_than_asked_for_are_at_work(monkeypatch):
 
     with ThreadPoolExecutor(8) as threads:
         monkeypatch.setattr(_threads, "_threads", lambda: threads)
+        monkeypatch.setattr(_threads, "num_cores", lambda: 8)
         side_by_side([work] * 20, 3)
         assert max(peak) == 3
         peak.clear()
         side_by_side([work] * 20, 1)
+        assert max(peak) == 1
+        peak.clear()
+        monkeypatch.setattr(_threads, "num_cores", lambda: 1)
+        side_by_side([work] * 20)
         assert max(peak) == 1
 
 

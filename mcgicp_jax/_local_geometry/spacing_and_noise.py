@@ -87,25 +87,29 @@ def _spacings(cloud: PointCloud) -> tuple[Float[AnyScalar, ""], Float[AnyScalar,
 
 
 def _measured_spacings(cloud: PointCloud) -> tuple[Float[AnyScalar, ""], Float[AnyScalar, ""]]:
-    distances = _neighbor_distances(cloud)
-    xp = numpy_for(distances)
-    nearest = xp.min(xp.where(distances > 0, distances, xp.inf), axis=1)
+    squares = _squared_neighbor_distances(cloud)
+    xp = numpy_for(squares)
+    nearest = xp.sqrt(xp.min(xp.where(squares > 0, squares, xp.inf), axis=0))
     spacing = xp.nan_to_num(median(xp.where(xp.isfinite(nearest), nearest, xp.nan)))
-    known = xp.isfinite(distances)
-    count = xp.sum(known, axis=1)
-    grid = xp.max(xp.where(known, distances, 0), axis=1) * xp.sqrt(xp.pi / xp.maximum(count, 1))
-    return spacing, xp.nan_to_num(median(xp.where(count > 1, grid, xp.nan))).astype(distances.dtype)
+    known = xp.isfinite(squares)
+    count = xp.sum(known, axis=0)
+    grid = xp.sqrt(xp.max(xp.where(known, squares, 0), axis=0)) * xp.sqrt(xp.pi / xp.maximum(count, 1))
+    return spacing, xp.nan_to_num(median(xp.where(count > 1, grid, xp.nan))).astype(squares.dtype)
 
 
-def _neighbor_distances(cloud: PointCloud) -> Float[AnyArray, "n k"]:
-    """Distances between sampled points and their neighbours, metres; infinite where there is none."""
+def _squared_neighbor_distances(cloud: PointCloud) -> Float[AnyArray, "k n"]:
+    """Squared distances between the neighbours of sampled points and the points, metres²; infinite where there is none.
+
+    Neighbours come first, so that NumPy's loops run over the points.
+    """
     check_neighbors(cloud)
     xp = numpy_for(cloud)
     rows, counts = sampled_rows(xp.asarray(cloud.valid))
-    neighbors = xp.asarray(cloud.neighbors)[rows]
-    square = xp.zeros(neighbors.shape, cloud.points.dtype)
+    neighbors = xp.asarray(cloud.neighbors)[rows].T.copy()
+    near = xp.maximum(neighbors, 0)
+    square = xp.zeros(near.shape, cloud.points.dtype)
     # Distances that overflow become infinite and are ignored.
     with np.errstate(over="ignore", invalid="ignore"):
         for coordinate in xp.asarray(cloud.points).T:
-            square = square + (coordinate[xp.maximum(neighbors, 0)] - coordinate[rows, None]) ** 2
-    return xp.sqrt(xp.where(counts[:, None] & (neighbors >= 0) & xp.isfinite(square), square, xp.inf))
+            square = square + (xp.take(coordinate, near) - coordinate[rows]) ** 2
+    return xp.where(counts & (neighbors >= 0) & xp.isfinite(square), square, xp.inf)
