@@ -374,11 +374,7 @@ def test_the_sums_say_what_the_correspondences_say(kernel):
         left = d - D @ np.append(p - center, 1)
         expected += weight * left @ M @ left
     Q = np.zeros((3, 4, 3, 4))
-    three, four = np.triu_indices(3), np.triu_indices(4)
-    for row, (i, j) in enumerate(zip(*three, strict=True)):
-        for column, (k, l) in enumerate(zip(*four, strict=True)):
-            for p, q in {(i, j), (j, i)}:
-                for r, s in {(k, l), (l, k)}:
-                    Q[p, r, q, s] = found.stiffness[row, column]
+    for row, (i, j) in enumerate(zip(*np.triu_indices(3), strict=True)):
+        Q[i, :, j] = Q[j, :, i] = found.stiffness[row]
     actual = float(found.energy) - 2 * np.sum(D * np.asarray(found.force)) + np.einsum("ij,ijkl,kl", D, Q, D)
     assert actual == pytest.approx(expected, rel=tolerance(1e-4, 1e-10))

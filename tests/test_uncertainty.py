@@ -86,7 +86,7 @@ def test_directions_are_the_eigenvectors_of_the_share_of_motion(seed, held, radi
     normals = rng.normal(size=(200, 3))
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
     matrices = np.einsum("ni,nj->nij", normals, normals) * (held / 6)
-    hh = np.einsum("in,jn->ijn", *[np.concatenate([p, np.ones((1, 200))])] * 2)[np.triu_indices(4)]
+    h = np.concatenate([p, np.ones((1, 200))])
     upper = matrices[:, *np.triu_indices(3)].T
     sums = Sums(
         center=np.zeros(3),
@@ -97,9 +97,9 @@ def test_directions_are_the_eigenvectors_of_the_share_of_motion(seed, held, radi
         square_distance=np.array(0.0),
         num_matched=np.array(200.0),
         force=np.zeros((3, 4)),
-        stiffness=np.zeros((6, 10)),
-        mass=hh @ weight,
-        observability=(weight * upper) @ hh.T,
+        stiffness=np.zeros((6, 4, 4)),
+        mass=weight * h @ h.T,
+        observability=np.einsum("rn,in,jn->rij", weight * upper, h, h),
     )
     found = jax.jit(find_directions)(jax.tree.map(lambda array: jnp.asarray(array, float), sums))
     arms = p.T / radius

@@ -29,7 +29,7 @@ from mcgicp_jax._math.poses import adjoint_to_source, units
 from mcgicp_jax._math.statistics import cell_numbers, median
 from mcgicp_jax._pose_solver.degeneracy import Directions
 from mcgicp_jax._pose_solver.matched import Matched, Motion, linearize_at
-from mcgicp_jax._pose_solver.sums import mean_observability, powers
+from mcgicp_jax._pose_solver.sums import mean_observability, moments_about, with_one
 from mcgicp_jax._pose_solver.update import twist_form
 from mcgicp_jax._terms.base import AbstractTerm, PosedMatches, linearize
 
@@ -122,7 +122,7 @@ class Scores(NamedTuple):
     wrenches: Float[AnyArray, "n 6"]
     valid: Float[AnyArray, "n"]
     cells: Int[AnyArray, "n"] | None
-    jacobian: Float[AnyArray, "6 10"]
+    jacobian: Float[AnyArray, "6 4 4"]
     bias: Float[AnyArray, "6"]
 
 
@@ -175,7 +175,7 @@ def scores_of(
             bias = jnp.sum(_wrench(arms, left_out), axis=1)
             if all(term.matches_slide for term in terms):
                 stiffness = alg.symmetric_product(stiffness, shown)
-    jacobian = jnp.dot(stiffness, powers(arms * frame.radius).T, precision="highest")
+    jacobian = moments_about(stiffness, with_one(arms * frame.radius))
     return Scores(_wrench(arms, found.force).T, matched.valid.astype(moved.dtype), cells, jacobian, bias)
 
 
@@ -227,7 +227,7 @@ class Moments(NamedTuple):
         num_cells: number of cells with valid correspondences.
     """
 
-    jacobian: Float[AnyArray, "6 10"]
+    jacobian: Float[AnyArray, "6 4 4"]
     bias: Float[AnyArray, "6"]
     scatter: Float[AnyArray, "6 6"]
     num_cells: Int[AnyArray, ""]

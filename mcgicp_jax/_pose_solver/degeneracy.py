@@ -76,8 +76,8 @@ def find_directions(sums: Sums) -> Directions:
     if sums.mass is None or sums.observability is None:
         raise ValueError("sums: expected those of surfaces with observability")
     center, radius = sums.center, sums.radius
-    total = jnp.where(sums.mass[9] > 0, sums.mass[9], 1)
-    motion = twist_form(jnp.outer(_IDENTITY.astype(total.dtype), sums.mass / total), radius)
+    total = jnp.where(sums.mass[3, 3] > 0, sums.mass[3, 3], 1)
+    motion = twist_form(_IDENTITY.astype(total.dtype)[:, None, None] * (sums.mass / total), radius)
     geometry = twist_form(sums.observability / total, radius)
     # Each decomposition needs the result of the last: concurrent batched LAPACK calls can deadlock XLA's thread pool.
     # The floor: points on a line do not move when they turn about it, so that rotation is not observed.

@@ -45,7 +45,7 @@ def root_near(sums: Sums, usable: Bool[Array, ""], fusion: Fusion | None) -> Imp
         return ImplicitRoot(center=jnp.asarray(fusion.center), radius=radius, scale=radius, usable=usable)
     radius = jnp.where(usable, sums.radius, 1)
     # The trace of Σ K, in the unit of g.
-    scale = jnp.sum(sums.stiffness[jnp.array([0, 3, 5]), 9]) * radius**2
+    scale = jnp.sum(sums.stiffness[jnp.array([0, 3, 5]), 3, 3]) * radius**2
     return ImplicitRoot(
         center=jnp.where(usable, sums.center, 0), radius=radius, scale=jnp.where(usable, scale, 1), usable=usable
     )

@@ -2,7 +2,7 @@
 
 With the residual d = b − T a and the robust weight w, each correspondence has a force f = w M d (3), a stiffness
 K = w M (3×3) and a cost. About a centre c, with p = T a − c and h = (p, 1), the sums are G = Σ f hᵀ (12 numbers),
-Q = Σ K ⊗ h hᵀ (60) and e = Σ dᵀ f. With the observability O of each correspondence (3×3, see
+Q = Σ K ⊗ h hᵀ (6 × 16) and e = Σ dᵀ f. With the observability O of each correspondence (3×3, see
 `_local_geometry.observability`), Σ w O ⊗ h hᵀ is added.
 """
 
@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
@@ -19,7 +20,6 @@ from mcgicp_jax._math import symmetric_matrices as alg
 from mcgicp_jax._pose_solver.matched import Matched, Motion, linearize_at
 from mcgicp_jax._terms.base import AbstractTerm, PosedMatches, channel_observability
 
-_UPPER = np.triu_indices(4)
 # Fields of `Sums` that are sums over h hᵀ.
 _SECOND_MOMENTS = ("stiffness", "mass", "observability", "channel_observability")
 
@@ -27,8 +27,8 @@ _SECOND_MOMENTS = ("stiffness", "mass", "observability", "channel_observability"
 class Sums(NamedTuple):
     """Sums over correspondences, see the module. The centre c is the centroid of the moved, matched source points.
 
-    Taken about this centre and at the current pose, the sums remain precise in float32. Symmetric matrices are stored
-    as upper triangles: 6 entries of 3×3, 10 of h hᵀ.
+    Taken about this centre and at the current pose, the sums remain precise in float32. Symmetric 3×3
+    matrices are stored as upper triangles, h hᵀ is stored whole.
 
     Attributes:
         center: c, metres.
@@ -53,10 +53,10 @@ class Sums(NamedTuple):
     square_distance: Float[AnyArray, "*batch"]
     num_matched: Float[AnyArray, "*batch"]
     force: Float[AnyArray, "*batch 3 4"]
-    stiffness: Float[AnyArray, "*batch 6 10"]
-    mass: Float[AnyArray, "*batch 10"] | None = None
-    observability: Float[AnyArray, "*batch 6 10"] | None = None
-    channel_observability: Float[AnyArray, "*batch 6 10"] | None = None
+    stiffness: Float[AnyArray, "*batch 6 4 4"]
+    mass: Float[AnyArray, "*batch 4 4"] | None = None
+    observability: Float[AnyArray, "*batch 6 4 4"] | None = None
+    channel_observability: Float[AnyArray, "*batch 6 4 4"] | None = None
 
     @property
     def radius(self) -> Float[AnyScalar, ""]:
@@ -76,37 +76,72 @@ class Sums(NamedTuple):
 
 
 def sums_of(motion: Motion, matched: Matched, terms: tuple[AbstractTerm, ...]) -> Sums:
-    """Compute the sums at a pose in one pass over the correspondences, the only part of a step that touches points."""
+    """Compute the sums at a pose in one pass over the correspondences, the only part of a step that touches points.
+
+    All sums but those for the centre are rows of one product with h hᵀ: sums of their own would be programs of several
+    loops each, which evaluate the same expressions again.
+    """
     posed, found, counts = linearize_at(motion, matched, terms)
-    moved = posed.moved
-    mask = jnp.asarray(matched.valid).astype(moved.dtype)
-    count = jnp.sum(mask)
-    center = jnp.sum(mask * moved, axis=1) / jnp.maximum(count, 1)
-    p = mask * (moved - center[:, None])
-    h = jnp.concatenate([p, jnp.ones_like(p[:1])])
+    mask = jnp.asarray(matched.valid).astype(posed.moved.dtype)
+    *total, count = jnp.dot(with_one(posed.moved), mask, precision="highest")
+    center = jnp.stack(total) / jnp.maximum(count, 1)
+    h = with_one(mask * (posed.moved - center[:, None]))
+    share = _share(counts, matched.num_candidates)
     shown = mean_observability(posed, terms)
-    # One product for all sums over h hᵀ.
-    rows = [found.stiffness]
+    rows = [
+        found.stiffness,
+        found.force,
+        jnp.stack(
+            [
+                mask,
+                alg.inner(found.residual, found.force),
+                found.cost,
+                share * alg.inner(found.residual, found.residual),
+                _first_of_each(mask, matched.num_candidates),
+            ]
+        ),
+    ]
     if shown:
         rows += [found.weight[None], *(found.weight * each for each in shown)]
-    sums = jnp.dot(jnp.concatenate(rows), powers(p).T, precision="highest")
-    stiffness, *others = jnp.split(sums, np.cumsum([len(row) for row in rows])[:-1])
-    num_matched = jnp.sum(jnp.any(jnp.asarray(matched.valid).reshape(matched.num_candidates, -1), axis=0))
-    square = alg.inner(found.residual, found.residual)
+    stiffness, force, numbers, *others = jnp.split(
+        moments_about(jnp.concatenate(rows), h), np.cumsum([len(row) for row in rows])[:-1]
+    )
+    _, energy, cost, square_distance, num_matched = numbers[:, 3, 3]
     return Sums(
         center=center,
         count=count,
-        square_extent=jnp.sum(p * p),
-        energy=jnp.sum(found.residual * found.force),
-        cost=jnp.sum(found.cost),
-        square_distance=jnp.sum(_share(counts, matched.num_candidates) * square),
-        num_matched=num_matched.astype(moved.dtype),
-        force=jnp.dot(found.force, h.T, precision="highest"),
+        square_extent=jnp.trace(numbers[0, :3, :3]),
+        energy=energy,
+        cost=cost,
+        square_distance=square_distance,
+        num_matched=num_matched,
+        force=force[:, 3],
         stiffness=stiffness,
         mass=others[0][0] if shown else None,
         observability=others[1] if shown else None,
         channel_observability=others[2] if len(shown) > 1 else None,
     )
+
+
+def with_one(points: Float[Array, "3 n"]) -> Float[Array, "4 n"]:
+    """h = (p, 1) of each point."""
+    return jnp.concatenate([points, jnp.ones_like(points[:1])])
+
+
+def moments_about(rows: Float[Array, "R n"], h: Float[Array, "4 n"]) -> Float[Array, "R 4 4"]:
+    """Σ r h hᵀ for each row r of numbers."""
+    # Without the barrier XLA evaluates h anew for each of the sixteen products.
+    h = jax.lax.optimization_barrier(h)
+    products = (h[:, None] * h[None]).reshape(16, -1)
+    return jnp.dot(rows, products.T, precision="highest").reshape(-1, 4, 4)
+
+
+def _first_of_each(mask: Float[Array, "n"], num_candidates: int) -> Float[Array, "n"]:
+    """1 for the first valid candidate of each source point."""
+    if num_candidates == 1:
+        return mask
+    each = mask.reshape(num_candidates, -1)
+    return jnp.where(jnp.cumsum(each, axis=0) == 1, each, 0).reshape(-1)
 
 
 def _share(counts: Float[Array, "n"], num_candidates: int) -> Float[Array, "n"]:
@@ -128,12 +163,6 @@ def mean_observability(posed: PosedMatches, terms: tuple[AbstractTerm, ...]) -> 
     return found
 
 
-def powers(p: Float[Array, "3 N"]) -> Float[Array, "10 N"]:
-    """The upper triangle of h hᵀ with h = (p, 1)."""
-    x, y, z = p
-    return jnp.stack([x * x, x * y, x * z, x, y * y, y * z, y, z * z, z, jnp.ones_like(x)])
-
-
 def combine(parts: Sums) -> Sums:
     """Add the sums of blocks, stacked along the first axis, after moving them to the common centroid. NumPy, float64.
 
@@ -150,20 +179,17 @@ def combine(parts: Sums) -> Sums:
 def _about(center: Float[np.ndarray, "3"], parts: Sums) -> Sums:
     """The sums of blocks about another centre."""
     offset = parts.center - center
-    shift = np.tile(np.eye(4), (len(offset), 1, 1))
+    shift = np.zeros((len(offset), 4, 4)) + np.eye(4)
     shift[:, :3, 3] = offset
 
     # All sums over h hᵀ at once.
     names = [name for name in _SECOND_MOMENTS if getattr(parts, name) is not None]
-    rows = [getattr(parts, name).reshape(len(offset), -1, 10) for name in names]
-    sums = np.concatenate(rows, axis=1)
-    full = np.empty((*sums.shape[:2], 4, 4))
-    full[..., _UPPER[0], _UPPER[1]] = full[..., _UPPER[1], _UPPER[0]] = sums
-    full = shift[:, None] @ full @ shift[:, None].swapaxes(-1, -2)
-    moved = np.split(full[..., _UPPER[0], _UPPER[1]], np.cumsum([each.shape[1] for each in rows])[:-1], axis=1)
+    rows = [getattr(parts, name).reshape(len(offset), -1, 4, 4) for name in names]
+    sums = shift[:, None] @ np.concatenate(rows, axis=1) @ shift[:, None].swapaxes(-1, -2)
+    moved = np.split(sums, np.cumsum([each.shape[1] for each in rows])[:-1], axis=1)
     shaped = {name: each.reshape(getattr(parts, name).shape) for name, each in zip(names, moved, strict=True)}
     return parts._replace(
-        square_extent=parts.square_extent + parts.count * np.einsum("bi,bi->b", offset, offset),
-        force=np.einsum("bij,bkj->bik", parts.force, shift),
+        square_extent=parts.square_extent + parts.count * np.sum(offset * offset, axis=1),
+        force=parts.force @ shift.swapaxes(-1, -2),
         **shaped,
     )

@@ -19,9 +19,8 @@ from mcgicp_jax._pose_solver.sums import Sums
 _HESSIAN_SCALE = 1e4
 # Iteration limit. Levenberg-Marquardt was seen to take at most 16, with noisy data.
 _MAX_STEPS = 32
-# Row and column of each stored entry of the symmetric 3×3 and 4×4 matrices.
-_SYMMETRIC_3 = ((0, 1, 2), (1, 3, 4), (2, 4, 5))
-_SYMMETRIC_4 = ((0, 1, 2, 3), (1, 4, 5, 6), (2, 5, 7, 8), (3, 6, 8, 9))
+# Stored entry of each row and column of the symmetric 3×3 matrices.
+_SYMMETRIC = ((0, 1, 2), (1, 3, 4), (2, 4, 5))
 # (12, 6) derivative at the identity of vec D by ξ = (v, ω): D = [ω× | v], flattened row by row.
 _TANGENT = (
     (0, 0, 0, 0, 0, 0),
@@ -128,12 +127,10 @@ def _quadratic_form(sums: Sums, radius: Float[Array, ""]) -> Float[Array, "13 13
     return jnp.block([[quadratic, -linear[:, None]], [-linear[None, :], constant[None, None]]])
 
 
-def _unit_quadratic(second: Float[Array, "6 10"], radius: Float[Array, ""]) -> Float[Array, "12 12"]:
+def _unit_quadratic(second: Float[Array, "6 4 4"], radius: Float[Array, ""]) -> Float[Array, "12 12"]:
     lengths = _unit_lengths(radius)
-    rows = jnp.asarray(_SYMMETRIC_3)[:, None, :, None]
-    columns = jnp.asarray(_SYMMETRIC_4)[None, :, None, :]
-    quadratic = second[rows, columns] * lengths[None, :, None, None] * lengths[None, None, None, :]
-    return quadratic.reshape(12, 12)
+    scaled = second * lengths[:, None] * lengths
+    return scaled[jnp.asarray(_SYMMETRIC)].transpose(0, 2, 1, 3).reshape(12, 12)
 
 
 def _unit_lengths(radius: Float[Array, ""]) -> Float[Array, "4"]:
@@ -141,7 +138,7 @@ def _unit_lengths(radius: Float[Array, ""]) -> Float[Array, "4"]:
     return jnp.stack([1 / radius, 1 / radius, 1 / radius, jnp.ones_like(radius)])
 
 
-def twist_form(second: Float[Array, "6 10"], radius: Float[Array, ""]) -> Float[Array, "6 6"]:
+def twist_form(second: Float[Array, "6 4 4"], radius: Float[Array, ""]) -> Float[Array, "6 6"]:
     """Σ JᵀKJ from Σ K ⊗ h hᵀ, for symmetric K and twists ξ = (v, ω) with lengths in units of the radius."""
     tangent = jnp.asarray(_TANGENT, second.dtype)
     return tangent.T @ _unit_quadratic(second, radius) @ tangent
