@@ -163,7 +163,7 @@ def _downsampled(cloud: PointCloud, voxel_size: float) -> PointCloud:
         )
 
     def total(columns: Iterable[np.ndarray]) -> np.ndarray:
-        sums = [np.add.reduceat(column[order].astype(np.float64), starts) for column in columns]
+        sums = [np.add.reduceat(column[order].astype(np.float64, copy=False), starts) for column in columns]
         return np.stack(sums, axis=1) if sums else np.zeros((len(starts), 0))
 
     counts = np.diff(np.append(starts, len(order)))[:, None]

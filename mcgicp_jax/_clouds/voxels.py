@@ -66,7 +66,9 @@ def voxel_order(
 
 def starts_of(sorted_keys: Int[np.ndarray, "N"]) -> Int[np.ndarray, "M"]:
     """Positions at which a new key starts."""
-    return np.flatnonzero(np.diff(sorted_keys, prepend=sorted_keys[:1] - 1))
+    first = np.ones(len(sorted_keys), bool)
+    np.not_equal(sorted_keys[1:], sorted_keys[:-1], out=first[1:])
+    return np.flatnonzero(first)
 
 
 def _stable_order(key: Int[np.ndarray, "N"], num_keys: int) -> Int[np.ndarray, "N"]:

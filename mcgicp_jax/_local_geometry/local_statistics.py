@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from mcgicp_jax._clouds.point_cloud import PointCloud
-from mcgicp_jax._compute.blocks import map_rows
+from mcgicp_jax._compute.blocks import NEIGHBORHOOD_BLOCK, map_rows
 from mcgicp_jax._compute.cache import cached_with
 from mcgicp_jax._compute.concrete import is_concrete
 from mcgicp_jax._compute.packing import Packed
@@ -55,7 +55,8 @@ def local_geometry_on_host(cloud: PointCloud, with_channels: bool, num_threads: 
 
     def make() -> LocalGeometry:
         gather = gatherer(cloud, with_channels, np)
-        return map_rows(lambda rows: _describe(gather(rows)), cloud.points.shape[0], num_threads).tree
+        size = cloud.points.shape[0]
+        return map_rows(lambda rows: _describe(gather(rows)), size, num_threads, NEIGHBORHOOD_BLOCK).tree
 
     return cached_with(cloud, "local geometry", with_channels, make)
 

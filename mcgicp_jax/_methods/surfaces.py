@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Float
 
 from mcgicp_jax._clouds.point_cloud import PointCloud
-from mcgicp_jax._compute.blocks import map_rows
+from mcgicp_jax._compute.blocks import NEIGHBORHOOD_BLOCK, map_rows
 from mcgicp_jax._compute.cache import cached_with
 from mcgicp_jax._compute.concrete import is_concrete, numpy_for
 from mcgicp_jax._compute.packing import Packed
@@ -132,7 +132,7 @@ def surface_on_host(
             here = None if statistics is None else statistics.rows(rows)
             return _surface_of_block(method, kinds, gather(rows), here, observed)
 
-        columns, noise = map_rows(block, cloud.points.shape[0], num_threads)
+        columns, noise = map_rows(block, cloud.points.shape[0], num_threads, NEIGHBORHOOD_BLOCK)
         # Views of one array, from which the executor on the host gathers rows.
         surface = columns.tree
         return surface._replace(noise=None if noise is None else noise.tree, search=searchable(method, cloud))
