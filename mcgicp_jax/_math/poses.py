@@ -156,7 +156,9 @@ def cast_pose(pose: jaxlie.SE3, dtype: DTypeLike) -> jaxlie.SE3:
 
 def rotation_from_quaternion(wxyz: Float[np.ndarray, "*batch 4"]) -> Float[np.ndarray, "*batch 3 3"]:
     """Rotation matrices of quaternions, in the precision of the input: jaxlie would use float32 where x64 is off."""
-    w, x, y, z = (wxyz / np.sqrt(np.sum(wxyz * wxyz, axis=-1, keepdims=True))).T
+    unit = (wxyz / np.sqrt(np.sum(wxyz * wxyz, axis=-1, keepdims=True))).T
+    # Python's floats are float64, and ten times as fast as NumPy's scalars.
+    w, x, y, z = unit.tolist() if unit.ndim == 1 and unit.dtype == np.float64 else unit
     rows = [
         [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
         [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],

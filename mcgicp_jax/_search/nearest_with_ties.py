@@ -148,4 +148,4 @@ def slack_of(farthest: Float[np.ndarray, "N"], following: Float[np.ndarray, "N"]
     of the k-th and the following row."""
     # The margin of 1e-6 covers rounding. Without a k-th nearest row the gap is NaN or −inf, and the slack 0.
     with np.errstate(invalid="ignore"):
-        return 0.5 * (1 - 1e-6) * np.nan_to_num(following - farthest, neginf=0.0)
+        return 0.5 * (1 - 1e-6) * np.fmax(following - farthest, 0)

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import importlib.util
+from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
@@ -42,14 +44,23 @@ class PyKDTree:
         return distances.reshape(-1, k), rows.reshape(-1, k).astype(np.int64)
 
 
-def _one_thread() -> Any:
+@contextlib.contextmanager
+def _one_thread() -> Iterator[None]:
     """OpenMP with one thread: queries are divided among our own, and a forked process has no others."""
-    return _controller().limit(limits=1, user_api="openmp")
+    before = [(library, library.get_num_threads()) for library in _openmp()]
+    for library, _ in before:
+        library.set_num_threads(1)
+    try:
+        yield
+    finally:
+        for library, number in before:
+            library.set_num_threads(number)
 
 
 @functools.cache
-def _controller() -> Any:
+def _openmp() -> list[Any]:
+    """The loaded OpenMP libraries. (`ThreadpoolController.limit` does the same, and describes them each time.)"""
     import pykdtree.kdtree  # noqa: F401
     from threadpoolctl import ThreadpoolController
 
-    return ThreadpoolController()
+    return [library for library in ThreadpoolController().lib_controllers if library.user_api == "openmp"]
