@@ -9,7 +9,7 @@ import jaxlie
 import numpy as np
 import pytest
 
-from mcgicp_jax import PointCloud, preprocess
+from mcgicp_jax import GICP, PointCloud, preprocess, register
 from mcgicp_jax._clouds.point_cloud import as_cloud
 from tests import reference as ref
 
@@ -349,3 +349,35 @@ def test_a_rotation_of_few_digits_becomes_one():
     moved = raw().transform(typed)
     apart = [np.linalg.norm(points[1:] - points[:-1], axis=1) for points in (np.asarray(moved.points), POINTS)]
     np.testing.assert_allclose(*apart, rtol=1e-6)
+
+
+class Foreign:
+    """Like a cloud of Open3D."""
+
+    def __init__(self, points, colors=()):
+        self.points, self.colors = points, colors
+
+
+def test_clouds_of_other_libraries_are_taken(tmp_path):
+    points = np.random.default_rng(0).normal(size=(5, 3))
+    fields = [("x", "f4"), ("y", "f4"), ("z", "f4"), ("intensity", "f4"), ("ring", "u2"), ("tag", "U3")]
+    structured = np.zeros((1, 5), fields)
+    structured["x"], structured["y"], structured["z"] = points.T[:, None]
+    structured["ring"] = np.arange(5)
+    cloud = PointCloud(structured)
+    assert cloud.channel_names == ("intensity", "ring")
+    np.testing.assert_allclose(cloud.points, points, atol=1e-6)
+    np.testing.assert_array_equal(cloud.channels[:, 1], np.arange(5))
+    colored, bare = PointCloud(Foreign(points, 0.5 * np.abs(points))), PointCloud(Foreign(points, []))
+    assert colored.channel_names == ("red", "green", "blue") and bare.channels.shape == (5, 0)
+    np.testing.assert_array_equal(colored.points, points)
+    for wrong, message in (
+        ("scan.ply", r"^points: expected coordinates, got a path; mcgicp_jax.io.read\('scan.ply'\)"),
+        (tmp_path / "scan.ply", "got a path"),
+        (object(), r"got object; its coordinates may be np.asarray\(cloud.points\)"),
+        (structured[["x", "y", "ring"]], "^points: expected the fields x, y and z, got x, y, ring"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            PointCloud(wrong)
+    with pytest.raises(ValueError, match=r"^source: points: expected coordinates, got a path"):
+        register("scan.ply", points, GICP())

@@ -945,3 +945,25 @@ def test_rows_outside_of_the_graph_are_named_inside_transformations():
     assert jax.jit(solve)(jnp.asarray(edges.j)).converged
     with pytest.raises(Exception, match="edges: expected rows from 0 to 7"):
         jax.block_until_ready(jax.jit(solve)(jnp.asarray(edges.j).at[3].set(8)).poses)
+
+
+def test_files_refuse_what_they_cannot_hold(tmp_path):
+    graph, _ = measured(*grid(2))
+    distance = Distance(np.array([[0, 1]]), np.ones((1, 1, 1)), np.zeros(1, bool), np.ones(1))
+    with pytest.raises(ValueError, match=r"^graph: expected edges alone, .* got 1 further factors"):
+        mcg.io.write_g2o(tmp_path / "graph.g2o", mcg.PoseGraph(graph.poses, graph.edges, [distance]))
+    key = 97 << 56
+    lines = [f"VERTEX_SE3:QUAT {key + k} 0 0 0 0 0 0 1" for k in range(2)]
+    (tmp_path / "keys.g2o").write_text("\n".join(lines))
+    with pytest.raises(ValueError, match=f"vertex numbers below 2.53, got {key}"):
+        mcg.io.read_g2o(tmp_path / "keys.g2o")
+
+
+def test_chi_squared_tells_whether_the_information_is_right():
+    graph, _ = measured(*SMALL["grid"])
+    found = mcg.optimize_poses(graph)
+    assert 0.7 < found.chi_squared < 1.4
+    edges = graph.edges
+    precise = mcg.Edge(edges.i, edges.j, edges.T_i_j, 100 * edges.information)
+    assert mcg.optimize_poses(mcg.PoseGraph(graph.poses, precise), robust=False).chi_squared > 50
+    assert np.isnan(mcg.optimize_poses(mcg.PoseGraph(graph.poses, edges[: len(graph.poses) - 1])).chi_squared)

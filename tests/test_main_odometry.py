@@ -6,6 +6,7 @@ import pytest
 
 from mcgicp_jax import datasets, io
 from mcgicp_jax.__main__ import main
+from mcgicp_jax._sequences import odometry
 
 
 def number_after(text, label):
@@ -77,3 +78,27 @@ def test_real_scans_are_followed(data, capsys):
     assert main(["odometry", "kitti", folder, "--method", "gicp", "--num-frames", "4", "--voxel-size", "0.5"]) == 0
     text = capsys.readouterr().out
     assert "pairs:     3 of 3 converged" in text and number_after(text, "per pair: ") < 50
+
+
+@pytest.mark.parametrize("error", [ValueError("no points"), KeyboardInterrupt()])
+def test_frames_before_an_invalid_one_are_written(tmp_path, capsys, monkeypatch, error):
+    def preprocess(cloud, *options):
+        calls.append(cloud)
+        if len(calls) == 4:
+            raise error
+        return before(cloud, *options)
+
+    calls, before = [], odometry.preprocess
+    poses, map = tmp_path / "poses.txt", tmp_path / "map.ply"
+    monkeypatch.setattr(odometry, "preprocess", preprocess)
+    files = ["--output", str(poses), "--map", str(map)]
+    assert main(["odometry", "box-room", "--num-frames", "4", "--method", "gicp", *files]) == 1
+    text, errors = capsys.readouterr()
+    reason = "frame 3: frames[3]: no points" if isinstance(error, ValueError) else "interrupted"
+    assert f"mcgicp: {reason}; stopped after 3 of 4 frames" in errors
+    assert "pairs:     2 of 2 converged" in text and len(io.read_poses(poses)) == 3 and len(io.read(map)) > 1000
+
+
+def test_cells_have_default_sizes(capsys):
+    assert main(["odometry", "box-room", "--num-frames", "2", "--method", "ndt"]) == 0
+    assert "1 of 1 converged" in capsys.readouterr().out

@@ -249,3 +249,11 @@ def test_lost_frames_are_named_and_follow_each_other(room):
         np.testing.assert_allclose(motion_found, steps[k].registration.matrix, atol=1e-6)
         assert steps[k].registration.converged
     np.testing.assert_allclose(steps[-1].pose[:3, 3], truth[2][:3, 3], atol=0.05)
+
+
+def test_a_radius_without_a_map_or_points_is_refused(room):
+    frames, _ = room
+    with pytest.raises(ValueError, match=r"^map_radius: expected None without"):
+        mcg.odometry(frames, mcg.GICP(), map_radius=3.0)
+    with pytest.raises(ValueError, match=r"^map_radius: expected metres within which the sensor sees points, got 0.01"):
+        list(mcg.odometry(frames, mcg.GICP(), against="map", map_radius=0.01))

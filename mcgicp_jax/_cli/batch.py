@@ -33,8 +33,10 @@ from mcgicp_jax._cli.options import (
     check_outputs,
     common_channels,
     described_voxels,
+    files_of,
     listed,
     method_for,
+    registration_for,
     voxel_size_for,
     with_channels,
     with_names,
@@ -83,7 +85,7 @@ def batch(pairs: Pairs, output: Path, method: MethodName = "mc-gicp", glob: str 
     """
     shared.check(method)
     check_outputs(output)
-    everything = _pairs_of_folder(pairs, glob) if pairs.is_dir() else _pairs_of_table(pairs)
+    everything = _pairs_of_folder(pairs, glob, output) if pairs.is_dir() else _pairs_of_table(pairs)
     table = Table(output)
     rows = {(row["source"], row["target"]): row for row in table.read()}
     settings = _settings(everything, method, shared)
@@ -181,8 +183,8 @@ def _pairs_of_table(path: Path) -> list[FilePair]:
     return _checked(path, pairs)
 
 
-def _pairs_of_folder(folder: Path, glob: str) -> list[FilePair]:
-    names = sorted(path.name for path in folder.glob(glob) if path.is_file())
+def _pairs_of_folder(folder: Path, glob: str, output: Path) -> list[FilePair]:
+    names = [path.name for path in files_of(folder, glob, output)]
     return _checked(folder, [FilePair(folder, source, target) for target, source in itertools.pairwise(names)])
 
 
@@ -216,7 +218,7 @@ def _settings(pairs: Sequence[FilePair], method: MethodName, options: Options) -
     def preprocessed() -> list[mcg.PointCloud]:
         return [mcg.preprocess(with_channels(cloud, names), voxel_size, options.num_neighbors) for cloud in clouds]
 
-    return options.registration() | {
+    return registration_for(method, options, lambda: preprocessed()[1]) | {
         "method": method_for(method, options, preprocessed),
         "channels": names,
         "voxel_size": voxel_size,

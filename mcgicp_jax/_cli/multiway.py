@@ -19,8 +19,10 @@ from mcgicp_jax._cli.options import (
     check_inputs,
     check_outputs,
     common_channels,
+    files_of,
     listed,
     method_for,
+    registration_for,
     voxel_size_for,
     with_channels,
     with_names,
@@ -59,7 +61,7 @@ def multiway(
     """
     check_outputs(output, graph, cloud=map, picture=plot)
     shared.check(method)
-    paths = sorted(path for path in folder.glob(glob) if path.is_file())
+    paths = files_of(folder, glob, output, map, graph, plot)
     if len(paths) < 2:
         raise ValueError(f"{folder}: expected at least 2 clouds {glob}, found {len(paths)}")
     check_inputs(*paths)
@@ -71,7 +73,9 @@ def multiway(
     print(f"channels:  {listed(names)}")
     start = None if init is None else list(io.read_poses(init))
     chosen = method_for(method, shared, lambda: (clouds[1], clouds[0]))
-    found = mcg.multiway(clouds, chosen, init=start, voxel_size=voxel, **shared.registration())
+    found = mcg.multiway(
+        clouds, chosen, init=start, voxel_size=voxel, **registration_for(method, shared, lambda: clouds[0])
+    )
     _report(found)
     if output is not None:
         io.write_poses(output, found.poses)
@@ -83,8 +87,11 @@ def multiway(
     if plot is not None:
         plots.graph(found.graph, path=plot)
         print(f"picture:   {plot}")
-    if not found.converged:
+    if not found.graph.converged:
         print(f"mcgicp: the poses are {found.graph.status.name}", file=sys.stderr)
+    for path, status in zip(paths, found.statuses, strict=True):
+        if status != mcg.Status.CONVERGED:
+            print(f"mcgicp: {path}: {status.name}, its pose contradicts the others or is unknown", file=sys.stderr)
     return 0 if found.converged else 1
 
 
@@ -94,4 +101,5 @@ def _report(found: mcg.MultiwayResult) -> None:
     print(f"pairs:     {total} registered, {len(edges)} with a result, {int((~kept).sum())} of them rejected")
     deviations = np.sqrt(np.diagonal(np.asarray(found.graph.covariance), 0, 1, 2))
     worst = deviations[:, :3].max(), np.degrees(deviations[:, 3:].max())
+    print(f"chi²:      {found.graph.chi_squared:.3g} per redundant number (1: as the covariances predict)")
     print(f"poses:     {found.graph.status.name}, at most {1e3 * worst[0]:.1f} mm and {worst[1]:.3f} deg uncertain")

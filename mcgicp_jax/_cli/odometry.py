@@ -24,6 +24,7 @@ from mcgicp_jax._cli.options import (
     enumerated,
     listed,
     method_for,
+    registration_for,
     round_voxel_size,
     shown,
     with_channels,
@@ -82,7 +83,7 @@ def odometry(
 
     DATASET is <datasets>, with the sequence in the folder PATH; or a simulated scene (<scenes>), which needs no PATH.
     Errors are printed if the true poses are known. The exit code is 0 only if all registrations converged; output files
-    are written in any case.
+    are written in any case: after an invalid frame or Ctrl-C, of the frames before it.
 
     Defaults of --voxel-size: <voxel_sizes>. Defaults of --max-distance: <max_distances>.
 
@@ -110,7 +111,7 @@ def odometry(
         "against": against,
         "map_radius": map_radius,
         "loops": loops,
-    } | shared.registration()
+    }
     first = frames[0]
     names = shared.channels or first.cloud.channel_names
     print(f"frames:    {len(frames)} of {dataset}, {len(first.cloud):,} points in the first")
@@ -121,17 +122,21 @@ def odometry(
 
     truth: Truth = []
     chosen = method_for(method, shared, first_two)
+    options |= registration_for(method, shared, lambda: first_two()[1])
     steps = mcg.odometry(_clouds(frames, names, truth), chosen, voxel_size=voxel, start=first.pose, **options)
     map_voxel = round_voxel_size([first.cloud], len(first.cloud) // 2) if map and voxel is None else voxel
-    poses, results = _follow(steps, len(frames), loops, map, map_voxel)
+    poses, results, failure = _follow(steps, len(frames), loops, map, map_voxel)
+    del truth[len(poses) :]
     _report(poses, truth, results)
     if output is not None:
         io.write_poses(output, poses)
     if plot is not None:
         _draw(plot, method, poses, truth)
+    if failure:
+        print(f"mcgicp: {failure}; stopped after {len(poses)} of {len(frames)} frames", file=sys.stderr)
     if failed := sum(not result.converged for result in results):
         print(f"mcgicp: {failed} of {len(results)} registrations did not converge", file=sys.stderr)
-    return 1 if failed else 0
+    return 1 if failed or failure else 0
 
 
 def _open(dataset: DatasetName, path: Path, num_frames: int | Literal["all"]) -> AbstractFrames:
@@ -154,14 +159,27 @@ def _clouds(frames: AbstractFrames, names: tuple[str, ...], truth: Truth) -> Ite
 
 def _follow(
     steps: Iterator[OdometryStep], num_frames: int, loops: bool, map: Path | None, voxel_size: float | None
-) -> tuple[Poses, list[mcg.RegistrationResult]]:
-    """Run the odometry, write the map if it has a file, and return the poses and the registrations."""
+) -> tuple[Poses, list[mcg.RegistrationResult], str]:
+    """Run the odometry, write the map if it has a file; return the poses, the registrations and why it stopped early.
+
+    Raises the error of the first frame, since nothing is known then.
+    """
     poses: Poses = []
     results: list[mcg.RegistrationResult] = []
     last: Any = None
+    failure = ""
+
+    def valid() -> Iterator[OdometryStep]:
+        nonlocal failure
+        try:
+            yield from steps
+        except (ValueError, OSError, KeyboardInterrupt) as error:
+            if not poses:
+                raise
+            failure = "interrupted" if isinstance(error, KeyboardInterrupt) else f"frame {len(poses)}: {error}"
 
     def followed() -> Iterator[tuple[mcg.PointCloud, Float[np.ndarray, "4 4"]]]:
-        for step in tqdm(steps, total=num_frames, unit="frame", disable=None):
+        for step in tqdm(valid(), total=num_frames, unit="frame", disable=None):
             nonlocal last
             last = step
             poses.append(step.pose)
@@ -180,16 +198,16 @@ def _follow(
         stream = zip(clouds, poses, strict=True)
     if map is None or voxel_size is None:
         collections.deque(stream, maxlen=0)
-        return poses, results
+        return poses, results, failure
     with_clouds, with_poses = itertools.tee(stream)
     world = mcg.merge_clouds((cloud for cloud, _ in with_clouds), (pose for _, pose in with_poses), voxel_size)
     io.write(map, world)
     print(f"map:       {map}, {len(world):,} points, voxels of {voxel_size:g} m")
-    return poses, results
+    return poses, results, failure
 
 
 def _report(poses: Poses, truth: Truth, results: list[mcg.RegistrationResult]) -> None:
-    iterations = np.mean([np.asarray(result.num_iterations) for result in results])
+    iterations = np.mean([np.asarray(result.num_iterations) for result in results]) if results else 0
     converged = sum(bool(result.converged) for result in results)
     print(f"pairs:     {converged} of {len(results)} converged, {iterations:.1f} iterations on average")
     known = [row for row, pose in enumerate(truth) if pose is not None]

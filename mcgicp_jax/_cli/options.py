@@ -196,6 +196,12 @@ def check_inputs(*clouds: Path) -> None:
         path.stat()
 
 
+def files_of(folder: Path, glob: str, *outputs: Path | None) -> list[Path]:
+    """The files of a folder in order of name, without those that the command writes."""
+    written = {path.resolve() for path in outputs if path is not None}
+    return sorted(path for path in folder.glob(glob) if path.is_file() and path.resolve() not in written)
+
+
 def method_for(name: MethodName, options: Options, clouds: Callable[[], Sequence[mcg.PointCloud]]) -> AbstractMethod:
     """The method with the user's parameters. Color ICP's weights, if not given, come from two preprocessed clouds."""
     given = options.parameters_of(name)
@@ -235,6 +241,16 @@ def round_voxel_size(clouds: Sequence[mcg.PointCloud], most: int) -> float:
         return max(len(np.unique(number)) for number in numbers)
 
     return sizes[bisect.bisect_left(sizes, -most, key=lambda size: -occupied(size))]
+
+
+def registration_for(name: MethodName, options: Options, target: Callable[[], mcg.PointCloud]) -> dict[str, Any]:
+    """Keyword arguments of `mcgicp_jax.register`; sizes of cells, if not given, come from a preprocessed target."""
+    arguments = options.registration()
+    if METHODS[name].kind.needs_covariances and not options.voxel_sizes:
+        spacing = float(point_spacing(target()))
+        # With 8 spacings, a cell has some tens of points.
+        arguments["voxel_sizes"] = tuple(float(f"{times * spacing:.2g}") for times in (32, 16, 8))
+    return arguments
 
 
 def described_distance(options: Options, target: mcg.PointCloud) -> str:

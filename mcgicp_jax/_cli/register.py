@@ -27,18 +27,23 @@ from mcgicp_jax._cli.options import (
     enumerated,
     listed,
     method_for,
+    registration_for,
     voxel_size_for,
     with_channels,
     with_names,
     words,
 )
+from mcgicp_jax._compute.argument_checks import errors_named
 from mcgicp_jax._methods.base import AbstractMethod
 from mcgicp_jax._methods.registry import METHODS
 from mcgicp_jax._pose_solver.degeneracy import describe
-from mcgicp_jax._registration.settings import matching_spacing
 
 Source: TypeAlias = Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="SOURCE")]
 Target: TypeAlias = Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="TARGET")]
+
+
+# Methods of the demo: two that use geometry alone, two that use channels. Each compiles for seconds.
+_DEMO = ("point-to-plane", "gicp", "color-icp", "mc-gicp")
 
 
 class PreparedPair:
@@ -84,20 +89,14 @@ class PreparedPair:
         translation, rotation = metrics.pose_error(pose, true_pose, at=centroid)
         return f"{1e3 * float(translation):9.2f}  {np.degrees(rotation):11.3f}"
 
-    def register(self, method: AbstractMethod) -> mcg.RegistrationResult:
-        source, target, options = self.source, self.target, self.options.registration()
-        if method.needs_covariances:
-            # Cells are made of all points.
-            whole = [with_channels(cloud, self.channels) for cloud in self.raw]
-            source = whole[0] if "source" in method.needs_covariances else source
-            target = whole[1]
-            options["voxel_sizes"] = self.cells(method)
+    def register(self, name: MethodName, method: AbstractMethod) -> mcg.RegistrationResult:
+        options = registration_for(name, self.options, lambda: self.target)
+        # Cells are made of all points.
+        source, target = (
+            with_channels(raw, self.channels) if side in method.needs_covariances else ready
+            for side, raw, ready in zip(("source", "target"), self.raw, (self.source, self.target), strict=True)
+        )
         return mcg.register(source, target, method, init=self.start, **options)
-
-    def cells(self, method: AbstractMethod) -> tuple[float, ...]:
-        """Sizes of the cells, metres, for methods that need any: with 8 spacings, a cell has some tens of points."""
-        spacing = float(matching_spacing(method, self.target))
-        return self.options.voxel_sizes or tuple(float(f"{times * spacing:.2g}") for times in (32, 16, 8))
 
     def draw(self, results: dict[MethodName, mcg.RegistrationResult]) -> None:
         if self.options.plot is not None:
@@ -133,8 +132,9 @@ def register(
     chosen = pair.method(method)
     print(f"method:    {method}{_parameters(chosen)}")
     if chosen.needs_covariances:
-        print(f"cells:     of {', '.join(f'{size:g}' for size in pair.cells(chosen))} m")
-    result = pair.register(chosen)
+        sizes = registration_for(method, shared, lambda: pair.target)["voxel_sizes"]
+        print(f"cells:     of {', '.join(f'{size:g}' for size in sizes)} m")
+    result = pair.register(method, chosen)
     _report(pair, result)
     if output is not None:
         io.write_poses(output, [result.matrix])
@@ -161,11 +161,12 @@ def compare(source: Source, target: Target, shared: PairOptions, truth: File = N
     return _verdict(_compare(source, target, shared, truth))
 
 
-def demo(output: Path = Path("mcgicp_demo")) -> int:
-    """Register two simulated views of a flat wall of posters by a noisy RGB-D camera, with every method.
+def demo(output: Path = Path("mcgicp_demo"), *, all_methods: bool = False) -> int:
+    """Register two simulated views of a flat wall of posters by a noisy RGB-D camera.
 
     Args:
         output: Folder for the two clouds, the true pose and a picture.
+        all_methods: Register with every method; by default with four of them.
     """
     output.mkdir(parents=True, exist_ok=True)
     frames = datasets.poster_wall(2)
@@ -175,11 +176,12 @@ def demo(output: Path = Path("mcgicp_demo")) -> int:
     io.write(target_file, target.cloud)
     io.write_poses(truth_file, [np.linalg.inv(frames.path(0)) @ frames.path(1)])
     options = PairOptions(voxel_size="off", plot=output / "before_after.png")
-    _compare(source_file, target_file, options, truth_file)
+    names = tuple(METHODS) if all_methods else _DEMO
+    _compare(source_file, target_file, options, truth_file, names)
     print(
         "Geometry does not constrain motion along a flat wall: methods that use it alone report it (degenerate) and"
         "\nkeep the initial pose along it, so in their rows of the picture the posters do not fit."
-        f"\n{enumerated([name for name in METHODS if METHODS[name].kind.uses_channels])}"
+        f"\n{enumerated([name for name in names if METHODS[name].kind.uses_channels])}"
         "\nare constrained by the channels red, green and blue."
         f"\nThe clouds are in {output}; try: mcgicp register {source_file} {target_file}"
     )
@@ -187,24 +189,24 @@ def demo(output: Path = Path("mcgicp_demo")) -> int:
 
 
 def _compare(
-    source: Path, target: Path, options: PairOptions, truth: Path | None
+    source: Path, target: Path, options: PairOptions, truth: Path | None, names: Sequence[MethodName] = tuple(METHODS)
 ) -> dict[MethodName, mcg.RegistrationResult]:
     true_pose = None if truth is None else _read_pose(truth)
     pair = PreparedPair(source, target, options)
     results: dict[MethodName, mcg.RegistrationResult] = {}
     measures = "inliers      rmse, m" if true_pose is None else "error, mm   error, deg"
-    width = max(map(len, METHODS))
+    width = max(map(len, names))
     print(f"\n{'method':{width}}  {measures:>22}  iterations  time, ms  status")
     if true_pose is not None:
         print(f"{'(start)':{width}}  {pair.errors(pair.start, true_pose)}")
-    for name in METHODS:
+    for name in names:
         if METHODS[name].kind.uses_channels and not pair.channels:
             print(f"{name:{width}}  left out: no channels in common")
             continue
         method = pair.method(name)
-        pair.register(method)
+        pair.register(name, method)
         begin = time.perf_counter()
-        result = results[name] = pair.register(method)
+        result = results[name] = pair.register(name, method)
         milliseconds = 1e3 * (time.perf_counter() - begin)
         values = f"{result.num_inliers:9,}  {result.rmse:11.4g}"
         if true_pose is not None:
@@ -269,7 +271,5 @@ def _found(clouds: Sequence[mcg.PointCloud], channels: Sequence[str]) -> Float[n
 def _preprocess(
     path: Path, cloud: mcg.PointCloud, channels: Sequence[str], voxel_size: float | None, num_neighbors: int
 ) -> mcg.PointCloud:
-    try:
+    with errors_named(str(path)):
         return mcg.preprocess(with_channels(cloud, channels), voxel_size, num_neighbors)
-    except ValueError as error:
-        raise ValueError(f"{path}: {error}") from error

@@ -105,7 +105,7 @@ def _colors(rgb: Values) -> tuple[Any, Any]:
     colors: Any = xp.asarray(rgb)
     if colors.ndim == 0 or colors.shape[-1] != 3:
         raise ValueError(f"rgb: expected shape (..., 3), got {colors.shape}")
-    if colors.dtype.kind == "u":
+    if colors.dtype.kind in "ui":
         raise ValueError(f"rgb: expected numbers from 0 to 1, got {colors.dtype}; divide images by 255")
     return (colors if colors.dtype in (np.float32, np.float64) else colors.astype(canonical_float())), xp
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, TypeAlias
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 import equinox as eqx
 import jax
@@ -12,13 +12,18 @@ import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float, Int
 
+from mcgicp_jax._clouds.other_libraries import arrays_of
 from mcgicp_jax._compute.argument_checks import errors_named
 from mcgicp_jax._compute.concrete import is_concrete
 from mcgicp_jax._compute.size_classes import size_class
 from mcgicp_jax._math.poses import Pose, pose_matrix
 
-# Array input: NumPy, JAX or any array-like, or nested lists.
-Values: TypeAlias = ArrayLike | Sequence[Any]
+if TYPE_CHECKING:
+    # Array input: NumPy, JAX or any array-like, or nested lists.
+    Values: TypeAlias = ArrayLike | Sequence[Any]
+else:
+    # Not checked at run time: `PointCloud` has better messages, and takes clouds of other libraries.
+    Values = Any
 
 # Distance from zero, in cloud sizes, beyond which the origin is kept apart in float64: float32 coordinates would lose
 # more than log2(8) = 3 of their 24 significant bits.
@@ -106,7 +111,9 @@ class PointCloud(eqx.Module):
         """Create a raw cloud.
 
         Args:
-            points: (N, 3), metres: nested lists or arrays of any real dtype, NumPy or JAX.
+            points: (N, 3), metres: nested lists or arrays of any real dtype, NumPy or JAX. Without `channels`, also a
+                structured array with the fields x, y and z, whose other numbers become channels, or an object with
+                `points` and perhaps `colors`, such as a cloud of Open3D.
             channels: (N, C), or (N,) for a single channel, in any unit; none by default.
             channel_valid: booleans in the shape of `channels`, False where a point lacks the channel; the value there
                 is ignored and may be NaN. None: all points have all channels.
@@ -117,6 +124,9 @@ class PointCloud(eqx.Module):
         Raises:
             ValueError: if a shape or dtype does not fit; the message names the argument.
         """
+        points, found, names = arrays_of(points)
+        if channels is None and found is not None:
+            channels, channel_names = found, channel_names or names
         self.points = _as_float("points", points)
         if self.points.ndim != 2 or self.points.shape[1] != 3:
             raise ValueError(f"points: expected shape (N, 3), got {self.points.shape}")

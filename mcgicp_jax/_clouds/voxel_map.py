@@ -51,6 +51,10 @@ class VoxelMap:
         # Voxel of the first point, from which the others are counted: keys have no room for UTM coordinates.
         self._first: Float[np.ndarray, "3"] | None = None
 
+    def __len__(self) -> int:
+        """Number of occupied voxels."""
+        return len(self._keys)
+
     def add(self, name: str, cloud: PointCloud, pose: Float[np.ndarray, "4 4"]) -> None:
         """Add the finite points of a cloud in its sensor frame, moved by its pose; `name` is for error messages."""
         if self._names not in (None, cloud.channel_names):

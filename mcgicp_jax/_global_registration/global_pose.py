@@ -136,7 +136,8 @@ def global_pose(
         voxel_size: metres. By default the smallest size at which the smaller cloud has at most 6,000 voxels, the larger
             one at most 20,000, and each at most half as many voxels as points.
         correspondences: integer arrays (n,) of source rows and (n,) of target rows that replace steps 1 and 2, such as
-            those of `image_matches`. At most 1,024 matches are used, evenly spaced; most may be wrong.
+            those of `image_matches`. At most 1,024 matches are used, evenly spaced; most may be wrong. With fewer than
+            ten, none succeeds.
 
     Returns:
         The pose, with `success` to tell whether to trust it.

@@ -9,6 +9,7 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
 from mcgicp_jax._clouds.point_cloud import PointCloud, Values
+from mcgicp_jax._compute.argument_checks import check_integer
 from mcgicp_jax._local_geometry.local_geometry import LocalGeometry
 from mcgicp_jax._local_geometry.neighborhoods import Neighborhoods
 from mcgicp_jax._math import symmetric_matrices as alg
@@ -105,8 +106,7 @@ class D2DNDT(AbstractNDT, AbstractGeneralized):
 
     def __init__(self, scale: ArrayLike | None = _SCALE, num_candidates: int = _NUM_CANDIDATES):
         """Raises `ValueError` unless `scale` is positive and `num_candidates` at least 1."""
-        if num_candidates < 1:
-            raise ValueError(f"num_candidates: expected at least 1, got {num_candidates}")
+        check_integer("num_candidates", num_candidates, 1)
         self.kernel = _welsch(scale)
         self.num_candidates = num_candidates
 

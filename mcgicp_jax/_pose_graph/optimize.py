@@ -13,9 +13,10 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float, Int
 
 from mcgicp_jax._compute.argument_checks import check_integer
-from mcgicp_jax._compute.concrete import AnyArray, is_concrete
+from mcgicp_jax._compute.concrete import AnyArray, is_concrete, numpy_for
 from mcgicp_jax._compute.lazy import Lazy
 from mcgicp_jax._pose_graph.edge import Edge
+from mcgicp_jax._pose_graph.factors import WORLD
 from mcgicp_jax._pose_graph.graph import PoseGraph
 from mcgicp_jax._pose_graph.implicit_derivative import Found, covariances_traced, solve_traced
 from mcgicp_jax._pose_graph.solver import solve
@@ -55,6 +56,19 @@ class PoseGraphResult:
     def kept(self) -> Bool[Array, "m"] | Bool[np.ndarray, "m"]:
         """(m,) False for edges that were rejected."""
         return self.weights > 0.5
+
+    @property
+    def chi_squared(self) -> Any:
+        """χ² of the edges that were kept, per redundant number: about 1 if the information matrices are right.
+
+        Each edge has six numbers, and each pose that may move takes six. NaN if none is redundant.
+        """
+        xp = numpy_for(self.weights, self.residuals)
+        of_world = xp.any(xp.asarray(self.edges.i) == WORLD)
+        redundant = 6.0 * (xp.sum(self.weights) - (len(self.poses) - 1 + of_world))
+        return xp.where(
+            redundant > 0, xp.sum(self.weights * self.residuals**2) / xp.where(redundant > 0, redundant, 1), xp.nan
+        )[()]
 
     @property
     def covariance(self) -> Float[Array, "n 6 6"] | Float[np.ndarray, "n 6 6"]:

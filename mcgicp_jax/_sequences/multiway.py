@@ -11,10 +11,11 @@ from typing import Any, Unpack
 import numpy as np
 from jaxtyping import Float
 
-from mcgicp_jax._clouds.point_cloud import PointCloud, Values
+from mcgicp_jax._clouds.point_cloud import PointCloud, Values, as_cloud
 from mcgicp_jax._clouds.preprocess import check_preprocessing, preprocess
 from mcgicp_jax._clouds.voxel_map import merge_clouds
 from mcgicp_jax._clouds.voxels import wrapped_keys
+from mcgicp_jax._compute.argument_checks import errors_named
 from mcgicp_jax._local_geometry.spacing_and_noise import point_spacing
 from mcgicp_jax._math.poses import Pose, pose_matrices
 from mcgicp_jax._methods.base import AbstractMethod
@@ -113,7 +114,12 @@ def multiway(
     check_method(method)
     check_preprocessing(voxel_size, num_neighbors)
     settings = options_of(multiway, options)
-    ready = [_ready(k, cloud, voxel_size, num_neighbors) for k, cloud in enumerate(clouds)]
+    ready = []
+    for k, cloud in enumerate(clouds):
+        ready.append(as_cloud(f"clouds[{k}]", cloud))
+        if ready[k].neighbors is None:
+            with errors_named(f"clouds[{k}]"):
+                ready[k] = preprocess(ready[k], voxel_size, num_neighbors)
     if not ready:
         raise ValueError("clouds: expected at least one, got none")
     given = None if pairs is None else _checked(pairs, len(ready))
@@ -183,7 +189,8 @@ def _fit(result: RegistrationResult) -> float:
 
 def _checked(pairs: Sequence[tuple[int, int]], num_clouds: int) -> list[tuple[int, int]]:
     for k, pair in enumerate(pairs):
-        if len(pair) != 2 or not all(0 <= row < num_clouds for row in pair) or pair[0] == pair[1]:
+        valid = [isinstance(row, int | np.integer) and 0 <= row < num_clouds for row in pair]
+        if len(pair) != 2 or not all(valid) or pair[0] == pair[1]:
             raise ValueError(f"pairs[{k}]: expected two different rows from 0 to {num_clouds - 1}, got {pair}")
     return [(int(i), int(j)) for i, j in pairs]
 
@@ -238,11 +245,3 @@ def _overlapping(clouds: list[PointCloud], poses: Float[np.ndarray, "n 4 4"], ce
             if overlaps[best] >= LEAST_OVERLAP:
                 pairs.append((best, j))
     return pairs
-
-
-def _ready(number: int, cloud: PointCloud | Values, voxel_size: float | None, num_neighbors: int) -> PointCloud:
-    try:
-        cloud = cloud if isinstance(cloud, PointCloud) else PointCloud(cloud)
-        return cloud if cloud.neighbors is not None else preprocess(cloud, voxel_size, num_neighbors)
-    except ValueError as error:
-        raise ValueError(f"clouds[{number}]: {error}") from error

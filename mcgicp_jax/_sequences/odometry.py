@@ -112,6 +112,8 @@ def odometry(
         raise ValueError(f'against: expected "previous" or "map", got {against!r}')
     if map_radius is not None:
         check_positive("map_radius", map_radius)
+        if against != "map":
+            raise ValueError(f'map_radius: expected None without against="map", got {map_radius}')
     if loops and (against == "map" or recover):
         raise ValueError(
             'loops: expected against="previous" and no recover: registrations to the previous frame become edges'
@@ -183,6 +185,8 @@ class _Sensor(Iterator[OdometryStep]):
                 known.add(name, cloud, self.pose)
         if self.world is not None:
             self.world.forget(self.pose[:3, 3], self.radius)
+            if not len(self.world):
+                raise ValueError(f"map_radius: expected metres within which the sensor sees points, got {self.radius}")
         graph = None
         if self.trajectory is not None:
             self.pose = self.trajectory.add(cloud, self.pose, result)

@@ -47,10 +47,12 @@ def write_g2o(path: str | os.PathLike[str], graph: PoseGraph | Any) -> None:
 
     Raises:
         OSError: if the file cannot be written.
-        ValueError: if `graph` is neither.
+        ValueError: if `graph` is neither, or has factors that are not edges, for which the format has no lines.
     """
     if not isinstance(getattr(graph, "edges", None), Edge):
         raise ValueError(f"graph: expected a PoseGraph or a PoseGraphResult, got {type(graph).__name__}")
+    if others := getattr(graph, "factors", None) or getattr(graph, "factor_weights", None):
+        raise ValueError(f"graph: expected edges alone, which g2o files can hold, got {len(others)} further factors")
     with replacing(path) as file:
         for form, rows in _lines_of(graph):
             np.savetxt(file, rows, fmt=form)
@@ -109,6 +111,8 @@ def _rows(lines: list[tuple[int, list[str]]], tag: str) -> tuple[list[int], Floa
                 raise ValueError(f"line {line}: expected {width} numbers after {tag}, got {len(row)}")
             if not (np.isfinite(row).all() and any(row[whole + 3 : whole + 7])):
                 raise ValueError(f"line {line}: expected finite numbers and a quaternion other than 0, got {row}")
+            if any(abs(number) >= 2**53 for number in row[:whole]):
+                raise ValueError(f"line {line}: expected vertex numbers below 2^53, got {words[1]}; number them anew")
             chosen.append(line)
             rows.append(row)
     return chosen, np.array(rows).reshape(-1, width)
