@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import jax
 import jax.numpy as jnp
 import jaxlie
 import numpy as np
@@ -46,6 +47,12 @@ def pose_in_user_frame(
         matrix = matrices_of(parameters)
         matrix[..., :3, 3] += offset
         return matrix
+    return _in_user_frame(centred, source_origin, target_origin)
+
+
+@jax.jit
+def _in_user_frame(centred: jaxlie.SE3, source_origin: Array, target_origin: Array) -> Array:
+    """`pose_in_user_frame` for traced arrays."""
     traced = centred.as_matrix().astype(centred.wxyz_xyz.dtype)
     turned = jnp.einsum("...ij,...j->...i", traced[..., :3, :3] - jnp.eye(3), source_origin, precision="highest")
     shift = target_origin - source_origin - turned

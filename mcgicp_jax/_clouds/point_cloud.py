@@ -176,7 +176,9 @@ class PointCloud(eqx.Module):
         }
         for name in arrays.keys() & {"points", "channels", "covariances"}:
             if arrays[name] is not None:
-                arrays[name] = _as_float(name, arrays[name]).astype(self.points.dtype)
+                array = _as_float(name, arrays[name])
+                # Of traced arrays, even a conversion to the same dtype would be compiled.
+                arrays[name] = array if array.dtype == self.points.dtype else array.astype(self.points.dtype)
         for name, value in arrays.items():
             expected = shapes.get(name, np.shape(value))
             if np.shape(value) != expected and not (name == "covariances" and value is None):

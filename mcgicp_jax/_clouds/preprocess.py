@@ -3,16 +3,19 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
+from typing import Any
 
 import jax
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float, Int
+from scipy.sparse import csr_array
 
 from mcgicp_jax._clouds.point_cloud import PointCloud, Values, as_cloud, is_far
 from mcgicp_jax._clouds.voxels import voxel_order
 from mcgicp_jax._compute.argument_checks import check_integer, check_positive
 from mcgicp_jax._compute.concrete import is_concrete
+from mcgicp_jax._compute.linear_maps import AbstractLinearMap, primal, with_derivative
 from mcgicp_jax._search.base import AbstractSearch
 from mcgicp_jax._search.brute_force import default_search
 
@@ -34,7 +37,9 @@ def preprocess(
 ) -> PointCloud:
     """Prepare a cloud for registration: drop non-finite points, downsample to voxels, find neighbours.
 
-    Preprocess each cloud once and register it as often as needed. Runs on the host.
+    Preprocess each cloud once and register it as often as needed. Runs on the host; not inside `jit` or `vmap`. Points,
+    channels and covariances of the result can be differentiated by those of the raw cloud; voxels and neighbours are
+    constants.
 
     Args:
         cloud: raw cloud, or (N, 3) array in metres. Padding and old neighbours are dropped first.
@@ -57,6 +62,10 @@ def preprocess(
             than `num_neighbors`, and if coordinates far from zero are float32 and too coarse for the points' spacing.
     """
     check_preprocessing(voxel_size, num_neighbors)
+    cloud = as_cloud("cloud", cloud)
+    fixed = primal(cloud)
+    if is_concrete(fixed) and not is_concrete(cloud):
+        return _differentiable(cloud, preprocess(fixed, voxel_size, num_neighbors, search=search), fixed, voxel_size)
     cloud = finite_rows(cloud)
     found = with_neighbors(cloud, voxel_size, num_neighbors, search)
     _warn_of_rounding(cloud, found)
@@ -68,6 +77,61 @@ def preprocess(
             stacklevel=2,
         )
     return found
+
+
+def _differentiable(cloud: PointCloud, found: PointCloud, fixed: PointCloud, voxel_size: float | None) -> PointCloud:
+    """The preprocessed cloud `found` with the derivative by the arrays of a raw one that differentiation traces.
+
+    Args:
+        fixed: the raw cloud without these traces.
+    """
+    raw = fixed.unpad()
+    finite = _is_finite(raw)
+    rows, voxels = np.flatnonzero(np.asarray(fixed.valid))[finite], np.arange(np.sum(finite))
+    if voxel_size is not None:
+        order, starts = voxel_order(np.ascontiguousarray(raw.points[finite].T, np.float64), voxel_size)
+        voxels[order] = np.repeat(np.arange(len(starts)), np.diff(np.append(starts, len(order))))
+    arrays: dict[str, Any] = {}
+    for name in ("points", "channels", "covariances"):
+        array = getattr(cloud, name)
+        if not is_concrete(array):
+            known = (
+                np.ones((len(rows), 1))
+                if raw.channel_valid is None or name != "channels"
+                else raw.channel_valid[finite]
+            )
+            average = RowAverage(rows, voxels, known, (array.shape[0], len(found.points)))
+            (arrays[name],) = with_derivative([getattr(found, name)], average, [array])
+    return found.replace_rows(**arrays)
+
+
+class RowAverage(AbstractLinearMap):
+    """Each row of the result is the mean of some rows.
+
+    Args:
+        rows, groups: which row counts in which row of the result.
+        known: (n, C) or (n, 1), which of its entries count.
+        sizes: numbers of rows of the array and of the result.
+    """
+
+    def __init__(self, rows: Int[np.ndarray, "n"], groups: Int[np.ndarray, "n"], known: Any, sizes: tuple[int, int]):
+        ones = np.ones(len(rows))
+        self._sum = csr_array((ones, (groups, np.arange(len(rows)))), shape=(sizes[1], len(rows)))
+        counts = np.maximum(self._sum @ known.astype(np.float64), 1)
+        self._rows, self._weights, self._size = rows, known / counts[groups], sizes[0]
+
+    def push(self, tangents: Sequence[np.ndarray], moving: tuple[int, ...]) -> list[np.ndarray]:
+        (each,) = tangents
+        shape = each.shape[2:]
+        flat = each.reshape(*each.shape[:2], -1)[:, self._rows]
+        return [np.stack([(self._sum @ (self._weights * rows)).reshape(-1, *shape) for rows in flat])]
+
+    def pull(self, cotangents: Sequence[np.ndarray], moving: tuple[int, ...]) -> list[np.ndarray]:
+        (each,) = cotangents
+        found = np.zeros((len(each), self._size, *each.shape[2:]), each.dtype)
+        for rows, by in zip(found, each.reshape(*each.shape[:2], -1), strict=True):
+            rows[self._rows] = (self._weights * (self._sum.T @ by)).reshape(-1, *each.shape[2:])
+        return [found]
 
 
 def with_neighbors(
@@ -126,17 +190,13 @@ def finite_rows(cloud: PointCloud | Values) -> PointCloud:
     """A raw cloud without padding and without rows that have a NaN or infinity in any array; warns of the latter."""
     cloud = as_cloud("cloud", cloud)
     if not is_concrete(cloud):
-        raise ValueError("cloud: expected concrete arrays, got tracers; preprocess outside of jit, grad and vmap")
+        raise ValueError("cloud: expected concrete arrays, got tracers; preprocess outside of jit and vmap")
     if cloud.points.ndim != 2:
         raise ValueError(f"cloud: expected a single cloud, got a batch of shape {cloud.points.shape}")
     cloud = cloud.unpad()
-    arrays = [array for array in (cloud.points, cloud.channels, cloud.covariances) if array is not None]
-    # Values such as 1e39 or 1e300 overflow float32 and count as infinite.
-    finite = [np.abs(array) <= _LARGEST for array in arrays]
-    # Most clouds are finite throughout, and one check of all values is much faster than one per row.
-    if len(cloud.points) >= MIN_POINTS and all(each.all() for each in finite):
+    keep = _is_finite(cloud)
+    if len(keep) >= MIN_POINTS and keep.all():
         return cloud
-    keep = np.all([each.all(axis=tuple(range(1, each.ndim))) for each in finite], axis=0)
     if keep.sum() < MIN_POINTS:
         raise ValueError(f"cloud: expected at least {MIN_POINTS} finite points, got {keep.sum()} of {keep.size}")
     warnings.warn(f"left out {np.sum(~keep)} of {keep.size} points with a NaN or infinity", UserWarning, stacklevel=3)
@@ -147,6 +207,16 @@ def finite_rows(cloud: PointCloud | Values) -> PointCloud:
         covariances=None if cloud.covariances is None else cloud.covariances[keep],
         channel_names=cloud.channel_names,
     )
+
+
+def _is_finite(cloud: PointCloud) -> Bool[np.ndarray, "N"]:
+    """Which rows are finite in all arrays. Values such as 1e39 or 1e300 overflow float32 and count as infinite."""
+    arrays = [array for array in (cloud.points, cloud.channels, cloud.covariances) if array is not None]
+    finite = [np.abs(array) <= _LARGEST for array in arrays]
+    # Most clouds are finite throughout, and one check of all values is much faster than one per row.
+    if all(each.all() for each in finite):
+        return np.ones(len(cloud.points), bool)
+    return np.all([each.all(axis=tuple(range(1, each.ndim))) for each in finite], axis=0)
 
 
 def _downsampled(cloud: PointCloud, voxel_size: float) -> PointCloud:

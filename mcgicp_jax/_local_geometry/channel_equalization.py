@@ -50,8 +50,11 @@ def _ranges(cloud: PointCloud) -> list[tuple[float, float]]:
     return ranges
 
 
-def with_channels_matched(source: PointCloud, target: PointCloud, matches: Correspondences | None = None) -> PointCloud:
-    """The source with a gain and an offset applied to each channel, so that its distribution matches the target's.
+def with_channels_matched(
+    source: PointCloud, target: PointCloud, matches: Correspondences | None = None
+) -> tuple[PointCloud, Float[AnyArray, "C"]]:
+    """The source with a gain and an offset applied to each channel, so that its distribution matches the target's; and
+    the gains.
 
     Gain and offset equalise mean and standard deviation of the quantiles from 5 to 95 %, which is robust against small
     parts that only one cloud sees. Regression over matches is not used: noise, and matches across edges, would bias the
@@ -69,7 +72,8 @@ def with_channels_matched(source: PointCloud, target: PointCloud, matches: Corre
         values = [xp.where(matched, each, xp.nan) for each in values]
     gain, offset = gain_and_offset(*values)
     dtype = source.channels.dtype
-    return source.replace(channels=xp.asarray(source.channels) * gain.astype(dtype) + offset.astype(dtype))
+    channels = xp.asarray(source.channels) * gain.astype(dtype) + offset.astype(dtype)
+    return source.replace(channels=channels), gain
 
 
 def gain_and_offset(

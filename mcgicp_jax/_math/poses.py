@@ -193,6 +193,18 @@ def units(radius: Float[Array, ""]) -> Float[Array, "6"]:
     return jnp.stack([radius] * 3 + [jnp.ones_like(radius)] * 3)
 
 
+def parameters_by_twist(pose: Float[np.ndarray, "7"], center: Float[np.ndarray, "3"]) -> Float[np.ndarray, "7 6"]:
+    """Derivative of pose parameters `wxyz_xyz` by a twist about a centre, metres and radians: the pose turns by ω about
+    the centre and shifts by v."""
+    found, identity = np.zeros((7, 6)), np.eye(3)
+    found[0, 3:] = -0.5 * pose[1:4]
+    # np.cross(identity, a) is the matrix that maps b to a × b.
+    found[1:4, 3:] = 0.5 * (pose[0] * identity - np.cross(identity, pose[1:4]))
+    found[4:, :3] = identity
+    found[4:, 3:] = -np.cross(identity, pose[4:] - center)
+    return found
+
+
 def from_center(offset: Float[Array, "3"], radius: Float[Array, ""], other: Float[Array, ""]) -> Float[Array, "6 6"]:
     """(6, 6) matrix from twists about a centre, lengths in units of `radius`, to twists about another one.
 

@@ -6,6 +6,7 @@ import abc
 from collections.abc import Callable
 from typing import ClassVar, TypeAlias
 
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
@@ -99,6 +100,13 @@ class AbstractMethod(Numbers):
         A subclass that defines `weights` defines this too.
         """
         raise NotImplementedError(f"{type(self).__name__} defines weights, but not missing_variances")
+
+
+def with_unset_from(method: AbstractMethod, resolved: AbstractMethod) -> AbstractMethod:
+    """The method, with the parameters that are None taken from the result of `resolve`."""
+    return jax.tree.map(
+        lambda own, other: other if own is None else own, method, resolved, is_leaf=lambda leaf: leaf is None
+    )
 
 
 class AbstractOneSided(AbstractMethod):

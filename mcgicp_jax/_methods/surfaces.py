@@ -98,20 +98,25 @@ def covariances_of(method: AbstractMethod, cloud: PointCloud) -> Float[np.ndarra
 
 
 def searchable(method: AbstractMethod, cloud: PointCloud) -> SearchPoints:
-    """The cloud as the input of a search: positions, descriptors α · channel, and penalties for missing channels."""
-    xp = numpy_for(method, cloud)
-    points, channels = xp.asarray(cloud.points), xp.asarray(cloud.channels)
+    """The cloud as the input of a search."""
+    return search_rows(method, cloud.points, cloud.channels, cloud.channel_valid, cloud.valid)
+
+
+def search_rows(method: AbstractMethod, points: Any, channels: Any, channel_valid: Any, valid: Any) -> SearchPoints:
+    """Rows of a cloud as the input of a search: positions, descriptors α · channel, penalties for missing channels."""
+    xp = numpy_for(method, points, channels, channel_valid, valid)
+    points, channels, valid = xp.asarray(points), xp.asarray(channels), xp.asarray(valid)
     weights = method.weights(channels.shape[-1])
     if weights is None:
-        return SearchPoints(points, xp.zeros((points.shape[0], 0), points.dtype), xp.asarray(cloud.valid))
+        return SearchPoints(points, xp.zeros((points.shape[0], 0), points.dtype), valid)
     weights, penalty = xp.asarray(weights), None
-    if cloud.channel_valid is not None:
+    if channel_valid is not None:
         # The expected squared difference in a true match: on average, a missing channel makes a match neither nearer
         # nor farther.
         with np.errstate(over="ignore", invalid="ignore"):
             expected = weights**2 * xp.asarray(method.missing_variances(channels.shape[-1]))
-        penalty = xp.where(xp.asarray(cloud.channel_valid), 0, expected.astype(points.dtype))
-    return SearchPoints(points, channels * weights.astype(points.dtype), xp.asarray(cloud.valid), penalty)
+        penalty = xp.where(xp.asarray(channel_valid), 0, expected.astype(points.dtype))
+    return SearchPoints(points, channels * weights.astype(points.dtype), valid, penalty)
 
 
 def surface_on_host(

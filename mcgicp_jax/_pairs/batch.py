@@ -12,6 +12,7 @@ import numpy as np
 
 from mcgicp_jax._clouds.point_cloud import PointCloud
 from mcgicp_jax._clouds.preprocess import check_preprocessing
+from mcgicp_jax._compute.concrete import is_concrete
 from mcgicp_jax._math.poses import Pose, pose_matrix
 from mcgicp_jax._methods.base import AbstractMethod
 from mcgicp_jax._pairs.batch_executors import check_executor, run
@@ -34,18 +35,19 @@ def register_batch(
     """Register many pairs of clouds of any sizes; return one `RegistrationResult` per pair, in the order of the pairs.
 
     Waits for all pairs. See `register_as_completed` for arguments, errors and warnings.
+
+    Outside `jit`, the poses have derivatives, as those of `register`, by the points and channels of the clouds and the
+    parameters of the method. They are computed side by side, so that `jax.value_and_grad` of a loss over the poses of
+    many pairs is one call. Only the default `executor` is available then, and clouds must be given in lists.
     """
-    completed = register_as_completed(
-        sources,
-        targets,
-        method,
-        init=init,
-        voxel_size=voxel_size,
-        num_neighbors=num_neighbors,
-        executor=executor,
-        **options,
-    )
-    return [result for _, result in sorted(completed, key=lambda item: item[0])]
+    job, pairs = _job(sources, targets, method, init, voxel_size, num_neighbors, executor, options)
+    # A look at an iterator would use it up.
+    clouds = [side for side in (sources, targets) if isinstance(side, list | tuple | PointCloud)]
+    if not is_concrete(clouds, job.method, job.options.robust):
+        if executor is not None:
+            raise ValueError(f"executor: expected None for derivatives, got {executor!r}")
+        return job.register_differentiated(pairs)
+    return [result for _, result in sorted(run(job, pairs, executor), key=lambda item: item[0])]
 
 
 def register_as_completed(
@@ -89,11 +91,25 @@ def register_as_completed(
     Warns:
         PairWarning: the reason for each pair with the status `INVALID_INPUT` or `WORKER_FAILED`; a `UserWarning`.
     """
+    return run(*_job(sources, targets, method, init, voxel_size, num_neighbors, executor, options), executor)
+
+
+def _job(
+    sources: Iterable[Cloud] | Cloud,
+    targets: Iterable[Cloud] | Cloud,
+    method: AbstractMethod,
+    init: Any,
+    voxel_size: float | None,
+    num_neighbors: int,
+    executor: Executor | None,
+    options: GivenOptions,
+) -> tuple[BatchJob, Iterator[Pair]]:
+    """The settings common to all pairs, checked, and the pairs."""
     check_method(method)
     check_preprocessing(voxel_size, num_neighbors)
     check_executor(executor)
     job = BatchJob(method, options_of(register_batch, options), voxel_size, num_neighbors)
-    return run(job, _pairs(job, sources, targets, init), executor)
+    return job, _pairs(job, sources, targets, init)
 
 
 def _pairs(

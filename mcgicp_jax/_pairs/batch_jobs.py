@@ -7,6 +7,7 @@ import warnings
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Executor, Future, ThreadPoolExecutor
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any, Literal, TypeAlias
 
 import equinox as eqx
@@ -16,14 +17,16 @@ import numpy as np
 from mcgicp_jax._clouds.point_cloud import PointCloud, Values
 from mcgicp_jax._clouds.preprocess import preprocess
 from mcgicp_jax._compute.argument_checks import errors_named
+from mcgicp_jax._compute.linear_maps import primal
 from mcgicp_jax._compute.size_classes import size_class
-from mcgicp_jax._compute.threads import with_settings
+from mcgicp_jax._compute.threads import in_new_thread, num_cores, side_by_side, with_settings
 from mcgicp_jax._math.poses import Pose
 from mcgicp_jax._methods.base import AbstractMethod
 from mcgicp_jax._pairs.register import register_from, start_from_anywhere
 from mcgicp_jax._registration.make_result import registration_of
 from mcgicp_jax._registration.options import Options
-from mcgicp_jax._registration.register_pair import pose_problem
+from mcgicp_jax._registration.pose_derivative import Given
+from mcgicp_jax._registration.register_pair import Run, pose_problem, prepared, results_of, run_pair
 from mcgicp_jax._registration.result import RegistrationResult, Status, computed
 from mcgicp_jax._registration.step import Problem
 from mcgicp_jax._registration.vectorized import run_problems
@@ -80,6 +83,15 @@ class _LanePair:
     index: int
     source: PointCloud
     target: PointCloud
+
+
+@dataclass(frozen=True)
+class _GivenPair:
+    """A pair whose arrays differentiation traces."""
+
+    index: int
+    given: Given
+    init: Pose | None
 
 
 @dataclass(frozen=True)
@@ -142,28 +154,66 @@ class BatchJob:
             options = replace(self.options, search=self.search)
             result = register_from(source, target, self.method, pair.init, options)
         except ValueError as error:
-            return _invalid(pair, error)
+            return _invalid(pair.index, error)
         return PairResult(pair.index, computed(result))
+
+    def register_differentiated(self, pairs: Iterable[Pair]) -> list[RegistrationResult]:
+        """The results of pairs whose arrays differentiation traces. All derivatives are computed side by side."""
+        ready = [self._given(pair) for pair in pairs]
+        # What is traced is traced in this thread alone.
+        calls = [
+            partial(lambda each: each, pair)
+            if isinstance(pair, PairResult)
+            else partial(self._run, pair, pair.given.values())
+            for pair in ready
+        ]
+        runs = in_new_thread(partial(side_by_side, calls, num_cores()))
+        both = zip(runs, ready, strict=True)
+        ended = [(run, pair.given) for run, pair in both if isinstance(run, Run) and isinstance(pair, _GivenPair)]
+        results = iter(results_of([run for run, _ in ended], [given for _, given in ended]))
+        return [next(results) if isinstance(run, Run) else run.with_warning()[1] for run in runs]
+
+    def _given(self, pair: Pair) -> PairResult | _GivenPair:
+        try:
+            source, target = self.ready("source", pair.source), self.ready("target", pair.target)
+            init = self._start(pair, primal(source), primal(target))
+            if isinstance(init, PairResult):
+                return init
+            return _GivenPair(pair.index, prepared(source, target, self.method, self.options), primal(init))
+        except ValueError as error:
+            return _invalid(pair.index, error)
+
+    def _run(self, pair: _GivenPair, values: Given) -> PairResult | Run:
+        try:
+            return run_pair(values, pair.init, replace(self.options, search=self.search))
+        except ValueError as error:
+            return _invalid(pair.index, error)
+
+    def _start(self, pair: Pair, source: PointCloud, target: PointCloud) -> PairResult | Pose | None:
+        """The initial pose of a pair, or its result if none is found."""
+        if not isinstance(pair.init, str):
+            return pair.init
+        start = start_from_anywhere(pair.init, source, target)
+        if start.success:
+            return start.matrix
+        return PairResult(pair.index, RegistrationResult.without_pose(Status.TOO_FEW_CORRESPONDENCES))
 
     def _problem(self, pair: Pair) -> PairResult | tuple[_LanePair, Problem]:
         """The pair as input of a lane, both surfaces padded to one size class so that few programs are compiled."""
         try:
             source, target = self.ready("source", pair.source), self.ready("target", pair.target)
-            init = pair.init
-            if isinstance(init, str):
-                start = start_from_anywhere(init, source, target)
-                if not start.success:
-                    return PairResult(pair.index, RegistrationResult.without_pose(Status.TOO_FEW_CORRESPONDENCES))
-                init = start.matrix
+            init = self._start(pair, source, target)
+            if isinstance(init, PairResult):
+                return init
             problem, _ = pose_problem(source, target, self.method, init, self.options, num_threads=1)
             problem = _padded(problem, size_class(max(len(source.points), len(target.points))))
         except ValueError as error:
-            return _invalid(pair, error)
+            return _invalid(pair.index, error)
         return _LanePair(pair.index, source, target), problem
 
 
-def _invalid(pair: Pair, error: ValueError) -> PairResult:
-    return PairResult(pair.index, RegistrationResult.without_pose(Status.INVALID_INPUT), str(error))
+def _invalid(index: int, error: ValueError) -> PairResult:
+    return PairResult(index, RegistrationResult.without_pose(Status.INVALID_INPUT), str(error))
 
 
 def _padded(problem: Problem, size: int) -> Problem:

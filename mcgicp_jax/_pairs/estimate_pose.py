@@ -1,6 +1,8 @@
-"""The pose for given matches, for losses and custom loops. Pure JAX."""
+"""The pose for given matches, for losses and custom loops."""
 
 from __future__ import annotations
+
+from functools import partial
 
 import jax
 import jax.numpy as jnp
@@ -9,6 +11,9 @@ from jax.typing import ArrayLike
 
 from mcgicp_jax._clouds.origins import centred_pose
 from mcgicp_jax._clouds.point_cloud import PointCloud
+from mcgicp_jax._compute.concrete import is_concrete, numpy_for
+from mcgicp_jax._compute.linear_maps import primal
+from mcgicp_jax._compute.threads import in_new_thread
 from mcgicp_jax._math.poses import Pose, se3_from_matrix
 from mcgicp_jax._math.robust_kernels import AbstractKernel
 from mcgicp_jax._methods.base import AbstractMethod
@@ -16,7 +21,10 @@ from mcgicp_jax._methods.surfaces import surface_pair
 from mcgicp_jax._pose_solver.matched import match_surfaces
 from mcgicp_jax._registration.input_checks import check_clouds, check_matches
 from mcgicp_jax._registration.make_result import registration_of
+from mcgicp_jax._registration.on_host import FixedMatchesOnHost
 from mcgicp_jax._registration.options import Options
+from mcgicp_jax._registration.pose_derivative import Given, Inputs
+from mcgicp_jax._registration.register_pair import Run, results_of, run_to_end
 from mcgicp_jax._registration.result import RegistrationResult
 from mcgicp_jax._registration.settings import settings_for
 from mcgicp_jax._registration.step import Problem
@@ -37,7 +45,7 @@ def estimate_pose(
     robust: AbstractKernel | None = None,
     temperature: ArrayLike | None = None,
 ) -> RegistrationResult:
-    """Compute the pose for fixed matches: update the pose, recompute M, and repeat until the pose converges. Pure JAX.
+    """Compute the pose for fixed matches: update the pose, recompute M, and repeat until the pose converges.
 
     Works under `jit`, `vmap`, `grad` and `jvp`. The first derivative follows from the implicit function theorem for
     the root of Σ w JᵀM d = 0 near the returned pose (d = b − T a, J = ∂(T a)/∂ξ, robust weight w). Matches, neighbours
@@ -74,14 +82,41 @@ def estimate_pose(
     )
     check_matches(matches, source, method, temperature)
     check_clouds(source, target, method)
-    pair = surface_pair(method, source, target, observed=False, robust=robust)
+    dtype = source.points.dtype
+    softness = None if temperature is None else numpy_for(temperature).asarray(temperature, dtype)
+    given = Given(source, target, method, robust, temperature=softness)
+    values, init, matches = given.values(), primal(init), primal(matches)
+    if not is_concrete(values, matches, init):
+        return _estimated_inside_jit(given, matches, init, options)
+    estimate = partial(_estimated_on_host, values, matches, init, options)
+    run = estimate() if is_concrete(given) else in_new_thread(estimate)
+    (result,) = results_of([run], [given])
+    return result
+
+
+def _estimated_on_host(given: Given, matches: Correspondences, init: Pose | None, options: Options) -> Run:
+    problem, method = _problem(given, init, options)
+    inputs = Inputs(given.source, given.target, method, problem.terms, temperature=given.temperature)
+    return run_to_end(inputs, FixedMatchesOnHost(problem, matches, given.temperature, 1), rematched=False)
+
+
+def _estimated_inside_jit(
+    given: Given, matches: Correspondences, init: Pose | None, options: Options
+) -> RegistrationResult:
+    problem, _ = _problem(given, init, options)
+    softness = None if given.temperature is None else jnp.asarray(given.temperature)
+    fixed, fixed_softness = jax.lax.stop_gradient((problem, softness))
+    loop = estimate_pose_traced(fixed, matches, fixed_softness, options.max_iterations)
+    matched = match_surfaces(problem.source, problem.target, matches, softness)
+    state = differentiable(loop, matched, problem.terms)
+    assessment = assess_alignment(loop, fixed, fixed_softness)
+    return registration_of(state, assessment, loop.history, given.source, given.target)
+
+
+def _problem(given: Given, init: Pose | None, options: Options) -> tuple[Problem, AbstractMethod]:
+    source, target = given.source, given.target
+    pair = surface_pair(given.method, source, target, observed=False, robust=given.robust)
     dtype = source.points.dtype
     start = se3_from_matrix(centred_pose(init, source, target), dtype)
-    softness = None if temperature is None else jnp.asarray(temperature, dtype)
     settings = settings_for(options, pair.method, target, 1, dtype)
-    problem = Problem(start, pair.source, pair.target, pair.terms, settings)
-    fixed, fixed_softness = jax.lax.stop_gradient((problem, softness))
-    loop = estimate_pose_traced(fixed, matches, fixed_softness, max_iterations)
-    matched = match_surfaces(pair.source, pair.target, matches, softness)
-    state = differentiable(loop, matched, pair.terms)
-    return registration_of(state, assess_alignment(loop, fixed, fixed_softness), loop.history, source, target)
+    return Problem(start, pair.source, pair.target, pair.terms, settings), pair.method

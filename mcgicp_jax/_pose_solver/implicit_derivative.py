@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -10,6 +11,7 @@ import jax.numpy as jnp
 import jaxlie
 from jaxtyping import Array, Bool, Float
 
+from mcgicp_jax._compute.linear_maps import is_symbolic_zero, once
 from mcgicp_jax._math.poses import units
 from mcgicp_jax._pose_solver.matched import Matched, Motion, linearize_at
 from mcgicp_jax._pose_solver.pose_measurements import Fusion
@@ -17,7 +19,7 @@ from mcgicp_jax._pose_solver.sums import Sums
 from mcgicp_jax._terms.base import AbstractTerm
 
 # Iteration limit. Newton's method, which starts at the pose of the loop and converges quadratically, takes 3 or 4.
-_MAX_NEWTON_STEPS = 8
+MAX_NEWTON_STEPS = 8
 
 
 class ImplicitRoot(eqx.Module):
@@ -39,7 +41,11 @@ class ImplicitRoot(eqx.Module):
 
 
 def root_near(sums: Sums, usable: Bool[Array, ""], fusion: Fusion | None) -> ImplicitRoot:
-    """The scaling of g, from the sums at the returned pose or from `Fusion`."""
+    """The scaling of g, from the sums at the returned pose or from `Fusion`.
+
+    Args:
+        usable: False if the loop ended without a pose at rest. With `fusion`, all directions must be held, too.
+    """
     if fusion is not None:
         radius = jnp.asarray(fusion.radius)
         return ImplicitRoot(center=jnp.asarray(fusion.center), radius=radius, scale=radius, usable=usable)
@@ -78,11 +84,11 @@ def _with_derivative_jvp(
 ) -> tuple[Float[Array, "7"], Float[Array, "7"]]:
     pose, root, model = primals
     leaves, structure = jax.tree.flatten(model)
-    slopes = jax.tree.leaves(tangents[2], is_leaf=_is_symbolic_zero)
-    moving = [i for i, slope in enumerate(slopes) if not _is_symbolic_zero(slope)]
+    slopes = jax.tree.leaves(tangents[2], is_leaf=is_symbolic_zero)
+    moving = [i for i, slope in enumerate(slopes) if not is_symbolic_zero(slope)]
     if not moving:
         return pose, jnp.zeros_like(pose)
-    leaves = [_once(leaf) if jnp.issubdtype(leaf.dtype, jnp.inexact) else leaf for leaf in leaves]
+    leaves = [once(leaf) if jnp.issubdtype(leaf.dtype, jnp.inexact) else leaf for leaf in leaves]
     constants = jax.lax.stop_gradient((pose, root, leaves))
     at_root, inverse, found = _newton(constants[0], constants[1], jax.tree.unflatten(structure, constants[2]))
 
@@ -100,30 +106,11 @@ def _with_derivative_jvp(
 with_derivative.defjvp(_with_derivative_jvp, symbolic_zeros=True)
 
 
-@jax.custom_jvp
-def _once(value: Array) -> Array:
-    """The value. Its derivative raises, because second derivatives of the pose would be wrong."""
-    return value
-
-
-def _once_jvp(primals: tuple[Array], tangents: tuple[Any]) -> tuple[Array, Any]:
-    if not _is_symbolic_zero(tangents[0]):
-        raise NotImplementedError("poses of register and estimate_pose have first derivatives only, not second ones")
-    return primals[0], jnp.zeros_like(primals[0])
-
-
-_once.defjvp(_once_jvp, symbolic_zeros=True)
-
-
 def _along(pose: Float[Array, "7"], twist: Float[Array, "6"], center: Float[Array, "3"]) -> Float[Array, "7"]:
     """First-order change of the pose parameters `wxyz_xyz` along a twist about a centre; linear in the twist."""
     rotation = jaxlie.SO3(jnp.append(jnp.zeros(1, twist.dtype), 0.5 * twist[3:])) @ jaxlie.SO3(pose[:4])
     translation = twist[:3] + jnp.cross(twist[3:], pose[4:] - center)
     return jnp.concatenate([rotation.wxyz.astype(pose.dtype), translation])
-
-
-def _is_symbolic_zero(tangent: object) -> bool:
-    return isinstance(tangent, jax.custom_derivatives.SymbolicZero)
 
 
 def _newton(
@@ -135,8 +122,10 @@ def _newton(
 
     def step(carry: tuple[Array, Array, Array, Array]) -> tuple[Array, Array, Array, Array]:
         count, pose, _, _ = carry
-        balance, push = jax.linearize(lambda twist: _balance(twist, pose, root, model), jnp.zeros_like(pose[:6]))
-        jacobian = jnp.where(root.usable, jax.vmap(push, out_axes=1)(identity), identity)
+        balance, jacobian = value_and_jacobian(
+            lambda twist: _balance(twist, pose, root, model), jnp.zeros_like(pose[:6])
+        )
+        jacobian = jnp.where(root.usable, jacobian, identity)
         inverse = jnp.linalg.inv(jacobian)
         twist = jnp.where(root.usable, -inverse @ balance, 0)
         moved = pose + _along(pose, twist * units(root.radius), root.center)
@@ -146,27 +135,54 @@ def _newton(
     def unfinished(carry: tuple[Array, Array, Array, Array]) -> Bool[Array, ""]:
         count, _, _, size = carry
         # Convergence is quadratic: after a step below √eps the remaining error is rounding.
-        return (count < _MAX_NEWTON_STEPS) & ~(size <= jnp.sqrt(eps))
+        return (count < MAX_NEWTON_STEPS) & ~(size <= jnp.sqrt(eps))
 
     start = jnp.int32(0), pose, identity, jnp.asarray(jnp.inf, pose.dtype)
     _, at_root, inverse, size = jax.lax.while_loop(unfinished, step, start)
     return at_root, inverse, root.usable & (size <= jnp.sqrt(eps))
 
 
-def _balance(twist: Float[Array, "6"], pose: Float[Array, "7"], root: ImplicitRoot, model: Model) -> Float[Array, "6"]:
-    """g / scale, sums of forces and torques, at a pose moved to first order along a twist (in units of the radius).
+def value_and_jacobian(
+    function: Callable[[Float[Array, "6"]], Float[Array, "6"]], twist: Float[Array, "6"]
+) -> tuple[Float[Array, "6"], Float[Array, "6 6"]]:
+    """A sum over points at a twist, and its derivative. In forward mode the program takes fifteen times as long."""
+    value, pull = jax.vjp(function, twist)
+    return value, jax.vmap(lambda row: pull(row)[0])(jnp.eye(6, dtype=twist.dtype))
 
-    With tie points or a prior, `Fusion.balance`.
-    """
+
+def _balance(twist: Float[Array, "6"], pose: Float[Array, "7"], root: ImplicitRoot, model: Model) -> Float[Array, "6"]:
+    """g / scale at a pose moved along a twist, see `score_along`; with tie points or a prior, `Fusion.balance`."""
     matched, terms, fusion = model
+    score = score_along(twist, pose, root, matched, terms)
+    return score if fusion is None else balance_along(twist, pose, root, score, fusion)
+
+
+def score_along(
+    twist: Float[Array, "6"],
+    pose: Float[Array, "7"],
+    root: ImplicitRoot,
+    matched: Matched,
+    terms: tuple[AbstractTerm, ...],
+) -> Float[Array, "6"]:
+    """g / scale, sums of forces and torques, at a pose moved to first order along a twist (in units of the radius)."""
+    # Without a usable root, ignoring all correspondences keeps values and derivatives finite.
+    matched = eqx.tree_at(lambda matched: matched.valid, matched, matched.valid & root.usable)
+    posed, found, _ = linearize_at(_moved(twist, pose, root), matched, terms)
+    arms = jnp.where(matched.valid, posed.moved - root.center[:, None], 0)
+    torque = jnp.cross(arms, found.force, axis=0)
+    return jnp.concatenate([jnp.sum(found.force, axis=1) * root.radius, jnp.sum(torque, axis=1)]) / root.scale
+
+
+def balance_along(
+    twist: Float[Array, "6"], pose: Float[Array, "7"], root: ImplicitRoot, score: Float[Array, "6"], fusion: Fusion
+) -> Float[Array, "6"]:
+    """`Fusion.balance` at a pose moved to first order along a twist, from the score there."""
+    motion = _moved(twist, pose, root)
+    return fusion.balance(score, jnp.asarray(motion.rotation), jnp.asarray(motion.translation))
+
+
+def _moved(twist: Float[Array, "6"], pose: Float[Array, "7"], root: ImplicitRoot) -> Motion:
     rotation = jaxlie.SO3(pose[:4]).as_matrix().astype(pose.dtype)
     v, omega = twist[:3] * root.radius, twist[3:]
     turned = rotation + jnp.cross(omega[:, None], rotation, axis=0)
-    translation = pose[4:] + v + jnp.cross(omega, pose[4:] - root.center)
-    # Without a usable root, ignoring all correspondences keeps values and derivatives finite.
-    matched = eqx.tree_at(lambda matched: matched.valid, matched, matched.valid & root.usable)
-    posed, found, _ = linearize_at(Motion(turned, translation), matched, terms)
-    arms = jnp.where(matched.valid, posed.moved - root.center[:, None], 0)
-    torque = jnp.cross(arms, found.force, axis=0)
-    score = jnp.concatenate([jnp.sum(found.force, axis=1) * root.radius, jnp.sum(torque, axis=1)]) / root.scale
-    return score if fusion is None else fusion.balance(score, turned, translation)
+    return Motion(turned, pose[4:] + v + jnp.cross(omega, pose[4:] - root.center))

@@ -7,10 +7,10 @@ from typing import Any, NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Float
 
-from mcgicp_jax._compute.concrete import AnyArray, AnyScalar
-from mcgicp_jax._local_geometry.surface import Surface
+from mcgicp_jax._compute.concrete import AnyArray, AnyScalar, numpy_for
+from mcgicp_jax._local_geometry.surface import Surface, searched
 from mcgicp_jax._math import symmetric_matrices as alg
 from mcgicp_jax._search.base import Correspondences, SearchPoints
 from mcgicp_jax._terms.base import AbstractTerm, Linearization, PosedMatches, linearize
@@ -74,11 +74,14 @@ def match_surfaces(
     tiled = source
     if num_candidates > 1:
         tiled = jax.tree.map(lambda rows: jnp.concatenate([rows] * num_candidates), source)
-    apart = None if temperature is None else _square_apart(tiled.search, target.search, indices)
-    if not with_search:
+    if not with_search and temperature is None:
         tiled, target = tiled._replace(search=None), target._replace(search=None)
     tiled, target = jax.tree.map(jnp.asarray, (tiled, target))
-    return Matched(tiled, surface_rows(target, indices), valid, apart, temperature, num_candidates)
+    target = surface_rows(target, indices)
+    apart = None if temperature is None else square_apart(searched(tiled), searched(target))
+    if not with_search:
+        tiled, target = tiled._replace(search=None), target._replace(search=None)
+    return Matched(tiled, target, valid, apart, temperature, num_candidates)
 
 
 def surface_rows(surface: Surface, rows: Any) -> Surface:
@@ -96,18 +99,14 @@ def distances_within(
     return distances, distances <= max_distance
 
 
-def _square_apart(
-    source: SearchPoints | None, target: SearchPoints | None, indices: Int[Array, "n"]
-) -> Float[Array, "n"]:
-    """Squared distance of the descriptors, with the penalties for missing channels, metres²."""
-    if source is None or target is None:
-        raise ValueError("temperature: expected surfaces with the inputs of the search")
-    square = (jnp.asarray(source.descriptors) - jnp.asarray(target.descriptors)[indices]) ** 2
-    penalties = (source.penalty, None if target.penalty is None else jnp.asarray(target.penalty)[indices])
-    for penalty in penalties:
+def square_apart(source: SearchPoints, target: SearchPoints) -> Float[AnyArray, "*m n"]:
+    """Squared distance of the descriptors of matched rows, with the penalties for missing channels, metres²."""
+    xp = numpy_for(source, target)
+    square = (source.descriptors - target.descriptors) ** 2
+    for penalty in (source.penalty, target.penalty):
         if penalty is not None:
-            square = jnp.where(penalty > 0, penalty, square)
-    return jnp.sum(square, axis=1)
+            square = xp.where(penalty > 0, penalty, square)
+    return xp.sum(square, axis=-1)
 
 
 def linearize_at(

@@ -13,6 +13,7 @@ from mcgicp_jax._clouds.point_cloud import PointCloud
 from mcgicp_jax._compute.argument_checks import check_integer, check_positive
 from mcgicp_jax._compute.cache import cached_with
 from mcgicp_jax._compute.concrete import constant, is_concrete
+from mcgicp_jax._compute.linear_maps import primal
 from mcgicp_jax._math.poses import Pose, se3_from_matrix
 from mcgicp_jax._methods.base import AbstractMethod
 from mcgicp_jax._methods.surfaces import searchable
@@ -51,6 +52,8 @@ def find_correspondences(
             channels or dtypes do not fit.
     """
     search = search or default_search()
+    # Matches are constants to autodiff.
+    source, target, pose, method, max_distance = map(primal, (source, target, pose, method, max_distance))
     check_clouds(source, target, method)
     method = method.resolve(source, target)
     check_positive("max_distance", max_distance)

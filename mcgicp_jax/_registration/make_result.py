@@ -13,6 +13,7 @@ from mcgicp_jax._clouds.origins import pose_in_user_frame
 from mcgicp_jax._clouds.point_cloud import PointCloud
 from mcgicp_jax._compute.concrete import constant, is_concrete, numpy_for
 from mcgicp_jax._compute.lazy import Lazy
+from mcgicp_jax._compute.linear_maps import primal
 from mcgicp_jax._math.poses import se3_from_matrix, translation_adjoint
 from mcgicp_jax._registration.assessment import Assessment
 from mcgicp_jax._registration.result import Constraints, RegistrationResult, Uncertainty
@@ -28,11 +29,13 @@ def registration_of(
 ) -> RegistrationResult:
     """Build the `RegistrationResult` of a final state, in the user's frames; NumPy where everything is concrete."""
     history: dict[str, Any] = records._asdict()
+    # Outside `jit`, the derivative of the pose is all that may be traced.
+    pose, state, source, target = state.pose, *map(primal, (state, source, target))
     concrete = is_concrete(state, history)
     if concrete:
         # Reading NumPy arrays compiles nothing.
         state, history = jax.tree.map(np.asarray, (state, history))
-    pose = state.pose
+        pose = state.pose if is_concrete(pose) else pose
     matrix = pose_in_user_frame(pose, source.origin, target.origin)
     numbers: Any = {
         "status_code": state.status,

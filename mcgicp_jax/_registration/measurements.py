@@ -14,6 +14,7 @@ from jaxtyping import Float
 from mcgicp_jax._clouds.origins import centred_pose
 from mcgicp_jax._clouds.point_cloud import PointCloud
 from mcgicp_jax._compute.concrete import AnyArray, constant, is_concrete, numpy_for, outside_trace
+from mcgicp_jax._compute.linear_maps import primal
 from mcgicp_jax._math.poses import matrices_of, translation_adjoint
 from mcgicp_jax._math.symmetric_matrices import inverse_6
 from mcgicp_jax._pose_solver.covariance import Moments
@@ -98,13 +99,17 @@ def fusion_of(state: State, moments: Moments, ties: TiePoints | None, prior: Pri
         # Reading NumPy arrays compiles nothing.
         center, directions = jax.tree.map(np.asarray, (center, directions))
     form = form_at(matrix[:3, :3], matrix[:3, 3], center, directions.radius, ties, prior)
-    if is_concrete(state, moments, form):
+    fixed = primal(form)
+    if is_concrete(state, moments, fixed):
         with jax.enable_x64(True), outside_trace():
-            fusion = fuse(*as_float64((state.pose, center, directions, moments, form)))
-        return jax.tree.map(lambda array: np.asarray(array, None if array.dtype == bool else dtype), fusion)
+            fusion = fuse(*as_float64((state.pose, center, directions, moments, fixed)))
+        fusion = jax.tree.map(lambda array: np.asarray(array, None if array.dtype == bool else dtype), fusion)
+        if form is fixed:
+            return fusion
+    else:
+        fusion = fuse(state.pose, center, directions, moments, constant(fixed))
+        fusion = jax.tree.map(lambda array: array if array.dtype == bool else array.astype(dtype), fusion)
     form = jax.tree.map(lambda array: jnp.asarray(array, dtype), form)
-    fusion = fuse(state.pose, center, directions, moments, constant(form))
-    fusion = jax.tree.map(lambda array: array if array.dtype == bool else array.astype(dtype), fusion)
     return eqx.tree_at(lambda fusion: fusion.form, fusion, form)
 
 

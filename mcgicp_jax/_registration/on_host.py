@@ -11,19 +11,19 @@ import jax
 import jax.numpy as jnp
 import jaxlie
 import numpy as np
-from jaxtyping import Bool, Int
+from jaxtyping import Bool, Float, Int
 
 from mcgicp_jax._compute.blocks import map_blocks, map_rows
 from mcgicp_jax._compute.packing import Packed
 from mcgicp_jax._local_geometry.surface import Surface, SurfaceNoise, searched
 from mcgicp_jax._math.poses import rotation_from_quaternion
 from mcgicp_jax._pose_solver.covariance import Scores, scores_of
-from mcgicp_jax._pose_solver.matched import Matched, Motion
+from mcgicp_jax._pose_solver.matched import Matched, Motion, square_apart
 from mcgicp_jax._pose_solver.pose_measurements import Fusion
 from mcgicp_jax._pose_solver.sums import Sums, combine, sums_of
 from mcgicp_jax._registration.loop import AbstractExecutor, LoopResult
 from mcgicp_jax._registration.step import COARSE, SETTLED, Problem, Record, Settings, State, update
-from mcgicp_jax._search.base import AbstractIndex, SearchPoints, by_position
+from mcgicp_jax._search.base import AbstractIndex, Correspondences, SearchPoints, by_position
 from mcgicp_jax._terms.base import AbstractTerm
 
 
@@ -47,6 +47,7 @@ class _Matches:
     """Target rows `indices` (m, N) of the m candidates of each source row, −1 where there is none.
 
     `found` says which of them are matches of points that are no padding; `max_distance` is applied when they are used.
+    `apart` and `temperature` are those of `Matched`.
     """
 
     source: _Rows
@@ -54,6 +55,8 @@ class _Matches:
     indices: Int[np.ndarray, "m N"]
     found: Bool[np.ndarray, "m N"]
     max_distance: Any
+    apart: Float[np.ndarray, "m N"] | None = None
+    temperature: Any = None
 
     @cached_property
     def rows(self) -> Int[np.ndarray, "m N"]:
@@ -63,7 +66,8 @@ class _Matches:
         """The matched rows of some source rows."""
         chosen = self.rows[:, index]
         columns = self.source.columns.rows(index), self.target.columns.rows(chosen)
-        gathered = _Gathered(*columns, self.found[:, index], self.max_distance)
+        apart = None if self.apart is None else self.apart[:, index]
+        gathered = _Gathered(*columns, self.found[:, index], self.max_distance, apart, self.temperature)
         if not with_noise:
             return gathered
         source, target = self.source.surface, self.target.surface
@@ -90,6 +94,8 @@ class _Gathered(NamedTuple):
     target: Packed[Surface]
     found: Bool[Any, "m n"]
     max_distance: Any
+    apart: Float[Any, "m n"] | None
+    temperature: Any
     source_noise: SurfaceNoise | None = None
     target_noise: SurfaceNoise | None = None
     source_search: SearchPoints | None = None
@@ -106,7 +112,7 @@ class HostExecutor(AbstractExecutor):
 
     def __init__(self, problem: Problem, index_of: Callable[[bool], AbstractIndex], num_threads: int | None):
         super().__init__(problem)
-        self._index_of, self._num_threads = index_of, num_threads
+        self._index_of, self.num_threads = index_of, num_threads
         # Which source rows are followed from pose to pose, and the function that finds their matches.
         self._followed: tuple[int, bool] | None = None
         self._whole, self._target = _Rows.of(problem.source), _Rows.of(problem.target)
@@ -153,6 +159,14 @@ class HostExecutor(AbstractExecutor):
     def source_of(self, matches: _Matches) -> Surface:
         return matches.source.surface
 
+    def correspondences(self, loop: LoopResult) -> tuple[Int[np.ndarray, "m N"], Bool[np.ndarray, "m N"]]:
+        """Target rows matched with all source points at the final pose, and whether the matches count."""
+        matches, motion = loop.matches, self.motion(loop.state.pose)
+        moved = matches.source.surface.points @ motion.rotation.T + motion.translation
+        with np.errstate(invalid="ignore", over="ignore"):
+            distances = np.linalg.norm(matches.target.surface.points[matches.rows] - moved, axis=-1)
+        return matches.rows, matches.found & (distances <= matches.max_distance)
+
     def over_rematched(
         self,
         function: Callable[..., Any],
@@ -192,7 +206,7 @@ class HostExecutor(AbstractExecutor):
         def block(index: Any) -> Any:
             return program(motion, matches.gathered(rows[index], with_noise), *arguments)
 
-        return map_rows(block, rows.size, self._num_threads if with_noise else 1)
+        return map_rows(block, rows.size, self.num_threads if with_noise else 1)
 
     def sums(self, motion: Motion, matches: _Matches, terms: tuple[AbstractTerm, ...]) -> Sums:
         parts: list[Packed[Sums]] = self._over_blocks(_packed_sums, motion, matches, terms)
@@ -238,7 +252,38 @@ class HostExecutor(AbstractExecutor):
                 chosen.found[:, size - index[0] :] = False
             return program(motion, chosen, *arguments)
 
-        return [part for _, part in map_blocks(block, size, self._num_threads if with_noise else 1)]
+        return [part for _, part in map_blocks(block, size, self.num_threads if with_noise else 1)]
+
+
+class FixedMatchesOnHost(HostExecutor):
+    """Matches that do not change with the pose, as in `estimate_pose`; there is no coarse phase.
+
+    Args:
+        matches: used at every pose.
+        temperature: of the soft assignment, metres; None for the nearest candidate.
+    """
+
+    def __init__(self, problem: Problem, matches: Correspondences, temperature: Any, num_threads: int | None):
+        super().__init__(problem, _no_index, num_threads)
+        valid = np.asarray(matches.valid).reshape(-1, problem.source.num_points)
+        indices = np.where(valid, np.asarray(matches.indices).reshape(valid.shape), -1)
+        fixed = _Matches.of(self._whole, self._target, indices, np.asarray(np.inf, problem.source.points.dtype))
+        if temperature is not None:
+            source, target = searched(problem.source), searched(problem.target)
+            apart = square_apart(source, jax.tree.map(lambda rows: rows[fixed.rows], target))
+            fixed = replace(fixed, apart=apart, temperature=np.asarray(temperature))
+        self._fixed = fixed
+
+    @property
+    def first_status(self) -> Any:
+        return self.problem.settings.first_status()
+
+    def match(self, state: State, before: Any) -> _Matches:
+        return self._fixed
+
+
+def _no_index(position_alone: bool) -> AbstractIndex:
+    raise ValueError("matches: expected a registration that searches for them")
 
 
 @cache
@@ -266,7 +311,8 @@ def _matched(gathered: _Gathered) -> Matched:
     source, target = tiled(gathered.source).tree, flat(gathered.target).tree
     source = source._replace(noise=tiled(gathered.source_noise), search=tiled(gathered.source_search))
     target = target._replace(noise=flat(gathered.target_noise), search=flat(gathered.target_search))
-    return Matched(source, target, gathered.found.reshape(-1), num_candidates=count)
+    apart = None if gathered.apart is None else gathered.apart.reshape(-1)
+    return Matched(source, target, gathered.found.reshape(-1), apart, gathered.temperature, num_candidates=count)
 
 
 def _packed_sums(motion: Motion, matched: Matched, terms: tuple[AbstractTerm, ...]) -> Packed[Sums]:

@@ -2,18 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
+from functools import partial
 from typing import NamedTuple
 
 import jax
+from jaxtyping import Float
 
 from mcgicp_jax._clouds.origins import centred_pose, pose_in_user_frame
 from mcgicp_jax._clouds.point_cloud import PointCloud, Values, as_cloud
 from mcgicp_jax._clouds.preprocess import preprocess
 from mcgicp_jax._compute.argument_checks import errors_named
-from mcgicp_jax._compute.concrete import constant, is_concrete, numpy_for, outside_trace
+from mcgicp_jax._compute.concrete import AnyArray, constant, is_concrete, numpy_for, outside_trace
 from mcgicp_jax._compute.lazy import Lazy
+from mcgicp_jax._compute.linear_maps import primal
+from mcgicp_jax._compute.threads import in_new_thread
 from mcgicp_jax._local_geometry.channel_equalization import warn_of_units, with_channels_matched
 from mcgicp_jax._local_geometry.surface import searched
 from mcgicp_jax._math.poses import Pose, se3_from_matrix
@@ -32,6 +36,7 @@ from mcgicp_jax._registration.measurements import GivenPrior, GivenTiePoints, fu
 from mcgicp_jax._registration.multi_scale import stages_of
 from mcgicp_jax._registration.on_host import HostExecutor
 from mcgicp_jax._registration.options import Options, check_method
+from mcgicp_jax._registration.pose_derivative import Given, Inputs, differentiated, with_derivatives
 from mcgicp_jax._registration.result import RegistrationResult, is_usable
 from mcgicp_jax._registration.settings import settings_for
 from mcgicp_jax._registration.step import Problem, State
@@ -41,6 +46,28 @@ from mcgicp_jax._search.brute_force import default_search
 
 # Smallest number of source points in a subsampled coarse phase: enough for nearly the pose of all points.
 _COARSE_ROWS = 4096
+
+
+class Run(NamedTuple):
+    """A registration that has ended.
+
+    Attributes:
+        inputs: of the problem, constant to autodiff outside `jit`.
+        gains: by which the channels of the source were multiplied; None unless equalised.
+        loop: its end, constant to autodiff.
+        executor: of the loop; None inside `jit`.
+        state: computes the final state, whose pose is differentiable inside `jit`.
+        assessment, moments: compute these of the final pose.
+    """
+
+    inputs: Inputs
+    gains: Float[AnyArray, "C"] | None
+    problem: Problem
+    loop: LoopResult
+    executor: HostExecutor | None
+    state: Callable[[], State]
+    assessment: Callable[[], Assessment]
+    moments: Callable[[], Moments]
 
 
 def register_pair(
@@ -53,56 +80,87 @@ def register_pair(
     prior: GivenPrior | None = None,
 ) -> RegistrationResult:
     """`register` from a given initial pose, with its options as one object."""
+    given = prepared(source, target, method, options, tie_points, prior)
+    if init is None and prior is not None:
+        init = prior[0]
+    values, init = given.values(), primal(init)
+    if not is_concrete(values):
+        values = given
+    register = partial(run_pair, values, init, options)
+    # Differentiation is a transformation, too: inside it, calls of programs take longer.
+    run = register() if values is given or is_concrete(given) else in_new_thread(register)
+    (result,) = results_of([run], [given])
+    return result
+
+
+def prepared(
+    source: PointCloud | Values,
+    target: PointCloud | Values,
+    method: AbstractMethod,
+    options: Options,
+    tie_points: GivenTiePoints | None = None,
+    prior: GivenPrior | None = None,
+) -> Given:
+    """The arguments of a registration, checked; clouds preprocessed unless the method makes cells of raw ones."""
     check_method(method)
     source, target = (
         _ready(name, cloud, options.takes_raw(method, name)) for name, cloud in (("source", source), ("target", target))
     )
     if options.voxel_sizes and not (source.covariances is None and target.covariances is None):
         raise ValueError("voxel_sizes: expected none for clouds with covariances, which cannot be averaged in voxels")
+    if options.voxel_sizes and method.needs_covariances and not is_concrete(source, target):
+        raise ValueError("voxel_sizes: expected none for derivatives with cells; make these with voxel_gaussians")
+    return Given(source, target, method, options.robust, *known(tie_points, prior, source, target))
+
+
+def run_pair(given: Given, init: Pose | None, options: Options) -> Run:
+    """Register arrays that are all concrete, or some of which `jit` or `vmap` trace."""
+    source, target, method, robust, ties, belief, _ = given
+    options, gains = replace(options, robust=robust), None
     if isinstance(method, GICP) and is_concrete(source, target):
         warn_of_covariances(source, target)
     if options.equalize_channels:
-        source = _equalized(source, target, method)
+        source, gains = _equalized(source, target, method)
     elif method.uses_channels and is_concrete(source, target):
         warn_of_units(source, target)
     *before, (method, source, target) = stages_of(method, source, target, options.voxel_sizes)
-    ties, belief = known(tie_points, prior, source, target)
-    if init is None and prior is not None:
-        init = prior[0]
     search = options.search or default_search()
     once = replace(options, max_distance=None)
     for stage in before:
         run = _solved(stage.source, stage.target, stage.method, init, once, search)
-        found = registration_of(run.state(), run.assessment(), run.loop.history, stage.source, stage.target)
+        (found,) = results_of([run], [None])
         init = found.matrix if is_usable(found) else init
     run = _solved(source, target, method, init, options, search)
     if options.equalize_channels and not any(term.estimates_gains for term in run.problem.terms):
-        source = _equalized(source, target, method, _nearest_points(source, target, run, search))
+        source, more = _equalized(source, target, method, _nearest_points(source, target, run, search))
+        gains = gains * more
         init = constant(pose_in_user_frame(run.loop.state.pose, source.origin, target.origin))
         run = _solved(source, target, method, init, options, search)
     if not (ties is None and belief is None):
         fusion = fusion_of(run.loop.state, run.moments(), ties, belief)
         problem = replace(run.problem, start=constant(run.loop.state.pose), fusion=fusion)
-        run = _run(problem, run.method, target, search, options.max_iterations)
-    return registration_of(run.state(), run.assessment(), run.loop.history, source, target)
+        run = _run(run.inputs._replace(form=fusion.form), problem, search, options.max_iterations)
+    return run._replace(gains=gains)
 
 
-class _Run(NamedTuple):
-    """A problem that has been run.
+def results_of(runs: Sequence[Run], givens: Sequence[Given | None]) -> list[RegistrationResult]:
+    """The results of registrations.
 
-    Attributes:
-        method: with its unset parameters chosen.
-        loop: its end, constant to autodiff.
-        state: computes the final state, whose pose is differentiable.
-        assessment, moments: compute these of the final pose.
+    Args:
+        givens: the arguments of each, or None. Outside `jit`, the poses get derivatives by those arrays of these
+            arguments that are traced. All derivatives are computed side by side.
     """
-
-    problem: Problem
-    method: AbstractMethod
-    loop: LoopResult
-    state: Callable[[], State]
-    assessment: Callable[[], Assessment]
-    moments: Callable[[], Moments]
+    traced = [
+        None
+        if given is None or run.executor is None
+        else differentiated(given, run.inputs, run.executor, run.loop, run.gains)
+        for run, given in zip(runs, givens, strict=True)
+    ]
+    states = with_derivatives([run.state() for run in runs], traced)
+    return [
+        registration_of(state, run.assessment(), run.loop.history, run.inputs.source, run.inputs.target)
+        for state, run in zip(states, runs, strict=True)
+    ]
 
 
 def _solved(
@@ -112,18 +170,16 @@ def _solved(
     init: Pose | None,
     options: Options,
     search: AbstractSearch,
-) -> _Run:
+) -> Run:
     """Pose and run the problem."""
     problem, method = pose_problem(source, target, method, init, options, search.num_threads)
-    return _run(problem, method, target, search, options.max_iterations)
+    return _run(Inputs(source, target, method, problem.terms), problem, search, options.max_iterations)
 
 
-def _run(
-    problem: Problem, method: AbstractMethod, target: PointCloud, search: AbstractSearch, max_iterations: int
-) -> _Run:
+def _run(inputs: Inputs, problem: Problem, search: AbstractSearch, max_iterations: int) -> Run:
     """Run the loop."""
-    if is_concrete(problem):
-        return _run_on_host(problem, method, target, search)
+    if is_concrete(inputs, problem):
+        return _run_on_host(inputs, problem, search)
     # Gradients stop here, so that autodiff does not enter the compiled functions.
     fixed = jax.lax.stop_gradient(problem)
     loop = register_traced(fixed, search, max_iterations)
@@ -133,21 +189,29 @@ def _run(
         matched = match_surfaces(source_surface, target_surface, loop.matches)
         return differentiable(loop, matched, problem.terms, problem.fusion)
 
-    return _Run(
-        problem, method, loop, state, lambda: assess(loop, fixed, search), lambda: moments_traced(loop, fixed, search)
-    )
+    calls = state, lambda: assess(loop, fixed, search), lambda: moments_traced(loop, fixed, search)
+    return Run(inputs, None, problem, loop, None, *calls)
 
 
-def _run_on_host(problem: Problem, method: AbstractMethod, target: PointCloud, search: AbstractSearch) -> _Run:
+def _run_on_host(inputs: Inputs, problem: Problem, search: AbstractSearch) -> Run:
     def index(position_alone: bool) -> AbstractIndex:
-        return index_of(search, PointToPoint() if position_alone else method, target)
+        return index_of(search, PointToPoint() if position_alone else inputs.method, inputs.target)
 
-    executor = HostExecutor(problem, index, search.num_threads)
+    return run_to_end(inputs, HostExecutor(problem, index, search.num_threads), rematched=True)
+
+
+def run_to_end(inputs: Inputs, executor: HostExecutor, rematched: bool) -> Run:
+    """Run the loop on the host.
+
+    Args:
+        rematched: whether matches follow when the pose moves; False if they are fixed.
+    """
     with outside_trace():
         loop = iterate(executor)
-    moments = Lazy(lambda: moments_of(executor, loop, rematched=True))
+    moments = Lazy(lambda: moments_of(executor, loop, rematched))
+    problem = executor.problem
     assessment = assessment_of(executor, loop, None if problem.fusion is not None else moments)
-    return _Run(problem, method, loop, lambda: loop.state, lambda: assessment, lambda: moments.value)
+    return Run(inputs, None, problem, loop, executor, lambda: loop.state, lambda: assessment, lambda: moments.value)
 
 
 def pose_problem(
@@ -181,12 +245,12 @@ def pose_problem(
 
 def _equalized(
     source: PointCloud, target: PointCloud, method: AbstractMethod, matches: Correspondences | None = None
-) -> PointCloud:
+) -> tuple[PointCloud, Float[AnyArray, "C"]]:
     check_channels(source, target, method)
     return with_channels_matched(source, target, matches)
 
 
-def _nearest_points(source: PointCloud, target: PointCloud, run: _Run, search: AbstractSearch) -> Correspondences:
+def _nearest_points(source: PointCloud, target: PointCloud, run: Run, search: AbstractSearch) -> Correspondences:
     """Nearest matches in position at the final pose."""
     pose = constant(pose_in_user_frame(run.loop.state.pose, source.origin, target.origin))
     distance = run.problem.settings.fine_distance

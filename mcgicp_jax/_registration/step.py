@@ -16,6 +16,7 @@ from mcgicp_jax._local_geometry.surface import Surface
 from mcgicp_jax._math.poses import move_pose
 from mcgicp_jax._pose_solver.degeneracy import Directions, find_directions
 from mcgicp_jax._pose_solver.fusion import fused_update
+from mcgicp_jax._pose_solver.implicit_derivative import ImplicitRoot, root_near
 from mcgicp_jax._pose_solver.pose_measurements import Fusion
 from mcgicp_jax._pose_solver.sums import Sums
 from mcgicp_jax._pose_solver.update import solve_update
@@ -191,3 +192,15 @@ def update(
         directions=directions,
         record=Record(*(number.astype(sums.center.dtype) for number in record)),
     )
+
+
+@jax.jit
+def root_of(state: State, fusion: Fusion | None) -> ImplicitRoot:
+    """The equation that defines the final pose, for its derivative."""
+    usable = (state.status == Status.CONVERGED) | (state.status == Status.MAX_ITERATIONS)
+    if state.directions is not None:
+        # Along an unconstrained direction the root of g (see `ImplicitRoot`) is arbitrary.
+        usable = usable & jnp.all(state.directions.held)
+    if fusion is not None:
+        usable = usable & jnp.all(fusion.held)
+    return root_near(state.sums, usable, fusion)

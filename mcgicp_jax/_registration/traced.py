@@ -20,16 +20,15 @@ from mcgicp_jax._compute.concrete import AnyScalar
 from mcgicp_jax._compute.lazy import Lazy
 from mcgicp_jax._local_geometry.surface import Surface, searched
 from mcgicp_jax._pose_solver.covariance import Moments, Scores, scores_of
-from mcgicp_jax._pose_solver.implicit_derivative import Model, root_near, with_derivative
+from mcgicp_jax._pose_solver.implicit_derivative import Model, with_derivative
 from mcgicp_jax._pose_solver.matched import Matched, Motion, distances_within, match_surfaces
 from mcgicp_jax._pose_solver.pose_measurements import Fusion
 from mcgicp_jax._pose_solver.sums import Sums, sums_of
 from mcgicp_jax._registration.assessment import Assessment, assessment_of, moments_of
 from mcgicp_jax._registration.loop import AbstractExecutor, LoopResult, iterate
-from mcgicp_jax._registration.result import Status
-from mcgicp_jax._registration.step import COARSE, RUNNING, SETTLED, Problem, State
+from mcgicp_jax._registration.step import COARSE, RUNNING, SETTLED, Problem, State, root_of
 from mcgicp_jax._search.base import AbstractSearch, Correspondences, SearchPoints, by_position
-from mcgicp_jax._terms.base import AbstractTerm, is_adaptive
+from mcgicp_jax._terms.base import AbstractTerm, is_adaptive, with_numbers_of
 
 
 class TracedExecutor(AbstractExecutor):
@@ -245,16 +244,9 @@ def differentiable(
         matched, terms, fusion: differentiable, and at the matches at which the loop ended.
     """
     state = loop.state
-    usable = (state.status == Status.CONVERGED) | (state.status == Status.MAX_ITERATIONS)
-    if state.directions is not None:
-        # Along an unconstrained direction the root of g (see `ImplicitRoot`) is arbitrary.
-        usable = usable & jnp.all(state.directions.held)
-    if fusion is not None:
-        usable = usable & jnp.all(fusion.held)
-    # The numbers that the terms estimated are constants to autodiff.
-    terms = tuple(term.with_numbers_of(last) for term, last in zip(terms, loop.terms, strict=True))
+    terms = with_numbers_of(terms, loop.terms)
     with jax.default_matmul_precision("highest"):
-        root = jax.lax.stop_gradient(root_near(state.sums, usable, fusion))
+        root = jax.lax.stop_gradient(root_of(state, fusion))
         pose = with_derivative(jax.lax.stop_gradient(state.pose.wxyz_xyz), root, Model(matched, terms, fusion))
     return state._replace(pose=jaxlie.SE3(pose))
 

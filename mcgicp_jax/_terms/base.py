@@ -177,6 +177,11 @@ def is_adaptive(terms: tuple[AbstractTerm, ...]) -> bool:
     return any(term.is_adaptive for term in terms)
 
 
+def with_numbers_of(terms: tuple[AbstractTerm, ...], others: tuple[AbstractTerm, ...]) -> tuple[AbstractTerm, ...]:
+    """The terms with the numbers that the others have estimated, which are constants to autodiff."""
+    return tuple(term.with_numbers_of(other) for term, other in zip(terms, others, strict=True))
+
+
 def linearize(terms: tuple[AbstractTerm, ...], matches: PosedMatches) -> Linearization:
     """Sum of the terms."""
     first, *others = (term.linearize(matches) for term in terms)

@@ -1,0 +1,177 @@
+"""Derivatives of values that NumPy computed from concrete arrays: linear maps that compile nothing for any shape."""
+
+from __future__ import annotations
+
+import abc
+import itertools
+import math
+from collections.abc import Callable, Sequence
+from functools import partial
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.extend.core import Primitive
+from jax.interpreters import ad, batching, mlir
+
+from mcgicp_jax._compute.concrete import is_concrete
+from mcgicp_jax._compute.threads import side_by_side
+
+
+class AbstractLinearMap(abc.ABC):
+    """The derivative of some values by some inputs, in NumPy. The first axis of all arrays counts the tangents or
+    cotangents."""
+
+    @abc.abstractmethod
+    def push(self, tangents: Sequence[np.ndarray], moving: tuple[int, ...]) -> Sequence[np.ndarray]:
+        """Tangents of the values, one array (m, ...) for each, from those of the inputs with numbers `moving`."""
+
+    @abc.abstractmethod
+    def pull(self, cotangents: Sequence[np.ndarray], moving: tuple[int, ...]) -> Sequence[np.ndarray]:
+        """Cotangents of the inputs with numbers `moving`, one array (m, ...) for each, from those of the values."""
+
+
+class SideBySide(AbstractLinearMap):
+    """Several maps, each with one value and its own inputs, computed in threads.
+
+    Args:
+        counts: number of inputs of each map, in the order of all inputs.
+    """
+
+    def __init__(self, maps: Sequence[AbstractLinearMap], counts: Sequence[int]):
+        self._maps, self._starts = maps, np.cumsum([0, *counts])
+
+    def _moving(self, moving: tuple[int, ...]) -> list[tuple[int, ...]]:
+        """The numbers of the inputs of each map that are moving."""
+        return [
+            tuple(i - start for i in moving if start <= i < stop)
+            for start, stop in itertools.pairwise(self._starts.tolist())
+        ]
+
+    def push(self, tangents: Sequence[np.ndarray], moving: tuple[int, ...]) -> list[np.ndarray]:
+        rest = iter(tangents)
+        parts = [
+            (each, [next(rest) for _ in some], some)
+            for each, some in zip(self._maps, self._moving(moving), strict=True)
+        ]
+        calls = [partial(each.push, tangent, some) for each, tangent, some in parts]
+        return [value for (value,) in side_by_side(calls)]
+
+    def pull(self, cotangents: Sequence[np.ndarray], moving: tuple[int, ...]) -> list[np.ndarray]:
+        parts = zip(self._maps, cotangents, self._moving(moving), strict=True)
+        results = side_by_side([partial(each.pull, [cotangent], some) for each, cotangent, some in parts])
+        return [found for result in results for found in result]
+
+
+def primal(tree: Any) -> Any:
+    """The tree with the values of arrays that only differentiation traces, as NumPy arrays.
+
+    `grad`, `jvp` and the like know the values of what they trace, unless `jit` or `vmap` trace them as well. Those
+    arrays remain traced, and concrete ones remain as they are.
+    """
+
+    def value(leaf: Any) -> Any:
+        if is_concrete(leaf):
+            return leaf
+        fixed = jax.lax.stop_gradient(leaf)
+        return np.asarray(fixed) if is_concrete(fixed) else leaf
+
+    return tree if is_concrete(tree) else jax.tree.map(value, tree)
+
+
+def with_derivative(values: Sequence[np.ndarray], linear: AbstractLinearMap, inputs: Sequence[Any]) -> list[jax.Array]:
+    """The values with a derivative by `inputs`, which differentiation traces; a second one raises an error."""
+
+    @jax.custom_jvp
+    def attached(*inputs: Any) -> list[jax.Array]:
+        return [jnp.asarray(value) for value in values]
+
+    def rule(inputs: tuple[Any, ...], tangents: tuple[Any, ...]) -> tuple[list[jax.Array], list[jax.Array]]:
+        found = [jnp.asarray(value) for value in values]
+        moving = tuple(i for i, tangent in enumerate(tangents) if not is_symbolic_zero(tangent))
+        if not moving:
+            return found, [jnp.zeros_like(value) for value in found]
+        shapes = tuple(jax.typeof(once(inputs[i])) for i in moving)
+        slopes = _linear.bind(
+            *(tangents[i] for i in moving),
+            function=partial(linear.push, moving=moving),
+            transpose=partial(linear.pull, moving=moving),
+            inputs=shapes,
+            outputs=tuple(jax.typeof(value) for value in found),
+            batch=(),
+        )
+        return found, slopes
+
+    attached.defjvp(rule, symbolic_zeros=True)
+    return attached(*inputs)
+
+
+def is_symbolic_zero(tangent: object) -> bool:
+    return isinstance(tangent, jax.custom_derivatives.SymbolicZero)
+
+
+@jax.custom_jvp
+def once(value: Any) -> Any:
+    """The value. Its derivative raises an error, because second derivatives of the pose would be wrong."""
+    return value
+
+
+def _once_jvp(primals: tuple[Any], tangents: tuple[Any]) -> tuple[Any, Any]:
+    if not is_symbolic_zero(tangents[0]):
+        raise NotImplementedError("poses of register and estimate_pose have first derivatives only, not second ones")
+    return primals[0], jnp.zeros_like(primals[0])
+
+
+once.defjvp(_once_jvp, symbolic_zeros=True)
+
+# Applies `function`, a linear map of NumPy arrays with one leading axis; `transpose` is its transpose. The shapes of
+# `inputs` and `outputs` are without the axes `batch`, which `vmap` adds in front.
+_linear = Primitive("mcgicp_linear")
+_linear.multiple_results = True
+
+
+@_linear.def_impl
+def _call(*operands: Any, function: Callable, transpose: Callable, inputs: Any, outputs: Any, batch: Any) -> list[Any]:
+    count = math.prod(batch)
+    arrays = [np.asarray(each).reshape((count, *aval.shape)) for each, aval in zip(operands, inputs, strict=True)]
+    return [
+        jnp.asarray(np.asarray(each, aval.dtype).reshape((*batch, *aval.shape)))
+        for each, aval in zip(function(arrays), outputs, strict=True)
+    ]
+
+
+@_linear.def_abstract_eval
+def _shapes(*operands: Any, function: Callable, transpose: Callable, inputs: Any, outputs: Any, batch: Any) -> Any:
+    return [aval.update(shape=(*batch, *aval.shape)) for aval in outputs]
+
+
+def _transposed(
+    cotangents: Any, *operands: Any, function: Callable, transpose: Callable, inputs: Any, outputs: Any, batch: Any
+) -> Any:
+    cotangents = [ad.instantiate_zeros(each) for each in cotangents]
+    return _linear.bind(
+        *cotangents, function=transpose, transpose=function, inputs=outputs, outputs=inputs, batch=batch
+    )
+
+
+def _batched(operands: Any, axes: Any, *, batch: Any, **parameters: Any) -> Any:
+    (size,) = {each.shape[axis] for each, axis in zip(operands, axes, strict=True) if axis is not None}
+    first = [
+        jnp.broadcast_to(each, (size, *each.shape)) if axis is None else jnp.moveaxis(each, axis, 0)
+        for each, axis in zip(operands, axes, strict=True)
+    ]
+    results = _linear.bind(*first, batch=(size, *batch), **parameters)
+    return results, [0] * len(results)
+
+
+def _not_compiled(*_: Any, **__: Any) -> Any:
+    # A callback would run compiled programs, which was seen to deadlock.
+    raise NotImplementedError(
+        "the derivative of a registration outside of jit was to be compiled; put the registration inside the jit, too"
+    )
+
+
+ad.deflinear2(_linear, _transposed)
+batching.primitive_batchers[_linear] = _batched
+mlir.register_lowering(_linear, _not_compiled)

@@ -1,0 +1,192 @@
+"""Compiled programs of `PoseDerivative` over blocks of rows, and over the few numbers of a pose."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import partial
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
+
+from mcgicp_jax._compute.packing import Packed
+from mcgicp_jax._local_geometry.local_geometry import describe
+from mcgicp_jax._local_geometry.neighborhoods import Neighborhoods
+from mcgicp_jax._local_geometry.surface import Surface
+from mcgicp_jax._methods.base import AbstractMethod
+from mcgicp_jax._methods.surfaces import Kinds, search_rows, surface_of
+from mcgicp_jax._pose_solver.implicit_derivative import ImplicitRoot, balance_along, score_along, value_and_jacobian
+from mcgicp_jax._pose_solver.matched import Matched, square_apart
+from mcgicp_jax._pose_solver.pose_measurements import Fusion, PoseForm
+from mcgicp_jax._search.base import SearchPoints
+from mcgicp_jax._terms.base import AbstractTerm
+
+# The terms, and the temperature of a soft assignment or None.
+Parameters = tuple[tuple[AbstractTerm, ...], Any]
+
+
+class Columns(NamedTuple):
+    """The values of the rows of a cloud that a pose depends on; the input of the search for a soft assignment only."""
+
+    surface: Surface
+    search: SearchPoints | None
+
+    @staticmethod
+    def of(surface: Surface, search: SearchPoints | None) -> Columns:
+        surface = surface._replace(observability=None, channel_observability=None, noise=None, search=None)
+        # A mask is no number, and positions are in the surface already.
+        return Columns(surface, None if search is None else search._replace(points=None, valid=None))
+
+
+class Block(NamedTuple):
+    """A block of n matched rows with m candidates each, (n, L) and (m, n, L), and which matches count."""
+
+    source: Packed[Columns]
+    target: Packed[Columns]
+    valid: Bool[Any, "m n"]
+
+
+def _matched(block: Block, temperature: Any) -> Matched:
+    count = len(block.valid)
+    source = replace(block.source, table=jnp.tile(block.source.table, (count, 1))).tree
+    target = replace(block.target, table=block.target.table.reshape(block.valid.size, -1)).tree
+    apart = None
+    if source.search is not None and target.search is not None:
+        apart = square_apart(source.search, target.search)
+    return Matched(source.surface, target.surface, block.valid.reshape(-1), apart, temperature, count)
+
+
+@jax.jit
+def score_and_slope(
+    parameters: Parameters, root: ImplicitRoot, block: Block, pose: Float[Array, "7"]
+) -> Float[Array, "6 7"]:
+    """g of a block, and its derivative by a twist."""
+    terms, temperature = parameters
+    with jax.default_matmul_precision("highest"):
+        matched = _matched(block, temperature)
+        return _with_slope(lambda twist: score_along(twist, pose, root, matched, terms), pose)
+
+
+@jax.jit
+def balance_and_slope(
+    pose: Float[Array, "7"], root: ImplicitRoot, fusion: Fusion, known: Float[Array, "6 7"]
+) -> Float[Array, "6 7"]:
+    """The equation with tie points and a prior, and its derivative by a twist.
+
+    Args:
+        known: `score_and_slope` of all blocks.
+    """
+    with jax.default_matmul_precision("highest"):
+        return _with_slope(
+            lambda twist: balance_along(twist, pose, root, known[:, 0] + known[:, 1:] @ twist, fusion), pose
+        )
+
+
+def _with_slope(function: Any, pose: Float[Array, "7"]) -> Float[Array, "6 7"]:
+    value, slope = value_and_jacobian(function, jnp.zeros_like(pose[:6]))
+    return jnp.concatenate([value[:, None], slope], axis=1)
+
+
+@jax.jit
+def pull_balance(
+    pose: Float[Array, "7"], root: ImplicitRoot, fusion: Fusion, cotangents: Float[Array, "m 6"]
+) -> tuple[Float[Array, "m 6"], PoseForm]:
+    """Cotangents of the score and of the form of tie points and prior, from those of the equation."""
+
+    def balance(score: Float[Array, "6"], form: PoseForm) -> Float[Array, "6"]:
+        nowhere = jnp.zeros_like(score)
+        return balance_along(nowhere, pose, root, score, eqx.tree_at(lambda fusion: fusion.form, fusion, form))
+
+    with jax.default_matmul_precision("highest"):
+        # The equation is linear in the score.
+        _, pull = jax.vjp(balance, jnp.zeros_like(pose[:6]), fusion.form)
+        return jax.vmap(pull)(cotangents)
+
+
+@jax.jit
+def pull_matches(
+    parameters: Parameters,
+    root: ImplicitRoot,
+    block: Block,
+    pose: Float[Array, "7"],
+    cotangents: Float[Array, "k 6"],
+) -> tuple[Float[Array, "n k L"], Float[Array, "m n k K"], Any]:
+    """Cotangents of the matched rows and of the numbers of the parameters, from k of the score."""
+    numbers, rest = eqx.partition(parameters, eqx.is_inexact_array)
+
+    def score(source: Array, target: Array, numbers: Any) -> Float[Array, "6"]:
+        terms, temperature = eqx.combine(numbers, rest)
+        moved = Block(replace(block.source, table=source), replace(block.target, table=target), block.valid)
+        matched = _matched(moved, temperature)
+        return score_along(jnp.zeros_like(pose[:6]), pose, root, matched, terms)
+
+    with jax.default_matmul_precision("highest"):
+        _, pull = jax.vjp(score, block.source.table, block.target.table, numbers)
+        return jax.vmap(pull, out_axes=(1, 2, 0))(cotangents)
+
+
+class Moving(NamedTuple):
+    """The arrays of a block that differentiation moves; None for the others."""
+
+    own: Any
+    near: Any
+    own_channels: Any
+    near_channels: Any
+    given: Any
+    numbers: Any
+
+
+@partial(jax.jit, static_argnums=(0, 1))
+def pull_surface(
+    kinds: Kinds,
+    fields: tuple[str, ...],
+    method: AbstractMethod,
+    around: Neighborhoods,
+    masks: tuple[Any, Any] | None,
+    cotangents: Float[Array, "n k L"],
+) -> tuple[Any, Any, Any, Any]:
+    """Cotangents of the inputs of `surface_of` from those of the packed `Columns`.
+
+    Args:
+        fields: of a `PointCloud`, or "method".
+        around: the neighbourhoods of the rows, with their channels even where there are no neighbours.
+        masks: `channel_valid` and `valid` of the rows for a soft assignment; None otherwise.
+
+    Returns:
+        Of the points themselves (n, k w) and of their q neighbours (q, n, k w), for w = 3 + C positions and channels or
+        those of them that are in `fields`; of given covariances (k, n, 3, 3); of the numbers of the method, (k, ...).
+        None for what is not in `fields`.
+    """
+    numbers, rest = eqx.partition(method, eqx.is_inexact_array)
+    points, channels = "points" in fields, "channels" in fields and around.num_channels > 0
+    moving = Moving(
+        around.own if points else None,
+        around.near if points else None,
+        around.own_channels if channels else None,
+        around.near_channels if channels else None,
+        around.given if "covariances" in fields else None,
+        numbers if "method" in fields else None,
+    )
+
+    def rows(moving: Moving) -> Float[Array, "n L"]:
+        names = ("own", "near", "own_channels", "near_channels", "given")
+        here = around._replace(**{name: getattr(moving, name) for name in names if getattr(moving, name) is not None})
+        used = method if moving.numbers is None else eqx.combine(moving.numbers, rest)
+        surface = surface_of(used, kinds, here, None if here.near is None else describe(here), False)
+        search = None if masks is None else search_rows(used, here.own.T, here.own_channels.T, *masks)
+        return Packed.of(Columns.of(surface, search)).table
+
+    _, pull = jax.vjp(rows, moving)
+    (found,) = jax.vmap(pull, in_axes=1)(cotangents)
+    own = [each.transpose(2, 0, 1) for each in (found.own, found.own_channels) if each is not None]
+    near = [each.transpose(2, 3, 0, 1) for each in (found.near, found.near_channels) if each is not None]
+
+    def side_by_side(parts: list[Array]) -> Any:
+        if not parts:
+            return None
+        whole = jnp.concatenate(parts, axis=-1)
+        return whole.reshape(*whole.shape[:-2], -1)
+
+    return side_by_side(own), side_by_side(near), found.given, found.numbers

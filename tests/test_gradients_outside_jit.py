@@ -1,0 +1,254 @@
+"""Gradients of concrete clouds, outside `jit`: against central differences, in every mode; nothing compiled anew."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import mcgicp_jax as mcg
+from mcgicp_jax import Status
+from tests.differences import CASES, GATE, TO_ROUNDING, clouds_with, directional_errors, inputs_of, weigh
+from tests.scenes import motion, pair, room_corner, wall
+from tests.test_programs import compilations
+
+
+@pytest.fixture(scope="module", autouse=True)
+def in_float64():
+    with jax.enable_x64(True):
+        yield
+
+
+@pytest.fixture(scope="module")
+def clouds(in_float64):
+    source, target, _ = pair(size=400, noise=0.05, channel_noise=0.05)
+    return source, target
+
+
+def check(loss, inputs, scale=1e-2):
+    """The gradient agrees with central differences along a random direction in each input, and with forward mode."""
+    gradient = jax.grad(loss)(inputs)
+    for name, actual, expected in directional_errors(loss, inputs, gradient):
+        assert abs(actual - expected) <= 1e-6 * max(abs(expected), scale), name
+    tangent = jax.tree.map(lambda leaf: jnp.asarray(np.random.default_rng(2).normal(size=leaf.shape)), inputs)
+    _, forward = jax.jvp(loss, (inputs,), (tangent,))
+    reverse = sum(jax.tree.leaves(jax.tree.map(lambda a, b: jnp.sum(a * b), gradient, tangent)))
+    np.testing.assert_allclose(forward, reverse, rtol=1e-9)
+    return gradient
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_every_input_of_every_method(name, clouds):
+    method, robust = jax.tree.map(lambda number: jnp.asarray(number, float), CASES[name])
+    start = mcg.register(*clouds, method, robust=robust, max_distance=GATE, **TO_ROUNDING)
+
+    def loss(inputs):
+        options = {"robust": inputs["robust"], "init": start.matrix, "max_distance": GATE, **TO_ROUNDING}
+        return weigh(mcg.register(*clouds_with(inputs, *clouds), inputs["method"], **options).matrix)
+
+    check(loss, inputs_of(*clouds, method, robust))
+
+
+def test_a_soft_assignment_has_gradients_by_weights_and_temperature(clouds):
+    method, robust = jax.tree.map(lambda number: jnp.asarray(number, float), CASES["mc-gicp"])
+    matches = mcg.find_correspondences(*clouds, motion(), method, max_distance=GATE, num_candidates=3)
+
+    def loss(inputs):
+        options = {"robust": inputs["robust"], "temperature": inputs["temperature"], **TO_ROUNDING}
+        return weigh(mcg.estimate_pose(*clouds_with(inputs, *clouds), matches, inputs["method"], **options).matrix)
+
+    gradient = check(loss, inputs_of(*clouds, method, robust) | {"temperature": jnp.asarray(0.1)})
+    assert gradient["method"].channel_weights != 0 and gradient["temperature"] != 0
+
+
+@pytest.mark.slow
+def test_the_photometric_term_has_the_gradient_of_jit(clouds):
+    """Its scales are constants to autodiff, which differences would see."""
+    method = mcg.MultiChannelGICP(0.05, 0.3, photometric=True)
+
+    def loss(points, search=None):
+        cloud = clouds[0].replace(points=points)
+        return weigh(mcg.register(cloud, clouds[1], method, max_distance=GATE, search=search, **TO_ROUNDING).matrix)
+
+    expected = jax.jit(jax.grad(lambda points: loss(points, mcg.DenseSearch())))(clouds[0].points)
+    np.testing.assert_allclose(jax.grad(loss)(clouds[0].points), expected, atol=1e-9 * np.abs(expected).max())
+
+
+def test_given_covariances(clouds):
+    rng = np.random.default_rng(0)
+    roots = rng.normal(size=(2, 400, 3, 3))
+    source, target = (
+        cloud.replace(covariances=0.1 * root @ root.swapaxes(1, 2) + 0.1 * np.eye(3))
+        for cloud, root in zip(clouds, roots, strict=True)
+    )
+
+    def loss(inputs):
+        return weigh(
+            mcg.register(*clouds_with(inputs, source, target), mcg.GICP(), max_distance=GATE, **TO_ROUNDING).matrix
+        )
+
+    names = ("source points", "source covariances", "target covariances")
+    check(loss, {name: value for name, value in inputs_of(source, target, None, None).items() if name in names})
+
+
+def test_tie_points_and_a_prior(clouds):
+    """By what was measured, and its variances, on which the weights of the matches from a first registration do not
+    depend."""
+    points = np.asarray(clouds[0].points[:5])
+
+    def loss(inputs):
+        ties = points, inputs["tie target"], inputs["tie variance"] * jnp.tile(jnp.eye(3), (5, 1, 1))
+        prior = motion(), inputs["prior variance"] * jnp.eye(6)
+        return weigh(
+            mcg.register(*clouds, mcg.GICP(), tie_points=ties, prior=prior, max_distance=GATE, **TO_ROUNDING).matrix
+        )
+
+    target = points @ motion()[:3, :3].T + motion()[:3, 3] + 0.01
+    check(loss, {"tie target": target, "tie variance": jnp.asarray(1e-3), "prior variance": jnp.asarray(1e-3)})
+
+
+def test_gains_of_equalized_channels_are_constants(clouds):
+    """Twice the contrast: a gradient half as large."""
+    source, target = clouds
+
+    def gradient(gain):
+        def loss(channels):
+            options = {"max_distance": GATE, "equalize_channels": True, **TO_ROUNDING}
+            cloud = source.replace(channels=channels)
+            return weigh(mcg.register(cloud, target, mcg.MultiChannelGICP(0.05, 0.3), **options).matrix)
+
+        return jax.grad(loss)(gain * source.channels + 0.3)
+
+    np.testing.assert_allclose(gradient(2.0), 0.5 * gradient(1.0), rtol=1e-6, atol=1e-9)
+
+
+def test_preprocessing_has_a_derivative():
+    """Raw points, with rows to drop and missing channels, through the voxels."""
+    points, channels = room_corner(900, noise=0.02, seed=1)
+    points = (points - motion()[:3, 3]) @ motion()[:3, :3]
+    points[7] = np.nan
+    known = np.random.default_rng(3).random(channels.shape) > 0.1
+    target = mcg.preprocess(mcg.PointCloud(*room_corner(900, noise=0.02, seed=2)), 0.1)
+    others = np.arange(900) != 7
+
+    def loss(inputs):
+        # The NaN stays where it is.
+        whole = jnp.asarray(points).at[others].set(inputs["points"])
+        cloud = mcg.PointCloud(whole, inputs["channels"], channel_valid=known)
+        ready = mcg.preprocess(cloud, 0.1)
+        return weigh(
+            mcg.register(ready, target, mcg.MultiChannelGICP(0.05, 0.3), max_distance=0.5, **TO_ROUNDING).matrix
+        )
+
+    with pytest.warns(UserWarning, match="left out 1 of 900"):
+        gradient = jax.grad(loss)({"points": points[others], "channels": channels})
+        assert not np.any(gradient["channels"][~known]) and not np.any(gradient["channels"][7])
+        for name, actual, expected in directional_errors(
+            loss, {"channels": channels, "points": points[others]}, gradient
+        ):
+            assert abs(actual - expected) <= 1e-5 * max(abs(expected), 1e-2), name
+
+
+def test_all_modes_agree_and_second_derivatives_are_refused(clouds):
+    source, target = clouds
+    method = mcg.MultiChannelGICP(0.05, 0.3)
+
+    def pose(channels):
+        return mcg.register(source.replace(channels=channels), target, method, max_distance=GATE).centred.wxyz_xyz
+
+    channels, direction = source.channels, np.random.default_rng(0).normal(size=source.channels.shape)
+    jacobian = jax.jacrev(pose)(channels)
+    assert jacobian.shape == (7, *channels.shape)
+    expected = np.tensordot(jacobian, direction, 2)
+    _, forward = jax.jvp(pose, (channels,), (direction,))
+    _, linear = jax.linearize(pose, channels)
+    _, pull = jax.vjp(pose, channels)
+    np.testing.assert_allclose(forward, expected, rtol=1e-9)
+    np.testing.assert_allclose(linear(direction), expected, rtol=1e-9)
+    np.testing.assert_allclose(
+        pull(jnp.arange(7.0))[0], np.tensordot(np.arange(7.0), jacobian, 1), rtol=1e-6, atol=1e-12
+    )
+    few = jax.jacfwd(lambda scale: pose(channels + scale * direction))(jnp.zeros(()))
+    np.testing.assert_allclose(few, expected, rtol=1e-9)
+    with pytest.raises(NotImplementedError, match="first derivatives only"):
+        jax.hessian(lambda scale: weigh(jnp.tile(pose(channels + scale * direction), 2)[:12].reshape(3, 4)))(0.0)
+    with pytest.raises(NotImplementedError, match="put the registration inside the jit"):
+        jax.jit(pull)(jnp.arange(7.0))
+
+
+def test_another_size_compiles_nothing():
+    """But for a copy of each of the two arguments, which `jax.grad` itself makes."""
+    method = mcg.MultiChannelGICP(0.05, 0.3)
+    several = [pair(size=size)[:2] for size in (2500, 2600)]
+
+    def gradient(source, target, points, channels):
+        def loss(points, channels):
+            cloud = source.replace(points=points, channels=channels)
+            return jnp.sum(mcg.register(cloud, target, method, max_distance=GATE).matrix)
+
+        return jax.grad(loss, (0, 1))(points, channels)
+
+    several = [(*clouds, jnp.asarray(clouds[0].points), jnp.asarray(clouds[0].channels)) for clouds in several]
+    gradient(*several[0])
+    with compilations() as compiled:
+        gradient(*several[1])
+    assert len(compiled) <= 2
+
+
+def test_several_blocks_of_rows():
+    """2,500 points are two blocks, the second one padded."""
+    source, target, truth = pair(size=2500, noise=0.03)
+    method = mcg.MultiChannelGICP(0.05, 0.3)
+    # Of so many matches, some would flip.
+    matches = mcg.find_correspondences(source, target, truth, method, max_distance=GATE)
+
+    def loss(inputs):
+        return weigh(mcg.estimate_pose(*clouds_with(inputs, source, target), matches, method, **TO_ROUNDING).matrix)
+
+    names = ("source points", "target channels")
+    check(loss, {name: value for name, value in inputs_of(source, target, None, None).items() if name in names})
+
+
+def test_a_ragged_batch_has_the_gradients_of_its_pairs():
+    pairs = [pair(size=size)[:2] for size in (300, 500, 2100)]
+    method = mcg.MultiChannelGICP(0.05, 0.3)
+
+    def poses(channels):
+        sources = [source.replace(channels=each) for (source, _), each in zip(pairs, channels, strict=True)]
+        return mcg.register_batch(sources, [target for _, target in pairs], method, max_distance=GATE)
+
+    channels = [source.channels for source, _ in pairs]
+    found = jax.grad(lambda channels: sum(weigh(each.matrix) for each in poses(channels)))(channels)
+    for (source, target), gradient in zip(pairs, found, strict=True):
+
+        def alone(each, source=source, target=target):
+            return weigh(mcg.register(source.replace(channels=each), target, method, max_distance=GATE).matrix)
+
+        np.testing.assert_array_equal(gradient, jax.grad(alone)(source.channels))
+
+
+def test_an_invalid_pair_has_no_gradient():
+    source, target, _ = pair(size=300)
+    few = np.zeros((3, 3))
+
+    def loss(points):
+        with pytest.warns(mcg.PairWarning, match="pair 1"):
+            found = mcg.register_batch(
+                [source.replace(points=points), few], [target, target], mcg.GICP(), max_distance=GATE
+            )
+        assert [each.status for each in found] == [Status.CONVERGED, Status.INVALID_INPUT]
+        return weigh(found[0].matrix)
+
+    assert np.any(jax.grad(loss)(source.points))
+
+
+@pytest.mark.parametrize("status", [Status.DEGENERATE, Status.TOO_FEW_CORRESPONDENCES])
+def test_a_pose_that_is_not_determined_has_no_gradient(status):
+    source, target, _ = pair(wall, size=400)
+    distance = 0.2 if status == Status.DEGENERATE else 1e-6
+
+    def loss(points):
+        found = mcg.register(source.replace(points=points), target, mcg.GICP(), max_distance=distance)
+        assert found.status == status
+        return weigh(found.matrix)
+
+    np.testing.assert_array_equal(jax.grad(loss)(source.points), 0)
