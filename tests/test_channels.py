@@ -1,11 +1,22 @@
 """What is measured of channels: Λ from aligned clouds, gain and offset."""
 
+import warnings
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from mcgicp_jax import Correspondences, PointCloud, estimate_channel_covariance, preprocess
+from mcgicp_jax import (
+    GICP,
+    Correspondences,
+    MultiChannelGICP,
+    PointCloud,
+    datasets,
+    estimate_channel_covariance,
+    preprocess,
+    register,
+)
 from mcgicp_jax._local_geometry.channel_equalization import with_channels_matched
 from mcgicp_jax._local_geometry.spacing_and_noise import point_spacing
 from tests import reference as ref
@@ -133,3 +144,17 @@ def test_padding_takes_no_part_in_the_spacing():
     expected = float(point_spacing(cloud))
     for size in (5_000, 100_000):
         assert float(point_spacing(cloud.pad(size))) == expected
+
+
+@pytest.mark.parametrize("photometric", [False, True])
+def test_another_exposure_is_told(photometric):
+    target, source = (preprocess(frame.cloud, voxel_size=0.03) for frame in datasets.poster_wall(num_frames=2, seed=1))
+    method = MultiChannelGICP(photometric=photometric)
+    dark = source.replace(channels=0.5 * np.asarray(source.channels))
+    with pytest.warns(UserWarning, match=r"channel red: values in the target are [12].* times as spread"):
+        register(dark, target, method)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert register(source, target, method).converged
+        assert register(dark, target, method, equalize_channels=True).converged
+        register(dark, target, GICP())

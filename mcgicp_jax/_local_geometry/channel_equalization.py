@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import warnings
+from collections.abc import Callable
 from functools import partial
 
 import numpy as np
@@ -20,6 +21,9 @@ _QUANTILES = tuple(step / 20 for step in range(1, 20))
 # Ratio of the ranges of a channel in two clouds above which its units probably differ: files hold intensities from 0 to
 # 1, 255 or 65,535, whereas exposures differ by less.
 _OTHER_UNIT = 10.0
+# Gain between the channels of two clouds from which on a warning is issued. In simulated pairs, it was between 0.9 and
+# 1.1 with the same exposure, and 1.8 to 2.2 with half the exposure, which moved the pose by up to 0.1 m.
+_OTHER_EXPOSURE = 1.5
 
 
 def warn_of_units(source: PointCloud, target: PointCloud) -> None:
@@ -31,6 +35,22 @@ def warn_of_units(source: PointCloud, target: PointCloud) -> None:
             warnings.warn(
                 f"channel {name}: most values lie between {low:.3g} and {high:.3g} in the source, but between "
                 f"{first:.3g} and {last:.3g} in the target; if their units differ, scale one, or use equalize_channels",
+                UserWarning,
+                stacklevel=4,
+            )
+
+
+def warn_of_exposure(source: PointCloud, target: PointCloud, matches: Callable[[], Correspondences]) -> None:
+    """Warn of channels that differ by a gain between matched points; these are sought if the ranges differ as much."""
+    ranges = [cached_with(cloud, "ranges", None, partial(_ranges, cloud)) for cloud in (source, target)]
+    widths = [sorted([high - low, last - first]) for (low, high), (first, last) in zip(*ranges, strict=False)]
+    if not any(_OTHER_EXPOSURE * narrow < wide <= _OTHER_UNIT * narrow for narrow, wide in widths):
+        return
+    for name, gain in zip(source.channel_names, np.asarray(_gain(source, target, matches())[0]), strict=True):
+        if not 1 / _OTHER_EXPOSURE < gain < _OTHER_EXPOSURE:
+            warnings.warn(
+                f"channel {name}: values in the target are {gain:.2g} times as spread as those of matched points in "
+                "the source, which displaces the pose; if the exposure differs, use equalize_channels=True",
                 UserWarning,
                 stacklevel=4,
             )
@@ -61,19 +81,25 @@ def with_channels_matched(
     gain towards 0. With `matches`, only values of valid matches are used. Gain and offset are constants to autodiff;
     they are 1 and 0 for channels without usable spread.
     """
+    gain, offset = _gain(source, target, matches)
+    xp, dtype = numpy_for(source, gain), source.channels.dtype
+    channels = xp.asarray(source.channels) * gain.astype(dtype) + offset.astype(dtype)
+    return source.replace(channels=channels), gain
+
+
+def _gain(
+    source: PointCloud, target: PointCloud, matches: Correspondences | None
+) -> tuple[Float[AnyArray, "C"], Float[AnyArray, "C"]]:
+    """Gain and offset of each channel of the source."""
     xp = numpy_for(source, target, matches)
-    values = [known_values(constant(cloud)) for cloud in (source, target)]
-    values = [xp.asarray(each) for each in values]
+    values = [xp.asarray(known_values(constant(cloud))) for cloud in (source, target)]
     if matches is not None:
         values[1] = values[1][xp.asarray(matches.indices)]
         matched = xp.asarray(matches.valid)[:, None] & xp.isfinite(values[0]) & xp.isfinite(values[1])
         # Too few points do not determine a distribution.
         matched = matched & (xp.sum(matched, axis=0) > len(_QUANTILES))
         values = [xp.where(matched, each, xp.nan) for each in values]
-    gain, offset = gain_and_offset(*values)
-    dtype = source.channels.dtype
-    channels = xp.asarray(source.channels) * gain.astype(dtype) + offset.astype(dtype)
-    return source.replace(channels=channels), gain
+    return gain_and_offset(*values)
 
 
 def gain_and_offset(

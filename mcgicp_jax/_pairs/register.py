@@ -109,7 +109,8 @@ def register(
             argument. Failures to register well-formed clouds show in `RegistrationResult.status`.
     Warns:
         UserWarning: if points with NaN or infinity are left out, `MultiChannelGICP` gets clouds without channels, the
-            values of a channel are so different in the two clouds that their units probably are, too, or `GICP` gets
+            values of a channel are so different in the two clouds that their units probably are, too, or matched points
+            have so different ones that the exposure was probably another, or `GICP` gets
             one cloud with covariances that are not dimensionless.
     """
     options = Options(

@@ -18,7 +18,11 @@ from mcgicp_jax._compute.concrete import AnyArray, constant, is_concrete, numpy_
 from mcgicp_jax._compute.lazy import Lazy
 from mcgicp_jax._compute.linear_maps import primal
 from mcgicp_jax._compute.threads import in_new_thread
-from mcgicp_jax._local_geometry.channel_equalization import warn_of_units, with_channels_matched
+from mcgicp_jax._local_geometry.channel_equalization import (
+    warn_of_exposure,
+    warn_of_units,
+    with_channels_matched,
+)
 from mcgicp_jax._local_geometry.surface import searched
 from mcgicp_jax._math.poses import Pose, se3_from_matrix
 from mcgicp_jax._methods.base import AbstractMethod
@@ -136,6 +140,8 @@ def run_pair(given: Given, init: Pose | None, options: Options) -> Run:
         gains = gains * more
         init = constant(pose_in_user_frame(run.loop.state.pose, source.origin, target.origin))
         run = _solved(source, target, method, init, options, search)
+    elif not options.equalize_channels and method.uses_channels and is_concrete(source, target, run.loop.state.pose):
+        warn_of_exposure(source, target, lambda: _nearest_points(source, target, run, search))
     if not (ties is None and belief is None):
         fusion = fusion_of(run.loop.state, run.moments(), ties, belief)
         problem = replace(run.problem, start=constant(run.loop.state.pose), fusion=fusion)
