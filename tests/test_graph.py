@@ -908,6 +908,8 @@ def test_poses_do_not_slide_along_what_edges_do_not_measure(kind):
         assert after < max(before, 1.0)
         # What is measured is no further from the measurements than the noise.
         assert found.cost < 3 * len(graph.edges)
+        inside = jax.jit(mcg.optimize_poses)(graph)
+        np.testing.assert_allclose(inside.poses, found.poses, atol=0.05)
 
 
 def test_directions_that_only_some_edges_measure_do_not_depend_on_the_start():

@@ -77,9 +77,9 @@ def solve(
         uncertain = np.concatenate([np.asarray(factor.uncertain) for factor in factors]) & robust
         held = unmeasured(factors[0], poses, typical_information(*factors)[: len(factors[0])])
         equations, found, weights = _minimum(poses, factors, held, uncertain, max_iterations)
-        if exact and found.converged:
-            found = refine(equations, found, weights)
         status = _status(equations, found, weights, held)
+        if exact and status == Status.CONVERGED:
+            found = refine(equations, found, weights)
         return Solution(equations, found, weights, origin, status, found.terms.cost(weights))
 
 

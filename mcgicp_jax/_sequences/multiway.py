@@ -159,7 +159,19 @@ def _given(
 def _start(
     clouds: list[PointCloud], method: AbstractMethod, options: Options
 ) -> tuple[Float[np.ndarray, "n 4 4"], dict[tuple[int, int], RegistrationResult]]:
-    """Initial poses, and the registrations from which they were computed.
+    """Initial poses and their registrations; from the other end if the first two registrations fit badly."""
+    poses, found = _chained(clouds, method, options)
+    fits = [_fit(found[k - 1, k]) for k in range(1, len(clouds))]
+    if len(fits) > 2 and min(fits[:2]) < _DOUBTFUL * np.median(fits):
+        back, _ = _chained(clouds[::-1], method, options)
+        return np.linalg.inv(back[-1]) @ back[::-1], {}
+    return poses, found
+
+
+def _chained(
+    clouds: list[PointCloud], method: AbstractMethod, options: Options
+) -> tuple[Float[np.ndarray, "n 4 4"], dict[tuple[int, int], RegistrationResult]]:
+    """Poses of clouds that are registered in order to the two before.
 
     After a doubtful cloud, the next one starts from the motion before it, and at the better of two registrations.
     """
