@@ -7,7 +7,10 @@ from jaxtyping import install_import_hook
 
 import tests.checks  # noqa: F401
 
-# Keep compiled programs between runs: compilation takes most of the tests' time.
+# Compilation takes most of the tests' time, and on CPUs four times as much where it optimizes. Unless XLA_FLAGS is set,
+# the tests do without; CI runs the slow tests and some of the others as users do.
+os.environ.setdefault("XLA_FLAGS", "--xla_backend_optimization_level=0 --xla_cpu_use_fusion_emitters=false")
+# Keep compiled programs between runs.
 os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(pathlib.Path(__file__).parent.parent / ".jax_cache"))
 os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0.2")
 
@@ -21,31 +24,18 @@ import pytest
 DATA = pathlib.Path(os.environ.get("MCGICP_DATA", pathlib.Path(__file__).parents[2] / "shared" / "data"))
 
 
-# Modules that depend on the precision; only these run in float64 too.
-_IN_FLOAT64 = (
-    *(
-        "align_gradients",
-        "cost",
-        "covariance",
-        "gaussians",
-        "graph",
-        "large_coordinates",
-        "methods",
-        "photometric",
-        "reference",
-        "register",
-        "solve",
-        "tie_points",
-    ),
-    "transformations",
-)
+def pytest_generate_tests(metafunc):
+    marker = metafunc.definition.get_closest_marker("precision")
+    if marker is not None:
+        metafunc.parametrize("precision", marker.args, indirect=True, scope="module")
 
 
-def pytest_collection_modifyitems(config, items):
-    if jax.config.jax_enable_x64:
-        modules = {f"test_{name}.py" for name in _IN_FLOAT64}
-        config.hook.pytest_deselected(items=[item for item in items if item.path.name not in modules])
-        items[:] = [item for item in items if item.path.name in modules]
+@pytest.fixture(autouse=True, scope="module")
+def precision(request):
+    """Fixtures of modules whose tests run in both precisions depend on it."""
+    jax.config.update("jax_enable_x64", getattr(request, "param", "float32") == "float64")
+    yield
+    jax.config.update("jax_enable_x64", False)
 
 
 # Each compiled program takes dozens of memory maps. Linux allows a process 65,530, and beyond that the compiler aborts;
@@ -70,7 +60,7 @@ def data() -> pathlib.Path:
 
 
 @pytest.fixture(scope="module")
-def noisy():
+def noisy(precision):
     """A pair with 5 cm of noise on a 2 m cloud, so that terms missing from a gradient show."""
     from tests.scenes import pair
 

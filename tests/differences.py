@@ -3,21 +3,24 @@
 import jax
 import jax.numpy as jnp
 import numpy as np
-import pytest
 
 import mcgicp_jax as mcg
 
-X64 = bool(jax.config.jax_enable_x64)
-needs_x64 = pytest.mark.skipif(not X64, reason="finite differences need float64: JAX_ENABLE_X64=1")
 GATE = 0.4
-# (method, robust kernel): the tests differentiate with respect to all their parameters.
-CASES = {
-    "mc-gicp": (mcg.MultiChannelGICP([[0.05, 0.01], [0.01, 0.08]], 0.3, epsilon=1e-2), mcg.Cauchy(0.5)),
-    "gicp": (mcg.GICP(1e-2), mcg.Huber(0.3)),
-    "point-to-plane": (mcg.PointToPlane(), mcg.GemanMcClure(0.5)),
-    "point-to-point": (mcg.PointToPoint(), mcg.Tukey(1.0)),
-    "color-icp": (mcg.ColorICP(0.3), None),
-}
+CASES = ("mc-gicp", "gicp", "point-to-plane", "point-to-point", "color-icp")
+
+
+def case(name):
+    """A method and a robust kernel: the tests differentiate with respect to all their parameters."""
+    if name == "mc-gicp":
+        return mcg.MultiChannelGICP([[0.05, 0.01], [0.01, 0.08]], 0.3, epsilon=1e-2), mcg.Cauchy(0.5)
+    if name == "gicp":
+        return mcg.GICP(1e-2), mcg.Huber(0.3)
+    if name == "point-to-plane":
+        return mcg.PointToPlane(), mcg.GemanMcClure(0.5)
+    return (mcg.PointToPoint(), mcg.Tukey(1.0)) if name == "point-to-point" else (mcg.ColorICP(0.3), None)
+
+
 CONVERGED = {"translation_tolerance": 1e-12, "rotation_tolerance": 1e-12, "max_iterations": 200}
 # Differences over 4e-7 need poses to the last digit: no update is below these tolerances.
 TO_ROUNDING = {"translation_tolerance": 1e-15, "rotation_tolerance": 1e-15, "max_iterations": 60}
@@ -75,20 +78,10 @@ def directional_errors(loss, inputs, gradient):
 
 
 def check_gradient(loss, inputs):
-    """Compare the gradient with differences and forward mode; return the compiled value and gradient."""
-    # Forward mode, along one random direction in all inputs.
-    tangent = jax.tree.map(lambda leaf: jnp.asarray(np.random.default_rng(2).normal(size=leaf.shape)), inputs)
-
-    # One program for all, since compilation takes most of the time.
-    @jax.jit
-    def compiled(inputs):
-        return *jax.value_and_grad(loss)(inputs), jax.jvp(loss, (inputs,), (tangent,))[1]
-
-    _, gradient, forward = compiled(inputs)
-    scale = 1e-3
-    for name, actual, expected in directional_errors(lambda moved: compiled(moved)[0], inputs, gradient):
+    """Compare the gradient with differences of values outside of transformations; return the compiled gradient."""
+    compiled = jax.jit(jax.grad(loss))
+    gradient = compiled(inputs)
+    for name, actual, expected in directional_errors(loss, inputs, gradient):
         assert np.isfinite(actual)
-        assert abs(actual - expected) <= 1e-6 * max(abs(expected), scale), name
-    reverse = sum(jax.tree.leaves(jax.tree.map(lambda a, b: jnp.sum(a * b), gradient, tangent)))
-    np.testing.assert_allclose(forward, reverse, rtol=1e-9, atol=1e-12)
-    return lambda inputs: compiled(inputs)[:2]
+        assert abs(actual - expected) <= 1e-6 * max(abs(expected), 1e-3), name
+    return compiled

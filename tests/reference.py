@@ -4,13 +4,7 @@ Nothing here is fast, batched or differentiable, and nothing is imported from th
 `neighbors` is (N, k) with the point itself among its neighbours and −1 where there is none.
 """
 
-import jax
 import numpy as np
-
-
-def tolerance(f32: float, f64: float) -> float:
-    """Returns `f32`, or `f64` under JAX_ENABLE_X64=1."""
-    return f64 if jax.config.jax_enable_x64 else f32
 
 
 def scene(num_points: int, num_channels: int = 0, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:

@@ -11,20 +11,22 @@ from tests.differences import (
     CONVERGED,
     GATE,
     TO_ROUNDING,
+    case,
     check_gradient,
     clouds_with,
     inputs_of,
-    needs_x64,
     weigh,
 )
+from tests.precision import in_float64
 from tests.scenes import motion
 
+pytestmark = in_float64
 
-@needs_x64
+
 @pytest.mark.parametrize("name", CASES)
 def test_align_has_the_gradient_of_its_answer(name, noisy):
     source, target, _ = noisy
-    method, robust = CASES[name]
+    method, robust = case(name)
     start = mcg.register(source, target, method, robust=robust, max_distance=GATE).matrix
     matches = mcg.find_correspondences(source, target, start, method, max_distance=GATE)
 
@@ -38,11 +40,10 @@ def test_align_has_the_gradient_of_its_answer(name, noisy):
     check_gradient(loss, inputs_of(source, target, method, robust))
 
 
-@needs_x64
 @pytest.mark.parametrize("name", [pytest.param("mc-gicp", marks=pytest.mark.slow), "color-icp"])
 def test_align_has_the_gradient_where_channels_are_missing(name, noisy):
     source, target, _ = noisy
-    method, robust = CASES[name]
+    method, robust = case(name)
     clouds = []
     for i, cloud in enumerate((source, target)):
         mask = np.random.default_rng(i).random(cloud.channels.shape) < 0.7
@@ -58,20 +59,19 @@ def test_align_has_the_gradient_where_channels_are_missing(name, noisy):
         return weigh(mcg.estimate_pose(*clouds, matches, inputs["method"], **settings).matrix)
 
     inputs = inputs_of(source, target, method, robust)
-    value_and_gradient = check_gradient(loss, inputs)
+    compiled = check_gradient(loss, inputs)
     # What stands where nothing is, NaN for one, is not seen.
     for side, cloud in (("source", source), ("target", target)):
         inputs[f"{side} channels"] = jnp.where(cloud.channel_valid, cloud.channels, jnp.nan)
-    _, gradient = value_and_gradient(inputs)
+    gradient = compiled(inputs)
     for side, cloud in (("source", source), ("target", target)):
         assert np.isfinite(gradient[f"{side} channels"]).all()
         np.testing.assert_array_equal(gradient[f"{side} channels"][~np.asarray(cloud.channel_valid)], 0)
 
 
-@needs_x64
 def test_align_has_the_gradient_of_given_covariances(noisy):
     source, target, _ = noisy
-    method, robust = CASES["gicp"]
+    method, robust = case("gicp")
     rng = np.random.default_rng(0)
     clouds = []
     for cloud in (source, target):
@@ -91,7 +91,6 @@ def test_align_has_the_gradient_of_given_covariances(noisy):
     check_gradient(loss, inputs_of(source, target, method, robust))
 
 
-@needs_x64
 def test_soft_matches_give_every_number_a_gradient(noisy):
     source, target, _ = noisy
     method = mcg.MultiChannelGICP([[0.05, 0.01], [0.01, 0.08]], [0.3, 0.2], epsilon=1e-2)
@@ -115,14 +114,13 @@ def test_soft_matches_give_every_number_a_gradient(noisy):
         return weigh(result.matrix)
 
     inputs = inputs_of(source, target, method, robust) | {"temperature": jnp.asarray(0.1)}
-    _, gradient = check_gradient(loss, inputs)(inputs)
+    gradient = check_gradient(loss, inputs)(inputs)
     assert np.abs(gradient["method"].channel_weights).min() > 1e-4
 
 
-@needs_x64
 def test_jacobians_agree_forward_and_backward(noisy):
     source, target, _ = noisy
-    method, _ = CASES["point-to-point"]
+    method, _ = case("point-to-point")
     matches = mcg.find_correspondences(source, target, motion(), method, max_distance=GATE)
 
     def pose(scale):

@@ -20,6 +20,7 @@ from mcgicp_jax import (
 from mcgicp_jax._local_geometry.channel_equalization import with_channels_matched
 from mcgicp_jax._local_geometry.spacing_and_noise import point_spacing
 from tests import reference as ref
+from tests.precision import tolerance
 from tests.scenes import motion
 
 NOISE = np.array([[0.04, 0.03, 0.0], [0.03, 0.09, -0.02], [0.0, -0.02, 0.01]])
@@ -91,7 +92,7 @@ def test_gain_and_offset_are_undone(present):
         channels=np.asarray(target.channels) * np.array([0.5, 3.0, 1.0]) + np.array([7.0, 0.0, -1.0])
     )
     matched, _ = with_channels_matched(source, target)
-    np.testing.assert_allclose(matched.channels[:500], target.channels[:500], atol=ref.tolerance(2e-5, 1e-12))
+    np.testing.assert_allclose(matched.channels[:500], target.channels[:500], atol=tolerance(2e-5, 1e-12))
 
 
 @pytest.mark.parametrize("present", [None, 0.5])
@@ -110,7 +111,7 @@ def test_what_only_one_cloud_sees_does_not_count_with_matches(present):
     )
     matches = Correspondences(indices=indices, distances=jnp.zeros(len(alien)), valid=jnp.asarray(~alien))
     matched, _ = with_channels_matched(source, rolled, matches)
-    np.testing.assert_allclose(matched.channels[:300], target.channels[:300], atol=ref.tolerance(2e-5, 1e-12))
+    np.testing.assert_allclose(matched.channels[:300], target.channels[:300], atol=tolerance(2e-5, 1e-12))
     fooled, _ = with_channels_matched(source, rolled)
     assert np.abs(fooled.channels[:300] - target.channels[:300]).max() > 0.3
 

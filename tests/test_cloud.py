@@ -12,6 +12,7 @@ import pytest
 from mcgicp_jax import GICP, PointCloud, preprocess, register
 from mcgicp_jax._clouds.point_cloud import as_cloud
 from tests import reference as ref
+from tests.precision import tolerance
 
 POINTS, CHANNELS = ref.scene(150, 2)
 T = ref.pose([0.3, -0.5, 0.8], [1.0, -2.0, 0.5])
@@ -185,7 +186,7 @@ def test_transform_moves_points_and_turns_covariances(form, cloud):
     }[form]
     moved = cloud.transform(pose)
     R, t = T[:3, :3], T[:3, 3]
-    atol = ref.tolerance(2e-6, 1e-12)
+    atol = tolerance(2e-6, 1e-12)
     np.testing.assert_allclose(np.asarray(moved.points)[:150], POINTS @ R.T + t, atol=atol)
     np.testing.assert_allclose(np.asarray(moved.covariances)[:150], R @ covariances() @ R.T, atol=10 * atol)
     np.testing.assert_array_equal(moved.channels, cloud.channels)
@@ -196,20 +197,20 @@ def test_transform_moves_points_and_turns_covariances(form, cloud):
 def test_transform_there_and_back():
     cloud = ready()
     back = cloud.transform(T).transform(np.linalg.inv(T))
-    np.testing.assert_allclose(back.points[:150], cloud.points[:150], atol=ref.tolerance(2e-6, 1e-12))
+    np.testing.assert_allclose(back.points[:150], cloud.points[:150], atol=tolerance(2e-6, 1e-12))
 
 
 def test_transform_keeps_the_digits_of_large_coordinates():
     cloud = ready(PointCloud(POINTS + UTM))
     expected = (POINTS + UTM) @ T[:3, :3].T + T[:3, 3]
-    np.testing.assert_allclose(cloud.transform(T).unpad().points, expected, rtol=0, atol=ref.tolerance(2e-6, 1e-8))
+    np.testing.assert_allclose(cloud.transform(T).unpad().points, expected, rtol=0, atol=tolerance(2e-6, 1e-8))
 
 
 def test_transform_under_jit_and_grad():
     cloud = ready()
     pose = jnp.asarray(T, cloud.points.dtype)
     moved = jax.jit(PointCloud.transform)(cloud, pose)
-    np.testing.assert_allclose(moved.points, cloud.transform(T).points, atol=ref.tolerance(2e-6, 1e-12))
+    np.testing.assert_allclose(moved.points, cloud.transform(T).points, atol=tolerance(2e-6, 1e-12))
     gradient = jax.grad(lambda pose: jnp.sum(cloud.transform(pose).points[:150]))(pose)
     np.testing.assert_allclose(gradient[:3, 3], 150, rtol=1e-6)
 
@@ -340,7 +341,7 @@ def test_transform_by_kilometres_moves_the_points_of_a_raw_cloud():
     # A preprocessed one keeps its precision, and says where it is.
     moved = ready().transform(far)
     for points in (moved.coordinates[:150], moved.unpad().points):
-        np.testing.assert_allclose(points, expected, rtol=0, atol=ref.tolerance(2e-6, 1e-8))
+        np.testing.assert_allclose(points, expected, rtol=0, atol=tolerance(2e-6, 1e-8))
 
 
 def test_a_rotation_of_few_digits_becomes_one():

@@ -28,8 +28,9 @@ from mcgicp_jax._methods.surfaces import surface_pair
 from mcgicp_jax._pose_solver.matched import Motion, match_surfaces
 from mcgicp_jax._pose_solver.sums import sums_of
 from tests import reference as ref
-from tests.reference import tolerance
+from tests.precision import cached, in_both_precisions, in_float64, tolerance
 
+pytestmark = in_float64
 N, K, ROWS = 150, 12, 160
 EPSILON, FLOOR, REGULARISATION = 0.02, 1e-3, 1e-6
 LAMBDA = np.array([[0.5, 0.2, 0.0], [0.2, 0.4, -0.1], [0.0, -0.1, 0.6]])
@@ -37,15 +38,15 @@ T = ref.pose([0.05, -0.08, 0.1], [0.03, 0.05, -0.04])
 KERNELS = {"huber": Huber, "cauchy": Cauchy, "geman_mcclure": GemanMcClure, "tukey": Tukey}
 SCALE = 0.4
 METHODS = {
-    "PointToPoint": PointToPoint(),
-    "PointToPlane": PointToPlane(),
-    "ColorICP": ColorICP(0.2),
-    "GICP": GICP(EPSILON),
-    "MultiChannelGICP": MultiChannelGICP(LAMBDA, 0.2, EPSILON, FLOOR),
+    "PointToPoint": PointToPoint,
+    "PointToPlane": PointToPlane,
+    "ColorICP": lambda: ColorICP(0.2),
+    "GICP": lambda: GICP(EPSILON),
+    "MultiChannelGICP": lambda: MultiChannelGICP(LAMBDA, 0.2, EPSILON, FLOOR),
 }
 
 
-@functools.cache
+@cached
 def problem():
     """Two clouds, their neighbours, and matches of which some are none."""
     raw = [ref.scene(N, 3, seed) for seed in (0, 1)]
@@ -88,13 +89,14 @@ def reference_cost(name, pose=T, source=None, target=None, rho=None, **numbers):
     return ref.cost(pose, source[0], target[0], matched, information(name, source, target, neighbors, **numbers), rho)
 
 
+@in_both_precisions
 @pytest.mark.parametrize("kernel", [None, *KERNELS])
 @pytest.mark.parametrize("name", METHODS)
 def test_cost_against_the_reference(name, kernel):
     _, _, clouds, matches, _ = problem()
     robust = None if kernel is None else KERNELS[kernel](SCALE)
     rho = None if kernel is None else functools.partial(ref.ROBUST[kernel], c=SCALE)
-    actual = mahalanobis_cost(T, *clouds, matches, METHODS[name], robust=robust)
+    actual = mahalanobis_cost(T, *clouds, matches, METHODS[name](), robust=robust)
     assert actual.dtype == clouds[0].points.dtype
     assert float(actual) == pytest.approx(reference_cost(name, rho=rho), rel=tolerance(1e-4, 1e-10))
 
@@ -105,7 +107,7 @@ def test_the_determinant_against_the_reference(name):
     raw, neighbors, clouds, matches, matched = problem()
     weigh = information(name, *raw, neighbors)
     determinants = [np.linalg.slogdet(weigh(i, j, T[:3, :3]))[1] for i, j in enumerate(matched) if j >= 0]
-    actual = mahalanobis_cost(T, *clouds, matches, METHODS[name], log_determinant=True)
+    actual = mahalanobis_cost(T, *clouds, matches, METHODS[name](), log_determinant=True)
     assert float(actual) == pytest.approx(reference_cost(name) - sum(determinants), rel=tolerance(1e-4, 1e-10))
 
 
@@ -114,8 +116,8 @@ def test_soft_matches_against_the_reference(name):
     """Each candidate counts by exp(−½ (distance/τ)²), in position and weighted channels, over its point's sum."""
     raw, neighbors, clouds, _, _ = problem()
     temperature, gate, num_candidates = 0.15, 0.3, 4
-    found = find_correspondences(*clouds, T, METHODS[name], max_distance=gate, num_candidates=num_candidates)
-    actual = mahalanobis_cost(T, *clouds, found, METHODS[name], robust=Cauchy(SCALE), temperature=temperature)
+    found = find_correspondences(*clouds, T, METHODS[name](), max_distance=gate, num_candidates=num_candidates)
+    actual = mahalanobis_cost(T, *clouds, found, METHODS[name](), robust=Cauchy(SCALE), temperature=temperature)
     (a, ca), (b, cb) = raw
     alpha = 0.0 if name == "PointToPlane" else 0.2
     moved = a @ T[:3, :3].T + T[:3, 3]
@@ -135,7 +137,7 @@ def test_soft_matches_against_the_reference(name):
 def test_every_form_of_pose(form):
     _, _, clouds, matches, _ = problem()
     pose = jnp.asarray(T) if form == "jax" else jaxlie.SE3.from_matrix(jnp.asarray(T))
-    actual = mahalanobis_cost(pose, *clouds, matches, METHODS["GICP"])
+    actual = mahalanobis_cost(pose, *clouds, matches, METHODS["GICP"]())
     assert float(actual) == pytest.approx(reference_cost("GICP"), rel=tolerance(1e-4, 1e-10))
 
 
@@ -148,13 +150,14 @@ def test_at_large_coordinates_the_cost_is_the_same(kernel):
     shift[:3, 3], back[:3, 3] = utm, -utm
     robust = None if kernel is None else Cauchy(SCALE)
     rho = None if kernel is None else functools.partial(ref.ROBUST["cauchy"], c=SCALE)
-    actual = mahalanobis_cost(shift @ T @ back, *clouds, matches, METHODS["MultiChannelGICP"], robust=robust)
+    actual = mahalanobis_cost(shift @ T @ back, *clouds, matches, METHODS["MultiChannelGICP"](), robust=robust)
     assert float(actual) == pytest.approx(reference_cost("MultiChannelGICP", rho=rho), rel=tolerance(1e-3, 1e-6))
 
 
 SQUARES = np.concatenate([[0.0, 1e-12], np.geomspace(1e-4, 1e4, 60)])
 
 
+@in_both_precisions
 @pytest.mark.parametrize("scale", [0.1, 1.0, 7.0])
 @pytest.mark.parametrize("name", KERNELS)
 def test_kernels_against_the_reference(name, scale):
@@ -166,6 +169,7 @@ def test_kernels_against_the_reference(name, scale):
     )
 
 
+@in_both_precisions
 @pytest.mark.parametrize("scale", [0.1, 1.0, 7.0])
 @pytest.mark.parametrize("name", KERNELS)
 def test_the_weight_is_the_derivative_of_rho(name, scale):
@@ -185,6 +189,7 @@ def test_the_weight_is_the_derivative_of_rho(name, scale):
     np.testing.assert_allclose(kernel.weight(jnp.zeros(1, dtype)), 1)
 
 
+@in_both_precisions
 @pytest.mark.parametrize("name", KERNELS)
 def test_gradients_of_kernels_are_finite(name):
     kernel, squares = KERNELS[name](1.0), jnp.array([0.0, 1.0, 1e-30, 1e30])
@@ -209,7 +214,7 @@ def value_and_gradients(name, *arguments):
     def value(pose, source_points, target_points, source_channels, target_channels, channel_covariance, epsilon):
         source = clouds[0].replace(points=source_points, channels=source_channels)
         target = clouds[1].replace(points=target_points, channels=target_channels)
-        method = METHODS[name]
+        method = METHODS[name]()
         if name == "GICP":
             method = GICP(epsilon)
         elif name == "MultiChannelGICP":
@@ -219,7 +224,7 @@ def value_and_gradients(name, *arguments):
     return jax.value_and_grad(value, argnums=tuple(range(7)))(*arguments)
 
 
-@functools.cache
+@cached
 def gradients(name):
     _, _, (source, target), _, _ = problem()
     numbers = (source.points, target.points, source.channels, target.channels, LAMBDA, EPSILON)
@@ -275,7 +280,7 @@ def test_rows_without_a_match_add_nothing():
     elsewhere = Correspondences(
         indices=matches.indices.at[free].set(3), distances=matches.distances, valid=matches.valid
     )
-    for method in METHODS.values():
+    for method in (make() for make in METHODS.values()):
         cost = mahalanobis_cost(T, source, target, matches, method)
         np.testing.assert_allclose(mahalanobis_cost(T, source, target, elsewhere, method), cost, rtol=1e-6)
 
@@ -319,7 +324,7 @@ def test_padding_of_given_covariances_adds_nothing():
 def test_no_matches_cost_nothing():
     _, _, clouds, matches, _ = problem()
     none = Correspondences(indices=matches.indices, distances=matches.distances, valid=jnp.zeros(ROWS, bool))
-    for method in METHODS.values():
+    for method in (make() for make in METHODS.values()):
         assert mahalanobis_cost(T, *clouds, none, method) == 0
 
 
@@ -335,7 +340,7 @@ def test_a_batch_is_its_lanes():
     poses = jnp.asarray(np.stack([T, ref.pose([0.02, 0, 0], [0, 0.1, 0]), np.eye(4)]), dtype)
 
     def cost(pose):
-        return mahalanobis_cost(pose, source, target, matches, METHODS["MultiChannelGICP"])
+        return mahalanobis_cost(pose, source, target, matches, METHODS["MultiChannelGICP"]())
 
     values, slopes = jax.jit(jax.vmap(jax.value_and_grad(cost)))(poses)
     for i, pose in enumerate(poses):
@@ -345,12 +350,13 @@ def test_a_batch_is_its_lanes():
     assert np.isfinite(slopes).all()
 
 
+@in_both_precisions
 @pytest.mark.parametrize("kernel", [None, "huber"])
 def test_the_sums_say_what_the_correspondences_say(kernel):
     """e − 2⟨D, G⟩ + ⟨D, Q(D)⟩ = Σ w (d − D h)ᵀ M (d − D h) for any D."""
     _, _, (source, target), matches, matched = problem()
     dtype = source.points.dtype
-    method = METHODS["MultiChannelGICP"]
+    method = METHODS["MultiChannelGICP"]()
     pair = surface_pair(method, source, target, observed=False, robust=None if kernel is None else Huber(SCALE))
     there = Motion(jnp.asarray(T[:3, :3], dtype), jnp.asarray(T[:3, 3], dtype))
     found = jax.jit(lambda: sums_of(there, match_surfaces(pair.source, pair.target, matches), pair.terms))()

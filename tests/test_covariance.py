@@ -1,44 +1,42 @@
 """Covariances and their closed-form algebra, against NumPy; compiled, at the sizes that are met in use."""
 
-import functools
-import warnings
-
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from hypothesis import example, given, settings
-from hypothesis import strategies as st
 
 from mcgicp_jax import GICP, MultiChannelGICP, PointCloud, PointToPlane, preprocess
 from mcgicp_jax._local_geometry import local_statistics as _local
 from mcgicp_jax._local_geometry.local_geometry import weighted_covariance
 from mcgicp_jax._local_geometry.local_statistics import local_geometries
 from mcgicp_jax._local_geometry.spacing_and_noise import channel_noise
-from mcgicp_jax._math import statistics as _statistics
-from mcgicp_jax._math import symmetric_matrices as cov
 from mcgicp_jax._methods.surfaces import surface_pair
 from tests import reference as ref
 from tests import scenes
-from tests.reference import tolerance
+from tests.precision import cached, in_both_precisions, in_float64, tolerance
 from tests.scenes import prepare
 
+pytestmark = in_float64
 K = 20
 EPSILON = 1e-3
 REGULARISATION = 1e-6
 
 
-@functools.cache
+@cached
 def cloud_of(num_points, num_channels):
     points, channels = ref.scene(num_points, num_channels, seed=num_channels)
     cloud = preprocess(PointCloud(points, channels), num_neighbors=K)
     return cloud.pad(num_points + 10)
 
 
-@functools.cache
+@cached
 def neighbors_of(num_points, num_channels):
     points, _ = ref.scene(num_points, num_channels, seed=num_channels)
     return ref.nearest(points, points, K)
+
+
+def dtype():
+    return jnp.zeros(()).dtype
 
 
 def covariances(method, cloud):
@@ -55,6 +53,7 @@ def full_lambda(num_channels, seed=0):
     return 0.2 * (root @ root.T / num_channels + 0.3 * np.eye(num_channels))
 
 
+@in_both_precisions
 @pytest.mark.parametrize("num_points", [150, 2000])
 def test_gicp_against_the_reference(num_points):
     points, _ = ref.scene(num_points, 3, seed=3)
@@ -68,6 +67,7 @@ def test_point_to_plane_against_the_reference():
     compare(covariances(PointToPlane(), cloud_of(2000, 3)), normals[:, :, None] * normals[:, None, :])
 
 
+@in_both_precisions
 @pytest.mark.parametrize(
     "num_points, num_channels, channel_covariance",
     [
@@ -160,7 +160,7 @@ def test_it_turns_with_the_cloud(seed):
     compare(covariances(method, turned), R @ covariances(method, cloud) @ R.T, 5e-4, 1e-9)
 
 
-@functools.cache
+@cached
 def edge(angle):
     """A flat grid, half of it of another colour; the line between runs at the angle through the middle."""
     x, y = (axis.ravel() for axis in np.meshgrid(np.arange(-7, 8) * 0.1, np.arange(-7, 8) * 0.1))
@@ -225,6 +225,7 @@ def test_the_unit_of_a_channel_does_not_matter():
     compare(actual, covariances(MultiChannelGICP(single, 0.1, EPSILON), cloud), 2e-5, 1e-9)
 
 
+@in_both_precisions
 @pytest.mark.parametrize("scale", [1e-6, 1e-3, 1e3, 1e6])
 def test_the_unit_of_length_does_not_matter(scale):
     cloud, method = cloud_of(2000, 3), MultiChannelGICP(0.3, 0.1, EPSILON)
@@ -308,6 +309,7 @@ AWKWARD = [
 ]
 
 
+@in_both_precisions
 @pytest.mark.parametrize("kind", AWKWARD)
 @pytest.mark.parametrize("as_gicp", [False, True])
 def test_awkward_neighbourhoods_stay_finite_in_value_and_gradient(kind, as_gicp):
@@ -401,192 +403,14 @@ def test_gradients_against_differences_of_the_reference(argument, as_gicp):
     assert np.sum(gradient * direction) == pytest.approx(expected, rel=tolerance(3e-3, 1e-6))
 
 
-# Algebra: 512 matrices at a time, of every kind.
-SEEDS = st.integers(0, 2**31)
-SCALES = st.floats(-6, 6).map(lambda power: 10.0**power)
-KINDS = ("random", "flat", "line", "near line", "isotropic", "near isotropic", "zero")
-EXAMPLES = settings(max_examples=15, deadline=None)
-
-
-def dtype():
-    return jnp.zeros(()).dtype
-
-
-def random_symmetric(seed, size, eigenvalues):
-    """Matrices with the given (N, size) eigenvalues, rounded to the precision of the run."""
-    orthogonal = np.linalg.qr(np.random.default_rng(seed).normal(size=(len(eigenvalues), size, size)))[0]
-    matrices = orthogonal * eigenvalues[:, None, :] @ orthogonal.swapaxes(1, 2)
-    packed = jnp.asarray(ref.packed(matrices), dtype())
-    return packed, ref.symmetric(packed)
-
-
-def eigenvalues_of(kind, seed):
-    rng = np.random.default_rng(seed)
-    a, b, c = rng.uniform(0.1, 1, (3, 512))
-    zero = np.zeros(512)
-    values = {
-        "random": (a, b, c),
-        "flat": (a, b, zero),
-        "line": (a, zero, zero),
-        "near line": (a, 1e-4 * b, 1e-6 * c),
-        "isotropic": (a, a, a),
-        "near isotropic": (a, a * (1 + 1e-5), a * (1 - 1e-5)),
-        "zero": (zero, zero, zero),
-    }[kind]
-    return np.stack(values, axis=1)
-
-
-smallest_eigenvector = jax.jit(cov.smallest_eigenvector)
-
-
-@pytest.mark.parametrize("kind", KINDS)
-@EXAMPLES
-@given(seed=SEEDS, scale=SCALES)
-def test_smallest_eigenvector(kind, seed, scale):
-    packed, matrices = random_symmetric(seed, 3, scale * eigenvalues_of(kind, seed))
-    normal = np.asarray(smallest_eigenvector(packed), float).T
-    eps = np.finfo(dtype()).eps
-    np.testing.assert_allclose(np.linalg.norm(normal, axis=1), 1, atol=16 * eps)
-    # Backward stable: it has the smallest eigenvalue to rounding, whatever the gap.
-    trace = np.trace(matrices, axis1=1, axis2=2)
-    quotient = np.einsum("ni,nij,nj->n", normal, matrices, normal)
-    values, vectors = np.linalg.eigh(matrices)
-    assert np.all(np.abs(quotient - values[:, 0]) <= 64 * eps * trace)
-    # And where there is a gap, it is the vector.
-    gap = (values[:, 1] - values[:, 0]) / np.where(trace > 0, trace, 1)
-    error = np.linalg.norm(np.cross(normal, vectors[:, :, 0]), axis=1)
-    assert np.all(error * gap <= 64 * eps)
-
-
-def test_derivative_of_the_smallest_eigenvector():
-    packed, matrices = random_symmetric(3, 3, np.random.default_rng(3).uniform(0.1, 1, (512, 3)) * [[1, 0.8, 0.05]])
-    change = np.random.default_rng(4).normal(size=(512, 3, 3))
-    change = change + change.swapaxes(1, 2)
-    tangent = jnp.asarray(ref.packed(change), dtype())
-    normal, derivative = jax.jit(lambda p, t: jax.jvp(cov.smallest_eigenvector, (p,), (t,)))(packed, tangent)
-    normal = np.asarray(normal, float).T
-
-    def vector(A):
-        found = np.linalg.eigh(A)[1][:, :, 0]
-        return found * np.sign(np.sum(found * normal, axis=1))[:, None]
-
-    gaps = np.diff(np.linalg.eigvalsh(matrices))[:, 0]
-    expected = ref.difference(vector, matrices, change, 1e-6)
-    error = np.abs(np.asarray(derivative).T - expected).max(axis=1)
-    clear = gaps > 0.05
-    assert clear.sum() > 200
-    assert np.all(error[clear] <= tolerance(1e-3, 1e-6) * (1 + np.abs(expected).max(axis=1)[clear]))
-
-
-@pytest.mark.parametrize("kind", KINDS)
-@EXAMPLES
-@given(seed=SEEDS, scale=SCALES)
-def test_derivative_of_the_smallest_eigenvector_is_finite(kind, seed, scale):
-    packed, _ = random_symmetric(seed, 3, scale * eigenvalues_of(kind, seed))
-    assert np.isfinite(eigenvector_gradient(packed)).all()
-
-
-eigenvector_gradient = jax.jit(jax.grad(lambda packed: jnp.sum(cov.smallest_eigenvector(packed) ** 3)))
-
-
-def test_an_isotropic_neighbourhood_has_no_derivative():
-    identity = jnp.tile(jnp.array([[1.0], [0.0], [0.0], [1.0], [0.0], [1.0]]), (1, 512))
-    np.testing.assert_array_equal(eigenvector_gradient(identity), 0)
-    np.testing.assert_array_equal(eigenvector_gradient(jnp.zeros((6, 512))), 0)
-
-
-@EXAMPLES
-@given(seed=SEEDS, scale=SCALES)
-def test_orthonormal_basis(seed, scale):
-    normal = np.random.default_rng(seed).normal(size=(3, 512))
-    normal[:2, :100] *= min(scale, 1)
-    normal[:, :6] = np.concatenate([np.eye(3), -np.eye(3)], axis=1)
-    normal /= np.linalg.norm(normal, axis=0)
-    u, v = jax.jit(cov.orthonormal_basis)(jnp.asarray(normal, dtype()))
-    frames = np.stack([u, v, jnp.asarray(normal, dtype())], axis=-1).transpose(1, 0, 2).astype(float)
-    eps = np.finfo(dtype()).eps
-    np.testing.assert_allclose(frames.swapaxes(1, 2) @ frames, np.broadcast_to(np.eye(3), (512, 3, 3)), atol=16 * eps)
-    np.testing.assert_allclose(np.linalg.det(frames), 1, atol=16 * eps)
-
-
-def positive(seed, size):
-    return np.random.default_rng(seed).uniform(0.05, 1, (512, size))
-
-
-@EXAMPLES
-@given(seed=SEEDS, scale=SCALES)
-def test_inverse_of_3x3(seed, scale):
-    packed, matrices = random_symmetric(seed, 3, scale * positive(seed, 3))
-    actual = ref.symmetric(jax.jit(cov.inverse)(packed))
-    np.testing.assert_allclose(actual @ matrices, np.broadcast_to(np.eye(3), (512, 3, 3)), atol=tolerance(5e-4, 1e-11))
-
-
-@EXAMPLES
-@given(seed=SEEDS, scale=SCALES)
-def test_inverse_square_root_of_2x2(seed, scale):
-    packed, matrices = random_symmetric(seed, 2, scale * positive(seed, 2))
-    root = ref.symmetric(jax.jit(cov.inverse_square_root)(packed))
-    product = root @ matrices @ root
-    np.testing.assert_allclose(product, np.broadcast_to(np.eye(2), (512, 2, 2)), atol=tolerance(1e-4, 1e-12))
-    assert np.all(np.linalg.eigvalsh(root) > 0)
-
-
-@EXAMPLES
-@given(seed=SEEDS, scale=SCALES)
-def test_sandwich(seed, scale):
-    outside, W = random_symmetric(seed, 2, scale * positive(seed, 2))
-    inside, A = random_symmetric(seed + 1, 2, positive(seed + 1, 2))
-    actual = ref.symmetric(jax.jit(cov.sandwich)(outside, inside)) / scale**2
-    np.testing.assert_allclose(actual, W @ A @ W / scale**2, atol=tolerance(1e-6, 1e-14))
-
-
-@EXAMPLES
-@given(seed=SEEDS, scale=SCALES, low=st.floats(-1, 1))
-def test_floor_eigenvalues(seed, scale, low):
-    values = scale * np.random.default_rng(seed).uniform(-1, 1, (512, 2))
-    values[:50] = values[:50, :1]
-    packed, matrices = random_symmetric(seed, 2, values)
-    floor = jnp.asarray(scale * low, dtype())
-    actual = jax.jit(cov.floor_eigenvalues)(packed, floor)
-    values, vectors = np.linalg.eigh(matrices)
-    expected = vectors * np.maximum(values, float(floor))[:, None, :] @ vectors.swapaxes(1, 2)
-    eps = np.finfo(dtype()).eps
-    np.testing.assert_allclose(ref.symmetric(actual), expected, atol=16 * eps * scale)
-    above = values[:, 0] > float(floor) + 16 * eps * scale
-    np.testing.assert_array_equal(np.asarray(actual)[:, above], np.asarray(packed)[:, above])
-
-
-def test_gradient_of_the_floor_is_finite():
-    packed = jnp.array([[1.0, 0, -1, 0.5], [0, 0, 0, 0], [1.0, 0, -1, 0.5]])
-    gradient = jax.grad(lambda p: jnp.sum(cov.floor_eigenvalues(p, jnp.asarray(0.5)) ** 2))(packed)
-    assert np.isfinite(gradient).all()
-
-
-@EXAMPLES
-@given(seed=SEEDS)
-def test_rotate_multiply_and_outer(seed):
-    rng = np.random.default_rng(seed)
-    packed, matrices = random_symmetric(seed, 3, positive(seed, 3))
-    R, vectors = ref.rotation(rng.normal(size=3)), rng.normal(size=(512, 3))
-    atol = tolerance(2e-6, 1e-14)
-    rotated = jax.jit(cov.rotate)(jnp.asarray(R, dtype()), packed)
-    np.testing.assert_allclose(ref.symmetric(rotated), R @ matrices @ R.T, atol=atol)
-    columns = jnp.asarray(vectors.T, dtype())
-    moved = np.asarray(jax.jit(cov.multiply)(packed, columns)).T
-    np.testing.assert_allclose(moved, np.einsum("nij,nj->ni", matrices, vectors), atol=atol)
-    products = ref.symmetric(jax.jit(cov.outer)(columns))
-    np.testing.assert_allclose(products, vectors[:, :, None] * vectors[:, None, :], atol=2 * atol)
-    np.testing.assert_allclose(cov.matrix_from_symmetric(packed), matrices, atol=0)
-    np.testing.assert_allclose(cov.symmetric_from_matrix(jnp.asarray(matrices, dtype())), packed, atol=0)
-
-
 @pytest.mark.parametrize(
     "method, masked",
-    [(GICP(), False), (MultiChannelGICP(0.3 * np.eye(3), 0.1), True)],
+    [(GICP, False), (lambda: MultiChannelGICP(0.3 * np.eye(3), 0.1), True)],
     ids=["GICP", "MultiChannelGICP, some channels missing"],
 )
 def test_surfaces_are_the_same_block_by_block_and_inside_transformations(method, masked, monkeypatch):
     """Blocks that do not come out even, on the host; whole arrays, and the blocks of large ones, inside; gradients."""
+    method = method()
     points, channels = ref.scene(700, 3, seed=4)
     mask = np.random.default_rng(0).random((700, 3)) < 0.8 if masked else None
     cloud = preprocess(PointCloud(points, channels, channel_valid=mask), num_neighbors=K)
@@ -629,32 +453,3 @@ def test_weighted_covariance_is_that_of_numpy():
     )
     expected = [np.cov(offsets[:, :, i], aweights=weights[:, i], ddof=0) for i in range(2000)]
     np.testing.assert_allclose(ref.symmetric(found), expected, atol=tolerance(1e-5, 1e-12))
-
-
-NUMBERS = st.floats(width=32, allow_nan=True, allow_infinity=True)
-
-
-@settings(deadline=None, max_examples=100)
-@given(st.lists(NUMBERS, min_size=7, max_size=7))
-@example(values=[0.0, 0.0, 0.0, 2e38, 2e38, 2e38, 2e38])
-def test_median_is_that_of_numpy(values):
-    values = np.array(values, float)
-    with np.errstate(invalid="ignore"), warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        np.testing.assert_array_equal(_statistics.median(values), np.nanmedian(values))
-        expected = np.nanmedian(values.astype(np.float32).astype(float))
-    actual = jax.jit(_statistics.median)(jnp.asarray(values, float))
-    # XLA takes the smallest numbers for zero.
-    np.testing.assert_allclose(actual, expected, rtol=1e-6, atol=1e-37)
-
-
-def test_median_of_several_and_of_nothing():
-    values = np.random.default_rng(0).normal(size=(4, 1000))
-    values[0, ::3], values[1] = np.nan, np.nan
-    actual = jax.jit(_statistics.median)(jnp.asarray(values, float))
-    np.testing.assert_allclose(
-        np.asarray(actual)[[0, 2, 3]], np.nanmedian(values[[0, 2, 3]], axis=1), rtol=tolerance(1e-6, 1e-12)
-    )
-    assert np.isnan(actual[1])
-    slope = jax.grad(lambda scale: jnp.sum(_statistics.median(scale * jnp.asarray(values[2:], float))))(1.0)
-    assert slope == 0

@@ -10,7 +10,8 @@ import pytest
 import mcgicp_jax as mcg
 from mcgicp_jax import extend
 from mcgicp_jax.metrics import pose_error
-from tests.differences import GATE, TO_ROUNDING, X64, check_gradient, needs_x64, weigh
+from tests.differences import GATE, TO_ROUNDING, check_gradient, weigh
+from tests.precision import in_both_precisions, in_float64, tolerance
 from tests.scenes import motion, room_corner, wall
 
 SIZE = 0.4
@@ -24,10 +25,11 @@ def raw_pair(size=6000, truth=None, scene=room_corner):
 
 
 @pytest.fixture(scope="module")
-def raw():
+def raw(precision):
     return raw_pair()
 
 
+@in_both_precisions
 def test_statistics_are_those_of_numpy():
     points, channels = room_corner(3000)
     cloud = mcg.PointCloud(points + 100.0, channels)
@@ -35,12 +37,11 @@ def test_statistics_are_those_of_numpy():
     found = mcg.voxel_gaussians(cloud, SIZE, min_ratio=0.0)
     assert len(found) == cells.max() + 1 > 20 and found.neighbors is not None
     expected = [np.cov(points[cells == i].T) for i in range(len(found))]
-    tolerance = 1e-12 if X64 else 1e-7
-    np.testing.assert_allclose(found.covariances, expected, atol=tolerance)
+    np.testing.assert_allclose(found.covariances, expected, atol=tolerance(1e-7, 1e-12))
     means = [np.mean(points[cells == i] + 100.0, axis=0) for i in range(len(found))]
-    np.testing.assert_allclose(found.coordinates, means, atol=1e-12 if X64 else 1e-5)
+    np.testing.assert_allclose(found.coordinates, means, atol=tolerance(1e-5, 1e-12))
     values = [np.mean(channels[cells == i], axis=0) for i in range(len(found))]
-    np.testing.assert_allclose(found.channels, values, atol=1e-12 if X64 else 1e-6)
+    np.testing.assert_allclose(found.channels, values, atol=tolerance(1e-6, 1e-12))
     # Cells are voxels: no two have points in the same one.
     voxels = np.floor((points + 100.0) / SIZE).astype(int)
     assert all(len(np.unique(voxels[cells == i], axis=0)) == 1 for i in range(len(found)))
@@ -120,6 +121,7 @@ def test_covariances_in_square_metres_beside_those_of_gicp():
         mcg.register(source, mcg.voxel_gaussians(target, SIZE, of="covariances"), mcg.GICP())
 
 
+@in_both_precisions
 def test_moments_in_jax():
     points, channels = room_corner(3000)
     cloud = mcg.PointCloud(points, channels)
@@ -128,13 +130,13 @@ def test_moments_in_jax():
     moments = jax.jit(lambda points, channels: extend.cell_moments(points, channels, cells))
     means, values, covariances = moments(points.astype(dtype), channels.astype(dtype))
     assert means.dtype == covariances.dtype == dtype
-    tolerance = 1e-12 if X64 else 2e-6
-    np.testing.assert_allclose(means, expected.points, atol=tolerance)
-    np.testing.assert_allclose(values, expected.channels, atol=tolerance)
-    np.testing.assert_allclose(covariances, expected.covariances, atol=tolerance)
+    atol = tolerance(2e-6, 1e-12)
+    np.testing.assert_allclose(means, expected.points, atol=atol)
+    np.testing.assert_allclose(values, expected.channels, atol=atol)
+    np.testing.assert_allclose(covariances, expected.covariances, atol=atol)
 
 
-@needs_x64
+@in_float64
 @pytest.mark.parametrize("name", ["ndt", "d2d-ndt"])
 def test_gradients_reach_the_points(name, raw):
     source, target, _ = raw
@@ -154,8 +156,9 @@ def test_gradients_reach_the_points(name, raw):
     check_gradient(loss, {"source": jnp.asarray(source.points), "target": jnp.asarray(target.points), "method": method})
 
 
-@pytest.mark.parametrize("method", [mcg.NDT(), mcg.D2DNDT(), mcg.ColorNDT(0.1)], ids=["ndt", "d2d-ndt", "colour"])
+@pytest.mark.parametrize("method", [mcg.NDT, mcg.D2DNDT, lambda: mcg.ColorNDT(0.1)], ids=["ndt", "d2d-ndt", "colour"])
 def test_the_pose_is_found(method, raw):
+    method = method()
     source, target, truth = raw
     cells = mcg.voxel_gaussians(target, SIZE)
     moving = source if method.needs_covariances == ("target",) else mcg.voxel_gaussians(source, SIZE)
@@ -163,7 +166,7 @@ def test_the_pose_is_found(method, raw):
     assert result.converged and np.isfinite(result.covariance).all()
     assert max(pose_error(result.matrix, truth)) < (0.02 if isinstance(method, mcg.D2DNDT) else 0.01)
     inside = jax.jit(lambda a, b: mcg.register(a, b, method).matrix)(mcg.preprocess(moving), cells)
-    np.testing.assert_allclose(inside, result.matrix, atol=1e-9 if X64 else 1e-4)
+    np.testing.assert_allclose(inside, result.matrix, atol=tolerance(1e-4, 1e-9))
 
 
 def test_scales_make_the_cells(raw):
@@ -182,7 +185,7 @@ def test_scales_make_the_cells(raw):
         assert again.num_inliers == result.num_inliers
 
 
-@pytest.mark.parametrize("method", [mcg.NDT(), mcg.D2DNDT()], ids=["ndt", "d2d-ndt"])
+@pytest.mark.parametrize("method", [mcg.NDT, mcg.D2DNDT], ids=["ndt", "d2d-ndt"])
 def test_views_that_overlap_in_part_are_not_pulled_over_each_other(method):
     """A yard with a ground, two walls and a box; each view ends where the other one goes on."""
     rng = np.random.default_rng(0)
@@ -196,25 +199,26 @@ def test_views_that_overlap_in_part_are_not_pulled_over_each_other(method):
         return mcg.PointCloud(points[keep(points[:, 0])] + 0.01 * rng.normal(size=(np.sum(keep(points[:, 0])), 3)))
 
     target, source = view(lambda x: x < 15), view(lambda x: x > 3)
-    result = mcg.register(source, target, method, voxel_sizes=(2.0, 1.0), init=motion((1.0, 0.8, 0, 0, 0, 0.15)))
+    result = mcg.register(source, target, method(), voxel_sizes=(2.0, 1.0), init=motion((1.0, 0.8, 0, 0, 0, 0.15)))
     assert result.converged and np.linalg.norm(result.matrix[:3, 3]) < 0.1
 
 
-@pytest.mark.parametrize("method", [mcg.NDT(), mcg.D2DNDT()], ids=["ndt", "d2d-ndt"])
+@pytest.mark.parametrize("method", [mcg.NDT, mcg.D2DNDT], ids=["ndt", "d2d-ndt"])
 def test_the_unit_of_length_does_not_matter(method, raw):
     source, target, _ = raw
     results = []
     for unit in (1.0, 1000.0):
         clouds = [mcg.voxel_gaussians(mcg.PointCloud(unit * cloud.points), unit * SIZE) for cloud in (source, target)]
-        results.append(mcg.register(*clouds, method).matrix)
+        results.append(mcg.register(*clouds, method()).matrix)
     results[1][:3, 3] /= 1000.0
-    np.testing.assert_allclose(results[0], results[1], atol=1e-9 if X64 else 2e-5)
+    np.testing.assert_allclose(results[0], results[1], atol=tolerance(2e-5, 1e-9))
 
 
 def cells_of(raw):
     return [mcg.voxel_gaussians(cloud, SIZE) for cloud in raw[:2]]
 
 
+@in_both_precisions
 def test_the_cost_is_the_sum_over_the_nearest_cells(raw):
     """By brute force: each of four cells with its own residual, information and Welsch weight."""
     source, target = cells_of(raw)
@@ -233,7 +237,7 @@ def test_the_cost_is_the_sum_over_the_nearest_cells(raw):
         square += np.mean([apart[i, j] ** 2 for j in near])
     matches = mcg.find_correspondences(source, target, pose, method, max_distance=gate)
     np.testing.assert_array_equal(np.sort(matches.indices.T, axis=1), np.sort(rows, axis=1))
-    rtol = 1e-9 if X64 else 1e-3
+    rtol = tolerance(1e-3, 1e-9)
     np.testing.assert_allclose(mcg.mahalanobis_cost(pose, source, target, matches, method), cost, rtol=rtol)
     result = mcg.register(source, target, method, init=pose, max_distance=gate, max_iterations=1)
     np.testing.assert_allclose(result.history["cost"][0], cost, rtol=rtol)
@@ -255,11 +259,11 @@ def test_the_sum_is_more_accurate_than_the_nearest_cell():
 def test_the_sum_is_the_same_everywhere(raw):
     """On the host, inside `jit`, in batches, in lanes, and in the alignment to its final matches."""
     source, target = cells_of(raw)
-    method, atol = mcg.D2DNDT(), 1e-9 if X64 else 1e-4
+    method, atol = mcg.D2DNDT(), tolerance(1e-4, 1e-9)
     alone = mcg.register(source, target, method, max_distance=1.0)
     inside = jax.jit(lambda a, b: mcg.register(a, b, method, max_distance=1.0))(source, target)
     np.testing.assert_allclose(inside.matrix, alone.matrix, atol=atol)
-    np.testing.assert_allclose(inside.covariance, alone.covariance, rtol=1e-6 if X64 else 0.05, atol=1e-9)
+    np.testing.assert_allclose(inside.covariance, alone.covariance, rtol=tolerance(0.05, 1e-6), atol=1e-9)
     lanes = mcg.register_batch([source] * 2, target, method, max_distance=1.0, search=mcg.DenseSearch())
     for result in (*mcg.register_batch([source], target, method, max_distance=1.0), *lanes):
         np.testing.assert_allclose(result.matrix, alone.matrix, atol=atol)

@@ -21,8 +21,8 @@ from mcgicp_jax._pose_graph.factors import AbstractFactor
 from mcgicp_jax._pose_graph.levenberg_marquardt import Minimum
 from mcgicp_jax._pose_graph.marginal_covariances import inverse_blocks
 from mcgicp_jax._pose_graph.normal_equations import NormalEquations, factored
-from tests.differences import X64, needs_x64
 from tests.graphs import garage, grid, joined, measured, moved, pose, sphere, with_gtsam, with_priors
+from tests.precision import in_float64
 from tests.test_programs import compilations
 
 SMALL = {"sphere": sphere(6, 10), "grid": grid(3), "garage": garage(2, 40)}
@@ -161,7 +161,7 @@ def test_rounding_does_not_decide_the_status(name):
             np.testing.assert_allclose(far.cost, near.cost, rtol=1e-4)
 
 
-@needs_x64
+@in_float64
 def test_rounding_does_not_decide_the_status_inside_transformations():
     poses, loops = grid(2)
     solve = jax.jit(lambda graph: mcg.optimize_poses(graph, robust=False).status_code)
@@ -332,7 +332,7 @@ def differentiated(graph, twists, change):
 
 
 @pytest.fixture(scope="module")
-def both():
+def both(precision):
     """A graph, its result, and that of a compiled program with its derivative in some direction."""
     graph, _ = measured(*SMALL["grid"])
     return graph, mcg.optimize_poses(graph, robust=False), *differentiated(graph, *direction(graph))
@@ -345,12 +345,13 @@ def direction(graph):
     return 0.1 * twists, 20 * (change + change.swapaxes(1, 2))
 
 
+@in_float64
 def test_covariances_are_blocks_of_the_inverse(both):
     _, found, inside, _ = both
     dense = np.asarray(inside.covariance)
     deviations = np.sqrt(np.diagonal(found.covariance, 0, 1, 2))[1:]
     difference = (found.covariance - dense)[1:] / deviations[:, :, None] / deviations[:, None]
-    assert np.abs(difference).max() < (1e-4 if X64 else 0.05)
+    assert np.abs(difference).max() < 1e-4
 
 
 def test_blocks_of_a_sparse_inverse_are_those_of_the_dense_one():
@@ -410,6 +411,7 @@ def test_other_sizes_compile_nothing():
     assert not found
 
 
+@in_float64
 def test_transformations_give_the_same_poses(both):
     _, expected, found, _ = both
     assert found.converged and found.status == mcg.Status.CONVERGED
@@ -418,6 +420,7 @@ def test_transformations_give_the_same_poses(both):
     np.testing.assert_allclose(found.residuals, expected.residuals, atol=0.05)
 
 
+@in_float64
 def test_the_derivative_is_that_of_finite_differences(both):
     graph, _, _, slope = both
     check_slope(graph, slope)
@@ -650,7 +653,7 @@ def test_other_kinds_of_measurements_have_gradients():
 
 
 @pytest.mark.slow
-@needs_x64
+@in_float64
 @pytest.mark.parametrize("priors", [False, True])
 def test_gradients_reach_motions_and_informations(priors):
     graph = correlated(measured(*grid(2))[0])

@@ -15,7 +15,8 @@ from mcgicp_jax._pose_solver.matched import Matched, Motion, match_surfaces, sur
 from mcgicp_jax._terms.base import AbstractTerm
 from mcgicp_jax._terms.mahalanobis import Mahalanobis
 from mcgicp_jax._terms.photometric import Photometric, Residuals
-from tests.differences import CONVERGED, GATE, TO_ROUNDING, check_gradient, clouds_with, inputs_of, needs_x64, weigh
+from tests.differences import CONVERGED, GATE, TO_ROUNDING, check_gradient, clouds_with, inputs_of, weigh
+from tests.precision import in_float64
 from tests.scenes import motion, pair, wall
 
 PHOTOMETRIC = mcg.MultiChannelGICP(photometric=True)
@@ -193,7 +194,7 @@ def test_noise_of_slopes_is_discounted(noise):
     np.testing.assert_allclose(designs[0] / designs[1], reliability, rtol=0.15, atol=0.03)
 
 
-@needs_x64
+@in_float64
 def test_align_has_the_gradient_of_its_answer(noisy):
     """With its numbers held, as autodiff holds them."""
     source, target, _ = noisy
@@ -211,7 +212,7 @@ def test_align_has_the_gradient_of_its_answer(noisy):
     check_gradient(loss, inputs)
 
 
-@needs_x64
+@in_float64
 @pytest.mark.slow
 def test_register_has_the_gradient_of_align():
     """At the same matches, with the numbers of the term that they lead to."""

@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 from mcgicp_jax import GICP, PointCloud, preprocess
 from mcgicp_jax._compute.size_classes import size_class
 from tests import reference as ref
+from tests.precision import tolerance
 from tests.scenes import prepare
 
 POINTS, CHANNELS = ref.scene(150, 2)
@@ -35,7 +36,7 @@ def test_voxels_hold_the_mean_of_what_falls_into_them(seed, voxel_size, shift):
     # The order of the rows is the library's own affair.
     actual = actual[np.lexsort(np.round(actual, 3).T[::-1])]
     expected = expected[np.lexsort(np.round(expected, 3).T[::-1])]
-    np.testing.assert_allclose(actual, expected, atol=ref.tolerance(3e-5, 1e-9))
+    np.testing.assert_allclose(actual, expected, atol=tolerance(3e-5, 1e-9))
 
 
 @settings(max_examples=20, deadline=None)
@@ -52,7 +53,7 @@ def test_a_voxel_averages_each_channel_over_the_points_that_have_it(seed, voxel_
         mine = np.asarray(cloud.valid) & mask[:, i]
         expected = ref.voxel_means(CHANNELS[present[:, i], i : i + 1], POINTS[present[:, i]], voxel_size)
         np.testing.assert_allclose(
-            np.sort(np.asarray(cloud.channels)[mine, i]), np.sort(expected[:, 0]), atol=ref.tolerance(1e-6, 1e-12)
+            np.sort(np.asarray(cloud.channels)[mine, i]), np.sort(expected[:, 0]), atol=tolerance(1e-6, 1e-12)
         )
         np.testing.assert_array_equal(np.asarray(cloud.channels)[~mine, i], 0)
     whole = ready(PointCloud(POINTS, CHANNELS), voxel_size=voxel_size)
@@ -152,17 +153,17 @@ def test_large_coordinates_lose_nothing():
     cloud, local = ready(points, num_neighbors=20), ready(POINTS, num_neighbors=20)
     assert np.abs(cloud.points).max() < 5
     assert np.asarray(cloud.origin).dtype == np.float64
-    np.testing.assert_allclose(cloud.unpad().points, points, rtol=0, atol=ref.tolerance(2e-7, 1e-9))
+    np.testing.assert_allclose(cloud.unpad().points, points, rtol=0, atol=tolerance(2e-7, 1e-9))
     np.testing.assert_array_equal(cloud.neighbors, local.neighbors)
     found = prepare(GICP(), cloud).covariance, prepare(GICP(), local).covariance
-    np.testing.assert_allclose(*found, atol=ref.tolerance(1e-4, 1e-6))
+    np.testing.assert_allclose(*found, atol=tolerance(1e-4, 1e-6))
 
 
 def test_large_coordinates_in_voxels():
     points = POINTS + UTM
     expected = ref.voxel_means(points, points, 0.5)
     actual = ready(points, voxel_size=0.5).unpad().points
-    np.testing.assert_allclose(actual[np.lexsort(actual.T[::-1])], expected, rtol=0, atol=ref.tolerance(2e-7, 1e-8))
+    np.testing.assert_allclose(actual[np.lexsort(actual.T[::-1])], expected, rtol=0, atol=tolerance(2e-7, 1e-8))
 
 
 def test_a_cloud_about_zero_keeps_its_origin():
@@ -173,7 +174,7 @@ def test_a_cloud_about_zero_keeps_its_origin():
 def test_preprocessing_again_starts_from_what_is_there():
     once = ready(PointCloud(POINTS + UTM, CHANNELS), num_neighbors=20)
     again = preprocess(once, num_neighbors=6)
-    np.testing.assert_allclose(again.unpad().points, POINTS + UTM, rtol=0, atol=ref.tolerance(5e-7, 1e-9))
+    np.testing.assert_allclose(again.unpad().points, POINTS + UTM, rtol=0, atol=tolerance(5e-7, 1e-9))
     np.testing.assert_array_equal(again.channels, once.channels)
     assert again.neighbors.shape == (150, 6)
 

@@ -1,13 +1,12 @@
 """Agreement with small_gicp, and published behaviour on real scans."""
 
-import jax
 import numpy as np
 import pytest
 
 import mcgicp_jax as mcg
 from mcgicp_jax.metrics import pose_error
+from tests.precision import in_both_precisions, in_float64, tolerance
 
-X64 = bool(jax.config.jax_enable_x64)
 small_gicp = pytest.importorskip("small_gicp")
 
 
@@ -36,22 +35,23 @@ def small_gicp_pose(source, target, max_distance):
 
 
 def check_against_small_gicp(source, target):
-    tolerance = 1e-12 if X64 else 1e-7
+    rest = tolerance(1e-7, 1e-12)
     result = mcg.register(
         source,
         target,
         mcg.GICP(1e-3),
         max_distance=1.0,
         max_iterations=100,
-        translation_tolerance=tolerance,
-        rotation_tolerance=tolerance,
+        translation_tolerance=rest,
+        rotation_tolerance=rest,
     )
     translation, rotation = pose_error(result.matrix, small_gicp_pose(source, target, 1.0))
-    assert translation < (1e-8 if X64 else 1e-5)
-    assert rotation < (1e-8 if X64 else 1e-5)
+    assert translation < tolerance(1e-5, 1e-8)
+    assert rotation < tolerance(1e-5, 1e-8)
     return result
 
 
+@in_both_precisions
 def test_lidar_pair_agrees_with_small_gicp_from_either_format(data):
     folder = data / "lidar_pair"
     poses = []
@@ -64,6 +64,7 @@ def test_lidar_pair_agrees_with_small_gicp_from_either_format(data):
     assert translation < 0.05 and rotation < np.radians(1)
 
 
+@in_float64
 @pytest.mark.parametrize("target, source", [(0, 1), (5, 6)])
 def test_kitti_agrees_with_small_gicp(target, source, data):
     scans = data / "kitti" / "sequences" / "04" / "velodyne"

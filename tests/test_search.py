@@ -23,6 +23,7 @@ from mcgicp_jax._search.base import SearchPoints
 from mcgicp_jax._search.positions import nearest_in_position
 from mcgicp_jax._search.tree_index import TreeIndex
 from tests import reference as ref
+from tests.precision import tolerance
 
 SIZES = {"source": 150, "target": 140}
 T = ref.pose([0.1, -0.2, 0.3], [0.05, 0.1, -0.02])
@@ -247,7 +248,7 @@ def test_correspondences_against_the_reference(weights, max_distance):
     moved = a @ T[:3, :3].T + T[:3, 3]
     apart = np.linalg.norm(b[expected] - moved, axis=1)
     np.testing.assert_allclose(
-        np.asarray(found.distances)[:150][valid[:150]], apart[expected >= 0], atol=ref.tolerance(1e-6, 1e-12)
+        np.asarray(found.distances)[:150][valid[:150]], apart[expected >= 0], atol=tolerance(1e-6, 1e-12)
     )
 
 

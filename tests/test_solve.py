@@ -13,8 +13,9 @@ from mcgicp_jax._pose_solver import update as _solve
 from mcgicp_jax._pose_solver.matched import Matched, Motion
 from mcgicp_jax._pose_solver.sums import sums_of
 from mcgicp_jax._terms.base import AbstractTerm, linearize_residual
+from tests.precision import in_both_precisions, tolerance
 
-X64 = jax.config.jax_enable_x64
+pytestmark = in_both_precisions
 N = 2000
 
 
@@ -70,8 +71,8 @@ def test_update_is_the_least_squares_answer_on_all_residuals(scale, offset):
     expected = scipy.optimize.least_squares(
         lambda twist: whitened(units * twist, *data) / scale, np.zeros(6), method="lm", xtol=1e-15, ftol=1e-15
     )
-    np.testing.assert_allclose(measured.center, center, rtol=1e-5 if not X64 else 1e-12)
-    np.testing.assert_allclose(update.twist / units, expected.x, atol=1e-9 if X64 else 1e-5)
+    np.testing.assert_allclose(measured.center, center, rtol=tolerance(1e-5, 1e-12))
+    np.testing.assert_allclose(update.twist / units, expected.x, atol=tolerance(1e-5, 1e-9))
     assert not update.degenerate
 
 
@@ -89,7 +90,7 @@ def test_information_is_the_sum_of_jacobians(scale):
     lengths = np.repeat([1, float(measured.radius)], 3)
     actual = np.asarray(update.information, float) * np.outer(lengths * units, lengths * units)
     expected = expected * np.outer(units, units)
-    np.testing.assert_allclose(actual, expected, atol=np.abs(expected).max() * (1e-12 if X64 else 1e-5))
+    np.testing.assert_allclose(actual, expected, atol=np.abs(expected).max() * tolerance(1e-5, 1e-12))
 
 
 def test_exact_pairs_need_no_second_update():
@@ -98,7 +99,7 @@ def test_exact_pairs_need_no_second_update():
     turn = Rotation.from_rotvec(np.array(update.twist[3:], float))
     center = np.asarray(measured.center, float)
     change = turn.apply(moved - center) + center + np.asarray(update.twist[:3], float) - moved
-    np.testing.assert_allclose(change[valid], residual[valid], atol=1e-10 if X64 else 1e-5)
+    np.testing.assert_allclose(change[valid], residual[valid], atol=tolerance(1e-5, 1e-10))
 
 
 def test_rounding_at_the_minimum_costs_no_steps():
@@ -136,5 +137,5 @@ def test_square_root_of_semidefinite_matrices(rank):
     factor = np.random.default_rng(rank).normal(size=(13, max(rank, 1))) * (rank > 0)
     form = factor @ factor.T
     root, pivots = jax.jit(_solve._semidefinite_root)(jnp.asarray(form, float))
-    np.testing.assert_allclose(root @ root.T, form, atol=1e-10 if X64 else 1e-3)
+    np.testing.assert_allclose(root @ root.T, form, atol=tolerance(1e-3, 1e-10))
     assert np.sum(np.asarray(pivots) > 1e-3) == rank

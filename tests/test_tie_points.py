@@ -12,7 +12,8 @@ from mcgicp_jax import datasets
 from mcgicp_jax._math.symmetric_matrices import inverse_3, inverse_6
 from mcgicp_jax._math.twists import logarithm
 from mcgicp_jax._pose_solver.pose_measurements import Fusion, Prior, TiePoints, form_at
-from tests.differences import TO_ROUNDING, check_gradient, needs_x64, weigh
+from tests.differences import TO_ROUNDING, check_gradient, weigh
+from tests.precision import in_float64
 from tests.scenes import motion, pair
 from tests.test_programs import compilations
 
@@ -45,12 +46,12 @@ def twist_error(matrix, truth):
 
 
 @pytest.fixture(scope="module")
-def corner():
+def corner(precision):
     return pair()
 
 
 @pytest.fixture(scope="module")
-def hall():
+def hall(precision):
     """Two clouds of a bare corridor, the true pose, and the direction of its axis in the source's frame."""
     target, source = datasets.corridor(2, textured=False)
     truth = np.linalg.inv(target.pose) @ source.pose
@@ -227,7 +228,7 @@ def test_a_prior_is_the_start(corner):
 # Derivatives
 
 
-@needs_x64
+@in_float64
 @pytest.mark.parametrize("scene", ["corner", pytest.param("corridor", marks=pytest.mark.slow)])
 def test_gradients_of_tie_points_and_prior(scene, noisy, hall):
     source, target, truth = noisy if scene == "corner" else hall[:3]

@@ -1,0 +1,190 @@
+"""Closed-form algebra of packed symmetric matrices, against NumPy: 512 matrices at a time, of every kind."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from mcgicp_jax._math import symmetric_matrices as cov
+from tests import reference as ref
+from tests.precision import in_both_precisions, tolerance
+
+pytestmark = in_both_precisions
+SEEDS = st.integers(0, 2**31)
+SCALES = st.floats(-6, 6).map(lambda power: 10.0**power)
+KINDS = ("random", "flat", "line", "near line", "isotropic", "near isotropic", "zero")
+EXAMPLES = settings(max_examples=15, deadline=None)
+
+
+def dtype():
+    return jnp.zeros(()).dtype
+
+
+def random_symmetric(seed, size, eigenvalues):
+    """Matrices with the given (N, size) eigenvalues, rounded to the precision of the run."""
+    orthogonal = np.linalg.qr(np.random.default_rng(seed).normal(size=(len(eigenvalues), size, size)))[0]
+    matrices = orthogonal * eigenvalues[:, None, :] @ orthogonal.swapaxes(1, 2)
+    packed = jnp.asarray(ref.packed(matrices), dtype())
+    return packed, ref.symmetric(packed)
+
+
+def eigenvalues_of(kind, seed):
+    rng = np.random.default_rng(seed)
+    a, b, c = rng.uniform(0.1, 1, (3, 512))
+    zero = np.zeros(512)
+    values = {
+        "random": (a, b, c),
+        "flat": (a, b, zero),
+        "line": (a, zero, zero),
+        "near line": (a, 1e-4 * b, 1e-6 * c),
+        "isotropic": (a, a, a),
+        "near isotropic": (a, a * (1 + 1e-5), a * (1 - 1e-5)),
+        "zero": (zero, zero, zero),
+    }[kind]
+    return np.stack(values, axis=1)
+
+
+smallest_eigenvector = jax.jit(cov.smallest_eigenvector)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@EXAMPLES
+@given(seed=SEEDS, scale=SCALES)
+def test_smallest_eigenvector(kind, seed, scale):
+    packed, matrices = random_symmetric(seed, 3, scale * eigenvalues_of(kind, seed))
+    normal = np.asarray(smallest_eigenvector(packed), float).T
+    eps = np.finfo(dtype()).eps
+    np.testing.assert_allclose(np.linalg.norm(normal, axis=1), 1, atol=16 * eps)
+    # Backward stable: it has the smallest eigenvalue to rounding, whatever the gap.
+    trace = np.trace(matrices, axis1=1, axis2=2)
+    quotient = np.einsum("ni,nij,nj->n", normal, matrices, normal)
+    values, vectors = np.linalg.eigh(matrices)
+    assert np.all(np.abs(quotient - values[:, 0]) <= 64 * eps * trace)
+    # And where there is a gap, it is the vector.
+    gap = (values[:, 1] - values[:, 0]) / np.where(trace > 0, trace, 1)
+    error = np.linalg.norm(np.cross(normal, vectors[:, :, 0]), axis=1)
+    assert np.all(error * gap <= 64 * eps)
+
+
+def test_derivative_of_the_smallest_eigenvector():
+    packed, matrices = random_symmetric(3, 3, np.random.default_rng(3).uniform(0.1, 1, (512, 3)) * [[1, 0.8, 0.05]])
+    change = np.random.default_rng(4).normal(size=(512, 3, 3))
+    change = change + change.swapaxes(1, 2)
+    tangent = jnp.asarray(ref.packed(change), dtype())
+    normal, derivative = jax.jit(lambda p, t: jax.jvp(cov.smallest_eigenvector, (p,), (t,)))(packed, tangent)
+    normal = np.asarray(normal, float).T
+
+    def vector(A):
+        found = np.linalg.eigh(A)[1][:, :, 0]
+        return found * np.sign(np.sum(found * normal, axis=1))[:, None]
+
+    gaps = np.diff(np.linalg.eigvalsh(matrices))[:, 0]
+    expected = ref.difference(vector, matrices, change, 1e-6)
+    error = np.abs(np.asarray(derivative).T - expected).max(axis=1)
+    clear = gaps > 0.05
+    assert clear.sum() > 200
+    assert np.all(error[clear] <= tolerance(1e-3, 1e-6) * (1 + np.abs(expected).max(axis=1)[clear]))
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@EXAMPLES
+@given(seed=SEEDS, scale=SCALES)
+def test_derivative_of_the_smallest_eigenvector_is_finite(kind, seed, scale):
+    packed, _ = random_symmetric(seed, 3, scale * eigenvalues_of(kind, seed))
+    assert np.isfinite(eigenvector_gradient(packed)).all()
+
+
+eigenvector_gradient = jax.jit(jax.grad(lambda packed: jnp.sum(cov.smallest_eigenvector(packed) ** 3)))
+
+
+def test_an_isotropic_neighbourhood_has_no_derivative():
+    identity = jnp.tile(jnp.array([[1.0], [0.0], [0.0], [1.0], [0.0], [1.0]]), (1, 512))
+    np.testing.assert_array_equal(eigenvector_gradient(identity), 0)
+    np.testing.assert_array_equal(eigenvector_gradient(jnp.zeros((6, 512))), 0)
+
+
+@EXAMPLES
+@given(seed=SEEDS, scale=SCALES)
+def test_orthonormal_basis(seed, scale):
+    normal = np.random.default_rng(seed).normal(size=(3, 512))
+    normal[:2, :100] *= min(scale, 1)
+    normal[:, :6] = np.concatenate([np.eye(3), -np.eye(3)], axis=1)
+    normal /= np.linalg.norm(normal, axis=0)
+    u, v = jax.jit(cov.orthonormal_basis)(jnp.asarray(normal, dtype()))
+    frames = np.stack([u, v, jnp.asarray(normal, dtype())], axis=-1).transpose(1, 0, 2).astype(float)
+    eps = np.finfo(dtype()).eps
+    np.testing.assert_allclose(frames.swapaxes(1, 2) @ frames, np.broadcast_to(np.eye(3), (512, 3, 3)), atol=16 * eps)
+    np.testing.assert_allclose(np.linalg.det(frames), 1, atol=16 * eps)
+
+
+def positive(seed, size):
+    return np.random.default_rng(seed).uniform(0.05, 1, (512, size))
+
+
+@EXAMPLES
+@given(seed=SEEDS, scale=SCALES)
+def test_inverse_of_3x3(seed, scale):
+    packed, matrices = random_symmetric(seed, 3, scale * positive(seed, 3))
+    actual = ref.symmetric(jax.jit(cov.inverse)(packed))
+    np.testing.assert_allclose(actual @ matrices, np.broadcast_to(np.eye(3), (512, 3, 3)), atol=tolerance(5e-4, 1e-11))
+
+
+@EXAMPLES
+@given(seed=SEEDS, scale=SCALES)
+def test_inverse_square_root_of_2x2(seed, scale):
+    packed, matrices = random_symmetric(seed, 2, scale * positive(seed, 2))
+    root = ref.symmetric(jax.jit(cov.inverse_square_root)(packed))
+    product = root @ matrices @ root
+    np.testing.assert_allclose(product, np.broadcast_to(np.eye(2), (512, 2, 2)), atol=tolerance(1e-4, 1e-12))
+    assert np.all(np.linalg.eigvalsh(root) > 0)
+
+
+@EXAMPLES
+@given(seed=SEEDS, scale=SCALES)
+def test_sandwich(seed, scale):
+    outside, W = random_symmetric(seed, 2, scale * positive(seed, 2))
+    inside, A = random_symmetric(seed + 1, 2, positive(seed + 1, 2))
+    actual = ref.symmetric(jax.jit(cov.sandwich)(outside, inside)) / scale**2
+    np.testing.assert_allclose(actual, W @ A @ W / scale**2, atol=tolerance(1e-6, 1e-14))
+
+
+@EXAMPLES
+@given(seed=SEEDS, scale=SCALES, low=st.floats(-1, 1))
+def test_floor_eigenvalues(seed, scale, low):
+    values = scale * np.random.default_rng(seed).uniform(-1, 1, (512, 2))
+    values[:50] = values[:50, :1]
+    packed, matrices = random_symmetric(seed, 2, values)
+    floor = jnp.asarray(scale * low, dtype())
+    actual = jax.jit(cov.floor_eigenvalues)(packed, floor)
+    values, vectors = np.linalg.eigh(matrices)
+    expected = vectors * np.maximum(values, float(floor))[:, None, :] @ vectors.swapaxes(1, 2)
+    eps = np.finfo(dtype()).eps
+    np.testing.assert_allclose(ref.symmetric(actual), expected, atol=16 * eps * scale)
+    above = values[:, 0] > float(floor) + 16 * eps * scale
+    np.testing.assert_array_equal(np.asarray(actual)[:, above], np.asarray(packed)[:, above])
+
+
+def test_gradient_of_the_floor_is_finite():
+    packed = jnp.array([[1.0, 0, -1, 0.5], [0, 0, 0, 0], [1.0, 0, -1, 0.5]])
+    gradient = jax.grad(lambda p: jnp.sum(cov.floor_eigenvalues(p, jnp.asarray(0.5)) ** 2))(packed)
+    assert np.isfinite(gradient).all()
+
+
+@EXAMPLES
+@given(seed=SEEDS)
+def test_rotate_multiply_and_outer(seed):
+    rng = np.random.default_rng(seed)
+    packed, matrices = random_symmetric(seed, 3, positive(seed, 3))
+    R, vectors = ref.rotation(rng.normal(size=3)), rng.normal(size=(512, 3))
+    atol = tolerance(2e-6, 1e-14)
+    rotated = jax.jit(cov.rotate)(jnp.asarray(R, dtype()), packed)
+    np.testing.assert_allclose(ref.symmetric(rotated), R @ matrices @ R.T, atol=atol)
+    columns = jnp.asarray(vectors.T, dtype())
+    moved = np.asarray(jax.jit(cov.multiply)(packed, columns)).T
+    np.testing.assert_allclose(moved, np.einsum("nij,nj->ni", matrices, vectors), atol=atol)
+    products = ref.symmetric(jax.jit(cov.outer)(columns))
+    np.testing.assert_allclose(products, vectors[:, :, None] * vectors[:, None, :], atol=2 * atol)
+    np.testing.assert_allclose(cov.matrix_from_symmetric(packed), matrices, atol=0)
+    np.testing.assert_allclose(cov.symmetric_from_matrix(jnp.asarray(matrices, dtype())), packed, atol=0)
