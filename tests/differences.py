@@ -23,7 +23,7 @@ def case(name):
 
 CONVERGED = {"translation_tolerance": 1e-12, "rotation_tolerance": 1e-12, "max_iterations": 200}
 # Differences over 4e-7 need poses to the last digit: no update is below these tolerances.
-TO_ROUNDING = {"translation_tolerance": 1e-15, "rotation_tolerance": 1e-15, "max_iterations": 60}
+TO_ROUNDING = {"translation_tolerance": 1e-15, "rotation_tolerance": 1e-15, "max_iterations": 30}
 
 
 def weigh(matrix):

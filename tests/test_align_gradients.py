@@ -27,13 +27,12 @@ pytestmark = in_float64
 def test_align_has_the_gradient_of_its_answer(name, noisy):
     source, target, _ = noisy
     method, robust = case(name)
-    start = mcg.register(source, target, method, robust=robust, max_distance=GATE).matrix
-    matches = mcg.find_correspondences(source, target, start, method, max_distance=GATE)
+    matches = mcg.find_correspondences(source, target, motion(), method, max_distance=GATE)
 
     def loss(inputs):
         clouds = clouds_with(inputs, source, target)
         result = mcg.estimate_pose(
-            *clouds, matches, inputs["method"], robust=inputs["robust"], init=start, **TO_ROUNDING
+            *clouds, matches, inputs["method"], robust=inputs["robust"], init=motion(), **TO_ROUNDING
         )
         return weigh(result.matrix)
 
@@ -50,12 +49,11 @@ def test_align_has_the_gradient_where_channels_are_missing(name, noisy):
         clouds.append(cloud.replace(channel_valid=mask))
     source, target = clouds
     method = method.resolve(source, target)
-    start = mcg.register(source, target, method, robust=robust, max_distance=GATE).matrix
-    matches = mcg.find_correspondences(source, target, start, method, max_distance=GATE, num_candidates=2)
+    matches = mcg.find_correspondences(source, target, motion(), method, max_distance=GATE, num_candidates=2)
 
     def loss(inputs):
         clouds = clouds_with(inputs, source, target)
-        settings = {"robust": inputs["robust"], "init": start, "temperature": 0.1, **TO_ROUNDING}
+        settings = {"robust": inputs["robust"], "init": motion(), "temperature": 0.1, **TO_ROUNDING}
         return weigh(mcg.estimate_pose(*clouds, matches, inputs["method"], **settings).matrix)
 
     inputs = inputs_of(source, target, method, robust)
@@ -95,8 +93,7 @@ def test_soft_matches_give_every_number_a_gradient(noisy):
     source, target, _ = noisy
     method = mcg.MultiChannelGICP([[0.05, 0.01], [0.01, 0.08]], [0.3, 0.2], epsilon=1e-2)
     robust = mcg.Cauchy(0.5)
-    start = mcg.register(source, target, method, robust=robust, max_distance=GATE).matrix
-    matches = mcg.find_correspondences(source, target, start, method, max_distance=GATE, num_candidates=4)
+    matches = mcg.find_correspondences(source, target, motion(), method, max_distance=GATE, num_candidates=4)
     assert matches.indices.shape == (4, source.points.shape[0])
 
     def loss(inputs):
@@ -107,7 +104,7 @@ def test_soft_matches_give_every_number_a_gradient(noisy):
             matches,
             inputs["method"],
             robust=inputs["robust"],
-            init=start,
+            init=motion(),
             temperature=temperature,
             **TO_ROUNDING,
         )

@@ -107,9 +107,12 @@ def test_batches_on_accelerators_find_the_same_pose():
 
 
 def test_transformations_find_the_same_pose():
+    """Also of channels with a gain and an offset, which are estimated there too."""
     source, target, _ = pair(wall, 900, truth=SMALL)
-    outside = mcg.register(source, target, PHOTOMETRIC)
-    inside = jax.jit(lambda s, t: mcg.register(s, t, PHOTOMETRIC))(source, target.pad(1024))
+    source = source.replace(channels=np.float32(0.7) * source.channels - np.float32(0.2))
+    options = {"equalize_channels": True, "search": mcg.DenseSearch()}
+    outside = mcg.register(source, target, PHOTOMETRIC, **options)
+    inside = jax.jit(lambda s, t: mcg.register(s, t, PHOTOMETRIC, **options))(source, target.pad(1024))
     np.testing.assert_allclose(inside.matrix, outside.matrix, atol=2e-6)
     assert inside.status == outside.status and inside.num_iterations == outside.num_iterations
     np.testing.assert_allclose(
@@ -197,8 +200,7 @@ def test_noise_of_slopes_is_discounted(noise):
 @in_float64
 def test_align_has_the_gradient_of_its_answer(noisy):
     """With its numbers held, as autodiff holds them."""
-    source, target, _ = noisy
-    start = mcg.register(source, target, PHOTOMETRIC, max_distance=GATE).matrix
+    source, target, start = noisy
     matches = mcg.find_correspondences(source, target, start, mcg.PointToPoint(), max_distance=GATE)
     method, _ = held(source, target, PHOTOMETRIC, start, matches)
     start = mcg.estimate_pose(source, target, matches, method, init=start, **TO_ROUNDING).matrix
@@ -276,8 +278,6 @@ def test_gain_and_offset_are_estimated_with_the_pose():
     without, matched = (mcg.register(darker, target, PHOTOMETRIC, equalize_channels=match) for match in (False, True))
     errors = [mcg.metrics.pose_error(result.matrix, truth)[0] for result in (without, matched)]
     assert matched.converged and errors[1] < 1e-3 < 5e-3 < errors[0]
-    inside = jax.jit(lambda s: mcg.register(s, target, PHOTOMETRIC, equalize_channels=True).matrix)(darker)
-    np.testing.assert_allclose(inside, matched.matrix, atol=1e-5)
 
 
 def test_without_channels_the_term_is_off():

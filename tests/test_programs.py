@@ -18,7 +18,8 @@ METHODS = {
     "point-to-plane": mcg.PointToPlane(),
     "point-to-point": mcg.PointToPoint(),
 }
-SIZES = (37, 900, 1024, 1500, 2600, 9000)
+# Less than a block of 2,048 rows, one, two and three.
+SIZES = (37, 1500, 2600, 4500)
 
 
 @contextlib.contextmanager
@@ -165,8 +166,8 @@ def test_settings_of_a_block_of_code_hold_in_all_threads():
 
 def test_find_correspondences_computes_nothing_that_it_does_not_use():
     source, target = (mcg.preprocess(cloud) for cloud in clouds(400))
-    jax.clear_caches()
-    with compilations() as found:
+    # No program that was compiled before serves here.
+    with jax.default_matmul_precision("float32"), compilations() as found:
         mcg.find_correspondences(source, target, None, mcg.GICP(), max_distance=0.5)
         mcg.find_correspondences(source, target, None, mcg.ColorICP(0.3), max_distance=0.5)
     assert not found

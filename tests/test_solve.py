@@ -36,20 +36,30 @@ def random_pairs(seed: int, scale: float = 1.0, offset: float = 0.0, noise: floa
     return moved, residual, information, weight, valid
 
 
+class Given(AbstractTerm):
+    """Forces of given weight matrices."""
+
+    information: jax.Array
+    weight: jax.Array
+
+    def linearize(self, matches):
+        found = linearize_residual(matches.residual, cov.symmetric_from_matrix(self.information), None)
+        return found.scaled(self.weight)
+
+
+# With data as arguments, so that all tests share a program.
+measure = jax.jit(lambda matched, term: sums_of(Motion(jnp.eye(3), jnp.zeros(3)), matched, (term,)))
+update_of = jax.jit(_solve.solve_update)
+least_squares = jax.jit(lambda root: _solve._least_squares(root, jnp.eye(6)).stats["num_steps"])
+semidefinite_root = jax.jit(_solve._semidefinite_root)
+
+
 def solve(moved, residual, information, weight, valid):
-    class Given(AbstractTerm):
-        """Forces of given weight matrices."""
-
-        def linearize(self, matches):
-            matrices = cov.symmetric_from_matrix(jnp.asarray(information, float))
-            found = linearize_residual(matches.residual, matrices, None)
-            return found.scaled(jnp.asarray(weight, float))
-
     points = (jnp.asarray(rows, float) for rows in (moved, moved + residual))
     surfaces = [Surface(rows, jnp.zeros((len(rows), 6)), None, None, {}) for rows in points]
-    matched = Matched(*surfaces, jnp.asarray(valid))
-    measured = jax.jit(lambda: sums_of(Motion(jnp.eye(3), jnp.zeros(3)), matched, (Given(),)))()
-    return measured, jax.jit(_solve.solve_update)(measured, jnp.eye(6))
+    term = Given(jnp.asarray(information, float), jnp.asarray(weight, float))
+    measured = measure(Matched(*surfaces, jnp.asarray(valid)), term)
+    return measured, update_of(measured, jnp.eye(6))
 
 
 def whitened(twist, moved, residual, information, weight, center):
@@ -111,8 +121,8 @@ def test_rounding_at_the_minimum_costs_no_steps():
         measured, update = solve(moved, residual, information, weight, valid)
         form = _solve._quadratic_form(measured, measured.radius)
         scale = _solve._HESSIAN_SCALE / jnp.mean(jnp.diagonal(update.information))
-        root, _ = _solve._semidefinite_root(form * scale)
-        return int(jax.jit(lambda root: _solve._least_squares(root, jnp.eye(6)).stats["num_steps"])(root))
+        root, _ = semidefinite_root(form * scale)
+        return int(least_squares(root))
 
     assert max(num_steps(seed) for seed in range(10)) < 16
 
@@ -136,6 +146,6 @@ def test_free_directions_are_named_and_held(missing):
 def test_square_root_of_semidefinite_matrices(rank):
     factor = np.random.default_rng(rank).normal(size=(13, max(rank, 1))) * (rank > 0)
     form = factor @ factor.T
-    root, pivots = jax.jit(_solve._semidefinite_root)(jnp.asarray(form, float))
+    root, pivots = semidefinite_root(jnp.asarray(form, float))
     np.testing.assert_allclose(root @ root.T, form, atol=tolerance(1e-3, 1e-10))
     assert np.sum(np.asarray(pivots) > 1e-3) == rank

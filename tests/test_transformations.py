@@ -21,34 +21,52 @@ from tests.differences import (
     inputs_of,
     weigh,
 )
-from tests.precision import in_float64, tolerance
+from tests.precision import in_float64
 from tests.scenes import motion, pair
+
+PADDED = 512
+
+
+@pytest.fixture(scope="module")
+def padded(noisy):
+    source, target, truth = noisy
+    return source.pad(PADDED), target.pad(PADDED), truth
+
+
+@jax.jit
+def gradient_of_register(inputs, source, target, start):
+    """And the result; by dense search, as programs with callbacks are not kept on disk."""
+
+    def loss(inputs):
+        result = registered(inputs, source, target, start, mcg.DenseSearch())
+        return weigh(result.matrix), result
+
+    return jax.grad(loss, has_aux=True)(inputs)
+
+
+def registered(inputs, source, target, start, search=None):
+    options = {"init": start, "max_distance": GATE, "search": search, **TO_ROUNDING}
+    clouds = clouds_with(inputs, source, target)
+    return mcg.register(*clouds, inputs["method"], robust=inputs["robust"], **options)
 
 
 @in_float64
 @pytest.mark.parametrize(
     "name", [name if "gicp" in name else pytest.param(name, marks=pytest.mark.slow) for name in CASES]
 )
-def test_register_has_the_gradient_of_its_answer(name, noisy):
+def test_register_has_the_gradient_of_its_answer(name, padded):
     """Where no match flips within the step of the difference, which is checked."""
-    source, target, _ = noisy
+    source, target, _ = padded
     method, robust = case(name)
     start = mcg.register(source, target, method, robust=robust, max_distance=GATE, **CONVERGED)
     assert start.converged
-
-    def result_of(inputs):
-        clouds = clouds_with(inputs, source, target)
-        return mcg.register(
-            *clouds, inputs["method"], robust=inputs["robust"], init=start.matrix, max_distance=GATE, **TO_ROUNDING
-        )
-
     inputs = inputs_of(source, target, method, robust)
-    gradient = jax.jit(jax.grad(lambda inputs: weigh(result_of(inputs).matrix)))(inputs)
+    gradient, _ = gradient_of_register(inputs, source, target, start.matrix)
     before = mcg.find_correspondences(source, target, start.matrix, method, max_distance=GATE)
 
     def loss(moved):
         """The answer; and no match may differ from those at the start."""
-        result = result_of(moved)
+        result = registered(moved, source, target, start.matrix)
         after = mcg.find_correspondences(
             *clouds_with(moved, source, target), result.matrix, moved["method"], max_distance=GATE
         )
@@ -58,6 +76,43 @@ def test_register_has_the_gradient_of_its_answer(name, noisy):
 
     for key, actual, expected in directional_errors(loss, inputs, gradient):
         assert abs(actual - expected) <= 1e-6 * max(abs(expected), 1e-2), key
+
+
+@in_float64
+def test_no_pairs_give_no_gradient_and_say_why(padded):
+    source, target, truth = padded
+    inputs = inputs_of(source, target, *case("mc-gicp"))
+    inputs["source points"] = inputs["source points"] + 100
+    gradient, result = gradient_of_register(inputs, source, target, truth)
+    for leaf in jax.tree.leaves(gradient):
+        np.testing.assert_array_equal(leaf, 0)
+    assert result.status is Status.TOO_FEW_CORRESPONDENCES
+
+
+@in_float64
+def test_identical_clouds_have_a_finite_gradient(padded):
+    source, _, _ = padded
+    inputs = inputs_of(source, source, *case("mc-gicp"))
+    gradient, result = gradient_of_register(inputs, source, source, np.eye(4))
+    assert np.isfinite(gradient["source points"]).all()
+    np.testing.assert_allclose(result.matrix, np.eye(4), atol=1e-5)
+
+
+@in_float64
+def test_padding_has_no_gradient_and_degenerate_neighborhoods_a_finite_one(padded):
+    source, target, truth = padded
+    # Coincident, collinear and isotropic neighbourhoods.
+    points = np.array(source.unpad().points)
+    points[:25] = points[0]
+    points[25:50] = points[25] + np.linspace(0, 0.1, 25)[:, None] * [1.0, 2.0, 3.0]
+    grid = np.stack(np.meshgrid(*[np.arange(3) * 0.05] * 3), axis=-1).reshape(-1, 3)
+    points[50:77] = points[50] + grid
+    cloud = mcg.preprocess(mcg.PointCloud(points, source.unpad().channels)).pad(PADDED)
+    gradients, _ = gradient_of_register(inputs_of(cloud, target, *case("mc-gicp")), cloud, target, truth)
+    for name in ("source points", "source channels"):
+        assert np.isfinite(gradients[name]).all()
+        assert np.abs(gradients[name][: len(cloud)]).max() > 0
+        np.testing.assert_array_equal(gradients[name][len(cloud) :], 0)
 
 
 @in_float64
@@ -112,37 +167,10 @@ def test_the_start_has_no_influence_on_the_answer(noisy):
 
 
 @in_float64
-def test_no_pairs_give_no_gradient_and_say_why(noisy):
-    source, target, _ = noisy
-    method, _ = case("mc-gicp")
-
-    def loss(points):
-        result = mcg.register(source.replace(points=points + 100), target, method, max_distance=GATE)
-        return weigh(result.matrix), result
-
-    gradient, result = jax.jit(jax.grad(loss, has_aux=True))(source.points)
-    np.testing.assert_array_equal(gradient, 0)
-    assert result.status is Status.TOO_FEW_CORRESPONDENCES
-
-
-@in_float64
-def test_identical_clouds_have_a_finite_gradient(noisy):
-    source, _, _ = noisy
-    method, _ = case("mc-gicp")
-
-    def loss(points):
-        result = mcg.register(source.replace(points=points), source, method, max_distance=GATE)
-        return mcg.metrics.pose_error(result.matrix, jnp.eye(4, dtype=points.dtype))[0]
-
-    value, gradient = jax.jit(jax.value_and_grad(loss))(source.points)
-    assert value < 1e-5 and np.isfinite(gradient).all()
-
-
-@in_float64
 @pytest.mark.timeout(240)
 def test_the_traced_loop_is_the_host_loop(noisy):
     source, target, _ = noisy
-    method, robust = case("mc-gicp")
+    method, robust = case("gicp")
     host = mcg.register(source, target, method, robust=robust, max_distance=GATE)
 
     @eqx.filter_jit
@@ -152,7 +180,7 @@ def test_the_traced_loop_is_the_host_loop(noisy):
 
     matrix, counts, costs = traced(source, target, method, robust)
     assert counts == (host.status, host.num_iterations, host.num_inliers)
-    np.testing.assert_allclose(matrix, host.matrix, atol=tolerance(1e-6, 1e-9))
+    np.testing.assert_allclose(matrix, host.matrix, atol=1e-9)
     np.testing.assert_allclose(costs[: host.num_iterations], host.history["cost"][:-1], rtol=1e-3)
     assert np.isnan(costs[host.num_iterations + 1 :]).all()
     # jit inside jit, and grad of jit of jit.
@@ -178,9 +206,9 @@ def test_a_batch_is_its_lanes(name, noisy):
     single = jax.jit(jax.value_and_grad(lane, argnums=1, has_aux=True))
     for i, start in enumerate(starts):
         (value, _), gradient = single(start, source.points)
-        np.testing.assert_allclose(values[i], value, atol=tolerance(1e-4, 1e-9))
+        np.testing.assert_allclose(values[i], value, atol=1e-9)
         scale = max(np.abs(gradient).max(), 1e-6)
-        np.testing.assert_allclose(gradients[i], gradient, atol=scale * tolerance(5e-2, 1e-6))
+        np.testing.assert_allclose(gradients[i], gradient, atol=scale * 1e-6)
 
 
 @pytest.mark.slow
@@ -231,12 +259,11 @@ def test_nothing_dead_locks():
     assert np.isfinite(gradient).all()
 
 
+@in_float64
 def test_towards_zero_temperature_the_nearest_counts_alone(noisy):
     source, target, _ = noisy
-    method, _ = case("mc-gicp")
-    rest = tolerance(1e-6, 1e-10)
-    tight = {"translation_tolerance": rest, "rotation_tolerance": rest}
-    start = mcg.register(source, target, method, max_distance=GATE, **tight).matrix
+    method, _ = case("gicp")
+    start = mcg.register(source, target, method, max_distance=GATE, **CONVERGED).matrix
     hard, many = (
         mcg.find_correspondences(source, target, start, method, max_distance=GATE, num_candidates=m) for m in (1, 4)
     )
@@ -248,7 +275,7 @@ def test_towards_zero_temperature_the_nearest_counts_alone(noisy):
     # At a pose that the hard matches balance, so do the soft ones.
     soft = mcg.estimate_pose(source, target, many, method, init=start, temperature=1e-4)
     aligned = mcg.estimate_pose(source, target, hard, method, init=start)
-    np.testing.assert_allclose(soft.matrix, aligned.matrix, atol=tolerance(1e-4, 1e-6))
+    np.testing.assert_allclose(soft.matrix, aligned.matrix, atol=1e-6)
 
 
 def test_candidates_need_a_temperature(noisy):

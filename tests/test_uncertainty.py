@@ -320,7 +320,8 @@ def test_large_coordinates_keep_the_covariance_of_the_points():
 
 
 def test_traced_and_batched_results_carry_the_same():
-    clouds = [pair(truth=motion((0.02 * i, 0.01, 0, 0.01, 0, 0.02)))[:2] for i in range(3)]
+    """Clouds of several sizes, stacked."""
+    clouds = [pair(size=2000 - 100 * i, truth=motion((0.02 * i, 0.01, 0, 0.01, 0, 0.02)))[:2] for i in range(3)]
     stacked = [mcg.PointCloud.stack([clouds[i][which] for i in range(3)]) for which in (0, 1)]
     run = jax.jit(jax.vmap(lambda s, t: mcg.register(s, t, mcg.GICP(), max_distance=0.5)))
     batch = run(*stacked)
@@ -328,6 +329,8 @@ def test_traced_and_batched_results_carry_the_same():
         _ = batch.unconstrained_directions
     for i, (source, target) in enumerate(clouds):
         alone = mcg.register(source, target, mcg.GICP(), max_distance=0.5)
+        assert batch.status[i] == alone.status
+        np.testing.assert_allclose(batch.matrix[i], alone.matrix, atol=1e-3)
         np.testing.assert_allclose(batch.directions.geometry[i], alone.directions.geometry, atol=1e-3)
         np.testing.assert_allclose(
             np.sqrt(np.diagonal(batch.covariance[i])), np.sqrt(np.diagonal(alone.covariance)), rtol=0.05
