@@ -219,7 +219,8 @@ def test_results_come_as_they_finish(raw):
         return sources[0]
 
     numbers = []
-    for number, result in mcg.register_as_completed([slow, *sources[1:3]], targets[:3], METHOD, max_distance=0.5):
+    options = {"max_distance": 0.5, "num_workers": 2}
+    for number, result in mcg.register_as_completed([slow, *sources[1:3]], targets[:3], METHOD, **options):
         numbers.append(number)
         gate.set()
         assert result.num_inliers > 250
