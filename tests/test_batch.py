@@ -219,7 +219,7 @@ def test_results_come_as_they_finish(raw):
         return sources[0]
 
     numbers = []
-    options = {"max_distance": 0.5, "num_workers": 2}
+    options = {"max_distance": 0.5, "executor": ThreadPoolExecutor(2)}
     for number, result in mcg.register_as_completed([slow, *sources[1:3]], targets[:3], METHOD, **options):
         numbers.append(number)
         gate.set()

@@ -7,21 +7,17 @@ import pytest
 
 import mcgicp_jax as mcg
 from mcgicp_jax import Status
-from tests.differences import CASES, GATE, TO_ROUNDING, clouds_with, directional_errors, inputs_of, weigh
+from tests.differences import CASES, GATE, TO_ROUNDING, case, clouds_with, directional_errors, inputs_of, weigh
+from tests.precision import in_float64
 from tests.scenes import motion, pair, room_corner, wall
 from tests.test_programs import compilations
 
-
-@pytest.fixture(scope="module", autouse=True)
-def in_float64():
-    with jax.enable_x64(True):
-        yield
+pytestmark = in_float64
 
 
 @pytest.fixture(scope="module")
-def clouds(in_float64):
-    source, target, _ = pair(size=400, noise=0.05, channel_noise=0.05)
-    return source, target
+def clouds(noisy):
+    return noisy[:2]
 
 
 def check(loss, inputs, scale=1e-2):
@@ -38,7 +34,7 @@ def check(loss, inputs, scale=1e-2):
 
 @pytest.mark.parametrize("name", CASES)
 def test_every_input_of_every_method(name, clouds):
-    method, robust = jax.tree.map(lambda number: jnp.asarray(number, float), CASES[name])
+    method, robust = case(name)
     start = mcg.register(*clouds, method, robust=robust, max_distance=GATE, **TO_ROUNDING)
 
     def loss(inputs):
@@ -49,7 +45,7 @@ def test_every_input_of_every_method(name, clouds):
 
 
 def test_a_soft_assignment_has_gradients_by_weights_and_temperature(clouds):
-    method, robust = jax.tree.map(lambda number: jnp.asarray(number, float), CASES["mc-gicp"])
+    method, robust = case("mc-gicp")
     matches = mcg.find_correspondences(*clouds, motion(), method, max_distance=GATE, num_candidates=3)
 
     def loss(inputs):
