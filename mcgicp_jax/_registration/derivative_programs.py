@@ -12,6 +12,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from mcgicp_jax._compute.packing import Packed
+from mcgicp_jax._compute.quick_compilation import quickly_compiled
 from mcgicp_jax._local_geometry.local_geometry import describe
 from mcgicp_jax._local_geometry.neighborhoods import Neighborhoods
 from mcgicp_jax._local_geometry.surface import Surface
@@ -58,7 +59,7 @@ def _matched(block: Block, temperature: Any) -> Matched:
     return Matched(source.surface, target.surface, block.valid.reshape(-1), apart, temperature, count)
 
 
-@jax.jit
+@quickly_compiled
 def score_and_slope(
     parameters: Parameters, root: ImplicitRoot, block: Block, pose: Float[Array, "7"]
 ) -> Float[Array, "6 7"]:
@@ -69,7 +70,7 @@ def score_and_slope(
         return _with_slope(lambda twist: score_along(twist, pose, root, matched, terms), pose)
 
 
-@jax.jit
+@quickly_compiled
 def balance_and_slope(
     pose: Float[Array, "7"], root: ImplicitRoot, fusion: Fusion, known: Float[Array, "6 7"]
 ) -> Float[Array, "6 7"]:
@@ -89,7 +90,7 @@ def _with_slope(function: Any, pose: Float[Array, "7"]) -> Float[Array, "6 7"]:
     return jnp.concatenate([value[:, None], slope], axis=1)
 
 
-@jax.jit
+@quickly_compiled
 def pull_balance(
     pose: Float[Array, "7"], root: ImplicitRoot, fusion: Fusion, cotangents: Float[Array, "m 6"]
 ) -> tuple[Float[Array, "m 6"], PoseForm]:
@@ -105,7 +106,7 @@ def pull_balance(
         return jax.vmap(pull)(cotangents)
 
 
-@jax.jit
+@quickly_compiled
 def pull_matches(
     parameters: Parameters,
     root: ImplicitRoot,
@@ -138,7 +139,7 @@ class Moving(NamedTuple):
     numbers: Any
 
 
-@partial(jax.jit, static_argnums=(0, 1))
+@partial(quickly_compiled, static_argnums=(0, 1))
 def pull_surface(
     kinds: Kinds,
     fields: tuple[str, ...],

@@ -141,9 +141,10 @@ class PoseDerivative(AbstractLinearMap):
         found: dict[Name, np.ndarray] = {}
         by_score = np.asarray(-(cotangents @ self._by_twist(self._pose)) @ inverse, pose.dtype)
         if self._fusion is not None:
-            by_score, by_form = pull_balance(pose, self._scaling, self._fusion, by_score)
+            pulled, by_form = pull_balance(pose, self._scaling, self._fusion, by_score)
+            by_score = np.asarray(pulled)
             found |= {("form", i): np.asarray(leaf) for i, leaf in enumerate(jax.tree.leaves(by_form))}
-        tables, by_parameters = self._pull_matches(pose, np.asarray(by_score))
+        tables, by_parameters = self._pull_matches(pose, by_score)
         for parameter, tree in zip(("terms", "temperature"), by_parameters, strict=True):
             found |= {(parameter, i): leaf for i, leaf in enumerate(jax.tree.leaves(tree))}
         by_method = any(parameter == "method" for parameter, _ in names)
@@ -161,7 +162,7 @@ class PoseDerivative(AbstractLinearMap):
         pose, root = self._pose, self._scaling
         for _ in range(MAX_NEWTON_STEPS if root.usable else 0):
             program = partial(score_and_slope, self._parameters, root)
-            known = sum(np.asarray(part, np.float64) for _, part in self._over_matches(program, pose))
+            known: Any = sum(np.asarray(part, np.float64) for _, part in self._over_matches(program, pose))
             if self._fusion is not None:
                 known = balance_and_slope(pose, root, self._fusion, np.asarray(known, pose.dtype))
             balance, slope = np.split(np.asarray(known, np.float64), [1], axis=1)

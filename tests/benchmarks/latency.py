@@ -79,6 +79,64 @@ _GRADIENT = """
     print(json.dumps([seconds, float(np.median(times))]))
 """
 
+_EAGER = """
+    import jax.numpy as jnp
+    import resource
+    several = {size: [mcg.preprocess(cloud) for cloud in clouds(size)] for size in (9000, 8000, 34000)}
+
+    def loss(channels, points, pair):
+        arrays = {"channels": channels} if points is None else {"channels": channels, "points": points}
+        result = mcg.register(pair[0].replace(**arrays), pair[1], mcg.MultiChannelGICP(), max_distance=0.2)
+        return jnp.sum(result.matrix[:3, 3])
+
+    def forward(size):
+        # A new cloud each time, as in training.
+        channels = np.asarray(several[size][0].channels) + 0
+        return timed(lambda: loss(channels, None, several[size]))
+
+    def gradient(size, by_points=False):
+        channels, points = (jnp.asarray(array) for array in (several[size][0].channels, several[size][0].points))
+        function = jax.value_and_grad(loss, (0, 1) if by_points else 0)
+        return timed(lambda: jax.block_until_ready(function(channels, points if by_points else None, several[size])))
+
+    def again(function, *arguments):
+        return float(np.median([function(*arguments)[0] for _ in range(9)]))
+
+    first = forward(9000)[0]
+    once = gradient(9000)[0]
+    same, plain = again(gradient, 9000), again(forward, 9000)
+    other, count, _ = gradient(8000)
+    gradient(9000, True)
+    points = again(gradient, 9000, True)
+    forward(34000)
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    gradient(34000, True)
+    memory = (resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before) / 1024
+    print(json.dumps([first, once, plain, same, other, again(gradient, 8000), count, points, memory]))
+"""
+
+_EPOCH = """
+    import jax.numpy as jnp
+    sizes = np.random.default_rng(0).integers(2000, 10_000, 60)
+    sources, targets = zip(*[[mcg.preprocess(cloud) for cloud in clouds(int(size), i)] for i, size in enumerate(sizes)])
+    channels = [jnp.asarray(source.channels) for source in sources]
+
+    def loss(channels):
+        moved = [source.replace(channels=each) for source, each in zip(sources, channels)]
+        results = mcg.register_batch(moved, list(targets), mcg.MultiChannelGICP(), max_distance=0.2)
+        return sum(jnp.sum(result.matrix[:3, 3]) for result in results)
+
+    plain = timed(lambda: loss([np.asarray(each) + 0 for each in channels]))[0]
+    first = timed(lambda: jax.value_and_grad(loss)(channels))[0]
+    times = [
+        (timed(lambda: loss([np.asarray(each) + 0 for each in channels]))[0],
+         timed(lambda: jax.value_and_grad(loss)(channels))[0])
+        for _ in range(3)
+    ]
+    ratio = float(np.median([gradient / forward for forward, gradient in times]))
+    print(json.dumps([plain, first, *times[-1], ratio]))
+"""
+
 _BATCH = """
     scan = mcg.io.read(sys.argv[1])
     other = mcg.io.read(sys.argv[2])
@@ -134,6 +192,23 @@ def first() -> None:
 
 
 def gradients() -> None:
+    """Outside and inside of `jit`."""
+    with tempfile.TemporaryDirectory() as folder:
+        for state in ("empty", "filled"):
+            (numbers,) = _run(_EAGER, cache=pathlib.Path(folder))
+            first, once, plain, same, other, again, count, points, memory = numbers
+            print(f"value_and_grad(register) by channels, MC-GICP, 9,000 points, not jitted, cache {state}:")
+            print(f"  first call {first:.2f} s and then the first gradient {once:.2f} s, together {first + once:.2f} s")
+            print(f"  forward {1e3 * plain:.0f} ms; gradient {1e3 * same:.0f} ms, {same / plain:.2f} times")
+            print(f"  8,000 points: {1e3 * other:.0f} ms with {count} compilations, again {1e3 * again:.0f} ms")
+            print(f"  by points too: {1e3 * points:.0f} ms, {points / plain:.2f} times")
+            print(f"  34,000 points: peak memory {memory:.0f} MB above that of the forward call", flush=True)
+        ((plain, first, *times, ratio),) = _run(_EPOCH, cache=pathlib.Path(folder))
+        print(
+            f"60 pairs of 2,000 to 10,000 points: batch {plain:.1f} s, values and gradients {first:.1f} s; again",
+            end=" ",
+        )
+        print(f"{times[0]:.1f} and {times[1]:.1f} s, {ratio:.2f} times", flush=True)
     for name, what, size in (
         ("jit(grad(register)), 9,000 points", "grad", "9000"),
         ("jit(vmap(value_and_grad(register))), 16 pairs of 600 points", "vmap", "600"),
