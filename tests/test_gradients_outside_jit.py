@@ -248,3 +248,28 @@ def test_a_pose_that_is_not_determined_has_no_gradient(status):
         return weigh(found.matrix)
 
     np.testing.assert_array_equal(jax.grad(loss)(source.points), 0)
+
+
+def test_the_jacobian_is_that_of_small_motions(clouds):
+    """Also at a far origin: ξ refers to the user's frame."""
+    method, _ = case("mc-gicp")
+    options = {"max_distance": GATE, **TO_ROUNDING}
+    for shift in (np.zeros(3), np.array([300.0, 400.0, 100.0])):
+        source, target = (mcg.preprocess(mcg.PointCloud(cloud.points + shift, cloud.channels)) for cloud in clouds)
+        result = mcg.register(source, target, method, **options)
+        assert result.history["translation_step"][-1] < 1e-12
+        for field in ("points", "channels"):
+            array = np.asarray(getattr(source, field))
+            direction, step = np.random.default_rng(0).normal(size=array.shape), 1e-6
+            plus, minus = (
+                mcg.register(source.replace(**{field: array + each * direction}), target, method, **options).matrix
+                for each in (step, -step)
+            )
+            change = np.linalg.inv(result.matrix) @ (plus - minus) / (2 * step)
+            expected = np.append(change[:3, 3], change[[2, 0, 1], [1, 2, 0]])
+            found = np.tensordot(result.jacobian("source", field), direction, array.ndim)
+            np.testing.assert_allclose(found, expected, atol=1e-5 * np.abs(expected).max())
+    with pytest.raises(ValueError, match="got a copy"):
+        jax.tree.map(lambda leaf: leaf, result).jacobian("source", "points")
+    with pytest.raises(ValueError, match="covariances: expected a source that has some"):
+        result.jacobian("source", "covariances")

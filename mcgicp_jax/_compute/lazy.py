@@ -48,3 +48,21 @@ class Lazy(Generic[Value]):
 
     def __reduce__(self) -> Any:
         return Lazy.of, (self.value,)
+
+
+@jax.tree_util.register_pytree_node_class
+class Held(Generic[Value]):
+    """A value, or None, that copies of the pytree do not have, so that it lives no longer than the original."""
+
+    def __init__(self, value: Value | None = None):
+        self.value = value
+
+    def tree_flatten(self) -> tuple[tuple[()], None]:
+        return (), None
+
+    @classmethod
+    def tree_unflatten(cls, _: None, __: tuple[()]) -> Held[Value]:
+        return cls()
+
+    def __reduce__(self) -> Any:
+        return Held, ()

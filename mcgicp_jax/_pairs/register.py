@@ -9,6 +9,7 @@ from jax.typing import ArrayLike
 
 from mcgicp_jax._clouds.point_cloud import PointCloud, Values
 from mcgicp_jax._compute.concrete import is_concrete
+from mcgicp_jax._compute.linear_maps import primal
 from mcgicp_jax._global_registration.global_pose import GlobalPoseResult, global_pose
 from mcgicp_jax._math.poses import Pose
 from mcgicp_jax._math.robust_kernels import AbstractKernel
@@ -43,9 +44,9 @@ def register(
     A coarse phase uses the larger `max_distance`, and of a source of 8,192 points or more an even subset of at least
     4,096. Near convergence, a fine phase with all points and the smaller `max_distance` takes over.
 
-    With concrete arrays (outside `jit`, `vmap`, `grad`) the loop runs on the host and calls compiled programs whose
-    shapes do not depend on the sizes of the clouds. Inside, it is one program per size of clouds, whose matches come
-    from host callbacks, one batch element at a time (with `DenseSearch`, from XLA). The pose is the same up to
+    Outside `jit` and `vmap`, also inside `grad` or `jvp`, the loop runs on the host and calls compiled programs whose
+    shapes do not depend on the sizes of the clouds. Inside `jit`, it is one program per size of clouds, whose matches
+    come from host callbacks, one batch element at a time (with `DenseSearch`, from XLA). The pose is the same up to
     rounding; its derivative is that of `estimate_pose` at the final matches.
 
     Args:
@@ -141,7 +142,7 @@ def register_from(
     """`register` with its options as one object."""
     check_method(method)
     if isinstance(init, str):
-        start = start_from_anywhere(init, source, target)
+        start = start_from_anywhere(init, primal(source), primal(target))
         if not start.success:
             return RegistrationResult.without_pose(Status.TOO_FEW_CORRESPONDENCES)
         init = start.matrix

@@ -12,7 +12,7 @@ import numpy as np
 from mcgicp_jax._clouds.origins import pose_in_user_frame
 from mcgicp_jax._clouds.point_cloud import PointCloud
 from mcgicp_jax._compute.concrete import constant, is_concrete, numpy_for
-from mcgicp_jax._compute.lazy import Lazy
+from mcgicp_jax._compute.lazy import Held, Lazy
 from mcgicp_jax._compute.linear_maps import primal
 from mcgicp_jax._math.poses import se3_from_matrix, translation_adjoint
 from mcgicp_jax._registration.assessment import Assessment
@@ -26,8 +26,13 @@ def registration_of(
     records: Record,
     source: PointCloud,
     target: PointCloud,
+    derivative: Callable[[str, str], np.ndarray] | None = None,
 ) -> RegistrationResult:
-    """Build the `RegistrationResult` of a final state, in the user's frames; NumPy where everything is concrete."""
+    """Build the `RegistrationResult` of a final state, in the user's frames; NumPy where everything is concrete.
+
+    Args:
+        derivative: computes `RegistrationResult.jacobian`.
+    """
     history: dict[str, Any] = records._asdict()
     # Outside `jit`, the derivative of the pose is all that may be traced.
     pose, state, source, target = state.pose, *map(primal, (state, source, target))
@@ -59,6 +64,7 @@ def registration_of(
         centred=pose,
         constraints=_later(lambda: _constraints(assessment, source.origin), concrete),
         uncertainty=_later(lambda: _uncertainty(assessment, state, source.origin), concrete),
+        derivative=Held(derivative),
         **numbers,
     )
 

@@ -26,7 +26,7 @@ from mcgicp_jax._compute.linear_maps import AbstractLinearMap, SideBySide, prima
 from mcgicp_jax._compute.packing import Packed
 from mcgicp_jax._compute.threads import num_cores, side_by_side
 from mcgicp_jax._local_geometry.neighborhoods import Neighborhoods, gatherer, points_alone
-from mcgicp_jax._math.poses import parameters_by_twist
+from mcgicp_jax._math.poses import parameters_by_twist, translation_adjoint
 from mcgicp_jax._math.robust_kernels import AbstractKernel
 from mcgicp_jax._methods.base import AbstractMethod, with_unset_from
 from mcgicp_jax._pose_solver.implicit_derivative import MAX_NEWTON_STEPS, ImplicitRoot
@@ -256,6 +256,21 @@ class PoseDerivative(AbstractLinearMap):
                 columns[..., widths["points"] :] if num_channels else np.zeros((count, *cloud.channels.shape))
             )
         return found
+
+
+def jacobian(
+    inputs: Inputs, executor: HostExecutor, loop: LoopResult, gains: Any, cloud: str, field: str
+) -> Float[np.ndarray, "6 ..."]:
+    """The derivative of the final pose by an array of a cloud, see `RegistrationResult.jacobian`."""
+    if getattr(getattr(inputs, cloud), field) is None:
+        raise ValueError(f"{field}: expected a {cloud} that has some, got None")
+    (by_array,) = PoseDerivative([(cloud, field)], inputs, executor, loop, gains).jacobian((0,))
+    pose, rotation = np.asarray(loop.state.pose.wxyz_xyz, np.float64), executor.motion(loop.state.pose).rotation
+    # The vector part of 2 δq q* is the rotation vector in the axes of the target.
+    turn = 2 * np.column_stack([-pose[1:4], pose[0] * np.eye(3) + np.cross(np.eye(3), pose[1:4])])
+    twist = np.zeros((6, 7))
+    twist[:3, 4:], twist[3:, :4] = rotation.T, rotation.T @ turn
+    return np.tensordot(translation_adjoint(np.asarray(inputs.source.origin)) @ twist, by_array, 1)
 
 
 class Differentiated(NamedTuple):

@@ -40,7 +40,7 @@ from mcgicp_jax._registration.measurements import GivenPrior, GivenTiePoints, fu
 from mcgicp_jax._registration.multi_scale import stages_of
 from mcgicp_jax._registration.on_host import HostExecutor
 from mcgicp_jax._registration.options import Options, check_method
-from mcgicp_jax._registration.pose_derivative import Given, Inputs, differentiated, with_derivatives
+from mcgicp_jax._registration.pose_derivative import Given, Inputs, differentiated, jacobian, with_derivatives
 from mcgicp_jax._registration.result import RegistrationResult, is_usable
 from mcgicp_jax._registration.settings import settings_for
 from mcgicp_jax._registration.step import Problem, State
@@ -163,10 +163,12 @@ def results_of(runs: Sequence[Run], givens: Sequence[Given | None]) -> list[Regi
         for run, given in zip(runs, givens, strict=True)
     ]
     states = with_derivatives([run.state() for run in runs], traced)
-    return [
-        registration_of(state, run.assessment(), run.loop.history, run.inputs.source, run.inputs.target)
-        for state, run in zip(states, runs, strict=True)
-    ]
+    results = []
+    for state, run in zip(states, runs, strict=True):
+        by = None if run.executor is None else partial(jacobian, run.inputs, run.executor, run.loop, run.gains)
+        source, target = run.inputs.source, run.inputs.target
+        results.append(registration_of(state, run.assessment(), run.loop.history, source, target, by))
+    return results
 
 
 def _solved(

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import enum
-from typing import Any, NamedTuple
+from collections.abc import Callable
+from typing import Any, Literal, NamedTuple
 
 import equinox as eqx
 import jax
@@ -14,7 +15,7 @@ from jaxtyping import Array, Float, Int
 
 from mcgicp_jax._clouds.origins import pose_in_user_frame
 from mcgicp_jax._compute.concrete import AnyArray, canonical_float, is_concrete
-from mcgicp_jax._compute.lazy import Lazy
+from mcgicp_jax._compute.lazy import Held, Lazy
 from mcgicp_jax._math.poses import se3
 from mcgicp_jax._pose_solver.degeneracy import Directions, UnconstrainedDirection, describe, unconstrained_directions
 
@@ -89,6 +90,7 @@ class RegistrationResult(eqx.Module):
         centred: the pose between coordinates relative to these origins.
         constraints, uncertainty: deferred values of `information` and `directions`, and of `covariance` and
             `deviations`, computed on first access.
+        derivative: computes `jacobian`; empty in copies.
     """
 
     T_target_source: jaxlie.SE3
@@ -104,6 +106,7 @@ class RegistrationResult(eqx.Module):
     centred: jaxlie.SE3
     constraints: Lazy[Constraints]
     uncertainty: Lazy[Uncertainty]
+    derivative: Held[Callable[[str, str], np.ndarray]]
 
     @classmethod
     def build(cls, **fields: Any) -> RegistrationResult:
@@ -132,6 +135,7 @@ class RegistrationResult(eqx.Module):
             centred=nowhere,
             constraints=Lazy.of(Constraints(np.zeros((6, 6)), None)),
             uncertainty=Lazy.of(Uncertainty(np.full((6, 6), np.nan), np.full(6, np.nan))),
+            derivative=Held(),
         )
 
     @property
@@ -173,6 +177,29 @@ class RegistrationResult(eqx.Module):
         Derived from `covariance`, with the same limitations.
         """
         return self.uncertainty.value.deviations
+
+    def jacobian(
+        self, cloud: Literal["source", "target"], field: Literal["points", "channels", "covariances"] = "points"
+    ) -> Float[np.ndarray, "6 N ..."]:
+        """Derivative of the pose by an array of a preprocessed cloud, with matches and neighbours held fixed.
+
+        Errors of the array with the covariance Σ cause the error J Σ Jᵀ of the pose.
+
+        Args:
+            cloud, field: the array, for instance the points (N, 3) of the source.
+
+        Returns:
+            (6, *shape of the array): of ξ = (v, ω) in T exp(ξ), metres and radians, as in `covariance`, per unit of the
+            array. 0 where the derivative of `register` is.
+
+        Raises:
+            ValueError: in copies, such as the results of batches and odometry, and inside transformations.
+        """
+        if self.derivative.value is None:
+            raise ValueError("jacobian: expected the result of register or estimate_pose itself, got a copy")
+        if cloud not in ("source", "target") or field not in ("points", "channels", "covariances"):
+            raise ValueError(f'jacobian: expected an array such as ("source", "points"), got {(cloud, field)!r}')
+        return self.derivative.value(cloud, field)
 
     @property
     def status(self) -> Any:
