@@ -16,7 +16,7 @@ os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0.2")
 
 with install_import_hook("mcgicp_jax", "tests.checks.checked"):
     import mcgicp_jax
-    import mcgicp_jax.__main__  # noqa: F401
+    import mcgicp_jax.__main__
 
 import jax
 import pytest
@@ -65,3 +65,22 @@ def noisy(precision):
     from tests.scenes import pair
 
     return pair(size=400, noise=0.05, channel_noise=0.05)
+
+
+@pytest.fixture(scope="module")
+def raw():
+    """Pairs of a batch, and the true poses."""
+    from tests.batches import SIZES, raw_pair
+
+    return [raw_pair(size, seed) for seed, size in enumerate(SIZES)]
+
+
+@pytest.fixture(scope="module")
+def alone(raw):
+    """Each pair by `register`."""
+    from tests.batches import METHOD
+
+    return [
+        mcgicp_jax.register(mcgicp_jax.preprocess(source), mcgicp_jax.preprocess(target), METHOD, max_distance=0.5)
+        for source, target, _ in raw
+    ]

@@ -7,6 +7,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 import mcgicp_jax as mcg
+from tests.scenes import motion
 
 
 def moved(poses, twists):
@@ -15,13 +16,6 @@ def moved(poses, twists):
     change[:, :3, :3] = Rotation.from_rotvec(twists[:, 3:]).as_matrix()
     change[:, :3, 3] = twists[:, :3]
     return poses @ change
-
-
-def pose(position, rotation_vector):
-    matrix = np.eye(4)
-    matrix[:3, :3] = Rotation.from_rotvec(rotation_vector).as_matrix()
-    matrix[:3, 3] = position
-    return matrix
 
 
 def sphere(turns=50, per_turn=50, radius=50.0):
@@ -46,7 +40,7 @@ def grid(side=5, step=1.0):
         for y in range(side)[:: 1 if z % 2 == 0 else -1]:
             cells += [(x, y, z) for x in range(side)[:: 1 if (y + z) % 2 == 0 else -1]]
     cells = np.array(cells)
-    poses = np.array([pose(step * cell, 0.5 * rng.normal(size=3)) for cell in cells])
+    poses = np.array([motion((*(step * cell), *(0.5 * rng.normal(size=3)))) for cell in cells])
     apart = np.abs(cells[:, None] - cells).sum(axis=2)
     return poses, [(i, j) for i, j in np.argwhere(apart == 1) if j > i + 1 and rng.random() < 0.9]
 
@@ -57,7 +51,7 @@ def garage(floors=4, per_floor=400, size=(60.0, 30.0)):
     for k in range(floors * per_floor):
         angle = 2 * np.pi * k / per_floor
         place = np.array([size[0] * np.cos(angle), size[1] * np.sin(angle), 3.0 * k / per_floor])
-        poses.append(pose(place, [0, 0, np.arctan2(size[1] * np.cos(angle), -size[0] * np.sin(angle))]))
+        poses.append(motion((*place, 0, 0, np.arctan2(size[1] * np.cos(angle), -size[0] * np.sin(angle)))))
     n = len(poses)
     return np.array(poses), [
         (k, k + per_floor + d) for k in range(n - per_floor) for d in (-1, 0, 1) if k + per_floor + d < n
@@ -87,8 +81,8 @@ def measured(poses, loops, deviations=(0.05, 0.02), seed=0, false=0.0):
         uncertain=np.arange(len(i) + number) >= len(poses) - 1,
     )
     start = [poses[0]]
-    for motion in motions[: len(poses) - 1]:
-        start.append(start[-1] @ motion)
+    for step in motions[: len(poses) - 1]:
+        start.append(start[-1] @ step)
     return mcg.PoseGraph(np.array(start), edges), np.arange(len(edges)) < len(i)
 
 

@@ -51,7 +51,7 @@ def rotation(axis_angle) -> np.ndarray:
     return np.eye(3) + np.sin(angle) * k + (1 - np.cos(angle)) * k @ k
 
 
-def pose(axis_angle, translation) -> np.ndarray:
+def pose(axis_angle, translation=(0, 0, 0)) -> np.ndarray:
     matrix = np.eye(4)
     matrix[:3, :3], matrix[:3, 3] = rotation(axis_angle), translation
     return matrix

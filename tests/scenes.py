@@ -5,18 +5,12 @@ import numpy as np
 import mcgicp_jax as mcg
 from mcgicp_jax._local_geometry.local_statistics import local_geometry_on_host
 from mcgicp_jax._methods.surfaces import surface_on_host, surface_pair
+from tests.reference import pose
 
 
 def motion(twist=(0.05, -0.03, 0.04, 0.02, -0.03, 0.05)) -> np.ndarray:
     """A rigid motion, (4, 4) float64, from its translation and rotation vector."""
-    *translation, x, y, z = twist
-    angle = np.linalg.norm([x, y, z])
-    cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
-    matrix = np.eye(4)
-    if angle > 0:
-        matrix[:3, :3] += np.sin(angle) / angle * cross + (1 - np.cos(angle)) / angle**2 * cross @ cross
-    matrix[:3, 3] = translation
-    return matrix
+    return pose(twist[3:], twist[:3])
 
 
 def room_corner(size: int, noise: float = 0.01, channel_noise: float = 0.02, seed: int = 0, channels: int = 2):

@@ -4,10 +4,9 @@ import copy
 import multiprocessing
 import os
 import pickle
-import signal
 import threading
 import warnings
-from concurrent.futures import BrokenExecutor, Executor, Future, ProcessPoolExecutor, ThreadPoolExecutor
+from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
 from functools import partial
 
 import jax
@@ -18,48 +17,8 @@ import mcgicp_jax as mcg
 from mcgicp_jax import Status, datasets
 from mcgicp_jax._pairs.batch_executors import executor_like
 from mcgicp_jax.metrics import pose_error
-from tests.scenes import motion, room_corner
-
-METHOD = mcg.MultiChannelGICP(0.05, 0.3)
-# Two size classes, both of other tests.
-SIZES = (300, 310, 500, 290, 480, 305)
-
-
-def raw_pair(size, seed):
-    truth = motion(0.02 * np.random.default_rng(seed).normal(size=6))
-    points, channels = room_corner(size, seed=2 * seed + 1)
-    source = mcg.PointCloud((points - truth[:3, 3]) @ truth[:3, :3], channels)
-    return source, mcg.PointCloud(*room_corner(size + 20, seed=2 * seed + 2)), truth
-
-
-@pytest.fixture(scope="module")
-def raw():
-    return [raw_pair(size, seed) for seed, size in enumerate(SIZES)]
-
-
-def prepared(raw):
-    return [[mcg.preprocess(pair[side]) for pair in raw] for side in (0, 1)]
-
-
-def batch(sources, targets, **settings):
-    return mcg.register_batch(sources, targets, METHOD, **{"max_distance": 0.5} | settings)
-
-
-@pytest.fixture(scope="module")
-def alone(raw):
-    """Each pair by `register`."""
-    return [
-        mcg.register(mcg.preprocess(source), mcg.preprocess(target), METHOD, max_distance=0.5)
-        for source, target, _ in raw
-    ]
-
-
-def assert_same(first, second):
-    """Bit for bit, NaN included."""
-    assert len(first) == len(second)
-    for one, other in zip(first, second, strict=True):
-        for a, b in zip(jax.tree.leaves(one), jax.tree.leaves(other), strict=True):
-            np.testing.assert_array_equal(np.asarray(a), np.asarray(b))
+from tests.batches import METHOD, assert_same, batch, prepared
+from tests.scenes import motion
 
 
 def test_each_pair_is_as_if_it_were_alone(raw, alone):
@@ -255,100 +214,6 @@ def test_sides_that_do_not_fit(raw):
     with pytest.raises(ValueError, match=r"targets: .*expected at least 4 finite points"):
         batch(sources, np.eye(3))
     assert batch([], []) == []
-
-
-class Unlucky(Executor):
-    """Whose worker dies with some of the pairs, always or at first."""
-
-    def __init__(self, deadly, times, at_submit=False):
-        self.deadly, self.times, self.sent = deadly, times, []
-
-    def submit(self, function, chunk):
-        future = Future()
-        numbers = [pair.index for pair in chunk]
-        self.sent.append(numbers)
-        if self.deadly in numbers and self.times > 0:
-            self.times -= 1
-            future.set_exception(BrokenExecutor("a worker died"))
-        else:
-            future.set_result(function(chunk))
-        return future
-
-
-def test_a_worker_that_dies_costs_a_retry(raw, alone):
-    executor = Unlucky(deadly=2, times=1)
-    with pytest.warns(UserWarning, match=r"pairs 0, 1, 2, 3, 4, 5 failed \(BrokenExecutor: a worker died\)"):
-        results = batch(*prepared(raw), executor=executor)
-    assert_same(results, alone)
-    assert executor.sent == [[0, 1, 2, 3, 4, 5], [0], [1], [2], [3], [4], [5]]
-
-
-def test_a_pair_that_kills_its_workers_is_given_up_alone(raw, alone):
-    with pytest.warns(UserWarning, match="pair 2: its worker failed twice"), warnings.catch_warnings():
-        warnings.filterwarnings("ignore", "the worker of the pairs")
-        results = batch(*prepared(raw), executor=Unlucky(deadly=2, times=9))
-    assert results[2].status is Status.WORKER_FAILED
-    del results[2]
-    assert_same(results, alone[:2] + alone[3:])
-
-
-def die(marker):
-    """The first process that comes here is gone."""
-    try:
-        marker.touch(exist_ok=False)
-    except FileExistsError:
-        return mcg.PointCloud(*room_corner(300, seed=1))
-    os.kill(os.getpid(), signal.SIGKILL)
-
-
-@pytest.mark.slow
-def test_spawned_processes_and_one_that_is_killed(raw, alone, tmp_path):
-    sources, targets = prepared(raw)
-    context = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(1, mp_context=context) as processes:
-        assert_same(batch(sources, targets, executor=processes), alone)
-        # What is set for a block of code holds in the other processes, too.
-        with jax.enable_x64(True):
-            again = [[cloud.unpad() for cloud in side] for side in (sources, targets)]
-            results = batch(*again, executor=processes)
-            assert results[0].T_target_source.wxyz_xyz.dtype == again[0][0].points.dtype
-            assert_same(results, batch(*again))
-        with pytest.warns(UserWarning, match="BrokenProcessPool"):
-            results = batch([partial(die, tmp_path / "marker"), *sources], [targets[0], *targets], executor=processes)
-    assert results[0].converged
-    assert_same(results[1:], alone)
-
-
-def test_forked_processes_are_refused(raw):
-    with (
-        ProcessPoolExecutor(1, mp_context=multiprocessing.get_context("fork")) as processes,
-        pytest.raises(ValueError, match="spawn"),
-    ):
-        batch(*prepared(raw), executor=processes)
-
-
-@pytest.mark.slow
-def test_a_cluster_that_loses_a_worker(raw, alone):
-    """Processes of Dask's, one of which is killed while it works."""
-    distributed = pytest.importorskip("distributed")
-    sources, targets = prepared(raw)
-    repeats = 12
-    with (
-        distributed.LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address=None) as cluster,
-        distributed.Client(cluster) as client,
-    ):
-        numbers = []
-        completed = mcg.register_as_completed(
-            sources * repeats, targets * repeats, METHOD, max_distance=0.5, executor=client.get_executor()
-        )
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
-            for number, result in completed:
-                if not numbers:
-                    os.kill(next(iter(client.run(os.getpid).values())), signal.SIGKILL)
-                numbers.append(number)
-                assert_same([result], [alone[number % len(raw)]])
-    assert sorted(numbers) == list(range(repeats * len(raw)))
 
 
 def test_everything_survives_pickle_and_deepcopy(raw, alone):

@@ -19,9 +19,9 @@ from mcgicp_jax._search.base import SearchPoints
 from mcgicp_jax._search.brute_force import _nearest
 from mcgicp_jax.metrics import pose_error
 from tests import reference as ref
+from tests.batches import METHOD, assert_same, prepared
+from tests.compilations import compilations
 from tests.scenes import motion
-from tests.test_batch import METHOD, SIZES, assert_same, prepared, raw_pair
-from tests.test_programs import compilations
 
 T = ref.pose([0.1, -0.2, 0.3], [0.05, 0.1, -0.02])
 
@@ -107,11 +107,6 @@ def test_no_table_of_pairs_is_stored(num_candidates, lanes):
 
 
 @pytest.fixture(scope="module")
-def raw():
-    return [raw_pair(size, seed) for seed, size in enumerate(SIZES)]
-
-
-@pytest.fixture(scope="module")
 def clouds(raw):
     return prepared(raw)
 
@@ -187,7 +182,7 @@ SHARDED = """
     import jax, numpy as np
     import mcgicp_jax as mcg
     from mcgicp_jax._registration import vectorized as _lanes
-    from tests.test_batch import METHOD, SIZES, prepared, raw_pair
+    from tests.batches import METHOD, SIZES, prepared, raw_pair
     assert jax.local_device_count() == 4
     clouds = prepared([raw_pair(size, seed) for seed, size in enumerate(SIZES)])
     devices, run_lanes = set(), _lanes.run_lanes

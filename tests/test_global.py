@@ -1,9 +1,5 @@
 """Poses from any start: features against plain loops, poses against SciPy, honest verdicts, and no compilations."""
 
-import os
-import subprocess
-import sys
-
 import jax
 import numpy as np
 import pytest
@@ -24,8 +20,8 @@ from mcgicp_jax._global_registration.robust_pose_fit import (
     refined,
 )
 from mcgicp_jax.metrics import pose_error
+from tests.compilations import compilations
 from tests.scenes import room_corner, wall
-from tests.test_programs import compilations
 
 VOXEL = 0.2
 
@@ -355,25 +351,6 @@ def test_other_sizes_compile_nothing():
                 mcg.global_pose(*clouds)
         mcg.global_pose(*pair(2000, 5), correspondences=(np.arange(50), np.arange(50)))
     assert not found
-
-
-_IN_ANOTHER_PROCESS = """
-import os
-if hasattr(os, "sched_setaffinity"):
-    os.sched_setaffinity(0, [min(os.sched_getaffinity(0))])
-from tests.test_global import rooms
-import mcgicp_jax as mcg
-print(mcg.global_pose(*rooms()[:2]).matrix.tobytes().hex())
-"""
-
-
-def test_the_same_bits_on_one_core_in_another_process():
-    expected = [mcg.global_pose(*rooms()[:2]).matrix.tobytes().hex() for _ in range(2)]
-    environment = os.environ | {"JAX_ENABLE_X64": str(int(jax.config.jax_enable_x64))}
-    command = [sys.executable, "-c", _IN_ANOTHER_PROCESS]
-    done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=300)
-    assert done.returncode == 0, done.stderr
-    assert {*expected, *done.stdout.split()} == {expected[0]}
 
 
 # Uses

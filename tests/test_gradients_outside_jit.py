@@ -7,10 +7,10 @@ import pytest
 
 import mcgicp_jax as mcg
 from mcgicp_jax import Status
+from tests.compilations import compilations
 from tests.differences import CASES, GATE, TO_ROUNDING, case, clouds_with, directional_errors, inputs_of, weigh
 from tests.precision import in_float64
 from tests.scenes import motion, pair, room_corner, wall
-from tests.test_programs import compilations
 
 pytestmark = in_float64
 

@@ -21,9 +21,10 @@ from mcgicp_jax._pose_graph.factors import AbstractFactor
 from mcgicp_jax._pose_graph.levenberg_marquardt import Minimum
 from mcgicp_jax._pose_graph.marginal_covariances import inverse_blocks
 from mcgicp_jax._pose_graph.normal_equations import NormalEquations, factored
-from tests.graphs import garage, grid, joined, measured, moved, pose, sphere, with_gtsam, with_priors
+from tests.compilations import compilations
+from tests.graphs import garage, grid, joined, measured, moved, sphere, with_gtsam, with_priors
 from tests.precision import in_float64
-from tests.test_programs import compilations
+from tests.scenes import motion
 
 SMALL = {"sphere": sphere(6, 10), "grid": grid(3), "garage": garage(2, 40)}
 
@@ -125,7 +126,7 @@ def test_priors_give_the_minimum_and_the_covariances_of_gtsam():
 def test_a_prior_alone_moves_the_graph_and_makes_it_uncertain():
     """Next to motions known to a millimetre, a start known to 100 m: no pose is held, and no digit is lost."""
     graph, _ = measured(*grid(2), deviations=(1e-3, 1e-3))
-    start = pose((3e5, 5e6, 100), (0.1, 0.2, -2.0))
+    start = motion((3e5, 5e6, 100, 0.1, 0.2, -2.0))
     covariance = np.diag([1e4, 1e4, 1e4, 0.1, 0.1, 0.2])
     prior = mcg.Edge(mcg.WORLD, 0, start, covariance=covariance)
     found = mcg.optimize_poses(mcg.PoseGraph(None, joined(graph.edges, prior[None])))
@@ -184,7 +185,7 @@ def test_parts_that_have_priors_are_well_defined():
     assert one.status == mcg.Status.DEGENERATE
     assert np.all(np.isinf(np.diagonal(one.covariance[:13], 0, 1, 2))) and np.all(np.isfinite(one.covariance[13:]))
     # A wrong prior is rejected like a loop.
-    wrong = mcg.Edge(mcg.WORLD, 5, pose((50, 0, 0), (0, 0, 1)), covariance=covariance, uncertain=True)[None]
+    wrong = mcg.Edge(mcg.WORLD, 5, motion((50, 0, 0, 0, 0, 1)), covariance=covariance, uncertain=True)[None]
     again = mcg.optimize_poses(mcg.PoseGraph(graph.poses, joined(apart, *priors, wrong)))
     assert not again.kept[-1]
     np.testing.assert_array_equal(again.kept[:-1], found.kept)
@@ -230,8 +231,8 @@ def test_a_start_is_composed_from_the_edges():
     apart = mcg.PoseGraph(None, joined(exact[gap], prior[None])).poses
     np.testing.assert_allclose(apart[:30], np.linalg.inv(poses[0]) @ poses[:30], atol=1e-9)
     np.testing.assert_allclose(apart[30:], poses[30:], atol=1e-9)
-    blind = mcg.Edge(0, 1, pose((9, 9, 9), (0, 0, 1)), np.diag([1.0, 1, 1, 1, 1, 0]))
-    sure = mcg.Edge(0, 1, pose((1, 0, 0), (0, 0, 0)), np.eye(6), uncertain=True)
+    blind = mcg.Edge(0, 1, motion((9, 9, 9, 0, 0, 1)), np.diag([1.0, 1, 1, 1, 1, 0]))
+    sure = mcg.Edge(0, 1, motion((1, 0, 0, 0, 0, 0)), np.eye(6), uncertain=True)
     np.testing.assert_allclose(mcg.PoseGraph(None, [blind, sure]).poses[1], sure.T_i_j, atol=1e-12)
     with pytest.raises(
         ValueError, match="poses: required, since initial poses can only be computed from at least one concrete edge"
@@ -289,7 +290,7 @@ def test_rejected_loops_leave_no_trace():
 def test_a_loop_is_rejected_only_beyond_its_own_uncertainty_and_that_of_the_others(monkeypatch):
     """Edges of variances 1 and 1 that contradict each other by d: d² alone, d²/2 together."""
     squares = np.array([20.0, 30.0, 40.0, 60.0, 80.0])
-    motions = np.tile(pose((0, 10, 0), np.zeros(3)), (10, 1, 1))
+    motions = np.tile(motion((0, 10, 0, 0, 0, 0)), (10, 1, 1))
     poses = np.concatenate([np.eye(4)[None], motions[:5]])
     motions[5:, 0, 3] = np.sqrt(squares)
     edges = mcg.Edge(
@@ -474,7 +475,7 @@ def circle(seed, number=20, step=30.0):
     """A closed path, with a millimetre and a milliradian of noise."""
     angles = 2 * np.pi * np.arange(number) / number
     poses = np.array(
-        [pose(step * number / (2 * np.pi) * np.array([np.sin(a), -np.cos(a), 0]), (0, 0, a)) for a in angles]
+        [motion((*(step * number / (2 * np.pi) * np.array([np.sin(a), -np.cos(a)])), 0, 0, 0, a)) for a in angles]
     )
     return measured(poses, [(0, number - 1)], deviations=(1e-3, 1e-3), seed=seed)[0]
 
@@ -886,7 +887,7 @@ def partly_blind(seed, kind, number=8):
     """A ring of poses with loops; edges know nothing of x or, in a corridor, of its direction seen to 0.02 rad."""
     rng, sigma = np.random.default_rng(seed), np.repeat([0.05, 0.02], 3)
     angles = 2 * np.pi * np.arange(number) / number * (kind == "ring")
-    poses = np.array([pose((10 * np.cos(a), 10 * np.sin(a), k), (0, 0, a)) for k, a in enumerate(angles)])
+    poses = np.array([motion((10 * np.cos(a), 10 * np.sin(a), k, 0, 0, a)) for k, a in enumerate(angles)])
     i, j = np.array([(k, k + step) for step in (1, 2, number - 1) for k in range(number - step)]).T
     motions = moved(np.linalg.inv(poses[i]) @ poses[j], sigma * rng.normal(size=(len(i), 6)))
     information = np.tile(np.diag(sigma**-2.0), (len(i), 1, 1))
@@ -896,8 +897,8 @@ def partly_blind(seed, kind, number=8):
         others[:3, :3] -= np.outer(along, along)
         each[:] = others @ each @ others
     start = [poses[0]]
-    for motion in motions[: number - 1]:
-        start.append(start[-1] @ motion)
+    for step in motions[: number - 1]:
+        start.append(start[-1] @ step)
     return mcg.PoseGraph(np.array(start), mcg.Edge(i, j, motions, information)), poses
 
 

@@ -12,15 +12,9 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from mcgicp_jax.metrics import ate, kitti_errors, pose_error, rpe
+from tests.reference import pose
 
 EASY_ANGLES = [1e-9, 1e-5, 0.3, 1.7, 3.0, np.pi - 1e-5, np.pi - 1e-9]
-
-
-def pose(rotation_vector, translation=(0.0, 0.0, 0.0)):
-    matrix = np.eye(4)
-    matrix[:3, :3] = Rotation.from_rotvec(rotation_vector).as_matrix()
-    matrix[:3, 3] = translation
-    return matrix
 
 
 def random_pose(rng):

@@ -1,6 +1,5 @@
 """Clouds of every size run the same few programs: compilations are counted."""
 
-import contextlib
 import gc
 
 import jax
@@ -8,6 +7,7 @@ import numpy as np
 import pytest
 
 import mcgicp_jax as mcg
+from tests.compilations import compilations
 from tests.scenes import room_corner
 
 METHODS = {
@@ -20,22 +20,6 @@ METHODS = {
 }
 # Less than a block of 2,048 rows, one, two and three.
 SIZES = (37, 1500, 2600, 4500)
-
-
-@contextlib.contextmanager
-def compilations():
-    """The durations of the compilations within; empty if there are none."""
-    found = []
-
-    def listen(event, duration, **_):
-        if event == "/jax/core/compile/backend_compile_duration":
-            found.append(duration)
-
-    jax.monitoring.register_event_duration_secs_listener(listen)
-    try:
-        yield found
-    finally:
-        jax.monitoring.unregister_event_duration_listener(listen)
 
 
 def clouds(size, names=("red", "green"), more=0, seed=0):

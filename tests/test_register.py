@@ -199,8 +199,13 @@ def test_points_that_are_not_finite_are_reported(value, room):
     broken = source.replace(points=with_value(source.points, (3, 0), value))
     assert mcg.register(broken, target, mcg.PointToPoint(), max_distance=0.5).status is Status.NON_FINITE
     broken = target.replace(channels=with_value(target.channels, (3, 0), value))
-    result = mcg.register(source, broken, METHODS["color-icp"](), max_distance=0.5)
-    assert result.status is Status.CONVERGED and result.num_inliers < len(source) + 1
+    broken_row, whole = (
+        mcg.register(source, cloud, METHODS["color-icp"](), max_distance=0.5) for cloud in (broken, target)
+    )
+    assert broken_row.status is Status.CONVERGED
+    # Its pairs go to others, and no other pair is lost.
+    assert abs(broken_row.num_inliers - whole.num_inliers) <= 2
+    assert difference(broken_row.matrix, whole.matrix) < 1e-3
 
 
 def test_identical_clouds_converge_at_once(room):
@@ -248,18 +253,6 @@ def test_bare_arrays_are_enough():
     target, _ = room_corner(2000, seed=2)
     result = mcg.register((points - truth[:3, 3]) @ truth[:3, :3], target.tolist(), mcg.GICP(), max_distance=0.5)
     assert result.converged and difference(result.matrix, truth) < 4e-3
-
-
-def test_rows_that_are_not_finite_are_left_out_with_one_warning():
-    points, channels = room_corner(2000, seed=1)
-    broken = np.concatenate([points, np.full((50, 3), np.nan)])
-    with warnings.catch_warnings(record=True) as caught:
-        warnings.simplefilter("always")
-        cloud = mcg.preprocess(mcg.PointCloud(broken, np.concatenate([channels, np.zeros((50, 2))])))
-    assert [str(warning.message) for warning in caught] == ["left out 50 of 2050 points with a NaN or infinity"]
-    expected = mcg.preprocess(mcg.PointCloud(points, channels))
-    result = mcg.register(cloud, expected, METHODS["mc-gicp"](), max_distance=0.5)
-    assert result.converged and difference(result.matrix, np.eye(4)) < 1e-6
 
 
 BAD_ARGUMENTS = {
@@ -484,14 +477,6 @@ def test_bad_numbers_of_methods_are_named(make, message):
         make()
 
 
-def test_no_channels_make_multi_channel_gicp_plain_gicp(room):
-    source, target, _ = room
-    bare = [cloud.replace(channels=cloud.channels[:, :0]) for cloud in (source, target)]
-    plain = mcg.register(*bare, mcg.GICP(), max_distance=0.5)
-    multi = mcg.register(*bare, mcg.MultiChannelGICP(), max_distance=0.5)
-    np.testing.assert_allclose(plain.matrix, multi.matrix, atol=tolerance(1e-6, 1e-12))
-
-
 def test_results_repeat_and_survive_pickle(room):
     source, target, _ = room
     results = [mcg.register(source, target, METHODS["mc-gicp"](), max_distance=0.5) for _ in range(5)]
@@ -563,9 +548,3 @@ def test_tight_tolerances_do_not_keep_the_coarse_phase_from_ending(room):
     never = mcg.register(source, target, mcg.GICP(), translation_tolerance=0.0, rotation_tolerance=0.0)
     assert never.num_inliers == exact.num_inliers == usual.num_inliers
     np.testing.assert_allclose(never.matrix, exact.matrix, atol=1e-6)
-
-
-def test_a_batch_of_clouds_is_refused(room):
-    source, target, _ = room
-    with pytest.raises(ValueError, match=r"source: .*expected a single cloud"):
-        mcg.register(mcg.PointCloud.stack([source.unpad(), source.unpad()]), target, mcg.GICP())

@@ -21,6 +21,7 @@ from tests.test_repeatable import METHODS, bits, clouds
 import mcgicp_jax as mcg
 for method in METHODS.values():
     print(bits(mcg.register(*clouds(), method)))
+print(mcg.global_pose(*clouds()).matrix.tobytes().hex())
 """
 
 
@@ -62,4 +63,5 @@ def test_in_another_process(expected):
     command = [sys.executable, "-c", _IN_ANOTHER_PROCESS]
     done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=300)
     assert done.returncode == 0, done.stderr
-    assert done.stdout.split() == list(expected.values())
+    anywhere = mcg.global_pose(*clouds()).matrix.tobytes().hex()
+    assert done.stdout.split() == [*expected.values(), anywhere]

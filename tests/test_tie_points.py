@@ -12,10 +12,10 @@ from mcgicp_jax import datasets
 from mcgicp_jax._math.symmetric_matrices import inverse_3, inverse_6
 from mcgicp_jax._math.twists import logarithm
 from mcgicp_jax._pose_solver.pose_measurements import Fusion, Prior, TiePoints, form_at
+from tests.compilations import compilations
 from tests.differences import TO_ROUNDING, check_gradient, weigh
 from tests.precision import in_float64
 from tests.scenes import motion, pair
-from tests.test_programs import compilations
 
 OPTIONS = {"max_distance": 0.5}
 

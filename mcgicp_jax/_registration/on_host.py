@@ -228,7 +228,8 @@ class HostExecutor(AbstractExecutor):
         )
         # Rows that pad the last block have no matches; their scores are 0.
         wrenches, valid, cells = (
-            np.concatenate([getattr(part, name) for part in parts]) for name in ("wrenches", "valid", "cells")
+            None if getattr(parts[0], name) is None else np.concatenate([getattr(part, name) for part in parts])
+            for name in ("wrenches", "valid", "cells")
         )
         return Scores(wrenches, valid, cells, jacobian, bias)
 
