@@ -152,7 +152,7 @@ def test_another_exposure_is_told(photometric):
     target, source = (preprocess(frame.cloud, voxel_size=0.03) for frame in datasets.poster_wall(num_frames=2, seed=1))
     method = MultiChannelGICP(photometric=photometric)
     dark = source.replace(channels=0.5 * np.asarray(source.channels))
-    with pytest.warns(UserWarning, match=r"channel red: values in the target are [12].* times as spread"):
+    with pytest.warns(UserWarning, match="channel red: the spreads of its values"):
         register(dark, target, method)
     with warnings.catch_warnings():
         warnings.simplefilter("error")

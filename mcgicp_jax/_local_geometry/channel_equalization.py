@@ -48,9 +48,11 @@ def warn_of_exposure(source: PointCloud, target: PointCloud, matches: Callable[[
         return
     for name, gain in zip(source.channel_names, np.asarray(_gain(source, target, matches())[0]), strict=True):
         if not 1 / _OTHER_EXPOSURE < gain < _OTHER_EXPOSURE:
+            # Without the number, so that Python shows it once.
             warnings.warn(
-                f"channel {name}: values in the target are {gain:.2g} times as spread as those of matched points in "
-                "the source, which displaces the pose; if the exposure differs, use equalize_channels=True",
+                f"channel {name}: the spreads of its values at matched points of source and target differ by a factor "
+                f"of more than {_OTHER_EXPOSURE}, which displaces the pose; if the exposure differs, use "
+                "equalize_channels=True",
                 UserWarning,
                 stacklevel=4,
             )
