@@ -1,4 +1,4 @@
-"""Gradients of `estimate_pose` against finite differences, with respect to everything that a pose depends on."""
+"""Gradients of `estimate_pose` inside `jit` against differences; `test_gradients_outside_jit.py` has those outside."""
 
 import jax
 import jax.numpy as jnp
@@ -23,7 +23,9 @@ from tests.scenes import motion
 pytestmark = in_float64
 
 
-@pytest.mark.parametrize("name", CASES)
+@pytest.mark.parametrize(
+    "name", [name if name == "gicp" else pytest.param(name, marks=pytest.mark.slow) for name in CASES]
+)
 def test_align_has_the_gradient_of_its_answer(name, noisy):
     source, target, _ = noisy
     method, robust = case(name)
@@ -67,6 +69,7 @@ def test_align_has_the_gradient_where_channels_are_missing(name, noisy):
         np.testing.assert_array_equal(gradient[f"{side} channels"][~np.asarray(cloud.channel_valid)], 0)
 
 
+@pytest.mark.slow
 def test_align_has_the_gradient_of_given_covariances(noisy):
     source, target, _ = noisy
     method, robust = case("gicp")
@@ -89,6 +92,7 @@ def test_align_has_the_gradient_of_given_covariances(noisy):
     check_gradient(loss, inputs_of(source, target, method, robust))
 
 
+@pytest.mark.slow
 def test_soft_matches_give_every_number_a_gradient(noisy):
     source, target, _ = noisy
     method = mcg.MultiChannelGICP([[0.05, 0.01], [0.01, 0.08]], [0.3, 0.2], epsilon=1e-2)

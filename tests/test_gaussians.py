@@ -137,7 +137,7 @@ def test_moments_in_jax():
 
 
 @in_float64
-@pytest.mark.parametrize("name", ["ndt", "d2d-ndt"])
+@pytest.mark.parametrize("name", [pytest.param("ndt", marks=pytest.mark.slow), "d2d-ndt"])
 def test_gradients_reach_the_points(name):
     source, target, start = raw_pair(2000)
     method = {"ndt": mcg.NDT(), "d2d-ndt": mcg.D2DNDT()}[name]
