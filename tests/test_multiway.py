@@ -11,7 +11,6 @@ from mcgicp_jax._sequences import loop_closure as _loops
 from mcgicp_jax._sequences.edges import edge_from
 from mcgicp_jax._sequences.loop_closure import Trajectory
 from mcgicp_jax._sequences.multiway import _overlapping
-from tests.graphs import pose
 from tests.scenes import motion, pair, wall
 
 
@@ -69,7 +68,7 @@ def trajectory(number=5, **options):
     """One with frames along x, a metre apart; their points have a median range of 1 m."""
     found = Trajectory(mcg.GICP(), Options(**options))
     found._clouds = [mcg.PointCloud(np.eye(3) * [0.5, 1, 2] + [0, 0, 1e-9 * k]) for k in range(number)]
-    found._poses = np.array([pose((k, 0, 0), (0, 0, 0.1 * k)) for k in range(number)])
+    found._poses = np.array([motion((k, 0, 0, 0, 0, 0.1 * k)) for k in range(number)])
     return found
 
 
@@ -167,7 +166,7 @@ def test_pairs_and_starts_can_be_given(room):
 
 def test_clouds_are_preprocessed_once_and_mapped_in_voxels():
     points = np.random.default_rng(0).uniform(-1, 1, (300, 3))
-    start = pose((5, 0, 0), (0, 0, 1.0))
+    start = motion((5, 0, 0, 0, 0, 1.0))
     found = mcg.multiway([points], mcg.GICP(), init=[start], voxel_size=0.2, num_neighbors=7)
     assert found.converged and found.registrations == {} and found.clouds[0].neighbors.shape[1] == 7
     expected = mcg.merge_clouds(found.clouds, [start], 0.2)

@@ -78,6 +78,23 @@ def test_each_pair_starts_from_the_motion_before(room, monkeypatch):
         np.testing.assert_array_equal(start, step.registration.matrix)
 
 
+def test_each_frame_starts_in_the_map_from_the_pose_that_the_motion_before_leads_to(room, monkeypatch):
+    frames, _ = room
+    starts = []
+    register = _odometry.register_pair
+
+    def spy(source, target, method, init, options):
+        starts.append(init)
+        return register(source, target, method, init, options)
+
+    monkeypatch.setattr(_odometry, "register_pair", spy)
+    start = motion((1, 2, 0, 0.3, 0, 1))
+    options = {"max_distance": 0.5, "against": "map", "start": start}
+    poses = [step.pose for step in mcg.odometry(frames[:4], mcg.GICP(), **options)]
+    for i in (2, 3):
+        np.testing.assert_allclose(starts[i - 1], poses[i - 1] @ np.linalg.inv(poses[i - 2]) @ poses[i - 1], atol=1e-6)
+
+
 def test_a_frame_that_does_not_overlap_is_passed_by_at_constant_velocity(room):
     frames, _ = room
     lost = mcg.PointCloud(frames[0].cloud.points + 1000, frames[0].cloud.channels)

@@ -319,7 +319,7 @@ def test_two_distances_are_two_registrations_in_a_row(room):
 
 def test_some_of_the_points_find_the_pose_and_all_settle_it(room, monkeypatch):
     source, target, _ = room
-    # So few points come to rest within 0.4 mm; that large scans do where other libraries do, test_reference.py tests.
+    # So few points come to rest within 0.4 mm; test_agrees_with_small_gicp.py has large scans.
     to_rest = {"max_distance": 0.3, "translation_tolerance": 1e-4, "rotation_tolerance": 1e-4}
     plain = mcg.register(source, target, mcg.GICP(), **to_rest)
     monkeypatch.setattr(_register, "_COARSE_ROWS", len(source) // 5)

@@ -11,6 +11,12 @@ from mcgicp_jax._compute import threads as _threads
 from mcgicp_jax._compute.threads import side_by_side
 
 
+@pytest.fixture(autouse=True)
+def cores(monkeypatch):
+    """On a single core, no other threads take part."""
+    monkeypatch.setattr(_threads, "num_cores", lambda: 3)
+
+
 def test_answers_come_in_order_and_the_first_from_this_thread():
     calls = [partial(lambda i: (i, threading.get_ident()), i) for i in range(20)]
     answers = side_by_side(calls)

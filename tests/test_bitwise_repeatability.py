@@ -17,7 +17,7 @@ _IN_ANOTHER_PROCESS = """
 import os
 if hasattr(os, "sched_setaffinity"):
     os.sched_setaffinity(0, [min(os.sched_getaffinity(0))])
-from tests.test_repeatable import METHODS, bits, clouds
+from tests.test_bitwise_repeatability import METHODS, bits, clouds
 import mcgicp_jax as mcg
 for method in METHODS.values():
     print(bits(mcg.register(*clouds(), method)))
