@@ -245,6 +245,7 @@ def broken(folder):
         ([good, good, "--num-neighbors", "1"], "num_neighbors: expected"),
         ([good, good, "--max-distance", "0"], "max_distance: expected"),
         ([good, good, "--max-iterations", "0"], "max_iterations: expected"),
+        ([good, good, "--max-source-points", "3"], "max_source_points: expected"),
         ([good, good, "--aligned", str(folder / "out.doc")], "unknown suffix '.doc'"),
         ([good, good, "--output", str(folder / "no" / "pose.txt")], "No such file or directory"),
         ([good, good, "--output", str(folder)], f"{folder}: Is a directory"),

@@ -22,7 +22,7 @@ from mcgicp_jax._local_geometry.spacing_and_noise import point_spacing
 from mcgicp_jax._math.robust_kernels import KERNELS
 from mcgicp_jax._methods.base import AbstractMethod
 from mcgicp_jax._methods.registry import METHODS
-from mcgicp_jax._registration.options import ROTATION_TOLERANCE
+from mcgicp_jax._registration.options import ENOUGH_SOURCE_POINTS, ROTATION_TOLERANCE
 from mcgicp_jax._registration.options import Options as RegistrationOptions
 from mcgicp_jax._registration.settings import default_distances
 from mcgicp_jax.io.clouds import FORMATS, format_of
@@ -109,6 +109,7 @@ class Options:
         equalize_channels: Scale and shift the channels of the source to the distribution of those of the target.
         voxel_sizes: Voxel sizes in metres, coarse to fine, at which to register first if the initial pose is far off.
             For {cell_methods} the sizes of the cells; by default 32, 16 and 8 times the spacing of the points.
+        max_source_points: Largest number of points of the source that are matched, evenly spread.
         channel_covariance: For {channel_covariance}: one variance for all channels, or one for each; channel units
             squared.
         channel_weights: For {channel_weights}: one weight for all channels, or one for each; metres per channel unit.
@@ -126,6 +127,7 @@ class Options:
     hold_unconstrained: bool = True
     equalize_channels: bool = False
     voxel_sizes: Sizes = ()
+    max_source_points: int | Literal["all"] = ENOUGH_SOURCE_POINTS
     channel_covariance: Numbers = ()
     channel_weights: Numbers = ()
     epsilon: Epsilon = None
@@ -154,6 +156,7 @@ class Options:
             raise ValueError(f"max_distance: expected one or two numbers, got {self.max_distance}")
         names = [field.name for field in fields(RegistrationOptions) if hasattr(self, field.name)]
         options = {name: getattr(self, name) for name in names if name != "max_distance"}
+        options["max_source_points"] = None if self.max_source_points == "all" else self.max_source_points
         if self.max_distance:
             options["max_distance"] = self.max_distance if len(self.max_distance) == 2 else self.max_distance[0]
         if self.robust is not None:

@@ -29,36 +29,51 @@ _LARGEST_BLOCK = 8192
 
 
 def local_geometries(
-    source: PointCloud, target: PointCloud, with_channels: bool, num_threads: int | None = 1
+    source: PointCloud,
+    target: PointCloud,
+    with_channels: bool,
+    num_threads: int | None = 1,
+    source_rows: Any = None,
 ) -> tuple[LocalGeometry, LocalGeometry]:
     """Local geometry of two preprocessed clouds.
 
     Args:
         with_channels: whether the method uses the channels; if not, the programs do not depend on their number.
         num_threads: largest number of threads on the host; None for no limit.
+        source_rows: (n,) rows of the source to describe; None for all.
 
     Returns:
         Of the source and of the target.
     """
     if is_concrete(source, target):
-        calls = [partial(local_geometry_on_host, cloud, with_channels, num_threads) for cloud in (target, source)]
+        calls = [
+            partial(local_geometry_on_host, cloud, with_channels, num_threads, rows)
+            for cloud, rows in ((target, None), (source, source_rows))
+        ]
         of_target, of_source = side_by_side(calls, num_threads)
         return of_source, of_target
     # A concrete cloud beside a traced one is traced as well, which needs no program of its own.
-    if not share_a_body(source, target):
-        return _traced(source, with_channels), _traced(target, with_channels)
+    if source_rows is not None or not share_a_body(source, target):
+        return _traced(source, with_channels, source_rows), _traced(target, with_channels)
     return split(_traced(joined(source, target, with_channels), with_channels), source.points.shape[0])
 
 
-def local_geometry_on_host(cloud: PointCloud, with_channels: bool, num_threads: int | None = 1) -> LocalGeometry:
-    """Local geometry of a concrete cloud as NumPy arrays, cached with the cloud."""
+def local_geometry_on_host(
+    cloud: PointCloud, with_channels: bool, num_threads: int | None = 1, among: Any = None
+) -> LocalGeometry:
+    """Local geometry of a concrete cloud as NumPy arrays, cached with the cloud.
+
+    Args:
+        among: as in `gatherer`, the result of `spread_rows`.
+    """
+    size = cloud.points.shape[0] if among is None else among.size
 
     def make() -> LocalGeometry:
-        gather = gatherer(cloud, with_channels, np)
-        size = cloud.points.shape[0]
+        gather = gatherer(cloud, with_channels, np, among=among)
         return map_rows(lambda rows: _describe(gather(rows)), size, num_threads, NEIGHBORHOOD_BLOCK).tree
 
-    return cached_with(cloud, "local geometry", with_channels, make)
+    # The number of spread rows tells which these are.
+    return cached_with(cloud, "local geometry", (with_channels, size), make)
 
 
 @jax.jit
@@ -67,9 +82,9 @@ def _describe(around: Neighborhoods) -> Packed[LocalGeometry]:
     return Packed.of(describe(around))
 
 
-def _traced(cloud: PointCloud, with_channels: bool) -> LocalGeometry:
-    gather = gatherer(cloud, with_channels, jnp)
-    return over_rows(lambda rows: describe(gather(rows)), cloud.points.shape[0])
+def _traced(cloud: PointCloud, with_channels: bool, among: Any = None) -> LocalGeometry:
+    gather = gatherer(cloud, with_channels, jnp, among=among)
+    return over_rows(lambda rows: describe(gather(rows)), cloud.points.shape[0] if among is None else among.size)
 
 
 def share_a_body(source: PointCloud, target: PointCloud) -> bool:

@@ -76,21 +76,28 @@ def check_neighbors(cloud: PointCloud) -> AnyArray:
     return cloud.neighbors
 
 
-def points_alone(cloud: PointCloud, xp: ModuleType) -> Callable[[Any], Neighborhoods]:
+def points_alone(cloud: PointCloud, xp: ModuleType, among: Any = None) -> Callable[[Any], Neighborhoods]:
     """A function that maps rows to `Neighborhoods` without neighbours; arguments as of `gatherer`."""
     points, given = xp.asarray(cloud.points), cloud.covariances
     given = None if given is None else xp.asarray(given)
-    return lambda rows: Neighborhoods(points[rows].T, None if given is None else given[rows])
+
+    def gather(index: Any) -> Neighborhoods:
+        rows = index if among is None else among[index]
+        return Neighborhoods(points[rows].T, None if given is None else given[rows])
+
+    return gather
 
 
 def gatherer(
-    cloud: PointCloud, with_channels: bool, xp: ModuleType, with_given: bool = False
+    cloud: PointCloud, with_channels: bool, xp: ModuleType, with_given: bool = False, among: Any = None
 ) -> Callable[[Any], Neighborhoods]:
     """A function that maps rows (a slice or an array of row numbers) to their neighbourhoods.
 
     Args:
         xp: NumPy on the host, `jax.numpy` where the rows may be traced.
         with_given: whether to include the covariances given with the cloud.
+        among: (n,) rows of the cloud, in which the function's row numbers are places; None for all. Neighbours may be
+            any points of the cloud.
     """
     check_neighbors(cloud)
     neighbors, points, channels = (xp.asarray(array) for array in (cloud.neighbors, cloud.points, cloud.channels))
@@ -103,7 +110,8 @@ def gatherer(
     if with_channels and cloud.channel_valid is not None:
         known = xp.asarray(cloud.channel_valid).T
 
-    def gather(rows: Any) -> Neighborhoods:
+    def gather(index: Any) -> Neighborhoods:
+        rows = index if among is None else among[index]
         chosen = neighbors[rows].T
         present = chosen >= 0
         near = xp.where(present, chosen, 0)

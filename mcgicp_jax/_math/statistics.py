@@ -35,6 +35,26 @@ def sampled_rows(valid: Any) -> tuple[Any, Any]:
     return rows, inside & valid[rows]
 
 
+def spread_rows(valid: Any, count: int) -> Any:
+    """`count` of the valid rows of a cloud with more rows than that, in order: one of each of as many equal runs.
+
+    Rows sorted by voxel, as `preprocess` leaves them, are spread evenly in space, others as densely as the points.
+    The place in each run is random with a fixed seed: with a constant stride, all rows of an organised scan could be
+    from one scan line.
+
+    Args:
+        valid: (N,) booleans; False for padding. If fewer than `count` are True, rows of padding follow.
+    """
+    xp = numpy_for(valid)
+    valid_first = xp.argsort(~xp.asarray(valid), stable=True)
+    total = xp.maximum(xp.sum(valid), count)
+    # Products of whole numbers would overflow int32. Rounding moves the ends of runs by a row, but keeps their order.
+    fractions, rest = (np.arange(count + 1) / count).astype(np.float32), (total % count).astype(np.float32)
+    ends = xp.arange(count + 1) * (total // count) + xp.floor(fractions * rest).astype(np.int32)
+    places = np.random.default_rng(0).random(count, np.float32)
+    return valid_first[ends[:-1] + xp.floor(places * xp.diff(ends)).astype(np.int32)]
+
+
 def median(values: Any) -> Any:
     """Median over the last axis, ignoring NaNs; NaN where all values are. Not meant to be differentiated."""
     if not is_concrete(values):

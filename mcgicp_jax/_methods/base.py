@@ -68,7 +68,7 @@ class AbstractMethod(Numbers):
         """The residuals of each correspondence, by default the Mahalanobis distance alone.
 
         Args:
-            source, target: preprocessed clouds.
+            source, target: preprocessed clouds; of the source, as for `resolve`, perhaps only the points used.
             robust: kernel given by the user; None: the kernel of the method, if it has any.
             equalize_channels: option of `register`; a term may estimate gains and offsets of the channels itself.
         """
@@ -83,6 +83,7 @@ class AbstractMethod(Numbers):
         """The method with every unset parameter chosen from two preprocessed clouds; constants to autodiff.
 
         Args:
+            source: if `max_source_points` is smaller, only the points used, without neighbours.
             geometries: computes the local geometry of both clouds; given by callers that need it too.
 
         Raises:

@@ -57,6 +57,7 @@ def surface_pair(
     robust: AbstractKernel | None = None,
     equalize_channels: bool = False,
     num_threads: int | None = 1,
+    source_rows: Any = None,
 ) -> SurfacePair:
     """Choose unset parameters from two clouds, and compute their surfaces.
 
@@ -67,26 +68,29 @@ def surface_pair(
         observed: whether to compute observability, which `register` needs and the cost of given matches does not.
         robust, equalize_channels: as in `AbstractMethod.terms`.
         num_threads: largest number of threads on the host; None for no limit.
+        source_rows: the rows of the surface of the source, with neighbours among all points; None for all rows.
     """
-    geometries = cache(partial(local_geometries, source, target, method.uses_channels, num_threads))
-    method = method.resolve(source, target, geometries)
-    terms = method.terms(source, target, robust, equalize_channels)
+    geometries = cache(partial(local_geometries, source, target, method.uses_channels, num_threads, source_rows))
+    used = source if source_rows is None else _some_rows(source, source_rows)
+    method = method.resolve(used, target, geometries)
+    terms = method.terms(used, target, robust, equalize_channels)
     kinds = tuple(type(term) for term in terms if term.name)
     locals: tuple[Any, Any] = (None, None)
     # Raises an error if observability is needed and a cloud has no neighbours.
     if observed or (source.neighbors is not None and target.neighbors is not None):
         locals = geometries()
-    sides = list(zip((source, target), locals, strict=True))
+    rows = source_rows, None
     if is_concrete(method, source, target):
         calls = [
-            partial(surface_on_host, method, kinds, cloud, local, observed, num_threads) for cloud, local in sides[::-1]
+            partial(surface_on_host, method, kinds, cloud, local, observed, num_threads, among)
+            for cloud, local, among in list(zip((source, target), locals, rows, strict=True))[::-1]
         ]
         of_target, of_source = side_by_side(calls, num_threads)
         return SurfacePair(method, terms, of_source, of_target)
-    surfaces = _traced(method, kinds, source, target, locals, observed)
+    surfaces = _traced(method, kinds, source, target, locals, observed, source_rows)
     of_source, of_target = (
         surface._replace(search=searchable(method, cloud))
-        for surface, cloud in zip(surfaces, (source, target), strict=True)
+        for surface, cloud in zip(surfaces, (used, target), strict=True)
     )
     return SurfacePair(method, terms, of_source, of_target)
 
@@ -95,6 +99,14 @@ def covariances_of(method: AbstractMethod, cloud: PointCloud) -> Float[np.ndarra
     """Covariances of a method at the points of a concrete cloud; unset parameters are chosen from the cloud."""
     surface = surface_pair(method, cloud, cloud, observed=False).source
     return np.asarray(alg.matrix_from_symmetric(jnp.asarray(surface.covariance.T)))
+
+
+def _some_rows(cloud: PointCloud, rows: Any) -> PointCloud:
+    """Some rows of a cloud, without neighbours, which are rows of the whole cloud."""
+    xp = numpy_for(cloud, rows)
+    names = ("points", "channels", "channel_valid", "valid", "covariances")
+    some = {name: xp.asarray(getattr(cloud, name))[rows] for name in names if getattr(cloud, name) is not None}
+    return cloud.replace_rows(neighbors=None, **some)
 
 
 def searchable(method: AbstractMethod, cloud: PointCloud) -> SearchPoints:
@@ -126,31 +138,40 @@ def surface_on_host(
     local: LocalGeometry | None,
     observed: bool,
     num_threads: int | None,
+    among: Any = None,
 ) -> Surface:
-    """The surface of a concrete cloud as NumPy arrays, cached for this cloud and method."""
+    """The surface of a concrete cloud as NumPy arrays, cached for this cloud and method.
+
+    Args:
+        among: as in `gatherer`, the result of `spread_rows`.
+    """
+    used = cloud if among is None else _some_rows(cloud, among)
+    size = used.points.shape[0]
 
     def make() -> Surface:
-        gather = _gatherer(method, cloud, local is not None, np)
+        gather = _gatherer(method, cloud, local is not None, np, among)
         statistics = None if local is None else Packed.of(local)
 
         def block(rows: Any) -> tuple[Packed[Surface], Packed[SurfaceNoise] | None]:
             here = None if statistics is None else statistics.rows(rows)
             return _surface_of_block(method, kinds, gather(rows), here, observed)
 
-        columns, noise = map_rows(block, cloud.points.shape[0], num_threads, NEIGHBORHOOD_BLOCK)
+        columns, noise = map_rows(block, size, num_threads, NEIGHBORHOOD_BLOCK)
         # Views of one array, from which the executor on the host gathers rows.
         surface = columns.tree
-        return surface._replace(noise=None if noise is None else noise.tree, search=searchable(method, cloud))
+        return surface._replace(noise=None if noise is None else noise.tree, search=searchable(method, used))
 
     leaves, structure = jax.tree.flatten(method)
-    key = (structure, *(np.asarray(leaf).tobytes() for leaf in leaves), kinds, observed)
+    key = (structure, *(np.asarray(leaf).tobytes() for leaf in leaves), kinds, observed, size)
     return cached_with(cloud, "surface", key, make)
 
 
-def _gatherer(method: AbstractMethod, cloud: PointCloud, preprocessed: bool, xp: Any) -> Callable[[Any], Neighborhoods]:
+def _gatherer(
+    method: AbstractMethod, cloud: PointCloud, preprocessed: bool, xp: Any, among: Any
+) -> Callable[[Any], Neighborhoods]:
     if method.uses_neighborhoods and preprocessed:
-        return gatherer(cloud, method.uses_channels, xp, with_given=True)
-    return points_alone(cloud, xp)
+        return gatherer(cloud, method.uses_channels, xp, with_given=True, among=among)
+    return points_alone(cloud, xp, among)
 
 
 def _traced(
@@ -160,12 +181,14 @@ def _traced(
     target: PointCloud,
     locals: tuple[LocalGeometry | None, LocalGeometry | None],
     observed: bool,
+    source_rows: Any,
 ) -> tuple[Surface, Surface]:
     """Both surfaces, from one compiled body if both clouds have the same inputs and are not large."""
-    alike = None not in locals and (source.covariances is None) == (target.covariances is None)
+    alike = None not in locals and (source.covariances is None) == (target.covariances is None) and source_rows is None
     if not alike or not share_a_body(source, target):
         of_source, of_target = (
-            _whole(method, kinds, cloud, local, observed) for cloud, local in zip((source, target), locals, strict=True)
+            _whole(method, kinds, cloud, local, observed, among)
+            for cloud, local, among in zip((source, target), locals, (source_rows, None), strict=True)
         )
         return of_source, of_target
     cloud = joined(source, target, method.uses_channels)
@@ -177,15 +200,20 @@ def _traced(
 
 
 def _whole(
-    method: AbstractMethod, kinds: Kinds, cloud: PointCloud, local: LocalGeometry | None, observed: bool
+    method: AbstractMethod,
+    kinds: Kinds,
+    cloud: PointCloud,
+    local: LocalGeometry | None,
+    observed: bool,
+    among: Any = None,
 ) -> Surface:
-    gather = _gatherer(method, cloud, local is not None, jnp)
+    gather = _gatherer(method, cloud, local is not None, jnp, among)
 
     def surface(rows: Any) -> Surface:
         here = None if local is None else jax.tree.map(lambda array: jnp.asarray(array)[rows], local)
         return surface_of(method, kinds, gather(rows), here, observed)
 
-    return over_rows(surface, cloud.points.shape[0])
+    return over_rows(surface, cloud.points.shape[0] if among is None else among.size)
 
 
 def surface_of(

@@ -13,6 +13,7 @@ from typing import Any, Literal, TypeAlias
 import equinox as eqx
 import jax
 import numpy as np
+from jaxtyping import Bool
 
 from mcgicp_jax._clouds.point_cloud import PointCloud, Values
 from mcgicp_jax._clouds.preprocess import preprocess
@@ -20,6 +21,7 @@ from mcgicp_jax._compute.argument_checks import errors_named
 from mcgicp_jax._compute.linear_maps import primal
 from mcgicp_jax._compute.size_classes import size_class
 from mcgicp_jax._compute.threads import in_new_thread, num_cores, side_by_side, with_settings
+from mcgicp_jax._local_geometry.surface import Surface, searched
 from mcgicp_jax._math.poses import Pose
 from mcgicp_jax._methods.base import AbstractMethod
 from mcgicp_jax._pairs.register import register_from, start_from_anywhere
@@ -78,11 +80,12 @@ class PairResult:
 
 @dataclass(frozen=True)
 class _LanePair:
-    """A pair in a lane: its index and its preprocessed clouds."""
+    """A pair in a lane: its index, its preprocessed clouds, and which source points can be matched."""
 
     index: int
     source: PointCloud
     target: PointCloud
+    used: Bool[np.ndarray, "n"]
 
 
 @dataclass(frozen=True)
@@ -144,7 +147,9 @@ class BatchJob:
             limit = self.options.max_iterations
             for ended in run_problems(problems(), self.search, limit):
                 pair = ended.key
-                result = registration_of(ended.state, ended.assessment, ended.history, pair.source, pair.target)
+                result = registration_of(
+                    ended.state, ended.assessment, ended.history, pair.source, pair.target, pair.used
+                )
                 yield PairResult(pair.index, result)
             yield from rejected
 
@@ -199,30 +204,38 @@ class BatchJob:
         return PairResult(pair.index, RegistrationResult.without_pose(Status.TOO_FEW_CORRESPONDENCES))
 
     def _problem(self, pair: Pair) -> PairResult | tuple[_LanePair, Problem]:
-        """The pair as input of a lane, both surfaces padded to one size class so that few programs are compiled."""
+        """The pair as input of a lane, with both surfaces padded to one size class so that few programs are compiled.
+
+        With `max_source_points`, the surface of the source is padded to the size class of this number at most.
+        """
         try:
             source, target = self.ready("source", pair.source), self.ready("target", pair.target)
             init = self._start(pair, source, target)
             if isinstance(init, PairResult):
                 return init
             problem, _ = pose_problem(source, target, self.method, init, self.options, num_threads=1)
-            problem = _padded(problem, size_class(max(len(source.points), len(target.points))))
         except ValueError as error:
             return _invalid(pair.index, error)
-        return _LanePair(pair.index, source, target), problem
+        used, size = searched(problem.source).valid, size_class(max(len(source.points), len(target.points)))
+        few = self.options.max_source_points
+        sizes = size if few is None else min(size, size_class(few)), size
+        return _LanePair(pair.index, source, target, used), _padded(problem, sizes)
 
 
 def _invalid(index: int, error: ValueError) -> PairResult:
     return PairResult(index, RegistrationResult.without_pose(Status.INVALID_INPUT), str(error))
 
 
-def _padded(problem: Problem, size: int) -> Problem:
-    """Pad both surfaces to `size` rows; padding matches nothing."""
+def _padded(problem: Problem, sizes: tuple[int, int]) -> Problem:
+    """Pad the surfaces of source and target to these numbers of rows; padding matches nothing."""
 
-    def grow(array: np.ndarray) -> np.ndarray:
-        return np.pad(array, [(0, size - len(array))] + [(0, 0)] * (array.ndim - 1))
+    def grown(surface: Surface, size: int) -> Surface:
+        def grow(array: np.ndarray) -> np.ndarray:
+            return np.pad(array, [(0, size - len(array))] + [(0, 0)] * (array.ndim - 1))
 
-    source, target = (jax.tree.map(grow, surface) for surface in (problem.source, problem.target))
+        return jax.tree.map(grow, surface)
+
+    source, target = map(grown, (problem.source, problem.target), sizes)
     return eqx.tree_at(lambda problem: (problem.source, problem.target), problem, (source, target))
 
 

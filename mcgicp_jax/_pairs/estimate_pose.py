@@ -110,7 +110,7 @@ def _estimated_inside_jit(
     matched = match_surfaces(problem.source, problem.target, matches, softness)
     state = differentiable(loop, matched, problem.terms)
     assessment = assess_alignment(loop, fixed, fixed_softness)
-    return registration_of(state, assessment, loop.history, given.source, given.target)
+    return registration_of(state, assessment, loop.history, given.source, given.target, given.source.valid)
 
 
 def _problem(given: Given, init: Pose | None, options: Options) -> tuple[Problem, AbstractMethod]:

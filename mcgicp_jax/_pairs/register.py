@@ -36,6 +36,7 @@ def register(
     hold_unconstrained: bool = True,
     equalize_channels: bool = False,
     voxel_sizes: Sequence[float] = (),
+    max_source_points: int | None = None,
     tie_points: GivenTiePoints | None = None,
     prior: GivenPrior | None = None,
 ) -> RegistrationResult:
@@ -83,6 +84,12 @@ def register(
             registration at full resolution. For NDT these are cell sizes and the clouds must be raw: the last size
             gives the result, and at the others `GICP` registers voxels of a quarter of the size. Not available inside
             transformations.
+        max_source_points: match at most so many points of the source, at least 4, in every phase: one random point
+            (with a fixed seed) of each of as many equal runs of rows, which lie evenly in space if `preprocess`
+            averaged voxels, and else as densely as the points. Only for these are local geometry and covariances
+            computed, from neighbours among all points. `num_inliers`, `overlap` and the covariance count them alone.
+            The target stays complete. None: all points. 10,000 nearly give the pose of all: `odometry`, `multiway` and
+            the command line use these.
         tie_points: (source_points, target_points, covariances), metres: points (n, 3) known to be the same, such as
             surveyed targets or image features (Huhle & Jenke 2008), and the covariances (n, 3, 3) of b − T a, in the
             target's axes. n may be 1 or 2. They do not replace the initial pose: if `init` is far off, pass a better
@@ -124,6 +131,7 @@ def register(
         hold_unconstrained=hold_unconstrained,
         equalize_channels=equalize_channels,
         voxel_sizes=voxel_sizes,
+        max_source_points=max_source_points,
     )
     if not (tie_points is None and prior is None) and not hold_unconstrained:
         raise ValueError("hold_unconstrained: expected True with tie_points or prior, got False")

@@ -8,10 +8,11 @@ from typing import Any
 import equinox as eqx
 import jax
 import numpy as np
+from jaxtyping import Bool
 
 from mcgicp_jax._clouds.origins import pose_in_user_frame
 from mcgicp_jax._clouds.point_cloud import PointCloud
-from mcgicp_jax._compute.concrete import constant, is_concrete, numpy_for
+from mcgicp_jax._compute.concrete import AnyArray, constant, is_concrete, numpy_for
 from mcgicp_jax._compute.lazy import Held, Lazy
 from mcgicp_jax._compute.linear_maps import primal
 from mcgicp_jax._math.poses import se3_from_matrix, translation_adjoint
@@ -26,11 +27,13 @@ def registration_of(
     records: Record,
     source: PointCloud,
     target: PointCloud,
+    used: Bool[AnyArray, "n"],
     derivative: Callable[[str, str], np.ndarray] | None = None,
 ) -> RegistrationResult:
     """Build the `RegistrationResult` of a final state, in the user's frames; NumPy where everything is concrete.
 
     Args:
+        used: which source points could be matched; False for padding.
         derivative: computes `RegistrationResult.jacobian`.
     """
     history: dict[str, Any] = records._asdict()
@@ -50,12 +53,11 @@ def registration_of(
         "rmse": state.record.rmse,
         "history": history,
     }
-    valid = source.valid
-    if is_concrete(numbers, valid):
+    if is_concrete(numbers, used):
         # NumPy scalars print as numbers, arrays without dimensions do not.
-        numbers, valid = jax.tree.map(lambda number: np.asarray(number)[()], (numbers, valid))
+        numbers, used = jax.tree.map(lambda number: np.asarray(number)[()], (numbers, used))
     numbers["num_inliers"] = numbers["num_inliers"].astype(np.int32)
-    numbers["overlap"] = (numbers["num_inliers"] / valid.sum()).astype(numbers["rmse"].dtype)
+    numbers["overlap"] = (numbers["num_inliers"] / used.sum()).astype(numbers["rmse"].dtype)
     far = not is_concrete(source.origin, target.origin) or np.any(source.origin) or np.any(target.origin)
     return RegistrationResult.build(
         T_target_source=se3_from_matrix(matrix, pose.wxyz_xyz.dtype) if far else pose,

@@ -11,6 +11,7 @@ from typing import Any, TypeAlias, TypedDict
 import numpy as np
 from jax.typing import ArrayLike
 
+from mcgicp_jax._clouds.preprocess import MIN_POINTS
 from mcgicp_jax._compute.argument_checks import check_integer, check_positive, is_number
 from mcgicp_jax._compute.concrete import is_concrete
 from mcgicp_jax._math.robust_kernels import AbstractKernel
@@ -22,6 +23,9 @@ Distance: TypeAlias = ArrayLike | tuple[ArrayLike, ArrayLike]
 # Radians. Above the small cycles in which nearest-neighbour matching often ends: with real scans of 0.1 m spacing,
 # these were seen to stay within 0.2 mm and 0.4 mrad. The default translation tolerance is chosen likewise.
 ROTATION_TOLERANCE = 5e-4
+# Default `max_source_points` of odometry, multiway and the command line. With every third point, mean errors were those
+# of all points within 4 % (scans of KITTI with 34,000 points, RGB-D with 7,500); with every tenth, up to 36 % larger.
+ENOUGH_SOURCE_POINTS = 10_000
 
 
 @dataclass(frozen=True)
@@ -41,6 +45,7 @@ class Options:
     hold_unconstrained: bool = True
     equalize_channels: bool = False
     voxel_sizes: Sequence[float] = ()
+    max_source_points: int | None = None
     reach: float = 0.0
 
     def __post_init__(self) -> None:
@@ -65,6 +70,8 @@ class Options:
             raise ValueError(f"voxel_sizes: expected a sequence of voxel sizes in metres, got {self.voxel_sizes!r}")
         for size in self.voxel_sizes:
             check_positive("voxel_sizes", size)
+        if self.max_source_points is not None:
+            check_integer("max_source_points", self.max_source_points, MIN_POINTS)
 
     def takes_raw(self, method: AbstractMethod, name: str) -> bool:
         """Whether the method makes its cells of the cloud "source" or "target" itself, of all points."""
@@ -83,6 +90,7 @@ class GivenOptions(TypedDict, total=False):
     hold_unconstrained: bool
     equalize_channels: bool
     voxel_sizes: Sequence[float]
+    max_source_points: int | None
 
 
 def options_of(function: Callable[..., Any], given: Any) -> Options:

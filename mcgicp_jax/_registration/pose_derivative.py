@@ -59,6 +59,7 @@ class Inputs(NamedTuple):
         terms: the residuals of each correspondence.
         form: of tie points and prior; None without them.
         temperature: of a soft assignment, metres; None without one.
+        source_rows: (n,) rows of the source that are matched; None for all.
     """
 
     source: PointCloud
@@ -67,6 +68,7 @@ class Inputs(NamedTuple):
     terms: tuple[AbstractTerm, ...]
     form: PoseForm | None = None
     temperature: Any = None
+    source_rows: Any = None
 
     def traced(self) -> dict[Name, Any]:
         """The arrays that differentiation traces."""
@@ -223,6 +225,8 @@ class PoseDerivative(AbstractLinearMap):
     ) -> dict[Name, np.ndarray]:
         """Cotangents of fields of a cloud, and of the method, from those of its table."""
         cloud, method = getattr(self._inputs, side), self._inputs.method
+        among = self._inputs.source_rows if side == "source" else None
+        among = np.arange(len(cloud.points)) if among is None else among
         gather, soft = _gatherer(cloud, method), self._inputs.temperature is not None
         valid = None if cloud.channel_valid is None else np.asarray(cloud.channel_valid)
 
@@ -230,16 +234,16 @@ class PoseDerivative(AbstractLinearMap):
             masks = (None if valid is None else valid[index], np.asarray(cloud.valid)[index]) if soft else None
             by_rows = table[index].copy()
             by_rows[rows.stop - rows.start :] = 0
-            return pull_surface(self._kinds, fields, method, gather(index), masks, by_rows)
+            return pull_surface(self._kinds, fields, method, gather(among[index]), masks, by_rows)
 
         count, num_channels = table.shape[1], cloud.channels.shape[1] if method.uses_channels else 0
         widths = {"points": 3 * ("points" in fields), "channels": num_channels * ("channels" in fields)}
-        columns = np.zeros((len(table), count, sum(widths.values())))
+        columns = np.zeros((len(cloud.points), count, sum(widths.values())))
         found: dict[Name, Any] = {}
         if "covariances" in fields:
-            found[side, "covariances"] = np.zeros((count, len(table), 3, 3))
-        for rows, (own, near, given, numbers) in self._in_order(call, len(table)):
-            size = rows.stop - rows.start
+            found[side, "covariances"] = np.zeros((count, len(cloud.points), 3, 3))
+        for places, (own, near, given, numbers) in self._in_order(call, len(table)):
+            size, rows = places.stop - places.start, among[places]
             if own is not None:
                 columns[rows] += np.asarray(own)[:size].reshape(size, *columns.shape[1:])
             if near is not None:

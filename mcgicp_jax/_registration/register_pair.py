@@ -25,6 +25,7 @@ from mcgicp_jax._local_geometry.channel_equalization import (
 )
 from mcgicp_jax._local_geometry.surface import searched
 from mcgicp_jax._math.poses import Pose, se3_from_matrix
+from mcgicp_jax._math.statistics import spread_rows
 from mcgicp_jax._methods.base import AbstractMethod
 from mcgicp_jax._methods.gicp import GICP
 from mcgicp_jax._methods.icp import PointToPoint
@@ -166,8 +167,8 @@ def results_of(runs: Sequence[Run], givens: Sequence[Given | None]) -> list[Regi
     results = []
     for state, run in zip(states, runs, strict=True):
         by = None if run.executor is None else partial(jacobian, run.inputs, run.executor, run.loop, run.gains)
-        source, target = run.inputs.source, run.inputs.target
-        results.append(registration_of(state, run.assessment(), run.loop.history, source, target, by))
+        source, target, used = run.inputs.source, run.inputs.target, searched(run.problem.source).valid
+        results.append(registration_of(state, run.assessment(), run.loop.history, source, target, used, by))
     return results
 
 
@@ -180,8 +181,8 @@ def _solved(
     search: AbstractSearch,
 ) -> Run:
     """Pose and run the problem."""
-    problem, method = pose_problem(source, target, method, init, options, search.num_threads)
-    return _run(Inputs(source, target, method, problem.terms), problem, search, options.max_iterations)
+    problem, inputs = pose_problem(source, target, method, init, options, search.num_threads)
+    return _run(inputs, problem, search, options.max_iterations)
 
 
 def _run(inputs: Inputs, problem: Problem, search: AbstractSearch, max_iterations: int) -> Run:
@@ -229,10 +230,13 @@ def pose_problem(
     init: Pose | None,
     options: Options,
     num_threads: int | None,
-) -> tuple[Problem, AbstractMethod]:
-    """Inputs of the loop for preprocessed clouds, NumPy arrays where everything is concrete; and the method with its
-    unset parameters chosen."""
+) -> tuple[Problem, Inputs]:
+    """Inputs of the loop for preprocessed clouds, NumPy arrays where everything is concrete; and what these were
+    computed from."""
     check_clouds(source, target, method)
+    most, rows = options.max_source_points, None
+    if most is not None and most < source.valid.size:
+        rows = spread_rows(source.valid, most)
     pair = surface_pair(
         method,
         source,
@@ -241,6 +245,7 @@ def pose_problem(
         robust=options.robust,
         equalize_channels=options.equalize_channels,
         num_threads=num_threads,
+        source_rows=rows,
     )
     dtype, valid = source.points.dtype, searched(pair.source).valid
     xp = numpy_for(valid)
@@ -248,7 +253,7 @@ def pose_problem(
     start = se3_from_matrix(centred_pose(init, source, target), dtype)
     settings = settings_for(options, pair.method, target, stride, dtype)
     problem = Problem(start, pair.source, pair.target, pair.terms, settings, num_candidates=pair.method.num_candidates)
-    return problem, pair.method
+    return problem, Inputs(source, target, pair.method, pair.terms, source_rows=rows)
 
 
 def _equalized(

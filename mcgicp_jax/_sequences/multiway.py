@@ -23,7 +23,7 @@ from mcgicp_jax._pairs.batch import register_batch
 from mcgicp_jax._pose_graph.edge import Edge
 from mcgicp_jax._pose_graph.graph import PoseGraph
 from mcgicp_jax._pose_graph.optimize import PoseGraphResult, optimize_poses
-from mcgicp_jax._registration.options import GivenOptions, Options, check_method, options_of
+from mcgicp_jax._registration.options import ENOUGH_SOURCE_POINTS, GivenOptions, Options, check_method, options_of
 from mcgicp_jax._registration.register_pair import register_pair
 from mcgicp_jax._registration.result import RegistrationResult, Status, computed, is_usable
 from mcgicp_jax._sequences.edges import LEAST_OVERLAP, edge_from
@@ -102,7 +102,7 @@ def multiway(
             in order to the two before it, from the previous motion, and starts at the pose of larger overlap.
         voxel_size, num_neighbors: arguments of `preprocess`.
         executor: see `register_batch`, which registers the pairs.
-        options: options of `register`, except for `tie_points` and `prior`.
+        options: options of `register`, except for `tie_points` and `prior`; `max_source_points` is 10,000 by default.
 
     Returns:
         Clouds, poses, registrations and map.
@@ -113,6 +113,7 @@ def multiway(
     """
     check_method(method)
     check_preprocessing(voxel_size, num_neighbors)
+    options.setdefault("max_source_points", ENOUGH_SOURCE_POINTS)
     settings = options_of(multiway, options)
     ready = []
     for k, cloud in enumerate(clouds):

@@ -20,7 +20,7 @@ from mcgicp_jax._local_geometry.spacing_and_noise import point_spacing
 from mcgicp_jax._math.poses import Pose, nearest_rotation, pose_matrix
 from mcgicp_jax._methods.base import AbstractMethod
 from mcgicp_jax._pose_graph.graph import PoseGraph
-from mcgicp_jax._registration.options import GivenOptions, Options, check_method, options_of
+from mcgicp_jax._registration.options import ENOUGH_SOURCE_POINTS, GivenOptions, Options, check_method, options_of
 from mcgicp_jax._registration.register_pair import register_pair
 from mcgicp_jax._registration.result import RegistrationResult, computed, is_usable
 from mcgicp_jax._sequences.loop_closure import Trajectory
@@ -97,7 +97,7 @@ def odometry(
             poses, and correct all poses by `optimize_poses`. Steps keep the pose known at their time; the corrected
             poses are in the `graph` of the last step. All clouds are kept in memory. Not with `against="map"` or
             `recover`.
-        options: options of `register`, except for `tie_points` and `prior`.
+        options: options of `register`, except for `tie_points` and `prior`; `max_source_points` is 10,000 by default.
 
     Returns:
         Iterator over one `OdometryStep` per frame, including the first.
@@ -108,6 +108,7 @@ def odometry(
     """
     check_preprocessing(voxel_size, num_neighbors)
     check_method(method)
+    options.setdefault("max_source_points", ENOUGH_SOURCE_POINTS)
     if against not in ("previous", "map"):
         raise ValueError(f'against: expected "previous" or "map", got {against!r}')
     if map_radius is not None:

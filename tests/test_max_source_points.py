@@ -1,0 +1,208 @@
+"""`max_source_points`: few source points are matched, their neighbourhoods come from all points."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import mcgicp_jax as mcg
+from mcgicp_jax import io
+from mcgicp_jax.__main__ import main
+from mcgicp_jax._cli.options import Options
+from mcgicp_jax._math.statistics import spread_rows
+from mcgicp_jax._registration import on_host
+from tests.differences import GATE, TO_ROUNDING, inputs_of, weigh
+from tests.scenes import covariances, motion, pair, room_corner
+from tests.test_gradients_outside_jit import check
+
+
+@pytest.fixture(scope="module", autouse=True)
+def in_float64():
+    with jax.enable_x64(True):
+        yield
+
+
+@pytest.fixture(scope="module")
+def clouds(in_float64):
+    source, target, _ = pair(size=400, noise=0.05, channel_noise=0.05)
+    return source, target
+
+
+@pytest.mark.parametrize(("size", "count"), [(10, 4), (1000, 999), (34_000, 10_000), (3_000_000, 70_000)])
+def test_rows_are_spread_evenly(size, count):
+    rows = spread_rows(np.ones(size, bool), count)
+    assert rows.shape == (count,) and rows[-1] < size
+    assert np.diff(rows).min() >= 1 and np.diff(rows).max() <= 2 * -(-size // count)
+    # One of each run; rounding may move its ends by a row.
+    runs = np.arange(count) * size / count
+    assert np.all(rows >= np.floor(runs) - 1) and np.all(rows <= runs + size / count + 1)
+
+
+def test_rows_of_organised_scans_are_of_all_lines():
+    """Scans store one point of each of 64 lines after the other."""
+    lines = spread_rows(np.ones(64_000, bool), 1000) % 64
+    assert np.bincount(lines, minlength=64).min() > 0
+
+
+def test_rows_of_padding_come_last_and_are_the_same_inside_jit():
+    valid = np.random.default_rng(0).random(1000) < 0.3
+    rows = spread_rows(valid, 500)
+    total = valid.sum()
+    np.testing.assert_array_equal(rows[:total], np.flatnonzero(valid))
+    assert not valid[rows[total:]].any()
+    assert valid[spread_rows(valid, 100)].all()
+    for count in (100, 120, 150, 500):
+        np.testing.assert_array_equal(jax.jit(spread_rows, static_argnums=1)(valid, count), spread_rows(valid, count))
+
+
+def test_the_pose_is_that_of_the_points_alone_with_neighbours_among_all(clouds):
+    """With covariances of the whole cloud, given to a cloud of the same rows."""
+    source, target = clouds
+    rows = spread_rows(source.valid, 150)
+    given = np.asarray(mcg.preprocess(source.unpad().replace(covariances=_matrices(mcg.GICP(), source))).covariances)
+    few = mcg.preprocess(mcg.PointCloud(source.points[rows], source.channels[rows], covariances=given[rows]))
+    options = {"max_distance": GATE, "hold_unconstrained": False, **TO_ROUNDING}
+    expected = mcg.register(few, target, mcg.GICP(), **options)
+    found = mcg.register(source, target, mcg.GICP(), max_source_points=150, **options)
+    np.testing.assert_allclose(found.matrix, expected.matrix, atol=1e-10)
+    assert found.num_inliers == expected.num_inliers <= 150
+    np.testing.assert_allclose(found.overlap, found.num_inliers / 150)
+
+
+def _matrices(method, cloud):
+    xx, xy, xz, yy, yz, zz = np.asarray(covariances(method, cloud))
+    return np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]]).transpose(2, 0, 1)
+
+
+def test_only_some_points_are_matched_in_every_phase(clouds, monkeypatch):
+    sizes = set()
+    original = on_host.HostExecutor.match
+
+    def match(self, state, before):
+        found = original(self, state, before)
+        sizes.add(found.indices.shape[1])
+        return found
+
+    monkeypatch.setattr(on_host.HostExecutor, "match", match)
+    mcg.register(*clouds, mcg.MultiChannelGICP(), max_source_points=150)
+    assert sizes == {150}
+    sizes.clear()
+    # More than there are: all.
+    mcg.register(*clouds, mcg.MultiChannelGICP(), max_source_points=401)
+    assert sizes == {400}
+
+
+def test_the_pose_inside_jit_of_a_padded_cloud_and_in_a_batch_is_the_same(clouds):
+    source, target = clouds
+    padded, method = source.pad(512), mcg.MultiChannelGICP()
+
+    def pose(source, target):
+        result = mcg.register(source, target, method, max_source_points=150)
+        return result.matrix, result.overlap, result.covariance
+
+    expected = mcg.register(source, target, method, max_source_points=150)
+    for name, found in {
+        "jit": jax.jit(pose)(padded, target),
+        "padded": pose(padded, target),
+    }.items():
+        np.testing.assert_allclose(found[0], expected.matrix, atol=1e-9, err_msg=name)
+        np.testing.assert_allclose(found[1], expected.overlap, atol=1e-9, err_msg=name)
+        np.testing.assert_allclose(found[2], expected.covariance, rtol=1e-6, err_msg=name)
+    for search in (None, mcg.DenseSearch()):
+        (found,) = mcg.register_batch([source], [target], method, max_source_points=150, search=search)
+        np.testing.assert_allclose(found.matrix, expected.matrix, atol=1e-6)
+        np.testing.assert_allclose(found.overlap, expected.overlap, atol=1e-9)
+
+
+@pytest.mark.parametrize("method", [mcg.MultiChannelGICP([0.05, 0.08], 0.3, epsilon=1e-2), mcg.PointToPoint()])
+def test_the_gradient_is_that_of_differences(clouds, method):
+    source, target = clouds
+    method = jax.tree.map(lambda number: jnp.asarray(number, float), method)
+    options = {"max_distance": GATE, "max_source_points": 150, **TO_ROUNDING}
+    start = mcg.register(source, target, method, **options)
+
+    def loss(inputs):
+        moved = (
+            cloud.replace(points=inputs[f"{name} points"], channels=inputs[f"{name} channels"])
+            for name, cloud in (("source", source), ("target", target))
+        )
+        return weigh(mcg.register(*moved, inputs["method"], init=start.matrix, **options).matrix)
+
+    inputs = inputs_of(source, target, method, None)
+    gradient = check(loss, inputs)
+    used = np.zeros(400, bool)
+    used[spread_rows(source.valid, 150)] = True
+    others = np.abs(np.asarray(gradient["source points"]))[~used].sum(axis=1)
+    # The others matter as neighbours of those, where the method computes covariances.
+    assert (others > 0).mean() > 0.9 if method.uses_neighborhoods else not others.any()
+    by_points = start.jacobian("source", "points")
+    assert by_points.shape == (6, 400, 3) and by_points[:, used].any(axis=(0, 2)).mean() > 0.8
+
+
+def test_gradients_with_given_covariances_and_inside_jit(clouds):
+    source, target = clouds
+    source = source.replace(covariances=_matrices(mcg.GICP(), source))
+
+    def loss(points, covariances):
+        cloud = source.replace(points=points, covariances=covariances)
+        options = {"max_distance": GATE, "max_source_points": 150, "search": mcg.DenseSearch(), **TO_ROUNDING}
+        return weigh(mcg.register(cloud, target, mcg.GICP(), **options).matrix)
+
+    both = [
+        function(source.points, source.covariances)
+        for function in (jax.grad(loss, argnums=(0, 1)), jax.jit(jax.grad(loss, argnums=(0, 1))))
+    ]
+    for outside, inside in zip(*both, strict=True):
+        assert np.abs(inside).max() > 0
+        np.testing.assert_allclose(outside, inside, atol=1e-9 * np.abs(inside).max())
+
+
+@pytest.mark.parametrize("value", [0, -3, 3])
+def test_the_number_is_checked(clouds, value):
+    with pytest.raises(ValueError, match=r"max_source_points: expected an integer of at least 4"):
+        mcg.register_batch(clouds, clouds, mcg.GICP(), max_source_points=value)
+
+
+def test_odometry_and_multiway_match_at_most_10000_points(monkeypatch):
+    source, target, _ = pair(size=10_500)
+    *_, step = mcg.odometry([target, source], mcg.PointToPoint())
+    assert step.registration.num_inliers == round(float(step.registration.overlap) * 10_000)
+    *_, step = mcg.odometry([target, source], mcg.PointToPoint(), max_source_points=None)
+    assert step.registration.num_inliers == round(float(step.registration.overlap) * 10_500)
+    found = mcg.multiway([target, source], mcg.PointToPoint())
+    for result in found.registrations.values():
+        assert result.num_inliers == round(float(result.overlap) * 10_000)
+
+
+def test_the_command_line_takes_a_number_or_all(tmp_path, capsys):
+    source, target, _ = pair(size=400)
+    files = [str(tmp_path / name) for name in ("source.npz", "target.npz")]
+    for path, cloud in zip(files, (source, target), strict=True):
+        io.write(path, cloud)
+    shown = {}
+    for number in ("150", "all"):
+        assert main(["register", *files, "--max-source-points", number]) == 0
+        shown[number] = capsys.readouterr().out
+    assert Options().registration()["max_source_points"] == 10_000
+    assert shown["150"] != shown["all"]
+    assert Options(max_source_points="all").registration()["max_source_points"] is None
+
+
+@pytest.mark.slow
+def test_the_covariance_is_calibrated():
+    """ξᵀ Σ⁻¹ ξ of the pose errors is distributed as χ² with six degrees of freedom: over 40 pairs, its mean of 6 has a
+    standard error of 0.55. As for all points, a factor of two either way is the design effect's own error."""
+    squares = []
+    for seed in range(40):
+        truth = motion()
+        points, channels = room_corner(3000, seed=2 * seed + 10)
+        source = mcg.preprocess(mcg.PointCloud((points - truth[:3, 3]) @ truth[:3, :3], channels))
+        target = mcg.preprocess(mcg.PointCloud(*room_corner(3000, seed=2 * seed + 11)))
+        result = mcg.register(source, target, mcg.MultiChannelGICP(), max_source_points=1000)
+        error = np.linalg.inv(truth) @ result.matrix
+        twist = np.array(
+            [*error[:3, 3], error[2, 1] - error[1, 2], error[0, 2] - error[2, 0], error[1, 0] - error[0, 1]]
+        )
+        twist[3:] /= 2
+        squares.append(twist @ np.linalg.solve(np.asarray(result.covariance), twist))
+    assert 3 < np.mean(squares) < 12
