@@ -13,8 +13,8 @@ from mcgicp_jax import datasets
 from mcgicp_jax._math import symmetric_matrices as cov
 from mcgicp_jax._pose_solver.degeneracy import find_directions
 from mcgicp_jax._pose_solver.sums import Sums
-
-from .scenes import motion, pair, prepare, room_corner, wall
+from tests.precision import in_float64
+from tests.scenes import motion, pair, prepare, room_corner, wall
 
 
 def matrices(symmetric):
@@ -236,6 +236,22 @@ def on_the_road(scan):
 
 
 # Covariance
+
+
+@in_float64
+def test_the_pose_takes_six_degrees_of_freedom_of_few_correspondences():
+    """n of them, each several times: 1 / (n − 6), not 1 / n."""
+    rng = np.random.default_rng(0)
+    points = rng.normal(size=(10, 3))
+    clouds, variances = (points, points + 0.01 * rng.normal(size=(10, 3))), {}
+    for number in (10, 20, 50):
+        source, target = (mcg.preprocess(np.tile(rows, (number // 10, 1)), num_neighbors=4) for rows in clouds)
+        rows = np.arange(number, dtype=np.int32)
+        matches = mcg.Correspondences(indices=rows, distances=np.zeros(number), valid=np.ones(number, bool))
+        found = mcg.estimate_pose(source, target, matches, mcg.PointToPoint())
+        variances[number] = np.diagonal(found.covariance)
+    np.testing.assert_allclose(variances[10] / variances[20], 14 / 4, rtol=1e-6)
+    np.testing.assert_allclose(variances[20] / variances[50], 44 / 14, rtol=1e-6)
 
 
 def test_the_covariance_is_a_covariance():

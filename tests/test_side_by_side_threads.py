@@ -69,6 +69,17 @@ def test_no_more_threads_than_asked_for_are_at_work(monkeypatch):
 
 
 @pytest.mark.timeout(30)
+def test_an_error_in_another_thread_is_raised():
+    started = threading.Event()
+
+    def fail():
+        started.set()
+        raise ZeroDivisionError
+
+    with pytest.raises(ZeroDivisionError):
+        side_by_side([lambda: started.wait(10), fail])
+
+
 def test_after_an_error_nobody_goes_on(monkeypatch):
     calls = []
 
