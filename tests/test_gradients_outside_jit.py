@@ -2,6 +2,7 @@
 
 import jax
 import jax.numpy as jnp
+import jaxlie
 import numpy as np
 import pytest
 
@@ -92,14 +93,17 @@ def test_tie_points_and_a_prior(clouds):
     points = np.asarray(clouds[0].points[:5])
 
     def loss(inputs):
-        ties = points, inputs["tie target"], inputs["tie variance"] * jnp.tile(jnp.eye(3), (5, 1, 1))
-        prior = motion(), inputs["prior variance"] * jnp.eye(6)
+        ties = inputs["tie source"], inputs["tie target"], inputs["tie variance"] * jnp.tile(jnp.eye(3), (5, 1, 1))
+        pose = jaxlie.SE3.from_matrix(motion()) @ jaxlie.SE3.exp(inputs["prior twist"])
+        prior = pose, inputs["prior variance"] * jnp.eye(6)
         return weigh(
             mcg.register(*clouds, mcg.GICP(), tie_points=ties, prior=prior, max_distance=GATE, **TO_ROUNDING).matrix
         )
 
     target = points @ motion()[:3, :3].T + motion()[:3, 3] + 0.01
-    check(loss, {"tie target": target, "tie variance": jnp.asarray(1e-3), "prior variance": jnp.asarray(1e-3)})
+    inputs = {"tie source": points, "tie target": target, "tie variance": 1e-3}
+    inputs |= {"prior twist": np.zeros(6), "prior variance": 1e-3}
+    check(loss, jax.tree.map(jnp.asarray, inputs))
 
 
 def test_gains_of_equalized_channels_are_constants(clouds):

@@ -229,7 +229,8 @@ def test_a_prior_is_the_start(corner):
 
 
 @in_float64
-@pytest.mark.parametrize("scene", ["corner", pytest.param("corridor", marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("scene", ["corner", "corridor"])
 def test_gradients_of_tie_points_and_prior(scene, noisy, hall):
     source, target, truth = noisy if scene == "corner" else hall[:3]
     weak = 0.02 if scene == "corner" else 0.05
