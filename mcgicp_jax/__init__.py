@@ -8,8 +8,8 @@ from mcgicp_jax._clouds.color_spaces import rgb_to_hsv, rgb_to_lab, rgb_to_yuv
 from mcgicp_jax._clouds.point_cloud import PointCloud
 from mcgicp_jax._clouds.preprocess import preprocess
 from mcgicp_jax._clouds.voxel_map import merge_clouds
-from mcgicp_jax._global_registration.global_pose import GlobalPoseResult, global_pose
-from mcgicp_jax._global_registration.image_matches import image_matches
+from mcgicp_jax._global_pose.global_pose import GlobalPoseResult, global_pose
+from mcgicp_jax._global_pose.image_matches import image_matches
 from mcgicp_jax._math.robust_kernels import AbstractKernel, Cauchy, GemanMcClure, Huber, Tukey, Welsch
 from mcgicp_jax._methods.base import AbstractMethod
 from mcgicp_jax._methods.channel_covariance import estimate_channel_covariance

@@ -18,7 +18,7 @@ LAYERS = (
     "_methods",
     "_pose_solver",
     "_registration",
-    "_global_registration",
+    "_global_pose",
     "_pairs",
     "_pose_graph",
     "_sequences",

@@ -10,7 +10,7 @@ from jax.typing import ArrayLike
 from mcgicp_jax._clouds.point_cloud import PointCloud, Values
 from mcgicp_jax._compute.concrete import is_concrete
 from mcgicp_jax._compute.linear_maps import primal
-from mcgicp_jax._global_registration.global_pose import GlobalPoseResult, global_pose
+from mcgicp_jax._global_pose.global_pose import GlobalPoseResult, global_pose
 from mcgicp_jax._math.poses import Pose
 from mcgicp_jax._math.robust_kernels import AbstractKernel
 from mcgicp_jax._methods.base import AbstractMethod

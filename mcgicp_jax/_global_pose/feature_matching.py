@@ -12,8 +12,8 @@ from jaxtyping import Array, Bool, Float, Int
 from mcgicp_jax._clouds.point_cloud import PointCloud
 from mcgicp_jax._compute.blocks import BLOCK, blocks, map_rows
 from mcgicp_jax._compute.concrete import AnyArray
-from mcgicp_jax._global_registration.fpfh import comparable, histograms_of, normals_of, statistics_of
-from mcgicp_jax._global_registration.robust_pose_fit import NUM_MATCHES, PutativeMatches
+from mcgicp_jax._global_pose.fpfh import comparable, histograms_of, normals_of, statistics_of
+from mcgicp_jax._global_pose.robust_pose_fit import NUM_MATCHES, PutativeMatches
 
 
 def matches_of_features(source: PointCloud, target: PointCloud, voxel_size: float) -> PutativeMatches:

@@ -15,9 +15,9 @@ from mcgicp_jax._clouds.preprocess import finite_rows, with_neighbors
 from mcgicp_jax._clouds.voxels import voxel_order
 from mcgicp_jax._compute.argument_checks import check_positive, errors_named
 from mcgicp_jax._compute.concrete import outside_trace
-from mcgicp_jax._global_registration.feature_matching import matches_of_features, matches_of_rows
-from mcgicp_jax._global_registration.fpfh import NUM_NEIGHBORS
-from mcgicp_jax._global_registration.robust_pose_fit import (
+from mcgicp_jax._global_pose.feature_matching import matches_of_features, matches_of_rows
+from mcgicp_jax._global_pose.fpfh import NUM_NEIGHBORS
+from mcgicp_jax._global_pose.robust_pose_fit import (
     MIN_SEPARATION,
     TOLERANCE,
     PoseHypotheses,
