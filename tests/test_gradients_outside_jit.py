@@ -277,3 +277,58 @@ def test_the_jacobian_is_that_of_small_motions(clouds):
         jax.tree.map(lambda leaf: leaf, result).jacobian("source", "points")
     with pytest.raises(ValueError, match="covariances: expected a source that has some"):
         result.jacobian("source", "covariances")
+
+
+def test_nested_differentiation_is_refused(clouds):
+    """By other inputs, too: the inner value would be a constant to the outer differentiation."""
+    source, target = clouds
+
+    def pose(scale, other):
+        moved = source.replace(points=source.points * scale), target.replace(points=target.points * other)
+        return mcg.register(*moved, mcg.GICP(), max_distance=GATE).matrix[0, 3]
+
+    with pytest.raises(NotImplementedError, match="first derivatives only"):
+        jax.grad(lambda scale: jax.grad(lambda other: pose(scale, other))(1.0))(1.0)
+    with pytest.raises(NotImplementedError, match="first derivatives only"):
+        jax.grad(lambda scale: jax.jvp(lambda other: pose(scale, other), (1.0,), (1.0,))[0])(1.0)
+
+
+def test_options_are_constants_wherever_they_come_from(clouds):
+    source, target = clouds
+
+    def pose(points, **options):
+        cloud = source.replace(points=points)
+        return mcg.register(cloud, target, mcg.GICP(), **({"max_distance": GATE} | options)).matrix[0, 3]
+
+    expected = jax.grad(pose)(source.points)
+    for name, value in (("max_distance", GATE), ("rotation_tolerance", 5e-4), ("init", np.eye(4))):
+        derived = jax.grad(lambda points, name=name, value=value: pose(points, **{name: value + 0 * points[0, 0]}))
+        np.testing.assert_allclose(derived(source.points), expected, rtol=1e-6, atol=1e-9)
+    # Here `vmap` traces the initial pose, so that the registration is compiled.
+    starts = jnp.tile(jnp.eye(4), (2, 1, 1))
+    several = jax.vmap(
+        lambda init: jax.grad(lambda points: pose(points, init=init, search=mcg.DenseSearch()))(source.points)
+    )
+    np.testing.assert_allclose(several(starts)[1], expected, rtol=1e-6, atol=1e-9)
+
+
+def test_a_batch_of_a_generator_is_refused_in_a_gradient(clouds):
+    source, target = clouds
+
+    def loss(points):
+        sources = (source.replace(points=points) for _ in range(2))
+        return mcg.register_batch(sources, [target, target], mcg.GICP())[0].matrix[0, 3]
+
+    with pytest.raises(ValueError, match="pair 0: expected concrete arrays, got tracers"):
+        jax.grad(loss)(source.points)
+
+
+def test_a_result_is_printed_in_a_gradient(clouds):
+    source, target = clouds
+
+    def loss(points):
+        result = mcg.register(source.replace(points=points), target, mcg.GICP(), max_distance=GATE)
+        assert f"{result.status.name}: translation" in repr(result)
+        return result.matrix[0, 3]
+
+    jax.grad(loss)(source.points)

@@ -81,18 +81,21 @@ def primal(tree: Any) -> Any:
 
 
 def with_derivative(values: Sequence[np.ndarray], linear: AbstractLinearMap, inputs: Sequence[Any]) -> list[jax.Array]:
-    """The values with a derivative by `inputs`, which differentiation traces; a second one raises an error."""
+    """The values with a derivative by `inputs`, which differentiation traces; an outer one raises an error."""
 
     @jax.custom_jvp
     def attached(*inputs: Any) -> list[jax.Array]:
         return [jnp.asarray(value) for value in values]
 
     def rule(inputs: tuple[Any, ...], tangents: tuple[Any, ...]) -> tuple[list[jax.Array], list[jax.Array]]:
+        # An outer differentiation, even by other inputs, would see constants.
+        for each in inputs:
+            once(each)
         found = [jnp.asarray(value) for value in values]
         moving = tuple(i for i, tangent in enumerate(tangents) if not is_symbolic_zero(tangent))
         if not moving:
             return found, [jnp.zeros_like(value) for value in found]
-        shapes = tuple(jax.typeof(once(inputs[i])) for i in moving)
+        shapes = tuple(jax.typeof(inputs[i]) for i in moving)
         slopes = _linear.bind(
             *(tangents[i] for i in moving),
             function=partial(linear.push, moving=moving),

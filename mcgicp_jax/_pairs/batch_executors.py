@@ -22,6 +22,7 @@ from typing import Any
 import jax
 import numpy as np
 
+from mcgicp_jax._compute.concrete import is_concrete
 from mcgicp_jax._compute.threads import num_cores, with_settings
 from mcgicp_jax._pairs.batch_jobs import BatchJob, Pair, PairResult
 from mcgicp_jax._registration.options import Options
@@ -47,7 +48,7 @@ def run(
     job: BatchJob, pairs: Iterator[Pair], executor: Executor | None
 ) -> Generator[tuple[int, RegistrationResult], None, None]:
     """Register the pairs and yield index and result of each as soon as it is computed; see `register_as_completed`."""
-    num_workers = num_cores()
+    num_workers, pairs = num_cores(), map(_concrete, pairs)
     if executor is None and job.uses_lanes:
         yield from map(PairResult.with_warning, job.register_in_lanes(pairs, num_workers))
     elif executor is None:
@@ -56,6 +57,15 @@ def run(
     else:
         chunk_size = 1 if isinstance(executor, ThreadPoolExecutor) else _CHUNK_SIZE
         yield from ChunkedExecutor(job, executor).run(pairs, chunk_size, _MAX_SUBMITTED)
+
+
+def _concrete(pair: Pair) -> Pair:
+    if not is_concrete(pair.source, pair.target):
+        raise ValueError(
+            f"pair {pair.index}: expected concrete arrays, got tracers; for derivatives, call register_batch outside "
+            "of jit with lists of clouds"
+        )
+    return pair
 
 
 class ChunkedExecutor:

@@ -86,7 +86,7 @@ def estimate_pose(
     softness = None if temperature is None else numpy_for(temperature).asarray(temperature, dtype)
     given = Given(source, target, method, robust, temperature=softness)
     values, init, matches = given.values(), primal(init), primal(matches)
-    if not is_concrete(values, matches, init):
+    if not is_concrete(values, matches, init, options.numbers):
         return _estimated_inside_jit(given, matches, init, options)
     estimate = partial(_estimated_on_host, values, matches, init, options)
     run = estimate() if is_concrete(given) else in_new_thread(estimate)

@@ -14,6 +14,7 @@ from jax.typing import ArrayLike
 from mcgicp_jax._clouds.preprocess import MIN_POINTS
 from mcgicp_jax._compute.argument_checks import check_integer, check_positive, is_number
 from mcgicp_jax._compute.concrete import is_concrete
+from mcgicp_jax._compute.linear_maps import primal
 from mcgicp_jax._math.robust_kernels import AbstractKernel
 from mcgicp_jax._methods.base import AbstractMethod
 from mcgicp_jax._search.base import AbstractSearch
@@ -49,6 +50,8 @@ class Options:
     reach: float = 0.0
 
     def __post_init__(self) -> None:
+        for name in ("max_distance", "translation_tolerance", "rotation_tolerance", "hold_unconstrained"):
+            object.__setattr__(self, name, primal(getattr(self, name)))
         if self.max_distance is not None:
             _check_distances(self.max_distance)
         check_integer("max_iterations", self.max_iterations, 1)
@@ -72,6 +75,11 @@ class Options:
             check_positive("voxel_sizes", size)
         if self.max_source_points is not None:
             check_integer("max_source_points", self.max_source_points, MIN_POINTS)
+
+    @property
+    def numbers(self) -> tuple[Any, ...]:
+        """The options that may be arrays, constants to autodiff."""
+        return self.max_distance, self.translation_tolerance, self.rotation_tolerance, self.hold_unconstrained
 
     def takes_raw(self, method: AbstractMethod, name: str) -> bool:
         """Whether the method makes its cells of the cloud "source" or "target" itself, of all points."""

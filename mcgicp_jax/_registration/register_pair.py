@@ -89,7 +89,7 @@ def register_pair(
     if init is None and prior is not None:
         init = prior[0]
     values, init = given.values(), primal(init)
-    if not is_concrete(values):
+    if not is_concrete(values, init, options.numbers):
         values = given
     register = partial(run_pair, values, init, options)
     # Differentiation is a transformation, too: inside it, calls of programs take longer.

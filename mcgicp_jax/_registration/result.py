@@ -16,6 +16,7 @@ from jaxtyping import Array, Float, Int
 from mcgicp_jax._clouds.origins import pose_in_user_frame
 from mcgicp_jax._compute.concrete import AnyArray, canonical_float, is_concrete
 from mcgicp_jax._compute.lazy import Held, Lazy
+from mcgicp_jax._compute.linear_maps import primal
 from mcgicp_jax._math.poses import se3
 from mcgicp_jax._pose_solver.degeneracy import Directions, UnconstrainedDirection, describe, unconstrained_directions
 
@@ -234,16 +235,17 @@ class RegistrationResult(eqx.Module):
         return unconstrained_directions(self.directions)
 
     def __repr__(self) -> str:
-        if not is_concrete(self.centred, self.history) or np.ndim(self.status_code):
+        if not is_concrete(primal(self.centred), self.history) or np.ndim(self.status_code):
             return f"RegistrationResult(batch of shape {np.shape(self.status_code)})"
+        matrix = np.asarray(primal(self.matrix))
         if np.any(self.source_origin):
             # The translation column is the motion of a far point; print the motion of the source's origin instead.
             origin = np.append(self.source_origin, 1)
-            moved, where = (np.asarray(self.matrix) @ origin - origin)[:3], "of the source's origin "
+            moved, where = (matrix @ origin - origin)[:3], "of the source's origin "
         else:
-            moved, where = np.asarray(self.matrix)[:3, 3], ""
+            moved, where = matrix[:3, 3], ""
         translation = np.array2string(moved, precision=4, suppress_small=True)
-        cosine = (np.trace(np.asarray(self.matrix)[:3, :3]) - 1) / 2
+        cosine = (np.trace(matrix[:3, :3]) - 1) / 2
         angle = np.degrees(np.arccos(np.clip(cosine, -1, 1)))
         free = describe(self.unconstrained_directions)
         return (
