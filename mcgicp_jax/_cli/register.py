@@ -181,8 +181,8 @@ def demo(output: Path = Path("mcgicp_demo"), *, all_methods: bool = False) -> in
     print(
         "Geometry does not constrain motion along a flat wall: methods that use it alone report it (degenerate) and"
         "\nkeep the initial pose along it, so in their rows of the picture the posters do not fit."
-        f"\n{enumerated([name for name in names if METHODS[name].kind.uses_channels])}"
-        "\nare constrained by the channels red, green and blue."
+        f"\n{enumerated([name for name in names if METHODS[name].kind.uses_channels])} are constrained by the channels "
+        "red, green and blue."
         f"\nThe clouds are in {output}; try: mcgicp register {source_file} {target_file}"
     )
     return 0
