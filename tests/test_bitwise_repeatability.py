@@ -4,7 +4,6 @@ import os
 import subprocess
 import sys
 
-import jax
 import numpy as np
 import pytest
 
@@ -12,7 +11,7 @@ import mcgicp_jax as mcg
 from tests.scenes import pair
 
 METHODS = {"gicp": mcg.GICP(), "mc-gicp": mcg.MultiChannelGICP()}
-# On one core: JAX, too, has other threads there.
+# On one core, where JAX, too, has other threads; and compiled there, not loaded.
 _IN_ANOTHER_PROCESS = """
 import os
 if hasattr(os, "sched_setaffinity"):
@@ -58,8 +57,9 @@ def test_in_a_batch_of_threads(name, expected):
         assert bits(result) == expected[name]
 
 
+@pytest.mark.slow  # Programs compiled without optimization depend on the number of cores, by rounding.
 def test_in_another_process(expected):
-    environment = os.environ | {"JAX_ENABLE_X64": str(int(jax.config.jax_enable_x64))}
+    environment = os.environ | {"JAX_ENABLE_COMPILATION_CACHE": "false"}
     command = [sys.executable, "-c", _IN_ANOTHER_PROCESS]
     done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=300)
     assert done.returncode == 0, done.stderr

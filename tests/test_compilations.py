@@ -100,7 +100,12 @@ def test_a_cloud_is_prepared_once(monkeypatch):
     built, described = [], []
     build, gatherer = KDTreeSearch.build, _local.gatherer
     monkeypatch.setattr(KDTreeSearch, "build", lambda self, points: built.append(len(points)) or build(self, points))
-    monkeypatch.setattr(_local, "gatherer", lambda cloud, *rest: described.append(len(cloud)) or gatherer(cloud, *rest))
+
+    def counted(cloud, *rest, **options):
+        described.append(len(cloud))
+        return gatherer(cloud, *rest, **options)
+
+    monkeypatch.setattr(_local, "gatherer", counted)
     first, second, third = (mcg.preprocess(room_corner(size, seed=size)[0]) for size in (300, 310, 320))
     built.clear()
     for _ in range(3):
