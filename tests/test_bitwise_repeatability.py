@@ -11,11 +11,7 @@ import mcgicp_jax as mcg
 from tests.scenes import pair
 
 METHODS = {"gicp": mcg.GICP(), "mc-gicp": mcg.MultiChannelGICP()}
-# On one core, where JAX, too, has other threads; and compiled there, not loaded.
 _IN_ANOTHER_PROCESS = """
-import os
-if hasattr(os, "sched_setaffinity"):
-    os.sched_setaffinity(0, [min(os.sched_getaffinity(0))])
 from tests.test_bitwise_repeatability import METHODS, bits, clouds
 import mcgicp_jax as mcg
 for method in METHODS.values():
@@ -57,8 +53,9 @@ def test_in_a_batch_of_threads(name, expected):
         assert bits(result) == expected[name]
 
 
-@pytest.mark.slow  # Programs compiled without optimization depend on the number of cores, by rounding.
+@pytest.mark.slow
 def test_in_another_process(expected):
+    """On as many cores: what XLA compiles depends on their number. Compiled anew, not loaded from the cache."""
     environment = os.environ | {"JAX_ENABLE_COMPILATION_CACHE": "false"}
     command = [sys.executable, "-c", _IN_ANOTHER_PROCESS]
     done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=300)

@@ -128,8 +128,8 @@ def global_pose(
     channels, by the means and standard deviations of the channels around it; (2) match voxels that are mutual nearest
     neighbours in these features, of which most may be wrong; (3) compute poses from triplets of matches that agree with
     each other; (4) refine them by graduated non-convexity (Yang et al. 2020); (5) verify the best by a coarse
-    registration, which uses the channels. The same clouds give the same result, to the last bit. Runs on the host, with
-    programs whose shapes do not depend on the clouds.
+    registration, which uses the channels. On one machine, the same clouds give the same result, to the last bit. Runs
+    on the host, with programs whose shapes do not depend on the clouds.
 
     Args:
         source, target: raw or preprocessed clouds, or (N, 3) arrays in metres; they may lie anywhere, in any rotation.
