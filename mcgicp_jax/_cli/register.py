@@ -5,6 +5,7 @@ from __future__ import annotations
 import sys
 import time
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Any, TypeAlias
 
@@ -34,6 +35,7 @@ from mcgicp_jax._cli.options import (
     words,
 )
 from mcgicp_jax._compute.argument_checks import errors_named
+from mcgicp_jax._compute.threads import side_by_side
 from mcgicp_jax._methods.base import AbstractMethod
 from mcgicp_jax._methods.registry import METHODS
 from mcgicp_jax._pose_solver.degeneracy import describe
@@ -176,6 +178,7 @@ def demo(output: Path = Path("mcgicp_demo"), *, all_methods: bool = False) -> in
     io.write(target_file, target.cloud)
     io.write_poses(truth_file, [np.linalg.inv(frames.path(0)) @ frames.path(1)])
     options = PairOptions(voxel_size="off", plot=output / "before_after.png")
+    check_outputs(picture=options.plot)
     names = tuple(METHODS) if all_methods else _DEMO
     _compare(source_file, target_file, options, truth_file, names)
     print(
@@ -199,11 +202,12 @@ def _compare(
     print(f"\n{'method':{width}}  {measures:>22}  iterations  time, ms  status")
     if true_pose is not None:
         print(f"{'(start)':{width}}  {pair.errors(pair.start, true_pose)}")
+    methods = _compiled(pair, names)
     for name in names:
-        if METHODS[name].kind.uses_channels and not pair.channels:
+        if name not in methods:
             print(f"{name:{width}}  left out: no channels in common")
             continue
-        method = pair.method(name)
+        method = methods[name]
         pair.register(name, method)
         begin = time.perf_counter()
         result = results[name] = pair.register(name, method)
@@ -215,6 +219,21 @@ def _compare(
     print("(times do not include compilation, preprocessing and the choice of parameters)\n")
     pair.draw(results)
     return results
+
+
+def _compiled(pair: PreparedPair, names: Sequence[MethodName]) -> dict[MethodName, AbstractMethod]:
+    """The methods that the pair has channels for, each run once so that its programs are compiled."""
+    methods: dict[MethodName, AbstractMethod] = {}
+
+    def run(uses_channels: bool) -> None:
+        for name in names:
+            if METHODS[name].kind.uses_channels == uses_channels:
+                methods[name] = pair.method(name)
+                pair.register(name, methods[name])
+
+    # Methods with and without channels share no programs.
+    side_by_side([partial(run, kind) for kind in ([True, False] if pair.channels else [False])])
+    return methods
 
 
 def _parameters(method: AbstractMethod) -> str:

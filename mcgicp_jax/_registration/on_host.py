@@ -15,6 +15,7 @@ from jaxtyping import Bool, Float, Int
 
 from mcgicp_jax._compute.blocks import map_blocks, map_rows
 from mcgicp_jax._compute.packing import Packed
+from mcgicp_jax._compute.quick_compilation import quickly_compiled
 from mcgicp_jax._local_geometry.surface import Surface, SurfaceNoise, searched
 from mcgicp_jax._math.poses import rotation_from_quaternion
 from mcgicp_jax._pose_solver.covariance import Scores, scores_of
@@ -291,7 +292,7 @@ def _no_index(position_alone: bool) -> AbstractIndex:
 def _program(function: Callable[..., Any]) -> Callable[..., Any]:
     """A function of correspondences as a compiled program for gathered rows."""
 
-    @jax.jit
+    @quickly_compiled
     def program(motion: Motion, gathered: _Gathered, *arguments: Any) -> Any:
         matched = _matched(gathered)
         return function(motion, matched.within(motion.move(matched.source.points), gathered.max_distance), *arguments)
@@ -329,7 +330,7 @@ def _combined(parts: list[Packed[Sums]]) -> Packed[Sums]:
     return Packed(table, parts[0].layout)
 
 
-@jax.jit
+@quickly_compiled
 def _update(
     pose: jaxlie.SE3,
     status: Any,
