@@ -1,6 +1,9 @@
 """Multi-Channel Generalized ICP in JAX: registration of point clouds with channels (intensity, colour, any numbers).
 
 `T_target_source` maps source coordinates into the target's frame. Units are metres and radians throughout.
+
+JAX keeps compiled programs for other processes if the environment has `JAX_COMPILATION_CACHE_DIR=folder` and
+`JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS=0`. The command line does so by itself.
 """
 
 from mcgicp_jax import datasets, io, metrics, plot

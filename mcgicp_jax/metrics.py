@@ -15,6 +15,8 @@ from jaxtyping import Array, Float
 from mcgicp_jax._compute.concrete import is_concrete
 from mcgicp_jax._math.poses import Pose, pose_matrix
 
+__all__ = ["ate", "kitti_errors", "pose_error", "rpe"]
+
 Scalar: TypeAlias = float | Float[Array, ""]
 Poses: TypeAlias = Float[np.ndarray, "N 4 4"] | Sequence[Any]
 

@@ -1,9 +1,12 @@
-"""The README is run: its snippets, in order, in one namespace."""
+"""The README is run: its snippets, in order, in one namespace. The other reference is `help`."""
 
 import pathlib
+import pydoc
 import re
 
 import pytest
+
+import mcgicp_jax as mcg
 
 README = pathlib.Path(__file__).parent.parent / "README.md"
 
@@ -27,5 +30,16 @@ def test_snippets_run_as_printed(tmp_path, monkeypatch, capsys):
 
 def test_it_is_short_and_has_two_set_up_commands():
     text = README.read_text()
-    assert 60 <= len(text.splitlines()) <= 150
+    assert 60 <= len(text.splitlines()) <= 95
+    assert max(map(len, text.splitlines())) <= 120
     assert len(re.findall(r"^pip install .*$", text, flags=re.MULTILINE)) == 2
+
+
+@pytest.mark.parametrize("name", [name for name in mcg.__all__ if callable(getattr(mcg, name))])
+def test_help_fits_on_two_screens(name):
+    """Types are printed by their names. Classes inherit up to a screen and a half of members, which come last."""
+    thing = getattr(mcg, name)
+    # Without the members of `int`.
+    lines = pydoc.plain(pydoc.render_doc(thing)).split("Methods inherited from builtins.int")[0].splitlines()
+    assert len(lines) <= (180 if isinstance(thing, type) else 100)
+    assert max(map(len, lines)) < 800

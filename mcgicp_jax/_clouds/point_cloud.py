@@ -111,9 +111,10 @@ class PointCloud(eqx.Module):
         """Create a raw cloud.
 
         Args:
-            points: (N, 3), metres: nested lists or arrays of any real dtype, NumPy or JAX. Without `channels`, also a
-                structured array with the fields x, y and z, whose other numbers become channels, or an object with
-                `points` and perhaps `colors`, such as a cloud of Open3D.
+            points: (N, 3), metres: nested lists or arrays of any real dtype, NumPy or JAX; at large (UTM) coordinates
+                float64 NumPy arrays, as float32 is too coarse there. Without `channels`, also a structured array with
+                the fields x, y and z, whose other numbers become channels, or an object with `points` and perhaps
+                `colors`, such as a cloud of Open3D.
             channels: (N, C), or (N,) for a single channel, in any unit; none by default.
             channel_valid: booleans in the shape of `channels`, False where a point lacks the channel; the value there
                 is ignored and may be NaN. None: all points have all channels.

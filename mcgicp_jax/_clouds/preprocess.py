@@ -35,7 +35,9 @@ def preprocess(
     *,
     search: AbstractSearch | None = None,
 ) -> PointCloud:
-    """Prepare a cloud for registration: drop non-finite points, downsample to voxels, find neighbours.
+    """Prepare a cloud for registration: drop points with NaN or infinity, downsample to voxels, find neighbours.
+
+    A NaN drops the point in a channel as well, unless `channel_valid` says that the channel is missing.
 
     Preprocess each cloud once and register it as often as needed. Runs on the host; not inside `jit` or `vmap`. Points,
     channels and covariances of the result can be differentiated by those of the raw cloud; voxels and neighbours are

@@ -75,9 +75,10 @@ def register_as_completed(
         init: initial T_target_source: one for all pairs, or an iterable with one per pair. None is the identity, and
             "global" the pose found by `global_pose`.
         voxel_size, num_neighbors: as in `preprocess`, for raw clouds, which the workers preprocess.
-        executor: any `concurrent.futures.Executor`, such as a `ProcessPoolExecutor` with the start method "spawn" or
-            Dask's `Client.get_executor()`; by default one thread per core. A pair whose worker dies is sent once more,
-            and gets the status `WORKER_FAILED` and a warning if that fails too.
+        executor: any `concurrent.futures.Executor`, such as a `ProcessPoolExecutor` with the start method "spawn" (its
+            start pays off with hundreds of pairs) or Dask's `Client.get_executor()`; by default one thread per core. A
+            pair whose worker dies is sent once more, and gets the status `WORKER_FAILED` and a warning if that fails
+            too.
         options: options of `register`, except for `tie_points` and `prior`. `search` is also used to preprocess; by
             default SciPy's k-d tree with one thread per pair. With `DenseSearch`, the default on accelerators, pairs
             run as lanes of one vectorised program, spread over all local devices (not with `equalize_channels` or

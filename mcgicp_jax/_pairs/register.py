@@ -50,6 +50,12 @@ def register(
     come from host callbacks, one batch element at a time (with `DenseSearch`, from XLA). The pose is the same up to
     rounding; its derivative is that of `estimate_pose` at the final matches.
 
+    The derivative is by points, channels, given covariances and given parameters; that by `init` is 0. Matches,
+    neighbours and estimated parameters are constants. α has a derivative only with soft matches: see `estimate_pose`.
+    If registration fails, the derivative is 0, never NaN, except after MAX_ITERATIONS. Outside `jit` it costs about as
+    much as the registration, for clouds of any size; inside, each size compiles for some ten seconds, so pad clouds
+    (`PointCloud.pad`). `register_batch` differentiates many pairs at once.
+
     Args:
         source, target: clouds from `preprocess`. Raw clouds and (N, 3) arrays, metres, are preprocessed with the
             defaults of `preprocess`; not inside `jit`.

@@ -162,12 +162,12 @@ class RegistrationResult(eqx.Module):
         ξ rotates about the origin of the source's coordinates. If that is far from the points, as in UTM coordinates, a
         small rotation moves the points far and the first three variances are large: use `deviations` there.
 
-        The estimate covers the noise and the sampling of the points. It does not cover a wrong local minimum, errors
-        common to all points (calibration, motion during a scan), or moving objects. An unconstrained direction gets a
-        standard deviation of 10 times the radius of the matched points; in float32, rounding then falsifies the other
-        variances. The matrix is therefore float64, except inside transformations and from `DenseSearch` in batches. NaN
-        if the status is TOO_FEW_CORRESPONDENCES or NON_FINITE, if an alignment is degenerate, or if the matches are too
-        few for an estimate.
+        The estimate covers the noise and the sampling of the points, as checked on 504 simulated pairs
+        (`tests/benchmarks`). It does not cover a wrong local minimum, errors common to all points (calibration, motion
+        during a scan), or moving objects. An unconstrained direction gets a standard deviation of 10 times the radius
+        of the matched points; in float32, rounding then falsifies the other variances. The matrix is therefore float64,
+        except inside transformations and from `DenseSearch` in batches. NaN if the status is TOO_FEW_CORRESPONDENCES or
+        NON_FINITE, if an alignment is degenerate, or if the matches are too few for an estimate.
         """
         return self.uncertainty.value.covariance
 

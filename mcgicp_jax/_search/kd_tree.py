@@ -72,7 +72,7 @@ class KDTreeSearch(AbstractTreeSearch):
 
     Attributes:
         workers: largest number of threads per registration; −1 uses all cores.
-        backend: "scipy", or "pykdtree" (the extra `fast`), which is quicker and finds the same; by default pykdtree if
+        backend: "scipy", or "pykdtree" (the extra `fast`; LGPL), which is quicker and finds the same; by default pykdtree if
             it is installed.
 
     Raises:
