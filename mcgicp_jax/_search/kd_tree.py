@@ -72,8 +72,8 @@ class KDTreeSearch(AbstractTreeSearch):
 
     Attributes:
         workers: largest number of threads per registration; −1 uses all cores.
-        backend: "scipy", or "pykdtree" (the extra `fast`; LGPL), which is quicker and finds the same; by default pykdtree
-            if it is installed.
+        backend: "scipy", or "pykdtree" (the extra `fast`; LGPL), which is quicker and finds the same; by default
+            pykdtree if it is installed.
 
     Raises:
         ValueError: if `backend` is none of these, or pykdtree is not installed.
