@@ -18,12 +18,13 @@ class ChannelFits(NamedTuple):
     Where too few neighbours have the channel, the residual is NaN and the rest 0.
 
     Attributes:
-        gradient: channel units per metre.
+        gradients: of the fits to every second neighbour, from the first and from the second on, channel units per
+            metre. Their noise is independent.
         residual: variance of the channel about the fit, channel units².
         inverse: inverse of the normal matrix (symmetric), 1/metres²: times `residual`, the covariance of the gradient.
     """
 
-    gradient: Float[AnyArray, "*batch N C 2"]
+    gradients: Float[AnyArray, "*batch N C 2 2"]
     residual: Float[AnyArray, "*batch N C"]
     inverse: Float[AnyArray, "*batch N C 3"]
 
@@ -33,16 +34,18 @@ def fit_channels(around: Neighborhoods, x: Float[Array, "k n"], y: Float[Array, 
     size = around.own.shape[1]
     gradients, residuals, inverses = [], [], []
     for channel in range(around.num_channels):
-        fit = fit_linear(x, y, around.difference(channel), around.known(channel).astype(x.dtype))
+        values, known = around.difference(channel), around.known(channel).astype(x.dtype)
+        fit = fit_linear(x, y, values, known)
+        halves = [fit_linear(*(array[first::2] for array in (x, y, values, known))).gradient for first in (0, 1)]
         enough = fit.weight > 3 if around.own_known is None else (fit.weight > 3) & around.own_known[channel]
-        gradients.append(jnp.where(enough, jnp.stack(fit.gradient), 0))
+        gradients.append(jnp.where(enough, jnp.stack([jnp.stack(half) for half in halves]), 0))
         residuals.append(jnp.where(enough, fit.residual, jnp.nan))
         inverses.append(jnp.where(enough, fit.inverse, 0))
     if not gradients:
-        return ChannelFits(*(jnp.zeros(shape, x.dtype) for shape in ((size, 0, 2), (size, 0), (size, 0, 3))))
+        return ChannelFits(*(jnp.zeros(shape, x.dtype) for shape in ((size, 0, 2, 2), (size, 0), (size, 0, 3))))
     # From (C, columns, n) to rows.
     return ChannelFits(
-        jnp.stack(gradients).transpose(2, 0, 1), jnp.stack(residuals).T, jnp.stack(inverses).transpose(2, 0, 1)
+        jnp.stack(gradients).transpose(3, 0, 1, 2), jnp.stack(residuals).T, jnp.stack(inverses).transpose(2, 0, 1)
     )
 
 

@@ -18,6 +18,10 @@ from mcgicp_jax._compute.concrete import AnyArray
 from mcgicp_jax._local_geometry.channel_fits import ChannelFits
 from mcgicp_jax._math import symmetric_matrices as alg
 
+# Fraction of the variance of a fitted gradient that is subtracted from the product of both halves: few points scatter.
+# Of 140 walls with noise for channels (400, 2,000 and 12,000 points), channels held a direction of 6; with 0, of 80.
+_MARGIN = 0.2
+
 Basis: TypeAlias = tuple[Float[Array, "3 N"], Float[Array, "3 N"]]
 
 
@@ -64,7 +68,10 @@ def channel_observability(
 
     If a point moves by x within the surface, its nearest target point in position and descriptors moves by (I + A)⁻¹ x,
     with A = Σ g gᵀ, and the residual changes by the rest, A (I + A)⁻¹ x. A / (1 + tr A) is used instead, which is equal
-    for one channel and smaller for several. The variance of the fitted gradients is subtracted from A in the numerator.
+    for one channel and smaller for several. A is the mean of g hᵀ and h gᵀ, where g and h are fitted to different
+    neighbours: their noise is independent and contributes nothing on average. (To subtract the variance of one fit from
+    its square instead subtracts the misfit at sharp edges, too: on a wall of posters the sum along a direction that
+    was known to a millimetre was negative.) Each half needs three neighbours; with fewer, the observability is 0.
 
     Args:
         weights: α, metres per channel unit.
@@ -74,14 +81,15 @@ def channel_observability(
         over the channels.
     """
     total = jnp.zeros((3, normal.shape[0]), normal.dtype)
-    uncertain, noise = total, total[0]
+    length, noise = total[0], total[0]
     for channel in range(fits.residual.shape[1]):
-        gx, gy = fits.gradient[:, channel].T
+        (gx, gy), (hx, hy) = fits.gradients[:, channel].transpose(1, 2, 0)
         square = weights[channel] ** 2
         residual = square * jnp.where(jnp.isnan(fits.residual[:, channel]), 0, fits.residual[:, channel])
-        total = total + square * jnp.stack([gx * gx, gx * gy, gy * gy])
-        uncertain = uncertain + residual * fits.inverse[:, channel].T
+        product = jnp.stack([gx * hx, 0.5 * (gx * hy + gy * hx), gy * hy])
+        total = total + square * product - _MARGIN * residual * fits.inverse[:, channel].T
+        length = length + 0.5 * square * (gx * gx + gy * gy + hx * hx + hy * hy)
         noise = noise + residual
     # The same tangent basis as in the linear fits.
     basis = alg.orthonormal_basis(normal.T)
-    return alg.embed((total - uncertain) / (1 + total[0] + total[2]), *basis), noise
+    return alg.embed(total / (1 + length), *basis), noise
