@@ -206,6 +206,27 @@ def test_control_c_is_noticed_where_python_loses_it(folder, tmp_path, capsys, mo
     assert run_folder(folder, output) == 0 and len(table(output)) == NUM_FILES - 1
 
 
+@pytest.mark.parametrize("name", ["results.csv", "results.npz"])
+def test_the_files_of_an_interrupted_run_are_no_clouds(folder, tmp_path, capsys, monkeypatch, name):
+    for path in sorted(folder.glob("*.ply"))[:3]:
+        shutil.copy(path, tmp_path)
+    (tmp_path / ".0123.tmp").write_text("left by a killed process")
+    completed = mcg.register_as_completed
+
+    def interrupted(*arguments, **options):
+        yield next(completed(*arguments, **options))
+        raise KeyboardInterrupt
+
+    command = ["batch", str(tmp_path), "--output", str(tmp_path / name), *OPTIONS]
+    monkeypatch.setattr(mcg, "register_as_completed", interrupted)
+    assert main(command) == 130
+    monkeypatch.undo()
+    capsys.readouterr()
+    assert main(command) == 0
+    assert "2, of which 1 are in" in capsys.readouterr().out
+    assert main(command) == 0
+
+
 def test_rows_of_other_options_or_files_are_not_taken_for_done(folder, tmp_path, capsys):
     scans, output = tmp_path / "scans", tmp_path / "results.csv"
     shutil.copytree(folder, scans)

@@ -248,7 +248,17 @@ def test_a_far_point_costs_no_registrations():
 def test_outputs_in_the_folder_are_no_inputs(room, tmp_path):
     for k in range(2):
         io.write(tmp_path / f"{k}.ply", room[0][k].cloud)
-    options = ["--method", "gicp", "--max-distance", "1.0", "--output", str(tmp_path / "poses.txt")]
+    io.write_poses(tmp_path / "init.txt", [np.linalg.inv(room[0][0].pose) @ room[0][k].pose for k in range(2)])
+    options = [
+        "--init",
+        str(tmp_path / "init.txt"),
+        "--method",
+        "gicp",
+        "--max-distance",
+        "1.0",
+        "--output",
+        str(tmp_path / "poses.txt"),
+    ]
     for _ in range(2):
         assert main(["multiway", str(tmp_path), *options, "--map", str(tmp_path / "map.ply")]) == 0
         assert len(io.read_poses(tmp_path / "poses.txt")) == 2

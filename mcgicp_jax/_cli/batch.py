@@ -85,8 +85,8 @@ def batch(pairs: Pairs, output: Path, method: MethodName = "mc-gicp", glob: str 
     """
     shared.check(method)
     check_outputs(output)
-    everything = _pairs_of_folder(pairs, glob, output) if pairs.is_dir() else _pairs_of_table(pairs)
     table = Table(output)
+    everything = _pairs_of_folder(pairs, glob, table) if pairs.is_dir() else _pairs_of_table(pairs)
     rows = {(row["source"], row["target"]): row for row in table.read()}
     settings = _settings(everything, method, shared)
     known = [pair for pair in everything if pair.key in rows]
@@ -183,8 +183,8 @@ def _pairs_of_table(path: Path) -> list[FilePair]:
     return _checked(path, pairs)
 
 
-def _pairs_of_folder(folder: Path, glob: str, output: Path) -> list[FilePair]:
-    names = [path.name for path in files_of(folder, glob, output)]
+def _pairs_of_folder(folder: Path, glob: str, table: Table) -> list[FilePair]:
+    names = [path.name for path in files_of(folder, glob, *table.files)]
     return _checked(folder, [FilePair(folder, source, target) for target, source in itertools.pairwise(names)])
 
 

@@ -61,7 +61,7 @@ def multiway(
     """
     check_outputs(output, graph, cloud=map, picture=plot)
     shared.check(method)
-    paths = files_of(folder, glob, output, map, graph, plot)
+    paths = files_of(folder, glob, init, output, map, graph, plot)
     if len(paths) < 2:
         raise ValueError(f"{folder}: expected at least 2 clouds {glob}, found {len(paths)}")
     check_inputs(*paths)

@@ -199,10 +199,15 @@ def check_inputs(*clouds: Path) -> None:
         path.stat()
 
 
-def files_of(folder: Path, glob: str, *outputs: Path | None) -> list[Path]:
-    """The files of a folder in order of name, without those that the command writes."""
-    written = {path.resolve() for path in outputs if path is not None}
-    return sorted(path for path in folder.glob(glob) if path.is_file() and path.resolve() not in written)
+def files_of(folder: Path, glob: str, *others: Path | None) -> list[Path]:
+    """The files of a folder in order of name, without hidden ones, such as the temporary files of a killed process.
+
+    Args:
+        others: files of the command that are no clouds, such as its outputs.
+    """
+    known = {path.resolve() for path in others if path is not None}
+    shown = (path for path in folder.glob(glob) if path.is_file() and not path.name.startswith("."))
+    return sorted(path for path in shown if path.resolve() not in known)
 
 
 def method_for(name: MethodName, options: Options, clouds: Callable[[], Sequence[mcg.PointCloud]]) -> AbstractMethod:
