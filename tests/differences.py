@@ -85,3 +85,15 @@ def check_gradient(loss, inputs):
         assert np.isfinite(actual)
         assert abs(actual - expected) <= 1e-6 * max(abs(expected), 1e-3), name
     return compiled
+
+
+def check_eager_gradient(loss, inputs, scale=1e-2):
+    """The gradient agrees with central differences along a random direction in each input, and with forward mode."""
+    gradient = jax.grad(loss)(inputs)
+    for name, actual, expected in directional_errors(loss, inputs, gradient):
+        assert abs(actual - expected) <= 1e-6 * max(abs(expected), scale), name
+    tangent = jax.tree.map(lambda leaf: jnp.asarray(np.random.default_rng(2).normal(size=leaf.shape)), inputs)
+    _, forward = jax.jvp(loss, (inputs,), (tangent,))
+    reverse = sum(jax.tree.leaves(jax.tree.map(lambda a, b: jnp.sum(a * b), gradient, tangent)))
+    np.testing.assert_allclose(forward, reverse, rtol=1e-9)
+    return gradient

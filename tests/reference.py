@@ -189,7 +189,7 @@ def multi_channel_covariances(
 ROBUST = {
     "huber": lambda s2, c: s2 if s2 <= c * c else 2 * c * np.sqrt(s2) - c * c,
     "cauchy": lambda s2, c: c * c * np.log1p(s2 / (c * c)),
-    "geman_mcclure": lambda s2, c: s2 / (1 + s2 / (c * c)),
+    "geman-mcclure": lambda s2, c: s2 / (1 + s2 / (c * c)),
     "tukey": lambda s2, c: c * c / 3 * (1 - max(0.0, 1 - s2 / (c * c)) ** 3),
     "welsch": lambda s2, c: c * c * (1 - np.exp(-s2 / (c * c))),
 }

@@ -245,3 +245,9 @@ def test_rows_of_other_options_or_files_are_not_taken_for_done(folder, tmp_path,
     os.utime(scans / "scan_1.ply", (1, 1))
     again, third = run("--robust", "huber", "0.3")
     assert again and sum(row in second for row in third) == len(first) - 2
+    for start in (np.eye(4), pose(1)):
+        pairs = write_pairs(
+            scans / "pairs.csv", [["scan_1.ply", "scan_0.ply", *start[:3].ravel()]], ("source", "target", *POSE)
+        )
+        assert main(["batch", pairs, "--output", str(tmp_path / "pairs_results.csv"), *OPTIONS]) == 0
+        assert ("registered again" in capsys.readouterr().out) == (start[0, 3] != 0)

@@ -177,6 +177,9 @@ def test_tum_frames_are_put_together_by_time(tum_folder):
     np.testing.assert_allclose(frames[0].pose[:3, :3], times(1.0).as_matrix(), atol=1e-9)
     np.testing.assert_allclose(frames[0].pose[:3, 3], [0.05, 0, 0], atol=1e-9)
     assert frames[1].pose is None
+    # Between two poses more than 0.1 s apart, the motion is not known.
+    io.write_poses(tum_folder / "groundtruth.txt", [np.eye(4)] * 2, [0.93, 1.04])
+    assert tum_rgbd(tum_folder)[0].pose is None
     (tum_folder / "groundtruth.txt").unlink()
     assert tum_rgbd(tum_folder)[0].pose is None
 

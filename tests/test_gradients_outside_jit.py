@@ -9,7 +9,17 @@ import pytest
 import mcgicp_jax as mcg
 from mcgicp_jax import Status
 from tests.compilations import compilations
-from tests.differences import CASES, GATE, TO_ROUNDING, case, clouds_with, directional_errors, inputs_of, weigh
+from tests.differences import (
+    CASES,
+    GATE,
+    TO_ROUNDING,
+    case,
+    check_eager_gradient,
+    clouds_with,
+    directional_errors,
+    inputs_of,
+    weigh,
+)
 from tests.precision import in_float64
 from tests.scenes import motion, pair, room_corner, wall
 
@@ -21,18 +31,6 @@ def clouds(noisy):
     return noisy[:2]
 
 
-def check(loss, inputs, scale=1e-2):
-    """The gradient agrees with central differences along a random direction in each input, and with forward mode."""
-    gradient = jax.grad(loss)(inputs)
-    for name, actual, expected in directional_errors(loss, inputs, gradient):
-        assert abs(actual - expected) <= 1e-6 * max(abs(expected), scale), name
-    tangent = jax.tree.map(lambda leaf: jnp.asarray(np.random.default_rng(2).normal(size=leaf.shape)), inputs)
-    _, forward = jax.jvp(loss, (inputs,), (tangent,))
-    reverse = sum(jax.tree.leaves(jax.tree.map(lambda a, b: jnp.sum(a * b), gradient, tangent)))
-    np.testing.assert_allclose(forward, reverse, rtol=1e-9)
-    return gradient
-
-
 @pytest.mark.parametrize("name", CASES)
 def test_every_input_of_every_method(name, clouds):
     method, robust = case(name)
@@ -42,18 +40,18 @@ def test_every_input_of_every_method(name, clouds):
         options = {"robust": inputs["robust"], "init": start.matrix, "max_distance": GATE, **TO_ROUNDING}
         return weigh(mcg.register(*clouds_with(inputs, *clouds), inputs["method"], **options).matrix)
 
-    check(loss, inputs_of(*clouds, method, robust))
+    check_eager_gradient(loss, inputs_of(*clouds, method, robust))
 
 
 def test_a_soft_assignment_has_gradients_by_weights_and_temperature(clouds):
-    method, robust = case("mc-gicp")
+    method, robust = mcg.ColorICP(0.3), mcg.Cauchy(0.5)
     matches = mcg.find_correspondences(*clouds, motion(), method, max_distance=GATE, num_candidates=3)
 
     def loss(inputs):
         options = {"robust": inputs["robust"], "temperature": inputs["temperature"], **TO_ROUNDING}
         return weigh(mcg.estimate_pose(*clouds_with(inputs, *clouds), matches, inputs["method"], **options).matrix)
 
-    gradient = check(loss, inputs_of(*clouds, method, robust) | {"temperature": jnp.asarray(0.1)})
+    gradient = check_eager_gradient(loss, inputs_of(*clouds, method, robust) | {"temperature": jnp.asarray(0.1)})
     assert gradient["method"].channel_weights != 0 and gradient["temperature"] != 0
 
 
@@ -84,7 +82,9 @@ def test_given_covariances(clouds):
         )
 
     names = ("source points", "source covariances", "target covariances")
-    check(loss, {name: value for name, value in inputs_of(source, target, None, None).items() if name in names})
+    check_eager_gradient(
+        loss, {name: value for name, value in inputs_of(source, target, None, None).items() if name in names}
+    )
 
 
 def test_tie_points_and_a_prior(clouds):
@@ -96,14 +96,14 @@ def test_tie_points_and_a_prior(clouds):
         ties = inputs["tie source"], inputs["tie target"], inputs["tie variance"] * jnp.tile(jnp.eye(3), (5, 1, 1))
         pose = jaxlie.SE3.from_matrix(motion()) @ jaxlie.SE3.exp(inputs["prior twist"])
         prior = pose, inputs["prior variance"] * jnp.eye(6)
-        return weigh(
-            mcg.register(*clouds, mcg.GICP(), tie_points=ties, prior=prior, max_distance=GATE, **TO_ROUNDING).matrix
-        )
+        options = {"tie_points": ties, "prior": prior, "max_distance": 0.15, **TO_ROUNDING}
+        return weigh(mcg.register(*clouds, mcg.PointToPoint(), **options).matrix)
 
-    target = points @ motion()[:3, :3].T + motion()[:3, 3] + 0.01
+    # So far off that fewer points are matched than without: the unit of length is not that of the first registration.
+    target = points @ motion()[:3, :3].T + motion()[:3, 3] + 0.05
     inputs = {"tie source": points, "tie target": target, "tie variance": 1e-3}
     inputs |= {"prior twist": np.zeros(6), "prior variance": 1e-3}
-    check(loss, jax.tree.map(jnp.asarray, inputs))
+    check_eager_gradient(loss, jax.tree.map(jnp.asarray, inputs))
 
 
 def test_gains_of_equalized_channels_are_constants(clouds):
@@ -205,7 +205,9 @@ def test_several_blocks_of_rows():
         return weigh(mcg.estimate_pose(*clouds_with(inputs, source, target), matches, method, **TO_ROUNDING).matrix)
 
     names = ("source points", "target channels")
-    check(loss, {name: value for name, value in inputs_of(source, target, None, None).items() if name in names})
+    check_eager_gradient(
+        loss, {name: value for name, value in inputs_of(source, target, None, None).items() if name in names}
+    )
 
 
 def test_a_ragged_batch_has_the_gradients_of_its_pairs():
@@ -298,7 +300,7 @@ def test_options_are_constants_wherever_they_come_from(clouds):
 
     def pose(points, **options):
         cloud = source.replace(points=points)
-        return mcg.register(cloud, target, mcg.GICP(), **({"max_distance": GATE} | options)).matrix[0, 3]
+        return mcg.register(cloud, target, mcg.PointToPoint(), **({"max_distance": GATE} | options)).matrix[0, 3]
 
     expected = jax.grad(pose)(source.points)
     for name, value in (("max_distance", GATE), ("rotation_tolerance", 5e-4), ("init", np.eye(4))):

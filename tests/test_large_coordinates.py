@@ -69,6 +69,13 @@ def test_register_from_raw_clouds_and_arrays(near):
     assert pose_error(mcg.register(*points, mcg.GICP(), max_distance=0.5).matrix, UTM_TRUTH, at=UTM)[0] < 1e-2
 
 
+@pytest.mark.parametrize("method", [mcg.GICP(), mcg.PointToPlane()])
+def test_other_methods(method):
+    near, far = (mcg.register(*scene(offset), method, max_distance=0.5) for offset in (np.zeros(3), UTM))
+    assert far.converged
+    assert_as_near(far.matrix, near)
+
+
 def test_where_only_one_cloud_is_far(near):
     source, target = scene(np.zeros(3))[0], scene(UTM)[1]
     result = mcg.register(source, target, mcg.MultiChannelGICP(), init=TO_UTM, max_distance=0.5)
@@ -88,10 +95,13 @@ def test_a_batch(search, near):
 def test_inside_a_transformation():
     @jax.jit
     def pose(source, target):
-        return mcg.register(source, target, mcg.GICP(), max_distance=0.5)
+        result = mcg.register(source, target, mcg.GICP(), max_distance=0.5)
+        return result, result.matrix
 
     # The pose is refined there, so its like is one that is, too.
-    near, far = (pose(*(mcg.preprocess(cloud) for cloud in scene(offset))) for offset in (np.zeros(3), UTM))
+    (near, _), (far, matrix) = (pose(*map(mcg.preprocess, scene(offset))) for offset in (np.zeros(3), UTM))
+    # Inside, positions of 5,000 km have steps of half a metre.
+    np.testing.assert_allclose(matrix, far.matrix, atol=1)
     assert far.converged
     assert_as_near(far.matrix, near)
 

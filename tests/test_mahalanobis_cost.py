@@ -13,13 +13,11 @@ from mcgicp_jax import (
     Cauchy,
     ColorICP,
     Correspondences,
-    GemanMcClure,
     Huber,
     MultiChannelGICP,
     PointCloud,
     PointToPlane,
     PointToPoint,
-    Tukey,
     find_correspondences,
     mahalanobis_cost,
     preprocess,
@@ -27,6 +25,7 @@ from mcgicp_jax import (
 from mcgicp_jax._methods.surfaces import surface_pair
 from mcgicp_jax._pose_solver.matched import Motion, match_surfaces
 from mcgicp_jax._pose_solver.sums import sums_of
+from mcgicp_jax.extend import KERNELS
 from tests import reference as ref
 from tests.precision import cached, in_both_precisions, in_float64, tolerance
 
@@ -35,7 +34,6 @@ N, K, ROWS = 150, 12, 160
 EPSILON, FLOOR, REGULARISATION = 0.02, 1e-3, 1e-6
 LAMBDA = np.array([[0.5, 0.2, 0.0], [0.2, 0.4, -0.1], [0.0, -0.1, 0.6]])
 T = ref.pose([0.05, -0.08, 0.1], [0.03, 0.05, -0.04])
-KERNELS = {"huber": Huber, "cauchy": Cauchy, "geman_mcclure": GemanMcClure, "tukey": Tukey}
 SCALE = 0.4
 METHODS = {
     "PointToPoint": PointToPoint,

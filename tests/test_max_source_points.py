@@ -11,21 +11,16 @@ from mcgicp_jax.__main__ import main
 from mcgicp_jax._cli.options import Options
 from mcgicp_jax._math.statistics import spread_rows
 from mcgicp_jax._registration import on_host
-from tests.differences import GATE, TO_ROUNDING, inputs_of, weigh
+from tests.differences import GATE, TO_ROUNDING, check_eager_gradient, inputs_of, weigh
+from tests.precision import in_float64
 from tests.scenes import covariances, motion, pair, room_corner
-from tests.test_gradients_outside_jit import check
 
-
-@pytest.fixture(scope="module", autouse=True)
-def in_float64():
-    with jax.enable_x64(True):
-        yield
+pytestmark = in_float64
 
 
 @pytest.fixture(scope="module")
-def clouds(in_float64):
-    source, target, _ = pair(size=400, noise=0.05, channel_noise=0.05)
-    return source, target
+def clouds(noisy):
+    return noisy[:2]
 
 
 @pytest.mark.parametrize(("size", "count"), [(10, 4), (1000, 999), (34_000, 10_000), (3_000_000, 70_000)])
@@ -129,7 +124,7 @@ def test_the_gradient_is_that_of_differences(clouds, method):
         return weigh(mcg.register(*moved, inputs["method"], init=start.matrix, **options).matrix)
 
     inputs = inputs_of(source, target, method, None)
-    gradient = check(loss, inputs)
+    gradient = check_eager_gradient(loss, inputs)
     used = np.zeros(400, bool)
     used[spread_rows(source.valid, 150)] = True
     others = np.abs(np.asarray(gradient["source points"]))[~used].sum(axis=1)

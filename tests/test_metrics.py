@@ -217,7 +217,8 @@ def test_relative_errors_are_pose_errors_of_the_motions(delta):
     assert len(translation) == len(rotation) == 8 - delta
 
 
-def test_kitti_errors_by_their_definition():
+@pytest.mark.parametrize("step", [10, 7])
+def test_kitti_errors_by_their_definition(step):
     rng = np.random.default_rng(2)
     truth = walk(rng, 120, step=0.7)
     noisy = disturbed(rng, truth)
@@ -225,7 +226,7 @@ def test_kitti_errors_by_their_definition():
     for before, after in itertools.pairwise(truth):
         along.append(along[-1] + np.linalg.norm(after[:3, 3] - before[:3, 3]))
     percent, degrees = [], []
-    for first in range(0, 120, 10):
+    for first in range(0, 120, step):
         for length in (5, 20, 60):
             last = next((i for i in range(first, 120) if along[i] > along[first] + length), None)
             if last is not None:
@@ -233,13 +234,14 @@ def test_kitti_errors_by_their_definition():
                 translation, rotation = pose_error(*motions)
                 percent.append(100 * translation / length)
                 degrees.append(np.rad2deg(rotation) / length)
-    got = kitti_errors(noisy, truth, lengths=(5.0, 20.0, 60.0))
+    got = kitti_errors(noisy, truth, lengths=(5.0, 20.0, 60.0), step=step)
     assert got == pytest.approx((np.mean(percent), np.mean(degrees)), rel=1e-9)
-    # A scale that is 2 % wrong is 2 % of the length, but for the last step's excess.
+    # A scale that is 2 % wrong is 2 % of the length; the first frame further than 100 m is 101 m away.
     straight = np.array([pose([0, 0, 0], [i, 0, 0]) for i in range(1000)])
     stretched = straight.copy()
     stretched[:, :3, 3] *= 1.02
     assert kitti_errors(stretched, straight) == pytest.approx((2.0, 0), rel=0.01)
+    assert kitti_errors(stretched, straight, lengths=(100.0,)) == pytest.approx((2.02, 0), abs=1e-9)
 
 
 def test_wrong_trajectories_are_refused_by_name():

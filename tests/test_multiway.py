@@ -1,5 +1,7 @@
 """Edges from registrations, loops of a sensor, and many clouds registered with each other."""
 
+from concurrent.futures import ThreadPoolExecutor
+
 import numpy as np
 import pytest
 
@@ -239,7 +241,9 @@ def test_a_far_point_costs_no_registrations():
     points = np.array(clouds[1].points)
     points[0] = 1e8
     clouds[1] = mcg.PointCloud(points, clouds[1].channels, channel_names=clouds[0].channel_names)
-    found = mcg.multiway(clouds, mcg.GICP(), max_distance=1.0)
+    with ThreadPoolExecutor(1) as threads:
+        found = mcg.multiway(clouds, mcg.GICP(), max_distance=1.0, executor=threads)
+    assert threads._threads
     assert np.isfinite(found.poses).all() and len(found.registrations) >= 2
     with pytest.raises(ValueError, match=r"clouds\[1\]: .* voxels of"):
         _ = found.map

@@ -1,5 +1,6 @@
 """The photometric term: residuals, estimates, gradients, and what it does for a pose."""
 
+from dataclasses import replace
 from typing import Any
 
 import jax
@@ -140,6 +141,20 @@ def test_forces_are_the_gradient_of_the_cost():
     change = jax.jit(lambda moved: jax.jvp(lambda moved: of(moved, "force"), (moved,), (axis,))[1])(moved)
     stiffness = jax.jit(lambda moved: of(moved, "stiffness"))(moved)
     np.testing.assert_allclose(np.sum(stiffness[0]), -np.sum(change[0]), rtol=0.15)
+
+
+def test_gains_and_offsets_apply_to_values_and_slopes():
+    source, target, truth, matches = at_truth()
+    _, term = held(source, target, PHOTOMETRIC, truth, matches)
+    darker = source.replace(channels=np.float32(0.7) * source.channels - np.float32(0.2))
+    brighter = replace(term, gains=term.gains / 0.7, offsets=term.offsets + 0.2 / 0.7)
+    samples = []
+    for cloud, each in ((source, term), (darker, brighter)):
+        matched, _, motion = matched_at(cloud, target, PHOTOMETRIC, truth, matches)
+        samples.append(each.sample(matched.at(motion)))
+    for name in ("values", "slopes", "products"):
+        expected, found = (np.asarray(getattr(each, name)) for each in samples)
+        np.testing.assert_allclose(found, expected, atol=1e-3 * np.nanmax(np.abs(expected)), err_msg=name)
 
 
 def test_estimates_are_scales_and_correlations_of_the_residuals():

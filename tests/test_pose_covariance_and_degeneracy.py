@@ -11,6 +11,7 @@ from scipy.spatial.transform import Rotation
 import mcgicp_jax as mcg
 from mcgicp_jax import datasets
 from mcgicp_jax._math import symmetric_matrices as cov
+from mcgicp_jax._pose_solver.covariance import Moments, response_and_scatter
 from mcgicp_jax._pose_solver.degeneracy import find_directions
 from mcgicp_jax._pose_solver.sums import Sums
 from tests.precision import in_float64
@@ -152,7 +153,7 @@ def test_the_channels_hold_what_geometry_leaves_free(flat):
     result = mcg.register(source, target, mcg.MultiChannelGICP(), max_distance=0.3)
     assert result.converged and len(result.unconstrained_directions) == 3
     assert all(direction.held_by_channels for direction in result.unconstrained_directions)
-    assert mcg.metrics.pose_error(result.matrix, truth)[0] < 0.01
+    assert mcg.metrics.pose_error(result.matrix, truth)[0] < 3e-3
     assert repr(result).count("constrained by channels: all") == 1
 
 
@@ -252,6 +253,13 @@ def test_the_pose_takes_six_degrees_of_freedom_of_few_correspondences():
         variances[number] = np.diagonal(found.covariance)
     np.testing.assert_allclose(variances[10] / variances[20], 14 / 4, rtol=1e-6)
     np.testing.assert_allclose(variances[20] / variances[50], 44 / 14, rtol=1e-6)
+
+
+def test_the_bias_of_matching_is_one_more_score():
+    root, bias = np.random.default_rng(0).normal(size=(6, 6)), np.arange(1.0, 7.0)
+    moments = Moments(jnp.zeros((6, 4, 4)), bias, root @ root.T, np.int32(10))
+    _, scatter = response_and_scatter(moments, jnp.asarray(1.0))
+    np.testing.assert_allclose(scatter, 10 / 4 * root @ root.T + np.outer(bias, bias), rtol=1e-5)
 
 
 def test_the_covariance_is_a_covariance():

@@ -305,6 +305,10 @@ def test_a_loop_is_rejected_only_beyond_its_own_uncertainty_and_that_of_the_othe
     np.testing.assert_allclose(terms.squares[5:], squares)
     again = outliers._wrongly_rejected(equations, Minimum(poses, terms), 1.0 * (np.arange(10) < 5))
     np.testing.assert_array_equal(again, [5, 6])
+    # Without the edge to the fourth pose, nothing contradicts the loop to it.
+    used = np.isin(np.arange(10), [0, 1, 2, 4])
+    again = outliers._wrongly_rejected(equations.restricted(used), Minimum(poses, terms), 1.0 * used)
+    np.testing.assert_array_equal(again, [5, 6, 8])
     # Rejected at first, these two are kept in the end, and half of what contradicts is left in both edges.
     monkeypatch.setattr(outliers, "truncated_weights", lambda ratio, _: 1.0 * (ratio >= 1))
     found = mcg.optimize_poses(mcg.PoseGraph(poses, edges))

@@ -88,14 +88,6 @@ def test_four_noisy_starts_reach_one_pose(name, room):
     assert max(difference(pose, poses[0]) for pose in poses) < 1e-3
 
 
-def test_the_channels_hold_what_geometry_does_not():
-    source, target, truth = pair(wall, truth=motion((0.05, -0.04, 0.01, 0.002, 0.003, 0.02)))
-    geometry = mcg.register(source, target, mcg.GICP(), max_distance=0.2)
-    channels = mcg.register(source, target, mcg.MultiChannelGICP(), max_distance=0.2)
-    assert channels.converged
-    assert pose_error(channels.matrix, truth)[0] < 3e-3 < 3e-2 < pose_error(geometry.matrix, truth)[0]
-
-
 def test_the_result_belongs_to_the_returned_pose(room):
     source, target, _ = room
     method = METHODS["mc-gicp"]()
@@ -213,35 +205,6 @@ def test_identical_clouds_converge_at_once(room):
     result = mcg.register(source, source, METHODS["mc-gicp"](), max_distance=0.5)
     assert result.converged and result.num_iterations == 1
     np.testing.assert_allclose(result.matrix, np.eye(4), atol=1e-6)
-
-
-@pytest.mark.parametrize("name", ["gicp", "mc-gicp", "point-to-plane"])
-def test_large_coordinates_lose_nothing(name):
-    utm = np.array([4.5e5, 5.2e6, 300.0])
-    truth = motion()
-    points, channels = room_corner(2000, seed=1)
-    target_points, target_channels = room_corner(2000, seed=2)
-    points = (points - truth[:3, 3]) @ truth[:3, :3]
-    near = mcg.register(
-        mcg.preprocess(mcg.PointCloud(points, channels)),
-        mcg.preprocess(mcg.PointCloud(target_points, target_channels)),
-        METHODS[name](),
-        max_distance=0.5,
-    )
-    shift = motion((*utm, 0, 0, 0))
-    far = mcg.register(
-        mcg.preprocess(mcg.PointCloud(points + utm, channels)),
-        mcg.preprocess(mcg.PointCloud(target_points + utm, target_channels)),
-        METHODS[name](),
-        max_distance=0.5,
-    )
-    assert far.converged and far.matrix.dtype == np.float64
-    unshifted = np.linalg.inv(shift) @ far.matrix @ shift
-    # A rotation of float32 carries 6e-8 rad to 5,000 km; what counts is where the cloud itself goes.
-    cloud = np.c_[points + utm, np.ones(len(points))]
-    expected = np.c_[points, np.ones(len(points))] @ near.matrix.T
-    assert np.abs((cloud @ far.matrix.T - expected)[:, :3] - utm).max() < 1e-4
-    assert np.abs(unshifted[:3, :3] - near.matrix[:3, :3]).max() < 1e-5
 
 
 # --- Input

@@ -54,6 +54,8 @@ def test_counts():
     cells = extend.voxel_cells(points, SIZE)
     np.testing.assert_array_equal(counts, np.unique(cells[cells >= 0], return_counts=True)[1])
     np.testing.assert_array_equal(cloud.points, mcg.voxel_gaussians(points, SIZE).points)
+    fuller = mcg.voxel_gaussians(points, SIZE, min_points=20)
+    assert len(fuller) == extend.voxel_cells(points, SIZE, min_points=20).max() + 1 == np.sum(counts >= 20) < len(cloud)
 
 
 def test_flat_cells_are_kept():
@@ -125,9 +127,9 @@ def test_covariances_in_square_metres_beside_those_of_gicp():
 def test_moments_in_jax():
     points, channels = room_corner(3000)
     cloud = mcg.PointCloud(points, channels)
-    cells, expected = extend.voxel_cells(cloud, SIZE), mcg.voxel_gaussians(cloud, SIZE)
+    cells, expected = extend.voxel_cells(cloud, SIZE), mcg.voxel_gaussians(cloud, SIZE, min_ratio=0.1)
     dtype = expected.points.dtype
-    moments = jax.jit(lambda points, channels: extend.cell_moments(points, channels, cells))
+    moments = jax.jit(lambda points, channels: extend.cell_moments(points, channels, cells, min_ratio=0.1))
     means, values, covariances = moments(points.astype(dtype), channels.astype(dtype))
     assert means.dtype == covariances.dtype == dtype
     atol = tolerance(2e-6, 1e-12)
