@@ -241,12 +241,18 @@ def test_a_far_point_costs_no_registrations():
     points = np.array(clouds[1].points)
     points[0] = 1e8
     clouds[1] = mcg.PointCloud(points, clouds[1].channels, channel_names=clouds[0].channel_names)
-    with ThreadPoolExecutor(1) as threads:
-        found = mcg.multiway(clouds, mcg.GICP(), max_distance=1.0, executor=threads)
-    assert threads._threads
+    found = mcg.multiway(clouds, mcg.GICP(), max_distance=1.0)
     assert np.isfinite(found.poses).all() and len(found.registrations) >= 2
     with pytest.raises(ValueError, match=r"clouds\[1\]: .* voxels of"):
         _ = found.map
+
+
+def test_pairs_that_are_given_are_registered_by_the_executor():
+    clouds = [frame.cloud for frame in datasets.box_room(3, points_per_frame=800)]
+    with ThreadPoolExecutor(1) as threads:
+        start = [np.eye(4)] * 3
+        found = mcg.multiway(clouds, mcg.GICP(), [(0, 1), (0, 2)], init=start, max_distance=1.0, executor=threads)
+    assert threads._threads and found.registrations.keys() == {(0, 1), (0, 2)}
 
 
 def test_outputs_in_the_folder_are_no_inputs(room, tmp_path):
