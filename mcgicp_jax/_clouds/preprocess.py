@@ -252,7 +252,8 @@ def _downsampled(cloud: PointCloud, voxel_size: float) -> PointCloud:
 
 def _far_origin(points: Float[np.ndarray, "N 3"]) -> Float[np.ndarray, "3"]:
     """Offset to subtract: the cloud's centre if `is_far` from zero, else zero."""
-    low, high = points.min(axis=0).astype(np.float64), points.max(axis=0).astype(np.float64)
+    columns = np.ascontiguousarray(points.T)
+    low, high = columns.min(axis=1).astype(np.float64), columns.max(axis=1).astype(np.float64)
     center = 0.5 * (low + high)
     # Rounded to float32, so that the origin has the same value inside a transformation.
     center = center.astype(np.float32).astype(np.float64)

@@ -48,7 +48,8 @@ def side_by_side(calls: Sequence[Callable[[], Answer]], max_threads: int | None 
             answers[i] = call()
 
     # On a single core, other threads would only take turns with this one.
-    count = min(len(calls), max_threads or len(calls)) - 1 if num_cores() > 1 else 0
+    count = min(len(calls), max_threads or len(calls)) - 1
+    count = count if count and num_cores() > 1 else 0
     elsewhere = with_settings(work) if count else work
     helpers = [_submit(elsewhere) for _ in range(count)]
     try:

@@ -5,6 +5,7 @@ A twist ξ = (v, ω) is a small motion: v in metres (or in units of a radius), �
 
 from __future__ import annotations
 
+import math
 from functools import partial
 from typing import TYPE_CHECKING, Any, TypeAlias
 
@@ -156,9 +157,13 @@ def cast_pose(pose: jaxlie.SE3, dtype: DTypeLike) -> jaxlie.SE3:
 
 def rotation_from_quaternion(wxyz: Float[np.ndarray, "*batch 4"]) -> Float[np.ndarray, "*batch 3 3"]:
     """Rotation matrices of quaternions, in the precision of the input: jaxlie would use float32 where x64 is off."""
-    unit = (wxyz / np.sqrt(np.sum(wxyz * wxyz, axis=-1, keepdims=True))).T
-    # Python's floats are float64, and ten times as fast as NumPy's scalars.
-    w, x, y, z = unit.tolist() if unit.ndim == 1 and unit.dtype == np.float64 else unit
+    if wxyz.ndim == 1 and wxyz.dtype == np.float64:
+        # Python's floats are float64, and ten times as fast as NumPy's scalars.
+        w, x, y, z = wxyz.tolist()
+        norm = math.sqrt(w * w + x * x + y * y + z * z)
+        w, x, y, z = (w / norm, x / norm, y / norm, z / norm) if norm else [math.nan] * 4
+    else:
+        w, x, y, z = (wxyz / np.sqrt(np.sum(wxyz * wxyz, axis=-1, keepdims=True))).T
     rows = [
         [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
         [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],

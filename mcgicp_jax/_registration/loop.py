@@ -28,7 +28,6 @@ from mcgicp_jax._local_geometry.surface import Surface, searched
 from mcgicp_jax._pose_solver.adaptation import adapted, sample_of_term
 from mcgicp_jax._pose_solver.covariance import Scores
 from mcgicp_jax._pose_solver.matched import Motion
-from mcgicp_jax._pose_solver.sums import Sums
 from mcgicp_jax._registration.step import Problem, State, update
 from mcgicp_jax._terms.base import AbstractTerm, is_adaptive
 
@@ -129,10 +128,10 @@ class AbstractExecutor(abc.ABC):
         """
 
     @abc.abstractmethod
-    def sums(self, motion: Motion, matches: Any, terms: tuple[AbstractTerm, ...]) -> Sums:
-        """`sums_of` all correspondences."""
+    def sums(self, motion: Motion, matches: Any, terms: tuple[AbstractTerm, ...]) -> Any:
+        """`sums_of` all correspondences, as the executor keeps them while the loop runs."""
 
-    def update(self, state: State, sums: Sums) -> State:
+    def update(self, state: State, sums: Any) -> State:
         """The state after an update of the pose, without the sums."""
         problem = self.problem
         return update(state.pose, state.status, state.num_iterations, sums, problem.settings, problem.fusion)

@@ -120,8 +120,6 @@ class HostExecutor(AbstractExecutor):
         self._source = self._whole
         self._nearest: Callable[[Any], Int[np.ndarray, "m N"]]
         self._settings = Packed.of(problem.settings, num_axes=0)
-        # The last sums.
-        self._sums: Packed[Sums]
 
     def begin(self) -> LoopResult:
         state = State(self.problem.start, np.asarray(self.first_status), np.int32(0))
@@ -130,7 +128,8 @@ class HostExecutor(AbstractExecutor):
     def repeat(self, step: Callable[[LoopResult], LoopResult], loop: LoopResult) -> LoopResult:
         while loop.state.status < 0:
             loop = step(loop)
-        return loop._replace(history=jax.tree.map(lambda *entries: np.stack(entries), *loop.history))
+        history = Record(*map(np.stack, zip(*loop.history, strict=True)))
+        return loop._replace(state=loop.state._replace(sums=loop.state.sums.tree), history=history)
 
     def record(self, history: Any, state: State) -> list[Record]:
         return [*history, state.record]
@@ -209,16 +208,13 @@ class HostExecutor(AbstractExecutor):
 
         return map_rows(block, rows.size, self.num_threads if with_noise else 1)
 
-    def sums(self, motion: Motion, matches: _Matches, terms: tuple[AbstractTerm, ...]) -> Sums:
+    def sums(self, motion: Motion, matches: _Matches, terms: tuple[AbstractTerm, ...]) -> Packed[Sums]:
+        # Packed until the loop ends: to pass and to return dozens of arrays takes longer than to use them.
         parts: list[Packed[Sums]] = self._over_blocks(_packed_sums, motion, matches, terms)
-        self._sums = parts[0] if len(parts) == 1 else _combined(parts)
-        return self._sums.tree
+        return parts[0] if len(parts) == 1 else _combined(parts)
 
-    def update(self, state: State, sums: Sums) -> State:
-        # With the packed sums: to pass and to return dozens of arrays takes longer than to use them.
-        updated = _update(
-            state.pose, state.status, state.num_iterations, self._sums, self._settings, self.problem.fusion
-        )
+    def update(self, state: State, sums: Packed[Sums]) -> State:
+        updated = _update(state.pose, state.status, state.num_iterations, sums, self._settings, self.problem.fusion)
         return Packed(np.asarray(updated.table), updated.layout).tree
 
     def scores(self, motion: Motion, matches: _Matches, *arguments: Any) -> Scores:

@@ -100,6 +100,9 @@ class AbstractIndex(abc.ABC):
 class AbstractSearch(eqx.Module):
     """An algorithm for nearest-neighbour search."""
 
+    # As in `PointCloud`.
+    __getattribute__ = object.__getattribute__
+
     @property
     def num_threads(self) -> int | None:
         """Largest number of host threads that one registration may use; None for no limit."""
