@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import jax
 import jax.numpy as jnp
 import jaxlie
@@ -10,7 +12,8 @@ from jaxtyping import Array
 
 from mcgicp_jax._clouds.point_cloud import PointCloud
 from mcgicp_jax._compute.concrete import is_concrete
-from mcgicp_jax._math.poses import Pose, matrices_of, pose_matrix, rotation_from_quaternion
+from mcgicp_jax._compute.linear_maps import AbstractLinearMap, primal, with_derivative
+from mcgicp_jax._math.poses import Pose, matrices_of, pose_matrix, rotation_from_quaternion, turn_by_quaternion
 
 
 def centred_pose(pose: Pose | None, source: PointCloud, target: PointCloud, name: str = "init") -> Array | np.ndarray:
@@ -37,17 +40,44 @@ def centred_pose(pose: Pose | None, source: PointCloud, target: PointCloud, name
 def pose_in_user_frame(
     centred: jaxlie.SE3, source_origin: Array | np.ndarray, target_origin: Array | np.ndarray
 ) -> Array | np.ndarray:
-    """T(o_t) · T · T(−o_s) as (4, 4), with translations T(o) by the origins; float64 NumPy for concrete arrays."""
-    if is_concrete(centred, source_origin, target_origin):
-        parameters = np.asarray(centred.wxyz_xyz, np.float64)
-        rotation = rotation_from_quaternion(parameters[..., :4])
-        # Origins returned by `jit` are float32 (exactly so); the arithmetic with them must be float64.
-        start, end = np.asarray(source_origin, np.float64), np.asarray(target_origin, np.float64)
-        offset = end - start - np.einsum("...ij,...j->...i", rotation - np.eye(3), start)
-        matrix = matrices_of(parameters)
-        matrix[..., :3, 3] += offset
+    """T(o_t) · T · T(−o_s) as (4, 4), with translations T(o) by the origins, which are constants outside `jit`; float64
+    NumPy for concrete arrays."""
+    values = primal((centred.wxyz_xyz, source_origin, target_origin))
+    if not is_concrete(values):
+        return _in_user_frame(centred, source_origin, target_origin)
+    # Origins returned by `jit` are float32 (exactly so); the arithmetic with them must be float64.
+    parameters, start, end = (np.asarray(value, np.float64) for value in values)
+    rotation = rotation_from_quaternion(parameters[..., :4])
+    matrix = matrices_of(parameters)
+    matrix[..., :3, 3] += end - start - np.einsum("...ij,...j->...i", rotation - np.eye(3), start)
+    if is_concrete(centred):
         return matrix
-    return _in_user_frame(centred, source_origin, target_origin)
+    derivative = _MatrixByParameters(parameters, rotation, start)
+    (traced,) = with_derivative([matrix.astype(centred.wxyz_xyz.dtype)], derivative, [centred.wxyz_xyz])
+    return traced
+
+
+class _MatrixByParameters(AbstractLinearMap):
+    """The derivative of `pose_in_user_frame` by `wxyz_xyz`, which compiles nothing.
+
+    Args:
+        parameters, rotation: of the pose.
+        start: origin of the source.
+    """
+
+    def __init__(self, parameters: np.ndarray, rotation: np.ndarray, start: np.ndarray):
+        turn = turn_by_quaternion(parameters[..., :4])
+        self._slopes = np.zeros((*parameters.shape[:-1], 4, 4, 7))
+        turned = np.cross(turn[..., :, None, :], rotation[..., None], axisa=-3, axisb=-3, axisc=-3)
+        self._slopes[..., :3, :3, :4] = turned
+        self._slopes[..., :3, 3, :4] = -np.einsum("...ijp,...j->...ip", turned, start)
+        self._slopes[..., :3, 3, 4:] = np.eye(3)
+
+    def push(self, tangents: Sequence[np.ndarray], moving: tuple[int, ...]) -> list[np.ndarray]:
+        return [np.einsum("...ijp,m...p->m...ij", self._slopes, tangents[0])]
+
+    def pull(self, cotangents: Sequence[np.ndarray], moving: tuple[int, ...]) -> list[np.ndarray]:
+        return [np.einsum("...ijp,m...ij->m...p", self._slopes, cotangents[0])]
 
 
 @jax.jit

@@ -173,6 +173,12 @@ def rotation_from_quaternion(wxyz: Float[np.ndarray, "*batch 4"]) -> Float[np.nd
     return np.array(rows).swapaxes(0, 1).T
 
 
+def turn_by_quaternion(wxyz: Float[np.ndarray, "*batch 4"]) -> Float[np.ndarray, "*batch 3 4"]:
+    """Derivative of the rotation vector in the axes of the target, the vector part of 2 δq q*, by a unit quaternion."""
+    w, vector = wxyz[..., :1, None], wxyz[..., 1:]
+    return 2 * np.concatenate([-vector[..., None], w * np.eye(3) + np.cross(np.eye(3), vector[..., None, :])], axis=-1)
+
+
 def move_pose(pose: jaxlie.SE3, twist: Float[Array, "6"], center: Float[Array, "3"]) -> jaxlie.SE3:
     """The pose that maps a to c + exp(ω)(T a − c) + v; v in metres, ω in radians."""
     turn = jaxlie.SO3.exp(twist[3:])

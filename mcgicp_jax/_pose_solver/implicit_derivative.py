@@ -151,23 +151,20 @@ def value_and_jacobian(
 
 
 def _balance(twist: Float[Array, "6"], pose: Float[Array, "7"], root: ImplicitRoot, model: Model) -> Float[Array, "6"]:
-    """g / scale at a pose moved along a twist, see `score_along`; with tie points or a prior, `Fusion.balance`."""
+    """`score_at` a pose moved to first order along a twist (in units of the radius); with tie points or a prior,
+    `Fusion.balance`."""
     matched, terms, fusion = model
-    score = score_along(twist, pose, root, matched, terms)
+    score = score_at(_moved(twist, pose, root), root, matched, terms)
     return score if fusion is None else balance_along(twist, pose, root, score, fusion)
 
 
-def score_along(
-    twist: Float[Array, "6"],
-    pose: Float[Array, "7"],
-    root: ImplicitRoot,
-    matched: Matched,
-    terms: tuple[AbstractTerm, ...],
+def score_at(
+    motion: Motion, root: ImplicitRoot, matched: Matched, terms: tuple[AbstractTerm, ...]
 ) -> Float[Array, "6"]:
-    """g / scale, sums of forces and torques, at a pose moved to first order along a twist (in units of the radius)."""
+    """g / scale, sums of forces and torques."""
     # Without a usable root, ignoring all correspondences keeps values and derivatives finite.
     matched = eqx.tree_at(lambda matched: matched.valid, matched, matched.valid & root.usable)
-    posed, found, _ = linearize_at(_moved(twist, pose, root), matched, terms)
+    posed, found, _ = linearize_at(motion, matched, terms)
     arms = jnp.where(matched.valid, posed.moved - root.center[:, None], 0)
     torque = jnp.cross(arms, found.force, axis=0)
     return jnp.concatenate([jnp.sum(found.force, axis=1) * root.radius, jnp.sum(torque, axis=1)]) / root.scale

@@ -13,13 +13,13 @@ from jaxtyping import Array, Bool, Float
 
 from mcgicp_jax._compute.packing import Packed
 from mcgicp_jax._compute.quick_compilation import quickly_compiled
-from mcgicp_jax._local_geometry.local_geometry import describe
+from mcgicp_jax._local_geometry.local_geometry import LocalGeometry, describe
 from mcgicp_jax._local_geometry.neighborhoods import Neighborhoods
 from mcgicp_jax._local_geometry.surface import Surface
 from mcgicp_jax._methods.base import AbstractMethod
 from mcgicp_jax._methods.surfaces import Kinds, search_rows, surface_of
-from mcgicp_jax._pose_solver.implicit_derivative import ImplicitRoot, balance_along, score_along, value_and_jacobian
-from mcgicp_jax._pose_solver.matched import Matched, square_apart
+from mcgicp_jax._pose_solver.implicit_derivative import ImplicitRoot, balance_along, score_at, value_and_jacobian
+from mcgicp_jax._pose_solver.matched import Matched, Motion, square_apart
 from mcgicp_jax._pose_solver.pose_measurements import Fusion, PoseForm
 from mcgicp_jax._search.base import SearchPoints
 from mcgicp_jax._terms.base import AbstractTerm
@@ -60,14 +60,21 @@ def _matched(block: Block, temperature: Any) -> Matched:
 
 
 @quickly_compiled
-def score_and_slope(
-    parameters: Parameters, root: ImplicitRoot, block: Block, pose: Float[Array, "7"]
-) -> Float[Array, "6 7"]:
-    """g of a block, and its derivative by a twist."""
-    terms, temperature = parameters
+def score_and_pull(
+    parameters: Parameters, root: ImplicitRoot, motion: Motion, block: Block
+) -> tuple[Float[Array, "6"], tuple[Motion, Float[Array, "6 n L"], Float[Array, "6 m n K"], Any]]:
+    """g of a block, and the derivatives of its six numbers by the motion, by the matched rows of both clouds, and by
+    the numbers of the parameters. One program for all of them, since it takes half as long to compile as two."""
+    numbers, rest = eqx.partition(parameters, eqx.is_inexact_array)
+
+    def score(motion: Motion, source: Array, target: Array, numbers: Any) -> Float[Array, "6"]:
+        terms, temperature = eqx.combine(numbers, rest)
+        moved = Block(replace(block.source, table=source), replace(block.target, table=target), block.valid)
+        return score_at(motion, root, _matched(moved, temperature), terms)
+
     with jax.default_matmul_precision("highest"):
-        matched = _matched(block, temperature)
-        return _with_slope(lambda twist: score_along(twist, pose, root, matched, terms), pose)
+        found, pull = jax.vjp(score, motion, block.source.table, block.target.table, numbers)
+        return found, jax.vmap(pull)(jnp.eye(6, dtype=found.dtype))
 
 
 @quickly_compiled
@@ -77,17 +84,14 @@ def balance_and_slope(
     """The equation with tie points and a prior, and its derivative by a twist.
 
     Args:
-        known: `score_and_slope` of all blocks.
+        known: g of all blocks without these, and its derivative by a twist.
     """
     with jax.default_matmul_precision("highest"):
-        return _with_slope(
-            lambda twist: balance_along(twist, pose, root, known[:, 0] + known[:, 1:] @ twist, fusion), pose
+        value, slope = value_and_jacobian(
+            lambda twist: balance_along(twist, pose, root, known[:, 0] + known[:, 1:] @ twist, fusion),
+            jnp.zeros_like(pose[:6]),
         )
-
-
-def _with_slope(function: Any, pose: Float[Array, "7"]) -> Float[Array, "6 7"]:
-    value, slope = value_and_jacobian(function, jnp.zeros_like(pose[:6]))
-    return jnp.concatenate([value[:, None], slope], axis=1)
+        return jnp.concatenate([value[:, None], slope], axis=1)
 
 
 @quickly_compiled
@@ -104,28 +108,6 @@ def pull_balance(
         # The equation is linear in the score.
         _, pull = jax.vjp(balance, jnp.zeros_like(pose[:6]), fusion.form)
         return jax.vmap(pull)(cotangents)
-
-
-@quickly_compiled
-def pull_matches(
-    parameters: Parameters,
-    root: ImplicitRoot,
-    block: Block,
-    pose: Float[Array, "7"],
-    cotangents: Float[Array, "k 6"],
-) -> tuple[Float[Array, "n k L"], Float[Array, "m n k K"], Any]:
-    """Cotangents of the matched rows and of the numbers of the parameters, from k of the score."""
-    numbers, rest = eqx.partition(parameters, eqx.is_inexact_array)
-
-    def score(source: Array, target: Array, numbers: Any) -> Float[Array, "6"]:
-        terms, temperature = eqx.combine(numbers, rest)
-        moved = Block(replace(block.source, table=source), replace(block.target, table=target), block.valid)
-        matched = _matched(moved, temperature)
-        return score_along(jnp.zeros_like(pose[:6]), pose, root, matched, terms)
-
-    with jax.default_matmul_precision("highest"):
-        _, pull = jax.vjp(score, block.source.table, block.target.table, numbers)
-        return jax.vmap(pull, out_axes=(1, 2, 0))(cotangents)
 
 
 class Moving(NamedTuple):
@@ -145,6 +127,7 @@ def pull_surface(
     fields: tuple[str, ...],
     method: AbstractMethod,
     around: Neighborhoods,
+    local: Packed[LocalGeometry] | None,
     masks: tuple[Any, Any] | None,
     cotangents: Float[Array, "n k L"],
 ) -> tuple[Any, Any, Any, Any]:
@@ -153,6 +136,7 @@ def pull_surface(
     Args:
         fields: of a `PointCloud`, or "method".
         around: the neighbourhoods of the rows, with their channels even where there are no neighbours.
+        local: of the rows; None if there are no neighbours, and if points are in `fields`, on which it depends.
         masks: `channel_valid` and `valid` of the rows for a soft assignment; None otherwise.
 
     Returns:
@@ -175,7 +159,8 @@ def pull_surface(
         names = ("own", "near", "own_channels", "near_channels", "given")
         here = around._replace(**{name: getattr(moving, name) for name in names if getattr(moving, name) is not None})
         used = method if moving.numbers is None else eqx.combine(moving.numbers, rest)
-        surface = surface_of(used, kinds, here, None if here.near is None else describe(here), False)
+        geometry = None if here.near is None else describe(here) if local is None else local.tree
+        surface = surface_of(used, kinds, here, geometry, False)
         search = None if masks is None else search_rows(used, here.own.T, here.own_channels.T, *masks)
         return Packed.of(Columns.of(surface, search)).table
 

@@ -25,20 +25,26 @@ from mcgicp_jax._compute.concrete import is_concrete
 from mcgicp_jax._compute.linear_maps import AbstractLinearMap, SideBySide, primal, with_derivative
 from mcgicp_jax._compute.packing import Packed
 from mcgicp_jax._compute.threads import num_cores, side_by_side
+from mcgicp_jax._local_geometry.local_statistics import local_geometry_on_host
 from mcgicp_jax._local_geometry.neighborhoods import Neighborhoods, gatherer, points_alone
-from mcgicp_jax._math.poses import parameters_by_twist, translation_adjoint
+from mcgicp_jax._math.poses import (
+    parameters_by_twist,
+    rotation_from_quaternion,
+    translation_adjoint,
+    turn_by_quaternion,
+)
 from mcgicp_jax._math.robust_kernels import AbstractKernel
 from mcgicp_jax._methods.base import AbstractMethod, with_unset_from
 from mcgicp_jax._pose_solver.implicit_derivative import MAX_NEWTON_STEPS, ImplicitRoot
+from mcgicp_jax._pose_solver.matched import Motion
 from mcgicp_jax._pose_solver.pose_measurements import PoseForm, Prior, TiePoints, form_at
 from mcgicp_jax._registration.derivative_programs import (
     Block,
     Columns,
     balance_and_slope,
     pull_balance,
-    pull_matches,
     pull_surface,
-    score_and_slope,
+    score_and_pull,
 )
 from mcgicp_jax._registration.loop import LoopResult
 from mcgicp_jax._registration.on_host import HostExecutor
@@ -163,11 +169,13 @@ class PoseDerivative(AbstractLinearMap):
         """The root of g near the final pose, by Newton's method, and (∂g/∂ξ)⁻¹ there; 0 if there is none."""
         pose, root = self._pose, self._scaling
         for _ in range(MAX_NEWTON_STEPS if root.usable else 0):
-            program = partial(score_and_slope, self._parameters, root)
-            known: Any = sum(np.asarray(part, np.float64) for _, part in self._over_matches(program, pose))
+            known: Any = np.zeros((6, 13))
+            for _, (score, (motion, *_)) in self._over_matches(pose):
+                known += np.column_stack([score, *(np.asarray(each).reshape(6, -1) for each in motion)])
+            known = np.column_stack([known[:, :1], known[:, 1:] @ self._motion_by_twist(pose)])
             if self._fusion is not None:
-                known = balance_and_slope(pose, root, self._fusion, np.asarray(known, pose.dtype))
-            balance, slope = np.split(np.asarray(known, np.float64), [1], axis=1)
+                known = np.asarray(balance_and_slope(pose, root, self._fusion, known.astype(pose.dtype)), np.float64)
+            balance, slope = np.split(known, [1], axis=1)
             if not np.linalg.cond(slope) < 1 / np.finfo(slope.dtype).eps:
                 break
             inverse = np.linalg.inv(slope)
@@ -185,14 +193,24 @@ class PoseDerivative(AbstractLinearMap):
         lengths = np.array([self._scaling.radius] * 3 + [1.0] * 3)
         return parameters_by_twist(pose.astype(np.float64), np.asarray(self._scaling.center)) * lengths
 
-    def _over_matches(self, program: Callable[..., Any], *arguments: Any) -> Iterator[tuple[slice, Any]]:
-        """The results of a program for each block of matches, in order."""
+    def _motion_by_twist(self, pose: Float[np.ndarray, "7"]) -> Float[np.ndarray, "12 6"]:
+        """Derivative of rotation matrix and translation by the same twist."""
+        identity, found = np.eye(3), np.zeros((12, 6))
+        rotation = rotation_from_quaternion(pose[:4].astype(np.float64))
+        found[:9, 3:] = np.cross(identity[:, :, None], rotation[None], axis=1).reshape(3, 9).T
+        found[9:] = self._by_twist(pose)[4:]
+        return found
+
+    def _over_matches(self, pose: Float[np.ndarray, "7"]) -> Iterator[tuple[slice, Any]]:
+        """The results of `score_and_pull` for each block of matches, in order."""
+        motion = Motion(rotation_from_quaternion(pose[:4].astype(np.float64)).astype(pose.dtype), pose[4:])
 
         def call(rows: slice, index: Any) -> Any:
             valid = self._valid[:, index].copy()
             valid[:, rows.stop - rows.start :] = False
             source, target = self._columns
-            return program(Block(source.rows(index), target.rows(self._matches[:, index]), valid), *arguments)
+            block = Block(source.rows(index), target.rows(self._matches[:, index]), valid)
+            return score_and_pull(self._parameters, self._scaling, motion, block)
 
         return self._in_order(call, self._matches.shape[1])
 
@@ -211,12 +229,12 @@ class PoseDerivative(AbstractLinearMap):
         shapes = [each.table.shape for each in self._columns]
         tables = [np.zeros((size, len(by_score), width), by_score.dtype) for size, width in shapes]
         total: Any = None
-        program = partial(pull_matches, self._parameters, self._scaling)
-        for rows, (source, target, numbers) in self._over_matches(program, pose, by_score):
+        for rows, (_, (_, *found)) in self._over_matches(pose):
+            source, target, numbers = jax.tree.map(lambda rows: np.tensordot(by_score, rows, 1), found)
             count = rows.stop - rows.start
-            tables[0][rows] = np.asarray(source)[:count]
-            _add_rows(tables[1], self._matches[:, rows], np.asarray(target)[:, :count])
-            numbers = jax.tree.map(lambda leaf: np.asarray(leaf, np.float64), numbers)
+            tables[0][rows] = source[:, :count].swapaxes(0, 1)
+            _add_rows(tables[1], self._matches[:, rows], np.moveaxis(target[:, :, :count], 0, 2))
+            numbers = jax.tree.map(lambda leaf: leaf.astype(np.float64), numbers)
             total = numbers if total is None else jax.tree.map(np.add, total, numbers)
         return tables, total
 
@@ -225,16 +243,19 @@ class PoseDerivative(AbstractLinearMap):
     ) -> dict[Name, np.ndarray]:
         """Cotangents of fields of a cloud, and of the method, from those of its table."""
         cloud, method = getattr(self._inputs, side), self._inputs.method
-        among = self._inputs.source_rows if side == "source" else None
-        among = np.arange(len(cloud.points)) if among is None else among
-        gather, soft = _gatherer(cloud, method), self._inputs.temperature is not None
+        some = self._inputs.source_rows if side == "source" else None
+        among = np.arange(len(cloud.points)) if some is None else some
+        gather, soft, local = _gatherer(cloud, method), self._inputs.temperature is not None, None
+        if cloud.neighbors is not None and "points" not in fields:
+            local = Packed.of(local_geometry_on_host(cloud, method.uses_channels, self._num_threads, some))
         valid = None if cloud.channel_valid is None else np.asarray(cloud.channel_valid)
 
         def call(rows: slice, index: Any) -> Any:
             masks = (None if valid is None else valid[index], np.asarray(cloud.valid)[index]) if soft else None
             by_rows = table[index].copy()
             by_rows[rows.stop - rows.start :] = 0
-            return pull_surface(self._kinds, fields, method, gather(among[index]), masks, by_rows)
+            here = None if local is None else local.rows(index)
+            return pull_surface(self._kinds, fields, method, gather(among[index]), here, masks, by_rows)
 
         count, num_channels = table.shape[1], cloud.channels.shape[1] if method.uses_channels else 0
         widths = {"points": 3 * ("points" in fields), "channels": num_channels * ("channels" in fields)}
@@ -270,10 +291,8 @@ def jacobian(
         raise ValueError(f"{field}: expected a {cloud} that has some, got None")
     (by_array,) = PoseDerivative([(cloud, field)], inputs, executor, loop, gains).jacobian((0,))
     pose, rotation = np.asarray(loop.state.pose.wxyz_xyz, np.float64), executor.motion(loop.state.pose).rotation
-    # The vector part of 2 δq q* is the rotation vector in the axes of the target.
-    turn = 2 * np.column_stack([-pose[1:4], pose[0] * np.eye(3) + np.cross(np.eye(3), pose[1:4])])
     twist = np.zeros((6, 7))
-    twist[:3, 4:], twist[3:, :4] = rotation.T, rotation.T @ turn
+    twist[:3, 4:], twist[3:, :4] = rotation.T, rotation.T @ turn_by_quaternion(pose[:4])
     return np.tensordot(translation_adjoint(np.asarray(inputs.source.origin)) @ twist, by_array, 1)
 
 
