@@ -11,13 +11,13 @@ import jax.numpy as jnp
 import numpy as np
 
 from mcgicp_jax._clouds.point_cloud import PointCloud
-from mcgicp_jax._compute.blocks import NEIGHBORHOOD_BLOCK, map_rows
 from mcgicp_jax._compute.cache import cached_with
 from mcgicp_jax._compute.concrete import is_concrete
 from mcgicp_jax._compute.packing import Packed
+from mcgicp_jax._compute.rows_on_demand import RowsOnDemand, in_blocks
 from mcgicp_jax._compute.threads import side_by_side
 from mcgicp_jax._local_geometry.local_geometry import LocalGeometry, describe
-from mcgicp_jax._local_geometry.neighborhoods import Neighborhoods, gatherer
+from mcgicp_jax._local_geometry.neighborhoods import Neighborhoods, check_neighbors, gatherer
 
 Tree = TypeVar("Tree")
 
@@ -61,19 +61,30 @@ def local_geometries(
 def local_geometry_on_host(
     cloud: PointCloud, with_channels: bool, num_threads: int | None = 1, among: Any = None
 ) -> LocalGeometry:
-    """Local geometry of a concrete cloud as NumPy arrays, cached with the cloud.
+    """Local geometry of a concrete cloud as NumPy arrays.
 
     Args:
-        among: as in `gatherer`, the result of `spread_rows`.
+        among: (n,) rows of the cloud; None for all.
     """
-    size = cloud.points.shape[0] if among is None else among.size
+    table = geometry_table(cloud, with_channels)
+    return (table.known(None, num_threads) if among is None else table.rows(among, num_threads)).tree
 
-    def make() -> LocalGeometry:
-        gather = gatherer(cloud, with_channels, np, among=among)
-        return map_rows(lambda rows: _describe(gather(rows)), size, num_threads, NEIGHBORHOOD_BLOCK).tree
 
-    # The number of spread rows tells which these are.
-    return cached_with(cloud, "local geometry", (with_channels, size), make)
+def geometry_table(cloud: PointCloud, with_channels: bool) -> RowsOnDemand[Packed[LocalGeometry]]:
+    """Local geometry of a concrete cloud, cached with the cloud."""
+
+    def make() -> RowsOnDemand[Packed[LocalGeometry]]:
+        neighbors, gather = check_neighbors(cloud), gatherer(cloud, with_channels, np)
+        size = cloud.points.shape[0]
+
+        def compute(rows: Any, num_threads: int | None) -> Packed[LocalGeometry]:
+            # Neighbours are found of all rows at once.
+            neighbors[slice(None) if rows is None else rows]
+            return in_blocks(lambda index: _describe(gather(index)), rows, size, num_threads)
+
+        return RowsOnDemand(compute, size)
+
+    return cached_with(cloud, "local geometry", with_channels, make)
 
 
 @jax.jit
@@ -83,8 +94,10 @@ def _describe(around: Neighborhoods) -> Packed[LocalGeometry]:
 
 
 def _traced(cloud: PointCloud, with_channels: bool, among: Any = None) -> LocalGeometry:
-    gather = gatherer(cloud, with_channels, jnp, among=among)
-    return over_rows(lambda rows: describe(gather(rows)), cloud.points.shape[0] if among is None else among.size)
+    gather = gatherer(cloud, with_channels, jnp)
+    if among is None:
+        return over_rows(lambda rows: describe(gather(rows)), cloud.points.shape[0])
+    return over_rows(lambda rows: describe(gather(among[rows])), among.size)
 
 
 def share_a_body(source: PointCloud, target: PointCloud) -> bool:

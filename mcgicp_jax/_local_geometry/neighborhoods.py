@@ -13,6 +13,7 @@ from jaxtyping import Bool, Float
 from mcgicp_jax._clouds.point_cloud import PointCloud
 from mcgicp_jax._compute.concrete import AnyArray
 from mcgicp_jax._math import symmetric_matrices as alg
+from mcgicp_jax._search.base import NeighborsOnDemand
 
 NO_NEIGHBORS = "cloud: expected one with neighbors or covariances; make it with mcgicp_jax.preprocess"
 
@@ -69,38 +70,35 @@ class Neighborhoods(NamedTuple):
         return self.present if self.near_known is None else self.near_known[channel]
 
 
-def check_neighbors(cloud: PointCloud) -> AnyArray:
-    """The (N, k) neighbours of a cloud; raises `ValueError` if it was not preprocessed."""
+def check_neighbors(cloud: PointCloud, xp: ModuleType = np) -> Any:
+    """The (N, k) neighbours of a cloud, or `NeighborsOnDemand`; raises `ValueError` if it was not preprocessed."""
     if cloud.neighbors is None:
         raise ValueError(NO_NEIGHBORS)
-    return cloud.neighbors
+    return cloud.neighbors if isinstance(cloud.neighbors, NeighborsOnDemand) else xp.asarray(cloud.neighbors)
 
 
-def points_alone(cloud: PointCloud, xp: ModuleType, among: Any = None) -> Callable[[Any], Neighborhoods]:
+def points_alone(cloud: PointCloud, xp: ModuleType) -> Callable[[Any], Neighborhoods]:
     """A function that maps rows to `Neighborhoods` without neighbours; arguments as of `gatherer`."""
     points, given = xp.asarray(cloud.points), cloud.covariances
     given = None if given is None else xp.asarray(given)
 
-    def gather(index: Any) -> Neighborhoods:
-        rows = index if among is None else among[index]
+    def gather(rows: Any) -> Neighborhoods:
         return Neighborhoods(points[rows].T, None if given is None else given[rows])
 
     return gather
 
 
 def gatherer(
-    cloud: PointCloud, with_channels: bool, xp: ModuleType, with_given: bool = False, among: Any = None
+    cloud: PointCloud, with_channels: bool, xp: ModuleType, with_given: bool = False
 ) -> Callable[[Any], Neighborhoods]:
     """A function that maps rows (a slice or an array of row numbers) to their neighbourhoods.
 
     Args:
         xp: NumPy on the host, `jax.numpy` where the rows may be traced.
         with_given: whether to include the covariances given with the cloud.
-        among: (n,) rows of the cloud, in which the function's row numbers are places; None for all. Neighbours may be
-            any points of the cloud.
     """
-    check_neighbors(cloud)
-    neighbors, points, channels = (xp.asarray(array) for array in (cloud.neighbors, cloud.points, cloud.channels))
+    neighbors, size = check_neighbors(cloud, xp), cloud.points.shape[0]
+    points, channels = xp.asarray(cloud.points), xp.asarray(cloud.channels)
     points, channels = points.T, channels.T if with_channels else channels.T[:0]
     if xp is np:
         # Gathers along the last axis are contiguous for each coordinate.
@@ -110,8 +108,8 @@ def gatherer(
     if with_channels and cloud.channel_valid is not None:
         known = xp.asarray(cloud.channel_valid).T
 
-    def gather(index: Any) -> Neighborhoods:
-        rows = index if among is None else among[index]
+    # The function does not refer to the cloud, since it is cached with it.
+    def gather(rows: Any) -> Neighborhoods:
         chosen = neighbors[rows].T
         present = chosen >= 0
         near = xp.where(present, chosen, 0)
@@ -129,7 +127,7 @@ def gatherer(
         return around._replace(
             own_known=own_known,
             near_known=present & xp.take(known, near, axis=1) & own_known[:, None],
-            other=present & (xp.arange(cloud.points.shape[0])[rows] != near),
+            other=present & (xp.arange(size)[rows] != near),
         )
 
     return gather

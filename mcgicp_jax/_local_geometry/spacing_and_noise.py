@@ -102,10 +102,9 @@ def _squared_neighbor_distances(cloud: PointCloud) -> Float[AnyArray, "k n"]:
 
     Neighbours come first, so that NumPy's loops run over the points.
     """
-    check_neighbors(cloud)
     xp = numpy_for(cloud)
     rows, counts = sampled_rows(xp.asarray(cloud.valid))
-    neighbors = xp.asarray(cloud.neighbors)[rows].T.copy()
+    neighbors = check_neighbors(cloud, xp)[rows].T.copy()
     near = xp.maximum(neighbors, 0)
     square = xp.zeros(near.shape, cloud.points.dtype)
     # Distances that overflow become infinite and are ignored.

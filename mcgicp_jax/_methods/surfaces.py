@@ -9,17 +9,24 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from mcgicp_jax._clouds.point_cloud import PointCloud
-from mcgicp_jax._compute.blocks import NEIGHBORHOOD_BLOCK, map_rows
 from mcgicp_jax._compute.cache import cached_with
 from mcgicp_jax._compute.concrete import is_concrete, numpy_for
 from mcgicp_jax._compute.packing import Packed
+from mcgicp_jax._compute.rows_on_demand import RowsOnDemand, in_blocks
 from mcgicp_jax._compute.threads import side_by_side
 from mcgicp_jax._local_geometry.cells import geometry_of_cells
 from mcgicp_jax._local_geometry.local_geometry import LocalGeometry
-from mcgicp_jax._local_geometry.local_statistics import joined, local_geometries, over_rows, share_a_body, split
+from mcgicp_jax._local_geometry.local_statistics import (
+    geometry_table,
+    joined,
+    local_geometries,
+    over_rows,
+    share_a_body,
+    split,
+)
 from mcgicp_jax._local_geometry.neighborhoods import Neighborhoods, gatherer, points_alone
 from mcgicp_jax._local_geometry.observability import channel_observability
 from mcgicp_jax._local_geometry.surface import Surface, SurfaceNoise
@@ -40,12 +47,14 @@ class SurfacePair(NamedTuple):
         method: with its unset parameters chosen from the data.
         terms: the residuals of each correspondence.
         source, target: the surfaces of both clouds.
+        describe_target: computes rows of `target` before they are used; None if all are.
     """
 
     method: AbstractMethod
     terms: tuple[AbstractTerm, ...]
     source: Surface
     target: Surface
+    describe_target: Callable[[Int[np.ndarray, "*n"]], Any] | None = None
 
 
 def surface_pair(
@@ -68,25 +77,31 @@ def surface_pair(
         observed: whether to compute observability, which `register` needs and the cost of given matches does not.
         robust, equalize_channels: as in `AbstractMethod.terms`.
         num_threads: largest number of threads on the host; None for no limit.
-        source_rows: the rows of the surface of the source, with neighbours among all points; None for all rows.
+        source_rows: the rows of the surface of the source, with neighbours among all points; None for all rows. If
+            given, the rows of a concrete target are computed when they are used: most are not.
     """
     geometries = cache(partial(local_geometries, source, target, method.uses_channels, num_threads, source_rows))
     used = source if source_rows is None else _some_rows(source, source_rows)
     method = method.resolve(used, target, geometries)
     terms = method.terms(used, target, robust, equalize_channels)
     kinds = tuple(type(term) for term in terms if term.name)
-    locals: tuple[Any, Any] = (None, None)
     # Raises an error if observability is needed and a cloud has no neighbours.
-    if observed or (source.neighbors is not None and target.neighbors is not None):
-        locals = geometries()
-    rows = source_rows, None
+    described = observed or (source.neighbors is not None and target.neighbors is not None)
     if is_concrete(method, source, target):
-        calls = [
-            partial(surface_on_host, method, kinds, cloud, local, observed, num_threads, among)
-            for cloud, local, among in list(zip((source, target), locals, rows, strict=True))[::-1]
-        ]
-        of_target, of_source = side_by_side(calls, num_threads)
+        on_host = partial(
+            surface_on_host, method, kinds, described=described, observed=observed, num_threads=num_threads
+        )
+        if source_rows is not None:
+            describe = partial(surface_table(method, kinds, target, described, observed).known, num_threads=num_threads)
+            columns = describe(np.zeros(1, int))
+            # Columns of another dtype are copies, not views of the table.
+            if any(columns[0].layout.dtypes):
+                columns = describe(None)
+            of_target = _surface_in(columns, method, target)
+            return SurfacePair(method, terms, on_host(cloud=source, among=source_rows), of_target, describe)
+        of_target, of_source = side_by_side([partial(on_host, cloud=cloud) for cloud in (target, source)], num_threads)
         return SurfacePair(method, terms, of_source, of_target)
+    locals = geometries() if described else (None, None)
     surfaces = _traced(method, kinds, source, target, locals, observed, source_rows)
     of_source, of_target = (
         surface._replace(search=searchable(method, cloud))
@@ -135,43 +150,62 @@ def surface_on_host(
     method: AbstractMethod,
     kinds: Kinds,
     cloud: PointCloud,
-    local: LocalGeometry | None,
+    described: bool,
     observed: bool,
     num_threads: int | None,
     among: Any = None,
 ) -> Surface:
-    """The surface of a concrete cloud as NumPy arrays, cached for this cloud and method.
+    """The surface of a concrete cloud as NumPy arrays.
 
     Args:
-        among: as in `gatherer`, the result of `spread_rows`.
+        described: whether the cloud has neighbours, whose local geometry is used.
+        among: (n,) rows of the cloud; None for all.
     """
-    used = cloud if among is None else _some_rows(cloud, among)
-    size = used.points.shape[0]
+    table = surface_table(method, kinds, cloud, described, observed)
+    if among is None:
+        return _surface_in(table.known(None, num_threads), method, cloud)
+    return _surface_in(table.rows(among, num_threads), method, _some_rows(cloud, among))
 
-    def make() -> Surface:
-        gather = _gatherer(method, cloud, local is not None, np, among)
-        statistics = None if local is None else Packed.of(local)
 
-        def block(rows: Any) -> tuple[Packed[Surface], Packed[SurfaceNoise] | None]:
-            here = None if statistics is None else statistics.rows(rows)
-            return _surface_of_block(method, kinds, gather(rows), here, observed)
+# The columns that a step of the loop uses, and the noise.
+_Columns = tuple[Packed[Surface], Packed[SurfaceNoise] | None]
 
-        columns, noise = map_rows(block, size, num_threads, NEIGHBORHOOD_BLOCK)
-        # Views of one array, from which the executor on the host gathers rows.
-        surface = columns.tree
-        return surface._replace(noise=None if noise is None else noise.tree, search=searchable(method, used))
+
+def surface_table(
+    method: AbstractMethod, kinds: Kinds, cloud: PointCloud, described: bool, observed: bool
+) -> RowsOnDemand[_Columns]:
+    """The surface of a concrete cloud, cached for this cloud and method; arguments as of `surface_on_host`."""
+
+    def make() -> RowsOnDemand[_Columns]:
+        geometry = geometry_table(cloud, method.uses_channels) if described else None
+        gather, size = _gatherer(method, cloud, described, np), cloud.points.shape[0]
+
+        def compute(rows: Any, num_threads: int | None) -> _Columns:
+            statistics = None if geometry is None else geometry.known(rows, num_threads)
+
+            def block(index: Any) -> _Columns:
+                here = None if statistics is None else statistics.rows(index)
+                return _surface_of_block(method, kinds, gather(index), here, observed)
+
+            return in_blocks(block, rows, size, num_threads)
+
+        return RowsOnDemand(compute, size)
 
     leaves, structure = jax.tree.flatten(method)
-    key = (structure, *(np.asarray(leaf).tobytes() for leaf in leaves), kinds, observed, size)
+    key = (structure, *(np.asarray(leaf).tobytes() for leaf in leaves), kinds, described, observed)
     return cached_with(cloud, "surface", key, make)
 
 
-def _gatherer(
-    method: AbstractMethod, cloud: PointCloud, preprocessed: bool, xp: Any, among: Any
-) -> Callable[[Any], Neighborhoods]:
-    if method.uses_neighborhoods and preprocessed:
-        return gatherer(cloud, method.uses_channels, xp, with_given=True, among=among)
-    return points_alone(cloud, xp, among)
+def _surface_in(columns: _Columns, method: AbstractMethod, cloud: PointCloud) -> Surface:
+    """The columns, views of one array, from which the executor on the host gathers rows; with the search."""
+    surface, noise = columns[0].tree, columns[1]
+    return surface._replace(noise=None if noise is None else noise.tree, search=searchable(method, cloud))
+
+
+def _gatherer(method: AbstractMethod, cloud: PointCloud, described: bool, xp: Any) -> Callable[[Any], Neighborhoods]:
+    if method.uses_neighborhoods and described:
+        return gatherer(cloud, method.uses_channels, xp, with_given=True)
+    return points_alone(cloud, xp)
 
 
 def _traced(
@@ -207,11 +241,11 @@ def _whole(
     observed: bool,
     among: Any = None,
 ) -> Surface:
-    gather = _gatherer(method, cloud, local is not None, jnp, among)
+    gather = _gatherer(method, cloud, local is not None, jnp)
 
     def surface(rows: Any) -> Surface:
         here = None if local is None else jax.tree.map(lambda array: jnp.asarray(array)[rows], local)
-        return surface_of(method, kinds, gather(rows), here, observed)
+        return surface_of(method, kinds, gather(rows if among is None else among[rows]), here, observed)
 
     return over_rows(surface, cloud.points.shape[0] if among is None else among.size)
 

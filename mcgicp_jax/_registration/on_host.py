@@ -29,14 +29,18 @@ from mcgicp_jax._terms.base import AbstractTerm
 
 
 class _Rows(NamedTuple):
-    """The rows of a surface, and those that a step of the loop uses in one array, so that they are gathered at once."""
+    """The rows of a surface, and those that a step of the loop uses in one array, so that they are gathered at once.
+
+    `describe` computes rows before they are used; None if all are.
+    """
 
     surface: Surface
     columns: Packed[Surface]
+    describe: Callable[[Int[np.ndarray, "*n"]], Any] | None = None
 
     @staticmethod
-    def of(surface: Surface) -> _Rows:
-        return _Rows(surface, Packed.of(surface._replace(noise=None, search=None)))
+    def of(surface: Surface, describe: Callable[[Int[np.ndarray, "*n"]], Any] | None = None) -> _Rows:
+        return _Rows(surface, Packed.of(surface._replace(noise=None, search=None)), describe)
 
     def every(self, stride: int) -> _Rows:
         """Every `stride`-th row."""
@@ -83,9 +87,10 @@ class _Matches:
 
     @staticmethod
     def of(source: _Rows, target: _Rows, indices: Int[np.ndarray, "m N"], max_distance: Any) -> _Matches:
-        valid, among = searched(source.surface).valid, searched(target.surface).valid
-        found = (indices >= 0) & valid & among[np.maximum(indices, 0)]
-        return _Matches(source, target, indices, found, max_distance)
+        valid, among, rows = searched(source.surface).valid, searched(target.surface).valid, np.maximum(indices, 0)
+        if target.describe is not None:
+            target.describe(rows)
+        return _Matches(source, target, indices, (indices >= 0) & valid & among[rows], max_distance)
 
 
 class _Gathered(NamedTuple):
@@ -116,7 +121,7 @@ class HostExecutor(AbstractExecutor):
         self._index_of, self.num_threads = index_of, num_threads
         # Which source rows are followed from pose to pose, and the function that finds their matches.
         self._followed: tuple[int, bool] | None = None
-        self._whole, self._target = _Rows.of(problem.source), _Rows.of(problem.target)
+        self._whole, self._target = _Rows.of(problem.source), _Rows.of(problem.target, problem.describe_target)
         self._source = self._whole
         self._nearest: Callable[[Any], Int[np.ndarray, "m N"]]
         self._settings = Packed.of(problem.settings, num_axes=0)

@@ -252,7 +252,15 @@ def pose_problem(
     stride = xp.maximum(xp.sum(xp.asarray(valid)) // _COARSE_ROWS, 1)
     start = se3_from_matrix(centred_pose(init, source, target), dtype)
     settings = settings_for(options, pair.method, target, stride, dtype)
-    problem = Problem(start, pair.source, pair.target, pair.terms, settings, num_candidates=pair.method.num_candidates)
+    problem = Problem(
+        start,
+        pair.source,
+        pair.target,
+        pair.terms,
+        settings,
+        num_candidates=pair.method.num_candidates,
+        describe_target=pair.describe_target,
+    )
     return problem, Inputs(source, target, pair.method, pair.terms, source_rows=rows)
 
 

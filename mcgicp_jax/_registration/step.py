@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -88,6 +89,7 @@ class Problem(eqx.Module):
         terms: the residuals of each correspondence, before any number is adapted.
         fusion: tie points and prior, weighted after a registration without them; None if there are none.
         num_candidates: number of target points that a source point is matched with.
+        describe_target: computes rows of the surface of the target before they are used; None if all are.
     """
 
     start: jaxlie.SE3
@@ -97,6 +99,7 @@ class Problem(eqx.Module):
     settings: Settings
     fusion: Fusion | None = None
     num_candidates: int = eqx.field(static=True, default=1)
+    describe_target: Callable[[Int[np.ndarray, "*n"]], Any] | None = eqx.field(static=True, default=None)
 
     @property
     def first_status(self) -> Int[AnyScalar, ""]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import abc
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -13,6 +13,7 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float, Int
 
 from mcgicp_jax._compute.concrete import AnyArray
+from mcgicp_jax._compute.rows_on_demand import RowsOnDemand
 
 
 class SearchPoints(NamedTuple):
@@ -65,6 +66,24 @@ class Correspondences(eqx.Module):
 
     def __repr__(self) -> str:
         return f"Correspondences({self.indices.shape[-1]} source rows)"
+
+
+class NeighborsOnDemand:
+    """Stands for the (N, k) array of `AbstractSearch.neighbors`, whose rows are found when they are first needed.
+
+    Args:
+        find: maps row numbers, or None for all rows, to the rows of their k nearest neighbours.
+    """
+
+    def __init__(self, find: Callable[[Any], Int[np.ndarray, "n k"]], shape: tuple[int, int]):
+        self.shape = shape
+        self._table = RowsOnDemand(lambda rows, _: find(rows), shape[0])
+
+    def __getitem__(self, rows: Any) -> Int[np.ndarray, "*n k"]:
+        return self._table.known(rows)[rows]
+
+    def __array__(self, dtype: Any = None, copy: bool | None = None) -> Int[np.ndarray, "N k"]:
+        return np.asarray(self._table.known(), dtype)
 
 
 class AbstractIndex(abc.ABC):
@@ -135,6 +154,10 @@ class AbstractSearch(eqx.Module):
 
         The points are finite, in metres. The row is −1 where there are fewer than k points.
         """
+
+    def neighbors_on_demand(self, points: Float[np.ndarray, "N 3"], num_neighbors: int) -> Any:
+        """`neighbors`, or what finds them when they are needed."""
+        return self.neighbors(points, num_neighbors)
 
 
 def on_host(tree: SearchPoints) -> SearchPoints:

@@ -20,7 +20,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from mcgicp_jax._compute.cache import MAX_ROWS, Cache
 from mcgicp_jax._compute.callbacks import call_host
-from mcgicp_jax._search.base import AbstractSearch, SearchPoints, on_host
+from mcgicp_jax._search.base import AbstractSearch, NeighborsOnDemand, SearchPoints, on_host
 from mcgicp_jax._search.nearest_with_ties import TiedTree, TreeBackend
 from mcgicp_jax._search.pykdtree import MAX_DIMENSIONS, PyKDTree, has_pykdtree
 from mcgicp_jax._search.tree_index import LARGEST_UNORDERED, TreeIndex
@@ -58,13 +58,20 @@ class AbstractTreeSearch(AbstractSearch, TreeBackend):
         )
 
     def neighbors(self, points: Float[np.ndarray, "N 3"], num_neighbors: int) -> Int[np.ndarray, "N k"]:
-        tree = TiedTree(self, points)
-        # In the order of the leaves, each query finds the nodes it needs in the processor's caches.
-        order = tree.leaf_order()
-        found, _ = tree.nearest(points[order], num_neighbors)
-        neighbors = np.full((len(points), num_neighbors), -1, np.int32)
-        neighbors[order, : found.shape[1]] = found
-        return neighbors
+        return np.asarray(self.neighbors_on_demand(points, num_neighbors))
+
+    def neighbors_on_demand(self, points: Float[np.ndarray, "N 3"], num_neighbors: int) -> NeighborsOnDemand:
+        tree, shape = TiedTree(self, points), (len(points), num_neighbors)
+
+        def find(rows: Any) -> Int[np.ndarray, "n k"]:
+            # In the order of the leaves, each query finds the nodes it needs in the processor's caches.
+            order = tree.leaf_order() if rows is None else rows
+            found, _ = tree.nearest(points[order], num_neighbors)
+            neighbors = np.full((len(order), num_neighbors), -1, np.int32)
+            neighbors[order if rows is None else slice(None), : found.shape[1]] = found
+            return neighbors
+
+        return NeighborsOnDemand(find, shape)
 
 
 class KDTreeSearch(AbstractTreeSearch):
