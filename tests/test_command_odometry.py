@@ -88,9 +88,9 @@ def test_frames_before_an_invalid_one_are_written(tmp_path, capsys, monkeypatch,
             raise error
         return before(cloud, *options)
 
-    calls, before = [], odometry.preprocess
+    calls, before = [], odometry.preprocess_on_demand
     poses, map = tmp_path / "poses.txt", tmp_path / "map.ply"
-    monkeypatch.setattr(odometry, "preprocess", preprocess)
+    monkeypatch.setattr(odometry, "preprocess_on_demand", preprocess)
     files = ["--output", str(poses), "--map", str(map)]
     assert main(["odometry", "box-room", "--num-frames", "4", "--method", "gicp", *files]) == 1
     text, errors = capsys.readouterr()

@@ -1,6 +1,9 @@
 """Odometry over sequences with exact truth, and the maps made of them."""
 
+import gc
 import itertools
+import threading
+import weakref
 from collections import defaultdict
 
 import numpy as np
@@ -10,8 +13,11 @@ from hypothesis import strategies as st
 
 import mcgicp_jax as mcg
 from mcgicp_jax import datasets, metrics
+from mcgicp_jax._compute.rows_on_demand import RowsOnDemand
+from mcgicp_jax._search.tree_index import TreeIndex
 from mcgicp_jax._sequences import odometry as _odometry
 from mcgicp_jax._sequences import relocalization as _relocalization
+from tests.precision import in_both_precisions
 from tests.scenes import motion
 
 
@@ -45,20 +51,101 @@ def test_clouds_do_as_well_as_frames_and_preprocessed_ones_are_kept(room):
     np.testing.assert_allclose(steps[1].pose, steps[1].registration.matrix, atol=1e-7)
 
 
-def test_frames_are_taken_one_by_one(room):
+def test_frames_are_read_one_ahead_and_no_further(room):
     frames, _ = room
-    taken = []
+    taken, fourth = [], threading.Event()
 
     def stream():
         for i in itertools.count():
             taken.append(i)
+            if i == 3:
+                fourth.set()
             yield frames[i % 2]
 
     endless = mcg.odometry(stream(), mcg.GICP(), max_distance=0.5)
     assert taken == []
-    for _ in range(3):
+    for count in range(1, 4):
         next(endless)
-    assert taken == [0, 1, 2]
+        assert count <= len(taken) <= count + 1
+    # Nothing asks for it.
+    assert fourth.wait(60)
+    assert taken == [0, 1, 2, 3]
+
+
+@pytest.mark.parametrize("against", ["previous", "map"])
+def test_a_row_is_described_once_and_only_if_it_is_used(room, monkeypatch, against):
+    frames, _ = room
+    tables, indices, preprocessed = [], [], []
+
+    def counting(call, list):
+        def counted(*arguments):
+            list.append(arguments)
+            return call(*arguments)
+
+        return counted
+
+    def table(self, compute, num_rows):
+        asked = []
+        tables.append((num_rows, asked))
+
+        def computed(rows, num_threads):
+            asked.append(np.arange(num_rows) if rows is None else rows)
+            return compute(rows, num_threads)
+
+        before(self, computed, num_rows)
+
+    before = RowsOnDemand.__init__
+    monkeypatch.setattr(RowsOnDemand, "__init__", table)
+    monkeypatch.setattr(TreeIndex, "__init__", counting(TreeIndex.__init__, indices))
+    monkeypatch.setattr(_odometry, "preprocess_on_demand", counting(_odometry.preprocess_on_demand, preprocessed))
+    given = {"max_distance": 0.5, "max_source_points": 300, "against": against}
+    poses = [step.pose for step in mcg.odometry(frames, mcg.GICP(), **given)]
+    assert len(poses) == len(preprocessed) == 5 and len(indices) == 4
+    # Neighbours, local geometry and surface of each frame, and of each map; the first frame in a map has no surface.
+    assert len(tables) == (3 * 5 if against == "previous" else 3 * (5 + 4) - 1)
+    for num_rows, asked in tables:
+        rows = np.concatenate(asked)
+        assert len(np.unique(rows)) == len(rows) <= num_rows
+    assert sum(sum(map(len, asked)) for _, asked in tables) < 0.7 * sum(num_rows for num_rows, _ in tables)
+
+
+@in_both_precisions
+def test_rows_described_when_they_are_used_change_nothing(room):
+    frames, _ = room
+    given = {"max_distance": 0.5, "max_source_points": 300}
+    steps = list(mcg.odometry(frames, mcg.MultiChannelGICP(), voxel_size=0.05, **given))
+    clouds = [mcg.preprocess(frame.cloud, 0.05) for frame in frames]
+    init = np.eye(4)
+    for step, source, target in zip(steps[1:], clouds[1:], clouds, strict=False):
+        result = mcg.register(source, target, mcg.MultiChannelGICP(), init=init, **given)
+        init = result.matrix
+        np.testing.assert_array_equal(step.registration.matrix, init)
+        np.testing.assert_array_equal(step.registration.covariance, result.covariance)
+    for step, cloud in zip(steps, clouds, strict=True):
+        assert isinstance(step.cloud.neighbors, np.ndarray) and not step.cloud.neighbors.flags.writeable
+        np.testing.assert_array_equal(step.cloud.neighbors, cloud.neighbors)
+        np.testing.assert_array_equal(step.cloud.points, cloud.points)
+
+
+def test_registrations_that_are_kept_release_their_clouds(room):
+    frames, _ = room
+    alive = []
+
+    def stream():
+        for frame in frames:
+            cloud = mcg.preprocess(frame.cloud)
+            alive.append(weakref.ref(cloud))
+            yield cloud
+
+    steps = mcg.odometry(stream(), mcg.GICP(), max_distance=0.5)
+    kept = [step.deferred_registration for step in steps]
+    del steps
+    gc.collect()
+    # Those of the last two steps may be read later.
+    assert [cloud() is None for cloud in alive] == [True, True, False, False, False]
+    assert all(each.value.converged for each in kept[1:])
+    gc.collect()
+    assert all(cloud() is None for cloud in alive)
 
 
 def test_each_pair_starts_from_the_motion_before(room, monkeypatch):
@@ -209,19 +296,18 @@ def test_a_map_drifts_less():
 def test_the_map_slides(room):
     frames, _ = room
     sizes = []
-    preprocess = _odometry.preprocess
+    preprocess = _relocalization.preprocess_on_demand
 
-    def counted(cloud, *arguments, **options):
+    def counted(cloud, *arguments):
         sizes.append(len(cloud))
-        return preprocess(cloud, *arguments, **options)
+        return preprocess(cloud, *arguments)
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(_odometry, "preprocess", counted)
-        patch.setattr(_relocalization, "preprocess", counted)
+        patch.setattr(_relocalization, "preprocess_on_demand", counted)
         for radius in (None, 1.0):
             list(mcg.odometry(frames[:3], mcg.GICP(), max_distance=0.5, against="map", map_radius=radius))
-    # Two maps each, after the frames' own clouds.
-    assert sizes[9] < sizes[4]
+    # Two maps each.
+    assert sizes[3] < sizes[1]
 
 
 def test_what_is_wrong_with_a_map_is_named(room):

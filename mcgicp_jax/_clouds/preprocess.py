@@ -12,11 +12,11 @@ from jaxtyping import Bool, Float, Int
 from scipy.sparse import csr_array
 
 from mcgicp_jax._clouds.point_cloud import PointCloud, Values, as_cloud, is_far
-from mcgicp_jax._clouds.voxels import voxel_order
+from mcgicp_jax._clouds.voxels import voxel_numbers
 from mcgicp_jax._compute.argument_checks import check_integer, check_positive
 from mcgicp_jax._compute.concrete import is_concrete
 from mcgicp_jax._compute.linear_maps import AbstractLinearMap, primal, with_derivative
-from mcgicp_jax._search.base import AbstractSearch
+from mcgicp_jax._search.base import AbstractSearch, NeighborsOnDemand
 from mcgicp_jax._search.brute_force import default_search
 
 # Fewest finite points of a cloud: four points are the fewest that are not always coplanar.
@@ -70,15 +70,25 @@ def preprocess(
         return _differentiable(cloud, preprocess(fixed, voxel_size, num_neighbors, search=search), fixed, voxel_size)
     cloud = finite_rows(cloud)
     found = with_neighbors(cloud, voxel_size, num_neighbors, search)
-    _warn_of_rounding(cloud, found)
-    if len(found) < min(len(cloud), num_neighbors):
-        warnings.warn(
-            f"voxel_size: {voxel_size} m leaves {len(found)} of {len(cloud)} points, fewer than the {num_neighbors} "
-            "neighbours from which a covariance is computed; choose a smaller size",
-            UserWarning,
-            stacklevel=2,
-        )
+    _warn_of_loss(cloud, found, voxel_size, num_neighbors)
     return found
+
+
+def preprocess_on_demand(cloud: PointCloud, voxel_size: float | None, num_neighbors: int) -> PointCloud:
+    """`preprocess` with `NeighborsOnDemand` where the search has them, for use within the package."""
+    cloud = finite_rows(cloud)
+    found = with_neighbors(cloud, voxel_size, num_neighbors, on_demand=True)
+    _warn_of_loss(cloud, found, voxel_size, num_neighbors)
+    return found
+
+
+def completed(cloud: PointCloud) -> PointCloud:
+    """The cloud with all neighbours as an array."""
+    if not isinstance(cloud.neighbors, NeighborsOnDemand):
+        return cloud
+    neighbors = np.asarray(cloud.neighbors)
+    neighbors.setflags(write=False)
+    return cloud.replace_rows(neighbors=neighbors)
 
 
 def _differentiable(cloud: PointCloud, found: PointCloud, fixed: PointCloud, voxel_size: float | None) -> PointCloud:
@@ -91,8 +101,7 @@ def _differentiable(cloud: PointCloud, found: PointCloud, fixed: PointCloud, vox
     finite = _is_finite(raw)
     rows, voxels = np.flatnonzero(np.asarray(fixed.valid))[finite], np.arange(np.sum(finite))
     if voxel_size is not None:
-        order, starts = voxel_order(np.ascontiguousarray(raw.points[finite].T, np.float64), voxel_size)
-        voxels[order] = np.repeat(np.arange(len(starts)), np.diff(np.append(starts, len(order))))
+        voxels, _ = voxel_numbers(np.ascontiguousarray(raw.points[finite].T, np.float64), voxel_size)
     arrays: dict[str, Any] = {}
     for name in ("points", "channels", "covariances"):
         array = getattr(cloud, name)
@@ -137,9 +146,17 @@ class RowAverage(AbstractLinearMap):
 
 
 def with_neighbors(
-    cloud: PointCloud, voxel_size: float | None, num_neighbors: int, search: AbstractSearch | None = None
+    cloud: PointCloud,
+    voxel_size: float | None,
+    num_neighbors: int,
+    search: AbstractSearch | None = None,
+    on_demand: bool = False,
 ) -> PointCloud:
-    """`preprocess` for a cloud of `finite_rows`."""
+    """`preprocess` for a cloud of `finite_rows`.
+
+    Args:
+        on_demand: whether `neighbors` may be `NeighborsOnDemand`.
+    """
     if voxel_size is not None:
         cloud = _downsampled(cloud, voxel_size)
     points, channel_valid, covariances = np.asarray(cloud.points), cloud.channel_valid, cloud.covariances
@@ -147,35 +164,44 @@ def with_neighbors(
     origin = _far_origin(points)
     points = (points - origin).astype(dtype)
     # Neighbours are searched among the rounded coordinates, which are those of the registration.
-    neighbors = (search or default_search()).neighbors(points, num_neighbors)
+    search = search or default_search()
+    neighbors: Any = (search.neighbors_on_demand if on_demand else search.neighbors)(points, num_neighbors)
+    if isinstance(neighbors, np.ndarray):
+        neighbors = neighbors.astype(np.int32, copy=False)
     arrays = {
         "points": points,
         "channels": np.asarray(cloud.channels, dtype),
         # Without missing channels the mask is None, so that all complete clouds share compiled programs.
         "channel_valid": None if channel_valid is None or np.all(channel_valid) else np.asarray(channel_valid),
         "valid": np.ones(len(points), bool),
-        "neighbors": neighbors.astype(np.int32, copy=False),
+        "neighbors": neighbors,
         "covariances": None if covariances is None else np.asarray(covariances, dtype),
         "origin": origin,
     }
     for array in arrays.values():
-        if array is not None:
+        if isinstance(array, np.ndarray):
             # Quantities derived from these arrays are cached, so the arrays must not change. They are copies.
             array.setflags(write=False)
     return cloud.replace_rows(**arrays)
 
 
-def _warn_of_rounding(given: PointCloud, found: PointCloud) -> None:
-    """Warn if the coordinates were given in float32 and are too large for it, such as those of UTM."""
-    if given.points.dtype != np.float32 or not np.any(found.origin):
-        return
-    largest, points, neighbors = np.abs(given.points).max(), np.asarray(found.points), np.asarray(found.neighbors)
-    # Each point is its own first neighbour.
-    spacing = np.median(np.linalg.norm(points[neighbors[:, 1]] - points, axis=1))
-    if np.spacing(largest) > _LARGEST_STEP * spacing:
+def _warn_of_loss(given: PointCloud, found: PointCloud, voxel_size: float | None, num_neighbors: int) -> None:
+    """Warn of coordinates given in float32 that are too large for it, such as those of UTM, and of too few voxels."""
+    if given.points.dtype == np.float32 and np.any(found.origin):
+        largest, points, neighbors = np.abs(given.points).max(), np.asarray(found.points), np.asarray(found.neighbors)
+        # Each point is its own first neighbour.
+        spacing = np.median(np.linalg.norm(points[neighbors[:, 1]] - points, axis=1))
+        if np.spacing(largest) > _LARGEST_STEP * spacing:
+            warnings.warn(
+                f"points: float32 has rounded coordinates of {largest:.0f} m to steps of {np.spacing(largest):.2g} m, "
+                f"and neighbours are {spacing:.2g} m apart; read them as float64, or subtract an offset before float32",
+                UserWarning,
+                stacklevel=3,
+            )
+    if len(found) < min(len(given), num_neighbors):
         warnings.warn(
-            f"points: float32 has rounded coordinates of {largest:.0f} m to steps of {np.spacing(largest):.2g} m, and "
-            f"neighbours are {spacing:.2g} m apart; read them as float64, or subtract an offset before float32",
+            f"voxel_size: {voxel_size} m leaves {len(found)} of {len(given)} points, fewer than the {num_neighbors} "
+            "neighbours from which a covariance is computed; choose a smaller size",
             UserWarning,
             stacklevel=3,
         )
@@ -227,18 +253,18 @@ def _downsampled(cloud: PointCloud, voxel_size: float) -> PointCloud:
         raise ValueError("voxel_size: expected None for a cloud with covariances, which cannot be averaged")
     # Working by columns takes a third of the time of working by rows.
     columns = np.ascontiguousarray(np.asarray(cloud.points).T, np.float64)
-    order, starts = voxel_order(columns, voxel_size)
-    if len(starts) < MIN_POINTS:
+    voxels, size = voxel_numbers(columns, voxel_size)
+    if size < MIN_POINTS:
         raise ValueError(
             f"voxel_size: expected a size that leaves at least {MIN_POINTS} points, got {voxel_size} m, "
-            f"which leaves {len(starts)}"
+            f"which leaves {size}"
         )
 
     def total(columns: Iterable[np.ndarray]) -> np.ndarray:
-        sums = [np.add.reduceat(column[order].astype(np.float64, copy=False), starts) for column in columns]
-        return np.stack(sums, axis=1) if sums else np.zeros((len(starts), 0))
+        sums = [np.bincount(voxels, column, size) for column in columns]
+        return np.stack(sums, axis=1) if sums else np.zeros((size, 0))
 
-    counts = np.diff(np.append(starts, len(order)))[:, None]
+    counts = np.bincount(voxels)[:, None]
     means = (total(columns) / counts).astype(cloud.points.dtype)
     channels, names = np.asarray(cloud.channels), cloud.channel_names
     channel_valid = None

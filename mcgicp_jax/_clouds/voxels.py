@@ -64,6 +64,14 @@ def voxel_order(
     return order, starts_of(key[order])
 
 
+def voxel_numbers(columns: Float[np.ndarray, "3 N"], voxel_size: float) -> tuple[Int[np.ndarray, "N"], int]:
+    """The number of the voxel of each point, in the order of `voxel_order`, and how many are occupied."""
+    order, starts = voxel_order(columns, voxel_size)
+    numbers = np.empty_like(order)
+    numbers[order] = np.repeat(np.arange(len(starts)), np.diff(np.append(starts, len(order))))
+    return numbers, len(starts)
+
+
 def starts_of(sorted_keys: Int[np.ndarray, "N"]) -> Int[np.ndarray, "M"]:
     """Positions at which a new key starts."""
     first = np.ones(len(sorted_keys), bool)

@@ -6,7 +6,7 @@ import collections
 import contextlib
 import functools
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor, wait
 from typing import Any, TypeVar
 
@@ -70,8 +70,39 @@ def in_new_thread(call: Callable[[], Answer]) -> Answer:
 
     While one is, as inside `jax.grad`, each call of a compiled program takes half a millisecond longer.
     """
-    with ThreadPoolExecutor(1, thread_name_prefix="mcgicp") as executor:
-        return executor.submit(with_settings(call)).result()
+    return started(call).result()
+
+
+def started(call: Callable[[], Answer]) -> Future[Answer]:
+    """The future result of a call that begins now, in a thread of its own."""
+    executor = ThreadPoolExecutor(1, thread_name_prefix="mcgicp")
+    future = executor.submit(with_settings(call))
+    # The thread ends after the call.
+    executor.shutdown(wait=False)
+    return future
+
+
+class ReadAhead(Iterator[Answer]):
+    """The results of a function, called anew while the last result is in use, in a thread: one ahead, no further.
+
+    An error is raised in the place of its result, and the iteration may go on.
+
+    Args:
+        read: returns the next result; raises `StopIteration` at the end.
+    """
+
+    def __init__(self, read: Callable[[], Answer]):
+        self._read = read
+        self._next: Future[Answer] | None = None
+
+    def __next__(self) -> Answer:
+        self._next = self._next or started(self._read)
+        # An interruption while waiting loses nothing.
+        wait([self._next])
+        done, self._next = self._next, None
+        found = done.result()
+        self._next = started(self._read)
+        return found
 
 
 def with_settings(work: Callable[..., Answer], *, pickled: bool = False) -> Callable[..., Answer]:

@@ -8,7 +8,7 @@ from functools import partial
 from typing import NamedTuple
 
 import jax
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from mcgicp_jax._clouds.origins import centred_pose, pose_in_user_frame
 from mcgicp_jax._clouds.point_cloud import PointCloud, Values, as_cloud
@@ -234,9 +234,7 @@ def pose_problem(
     """Inputs of the loop for preprocessed clouds, NumPy arrays where everything is concrete; and what these were
     computed from."""
     check_clouds(source, target, method)
-    most, rows = options.max_source_points, None
-    if most is not None and most < source.valid.size:
-        rows = spread_rows(source.valid, most)
+    rows = rows_to_match(source, options)
     pair = surface_pair(
         method,
         source,
@@ -262,6 +260,12 @@ def pose_problem(
         describe_target=pair.describe_target,
     )
     return problem, Inputs(source, target, pair.method, pair.terms, source_rows=rows)
+
+
+def rows_to_match(source: PointCloud, options: Options) -> Int[AnyArray, "n"] | None:
+    """The source rows that `max_source_points` leaves; None for all."""
+    most = options.max_source_points
+    return None if most is None or most >= source.valid.size else spread_rows(source.valid, most)
 
 
 def _equalized(

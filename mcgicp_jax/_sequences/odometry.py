@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import collections
+import weakref
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import partial
 from typing import Any, Literal, Unpack
 
@@ -12,16 +14,18 @@ from jaxtyping import Float
 
 from mcgicp_jax._clouds.frame import Frame
 from mcgicp_jax._clouds.point_cloud import PointCloud, Values, as_cloud
-from mcgicp_jax._clouds.preprocess import check_preprocessing, preprocess
+from mcgicp_jax._clouds.preprocess import check_preprocessing, completed, preprocess_on_demand
 from mcgicp_jax._clouds.voxel_map import VoxelMap
 from mcgicp_jax._compute.argument_checks import check_positive, errors_named
 from mcgicp_jax._compute.lazy import Lazy
+from mcgicp_jax._compute.threads import ReadAhead
+from mcgicp_jax._local_geometry.local_statistics import geometry_table
 from mcgicp_jax._local_geometry.spacing_and_noise import point_spacing
 from mcgicp_jax._math.poses import Pose, nearest_rotation, pose_matrix
 from mcgicp_jax._methods.base import AbstractMethod
 from mcgicp_jax._pose_graph.graph import PoseGraph
 from mcgicp_jax._registration.options import ENOUGH_SOURCE_POINTS, GivenOptions, Options, check_method, options_of
-from mcgicp_jax._registration.register_pair import register_pair
+from mcgicp_jax._registration.register_pair import register_pair, rows_to_match
 from mcgicp_jax._registration.result import RegistrationResult, computed, is_usable
 from mcgicp_jax._sequences.loop_closure import Trajectory
 from mcgicp_jax._sequences.relocalization import Relocalizer, map_target
@@ -32,21 +36,31 @@ class OdometryStep:
     """One frame of `odometry`.
 
     Attributes:
-        cloud: the preprocessed cloud, in the sensor's frame.
         pose: (4, 4) float64, sensor to world, metres.
-        registration: registration of this frame, None for the first; check its `converged`. Its matrix maps to the
-            previous frame, or with `against="map"`, or where the frame was found again by `recover`, to the world. Of a
-            lost frame, it maps to the previous frame, and that of the first lost one was not used.
         lost: with `recover`, whether the pose in the world is not known: it was extrapolated, or follows an
             extrapolated one by registrations to the previous frame.
-        deferred_graph: value of `graph`.
+        deferred_cloud, deferred_registration, deferred_graph: values of the properties.
     """
 
-    cloud: PointCloud
     pose: Float[np.ndarray, "4 4"]
-    registration: RegistrationResult | None
+    deferred_cloud: Lazy[PointCloud]
+    deferred_registration: Lazy[RegistrationResult] | None
     lost: bool = False
     deferred_graph: Lazy[PoseGraph] | None = None
+
+    @property
+    def cloud(self) -> PointCloud:
+        """The preprocessed cloud, in the sensor's frame."""
+        return self.deferred_cloud.value
+
+    @property
+    def registration(self) -> RegistrationResult | None:
+        """Registration of this frame, None for the first; check its `converged`.
+
+        Its matrix maps to the previous frame, or with `against="map"`, or where the frame was found again by `recover`,
+        to the world. Of a lost frame, it maps to the previous frame, and that of the first lost one was not used.
+        """
+        return None if self.deferred_registration is None else self.deferred_registration.value
 
     @property
     def graph(self) -> PoseGraph | None:
@@ -77,8 +91,8 @@ def odometry(
     the previous motion.
 
     Args:
-        frames: iterable of `datasets.Frame`, `PointCloud` or (N, 3) arrays in metres; consumed lazily. Preprocessed
-            clouds are used unchanged.
+        frames: iterable of `datasets.Frame`, `PointCloud` or (N, 3) arrays in metres; consumed lazily: while a frame is
+            registered, the next one is read and preprocessed in a thread. Preprocessed clouds are used unchanged.
         method: registration method.
         voxel_size, num_neighbors: arguments of `preprocess`. The map has the same voxel size, by default the point
             spacing of the first frame.
@@ -119,18 +133,38 @@ def odometry(
         raise ValueError(
             'loops: expected against="previous" and no recover: registrations to the previous frame become edges'
         )
+    given = options_of(odometry, options)
     return _Sensor(
-        frames=enumerate(frames),
+        frames=ReadAhead(partial(_read, enumerate(frames), method, given, voxel_size, num_neighbors)),
         method=method,
-        options=options_of(odometry, options),
+        options=given,
         preprocessing=(voxel_size, num_neighbors),
         motion=pose_matrix(init),
         pose=np.asarray(pose_matrix(start, "start")),
         against_map=against == "map",
         radius=map_radius,
         recover=recover,
-        trajectory=Trajectory(method, options_of(odometry, options)) if loops else None,
+        trajectory=Trajectory(method, given) if loops else None,
     )
+
+
+def _read(
+    frames: Iterator[tuple[int, Frame | PointCloud | Values]],
+    method: AbstractMethod,
+    options: Options,
+    voxel_size: float | None,
+    num_neighbors: int,
+) -> tuple[str, PointCloud]:
+    """The name and the cloud of the next frame, preprocessed and described as the source of a registration."""
+    number, frame = next(frames)
+    name = f"frames[{number}]"
+    cloud = as_cloud(name, frame.cloud if isinstance(frame, Frame) else frame)
+    if cloud.neighbors is None:
+        with errors_named(name):
+            cloud = preprocess_on_demand(cloud, voxel_size, num_neighbors)
+    if not (options.equalize_channels or options.takes_raw(method, "source")):
+        geometry_table(cloud, method.uses_channels).known(rows_to_match(cloud, options))
+    return name, cloud
 
 
 @dataclass
@@ -138,6 +172,7 @@ class _Sensor(Iterator[OdometryStep]):
     """The sensor at its last frame, and the maps of the previous frames. A class, as generators end when they raise.
 
     Attributes:
+        frames: names and clouds of the frames.
         preprocessing: voxel size and number of neighbours.
         motion: (4, 4), between the last two frames.
         pose: (4, 4), sensor to world.
@@ -146,9 +181,10 @@ class _Sensor(Iterator[OdometryStep]):
         cloud: the last frame; None before the first.
         world: the map that frames are registered to; None registers them to the previous frame.
         places: the map in which lost frames are found; None without relocalisation.
+        unread: registrations of the last two steps.
     """
 
-    frames: Iterator[tuple[int, Frame | PointCloud | Values]]
+    frames: Iterator[tuple[str, PointCloud]]
     method: AbstractMethod
     options: Options
     preprocessing: tuple[float | None, int]
@@ -161,6 +197,7 @@ class _Sensor(Iterator[OdometryStep]):
     cloud: PointCloud | None = None
     world: Any = None
     places: Relocalizer | None = None
+    unread: collections.deque[Any] = field(default_factory=partial(collections.deque, maxlen=2))
 
     @property
     def is_lost(self) -> bool:
@@ -168,12 +205,7 @@ class _Sensor(Iterator[OdometryStep]):
 
     def __next__(self) -> OdometryStep:
         """Locate the sensor at the next frame, and add the frame to the maps."""
-        number, frame = next(self.frames)
-        name = f"frames[{number}]"
-        cloud = as_cloud(name, frame.cloud if isinstance(frame, Frame) else frame)
-        if cloud.neighbors is None:
-            with errors_named(name):
-                cloud = preprocess(cloud, *self.preprocessing)
+        name, cloud = next(self.frames)
         if self.cloud is None:
             voxel = self.preprocessing[0] or float(point_spacing(cloud))
             self.world = VoxelMap(voxel) if self.against_map else None
@@ -193,7 +225,22 @@ class _Sensor(Iterator[OdometryStep]):
             self.pose = self.trajectory.add(cloud, self.pose, result)
             graph = Lazy(partial(self.trajectory.graph, *self.trajectory.size))
         self.cloud = cloud
-        return OdometryStep(cloud, self.pose, None if result is None else computed(result), self.is_lost, graph)
+        complete = Lazy(partial(completed, cloud))
+        if result is None:
+            return OdometryStep(self.pose, complete, None, self.is_lost, graph)
+        registration = Lazy(partial(computed, result))
+        self._compute_kept(registration)
+        return OdometryStep(self.pose, complete, registration, self.is_lost, graph)
+
+    def _compute_kept(self, registration: Lazy[RegistrationResult]) -> None:
+        """Compute the registration of the step before the last if somebody keeps it, since it refers to two frames.
+
+        The caller of a loop still holds the last step. What nobody reads is not computed.
+        """
+        kept = self.unread[0]() if len(self.unread) == 2 else None
+        if kept is not None:
+            _ = kept.value
+        self.unread.append(weakref.ref(registration))
 
     def _located(self, cloud: PointCloud, before: PointCloud) -> RegistrationResult:
         """Update motion and pose by a registration."""
