@@ -10,12 +10,15 @@ from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
 from functools import partial
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
 import mcgicp_jax as mcg
 from mcgicp_jax import Status, datasets
-from mcgicp_jax._pairs.batch_executors import executor_like
+from mcgicp_jax._pairs.batch_executors import _as_numpy, executor_like
+from mcgicp_jax._pairs.batch_jobs import BatchJob
+from mcgicp_jax._registration.options import Options
 from mcgicp_jax.metrics import pose_error
 from tests.batches import METHOD, assert_same, batch, prepared
 from tests.scenes import motion
@@ -238,6 +241,17 @@ def test_workers_have_the_settings_of_the_caller(raw):
         (result,) = batch([make], [target])
     assert seen == [(True, "highest")]
     assert result.T_target_source.wxyz_xyz.dtype == np.float64
+
+
+def test_what_is_pickled_for_workers_is_numpy():
+    """In a process without x64, float64 arrays of JAX would become float32."""
+    with jax.enable_x64(True):
+        options = Options(max_distance=jnp.asarray(0.5), robust=mcg.Huber(1.0))
+        job = BatchJob(METHOD, options, None, 20)
+    assert any(isinstance(leaf, jax.Array) for leaf in jax.tree.leaves((job.method, job.options.robust)))
+    sent = _as_numpy(job)
+    for leaf in jax.tree.leaves((sent.method, sent.options.robust, sent.options.max_distance)):
+        assert isinstance(leaf, np.ndarray)
 
 
 def test_another_pool_in_place_of_a_broken_one_is_like_it():

@@ -15,6 +15,7 @@ from mcgicp_jax._global_pose.robust_pose_fit import (
     NUM_MATCHES,
     PoseHypotheses,
     PutativeMatches,
+    _support,
     fit_pose,
     hypotheses,
     refined,
@@ -200,6 +201,18 @@ def test_poses_are_those_of_scipy(kind):
             np.testing.assert_allclose(rotation, expected.as_matrix(), atol=2e-3)
         np.testing.assert_allclose(rotation @ rotation.T, np.eye(3), atol=1e-5)
         assert np.linalg.det(rotation) > 0.99
+
+
+@pytest.mark.parametrize("same", [True, False])
+def test_matches_whose_normals_differ_do_not_support_each_other(same):
+    columns = np.zeros((4, NUM_MATCHES, 3), np.float32)
+    columns[:2, :4] = [[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]]
+    columns[2:, :4] = [0, 0, 1]
+    if not same:
+        columns[3, :2] = [1, 0, 0]
+    matches = PutativeMatches(*columns, np.arange(NUM_MATCHES) < 4)
+    # Of two of the four matches, the other two.
+    assert np.max(_support(matches, np.float32(0.05))) == (2 if same else 0)
 
 
 def test_ninety_percent_of_wrong_matches_do_not_matter():

@@ -16,7 +16,7 @@ from mcgicp_jax._pose_solver.matched import Matched, Motion, match_surfaces, sur
 from mcgicp_jax._terms.base import AbstractTerm
 from mcgicp_jax._terms.mahalanobis import Mahalanobis
 from mcgicp_jax._terms.photometric import Photometric, Residuals
-from tests.differences import CONVERGED, GATE, TO_ROUNDING, check_gradient, clouds_with, inputs_of, weigh
+from tests.differences import CONVERGED, GATE, TO_ROUNDING, check_eager_gradient, clouds_with, inputs_of, weigh
 from tests.precision import in_float64
 from tests.scenes import motion, pair, wall
 
@@ -201,6 +201,16 @@ def test_a_sample_has_the_design_effect_of_all():
     np.testing.assert_allclose(sample.designs[1], whole.designs[1], rtol=0.3)
 
 
+def test_the_response_is_that_to_shifts_in_all_directions():
+    """Values that change by half of what slopes in any direction predict."""
+    term = replace(photometric(1.0), deviations=np.full(2, 100.0))
+    slopes = np.random.default_rng(0).normal(size=(500, 2, 3))
+    values = 0.5 * np.einsum("nki,si->snk", slopes, term.shifts)
+    others = np.zeros((6, 500, 1)), np.zeros((6, 500, 1)), np.zeros((6, 500, 3))
+    responding = term.with_response(Residuals(values, np.stack([slopes] * 6), *others))
+    np.testing.assert_allclose(responding.designs, 2 * term.designs, rtol=1e-2)
+
+
 @pytest.mark.parametrize("noise", [0.0, 1.0, 100.0])
 def test_noise_of_slopes_is_discounted(noise):
     """The reliability is the share of the true slope in the squared mean of two noisy ones: s² / (s² + n²/2)."""
@@ -228,7 +238,7 @@ def test_align_has_the_gradient_of_its_answer(noisy):
 
     inputs = inputs_of(source, target, method, None)
     inputs = {name: value for name, value in inputs.items() if name not in ("method", "robust")}
-    check_gradient(loss, inputs)
+    check_eager_gradient(loss, inputs)
 
 
 @in_float64

@@ -330,6 +330,9 @@ def test_large_coordinates_keep_the_covariance_of_the_points():
     to_near[:3, 3:] = -np.cross(np.eye(3), offset)
     brought = to_near @ far.covariance @ to_near.T
     np.testing.assert_allclose(np.diagonal(brought), np.diagonal(near.covariance), rtol=0.5)
+    from_near = np.linalg.inv(to_near)
+    scale = np.abs(near.information).max()
+    np.testing.assert_allclose(from_near.T @ far.information @ from_near, near.information, atol=1e-2 * scale)
     assert far.unconstrained_directions == near.unconstrained_directions == ()
     # Of the points themselves, wherever zero is.
     np.testing.assert_allclose(far.deviations, near.deviations, rtol=0.3)
