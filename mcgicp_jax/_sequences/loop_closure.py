@@ -8,13 +8,14 @@ from __future__ import annotations
 
 import itertools
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float
 
 from mcgicp_jax._clouds.point_cloud import PointCloud
 from mcgicp_jax._math.poses import adjoint, inverse
-from mcgicp_jax._math.twists import logarithm
+from mcgicp_jax._math.twists import exponential, logarithm
 from mcgicp_jax._methods.base import AbstractMethod
 from mcgicp_jax._pose_graph.edge import Edge
 from mcgicp_jax._pose_graph.graph import PoseGraph
@@ -31,9 +32,11 @@ _RANGES, _DEVIATIONS = 2.0, 3.37
 # A loop is tried if the motion between two frames is less certain than a registration: its variance is larger by this
 # factor, in the geometric mean over the six directions.
 _GAIN = 4.0
-# Squared Mahalanobis distance of a loop beyond which all poses are optimised at once, and not when they are read: 99 %
-# of χ² with six degrees of freedom.
+# Squared Mahalanobis distance beyond which a loop contradicts the path: 99 % of χ² with six degrees of freedom.
 _CONTRADICTION = 16.8
+# All poses are optimised where a loop contradicts the path, or if this many times as many frames as the last time are
+# known, so that all optimisations take as long as some of the last. Other loops move the last pose alone.
+_GROWTH = 1.1
 # Largest number of registrations per frame.
 _TRIES = 2
 
@@ -46,14 +49,18 @@ class Trajectory:
         self._clouds: list[PointCloud] = []
         self._poses = np.zeros((0, 4, 4))
         self._edges: list[Edge] = []
-        # Of each edge, its frames, its covariance and its geometric mean over the six directions.
-        self._ends: list[tuple[int, int]] = []
+        # Of each edge, its frames, its covariance, the same for twists of the world (the rows beyond the last edge are
+        # spare), and the geometric mean of the covariance over the six directions.
+        self._ends = np.zeros((2, 0), np.int32)
         self._covariances: list[Float[np.ndarray, "6 6"]] = []
-        self._variances: list[float] = []
+        self._in_world = np.zeros((1, 6, 6))
+        self._variances = np.zeros(0)
+        # This mean of the last edge with information; 0 before there is one.
+        self._usual = 0.0
         # Which edges the last optimisation kept; later ones are.
         self._kept = np.zeros(0, bool)
-        # Whether loops were closed since the last optimisation.
-        self._stale = False
+        # Whether loops were closed since the last optimisation, and the number of frames then.
+        self._stale, self._optimized = False, 0
         self._between: dict[tuple[int, int], int] = {}
 
     def graph(self, num_frames: int | None = None, num_edges: int | None = None) -> PoseGraph:
@@ -81,63 +88,90 @@ class Trajectory:
             self._connect(edge)
             loop = self._loop(number)
             if loop is not None:
-                self._connect(loop)
-                self._stale = True
-                residual = logarithm(inverse(np.asarray(loop.T_i_j)) @ inverse(self._poses[int(loop.i)]) @ pose)
-                if residual @ loop.information @ residual > _CONTRADICTION:
-                    self._optimize()
-        return self._poses[-1]
+                self._close(*loop)
+        # A view would keep the poses of all frames until then in memory.
+        return self._poses[-1].copy()
+
+    def _close(self, loop: Edge, known: Float[np.ndarray, "6 6"]) -> None:
+        """Add a loop to the last frame, and correct poses.
+
+        Args:
+            known: covariance of the motion between the two frames without the loop, for the twists of the edge.
+        """
+        self._connect(loop)
+        self._stale = True
+        pose = self._poses[-1]
+        residual = logarithm(inverse(self._poses[int(loop.i)] @ np.asarray(loop.T_i_j)) @ pose)
+        gain = np.linalg.solve(known + self._covariances[-1], known).T
+        contradicts = residual @ np.linalg.solve(known + self._covariances[-1], residual) > _CONTRADICTION
+        if contradicts or len(self._poses) >= _GROWTH * self._optimized:
+            self._optimize()
+        else:
+            self._poses[-1] = pose @ exponential(-gain @ residual)
 
     def _optimize(self) -> None:
         if self._stale:
             found = optimize_poses(PoseGraph(self._poses, self._edges))
-            self._poses, self._kept, self._stale = np.asarray(found.poses), np.asarray(found.kept), False
+            self._poses, self._kept, self._stale = np.array(found.poses), np.asarray(found.kept), False
+            self._optimized = len(self._poses)
+            self._in_world[: len(self._edges)] = self._moved(np.array(self._covariances), self._ends[1])
 
     def _connect(self, edge: Edge) -> None:
         i, j = int(edge.i), int(edge.j)
         # An assumed motion is right to the reach of the sensor and to half a turn.
         least = np.repeat([self._reach(j), np.pi], 3) ** -2.0
-        self._ends.append((i, j))
+        self._ends = np.append(self._ends, np.array([[i], [j]], np.int32), axis=1)
         self._between[i, j] = self._between[j, i] = len(self._edges)
         self._edges.append(edge)
         self._covariances.append(np.linalg.inv(np.asarray(edge.information) + np.diag(least)))
-        self._variances.append(float(np.exp(np.linalg.slogdet(self._covariances[-1])[1] / 6)))
+        if len(self._edges) > len(self._in_world):
+            self._in_world = np.concatenate([self._in_world, np.zeros_like(self._in_world)])
+        self._in_world[len(self._edges) - 1] = self._moved(self._covariances[-1], j)
+        mean = float(np.exp(np.linalg.slogdet(self._covariances[-1])[1] / 6))
+        self._variances = np.append(self._variances, mean)
+        self._usual = mean if np.any(edge.information) else self._usual
+
+    def _moved(self, covariances: Float[np.ndarray, "*m 6 6"], frames: Any) -> Float[np.ndarray, "*m 6 6"]:
+        """Covariances for twists of frames, for those of the world."""
+        change = adjoint(self._poses[frames])
+        return change @ covariances @ change.swapaxes(-1, -2)
 
     def _reach(self, frame: int) -> float:
         return _RANGES * float(np.median(np.linalg.norm(self._clouds[frame].coordinates, axis=1)))
 
-    def _loop(self, number: int) -> Edge | None:
-        """An edge to an earlier frame nearby, if the motion between the two is less certain than a registration."""
+    def _loop(self, number: int) -> tuple[Edge, Float[np.ndarray, "6 6"]] | None:
+        """An edge to an earlier frame nearby, if the motion between the two is less certain than a registration; and
+        the covariance of this motion."""
         from scipy.sparse import coo_array
         from scipy.sparse.csgraph import dijkstra
 
         kept = np.append(self._kept, np.ones(len(self._edges) - len(self._kept), bool))
-        edges = np.array(self._variances)[kept], np.array(self._ends)[kept].T
+        edges = self._variances[kept], self._ends[:, kept]
         graph = coo_array(edges, (number + 1, number + 1)).tocsr()
         variances, before = dijkstra(graph, directed=False, indices=number, return_predecessors=True)
-        informed = (k for k in reversed(range(len(self._edges))) if np.any(self._edges[k].information))
-        usual = self._variances[next(informed, 0)]
+        before = before.tolist()
         distances = np.linalg.norm(self._poses[:, :3, 3] - self._poses[number, :3, 3], axis=1)
         tries = 0
-        for i in _candidates(variances > _GAIN * usual, distances, variances):
-            sigma = self._deviation(number, i, before)
+        for i in _candidates(variances > _GAIN * self._usual, distances, variances):
+            known = self._covariance(number, i, before)
+            sigma = float(np.sqrt(np.linalg.eigvalsh(known[:3, :3])[-1]))
             if distances[i] <= self._reach(number) + _DEVIATIONS * sigma:
                 edge = self._registered(i, number, sigma)
                 tries += 1
-                if edge is not None or tries == _TRIES:
-                    return edge
+                if edge is not None:
+                    return edge, known
+                if tries == _TRIES:
+                    break
         return None
 
-    def _deviation(self, number: int, i: int, before: Int[np.ndarray, "n"]) -> float:
-        """Largest standard deviation of the position of a frame in the frame of another, metres."""
+    def _covariance(self, number: int, i: int, before: list[int]) -> Float[np.ndarray, "6 6"]:
+        """Covariance of the motion from frame `i` to the last one along the path, for twists of the last frame."""
         path = [i]
         while path[-1] != number:
-            path.append(int(before[path[-1]]))
-        rows = [self._between[ends] for ends in itertools.pairwise(path)]
-        ends = [self._ends[row][1] for row in rows]
-        moved = adjoint(inverse(self._poses[number]) @ self._poses[ends])[:, :3]
-        total = np.einsum("mij,mjk,mlk->il", moved, np.array([self._covariances[row] for row in rows]), moved)
-        return float(np.sqrt(np.linalg.eigvalsh(total)[-1]))
+            path.append(before[path[-1]])
+        total = np.sum(self._in_world[[self._between[ends] for ends in itertools.pairwise(path)]], axis=0)
+        change = adjoint(inverse(self._poses[number]))
+        return change @ total @ change.T
 
     def _registered(self, i: int, j: int, sigma: float) -> Edge | None:
         """The edge of a registration whose coarse `max_distance` covers the uncertainty of the motion."""
