@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from mcgicp_jax import GICP, PointCloud, preprocess, register
+from mcgicp_jax._clouds.frame import Frame
 from mcgicp_jax._clouds.point_cloud import as_cloud
 from tests import reference as ref
 from tests.precision import tolerance
@@ -361,24 +362,44 @@ class Foreign:
 
 def test_clouds_of_other_libraries_are_taken(tmp_path):
     points = np.random.default_rng(0).normal(size=(5, 3))
-    fields = [("x", "f4"), ("y", "f4"), ("z", "f4"), ("intensity", "f4"), ("ring", "u2"), ("tag", "U3")]
+    fields = [
+        ("x", "f4"),
+        ("y", "f4"),
+        ("z", "f4"),
+        ("rgb", "f4"),
+        ("ring", "u2"),
+        ("name", "U3"),
+        ("reflectivity", "u2"),
+    ]
     structured = np.zeros((1, 5), fields)
     structured["x"], structured["y"], structured["z"] = points.T[:, None]
-    structured["ring"] = np.arange(5)
+    structured["reflectivity"] = np.arange(5)
+    # As of PCL and ROS: 0x00RRGGBB in the bits of a float.
+    structured["rgb"] = np.full(5, 0x00FF3300, np.uint32).view(np.float32)
     cloud = PointCloud(structured)
-    assert cloud.channel_names == ("intensity", "ring")
+    # As in files, rings and other metadata are no channels.
+    assert cloud.channel_names == ("intensity", "red", "green", "blue")
     np.testing.assert_allclose(cloud.points, points, atol=1e-6)
-    np.testing.assert_array_equal(cloud.channels[:, 1], np.arange(5))
-    colored, bare = PointCloud(Foreign(points, 0.5 * np.abs(points))), PointCloud(Foreign(points, []))
-    assert colored.channel_names == ("red", "green", "blue") and bare.channels.shape == (5, 0)
+    np.testing.assert_allclose(cloud.channels, [[i, 1, 0.2, 0] for i in range(5)], atol=1e-7)
+    colored = PointCloud(Foreign(points, 0.5 * np.abs(points)))
+    assert colored.channel_names == ("red", "green", "blue")
     np.testing.assert_array_equal(colored.points, points)
+    for none in ([], np.zeros((0, 3))):
+        assert PointCloud(Foreign(points, none)).channels.shape == (5, 0)
     for wrong, message in (
         ("scan.ply", r"^points: expected coordinates, got a path; mcgicp_jax.io.read\('scan.ply'\)"),
         (tmp_path / "scan.ply", "got a path"),
-        (object(), r"got object; its coordinates may be np.asarray\(cloud.points\)"),
+        (object(), "got object; pass its coordinates as an array"),
+        ({"x": points}, "got dict; pass its coordinates"),
+        (Frame(cloud), "got Frame; pass its cloud"),
+        (cloud, "got a PointCloud; use it as it is"),
+        (points.T, r"expected shape \(N, 3\), got \(3, 5\); pass points.T"),
+        (np.hstack([points, points]), r"expected shape \(N, 3\), got \(5, 6\); pass further columns as channels"),
         (structured[["x", "y", "ring"]], "^points: expected the fields x, y and z, got x, y, ring"),
     ):
         with pytest.raises(ValueError, match=message):
             PointCloud(wrong)
+    with pytest.raises(ValueError, match=r"^channel_names: expected a sequence of names, got the string 'ab'"):
+        PointCloud(points, points[:, :2], channel_names="ab")
     with pytest.raises(ValueError, match=r"^source: points: expected coordinates, got a path"):
         register("scan.ply", points, GICP())

@@ -50,6 +50,13 @@ def _as_float(name: str, values: Values) -> Any:
     return array if array.dtype in (np.float32, np.float64) else array.astype(np.float64)
 
 
+def _advice(shape: tuple[int, ...]) -> str:
+    """What to do with points of another shape."""
+    if len(shape) == 2 and shape[0] == 3:
+        return "; pass points.T"
+    return "; pass further columns as channels" if len(shape) == 2 and shape[1] > 3 else ""
+
+
 def _as_mask(values: Values, shape: tuple[int, ...]) -> Any:
     """Check `channel_valid` against the shape of the channels; a single channel may have a 1-D mask."""
     mask = values if isinstance(values, jax.Array) else np.asarray(values)
@@ -114,9 +121,9 @@ class PointCloud(eqx.Module):
 
         Args:
             points: (N, 3), metres: nested lists or arrays of any real dtype, NumPy or JAX; at large (UTM) coordinates
-                float64 NumPy arrays, as float32 is too coarse there. Without `channels`, also a structured array with
-                the fields x, y and z, whose other numbers become channels, or an object with `points` and perhaps
-                `colors`, such as a cloud of Open3D.
+                float64 NumPy arrays, as float32 is too coarse there. Also a structured array with the fields x, y and z
+                or an object with `points` and perhaps `colors`, such as a cloud of Open3D. Without `channels`, their
+                other numbers become channels, as `io.read` says.
             channels: (N, C), or (N,) for a single channel, in any unit; none by default.
             channel_valid: booleans in the shape of `channels`, False where a point lacks the channel; the value there
                 is ignored and may be NaN. None: all points have all channels.
@@ -132,7 +139,7 @@ class PointCloud(eqx.Module):
             channels, channel_names = found, channel_names or names
         self.points = _as_float("points", points)
         if self.points.ndim != 2 or self.points.shape[1] != 3:
-            raise ValueError(f"points: expected shape (N, 3), got {self.points.shape}")
+            raise ValueError(f"points: expected shape (N, 3), got {self.points.shape}{_advice(self.points.shape)}")
         size = self.points.shape[0]
         if channels is None:
             channels = np.zeros((size, 0), self.points.dtype)
@@ -151,6 +158,8 @@ class PointCloud(eqx.Module):
         count = self.channels.shape[1]
         if channel_names is None:
             channel_names = [f"channel_{i}" for i in range(count)]
+        if isinstance(channel_names, str):
+            raise ValueError(f"channel_names: expected a sequence of names, got the string {channel_names!r}")
         if len(channel_names) != count:
             raise ValueError(f"channel_names: expected {count} names, got {len(channel_names)}")
         self.channel_names = tuple(channel_names)

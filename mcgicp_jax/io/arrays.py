@@ -10,8 +10,9 @@ import numpy as np
 from jaxtyping import Float, Shaped
 from numpy.lib import format as npy
 
+from mcgicp_jax._clouds.columns import COLORS, INTENSITIES
 from mcgicp_jax._clouds.point_cloud import PointCloud
-from mcgicp_jax.io.columns import COLORS, INTENSITIES, cloud_of
+from mcgicp_jax.io.columns import cloud_of
 from mcgicp_jax.io.files import check_size
 
 # Metres: float32 resolves 8 mm at this distance; larger coordinates are not written, nor accepted as a KITTI scan.

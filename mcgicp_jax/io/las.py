@@ -8,8 +8,9 @@ from typing import Any, BinaryIO
 import numpy as np
 from jaxtyping import Float, Shaped
 
+from mcgicp_jax._clouds.columns import COLORS, ORDER
 from mcgicp_jax._clouds.point_cloud import PointCloud
-from mcgicp_jax.io.columns import COLORS, ORDER, cloud_of
+from mcgicp_jax.io.columns import cloud_of
 from mcgicp_jax.io.files import check_size, optional_module
 
 # Points per chunk: bounds the memory that laspy needs beyond the columns that are kept.

@@ -7,8 +7,9 @@ from typing import BinaryIO
 
 import numpy as np
 
+from mcgicp_jax._clouds.columns import COLORS, with_unpacked_colors
 from mcgicp_jax._clouds.point_cloud import PointCloud
-from mcgicp_jax.io.columns import COLORS, cloud_of, columns_of
+from mcgicp_jax.io.columns import cloud_of, columns_of
 from mcgicp_jax.io.files import check_size, optional_module
 
 # Bound on the compression ratio of LZF, whose blocks of three bytes expand to at most 264.
@@ -36,11 +37,7 @@ def read_pcd(file: BinaryIO, size: int) -> PointCloud:
         raise ValueError(f"the header claims {metadata.points} points, the file has {len(rows)}")
     # pypcd4 names padding fields "#" plus a random suffix, and renames fields with several values per point.
     names = [name for name in metadata.fields if name in rows.dtype.names and not name.startswith("#")]
-    columns = {name: rows[name] for name in names}
-    for packed in columns.keys() & {"rgb"} or columns.keys() & {"rgba"}:
-        colours = pypcd4.PointCloud.decode_rgb(columns.pop(packed))
-        columns |= dict(zip(COLORS, colours.T, strict=True))
-    return cloud_of(columns)
+    return cloud_of(with_unpacked_colors({name: rows[name] for name in names}))
 
 
 def _pcd_header(file: BinaryIO) -> list[str]:

@@ -9,8 +9,9 @@ from typing import BinaryIO
 
 import numpy as np
 
+from mcgicp_jax._clouds.columns import COLORS, channel_name
 from mcgicp_jax._clouds.point_cloud import PointCloud
-from mcgicp_jax.io.columns import COLORS, channel_name, cloud_of, column_name, columns_of
+from mcgicp_jax.io.columns import cloud_of, column_name, columns_of
 
 
 def read_text(file: BinaryIO, size: int) -> PointCloud:
