@@ -257,7 +257,8 @@ def test_what_makes_no_map_is_refused_by_name(room):
     for arguments, message in (
         (([], [], 0.1), "clouds: expected at least one"),
         ((clouds[:1], truth[:1], 0.0), "voxel_size: expected a positive"),
-        ((clouds[:1], truth[:2], 0.1), "argument"),
+        ((clouds[:1], truth[:2], 0.1), "poses: expected one per cloud, got more"),
+        ((clouds[:2], truth[:1], 0.1), "poses: expected one per cloud, got only 1"),
         (([clouds[0], bare], truth[:2], 0.1), r"clouds\[1\]: expected the channels"),
         ((clouds[:1], [2 * np.eye(4)], 0.1), r"poses\[0\]"),
         (

@@ -294,3 +294,21 @@ def test_too_few_voxels_for_the_neighbours():
         warnings.simplefilter("error")
         preprocess(points, 0.5, num_neighbors=5)
         preprocess(points[:8])
+
+
+def test_points_left_out_for_their_channels_are_told():
+    channels = CHANNELS.copy()
+    channels[:5, 1] = np.nan
+    with pytest.warns(UserWarning, match=r"^left out 5 of 150 .*, 5 of them with finite coordinates; .*channel_valid$"):
+        ready(PointCloud(POINTS, channels))
+    with pytest.raises(ValueError, match=r"got 0 of 150, left out 150, 150 of them with finite .*channel_valid$"):
+        ready(PointCloud(POINTS, np.nan * CHANNELS))
+
+
+def test_clouds_of_duplicates_are_told():
+    with pytest.warns(UserWarning, match="^points: 100% lie exactly on another one, .* voxel_size$"):
+        ready(np.repeat(POINTS, 2, axis=0))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        ready(np.repeat(POINTS, 2, axis=0), voxel_size=1e-3)
+        ready(np.concatenate([POINTS, POINTS[:40]]))

@@ -61,7 +61,8 @@ def preprocess(
 
     Warns:
         UserWarning: once per call, if points with NaN or infinity were left out, if downsampling leaves fewer points
-            than `num_neighbors`, and if coordinates far from zero are float32 and too coarse for the points' spacing.
+            than `num_neighbors`, if more than half of the points lie exactly on another one, or if coordinates far from
+            zero are float32 and too coarse for the points' spacing.
     """
     check_preprocessing(voxel_size, num_neighbors)
     cloud = as_cloud("cloud", cloud)
@@ -186,7 +187,7 @@ def with_neighbors(
 
 
 def _warn_of_loss(given: PointCloud, found: PointCloud, voxel_size: float | None, num_neighbors: int) -> None:
-    """Warn of coordinates given in float32 that are too large for it, such as those of UTM, and of too few voxels."""
+    """Warn of float32 coordinates that are too large for it, such as those of UTM, of duplicates and few voxels."""
     if given.points.dtype == np.float32 and np.any(found.origin):
         largest, points, neighbors = np.abs(given.points).max(), np.asarray(found.points), np.asarray(found.neighbors)
         # Each point is its own first neighbour.
@@ -195,6 +196,16 @@ def _warn_of_loss(given: PointCloud, found: PointCloud, voxel_size: float | None
             warnings.warn(
                 f"points: float32 has rounded coordinates of {largest:.0f} m to steps of {np.spacing(largest):.2g} m, "
                 f"and neighbours are {spacing:.2g} m apart; read them as float64, or subtract an offset before float32",
+                UserWarning,
+                stacklevel=3,
+            )
+    if not isinstance(found.neighbors, NeighborsOnDemand):
+        second = np.asarray(found.neighbors)[:, 1]
+        duplicates = np.mean((found.points[second] == found.points).all(axis=1))
+        if duplicates > 0.5:
+            warnings.warn(
+                f"points: {duplicates:.0%} lie exactly on another one, so that neighbourhoods do not span the surface; "
+                "average them with voxel_size",
                 UserWarning,
                 stacklevel=3,
             )
@@ -225,9 +236,13 @@ def finite_rows(cloud: PointCloud | Values) -> PointCloud:
     keep = _is_finite(cloud)
     if len(keep) >= MIN_POINTS and keep.all():
         return cloud
+    others = np.sum(~keep & (np.abs(cloud.points) <= _LARGEST).all(axis=1))
+    advice = f", {others} of them with finite coordinates; mark missing channels by channel_valid" if others else ""
     if keep.sum() < MIN_POINTS:
-        raise ValueError(f"cloud: expected at least {MIN_POINTS} finite points, got {keep.sum()} of {keep.size}")
-    warnings.warn(f"left out {np.sum(~keep)} of {keep.size} points with a NaN or infinity", UserWarning, stacklevel=3)
+        left = f", left out {np.sum(~keep)}{advice}" if others else ""
+        raise ValueError(f"cloud: expected at least {MIN_POINTS} finite points, got {keep.sum()} of {keep.size}{left}")
+    text = f"left out {np.sum(~keep)} of {keep.size} points with a NaN or infinity{advice}"
+    warnings.warn(text, UserWarning, stacklevel=3)
     return PointCloud(
         cloud.points[keep],
         cloud.channels[keep],

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Iterable
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
@@ -32,7 +34,10 @@ def merge_clouds(clouds: Iterable[PointCloud | Values], poses: Iterable[Pose], v
             differ, or a point lies more than 2²⁰ voxels from the first one along an axis.
     """
     world = VoxelMap(voxel_size)
-    for i, (cloud, pose) in enumerate(zip(clouds, poses, strict=True)):
+    end: Any = object()
+    for i, (cloud, pose) in enumerate(itertools.zip_longest(clouds, poses, fillvalue=end)):
+        if cloud is end or pose is end:
+            raise ValueError(f"poses: expected one per cloud, got {'more' if cloud is end else f'only {i}'}")
         name = f"clouds[{i}]"
         world.add(name, as_cloud(name, cloud), np.asarray(pose_matrix(pose, f"poses[{i}]")))
     return world.cloud()

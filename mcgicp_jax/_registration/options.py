@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import difflib
 import inspect
+import reprlib
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, TypeAlias, TypedDict
@@ -115,7 +116,7 @@ def options_of(function: Callable[..., Any], given: Any) -> Options:
 
 def check_method(method: AbstractMethod) -> None:
     if not isinstance(method, AbstractMethod):
-        raise ValueError(f"method: expected a method such as MultiChannelGICP(), got {method!r}")
+        raise ValueError(f"method: expected a method such as MultiChannelGICP(), got {reprlib.repr(method)}")
 
 
 def _check_tolerance(name: str, value: Any) -> None:
