@@ -2,11 +2,14 @@
 
 import gc
 import threading
+import time
+from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 
 import mcgicp_jax as mcg
 from mcgicp_jax._compute.cache import Cache, cached_with
+from mcgicp_jax._compute.lazy import Lazy
 
 
 def test_the_least_recently_used_are_evicted_by_size():
@@ -42,6 +45,14 @@ def test_making_a_value_does_not_block_other_threads():
         return 2
 
     assert cache.get("slow", slow) == 2
+
+
+def test_a_lazy_value_is_computed_once():
+    calls = []
+    lazy = Lazy(lambda: calls.append(time.sleep(0.05)))
+    with ThreadPoolExecutor(8) as threads:
+        assert list(threads.map(lambda _: lazy.value, range(8))) == [None] * 8
+    assert len(calls) == 1
 
 
 def test_two_values_of_each_kind_are_cached_with_a_cloud():

@@ -215,6 +215,15 @@ def test_matches_whose_normals_differ_do_not_support_each_other(same):
     assert np.max(_support(matches, np.float32(0.05))) == (2 if same else 0)
 
 
+def test_padding_is_no_match():
+    points = np.zeros((NUM_MATCHES, 3), np.float32)
+    points[:40] = np.random.default_rng(0).uniform(-2, 2, (40, 3))
+    none = np.zeros_like(points)
+    matches = PutativeMatches(points, points, none, none, np.arange(NUM_MATCHES) < 40)
+    # They fit as they are, and so would zeros.
+    assert 30 < hypotheses(matches, np.float32(0.05), np.float32(2.0)).score.max() <= 40.001
+
+
 def test_ninety_percent_of_wrong_matches_do_not_matter():
     rng = np.random.default_rng(5)
     truth = anywhere(2, 1.0)

@@ -167,6 +167,9 @@ def test_all_modes_agree_and_second_derivatives_are_refused(clouds):
     np.testing.assert_allclose(
         pull(jnp.arange(7.0))[0], np.tensordot(np.arange(7.0), jacobian, 1), rtol=1e-6, atol=1e-12
     )
+    columns = np.random.default_rng(1).normal(size=(7, 2))
+    (several,) = jax.vmap(pull, in_axes=1)(columns)
+    np.testing.assert_allclose(several, np.tensordot(columns.T, jacobian, 1), rtol=1e-6, atol=1e-12)
     few = jax.jacfwd(lambda scale: pose(channels + scale * direction))(jnp.zeros(()))
     np.testing.assert_allclose(few, expected, rtol=1e-9)
     with pytest.raises(NotImplementedError, match="first derivatives only"):
@@ -243,13 +246,15 @@ def test_an_invalid_pair_has_no_gradient():
     assert np.any(jax.grad(loss)(source.points))
 
 
-@pytest.mark.parametrize("status", [Status.DEGENERATE, Status.TOO_FEW_CORRESPONDENCES])
+@pytest.mark.parametrize("status", [Status.DEGENERATE, Status.MAX_ITERATIONS, Status.TOO_FEW_CORRESPONDENCES])
 def test_a_pose_that_is_not_determined_has_no_gradient(status):
     source, target, _ = pair(wall, size=400)
-    distance = 0.2 if status == Status.DEGENERATE else 1e-6
+    options = {"max_distance": 1e-6 if status == Status.TOO_FEW_CORRESPONDENCES else 0.2}
+    if status == Status.MAX_ITERATIONS:
+        options["max_iterations"] = 1
 
     def loss(points):
-        found = mcg.register(source.replace(points=points), target, mcg.GICP(), max_distance=distance)
+        found = mcg.register(source.replace(points=points), target, mcg.GICP(), **options)
         assert found.status == status
         return weigh(found.matrix)
 

@@ -390,6 +390,7 @@ def test_deviations_are_those_of_the_matched_points():
     result = mcg.register(source, target, mcg.GICP(), init=motion((0.1, -0.2, 0.05, 0.3, 0.2, 1.2)), max_distance=0.5)
     matches = mcg.find_correspondences(source, target, result.matrix, mcg.GICP(), max_distance=0.5)
     centroid = np.append(np.asarray(source.points, np.float64)[np.asarray(matches.valid)].mean(axis=0), 1)
+    np.testing.assert_allclose(result.directions.center, centroid[:3], atol=1e-3)
     draws = np.random.default_rng(0).multivariate_normal(np.zeros(6), np.asarray(result.covariance, float), 4000)
     moved = [result.matrix @ motion(draw) for draw in draws]
     shifts = [pose @ centroid - result.matrix @ centroid for pose in moved]

@@ -5,6 +5,7 @@ import time
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 
+import jax
 import pytest
 
 from mcgicp_jax._compute import threads as _threads
@@ -22,6 +23,18 @@ def test_answers_come_in_order_and_the_first_from_this_thread():
     answers = side_by_side(calls)
     assert [i for i, _ in answers] == list(range(20))
     assert answers[0][1] == threading.get_ident()
+
+
+@pytest.mark.timeout(30)
+def test_other_threads_have_the_settings_of_this_one():
+    both = threading.Barrier(2)
+
+    def setting():
+        both.wait()
+        return jax.enable_x64.value
+
+    with jax.enable_x64(True):
+        assert side_by_side([setting] * 2) == [True, True]
 
 
 @pytest.mark.timeout(30)

@@ -444,6 +444,16 @@ def test_noise_is_the_same_inside_transformations():
         np.testing.assert_allclose(one, other, rtol=tolerance(1e-4, 1e-9))
 
 
+def test_channels_without_noise_have_some():
+    """A ramp, which a linear fit leaves nothing of: a thousandth of its standard deviation."""
+    points, _ = ref.scene(700, seed=4)
+    points[:, 2] = 0
+    cloud = preprocess(PointCloud(points, points[:, 0]), num_neighbors=K)
+    noise, uniform, _ = channel_noise(cloud, cloud, local_geometries(cloud, cloud, with_channels=True))
+    np.testing.assert_allclose(noise, 1e-3 * np.std(points[:, 0]), rtol=1e-6)
+    assert not uniform.any()
+
+
 def test_weighted_covariance_is_that_of_numpy():
     """At a size at which jaxlib 0.10.2 miscompiled the reduction over stacked coordinates."""
     rng = np.random.default_rng(0)

@@ -10,6 +10,7 @@ import pytest
 
 import mcgicp_jax as mcg
 from mcgicp_jax import extend
+from mcgicp_jax._registration.multi_scale import stages_of
 from mcgicp_jax.metrics import pose_error
 from tests.differences import GATE, TO_ROUNDING, check_eager_gradient, weigh
 from tests.precision import in_both_precisions, in_float64, tolerance
@@ -190,6 +191,14 @@ def test_scales_make_the_cells(raw):
         again = mcg.register(end, cells, method, init=result.matrix)
         np.testing.assert_allclose(again.matrix, result.matrix, atol=1e-3)
         assert again.num_inliers == result.num_inliers
+
+
+def test_coarse_scales_register_voxels_of_a_quarter(raw):
+    stages = list(stages_of(mcg.D2DNDT(), *raw[:2], (0.8, SIZE)))
+    assert [type(stage.method) for stage in stages] == [mcg.GICP, mcg.D2DNDT]
+    for coarse, cells, cloud in zip(stages[0][1:], stages[1][1:], raw[:2], strict=True):
+        np.testing.assert_array_equal(coarse.points, mcg.preprocess(cloud, 0.2).points)
+        np.testing.assert_array_equal(cells.points, mcg.voxel_gaussians(cloud, SIZE).points)
 
 
 @pytest.mark.parametrize("method", [mcg.NDT, mcg.D2DNDT], ids=["ndt", "d2d-ndt"])
