@@ -317,6 +317,9 @@ def test_covariances_within_a_surface_are_drawn_as_they_are():
     np.testing.assert_allclose(np.abs(np.tan(np.radians(second.get_angles()))), 1)
     assert len(first.get_offsets()) == 3
     np.testing.assert_allclose(np.diff(first.get_offsets()[:, 0]), 0.5)
+    limits = np.array([[-0.2, 0.3], [-0.1, 0.1]])
+    part = plot.surface_covariances(cloud, {"along": along}, indices=[0], limits=limits).axes[0]
+    assert part.get_xlim()[1] == pytest.approx(0.5, rel=0.1) and part.get_ylim()[1] == pytest.approx(0.2, rel=0.1)
     with pytest.raises(ValueError, match=r"covariances\['short'\]: expected shape \(200, 3, 3\)"):
         plot.surface_covariances(cloud, {"short": along[:5]}, indices=[0])
 
