@@ -269,6 +269,18 @@ def test_a_cloud_of_another_place_leaves_the_others_where_they_are():
     assert all(found.statuses[k] == mcg.Status.CONVERGED for k in others)
 
 
+def test_a_cloud_of_another_place_at_the_front_does_not_spoil_the_motions_that_follow():
+    """The wrong first motion led all others astray: they agreed with each other, but for one that failed."""
+    size = {"points_per_frame": 900, "step": 0.4}
+    frames, other = datasets.box_room(7, seed=108, **size), datasets.box_room(1, seed=1108, **size)
+    clouds = [mcg.PointCloud(np.asarray(frame.cloud.points, np.float32)) for frame in (other[0], *list(frames)[1:])]
+    found = mcg.multiway(clouds, mcg.GICP(), max_distance=1.0)
+    truth = np.array([frames.path(k) for k in range(1, 7)])
+    np.testing.assert_allclose(
+        np.linalg.inv(found.poses[1]) @ found.poses[1:], np.linalg.inv(truth[0]) @ truth, atol=0.05
+    )
+
+
 def test_a_far_point_costs_no_registrations():
     clouds = [frame.cloud for frame in datasets.box_room(3, points_per_frame=800)]
     points = np.array(clouds[1].points)

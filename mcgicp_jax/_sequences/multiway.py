@@ -160,12 +160,16 @@ def _given(
 def _start(
     clouds: list[PointCloud], method: AbstractMethod, options: Options
 ) -> tuple[Float[np.ndarray, "n 4 4"], dict[tuple[int, int], RegistrationResult]]:
-    """Initial poses and their registrations; from the other end if the first two registrations fit badly."""
+    """Initial poses and their registrations; from the other end if the first two registrations fit badly, or if one
+    fails and those from the other end fit better. A wrong first motion may spoil all others.
+    """
     poses, found = _chained(clouds, method, options)
     fits = [_fit(found[k - 1, k]) for k in range(1, len(clouds))]
-    if len(fits) > 2 and min(fits[:2]) < _DOUBTFUL * np.median(fits):
-        back, _ = _chained(clouds[::-1], method, options)
-        return np.linalg.inv(back[-1]) @ back[::-1], {}
+    doubtful = len(fits) > 2 and min(fits[:2]) < _DOUBTFUL * np.median(fits)
+    if doubtful or (len(fits) > 2 and min(fits) == 0):
+        back, others = _chained(clouds[::-1], method, options)
+        if doubtful or np.median([_fit(others[k - 1, k]) for k in range(1, len(clouds))]) > np.median(fits):
+            return np.linalg.inv(back[-1]) @ back[::-1], {}
     return poses, found
 
 
