@@ -72,9 +72,15 @@ class VoxelMap:
             self._first = voxel_of(points[finite][0], self._voxel_size)
         first = 0.0 if self._first is None else self._first
         with errors_named(name):
-            keys = np.concatenate([self._keys, voxel_keys(points[finite], self._voxel_size, first)])
-        sums = rows[finite] if self._sums is None else np.concatenate([self._sums, rows[finite]])
-        self._keys, self._sums = _merge(keys, sums)
+            keys, sums = _merged(voxel_keys(points[finite], self._voxel_size, first), rows[finite])
+        if self._sums is None:
+            self._keys, self._sums = keys, sums
+            return
+        places = np.searchsorted(self._keys, keys)
+        new = np.append(self._keys, -1)[places] != keys
+        self._sums[places[~new]] += sums[~new]
+        self._keys = np.insert(self._keys, places[new], keys[new])
+        self._sums = np.insert(self._sums, places[new], sums[new], axis=0)
 
     def forget(self, center: Float[np.ndarray, "3"], radius: float) -> None:
         """Drop the voxels whose mean point is further than `radius`, metres, from a position."""
@@ -106,7 +112,7 @@ def _valid_channels(cloud: PointCloud) -> tuple[Float[np.ndarray, "N C"], Float[
     return channels, np.asarray(cloud.channel_valid, np.float64)
 
 
-def _merge(keys: np.ndarray, rows: Float[np.ndarray, "N D"]) -> tuple[np.ndarray, Float[np.ndarray, "M D"]]:
+def _merged(keys: np.ndarray, rows: Float[np.ndarray, "N D"]) -> tuple[np.ndarray, Float[np.ndarray, "M D"]]:
     """Unique keys, sorted, and the sum of the rows of each key."""
     order = np.argsort(keys, kind="stable")
     starts = starts_of(keys[order])

@@ -31,7 +31,7 @@ class RowsOnDemand(Generic[Tree]):
         self._tree: Any = None
 
     def known(self, rows: slice | Int[np.ndarray, "*n"] | None = None, num_threads: int | None = 1) -> Tree:
-        """The whole arrays, in which these rows (None: all) are computed, and others may not be."""
+        """The whole arrays, in which these rows (None: all), or any, are computed, and others may not be."""
         with self._lock:
             missing = self._missing
             if rows is not None:
@@ -39,6 +39,8 @@ class RowsOnDemand(Generic[Tree]):
                 missing[rows] = True
                 missing &= self._missing
             some = np.flatnonzero(missing)
+            if self._tree is None and not some.size:
+                some = np.zeros(1, np.intp)
             if some.size == missing.size:
                 self._tree = self._compute(None, num_threads)
             elif some.size:

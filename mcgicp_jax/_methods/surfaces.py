@@ -93,7 +93,7 @@ def surface_pair(
         )
         if source_rows is not None:
             describe = partial(surface_table(method, kinds, target, described, observed).known, num_threads=num_threads)
-            columns = describe(np.zeros(1, int))
+            columns = describe(np.zeros(0, int))
             # Columns of another dtype are copies, not views of the table.
             if any(columns[0].layout.dtypes):
                 columns = describe(None)
