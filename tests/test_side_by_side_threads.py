@@ -9,7 +9,7 @@ import jax
 import pytest
 
 from mcgicp_jax._compute import threads as _threads
-from mcgicp_jax._compute.threads import side_by_side
+from mcgicp_jax._compute.threads import ReadAhead, side_by_side
 
 
 @pytest.fixture(autouse=True)
@@ -108,3 +108,17 @@ def test_after_an_error_nobody_goes_on(monkeypatch):
         with pytest.raises(ZeroDivisionError):
             side_by_side([fail, *[slow] * 50])
     assert len(calls) <= 1
+
+
+def test_what_is_read_ahead_survives_an_interruption_and_an_error_is_raised_in_its_place(monkeypatch):
+    numbers = iter([1, 2, 0, 4])
+    ahead = ReadAhead(lambda: 1 / next(numbers))
+    assert next(ahead) == 1
+    with monkeypatch.context() as patch:
+        patch.setattr(_threads, "wait", lambda futures: (_ for _ in ()).throw(KeyboardInterrupt))
+        with pytest.raises(KeyboardInterrupt):
+            next(ahead)
+    assert next(ahead) == 0.5
+    with pytest.raises(ZeroDivisionError):
+        next(ahead)
+    assert list(ahead) == [0.25]
