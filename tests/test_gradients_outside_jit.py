@@ -148,6 +148,22 @@ def test_preprocessing_has_a_derivative():
             assert abs(actual - expected) <= 1e-5 * max(abs(expected), 1e-2), name
 
 
+def test_means_of_voxels_have_a_forward_derivative():
+    """They are linear in points and channels, as long as no point changes its voxel."""
+    points, channels = room_corner(300, noise=0.02, seed=1)
+    known = np.random.default_rng(3).random(channels.shape) > 0.1
+
+    def means(step):
+        cloud = mcg.PointCloud(points + step * directions[0], channels + step * directions[1], channel_valid=known)
+        found = mcg.preprocess(cloud, 0.3)
+        return found.points, found.channels
+
+    directions = [np.random.default_rng(4).normal(size=array.shape) for array in (points, channels)]
+    _, slopes = jax.jvp(means, (0.0,), (1.0,))
+    for slope, plus, minus in zip(slopes, means(1e-6), means(-1e-6), strict=True):
+        np.testing.assert_allclose(slope, (plus - minus) / 2e-6, atol=1e-8)
+
+
 def test_all_modes_agree_and_second_derivatives_are_refused(clouds):
     source, target = clouds
     method = mcg.MultiChannelGICP(0.05, 0.3)
