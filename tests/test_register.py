@@ -1,8 +1,10 @@
 """Registration end to end: right poses, honest outcomes, clear errors."""
 
 import copy
+import gc
 import pickle
 import warnings
+import weakref
 
 import jax
 import numpy as np
@@ -11,6 +13,7 @@ import pytest
 import mcgicp_jax as mcg
 from mcgicp_jax import Status
 from mcgicp_jax._registration import register_pair as _register
+from mcgicp_jax._search.tree_index import TreeIndex
 from mcgicp_jax.metrics import pose_error
 from tests.precision import in_both_precisions, tolerance
 from tests.scenes import motion, pair, room_corner, wall
@@ -511,3 +514,19 @@ def test_tight_tolerances_do_not_keep_the_coarse_phase_from_ending(room):
     never = mcg.register(source, target, mcg.GICP(), translation_tolerance=0.0, rotation_tolerance=0.0)
     assert never.num_inliers == exact.num_inliers == usual.num_inliers
     np.testing.assert_allclose(never.matrix, exact.matrix, atol=1e-6)
+
+
+def test_an_unread_result_does_not_hold_its_search(monkeypatch):
+    follow, alive = TreeIndex.follow, []
+
+    def followed(*arguments):
+        found = follow(*arguments)
+        alive.append(weakref.ref(found.__self__))
+        return found
+
+    monkeypatch.setattr(TreeIndex, "follow", followed)
+    source, target, _ = pair()
+    result = mcg.register(source, target, mcg.GICP(), max_distance=0.5)
+    gc.collect()
+    assert alive and not any(each() for each in alive)
+    assert np.isfinite(result.covariance).all()

@@ -133,6 +133,8 @@ class HostExecutor(AbstractExecutor):
     def repeat(self, step: Callable[[LoopResult], LoopResult], loop: LoopResult) -> LoopResult:
         while loop.state.status < 0:
             loop = step(loop)
+        # Frees the tree: deferred parts of the result keep the executor.
+        self._followed, self._nearest = None, _no_matches
         history = Record(*map(np.stack, zip(*loop.history, strict=True)))
         return loop._replace(state=loop.state._replace(sums=loop.state.sums.tree), history=history)
 
@@ -283,6 +285,10 @@ class FixedMatchesOnHost(HostExecutor):
 
     def match(self, state: State, before: Any) -> _Matches:
         return self._fixed
+
+
+def _no_matches(pose: Any) -> Int[np.ndarray, "m N"]:
+    raise ValueError("matches: expected a loop that has not ended")
 
 
 def _no_index(position_alone: bool) -> AbstractIndex:
