@@ -78,7 +78,7 @@ def paper(
     """Run the experiments of the paper, Table I and Figs. 1 to 4, and write a report with pictures.
 
     The paper's own data are not available, so they run on simulated scenes: a street seen by a LiDAR with a camera, and
-    a wall of posters seen by a Kinect.
+    a wall of posters seen by a Kinect. They take some five minutes.
 
     Args:
         output: Folder for report.md and its pictures.

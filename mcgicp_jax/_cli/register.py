@@ -55,7 +55,7 @@ class PreparedPair:
         """Read, preprocess and print; `with_cells`: the only method matches cells, not points."""
         check_inputs(source, target)
         self.options = options
-        self.start = np.eye(4) if options.init in (None, "global") else _read_pose(Path(options.init))
+        self.start = np.eye(4) if options.init in (None, "global") else _read_pose("init", Path(options.init))
         self.raw = io.read(source), io.read(target)
         names = [cloud.channel_names for cloud in self.raw]
         self.channels = common_channels(options, *self.raw)
@@ -194,7 +194,7 @@ def demo(output: Path = Path("mcgicp_demo"), *, all_methods: bool = False) -> in
 def _compare(
     source: Path, target: Path, options: PairOptions, truth: Path | None, names: Sequence[MethodName] = tuple(METHODS)
 ) -> dict[MethodName, mcg.RegistrationResult]:
-    true_pose = None if truth is None else _read_pose(truth)
+    true_pose = None if truth is None else _read_pose("truth", truth)
     pair = PreparedPair(source, target, options)
     results: dict[MethodName, mcg.RegistrationResult] = {}
     measures = "inliers      rmse, m" if true_pose is None else "error, mm   error, deg"
@@ -268,9 +268,10 @@ def _verdict(results: dict[MethodName, mcg.RegistrationResult]) -> int:
     return 1 if failed else 0
 
 
-def _read_pose(path: Path) -> Float[np.ndarray, "4 4"]:
+def _read_pose(option: str, path: Path) -> Float[np.ndarray, "4 4"]:
     if not path.is_file():
-        raise ValueError(f"--init: expected a file with a pose, or global; {path} is no file")
+        others = ", or global" if option == "init" else ""
+        raise ValueError(f"--{option}: expected a file with a pose{others}; {path} is no file")
     poses = io.read_poses(path)
     if len(poses) != 1:
         raise ValueError(f"{path}: expected one pose, got {len(poses)}")

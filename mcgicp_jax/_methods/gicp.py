@@ -15,6 +15,8 @@ from mcgicp_jax._methods.parameters import epsilon_of
 class GICP(AbstractGeneralized):
     """Generalized ICP (Segal, Haehnel & Thrun 2009), plane to plane.
 
+    With tight tolerances, poses of LiDAR scans agree with those of small_gicp to 1e-5 m.
+
     Attributes:
         epsilon: ε, the variance along the normal, relative to the variance of 1 within the surface.
     """

@@ -60,8 +60,8 @@ class MultiChannelGICP(AbstractGeneralized):
             chosen along with Λ, see `resolve`; 0.005 if Λ is given.
         photometric: if True, Ω and α are used in the coarse phase only. The fine phase matches by position and
             minimises point-to-plane residuals and differences of interpolated channels, each divided by its estimated
-            standard deviation (see `_terms.photometric`). A kernel `robust` then acts in the fine phase only. Its scale
-            and `information` are in standard deviations.
+            standard deviation (see `_terms.photometric`), which is mostly more accurate. A kernel `robust` then acts in
+            the fine phase only. Its scale and `information` are in standard deviations.
     """
 
     uses_channels: ClassVar[bool] = True
