@@ -260,11 +260,11 @@ def test_wrong_input_gets_one_line(tmp_path, capsys):
         text, errors = capsys.readouterr()
         assert errors.startswith("mcgicp: ") and errors.count("\n") == 1, errors
         assert message in errors
+        # It is found before any work is done.
+        assert text == ""
     good = str(tmp_path / "good.npz")
     assert main(["compare", good, good, "--truth", str(tmp_path / "no.txt")]) == 2
     assert capsys.readouterr().err.startswith("mcgicp: --truth: expected a file with a pose; ")
-        # It is found before any work is done.
-        assert text == ""
 
 
 def test_the_version(capsys):
