@@ -39,8 +39,9 @@ def mahalanobis_cost(
     """Compute the cost F(T) = Σ ρ(dᵀ M d) of given matches, with d = b − T a and M = (C^B + R C^A Rᵀ)⁻¹ (Servos &
     Waslander 2014, eq. 3, which omits the inverse); M = I or n nᵀ for the methods without covariances.
 
-    Pure JAX, differentiable with respect to all inputs but the matches. Here M is a function of the rotation R, whereas
-    `estimate_pose`, like every GICP, holds M fixed during each update: its pose is not exactly the minimum of F.
+    Pure JAX, differentiable with respect to all inputs but the matches. Unlike `register`, it and its gradient compile
+    for every size of clouds, also outside `jit`. Here M is a function of the rotation R, whereas `estimate_pose`, like
+    every GICP, holds M fixed during each update: its pose is not exactly the minimum of F.
 
     Args:
         pose: T_target_source, `jaxlie.SE3` or (4, 4).
