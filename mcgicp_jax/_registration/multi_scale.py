@@ -10,6 +10,7 @@ import numpy as np
 from mcgicp_jax._clouds.point_cloud import PointCloud
 from mcgicp_jax._clouds.preprocess import finite_rows, preprocess, with_neighbors
 from mcgicp_jax._compute.argument_checks import errors_named
+from mcgicp_jax._compute.concrete import numpy_for
 from mcgicp_jax._local_geometry.neighborhoods import check_neighbors
 from mcgicp_jax._methods.base import AbstractMethod
 from mcgicp_jax._methods.gicp import GICP
@@ -51,7 +52,7 @@ def stages_of(
         yield Stage(method, *sides)
         return
     for size in voxel_sizes:
-        sides = [preprocess(cloud, size, check_neighbors(cloud).shape[-1]) for cloud in (source, target)]
+        sides = [preprocess(cloud, size, check_neighbors(cloud, numpy_for(cloud)).shape[-1]) for cloud in (source, target)]
         yield Stage(method, *sides)
     yield Stage(method, source, target)
 
