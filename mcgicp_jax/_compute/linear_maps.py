@@ -16,7 +16,7 @@ from jax.extend.core import Primitive
 from jax.interpreters import ad, batching, mlir
 
 from mcgicp_jax._compute.concrete import is_concrete
-from mcgicp_jax._compute.threads import side_by_side
+from mcgicp_jax._compute.threads import in_new_thread, side_by_side
 
 
 class AbstractLinearMap(abc.ABC):
@@ -138,9 +138,11 @@ _linear.multiple_results = True
 def _call(*operands: Any, function: Callable, transpose: Callable, inputs: Any, outputs: Any, batch: Any) -> list[Any]:
     count = math.prod(batch)
     arrays = [np.asarray(each).reshape((count, *aval.shape)) for each, aval in zip(operands, inputs, strict=True)]
+    # Inside differentiation JAX compiles programs separately: `function` would compile its own here and in its threads.
+    results = in_new_thread(partial(function, arrays))
     return [
         jnp.asarray(np.asarray(each, aval.dtype).reshape((*batch, *aval.shape)))
-        for each, aval in zip(function(arrays), outputs, strict=True)
+        for each, aval in zip(results, outputs, strict=True)
     ]
 
 
