@@ -52,7 +52,9 @@ def stages_of(
         yield Stage(method, *sides)
         return
     for size in voxel_sizes:
-        sides = [preprocess(cloud, size, check_neighbors(cloud, numpy_for(cloud)).shape[-1]) for cloud in (source, target)]
+        sides = [
+            preprocess(cloud, size, check_neighbors(cloud, numpy_for(cloud)).shape[-1]) for cloud in (source, target)
+        ]
         yield Stage(method, *sides)
     yield Stage(method, source, target)
 
