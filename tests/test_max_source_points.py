@@ -11,6 +11,7 @@ from mcgicp_jax.__main__ import main
 from mcgicp_jax._cli.options import Options
 from mcgicp_jax._math.statistics import spread_rows
 from mcgicp_jax._registration import on_host
+from tests.compilations import compilations
 from tests.differences import GATE, TO_ROUNDING, check_eager_gradient, inputs_of, weigh
 from tests.precision import in_float64
 from tests.scenes import covariances, motion, pair, room_corner
@@ -103,10 +104,29 @@ def test_the_pose_inside_jit_of_a_padded_cloud_and_in_a_batch_is_the_same(clouds
         np.testing.assert_allclose(found[0], expected.matrix, atol=1e-9, err_msg=name)
         np.testing.assert_allclose(found[1], expected.overlap, atol=1e-9, err_msg=name)
         np.testing.assert_allclose(found[2], expected.covariance, rtol=1e-6, err_msg=name)
-    for search in (None, mcg.DenseSearch()):
-        (found,) = mcg.register_batch([source], [target], method, max_source_points=150, search=search)
-        np.testing.assert_allclose(found.matrix, expected.matrix, atol=1e-6)
-        np.testing.assert_allclose(found.overlap, expected.overlap, atol=1e-9)
+    (found,) = mcg.register_batch([source], [target], method, max_source_points=150)
+    np.testing.assert_allclose(found.matrix, expected.matrix, atol=1e-6)
+    np.testing.assert_allclose(found.overlap, expected.overlap, atol=1e-9)
+
+
+def test_compiled_programs_get_all_rows_of_a_target_that_is_described_on_demand(clouds):
+    """For lanes, and where only the initial pose is traced. New clouds, of which nothing is computed yet."""
+    options = {"max_distance": GATE, "max_source_points": 150, "search": mcg.DenseSearch()}
+
+    def new():
+        return [mcg.preprocess(cloud.unpad()) for cloud in clouds]
+
+    expected = mcg.register(*new(), mcg.GICP(), **options)
+    for turn in range(2):
+        with compilations() as compiled:
+            found = mcg.register_batch(*zip(new(), new(), strict=True), mcg.GICP(), **options)
+        assert turn == 0 or not compiled
+        for each in found:
+            np.testing.assert_allclose(each.matrix, expected.matrix, atol=1e-6)
+            np.testing.assert_allclose(each.overlap, expected.overlap, atol=1e-9)
+    source, target = new()
+    traced = jax.jit(lambda start: mcg.register(source, target, mcg.GICP(), init=start, **options).matrix)
+    np.testing.assert_allclose(traced(np.eye(4)), expected.matrix, atol=1e-9)
 
 
 @pytest.mark.parametrize("method", [mcg.MultiChannelGICP([0.05, 0.08], 0.3, epsilon=1e-2), mcg.PointToPoint()])

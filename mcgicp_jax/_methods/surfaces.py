@@ -47,14 +47,14 @@ class SurfacePair(NamedTuple):
         method: with its unset parameters chosen from the data.
         terms: the residuals of each correspondence.
         source, target: the surfaces of both clouds.
-        describe_target: computes rows of `target` before they are used; None if all are.
+        describe_target: computes rows of `target` (None: all) before they are used; None if all are computed.
     """
 
     method: AbstractMethod
     terms: tuple[AbstractTerm, ...]
     source: Surface
     target: Surface
-    describe_target: Callable[[Int[np.ndarray, "*n"]], Any] | None = None
+    describe_target: Callable[[Int[np.ndarray, "*n"] | None], Any] | None = None
 
 
 def surface_pair(

@@ -189,6 +189,7 @@ def _run(inputs: Inputs, problem: Problem, search: AbstractSearch, max_iteration
     """Run the loop."""
     if is_concrete(inputs, problem):
         return _run_on_host(inputs, problem, search)
+    problem = problem.completed()
     # Gradients stop here, so that autodiff does not enter the compiled functions.
     fixed = jax.lax.stop_gradient(problem)
     loop = register_traced(fixed, search, max_iterations)

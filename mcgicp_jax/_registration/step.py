@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -89,7 +90,8 @@ class Problem(eqx.Module):
         terms: the residuals of each correspondence, before any number is adapted.
         fusion: tie points and prior, weighted after a registration without them; None if there are none.
         num_candidates: number of target points that a source point is matched with.
-        describe_target: computes rows of the surface of the target before they are used; None if all are.
+        describe_target: computes rows of the surface of the target (None: all) before they are used, for an executor
+            on the host; None if all are computed, as compiled programs need it.
     """
 
     start: jaxlie.SE3
@@ -99,7 +101,14 @@ class Problem(eqx.Module):
     settings: Settings
     fusion: Fusion | None = None
     num_candidates: int = eqx.field(static=True, default=1)
-    describe_target: Callable[[Int[np.ndarray, "*n"]], Any] | None = eqx.field(static=True, default=None)
+    describe_target: Callable[[Int[np.ndarray, "*n"] | None], Any] | None = eqx.field(static=True, default=None)
+
+    def completed(self) -> Problem:
+        """With all rows of the surface of the target."""
+        if self.describe_target is None:
+            return self
+        self.describe_target(None)
+        return replace(self, describe_target=None)
 
     @property
     def first_status(self) -> Int[AnyScalar, ""]:
