@@ -18,6 +18,7 @@ from mcgicp_jax._clouds.voxels import wrapped_keys
 from mcgicp_jax._compute.argument_checks import errors_named
 from mcgicp_jax._local_geometry.spacing_and_noise import point_spacing
 from mcgicp_jax._math.poses import Pose, pose_matrices
+from mcgicp_jax._math.twists import exponential, logarithm
 from mcgicp_jax._methods.base import AbstractMethod
 from mcgicp_jax._pairs.batch import register_batch
 from mcgicp_jax._pose_graph.edge import Edge
@@ -31,9 +32,6 @@ from mcgicp_jax._sequences.edges import LEAST_OVERLAP, edge_from
 # Size of the cells in which overlap is counted, in spacings of the points: two samples of one surface then occupy
 # nearly the same cells.
 _CELL = 5.0
-# A cloud is doubtful if its fit to the one before falls below this fraction of the last one's. In simulated rooms, that
-# of a cloud of another room fell to 0.5 to 0.8, and others stayed within 5 %.
-_DOUBTFUL = 0.85
 # Largest number of rounds of registration. From the second on, only newly overlapping pairs are registered.
 _ROUNDS = 5
 
@@ -47,8 +45,9 @@ class MultiwayResult:
         graph: result of `optimize_poses`: the poses of the clouds with status and covariances, and the edges.
         registrations: maps each pair (i, j) to the registration of cloud j to cloud i. Registrations that failed or
             overlap by less than 40 % are listed here, but have no edge in `graph`.
-        statuses: of each cloud: CONVERGED; TOO_FEW_CORRESPONDENCES if it has no edge; DEGENERATE if it is connected
-            with the others only by edges that contradict more of its edges than agree, as a cloud of another place is.
+        statuses: of each cloud: CONVERGED; TOO_FEW_CORRESPONDENCES if it has no edge; DEGENERATE if at least half of
+            its edges contradict the others. A cloud of another place leaves the others where they are, but is often
+            CONVERGED itself: its registrations agree with each other at a pose of mediocre overlap.
         voxel_size: of the map, metres: the given one, or the median point spacing of the clouds.
     """
 
@@ -98,8 +97,8 @@ def multiway(
             one before it, and with the earlier cloud of largest overlap among those 2 to 3 places before it, among
             those 4 to 7 places before it, 8 to 15, and so on, if that overlap is at least 40 %. More pairs would add
             little: the errors of edges that share a cloud are not independent.
-        init: n poses to start from, cloud to world, `jaxlie.SE3` or (4, 4), metres. By default each cloud is registered
-            in order to the two before it, from the previous motion, and starts at the pose of larger overlap.
+        init: n poses to start from, cloud to world, `jaxlie.SE3` or (4, 4), metres. By default the clouds are
+            registered in order, each to the two before it, and again in the opposite order; the better fits are used.
         voxel_size, num_neighbors: arguments of `preprocess`.
         executor: see `register_batch`, which registers the pairs.
         options: options of `register`, except for `tie_points` and `prior`; `max_source_points` is 10,000 by default.
@@ -160,48 +159,49 @@ def _given(
 def _start(
     clouds: list[PointCloud], method: AbstractMethod, options: Options
 ) -> tuple[Float[np.ndarray, "n 4 4"], dict[tuple[int, int], RegistrationResult]]:
-    """Initial poses and their registrations; from the other end if the first two registrations fit badly, or if one
-    fails and those from the other end fit better. A wrong first motion may spoil all others.
+    """Initial poses, and the registrations that they follow from.
+
+    The clouds are registered from both ends, and the poses of larger fit are used: a wrong first motion, as that to a
+    cloud of another place, may spoil those that follow.
     """
-    poses, found = _chained(clouds, method, options)
-    fits = [_fit(found[k - 1, k]) for k in range(1, len(clouds))]
-    doubtful = len(fits) > 2 and min(fits[:2]) < _DOUBTFUL * np.median(fits)
-    if doubtful or (len(fits) > 2 and min(fits) == 0):
-        back, others = _chained(clouds[::-1], method, options)
-        if doubtful or np.median([_fit(others[k - 1, k]) for k in range(1, len(clouds))]) > np.median(fits):
-            return np.linalg.inv(back[-1]) @ back[::-1], {}
-    return poses, found
+    poses, found, fit = _chained(clouds, method, options)
+    back, _, other_fit = _chained(clouds[::-1], method, options)
+    return (np.linalg.inv(back[-1]) @ back[::-1], {}) if other_fit > fit else (poses, found)
 
 
 def _chained(
     clouds: list[PointCloud], method: AbstractMethod, options: Options
-) -> tuple[Float[np.ndarray, "n 4 4"], dict[tuple[int, int], RegistrationResult]]:
-    """Poses of clouds that are registered in order to the two before.
+) -> tuple[Float[np.ndarray, "n 4 4"], dict[tuple[int, int], RegistrationResult], float]:
+    """Poses of clouds that are registered in order, the registrations that they follow from, and the sum of the fits.
 
-    After a doubtful cloud, the next one starts from the motion before it, and at the better of two registrations.
+    Each cloud is registered to each of the two before it, from the motion of that one, and the better fit is used.
+    Neither pose nor motion of the cloud between them, which may be of another place, enters the second registration.
     """
-    poses = [np.eye(4)]
+    poses, steps, total = [np.eye(4)], [np.zeros(6)], 0.0
     found: dict[tuple[int, int], RegistrationResult] = {}
-    motion, before, usual = np.eye(4), 0, 0.0
     for k in range(1, len(clouds)):
-        guess = poses[before] @ np.linalg.matrix_power(motion, k - before)
         rows = range(max(k - 2, 0), k)
-        for i in rows:
-            result = register_pair(clouds[k], clouds[i], method, np.linalg.inv(poses[i]) @ guess, options)
-            found[i, k] = computed(result)
-        fits = [_fit(found[i, k]) for i in rows]
-        best = rows[int(np.argmax(fits))] if before < k - 1 else k - 1
-        poses.append(poses[best] @ np.asarray(found[best, k].matrix) if is_usable(found[best, k]) else guess)
-        if fits[-1] >= _DOUBTFUL * usual or before < k - 1:
-            motion = np.asarray(found[k - 1, k].matrix) if best == k - 1 and fits[-1] else motion
-            before, usual = k, max(fits)
-    return np.array(poses), found
+        starts = [exponential((k - i) * steps[i]) for i in rows]
+        results = [
+            register_pair(clouds[k], clouds[i], method, start, options) for i, start in zip(rows, starts, strict=True)
+        ]
+        fits = [_fit(result) for result in results]
+        best = int(np.argmax(fits))
+        i, result, total = rows[best], computed(results[best]), total + fits[best]
+        found[i, k] = result
+        motion = np.asarray(result.matrix, np.float64) if is_usable(result) else starts[best]
+        poses.append(poses[i] @ motion)
+        steps.append(logarithm(motion) / (k - i))
+    return np.array(poses), found, total
 
 
 def _fit(result: RegistrationResult) -> float:
-    """Overlap per distance of the matches, 1/m; 0 if the registration failed."""
-    settled = result.status in (Status.CONVERGED, Status.DEGENERATE)
-    return float(np.asarray(result.overlap)) / float(np.asarray(result.rmse)) if settled else 0.0
+    """Overlap per distance of the matches, 1/m; 0 without a pose.
+
+    MAX_ITERATIONS counts as well: on sparse points, the updates may go to and fro at the right pose.
+    """
+    with np.errstate(divide="ignore"):
+        return float(np.asarray(result.overlap) / np.asarray(result.rmse)) if is_usable(result) else 0.0
 
 
 def _checked(pairs: Sequence[tuple[int, int]], num_clouds: int) -> list[tuple[int, int]]:
