@@ -56,12 +56,12 @@ def map_blocks(
         size: number of rows of a block; another size needs other programs.
 
     Returns:
-        For each block, in order, the slice of rows that it covers and the result as NumPy arrays.
+        For each block, in order, the slice of rows that it covers and the result. Programs are dispatched
+        asynchronously: their results may not be computed yet.
     """
     cut = blocks(num_rows, size)
     results = side_by_side([partial(function, index) for _, index in cut], num_threads) if cut else []
-    # Programs are dispatched asynchronously and run while the next block is gathered; wait only once all have started.
-    return [(rows, jax.tree.map(np.asarray, result)) for (rows, _), result in zip(cut, results, strict=True)]
+    return [(rows, result) for (rows, _), result in zip(cut, results, strict=True)]
 
 
 def map_rows(function: Callable[[Any], Any], num_rows: int, num_threads: int | None = 1, size: int = BLOCK) -> Any:
@@ -82,5 +82,5 @@ def map_rows(function: Callable[[Any], Any], num_rows: int, num_threads: int | N
     whole = [np.empty((num_rows, *leaf.shape[1:]), leaf.dtype) for leaf in leaves[0]]
     for (rows, _), block in zip(results, leaves, strict=True):
         for array, leaf in zip(whole, block, strict=True):
-            array[rows] = leaf[: rows.stop - rows.start]
+            array[rows] = np.asarray(leaf)[: rows.stop - rows.start]
     return jax.tree.unflatten(structure, whole)

@@ -136,7 +136,8 @@ class HostExecutor(AbstractExecutor):
         # Frees the tree: deferred parts of the result keep the executor.
         self._followed, self._nearest = None, _no_matches
         history = Record(*map(np.stack, zip(*loop.history, strict=True)))
-        return loop._replace(state=loop.state._replace(sums=loop.state.sums.tree), history=history)
+        sums: Packed[Sums] = Packed(np.asarray(loop.state.sums.table), loop.state.sums.layout)
+        return loop._replace(state=loop.state._replace(sums=sums.tree), history=history)
 
     def record(self, history: Any, state: State) -> list[Record]:
         return [*history, state.record]
@@ -216,7 +217,8 @@ class HostExecutor(AbstractExecutor):
         return map_rows(block, rows.size, self.num_threads if with_noise else 1)
 
     def sums(self, motion: Motion, matches: _Matches, terms: tuple[AbstractTerm, ...]) -> Packed[Sums]:
-        # Packed until the loop ends: to pass and to return dozens of arrays takes longer than to use them.
+        # Packed until the loop ends: to pass and to return dozens of arrays takes longer than to use them. Not awaited:
+        # `update` is dispatched while they are computed, which saves half of the hand-overs between threads.
         parts: list[Packed[Sums]] = self._over_blocks(_packed_sums, motion, matches, terms)
         return parts[0] if len(parts) == 1 else _combined(parts)
 
@@ -226,9 +228,9 @@ class HostExecutor(AbstractExecutor):
 
     def scores(self, motion: Motion, matches: _Matches, *arguments: Any) -> Scores:
         parts: list[Scores] = self._over_blocks(scores_of, motion, matches, *arguments, with_noise=True)
+        parts = [jax.tree.map(np.asarray, part) for part in parts]
         jacobian, bias = (
-            np.sum([np.asarray(getattr(part, name), np.float64) for part in parts], axis=0)
-            for name in ("jacobian", "bias")
+            np.sum([getattr(part, name).astype(np.float64) for part in parts], axis=0) for name in ("jacobian", "bias")
         )
         # Rows that pad the last block have no matches; their scores are 0.
         wrenches, valid, cells = (
