@@ -516,6 +516,18 @@ def test_tight_tolerances_do_not_keep_the_coarse_phase_from_ending(room):
     np.testing.assert_allclose(never.matrix, exact.matrix, atol=1e-6)
 
 
+def test_a_copied_result_holds_no_clouds():
+    source, target, _ = pair()
+    clouds = [weakref.ref(cloud) for cloud in (source, target)]
+    result = mcg.register(source, target, mcg.GICP(), max_distance=0.5)
+    del source, target
+    gc.collect()
+    assert all(cloud() is not None for cloud in clouds)
+    result = copy.deepcopy(result)
+    gc.collect()
+    assert all(cloud() is None for cloud in clouds) and np.isfinite(result.covariance).all()
+
+
 def test_an_unread_result_does_not_hold_its_search(monkeypatch):
     follow, alive = TreeIndex.follow, []
 

@@ -71,6 +71,10 @@ class RegistrationResult(eqx.Module):
     Fields are NumPy scalars and arrays; inside `jit`, `vmap` or `grad`, and when returned by these, JAX arrays.
     Only the pose carries a gradient; for the gradient of a cost, call `mahalanobis_cost` at the pose.
 
+    The result of a call outside of transformations keeps both clouds and their surfaces in memory for the deferred
+    values and `jacobian`: 10 MB for two clouds of 20,000 points. `copy.deepcopy(result)`, like a pickle, holds the
+    deferred values instead, and no clouds.
+
     Attributes:
         T_target_source: maps source coordinates into the target's frame, b ≈ T a; in the precision of the clouds. At
             large (UTM) coordinates use `matrix`, or in float32 under `jit`, `centred`.
