@@ -115,7 +115,9 @@ def _smooth(picture: Picture) -> Picture:
     """Mean over a window a little larger than the point spacing, so that differences do not show the sampling."""
     half = drawing.PIXELS_PER_SPACING // 2 + 1
     padded = np.pad(picture, ((half, half), (half, half), (0, 0)), mode="edge")
-    return np.lib.stride_tricks.sliding_window_view(padded, (2 * half + 1,) * 2, (0, 1)).mean(axis=(-1, -2))
+    for axis in (0, 1):
+        padded = np.lib.stride_tricks.sliding_window_view(padded, 2 * half + 1, axis).mean(axis=-1)
+    return padded
 
 
 def _overlays(view: View, target: Float[np.ndarray, "M 3"], moved: Sequence[Points]) -> list[tuple[Picture, Map]]:
