@@ -7,12 +7,12 @@ import jax
 
 @contextlib.contextmanager
 def compilations():
-    """The durations of the compilations within; empty if there are none."""
+    """The names of the programs compiled within; empty if there are none."""
     found = []
 
-    def listen(event, duration, **_):
+    def listen(event, _, fun_name=None, **__):
         if event == "/jax/core/compile/backend_compile_duration":
-            found.append(duration)
+            found.append(fun_name)
 
     jax.monitoring.register_event_duration_secs_listener(listen)
     try:

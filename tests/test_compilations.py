@@ -153,6 +153,23 @@ def test_settings_of_a_block_of_code_hold_in_all_threads():
     np.testing.assert_array_equal(result.matrix, expected.matrix)
 
 
+@pytest.mark.slow
+def test_a_first_gradient_compiles_each_program_once():
+    """Inside `grad`, JAX's context is another one than in threads; programs called in both would be compiled twice."""
+    raw = [(points, np.hstack([channels] * 3)) for points, channels in (room_corner(300, seed=i) for i in (0, 1))]
+    source, target = (mcg.preprocess(mcg.PointCloud(*arrays)) for arrays in raw)
+
+    def loss(channels):
+        clouds = [source.replace(channels=channels), target]
+        results = mcg.register_batch(clouds, clouds[::-1], mcg.MultiChannelGICP(), max_distance=0.5)
+        return sum(result.matrix[0, 3] for result in results)
+
+    with compilations() as found:
+        jax.grad(loss)(source.channels)
+    programs = ("_describe", "_surface_of_block", "program", "_update", "root_of", "score_and_pull", "pull_surface")
+    assert [found.count(f"jit({name})") for name in programs] == [1] * len(programs), found
+
+
 def test_find_correspondences_computes_nothing_that_it_does_not_use():
     source, target = (mcg.preprocess(cloud) for cloud in clouds(400))
     # No program that was compiled before serves here.
