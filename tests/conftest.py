@@ -1,5 +1,6 @@
 """Fixtures, and run-time checks of annotated shapes: beartype checks every call into the package during the tests."""
 
+import gc
 import os
 import pathlib
 
@@ -22,6 +23,13 @@ import jax
 import pytest
 
 DATA = pathlib.Path(os.environ.get("MCGICP_DATA", pathlib.Path(__file__).parents[2] / "shared" / "data"))
+
+
+def pytest_collection_finish():
+    """Tracing makes many objects that stay: at Python's usual thresholds, 700, 10 and 10, the search for garbage among
+    them is 29 % of the time to trace and lower the gradient of `register`."""
+    gc.freeze()
+    gc.set_threshold(100_000, 20, 100)
 
 
 def pytest_generate_tests(metafunc):

@@ -22,7 +22,7 @@ def case(name):
 
 
 CONVERGED = {"translation_tolerance": 1e-12, "rotation_tolerance": 1e-12, "max_iterations": 200}
-# Differences over 4e-7 need poses to the last digit: no update is below these tolerances.
+# Differences over 1e-6 need poses to the last digit: no update is below these tolerances.
 TO_ROUNDING = {"translation_tolerance": 1e-15, "rotation_tolerance": 1e-15, "max_iterations": 30}
 
 
@@ -55,7 +55,7 @@ def clouds_with(inputs, source, target):
 
 
 def directional_errors(loss, inputs, gradient):
-    """Yield name, derivative and fourth-order difference along a random direction in each input."""
+    """Yield name, derivative and central difference along a random direction in each input."""
     rng = np.random.default_rng(1)
     for name, value in inputs.items():
         leaves, structure = jax.tree.flatten(value)
@@ -70,9 +70,10 @@ def directional_errors(loss, inputs, gradient):
                 moved = [*leaves[:i], leaf + step * direction, *leaves[i + 1 :]]
                 return float(loss(inputs | {name: jax.tree.unflatten(structure, moved)}))
 
-            # Short, so that no match crosses the kink of a kernel.
+            # Short, so that no match crosses the kink of a kernel, and that the next term of the series, of the step's
+            # square, is far below rounding.
             step = 5e-7
-            expected = (8 * (at(step) - at(-step)) - (at(2 * step) - at(-2 * step))) / (12 * step)
+            expected = (at(step) - at(-step)) / (2 * step)
             actual = float(jnp.sum(jax.tree.leaves(gradient[name])[i] * direction))
             yield f"{name}[{i}]", actual, expected
 

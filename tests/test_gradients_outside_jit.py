@@ -92,10 +92,14 @@ def test_tie_points_and_a_prior(clouds):
     depend."""
     points = np.asarray(clouds[0].points[:5])
 
-    def loss(inputs):
+    @jax.jit
+    def measurements(inputs):
         ties = inputs["tie source"], inputs["tie target"], inputs["tie variance"] * jnp.tile(jnp.eye(3), (5, 1, 1))
         pose = jaxlie.SE3.from_matrix(motion()) @ jaxlie.SE3.exp(inputs["prior twist"])
-        prior = pose, inputs["prior variance"] * jnp.eye(6)
+        return ties, (pose, inputs["prior variance"] * jnp.eye(6))
+
+    def loss(inputs):
+        ties, prior = measurements(inputs)
         options = {"tie_points": ties, "prior": prior, "max_distance": 0.15, **TO_ROUNDING}
         return weigh(mcg.register(*clouds, mcg.PointToPoint(), **options).matrix)
 
@@ -327,10 +331,10 @@ def test_options_are_constants_wherever_they_come_from(clouds):
     for name, value in (("max_distance", GATE), ("rotation_tolerance", 5e-4), ("init", np.eye(4))):
         derived = jax.grad(lambda points, name=name, value=value: pose(points, **{name: value + 0 * points[0, 0]}))
         np.testing.assert_allclose(derived(source.points), expected, rtol=1e-6, atol=1e-9)
-    # Here `vmap` traces the initial pose, so that the registration is compiled.
+    # Here `vmap` traces the initial pose, so that the registration is compiled; with `jit`, as one program.
     starts = jnp.tile(jnp.eye(4), (2, 1, 1))
-    several = jax.vmap(
-        lambda init: jax.grad(lambda points: pose(points, init=init, search=mcg.DenseSearch()))(source.points)
+    several = jax.jit(
+        jax.vmap(lambda init: jax.grad(lambda points: pose(points, init=init, search=mcg.DenseSearch()))(source.points))
     )
     np.testing.assert_allclose(several(starts)[1], expected, rtol=1e-6, atol=1e-9)
 

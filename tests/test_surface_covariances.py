@@ -461,5 +461,7 @@ def test_weighted_covariance_is_that_of_numpy():
     found = jax.jit(weighted_covariance)(
         tuple(jnp.asarray(each, float) for each in offsets), jnp.asarray(weights, float)
     )
-    expected = [np.cov(offsets[:, :, i], aweights=weights[:, i], ddof=0) for i in range(2000)]
+    centred = offsets - np.average(offsets, axis=1, weights=np.broadcast_to(weights, offsets.shape))[:, None]
+    expected = np.einsum("aki,bki,ki->iab", centred, centred, weights) / weights.sum(axis=0)[:, None, None]
+    np.testing.assert_allclose(expected[0], np.cov(offsets[:, :, 0], aweights=weights[:, 0], ddof=0), rtol=1e-12)
     np.testing.assert_allclose(ref.symmetric(found), expected, atol=tolerance(1e-5, 1e-12))

@@ -173,7 +173,8 @@ def test_the_pose_is_found(method, raw):
     assert result.converged and np.isfinite(result.covariance).all()
     assert max(pose_error(result.matrix, truth)) < (0.02 if isinstance(method, mcg.D2DNDT) else 0.01)
     if isinstance(method, mcg.ColorNDT):
-        inside = jax.jit(lambda a, b: mcg.register(a, b, method).matrix)(mcg.preprocess(moving), cells)
+        traced = jax.jit(lambda a, b: mcg.register(a, b, method, search=mcg.DenseSearch()).matrix)
+        inside = traced(mcg.preprocess(moving), cells)
         np.testing.assert_allclose(inside, result.matrix, atol=1e-4)
 
 
@@ -277,10 +278,11 @@ def test_the_sum_is_the_same_everywhere(raw):
     source, target = cells_of(raw)
     method, atol = mcg.D2DNDT(), tolerance(1e-4, 1e-9)
     alone = mcg.register(source, target, method, max_distance=1.0)
-    inside = jax.jit(lambda a, b: mcg.register(a, b, method, max_distance=1.0))(source, target)
+    dense = {"max_distance": 1.0, "search": mcg.DenseSearch()}
+    inside = jax.jit(lambda a, b: mcg.register(a, b, method, **dense))(source, target)
     np.testing.assert_allclose(inside.matrix, alone.matrix, atol=atol)
     np.testing.assert_allclose(inside.covariance, alone.covariance, rtol=tolerance(0.05, 1e-6), atol=1e-9)
-    lanes = mcg.register_batch([source] * 2, target, method, max_distance=1.0, search=mcg.DenseSearch())
+    lanes = mcg.register_batch([source] * 2, target, method, **dense)
     for result in (*mcg.register_batch([source], target, method, max_distance=1.0), *lanes):
         np.testing.assert_allclose(result.matrix, alone.matrix, atol=atol)
         assert result.num_inliers == alone.num_inliers
