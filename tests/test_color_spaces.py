@@ -57,7 +57,7 @@ def test_the_same_inside_transformations(name):
 @pytest.mark.parametrize("name", SPACES)
 def test_derivatives(name):
     """Finite at black, greys and ties; elsewhere those of differences."""
-    slopes = jax.vmap(jax.jacobian(SPACES[name]))(jnp.asarray(np.concatenate([SPECIAL, COLORS]), jnp.float32))
+    slopes = jax.jit(jax.vmap(jax.jacobian(SPACES[name])))(jnp.asarray(np.concatenate([SPECIAL, COLORS]), jnp.float32))
     assert np.isfinite(slopes).all()
     step = 1e-6
     for i, axis in enumerate(np.eye(3)):

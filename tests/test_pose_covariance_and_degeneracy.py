@@ -392,11 +392,13 @@ def test_deviations_are_those_of_the_matched_points():
     centroid = np.append(np.asarray(source.points, np.float64)[np.asarray(matches.valid)].mean(axis=0), 1)
     np.testing.assert_allclose(result.directions.center, centroid[:3], atol=1e-3)
     draws = np.random.default_rng(0).multivariate_normal(np.zeros(6), np.asarray(result.covariance, float), 4000)
-    moved = [result.matrix @ motion(draw) for draw in draws]
-    shifts = [pose @ centroid - result.matrix @ centroid for pose in moved]
-    turns = [Rotation.from_matrix(pose[:3, :3] @ result.matrix[:3, :3].T).as_rotvec() for pose in moved]
+    matrix = np.asarray(result.matrix)
+    moved = matrix @ np.stack([motion(draw) for draw in draws])
+    shifts = moved @ centroid - matrix @ centroid
+    turns = Rotation.from_matrix(moved[:, :3, :3] @ matrix[:3, :3].T).as_rotvec()
     np.testing.assert_allclose(result.deviations, [*np.std(shifts, axis=0)[:3], *np.std(turns, axis=0)], rtol=0.06)
-    inside = jax.jit(lambda source: mcg.register(source, target, mcg.GICP(), init=result.matrix, max_distance=0.5))
+    options = {"init": result.matrix, "max_distance": 0.5, "search": mcg.DenseSearch()}
+    inside = jax.jit(lambda source: mcg.register(source, target, mcg.GICP(), **options))
     np.testing.assert_allclose(inside(source).deviations, result.deviations, rtol=0.05)
 
 
