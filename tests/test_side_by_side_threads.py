@@ -101,7 +101,8 @@ def test_after_an_error_nobody_goes_on(monkeypatch):
 
     def slow():
         calls.append(1)
-        time.sleep(0.05)
+        # Far longer than the first call, on a busy machine, too.
+        time.sleep(0.5)
 
     with ThreadPoolExecutor(1) as threads:
         monkeypatch.setattr(_threads, "_threads", lambda: threads)
