@@ -178,6 +178,7 @@ def demo(output: Path = Path("mcgicp_demo"), *, all_methods: bool = False) -> in
     io.write(target_file, target.cloud)
     io.write_poses(truth_file, [np.linalg.inv(frames.path(0)) @ frames.path(1)])
     options = PairOptions(voxel_size="off", plot=output / "before_after.png")
+    check_outputs(picture=options.plot)
     names = tuple(METHODS) if all_methods else _DEMO
     _compare(source_file, target_file, options, truth_file, names)
     print(
@@ -207,6 +208,7 @@ def _compare(
             print(f"{name:{width}}  left out: no channels in common")
             continue
         method = methods[name]
+        pair.register(name, method)
         begin = time.perf_counter()
         result = results[name] = pair.register(name, method)
         milliseconds = 1e3 * (time.perf_counter() - begin)
@@ -223,19 +225,14 @@ def _compiled(pair: PreparedPair, names: Sequence[MethodName]) -> dict[MethodNam
     """The methods that the pair has channels for, each run once so that its programs are compiled."""
     methods: dict[MethodName, AbstractMethod] = {}
 
-    def run(name: MethodName) -> None:
-        methods[name] = pair.method(name)
-        pair.register(name, methods[name])
+    def run(uses_channels: bool) -> None:
+        for name in names:
+            if METHODS[name].kind.uses_channels == uses_channels:
+                methods[name] = pair.method(name)
+                pair.register(name, methods[name])
 
-    # Methods that use channels share programs, and so do the others. The first of each kind compiles them; then two
-    # threads share the other methods, and load what the picture needs.
-    kinds = [[name for name in names if METHODS[name].kind.uses_channels == kind] for kind in (True, False)]
-    kinds = [kind for kind in (kinds if pair.channels else kinds[1:]) if kind]
-    first = [kind[0] for kind in kinds]
-    calls = [partial(run, name) for name in [*first, *(name for kind in kinds[::-1] for name in kind[1:])]]
-    if pair.options.plot is not None:
-        calls.append(partial(check_outputs, picture=pair.options.plot))
-    side_by_side(calls, len(kinds))
+    # Methods with and without channels share no programs.
+    side_by_side([partial(run, kind) for kind in ([True, False] if pair.channels else [False])])
     return methods
 
 
