@@ -63,6 +63,10 @@ def main(args: Sequence[str] | None = None) -> int:
                 args=args,
                 config=(tyro.conf.OmitArgPrefixes, tyro.conf.DisallowNone),
             )
+        except BrokenPipeError:
+            # The reader of the output, such as `head`, has ended. Python would fail again when it flushes the output.
+            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+            return 1
         except (ValueError, OSError, ImportError) as error:
             print(f"mcgicp: {_explanation(error)}", file=sys.stderr)
             return 2

@@ -1,10 +1,13 @@
 """Arguments of the wrong kind are named."""
 
+import inspect
+
 import numpy as np
 import pytest
 
 import mcgicp_jax as mcg
 from mcgicp_jax._compute.argument_checks import check_integer, check_positive
+from mcgicp_jax._registration.options import check_method
 
 
 @pytest.mark.parametrize("value", ["x", None, [1.0], np.nan, 0, -1.0])
@@ -31,3 +34,12 @@ def test_unknown_options_are_named(function):
         TypeError, match=rf"^{name}: got an unexpected argument 'tie_points'; expected one of .*voxel_sizes"
     ):
         list(function(*given, tie_points=None).__iter__())
+
+
+def test_frequent_mistakes_are_named():
+    points = np.random.default_rng(0).random((50, 3))
+    with pytest.raises(ValueError, match="voxel_sizes: expected the coarsest first"):
+        mcg.register(points, points, mcg.NDT(), voxel_sizes=(0.25, 1.0))
+    # The check of annotations, which only tests have, would refuse a class first.
+    with pytest.raises(ValueError, match=r"method: expected GICP\(\), got the class GICP"):
+        inspect.unwrap(check_method)(mcg.GICP)

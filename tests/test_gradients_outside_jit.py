@@ -359,3 +359,15 @@ def test_a_result_is_printed_in_a_gradient(clouds):
         return result.matrix[0, 3]
 
     jax.grad(loss)(source.points)
+
+
+def test_a_gradient_by_weights_of_the_matches_is_warned_of():
+    source, target, _ = pair(size=300)
+
+    def loss(weights):
+        method = mcg.MultiChannelGICP(channel_weights=weights)
+        return mcg.register(source, target, method, max_distance=0.5).matrix[0, 3]
+
+    with pytest.warns(UserWarning, match="channel_weights: the derivative is 0"):
+        gradient = jax.grad(loss)(jnp.full(2, 0.1))
+    np.testing.assert_array_equal(gradient, 0)

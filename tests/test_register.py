@@ -2,17 +2,24 @@
 
 import copy
 import gc
+import inspect
 import pickle
+import types
 import warnings
 import weakref
 
 import jax
+import jaxlie
 import numpy as np
 import pytest
 
 import mcgicp_jax as mcg
 from mcgicp_jax import Status
+from mcgicp_jax._compute.lazy import Lazy
 from mcgicp_jax._registration import register_pair as _register
+from mcgicp_jax._registration.assessment import Assessment
+from mcgicp_jax._registration.make_result import _uncertainty
+from mcgicp_jax._registration.step import State
 from mcgicp_jax._search.tree_index import TreeIndex
 from mcgicp_jax.metrics import pose_error
 from tests.precision import in_both_precisions, tolerance
@@ -507,8 +514,9 @@ def test_channels_in_other_units_are_reported(gain, offset, warned, room):
         mcg.register(changed, target, mcg.GICP(), max_distance=0.5, max_iterations=1)
         mcg.register(changed, target, mcg.MultiChannelGICP(0.05, 0.3), equalize_channels=True, max_iterations=1)
     messages = [str(each.message) for each in caught]
-    assert any("units differ" in message for message in messages) == warned
-    assert len(messages) <= source.channels.shape[1]
+    of_units = [message for message in messages if "units differ" in message]
+    assert bool(of_units) == warned
+    assert len(of_units) <= source.channels.shape[1]
 
 
 def test_tight_tolerances_do_not_keep_the_coarse_phase_from_ending(room):
@@ -545,3 +553,20 @@ def test_an_unread_result_does_not_hold_its_search(monkeypatch):
     gc.collect()
     assert alive and not any(each() for each in alive)
     assert np.isfinite(result.covariance).all()
+
+
+def test_a_pose_from_a_small_overlap_is_warned_of():
+    target, _ = room_corner(2000, seed=0)
+    near, _ = room_corner(60, seed=1)
+    source = np.concatenate([near, target[:1940] + 50])
+    with pytest.warns(UserWarning, match=r"only \d.* % of the source points have a match"):
+        result = mcg.register(source, target, mcg.PointToPlane(), max_distance=0.3)
+    assert 0 < result.overlap < 0.1
+
+
+def test_a_variance_that_is_rounded_below_zero_has_a_deviation():
+    """As on noise-free points, where the variance is 0."""
+    assessment = Assessment(Lazy.of(None), Lazy.of(np.diag([4.0, -1e-43, 1, 1, -1e-43, 1])))
+    state = State(jaxlie.SE3.identity(), Status.CONVERGED, 1, sums=types.SimpleNamespace(center=np.zeros(3)))
+    found = inspect.unwrap(_uncertainty)(assessment, state, np.zeros(3))
+    np.testing.assert_array_equal(found.deviations, [2, 0, 1, 1, 0, 1])

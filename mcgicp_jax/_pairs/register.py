@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Sequence
 from typing import Any, Literal
 
+import numpy as np
 from jax.typing import ArrayLike
 
 from mcgicp_jax._clouds.point_cloud import PointCloud, Values
@@ -17,8 +19,12 @@ from mcgicp_jax._methods.base import AbstractMethod
 from mcgicp_jax._registration.measurements import GivenPrior, GivenTiePoints
 from mcgicp_jax._registration.options import Distance, Options, check_method
 from mcgicp_jax._registration.register_pair import register_pair
-from mcgicp_jax._registration.result import RegistrationResult, Status
+from mcgicp_jax._registration.result import RegistrationResult, Status, is_usable
 from mcgicp_jax._search.base import AbstractSearch
+
+# Smallest overlap without a warning. Pairs of scans that overlap by 10 to 30 % count as the hardest that can be
+# registered (3DLoMatch, Huang et al. 2021).
+_LEAST_OVERLAP = 0.1
 
 
 def register(
@@ -124,8 +130,9 @@ def register(
     Warns:
         UserWarning: if points with NaN or infinity are left out, `MultiChannelGICP` gets clouds without channels, the
             values of a channel are so different in the two clouds that their units probably are, too, or matched points
-            have so different ones that the exposure was probably another, or `GICP` gets
-            one cloud with covariances that are not dimensionless.
+            have so different ones that the exposure was probably another, `GICP` gets one
+            cloud with covariances that are not dimensionless, or less than 10 % of the source points have a match at
+            the end (outside of transformations).
     """
     options = Options(
         max_distance=max_distance,
@@ -141,7 +148,13 @@ def register(
     )
     if not (tie_points is None and prior is None) and not hold_unconstrained:
         raise ValueError("hold_unconstrained: expected True with tie_points or prior, got False")
-    return register_from(source, target, method, init, options, tie_points, prior)
+    result = register_from(source, target, method, init, options, tie_points, prior)
+    if is_concrete(result.overlap, result.status_code) and is_usable(result):
+        overlap = float(np.asarray(result.overlap))
+        if overlap < _LEAST_OVERLAP:
+            message = f"only {100 * overlap:.2g} % of the source points have a match, so the pose is probably wrong"
+            warnings.warn(f'{message}; pass a better init, or init="global"', UserWarning, stacklevel=2)
+    return result
 
 
 def register_from(

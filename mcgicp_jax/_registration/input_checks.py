@@ -9,6 +9,7 @@ from jax.typing import ArrayLike
 
 from mcgicp_jax._clouds.point_cloud import PointCloud
 from mcgicp_jax._compute.concrete import is_concrete
+from mcgicp_jax._compute.linear_maps import primal
 from mcgicp_jax._math.statistics import median, sampled_rows
 from mcgicp_jax._methods.base import AbstractMethod
 from mcgicp_jax._methods.multichannel_gicp import MultiChannelGICP
@@ -65,6 +66,17 @@ def check_matches(
         raise ValueError(f"temperature: expected metres to go with {matches.indices.shape[0]} candidates, got None")
     if temperature is not None and is_concrete(temperature) and not np.asarray(temperature) > 0:
         raise ValueError(f"temperature: expected a positive number of metres, got {temperature!r}")
+
+
+def warn_of_constant_weights(method: AbstractMethod) -> None:
+    """Warn if α is differentiated outside of `jit`: it decides matches alone, which are constant to autodiff."""
+    weights = getattr(method, "channel_weights", None)
+    if not is_concrete(weights) and is_concrete(primal(weights)):
+        warnings.warn(
+            "channel_weights: the derivative is 0, since they decide matches alone, which are constant in derivatives",
+            UserWarning,
+            stacklevel=5,
+        )
 
 
 def warn_of_covariances(source: PointCloud, target: PointCloud) -> None:

@@ -105,7 +105,9 @@ def _uncertainty(assessment: Assessment, state: State, origin: Any) -> Uncertain
         matrix = pose_in_user_frame(pose, np.zeros(3), np.zeros(3))
         # In the target's axes T exp(ξ) turns by R ω, and moves the centre c by R v + (t − c) × R ω.
         to_center = translation_adjoint(matrix[:3, 3] - center) @ xp.kron(xp.eye(2), matrix[:3, :3])
-        deviations = xp.sqrt(xp.diagonal(to_center @ covariance @ to_center.T)).astype(covariance.dtype)
+        variances = xp.diagonal(to_center @ covariance @ to_center.T)
+        # On noise-free points a variance is 0, up to rounding.
+        deviations = xp.sqrt(xp.maximum(variances, 0)).astype(covariance.dtype)
         if is_concrete(origin) and not np.any(origin):
             return Uncertainty(covariance, deviations)
         from_centred = translation_adjoint(origin)

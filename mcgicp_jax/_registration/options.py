@@ -74,6 +74,8 @@ class Options:
             raise ValueError(f"voxel_sizes: expected a sequence of voxel sizes in metres, got {self.voxel_sizes!r}")
         for size in self.voxel_sizes:
             check_positive("voxel_sizes", size)
+        if list(self.voxel_sizes) != sorted(self.voxel_sizes, reverse=True):
+            raise ValueError(f"voxel_sizes: expected the coarsest first, got {self.voxel_sizes!r}")
         if self.max_source_points is not None:
             check_integer("max_source_points", self.max_source_points, MIN_POINTS)
 
@@ -115,6 +117,8 @@ def options_of(function: Callable[..., Any], given: Any) -> Options:
 
 
 def check_method(method: AbstractMethod) -> None:
+    if isinstance(method, type) and issubclass(method, AbstractMethod):
+        raise ValueError(f"method: expected {method.__name__}(), got the class {method.__name__}")
     if not isinstance(method, AbstractMethod):
         raise ValueError(f"method: expected a method such as MultiChannelGICP(), got {reprlib.repr(method)}")
 

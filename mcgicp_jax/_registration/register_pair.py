@@ -34,7 +34,12 @@ from mcgicp_jax._pose_solver.covariance import Moments
 from mcgicp_jax._pose_solver.matched import match_surfaces
 from mcgicp_jax._registration.assessment import Assessment, assessment_of, moments_of
 from mcgicp_jax._registration.correspondences import find_correspondences, index_of
-from mcgicp_jax._registration.input_checks import check_channels, check_clouds, warn_of_covariances
+from mcgicp_jax._registration.input_checks import (
+    check_channels,
+    check_clouds,
+    warn_of_constant_weights,
+    warn_of_covariances,
+)
 from mcgicp_jax._registration.loop import LoopResult, iterate
 from mcgicp_jax._registration.make_result import registration_of
 from mcgicp_jax._registration.measurements import GivenPrior, GivenTiePoints, fusion_of, known
@@ -108,6 +113,7 @@ def prepared(
 ) -> Given:
     """The arguments of a registration, checked; clouds preprocessed unless the method makes cells of raw ones."""
     check_method(method)
+    warn_of_constant_weights(method)
     source, target = (
         _ready(name, cloud, options.takes_raw(method, name)) for name, cloud in (("source", source), ("target", target))
     )

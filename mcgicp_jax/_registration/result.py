@@ -179,7 +179,7 @@ class RegistrationResult(eqx.Module):
     def deviations(self) -> Float[AnyArray, "*batch 6"]:
         """(6,) standard deviations in the target's axes: position of the centroid of the matches (m), rotation (rad).
 
-        Derived from `covariance`, with the same limitations.
+        Derived from `covariance`, with the same limitations; unconstrained directions inflate all entries they touch.
         """
         return self.uncertainty.value.deviations
 

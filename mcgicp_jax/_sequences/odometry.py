@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import collections
+import warnings
 import weakref
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
@@ -119,6 +120,10 @@ def odometry(
     Raises:
         ValueError: if an argument is invalid; on iteration, if a cloud is. The message names the frame, and the
             iteration may go on with the next one: that one is registered to the last valid frame.
+
+    Warns:
+        UserWarning: on iteration, if a frame cannot be registered and there is no `recover`. The next one is registered
+            to it all the same.
     """
     check_preprocessing(voxel_size, num_neighbors)
     check_method(method)
@@ -213,6 +218,13 @@ class _Sensor(Iterator[OdometryStep]):
             if self.radius is None:
                 self.radius = float(np.linalg.norm(cloud.coordinates, axis=1).max())
         result = None if self.cloud is None else self._located(cloud, self.cloud)
+        if result is not None and not is_usable(result) and self.places is None:
+            warnings.warn(
+                f"{name}: {result.status.name}; the motion of the previous frame is used instead. With recover=True, "
+                "frames are found again",
+                UserWarning,
+                stacklevel=2,
+            )
         for known in (self.places, self.world):
             if known is not None and not self.is_lost:
                 known.add(name, cloud, self.pose)
