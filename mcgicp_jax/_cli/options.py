@@ -62,7 +62,7 @@ ADVICE = {
     mcg.Status.MAX_ITERATIONS: "the pose was still changing after the last iteration; "
     "try a larger --max-iterations, or --init with a better initial pose",
     mcg.Status.TOO_FEW_CORRESPONDENCES: "fewer than four points have a match; "
-    "try --init with a pose at which the clouds overlap, or a larger --max-distance",
+    "are both clouds in metres? If so, try --init with a pose at which they overlap, or a larger --max-distance",
     mcg.Status.DEGENERATE: "the pose is unconstrained in at least one direction; "
     "try clouds that show more of the scene, or have channels that mc-gicp can use",
     mcg.Status.NON_FINITE: "numerical overflow; are the coordinates in metres?",
