@@ -129,6 +129,7 @@ def test_files_and_the_command(files, near, capsys):
     assert main(["register", *pair, *OPTIONS, "--init", str(folder / "pose.txt"), "--max-iterations", "3"]) == 0
 
 
+@pytest.mark.parametrize("files", [".npz"], indirect=True)
 def test_compare_measures_at_the_cloud(files, capsys):
     folder, pair = files
     assert main(["compare", *pair, *OPTIONS, "--truth", str(folder / "truth.txt")]) == 0

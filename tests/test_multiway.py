@@ -288,12 +288,12 @@ def test_a_cloud_whose_registrations_contradict_each_other_is_named(monkeypatch)
     ("seed", "alien", "step"),
     [
         # The wrong first motion led all others astray: they agreed with each other.
-        (108, 0, 0.4),
+        pytest.param(108, 0, 0.4, marks=pytest.mark.slow),
         # It fits at 0.87 of the usual overlap per distance; later clouds agreed with it in a wrong minimum.
         (128, 4, 0.4),
         # The registration across it ends at the right pose, but as MAX_ITERATIONS.
         (102, 3, 0.4),
-        (30, 0, 0.6),
+        pytest.param(30, 0, 0.6, marks=pytest.mark.slow),
     ],
 )
 def test_a_cloud_of_another_place_does_not_spoil_the_motions_that_follow(seed, alien, step):

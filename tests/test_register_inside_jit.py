@@ -115,6 +115,7 @@ def test_padding_has_no_gradient_and_degenerate_neighborhoods_a_finite_one(padde
         np.testing.assert_array_equal(gradients[name][len(cloud) :], 0)
 
 
+@pytest.mark.slow
 @in_float64
 def test_implicit_gradient_is_that_of_the_unrolled_loop(noisy):
     """Differentiating through 60 updates with M renewed each time reaches the same number, at many times the cost."""
