@@ -16,7 +16,7 @@ README = pathlib.Path(__file__).parent.parent / "README.md"
 def test_snippets_run_as_printed(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     snippets = re.findall(r"```python\n(.*?)```", README.read_text(), flags=re.DOTALL)
-    assert len(snippets) == 5
+    assert len(snippets) == 4
     namespace = {}
     for snippet in snippets:
         exec(compile(snippet, str(README), "exec"), namespace)
