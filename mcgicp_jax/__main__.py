@@ -45,7 +45,18 @@ def _explanation(error: Exception) -> str:
 
 def main(args: Sequence[str] | None = None) -> int:
     """Run a command and return the exit code: 0, 1 if a registration did not converge, 2 for invalid input."""
-    args = sys.argv[1:] if args is None else args
+    try:
+        try:
+            return _run(sys.argv[1:] if args is None else args)
+        finally:
+            sys.stdout.flush()
+    except BrokenPipeError:
+        # The reader of the output, such as `head`, has ended. Python flushes the output once more when it exits.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 1
+
+
+def _run(args: Sequence[str]) -> int:
     if list(args) == ["--version"]:
         print(f"mcgicp {__version__}")
         return 0
@@ -64,9 +75,7 @@ def main(args: Sequence[str] | None = None) -> int:
                 config=(tyro.conf.OmitArgPrefixes, tyro.conf.DisallowNone),
             )
         except BrokenPipeError:
-            # The reader of the output, such as `head`, has ended. Python would fail again when it flushes the output.
-            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-            return 1
+            raise
         except (ValueError, OSError, ImportError) as error:
             print(f"mcgicp: {_explanation(error)}", file=sys.stderr)
             return 2

@@ -364,3 +364,15 @@ def test_compiled_programs_are_kept(files, tmp_path):
     assert (done.returncode, done.stderr) == (0, "")
     assert close_to_truth(io.read_poses(tmp_path / "pose.txt")[0])
     assert len(list((tmp_path / "cache" / "mcgicp_jax").iterdir())) > 5
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("arguments", [["--help"], ["register", "--help"], ["--version"]])
+def test_a_reader_that_ends_early_is_no_error(arguments):
+    """As in `mcgicp --help | head`."""
+    reader, writer = os.pipe()
+    os.close(reader)
+    command = [sys.executable, "-m", "mcgicp_jax", *arguments]
+    done = subprocess.run(command, stdout=writer, stderr=subprocess.PIPE, text=True, timeout=120)
+    os.close(writer)
+    assert done.stderr == ""

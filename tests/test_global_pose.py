@@ -368,7 +368,7 @@ def test_other_sizes_compile_nothing():
     for clouds in (pair(3000, 0), [bare(cloud) for cloud in pair(3000, 0)]):
         mcg.global_pose(*clouds)
     with compilations() as found:
-        for size in (300, 12_000):
+        for size in (300, 5000, 12_000):
             for clouds in (pair(size, size), [bare(cloud) for cloud in pair(size, size)]):
                 mcg.global_pose(*clouds)
         mcg.global_pose(*pair(2000, 5), correspondences=(np.arange(50), np.arange(50)))

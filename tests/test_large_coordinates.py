@@ -129,7 +129,10 @@ def test_files_and_the_command(files, near, capsys):
     assert main(["register", *pair, *OPTIONS, "--init", str(folder / "pose.txt"), "--max-iterations", "3"]) == 0
 
 
-@pytest.mark.parametrize("files", [".npz"], indirect=True)
+SLOW_FORMATS = [pytest.param(suffix, marks=pytest.mark.slow) for suffix in (".ply", ".las", ".txt")]
+
+
+@pytest.mark.parametrize("files", [".npz", *SLOW_FORMATS], indirect=True)
 def test_compare_measures_at_the_cloud(files, capsys):
     folder, pair = files
     assert main(["compare", *pair, *OPTIONS, "--truth", str(folder / "truth.txt")]) == 0

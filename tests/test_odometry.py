@@ -369,6 +369,6 @@ def test_a_radius_without_a_map_or_points_is_refused(room):
 def test_a_frame_that_cannot_be_registered_is_named():
     room = [np.asarray(frame.cloud.points) for frame in datasets.box_room(3, points_per_frame=600)]
     steps = mcg.odometry([*room, 1000 * room[0], room[2]], mcg.GICP(), max_distance=0.5)
-    with pytest.warns(UserWarning, match=r"frames\[3\]: TOO_FEW_CORRESPONDENCES; the motion .* recover=True"):
+    with pytest.warns(UserWarning, match=r"frames\[3\]: TOO_FEW_CORRESPONDENCES; the motion .*recover=True"):
         found = list(steps)
     assert not found[3].registration.converged

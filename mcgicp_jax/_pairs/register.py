@@ -127,12 +127,13 @@ def register(
         ValueError: if an argument is malformed, for instance in shape or dtype, numbers of channels differ where they
             are used, a cloud has fewer than four finite points, or `init` is not a rigid motion. The message names the
             argument. Failures to register well-formed clouds show in `RegistrationResult.status`.
+
     Warns:
         UserWarning: if points with NaN or infinity are left out, `MultiChannelGICP` gets clouds without channels, the
             values of a channel are so different in the two clouds that their units probably are, too, or matched points
-            have so different ones that the exposure was probably another, `GICP` gets one
-            cloud with covariances that are not dimensionless, or less than 10 % of the source points have a match at
-            the end (outside of transformations).
+            have so different ones that the exposure was probably another, or `GICP` gets one cloud with covariances
+            that are not dimensionless. Outside of `jit`: if less than 10 % of the source points have a match at the
+            end, or `channel_weights` are differentiated.
     """
     options = Options(
         max_distance=max_distance,
@@ -148,13 +149,7 @@ def register(
     )
     if not (tie_points is None and prior is None) and not hold_unconstrained:
         raise ValueError("hold_unconstrained: expected True with tie_points or prior, got False")
-    result = register_from(source, target, method, init, options, tie_points, prior)
-    if is_concrete(result.overlap, result.status_code) and is_usable(result):
-        overlap = float(np.asarray(result.overlap))
-        if overlap < _LEAST_OVERLAP:
-            message = f"only {100 * overlap:.2g} % of the source points have a match, so the pose is probably wrong"
-            warnings.warn(f'{message}; pass a better init, or init="global"', UserWarning, stacklevel=2)
-    return result
+    return register_from(source, target, method, init, options, tie_points, prior)
 
 
 def register_from(
@@ -173,7 +168,13 @@ def register_from(
         if not start.success:
             return RegistrationResult.without_pose(Status.TOO_FEW_CORRESPONDENCES)
         init = start.matrix
-    return register_pair(source, target, method, init, options, tie_points, prior)
+    result = register_pair(source, target, method, init, options, tie_points, prior)
+    if is_concrete(result.overlap, result.status_code) and is_usable(result):
+        overlap = float(np.asarray(result.overlap))
+        if overlap < _LEAST_OVERLAP:
+            message = f"only {100 * overlap:.2g} % of the source points have a match, so the pose is probably wrong"
+            warnings.warn(f'{message}; pass a better init, or init="global"', UserWarning, stacklevel=3)
+    return result
 
 
 def start_from_anywhere(init: str, source: PointCloud | Values, target: PointCloud | Values) -> GlobalPoseResult:

@@ -75,7 +75,7 @@ def warn_of_constant_weights(method: AbstractMethod) -> None:
         warnings.warn(
             "channel_weights: the derivative is 0, since they decide matches alone, which are constant in derivatives",
             UserWarning,
-            stacklevel=5,
+            stacklevel=6,
         )
 
 

@@ -166,7 +166,9 @@ def _start(
     """
     poses, found, fit = _chained(clouds, method, options)
     back, _, other_fit = _chained(clouds[::-1], method, options)
-    return (np.linalg.inv(back[-1]) @ back[::-1], {}) if other_fit > fit else (poses, found)
+    if other_fit > fit:
+        return np.linalg.inv(back[-1]) @ back[::-1], {}
+    return poses, {rows: computed(result) for rows, result in found.items()}
 
 
 def _chained(
@@ -187,7 +189,7 @@ def _chained(
         ]
         fits = [_fit(result) for result in results]
         best = int(np.argmax(fits))
-        i, result, total = rows[best], computed(results[best]), total + fits[best]
+        i, result, total = rows[best], results[best], total + fits[best]
         found[i, k] = result
         motion = np.asarray(result.matrix, np.float64) if is_usable(result) else starts[best]
         poses.append(poses[i] @ motion)

@@ -220,8 +220,8 @@ class _Sensor(Iterator[OdometryStep]):
         result = None if self.cloud is None else self._located(cloud, self.cloud)
         if result is not None and not is_usable(result) and self.places is None:
             warnings.warn(
-                f"{name}: {result.status.name}; the motion of the previous frame is used instead. With recover=True, "
-                "frames are found again",
+                f"{name}: {result.status.name}; the motion of the previous frame is used instead. "
+                "mcgicp_jax.odometry(..., recover=True) finds lost frames again",
                 UserWarning,
                 stacklevel=2,
             )
