@@ -147,11 +147,12 @@ def copied(values):
 
 @pytest.mark.parametrize("size", [1e18, 1e38])
 def test_squares_of_channels_may_overflow(size):
-    points = np.random.default_rng(0).normal(size=(8, 3))
-    channels = size * np.random.default_rng(1).uniform(-1, 1, (8, 2))
+    points = np.random.default_rng(0).normal(size=(40, 3))
+    channels = size * np.random.default_rng(1).uniform([-1, 0.5], 1, (40, 2))
     for name in ("mc-gicp", "photometric"):
-        cloud = mcg.PointCloud(points, channels)
-        assert_believable(outcome(lambda name=name, cloud=cloud: mcg.register(cloud, cloud, METHODS[name])))
+        cloud, brighter = mcg.PointCloud(points, channels), mcg.PointCloud(points, 1.8 * channels)
+        for target in (cloud, brighter):
+            assert_believable(outcome(lambda n=name, c=cloud, t=target: mcg.register(c, t, METHODS[n])))
 
 
 @settings(max_examples=80, deadline=None)

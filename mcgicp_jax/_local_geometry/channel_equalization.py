@@ -114,10 +114,12 @@ def gain_and_offset(
     xp = numpy_for(values, wanted)
     levels = xp.asarray(_QUANTILES, values.dtype)
     quantiles = [of_known(partial(xp.nanquantile, q=levels, axis=0), each) for each in (values, wanted)]
-    means = [xp.mean(each, axis=0) for each in quantiles]
-    spreads = [xp.std(each, axis=0) for each in quantiles]
-    varying = (spreads[0] > 0) & (spreads[1] > 0)
-    gain = xp.where(varying, spreads[1] / xp.where(varying, spreads[0], 1), 1)
-    offset = means[1] - gain * means[0]
+    # What overflows is not finite, and leaves its channel as it is.
+    with np.errstate(over="ignore", invalid="ignore"):
+        means = [xp.mean(each, axis=0) for each in quantiles]
+        spreads = [xp.std(each, axis=0) for each in quantiles]
+        varying = (spreads[0] > 0) & (spreads[1] > 0)
+        gain = xp.where(varying, spreads[1] / xp.where(varying, spreads[0], 1), 1)
+        offset = means[1] - gain * means[0]
     known = xp.isfinite(gain) & xp.isfinite(offset)
     return xp.where(known, gain, 1), xp.where(known, offset, 0)
