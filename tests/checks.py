@@ -1,9 +1,10 @@
-"""The run-time check of annotated shapes."""
+"""Run-time checks of annotated shapes, a plugin of pytest: `python -m pytest -p tests.checks`."""
 
 from collections.abc import Callable
 from typing import Any
 
 import beartype
+from jaxtyping import install_import_hook
 
 
 def checked(function: Callable[..., Any]) -> Callable[..., Any]:
@@ -13,3 +14,6 @@ def checked(function: Callable[..., Any]) -> Callable[..., Any]:
     while beartype decorates, it intercepts the warnings of all threads.
     """
     return function if "<locals>" in function.__qualname__ else beartype.beartype(function)
+
+
+install_import_hook("mcgicp_jax", "tests.checks.checked")

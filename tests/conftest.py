@@ -1,26 +1,20 @@
-"""Fixtures, and run-time checks of annotated shapes: beartype checks every call into the package during the tests."""
+"""Fixtures, and how the tests compile."""
 
 import gc
 import os
 import pathlib
 
-from jaxtyping import install_import_hook
-
-import tests.checks  # noqa: F401
-
 # Compilation takes most of the tests' time, and on CPUs four times as much where it optimizes. Unless XLA_FLAGS is set,
-# the tests do without; CI runs the slow tests and some of the others as users do.
+# the tests do without; CI runs the slow tests, and the others once more, as users do.
 os.environ.setdefault("XLA_FLAGS", "--xla_backend_optimization_level=0 --xla_cpu_use_fusion_emitters=false")
 # Keep compiled programs between runs. Those that compile in less than 50 ms are 85 % of all, and 15 % of the time.
 os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(pathlib.Path(__file__).parent.parent / ".jax_cache"))
 os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0.05")
 
-with install_import_hook("mcgicp_jax", "tests.checks.checked"):
-    import mcgicp_jax
-    import mcgicp_jax.__main__
-
 import jax
 import pytest
+
+import mcgicp_jax
 
 DATA = pathlib.Path(os.environ.get("MCGICP_DATA", pathlib.Path(__file__).parents[2] / "shared" / "data"))
 

@@ -40,6 +40,6 @@ def test_frequent_mistakes_are_named():
     points = np.random.default_rng(0).random((50, 3))
     with pytest.raises(ValueError, match="voxel_sizes: expected the coarsest first"):
         mcg.register(points, points, mcg.NDT(), voxel_sizes=(0.25, 1.0))
-    # The check of annotations, which only tests have, would refuse a class first.
+    # The check of annotations, which tests may have, would refuse a class first.
     with pytest.raises(ValueError, match=r"method: expected GICP\(\), got the class GICP"):
         inspect.unwrap(check_method)(mcg.GICP)

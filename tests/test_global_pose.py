@@ -306,10 +306,10 @@ def box(size, seed):
     return points + 0.005 * rng.normal(size=points.shape)
 
 
-def test_two_boxes_do_not_match():
+@pytest.mark.parametrize("size", [(1.5, 1.4, 0.7), pytest.param((2.2, 1.2, 1), marks=pytest.mark.slow)])
+def test_two_boxes_do_not_match(size):
     source = mcg.PointCloud(box((2, 1.2, 1), 1)).transform(anywhere(6))
-    for size in ((1.5, 1.4, 0.7), (2.2, 1.2, 1)):
-        assert not mcg.global_pose(source, box(size, 2)).success
+    assert not mcg.global_pose(source, box(size, 2)).success
 
 
 def test_a_symmetric_scene_is_ambiguous():
@@ -368,9 +368,10 @@ def test_other_sizes_compile_nothing():
     for clouds in (pair(3000, 0), [bare(cloud) for cloud in pair(3000, 0)]):
         mcg.global_pose(*clouds)
     with compilations() as found:
-        for size in (300, 5000, 12_000):
+        for size in (300, 5000):
             for clouds in (pair(size, size), [bare(cloud) for cloud in pair(size, size)]):
                 mcg.global_pose(*clouds)
+        mcg.global_pose(*pair(12_000, 12_000))
         mcg.global_pose(*pair(2000, 5), correspondences=(np.arange(50), np.arange(50)))
     assert not found
 
@@ -394,7 +395,7 @@ def test_register_starts_from_anywhere():
         )
 
 
-@pytest.mark.parametrize("against", ["previous", "map"])
+@pytest.mark.parametrize("against", [pytest.param("previous", marks=pytest.mark.slow), "map"])
 def test_a_lost_frame_is_found_in_the_map(against):
     """The sensor is carried away, looks at nothing it knows, and comes back turned round."""
     frames = list(datasets.box_room(6, points_per_frame=2500, step=0.08))

@@ -95,7 +95,7 @@ def test_a_batch(search, near):
 def test_inside_a_transformation():
     @jax.jit
     def pose(source, target):
-        result = mcg.register(source, target, mcg.GICP(), max_distance=0.5)
+        result = mcg.register(source, target, mcg.GICP(), max_distance=0.5, search=mcg.DenseSearch())
         return result, result.matrix
 
     # The pose is refined there, so its like is one that is, too.

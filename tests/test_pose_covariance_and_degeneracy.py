@@ -343,12 +343,12 @@ def test_traced_and_batched_results_carry_the_same():
     """Clouds of several sizes, stacked."""
     clouds = [pair(size=2000 - 100 * i, truth=motion((0.02 * i, 0.01, 0, 0.01, 0, 0.02)))[:2] for i in range(3)]
     stacked = [mcg.PointCloud.stack([clouds[i][which] for i in range(3)]) for which in (0, 1)]
-    run = jax.jit(jax.vmap(lambda s, t: mcg.register(s, t, mcg.GICP(), max_distance=0.5)))
-    batch = run(*stacked)
+    options = {"max_distance": 0.5, "search": mcg.DenseSearch()}
+    batch = jax.jit(jax.vmap(lambda s, t: mcg.register(s, t, mcg.GICP(), **options)))(*stacked)
     with pytest.raises(ValueError, match="unconstrained_directions"):
         _ = batch.unconstrained_directions
     for i, (source, target) in enumerate(clouds):
-        alone = mcg.register(source, target, mcg.GICP(), max_distance=0.5)
+        alone = mcg.register(source, target, mcg.GICP(), **options)
         assert batch.status[i] == alone.status
         np.testing.assert_allclose(batch.matrix[i], alone.matrix, atol=1e-3)
         np.testing.assert_allclose(batch.directions.geometry[i], alone.directions.geometry, atol=1e-3)

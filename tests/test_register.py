@@ -300,7 +300,7 @@ def test_some_of_the_points_find_the_pose_and_all_settle_it(room, monkeypatch):
     pairs = result.history["num_inliers"]
     assert 4 * pairs[0] < plain.history["num_inliers"][0] and pairs[-1] == result.num_inliers
     assert result.converged and difference(result.matrix, plain.matrix) < 4e-4
-    traced = jax.jit(lambda cloud: mcg.register(cloud, target, mcg.GICP(), **to_rest))(source)
+    traced = jax.jit(lambda s: mcg.register(s, target, mcg.GICP(), search=mcg.DenseSearch(), **to_rest))(source)
     assert traced.status == Status.CONVERGED and difference(traced.matrix, result.matrix) < 4e-4
     np.testing.assert_allclose(traced.history["num_inliers"][: len(pairs)], pairs, rtol=1e-2)
     # What is measured last is measured with all points, wherever the iterations have run out.

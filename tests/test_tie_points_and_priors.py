@@ -273,7 +273,8 @@ def test_batches_of_tie_points(corner):
 
 def test_other_numbers_of_tie_points_compile_nothing(corner):
     source, target, truth = corner
-    mcg.register(source, target, mcg.GICP(), tie_points=tie_points(truth, source.points, 0.01), **OPTIONS)
+    given = tie_points(truth, source.points, 0.01)
+    assert mcg.register(source, target, mcg.GICP(), tie_points=given, **OPTIONS).covariance.shape == (6, 6)
     with compilations() as found:
         for count in (1, 4, 300):
             given = tie_points(truth, source.points, 0.01, count=count)
