@@ -46,7 +46,9 @@ def everything(method, raw):
         assert repr(found) and found.matrix.shape == (4, 4)
 
 
-@pytest.mark.parametrize("name", METHODS)
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=pytest.mark.slow) if name == "photometric" else name for name in METHODS]
+)
 def test_other_sizes_and_names_compile_nothing(name):
     method = METHODS[name]
     everything(method, clouds(400))

@@ -83,7 +83,9 @@ def test_where_only_one_cloud_is_far(near):
     assert_as_near(result.matrix @ np.linalg.inv(TO_UTM), near)
 
 
-@pytest.mark.parametrize("search", [None, mcg.DenseSearch()], ids=["threads", "lanes"])
+@pytest.mark.parametrize(
+    "search", [pytest.param(None, id="threads"), pytest.param(mcg.DenseSearch(), id="lanes", marks=pytest.mark.slow)]
+)
 def test_a_batch(search, near):
     source, target = scene(UTM)
     pairs = mcg.register_batch([source] * 3, [target] * 3, mcg.MultiChannelGICP(), max_distance=0.5, search=search)

@@ -198,7 +198,8 @@ def test_a_batch_is_its_lanes(name, noisy):
     starts = jnp.asarray(np.stack([motion(), motion((50, 0, 0, 0, 0, 0)), np.eye(4)]), source.points.dtype)
 
     def lane(start, points):
-        result = mcg.register(source.replace(points=points), target, method, init=start, max_distance=GATE)
+        moved, options = source.replace(points=points), {"max_distance": GATE, "search": mcg.DenseSearch()}
+        result = mcg.register(moved, target, method, init=start, **options)
         return weigh(result.matrix), result.status
 
     batched = jax.jit(jax.vmap(jax.value_and_grad(lane, argnums=1, has_aux=True), in_axes=(0, None)))
