@@ -43,7 +43,7 @@ def precision(request):
 # Each compiled program takes dozens of memory maps. Linux allows a process 65,530, and beyond that the compiler aborts;
 # tests of transformations compile for many shapes.
 _MAPS = pathlib.Path("/proc/self/maps")
-_MANY_MAPS = 30_000
+_MANY_MAPS = 40_000
 
 
 @pytest.fixture(autouse=True, scope="module")

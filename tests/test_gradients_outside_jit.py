@@ -144,7 +144,7 @@ def test_preprocessing_has_a_derivative():
         )
 
     with pytest.warns(UserWarning, match="left out 1 of 900"):
-        gradient = jax.grad(loss)({"points": points[others], "channels": channels})
+        gradient = jax.tree.map(np.asarray, jax.grad(loss)({"points": points[others], "channels": channels}))
         assert not np.any(gradient["channels"][~known]) and not np.any(gradient["channels"][7])
         for name, actual, expected in directional_errors(
             loss, {"channels": channels, "points": points[others]}, gradient

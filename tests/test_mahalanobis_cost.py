@@ -27,6 +27,7 @@ from mcgicp_jax._pose_solver.matched import Motion, match_surfaces
 from mcgicp_jax._pose_solver.sums import sums_of
 from mcgicp_jax.extend import KERNELS
 from tests import reference as ref
+from tests.compilations import compilations
 from tests.precision import cached, in_both_precisions, in_float64, tolerance
 
 pytestmark = in_float64
@@ -155,36 +156,36 @@ def test_at_large_coordinates_the_cost_is_the_same(kernel):
 SQUARES = np.concatenate([[0.0, 1e-12], np.geomspace(1e-4, 1e4, 60)])
 
 
+@jax.jit
+def values_weights_and_slopes(kernel, squares):
+    slopes = jax.vmap(jax.grad(lambda s2: kernel.rho(s2[None])[0]))(squares)
+    return kernel.rho(squares), kernel.weight(squares), slopes
+
+
 @in_both_precisions
 @pytest.mark.parametrize("scale", [0.1, 1.0, 7.0])
 @pytest.mark.parametrize("name", KERNELS)
 def test_kernels_against_the_reference(name, scale):
-    kernel = KERNELS[name](scale)
-    squares = jnp.asarray(SQUARES, jnp.zeros(()).dtype)
+    values, _, _ = values_weights_and_slopes(KERNELS[name](scale), SQUARES)
     expected = [ref.ROBUST[name](s2, scale) for s2 in SQUARES]
-    np.testing.assert_allclose(
-        kernel.rho(squares), expected, rtol=tolerance(2e-5, 1e-9), atol=tolerance(3e-7, 1e-15) * scale**2
-    )
+    np.testing.assert_allclose(values, expected, rtol=tolerance(2e-5, 1e-9), atol=tolerance(3e-7, 1e-15) * scale**2)
 
 
 @in_both_precisions
 @pytest.mark.parametrize("scale", [0.1, 1.0, 7.0])
 @pytest.mark.parametrize("name", KERNELS)
 def test_the_weight_is_the_derivative_of_rho(name, scale):
-    kernel = KERNELS[name](scale)
-    dtype = jnp.zeros(()).dtype
     # Away from the corners of Huber and Tukey, where a central difference straddles two branches.
-    squares = SQUARES[(SQUARES > 1e-5) & (np.abs(SQUARES / scale**2 - 1) > 0.01)]
-    step = 3e-4 * squares
+    away = (SQUARES > 1e-5) & (np.abs(SQUARES / scale**2 - 1) > 0.01)
+    squares, step = SQUARES[away], 3e-4 * SQUARES[away]
     expected = [
         (ref.ROBUST[name](s2 + h, scale) - ref.ROBUST[name](s2 - h, scale)) / (2 * h)
         for s2, h in zip(squares, step, strict=True)
     ]
-    weights = kernel.weight(jnp.asarray(squares, dtype))
-    np.testing.assert_allclose(weights, expected, rtol=tolerance(1e-4, 1e-5), atol=tolerance(1e-6, 1e-8))
-    slope = jax.vmap(jax.grad(lambda s2: kernel.rho(s2[None])[0]))(jnp.asarray(squares, dtype))
-    np.testing.assert_allclose(slope, weights, rtol=tolerance(1e-4, 1e-10), atol=1e-6)
-    np.testing.assert_allclose(kernel.weight(jnp.zeros(1, dtype)), 1)
+    _, weights, slopes = values_weights_and_slopes(KERNELS[name](scale), SQUARES)
+    assert SQUARES[0] == 0 and weights[0] == 1
+    np.testing.assert_allclose(weights[away], expected, rtol=tolerance(1e-4, 1e-5), atol=tolerance(1e-6, 1e-8))
+    np.testing.assert_allclose(slopes[away], weights[away], rtol=tolerance(1e-4, 1e-10), atol=1e-6)
 
 
 @in_both_precisions
@@ -192,7 +193,7 @@ def test_the_weight_is_the_derivative_of_rho(name, scale):
 def test_gradients_of_kernels_are_finite(name):
     kernel, squares = KERNELS[name](1.0), jnp.array([0.0, 1.0, 1e-30, 1e30])
     for function in (kernel.rho, kernel.weight):
-        assert np.isfinite(jax.grad(lambda s2, function=function: jnp.sum(function(s2)))(squares)).all()
+        assert np.isfinite(jax.jit(jax.grad(lambda s2, function=function: jnp.sum(function(s2))))(squares)).all()
 
 
 @pytest.mark.parametrize("scale", [0, -1.0, np.nan, np.inf, np.ones(2)])
@@ -313,7 +314,10 @@ def test_padding_of_given_covariances_adds_nothing():
         moved = source.replace(points=points, covariances=covariances)
         return mahalanobis_cost(T, moved, target, matches, GICP())
 
-    value, found = jax.value_and_grad(cost, argnums=(0, 1))(source.points, source.covariances)
+    with compilations() as programs:
+        value, found = jax.value_and_grad(cost, argnums=(0, 1))(source.points, source.covariances)
+    # Outside of `jit` too, not each operation alone.
+    assert len(programs) < 10
     assert np.isfinite(value)
     for gradient in found:
         assert np.isfinite(gradient).all()

@@ -308,11 +308,12 @@ def test_traced_and_batched_it_finds_the_same():
     pairs = [clouds(seed=10 * i)[0] for i in range(3)]
     expected = [find(*pair, T, 0.3, 0.4) for pair in pairs]
     pose = jnp.asarray(T, pairs[0][0].points.dtype)
-    jitted = jax.jit(find)(*pairs[0], pose, 0.3, 0.4)
+    jitted = jax.tree.map(np.asarray, jax.jit(find)(*pairs[0], pose, 0.3, 0.4))
     np.testing.assert_array_equal(jitted.valid, expected[0].valid)
     np.testing.assert_array_equal(jitted.indices[jitted.valid], expected[0].indices[expected[0].valid])
     sources, targets = (PointCloud.stack(side) for side in zip(*pairs, strict=True))
-    batched = jax.jit(jax.vmap(find, in_axes=(0, 0, None, None, 0)))(sources, targets, pose, 0.3, jnp.full(3, 0.4))
+    batched = jax.jit(jax.vmap(find, in_axes=(0, 0, None, None, 0)))(sources, targets, pose, 0.3, np.full(3, 0.4))
+    batched = jax.tree.map(np.asarray, batched)
     for i, one in enumerate(expected):
         size = one.valid.size
         np.testing.assert_array_equal(batched.valid[i, :size], one.valid)
@@ -393,9 +394,7 @@ def test_a_pose_that_is_not_a_number_matches_nothing():
 def test_lanes_that_have_ended_are_not_searched(monkeypatch):
     """In a batched loop the body runs for them, too."""
     (source, target), _ = clouds()
-    poses = jnp.stack([jnp.eye(4), jnp.asarray(ref.pose([0.08, -0.05, 0.1], [0.02, 0.05, -0.03]))]).astype(
-        source.points.dtype
-    )
+    poses = np.stack([np.eye(4), ref.pose([0.08, -0.05, 0.1], [0.02, 0.05, -0.03])]).astype(source.points.dtype)
     asked, nearest = [], TreeIndex.nearest
     monkeypatch.setattr(TreeIndex, "nearest", lambda *arguments: asked.append(1) or nearest(*arguments))
 

@@ -51,20 +51,31 @@ class Held(mcg.MultiChannelGICP):
 def matched_at(source, target, method, pose, matches):
     """The matched surfaces, the terms and the motion."""
     both = surface_pair(method, source, target, observed=False)
-    pose = jnp.asarray(pose, source.points.dtype)
-    motion = Motion(pose[:3, :3], pose[:3, 3])
-    return match_surfaces(both.source, both.target, matches), both, motion
+    pose = np.asarray(pose, source.points.dtype)
+    motion = Motion(jnp.asarray(pose[:3, :3]), jnp.asarray(pose[:3, 3]))
+    return jax.jit(match_surfaces)(both.source, both.target, matches), both, motion
 
 
-def held(source, target, method, pose, matches):
-    """The method with its numbers from the matches at a pose, held; and the term with these."""
-    matched, both, motion = matched_at(source, target, method, pose, matches)
+@jax.jit
+def numbers_at(motion, matched, terms, valid):
+    """The terms with their numbers from the matches."""
 
     def sample(term, rows):
         some = Matched(surface_rows(matched.source, rows), surface_rows(matched.target, rows), matched.valid[rows])
         return sample_of_term(motion, some, term)
 
-    (term,) = adapted(both.terms, source.valid, sample)
+    return adapted(terms, valid, sample)
+
+
+@jax.jit
+def sampled(term, matched, motion):
+    return term.sample(matched.at(motion))
+
+
+def held(source, target, method, pose, matches):
+    """The method with its numbers from the matches at a pose, held; and the term with these."""
+    matched, both, motion = matched_at(source, target, method, pose, matches)
+    (term,) = numbers_at(motion, matched, both.terms, source.valid)
     return Held(both.method, term), term
 
 
@@ -151,7 +162,7 @@ def test_gains_and_offsets_apply_to_values_and_slopes():
     samples = []
     for cloud, each in ((source, term), (darker, brighter)):
         matched, _, motion = matched_at(cloud, target, PHOTOMETRIC, truth, matches)
-        samples.append(each.sample(matched.at(motion)))
+        samples.append(sampled(each, matched, motion))
     for name in ("values", "slopes", "products"):
         expected, found = (np.asarray(getattr(each, name)) for each in samples)
         np.testing.assert_allclose(found, expected, atol=1e-3 * np.nanmax(np.abs(expected)), err_msg=name)
@@ -162,7 +173,7 @@ def test_estimates_are_scales_and_correlations_of_the_residuals():
     _, term = held(source, target, PHOTOMETRIC, truth, matches)
     matched, _, motion = matched_at(source, target, PHOTOMETRIC, truth, matches)
     moved = motion.move(matched.source.points)
-    residuals = term.sample(matched.at(motion))
+    residuals = sampled(term, matched, motion)
     for k, values in enumerate(residuals.values.T):
         scatter = 1.4826 * median(np.abs(np.asarray(values) - median(np.asarray(values))))
         np.testing.assert_allclose(term.deviations[k], scatter, rtol=1e-4)

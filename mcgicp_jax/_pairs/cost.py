@@ -12,6 +12,7 @@ from jaxtyping import Array, Float, Int
 
 from mcgicp_jax._clouds.origins import centred_pose
 from mcgicp_jax._clouds.point_cloud import PointCloud
+from mcgicp_jax._compute.concrete import is_concrete
 from mcgicp_jax._local_geometry.surface import searched
 from mcgicp_jax._math import symmetric_matrices as alg
 from mcgicp_jax._math.poses import Pose
@@ -68,12 +69,17 @@ def mahalanobis_cost(
     check_matches(matches, source, method, temperature)
     if log_determinant and not isinstance(method, AbstractGeneralized):
         raise ValueError(f"log_determinant: expected a method with covariances, got {type(method).__name__}")
-    pair = surface_pair(method, source, target, observed=False, robust=robust)
+    surfaces = surface_pair if is_concrete(method, source, target) else _surface_pair_in_jit
+    pair = surfaces(method, source, target, observed=False, robust=robust)
     dtype = source.points.dtype
     matrix = centred_pose(pose, source, target, "pose")
     rotation, translation = jnp.asarray(matrix[:3, :3], dtype), jnp.asarray(matrix[:3, 3], dtype)
     temperature = None if temperature is None else jnp.asarray(temperature, dtype)
     return _total_cost(Motion(rotation, translation), pair, matches, temperature, log_determinant)
+
+
+# Otherwise a gradient outside `jit` would compile each of some hundred operations alone.
+_surface_pair_in_jit = jax.jit(surface_pair, static_argnames="observed")
 
 
 @partial(jax.jit, static_argnames="log_determinant")

@@ -14,7 +14,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.typing import DTypeLike
-from jaxtyping import Float, Int
+from jaxtyping import Array, Float, Int
 
 from mcgicp_jax._compute.callbacks import call_host
 from mcgicp_jax._compute.concrete import AnyArray, is_concrete
@@ -66,25 +66,33 @@ def solve_traced(poses: Float[AnyArray, "n 4 4"], factors: Factors, robust: bool
 def _derivative(robust: bool, max_iterations: int, primals: Any, tangents: Any) -> tuple[Found, Found]:
     (poses, factors), (_, changes) = primals, tangents
     found, sensitivity = _solved(poses, factors, robust, max_iterations, True)
-    n, dtype = len(poses), found.poses.dtype
+    moved = _moved(found, sensitivity, [each.rows for each in factors], [_floats(each) for each in changes])
+    constants = jax.tree.map(lambda value: jax.custom_derivatives.zero_from_primal(value), found)
+    return found, constants._replace(poses=moved)
+
+
+# Compiled as a whole: outside of `jit`, each of some fifty operations would be compiled alone.
+@jax.jit
+def _moved(found: Found, sensitivity: _Sensitivity, rows: list[Any], changes: list[list[Any]]) -> Float[Array, "n 4 4"]:
+    """Tangents of the poses, given those of the arrays of floats of each kind of measurement."""
+    n, dtype = len(found.poses), found.poses.dtype
     gradient = jnp.zeros((n + 1, 6), dtype)
-    for factor, change, forces in zip(factors, changes, sensitivity.forces, strict=True):
-        rows = jnp.where(jnp.asarray(factor.rows) == WORLD, n, factor.rows)
-        for tangent, force in zip(_floats(change), forces, strict=True):
-            force = force.reshape(*rows.shape, 6, -1)
+    for index, tangents, forces in zip(rows, changes, sensitivity.forces, strict=True):
+        ends = jnp.where(jnp.asarray(index) == WORLD, n, index)
+        for tangent, force in zip(tangents, forces, strict=True):
+            force = force.reshape(*ends.shape, 6, -1)
             product = jnp.einsum(
-                "mkap,mp->mka", force, tangent.reshape(len(rows), -1).astype(dtype), precision="highest"
+                "mkap,mp->mka", force, tangent.reshape(len(ends), -1).astype(dtype), precision="highest"
             )
-            gradient = gradient.at[rows].add(product)
+            gradient = gradient.at[ends].add(product)
     twists = -jnp.einsum("iajb,jb->ia", sensitivity.inverse, gradient[:-1], precision="highest")
     v, (x, y, z) = twists[:, :3], twists[:, 3:].T
     zero = jnp.zeros_like(x)
     turn = jnp.stack([zero, -z, y, z, zero, -x, -y, x, zero], axis=-1).reshape(n, 3, 3)
     generators = jnp.zeros((n, 4, 4), dtype).at[:, :3, :3].set(turn).at[:, :3, 3].set(v)
     moved = jnp.matmul(found.poses, generators, precision="highest")
-    constants = jax.tree.map(lambda value: jax.custom_derivatives.zero_from_primal(value), found)
     # Tangents that are not finite would leave NaN behind a zero derivative.
-    return found, constants._replace(poses=jnp.where(found.status == Status.CONVERGED, moved, 0))
+    return jnp.where(found.status == Status.CONVERGED, moved, 0)
 
 
 def covariances_traced(poses: Float[AnyArray, "n 4 4"], factors: Factors, weights: Float[AnyArray, "m"]) -> Lazy[Any]:

@@ -63,8 +63,13 @@ def _centred_prior(given: GivenPrior, source: PointCloud, target: PointCloud) ->
     covariance = _numbers("prior: covariance", covariance, (6, 6))
     if is_concrete(covariance, source.points, source.origin):
         return Prior(matrix[:3, :3], matrix[:3, 3], _information(covariance, source))
-    change = translation_adjoint(-source.origin)
-    return Prior(matrix[:3, :3], matrix[:3, 3], inverse_6(change @ covariance @ change.T))
+    return Prior(matrix[:3, :3], matrix[:3, 3], _information_traced(covariance, source.origin))
+
+
+@jax.jit
+def _information_traced(covariance: Float[AnyArray, "6 6"], origin: Float[AnyArray, "3"]) -> Float[AnyArray, "6 6"]:
+    change = translation_adjoint(-origin)
+    return inverse_6(change @ covariance @ change.T)
 
 
 def _information(covariance: Float[np.ndarray, "6 6"], source: PointCloud) -> Float[np.ndarray, "6 6"]:
