@@ -2,6 +2,7 @@
 
 import copy
 import pickle
+import warnings
 
 import jax
 import jax.numpy as jnp
@@ -143,6 +144,10 @@ def test_replace_exchanges_and_leaves_the_rest():
     replaced = cloud.replace(channels=channels)
     assert_same(replaced, ready().replace(channels=channels))
     assert replaced.points is cloud.points
+    # Also where JAX has no float64: without a warning of its own.
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        PointCloud(np.zeros((5, 3))).replace(points=jnp.ones((5, 3), jnp.float32))
     assert not np.any(np.asarray(cloud.channels)[:150] == 1)
 
 

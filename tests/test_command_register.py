@@ -281,8 +281,9 @@ def test_a_missing_package_is_named(files, monkeypatch, capsys):
 def test_points_left_out_are_reported_in_one_line(files, tmp_path, capsys):
     cloud = io.read(files["bare"])
     points = np.vstack([cloud.points, [[np.nan, 0, 0]]])
-    assert main(["register", save(tmp_path / "nan.npz", points), files["target"], "--method", "gicp"]) == 0
-    assert capsys.readouterr().err == "mcgicp: left out 1 of 1001 points with a NaN or infinity\n"
+    path = save(tmp_path / "nan.npz", points)
+    assert main(["register", path, files["target"], "--method", "gicp"]) == 0
+    assert capsys.readouterr().err == f"mcgicp: {path}: left out 1 of 1001 points with a NaN or infinity\n"
 
 
 @pytest.mark.parametrize(

@@ -6,6 +6,7 @@ import warnings
 from functools import partial
 
 import jax.numpy as jnp
+import jaxtyping
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -235,6 +236,17 @@ def test_what_no_float32_holds_is_left_out():
     assert len(cloud) == 98
     with pytest.raises(ValueError, match="cloud: expected at least 4 finite points, got 0 of 100"):
         mcg.preprocess(points + 1e40)
+
+
+def test_warnings_name_the_cloud_and_show_the_line_of_the_caller():
+    clouds = [np.vstack([room_corner(100, seed=seed)[0], [[np.nan, 0, 0]]]) for seed in (0, 1)]
+    with pytest.warns(UserWarning, match="left out") as caught:
+        mcg.register(*clouds, mcg.GICP(), max_distance=0.5)
+        mcg.register_batch(clouds[:1], clouds[1:], mcg.GICP(), max_distance=0.5)
+    texts = [str(each.message).split(" left")[0] for each in caught]
+    assert texts == ["source:", "target:", "pair 0: source:", "pair 0: target:"]
+    # Run-time checks of annotations wrap each function of the package.
+    assert {each.filename for each in caught[:2]} <= {__file__, jaxtyping._decorator.__file__}
 
 
 def test_more_neighbors_than_points():

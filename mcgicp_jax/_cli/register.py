@@ -34,7 +34,7 @@ from mcgicp_jax._cli.options import (
     with_names,
     words,
 )
-from mcgicp_jax._compute.argument_checks import errors_named
+from mcgicp_jax._compute.messages import messages_named
 from mcgicp_jax._compute.threads import side_by_side
 from mcgicp_jax._methods.base import AbstractMethod
 from mcgicp_jax._methods.registry import METHODS
@@ -291,5 +291,5 @@ def _found(clouds: Sequence[mcg.PointCloud], channels: Sequence[str]) -> Float[n
 def _preprocess(
     path: Path, cloud: mcg.PointCloud, channels: Sequence[str], voxel_size: float | None, num_neighbors: int
 ) -> mcg.PointCloud:
-    with errors_named(str(path)):
+    with messages_named(str(path)):
         return mcg.preprocess(with_channels(cloud, channels), voxel_size, num_neighbors)

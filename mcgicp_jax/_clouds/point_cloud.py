@@ -13,8 +13,8 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float, Int
 
 from mcgicp_jax._clouds.other_libraries import arrays_of
-from mcgicp_jax._compute.argument_checks import errors_named
 from mcgicp_jax._compute.concrete import is_concrete
+from mcgicp_jax._compute.messages import messages_named
 from mcgicp_jax._compute.size_classes import size_class
 from mcgicp_jax._math.poses import Pose, pose_matrix
 
@@ -188,9 +188,11 @@ class PointCloud(eqx.Module):
         }
         for name in arrays.keys() & {"points", "channels", "covariances"}:
             if arrays[name] is not None:
-                array = _as_float(name, arrays[name])
+                array, dtype = _as_float(name, arrays[name]), self.points.dtype
+                # JAX warns of conversions to float64 where it has none.
+                dtype = dtype if isinstance(array, np.ndarray) else jax.dtypes.canonicalize_dtype(dtype)
                 # Of traced arrays, even a conversion to the same dtype would be compiled.
-                arrays[name] = array if array.dtype == self.points.dtype else array.astype(self.points.dtype)
+                arrays[name] = array if array.dtype == dtype else array.astype(dtype)
         for name, value in arrays.items():
             expected = shapes.get(name, np.shape(value))
             if np.shape(value) != expected and not (name == "covariances" and value is None):
@@ -356,7 +358,7 @@ def as_cloud(name: str, cloud: PointCloud | Values) -> PointCloud:
     """The argument `name` as a `PointCloud`. Raises `ValueError`, which starts with the name, if it cannot be one."""
     if isinstance(cloud, PointCloud):
         return cloud
-    with errors_named(name):
+    with messages_named(name):
         return PointCloud(cloud)
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Iterable, Sequence
 from typing import Any
 
@@ -16,6 +15,7 @@ from mcgicp_jax._clouds.voxels import voxel_numbers
 from mcgicp_jax._compute.argument_checks import check_integer, check_positive
 from mcgicp_jax._compute.concrete import is_concrete
 from mcgicp_jax._compute.linear_maps import AbstractLinearMap, primal, with_derivative
+from mcgicp_jax._compute.messages import warn
 from mcgicp_jax._search.base import AbstractSearch, NeighborsOnDemand
 from mcgicp_jax._search.brute_force import default_search
 
@@ -193,28 +193,22 @@ def _warn_of_loss(given: PointCloud, found: PointCloud, voxel_size: float | None
         # Each point is its own first neighbour.
         spacing = np.median(np.linalg.norm(points[neighbors[:, 1]] - points, axis=1))
         if np.spacing(largest) > _LARGEST_STEP * spacing:
-            warnings.warn(
+            warn(
                 f"points: float32 has rounded coordinates of {largest:.0f} m to steps of {np.spacing(largest):.2g} m, "
-                f"and neighbours are {spacing:.2g} m apart; read them as float64, or subtract an offset before float32",
-                UserWarning,
-                stacklevel=3,
+                f"and neighbours are {spacing:.2g} m apart; read them as float64, or subtract an offset before float32"
             )
     if not isinstance(found.neighbors, NeighborsOnDemand):
         second = np.asarray(found.neighbors)[:, 1]
         duplicates = np.mean((found.points[second] == found.points).all(axis=1))
         if duplicates > 0.5:
-            warnings.warn(
+            warn(
                 f"points: {duplicates:.0%} lie exactly on another one, so that neighbourhoods do not span the surface; "
-                "average them with voxel_size",
-                UserWarning,
-                stacklevel=3,
+                "average them with voxel_size"
             )
     if len(found) < min(len(given), num_neighbors):
-        warnings.warn(
+        warn(
             f"voxel_size: {voxel_size} m leaves {len(found)} of {len(given)} points, fewer than the {num_neighbors} "
-            "neighbours from which a covariance is computed; choose a smaller size",
-            UserWarning,
-            stacklevel=3,
+            "neighbours from which a covariance is computed; choose a smaller size"
         )
 
 
@@ -242,7 +236,7 @@ def finite_rows(cloud: PointCloud | Values) -> PointCloud:
         left = f", left out {np.sum(~keep)}{advice}" if others else ""
         raise ValueError(f"cloud: expected at least {MIN_POINTS} finite points, got {keep.sum()} of {keep.size}{left}")
     text = f"left out {np.sum(~keep)} of {keep.size} points with a NaN or infinity{advice}"
-    warnings.warn(text, UserWarning, stacklevel=3)
+    warn(text)
     return PointCloud(
         cloud.points[keep],
         cloud.channels[keep],

@@ -11,7 +11,8 @@ from jaxtyping import Float
 
 from mcgicp_jax._clouds.point_cloud import PointCloud, Values, as_cloud
 from mcgicp_jax._clouds.voxels import starts_of, voxel_keys, voxel_of
-from mcgicp_jax._compute.argument_checks import check_positive, errors_named
+from mcgicp_jax._compute.argument_checks import check_positive
+from mcgicp_jax._compute.messages import messages_named
 from mcgicp_jax._math.poses import Pose, pose_matrix
 
 
@@ -71,7 +72,7 @@ class VoxelMap:
         if self._first is None and finite.any():
             self._first = voxel_of(points[finite][0], self._voxel_size)
         first = 0.0 if self._first is None else self._first
-        with errors_named(name):
+        with messages_named(name):
             keys, sums = _merged(voxel_keys(points[finite], self._voxel_size, first), rows[finite])
         if self._sums is None:
             self._keys, self._sums = keys, sums

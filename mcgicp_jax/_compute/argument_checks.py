@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
-from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
@@ -23,12 +21,3 @@ def check_integer(name: str, value: Any, minimum: int) -> None:
 
 def is_number(value: Any) -> bool:
     return np.ndim(value) == 0 and np.asarray(value).dtype.kind in "fiu"
-
-
-@contextlib.contextmanager
-def errors_named(name: str) -> Iterator[None]:
-    """Context in which the message of a `ValueError` or `OSError` gets the name of an argument; a `ValueError`."""
-    try:
-        yield
-    except (ValueError, OSError) as error:
-        raise ValueError(f"{name}: {error}") from error

@@ -13,8 +13,9 @@ from jaxtyping import Float, Int
 from mcgicp_jax._clouds.point_cloud import PointCloud, Values, as_cloud
 from mcgicp_jax._clouds.preprocess import finite_rows, with_neighbors
 from mcgicp_jax._clouds.voxels import voxel_order
-from mcgicp_jax._compute.argument_checks import check_positive, errors_named
+from mcgicp_jax._compute.argument_checks import check_positive
 from mcgicp_jax._compute.concrete import outside_trace
+from mcgicp_jax._compute.messages import messages_named
 from mcgicp_jax._global_pose.feature_matching import matches_of_features, matches_of_rows
 from mcgicp_jax._global_pose.fpfh import NUM_NEIGHBORS
 from mcgicp_jax._global_pose.robust_pose_fit import (
@@ -188,7 +189,7 @@ def _checked(correspondences: RowMatches, source: PointCloud, target: PointCloud
 
 def _centred(name: str, cloud: PointCloud) -> tuple[PointCloud, Float[np.ndarray, "3"]]:
     """The finite points, in float32 about the middle of their extent, as a raw cloud; and that middle, metres."""
-    with errors_named(name):
+    with messages_named(name):
         cloud = finite_rows(cloud.replace_rows(covariances=None))
     points = cloud.coordinates
     # Working by columns takes a tenth of the time.

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Callable
 from functools import partial
 
@@ -12,6 +11,7 @@ from jaxtyping import Float
 from mcgicp_jax._clouds.point_cloud import PointCloud
 from mcgicp_jax._compute.cache import cached_with
 from mcgicp_jax._compute.concrete import AnyArray, constant, numpy_for
+from mcgicp_jax._compute.messages import warn
 from mcgicp_jax._local_geometry.spacing_and_noise import known_values
 from mcgicp_jax._math.statistics import of_known, sampled_rows
 from mcgicp_jax._search.base import Correspondences
@@ -32,11 +32,9 @@ def warn_of_units(source: PointCloud, target: PointCloud) -> None:
     for name, (low, high), (first, last) in zip(source.channel_names, *ranges, strict=False):
         narrow, wide = sorted([high - low, last - first])
         if high < first or last < low or wide > _OTHER_UNIT * narrow > 0:
-            warnings.warn(
+            warn(
                 f"channel {name}: most values lie between {low:.3g} and {high:.3g} in the source, but between "
-                f"{first:.3g} and {last:.3g} in the target; if their units differ, scale one, or use equalize_channels",
-                UserWarning,
-                stacklevel=4,
+                f"{first:.3g} and {last:.3g} in the target; if their units differ, scale one, or use equalize_channels"
             )
 
 
@@ -49,12 +47,10 @@ def warn_of_exposure(source: PointCloud, target: PointCloud, matches: Callable[[
     for name, gain in zip(source.channel_names, np.asarray(_gain(source, target, matches())[0]), strict=True):
         if not 1 / _OTHER_EXPOSURE < gain < _OTHER_EXPOSURE:
             # Without the number, so that Python shows it once.
-            warnings.warn(
+            warn(
                 f"channel {name}: the spreads of its values at matched points of source and target differ by a factor "
                 f"of more than {_OTHER_EXPOSURE}, which displaces the pose; if the exposure differs, use "
-                "equalize_channels=True",
-                UserWarning,
-                stacklevel=4,
+                "equalize_channels=True"
             )
 
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import collections
 import itertools
-import warnings
 from collections.abc import Generator, Iterator
 from concurrent.futures import (
     FIRST_COMPLETED,
@@ -23,6 +22,7 @@ import jax
 import numpy as np
 
 from mcgicp_jax._compute.concrete import is_concrete
+from mcgicp_jax._compute.messages import warn
 from mcgicp_jax._compute.threads import num_cores, with_settings
 from mcgicp_jax._pairs.batch_jobs import BatchJob, Pair, PairResult
 from mcgicp_jax._registration.options import Options
@@ -123,7 +123,7 @@ class ChunkedExecutor:
             except Exception as error:
                 numbers = ", ".join(str(pair.index) for pair in chunk)
                 message = f"the worker of the pairs {numbers} failed ({_words(error)}); they are submitted again"
-                warnings.warn(message, UserWarning, stacklevel=2)
+                warn(message)
                 self._suspects.extend(chunk)
             else:
                 yield from map(PairResult.with_warning, results)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import collections
-import warnings
+import functools
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Executor, Future, ThreadPoolExecutor
 from dataclasses import dataclass, replace
@@ -17,8 +17,8 @@ from jaxtyping import Bool
 
 from mcgicp_jax._clouds.point_cloud import PointCloud, Values
 from mcgicp_jax._clouds.preprocess import preprocess
-from mcgicp_jax._compute.argument_checks import errors_named
 from mcgicp_jax._compute.linear_maps import primal
+from mcgicp_jax._compute.messages import messages_named, warn, warnings_named
 from mcgicp_jax._compute.size_classes import size_class
 from mcgicp_jax._compute.threads import in_new_thread, num_cores, side_by_side, with_settings
 from mcgicp_jax._local_geometry.surface import Surface, searched
@@ -74,7 +74,7 @@ class PairResult:
         if self.reason is not None:
             warning = PairWarning(f"pair {self.index}: {self.reason}")
             warning.index, warning.reason = self.index, self.reason
-            warnings.warn(warning, stacklevel=2)
+            warn(warning)
         return self.index, self.registration
 
 
@@ -95,6 +95,20 @@ class _GivenPair:
     index: int
     given: Given
     init: Pose | None
+
+
+def _of_a_pair(work: Callable[..., Any]) -> Callable[..., Any]:
+    """Decorator of methods for one pair: warnings name the pair; a `ValueError` becomes the reason of its result."""
+
+    @functools.wraps(work)
+    def named(self: BatchJob, pair: Pair | _GivenPair, *arguments: Any) -> Any:
+        try:
+            with warnings_named(f"pair {pair.index}"):
+                return work(self, pair, *arguments)
+        except ValueError as error:
+            return PairResult(pair.index, RegistrationResult.without_pose(Status.INVALID_INPUT), str(error))
+
+    return named
 
 
 @dataclass(frozen=True)
@@ -119,7 +133,7 @@ class BatchJob:
 
     def ready(self, name: str, cloud: Cloud) -> PointCloud:
         """The cloud, read and preprocessed if necessary; errors become a `ValueError` that starts with `name`."""
-        with errors_named(name):
+        with messages_named(name):
             if not isinstance(cloud, PointCloud) and callable(cloud):
                 cloud = cloud()
             if not isinstance(cloud, PointCloud):
@@ -153,13 +167,11 @@ class BatchJob:
                 yield PairResult(pair.index, result)
             yield from rejected
 
+    @_of_a_pair
     def _register(self, pair: Pair) -> PairResult:
-        try:
-            source, target = self.ready("source", pair.source), self.ready("target", pair.target)
-            options = replace(self.options, search=self.search)
-            result = register_from(source, target, self.method, pair.init, options)
-        except ValueError as error:
-            return _invalid(pair.index, error)
+        source, target = self.ready("source", pair.source), self.ready("target", pair.target)
+        options = replace(self.options, search=self.search)
+        result = register_from(source, target, self.method, pair.init, options)
         return PairResult(pair.index, computed(result))
 
     def register_differentiated(self, pairs: Iterable[Pair]) -> list[RegistrationResult]:
@@ -178,21 +190,17 @@ class BatchJob:
         results = iter(results_of([run for run, _ in ended], [given for _, given in ended]))
         return [next(results) if isinstance(run, Run) else run.with_warning()[1] for run in runs]
 
+    @_of_a_pair
     def _given(self, pair: Pair) -> PairResult | _GivenPair:
-        try:
-            source, target = self.ready("source", pair.source), self.ready("target", pair.target)
-            init = self._start(pair, primal(source), primal(target))
-            if isinstance(init, PairResult):
-                return init
-            return _GivenPair(pair.index, prepared(source, target, self.method, self.options), primal(init))
-        except ValueError as error:
-            return _invalid(pair.index, error)
+        source, target = self.ready("source", pair.source), self.ready("target", pair.target)
+        init = self._start(pair, primal(source), primal(target))
+        if isinstance(init, PairResult):
+            return init
+        return _GivenPair(pair.index, prepared(source, target, self.method, self.options), primal(init))
 
+    @_of_a_pair
     def _run(self, pair: _GivenPair, values: Given) -> PairResult | Run:
-        try:
-            return run_pair(values, pair.init, replace(self.options, search=self.search))
-        except ValueError as error:
-            return _invalid(pair.index, error)
+        return run_pair(values, pair.init, replace(self.options, search=self.search))
 
     def _start(self, pair: Pair, source: PointCloud, target: PointCloud) -> PairResult | Pose | None:
         """The initial pose of a pair, or its result if none is found."""
@@ -203,27 +211,21 @@ class BatchJob:
             return start.matrix
         return PairResult(pair.index, RegistrationResult.without_pose(Status.TOO_FEW_CORRESPONDENCES))
 
+    @_of_a_pair
     def _problem(self, pair: Pair) -> PairResult | tuple[_LanePair, Problem]:
         """The pair as input of a lane, with both surfaces padded to one size class so that few programs are compiled.
 
         With `max_source_points`, the surface of the source is padded to the size class of this number at most.
         """
-        try:
-            source, target = self.ready("source", pair.source), self.ready("target", pair.target)
-            init = self._start(pair, source, target)
-            if isinstance(init, PairResult):
-                return init
-            problem, _ = pose_problem(source, target, self.method, init, self.options, num_threads=1)
-        except ValueError as error:
-            return _invalid(pair.index, error)
+        source, target = self.ready("source", pair.source), self.ready("target", pair.target)
+        init = self._start(pair, source, target)
+        if isinstance(init, PairResult):
+            return init
+        problem, _ = pose_problem(source, target, self.method, init, self.options, num_threads=1)
         used, size = searched(problem.source).valid, size_class(max(len(source.points), len(target.points)))
         few = self.options.max_source_points
         sizes = size if few is None else min(size, size_class(few)), size
         return _LanePair(pair.index, source, target, used), _padded(problem.completed(), sizes)
-
-
-def _invalid(index: int, error: ValueError) -> PairResult:
-    return PairResult(index, RegistrationResult.without_pose(Status.INVALID_INPUT), str(error))
 
 
 def _padded(problem: Problem, sizes: tuple[int, int]) -> Problem:

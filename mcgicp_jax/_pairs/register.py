@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Sequence
 from typing import Any, Literal
 
@@ -12,6 +11,7 @@ from jax.typing import ArrayLike
 from mcgicp_jax._clouds.point_cloud import PointCloud, Values
 from mcgicp_jax._compute.concrete import is_concrete
 from mcgicp_jax._compute.linear_maps import primal
+from mcgicp_jax._compute.messages import warn
 from mcgicp_jax._global_pose.global_pose import GlobalPoseResult, global_pose
 from mcgicp_jax._math.poses import Pose
 from mcgicp_jax._math.robust_kernels import AbstractKernel
@@ -173,7 +173,7 @@ def register_from(
         overlap = float(np.asarray(result.overlap))
         if overlap < _LEAST_OVERLAP:
             message = f"only {100 * overlap:.2g} % of the source points have a match, so the pose is probably wrong"
-            warnings.warn(f'{message}; pass a better init, or init="global"', UserWarning, stacklevel=3)
+            warn(f'{message}; pass a better init, or init="global"')
     return result
 
 

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import warnings
-
 import numpy as np
 from jax.typing import ArrayLike
 
 from mcgicp_jax._clouds.point_cloud import PointCloud
 from mcgicp_jax._compute.concrete import is_concrete
 from mcgicp_jax._compute.linear_maps import primal
+from mcgicp_jax._compute.messages import warn
 from mcgicp_jax._math.statistics import median, sampled_rows
 from mcgicp_jax._methods.base import AbstractMethod
 from mcgicp_jax._methods.multichannel_gicp import MultiChannelGICP
@@ -38,7 +37,7 @@ def check_clouds(source: PointCloud, target: PointCloud, method: AbstractMethod)
     if method.uses_channels:
         check_channels(source, target, method)
         if isinstance(method, MultiChannelGICP) and source.channels.shape[-1] == 0:
-            warnings.warn("the clouds have no channels: MultiChannelGICP equals GICP", UserWarning, stacklevel=5)
+            warn("the clouds have no channels: MultiChannelGICP equals GICP")
     if source.points.dtype != target.points.dtype:
         raise ValueError(
             f"points: expected one precision in both clouds, got {source.points.dtype} in the source and "
@@ -72,11 +71,7 @@ def warn_of_constant_weights(method: AbstractMethod) -> None:
     """Warn if α is differentiated outside of `jit`: it decides matches alone, which are constant to autodiff."""
     weights = getattr(method, "channel_weights", None)
     if not is_concrete(weights) and is_concrete(primal(weights)):
-        warnings.warn(
-            "channel_weights: the derivative is 0, since they decide matches alone, which are constant in derivatives",
-            UserWarning,
-            stacklevel=6,
-        )
+        warn("channel_weights: the derivative is 0, since they decide matches alone, which are constant in derivatives")
 
 
 def warn_of_covariances(source: PointCloud, target: PointCloud) -> None:
@@ -86,9 +81,7 @@ def warn_of_covariances(source: PointCloud, target: PointCloud) -> None:
             rows, _ = sampled_rows(cloud.valid)
             trace = float(median(np.trace(np.asarray(cloud.covariances)[rows], axis1=1, axis2=2)))
             if not _LEAST_TRACE <= trace / 2 <= _LARGEST_TRACE:
-                warnings.warn(
+                warn(
                     f"{name}: covariances look like m² (median trace {trace:.2g}; GICP's are dimensionless with trace "
-                    '2). For voxel cells use NDT or D2DNDT, or voxel_gaussians(..., of="covariances")',
-                    UserWarning,
-                    stacklevel=4,
+                    '2). For voxel cells use NDT or D2DNDT, or voxel_gaussians(..., of="covariances")'
                 )

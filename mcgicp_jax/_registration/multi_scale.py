@@ -9,8 +9,8 @@ import numpy as np
 
 from mcgicp_jax._clouds.point_cloud import PointCloud
 from mcgicp_jax._clouds.preprocess import finite_rows, preprocess, with_neighbors
-from mcgicp_jax._compute.argument_checks import errors_named
 from mcgicp_jax._compute.concrete import numpy_for
+from mcgicp_jax._compute.messages import messages_named
 from mcgicp_jax._local_geometry.neighborhoods import check_neighbors
 from mcgicp_jax._methods.base import AbstractMethod
 from mcgicp_jax._methods.gicp import GICP
@@ -71,10 +71,10 @@ def _in_cells(method: AbstractMethod, name: str, cloud: PointCloud, size: float)
         # A cell extends as far in α · channel as in position.
         with np.errstate(divide="ignore"):
             channel_size = size / np.asarray(method.weights(cloud.channels.shape[1]), np.float64)
-    with errors_named(name):
+    with messages_named(name):
         return voxel_gaussians(cloud, size, channel_size=channel_size)
 
 
 def _in_voxels(name: str, cloud: PointCloud, size: float) -> PointCloud:
-    with errors_named(name):
+    with messages_named(name):
         return with_neighbors(finite_rows(cloud), size, _NUM_NEIGHBORS)

@@ -13,10 +13,10 @@ from jaxtyping import Float, Int
 from mcgicp_jax._clouds.origins import centred_pose, pose_in_user_frame
 from mcgicp_jax._clouds.point_cloud import PointCloud, Values, as_cloud
 from mcgicp_jax._clouds.preprocess import preprocess
-from mcgicp_jax._compute.argument_checks import errors_named
 from mcgicp_jax._compute.concrete import AnyArray, constant, is_concrete, numpy_for, outside_trace
 from mcgicp_jax._compute.lazy import Lazy
 from mcgicp_jax._compute.linear_maps import primal
+from mcgicp_jax._compute.messages import messages_named
 from mcgicp_jax._compute.threads import in_new_thread
 from mcgicp_jax._local_geometry.channel_equalization import (
     warn_of_exposure,
@@ -294,5 +294,5 @@ def _ready(name: str, cloud: PointCloud | Values, raw: bool = False) -> PointClo
     cloud = as_cloud(name, cloud)
     if cloud.neighbors is not None or raw:
         return cloud
-    with errors_named(name):
+    with messages_named(name):
         return preprocess(cloud)

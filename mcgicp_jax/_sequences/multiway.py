@@ -15,7 +15,7 @@ from mcgicp_jax._clouds.point_cloud import PointCloud, Values, as_cloud
 from mcgicp_jax._clouds.preprocess import check_preprocessing, preprocess
 from mcgicp_jax._clouds.voxel_map import merge_clouds
 from mcgicp_jax._clouds.voxels import wrapped_keys
-from mcgicp_jax._compute.argument_checks import errors_named
+from mcgicp_jax._compute.messages import messages_named
 from mcgicp_jax._local_geometry.spacing_and_noise import point_spacing
 from mcgicp_jax._math.poses import Pose, pose_matrices
 from mcgicp_jax._math.twists import exponential, logarithm
@@ -118,7 +118,7 @@ def multiway(
     for k, cloud in enumerate(clouds):
         ready.append(as_cloud(f"clouds[{k}]", cloud))
         if ready[k].neighbors is None:
-            with errors_named(f"clouds[{k}]"):
+            with messages_named(f"clouds[{k}]"):
                 ready[k] = preprocess(ready[k], voxel_size, num_neighbors)
     if not ready:
         raise ValueError("clouds: expected at least one, got none")

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import collections
-import warnings
 import weakref
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
@@ -17,8 +16,9 @@ from mcgicp_jax._clouds.frame import Frame
 from mcgicp_jax._clouds.point_cloud import PointCloud, Values, as_cloud
 from mcgicp_jax._clouds.preprocess import check_preprocessing, completed, preprocess_on_demand
 from mcgicp_jax._clouds.voxel_map import VoxelMap
-from mcgicp_jax._compute.argument_checks import check_positive, errors_named
+from mcgicp_jax._compute.argument_checks import check_positive
 from mcgicp_jax._compute.lazy import Lazy
+from mcgicp_jax._compute.messages import messages_named, warn
 from mcgicp_jax._compute.threads import ReadAhead
 from mcgicp_jax._local_geometry.local_statistics import geometry_table
 from mcgicp_jax._local_geometry.spacing_and_noise import point_spacing
@@ -165,7 +165,7 @@ def _read(
     name = f"frames[{number}]"
     cloud = as_cloud(name, frame.cloud if isinstance(frame, Frame) else frame)
     if cloud.neighbors is None:
-        with errors_named(name):
+        with messages_named(name):
             cloud = preprocess_on_demand(cloud, voxel_size, num_neighbors)
     if not (options.equalize_channels or options.takes_raw(method, "source")):
         geometry_table(cloud, method.uses_channels).known(rows_to_match(cloud, options))
@@ -219,11 +219,9 @@ class _Sensor(Iterator[OdometryStep]):
                 self.radius = float(np.linalg.norm(cloud.coordinates, axis=1).max())
         result = None if self.cloud is None else self._located(cloud, self.cloud)
         if result is not None and not is_usable(result) and self.places is None:
-            warnings.warn(
+            warn(
                 f"{name}: {result.status.name}; the motion of the previous frame is used instead. "
-                "mcgicp_jax.odometry(..., recover=True) finds lost frames again",
-                UserWarning,
-                stacklevel=2,
+                "mcgicp_jax.odometry(..., recover=True) finds lost frames again"
             )
         for known in (self.places, self.world):
             if known is not None and not self.is_lost:
