@@ -2,6 +2,7 @@
 
 import ast
 import graphlib
+import importlib
 import pathlib
 
 import mcgicp_jax
@@ -124,3 +125,13 @@ def test_nothing_is_printed_or_asserted():
             if (printed and parts[0] not in ("__main__", "_cli")) or isinstance(node, ast.Assert):
                 found.append(f"{path.name}:{node.lineno}")
     assert not found
+
+
+def test_benchmarks_can_be_imported():
+    """Without the packages that some of them compare with."""
+    for path in (pathlib.Path(__file__).parent / "benchmarks").glob("*.py"):
+        try:
+            importlib.import_module(f"tests.benchmarks.{path.stem}")
+        except ModuleNotFoundError as error:
+            if error.name is None or error.name.startswith(("tests", "mcgicp_jax")):
+                raise

@@ -36,7 +36,7 @@ import numpy as np
 import pypcd4
 
 from mcgicp_jax import io
-from tests import test_io as cases
+from tests import test_file_formats as cases
 from tests.conftest import DATA
 
 _SECONDS = 20
