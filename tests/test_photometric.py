@@ -135,6 +135,13 @@ def test_transformations_find_the_same_pose():
     np.testing.assert_allclose(inside.covariance, outside.covariance, rtol=0.05, atol=0.02 * outside.covariance.max())
 
 
+def test_the_cost_of_matches_is_that_of_estimate_pose():
+    source, target, truth, matches = at_truth()
+    found = mcg.estimate_pose(source, target, matches, PHOTOMETRIC, init=truth)
+    cost = mcg.mahalanobis_cost(found.matrix, source, target, matches, PHOTOMETRIC)
+    assert found.converged and float(cost) == pytest.approx(float(found.cost), rel=1e-3)
+
+
 def test_forces_are_the_gradient_of_the_cost():
     source, target, truth, matches = at_truth()
     _, term = held(source, target, PHOTOMETRIC, truth, matches)

@@ -10,6 +10,7 @@ import weakref
 
 import jax
 import jaxlie
+import jaxtyping
 import numpy as np
 import pytest
 
@@ -247,13 +248,19 @@ BAD_ARGUMENTS = {
         {"init": np.full((4, 4), np.nan)},
         {"init": 2 * np.eye(4)},
     ],
+    "voxel_sizes": [{"voxel_sizes": (0.5, -1.0)}],
+    "robust": [{"robust": 1.0}],
+    "search": [{"search": "tree"}],
+    "hold_unconstrained": [{"hold_unconstrained": 2}],
+    "equalize_channels": [{"equalize_channels": "yes"}],
 }
 
 
 @pytest.mark.parametrize("name, arguments", [(name, bad) for name, cases in BAD_ARGUMENTS.items() for bad in cases])
 def test_a_bad_argument_is_named(name, arguments, room):
     source, target, _ = room
-    with pytest.raises(ValueError, match=name):
+    # Run-time checks of annotations refuse the last ones first.
+    with pytest.raises((ValueError, jaxtyping.TypeCheckError), match=name):
         mcg.register(source, target, mcg.GICP(), **{"max_distance": 0.5} | arguments)
 
 

@@ -42,7 +42,9 @@ def mahalanobis_cost(
 
     Pure JAX, differentiable with respect to all inputs but the matches. Unlike `register`, it and its gradient compile
     for every size of clouds, also outside `jit`. Here M is a function of the rotation R, whereas `estimate_pose`, like
-    every GICP, holds M fixed during each update: its pose is not exactly the minimum of F.
+    every GICP, holds M fixed during each update: its pose is not exactly the minimum of F. With `photometric=True`, the
+    standard deviations of the residuals are estimated at the given pose, as constants to autodiff, so that values at
+    different poses do not compare.
 
     Args:
         pose: T_target_source, `jaxlie.SE3` or (4, 4).
