@@ -10,7 +10,7 @@ os.environ.setdefault("XLA_FLAGS", "--xla_backend_optimization_level=0 --xla_cpu
 # Keep all compiled programs between runs.
 os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(pathlib.Path(__file__).parent.parent / ".jax_cache"))
 os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0")
-# There is a worker for each core: threads of BLAS would wait for each other, 3 % of the time of the tests.
+# There is a worker for each core. Where each has further threads for BLAS, these wait for each other: 3 % of the time.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import jax
@@ -42,8 +42,8 @@ def precision(request):
     jax.config.update("jax_enable_x64", False)
 
 
-# Each compiled program takes dozens of memory maps. Linux allows a process 65,530, and beyond that the compiler aborts;
-# tests of transformations compile for many shapes.
+# Each compiled program takes some twenty memory maps. Linux allows a process 65,530, and beyond that the compiler aborts.
+# Modules of quick tests take up to 7,500.
 _MAPS = pathlib.Path("/proc/self/maps")
 _MANY_MAPS = 40_000
 

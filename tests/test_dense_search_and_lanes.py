@@ -160,8 +160,8 @@ def test_a_batch_in_lanes_is_its_pairs(raw, clouds):
             assert result.num_iterations == alone.num_iterations
             np.testing.assert_allclose(result.history["cost"], alone.history["cost"], rtol=1e-3)
             np.testing.assert_allclose(result.information, alone.information, rtol=1e-2, atol=1)
-    # In another order, and without some of the others.
-    order = np.random.default_rng(0).permutation(len(raw))[:3]
+    # In another order, and without one of the others.
+    order = np.random.default_rng(0).permutation(len(raw))[1:]
     assert_same(lanes(*([side[i] for i in order] for side in clouds)), [results[i] for i in order])
 
 

@@ -235,8 +235,7 @@ def finite_rows(cloud: PointCloud | Values) -> PointCloud:
     if keep.sum() < MIN_POINTS:
         left = f", left out {np.sum(~keep)}{advice}" if others else ""
         raise ValueError(f"cloud: expected at least {MIN_POINTS} finite points, got {keep.sum()} of {keep.size}{left}")
-    text = f"left out {np.sum(~keep)} of {keep.size} points with a NaN or infinity{advice}"
-    warn(text)
+    warn(f"left out {np.sum(~keep)} of {keep.size} points with a NaN or infinity{advice}")
     return PointCloud(
         cloud.points[keep],
         cloud.channels[keep],

@@ -98,17 +98,16 @@ class _GivenPair:
 
 
 def _of_a_pair(work: Callable[..., Any]) -> Callable[..., Any]:
-    """Decorator of methods for one pair: warnings name the pair; a `ValueError` becomes the reason of its result."""
+    """Decorator of methods for one pair: a `ValueError` becomes the reason of its result."""
 
     @functools.wraps(work)
-    def named(self: BatchJob, pair: Pair | _GivenPair, *arguments: Any) -> Any:
+    def caught(self: BatchJob, pair: Pair | _GivenPair, *arguments: Any) -> Any:
         try:
-            with warnings_named(f"pair {pair.index}"):
-                return work(self, pair, *arguments)
+            return work(self, pair, *arguments)
         except ValueError as error:
             return PairResult(pair.index, RegistrationResult.without_pose(Status.INVALID_INPUT), str(error))
 
-    return named
+    return caught
 
 
 @dataclass(frozen=True)
@@ -142,6 +141,11 @@ class BatchJob:
                 cloud = preprocess(cloud, self.voxel_size, self.num_neighbors, search=self.search)
             return cloud
 
+    def _clouds(self, pair: Pair) -> tuple[PointCloud, PointCloud]:
+        """Both clouds by `ready`. Warnings of the pair as a whole do not name it, so that Python shows each once."""
+        with warnings_named(f"pair {pair.index}"):
+            return self.ready("source", pair.source), self.ready("target", pair.target)
+
     def register_chunk(self, chunk: list[Pair]) -> list[PairResult]:
         """Register the pairs one after the other, or in lanes."""
         return list(self.register_in_lanes(chunk, 1)) if self.uses_lanes else [self._register(pair) for pair in chunk]
@@ -169,7 +173,7 @@ class BatchJob:
 
     @_of_a_pair
     def _register(self, pair: Pair) -> PairResult:
-        source, target = self.ready("source", pair.source), self.ready("target", pair.target)
+        source, target = self._clouds(pair)
         options = replace(self.options, search=self.search)
         result = register_from(source, target, self.method, pair.init, options)
         return PairResult(pair.index, computed(result))
@@ -192,7 +196,7 @@ class BatchJob:
 
     @_of_a_pair
     def _given(self, pair: Pair) -> PairResult | _GivenPair:
-        source, target = self.ready("source", pair.source), self.ready("target", pair.target)
+        source, target = self._clouds(pair)
         init = self._start(pair, primal(source), primal(target))
         if isinstance(init, PairResult):
             return init
@@ -217,7 +221,7 @@ class BatchJob:
 
         With `max_source_points`, the surface of the source is padded to the size class of this number at most.
         """
-        source, target = self.ready("source", pair.source), self.ready("target", pair.target)
+        source, target = self._clouds(pair)
         init = self._start(pair, source, target)
         if isinstance(init, PairResult):
             return init

@@ -50,7 +50,7 @@ def mahalanobis_cost(
         pose: T_target_source, `jaxlie.SE3` or (4, 4).
         source, target: preprocessed clouds.
         matches: from `find_correspondences`.
-        method: defines M; parameters left None are estimated from the clouds.
+        method: defines M; parameters left None are estimated from the clouds, as constants to autodiff.
         robust: kernel ρ applied to the Mahalanobis distance of each match, as in `register`; without any, ρ(s²) = s².
         temperature: metres. Weighs the candidates of each source point (`num_candidates`) by a softmax of
             −½ (distance / temperature)², with distances in position and α · channel; this gives α a gradient. As it
@@ -80,7 +80,7 @@ def mahalanobis_cost(
     return _total_cost(Motion(rotation, translation), pair, matches, temperature, log_determinant)
 
 
-# Otherwise a gradient outside `jit` would compile each of some hundred operations alone.
+# Without it, a gradient outside `jit` would compile each of some hundred operations alone.
 _surface_pair_in_jit = jax.jit(surface_pair, static_argnames="observed")
 
 
