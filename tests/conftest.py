@@ -42,8 +42,8 @@ def precision(request):
     jax.config.update("jax_enable_x64", False)
 
 
-# Each compiled program takes some twenty memory maps. Linux allows a process 65,530, and beyond that the compiler aborts.
-# Modules of quick tests take up to 7,500.
+# Each compiled program takes some twenty memory maps, the quick tests of a module up to 7,500. Linux allows a process
+# 65,530, and beyond that the compiler aborts.
 _MAPS = pathlib.Path("/proc/self/maps")
 _MANY_MAPS = 40_000
 

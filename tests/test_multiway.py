@@ -313,6 +313,17 @@ def test_equal_clouds_are_registered():
     np.testing.assert_allclose(found.poses, np.tile(np.eye(4), (2, 1, 1)), atol=1e-6)
 
 
+@pytest.mark.parametrize("seed", [0, 2, 3])
+def test_an_edge_of_equal_clouds_is_as_precise_as_their_rounding(seed):
+    """On a plane, rounding makes small variances negative."""
+    cloud = mcg.preprocess(datasets.poster_wall(1, points_per_frame=1000, seed=seed)[0].cloud)
+    result = mcg.register(cloud, cloud, mcg.GICP(), max_distance=0.1)
+    information = edge_from(0, 1, result).information
+    assert np.linalg.eigvalsh(information).min() > 0
+    deviation = 1 / np.sqrt(np.linalg.eigvalsh(information[:3, :3]).max())
+    assert deviation > 0.1 * np.finfo(np.float32).eps * np.abs(cloud.points).max()
+
+
 def test_a_far_point_costs_no_registrations():
     clouds = [frame.cloud for frame in datasets.box_room(3, points_per_frame=800)]
     points = np.array(clouds[1].points)

@@ -8,9 +8,11 @@ import traceback
 import warnings
 from collections.abc import Iterator
 from contextvars import ContextVar
+from typing import Any, NamedTuple
 
 _PACKAGE = __name__.split(".", maxsplit=1)[0]
 _prefix: ContextVar[str] = ContextVar("prefix", default="")
+_line: ContextVar[Line | None] = ContextVar("line", default=None)
 
 
 @contextlib.contextmanager
@@ -33,9 +35,38 @@ def messages_named(name: str) -> Iterator[None]:
         raise ValueError(f"{name}: {error}") from error
 
 
+class Line(NamedTuple):
+    """A line of code at which a warning is shown: arguments of `warnings.warn_explicit`."""
+
+    filename: str
+    lineno: int
+    module: str
+    registry: dict[Any, Any]
+
+
+def calling_line() -> Line:
+    """The line that called the package; in a thread of the package, the one that caused its work."""
+    if (known := _line.get()) is not None:
+        return known
+    frames = [frame for frame, _ in traceback.walk_stack(sys._getframe())]
+    names = [frame.f_globals.get("__name__", "") for frame in frames]
+    inside = [i for i, name in enumerate(names) if name.split(".", maxsplit=1)[0] == _PACKAGE]
+    frame = frames[min(inside[-1] + 1, len(frames) - 1)]
+    registry = frame.f_globals.setdefault("__warningregistry__", {})
+    return Line(frame.f_code.co_filename, frame.f_lineno, frame.f_globals.get("__name__", ""), registry)
+
+
+@contextlib.contextmanager
+def shown_at(line: Line) -> Iterator[None]:
+    """Context in which warnings by `warn` are shown at a line."""
+    before = _line.set(line)
+    try:
+        yield
+    finally:
+        _line.reset(before)
+
+
 def warn(message: str | Warning) -> None:
     """Issue a warning, of `UserWarning` if it is a text, at the line that called the package."""
-    frames = (frame for frame, _ in traceback.walk_stack(sys._getframe()))
-    names = [frame.f_globals.get("__name__", "") for frame in frames]
-    inside = [level for level, name in enumerate(names, 1) if name.split(".", maxsplit=1)[0] == _PACKAGE]
-    warnings.warn(f"{_prefix.get()}{message}" if isinstance(message, str) else message, stacklevel=max(inside) + 1)
+    text = f"{_prefix.get()}{message}" if isinstance(message, str) else message
+    warnings.warn_explicit(text, UserWarning, **calling_line()._asdict())

@@ -12,6 +12,8 @@ from typing import Any, TypeVar
 
 import jax
 
+from mcgicp_jax._compute.messages import Line, calling_line, shown_at
+
 Answer = TypeVar("Answer")
 
 # JAX settings that are local to a thread and change what a program computes.
@@ -50,7 +52,7 @@ def side_by_side(calls: Sequence[Callable[[], Answer]], max_threads: int | None 
     # On a single core, other threads would only take turns with this one.
     count = min(len(calls), max_threads or len(calls)) - 1
     count = count if count and num_cores() > 1 else 0
-    elsewhere = with_settings(work) if count else work
+    elsewhere = functools.partial(_run_with, _settings(), work) if count else work
     helpers = [_submit(elsewhere) for _ in range(count)]
     try:
         answers[first] = call()
@@ -106,16 +108,26 @@ class ReadAhead(Iterator[Answer]):
 
 
 def with_settings(work: Callable[..., Answer], *, pickled: bool = False) -> Callable[..., Answer]:
-    """The function bound to the JAX settings of this thread, for calls in another one: settings are thread-local.
+    """The function bound to the JAX settings of this thread, which are thread-local, for calls in another one. Warnings
+    are shown at the line that called the package here.
 
     Args:
         pickled: whether the function goes to another process. Devices cannot be sent there, so that process uses the
-            first device of the same platform.
+            first device of the same platform; nor can the line.
     """
-    values: list[Any] = [setting.value for setting in _SETTINGS]
-    if pickled:
-        values = [value.platform if isinstance(value, jax.Device) else value for value in values]
+    if not pickled:
+        return functools.partial(_run_with, _settings(), functools.partial(_shown_at, calling_line(), work))
+    values = [value.platform if isinstance(value, jax.Device) else value for value in _settings()]
     return functools.partial(_run_with, values, work)
+
+
+def _shown_at(line: Line, work: Callable[..., Answer], *arguments: Any) -> Answer:
+    with shown_at(line):
+        return work(*arguments)
+
+
+def _settings() -> list[Any]:
+    return [setting.value for setting in _SETTINGS]
 
 
 def _run_with(values: list[Any], work: Callable[..., Answer], *arguments: Any) -> Answer:

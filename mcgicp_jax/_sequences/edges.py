@@ -37,10 +37,15 @@ def edge_from(i: int, j: int, result: RegistrationResult, *, uncertain: bool = F
     # Coordinates along the six directions: the constrained ones do not depend on the others.
     coordinates = np.linalg.inv(np.asarray(directions.twists, np.float64).T)
     inner = (coordinates @ covariance @ coordinates.T)[np.ix_(held, held)]
-    if not held.any() or np.linalg.cond(inner) > 1 / np.finfo(float).eps:
+    if not held.any():
         return None
+    # The coordinates are lengths. No registration is more precise than the rounding of the points. The covariance of
+    # equal clouds is smaller, or even negative by rounding of its own.
+    radius = np.asarray(directions.radius)
+    rounding = np.finfo(radius.dtype).eps * float(radius)
+    values, vectors = np.linalg.eigh(inner)
     known = np.zeros((6, 6))
-    known[np.ix_(held, held)] = np.linalg.inv(inner)
+    known[np.ix_(held, held)] = (vectors / np.maximum(values, rounding**2)) @ vectors.T
     known[~held, ~held] = _UNCONSTRAINED_RATIO * np.median(np.linalg.eigvalsh(known[np.ix_(held, held)]))
     information = coordinates.T @ known @ coordinates
     return Edge(i, j, result.matrix, 0.5 * (information + information.T), uncertain=uncertain)
