@@ -40,7 +40,12 @@ class _Rows(NamedTuple):
 
     @staticmethod
     def of(surface: Surface, describe: Callable[[Int[np.ndarray, "*n"]], Any] | None = None) -> _Rows:
-        return _Rows(surface, Packed.of(surface._replace(noise=None, search=None)), describe)
+        columns = Packed.of(surface._replace(noise=None, search=None))
+        if describe is not None and not np.shares_memory(columns.table, surface.covariance):
+            # Of a copy, rows that are computed later would not be seen.
+            describe(None)
+            return _Rows.of(surface)
+        return _Rows(surface, columns, describe)
 
     def every(self, stride: int) -> _Rows:
         """Every `stride`-th row."""
