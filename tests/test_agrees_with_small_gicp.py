@@ -42,6 +42,7 @@ def check_against_small_gicp(source, target):
         mcg.GICP(1e-3),
         max_distance=1.0,
         max_iterations=100,
+        max_source_points=None,
         translation_tolerance=rest,
         rotation_tolerance=rest,
     )

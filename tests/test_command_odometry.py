@@ -70,7 +70,7 @@ def test_help_says_what_there_is(capsys):
     with pytest.raises(SystemExit):
         main(["odometry", "--help"])
     text = " ".join(capsys.readouterr().out.replace("│", " ").split())
-    assert all(word in text for word in ("DATASET PATH", "7-scenes", "--map", "--channels", "0.25 for kitti"))
+    assert all(word in text for word in ("DATASET PATH", "7-scenes", "--map", "--channels", "2.5 and 0.6 for kitti"))
     assert "None" not in text
 
 
@@ -90,9 +90,9 @@ def test_frames_before_an_invalid_one_are_written(tmp_path, capsys, monkeypatch,
             raise error
         return before(cloud, *options)
 
-    calls, before = [], odometry.preprocess_on_demand
+    calls, before = [], odometry.preprocess
     poses, map = tmp_path / "poses.txt", tmp_path / "map.ply"
-    monkeypatch.setattr(odometry, "preprocess_on_demand", preprocess)
+    monkeypatch.setattr(odometry, "preprocess", preprocess)
     files = ["--output", str(poses), "--map", str(map)]
     assert main(["odometry", "box-room", "--num-frames", "4", "--method", "gicp", *files]) == 1
     text, errors = capsys.readouterr()

@@ -197,7 +197,7 @@ def test_no_common_channels_is_said(files, capsys):
 
 @pytest.mark.slow
 def test_voxels_are_chosen_from_the_data(tmp_path, capsys):
-    for size, rows, voxels in ((1.0, 30_000, "voxels of "), (1000.0, 30_000, "voxels of "), (1.0, 5000, "all kept")):
+    for size, rows, voxels in ((1.0, 60_000, "voxels of "), (1000.0, 60_000, "voxels of "), (1.0, 5000, "all points")):
         points = size * room_corner(rows, noise=0.002)[0]
         half = save(tmp_path / "half.npz", points[::2])
         whole = save(tmp_path / "whole.npz", points)
@@ -206,8 +206,9 @@ def test_voxels_are_chosen_from_the_data(tmp_path, capsys):
         used = int(first.split("target ")[1].split()[0].replace(",", ""))
         assert voxels in first
         distances = [float(part.split()[0]) for part in second.split("up to ")[1].split("then")]
-        assert used == rows if voxels == "all kept" else 8000 < used <= 20_000
-        chosen = None if voxels == "all kept" else float(first.split(voxels)[1].split()[0])
+        assert used == rows if voxels == "all points" else 16_000 < used <= 40_000
+        chosen = None if voxels == "all points" else float(first.split(voxels)[1].split()[0])
+        assert chosen is None or "at most 40,000 of 60,000 points" in first
         kept = mcg.preprocess(io.read(whole), chosen).points
         assert len(kept) == used
         near, far = np.median(scipy.spatial.cKDTree(kept).query(kept, k=(2, 20))[0], axis=0)
@@ -220,7 +221,7 @@ def test_clouds_with_covariances_keep_their_points(tmp_path, capsys):
     cloud = mcg.PointCloud(points, covariances=np.tile(np.eye(3), (len(points), 1, 1)))
     io.write(tmp_path / "cloud.npz", cloud)
     assert main(["register", str(tmp_path / "cloud.npz"), str(tmp_path / "cloud.npz"), "--method", "gicp"]) == 0
-    assert "(all kept)" in capsys.readouterr().out
+    assert "(all points)" in capsys.readouterr().out
 
 
 def broken(folder):
@@ -293,7 +294,7 @@ def test_points_left_out_are_reported_in_one_line(files, tmp_path, capsys):
         (["demo"], ["--output"]),
         (
             ["register"],
-            ["SOURCE TARGET", "--method {mc-gicp,", "--voxel-size", "20,000", "10 and 2.5 spacings", "--aligned"],
+            ["SOURCE TARGET", "--method {mc-gicp,", "--voxel-size", "40,000", "10 and 2.5 spacings", "--aligned"],
         ),
         (["compare"], ["SOURCE TARGET", "--truth", "--channel-weights", "metres per channel"]),
     ],

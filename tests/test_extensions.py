@@ -218,7 +218,7 @@ from tests.test_extensions import TOY, Folder, PseudoHuber, Ridge
 extend.METHODS["ridge"] = extend.RegisteredMethod(Ridge)
 extend.KERNELS["pseudo-huber"] = PseudoHuber
 extend.FORMATS[".toy"] = TOY
-extend.DATASETS["folder"] = mcg.datasets.Dataset(Folder, None, (0.3, 0.3))
+extend.DATASETS["folder"] = mcg.datasets.Dataset(Folder, (0.3, 0.3))
 from mcgicp_jax.__main__ import main
 
 options = ["--method", "ridge", "--robust", "pseudo-huber", "1.0", "--output", {str(tmp_path / "poses.txt")!r}]

@@ -135,7 +135,7 @@ def test_statistics_are_those_of_the_neighbours_that_have_the_channel(small):
 def test_a_motion_does_not_change_features(small):
     cloud, normals = small
     pose = anywhere(1, 0.3)
-    moved = cloud.transform(pose).replace_rows(neighbors=cloud.neighbors)
+    moved = cloud.transform(pose).replace_rows(deferred_neighbors=cloud.neighbors)
     again = features.normals_of(moved, VOXEL)
     flips = np.where(np.arange(len(normals)) % 2, -1, 1)[:, None]
     first = features.histograms_of(cloud, normals, VOXEL)

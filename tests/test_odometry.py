@@ -97,8 +97,8 @@ def test_a_row_is_described_once_and_only_if_it_is_used(room, monkeypatch, again
     before = RowsOnDemand.__init__
     monkeypatch.setattr(RowsOnDemand, "__init__", table)
     monkeypatch.setattr(TreeIndex, "__init__", counting(TreeIndex.__init__, indices))
-    monkeypatch.setattr(_odometry, "preprocess_on_demand", counting(_odometry.preprocess_on_demand, preprocessed))
-    given = {"max_distance": 0.5, "max_source_points": 300, "against": against}
+    monkeypatch.setattr(_odometry, "preprocess", counting(_odometry.preprocess, preprocessed))
+    given = {"max_distance": 0.5, "max_source_points": 300, "against": against, "voxel_size": None}
     poses = [step.pose for step in mcg.odometry(frames, mcg.GICP(), **given)]
     assert len(poses) == len(preprocessed) == 5 and len(indices) == 4
     # Neighbours, local geometry and surface of each frame, and of each map; the first frame in a map has no surface.
@@ -300,14 +300,14 @@ def test_a_map_drifts_less():
 def test_the_map_slides(room):
     frames, _ = room
     sizes = []
-    preprocess = _relocalization.preprocess_on_demand
+    preprocess = _relocalization.with_neighbors
 
     def counted(cloud, *arguments):
         sizes.append(len(cloud))
         return preprocess(cloud, *arguments)
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(_relocalization, "preprocess_on_demand", counted)
+        patch.setattr(_relocalization, "with_neighbors", counted)
         for radius in (None, 1.0):
             list(mcg.odometry(frames[:3], mcg.GICP(), max_distance=0.5, against="map", map_radius=radius))
     # Two maps each.

@@ -32,12 +32,11 @@ from mcgicp_jax._cli.options import (
     Options,
     check_outputs,
     common_channels,
-    described_voxels,
     files_of,
     listed,
     method_for,
     registration_for,
-    voxel_size_for,
+    voxels_of,
     with_channels,
     with_names,
 )
@@ -211,17 +210,17 @@ def _settings(pairs: Sequence[FilePair], method: MethodName, options: Options) -
     names = common_channels(options, *clouds)
     if METHODS[method].kind.uses_channels and not names:
         raise ValueError("expected clouds with channels in common, got none; use gicp instead (--method gicp)")
-    voxel_size = voxel_size_for(clouds, options)
-    print(f"points:    {described_voxels(voxel_size)}")
+    voxels = voxels_of(clouds, options)
+    print(f"points:    {voxels}")
     print(f"channels:  {listed(names)}")
 
     def preprocessed() -> list[mcg.PointCloud]:
-        return [mcg.preprocess(with_channels(cloud, names), voxel_size, options.num_neighbors) for cloud in clouds]
+        return [mcg.preprocess(with_channels(cloud, names), voxels, options.num_neighbors) for cloud in clouds]
 
     return registration_for(method, options, lambda: preprocessed()[1]) | {
         "method": method_for(method, options, preprocessed),
         "channels": names,
-        "voxel_size": voxel_size,
+        "voxel_size": voxels.size,
         "num_neighbors": options.num_neighbors,
     }
 

@@ -25,8 +25,8 @@ from mcgicp_jax._cli.options import (
     listed,
     method_for,
     registration_for,
-    round_voxel_size,
     shown,
+    voxels_of,
     with_channels,
     with_names,
 )
@@ -56,7 +56,6 @@ def _with_datasets(command: Callable[..., int]) -> Callable[..., int]:
     texts = {
         "datasets": enumerated([name for name in DATASETS if not DATASETS[name].simulated], "or"),
         "scenes": enumerated([name for name in DATASETS if DATASETS[name].simulated], "or"),
-        "voxel_sizes": defaults(lambda each: "off" if each.voxel_size is None else f"{each.voxel_size:g}"),
         "max_distances": defaults(lambda each: "{:g} and {:g}".format(*each.max_distance)),
     }
     for name, text in texts.items():
@@ -85,7 +84,7 @@ def odometry(
     Errors are printed if the true poses are known. The exit code is 0 only if all registrations converged; output files
     are written in any case: after an invalid frame or Ctrl-C, of the frames before it.
 
-    Defaults of --voxel-size: <voxel_sizes>. Defaults of --max-distance: <max_distances>.
+    Defaults of --max-distance: <max_distances>.
 
     Args:
         dataset: Format of the data set, or simulated scene.
@@ -97,14 +96,12 @@ def odometry(
         loops: Register frames with earlier ones that saw the same place, and correct all poses.
         output: File for the poses, sensor to world, in KITTI format: the upper three rows of each matrix on one line.
         map: File for the map in the world frame, such as map.ply. Its voxels have the size used for registration; if
-            that is off, a size that keeps at most half of the first cloud.
+            that is off, the spacing of the points.
         plot: File for a picture of the trajectory from above, such as way.png.
     """
     check_outputs(output, cloud=map, picture=plot)
     shared.check(method)
     defaults, frames = DATASETS[dataset], _open(dataset, path, num_frames)
-    given = shared.voxel_size
-    voxel = given if not isinstance(given, str) else defaults.voxel_size if given == "auto" else None
     options: dict[str, Any] = {
         "max_distance": defaults.max_distance,
         "num_neighbors": shared.num_neighbors,
@@ -116,16 +113,17 @@ def odometry(
     names = shared.channels or first.cloud.channel_names
     print(f"frames:    {len(frames)} of {dataset}, {len(first.cloud):,} points in the first")
     print(f"channels:  {listed(names)}")
+    voxels = voxels_of([first.cloud], shared)
+    print(f"points:    {voxels}")
 
     def first_two() -> list[mcg.PointCloud]:
-        return [mcg.preprocess(with_channels(frames[row].cloud, names), voxel) for row in (1, 0)]
+        return [mcg.preprocess(with_channels(frames[row].cloud, names), voxels) for row in (1, 0)]
 
     truth: Truth = []
     chosen = method_for(method, shared, first_two)
     options |= registration_for(method, shared, lambda: first_two()[1])
-    steps = mcg.odometry(_clouds(frames, names, truth), chosen, voxel_size=voxel, start=first.pose, **options)
-    map_voxel = round_voxel_size([first.cloud], len(first.cloud) // 2) if map and voxel is None else voxel
-    poses, results, failure = _follow(steps, len(frames), loops, map, map_voxel)
+    steps = mcg.odometry(_clouds(frames, names, truth), chosen, voxel_size=voxels.size, start=first.pose, **options)
+    poses, results, failure = _follow(steps, len(frames), loops, map)
     del truth[len(poses) :]
     _report(poses, truth, results)
     if output is not None:
@@ -158,7 +156,7 @@ def _clouds(frames: AbstractFrames, names: tuple[str, ...], truth: Truth) -> Ite
 
 
 def _follow(
-    steps: Iterator[OdometryStep], num_frames: int, loops: bool, map: Path | None, voxel_size: float | None
+    steps: Iterator[OdometryStep], num_frames: int, loops: bool, map: Path | None
 ) -> tuple[Poses, list[mcg.RegistrationResult], str]:
     """Run the odometry, write the map if it has a file; return the poses, the registrations and why it stopped early.
 
@@ -196,13 +194,13 @@ def _follow(
         print(f"loops:     {int(np.asarray(graph.edges.uncertain).sum())} closed")
         poses[:] = graph.poses
         stream = zip(clouds, poses, strict=True)
-    if map is None or voxel_size is None:
+    if map is None:
         collections.deque(stream, maxlen=0)
         return poses, results, failure
     with_clouds, with_poses = itertools.tee(stream)
-    world = mcg.merge_clouds((cloud for cloud, _ in with_clouds), (pose for _, pose in with_poses), voxel_size)
+    world = mcg.merge_clouds((cloud for cloud, _ in with_clouds), (pose for _, pose in with_poses))
     io.write(map, world)
-    print(f"map:       {map}, {len(world):,} points, voxels of {voxel_size:g} m")
+    print(f"map:       {map}, {len(world):,} points, {world.voxels}")
     return poses, results, failure
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import bisect
 import errno
 import inspect
 import os
@@ -17,12 +16,14 @@ import tyro
 import mcgicp_jax as mcg
 from mcgicp_jax import plot
 from mcgicp_jax._clouds.color_spaces import COLOR_SPACES
+from mcgicp_jax._clouds.point_cloud import Voxels
 from mcgicp_jax._clouds.preprocess import check_preprocessing
+from mcgicp_jax._clouds.voxel_size import voxels_for
 from mcgicp_jax._local_geometry.spacing_and_noise import point_spacing
 from mcgicp_jax._math.robust_kernels import KERNELS
 from mcgicp_jax._methods.base import AbstractMethod
 from mcgicp_jax._methods.registry import METHODS
-from mcgicp_jax._registration.options import ENOUGH_SOURCE_POINTS, ROTATION_TOLERANCE
+from mcgicp_jax._registration.options import ROTATION_TOLERANCE
 from mcgicp_jax._registration.options import Options as RegistrationOptions
 from mcgicp_jax._registration.settings import default_distances
 from mcgicp_jax.io.clouds import FORMATS, format_of
@@ -56,8 +57,6 @@ Epsilon: TypeAlias = Annotated[
 _RGB = ("red", "green", "blue")
 # Parameters of methods that have an option.
 _PARAMETERS = ("channel_covariance", "channel_weights", "epsilon")
-# Larger clouds are downsampled to at most this many points by default: registered in a tenth of a second.
-_MOST_POINTS = 20_000
 ADVICE = {
     mcg.Status.MAX_ITERATIONS: "the pose was still changing after the last iteration; "
     "try a larger --max-iterations, or --init with a better initial pose",
@@ -95,9 +94,8 @@ class Options:
     Attributes:
         channels: Channels to use, such as intensity, or red green blue, or {spaces} computed from these three. By
             default those that the first two clouds have in common.
-        voxel_size: Metres; the points of each voxel are averaged. auto: all points are kept in clouds of up to 20,000
-            points; otherwise the smallest of 1, 1.5, 2, 3, 5, 7, 10, ... times a power of ten that leaves at most
-            20,000 in each cloud. off: all points are kept.
+        voxel_size: Metres; the points of each voxel are averaged. auto: from the first two clouds, the smallest size at
+            which few neighbourhoods are lines or noise and at most 40,000 voxels remain. off: all points are kept.
         num_neighbors: Number of neighbours from which the covariance of a point is computed.
         max_distance: Metres; largest distance between matched points. Two numbers: one to find the pose, and a smaller
             one to refine it.
@@ -127,7 +125,7 @@ class Options:
     hold_unconstrained: bool = True
     equalize_channels: bool = False
     voxel_sizes: Sizes = ()
-    max_source_points: int | Literal["all"] = ENOUGH_SOURCE_POINTS
+    max_source_points: int | Literal["all"] | None = RegistrationOptions.max_source_points
     channel_covariance: Numbers = ()
     channel_weights: Numbers = ()
     epsilon: Epsilon = None
@@ -224,31 +222,9 @@ def weights_from(source: mcg.PointCloud, target: mcg.PointCloud) -> Any:
     return chosen.channel_weights
 
 
-def voxel_size_for(clouds: Sequence[mcg.PointCloud], options: Options) -> float | None:
-    """The voxel size in metres by the rule of `Options`, or None to keep all points."""
-    if not isinstance(options.voxel_size, str):
-        return options.voxel_size
-    # `preprocess` cannot average covariances.
-    few = max(map(len, clouds)) <= _MOST_POINTS or any(cloud.covariances is not None for cloud in clouds)
-    return None if options.voxel_size == "off" or few else round_voxel_size(clouds, _MOST_POINTS)
-
-
-def round_voxel_size(clouds: Sequence[mcg.PointCloud], most: int) -> float:
-    """The smallest of 1, 1.5, 2, 3, 5, 7, 10, ... times a power of ten that leaves at most `most` points; metres."""
-    finite = [np.asarray(cloud.points, np.float64)[np.isfinite(cloud.points).all(axis=1)] for cloud in clouds]
-    extent = max((np.ptp(points, axis=0).max() for points in finite if len(points)), default=0.0)
-    if extent == 0:
-        return 1.0
-    exponent = int(np.floor(np.log10(extent)))
-    sizes = [float(f"{digits}e{exponent + i}") for i in range(-14, 1) for digits in (1, 1.5, 2, 3, 5, 7, 10)]
-
-    def occupied(size: float) -> int:
-        cells = [np.floor(points / size) for points in finite if len(points)]
-        # One integer key per voxel, 21 bits per axis
-        numbers = [(cell - cell.min(axis=0)).astype(np.int64) @ [1, 2**21, 2**42] for cell in cells]
-        return max(len(np.unique(number)) for number in numbers)
-
-    return sizes[bisect.bisect_left(sizes, -most, key=lambda size: -occupied(size))]
+def voxels_of(clouds: Sequence[mcg.PointCloud], options: Options) -> Voxels:
+    """The voxels for raw clouds by the user's option."""
+    return voxels_for(None if options.voxel_size == "off" else options.voxel_size, *clouds)
 
 
 def registration_for(name: MethodName, options: Options, target: Callable[[], mcg.PointCloud]) -> dict[str, Any]:
@@ -265,10 +241,6 @@ def described_distance(options: Options, target: mcg.PointCloud) -> str:
     """`max_distance` in words."""
     distances = options.max_distance or default_distances(point_spacing(target), target)
     return " m, then ".join(f"{float(distance):.3g}" for distance in distances) + " m"
-
-
-def described_voxels(voxel_size: float | None) -> str:
-    return "all kept" if voxel_size is None else f"voxels of {voxel_size:g} m"
 
 
 def common_channels(options: Options, first: mcg.PointCloud, second: mcg.PointCloud) -> tuple[str, ...]:

@@ -26,9 +26,7 @@ _PAPER = {
     "MC-GICP, combined": (0.2891, 0.1387),
 }
 # Voxel size, and max_distance while the pose is being found and when it is refined; metres.
-_STREET, _KITTI = (
-    (datasets.DATASETS[name].voxel_size, datasets.DATASETS[name].max_distance) for name in ("street", "kitti")
-)
+_STREET, _KITTI = (0.2, datasets.DATASETS["street"].max_distance), (0.25, datasets.DATASETS["kitti"].max_distance)
 _ROAD, _WALL = (0.1, (0.6, 0.15)), (None, (0.15, 0.04))
 # Metres. Points of the road: height, distance to either side, range; its initial poses are this far ahead of the truth.
 _ROAD_LIMITS, _ROAD_START = (0.06, 6.0, 25.0), 0.3

@@ -24,16 +24,16 @@ from mcgicp_jax._cli.options import (
     check_outputs,
     common_channels,
     described_distance,
-    described_voxels,
     enumerated,
     listed,
     method_for,
     registration_for,
-    voxel_size_for,
+    voxels_of,
     with_channels,
     with_names,
     words,
 )
+from mcgicp_jax._clouds.point_cloud import Voxels
 from mcgicp_jax._compute.messages import messages_named
 from mcgicp_jax._compute.threads import side_by_side
 from mcgicp_jax._methods.base import AbstractMethod
@@ -60,15 +60,15 @@ class PreparedPair:
         names = [cloud.channel_names for cloud in self.raw]
         self.channels = common_channels(options, *self.raw)
         self.difference = f"{source} has {listed(names[0])}, {target} has {listed(names[1])}"
-        voxel_size = voxel_size_for(self.raw, options)
+        voxels = voxels_of(self.raw, options)
         self.source, self.target = (
-            _preprocess(path, cloud, self.channels, voxel_size, options.num_neighbors)
+            _preprocess(path, cloud, self.channels, voxels, options.num_neighbors)
             for path, cloud in zip((source, target), self.raw, strict=True)
         )
         counts = (
             f"{len(used):,} of {len(raw):,}" for used, raw in zip((self.source, self.target), self.raw, strict=True)
         )
-        print("points:    source {}, target {} ({})".format(*counts, described_voxels(voxel_size)))
+        print("points:    source {}, target {} ({})".format(*counts, voxels))
         if not with_cells:
             print(f"matches:   up to {described_distance(options, self.target)} apart")
         # Without common channels, `method` raises an error if the method needs any.
@@ -177,7 +177,7 @@ def demo(output: Path = Path("mcgicp_demo"), *, all_methods: bool = False) -> in
     io.write(source_file, source.cloud)
     io.write(target_file, target.cloud)
     io.write_poses(truth_file, [np.linalg.inv(frames.path(0)) @ frames.path(1)])
-    options = PairOptions(voxel_size="off", plot=output / "before_after.png")
+    options = PairOptions(plot=output / "before_after.png")
     check_outputs(picture=options.plot)
     names = tuple(METHODS) if all_methods else _DEMO
     _compare(source_file, target_file, options, truth_file, names)
@@ -246,7 +246,8 @@ def _parameters(method: AbstractMethod) -> str:
 def _report(pair: PreparedPair, result: mcg.RegistrationResult) -> None:
     plural = "" if result.num_iterations == 1 else "s"
     print(f"status:    {words(result)} after {result.num_iterations} iteration{plural}")
-    print(f"inliers:   {result.num_inliers:,} of {len(pair.source):,} ({result.overlap:.0%}), rmse {result.rmse:.4g} m")
+    used = min(len(pair.source), pair.options.registration()["max_source_points"] or len(pair.source))
+    print(f"inliers:   {result.num_inliers:,} of {used:,} ({result.overlap:.0%}), rmse {result.rmse:.4g} m")
     if result.converged and np.all(np.isfinite(result.deviations)):
         x, y, z, *angles = result.deviations
         roll, pitch, yaw = np.degrees(angles)
@@ -289,7 +290,7 @@ def _found(clouds: Sequence[mcg.PointCloud], channels: Sequence[str]) -> Float[n
 
 
 def _preprocess(
-    path: Path, cloud: mcg.PointCloud, channels: Sequence[str], voxel_size: float | None, num_neighbors: int
+    path: Path, cloud: mcg.PointCloud, channels: Sequence[str], voxels: Voxels, num_neighbors: int
 ) -> mcg.PointCloud:
     with messages_named(str(path)):
-        return mcg.preprocess(with_channels(cloud, channels), voxel_size, num_neighbors)
+        return mcg.preprocess(with_channels(cloud, channels), voxels, num_neighbors)

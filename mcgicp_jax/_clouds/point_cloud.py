@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, TypeAlias
 
 import equinox as eqx
@@ -17,6 +18,7 @@ from mcgicp_jax._compute.concrete import is_concrete
 from mcgicp_jax._compute.messages import messages_named
 from mcgicp_jax._compute.size_classes import size_class
 from mcgicp_jax._math.poses import Pose, pose_matrix
+from mcgicp_jax._search.base import NeighborsOnDemand
 
 if TYPE_CHECKING:
     # Array input: NumPy, JAX or any array-like, or nested lists.
@@ -25,6 +27,8 @@ else:
     # Not checked at run time: `PointCloud` has better messages, and takes clouds of other libraries.
     Values = Any
 
+# Largest magnitude of a value, in its own unit: larger ones overflow float32.
+LARGEST = np.finfo(np.float32).max
 # Distance from zero, in cloud sizes, beyond which the origin is kept apart in float64: float32 coordinates would lose
 # more than log2(8) = 3 of their 24 significant bits.
 _FAR = 8.0
@@ -75,6 +79,32 @@ def _blank(channels: Any, channel_valid: Any) -> Any:
     return xp.where(channel_valid, channels, 0)
 
 
+@jax.tree_util.register_pytree_node_class
+@dataclass(frozen=True)
+class Voxels:
+    """How a cloud was downsampled. As a pytree it is empty, so that it decides no program; copies that a transformation
+    of JAX makes do not have it.
+
+    Attributes:
+        size: edge of the voxels, metres; None if every point was kept.
+        reason: why this size was chosen; "" if it was given.
+    """
+
+    size: float | None = None
+    reason: str = ""
+
+    def tree_flatten(self) -> tuple[tuple[()], None]:
+        return (), None
+
+    @classmethod
+    def tree_unflatten(cls, _: None, __: tuple[()]) -> Voxels:
+        return cls()
+
+    def __str__(self) -> str:
+        because = f": {self.reason}" if self.reason else ""
+        return "all points" if self.size is None else f"voxels of {self.size:g} m{because}"
+
+
 class PointCloud(eqx.Module):
     """Points with channels; a pytree whose arrays may all have leading batch dimensions.
 
@@ -89,7 +119,8 @@ class PointCloud(eqx.Module):
         channel_valid: (N, C), False where the point lacks the channel, as outside a camera's view; the value there is
             0 and is ignored. None: all points have all channels.
         valid: (N,), False for padding.
-        neighbors: (N, k) row indices of the k nearest points, including the point itself; −1 where there are fewer.
+        deferred_neighbors: value of the property `neighbors`, of which some rows may not be found yet.
+        voxels: how the points were averaged, see `voxel_size`.
         covariances: (N, 3, 3), or None. If given, methods use them instead of computing their own: dimensionless for
             GICP and MC-GICP, m² for NDT (from `voxel_gaussians`; the scale of a kernel is then in standard deviations).
         origin: (3,) float64, metres, subtracted from the points so that float32 stays precise at large (UTM)
@@ -101,9 +132,10 @@ class PointCloud(eqx.Module):
     channels: Float[Array, "*batch N C"] | Float[np.ndarray, "*batch N C"]
     channel_valid: Bool[Array, "*batch N C"] | Bool[np.ndarray, "*batch N C"] | None
     valid: Bool[Array, "*batch N"] | Bool[np.ndarray, "*batch N"]
-    neighbors: Int[Array, "*batch N k"] | Int[np.ndarray, "*batch N k"] | None
+    deferred_neighbors: Int[Array, "*batch N k"] | Int[np.ndarray, "*batch N k"] | NeighborsOnDemand | None
     covariances: Float[Array, "*batch N 3 3"] | Float[np.ndarray, "*batch N 3 3"] | None
     origin: Float[Array, "*batch 3"] | Float[np.ndarray, "*batch 3"]
+    voxels: Voxels
     channel_names: tuple[str, ...] = eqx.field(static=True)
     # Methods are Python's own. equinox would bind them as pytrees, which takes 40 µs for each call.
     __getattribute__ = object.__getattribute__
@@ -164,8 +196,9 @@ class PointCloud(eqx.Module):
             raise ValueError(f"channel_names: expected {count} names, got {len(channel_names)}")
         self.channel_names = tuple(channel_names)
         self.valid = np.ones(size, bool)
-        self.neighbors = None
+        self.deferred_neighbors = None
         self.origin = np.zeros(3)
+        self.voxels = Voxels()
 
     def replace(self, **arrays: Any) -> PointCloud:
         """Return a copy with the given fields replaced (`points`, `channels`, `covariances`, ...).
@@ -210,6 +243,21 @@ class PointCloud(eqx.Module):
         return _build(**fields)
 
     @property
+    def neighbors(self) -> Int[Array, "*batch N k"] | Int[np.ndarray, "*batch N k"] | None:
+        """(N, k) rows of the k nearest points, nearest first, including the point itself; −1 where there are fewer.
+
+        None for raw clouds. `preprocess` leaves the search to the first use of each row; reading this finds the rest.
+        """
+        found = self.deferred_neighbors
+        return found.whole if isinstance(found, NeighborsOnDemand) else found
+
+    @property
+    def voxel_size(self) -> float | None:
+        """Edge of the voxels in which `preprocess` averaged the points, metres; None if it kept all points, and for raw
+        clouds and copies made by transformations of JAX."""
+        return self.voxels.size
+
+    @property
     def coordinates(self) -> Float[np.ndarray, "*batch N 3"]:
         """Positions in the user's frame, (N, 3) float64, metres: `points` + `origin`."""
         return np.asarray(self.points, np.float64) + np.asarray(self.origin, np.float64)[..., None, :]
@@ -230,8 +278,10 @@ class PointCloud(eqx.Module):
             fractions = np.mean(np.asarray(self.channel_valid)[np.asarray(self.valid)], axis=0)
             names = [f"{name} ({fraction:.0%})" for name, fraction in zip(names, fractions, strict=True)]
         parts = [size, f"channels: {', '.join(names) or 'none'}", str(self.points.dtype)]
-        if self.neighbors is not None:
-            parts.append(f"{self.neighbors.shape[-1]} neighbors")
+        if self.deferred_neighbors is not None:
+            parts.append(f"{self.deferred_neighbors.shape[-1]} neighbors")
+        if self.voxel_size is not None:
+            parts.append(str(self.voxels))
         if is_concrete(self.origin) and np.any(self.origin):
             parts.append(f"origin {np.array2string(np.asarray(self.origin), precision=1)}")
         return f"PointCloud({', '.join(parts)})"
@@ -291,7 +341,7 @@ class PointCloud(eqx.Module):
             channels=grow(self.channels),
             channel_valid=grow(self.channel_valid),
             valid=grow(self.valid),
-            neighbors=grow(self.neighbors, -1),
+            deferred_neighbors=grow(self.neighbors, -1),
             covariances=covariances,
         )
 
@@ -318,7 +368,7 @@ class PointCloud(eqx.Module):
         covariances = None if self.covariances is None else rotation @ self.covariances @ rotation.T
         offset, origin = matrix[:3, :3] @ self.origin + matrix[:3, 3], self.origin
         far = is_concrete(points, offset) and is_far(np.asarray(offset), float(np.abs(points).max(initial=0)))
-        if far and self.neighbors is None:
+        if far and self.deferred_neighbors is None:
             moved = self.coordinates @ np.asarray(matrix[:3, :3], np.float64).T + np.asarray(matrix[:3, 3])
             return self.replace_rows(points=moved, covariances=covariances, origin=np.zeros(3))
         if far:

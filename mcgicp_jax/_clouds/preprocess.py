@@ -3,20 +3,22 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from typing import Any
+from typing import Any, cast
 
 import jax
 import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy.sparse import csr_array
 
-from mcgicp_jax._clouds.point_cloud import PointCloud, Values, as_cloud, is_far
+from mcgicp_jax._clouds.point_cloud import LARGEST, PointCloud, Values, Voxels, as_cloud, is_far
+from mcgicp_jax._clouds.voxel_size import NUM_NEIGHBORS, VoxelSize, voxels_for, warn_of_shape
 from mcgicp_jax._clouds.voxels import voxel_numbers
 from mcgicp_jax._compute.argument_checks import check_integer, check_positive
 from mcgicp_jax._compute.concrete import is_concrete
 from mcgicp_jax._compute.linear_maps import AbstractLinearMap, primal, with_derivative
 from mcgicp_jax._compute.messages import warn
-from mcgicp_jax._search.base import AbstractSearch, NeighborsOnDemand
+from mcgicp_jax._math.statistics import sampled_rows
+from mcgicp_jax._search.base import AbstractSearch
 from mcgicp_jax._search.brute_force import default_search
 
 # Fewest finite points of a cloud: four points are the fewest that are not always coplanar.
@@ -24,20 +26,21 @@ MIN_POINTS = 4
 # Coordinates rounded to steps of more than this fraction of the spacing of the points are warned of. The error, uniform
 # over a step, then has a standard deviation of 3 % of the spacing, the noise of a good sensor.
 _LARGEST_STEP = 0.1
-# Largest magnitude of a value, in its own unit: larger ones overflow float32.
-_LARGEST = np.finfo(np.float32).max
+# Number of points among which duplicates are counted: half of them is known to within 2 %.
+_SAMPLE = 500
 
 
 def preprocess(
     cloud: PointCloud | Values,
-    voxel_size: float | None = None,
-    num_neighbors: int = 20,
+    voxel_size: VoxelSize | Voxels = "auto",
+    num_neighbors: int = NUM_NEIGHBORS,
     *,
     search: AbstractSearch | None = None,
 ) -> PointCloud:
     """Prepare a cloud for registration: drop points with NaN or infinity, downsample to voxels, find neighbours.
 
-    A NaN drops the point in a channel as well, unless `channel_valid` says that the channel is missing.
+    A NaN drops the point in a channel as well, unless `channel_valid` says that the channel is missing. The neighbours
+    of a point are found when they are first needed.
 
     Preprocess each cloud once and register it as often as needed. Runs on the host; not inside `jit` or `vmap`. Points,
     channels and covariances of the result can be differentiated by those of the raw cloud; voxels and neighbours are
@@ -46,7 +49,10 @@ def preprocess(
     Args:
         cloud: raw cloud, or (N, 3) array in metres. Padding and old neighbours are dropped first.
         voxel_size: metres. Points and channels are averaged per voxel, each channel over the points that have it.
-            None keeps every point.
+            "auto": the smallest size at which at most 5 % of the neighbourhoods are lines, such as scan lines, and at
+            most 40,000 voxels remain; a larger one where noise makes neighbourhoods thicker than 0.3 of their width.
+            Points that are spread evenly are kept as they are, as are clouds of fewer than 500 points or with
+            covariances. The repr of the result says what was chosen and why. None keeps every point.
         num_neighbors: number k of neighbours, including the point itself, from which a covariance is computed; at
             least 3. All points are used if the cloud has fewer.
         search: neighbour search; by default SciPy's k-d tree, or `DenseSearch` on an accelerator.
@@ -61,38 +67,24 @@ def preprocess(
 
     Warns:
         UserWarning: once per call, if points with NaN or infinity were left out, if downsampling leaves fewer points
-            than `num_neighbors`, if more than half of the points lie exactly on another one, or if coordinates far from
-            zero are float32 and too coarse for the points' spacing.
+            than `num_neighbors`, if more than half of the points lie exactly on another one, if coordinates far from
+            zero are float32 and too coarse for the points' spacing, or if `voxel_size` is None and more than a tenth of
+            the neighbourhoods are lines, or most are as thick as wide.
     """
     check_preprocessing(voxel_size, num_neighbors)
     cloud = as_cloud("cloud", cloud)
     fixed = primal(cloud)
     if is_concrete(fixed) and not is_concrete(cloud):
-        return _differentiable(cloud, preprocess(fixed, voxel_size, num_neighbors, search=search), fixed, voxel_size)
+        return _differentiable(cloud, preprocess(fixed, voxel_size, num_neighbors, search=search), fixed)
     cloud = finite_rows(cloud)
     found = with_neighbors(cloud, voxel_size, num_neighbors, search)
-    _warn_of_loss(cloud, found, voxel_size, num_neighbors)
+    _warn_of_loss(cloud, found, num_neighbors)
+    if voxel_size is None and found.covariances is None:
+        warn_of_shape(found)
     return found
 
 
-def preprocess_on_demand(cloud: PointCloud, voxel_size: float | None, num_neighbors: int) -> PointCloud:
-    """`preprocess` with `NeighborsOnDemand` where the search has them, for use within the package."""
-    cloud = finite_rows(cloud)
-    found = with_neighbors(cloud, voxel_size, num_neighbors, on_demand=True)
-    _warn_of_loss(cloud, found, voxel_size, num_neighbors)
-    return found
-
-
-def completed(cloud: PointCloud) -> PointCloud:
-    """The cloud with all neighbours as an array."""
-    if not isinstance(cloud.neighbors, NeighborsOnDemand):
-        return cloud
-    neighbors = np.asarray(cloud.neighbors)
-    neighbors.setflags(write=False)
-    return cloud.replace_rows(neighbors=neighbors)
-
-
-def _differentiable(cloud: PointCloud, found: PointCloud, fixed: PointCloud, voxel_size: float | None) -> PointCloud:
+def _differentiable(cloud: PointCloud, found: PointCloud, fixed: PointCloud) -> PointCloud:
     """The preprocessed cloud `found` with the derivative by the arrays of a raw one that differentiation traces.
 
     Args:
@@ -101,8 +93,8 @@ def _differentiable(cloud: PointCloud, found: PointCloud, fixed: PointCloud, vox
     raw = fixed.unpad()
     finite = _is_finite(raw)
     rows, voxels = np.flatnonzero(np.asarray(fixed.valid))[finite], np.arange(np.sum(finite))
-    if voxel_size is not None:
-        voxels, _ = voxel_numbers(np.ascontiguousarray(raw.points[finite].T, np.float64), voxel_size)
+    if found.voxel_size is not None:
+        voxels, _ = voxel_numbers(np.ascontiguousarray(raw.points[finite].T, np.float64), found.voxel_size)
     arrays: dict[str, Any] = {}
     for name in ("points", "channels", "covariances"):
         array = getattr(cloud, name)
@@ -148,25 +140,21 @@ class RowAverage(AbstractLinearMap):
 
 def with_neighbors(
     cloud: PointCloud,
-    voxel_size: float | None,
+    voxel_size: VoxelSize | Voxels,
     num_neighbors: int,
     search: AbstractSearch | None = None,
-    on_demand: bool = False,
 ) -> PointCloud:
-    """`preprocess` for a cloud of `finite_rows`.
-
-    Args:
-        on_demand: whether `neighbors` may be `NeighborsOnDemand`.
-    """
-    if voxel_size is not None:
-        cloud = _downsampled(cloud, voxel_size)
+    """`preprocess` for a cloud of `finite_rows`."""
+    voxels = voxels_for(voxel_size, cloud)
+    if voxels.size is not None:
+        cloud = _downsampled(cloud, voxels.size)
     points, channel_valid, covariances = np.asarray(cloud.points), cloud.channel_valid, cloud.covariances
     dtype = jax.dtypes.canonicalize_dtype(points.dtype)
     origin = _far_origin(points)
     points = (points - origin).astype(dtype)
     # Neighbours are searched among the rounded coordinates, which are those of the registration.
     search = search or default_search()
-    neighbors: Any = (search.neighbors_on_demand if on_demand else search.neighbors)(points, num_neighbors)
+    neighbors: Any = search.neighbors_on_demand(points, num_neighbors)
     if isinstance(neighbors, np.ndarray):
         neighbors = neighbors.astype(np.int32, copy=False)
     arrays = {
@@ -175,7 +163,7 @@ def with_neighbors(
         # Without missing channels the mask is None, so that all complete clouds share compiled programs.
         "channel_valid": None if channel_valid is None or np.all(channel_valid) else np.asarray(channel_valid),
         "valid": np.ones(len(points), bool),
-        "neighbors": neighbors,
+        "deferred_neighbors": neighbors,
         "covariances": None if covariances is None else np.asarray(covariances, dtype),
         "origin": origin,
     }
@@ -183,39 +171,41 @@ def with_neighbors(
         if isinstance(array, np.ndarray):
             # Quantities derived from these arrays are cached, so the arrays must not change. They are copies.
             array.setflags(write=False)
-    return cloud.replace_rows(**arrays)
+    return cloud.replace_rows(**arrays, voxels=voxels)
 
 
-def _warn_of_loss(given: PointCloud, found: PointCloud, voxel_size: float | None, num_neighbors: int) -> None:
+def _warn_of_loss(given: PointCloud, found: PointCloud, num_neighbors: int) -> None:
     """Warn of float32 coordinates that are too large for it, such as those of UTM, of duplicates and few voxels."""
+    points, neighbors = np.asarray(found.points), cast(Any, found.deferred_neighbors)
+    # Of the rows from which the spacing of a target is computed. Each point is its own first neighbour.
+    rows, _ = sampled_rows(np.asarray(found.valid))
+    rows = rows[:: 1 + rows.size // _SAMPLE]
+    apart = points[neighbors[rows][:, 1]] - points[rows]
     if given.points.dtype == np.float32 and np.any(found.origin):
-        largest, points, neighbors = np.abs(given.points).max(), np.asarray(found.points), np.asarray(found.neighbors)
-        # Each point is its own first neighbour.
-        spacing = np.median(np.linalg.norm(points[neighbors[:, 1]] - points, axis=1))
+        largest, spacing = np.abs(given.points).max(), np.median(np.linalg.norm(apart, axis=1))
         if np.spacing(largest) > _LARGEST_STEP * spacing:
             warn(
                 f"points: float32 has rounded coordinates of {largest:.0f} m to steps of {np.spacing(largest):.2g} m, "
                 f"and neighbours are {spacing:.2g} m apart; read them as float64, or subtract an offset before float32"
             )
-    if not isinstance(found.neighbors, NeighborsOnDemand):
-        second = np.asarray(found.neighbors)[:, 1]
-        duplicates = np.mean((found.points[second] == found.points).all(axis=1))
-        if duplicates > 0.5:
-            warn(
-                f"points: {duplicates:.0%} lie exactly on another one, so that neighbourhoods do not span the surface; "
-                "average them with voxel_size"
-            )
+    duplicates = np.mean((apart == 0).all(axis=1))
+    if duplicates > 0.5:
+        warn(
+            f"points: {duplicates:.0%} lie exactly on another one, so that neighbourhoods do not span the surface; "
+            "average them with voxel_size"
+        )
     if len(found) < min(len(given), num_neighbors):
         warn(
-            f"voxel_size: {voxel_size} m leaves {len(found)} of {len(given)} points, fewer than the {num_neighbors} "
-            "neighbours from which a covariance is computed; choose a smaller size"
+            f"voxel_size: {found.voxel_size} m leaves {len(found)} of {len(given)} points, fewer than the "
+            f"{num_neighbors} neighbours from which a covariance is computed; choose a smaller size"
         )
 
 
-def check_preprocessing(voxel_size: float | None, num_neighbors: int) -> None:
+def check_preprocessing(voxel_size: VoxelSize | Voxels, num_neighbors: int) -> None:
     """Check the arguments of `preprocess` other than the cloud; raises `ValueError`."""
-    if voxel_size is not None:
-        check_positive("voxel_size", voxel_size)
+    automatic = isinstance(voxel_size, str) and voxel_size == "auto"
+    if not (automatic or voxel_size is None or isinstance(voxel_size, Voxels)):
+        check_positive("voxel_size", voxel_size, 'a positive number, "auto" or None')
     check_integer("num_neighbors", num_neighbors, 3)
 
 
@@ -230,7 +220,7 @@ def finite_rows(cloud: PointCloud | Values) -> PointCloud:
     keep = _is_finite(cloud)
     if len(keep) >= MIN_POINTS and keep.all():
         return cloud
-    others = np.sum(~keep & (np.abs(cloud.points) <= _LARGEST).all(axis=1))
+    others = np.sum(~keep & (np.abs(cloud.points) <= LARGEST).all(axis=1))
     advice = f", {others} of them with finite coordinates; mark missing channels by channel_valid" if others else ""
     if keep.sum() < MIN_POINTS:
         left = f", left out {np.sum(~keep)}{advice}" if others else ""
@@ -248,7 +238,7 @@ def finite_rows(cloud: PointCloud | Values) -> PointCloud:
 def _is_finite(cloud: PointCloud) -> Bool[np.ndarray, "N"]:
     """Which rows are finite in all arrays. Values such as 1e39 or 1e300 overflow float32 and count as infinite."""
     arrays = [array for array in (cloud.points, cloud.channels, cloud.covariances) if array is not None]
-    finite = [np.abs(array) <= _LARGEST for array in arrays]
+    finite = [np.abs(array) <= LARGEST for array in arrays]
     # Most clouds are finite throughout, and one check of all values is much faster than one per row.
     if all(each.all() for each in finite):
         return np.ones(len(cloud.points), bool)

@@ -4,19 +4,22 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Iterable
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from jaxtyping import Float
 
-from mcgicp_jax._clouds.point_cloud import PointCloud, Values, as_cloud
+from mcgicp_jax._clouds.point_cloud import PointCloud, Values, Voxels, as_cloud
+from mcgicp_jax._clouds.voxel_size import map_voxel_size
 from mcgicp_jax._clouds.voxels import starts_of, voxel_keys, voxel_of
 from mcgicp_jax._compute.argument_checks import check_positive
 from mcgicp_jax._compute.messages import messages_named
 from mcgicp_jax._math.poses import Pose, pose_matrix
 
 
-def merge_clouds(clouds: Iterable[PointCloud | Values], poses: Iterable[Pose], voxel_size: float) -> PointCloud:
+def merge_clouds(
+    clouds: Iterable[PointCloud | Values], poses: Iterable[Pose], voxel_size: float | Literal["auto"] = "auto"
+) -> PointCloud:
     """Merge clouds into one map: the mean of all points, and of their channels, per voxel of the world.
 
     Clouds are processed one by one; memory grows with the size of the map, not with the number of clouds.
@@ -25,7 +28,8 @@ def merge_clouds(clouds: Iterable[PointCloud | Values], poses: Iterable[Pose], v
         clouds: clouds or (N, 3) arrays in metres, in their sensor frames, with the same channels. Points with a
             non-finite coordinate or channel are ignored.
         poses: one pose per cloud, sensor to world.
-        voxel_size: metres.
+        voxel_size: metres. "auto": that of the first cloud if it is preprocessed, or as `preprocess` chooses it; if
+            there is none, the spacing of its points.
 
     Returns:
         Raw float64 cloud in the world frame.
@@ -34,13 +38,20 @@ def merge_clouds(clouds: Iterable[PointCloud | Values], poses: Iterable[Pose], v
         ValueError: if there are no clouds, the number of poses differs, a pose is no rigid motion, the channels
             differ, or a point lies more than 2²⁰ voxels from the first one along an axis.
     """
-    world = VoxelMap(voxel_size)
+    if voxel_size != "auto":
+        check_positive("voxel_size", voxel_size, 'a positive number or "auto"')
+    world: Any = None
     end: Any = object()
     for i, (cloud, pose) in enumerate(itertools.zip_longest(clouds, poses, fillvalue=end)):
         if cloud is end or pose is end:
             raise ValueError(f"poses: expected one per cloud, got {'more' if cloud is end else f'only {i}'}")
         name = f"clouds[{i}]"
-        world.add(name, as_cloud(name, cloud), np.asarray(pose_matrix(pose, f"poses[{i}]")))
+        cloud = as_cloud(name, cloud)
+        if world is None:
+            world = VoxelMap(map_voxel_size(cloud) if voxel_size == "auto" else voxel_size)
+        world.add(name, cloud, np.asarray(pose_matrix(pose, f"poses[{i}]")))
+    if world is None:
+        raise ValueError("clouds: expected at least one, got none")
     return world.cloud()
 
 
@@ -48,11 +59,10 @@ class VoxelMap:
     """The sums of positions and channels in each voxel of the world."""
 
     def __init__(self, voxel_size: float):
-        check_positive("voxel_size", voxel_size)
         self._voxel_size = voxel_size
         # Keys of the voxels, sorted; and for each the number of points, and sums of positions, channels and masks.
         self._keys = np.empty(0, np.int64)
-        self._sums: np.ndarray | None = None
+        self._sums: Any = None
         self._names: tuple[str, ...] | None = None
         # Voxel of the first point, from which the others are counted: keys have no room for UTM coordinates.
         self._first: Float[np.ndarray, "3"] | None = None
@@ -92,17 +102,16 @@ class VoxelMap:
 
     def cloud(self) -> PointCloud:
         """The mean points and channels of the voxels, as a raw float64 cloud."""
-        if self._sums is None:
-            raise ValueError("clouds: expected at least one, got none")
         points = self._sums[:, 1:4] / self._sums[:, :1]
         values, counts = np.split(self._sums[:, 4:], 2, axis=1)
         valid = counts > 0
-        return PointCloud(
+        cloud = PointCloud(
             points,
             values / np.maximum(counts, 1),
             channel_valid=None if valid.all() else valid,
             channel_names=self._names,
         )
+        return cloud.replace_rows(voxels=Voxels(self._voxel_size))
 
 
 def _valid_channels(cloud: PointCloud) -> tuple[Float[np.ndarray, "N C"], Float[np.ndarray, "N C"]]:

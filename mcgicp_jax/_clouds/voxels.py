@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 # Number of voxels along an axis: three 21-bit indices fit into one 63-bit key.
-_VOXELS_PER_AXIS = 2**21
+VOXELS_PER_AXIS = 2**21
 
 
 def voxel_of(points: Float[np.ndarray, "*N 3"], voxel_size: float) -> Float[np.ndarray, "*N 3"]:
@@ -23,19 +23,19 @@ def voxel_keys(
         ValueError: if a point lies 2²⁰ or more voxels from `first` along an axis.
     """
     cells = voxel_of(points, voxel_size) - first
-    if np.abs(cells).max(initial=0) >= _VOXELS_PER_AXIS // 2:
+    if np.abs(cells).max(initial=0) >= VOXELS_PER_AXIS // 2:
         worst = points[np.argmax(np.abs(cells).max(axis=1))]
         raise ValueError(
             f"the point {worst} lies {np.abs(cells).max():.0f} voxels of {voxel_size:g} m from the first one, expected "
-            f"fewer than {_VOXELS_PER_AXIS // 2}; leave far points out, or choose a larger voxel_size"
+            f"fewer than {VOXELS_PER_AXIS // 2}; leave far points out, or choose a larger voxel_size"
         )
-    x, y, z = (cells.astype(np.int64) + _VOXELS_PER_AXIS // 2).T
+    x, y, z = (cells.astype(np.int64) + VOXELS_PER_AXIS // 2).T
     return (x << 42) | (y << 21) | z
 
 
 def wrapped_keys(points: Float[np.ndarray, "N 3"], voxel_size: float) -> Int[np.ndarray, "N"]:
     """Keys of the voxels that contain the points; voxels that are multiples of 2²¹ voxels apart have the same."""
-    x, y, z = np.mod(voxel_of(points, voxel_size), _VOXELS_PER_AXIS).astype(np.int64).T
+    x, y, z = np.mod(voxel_of(points, voxel_size), VOXELS_PER_AXIS).astype(np.int64).T
     return (x << 42) | (y << 21) | z
 
 
@@ -53,9 +53,9 @@ def voxel_order(
         cell = np.floor(column / voxel_size)
         cell -= cell.min()
         extent = cell.max() + 1
-        if extent > _VOXELS_PER_AXIS:
+        if extent > VOXELS_PER_AXIS:
             raise ValueError(
-                f"voxel_size: expected at most {_VOXELS_PER_AXIS} voxels along an axis, got {extent:.0f} "
+                f"voxel_size: expected at most {VOXELS_PER_AXIS} voxels along an axis, got {extent:.0f} "
                 f"with {voxel_size} m; choose a larger size"
             )
         key = key * int(extent) + cell.astype(np.int64)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import abc
 import contextlib
 from types import ModuleType
 from typing import TYPE_CHECKING, Any, TypeAlias
@@ -21,9 +22,33 @@ else:
     AnyScalar = ArrayLike
 
 
+class Deferred(abc.ABC):
+    """A concrete array that is computed when it is needed. As a pytree it is the whole array: what JAX passes through a
+    transformation, copies or pickles is computed first."""
+
+    @property
+    @abc.abstractmethod
+    def whole(self) -> np.ndarray:
+        """The array."""
+
+    def tree_flatten(self) -> tuple[tuple[np.ndarray], None]:
+        return (self.whole,), None
+
+    @classmethod
+    def tree_unflatten(cls, _: None, children: tuple[Any]) -> Any:
+        return children[0]
+
+    def __reduce__(self) -> Any:
+        return np.asarray, (self.whole,)
+
+
+def is_deferred(leaf: object) -> bool:
+    return isinstance(leaf, Deferred)
+
+
 def is_concrete(*trees: object) -> bool:
     """Whether every array in the trees is concrete, that is, none is a tracer of a JAX transformation."""
-    return not any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(trees))
+    return not any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(trees, is_leaf=is_deferred))
 
 
 def outside_trace() -> contextlib.AbstractContextManager[None]:

@@ -15,7 +15,7 @@ import numpy as np
 from jax.extend.core import Primitive
 from jax.interpreters import ad, batching, mlir
 
-from mcgicp_jax._compute.concrete import is_concrete
+from mcgicp_jax._compute.concrete import is_concrete, is_deferred
 from mcgicp_jax._compute.threads import in_new_thread, side_by_side
 
 
@@ -77,7 +77,7 @@ def primal(tree: Any) -> Any:
         fixed = jax.lax.stop_gradient(leaf)
         return np.asarray(fixed) if is_concrete(fixed) else leaf
 
-    return tree if is_concrete(tree) else jax.tree.map(value, tree)
+    return tree if is_concrete(tree) else jax.tree.map(value, tree, is_leaf=is_deferred)
 
 
 def with_derivative(values: Sequence[np.ndarray], linear: AbstractLinearMap, inputs: Sequence[Any]) -> list[jax.Array]:

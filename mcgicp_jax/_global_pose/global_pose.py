@@ -282,7 +282,7 @@ def _verified(
 ) -> list[Candidate]:
     """The best pose and its rivals, registered; without repetitions."""
     near = [np.ascontiguousarray(np.asarray(cloud.neighbors)[:, :_NUM_NEIGHBORS]) for cloud in clouds]
-    source, target = (cloud.replace_rows(neighbors=rows) for cloud, rows in zip(clouds, near, strict=True))
+    source, target = (cloud.replace_rows(deferred_neighbors=rows) for cloud, rows in zip(clouds, near, strict=True))
     method = MultiChannelGICP() if source.channels.shape[1] else GICP()
     options = Options(
         max_distance=(_VERIFIED_WITHIN[0] * voxel_size, _VERIFIED_WITHIN[1] * voxel_size),

@@ -143,7 +143,7 @@ def joined(source: PointCloud, target: PointCloud, with_channels: bool) -> Point
         channels=both("channels") if with_channels else jnp.zeros((both("points").shape[0], 0), source.points.dtype),
         channel_valid=valid,
         valid=None,
-        neighbors=jnp.concatenate(padded),
+        deferred_neighbors=jnp.concatenate(padded),
         covariances=None,
         origin=None,
         channel_names=(),

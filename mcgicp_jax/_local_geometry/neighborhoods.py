@@ -11,9 +11,8 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from mcgicp_jax._clouds.point_cloud import PointCloud
-from mcgicp_jax._compute.concrete import AnyArray
+from mcgicp_jax._compute.concrete import AnyArray, is_deferred
 from mcgicp_jax._math import symmetric_matrices as alg
-from mcgicp_jax._search.base import NeighborsOnDemand
 
 NO_NEIGHBORS = "cloud: expected one with neighbors or covariances; make it with mcgicp_jax.preprocess"
 
@@ -71,10 +70,11 @@ class Neighborhoods(NamedTuple):
 
 
 def check_neighbors(cloud: PointCloud, xp: ModuleType = np) -> Any:
-    """The (N, k) neighbours of a cloud, or `NeighborsOnDemand`; raises `ValueError` if it was not preprocessed."""
-    if cloud.neighbors is None:
+    """The (N, k) neighbours of a cloud, on the host perhaps `NeighborsOnDemand`; a raw cloud raises `ValueError`."""
+    if cloud.deferred_neighbors is None:
         raise ValueError(NO_NEIGHBORS)
-    return cloud.neighbors if isinstance(cloud.neighbors, NeighborsOnDemand) else xp.asarray(cloud.neighbors)
+    deferred = cloud.deferred_neighbors
+    return deferred if xp is np and is_deferred(deferred) else xp.asarray(cloud.neighbors)
 
 
 def points_alone(cloud: PointCloud, xp: ModuleType) -> Callable[[Any], Neighborhoods]:

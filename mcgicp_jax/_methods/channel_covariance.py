@@ -48,7 +48,7 @@ def estimate_channel_covariance(
     if len(clouds) < 2 or len(clouds) != len(poses):
         raise ValueError(f"poses: expected one per cloud and at least two, got {len(poses)} for {len(clouds)} clouds")
     matrices = [np.asarray(pose_matrix(pose, f"poses[{i}]")) for i, pose in enumerate(poses)]
-    ready = [cloud if cloud.neighbors is not None else preprocess(cloud) for cloud in clouds]
+    ready = [cloud if cloud.deferred_neighbors is not None else preprocess(cloud, None) for cloud in clouds]
     names = ready[0].channel_names
     for i, cloud in enumerate(ready):
         if cloud.channel_names != names:

@@ -86,7 +86,7 @@ def surface_pair(
     terms = method.terms(used, target, robust, equalize_channels)
     kinds = tuple(type(term) for term in terms if term.name)
     # Raises an error if observability is needed and a cloud has no neighbours.
-    described = observed or (source.neighbors is not None and target.neighbors is not None)
+    described = observed or (source.deferred_neighbors is not None and target.deferred_neighbors is not None)
     if is_concrete(method, source, target):
         on_host = partial(
             surface_on_host, method, kinds, described=described, observed=observed, num_threads=num_threads
@@ -121,7 +121,7 @@ def _some_rows(cloud: PointCloud, rows: Any) -> PointCloud:
     xp = numpy_for(cloud, rows)
     names = ("points", "channels", "channel_valid", "valid", "covariances")
     some = {name: xp.asarray(getattr(cloud, name))[rows] for name in names if getattr(cloud, name) is not None}
-    return cloud.replace_rows(neighbors=None, **some)
+    return cloud.replace_rows(deferred_neighbors=None, **some)
 
 
 def searchable(method: AbstractMethod, cloud: PointCloud) -> SearchPoints:

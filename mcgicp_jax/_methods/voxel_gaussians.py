@@ -11,7 +11,8 @@ import numpy as np
 from jaxtyping import Array, Float, Int, Shaped
 
 from mcgicp_jax._clouds.point_cloud import PointCloud, Values, as_cloud
-from mcgicp_jax._clouds.preprocess import MIN_POINTS, finite_rows, preprocess
+from mcgicp_jax._clouds.preprocess import MIN_POINTS, finite_rows, preprocess, with_neighbors
+from mcgicp_jax._clouds.voxel_size import NUM_NEIGHBORS
 from mcgicp_jax._clouds.voxels import voxel_order
 from mcgicp_jax._compute.argument_checks import check_integer, check_positive, is_number
 from mcgicp_jax._compute.concrete import AnyArray, numpy_for
@@ -93,7 +94,8 @@ def voxel_gaussians(
         raise ValueError(f"min_ratio: expected a number from 0 to 1, got {min_ratio!r}")
     cloud = finite_rows(cloud)
     if of == "covariances" and cloud.covariances is None:
-        cloud = cloud.replace(covariances=covariances_of(GICP(), preprocess(cloud)).astype(cloud.points.dtype))
+        covariances = covariances_of(GICP(), with_neighbors(cloud, None, NUM_NEIGHBORS))
+        cloud = cloud.replace(covariances=covariances.astype(cloud.points.dtype))
     cells = _Cells(cloud, voxel_size, min_points, channel_size)
     kept = cells.kept
     if kept.sum() < MIN_POINTS:

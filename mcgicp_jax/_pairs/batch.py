@@ -12,6 +12,7 @@ import numpy as np
 
 from mcgicp_jax._clouds.point_cloud import PointCloud
 from mcgicp_jax._clouds.preprocess import check_preprocessing
+from mcgicp_jax._clouds.voxel_size import NUM_NEIGHBORS, VoxelSize
 from mcgicp_jax._compute.concrete import is_concrete
 from mcgicp_jax._math.poses import Pose, pose_matrix
 from mcgicp_jax._methods.base import AbstractMethod
@@ -27,8 +28,8 @@ def register_batch(
     method: AbstractMethod,
     *,
     init: Iterable[Pose | Literal["global"] | None] | Pose | Literal["global"] | None = None,
-    voxel_size: float | None = None,
-    num_neighbors: int = 20,
+    voxel_size: VoxelSize = "auto",
+    num_neighbors: int = NUM_NEIGHBORS,
     executor: Executor | None = None,
     **options: Unpack[GivenOptions],
 ) -> list[RegistrationResult]:
@@ -56,8 +57,8 @@ def register_as_completed(
     method: AbstractMethod,
     *,
     init: Iterable[Pose | Literal["global"] | None] | Pose | Literal["global"] | None = None,
-    voxel_size: float | None = None,
-    num_neighbors: int = 20,
+    voxel_size: VoxelSize = "auto",
+    num_neighbors: int = NUM_NEIGHBORS,
     executor: Executor | None = None,
     **options: Unpack[GivenOptions],
 ) -> Generator[tuple[int, RegistrationResult], None, None]:
@@ -74,7 +75,8 @@ def register_as_completed(
         method: as in `register`; parameters left None are estimated for each pair.
         init: initial T_target_source: one for all pairs, or an iterable with one per pair. None is the identity, and
             "global" the pose found by `global_pose`.
-        voxel_size, num_neighbors: as in `preprocess`, for raw clouds, which the workers preprocess.
+        voxel_size, num_neighbors: as in `preprocess`, for raw clouds, which the workers preprocess. "auto": one size
+            for both clouds of a pair; that of a single cloud for all pairs, if it has any, applies to all.
         executor: any `concurrent.futures.Executor`, such as a `ProcessPoolExecutor` with the start method "spawn" (its
             start pays off with hundreds of pairs) or Dask's `Client.get_executor()`; by default one thread per core. A
             pair whose worker dies is sent once more, and gets the status `WORKER_FAILED` and a warning if that fails
@@ -100,7 +102,7 @@ def _job(
     targets: Iterable[Cloud] | Cloud,
     method: AbstractMethod,
     init: Any,
-    voxel_size: float | None,
+    voxel_size: VoxelSize,
     num_neighbors: int,
     executor: Executor | None,
     options: GivenOptions,
@@ -129,7 +131,7 @@ def _pairs(
     for name in sides:
         if one_for_all[name]:
             if name != "init":
-                sides[name] = job.ready(name, sides[name])
+                (sides[name],) = job.ready({name: sides[name]})
             elif not isinstance(init, str):
                 sides[name] = pose_matrix(sides[name])
             sides[name] = itertools.repeat(sides[name])

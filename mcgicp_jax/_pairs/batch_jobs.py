@@ -16,7 +16,7 @@ import numpy as np
 from jaxtyping import Bool
 
 from mcgicp_jax._clouds.point_cloud import PointCloud, Values
-from mcgicp_jax._clouds.preprocess import preprocess
+from mcgicp_jax._clouds.voxel_size import VoxelSize
 from mcgicp_jax._compute.linear_maps import primal
 from mcgicp_jax._compute.messages import messages_named, warn, warnings_named
 from mcgicp_jax._compute.size_classes import size_class
@@ -28,7 +28,7 @@ from mcgicp_jax._pairs.register import register_from, start_from_anywhere
 from mcgicp_jax._registration.make_result import registration_of
 from mcgicp_jax._registration.options import Options
 from mcgicp_jax._registration.pose_derivative import Given
-from mcgicp_jax._registration.register_pair import Run, pose_problem, prepared, results_of, run_pair
+from mcgicp_jax._registration.register_pair import Run, pose_problem, prepared, preprocessed, results_of, run_pair
 from mcgicp_jax._registration.result import RegistrationResult, Status, computed
 from mcgicp_jax._registration.step import Problem
 from mcgicp_jax._registration.vectorized import run_problems
@@ -116,7 +116,7 @@ class BatchJob:
 
     method: AbstractMethod
     options: Options
-    voxel_size: float | None
+    voxel_size: VoxelSize
     num_neighbors: int
 
     @property
@@ -130,21 +130,20 @@ class BatchJob:
         repeated = self.options.equalize_channels or len(self.options.voxel_sizes) > 0
         return isinstance(self.search, DenseSearch) and not repeated
 
-    def ready(self, name: str, cloud: Cloud) -> PointCloud:
-        """The cloud, read and preprocessed if necessary; errors become a `ValueError` that starts with `name`."""
-        with messages_named(name):
-            if not isinstance(cloud, PointCloud) and callable(cloud):
-                cloud = cloud()
-            if not isinstance(cloud, PointCloud):
-                cloud = PointCloud(cloud)
-            if cloud.neighbors is None and not self.options.takes_raw(self.method, name):
-                cloud = preprocess(cloud, self.voxel_size, self.num_neighbors, search=self.search)
-            return cloud
+    def ready(self, clouds: dict[str, Cloud]) -> list[PointCloud]:
+        """Clouds by their names, read and preprocessed if necessary; errors become a `ValueError` that names one."""
+        sides = dict[str, PointCloud]()
+        for name, cloud in clouds.items():
+            with messages_named(name):
+                given: Any = cloud() if callable(cloud) and not isinstance(cloud, PointCloud) else cloud
+                sides[name] = given if isinstance(given, PointCloud) else PointCloud(given)
+        options = replace(self.options, search=self.search)
+        return preprocessed(sides, self.method, options, self.voxel_size, self.num_neighbors)
 
-    def _clouds(self, pair: Pair) -> tuple[PointCloud, PointCloud]:
+    def _clouds(self, pair: Pair) -> list[PointCloud]:
         """Both clouds by `ready`. Warnings of the pair as a whole do not name it, so that Python shows each once."""
         with warnings_named(f"pair {pair.index}"):
-            return self.ready("source", pair.source), self.ready("target", pair.target)
+            return self.ready({"source": pair.source, "target": pair.target})
 
     def register_chunk(self, chunk: list[Pair]) -> list[PairResult]:
         """Register the pairs one after the other, or in lanes."""

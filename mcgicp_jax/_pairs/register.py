@@ -42,7 +42,7 @@ def register(
     hold_unconstrained: bool = True,
     equalize_channels: bool = False,
     voxel_sizes: Sequence[float] = (),
-    max_source_points: int | None = None,
+    max_source_points: int | None = Options.max_source_points,
     tie_points: GivenTiePoints | None = None,
     prior: GivenPrior | None = None,
 ) -> RegistrationResult:
@@ -64,7 +64,7 @@ def register(
 
     Args:
         source, target: clouds from `preprocess`. Raw clouds and (N, 3) arrays, metres, are preprocessed with the
-            defaults of `preprocess`; not inside `jit`.
+            defaults of `preprocess` and one voxel size for both, or that of the other cloud; not inside `jit`.
         method: `MultiChannelGICP()`, `GICP()`, `PointToPlane()`, `PointToPoint()`, `ColorICP(...)`; for clouds of
             `voxel_gaussians` or with `voxel_sizes`, `NDT()`, `ColorNDT(...)`, `D2DNDT()`. Parameters left None are
             estimated.
@@ -98,10 +98,10 @@ def register(
             transformations.
         max_source_points: match at most so many points of the source, at least 4, in every phase: one random point
             (with a fixed seed) of each of as many equal runs of rows, which lie evenly in space if `preprocess`
-            averaged voxels, and else as densely as the points. Only for these are local geometry and covariances
-            computed, from neighbours among all points. `num_inliers`, `overlap` and the covariance count them alone.
-            The target stays complete. None: all points. 10,000 nearly give the pose of all: `odometry`, `multiway` and
-            the command line use these.
+            averaged voxels, and else as densely as the points. Only for these are neighbours (among all points), local
+            geometry and covariances computed. `num_inliers`, `overlap` and the covariance count them alone, and the
+            pose has a derivative by these points and their neighbours. The target stays complete. None: all points.
+            10,000 nearly give the pose of all.
         tie_points: (source_points, target_points, covariances), metres: points (n, 3) known to be the same, such as
             surveyed targets or image features (Huhle & Jenke 2008), and the covariances (n, 3, 3) of b − T a, in the
             target's axes. n may be 1 or 2. They do not replace the initial pose: if `init` is far off, pass a better

@@ -9,6 +9,7 @@ import numpy as np
 
 from mcgicp_jax._clouds.point_cloud import PointCloud
 from mcgicp_jax._clouds.preprocess import finite_rows, preprocess, with_neighbors
+from mcgicp_jax._clouds.voxel_size import NUM_NEIGHBORS
 from mcgicp_jax._compute.concrete import numpy_for
 from mcgicp_jax._compute.messages import messages_named
 from mcgicp_jax._local_geometry.neighborhoods import check_neighbors
@@ -21,8 +22,6 @@ from mcgicp_jax._methods.voxel_gaussians import voxel_gaussians
 # overlap of three quarters ended 4 m off, and GICP ends at 0 m. On KITTI, from 5 m and 30° off, GICP found 7 of 8
 # poses, cells 4.
 _COARSE_VOXEL = 0.25
-# Neighbours of a voxel, the default of `preprocess`.
-_NUM_NEIGHBORS = 20
 
 
 class Stage(NamedTuple):
@@ -77,4 +76,4 @@ def _in_cells(method: AbstractMethod, name: str, cloud: PointCloud, size: float)
 
 def _in_voxels(name: str, cloud: PointCloud, size: float) -> PointCloud:
     with messages_named(name):
-        return with_neighbors(finite_rows(cloud), size, _NUM_NEIGHBORS)
+        return with_neighbors(finite_rows(cloud), size, NUM_NEIGHBORS)

@@ -36,10 +36,10 @@ class _Rows(NamedTuple):
 
     surface: Surface
     columns: Packed[Surface]
-    describe: Callable[[Int[np.ndarray, "*n"]], Any] | None = None
+    describe: Callable[[Int[np.ndarray, "*n"] | None], Any] | None = None
 
     @staticmethod
-    def of(surface: Surface, describe: Callable[[Int[np.ndarray, "*n"]], Any] | None = None) -> _Rows:
+    def of(surface: Surface, describe: Callable[[Int[np.ndarray, "*n"] | None], Any] | None = None) -> _Rows:
         columns = Packed.of(surface._replace(noise=None, search=None))
         if describe is not None and not np.shares_memory(columns.table, surface.covariance):
             # Of a copy, rows that are computed later would not be seen.

@@ -25,9 +25,9 @@ Distance: TypeAlias = ArrayLike | tuple[ArrayLike, ArrayLike]
 # Radians. Above the small cycles in which nearest-neighbour matching often ends: with real scans of 0.1 m spacing,
 # these were seen to stay within 0.2 mm and 0.4 mrad. The default translation tolerance is chosen likewise.
 ROTATION_TOLERANCE = 5e-4
-# Default `max_source_points` of odometry, multiway and the command line. With every third point, mean errors were those
+# Default `max_source_points`. With every third point, mean errors were those
 # of all points within 4 % (scans of KITTI with 34,000 points, RGB-D with 7,500); with every tenth, up to 36 % larger.
-ENOUGH_SOURCE_POINTS = 10_000
+_ENOUGH_SOURCE_POINTS = 10_000
 
 
 @dataclass(frozen=True)
@@ -47,7 +47,7 @@ class Options:
     hold_unconstrained: bool = True
     equalize_channels: bool = False
     voxel_sizes: Sequence[float] = ()
-    max_source_points: int | None = None
+    max_source_points: int | None = _ENOUGH_SOURCE_POINTS
     reach: float = 0.0
 
     def __post_init__(self) -> None:

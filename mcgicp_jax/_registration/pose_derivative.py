@@ -246,7 +246,7 @@ class PoseDerivative(AbstractLinearMap):
         some = self._inputs.source_rows if side == "source" else None
         among = np.arange(len(cloud.points)) if some is None else some
         gather, soft, local = _gatherer(cloud, method), self._inputs.temperature is not None, None
-        if cloud.neighbors is not None and "points" not in fields:
+        if cloud.deferred_neighbors is not None and "points" not in fields:
             local = Packed.of(local_geometry_on_host(cloud, method.uses_channels, self._num_threads, some))
         valid = None if cloud.channel_valid is None else np.asarray(cloud.channel_valid)
 
@@ -341,7 +341,7 @@ def _numbers(tree: Any) -> list[Any]:
 
 def _gatherer(cloud: PointCloud, method: AbstractMethod) -> Callable[[Any], Neighborhoods]:
     """Neighbourhoods of rows, with the covariances that were given, and with channels where the method uses these."""
-    if cloud.neighbors is not None:
+    if cloud.deferred_neighbors is not None:
         return gatherer(cloud, method.uses_channels, np, with_given=True)
     gather, channels = points_alone(cloud, np), np.asarray(cloud.channels).T
     if not method.uses_channels:

@@ -11,8 +11,9 @@ import jax
 from jaxtyping import Float, Int
 
 from mcgicp_jax._clouds.origins import centred_pose, pose_in_user_frame
-from mcgicp_jax._clouds.point_cloud import PointCloud, Values, as_cloud
+from mcgicp_jax._clouds.point_cloud import PointCloud, Values, Voxels, as_cloud
 from mcgicp_jax._clouds.preprocess import preprocess
+from mcgicp_jax._clouds.voxel_size import NUM_NEIGHBORS, VoxelSize, voxels_for
 from mcgicp_jax._compute.concrete import AnyArray, constant, is_concrete, numpy_for, outside_trace
 from mcgicp_jax._compute.lazy import Lazy
 from mcgicp_jax._compute.linear_maps import primal
@@ -114,9 +115,8 @@ def prepared(
     """The arguments of a registration, checked; clouds preprocessed unless the method makes cells of raw ones."""
     check_method(method)
     warn_of_constant_weights(method)
-    source, target = (
-        _ready(name, cloud, options.takes_raw(method, name)) for name, cloud in (("source", source), ("target", target))
-    )
+    sides = {"source": as_cloud("source", source), "target": as_cloud("target", target)}
+    source, target = preprocessed(sides, method, options)
     if options.voxel_sizes and not (source.covariances is None and target.covariances is None):
         raise ValueError("voxel_sizes: expected none for clouds with covariances, which cannot be averaged in voxels")
     if options.voxel_sizes and method.needs_covariances and not is_concrete(source, target):
@@ -289,10 +289,18 @@ def _nearest_points(source: PointCloud, target: PointCloud, run: Run, search: Ab
     return find_correspondences(source, target, pose, PointToPoint(), max_distance=distance, search=search)
 
 
-def _ready(name: str, cloud: PointCloud | Values, raw: bool = False) -> PointCloud:
-    """The cloud, preprocessed unless it may be `raw`."""
-    cloud = as_cloud(name, cloud)
-    if cloud.neighbors is not None or raw:
-        return cloud
-    with messages_named(name):
-        return preprocess(cloud)
+def preprocessed(
+    sides: dict[str, PointCloud],
+    method: AbstractMethod,
+    options: Options,
+    voxel_size: VoxelSize | Voxels = "auto",
+    num_neighbors: int = NUM_NEIGHBORS,
+) -> list[PointCloud]:
+    """The clouds "source" and "target", preprocessed with one voxel size unless the method makes cells of raw ones."""
+    points = {name: cloud for name, cloud in sides.items() if not options.takes_raw(method, name)}
+    voxels = voxels_for(voxel_size, *points.values())
+    for name, cloud in points.items():
+        if cloud.deferred_neighbors is None:
+            with messages_named(name):
+                sides[name] = preprocess(cloud, voxels, num_neighbors, search=options.search)
+    return list(sides.values())

@@ -12,7 +12,7 @@ import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float, Int
 
-from mcgicp_jax._compute.concrete import AnyArray
+from mcgicp_jax._compute.concrete import AnyArray, Deferred
 from mcgicp_jax._compute.rows_on_demand import RowsOnDemand
 
 
@@ -68,7 +68,8 @@ class Correspondences(eqx.Module):
         return f"Correspondences({self.indices.shape[-1]} source rows)"
 
 
-class NeighborsOnDemand:
+@jax.tree_util.register_pytree_node_class
+class NeighborsOnDemand(Deferred):
     """Stands for the (N, k) array of `AbstractSearch.neighbors`, whose rows are found when they are first needed.
 
     Args:
@@ -82,8 +83,12 @@ class NeighborsOnDemand:
     def __getitem__(self, rows: Any) -> Int[np.ndarray, "*n k"]:
         return self._table.known(rows)[rows]
 
-    def __array__(self, dtype: Any = None, copy: bool | None = None) -> Int[np.ndarray, "N k"]:
-        return np.asarray(self._table.known(), dtype)
+    @property
+    def whole(self) -> Int[np.ndarray, "N k"]:
+        """All rows, as a read-only array."""
+        found = self._table.known()
+        found.setflags(write=False)
+        return found
 
 
 class AbstractIndex(abc.ABC):

@@ -58,7 +58,7 @@ class AbstractTreeSearch(AbstractSearch, TreeBackend):
         )
 
     def neighbors(self, points: Float[np.ndarray, "N 3"], num_neighbors: int) -> Int[np.ndarray, "N k"]:
-        return np.asarray(self.neighbors_on_demand(points, num_neighbors))
+        return self.neighbors_on_demand(points, num_neighbors).whole
 
     def neighbors_on_demand(self, points: Float[np.ndarray, "N 3"], num_neighbors: int) -> NeighborsOnDemand:
         tree, shape = TiedTree(self, points), (len(points), num_neighbors)

@@ -14,6 +14,7 @@ from jaxtyping import Float
 from mcgicp_jax._clouds.point_cloud import PointCloud, Values, as_cloud
 from mcgicp_jax._clouds.preprocess import check_preprocessing, preprocess
 from mcgicp_jax._clouds.voxel_map import merge_clouds
+from mcgicp_jax._clouds.voxel_size import NUM_NEIGHBORS, VoxelSize, voxels_for
 from mcgicp_jax._clouds.voxels import wrapped_keys
 from mcgicp_jax._compute.messages import messages_named
 from mcgicp_jax._local_geometry.spacing_and_noise import point_spacing
@@ -24,7 +25,7 @@ from mcgicp_jax._pairs.batch import register_batch
 from mcgicp_jax._pose_graph.edge import Edge
 from mcgicp_jax._pose_graph.graph import PoseGraph
 from mcgicp_jax._pose_graph.optimize import PoseGraphResult, optimize_poses
-from mcgicp_jax._registration.options import ENOUGH_SOURCE_POINTS, GivenOptions, Options, check_method, options_of
+from mcgicp_jax._registration.options import GivenOptions, Options, check_method, options_of
 from mcgicp_jax._registration.register_pair import register_pair
 from mcgicp_jax._registration.result import RegistrationResult, Status, computed, is_usable
 from mcgicp_jax._sequences.edges import LEAST_OVERLAP, edge_from
@@ -48,7 +49,7 @@ class MultiwayResult:
         statuses: of each cloud: CONVERGED; TOO_FEW_CORRESPONDENCES if it has no edge; DEGENERATE if at least half of
             its edges contradict the others. A cloud of another place leaves the others where they are, but is often
             CONVERGED itself: its registrations agree with each other at a pose of mediocre overlap.
-        voxel_size: of the map, metres: the given one, or the median point spacing of the clouds.
+        voxel_size: of the map, metres: that of the clouds, or their median point spacing.
     """
 
     clouds: list[PointCloud]
@@ -79,8 +80,8 @@ def multiway(
     pairs: Sequence[tuple[int, int]] | None = None,
     *,
     init: Sequence[Pose] | Float[np.ndarray, "n 4 4"] | None = None,
-    voxel_size: float | None = None,
-    num_neighbors: int = 20,
+    voxel_size: VoxelSize = "auto",
+    num_neighbors: int = NUM_NEIGHBORS,
     executor: Executor | None = None,
     **options: Unpack[GivenOptions],
 ) -> MultiwayResult:
@@ -99,9 +100,9 @@ def multiway(
             little: the errors of edges that share a cloud are not independent.
         init: n poses to start from, cloud to world, `jaxlie.SE3` or (4, 4), metres. By default the clouds are
             registered in order, each to the two before it, and again in the opposite order; the better fits are used.
-        voxel_size, num_neighbors: arguments of `preprocess`.
+        voxel_size, num_neighbors: arguments of `preprocess`. "auto": one size for all clouds.
         executor: see `register_batch`, which registers the pairs.
-        options: options of `register`, except for `tie_points` and `prior`; `max_source_points` is 10,000 by default.
+        options: options of `register`, except for `tie_points` and `prior`.
 
     Returns:
         Clouds, poses, registrations and map.
@@ -112,16 +113,15 @@ def multiway(
     """
     check_method(method)
     check_preprocessing(voxel_size, num_neighbors)
-    options.setdefault("max_source_points", ENOUGH_SOURCE_POINTS)
     settings = options_of(multiway, options)
-    ready = []
-    for k, cloud in enumerate(clouds):
-        ready.append(as_cloud(f"clouds[{k}]", cloud))
-        if ready[k].neighbors is None:
-            with messages_named(f"clouds[{k}]"):
-                ready[k] = preprocess(ready[k], voxel_size, num_neighbors)
+    ready = [as_cloud(f"clouds[{k}]", cloud) for k, cloud in enumerate(clouds)]
     if not ready:
         raise ValueError("clouds: expected at least one, got none")
+    voxels = voxels_for(voxel_size, *ready)
+    for k, cloud in enumerate(ready):
+        if cloud.deferred_neighbors is None:
+            with messages_named(f"clouds[{k}]"):
+                ready[k] = preprocess(cloud, voxels, num_neighbors)
     given = None if pairs is None else _checked(pairs, len(ready))
     poses, found = _given(init, len(ready)) if init is not None else _start(ready, method, settings)
     if given is not None:
@@ -143,7 +143,7 @@ def multiway(
         poses = np.asarray(graph.poses)
         if not new:
             break
-    return MultiwayResult(ready, graph, found, statuses, voxel_size or spacing)
+    return MultiwayResult(ready, graph, found, statuses, voxels.size or spacing)
 
 
 def _given(

@@ -13,9 +13,10 @@ import numpy as np
 from jaxtyping import Float
 
 from mcgicp_jax._clouds.frame import Frame
-from mcgicp_jax._clouds.point_cloud import PointCloud, Values, as_cloud
-from mcgicp_jax._clouds.preprocess import check_preprocessing, completed, preprocess_on_demand
+from mcgicp_jax._clouds.point_cloud import PointCloud, Values, Voxels, as_cloud
+from mcgicp_jax._clouds.preprocess import check_preprocessing, preprocess
 from mcgicp_jax._clouds.voxel_map import VoxelMap
+from mcgicp_jax._clouds.voxel_size import NUM_NEIGHBORS, VoxelSize, voxels_for
 from mcgicp_jax._compute.argument_checks import check_positive
 from mcgicp_jax._compute.lazy import Lazy
 from mcgicp_jax._compute.messages import messages_named, warn
@@ -25,7 +26,7 @@ from mcgicp_jax._local_geometry.spacing_and_noise import point_spacing
 from mcgicp_jax._math.poses import Pose, nearest_rotation, pose_matrix
 from mcgicp_jax._methods.base import AbstractMethod
 from mcgicp_jax._pose_graph.graph import PoseGraph
-from mcgicp_jax._registration.options import ENOUGH_SOURCE_POINTS, GivenOptions, Options, check_method, options_of
+from mcgicp_jax._registration.options import GivenOptions, Options, check_method, options_of
 from mcgicp_jax._registration.register_pair import register_pair, rows_to_match
 from mcgicp_jax._registration.result import RegistrationResult, computed, is_usable
 from mcgicp_jax._sequences.loop_closure import Trajectory
@@ -38,21 +39,17 @@ class OdometryStep:
 
     Attributes:
         pose: (4, 4) float64, sensor to world, metres.
+        cloud: the preprocessed cloud, in the sensor's frame.
         lost: with `recover`, whether the pose in the world is not known: it was extrapolated, or follows an
             extrapolated one by registrations to the previous frame.
-        deferred_cloud, deferred_registration, deferred_graph: values of the properties.
+        deferred_registration, deferred_graph: values of the properties.
     """
 
     pose: Float[np.ndarray, "4 4"]
-    deferred_cloud: Lazy[PointCloud]
+    cloud: PointCloud
     deferred_registration: Lazy[RegistrationResult] | None
     lost: bool = False
     deferred_graph: Lazy[PoseGraph] | None = None
-
-    @property
-    def cloud(self) -> PointCloud:
-        """The preprocessed cloud, in the sensor's frame."""
-        return self.deferred_cloud.value
 
     @property
     def registration(self) -> RegistrationResult | None:
@@ -76,8 +73,8 @@ def odometry(
     frames: Iterable[Frame | PointCloud | Values],
     method: AbstractMethod,
     *,
-    voxel_size: float | None = None,
-    num_neighbors: int = 20,
+    voxel_size: VoxelSize = "auto",
+    num_neighbors: int = NUM_NEIGHBORS,
     init: Pose | None = None,
     start: Pose | None = None,
     against: Literal["previous", "map"] = "previous",
@@ -95,8 +92,8 @@ def odometry(
         frames: iterable of `datasets.Frame`, `PointCloud` or (N, 3) arrays in metres; consumed lazily: while a frame is
             registered, the next one is read and preprocessed in a thread. Preprocessed clouds are used unchanged.
         method: registration method.
-        voxel_size, num_neighbors: arguments of `preprocess`. The map has the same voxel size, by default the point
-            spacing of the first frame.
+        voxel_size, num_neighbors: arguments of `preprocess`. "auto": the size chosen for the first raw frame applies to
+            all. The map has the same voxel size, or if there is none, the point spacing of the first frame.
         init: motion of the sensor between the first two frames, to start from, `jaxlie.SE3` or (4, 4); the identity by
             default.
         start: pose of the first frame, sensor to world; the identity by default.
@@ -112,7 +109,7 @@ def odometry(
             poses, and correct all poses by `optimize_poses`. Steps keep the pose known at their time; the corrected
             poses are in the `graph` of the last step. All clouds are kept in memory. Not with `against="map"` or
             `recover`.
-        options: options of `register`, except for `tie_points` and `prior`; `max_source_points` is 10,000 by default.
+        options: options of `register`, except for `tie_points` and `prior`.
 
     Returns:
         Iterator over one `OdometryStep` per frame, including the first.
@@ -127,7 +124,6 @@ def odometry(
     """
     check_preprocessing(voxel_size, num_neighbors)
     check_method(method)
-    options.setdefault("max_source_points", ENOUGH_SOURCE_POINTS)
     if against not in ("previous", "map"):
         raise ValueError(f'against: expected "previous" or "map", got {against!r}')
     if map_radius is not None:
@@ -140,10 +136,10 @@ def odometry(
         )
     given = options_of(odometry, options)
     return _Sensor(
-        frames=ReadAhead(partial(_read, enumerate(frames), method, given, voxel_size, num_neighbors)),
+        frames=ReadAhead(partial(_read, enumerate(frames), method, given, _Preprocessing(voxel_size, num_neighbors))),
         method=method,
         options=given,
-        preprocessing=(voxel_size, num_neighbors),
+        num_neighbors=num_neighbors,
         motion=pose_matrix(init),
         pose=np.asarray(pose_matrix(start, "start")),
         against_map=against == "map",
@@ -157,19 +153,30 @@ def _read(
     frames: Iterator[tuple[int, Frame | PointCloud | Values]],
     method: AbstractMethod,
     options: Options,
-    voxel_size: float | None,
-    num_neighbors: int,
+    preprocessing: _Preprocessing,
 ) -> tuple[str, PointCloud]:
     """The name and the cloud of the next frame, preprocessed and described as the source of a registration."""
     number, frame = next(frames)
     name = f"frames[{number}]"
     cloud = as_cloud(name, frame.cloud if isinstance(frame, Frame) else frame)
-    if cloud.neighbors is None:
+    if cloud.deferred_neighbors is None:
         with messages_named(name):
-            cloud = preprocess_on_demand(cloud, voxel_size, num_neighbors)
+            cloud = preprocessing.of(cloud)
     if not (options.equalize_channels or options.takes_raw(method, "source")):
         geometry_table(cloud, method.uses_channels).known(rows_to_match(cloud, options))
     return name, cloud
+
+
+@dataclass
+class _Preprocessing:
+    """Arguments of `preprocess` for the frames of a sequence; the first one decides about an automatic voxel size."""
+
+    voxel_size: VoxelSize | Voxels
+    num_neighbors: int
+
+    def of(self, cloud: PointCloud) -> PointCloud:
+        self.voxel_size = voxels_for(self.voxel_size, cloud)
+        return preprocess(cloud, self.voxel_size, self.num_neighbors)
 
 
 @dataclass
@@ -178,7 +185,7 @@ class _Sensor(Iterator[OdometryStep]):
 
     Attributes:
         frames: names and clouds of the frames.
-        preprocessing: voxel size and number of neighbours.
+        num_neighbors: from which covariances are computed.
         motion: (4, 4), between the last two frames.
         pose: (4, 4), sensor to world.
         radius: metres around the sensor beyond which points leave the map.
@@ -192,7 +199,7 @@ class _Sensor(Iterator[OdometryStep]):
     frames: Iterator[tuple[str, PointCloud]]
     method: AbstractMethod
     options: Options
-    preprocessing: tuple[float | None, int]
+    num_neighbors: int
     motion: Any
     pose: Float[np.ndarray, "4 4"]
     against_map: bool
@@ -212,7 +219,7 @@ class _Sensor(Iterator[OdometryStep]):
         """Locate the sensor at the next frame, and add the frame to the maps."""
         name, cloud = next(self.frames)
         if self.cloud is None:
-            voxel = self.preprocessing[0] or float(point_spacing(cloud))
+            voxel = cloud.voxel_size or float(point_spacing(cloud))
             self.world = VoxelMap(voxel) if self.against_map else None
             self.places = Relocalizer(voxel) if self.recover else None
             if self.radius is None:
@@ -235,12 +242,11 @@ class _Sensor(Iterator[OdometryStep]):
             self.pose = self.trajectory.add(cloud, self.pose, result)
             graph = Lazy(partial(self.trajectory.graph, *self.trajectory.size))
         self.cloud = cloud
-        complete = Lazy(partial(completed, cloud))
         if result is None:
-            return OdometryStep(self.pose, complete, None, self.is_lost, graph)
+            return OdometryStep(self.pose, cloud, None, self.is_lost, graph)
         registration = Lazy(partial(computed, result))
         self._compute_kept(registration)
-        return OdometryStep(self.pose, complete, registration, self.is_lost, graph)
+        return OdometryStep(self.pose, cloud, registration, self.is_lost, graph)
 
     def _compute_kept(self, registration: Lazy[RegistrationResult]) -> None:
         """Compute the registration of the step before the last if somebody keeps it, since it refers to two frames.
@@ -258,11 +264,11 @@ class _Sensor(Iterator[OdometryStep]):
         if follows:
             result = register_pair(cloud, before, self.method, self.motion, self.options)
         else:
-            target = map_target(self.world.cloud(), self.method, self.options, self.preprocessing[1])
+            target = map_target(self.world.cloud(), self.method, self.options, self.num_neighbors)
             result = register_pair(cloud, target, self.method, self.pose @ self.motion, self.options)
         known, found = not self.is_lost, None
         if self.places is not None:
-            found = self.places.corrected(cloud, result, self.method, self.options, self.preprocessing[1])
+            found = self.places.corrected(cloud, result, self.method, self.options, self.num_neighbors)
         # The result with which tracking is lost is not used, those of the frames that follow are.
         if found is None and not (known and self.is_lost) and is_usable(result):
             self.motion = np.asarray(result.matrix) if follows else np.linalg.solve(self.pose, result.matrix)

@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Float
 
 from mcgicp_jax._clouds.point_cloud import PointCloud
-from mcgicp_jax._clouds.preprocess import preprocess_on_demand
+from mcgicp_jax._clouds.preprocess import with_neighbors
 from mcgicp_jax._clouds.voxel_map import VoxelMap
 from mcgicp_jax._global_pose.global_pose import global_pose
 from mcgicp_jax._methods.base import AbstractMethod
@@ -67,4 +67,4 @@ class Relocalizer:
 
 def map_target(cloud: PointCloud, method: AbstractMethod, options: Options, num_neighbors: int) -> PointCloud:
     """The map as a target: preprocessed, or raw if the method computes voxel cells from it."""
-    return cloud if options.takes_raw(method, "target") else preprocess_on_demand(cloud, None, num_neighbors)
+    return cloud if options.takes_raw(method, "target") else with_neighbors(cloud, None, num_neighbors)

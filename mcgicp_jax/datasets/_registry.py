@@ -23,24 +23,22 @@ class Dataset:
 
     Attributes:
         frames: function of the folder of a sequence; of the number of frames if `simulated`.
-        voxel_size: metres; None to keep all points.
         max_distance: metres, while the pose is being found and when it is refined.
         simulated: whether it is a simulated scene.
     """
 
     frames: Callable[[Any], AbstractFrames]
-    voxel_size: float | None
     max_distance: tuple[float, float]
     simulated: bool = False
 
 
 DATASETS = {
-    "kitti": Dataset(kitti, 0.25, (2.5, 0.6)),
-    "ford": Dataset(ford_campus, 0.25, (2.5, 0.6)),
-    "tum": Dataset(tum_rgbd, 0.03, (0.2, 0.06)),
-    "7-scenes": Dataset(seven_scenes, 0.03, (0.2, 0.06)),
-    "street": Dataset(street, 0.2, (2.0, 0.5), simulated=True),
-    "corridor": Dataset(corridor, None, (0.5, 0.25), simulated=True),
-    "box-room": Dataset(box_room, None, (0.5, 0.25), simulated=True),
-    "poster-wall": Dataset(poster_wall, None, (0.1, 0.04), simulated=True),
+    "kitti": Dataset(kitti, (2.5, 0.6)),
+    "ford": Dataset(ford_campus, (2.5, 0.6)),
+    "tum": Dataset(tum_rgbd, (0.2, 0.06)),
+    "7-scenes": Dataset(seven_scenes, (0.2, 0.06)),
+    "street": Dataset(street, (2.0, 0.5), simulated=True),
+    "corridor": Dataset(corridor, (0.5, 0.25), simulated=True),
+    "box-room": Dataset(box_room, (0.5, 0.25), simulated=True),
+    "poster-wall": Dataset(poster_wall, (0.1, 0.04), simulated=True),
 }

@@ -7,6 +7,10 @@ for every pair. The table has the normalised estimation error squared per degree
 the pairs: 1 if C is right, above if too small, below if too large. d is the number of constrained directions.
 For comparison with `RegistrationResult.covariance`, C is also the inverse Hessian: unscaled, scaled by the variance of
 the residuals, and small_gicp's for the same clouds.
+
+    python -m tests.benchmarks.calibration --seeds 20
+
+One pair of each of many scenes instead, raw, with all defaults, from the identity: the mean over the CONVERGED ones.
 """
 
 from __future__ import annotations
@@ -110,11 +114,41 @@ def calibrate(scene: str, noise: float, pairs: int) -> dict[str, list[float]]:
     return claims
 
 
+MANY: dict[str, Callable[[int], datasets.SyntheticFrames]] = {
+    "box room": lambda seed: datasets.box_room(2, seed=seed, points_per_frame=5000),
+    "street": lambda seed: datasets.street(2, seed=seed),
+    "poster wall": lambda seed: datasets.poster_wall(2, seed=seed),
+}
+
+
+def many(seeds: int) -> None:
+    print("| scene | method | CONVERGED | NEES | largest error, mm |\n|---|---|---|---|---|")
+    for scene, make in MANY.items():
+        rows: dict[str, list[tuple[float, float]]] = {}
+        for seed in range(100, 100 + seeds):
+            target, source = make(seed)
+            truth = np.linalg.inv(target.pose) @ source.pose
+            for name, method in list(METHODS.items())[:3]:
+                result = mcg.register(source.cloud, target.cloud, method)
+                if result.converged:
+                    error = twist_error(result.matrix, truth)
+                    nees = normalised(error, np.asarray(result.covariance), result.directions)
+                    rows.setdefault(name, []).append((nees, mcg.metrics.pose_error(result.matrix, truth)[0]))
+        for name, found in rows.items():
+            nees, errors = np.array(found).T
+            row = f"{len(found)}/{seeds} | {np.mean(nees):.2f} | {1e3 * errors.max():.1f}"
+            print(f"| {scene} | {name} | {row} |", flush=True)
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--pairs", type=int, default=84, help="per scene and noise level")
     parser.add_argument("--scenes", nargs="*", default=list(SCENES))
+    parser.add_argument("--seeds", type=int, help="number of scenes of each kind, raw and from the identity")
     arguments = parser.parse_args()
+    if arguments.seeds is not None:
+        many(arguments.seeds)
+        return
     columns: list[str] = []
     for scene in arguments.scenes:
         for noise in (1.0, 2.0):

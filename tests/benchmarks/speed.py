@@ -17,11 +17,13 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import numpy as np
 
 import mcgicp_jax as mcg
+from mcgicp_jax._clouds.voxel_size import voxels_for
 
 DATA = pathlib.Path(os.environ.get("MCGICP_DATA", pathlib.Path(__file__).parents[3] / "shared" / "data"))
 NUM_TURNS = 9
@@ -211,6 +213,37 @@ def turns(chart: pathlib.Path | None, chosen: list[str]) -> None:
         _draw(chart, drawn)
 
 
+def defaults() -> None:
+    """Raw arrays to pose with all defaults, small_gicp in the same voxels, and small_gicp with its own defaults."""
+    import small_gicp
+
+    print("\nRaw arrays, all defaults: ms, medians of 9 turns; ratio to small_gicp in the same voxels, two threads")
+    print(f"{'clouds':>20} {'points':>9} {'voxels':>9} {'size, m':>8} {'ours':>6} {'small':>6} {'own':>6} {'ratio':>6}")
+    for name, load in (("lidar_pair", lidar_pair), ("kitti", kitti), ("a million", million)):
+        source, target = (cloud.astype(np.float32) for cloud in load())
+        voxel = voxels_for("auto", mcg.PointCloud(source), mcg.PointCloud(target)).size
+        points = source.astype(float), target.astype(float)
+        calls: list[Callable[[], Any]] = [
+            partial(mcg.register, source, target, mcg.GICP()),
+            partial(small(2), *points, voxel, 10 * (voxel or 1)),
+            partial(small_gicp.align, points[1], points[0], num_threads=2),
+        ]
+        rows = []
+        for _ in range(NUM_TURNS + 1):
+            row = []
+            for call in calls:
+                begin = time.perf_counter()
+                call()
+                row.append(1e3 * (time.perf_counter() - begin))
+            rows.append(row)
+        ours_, same, own = np.median(rows[1:], axis=0)
+        ratio = statistics.median(row[0] / row[1] for row in rows[1:])
+        size = len(mcg.preprocess(source, voxel))
+        print(
+            f"{name:>20} {len(source):9,} {size:9,} {voxel or 0:8.2g} {ours_:6.0f} {same:6.0f} {own:6.0f} {ratio:6.2f}"
+        )
+
+
 def _ratio(times: dict[str, list[tuple[float, float]]], stage: slice) -> float:
     """Median ratio, within turns, of our time to the better of small_gicp with one and two threads."""
     rows = zip(times["ours"], times["small 1"], times["small 2"], strict=True)
@@ -278,6 +311,7 @@ def main() -> None:
     arguments = parser.parse_args()
     print(f"{os.cpu_count()} cores, load {os.getloadavg()[0]:.1f} before")
     turns(arguments.chart, arguments.cases or list(CASES))
+    defaults()
     if importlib.util.find_spec("open3d") is not None and not arguments.cases:
         colored()
     with tempfile.TemporaryDirectory() as folder:

@@ -1,0 +1,221 @@
+"""The automatic voxel size: chosen from the shape of neighbourhoods, one for all clouds of a call, and said."""
+
+import pickle
+
+import jax
+import numpy as np
+import pytest
+
+import mcgicp_jax as mcg
+from mcgicp_jax import datasets
+from tests.precision import in_float64
+
+RNG = np.random.default_rng(0)
+
+
+def lines(spacing=0.5, along=0.02, size=8.0, seed=0):
+    """A floor and a wall, seen as scan lines: points every 2 cm along lines that are half a metre apart."""
+    rng = np.random.default_rng(seed)
+    along, across = np.meshgrid(np.arange(0, size, along), np.arange(0, size, spacing) + rng.random() * spacing)
+    flat = np.stack([along.ravel(), across.ravel(), np.zeros(along.size)], axis=1)
+    wall = flat[:, [0, 2, 1]] + [0, 8.0, 0]
+    return np.concatenate([flat, wall]) + rng.normal(scale=0.002, size=(2 * along.size, 3))
+
+
+def even(count=3000, noise=0.0, seed=0):
+    """A square of 10 m with points spread evenly."""
+    rng = np.random.default_rng(seed)
+    return np.column_stack([10 * rng.random((count, 2)), noise * rng.normal(size=count)])
+
+
+def extents(points, k=20):
+    """Brute force: the three extents of the k nearest points of some points, the largest first."""
+    points = np.asarray(points, float)
+    some = points[:: max(len(points) // 400, 1)]
+    rows = np.argsort(((some[:, None] - points) ** 2).sum(-1), axis=1)[:, :k]
+    offsets = points[rows] - points[rows].mean(axis=1, keepdims=True)
+    return np.linalg.svd(offsets, compute_uv=False).T
+
+
+def fraction_of_lines(points):
+    first, second, _ = extents(points)
+    return float(np.mean(second < 0.2 * first))
+
+
+def thickness(points):
+    _, second, third = extents(points)
+    return float(np.median(third / second))
+
+
+def test_scan_lines_are_averaged_until_their_neighbourhoods_are_no_lines():
+    raw = lines()
+    assert fraction_of_lines(raw) > 0.9
+    cloud = mcg.preprocess(raw)
+    assert 0.1 < cloud.voxel_size < 0.5 and fraction_of_lines(cloud.points) < 0.1
+    finer = mcg.preprocess(raw, cloud.voxel_size / 2)
+    assert fraction_of_lines(finer.points) > 0.05
+
+
+def test_points_that_are_spread_evenly_are_kept():
+    raw = even(noise=0.02)
+    cloud = mcg.preprocess(raw)
+    assert cloud.voxel_size is None and "voxels" not in repr(cloud)
+    np.testing.assert_array_equal(cloud.points, raw.astype(np.float32))
+
+
+def test_noise_is_averaged():
+    raw = even(20_000, noise=0.1)
+    cloud = mcg.preprocess(raw)
+    assert "times as thick as wide" in repr(cloud)
+    assert thickness(raw[::4]) > 0.4 and thickness(cloud.points) < 0.35
+
+
+def test_large_clouds_keep_at_most_40_000_voxels():
+    raw = even(100_000)
+    cloud = mcg.preprocess(raw)
+    assert 20_000 < len(cloud) <= 40_000
+    assert f"voxels of {cloud.voxel_size:g} m: at most 40,000 of 100,000 points" in repr(cloud)
+
+
+def test_the_size_goes_with_the_unit_and_not_with_far_points_or_the_order():
+    raw = lines()
+    size = mcg.preprocess(raw).voxel_size
+    assert mcg.preprocess(1000 * raw).voxel_size == pytest.approx(1000 * size)
+    assert mcg.preprocess(np.append(raw, [[1e5, 0, 0]], axis=0)).voxel_size == size
+    # The grid lies elsewhere in the cloud, and other points are sampled.
+    for other in (raw + np.array([500_000, 5_000_000, 100]), np.random.default_rng(1).permutation(raw)):
+        assert 0.5 < mcg.preprocess(other).voxel_size / size < 2
+
+
+@pytest.mark.parametrize(
+    "raw",
+    [np.zeros((600, 3)), np.repeat(RNG.random((100, 3)), 6, axis=0), RNG.random((600, 3)) * [1, 0, 0], 1e30 * even()],
+    ids=["one place", "duplicates", "one line", "huge"],
+)
+def test_any_cloud_has_a_size_or_none(raw):
+    size = mcg.preprocess(raw).voxel_size
+    assert size is None or size > 0
+
+
+def test_clouds_with_covariances_and_small_ones_are_kept():
+    raw = lines()
+    assert mcg.preprocess(mcg.PointCloud(raw, covariances=np.tile(np.eye(3), (len(raw), 1, 1)))).voxel_size is None
+    assert mcg.preprocess(raw[:499]).voxel_size is None
+
+
+def test_a_planar_scan_is_kept_and_sparse_lines_are_averaged_as_far_as_the_scene_is_shown():
+    angle = np.linspace(0, 2 * np.pi, 1081)
+    planar = np.stack([5 * np.cos(angle), 3 * np.sin(angle), np.zeros(1081)], axis=1)
+    assert mcg.preprocess(planar).voxel_size is None
+    sparse = lines(spacing=1.0, along=0.05, size=16.0)
+    assert fraction_of_lines(sparse) == 1
+    cloud = mcg.preprocess(sparse)
+    assert len(cloud) >= 500 and fraction_of_lines(cloud.points) < 0.5
+
+
+def test_one_size_for_both_clouds_of_a_pair():
+    coarse, fine = lines(0.6), lines(0.25)
+    chosen = [mcg.preprocess(cloud).voxel_size for cloud in (coarse, fine)]
+    assert chosen[0] > chosen[1]
+    both = mcg.register(coarse, fine, mcg.PointToPlane())
+    given = mcg.register(*(mcg.preprocess(cloud, chosen[0]) for cloud in (coarse, fine)), mcg.PointToPlane())
+    np.testing.assert_array_equal(both.matrix, given.matrix)
+    # The raw cloud has the voxels of the preprocessed one.
+    mixed = mcg.register(coarse, mcg.preprocess(fine, chosen[0]), mcg.PointToPlane())
+    np.testing.assert_array_equal(mixed.matrix, given.matrix)
+    for result in mcg.register_batch([coarse] * 2, [fine] * 2, mcg.PointToPlane()):
+        np.testing.assert_array_equal(result.matrix, both.matrix)
+
+
+def test_one_size_for_a_sequence_and_its_map():
+    frames = [lines(spacing, seed=seed) for seed, spacing in enumerate((0.3, 0.5, 0.4))]
+    steps = list(mcg.odometry(frames, mcg.PointToPlane()))
+    assert {step.cloud.voxel_size for step in steps} == {mcg.preprocess(frames[0]).voxel_size}
+    world = mcg.merge_clouds([step.cloud for step in steps], [step.pose for step in steps])
+    assert world.voxel_size == steps[0].cloud.voxel_size
+    found = mcg.multiway(frames, mcg.PointToPlane())
+    assert len({cloud.voxel_size for cloud in found.clouds} | {found.voxel_size}) == 1
+
+
+def test_raw_clouds_of_cells_keep_all_points():
+    target, source = datasets.box_room(2, seed=3, points_per_frame=2000)
+    given = mcg.register(source.cloud, target.cloud, mcg.NDT(), voxel_sizes=(0.5,))
+    cells = mcg.voxel_gaussians(target.cloud, 0.5)
+    np.testing.assert_array_equal(
+        given.matrix,
+        mcg.register(source.cloud, cells, mcg.NDT()).matrix,
+    )
+
+
+def test_the_size_survives_what_users_do_with_clouds():
+    cloud = mcg.preprocess(lines())
+    assert pickle.loads(pickle.dumps(cloud)).voxel_size == cloud.voxel_size
+    moved = cloud.transform(np.eye(4)).replace(channels=np.zeros((len(cloud), 1)))
+    assert moved.voxel_size == cloud.voxel_size
+    assert jax.tree.structure(cloud) == jax.tree.structure(mcg.preprocess(lines(), 0.3))
+
+
+def test_a_given_none_is_warned_of_with_figures():
+    with pytest.warns(UserWarning, match=r"voxel_size: without voxels, \d+% of the neighbourhoods are lines"):
+        mcg.preprocess(lines(), None)
+    with pytest.warns(UserWarning, match=r"voxel_size: without voxels, .* thickness is 0\.\d+ of their width"):
+        mcg.preprocess(even(20_000, noise=0.1), None)
+
+
+@pytest.mark.parametrize("wrong", ["large", 0.0, -1.0, (1.0,), float("nan")])
+def test_what_is_no_size_is_turned_away(wrong):
+    with pytest.raises(ValueError, match=r'^voxel_size: expected a positive number, "auto" or None, got'):
+        mcg.preprocess(lines(), wrong)
+
+
+@in_float64
+def test_derivatives_by_raw_points_go_through_the_means():
+    raw = lines(along=0.04)
+    direction = RNG.normal(size=raw.shape)
+    weights = RNG.normal(size=(len(mcg.preprocess(raw).points), 3))
+
+    def points(step):
+        return mcg.preprocess(raw + step * direction).points
+
+    assert mcg.preprocess(raw).voxel_size is not None
+    found = jax.grad(lambda step: (points(step) * weights).sum())(0.0)
+    # The means are linear in the points, as long as no point changes its voxel.
+    expected = ((points(1e-7) - points(-1e-7)) * weights).sum() / 2e-7
+    np.testing.assert_allclose(found, expected, rtol=1e-6)
+
+
+def test_neighbours_are_found_when_they_are_used():
+    asked = []
+
+    class Counted(mcg.KDTreeSearch):
+        def query(self, tree, queries, k, bound):
+            asked.append(len(queries) if k > 1 else 0)
+            return super().query(tree, queries, k, bound)
+
+    raw = even(30_000)
+    clouds = [mcg.preprocess(cloud, search=Counted()) for cloud in (raw, raw)]
+    mcg.register(*clouds, mcg.GICP(), max_source_points=500)
+    assert sum(asked) < 0.5 * 2 * len(raw)
+    whole = mcg.KDTreeSearch().neighbors(np.asarray(clouds[0].points), 20)
+    for each in (clouds[0], pickle.loads(pickle.dumps(clouds[1])), jax.tree.map(lambda leaf: leaf, clouds[1])):
+        assert isinstance(each.neighbors, np.ndarray) and each.neighbors.shape == (len(raw), 20)
+        np.testing.assert_array_equal(each.neighbors, whole)
+    assert not clouds[0].neighbors.flags.writeable
+
+
+def test_ten_thousand_source_points_are_matched_by_default():
+    raw = even(30_000)
+    few = mcg.register(raw, raw + np.array([0, 0, 0.01]), mcg.PointToPlane())
+    every = mcg.register(raw, raw + np.array([0, 0, 0.01]), mcg.PointToPlane(), max_source_points=None)
+    assert few.num_inliers == 10_000 and every.num_inliers == 30_000
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("rows", [(2, 0), (7, 5)])
+def test_raw_scans_two_frames_apart_are_registered(data, rows):
+    frames = datasets.kitti(data / "kitti" / "sequences" / "04")
+    source, target = (frames[row] for row in rows)
+    truth = np.linalg.inv(target.pose) @ source.pose
+    for method in (mcg.PointToPlane(), mcg.GICP(), mcg.MultiChannelGICP()):
+        result = mcg.register(source.cloud, target.cloud, method)
+        assert result.converged and mcg.metrics.pose_error(result.matrix, truth)[0] < 0.06
