@@ -21,7 +21,7 @@ from tests.differences import (
     weigh,
 )
 from tests.precision import in_float64
-from tests.scenes import motion, pair, room_corner, wall
+from tests.scenes import motion, pair, room_corner
 
 pytestmark = in_float64
 
@@ -266,16 +266,12 @@ def test_an_invalid_pair_has_no_gradient():
     assert np.any(jax.grad(loss)(source.points))
 
 
-@pytest.mark.parametrize("status", [Status.DEGENERATE, Status.MAX_ITERATIONS, Status.TOO_FEW_CORRESPONDENCES])
-def test_a_pose_that_is_not_determined_has_no_gradient(status):
-    source, target, _ = pair(wall, size=400)
-    options = {"max_distance": 1e-6 if status == Status.TOO_FEW_CORRESPONDENCES else 0.2}
-    if status == Status.MAX_ITERATIONS:
-        options["max_iterations"] = 1
+def test_a_pose_without_matches_has_no_gradient():
+    source, target, _ = pair(size=300)
 
     def loss(points):
-        found = mcg.register(source.replace(points=points), target, mcg.GICP(), **options)
-        assert found.status == status
+        found = mcg.register(source.replace(points=points), target, mcg.GICP(), max_distance=1e-6)
+        assert found.status == Status.TOO_FEW_CORRESPONDENCES
         return weigh(found.matrix)
 
     np.testing.assert_array_equal(jax.grad(loss)(source.points), 0)

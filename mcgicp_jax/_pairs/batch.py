@@ -38,8 +38,9 @@ def register_batch(
     Waits for all pairs. See `register_as_completed` for arguments, errors and warnings.
 
     Outside `jit`, the poses have derivatives, as those of `register`, by the points and channels of the clouds and the
-    parameters of the method. They are computed side by side, so that `jax.value_and_grad` of a loss over the poses of
-    many pairs is one call. Only the default `executor` is available then, and clouds must be given in lists.
+    parameters of the method: of a DEGENERATE pose within its constrained directions, 0 of other failures but
+    MAX_ITERATIONS. They are computed side by side, so that `jax.value_and_grad` of a loss over the poses of many pairs
+    is one call. Only the default `executor` is available then, and clouds must be given in lists.
     """
     job, pairs = _job(sources, targets, method, init, voxel_size, num_neighbors, executor, options)
     # A look at an iterator would use it up.

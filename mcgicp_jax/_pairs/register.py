@@ -58,9 +58,10 @@ def register(
 
     The derivative is by points, channels, given covariances and given parameters; that by `init` is 0. Matches,
     neighbours and estimated parameters are constants. α has a derivative only with soft matches: see `estimate_pose`.
-    If registration fails, the derivative is 0, never NaN, except after MAX_ITERATIONS. Outside `jit` it costs about as
-    much as the registration, for clouds of any size; inside, each size compiles for some ten seconds, so pad clouds
-    (`PointCloud.pad`). `register_batch` differentiates many pairs at once.
+    Of a DEGENERATE pose it is that within the constrained directions, which are constants, too, and 0 along the others.
+    If registration fails otherwise, the derivative is 0, never NaN, except after MAX_ITERATIONS. Outside `jit` it costs
+    about as much as the registration, for clouds of any size; inside, each size compiles for some ten seconds, so pad
+    clouds (`PointCloud.pad`). `register_batch` differentiates many pairs at once.
 
     Args:
         source, target: clouds from `preprocess`. Raw clouds and (N, 3) arrays, metres, are preprocessed with the

@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import jaxlie
 from jaxtyping import Array, Bool, Float
 
+from mcgicp_jax._compute.concrete import AnyArray, numpy_for
 from mcgicp_jax._compute.linear_maps import is_symbolic_zero, once
 from mcgicp_jax._math.poses import units
 from mcgicp_jax._pose_solver.matched import Matched, Motion, linearize_at
@@ -28,33 +29,56 @@ class ImplicitRoot(eqx.Module):
     Every GICP recomputes M between updates, so the loop converges to a root of g, not to a minimum of the cost F. The
     derivative of the pose follows from g, including the dependence of M and w on the pose.
 
+    Where directions are unconstrained, the loop converges to a root of Pᵀ g: the columns of P are twists along the
+    constrained directions, and the pose moves along these alone, as in `solve_update`. P is a constant to autodiff, as
+    the matches are: what it contributes is the forces along unconstrained directions, which are arbitrary, times its
+    own change.
+
     Attributes:
         center, radius: `Sums.center` and `Sums.radius` at the returned pose, metres.
         scale: tr(Σ K) · radius²; g is divided by it to be dimensionless.
         usable: whether a root is to be searched; if False, the derivative is zero.
+        columns: P, lengths in units of the radius, with zeros for unconstrained directions. If there are none, I.
+        rows: Pᵀ; with `Fusion`, whose g is given in its basis, rows of I.
     """
 
     center: Float[Array, "3"]
     radius: Float[Array, ""]
     scale: Float[Array, ""]
     usable: Bool[Array, ""]
+    columns: Float[Array, "6 6"]
+    rows: Float[Array, "6 6"]
+
+    def within(self, slope: Float[AnyArray, "6 6"]) -> Float[AnyArray, "6 6"]:
+        """Pᵀ (∂g/∂ξ) P, with 1 on the diagonal for unconstrained directions, so that it has an inverse."""
+        xp = numpy_for(slope)
+        return self.rows @ slope @ self.columns + xp.diag(1.0 * ~xp.any(self.rows, axis=1))
 
 
-def root_near(sums: Sums, usable: Bool[Array, ""], fusion: Fusion | None) -> ImplicitRoot:
+def root_near(
+    sums: Sums,
+    usable: Bool[Array, ""],
+    basis: Float[AnyArray, "6 6"],
+    held: Bool[AnyArray, "6"],
+    fusion: Fusion | None,
+) -> ImplicitRoot:
     """The scaling of g, from the sums at the returned pose or from `Fusion`.
 
     Args:
-        usable: False if the loop ended without a pose at rest. With `fusion`, all directions must be held, too.
+        usable: False if the loop ended without a pose at rest.
+        basis: (6, 6), columns: twists about the centre, lengths in units of the radius.
+        held: which of them are constrained.
     """
+    identity, degenerate = jnp.eye(6, dtype=sums.center.dtype), usable & ~jnp.all(held)
+    columns = jnp.where(degenerate, basis * held, identity)
     if fusion is not None:
-        radius = jnp.asarray(fusion.radius)
-        return ImplicitRoot(center=jnp.asarray(fusion.center), radius=radius, scale=radius, usable=usable)
+        radius, rows = jnp.asarray(fusion.radius), jnp.where(degenerate, jnp.diag(1.0 * held), identity)
+        return ImplicitRoot(jnp.asarray(fusion.center), radius, radius, usable, columns, rows)
     radius = jnp.where(usable, sums.radius, 1)
     # The trace of Σ K, in the unit of g.
     scale = jnp.sum(sums.stiffness[jnp.array([0, 3, 5]), 3, 3]) * radius**2
-    return ImplicitRoot(
-        center=jnp.where(usable, sums.center, 0), radius=radius, scale=jnp.where(usable, scale, 1), usable=usable
-    )
+    center, scale = jnp.where(usable, sums.center, 0), jnp.where(usable, scale, 1)
+    return ImplicitRoot(center, radius, scale, usable, columns, columns.T)
 
 
 class Model(NamedTuple):
@@ -67,7 +91,8 @@ class Model(NamedTuple):
 
 @jax.custom_jvp
 def with_derivative(pose: Float[Array, "7"], root: ImplicitRoot, model: Model) -> Float[Array, "7"]:
-    """Return the pose, with the derivative −(∂g/∂ξ)⁻¹ ∂g/∂θ of the nearby root of g (implicit function theorem).
+    """Return the pose, with the derivative −P (Pᵀ ∂g/∂ξ P)⁻¹ Pᵀ ∂g/∂θ of the nearby root of Pᵀ g (implicit function
+    theorem).
 
     The derivative is evaluated at the root, which Newton's method finds from the pose. It is zero if `root.usable` is
     False or Newton's method does not converge. A second derivative raises `NotImplementedError`.
@@ -90,7 +115,8 @@ def _with_derivative_jvp(
         return pose, jnp.zeros_like(pose)
     leaves = [once(leaf) if jnp.issubdtype(leaf.dtype, jnp.inexact) else leaf for leaf in leaves]
     constants = jax.lax.stop_gradient((pose, root, leaves))
-    at_root, inverse, found = _newton(constants[0], constants[1], jax.tree.unflatten(structure, constants[2]))
+    with jax.default_matmul_precision("highest"):
+        at_root, inverse = _newton(constants[0], constants[1], jax.tree.unflatten(structure, constants[2]))
 
     def balance_of(values: list[Array]) -> Float[Array, "6"]:
         changed = list(constants[2])
@@ -99,7 +125,7 @@ def _with_derivative_jvp(
         return _balance(jnp.zeros_like(at_root[:6]), at_root, constants[1], jax.tree.unflatten(structure, changed))
 
     _, change = jax.jvp(balance_of, ([leaves[i] for i in moving],), ([slopes[i] for i in moving],))
-    twist = jnp.where(found, -inverse @ change, 0) * units(constants[1].radius)
+    twist = -inverse @ change * units(constants[1].radius)
     return pose, _along(constants[0], twist, constants[1].center)
 
 
@@ -114,11 +140,11 @@ def _along(pose: Float[Array, "7"], twist: Float[Array, "6"], center: Float[Arra
 
 
 def _newton(
-    pose: Float[Array, "7"], root: ImplicitRoot, model: Model
-) -> tuple[Float[Array, "7"], Float[Array, "6 6"], Bool[Array, ""]]:
-    """The root of g near a pose, (∂g/∂ξ)⁻¹ before the last step, and whether Newton's method converged."""
-    eps = float(jnp.finfo(pose.dtype).eps)
-    identity = jnp.eye(6, dtype=pose.dtype)
+    start: Float[Array, "7"], root: ImplicitRoot, model: Model
+) -> tuple[Float[Array, "7"], Float[Array, "6 6"]]:
+    """The root near a pose, and P (Pᵀ ∂g/∂ξ P)⁻¹ Pᵀ before the last step; that pose and 0 if the method diverged."""
+    small = jnp.sqrt(float(jnp.finfo(start.dtype).eps))
+    identity = jnp.eye(6, dtype=start.dtype)
 
     def step(carry: tuple[Array, Array, Array, Array]) -> tuple[Array, Array, Array, Array]:
         count, pose, _, _ = carry
@@ -126,20 +152,23 @@ def _newton(
             lambda twist: _balance(twist, pose, root, model), jnp.zeros_like(pose[:6])
         )
         jacobian = jnp.where(root.usable, jacobian, identity)
-        inverse = jnp.linalg.inv(jacobian)
+        inverse = root.columns @ jnp.linalg.inv(root.within(jacobian)) @ root.rows
         twist = jnp.where(root.usable, -inverse @ balance, 0)
+        size = jnp.max(jnp.abs(twist))
         moved = pose + _along(pose, twist * units(root.radius), root.center)
         moved = moved.at[:4].divide(jnp.sqrt(jnp.sum(moved[:4] ** 2)))
-        return count + 1, moved, inverse, jnp.max(jnp.abs(twist))
+        # Reverse mode multiplies by what follows from pose and inverse, so that they must never be NaN.
+        moved = jnp.where((size <= small) | (count + 1 < MAX_NEWTON_STEPS), moved, start)
+        return count + 1, moved, inverse, size
 
     def unfinished(carry: tuple[Array, Array, Array, Array]) -> Bool[Array, ""]:
         count, _, _, size = carry
         # Convergence is quadratic: after a step below √eps the remaining error is rounding.
-        return (count < MAX_NEWTON_STEPS) & ~(size <= jnp.sqrt(eps))
+        return (count < MAX_NEWTON_STEPS) & ~(size <= small)
 
-    start = jnp.int32(0), pose, identity, jnp.asarray(jnp.inf, pose.dtype)
-    _, at_root, inverse, size = jax.lax.while_loop(unfinished, step, start)
-    return at_root, inverse, root.usable & (size <= jnp.sqrt(eps))
+    first = jnp.int32(0), start, identity, jnp.asarray(jnp.inf, start.dtype)
+    _, at_root, inverse, size = jax.lax.while_loop(unfinished, step, first)
+    return at_root, jnp.where(root.usable & (size <= small), inverse, 0)
 
 
 def value_and_jacobian(

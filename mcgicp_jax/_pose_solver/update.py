@@ -65,7 +65,6 @@ def solve_update(sums: Sums, basis: Float[Array, "6 6"]) -> Update:
             keep the pose fixed along their directions.
     """
     radius, dtype = sums.radius, sums.center.dtype
-    eps = float(jnp.finfo(dtype).eps)
     form = _quadratic_form(sums, radius)
     unit_information = twist_form(sums.stiffness, radius)
     trace = jnp.trace(unit_information)
@@ -79,8 +78,13 @@ def solve_update(sums: Sums, basis: Float[Array, "6 6"]) -> Update:
     return Update(
         twist=jnp.concatenate([twist[:3] * radius, _rotation_vector(twist[3:])]),
         information=unit_information,
-        degenerate=~jnp.all(pivots[1, :6] > 64 * eps * jnp.max(jnp.diagonal(unit_information))),
+        degenerate=~jnp.all(pivots[1, :6] > rounding(jnp.diagonal(unit_information))),
     )
+
+
+def rounding(diagonal: Float[Array, "6"]) -> Float[Array, ""]:
+    """Pivots or eigenvalues of an information matrix up to this one are rounding; from its diagonal or eigenvalues."""
+    return 64 * jnp.finfo(diagonal.dtype).eps * jnp.max(diagonal)
 
 
 def _least_squares(root: Float[Array, "13 13"], basis: Float[Array, "6 6"]) -> optx.Solution:

@@ -166,7 +166,7 @@ class PoseDerivative(AbstractLinearMap):
 
     @cached_property
     def _root(self) -> tuple[Float[np.ndarray, "7"], Float[np.ndarray, "6 6"]]:
-        """The root of g near the final pose, by Newton's method, and (∂g/∂ξ)⁻¹ there; 0 if there is none."""
+        """The root near the final pose, by Newton's method, and P (Pᵀ ∂g/∂ξ P)⁻¹ Pᵀ there; 0 if there is none."""
         pose, root = self._pose, self._scaling
         for _ in range(MAX_NEWTON_STEPS if root.usable else 0):
             known: Any = np.zeros((6, 13))
@@ -176,9 +176,10 @@ class PoseDerivative(AbstractLinearMap):
             if self._fusion is not None:
                 known = np.asarray(balance_and_slope(pose, root, self._fusion, known.astype(pose.dtype)), np.float64)
             balance, slope = np.split(known, [1], axis=1)
-            if not np.linalg.cond(slope) < 1 / np.finfo(slope.dtype).eps:
+            within = root.within(slope)
+            if not np.linalg.cond(within) < 1 / np.finfo(slope.dtype).eps:
                 break
-            inverse = np.linalg.inv(slope)
+            inverse = np.asarray(root.columns @ np.linalg.inv(within) @ root.rows)
             twist = -(inverse @ balance)[:, 0]
             moved = pose + self._by_twist(pose) @ twist
             moved[:4] /= np.linalg.norm(moved[:4])

@@ -32,7 +32,8 @@ class Status(enum.IntEnum):
         DEGENERATE: the last update was below both tolerances, but at least one direction of motion is unconstrained
             (see `RegistrationResult.unconstrained_directions`). With `hold_unconstrained`, `register` keeps the initial
             pose along it. Tie points or a prior constrain a direction if its standard deviation is then below
-            the radius of the clouds.
+            the radius of the clouds. The derivative of the pose is that within the constrained directions, and 0 along
+            the others.
         NON_FINITE: the pose or the sums overflowed or became NaN.
         INVALID_INPUT: `register` would raise a `ValueError` for this pair. Only in batches; the pose is NaN.
         WORKER_FAILED: two workers in turn failed with this pair. Only in batches; the pose is NaN.

@@ -21,7 +21,7 @@ from mcgicp_jax._pose_solver.fusion import fused_update
 from mcgicp_jax._pose_solver.implicit_derivative import ImplicitRoot, root_near
 from mcgicp_jax._pose_solver.pose_measurements import Fusion
 from mcgicp_jax._pose_solver.sums import Sums
-from mcgicp_jax._pose_solver.update import solve_update
+from mcgicp_jax._pose_solver.update import rounding, solve_update
 from mcgicp_jax._registration.result import Status
 from mcgicp_jax._terms.base import AbstractTerm, is_adaptive
 
@@ -209,10 +209,13 @@ def update(
 @jax.jit
 def root_of(state: State, fusion: Fusion | None) -> ImplicitRoot:
     """The equation that defines the final pose, for its derivative."""
-    usable = (state.status == Status.CONVERGED) | (state.status == Status.MAX_ITERATIONS)
-    if state.directions is not None:
-        # Along an unconstrained direction the root of g (see `ImplicitRoot`) is arbitrary.
-        usable = usable & jnp.all(state.directions.held)
+    converged = state.status == Status.CONVERGED
+    usable = converged | (state.status == Status.DEGENERATE) | (state.status == Status.MAX_ITERATIONS)
     if fusion is not None:
-        usable = usable & jnp.all(fusion.held)
-    return root_near(state.sums, usable, fusion)
+        basis, held = fusion.basis, fusion.held
+    elif state.directions is not None:
+        basis, held = jnp.asarray(state.directions.twists).T, state.directions.held
+    else:
+        values, basis = jnp.linalg.eigh(state.information)
+        held = converged | (values > rounding(values))
+    return root_near(state.sums, usable, basis, held, fusion)

@@ -1,0 +1,316 @@
+"""Gradients of poses with unconstrained directions: those within the constrained ones, with the subspace a constant."""
+
+import jax
+import jax.numpy as jnp
+import jaxlie
+import numpy as np
+import pytest
+
+import mcgicp_jax as mcg
+from mcgicp_jax import Status
+from mcgicp_jax._math.twists import exponential
+from mcgicp_jax._methods.surfaces import surface_pair
+from mcgicp_jax._pose_solver.matched import Motion, linearize_at, match_surfaces
+from tests.differences import CONVERGED, GATE, clouds_with, directional_errors, inputs_of, weigh
+from tests.precision import cached, in_both_precisions, in_float64, tolerance
+from tests.scenes import motion, pair, wall
+
+SIZE = 400
+TRUTH = motion((0.02, 0.01, 0.02, 0.01, -0.01, 0.005))
+
+
+def plane(size, seed):
+    """2 m wide, with 2 cm of noise."""
+    return wall(size, 0.02, seed)
+
+
+def corridor(size, seed):
+    """4 m long, 1 m wide and high."""
+    return walls(size, seed, ((1, 0), (1, 1), (2, 0), (2, 1)), (4, 1, 1))
+
+
+def corner(size, seed):
+    """Two walls 2 m long and high, without a floor."""
+    return walls(size, seed, ((0, 0), (1, 0)), (2, 2, 2))
+
+
+def walls(size, seed, planes, lengths):
+    rng = np.random.default_rng(seed)
+    points = rng.random((size, 3)) * lengths
+    for i, (axis, height) in enumerate(planes):
+        points[i :: len(planes), axis] = height
+    return points + 0.02 * rng.normal(size=points.shape), rng.normal(size=(size, 1))
+
+
+def edge(size, seed):
+    """A plane whose channel changes from −1 to 1 within 10 cm."""
+    points, _ = wall(size, 0.01, seed)
+    return points, np.tanh((points[:, :1] - 1) / 0.1) + 0.01 * np.random.default_rng(seed).normal(size=(size, 1))
+
+
+# Scene, method, and number of unconstrained directions.
+CASES = {
+    "plane": (plane, mcg.GICP(1e-2), 3),
+    "plane, point-to-plane": (plane, mcg.PointToPlane(), 3),
+    "corridor": (corridor, mcg.GICP(1e-2), 1),
+    "corridor, point-to-plane": (corridor, mcg.PointToPlane(), 1),
+    "L": (corner, mcg.GICP(1e-2), 1),
+    "L, point-to-plane": (corner, mcg.PointToPlane(), 1),
+    "edge of a channel": (edge, mcg.MultiChannelGICP(0.05, 0.1), 1),
+}
+
+
+@cached
+def clouds_of(scene):
+    return pair(scene, SIZE, TRUTH)[:2]
+
+
+def registered(clouds, method, **options):
+    return mcg.register(*clouds, method, max_distance=GATE, **CONVERGED | options)
+
+
+class Reference:
+    """The pose near that of a result at which the forces along its constrained directions vanish, by NumPy.
+
+    The pose moves along these directions alone. They are fixed in the target's frame, and the matches are fixed, too.
+    """
+
+    def __init__(self, clouds, method, result):
+        self._pose = result.matrix
+        self._matches = mcg.find_correspondences(*clouds, self._pose, method, max_distance=GATE)
+        directions, adjoint = result.directions, jaxlie.SE3.from_matrix(result.matrix).adjoint()
+        self._along = np.asarray(adjoint) @ directions.twists[directions.held].T
+        steps = 1e-5 * np.eye(self._along.shape[1])
+        forces = [self._force(clouds, method, step) - self._force(clouds, method, -step) for step in steps]
+        self._slope = np.stack(forces, axis=1) / 2e-5
+
+    def _force(self, clouds, method, moved):
+        surfaces, pose = surface_pair(method, *clouds, observed=False), self._at(moved)
+        matched = match_surfaces(surfaces.source, surfaces.target, self._matches)
+        force = np.asarray(_forces(Motion(pose[:3, :3], pose[:3, 3]), matched, surfaces.terms)).T
+        points = np.asarray(clouds[0].points) @ pose[:3, :3].T + pose[:3, 3]
+        return self._along.T @ np.append(force.sum(axis=0), np.cross(points, force).sum(axis=0))
+
+    def _at(self, moved):
+        return exponential(self._along @ moved) @ self._pose
+
+    def pose(self, clouds, method):
+        moved = np.zeros(self._along.shape[1])
+        # The slope is off by a millionth, the displacement.
+        for _ in range(4):
+            moved = moved - np.linalg.solve(self._slope, self._force(clouds, method, moved))
+        return self._at(moved)
+
+
+_forces = jax.jit(lambda motion, matched, terms: linearize_at(motion, matched, terms)[1].force)
+
+
+def check(loss, reference, clouds, method):
+    """The gradient of a loss of the pose of some inputs agrees with differences of the reference."""
+    inputs = inputs_of(*clouds, method, None)
+    if not method.uses_channels:
+        inputs = {name: value for name, value in inputs.items() if not name.endswith("channels")}
+    gradient = jax.grad(loss)(inputs)
+
+    def expected(inputs):
+        return weigh(reference.pose(clouds_with(inputs, *clouds), inputs["method"]))
+
+    for name, actual, difference in directional_errors(expected, inputs, gradient):
+        assert abs(actual - difference) <= 1e-6 * max(abs(difference), 1e-3), name
+    assert np.abs(gradient["source points"]).max() > 1e-4
+
+
+@in_float64
+@pytest.mark.filterwarnings("ignore:channel_weights")
+@pytest.mark.parametrize("name, hold", [*((name, True) for name in CASES), ("L", False)])
+def test_the_derivative_within_the_constrained_directions(name, hold):
+    scene, method, free = CASES[name]
+    clouds = clouds_of(scene)
+    result = registered(clouds, method, hold_unconstrained=hold)
+    assert result.status == Status.DEGENERATE
+
+    def loss(inputs):
+        options = {"init": result.matrix, "hold_unconstrained": hold}
+        return weigh(registered(clouds_with(inputs, *clouds), inputs["method"], **options).matrix)
+
+    check(loss, Reference(clouds, method, result), clouds, method)
+    held, directions = result.directions.held, np.asarray(result.directions.twists)
+    assert (~held).sum() == free
+    along = np.tensordot(np.linalg.inv(directions.T), result.jacobian("source", "points"), 1)
+    assert np.abs(along[~held]).max() < 1e-12 < 1e-4 < np.abs(along[held]).max(axis=(1, 2)).min()
+
+
+@in_float64
+def test_the_pose_follows_the_cloud():
+    """Differences of the registration itself: where all matched points move as one, the directions do, too."""
+    clouds, method = clouds_of(plane), mcg.GICP()
+    result = registered(clouds, method)
+    directions, points = result.directions, np.asarray(clouds[0].points)
+
+    def pose(step, twist):
+        turn = jaxlie.SE3.exp(step * twist)
+        moved = clouds[0].replace(points=points @ turn.rotation().as_matrix().T + turn.translation())
+        return registered((moved, clouds[1]), method, init=result.matrix).matrix
+
+    for twist in directions.twists[directions.held]:
+        _, slope = jax.jvp(lambda step, twist=twist: pose(step, twist), (0.0,), (1.0,))
+        difference = (pose(1e-5, twist) - pose(-1e-5, twist)) / 2e-5
+        np.testing.assert_allclose(slope, difference, atol=1e-6 * np.abs(difference).max())
+        expected = result.matrix @ (exponential(-1e-5 * twist) - exponential(1e-5 * twist)) / 2e-5
+        np.testing.assert_allclose(slope, expected, atol=1e-6 * np.abs(expected).max())
+
+
+@in_float64
+def test_after_max_iterations_the_derivative_is_that_of_the_nearby_root():
+    clouds, method = clouds_of(plane), mcg.GICP()
+    result = registered(clouds, method)
+
+    def gradient(**options):
+        def height(points):
+            moved = clouds[0].replace(points=points), clouds[1]
+            return registered(moved, method, init=result.matrix, **options).matrix[2, 3]
+
+        return jax.grad(height)(clouds[0].points)
+
+    ended, stopped = gradient(), gradient(max_iterations=1, translation_tolerance=0.0)
+    np.testing.assert_allclose(stopped, ended, atol=1e-9)
+    assert np.abs(ended).max() > 1e-4
+
+
+@in_float64
+def test_lanes_inside_jit_have_the_gradients_outside():
+    check_lanes()
+
+
+@pytest.mark.slow
+def test_lanes_in_float32():
+    check_lanes(translation_tolerance=1e-5, rotation_tolerance=1e-5)
+
+
+def check_lanes(**tolerances):
+    """One program for several pairs; the last of them has no matches, and the gradient 0."""
+    points = [[np.asarray(cloud.points) for cloud in clouds_of(scene)] for scene in (plane, corridor, corner)]
+    points.append([points[0][0], points[0][1] + 100])
+    pairs = [[mcg.preprocess(mcg.PointCloud(each)) for each in pair_of_points] for pair_of_points in points]
+
+    def gradient(source, target, search=None):
+        def loss(points):
+            moved = source.replace(points=points), target
+            result = registered(moved, mcg.GICP(1e-2), search=search, **tolerances)
+            return weigh(result.matrix), result.status_code
+
+        return jax.grad(loss, has_aux=True)(source.points)
+
+    sources, targets = (jax.tree.map(lambda *leaves: jnp.stack(leaves), *clouds) for clouds in zip(*pairs, strict=True))
+    several, statuses = jax.jit(jax.vmap(lambda *clouds: gradient(*clouds, mcg.DenseSearch())))(sources, targets)
+    assert statuses.tolist() == [Status.DEGENERATE] * 3 + [Status.TOO_FEW_CORRESPONDENCES]
+    for clouds, found in zip(pairs, several, strict=True):
+        expected, _ = gradient(*clouds)
+        np.testing.assert_allclose(found, expected, atol=tolerance(2e-3, 1e-9))
+    assert not np.any(several[3]) and np.abs(several[:3]).max(axis=(1, 2)).min() > 1e-3
+
+
+@in_both_precisions
+def test_walls_of_a_batch_follow_motions_along_their_normals():
+    scenes = [clouds_of(scene) for scene in (plane, edge)]
+    sources, targets = zip(*scenes, strict=True)
+    normals = [np.linalg.eigh(np.cov(cloud.points.T))[1][:, 0] for cloud in targets]
+    turns = [mcg.register(*clouds, mcg.GICP(), max_distance=GATE).matrix[:3, :3] for clouds in scenes]
+
+    def heights(shifts):
+        moved = [
+            cloud.replace(points=cloud.points + shift * (turn.T @ normal))
+            for cloud, shift, turn, normal in zip(sources, shifts, turns, normals, strict=True)
+        ]
+        found = mcg.register_batch(moved, list(targets), mcg.GICP(), max_distance=GATE)
+        assert [each.status for each in found] == [Status.DEGENERATE] * 2
+        return jnp.stack([normal @ each.matrix[:3, 3] for each, normal in zip(found, normals, strict=True)])
+
+    # The directions are those of the matches, the normals those of all points.
+    np.testing.assert_allclose(jax.jacrev(heights)(jnp.zeros(2)), -np.eye(2), atol=1e-3)
+
+
+@in_float64
+def test_tie_points_and_a_prior_constrain_what_the_clouds_do_not():
+    """Differences of the registration itself, by what was measured: the directions do not depend on it.
+
+    The measurements agree with the clouds, so that the pose begins where it ends: elsewhere the pose along the
+    unconstrained directions depends on the path, to second order.
+    """
+    clouds, method = clouds_of(plane), mcg.GICP()
+    start = registered(clouds, method).matrix
+    points = np.asarray(clouds[0].points)[[7]]
+    # About the normal of the plane, nearly, it tells nothing.
+    loose = np.diag([1e-4, 1e-4, 1e-4, 1e-2, 1e-2, 1e8])
+
+    def loss(inputs, search=None):
+        options = {"init": start, "search": search}
+        if "target" in inputs:
+            options["tie_points"] = (points, inputs["target"], 1e-4 * np.eye(3)[None])
+        else:
+            options["prior"] = (jaxlie.SE3.from_matrix(start) @ jaxlie.SE3.exp(inputs["twist"]), loose)
+        moved = clouds[0].replace(points=inputs.get("points", clouds[0].points)), clouds[1]
+        result = registered(moved, method, **options)
+        return weigh(result.matrix), (result.status_code, result.directions.held)
+
+    gradient = jax.grad(loss, has_aux=True)
+    tied = {"target": points @ start[:3, :3].T + start[:3, 3]}
+    for inputs in (tied, {"twist": np.zeros(6)}):
+        found, (status, held) = gradient(inputs)
+        assert status == Status.DEGENERATE and held.sum() == 5
+        for name, actual, expected in directional_errors(lambda inputs: loss(inputs)[0], inputs, found):
+            assert abs(actual - expected) <= 1e-6 * abs(expected), name
+
+
+@in_float64
+@pytest.mark.slow
+@pytest.mark.parametrize("name, tied", [("L, point-to-plane", False), ("edge of a channel", False), ("plane", True)])
+def test_gradients_inside_jit(name, tied):
+    scene, method, _ = CASES[name]
+    clouds = clouds_of(scene)
+    start = registered(clouds, method).matrix
+    points = np.asarray(clouds[0].points)[[7]]
+    options = {"init": start}
+    if tied:
+        options["tie_points"] = (points, points @ start[:3, :3].T + start[:3, 3] + 0.01, 1e-4 * np.eye(3)[None])
+
+    def loss(arrays, search=None):
+        moved = clouds[0].replace(points=arrays[0], channels=arrays[1]), clouds[1]
+        result = registered(moved, method, search=search, **options)
+        return weigh(result.matrix), result.status_code
+
+    gradient, arrays = jax.grad(loss, has_aux=True), (clouds[0].points, clouds[0].channels)
+    compiled, status = jax.jit(lambda arrays: gradient(arrays, mcg.DenseSearch()))(arrays)
+    assert status == Status.DEGENERATE
+    for actual, expected in zip(compiled, gradient(arrays)[0], strict=True):
+        np.testing.assert_allclose(actual, expected, atol=1e-9 * np.abs(expected).max())
+
+
+@in_both_precisions
+def test_estimate_pose_on_a_line():
+    """A turn about the line of the points changes nothing: `information` is singular."""
+    line = np.linspace(0, 1, 40)[:, None] * [0.6, 0.0, 0.8]
+    noise = 0.01 * np.random.default_rng(0).normal(size=line.shape)
+    source, target = (mcg.preprocess(mcg.PointCloud(points)) for points in (line, line + noise))
+    matches = mcg.Correspondences(np.arange(40), np.zeros(40), np.ones(40, bool))
+    # No update is below 0: the status is MAX_ITERATIONS.
+    stopped = {"translation_tolerance": 0.0, "max_iterations": 1}
+
+    def loss(inputs, **options):
+        moved = target.replace(points=inputs["points"])
+        result = mcg.estimate_pose(source, moved, matches, mcg.PointToPoint(), **options)
+        return weigh(result.matrix), result.status_code
+
+    inputs, gradient = {"points": target.points}, jax.grad(loss, has_aux=True)
+    found, status = gradient(inputs)
+    assert status == Status.DEGENERATE
+    compiled, status = jax.jit(lambda inputs: gradient(inputs, **stopped))(inputs)
+    assert status == Status.MAX_ITERATIONS
+    np.testing.assert_allclose(compiled["points"], found["points"], atol=tolerance(1e-6, 1e-12))
+    if jax.config.jax_enable_x64:
+        start = mcg.estimate_pose(source, target, matches, mcg.PointToPoint(), **CONVERGED).matrix
+        options = CONVERGED | {"init": start}
+        found, _ = gradient(inputs, **options)
+        differences = directional_errors(lambda inputs: loss(inputs, **options)[0], inputs, found)
+        for _, actual, expected in differences:
+            assert abs(actual - expected) <= 1e-6 * abs(expected)
