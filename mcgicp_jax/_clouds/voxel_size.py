@@ -46,9 +46,10 @@ _FEWER = 0.5
 # Median thickness of neighbourhoods (third extent over the second) from which larger voxels are tried. Raw corridors
 # that noise made look constrained had 0.4 and more, and 20 points that fill a ball have 0.77.
 _THICK = 0.3
-# They are used if the thickness falls to this fraction or less, and given up if it rises by this factor while they
-# double. Averages over more points have less noise (which rose by 5 % at most before it fell); vegetation and clutter
-# are thicker in larger voxels (in KITTI's scans by 20 %).
+# They are used if the thickness falls below that, and to this fraction or less while they double; they are given up if
+# it rises by this factor. Averages over more points have less noise: its thickness rose by 5 % at most, and then fell
+# to half or less in doubled voxels. Vegetation and clutter are thicker in larger voxels (by 20 % in KITTI's scans), and
+# the thickness of hilly ground, which the grid causes, falls to 0.7.
 _THINNER, _THICKER = 0.6, 1.1
 # Sizes per decade: those of the preferred numbers R10 of ISO 3, 26 % apart.
 _STEPS = 10
@@ -59,9 +60,9 @@ _DOUBLE = 3
 _DECADES, _DOUBLINGS, _INNER = 4, 4, (0.05, 0.95)
 # Number of points whose neighbourhoods are examined: a fraction of 5 % is known to within 1.3 %.
 _SAMPLE = 300
-# Bits of the hash by which voxels are counted: 40,000 lose 0.5 % by collisions. Its multiplier is 2⁶⁴ over the golden
+# Bits of the hash by which voxels are counted: 40,000 lose 2 % by collisions. Its multiplier is 2⁶⁴ over the golden
 # ratio (Knuth, The Art of Computer Programming, volume 3, 6.4).
-_HASH_BITS, _GOLDEN = 22, np.uint64(0x9E3779B97F4A7C15)
+_HASH_BITS, _GOLDEN = 20, np.uint64(0x9E3779B97F4A7C15)
 # Fractions of lines and thickness from which raw clouds are warned of.
 _MANY_LINES, _AS_THICK_AS_WIDE = 0.1, 0.6
 
@@ -164,10 +165,13 @@ def _shape_of(points: Float[np.ndarray, "N 3"], neighbors: Any = None) -> Shape:
     Args:
         neighbors: (N, k) rows or `NeighborsOnDemand`; found if None.
     """
-    if neighbors is None:
-        neighbors = KDTreeSearch(workers=1).neighbors_on_demand(points, NUM_NEIGHBORS)
     rows = np.random.default_rng(0).integers(0, len(points), _SAMPLE)
-    near = points[neighbors[rows]]
+    if neighbors is None:
+        search, count = KDTreeSearch(workers=1), min(NUM_NEIGHBORS, len(points))
+        _, nearest = search.query(search.build(points), points[rows], count, np.inf)
+    else:
+        nearest = neighbors[rows]
+    near = points[nearest]
     distances = np.linalg.norm(near[:, 1] - near[:, 0], axis=1)
     offsets = near - near.mean(axis=1, keepdims=True)
     squares = np.linalg.eigvalsh(offsets.transpose(0, 2, 1) @ offsets)
@@ -213,14 +217,13 @@ class _Candidates:
             start: number of the size that is doubled, the current one or the spacing.
         """
         before = self.thickness(step)
-        limit = min(_THICK, _THINNER * before)
         for larger in range(start + _DOUBLE, start + _DOUBLE * _DOUBLINGS + 1, _DOUBLE):
             if not self.shows_scene(larger) or self.thickness(larger) > _THICKER * before:
                 return None
-            before = self.thickness(larger)
-            if before <= limit:
+            if self.thickness(larger) <= min(_THICK, _THINNER * before):
                 between = range(larger - _DOUBLE + 1, larger)
-                return next((finer for finer in between if self.thickness(finer) <= limit), larger)
+                return next((finer for finer in between if self.thickness(finer) <= _THICK), larger)
+            before = self.thickness(larger)
         return None
 
 
@@ -254,7 +257,7 @@ def _each(points: Sequence[Float[np.ndarray, "3 N"]], function: Callable[[np.nda
 
 
 def _counts(points: Sequence[Float[np.ndarray, "3 N"]], step: int) -> list[int]:
-    """The number of voxels of each cloud, to within a percent."""
+    """The number of voxels of each cloud, to within 2 %."""
 
     def count(columns: Float[np.ndarray, "3 N"]) -> int:
         key = np.zeros(columns.shape[1], np.int64)
