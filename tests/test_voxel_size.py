@@ -3,6 +3,7 @@
 import pickle
 
 import jax
+import jaxtyping
 import numpy as np
 import pytest
 
@@ -165,7 +166,9 @@ def test_a_given_none_is_warned_of_with_figures():
 
 @pytest.mark.parametrize("wrong", ["large", 0.0, -1.0, (1.0,), float("nan")])
 def test_what_is_no_size_is_turned_away(wrong):
-    with pytest.raises(ValueError, match=r'^voxel_size: expected a positive number, "auto" or None, got'):
+    # Run-time checks of annotations refuse what is no number first.
+    message = r'^voxel_size: expected a positive number, "auto" or None, got|parameter \'voxel_size\''
+    with pytest.raises((ValueError, jaxtyping.TypeCheckError), match=message):
         mcg.preprocess(lines(), wrong)
 
 

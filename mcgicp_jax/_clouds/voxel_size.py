@@ -98,7 +98,7 @@ def voxels_for(voxel_size: VoxelSize | Voxels, *clouds: PointCloud) -> Voxels:
 def map_voxel_size(cloud: PointCloud) -> float:
     """The voxel size of a map from its first cloud, metres: that of the cloud, or the spacing of its points."""
     size, points = voxels_for("auto", cloud).size, _finite_columns(cloud).T
-    return size or (len(points) and _shape_of(points).spacing) or 1.0
+    return size or (len(points) > 1 and _shape_of(points).spacing) or 1.0
 
 
 def warn_of_shape(cloud: PointCloud) -> None:
@@ -124,7 +124,7 @@ def _chosen(clouds: Sequence[PointCloud]) -> Voxels:
         return Voxels()
     points = [_finite_columns(cloud) for cloud in clouds]
     counts = [columns.shape[1] for columns in points]
-    if max(counts) < _LEAST_VOXELS or min(counts) == 0:
+    if max(counts) < _LEAST_VOXELS or min(counts) < NUM_NEIGHBORS:
         return Voxels()
     # Sizes are numbered, ten for each decade of metres; None stands for all points.
     smallest, largest = _range_of(points)
@@ -188,7 +188,7 @@ class _Candidates:
         least: smallest number of voxels of each cloud.
     """
 
-    def __init__(self, points: Sequence[Float[np.ndarray, "3 N"]], step: int | None, least: Sequence[int]):
+    def __init__(self, points: Sequence[Float[np.ndarray, "3 _"]], step: int | None, least: Sequence[int]):
         self._points, self._step, self._least = points, step, least
         self.shapes, self.shows_scene = cache(self._shapes), cache(self._shows_scene)
 
@@ -227,7 +227,7 @@ class _Candidates:
         return None
 
 
-def _range_of(points: Sequence[Float[np.ndarray, "3 N"]]) -> tuple[int, int]:
+def _range_of(points: Sequence[Float[np.ndarray, "3 _"]]) -> tuple[int, int]:
     """The numbers of the smallest and of the largest voxel size to consider."""
     samples = [columns[:, :: 1 + columns.shape[1] // _SAMPLE] for columns in points]
     inner = max(float(np.ptp(np.quantile(sample, _INNER, axis=1), axis=0).max()) for sample in samples)
@@ -251,12 +251,12 @@ def _first(steps: range, holds: Callable[[int], bool]) -> int:
     return steps.start + bisect.bisect_left(steps, True, key=holds)
 
 
-def _each(points: Sequence[Float[np.ndarray, "3 N"]], function: Callable[[np.ndarray], Value]) -> list[Value]:
+def _each(points: Sequence[Float[np.ndarray, "3 _"]], function: Callable[[np.ndarray], Value]) -> list[Value]:
     """The values of a function for each cloud, computed side by side."""
     return side_by_side([partial(function, columns) for columns in points])
 
 
-def _counts(points: Sequence[Float[np.ndarray, "3 N"]], step: int) -> list[int]:
+def _counts(points: Sequence[Float[np.ndarray, "3 _"]], step: int) -> list[int]:
     """The number of voxels of each cloud, to within 2 %."""
 
     def count(columns: Float[np.ndarray, "3 N"]) -> int:
