@@ -1,12 +1,19 @@
 """Fixtures, and how the tests compile."""
 
 import gc
+import importlib.metadata
 import os
 import pathlib
 
 # Compilation takes most of the tests' time, and on CPUs four times as much where it optimizes. Unless XLA_FLAGS is set,
 # the tests do without; CI runs the slow tests, and the others once more, as users do.
-os.environ.setdefault("XLA_FLAGS", "--xla_backend_optimization_level=0 --xla_cpu_use_fusion_emitters=false")
+# XLA aborts at flags that it does not know; jaxlib 0.11.1 no longer knows the second one.
+os.environ.setdefault(
+    "XLA_FLAGS",
+    "--xla_backend_optimization_level=0"
+    + " --xla_cpu_use_fusion_emitters=false"
+    * (tuple(map(int, importlib.metadata.version("jaxlib").split(".")[:3])) < (0, 11, 1)),
+)
 # Keep all compiled programs between runs.
 os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(pathlib.Path(__file__).parent.parent / ".jax_cache"))
 os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0")
