@@ -1,5 +1,7 @@
 """Small synthetic clouds with known motion, shared by the tests; of few sizes, since every size compiles."""
 
+from collections.abc import Callable
+
 import numpy as np
 
 import mcgicp_jax as mcg
@@ -51,3 +53,33 @@ def prepare(method, cloud, observed=False):
 def covariances(method, cloud):
     """Packed covariances (6, N) of a resolved method, for concrete and traced clouds."""
     return surface_pair(method, cloud, cloud, observed=False).source.covariance.T
+
+
+def rectangles(*sides: tuple[tuple[float, ...], tuple[float, ...], tuple[float, ...]]) -> Callable[..., np.ndarray]:
+    """A function that samples rectangles evenly, with noise in units of the spacing; each by a corner and two edges."""
+
+    def sample(rng: np.random.Generator, count: int, noise: float) -> np.ndarray:
+        corners, first, second = (np.array(part) for part in zip(*sides, strict=True))
+        areas = np.linalg.norm(np.cross(first, second), axis=1)
+        rows = rng.choice(len(areas), count, p=areas / areas.sum())
+        along, across = rng.random((2, count, 1))
+        points = corners[rows] + along * first[rows] + across * second[rows]
+        return points + noise * np.sqrt(areas.sum() / count) * rng.normal(size=points.shape)
+
+    return sample
+
+
+SURFACES = {
+    "plane": rectangles(((-5, -5, 0), (10, 0, 0), (0, 10, 0))),
+    "floor and wall": rectangles(((-10, 0, 0), (20, 0, 0), (0, 4, 0)), ((-10, 0, 0), (20, 0, 0), (0, 0, 3))),
+    "corridor": rectangles(
+        *(((-10, -1, z), (20, 0, 0), (0, 2, 0)) for z in (0, 2.5)),
+        *(((-10, y, 0), (20, 0, 0), (0, 0, 2.5)) for y in (-1, 1)),
+    ),
+    "crossing planes": rectangles(((-10, -2, 0), (20, 0, 0), (0, 4, 0)), ((-10, -1, -1.7), (20, 0, 0), (0, 2, 3.4))),
+    "room": rectangles(
+        ((-3, -2, 0), (6, 0, 0), (0, 4, 0)),
+        *(((-3, y, 0), (6, 0, 0), (0, 0, 2.5)) for y in (-2, 2)),
+        *(((x, -2, 0), (0, 4, 0), (0, 0, 2.5)) for x in (-3, 3)),
+    ),
+}

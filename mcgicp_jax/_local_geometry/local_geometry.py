@@ -65,15 +65,27 @@ def _described(
     basis = alg.orthonormal_basis(fixed_normal)
     rank = min(_ROUGHNESS_RANK, offsets[0].shape[0] - 1)
     height = sum(offset[rank] * axis for offset, axis in zip(offsets, fixed_normal, strict=True))
+    halves = _normals_of_halves(around, offsets)
     x, y = (sum(offset * b for offset, b in zip(offsets, axis, strict=True)) for axis in basis)
     return LocalGeometry(
         covariance=covariance.T,
         normal=normal.T,
-        observability=geometry_observability(fixed_covariance, fixed_normal, basis, count).T,
+        observability=geometry_observability(fixed_covariance, fixed_normal, basis, count, halves).T,
         roughness=0.5 * height**2,
         reach=jnp.sqrt(jnp.max(sum(offset * offset for offset in offsets), axis=0)),
         fits=fit_channels(around, x, y),
     )
+
+
+def _normals_of_halves(around: Neighborhoods, offsets: Offsets) -> tuple[Float[Array, "3 n"], Float[Array, "3 n"]]:
+    """Normals of every second neighbour, from the first and from the second on; 0 where these are fewer than three."""
+    present = around.present.astype(offsets[0].dtype)
+    halves = [[array[first::2] for array in (*offsets, present)] for first in (0, 1)]
+    # As one array, which compiles once.
+    covariances = jnp.concatenate([weighted_covariance((x, y, z), weights) for x, y, z, weights in halves], axis=1)
+    enough = jnp.concatenate([jnp.sum(weights, axis=0) >= 3 for *_, weights in halves])
+    first, second = jnp.split(jnp.where(enough, alg.smallest_eigenvector(covariances), 0), 2, axis=1)
+    return first, second
 
 
 def offsets_of(around: Neighborhoods) -> Offsets:

@@ -26,20 +26,31 @@ Basis: TypeAlias = tuple[Float[Array, "3 N"], Float[Array, "3 N"]]
 
 
 def geometry_observability(
-    covariance: Float[Array, "6 N"], normal: Float[Array, "3 N"], basis: Basis, count: Float[Array, "N"]
+    covariance: Float[Array, "6 N"],
+    normal: Float[Array, "3 N"],
+    basis: Basis,
+    count: Float[Array, "N"],
+    halves: tuple[Float[Array, "3 N"], Float[Array, "3 N"]] | None = None,
 ) -> Float[Array, "6 N"]:
-    """Observability from the normal: (1 − tr V) (n nᵀ − V), where V is the covariance of the estimated normal n.
+    """Observability from the normal: (1 − tr V) (P − noise), with the projector P = n nᵀ.
 
-    The eigenvector of the smallest eigenvalue λ₀ of a sample covariance has the variance λ₀ λ / (k (λ − λ₀)²) towards
-    the eigenvector of λ (Anderson 1963). It is large for points on a line, whose normal is undetermined about the line.
-    The saturated form λ₀ λ / (k (λ − λ₀)² + λ₀ λ), used here, is at most 1. The factor 1 − tr V, at least 0,
-    downweights uncertain normals.
+    V is the covariance of the estimated normal n. The eigenvector of the smallest eigenvalue λ₀ of a sample covariance
+    has the variance λ₀ λ / (k (λ − λ₀)²) towards the eigenvector of λ (Anderson 1963). It is large for points on a
+    line, whose normal is undetermined about it. The saturated form λ₀ λ / (k (λ − λ₀)² + λ₀ λ), used here, is at most
+    1. The factor 1 − tr V, at least 0, downweights uncertain normals.
+
+    P and its noise come from the normals of two halves of the neighbours, whose noise is independent: P is the mean
+    (P₁ + P₂) / 2, the noise 3/4 (P₁ − P₂)². With 1/2 it would be unbiased for normals that are nearly right; with 3/4
+    it is unbiased for normals of random directions, too, and exceeds the noise of the others. Where surfaces meet or
+    noise is as large as the spacing of the points, V is smaller than the noise. For covariances without neighbours,
+    P = n nᵀ and the noise is V.
 
     Args:
         covariance: covariance of the neighbours about their mean, metres².
         normal: n, the unit eigenvector of its smallest eigenvalue.
         basis: orthonormal basis of the tangent plane.
         count: k, the number of neighbours.
+        halves: unit normals of both halves of the neighbours.
     """
     smallest = jnp.maximum(jnp.sum(normal * alg.multiply(covariance, normal), axis=0), 0)
     a, b, c = alg.project(covariance, *basis)
@@ -58,7 +69,13 @@ def geometry_observability(
     i, j, k = inverse
     variance = jnp.stack([x * i + y * j, x * j + y * k, y * j + z * k])
     certain = jnp.where(known, jnp.maximum(1 - variance[0] - variance[2], 0), 0)
-    return certain * (alg.outer(normal) - alg.embed(variance, *basis))
+    if halves is None:
+        return certain * (alg.outer(normal) - alg.embed(variance, *basis))
+    # The same by the sum and the difference of the normals, which are orthogonal; their signs do not matter.
+    first, second = halves
+    cosine = jnp.sum(first * second, axis=0)
+    shown = (3 * cosine - 1) * alg.outer(first + second) - (3 * cosine + 1) * alg.outer(first - second)
+    return 0.125 * certain * shown
 
 
 def channel_observability(
