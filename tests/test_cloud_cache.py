@@ -1,14 +1,16 @@
 """Caches stay small, and values computed from a cloud live no longer than the cloud."""
 
+import copy
 import gc
 import threading
 import time
 from concurrent.futures import ThreadPoolExecutor
 
+import jax.numpy as jnp
 import numpy as np
 
 import mcgicp_jax as mcg
-from mcgicp_jax._compute.cache import Cache, cached_with
+from mcgicp_jax._compute.cache import Cache, cached_with_cloud
 from mcgicp_jax._compute.lazy import Lazy
 
 
@@ -55,25 +57,61 @@ def test_a_lazy_value_is_computed_once():
     assert len(calls) == 1
 
 
-def test_two_values_of_each_kind_are_cached_with_a_cloud():
+def test_two_values_of_each_function_are_cached_with_a_cloud():
     cloud, made = mcg.PointCloud(np.eye(3)), []
 
-    def get(kind, key):
-        return cached_with(cloud, kind, key, lambda: made.append(key) or key)
+    def compute(cloud, number):
+        made.append(number)
+        return number
 
-    assert [get("a", key) for key in (1, 2, 1, 2, 3, 1)] == [1, 2, 1, 2, 3, 1]
-    assert made == [1, 2, 3, 1] and get("b", 3) == 3 and made[-1] == 3 and len(made) == 5
-    same = cloud.replace()
-    assert cached_with(same, "a", 1, lambda: "of the other cloud") == "of the other cloud"
+    first, second = cached_with_cloud(compute), cached_with_cloud(lambda cloud, number: compute(cloud, number))
+    assert [first(cloud, number) for number in (1, 2, 1, 2, 3, 1)] == [1, 2, 1, 2, 3, 1]
+    assert made == [1, 2, 3, 1] and second(cloud, 3) == 3 and made[-1] == 3 and len(made) == 5
+    first(cloud.replace(), 1)
+    assert len(made) == 6
+
+
+def test_values_cached_with_a_cloud_are_told_apart_by_all_arguments():
+    cloud, made = mcg.PointCloud(np.eye(3)), []
+    compute = cached_with_cloud(lambda cloud, *arguments, **named: made.append(1))
+    weights = np.array([1.0, 2.0])
+    different = [
+        (mcg.ColorICP(weights),),
+        (mcg.ColorICP(weights[::-1].copy()),),
+        (mcg.MultiChannelGICP(0.1, weights),),
+        (mcg.MultiChannelGICP(0.2, weights),),
+        (mcg.MultiChannelGICP(0.2, weights, photometric=True),),
+        (mcg.KDTreeSearch(workers=1),),
+        (mcg.KDTreeSearch(workers=2),),
+        (mcg.KDTreeSearch(workers=1, backend="scipy"),),
+        (weights,),
+        (weights.astype(np.float32),),
+        (weights[:, None],),
+        (jnp.asarray(weights), None),
+        (None, jnp.asarray(weights)),
+        (1, True),
+        (1.0, True),
+        (1, False),
+        ((mcg.GICP,), True),
+        ((mcg.GICP, mcg.NDT), True),
+    ]
+    for i, arguments in enumerate(different):
+        for _ in range(2):
+            compute(cloud, *copy.deepcopy(arguments))
+            assert len(made) == i + 1, arguments
+    compute(cloud, flag=True), compute(cloud, flag=False)
+    assert len(made) == len(different) + 2
 
 
 def test_a_new_cloud_in_the_place_of_an_old_one_has_no_values():
     """Objects are told apart by identity, which a collected one leaves to others."""
     numbers = set()
+    number = cached_with_cloud(lambda cloud: now)
     for i in range(50):
         cloud = mcg.PointCloud(np.eye(3))
         numbers.add(id(cloud))
-        assert cached_with(cloud, "number", None, lambda i=i: i) == i
+        now = i
+        assert number(cloud) == i
         del cloud
         gc.collect(0)
     assert len(numbers) < 50
