@@ -6,12 +6,25 @@ import threading
 import time
 from concurrent.futures import ThreadPoolExecutor
 
+import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
+import pytest
 
 import mcgicp_jax as mcg
 from mcgicp_jax._compute.cache import Cache, cached_with_cloud
 from mcgicp_jax._compute.lazy import Lazy
+from mcgicp_jax._compute.rows_on_demand import RowsOnDemand
+from mcgicp_jax._methods.surfaces import surface_on_host
+from mcgicp_jax._terms.photometric import Photometric
+from tests.scenes import motion, room_corner
+
+METHOD = mcg.MultiChannelGICP(0.05, 0.3)
+
+
+@pytest.fixture
+def cloud():
+    return mcg.preprocess(mcg.PointCloud(*room_corner(400)))
 
 
 def test_the_least_recently_used_are_evicted_by_size():
@@ -115,3 +128,79 @@ def test_a_new_cloud_in_the_place_of_an_old_one_has_no_values():
         del cloud
         gc.collect(0)
     assert len(numbers) < 50
+
+
+def surface_of(cloud, kinds, observed, method=METHOD):
+    """What the surface of a cloud has beyond points and covariances, and the covariances."""
+    surface = surface_on_host(method, kinds, cloud, True, observed, 1)
+    return set(surface.columns), surface.observability is not None, surface.covariance
+
+
+def test_surfaces_of_a_cloud_have_what_was_asked_for(cloud):
+    """One after the other, as the cost of matches, a registration and photometric terms ask for them."""
+    wanted = [((), False), ((), True), ((Photometric,), True), ((Photometric,), False)]
+    for kinds, observed in wanted * 2:
+        columns, observability, _ = surface_of(cloud, kinds, observed)
+        assert columns == {kind.name for kind in kinds} and observability == observed
+    other = surface_of(cloud, (), True, mcg.MultiChannelGICP(0.5, 0.3))[2]
+    assert np.abs(other - surface_of(cloud, (), True)[2]).max() > 0.01
+
+
+def test_a_registration_after_the_cost_of_its_matches_is_that_of_new_clouds(cloud):
+    def directions(before):
+        source, target = cloud.replace(), cloud.replace()
+        if before:
+            matches = mcg.find_correspondences(source, target, None, METHOD, max_distance=0.2)
+            mcg.mahalanobis_cost(np.eye(4), source, target, matches, METHOD)
+        return mcg.register(source, target, METHOD, max_distance=0.2).directions.twists
+
+    np.testing.assert_array_equal(directions(True), directions(False))
+
+
+class Shifted(mcg.KDTreeSearch):
+    """Finds what is nearest to a place beside each point."""
+
+    shift: float = eqx.field(static=True, default=0.0)
+
+    def index(self, target):
+        return super().index(target._replace(points=target.points + np.float32(self.shift)))
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        [{"method": mcg.MultiChannelGICP(variance, 0.3)} for variance in (1e-4, 1.0)],
+        [{"method": mcg.MultiChannelGICP(0.05, weight)} for weight in (0.01, 0.3)],
+        [{"method": METHOD, "search": Shifted(shift=shift)} for shift in (0.0, 0.2)],
+        [{"method": METHOD, "search": search} for search in (mcg.KDTreeSearch(), Shifted(shift=0.2))],
+    ],
+    ids=["missing variances", "weights", "number of a search", "type of a search"],
+)
+def test_matches_of_a_cloud_are_those_of_a_new_one(cloud, arguments):
+    known = np.random.default_rng(1).random(cloud.channels.shape) < 0.7
+    source, target = cloud.replace(channel_valid=known[::-1]), cloud.replace(channel_valid=known)
+
+    def rows(target, given):
+        return mcg.find_correspondences(source, target, motion(), max_distance=1.0, **given).indices
+
+    found = [rows(target, given) for given in arguments]
+    assert np.any(found[0] != found[1])
+    for given, each in zip(arguments, found, strict=True):
+        np.testing.assert_array_equal(each, rows(target.replace(), given))
+
+
+def test_rows_are_computed_once_by_threads_that_share_a_table():
+    computed = []
+
+    def compute(rows, _):
+        rows = np.arange(20) if rows is None else rows
+        time.sleep(0.02)
+        computed.extend(rows.tolist())
+        return 10 * rows
+
+    table = RowsOnDemand(compute, 20)
+    wanted = [np.arange(k, k + 10) for k in (0, 5, 0, 10, 5, 3, 0, 10)]
+    with ThreadPoolExecutor(len(wanted)) as threads:
+        found = list(threads.map(table.rows, wanted))
+    np.testing.assert_array_equal(found, 10 * np.array(wanted))
+    assert sorted(computed) == list(range(20))
