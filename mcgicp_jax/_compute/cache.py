@@ -12,7 +12,8 @@ from typing import Any, ParamSpec, TypeVar
 import jax
 import numpy as np
 
-Value, Parameters = TypeVar("Value"), ParamSpec("Parameters")
+Value = TypeVar("Value")
+Parameters = ParamSpec("Parameters")
 
 # Total number of rows of the clouds or trees in a cache: hundreds of scans, some hundred megabytes.
 MAX_ROWS = 2_000_000
@@ -76,7 +77,7 @@ def cached_with_cloud(compute: Callable[Parameters, Value]) -> Callable[Paramete
         cloud, *rest = arguments
         leaves, structure = jax.tree.flatten((rest, named))
         key = (structure, *map(_by_value, leaves))
-        with_cloud: _CachedWithCloud = _clouds.get(id(cloud), partial(_CachedWithCloud, cloud))
+        with_cloud = _clouds.get(id(cloud), partial(_CachedWithCloud, cloud))
         values = with_cloud.values.setdefault(compute, Cache(_VALUES_PER_FUNCTION))
         return values.get(key, lambda: compute(*arguments, **named))
 
