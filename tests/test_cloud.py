@@ -106,6 +106,36 @@ def test_what_is_missing_has_no_gradient():
     np.testing.assert_array_equal(gradient, np.asarray(cloud.channel_valid, float))
 
 
+@pytest.mark.parametrize("dtype", [np.float32, np.float64, np.int16])
+def test_masked_arrays_keep_their_mask(dtype):
+    """The data under a mask is arbitrary, often a fill value such as 9999."""
+    masked, known = np.arange(150) % 10 == 3, partial()
+    points, channels = (100 * POINTS).astype(dtype), (100 * CHANNELS).astype(dtype)
+    coordinate = np.column_stack([np.zeros(150, bool), masked, np.zeros(150, bool)])
+    hidden = np.ma.masked_array(np.where(coordinate, 9999, points).astype(dtype), coordinate)
+    values = np.ma.masked_array(channels, ~known)
+    cloud = PointCloud(hidden, values)
+    assert cloud.points.dtype == (np.float64 if dtype == np.int16 else dtype)
+    np.testing.assert_array_equal(cloud.points, np.where(coordinate, np.nan, points))
+    np.testing.assert_array_equal(cloud.channel_valid, known)
+    np.testing.assert_array_equal(cloud.channels, np.where(known, channels, 0))
+    with pytest.warns(UserWarning, match="left out 15 of 150 points"):
+        assert len(preprocess(cloud, None)) == 135
+    # With another mask, in a vector, in its replacement, without any masked value, and in a cloud of another library.
+    both = PointCloud(points, values, channel_valid=np.ma.masked_array(np.ones((150, 2), bool), partial(1)))
+    np.testing.assert_array_equal(both.channel_valid, known & ~partial(1))
+    np.testing.assert_array_equal(PointCloud(points, values[:, 0]).channel_valid, known[:, :1])
+    replaced = PointCloud(points, channels, channel_valid=~partial(1)).replace(channels=values)
+    np.testing.assert_array_equal(replaced.channel_valid, known & ~partial(1))
+    np.testing.assert_array_equal(replaced.channels, np.where(known & ~partial(1), channels, 0))
+    assert PointCloud(np.ma.masked_array(points), np.ma.masked_array(channels)).channel_valid is None
+    np.testing.assert_array_equal(PointCloud(Foreign(hidden)).points, cloud.points)
+    structured = np.ma.masked_array(np.zeros(5, [(axis, dtype) for axis in "xyz"]))
+    structured["x"] = np.ma.masked
+    with pytest.raises(ValueError, match="points: expected no masked fields in a structured array"):
+        PointCloud(structured)
+
+
 @pytest.mark.parametrize("size", [150, 160, 333])
 def test_unpad_undoes_pad(size):
     cloud = raw(covariances=covariances(), channel_valid=partial())

@@ -55,6 +55,52 @@ def test_a_soft_assignment_has_gradients_by_weights_and_temperature(clouds):
     assert gradient["method"].channel_weights != 0 and gradient["temperature"] != 0
 
 
+@pytest.mark.parametrize("of", ["register", "register_batch", "estimate_pose", "mahalanobis_cost"])
+def test_origins_of_both_clouds(of, clouds):
+    """Poses in the user's frame depend on the origins, and so does the cost of a pose; as inside `jit`."""
+    method, origins = mcg.PointToPoint(), (np.array([30.0, -20, 10]), np.array([10.0, 40, -20]))
+    inputs = dict(zip(("source origin", "target origin"), map(jnp.asarray, origins), strict=True))
+    inputs |= {"source points": clouds[0].points}
+    there = clouds_with(inputs, *clouds)
+    init = motion()
+    init[:3, 3] += origins[1] - init[:3, :3] @ origins[0]
+    matches = mcg.find_correspondences(*there, init, method, max_distance=GATE)
+    options = {"init": init, **TO_ROUNDING}
+    # Away from the minimum of the cost, so that its gradient is not 0.
+    pose = init @ np.asarray(jaxlie.SE3.exp(jnp.full(6, 0.01)).as_matrix())
+
+    def loss(inputs):
+        pair = clouds_with(inputs, *clouds)
+        if of == "mahalanobis_cost":
+            return mcg.mahalanobis_cost(pose, *pair, matches, method)
+        if of == "estimate_pose":
+            result = mcg.estimate_pose(*pair, matches, method, **options)
+        elif of == "register_batch":
+            (result,) = mcg.register_batch([pair[0]], [pair[1]], method, init=[init], max_distance=GATE, **TO_ROUNDING)
+        else:
+            result = mcg.register(*pair, method, max_distance=GATE, **options)
+        assert "RegistrationResult(" in repr(result)
+        return weigh(result.matrix) + weigh(result.T_target_source.as_matrix()[::-1])
+
+    gradient = check_eager_gradient(loss, inputs)
+    if of in ("estimate_pose", "mahalanobis_cost"):
+        inside = jax.jit(jax.grad(loss))(inputs)
+        for name, expected in inside.items():
+            np.testing.assert_allclose(gradient[name], expected, rtol=1e-6, atol=1e-9 * np.abs(expected).max())
+
+
+def test_a_zero_origin_of_a_raw_cloud_has_a_gradient(clouds):
+    """As `eqx.filter_grad` by a cloud has it: to move the origin is to move all points."""
+    source, target = (mcg.PointCloud(cloud.points) for cloud in clouds)
+    target = mcg.preprocess(target, None)
+
+    def loss(origin):
+        cloud = mcg.preprocess(source.replace(origin=origin), None)
+        return weigh(mcg.register(cloud, target, mcg.PointToPoint(), max_distance=GATE, **TO_ROUNDING).matrix)
+
+    check_eager_gradient(lambda inputs: loss(inputs["origin"]), {"origin": jnp.zeros(3)})
+
+
 @pytest.mark.slow
 def test_the_photometric_term_has_the_gradient_of_jit(clouds):
     """Its scales are constants to autodiff, which differences would see."""

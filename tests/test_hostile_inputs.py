@@ -1,6 +1,7 @@
 """Whatever comes in, there is an error that names it or an outcome that can be believed; and it stays as it was."""
 
 import copy
+import itertools
 import re
 import warnings
 from functools import partial
@@ -14,6 +15,7 @@ from hypothesis import strategies as st
 import mcgicp_jax as mcg
 from mcgicp_jax import Status
 from mcgicp_jax._local_geometry.spacing_and_noise import point_spacing
+from mcgicp_jax._registration.input_checks import warn_of_lengths
 from mcgicp_jax.metrics import pose_error
 from tests.scenes import motion, pair, room_corner
 
@@ -246,6 +248,59 @@ def test_warnings_name_the_cloud_and_show_the_line_of_the_caller():
     assert texts == ["source:", "target:", "pair 0: source:", "pair 0: target:"]
     # Run-time checks of annotations wrap each function of the package.
     assert all(each.filename == __file__ or "jaxtyping" in each.filename for each in caught)
+
+
+OTHER_UNIT = r"points: the source extends over .* with a spacing of .*, the target over .*; are both in the same unit"
+
+
+@pytest.mark.parametrize("unit", [1e-3, 1e3, 1e2])
+def test_different_units_of_length_are_warned_of(unit):
+    """Of raw and preprocessed clouds, cells, and of one pair in a batch, which the warning names."""
+    points = room_corner(600)[0]
+    source, target = points * unit, room_corner(600, seed=1)[0]
+    ready = [mcg.preprocess(each) for each in (source, target)]
+    cells = [mcg.voxel_gaussians(each, 0.3 * size) for each, size in ((source, unit), (target, 1))]
+    once = {"max_distance": 0.5, "max_iterations": 1}
+    for clouds, method in (((source, target), mcg.GICP()), (ready, mcg.GICP()), (cells, mcg.D2DNDT())):
+        with pytest.warns(UserWarning, match=rf"^{OTHER_UNIT}"):
+            mcg.register(*clouds, method, **once)
+    extent = np.ptp(points, axis=0).max()
+    with pytest.warns(UserWarning) as caught:
+        mcg.register_batch([target, *ready[:1]], [target, *ready[1:]], mcg.GICP(), **once)
+        mcg.register_batch([target, source], target, mcg.GICP(), search=mcg.DenseSearch(), **once)
+    texts = [str(each.message) for each in caught if "same unit" in str(each.message)]
+    assert len(texts) == 2 and all(re.match(f"pair 1: {OTHER_UNIT}", text) for text in texts)
+    for text in texts:
+        first, second = (float(number) for number in re.findall(r"over (\S+) with", text))
+        assert first / unit == pytest.approx(extent, rel=0.2) and second == pytest.approx(extent, rel=0.2)
+
+
+def test_clouds_of_one_unit_may_differ(recwarn):
+    """A small part of a map, a thinned cloud, and no cloud at all."""
+    source, target = np.tile(room_corner(20_000)[0], (2, 1)), room_corner(200, seed=1)[0]
+    part = source[np.linalg.norm(source, axis=1) < 0.06]
+    far = np.vstack([source, np.full((10, 3), 1e6), np.full((10, 3), np.nan), np.full((10, 3), 1e300)])
+    for clouds in ((part, source), (source, part), (source, target), (far, target), (target, target[:0])):
+        warn_of_lengths(*map(mcg.PointCloud, clouds))
+    assert not recwarn
+
+
+def test_real_clouds_of_one_scene_are_in_one_unit(data, recwarn):
+    """A scan against a map, thinned, in voxels, and in parts."""
+    scans = [mcg.io.read(data / f"kitti/sequences/04/velodyne/{i:06d}.bin").points for i in (0, 4, 8)]
+    ways = [[scans[0], np.concatenate(scans)]]
+    ways += [[mcg.io.read(data / f"lidar_pair/{side}.ply").points for side in ("source", "target")]]
+    for scan, whole in ways:
+        forms = [scan, scan[::8], scan[scan[:, 0] > np.quantile(scan[:, 0], 0.9)], whole]
+        clouds = [mcg.PointCloud(form) for form in forms]
+        clouds += [mcg.preprocess(whole, size) for size in (0.2, 1.0)]
+        for source, target in itertools.permutations(clouds, 2):
+            warn_of_lengths(source, target)
+            lengths = source.replace_rows(points=source.points * 1e-3), target
+            if source.deferred_neighbors is None:
+                with pytest.warns(UserWarning, match="same unit"):
+                    warn_of_lengths(*lengths)
+    assert not recwarn
 
 
 def test_more_neighbors_than_points():

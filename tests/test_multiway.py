@@ -8,7 +8,7 @@ import pytest
 import mcgicp_jax as mcg
 from mcgicp_jax import datasets, io, metrics
 from mcgicp_jax.__main__ import main
-from mcgicp_jax._math.twists import exponential
+from mcgicp_jax._math.twists import exponential, logarithm
 from mcgicp_jax._registration.options import Options
 from mcgicp_jax._sequences import loop_closure as _loops
 from mcgicp_jax._sequences import multiway as _multiway
@@ -138,6 +138,29 @@ def test_loops_that_agree_with_the_path_do_not_optimize_all_poses(monkeypatch):
     graph = found.graph()
     assert graph.edges.uncertain.sum() > 20 and len(sizes) <= 12
     assert np.linalg.norm(pose[:3, 3] - truth[-1, :3, 3]) < 0.1
+
+
+def test_a_loop_moves_the_last_pose_to_that_of_all_edges(monkeypatch):
+    """As certain as the path in some directions, and correlated: the pose between the two is that of least squares."""
+    monkeypatch.setattr(_loops, "optimize_poses", None)
+    rng, found = np.random.default_rng(0), trajectory(2)
+    roots = rng.normal(size=(2, 6, 6)) * [1, 3, 0.3, 1, 3, 0.3]
+    informations = [1e4 * np.linalg.inv(root @ root.T + np.eye(6)) for root in roots]
+    moved = np.linalg.inv(found._poses[0]) @ found._poses[1]
+    path, loop = (
+        mcg.Edge(0, 1, moved @ exponential(twist), information, uncertain=uncertain)
+        for twist, information, uncertain in zip(
+            (np.zeros(6), np.full(6, 1e-3)), informations, (False, True), strict=True
+        )
+    )
+    expected = mcg.optimize_poses(mcg.PoseGraph(found._poses, [path, loop]), robust=False).poses[1]
+    found._connect(path)
+    before, found._optimized = found._poses[-1].copy(), 100
+    found._close(loop, found._covariances[0])
+    correction = logarithm(np.linalg.inv(before) @ expected)
+    assert np.abs(correction).max() > 1e-4
+    change = logarithm(np.linalg.inv(before) @ found._poses[-1])
+    np.testing.assert_allclose(change, correction, atol=0.01 * np.abs(correction).max())
 
 
 def test_loops_close_with_cells(room):

@@ -2,6 +2,7 @@
 
 import jax
 import jax.numpy as jnp
+import jaxlie
 import numpy as np
 import pytest
 import scipy.optimize
@@ -12,6 +13,8 @@ from mcgicp_jax._math import symmetric_matrices as cov
 from mcgicp_jax._pose_solver import update as _solve
 from mcgicp_jax._pose_solver.matched import Matched, Motion
 from mcgicp_jax._pose_solver.sums import sums_of
+from mcgicp_jax._registration.result import Status
+from mcgicp_jax._registration.step import COARSE, RUNNING, SETTLED, Settings, update
 from mcgicp_jax._terms.base import AbstractTerm, linearize_residual
 from tests.precision import in_both_precisions, tolerance
 
@@ -101,6 +104,20 @@ def test_information_is_the_sum_of_jacobians(scale):
     actual = np.asarray(update.information, float) * np.outer(lengths * units, lengths * units)
     expected = expected * np.outer(units, units)
     np.testing.assert_allclose(actual, expected, atol=np.abs(expected).max() * tolerance(1e-5, 1e-12))
+
+
+@pytest.mark.parametrize("before", [COARSE, RUNNING, SETTLED])
+@pytest.mark.parametrize("count", [0, 1, 3, 4])
+def test_too_few_matches_go_before_convergence(before, count):
+    """The last update may move matches beyond `max_distance`: three determine a pose, but one not to be believed."""
+    moved, residual, information, weight, _ = random_pairs(3, noise=0.0)
+    measured, _ = solve(moved, 0 * residual, information, weight, np.arange(N) < count)
+    number = measured.center.dtype.type
+    settings = Settings(*map(number, (0.5, 0.5)), np.int32(1), *map(number, [1e-3] * 4), np.int32(9), np.bool_(True))
+    start = jaxlie.SE3(jnp.array([1, 0, 0, 0, 0, 0, 0], number))
+    status = update(start, np.int32(before), np.int32(1), measured, settings).status
+    enough = {COARSE: RUNNING, RUNNING: SETTLED, SETTLED: Status.CONVERGED}
+    assert status == (enough[before] if count >= 4 else Status.TOO_FEW_CORRESPONDENCES)
 
 
 def test_exact_pairs_need_no_second_update():

@@ -40,8 +40,7 @@ def centred_pose(pose: Pose | None, source: PointCloud, target: PointCloud, name
 def pose_in_user_frame(
     centred: jaxlie.SE3, source_origin: Array | np.ndarray, target_origin: Array | np.ndarray
 ) -> Array | np.ndarray:
-    """T(o_t) · T · T(−o_s) as (4, 4), with translations T(o) by the origins, which are constants outside `jit`; float64
-    NumPy for concrete arrays."""
+    """T(o_t) · T · T(−o_s) as (4, 4), with translations T(o) by the origins; float64 NumPy for concrete arrays."""
     values = primal((centred.wxyz_xyz, source_origin, target_origin))
     if not is_concrete(values):
         return _in_user_frame(centred, source_origin, target_origin)
@@ -50,15 +49,16 @@ def pose_in_user_frame(
     rotation = rotation_from_quaternion(parameters[..., :4])
     matrix = matrices_of(parameters)
     matrix[..., :3, 3] += end - start - np.einsum("...ij,...j->...i", rotation - np.eye(3), start)
-    if is_concrete(centred):
+    inputs = [centred.wxyz_xyz, source_origin, target_origin]
+    if is_concrete(inputs):
         return matrix
-    derivative = _MatrixByParameters(parameters, rotation, start)
-    (traced,) = with_derivative([matrix.astype(centred.wxyz_xyz.dtype)], derivative, [centred.wxyz_xyz])
+    derivative = _InUserFrame(parameters, rotation, start)
+    (traced,) = with_derivative([matrix.astype(centred.wxyz_xyz.dtype)], derivative, inputs)
     return traced
 
 
-class _MatrixByParameters(AbstractLinearMap):
-    """The derivative of `pose_in_user_frame` by `wxyz_xyz`, which compiles nothing.
+class _InUserFrame(AbstractLinearMap):
+    """The derivative of `pose_in_user_frame` by `wxyz_xyz` and both origins, which compiles nothing.
 
     Args:
         parameters, rotation: of the pose.
@@ -67,17 +67,20 @@ class _MatrixByParameters(AbstractLinearMap):
 
     def __init__(self, parameters: np.ndarray, rotation: np.ndarray, start: np.ndarray):
         turn = turn_by_quaternion(parameters[..., :4])
-        self._slopes = np.zeros((*parameters.shape[:-1], 4, 4, 7))
+        by_pose, by_source, by_target = (np.zeros((*parameters.shape[:-1], 4, 4, n)) for n in (7, 3, 3))
         turned = np.cross(turn[..., :, None, :], rotation[..., None], axisa=-3, axisb=-3, axisc=-3)
-        self._slopes[..., :3, :3, :4] = turned
-        self._slopes[..., :3, 3, :4] = -np.einsum("...ijp,...j->...ip", turned, start)
-        self._slopes[..., :3, 3, 4:] = np.eye(3)
+        by_pose[..., :3, :3, :4] = turned
+        by_pose[..., :3, 3, :4] = -np.einsum("...ijp,...j->...ip", turned, start)
+        by_pose[..., :3, 3, 4:] = by_target[..., :3, 3, :] = np.eye(3)
+        by_source[..., :3, 3, :] = -rotation
+        self._slopes = by_pose, by_source, by_target
 
     def push(self, tangents: Sequence[np.ndarray], moving: tuple[int, ...]) -> list[np.ndarray]:
-        return [np.einsum("...ijp,m...p->m...ij", self._slopes, tangents[0])]
+        each = zip(moving, tangents, strict=True)
+        return [sum(np.einsum("...ijp,m...p->m...ij", self._slopes[i], tangent) for i, tangent in each)]
 
     def pull(self, cotangents: Sequence[np.ndarray], moving: tuple[int, ...]) -> list[np.ndarray]:
-        return [np.einsum("...ijp,m...ij->m...p", self._slopes, cotangents[0])]
+        return [np.einsum("...ijp,m...ij->m...p", self._slopes[i], cotangents[0]) for i in moving]
 
 
 @jax.jit

@@ -18,7 +18,7 @@ def arrays_of(points: Any) -> tuple[Any, Any, Sequence[str] | None]:
     it is.
 
     Raises:
-        ValueError: if it is a path, a `PointCloud`, or an object without points.
+        ValueError: if it is a path, a `PointCloud`, an object without points, or a structured array with masked fields.
     """
     if isinstance(points, str | os.PathLike):
         raise ValueError(f"points: expected coordinates, got a path; mcgicp_jax.io.read({str(points)!r}) reads a file")
@@ -26,12 +26,14 @@ def arrays_of(points: Any) -> tuple[Any, Any, Sequence[str] | None]:
     if fields is not None:
         if not {"x", "y", "z"} <= {field.lower() for field in fields}:
             raise ValueError(f"points: expected the fields x, y and z, got {', '.join(fields)}")
+        if any(np.ma.getmaskarray(points)[field].any() for field in fields):
+            raise ValueError("points: expected no masked fields in a structured array; pass points and channels apart")
         flat = np.asarray(points).reshape(-1)
         return arrays_of_columns(with_unpacked_colors({name: flat[name] for name in fields if flat[name].ndim == 1}))
     if hasattr(points, "points") and not isinstance(points, np.ndarray | jax.Array):
         if hasattr(points, "channels"):
             raise ValueError("points: expected coordinates, got a PointCloud; use it as it is, or PointCloud.replace")
-        coordinates, colors = np.asarray(points.points), np.asarray(getattr(points, "colors", ()))
+        coordinates, colors = np.asanyarray(points.points), np.asanyarray(getattr(points, "colors", ()))
         # An uncoloured cloud of Open3D has colours of shape (0, 3).
         colored = colors.shape == coordinates.shape and len(colors) > 0
         return coordinates, *((colors, COLORS) if colored else (None, None))

@@ -39,7 +39,7 @@ def is_far(offset: Float[np.ndarray, "3"], size: float) -> bool:
     return bool(np.linalg.norm(offset) > _FAR * size)
 
 
-def _as_float(name: str, values: Values) -> Any:
+def _as_float(name: str, values: Any) -> Any:
     """Convert to a floating-point array. NumPy input stays NumPy: float64 is needed until the origin is subtracted."""
     if isinstance(values, jax.Array):
         if jnp.issubdtype(values.dtype, jnp.complexfloating):
@@ -51,7 +51,8 @@ def _as_float(name: str, values: Values) -> Any:
         raise ValueError(f"{name}: expected numbers in a rectangular array, got rows of unequal length") from error
     if array.dtype.kind not in "fiub":
         raise ValueError(f"{name}: expected real numbers, got dtype {array.dtype}")
-    return array if array.dtype in (np.float32, np.float64) else array.astype(np.float64)
+    array = array if array.dtype in (np.float32, np.float64) else array.astype(np.float64)
+    return np.where(np.ma.getmaskarray(values), np.nan, array) if np.ma.is_masked(values) else array
 
 
 def _advice(shape: tuple[int, ...]) -> str:
@@ -63,7 +64,7 @@ def _advice(shape: tuple[int, ...]) -> str:
 
 def _as_mask(values: Values, shape: tuple[int, ...]) -> Any:
     """Check `channel_valid` against the shape of the channels; a single channel may have a 1-D mask."""
-    mask = values if isinstance(values, jax.Array) else np.asarray(values)
+    mask = values if isinstance(values, jax.Array) else np.ma.filled(values, False)
     if mask.dtype != bool:
         raise ValueError(f"channel_valid: expected booleans, got dtype {mask.dtype}")
     if mask.shape == shape[:-1] and shape[-1] == 1:
@@ -71,6 +72,15 @@ def _as_mask(values: Values, shape: tuple[int, ...]) -> Any:
     if mask.shape != shape:
         raise ValueError(f"channel_valid: expected shape {shape} to go with channels, got {mask.shape}")
     return mask
+
+
+def _without_masked(channels: Any, channel_valid: Values | None, shape: tuple[int, ...]) -> Any:
+    """`channel_valid` for channels of this shape, False where the array is masked; None if nothing is missing."""
+    valid = None if channel_valid is None else _as_mask(channel_valid, shape)
+    if not np.ma.is_masked(channels):
+        return valid
+    known = ~np.ma.getmaskarray(channels).reshape(shape)
+    return known if valid is None else known & valid
 
 
 def _blank(channels: Any, channel_valid: Any) -> Any:
@@ -111,7 +121,9 @@ class PointCloud(eqx.Module):
     A cloud built from arrays is *raw*; `preprocess` returns one that is ready to register, with neighbours. Both hold
     NumPy arrays with one row per point. Quantities derived from a cloud are cached while the cloud is in use, so do
     not modify its arrays in place. To exchange values, such as channels computed by a network, use
-    `cloud.replace(channels=...)`. Rows that are not `valid` are padding (see `pad`) and are ignored everywhere.
+    `cloud.replace(channels=...)`. Rows that are not `valid` are padding (see `pad`) and are ignored everywhere. In
+    masked arrays of NumPy, a masked coordinate is NaN, so that `preprocess` leaves the point out, and a masked channel
+    is not valid.
 
     Attributes:
         points: (N, 3), metres, relative to `origin` (0 for raw clouds); see `coordinates`.
@@ -180,9 +192,8 @@ class PointCloud(eqx.Module):
             self.channels = self.channels[:, None]
         if self.channels.ndim != 2 or self.channels.shape[0] != size:
             raise ValueError(f"channels: expected shape ({size}, C) to go with points, got {self.channels.shape}")
-        self.channel_valid = None
-        if channel_valid is not None:
-            self.channel_valid = _as_mask(channel_valid, np.shape(self.channels))
+        self.channel_valid = _without_masked(channels, channel_valid, np.shape(self.channels))
+        if self.channel_valid is not None:
             self.channels = _blank(self.channels, self.channel_valid)
         self.covariances = None if covariances is None else _as_float("covariances", covariances)
         if self.covariances is not None and self.covariances.shape != (size, 3, 3):
@@ -219,6 +230,7 @@ class PointCloud(eqx.Module):
             "covariances": (*np.shape(self.points), 3),
             "origin": np.shape(self.origin),
         }
+        given: Any = arrays.get("channels")
         for name in arrays.keys() & {"points", "channels", "covariances"}:
             if arrays[name] is not None:
                 array, dtype = _as_float(name, arrays[name]), self.points.dtype
@@ -226,6 +238,9 @@ class PointCloud(eqx.Module):
                 dtype = dtype if isinstance(array, np.ndarray) else jax.dtypes.canonicalize_dtype(dtype)
                 # Of traced arrays, even a conversion to the same dtype would be compiled.
                 arrays[name] = array if array.dtype == dtype else array.astype(dtype)
+        if np.ma.is_masked(given):
+            valid = arrays.get("channel_valid", self.channel_valid)
+            arrays["channel_valid"] = _without_masked(given, valid, np.shape(given))
         for name, value in arrays.items():
             expected = shapes.get(name, np.shape(value))
             if np.shape(value) != expected and not (name == "covariances" and value is None):

@@ -98,6 +98,9 @@ def _differentiable(cloud: PointCloud, found: PointCloud, fixed: PointCloud) -> 
     arrays: dict[str, Any] = {}
     for name in ("points", "channels", "covariances"):
         array = getattr(cloud, name)
+        if name == "points" and not is_concrete(cloud.origin):
+            # The sum is what was averaged; the origin of the result is a constant.
+            array = array + cloud.origin
         if not is_concrete(array):
             known = (
                 np.ones((len(rows), 1))

@@ -97,8 +97,13 @@ def voxels_for(voxel_size: VoxelSize | Voxels, *clouds: PointCloud) -> Voxels:
 
 def map_voxel_size(cloud: PointCloud) -> float:
     """The voxel size of a map from its first cloud, metres: that of the cloud, or the spacing of its points."""
-    size, points = voxels_for("auto", cloud).size, _finite_columns(cloud).T
-    return size or (len(points) > 1 and _shape_of(points).spacing) or 1.0
+    return voxels_for("auto", cloud).size or raw_spacing(cloud) or 1.0
+
+
+def raw_spacing(cloud: PointCloud) -> float:
+    """Median distance of the nearest neighbour of some of the finite points, metres; 0 if there is only one."""
+    points = _finite_columns(cloud).T
+    return _shape_of(points).spacing if len(points) > 1 else 0.0
 
 
 def warn_of_shape(cloud: PointCloud) -> None:

@@ -6,15 +6,19 @@ import collections
 import threading
 import weakref
 from collections.abc import Callable, Hashable
-from functools import partial
-from typing import Any, TypeVar
+from functools import partial, wraps
+from typing import Any, ParamSpec, TypeVar
+
+import jax
+import numpy as np
 
 Value = TypeVar("Value")
+Parameters = ParamSpec("Parameters")
 
 # Total number of rows of the clouds or trees in a cache: hundreds of scans, some hundred megabytes.
 MAX_ROWS = 2_000_000
-# Number of values cached per cloud and kind, such as its surfaces for two methods.
-_VALUES_PER_KIND = 2
+# Number of values of a function cached per cloud, such as its surfaces for two methods.
+_VALUES_PER_FUNCTION = 2
 
 
 class Cache:
@@ -54,16 +58,34 @@ class _CachedWithCloud:
         # Refers to the identity, not to the cloud.
         drop = partial(_clouds.drop, id(cloud))
         self.alive = weakref.ref(cloud, lambda _: drop())
-        self.kinds: dict[str, Cache] = {}
+        self.values: dict[Callable[..., Any], Cache] = {}
 
 
 _clouds = Cache(MAX_ROWS, lambda cached: cached.num_rows)
 
 
-def cached_with(cloud: Any, kind: str, key: Hashable, make: Callable[[], Value]) -> Value:
-    """The value cached for this cloud (by identity), kind and key, or else the result of `make`, which is then cached.
+def cached_with_cloud(compute: Callable[Parameters, Value]) -> Callable[Parameters, Value]:
+    """Decorator of functions whose first argument is a cloud. The key of a result is the cloud, by identity, and all
+    other arguments, pytrees that are compared by value: nothing that the result depends on can be missing in it.
 
-    Values live no longer than their cloud, any object with `points` that can be referenced weakly.
+    Values live no longer than their cloud, any object with `points` that can be referenced weakly, unless they refer to
+    it themselves.
     """
-    cached = _clouds.get(id(cloud), partial(_CachedWithCloud, cloud))
-    return cached.kinds.setdefault(kind, Cache(_VALUES_PER_KIND)).get(key, make)
+
+    @wraps(compute)
+    def cached(*arguments: Parameters.args, **named: Parameters.kwargs) -> Value:
+        cloud, *rest = arguments
+        leaves, structure = jax.tree.flatten((rest, named))
+        key = (structure, *map(_by_value, leaves))
+        with_cloud = _clouds.get(id(cloud), partial(_CachedWithCloud, cloud))
+        values = with_cloud.values.setdefault(compute, Cache(_VALUES_PER_FUNCTION))
+        return values.get(key, lambda: compute(*arguments, **named))
+
+    return cached
+
+
+def _by_value(leaf: Any) -> Hashable:
+    if not isinstance(leaf, np.ndarray | np.generic | jax.Array | bool | int | float):
+        return leaf
+    array = np.asarray(leaf)
+    return array.dtype.str, array.shape, array.tobytes()

@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float
 
 from mcgicp_jax._clouds.point_cloud import PointCloud
-from mcgicp_jax._compute.cache import cached_with
+from mcgicp_jax._compute.cache import cached_with_cloud
 from mcgicp_jax._compute.concrete import AnyArray, constant, numpy_for
 from mcgicp_jax._compute.messages import warn
 from mcgicp_jax._local_geometry.spacing_and_noise import known_values
@@ -28,7 +28,7 @@ _OTHER_EXPOSURE = 1.5
 
 def warn_of_units(source: PointCloud, target: PointCloud) -> None:
     """Warn of channels whose values differ so much between two concrete clouds that their units probably differ."""
-    ranges = [cached_with(cloud, "ranges", None, partial(_ranges, cloud)) for cloud in (source, target)]
+    ranges = [_ranges(cloud) for cloud in (source, target)]
     for name, (low, high), (first, last) in zip(source.channel_names, *ranges, strict=False):
         narrow, wide = sorted([high - low, last - first])
         if high < first or last < low or wide > _OTHER_UNIT * narrow > 0:
@@ -40,7 +40,7 @@ def warn_of_units(source: PointCloud, target: PointCloud) -> None:
 
 def warn_of_exposure(source: PointCloud, target: PointCloud, matches: Callable[[], Correspondences]) -> None:
     """Warn of channels that differ by a gain between matched points; these are sought if the ranges differ as much."""
-    ranges = [cached_with(cloud, "ranges", None, partial(_ranges, cloud)) for cloud in (source, target)]
+    ranges = [_ranges(cloud) for cloud in (source, target)]
     widths = [sorted([high - low, last - first]) for (low, high), (first, last) in zip(*ranges, strict=False)]
     if not any(_OTHER_EXPOSURE * narrow < wide <= _OTHER_UNIT * narrow for narrow, wide in widths):
         return
@@ -54,6 +54,7 @@ def warn_of_exposure(source: PointCloud, target: PointCloud, matches: Callable[[
             )
 
 
+@cached_with_cloud
 def _ranges(cloud: PointCloud) -> list[tuple[float, float]]:
     """The 5 and 95 % quantiles of a sample of each channel; NaN if no point has the channel."""
     rows, counts = sampled_rows(np.asarray(cloud.valid))

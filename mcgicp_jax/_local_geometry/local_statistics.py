@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from mcgicp_jax._clouds.point_cloud import PointCloud
-from mcgicp_jax._compute.cache import cached_with
+from mcgicp_jax._compute.cache import cached_with_cloud
 from mcgicp_jax._compute.concrete import is_concrete
 from mcgicp_jax._compute.packing import Packed
 from mcgicp_jax._compute.rows_on_demand import RowsOnDemand, in_blocks
@@ -70,21 +70,18 @@ def local_geometry_on_host(
     return (table.known(None, num_threads) if among is None else table.rows(among, num_threads)).tree
 
 
+@cached_with_cloud
 def geometry_table(cloud: PointCloud, with_channels: bool) -> RowsOnDemand[Packed[LocalGeometry]]:
     """Local geometry of a concrete cloud, cached with the cloud."""
+    neighbors, gather = check_neighbors(cloud), gatherer(cloud, with_channels, np)
+    size = cloud.points.shape[0]
 
-    def make() -> RowsOnDemand[Packed[LocalGeometry]]:
-        neighbors, gather = check_neighbors(cloud), gatherer(cloud, with_channels, np)
-        size = cloud.points.shape[0]
+    def compute(rows: Any, num_threads: int | None) -> Packed[LocalGeometry]:
+        # Neighbours are found of all rows at once.
+        neighbors[slice(None) if rows is None else rows]
+        return in_blocks(lambda index: _describe(gather(index)), rows, size, num_threads)
 
-        def compute(rows: Any, num_threads: int | None) -> Packed[LocalGeometry]:
-            # Neighbours are found of all rows at once.
-            neighbors[slice(None) if rows is None else rows]
-            return in_blocks(lambda index: _describe(gather(index)), rows, size, num_threads)
-
-        return RowsOnDemand(compute, size)
-
-    return cached_with(cloud, "local geometry", with_channels, make)
+    return RowsOnDemand(compute, size)
 
 
 @jax.jit

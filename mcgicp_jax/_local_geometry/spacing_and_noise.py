@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from mcgicp_jax._clouds.point_cloud import PointCloud
-from mcgicp_jax._compute.cache import cached_with
+from mcgicp_jax._compute.cache import cached_with_cloud
 from mcgicp_jax._compute.concrete import AnyArray, AnyScalar, is_concrete, numpy_for
 from mcgicp_jax._local_geometry.local_geometry import LocalGeometry
 from mcgicp_jax._local_geometry.neighborhoods import check_neighbors
@@ -81,9 +81,7 @@ def grid_spacing(cloud: PointCloud) -> Float[AnyScalar, ""]:
 
 def _spacings(cloud: PointCloud) -> tuple[Float[AnyScalar, ""], Float[AnyScalar, ""]]:
     """`point_spacing` and `grid_spacing`; cached with a concrete cloud."""
-    if is_concrete(cloud):
-        return cached_with(cloud, "spacings", None, lambda: _measured_spacings(cloud))
-    return _measured_spacings(cloud)
+    return _known_spacings(cloud) if is_concrete(cloud) else _measured_spacings(cloud)
 
 
 def _measured_spacings(cloud: PointCloud) -> tuple[Float[AnyScalar, ""], Float[AnyScalar, ""]]:
@@ -95,6 +93,9 @@ def _measured_spacings(cloud: PointCloud) -> tuple[Float[AnyScalar, ""], Float[A
     count = xp.sum(known, axis=0)
     grid = xp.sqrt(xp.max(xp.where(known, squares, 0), axis=0)) * xp.sqrt(xp.pi / xp.maximum(count, 1))
     return spacing, xp.nan_to_num(median(xp.where(count > 1, grid, xp.nan))).astype(squares.dtype)
+
+
+_known_spacings = cached_with_cloud(_measured_spacings)
 
 
 def _squared_neighbor_distances(cloud: PointCloud) -> Float[AnyArray, "k n"]:

@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from mcgicp_jax._clouds.point_cloud import PointCloud
-from mcgicp_jax._compute.cache import cached_with
+from mcgicp_jax._compute.cache import cached_with_cloud
 from mcgicp_jax._compute.concrete import is_concrete, numpy_for
 from mcgicp_jax._compute.packing import Packed
 from mcgicp_jax._compute.rows_on_demand import RowsOnDemand, in_blocks
@@ -92,7 +92,7 @@ def surface_pair(
             surface_on_host, method, kinds, described=described, observed=observed, num_threads=num_threads
         )
         if source_rows is not None:
-            describe = partial(surface_table(method, kinds, target, described, observed).known, num_threads=num_threads)
+            describe = partial(surface_table(target, method, kinds, described, observed).known, num_threads=num_threads)
             columns = describe(np.zeros(0, int))
             # Columns of another dtype are copies, not views of the table.
             if any(columns[0].layout.dtypes):
@@ -126,14 +126,23 @@ def _some_rows(cloud: PointCloud, rows: Any) -> PointCloud:
 
 def searchable(method: AbstractMethod, cloud: PointCloud) -> SearchPoints:
     """The cloud as the input of a search."""
-    return search_rows(method, cloud.points, cloud.channels, cloud.channel_valid, cloud.valid)
+    numbers = search_numbers(method, cloud.channels, cloud.channel_valid)
+    return search_rows(*numbers, cloud.points, cloud.channels, cloud.channel_valid, cloud.valid)
 
 
-def search_rows(method: AbstractMethod, points: Any, channels: Any, channel_valid: Any, valid: Any) -> SearchPoints:
+def search_numbers(method: AbstractMethod, channels: Any, channel_valid: Any) -> tuple[Any, Any]:
+    """α and the expected squared differences of missing channels; None for what a search does not need."""
+    count = channels.shape[-1]
+    weights = method.weights(count)
+    return weights, None if weights is None or channel_valid is None else method.missing_variances(count)
+
+
+def search_rows(
+    weights: Any, missing_variances: Any, points: Any, channels: Any, channel_valid: Any, valid: Any
+) -> SearchPoints:
     """Rows of a cloud as the input of a search: positions, descriptors α · channel, penalties for missing channels."""
-    xp = numpy_for(method, points, channels, channel_valid, valid)
+    xp = numpy_for(weights, missing_variances, points, channels, channel_valid, valid)
     points, channels, valid = xp.asarray(points), xp.asarray(channels), xp.asarray(valid)
-    weights = method.weights(channels.shape[-1])
     if weights is None:
         return SearchPoints(points, xp.zeros((points.shape[0], 0), points.dtype), valid)
     weights, penalty = xp.asarray(weights), None
@@ -141,7 +150,7 @@ def search_rows(method: AbstractMethod, points: Any, channels: Any, channel_vali
         # The expected squared difference in a true match: on average, a missing channel makes a match neither nearer
         # nor farther.
         with np.errstate(over="ignore", invalid="ignore"):
-            expected = weights**2 * xp.asarray(method.missing_variances(channels.shape[-1]))
+            expected = weights**2 * xp.asarray(missing_variances)
         penalty = xp.where(xp.asarray(channel_valid), 0, expected.astype(points.dtype))
     return SearchPoints(points, channels * weights.astype(points.dtype), valid, penalty)
 
@@ -161,7 +170,7 @@ def surface_on_host(
         described: whether the cloud has neighbours, whose local geometry is used.
         among: (n,) rows of the cloud; None for all.
     """
-    table = surface_table(method, kinds, cloud, described, observed)
+    table = surface_table(cloud, method, kinds, described, observed)
     if among is None:
         return _surface_in(table.known(None, num_threads), method, cloud)
     return _surface_in(table.rows(among, num_threads), method, _some_rows(cloud, among))
@@ -171,29 +180,24 @@ def surface_on_host(
 _Columns = tuple[Packed[Surface], Packed[SurfaceNoise] | None]
 
 
+@cached_with_cloud
 def surface_table(
-    method: AbstractMethod, kinds: Kinds, cloud: PointCloud, described: bool, observed: bool
+    cloud: PointCloud, method: AbstractMethod, kinds: Kinds, described: bool, observed: bool
 ) -> RowsOnDemand[_Columns]:
-    """The surface of a concrete cloud, cached for this cloud and method; arguments as of `surface_on_host`."""
+    """The surface of a concrete cloud, cached with the cloud; arguments as of `surface_on_host`."""
+    geometry = geometry_table(cloud, method.uses_channels) if described else None
+    gather, size = _gatherer(method, cloud, described, np), cloud.points.shape[0]
 
-    def make() -> RowsOnDemand[_Columns]:
-        geometry = geometry_table(cloud, method.uses_channels) if described else None
-        gather, size = _gatherer(method, cloud, described, np), cloud.points.shape[0]
+    def compute(rows: Any, num_threads: int | None) -> _Columns:
+        statistics = None if geometry is None else geometry.known(rows, num_threads)
 
-        def compute(rows: Any, num_threads: int | None) -> _Columns:
-            statistics = None if geometry is None else geometry.known(rows, num_threads)
+        def block(index: Any) -> _Columns:
+            here = None if statistics is None else statistics.rows(index)
+            return _surface_of_block(method, kinds, gather(index), here, observed)
 
-            def block(index: Any) -> _Columns:
-                here = None if statistics is None else statistics.rows(index)
-                return _surface_of_block(method, kinds, gather(index), here, observed)
+        return in_blocks(block, rows, size, num_threads)
 
-            return in_blocks(block, rows, size, num_threads)
-
-        return RowsOnDemand(compute, size)
-
-    leaves, structure = jax.tree.flatten(method)
-    key = (structure, *(np.asarray(leaf).tobytes() for leaf in leaves), kinds, described, observed)
-    return cached_with(cloud, "surface", key, make)
+    return RowsOnDemand(compute, size)
 
 
 def _surface_in(columns: _Columns, method: AbstractMethod, cloud: PointCloud) -> Surface:

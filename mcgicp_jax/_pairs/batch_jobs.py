@@ -25,6 +25,7 @@ from mcgicp_jax._local_geometry.surface import Surface, searched
 from mcgicp_jax._math.poses import Pose
 from mcgicp_jax._methods.base import AbstractMethod
 from mcgicp_jax._pairs.register import register_from, start_from_anywhere
+from mcgicp_jax._registration.input_checks import warn_of_lengths
 from mcgicp_jax._registration.make_result import registration_of
 from mcgicp_jax._registration.options import Options
 from mcgicp_jax._registration.pose_derivative import Given
@@ -143,7 +144,9 @@ class BatchJob:
     def _clouds(self, pair: Pair) -> list[PointCloud]:
         """Both clouds by `ready`. Warnings of the pair as a whole do not name it, so that Python shows each once."""
         with warnings_named(f"pair {pair.index}"):
-            return self.ready({"source": pair.source, "target": pair.target})
+            clouds = self.ready({"source": pair.source, "target": pair.target})
+            warn_of_lengths(*clouds)
+            return clouds
 
     def register_chunk(self, chunk: list[Pair]) -> list[PairResult]:
         """Register the pairs one after the other, or in lanes."""

@@ -8,7 +8,7 @@ from typing import Any, Literal
 import numpy as np
 from jax.typing import ArrayLike
 
-from mcgicp_jax._clouds.point_cloud import PointCloud, Values
+from mcgicp_jax._clouds.point_cloud import PointCloud, Values, as_cloud
 from mcgicp_jax._compute.concrete import is_concrete
 from mcgicp_jax._compute.linear_maps import primal
 from mcgicp_jax._compute.messages import warn
@@ -16,6 +16,7 @@ from mcgicp_jax._global_pose.global_pose import GlobalPoseResult, global_pose
 from mcgicp_jax._math.poses import Pose
 from mcgicp_jax._math.robust_kernels import AbstractKernel
 from mcgicp_jax._methods.base import AbstractMethod
+from mcgicp_jax._registration.input_checks import warn_of_lengths
 from mcgicp_jax._registration.measurements import GivenPrior, GivenTiePoints
 from mcgicp_jax._registration.options import Distance, Options, check_method
 from mcgicp_jax._registration.register_pair import register_pair
@@ -132,8 +133,9 @@ def register(
     Warns:
         UserWarning: if points with NaN or infinity are left out, `MultiChannelGICP` gets clouds without channels, the
             values of a channel are so different in the two clouds that their units probably are, too, or matched points
-            have so different ones that the exposure was probably another, or `GICP` gets one cloud with covariances
-            that are not dimensionless. Outside of `jit`: if less than 10 % of the source points have a match at the
+            have so different ones that the exposure was probably another, extent and spacing of the two clouds differ
+            so much that one is probably in another unit, or `GICP` gets one cloud with covariances that are not
+            dimensionless. Outside of `jit`: if less than 10 % of the source points have a match at the
             end, or `channel_weights` are differentiated.
     """
     options = Options(
@@ -150,6 +152,8 @@ def register(
     )
     if not (tie_points is None and prior is None) and not hold_unconstrained:
         raise ValueError("hold_unconstrained: expected True with tie_points or prior, got False")
+    source, target = as_cloud("source", source), as_cloud("target", target)
+    warn_of_lengths(source, target)
     return register_from(source, target, method, init, options, tie_points, prior)
 
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -11,12 +13,12 @@ from jaxtyping import Float, Int
 from mcgicp_jax._clouds.origins import centred_pose
 from mcgicp_jax._clouds.point_cloud import PointCloud
 from mcgicp_jax._compute.argument_checks import check_integer, check_positive
-from mcgicp_jax._compute.cache import cached_with
+from mcgicp_jax._compute.cache import cached_with_cloud
 from mcgicp_jax._compute.concrete import constant, is_concrete
 from mcgicp_jax._compute.linear_maps import primal
 from mcgicp_jax._math.poses import Pose, se3_from_matrix
 from mcgicp_jax._methods.base import AbstractMethod
-from mcgicp_jax._methods.surfaces import searchable
+from mcgicp_jax._methods.surfaces import search_numbers, search_rows, searchable
 from mcgicp_jax._pose_solver.matched import Motion, distances_within
 from mcgicp_jax._registration.input_checks import check_clouds
 from mcgicp_jax._search.base import AbstractIndex, AbstractSearch, Correspondences, SearchPoints
@@ -103,10 +105,11 @@ def _correspondences_at(
 
 
 def index_of(search: AbstractSearch, method: AbstractMethod, target: PointCloud) -> AbstractIndex:
-    """Search index of the target, cached while the cloud lives."""
-    count = target.channels.shape[-1]
-    numbers = [] if method.weights(count) is None else [method.weights(count)]
-    if numbers and target.channel_valid is not None:
-        numbers.append(method.missing_variances(count))
-    key = (repr(search), *(np.asarray(number).tobytes() for number in numbers))
-    return cached_with(target, "index", key, lambda: search.index(searchable(method, target)))
+    """Search index of the target, cached with the cloud; methods that search with the same numbers share it."""
+    return _index(target, search, *search_numbers(method, target.channels, target.channel_valid))
+
+
+@cached_with_cloud
+def _index(target: PointCloud, search: AbstractSearch, weights: Any, missing_variances: Any) -> AbstractIndex:
+    columns = target.points, target.channels, target.channel_valid, target.valid
+    return search.index(search_rows(weights, missing_variances, *columns))

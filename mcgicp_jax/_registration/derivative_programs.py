@@ -17,7 +17,7 @@ from mcgicp_jax._local_geometry.local_geometry import LocalGeometry, describe
 from mcgicp_jax._local_geometry.neighborhoods import Neighborhoods
 from mcgicp_jax._local_geometry.surface import Surface
 from mcgicp_jax._methods.base import AbstractMethod
-from mcgicp_jax._methods.surfaces import Kinds, search_rows, surface_of
+from mcgicp_jax._methods.surfaces import Kinds, search_numbers, search_rows, surface_of
 from mcgicp_jax._pose_solver.implicit_derivative import ImplicitRoot, balance_along, score_at, value_and_jacobian
 from mcgicp_jax._pose_solver.matched import Matched, Motion, square_apart
 from mcgicp_jax._pose_solver.pose_measurements import Fusion, PoseForm
@@ -161,7 +161,10 @@ def pull_surface(
         used = method if moving.numbers is None else eqx.combine(moving.numbers, rest)
         geometry = None if here.near is None else describe(here) if local is None else local.tree
         surface = surface_of(used, kinds, here, geometry, False)
-        search = None if masks is None else search_rows(used, here.own.T, here.own_channels.T, *masks)
+        search = None
+        if masks is not None:
+            channels = here.own_channels.T
+            search = search_rows(*search_numbers(used, channels, masks[0]), here.own.T, channels, *masks)
         return Packed.of(Columns.of(surface, search)).table
 
     _, pull = jax.vjp(rows, moving)

@@ -5,10 +5,12 @@ from __future__ import annotations
 import numpy as np
 from jax.typing import ArrayLike
 
-from mcgicp_jax._clouds.point_cloud import PointCloud
+from mcgicp_jax._clouds.point_cloud import LARGEST, PointCloud
+from mcgicp_jax._clouds.voxel_size import raw_spacing
 from mcgicp_jax._compute.concrete import is_concrete
 from mcgicp_jax._compute.linear_maps import primal
 from mcgicp_jax._compute.messages import warn
+from mcgicp_jax._local_geometry.spacing_and_noise import point_spacing
 from mcgicp_jax._math.statistics import median, sampled_rows
 from mcgicp_jax._methods.base import AbstractMethod
 from mcgicp_jax._methods.multichannel_gicp import MultiChannelGICP
@@ -18,6 +20,15 @@ from mcgicp_jax._search.base import Correspondences
 # Bounds of the trace of covariances given with one of the clouds, relative to the trace of GICP's (2: they are 1 within
 # the surface); beyond them a warning is issued. The trace of cells in m² is a sixth of their squared edge.
 _LEAST_TRACE, _LARGEST_TRACE = 0.25, 4.0
+# Ratio of the extents of two clouds, and of their spacings, above which both together are warned of: √1000, since units
+# usually differ by a factor of 1000, and the clouds may differ otherwise as well. A part of a map has a smaller extent,
+# a thinned cloud a larger spacing, but rarely do both differ: by at most 4.3 between scans, their far tenth, every
+# eighth point, maps of ten scans, and voxels of all of these, and by 13 between patches of a tenth of the extent with
+# all points and voxels of the whole.
+_OTHER_LENGTHS = 1000**0.5
+# Number of points from which the extent is computed, and the fraction of them (one in so many) that is left out on each
+# side of an axis, since a few points may be far away.
+_SAMPLE, _OUTSIDE = 300, 20
 
 
 def check_clouds(source: PointCloud, target: PointCloud, method: AbstractMethod) -> None:
@@ -72,6 +83,38 @@ def warn_of_constant_weights(method: AbstractMethod) -> None:
     weights = getattr(method, "channel_weights", None)
     if not is_concrete(weights) and is_concrete(primal(weights)):
         warn("channel_weights: the derivative is 0, since they decide matches alone, which are constant in derivatives")
+
+
+def warn_of_lengths(source: PointCloud, target: PointCloud) -> None:
+    """Warn of clouds outside `jit` whose extents and spacings both differ so much that their units probably differ."""
+    clouds = [primal(cloud) for cloud in (source, target)]
+    if not is_concrete(clouds) or any(cloud.points.ndim != 2 for cloud in clouds):
+        return
+    extents = [_extent(cloud) for cloud in clouds]
+    if not _differ(extents):
+        return
+    # More costly for raw clouds.
+    spacings = [raw_spacing(cloud) if cloud.deferred_neighbors is None else point_spacing(cloud) for cloud in clouds]
+    if _differ(spacings) and (extents[0] < extents[1]) == (spacings[0] < spacings[1]):
+        warn(
+            f"points: the source extends over {extents[0]:.2g} with a spacing of {spacings[0]:.2g}, the target over "
+            f"{extents[1]:.2g} with a spacing of {spacings[1]:.2g}; are both in the same unit, metres?"
+        )
+
+
+def _extent(cloud: PointCloud) -> float:
+    """The largest extent of most of the points along an axis, metres; 0 if there are none."""
+    rows, counts = sampled_rows(cloud.valid)
+    points = np.asarray(cloud.points)[rows[counts][:: 1 + rows.size // _SAMPLE]]
+    points = points[(np.abs(points) <= LARGEST).all(axis=1)]
+    # A tenth of the time of `np.quantile`.
+    ordered, outside = np.sort(points, axis=0).astype(np.float64), len(points) // _OUTSIDE
+    return float((ordered[-1 - outside] - ordered[outside]).max()) if len(points) else 0.0
+
+
+def _differ(lengths: list[float]) -> bool:
+    least, largest = sorted(lengths)
+    return 0 < least < largest / _OTHER_LENGTHS
 
 
 def warn_of_covariances(source: PointCloud, target: PointCloud) -> None:

@@ -37,14 +37,15 @@ def registration_of(
         derivative: computes `RegistrationResult.jacobian`.
     """
     history: dict[str, Any] = records._asdict()
-    # Outside `jit`, the derivative of the pose is all that may be traced.
-    pose, state, source, target = state.pose, *map(primal, (state, source, target))
+    # Outside `jit`, the derivative of the pose, by the origins too, is all that may be traced.
+    pose, source_origin, target_origin = state.pose, source.origin, target.origin
+    state, source, target = map(primal, (state, source, target))
     concrete = is_concrete(state, history)
     if concrete:
         # Reading NumPy arrays compiles nothing.
         state, history = jax.tree.map(np.asarray, (state, history))
         pose = state.pose if is_concrete(pose) else pose
-    matrix = pose_in_user_frame(pose, source.origin, target.origin)
+    matrix = pose_in_user_frame(pose, source_origin, target_origin)
     numbers: Any = {
         "status_code": state.status,
         "num_iterations": state.num_iterations,
@@ -58,11 +59,11 @@ def registration_of(
         numbers, used = jax.tree.map(lambda number: np.asarray(number)[()], (numbers, used))
     numbers["num_inliers"] = numbers["num_inliers"].astype(np.int32)
     numbers["overlap"] = (numbers["num_inliers"] / used.sum()).astype(numbers["rmse"].dtype)
-    far = not is_concrete(source.origin, target.origin) or np.any(source.origin) or np.any(target.origin)
+    far = not is_concrete(source_origin, target_origin) or np.any(source_origin) or np.any(target_origin)
     return RegistrationResult.build(
         T_target_source=se3_from_matrix(matrix, pose.wxyz_xyz.dtype) if far else pose,
-        source_origin=source.origin,
-        target_origin=target.origin,
+        source_origin=source_origin,
+        target_origin=target_origin,
         centred=pose,
         constraints=_later(lambda: _constraints(assessment, source.origin), concrete),
         uncertainty=_later(lambda: _uncertainty(assessment, state, source.origin), concrete),

@@ -307,7 +307,8 @@ class Differentiated(NamedTuple):
 def differentiated(
     given: Given, inputs: Inputs, executor: HostExecutor, loop: LoopResult, gains: Any
 ) -> Differentiated | None:
-    """The final pose of a registration and the traced arrays among its arguments; None if there are none."""
+    """The final pose of a registration and the traced arrays among its arguments on which it depends; None if there
+    are none. Origins are added later, see `pose_in_user_frame`."""
     if is_concrete(given):
         return None
     method = with_unset_from(given.method, inputs.method)
@@ -317,6 +318,8 @@ def differentiated(
     if fusion is not None:
         form = _form_at(fusion.rotation, fusion.translation, fusion.center, fusion.radius, *given[4:6])
     traced = Inputs(given.source, given.target, method, terms, form, given.temperature).traced()
+    if not traced:
+        return None
     return Differentiated(PoseDerivative(list(traced), inputs, executor, loop, gains), list(traced.values()))
 
 

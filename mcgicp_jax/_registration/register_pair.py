@@ -171,9 +171,12 @@ def results_of(runs: Sequence[Run], givens: Sequence[Given | None]) -> list[Regi
     ]
     states = with_derivatives([run.state() for run in runs], traced)
     results = []
-    for state, run in zip(states, runs, strict=True):
+    for state, run, given in zip(states, runs, givens, strict=True):
         by = None if run.executor is None else partial(jacobian, run.inputs, run.executor, run.loop, run.gains)
-        source, target, used = run.inputs.source, run.inputs.target, searched(run.problem.source).valid
+        # Traced origins are those of the inputs, as cells, which may have others, are made of concrete clouds alone.
+        traces_origins = given is not None and not is_concrete(given.source.origin, given.target.origin)
+        source, target = (given if given is not None and traces_origins else run.inputs)[:2]
+        used = searched(run.problem.source).valid
         results.append(registration_of(state, run.assessment(), run.loop.history, source, target, used, by))
     return results
 

@@ -243,9 +243,10 @@ class RegistrationResult(eqx.Module):
         if not is_concrete(primal(self.centred), self.history) or np.ndim(self.status_code):
             return f"RegistrationResult(batch of shape {np.shape(self.status_code)})"
         matrix = np.asarray(primal(self.matrix))
-        if np.any(self.source_origin):
+        start = np.asarray(primal(self.source_origin))
+        if np.any(start):
             # The translation column is the motion of a far point; print the motion of the source's origin instead.
-            origin = np.append(self.source_origin, 1)
+            origin = np.append(start, 1)
             moved, where = (matrix @ origin - origin)[:3], "of the source's origin "
         else:
             moved, where = matrix[:3, 3], ""
