@@ -203,7 +203,7 @@ def test_estimates_are_scales_and_correlations_of_the_residuals():
 def photometric(spacing):
     """The term of one channel before its numbers are known."""
     coarse = Mahalanobis(mcg.GICP())
-    return Photometric.before_estimate(np.float64(spacing), np.ones(1), coarse, robust=None, equalizes_channels=False)
+    return Photometric.before_estimate(np.float64(spacing), 1, coarse, robust=None, equalizes_channels=False)
 
 
 def test_a_sample_has_the_design_effect_of_all():

@@ -80,7 +80,7 @@ def geometry_observability(
 
 def channel_observability(
     fits: ChannelFits, normal: Float[AnyArray, "N 3"], weights: Float[Array, "C"]
-) -> tuple[Float[Array, "6 N"], Float[Array, "N"]]:
+) -> tuple[Float[Array, "6 N"], Float[Array, "N C 3"], Float[Array, "N"]]:
     """Observability of motions within the surface, from the gradients g of the descriptors α · channel.
 
     If a point moves by x within the surface, its nearest target point in position and descriptors moves by (I + A)⁻¹ x,
@@ -94,8 +94,8 @@ def channel_observability(
         weights: α, metres per channel unit.
 
     Returns:
-        Symmetric (6, N) matrices, and the (N,) variance of the descriptors about their linear fits, metres², summed
-        over the channels.
+        Symmetric (6, N) matrices; the (N, C, 3) gradients of the descriptors, means of both fits; and the (N,) variance
+        of the descriptors about their linear fits, metres², summed over the channels.
     """
     total = jnp.zeros((3, normal.shape[0]), normal.dtype)
     length, noise = total[0], total[0]
@@ -109,4 +109,17 @@ def channel_observability(
         noise = noise + residual
     # The same tangent basis as in the linear fits.
     basis = alg.orthonormal_basis(normal.T)
-    return alg.embed(total / (1 + length), *basis), noise
+    slopes = jnp.mean(fits.gradients, axis=2) * weights[:, None]
+    within = slopes[..., :1] * basis[0].T[:, None] + slopes[..., 1:] * basis[1].T[:, None]
+    return alg.embed(total / (1 + length), *basis), within, noise
+
+
+def agreement(source: Float[Array, "C 3 n"], target: Float[Array, "C 3 n"]) -> Float[Array, "6 n"]:
+    """Observability by the channels of matched points: A / (1 + tr A), where A is the mean of g hᵀ and h gᵀ.
+
+    g and h are the gradients of the descriptors in the two clouds, in one frame. At a wrong pose they are unrelated,
+    however distinct the channels of each cloud are, so that A vanishes on average.
+    """
+    product = sum(0.5 * (alg.outer(g + h) - alg.outer(g) - alg.outer(h)) for g, h in zip(source, target, strict=True))
+    length = 0.5 * (jnp.sum(source * source, axis=(0, 1)) + jnp.sum(target * target, axis=(0, 1)))
+    return product / (1 + length)

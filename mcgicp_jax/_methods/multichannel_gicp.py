@@ -142,9 +142,9 @@ class MultiChannelGICP(AbstractGeneralized):
         count = source.channels.shape[-1]
         if not self.photometric or count == 0:
             return super().terms(source, target, robust, equalize_channels)
-        spacing, weights = constant((point_spacing(target), self.weights(count)))
+        spacing = constant(point_spacing(target))
         # The scale of `robust` is that of the photometric residuals, not of the Mahalanobis distance.
-        return (Photometric.before_estimate(spacing, weights, Mahalanobis(self), robust, equalize_channels),)
+        return (Photometric.before_estimate(spacing, count, Mahalanobis(self), robust, equalize_channels),)
 
     def covariance(self, around: Neighborhoods, local: LocalGeometry | None) -> Float[Array, "6 n"]:
         given = around.given_covariance

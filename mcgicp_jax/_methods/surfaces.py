@@ -271,20 +271,22 @@ def surface_of(
         covariance=method.covariance(around, local).T,
         observability=None,
         channel_observability=None,
+        slopes=None,
         columns={kind.name: kind.columns(around, local) for kind in kinds},
     )
     if not observed or local is None:
         return surface
-    by_channels, noise = None, jnp.zeros_like(around.own[0])
+    by_channels, slopes, noise = None, None, jnp.zeros_like(around.own[0])
     if method.uses_channels and local.fits.residual.shape[1]:
         weights = jax.lax.stop_gradient(method.weights(local.fits.residual.shape[1]))
-        by_channels, noise = channel_observability(local.fits, local.normal, jnp.asarray(weights, around.own.dtype))
+        weights = jnp.asarray(weights, around.own.dtype)
+        by_channels, slopes, noise = channel_observability(local.fits, local.normal, weights)
         by_channels = by_channels.T
     # Observability is constant to autodiff.
-    by_shape, by_channels, details = jax.lax.stop_gradient(
-        (local.observability, by_channels, SurfaceNoise(noise, local.normal, local.roughness, local.reach))
+    by_shape, by_channels, slopes, details = jax.lax.stop_gradient(
+        (local.observability, by_channels, slopes, SurfaceNoise(noise, local.normal, local.roughness, local.reach))
     )
-    return surface._replace(observability=by_shape, channel_observability=by_channels, noise=details)
+    return surface._replace(observability=by_shape, channel_observability=by_channels, slopes=slopes, noise=details)
 
 
 @partial(jax.jit, static_argnums=(1, 4))

@@ -29,7 +29,7 @@ from mcgicp_jax._math.poses import adjoint_to_source, units
 from mcgicp_jax._math.statistics import cell_numbers, median
 from mcgicp_jax._pose_solver.degeneracy import Directions
 from mcgicp_jax._pose_solver.matched import Matched, Motion, linearize_at
-from mcgicp_jax._pose_solver.sums import mean_observability, moments_about, with_one
+from mcgicp_jax._pose_solver.sums import moments_about, observability, with_one
 from mcgicp_jax._pose_solver.update import twist_form
 from mcgicp_jax._terms.base import AbstractTerm, PosedMatches, linearize
 
@@ -182,10 +182,12 @@ def scores_of(
 def _discounted_observability(
     posed: PosedMatches, discount: Float[Array, "2"], terms: tuple[AbstractTerm, ...]
 ) -> Float[Array, "6 n"]:
-    geometry, *channels = mean_observability(posed, terms)
+    geometry, *channels = observability(posed)
     shown = discount[0] * geometry
-    for each in channels:
-        # A / (1 + tr A) of `channel_observability`, with A multiplied by the discount.
+    if channels:
+        # Slopes of matches that were sought in the channels agree more than those of the surface.
+        each = channels[all(term.by_position for term in terms)]
+        # A / (1 + tr A) with A multiplied by the discount.
         trace = each[0] + each[3] + each[5]
         shown = shown + discount[1] * each / (1 - (1 - discount[1]) * jnp.clip(trace, 0, 1))
     return shown

@@ -16,6 +16,7 @@ import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float
 
+from mcgicp_jax._compute.concrete import AnyScalar
 from mcgicp_jax._math.poses import adjoint_to_source, units
 from mcgicp_jax._pose_solver.sums import Sums
 from mcgicp_jax._pose_solver.update import twist_form
@@ -25,6 +26,9 @@ from mcgicp_jax._pose_solver.update import twist_form
 # artificial in-plane stiffness equals a true fraction of ε, 0.001 by default. Channels: 0.003 from noise alone, from
 # 0.008 on with the markings of a road.
 GEOMETRY_HOLDS, CHANNELS_HOLD = 2e-3, 5e-3
+# At right poses, the slopes of the channels at matched points agree to at least 0.7 of what each cloud observes (walls
+# and tables); at poses 0.2 to 0.4 m off, on walls and a road, to 0.3 at most.
+_AGREE = 0.5
 # Smallest information of tie points and prior for a direction to count as constrained: a standard deviation of one
 # radius of the matched points. Useful tie points and priors are far above it.
 _TIES_HOLD = 1.0
@@ -39,7 +43,8 @@ class Directions(eqx.Module):
     Attributes:
         twists: (6, 6), one direction per row, scaled so that the matched points move by 1 (root mean square).
         geometry: (6,) fraction of that squared motion that the shape of the surfaces observes, 0 to 1.
-        channels: (6,) fraction that the channels observe; 0 for the directions that geometry constrains.
+        channels: (6,) fraction that the channels observe; 0 for the directions that geometry constrains, negative where
+            the channels of matched points do not agree.
         ties: (6,) information of tie points and prior, one over the squared standard deviation in radii of that motion;
             0 for the directions that geometry or channels constrain. None without tie points and prior.
         center: (3,) centroid of the matched source points, metres.
@@ -69,9 +74,13 @@ class Directions(eqx.Module):
         return self.held_by_matches if self.ties is None else self.held_by_matches | (self.ties >= _TIES_HOLD)
 
 
-def find_directions(sums: Sums) -> Directions:
+def find_directions(sums: Sums, final: Bool[AnyScalar, ""]) -> Directions:
     """Eigenvectors of the observed fraction of the points' motion: by the geometry, and among the directions that
     geometry does not constrain, by the channels. Fractions do not depend on units or on the origin.
+
+    Args:
+        final: whether the channels of matched points must agree, too. Far from the right pose they do not, and there
+            the channels that each cloud observes guide the pose.
     """
     if sums.mass is None or sums.observability is None:
         raise ValueError("sums: expected those of surfaces with observability")
@@ -87,18 +96,18 @@ def find_directions(sums: Sums) -> Directions:
     shares, turn = jnp.linalg.eigh(basis.T @ geometry @ basis)
     basis = basis @ turn
     free = ~(shares >= GEOMETRY_HOLDS)
-    if sums.channel_observability is None:
+    if sums.channel_observability is None or sums.agreement is None:
         channels = jnp.zeros_like(shares)
         return Directions(twists=basis.T, geometry=shares, channels=channels, center=center, radius=radius)
     # Diagonalise the channels within the free directions; 2, above any fraction, sorts the other directions last.
     among = jnp.outer(free, free)
-    channels = jnp.where(
-        among, basis.T @ twist_form(sums.channel_observability / total, radius) @ basis, jnp.diag(2.0 * ~free)
-    )
-    held, turn = jnp.linalg.eigh(channels)
+    within, agreed = (twist_form(each / total, radius) for each in (sums.channel_observability, sums.agreement))
+    held, turn = jnp.linalg.eigh(jnp.where(among, basis.T @ within @ basis, jnp.diag(2.0 * ~free)))
     basis = basis @ turn
-    shares = jnp.sum(basis * (geometry @ basis), axis=0)
-    channels = jnp.where(held > 1.5, 0, held)
+    # The directions stay those along which the pose was updated.
+    shares, agreed = (jnp.sum(basis * (form @ basis), axis=0) for form in (geometry, agreed))
+    disagree = final & (agreed < _AGREE * held)
+    channels = jnp.where(held > 1.5, 0, jnp.where(disagree, agreed - _AGREE * held, held))
     return Directions(twists=basis.T, geometry=shares, channels=channels, center=center, radius=radius)
 
 

@@ -16,12 +16,13 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from mcgicp_jax._compute.concrete import AnyArray, AnyScalar
+from mcgicp_jax._local_geometry.observability import agreement
 from mcgicp_jax._math import symmetric_matrices as alg
 from mcgicp_jax._pose_solver.matched import Matched, Motion, linearize_at
-from mcgicp_jax._terms.base import AbstractTerm, PosedMatches, channel_observability
+from mcgicp_jax._terms.base import AbstractTerm, PosedMatches
 
 # Fields of `Sums` that are sums over h hᵀ.
-_SECOND_MOMENTS = ("stiffness", "mass", "observability", "channel_observability")
+_SECOND_MOMENTS = ("stiffness", "mass", "observability", "channel_observability", "agreement")
 
 
 class Sums(NamedTuple):
@@ -43,6 +44,7 @@ class Sums(NamedTuple):
         mass: Σ w h hᵀ; None where observability is not known.
         observability: Σ w O ⊗ h hᵀ by the shape of the surfaces; None where it is not known.
         channel_observability: the same by the channels; None also where they are not used.
+        agreement: the same by slopes of the channels that agree in both clouds, see `_local_geometry.observability`.
     """
 
     center: Float[AnyArray, "*batch 3"]
@@ -57,6 +59,7 @@ class Sums(NamedTuple):
     mass: Float[AnyArray, "*batch 4 4"] | None = None
     observability: Float[AnyArray, "*batch 6 4 4"] | None = None
     channel_observability: Float[AnyArray, "*batch 6 4 4"] | None = None
+    agreement: Float[AnyArray, "*batch 6 4 4"] | None = None
 
     @property
     def radius(self) -> Float[AnyScalar, ""]:
@@ -87,7 +90,7 @@ def sums_of(motion: Motion, matched: Matched, terms: tuple[AbstractTerm, ...]) -
     center = jnp.stack(total) / jnp.maximum(count, 1)
     h = with_one(mask * (posed.moved - center[:, None]))
     share = _share(counts, matched.num_candidates)
-    shown = mean_observability(posed, terms)
+    shown = observability(posed)
     rows = [
         found.stiffness,
         found.force,
@@ -120,6 +123,7 @@ def sums_of(motion: Motion, matched: Matched, terms: tuple[AbstractTerm, ...]) -
         mass=others[0][0] if shown else None,
         observability=others[1] if shown else None,
         channel_observability=others[2] if len(shown) > 1 else None,
+        agreement=others[3] if len(shown) > 1 else None,
     )
 
 
@@ -151,15 +155,17 @@ def _share(counts: Float[Array, "n"], num_candidates: int) -> Float[Array, "n"]:
     return (each / jnp.where(total > 0, total, 1)).reshape(-1)
 
 
-def mean_observability(posed: PosedMatches, terms: tuple[AbstractTerm, ...]) -> list[Float[Array, "6 n"]]:
-    """O per correspondence, in the target's frame: mean over its two points; by shape, then by channels if known."""
+def observability(posed: PosedMatches) -> list[Float[Array, "6 n"]]:
+    """O per correspondence, in the target's frame: mean over its two points, by shape and by channels; and by the
+    agreement of the channels. The latter two only where channels are used."""
     source, target, rotation = posed.source, posed.target, posed.rotation
     if source.observability is None or target.observability is None:
         return []
     found = [0.5 * (alg.rotate(rotation, source.observability.T) + target.observability.T)]
     if source.channel_observability is not None and target.channel_observability is not None:
-        mean = 0.5 * (alg.rotate(rotation, source.channel_observability.T) + target.channel_observability.T)
-        found.append(channel_observability(terms, mean, posed))
+        found.append(0.5 * (alg.rotate(rotation, source.channel_observability.T) + target.channel_observability.T))
+        turned = jnp.einsum("ij,ncj->cin", rotation, jnp.asarray(source.slopes), precision="highest")
+        found.append(agreement(turned, jnp.asarray(target.slopes).transpose(1, 2, 0)))
     return found
 
 

@@ -137,10 +137,6 @@ class AbstractTerm(Numbers):
     def linearize(self, matches: PosedMatches) -> Linearization:
         """Force, stiffness and cost of each correspondence."""
 
-    def observability(self, mean: Float[Array, "6 n"], matches: PosedMatches) -> Float[Array, "6 n"]:
-        """Observability of correspondences by the channels, given the mean observability of their two points."""
-        return mean
-
     def sample(self, matches: PosedMatches) -> Any:
         """Input of `adapt` for each correspondence, a pytree of arrays (n, ...)."""
         raise NotImplementedError(f"{type(self).__name__} is adaptive, but does not define sample")
@@ -186,12 +182,3 @@ def linearize(terms: tuple[AbstractTerm, ...], matches: PosedMatches) -> Lineari
     """Sum of the terms."""
     first, *others = (term.linearize(matches) for term in terms)
     return sum(others, start=first)
-
-
-def channel_observability(
-    terms: tuple[AbstractTerm, ...], mean: Float[Array, "6 n"], matches: PosedMatches
-) -> Float[Array, "6 n"]:
-    """`AbstractTerm.observability` with each term in turn."""
-    for term in terms:
-        mean = term.observability(mean, matches)
-    return mean

@@ -141,7 +141,6 @@ class Photometric(AbstractTerm):
 
     Attributes:
         spacing: of the target, metres.
-        channel_weights: α of each channel, metres per channel unit, for the observability.
         deviations: σ of each residual, metres and channel units; 0 before the first estimate.
         designs: f/q, design effect over reliability, of each residual.
         gains, offsets: applied to the fitted values of the source's channels; 1 and 0 unless `equalizes_channels`.
@@ -160,7 +159,6 @@ class Photometric(AbstractTerm):
     correlation_length: ClassVar[float] = 8.0
 
     spacing: Float[AnyArray, "*batch"]
-    channel_weights: Float[AnyArray, "*batch C"]
     deviations: Float[AnyArray, "*batch K"]
     designs: Float[AnyArray, "*batch K"]
     gains: Float[AnyArray, "*batch C"]
@@ -172,7 +170,7 @@ class Photometric(AbstractTerm):
     def before_estimate(
         cls,
         spacing: Float[AnyScalar, ""],
-        channel_weights: Float[AnyArray, "C"],
+        num_channels: int,
         coarse: AbstractTerm,
         robust: AbstractKernel | None,
         equalizes_channels: bool,
@@ -180,11 +178,8 @@ class Photometric(AbstractTerm):
         """The term before its numbers are known."""
         xp = numpy_for(spacing)
         spacing = xp.asarray(spacing)
-        count = 1 + channel_weights.shape[0]
-        zeros, ones = (make(count, spacing.dtype) for make in (xp.zeros, xp.ones))
-        return cls(
-            spacing, channel_weights, zeros, ones, ones[1:], zeros[1:], coarse, equalizes_channels, robust=robust
-        )
+        zeros, ones = (make(1 + num_channels, spacing.dtype) for make in (xp.zeros, xp.ones))
+        return cls(spacing, zeros, ones, ones[1:], zeros[1:], coarse, equalizes_channels, robust=robust)
 
     @staticmethod
     def columns(around: Neighborhoods, local: LocalGeometry | None) -> FittedChannels:
@@ -240,25 +235,6 @@ class Photometric(AbstractTerm):
             own.append(jnp.where(known, fitted, jnp.nan))
             products.append(jnp.where(known, alg.inner(turned, gradient), 0))
         return _Columns(values, slopes, own, products)
-
-    def observability(self, mean: Float[Array, "6 n"], matches: PosedMatches) -> Float[Array, "6 n"]:
-        """A / (1 + mean of both traces) with A = Σ α² (g_B g_Aᵀ + g_A g_Bᵀ)/2.
-
-        The noise of the slopes is independent in the two clouds, so that it does not contribute on average.
-        (Subtracting its variance from the slopes of one cloud instead, as `_local_geometry.observability` does, would
-        also subtract the misfit at sharp edges.)
-        """
-        total: Any = 0.0
-        length: Any = 0.0
-        for channel in range(self.channel_weights.shape[0]):
-            weight = self.channel_weights[channel]
-            slope = matches.source.columns[self.name].gradient[:, channel].T
-            a = weight * jnp.dot(matches.rotation, slope, precision="highest")
-            b = weight * matches.target.columns[self.name].gradient[:, channel].T
-            total = total + 0.5 * (alg.outer(a + b) - alg.outer(a) - alg.outer(b))
-            length = length + 0.5 * (alg.inner(a, a) + alg.inner(b, b))
-        # Before the numbers are known the pose is inaccurate, so that slopes of matched points are unrelated.
-        return jnp.where(self.is_known, total / (1 + length), mean)
 
     def sample(self, matches: PosedMatches) -> Residuals:
         found = self._residuals(matches)
