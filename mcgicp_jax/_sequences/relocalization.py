@@ -21,12 +21,15 @@ from mcgicp_jax._search.positions import nearest_in_position
 # hardly changes; after jumps in simulated rooms and streets and on KITTI it fell to 0.5 to 0.7 of the previous one.
 _DOUBTFUL = 0.8
 # Multiple of the previous misfit above which a pose is wrong. On KITTI and 7-Scenes and in simulated rooms, streets and
-# corridors, right poses had misfits of 1.9 to 2.9, at most 1.3 times the one before; after jumps to a street that was
-# never seen, misfits were 6.3 to 17.6, and at least 2.7 times the one before.
+# corridors, right poses had misfits of at most 2.9 and 1.3 times the one before; after jumps to a street that was never
+# seen, misfits were 6.3 to 23, and at least 2.7 times the one before.
 _WRONG = 2.0
 # Misfit of a right pose if both clouds are equally noisy: √2 times the 90 % quantile of |x| for normal x. A sensor at
 # rest that repeats its frames has less.
 _LEAST_MISFIT = 2.3
+# Least thickness of a neighbourhood, as a fraction of its standard deviation along the surface: √ε of GICP. Without
+# noise it is 0 on planes, where the misfit would be rounding.
+_THINNEST = 0.032
 # Number of points whose misfit is measured; a match is on the same surface if it is within this multiple of the
 # standard deviation of the neighbourhood along the surface.
 _SAMPLE, _WITHIN = 2048, 3.0
@@ -100,6 +103,7 @@ def misfit_of(source: PointCloud, target: PointCloud, result: RegistrationResult
     offsets -= offsets.mean(axis=1, keepdims=True)
     squares, axes = np.linalg.eigh(offsets.swapaxes(1, 2) @ offsets / near.shape[1])
     thin, along, _ = np.sqrt(np.maximum(squares.T, np.finfo(np.float32).tiny))
+    thin = np.maximum(thin, _THINNEST * along)
     matrix, known = np.asarray(result.matrix), target.coordinates[np.asarray(target.valid)]
     moved = points[rows] @ matrix[:3, :3].T + matrix[:3, 3]
     matches = nearest_in_position(moved, known, float(_WITHIN * along.max()))
