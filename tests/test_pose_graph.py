@@ -1,6 +1,7 @@
 """Pose graphs against gtsam or dense least squares, finite differences, and simulation."""
 
 import importlib.util
+import warnings
 from typing import Any
 
 import jax
@@ -169,6 +170,20 @@ def test_rounding_does_not_decide_the_status_inside_transformations():
     for seed in range(10):
         graph = with_priors(measured(poses, loops, deviations=(1e-3, 1e-3), seed=seed)[0], poses)
         assert solve(shifted(graph, (3e5, 5e6, 100))) == mcg.Status.CONVERGED
+
+
+def test_rounding_of_poses_in_float32_is_warned_of():
+    graph, _ = measured(*SMALL["grid"])
+    far, solve = shifted(graph, (5e5, 5e6, 100)), jax.jit(lambda each: mcg.optimize_poses(each).poses)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        near = solve(graph)
+        mcg.optimize_poses(far)
+        with jax.enable_x64(True):
+            np.testing.assert_allclose(np.subtract(solve(far), near)[1:, :3, 3] - (5e5, 5e6, 100), 0, atol=1e-4)
+    with pytest.warns(UserWarning, match=r"poses up to 5e\+06 m .* rounded to 0.5 m in float32. Subtract") as caught:
+        jax.block_until_ready(solve(far))
+    assert caught[0].filename == __file__
 
 
 def test_parts_that_have_priors_are_well_defined():
