@@ -358,6 +358,36 @@ def test_lost_frames_are_named_and_follow_each_other(room):
     np.testing.assert_allclose(steps[-1].pose[:3, 3], truth[2][:3, 3], atol=0.05)
 
 
+@pytest.mark.parametrize("against", ["previous", "map"])
+def test_a_jump_to_a_street_that_was_never_seen_is_lost(against):
+    """Two streets have ground and house fronts in common: registration converges, with half of the overlap or more."""
+    known = datasets.street(4, points_per_frame=12_000, seed=3)
+    elsewhere = datasets.street(60, points_per_frame=12_000, seed=13)[50]
+    clouds = [frame.cloud for frame in (*known[:3], elsewhere, known[3])]
+    steps = list(mcg.odometry(clouds, mcg.GICP(), recover=True, against=against, start=known[0].pose))
+    assert steps[3].registration.status != mcg.Status.TOO_FEW_CORRESPONDENCES
+    assert steps[3].registration.overlap > 0.6
+    assert [step.lost for step in steps] == [False, False, False, True, False]
+    assert metrics.pose_error(steps[-1].pose, known[3].pose)[0] < 0.1
+
+
+def test_exact_planes_are_not_lost():
+    """Their neighbourhoods have no thickness, so that distances in these units are rounding."""
+    frames = datasets.box_room(3, points_per_frame=3000, noise=0)
+    clouds = [frames[k].cloud for k in (0, 0, 1, 2)]
+    assert not any(step.lost for step in mcg.odometry(clouds, mcg.GICP(), recover=True))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("against", ["previous", "map"])
+def test_no_real_frame_is_lost(data, against):
+    kitti = [frame.cloud for frame in datasets.kitti(data / "kitti/sequences/04")]
+    rooms = [frame.cloud for frame in datasets.seven_scenes(data / "sevenscenes_redkitchen")]
+    # Also every third frame, and a car that moves on after a rest.
+    for clouds in (kitti, kitti[::3], [kitti[0], *kitti[:3]], rooms):
+        assert not any(step.lost for step in mcg.odometry(clouds, mcg.GICP(), recover=True, against=against))
+
+
 def test_a_radius_without_a_map_or_points_is_refused(room):
     frames, _ = room
     with pytest.raises(ValueError, match=r"^map_radius: expected None without"):

@@ -1,6 +1,7 @@
 """Pose graphs against gtsam or dense least squares, finite differences, and simulation."""
 
 import importlib.util
+import warnings
 from typing import Any
 
 import jax
@@ -20,7 +21,7 @@ from mcgicp_jax._pose_graph import levenberg_marquardt, outliers
 from mcgicp_jax._pose_graph.factors import AbstractFactor
 from mcgicp_jax._pose_graph.levenberg_marquardt import Minimum
 from mcgicp_jax._pose_graph.marginal_covariances import inverse_blocks
-from mcgicp_jax._pose_graph.normal_equations import NormalEquations, factored
+from mcgicp_jax._pose_graph.normal_equations import NormalEquations, factored, motion_jacobians
 from tests.compilations import compilations
 from tests.graphs import garage, grid, joined, measured, moved, sphere, with_gtsam, with_priors
 from tests.precision import in_float64
@@ -169,6 +170,20 @@ def test_rounding_does_not_decide_the_status_inside_transformations():
     for seed in range(10):
         graph = with_priors(measured(poses, loops, deviations=(1e-3, 1e-3), seed=seed)[0], poses)
         assert solve(shifted(graph, (3e5, 5e6, 100))) == mcg.Status.CONVERGED
+
+
+def test_rounding_of_poses_in_float32_is_warned_of():
+    graph, _ = measured(*SMALL["grid"])
+    far, solve = shifted(graph, (5e5, 5e6, 100)), jax.jit(lambda each: mcg.optimize_poses(each).poses)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        near = solve(graph)
+        mcg.optimize_poses(far)
+        with jax.enable_x64(True):
+            np.testing.assert_allclose(np.subtract(solve(far), near)[1:, :3, 3] - (5e5, 5e6, 100), 0, atol=1e-4)
+    with pytest.warns(UserWarning, match=r"poses up to 5e\+06 m .* rounded to 0.5 m in float32. Subtract") as caught:
+        jax.block_until_ready(solve(far))
+    assert caught[0].filename == __file__
 
 
 def test_parts_that_have_priors_are_well_defined():
@@ -921,6 +936,30 @@ def test_poses_do_not_slide_along_what_edges_do_not_measure(kind):
         assert found.cost < 3 * len(graph.edges)
         inside = jax.jit(mcg.optimize_poses)(graph)
         np.testing.assert_allclose(inside.poses, found.poses, atol=0.05)
+
+
+def unmeasured_motion(graph, truth, poses):
+    """Twists from the true poses to others: the part along motions that no edge would measure if it saw x exactly."""
+    ends = np.stack([truth[graph.edges.i], truth[graph.edges.j]], axis=1)
+    jacobians = motion_jacobians(ends)
+    rows = np.zeros((len(ends), 6, len(truth), 6))
+    for end, each in enumerate((graph.edges.i, graph.edges.j)):
+        rows[np.arange(len(ends)), :, each] = jacobians[:, end]
+    rows = rows[:, :, 1:].reshape(len(ends), 6, -1)
+    _, values, motions = np.linalg.svd(rows[:, 1:].reshape(-1, rows.shape[2]))
+    free = motions[values < 1e-9].T
+    twists = logarithm(np.linalg.inv(truth) @ poses)[1:].reshape(-1)
+    return free @ np.linalg.lstsq(rows[:, 0] @ free, rows[:, 0] @ twists)[0]
+
+
+@pytest.mark.parametrize(("kind", "metres"), [("ring", 0.005), ("corridor", 0.03)])
+def test_poses_stay_at_an_exact_start_along_what_no_edge_measures(kind, metres):
+    for seed in range(12):
+        graph, truth = partly_blind(seed, kind)
+        found = mcg.optimize_poses(mcg.PoseGraph(truth, graph.edges))
+        assert found.status == mcg.Status.DEGENERATE
+        # Next to noise of 0.05 m in the other directions, and over lengths of 7 m.
+        assert np.abs(unmeasured_motion(graph, truth, found.poses)).max() < metres
 
 
 def test_directions_that_only_some_edges_measure_do_not_depend_on_the_start():

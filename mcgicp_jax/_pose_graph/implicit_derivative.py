@@ -19,9 +19,10 @@ from jaxtyping import Array, Float, Int
 from mcgicp_jax._compute.callbacks import call_host
 from mcgicp_jax._compute.concrete import AnyArray, is_concrete
 from mcgicp_jax._compute.lazy import Lazy
+from mcgicp_jax._compute.messages import calling_line, shown_at, warn
 from mcgicp_jax._math.twists import exponential
 from mcgicp_jax._pose_graph.factors import WORLD, AbstractFactor, check_rows
-from mcgicp_jax._pose_graph.normal_equations import factored
+from mcgicp_jax._pose_graph.normal_equations import factored, typical_information
 from mcgicp_jax._pose_graph.solver import Factors, Solution, covariances_at, solve
 from mcgicp_jax._registration.result import Status
 
@@ -117,12 +118,15 @@ def _solved(
 ) -> tuple[Found, Any]:
     """On the host, or by a callback if an argument is traced; with a `_Sensitivity` if differentiated."""
     dtype, n = jnp.result_type(*_floats((poses, factors))), len(poses)
+    line = calling_line()
 
     def on_host(poses: Any, factors: Any) -> Any:
         for k, factor in enumerate(factors):
             # Indices of traced arrays are not known before.
             check_rows(f"factors[{k - 1}]" if k else "edges", np.asarray(factor.rows), n)
         solution = solve(poses, factors, robust, max_iterations, exact=True)
+        with shown_at(line):
+            _warn_of_rounding(solution.poses(n)[:, :3, 3].astype(dtype), factors)
         numbers: Any = (solution.poses(n), solution.residuals, solution.weights, solution.cost)
         counts: Any = (np.int32(solution.status), np.int32(solution.found.num_iterations))
         found = Found(*(np.asarray(each, dtype) for each in numbers), *counts)
@@ -136,6 +140,18 @@ def _solved(
     forces = [[shape((*factor.rows.shape, 6, *each.shape[1:])) for each in _floats(factor)] for factor in factors]
     sensitivity = _Sensitivity(shape((n, 6, n, 6)), forces) if differentiated else None
     return call_host(on_host, (found, sensitivity), poses, factors)
+
+
+def _warn_of_rounding(positions: Float[np.ndarray, "n 3"], factors: Factors) -> None:
+    """Warn if the spacing of floats at the positions exceeds the standard deviation of a typical edge."""
+    largest, typical = np.abs(positions).max(), typical_information(*factors)[:, 0].max(initial=0)
+    # NaN and overflow are a status.
+    spacing = np.spacing(largest) if np.isfinite(largest) else 0
+    if spacing**2 * typical > 1:
+        warn(
+            f"optimize_poses: poses up to {largest:.3g} m from the origin are rounded to {spacing:.1g} m in "
+            f"{positions.dtype}. Subtract an origin from poses and priors before, or enable jax_enable_x64"
+        )
 
 
 def _sensitivity(solution: Solution, number: int, dtype: DTypeLike) -> _Sensitivity:

@@ -31,6 +31,10 @@ _LARGEST_FILL = 20.0
 # Largest number of steps of `refine`, each of which reduces the error by a factor of 10 or more, and the relative size
 # of the last one.
 _REFINEMENTS, _ROUNDING = 10, 1e-13
+# Weight of the measurements of the start in `settle`. From an exact start, poses in corridors slide by up to 0.49 m
+# without `settle`, and by 0.12, 0.03 and 0.01 m with weights of 1, 2 and 3. More holds back what loops measure: on a
+# sphere started from odometry, with edges that know nothing of x, errors are 8.8 m without, and 7.8, 10.5 and 12.7 m.
+_START_WEIGHT = 2.0
 # Relative residual of conjugate gradients, which serve for steps far from the minimum, and largest number of products.
 _RESIDUAL, _MOST_PRODUCTS = 1e-2, 300
 
@@ -105,6 +109,29 @@ def refine(equations: NormalEquations, found: Minimum, weights: Float[np.ndarray
         found = after._replace(num_iterations=found.num_iterations, converged=True)
         if step <= _ROUNDING * np.abs(found.poses).max():
             break
+    return found
+
+
+def settle(
+    equations: NormalEquations, found: Minimum, weights: Float[np.ndarray, "m"], start: Bool[np.ndarray, "m"]
+) -> Minimum:
+    """Take back what noise has moved along directions that only the measurements of the `start` constrain.
+
+    Against these, measurements that leak information μ there would weigh μ/ε, with ε that of the start. If ε is
+    imaginary, the real part of the step is −(μg + ε²b)/(μ² + ε²), for gradients g and εb of both: where it vanishes,
+    they weigh (μ/ε)², and the start weighs no more than (ε/μ)² along the directions that are measured.
+    """
+    size, started = np.inf, _START_WEIGHT * start
+    for _ in range(_REFINEMENTS):
+        system = equations.weighted(found.terms.blocks, weights * ~start + 1j * started)
+        gradient = equations.gradient(found.terms, weights * ~start) + 1j * equations.gradient(found.terms, started)
+        step = -factored(equations.damped(system)).solve(gradient).real
+        # Rounding, or no contraction.
+        if not np.abs(step).max() < size:
+            break
+        size = np.abs(step).max()
+        poses = found.poses @ exponential(equations.spread(step))
+        found = found._replace(poses=poses, terms=equations.terms(poses))
     return found
 
 

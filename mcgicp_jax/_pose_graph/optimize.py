@@ -116,7 +116,8 @@ def optimize_poses(graph: PoseGraph, *, robust: bool = True, max_iterations: int
     Inside transformations the poses are differentiable with respect to all measured values and information matrices, by
     the implicit function theorem, but not with respect to the initial poses; second derivatives raise. Measurements
     that were rejected are constants there. The derivative is 0 unless the status is CONVERGED. It takes memory in
-    proportion to n², which suits some hundreds of poses.
+    proportion to n², which suits some hundreds of poses. The poses have the precision of the given arrays there: in
+    float32, 0.5 m at UTM coordinates. Outside of transformations they are float64.
 
     Args:
         graph: poses and measurements.
@@ -132,6 +133,10 @@ def optimize_poses(graph: PoseGraph, *, robust: bool = True, max_iterations: int
     Raises:
         ValueError: if `graph` is not a `PoseGraph` or `max_iterations` is not an integer of at least 1. Failures on
             well-formed graphs show in the status.
+
+    Warns:
+        UserWarning: when a transformed or compiled program runs, if its poses are rounded by more than the standard
+            deviation of a typical edge. Subtract an origin from poses and priors before.
     """
     if not isinstance(graph, PoseGraph):
         raise ValueError(f"graph: expected a PoseGraph, got {type(graph).__name__}")

@@ -10,7 +10,7 @@ from jaxtyping import Bool, Float
 from mcgicp_jax._math.poses import matrices_of, parameters_of
 from mcgicp_jax._pose_graph.edge import Edge
 from mcgicp_jax._pose_graph.factors import WORLD
-from mcgicp_jax._pose_graph.levenberg_marquardt import Minimum, minimize, refine
+from mcgicp_jax._pose_graph.levenberg_marquardt import Minimum, minimize, refine, settle
 from mcgicp_jax._pose_graph.marginal_covariances import pose_covariances
 from mcgicp_jax._pose_graph.normal_equations import (
     NormalEquations,
@@ -90,12 +90,15 @@ def _minimum(
     if not held.information.any():
         return robust_minimum(NormalEquations(factors, poses), poses, uncertain, limit)
     both = NormalEquations((*factors, held), poses)
-    _, found, weights = robust_minimum(both, poses, np.append(uncertain, held.uncertain), limit)
-    weights = weights[: len(uncertain)]
+    both, first, all_weights = robust_minimum(both, poses, np.append(uncertain, held.uncertain), limit)
+    weights = all_weights[: len(uncertain)]
     equations = NormalEquations(factors, poses, weights > 0)
-    found = found._replace(terms=equations.terms(found.poses))
+    found = first._replace(terms=equations.terms(first.poses))
     if not _is_degenerate(equations, found, weights, held):
         found = minimize(equations, found, weights, limit)
+    elif first.converged:
+        settled = settle(both, first, all_weights, np.arange(len(all_weights)) >= len(uncertain)).poses
+        found = found._replace(poses=settled, terms=equations.terms(settled))
     return equations, found, weights
 
 

@@ -100,11 +100,12 @@ def odometry(
         against: "previous": register to the previous frame. "map": to the points of all frames before that lie within
             `map_radius` of the last pose, averaged per voxel. Errors then accumulate more slowly.
         map_radius: metres; by default the distance of the farthest point of the first frame from its sensor.
-        recover: relocalise after a jump: if a registration does not converge or its overlap drops by a fifth, find the
-            frame by `global_pose` in a map of all previous frames, which is kept in memory. If relocalisation fails and
-            the registration has too few matches, or less than half of the previous overlap, tracking is lost: the pose
-            is extrapolated with constant velocity, and the next frames follow it, registered to the previous frame,
-            outside of the map, until one is relocalised.
+        recover: relocalise after a jump: if a registration does not converge, its overlap drops by a fifth, or the
+            distances along the normals double, in units of the thickness of the neighbourhoods, find the frame by
+            `global_pose` in a map of all previous frames, which is kept in memory. If relocalisation fails and the
+            registration has too few matches or such distances, tracking is lost: the pose is extrapolated with constant
+            velocity, and the next frames follow it, registered to the previous frame, outside of the map, until one is
+            relocalised. A place whose surfaces coincide with known ones cannot be told from these.
         loops: close loops: register a frame to an earlier one whose position is near, within the uncertainty of the
             poses, and correct all poses by `optimize_poses`. Steps keep the pose known at their time; the corrected
             poses are in the `graph` of the last step. All clouds are kept in memory. Not with `against="map"` or
@@ -262,13 +263,14 @@ class _Sensor(Iterator[OdometryStep]):
         """Update motion and pose by a registration."""
         follows = self.world is None or self.is_lost
         if follows:
-            result = register_pair(cloud, before, self.method, self.motion, self.options)
+            target = before
+            result = register_pair(cloud, target, self.method, self.motion, self.options)
         else:
             target = map_target(self.world.cloud(), self.method, self.options, self.num_neighbors)
             result = register_pair(cloud, target, self.method, self.pose @ self.motion, self.options)
         known, found = not self.is_lost, None
         if self.places is not None:
-            found = self.places.corrected(cloud, result, self.method, self.options, self.num_neighbors)
+            found = self.places.corrected(cloud, target, result, self.method, self.options, self.num_neighbors)
         # The result with which tracking is lost is not used, those of the frames that follow are.
         if found is None and not (known and self.is_lost) and is_usable(result):
             self.motion = np.asarray(result.matrix) if follows else np.linalg.solve(self.pose, result.matrix)
