@@ -8,8 +8,8 @@ of the forces, w M(I − O)d, sums to a bias of nearest-neighbour matching, whic
 `voxel_gaussians` stand still instead: A = Σ w JᵀMJ (`matches_slide`). (Including the derivative of M with respect to
 the rotation in A changed the result by less than 1 %.)
 
-Three steps: medians over sampled rows (`discounts`), scores of all rows (`scores_of`), and 6×6 algebra (`sandwich`).
-The first two work row by row, in blocks or over whole arrays.
+Three steps: medians over sampled rows (`discounts_and_reach`), scores of all rows (`scores_of`), and 6×6 algebra
+(`sandwich`). The first two work row by row, in blocks or over whole arrays.
 """
 
 from __future__ import annotations
@@ -42,18 +42,20 @@ _MEDIAN_SQUARE, _MEDIAN_MEAN_OF_TWO = 0.455, 0.693
 
 
 class NoiseSample(NamedTuple):
-    """Per match, the statistics whose medians `discounts` takes; NaN where there is no match.
+    """Per match, the statistics whose medians are taken; NaN where there is no match.
 
     Attributes:
         residual: squared residual along the normal, metres².
         expected: its variance expected from roughness, metres².
         quotient: squared descriptor difference over its variance expected from channel noise; NaN also where a point
             lacks a channel.
+        reach: mean distance of both points to their farthest neighbours, metres.
     """
 
     residual: Float[AnyArray, "n"]
     expected: Float[AnyArray, "n"]
     quotient: Float[AnyArray, "n"]
+    reach: Float[AnyArray, "n"]
 
 
 def noise_sample(motion: Motion, matched: Matched) -> NoiseSample:
@@ -76,6 +78,7 @@ def noise_sample(motion: Motion, matched: Matched) -> NoiseSample:
         jnp.where(matched.valid, seen, jnp.nan),
         jnp.where(matched.valid, expected, jnp.nan),
         jnp.where(complete, quotient, jnp.nan),
+        jnp.where(matched.valid, 0.5 * (noises[0].reach + noises[1].reach), jnp.nan),
     )
 
 
@@ -86,8 +89,11 @@ def _noises(matched: Matched) -> tuple[SurfaceNoise, SurfaceNoise]:
     return source, target
 
 
-def discounts(sample: NoiseSample, num_channels: Int[AnyScalar, ""]) -> Float[AnyArray, "2"]:
-    """(2,) factors, 0.2 to 1, by which observability must be reduced: of the geometry and of the channels.
+def discounts_and_reach(
+    sample: NoiseSample, num_channels: Int[AnyScalar, ""]
+) -> tuple[Float[AnyArray, "2"], Float[AnyScalar, ""]]:
+    """(2,) factors, 0.2 to 1, by which observability must be reduced: of the geometry and of the channels; and the
+    median distance to the farthest neighbour, metres.
 
     On a rough surface the nearest neighbour is one whose height resembles that of the point. Model the height b of a
     match as b = βa + e, with equal roughness on both sides. Then var(b − a) is (1 − β) times the sum of both
@@ -100,12 +106,14 @@ def discounts(sample: NoiseSample, num_channels: Int[AnyScalar, ""]) -> Float[An
         num_channels: number of channels with a nonzero weight α.
     """
     xp = numpy_for(sample, num_channels)
-    seen, expected, quotient = median(xp.stack([xp.asarray(column) for column in sample]))
+    seen, expected, quotient, reach = median(xp.stack([xp.asarray(column) for column in sample]))
     geometry = (seen / _MEDIAN_SQUARE) / (xp.where(expected > 0, expected, xp.nan) / _MEDIAN_MEAN_OF_TWO)
     # Divided by the median of χ²/C with C degrees of freedom, after Wilson & Hilferty 1931.
     channels = quotient / (1 - 2 / (9 * xp.maximum(num_channels, 1))) ** 3
     ratios = xp.stack([geometry, channels])
-    return xp.where(xp.isfinite(ratios), xp.clip(ratios, _LEAST_FRACTION, 1), 1).astype(sample.residual.dtype)
+    factors = xp.where(xp.isfinite(ratios), xp.clip(ratios, _LEAST_FRACTION, 1), 1)
+    reach = xp.where(reach > 0, reach, 1)
+    return factors.astype(sample.residual.dtype), reach.astype(sample.residual.dtype)
 
 
 class Scores(NamedTuple):
@@ -131,13 +139,14 @@ class Frame(NamedTuple):
 
     Attributes:
         center, radius: `Sums.center` and `Sums.radius` over all correspondences, metres.
-        discount: from `discounts`.
+        discount, reach: from `discounts_and_reach`.
         num_cells: size of the hash table of cells.
     """
 
     center: Float[AnyArray, "3"]
     radius: Float[AnyScalar, ""]
     discount: Float[AnyArray, "2"]
+    reach: Float[AnyScalar, ""]
     num_cells: Int[AnyScalar, ""]
 
 
@@ -162,7 +171,9 @@ def scores_of(
     if matched.source.noise is not None:
         edge = max(term.correlation_length for term in (responding or terms))
         source, target = _noises(matched)
-        cells = _cells(moved, matched.valid, 0.5 * edge * (source.reach + target.reach), frame.num_cells)
+        # In units of the data about their centre, so that cells do not depend on the unit of length or on the origin.
+        relative = 0.5 * (source.reach + target.reach) / frame.reach
+        cells = _cells(arms * (frame.radius / (edge * frame.reach)), matched.valid, relative, frame.num_cells)
     if responding is not None:
         seen = linearize_at(motion, matched, responding)[1]
         stiffness, bias = seen.stiffness, jnp.sum(_wrench(arms, found.force - seen.force), axis=1)
@@ -212,11 +223,11 @@ def _tangent_stiffness(
 
 
 def _cells(
-    moved: Float[Array, "3 N"], valid: Bool[Array, "N"], size: Float[Array, "N"], num_cells: Int[AnyScalar, ""]
+    points: Float[Array, "3 N"], valid: Bool[Array, "N"], size: Float[Array, "N"], num_cells: Int[AnyScalar, ""]
 ) -> Int[Array, "N"]:
     """Hash of the cell that contains each point. Cell sizes follow the point density, rounded to powers of two."""
     level = jnp.round(jnp.log2(jnp.where(valid & (size > 0), size, 1)))
-    cell = jnp.floor(jnp.where(valid, moved / 2.0**level, 0)).astype(jnp.int32)
+    cell = jnp.floor(jnp.where(valid, points / 2.0**level, 0)).astype(jnp.int32)
     return cell_numbers((*cell, level.astype(jnp.int32)), num_cells)
 
 

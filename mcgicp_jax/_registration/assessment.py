@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from mcgicp_jax._compute.concrete import AnyArray, is_concrete, numpy_for
+from mcgicp_jax._compute.concrete import AnyArray, AnyScalar, is_concrete, numpy_for
 from mcgicp_jax._compute.lazy import Lazy
 from mcgicp_jax._local_geometry.surface import searched
 from mcgicp_jax._math.poses import adjoint_to_center, units
@@ -19,7 +19,7 @@ from mcgicp_jax._pose_solver.adaptation import sample_of_term
 from mcgicp_jax._pose_solver.covariance import (
     Frame,
     Moments,
-    discounts,
+    discounts_and_reach,
     moments_from,
     noise_sample,
     sandwich,
@@ -72,21 +72,25 @@ def moments_of(executor: AbstractExecutor, loop: LoopResult, rematched: bool) ->
     problem, state = executor.problem, loop.state
     motion, surface = executor.motion(state.pose), executor.source_of(loop.matches)
     size = surface.num_points
-    frame = Frame(state.sums.center, state.sums.radius, np.ones(2, surface.points.dtype), np.int32(size))
+    one = np.ones((), surface.points.dtype)
+    frame = Frame(state.sums.center, state.sums.radius, np.tile(one, 2), one, np.int32(size))
     if surface.noise is not None and problem.target.noise is not None:
-        frame = frame._replace(discount=_discounts(executor, motion, loop.matches))
+        discount, reach = _discounts_and_reach(executor, motion, loop.matches)
+        frame = frame._replace(discount=discount, reach=reach)
     responding = _responding(executor, motion, loop) if rematched and is_adaptive(loop.terms) else None
     scores = executor.scores(motion, loop.matches, frame, loop.terms, responding)
     return moments_from(scores, size)
 
 
-def _discounts(executor: AbstractExecutor, motion: Motion, matches: Any) -> Float[AnyArray, "2"]:
+def _discounts_and_reach(
+    executor: AbstractExecutor, motion: Motion, matches: Any
+) -> tuple[Float[AnyArray, "2"], Float[AnyScalar, ""]]:
     search = searched(executor.source_of(matches))
     rows, counts = sampled_rows(search.valid)
     xp = numpy_for(counts)
     sample = executor.over_rows(noise_sample, motion, executor.nearest(motion, matches), rows, with_noise=True)
     sample = jax.tree.map(lambda column: xp.where(counts, column, np.asarray(np.nan, column.dtype)), sample)
-    return discounts(sample, xp.sum(xp.any(search.descriptors != 0, axis=0)))
+    return discounts_and_reach(sample, xp.sum(xp.any(search.descriptors != 0, axis=0)))
 
 
 def _responding(executor: AbstractExecutor, motion: Motion, loop: LoopResult) -> tuple[AbstractTerm, ...]:
