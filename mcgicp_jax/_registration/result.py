@@ -169,11 +169,12 @@ class RegistrationResult(eqx.Module):
 
         The estimate covers the noise and the sampling of the points, as checked on 504 simulated pairs
         (`tests/benchmarks`). It does not cover a wrong local minimum, errors common to all points (calibration, motion
-        during a scan), or moving objects. It scatters: of the same clouds turned by any angle, which cuts them into
-        other cells, the variances differ by 10 to 30 %, along single directions by 75 %. An unconstrained direction gets a standard deviation of 10 times the radius
-        of the matched points; in float32, rounding then falsifies the other variances. The matrix is therefore float64,
-        except inside transformations and from `DenseSearch` in batches. NaN if the status is TOO_FEW_CORRESPONDENCES or
-        NON_FINITE, if an alignment is degenerate, or if the matches are too few for an estimate.
+        during a scan), or moving objects. It scatters: where the same clouds are turned, which cuts them into other
+        cells, the variances differ by 10 to 30 %, along single directions by 75 %. An unconstrained direction gets a
+        standard deviation of 10 times the radius of the matched points; in float32, rounding then falsifies the other
+        variances. The matrix is therefore float64, except inside transformations and from `DenseSearch` in batches. NaN
+        if the status is TOO_FEW_CORRESPONDENCES or NON_FINITE, if an alignment is degenerate, or if the matches are too
+        few for an estimate.
         """
         return self.uncertainty.value.covariance
 
