@@ -53,7 +53,12 @@ def test_ties_are_ordered_by_row(seed, high, num_channels, size):
 @given(seed=st.integers(0, 2**31), num_points=st.integers(4, 120), scale=st.sampled_from([1e-3, 1.0, 1e4]))
 def test_neighbors_of_random_points(seed, num_points, scale):
     points = (scale * np.random.default_rng(seed).normal(size=(num_points, 3))).astype(np.float32)
-    np.testing.assert_array_equal(DenseSearch().neighbors(points, 20), KDTreeSearch().neighbors(points, 20))
+    found = [search.neighbors(points, 20) for search in (DenseSearch(), KDTreeSearch())]
+    # Rounding decides which of two points at nearly the same distance is the nearer one.
+    ours, others = (np.linalg.norm(points[rows] - points[:, None], axis=2) * (rows >= 0) for rows in found)
+    np.testing.assert_array_equal(found[0] >= 0, found[1] >= 0)
+    np.testing.assert_allclose(ours, others, rtol=1e-5)
+    assert np.mean(found[0] == found[1]) > 0.99
 
 
 def test_neighbors_far_from_the_origin_lose_nothing():

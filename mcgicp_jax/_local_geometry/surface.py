@@ -37,20 +37,20 @@ class Surface(NamedTuple):
         covariance: result of `AbstractMethod.covariance`.
         observability: by the shape of the surface, see `_local_geometry.observability`; None if not needed.
         channel_observability: by the channels; None if not needed, or if the method does not use channels.
-        slopes: gradients of the descriptors α · channel; None where `channel_observability` is.
         columns: `AbstractTerm.columns` by name of the term, for terms that define them.
         noise: for the covariance of the pose; None if not needed.
         search: the points as input to the search; None for matched rows where it is not needed.
+        slopes: gradients of the descriptors α · channel; None where `channel_observability` is, and for cells.
     """
 
     points: Float[AnyArray, "*batch N 3"]
     covariance: Float[AnyArray, "*batch N 6"]
     observability: Float[AnyArray, "*batch N 6"] | None
     channel_observability: Float[AnyArray, "*batch N 6"] | None
-    slopes: Float[AnyArray, "*batch N C 3"] | None
     columns: dict[str, Any]
     noise: SurfaceNoise | None = None
     search: SearchPoints | None = None
+    slopes: Float[AnyArray, "*batch N C 3"] | None = None
 
     @property
     def num_points(self) -> int:

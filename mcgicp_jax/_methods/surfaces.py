@@ -271,7 +271,6 @@ def surface_of(
         covariance=method.covariance(around, local).T,
         observability=None,
         channel_observability=None,
-        slopes=None,
         columns={kind.name: kind.columns(around, local) for kind in kinds},
     )
     if not observed or local is None:
@@ -282,6 +281,9 @@ def surface_of(
         weights = jnp.asarray(weights, around.own.dtype)
         by_channels, slopes, noise = channel_observability(local.fits, local.normal, weights)
         by_channels = by_channels.T
+        if method.needs_covariances:
+            # Slopes between cells are not those between points.
+            slopes = None
     # Observability is constant to autodiff.
     by_shape, by_channels, slopes, details = jax.lax.stop_gradient(
         (local.observability, by_channels, slopes, SurfaceNoise(noise, local.normal, local.roughness, local.reach))

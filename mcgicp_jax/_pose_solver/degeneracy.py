@@ -96,18 +96,20 @@ def find_directions(sums: Sums, final: Bool[AnyScalar, ""]) -> Directions:
     shares, turn = jnp.linalg.eigh(basis.T @ geometry @ basis)
     basis = basis @ turn
     free = ~(shares >= GEOMETRY_HOLDS)
-    if sums.channel_observability is None or sums.agreement is None:
+    if sums.channel_observability is None:
         channels = jnp.zeros_like(shares)
         return Directions(twists=basis.T, geometry=shares, channels=channels, center=center, radius=radius)
     # Diagonalise the channels within the free directions; 2, above any fraction, sorts the other directions last.
     among = jnp.outer(free, free)
-    within, agreed = (twist_form(each / total, radius) for each in (sums.channel_observability, sums.agreement))
+    within = twist_form(sums.channel_observability / total, radius)
     held, turn = jnp.linalg.eigh(jnp.where(among, basis.T @ within @ basis, jnp.diag(2.0 * ~free)))
     basis = basis @ turn
-    # The directions stay those along which the pose was updated.
-    shares, agreed = (jnp.sum(basis * (form @ basis), axis=0) for form in (geometry, agreed))
-    disagree = final & (agreed < _AGREE * held)
-    channels = jnp.where(held > 1.5, 0, jnp.where(disagree, agreed - _AGREE * held, held))
+    shares, channels = jnp.sum(basis * (geometry @ basis), axis=0), held
+    if sums.agreement is not None:
+        # The directions stay those along which the pose was updated.
+        agreed = jnp.sum(basis * (twist_form(sums.agreement / total, radius) @ basis), axis=0)
+        channels = jnp.where(final & (agreed < _AGREE * held), agreed - _AGREE * held, held)
+    channels = jnp.where(held > 1.5, 0, channels)
     return Directions(twists=basis.T, geometry=shares, channels=channels, center=center, radius=radius)
 
 

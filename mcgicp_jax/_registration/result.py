@@ -168,13 +168,11 @@ class RegistrationResult(eqx.Module):
         small rotation moves the points far and the first three variances are large: use `deviations` there.
 
         The estimate covers the noise and the sampling of the points, as checked on 504 simulated pairs
-        (`tests/benchmarks`). It does not cover a wrong local minimum, errors common to all points (calibration, motion
-        during a scan), or moving objects. It scatters: where the same clouds are turned, which cuts them into other
-        cells, the variances differ by 10 to 30 %, along single directions by 75 %. An unconstrained direction gets a
-        standard deviation of 10 times the radius of the matched points; in float32, rounding then falsifies the other
-        variances. The matrix is therefore float64, except inside transformations and from `DenseSearch` in batches. NaN
-        if the status is TOO_FEW_CORRESPONDENCES or NON_FINITE, if an alignment is degenerate, or if the matches are too
-        few for an estimate.
+        (`tests/benchmarks`), and scatters: turning both clouds changes variances by 10 to 30 %, some by 75 %. It does
+        not cover a wrong local minimum, errors common to all points (calibration, motion during a scan), or moving
+        objects. The standard deviation of an unconstrained direction is 10 times the radius of the matched points. So
+        that rounding spares the others, the matrix is float64, but for transformations and `DenseSearch` in batches.
+        NaN if the status is TOO_FEW_CORRESPONDENCES or NON_FINITE, or if the matches are too few for an estimate.
         """
         return self.uncertainty.value.covariance
 
