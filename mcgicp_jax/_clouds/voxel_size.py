@@ -60,9 +60,9 @@ _DOUBLE = 3
 _DECADES, _DOUBLINGS, _INNER = 4, 4, (0.05, 0.95)
 # Number of points whose neighbourhoods are examined: a fraction of 5 % is known to within 1.3 %.
 _SAMPLE = 300
-# Bits of the hash by which voxels are counted: 40,000 lose 2 % by collisions. Its multiplier is 2⁶⁴ over the golden
-# ratio (Knuth, The Art of Computer Programming, volume 3, 6.4).
-_HASH_BITS, _GOLDEN = 20, np.uint64(0x9E3779B97F4A7C15)
+# Bits of the hash by which voxels are counted: of 40,000, 2 % collide. Its multiplier is 2⁶⁴ over the golden ratio
+# (Knuth, The Art of Computer Programming, volume 3, 6.4); applied only once, planes collide five times as often.
+_HASH_BITS, _HALF, _GOLDEN = 20, np.uint64(32), np.uint64(0x9E3779B97F4A7C15)
 # Fractions of lines and thickness from which raw clouds are warned of.
 _MANY_LINES, _AS_THICK_AS_WIDE = 0.1, 0.6
 
@@ -262,15 +262,18 @@ def _each(points: Sequence[Float[np.ndarray, "3 _"]], function: Callable[[np.nda
 
 
 def _counts(points: Sequence[Float[np.ndarray, "3 _"]], step: int) -> list[int]:
-    """The number of voxels of each cloud, to within 2 %."""
+    """The number of voxels of each cloud, or up to 0.4 % more."""
 
     def count(columns: Float[np.ndarray, "3 N"]) -> int:
         key = np.zeros(columns.shape[1], np.int64)
         for column in columns:
             key = key * VOXELS_PER_AXIS + np.floor(column / _size(step)).astype(np.int64)
         occupied = np.zeros(2**_HASH_BITS, bool)
-        occupied[key.view(np.uint64) * _GOLDEN >> np.uint64(64 - _HASH_BITS)] = True
-        return int(np.count_nonzero(occupied))
+        mixed = key.view(np.uint64) * _GOLDEN
+        occupied[(mixed ^ mixed >> _HALF) * _GOLDEN >> np.uint64(64 - _HASH_BITS)] = True
+        # The expected number that collides, and three standard deviations of that.
+        number = -occupied.size * np.log1p(-occupied.mean())
+        return int(number * (1 + 3 / np.sqrt(2 * occupied.size)))
 
     return _each(points, count)
 
