@@ -48,6 +48,14 @@ def test_a_flat_wall_is_observed_along_its_normal_alone(size, turn):
     assert within[0] > -2e-3 and within[1] < 5e-4
 
 
+@pytest.mark.parametrize("size", [100, 300, 1000])
+def test_random_points_are_registered(size):
+    """Their neighbourhoods are no surfaces."""
+    target, truth = np.random.default_rng(size).random((size, 3)), motion((0.02, -0.01, 0.03, 0.02, -0.03, 0.01))
+    result = mcg.register((target - truth[:3, 3]) @ truth[:3, :3], target, mcg.GICP())
+    assert result.converged and np.abs(result.matrix - truth).max() < 1e-4
+
+
 @pytest.mark.parametrize("noise", [0.25, 0.75, 1.0])
 @pytest.mark.parametrize("name, free", [("plane", (0, 1)), ("crossing planes", (0,)), ("room", ())])
 def test_noise_as_large_as_the_spacing_constrains_nothing(name, free, noise):

@@ -160,8 +160,13 @@ def test_the_size_survives_what_users_do_with_clouds():
 def test_a_given_none_is_warned_of_with_figures():
     with pytest.warns(UserWarning, match=r"voxel_size: without voxels, \d+% of the neighbourhoods are lines"):
         mcg.preprocess(lines(), None)
-    with pytest.warns(UserWarning, match=r"voxel_size: without voxels, .* thickness is 0\.\d+ of their width"):
+    with pytest.warns(UserWarning, match=r"voxel_size: .* neighbourhoods are 0\.\d+ times as thick as wide"):
         mcg.preprocess(even(20_000, noise=0.1), None)
+
+
+def test_few_neighbours_are_not_warned_of(recwarn):
+    mcg.preprocess(even(5000), None, 4)
+    assert not [warning for warning in recwarn if "voxel_size" in str(warning.message)]
 
 
 @pytest.mark.parametrize("wrong", ["large", 0.0, -1.0, (1.0,), float("nan")])

@@ -210,8 +210,8 @@ def _settings(pairs: Sequence[FilePair], method: MethodName, options: Options) -
     names = common_channels(options, *clouds)
     if METHODS[method].kind.uses_channels and not names:
         raise ValueError("expected clouds with channels in common, got none; use gicp instead (--method gicp)")
-    voxels = voxels_of(clouds, options)
-    print(f"points:    {voxels}")
+    voxels, described = voxels_of(clouds, options)
+    print(f"points:    {described}")
     print(f"channels:  {listed(names)}")
 
     def preprocessed() -> list[mcg.PointCloud]:
@@ -220,7 +220,7 @@ def _settings(pairs: Sequence[FilePair], method: MethodName, options: Options) -
     return registration_for(method, options, lambda: preprocessed()[1]) | {
         "method": method_for(method, options, preprocessed),
         "channels": names,
-        "voxel_size": voxels.size,
+        "voxel_size": None if voxels is None else voxels.size,
         "num_neighbors": options.num_neighbors,
     }
 

@@ -67,14 +67,18 @@ def multiway(
     check_inputs(*paths)
     raw = [io.read(path) for path in paths]
     names = common_channels(shared, *raw[:2])
-    voxels = voxels_of(raw, shared)
+    voxels, described = voxels_of(raw, shared)
     clouds = [mcg.preprocess(with_channels(cloud, names), voxels, shared.num_neighbors) for cloud in raw]
-    print(f"clouds:    {len(clouds)}, {len(raw[0]):,} points in the first, {len(clouds[0]):,} used ({voxels})")
+    print(f"clouds:    {len(clouds)}, {len(raw[0]):,} points in the first, {len(clouds[0]):,} used ({described})")
     print(f"channels:  {listed(names)}")
     start = None if init is None else list(io.read_poses(init))
     chosen = method_for(method, shared, lambda: (clouds[1], clouds[0]))
     found = mcg.multiway(
-        clouds, chosen, init=start, voxel_size=voxels.size, **registration_for(method, shared, lambda: clouds[0])
+        clouds,
+        chosen,
+        init=start,
+        voxel_size=None if voxels is None else voxels.size,
+        **registration_for(method, shared, lambda: clouds[0]),
     )
     _report(found)
     if output is not None:

@@ -222,9 +222,11 @@ def weights_from(source: mcg.PointCloud, target: mcg.PointCloud) -> Any:
     return chosen.channel_weights
 
 
-def voxels_of(clouds: Sequence[mcg.PointCloud], options: Options) -> Voxels:
-    """The voxels for raw clouds by the user's option."""
-    return voxels_for(None if options.voxel_size == "off" else options.voxel_size, *clouds)
+def voxels_of(clouds: Sequence[mcg.PointCloud], options: Options) -> tuple[Voxels | None, str]:
+    """The voxels for raw clouds by the user's option, and their description; None for all points, of which `preprocess`
+    may warn."""
+    voxels = None if options.voxel_size == "off" else voxels_for(options.voxel_size, *clouds)
+    return voxels, str(voxels or Voxels())
 
 
 def registration_for(name: MethodName, options: Options, target: Callable[[], mcg.PointCloud]) -> dict[str, Any]:

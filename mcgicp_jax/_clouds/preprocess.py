@@ -195,7 +195,7 @@ def _warn_of_loss(given: PointCloud, found: PointCloud, num_neighbors: int) -> N
     if duplicates > 0.5:
         warn(
             f"points: {duplicates:.0%} lie exactly on another one, so that neighbourhoods do not span the surface; "
-            "average them with voxel_size"
+            "average them: preprocess(cloud, voxel_size=...)"
         )
     if len(found) < min(len(given), num_neighbors):
         warn(

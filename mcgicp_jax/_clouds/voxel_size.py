@@ -110,12 +110,16 @@ def warn_of_shape(cloud: PointCloud) -> None:
     """Warn if the neighbourhoods of a preprocessed cloud do not span the surface."""
     if len(cloud) < _LEAST_VOXELS:
         return
-    shape = _shape_of(np.asarray(cloud.points, np.float64), cloud.deferred_neighbors)
-    if shape.lines > _MANY_LINES or shape.thickness > _AS_THICK_AS_WIDE:
-        warn(
-            f"voxel_size: without voxels, {shape.lines:.0%} of the neighbourhoods are lines, and their median "
-            f'thickness is {shape.thickness:.2f} of their width, so they do not describe the surface; use "auto"'
-        )
+    neighbors: Any = cloud.deferred_neighbors
+    # Fewer neighbours are often lines by chance.
+    found = neighbors if neighbors.shape[1] >= NUM_NEIGHBORS else None
+    shape, seen = _shape_of(np.asarray(cloud.points, np.float64), found), []
+    if shape.lines > _MANY_LINES:
+        seen.append(f"{shape.lines:.0%} of the neighbourhoods are lines")
+    if shape.thickness > _AS_THICK_AS_WIDE:
+        seen.append(f"the neighbourhoods are {shape.thickness:.2f} times as thick as wide")
+    if seen:
+        warn(f'voxel_size: without voxels, {" and ".join(seen)}, so they do not describe the surface; use "auto"')
 
 
 def _chosen(clouds: Sequence[PointCloud]) -> Voxels:

@@ -78,13 +78,14 @@ def _described(
 
 
 def _normals_of_halves(around: Neighborhoods, offsets: Offsets) -> tuple[Float[Array, "3 n"], Float[Array, "3 n"]]:
-    """Normals of every second neighbour, from the first and from the second on; 0 where these are fewer than three."""
+    """Normals of every second neighbour, from the first and from the second on; 0 where there are too few."""
     present = around.present.astype(offsets[0].dtype)
     halves = [[array[first::2] for array in (*offsets, present)] for first in (0, 1)]
     # As one array, which compiles once.
     covariances = jnp.concatenate([weighted_covariance((x, y, z), weights) for x, y, z, weights in halves], axis=1)
     enough = jnp.concatenate([jnp.sum(weights, axis=0) >= 3 for *_, weights in halves])
-    first, second = jnp.split(jnp.where(enough, alg.smallest_eigenvector(covariances), 0), 2, axis=1)
+    used = enough & ~around.few
+    first, second = jnp.split(jnp.where(used, alg.smallest_eigenvector(covariances), 0), 2, axis=1)
     return first, second
 
 

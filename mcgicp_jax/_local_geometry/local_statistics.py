@@ -17,7 +17,7 @@ from mcgicp_jax._compute.packing import Packed
 from mcgicp_jax._compute.rows_on_demand import RowsOnDemand, in_blocks
 from mcgicp_jax._compute.threads import side_by_side
 from mcgicp_jax._local_geometry.local_geometry import LocalGeometry, describe
-from mcgicp_jax._local_geometry.neighborhoods import Neighborhoods, check_neighbors, gatherer
+from mcgicp_jax._local_geometry.neighborhoods import FEW_POINTS, Neighborhoods, check_neighbors, gatherer
 
 Tree = TypeVar("Tree")
 
@@ -53,9 +53,11 @@ def local_geometries(
         of_target, of_source = side_by_side(calls, num_threads)
         return of_source, of_target
     # A concrete cloud beside a traced one is traced as well, which needs no program of its own.
-    if source_rows is not None or not share_a_body(source, target):
+    few = source.points.shape[0] < FEW_POINTS
+    alike = share_a_body(source, target) and few == (target.points.shape[0] < FEW_POINTS)
+    if source_rows is not None or not alike:
         return _traced(source, with_channels, source_rows), _traced(target, with_channels)
-    return split(_traced(joined(source, target, with_channels), with_channels), source.points.shape[0])
+    return split(_traced(joined(source, target, with_channels), with_channels, few=few), source.points.shape[0])
 
 
 def local_geometry_on_host(
@@ -90,8 +92,8 @@ def _describe(around: Neighborhoods) -> Packed[LocalGeometry]:
     return Packed.of(describe(around))
 
 
-def _traced(cloud: PointCloud, with_channels: bool, among: Any = None) -> LocalGeometry:
-    gather = gatherer(cloud, with_channels, jnp)
+def _traced(cloud: PointCloud, with_channels: bool, among: Any = None, few: bool | None = None) -> LocalGeometry:
+    gather = gatherer(cloud, with_channels, jnp, few=few)
     if among is None:
         return over_rows(lambda rows: describe(gather(rows)), cloud.points.shape[0])
     return over_rows(lambda rows: describe(gather(among[rows])), among.size)

@@ -47,8 +47,8 @@ def geometry_observability(
     P and its noise come from the normals of two halves of the neighbours, whose noise is independent: P is the mean
     (P₁ + P₂) / 2, the noise η (P₁ − P₂)². With η = 1/2 it is unbiased for normals that are nearly right, with 3/4 for
     normals of random directions. Where surfaces meet or noise is as large as the spacing of the points, V is smaller
-    than the noise. For covariances without neighbours, and where a half has fewer than three, P = n nᵀ and the noise is
-    V.
+    than the noise. For covariances without neighbours, in clouds of few points, and where a half has fewer than three
+    neighbours, P = n nᵀ and the noise is V.
 
     Args:
         covariance: covariance of the neighbours about their mean, metres².
