@@ -373,7 +373,7 @@ def test_a_jump_to_a_street_that_was_never_seen_is_lost(against):
 
 def test_exact_planes_are_not_lost():
     """Their neighbourhoods have no thickness, so that distances in these units are rounding."""
-    frames = datasets.box_room(3, points_per_frame=3000, noise=0)
+    frames = datasets.box_room(3, points_per_frame=3000, noise=0.0)
     clouds = [frames[k].cloud for k in (0, 0, 1, 2)]
     assert not any(step.lost for step in mcg.odometry(clouds, mcg.GICP(), recover=True))
 

@@ -11,7 +11,7 @@ from __future__ import annotations
 from typing import Any, NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float, Inexact, Int
 
 from mcgicp_jax._math.poses import adjoint, inverse
 from mcgicp_jax._pose_graph.factors import WORLD, AbstractFactor
@@ -132,11 +132,11 @@ class NormalEquations:
         rows[~self.held] = vector.reshape(-1, *rows.shape[1:])[self.place[~self.held]]
         return rows
 
-    def weighted(self, blocks: Float[np.ndarray, "b 6 6"], weights: Float[np.ndarray, "m"]) -> Any:
+    def weighted(self, blocks: Float[np.ndarray, "b 6 6"], weights: Inexact[np.ndarray, "m"]) -> Any:
         """The sparse matrix of the blocks of all measurements, such as H."""
         return self.matrix(weights[self._of_block, None, None] * blocks)
 
-    def matrix(self, blocks: Float[np.ndarray, "b 6 6"]) -> Any:
+    def matrix(self, blocks: Inexact[np.ndarray, "b 6 6"]) -> Any:
         """The sparse symmetric matrix of the sum of all blocks."""
         from scipy.sparse import bsr_array, csc_array
 

@@ -94,7 +94,9 @@ def warn_of_lengths(source: PointCloud, target: PointCloud) -> None:
     if not _differ(extents):
         return
     # More costly for raw clouds.
-    spacings = [raw_spacing(cloud) if cloud.deferred_neighbors is None else point_spacing(cloud) for cloud in clouds]
+    spacings = [
+        raw_spacing(cloud) if cloud.deferred_neighbors is None else float(point_spacing(cloud)) for cloud in clouds
+    ]
     if _differ(spacings) and (extents[0] < extents[1]) == (spacings[0] < spacings[1]):
         warn(
             f"points: the source extends over {extents[0]:.2g} with a spacing of {spacings[0]:.2g}, the target over "
