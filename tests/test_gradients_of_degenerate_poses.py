@@ -25,8 +25,8 @@ def plane(size, seed):
 
 
 def corridor(size, seed):
-    """4 m long, 2 m wide and high: neighbourhoods are 0.7 m wide, and those on one wall observe the roll."""
-    return walls(size, seed, ((1, 0), (1, 2), (2, 0), (2, 2)), (4, 2, 2))
+    """4 m long, 1 m wide and high."""
+    return walls(size, seed, ((1, 0), (1, 1), (2, 0), (2, 1)), (4, 1, 1))
 
 
 def corner(size, seed):

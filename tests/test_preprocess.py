@@ -306,7 +306,7 @@ def test_points_left_out_for_their_channels_are_told():
 
 
 def test_clouds_of_duplicates_are_told():
-    with pytest.warns(UserWarning, match="^points: 100% lie exactly on another one, .* voxel_size$"):
+    with pytest.warns(UserWarning, match=r"^points: 100% lie exactly on another one, .* voxel_size=\.\.\.\)$"):
         ready(np.repeat(POINTS, 2, axis=0))
     with warnings.catch_warnings():
         warnings.simplefilter("error")
