@@ -35,6 +35,7 @@ from mcgicp_jax._cli.options import (
     files_of,
     listed,
     method_for,
+    preprocessed,
     registration_for,
     voxels_of,
     with_channels,
@@ -210,17 +211,17 @@ def _settings(pairs: Sequence[FilePair], method: MethodName, options: Options) -
     names = common_channels(options, *clouds)
     if METHODS[method].kind.uses_channels and not names:
         raise ValueError("expected clouds with channels in common, got none; use gicp instead (--method gicp)")
-    voxels, described = voxels_of(clouds, options)
-    print(f"points:    {described}")
+    voxels = voxels_of(clouds, options)
+    print(f"points:    {voxels}")
     print(f"channels:  {listed(names)}")
 
-    def preprocessed() -> list[mcg.PointCloud]:
-        return [mcg.preprocess(with_channels(cloud, names), voxels, options.num_neighbors) for cloud in clouds]
+    def ready() -> list[mcg.PointCloud]:
+        return [preprocessed(cloud, names, voxels, options) for cloud in clouds]
 
-    return registration_for(method, options, lambda: preprocessed()[1]) | {
-        "method": method_for(method, options, preprocessed),
+    return registration_for(method, options, lambda: ready()[1]) | {
+        "method": method_for(method, options, ready),
         "channels": names,
-        "voxel_size": None if voxels is None else voxels.size,
+        "voxel_size": voxels.size,
         "num_neighbors": options.num_neighbors,
     }
 

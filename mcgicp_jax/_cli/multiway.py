@@ -22,9 +22,9 @@ from mcgicp_jax._cli.options import (
     files_of,
     listed,
     method_for,
+    preprocessed,
     registration_for,
     voxels_of,
-    with_channels,
     with_names,
 )
 
@@ -67,18 +67,14 @@ def multiway(
     check_inputs(*paths)
     raw = [io.read(path) for path in paths]
     names = common_channels(shared, *raw[:2])
-    voxels, described = voxels_of(raw, shared)
-    clouds = [mcg.preprocess(with_channels(cloud, names), voxels, shared.num_neighbors) for cloud in raw]
-    print(f"clouds:    {len(clouds)}, {len(raw[0]):,} points in the first, {len(clouds[0]):,} used ({described})")
+    voxels = voxels_of(raw, shared)
+    clouds = [preprocessed(cloud, names, voxels, shared) for cloud in raw]
+    print(f"clouds:    {len(clouds)}, {len(raw[0]):,} points in the first, {len(clouds[0]):,} used ({voxels})")
     print(f"channels:  {listed(names)}")
     start = None if init is None else list(io.read_poses(init))
     chosen = method_for(method, shared, lambda: (clouds[1], clouds[0]))
     found = mcg.multiway(
-        clouds,
-        chosen,
-        init=start,
-        voxel_size=None if voxels is None else voxels.size,
-        **registration_for(method, shared, lambda: clouds[0]),
+        clouds, chosen, init=start, voxel_size=voxels.size, **registration_for(method, shared, lambda: clouds[0])
     )
     _report(found)
     if output is not None:

@@ -113,8 +113,8 @@ def odometry(
     names = shared.channels or first.cloud.channel_names
     print(f"frames:    {len(frames)} of {dataset}, {len(first.cloud):,} points in the first")
     print(f"channels:  {listed(names)}")
-    voxels, described = voxels_of([first.cloud], shared)
-    print(f"points:    {described}")
+    voxels = voxels_of([first.cloud], shared)
+    print(f"points:    {voxels}")
 
     def first_two() -> list[mcg.PointCloud]:
         return [mcg.preprocess(with_channels(frames[row].cloud, names), voxels) for row in (1, 0)]
@@ -122,8 +122,7 @@ def odometry(
     truth: Truth = []
     chosen = method_for(method, shared, first_two)
     options |= registration_for(method, shared, lambda: first_two()[1])
-    size = None if voxels is None else voxels.size
-    steps = mcg.odometry(_clouds(frames, names, truth), chosen, voxel_size=size, start=first.pose, **options)
+    steps = mcg.odometry(_clouds(frames, names, truth), chosen, voxel_size=voxels.size, start=first.pose, **options)
     poses, results, failure = _follow(steps, len(frames), loops, map)
     del truth[len(poses) :]
     _report(poses, truth, results)

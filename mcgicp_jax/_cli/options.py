@@ -222,11 +222,16 @@ def weights_from(source: mcg.PointCloud, target: mcg.PointCloud) -> Any:
     return chosen.channel_weights
 
 
-def voxels_of(clouds: Sequence[mcg.PointCloud], options: Options) -> tuple[Voxels | None, str]:
-    """The voxels for raw clouds by the user's option, and their description; None for all points, of which `preprocess`
-    may warn."""
-    voxels = None if options.voxel_size == "off" else voxels_for(options.voxel_size, *clouds)
-    return voxels, str(voxels or Voxels())
+def voxels_of(clouds: Sequence[mcg.PointCloud], options: Options) -> Voxels:
+    """The voxels for raw clouds by the user's option."""
+    return voxels_for(None if options.voxel_size == "off" else options.voxel_size, *clouds)
+
+
+def preprocessed(cloud: mcg.PointCloud, channels: Sequence[str], voxels: Voxels, options: Options) -> mcg.PointCloud:
+    """A cloud with some of its channels, ready to register."""
+    # Where the user asks for all points, `preprocess` warns of neighbourhoods that do not span the surface.
+    chosen = None if options.voxel_size == "off" else voxels
+    return mcg.preprocess(with_channels(cloud, channels), chosen, options.num_neighbors)
 
 
 def registration_for(name: MethodName, options: Options, target: Callable[[], mcg.PointCloud]) -> dict[str, Any]:

@@ -27,6 +27,7 @@ from mcgicp_jax._cli.options import (
     enumerated,
     listed,
     method_for,
+    preprocessed,
     registration_for,
     voxels_of,
     with_channels,
@@ -60,15 +61,15 @@ class PreparedPair:
         names = [cloud.channel_names for cloud in self.raw]
         self.channels = common_channels(options, *self.raw)
         self.difference = f"{source} has {listed(names[0])}, {target} has {listed(names[1])}"
-        voxels, described = voxels_of(self.raw, options)
+        voxels = voxels_of(self.raw, options)
         self.source, self.target = (
-            _preprocess(path, cloud, self.channels, voxels, options.num_neighbors)
+            _preprocess(path, cloud, self.channels, voxels, options)
             for path, cloud in zip((source, target), self.raw, strict=True)
         )
         counts = (
             f"{len(used):,} of {len(raw):,}" for used, raw in zip((self.source, self.target), self.raw, strict=True)
         )
-        print("points:    source {}, target {} ({})".format(*counts, described))
+        print("points:    source {}, target {} ({})".format(*counts, voxels))
         if not with_cells:
             print(f"matches:   up to {described_distance(options, self.target)} apart")
         # Without common channels, `method` raises an error if the method needs any.
@@ -290,7 +291,7 @@ def _found(clouds: Sequence[mcg.PointCloud], channels: Sequence[str]) -> Float[n
 
 
 def _preprocess(
-    path: Path, cloud: mcg.PointCloud, channels: Sequence[str], voxels: Voxels | None, num_neighbors: int
+    path: Path, cloud: mcg.PointCloud, channels: Sequence[str], voxels: Voxels, options: Options
 ) -> mcg.PointCloud:
     with messages_named(str(path)):
-        return mcg.preprocess(with_channels(cloud, channels), voxels, num_neighbors)
+        return preprocessed(cloud, channels, voxels, options)

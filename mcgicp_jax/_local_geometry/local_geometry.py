@@ -83,8 +83,7 @@ def _normals_of_halves(around: Neighborhoods, offsets: Offsets) -> tuple[Float[A
     halves = [[array[first::2] for array in (*offsets, present)] for first in (0, 1)]
     # As one array, which compiles once.
     covariances = jnp.concatenate([weighted_covariance((x, y, z), weights) for x, y, z, weights in halves], axis=1)
-    enough = jnp.concatenate([jnp.sum(weights, axis=0) >= 3 for *_, weights in halves])
-    used = enough & ~around.few
+    used = jnp.concatenate([(jnp.sum(weights, axis=0) >= 3) & ~around.few for *_, weights in halves])
     first, second = jnp.split(jnp.where(used, alg.smallest_eigenvector(covariances), 0), 2, axis=1)
     return first, second
 

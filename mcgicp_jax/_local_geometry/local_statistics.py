@@ -17,7 +17,7 @@ from mcgicp_jax._compute.packing import Packed
 from mcgicp_jax._compute.rows_on_demand import RowsOnDemand, in_blocks
 from mcgicp_jax._compute.threads import side_by_side
 from mcgicp_jax._local_geometry.local_geometry import LocalGeometry, describe
-from mcgicp_jax._local_geometry.neighborhoods import FEW_POINTS, Neighborhoods, check_neighbors, gatherer
+from mcgicp_jax._local_geometry.neighborhoods import Neighborhoods, check_neighbors, gatherer, has_few_points
 
 Tree = TypeVar("Tree")
 
@@ -53,10 +53,9 @@ def local_geometries(
         of_target, of_source = side_by_side(calls, num_threads)
         return of_source, of_target
     # A concrete cloud beside a traced one is traced as well, which needs no program of its own.
-    few = source.points.shape[0] < FEW_POINTS
-    alike = share_a_body(source, target) and few == (target.points.shape[0] < FEW_POINTS)
-    if source_rows is not None or not alike:
+    if source_rows is not None or not share_a_body(source, target):
         return _traced(source, with_channels, source_rows), _traced(target, with_channels)
+    few = jnp.concatenate([has_few_points(cloud, jnp) for cloud in (source, target)])
     return split(_traced(joined(source, target, with_channels), with_channels, few=few), source.points.shape[0])
 
 
@@ -92,7 +91,7 @@ def _describe(around: Neighborhoods) -> Packed[LocalGeometry]:
     return Packed.of(describe(around))
 
 
-def _traced(cloud: PointCloud, with_channels: bool, among: Any = None, few: bool | None = None) -> LocalGeometry:
+def _traced(cloud: PointCloud, with_channels: bool, among: Any = None, few: Any = None) -> LocalGeometry:
     gather = gatherer(cloud, with_channels, jnp, few=few)
     if among is None:
         return over_rows(lambda rows: describe(gather(rows)), cloud.points.shape[0])

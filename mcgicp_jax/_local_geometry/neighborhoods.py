@@ -37,7 +37,7 @@ class Neighborhoods(NamedTuple):
         own_known: (C, n) which channels the points have; None if no point lacks any.
         near_known: (C, k, n) which channels both a point and its neighbour have; None if no point lacks any.
         other: (k, n) which neighbours exist and are not the point itself; None if no point lacks a channel.
-        few: whether the cloud has fewer than `FEW_POINTS`.
+        few: (n,) whether the cloud of a point has fewer points than `FEW_POINTS`.
     """
 
     own: Float[AnyArray, "3 n"]
@@ -94,19 +94,25 @@ def points_alone(cloud: PointCloud, xp: ModuleType) -> Callable[[Any], Neighborh
     return gather
 
 
+def has_few_points(cloud: PointCloud, xp: ModuleType) -> Bool[AnyArray, "N"]:
+    """For each row whether the cloud has fewer points than `FEW_POINTS`; padding does not count."""
+    valid = xp.asarray(cloud.valid)
+    return xp.broadcast_to(xp.sum(valid) < FEW_POINTS, valid.shape)
+
+
 def gatherer(
-    cloud: PointCloud, with_channels: bool, xp: ModuleType, with_given: bool = False, few: bool | None = None
+    cloud: PointCloud, with_channels: bool, xp: ModuleType, with_given: bool = False, few: Any = None
 ) -> Callable[[Any], Neighborhoods]:
     """A function that maps rows (a slice or an array of row numbers) to their neighbourhoods.
 
     Args:
         xp: NumPy on the host, `jax.numpy` where the rows may be traced.
         with_given: whether to include the covariances given with the cloud.
-        few: `Neighborhoods.few`; by default by the number of rows.
+        few: `has_few_points`, for `joined` clouds, which need it to be described; others have their own.
     """
     neighbors, size = check_neighbors(cloud, xp), cloud.points.shape[0]
-    # An array, so that one program serves both.
-    is_few = np.bool_(size < FEW_POINTS if few is None else few)
+    if few is None and cloud.valid is not None:
+        few = has_few_points(cloud, xp)
     points, channels = xp.asarray(cloud.points), xp.asarray(cloud.channels)
     points, channels = points.T, channels.T if with_channels else channels.T[:0]
     if xp is np:
@@ -129,7 +135,7 @@ def gatherer(
             own_channels=channels[:, rows],
             near_channels=xp.take(channels, near, axis=1),
             present=present,
-            few=is_few,
+            few=None if few is None else few[rows],
         )
         if known is None:
             return around

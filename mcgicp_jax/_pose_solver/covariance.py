@@ -196,7 +196,7 @@ def _discounted_observability(
     geometry, *channels = observability(posed)
     shown = discount[0] * geometry
     if channels:
-        # Slopes of matches that were sought in the channels agree more than those of the surface.
+        # Their agreement is unbiased only for matches that are nearest in position.
         each = channels[-1 if all(term.by_position for term in terms) else 0]
         # A / (1 + tr A) with A multiplied by the discount.
         trace = each[0] + each[3] + each[5]

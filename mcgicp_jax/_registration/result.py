@@ -168,11 +168,11 @@ class RegistrationResult(eqx.Module):
         small rotation moves the points far and the first three variances are large: use `deviations` there.
 
         The estimate covers the noise and the sampling of the points, as checked on 504 simulated pairs
-        (`tests/benchmarks`), and scatters: turning both clouds changes variances by 10 to 30 %, some by 75 %. It does
+        (`tests/benchmarks`). It scatters: turning both clouds changes variances by 10 to 30 %, some by 75 %. It does
         not cover a wrong local minimum, errors common to all points (calibration, motion during a scan), or moving
-        objects. The standard deviation of an unconstrained direction is 10 times the radius of the matched points. So
-        that rounding spares the others, the matrix is float64, but for transformations and `DenseSearch` in batches.
-        NaN if the status is TOO_FEW_CORRESPONDENCES or NON_FINITE, or if the matches are too few for an estimate.
+        objects. An unconstrained direction gets a standard deviation of 10 times the radius of the matched points, next
+        to which float32 would round the others away: the matrix is float64, except inside transformations and from
+        `DenseSearch` in batches. NaN for too few matches, a NON_FINITE status, or a degenerate alignment.
         """
         return self.uncertainty.value.covariance
 
