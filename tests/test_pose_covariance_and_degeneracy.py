@@ -152,7 +152,7 @@ def test_directions_are_the_eigenvectors_of_the_share_of_motion(seed, held, radi
         mass=weight * h @ h.T,
         observability=np.einsum("rn,in,jn->rij", weight * upper, h, h),
     )
-    found = jax.jit(find_directions)(jax.tree.map(lambda array: jnp.asarray(array, float), sums), False)
+    found = jax.jit(find_directions)(jax.tree.map(lambda array: jnp.asarray(array, float), sums))
     arms = p.T / radius
     jacobians = np.concatenate([np.tile(np.eye(3), (200, 1, 1)), -np.cross(arms[:, None, :], np.eye(3)[None])], axis=2)
     jacobians[:, :, 3:] = np.stack([np.cross(axis, arms) for axis in np.eye(3)], axis=2)

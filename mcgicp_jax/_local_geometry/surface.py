@@ -11,19 +11,21 @@ from mcgicp_jax._search.base import SearchPoints
 
 
 class SurfaceNoise(NamedTuple):
-    """How uncertain the surface is, for the covariance of the pose; one row per point.
+    """What is used at the final pose alone, for its status and covariance; one row per point.
 
     Attributes:
         descriptors: variance of the descriptors α · channel about their linear fits, metres², summed over the channels.
         normal: unit normal.
         roughness: half the squared height difference along the normal between a point and a neighbour, metres².
         reach: distance to the farthest neighbour, metres.
+        slopes: gradients of the descriptors; None where channels are not used, and for cells.
     """
 
     descriptors: Float[AnyArray, "*batch N"]
     normal: Float[AnyArray, "*batch N 3"]
     roughness: Float[AnyArray, "*batch N"]
     reach: Float[AnyArray, "*batch N"]
+    slopes: Float[AnyArray, "*batch N C 3"] | None = None
 
 
 class Surface(NamedTuple):
@@ -40,7 +42,6 @@ class Surface(NamedTuple):
         columns: `AbstractTerm.columns` by name of the term, for terms that define them.
         noise: for the covariance of the pose; None if not needed.
         search: the points as input to the search; None for matched rows where it is not needed.
-        slopes: gradients of the descriptors α · channel; None where `channel_observability` is, and for cells.
     """
 
     points: Float[AnyArray, "*batch N 3"]
@@ -50,7 +51,6 @@ class Surface(NamedTuple):
     columns: dict[str, Any]
     noise: SurfaceNoise | None = None
     search: SearchPoints | None = None
-    slopes: Float[AnyArray, "*batch N C 3"] | None = None
 
     @property
     def num_points(self) -> int:

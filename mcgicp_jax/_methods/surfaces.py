@@ -285,10 +285,9 @@ def surface_of(
             # Slopes between cells are not those between points.
             slopes = None
     # Observability is constant to autodiff.
-    by_shape, by_channels, slopes, details = jax.lax.stop_gradient(
-        (local.observability, by_channels, slopes, SurfaceNoise(noise, local.normal, local.roughness, local.reach))
-    )
-    return surface._replace(observability=by_shape, channel_observability=by_channels, slopes=slopes, noise=details)
+    details = SurfaceNoise(noise, local.normal, local.roughness, local.reach, slopes)
+    by_shape, by_channels, details = jax.lax.stop_gradient((local.observability, by_channels, details))
+    return surface._replace(observability=by_shape, channel_observability=by_channels, noise=details)
 
 
 @partial(jax.jit, static_argnums=(1, 4))

@@ -16,7 +16,6 @@ import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float
 
-from mcgicp_jax._compute.concrete import AnyScalar
 from mcgicp_jax._math.poses import adjoint_to_source, units
 from mcgicp_jax._pose_solver.sums import Sums
 from mcgicp_jax._pose_solver.update import twist_form
@@ -74,13 +73,9 @@ class Directions(eqx.Module):
         return self.held_by_matches if self.ties is None else self.held_by_matches | (self.ties >= _TIES_HOLD)
 
 
-def find_directions(sums: Sums, final: Bool[AnyScalar, ""]) -> Directions:
+def find_directions(sums: Sums) -> Directions:
     """Eigenvectors of the observed fraction of the points' motion: by the geometry, and among the directions that
     geometry does not constrain, by the channels. Fractions do not depend on units or on the origin.
-
-    Args:
-        final: whether the channels of matched points must agree, too. Far from the right pose they do not, and there
-            the channels that each cloud observes guide the pose.
     """
     if sums.mass is None or sums.observability is None:
         raise ValueError("sums: expected those of surfaces with observability")
@@ -96,7 +91,7 @@ def find_directions(sums: Sums, final: Bool[AnyScalar, ""]) -> Directions:
     shares, turn = jnp.linalg.eigh(basis.T @ geometry @ basis)
     basis = basis @ turn
     free = ~(shares >= GEOMETRY_HOLDS)
-    if sums.channel_observability is None:
+    if sums.channel_observability is None or sums.agreement is None:
         channels = jnp.zeros_like(shares)
         return Directions(twists=basis.T, geometry=shares, channels=channels, center=center, radius=radius)
     # Diagonalise the channels within the free directions; 2, above any fraction, sorts the other directions last.
@@ -104,11 +99,10 @@ def find_directions(sums: Sums, final: Bool[AnyScalar, ""]) -> Directions:
     within = twist_form(sums.channel_observability / total, radius)
     held, turn = jnp.linalg.eigh(jnp.where(among, basis.T @ within @ basis, jnp.diag(2.0 * ~free)))
     basis = basis @ turn
-    shares, channels = jnp.sum(basis * (geometry @ basis), axis=0), held
-    if sums.agreement is not None:
-        # The directions stay those along which the pose was updated.
-        agreed = jnp.sum(basis * (twist_form(sums.agreement / total, radius) @ basis), axis=0)
-        channels = jnp.where(final & (agreed < _AGREE * held), agreed - _AGREE * held, held)
+    # Where the channels disagree, the directions stay those along which the pose was updated.
+    agreement = twist_form(sums.agreement / total, radius)
+    shares, agreed = (jnp.sum(basis * (form @ basis), axis=0) for form in (geometry, agreement))
+    channels = jnp.where((held > 0) & (agreed < _AGREE * held), agreed - _AGREE * held, held)
     channels = jnp.where(held > 1.5, 0, channels)
     return Directions(twists=basis.T, geometry=shares, channels=channels, center=center, radius=radius)
 

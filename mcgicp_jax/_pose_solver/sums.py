@@ -44,7 +44,8 @@ class Sums(NamedTuple):
         mass: Σ w h hᵀ; None where observability is not known.
         observability: Σ w O ⊗ h hᵀ by the shape of the surfaces; None where it is not known.
         channel_observability: the same by the channels; None also where they are not used.
-        agreement: the same by slopes of the channels that agree in both clouds; None where these are not known.
+        agreement: the same by slopes of the channels that agree in both clouds; `channel_observability` where the
+            slopes are not known, as before the last step.
     """
 
     center: Float[AnyArray, "*batch 3"]
@@ -123,7 +124,7 @@ def sums_of(motion: Motion, matched: Matched, terms: tuple[AbstractTerm, ...]) -
         mass=others[0][0] if shown else None,
         observability=others[1] if shown else None,
         channel_observability=others[2] if len(shown) > 1 else None,
-        agreement=others[3] if len(shown) > 2 else None,
+        agreement=others[-1] if len(shown) > 1 else None,
     )
 
 
@@ -157,16 +158,17 @@ def _share(counts: Float[Array, "n"], num_candidates: int) -> Float[Array, "n"]:
 
 def observability(posed: PosedMatches) -> list[Float[Array, "6 n"]]:
     """O per correspondence, in the target's frame: mean over its two points, by shape, and where channels are used, by
-    channels; then by the agreement of the channels, if both clouds have slopes."""
+    channels; then by the agreement of the channels, if the surfaces have `noise` with slopes."""
     source, target, rotation = posed.source, posed.target, posed.rotation
     if source.observability is None or target.observability is None:
         return []
     found = [0.5 * (alg.rotate(rotation, source.observability.T) + target.observability.T)]
     if source.channel_observability is not None and target.channel_observability is not None:
         found.append(0.5 * (alg.rotate(rotation, source.channel_observability.T) + target.channel_observability.T))
-    if source.slopes is not None and target.slopes is not None:
-        turned = jnp.einsum("ij,ncj->cin", rotation, source.slopes, precision="highest")
-        found.append(agreement(turned, target.slopes.transpose(1, 2, 0)))
+    slopes = [None if surface.noise is None else surface.noise.slopes for surface in (source, target)]
+    if slopes[0] is not None and slopes[1] is not None:
+        turned = jnp.einsum("ij,ncj->cin", rotation, slopes[0], precision="highest")
+        found.append(agreement(turned, slopes[1].transpose(1, 2, 0)))
     return found
 
 

@@ -36,7 +36,7 @@ class Columns(NamedTuple):
 
     @staticmethod
     def of(surface: Surface, search: SearchPoints | None) -> Columns:
-        surface = surface._replace(observability=None, channel_observability=None, slopes=None, noise=None, search=None)
+        surface = surface._replace(observability=None, channel_observability=None, noise=None, search=None)
         # A mask is no number, and positions are in the surface already.
         return Columns(surface, None if search is None else search._replace(points=None, valid=None))
 

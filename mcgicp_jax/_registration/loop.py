@@ -28,7 +28,7 @@ from mcgicp_jax._local_geometry.surface import Surface, searched
 from mcgicp_jax._pose_solver.adaptation import adapted, sample_of_term
 from mcgicp_jax._pose_solver.covariance import Scores
 from mcgicp_jax._pose_solver.matched import Motion
-from mcgicp_jax._registration.step import Problem, State, update
+from mcgicp_jax._registration.step import SETTLED, Problem, State, update
 from mcgicp_jax._terms.base import AbstractTerm, is_adaptive
 
 Result = TypeVar("Result")
@@ -128,8 +128,13 @@ class AbstractExecutor(abc.ABC):
         """
 
     @abc.abstractmethod
-    def sums(self, motion: Motion, matches: Any, terms: tuple[AbstractTerm, ...]) -> Any:
-        """`sums_of` all correspondences, as the executor keeps them while the loop runs."""
+    def sums(self, motion: Motion, matches: Any, terms: tuple[AbstractTerm, ...], last: Bool[AnyScalar, ""]) -> Any:
+        """`sums_of` all correspondences, as the executor keeps them while the loop runs.
+
+        Args:
+            last: whether the channels of matched points must agree. Far from the right pose they do not, and there the
+                channels that each cloud observes guide the pose.
+        """
 
     def update(self, state: State, sums: Any) -> State:
         """The state after an update of the pose, without the sums."""
@@ -166,7 +171,7 @@ def step(executor: AbstractExecutor, loop: LoopResult) -> LoopResult:
     state = loop.state
     matches = executor.match(state, loop.matches)
     terms = executor.adapt(state, matches, loop.terms)
-    sums = executor.sums(executor.motion(state.pose), matches, terms)
+    sums = executor.sums(executor.motion(state.pose), matches, terms, state.status == SETTLED)
     state = executor.update(state, sums)
     # Not an output of the compiled update, which would copy the sums.
     state = state._replace(sums=sums)

@@ -221,10 +221,11 @@ class HostExecutor(AbstractExecutor):
 
         return map_rows(block, rows.size, self.num_threads if with_noise else 1)
 
-    def sums(self, motion: Motion, matches: _Matches, terms: tuple[AbstractTerm, ...]) -> Packed[Sums]:
+    def sums(self, motion: Motion, matches: _Matches, terms: tuple[AbstractTerm, ...], last: Any) -> Packed[Sums]:
         # Packed until the loop ends: to pass and to return dozens of arrays takes longer than to use them. Not awaited:
         # `update` is dispatched while they are computed, which saves half of the hand-overs between threads.
-        parts: list[Packed[Sums]] = self._over_blocks(_packed_sums, motion, matches, terms)
+        with_slopes = bool(last) and self.problem.source.channel_observability is not None
+        parts: list[Packed[Sums]] = self._over_blocks(_packed_sums, motion, matches, terms, with_noise=with_slopes)
         return parts[0] if len(parts) == 1 else _combined(parts)
 
     def update(self, state: State, sums: Packed[Sums]) -> State:

@@ -161,7 +161,7 @@ def update(
     degenerate: AnyScalar = np.bool_(False)
     with jax.default_matmul_precision("highest"):
         if sums.observability is not None:
-            directions = find_directions(sums, status == SETTLED)
+            directions = find_directions(sums)
             degenerate = ~jnp.all(directions.held)
             # Along unconstrained directions an update would follow arbitrary nearest-neighbour matches.
             basis = jnp.asarray(directions.twists).T * (directions.held | ~settings.hold_unconstrained)

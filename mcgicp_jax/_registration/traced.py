@@ -66,7 +66,7 @@ class TracedExecutor(AbstractExecutor):
         """The state after one step, for its shapes."""
         state = loop.state
         matches = self.match(state, loop.matches)
-        sums = self.sums(self.motion(state.pose), matches, loop.terms)
+        sums = self.sums(self.motion(state.pose), matches, loop.terms, jnp.bool_(False))
         return self.update(state, sums)._replace(sums=sums)
 
     def repeat(self, step: Callable[[LoopResult], LoopResult], loop: LoopResult) -> LoopResult:
@@ -144,8 +144,14 @@ class TracedExecutor(AbstractExecutor):
         some = jax.tree.map(lambda array: jnp.asarray(array)[..., rows], matches)
         return function(motion, self._matched(self._some(rows), some, with_noise), *arguments)
 
-    def sums(self, motion: Motion, matches: Correspondences, terms: tuple[AbstractTerm, ...]) -> Sums:
-        return sums_of(motion, self._matched(self.problem.source, matches, False), terms)
+    def sums(
+        self, motion: Motion, matches: Correspondences, terms: tuple[AbstractTerm, ...], last: Bool[Array, ""]
+    ) -> Sums:
+        observed = self.problem.source.channel_observability
+        sums = sums_of(motion, self._matched(self.problem.source, matches, observed is not None), terms)
+        if sums.channel_observability is None or sums.agreement is None:
+            return sums
+        return sums._replace(agreement=jnp.where(last, sums.agreement, sums.channel_observability))
 
     def scores(self, motion: Motion, matches: Correspondences, *arguments: Any) -> Scores:
         return scores_of(motion, self._matched(self.problem.source, matches, True), *arguments)
