@@ -177,6 +177,7 @@ def test_after_max_iterations_the_derivative_is_that_of_the_nearby_root():
     assert np.abs(ended).max() > 1e-4
 
 
+@pytest.mark.slow
 @in_float64
 def test_lanes_inside_jit_have_the_gradients_outside():
     check_lanes()
