@@ -1,4 +1,5 @@
-"""Base classes and registries for those who add a method, a term, a search, a kernel, a format, a data set or a factor.
+"""Base classes and registries for those who add a method, a term, a search, a kernel, a format, a data set,
+a factor or a loss.
 
 Each is one class or function:
 
@@ -8,7 +9,8 @@ Each is one class or function:
 - a robust kernel: a subclass of `AbstractKernel` with `_rho` and `_weight`;
 - a file format: two functions in a `mcgicp_jax.io.Format`, registered by the suffix;
 - a data set: a subclass of `mcgicp_jax.datasets.AbstractFrames` with `_frame`, in a `mcgicp_jax.datasets.Dataset`;
-- a factor of a pose graph: a subclass of `AbstractFactor`.
+- a factor of a pose graph: a subclass of `AbstractFactor`;
+- a loss over points or matches: a function of `Rows` of `Input`s, applied by `blockwise`, which has its derivative.
 
 `voxel_cells` and `cell_moments` are the parts of `mcgicp_jax.voxel_gaussians`; `cell_moments` is differentiable.
 
@@ -17,6 +19,7 @@ The command line offers the entries that the registries `METHODS` (each a `Regis
 """
 
 from mcgicp_jax._clouds.color_spaces import COLOR_SPACES
+from mcgicp_jax._compute.row_functions import Input, Rows, blockwise
 from mcgicp_jax._local_geometry.local_geometry import LocalGeometry
 from mcgicp_jax._local_geometry.neighborhoods import Neighborhoods
 from mcgicp_jax._local_geometry.surface import Surface
@@ -49,14 +52,17 @@ __all__ = [
     "AbstractTerm",
     "AbstractTreeSearch",
     "Correspondences",
+    "Input",
     "Linearization",
     "LocalGeometry",
     "Mahalanobis",
     "Neighborhoods",
     "PosedMatches",
     "RegisteredMethod",
+    "Rows",
     "SearchPoints",
     "Surface",
+    "blockwise",
     "cell_moments",
     "linearize_residual",
     "symmetric_matrices",

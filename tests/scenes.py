@@ -5,7 +5,7 @@ from collections.abc import Callable
 import numpy as np
 
 import mcgicp_jax as mcg
-from mcgicp_jax._methods.surfaces import surface_on_host, surface_pair
+from mcgicp_jax._methods.surfaces import searchable, surface_pair, surface_table
 from tests.reference import pose
 
 
@@ -47,12 +47,13 @@ def pair(scene=room_corner, size: int = 2000, truth: np.ndarray | None = None, *
 
 def prepare(method, cloud, observed=False):
     """The surface that a resolved method computes for one concrete cloud."""
-    return surface_on_host(method, (), cloud, cloud.neighbors is not None, observed, 1)
+    surface, *_ = surface_table(cloud, method, (), cloud.neighbors is not None, observed).trees()
+    return surface._replace(search=searchable(method, cloud))
 
 
 def covariances(method, cloud):
     """Packed covariances (6, N) of a resolved method, for concrete and traced clouds."""
-    return surface_pair(method, cloud, cloud, observed=False).source.covariance.T
+    return surface_pair(method, cloud, cloud, observed=False).whole().source.covariance.T
 
 
 def rectangles(*sides: tuple[tuple[float, ...], tuple[float, ...], tuple[float, ...]]) -> Callable[..., np.ndarray]:

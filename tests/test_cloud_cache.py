@@ -15,7 +15,7 @@ import mcgicp_jax as mcg
 from mcgicp_jax._compute.cache import Cache, cached_with_cloud
 from mcgicp_jax._compute.lazy import Lazy
 from mcgicp_jax._compute.rows_on_demand import RowsOnDemand
-from mcgicp_jax._methods.surfaces import surface_on_host
+from mcgicp_jax._methods.surfaces import surface_table
 from mcgicp_jax._terms.photometric import Photometric
 from tests.scenes import motion, room_corner
 
@@ -132,7 +132,7 @@ def test_a_new_cloud_in_the_place_of_an_old_one_has_no_values():
 
 def surface_of(cloud, kinds, observed, method=METHOD):
     """What the surface of a cloud has beyond points and covariances, and the covariances."""
-    surface = surface_on_host(method, kinds, cloud, True, observed, 1)
+    surface, *_ = surface_table(cloud, method, kinds, True, observed).trees()
     return set(surface.columns), surface.observability is not None, surface.covariance
 
 
@@ -201,6 +201,6 @@ def test_rows_are_computed_once_by_threads_that_share_a_table():
     table = RowsOnDemand(compute, 20)
     wanted = [np.arange(k, k + 10) for k in (0, 5, 0, 10, 5, 3, 0, 10)]
     with ThreadPoolExecutor(len(wanted)) as threads:
-        found = list(threads.map(table.rows, wanted))
+        found = list(threads.map(lambda rows: table.known(rows)[rows], wanted))
     np.testing.assert_array_equal(found, 10 * np.array(wanted))
     assert sorted(computed) == list(range(20))

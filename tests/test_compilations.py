@@ -100,14 +100,14 @@ def test_a_cloud_is_prepared_once(monkeypatch):
     from mcgicp_jax._local_geometry import local_statistics as _local
 
     built, described = [], []
-    build, gatherer = KDTreeSearch.build, _local.gatherer
+    build, with_near = KDTreeSearch.build, _local.with_near
     monkeypatch.setattr(KDTreeSearch, "build", lambda self, points: built.append(len(points)) or build(self, points))
 
     def counted(cloud, *rest, **options):
         described.append(len(cloud))
-        return gatherer(cloud, *rest, **options)
+        return with_near(cloud, *rest, **options)
 
-    monkeypatch.setattr(_local, "gatherer", counted)
+    monkeypatch.setattr(_local, "with_near", counted)
     first, second, third = (mcg.preprocess(room_corner(size, seed=size)[0]) for size in (300, 310, 320))
     built.clear()
     for _ in range(3):
@@ -162,16 +162,18 @@ def test_a_first_gradient_compiles_each_program_once():
     source, target = (mcg.preprocess(mcg.PointCloud(*arrays)) for arrays in raw)
 
     def loss(channels):
-        clouds = [source.replace(channels=channels), target]
-        results = mcg.register_batch(clouds, clouds[::-1], mcg.MultiChannelGICP(), max_distance=0.5)
-        return sum(result.matrix[0, 3] for result in results)
+        # In one thread: two that call a new program at the same time may both compile it.
+        options = {"max_distance": 0.5, "search": mcg.KDTreeSearch(workers=1)}
+        return mcg.register(source.replace(channels=channels), target, mcg.MultiChannelGICP(), **options).matrix[0, 3]
 
     # Other tests may have compiled some of them.
     jax.clear_caches()
     with compilations() as found:
         jax.grad(loss)(source.channels)
-    programs = ("_describe", "_surface_of_block", "program", "_update", "root_of", "score_and_pull", "pull_surface")
-    assert [found.count(f"jit({name})") for name in programs] == [1] * len(programs), found
+    programs = ("_geometry", "surface", "_update", "root_of", "jacobian__score_of_rows", "pull__score_of_rows")
+    assert [found.count(f"jit({name})") for name in (*programs, "pull_surface")] == [1] * 7, found
+    # The last sums have slopes of the channels, too.
+    assert found.count("jit(sums_of)") == 2, found
 
 
 def test_find_correspondences_computes_nothing_that_it_does_not_use():

@@ -13,6 +13,7 @@ import pytest
 import mcgicp_jax as mcg
 from mcgicp_jax import extend
 from mcgicp_jax.extend import symmetric_matrices as alg
+from tests.compilations import compilations
 from tests.scenes import motion, pair
 
 ROOT = pathlib.Path(__file__).parent.parent
@@ -201,6 +202,36 @@ def test_a_graph_factor():
 
 
 @pytest.mark.slow
+def feature_cost(scale, source, target):
+    """Geman-McClure's kernel of the difference of the features of matched points."""
+    square = jnp.sum((source.tree - target.tree) ** 2, axis=-1) / scale**2
+    return jnp.sum(jnp.where(target.index >= 0, square / (1 + square), 0))
+
+
+def test_a_loss():
+    """It has its derivatives outside of jit, where another size compiles nothing, and inside."""
+    for size in (2500, 300, 310):
+        source, target, truth = pair(size=size)
+        matches = mcg.find_correspondences(source, target, truth, mcg.GICP(), max_distance=0.06)
+        rows = np.where(matches.valid, matches.indices, -1)
+        assert 0 < np.sum(rows < 0) < len(rows)
+
+        def loss(channels, scale, rows=rows, target=target):
+            features = extend.Input(channels), extend.Input(target.channels, rows)
+            return extend.blockwise(feature_cost, scale, *features, total=True)
+
+        arguments = jnp.asarray(source.channels), jnp.asarray(0.3)
+        with compilations() as found:
+            value, gradients = jax.value_and_grad(loss, (0, 1))(*arguments)
+        expected, slopes = jax.jit(jax.value_and_grad(loss, (0, 1)))(*arguments)
+        np.testing.assert_allclose(value, expected, rtol=1e-5)
+        for actual, slope in zip(gradients, slopes, strict=True):
+            np.testing.assert_allclose(actual, slope, rtol=1e-4, atol=1e-5 * np.abs(slope).max())
+        forward = jax.jvp(loss, arguments, (gradients[0], jnp.asarray(0.0)))[1]
+        np.testing.assert_allclose(forward, np.sum(gradients[0] ** 2, dtype=np.float64), rtol=1e-4)
+    assert not found
+
+
 def test_the_command_line_has_what_is_registered(tmp_path):
     """If it is registered before the commands are imported."""
     source, target, _ = pair(size=400)

@@ -85,7 +85,7 @@ class Reference:
         self._slope = np.stack(forces, axis=1) / 2e-5
 
     def _force(self, clouds, method, moved):
-        surfaces, pose = surface_pair(method, *clouds, observed=False), self._at(moved)
+        surfaces, pose = surface_pair(method, *clouds, observed=False).whole(), self._at(moved)
         matched = match_surfaces(surfaces.source, surfaces.target, self._matches)
         force = np.asarray(_forces(Motion(pose[:3, :3], pose[:3, 3]), matched, surfaces.terms)).T
         points = np.asarray(clouds[0].points) @ pose[:3, :3].T + pose[:3, 3]

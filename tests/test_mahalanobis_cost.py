@@ -360,7 +360,8 @@ def test_the_sums_say_what_the_correspondences_say(kernel):
     _, _, (source, target), matches, matched = problem()
     dtype = source.points.dtype
     method = METHODS["MultiChannelGICP"]()
-    pair = surface_pair(method, source, target, observed=False, robust=None if kernel is None else Huber(SCALE))
+    robust = None if kernel is None else Huber(SCALE)
+    pair = surface_pair(method, source, target, observed=False, robust=robust).whole()
     there = Motion(jnp.asarray(T[:3, :3], dtype), jnp.asarray(T[:3, 3], dtype))
     found = jax.jit(lambda: sums_of(there, match_surfaces(pair.source, pair.target, matches), pair.terms))()
 

@@ -9,7 +9,6 @@ import mcgicp_jax as mcg
 from mcgicp_jax import io
 from mcgicp_jax.__main__ import main
 from mcgicp_jax._cli.options import Options
-from mcgicp_jax._compute import packing
 from mcgicp_jax._math.statistics import spread_rows
 from mcgicp_jax._registration import on_host
 from tests.compilations import compilations
@@ -23,14 +22,6 @@ pytestmark = in_float64
 @pytest.fixture(scope="module")
 def clouds(noisy):
     return noisy[:2]
-
-
-def test_rows_of_the_target_are_computed_where_the_sums_would_see_a_copy(clouds, monkeypatch):
-    options = {"max_distance": GATE, "max_source_points": 100}
-    expected = mcg.register(*clouds, mcg.GICP(), **options)
-    monkeypatch.setattr(packing, "_shared_table", lambda *_: None)
-    source, target = (mcg.preprocess(cloud) for cloud in clouds)
-    np.testing.assert_allclose(mcg.register(source, target, mcg.GICP(), **options).matrix, expected.matrix, atol=1e-12)
 
 
 @pytest.mark.parametrize(("size", "count"), [(10, 4), (1000, 999), (34_000, 10_000), (3_000_000, 70_000)])

@@ -12,7 +12,7 @@ import mcgicp_jax as mcg
 from mcgicp_jax._math.statistics import median
 from mcgicp_jax._methods.surfaces import surface_pair
 from mcgicp_jax._pose_solver.adaptation import adapted, sample_of_term
-from mcgicp_jax._pose_solver.matched import Matched, Motion, match_surfaces, surface_rows
+from mcgicp_jax._pose_solver.matched import Matched, Motion, match_surfaces
 from mcgicp_jax._terms.base import AbstractTerm
 from mcgicp_jax._terms.mahalanobis import Mahalanobis
 from mcgicp_jax._terms.photometric import Photometric, Residuals
@@ -50,7 +50,7 @@ class Held(mcg.MultiChannelGICP):
 
 def matched_at(source, target, method, pose, matches):
     """The matched surfaces, the terms and the motion."""
-    both = surface_pair(method, source, target, observed=False)
+    both = surface_pair(method, source, target, observed=False).whole()
     pose = np.asarray(pose, source.points.dtype)
     motion = Motion(jnp.asarray(pose[:3, :3]), jnp.asarray(pose[:3, 3]))
     return jax.jit(match_surfaces)(both.source, both.target, matches), both, motion
@@ -61,7 +61,7 @@ def numbers_at(motion, matched, terms, valid):
     """The terms with their numbers from the matches."""
 
     def sample(term, rows):
-        some = Matched(surface_rows(matched.source, rows), surface_rows(matched.target, rows), matched.valid[rows])
+        some = jax.tree.map(lambda array: array[rows], Matched(matched.source, matched.target, matched.valid))
         return sample_of_term(motion, some, term)
 
     return adapted(terms, valid, sample)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from mcgicp_jax import GICP, MultiChannelGICP, PointCloud, PointToPlane, preprocess
-from mcgicp_jax._local_geometry import local_statistics as _local
+from mcgicp_jax._compute import row_functions
 from mcgicp_jax._local_geometry.local_geometry import weighted_covariance
 from mcgicp_jax._local_geometry.local_statistics import local_geometries
 from mcgicp_jax._local_geometry.spacing_and_noise import channel_noise
@@ -415,7 +415,7 @@ def test_surfaces_are_the_same_block_by_block_and_inside_transformations(method,
     mask = np.random.default_rng(0).random((700, 3)) < 0.8 if masked else None
     cloud = preprocess(PointCloud(points, channels, channel_valid=mask), num_neighbors=K)
     weights = jnp.asarray(np.random.default_rng(1).normal(size=(700, 9)), cloud.points.dtype)
-    everything = jax.tree.leaves(surface_pair(method, cloud, cloud, observed=True).source)
+    everything = jax.tree.leaves(surface_pair(method, cloud, cloud, observed=True).whole().source)
 
     def traced():
         def surface(points):
@@ -425,8 +425,8 @@ def test_surfaces_are_the_same_block_by_block_and_inside_transformations(method,
         return jax.jit(jax.grad(surface, has_aux=True))(jnp.asarray(cloud.points))
 
     slope, whole = traced()
-    monkeypatch.setattr(_local, "_LARGEST_WHOLE", 100)
-    monkeypatch.setattr(_local, "_LARGEST_BLOCK", 128)
+    monkeypatch.setattr(row_functions, "_LARGEST_WHOLE", 100)
+    monkeypatch.setattr(row_functions, "_LARGEST_BLOCK", 128)
     slope_by_blocks, by_blocks = traced()
     for found in (whole, by_blocks):
         for one, other in zip(jax.tree.leaves(found), everything, strict=True):

@@ -141,7 +141,7 @@ def _call(*operands: Any, function: Callable, transpose: Callable, inputs: Any, 
     # Inside differentiation JAX compiles programs separately: `function` would compile its own here and in its threads.
     results = in_new_thread(partial(function, arrays))
     return [
-        jnp.asarray(np.asarray(each, aval.dtype).reshape((*batch, *aval.shape)))
+        jax.device_put(np.asarray(each, aval.dtype).reshape((*batch, *aval.shape)))
         for each, aval in zip(results, outputs, strict=True)
     ]
 

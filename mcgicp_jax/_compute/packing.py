@@ -42,10 +42,7 @@ class Packed(Generic[Tree]):
 
     @staticmethod
     def of(tree: Tree, num_axes: int = 1) -> Packed[Tree]:
-        """Pack NumPy or traced arrays that share their first `num_axes` axes.
-
-        NumPy arrays are not copied if they are what `tree` of a `Packed` returned.
-        """
+        """Pack NumPy or traced arrays that share their first `num_axes` axes."""
         leaves, structure = jax.tree.flatten(tree)
         dtype = leaves[0].dtype
         layout = Layout(
@@ -53,11 +50,9 @@ class Packed(Generic[Tree]):
             tuple(leaf.shape[num_axes:] for leaf in leaves),
             tuple(None if leaf.dtype == dtype else leaf.dtype for leaf in leaves),
         )
-        table = _shared_table(leaves, layout) if num_axes == 1 else None
-        if table is None:
-            xp: Any = np if isinstance(leaves[0], np.ndarray) else jnp
-            shared = leaves[0].shape[:num_axes]
-            table = xp.concatenate([xp.asarray(leaf, dtype).reshape((*shared, -1)) for leaf in leaves], axis=-1)
+        xp: Any = np if isinstance(leaves[0], np.ndarray) else jnp
+        shared = leaves[0].shape[:num_axes]
+        table = xp.concatenate([xp.asarray(leaf, dtype).reshape((*shared, -1)) for leaf in leaves], axis=-1)
         return Packed(table, layout)
 
     @property
@@ -76,14 +71,3 @@ class Packed(Generic[Tree]):
         # `take` takes a quarter of the time of an index array.
         table = self.table[index] if isinstance(index, slice) else self.table.take(index, axis=0)
         return Packed(table, self.layout)
-
-
-def _shared_table(leaves: list[Any], layout: Layout) -> np.ndarray | None:
-    """The NumPy array of which the arrays are the columns, in their order; None if there is no such array."""
-    base = leaves[0].base if isinstance(leaves[0], np.ndarray) else None
-    widths = [math.prod(shape) for shape in layout.shapes]
-    if base is None or base.shape != (len(leaves[0]), sum(widths)) or not base.flags.c_contiguous:
-        return None
-    starts = np.cumsum([0, *widths[:-1]]) * base.itemsize + base.ctypes.data
-    shared = all(leaf.base is base and leaf.ctypes.data == start for leaf, start in zip(leaves, starts, strict=True))
-    return base if shared else None

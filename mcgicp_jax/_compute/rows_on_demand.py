@@ -10,8 +10,6 @@ import jax
 import numpy as np
 from jaxtyping import Int
 
-from mcgicp_jax._compute.blocks import NEIGHBORHOOD_BLOCK, map_rows
-
 Tree = TypeVar("Tree")
 
 
@@ -48,27 +46,9 @@ class RowsOnDemand(Generic[Tree]):
             self._missing[some] = False
             return self._tree
 
-    def rows(self, rows: Int[np.ndarray, "n"], num_threads: int | None = 1) -> Tree:
-        """Copies of these rows."""
-        return jax.tree.map(lambda array: array.take(rows, axis=0), self.known(rows, num_threads))
-
     def _fill(self, rows: Int[np.ndarray, "n"], found: Tree) -> None:
         if self._tree is None:
             size = self._missing.size
             self._tree = jax.tree.map(lambda array: np.zeros((size, *array.shape[1:]), array.dtype), found)
         for whole, part in zip(jax.tree.leaves(self._tree), jax.tree.leaves(found), strict=True):
             whole[rows] = part
-
-
-def in_blocks(
-    block: Callable[[Any], Tree], rows: Int[np.ndarray, "n"] | None, size: int, num_threads: int | None
-) -> Tree:
-    """The rows that a function returns for blocks of row numbers.
-
-    Args:
-        block: maps an index of `NEIGHBORHOOD_BLOCK` rows to a pytree of arrays with as many rows.
-        rows: the row numbers; None for 0 to `size` − 1.
-    """
-    if rows is None:
-        return map_rows(block, size, num_threads, NEIGHBORHOOD_BLOCK)
-    return map_rows(lambda index: block(rows[index]), rows.size, num_threads, NEIGHBORHOOD_BLOCK)

@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from mcgicp_jax._clouds.point_cloud import PointCloud
-from mcgicp_jax._compute.blocks import BLOCK, blocks, map_rows
+from mcgicp_jax._compute.blocks import BLOCK, blocks
 from mcgicp_jax._compute.concrete import AnyArray
+from mcgicp_jax._compute.row_functions import Input, Rows, blockwise
 from mcgicp_jax._global_pose.fpfh import comparable, histograms_of, normals_of, statistics_of
 from mcgicp_jax._global_pose.robust_pose_fit import NUM_MATCHES, PutativeMatches
 
@@ -90,21 +89,18 @@ def _two_nearest(
         for _, index in blocks(len(rows))
     ]
 
-    def search(index: Any) -> list[tuple[Array, Array]]:
-        return [_two_nearest_of_block(queries[index], *part) for part in parts]
-
-    found = map_rows(search, len(queries), None)
+    found = [blockwise(_two_nearest_of_block, part, Input(queries)) for part in parts]
     squares = np.hstack([square for square, _ in found])
     numbers = np.hstack([number + i * BLOCK for i, (_, number) in enumerate(found)])
     best = np.argsort(squares, axis=1, kind="stable")[:, :2]
     return np.take_along_axis(numbers, best, axis=1), np.take_along_axis(squares, best, axis=1)
 
 
-@jax.jit
 def _two_nearest_of_block(
-    queries: Float[AnyArray, "n L"], rows: Float[AnyArray, "n L"], counted: Bool[AnyArray, "n"]
-) -> tuple[Float[Array, "n 2"], Int[Array, "n 2"]]:
+    block: tuple[Float[AnyArray, "n L"], Bool[AnyArray, "n"]], own: Rows
+) -> tuple[Float[Array, "m 2"], Int[Array, "m 2"]]:
     """Squared distances and numbers of the two nearest rows. All terms are integers, hence exact."""
+    (rows, counted), queries = block, own.tree
     squares = [jnp.sum(each * each, axis=1) for each in (queries, rows)]
     product = jnp.matmul(queries, rows.T, precision="highest")
     square = squares[0][:, None] + jnp.where(counted, squares[1], jnp.inf) - 2 * product

@@ -8,17 +8,16 @@ about 1.4 times as many correct matches on nine real pairs without channels.)
 
 from __future__ import annotations
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 from scipy.sparse import csr_array
 
 from mcgicp_jax._clouds.point_cloud import PointCloud
-from mcgicp_jax._compute.blocks import map_rows
 from mcgicp_jax._compute.concrete import AnyScalar
+from mcgicp_jax._compute.row_functions import Rows, blockwise
 from mcgicp_jax._local_geometry.local_geometry import Offsets, weighted_covariance
-from mcgicp_jax._local_geometry.neighborhoods import Neighborhoods, gatherer
+from mcgicp_jax._local_geometry.neighborhoods import Neighborhoods, neighborhoods, with_near
 from mcgicp_jax._math import symmetric_matrices as alg
 
 # Radii, in voxels, of the neighbourhoods for normals and for histograms: as in Open3D's examples.
@@ -39,8 +38,8 @@ _LARGEST, _DEVIATION = 127, 16
 
 def normals_of(cloud: PointCloud, voxel_size: float) -> Float[np.ndarray, "N 3"]:
     """Unit normals of arbitrary sign, from the neighbours within two voxels."""
-    gather, radius = gatherer(cloud, False, np), np.float32(_NORMAL_RADIUS * voxel_size)
-    return map_rows(lambda rows: _normals(gather(rows), radius), cloud.points.shape[0], None)
+    (normals,) = blockwise(_normals, np.float32(_NORMAL_RADIUS * voxel_size), *with_near(cloud, False))
+    return normals
 
 
 def histograms_of(cloud: PointCloud, normals: Float[np.ndarray, "N 3"], voxel_size: float) -> Float[np.ndarray, "N 33"]:
@@ -49,8 +48,8 @@ def histograms_of(cloud: PointCloud, normals: Float[np.ndarray, "N 3"], voxel_si
     A point that has no neighbours within five voxels has zeros.
     """
     size, radius = cloud.points.shape[0], np.float32(_RADIUS * voxel_size)
-    gather = gatherer(cloud.replace_rows(channels=normals, channel_valid=None), True, np)
-    simple, weights = map_rows(lambda rows: _simple_histograms(gather(rows), radius), size, None)
+    inputs = with_near(cloud.replace_rows(channels=normals, channel_valid=None), True)
+    simple, weights = blockwise(_simple_histograms, radius, *inputs)
     # The point's histogram plus the weighted mean of its neighbours' histograms. Gathering takes ten times as long.
     neighbors = np.maximum(np.asarray(cloud.neighbors), 0)
     starts = np.arange(size + 1) * neighbors.shape[1]
@@ -59,8 +58,8 @@ def histograms_of(cloud: PointCloud, normals: Float[np.ndarray, "N 3"], voxel_si
 
 def statistics_of(cloud: PointCloud, voxel_size: float) -> Float[np.ndarray, "N D"]:
     """Mean and standard deviation of each channel within three radii of each point; NaN where no point has it."""
-    gather, voxel = gatherer(cloud, True, np), np.float32(voxel_size)
-    return map_rows(lambda rows: _statistics(gather(rows), voxel), cloud.points.shape[0], None)
+    (statistics,) = blockwise(_statistics, np.float32(voxel_size), *with_near(cloud, True))
+    return statistics
 
 
 def comparable(
@@ -97,16 +96,15 @@ def _offsets(around: Neighborhoods) -> tuple[Offsets, Float[Array, "k n"]]:
     return (x, y, z), x * x + y * y + z * z
 
 
-@jax.jit
-def _normals(around: Neighborhoods, radius: Float[AnyScalar, ""]) -> Float[Array, "n 3"]:
+def _normals(radius: Float[AnyScalar, ""], own: Rows, near: Rows) -> tuple[Float[Array, "n 3"]]:
+    around = neighborhoods(own, near)
     offsets, square = _offsets(around)
-    near = around.present & (square <= radius * radius)
-    return alg.smallest_eigenvector(weighted_covariance(offsets, near.astype(square.dtype))).T
+    weights = (around.present & (square <= radius * radius)).astype(square.dtype)
+    return (alg.smallest_eigenvector(weighted_covariance(offsets, weights)).T,)
 
 
-@jax.jit
 def _simple_histograms(
-    around: Neighborhoods, radius: Float[AnyScalar, ""]
+    radius: Float[AnyScalar, ""], points: Rows, neighbors: Rows
 ) -> tuple[Float[Array, "n 33"], Float[Array, "n k"]]:
     """SPFH of points whose channels are their normals; and the weights of their neighbours in FPFH, 1/d².
 
@@ -114,6 +112,7 @@ def _simple_histograms(
     Let u be its normal, d the unit vector to the second point, n the normal of the second point, v = d × u / |d × u|
     and w = u × v. The angles are α = v·n, φ = u·d and θ = atan2(w·n, u·n).
     """
+    around = neighborhoods(points, neighbors)
     offsets, square = _offsets(around)
     near = around.present & (square > 0) & (square <= radius * radius)
     distance = jnp.sqrt(jnp.where(near, square, 1))
@@ -147,23 +146,26 @@ def _simple_histograms(
 
 def _histogram(values: Float[Array, "k n"], counted: Array) -> Float[Array, "n 11"]:
     """Fractions of the counted values, from 0 to 1, in each bin."""
-    index = jnp.clip(jnp.floor(NUM_BINS * values), 0, NUM_BINS - 1)
-    counts = jnp.stack([jnp.sum(counted & (index == i), axis=0) for i in range(NUM_BINS)], axis=1)
-    return counts / jnp.maximum(jnp.sum(counted, axis=0), 1)[:, None].astype(values.dtype)
+    # Differences of cumulative counts: XLA may evaluate a value anew for each bin, with other rounding, and it would
+    # fall into two bins, or none.
+    total = jnp.sum(counted, axis=0)
+    below = [jnp.sum(counted & (NUM_BINS * values < i), axis=0) for i in range(1, NUM_BINS)]
+    cumulative = jnp.stack([jnp.zeros_like(total), *below, total], axis=1)
+    return jnp.diff(cumulative, axis=1) / jnp.maximum(total, 1)[:, None].astype(values.dtype)
 
 
-@jax.jit
-def _statistics(around: Neighborhoods, voxel_size: Float[AnyScalar, ""]) -> Float[Array, "n D"]:
+def _statistics(voxel_size: Float[AnyScalar, ""], own: Rows, near: Rows) -> tuple[Float[Array, "n D"]]:
+    around = neighborhoods(own, near)
     _, square = _offsets(around)
     columns = []
     for channel in range(around.num_channels):
         known = around.present if around.near_known is None else around.near_known[channel]
-        difference, own = around.difference(channel), around.own_channels[channel]
+        difference, here = around.difference(channel), around.own_channels[channel]
         for radius in _CHANNEL_RADII:
             weights = (known & (square <= (radius * voxel_size) ** 2)).astype(square.dtype)
             total = jnp.sum(weights, axis=0)
             count = jnp.maximum(total, 1)
             mean = jnp.sum(weights * difference, axis=0) / count
             variance = jnp.sum(weights * (difference - mean) ** 2, axis=0) / count
-            columns += [jnp.where(total > 0, each, jnp.nan) for each in (own + mean, jnp.sqrt(variance))]
-    return jnp.stack(columns, axis=1)
+            columns += [jnp.where(total > 0, each, jnp.nan) for each in (here + mean, jnp.sqrt(variance))]
+    return (jnp.stack(columns, axis=1),)

@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from types import ModuleType
 from typing import Any, NamedTuple
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float
 
 from mcgicp_jax._clouds.point_cloud import PointCloud
-from mcgicp_jax._compute.concrete import AnyArray, is_deferred
+from mcgicp_jax._compute.concrete import AnyArray, is_deferred, numpy_for
+from mcgicp_jax._compute.row_functions import Input, Rows
 from mcgicp_jax._math import symmetric_matrices as alg
 
 # Number of points below which normals of halves of the neighbours are not used: their mean over 50 neighbourhoods of
@@ -83,67 +84,66 @@ def check_neighbors(cloud: PointCloud, xp: ModuleType = np) -> Any:
     return deferred if xp is np and is_deferred(deferred) else xp.asarray(cloud.neighbors)
 
 
-def points_alone(cloud: PointCloud, xp: ModuleType) -> Callable[[Any], Neighborhoods]:
-    """A function that maps rows to `Neighborhoods` without neighbours; arguments as of `gatherer`."""
-    points, given = xp.asarray(cloud.points), cloud.covariances
-    given = None if given is None else xp.asarray(given)
+class PointRows(NamedTuple):
+    """The columns of a cloud from which its surface is computed; None for what is not needed.
 
-    def gather(rows: Any) -> Neighborhoods:
-        return Neighborhoods(points[rows].T, None if given is None else given[rows])
+    Attributes:
+        points: (N, 3) positions, metres.
+        channels: (N, C).
+        known: (N, C) which channels the points have; None if no point lacks any.
+        given: (N, 3, 3) covariances that were given with the cloud.
+        few: (N,) whether the cloud has fewer points than `FEW_POINTS`.
+    """
 
-    return gather
+    points: Any
+    channels: Any = None
+    known: Any = None
+    given: Any = None
+    few: Any = None
 
 
-def has_few_points(cloud: PointCloud, xp: ModuleType) -> Bool[AnyArray, "N"]:
-    """For each row whether the cloud has fewer points than `FEW_POINTS`; padding does not count."""
-    valid = xp.asarray(cloud.valid)
-    return xp.broadcast_to(xp.sum(valid) < FEW_POINTS, valid.shape)
+def points_alone(cloud: PointCloud) -> list[Input]:
+    """The input of a row function of points without neighbours, see `neighborhoods`."""
+    return [Input(PointRows(cloud.points, given=cloud.covariances))]
 
 
-def gatherer(
-    cloud: PointCloud, with_channels: bool, xp: ModuleType, with_given: bool = False, few: Any = None
-) -> Callable[[Any], Neighborhoods]:
-    """A function that maps rows (a slice or an array of row numbers) to their neighbourhoods.
+def with_near(cloud: PointCloud, with_channels: bool, with_given: bool = False) -> list[Input]:
+    """The inputs of a row function of neighbourhoods, see `neighborhoods`: the points and their neighbours.
 
     Args:
-        xp: NumPy on the host, `jax.numpy` where the rows may be traced.
+        with_channels: whether the channels are used; if not, the programs do not depend on their number.
         with_given: whether to include the covariances given with the cloud.
-        few: `has_few_points`, for `joined` clouds, which need it to be described; others have their own.
     """
-    neighbors, size = check_neighbors(cloud, xp), cloud.points.shape[0]
-    if few is None and cloud.valid is not None:
-        few = has_few_points(cloud, xp)
-    points, channels = xp.asarray(cloud.points), xp.asarray(cloud.channels)
-    points, channels = points.T, channels.T if with_channels else channels.T[:0]
-    if xp is np:
-        # Gathers along the last axis are contiguous for each coordinate.
-        points, channels = np.ascontiguousarray(points), np.ascontiguousarray(channels)
-    given = xp.asarray(cloud.covariances) if with_given and cloud.covariances is not None else None
-    known = None
-    if with_channels and cloud.channel_valid is not None:
-        known = xp.asarray(cloud.channel_valid).T
+    # Differentiation traces neither of them.
+    xp = numpy_for(cloud.deferred_neighbors, cloud.valid)
+    neighbors, valid = check_neighbors(cloud, xp), xp.asarray(cloud.valid)
+    none = np.zeros((cloud.points.shape[0], 0), cloud.points.dtype)
+    near = PointRows(
+        cloud.points, cloud.channels if with_channels else none, cloud.channel_valid if with_channels else None
+    )
+    few = xp.broadcast_to(xp.sum(valid) < FEW_POINTS, valid.shape)
+    own = near._replace(given=cloud.covariances if with_given else None, few=few)
+    return [Input(own), Input(near, neighbors)]
 
-    # The function does not refer to the cloud, since it is cached with it.
-    def gather(rows: Any) -> Neighborhoods:
-        chosen = neighbors[rows].T
-        present = chosen >= 0
-        near = xp.where(present, chosen, 0)
-        around = Neighborhoods(
-            own=points[:, rows],
-            given=None if given is None else given[rows],
-            near=xp.take(points, near, axis=1),
-            own_channels=channels[:, rows],
-            near_channels=xp.take(channels, near, axis=1),
-            present=present,
-            few=None if few is None else few[rows],
-        )
-        if known is None:
-            return around
-        own_known = known[:, rows]
-        return around._replace(
-            own_known=own_known,
-            near_known=present & xp.take(known, near, axis=1) & own_known[:, None],
-            other=present & (xp.arange(size)[rows] != near),
-        )
 
-    return gather
+def of_rows(inputs: list[Input], rows: Any) -> list[Input]:
+    """The inputs for some rows (None: all)."""
+    if rows is None:
+        return inputs
+    return [each._replace(index=rows if each.index is None else each.index[rows]) for each in inputs]
+
+
+def neighborhoods(own: Rows, near: Rows | None = None) -> Neighborhoods:
+    """The neighbourhoods of the rows of `with_near`, or the points of `points_alone`."""
+    if near is None:
+        return Neighborhoods(own.tree.points.T, own.tree.given)
+    present, known, channels = near.index >= 0, own.tree.known, own.tree.channels.T
+    # Without the barrier XLA would gather each number again for each of its uses.
+    points, others = jax.lax.optimization_barrier(
+        (near.tree.points.transpose(2, 0, 1), near.tree.channels.transpose(2, 0, 1))
+    )
+    around = Neighborhoods(own.tree.points.T, own.tree.given, points, channels, others, present, few=own.tree.few)
+    if known is None:
+        return around
+    both = present & near.tree.known.transpose(2, 0, 1) & known.T[:, None]
+    return around._replace(own_known=known.T, near_known=both, other=present & (near.index != own.index))

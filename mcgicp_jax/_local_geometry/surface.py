@@ -56,6 +56,10 @@ class Surface(NamedTuple):
     def num_points(self) -> int:
         return self.points.shape[-2]
 
+    @property
+    def observed(self) -> bool:
+        return self.observability is not None
+
 
 def searched(surface: Surface) -> SearchPoints:
     """The input of the search of a surface of a whole cloud."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import cache, partial
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
 
 import jax
 import jax.numpy as jnp
@@ -14,20 +14,19 @@ from jaxtyping import Float, Int
 from mcgicp_jax._clouds.point_cloud import PointCloud
 from mcgicp_jax._compute.cache import cached_with_cloud
 from mcgicp_jax._compute.concrete import is_concrete, numpy_for
-from mcgicp_jax._compute.packing import Packed
-from mcgicp_jax._compute.rows_on_demand import RowsOnDemand, in_blocks
+from mcgicp_jax._compute.row_functions import ComputedTable, Input, Rows, over_both
 from mcgicp_jax._compute.threads import side_by_side
 from mcgicp_jax._local_geometry.cells import geometry_of_cells
 from mcgicp_jax._local_geometry.local_geometry import LocalGeometry
-from mcgicp_jax._local_geometry.local_statistics import (
-    geometry_table,
-    joined,
-    local_geometries,
-    over_rows,
-    share_a_body,
-    split,
+from mcgicp_jax._local_geometry.local_statistics import differentiable_geometry, geometry_table, local_geometries
+from mcgicp_jax._local_geometry.neighborhoods import (
+    Neighborhoods,
+    PointRows,
+    neighborhoods,
+    of_rows,
+    points_alone,
+    with_near,
 )
-from mcgicp_jax._local_geometry.neighborhoods import Neighborhoods, gatherer, points_alone
 from mcgicp_jax._local_geometry.observability import channel_observability
 from mcgicp_jax._local_geometry.surface import Surface, SurfaceNoise
 from mcgicp_jax._math import symmetric_matrices as alg
@@ -40,21 +39,63 @@ from mcgicp_jax._terms.base import AbstractTerm
 Kinds = tuple[type[AbstractTerm], ...]
 
 
+class SurfaceTable(NamedTuple):
+    """The surface of a concrete cloud, whose rows are computed when they are used.
+
+    Attributes:
+        table: of `Surface`, and of its `noise` if `observed`.
+        rows: (n,) those that are used; None for all.
+        search: the points, those of `rows`, as input of the search.
+        observed: as in `surface_pair`.
+    """
+
+    table: ComputedTable
+    rows: Any
+    search: SearchPoints
+    observed: bool
+
+    @property
+    def points(self) -> Float[np.ndarray, "n 3"]:
+        return self.search.points
+
+    @property
+    def num_points(self) -> int:
+        return self.search.valid.size
+
+    def whole(self, num_threads: int | None = 1) -> Surface:
+        """All rows, computed."""
+        return _surface_in(self.table.trees(self.rows, num_threads), self.search)
+
+
+# Inside transformations a `Surface`, else a table.
+if TYPE_CHECKING:
+    AnySurface: TypeAlias = Any
+else:
+    AnySurface = Surface | SurfaceTable
+
+
 class SurfacePair(NamedTuple):
     """Two clouds as the input of a registration.
 
     Attributes:
         method: with its unset parameters chosen from the data.
         terms: the residuals of each correspondence.
-        source, target: the surfaces of both clouds.
-        describe_target: computes rows of `target` (None: all) before they are used; None if all are computed.
+        source, target: the surfaces of both clouds; tables if everything is concrete.
     """
 
     method: AbstractMethod
     terms: tuple[AbstractTerm, ...]
-    source: Surface
-    target: Surface
-    describe_target: Callable[[Int[np.ndarray, "*n"] | None], Any] | None = None
+    source: AnySurface
+    target: AnySurface
+
+    def whole(self) -> SurfacePair:
+        """With all rows of both surfaces."""
+        return self._replace(source=whole_surface(self.source), target=whole_surface(self.target))
+
+
+def whole_surface(surface: AnySurface) -> Surface:
+    """The surface with all rows, as compiled programs need it."""
+    return surface.whole() if isinstance(surface, SurfaceTable) else surface
 
 
 def surface_pair(
@@ -70,49 +111,52 @@ def surface_pair(
 ) -> SurfacePair:
     """Choose unset parameters from two clouds, and compute their surfaces.
 
-    Concrete clouds are processed on the host in blocks, and the results are cached with each cloud. Inside
+    Rows of concrete clouds are computed on the host when they are used, and are cached with each cloud. Inside
     transformations both clouds share one compiled body, unless they are large.
 
     Args:
         observed: whether to compute observability, which `register` needs and the cost of given matches does not.
         robust, equalize_channels: as in `AbstractMethod.terms`.
         num_threads: largest number of threads on the host; None for no limit.
-        source_rows: the rows of the surface of the source, with neighbours among all points; None for all rows. If
-            given, the rows of a concrete target are computed when they are used: most are not.
+        source_rows: the rows of the surface of the source, with neighbours among all points; None for all rows.
     """
     geometries = cache(partial(local_geometries, source, target, method.uses_channels, num_threads, source_rows))
     used = source if source_rows is None else _some_rows(source, source_rows)
     method = method.resolve(used, target, geometries)
     terms = method.terms(used, target, robust, equalize_channels)
-    kinds = tuple(type(term) for term in terms if term.name)
+    kinds = kinds_of(terms)
     # Raises an error if observability is needed and a cloud has no neighbours.
     described = observed or (source.deferred_neighbors is not None and target.deferred_neighbors is not None)
     if is_concrete(method, source, target):
-        on_host = partial(
-            surface_on_host, method, kinds, described=described, observed=observed, num_threads=num_threads
+        of_source, of_target = (
+            SurfaceTable(
+                surface_table(cloud, method, kinds, described, observed), rows, searchable(method, points), observed
+            )
+            for cloud, points, rows in ((source, used, source_rows), (target, target, None))
         )
-        if source_rows is not None:
-            describe = partial(surface_table(target, method, kinds, described, observed).known, num_threads=num_threads)
-            columns = describe(np.zeros(0, int))
-            # Columns of another dtype are copies, not views of the table.
-            if any(columns[0].layout.dtypes):
-                columns = describe(None)
-            of_target = _surface_in(columns, method, target)
-            return SurfacePair(method, terms, on_host(cloud=source, among=source_rows), of_target, describe)
-        of_target, of_source = side_by_side([partial(on_host, cloud=cloud) for cloud in (target, source)], num_threads)
+        if source_rows is None:
+            # At once, and side by side: most rows are used.
+            side_by_side([partial(each.table.known, None, num_threads) for each in (of_target, of_source)], num_threads)
         return SurfacePair(method, terms, of_source, of_target)
-    locals = geometries() if described else (None, None)
-    surfaces = _traced(method, kinds, source, target, locals, observed, source_rows)
-    of_source, of_target = (
-        surface._replace(search=searchable(method, cloud))
-        for surface, cloud in zip(surfaces, (used, target), strict=True)
-    )
-    return SurfacePair(method, terms, of_source, of_target)
+    function = _surface_rows(kinds, observed, described, needs_neighborhoods(method, described))
+    inputs = [_inputs(method, cloud, described) for cloud in (source, target)]
+    if described:
+        locals, rows = geometries(), (source_rows, None)
+        inputs = [[*of_rows(each, some), Input(local)] for each, some, local in zip(inputs, rows, locals, strict=True)]
+    else:
+        inputs[0] = of_rows(inputs[0], source_rows)
+    parts = over_both(function, method, *inputs)
+    both = [_surface_in(each, searchable(method, cloud)) for each, cloud in zip(parts, (used, target), strict=True)]
+    return SurfacePair(method, terms, *both)
+
+
+def kinds_of(terms: tuple[AbstractTerm, ...]) -> Kinds:
+    return tuple(type(term) for term in terms if term.name)
 
 
 def covariances_of(method: AbstractMethod, cloud: PointCloud) -> Float[np.ndarray, "N 3 3"]:
     """Covariances of a method at the points of a concrete cloud; unset parameters are chosen from the cloud."""
-    surface = surface_pair(method, cloud, cloud, observed=False).source
+    surface = surface_pair(method, cloud, cloud, observed=False).whole().source
     return np.asarray(alg.matrix_from_symmetric(jnp.asarray(surface.covariance.T)))
 
 
@@ -155,103 +199,114 @@ def search_rows(
     return SearchPoints(points, channels * weights.astype(points.dtype), valid, penalty)
 
 
-def surface_on_host(
-    method: AbstractMethod,
-    kinds: Kinds,
-    cloud: PointCloud,
-    described: bool,
-    observed: bool,
-    num_threads: int | None,
-    among: Any = None,
-) -> Surface:
-    """The surface of a concrete cloud as NumPy arrays.
-
-    Args:
-        described: whether the cloud has neighbours, whose local geometry is used.
-        among: (n,) rows of the cloud; None for all.
-    """
-    table = surface_table(cloud, method, kinds, described, observed)
-    if among is None:
-        return _surface_in(table.known(None, num_threads), method, cloud)
-    return _surface_in(table.rows(among, num_threads), method, _some_rows(cloud, among))
-
-
-# The columns that a step of the loop uses, and the noise.
-_Columns = tuple[Packed[Surface], Packed[SurfaceNoise] | None]
-
-
 @cached_with_cloud
 def surface_table(
     cloud: PointCloud, method: AbstractMethod, kinds: Kinds, described: bool, observed: bool
-) -> RowsOnDemand[_Columns]:
-    """The surface of a concrete cloud, cached with the cloud; arguments as of `surface_on_host`."""
-    geometry = geometry_table(cloud, method.uses_channels) if described else None
-    gather, size = _gatherer(method, cloud, described, np), cloud.points.shape[0]
+) -> ComputedTable:
+    """The surface of a concrete cloud, whose rows are cached with the cloud: `Surface`, and its `noise` if `observed`.
 
-    def compute(rows: Any, num_threads: int | None) -> _Columns:
-        statistics = None if geometry is None else geometry.known(rows, num_threads)
-
-        def block(index: Any) -> _Columns:
-            here = None if statistics is None else statistics.rows(index)
-            return _surface_of_block(method, kinds, gather(index), here, observed)
-
-        return in_blocks(block, rows, size, num_threads)
-
-    return RowsOnDemand(compute, size)
+    Args:
+        described: whether the cloud has neighbours, whose local geometry is used.
+        observed: as in `surface_pair`.
+    """
+    return _table(cloud, method, kinds, geometry_table(cloud, method.uses_channels) if described else None, observed)
 
 
-def _surface_in(columns: _Columns, method: AbstractMethod, cloud: PointCloud) -> Surface:
-    """The columns, views of one array, from which the executor on the host gathers rows; with the search."""
-    surface, noise = columns[0].tree, columns[1]
-    return surface._replace(noise=None if noise is None else noise.tree, search=searchable(method, cloud))
+class Fixed(NamedTuple):
+    """The clouds and the method, with its parameters chosen, without the traces of differentiation, see `primal`."""
+
+    source: PointCloud
+    target: PointCloud
+    method: AbstractMethod
 
 
-def _gatherer(method: AbstractMethod, cloud: PointCloud, described: bool, xp: Any) -> Callable[[Any], Neighborhoods]:
-    if method.uses_neighborhoods and described:
-        return gatherer(cloud, method.uses_channels, xp, with_given=True)
-    return points_alone(cloud, xp)
-
-
-def _traced(
-    method: AbstractMethod,
-    kinds: Kinds,
+def differentiable_inputs(
     source: PointCloud,
     target: PointCloud,
-    locals: tuple[LocalGeometry | None, LocalGeometry | None],
-    observed: bool,
-    source_rows: Any,
-) -> tuple[Surface, Surface]:
-    """Both surfaces, from one compiled body if both clouds have the same inputs and are not large."""
-    alike = None not in locals and (source.covariances is None) == (target.covariances is None) and source_rows is None
-    if not alike or not share_a_body(source, target):
-        of_source, of_target = (
-            _whole(method, kinds, cloud, local, observed, among)
-            for cloud, local, among in zip((source, target), locals, (source_rows, None), strict=True)
-        )
-        return of_source, of_target
-    cloud = joined(source, target, method.uses_channels)
-    if source.covariances is not None:
-        given = jnp.concatenate([jnp.asarray(cloud.covariances) for cloud in (source, target)])
-        cloud = cloud.replace_rows(covariances=given)
-    local = jax.tree.map(lambda *rows: jnp.concatenate(rows), *locals)
-    return split(_whole(method, kinds, cloud, local, observed), source.points.shape[0])
+    method: AbstractMethod,
+    terms: tuple[AbstractTerm, ...],
+    fixed: Fixed,
+    indices: Int[np.ndarray, "n m"],
+    *,
+    source_rows: Any = None,
+    observed: bool = False,
+    soft: bool = False,
+) -> list[Input]:
+    """The surfaces of matched points on the host, as inputs of a row function with `matched_rows`.
+
+    Args:
+        source, target, method, terms: differentiation may trace them.
+        indices: rows of the target, −1 where there is no match.
+        source_rows: (n,) rows of the source; None for all.
+        observed: as in `surface_pair`, from which values are taken.
+        soft: whether to include the descriptors.
+    """
+    sides = ((source, fixed.source, source_rows), (target, fixed.target, indices))
+    described = observed or all(cloud.deferred_neighbors is not None for _, cloud, _ in sides)
+    inputs = []
+    kinds = kinds_of(terms)
+    for cloud, same, rows in sides:
+        geometry = differentiable_geometry(cloud, method.uses_channels, same) if described else None
+        values = surface_table(same, fixed.method, kinds, described, observed)
+        inputs.append(Input(_table(cloud, method, kinds, geometry, observed, values), rows))
+    if soft:
+        inputs += [Input(_search_table(cloud, method), rows) for cloud, _, rows in sides]
+    return inputs
 
 
-def _whole(
+def _table(
+    cloud: PointCloud,
     method: AbstractMethod,
     kinds: Kinds,
-    cloud: PointCloud,
-    local: LocalGeometry | None,
+    geometry: ComputedTable | None,
     observed: bool,
-    among: Any = None,
-) -> Surface:
-    gather = _gatherer(method, cloud, local is not None, jnp)
+    values: ComputedTable | None = None,
+) -> ComputedTable:
+    described = geometry is not None
+    inputs = _inputs(method, cloud, described) + ([Input(geometry)] if described else [])
+    function = _surface_rows(kinds, observed, described, needs_neighborhoods(method, described))
+    return ComputedTable(function, method, inputs, cloud.points.shape[0], values)
 
-    def surface(rows: Any) -> Surface:
-        here = None if local is None else jax.tree.map(lambda array: jnp.asarray(array)[rows], local)
-        return surface_of(method, kinds, gather(rows if among is None else among[rows]), here, observed)
 
-    return over_rows(surface, cloud.points.shape[0] if among is None else among.size)
+def _search_table(cloud: PointCloud, method: AbstractMethod) -> ComputedTable:
+    """Descriptors and penalties of `searchable`, for the derivative of a soft assignment."""
+    given = PointRows(cloud.points, cloud.channels, cloud.channel_valid)
+    return ComputedTable(_descriptors, method, [Input(given)], cloud.points.shape[0])
+
+
+def _descriptors(method: AbstractMethod, own: Rows) -> tuple[SearchPoints]:
+    points, channels, known, *_ = own.tree
+    found = search_rows(*search_numbers(method, channels, known), points, channels, known, jnp.ones(len(points), bool))
+    # A mask is no number, and positions are in the surface already.
+    return (found._replace(points=None, valid=None),)
+
+
+def _surface_in(parts: tuple[Any, ...], search: SearchPoints) -> Surface:
+    """The columns, with noise and search; those of a table are views, from which the executor on the host gathers."""
+    surface, *noise = parts
+    return surface._replace(noise=noise[0] if noise else None, search=search)
+
+
+def needs_neighborhoods(method: AbstractMethod, described: bool) -> bool:
+    return method.uses_neighborhoods and described
+
+
+def _inputs(method: AbstractMethod, cloud: PointCloud, described: bool) -> list[Input]:
+    if needs_neighborhoods(method, described):
+        return with_near(cloud, method.uses_channels, with_given=True)
+    return points_alone(cloud)
+
+
+@cache
+def _surface_rows(kinds: Kinds, observed: bool, described: bool, with_neighborhoods: bool) -> Callable[..., Any]:
+    """The row function of `surface_of`, for `_inputs` and the local geometry."""
+
+    def surface(method: AbstractMethod, own: Rows, *rest: Rows) -> tuple[Any, ...]:
+        around = neighborhoods(own, rest[0]) if with_neighborhoods else neighborhoods(own)
+        found = surface_of(method, kinds, around, rest[-1].tree if described else None, observed)
+        return (found,) if found.noise is None else (found._replace(noise=None), found.noise)
+
+    return surface
 
 
 def surface_of(
@@ -288,12 +343,3 @@ def surface_of(
     details = SurfaceNoise(noise, local.normal, local.roughness, local.reach, slopes)
     by_shape, by_channels, details = jax.lax.stop_gradient((local.observability, by_channels, details))
     return surface._replace(observability=by_shape, channel_observability=by_channels, noise=details)
-
-
-@partial(jax.jit, static_argnums=(1, 4))
-def _surface_of_block(
-    method: AbstractMethod, kinds: Kinds, around: Neighborhoods, local: Packed[LocalGeometry] | None, observed: bool
-) -> tuple[Packed[Surface], Packed[SurfaceNoise] | None]:
-    """`surface_of` as two arrays: the columns that a step of the loop uses, and the noise."""
-    surface = surface_of(method, kinds, around, None if local is None else local.tree, observed)
-    return Packed.of(surface._replace(noise=None)), None if surface.noise is None else Packed.of(surface.noise)

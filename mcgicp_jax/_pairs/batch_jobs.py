@@ -231,7 +231,7 @@ class BatchJob:
         used, size = searched(problem.source).valid, size_class(max(len(source.points), len(target.points)))
         few = self.options.max_source_points
         sizes = size if few is None else min(size, size_class(few)), size
-        return _LanePair(pair.index, source, target, used), _padded(problem.completed(), sizes)
+        return _LanePair(pair.index, source, target, used), _padded(problem.whole(), sizes)
 
 
 def _padded(problem: Problem, sizes: tuple[int, int]) -> Problem:

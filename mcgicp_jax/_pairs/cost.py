@@ -1,26 +1,27 @@
-"""The Mahalanobis cost of given matches, for losses and custom loops. Pure JAX."""
+"""The Mahalanobis cost of given matches, for losses and custom loops."""
 
 from __future__ import annotations
 
-from functools import partial
 from typing import Any
 
-import jax
 import jax.numpy as jnp
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float, Int
 
 from mcgicp_jax._clouds.origins import centred_pose
 from mcgicp_jax._clouds.point_cloud import PointCloud
-from mcgicp_jax._compute.concrete import is_concrete
+from mcgicp_jax._compute.concrete import AnyArray, constant, is_concrete, numpy_for
+from mcgicp_jax._compute.linear_maps import primal
+from mcgicp_jax._compute.row_functions import Input, Rows, blockwise
+from mcgicp_jax._local_geometry.neighborhoods import of_rows
 from mcgicp_jax._local_geometry.surface import searched
 from mcgicp_jax._math import symmetric_matrices as alg
 from mcgicp_jax._math.poses import Pose
 from mcgicp_jax._math.robust_kernels import AbstractKernel
-from mcgicp_jax._methods.base import AbstractGeneralized, AbstractMethod
-from mcgicp_jax._methods.surfaces import SurfacePair, surface_pair
+from mcgicp_jax._methods.base import AbstractGeneralized, AbstractMethod, with_unset_from
+from mcgicp_jax._methods.surfaces import Fixed, differentiable_inputs, surface_pair
 from mcgicp_jax._pose_solver.adaptation import adapted, sample_of_term
-from mcgicp_jax._pose_solver.matched import Matched, Motion, linearize_at, match_surfaces, surface_rows
+from mcgicp_jax._pose_solver.matched import Motion, linearize_at, matched_rows
 from mcgicp_jax._registration.input_checks import check_matches
 from mcgicp_jax._search.base import Correspondences
 from mcgicp_jax._terms.base import AbstractTerm
@@ -40,11 +41,11 @@ def mahalanobis_cost(
     """Compute the cost F(T) = Σ ρ(dᵀ M d) of given matches, with d = b − T a and M = (C^B + R C^A Rᵀ)⁻¹ (Servos &
     Waslander 2014, eq. 3, which omits the inverse); M = I or n nᵀ for the methods without covariances.
 
-    Pure JAX, differentiable with respect to all inputs but the matches. Unlike `register`, it and its gradient compile
-    for every size of clouds, also outside `jit`. Here M is a function of the rotation R, whereas `estimate_pose`, like
-    every GICP, holds M fixed during each update: its pose is not exactly the minimum of F. With `photometric=True`, the
-    standard deviations of the residuals are estimated at the given pose, as constants to autodiff, so that values at
-    different poses do not compare.
+    Differentiable with respect to all inputs but the matches, also inside `jit` and `vmap`. Outside of these, the cost
+    and its gradient compile nothing for another size of clouds, and second derivatives raise `NotImplementedError`.
+    Here M is a function of the rotation R, whereas `estimate_pose`, like every GICP, holds M fixed during each update:
+    its pose is not exactly the minimum of F. With `photometric=True`, the standard deviations of the residuals are
+    estimated at the given pose, as constants to autodiff, so that values at different poses do not compare.
 
     Args:
         pose: T_target_source, `jaxlie.SE3` or (4, 4).
@@ -71,37 +72,64 @@ def mahalanobis_cost(
     check_matches(matches, source, method, temperature)
     if log_determinant and not isinstance(method, AbstractGeneralized):
         raise ValueError(f"log_determinant: expected a method with covariances, got {type(method).__name__}")
-    surfaces = surface_pair if is_concrete(method, source, target) else _surface_pair_in_jit
-    pair = surfaces(method, source, target, observed=False, robust=robust)
-    dtype = source.points.dtype
-    matrix = centred_pose(pose, source, target, "pose")
-    rotation, translation = jnp.asarray(matrix[:3, :3], dtype), jnp.asarray(matrix[:3, 3], dtype)
-    temperature = None if temperature is None else jnp.asarray(temperature, dtype)
-    return _total_cost(Motion(rotation, translation), pair, matches, temperature, log_determinant)
+    matrix, dtype = centred_pose(pose, source, target, "pose"), source.points.dtype
+    motion = Motion(matrix[:3, :3].astype(dtype), matrix[:3, 3].astype(dtype))
+    temperature = None if temperature is None else numpy_for(temperature).asarray(temperature, dtype)
+    numbers, inputs = _problem(motion, source, target, matches, method, robust, temperature)
+    return blockwise(_likelihood if log_determinant else _cost, numbers, *inputs, total=True)
 
 
-# Without it, a gradient outside `jit` would compile each of some hundred operations alone.
-_surface_pair_in_jit = jax.jit(surface_pair, static_argnames="observed")
+Numbers = tuple[Motion, tuple[AbstractTerm, ...], Any]
 
 
-@partial(jax.jit, static_argnames="log_determinant")
-def _total_cost(
+def _problem(
     motion: Motion,
-    pair: SurfacePair,
+    source: PointCloud,
+    target: PointCloud,
     matches: Correspondences,
-    temperature: Float[Array, ""] | None,
-    log_determinant: bool,
-) -> Float[Array, ""]:
-    matched = match_surfaces(pair.source, pair.target, matches, temperature)
+    method: AbstractMethod,
+    robust: AbstractKernel | None,
+    temperature: Any,
+) -> tuple[Numbers, list[Input]]:
+    """Numbers and inputs of the row function of the cost."""
+    fixed = Fixed(*primal((source, target, method)))
+    given = primal((motion, temperature, matches))
+    xp = numpy_for(given[2])
+    indices = xp.where(xp.asarray(matches.valid), xp.asarray(matches.indices), -1)
+    indices = indices.reshape(-1, indices.shape[-1]).T
+    if is_concrete(fixed, given):
+        method = with_unset_from(method, fixed.method.resolve(fixed.source, fixed.target))
+        terms = method.terms(fixed.source, fixed.target, robust, False)
+        fixed, soft = fixed._replace(method=primal(method)), temperature is not None
+        inputs = differentiable_inputs(source, target, method, terms, fixed, indices, soft=soft)
+    else:
+        pair = surface_pair(method, source, target, observed=False, robust=robust).whole()
+        terms, both = pair.terms, ((pair.source, None), (pair.target, indices))
+        inputs = [Input(surface._replace(search=None), rows) for surface, rows in both]
+        if temperature is not None:
+            inputs += [Input(searched(surface), rows) for surface, rows in both]
 
-    def sample(term: AbstractTerm, rows: Int[Array, "n"]) -> Any:
-        some = Matched(surface_rows(matched.source, rows), surface_rows(matched.target, rows), matched.valid[rows])
-        return sample_of_term(motion, some, term)
+    def sample(term: AbstractTerm, rows: Int[AnyArray, "n"]) -> Any:
+        (found,) = blockwise(_sample, constant(primal((motion, term))), *of_rows(inputs, rows))
+        return primal(found)
 
-    terms = adapted(pair.terms, searched(pair.source).valid, sample)
+    return (motion, adapted(terms, fixed.source.valid, sample), temperature), inputs
+
+
+def _sample(numbers: tuple[Motion, AbstractTerm], *rows: Rows) -> tuple[Any]:
+    motion, term = numbers
+    return (sample_of_term(motion, matched_rows(rows), term),)
+
+
+def _cost(numbers: Any, *rows: Rows) -> Float[Array, ""]:
+    motion, terms, temperature = numbers
+    _, found, _ = linearize_at(motion, matched_rows(rows, temperature), terms)
+    return jnp.sum(found.cost)
+
+
+def _likelihood(numbers: Any, *rows: Rows) -> Float[Array, ""]:
+    motion, terms, temperature = numbers
+    matched = matched_rows(rows, temperature)
     _, found, counts = linearize_at(motion, matched, terms)
-    cost = jnp.sum(found.cost)
-    if log_determinant:
-        determinant = jnp.where(matched.valid, alg.determinant(found.information), 1)
-        cost = cost - jnp.sum(counts * jnp.log(determinant))
-    return cost
+    determinant = jnp.where(matched.valid, alg.determinant(found.information), 1)
+    return jnp.sum(found.cost) - jnp.sum(counts * jnp.log(determinant))

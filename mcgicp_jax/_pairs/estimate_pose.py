@@ -103,7 +103,7 @@ def _estimated_on_host(given: Given, matches: Correspondences, init: Pose | None
 def _estimated_inside_jit(
     given: Given, matches: Correspondences, init: Pose | None, options: Options
 ) -> RegistrationResult:
-    problem, _ = _problem(given, init, options)
+    problem = _problem(given, init, options)[0].whole()
     softness = None if given.temperature is None else jnp.asarray(given.temperature)
     fixed, fixed_softness = jax.lax.stop_gradient((problem, softness))
     loop = estimate_pose_traced(fixed, matches, fixed_softness, options.max_iterations)

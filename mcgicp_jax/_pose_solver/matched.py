@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -10,6 +11,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from mcgicp_jax._compute.concrete import AnyArray, AnyScalar, numpy_for
+from mcgicp_jax._compute.row_functions import Input, Rows, whole
 from mcgicp_jax._local_geometry.surface import Surface, searched
 from mcgicp_jax._math import symmetric_matrices as alg
 from mcgicp_jax._search.base import Correspondences, SearchPoints
@@ -68,25 +70,42 @@ def match_surfaces(
     with_search: bool = False,
 ) -> Matched:
     """Gather the matched rows of both surfaces, with the inputs of the search if `with_search`; pure JAX."""
-    size = source.num_points
-    indices, valid = jnp.asarray(matches.indices).reshape(-1), jnp.asarray(matches.valid).reshape(-1)
-    num_candidates = indices.size // size
-    tiled = source
-    if num_candidates > 1:
-        tiled = jax.tree.map(lambda rows: jnp.concatenate([rows] * num_candidates), source)
-    if not with_search and temperature is None:
-        tiled, target = tiled._replace(search=None), target._replace(search=None)
-    tiled, target = jax.tree.map(jnp.asarray, (tiled, target))
-    target = surface_rows(target, indices)
-    apart = None if temperature is None else square_apart(searched(tiled), searched(target))
-    if not with_search:
-        tiled, target = tiled._replace(search=None), target._replace(search=None)
-    return Matched(tiled, target, valid, apart, temperature, num_candidates)
+    indices = jnp.where(jnp.asarray(matches.valid), jnp.asarray(matches.indices), -1).reshape(-1, source.num_points).T
+    sides = ((source, None), (target, indices))
+    inputs = [Input(side if with_search else side._replace(search=None), index) for side, index in sides]
+    if temperature is not None:
+        inputs += [Input(searched(side), index) for side, index in sides]
+    return matched_rows([whole(each) for each in inputs], temperature)
 
 
-def surface_rows(surface: Surface, rows: Any) -> Surface:
-    """Some rows of a surface."""
-    return jax.tree.map(lambda array: array[rows], surface)
+def matched_rows(
+    rows: Sequence[Rows], temperature: Float[AnyScalar, ""] | None = None, with_noise: bool = False
+) -> Matched:
+    """Matches from gathered rows of the source and of the target, whose index is −1 for correspondences to ignore.
+
+    Args:
+        rows: of both surfaces; of the noise of both if `with_noise`; of the inputs of the search of both if the matches
+            are to have these, or `temperature` is given.
+    """
+    target = rows[1]
+    count = len(target.index) if target.index.ndim == 2 else 1
+
+    def tiled(tree: Any) -> Any:
+        return jax.tree.map(lambda rows: jnp.tile(rows, (count, *[1] * (rows.ndim - 1))), tree)
+
+    def flat(tree: Any) -> Any:
+        return jax.tree.map(lambda rows: rows.reshape(target.index.size, *rows.shape[target.index.ndim :]), tree)
+
+    sources, targets = [tiled(each.tree) for each in rows[::2]], [flat(each.tree) for each in rows[1::2]]
+    surfaces = sources[0], targets[0]
+    if with_noise:
+        surfaces = surfaces[0]._replace(noise=sources[1]), surfaces[1]._replace(noise=targets[1])
+    apart = None
+    if temperature is not None:
+        apart = square_apart(sources[-1], targets[-1])
+    elif len(sources) > 1 + with_noise:
+        surfaces = surfaces[0]._replace(search=sources[-1]), surfaces[1]._replace(search=targets[-1])
+    return Matched(*surfaces, target.index.reshape(-1) >= 0, apart, temperature, count)
 
 
 def distances_within(

@@ -12,7 +12,6 @@ from jaxtyping import Array, Float
 
 from mcgicp_jax._compute.concrete import AnyArray, AnyScalar, is_concrete, numpy_for
 from mcgicp_jax._compute.lazy import Lazy
-from mcgicp_jax._local_geometry.surface import searched
 from mcgicp_jax._math.poses import adjoint_to_center, units
 from mcgicp_jax._math.statistics import sampled_rows
 from mcgicp_jax._pose_solver.adaptation import sample_of_term
@@ -70,11 +69,11 @@ def moments_of(executor: AbstractExecutor, loop: LoopResult, rematched: bool) ->
         rematched: whether matches follow when the pose moves; False if they are fixed.
     """
     problem, state = executor.problem, loop.state
-    motion, surface = executor.motion(state.pose), executor.source_of(loop.matches)
-    size = surface.num_points
-    one = np.ones((), surface.points.dtype)
+    motion, source = executor.motion(state.pose), executor.source_of(loop.matches)
+    size = source.valid.size
+    one = np.ones((), source.points.dtype)
     frame = Frame(state.sums.center, state.sums.radius, np.tile(one, 2), one, np.int32(size))
-    if surface.noise is not None and problem.target.noise is not None:
+    if problem.source.observed:
         discount, reach = _discounts_and_reach(executor, motion, loop.matches)
         frame = frame._replace(discount=discount, reach=reach)
     responding = _responding(executor, motion, loop) if rematched and is_adaptive(loop.terms) else None
@@ -85,7 +84,7 @@ def moments_of(executor: AbstractExecutor, loop: LoopResult, rematched: bool) ->
 def _discounts_and_reach(
     executor: AbstractExecutor, motion: Motion, matches: Any
 ) -> tuple[Float[AnyArray, "2"], Float[AnyScalar, ""]]:
-    search = searched(executor.source_of(matches))
+    search = executor.source_of(matches)
     rows, counts = sampled_rows(search.valid)
     xp = numpy_for(counts)
     sample = executor.over_rows(noise_sample, motion, executor.nearest(motion, matches), rows, with_noise=True)
@@ -95,7 +94,7 @@ def _discounts_and_reach(
 
 def _responding(executor: AbstractExecutor, motion: Motion, loop: LoopResult) -> tuple[AbstractTerm, ...]:
     """The terms with their response, from a sample of the source points that is shifted and matched anew."""
-    rows, counts = sampled_rows(searched(executor.problem.source).valid)
+    rows, counts = sampled_rows(executor.problem.source.search.valid)
 
     def responding(term: AbstractTerm) -> AbstractTerm:
         def sample(shift: Float[AnyArray, "3"]) -> Any:

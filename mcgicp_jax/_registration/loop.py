@@ -24,11 +24,11 @@ import jaxlie
 from jaxtyping import Bool, Int
 
 from mcgicp_jax._compute.concrete import AnyArray, AnyScalar
-from mcgicp_jax._local_geometry.surface import Surface, searched
 from mcgicp_jax._pose_solver.adaptation import adapted, sample_of_term
 from mcgicp_jax._pose_solver.covariance import Scores
 from mcgicp_jax._pose_solver.matched import Motion
 from mcgicp_jax._registration.step import SETTLED, Problem, State, update
+from mcgicp_jax._search.base import SearchPoints
 from mcgicp_jax._terms.base import AbstractTerm, is_adaptive
 
 Result = TypeVar("Result")
@@ -89,7 +89,7 @@ class AbstractExecutor(abc.ABC):
         """The nearest candidate of each source point alone."""
 
     @abc.abstractmethod
-    def source_of(self, matches: Any) -> Surface:
+    def source_of(self, matches: Any) -> SearchPoints:
         """The source points that are matched: in the coarse phase on the host, every `coarse_stride`-th."""
 
     @abc.abstractmethod
@@ -157,7 +157,7 @@ class AbstractExecutor(abc.ABC):
         terms = self.problem.terms
         if not is_adaptive(terms):
             return terms
-        motion, valid = self.motion(state.pose), searched(self.source_of(matches)).valid
+        motion, valid = self.motion(state.pose), self.source_of(matches).valid
         return adapted(terms, valid, lambda term, rows: self.over_rows(sample_of_term, motion, matches, rows, term))
 
 

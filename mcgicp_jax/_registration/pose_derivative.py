@@ -1,32 +1,28 @@
-"""The derivative of the pose of concrete clouds, outside `jit`: programs over blocks, which no size compiles anew.
+"""The derivative of the pose of concrete clouds, outside `jit`.
 
 A pose has six degrees of freedom, so its derivative by all n numbers of the inputs is a (6, n) matrix, of which a
-gradient needs one combination of the rows. The pose is a root of g, see `_pose_solver.implicit_derivative`. Newton's
-method finds the root and ∂g/∂ξ by sums over blocks. A cotangent of the pose then becomes one of g, of the matched rows
-of both surfaces, and of the points and channels in the neighbourhood of each row. NumPy adds the latter.
+gradient needs one combination of the rows. The pose is a root of g, see `_pose_solver.implicit_derivative`: the sum of
+a row function of the matched rows of both surfaces, which are row functions of the clouds.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
-from functools import cached_property, partial
+from collections.abc import Sequence
+from functools import cached_property
 from typing import Any, NamedTuple
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import jaxlie
 import numpy as np
-from jaxtyping import Float, Int
-from scipy.sparse import csc_array
+from jaxtyping import Array, Float
 
 from mcgicp_jax._clouds.point_cloud import PointCloud
-from mcgicp_jax._compute.blocks import blocks
 from mcgicp_jax._compute.concrete import is_concrete
 from mcgicp_jax._compute.linear_maps import AbstractLinearMap, SideBySide, primal, with_derivative
-from mcgicp_jax._compute.packing import Packed
-from mcgicp_jax._compute.threads import num_cores, side_by_side
-from mcgicp_jax._local_geometry.local_statistics import local_geometry_on_host
-from mcgicp_jax._local_geometry.neighborhoods import Neighborhoods, gatherer, points_alone
+from mcgicp_jax._compute.quick_compilation import quickly_compiled
+from mcgicp_jax._compute.row_functions import Input, RowFunction, Rows, blockwise
 from mcgicp_jax._math.poses import (
     parameters_by_twist,
     rotation_from_quaternion,
@@ -35,25 +31,20 @@ from mcgicp_jax._math.poses import (
 )
 from mcgicp_jax._math.robust_kernels import AbstractKernel
 from mcgicp_jax._methods.base import AbstractMethod, with_unset_from
-from mcgicp_jax._pose_solver.implicit_derivative import MAX_NEWTON_STEPS, ImplicitRoot
-from mcgicp_jax._pose_solver.matched import Motion
-from mcgicp_jax._pose_solver.pose_measurements import PoseForm, Prior, TiePoints, form_at
-from mcgicp_jax._registration.derivative_programs import (
-    Block,
-    Columns,
-    balance_and_slope,
-    pull_balance,
-    pull_surface,
-    score_and_pull,
+from mcgicp_jax._methods.surfaces import Fixed, differentiable_inputs
+from mcgicp_jax._pose_solver.implicit_derivative import (
+    MAX_NEWTON_STEPS,
+    ImplicitRoot,
+    balance_along,
+    score_at,
+    value_and_jacobian,
 )
+from mcgicp_jax._pose_solver.matched import Motion, matched_rows
+from mcgicp_jax._pose_solver.pose_measurements import Fusion, PoseForm, Prior, TiePoints, form_at
 from mcgicp_jax._registration.loop import LoopResult
 from mcgicp_jax._registration.on_host import HostExecutor
 from mcgicp_jax._registration.step import State, root_of
 from mcgicp_jax._terms.base import AbstractTerm, with_numbers_of
-
-# An input: the cloud and its field, or the parameter and the number of the leaf.
-Name = tuple[str, Any]
-_FIELDS = ("points", "channels", "covariances")
 
 
 class Inputs(NamedTuple):
@@ -75,15 +66,6 @@ class Inputs(NamedTuple):
     form: PoseForm | None = None
     temperature: Any = None
     source_rows: Any = None
-
-    def traced(self) -> dict[Name, Any]:
-        """The arrays that differentiation traces."""
-        leaves: dict[Name, Any] = {
-            (side, field): getattr(getattr(self, side), field) for side in ("source", "target") for field in _FIELDS
-        }
-        for name in ("method", "terms", "form", "temperature"):
-            leaves |= {(name, i): leaf for i, leaf in enumerate(_numbers(getattr(self, name)))}
-        return {name: leaf for name, leaf in leaves.items() if not is_concrete(leaf)}
 
 
 class Given(NamedTuple):
@@ -107,74 +89,88 @@ class PoseDerivative(AbstractLinearMap):
     """The derivative of the parameters `jaxlie.SE3.wxyz_xyz` of a final pose by some inputs; 0 if there is none.
 
     Args:
-        names: of these inputs.
-        inputs: of the registration, concrete.
+        inputs: of the registration; differentiation may trace them.
+        fixed: the same, concrete.
         executor, loop: the registration.
-        gains: by which the channels of the source were multiplied; None for 1.
+        arrays: those of `inputs` by which it is; by default all that are traced.
     """
 
-    def __init__(self, names: Sequence[Name], inputs: Inputs, executor: HostExecutor, loop: LoopResult, gains: Any):
-        self._names, self._inputs, self._gains = names, inputs, gains
-        self._matches, self._valid = executor.correspondences(loop)
-        self._num_threads, problem = executor.num_threads or num_cores(), executor.problem
+    def __init__(
+        self, inputs: Inputs, fixed: Inputs, executor: HostExecutor, loop: LoopResult, arrays: Sequence[Any] = ()
+    ):
+        problem = executor.problem
         self._pose, self._fusion = np.asarray(loop.state.pose.wxyz_xyz), problem.fusion
         self._scaling: ImplicitRoot = jax.tree.map(np.asarray, root_of(loop.state._replace(record=None), self._fusion))
-        self._parameters = with_numbers_of(inputs.terms, loop.terms), inputs.temperature
-        self._kinds = tuple(type(term) for term in inputs.terms if term.name)
-        soft = inputs.temperature is not None
-        columns = [Columns.of(each, each.search if soft else None) for each in (problem.source, problem.target)]
-        self._columns = [Packed.of(each) for each in columns]
-        self._jacobians: dict[tuple[int, ...], list[np.ndarray]] = {}
+        self._form = jax.tree.leaves(inputs.form)
+        matches, valid = executor.correspondences(loop)
+        tables = differentiable_inputs(
+            *inputs[:4],
+            Fixed(*fixed[:3]),
+            np.where(valid, matches, -1).T,
+            source_rows=inputs.source_rows,
+            observed=problem.source.observed,
+            soft=inputs.temperature is not None,
+        )
+        numbers = (
+            Motion(*_motion(self._pose)),
+            self._scaling,
+            with_numbers_of(inputs.terms, loop.terms),
+            inputs.temperature,
+        )
+        self._scored = RowFunction(_score_of_rows, numbers, tables, matches.shape[1], total=True)
+        traced = [leaf for leaf in self._form if not is_concrete(leaf)]
+        self.arrays = list(arrays) or self._scored.tracers + traced
 
     def push(self, tangents: Sequence[np.ndarray], moving: tuple[int, ...]) -> list[np.ndarray]:
-        pairs = zip(tangents, self.jacobian(moving), strict=True)
-        return [sum(each.reshape(len(each), -1) @ by.reshape(7, -1).T for each, by in pairs)]
+        slopes = {id(self.arrays[i]): tangent for i, tangent in zip(moving, tangents, strict=True)}
+        pose, inverse = self._root
+        count = len(tangents[0])
+        change = np.broadcast_to(self._score(pose).push(slopes, frozenset(slopes)), (count, 6))
+        if self._fusion is not None:
+            by_score, by_form = self._by_balance(np.eye(6))
+            change = change @ by_score.T
+            for leaf, by in zip(self._form, by_form, strict=True):
+                if id(leaf) in slopes:
+                    change = change + slopes[id(leaf)].reshape(count, -1) @ by.reshape(6, -1).T
+        return [-change @ (self._by_twist(self._pose) @ inverse).T]
 
     def pull(self, cotangents: Sequence[np.ndarray], moving: tuple[int, ...]) -> list[np.ndarray]:
-        (each,) = cotangents
-        # One program for any number of cotangents but one.
-        return (
-            self._pull(each, moving) if len(each) == 1 else [np.tensordot(each, by, 1) for by in self.jacobian(moving)]
-        )
-
-    def jacobian(self, moving: tuple[int, ...]) -> list[np.ndarray]:
-        """(7, ...) derivative of the pose parameters by each input with one of these numbers."""
-        if moving not in self._jacobians:
-            self._jacobians[moving] = self._pull(np.eye(7), moving)
-        return self._jacobians[moving]
-
-    def _pull(self, cotangents: Float[np.ndarray, "k 7"], moving: tuple[int, ...]) -> list[np.ndarray]:
-        names = [self._names[i] for i in moving]
         pose, inverse = self._root
-        found: dict[Name, np.ndarray] = {}
-        by_score = np.asarray(-(cotangents @ self._by_twist(self._pose)) @ inverse, pose.dtype)
+        by_form: list[np.ndarray] = []
+        by_score = -(cotangents[0] @ self._by_twist(self._pose)) @ inverse
         if self._fusion is not None:
-            pulled, by_form = pull_balance(pose, self._scaling, self._fusion, by_score)
-            by_score = np.asarray(pulled)
-            found |= {("form", i): np.asarray(leaf) for i, leaf in enumerate(jax.tree.leaves(by_form))}
-        tables, by_parameters = self._pull_matches(pose, by_score)
-        for parameter, tree in zip(("terms", "temperature"), by_parameters, strict=True):
-            found |= {(parameter, i): leaf for i, leaf in enumerate(jax.tree.leaves(tree))}
-        by_method = any(parameter == "method" for parameter, _ in names)
-        for side, table in zip(("source", "target"), tables, strict=True):
-            fields = tuple(field for field in _FIELDS if (side, field) in names) + ("method",) * by_method
-            for name, values in self._pull_surface(side, table, fields).items() if fields else ():
-                found[name] = found[name] + values if name in found else values
-        if self._gains is not None and ("source", "channels") in found:
-            found["source", "channels"] *= self._gains
-        return [found[name] for name in names]
+            by_score, by_form = self._by_balance(by_score)
+        arrays = [self.arrays[i] for i in moving]
+        found = self._score(pose).cotangents(by_score.astype(pose.dtype), arrays)
+        for leaf, by in zip(self._form, by_form, strict=True):
+            found = [by if array is leaf else each for array, each in zip(arrays, found, strict=True)]
+        return found
+
+    def jacobian(self) -> list[np.ndarray]:
+        """(7, ...) derivative of the pose parameters by each of the arrays."""
+        return self.pull([np.eye(7)], tuple(range(len(self.arrays))))
+
+    def _by_balance(self, cotangents: Float[np.ndarray, "c 6"]) -> tuple[np.ndarray, list[np.ndarray]]:
+        """Cotangents of the score and of the leaves of the form, from those of the equation with both."""
+        pose, _ = self._root
+        found = _pull_balance(pose, self._scaling, self._fusion, cotangents.astype(pose.dtype))
+        by_score, by_form = jax.tree.map(np.asarray, found)
+        return by_score, jax.tree.leaves(by_form) if self._form else []
+
+    def _score(self, pose: Float[np.ndarray, "7"]) -> RowFunction:
+        """g at a pose, without tie points and prior."""
+        return self._scored.at(_motion(pose))
 
     @cached_property
     def _root(self) -> tuple[Float[np.ndarray, "7"], Float[np.ndarray, "6 6"]]:
         """The root near the final pose, by Newton's method, and P (Pᵀ ∂g/∂ξ P)⁻¹ Pᵀ there; 0 if there is none."""
         pose, root = self._pose, self._scaling
         for _ in range(MAX_NEWTON_STEPS if root.usable else 0):
-            known: Any = np.zeros((6, 13))
-            for _, (score, (motion, *_)) in self._over_matches(pose):
-                known += np.column_stack([score, *(np.asarray(each).reshape(6, -1) for each in motion)])
-            known = np.column_stack([known[:, :1], known[:, 1:] @ self._motion_by_twist(pose)])
+            score, by_motion = self._score(pose).value_and_jacobian((0, 1))
+            slopes = np.column_stack([each.reshape(6, -1) for each in by_motion]) @ self._motion_by_twist(pose)
+            known = np.column_stack([score, slopes])
             if self._fusion is not None:
-                known = np.asarray(balance_and_slope(pose, root, self._fusion, known.astype(pose.dtype)), np.float64)
+                known = np.asarray(_balance_and_slope(pose, root, self._fusion, known.astype(pose.dtype)), np.float64)
             balance, slope = np.split(known, [1], axis=1)
             within = root.within(slope)
             if not np.linalg.cond(within) < 1 / np.finfo(slope.dtype).eps:
@@ -202,164 +198,100 @@ class PoseDerivative(AbstractLinearMap):
         found[9:] = self._by_twist(pose)[4:]
         return found
 
-    def _over_matches(self, pose: Float[np.ndarray, "7"]) -> Iterator[tuple[slice, Any]]:
-        """The results of `score_and_pull` for each block of matches, in order."""
-        motion = Motion(rotation_from_quaternion(pose[:4].astype(np.float64)).astype(pose.dtype), pose[4:])
 
-        def call(rows: slice, index: Any) -> Any:
-            valid = self._valid[:, index].copy()
-            valid[:, rows.stop - rows.start :] = False
-            source, target = self._columns
-            block = Block(source.rows(index), target.rows(self._matches[:, index]), valid)
-            return score_and_pull(self._parameters, self._scaling, motion, block)
+def _motion(pose: Float[np.ndarray, "7"]) -> tuple[Float[np.ndarray, "3 3"], Float[np.ndarray, "3"]]:
+    return rotation_from_quaternion(pose[:4].astype(np.float64)).astype(pose.dtype), pose[4:]
 
-        return self._in_order(call, self._matches.shape[1])
 
-    def _in_order(self, call: Callable[[slice, Any], Any], num_rows: int) -> Iterator[tuple[slice, Any]]:
-        """Results for blocks of rows, in order; only as many at once as there are threads, which bounds the memory."""
-        cut = blocks(num_rows)
-        for start in range(0, len(cut), self._num_threads):
-            some = cut[start : start + self._num_threads]
-            results = side_by_side([partial(call, *block) for block in some], self._num_threads)
-            yield from ((rows, result) for (rows, _), result in zip(some, results, strict=True))
+def _score_of_rows(numbers: tuple[Motion, ImplicitRoot, Any, Any], *rows: Rows) -> Float[Array, "6"]:
+    motion, root, terms, temperature = numbers
+    return score_at(motion, root, matched_rows(rows, temperature), terms)
 
-    def _pull_matches(
-        self, pose: Float[np.ndarray, "7"], by_score: Float[np.ndarray, "k 6"]
-    ) -> tuple[list[Float[np.ndarray, "N k L"]], Any]:
-        """Cotangents of the tables of both clouds and of the parameters."""
-        shapes = [each.table.shape for each in self._columns]
-        tables = [np.zeros((size, len(by_score), width), by_score.dtype) for size, width in shapes]
-        total: Any = None
-        for rows, (_, (_, *found)) in self._over_matches(pose):
-            source, target, numbers = jax.tree.map(lambda rows: np.tensordot(by_score, rows, 1), found)
-            count = rows.stop - rows.start
-            tables[0][rows] = source[:, :count].swapaxes(0, 1)
-            _add_rows(tables[1], self._matches[:, rows], np.moveaxis(target[:, :, :count], 0, 2))
-            numbers = jax.tree.map(lambda leaf: leaf.astype(np.float64), numbers)
-            total = numbers if total is None else jax.tree.map(np.add, total, numbers)
-        return tables, total
 
-    def _pull_surface(
-        self, side: str, table: Float[np.ndarray, "N k L"], fields: tuple[str, ...]
-    ) -> dict[Name, np.ndarray]:
-        """Cotangents of fields of a cloud, and of the method, from those of its table."""
-        cloud, method = getattr(self._inputs, side), self._inputs.method
-        some = self._inputs.source_rows if side == "source" else None
-        among = np.arange(len(cloud.points)) if some is None else some
-        gather, soft, local = _gatherer(cloud, method), self._inputs.temperature is not None, None
-        if cloud.deferred_neighbors is not None and "points" not in fields:
-            local = Packed.of(local_geometry_on_host(cloud, method.uses_channels, self._num_threads, some))
-        valid = None if cloud.channel_valid is None else np.asarray(cloud.channel_valid)
+@quickly_compiled
+def _balance_and_slope(
+    pose: Float[Array, "7"], root: ImplicitRoot, fusion: Fusion, known: Float[Array, "6 7"]
+) -> Float[Array, "6 7"]:
+    """The equation with tie points and a prior, and its derivative by a twist.
 
-        def call(rows: slice, index: Any) -> Any:
-            masks = (None if valid is None else valid[index], np.asarray(cloud.valid)[index]) if soft else None
-            by_rows = table[index].copy()
-            by_rows[rows.stop - rows.start :] = 0
-            here = None if local is None else local.rows(index)
-            return pull_surface(self._kinds, fields, method, gather(among[index]), here, masks, by_rows)
+    Args:
+        known: g of all matches without these, and its derivative by a twist.
+    """
+    with jax.default_matmul_precision("highest"):
+        value, slope = value_and_jacobian(
+            lambda twist: balance_along(twist, pose, root, known[:, 0] + known[:, 1:] @ twist, fusion),
+            jnp.zeros_like(pose[:6]),
+        )
+        return jnp.concatenate([value[:, None], slope], axis=1)
 
-        count, num_channels = table.shape[1], cloud.channels.shape[1] if method.uses_channels else 0
-        widths = {"points": 3 * ("points" in fields), "channels": num_channels * ("channels" in fields)}
-        columns = np.zeros((len(cloud.points), count, sum(widths.values())))
-        found: dict[Name, Any] = {}
-        if "covariances" in fields:
-            found[side, "covariances"] = np.zeros((count, len(cloud.points), 3, 3))
-        for places, (own, near, given, numbers) in self._in_order(call, len(table)):
-            size, rows = places.stop - places.start, among[places]
-            if own is not None:
-                columns[rows] += np.asarray(own)[:size].reshape(size, *columns.shape[1:])
-            if near is not None:
-                _add_rows(columns, np.asarray(cloud.neighbors)[rows].T, np.asarray(near)[:, :size])
-            if given is not None:
-                found[side, "covariances"][:, rows] = np.asarray(given)[:, :size]
-            for i, leaf in enumerate(jax.tree.leaves(numbers)):
-                found["method", i] = found.get(("method", i), 0) + np.asarray(leaf, np.float64)
-        columns = columns.swapaxes(0, 1)
-        if "points" in fields:
-            found[side, "points"] = columns[..., :3]
-        if "channels" in fields:
-            found[side, "channels"] = (
-                columns[..., widths["points"] :] if num_channels else np.zeros((count, *cloud.channels.shape))
-            )
-        return found
+
+@quickly_compiled
+def _pull_balance(
+    pose: Float[Array, "7"], root: ImplicitRoot, fusion: Fusion, cotangents: Float[Array, "m 6"]
+) -> tuple[Float[Array, "m 6"], PoseForm]:
+    """Cotangents of the score and of the form of tie points and prior, from those of the equation."""
+
+    def balance(score: Float[Array, "6"], form: PoseForm) -> Float[Array, "6"]:
+        nowhere = jnp.zeros_like(score)
+        return balance_along(nowhere, pose, root, score, eqx.tree_at(lambda fusion: fusion.form, fusion, form))
+
+    with jax.default_matmul_precision("highest"):
+        # The equation is linear in the score.
+        _, pull = jax.vjp(balance, jnp.zeros_like(pose[:6]), fusion.form)
+        return jax.vmap(pull)(cotangents)
 
 
 def jacobian(
     inputs: Inputs, executor: HostExecutor, loop: LoopResult, gains: Any, cloud: str, field: str
 ) -> Float[np.ndarray, "6 ..."]:
     """The derivative of the final pose by an array of a cloud, see `RegistrationResult.jacobian`."""
-    if getattr(getattr(inputs, cloud), field) is None:
+    array = getattr(getattr(inputs, cloud), field)
+    if array is None:
         raise ValueError(f"{field}: expected a {cloud} that has some, got None")
-    (by_array,) = PoseDerivative([(cloud, field)], inputs, executor, loop, gains).jacobian((0,))
+    (by_array,) = PoseDerivative(inputs, inputs, executor, loop, [array]).jacobian()
+    if gains is not None and (cloud, field) == ("source", "channels"):
+        by_array = by_array * gains
     pose, rotation = np.asarray(loop.state.pose.wxyz_xyz, np.float64), executor.motion(loop.state.pose).rotation
     twist = np.zeros((6, 7))
     twist[:3, 4:], twist[3:, :4] = rotation.T, rotation.T @ turn_by_quaternion(pose[:4])
     return np.tensordot(translation_adjoint(np.asarray(inputs.source.origin)) @ twist, by_array, 1)
 
 
-class Differentiated(NamedTuple):
-    """A pose, and the arrays that differentiation traces, by which it has a derivative."""
-
-    derivative: PoseDerivative
-    arrays: list[Any]
-
-
 def differentiated(
     given: Given, inputs: Inputs, executor: HostExecutor, loop: LoopResult, gains: Any
-) -> Differentiated | None:
-    """The final pose of a registration and the traced arrays among its arguments on which it depends; None if there
-    are none. Origins are added later, see `pose_in_user_frame`."""
+) -> PoseDerivative | None:
+    """The derivative of the final pose by the traced arrays among the arguments on which it depends; None if there are
+    none. Origins are added later, see `pose_in_user_frame`."""
     if is_concrete(given):
         return None
-    method = with_unset_from(given.method, inputs.method)
+    method, source = with_unset_from(given.method, inputs.method), given.source
     equalized = any(term.estimates_gains for term in inputs.terms)
     terms = method.terms(inputs.source, inputs.target, given.robust, equalized)
     fusion, form = executor.problem.fusion, None
     if fusion is not None:
         form = _form_at(fusion.rotation, fusion.translation, fusion.center, fusion.radius, *given[4:6])
-    traced = Inputs(given.source, given.target, method, terms, form, given.temperature).traced()
-    if not traced:
-        return None
-    return Differentiated(PoseDerivative(list(traced), inputs, executor, loop, gains), list(traced.values()))
+    if gains is not None and not is_concrete(source.channels):
+        (channels,) = blockwise(_multiplied, np.asarray(gains, source.channels.dtype), Input(source.channels))
+        source = source.replace_rows(channels=channels)
+    traced = Inputs(source, given.target, method, terms, form, given.temperature, inputs.source_rows)
+    found = PoseDerivative(traced, inputs, executor, loop)
+    return found if found.arrays else None
+
+
+def _multiplied(gains: Float[Array, "C"], channels: Rows) -> tuple[Float[Array, "n C"]]:
+    return (gains * channels.tree,)
 
 
 _form_at = jax.jit(form_at)
 
 
-def with_derivatives(states: Sequence[State], found: Sequence[Differentiated | None]) -> list[State]:
+def with_derivatives(states: Sequence[State], found: Sequence[PoseDerivative | None]) -> list[State]:
     """The final states; their poses have derivatives, which are computed side by side."""
     some = [(i, each) for i, each in enumerate(found) if each is not None]
     if not some:
         return list(states)
-    together = SideBySide([each.derivative for _, each in some], [len(each.arrays) for _, each in some])
+    together = SideBySide([each for _, each in some], [len(each.arrays) for _, each in some])
     values = [np.asarray(states[i].pose.wxyz_xyz) for i, _ in some]
     poses = with_derivative(values, together, [array for _, each in some for array in each.arrays])
     attached = {i: jaxlie.SE3(pose) for (i, _), pose in zip(some, poses, strict=True)}
     return [state._replace(pose=attached.get(i, state.pose)) for i, state in enumerate(states)]
-
-
-def _numbers(tree: Any) -> list[Any]:
-    """The leaves that can be differentiated by, in the order of `jax.tree.leaves`."""
-    return [leaf for leaf in jax.tree.leaves(tree) if jnp.issubdtype(jnp.result_type(leaf), jnp.inexact)]
-
-
-def _gatherer(cloud: PointCloud, method: AbstractMethod) -> Callable[[Any], Neighborhoods]:
-    """Neighbourhoods of rows, with the covariances that were given, and with channels where the method uses these."""
-    if cloud.deferred_neighbors is not None:
-        return gatherer(cloud, method.uses_channels, np, with_given=True)
-    gather, channels = points_alone(cloud, np), np.asarray(cloud.channels).T
-    if not method.uses_channels:
-        channels = channels[:0]
-    return lambda rows: gather(rows)._replace(own_channels=channels[:, rows])
-
-
-def _add_rows(
-    total: Float[np.ndarray, "N k L"], rows: Int[np.ndarray, "m n"], values: Float[np.ndarray, "m n ..."]
-) -> None:
-    """Add values to rows that may repeat; negative ones are left out. `np.add.at` takes ten times as long."""
-    rows, values = rows.reshape(-1), values.reshape(rows.size, -1)
-    weights = (rows >= 0).astype(values.dtype)
-    size = rows.size
-    some, places = np.unique(np.maximum(rows, 0), return_inverse=True)
-    sums = csc_array((weights, places.reshape(-1), np.arange(size + 1)), shape=(len(some), size)) @ values
-    total[some] += sums.reshape(len(some), *total.shape[1:])

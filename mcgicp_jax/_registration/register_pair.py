@@ -198,7 +198,7 @@ def _run(inputs: Inputs, problem: Problem, search: AbstractSearch, max_iteration
     """Run the loop."""
     if is_concrete(inputs, problem):
         return _run_on_host(inputs, problem, search)
-    problem = problem.completed()
+    problem = problem.whole()
     # Gradients stop here, so that autodiff does not enter the compiled functions.
     fixed = jax.lax.stop_gradient(problem)
     loop = register_traced(fixed, search, max_iterations)
@@ -267,7 +267,6 @@ def pose_problem(
         pair.terms,
         settings,
         num_candidates=pair.method.num_candidates,
-        describe_target=pair.describe_target,
     )
     return problem, Inputs(source, target, pair.method, pair.terms, source_rows=rows)
 

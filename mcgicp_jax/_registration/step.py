@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import replace
 from typing import Any, NamedTuple
 
@@ -14,8 +13,8 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from mcgicp_jax._compute.concrete import AnyArray, AnyScalar, numpy_for
-from mcgicp_jax._local_geometry.surface import Surface
 from mcgicp_jax._math.poses import move_pose
+from mcgicp_jax._methods.surfaces import AnySurface, whole_surface
 from mcgicp_jax._pose_solver.degeneracy import Directions, find_directions
 from mcgicp_jax._pose_solver.fusion import fused_update
 from mcgicp_jax._pose_solver.implicit_derivative import ImplicitRoot, root_near
@@ -90,25 +89,19 @@ class Problem(eqx.Module):
         terms: the residuals of each correspondence, before any number is adapted.
         fusion: tie points and prior, weighted after a registration without them; None if there are none.
         num_candidates: number of target points that a source point is matched with.
-        describe_target: computes rows of the surface of the target (None: all) before they are used, for an executor
-            on the host; None if all are computed, as compiled programs need it.
     """
 
     start: jaxlie.SE3
-    source: Surface
-    target: Surface
+    source: AnySurface
+    target: AnySurface
     terms: tuple[AbstractTerm, ...]
     settings: Settings
     fusion: Fusion | None = None
     num_candidates: int = eqx.field(static=True, default=1)
-    describe_target: Callable[[Int[np.ndarray, "*n"] | None], Any] | None = eqx.field(static=True, default=None)
 
-    def completed(self) -> Problem:
-        """With all rows of the surface of the target."""
-        if self.describe_target is None:
-            return self
-        self.describe_target(None)
-        return replace(self, describe_target=None)
+    def whole(self) -> Problem:
+        """With all rows of both surfaces."""
+        return replace(self, source=whole_surface(self.source), target=whole_surface(self.target))
 
     @property
     def first_status(self) -> Int[AnyScalar, ""]:

@@ -159,8 +159,8 @@ class TracedExecutor(AbstractExecutor):
     def each(self, function: Callable[[Any], Any], items: Any) -> Any:
         return jax.lax.map(function, jnp.asarray(items))
 
-    def source_of(self, matches: Correspondences) -> Surface:
-        return self.problem.source
+    def source_of(self, matches: Correspondences) -> SearchPoints:
+        return searched(self.problem.source)
 
     def _some(self, rows: Int[Array, "n"]) -> Surface:
         return jax.tree.map(lambda array: jnp.asarray(array)[rows], self.problem.source)

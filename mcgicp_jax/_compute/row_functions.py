@@ -1,0 +1,612 @@
+"""Row functions: one way over the rows of clouds of any size, on the host and inside transformations, with derivatives.
+
+A *row function* is pure JAX: `function(numbers, *rows)` maps some numbers, a pytree, and the `Rows` of one or more
+tables to one row each, or to a sum over them. A *table* is a pytree of arrays that share their rows: given, or computed
+by a row function from the rows of other tables when they are first used.
+
+JAX compiles a program for every shape of its arguments. On the host, row functions are therefore called for blocks of a
+fixed number of rows, gathered by NumPy, and so are their vector-Jacobian and Jacobian-vector products: a cloud of
+another size compiles nothing. Sums are added in float64 in the order of the blocks: they are bitwise the same for any
+number of threads. Inside `jit` and `vmap` the function is applied to whole arrays.
+"""
+
+from __future__ import annotations
+
+import abc
+import copy
+import math
+from collections.abc import Callable, Iterator, Sequence
+from functools import cache, cached_property, partial
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float, Int
+from scipy.sparse import csc_array
+
+from mcgicp_jax._compute.blocks import BLOCK, NEIGHBORHOOD_BLOCK, blocks
+from mcgicp_jax._compute.concrete import Deferred, is_concrete, outside_trace
+from mcgicp_jax._compute.linear_maps import AbstractLinearMap, primal, with_derivative
+from mcgicp_jax._compute.packing import Packed
+from mcgicp_jax._compute.quick_compilation import quickly_compiled
+from mcgicp_jax._compute.rows_on_demand import RowsOnDemand
+from mcgicp_jax._compute.threads import num_cores, side_by_side
+
+# Points. Inside transformations, neighbourhoods of more points are processed in blocks, too: on CPUs XLA sums over the
+# first axis of a wider table column by column, which is twenty times slower.
+_LARGEST_WHOLE = 16_000
+# Largest number of points in such a block; below the limit above.
+_LARGEST_BLOCK = 8192
+
+# Arrays by which a derivative is taken, by identity; and (c, ...) or (N, c, ...) tangents or cotangents of these.
+Moving = frozenset[int]
+Slopes = dict[int, Any]
+
+
+class Rows(NamedTuple):
+    """Rows of a table, as a row function sees them.
+
+    Attributes:
+        tree: of arrays (n, ...), or (k, n, ...) where each row has k rows of the table.
+        index: (n,) or (k, n) numbers of these rows; −1 where there is none.
+    """
+
+    tree: Any
+    index: Int[Any, "*k n"]
+
+
+class Table(abc.ABC):
+    """A pytree of arrays that share their rows, packed in one array, or several such trees.
+
+    Attributes:
+        size: number of rows.
+    """
+
+    size: int
+
+    @property
+    @abc.abstractmethod
+    def arrays(self) -> dict[int, Any]:
+        """The arrays that it depends on, by identity: its own, or those that it is computed from."""
+
+    @abc.abstractmethod
+    def known(self, rows: Int[np.ndarray, "n"] | None = None, num_threads: int | None = 1) -> tuple[Packed, ...]:
+        """The packed trees, in which these rows (None: all) are computed, and others may not be."""
+
+    def trees(self, rows: Int[np.ndarray, "n"] | None = None, num_threads: int | None = 1) -> tuple[Any, ...]:
+        """The trees: of all rows, views that must not be changed, or copies of some rows."""
+        known = self.known(rows, num_threads)
+        return tuple((part if rows is None else part.rows(rows)).tree for part in known)
+
+    @abc.abstractmethod
+    def columns(self, moving: Moving) -> tuple[int, ...]:
+        """The numbers of the arrays of the first tree that depend on those that are moving. Further trees are constants
+        to autodiff."""
+
+    @abc.abstractmethod
+    def pull(
+        self, rows: Int[np.ndarray, "n"], cotangents: Float[np.ndarray, "N c W"], moving: Moving, into: Slopes
+    ) -> None:
+        """Add the cotangents of what is moving to `into`, from those of the `columns`, which are 0 in other rows."""
+
+    @abc.abstractmethod
+    def push(self, rows: Int[np.ndarray, "n"], tangents: Slopes, moving: Moving) -> Float[np.ndarray, "N c W"]:
+        """Tangents of the `columns`, in these rows, from those of what is moving."""
+
+
+class Input(NamedTuple):
+    """What a row function gets of a table: for row i of its result, row i of the table, or the rows `index[i]`.
+
+    Attributes:
+        table: a `Table`, or a pytree of arrays, also traced ones.
+        index: None, or (N,) or (N, k) row numbers, −1 where there is none; anything that row numbers select from.
+        part: which of the trees of the table.
+    """
+
+    table: Any
+    index: Any = None
+    part: int = 0
+
+
+class GivenTable(Table):
+    """A table of NumPy arrays, some of which differentiation may trace."""
+
+    def __init__(self, tree: Any):
+        self._leaves = jax.tree.leaves(tree)
+        self._packed = (Packed.of(jax.tree.map(np.asarray, primal(tree))),)
+        self.size = len(self._packed[0].table)
+
+    @property
+    def arrays(self) -> dict[int, Any]:
+        return {id(leaf): leaf for leaf in self._leaves}
+
+    def known(self, rows: Any = None, num_threads: int | None = 1) -> tuple[Packed, ...]:
+        return self._packed
+
+    def columns(self, moving: Moving) -> tuple[int, ...]:
+        return tuple(i for i, leaf in enumerate(self._leaves) if id(leaf) in moving)
+
+    def pull(self, rows: Any, cotangents: Any, moving: Moving, into: Slopes) -> None:
+        start = 0
+        for leaf in (self._leaves[i] for i in self.columns(moving)):
+            stop = start + math.prod(leaf.shape[1:])
+            found = cotangents[..., start:stop].swapaxes(0, 1).astype(np.float64)
+            into[id(leaf)] = into.get(id(leaf), 0) + found.reshape(len(found), *leaf.shape)
+            start = stop
+
+    def push(self, rows: Any, tangents: Slopes, moving: Moving) -> Any:
+        leaves = [tangents[id(self._leaves[i])] for i in self.columns(moving)]
+        return np.concatenate([leaf.reshape(*leaf.shape[:2], -1) for leaf in leaves], axis=-1).swapaxes(0, 1)
+
+
+class ComputedTable(Table):
+    """The result of a row function, whose rows are computed when they are first used. Threads may share it.
+
+    Args:
+        function, numbers, inputs: as of `RowFunction`; the function returns a tuple of trees.
+        size: number of rows.
+        values: a table with the same values, from which rows are taken.
+    """
+
+    def __init__(self, function: Any, numbers: Any, inputs: Sequence[Input], size: int, values: Any = None):
+        self._of = RowFunction(function, numbers, inputs, size)
+        self._rows = RowsOnDemand(self._of.rows, size) if values is None else values._rows
+        self.size = size
+
+    @property
+    def arrays(self) -> dict[int, Any]:
+        return self._of.arrays
+
+    def known(self, rows: Any = None, num_threads: int | None = 1) -> tuple[Packed, ...]:
+        return self._rows.known(rows, num_threads)
+
+    def columns(self, moving: Moving) -> tuple[int, ...]:
+        if moving.isdisjoint(self.arrays):
+            return ()
+        layout = self.known(np.zeros(0, int))[0].layout
+        return tuple(i for i, dtype in enumerate(layout.dtypes) if dtype is None)
+
+    def pull(self, rows: Any, cotangents: Any, moving: Moving, into: Slopes) -> None:
+        self._of.pull(cotangents, moving, into, rows)
+
+    def push(self, rows: Any, tangents: Slopes, moving: Moving) -> Any:
+        found = self._of.push(tangents, moving, rows)
+        whole = np.zeros((self.size, *found.shape[1:]), found.dtype)
+        whole[rows] = found
+        return whole
+
+
+class RowFunction:
+    """A row function with its arguments, on the host.
+
+    Args:
+        function: pure JAX, at module level or cached, since its programs are kept for it. It returns a sum, a
+            pytree, or a tuple of pytrees of arrays with one row each.
+        numbers: a pytree of arrays.
+        inputs: the tables.
+        size: number of rows.
+        total: whether it returns a sum, to which rows with the index −1 must not add.
+    """
+
+    def __init__(self, function: Any, numbers: Any, inputs: Sequence[Input], size: int, total: bool = False):
+        self._function, self._size, self._total = function, size, total
+        self._inputs = [each._replace(table=as_table(each.table)) for each in inputs]
+        self._leaves = jax.tree.leaves(numbers)
+        self._numbers = primal(numbers)
+
+    def at(self, first: Sequence[Any]) -> RowFunction:
+        """The same with other values of the first leaves of the numbers, which are concrete."""
+        moved = copy.copy(self)
+        leaves, structure = jax.tree.flatten(self._numbers)
+        moved._numbers = jax.tree.unflatten(structure, [*first, *leaves[len(first) :]])
+        return moved
+
+    @cached_property
+    def arrays(self) -> dict[int, Any]:
+        """The numbers, and the arrays on which the tables depend, by identity."""
+        found = {id(leaf): leaf for leaf in self._leaves}
+        for each in self._inputs:
+            found |= each.table.arrays
+        return found
+
+    @property
+    def tracers(self) -> list[Any]:
+        """The arrays that differentiation traces."""
+        return [array for array in self.arrays.values() if not is_concrete(array)]
+
+    def rows(self, rows: Int[np.ndarray, "n"] | None = None, num_threads: int | None = 1) -> tuple[Packed, ...]:
+        """The trees of rows; of all rows by default."""
+        gathered = _Gathered(self._inputs, self._size, rows, num_threads)
+        found = self._over_blocks(gathered, num_threads)
+        layouts = [part.layout for part in found[0][1]]
+        tables = [np.empty((gathered.size, *part.table.shape[1:]), part.table.dtype) for part in found[0][1]]
+        for places, parts in found:
+            for table, part in zip(tables, parts, strict=True):
+                table[places] = np.asarray(part.table)[: places.stop - places.start]
+        return tuple(Packed(table, layout) for table, layout in zip(tables, layouts, strict=True))
+
+    def sums(self, num_threads: int | None = 1, packed: bool = True) -> list[Any]:
+        """The sum over each block, packed if that is not declined; programs may not have ended."""
+        gathered = _Gathered(self._inputs, self._size, None, num_threads)
+        return [part for _, part in self._over_blocks(gathered, num_threads, packed)]
+
+    def _over_blocks(
+        self, gathered: _Gathered, num_threads: int | None, packed: bool = True
+    ) -> list[tuple[slice, Any]]:
+        # Without its fusion emitters XLA compiles in half the time; programs over neighbourhoods would run longer.
+        run = _program(self._function, self._total, packed, gathered.block_size == BLOCK)
+        # Worker threads run outside a trace that is active in this thread; this thread leaves it for the same results.
+        with outside_trace():
+            return list(
+                self._in_order(gathered, lambda block, _: run(self._numbers, *block), gathered.size, num_threads)
+            )
+
+    def value_and_jacobian(self, wanted: Sequence[int]) -> tuple[np.ndarray, list[np.ndarray]]:
+        """A sum, packed, and its derivative (L, ...) by the leaves of `numbers` with these numbers; float64."""
+        total: Any = None
+        program = _jacobian_program(self._function, tuple(wanted))
+        gathered = _Gathered(self._inputs, self._size, None)
+        for _, found in self._in_order(gathered, lambda block, _: program(self._numbers, *block), num_cores()):
+            found = jax.tree.map(lambda leaf: np.asarray(leaf, np.float64), found)
+            total = found if total is None else jax.tree.map(np.add, total, found)
+        return total
+
+    def cotangents(self, cotangents: np.ndarray, leaves: Sequence[Any]) -> list[np.ndarray]:
+        """Cotangents (c, ...) of some arrays, from those of the sum or of the rows, as `pull` takes them."""
+        into: Slopes = {}
+        self.pull(cotangents, frozenset(map(id, leaves)), into)
+        count = cotangents.shape[0 if self._total else 1]
+        return [into.get(id(leaf), np.zeros((count, *np.shape(leaf)))) for leaf in leaves]
+
+    def pull(self, cotangents: Any, moving: Moving, into: Slopes, rows: Int[np.ndarray, "n"] | None = None) -> None:
+        """Add the cotangents of what is moving to `into`.
+
+        Args:
+            cotangents: (c, L) of the sum, packed, or (N, c, L) of the rows.
+            rows: those whose cotangents are not 0; None for all.
+        """
+        numbers, columns = chosen = self._chosen(moving)
+        if not (numbers or any(columns)):
+            return
+        gathered = _Gathered(self._inputs, self._size, rows)
+        program, count = _pull_program(self._function, self._total, chosen), cotangents.shape[0 if self._total else 1]
+
+        def call(block: Any, places: slice) -> Any:
+            some = cotangents
+            if not self._total:
+                here = cotangents[places if rows is None else rows[places]]
+                some = np.zeros((gathered.block_size, *here.shape[1:]), here.dtype)
+                some[: len(here)] = here
+            return [jax.tree.map(np.asarray, program(self._numbers, *block, some)), block[1]]
+
+        slopes: list[Any] = [None] * len(columns)
+        for places, ((by_numbers, by_rows), indices) in self._in_order(gathered, call, num_cores()):
+            for i, by in zip(numbers, by_numbers, strict=True):
+                key = id(self._leaves[i])
+                into[key] = into.get(key, 0) + by.astype(np.float64)
+            for j, by in enumerate(by_rows):
+                if by is not None:
+                    if slopes[j] is None:
+                        slopes[j] = np.zeros((self._inputs[j].table.size, count, by.shape[-1]), by.dtype)
+                    live = (..., slice(0, places.stop - places.start))
+                    _add_rows(slopes[j], indices[j][live], np.moveaxis(by, 0, -2)[(*live, slice(None), slice(None))])
+        for j, slope in enumerate(slopes):
+            if slope is not None:
+                self._inputs[j].table.pull(gathered.used(j), slope, moving, into)
+
+    def push(self, tangents: Slopes, moving: Moving, rows: Int[np.ndarray, "n"] | None = None) -> np.ndarray:
+        """Tangents (c, L) of the sum, packed, or (n, c, L) of the rows, from those (c, ...) of what is moving. A scalar
+        0 if it does not depend on that."""
+        numbers, columns = chosen = self._chosen(moving)
+        if not (numbers or any(columns)):
+            return np.zeros(())
+        gathered = _Gathered(self._inputs, self._size, rows)
+        program = _push_program(self._function, self._total, chosen)
+        slopes = [
+            each.table.push(gathered.used(j), tangents, moving) if columns[j] else None
+            for j, each in enumerate(self._inputs)
+        ]
+        by_numbers = [tangents[id(self._leaves[i])].astype(np.result_type(self._leaves[i])) for i in numbers]
+
+        def call(block: Any, _: slice) -> Any:
+            by_rows = [
+                None if slope is None else np.moveaxis(slope[np.maximum(index, 0)], -2, 0).astype(pack.table.dtype)
+                for slope, pack, index in zip(slopes, *block, strict=True)
+            ]
+            return np.asarray(program(self._numbers, *block, by_numbers, by_rows))
+
+        found = list(self._in_order(gathered, call, num_cores()))
+        if self._total:
+            return np.sum([part.astype(np.float64) for _, part in found], axis=0)
+        return np.concatenate([part[:, : places.stop - places.start] for places, part in found], axis=1).swapaxes(0, 1)
+
+    def _chosen(self, moving: Moving) -> tuple[tuple[int, ...], tuple[tuple[int, ...], ...]]:
+        """The numbers of the leaves of `numbers`, and of the columns of each input, that depend on what is moving."""
+        numbers = tuple(i for i, leaf in enumerate(self._leaves) if id(leaf) in moving)
+        return numbers, tuple(() if each.part else each.table.columns(moving) for each in self._inputs)
+
+    def _in_order(
+        self, gathered: _Gathered, call: Callable[[Any, slice], Any], at_once: int, num_threads: int | None = None
+    ) -> Iterator[tuple[slice, Any]]:
+        """Results for blocks, in order; only some are computed at once, which bounds the memory."""
+        cut = blocks(gathered.size, gathered.block_size)
+
+        def work(places: slice, index: Any) -> Any:
+            return call(gathered.block(index, self._total), places)
+
+        for start in range(0, len(cut), at_once):
+            some = cut[start : start + at_once]
+            results = side_by_side([partial(work, *each) for each in some], num_threads)
+            yield from zip((places for places, _ in some), results, strict=True)
+
+
+class _Gathered:
+    """The inputs of a row function for some rows (None: all), from which blocks are gathered."""
+
+    def __init__(self, inputs: Sequence[Input], size: int, rows: Any, num_threads: int | None = 1):
+        self.size = size if rows is None else len(rows)
+        self._rows = rows
+        self.indices, self._packs = [], []
+        for table, index, part in inputs:
+            # Of all rows at once: neighbours are found on the way.
+            chosen = None if index is None else np.asarray(index[slice(None) if rows is None else rows], np.int32)
+            used = rows if chosen is None else np.maximum(chosen, 0).reshape(-1)
+            self._packs.append(table.known(used, num_threads)[part])
+            self.indices.append(chosen)
+        wide = any(index is not None and index.ndim == 2 and index.shape[1] > 1 for index in self.indices)
+        self.block_size = NEIGHBORHOOD_BLOCK if wide else BLOCK
+
+    def block(self, index: Any, total: bool) -> tuple[tuple[Packed, ...], tuple[Any, ...]]:
+        """The rows of a block (see `blocks`) and their numbers; −1 for padding if it must not add to a sum."""
+        own = index if self._rows is None else self._rows[index]
+        packs, numbers = [], []
+        for pack, chosen in zip(self._packs, self.indices, strict=True):
+            if chosen is None:
+                packs.append(pack.rows(own))
+                number = np.arange(own.start, own.stop, dtype=np.int32) if isinstance(own, slice) else own
+                number = np.array(number, np.int32)
+            else:
+                number = np.array(chosen[index].T, order="C")
+                packs.append(pack.rows(np.maximum(number, 0)))
+            if total and not isinstance(index, slice):
+                number[..., self.size - index[0] :] = -1
+            numbers.append(number)
+        return tuple(packs), tuple(numbers)
+
+    def used(self, j: int) -> Int[np.ndarray, "n"]:
+        """The different rows of an input."""
+        index = self.indices[j]
+        if index is None:
+            return np.arange(self.size) if self._rows is None else self._rows
+        return np.unique(index[index >= 0])
+
+
+def as_table(table: Any) -> Table:
+    return table if isinstance(table, Table) else GivenTable(table)
+
+
+def blockwise(function: Callable[..., Any], numbers: Any, *inputs: Input, total: bool = False) -> Any:
+    """Apply a row function, outside or inside of transformations.
+
+    Outside of `jit` and `vmap` it runs in blocks on the host, and a derivative does, too: nothing is compiled for the
+    number of rows.
+
+    Args:
+        function: `function(numbers, *rows)`, with `Rows` of each input: pure JAX, defined at module level. It returns a
+            sum, to which rows with the index −1 must not add, or a tuple of pytrees of arrays with one row each.
+        numbers: a pytree of arrays.
+        inputs: tables, or pytrees of arrays; the first is indexed as the result is, unless it has an `index`.
+        total: whether the function returns a sum.
+
+    Returns:
+        What the function returns, for all rows. Trees of rows after the first are constants to autodiff.
+    """
+    if not is_concrete(primal((numbers, [each for each in inputs if not isinstance(each.table, Table)]))):
+        return overwhole(function, numbers, inputs)
+    first = inputs[0]
+    size = as_table(first.table).size if first.index is None else len(first.index)
+    applied = RowFunction(function, numbers, inputs, size, total)
+    if total:
+        parts = applied.sums(None)
+        added = np.sum([np.asarray(part.table, np.float64) for part in parts], axis=0)
+        found: list[Packed] = [Packed(added.astype(parts[0].table.dtype), parts[0].layout)]
+    else:
+        found = list(applied.rows(None, None))
+    leaves, structure = jax.tree.flatten(found[0].tree)
+    if applied.tracers:
+        leaves = with_derivative(leaves, _Derivative(applied, total, leaves), applied.tracers)
+    trees = (jax.tree.unflatten(structure, leaves), *(each.tree for each in found[1:]))
+    return trees[0] if total else trees
+
+
+class _Derivative(AbstractLinearMap):
+    """The derivative of the arrays that a row function returns."""
+
+    def __init__(self, applied: RowFunction, total: bool, values: Sequence[np.ndarray]):
+        self._applied, self._total = applied, total
+        self._leaves = applied.tracers
+        self._shapes = [value.shape if total else value.shape[1:] for value in values]
+
+    def push(self, tangents: Sequence[np.ndarray], moving: tuple[int, ...]) -> list[np.ndarray]:
+        slopes = {id(self._leaves[i]): tangent for i, tangent in zip(moving, tangents, strict=True)}
+        found = self._applied.push(slopes, frozenset(slopes))
+        found = found if self._total else found.swapaxes(0, 1)
+        ends = np.cumsum([math.prod(shape) for shape in self._shapes])
+        parts = np.split(found, ends[:-1], axis=-1)
+        return [part.reshape(*part.shape[:-1], *shape) for part, shape in zip(parts, self._shapes, strict=True)]
+
+    def pull(self, cotangents: Sequence[np.ndarray], moving: tuple[int, ...]) -> list[np.ndarray]:
+        axes = 1 if self._total else 2
+        packed = np.concatenate([each.reshape(*each.shape[:axes], -1) for each in cotangents], axis=-1)
+        packed = packed if self._total else packed.swapaxes(0, 1)
+        return self._applied.cotangents(packed, [self._leaves[i] for i in moving])
+
+
+def overwhole(function: Callable[..., Any], numbers: Any, inputs: Sequence[Input]) -> Any:
+    """A row function of whole arrays, inside transformations; many neighbourhoods are processed in blocks."""
+    inputs = [_found(each) for each in inputs]
+    own = inputs[0]
+    num_rows = len(jax.tree.leaves(own.table)[0] if own.index is None else own.index)
+    wide = any(each.index is not None and each.index.ndim == 2 for each in inputs)
+    if not wide or num_rows <= _LARGEST_WHOLE:
+        return function(numbers, *(whole(each) for each in inputs))
+    num_blocks = -(-num_rows // _LARGEST_BLOCK)
+    size = -(-num_rows // num_blocks)
+    padded = jnp.minimum(jnp.arange(num_blocks * size), num_rows - 1).reshape(num_blocks, size)
+    found = jax.lax.map(lambda rows: function(numbers, *(whole(each, rows) for each in inputs)), padded)
+    return jax.tree.map(lambda leaf: leaf.reshape(padded.size, *leaf.shape[2:])[:num_rows], found)
+
+
+def over_both(function: Callable[..., Any], numbers: Any, one: Sequence[Input], other: Sequence[Input]) -> Any:
+    """`over_whole` for two clouds, in one compiled body if their inputs are alike and they are not large."""
+    one, other = [_found(each) for each in one], [_found(each) for each in other]
+    trees = [[each.table for each in inputs] for inputs in (one, other)]
+    sizes = [len(jax.tree.leaves(tree)[0]) for tree in trees]
+    structures: list[Any] = [jax.tree.structure(tree) for tree in trees]
+    alike = structures[0] == structures[1]
+    if not alike or sum(sizes) > _LARGEST_WHOLE or one[0].index is not None:
+        return overwhole(function, numbers, one), overwhole(function, numbers, other)
+
+    def stacked(each: Input, next_one: Input) -> Input:
+        table = jax.tree.map(lambda *rows: jnp.concatenate(list(map(jnp.asarray, rows))), each.table, next_one.table)
+        if each.index is None:
+            return Input(table)
+        indices = [jnp.asarray(each.index), jnp.asarray(next_one.index)]
+        most = max(index.shape[1] for index in indices)
+        indices[1] = jnp.where(indices[1] >= 0, indices[1] + sizes[0], -1)
+        padded = [jnp.pad(index, [(0, 0), (0, most - index.shape[1])], constant_values=-1) for index in indices]
+        return Input(table, jnp.concatenate(padded))
+
+    found = overwhole(function, numbers, list(map(stacked, one, other)))
+    return jax.tree.map(lambda rows: rows[: sizes[0]], found), jax.tree.map(lambda rows: rows[sizes[0] :], found)
+
+
+def _found(given: Input) -> Input:
+    return given._replace(index=given.index.whole) if isinstance(given.index, Deferred) else given
+
+
+def whole(given: Input, rows: Any = None) -> Rows:
+    """All rows, or some, of a pytree of arrays, some of which are traced."""
+    tree, index = jax.tree.map(jnp.asarray, given.table), given.index
+    if index is None and rows is None:
+        return Rows(tree, jnp.arange(len(jax.tree.leaves(tree)[0])))
+    index = rows if index is None else jnp.asarray(index)[slice(None) if rows is None else rows].T
+    return Rows(jax.tree.map(lambda array: array[jnp.maximum(index, 0)], tree), index)
+
+
+def _add_rows(
+    total: Float[np.ndarray, "N c W"], rows: Int[np.ndarray, "*k n"], values: Float[np.ndarray, "*k n c W"]
+) -> None:
+    """Add values to rows that may repeat; negative ones are left out. `np.add.at` takes ten times as long."""
+    rows, values = rows.reshape(-1), values.reshape(rows.size, -1)
+    used, places = np.unique(np.maximum(rows, 0), return_inverse=True)
+    weights = (rows >= 0).astype(values.dtype)
+    sums = csc_array((weights, places.reshape(-1), np.arange(rows.size + 1)), shape=(len(used), rows.size)) @ values
+    total[used] += sums.reshape(len(used), *total.shape[1:])
+
+
+def _unpacked(packs: tuple[Packed, ...], indices: tuple[Any, ...]) -> list[Rows]:
+    return [Rows(pack.tree, index) for pack, index in zip(packs, indices, strict=True)]
+
+
+@cache
+def _program(function: Callable[..., Any], total: bool, packed: bool, quickly: bool) -> Callable[..., Any]:
+    """A row function for a block, with packed arguments and results: to pass dozens of arrays takes longer than to use
+    them."""
+
+    def program(numbers: Any, packs: Any, indices: Any) -> Any:
+        found = function(numbers, *_unpacked(packs, indices))
+        if not packed:
+            return found
+        return Packed.of(found, num_axes=0) if total else tuple(Packed.of(part) for part in found)
+
+    program.__name__ = function.__name__
+    return quickly_compiled(program) if quickly else jax.jit(program)
+
+
+Chosen = tuple[tuple[int, ...], tuple[tuple[int, ...], ...]]
+
+
+def _of_chosen(function: Callable[..., Any], total: bool, chosen: Chosen, arguments: Any) -> tuple[Any, Any]:
+    """The packed result as a function of the chosen leaves of the numbers and of each input; and these leaves."""
+    numbers, packs, indices = arguments
+    leaves, structure = jax.tree.flatten(numbers)
+    rows = [jax.tree.flatten(each) for each in _unpacked(packs, indices)]
+    here = (
+        [leaves[i] for i in chosen[0]],
+        [[columns[i] for i in some] for (columns, _), some in zip(rows, chosen[1], strict=True)],
+    )
+
+    def put(leaves: list[Any], some: tuple[int, ...], values: list[Any]) -> list[Any]:
+        by_place = dict(zip(some, values, strict=True))
+        return [by_place.get(i, leaf) for i, leaf in enumerate(leaves)]
+
+    def result(some_numbers: Any, some_rows: Any) -> Any:
+        moved = [
+            jax.tree.unflatten(tree, put(columns, some, values))
+            for (columns, tree), some, values in zip(rows, chosen[1], some_rows, strict=True)
+        ]
+        found = function(jax.tree.unflatten(structure, put(leaves, chosen[0], some_numbers)), *moved)
+        return Packed.of(found if total else found[0], num_axes=0 if total else 1).table
+
+    return result, here
+
+
+def _joined(columns: list[Any], num_axes: int) -> Any:
+    """Arrays that share their first axes side by side; None if there are none."""
+    if not columns:
+        return None
+    return jnp.concatenate([each.reshape(*each.shape[:num_axes], -1) for each in columns], axis=-1)
+
+
+@cache
+def _pull_program(function: Callable[..., Any], total: bool, chosen: Chosen) -> Callable[..., Any]:
+    """The vector-Jacobian product of a block for several cotangents: of the chosen numbers, (c, ...), and of the chosen
+    columns of each input, (c, n, W) or (c, k, n, W)."""
+
+    def program(numbers: Any, packs: Any, indices: Any, cotangents: Any) -> Any:
+        with jax.default_matmul_precision("highest"):
+            result, here = _of_chosen(function, total, chosen, (numbers, packs, indices))
+            _, pull = jax.vjp(result, *here)
+            by_numbers, by_rows = jax.vmap(pull, in_axes=0 if total else 1)(cotangents)
+        axes = [1 + index.ndim for index in indices]
+        return by_numbers, [_joined(each, count) for each, count in zip(by_rows, axes, strict=True)]
+
+    program.__name__ = f"pull_{function.__name__}"
+    return quickly_compiled(program)
+
+
+@cache
+def _push_program(function: Callable[..., Any], total: bool, chosen: Chosen) -> Callable[..., Any]:
+    """The Jacobian-vector products of a block, (c, L) or (c, n, L), for several tangents, shaped as the results of
+    `_pull_program`."""
+
+    def program(numbers: Any, packs: Any, indices: Any, by_numbers: Any, by_rows: Any) -> Any:
+        with jax.default_matmul_precision("highest"):
+            result, here = _of_chosen(function, total, chosen, (numbers, packs, indices))
+            _, push = jax.linearize(result, *here)
+            slopes = []
+            for columns, joined, index in zip(here[1], by_rows, indices, strict=True):
+                ends = np.cumsum([math.prod(each.shape[index.ndim :]) for each in columns])
+                parts = jnp.split(joined, ends[:-1], axis=-1) if columns else []
+                slopes.append([part.reshape(len(part), *each.shape) for part, each in zip(parts, columns, strict=True)])
+            return jax.vmap(push)(by_numbers, slopes)
+
+    program.__name__ = f"push_{function.__name__}"
+    return quickly_compiled(program)
+
+
+@cache
+def _jacobian_program(function: Callable[..., Any], chosen: tuple[int, ...]) -> Callable[..., Any]:
+    """A sum over a block, packed, and its derivative by some leaves of the numbers."""
+
+    def program(numbers: Any, packs: Any, indices: Any) -> Any:
+        with jax.default_matmul_precision("highest"):
+            some = chosen, tuple(() for _ in packs)
+            result, here = _of_chosen(function, True, some, (numbers, packs, indices))
+            value, pull = jax.vjp(result, *here)
+            return value, jax.vmap(pull)(jnp.eye(len(value), dtype=value.dtype))[0]
+
+    program.__name__ = f"jacobian_{function.__name__}"
+    return quickly_compiled(program)
