@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import abc
 import contextlib
 from types import ModuleType
 from typing import TYPE_CHECKING, Any, TypeAlias
@@ -22,14 +21,15 @@ else:
     AnyScalar = ArrayLike
 
 
-class Deferred(abc.ABC):
+class Deferred:
     """A concrete array that is computed when it is needed. As a pytree it is the whole array: what JAX passes through a
     transformation, copies or pickles is computed first."""
 
+    # Not an `abc.ABC`, for whose subclasses `isinstance` takes ten times as long: it is asked of every array.
     @property
-    @abc.abstractmethod
     def whole(self) -> np.ndarray:
         """The array."""
+        raise NotImplementedError
 
     def tree_flatten(self) -> tuple[tuple[np.ndarray], None]:
         return (self.whole,), None
