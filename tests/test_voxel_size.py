@@ -52,7 +52,7 @@ def test_scan_lines_are_averaged_until_their_neighbourhoods_are_no_lines():
     raw = lines()
     assert fraction_of_lines(raw) > 0.9
     cloud = mcg.preprocess(raw)
-    assert 0.1 < cloud.voxel_size < 0.5 and fraction_of_lines(cloud.points) < 0.1
+    assert 0.05 < cloud.voxel_size < 0.5 and fraction_of_lines(cloud.points) < 0.1
     finer = mcg.preprocess(raw, cloud.voxel_size / 2)
     assert fraction_of_lines(finer.points) > 0.05
 

@@ -16,7 +16,7 @@ import numpy as np
 from jaxtyping import Float
 
 from mcgicp_jax._clouds.point_cloud import LARGEST, PointCloud, Voxels
-from mcgicp_jax._clouds.voxels import VOXELS_PER_AXIS, voxel_numbers
+from mcgicp_jax._clouds.voxels import VOXELS_PER_AXIS, turned, voxel_numbers
 from mcgicp_jax._compute.linear_maps import primal
 from mcgicp_jax._compute.messages import warn
 from mcgicp_jax._compute.threads import side_by_side
@@ -139,6 +139,7 @@ def _chosen(clouds: Sequence[PointCloud]) -> Voxels:
     smallest, largest = _range_of(points)
     least = [min(_LEAST_VOXELS, count // 2) for count in counts]
     most = max(counts)
+    points = _each(points, turned)
     step: int | None = None
     reason = ""
     if most > _MOST_VOXELS:
