@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from mcgicp_jax import GICP, PointCloud, preprocess
-from mcgicp_jax._clouds.voxels import turned
+from mcgicp_jax._clouds.voxels import grid_of
 from mcgicp_jax._compute.size_classes import size_class
 from tests import reference as ref
 from tests.precision import tolerance
@@ -23,7 +23,7 @@ UTM = np.array([512_345.6, 5_403_210.9, 312.3])
 
 def in_grid(points):
     """Coordinates along the axes of the voxels."""
-    return turned(points.T).T
+    return grid_of(points).columns.T
 
 
 def ready(values=POINTS, **kwargs):

@@ -7,6 +7,7 @@ fault, if the voxels are large enough; larger ones lose detail. Hence the smalle
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Sequence
 from functools import partial
 from typing import Any, Literal, NamedTuple, TypeAlias
@@ -15,7 +16,7 @@ import numpy as np
 from jaxtyping import Float
 
 from mcgicp_jax._clouds.point_cloud import LARGEST, PointCloud, Voxels
-from mcgicp_jax._clouds.voxels import VOXELS_PER_AXIS, turned, voxel_numbers
+from mcgicp_jax._clouds.voxels import VOXELS_PER_AXIS, Grid, grid_of
 from mcgicp_jax._compute.linear_maps import primal
 from mcgicp_jax._compute.messages import warn
 from mcgicp_jax._compute.threads import side_by_side
@@ -83,13 +84,24 @@ def voxels_for(voxel_size: VoxelSize | Voxels, *clouds: PointCloud) -> Voxels:
 
     Chosen automatically, they are those of clouds among them that are preprocessed already and have some.
     """
+    return voxels_and_grids(voxel_size, *clouds)[0]
+
+
+def voxels_and_grids(voxel_size: VoxelSize | Voxels, *clouds: PointCloud) -> tuple[Voxels, Sequence[Grid | None]]:
+    """`voxels_for`, and the grids of the clouds for which a size was chosen, in which voxels of it are numbered."""
+    none = [None] * len(clouds)
     if isinstance(voxel_size, Voxels):
-        return voxel_size
+        return voxel_size, none
     if voxel_size != "auto":
-        return Voxels(voxel_size)
+        return Voxels(voxel_size), none
     given = [cloud.voxels for cloud in clouds if cloud.voxel_size is not None]
-    raw = [cloud for cloud in clouds if cloud.deferred_neighbors is None]
-    return given[0] if given else _chosen(raw)
+    if given:
+        return given[0], none
+    raw = [cloud.deferred_neighbors is None for cloud in clouds]
+    if not any(raw) or any(cloud.covariances is not None for cloud in itertools.compress(clouds, raw)):
+        return Voxels(), none
+    grids = [grid_of(_finite_points(cloud)) if each else None for cloud, each in zip(clouds, raw, strict=True)]
+    return _chosen([grid for grid in grids if grid is not None]), grids
 
 
 def map_voxel_size(cloud: PointCloud) -> float:
@@ -99,8 +111,8 @@ def map_voxel_size(cloud: PointCloud) -> float:
 
 def raw_spacing(cloud: PointCloud) -> float:
     """Median distance of the nearest neighbour of some of the finite points, metres; 0 if there is only one."""
-    columns = _finite_columns(cloud)
-    return _shape_of(columns).spacing if columns.shape[1] > 1 else 0.0
+    points = _finite_points(cloud)
+    return _shape_of(points.T).spacing if len(points) > 1 else 0.0
 
 
 def warn_of_shape(cloud: PointCloud) -> None:
@@ -119,24 +131,21 @@ def warn_of_shape(cloud: PointCloud) -> None:
         warn(f'voxel_size: without voxels, {" and ".join(seen)}, so they do not describe the surface; use "auto"')
 
 
-def _chosen(clouds: Sequence[PointCloud]) -> Voxels:
+def _chosen(grids: Sequence[Grid]) -> Voxels:
     """One voxel size for some raw clouds, metres, and the reason; None where their points are spread evenly.
 
     It is the smallest at which no cloud has more than 5 % of linear neighbourhoods or more than 40,000 voxels. If the
-    neighbourhoods are thicker than 0.3 of their width, but thinner in larger voxels, it is increased. Clouds with
-    covariances, which cannot be averaged, keep all points, as do those of fewer than 500. A constant to autodiff.
+    neighbourhoods are thicker than 0.3 of their width, but thinner in larger voxels, it is increased. Clouds of
+    fewer than 500 points keep all. A constant to autodiff.
     """
-    if not clouds or any(cloud.covariances is not None for cloud in clouds):
-        return Voxels()
-    points = [_finite_columns(cloud) for cloud in clouds]
-    counts = [columns.shape[1] for columns in points]
+    counts = [grid.columns.shape[1] for grid in grids]
     if max(counts) < _LEAST_VOXELS or min(counts) < NUM_NEIGHBORS:
         return Voxels()
     # Sizes are numbered, ten for each decade of metres; None stands for all points.
-    smallest, largest = _range_of(points)
+    smallest, largest = _range_of([grid.columns for grid in grids])
     # What suffices for the largest cloud mostly suffices for the others.
-    points.sort(key=np.size, reverse=True)
-    candidates = [_Candidate(turned(columns), None, min(_LEAST_VOXELS, columns.shape[1] // 2)) for columns in points]
+    ordered = sorted(zip(counts, grids, strict=True), key=lambda each: each[0], reverse=True)
+    candidates = [_Candidate(grid, None, min(_LEAST_VOXELS, count // 2)) for count, grid in ordered]
     step: int | None = None
     reason = ""
     most = max(counts)
@@ -192,23 +201,24 @@ class _Candidate:
     """A cloud for which a voxel size is chosen, and the shapes of its neighbourhoods in voxels.
 
     Args:
-        columns: coordinates along the axes of its grid, of its points or of means in voxels.
+        grid: of the points, or of means in voxels.
         step: number of the size of these voxels; None for points.
         least: smallest number of voxels that show the scene.
     """
 
-    def __init__(self, columns: Float[np.ndarray, "3 N"], step: int | None, least: int):
-        self._columns, self._step, self._least = columns, step, least
+    def __init__(self, grid: Grid, step: int | None, least: int):
+        self._grid, self._step, self._least = grid, step, least
         self._shapes: dict[int | None, Shape] = {}
 
     def averaged(self, step: int) -> _Candidate:
         """The same cloud with the means of its voxels as its points."""
-        return _Candidate(_means(self._columns, step), step, self._least)
+        return _Candidate(Grid(self._means(step)), step, self._least)
 
     def shape(self, step: int | None) -> Shape:
         if step not in self._shapes:
             # Means of means in the same voxels would be the same.
-            self._shapes[step] = _shape_of(_means(self._columns, None if step == self._step else step))
+            columns = self._grid.columns if step is None or step == self._step else self._means(step)
+            self._shapes[step] = _shape_of(columns)
         return self._shapes[step]
 
     def shows_scene(self, step: int) -> bool:
@@ -229,12 +239,18 @@ class _Candidate:
             guess += round(_STEPS / 2 * np.log10(count / limit))
         return low
 
+    def _means(self, step: int) -> Float[np.ndarray, "3 M"]:
+        numbers, count = self._grid.numbers(_size(step))
+        sums = np.stack([np.bincount(numbers, column, count) for column in self._grid.columns])
+        return sums / np.bincount(numbers)
+
     def _count(self, step: int) -> int:
         """The number of voxels, or up to 0.4 % more."""
+        columns = self._grid.columns
         if step == self._step:
-            return self._columns.shape[1]
-        key = np.zeros(self._columns.shape[1], np.int64)
-        for column in self._columns:
+            return columns.shape[1]
+        key = np.zeros(columns.shape[1], np.int64)
+        for column in columns:
             key = key * VOXELS_PER_AXIS + np.floor(column / _size(step)).astype(np.int64)
         occupied = np.zeros(2**_HASH_BITS, bool)
         mixed = key.view(np.uint64) * _GOLDEN
@@ -313,16 +329,8 @@ def _size(step: int) -> float:
     return float(f"{10 ** (step / _STEPS):.2g}")
 
 
-def _means(columns: Float[np.ndarray, "3 N"], step: int | None) -> Float[np.ndarray, "3 M"]:
-    """The mean of the points of each voxel; all points without a step."""
-    if step is None:
-        return columns
-    numbers, count = voxel_numbers(columns, _size(step))
-    return np.stack([np.bincount(numbers, column, count) for column in columns]) / np.bincount(numbers)
-
-
-def _finite_columns(cloud: PointCloud) -> Float[np.ndarray, "3 N"]:
-    """Coordinates of the finite points, float64."""
-    columns, kept = np.asarray(primal(cloud.points), np.float64).T, np.asarray(cloud.valid)
-    kept = np.logical_and.reduce([kept, *(np.abs(column) <= LARGEST for column in columns)])
-    return np.ascontiguousarray(columns if kept.all() else columns[:, kept])
+def _finite_points(cloud: PointCloud) -> Float[np.ndarray, "N 3"]:
+    """The finite points, float64."""
+    points, kept = np.asarray(primal(cloud.points), np.float64), np.asarray(cloud.valid)
+    kept = np.logical_and.reduce([kept, *(np.abs(column) <= LARGEST for column in points.T)])
+    return points if kept.all() else points[kept]
