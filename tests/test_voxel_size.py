@@ -129,6 +129,16 @@ def test_one_size_for_both_clouds_of_a_pair():
         np.testing.assert_array_equal(result.matrix, both.matrix)
 
 
+@pytest.mark.filterwarnings("ignore:.*left out 1 of")
+def test_points_without_a_finite_channel_are_left_out_of_voxels_of_a_pair():
+    raw = lines()
+    channels = np.zeros((len(raw), 1))
+    whole = mcg.PointCloud(raw[1:], channels[1:])
+    channels[0] = np.nan
+    results = [mcg.register(cloud, whole, mcg.PointToPlane()) for cloud in (mcg.PointCloud(raw, channels), whole)]
+    np.testing.assert_array_equal(*(result.matrix for result in results))
+
+
 def test_one_size_for_a_sequence_and_its_map():
     frames = [lines(spacing, seed=seed) for seed, spacing in enumerate((0.3, 0.5, 0.4))]
     steps = list(mcg.odometry(frames, mcg.PointToPlane()))

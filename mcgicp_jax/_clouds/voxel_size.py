@@ -7,7 +7,6 @@ fault, if the voxels are large enough; larger ones lose detail. Hence the smalle
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Sequence
 from functools import partial
 from typing import Any, Literal, NamedTuple, TypeAlias
@@ -97,11 +96,16 @@ def voxels_and_grids(voxel_size: VoxelSize | Voxels, *clouds: PointCloud) -> tup
     given = [cloud.voxels for cloud in clouds if cloud.voxel_size is not None]
     if given:
         return given[0], none
-    raw = [cloud.deferred_neighbors is None for cloud in clouds]
-    if not any(raw) or any(cloud.covariances is not None for cloud in itertools.compress(clouds, raw)):
+    raw = {row: cloud for row, cloud in enumerate(clouds) if cloud.deferred_neighbors is None}
+    points = {row: _finite_points(cloud) for row, cloud in raw.items()}
+    counts = [len(each) for each in points.values()]
+    # Clouds with covariances cannot be averaged.
+    if any(cloud.covariances is not None for cloud in raw.values()) or (
+        max(counts, default=0) < _LEAST_VOXELS or min(counts) < NUM_NEIGHBORS
+    ):
         return Voxels(), none
-    grids = [grid_of(_finite_points(cloud)) if each else None for cloud, each in zip(clouds, raw, strict=True)]
-    return _chosen([grid for grid in grids if grid is not None]), grids
+    grids = {row: grid_of(each) for row, each in points.items()}
+    return _chosen(list(grids.values())), [grids.get(row) for row in range(len(clouds))]
 
 
 def map_voxel_size(cloud: PointCloud) -> float:
@@ -135,12 +139,10 @@ def _chosen(grids: Sequence[Grid]) -> Voxels:
     """One voxel size for some raw clouds, metres, and the reason; None where their points are spread evenly.
 
     It is the smallest at which no cloud has more than 5 % of linear neighbourhoods or more than 40,000 voxels. If the
-    neighbourhoods are thicker than 0.3 of their width, but thinner in larger voxels, it is increased. Clouds of
-    fewer than 500 points keep all. A constant to autodiff.
+    neighbourhoods are thicker than 0.3 of their width, but thinner in larger voxels, it is increased. A constant to
+    autodiff.
     """
     counts = [grid.columns.shape[1] for grid in grids]
-    if max(counts) < _LEAST_VOXELS or min(counts) < NUM_NEIGHBORS:
-        return Voxels()
     # Sizes are numbered, ten for each decade of metres; None stands for all points.
     smallest, largest = _range_of([grid.columns for grid in grids])
     # What suffices for the largest cloud mostly suffices for the others.
