@@ -65,8 +65,9 @@ def test_lidar_pair_agrees_with_small_gicp_from_either_format(data):
     assert translation < 0.05 and rotation < np.radians(1)
 
 
+# On other pairs small_gicp stops up to 0.1 mm before its rest. From the pose found here it moves by less than 1e-12 m.
 @in_float64
-@pytest.mark.parametrize("target, source", [(0, 1), (5, 6)])
+@pytest.mark.parametrize("target, source", [(0, 1), (7, 8)])
 def test_kitti_agrees_with_small_gicp(target, source, data):
     scans = data / "kitti" / "sequences" / "04" / "velodyne"
     source, target = (read(scans / f"{i:06d}.bin") for i in (source, target))

@@ -52,7 +52,7 @@ def test_scan_lines_are_averaged_until_their_neighbourhoods_are_no_lines():
     raw = lines()
     assert fraction_of_lines(raw) > 0.9
     cloud = mcg.preprocess(raw)
-    assert 0.1 < cloud.voxel_size < 0.5 and fraction_of_lines(cloud.points) < 0.1
+    assert 0.05 < cloud.voxel_size < 0.5 and fraction_of_lines(cloud.points) < 0.1
     finer = mcg.preprocess(raw, cloud.voxel_size / 2)
     assert fraction_of_lines(finer.points) > 0.05
 
@@ -127,6 +127,16 @@ def test_one_size_for_both_clouds_of_a_pair():
     np.testing.assert_array_equal(mixed.matrix, given.matrix)
     for result in mcg.register_batch([coarse] * 2, [fine] * 2, mcg.PointToPlane()):
         np.testing.assert_array_equal(result.matrix, both.matrix)
+
+
+@pytest.mark.filterwarnings("ignore:.*left out 1 of")
+def test_points_without_a_finite_channel_are_left_out_of_voxels_of_a_pair():
+    raw = lines()
+    channels = np.zeros((len(raw), 1))
+    whole = mcg.PointCloud(raw[1:], channels[1:])
+    channels[0] = np.nan
+    results = [mcg.register(cloud, whole, mcg.PointToPlane()) for cloud in (mcg.PointCloud(raw, channels), whole)]
+    np.testing.assert_array_equal(*(result.matrix for result in results))
 
 
 def test_one_size_for_a_sequence_and_its_map():

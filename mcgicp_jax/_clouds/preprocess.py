@@ -11,8 +11,8 @@ from jaxtyping import Bool, Float, Int
 from scipy.sparse import csr_array
 
 from mcgicp_jax._clouds.point_cloud import LARGEST, PointCloud, Values, Voxels, as_cloud, is_far
-from mcgicp_jax._clouds.voxel_size import NUM_NEIGHBORS, VoxelSize, voxels_for, warn_of_shape
-from mcgicp_jax._clouds.voxels import voxel_numbers
+from mcgicp_jax._clouds.voxel_size import NUM_NEIGHBORS, VoxelSize, voxels_and_grids, warn_of_shape
+from mcgicp_jax._clouds.voxels import Grid, grid_of
 from mcgicp_jax._compute.argument_checks import check_integer, check_positive
 from mcgicp_jax._compute.concrete import is_concrete
 from mcgicp_jax._compute.linear_maps import AbstractLinearMap, primal, with_derivative
@@ -48,7 +48,8 @@ def preprocess(
 
     Args:
         cloud: raw cloud, or (N, 3) array in metres. Padding and old neighbours are dropped first.
-        voxel_size: metres. Points and channels are averaged per voxel, each channel over the points that have it.
+        voxel_size: metres. Points and channels are averaged per voxel, each channel over the points that have it. The
+            grid of voxels is turned, differently for each cloud, so that planes along the axes are not biased.
             "auto": the smallest size at which at most 5 % of the neighbourhoods are lines, such as scan lines, and at
             most 40,000 voxels remain; a larger one where noise makes neighbourhoods thicker than 0.3 of their width.
             Points that are spread evenly are kept as they are, as are clouds of fewer than 500 points or with
@@ -71,13 +72,28 @@ def preprocess(
             zero are float32 and too coarse for the points' spacing, or if `voxel_size` is None and more than a tenth of
             the neighbourhoods are lines, or most are as thick as wide.
     """
+    return preprocessed_in(None, cloud, voxel_size, num_neighbors, search)
+
+
+def preprocessed_in(
+    grid: Grid | None,
+    cloud: PointCloud | Values,
+    voxel_size: VoxelSize | Voxels,
+    num_neighbors: int,
+    search: AbstractSearch | None,
+) -> PointCloud:
+    """`preprocess` for a cloud whose grid may be known, from `voxels_and_grids`."""
     check_preprocessing(voxel_size, num_neighbors)
     cloud = as_cloud("cloud", cloud)
     fixed = primal(cloud)
     if is_concrete(fixed) and not is_concrete(cloud):
-        return _differentiable(cloud, preprocess(fixed, voxel_size, num_neighbors, search=search), fixed)
+        found = preprocessed_in(grid, fixed, voxel_size, num_neighbors, search)
+        return _differentiable(cloud, found, fixed)
     cloud = finite_rows(cloud)
-    found = with_neighbors(cloud, voxel_size, num_neighbors, search)
+    if grid is not None and grid.columns.shape[1] != len(cloud):
+        # Rows without a finite channel were left out.
+        grid = None
+    found = with_neighbors(cloud, voxel_size, num_neighbors, search, grid)
     _warn_of_loss(cloud, found, num_neighbors)
     if voxel_size is None and found.covariances is None:
         warn_of_shape(found)
@@ -94,7 +110,7 @@ def _differentiable(cloud: PointCloud, found: PointCloud, fixed: PointCloud) -> 
     finite = _is_finite(raw)
     rows, voxels = np.flatnonzero(np.asarray(fixed.valid))[finite], np.arange(np.sum(finite))
     if found.voxel_size is not None:
-        voxels, _ = voxel_numbers(np.ascontiguousarray(raw.points[finite].T, np.float64), found.voxel_size)
+        voxels, _ = grid_of(np.asarray(raw.points)[finite]).numbers(found.voxel_size)
     arrays: dict[str, Any] = {}
     for name in ("points", "channels", "covariances"):
         array = getattr(cloud, name)
@@ -146,11 +162,12 @@ def with_neighbors(
     voxel_size: VoxelSize | Voxels,
     num_neighbors: int,
     search: AbstractSearch | None = None,
+    grid: Grid | None = None,
 ) -> PointCloud:
-    """`preprocess` for a cloud of `finite_rows`."""
-    voxels = voxels_for(voxel_size, cloud)
+    """`preprocess` for a cloud of `finite_rows`, whose grid may be known."""
+    voxels, (known,) = voxels_and_grids(voxel_size, cloud)
     if voxels.size is not None:
-        cloud = _downsampled(cloud, voxels.size)
+        cloud = _downsampled(cloud, grid or known or grid_of(np.asarray(cloud.points)), voxels.size)
     points, channel_valid, covariances = np.asarray(cloud.points), cloud.channel_valid, cloud.covariances
     dtype = jax.dtypes.canonicalize_dtype(points.dtype)
     origin = _far_origin(points)
@@ -248,13 +265,11 @@ def _is_finite(cloud: PointCloud) -> Bool[np.ndarray, "N"]:
     return np.all([each.all(axis=tuple(range(1, each.ndim))) for each in finite], axis=0)
 
 
-def _downsampled(cloud: PointCloud, voxel_size: float) -> PointCloud:
+def _downsampled(cloud: PointCloud, grid: Grid, voxel_size: float) -> PointCloud:
     """The mean points and channels of each voxel, summed in float64, sorted by voxel."""
     if cloud.covariances is not None:
         raise ValueError("voxel_size: expected None for a cloud with covariances, which cannot be averaged")
-    # Working by columns takes a third of the time of working by rows.
-    columns = np.ascontiguousarray(np.asarray(cloud.points).T, np.float64)
-    voxels, size = voxel_numbers(columns, voxel_size)
+    voxels, size = grid.numbers(voxel_size)
     if size < MIN_POINTS:
         raise ValueError(
             f"voxel_size: expected a size that leaves at least {MIN_POINTS} points, got {voxel_size} m, "
@@ -266,7 +281,7 @@ def _downsampled(cloud: PointCloud, voxel_size: float) -> PointCloud:
         return np.stack(sums, axis=1) if sums else np.zeros((size, 0))
 
     counts = np.bincount(voxels)[:, None]
-    means = (total(columns) / counts).astype(cloud.points.dtype)
+    means = (total(np.asarray(cloud.points).T) / counts).astype(cloud.points.dtype)
     channels, names = np.asarray(cloud.channels), cloud.channel_names
     channel_valid = None
     if cloud.channel_valid is not None:

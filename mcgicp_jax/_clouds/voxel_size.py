@@ -7,16 +7,15 @@ fault, if the voxels are large enough; larger ones lose detail. Hence the smalle
 
 from __future__ import annotations
 
-import bisect
-from collections.abc import Callable, Sequence
-from functools import cache, partial
-from typing import Any, Literal, NamedTuple, TypeAlias, TypeVar
+from collections.abc import Sequence
+from functools import partial
+from typing import Any, Literal, NamedTuple, TypeAlias
 
 import numpy as np
 from jaxtyping import Float
 
 from mcgicp_jax._clouds.point_cloud import LARGEST, PointCloud, Voxels
-from mcgicp_jax._clouds.voxels import VOXELS_PER_AXIS, voxel_numbers
+from mcgicp_jax._clouds.voxels import VOXELS_PER_AXIS, Grid, grid_of
 from mcgicp_jax._compute.linear_maps import primal
 from mcgicp_jax._compute.messages import warn
 from mcgicp_jax._compute.threads import side_by_side
@@ -24,8 +23,6 @@ from mcgicp_jax._search.kd_tree import KDTreeSearch
 
 # Metres; "auto": chosen from the data; None: every point is kept.
 VoxelSize: TypeAlias = float | Literal["auto"] | None
-
-Value = TypeVar("Value")
 
 # Default number of neighbours of a point, including itself, from which its covariance is computed (as in small_gicp).
 NUM_NEIGHBORS = 20
@@ -86,13 +83,29 @@ def voxels_for(voxel_size: VoxelSize | Voxels, *clouds: PointCloud) -> Voxels:
 
     Chosen automatically, they are those of clouds among them that are preprocessed already and have some.
     """
+    return voxels_and_grids(voxel_size, *clouds)[0]
+
+
+def voxels_and_grids(voxel_size: VoxelSize | Voxels, *clouds: PointCloud) -> tuple[Voxels, Sequence[Grid | None]]:
+    """`voxels_for`, and the grids of the clouds for which a size was chosen, in which voxels of it are numbered."""
+    none = [None] * len(clouds)
     if isinstance(voxel_size, Voxels):
-        return voxel_size
+        return voxel_size, none
     if voxel_size != "auto":
-        return Voxels(voxel_size)
+        return Voxels(voxel_size), none
     given = [cloud.voxels for cloud in clouds if cloud.voxel_size is not None]
-    raw = [cloud for cloud in clouds if cloud.deferred_neighbors is None]
-    return given[0] if given else _chosen(raw)
+    if given:
+        return given[0], none
+    raw = {row: cloud for row, cloud in enumerate(clouds) if cloud.deferred_neighbors is None}
+    points = {row: _finite_points(cloud) for row, cloud in raw.items()}
+    counts = [len(each) for each in points.values()]
+    # Clouds with covariances cannot be averaged.
+    if any(cloud.covariances is not None for cloud in raw.values()) or (
+        max(counts, default=0) < _LEAST_VOXELS or min(counts) < NUM_NEIGHBORS
+    ):
+        return Voxels(), none
+    grids = {row: grid_of(each) for row, each in points.items()}
+    return _chosen(list(grids.values())), [grids.get(row) for row in range(len(clouds))]
 
 
 def map_voxel_size(cloud: PointCloud) -> float:
@@ -102,8 +115,8 @@ def map_voxel_size(cloud: PointCloud) -> float:
 
 def raw_spacing(cloud: PointCloud) -> float:
     """Median distance of the nearest neighbour of some of the finite points, metres; 0 if there is only one."""
-    points = _finite_columns(cloud).T
-    return _shape_of(points).spacing if len(points) > 1 else 0.0
+    points = _finite_points(cloud)
+    return _shape_of(points.T).spacing if len(points) > 1 else 0.0
 
 
 def warn_of_shape(cloud: PointCloud) -> None:
@@ -113,7 +126,7 @@ def warn_of_shape(cloud: PointCloud) -> None:
     neighbors: Any = cloud.deferred_neighbors
     # Fewer neighbours are often lines by chance.
     found = neighbors if neighbors.shape[1] >= NUM_NEIGHBORS else None
-    shape, seen = _shape_of(np.asarray(cloud.points, np.float64), found), []
+    shape, seen = _shape_of(np.asarray(cloud.points, np.float64).T, found), []
     if shape.lines > _MANY_LINES:
         seen.append(f"{shape.lines:.0%} of the neighbourhoods are lines")
     if shape.thickness > _AS_THICK_AS_WIDE:
@@ -122,118 +135,181 @@ def warn_of_shape(cloud: PointCloud) -> None:
         warn(f'voxel_size: without voxels, {" and ".join(seen)}, so they do not describe the surface; use "auto"')
 
 
-def _chosen(clouds: Sequence[PointCloud]) -> Voxels:
+def _chosen(grids: Sequence[Grid]) -> Voxels:
     """One voxel size for some raw clouds, metres, and the reason; None where their points are spread evenly.
 
     It is the smallest at which no cloud has more than 5 % of linear neighbourhoods or more than 40,000 voxels. If the
-    neighbourhoods are thicker than 0.3 of their width, but thinner in larger voxels, it is increased. Clouds with
-    covariances, which cannot be averaged, keep all points, as do those of fewer than 500. A constant to autodiff.
+    neighbourhoods are thicker than 0.3 of their width, but thinner in larger voxels, it is increased. A constant to
+    autodiff.
     """
-    if not clouds or any(cloud.covariances is not None for cloud in clouds):
-        return Voxels()
-    points = [_finite_columns(cloud) for cloud in clouds]
-    counts = [columns.shape[1] for columns in points]
-    if max(counts) < _LEAST_VOXELS or min(counts) < NUM_NEIGHBORS:
-        return Voxels()
+    counts = [grid.columns.shape[1] for grid in grids]
     # Sizes are numbered, ten for each decade of metres; None stands for all points.
-    smallest, largest = _range_of(points)
-    least = [min(_LEAST_VOXELS, count // 2) for count in counts]
-    most = max(counts)
+    smallest, largest = _range_of([grid.columns for grid in grids])
+    # What suffices for the largest cloud mostly suffices for the others.
+    ordered = sorted(zip(counts, grids, strict=True), key=lambda each: each[0], reverse=True)
+    candidates = [_Candidate(grid, None, min(_LEAST_VOXELS, count // 2)) for count, grid in ordered]
     step: int | None = None
     reason = ""
+    most = max(counts)
     if most > _MOST_VOXELS:
-        step = _first(range(smallest, largest), lambda step: max(_counts(points, step)) <= _MOST_VOXELS)
+        # The size in which a square of the extent of the clouds has as many voxels, where the search begins.
+        first, step = smallest, largest - round(_STEPS / 2 * np.log10(_MOST_VOXELS))
+        for candidate in candidates:
+            first = step = candidate.first_with(_MOST_VOXELS, range(first, largest), step)
         reason = f"at most {_MOST_VOXELS:,} of {most:,} points"
         # Larger voxels are examined on these averages, which takes a third of the time.
-        points = _each(points, partial(_means, step=step))
-    candidates = _Candidates(points, step, least)
-    if step is not None and not candidates.shows_scene(step):
-        return Voxels()
+        candidates = side_by_side([partial(candidate.averaged, step) for candidate in candidates])
+        if not all(candidate.shows_scene(step) for candidate in candidates):
+            return Voxels()
+    shapes = side_by_side([partial(candidate.shape, step) for candidate in candidates])
     # Voxels below the spacing would average nothing.
-    start = max(smallest, _step_of(candidates.spacing or 1.0)) if step is None else step
-    lines = candidates.lines(step)
+    spacing = max(shape.spacing for shape in shapes)
+    start = max(smallest, _step_of(spacing or 1.0)) if step is None else step
+    lines = max(shape.lines for shape in shapes)
     if lines > _MOST_LINES:
-        larger = _first(
-            range(start, largest),
-            lambda step: not candidates.shows_scene(step) or candidates.lines(step) <= _MOST_LINES,
-        )
-        larger -= not candidates.shows_scene(larger)
-        if larger >= start and candidates.lines(larger) <= max(_MOST_LINES, _FEWER * lines):
+        larger = _without_lines(candidates, step, range(start, largest))
+        if larger is not None and _lines(candidates, larger) <= max(_MOST_LINES, _FEWER * lines):
             step, reason = larger, f"{lines:.0%} of the neighbourhoods were lines"
-    thickness = candidates.thickness(step)
+    thickness = _thickness(candidates, step)
     if thickness > _THICK:
-        thinner = candidates.thinner(step, start if step is None else step)
+        thinner = _thinner(candidates, step, start if step is None else step)
         if thinner is not None:
             step, reason = thinner, f"the neighbourhoods were {thickness:.2f} times as thick as wide"
     return Voxels(None if step is None else _size(step), reason)
 
 
-def _shape_of(points: Float[np.ndarray, "N 3"], neighbors: Any = None) -> Shape:
+def _shape_of(columns: Float[np.ndarray, "3 N"], neighbors: Any = None) -> Shape:
     """The shape of a sample of the neighbourhoods.
 
     Args:
         neighbors: (N, k) rows or `NeighborsOnDemand`; found if None.
     """
-    rows = np.random.default_rng(0).integers(0, len(points), _SAMPLE)
+    size = columns.shape[1]
+    rows = np.random.default_rng(0).integers(0, size, _SAMPLE)
     if neighbors is None:
-        search, count = KDTreeSearch(workers=1), min(NUM_NEIGHBORS, len(points))
-        _, nearest = search.query(search.build(points), points[rows], count, np.inf)
+        points, search = np.ascontiguousarray(columns.T), KDTreeSearch(workers=1)
+        _, nearest = search.query(search.build(points), points[rows], min(NUM_NEIGHBORS, size), np.inf)
     else:
         nearest = neighbors[rows]
-    near = points[nearest]
-    distances = np.linalg.norm(near[:, 1] - near[:, 0], axis=1)
-    offsets = near - near.mean(axis=1, keepdims=True)
-    squares = np.linalg.eigvalsh(offsets.transpose(0, 2, 1) @ offsets)
+    near = columns[:, nearest]
+    distances = np.linalg.norm(near[:, :, 1] - near[:, :, 0], axis=0)
+    offsets = near - near.mean(axis=2, keepdims=True)
+    squares = np.linalg.eigvalsh(np.einsum("ink,jnk->nij", offsets, offsets))
     thin, second, first = np.sqrt(np.maximum(squares.T, np.finfo(float).tiny))
     return Shape(float(np.mean(second < _LINE * first)), float(np.median(thin / second)), float(np.median(distances)))
 
 
-class _Candidates:
-    """The neighbourhoods of some clouds in voxels of different sizes.
+class _Candidate:
+    """A cloud for which a voxel size is chosen, and the shapes of its neighbourhoods in voxels.
 
     Args:
-        points: (3, N) coordinates of each cloud.
-        step: number of the voxel size that they have already; None if they are raw.
-        least: smallest number of voxels of each cloud.
+        grid: of the points, or of means in voxels.
+        step: number of the size of these voxels; None for points.
+        least: smallest number of voxels that show the scene.
     """
 
-    def __init__(self, points: Sequence[Float[np.ndarray, "3 _"]], step: int | None, least: Sequence[int]):
-        self._points, self._step, self._least = points, step, least
-        self.shapes, self.shows_scene = cache(self._shapes), cache(self._shows_scene)
+    def __init__(self, grid: Grid, step: int | None, least: int):
+        self._grid, self._step, self._least = grid, step, least
+        self._shapes: dict[int | None, Shape] = {}
 
-    def _shapes(self, step: int | None) -> list[Shape]:
-        # Means of means in the same voxels would be the same.
-        same = None if step == self._step else step
-        return _each(self._points, lambda columns: _shape_of(_means(columns, same).T))
+    def averaged(self, step: int) -> _Candidate:
+        """The same cloud with the means of its voxels as its points."""
+        return _Candidate(Grid(self._means(step)), step, self._least)
 
-    def _shows_scene(self, step: int) -> bool:
-        return all(count >= least for count, least in zip(_counts(self._points, step), self._least, strict=True))
+    def shape(self, step: int | None) -> Shape:
+        if step not in self._shapes:
+            # Means of means in the same voxels would be the same.
+            columns = self._grid.columns if step is None or step == self._step else self._means(step)
+            self._shapes[step] = _shape_of(columns)
+        return self._shapes[step]
 
-    def lines(self, step: int | None) -> float:
-        return max(shape.lines for shape in self.shapes(step))
+    def shows_scene(self, step: int) -> bool:
+        return self._count(step) >= self._least
 
-    def thickness(self, step: int | None) -> float:
-        return max(shape.thickness for shape in self.shapes(step))
+    def last_that_shows_scene(self, steps: range) -> int:
+        """The last step at which enough voxels are left; the one before the first if there is none."""
+        return self.first_with(self._least - 1, steps, steps.stop - 1) - 1
 
-    @property
-    def spacing(self) -> float:
-        return max(shape.spacing for shape in self.shapes(self._step))
+    def first_with(self, limit: int, steps: range, guess: int) -> int:
+        """The first step with at most so many voxels, the end of the range if there is none."""
+        low, high = steps.start, steps.stop
+        while low < high:
+            guess = min(max(guess, low), high - 1)
+            count = self._count(guess)
+            low, high = (low, guess) if count <= limit else (guess + 1, high)
+            # On a surface, the number of voxels goes with the inverse square of their size.
+            guess += round(_STEPS / 2 * np.log10(count / limit))
+        return low
 
-    def thinner(self, step: int | None, start: int) -> int | None:
-        """The smallest size in whose voxels the neighbourhoods are clearly thinner; None if there is none.
+    def _means(self, step: int) -> Float[np.ndarray, "3 M"]:
+        numbers, count = self._grid.numbers(_size(step))
+        sums = np.stack([np.bincount(numbers, column, count) for column in self._grid.columns])
+        return sums / np.bincount(numbers)
 
-        Args:
-            start: number of the size that is doubled, the current one or the spacing.
-        """
-        before = self.thickness(step)
-        for larger in range(start + _DOUBLE, start + _DOUBLE * _DOUBLINGS + 1, _DOUBLE):
-            if not self.shows_scene(larger) or self.thickness(larger) > _THICKER * before:
-                return None
-            if self.thickness(larger) <= min(_THICK, _THINNER * before):
-                between = range(larger - _DOUBLE + 1, larger)
-                return next((finer for finer in between if self.thickness(finer) <= _THICK), larger)
-            before = self.thickness(larger)
-        return None
+    def _count(self, step: int) -> int:
+        """The number of voxels, or up to 0.4 % more."""
+        columns = self._grid.columns
+        if step == self._step:
+            return columns.shape[1]
+        key = np.zeros(columns.shape[1], np.int64)
+        for column in columns:
+            key = key * VOXELS_PER_AXIS + np.floor(column / _size(step)).astype(np.int64)
+        occupied = np.zeros(2**_HASH_BITS, bool)
+        mixed = key.view(np.uint64) * _GOLDEN
+        occupied[(mixed ^ mixed >> _HALF) * _GOLDEN >> np.uint64(64 - _HASH_BITS)] = True
+        # The expected number that collides, and three standard deviations of that.
+        number = -occupied.size * np.log1p(-occupied.mean())
+        return int(number * (1 + 3 / np.sqrt(2 * occupied.size)))
+
+
+def _lines(candidates: Sequence[_Candidate], step: int | None) -> float:
+    return max(candidate.shape(step).lines for candidate in candidates)
+
+
+def _thickness(candidates: Sequence[_Candidate], step: int | None) -> float:
+    return max(candidate.shape(step).thickness for candidate in candidates)
+
+
+def _without_lines(candidates: Sequence[_Candidate], step: int | None, steps: range) -> int | None:
+    """The smallest size at which few neighbourhoods are lines, or else the largest at which all clouds show the scene;
+    None if there is none.
+
+    Args:
+        step: number of the current size.
+    """
+    end = steps.stop
+    for candidate in candidates:
+        end = candidate.last_that_shows_scene(range(steps.start, end)) + 1
+    larger, guess = steps.start, (steps.start + end) // 2
+    # What suffices for the cloud of most lines mostly suffices for the others.
+    for candidate in sorted(candidates, key=lambda candidate: candidate.shape(step).lines, reverse=True):
+        high = end
+        while larger < high:
+            few = candidate.shape(guess).lines <= _MOST_LINES
+            larger, high = (larger, guess) if few else (guess + 1, high)
+            guess = (larger + high) // 2
+    return min(larger, end - 1) if steps.start < end else None
+
+
+def _thinner(candidates: Sequence[_Candidate], step: int | None, start: int) -> int | None:
+    """The smallest size in whose voxels the neighbourhoods are clearly thinner; None if there is none.
+
+    Args:
+        start: number of the size that is doubled, the current one or the spacing.
+    """
+    before = _thickness(candidates, step)
+    for larger in range(start + _DOUBLE, start + _DOUBLE * _DOUBLINGS + 1, _DOUBLE):
+        if not all(candidate.shows_scene(larger) for candidate in candidates):
+            return None
+        # One cloud that is thicker settles it.
+        if any(candidate.shape(larger).thickness > _THICKER * before for candidate in candidates):
+            return None
+        now = _thickness(candidates, larger)
+        if now <= min(_THICK, _THINNER * before):
+            between = range(larger - _DOUBLE + 1, larger)
+            return next((finer for finer in between if _thickness(candidates, finer) <= _THICK), larger)
+        before = now
+    return None
 
 
 def _range_of(points: Sequence[Float[np.ndarray, "3 _"]]) -> tuple[int, int]:
@@ -255,43 +331,8 @@ def _size(step: int) -> float:
     return float(f"{10 ** (step / _STEPS):.2g}")
 
 
-def _first(steps: range, holds: Callable[[int], bool]) -> int:
-    """The first step from which on a condition holds; the end of the range if it never does."""
-    return steps.start + bisect.bisect_left(steps, True, key=holds)
-
-
-def _each(points: Sequence[Float[np.ndarray, "3 _"]], function: Callable[[np.ndarray], Value]) -> list[Value]:
-    """The values of a function for each cloud, computed side by side."""
-    return side_by_side([partial(function, columns) for columns in points])
-
-
-def _counts(points: Sequence[Float[np.ndarray, "3 _"]], step: int) -> list[int]:
-    """The number of voxels of each cloud, or up to 0.4 % more."""
-
-    def count(columns: Float[np.ndarray, "3 N"]) -> int:
-        key = np.zeros(columns.shape[1], np.int64)
-        for column in columns:
-            key = key * VOXELS_PER_AXIS + np.floor(column / _size(step)).astype(np.int64)
-        occupied = np.zeros(2**_HASH_BITS, bool)
-        mixed = key.view(np.uint64) * _GOLDEN
-        occupied[(mixed ^ mixed >> _HALF) * _GOLDEN >> np.uint64(64 - _HASH_BITS)] = True
-        # The expected number that collides, and three standard deviations of that.
-        number = -occupied.size * np.log1p(-occupied.mean())
-        return int(number * (1 + 3 / np.sqrt(2 * occupied.size)))
-
-    return _each(points, count)
-
-
-def _means(columns: Float[np.ndarray, "3 N"], step: int | None) -> Float[np.ndarray, "3 M"]:
-    """The mean of the points of each voxel; all points without a step."""
-    if step is None:
-        return columns
-    numbers, count = voxel_numbers(columns, _size(step))
-    return np.stack([np.bincount(numbers, column, count) for column in columns]) / np.bincount(numbers)
-
-
-def _finite_columns(cloud: PointCloud) -> Float[np.ndarray, "3 N"]:
-    """Coordinates of the finite points, float64."""
-    columns, kept = np.asarray(primal(cloud.points), np.float64).T, np.asarray(cloud.valid)
-    kept = np.logical_and.reduce([kept, *(np.abs(column) <= LARGEST for column in columns)])
-    return np.ascontiguousarray(columns if kept.all() else columns[:, kept])
+def _finite_points(cloud: PointCloud) -> Float[np.ndarray, "N 3"]:
+    """The finite points, float64."""
+    points, kept = np.asarray(primal(cloud.points), np.float64), np.asarray(cloud.valid)
+    kept = np.logical_and.reduce([kept, *(np.abs(column) <= LARGEST for column in points.T)])
+    return points if kept.all() else points[kept]

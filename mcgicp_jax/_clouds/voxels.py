@@ -1,12 +1,23 @@
-"""Voxels: cubes of space with a corner at the origin, numbered by one integer key each."""
+"""Voxels: cubes of space with a corner at the origin, numbered by one integer key each.
+
+The grid in which a cloud is averaged is turned, differently for each cloud. A plane along a grid cuts all its voxels in
+the same place: where these hold few points, their means are biased to one side, by up to half the noise. And in grids
+of one direction, two scans of a surface have the same pattern of such errors, which favours the pose at which the grids
+coincide: the error of the pose was then up to twice as large as with different grids, and unknown to its covariance.
+"""
 
 from __future__ import annotations
 
 import numpy as np
 from jaxtyping import Float, Int
+from scipy.spatial.transform import Rotation
 
 # Number of voxels along an axis: three 21-bit indices fit into one 63-bit key.
 VOXELS_PER_AXIS = 2**21
+# Angles in radians by which grids are turned: about the diagonal, so that the axes of a grid are 48 degrees from those
+# of the cloud, along which scenes often lie; and at most about each axis, to make grids differ. The axes then come no
+# nearer than 18 degrees. Variations of 0.1 to 0.3, and grids of any direction, give the same errors.
+_TURN, _VARIATION = np.pi / 3, 0.3
 
 
 def voxel_of(points: Float[np.ndarray, "*N 3"], voxel_size: float) -> Float[np.ndarray, "*N 3"]:
@@ -64,12 +75,40 @@ def voxel_order(
     return order, starts_of(key[order])
 
 
-def voxel_numbers(columns: Float[np.ndarray, "3 N"], voxel_size: float) -> tuple[Int[np.ndarray, "N"], int]:
-    """The number of the voxel of each point, in the order of `voxel_order`, and how many are occupied."""
-    order, starts = voxel_order(columns, voxel_size)
-    numbers = np.empty_like(order)
-    numbers[order] = np.repeat(np.arange(len(starts)), np.diff(np.append(starts, len(order))))
-    return numbers, len(starts)
+class Grid:
+    """The points of a cloud in the grid in which it is averaged.
+
+    Attributes:
+        columns: coordinates along the axes of the grid, metres.
+    """
+
+    def __init__(self, columns: Float[np.ndarray, "3 N"]):
+        self.columns = columns
+        self._numbers: dict[float, tuple[Int[np.ndarray, "N"], int]] = {}
+
+    def numbers(self, voxel_size: float) -> tuple[Int[np.ndarray, "N"], int]:
+        """The number of the voxel of each point, in the order of `voxel_order`, and how many are occupied; computed
+        once for each size."""
+        if voxel_size not in self._numbers:
+            order, starts = voxel_order(self.columns, voxel_size)
+            numbers = np.empty_like(order)
+            numbers[order] = np.repeat(np.arange(len(starts)), np.diff(np.append(starts, len(order))))
+            self._numbers[voxel_size] = numbers, len(starts)
+        return self._numbers[voxel_size]
+
+
+def grid_of(points: Float[np.ndarray, "N 3"]) -> Grid:
+    """The grid of finite points.
+
+    Its angles depend on how many points lie on either side of the middle: at random from cloud to cloud, but the same
+    for any order of the points, and constant to derivatives.
+    """
+    # Working by columns takes a third of the time of working by rows.
+    columns = np.ascontiguousarray(points.T, np.float64)
+    middle = 0.5 * (columns.min(axis=1) + columns.max(axis=1))
+    sides = [int(np.sum(column > value)) for column, value in zip(columns, middle, strict=True)]
+    variation = np.random.default_rng([len(points), *sides]).uniform(-_VARIATION, _VARIATION, 3)
+    return Grid(Rotation.from_rotvec(_TURN / np.sqrt(3) + variation).as_matrix() @ columns)
 
 
 def starts_of(sorted_keys: Int[np.ndarray, "N"]) -> Int[np.ndarray, "M"]:

@@ -12,7 +12,7 @@ from jaxtyping import Float, Int
 
 from mcgicp_jax._clouds.point_cloud import PointCloud, Values, as_cloud
 from mcgicp_jax._clouds.preprocess import finite_rows, with_neighbors
-from mcgicp_jax._clouds.voxels import voxel_order
+from mcgicp_jax._clouds.voxels import grid_of, voxel_order
 from mcgicp_jax._compute.argument_checks import check_positive
 from mcgicp_jax._compute.concrete import outside_trace
 from mcgicp_jax._compute.messages import messages_named
@@ -202,14 +202,14 @@ def _centred(name: str, cloud: PointCloud) -> tuple[PointCloud, Float[np.ndarray
 
 def _voxel_size(clouds: tuple[PointCloud, ...]) -> float:
     """The smallest size with few enough voxels, metres; 0 if the clouds have no finite extent."""
-    columns = [np.ascontiguousarray(np.asarray(cloud.points, np.float64).T) for cloud in clouds]
-    extent = max(float(np.ptp(each, axis=1).max()) for each in columns)
+    grids = [grid_of(np.asarray(cloud.points)).columns for cloud in clouds]
+    extent = max(float(np.ptp(each, axis=1).max()) for each in grids)
     if not 0 < extent < np.inf:
         return 0.0
     limits = [max(min(_MAX_VOXELS, _MAX_FRACTION * len(cloud)), 8) for cloud in clouds]
 
     def few(step: int, stride: int) -> bool:
-        counts = [len(voxel_order(each[:, ::stride], 2.0 ** (step / _STEPS_PER_OCTAVE))[1]) for each in columns]
+        counts = [len(voxel_order(each[:, ::stride], 2.0 ** (step / _STEPS_PER_OCTAVE))[1]) for each in grids]
         return min(counts) <= _VOXELS and all(count <= limit for count, limit in zip(counts, limits, strict=True))
 
     high = int(np.ceil(_STEPS_PER_OCTAVE * np.log2(extent))) + 1

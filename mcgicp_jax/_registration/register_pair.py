@@ -12,8 +12,8 @@ from jaxtyping import Float, Int
 
 from mcgicp_jax._clouds.origins import centred_pose, pose_in_user_frame
 from mcgicp_jax._clouds.point_cloud import PointCloud, Values, Voxels, as_cloud
-from mcgicp_jax._clouds.preprocess import preprocess
-from mcgicp_jax._clouds.voxel_size import NUM_NEIGHBORS, VoxelSize, voxels_for
+from mcgicp_jax._clouds.preprocess import preprocessed_in
+from mcgicp_jax._clouds.voxel_size import NUM_NEIGHBORS, VoxelSize, voxels_and_grids
 from mcgicp_jax._compute.concrete import AnyArray, constant, is_concrete, numpy_for, outside_trace
 from mcgicp_jax._compute.lazy import Lazy
 from mcgicp_jax._compute.linear_maps import primal
@@ -300,9 +300,9 @@ def preprocessed(
 ) -> list[PointCloud]:
     """The clouds "source" and "target", preprocessed with one voxel size unless the method makes cells of raw ones."""
     points = {name: cloud for name, cloud in sides.items() if not options.takes_raw(method, name)}
-    voxels = voxels_for(voxel_size, *points.values())
-    for name, cloud in points.items():
+    voxels, grids = voxels_and_grids(voxel_size, *points.values())
+    for (name, cloud), grid in zip(points.items(), grids, strict=True):
         if cloud.deferred_neighbors is None:
             with messages_named(name):
-                sides[name] = preprocess(cloud, voxels, num_neighbors, search=options.search)
+                sides[name] = preprocessed_in(grid, cloud, voxels, num_neighbors, options.search)
     return list(sides.values())
