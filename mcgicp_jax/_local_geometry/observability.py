@@ -121,12 +121,24 @@ def channel_observability(
     return alg.embed(total / (1 + length), *basis), within, noise
 
 
-def agreement(source: Float[Array, "C 3 n"], target: Float[Array, "C 3 n"]) -> Float[Array, "6 n"]:
-    """Observability by the channels of matched points: A / (1 + tr A), where A is the mean of g hᵀ and h gᵀ.
+def agreement(
+    source: Float[Array, "C 3 n"], target: Float[Array, "C 3 n"], tangent: Float[Array, "3 n"]
+) -> tuple[Float[Array, "6 n"], Float[Array, "6 n"]]:
+    """Observability by the channels of matched points, A / (1 + tr A), where A is the mean of g hᵀ and h gᵀ; and the
+    surplus of gradients across the lines of sight.
 
     g and h are the gradients of the descriptors in the two clouds, in one frame. At a wrong pose they are unrelated,
-    however distinct the channels of each cloud are, so that A vanishes on average.
+    however distinct the channels of each cloud are, so that A vanishes on average, unless the sensor carries a pattern
+    along: then the gradients agree where it has not moved. Such a pattern (of beams, ranges, angles of incidence) has
+    its gradients along the lines of sight, a texture has them in all directions. With the unit tangent t across the
+    line of sight, the surplus is ((t·g) (t·h) − g·h / 4) t tᵀ / (1 + tr A): positive, g·h / 4, on average over all
+    directions of the gradients, and negative for the pattern.
+
+    Args:
+        tangent: t, or 0 where it is unknown.
     """
     product = sum(0.5 * (alg.outer(g + h) - alg.outer(g) - alg.outer(h)) for g, h in zip(source, target, strict=True))
-    length = 0.5 * (jnp.sum(source * source, axis=(0, 1)) + jnp.sum(target * target, axis=(0, 1)))
-    return product / (1 + length)
+    scale = 1 / (1 + 0.5 * (jnp.sum(source * source, axis=(0, 1)) + jnp.sum(target * target, axis=(0, 1))))
+    across = alg.inner(tangent, alg.multiply(jnp.asarray(product), tangent))
+    quarter = 0.25 * jnp.sum(source * target, axis=(0, 1))
+    return scale * product, scale * (across - quarter) * alg.outer(tangent)
