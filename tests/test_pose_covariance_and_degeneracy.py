@@ -17,6 +17,7 @@ from mcgicp_jax._math import symmetric_matrices as cov
 from mcgicp_jax._pose_solver.covariance import Moments, response_and_scatter
 from mcgicp_jax._pose_solver.degeneracy import GEOMETRY_HOLDS, find_directions
 from mcgicp_jax._pose_solver.sums import Sums
+from tests.benchmarks.noise_scenes import street
 from tests.precision import in_float64
 from tests.scenes import SURFACES, motion, pair, prepare, room_corner, wall
 
@@ -75,12 +76,21 @@ def test_noise_as_large_as_the_spacing_constrains_nothing(name, free, noise):
     assert np.all(np.diag(geometry)[list(free)] < GEOMETRY_HOLDS) and np.all(np.diag(geometry)[held] > 0.02)
 
 
+@pytest.mark.parametrize("seed", range(4))
+def test_a_noisy_street_is_observed_along_the_road(seed):
+    """By the 4 % of its points that lie on surfaces across it, such as the ends of parked cars."""
+    cloud = mcg.preprocess(street(np.random.default_rng(seed), 3000, 0.5), None)
+    geometry, _ = mean_evidence(cloud, mcg.GICP())
+    assert geometry[0, 0] > GEOMETRY_HOLDS
+
+
 def test_a_line_is_observed_across_alone_and_a_single_spot_not_at_all():
     rng = np.random.default_rng(0)
     along = np.array([1, 2, 3]) / np.sqrt(14)
     line = np.outer(rng.uniform(high=4, size=2000), along) + 1e-3 * rng.normal(size=(2000, 3))
     geometry, _ = mean_evidence(mcg.preprocess(line), mcg.GICP())
-    assert abs(along @ geometry @ along) < 1e-3 and np.linalg.eigvalsh(geometry)[1] > 0.1
+    # The normals of both halves of the neighbours turn about the line independently, so that a quarter remains.
+    assert abs(along @ geometry @ along) < 1e-3 and np.linalg.eigvalsh(geometry)[1] > 0.05
     geometry, _ = mean_evidence(mcg.preprocess(np.tile([[1.0, 2.0, 3.0]], (2000, 1))), mcg.GICP())
     np.testing.assert_allclose(geometry, 0, atol=1e-6)
 
@@ -108,8 +118,38 @@ def test_slopes_that_agree_are_observed_and_unrelated_ones_are_not():
     ours, theirs = rng.normal(size=(2, 2, 3, 4000)).astype(np.float32)
     length = np.sum(ours**2, axis=(0, 1))
     expected = np.einsum("cin,cjn->nij", ours, ours) / (1 + length)[:, None, None]
-    np.testing.assert_allclose(matrices(agreement(jnp.asarray(ours), jnp.asarray(ours))), expected, atol=1e-5)
-    np.testing.assert_allclose(matrices(agreement(jnp.asarray(ours), jnp.asarray(theirs))).mean(axis=0), 0, atol=0.02)
+    observed, _ = agreement(jnp.asarray(ours), jnp.asarray(ours), jnp.zeros((3, 4000)))
+    np.testing.assert_allclose(matrices(observed), expected, atol=1e-5)
+    observed, _ = agreement(jnp.asarray(ours), jnp.asarray(theirs), jnp.zeros((3, 4000)))
+    np.testing.assert_allclose(matrices(observed).mean(axis=0), 0, atol=0.02)
+
+
+@pytest.mark.parametrize("kind, least, most", [("all", 0.2, 0.3), ("x", -1 / 64, 1), ("radial", -1, -0.1)])
+def test_gradients_along_the_lines_of_sight_alone_lack_others(kind, least, most):
+    """Surplus over agreement along x, on a disc below the sensor: negative for a pattern of ranges alone."""
+    rng = np.random.default_rng(0)
+    around, angle = rng.uniform(0, 2 * np.pi, (2, 20_000))
+    angle = {"all": angle, "x": 0 * angle, "radial": around}[kind]
+    zero = np.zeros_like(around)
+    gradients = jnp.asarray([[np.cos(angle), np.sin(angle), zero]])
+    observed = agreement(gradients, gradients, jnp.asarray([-np.sin(around), np.cos(around), zero]))
+    agreed, surplus = (matrices(each).mean(axis=0)[0, 0] for each in observed)
+    assert least <= surplus / agreed <= most
+
+
+@pytest.mark.parametrize("moves, status", [(True, mcg.Status.DEGENERATE), (False, mcg.Status.CONVERGED)])
+def test_a_pattern_that_moves_with_the_sensor_constrains_nothing(moves, status):
+    """A road whose intensity depends on range alone, from a sensor that drives: the clouds agree at no motion. A sensor
+    at rest that sees a texture has clouds that agree there, too."""
+    rng = np.random.default_rng(0)
+    clouds = []
+    for _ in range(2):
+        points = np.column_stack([rng.uniform(-8, 8, 8000), rng.uniform(-4, 4, 8000), 0.01 * rng.normal(size=8000) - 2])
+        x, y, _ = points.T
+        pattern = np.sin(4 * np.hypot(x, y)) if moves else np.sin(3 * x + np.cos(2 * y)) + np.sin(3 * y)
+        clouds.append(mcg.PointCloud(points, pattern + 0.05 * rng.normal(size=8000)))
+    ahead = motion((0.1, 0, 0, 0, 0, 0))
+    assert mcg.register(*clouds, mcg.MultiChannelGICP(), init=ahead).status == status
 
 
 @pytest.mark.parametrize("start, status", [("truth", mcg.Status.CONVERGED), ("identity", mcg.Status.DEGENERATE)])

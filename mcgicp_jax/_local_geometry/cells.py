@@ -43,7 +43,7 @@ def geometry_of_cells(local: LocalGeometry, given: Float[Array, "6 n"], num_cand
     return LocalGeometry(
         covariance=given.T,
         normal=normal.T,
-        observability=geometry_observability(given, normal, alg.orthonormal_basis(normal), count).T,
+        observability=geometry_observability(given, normal, count).T,
         roughness=across,
         reach=0.5 * jnp.sqrt(num_candidates * _SQUARE_EDGE * (given[0] + given[3] + given[5])),
         fits=local.fits,

@@ -65,27 +65,29 @@ def _described(
     basis = alg.orthonormal_basis(fixed_normal)
     rank = min(_ROUGHNESS_RANK, offsets[0].shape[0] - 1)
     height = sum(offset[rank] * axis for offset, axis in zip(offsets, fixed_normal, strict=True))
-    halves = _normals_of_halves(around, offsets)
+    halves = _halves(around, offsets)
     x, y = (sum(offset * b for offset, b in zip(offsets, axis, strict=True)) for axis in basis)
     return LocalGeometry(
         covariance=covariance.T,
         normal=normal.T,
-        observability=geometry_observability(fixed_covariance, fixed_normal, basis, count, halves).T,
+        observability=geometry_observability(fixed_covariance, fixed_normal, count, halves).T,
         roughness=0.5 * height**2,
         reach=jnp.sqrt(jnp.max(sum(offset * offset for offset in offsets), axis=0)),
         fits=fit_channels(around, x, y),
     )
 
 
-def _normals_of_halves(around: Neighborhoods, offsets: Offsets) -> tuple[Float[Array, "3 n"], Float[Array, "3 n"]]:
-    """Normals of every second neighbour, from the first and from the second on; 0 where there are too few."""
+def _halves(
+    around: Neighborhoods, offsets: Offsets
+) -> tuple[Float[Array, "6 m"], Float[Array, "3 m"], Float[Array, "m"]]:
+    """Covariance, normal and number of every second neighbour, from the first on and then from the second on, as one
+    array, which compiles once; normals are 0 where there are too few."""
     present = around.present.astype(offsets[0].dtype)
     halves = [[array[first::2] for array in (*offsets, present)] for first in (0, 1)]
-    # As one array, which compiles once.
     covariances = jnp.concatenate([weighted_covariance((x, y, z), weights) for x, y, z, weights in halves], axis=1)
-    used = jnp.concatenate([(jnp.sum(weights, axis=0) >= 3) & ~around.few for *_, weights in halves])
-    first, second = jnp.split(jnp.where(used, alg.smallest_eigenvector(covariances), 0), 2, axis=1)
-    return first, second
+    counts = jnp.concatenate([jnp.sum(weights, axis=0) for *_, weights in halves])
+    used = (counts >= 3) & ~jnp.tile(around.few, 2)
+    return covariances, jnp.where(used, alg.smallest_eigenvector(covariances), 0), counts
 
 
 def offsets_of(around: Neighborhoods) -> Offsets:

@@ -9,8 +9,6 @@ subtracted, values of single points may be slightly negative.
 
 from __future__ import annotations
 
-from typing import TypeAlias
-
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
@@ -22,41 +20,62 @@ from mcgicp_jax._math import symmetric_matrices as alg
 # Of 140 walls with noise for channels (400, 2,000 and 12,000 points), channels held a direction of 6; with 0, of 80.
 _MARGIN = 0.2
 
-# η of `geometry_observability`. Corridors, planes, and floors with a wall (3,000 and 10,000 points, noise of up to 1.5
-# spacings) had at most 0.0007 along their free directions, rooms at least 0.008; with 0.75, rooms had -0.004, and
-# with 0.5, planes 0.04.
-_NOISE = 0.7
-
-Basis: TypeAlias = tuple[Float[Array, "3 N"], Float[Array, "3 N"]]
+# κ of `geometry_observability`: 1/16 makes normals that are nearly right unbiased, 5/16 those of random directions.
+# Corridors, planes, floors with a wall and crossing planes (3,000 and 10,000 points, noise of up to 1.5 spacings) had
+# at most 0.0023 along their free directions, with 0.21 up to 0.006. A street of 10,000 points had at least 0.0016 up to
+# one spacing, in 27 of 28 samples above 0.002; at 1.5 spacings it had −0.001 to 0.003 (0.0018 and more with 0.21).
+_NOISE = 0.22
 
 
 def geometry_observability(
     covariance: Float[Array, "6 N"],
     normal: Float[Array, "3 N"],
-    basis: Basis,
     count: Float[Array, "N"],
-    halves: tuple[Float[Array, "3 N"], Float[Array, "3 N"]] | None = None,
+    halves: tuple[Float[Array, "6 M"], Float[Array, "3 M"], Float[Array, "M"]] | None = None,
 ) -> Float[Array, "6 N"]:
-    """Observability from the normal: (1 − tr V) (P − noise), with the projector P = n nᵀ.
+    """Observability from the normals n₁ and n₂ of two halves of the neighbours, whose noise is independent.
 
-    V is the covariance of the estimated normal n. The eigenvector of the smallest eigenvalue λ₀ of a sample covariance
-    has the variance λ₀ λ / (k (λ − λ₀)²) towards the eigenvector of λ (Anderson 1963). It is large for points on a
-    line, whose normal is undetermined about it. The saturated form λ₀ λ / (k (λ − λ₀)² + λ₀ λ), used here, is at most
-    1. The factor 1 − tr V, at least 0, downweights uncertain normals.
+    With the projectors Pᵢ = nᵢ nᵢᵀ, the part of noise in (P₁ P₂ + P₂ P₁) / 2 is the square of its part in each of them.
+    κ sin²φ (P₁ − P₂)² estimates it, where φ is the angle between the normals, and is subtracted. The rest is multiplied
+    by the certainties of both normals, which are independent, too: the certainty of the normal of all neighbours is
+    larger where both halves deviate alike.
 
-    P and its noise come from the normals of two halves of the neighbours, whose noise is independent: P is the mean
-    (P₁ + P₂) / 2, the noise η (P₁ − P₂)². With η = 1/2 it is unbiased for normals that are nearly right, with 3/4 for
-    normals of random directions. Where surfaces meet or noise is as large as the spacing of the points, V is smaller
-    than the noise. For covariances without neighbours, in clouds of few points, and where a half has fewer than three
-    neighbours, P = n nᵀ and the noise is V.
+    For covariances without neighbours, in clouds of few points, and where a half has fewer than three neighbours, the
+    projector of the normal of all neighbours is used, its covariance V is subtracted, and its certainty is a factor.
 
     Args:
         covariance: covariance of the neighbours about their mean, metres².
-        normal: n, the unit eigenvector of its smallest eigenvalue.
-        basis: orthonormal basis of the tangent plane.
-        count: k, the number of neighbours.
-        halves: unit normals of both halves of the neighbours, 0 where there are too few.
+        normal: unit eigenvector of its smallest eigenvalue.
+        count: number of neighbours.
+        halves: the same for the first halves and then for the second ones, M = 2 N; normals are 0 where there are too
+            few neighbours.
     """
+    certain, variance = _certainty(covariance, normal, count)
+    whole = certain * (alg.outer(normal) - variance)
+    if halves is None:
+        return whole
+    certain, _ = _certainty(*halves)
+    first, second = jnp.split(halves[1], 2, axis=1)
+    # By the sum and the difference of the normals, which are orthogonal; the signs of the normals do not matter.
+    cosine = jnp.sum(first * second, axis=0)
+    by_sum, by_difference = (
+        0.25 * sign * cosine - 0.5 * _NOISE * (1 - cosine * cosine) * (1 - sign * cosine) for sign in (1, -1)
+    )
+    split = by_sum * alg.outer(first + second) + by_difference * alg.outer(first - second)
+    split = jnp.prod(certain.reshape(2, -1), axis=0) * split
+    return jnp.where(jnp.any(first != 0, axis=0) & jnp.any(second != 0, axis=0), split, whole)
+
+
+def _certainty(
+    covariance: Float[Array, "6 N"], normal: Float[Array, "3 N"], count: Float[Array, "N"]
+) -> tuple[Float[Array, "N"], Float[Array, "6 N"]]:
+    """1 − tr V, at least 0, and the covariance V of an estimated normal.
+
+    The eigenvector of the smallest eigenvalue λ₀ of a sample covariance of k points has the variance
+    λ₀ λ / (k (λ − λ₀)²) towards the eigenvector of λ (Anderson 1963). It is large for points on a line, whose normal is
+    undetermined about it. The saturated form λ₀ λ / (k (λ − λ₀)² + λ₀ λ), used here, is at most 1.
+    """
+    basis = alg.orthonormal_basis(normal)
     smallest = jnp.maximum(jnp.sum(normal * alg.multiply(covariance, normal), axis=0), 0)
     a, b, c = alg.project(covariance, *basis)
     scale = 1 / jnp.where(a + c > 0, a + c, 1)
@@ -74,15 +93,7 @@ def geometry_observability(
     i, j, k = inverse
     variance = jnp.stack([x * i + y * j, x * j + y * k, y * j + z * k])
     certain = jnp.where(known, jnp.maximum(1 - variance[0] - variance[2], 0), 0)
-    shown = alg.outer(normal) - alg.embed(variance, *basis)
-    if halves is None:
-        return certain * shown
-    # The same by the sum and the difference of the normals, which are orthogonal; their signs do not matter.
-    first, second = halves
-    cosine = jnp.sum(first * second, axis=0)
-    by_sum, by_difference = (0.25 - 0.5 * _NOISE * (1 - sign * cosine) for sign in (1, -1))
-    split = by_sum * alg.outer(first + second) + by_difference * alg.outer(first - second)
-    return certain * jnp.where(jnp.any(first != 0, axis=0) & jnp.any(second != 0, axis=0), split, shown)
+    return certain, alg.embed(variance, *basis)
 
 
 def channel_observability(
@@ -121,12 +132,24 @@ def channel_observability(
     return alg.embed(total / (1 + length), *basis), within, noise
 
 
-def agreement(source: Float[Array, "C 3 n"], target: Float[Array, "C 3 n"]) -> Float[Array, "6 n"]:
-    """Observability by the channels of matched points: A / (1 + tr A), where A is the mean of g hᵀ and h gᵀ.
+def agreement(
+    source: Float[Array, "C 3 n"], target: Float[Array, "C 3 n"], tangent: Float[Array, "3 n"]
+) -> tuple[Float[Array, "6 n"], Float[Array, "6 n"]]:
+    """Observability by the channels of matched points, A / (1 + tr A), where A is the mean of g hᵀ and h gᵀ; and the
+    surplus of gradients across the lines of sight.
 
     g and h are the gradients of the descriptors in the two clouds, in one frame. At a wrong pose they are unrelated,
-    however distinct the channels of each cloud are, so that A vanishes on average.
+    however distinct the channels of each cloud are, so that A vanishes on average, unless the sensor carries a pattern
+    along: then the gradients agree where it has not moved. Such a pattern (of beams, ranges, angles of incidence) has
+    its gradients along the lines of sight, a texture has them in all directions. With the unit tangent t across the
+    line of sight, the surplus is ((t·g) (t·h) − g·h / 4) t tᵀ / (1 + tr A): positive, g·h / 4, on average over all
+    directions of the gradients, and negative for the pattern.
+
+    Args:
+        tangent: t, or 0 where it is unknown.
     """
     product = sum(0.5 * (alg.outer(g + h) - alg.outer(g) - alg.outer(h)) for g, h in zip(source, target, strict=True))
-    length = 0.5 * (jnp.sum(source * source, axis=(0, 1)) + jnp.sum(target * target, axis=(0, 1)))
-    return product / (1 + length)
+    scale = 1 / (1 + 0.5 * (jnp.sum(source * source, axis=(0, 1)) + jnp.sum(target * target, axis=(0, 1))))
+    across = alg.inner(tangent, alg.multiply(jnp.asarray(product), tangent))
+    quarter = 0.25 * jnp.sum(source * target, axis=(0, 1))
+    return scale * product, scale * (across - quarter) * alg.outer(tangent)

@@ -197,7 +197,7 @@ def _discounted_observability(
     shown = discount[0] * geometry
     if channels:
         # Their agreement is unbiased only for matches that are nearest in position.
-        each = channels[-1 if all(term.by_position for term in terms) else 0]
+        each = channels[min(1, len(channels) - 1) if all(term.by_position for term in terms) else 0]
         # A / (1 + tr A) with A multiplied by the discount.
         trace = each[0] + each[3] + each[5]
         shown = shown + discount[1] * each / (1 - (1 - discount[1]) * jnp.clip(trace, 0, 1))

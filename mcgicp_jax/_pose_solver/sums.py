@@ -22,7 +22,7 @@ from mcgicp_jax._pose_solver.matched import Matched, Motion, linearize_at
 from mcgicp_jax._terms.base import AbstractTerm, PosedMatches
 
 # Fields of `Sums` that are sums over h hᵀ.
-_SECOND_MOMENTS = ("stiffness", "mass", "observability", "channel_observability", "agreement")
+_SECOND_MOMENTS = ("stiffness", "mass", "observability", "channel_observability", "agreement", "surplus")
 
 
 class Sums(NamedTuple):
@@ -46,6 +46,7 @@ class Sums(NamedTuple):
         channel_observability: the same by the channels; None also where they are not used.
         agreement: the same by slopes of the channels that agree in both clouds; `channel_observability` where the
             slopes are not known, as before the last step.
+        surplus: the same by the surplus of gradients across the lines of sight; 0 where the slopes are not known.
     """
 
     center: Float[AnyArray, "*batch 3"]
@@ -61,6 +62,7 @@ class Sums(NamedTuple):
     observability: Float[AnyArray, "*batch 6 4 4"] | None = None
     channel_observability: Float[AnyArray, "*batch 6 4 4"] | None = None
     agreement: Float[AnyArray, "*batch 6 4 4"] | None = None
+    surplus: Float[AnyArray, "*batch 6 4 4"] | None = None
 
     @property
     def radius(self) -> Float[AnyScalar, ""]:
@@ -124,7 +126,8 @@ def sums_of(motion: Motion, matched: Matched, terms: tuple[AbstractTerm, ...]) -
         mass=others[0][0] if shown else None,
         observability=others[1] if shown else None,
         channel_observability=others[2] if len(shown) > 1 else None,
-        agreement=others[-1] if len(shown) > 1 else None,
+        agreement=others[min(3, len(shown))] if len(shown) > 1 else None,
+        surplus=others[4] if len(shown) > 2 else jnp.zeros_like(others[2]) if len(shown) > 1 else None,
     )
 
 
@@ -158,7 +161,7 @@ def _share(counts: Float[Array, "n"], num_candidates: int) -> Float[Array, "n"]:
 
 def observability(posed: PosedMatches) -> list[Float[Array, "6 n"]]:
     """O per correspondence, in the target's frame: mean over its two points, by shape, and where channels are used, by
-    channels; then by the agreement of the channels, if the surfaces have `noise` with slopes."""
+    channels; then, if the surfaces have `noise` with slopes, by the agreement of the channels, and its surplus."""
     source, target, rotation = posed.source, posed.target, posed.rotation
     if source.observability is None or target.observability is None:
         return []
@@ -166,9 +169,12 @@ def observability(posed: PosedMatches) -> list[Float[Array, "6 n"]]:
     if source.channel_observability is not None and target.channel_observability is not None:
         found.append(0.5 * (alg.rotate(rotation, source.channel_observability.T) + target.channel_observability.T))
     slopes = [None if surface.noise is None else surface.noise.slopes for surface in (source, target)]
-    if slopes[0] is not None and slopes[1] is not None:
+    if target.noise is not None and slopes[0] is not None and slopes[1] is not None:
         turned = jnp.einsum("ij,ncj->cin", rotation, slopes[0], precision="highest")
-        found.append(agreement(turned, slopes[1].transpose(1, 2, 0)))
+        # The sensor is at the origin of the target's frame.
+        tangent = jnp.cross(target.noise.normal, target.points).T
+        length = jnp.sqrt(alg.inner(tangent, tangent))
+        found += agreement(turned, slopes[1].transpose(1, 2, 0), tangent / jnp.where(length > 0, length, 1))
     return found
 
 

@@ -149,9 +149,10 @@ class TracedExecutor(AbstractExecutor):
     ) -> Sums:
         observed = self.problem.source.channel_observability
         sums = sums_of(motion, self._matched(self.problem.source, matches, observed is not None), terms)
-        if sums.channel_observability is None or sums.agreement is None:
+        if sums.channel_observability is None or sums.agreement is None or sums.surplus is None:
             return sums
-        return sums._replace(agreement=jnp.where(last, sums.agreement, sums.channel_observability))
+        agreement = jnp.where(last, sums.agreement, sums.channel_observability)
+        return sums._replace(agreement=agreement, surplus=jnp.where(last, sums.surplus, 0))
 
     def scores(self, motion: Motion, matches: Correspondences, *arguments: Any) -> Scores:
         return scores_of(motion, self._matched(self.problem.source, matches, True), *arguments)
