@@ -28,9 +28,10 @@ from tqdm import tqdm
 import mcgicp_jax as mcg
 from mcgicp_jax import io
 from mcgicp_jax._cli.options import (
-    MethodName,
+    Method,
     Options,
     check_outputs,
+    choose_method,
     common_channels,
     files_of,
     listed,
@@ -42,7 +43,6 @@ from mcgicp_jax._cli.options import (
     with_names,
 )
 from mcgicp_jax._cli.table import COLUMNS, POSE, Row, Table, pose_of
-from mcgicp_jax._methods.registry import METHODS
 
 Pairs: TypeAlias = Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="PAIRS")]
 
@@ -67,7 +67,7 @@ class FilePair:
 
 
 @with_names
-def batch(pairs: Pairs, output: Path, method: MethodName = "mc-gicp", glob: str = "*", *, shared: Options) -> int:
+def batch(pairs: Pairs, output: Path, method: Method = None, glob: str = "*", *, shared: Options) -> int:
     """Register many pairs of clouds and write a table of their poses T_target_source.
 
     PAIRS is a CSV file or a folder. The CSV file has the columns source and target, with paths relative to its folder,
@@ -197,7 +197,7 @@ def _checked(path: Path, pairs: list[FilePair]) -> list[FilePair]:
     return pairs
 
 
-def _settings(pairs: Sequence[FilePair], method: MethodName, options: Options) -> dict[str, Any]:
+def _settings(pairs: Sequence[FilePair], method: Method, options: Options) -> dict[str, Any]:
     """Options common to all pairs, with defaults chosen from the first pair whose files can be read."""
     for pair in pairs:
         try:
@@ -209,17 +209,15 @@ def _settings(pairs: Sequence[FilePair], method: MethodName, options: Options) -
     else:
         raise reason
     names = common_channels(options, *clouds)
-    if METHODS[method].kind.uses_channels and not names:
-        raise ValueError("expected clouds with channels in common, got none; use gicp instead (--method gicp)")
+    name = choose_method(method, options, names, dict(zip(pair.key, clouds, strict=True)))
     voxels = voxels_of(clouds, options)
     print(f"points:    {voxels}")
-    print(f"channels:  {listed(names)}")
 
     def ready() -> list[mcg.PointCloud]:
         return [preprocessed(cloud, names, voxels, options) for cloud in clouds]
 
-    return registration_for(method, options, lambda: ready()[1]) | {
-        "method": method_for(method, options, ready),
+    return registration_for(name, options, lambda: ready()[1]) | {
+        "method": method_for(name, options, ready),
         "channels": names,
         "voxel_size": voxels.size,
         "num_neighbors": options.num_neighbors,

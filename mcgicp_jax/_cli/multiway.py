@@ -14,13 +14,13 @@ from mcgicp_jax import io
 from mcgicp_jax import plot as plots
 from mcgicp_jax._cli.options import (
     File,
-    MethodName,
+    Method,
     Options,
     check_inputs,
     check_outputs,
+    choose_method,
     common_channels,
     files_of,
-    listed,
     method_for,
     preprocessed,
     registration_for,
@@ -36,7 +36,7 @@ def multiway(
     folder: Folder,
     *,
     shared: Options,
-    method: MethodName = "mc-gicp",
+    method: Method = None,
     glob: str = "*",
     init: File = None,
     output: File = None,
@@ -70,11 +70,11 @@ def multiway(
     voxels = voxels_of(raw, shared)
     clouds = [preprocessed(cloud, names, voxels, shared) for cloud in raw]
     print(f"clouds:    {len(clouds)}, {len(raw[0]):,} points in the first, {len(clouds[0]):,} used ({voxels})")
-    print(f"channels:  {listed(names)}")
+    name = choose_method(method, shared, names, {path.name: cloud for path, cloud in zip(paths[:2], raw, strict=False)})
     start = None if init is None else list(io.read_poses(init))
-    chosen = method_for(method, shared, lambda: (clouds[1], clouds[0]))
+    chosen = method_for(name, shared, lambda: (clouds[1], clouds[0]))
     found = mcg.multiway(
-        clouds, chosen, init=start, voxel_size=voxels.size, **registration_for(method, shared, lambda: clouds[0])
+        clouds, chosen, init=start, voxel_size=voxels.size, **registration_for(name, shared, lambda: clouds[0])
     )
     _report(found)
     if output is not None:

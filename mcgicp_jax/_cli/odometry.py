@@ -18,11 +18,12 @@ import mcgicp_jax as mcg
 from mcgicp_jax import io, metrics, plot
 from mcgicp_jax._cli.options import (
     File,
+    Method,
     MethodName,
     Options,
     check_outputs,
+    choose_method,
     enumerated,
-    listed,
     method_for,
     registration_for,
     shown,
@@ -69,7 +70,7 @@ def odometry(
     path: Folder = Path(),
     *,
     shared: Options,
-    method: MethodName = "mc-gicp",
+    method: Method = None,
     num_frames: int | Literal["all"] = "all",
     against: Literal["previous", "map"] = "previous",
     map_radius: Annotated[float | None, shown("FLOAT")] = None,
@@ -112,7 +113,7 @@ def odometry(
     first = frames[0]
     names = shared.channels or first.cloud.channel_names
     print(f"frames:    {len(frames)} of {dataset}, {len(first.cloud):,} points in the first")
-    print(f"channels:  {listed(names)}")
+    name = choose_method(method, shared, names, {"the first frame": first.cloud})
     voxels = voxels_of([first.cloud], shared)
     print(f"points:    {voxels}")
 
@@ -120,8 +121,8 @@ def odometry(
         return [mcg.preprocess(with_channels(frames[row].cloud, names), voxels) for row in (1, 0)]
 
     truth: Truth = []
-    chosen = method_for(method, shared, first_two)
-    options |= registration_for(method, shared, lambda: first_two()[1])
+    chosen = method_for(name, shared, first_two)
+    options |= registration_for(name, shared, lambda: first_two()[1])
     steps = mcg.odometry(_clouds(frames, names, truth), chosen, voxel_size=voxels.size, start=first.pose, **options)
     poses, results, failure = _follow(steps, len(frames), loops, map)
     del truth[len(poses) :]
@@ -129,7 +130,7 @@ def odometry(
     if output is not None:
         io.write_poses(output, poses)
     if plot is not None:
-        _draw(plot, method, poses, truth)
+        _draw(plot, name, poses, truth)
     if failure:
         print(f"mcgicp: {failure}; stopped after {len(poses)} of {len(frames)} frames", file=sys.stderr)
     if failed := sum(not result.converged for result in results):

@@ -5,7 +5,7 @@ from __future__ import annotations
 import errno
 import inspect
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeAlias, TypeVar
@@ -43,6 +43,9 @@ def shown(metavar: str | None = None, default: str = "") -> Any:
 
 
 File: TypeAlias = Annotated[Path | None, shown("FILE")]
+Method: TypeAlias = Annotated[
+    MethodName | None, shown(f"{{{','.join(METHODS)}}}", "mc-gicp; gicp for clouds without common channels")
+]
 Start: TypeAlias = Annotated[Literal["global"] | Path | None, shown("{FILE,global}")]
 Names: TypeAlias = Annotated[tuple[str, ...], shown("NAMES", "all in common")]
 Numbers: TypeAlias = Annotated[tuple[float, ...], shown(default="from the data")]
@@ -206,6 +209,30 @@ def files_of(folder: Path, glob: str, *others: Path | None) -> list[Path]:
     known = {path.resolve() for path in others if path is not None}
     shown = (path for path in folder.glob(glob) if path.is_file() and not path.name.startswith("."))
     return sorted(path for path in shown if path.resolve() not in known)
+
+
+def choose_method(
+    given: MethodName | None, options: Options, channels: Sequence[str], clouds: Mapping[str, mcg.PointCloud]
+) -> MethodName:
+    """The method that the user gave or else suits the common channels of the clouds, which are printed."""
+    name = given or ("mc-gicp" if channels else "gicp")
+    if METHODS[name].kind.uses_channels and not channels:
+        raise ValueError(f"{name} needs channels in common, but {_having(clouds)}; use gicp instead (--method gicp)")
+    options.check(name)
+    print_channels(options, channels, clouds, "" if given or channels else " in common, therefore gicp")
+    return name
+
+
+def print_channels(
+    options: Options, channels: Sequence[str], clouds: Mapping[str, mcg.PointCloud], words: str = ""
+) -> None:
+    """Print the channels that are used, and those of each cloud if these differ."""
+    differ = not options.channels and len({cloud.channel_names for cloud in clouds.values()}) > 1
+    print(f"channels:  {listed(channels)}{words}{f' ({_having(clouds)})' if differ else ''}")
+
+
+def _having(clouds: Mapping[str, mcg.PointCloud]) -> str:
+    return ", ".join(f"{name} has {listed(cloud.channel_names)}" for name, cloud in clouds.items())
 
 
 def method_for(name: MethodName, options: Options, clouds: Callable[[], Sequence[mcg.PointCloud]]) -> AbstractMethod:
