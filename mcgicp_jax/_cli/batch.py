@@ -32,8 +32,8 @@ from mcgicp_jax._cli.options import (
     Options,
     check_outputs,
     choose_method,
+    clouds_in,
     common_channels,
-    files_of,
     listed,
     method_for,
     preprocessed,
@@ -71,9 +71,10 @@ def batch(pairs: Pairs, output: Path, method: Method = None, glob: str = "*", *,
     """Register many pairs of clouds and write a table of their poses T_target_source.
 
     PAIRS is a CSV file or a folder. The CSV file has the columns source and target, with paths relative to its folder,
-    and optionally m00 m01 ... m23, the upper three rows of the initial pose. In a folder, each file is registered to
-    the one before it in order of name. To resume after Ctrl-C, or to add pairs, run the same command again: it skips
-    pairs in the table whose files and options are unchanged. The exit code is 0 only if all pairs converged.
+    and optionally m00 m01 ... m23, the upper three rows of the initial pose. In a folder, each cloud is registered to
+    the one before it in order of name; files that are no clouds are left out. To resume after Ctrl-C, or to add pairs,
+    run the same command again: it skips pairs in the table whose files and options are unchanged. The exit code is 0
+    only if all pairs converged.
 
     Args:
         pairs: CSV file or folder.
@@ -86,7 +87,7 @@ def batch(pairs: Pairs, output: Path, method: Method = None, glob: str = "*", *,
     shared.check(method)
     check_outputs(output)
     table = Table(output)
-    everything = _pairs_of_folder(pairs, glob, table) if pairs.is_dir() else _pairs_of_table(pairs)
+    everything = _pairs_of_folder(pairs, glob) if pairs.is_dir() else _pairs_of_table(pairs)
     rows = {(row["source"], row["target"]): row for row in table.read()}
     settings = _settings(everything, method, shared)
     known = [pair for pair in everything if pair.key in rows]
@@ -183,8 +184,8 @@ def _pairs_of_table(path: Path) -> list[FilePair]:
     return _checked(path, pairs)
 
 
-def _pairs_of_folder(folder: Path, glob: str, table: Table) -> list[FilePair]:
-    names = [path.name for path in files_of(folder, glob, *table.files)]
+def _pairs_of_folder(folder: Path, glob: str) -> list[FilePair]:
+    names = [path.name for path in clouds_in(folder, glob).paths]
     return _checked(folder, [FilePair(folder, source, target) for target, source in itertools.pairwise(names)])
 
 

@@ -16,11 +16,10 @@ from mcgicp_jax._cli.options import (
     File,
     Method,
     Options,
-    check_inputs,
     check_outputs,
     choose_method,
+    clouds_in,
     common_channels,
-    files_of,
     method_for,
     preprocessed,
     registration_for,
@@ -50,7 +49,8 @@ def multiway(
     that contradict the others. The exit code is 0 only if one pose was found for each cloud.
 
     Args:
-        folder: Folder of clouds of one scene; in order of name, each should overlap the one before it.
+        folder: Folder of clouds of one scene; in order of name, each should overlap the one before it. Files that are
+            no clouds are left out.
         method: {channel_methods} use channels (intensity, colours, ...), the others geometry alone.
         glob: Pattern for the files of the folder, such as "*.ply".
         init: File with a pose to start from for each cloud: 12 numbers (KITTI) or 8 (TUM) on each line.
@@ -61,10 +61,7 @@ def multiway(
     """
     check_outputs(output, graph, cloud=map, picture=plot)
     shared.check(method)
-    paths = files_of(folder, glob, init, output, map, graph, plot)
-    if len(paths) < 2:
-        raise ValueError(f"{folder}: expected at least 2 clouds {glob}, found {len(paths)}")
-    check_inputs(*paths)
+    paths = clouds_in(folder, glob, map).paths
     raw = [io.read(path) for path in paths]
     names = common_channels(shared, *raw[:2])
     voxels = voxels_of(raw, shared)

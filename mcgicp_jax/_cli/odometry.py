@@ -1,4 +1,4 @@
-"""`mcgicp odometry DATASET PATH`: register each frame of a sequence to the one before it."""
+"""`mcgicp odometry FOLDER` or `DATASET PATH`: register each frame of a sequence to the one before it."""
 
 from __future__ import annotations
 
@@ -23,6 +23,7 @@ from mcgicp_jax._cli.options import (
     Options,
     check_outputs,
     choose_method,
+    clouds_in,
     enumerated,
     method_for,
     registration_for,
@@ -39,7 +40,7 @@ if TYPE_CHECKING:
 else:
     DatasetName = Literal[tuple(DATASETS)]
 
-Positional: TypeAlias = Annotated[DatasetName, tyro.conf.Positional, tyro.conf.arg(metavar="DATASET")]
+Positional: TypeAlias = Annotated[DatasetName | Path, tyro.conf.Positional, tyro.conf.arg(metavar="{FOLDER,DATASET}")]
 Folder: TypeAlias = Annotated[Path, tyro.conf.Positional, shown("PATH")]
 Poses: TypeAlias = list[Float[np.ndarray, "4 4"]]
 Truth: TypeAlias = list[Float[np.ndarray, "4 4"] | None]
@@ -81,14 +82,15 @@ def odometry(
 ) -> int:
     """Estimate the sensor's trajectory by registering each frame of a sequence to the one before it, or to a map.
 
-    DATASET is <datasets>, with the sequence in the folder PATH; or a simulated scene (<scenes>), which needs no PATH.
-    Errors are printed if the true poses are known. The exit code is 0 only if all registrations converged; output files
-    are written in any case: after an invalid frame or Ctrl-C, of the frames before it.
+    FOLDER holds a cloud per frame; files that are no clouds are left out. DATASET is <datasets>, with the sequence in
+    the folder PATH; or a simulated scene (<scenes>), which needs no PATH. Errors are printed if the true poses are
+    known. The exit code is 0 only if all registrations converged; output files are written in any case: after an
+    invalid frame or Ctrl-C, of the frames before it.
 
     Defaults of --max-distance: <max_distances>.
 
     Args:
-        dataset: Format of the data set, or simulated scene.
+        dataset: Folder of clouds in order of name, such as ./scans, or format of a data set, or simulated scene.
         path: Folder of the sequence, such as sequences/04.
         method: {channel_methods} use channels, the others geometry alone.
         num_frames: Number of frames to use, from the start; all means 20 for a simulated scene.
@@ -102,9 +104,9 @@ def odometry(
     """
     check_outputs(output, cloud=map, picture=plot)
     shared.check(method)
-    defaults, frames = DATASETS[dataset], _open(dataset, path, num_frames)
+    frames = _open(dataset, path, num_frames, map)
     options: dict[str, Any] = {
-        "max_distance": defaults.max_distance,
+        "max_distance": DATASETS[dataset].max_distance if isinstance(dataset, str) else None,
         "num_neighbors": shared.num_neighbors,
         "against": against,
         "map_radius": map_radius,
@@ -138,12 +140,19 @@ def odometry(
     return 1 if failed or failure else 0
 
 
-def _open(dataset: DatasetName, path: Path, num_frames: int | Literal["all"]) -> AbstractFrames:
+def _open(
+    dataset: DatasetName | Path, path: Path, num_frames: int | Literal["all"], map: Path | None
+) -> AbstractFrames:
     if num_frames != "all" and num_frames < 2:
         raise ValueError(f"num_frames: expected at least 2, got {num_frames}")
-    if DATASETS[dataset].simulated:
+    if isinstance(dataset, str) and DATASETS[dataset].simulated:
         return DATASETS[dataset].frames(_FRAMES_OF_A_SCENE if num_frames == "all" else num_frames)
-    frames = DATASETS[dataset].frames(path)
+    if isinstance(dataset, str):
+        frames = DATASETS[dataset].frames(path)
+    elif dataset.is_dir():
+        frames = clouds_in(dataset, map=map)
+    else:
+        raise ValueError(f"{dataset}: expected a folder of clouds or one of {enumerated(list(DATASETS), 'or')}")
     if len(frames) < 2:
         raise ValueError(f"{path}: expected at least 2 frames, got {len(frames)}")
     return frames if num_frames == "all" else frames[:num_frames]

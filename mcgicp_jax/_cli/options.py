@@ -7,6 +7,7 @@ import inspect
 import os
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, fields
+from fnmatch import fnmatch
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeAlias, TypeVar
 
@@ -14,7 +15,7 @@ import numpy as np
 import tyro
 
 import mcgicp_jax as mcg
-from mcgicp_jax import plot
+from mcgicp_jax import datasets, plot
 from mcgicp_jax._clouds.color_spaces import COLOR_SPACES
 from mcgicp_jax._clouds.point_cloud import Voxels
 from mcgicp_jax._clouds.preprocess import check_preprocessing
@@ -57,6 +58,8 @@ Epsilon: TypeAlias = Annotated[
     float | None, shown("FLOAT", str(inspect.signature(mcg.GICP).parameters["epsilon"].default))
 ]
 
+# Number of files that a message lists.
+_MOST_NAMES = 5
 _RGB = ("red", "green", "blue")
 # Parameters of methods that have an option.
 _PARAMETERS = ("channel_covariance", "channel_weights", "epsilon")
@@ -200,15 +203,18 @@ def check_inputs(*clouds: Path) -> None:
         path.stat()
 
 
-def files_of(folder: Path, glob: str, *others: Path | None) -> list[Path]:
-    """The files of a folder in order of name, without hidden ones, such as the temporary files of a killed process.
-
-    Args:
-        others: files of the command that are no clouds, such as its outputs.
-    """
-    known = {path.resolve() for path in others if path is not None}
-    shown = (path for path in folder.glob(glob) if path.is_file() and not path.name.startswith("."))
-    return sorted(path for path in shown if path.resolve() not in known)
+def clouds_in(folder: Path, glob: str = "*", map: File = None) -> datasets.CloudFiles:
+    """The clouds of a folder; `map`, a cloud that the command writes, may not become one of them."""
+    if map is not None and map.resolve().parent == folder.resolve() and fnmatch(map.name, glob):
+        raise ValueError(f"{map}: expected a map outside of {folder}, where it would be one of the clouds")
+    found = datasets.clouds(folder, glob)
+    if len(found) < 2:
+        raise ValueError(f"{folder}: expected at least 2 clouds {glob}, found {len(found)}")
+    if found.left_out:
+        names = [path.name for path in found.left_out]
+        more = f" and {len(names) - _MOST_NAMES:,} more" if len(names) > _MOST_NAMES else ""
+        print(f"left out:  {', '.join(names[:_MOST_NAMES])}{more}, since they are no clouds")
+    return found
 
 
 def choose_method(
