@@ -210,6 +210,8 @@ def test_control_c_is_noticed_where_python_loses_it(folder, tmp_path, capsys, mo
 def test_the_files_of_an_interrupted_run_are_no_clouds(folder, tmp_path, capsys, monkeypatch, name):
     for path in sorted(folder.glob("*.ply"))[:3]:
         shutil.copy(path, tmp_path)
+    # Neither these nor the table of the first runs is a cloud.
+    io.write_poses(tmp_path / "poses.txt", [pose(1), pose(2)])
     (tmp_path / ".0123.tmp").write_text("left by a killed process")
     completed = mcg.register_as_completed
 

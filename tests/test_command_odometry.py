@@ -4,7 +4,7 @@ import matplotlib.image
 import numpy as np
 import pytest
 
-from mcgicp_jax import datasets, io
+from mcgicp_jax import PointCloud, datasets, io
 from mcgicp_jax.__main__ import main
 from mcgicp_jax._sequences import odometry
 
@@ -66,11 +66,35 @@ def test_wrong_input_gets_one_line(tmp_path, capsys):
         assert errors.startswith("mcgicp: ") and errors.count("\n") == 1 and message in errors
 
 
+def test_a_plain_folder_is_followed(tmp_path, capsys):
+    frames = datasets.box_room(3, points_per_frame=1500)
+    for k, suffix in enumerate((".xyz", ".pcd", ".npz")):
+        io.write(tmp_path / f"scan_{8 + k}{suffix}", PointCloud(frames[k].cloud.points))
+    for name in ("readme.md", "run_log.txt"):
+        (tmp_path / name).write_text("no cloud\n")
+    command = ["odometry", str(tmp_path), "--max-distance", "0.5", "--output", str(tmp_path / "poses.txt")]
+    for left_out in ("readme.md, run_log.txt", "poses.txt, readme.md, run_log.txt"):
+        assert main(command) == 0
+        text, errors = capsys.readouterr()
+        assert errors == "" and f"left out:  {left_out}, since they are no clouds\n" in text
+        assert "frames:    3 of " in text and "therefore gicp" in text and "2 of 2 converged" in text
+    poses = io.read_poses(tmp_path / "poses.txt")
+    truth = [frames.path(0) @ pose for pose in poses]
+    np.testing.assert_allclose(truth, [frames.path(k) for k in range(3)], atol=0.03)
+    assert main([*command, "--map", str(tmp_path / "map.ply")]) == 2
+    assert main(["odometry", str(tmp_path / "nothing")]) == 2
+    outside, unknown = capsys.readouterr().err.splitlines()
+    assert "map.ply: expected a map outside of" in outside
+    assert "nothing: expected a folder of clouds or one of kitti, " in unknown
+
+
 def test_help_says_what_there_is(capsys):
     with pytest.raises(SystemExit):
         main(["odometry", "--help"])
     text = " ".join(capsys.readouterr().out.replace("│", " ").split())
-    assert all(word in text for word in ("DATASET PATH", "7-scenes", "--map", "--channels", "2.5 and 0.6 for kitti"))
+    assert all(
+        word in text for word in ("{FOLDER,DATASET} PATH", "7-scenes", "--map", "--channels", "2.5 and 0.6 for kitti")
+    )
     assert "None" not in text
 
 

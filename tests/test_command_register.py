@@ -192,7 +192,26 @@ def test_no_common_channels_is_said(files, capsys):
         assert main(["register", files["bare"], files["target"], "--method", method]) == 2
         error = capsys.readouterr().err
         assert "bare.npz has no channels" in error and "target.ply has intensity" in error and "--method gicp" in error
-    assert main(["register", files["bare"], files["target"], "--method", "gicp"]) == 0
+    # Before the search for a pose, which takes seconds
+    assert main(["register", files["bare"], files["target"], "--method", "mc-gicp", "--init", "global"]) == 2
+    assert "start:" not in capsys.readouterr().out
+
+
+def test_clouds_without_channels_in_common_are_registered_by_gicp(files, tmp_path, capsys):
+    assert main(["register", files["bare"], files["target"]]) == 0
+    text, errors = capsys.readouterr()
+    assert errors == "" and "\nmethod:    gicp, epsilon" in text
+    assert text.count("no channels in common, therefore gicp") == 1
+    assert main(["register", files["bare"], files["target"], "--channel-weights", "1"]) == 2
+    assert "gicp has no channel_weights" in capsys.readouterr().err
+    folder = tmp_path / "clouds"
+    folder.mkdir()
+    for k in range(2):
+        save(folder / f"{k}.npz", room_corner(1000, seed=k)[0])
+    for command in (["batch", str(folder), "--output", str(tmp_path / "table.csv")], ["multiway", str(folder)]):
+        assert main(command) == 0
+        text, errors = capsys.readouterr()
+        assert errors == "" and text.count("no channels in common, therefore gicp") == 1
 
 
 @pytest.mark.slow
@@ -202,7 +221,8 @@ def test_voxels_are_chosen_from_the_data(tmp_path, capsys):
         half = save(tmp_path / "half.npz", points[::2])
         whole = save(tmp_path / "whole.npz", points)
         assert main(["register", half, whole, "--method", "point-to-plane"]) in (0, 1)
-        first, second, *_ = capsys.readouterr().out.splitlines()
+        first, *lines = capsys.readouterr().out.splitlines()
+        (second,) = (line for line in lines if line.startswith("matches:"))
         used = int(first.split("target ")[1].split()[0].replace(",", ""))
         assert voxels in first
         distances = [float(part.split()[0]) for part in second.split("up to ")[1].split("then")]

@@ -10,7 +10,7 @@ from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation, Slerp
 
 from mcgicp_jax import io, metrics
-from mcgicp_jax.datasets import ford_campus, kitti, seven_scenes, tum_rgbd
+from mcgicp_jax.datasets import clouds, ford_campus, kitti, seven_scenes, tum_rgbd
 from mcgicp_jax.datasets._images import look_up
 from tests.scenes import motion
 
@@ -345,3 +345,50 @@ def test_what_is_no_ford_data_is_refused_by_name(tmp_path):
     (tmp_path / "Timestamp.log").write_text("nothing\n")
     with pytest.raises(ValueError, match=r"Timestamp.log: expected rows"):
         ford_campus(tmp_path)
+
+
+def test_a_folder_of_clouds(tmp_path):
+    rng = np.random.default_rng(0)
+    points = rng.normal(size=(50, 3))
+    poses = [motion(rng.normal(size=6)) for _ in range(5)]
+    normals = rng.normal(size=(50, 3))
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    seven = np.hstack([points, normals, rng.uniform(0, 0.01, (50, 1))])
+    kept = {
+        "2.xyz": lambda path: np.savetxt(path, points),
+        "10.txt": lambda path: np.savetxt(path, np.hstack([points, rng.normal(size=(50, 9))])),
+        "11.txt": lambda path: np.savetxt(path, seven),
+        "12.txt": lambda path: np.savetxt(path, np.insert(seven, 3, 0.5, axis=1)),
+        "13.csv": lambda path: np.savetxt(path, points, delimiter=",", header="x,y,z", comments=""),
+        "14.npy": lambda path: np.save(path, points),
+        "15.npz": lambda path: np.savez(path, points=points),
+        "16.ply": lambda path: path.write_text("broken"),
+    }
+    left_out = {
+        "calibration.txt": lambda path: path.write_text("P0: 1 0 0 0\n"),
+        "empty.txt": lambda path: path.touch(),
+        "kitti.txt": lambda path: io.write_poses(path, poses),
+        "matrix.txt": lambda path: np.savetxt(path, poses[0]),
+        "matrix.npy": lambda path: np.save(path, poses[0]),
+        "picture.png": lambda path: path.touch(),
+        "poses.npy": lambda path: np.save(path, poses),
+        "table.csv": lambda path: path.write_text("source,target\na.ply,b.ply\n"),
+        "table.npz": lambda path: np.savez(path, T_target_source=poses),
+        "times.txt": lambda path: path.write_text("0.0\n0.1\n"),
+        "tum.txt": lambda path: io.write_poses(path, poses, range(5)),
+    }
+    for name, write in (kept | left_out).items():
+        write(tmp_path / name)
+    (tmp_path / ".hidden.ply").touch()
+    (tmp_path / "folder.ply").mkdir()
+    frames = clouds(tmp_path)
+    assert [path.name for path in frames.paths] == list(kept)
+    assert {path.name for path in frames.left_out} == set(left_out)
+    np.testing.assert_allclose(frames[0].cloud.points, points)
+    assert frames[0].pose is None and len(clouds(tmp_path, "*.npz")) == 1
+    with pytest.raises(ValueError, match=r"16\.ply: cannot be read"):
+        frames[-1]
+    with pytest.raises(ValueError, match=r"expected clouds \*\.las, found none"):
+        clouds(tmp_path, "*.las")
+    with pytest.raises(FileNotFoundError):
+        clouds(tmp_path / "nothing")

@@ -28,11 +28,12 @@ from tqdm import tqdm
 import mcgicp_jax as mcg
 from mcgicp_jax import io
 from mcgicp_jax._cli.options import (
-    MethodName,
+    Method,
     Options,
     check_outputs,
+    choose_method,
+    clouds_in,
     common_channels,
-    files_of,
     listed,
     method_for,
     preprocessed,
@@ -42,7 +43,6 @@ from mcgicp_jax._cli.options import (
     with_names,
 )
 from mcgicp_jax._cli.table import COLUMNS, POSE, Row, Table, pose_of
-from mcgicp_jax._methods.registry import METHODS
 
 Pairs: TypeAlias = Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="PAIRS")]
 
@@ -67,13 +67,14 @@ class FilePair:
 
 
 @with_names
-def batch(pairs: Pairs, output: Path, method: MethodName = "mc-gicp", glob: str = "*", *, shared: Options) -> int:
+def batch(pairs: Pairs, output: Path, method: Method = None, glob: str = "*", *, shared: Options) -> int:
     """Register many pairs of clouds and write a table of their poses T_target_source.
 
     PAIRS is a CSV file or a folder. The CSV file has the columns source and target, with paths relative to its folder,
-    and optionally m00 m01 ... m23, the upper three rows of the initial pose. In a folder, each file is registered to
-    the one before it in order of name. To resume after Ctrl-C, or to add pairs, run the same command again: it skips
-    pairs in the table whose files and options are unchanged. The exit code is 0 only if all pairs converged.
+    and optionally m00 m01 ... m23, the upper three rows of the initial pose. In a folder, each cloud is registered to
+    the one before it in order of name; files that are no clouds are left out. To resume after Ctrl-C, or to add pairs,
+    run the same command again: it skips pairs in the table whose files and options are unchanged. The exit code is 0
+    only if all pairs converged.
 
     Args:
         pairs: CSV file or folder.
@@ -86,7 +87,7 @@ def batch(pairs: Pairs, output: Path, method: MethodName = "mc-gicp", glob: str 
     shared.check(method)
     check_outputs(output)
     table = Table(output)
-    everything = _pairs_of_folder(pairs, glob, table) if pairs.is_dir() else _pairs_of_table(pairs)
+    everything = _pairs_of_folder(pairs, glob) if pairs.is_dir() else _pairs_of_table(pairs)
     rows = {(row["source"], row["target"]): row for row in table.read()}
     settings = _settings(everything, method, shared)
     known = [pair for pair in everything if pair.key in rows]
@@ -183,8 +184,8 @@ def _pairs_of_table(path: Path) -> list[FilePair]:
     return _checked(path, pairs)
 
 
-def _pairs_of_folder(folder: Path, glob: str, table: Table) -> list[FilePair]:
-    names = [path.name for path in files_of(folder, glob, *table.files)]
+def _pairs_of_folder(folder: Path, glob: str) -> list[FilePair]:
+    names = [path.name for path in clouds_in(folder, glob).paths]
     return _checked(folder, [FilePair(folder, source, target) for target, source in itertools.pairwise(names)])
 
 
@@ -197,7 +198,7 @@ def _checked(path: Path, pairs: list[FilePair]) -> list[FilePair]:
     return pairs
 
 
-def _settings(pairs: Sequence[FilePair], method: MethodName, options: Options) -> dict[str, Any]:
+def _settings(pairs: Sequence[FilePair], method: Method, options: Options) -> dict[str, Any]:
     """Options common to all pairs, with defaults chosen from the first pair whose files can be read."""
     for pair in pairs:
         try:
@@ -209,17 +210,15 @@ def _settings(pairs: Sequence[FilePair], method: MethodName, options: Options) -
     else:
         raise reason
     names = common_channels(options, *clouds)
-    if METHODS[method].kind.uses_channels and not names:
-        raise ValueError("expected clouds with channels in common, got none; use gicp instead (--method gicp)")
+    name = choose_method(method, options, names, dict(zip(pair.key, clouds, strict=True)))
     voxels = voxels_of(clouds, options)
     print(f"points:    {voxels}")
-    print(f"channels:  {listed(names)}")
 
     def ready() -> list[mcg.PointCloud]:
         return [preprocessed(cloud, names, voxels, options) for cloud in clouds]
 
-    return registration_for(method, options, lambda: ready()[1]) | {
-        "method": method_for(method, options, ready),
+    return registration_for(name, options, lambda: ready()[1]) | {
+        "method": method_for(name, options, ready),
         "channels": names,
         "voxel_size": voxels.size,
         "num_neighbors": options.num_neighbors,

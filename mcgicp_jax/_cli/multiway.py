@@ -14,13 +14,12 @@ from mcgicp_jax import io
 from mcgicp_jax import plot as plots
 from mcgicp_jax._cli.options import (
     File,
-    MethodName,
+    Method,
     Options,
-    check_inputs,
     check_outputs,
+    choose_method,
+    clouds_in,
     common_channels,
-    files_of,
-    listed,
     method_for,
     preprocessed,
     registration_for,
@@ -36,7 +35,7 @@ def multiway(
     folder: Folder,
     *,
     shared: Options,
-    method: MethodName = "mc-gicp",
+    method: Method = None,
     glob: str = "*",
     init: File = None,
     output: File = None,
@@ -50,7 +49,8 @@ def multiway(
     that contradict the others. The exit code is 0 only if one pose was found for each cloud.
 
     Args:
-        folder: Folder of clouds of one scene; in order of name, each should overlap the one before it.
+        folder: Folder of clouds of one scene; in order of name, each should overlap the one before it. Files that are
+            no clouds are left out.
         method: {channel_methods} use channels (intensity, colours, ...), the others geometry alone.
         glob: Pattern for the files of the folder, such as "*.ply".
         init: File with a pose to start from for each cloud: 12 numbers (KITTI) or 8 (TUM) on each line.
@@ -61,20 +61,17 @@ def multiway(
     """
     check_outputs(output, graph, cloud=map, picture=plot)
     shared.check(method)
-    paths = files_of(folder, glob, init, output, map, graph, plot)
-    if len(paths) < 2:
-        raise ValueError(f"{folder}: expected at least 2 clouds {glob}, found {len(paths)}")
-    check_inputs(*paths)
+    paths = clouds_in(folder, glob, map).paths
     raw = [io.read(path) for path in paths]
     names = common_channels(shared, *raw[:2])
     voxels = voxels_of(raw, shared)
     clouds = [preprocessed(cloud, names, voxels, shared) for cloud in raw]
     print(f"clouds:    {len(clouds)}, {len(raw[0]):,} points in the first, {len(clouds[0]):,} used ({voxels})")
-    print(f"channels:  {listed(names)}")
+    name = choose_method(method, shared, names, {path.name: cloud for path, cloud in zip(paths[:2], raw, strict=False)})
     start = None if init is None else list(io.read_poses(init))
-    chosen = method_for(method, shared, lambda: (clouds[1], clouds[0]))
+    chosen = method_for(name, shared, lambda: (clouds[1], clouds[0]))
     found = mcg.multiway(
-        clouds, chosen, init=start, voxel_size=voxels.size, **registration_for(method, shared, lambda: clouds[0])
+        clouds, chosen, init=start, voxel_size=voxels.size, **registration_for(name, shared, lambda: clouds[0])
     )
     _report(found)
     if output is not None:

@@ -1,4 +1,4 @@
-"""`mcgicp odometry DATASET PATH`: register each frame of a sequence to the one before it."""
+"""`mcgicp odometry FOLDER` or `DATASET PATH`: register each frame of a sequence to the one before it."""
 
 from __future__ import annotations
 
@@ -18,11 +18,13 @@ import mcgicp_jax as mcg
 from mcgicp_jax import io, metrics, plot
 from mcgicp_jax._cli.options import (
     File,
+    Method,
     MethodName,
     Options,
     check_outputs,
+    choose_method,
+    clouds_in,
     enumerated,
-    listed,
     method_for,
     registration_for,
     shown,
@@ -38,7 +40,7 @@ if TYPE_CHECKING:
 else:
     DatasetName = Literal[tuple(DATASETS)]
 
-Positional: TypeAlias = Annotated[DatasetName, tyro.conf.Positional, tyro.conf.arg(metavar="DATASET")]
+Positional: TypeAlias = Annotated[DatasetName | Path, tyro.conf.Positional, tyro.conf.arg(metavar="{FOLDER,DATASET}")]
 Folder: TypeAlias = Annotated[Path, tyro.conf.Positional, shown("PATH")]
 Poses: TypeAlias = list[Float[np.ndarray, "4 4"]]
 Truth: TypeAlias = list[Float[np.ndarray, "4 4"] | None]
@@ -69,7 +71,7 @@ def odometry(
     path: Folder = Path(),
     *,
     shared: Options,
-    method: MethodName = "mc-gicp",
+    method: Method = None,
     num_frames: int | Literal["all"] = "all",
     against: Literal["previous", "map"] = "previous",
     map_radius: Annotated[float | None, shown("FLOAT")] = None,
@@ -80,14 +82,15 @@ def odometry(
 ) -> int:
     """Estimate the sensor's trajectory by registering each frame of a sequence to the one before it, or to a map.
 
-    DATASET is <datasets>, with the sequence in the folder PATH; or a simulated scene (<scenes>), which needs no PATH.
-    Errors are printed if the true poses are known. The exit code is 0 only if all registrations converged; output files
-    are written in any case: after an invalid frame or Ctrl-C, of the frames before it.
+    FOLDER holds a cloud per frame; files that are no clouds are left out. DATASET is <datasets>, with the sequence in
+    the folder PATH; or a simulated scene (<scenes>), which needs no PATH. Errors are printed if the true poses are
+    known. The exit code is 0 only if all registrations converged; output files are written in any case: after an
+    invalid frame or Ctrl-C, of the frames before it.
 
     Defaults of --max-distance: <max_distances>.
 
     Args:
-        dataset: Format of the data set, or simulated scene.
+        dataset: Folder of clouds in order of name, such as ./scans, or format of a data set, or simulated scene.
         path: Folder of the sequence, such as sequences/04.
         method: {channel_methods} use channels, the others geometry alone.
         num_frames: Number of frames to use, from the start; all means 20 for a simulated scene.
@@ -101,9 +104,9 @@ def odometry(
     """
     check_outputs(output, cloud=map, picture=plot)
     shared.check(method)
-    defaults, frames = DATASETS[dataset], _open(dataset, path, num_frames)
+    frames = _open(dataset, path, num_frames, map)
     options: dict[str, Any] = {
-        "max_distance": defaults.max_distance,
+        "max_distance": DATASETS[dataset].max_distance if isinstance(dataset, str) else None,
         "num_neighbors": shared.num_neighbors,
         "against": against,
         "map_radius": map_radius,
@@ -112,7 +115,7 @@ def odometry(
     first = frames[0]
     names = shared.channels or first.cloud.channel_names
     print(f"frames:    {len(frames)} of {dataset}, {len(first.cloud):,} points in the first")
-    print(f"channels:  {listed(names)}")
+    name = choose_method(method, shared, names, {"the first frame": first.cloud})
     voxels = voxels_of([first.cloud], shared)
     print(f"points:    {voxels}")
 
@@ -120,8 +123,8 @@ def odometry(
         return [mcg.preprocess(with_channels(frames[row].cloud, names), voxels) for row in (1, 0)]
 
     truth: Truth = []
-    chosen = method_for(method, shared, first_two)
-    options |= registration_for(method, shared, lambda: first_two()[1])
+    chosen = method_for(name, shared, first_two)
+    options |= registration_for(name, shared, lambda: first_two()[1])
     steps = mcg.odometry(_clouds(frames, names, truth), chosen, voxel_size=voxels.size, start=first.pose, **options)
     poses, results, failure = _follow(steps, len(frames), loops, map)
     del truth[len(poses) :]
@@ -129,7 +132,7 @@ def odometry(
     if output is not None:
         io.write_poses(output, poses)
     if plot is not None:
-        _draw(plot, method, poses, truth)
+        _draw(plot, name, poses, truth)
     if failure:
         print(f"mcgicp: {failure}; stopped after {len(poses)} of {len(frames)} frames", file=sys.stderr)
     if failed := sum(not result.converged for result in results):
@@ -137,12 +140,19 @@ def odometry(
     return 1 if failed or failure else 0
 
 
-def _open(dataset: DatasetName, path: Path, num_frames: int | Literal["all"]) -> AbstractFrames:
+def _open(
+    dataset: DatasetName | Path, path: Path, num_frames: int | Literal["all"], map: Path | None
+) -> AbstractFrames:
     if num_frames != "all" and num_frames < 2:
         raise ValueError(f"num_frames: expected at least 2, got {num_frames}")
-    if DATASETS[dataset].simulated:
+    if isinstance(dataset, str) and DATASETS[dataset].simulated:
         return DATASETS[dataset].frames(_FRAMES_OF_A_SCENE if num_frames == "all" else num_frames)
-    frames = DATASETS[dataset].frames(path)
+    if isinstance(dataset, str):
+        frames = DATASETS[dataset].frames(path)
+    elif dataset.is_dir():
+        frames = clouds_in(dataset, map=map)
+    else:
+        raise ValueError(f"{dataset}: expected a folder of clouds or one of {enumerated(list(DATASETS), 'or')}")
     if len(frames) < 2:
         raise ValueError(f"{path}: expected at least 2 frames, got {len(frames)}")
     return frames if num_frames == "all" else frames[:num_frames]

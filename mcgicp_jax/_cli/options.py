@@ -5,8 +5,9 @@ from __future__ import annotations
 import errno
 import inspect
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, fields
+from fnmatch import fnmatch
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeAlias, TypeVar
 
@@ -14,7 +15,7 @@ import numpy as np
 import tyro
 
 import mcgicp_jax as mcg
-from mcgicp_jax import plot
+from mcgicp_jax import datasets, plot
 from mcgicp_jax._clouds.color_spaces import COLOR_SPACES
 from mcgicp_jax._clouds.point_cloud import Voxels
 from mcgicp_jax._clouds.preprocess import check_preprocessing
@@ -43,6 +44,9 @@ def shown(metavar: str | None = None, default: str = "") -> Any:
 
 
 File: TypeAlias = Annotated[Path | None, shown("FILE")]
+Method: TypeAlias = Annotated[
+    MethodName | None, shown(f"{{{','.join(METHODS)}}}", "mc-gicp; gicp for clouds without common channels")
+]
 Start: TypeAlias = Annotated[Literal["global"] | Path | None, shown("{FILE,global}")]
 Names: TypeAlias = Annotated[tuple[str, ...], shown("NAMES", "all in common")]
 Numbers: TypeAlias = Annotated[tuple[float, ...], shown(default="from the data")]
@@ -54,6 +58,8 @@ Epsilon: TypeAlias = Annotated[
     float | None, shown("FLOAT", str(inspect.signature(mcg.GICP).parameters["epsilon"].default))
 ]
 
+# Number of files that a message lists.
+_MOST_NAMES = 5
 _RGB = ("red", "green", "blue")
 # Parameters of methods that have an option.
 _PARAMETERS = ("channel_covariance", "channel_weights", "epsilon")
@@ -197,15 +203,42 @@ def check_inputs(*clouds: Path) -> None:
         path.stat()
 
 
-def files_of(folder: Path, glob: str, *others: Path | None) -> list[Path]:
-    """The files of a folder in order of name, without hidden ones, such as the temporary files of a killed process.
+def clouds_in(folder: Path, glob: str = "*", map: File = None) -> datasets.CloudFiles:
+    """The clouds of a folder; `map`, a cloud that the command writes, may not become one of them."""
+    if map is not None and map.resolve().parent == folder.resolve() and fnmatch(map.name, glob):
+        raise ValueError(f"{map}: expected a map outside of {folder}, where it would be one of the clouds")
+    found = datasets.clouds(folder, glob)
+    if len(found) < 2:
+        raise ValueError(f"{folder}: expected at least 2 clouds {glob}, found {len(found)}")
+    if found.left_out:
+        names = [path.name for path in found.left_out]
+        more = f" and {len(names) - _MOST_NAMES:,} more" if len(names) > _MOST_NAMES else ""
+        print(f"left out:  {', '.join(names[:_MOST_NAMES])}{more}, since they are no clouds")
+    return found
 
-    Args:
-        others: files of the command that are no clouds, such as its outputs.
-    """
-    known = {path.resolve() for path in others if path is not None}
-    shown = (path for path in folder.glob(glob) if path.is_file() and not path.name.startswith("."))
-    return sorted(path for path in shown if path.resolve() not in known)
+
+def choose_method(
+    given: MethodName | None, options: Options, channels: Sequence[str], clouds: Mapping[str, mcg.PointCloud]
+) -> MethodName:
+    """The method that the user gave or else suits the common channels of the clouds, which are printed."""
+    name = given or ("mc-gicp" if channels else "gicp")
+    if METHODS[name].kind.uses_channels and not channels:
+        raise ValueError(f"{name} needs channels in common, but {_having(clouds)}; use gicp instead (--method gicp)")
+    options.check(name)
+    print_channels(options, channels, clouds, "" if given or channels else " in common, therefore gicp")
+    return name
+
+
+def print_channels(
+    options: Options, channels: Sequence[str], clouds: Mapping[str, mcg.PointCloud], words: str = ""
+) -> None:
+    """Print the channels that are used, and those of each cloud if these differ."""
+    differ = not options.channels and len({cloud.channel_names for cloud in clouds.values()}) > 1
+    print(f"channels:  {listed(channels)}{words}{f' ({_having(clouds)})' if differ else ''}")
+
+
+def _having(clouds: Mapping[str, mcg.PointCloud]) -> str:
+    return ", ".join(f"{name} has {listed(cloud.channel_names)}" for name, cloud in clouds.items())
 
 
 def method_for(name: MethodName, options: Options, clouds: Callable[[], Sequence[mcg.PointCloud]]) -> AbstractMethod:

@@ -18,16 +18,18 @@ from mcgicp_jax import datasets, io, metrics, plot
 from mcgicp_jax._cli.options import (
     ADVICE,
     File,
+    Method,
     MethodName,
     PairOptions,
     check_inputs,
     check_outputs,
+    choose_method,
     common_channels,
     described_distance,
     enumerated,
-    listed,
     method_for,
     preprocessed,
+    print_channels,
     registration_for,
     voxels_of,
     with_channels,
@@ -52,15 +54,13 @@ _DEMO = ("point-to-plane", "gicp", "color-icp", "mc-gicp")
 class PreparedPair:
     """Two preprocessed clouds with the channels that they have in common."""
 
-    def __init__(self, source: Path, target: Path, options: PairOptions, *, with_cells: bool = False):
-        """Read, preprocess and print; `with_cells`: the only method matches cells, not points."""
+    def __init__(self, source: Path, target: Path, options: PairOptions):
         check_inputs(source, target)
         self.options = options
         self.start = np.eye(4) if options.init in (None, "global") else _read_pose("init", Path(options.init))
         self.raw = io.read(source), io.read(target)
-        names = [cloud.channel_names for cloud in self.raw]
+        self.files = {str(source): self.raw[0], str(target): self.raw[1]}
         self.channels = common_channels(options, *self.raw)
-        self.difference = f"{source} has {listed(names[0])}, {target} has {listed(names[1])}"
         voxels = voxels_of(self.raw, options)
         self.source, self.target = (
             _preprocess(path, cloud, self.channels, voxels, options)
@@ -70,20 +70,14 @@ class PreparedPair:
             f"{len(used):,} of {len(raw):,}" for used, raw in zip((self.source, self.target), self.raw, strict=True)
         )
         print("points:    source {}, target {} ({})".format(*counts, voxels))
-        if not with_cells:
-            print(f"matches:   up to {described_distance(options, self.target)} apart")
-        # Without common channels, `method` raises an error if the method needs any.
-        unused = self.channels and names[0] != names[1] and not options.channels
-        print(f"channels:  {listed(self.channels)}{f' ({self.difference})' if unused else ''}")
-        if options.init == "global":
+
+    def find_start(self) -> None:
+        """With `--init global`, the pose by local features becomes the initial one."""
+        if self.options.init == "global":
             self.start = _found(self.raw, self.channels)
 
     def method(self, name: MethodName) -> AbstractMethod:
         """The method with parameters from the options or else from the data."""
-        if METHODS[name].kind.uses_channels and not self.channels:
-            raise ValueError(
-                f"{name} needs channels in common, but {self.difference}; use gicp instead (--method gicp)"
-            )
         return method_for(name, self.options, lambda: (self.source, self.target)).resolve(self.source, self.target)
 
     def errors(self, pose: Float[np.ndarray, "4 4"], true_pose: Float[np.ndarray, "4 4"]) -> str:
@@ -113,7 +107,7 @@ def register(
     source: Source,
     target: Target,
     shared: PairOptions,
-    method: MethodName = "mc-gicp",
+    method: Method = None,
     output: File = None,
     aligned: File = None,
 ) -> int:
@@ -131,20 +125,24 @@ def register(
     """
     shared.check(method)
     check_outputs(output, cloud=aligned, picture=shared.plot)
-    pair = PreparedPair(source, target, shared, with_cells=bool(METHODS[method].kind.needs_covariances))
-    chosen = pair.method(method)
-    print(f"method:    {method}{_parameters(chosen)}")
-    if chosen.needs_covariances:
-        sizes = registration_for(method, shared, lambda: pair.target)["voxel_sizes"]
+    pair = PreparedPair(source, target, shared)
+    name = choose_method(method, shared, pair.channels, pair.files)
+    pair.find_start()
+    chosen = pair.method(name)
+    print(f"method:    {name}{_parameters(chosen)}")
+    if not chosen.needs_covariances:
+        print(f"matches:   up to {described_distance(shared, pair.target)} apart")
+    else:
+        sizes = registration_for(name, shared, lambda: pair.target)["voxel_sizes"]
         print(f"cells:     of {', '.join(f'{size:g}' for size in sizes)} m")
-    result = pair.register(method, chosen)
+    result = pair.register(name, chosen)
     _report(pair, result)
     if output is not None:
         io.write_poses(output, [result.matrix])
     if aligned is not None:
         io.write(aligned, pair.raw[0].transform(result.matrix))
-    pair.draw({method: result})
-    return _verdict({method: result})
+    pair.draw({name: result})
+    return _verdict({name: result})
 
 
 def compare(source: Source, target: Target, shared: PairOptions, truth: File = None) -> int:
@@ -197,6 +195,9 @@ def _compare(
 ) -> dict[MethodName, mcg.RegistrationResult]:
     true_pose = None if truth is None else _read_pose("truth", truth)
     pair = PreparedPair(source, target, options)
+    print(f"matches:   up to {described_distance(options, pair.target)} apart")
+    print_channels(options, pair.channels, pair.files)
+    pair.find_start()
     results: dict[MethodName, mcg.RegistrationResult] = {}
     measures = "inliers      rmse, m" if true_pose is None else "error, mm   error, deg"
     width = max(map(len, names))

@@ -31,11 +31,6 @@ class Table:
         self._path = path
         self._rows = path if path.suffix.lower() == ".csv" else path.with_name(f"{path.name}.csv")
 
-    @property
-    def files(self) -> tuple[Path, Path]:
-        """The files that a run writes, whether it ends or is interrupted."""
-        return self._path, self._rows
-
     def read(self) -> list[Row]:
         """Return the rows written so far."""
         rows = self._read_arrays() if self._rows != self._path and self._path.exists() else []

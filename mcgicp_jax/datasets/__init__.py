@@ -2,6 +2,7 @@
 
 from mcgicp_jax._clouds.frame import Frame
 from mcgicp_jax.datasets._box_room import box_room
+from mcgicp_jax.datasets._clouds import CloudFiles, clouds
 from mcgicp_jax.datasets._corridor import corridor
 from mcgicp_jax.datasets._ford import ford_campus
 from mcgicp_jax.datasets._frames import AbstractFrames, SyntheticFrames
@@ -15,10 +16,12 @@ from mcgicp_jax.datasets._tum_rgbd import tum_rgbd
 __all__ = [
     "DATASETS",
     "AbstractFrames",
+    "CloudFiles",
     "Dataset",
     "Frame",
     "SyntheticFrames",
     "box_room",
+    "clouds",
     "corridor",
     "ford_campus",
     "kitti",

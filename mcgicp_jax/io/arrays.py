@@ -53,9 +53,20 @@ def read_npy(file: BinaryIO, size: int) -> PointCloud:
     return PointCloud(array[:, :3], array[:, 3:])
 
 
-def _read_array(file: Any, size: int) -> Shaped[np.ndarray, "..."]:
+def is_npy_cloud(file: BinaryIO) -> bool:
+    """Whether it holds rows of numbers, and not a pose or several."""
+    shape, _ = _npy_header(file)
+    return len(shape) == 2 and shape[1] >= 3 and shape != (4, 4)
+
+
+def _npy_header(file: BinaryIO) -> tuple[tuple[int, ...], np.dtype]:
     headers = {(1, 0): npy.read_array_header_1_0, (2, 0): npy.read_array_header_2_0}
     shape, _, dtype = headers[npy.read_magic(file)](file)
+    return shape, dtype
+
+
+def _read_array(file: Any, size: int) -> Shaped[np.ndarray, "..."]:
+    shape, dtype = _npy_header(file)
     check_size(math.prod(shape) * dtype.itemsize, size)
     file.seek(0)
     return npy.read_array(file, allow_pickle=False)
@@ -89,6 +100,11 @@ def read_npz(file: BinaryIO, size: int) -> PointCloud:
         for name in [name for name in names if name.lower() in _RGB_ARRAYS]:
             columns |= dict(zip(COLORS, load(name)[:, :3].T, strict=True))
         return cloud_of(columns)
+
+
+def is_npz_cloud(file: BinaryIO) -> bool:
+    with zipfile.ZipFile(file) as archive:
+        return "points.npy" in archive.namelist()
 
 
 def write_npz(file: BinaryIO, cloud: PointCloud) -> None:

@@ -12,12 +12,21 @@ from typing import BinaryIO
 import numpy as np
 
 from mcgicp_jax._clouds.point_cloud import PointCloud
-from mcgicp_jax.io.arrays import read_kitti, read_npy, read_npz, write_kitti, write_npy, write_npz
+from mcgicp_jax.io.arrays import (
+    is_npy_cloud,
+    is_npz_cloud,
+    read_kitti,
+    read_npy,
+    read_npz,
+    write_kitti,
+    write_npy,
+    write_npz,
+)
 from mcgicp_jax.io.files import reason_of, replacing
 from mcgicp_jax.io.las import read_las, write_las
 from mcgicp_jax.io.pcd import read_pcd, write_pcd
 from mcgicp_jax.io.ply import read_ply, write_ply
-from mcgicp_jax.io.text import read_text, write_text
+from mcgicp_jax.io.text import is_text_cloud, read_text, write_text
 
 
 @dataclass(frozen=True)
@@ -27,13 +36,15 @@ class Format:
     Attributes:
         read: reads a cloud from an open file, given its size in bytes.
         write: writes a cloud without padding, with NaN for missing channels, to an open file.
+        is_cloud: whether an open file with this suffix is a cloud, for suffixes that other kinds of files have, too.
     """
 
     read: Callable[[BinaryIO, int], PointCloud]
     write: Callable[[BinaryIO, PointCloud], None]
+    is_cloud: Callable[[BinaryIO], bool] = lambda _: True
 
 
-_SPACES = Format(read_text, partial(write_text, delimiter=" ", mark="# "))
+_SPACES = Format(read_text, partial(write_text, delimiter=" ", mark="# "), is_text_cloud)
 # By lower-case suffix.
 FORMATS = {
     ".ply": Format(read_ply, write_ply),
@@ -41,11 +52,11 @@ FORMATS = {
     ".las": Format(read_las, partial(write_las, compress=False)),
     ".laz": Format(read_las, partial(write_las, compress=True)),
     ".bin": Format(read_kitti, write_kitti),
-    ".npy": Format(read_npy, write_npy),
-    ".npz": Format(read_npz, write_npz),
+    ".npy": Format(read_npy, write_npy, is_npy_cloud),
+    ".npz": Format(read_npz, write_npz, is_npz_cloud),
     ".xyz": _SPACES,
     ".txt": _SPACES,
-    ".csv": Format(read_text, partial(write_text, delimiter=",", mark="")),
+    ".csv": Format(read_text, partial(write_text, delimiter=",", mark=""), is_text_cloud),
 }
 
 
@@ -55,6 +66,15 @@ def format_of(path: Path) -> Format:
         return FORMATS[path.suffix.lower()]
     except KeyError:
         raise ValueError(f"{path}: unknown suffix {path.suffix!r}; expected one of {', '.join(FORMATS)}") from None
+
+
+def is_cloud(path: Path) -> bool:
+    """Whether a file is a cloud by its suffix and, where this is not enough, by the start of its content."""
+    known = FORMATS.get(path.suffix.lower())
+    if known is None:
+        return False
+    with open(path, "rb") as file:
+        return known.is_cloud(file)
 
 
 def read(path: str | os.PathLike[str]) -> PointCloud:

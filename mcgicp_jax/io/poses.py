@@ -9,8 +9,11 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from mcgicp_jax._math.poses import pose_matrix
+from mcgicp_jax._math.poses import pose_matrices, pose_matrix
 from mcgicp_jax.io.files import reason_of, replacing
+
+# Quaternions are commonly written with four digits.
+_UNIT_TOLERANCE = 1e-3
 
 
 def read_poses(path: str | os.PathLike[str]) -> Float[np.ndarray, "N 4 4"]:
@@ -37,6 +40,19 @@ def read_poses(path: str | os.PathLike[str]) -> Float[np.ndarray, "N 4 4"]:
     for i, pose in enumerate(poses):
         pose_matrix(pose, f"{path}: pose {i}")
     return poses
+
+
+def are_poses(lines: list[str]) -> bool:
+    """Whether lines of a text that may be a cloud are KITTI or TUM poses or a 4×4 matrix."""
+    try:
+        rows = np.loadtxt(lines, ndmin=2)
+        pose_matrices(_poses_of(rows))
+    except ValueError:
+        return False
+    # Point, normal and curvature are seven numbers like a pose, and eight with an intensity.
+    timed = rows.shape[1] == 8 and bool((np.diff(rows[:, 0]) > 0).all())
+    unit = bool((np.abs(np.linalg.norm(rows[:, -4:], axis=1) - 1) < _UNIT_TOLERANCE).all())
+    return rows.shape[1] in (4, 12) or (timed and unit)
 
 
 def _poses_of(rows: Float[np.ndarray, "R C"]) -> Float[np.ndarray, "N 4 4"]:

@@ -12,6 +12,11 @@ import numpy as np
 from mcgicp_jax._clouds.columns import COLORS, channel_name
 from mcgicp_jax._clouds.point_cloud import PointCloud
 from mcgicp_jax.io.columns import cloud_of, column_name, columns_of
+from mcgicp_jax.io.poses import are_poses
+
+# Number of lines from which poses are recognised: so many points are not in order of their first coordinate with unit
+# normals by chance.
+_MOST_LINES = 1000
 
 
 def read_text(file: BinaryIO, size: int) -> PointCloud:
@@ -28,6 +33,16 @@ def read_text(file: BinaryIO, size: int) -> PointCloud:
         integers = values.astype(np.uint8 if values.max() < 256 else np.uint16)
         columns |= dict(zip(colours, integers, strict=True))
     return cloud_of(columns)
+
+
+def is_text_cloud(file: BinaryIO) -> bool:
+    """Whether the first lines are rows of coordinates, and not of poses, a log or another table."""
+    with io.TextIOWrapper(file, "utf-8-sig") as text:
+        try:
+            names, line, cells = _text_start(text)
+        except ValueError:
+            return False
+        return len(cells) >= 3 and (bool(names) or not are_poses([line, *itertools.islice(text, _MOST_LINES)]))
 
 
 def _text_start(text: io.TextIOWrapper) -> tuple[list[str], str, list[str]]:
