@@ -4,9 +4,10 @@ import copy
 import multiprocessing
 import os
 import pickle
+import re
 import threading
 import warnings
-from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
+from concurrent.futures import Executor, Future, ProcessPoolExecutor, ThreadPoolExecutor
 from functools import partial
 
 import jax
@@ -170,6 +171,29 @@ def test_functions_that_make_clouds_are_called_by_the_workers(raw, alone):
     assert results[1].status is Status.INVALID_INPUT
     assert threading.main_thread() not in threads and len(threads) == len(raw) - 1
     assert_same(results[2:], alone[2:])
+
+
+def test_any_error_of_a_function_is_the_reason_of_its_pair(raw, alone):
+    calls = []
+
+    def broken():
+        calls.append(None)
+        return {}["scan"]
+
+    class OtherProcesses(Executor):
+        def submit(self, function, chunk):
+            future = Future()
+            future.set_result(function(chunk))
+            return future
+
+    sources, targets = prepared(raw)
+    for executor in (None, OtherProcesses()):
+        reason = rf"pair 1: source: KeyError: 'scan' \({re.escape(__file__)}, line \d+\)"
+        with pytest.warns(mcg.PairWarning, match=reason) as caught:
+            results = batch([sources[0], broken, *sources[2:]], targets, executor=executor)
+        assert len(caught) == len(calls) == 1 and results[1].status is Status.INVALID_INPUT
+        assert_same(results[:1] + results[2:], alone[:1] + alone[2:])
+        calls.clear()
 
 
 def test_results_come_as_they_finish(raw):

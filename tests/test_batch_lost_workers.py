@@ -36,7 +36,7 @@ class Unlucky(Executor):
 
 def test_a_worker_that_dies_costs_a_retry(raw, alone):
     executor = Unlucky(deadly=2, times=1)
-    with pytest.warns(UserWarning, match=r"pairs 0, 1, 2, 3, 4, 5 failed \(BrokenExecutor: a worker died\)"):
+    with pytest.warns(UserWarning, match=r"a worker failed \(BrokenExecutor: a worker died\)"):
         results = batch(*prepared(raw), executor=executor)
     assert_same(results, alone)
     assert executor.sent == [[0, 1, 2, 3, 4, 5], [0], [1], [2], [3], [4], [5]]
@@ -44,11 +44,26 @@ def test_a_worker_that_dies_costs_a_retry(raw, alone):
 
 def test_a_pair_that_kills_its_workers_is_given_up_alone(raw, alone):
     with pytest.warns(UserWarning, match="pair 2: its worker failed twice"), warnings.catch_warnings():
-        warnings.filterwarnings("ignore", "the worker of the pairs")
+        warnings.filterwarnings("ignore", "a worker failed")
         results = batch(*prepared(raw), executor=Unlucky(deadly=2, times=9))
     assert results[2].status is Status.WORKER_FAILED
     del results[2]
     assert_same(results, alone[:2] + alone[3:])
+
+
+def test_a_worker_that_dies_causes_one_warning(raw, alone):
+    """As in a pool, the chunks of other workers fail with it."""
+
+    class Pool(Unlucky):
+        def submit(self, function, chunk):
+            self.deadly = chunk[0].index
+            return super().submit(function, chunk)
+
+    sources, targets = prepared(raw)
+    with pytest.warns(UserWarning) as caught:
+        results = batch(4 * sources, 4 * targets, executor=Pool(deadly=0, times=3))
+    assert_same(results, 4 * alone)
+    assert len(caught) == 1
 
 
 def die(marker):

@@ -133,6 +133,27 @@ def test_pairs_that_fail_have_messages_of_their_own(folder, tmp_path, capsys):
     assert "3 of 4 pairs did not converge" in errors
 
 
+def test_a_pair_from_several_starts(folder, tmp_path, capsys):
+    """Rows are in the order of the pairs, which tells the starts apart; a start that is added is run alone."""
+    starts = [motion((50.0, 0, 0, 0, 0, 0)), np.eye(4), pose(1)]
+    header = ("source", "target", *POSE)
+    lines = [["scan_1.ply", "scan_0.ply", *start[:3].ravel()] for start in starts]
+    expected = ["too_few_correspondences", "converged", "converged"]
+    for output in ("results.csv", "results.npz"):
+        for rows, done in ((lines[::2], 0), (lines, 2)):
+            command = ["batch", write_pairs(tmp_path / "pairs.csv", rows, header), "--output", str(tmp_path / output)]
+            for scan in ("scan_0.ply", "scan_1.ply"):
+                shutil.copy2(folder / scan, tmp_path)
+            assert main([*command, *OPTIONS]) == 1
+            text = capsys.readouterr().out
+            assert "outdated" not in text and (f"of which {done}" in text) == bool(done)
+        if output.endswith("csv"):
+            assert [row["status"] for row in table(tmp_path / output)] == expected
+        else:
+            with np.load(tmp_path / output) as arrays:
+                assert arrays["status"].tolist() == expected
+
+
 @pytest.mark.parametrize(
     ("content", "message"),
     [

@@ -12,7 +12,7 @@ import sys
 import threading
 import time
 import warnings
-from collections.abc import Generator, Iterator, Sequence
+from collections.abc import Generator, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -42,7 +42,7 @@ from mcgicp_jax._cli.options import (
     with_channels,
     with_names,
 )
-from mcgicp_jax._cli.table import COLUMNS, POSE, Row, Table, pose_of
+from mcgicp_jax._cli.table import COLUMNS, POSE, Key, Row, Table, key_of, pose_of
 
 Pairs: TypeAlias = Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="PAIRS")]
 
@@ -58,10 +58,6 @@ class FilePair:
     target: str
     init: Float[np.ndarray, "4 4"] | None = None
 
-    @property
-    def key(self) -> tuple[str, str]:
-        return self.source, self.target
-
     def paths(self) -> tuple[Path, Path]:
         return self.folder / self.source, self.folder / self.target
 
@@ -71,16 +67,16 @@ def batch(pairs: Pairs, output: Path, method: Method = None, glob: str = "*", *,
     """Register many pairs of clouds and write a table of their poses T_target_source.
 
     PAIRS is a CSV file or a folder. The CSV file has the columns source and target, with paths relative to its folder,
-    and optionally m00 m01 ... m23, the upper three rows of the initial pose. In a folder, each cloud is registered to
-    the one before it in order of name; files that are no clouds are left out. To resume after Ctrl-C, or to add pairs,
-    run the same command again: it skips pairs in the table whose files and options are unchanged. The exit code is 0
-    only if all pairs converged.
+    and optionally m00 m01 ... m23, the upper three rows of the initial pose; a pair may occur with several initial
+    poses. In a folder, each cloud is registered to the one before it in order of name; files that are no clouds are
+    left out. To resume after Ctrl-C, or to add pairs, run the same command again: it skips pairs in the table whose
+    files and options are unchanged. The exit code is 0 only if all pairs converged.
 
     Args:
         pairs: CSV file or folder.
-        output: Table to write or to resume, .csv or .npz, a row per pair: source, target, status, iterations, inliers,
-            cost, rmse, the upper three rows of the pose, the reason if it could not be registered, and a fingerprint
-            of files and options.
+        output: Table to write or to resume, .csv or .npz. A row per pair, at the end in the order of PAIRS: source,
+            target, status, iterations, inliers, cost, rmse, the upper three rows of the pose, the reason if it could
+            not be registered, and a fingerprint of files and options.
         method: {channel_methods} use channels (intensity, colours, ...), the others geometry alone.
         glob: Pattern for the files of a folder, such as "*.ply".
     """
@@ -88,19 +84,23 @@ def batch(pairs: Pairs, output: Path, method: Method = None, glob: str = "*", *,
     check_outputs(output)
     table = Table(output)
     everything = _pairs_of_folder(pairs, glob) if pairs.is_dir() else _pairs_of_table(pairs)
-    rows = {(row["source"], row["target"]): row for row in table.read()}
+    rows = {key_of(row): row for row in table.read()}
     settings = _settings(everything, method, shared)
-    known = [pair for pair in everything if pair.key in rows]
-    outdated = [pair.key for pair in known if rows[pair.key]["fingerprint"] != _fingerprint(pair, settings)]
+    wanted: dict[Key, FilePair] = {
+        (pair.source, pair.target, _fingerprint(pair, settings)): pair for pair in everything
+    }
+    names = {key[:2] for key in wanted}
+    outdated = {key for key in rows if key[:2] in names and key not in wanted}
     if outdated:
-        print(f"outdated:  {len(outdated):,} in {output} with other options or files; registered again")
-        rows = {key: row for key, row in rows.items() if key not in set(outdated)}
-    missing = [pair for pair in everything if pair.key not in rows]
-    finished = len(everything) - len(missing)
-    print(f"pairs:     {len(everything):,}" + (f", of which {finished:,} are in {output}" if finished else ""))
+        print(f"outdated:  {len(outdated):,} in {output} with other options, starts or files; registered again")
+        rows = {key: row for key, row in rows.items() if key not in outdated}
+    missing = {key: pair for key, pair in wanted.items() if key not in rows}
+    finished = len(wanted) - len(missing)
+    print(f"pairs:     {len(wanted):,}" + (f", of which {finished:,} are in {output}" if finished else ""))
     interrupted = bool(missing) and _register_missing(missing, settings, table, rows, finished)
+    rows = {key: rows[key] for key in wanted if key in rows} | rows
     table.finish(list(rows.values()))
-    counts = collections.Counter(rows[pair.key]["status"] for pair in everything if pair.key in rows)
+    counts = collections.Counter(rows[key]["status"] for key in wanted if key in rows)
     print("status:    " + ", ".join(f"{count:,} {name}" for name, count in counts.most_common()))
     if interrupted:
         print("mcgicp: interrupted; run the same command again to continue", file=sys.stderr)
@@ -112,7 +112,7 @@ def batch(pairs: Pairs, output: Path, method: Method = None, glob: str = "*", *,
 
 
 def _register_missing(
-    pairs: Sequence[FilePair], settings: dict[str, Any], table: Table, rows: dict[tuple[str, str], Row], finished: int
+    pairs: Mapping[Key, FilePair], settings: dict[str, Any], table: Table, rows: dict[Key, Row], finished: int
 ) -> bool:
     """Register pairs, adding their rows to the table and to `rows`; return whether Ctrl-C stopped it."""
     interrupted, begin = False, time.perf_counter()
@@ -123,15 +123,15 @@ def _register_missing(
         _interrupts() as pressed,
     ):
         try:
-            for pair, row in completed:
+            for row in completed:
                 append(row)
-                rows[pair.key] = row
+                rows[key_of(row)] = row
                 bar.update()
                 if pressed:
                     raise KeyboardInterrupt
         except KeyboardInterrupt:
             interrupted = True
-    done = sum(pair.key in rows for pair in pairs)
+    done = sum(key in rows for key in pairs)
     print(f"done:      {done:,} of {len(pairs):,}, {done / (time.perf_counter() - begin):.3g} pairs per second")
     return interrupted
 
@@ -192,9 +192,11 @@ def _pairs_of_folder(folder: Path, glob: str) -> list[FilePair]:
 def _checked(path: Path, pairs: list[FilePair]) -> list[FilePair]:
     if not pairs:
         raise ValueError(f"{path}: expected pairs of clouds, got none")
-    repeated = [key for key, count in collections.Counter(pair.key for pair in pairs).items() if count > 1]
+    keys = [(pair.source, pair.target, None if pair.init is None else pair.init.tobytes()) for pair in pairs]
+    repeated = [key for key, count in collections.Counter(keys).items() if count > 1]
     if repeated:
-        raise ValueError(f"{path}: expected each pair once, got {' '.join(repeated[0])} several times")
+        names = " ".join(repeated[0][:2])
+        raise ValueError(f"{path}: expected each pair once from each initial pose, got {names} several times")
     return pairs
 
 
@@ -210,7 +212,7 @@ def _settings(pairs: Sequence[FilePair], method: Method, options: Options) -> di
     else:
         raise reason
     names = common_channels(options, *clouds)
-    name = choose_method(method, options, names, dict(zip(pair.key, clouds, strict=True)))
+    name = choose_method(method, options, names, dict(zip((pair.source, pair.target), clouds, strict=True)))
     voxels = voxels_of(clouds, options)
     print(f"points:    {voxels}")
 
@@ -233,31 +235,28 @@ def _fingerprint(pair: FilePair, settings: dict[str, Any]) -> str:
     return hashlib.sha256(repr((sorted(settings.items(), key=str), numbers, files, start)).encode()).hexdigest()[:16]
 
 
-def _rows(
-    pairs: Sequence[FilePair], settings: dict[str, Any], bar: tqdm
-) -> Generator[tuple[FilePair, Row], None, None]:
-    """Yield each pair and its row as it finishes. Reasons for failure go into the row and to stderr."""
-    reasons: dict[int, str] = {}
+def _rows(pairs: Mapping[Key, FilePair], settings: dict[str, Any], bar: tqdm) -> Generator[Row, None, None]:
+    """Yield the row of each pair as it finishes. Reasons for failure go into the row and to stderr."""
+    keys, reasons = list(pairs), dict[int, str]()
     show = warnings.showwarning
 
     def keep(message: Warning | str, *rest: Any, **options: Any) -> None:
         if isinstance(message, mcg.PairWarning) and message.index is not None:
             reasons[message.index] = message.reason
-            message = f"{' '.join(pairs[message.index].key)}: {message.reason}"
+            message = f"{' '.join(keys[message.index][:2])}: {message.reason}"
         with bar.external_write_mode(file=sys.stderr):
             show(message, *rest, **options)
 
     arguments = settings.copy()
     method, names = arguments.pop("method"), arguments.pop("channels")
-    sources, targets = ([partial(_read, pair.paths()[side], names) for pair in pairs] for side in (0, 1))
-    starts = [pair.init for pair in pairs]
+    sources, targets = ([partial(_read, pair.paths()[side], names) for pair in pairs.values()] for side in (0, 1))
+    starts = [pair.init for pair in pairs.values()]
     completed = mcg.register_as_completed(sources, targets, method, init=starts, **arguments)
     with warnings.catch_warnings(), contextlib.closing(completed):
         warnings.simplefilter("always", mcg.PairWarning)
         warnings.showwarning = keep
         for index, result in completed:
-            pair = pairs[index]
-            yield pair, _row(pair, result, reasons.pop(index, ""), _fingerprint(pair, settings))
+            yield _row(keys[index], result, reasons.pop(index, ""))
 
 
 def _read(path: Path, channels: Sequence[str]) -> mcg.PointCloud:
@@ -267,10 +266,11 @@ def _read(path: Path, channels: Sequence[str]) -> mcg.PointCloud:
         raise error if str(path) in str(error) else ValueError(f"{path}: {error}") from error
 
 
-def _row(pair: FilePair, result: mcg.RegistrationResult, reason: str, fingerprint: str) -> Row:
+def _row(key: Key, result: mcg.RegistrationResult, reason: str) -> Row:
     numbers = (result.num_iterations, result.num_inliers, result.cost, result.rmse, *result.matrix[:3].ravel())
     values = (np.asarray(number).item() for number in numbers)
-    texts = (*pair.key, _word(result.status), *map(repr, values), " ".join(reason.split()), fingerprint)
+    source, target, fingerprint = key
+    texts = (source, target, _word(result.status), *map(repr, values), " ".join(reason.split()), fingerprint)
     return dict(zip(COLUMNS, texts, strict=True))
 
 

@@ -15,6 +15,8 @@ from jaxtyping import Float
 from mcgicp_jax.io.files import replacing
 
 Row: TypeAlias = dict[str, str]
+# Source, target and fingerprint.
+Key: TypeAlias = tuple[str, str, str]
 
 # Columns of the upper three rows of the pose matrix
 POSE = tuple(f"m{row}{column}" for row in range(3) for column in range(4))
@@ -39,8 +41,7 @@ class Table:
     @contextlib.contextmanager
     def appending(self, rows: Iterable[Row]) -> Iterator[Callable[[Row], None]]:
         """Replace all rows, and yield a function that appends one more and flushes it to the file."""
-        with replacing(self._rows) as start:
-            start.write((",".join(COLUMNS) + "\n" + "".join(map(_line, rows))).encode())
+        self._write_rows(rows)
         if self._rows != self._path:
             self._path.unlink(missing_ok=True)
         with open(self._rows, "ab", buffering=0) as file:
@@ -51,8 +52,9 @@ class Table:
             yield append
 
     def finish(self, rows: Sequence[Row]) -> None:
-        """Write the arrays of an .npz in the order of `rows`; a .csv is complete already."""
+        """Write all rows in this order."""
         if self._rows == self._path or not rows:
+            self._write_rows(rows)
             return
         arrays: dict[str, Any] = {name: np.array([row[name] for row in rows]) for name in _TEXTS}
         arrays |= {name: np.array([float(row[name]) for row in rows]) for name in ("cost", "rmse")}
@@ -61,6 +63,10 @@ class Table:
         with replacing(self._path) as file:
             np.savez_compressed(file, **arrays)
         self._rows.unlink(missing_ok=True)
+
+    def _write_rows(self, rows: Iterable[Row]) -> None:
+        with replacing(self._rows) as file:
+            file.write((",".join(COLUMNS) + "\n" + "".join(map(_line, rows))).encode())
 
     def _read_rows(self) -> list[Row]:
         with open(self._rows, newline="", encoding="utf-8") as file:
@@ -80,6 +86,10 @@ class Table:
         columns |= {name: poses[:, i // 4, i % 4].tolist() for i, name in enumerate(POSE)}
         rows = zip(*(columns[name] for name in COLUMNS), strict=True)
         return [dict(zip(COLUMNS, map(str, row), strict=True)) for row in rows]
+
+
+def key_of(row: Row) -> Key:
+    return row["source"], row["target"], row["fingerprint"]
 
 
 def pose_of(row: Row) -> Float[np.ndarray, "4 4"]:

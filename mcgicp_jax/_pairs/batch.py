@@ -66,8 +66,8 @@ def register_as_completed(
     """Register many pairs of clouds of any sizes and yield each result as soon as it is computed.
 
     Pairs are independent: a result is bitwise the same for any other pairs, any order and any number of workers, and a
-    slow pair does not delay others. Invalid pairs (too few finite points, mismatched channels, unreadable file)
-    get the status `INVALID_INPUT` and a warning. Iterators are consumed lazily.
+    slow pair does not delay others. Invalid pairs (too few finite points, mismatched channels, unreadable file, a
+    function that raises) get the status `INVALID_INPUT` and a warning. Iterators are consumed lazily.
 
     Args:
         sources, targets: iterables of equal length, of clouds from `preprocess`, raw clouds or (N, 3) arrays, metres;

@@ -121,9 +121,9 @@ class ChunkedExecutor:
             try:
                 results = future.result()
             except Exception as error:
-                numbers = ", ".join(str(pair.index) for pair in chunk)
-                message = f"the worker of the pairs {numbers} failed ({_words(error)}); they are submitted again"
-                warn(message)
+                # A worker that dies breaks its pool, and so all chunks that were submitted.
+                if not self._suspects:
+                    warn(f"a worker failed ({_words(error)}); its pairs are submitted again, one by one, at the end")
                 self._suspects.extend(chunk)
             else:
                 yield from map(PairResult.with_warning, results)

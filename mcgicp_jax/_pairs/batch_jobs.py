@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import collections
 import functools
+import traceback
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Executor, Future, ThreadPoolExecutor
 from dataclasses import dataclass, replace
@@ -136,7 +137,7 @@ class BatchJob:
         sides = dict[str, PointCloud]()
         for name, cloud in clouds.items():
             with messages_named(name):
-                given: Any = cloud() if callable(cloud) and not isinstance(cloud, PointCloud) else cloud
+                given: Any = _loaded(cloud) if callable(cloud) and not isinstance(cloud, PointCloud) else cloud
                 sides[name] = given if isinstance(given, PointCloud) else PointCloud(given)
         options = replace(self.options, search=self.search)
         return preprocessed(sides, self.method, options, self.voxel_size, self.num_neighbors)
@@ -232,6 +233,18 @@ class BatchJob:
         few = self.options.max_source_points
         sizes = size if few is None else min(size, size_class(few)), size
         return _LanePair(pair.index, source, target, used), _padded(problem.whole(), sizes)
+
+
+def _loaded(load: Callable[[], PointCloud | Values]) -> PointCloud | Values:
+    """The cloud that a function returns; any error of it becomes a `ValueError` that says where it was raised."""
+    try:
+        return load()
+    except (ValueError, OSError):
+        raise
+    except Exception as error:
+        place = traceback.extract_tb(error.__traceback__)[-1]
+        reason = f"{type(error).__name__}: {error}".rstrip(": ")
+        raise ValueError(f"{reason} ({place.filename}, line {place.lineno})") from error
 
 
 def _padded(problem: Problem, sizes: tuple[int, int]) -> Problem:
