@@ -143,7 +143,8 @@ def agreement(
     along: then the gradients agree where it has not moved. Such a pattern (of beams, ranges, angles of incidence) has
     its gradients along the lines of sight, a texture has them in all directions. With the unit tangent t across the
     line of sight, the surplus is ((t·g) (t·h) − g·h / 4) t tᵀ / (1 + tr A): positive, g·h / 4, on average over all
-    directions of the gradients, and negative for the pattern.
+    directions of the gradients, and negative for the pattern. A texture as strong as the pattern hides it, even if its
+    gradients lie across the motion.
 
     Args:
         tangent: t, or 0 where it is unknown.
