@@ -2,6 +2,7 @@
 
 import inspect
 
+import jax
 import numpy as np
 import pytest
 
@@ -43,3 +44,30 @@ def test_frequent_mistakes_are_named():
     # The check of annotations, which tests may have, would refuse a class first.
     with pytest.raises(ValueError, match=r"method: expected GICP\(\), got the class GICP"):
         inspect.unwrap(check_method)(mcg.GICP)
+
+
+def test_swapped_arguments_are_named():
+    cloud = mcg.preprocess(np.random.default_rng(0).normal(size=(50, 3)))
+    matches = mcg.find_correspondences(cloud, cloud, None, mcg.GICP(), max_distance=1.0)
+    with pytest.raises(ValueError, match=r"matches: expected the result of find_correspondences, got .*order"):
+        mcg.mahalanobis_cost(cloud, cloud, np.eye(4), cloud, mcg.GICP())
+    with pytest.raises(ValueError, match=r"pose: expected a jaxlie\.SE3"):
+        mcg.mahalanobis_cost(cloud, cloud, cloud, matches, mcg.GICP())
+    with pytest.raises(ValueError, match="num_candidates: expected an integer"):
+        mcg.D2DNDT(num_candidates=True)
+
+
+def test_poses_with_rounding_in_the_last_row_and_of_three_rows():
+    cloud = mcg.preprocess(np.random.default_rng(0).normal(size=(50, 3)))
+    pose = np.eye(4)
+    pose[:3, 3] = 0.01
+    expected = mcg.register(cloud, cloud, mcg.GICP(), init=pose).matrix
+    rounded = pose.copy()
+    rounded[3] += [1e-17, -1e-17, 0, 2e-16]
+    for given in (rounded, pose[:3]):
+        np.testing.assert_array_equal(mcg.register(cloud, cloud, mcg.GICP(), init=given).matrix, expected)
+    matches = mcg.find_correspondences(cloud, cloud, pose, mcg.GICP(), max_distance=1.0)
+    inside = jax.jit(lambda pose: mcg.mahalanobis_cost(pose, cloud, cloud, matches, mcg.PointToPoint()))(pose[:3])
+    np.testing.assert_allclose(inside, mcg.mahalanobis_cost(pose, cloud, cloud, matches, mcg.PointToPoint()), rtol=1e-5)
+    with pytest.raises(ValueError, match="init: expected a rigid motion"):
+        mcg.register(cloud, cloud, mcg.GICP(), init=pose + 1e-3 * np.eye(4)[3:])

@@ -15,7 +15,7 @@ def check_positive(name: str, value: Any, expected: str = "a positive number") -
 
 
 def check_integer(name: str, value: Any, minimum: int) -> None:
-    if not isinstance(value, int | np.integer) or value < minimum:
+    if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < minimum:
         raise ValueError(f"{name}: expected an integer of at least {minimum}, got {value!r}")
 
 

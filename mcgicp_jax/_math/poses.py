@@ -27,6 +27,8 @@ else:
 
 # Tolerance on the largest entry of R Rᵀ − I: a matrix typed with four digits still counts as a rotation.
 _ROTATION_TOLERANCE = 1e-3
+# Tolerance on the last row, which rounding may change, as in products of matrices.
+_LAST_ROW_TOLERANCE = 1e-9
 # The same of a rotation that is exact to rounding.
 _EXACT = 1e-14
 # Largest displacement, in radii of the cloud, that rounding of R may cause for a cloud far from the origin.
@@ -41,7 +43,7 @@ def pose_matrix(
     The rotation of a concrete matrix is replaced by the nearest exact one, so that the pose does not scale the cloud.
 
     Args:
-        pose: `jaxlie.SE3` or (4, 4) matrix; None is the identity.
+        pose: `jaxlie.SE3`, (4, 4) matrix, or its first three rows; None is the identity.
         name: name of the argument, for error messages.
         distance: distance of the cloud that the pose will move from the origin, in radii of that cloud.
 
@@ -53,20 +55,23 @@ def pose_matrix(
         return np.eye(4)
     matrix = pose.as_matrix() if isinstance(pose, jaxlie.SE3) else pose
     if not is_concrete(matrix):
-        if matrix.shape != (4, 4):
+        if matrix.shape not in ((4, 4), (3, 4)):
             raise ValueError(f"{name}: expected a jaxlie.SE3 or a (4, 4) matrix, got shape {matrix.shape}")
-        return matrix
+        return matrix if len(matrix) == 4 else jnp.concatenate([matrix, jnp.eye(4, dtype=matrix.dtype)[3:]])
     try:
         matrix = np.asarray(matrix, dtype=np.float64)
     except (TypeError, ValueError) as error:
         raise ValueError(f"{name}: expected a jaxlie.SE3 or a (4, 4) matrix, got {type(pose).__name__}") from error
+    if matrix.shape == (3, 4):
+        matrix = np.concatenate([matrix, np.eye(4)[3:]])
     if matrix.shape != (4, 4):
         raise ValueError(f"{name}: expected a jaxlie.SE3 or a (4, 4) matrix, got shape {matrix.shape}")
     rotation = matrix[:3, :3]
     off = np.abs(rotation @ rotation.T - np.eye(3)).max()
     # Written so that NaN fails as well.
     rigid = off <= _ROTATION_TOLERANCE and np.linalg.det(rotation) > 0
-    if not (rigid and np.isfinite(matrix).all() and np.array_equal(matrix[3], [0.0, 0.0, 0.0, 1.0])):
+    last = np.abs(matrix[3] - [0.0, 0.0, 0.0, 1.0]).max()
+    if not (rigid and np.isfinite(matrix).all() and last <= _LAST_ROW_TOLERANCE):
         raise ValueError(
             f"{name}: expected a rigid motion (rotation of determinant 1, last row 0 0 0 1), got\n{matrix}"
         )
@@ -75,6 +80,8 @@ def pose_matrix(
             f"{name}: expected a rotation with more digits: R Rᵀ differs from the identity by {off:.1g}, which "
             f"displaces a cloud so far from the origin by {off * distance:.1g} of its radius"
         )
+    if last > 0:
+        matrix = np.concatenate([matrix[:3], np.eye(4)[3:]])
     return nearest_rotation(matrix)
 
 

@@ -69,6 +69,9 @@ def check_matches(
 ) -> None:
     """Raise `ValueError` unless there is one match per source row, or several with a positive `temperature` or for a
     method that uses several."""
+    if not isinstance(matches, Correspondences):
+        kind = type(matches).__name__
+        raise ValueError(f"matches: expected the result of find_correspondences, got {kind}; is the order right?")
     rows = source.points.shape[0]
     if matches.indices.ndim > 2 or matches.indices.shape[-1] != rows:
         raise ValueError(f"matches: expected one per source row ({rows}), got shape {matches.indices.shape}")
