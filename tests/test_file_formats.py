@@ -351,6 +351,20 @@ def test_pcd_padding_and_vectors_are_no_channels(tmp_path):
     np.testing.assert_array_equal(cloud.channels, [[7], [8]])
 
 
+@pytest.mark.parametrize("version", [".5", ".6"])
+@pytest.mark.parametrize("counts", ["COUNT 1 1 1\n", ""])
+def test_pcd_of_old_versions(tmp_path, version, counts):
+    """As PCL's own `bun4.pcd`: no viewpoint."""
+    points = np.arange(12, dtype=np.float32).reshape(4, 3)
+    header = f"# .PCD v{version}\nVERSION {version}\nFIELDS x y z\nSIZE 4 4 4\nTYPE F F F\n{counts}"
+    header += "WIDTH 4\nHEIGHT 1\nPOINTS 4\n"
+    text, binary = tmp_path / "text.pcd", tmp_path / "binary.pcd"
+    text.write_text(header + "DATA ascii\n" + "\n".join(" ".join(map(str, row)) for row in points) + "\n")
+    binary.write_bytes(header.encode() + b"DATA binary\n" + points.tobytes())
+    for file in (text, binary):
+        np.testing.assert_array_equal(io.read(file).points, points)
+
+
 def test_pcd_text_with_any_white_space(tmp_path):
     header = (
         "FIELDS x y z i _\nSIZE 4 4 4 4 1\nTYPE F F F F U\nCOUNT 1 1 1 1 1\nWIDTH 2\nHEIGHT 1\nPOINTS 2\nDATA ascii\n"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import struct
 from typing import BinaryIO
 
@@ -18,7 +19,7 @@ _LZF_RATIO = 100
 
 def read_pcd(file: BinaryIO, size: int) -> PointCloud:
     pypcd4 = optional_module("pypcd4", "reading .pcd")
-    metadata = pypcd4.MetaData.parse_header(_pcd_header(file))
+    metadata, start = pypcd4.MetaData.parse_header(_pcd_header(file)), file.tell()
     if metadata.points == 0:
         raise ValueError("it has no points")
     widths = [width * count for width, count in zip(metadata.size, metadata.count, strict=True)]
@@ -31,8 +32,9 @@ def read_pcd(file: BinaryIO, size: int) -> PointCloud:
             check_size(metadata.points * sum(widths), size - file.tell())
         else:
             _check_lzf(file, metadata.points * sum(widths), size)
-        file.seek(0)
-        rows = pypcd4.PointCloud.from_fileobj(file).pc_data
+        file.seek(start)
+        # With a header of today's version.
+        rows = pypcd4.PointCloud.from_fileobj(io.BytesIO(metadata.compose_header().encode() + file.read())).pc_data
     if len(rows) != metadata.points:
         raise ValueError(f"the header claims {metadata.points} points, the file has {len(rows)}")
     # pypcd4 names padding fields "#" plus a random suffix, and renames fields with several values per point.
@@ -41,14 +43,18 @@ def read_pcd(file: BinaryIO, size: int) -> PointCloud:
 
 
 def _pcd_header(file: BinaryIO) -> list[str]:
-    """The header lines in the form that pypcd4 parses: at most ten, without comments."""
+    """The header lines in the form that pypcd4 parses: at most ten, without comments. Versions .5 and .6 differ from .7
+    in what they may omit: the viewpoint and, in some files, the counts."""
     lines: list[str] = []
     while len(lines) < 10 and not (lines and lines[-1].startswith("DATA")):
         line = file.readline()
         if not line:
             raise ValueError("no complete PCD header")
         lines += [text for text in [line.decode().strip()] if text and not text.startswith("#")]
-    return lines
+    lines = [line for line in lines if not line.startswith("VERSION")]
+    fields = next((line for line in lines if line.startswith("FIELDS")), "")
+    counted = any(line.startswith("COUNT") for line in lines)
+    return lines if counted else [*lines, "COUNT" + " 1" * len(fields.split()[1:])]
 
 
 def _check_lzf(file: BinaryIO, claimed: int, size: int) -> None:
