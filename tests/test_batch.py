@@ -319,3 +319,10 @@ def test_a_batch_starts_from_anywhere(search):
         mcg.register_batch(sources, frames[0].cloud, mcg.GICP(), init="local")
     with pytest.warns(mcg.PairWarning, match=r'pair 0: init: expected a pose, "global" or None, got'):
         mcg.register_batch(sources[:1], frames[0].cloud, mcg.GICP(), init=["local"])
+
+
+def test_one_structured_cloud_for_many():
+    points = np.random.default_rng(0).normal(size=(60, 3))
+    table = np.rec.fromarrays(points.T, names="x,y,z")
+    results = mcg.register_batch([points + 0.01, points - 0.01], table, mcg.PointToPoint())
+    assert len(results) == 2 and all(result.num_inliers == 60 for result in results)

@@ -438,3 +438,36 @@ def test_clouds_of_other_libraries_are_taken(tmp_path):
         PointCloud(points, points[:, :2], channel_names="ab")
     with pytest.raises(ValueError, match=r"^source: points: expected coordinates, got a path"):
         register("scan.ply", points, GICP())
+
+
+def test_tables_with_named_columns_and_clouds_of_tensors():
+    """Stand-ins with the members that pandas and Open3D have."""
+    rng = np.random.default_rng(0)
+    points, colors = rng.normal(size=(5, 3)).astype(np.float32), rng.integers(0, 256, (5, 3)).astype(np.uint8)
+
+    class Table:
+        def to_records(self, index):
+            assert not index
+            return np.rec.fromarrays([*points.T, colors[:, 0] / 255], names="x,y,z,intensity")
+
+    cloud = PointCloud(Table())
+    assert cloud.channel_names == ("intensity",)
+    np.testing.assert_array_equal(cloud.points, points)
+
+    class Tensor:
+        def __init__(self, array):
+            self.numpy = lambda: array
+
+    class Attributes(dict):
+        __getattr__ = dict.__getitem__
+
+    class Tensors:
+        point = Attributes(positions=Tensor(points), colors=Tensor(colors))
+
+    cloud = PointCloud(Tensors())
+    assert cloud.channel_names == ("red", "green", "blue")
+    np.testing.assert_allclose(cloud.channels, colors / 255, rtol=1e-6)
+    del Tensors.point["colors"]
+    assert PointCloud(Tensors()).channels.shape == (5, 0)
+    with pytest.raises(ValueError, match=r"got \(2, 4, 3\); pass points.reshape\(-1, 3\)"):
+        PointCloud(np.zeros((2, 4, 3)))

@@ -13,15 +13,24 @@ from mcgicp_jax._clouds.columns import COLORS, arrays_of_columns, with_unpacked_
 
 
 def arrays_of(points: Any) -> tuple[Any, Any, Sequence[str] | None]:
-    """Points, channels and their names: of a structured array with the fields x, y and z, whose other numbers become
-    channels as in files, or of an object with `points` and perhaps `colors`, as in Open3D. Anything else is returned as
-    it is.
+    """Points, channels and their names: of a structured array or a table of pandas with the columns x, y and z, whose
+    other numbers become channels as in files, or of a cloud of Open3D, also of tensors. Anything else is returned as it
+    is.
 
     Raises:
         ValueError: if it is a path, a `PointCloud`, an object without points, or a structured array with masked fields.
     """
     if isinstance(points, str | os.PathLike):
         raise ValueError(f"points: expected coordinates, got a path; mcgicp_jax.io.read({str(points)!r}) reads a file")
+    if hasattr(points, "to_records"):
+        # A table of pandas with named columns.
+        points = points.to_records(index=False)
+    if hasattr(points, "point") and hasattr(points.point, "positions"):
+        # A cloud of Open3D's tensors.
+        colors = points.point.colors.numpy() if "colors" in points.point else None
+        scale = 255 if colors is not None and colors.dtype == np.uint8 else 1
+        colors = None if colors is None else colors / np.float32(scale)
+        return points.point.positions.numpy(), colors, None if colors is None else COLORS
     fields = getattr(getattr(points, "dtype", None), "names", None)
     if fields is not None:
         if not {"x", "y", "z"} <= {field.lower() for field in fields}:

@@ -59,6 +59,8 @@ def _advice(shape: tuple[int, ...]) -> str:
     """What to do with points of another shape."""
     if len(shape) == 2 and shape[0] == 3:
         return "; pass points.T"
+    if len(shape) == 3 and shape[2] == 3:
+        return "; pass points.reshape(-1, 3)"
     return "; pass further columns as channels" if len(shape) == 2 and shape[1] > 3 else ""
 
 
@@ -165,9 +167,9 @@ class PointCloud(eqx.Module):
 
         Args:
             points: (N, 3), metres: nested lists or arrays of any real dtype, NumPy or JAX; at large (UTM) coordinates
-                float64 NumPy arrays, as float32 is too coarse there. Also a structured array with the fields x, y and z
-                or an object with `points` and perhaps `colors`, such as a cloud of Open3D. Without `channels`, their
-                other numbers become channels, as `io.read` says.
+                float64 NumPy arrays, as float32 is too coarse there. Also a structured array or a table of pandas with
+                the columns x, y and z, or a cloud of Open3D. Without `channels`, their other numbers become channels,
+                as `io.read` says.
             channels: (N, C), or (N,) for a single channel, in any unit; none by default.
             channel_valid: booleans in the shape of `channels`, False where a point lacks the channel; the value there
                 is ignored and may be NaN. None: all points have all channels.

@@ -163,7 +163,8 @@ def _zip_pairs(sides: dict[str, Any], several: tuple[str, ...]) -> Iterator[Pair
 def _is_one_cloud(given: object) -> bool:
     if isinstance(given, PointCloud):
         return True
-    return callable(given) or getattr(given, "ndim", None) == 2
+    structured = getattr(getattr(given, "dtype", None), "names", None) is not None
+    return callable(given) or structured or getattr(given, "ndim", None) == 2
 
 
 def _is_one_pose(given: object) -> bool:
