@@ -1,5 +1,8 @@
 """Work side by side: every answer in its place, and no waiting for those who wait."""
 
+import subprocess
+import sys
+import textwrap
 import threading
 import time
 from concurrent.futures import ThreadPoolExecutor
@@ -123,3 +126,20 @@ def test_what_is_read_ahead_survives_an_interruption_and_an_error_is_raised_in_i
     with pytest.raises(ZeroDivisionError):
         next(ahead)
     assert list(ahead) == [0.25]
+
+
+def test_the_interpreter_does_not_wait_for_a_source_of_frames():
+    """Which is read ahead while the odometry of the last frame is in use."""
+    code = """
+        import time, numpy as np, mcgicp_jax as mcg
+        def frames():
+            for seed in (0, 1):
+                yield np.random.default_rng(seed).normal(size=(50, 3))
+            time.sleep(1e6)
+        steps = mcg.odometry(frames(), mcg.PointToPoint(), max_distance=1.0)
+        next(steps), next(steps)
+        time.sleep(0.5)
+        print("the end", flush=True)
+    """
+    ended = subprocess.run([sys.executable, "-c", textwrap.dedent(code)], capture_output=True, text=True, timeout=120)
+    assert ended.returncode == 0 and ended.stdout == "the end\n", ended.stderr

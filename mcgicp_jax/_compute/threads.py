@@ -6,6 +6,7 @@ import collections
 import contextlib
 import functools
 import os
+import threading
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor, wait
 from typing import Any, TypeVar
@@ -76,11 +77,17 @@ def in_new_thread(call: Callable[[], Answer]) -> Answer:
 
 
 def started(call: Callable[[], Answer]) -> Future[Answer]:
-    """The future result of a call that begins now, in a thread of its own."""
-    executor = ThreadPoolExecutor(1, thread_name_prefix="mcgicp")
-    future = executor.submit(with_settings(call))
-    # The thread ends after the call.
-    executor.shutdown(wait=False)
+    """The future result of a call that begins now, in a thread of its own, for which the interpreter does not wait when
+    it ends: a source of frames may block for ever."""
+    future, bound = Future[Answer](), with_settings(call)
+
+    def work() -> None:
+        try:
+            future.set_result(bound())
+        except BaseException as error:
+            future.set_exception(error)
+
+    threading.Thread(target=work, name="mcgicp", daemon=True).start()
     return future
 
 
