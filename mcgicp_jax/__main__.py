@@ -37,6 +37,13 @@ def _show_warning(message: Warning | str, *_: Any, **__: Any) -> None:
     print(f"mcgicp: {message}", file=sys.stderr)
 
 
+def _has_platform() -> bool:
+    try:
+        return len(jax.devices()) > 0
+    except (RuntimeError, AssertionError):
+        return False
+
+
 def _explanation(error: Exception) -> str:
     if isinstance(error, OSError) and error.filename is not None:
         return f"{error.filename}: {error.strerror}"
@@ -76,6 +83,16 @@ def _run(args: Sequence[str]) -> int:
             )
         except BrokenPipeError:
             raise
+        except (RuntimeError, AssertionError):
+            # JAX looks for its platform at the first computation.
+            if _has_platform():
+                raise
+            platform = os.environ.get("JAX_PLATFORMS")
+            print(
+                f"mcgicp: JAX has no device for JAX_PLATFORMS={platform}; unset it, or install its plugin",
+                file=sys.stderr,
+            )
+            return 2
         except (ValueError, OSError, ImportError) as error:
             print(f"mcgicp: {_explanation(error)}", file=sys.stderr)
             return 2
