@@ -115,6 +115,33 @@ _EAGER = """
     print(json.dumps([first, once, plain, same, other, again(gradient, 8000), count, points, memory]))
 """
 
+_COST = """
+    import jax.numpy as jnp
+    method = mcg.MultiChannelGICP(0.05, 0.3)
+
+    def prepared(size):
+        source, target = (mcg.preprocess(cloud) for cloud in clouds(size))
+        return source, target, mcg.find_correspondences(source, target, np.eye(4), method, max_distance=0.3)
+
+    def cost(channels, pose, problem):
+        source, target, matches = problem
+        return mcg.mahalanobis_cost(pose, source.replace(channels=channels), target, matches, method)
+
+    def value(problem):
+        return timed(lambda: cost(np.asarray(problem[0].channels) + 0, np.eye(4), problem))
+
+    def gradient(problem):
+        function = jax.value_and_grad(cost, (0, 1))
+        channels = jnp.asarray(problem[0].channels)
+        return timed(lambda: jax.block_until_ready(function(channels, jnp.eye(4), problem)))
+
+    problems = {size: prepared(size) for size in (2500, 2400)}
+    first = value(problems[2500])[0], gradient(problems[2500])[0]
+    other, count, _ = gradient(problems[2400])
+    again = [float(np.median([function(problems[2400])[0] for _ in range(9)])) for function in (value, gradient)]
+    print(json.dumps([*first, other, count, *again]))
+"""
+
 _EPOCH = """
     import jax.numpy as jnp
     sizes = np.random.default_rng(0).integers(2000, 10_000, 60)
@@ -203,6 +230,16 @@ def gradients() -> None:
             print(f"  8,000 points: {1e3 * other:.0f} ms with {count} compilations, again {1e3 * again:.0f} ms")
             print(f"  by points too: {1e3 * points:.0f} ms, {points / plain:.2f} times")
             print(f"  34,000 points: peak memory {memory:.0f} MB above that of the forward call", flush=True)
+            (numbers,) = _run(_COST, cache=pathlib.Path(folder) / "cost")
+            value, once, other, count, plain, again = numbers
+            print(f"value_and_grad(mahalanobis_cost) by 7,500 channel values and the pose, MC-GICP, cache {state}:")
+            print(
+                f"  first value {value:.2f} s and then the first gradient {once:.2f} s, together {value + once:.2f} s"
+            )
+            print(
+                f"  another size {1e3 * other:.0f} ms with {count} compilations, again {1e3 * again:.0f} ms", end=", "
+            )
+            print(f"{again / plain:.2f} times the value", flush=True)
         ((plain, first, *times, ratio),) = _run(_EPOCH, cache=pathlib.Path(folder))
         print(
             f"60 pairs of 2,000 to 10,000 points: batch {plain:.1f} s, values and gradients {first:.1f} s; again",
