@@ -59,7 +59,7 @@ def is_npy_cloud(file: BinaryIO) -> bool:
     return len(shape) == 2 and shape[1] >= 3 and shape != (4, 4)
 
 
-def _npy_header(file: BinaryIO) -> tuple[tuple[int, ...], np.dtype]:
+def _npy_header(file: Any) -> tuple[tuple[int, ...], np.dtype]:
     headers = {(1, 0): npy.read_array_header_1_0, (2, 0): npy.read_array_header_2_0}
     shape, _, dtype = headers[npy.read_magic(file)](file)
     return shape, dtype
