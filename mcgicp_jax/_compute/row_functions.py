@@ -416,6 +416,8 @@ def blockwise(function: Callable[..., Any], numbers: Any, *inputs: Input, total:
     leaves, structure = jax.tree.flatten(found[0].tree)
     if applied.tracers:
         leaves = with_derivative(leaves, _Derivative(applied, total, leaves), applied.tracers)
+    elif total:
+        leaves = [jax.device_put(leaf) for leaf in leaves]
     trees = (jax.tree.unflatten(structure, leaves), *(each.tree for each in found[1:]))
     return trees[0] if total else trees
 

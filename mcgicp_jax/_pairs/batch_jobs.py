@@ -22,7 +22,7 @@ from mcgicp_jax._compute.linear_maps import primal
 from mcgicp_jax._compute.messages import messages_named, warn, warnings_named
 from mcgicp_jax._compute.size_classes import size_class
 from mcgicp_jax._compute.threads import in_new_thread, num_cores, side_by_side, with_settings
-from mcgicp_jax._local_geometry.surface import Surface, searched
+from mcgicp_jax._local_geometry.surface import Surface
 from mcgicp_jax._math.poses import Pose
 from mcgicp_jax._methods.base import AbstractMethod
 from mcgicp_jax._pairs.register import register_from, start_from_anywhere
@@ -229,7 +229,7 @@ class BatchJob:
         if isinstance(init, PairResult):
             return init
         problem, _ = pose_problem(source, target, self.method, init, self.options, num_threads=1)
-        used, size = searched(problem.source).valid, size_class(max(len(source.points), len(target.points)))
+        used, size = problem.source.search.valid, size_class(max(len(source.points), len(target.points)))
         few = self.options.max_source_points
         sizes = size if few is None else min(size, size_class(few)), size
         return _LanePair(pair.index, source, target, used), _padded(problem.whole(), sizes)

@@ -24,7 +24,6 @@ from mcgicp_jax._local_geometry.channel_equalization import (
     warn_of_units,
     with_channels_matched,
 )
-from mcgicp_jax._local_geometry.surface import searched
 from mcgicp_jax._math.poses import Pose, se3_from_matrix
 from mcgicp_jax._math.statistics import spread_rows
 from mcgicp_jax._methods.base import AbstractMethod
@@ -176,7 +175,7 @@ def results_of(runs: Sequence[Run], givens: Sequence[Given | None]) -> list[Regi
         # Traced origins are those of the inputs, as cells, which may have others, are made of concrete clouds alone.
         traces_origins = given is not None and not is_concrete(given.source.origin, given.target.origin)
         source, target = (given if given is not None and traces_origins else run.inputs)[:2]
-        used = searched(run.problem.source).valid
+        used = run.problem.source.search.valid
         results.append(registration_of(state, run.assessment(), run.loop.history, source, target, used, by))
     return results
 
@@ -255,7 +254,7 @@ def pose_problem(
         num_threads=num_threads,
         source_rows=rows,
     )
-    dtype, valid = source.points.dtype, searched(pair.source).valid
+    dtype, valid = source.points.dtype, pair.source.search.valid
     xp = numpy_for(valid)
     stride = xp.maximum(xp.sum(xp.asarray(valid)) // _COARSE_ROWS, 1)
     start = se3_from_matrix(centred_pose(init, source, target), dtype)
