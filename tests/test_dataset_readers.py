@@ -375,7 +375,7 @@ def test_a_folder_of_clouds(tmp_path):
         "table.csv": lambda path: path.write_text("source,target\na.ply,b.ply\n"),
         "table.npz": lambda path: np.savez(path, T_target_source=poses),
         "times.txt": lambda path: path.write_text("0.0\n0.1\n"),
-        "tum.txt": lambda path: io.write_poses(path, poses, range(5)),
+        "tum.txt": lambda path: io.write_poses(path, poses, np.arange(5.0)),
     }
     for name, write in (kept | left_out).items():
         write(tmp_path / name)

@@ -17,7 +17,7 @@ from mcgicp_jax._terms.base import AbstractTerm
 from mcgicp_jax._terms.mahalanobis import Mahalanobis
 from mcgicp_jax._terms.photometric import Photometric, Residuals
 from tests.differences import CONVERGED, GATE, TO_ROUNDING, check_eager_gradient, clouds_with, inputs_of, weigh
-from tests.precision import in_float64
+from tests.precision import in_float64, tolerance
 from tests.scenes import motion, pair, wall
 
 PHOTOMETRIC = mcg.MultiChannelGICP(photometric=True)
@@ -332,4 +332,6 @@ def test_without_channels_the_term_is_off():
     bare = [mcg.preprocess(mcg.PointCloud(cloud.points)) for cloud in (source, target)]
     with pytest.warns(UserWarning, match="no channels"):
         result = mcg.register(*bare, PHOTOMETRIC)
-    np.testing.assert_array_equal(result.matrix, mcg.register(*bare, mcg.GICP()).matrix)
+    # Each method has programs of its own, which may round differently.
+    expected = mcg.register(*bare, mcg.GICP()).matrix
+    np.testing.assert_allclose(result.matrix, expected, atol=tolerance(1e-6, 1e-12))

@@ -447,7 +447,7 @@ class _Derivative(AbstractLinearMap):
 
 def overwhole(function: Callable[..., Any], numbers: Any, inputs: Sequence[Input]) -> Any:
     """A row function of whole arrays, inside transformations; many neighbourhoods are processed in blocks."""
-    inputs = [_found(each) for each in inputs]
+    numbers, inputs = jax.tree.map(jnp.asarray, numbers), [_found(each) for each in inputs]
     own = inputs[0]
     num_rows = len(jax.tree.leaves(own.table)[0] if own.index is None else own.index)
     wide = any(each.index is not None and each.index.ndim == 2 for each in inputs)
