@@ -10,7 +10,7 @@ import mcgicp_jax as mcg
 from mcgicp_jax import Status
 from mcgicp_jax._math.twists import exponential
 from mcgicp_jax._methods.surfaces import surface_pair
-from mcgicp_jax._pose_solver.matched import Motion, linearize_at, match_surfaces
+from mcgicp_jax._pose_solver.matched import Matches, Motion, linearize_at, match_surfaces
 from tests.differences import CONVERGED, GATE, clouds_with, directional_errors, inputs_of, weigh
 from tests.precision import cached, in_both_precisions, in_float64, tolerance
 from tests.scenes import motion, pair, wall
@@ -86,7 +86,7 @@ class Reference:
 
     def _force(self, clouds, method, moved):
         surfaces, pose = surface_pair(method, *clouds, observed=False).whole(), self._at(moved)
-        matched = match_surfaces(surfaces.source, surfaces.target, self._matches)
+        matched = match_surfaces(surfaces.source, surfaces.target, Matches.given(self._matches))
         force = np.asarray(_forces(Motion(pose[:3, :3], pose[:3, 3]), matched, surfaces.terms)).T
         points = np.asarray(clouds[0].points) @ pose[:3, :3].T + pose[:3, 3]
         return self._along.T @ np.append(force.sum(axis=0), np.cross(points, force).sum(axis=0))

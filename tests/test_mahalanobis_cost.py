@@ -22,8 +22,9 @@ from mcgicp_jax import (
     mahalanobis_cost,
     preprocess,
 )
+from mcgicp_jax._compute import row_functions
 from mcgicp_jax._methods.surfaces import surface_pair
-from mcgicp_jax._pose_solver.matched import Motion, match_surfaces
+from mcgicp_jax._pose_solver.matched import Matches, Motion, match_surfaces
 from mcgicp_jax._pose_solver.sums import sums_of
 from mcgicp_jax.extend import KERNELS
 from tests import reference as ref
@@ -337,6 +338,19 @@ def test_matches_of_another_cloud_are_refused():
         mahalanobis_cost(T, clouds[0].pad(200), clouds[1], matches, GICP())
 
 
+def test_neighbourhoods_of_large_clouds_are_summed_inside_jit(monkeypatch):
+    monkeypatch.setattr(row_functions, "_LARGEST_WHOLE", 100)
+    _, _, (source, target), matches, _ = problem()
+    several = find_correspondences(source, target, T, GICP(), max_distance=0.3, num_candidates=3)
+    for found, temperature in ((matches, None), (several, 0.1)):
+
+        def cost(points, found=found, temperature=temperature):
+            moved = source.replace(points=points)
+            return mahalanobis_cost(T, moved, target, found, PointToPoint(), temperature=temperature)
+
+        np.testing.assert_allclose(jax.jit(cost)(source.points), cost(source.points), rtol=1e-9)
+
+
 def test_a_batch_is_its_lanes():
     _, _, (source, target), matches, _ = problem()
     dtype = source.points.dtype
@@ -363,7 +377,7 @@ def test_the_sums_say_what_the_correspondences_say(kernel):
     robust = None if kernel is None else Huber(SCALE)
     pair = surface_pair(method, source, target, observed=False, robust=robust).whole()
     there = Motion(jnp.asarray(T[:3, :3], dtype), jnp.asarray(T[:3, 3], dtype))
-    found = jax.jit(lambda: sums_of(there, match_surfaces(pair.source, pair.target, matches), pair.terms))()
+    found = jax.jit(lambda: sums_of(there, match_surfaces(pair.source, pair.target, Matches.given(matches)), pair.terms))()
 
     raw, neighbors, _, _, _ = problem()
     pair_information = information("MultiChannelGICP", *raw, neighbors)

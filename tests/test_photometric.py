@@ -12,7 +12,7 @@ import mcgicp_jax as mcg
 from mcgicp_jax._math.statistics import median
 from mcgicp_jax._methods.surfaces import surface_pair
 from mcgicp_jax._pose_solver.adaptation import adapted, sample_of_term
-from mcgicp_jax._pose_solver.matched import Matched, Motion, match_surfaces
+from mcgicp_jax._pose_solver.matched import Matched, Matches, Motion, match_surfaces
 from mcgicp_jax._terms.base import AbstractTerm
 from mcgicp_jax._terms.mahalanobis import Mahalanobis
 from mcgicp_jax._terms.photometric import Photometric, Residuals
@@ -53,7 +53,7 @@ def matched_at(source, target, method, pose, matches):
     both = surface_pair(method, source, target, observed=False).whole()
     pose = np.asarray(pose, source.points.dtype)
     motion = Motion(jnp.asarray(pose[:3, :3]), jnp.asarray(pose[:3, 3]))
-    return jax.jit(match_surfaces)(both.source, both.target, matches), both, motion
+    return jax.jit(match_surfaces)(both.source, both.target, Matches.given(matches)), both, motion
 
 
 @jax.jit

@@ -123,14 +123,14 @@ def test_implicit_gradient_is_that_of_the_unrolled_loop(noisy):
     method, _ = case("gicp")
     from mcgicp_jax._math.poses import move_pose, se3_from_matrix
     from mcgicp_jax._methods.surfaces import surface_pair
-    from mcgicp_jax._pose_solver.matched import Motion, match_surfaces
+    from mcgicp_jax._pose_solver.matched import Matches, Motion, match_surfaces
     from mcgicp_jax._pose_solver.sums import sums_of
 
     matches = mcg.find_correspondences(source, target, motion(), method, max_distance=GATE)
 
     def unrolled(points):
         pair = surface_pair(method, source.replace(points=points), target, observed=False)
-        matched = match_surfaces(pair.source, pair.target, matches)
+        matched = match_surfaces(pair.source, pair.target, Matches.given(matches))
 
         def body(pose, _):
             sums = sums_of(Motion(pose.rotation().as_matrix(), pose.translation()), matched, pair.terms)

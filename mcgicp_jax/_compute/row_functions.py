@@ -403,7 +403,7 @@ def blockwise(function: Callable[..., Any], numbers: Any, *inputs: Input, total:
         What the function returns, for all rows. Trees of rows after the first are constants to autodiff.
     """
     if not is_concrete(primal((numbers, [each for each in inputs if not isinstance(each.table, Table)]))):
-        return overwhole(function, numbers, inputs)
+        return over_whole(function, numbers, inputs, total)
     first = inputs[0]
     size = as_table(first.table).size if first.index is None else len(first.index)
     applied = RowFunction(function, numbers, inputs, size, total)
@@ -445,13 +445,13 @@ class _Derivative(AbstractLinearMap):
         return self._applied.cotangents(packed, [self._leaves[i] for i in moving])
 
 
-def overwhole(function: Callable[..., Any], numbers: Any, inputs: Sequence[Input]) -> Any:
-    """A row function of whole arrays, inside transformations; many neighbourhoods are processed in blocks."""
+def over_whole(function: Callable[..., Any], numbers: Any, inputs: Sequence[Input], total: bool = False) -> Any:
+    """A row function of whole arrays, inside transformations; rows of many neighbourhoods are computed in blocks."""
     numbers, inputs = jax.tree.map(jnp.asarray, numbers), [_found(each) for each in inputs]
     own = inputs[0]
     num_rows = len(jax.tree.leaves(own.table)[0] if own.index is None else own.index)
     wide = any(each.index is not None and each.index.ndim == 2 for each in inputs)
-    if not wide or num_rows <= _LARGEST_WHOLE:
+    if total or not wide or num_rows <= _LARGEST_WHOLE:
         return function(numbers, *(whole(each) for each in inputs))
     num_blocks = -(-num_rows // _LARGEST_BLOCK)
     size = -(-num_rows // num_blocks)
@@ -468,7 +468,7 @@ def over_both(function: Callable[..., Any], numbers: Any, one: Sequence[Input], 
     structures: list[Any] = [jax.tree.structure(tree) for tree in trees]
     alike = structures[0] == structures[1]
     if not alike or sum(sizes) > _LARGEST_WHOLE or one[0].index is not None:
-        return overwhole(function, numbers, one), overwhole(function, numbers, other)
+        return over_whole(function, numbers, one), over_whole(function, numbers, other)
 
     def stacked(each: Input, next_one: Input) -> Input:
         table = jax.tree.map(lambda *rows: jnp.concatenate(list(map(jnp.asarray, rows))), each.table, next_one.table)
@@ -480,7 +480,7 @@ def over_both(function: Callable[..., Any], numbers: Any, one: Sequence[Input], 
         padded = [jnp.pad(index, [(0, 0), (0, most - index.shape[1])], constant_values=-1) for index in indices]
         return Input(table, jnp.concatenate(padded))
 
-    found = overwhole(function, numbers, list(map(stacked, one, other)))
+    found = over_whole(function, numbers, list(map(stacked, one, other)))
     return jax.tree.map(lambda rows: rows[: sizes[0]], found), jax.tree.map(lambda rows: rows[sizes[0] :], found)
 
 

@@ -60,6 +60,10 @@ class Surface(NamedTuple):
     def observed(self) -> bool:
         return self.observability is not None
 
+    @property
+    def observes_channels(self) -> bool:
+        return self.channel_observability is not None
+
 
 def searched(surface: Surface) -> SearchPoints:
     """The input of the search of a surface of a whole cloud."""

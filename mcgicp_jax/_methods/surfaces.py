@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import cache, partial
+from dataclasses import dataclass
+from functools import cache, cached_property, partial
 from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
 
 import jax
@@ -14,7 +15,7 @@ from jaxtyping import Float, Int
 from mcgicp_jax._clouds.point_cloud import PointCloud
 from mcgicp_jax._compute.cache import cached_with_cloud
 from mcgicp_jax._compute.concrete import is_concrete, numpy_for
-from mcgicp_jax._compute.row_functions import ComputedTable, Input, Rows, over_both
+from mcgicp_jax._compute.row_functions import ComputedTable, GivenTable, Input, Rows, over_both
 from mcgicp_jax._compute.threads import side_by_side
 from mcgicp_jax._local_geometry.cells import geometry_of_cells
 from mcgicp_jax._local_geometry.local_geometry import LocalGeometry
@@ -39,7 +40,12 @@ from mcgicp_jax._terms.base import AbstractTerm
 Kinds = tuple[type[AbstractTerm], ...]
 
 
-class SurfaceTable(NamedTuple):
+# The parts of a surface that row functions get as inputs of their own.
+SURFACE, NOISE, SEARCH = range(3)
+
+
+@dataclass(frozen=True, eq=False)
+class SurfaceTable:
     """The surface of a concrete cloud, whose rows are computed when they are used.
 
     Attributes:
@@ -53,6 +59,14 @@ class SurfaceTable(NamedTuple):
     rows: Any
     search: SearchPoints
     observed: bool
+
+    @cached_property
+    def search_table(self) -> GivenTable:
+        return GivenTable(self.search)
+
+    @property
+    def observes_channels(self) -> bool:
+        return self.table.known(np.zeros(0, int))[0].tree.channel_observability is not None
 
     @property
     def points(self) -> Float[np.ndarray, "n 3"]:
@@ -91,6 +105,17 @@ class SurfacePair(NamedTuple):
     def whole(self) -> SurfacePair:
         """With all rows of both surfaces."""
         return self._replace(source=whole_surface(self.source), target=whole_surface(self.target))
+
+
+def input_of(surface: AnySurface, part: int, rows: Any) -> Input:
+    """One part of a surface as the input of a row function; of some rows, or of all (None)."""
+    if isinstance(surface, Surface):
+        return Input((surface._replace(noise=None, search=None), surface.noise, surface.search)[part], rows)
+    if part == SEARCH:
+        return Input(surface.search_table, rows)
+    if surface.rows is not None:
+        rows = surface.rows if rows is None else surface.rows[rows]
+    return Input(surface.table, rows, part)
 
 
 def whole_surface(surface: AnySurface) -> Surface:

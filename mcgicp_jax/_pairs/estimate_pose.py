@@ -2,33 +2,25 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import partial
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 from jax.typing import ArrayLike
 
-from mcgicp_jax._clouds.origins import centred_pose
 from mcgicp_jax._clouds.point_cloud import PointCloud
 from mcgicp_jax._compute.concrete import is_concrete, numpy_for
 from mcgicp_jax._compute.linear_maps import primal
 from mcgicp_jax._compute.threads import in_new_thread
-from mcgicp_jax._math.poses import Pose, se3_from_matrix
+from mcgicp_jax._math.poses import Pose
 from mcgicp_jax._math.robust_kernels import AbstractKernel
 from mcgicp_jax._methods.base import AbstractMethod
-from mcgicp_jax._methods.surfaces import surface_pair
-from mcgicp_jax._pose_solver.matched import match_surfaces
+from mcgicp_jax._pose_solver.matched import Matches
 from mcgicp_jax._registration.input_checks import check_clouds, check_matches
-from mcgicp_jax._registration.make_result import registration_of
-from mcgicp_jax._registration.on_host import FixedMatchesOnHost
 from mcgicp_jax._registration.options import Options
-from mcgicp_jax._registration.pose_derivative import Given, Inputs
-from mcgicp_jax._registration.register_pair import Run, results_of, run_to_end
+from mcgicp_jax._registration.pose_derivative import Given
+from mcgicp_jax._registration.register_pair import Run, pose_problem, results_of, run_loop
 from mcgicp_jax._registration.result import RegistrationResult
-from mcgicp_jax._registration.settings import settings_for
-from mcgicp_jax._registration.step import Problem
-from mcgicp_jax._registration.traced import assess_alignment, differentiable, estimate_pose_traced
 from mcgicp_jax._search.base import Correspondences
 
 
@@ -79,44 +71,23 @@ def estimate_pose(
         rotation_tolerance=rotation_tolerance,
         hold_unconstrained=False,
         robust=robust,
+        max_source_points=None,
     )
     check_matches(matches, source, method, temperature)
     check_clouds(source, target, method)
-    dtype = source.points.dtype
-    softness = None if temperature is None else numpy_for(temperature).asarray(temperature, dtype)
+    softness = None if temperature is None else numpy_for(temperature).asarray(temperature, source.points.dtype)
     given = Given(source, target, method, robust, temperature=softness)
-    values, init, matches = given.values(), primal(init), primal(matches)
-    if not is_concrete(values, matches, init, options.numbers):
-        return _estimated_inside_jit(given, matches, init, options)
-    estimate = partial(_estimated_on_host, values, matches, init, options)
-    run = estimate() if is_concrete(given) else in_new_thread(estimate)
+    values, init, fixed = given.values(), primal(init), Matches.given(primal(matches))
+    if not is_concrete(values, fixed, init, options.numbers):
+        values = given
+    estimate = partial(_estimate, values, fixed, init, options)
+    run = estimate() if values is given or is_concrete(given) else in_new_thread(estimate)
     (result,) = results_of([run], [given])
     return result
 
 
-def _estimated_on_host(given: Given, matches: Correspondences, init: Pose | None, options: Options) -> Run:
-    problem, method = _problem(given, init, options)
-    inputs = Inputs(given.source, given.target, method, problem.terms, temperature=given.temperature)
-    return run_to_end(inputs, FixedMatchesOnHost(problem, matches, given.temperature, 1), rematched=False)
-
-
-def _estimated_inside_jit(
-    given: Given, matches: Correspondences, init: Pose | None, options: Options
-) -> RegistrationResult:
-    problem = _problem(given, init, options)[0].whole()
-    softness = None if given.temperature is None else jnp.asarray(given.temperature)
-    fixed, fixed_softness = jax.lax.stop_gradient((problem, softness))
-    loop = estimate_pose_traced(fixed, matches, fixed_softness, options.max_iterations)
-    matched = match_surfaces(problem.source, problem.target, matches, softness)
-    state = differentiable(loop, matched, problem.terms)
-    assessment = assess_alignment(loop, fixed, fixed_softness)
-    return registration_of(state, assessment, loop.history, given.source, given.target, given.source.valid)
-
-
-def _problem(given: Given, init: Pose | None, options: Options) -> tuple[Problem, AbstractMethod]:
-    source, target = given.source, given.target
-    pair = surface_pair(given.method, source, target, observed=False, robust=given.robust)
-    dtype = source.points.dtype
-    start = se3_from_matrix(centred_pose(init, source, target), dtype)
-    settings = settings_for(options, pair.method, target, 1, dtype)
-    return Problem(start, pair.source, pair.target, pair.terms, settings), pair.method
+def _estimate(given: Given, matches: Matches, init: Pose | None, options: Options) -> Run:
+    source, target, method, robust, *_, temperature = given
+    matches, options = matches._replace(temperature=temperature), replace(options, robust=robust)
+    problem, inputs = pose_problem(source, target, method, init, options, 1, matches)
+    return run_loop(inputs, problem, None, options.max_iterations)

@@ -2,18 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from functools import cache
 from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
 
 from mcgicp_jax._compute.concrete import AnyArray, AnyScalar, numpy_for
 from mcgicp_jax._compute.row_functions import Input, Rows, whole
-from mcgicp_jax._local_geometry.surface import Surface, searched
+from mcgicp_jax._local_geometry.surface import Surface
 from mcgicp_jax._math import symmetric_matrices as alg
+from mcgicp_jax._methods.surfaces import NOISE, SEARCH, SURFACE, AnySurface, input_of
 from mcgicp_jax._search.base import Correspondences, SearchPoints
 from mcgicp_jax._terms.base import AbstractTerm, Linearization, PosedMatches, linearize
 
@@ -31,6 +34,47 @@ class Motion(NamedTuple):
     def move(self, points: Float[AnyArray, "n 3"]) -> Float[Array, "3 n"]:
         """T a for each point, metres."""
         return jnp.dot(self.rotation, jnp.asarray(points).T, precision="highest") + self.translation[:, None]
+
+
+class Matches(NamedTuple):
+    """Candidates in the target for n source points.
+
+    Attributes:
+        indices: target rows of the m candidates; −1 where there is none, or a point does not count.
+        max_distance: metres; applied when the matches are used, so that they may follow a pose.
+        rows: the source points among all rows; None for all of them.
+        temperature: of a soft assignment, metres; None without one.
+    """
+
+    indices: Int[AnyArray, "m n"]
+    max_distance: Float[AnyScalar, ""]
+    rows: Any = None
+    temperature: Any = None
+
+    @staticmethod
+    def of(
+        source: SearchPoints,
+        target: SearchPoints,
+        indices: Int[AnyArray, "m n"],
+        max_distance: Float[AnyScalar, ""],
+        rows: Any = None,
+    ) -> Matches:
+        """Matches found by a search, without those of padding."""
+        xp = numpy_for(source, target, indices)
+        found = (indices >= 0) & source.valid & xp.asarray(target.valid)[xp.maximum(indices, 0)]
+        return Matches(xp.where(found, indices, -1), max_distance, rows)
+
+    @staticmethod
+    def given(matches: Correspondences, temperature: Any = None) -> Matches:
+        """Matches that do not change with the pose."""
+        xp = numpy_for(matches)
+        indices = xp.where(xp.asarray(matches.valid), xp.asarray(matches.indices), -1)
+        infinite = np.asarray(np.inf, matches.distances.dtype)
+        return Matches(indices.reshape(-1, indices.shape[-1]), infinite, temperature=temperature)
+
+    def some(self, rows: Int[AnyArray, "n"]) -> Matches:
+        """Those of some of the source points."""
+        return self._replace(indices=self.indices[:, rows], rows=rows if self.rows is None else self.rows[rows])
 
 
 class Matched(eqx.Module):
@@ -62,20 +106,32 @@ class Matched(eqx.Module):
         return eqx.tree_at(lambda matched: matched.valid, self, self.valid & near)
 
 
-def match_surfaces(
-    source: Surface,
-    target: Surface,
-    matches: Correspondences,
-    temperature: Float[Array, ""] | None = None,
-    with_search: bool = False,
-) -> Matched:
-    """Gather the matched rows of both surfaces, with the inputs of the search if `with_search`; pure JAX."""
-    indices = jnp.where(jnp.asarray(matches.valid), jnp.asarray(matches.indices), -1).reshape(-1, source.num_points).T
-    sides = ((source, None), (target, indices))
-    inputs = [Input(side if with_search else side._replace(search=None), index) for side, index in sides]
-    if temperature is not None:
-        inputs += [Input(searched(side), index) for side, index in sides]
-    return matched_rows([whole(each) for each in inputs], temperature)
+def match_surfaces(source: Surface, target: Surface, matches: Matches) -> Matched:
+    """Gather the matched rows of both surfaces; pure JAX."""
+    return matched_rows([whole(each) for each in inputs_of(source, target, matches)], matches.temperature)
+
+
+def inputs_of(
+    source: AnySurface, target: AnySurface, matches: Matches, with_noise: bool = False, with_search: bool = False
+) -> list[Input]:
+    """The surfaces of matched points as inputs of a row function, for `matched_rows`."""
+    with_search = with_search or matches.temperature is not None
+    parts = [SURFACE] + [NOISE] * with_noise + [SEARCH] * with_search
+    sides = (source, matches.rows), (target, matches.indices.T)
+    return [input_of(surface, part, rows) for part in parts for surface, rows in sides]
+
+
+@cache
+def of_matches(function: Callable[..., Any], with_noise: bool) -> Callable[..., Any]:
+    """A function of a motion, `Matched` and further arguments as a row function of `inputs_of`."""
+
+    def of_rows(numbers: tuple[Motion, Any, Any, tuple[Any, ...]], *rows: Rows) -> Any:
+        motion, max_distance, temperature, arguments = numbers
+        matched = matched_rows(rows, temperature, with_noise)
+        return function(motion, matched.within(motion.move(matched.source.points), max_distance), *arguments)
+
+    of_rows.__name__ = function.__name__
+    return of_rows
 
 
 def matched_rows(

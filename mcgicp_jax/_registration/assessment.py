@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -25,7 +26,7 @@ from mcgicp_jax._pose_solver.covariance import (
 )
 from mcgicp_jax._pose_solver.degeneracy import directions_at_source
 from mcgicp_jax._pose_solver.fusion import fused_covariance
-from mcgicp_jax._pose_solver.matched import Motion
+from mcgicp_jax._pose_solver.matched import Matches, Motion
 from mcgicp_jax._pose_solver.pose_measurements import Fusion
 from mcgicp_jax._registration.loop import AbstractExecutor, LoopResult
 from mcgicp_jax._registration.result import Constraints, Status
@@ -62,49 +63,52 @@ def assessment_of(executor: AbstractExecutor, loop: LoopResult, moments: Lazy[Mo
     return Assessment(Lazy.of(constraints()), Lazy.of(covariance()))
 
 
-def moments_of(executor: AbstractExecutor, loop: LoopResult, rematched: bool) -> Moments:
-    """Sums over the scores of all correspondences at the final pose.
-
-    Args:
-        rematched: whether matches follow when the pose moves; False if they are fixed.
-    """
+def moments_of(executor: AbstractExecutor, loop: LoopResult) -> Moments:
+    """Sums over the scores of all correspondences at the final pose."""
     problem, state = executor.problem, loop.state
-    motion, source = executor.motion(state.pose), executor.source_of(loop.matches)
-    size = source.valid.size
-    one = np.ones((), source.points.dtype)
+    motion, size = executor.motion(state.pose), problem.source.search.valid.size
+    one = np.ones((), problem.source.points.dtype)
     frame = Frame(state.sums.center, state.sums.radius, np.tile(one, 2), one, np.int32(size))
     if problem.source.observed:
         discount, reach = _discounts_and_reach(executor, motion, loop.matches)
         frame = frame._replace(discount=discount, reach=reach)
-    responding = _responding(executor, motion, loop) if rematched and is_adaptive(loop.terms) else None
+    # Fixed matches do not respond to a motion.
+    responding = _responding(executor, loop) if problem.matches is None and is_adaptive(loop.terms) else None
     scores = executor.scores(motion, loop.matches, frame, loop.terms, responding)
     return moments_from(scores, size)
 
 
 def _discounts_and_reach(
-    executor: AbstractExecutor, motion: Motion, matches: Any
+    executor: AbstractExecutor, motion: Motion, matches: Matches
 ) -> tuple[Float[AnyArray, "2"], Float[AnyScalar, ""]]:
-    search = executor.source_of(matches)
+    search = executor.problem.source.search
     rows, counts = sampled_rows(search.valid)
     xp = numpy_for(counts)
-    sample = executor.over_rows(noise_sample, motion, executor.nearest(motion, matches), rows, with_noise=True)
+    nearest = executor.nearest_candidates(motion, matches.some(rows))
+    sample = executor.rows(noise_sample, motion, nearest, with_noise=True)
     sample = jax.tree.map(lambda column: xp.where(counts, column, np.asarray(np.nan, column.dtype)), sample)
     return discounts_and_reach(sample, xp.sum(xp.any(search.descriptors != 0, axis=0)))
 
 
-def _responding(executor: AbstractExecutor, motion: Motion, loop: LoopResult) -> tuple[AbstractTerm, ...]:
+def _responding(executor: AbstractExecutor, loop: LoopResult) -> tuple[AbstractTerm, ...]:
     """The terms with their response, from a sample of the source points that is shifted and matched anew."""
     rows, counts = sampled_rows(executor.problem.source.search.valid)
 
     def responding(term: AbstractTerm) -> AbstractTerm:
         def sample(shift: Float[AnyArray, "3"]) -> Any:
-            shifted = motion._replace(translation=motion.translation + shift)
-            return executor.over_rematched(sample_of_term, shifted, loop.state.pose, rows, counts, term)
+            return executor.rows(sample_of_term, *executor.rematched(loop.state.pose, shift, rows, counts), term)
 
-        return term.with_response(executor.each(sample, term.shifts))
+        return term.with_response(_for_each(sample, term.shifts))
 
     with np.errstate(over="ignore", invalid="ignore"):
         return tuple(responding(term) if term.is_adaptive else term for term in loop.terms)
+
+
+def _for_each(function: Callable[[Any], Any], items: Any) -> Any:
+    """The results of a function for each item along the first axis, stacked."""
+    if not is_concrete(items):
+        return jax.lax.map(function, items)
+    return jax.tree.map(lambda *results: np.stack(results), *map(function, np.asarray(items)))
 
 
 def as_float64(tree: Any) -> Any:

@@ -19,20 +19,20 @@ from __future__ import annotations
 import abc
 from collections.abc import Callable
 from functools import partial
-from typing import Any, NamedTuple, TypeVar
+from typing import Any, NamedTuple
 
+import jax
 import jaxlie
-from jaxtyping import Bool, Int
+import numpy as np
+from jaxtyping import Bool, Float, Int
 
-from mcgicp_jax._compute.concrete import AnyArray, AnyScalar
+from mcgicp_jax._compute.concrete import AnyArray, AnyScalar, numpy_for
 from mcgicp_jax._pose_solver.adaptation import adapted, sample_of_term
 from mcgicp_jax._pose_solver.covariance import Scores
-from mcgicp_jax._pose_solver.matched import Motion
+from mcgicp_jax._pose_solver.matched import Matches, Motion
 from mcgicp_jax._registration.step import SETTLED, Problem, State, update
-from mcgicp_jax._search.base import SearchPoints
+from mcgicp_jax._search.base import SearchPoints, by_position
 from mcgicp_jax._terms.base import AbstractTerm, is_adaptive
-
-Result = TypeVar("Result")
 
 
 class LoopResult(NamedTuple):
@@ -40,13 +40,13 @@ class LoopResult(NamedTuple):
 
     Attributes:
         state: after the last step.
-        matches: at the pose before the last update, as the executor keeps them.
+        matches: at the pose before the last update.
         terms: as they were at that pose.
         history: of the steps; a list, or arrays with one entry for each possible step.
     """
 
     state: State
-    matches: Any
+    matches: Matches | None
     terms: tuple[AbstractTerm, ...]
     history: Any
 
@@ -61,16 +61,8 @@ class AbstractExecutor(abc.ABC):
     def __init__(self, problem: Problem):
         self.problem = problem
 
-    @property
-    def first_status(self) -> Int[AnyScalar, ""]:
-        return self.problem.first_status
-
     @abc.abstractmethod
-    def begin(self) -> LoopResult:
-        """The loop before its first step."""
-
-    @abc.abstractmethod
-    def repeat(self, step: Callable[[LoopResult], LoopResult], loop: LoopResult) -> LoopResult:
+    def run(self, step: Callable[[LoopResult], LoopResult]) -> LoopResult:
         """Repeat the step while the status is negative."""
 
     @abc.abstractmethod
@@ -82,54 +74,26 @@ class AbstractExecutor(abc.ABC):
         """The pose in the precision of the points."""
 
     @abc.abstractmethod
-    def match(self, state: State, before: Any) -> Any:
+    def match(self, state: State, before: Any) -> Matches:
         """The matches at the pose of a state. If its status is `SETTLED`, the previous matches, `before`."""
 
     @abc.abstractmethod
-    def nearest(self, motion: Motion, matches: Any) -> Any:
-        """The nearest candidate of each source point alone."""
+    def nearest(self, pose: Float[AnyArray, "7"], source: SearchPoints) -> Int[AnyArray, "1 n"]:
+        """Target rows nearest in position alone, at a pose `jaxlie.SE3.wxyz_xyz`; −1 for none within the fine
+        `max_distance`."""
 
     @abc.abstractmethod
-    def source_of(self, matches: Any) -> SearchPoints:
-        """The source points that are matched: in the coarse phase on the host, every `coarse_stride`-th."""
-
-    @abc.abstractmethod
-    def over_rows(
-        self,
-        function: Callable[..., Result],
-        motion: Motion,
-        matches: Any,
-        rows: Int[AnyArray, "n"],
-        *arguments: Any,
-        with_noise: bool = False,
-    ) -> Result:
-        """Apply a function that returns one row per correspondence to the matches of some source points.
+    def rows(
+        self, function: Callable[..., Any], motion: Motion, matches: Matches, *arguments: Any, with_noise: bool = False
+    ) -> Any:
+        """Apply a function that returns one row per correspondence.
 
         Args:
-            rows: of `source_of` the matches.
             with_noise: whether the surfaces include `noise` and `search`.
         """
 
     @abc.abstractmethod
-    def over_rematched(
-        self,
-        function: Callable[..., Result],
-        motion: Motion,
-        pose: jaxlie.SE3,
-        rows: Int[AnyArray, "n"],
-        counts: Bool[AnyArray, "n"],
-        *arguments: Any,
-    ) -> Result:
-        """As `over_rows`, for new matches at another pose, nearest in position alone.
-
-        Args:
-            motion: the other pose, with the rotation of `pose`.
-            rows: of the source.
-            counts: False for rows to leave unmatched.
-        """
-
-    @abc.abstractmethod
-    def sums(self, motion: Motion, matches: Any, terms: tuple[AbstractTerm, ...], last: Bool[AnyScalar, ""]) -> Any:
+    def sums(self, motion: Motion, matches: Matches, terms: tuple[AbstractTerm, ...], last: Bool[AnyScalar, ""]) -> Any:
         """`sums_of` all correspondences, as the executor keeps them while the loop runs.
 
         Args:
@@ -143,14 +107,10 @@ class AbstractExecutor(abc.ABC):
         return update(state.pose, state.status, state.num_iterations, sums, problem.settings, problem.fusion)
 
     @abc.abstractmethod
-    def scores(self, motion: Motion, matches: Any, *arguments: Any) -> Scores:
+    def scores(self, motion: Motion, matches: Matches, *arguments: Any) -> Scores:
         """`scores_of` all correspondences; further arguments are those of that function."""
 
-    @abc.abstractmethod
-    def each(self, function: Callable[[Any], Result], items: Any) -> Result:
-        """The results of a function for each item along the first axis, stacked."""
-
-    def adapt(self, state: State, matches: Any, before: tuple[AbstractTerm, ...]) -> tuple[AbstractTerm, ...]:
+    def adapt(self, state: State, matches: Matches, before: tuple[AbstractTerm, ...]) -> tuple[AbstractTerm, ...]:
         """The terms with their numbers estimated at the pose of a state, from a sample of the matches.
 
         They are estimated anew, not from those `before`, which an executor keeps outside the fine phase.
@@ -158,13 +118,50 @@ class AbstractExecutor(abc.ABC):
         terms = self.problem.terms
         if not is_adaptive(terms):
             return terms
-        motion, valid = self.motion(state.pose), self.source_of(matches).valid
-        return adapted(terms, valid, lambda term, rows: self.over_rows(sample_of_term, motion, matches, rows, term))
+        motion, valid = self.motion(state.pose), self.problem.source.search.valid
+        return adapted(terms, valid, lambda term, rows: self.rows(sample_of_term, motion, matches.some(rows), term))
+
+    def rematched(
+        self, pose: jaxlie.SE3, shift: Float[AnyArray, "3"], rows: Int[AnyArray, "n"], counts: Bool[AnyArray, "n"]
+    ) -> tuple[Motion, Matches]:
+        """A pose that is moved by `shift` metres, and new matches of some source points there, in position alone.
+
+        Args:
+            counts: False for rows to leave unmatched.
+        """
+        source, target, xp = self.problem.source.search, self.problem.target.search, numpy_for(rows, counts)
+        motion = self.motion(pose)
+        motion = motion._replace(translation=motion.translation + shift)
+        points = by_position(jax.tree.map(lambda array: xp.asarray(array)[rows], source))
+        indices = self.nearest(xp.concatenate([pose.wxyz_xyz[:4], motion.translation]), points)
+        limit = self.problem.settings.fine_distance
+        return motion, Matches.of(points, target, xp.where(counts, indices, -1), limit, rows)
+
+    def distances(self, motion: Motion, matches: Matches) -> Float[AnyArray, "m n"]:
+        """Distances of all matches, metres; infinite where there is none."""
+        xp = numpy_for(motion, matches, self.problem.source.points)
+        points, targets = xp.asarray(self.problem.source.points), xp.asarray(self.problem.target.points)
+        points = points if matches.rows is None else points[matches.rows]
+        with np.errstate(invalid="ignore", over="ignore"), jax.default_matmul_precision("highest"):
+            apart = targets[xp.maximum(matches.indices, 0)] - (points @ motion.rotation.T + motion.translation)
+            return xp.where(matches.indices >= 0, xp.linalg.norm(apart, axis=-1), np.inf)
+
+    def nearest_candidates(self, motion: Motion, matches: Matches) -> Matches:
+        """The nearest candidate of each source point alone. Followed candidates are in any order."""
+        distances = self.distances(motion, matches)
+        xp = numpy_for(distances)
+        first = xp.argmin(distances, axis=0)[None]
+        return matches._replace(indices=xp.take_along_axis(matches.indices, first, axis=0))
+
+    def within(self, motion: Motion, matches: Matches) -> Matches:
+        """The matches without those that are further apart than `max_distance`."""
+        near = self.distances(motion, matches) <= matches.max_distance
+        return matches._replace(indices=numpy_for(near).where(near, matches.indices, -1))
 
 
 def iterate(executor: AbstractExecutor) -> LoopResult:
     """Run the loop: find matches at this pose; sum their forces; update the pose; stop when it no longer moves."""
-    return executor.repeat(partial(step, executor), executor.begin())
+    return executor.run(partial(step, executor))
 
 
 def step(executor: AbstractExecutor, loop: LoopResult) -> LoopResult:

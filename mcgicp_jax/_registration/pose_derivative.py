@@ -102,14 +102,14 @@ class PoseDerivative(AbstractLinearMap):
         self._pose, self._fusion = np.asarray(loop.state.pose.wxyz_xyz), problem.fusion
         self._scaling: ImplicitRoot = jax.tree.map(np.asarray, root_of(loop.state._replace(record=None), self._fusion))
         self._form = jax.tree.leaves(inputs.form)
-        matches, valid = executor.correspondences(loop)
+        matches = executor.within(executor.motion(loop.state.pose), loop.matches)
         tables = differentiable_inputs(
             *inputs[:4],
             Fixed(*fixed[:3]),
-            np.where(valid, matches, -1).T,
+            matches.indices.T,
             source_rows=inputs.source_rows,
             observed=problem.source.observed,
-            soft=inputs.temperature is not None,
+            soft=matches.temperature is not None,
         )
         numbers = (
             Motion(*_motion(self._pose)),
@@ -117,7 +117,7 @@ class PoseDerivative(AbstractLinearMap):
             with_numbers_of(inputs.terms, loop.terms),
             inputs.temperature,
         )
-        self._scored = RowFunction(_score_of_rows, numbers, tables, matches.shape[1], total=True)
+        self._scored = RowFunction(_score_of_rows, numbers, tables, matches.indices.shape[1], total=True)
         traced = [leaf for leaf in self._form if not is_concrete(leaf)]
         self.arrays = list(arrays) or self._scored.tracers + traced
 

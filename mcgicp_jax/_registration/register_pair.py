@@ -31,7 +31,7 @@ from mcgicp_jax._methods.gicp import GICP
 from mcgicp_jax._methods.icp import PointToPoint
 from mcgicp_jax._methods.surfaces import surface_pair
 from mcgicp_jax._pose_solver.covariance import Moments
-from mcgicp_jax._pose_solver.matched import match_surfaces
+from mcgicp_jax._pose_solver.matched import Matches
 from mcgicp_jax._registration.assessment import Assessment, assessment_of, moments_of
 from mcgicp_jax._registration.correspondences import find_correspondences, index_of
 from mcgicp_jax._registration.input_checks import (
@@ -50,7 +50,7 @@ from mcgicp_jax._registration.pose_derivative import Given, Inputs, differentiat
 from mcgicp_jax._registration.result import RegistrationResult, is_usable
 from mcgicp_jax._registration.settings import settings_for
 from mcgicp_jax._registration.step import Problem, State
-from mcgicp_jax._registration.traced import assess, differentiable, moments_traced, register_traced
+from mcgicp_jax._registration.traced import assess, differentiable, moments_traced, run_traced
 from mcgicp_jax._search.base import AbstractIndex, AbstractSearch, Correspondences
 from mcgicp_jax._search.brute_force import default_search
 
@@ -151,7 +151,7 @@ def run_pair(given: Given, init: Pose | None, options: Options) -> Run:
     if not (ties is None and belief is None):
         fusion = fusion_of(run.loop.state, run.moments(), ties, belief)
         problem = replace(run.problem, start=constant(run.loop.state.pose), fusion=fusion)
-        run = _run(run.inputs._replace(form=fusion.form), problem, search, options.max_iterations)
+        run = run_loop(run.inputs._replace(form=fusion.form), problem, search, options.max_iterations)
     return run._replace(gains=gains)
 
 
@@ -190,44 +190,33 @@ def _solved(
 ) -> Run:
     """Pose and run the problem."""
     problem, inputs = pose_problem(source, target, method, init, options, search.num_threads)
-    return _run(inputs, problem, search, options.max_iterations)
+    return run_loop(inputs, problem, search, options.max_iterations)
 
 
-def _run(inputs: Inputs, problem: Problem, search: AbstractSearch, max_iterations: int) -> Run:
-    """Run the loop."""
-    if is_concrete(inputs, problem):
-        return _run_on_host(inputs, problem, search)
-    problem = problem.whole()
-    # Gradients stop here, so that autodiff does not enter the compiled functions.
-    fixed = jax.lax.stop_gradient(problem)
-    loop = register_traced(fixed, search, max_iterations)
-
-    def state() -> State:
-        source_surface, target_surface = (surface._replace(noise=None) for surface in (problem.source, problem.target))
-        matched = match_surfaces(source_surface, target_surface, loop.matches)
-        return differentiable(loop, matched, problem.terms, problem.fusion)
-
-    calls = state, lambda: assess(loop, fixed, search), lambda: moments_traced(loop, fixed, search)
-    return Run(inputs, None, problem, loop, None, *calls)
-
-
-def _run_on_host(inputs: Inputs, problem: Problem, search: AbstractSearch) -> Run:
-    def index(position_alone: bool) -> AbstractIndex:
-        return index_of(search, PointToPoint() if position_alone else inputs.method, inputs.target)
-
-    return run_to_end(inputs, HostExecutor(problem, index, search.num_threads), rematched=True)
-
-
-def run_to_end(inputs: Inputs, executor: HostExecutor, rematched: bool) -> Run:
-    """Run the loop on the host.
+def run_loop(inputs: Inputs, problem: Problem, search: AbstractSearch | None, max_iterations: int) -> Run:
+    """Run the loop on the host or inside `jit`.
 
     Args:
-        rematched: whether matches follow when the pose moves; False if they are fixed.
+        search: None for a problem with fixed matches.
     """
+    if not is_concrete(inputs, problem):
+        problem = problem.whole()
+        # Gradients stop here, so that autodiff does not enter the compiled functions.
+        fixed = jax.lax.stop_gradient(problem)
+        loop = run_traced(fixed, search, max_iterations)
+        state = partial(differentiable, loop, problem)
+        ended = loop, fixed, search
+        return Run(inputs, None, problem, loop, None, state, partial(assess, *ended), partial(moments_traced, *ended))
+
+    def index(position_alone: bool) -> AbstractIndex:
+        if search is None:
+            raise ValueError("matches: expected a registration that searches for them")
+        return index_of(search, PointToPoint() if position_alone else inputs.method, inputs.target)
+
+    executor = HostExecutor(problem, index, 1 if search is None else search.num_threads)
     with outside_trace():
         loop = iterate(executor)
-    moments = Lazy(lambda: moments_of(executor, loop, rematched))
-    problem = executor.problem
+    moments = Lazy(lambda: moments_of(executor, loop))
     assessment = assessment_of(executor, loop, None if problem.fusion is not None else moments)
     return Run(inputs, None, problem, loop, executor, lambda: loop.state, lambda: assessment, lambda: moments.value)
 
@@ -239,16 +228,21 @@ def pose_problem(
     init: Pose | None,
     options: Options,
     num_threads: int | None,
+    matches: Matches | None = None,
 ) -> tuple[Problem, Inputs]:
     """Inputs of the loop for preprocessed clouds, NumPy arrays where everything is concrete; and what these were
-    computed from."""
+    computed from.
+
+    Args:
+        matches: those at every pose; None to search for them.
+    """
     check_clouds(source, target, method)
     rows = rows_to_match(source, options)
     pair = surface_pair(
         method,
         source,
         target,
-        observed=True,
+        observed=matches is None,
         robust=options.robust,
         equalize_channels=options.equalize_channels,
         num_threads=num_threads,
@@ -256,18 +250,18 @@ def pose_problem(
     )
     dtype, valid = source.points.dtype, pair.source.search.valid
     xp = numpy_for(valid)
-    stride = xp.maximum(xp.sum(xp.asarray(valid)) // _COARSE_ROWS, 1)
-    start = se3_from_matrix(centred_pose(init, source, target), dtype)
-    settings = settings_for(options, pair.method, target, stride, dtype)
+    stride = xp.maximum(xp.sum(xp.asarray(valid)) // _COARSE_ROWS, 1) if matches is None else 1
     problem = Problem(
-        start,
+        se3_from_matrix(centred_pose(init, source, target), dtype),
         pair.source,
         pair.target,
         pair.terms,
-        settings,
+        settings_for(options, pair.method, target, stride, dtype),
+        matches=matches,
         num_candidates=pair.method.num_candidates,
     )
-    return problem, Inputs(source, target, pair.method, pair.terms, source_rows=rows)
+    temperature = None if matches is None else matches.temperature
+    return problem, Inputs(source, target, pair.method, pair.terms, temperature=temperature, source_rows=rows)
 
 
 def rows_to_match(source: PointCloud, options: Options) -> Int[AnyArray, "n"] | None:

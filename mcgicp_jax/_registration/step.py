@@ -18,6 +18,7 @@ from mcgicp_jax._methods.surfaces import AnySurface, whole_surface
 from mcgicp_jax._pose_solver.degeneracy import Directions, find_directions
 from mcgicp_jax._pose_solver.fusion import fused_update
 from mcgicp_jax._pose_solver.implicit_derivative import ImplicitRoot, root_near
+from mcgicp_jax._pose_solver.matched import Matches
 from mcgicp_jax._pose_solver.pose_measurements import Fusion
 from mcgicp_jax._pose_solver.sums import Sums
 from mcgicp_jax._pose_solver.update import rounding, solve_update
@@ -88,6 +89,7 @@ class Problem(eqx.Module):
         source, target: the surfaces of both clouds.
         terms: the residuals of each correspondence, before any number is adapted.
         fusion: tie points and prior, weighted after a registration without them; None if there are none.
+        matches: those of `estimate_pose`, at every pose; None if the loop searches for them.
         num_candidates: number of target points that a source point is matched with.
     """
 
@@ -97,6 +99,7 @@ class Problem(eqx.Module):
     terms: tuple[AbstractTerm, ...]
     settings: Settings
     fusion: Fusion | None = None
+    matches: Matches | None = None
     num_candidates: int = eqx.field(static=True, default=1)
 
     def whole(self) -> Problem:
@@ -105,7 +108,8 @@ class Problem(eqx.Module):
 
     @property
     def first_status(self) -> Int[AnyScalar, ""]:
-        return np.int32(COARSE) if is_adaptive(self.terms) else self.settings.first_status()
+        adapts = is_adaptive(self.terms) and self.matches is None
+        return np.int32(COARSE) if adapts else self.settings.first_status()
 
 
 class Record(NamedTuple):

@@ -18,7 +18,7 @@ from jaxtyping import Array, Bool, Int
 from mcgicp_jax._registration.assessment import Assessment
 from mcgicp_jax._registration.loop import LoopResult, step
 from mcgicp_jax._registration.step import Problem, Record, State
-from mcgicp_jax._registration.traced import TracedExecutor, assess, cleaned
+from mcgicp_jax._registration.traced import TracedExecutor, assess
 from mcgicp_jax._search.base import AbstractSearch
 
 Key = TypeVar("Key")
@@ -153,7 +153,4 @@ def run_lanes(problems: Problem, loops: LoopResult, search: AbstractSearch, num_
 def assess_lanes(problems: Problem, loops: LoopResult, search: AbstractSearch) -> Assessment:
     """Information matrices, directions and covariances of stacked loops, at their current poses."""
 
-    def of_lane(problem: Problem, loop: LoopResult) -> Assessment:
-        return assess(loop._replace(matches=cleaned(loop.matches)), problem, search)
-
-    return jax.vmap(of_lane)(problems, loops)
+    return jax.vmap(lambda problem, loop: assess(loop, problem, search))(problems, loops)
