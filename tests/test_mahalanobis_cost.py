@@ -377,7 +377,8 @@ def test_the_sums_say_what_the_correspondences_say(kernel):
     robust = None if kernel is None else Huber(SCALE)
     pair = surface_pair(method, source, target, observed=False, robust=robust).whole()
     there = Motion(jnp.asarray(T[:3, :3], dtype), jnp.asarray(T[:3, 3], dtype))
-    found = jax.jit(lambda: sums_of(there, match_surfaces(pair.source, pair.target, Matches.given(matches)), pair.terms))()
+    given = Matches.given(matches)
+    found = jax.jit(lambda: sums_of(there, match_surfaces(pair.source, pair.target, given), pair.terms))()
 
     raw, neighbors, _, _, _ = problem()
     pair_information = information("MultiChannelGICP", *raw, neighbors)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+from collections.abc import Callable
 from types import ModuleType
 from typing import TYPE_CHECKING, Any, TypeAlias
 
@@ -42,8 +43,8 @@ class Deferred:
         return np.asarray, (self.whole,)
 
 
-def is_deferred(leaf: object) -> bool:
-    return isinstance(leaf, Deferred)
+# `isinstance(leaf, Deferred)` without a Python function: it is asked of every node of a tree.
+is_deferred: Callable[[object], bool] = Deferred.__instancecheck__
 
 
 def is_concrete(*trees: object) -> bool:

@@ -24,7 +24,7 @@ from mcgicp_jax._pose_solver.adaptation import adapted, sample_of_term
 from mcgicp_jax._pose_solver.matched import Motion, linearize_at, matched_rows
 from mcgicp_jax._registration.input_checks import check_matches
 from mcgicp_jax._search.base import Correspondences
-from mcgicp_jax._terms.base import AbstractTerm
+from mcgicp_jax._terms.base import AbstractAdaptiveTerm, AbstractTerm
 
 
 def mahalanobis_cost(
@@ -109,14 +109,14 @@ def _problem(
         if temperature is not None:
             inputs += [Input(searched(surface), rows) for surface, rows in both]
 
-    def sample(term: AbstractTerm, rows: Int[AnyArray, "n"]) -> Any:
+    def sample(term: AbstractAdaptiveTerm, rows: Int[AnyArray, "n"]) -> Any:
         (found,) = blockwise(_sample, constant(primal((motion, term))), *of_rows(inputs, rows))
         return primal(found)
 
     return (motion, adapted(terms, fixed.source.valid, sample), temperature), inputs
 
 
-def _sample(numbers: tuple[Motion, AbstractTerm], *rows: Rows) -> tuple[Any]:
+def _sample(numbers: tuple[Motion, AbstractAdaptiveTerm], *rows: Rows) -> tuple[Any]:
     motion, term = numbers
     return (sample_of_term(motion, matched_rows(rows), term),)
 

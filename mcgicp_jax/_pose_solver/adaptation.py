@@ -12,13 +12,13 @@ from jaxtyping import Bool, Float, Int
 from mcgicp_jax._compute.concrete import AnyArray, constant, numpy_for
 from mcgicp_jax._math.statistics import sampled_rows
 from mcgicp_jax._pose_solver.matched import Matched, Motion
-from mcgicp_jax._terms.base import AbstractTerm
+from mcgicp_jax._terms.base import AbstractAdaptiveTerm, AbstractTerm
 
 
 def adapted(
     terms: tuple[AbstractTerm, ...],
     valid: Bool[AnyArray, "N"],
-    sample: Callable[[AbstractTerm, Int[AnyArray, "n"]], Any],
+    sample: Callable[[AbstractAdaptiveTerm, Int[AnyArray, "n"]], Any],
 ) -> tuple[AbstractTerm, ...]:
     """The terms with their numbers estimated; constants to autodiff.
 
@@ -37,11 +37,13 @@ def adapted(
     # Huge coordinates or channels lead to the status NON_FINITE; NumPy need not warn of them.
     with np.errstate(over="ignore", invalid="ignore"):
         return tuple(
-            constant(term.adapt(jax.tree.map(only, sample(term, rows)), fraction)) if term.is_adaptive else term
+            constant(term.adapt(jax.tree.map(only, sample(term, rows)), fraction))
+            if isinstance(term, AbstractAdaptiveTerm)
+            else term
             for term in terms
         )
 
 
-def sample_of_term(motion: Motion, matched: Matched, term: AbstractTerm) -> Any:
-    """`AbstractTerm.sample` of matched points."""
+def sample_of_term(motion: Motion, matched: Matched, term: AbstractAdaptiveTerm) -> Any:
+    """`AbstractAdaptiveTerm.sample` of matched points."""
     return term.sample(matched.at(motion))

@@ -161,8 +161,8 @@ def scores_of(
 
     Args:
         matched: where the surfaces have no `noise`, O = I.
-        responding: the terms with their response (`AbstractTerm.with_response`). Their stiffness replaces K O, and
-            their forces replace w M O d. None for terms that do not adapt, and where matches are fixed.
+        responding: the terms with their response (`AbstractAdaptiveTerm.with_response`). Their stiffness replaces K O,
+            and their forces replace w M O d. None for terms that do not adapt, and where matches are fixed.
     """
     posed, found, counts = linearize_at(motion, matched, terms)
     moved = posed.moved

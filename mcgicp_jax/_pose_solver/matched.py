@@ -9,13 +9,15 @@ from typing import Any, NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import jaxlie
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from mcgicp_jax._compute.concrete import AnyArray, AnyScalar, numpy_for
+from mcgicp_jax._compute.concrete import AnyArray, AnyScalar, is_concrete, numpy_for
 from mcgicp_jax._compute.row_functions import Input, Rows, whole
 from mcgicp_jax._local_geometry.surface import Surface
 from mcgicp_jax._math import symmetric_matrices as alg
+from mcgicp_jax._math.poses import rotation_from_quaternion
 from mcgicp_jax._methods.surfaces import NOISE, SEARCH, SURFACE, AnySurface, input_of
 from mcgicp_jax._search.base import Correspondences, SearchPoints
 from mcgicp_jax._terms.base import AbstractTerm, Linearization, PosedMatches, linearize
@@ -30,6 +32,15 @@ class Motion(NamedTuple):
 
     rotation: Float[AnyArray, "3 3"]
     translation: Float[AnyArray, "3"]
+
+    @staticmethod
+    def of(parameters: Float[AnyArray, "7"]) -> Motion:
+        """The motion of a pose `jaxlie.SE3.wxyz_xyz`, in its precision."""
+        dtype = parameters.dtype
+        if is_concrete(parameters):
+            wxyz = np.asarray(parameters[:4], np.float64)
+            return Motion(rotation_from_quaternion(wxyz).astype(dtype), np.asarray(parameters[4:]))
+        return Motion(jaxlie.SO3(parameters[:4]).as_matrix().astype(dtype), parameters[4:])
 
     def move(self, points: Float[AnyArray, "n 3"]) -> Float[Array, "3 n"]:
         """T a for each point, metres."""

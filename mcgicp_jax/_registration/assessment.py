@@ -31,7 +31,7 @@ from mcgicp_jax._pose_solver.pose_measurements import Fusion
 from mcgicp_jax._registration.loop import AbstractExecutor, LoopResult
 from mcgicp_jax._registration.result import Constraints, Status
 from mcgicp_jax._registration.step import State
-from mcgicp_jax._terms.base import AbstractTerm, is_adaptive
+from mcgicp_jax._terms.base import AbstractAdaptiveTerm, AbstractTerm, is_adaptive
 
 
 class Assessment(NamedTuple):
@@ -66,7 +66,7 @@ def assessment_of(executor: AbstractExecutor, loop: LoopResult, moments: Lazy[Mo
 def moments_of(executor: AbstractExecutor, loop: LoopResult) -> Moments:
     """Sums over the scores of all correspondences at the final pose."""
     problem, state = executor.problem, loop.state
-    motion, size = executor.motion(state.pose), problem.source.search.valid.size
+    motion, size = Motion.of(state.pose.wxyz_xyz), problem.source.search.valid.size
     one = np.ones((), problem.source.points.dtype)
     frame = Frame(state.sums.center, state.sums.radius, np.tile(one, 2), one, np.int32(size))
     if problem.source.observed:
@@ -95,13 +95,16 @@ def _responding(executor: AbstractExecutor, loop: LoopResult) -> tuple[AbstractT
     rows, counts = sampled_rows(executor.problem.source.search.valid)
 
     def responding(term: AbstractTerm) -> AbstractTerm:
+        if not isinstance(term, AbstractAdaptiveTerm):
+            return term
+
         def sample(shift: Float[AnyArray, "3"]) -> Any:
             return executor.rows(sample_of_term, *executor.rematched(loop.state.pose, shift, rows, counts), term)
 
         return term.with_response(_for_each(sample, term.shifts))
 
     with np.errstate(over="ignore", invalid="ignore"):
-        return tuple(responding(term) if term.is_adaptive else term for term in loop.terms)
+        return tuple(map(responding, loop.terms))
 
 
 def _for_each(function: Callable[[Any], Any], items: Any) -> Any:

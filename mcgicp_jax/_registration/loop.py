@@ -40,13 +40,13 @@ class LoopResult(NamedTuple):
 
     Attributes:
         state: after the last step.
-        matches: at the pose before the last update.
+        matches: at the pose before the last update; None before the first.
         terms: as they were at that pose.
-        history: of the steps; a list, or arrays with one entry for each possible step.
+        history: records of the steps; arrays with one entry for each possible step inside transformations.
     """
 
     state: State
-    matches: Matches | None
+    matches: Any
     terms: tuple[AbstractTerm, ...]
     history: Any
 
@@ -63,15 +63,7 @@ class AbstractExecutor(abc.ABC):
 
     @abc.abstractmethod
     def run(self, step: Callable[[LoopResult], LoopResult]) -> LoopResult:
-        """Repeat the step while the status is negative."""
-
-    @abc.abstractmethod
-    def record(self, history: Any, state: State) -> Any:
-        """The history with the record of the step that led to this state."""
-
-    @abc.abstractmethod
-    def motion(self, pose: jaxlie.SE3) -> Motion:
-        """The pose in the precision of the points."""
+        """Repeat the step while the status is negative, and keep the history."""
 
     @abc.abstractmethod
     def match(self, state: State, before: Any) -> Matches:
@@ -118,7 +110,7 @@ class AbstractExecutor(abc.ABC):
         terms = self.problem.terms
         if not is_adaptive(terms):
             return terms
-        motion, valid = self.motion(state.pose), self.problem.source.search.valid
+        motion, valid = Motion.of(state.pose.wxyz_xyz), self.problem.source.search.valid
         return adapted(terms, valid, lambda term, rows: self.rows(sample_of_term, motion, matches.some(rows), term))
 
     def rematched(
@@ -130,7 +122,7 @@ class AbstractExecutor(abc.ABC):
             counts: False for rows to leave unmatched.
         """
         source, target, xp = self.problem.source.search, self.problem.target.search, numpy_for(rows, counts)
-        motion = self.motion(pose)
+        motion = Motion.of(pose.wxyz_xyz)
         motion = motion._replace(translation=motion.translation + shift)
         points = by_position(jax.tree.map(lambda array: xp.asarray(array)[rows], source))
         indices = self.nearest(xp.concatenate([pose.wxyz_xyz[:4], motion.translation]), points)
@@ -169,8 +161,7 @@ def step(executor: AbstractExecutor, loop: LoopResult) -> LoopResult:
     state = loop.state
     matches = executor.match(state, loop.matches)
     terms = executor.adapt(state, matches, loop.terms)
-    sums = executor.sums(executor.motion(state.pose), matches, terms, state.status == SETTLED)
-    state = executor.update(state, sums)
-    # Not an output of the compiled update, which would copy the sums.
-    state = state._replace(sums=sums)
-    return LoopResult(state, matches, terms, executor.record(loop.history, state))
+    sums = executor.sums(Motion.of(state.pose.wxyz_xyz), matches, terms, state.status == SETTLED)
+    # The sums are not an output of the compiled update, which would copy them.
+    state = executor.update(state, sums)._replace(sums=sums)
+    return LoopResult(state, matches, terms, loop.history)

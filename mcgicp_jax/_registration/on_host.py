@@ -14,7 +14,6 @@ from jaxtyping import Float, Int
 from mcgicp_jax._compute.packing import Packed
 from mcgicp_jax._compute.quick_compilation import quickly_compiled
 from mcgicp_jax._compute.row_functions import RowFunction
-from mcgicp_jax._math.poses import rotation_from_quaternion
 from mcgicp_jax._pose_solver.covariance import Scores, scores_of
 from mcgicp_jax._pose_solver.matched import Matches, Motion, inputs_of, of_matches
 from mcgicp_jax._pose_solver.pose_measurements import Fusion
@@ -44,22 +43,15 @@ class HostExecutor(AbstractExecutor):
     def run(self, step: Callable[[LoopResult], LoopResult]) -> LoopResult:
         problem = self.problem
         state = State(problem.start, np.asarray(problem.first_status), np.int32(0))
-        loop = LoopResult(state, None, problem.terms, [])
+        loop, history = LoopResult(state, None, problem.terms, None), []
         while loop.state.status < 0:
             loop = step(loop)
+            history.append(loop.state.record)
         # Frees the tree: deferred parts of the result keep the executor.
         self._followed = self._follow = None
-        history = Record(*map(np.stack, zip(*loop.history, strict=True)))
         sums: Packed[Sums] = Packed(np.asarray(loop.state.sums.table), loop.state.sums.layout)
-        return loop._replace(state=loop.state._replace(sums=sums.tree), history=history)
-
-    def record(self, history: Any, state: State) -> list[Record]:
-        return [*history, state.record]
-
-    def motion(self, pose: jaxlie.SE3) -> Motion:
-        parameters = np.asarray(pose.wxyz_xyz)
-        rotation = rotation_from_quaternion(parameters[:4].astype(np.float64))
-        return Motion(rotation.astype(self.problem.source.points.dtype), parameters[4:])
+        records = Record(*map(np.stack, zip(*history, strict=True)))
+        return loop._replace(state=loop.state._replace(sums=sums.tree), history=records)
 
     def match(self, state: State, before: Any) -> Matches:
         status, settings, problem = state.status, self.problem.settings, self.problem

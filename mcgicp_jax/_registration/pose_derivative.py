@@ -102,7 +102,7 @@ class PoseDerivative(AbstractLinearMap):
         self._pose, self._fusion = np.asarray(loop.state.pose.wxyz_xyz), problem.fusion
         self._scaling: ImplicitRoot = jax.tree.map(np.asarray, root_of(loop.state._replace(record=None), self._fusion))
         self._form = jax.tree.leaves(inputs.form)
-        matches = executor.within(executor.motion(loop.state.pose), loop.matches)
+        matches = executor.within(Motion.of(loop.state.pose.wxyz_xyz), loop.matches)
         tables = differentiable_inputs(
             *inputs[:4],
             Fixed(*fixed[:3]),
@@ -112,7 +112,7 @@ class PoseDerivative(AbstractLinearMap):
             soft=matches.temperature is not None,
         )
         numbers = (
-            Motion(*_motion(self._pose)),
+            Motion.of(self._pose),
             self._scaling,
             with_numbers_of(inputs.terms, loop.terms),
             inputs.temperature,
@@ -159,7 +159,7 @@ class PoseDerivative(AbstractLinearMap):
 
     def _score(self, pose: Float[np.ndarray, "7"]) -> RowFunction:
         """g at a pose, without tie points and prior."""
-        return self._scored.at(_motion(pose))
+        return self._scored.at(Motion.of(pose))
 
     @cached_property
     def _root(self) -> tuple[Float[np.ndarray, "7"], Float[np.ndarray, "6 6"]]:
@@ -197,10 +197,6 @@ class PoseDerivative(AbstractLinearMap):
         found[:9, 3:] = np.cross(identity[:, :, None], rotation[None], axis=1).reshape(3, 9).T
         found[9:] = self._by_twist(pose)[4:]
         return found
-
-
-def _motion(pose: Float[np.ndarray, "7"]) -> tuple[Float[np.ndarray, "3 3"], Float[np.ndarray, "3"]]:
-    return rotation_from_quaternion(pose[:4].astype(np.float64)).astype(pose.dtype), pose[4:]
 
 
 def _score_of_rows(numbers: tuple[Motion, ImplicitRoot, Any, Any], *rows: Rows) -> Float[Array, "6"]:
@@ -251,7 +247,7 @@ def jacobian(
     (by_array,) = PoseDerivative(inputs, inputs, executor, loop, [array]).jacobian()
     if gains is not None and (cloud, field) == ("source", "channels"):
         by_array = by_array * gains
-    pose, rotation = np.asarray(loop.state.pose.wxyz_xyz, np.float64), executor.motion(loop.state.pose).rotation
+    pose, rotation = np.asarray(loop.state.pose.wxyz_xyz, np.float64), Motion.of(loop.state.pose.wxyz_xyz).rotation
     twist = np.zeros((6, 7))
     twist[:3, 4:], twist[3:, :4] = rotation.T, rotation.T @ turn_by_quaternion(pose[:4])
     return np.tensordot(translation_adjoint(np.asarray(inputs.source.origin)) @ twist, by_array, 1)

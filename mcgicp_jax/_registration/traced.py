@@ -59,20 +59,11 @@ class TracedExecutor(AbstractExecutor):
         """The state after one step, for its shapes."""
         state = loop.state
         matches = self.match(state, loop.matches)
-        sums = self.sums(self.motion(state.pose), matches, loop.terms, jnp.bool_(False))
+        sums = self.sums(Motion.of(state.pose.wxyz_xyz), matches, loop.terms, jnp.bool_(False))
         return self.update(state, sums)._replace(sums=sums)
 
     def run(self, step: Callable[[LoopResult], LoopResult]) -> LoopResult:
-        return jax.lax.while_loop(lambda loop: loop.state.status < 0, step, self.begin())
-
-    def record(self, history: Any, state: State) -> Any:
-        # `num_iterations` counts this update, if it was one.
-        place = state.num_iterations - (state.status < 0)
-        return jax.tree.map(lambda entries, entry: entries.at[place].set(entry), history, state.record)
-
-    def motion(self, pose: jaxlie.SE3) -> Motion:
-        dtype = pose.wxyz_xyz.dtype
-        return Motion(pose.rotation().as_matrix().astype(dtype), pose.translation().astype(dtype))
+        return jax.lax.while_loop(lambda loop: loop.state.status < 0, lambda loop: recorded(step(loop)), self.begin())
 
     def match(self, state: State, before: Matches) -> Matches:
         problem, status, settings = self.problem, state.status, self.problem.settings
@@ -118,6 +109,16 @@ class TracedExecutor(AbstractExecutor):
         return self.rows(scores_of, motion, matches, *arguments, with_noise=self.problem.source.observed)
 
 
+def recorded(loop: LoopResult) -> LoopResult:
+    """The loop after a step, with the record of this step in its history."""
+    state = loop.state
+    # `num_iterations` counts this update, if it was one.
+    place = state.num_iterations - (state.status < 0)
+    return loop._replace(
+        history=jax.tree.map(lambda entries, entry: entries.at[place].set(entry), loop.history, state.record)
+    )
+
+
 @partial(jax.jit, static_argnames="max_iterations")
 def run_traced(problem: Problem, search: AbstractSearch | None, max_iterations: int) -> LoopResult:
     """The loop, compiled."""
@@ -142,7 +143,7 @@ def differentiable(loop: LoopResult, problem: Problem) -> State:
     """The final state with the implicit derivative by the problem attached to its pose, see `with_derivative`."""
     loop, fixed = jax.lax.stop_gradient((loop, problem))
     executor, state = TracedExecutor(fixed, None, 0), loop.state
-    matches = executor.within(executor.motion(state.pose), loop.matches)
+    matches = executor.within(Motion.of(state.pose.wxyz_xyz), loop.matches)
     if problem.matches is not None:
         matches = matches._replace(temperature=problem.matches.temperature)
     source, target = (surface._replace(noise=None) for surface in (problem.source, problem.target))

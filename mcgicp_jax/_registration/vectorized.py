@@ -18,7 +18,7 @@ from jaxtyping import Array, Bool, Int
 from mcgicp_jax._registration.assessment import Assessment
 from mcgicp_jax._registration.loop import LoopResult, step
 from mcgicp_jax._registration.step import Problem, Record, State
-from mcgicp_jax._registration.traced import TracedExecutor, assess
+from mcgicp_jax._registration.traced import TracedExecutor, assess, recorded
 from mcgicp_jax._search.base import AbstractSearch
 
 Key = TypeVar("Key")
@@ -143,7 +143,7 @@ def run_lanes(problems: Problem, loops: LoopResult, search: AbstractSearch, num_
             return (counted[0].state.status < 0) & (counted[1] < num_steps)
 
         return jax.lax.while_loop(
-            unfinished, lambda counted: (step(executor, counted[0]), counted[1] + 1), (loop, jnp.int32(0))
+            unfinished, lambda counted: (recorded(step(executor, counted[0])), counted[1] + 1), (loop, jnp.int32(0))
         )[0]
 
     return jax.vmap(run)(problems, loops)

@@ -95,11 +95,7 @@ class PosedMatches(NamedTuple):
 
 
 class AbstractTerm(Numbers):
-    """A residual of each correspondence. A subclass defines `linearize`; the other members do nothing by default.
-
-    A term may estimate numbers from the residuals (`adapt`), such as their scale. It then defines `sample`, too. The
-    numbers are estimated again at each pose of the fine phase, and are constants to autodiff. A registration with such
-    a term always starts with a coarse phase, in which the term has its initial numbers.
+    """A residual of each correspondence. A subclass defines `linearize`; the other members have defaults.
 
     Attributes:
         robust: kernel of the residuals; None for squares.
@@ -107,8 +103,6 @@ class AbstractTerm(Numbers):
 
     # Key in `Surface.columns`, for terms that define `columns`.
     name: ClassVar[str] = ""
-    # Whether `adapt` estimates numbers.
-    is_adaptive: ClassVar[bool] = False
     # Whether matches in the fine phase are nearest in position alone, even if the method also searches in channels.
     by_position: ClassVar[bool] = False
     # Edge of the cells within which scores are treated as correlated, in distances to the farthest neighbour; values
@@ -137,10 +131,19 @@ class AbstractTerm(Numbers):
     def linearize(self, matches: PosedMatches) -> Linearization:
         """Force, stiffness and cost of each correspondence."""
 
+
+class AbstractAdaptiveTerm(AbstractTerm):
+    """A term that estimates numbers from the residuals, such as their scale.
+
+    The numbers are estimated again at each pose of the fine phase, and are constants to autodiff. A registration with
+    such a term always starts with a coarse phase, in which the term has its initial numbers.
+    """
+
+    @abc.abstractmethod
     def sample(self, matches: PosedMatches) -> Any:
         """Input of `adapt` for each correspondence, a pytree of arrays (n, ...)."""
-        raise NotImplementedError(f"{type(self).__name__} is adaptive, but does not define sample")
 
+    @abc.abstractmethod
     def adapt(self, sample: Any, fraction: Float[AnyScalar, ""]) -> AbstractTerm:
         """The term with its numbers estimated from some correspondences, computed by NumPy if these are concrete.
 
@@ -148,17 +151,17 @@ class AbstractTerm(Numbers):
             sample: result of `sample` for an even sample of the source points, NaN for points without a match.
             fraction: fraction of all source points that are in the sample and have a match.
         """
-        return self
 
+    @abc.abstractmethod
     def with_numbers_of(self, other: AbstractTerm) -> AbstractTerm:
         """The term with the estimated numbers of another one, as constants to autodiff."""
-        return self
 
     @property
+    @abc.abstractmethod
     def shifts(self) -> Float[AnyArray, "s 3"]:
-        """Translations of the source, metres, at which `with_response` needs samples; by default none."""
-        return jnp.zeros((0, 3))
+        """Translations of the source, metres, at which `with_response` needs samples."""
 
+    @abc.abstractmethod
     def with_response(self, samples: Any) -> AbstractTerm:
         """The term for the covariance of the pose, whose stiffness is the change of the force when the points move and
         are matched again.
@@ -166,16 +169,18 @@ class AbstractTerm(Numbers):
         Args:
             samples: results of `sample` at each of the `shifts`, with new matches, stacked.
         """
-        return self
 
 
 def is_adaptive(terms: tuple[AbstractTerm, ...]) -> bool:
-    return any(term.is_adaptive for term in terms)
+    return any(isinstance(term, AbstractAdaptiveTerm) for term in terms)
 
 
 def with_numbers_of(terms: tuple[AbstractTerm, ...], others: tuple[AbstractTerm, ...]) -> tuple[AbstractTerm, ...]:
     """The terms with the numbers that the others have estimated, which are constants to autodiff."""
-    return tuple(term.with_numbers_of(other) for term, other in zip(terms, others, strict=True))
+    return tuple(
+        term.with_numbers_of(other) if isinstance(term, AbstractAdaptiveTerm) else term
+        for term, other in zip(terms, others, strict=True)
+    )
 
 
 def linearize(terms: tuple[AbstractTerm, ...], matches: PosedMatches) -> Linearization:

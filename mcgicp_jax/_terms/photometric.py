@@ -49,7 +49,7 @@ from mcgicp_jax._local_geometry.neighborhoods import NO_NEIGHBORS, Neighborhoods
 from mcgicp_jax._math import symmetric_matrices as alg
 from mcgicp_jax._math.robust_kernels import AbstractKernel, Cauchy
 from mcgicp_jax._math.statistics import cell_numbers, median
-from mcgicp_jax._terms.base import AbstractTerm, Linearization, PosedMatches
+from mcgicp_jax._terms.base import AbstractAdaptiveTerm, AbstractTerm, Linearization, PosedMatches
 
 # Scale of the default kernel in standard deviations: weights are those of Student's t with k² = 20 degrees of freedom.
 # Errors on RGB-D pairs with 10 instead of 20: from 1 % less to 11 % more on four sets, a quarter less (0.06 mm) on
@@ -136,7 +136,7 @@ def fitted_channels(around: Neighborhoods, local: LocalGeometry | None) -> Fitte
     return FittedChannels(local.normal, jnp.stack(fitted, axis=1), jnp.stack(gradients).transpose(2, 0, 1))
 
 
-class Photometric(AbstractTerm):
+class Photometric(AbstractAdaptiveTerm):
     """The photometric term, see the module. Its numbers are constants to autodiff.
 
     Attributes:
@@ -151,7 +151,6 @@ class Photometric(AbstractTerm):
     """
 
     name: ClassVar[str] = "photometric"
-    is_adaptive: ClassVar[bool] = True
     by_position: ClassVar[bool] = True
     # Both points of a correspondence contribute fits over their neighbourhoods. With 2, 4 and 8, the squared errors on
     # thirty walls of posters were 2.8, 1.8 and 1.6 times their variance (with half of the shift below); with 12, where
