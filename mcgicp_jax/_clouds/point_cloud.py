@@ -17,7 +17,7 @@ from mcgicp_jax._clouds.other_libraries import arrays_of
 from mcgicp_jax._compute.concrete import is_concrete
 from mcgicp_jax._compute.messages import messages_named
 from mcgicp_jax._compute.size_classes import size_class
-from mcgicp_jax._math.poses import Pose, pose_matrix
+from mcgicp_jax._math.poses import Pose, pose_matrix, rotated
 from mcgicp_jax._search.base import NeighborsOnDemand
 
 if TYPE_CHECKING:
@@ -381,12 +381,12 @@ class PointCloud(eqx.Module):
         matrix = pose_matrix(pose, "pose")
         xp = np if isinstance(self.points, np.ndarray) and is_concrete(matrix) else jnp
         rotation = xp.asarray(matrix[:3, :3], self.points.dtype)
-        points = self.points @ rotation.T
+        points = rotated(np.asarray(self.points), rotation) if xp is np else self.points @ rotation.T
         covariances = None if self.covariances is None else rotation @ self.covariances @ rotation.T
         offset, origin = matrix[:3, :3] @ self.origin + matrix[:3, 3], self.origin
         far = is_concrete(points, offset) and is_far(np.asarray(offset), float(np.abs(points).max(initial=0)))
         if far and self.deferred_neighbors is None:
-            moved = self.coordinates @ np.asarray(matrix[:3, :3], np.float64).T + np.asarray(matrix[:3, 3])
+            moved = rotated(self.coordinates, np.asarray(matrix[:3, :3], np.float64)) + np.asarray(matrix[:3, 3])
             return self.replace_rows(points=moved, covariances=covariances, origin=np.zeros(3))
         if far:
             # The large offset stays in float64.

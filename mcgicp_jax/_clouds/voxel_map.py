@@ -14,7 +14,7 @@ from mcgicp_jax._clouds.voxel_size import map_voxel_size
 from mcgicp_jax._clouds.voxels import starts_of, voxel_keys, voxel_of
 from mcgicp_jax._compute.argument_checks import check_positive
 from mcgicp_jax._compute.messages import messages_named
-from mcgicp_jax._math.poses import Pose, pose_matrix
+from mcgicp_jax._math.poses import Pose, pose_matrix, rotated
 
 
 def merge_clouds(
@@ -76,7 +76,7 @@ class VoxelMap:
         if self._names not in (None, cloud.channel_names):
             raise ValueError(f"{name}: expected the channels {self._names}, got {cloud.channel_names}")
         cloud, self._names = cloud.unpad(), cloud.channel_names
-        points = np.asarray(cloud.points, np.float64) @ pose[:3, :3].T + pose[:3, 3]
+        points = rotated(np.asarray(cloud.points, np.float64), pose[:3, :3]) + pose[:3, 3]
         rows = np.hstack([np.ones((len(points), 1)), points, *_valid_channels(cloud)])
         finite = np.isfinite(rows).all(axis=1)
         if self._first is None and finite.any():

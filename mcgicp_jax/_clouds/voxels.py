@@ -11,6 +11,8 @@ from __future__ import annotations
 import numpy as np
 from jaxtyping import Float, Int
 
+from mcgicp_jax._math.poses import rotated
+
 # Number of voxels along an axis: three 21-bit indices fit into one 63-bit key.
 VOXELS_PER_AXIS = 2**21
 # Angles in radians by which grids are turned: about the diagonal, so that the axes of a grid are 48 degrees from those
@@ -110,7 +112,7 @@ def grid_of(points: Float[np.ndarray, "N 3"]) -> Grid:
     middle = 0.5 * (columns.min(axis=1) + columns.max(axis=1))
     sides = [int(np.sum(column > value)) for column, value in zip(columns, middle, strict=True)]
     variation = np.random.default_rng([len(points), *sides]).uniform(-_VARIATION, _VARIATION, 3)
-    return Grid(Rotation.from_rotvec(_TURN / np.sqrt(3) + variation).as_matrix() @ columns)
+    return Grid(rotated(columns.T, Rotation.from_rotvec(_TURN / np.sqrt(3) + variation).as_matrix()).T)
 
 
 def starts_of(sorted_keys: Int[np.ndarray, "N"]) -> Int[np.ndarray, "M"]:

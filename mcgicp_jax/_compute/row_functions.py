@@ -226,10 +226,14 @@ class RowFunction:
                 table[places] = np.asarray(part.table)[: places.stop - places.start]
         return tuple(Packed(table, layout) for table, layout in zip(tables, layouts, strict=True))
 
-    def sums(self, num_threads: int | None = 1, packed: bool = True) -> list[Any]:
-        """The sum over each block, packed if that is not declined; programs may not have ended."""
+    def sums(self, num_threads: int | None = 1, packed: bool = True, in_order: bool = False) -> list[Any]:
+        """The sum over each block, packed if that is not declined; programs may not have ended.
+
+        Args:
+            in_order: whether this thread calls all programs, so that threads compute the rows of tables alone.
+        """
         gathered = _Gathered(self._inputs, self._size, None, num_threads)
-        return [part for _, part in self._over_blocks(gathered, num_threads, packed)]
+        return [part for _, part in self._over_blocks(gathered, 1 if in_order else num_threads, packed)]
 
     def _over_blocks(
         self, gathered: _Gathered, num_threads: int | None, packed: bool = True

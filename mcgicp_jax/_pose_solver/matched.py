@@ -17,7 +17,7 @@ from mcgicp_jax._compute.concrete import AnyArray, AnyScalar, is_concrete, numpy
 from mcgicp_jax._compute.row_functions import Input, Rows, whole
 from mcgicp_jax._local_geometry.surface import Surface
 from mcgicp_jax._math import symmetric_matrices as alg
-from mcgicp_jax._math.poses import rotation_from_quaternion
+from mcgicp_jax._math.poses import rotated, rotation_from_quaternion
 from mcgicp_jax._methods.surfaces import NOISE, SEARCH, SURFACE, AnySurface, input_of
 from mcgicp_jax._search.base import Correspondences, SearchPoints
 from mcgicp_jax._terms.base import AbstractTerm, Linearization, PosedMatches, linearize
@@ -42,8 +42,10 @@ class Motion(NamedTuple):
             return Motion(rotation_from_quaternion(wxyz).astype(dtype), np.asarray(parameters[4:]))
         return Motion(jaxlie.SO3(parameters[:4]).as_matrix().astype(dtype), parameters[4:])
 
-    def move(self, points: Float[AnyArray, "n 3"]) -> Float[Array, "3 n"]:
+    def move(self, points: Float[AnyArray, "n 3"]) -> Float[AnyArray, "3 n"]:
         """T a for each point, metres."""
+        if is_concrete(self.rotation, points):
+            return (rotated(points, self.rotation) + self.translation).T
         return jnp.dot(self.rotation, jnp.asarray(points).T, precision="highest") + self.translation[:, None]
 
 

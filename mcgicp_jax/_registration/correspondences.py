@@ -16,7 +16,7 @@ from mcgicp_jax._compute.argument_checks import check_integer, check_positive
 from mcgicp_jax._compute.cache import cached_with_cloud
 from mcgicp_jax._compute.concrete import constant, is_concrete
 from mcgicp_jax._compute.linear_maps import primal
-from mcgicp_jax._math.poses import Pose, se3_from_matrix
+from mcgicp_jax._math.poses import Pose, rotated, se3_from_matrix
 from mcgicp_jax._methods.base import AbstractMethod
 from mcgicp_jax._methods.surfaces import search_numbers, search_rows, searchable
 from mcgicp_jax._pose_solver.matched import Motion, distances_within
@@ -98,7 +98,7 @@ def _correspondences_at(
     """Matches at a pose, valid within `max_distance` metres of position; NumPy, so that nothing is compiled."""
     rows, dtype = np.maximum(indices, 0), source.points.dtype
     with np.errstate(invalid="ignore"):
-        moved = source.points.astype(np.float64) @ matrix[:3, :3].T + matrix[:3, 3]
+        moved = rotated(source.points.astype(np.float64), matrix[:3, :3]) + matrix[:3, 3]
         distances = np.linalg.norm(target.points[rows] - moved, axis=-1).astype(dtype)
         valid = (indices >= 0) & source.valid & target.valid[rows] & (distances <= max_distance)
     return Correspondences(rows.astype(np.int32), distances, valid)

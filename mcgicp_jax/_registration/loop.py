@@ -133,9 +133,9 @@ class AbstractExecutor(abc.ABC):
         """Distances of all matches, metres; infinite where there is none."""
         xp = numpy_for(motion, matches, self.problem.source.points)
         points, targets = xp.asarray(self.problem.source.points), xp.asarray(self.problem.target.points)
-        points = points if matches.rows is None else points[matches.rows]
-        with np.errstate(invalid="ignore", over="ignore"), jax.default_matmul_precision("highest"):
-            apart = targets[xp.maximum(matches.indices, 0)] - (points @ motion.rotation.T + motion.translation)
+        with np.errstate(invalid="ignore", over="ignore"):
+            moved = motion.move(points if matches.rows is None else points[matches.rows]).T
+            apart = targets[xp.maximum(matches.indices, 0)] - moved
             return xp.where(matches.indices >= 0, xp.linalg.norm(apart, axis=-1), np.inf)
 
     def nearest_candidates(self, motion: Motion, matches: Matches) -> Matches:

@@ -8,7 +8,7 @@ import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Float, Int
 
-from mcgicp_jax._math.poses import rotation_from_quaternion
+from mcgicp_jax._math.poses import rotated, rotation_from_quaternion
 from mcgicp_jax._search.base import AbstractIndex, SearchPoints, on_host
 from mcgicp_jax._search.nearest_with_ties import TiedTree, TreeBackend, slack_of
 
@@ -270,4 +270,4 @@ def _moved(pose: Float[ArrayLike, "7"], points: Float[np.ndarray, "N 3"]) -> Flo
     pose = np.asarray(pose, np.float64)
     # A non-finite pose gives NaN; the status of the registration reports it.
     with np.errstate(invalid="ignore"):
-        return points @ rotation_from_quaternion(pose[:4]).T + pose[4:]
+        return rotated(points, rotation_from_quaternion(pose[:4])) + pose[4:]

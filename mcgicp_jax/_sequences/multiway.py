@@ -18,7 +18,7 @@ from mcgicp_jax._clouds.voxel_size import NUM_NEIGHBORS, VoxelSize, voxels_for
 from mcgicp_jax._clouds.voxels import wrapped_keys
 from mcgicp_jax._compute.messages import messages_named
 from mcgicp_jax._local_geometry.spacing_and_noise import point_spacing
-from mcgicp_jax._math.poses import Pose, pose_matrices
+from mcgicp_jax._math.poses import Pose, pose_matrices, rotated
 from mcgicp_jax._math.twists import exponential, logarithm
 from mcgicp_jax._methods.base import AbstractMethod
 from mcgicp_jax._pairs.batch import register_batch
@@ -247,7 +247,7 @@ def _overlapping(clouds: list[PointCloud], poses: Float[np.ndarray, "n 4 4"], ce
     from scipy.sparse import csr_array
 
     keys = [
-        np.unique(wrapped_keys(cloud.coordinates @ T[:3, :3].T + T[:3, 3], cell))
+        np.unique(wrapped_keys(rotated(cloud.coordinates, T[:3, :3]) + T[:3, 3], cell))
         for cloud, T in zip(clouds, poses, strict=True)
     ]
     sizes = np.array([len(each) for each in keys])
