@@ -19,7 +19,7 @@ from mcgicp_jax._math.robust_kernels import AbstractKernel
 from mcgicp_jax._methods.base import AbstractMethod
 from mcgicp_jax._methods.surfaces import surface_pair
 from mcgicp_jax._pose_solver.matched import match_surfaces
-from mcgicp_jax._registration.input_checks import check_clouds, check_matches
+from mcgicp_jax._registration.input_checks import check_clouds, check_matches, warn_of_estimated_parameters
 from mcgicp_jax._registration.make_result import registration_of
 from mcgicp_jax._registration.on_host import FixedMatchesOnHost
 from mcgicp_jax._registration.options import Options
@@ -82,6 +82,7 @@ def estimate_pose(
     )
     check_matches(matches, source, method, temperature)
     check_clouds(source, target, method)
+    warn_of_estimated_parameters(method, source, target, temperature)
     dtype = source.points.dtype
     softness = None if temperature is None else numpy_for(temperature).asarray(temperature, dtype)
     given = Given(source, target, method, robust, temperature=softness)
