@@ -432,12 +432,26 @@ def test_estimated_parameters_are_warned_of_where_channels_are_differentiated(of
         warnings.simplefilter("error", UserWarning)
         check_eager_gradient(loss, inputs)
         jax.grad(loss)({"source points": clouds[0].points}, unset)
+        # α decides matches alone.
+        jax.grad(loss)(inputs, mcg.MultiChannelGICP(0.05))
         if of != "register_batch":
             jax.eval_shape(jax.jit(jax.grad(partial(loss, method=unset))), inputs)
     with pytest.warns(UserWarning, match=r"^channel_covariance: estimated .* resolve") as caught:
         for _ in range(2):
             jax.grad(loss)(inputs, unset)
     assert {warning.filename for warning in caught} == {__file__}
+
+
+def test_estimated_weights_of_soft_matches_are_warned_of(clouds):
+    method = mcg.MultiChannelGICP(0.05)
+    matches = mcg.find_correspondences(*clouds, motion(), method, max_distance=GATE, num_candidates=3)
+
+    def loss(channels):
+        source = clouds[0].replace(channels=channels)
+        return mcg.mahalanobis_cost(motion(), source, clouds[1], matches, method, temperature=0.1)
+
+    with pytest.warns(UserWarning, match="^channel_weights: estimated"):
+        jax.grad(loss)(clouds[0].channels)
 
 
 def test_a_gradient_by_weights_of_the_matches_is_warned_of():
