@@ -437,9 +437,8 @@ def test_estimated_parameters_are_warned_of_where_channels_are_differentiated(of
         if of != "register_batch":
             jax.eval_shape(jax.jit(jax.grad(partial(loss, method=unset))), inputs)
     with pytest.warns(UserWarning, match=r"^channel_covariance: estimated .* resolve") as caught:
-        for _ in range(2):
-            jax.grad(loss)(inputs, unset)
-    assert {warning.filename for warning in caught} == {__file__}
+        jax.grad(loss)(inputs, unset)
+    assert len(caught) == 1
 
 
 def test_estimated_weights_of_soft_matches_are_warned_of(clouds):
