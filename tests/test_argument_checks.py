@@ -1,5 +1,6 @@
 """Arguments of the wrong kind are named."""
 
+import dataclasses
 import inspect
 
 import jax
@@ -8,8 +9,9 @@ import pytest
 from jaxtyping import TypeCheckError
 
 import mcgicp_jax as mcg
+from mcgicp_jax._cli.options import Options as CommandOptions
 from mcgicp_jax._compute.argument_checks import check_integer, check_positive
-from mcgicp_jax._registration.options import check_method
+from mcgicp_jax._registration.options import GivenOptions, Options, check_method
 
 
 @pytest.mark.parametrize("value", ["x", None, [1.0], np.nan, 0, -1.0])
@@ -36,6 +38,17 @@ def test_unknown_options_are_named(function):
         TypeError, match=rf"^{name}: got an unexpected argument 'tie_points'; expected one of .*voxel_sizes"
     ):
         list(function(*given, tie_points=None).__iter__())
+
+
+def test_options_are_declared_alike():
+    """By `register`, for batches and sequences, and on the command line."""
+    declared = {each.name: (each.type, each.default) for each in dataclasses.fields(Options) if each.name != "reach"}
+    parameters = inspect.signature(mcg.register).parameters
+    assert {name: (parameters[name].annotation, parameters[name].default) for name in declared} == declared
+    assert {name: (hint.__forward_arg__, declared[name][1]) for name, hint in GivenOptions.__annotations__.items()} == (
+        declared
+    )
+    assert Options(**CommandOptions().registration()) == Options()
 
 
 def test_frequent_mistakes_are_named():

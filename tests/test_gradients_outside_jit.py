@@ -1,5 +1,8 @@
 """Gradients of concrete clouds, outside `jit`: against central differences, in every mode; nothing compiled anew."""
 
+import warnings
+from functools import partial
+
 import jax
 import jax.numpy as jnp
 import jaxlie
@@ -401,6 +404,53 @@ def test_a_result_is_printed_in_a_gradient(clouds):
         return result.matrix[0, 3]
 
     jax.grad(loss)(source.points)
+
+
+@pytest.mark.parametrize("of", ["register", "register_batch", "estimate_pose", "mahalanobis_cost"])
+def test_estimated_parameters_are_warned_of_where_channels_are_differentiated(of, clouds):
+    """The gradient is exact for parameters resolved beforehand, and by points for estimated ones."""
+    unset = mcg.MultiChannelGICP()
+    resolved = unset.resolve(*clouds)
+    start = mcg.register(*clouds, resolved, max_distance=GATE, **TO_ROUNDING).matrix
+    matches = mcg.find_correspondences(*clouds, start, resolved, max_distance=GATE)
+    # Away from the minimum of the cost, so that its gradient is not 0.
+    pose = start @ np.asarray(jaxlie.SE3.exp(jnp.full(6, 0.01)).as_matrix())
+
+    def loss(inputs, method=resolved):
+        pair = clouds_with(inputs, *clouds)
+        if of == "mahalanobis_cost":
+            return mcg.mahalanobis_cost(pose, *pair, matches, method)
+        if of == "estimate_pose":
+            return weigh(mcg.estimate_pose(*pair, matches, method, init=start, **TO_ROUNDING).matrix)
+        if of == "register":
+            return weigh(mcg.register(*pair, method, init=start, max_distance=GATE, **TO_ROUNDING).matrix)
+        options = {"init": [start], "max_distance": GATE, **TO_ROUNDING}
+        return weigh(mcg.register_batch([pair[0]], [pair[1]], method, **options)[0].matrix)
+
+    inputs = {f"{side} channels": cloud.channels for side, cloud in zip(("source", "target"), clouds, strict=True)}
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", UserWarning)
+        check_eager_gradient(loss, inputs)
+        jax.grad(loss)({"source points": clouds[0].points}, unset)
+        # α decides matches alone.
+        jax.grad(loss)(inputs, mcg.MultiChannelGICP(0.05))
+        if of != "register_batch":
+            jax.eval_shape(jax.jit(jax.grad(partial(loss, method=unset))), inputs)
+    with pytest.warns(UserWarning, match=r"^channel_covariance: estimated .* resolve") as caught:
+        jax.grad(loss)(inputs, unset)
+    assert len(caught) == 1
+
+
+def test_estimated_weights_of_soft_matches_are_warned_of(clouds):
+    method = mcg.MultiChannelGICP(0.05)
+    matches = mcg.find_correspondences(*clouds, motion(), method, max_distance=GATE, num_candidates=3)
+
+    def loss(channels):
+        source = clouds[0].replace(channels=channels)
+        return mcg.mahalanobis_cost(motion(), source, clouds[1], matches, method, temperature=0.1)
+
+    with pytest.warns(UserWarning, match="^channel_weights: estimated"):
+        jax.grad(loss)(clouds[0].channels)
 
 
 def test_a_gradient_by_weights_of_the_matches_is_warned_of():

@@ -8,7 +8,10 @@ import traceback
 import warnings
 from collections.abc import Iterator
 from contextvars import ContextVar
-from typing import Any, NamedTuple
+from typing import Any, TypeAlias
+
+# A line of code at which a warning is shown, as `warnings.warn_explicit` takes it: file, number, module and registry.
+Line: TypeAlias = tuple[str, int, str, dict[Any, Any]]
 
 _PACKAGE = __name__.split(".", maxsplit=1)[0]
 _prefix: ContextVar[str] = ContextVar("prefix", default="")
@@ -35,15 +38,6 @@ def messages_named(name: str) -> Iterator[None]:
         raise ValueError(f"{name}: {error}") from error
 
 
-class Line(NamedTuple):
-    """A line of code at which a warning is shown: arguments of `warnings.warn_explicit`."""
-
-    filename: str
-    lineno: int
-    module: str
-    registry: dict[Any, Any]
-
-
 def calling_line() -> Line:
     """The line that called the package; in a thread of the package, the one that caused its work."""
     if (known := _line.get()) is not None:
@@ -53,7 +47,7 @@ def calling_line() -> Line:
     inside = [i for i, name in enumerate(names) if name.split(".", maxsplit=1)[0] == _PACKAGE]
     frame = frames[min(inside[-1] + 1, len(frames) - 1)]
     registry = frame.f_globals.setdefault("__warningregistry__", {})
-    return Line(frame.f_code.co_filename, frame.f_lineno, frame.f_globals.get("__name__", ""), registry)
+    return frame.f_code.co_filename, frame.f_lineno, frame.f_globals.get("__name__", ""), registry
 
 
 @contextlib.contextmanager
@@ -69,4 +63,4 @@ def shown_at(line: Line) -> Iterator[None]:
 def warn(message: str | Warning) -> None:
     """Issue a warning, of `UserWarning` if it is a text, at the line that called the package."""
     text = f"{_prefix.get()}{message}" if isinstance(message, str) else message
-    warnings.warn_explicit(text, UserWarning, **calling_line()._asdict())
+    warnings.warn_explicit(text, UserWarning, *calling_line())

@@ -16,7 +16,7 @@ import numpy as np
 from jax.typing import ArrayLike, DTypeLike
 from jaxtyping import Array, Float
 
-from mcgicp_jax._compute.concrete import AnyArray, is_concrete, numpy_for
+from mcgicp_jax._compute.concrete import AnyArray, AnyScalar, is_concrete, numpy_for
 
 if TYPE_CHECKING:
     # A pose that a user passes.
@@ -129,12 +129,7 @@ def se3_from_matrix(matrix: Float[ArrayLike, "4 4"], dtype: DTypeLike) -> jaxlie
 
 def parameters_of(matrices: Float[np.ndarray, "*batch 4 4"]) -> Float[np.ndarray, "*batch 7"]:
     """Unit quaternions wxyz and translations of rigid motions; float64."""
-    # Imported late: it takes a fifth of the import time of the package.
-    from scipy.spatial.transform import Rotation
-
-    xyzw = Rotation.from_matrix(matrices[..., :3, :3].reshape(-1, 3, 3)).as_quat(canonical=True)
-    xyzw = xyzw.reshape(*matrices.shape[:-2], 4)
-    return np.concatenate([xyzw[..., 3:], xyzw[..., :3], matrices[..., :3, 3]], axis=-1)
+    return np.concatenate([quaternion_from_rotation(matrices[..., :3, :3]), matrices[..., :3, 3]], axis=-1)
 
 
 def matrices_of(parameters: Float[np.ndarray, "*batch 7"]) -> Float[np.ndarray, "*batch 4 4"]:
@@ -148,18 +143,13 @@ def matrices_of(parameters: Float[np.ndarray, "*batch 7"]) -> Float[np.ndarray, 
 
 @partial(jax.jit, static_argnames="dtype")
 def _se3_from_traced(matrix: Float[Array, "4 4"], dtype: DTypeLike) -> jaxlie.SE3:
-    pose = jaxlie.SE3.from_matrix(jnp.asarray(matrix, dtype))
-    return cast_pose(pose.normalize(), dtype)
+    pose = jaxlie.SE3.from_matrix(jnp.asarray(matrix, dtype)).normalize()
+    return jaxlie.SE3(pose.wxyz_xyz.astype(dtype))
 
 
 def se3(parameters: AnyArray) -> jaxlie.SE3:
     """`jaxlie.SE3` from (7,) parameters, quaternion wxyz and translation; NumPy arrays stay NumPy arrays."""
     return jaxlie.SE3(parameters)
-
-
-def cast_pose(pose: jaxlie.SE3, dtype: DTypeLike) -> jaxlie.SE3:
-    """The pose in the given precision: undoes the promotion by constants that jaxlie computes in the default one."""
-    return jaxlie.SE3(pose.wxyz_xyz.astype(dtype))
 
 
 def rotation_from_quaternion(wxyz: Float[np.ndarray, "*batch 4"]) -> Float[np.ndarray, "*batch 3 3"]:
@@ -189,10 +179,24 @@ def rotated(points: Float[np.ndarray, "n 3"], rotation: Float[np.ndarray, "3 3"]
     return np.einsum("ij,jn->in", rotation, np.ascontiguousarray(points.T)).T
 
 
-def turn_by_quaternion(wxyz: Float[np.ndarray, "*batch 4"]) -> Float[np.ndarray, "*batch 3 4"]:
+def quaternion_from_rotation(rotations: Float[np.ndarray, "*batch 3 3"]) -> Float[np.ndarray, "*batch 4"]:
+    """Unit quaternions wxyz of rotation matrices, with w ≥ 0."""
+    r = np.moveaxis(rotations, (-2, -1), (0, 1))
+    x, y, z = r[2, 1] - r[1, 2], r[0, 2] - r[2, 0], r[1, 0] - r[0, 1]
+    xy, xz, yz = r[1, 0] + r[0, 1], r[0, 2] + r[2, 0], r[2, 1] + r[1, 2]
+    signs = np.array([[1, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1]])
+    a, b, c, d = 1 + np.einsum("ki,ii...->k...", signs, r)
+    # Rows of 4 q qᵀ; the row with the largest diagonal entry has the most digits.
+    products = np.array([[a, x, y, z], [x, b, xy, xz], [y, xy, c, yz], [z, xz, yz, d]])
+    largest = np.argmax([a, b, c, d], axis=0)
+    wxyz = np.moveaxis(np.take_along_axis(products, largest[None, None], axis=0)[0], 0, -1)
+    return wxyz * (np.where(wxyz[..., :1] < 0, -1, 1) / np.linalg.norm(wxyz, axis=-1, keepdims=True))
+
+
+def turn_by_quaternion(wxyz: Float[AnyArray, "*batch 4"]) -> Float[AnyArray, "*batch 3 4"]:
     """Derivative of the rotation vector in the axes of the target, the vector part of 2 δq q*, by a unit quaternion."""
-    w, vector = wxyz[..., :1, None], wxyz[..., 1:]
-    return 2 * np.concatenate([-vector[..., None], w * np.eye(3) + np.cross(np.eye(3), vector[..., None, :])], axis=-1)
+    xp, w, vector = numpy_for(wxyz), wxyz[..., :1, None], wxyz[..., 1:]
+    return 2 * xp.concatenate([-vector[..., None], w * xp.eye(3) + skew(vector)], axis=-1)
 
 
 def move_pose(pose: jaxlie.SE3, twist: Float[Array, "6"], center: Float[Array, "3"]) -> jaxlie.SE3:
@@ -200,7 +204,9 @@ def move_pose(pose: jaxlie.SE3, twist: Float[Array, "6"], center: Float[Array, "
     turn = jaxlie.SO3.exp(twist[3:])
     rotation = (turn @ pose.rotation()).normalize()
     translation = center + turn @ (pose.translation() - center) + twist[:3]
-    return cast_pose(jaxlie.SE3.from_rotation_and_translation(rotation, translation), pose.wxyz_xyz.dtype)
+    moved = jaxlie.SE3.from_rotation_and_translation(rotation, translation)
+    # jaxlie promotes to the default precision.
+    return jaxlie.SE3(moved.wxyz_xyz.astype(pose.wxyz_xyz.dtype))
 
 
 def adjoint_to_center(pose: jaxlie.SE3, center: Float[Array, "3"]) -> Float[Array, "6 6"]:
@@ -215,33 +221,19 @@ def adjoint_to_source(pose: jaxlie.SE3, center: Float[Array, "3"]) -> Float[Arra
     return to_center.inverse().adjoint().astype(pose.wxyz_xyz.dtype)
 
 
-def units(radius: Float[Array, ""]) -> Float[Array, "6"]:
+def units(radius: Float[AnyScalar, ""]) -> Float[AnyArray, "6"]:
     """Factors that convert a twist from units of the radius to metres; radians stay."""
-    return jnp.stack([radius] * 3 + [jnp.ones_like(radius)] * 3)
+    xp = numpy_for(radius)
+    return xp.stack([radius] * 3 + [xp.ones_like(radius)] * 3)
 
 
-def parameters_by_twist(pose: Float[np.ndarray, "7"], center: Float[np.ndarray, "3"]) -> Float[np.ndarray, "7 6"]:
+def parameters_by_twist(pose: Float[AnyArray, "7"], center: Float[AnyArray, "3"]) -> Float[AnyArray, "7 6"]:
     """Derivative of pose parameters `wxyz_xyz` by a twist about a centre, metres and radians: the pose turns by ω about
     the centre and shifts by v."""
-    found, identity = np.zeros((7, 6)), np.eye(3)
-    found[0, 3:] = -0.5 * pose[1:4]
-    # np.cross(identity, a) is the matrix that maps b to a × b.
-    found[1:4, 3:] = 0.5 * (pose[0] * identity - np.cross(identity, pose[1:4]))
-    found[4:, :3] = identity
-    found[4:, 3:] = -np.cross(identity, pose[4:] - center)
-    return found
-
-
-def from_center(offset: Float[Array, "3"], radius: Float[Array, ""], other: Float[Array, ""]) -> Float[Array, "6 6"]:
-    """(6, 6) matrix from twists about a centre, lengths in units of `radius`, to twists about another one.
-
-    Args:
-        offset: from the centre to the other one, metres.
-        other: unit of length of the result, metres.
-    """
-    cross = jnp.cross(jnp.eye(3, dtype=offset.dtype), offset[None], axis=1).T
-    top = jnp.concatenate([jnp.eye(3, dtype=offset.dtype) * radius, cross], axis=1) / other
-    return jnp.concatenate([top, jnp.eye(6, dtype=offset.dtype)[3:]])
+    xp = numpy_for(pose, center)
+    by_turn = turn_by_quaternion(pose[:4]).T / 4
+    quaternion = xp.concatenate([xp.zeros_like(by_turn), by_turn], axis=1)
+    return xp.concatenate([quaternion, translation_adjoint(center - pose[4:])[:3]])
 
 
 def inverse(matrices: Float[AnyArray, "*batch 4 4"]) -> Float[AnyArray, "*batch 4 4"]:
@@ -265,7 +257,13 @@ def adjoint(matrices: Float[AnyArray, "*batch 4 4"]) -> Float[AnyArray, "*batch 
 def translation_adjoint(offset: Float[AnyArray, "3"]) -> Float[AnyArray, "6 6"]:
     """The adjoint of a translation by `offset`."""
     xp = numpy_for(offset)
-    zero = xp.zeros_like(offset[0])
-    x, y, z = offset
-    cross = xp.stack([xp.stack([zero, -z, y]), xp.stack([z, zero, -x]), xp.stack([-y, x, zero])])
-    return xp.block([[xp.eye(3), cross], [xp.zeros((3, 3)), xp.eye(3)]])
+    return xp.block([[xp.eye(3), skew(offset)], [xp.zeros((3, 3)), xp.eye(3)]])
+
+
+def skew(vectors: Float[AnyArray, "*batch 3"]) -> Float[AnyArray, "*batch 3 3"]:
+    """The matrices of the cross products a × ·."""
+    xp = numpy_for(vectors)
+    x, y, z = xp.moveaxis(vectors, -1, 0)
+    zero = xp.zeros_like(x)
+    entries = xp.stack([zero, -z, y, z, zero, -x, -y, x, zero], axis=-1)
+    return entries.reshape(*vectors.shape, 3)

@@ -9,18 +9,12 @@ from __future__ import annotations
 import numpy as np
 from jaxtyping import Float
 
+from mcgicp_jax._math.poses import quaternion_from_rotation, skew
+
 # ζ(2k) for k = 1 to 28: the generating function of the Bernoulli numbers, which inverts the derivative of exp, is a
 # series in (θ/2π)² with these coefficients. At θ = π the remainder is below 4e-16.
 _POWERS = np.arange(1, 29)
 _ZETA = np.array([np.pi**2 / 6, np.pi**4 / 90, *(np.sum(np.arange(1.0, 999) ** (-2.0 * k)) for k in _POWERS[2:])])
-
-
-def skew(vectors: Float[np.ndarray, "*batch 3"]) -> Float[np.ndarray, "*batch 3 3"]:
-    """The matrices of the cross products a × ·."""
-    x, y, z = np.moveaxis(vectors, -1, 0)
-    zero = np.zeros_like(x)
-    entries = np.stack([zero, -z, y, z, zero, -x, -y, x, zero], axis=-1)
-    return entries.reshape(*vectors.shape, 3)
 
 
 def exponential(twists: Float[np.ndarray, "*batch 6"]) -> Float[np.ndarray, "*batch 4 4"]:
@@ -68,18 +62,8 @@ def logarithm_derivative(twists: Float[np.ndarray, "*batch 6"]) -> Float[np.ndar
 
 def _rotation_vectors(rotations: Float[np.ndarray, "*batch 3 3"]) -> Float[np.ndarray, "*batch 3"]:
     """Axis times angle, of angles up to π."""
-    r = np.moveaxis(rotations, (-2, -1), (0, 1))
-    x, y, z = r[2, 1] - r[1, 2], r[0, 2] - r[2, 0], r[1, 0] - r[0, 1]
-    xy, xz, yz = r[1, 0] + r[0, 1], r[0, 2] + r[2, 0], r[2, 1] + r[1, 2]
-    signs = np.array([[1, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1]])
-    a, b, c, d = 1 + np.einsum("ki,ii...->k...", signs, r)
-    # Rows of 4 q qᵀ, for q = wxyz; the row with the largest diagonal entry has the most digits.
-    products = np.array([[a, x, y, z], [x, b, xy, xz], [y, xy, c, yz], [z, xz, yz, d]])
-    largest = np.argmax([a, b, c, d], axis=0)
-    quaternions = np.moveaxis(np.take_along_axis(products, largest[None, None], axis=0)[0], 0, -1)
-    quaternions = quaternions * np.where(quaternions[..., :1] < 0, -1, 1)
+    quaternions = quaternion_from_rotation(rotations)
     sine = np.linalg.norm(quaternions[..., 1:], axis=-1, keepdims=True)
     angle = 2 * np.arctan2(sine, quaternions[..., :1])
     small = sine < 1e-150
-    factor = np.where(small, 2 / np.where(small, quaternions[..., :1], 1), angle / np.where(small, 1, sine))
-    return factor * quaternions[..., 1:]
+    return np.where(small, 2, angle / np.where(small, 1, sine)) * quaternions[..., 1:]

@@ -26,7 +26,7 @@ from mcgicp_jax._local_geometry.surface import Surface
 from mcgicp_jax._math.poses import Pose
 from mcgicp_jax._methods.base import AbstractMethod
 from mcgicp_jax._pairs.register import register_from, start_from_anywhere
-from mcgicp_jax._registration.input_checks import warn_of_lengths
+from mcgicp_jax._registration.input_checks import warn_of_estimated_parameters, warn_of_lengths
 from mcgicp_jax._registration.make_result import registration_of
 from mcgicp_jax._registration.options import Options
 from mcgicp_jax._registration.pose_derivative import Given
@@ -200,6 +200,7 @@ class BatchJob:
     @_of_a_pair
     def _given(self, pair: Pair) -> PairResult | _GivenPair:
         source, target = self._clouds(pair)
+        warn_of_estimated_parameters(self.method, source, target)
         init = self._start(pair, primal(source), primal(target))
         if isinstance(init, PairResult):
             return init

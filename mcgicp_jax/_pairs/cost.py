@@ -22,7 +22,7 @@ from mcgicp_jax._methods.base import AbstractGeneralized, AbstractMethod, with_u
 from mcgicp_jax._methods.surfaces import Fixed, differentiable_inputs, surface_pair
 from mcgicp_jax._pose_solver.adaptation import adapted, sample_of_term
 from mcgicp_jax._pose_solver.matched import Motion, linearize_at, matched_rows
-from mcgicp_jax._registration.input_checks import check_matches
+from mcgicp_jax._registration.input_checks import check_matches, warn_of_estimated_parameters
 from mcgicp_jax._search.base import Correspondences
 from mcgicp_jax._terms.base import AbstractAdaptiveTerm, AbstractTerm
 
@@ -72,6 +72,7 @@ def mahalanobis_cost(
     check_matches(matches, source, method, temperature)
     if log_determinant and not isinstance(method, AbstractGeneralized):
         raise ValueError(f"log_determinant: expected a method with covariances, got {type(method).__name__}")
+    warn_of_estimated_parameters(method, source, target, temperature)
     matrix, dtype = centred_pose(pose, source, target, "pose"), source.points.dtype
     motion = Motion(matrix[:3, :3].astype(dtype), matrix[:3, 3].astype(dtype))
     temperature = None if temperature is None else numpy_for(temperature).asarray(temperature, dtype)

@@ -16,7 +16,7 @@ from mcgicp_jax._math.poses import Pose
 from mcgicp_jax._math.robust_kernels import AbstractKernel
 from mcgicp_jax._methods.base import AbstractMethod
 from mcgicp_jax._pose_solver.matched import Matches
-from mcgicp_jax._registration.input_checks import check_clouds, check_matches
+from mcgicp_jax._registration.input_checks import check_clouds, check_matches, warn_of_estimated_parameters
 from mcgicp_jax._registration.options import Options
 from mcgicp_jax._registration.pose_derivative import Given
 from mcgicp_jax._registration.register_pair import Run, pose_problem, results_of, run_loop
@@ -75,6 +75,7 @@ def estimate_pose(
     )
     check_matches(matches, source, method, temperature)
     check_clouds(source, target, method)
+    warn_of_estimated_parameters(method, source, target, temperature)
     softness = None if temperature is None else numpy_for(temperature).asarray(temperature, source.points.dtype)
     given = Given(source, target, method, robust, temperature=softness)
     values, init, fixed = given.values(), primal(init), Matches.given(primal(matches))

@@ -16,7 +16,7 @@ from mcgicp_jax._global_pose.global_pose import GlobalPoseResult, global_pose
 from mcgicp_jax._math.poses import Pose
 from mcgicp_jax._math.robust_kernels import AbstractKernel
 from mcgicp_jax._methods.base import AbstractMethod
-from mcgicp_jax._registration.input_checks import warn_of_lengths
+from mcgicp_jax._registration.input_checks import warn_of_estimated_parameters, warn_of_lengths
 from mcgicp_jax._registration.measurements import GivenPrior, GivenTiePoints
 from mcgicp_jax._registration.options import Distance, Options, check_method
 from mcgicp_jax._registration.register_pair import register_pair
@@ -136,7 +136,7 @@ def register(
             have so different ones that the exposure was probably another, extent and spacing of the two clouds differ
             so much that one is probably in another unit, or `GICP` gets one cloud with covariances that are not
             dimensionless. Outside of `jit`: if less than 10 % of the source points have a match at the
-            end, or `channel_weights` are differentiated.
+            end, `channel_weights` are differentiated, or channels are while `channel_covariance` is None.
     """
     options = Options(
         max_distance=max_distance,
@@ -154,6 +154,7 @@ def register(
         raise ValueError("hold_unconstrained: expected True with tie_points or prior, got False")
     source, target = as_cloud("source", source), as_cloud("target", target)
     warn_of_lengths(source, target)
+    warn_of_estimated_parameters(method, source, target)
     return register_from(source, target, method, init, options, tie_points, prior)
 
 

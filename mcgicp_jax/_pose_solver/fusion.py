@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import jaxlie
 from jaxtyping import Array, Float
 
-from mcgicp_jax._math.poses import adjoint_to_source, from_center, units
+from mcgicp_jax._math.poses import adjoint_to_source, translation_adjoint, units
 from mcgicp_jax._pose_solver.covariance import UNKNOWN, Moments, response_and_scatter
 from mcgicp_jax._pose_solver.degeneracy import Directions
 from mcgicp_jax._pose_solver.pose_measurements import Fusion, PoseForm
@@ -80,8 +80,10 @@ def fused_update(pose: jaxlie.SE3, sums: Sums, directions: Directions, fusion: F
     """One Newton step on P s + γ = 0, with the matches and M fixed; and the directions with tie points and prior."""
     radius, dtype = fusion.radius, sums.center.dtype
     pull, known = fusion.pull(pose.rotation().as_matrix().astype(dtype), pose.translation())
-    outwards = from_center(sums.center - fusion.center, radius, sums.radius)
-    back = from_center(fusion.center - sums.center, sums.radius, radius)
+    # Matrices from twists about the centre of `fusion` to those about the centre of the sums, and back.
+    offset, lengths, lengths_here = sums.center - fusion.center, units(radius), units(sums.radius)
+    outwards = translation_adjoint(-offset).astype(dtype) * lengths / lengths_here[:, None]
+    back = translation_adjoint(offset).astype(dtype) * lengths_here / lengths[:, None]
     known_here = back.T @ known @ back
     directions = held_by_pose_form(directions, known_here)
     unit_information = twist_form(sums.stiffness, sums.radius)

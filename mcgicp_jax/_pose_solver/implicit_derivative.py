@@ -13,7 +13,7 @@ from jaxtyping import Array, Bool, Float
 
 from mcgicp_jax._compute.concrete import AnyArray, numpy_for
 from mcgicp_jax._compute.linear_maps import is_symbolic_zero, once
-from mcgicp_jax._math.poses import units
+from mcgicp_jax._math.poses import parameters_by_twist, units
 from mcgicp_jax._pose_solver.matched import Matched, Motion, linearize_at
 from mcgicp_jax._pose_solver.pose_measurements import Fusion
 from mcgicp_jax._pose_solver.sums import Sums
@@ -134,9 +134,7 @@ with_derivative.defjvp(_with_derivative_jvp, symbolic_zeros=True)
 
 def _along(pose: Float[Array, "7"], twist: Float[Array, "6"], center: Float[Array, "3"]) -> Float[Array, "7"]:
     """First-order change of the pose parameters `wxyz_xyz` along a twist about a centre; linear in the twist."""
-    rotation = jaxlie.SO3(jnp.append(jnp.zeros(1, twist.dtype), 0.5 * twist[3:])) @ jaxlie.SO3(pose[:4])
-    translation = twist[:3] + jnp.cross(twist[3:], pose[4:] - center)
-    return jnp.concatenate([rotation.wxyz.astype(pose.dtype), translation])
+    return jnp.matmul(parameters_by_twist(pose, center).astype(pose.dtype), twist, precision="highest")
 
 
 def _newton(

@@ -17,7 +17,7 @@ import jaxlie
 from jaxtyping import Array, Bool, Float
 
 from mcgicp_jax._compute.concrete import AnyArray, AnyScalar, numpy_for
-from mcgicp_jax._math.poses import translation_adjoint
+from mcgicp_jax._math.poses import translation_adjoint, units
 from mcgicp_jax._math.symmetric_matrices import inverse_3
 
 
@@ -74,7 +74,7 @@ def form_at(
     point = rotation.T @ (center - translation)
     apart = (prior.rotation @ point + prior.translation - center) / radius
     # ξ about the origin of the source from ξ about the point, with lengths in units of the radius.
-    change = translation_adjoint(point) * xp.concatenate([xp.broadcast_to(radius, 3), xp.ones(3)])
+    change = translation_adjoint(point) * units(radius)
     return PoseForm(stiffness, force, Prior(prior.rotation, apart, change.T @ prior.information @ change))
 
 

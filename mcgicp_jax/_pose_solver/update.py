@@ -12,6 +12,7 @@ import lineax as lx
 import optimistix as optx
 from jaxtyping import Array, Bool, Float, Int
 
+from mcgicp_jax._math.poses import skew
 from mcgicp_jax._pose_solver.sums import Sums
 
 # Mean eigenvalue to which the information matrix is scaled, dimensionless: large compared with 1, optimistix's initial
@@ -186,7 +187,7 @@ def _residuals(along: Float[Array, "6"], args: tuple[Float[Array, "13 13"], Floa
     root, basis = args
     twist = basis @ along
     half = 0.5 * twist[3:]
-    cross = jnp.cross(half[:, None], jnp.eye(3, dtype=half.dtype), axis=0)
+    cross = skew(half)
     rotation = 2 / (1 + half @ half) * (cross + cross @ cross)
     change = jnp.concatenate([rotation, twist[:3, None]], axis=1)
     return root.T @ jnp.append(change.reshape(12), 1)

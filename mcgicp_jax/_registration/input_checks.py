@@ -88,6 +88,26 @@ def warn_of_constant_weights(method: AbstractMethod) -> None:
         warn("channel_weights: the derivative is 0, since they decide matches alone, which are constant in derivatives")
 
 
+def warn_of_estimated_parameters(
+    method: AbstractMethod, source: PointCloud, target: PointCloud, temperature: ArrayLike | None = None
+) -> None:
+    """Warn if channels are differentiated outside of `jit` while Λ, or α with a `temperature`, is estimated from them.
+
+    Estimated parameters are constant to autodiff. Without a `temperature`, α decides matches alone, which are, too.
+    """
+    channels = source.channels, target.channels
+    # The photometric residuals use neither.
+    if not isinstance(method, MultiChannelGICP) or method.photometric or is_concrete(channels):
+        return
+    names = ["channel_covariance"] if temperature is None else ["channel_covariance", "channel_weights"]
+    unset = [name for name in names if getattr(method, name) is None]
+    if unset and is_concrete(primal(channels)):
+        warn(
+            f"{' and '.join(unset)}: estimated from the channels, but constant in the derivative by channels, which is "
+            "therefore not that of the result; pass a method resolved beforehand, method.resolve(source, target)"
+        )
+
+
 def warn_of_lengths(source: PointCloud, target: PointCloud) -> None:
     """Warn of clouds outside `jit` whose extents and spacings both differ so much that their units probably differ."""
     clouds = [primal(cloud) for cloud in (source, target)]

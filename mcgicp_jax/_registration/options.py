@@ -90,7 +90,8 @@ class Options:
 
 
 class GivenOptions(TypedDict, total=False):
-    """`Options` as keyword arguments of batches, odometry and multiway registration, for editors and type checkers."""
+    """`Options` as keyword arguments of batches, odometry and multiway registration, for editors and type checkers,
+    which cannot derive it."""
 
     max_distance: Distance | None
     max_iterations: int
