@@ -245,14 +245,10 @@ def method_for(name: MethodName, options: Options, clouds: Callable[[], Sequence
     """The method with the user's parameters. Color ICP's weights, if not given, come from two preprocessed clouds."""
     given = options.parameters_of(name)
     if issubclass(METHODS[name].kind, mcg.ColorICP) and not given:
-        given["channel_weights"] = weights_from(*clouds())
+        # As mc-gicp chooses them.
+        resolved: Any = mcg.MultiChannelGICP().resolve(*clouds())
+        given["channel_weights"] = resolved.channel_weights
     return METHODS[name](**given)
-
-
-def weights_from(source: mcg.PointCloud, target: mcg.PointCloud) -> Any:
-    """Channel weights α from the data, as mc-gicp chooses them."""
-    chosen: Any = mcg.MultiChannelGICP().resolve(source, target)
-    return chosen.channel_weights
 
 
 def voxels_of(clouds: Sequence[mcg.PointCloud], options: Options) -> Voxels:
