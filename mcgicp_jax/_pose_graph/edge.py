@@ -85,10 +85,8 @@ class Edge(AbstractFactor):
         self, poses: Float[np.ndarray, "m 2 4 4"]
     ) -> tuple[Float[np.ndarray, "m 6"], Float[np.ndarray, "m 2 6 6"]]:
         """r = log(T_i_j⁻¹ T_i⁻¹ T_j), and ∂r/∂ξ_i and ∂r/∂ξ_j."""
-        motion = inverse(poses[:, 0]) @ poses[:, 1]
-        residual = logarithm(inverse(np.asarray(self.T_i_j)) @ motion)
-        by_end = logarithm_derivative(residual)
-        return residual, np.stack([-by_end @ adjoint(inverse(motion)), by_end], axis=1)
+        residual = logarithm(inverse(np.asarray(self.T_i_j)) @ (inverse(poses[:, 0]) @ poses[:, 1]))
+        return residual, logarithm_derivative(residual)[:, None] @ motion_jacobians(poses)
 
     def __len__(self) -> int:
         return len(self.i)
@@ -96,6 +94,12 @@ class Edge(AbstractFactor):
     def __getitem__(self, rows: Any) -> Edge:
         """One edge, or those of a slice, mask or list of rows."""
         return jax.tree.map(lambda values: values[rows], self)
+
+
+def motion_jacobians(poses: Float[np.ndarray, "m 2 4 4"]) -> Float[np.ndarray, "m 2 6 6"]:
+    """Derivatives of the twist of the motion T_i⁻¹ T_j with respect to those of both poses."""
+    by_first = -adjoint(inverse(poses[:, 1]) @ poses[:, 0])
+    return np.stack([by_first, np.broadcast_to(np.eye(6), by_first.shape)], axis=1)
 
 
 def checked_edges(edges: Edge, num_poses: int) -> Edge:

@@ -13,37 +13,36 @@ WORLD = -(2**31)
 
 
 class AbstractFactor(eqx.Module):
-    """m measurements of one kind, each a function of k ≥ 2 poses; a pytree of arrays with a leading axis of length m.
+    """m measurements of one kind, each a function of two poses; a pytree of arrays with a leading axis of length m.
 
-    The cost of a measurement is ½ rᵀΛr. A subclass provides the fields below and `linearize`; the solver, the
-    covariances and the derivatives of the poses need nothing else.
+    The cost of a measurement is ½ rᵀΛr. A subclass provides the fields below and `linearize`; the solver and the
+    covariances need nothing else.
 
     Attributes:
-        rows: (m, k), rows of the poses that each measurement depends on. A measurement in the world's frame, such as a
-            height, has `WORLD` among them.
+        rows: (m, 2), rows of the poses that each measurement depends on. The first one of a measurement in the world's
+            frame, such as a height, is `WORLD`.
         information: (m, d, d), Λ, the inverse covariance of the residual; symmetric, positive semidefinite.
         uncertain: (m,), whether the measurement may be an outlier, so that `optimize_poses` may reject it.
     """
 
-    rows: eqx.AbstractVar[Int[Array, "*m k"] | Int[np.ndarray, "*m k"]]
+    rows: eqx.AbstractVar[Int[Array, "*m 2"] | Int[np.ndarray, "*m 2"]]
     information: eqx.AbstractVar[Float[Array, "*m d d"] | Float[np.ndarray, "*m d d"]]
     uncertain: eqx.AbstractVar[Bool[Array, "*m"] | Bool[np.ndarray, "*m"]]
 
     @abc.abstractmethod
     def linearize(
-        self, poses: Float[np.ndarray, "m k 4 4"]
-    ) -> tuple[Float[np.ndarray, "m d"], Float[np.ndarray, "m k d 6"]]:
-        """Residuals r, and their derivatives with respect to the twists ξ = (v, ω) of all poses T exp(ξ).
+        self, poses: Float[np.ndarray, "m 2 4 4"]
+    ) -> tuple[Float[np.ndarray, "m d"], Float[np.ndarray, "m 2 d 6"]]:
+        """Residuals r, and their derivatives with respect to the twists ξ = (v, ω) of both poses T exp(ξ).
 
         Called on the host with NumPy arrays in float64, also from within compiled programs: it must not call JAX.
-        Derivatives of the poses with respect to the fields are taken numerically, with steps of 1e-3.
 
         Args:
             poses: sensor to world, metres; the identity for `WORLD`.
         """
 
 
-def check_rows(name: str, rows: Int[np.ndarray, "m k"], num_poses: int) -> None:
+def check_rows(name: str, rows: Int[np.ndarray, "m 2"], num_poses: int) -> None:
     """Raise `ValueError` for rows of poses outside of the graph."""
     outside = ((rows < 0) & (rows != WORLD)) | (rows >= num_poses)
     if outside.any():
