@@ -16,20 +16,16 @@ from tqdm import tqdm
 
 import mcgicp_jax as mcg
 from mcgicp_jax import io, metrics, plot
+from mcgicp_jax._cli.choices import Choices, with_channels
 from mcgicp_jax._cli.options import (
     File,
     Method,
     MethodName,
     Options,
     check_outputs,
-    choose_method,
     clouds_in,
     enumerated,
-    method_for,
-    registration_for,
     shown,
-    voxels_of,
-    with_channels,
     with_names,
 )
 from mcgicp_jax._sequences.odometry import OdometryStep
@@ -113,19 +109,18 @@ def odometry(
         "loops": loops,
     }
     first = frames[0]
-    names = shared.channels or first.cloud.channel_names
     print(f"frames:    {len(frames)} of {dataset}, {len(first.cloud):,} points in the first")
-    name = choose_method(method, shared, names, {"the first frame": first.cloud})
-    voxels = voxels_of([first.cloud], shared)
-    print(f"points:    {voxels}")
+    choices = Choices.of(shared, first.cloud)
+    name = choices.method_name(method, {"the first frame": first.cloud})
+    print(f"points:    {choices.voxels}")
 
-    def first_two() -> list[mcg.PointCloud]:
-        return [mcg.preprocess(with_channels(frames[row].cloud, names), voxels) for row in (1, 0)]
+    def first_two() -> tuple[mcg.PointCloud, mcg.PointCloud]:
+        return choices.preprocess(frames[1].cloud), choices.preprocess(first.cloud)
 
     truth: Truth = []
-    chosen = method_for(name, shared, first_two)
-    options |= registration_for(name, shared, lambda: first_two()[1])
-    steps = mcg.odometry(_clouds(frames, names, truth), chosen, voxel_size=voxels.size, start=first.pose, **options)
+    clouds, chosen = _clouds(frames, choices.channels, truth), choices.method(name, first_two)
+    options |= choices.arguments(name, first_two)
+    steps = mcg.odometry(clouds, chosen, voxel_size=choices.voxels.size, start=first.pose, **options)
     poses, results, failure = _follow(steps, len(frames), loops, map)
     del truth[len(poses) :]
     _report(poses, truth, results)
