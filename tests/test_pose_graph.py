@@ -18,8 +18,7 @@ import mcgicp_jax as mcg
 from mcgicp_jax import metrics
 from mcgicp_jax._math.twists import logarithm
 from mcgicp_jax._pose_graph import outliers
-from mcgicp_jax._pose_graph.edge import motion_jacobians
-from mcgicp_jax._pose_graph.factors import AbstractFactor
+from mcgicp_jax._pose_graph.edge import AbstractFactor, motion_jacobians
 from mcgicp_jax._pose_graph.levenberg_marquardt import Minimum
 from mcgicp_jax._pose_graph.marginal_covariances import inverse_blocks
 from mcgicp_jax._pose_graph.normal_equations import NormalEquations, factored

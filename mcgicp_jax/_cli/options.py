@@ -63,8 +63,8 @@ def enumerated(names: Sequence[str], last: str = "and") -> str:
     return f" {last} ".join(filter(None, [", ".join(names[:-1]), names[-1]]))
 
 
-def with_names(documented: Documented) -> Documented:
-    """Fill the names from the registries into the help text of a command or of its options."""
+def with_names(documented: Documented, **others: str) -> Documented:
+    """Fill the names from the registries, and others, into the help text of a command or of its options."""
     having = {name: [m for m in METHODS if name in METHODS[m].kind.__dataclass_fields__] for name in _PARAMETERS}
     documented.__doc__ = (documented.__doc__ or "").format(
         formats=enumerated(list(FORMATS), "or"),
@@ -73,6 +73,7 @@ def with_names(documented: Documented) -> Documented:
         channel_methods=enumerated([name for name in METHODS if METHODS[name].kind.uses_channels]),
         cell_methods=enumerated([name for name in METHODS if METHODS[name].kind.needs_covariances]),
         **{name: enumerated(methods) for name, methods in having.items()},
+        **others,
     )
     return documented
 

@@ -14,8 +14,7 @@ from jaxtyping import Array, Float
 
 from mcgicp_jax._compute.concrete import is_concrete
 from mcgicp_jax._math.poses import Pose, pose_matrices
-from mcgicp_jax._pose_graph.edge import Edge, checked_edges
-from mcgicp_jax._pose_graph.factors import WORLD, AbstractFactor, check_rows
+from mcgicp_jax._pose_graph.edge import WORLD, AbstractFactor, Edge, check_rows, checked_edges
 from mcgicp_jax._pose_graph.initialization import initial_poses
 
 

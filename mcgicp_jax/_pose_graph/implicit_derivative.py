@@ -21,8 +21,7 @@ from mcgicp_jax._compute.concrete import AnyArray, is_concrete
 from mcgicp_jax._compute.lazy import Lazy
 from mcgicp_jax._compute.messages import calling_line, shown_at, warn
 from mcgicp_jax._math.twists import logarithm_derivative, skew
-from mcgicp_jax._pose_graph.edge import Edge, motion_jacobians
-from mcgicp_jax._pose_graph.factors import WORLD, check_rows
+from mcgicp_jax._pose_graph.edge import WORLD, Edge, check_rows, motion_jacobians
 from mcgicp_jax._pose_graph.normal_equations import factored, typical_information
 from mcgicp_jax._pose_graph.solver import Factors, Solution, covariances_at, solve
 from mcgicp_jax._registration.result import Status

@@ -13,8 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float, Inexact, Int
 
-from mcgicp_jax._pose_graph.edge import motion_jacobians
-from mcgicp_jax._pose_graph.factors import WORLD, AbstractFactor
+from mcgicp_jax._pose_graph.edge import WORLD, AbstractFactor, motion_jacobians
 
 # Least damping, as a fraction of the information of a typical edge. Directions that no measurement observes are then
 # 3e4 times as uncertain as a typical edge, and the factorisation loses half of the digits of float64.

@@ -8,8 +8,8 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from mcgicp_jax._math.poses import matrices_of, parameters_of
-from mcgicp_jax._pose_graph.edge import Edge, motion_jacobians
-from mcgicp_jax._pose_graph.factors import WORLD
+from mcgicp_jax._pose_graph.edge import WORLD, Edge, motion_jacobians
+from mcgicp_jax._pose_graph.initialization import unmeasured
 from mcgicp_jax._pose_graph.levenberg_marquardt import Minimum, minimize, refine, settle
 from mcgicp_jax._pose_graph.marginal_covariances import pose_covariances
 from mcgicp_jax._pose_graph.normal_equations import (
@@ -19,7 +19,6 @@ from mcgicp_jax._pose_graph.normal_equations import (
     typical_information,
 )
 from mcgicp_jax._pose_graph.outliers import robust_minimum
-from mcgicp_jax._pose_graph.unmeasured import unmeasured
 from mcgicp_jax._registration.result import Status
 
 # A direction of motion is unconstrained if its information is less than this multiple of the least damping.

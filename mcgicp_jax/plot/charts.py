@@ -10,7 +10,7 @@ from jax.typing import ArrayLike
 from jaxtyping import Float
 
 from mcgicp_jax._math.poses import Pose, pose_matrix
-from mcgicp_jax._pose_graph.factors import WORLD
+from mcgicp_jax._pose_graph.edge import WORLD
 from mcgicp_jax._pose_graph.optimize import PoseGraphResult
 from mcgicp_jax.plot.drawing import Figure, File, new_figure, optional_module, saved
 

@@ -20,7 +20,7 @@ import numpy as np
 
 import mcgicp_jax as mcg
 from mcgicp_jax import datasets, metrics
-from mcgicp_jax._sequences.edges import edge_from
+from mcgicp_jax._sequences.loop_closure import edge_from
 from tests.benchmarks.global_pose import desk
 from tests.corridor import corridor as simulated_corridor
 from tests.graphs import garage, grid, measured, moved, sphere, with_gtsam
