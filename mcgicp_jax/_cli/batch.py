@@ -77,9 +77,10 @@ def batch(pairs: Pairs, output: Path, method: Method = None, glob: str = "*", *,
     check_outputs(output)
     table = Table(output)
     everything = _pairs_of_folder(pairs, glob) if pairs.is_dir() else _pairs_of_table(pairs)
-    rows = {key_of(row): row for row in table.read() if row["status"] not in _TRIED_AGAIN}
-    settings = _settings(everything, method, shared)
     wanted = {pair.key: pair for pair in everything}
+    rows = {key_of(row): row for row in table.read()}
+    rows = {key: row for key, row in rows.items() if key not in wanted or row["status"] not in _TRIED_AGAIN}
+    settings = _settings(everything, method, shared)
     missing = {key: pair for key, pair in wanted.items() if key not in rows}
     finished = len(wanted) - len(missing)
     print(f"pairs:     {len(wanted):,}" + (f", of which {finished:,} are in {output}" if finished else ""))
