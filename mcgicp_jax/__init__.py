@@ -26,8 +26,7 @@ from mcgicp_jax._pairs.batch_jobs import PairWarning
 from mcgicp_jax._pairs.cost import mahalanobis_cost
 from mcgicp_jax._pairs.estimate_pose import estimate_pose
 from mcgicp_jax._pairs.register import register
-from mcgicp_jax._pose_graph.edge import Edge
-from mcgicp_jax._pose_graph.factors import WORLD
+from mcgicp_jax._pose_graph.edge import WORLD, Edge
 from mcgicp_jax._pose_graph.graph import PoseGraph
 from mcgicp_jax._pose_graph.optimize import PoseGraphResult, optimize_poses
 from mcgicp_jax._registration.correspondences import find_correspondences

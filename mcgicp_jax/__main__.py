@@ -17,7 +17,6 @@ from mcgicp_jax import __version__
 from mcgicp_jax._cli.batch import batch
 from mcgicp_jax._cli.multiway import multiway
 from mcgicp_jax._cli.odometry import odometry
-from mcgicp_jax._cli.paper import paper
 from mcgicp_jax._cli.register import compare, demo, register
 
 
@@ -70,7 +69,7 @@ def _run(args: Sequence[str]) -> int:
     _keep_compiled_programs()
     # Exclude imported modules from garbage collection, which took a tenth of the time of a short command.
     gc.freeze()
-    commands: tuple[Callable[..., int], ...] = (demo, register, compare, odometry, multiway, batch, paper)
+    commands: tuple[Callable[..., int], ...] = (demo, register, compare, odometry, multiway, batch)
     with warnings.catch_warnings():
         warnings.showwarning = _show_warning
         try:

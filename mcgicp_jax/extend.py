@@ -28,7 +28,7 @@ from mcgicp_jax._math.robust_kernels import KERNELS, AbstractKernel
 from mcgicp_jax._methods.base import AbstractGeneralized, AbstractMethod, AbstractOneSided
 from mcgicp_jax._methods.registry import METHODS, RegisteredMethod
 from mcgicp_jax._methods.voxel_gaussians import cell_moments, voxel_cells
-from mcgicp_jax._pose_graph.factors import AbstractFactor
+from mcgicp_jax._pose_graph.edge import AbstractFactor
 from mcgicp_jax._search.base import AbstractIndex, AbstractSearch, Correspondences, SearchPoints
 from mcgicp_jax._search.kd_tree import AbstractTreeSearch
 from mcgicp_jax._terms.base import AbstractTerm, Linearization, PosedMatches, linearize_residual

@@ -32,7 +32,7 @@ def test_a_scene_is_followed_and_its_files_are_written(tmp_path, capsys):
 
 
 def test_what_does_not_converge_is_no_success(capsys):
-    assert main(["odometry", "corridor", "--num-frames", "2", "--method", "gicp", "--max-distance", "1e-6"]) == 1
+    assert main(["odometry", "box-room", "--num-frames", "2", "--method", "gicp", "--max-distance", "1e-6"]) == 1
     text, errors = capsys.readouterr()
     assert "pairs:     0 of 1 converged" in text
     first, second = errors.splitlines()

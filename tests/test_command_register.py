@@ -116,7 +116,7 @@ def test_what_does_not_converge_is_no_success(files, tmp_path, capsys):
     assert main(["register", far, files["target"], "--method", "gicp"]) == 1
     text, errors = capsys.readouterr()
     assert "status:    too few correspondences" in text and "inliers:   0 of" in text
-    assert errors.startswith("mcgicp: gicp did not converge (too few correspondences)") and "--init" in errors
+    assert errors.startswith("mcgicp: gicp did not converge (too few correspondences)") and "try init" in errors
     assert main(["register", files["source"], files["target"], "--max-iterations", "1"]) == 1
     assert "max iterations" in capsys.readouterr().err
     flat = save(tmp_path / "flat.npz", np.random.default_rng(0).random((500, 3)) * [1, 1, 0])

@@ -12,8 +12,7 @@ from mcgicp_jax._math.twists import exponential, logarithm
 from mcgicp_jax._registration.options import Options
 from mcgicp_jax._sequences import loop_closure as _loops
 from mcgicp_jax._sequences import multiway as _multiway
-from mcgicp_jax._sequences.edges import edge_from
-from mcgicp_jax._sequences.loop_closure import Trajectory
+from mcgicp_jax._sequences.loop_closure import Trajectory, edge_from
 from tests.scenes import motion, pair, wall
 
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import mcgicp_jax as mcg
-from mcgicp_jax import MultiChannelGICP, PointCloud, merge_clouds, plot, preprocess, register
+from mcgicp_jax import PointCloud, merge_clouds, plot
 from mcgicp_jax.datasets import poster_wall
 from tests.graphs import grid, measured
 from tests.scenes import motion
@@ -190,32 +190,6 @@ def test_large_clouds_are_thinned_and_padding_is_left_out():
         plot.clouds(large, small, names=["one"])
 
 
-def test_ellipsoids_are_the_covariances_at_one_scale():
-    rng = np.random.default_rng(1)
-    cloud = PointCloud(rng.uniform(0, 5, (50, 3)))
-    factors = rng.normal(size=(50, 3, 3))
-    covariances = factors @ np.swapaxes(factors, 1, 2) + 0.1 * np.eye(3)
-    indices = [3, 17, 40]
-    _, mesh = plot.covariances(cloud, covariances, indices=indices).data
-    vertices = np.stack([mesh.x, mesh.y, mesh.z], axis=1).reshape(3, -1, 3)
-    faces = np.stack([mesh.i, mesh.j, mesh.k], axis=1)
-    assert faces.max() == 3 * vertices.shape[1] - 1
-    offsets = vertices - cloud.points[indices][:, None]
-    squared = np.einsum("mvi,mij,mvj->mv", offsets, np.linalg.inv(covariances[indices]), offsets)
-    np.testing.assert_allclose(squared, squared[0, 0], rtol=1e-8)
-    (one,) = plot.covariances(cloud, covariances, indices=[3]).data[1:]
-    assert np.ptp(one.x) < 0.3 * np.ptp(cloud.points)
-
-
-def test_covariances_are_checked():
-    cloud, covariances = PointCloud(np.eye(3)), np.tile(np.eye(3), (3, 1, 1))
-    with pytest.raises(ValueError, match=r"covariances: expected shape \(3, 3, 3\)"):
-        plot.covariances(cloud, covariances[:2], indices=[0])
-    for indices in ([], [3], [-1]):
-        with pytest.raises(ValueError, match="indices: expected rows"):
-            plot.covariances(cloud, covariances, indices=indices)
-
-
 def test_convergence_has_a_line_per_method():
     histories = {"GICP": [1.0, 0.5, 0.4], "MC-GICP": np.array([1.0, 0.1])}
     figure = plot.convergence(histories, ylabel="rmse (m)")
@@ -235,10 +209,7 @@ def test_a_missing_package_is_named(monkeypatch, wall, package):
         monkeypatch.setitem(sys.modules, name, None)
     draw = {
         "matplotlib": [lambda: plot.before_after(source, target, {}), lambda: plot.convergence({"x": [1.0]})],
-        "plotly": [
-            lambda: plot.clouds(source),
-            lambda: plot.covariances(source, np.zeros((len(source), 3, 3)), indices=[0]),
-        ],
+        "plotly": [lambda: plot.clouds(source)],
     }
     for function in draw[package]:
         with pytest.raises(ImportError, match=rf"plotting needs {package}: pip install 'mcgicp_jax\[plot\]'"):
@@ -254,21 +225,6 @@ def test_nothing_is_imported_before_it_is_needed_and_no_window_opens():
         "sys.exit(2 if 'matplotlib.pyplot' in sys.modules else 0)\n"
     )
     assert subprocess.run([sys.executable, "-c", program], check=False).returncode == 0
-
-
-def test_localizability_has_two_bars_per_direction_and_names_the_free_ones_first(wall, tmp_path):
-    clouds = [preprocess(cloud) for cloud in wall[:2]]
-    result = register(*clouds, MultiChannelGICP(), max_distance=0.08)
-    figure = plot.localizability(result, path=tmp_path / "held.png")
-    (panel,) = figure.axes
-    labels = [label.get_text().split(" (")[0] for label in panel.get_yticklabels()]
-    assert labels[:3] == ["translation along", "translation along", "rotation about"]
-    widths = np.array([bar.get_x() + bar.get_width() for bar in panel.patches]).reshape(2, 6)
-    geometry, channels = widths
-    assert np.all(geometry[:3] < 2e-3) and np.all(geometry[3:] > 0.9) and np.all(channels[:3] > 5e-3)
-    assert (tmp_path / "held.png").stat().st_size > 1000
-    with pytest.raises(ValueError, match="result: expected a single result of `register`"):
-        plot.localizability(result.without_pose(result.status))
 
 
 def test_trajectories_are_drawn_in_their_plane(tmp_path):

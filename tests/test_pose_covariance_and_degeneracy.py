@@ -18,6 +18,7 @@ from mcgicp_jax._pose_solver.covariance import Moments, response_and_scatter
 from mcgicp_jax._pose_solver.degeneracy import GEOMETRY_HOLDS, find_directions
 from mcgicp_jax._pose_solver.sums import Sums
 from tests.benchmarks.noise_scenes import street
+from tests.corridor import corridor
 from tests.precision import in_float64
 from tests.scenes import SURFACES, motion, pair, prepare, room_corner, wall
 
@@ -255,7 +256,7 @@ def test_nothing_is_free_in_a_corner():
 
 @pytest.mark.parametrize("textured", [True, False])
 def test_a_corridor_is_free_along_its_axis(textured):
-    target, source = datasets.corridor(2, textured=textured)
+    target, source = corridor(2, textured=textured)
     truth = np.linalg.inv(target.pose) @ source.pose
     clouds = [mcg.preprocess(frame.cloud) for frame in (source, target)]
     result = mcg.register(*clouds, mcg.MultiChannelGICP(), max_distance=0.5)

@@ -175,6 +175,10 @@ def test_a_flat_wall_is_degenerate_for_point_to_plane():
     np.testing.assert_allclose(result.matrix[:3, 3], [0, 0, -0.02], atol=1e-4)
 
 
+def test_every_status_but_success_has_an_advice():
+    assert [status for status in Status if not status.advice] == [Status.CONVERGED]
+
+
 def test_running_out_of_iterations_is_not_convergence(room):
     source, target, _ = room
     result = mcg.register(source, target, mcg.PointToPoint(), max_distance=0.5, max_iterations=3)

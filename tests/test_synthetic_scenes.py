@@ -9,9 +9,10 @@ from hypothesis import strategies as st
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
-from mcgicp_jax.datasets import box_room, corridor, poster_wall, street
+from mcgicp_jax.datasets import box_room, poster_wall, street
 from mcgicp_jax.datasets._raycast import Box, Cylinder, cast, random_rays, spinning_rays, value_noise
 from mcgicp_jax.datasets._street import _Kind, _things
+from tests.corridor import corridor
 
 SCENES = [poster_wall, box_room, corridor, street]
 LIDAR = [box_room, corridor, street]

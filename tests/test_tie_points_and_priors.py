@@ -14,6 +14,7 @@ from mcgicp_jax._math.twists import exponential, logarithm
 from mcgicp_jax._pose_solver.pose_measurements import Fusion, Prior, TiePoints, form_at
 from mcgicp_jax._registration.measurements import known
 from tests.compilations import compilations
+from tests.corridor import corridor
 from tests.differences import TO_ROUNDING, check_gradient, weigh
 from tests.precision import in_float64
 from tests.scenes import motion, pair
@@ -58,7 +59,7 @@ def corner(precision):
 @pytest.fixture(scope="module")
 def hall(precision):
     """Two clouds of a bare corridor, the true pose, and the direction of its axis in the source's frame."""
-    target, source = datasets.corridor(2, textured=False)
+    target, source = corridor(2, textured=False)
     truth = np.linalg.inv(target.pose) @ source.pose
     clouds = [mcg.preprocess(frame.cloud) for frame in (source, target)]
     return *clouds, truth, source.pose[:3, :3].T @ [1, 0, 0]
@@ -357,7 +358,7 @@ def test_malformed_arguments_are_named(corner):
 @pytest.mark.parametrize("scene", ["room", "corridor"])
 def test_covariances_are_right(scene):
     """40 simulated pairs: normalised error squared, and errors smaller than those of each source alone."""
-    make = datasets.box_room(2, points_per_frame=5000) if scene == "room" else datasets.corridor(2, textured=False)
+    make = datasets.box_room(2, points_per_frame=5000) if scene == "room" else corridor(2, textured=False)
     near, deviations = (2e-3, (7e-4, 4e-4)) if scene == "room" else (0.01, (3e-3, 1e-3))
     squares, nees = {}, {}
     for seed in range(40):

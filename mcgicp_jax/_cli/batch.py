@@ -5,7 +5,6 @@ from __future__ import annotations
 import collections
 import contextlib
 import csv
-import hashlib
 import itertools
 import signal
 import sys
@@ -19,7 +18,6 @@ from pathlib import Path
 from types import FrameType
 from typing import Annotated, Any, TypeAlias
 
-import jax
 import numpy as np
 import tyro
 from jaxtyping import Float
@@ -27,26 +25,15 @@ from tqdm import tqdm
 
 import mcgicp_jax as mcg
 from mcgicp_jax import io
-from mcgicp_jax._cli.options import (
-    Method,
-    Options,
-    check_outputs,
-    choose_method,
-    clouds_in,
-    common_channels,
-    listed,
-    method_for,
-    preprocessed,
-    registration_for,
-    voxels_of,
-    with_channels,
-    with_names,
-)
+from mcgicp_jax._cli.choices import Choices, listed, with_channels
+from mcgicp_jax._cli.options import Method, Options, check_outputs, clouds_in, with_names
 from mcgicp_jax._cli.table import COLUMNS, POSE, Key, Row, Table, key_of, pose_of
 
 Pairs: TypeAlias = Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="PAIRS")]
 
 _INTERRUPTED = 130
+# Status of pairs that could not be registered.
+_TRIED_AGAIN = ("invalid_input", "worker_failed")
 
 
 @dataclass(frozen=True)
@@ -57,6 +44,11 @@ class FilePair:
     source: str
     target: str
     init: Float[np.ndarray, "4 4"] | None = None
+
+    @property
+    def key(self) -> Key:
+        start = [] if self.init is None else self.init[:3].ravel().tolist()
+        return self.source, self.target, " ".join(map(repr, start))
 
     def paths(self) -> tuple[Path, Path]:
         return self.folder / self.source, self.folder / self.target
@@ -69,14 +61,15 @@ def batch(pairs: Pairs, output: Path, method: Method = None, glob: str = "*", *,
     PAIRS is a CSV file or a folder. The CSV file has the columns source and target, with paths relative to its folder,
     and optionally m00 m01 ... m23, the upper three rows of the initial pose; a pair may occur with several initial
     poses. In a folder, each cloud is registered to the one before it in order of name; files that are no clouds are
-    left out. To resume after Ctrl-C, or to add pairs, run the same command again: it skips pairs in the table whose
-    files and options are unchanged. The exit code is 0 only if all pairs converged.
+    left out. To resume after Ctrl-C, or to add pairs, run the same command again: it skips pairs that are in the table,
+    except those that could not be registered, for instance since a file is missing. For other options, write another
+    table. The exit code is 0 only if all pairs converged.
 
     Args:
         pairs: CSV file or folder.
         output: Table to write or to resume, .csv or .npz. A row per pair, at the end in the order of PAIRS: source,
-            target, status, iterations, inliers, cost, rmse, the upper three rows of the pose, the reason if it could
-            not be registered, and a fingerprint of files and options.
+            target, initial pose if given, status, iterations, inliers, cost, rmse, the upper three rows of the pose,
+            and the reason if it could not be registered.
         method: {channel_methods} use channels (intensity, colours, ...), the others geometry alone.
         glob: Pattern for the files of a folder, such as "*.ply".
     """
@@ -84,16 +77,10 @@ def batch(pairs: Pairs, output: Path, method: Method = None, glob: str = "*", *,
     check_outputs(output)
     table = Table(output)
     everything = _pairs_of_folder(pairs, glob) if pairs.is_dir() else _pairs_of_table(pairs)
+    wanted = {pair.key: pair for pair in everything}
     rows = {key_of(row): row for row in table.read()}
+    rows = {key: row for key, row in rows.items() if key not in wanted or row["status"] not in _TRIED_AGAIN}
     settings = _settings(everything, method, shared)
-    wanted: dict[Key, FilePair] = {
-        (pair.source, pair.target, _fingerprint(pair, settings)): pair for pair in everything
-    }
-    names = {key[:2] for key in wanted}
-    outdated = {key for key in rows if key[:2] in names and key not in wanted}
-    if outdated:
-        print(f"outdated:  {len(outdated):,} in {output} with other options, starts or files; registered again")
-        rows = {key: row for key, row in rows.items() if key not in outdated}
     missing = {key: pair for key, pair in wanted.items() if key not in rows}
     finished = len(wanted) - len(missing)
     print(f"pairs:     {len(wanted):,}" + (f", of which {finished:,} are in {output}" if finished else ""))
@@ -192,10 +179,9 @@ def _pairs_of_folder(folder: Path, glob: str) -> list[FilePair]:
 def _checked(path: Path, pairs: list[FilePair]) -> list[FilePair]:
     if not pairs:
         raise ValueError(f"{path}: expected pairs of clouds, got none")
-    keys = [(pair.source, pair.target, None if pair.init is None else pair.init.tobytes()) for pair in pairs]
-    repeated = [key for key, count in collections.Counter(keys).items() if count > 1]
-    if repeated:
-        names = " ".join(repeated[0][:2])
+    (source, target, _), count = collections.Counter(pair.key for pair in pairs).most_common(1)[0]
+    if count > 1:
+        names = f"{source} {target}"
         raise ValueError(f"{path}: expected each pair once from each initial pose, got {names} several times")
     return pairs
 
@@ -211,28 +197,20 @@ def _settings(pairs: Sequence[FilePair], method: Method, options: Options) -> di
         break
     else:
         raise reason
-    names = common_channels(options, *clouds)
-    name = choose_method(method, options, names, dict(zip((pair.source, pair.target), clouds, strict=True)))
-    voxels = voxels_of(clouds, options)
-    print(f"points:    {voxels}")
+    choices = Choices.of(options, *clouds)
+    name = choices.method_name(method, dict(zip((pair.source, pair.target), clouds, strict=True)))
+    print(f"points:    {choices.voxels}")
 
-    def ready() -> list[mcg.PointCloud]:
-        return [preprocessed(cloud, names, voxels, options) for cloud in clouds]
+    def ready() -> tuple[mcg.PointCloud, mcg.PointCloud]:
+        source, target = map(choices.preprocess, clouds)
+        return source, target
 
-    return registration_for(name, options, lambda: ready()[1]) | {
-        "method": method_for(name, options, ready),
-        "channels": names,
-        "voxel_size": voxels.size,
+    return choices.arguments(name, ready) | {
+        "method": choices.method(name, ready),
+        "channels": choices.channels,
+        "voxel_size": choices.voxels.size,
         "num_neighbors": options.num_neighbors,
     }
-
-
-def _fingerprint(pair: FilePair, settings: dict[str, Any]) -> str:
-    """Hash of the options, the initial pose, and the sizes and modification times of a pair's files."""
-    files = [(path.stat().st_size, path.stat().st_mtime_ns) if path.exists() else None for path in pair.paths()]
-    numbers = [np.asarray(leaf).tolist() for leaf in jax.tree.leaves((settings["method"], settings.get("robust")))]
-    start = None if pair.init is None else pair.init.tolist()
-    return hashlib.sha256(repr((sorted(settings.items(), key=str), numbers, files, start)).encode()).hexdigest()[:16]
 
 
 def _rows(pairs: Mapping[Key, FilePair], settings: dict[str, Any], bar: tqdm) -> Generator[Row, None, None]:
@@ -269,8 +247,7 @@ def _read(path: Path, channels: Sequence[str]) -> mcg.PointCloud:
 def _row(key: Key, result: mcg.RegistrationResult, reason: str) -> Row:
     numbers = (result.num_iterations, result.num_inliers, result.cost, result.rmse, *result.matrix[:3].ravel())
     values = (np.asarray(number).item() for number in numbers)
-    source, target, fingerprint = key
-    texts = (source, target, _word(result.status), *map(repr, values), " ".join(reason.split()), fingerprint)
+    texts = (*key, _word(result.status), *map(repr, values), " ".join(reason.split()))
     return dict(zip(COLUMNS, texts, strict=True))
 
 

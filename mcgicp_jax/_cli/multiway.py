@@ -12,20 +12,8 @@ import tyro
 import mcgicp_jax as mcg
 from mcgicp_jax import io
 from mcgicp_jax import plot as plots
-from mcgicp_jax._cli.options import (
-    File,
-    Method,
-    Options,
-    check_outputs,
-    choose_method,
-    clouds_in,
-    common_channels,
-    method_for,
-    preprocessed,
-    registration_for,
-    voxels_of,
-    with_names,
-)
+from mcgicp_jax._cli.choices import Choices
+from mcgicp_jax._cli.options import File, Method, Options, check_outputs, clouds_in, with_names
 
 Folder: TypeAlias = Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="FOLDER")]
 
@@ -63,16 +51,18 @@ def multiway(
     shared.check(method)
     paths = clouds_in(folder, glob, map).paths
     raw = [io.read(path) for path in paths]
-    names = common_channels(shared, *raw[:2])
-    voxels = voxels_of(raw, shared)
-    clouds = [preprocessed(cloud, names, voxels, shared) for cloud in raw]
+    choices = Choices.of(shared, *raw)
+    clouds = [choices.preprocess(cloud) for cloud in raw]
+    voxels = choices.voxels
     print(f"clouds:    {len(clouds)}, {len(raw[0]):,} points in the first, {len(clouds[0]):,} used ({voxels})")
-    name = choose_method(method, shared, names, {path.name: cloud for path, cloud in zip(paths[:2], raw, strict=False)})
+    name = choices.method_name(method, {path.name: cloud for path, cloud in zip(paths[:2], raw, strict=False)})
     start = None if init is None else list(io.read_poses(init))
-    chosen = method_for(name, shared, lambda: (clouds[1], clouds[0]))
-    found = mcg.multiway(
-        clouds, chosen, init=start, voxel_size=voxels.size, **registration_for(name, shared, lambda: clouds[0])
-    )
+
+    def ready() -> tuple[mcg.PointCloud, mcg.PointCloud]:
+        return clouds[1], clouds[0]
+
+    arguments = choices.arguments(name, ready)
+    found = mcg.multiway(clouds, choices.method(name, ready), init=start, voxel_size=voxels.size, **arguments)
     _report(found)
     if output is not None:
         io.write_poses(output, found.poses)

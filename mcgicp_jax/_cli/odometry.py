@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import collections
 import itertools
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeAlias
 
@@ -16,24 +16,22 @@ from tqdm import tqdm
 
 import mcgicp_jax as mcg
 from mcgicp_jax import io, metrics, plot
+from mcgicp_jax._cli.choices import Choices, with_channels
 from mcgicp_jax._cli.options import (
     File,
     Method,
     MethodName,
     Options,
     check_outputs,
-    choose_method,
     clouds_in,
     enumerated,
-    method_for,
-    registration_for,
     shown,
-    voxels_of,
-    with_channels,
     with_names,
 )
+from mcgicp_jax._clouds.voxel_map import VoxelMap
+from mcgicp_jax._clouds.voxel_size import map_voxel_size
 from mcgicp_jax._sequences.odometry import OdometryStep
-from mcgicp_jax.datasets import DATASETS, AbstractFrames, Dataset
+from mcgicp_jax.datasets import DATASETS, AbstractFrames
 
 if TYPE_CHECKING:
     DatasetName: TypeAlias = str
@@ -48,24 +46,17 @@ Truth: TypeAlias = list[Float[np.ndarray, "4 4"] | None]
 _FRAMES_OF_A_SCENE = 20
 
 
-def _with_datasets(command: Callable[..., int]) -> Callable[..., int]:
-    """Fill the data sets and their defaults into the help text."""
-
-    def defaults(words_of: Callable[[Dataset], str]) -> str:
-        groups = itertools.groupby(DATASETS, lambda name: words_of(DATASETS[name]))
-        return ", ".join(f"{words} for {enumerated(list(names))}" for words, names in groups)
-
-    texts = {
-        "datasets": enumerated([name for name in DATASETS if not DATASETS[name].simulated], "or"),
-        "scenes": enumerated([name for name in DATASETS if DATASETS[name].simulated], "or"),
-        "max_distances": defaults(lambda each: "{:g} and {:g}".format(*each.max_distance)),
-    }
-    for name, text in texts.items():
-        command.__doc__ = (command.__doc__ or "").replace(f"<{name}>", text)
-    return with_names(command)
+def _names(simulated: bool) -> str:
+    return enumerated([name for name, each in DATASETS.items() if each.simulated == simulated], "or")
 
 
-@_with_datasets
+def _distances() -> str:
+    """The default of `max_distance` for each data set."""
+    groups = itertools.groupby(DATASETS, lambda name: DATASETS[name].max_distance)
+    return ", ".join(f"{far:g} and {near:g} for {enumerated(list(names))}" for (far, near), names in groups)
+
+
+@partial(with_names, datasets=_names(False), scenes=_names(True), max_distances=_distances())
 def odometry(
     dataset: Positional,
     path: Folder = Path(),
@@ -82,12 +73,12 @@ def odometry(
 ) -> int:
     """Estimate the sensor's trajectory by registering each frame of a sequence to the one before it, or to a map.
 
-    FOLDER holds a cloud per frame; files that are no clouds are left out. DATASET is <datasets>, with the sequence in
-    the folder PATH; or a simulated scene (<scenes>), which needs no PATH. Errors are printed if the true poses are
+    FOLDER holds a cloud per frame; files that are no clouds are left out. DATASET is {datasets}, with the sequence in
+    the folder PATH; or a simulated scene ({scenes}), which needs no PATH. Errors are printed if the true poses are
     known. The exit code is 0 only if all registrations converged; output files are written in any case: after an
     invalid frame or Ctrl-C, of the frames before it.
 
-    Defaults of --max-distance: <max_distances>.
+    Defaults of --max-distance: {max_distances}.
 
     Args:
         dataset: Folder of clouds in order of name, such as ./scans, or format of a data set, or simulated scene.
@@ -113,19 +104,18 @@ def odometry(
         "loops": loops,
     }
     first = frames[0]
-    names = shared.channels or first.cloud.channel_names
     print(f"frames:    {len(frames)} of {dataset}, {len(first.cloud):,} points in the first")
-    name = choose_method(method, shared, names, {"the first frame": first.cloud})
-    voxels = voxels_of([first.cloud], shared)
-    print(f"points:    {voxels}")
+    choices = Choices.of(shared, first.cloud)
+    name = choices.method_name(method, {"the first frame": first.cloud})
+    print(f"points:    {choices.voxels}")
 
-    def first_two() -> list[mcg.PointCloud]:
-        return [mcg.preprocess(with_channels(frames[row].cloud, names), voxels) for row in (1, 0)]
+    def first_two() -> tuple[mcg.PointCloud, mcg.PointCloud]:
+        return choices.preprocess(frames[1].cloud), choices.preprocess(first.cloud)
 
     truth: Truth = []
-    chosen = method_for(name, shared, first_two)
-    options |= registration_for(name, shared, lambda: first_two()[1])
-    steps = mcg.odometry(_clouds(frames, names, truth), chosen, voxel_size=voxels.size, start=first.pose, **options)
+    clouds, chosen = _clouds(frames, choices.channels, truth), choices.method(name, first_two)
+    options |= choices.arguments(name, first_two)
+    steps = mcg.odometry(clouds, chosen, voxel_size=choices.voxels.size, start=first.pose, **options)
     poses, results, failure = _follow(steps, len(frames), loops, map)
     del truth[len(poses) :]
     _report(poses, truth, results)
@@ -174,43 +164,32 @@ def _follow(
     """
     poses: Poses = []
     results: list[mcg.RegistrationResult] = []
-    last: Any = None
-    failure = ""
-
-    def valid() -> Iterator[OdometryStep]:
-        nonlocal failure
-        try:
-            yield from steps
-        except (ValueError, OSError, KeyboardInterrupt) as error:
-            if not poses:
-                raise
-            failure = "interrupted" if isinstance(error, KeyboardInterrupt) else f"frame {len(poses)}: {error}"
-
-    def followed() -> Iterator[tuple[mcg.PointCloud, Float[np.ndarray, "4 4"]]]:
-        for step in tqdm(valid(), total=num_frames, unit="frame", disable=None):
-            nonlocal last
-            last = step
+    clouds: list[mcg.PointCloud] = []
+    world, last, failure = None, None, ""
+    try:
+        for step in tqdm(steps, total=num_frames, unit="frame", disable=None):
+            # Loops move the poses until the end. Without them, no cloud is kept once it is in the map.
+            if map is not None and loops:
+                clouds.append(step.cloud)
+            elif map is not None:
+                world = world or VoxelMap(map_voxel_size(step.cloud))
+                world.add(f"frame {len(poses)}", step.cloud, step.pose)
             poses.append(step.pose)
             if step.registration is not None:
                 results.append(step.registration)
-            yield step.cloud, step.pose
-
-    # A stream: no cloud is kept once it is in the map.
-    stream: Iterator[tuple[mcg.PointCloud, Float[np.ndarray, "4 4"]]] = followed()
-    if loops:
-        # The poses as the last loop left them.
-        clouds = [cloud for cloud, _ in followed()]
+            last = step
+    except (ValueError, OSError, KeyboardInterrupt) as error:
+        if not poses:
+            raise
+        failure = "interrupted" if isinstance(error, KeyboardInterrupt) else f"frame {len(poses)}: {error}"
+    if loops and last is not None:
         graph: Any = last.graph
         print(f"loops:     {int(np.asarray(graph.edges.uncertain).sum())} closed")
         poses[:] = graph.poses
-        stream = zip(clouds, poses, strict=True)
-    if map is None:
-        collections.deque(stream, maxlen=0)
-        return poses, results, failure
-    with_clouds, with_poses = itertools.tee(stream)
-    world = mcg.merge_clouds((cloud for cloud, _ in with_clouds), (pose for _, pose in with_poses))
-    io.write(map, world)
-    print(f"map:       {map}, {len(world):,} points, {world.voxels}")
+    if map is not None:
+        merged = mcg.merge_clouds(clouds, poses) if world is None else world.cloud()
+        io.write(map, merged)
+        print(f"map:       {map}, {len(merged):,} points, {merged.voxels}")
     return poses, results, failure
 
 

@@ -1,11 +1,11 @@
-"""Shared by the commands: their options, checks of files, choices that depend on the clouds, and results in words."""
+"""Shared by the commands: their options, checks of files, and results in words."""
 
 from __future__ import annotations
 
 import errno
 import inspect
 import os
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from fnmatch import fnmatch
 from pathlib import Path
@@ -17,16 +17,11 @@ import tyro
 import mcgicp_jax as mcg
 from mcgicp_jax import datasets, plot
 from mcgicp_jax._clouds.color_spaces import COLOR_SPACES
-from mcgicp_jax._clouds.point_cloud import Voxels
 from mcgicp_jax._clouds.preprocess import check_preprocessing
-from mcgicp_jax._clouds.voxel_size import voxels_for
-from mcgicp_jax._local_geometry.spacing_and_noise import point_spacing
 from mcgicp_jax._math.robust_kernels import KERNELS
-from mcgicp_jax._methods.base import AbstractMethod
 from mcgicp_jax._methods.registry import METHODS
 from mcgicp_jax._registration.options import ROTATION_TOLERANCE
 from mcgicp_jax._registration.options import Options as RegistrationOptions
-from mcgicp_jax._registration.settings import default_distances
 from mcgicp_jax.io.clouds import FORMATS, format_of
 
 if TYPE_CHECKING:
@@ -60,26 +55,16 @@ Epsilon: TypeAlias = Annotated[
 
 # Number of files that a message lists.
 _MOST_NAMES = 5
-_RGB = ("red", "green", "blue")
 # Parameters of methods that have an option.
 _PARAMETERS = ("channel_covariance", "channel_weights", "epsilon")
-ADVICE = {
-    mcg.Status.MAX_ITERATIONS: "the pose was still changing after the last iteration; "
-    "try a larger --max-iterations, or --init with a better initial pose",
-    mcg.Status.TOO_FEW_CORRESPONDENCES: "fewer than four points have a match; "
-    "are both clouds in metres? If so, try --init with a pose at which they overlap, or a larger --max-distance",
-    mcg.Status.DEGENERATE: "the pose is unconstrained in at least one direction; "
-    "try clouds that show more of the scene, or have channels that mc-gicp can use",
-    mcg.Status.NON_FINITE: "numerical overflow; are the coordinates in metres?",
-}
 
 
 def enumerated(names: Sequence[str], last: str = "and") -> str:
     return f" {last} ".join(filter(None, [", ".join(names[:-1]), names[-1]]))
 
 
-def with_names(documented: Documented) -> Documented:
-    """Fill the names from the registries into the help text of a command or of its options."""
+def with_names(documented: Documented, **others: str) -> Documented:
+    """Fill the names from the registries, and others, into the help text of a command or of its options."""
     having = {name: [m for m in METHODS if name in METHODS[m].kind.__dataclass_fields__] for name in _PARAMETERS}
     documented.__doc__ = (documented.__doc__ or "").format(
         formats=enumerated(list(FORMATS), "or"),
@@ -88,6 +73,7 @@ def with_names(documented: Documented) -> Documented:
         channel_methods=enumerated([name for name in METHODS if METHODS[name].kind.uses_channels]),
         cell_methods=enumerated([name for name in METHODS if METHODS[name].kind.needs_covariances]),
         **{name: enumerated(methods) for name, methods in having.items()},
+        **others,
     )
     return documented
 
@@ -196,13 +182,6 @@ def check_outputs(*files: Path | None, cloud: Path | None = None, picture: Path 
         plot.check_picture(picture)
 
 
-def check_inputs(*clouds: Path) -> None:
-    """Raise `ValueError` or `OSError` for files that are missing or of unknown format, before any is read."""
-    for path in clouds:
-        format_of(path)
-        path.stat()
-
-
 def clouds_in(folder: Path, glob: str = "*", map: File = None) -> datasets.CloudFiles:
     """The clouds of a folder; `map`, a cloud that the command writes, may not become one of them."""
     if map is not None and map.resolve().parent == folder.resolve() and fnmatch(map.name, glob):
@@ -215,101 +194,6 @@ def clouds_in(folder: Path, glob: str = "*", map: File = None) -> datasets.Cloud
         more = f" and {len(names) - _MOST_NAMES:,} more" if len(names) > _MOST_NAMES else ""
         print(f"left out:  {', '.join(names[:_MOST_NAMES])}{more}, since they are no clouds")
     return found
-
-
-def choose_method(
-    given: MethodName | None, options: Options, channels: Sequence[str], clouds: Mapping[str, mcg.PointCloud]
-) -> MethodName:
-    """The method that the user gave or else suits the common channels of the clouds, which are printed."""
-    name = given or ("mc-gicp" if channels else "gicp")
-    if METHODS[name].kind.uses_channels and not channels:
-        raise ValueError(f"{name} needs channels in common, but {_having(clouds)}; use gicp instead (--method gicp)")
-    options.check(name)
-    print_channels(options, channels, clouds, "" if given or channels else " in common, therefore gicp")
-    return name
-
-
-def print_channels(
-    options: Options, channels: Sequence[str], clouds: Mapping[str, mcg.PointCloud], words: str = ""
-) -> None:
-    """Print the channels that are used, and those of each cloud if these differ."""
-    differ = not options.channels and len({cloud.channel_names for cloud in clouds.values()}) > 1
-    print(f"channels:  {listed(channels)}{words}{f' ({_having(clouds)})' if differ else ''}")
-
-
-def _having(clouds: Mapping[str, mcg.PointCloud]) -> str:
-    return ", ".join(f"{name} has {listed(cloud.channel_names)}" for name, cloud in clouds.items())
-
-
-def method_for(name: MethodName, options: Options, clouds: Callable[[], Sequence[mcg.PointCloud]]) -> AbstractMethod:
-    """The method with the user's parameters. Color ICP's weights, if not given, come from two preprocessed clouds."""
-    given = options.parameters_of(name)
-    if issubclass(METHODS[name].kind, mcg.ColorICP) and not given:
-        given["channel_weights"] = weights_from(*clouds())
-    return METHODS[name](**given)
-
-
-def weights_from(source: mcg.PointCloud, target: mcg.PointCloud) -> Any:
-    """Channel weights α from the data, as mc-gicp chooses them."""
-    chosen: Any = mcg.MultiChannelGICP().resolve(source, target)
-    return chosen.channel_weights
-
-
-def voxels_of(clouds: Sequence[mcg.PointCloud], options: Options) -> Voxels:
-    """The voxels for raw clouds by the user's option."""
-    return voxels_for(None if options.voxel_size == "off" else options.voxel_size, *clouds)
-
-
-def preprocessed(cloud: mcg.PointCloud, channels: Sequence[str], voxels: Voxels, options: Options) -> mcg.PointCloud:
-    """A cloud with some of its channels, ready to register."""
-    # Where the user asks for all points, `preprocess` warns of neighbourhoods that do not span the surface.
-    chosen = None if options.voxel_size == "off" else voxels
-    return mcg.preprocess(with_channels(cloud, channels), chosen, options.num_neighbors)
-
-
-def registration_for(name: MethodName, options: Options, target: Callable[[], mcg.PointCloud]) -> dict[str, Any]:
-    """Keyword arguments of `mcgicp_jax.register`; sizes of cells, if not given, come from a preprocessed target."""
-    arguments = options.registration()
-    if METHODS[name].kind.needs_covariances and not options.voxel_sizes:
-        spacing = float(point_spacing(target()))
-        # With 8 spacings, a cell has some tens of points.
-        arguments["voxel_sizes"] = tuple(float(f"{times * spacing:.2g}") for times in (32, 16, 8))
-    return arguments
-
-
-def described_distance(options: Options, target: mcg.PointCloud) -> str:
-    """`max_distance` in words."""
-    distances = options.max_distance or default_distances(point_spacing(target), target)
-    return " m, then ".join(f"{float(distance):.3g}" for distance in distances) + " m"
-
-
-def common_channels(options: Options, first: mcg.PointCloud, second: mcg.PointCloud) -> tuple[str, ...]:
-    return options.channels or tuple(name for name in first.channel_names if name in second.channel_names)
-
-
-def with_channels(cloud: mcg.PointCloud, names: Sequence[str]) -> mcg.PointCloud:
-    """The cloud with only the named channels, in this order; a colour space is computed from red, green and blue."""
-    needed = [name for each in names for name in (_RGB if each in COLOR_SPACES else (each,))]
-    missing = [name for name in dict.fromkeys(needed) if name not in cloud.channel_names]
-    if missing:
-        raise ValueError(f"no channel {', '.join(missing)}; there are {listed(cloud.channel_names)}")
-    columns = [cloud.channel_names.index(name) for name in needed]
-    channels, known, chosen = np.asarray(cloud.channels)[:, columns], cloud.channel_valid, list[str]()
-    known = None if known is None else np.asarray(known)[:, columns]
-    for name in names:
-        three = slice(len(chosen), len(chosen) + len(_RGB))
-        if name in COLOR_SPACES:
-            channels[:, three] = COLOR_SPACES[name](channels[:, three])
-            if known is not None:
-                known[:, three] = known[:, three].all(axis=1, keepdims=True)
-        chosen += [f"{name}_{i}" for i in range(len(_RGB))] if name in COLOR_SPACES else [name]
-    return mcg.PointCloud(
-        cloud.points, channels, channel_valid=known, covariances=cloud.covariances, channel_names=chosen
-    )
-
-
-def listed(names: Sequence[str]) -> str:
-    return ", ".join(names) if names else "no channels"
 
 
 def words(result: mcg.RegistrationResult) -> str:

@@ -15,33 +15,23 @@ from jaxtyping import Float
 
 import mcgicp_jax as mcg
 from mcgicp_jax import datasets, io, metrics, plot
+from mcgicp_jax._cli.choices import Choices, described_distance, with_channels
 from mcgicp_jax._cli.options import (
-    ADVICE,
     File,
     Method,
     MethodName,
     PairOptions,
-    check_inputs,
     check_outputs,
-    choose_method,
-    common_channels,
-    described_distance,
     enumerated,
-    method_for,
-    preprocessed,
-    print_channels,
-    registration_for,
-    voxels_of,
-    with_channels,
     with_names,
     words,
 )
-from mcgicp_jax._clouds.point_cloud import Voxels
 from mcgicp_jax._compute.messages import messages_named
 from mcgicp_jax._compute.threads import side_by_side
 from mcgicp_jax._methods.base import AbstractMethod
 from mcgicp_jax._methods.registry import METHODS
 from mcgicp_jax._pose_solver.degeneracy import describe
+from mcgicp_jax.io.clouds import format_of
 
 Source: TypeAlias = Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="SOURCE")]
 Target: TypeAlias = Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="TARGET")]
@@ -55,45 +45,47 @@ class PreparedPair:
     """Two preprocessed clouds with the channels that they have in common."""
 
     def __init__(self, source: Path, target: Path, options: PairOptions):
-        check_inputs(source, target)
+        for path in (source, target):
+            format_of(path)
+            path.stat()
         self.options = options
         self.start = np.eye(4) if options.init in (None, "global") else _read_pose("init", Path(options.init))
         self.raw = io.read(source), io.read(target)
         self.files = {str(source): self.raw[0], str(target): self.raw[1]}
-        self.channels = common_channels(options, *self.raw)
-        voxels = voxels_of(self.raw, options)
-        self.source, self.target = (
-            _preprocess(path, cloud, self.channels, voxels, options)
-            for path, cloud in zip((source, target), self.raw, strict=True)
-        )
-        counts = (
-            f"{len(used):,} of {len(raw):,}" for used, raw in zip((self.source, self.target), self.raw, strict=True)
-        )
-        print("points:    source {}, target {} ({})".format(*counts, voxels))
+        self.choices = Choices.of(options, *self.raw)
+        self.ready = self._preprocess(source, self.raw[0]), self._preprocess(target, self.raw[1])
+        counts = (f"{len(used):,} of {len(raw):,}" for used, raw in zip(self.ready, self.raw, strict=True))
+        print("points:    source {}, target {} ({})".format(*counts, self.choices.voxels))
+
+    def _preprocess(self, path: Path, cloud: mcg.PointCloud) -> mcg.PointCloud:
+        with messages_named(str(path)):
+            return self.choices.preprocess(cloud)
 
     def find_start(self) -> None:
         """With `--init global`, the pose by local features becomes the initial one."""
         if self.options.init == "global":
-            self.start = _found(self.raw, self.channels)
+            self.start = _found(self.raw, self.choices.channels)
 
     def method(self, name: MethodName) -> AbstractMethod:
         """The method with parameters from the options or else from the data."""
-        return method_for(name, self.options, lambda: (self.source, self.target)).resolve(self.source, self.target)
+        return self.choices.method(name, lambda: self.ready).resolve(*self.ready)
 
     def errors(self, pose: Float[np.ndarray, "4 4"], true_pose: Float[np.ndarray, "4 4"]) -> str:
         """Translation error in mm at the centroid of the source, and rotation error in degrees, as two columns."""
-        centroid = np.asarray(self.source.unpad().points, np.float64).mean(axis=0)
+        centroid = np.asarray(self.ready[0].unpad().points, np.float64).mean(axis=0)
         translation, rotation = metrics.pose_error(pose, true_pose, at=centroid)
         return f"{1e3 * float(translation):9.2f}  {np.degrees(rotation):11.3f}"
 
     def register(self, name: MethodName, method: AbstractMethod) -> mcg.RegistrationResult:
-        options = registration_for(name, self.options, lambda: self.target)
         # Cells are made of all points.
         source, target = (
-            with_channels(raw, self.channels) if side in method.needs_covariances else ready
-            for side, raw, ready in zip(("source", "target"), self.raw, (self.source, self.target), strict=True)
+            with_channels(raw, self.choices.channels) if side in method.needs_covariances else ready
+            for side, raw, ready in zip(("source", "target"), self.raw, self.ready, strict=True)
         )
-        return mcg.register(source, target, method, init=self.start, **options)
+        return mcg.register(source, target, method, init=self.start, **self.arguments(name))
+
+    def arguments(self, name: MethodName) -> dict[str, Any]:
+        return self.choices.arguments(name, lambda: self.ready)
 
     def draw(self, results: dict[MethodName, mcg.RegistrationResult]) -> None:
         if self.options.plot is not None:
@@ -126,14 +118,14 @@ def register(
     shared.check(method)
     check_outputs(output, cloud=aligned, picture=shared.plot)
     pair = PreparedPair(source, target, shared)
-    name = choose_method(method, shared, pair.channels, pair.files)
+    name = pair.choices.method_name(method, pair.files)
     pair.find_start()
     chosen = pair.method(name)
     print(f"method:    {name}{_parameters(chosen)}")
     if not chosen.needs_covariances:
-        print(f"matches:   up to {described_distance(shared, pair.target)} apart")
+        print(f"matches:   up to {described_distance(shared, pair.ready[1])} apart")
     else:
-        sizes = registration_for(name, shared, lambda: pair.target)["voxel_sizes"]
+        sizes = pair.arguments(name)["voxel_sizes"]
         print(f"cells:     of {', '.join(f'{size:g}' for size in sizes)} m")
     result = pair.register(name, chosen)
     _report(pair, result)
@@ -195,8 +187,8 @@ def _compare(
 ) -> dict[MethodName, mcg.RegistrationResult]:
     true_pose = None if truth is None else _read_pose("truth", truth)
     pair = PreparedPair(source, target, options)
-    print(f"matches:   up to {described_distance(options, pair.target)} apart")
-    print_channels(options, pair.channels, pair.files)
+    print(f"matches:   up to {described_distance(options, pair.ready[1])} apart")
+    pair.choices.print_channels(pair.files)
     pair.find_start()
     results: dict[MethodName, mcg.RegistrationResult] = {}
     measures = "inliers      rmse, m" if true_pose is None else "error, mm   error, deg"
@@ -234,7 +226,7 @@ def _compiled(pair: PreparedPair, names: Sequence[MethodName]) -> dict[MethodNam
                 pair.register(name, methods[name])
 
     # Methods with and without channels share no programs.
-    side_by_side([partial(run, kind) for kind in ([True, False] if pair.channels else [False])])
+    side_by_side([partial(run, kind) for kind in ([True, False] if pair.choices.channels else [False])])
     return methods
 
 
@@ -248,7 +240,8 @@ def _parameters(method: AbstractMethod) -> str:
 def _report(pair: PreparedPair, result: mcg.RegistrationResult) -> None:
     plural = "" if result.num_iterations == 1 else "s"
     print(f"status:    {words(result)} after {result.num_iterations} iteration{plural}")
-    used = min(len(pair.source), pair.options.registration()["max_source_points"] or len(pair.source))
+    size = len(pair.ready[0])
+    used = min(size, pair.options.registration()["max_source_points"] or size)
     print(f"inliers:   {result.num_inliers:,} of {used:,} ({result.overlap:.0%}), rmse {result.rmse:.4g} m")
     if result.converged and np.all(np.isfinite(result.deviations)):
         x, y, z, *angles = result.deviations
@@ -258,7 +251,7 @@ def _report(pair: PreparedPair, result: mcg.RegistrationResult) -> None:
         print(f"unconstr.: {describe(result.unconstrained_directions)}")
     print("T_target_source:")
     # At UTM coordinates, 1e-8 in a rotation entry moves a point by centimetres.
-    form = "22.14f" if np.any(pair.source.origin) else "15.8f"
+    form = "22.14f" if np.any(pair.ready[0].origin) else "15.8f"
     for row in result.matrix:
         print("".join(f" {number:{form}}" for number in row))
 
@@ -267,7 +260,7 @@ def _verdict(results: dict[MethodName, mcg.RegistrationResult]) -> int:
     """Return the exit code, and print to stderr which methods did not converge."""
     failed = {name: result for name, result in results.items() if not result.converged}
     for name, result in failed.items():
-        print(f"mcgicp: {name} did not converge ({words(result)}): {ADVICE[result.status]}", file=sys.stderr)
+        print(f"mcgicp: {name} did not converge ({words(result)}): {result.status.advice}", file=sys.stderr)
     return 1 if failed else 0
 
 
@@ -289,10 +282,3 @@ def _found(clouds: Sequence[mcg.PointCloud], channels: Sequence[str]) -> Float[n
         raise ValueError(f"--init global: found no pose, {reason} ({result}); try --init with a file")
     print(f"start:     found, {result.num_inliers:,} of {result.num_matches:,} features match")
     return result.matrix
-
-
-def _preprocess(
-    path: Path, cloud: mcg.PointCloud, channels: Sequence[str], voxels: Voxels, options: Options
-) -> mcg.PointCloud:
-    with messages_named(str(path)):
-        return preprocessed(cloud, channels, voxels, options)

@@ -15,13 +15,13 @@ from jaxtyping import Float
 from mcgicp_jax.io.files import replacing
 
 Row: TypeAlias = dict[str, str]
-# Source, target and fingerprint.
+# Source, target and initial pose.
 Key: TypeAlias = tuple[str, str, str]
 
 # Columns of the upper three rows of the pose matrix
 POSE = tuple(f"m{row}{column}" for row in range(3) for column in range(4))
-COLUMNS = ("source", "target", "status", "iterations", "inliers", "cost", "rmse", *POSE, "reason", "fingerprint")
-_TEXTS = ("source", "target", "status", "reason", "fingerprint")
+COLUMNS = ("source", "target", "init", "status", "iterations", "inliers", "cost", "rmse", *POSE, "reason")
+_TEXTS = ("source", "target", "init", "status", "reason")
 
 
 class Table:
@@ -89,7 +89,7 @@ class Table:
 
 
 def key_of(row: Row) -> Key:
-    return row["source"], row["target"], row["fingerprint"]
+    return row["source"], row["target"], row["init"]
 
 
 def pose_of(row: Row) -> Float[np.ndarray, "4 4"]:

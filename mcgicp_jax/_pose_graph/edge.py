@@ -1,9 +1,11 @@
-"""Edges: measurements of the motion between two poses, and priors."""
+"""Measurements in a pose graph: their interface, and edges, which measure the motion between two poses."""
 
 from __future__ import annotations
 
+import abc
 from typing import Any
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import jaxlie
@@ -14,11 +16,49 @@ from jaxtyping import Array, Bool, Float, Int
 from mcgicp_jax._compute.concrete import is_concrete, numpy_for
 from mcgicp_jax._math.poses import Pose, adjoint, inverse, pose_matrices
 from mcgicp_jax._math.twists import logarithm, logarithm_derivative
-from mcgicp_jax._pose_graph.factors import WORLD, AbstractFactor
 
+# Row of the world's frame, whose pose is the identity. Unlike −1, it is not a row of any array.
+WORLD = -(2**31)
 # Largest negative eigenvalue of an information matrix that counts as rounding, as a fraction of the largest one; and
 # largest asymmetry. g2o files have six digits.
 _ROUNDING = 1e-6
+
+
+class AbstractFactor(eqx.Module):
+    """m measurements of one kind, each a function of two poses; a pytree of arrays with a leading axis of length m.
+
+    The cost of a measurement is ½ rᵀΛr. A subclass provides the fields below and `linearize`; the solver and the
+    covariances need nothing else.
+
+    Attributes:
+        rows: (m, 2), rows of the poses that each measurement depends on. The first one of a measurement in the world's
+            frame, such as a height, is `WORLD`.
+        information: (m, d, d), Λ, the inverse covariance of the residual; symmetric, positive semidefinite.
+        uncertain: (m,), whether the measurement may be an outlier, so that `optimize_poses` may reject it.
+    """
+
+    rows: eqx.AbstractVar[Int[Array, "*m 2"] | Int[np.ndarray, "*m 2"]]
+    information: eqx.AbstractVar[Float[Array, "*m d d"] | Float[np.ndarray, "*m d d"]]
+    uncertain: eqx.AbstractVar[Bool[Array, "*m"] | Bool[np.ndarray, "*m"]]
+
+    @abc.abstractmethod
+    def linearize(
+        self, poses: Float[np.ndarray, "m 2 4 4"]
+    ) -> tuple[Float[np.ndarray, "m d"], Float[np.ndarray, "m 2 d 6"]]:
+        """Residuals r, and their derivatives with respect to the twists ξ = (v, ω) of both poses T exp(ξ).
+
+        Called on the host with NumPy arrays in float64, also from within compiled programs: it must not call JAX.
+
+        Args:
+            poses: sensor to world, metres; the identity for `WORLD`.
+        """
+
+
+def check_rows(name: str, rows: Int[np.ndarray, "m 2"], num_poses: int) -> None:
+    """Raise `ValueError` for rows of poses outside of the graph."""
+    outside = ((rows < 0) & (rows != WORLD)) | (rows >= num_poses)
+    if outside.any():
+        raise ValueError(f"{name}: expected rows from 0 to {num_poses - 1} or WORLD, got {rows[outside][0]}")
 
 
 class Edge(AbstractFactor):
@@ -85,10 +125,8 @@ class Edge(AbstractFactor):
         self, poses: Float[np.ndarray, "m 2 4 4"]
     ) -> tuple[Float[np.ndarray, "m 6"], Float[np.ndarray, "m 2 6 6"]]:
         """r = log(T_i_j⁻¹ T_i⁻¹ T_j), and ∂r/∂ξ_i and ∂r/∂ξ_j."""
-        motion = inverse(poses[:, 0]) @ poses[:, 1]
-        residual = logarithm(inverse(np.asarray(self.T_i_j)) @ motion)
-        by_end = logarithm_derivative(residual)
-        return residual, np.stack([-by_end @ adjoint(inverse(motion)), by_end], axis=1)
+        residual = logarithm(inverse(np.asarray(self.T_i_j)) @ (inverse(poses[:, 0]) @ poses[:, 1]))
+        return residual, logarithm_derivative(residual)[:, None] @ motion_jacobians(poses)
 
     def __len__(self) -> int:
         return len(self.i)
@@ -96,6 +134,12 @@ class Edge(AbstractFactor):
     def __getitem__(self, rows: Any) -> Edge:
         """One edge, or those of a slice, mask or list of rows."""
         return jax.tree.map(lambda values: values[rows], self)
+
+
+def motion_jacobians(poses: Float[np.ndarray, "m 2 4 4"]) -> Float[np.ndarray, "m 2 6 6"]:
+    """Derivatives of the twist of the motion T_i⁻¹ T_j with respect to those of both poses."""
+    by_first = -adjoint(inverse(poses[:, 1]) @ poses[:, 0])
+    return np.stack([by_first, np.broadcast_to(np.eye(6), by_first.shape)], axis=1)
 
 
 def checked_edges(edges: Edge, num_poses: int) -> Edge:

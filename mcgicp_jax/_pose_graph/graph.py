@@ -14,8 +14,7 @@ from jaxtyping import Array, Float
 
 from mcgicp_jax._compute.concrete import is_concrete
 from mcgicp_jax._math.poses import Pose, pose_matrices
-from mcgicp_jax._pose_graph.edge import Edge, checked_edges
-from mcgicp_jax._pose_graph.factors import WORLD, AbstractFactor, check_rows
+from mcgicp_jax._pose_graph.edge import WORLD, AbstractFactor, Edge, check_rows, checked_edges
 from mcgicp_jax._pose_graph.initialization import initial_poses
 
 
@@ -96,9 +95,7 @@ def _check_factor(name: str, factor: Any, num_poses: int) -> None:
     if not isinstance(factor, AbstractFactor):
         raise ValueError(f"{name}: expected an AbstractFactor, got {type(factor).__name__}")
     rows, information = np.shape(factor.rows), np.shape(factor.information)
-    if len(rows) != 2 or rows[1] < 2 or len(information) != 3 or information[1] != information[2]:
-        raise ValueError(
-            f"{name}: expected rows (m, k) with k of at least 2 and information (m, d, d), got {rows} and {information}"
-        )
+    if len(information) != 3 or information[1] != information[2] or rows != (information[0], 2):
+        raise ValueError(f"{name}: expected rows (m, 2) and information (m, d, d), got {rows} and {information}")
     if is_concrete(factor.rows):
         check_rows(name, np.asarray(factor.rows), num_poses)

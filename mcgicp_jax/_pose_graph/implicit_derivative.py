@@ -1,8 +1,8 @@
 """Pose graphs inside transformations: the solver runs on the host, and its derivative follows at the solution.
 
 The poses are the root of g(ξ, θ) = Σ w JᵀΛr, so dξ = −(∂g/∂ξ)⁻¹ ∂g/∂θ dθ, with the full Hessian ∂g/∂ξ and with the
-measured values and information matrices θ. The host computes both derivatives in float64, numerically and so for all
-kinds of measurements alike; JAX only contracts them with tangents.
+motions and information matrices θ of the edges. The host computes both derivatives in float64; JAX only contracts them
+with tangents.
 """
 
 from __future__ import annotations
@@ -20,18 +20,15 @@ from mcgicp_jax._compute.callbacks import call_host
 from mcgicp_jax._compute.concrete import AnyArray, is_concrete
 from mcgicp_jax._compute.lazy import Lazy
 from mcgicp_jax._compute.messages import calling_line, shown_at, warn
-from mcgicp_jax._math.twists import exponential
-from mcgicp_jax._pose_graph.factors import WORLD, AbstractFactor, check_rows
+from mcgicp_jax._math.twists import logarithm_derivative, skew
+from mcgicp_jax._pose_graph.edge import WORLD, Edge, check_rows, motion_jacobians
 from mcgicp_jax._pose_graph.normal_equations import factored, typical_information
 from mcgicp_jax._pose_graph.solver import Factors, Solution, covariances_at, solve
 from mcgicp_jax._registration.result import Status
 
-# Differences of fourth order: step in radians, metres or units of the measured values, its multiples and their
-# coefficients. The error is of the order of 1e-12; rounding of positions at 100 m leaves 1e-11.
-_STEP = 1e-3
-_MULTIPLES, _COEFFICIENTS = np.array([1, -1, 2, -2]), np.array([8, -8, -1, 1]) / (12 * _STEP)
-# Measurements that are evaluated at once, so that temporary arrays stay in the processor's caches.
-_EVALUATED_AT_ONCE = 4096
+# Step of the central differences of `logarithm_derivative`, metres or radians: errors are of the order of 1e-10, and of
+# 1e-11 by rounding.
+_STEP = 1e-5
 
 
 class Found(NamedTuple):
@@ -46,47 +43,58 @@ class Found(NamedTuple):
 
 
 class _Sensitivity(NamedTuple):
-    """Derivatives at the solution; 0 unless the status is CONVERGED.
+    """Derivatives at the solution; 0 unless the status is CONVERGED, and for edges that were rejected.
 
     Attributes:
         inverse: (∂g/∂ξ)⁻¹, 0 for held poses.
-        forces: for each kind of measurement and each of its arrays of floats, ∂(w JᵀΛr) by the entries of the array.
+        by_motion: derivative of JᵀΛr by the twist μ of T_i_j exp(μ).
+        jacobians, residuals: J and r.
     """
 
     inverse: Float[AnyArray, "n 6 n 6"]
-    forces: list[list[Float[AnyArray, "m k 6 *entries"]]]
+    by_motion: Float[AnyArray, "m 2 6 6"]
+    jacobians: Float[AnyArray, "m 2 6 6"]
+    residuals: Float[AnyArray, "m 6"]
 
 
 @partial(jax.custom_jvp, nondiff_argnums=(2, 3))
 def solve_traced(poses: Float[AnyArray, "n 4 4"], factors: Factors, robust: bool, max_iterations: int) -> Found:
-    """`solver.solve` inside transformations, differentiable by the measurements, not by the initial poses."""
+    """`solver.solve` inside transformations, differentiable by the edges, not by the initial poses."""
     return _solved(poses, factors, robust, max_iterations, False)[0]
 
 
 @solve_traced.defjvp
 def _derivative(robust: bool, max_iterations: int, primals: Any, tangents: Any) -> tuple[Found, Found]:
     (poses, factors), (_, changes) = primals, tangents
+    if len(factors) > 1:
+        raise ValueError("graph: poses have derivatives only if edges are the only measurements, got further factors")
     found, sensitivity = _solved(poses, factors, robust, max_iterations, True)
-    moved = _moved(found, sensitivity, [each.rows for each in factors], [_floats(each) for each in changes])
+    (edges,), (change,) = factors, changes
+    moved = _moved(found, sensitivity, edges.rows, edges.T_i_j, change.T_i_j, change.information)
     constants = jax.tree.map(lambda value: jax.custom_derivatives.zero_from_primal(value), found)
     return found, constants._replace(poses=moved)
 
 
 # Compiled as a whole: outside of `jit`, each of some fifty operations would be compiled alone.
 @jax.jit
-def _moved(found: Found, sensitivity: _Sensitivity, rows: list[Any], changes: list[list[Any]]) -> Float[Array, "n 4 4"]:
-    """Tangents of the poses, given those of the arrays of floats of each kind of measurement."""
+def _moved(
+    found: Found,
+    sensitivity: _Sensitivity,
+    rows: Int[AnyArray, "m 2"],
+    motions: Float[AnyArray, "m 4 4"],
+    motion_change: Float[AnyArray, "m 4 4"],
+    information_change: Float[AnyArray, "m 6 6"],
+) -> Float[Array, "n 4 4"]:
+    """Tangents of the poses, given those of the motions and information matrices of the edges."""
     n, dtype = len(found.poses), found.poses.dtype
-    gradient = jnp.zeros((n + 1, 6), dtype)
-    for index, tangents, forces in zip(rows, changes, sensitivity.forces, strict=True):
-        ends = jnp.where(jnp.asarray(index) == WORLD, n, index)
-        for tangent, force in zip(tangents, forces, strict=True):
-            force = force.reshape(*ends.shape, 6, -1)
-            product = jnp.einsum(
-                "mkap,mp->mka", force, tangent.reshape(len(ends), -1).astype(dtype), precision="highest"
-            )
-            gradient = gradient.at[ends].add(product)
-    twists = -jnp.einsum("iajb,jb->ia", sensitivity.inverse, gradient[:-1], precision="highest")
+    einsum = partial(jnp.einsum, precision="highest")
+    local = einsum("mji,mjk->mik", motions[:, :3, :3], motion_change[:, :3]).astype(dtype)
+    turn = (local[:, :, :3] - local[:, :, :3].swapaxes(1, 2)) / 2
+    twists = jnp.concatenate([local[:, :, 3], turn[:, (2, 0, 1), (1, 2, 0)]], axis=1)
+    forces = einsum("mkab,mb->mka", sensitivity.by_motion, twists)
+    forces += einsum("mkia,mij,mj->mka", sensitivity.jacobians, information_change.astype(dtype), sensitivity.residuals)
+    gradient = jnp.zeros((n + 1, 6), dtype).at[jnp.where(rows == WORLD, n, rows)].add(forces)
+    twists = -einsum("iajb,jb->ia", sensitivity.inverse, gradient[:-1])
     v, (x, y, z) = twists[:, :3], twists[:, 3:].T
     zero = jnp.zeros_like(x)
     turn = jnp.stack([zero, -z, y, z, zero, -x, -y, x, zero], axis=-1).reshape(n, 3, 3)
@@ -137,8 +145,8 @@ def _solved(
     m, number = sum(len(factor.information) for factor in factors), jax.ShapeDtypeStruct((), np.int32)
     shape = partial(jax.ShapeDtypeStruct, dtype=dtype)
     found = Found(shape((n, 4, 4)), shape((m,)), shape((m,)), shape(()), number, number)
-    forces = [[shape((*factor.rows.shape, 6, *each.shape[1:])) for each in _floats(factor)] for factor in factors]
-    sensitivity = _Sensitivity(shape((n, 6, n, 6)), forces) if differentiated else None
+    sizes: Any = (n, 6, n, 6), (m, 2, 6, 6), (m, 2, 6, 6), (m, 6)
+    sensitivity = _Sensitivity(*map(shape, sizes)) if differentiated else None
     return call_host(on_host, (found, sensitivity), poses, factors)
 
 
@@ -156,65 +164,45 @@ def _warn_of_rounding(positions: Float[np.ndarray, "n 3"], factors: Factors) -> 
 
 def _sensitivity(solution: Solution, number: int, dtype: DTypeLike) -> _Sensitivity:
     equations, poses = solution.equations, solution.found.poses
-    blocks, forces = [], []
-    for factor, rows, weights in zip(equations.factors, equations.rows, equations.split(solution.weights), strict=True):
-        hessian, *others = _weighted_derivatives(factor, poses[rows], weights * (solution.status == Status.CONVERGED))
-        blocks.append(hessian.swapaxes(2, 3).reshape(-1, 6, 6))
-        forces.append([each.astype(dtype) for each in others])
+    edges: Any = equations.factors[0]
+    ends = poses[equations.rows]
     inverse = np.zeros((len(poses), 6, len(poses), 6))
-    if equations.size and solution.status == Status.CONVERGED:
-        matrix = equations.matrix(np.concatenate(blocks))
-        dense = equations.spread(factored(matrix).solve(np.eye(equations.size)))
-        inverse = equations.spread(np.moveaxis(dense, 2, 0))
-    return _Sensitivity(inverse[:number, :, :number].astype(dtype), forces)
+    found = [np.zeros((len(ends), *shape)) for shape in ((2, 6, 6), (2, 6, 6), (6,))]
+    if solution.status == Status.CONVERGED:
+        used = solution.weights > 0
+        blocks, *values = _derivatives(edges, ends)
+        for array, each in zip(found, values, strict=True):
+            array[used] = each[used]
+        if equations.size:
+            dense = equations.spread(factored(equations.matrix(blocks)).solve(np.eye(equations.size)))
+            inverse = equations.spread(np.moveaxis(dense, 2, 0))
+    return _Sensitivity(*(each.astype(dtype) for each in (inverse[:number, :, :number], *found)))
 
 
-def _weighted_derivatives(
-    factor: AbstractFactor, poses: Float[np.ndarray, "m k 4 4"], weights: Float[np.ndarray, "m"]
-) -> list[np.ndarray]:
-    """Derivatives of w JᵀΛr, (m, k, 6): by the twists, (m, k, 6, k, 6), and by the entries of each array of floats."""
-    k, parts = poses.shape[1], []
-    step = max(_EVALUATED_AT_ONCE // (4 * 6 * k), 1)
-    for start in range(0, max(len(weights), 1), step):
-        q = slice(start, start + step)
-        part = jax.tree.map(lambda values, q=q: values[q], factor)
-        found = [_by_twists(part, poses[q]), *_by_values(part, poses[q])]
-        parts.append([np.where(weights[q].reshape(-1, *[1] * (each.ndim - 1)) > 0, each, 0) for each in found])
-    return [np.concatenate(each) for each in zip(*parts, strict=True)]
+def _derivatives(edges: Edge, poses: Float[np.ndarray, "m 2 4 4"]) -> tuple[np.ndarray, ...]:
+    """Derivatives of JᵀΛr by the twists of both poses, (m, 2, 2, 6, 6), and by that of the motion; J, and r.
+
+    With B the right Jacobian of the logarithm at r, inverted, and D the derivative of T_i⁻¹ T_j by both poses, J = BD.
+    """
+    residuals, jacobians = edges.linearize(poses)
+    motion, information = motion_jacobians(poses), np.asarray(edges.information)
+    forces = information @ residuals[..., None]
+    steps = _STEP * np.eye(6)[:, None]
+    slopes = (logarithm_derivative(residuals + steps) - logarithm_derivative(residuals - steps)) / (2 * _STEP)
+    # Of BᵀΛr by r.
+    by_residual = jacobians[:, 1].swapaxes(1, 2) @ information + np.einsum("bmia,mi->mab", slopes, forces[..., 0])
+    outer = motion.swapaxes(2, 3) @ by_residual[:, None]
+    blocks = outer[:, :, None] @ jacobians[:, None]
+    # D depends on the poses, too: dD_i = D_i ad(ξ_i) − ad(ξ_j) D_i.
+    first, second = np.moveaxis((jacobians.swapaxes(2, 3) @ forces[:, None])[..., 0], 1, 0)
+    blocks[:, 0, 0] += _coadjoint(first)
+    blocks[:, 0, 1] -= motion[:, 0].swapaxes(1, 2) @ _coadjoint(second)
+    return blocks, outer @ -logarithm_derivative(-residuals)[:, None], jacobians, residuals
 
 
-def _by_twists(factor: AbstractFactor, poses: Float[np.ndarray, "m k 4 4"]) -> Float[np.ndarray, "m k 6 k 6"]:
-    m, k = poses.shape[:2]
-    twists = _STEP * np.multiply.outer(_MULTIPLES, np.eye(6 * k)).reshape(-1, 1, k, 6)
-    moved = (poses @ exponential(twists)).reshape(-1, k, 4, 4)
-    repeated = jax.tree.map(lambda values: np.concatenate([values] * len(twists)), factor)
-    return _differences(repeated, moved, 6 * k).reshape(m, k, 6, k, 6)
-
-
-def _by_values(factor: AbstractFactor, poses: Float[np.ndarray, "m k 4 4"]) -> list[np.ndarray]:
-    leaves, structure = jax.tree.flatten(factor)
-    found, (m, k) = [], poses.shape[:2]
-    for place, values in enumerate(leaves):
-        if values is factor.information:
-            residuals, jacobians = factor.linearize(poses)
-            found.append(np.einsum("mkia,mj->mkaij", jacobians, residuals))
-        elif np.issubdtype(values.dtype, np.floating):
-            size = values[0].size if m else 0
-            steps = _STEP * np.multiply.outer(_MULTIPLES, np.eye(size)).reshape(-1, 1, *values.shape[1:])
-            repeated = [np.concatenate([each] * len(steps)) for each in leaves]
-            repeated[place] = (values + steps).reshape(-1, *values.shape[1:])
-            many = np.concatenate([poses] * len(steps))
-            found.append(
-                _differences(jax.tree.unflatten(structure, repeated), many, size).reshape(m, k, 6, *values.shape[1:])
-            )
-    return found
-
-
-def _differences(
-    factor: AbstractFactor, poses: Float[np.ndarray, "q k 4 4"], number: int
-) -> Float[np.ndarray, "m k 6 number"]:
-    """Derivatives of JᵀΛr by some numbers; rows are ordered by multiple of the step, number and measurement."""
-    residuals, jacobians = factor.linearize(poses)
-    forces = (jacobians.swapaxes(2, 3) @ (factor.information @ residuals[..., None])[:, None])[..., 0]
-    forces = forces.reshape(len(_MULTIPLES), number, -1, *forces.shape[1:])
-    return np.moveaxis(np.tensordot(_COEFFICIENTS, forces, 1), 0, -1)
+def _coadjoint(forces: Float[np.ndarray, "m 6"]) -> Float[np.ndarray, "m 6 6"]:
+    """The matrix C with Cξ = ad(ξ)ᵀf."""
+    matrix = np.zeros((len(forces), 6, 6))
+    matrix[:, :3, 3:] = matrix[:, 3:, :3] = skew(forces[:, :3])
+    matrix[:, 3:, 3:] = skew(forces[:, 3:])
+    return matrix

@@ -6,9 +6,7 @@ compiled for every graph; so the loop is written out here.
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from functools import partial
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -24,10 +22,6 @@ _START_DAMPING, _DAMPING_FACTOR, _MOST_DAMPING = 1e-4, 10.0, 1e12
 _TOLERANCE = 1e-6
 # The same in σ², for graphs without contradiction: a step of a millionth of a standard deviation.
 _LEAST_DECREASE = 1e-12
-# Entries of the factors per entry of the matrix beyond which conjugate gradients are quicker. With half of the loops
-# false, the sphere of 2,500 poses has 53 and the garage of 1,600 has 38: conjugate gradients then take a tenth of the
-# time. At 12 to 20 they take as long as the factorisation. Without false loops they have 6 and 2.
-_LARGEST_FILL = 20.0
 # Largest number of steps of `refine`, each of which reduces the error by a factor of 10 or more, and the relative size
 # of the last one.
 _REFINEMENTS, _ROUNDING = 10, 1e-13
@@ -35,8 +29,6 @@ _REFINEMENTS, _ROUNDING = 10, 1e-13
 # without `settle`, and by 0.12, 0.03 and 0.01 m with weights of 1, 2 and 3. More holds back what loops measure: on a
 # sphere started from odometry, with edges that know nothing of x, errors are 8.8 m without, and 7.8, 10.5 and 12.7 m.
 _START_WEIGHT = 2.0
-# Relative residual of conjugate gradients, which serve for steps far from the minimum, and largest number of products.
-_RESIDUAL, _MOST_PRODUCTS = 1e-2, 300
 
 
 class Minimum(NamedTuple):
@@ -58,19 +50,12 @@ class Minimum(NamedTuple):
 
 
 def minimize(
-    equations: NormalEquations,
-    start: Minimum,
-    weights: Float[np.ndarray, "m"],
-    max_iterations: int,
-    core: Bool[np.ndarray, "m"] | None = None,
+    equations: NormalEquations, start: Minimum, weights: Float[np.ndarray, "m"], max_iterations: int
 ) -> Minimum:
     """Lower ½ Σ w rᵀΛr by Levenberg-Marquardt steps until one lowers it by no more than tolerance and rounding.
 
-    The weights of measurements that are not in use are 0. With a `core` of measurements, only these are factored if the
-    factors of all would be much larger than the matrix; conjugate gradients account for the others, inexactly.
+    The weights of measurements that are not in use are 0.
     """
-    within = equations if core is None or equations.fill <= _LARGEST_FILL else equations.restricted(core)
-    solver = partial(_solver, equations, equations if np.any(within.held != equations.held) else within)
     poses, terms, count, _, damping = start
     cost, system = terms.cost(weights), None
     end = count + max_iterations
@@ -81,7 +66,7 @@ def minimize(
             gradient, system = equations.gradient(terms, weights), equations.weighted(terms.blocks, weights)
         count += 1
         try:
-            step = -solver(system, terms, weights, damping)(gradient)
+            step = -factored(equations.damped(system, damping)).solve(gradient)
         except RuntimeError:
             damping *= _DAMPING_FACTOR
             continue
@@ -133,25 +118,3 @@ def settle(
         poses = found.poses @ exponential(equations.spread(step))
         found = found._replace(poses=poses, terms=equations.terms(poses))
     return found
-
-
-def _solver(
-    equations: NormalEquations,
-    core: NormalEquations,
-    matrix: Any,
-    terms: Terms,
-    weights: Float[np.ndarray, "m"],
-    damping: float,
-) -> Callable[[np.ndarray], np.ndarray]:
-    """Solver of (H + λD) x = b, by the factors of the core and, outside of it, conjugate gradients."""
-    from scipy.sparse.linalg import LinearOperator, cg
-
-    if core is equations:
-        return factored(equations.damped(matrix, damping)).solve
-    factors = factored(core.damped(core.weighted(terms.blocks, weights), damping))
-
-    def approximate(vector: Float[np.ndarray, "size"]) -> Float[np.ndarray, "size"]:
-        return equations.gathered(core.spread(factors.solve(core.gathered(equations.spread(vector)))))
-
-    whole, operator = equations.damped(matrix, damping), LinearOperator(matrix.shape, approximate, dtype=float)
-    return lambda vector: cg(whole, vector, rtol=_RESIDUAL, maxiter=_MOST_PRODUCTS, M=operator)[0]

@@ -42,10 +42,10 @@ def propagated(
     equations: NormalEquations,
     found: Minimum,
     weights: Float[np.ndarray, "m"],
-    rows: Int[np.ndarray, "q k"],
-    jacobians: Float[np.ndarray, "q k d 6"],
+    rows: Int[np.ndarray, "q 2"],
+    jacobians: Float[np.ndarray, "q 2 d 6"],
 ) -> Float[np.ndarray, "q d d"]:
-    """Covariances JΣJᵀ of functions of the poses in `rows`, by their Jacobians.
+    """Covariances JΣJᵀ of functions of two poses each, by their Jacobians.
 
     Infinite if the poses are not connected with each other, NaN if H is singular.
     """
@@ -68,8 +68,8 @@ def propagated(
         solved = equations.spread(solver.solve(gathered)).reshape(columns.shape)
         for row, jacobian in zip(rows[q].T, jacobians[q].swapaxes(0, 1), strict=True):
             covariances[q] += jacobian @ solved[row, :, each]
-    apart = (equations.parts[rows] != equations.parts[rows[:, :1]]).any(axis=1)
-    covariances[apart] = np.diag(np.full(d, np.inf))
+    first, second = equations.parts[rows].T
+    covariances[first != second] = np.diag(np.full(d, np.inf))
     return covariances
 
 

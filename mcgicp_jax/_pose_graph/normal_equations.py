@@ -13,8 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float, Inexact, Int
 
-from mcgicp_jax._math.poses import adjoint, inverse
-from mcgicp_jax._pose_graph.factors import WORLD, AbstractFactor
+from mcgicp_jax._pose_graph.edge import WORLD, AbstractFactor, motion_jacobians
 
 # Least damping, as a fraction of the information of a typical edge. Directions that no measurement observes are then
 # 3e4 times as uncertain as a typical edge, and the factorisation loses half of the digits of float64.
@@ -26,13 +25,13 @@ class Terms(NamedTuple):
 
     Attributes:
         squares: rᵀΛr of every measurement, the squared Mahalanobis distance.
-        gradient: JᵀΛr, for every pose of every measurement.
-        blocks: of JᵀΛJ, for every pair of poses of every measurement.
+        gradient: JᵀΛr, for both poses of every measurement.
+        blocks: JᵀΛJ of every measurement, by first and second pose.
     """
 
     squares: Float[np.ndarray, "m"]
-    gradient: Float[np.ndarray, "e 6"]
-    blocks: Float[np.ndarray, "b 6 6"]
+    gradient: Float[np.ndarray, "m 2 6"]
+    blocks: Float[np.ndarray, "m 2 2 6 6"]
 
     def cost(self, weights: Float[np.ndarray, "m"]) -> float:
         """½ Σ w rᵀΛr."""
@@ -49,10 +48,9 @@ class NormalEquations:
 
     Attributes:
         factors: all measurements, the edges first. Measurements are numbered in this order.
-        rows: rows of the poses of each kind of measurement.
+        rows: (m, 2) rows of the poses of every measurement.
         used: (m,) which measurements are in use.
         place: place of each pose in the elimination order; −1 for poses that are held.
-        fill: entries of the factors per entry of the matrix, in blocks.
         held: which poses do not move.
         parts: number of the connected part of each pose.
         root: the held pose to which covariances refer: the first one, or the world.
@@ -70,14 +68,13 @@ class NormalEquations:
         from scipy.sparse.csgraph import connected_components
 
         self.factors, self._start, num_poses = factors, poses, len(poses)
-        given = [np.asarray(factor.rows) for factor in factors]
-        of_world = np.concatenate([(rows == WORLD).any(axis=1) for rows in given])
-        self.root = num_poses - 1 if of_world.any() else 0
-        self.rows = [np.where(rows == WORLD, self.root, rows) for rows in given]
-        self.used = np.ones(len(of_world), bool) if used is None else used
-        self._index_blocks()
-        chosen = self.used[self._of_block]
-        ends = self._first[chosen], self._second[chosen]
+        rows = np.concatenate([np.asarray(factor.rows) for factor in factors])
+        self.root = num_poses - 1 if np.any(rows == WORLD) else 0
+        self.rows = np.where(rows == WORLD, self.root, rows)
+        self.used = np.ones(len(rows), bool) if used is None else used
+        # Poses of the rows and of the columns of the four blocks of each measurement.
+        self._first, self._second = np.repeat(self.rows, 2, axis=1), np.tile(self.rows, 2)
+        ends = self._first[self.used].ravel(), self._second[self.used].ravel()
         graph = coo_array((np.ones(len(ends[0])), ends), (num_poses, num_poses))
         _, self.parts = connected_components(graph, directed=False)
         held = np.unique(self.parts, return_index=True)[1]
@@ -85,9 +82,10 @@ class NormalEquations:
         self.held = np.zeros(num_poses, bool)
         self.held[held] = True
         self.place = np.full(num_poses, -1)
-        self.place[~self.held], self.fill = _elimination_order(graph, self.held)
+        self.place[~self.held] = _elimination_order(graph, self.held)
         self._lay_out()
-        self.metric = self.matrix(_metric_blocks(poses, self.rows, typical_information(*factors)))
+        typical = typical_information(*factors)[..., None] * np.eye(6)
+        self.metric = self.matrix(normal_blocks(motion_jacobians(poses[self.rows]), typical))
 
     @property
     def size(self) -> int:
@@ -96,7 +94,7 @@ class NormalEquations:
 
     def split(self, values: np.ndarray) -> list[np.ndarray]:
         """Values of all measurements, by kind."""
-        return np.split(values, np.cumsum([len(rows) for rows in self.rows])[:-1])
+        return np.split(values, np.cumsum([len(factor.information) for factor in self.factors])[:-1])
 
     def restricted(self, used: Bool[np.ndarray, "m"]) -> NormalEquations:
         """The equations of some of the measurements."""
@@ -105,20 +103,20 @@ class NormalEquations:
     def terms(self, poses: Float[np.ndarray, "n 4 4"]) -> Terms:
         """Evaluate all measurements."""
         found = []
-        for factor, rows in zip(self.factors, self.rows, strict=True):
+        for factor, rows in zip(self.factors, self.split(self.rows), strict=True):
             residuals, jacobians = factor.linearize(poses[rows])
             information = np.asarray(factor.information)
             forces = (information @ residuals[..., None])[..., 0]
-            gradient = (jacobians.swapaxes(2, 3) @ forces[:, None, :, None]).reshape(-1, 6)
+            gradient = (jacobians.swapaxes(2, 3) @ forces[:, None, :, None])[..., 0]
             blocks = normal_blocks(jacobians, information)
             found.append((np.einsum("mi,mi->m", residuals, forces), gradient, blocks))
         return Terms(*(np.concatenate(each) for each in zip(*found, strict=True)))
 
     def gradient(self, terms: Terms, weights: Float[np.ndarray, "m"]) -> Float[np.ndarray, "size"]:
         """g, in the elimination order."""
-        weighted = weights[self._of_end, None] * terms.gradient
-        number = len(self.place)
-        return self.gathered(np.stack([np.bincount(self._ends, each, number) for each in weighted.T], axis=1))
+        weighted = (weights[:, None, None] * terms.gradient).reshape(-1, 6)
+        ends, number = self.rows.ravel(), len(self.place)
+        return self.gathered(np.stack([np.bincount(ends, each, number) for each in weighted.T], axis=1))
 
     def gathered(self, rows: Float[np.ndarray, "n *k"]) -> Float[np.ndarray, "size"]:
         """Rows of the poses as a vector of the unknowns."""
@@ -132,17 +130,17 @@ class NormalEquations:
         rows[~self.held] = vector.reshape(-1, *rows.shape[1:])[self.place[~self.held]]
         return rows
 
-    def weighted(self, blocks: Float[np.ndarray, "b 6 6"], weights: Inexact[np.ndarray, "m"]) -> Any:
+    def weighted(self, blocks: Float[np.ndarray, "m 2 2 6 6"], weights: Inexact[np.ndarray, "m"]) -> Any:
         """The sparse matrix of the blocks of all measurements, such as H."""
-        return self.matrix(weights[self._of_block, None, None] * blocks)
+        return self.matrix(weights[:, None, None, None, None] * blocks)
 
-    def matrix(self, blocks: Inexact[np.ndarray, "b 6 6"]) -> Any:
+    def matrix(self, blocks: Inexact[np.ndarray, "m 2 2 6 6"]) -> Any:
         """The sparse symmetric matrix of the sum of all blocks."""
         from scipy.sparse import bsr_array, csc_array
 
         if not self.size:
             return csc_array((0, 0))
-        summed = np.add.reduceat(blocks[self._order], self._starts)
+        summed = np.add.reduceat(blocks.reshape(-1, 6, 6)[self._order], self._starts)
         rows = bsr_array((summed, self._columns, self._pointers), (self.size, self.size)).tocsr()
         # Rows of a symmetric matrix are its columns.
         return csc_array((rows.data, rows.indices, rows.indptr), rows.shape)
@@ -153,20 +151,10 @@ class NormalEquations:
         total.data += damping * self.metric.data
         return total
 
-    def _index_blocks(self) -> None:
-        """Poses and measurement of each row of `Terms.gradient`, and of each block."""
-        numbers = self.split(np.arange(len(self.used)))
-        pairs = list(zip(self.rows, numbers, strict=True))
-        self._ends = np.concatenate([rows.reshape(-1) for rows in self.rows])
-        self._of_end = np.concatenate([np.repeat(number, rows.shape[1]) for rows, number in pairs])
-        self._first = np.concatenate([np.repeat(rows, rows.shape[1], axis=1).reshape(-1) for rows in self.rows])
-        self._second = np.concatenate([np.tile(rows, rows.shape[1]).reshape(-1) for rows in self.rows])
-        self._of_block = np.concatenate([np.repeat(number, rows.shape[1] ** 2) for rows, number in pairs])
-
     def _lay_out(self) -> None:
         """Places of the blocks in compressed rows of blocks."""
-        rows, columns = self.place[self._first], self.place[self._second]
-        inside = np.flatnonzero((rows >= 0) & (columns >= 0) & self.used[self._of_block])
+        rows, columns = self.place[self._first].ravel(), self.place[self._second].ravel()
+        inside = np.flatnonzero((rows >= 0) & (columns >= 0) & np.repeat(self.used, 4))
         self._order = inside[np.lexsort((columns[inside], rows[inside]))]
         rows, columns = rows[self._order], columns[self._order]
         new = np.ones(len(rows), bool)
@@ -188,33 +176,11 @@ def factored(matrix: Any) -> Any:
 
 
 def normal_blocks(
-    jacobians: Float[np.ndarray, "m k d 6"], information: Float[np.ndarray, "m d d"]
-) -> Float[np.ndarray, "b 6 6"]:
-    """The blocks of JᵀΛJ for all k² pairs of poses of every measurement."""
+    jacobians: Float[np.ndarray, "m 2 d 6"], information: Float[np.ndarray, "m d d"]
+) -> Float[np.ndarray, "m 2 2 6 6"]:
+    """JᵀΛJ of every measurement, by first and second pose."""
     weighted = information[:, None] @ jacobians
-    return (jacobians.swapaxes(2, 3)[:, :, None] @ weighted[:, None]).reshape(-1, 6, 6)
-
-
-def motion_jacobians(poses: Float[np.ndarray, "m k 4 4"]) -> Float[np.ndarray, "m k d 6"]:
-    """Derivatives of the twists of the motions from the first pose to each other one, with respect to all twists."""
-    m, k = poses.shape[:2]
-    jacobians = np.zeros((m, k, k - 1, 6, 6))
-    jacobians[:, 0] = -adjoint(inverse(poses[:, 1:]) @ poses[:, :1])
-    jacobians[:, np.arange(1, k), np.arange(k - 1)] = np.eye(6)
-    return jacobians.reshape(m, k, 6 * (k - 1), 6)
-
-
-def _metric_blocks(
-    poses: Float[np.ndarray, "n 4 4"], rows: list[Int[np.ndarray, "_ _"]], typical: Float[np.ndarray, "m 6"]
-) -> Float[np.ndarray, "b 6 6"]:
-    """The blocks of D."""
-    scales = np.split(typical, np.cumsum([len(each) for each in rows])[:-1])
-    return np.concatenate(
-        [
-            normal_blocks(motion_jacobians(poses[each]), np.tile(scale, each.shape[1] - 1)[..., None] * np.eye(d))
-            for each, scale, d in ((r, s, 6 * (r.shape[1] - 1)) for r, s in zip(rows, scales, strict=True))
-        ]
-    )
+    return jacobians.swapaxes(2, 3)[:, :, None] @ weighted[:, None]
 
 
 def typical_information(*factors: AbstractFactor) -> Float[np.ndarray, "m 6"]:
@@ -234,18 +200,18 @@ def typical_information(*factors: AbstractFactor) -> Float[np.ndarray, "m 6"]:
     return np.repeat(typical, 3, axis=1)
 
 
-def _elimination_order(graph: Any, held: Bool[np.ndarray, "n"]) -> tuple[Int[np.ndarray, "k"], float]:
-    """Place of each free pose in an elimination order with little fill, minimum degree by SuperLU; and the fill."""
+def _elimination_order(graph: Any, held: Bool[np.ndarray, "n"]) -> Int[np.ndarray, "k"]:
+    """Place of each free pose in an elimination order with little fill, minimum degree by SuperLU."""
     from scipy.sparse import eye_array
     from scipy.sparse.linalg import splu
 
     free = ~held
     if not free.any():
-        return np.zeros(0, int), 1.0
+        return np.zeros(0, int)
     pattern = graph.tocsr()[free][:, free]
     pattern.data[:] = -1.0
     # Diagonally dominant, so that the factorisation exists.
     dominant = pattern + eye_array(pattern.shape[0]) * (2.0 + np.diff(pattern.indptr).max())
     options = {"SymmetricMode": True}
     factors = splu(dominant.tocsc(), permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options=options)
-    return factors.perm_c, factors.nnz / dominant.nnz
+    return factors.perm_c

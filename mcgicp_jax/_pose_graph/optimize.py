@@ -15,8 +15,7 @@ from jaxtyping import Array, Bool, Float, Int
 from mcgicp_jax._compute.argument_checks import check_integer
 from mcgicp_jax._compute.concrete import AnyArray, is_concrete, numpy_for
 from mcgicp_jax._compute.lazy import Lazy
-from mcgicp_jax._pose_graph.edge import Edge
-from mcgicp_jax._pose_graph.factors import WORLD
+from mcgicp_jax._pose_graph.edge import WORLD, Edge
 from mcgicp_jax._pose_graph.graph import PoseGraph
 from mcgicp_jax._pose_graph.implicit_derivative import Found, covariances_traced, solve_traced
 from mcgicp_jax._pose_graph.solver import solve
@@ -113,11 +112,12 @@ def optimize_poses(graph: PoseGraph, *, robust: bool = True, max_iterations: int
     runs on the host with sparse factorisations, also inside transformations. The first pose is held fixed, unless there
     are measurements in the world's frame, such as priors.
 
-    Inside transformations the poses are differentiable with respect to all measured values and information matrices, by
-    the implicit function theorem, but not with respect to the initial poses; second derivatives raise. Measurements
-    that were rejected are constants there. The derivative is 0 unless the status is CONVERGED. It takes memory in
-    proportion to n², which suits some hundreds of poses. The poses have the precision of the given arrays there: in
-    float32, 0.5 m at UTM coordinates. Outside of transformations they are float64.
+    Inside transformations the poses are differentiable with respect to the motions and information matrices of edges,
+    by the implicit function theorem, but not with respect to the initial poses; second derivatives raise, and so do
+    derivatives of graphs with factors. Edges that were rejected are constants there. The derivative is 0 unless the
+    status is CONVERGED. It takes memory in proportion to n², which suits some hundreds of poses. The poses have the
+    precision of the given arrays there: in float32, 0.5 m at UTM coordinates. Outside of transformations they are
+    float64.
 
     Args:
         graph: poses and measurements.

@@ -21,8 +21,6 @@ _LEVEL = 0.01
 # (Yang et al. 2020) keeps the same loops; with 4, 0.4 % of the true loops more are lost. The first steps cannot be
 # left out: if the non-convexity begins 32 times as large, errors grow by a factor of 30 in the garage of 1,600 poses.
 _GROWTH = 2.0
-# During the graduation, measurements of less weight need not take part in the factorisation, see `minimize`.
-_CORE = 0.5
 # Largest number of selections at the minimum, which end when a selection repeats itself.
 _SELECTIONS = 5
 # Rejected measurements are tested again if their squared residual is below this multiple of the threshold: beyond, the
@@ -46,7 +44,7 @@ def robust_minimum(
         if np.all((weights == 0) | (weights == 1)):
             break
         equations = equations.restricted(weights > 0)
-        found = minimize(equations, found, weights, 1, core=weights > _CORE)
+        found = minimize(equations, found, weights, 1)
         control *= _GROWTH
     selected = weights
     for _ in range(_SELECTIONS):
@@ -76,8 +74,8 @@ def _wrongly_rejected(
     squares, limits = found.terms.squares, thresholds(equations)
     near = (weights == 0) & (squares > limits) & (squares <= _NEAR * limits)
     accepted = []
-    kinds = zip(equations.factors, equations.rows, equations.split(near), equations.split(limits), strict=True)
-    for factor, all_rows, chosen, all_limits in kinds:
+    values = (equations.split(each) for each in (equations.rows, near, limits))
+    for factor, all_rows, chosen, all_limits in zip(equations.factors, *values, strict=True):
         within = np.zeros(len(chosen), bool)
         if chosen.any():
             part, rows = (

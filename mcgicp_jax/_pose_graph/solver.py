@@ -8,19 +8,17 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from mcgicp_jax._math.poses import matrices_of, parameters_of
-from mcgicp_jax._pose_graph.edge import Edge
-from mcgicp_jax._pose_graph.factors import WORLD
+from mcgicp_jax._pose_graph.edge import WORLD, Edge, motion_jacobians
+from mcgicp_jax._pose_graph.initialization import unmeasured
 from mcgicp_jax._pose_graph.levenberg_marquardt import Minimum, minimize, refine, settle
 from mcgicp_jax._pose_graph.marginal_covariances import pose_covariances
 from mcgicp_jax._pose_graph.normal_equations import (
     NormalEquations,
     factored,
-    motion_jacobians,
     normal_blocks,
     typical_information,
 )
 from mcgicp_jax._pose_graph.outliers import robust_minimum
-from mcgicp_jax._pose_graph.unmeasured import unmeasured
 from mcgicp_jax._registration.result import Status
 
 # A direction of motion is unconstrained if its information is less than this multiple of the least damping.
@@ -163,8 +161,8 @@ def _is_degenerate(equations: NormalEquations, found: Minimum, weights: Float[np
         return False
     matrix = equations.weighted(found.terms.blocks, weights)
     blocks = np.zeros_like(found.terms.blocks)
-    known = normal_blocks(motion_jacobians(found.poses[equations.rows[0]]), np.asarray(held.information))
-    blocks[: len(known)] = known / _UNCONSTRAINED
+    ends = found.poses[equations.rows[: len(held)]]
+    blocks[: len(held)] = normal_blocks(motion_jacobians(ends), np.asarray(held.information)) / _UNCONSTRAINED
     least = equations.damped(equations.weighted(blocks, weights))
     try:
         factors = factored(matrix + least)

@@ -166,19 +166,6 @@ def unconstrained_directions(directions: Directions) -> tuple[UnconstrainedDirec
     return tuple(found)
 
 
-def shares(directions: Directions) -> list[tuple[str, float, float]]:
-    """Name and fractions observed by geometry and by channels for each of the six directions, free ones first."""
-    free, motions = np.asarray(directions.free), _motions(directions)
-    geometry, channels = np.asarray(directions.geometry), np.asarray(directions.channels)
-    found: list[tuple[str, float, float]] = []
-    for group in (free, ~free):
-        mixing = _separate(motions[group])
-        names = [_named(motion, directions).name for motion in mixing @ motions[group]]
-        # Squared weights: the forms are diagonal, but for that of geometry among the free directions, which is tiny.
-        found += zip(names, mixing**2 @ geometry[group], mixing**2 @ channels[group], strict=True)
-    return [(name, float(by_geometry), float(by_channels)) for name, by_geometry, by_channels in found]
-
-
 def _motions(directions: Directions) -> Float[np.ndarray, "6 6"]:
     """(6, 6) motion of each direction: of the centroid, and by rotation about it, both in metres of rms motion."""
     twists = np.asarray(directions.twists, np.float64)

@@ -51,6 +51,25 @@ class Status(enum.IntEnum):
     __str__ = enum.Enum.__str__
     __format__ = enum.Enum.__format__
 
+    @property
+    def advice(self) -> str:
+        """What has happened and what to try, in a few words; "" for CONVERGED."""
+        return _ADVICE[self]
+
+
+_ADVICE = {
+    Status.CONVERGED: "",
+    Status.MAX_ITERATIONS: "the pose was still changing after the last iteration; "
+    "try a larger max_iterations, or init with a better initial pose",
+    Status.TOO_FEW_CORRESPONDENCES: "fewer than four points have a match; "
+    "are both clouds in metres? If so, try init with a pose at which they overlap, or a larger max_distance",
+    Status.DEGENERATE: "the pose is unconstrained in at least one direction; "
+    "try clouds that show more of the scene, or MC-GICP and clouds with channels",
+    Status.NON_FINITE: "numerical overflow; are the coordinates in metres?",
+    Status.INVALID_INPUT: "register raises an error for this pair; see its warning",
+    Status.WORKER_FAILED: "two workers failed with this pair; try register, or smaller clouds",
+}
+
 
 class Constraints(NamedTuple):
     """Values of `RegistrationResult.information` and `directions`."""

@@ -28,7 +28,7 @@ from mcgicp_jax._pose_graph.optimize import PoseGraphResult, optimize_poses
 from mcgicp_jax._registration.options import GivenOptions, Options, check_method, options_of
 from mcgicp_jax._registration.register_pair import register_pair
 from mcgicp_jax._registration.result import RegistrationResult, Status, computed, is_usable
-from mcgicp_jax._sequences.edges import LEAST_OVERLAP, edge_from
+from mcgicp_jax._sequences.loop_closure import LEAST_OVERLAP, edge_from
 
 # Size of the cells in which overlap is counted, in spacings of the points: two samples of one surface then occupy
 # nearly the same cells.

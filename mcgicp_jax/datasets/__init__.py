@@ -3,7 +3,6 @@
 from mcgicp_jax._clouds.frame import Frame
 from mcgicp_jax.datasets._box_room import box_room
 from mcgicp_jax.datasets._clouds import CloudFiles, clouds
-from mcgicp_jax.datasets._corridor import corridor
 from mcgicp_jax.datasets._ford import ford_campus
 from mcgicp_jax.datasets._frames import AbstractFrames, SyntheticFrames
 from mcgicp_jax.datasets._kitti import kitti
@@ -22,7 +21,6 @@ __all__ = [
     "SyntheticFrames",
     "box_room",
     "clouds",
-    "corridor",
     "ford_campus",
     "kitti",
     "poster_wall",

@@ -6,7 +6,7 @@ import os
 from typing import Any, TypeAlias
 
 import numpy as np
-from jaxtyping import Bool, Float, UInt8, UInt16
+from jaxtyping import Bool, Float, Shaped, UInt8, UInt16
 
 Picture: TypeAlias = UInt8[np.ndarray, "height width 3"]
 
@@ -29,14 +29,20 @@ def look_up(image: Picture, pixels: Float[np.ndarray, "N 2"]) -> tuple[Float[np.
 
     Pixels are (column, row); the centre of the first is (0, 0).
     """
-    from scipy.ndimage import map_coordinates
-
     height, width, _ = image.shape
     # NaN compares false and is outside.
     inside = np.all((pixels >= 0) & (pixels <= (width - 1, height - 1)), axis=1)
-    places = np.where(inside[:, None], pixels, 0).T[::-1]
-    colors = [map_coordinates(color, places, float, order=1, mode="nearest") for color in np.moveaxis(image, 2, 0)]
-    return np.stack(colors, axis=1) / 255, inside
+    return bilinear(image, np.where(inside[:, None], pixels, 0), "nearest") / 255, inside
+
+
+def bilinear(
+    image: Shaped[np.ndarray, "height width 3"], pixels: Float[np.ndarray, "N 2"], mode: str
+) -> Float[np.ndarray, "N 3"]:
+    """Values at pixels (column, row) of an image; `mode` says how SciPy's `map_coordinates` continues it."""
+    from scipy.ndimage import map_coordinates
+
+    values = [map_coordinates(each, pixels.T[::-1], float, order=1, mode=mode) for each in np.moveaxis(image, 2, 0)]
+    return np.stack(values, axis=1)
 
 
 def back_project(

@@ -12,6 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from mcgicp_jax._clouds.point_cloud import PointCloud
 from mcgicp_jax.datasets._frames import Matrix, SyntheticFrames, check_scene, pose_of, scene_and_path_rng
+from mcgicp_jax.datasets._images import bilinear
 
 # The constants of this module define the scene and the camera.
 # First-generation Kinect: image size and focal length, pixels.
@@ -119,7 +120,8 @@ def _observe(wall: Image, size: int, noise: float, rng: np.random.Generator, pos
     rotation, center = pose[:3, :3], pose[:3, 3]
     depth = -center[2] / (rays @ rotation[2])
     hits = (depth[:, None] * rays) @ rotation.T + center
-    colors = _sample(wall, hits[:, :2] / _TEXEL)
+    # The wall is periodic in both directions.
+    colors = bilinear(wall, hits[:, :2] / _TEXEL, "grid-wrap")
     depth_noise = noise * (0.0012 + 0.0019 * (depth - 0.4) ** 2)
     depth = depth + depth_noise * rng.normal(size=depth.shape)
     colors = np.clip(colors + noise * _COLOR_NOISE * rng.normal(size=colors.shape), 0, 1)
@@ -135,16 +137,6 @@ def _rays(rng: np.random.Generator, size: int) -> Float[np.ndarray, "N 3"]:
     pixels += rng.uniform(-0.5, 0.5, pixels.shape)
     xy = (pixels - (_WIDTH / 2, _HEIGHT / 2)) / _FOCAL
     return np.concatenate([xy, np.ones((len(xy), 1))], axis=1)
-
-
-def _sample(wall: Image, texels: Float[np.ndarray, "N 2"]) -> Float[np.ndarray, "N 3"]:
-    """Bilinear colours of the wall, which is periodic in both directions."""
-    from scipy.ndimage import map_coordinates
-
-    colors = [
-        map_coordinates(color, texels.T[::-1], float, order=1, mode="grid-wrap") for color in np.moveaxis(wall, 2, 0)
-    ]
-    return np.stack(colors, axis=1)
 
 
 # The wall

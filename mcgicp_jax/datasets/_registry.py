@@ -7,7 +7,6 @@ from dataclasses import dataclass
 from typing import Any
 
 from mcgicp_jax.datasets._box_room import box_room
-from mcgicp_jax.datasets._corridor import corridor
 from mcgicp_jax.datasets._ford import ford_campus
 from mcgicp_jax.datasets._frames import AbstractFrames
 from mcgicp_jax.datasets._kitti import kitti
@@ -38,7 +37,6 @@ DATASETS = {
     "tum": Dataset(tum_rgbd, (0.2, 0.06)),
     "7-scenes": Dataset(seven_scenes, (0.2, 0.06)),
     "street": Dataset(street, (2.0, 0.5), simulated=True),
-    "corridor": Dataset(corridor, (0.5, 0.25), simulated=True),
     "box-room": Dataset(box_room, (0.5, 0.25), simulated=True),
     "poster-wall": Dataset(poster_wall, (0.1, 0.04), simulated=True),
 }

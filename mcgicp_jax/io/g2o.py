@@ -10,8 +10,7 @@ import numpy as np
 from jaxtyping import Float
 
 from mcgicp_jax._math.poses import matrices_of, parameters_of
-from mcgicp_jax._pose_graph.edge import Edge
-from mcgicp_jax._pose_graph.factors import WORLD
+from mcgicp_jax._pose_graph.edge import WORLD, Edge
 from mcgicp_jax._pose_graph.graph import PoseGraph
 from mcgicp_jax.io.files import reason_of, replacing
 

@@ -1,4 +1,4 @@
-"""Charts: convergence, directions that are constrained, trajectories and pose graphs."""
+"""Charts: convergence, trajectories and pose graphs."""
 
 from __future__ import annotations
 
@@ -10,11 +10,9 @@ from jax.typing import ArrayLike
 from jaxtyping import Float
 
 from mcgicp_jax._math.poses import Pose, pose_matrix
-from mcgicp_jax._pose_graph.factors import WORLD
+from mcgicp_jax._pose_graph.edge import WORLD
 from mcgicp_jax._pose_graph.optimize import PoseGraphResult
-from mcgicp_jax._pose_solver.degeneracy import CHANNELS_HOLD, GEOMETRY_HOLDS, shares
-from mcgicp_jax._registration.result import RegistrationResult
-from mcgicp_jax.plot.drawing import CLOUD_COLORS, Figure, File, new_figure, optional_module, saved
+from mcgicp_jax.plot.drawing import Figure, File, new_figure, optional_module, saved
 
 # Residual at the end of the colour scale of a graph, standard deviations: loops beyond it are rejected.
 _LARGEST_RESIDUAL = 4.1
@@ -43,43 +41,6 @@ def convergence(histories: Mapping[str, Sequence[float] | ArrayLike], *, ylabel:
     panel.grid(alpha=0.3)
     panel.legend()
     return figure
-
-
-def localizability(result: RegistrationResult, *, path: File = None) -> Figure:
-    """Plot how well each of six directions is constrained: the observed fraction of squared motion.
-
-    The fraction refers to the motion of the matched points. One bar is for the geometry and one for the channels, which
-    count only in directions that the geometry does not constrain. Dashed lines mark the fractions above which a
-    direction counts as constrained.
-
-    Args:
-        result: a single result of `register`.
-        path: file to save the figure to; its suffix selects the format.
-
-    Raises:
-        ValueError: if the result is a batch or has no directions, such as a result of `estimate_pose`.
-        ImportError: if matplotlib is missing.
-    """
-    if result.directions is None or np.ndim(result.status_code):
-        raise ValueError("result: expected a single result of `register`, got a batch or one without directions")
-    figure = new_figure(7.5, 3.2)
-    panel = figure.subplots()
-    lowest = 1e-4
-    rows = np.arange(6)
-    names, *values = zip(*shares(result.directions), strict=True)
-    bars = (
-        ("geometry", values[0], GEOMETRY_HOLDS, CLOUD_COLORS[0], -0.2),
-        ("channels", values[1], CHANNELS_HOLD, CLOUD_COLORS[1], 0.2),
-    )
-    for name, share, threshold, color, offset in bars:
-        panel.barh(rows + offset, np.maximum(share, lowest) - lowest, 0.38, lowest, color=color, label=name)
-        panel.axvline(threshold, color=color, linestyle="--", linewidth=1)
-    panel.set(xscale="log", xlim=(lowest, 1), xlabel="observed fraction of the points' squared motion")
-    panel.set_yticks(rows, names)
-    panel.invert_yaxis()
-    panel.set_title(result.status.name, loc="left", fontsize="medium")
-    figure.legend(loc="outside upper right", ncols=2, frameon=False)
-    return saved(figure, path)
 
 
 def trajectories(

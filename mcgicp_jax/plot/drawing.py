@@ -22,9 +22,7 @@ Points: TypeAlias = Float[np.ndarray, "N 3"]
 Picture: TypeAlias = Float[np.ndarray, "height width 3"]
 Map: TypeAlias = Float[np.ndarray, "height width"]
 
-# These constants affect only how figures look.
-CLOUD_COLORS = ("#1f77d0", "#e8741c", "#2b9c5a", "#b03a8c", "#7a5230", "#707070")
-# Pixels per point spacing, unless the limit on the pixels of a picture makes them coarser.
+# Affects only how figures look: pixels per point spacing, unless the limit on the pixels makes them coarser.
 PIXELS_PER_SPACING = 3
 
 
@@ -114,13 +112,6 @@ def paint(view: View, points: Points, colors: Points) -> Picture:
     picture = picture.reshape(view.height, view.width, 3)
     distance, (row, column) = distance_transform_edt(np.isnan(picture[..., 0]), return_indices=True)
     return np.where(distance[..., None] <= PIXELS_PER_SPACING, picture[row, column], np.nan)
-
-
-def spacing_of(centers: Float[np.ndarray, "M 3"], extent: float) -> float:
-    """Half the median distance from a centre to its nearest neighbour, at most a tenth of `extent`; metres."""
-    distances = np.linalg.norm(centers[:, None] - centers, axis=-1)
-    np.fill_diagonal(distances, np.inf)
-    return min(float(np.median(distances.min(axis=1))) / 2, extent / 10)
 
 
 def drawable(cloud: PointCloud) -> PointCloud:

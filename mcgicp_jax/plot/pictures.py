@@ -88,7 +88,10 @@ def surface_covariances(
     # The indices refer to the rows of `cloud`; `raw`, which the picture shows, lacks padding and non-finite points.
     centers = cloud.coordinates[rows]
     offsets = ((centers - view.center) @ view.axes)[:, :2] - view.low
-    room = 2 * drawing.spacing_of(centers, float(np.ptp(np.asarray(raw.points), axis=0).max()))
+    extent = float(np.ptp(np.asarray(raw.points), axis=0).max())
+    distances = np.linalg.norm(centers[:, None] - centers, axis=-1)
+    np.fill_diagonal(distances, np.inf)
+    room = min(float(np.median(distances.min(axis=1))), extent / 5)
     picture = np.nan_to_num(drawing.paint(view, np.asarray(raw.points), _shades(raw, view)), nan=1)
     width = _WIDTH / len(covariances)
     figure = drawing.new_figure(_WIDTH, width * view.height / view.width + 0.35)

@@ -26,6 +26,7 @@ from scipy.spatial.transform import Rotation
 import mcgicp_jax as mcg
 from mcgicp_jax import datasets
 from mcgicp_jax.metrics import pose_error
+from tests.corridor import corridor
 
 try:
     import open3d
@@ -282,7 +283,7 @@ def different() -> Iterator[tuple[str, mcg.PointCloud, mcg.PointCloud]]:
     lidar = {"KITTI": intensity(datasets.kitti(DATA / "kitti" / "sequences" / "04")[0].cloud)}
     lidar["lidar_pair"] = intensity(mcg.io.read(DATA / "lidar_pair" / "target.ply"))
     lidar |= {f"street {seed}": intensity(datasets.street(1, seed=seed)[0].cloud) for seed in range(6)}
-    lidar |= {f"corridor {seed}": intensity(datasets.corridor(1, seed=seed)[0].cloud) for seed in range(2)}
+    lidar |= {f"corridor {seed}": intensity(corridor(1, seed=seed)[0].cloud) for seed in range(2)}
     cameras = {"kitchen": kitchen()[0].cloud, "living room": living_room()[0].cloud, "desk": desk()[0].cloud}
     cameras |= {f"box room {seed}": datasets.box_room(1, seed=seed)[0].cloud for seed in range(4)}
     cameras |= {f"posters {seed}": datasets.poster_wall(1, seed=seed)[0].cloud for seed in range(4)}

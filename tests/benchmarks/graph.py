@@ -20,8 +20,9 @@ import numpy as np
 
 import mcgicp_jax as mcg
 from mcgicp_jax import datasets, metrics
-from mcgicp_jax._sequences.edges import edge_from
+from mcgicp_jax._sequences.loop_closure import edge_from
 from tests.benchmarks.global_pose import desk
+from tests.corridor import corridor as simulated_corridor
 from tests.graphs import garage, grid, measured, moved, sphere, with_gtsam
 
 DATA = pathlib.Path(os.environ.get("MCGICP_DATA", pathlib.Path(__file__).parents[3] / "shared" / "data"))
@@ -138,7 +139,7 @@ def nees(found: mcg.PoseGraphResult, truth: np.ndarray) -> float:
 def corridor() -> None:
     """A corridor whose steps are 5 % too long in the start; GICP edges, and one loop from its end by intensity."""
     number = 20
-    frames = datasets.corridor(number + 1, points_per_frame=3000)
+    frames = simulated_corridor(number + 1, points_per_frame=3000)
     clouds = [mcg.preprocess(frame.cloud) for frame in frames]
     truth = np.array([frame.pose for frame in frames])
     start = truth.copy()

@@ -1,6 +1,4 @@
-"""A long corridor, whose geometry leaves the direction along it unobservable; only the intensity constrains it."""
-
-from __future__ import annotations
+"""A simulated corridor, whose geometry leaves the direction along it unobservable; only the intensity constrains it."""
 
 from functools import partial
 
