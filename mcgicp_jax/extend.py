@@ -31,8 +31,7 @@ from mcgicp_jax._methods.voxel_gaussians import cell_moments, voxel_cells
 from mcgicp_jax._pose_graph.edge import AbstractFactor
 from mcgicp_jax._search.base import AbstractIndex, AbstractSearch, Correspondences, SearchPoints
 from mcgicp_jax._search.kd_tree import AbstractTreeSearch
-from mcgicp_jax._terms.base import AbstractTerm, Linearization, PosedMatches, linearize_residual
-from mcgicp_jax._terms.mahalanobis import Mahalanobis
+from mcgicp_jax._terms.base import AbstractTerm, Linearization, Mahalanobis, PosedMatches, linearize_residual
 from mcgicp_jax.datasets import DATASETS
 from mcgicp_jax.io.clouds import FORMATS
 

@@ -10,7 +10,7 @@ from jaxtyping import TypeCheckError
 
 import mcgicp_jax as mcg
 from mcgicp_jax._cli.options import Options as CommandOptions
-from mcgicp_jax._compute.argument_checks import check_integer, check_positive
+from mcgicp_jax._compute.messages import check_integer, check_positive
 from mcgicp_jax._registration.options import GivenOptions, Options, check_method
 
 

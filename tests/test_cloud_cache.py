@@ -12,9 +12,8 @@ import numpy as np
 import pytest
 
 import mcgicp_jax as mcg
-from mcgicp_jax._compute.cache import Cache, cached_with_cloud
-from mcgicp_jax._compute.lazy import Lazy
-from mcgicp_jax._compute.rows_on_demand import RowsOnDemand
+from mcgicp_jax._compute.cache import Cache, Lazy, cached_with_cloud
+from mcgicp_jax._compute.tables import RowsOnDemand
 from mcgicp_jax._methods.surfaces import surface_table
 from mcgicp_jax._terms.photometric import Photometric
 from tests.scenes import motion, room_corner

@@ -97,7 +97,7 @@ def test_numbers_compile_nothing():
 def test_a_cloud_is_prepared_once(monkeypatch):
     """Its tree and its local statistics are kept as long as it is used."""
     from mcgicp_jax import KDTreeSearch
-    from mcgicp_jax._local_geometry import local_statistics as _local
+    from mcgicp_jax._local_geometry import local_geometry as _local
 
     built, described = [], []
     build, with_near = KDTreeSearch.build, _local.with_near

@@ -8,7 +8,7 @@ import pytest
 import mcgicp_jax as mcg
 from mcgicp_jax import datasets, io, metrics
 from mcgicp_jax.__main__ import main
-from mcgicp_jax._math.twists import exponential, logarithm
+from mcgicp_jax._math.poses import exponential, logarithm
 from mcgicp_jax._registration.options import Options
 from mcgicp_jax._sequences import loop_closure as _loops
 from mcgicp_jax._sequences import multiway as _multiway

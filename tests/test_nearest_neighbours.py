@@ -20,7 +20,7 @@ from mcgicp_jax import (
     preprocess,
 )
 from mcgicp_jax._search.base import SearchPoints
-from mcgicp_jax._search.positions import nearest_in_position
+from mcgicp_jax._search.kd_tree import nearest_in_position
 from mcgicp_jax._search.tree_index import TreeIndex
 from tests import reference as ref
 from tests.precision import tolerance

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 import mcgicp_jax as mcg
 from mcgicp_jax import datasets, metrics
-from mcgicp_jax._compute.rows_on_demand import RowsOnDemand
+from mcgicp_jax._compute.tables import RowsOnDemand
 from mcgicp_jax._search.tree_index import TreeIndex
 from mcgicp_jax._sequences import odometry as _odometry
 from mcgicp_jax._sequences import relocalization as _relocalization

@@ -16,7 +16,7 @@ from scipy.stats import chi2
 
 import mcgicp_jax as mcg
 from mcgicp_jax import metrics
-from mcgicp_jax._math.twists import logarithm
+from mcgicp_jax._math.poses import logarithm
 from mcgicp_jax._pose_graph import outliers
 from mcgicp_jax._pose_graph.edge import AbstractFactor, motion_jacobians
 from mcgicp_jax._pose_graph.levenberg_marquardt import Minimum

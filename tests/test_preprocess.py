@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from mcgicp_jax import GICP, PointCloud, preprocess
 from mcgicp_jax._clouds.voxels import grid_of
-from mcgicp_jax._compute.size_classes import size_class
+from mcgicp_jax._compute.programs import size_class
 from tests import reference as ref
 from tests.precision import tolerance
 from tests.scenes import prepare

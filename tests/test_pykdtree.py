@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 import mcgicp_jax as mcg
 from mcgicp_jax._search.base import SearchPoints
-from mcgicp_jax._search.pykdtree import PyKDTree
+from mcgicp_jax._search.kd_tree import PyKDTree
 from tests.benchmarks import accuracy
 
 pytest.importorskip("pykdtree")

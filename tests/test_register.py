@@ -16,10 +16,9 @@ import pytest
 
 import mcgicp_jax as mcg
 from mcgicp_jax import Status
-from mcgicp_jax._compute.lazy import Lazy
+from mcgicp_jax._compute.cache import Lazy
 from mcgicp_jax._registration import register_pair as _register
-from mcgicp_jax._registration.assessment import Assessment
-from mcgicp_jax._registration.make_result import _uncertainty
+from mcgicp_jax._registration.assessment import Assessment, _uncertainty
 from mcgicp_jax._registration.step import State
 from mcgicp_jax._search.tree_index import TreeIndex
 from mcgicp_jax.metrics import pose_error

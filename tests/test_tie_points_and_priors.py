@@ -9,8 +9,8 @@ from scipy.spatial.transform import Rotation
 
 import mcgicp_jax as mcg
 from mcgicp_jax import datasets
+from mcgicp_jax._math.poses import exponential, logarithm
 from mcgicp_jax._math.symmetric_matrices import inverse_3, inverse_6
-from mcgicp_jax._math.twists import exponential, logarithm
 from mcgicp_jax._pose_solver.pose_measurements import Fusion, Prior, TiePoints, form_at
 from mcgicp_jax._registration.measurements import known
 from tests.compilations import compilations

@@ -5,8 +5,15 @@ import numpy as np
 import pytest
 from scipy.linalg import expm
 
-from mcgicp_jax._math.poses import adjoint, inverse, skew, translation_adjoint
-from mcgicp_jax._math.twists import exponential, logarithm, logarithm_derivative
+from mcgicp_jax._math.poses import (
+    adjoint,
+    exponential,
+    inverse,
+    logarithm,
+    logarithm_derivative,
+    skew,
+    translation_adjoint,
+)
 
 ANGLES = (0.0, 1e-12, 1e-8, 1e-5, 1e-3, 0.1, 1.0, 2.5, 3.1, np.pi - 1e-9)
 

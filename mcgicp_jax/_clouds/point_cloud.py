@@ -13,10 +13,10 @@ import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float, Int
 
-from mcgicp_jax._clouds.other_libraries import arrays_of
+from mcgicp_jax._clouds.columns import arrays_of
 from mcgicp_jax._compute.concrete import is_concrete
 from mcgicp_jax._compute.messages import messages_named
-from mcgicp_jax._compute.size_classes import size_class
+from mcgicp_jax._compute.programs import size_class
 from mcgicp_jax._math.poses import Pose, pose_matrix, rotated
 from mcgicp_jax._search.base import NeighborsOnDemand
 

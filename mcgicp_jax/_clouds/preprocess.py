@@ -13,10 +13,9 @@ from scipy.sparse import csr_array
 from mcgicp_jax._clouds.point_cloud import LARGEST, PointCloud, Values, Voxels, as_cloud, is_far
 from mcgicp_jax._clouds.voxel_size import NUM_NEIGHBORS, VoxelSize, voxels_and_grids, warn_of_shape
 from mcgicp_jax._clouds.voxels import Grid, grid_of
-from mcgicp_jax._compute.argument_checks import check_integer, check_positive
 from mcgicp_jax._compute.concrete import is_concrete
 from mcgicp_jax._compute.linear_maps import AbstractLinearMap, primal, with_derivative
-from mcgicp_jax._compute.messages import warn
+from mcgicp_jax._compute.messages import check_integer, check_positive, warn
 from mcgicp_jax._math.statistics import sampled_rows
 from mcgicp_jax._search.base import AbstractSearch
 from mcgicp_jax._search.brute_force import default_search

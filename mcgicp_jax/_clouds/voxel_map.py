@@ -12,8 +12,7 @@ from jaxtyping import Float
 from mcgicp_jax._clouds.point_cloud import PointCloud, Values, Voxels, as_cloud
 from mcgicp_jax._clouds.voxel_size import map_voxel_size
 from mcgicp_jax._clouds.voxels import starts_of, voxel_keys, voxel_of
-from mcgicp_jax._compute.argument_checks import check_positive
-from mcgicp_jax._compute.messages import messages_named
+from mcgicp_jax._compute.messages import check_positive, messages_named
 from mcgicp_jax._math.poses import Pose, pose_matrix, rotated
 
 

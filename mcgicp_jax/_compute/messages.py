@@ -1,4 +1,4 @@
-"""Warnings and errors that name the argument that they are about."""
+"""Checks of arguments, and warnings and errors that name the argument that they are about."""
 
 from __future__ import annotations
 
@@ -9,6 +9,10 @@ import warnings
 from collections.abc import Iterator
 from contextvars import ContextVar
 from typing import Any, TypeAlias
+
+import numpy as np
+
+from mcgicp_jax._compute.concrete import is_concrete
 
 # A line of code at which a warning is shown, as `warnings.warn_explicit` takes it: file, number, module and registry.
 Line: TypeAlias = tuple[str, int, str, dict[Any, Any]]
@@ -64,3 +68,17 @@ def warn(message: str | Warning) -> None:
     """Issue a warning, of `UserWarning` if it is a text, at the line that called the package."""
     text = f"{_prefix.get()}{message}" if isinstance(message, str) else message
     warnings.warn_explicit(text, UserWarning, *calling_line())
+
+
+def check_positive(name: str, value: Any, expected: str = "a positive number") -> None:
+    if is_concrete(value) and not (is_number(value) and np.asarray(value) > 0):
+        raise ValueError(f"{name}: expected {expected}, got {value!r}")
+
+
+def check_integer(name: str, value: Any, minimum: int) -> None:
+    if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < minimum:
+        raise ValueError(f"{name}: expected an integer of at least {minimum}, got {value!r}")
+
+
+def is_number(value: Any) -> bool:
+    return np.ndim(value) == 0 and np.asarray(value).dtype.kind in "fiu"

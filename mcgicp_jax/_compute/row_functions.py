@@ -25,12 +25,10 @@ import numpy as np
 from jaxtyping import Float, Int
 from scipy.sparse import csc_array
 
-from mcgicp_jax._compute.blocks import BLOCK, NEIGHBORHOOD_BLOCK, blocks
 from mcgicp_jax._compute.concrete import Deferred, is_concrete, outside_trace
 from mcgicp_jax._compute.linear_maps import AbstractLinearMap, primal, with_derivative
-from mcgicp_jax._compute.packing import Packed
-from mcgicp_jax._compute.quick_compilation import quickly_compiled
-from mcgicp_jax._compute.rows_on_demand import RowsOnDemand
+from mcgicp_jax._compute.programs import quickly_compiled
+from mcgicp_jax._compute.tables import BLOCK, NEIGHBORHOOD_BLOCK, Packed, RowsOnDemand, blocks
 from mcgicp_jax._compute.threads import num_cores, side_by_side
 
 # Points. Inside transformations, neighbourhoods of more points are processed in blocks, too: on CPUs XLA sums over the

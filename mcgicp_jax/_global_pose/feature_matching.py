@@ -8,9 +8,9 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from mcgicp_jax._clouds.point_cloud import PointCloud
-from mcgicp_jax._compute.blocks import BLOCK, blocks
 from mcgicp_jax._compute.concrete import AnyArray
 from mcgicp_jax._compute.row_functions import Input, Rows, blockwise
+from mcgicp_jax._compute.tables import BLOCK, blocks
 from mcgicp_jax._global_pose.fpfh import comparable, histograms_of, normals_of, statistics_of
 from mcgicp_jax._global_pose.robust_pose_fit import NUM_MATCHES, PutativeMatches
 

@@ -13,9 +13,8 @@ from jaxtyping import Float, Int
 from mcgicp_jax._clouds.point_cloud import PointCloud, Values, as_cloud
 from mcgicp_jax._clouds.preprocess import finite_rows, with_neighbors
 from mcgicp_jax._clouds.voxels import grid_of, voxel_order
-from mcgicp_jax._compute.argument_checks import check_positive
 from mcgicp_jax._compute.concrete import outside_trace
-from mcgicp_jax._compute.messages import messages_named
+from mcgicp_jax._compute.messages import check_positive, messages_named
 from mcgicp_jax._global_pose.feature_matching import matches_of_features, matches_of_rows
 from mcgicp_jax._global_pose.fpfh import NUM_NEIGHBORS
 from mcgicp_jax._global_pose.robust_pose_fit import (
@@ -32,7 +31,7 @@ from mcgicp_jax._methods.multichannel_gicp import MultiChannelGICP
 from mcgicp_jax._registration.options import Options
 from mcgicp_jax._registration.register_pair import register_pair
 from mcgicp_jax._registration.result import is_usable
-from mcgicp_jax._search.positions import nearest_in_position
+from mcgicp_jax._search.kd_tree import nearest_in_position
 
 # Source rows and target rows of the matches.
 RowMatches: TypeAlias = tuple[Any, Any]

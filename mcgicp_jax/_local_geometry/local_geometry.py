@@ -1,18 +1,25 @@
-"""Statistics of neighbourhoods that do not depend on the method: covariance, normal, observability, channel fits."""
+"""Local geometry: covariance, normal, observability and channel fits of neighbourhoods, whatever the method."""
 
 from __future__ import annotations
 
-from typing import NamedTuple, TypeAlias
+from functools import partial
+from typing import Any, NamedTuple, TypeAlias
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
-from mcgicp_jax._compute.concrete import AnyArray
+from mcgicp_jax._clouds.point_cloud import PointCloud
+from mcgicp_jax._compute.cache import cached_with_cloud
+from mcgicp_jax._compute.concrete import AnyArray, AnyScalar, is_concrete, numpy_for
+from mcgicp_jax._compute.row_functions import ComputedTable, Rows, over_both
+from mcgicp_jax._compute.threads import side_by_side
 from mcgicp_jax._local_geometry.channel_fits import ChannelFits, fit_channels
-from mcgicp_jax._local_geometry.neighborhoods import Neighborhoods
+from mcgicp_jax._local_geometry.neighborhoods import Neighborhoods, neighborhoods, of_rows, with_near
 from mcgicp_jax._local_geometry.observability import geometry_observability
 from mcgicp_jax._math import symmetric_matrices as alg
+from mcgicp_jax._math.statistics import median, sampled_rows
 
 # Rank of the neighbour from which roughness is measured (0 is the point itself). The nearest neighbours are biased
 # towards similar heights, and the heights of far ones include the curvature of the surface.
@@ -101,3 +108,94 @@ def weighted_covariance(offsets: Offsets, weights: Float[Array, "k N"]) -> Float
     x, y, z = (offset - jnp.sum(weights * offset, axis=0) for offset in offsets)
     pairs = ((x, x), (x, y), (x, z), (y, y), (y, z), (z, z))
     return jnp.stack([jnp.sum(weights * p * q, axis=0) for p, q in pairs])
+
+
+# Squared edge of a cell over the trace of its covariance, for a uniformly filled square: the trace is 2 edge²/12.
+_SQUARE_EDGE = 6.0
+# Assumed number of points from which the normal of a cell was estimated: the size of a neighbourhood.
+_COUNT = 20
+
+
+def cell_edge(cells: PointCloud) -> Float[AnyScalar, ""]:
+    """The median edge of the cells, metres. (The median distance of cells may be smaller: where a plane lies between
+    two layers of voxels, cells are close together.)"""
+    xp = numpy_for(cells)
+    rows, counts = sampled_rows(xp.asarray(cells.valid))
+    traces = xp.trace(xp.asarray(cells.covariances)[rows], axis1=1, axis2=2)
+    return median(xp.where(counts, xp.sqrt(_SQUARE_EDGE * traces), xp.nan))
+
+
+def geometry_of_cells(local: LocalGeometry, given: Float[Array, "6 n"], num_candidates: int) -> LocalGeometry:
+    """Local geometry of cells: channel fits from their neighbourhoods, everything else from their covariances.
+
+    Args:
+        local: of the neighbourhoods.
+        given: covariances of the cells, metres².
+        num_candidates: number of cells matched with each point or cell.
+    """
+    given = jax.lax.stop_gradient(given)
+    normal = alg.smallest_eigenvector(given)
+    across = alg.inner(normal, alg.multiply(given, normal))
+    count = jnp.full_like(across, _COUNT)
+    return LocalGeometry(
+        covariance=given.T,
+        normal=normal.T,
+        observability=geometry_observability(given, normal, count).T,
+        roughness=across,
+        reach=0.5 * jnp.sqrt(num_candidates * _SQUARE_EDGE * (given[0] + given[3] + given[5])),
+        fits=local.fits,
+    )
+
+
+def local_geometries(
+    source: PointCloud,
+    target: PointCloud,
+    with_channels: bool,
+    num_threads: int | None = 1,
+    source_rows: Any = None,
+) -> tuple[LocalGeometry, LocalGeometry]:
+    """Local geometry of two preprocessed clouds.
+
+    Args:
+        with_channels: whether the method uses the channels; if not, the programs do not depend on their number.
+        num_threads: largest number of threads on the host; None for no limit.
+        source_rows: (n,) rows of the source to describe; None for all.
+
+    Returns:
+        Of the source and of the target.
+    """
+    if is_concrete(source, target):
+        calls = [
+            partial(geometry_table(cloud, with_channels).trees, rows, num_threads)
+            for cloud, rows in ((target, None), (source, source_rows))
+        ]
+        (of_target,), (of_source,) = side_by_side(calls, num_threads)
+        return of_source, of_target
+    # A concrete cloud beside a traced one is traced as well, which needs no program of its own.
+    of_rows_of_source = of_rows(with_near(source, with_channels), source_rows)
+    (of_source,), (of_target,) = over_both(_geometry, None, of_rows_of_source, with_near(target, with_channels))
+    return of_source, of_target
+
+
+@cached_with_cloud
+def geometry_table(cloud: PointCloud, with_channels: bool) -> ComputedTable:
+    """Local geometry of a concrete cloud, cached with the cloud."""
+    return _table(cloud, with_channels, cloud)
+
+
+def differentiable_geometry(cloud: PointCloud, with_channels: bool, fixed: PointCloud) -> ComputedTable:
+    """Local geometry of a cloud whose points differentiation may trace, with the values of the same, concrete cloud."""
+    return _table(cloud, with_channels, fixed, geometry_table(fixed, with_channels))
+
+
+def _table(
+    cloud: PointCloud, with_channels: bool, fixed: PointCloud, values: ComputedTable | None = None
+) -> ComputedTable:
+    # Another array: the local geometry has no derivative by channels.
+    channels = np.asarray(fixed.channels).view()
+    inputs = with_near(cloud.replace_rows(channels=channels), with_channels)
+    return ComputedTable(_geometry, None, inputs, cloud.points.shape[0], values)
+
+
+def _geometry(_: None, own: Rows, near: Rows) -> tuple[LocalGeometry]:
+    return (describe(neighborhoods(own, near)),)

@@ -16,8 +16,7 @@ from mcgicp_jax._local_geometry.local_geometry import LocalGeometry
 from mcgicp_jax._local_geometry.neighborhoods import NO_NEIGHBORS, Neighborhoods
 from mcgicp_jax._math import symmetric_matrices as alg
 from mcgicp_jax._math.robust_kernels import AbstractKernel, Numbers
-from mcgicp_jax._terms.base import AbstractTerm
-from mcgicp_jax._terms.mahalanobis import Mahalanobis
+from mcgicp_jax._terms.base import AbstractTerm, Mahalanobis
 
 # Computes the local geometry of source and target.
 Geometries: TypeAlias = Callable[[], tuple[LocalGeometry, LocalGeometry]]

@@ -12,7 +12,7 @@ from mcgicp_jax._clouds.point_cloud import PointCloud
 from mcgicp_jax._clouds.preprocess import preprocess
 from mcgicp_jax._local_geometry.spacing_and_noise import point_spacing
 from mcgicp_jax._math.poses import Pose, pose_matrix
-from mcgicp_jax._search.positions import nearest_in_position
+from mcgicp_jax._search.kd_tree import nearest_in_position
 
 # Smallest number n of differences per channel: the relative standard error of a variance is √(2/n), 45 % for 10.
 _MIN_DIFFERENCES = 10

@@ -14,8 +14,7 @@ from jaxtyping import Array, Float
 from mcgicp_jax._clouds.point_cloud import PointCloud, Values
 from mcgicp_jax._compute.concrete import AnyArray, constant, numpy_for
 from mcgicp_jax._local_geometry.covariances import channel_kernel, multichannel_covariance, plane_covariance
-from mcgicp_jax._local_geometry.local_geometry import LocalGeometry
-from mcgicp_jax._local_geometry.local_statistics import local_geometries
+from mcgicp_jax._local_geometry.local_geometry import LocalGeometry, local_geometries
 from mcgicp_jax._local_geometry.neighborhoods import NO_NEIGHBORS, Neighborhoods
 from mcgicp_jax._local_geometry.spacing_and_noise import channel_noise, point_spacing
 from mcgicp_jax._math.robust_kernels import AbstractKernel
@@ -28,8 +27,7 @@ from mcgicp_jax._methods.parameters import (
     positive_scalar,
     weights_of,
 )
-from mcgicp_jax._terms.base import AbstractTerm
-from mcgicp_jax._terms.mahalanobis import Mahalanobis
+from mcgicp_jax._terms.base import AbstractTerm, Mahalanobis
 from mcgicp_jax._terms.photometric import Photometric
 
 # Ratio. Between aligned real scans (RGB-D and LiDAR), the standard deviation of the channels' differences was 0.9 to

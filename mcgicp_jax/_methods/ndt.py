@@ -9,15 +9,14 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
 from mcgicp_jax._clouds.point_cloud import PointCloud, Values
-from mcgicp_jax._compute.argument_checks import check_integer
+from mcgicp_jax._compute.messages import check_integer
 from mcgicp_jax._local_geometry.local_geometry import LocalGeometry
 from mcgicp_jax._local_geometry.neighborhoods import Neighborhoods
 from mcgicp_jax._math import symmetric_matrices as alg
 from mcgicp_jax._math.robust_kernels import AbstractKernel, Welsch
 from mcgicp_jax._methods.base import AbstractGeneralized, AbstractMethod, AbstractOneSided, identity
 from mcgicp_jax._methods.icp import ColorICP
-from mcgicp_jax._terms.base import AbstractTerm
-from mcgicp_jax._terms.mahalanobis import Mahalanobis
+from mcgicp_jax._terms.base import AbstractTerm, Mahalanobis
 
 # Scale k of the kernel, standard deviations. The usual score is −exp(−d₂ s²/2), so that k² = 2/d₂. Magnusson's formula
 # for d₂ (2009) depends on the unit of length; with the usual 55 % of outliers and cells of 1 m it gives k = 2.15. For

@@ -17,9 +17,13 @@ from mcgicp_jax._compute.cache import cached_with_cloud
 from mcgicp_jax._compute.concrete import is_concrete, numpy_for
 from mcgicp_jax._compute.row_functions import ComputedTable, GivenTable, Input, Rows, over_both
 from mcgicp_jax._compute.threads import side_by_side
-from mcgicp_jax._local_geometry.cells import geometry_of_cells
-from mcgicp_jax._local_geometry.local_geometry import LocalGeometry
-from mcgicp_jax._local_geometry.local_statistics import differentiable_geometry, geometry_table, local_geometries
+from mcgicp_jax._local_geometry.local_geometry import (
+    LocalGeometry,
+    differentiable_geometry,
+    geometry_of_cells,
+    geometry_table,
+    local_geometries,
+)
 from mcgicp_jax._local_geometry.neighborhoods import (
     Neighborhoods,
     PointRows,

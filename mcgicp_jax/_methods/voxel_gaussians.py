@@ -14,8 +14,8 @@ from mcgicp_jax._clouds.point_cloud import PointCloud, Values, as_cloud
 from mcgicp_jax._clouds.preprocess import MIN_POINTS, finite_rows, preprocess, with_neighbors
 from mcgicp_jax._clouds.voxel_size import NUM_NEIGHBORS
 from mcgicp_jax._clouds.voxels import voxel_order
-from mcgicp_jax._compute.argument_checks import check_integer, check_positive, is_number
 from mcgicp_jax._compute.concrete import AnyArray, numpy_for
+from mcgicp_jax._compute.messages import check_integer, check_positive, is_number
 from mcgicp_jax._math import symmetric_matrices as alg
 from mcgicp_jax._methods.gicp import GICP
 from mcgicp_jax._methods.surfaces import covariances_of

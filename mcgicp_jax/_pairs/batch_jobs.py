@@ -20,14 +20,14 @@ from mcgicp_jax._clouds.point_cloud import PointCloud, Values
 from mcgicp_jax._clouds.voxel_size import VoxelSize
 from mcgicp_jax._compute.linear_maps import primal
 from mcgicp_jax._compute.messages import messages_named, warn, warnings_named
-from mcgicp_jax._compute.size_classes import size_class
+from mcgicp_jax._compute.programs import size_class
 from mcgicp_jax._compute.threads import in_new_thread, num_cores, side_by_side, with_settings
 from mcgicp_jax._local_geometry.surface import Surface
 from mcgicp_jax._math.poses import Pose
 from mcgicp_jax._methods.base import AbstractMethod
 from mcgicp_jax._pairs.register import register_from, start_from_anywhere
+from mcgicp_jax._registration.assessment import registration_of
 from mcgicp_jax._registration.input_checks import warn_of_estimated_parameters, warn_of_lengths
-from mcgicp_jax._registration.make_result import registration_of
 from mcgicp_jax._registration.options import Options
 from mcgicp_jax._registration.pose_derivative import Given
 from mcgicp_jax._registration.register_pair import Run, pose_problem, prepared, preprocessed, results_of, run_pair

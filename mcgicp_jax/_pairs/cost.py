@@ -20,8 +20,7 @@ from mcgicp_jax._math.poses import Pose
 from mcgicp_jax._math.robust_kernels import AbstractKernel
 from mcgicp_jax._methods.base import AbstractGeneralized, AbstractMethod, with_unset_from
 from mcgicp_jax._methods.surfaces import Fixed, differentiable_inputs, surface_pair
-from mcgicp_jax._pose_solver.adaptation import adapted, sample_of_term
-from mcgicp_jax._pose_solver.matched import Motion, linearize_at, matched_rows
+from mcgicp_jax._pose_solver.matched import Motion, adapted, linearize_at, matched_rows, sample_of_term
 from mcgicp_jax._registration.input_checks import check_matches, warn_of_estimated_parameters
 from mcgicp_jax._search.base import Correspondences
 from mcgicp_jax._terms.base import AbstractAdaptiveTerm, AbstractTerm

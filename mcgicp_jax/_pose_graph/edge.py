@@ -14,8 +14,7 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float, Int
 
 from mcgicp_jax._compute.concrete import is_concrete, numpy_for
-from mcgicp_jax._math.poses import Pose, adjoint, inverse, pose_matrices
-from mcgicp_jax._math.twists import logarithm, logarithm_derivative
+from mcgicp_jax._math.poses import Pose, adjoint, inverse, logarithm, logarithm_derivative, pose_matrices
 
 # Row of the world's frame, whose pose is the identity. Unlike −1, it is not a row of any array.
 WORLD = -(2**31)

@@ -16,11 +16,11 @@ import numpy as np
 from jax.typing import DTypeLike
 from jaxtyping import Array, Float, Int
 
-from mcgicp_jax._compute.callbacks import call_host
+from mcgicp_jax._compute.cache import Lazy
 from mcgicp_jax._compute.concrete import AnyArray, is_concrete
-from mcgicp_jax._compute.lazy import Lazy
 from mcgicp_jax._compute.messages import calling_line, shown_at, warn
-from mcgicp_jax._math.twists import logarithm_derivative, skew
+from mcgicp_jax._compute.programs import call_host
+from mcgicp_jax._math.poses import logarithm_derivative, skew
 from mcgicp_jax._pose_graph.edge import WORLD, Edge, check_rows, motion_jacobians
 from mcgicp_jax._pose_graph.normal_equations import factored, typical_information
 from mcgicp_jax._pose_graph.solver import Factors, Solution, covariances_at, solve

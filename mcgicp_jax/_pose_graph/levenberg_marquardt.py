@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float
 
-from mcgicp_jax._math.twists import exponential
+from mcgicp_jax._math.poses import exponential
 from mcgicp_jax._pose_graph.normal_equations import LEAST_DAMPING, NormalEquations, Terms, factored
 
 # Damping, as a fraction of the information of a typical edge: at the start, the factor by which it changes, and the

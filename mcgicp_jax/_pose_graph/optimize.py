@@ -12,9 +12,9 @@ import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float, Int
 
-from mcgicp_jax._compute.argument_checks import check_integer
+from mcgicp_jax._compute.cache import Lazy
 from mcgicp_jax._compute.concrete import AnyArray, is_concrete, numpy_for
-from mcgicp_jax._compute.lazy import Lazy
+from mcgicp_jax._compute.messages import check_integer
 from mcgicp_jax._pose_graph.edge import WORLD, Edge
 from mcgicp_jax._pose_graph.graph import PoseGraph
 from mcgicp_jax._pose_graph.implicit_derivative import Found, covariances_traced, solve_traced

@@ -1,4 +1,4 @@
-"""Matched points: the rows of both surfaces side by side."""
+"""Matched points: the rows of both surfaces side by side, and the numbers that terms estimate from them."""
 
 from __future__ import annotations
 
@@ -13,14 +13,15 @@ import jaxlie
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from mcgicp_jax._compute.concrete import AnyArray, AnyScalar, is_concrete, numpy_for
+from mcgicp_jax._compute.concrete import AnyArray, AnyScalar, constant, is_concrete, numpy_for
 from mcgicp_jax._compute.row_functions import Input, Rows, whole
 from mcgicp_jax._local_geometry.surface import Surface
 from mcgicp_jax._math import symmetric_matrices as alg
 from mcgicp_jax._math.poses import rotated, rotation_from_quaternion
+from mcgicp_jax._math.statistics import sampled_rows
 from mcgicp_jax._methods.surfaces import NOISE, SEARCH, SURFACE, AnySurface, input_of
 from mcgicp_jax._search.base import Correspondences, SearchPoints
-from mcgicp_jax._terms.base import AbstractTerm, Linearization, PosedMatches, linearize
+from mcgicp_jax._terms.base import AbstractAdaptiveTerm, AbstractTerm, Linearization, PosedMatches, linearize
 
 
 class Motion(NamedTuple):
@@ -218,3 +219,37 @@ def _softmax(logits: Float[Array, "m N"], valid: Bool[Array, "m N"]) -> Float[Ar
     exponentials = jnp.where(valid, jnp.exp(shifted), 0)
     total = jnp.sum(exponentials, axis=0)
     return (exponentials / jnp.where(total > 0, total, 1)).reshape(-1)
+
+
+def adapted(
+    terms: tuple[AbstractTerm, ...],
+    valid: Bool[AnyArray, "N"],
+    sample: Callable[[AbstractAdaptiveTerm, Int[AnyArray, "n"]], Any],
+) -> tuple[AbstractTerm, ...]:
+    """The terms with their numbers estimated; constants to autodiff.
+
+    Args:
+        valid: which source points are no padding.
+        sample: computes `sample_of_term` for the matches of some source points.
+    """
+    rows, counts = sampled_rows(valid)
+    xp = numpy_for(counts, valid)
+    fraction = xp.sum(counts) / xp.maximum(xp.sum(valid), 1)
+
+    def only(column: Float[AnyArray, "n *_"]) -> Float[AnyArray, "n *_"]:
+        missing = np.asarray(np.nan, column.dtype)
+        return numpy_for(column, counts).where(counts.reshape(-1, *[1] * (column.ndim - 1)), column, missing)
+
+    # Huge coordinates or channels lead to the status NON_FINITE; NumPy need not warn of them.
+    with np.errstate(over="ignore", invalid="ignore"):
+        return tuple(
+            constant(term.adapt(jax.tree.map(only, sample(term, rows)), fraction))
+            if isinstance(term, AbstractAdaptiveTerm)
+            else term
+            for term in terms
+        )
+
+
+def sample_of_term(motion: Motion, matched: Matched, term: AbstractAdaptiveTerm) -> Any:
+    """`AbstractAdaptiveTerm.sample` of matched points."""
+    return term.sample(matched.at(motion))

@@ -12,10 +12,10 @@ from jaxtyping import Float, Int
 
 from mcgicp_jax._clouds.origins import centred_pose
 from mcgicp_jax._clouds.point_cloud import PointCloud
-from mcgicp_jax._compute.argument_checks import check_integer, check_positive
 from mcgicp_jax._compute.cache import cached_with_cloud
 from mcgicp_jax._compute.concrete import constant, is_concrete
 from mcgicp_jax._compute.linear_maps import primal
+from mcgicp_jax._compute.messages import check_integer, check_positive
 from mcgicp_jax._math.poses import Pose, rotated, se3_from_matrix
 from mcgicp_jax._methods.base import AbstractMethod
 from mcgicp_jax._methods.surfaces import search_numbers, search_rows, searchable

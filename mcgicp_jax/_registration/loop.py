@@ -27,9 +27,8 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from mcgicp_jax._compute.concrete import AnyArray, AnyScalar, numpy_for
-from mcgicp_jax._pose_solver.adaptation import adapted, sample_of_term
 from mcgicp_jax._pose_solver.covariance import Scores
-from mcgicp_jax._pose_solver.matched import Matches, Motion
+from mcgicp_jax._pose_solver.matched import Matches, Motion, adapted, sample_of_term
 from mcgicp_jax._registration.step import SETTLED, Problem, State, update
 from mcgicp_jax._search.base import SearchPoints, by_position
 from mcgicp_jax._terms.base import AbstractTerm, is_adaptive

@@ -11,9 +11,9 @@ import jaxlie
 import numpy as np
 from jaxtyping import Float, Int
 
-from mcgicp_jax._compute.packing import Packed
-from mcgicp_jax._compute.quick_compilation import quickly_compiled
+from mcgicp_jax._compute.programs import quickly_compiled
 from mcgicp_jax._compute.row_functions import RowFunction
+from mcgicp_jax._compute.tables import Packed
 from mcgicp_jax._pose_solver.covariance import Scores, scores_of
 from mcgicp_jax._pose_solver.matched import Matches, Motion, inputs_of, of_matches
 from mcgicp_jax._pose_solver.pose_measurements import Fusion

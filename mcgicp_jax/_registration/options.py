@@ -13,9 +13,9 @@ import numpy as np
 from jax.typing import ArrayLike
 
 from mcgicp_jax._clouds.preprocess import MIN_POINTS
-from mcgicp_jax._compute.argument_checks import check_integer, check_positive, is_number
 from mcgicp_jax._compute.concrete import is_concrete
 from mcgicp_jax._compute.linear_maps import primal
+from mcgicp_jax._compute.messages import check_integer, check_positive, is_number
 from mcgicp_jax._math.robust_kernels import AbstractKernel
 from mcgicp_jax._methods.base import AbstractMethod
 from mcgicp_jax._search.base import AbstractSearch

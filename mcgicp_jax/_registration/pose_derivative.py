@@ -21,7 +21,7 @@ from jaxtyping import Array, Float
 from mcgicp_jax._clouds.point_cloud import PointCloud
 from mcgicp_jax._compute.concrete import is_concrete
 from mcgicp_jax._compute.linear_maps import AbstractLinearMap, SideBySide, primal, with_derivative
-from mcgicp_jax._compute.quick_compilation import quickly_compiled
+from mcgicp_jax._compute.programs import quickly_compiled
 from mcgicp_jax._compute.row_functions import Input, RowFunction, Rows, blockwise
 from mcgicp_jax._math.poses import (
     parameters_by_twist,

@@ -14,8 +14,8 @@ from mcgicp_jax._clouds.origins import centred_pose, pose_in_user_frame
 from mcgicp_jax._clouds.point_cloud import PointCloud, Values, Voxels, as_cloud
 from mcgicp_jax._clouds.preprocess import preprocessed_in
 from mcgicp_jax._clouds.voxel_size import NUM_NEIGHBORS, VoxelSize, voxels_and_grids
+from mcgicp_jax._compute.cache import Lazy
 from mcgicp_jax._compute.concrete import AnyArray, constant, is_concrete, numpy_for, outside_trace
-from mcgicp_jax._compute.lazy import Lazy
 from mcgicp_jax._compute.linear_maps import primal
 from mcgicp_jax._compute.messages import messages_named
 from mcgicp_jax._compute.threads import in_new_thread
@@ -32,7 +32,7 @@ from mcgicp_jax._methods.icp import PointToPoint
 from mcgicp_jax._methods.surfaces import surface_pair
 from mcgicp_jax._pose_solver.covariance import Moments
 from mcgicp_jax._pose_solver.matched import Matches
-from mcgicp_jax._registration.assessment import Assessment, assessment_of, moments_of
+from mcgicp_jax._registration.assessment import Assessment, assessment_of, moments_of, registration_of
 from mcgicp_jax._registration.correspondences import find_correspondences, index_of
 from mcgicp_jax._registration.input_checks import (
     check_channels,
@@ -41,15 +41,13 @@ from mcgicp_jax._registration.input_checks import (
     warn_of_covariances,
 )
 from mcgicp_jax._registration.loop import LoopResult, iterate
-from mcgicp_jax._registration.make_result import registration_of
 from mcgicp_jax._registration.measurements import GivenPrior, GivenTiePoints, fusion_of, known
 from mcgicp_jax._registration.multi_scale import stages_of
 from mcgicp_jax._registration.on_host import HostExecutor
 from mcgicp_jax._registration.options import Options, check_method
 from mcgicp_jax._registration.pose_derivative import Given, Inputs, differentiated, jacobian, with_derivatives
 from mcgicp_jax._registration.result import RegistrationResult, is_usable
-from mcgicp_jax._registration.settings import settings_for
-from mcgicp_jax._registration.step import Problem, State
+from mcgicp_jax._registration.step import Problem, State, settings_for
 from mcgicp_jax._registration.traced import assess, differentiable, moments_traced, run_traced
 from mcgicp_jax._search.base import AbstractIndex, AbstractSearch, Correspondences
 from mcgicp_jax._search.brute_force import default_search

@@ -14,8 +14,8 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Float, Int
 
 from mcgicp_jax._clouds.origins import pose_in_user_frame
+from mcgicp_jax._compute.cache import Held, Lazy
 from mcgicp_jax._compute.concrete import AnyArray, canonical_float, is_concrete
-from mcgicp_jax._compute.lazy import Held, Lazy
 from mcgicp_jax._compute.linear_maps import primal
 from mcgicp_jax._math.poses import se3
 from mcgicp_jax._pose_solver.degeneracy import Directions, UnconstrainedDirection, describe, unconstrained_directions

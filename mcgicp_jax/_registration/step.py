@@ -12,8 +12,12 @@ import jaxlie
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from mcgicp_jax._compute.concrete import AnyArray, AnyScalar, numpy_for
+from mcgicp_jax._clouds.point_cloud import PointCloud
+from mcgicp_jax._compute.concrete import AnyArray, AnyScalar, constant, numpy_for
+from mcgicp_jax._local_geometry.local_geometry import cell_edge
+from mcgicp_jax._local_geometry.spacing_and_noise import grid_spacing, point_spacing
 from mcgicp_jax._math.poses import move_pose
+from mcgicp_jax._methods.base import AbstractMethod
 from mcgicp_jax._methods.surfaces import AnySurface, whole_surface
 from mcgicp_jax._pose_solver.degeneracy import Directions, find_directions
 from mcgicp_jax._pose_solver.fusion import fused_update
@@ -22,6 +26,7 @@ from mcgicp_jax._pose_solver.matched import Matches
 from mcgicp_jax._pose_solver.pose_measurements import Fusion
 from mcgicp_jax._pose_solver.sums import Sums
 from mcgicp_jax._pose_solver.update import rounding, solve_update
+from mcgicp_jax._registration.options import ROTATION_TOLERANCE, Options
 from mcgicp_jax._registration.result import Status
 from mcgicp_jax._terms.base import AbstractTerm, is_adaptive
 
@@ -216,3 +221,60 @@ def root_of(state: State, fusion: Fusion | None) -> ImplicitRoot:
         values, basis = jnp.linalg.eigh(state.information)
         held = converged | (values > rounding(values))
     return root_near(state.sums, usable, basis, held, fusion)
+
+
+# Default maximum correspondence distances of the coarse and the fine phase, in spacings of the target. With the larger
+# one, initial poses several spacings off converge, but matches across edges and the border of the overlap bias the
+# final pose; the smaller one rejects these. The coarse phase also considers the spacing between scan lines: with the
+# spacing along the lines alone, raw scans of KITTI, 1.3 m apart, stayed at the identity.
+_COARSE_SPACINGS, _FINE_SPACINGS = 10.0, 2.5
+# Default translation tolerance, in spacings of the target: 0.5 mm at 0.1 m, chosen like `ROTATION_TOLERANCE`.
+_TOLERANCE_IN_SPACINGS = 0.005
+# Tolerances of the coarse phase, as a multiple of the tolerances or of their defaults, whichever is larger. With
+# smaller ones, the small cycles of nearest-neighbour matching would keep the coarse phase from ending.
+_COARSE_TOLERANCE = 10.0
+
+
+def matching_spacing(method: AbstractMethod, target: PointCloud) -> Float[AnyScalar, ""]:
+    """Unit of the default maximum correspondence distances, metres: the edge of the cells for a method that matches
+    voxel Gaussians, else the spacing of the points."""
+    cells = method.needs_covariances and target.covariances is not None
+    return cell_edge(target) if cells else point_spacing(target)
+
+
+def default_distances(spacing: Any, target: PointCloud) -> tuple[Any, Any]:
+    """Default `max_distance` of the coarse and the fine phase, metres, for a target with this spacing."""
+    # Cells have the spacing of their grid.
+    between = spacing if target.covariances is not None else constant(grid_spacing(target))
+    return _COARSE_SPACINGS * numpy_for(spacing, between).maximum(spacing, between), _FINE_SPACINGS * spacing
+
+
+def settings_for(options: Options, method: AbstractMethod, target: PointCloud, stride: Any, dtype: Any) -> Settings:
+    max_distance: Any = options.max_distance
+    tolerance: Any = options.translation_tolerance
+    # Options are constants to autodiff, even if they are derived from a differentiated cloud.
+    spacing = constant(matching_spacing(method, target))
+    max_distance = default_distances(spacing, target) if max_distance is None else max_distance
+    least = spacing * _TOLERANCE_IN_SPACINGS
+    tolerance = least if tolerance is None else tolerance
+
+    def number(value: Any, kind: Any) -> Any:
+        xp = numpy_for(value)
+        return xp.asarray(value, kind)
+
+    def coarse_tolerance(value: Any, least: Any) -> Any:
+        return number(_COARSE_TOLERANCE * numpy_for(value, least).maximum(value, least), dtype)
+
+    coarse, fine = max_distance if isinstance(max_distance, tuple) or np.shape(max_distance) else [max_distance] * 2
+    coarse = numpy_for(coarse).maximum(coarse, options.reach)
+    return Settings(
+        max_distance=number(coarse, dtype),
+        fine_distance=number(fine, dtype),
+        coarse_stride=number(stride, np.int32),
+        translation_tolerance=number(tolerance, dtype),
+        rotation_tolerance=number(options.rotation_tolerance, dtype),
+        coarse_translation_tolerance=coarse_tolerance(tolerance, least),
+        coarse_rotation_tolerance=coarse_tolerance(options.rotation_tolerance, ROTATION_TOLERANCE),
+        max_iterations=number(options.max_iterations, np.int32),
+        hold_unconstrained=number(options.hold_unconstrained, bool),
+    )

@@ -16,7 +16,7 @@ import jax.numpy as jnp
 import jaxlie
 from jaxtyping import Array, Bool, Float, Int
 
-from mcgicp_jax._compute.lazy import Lazy
+from mcgicp_jax._compute.cache import Lazy
 from mcgicp_jax._compute.row_functions import whole
 from mcgicp_jax._pose_solver.covariance import Moments, Scores, scores_of
 from mcgicp_jax._pose_solver.implicit_derivative import Model, with_derivative

@@ -13,7 +13,7 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float, Int
 
 from mcgicp_jax._compute.concrete import AnyArray, Deferred
-from mcgicp_jax._compute.rows_on_demand import RowsOnDemand
+from mcgicp_jax._compute.tables import RowsOnDemand
 
 
 class SearchPoints(NamedTuple):

@@ -13,7 +13,7 @@ import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float, Int
 
-from mcgicp_jax._compute.size_classes import size_class
+from mcgicp_jax._compute.programs import size_class
 from mcgicp_jax._search.base import IDENTITY, AbstractIndex, AbstractSearch, SearchPoints, on_host, search_points
 from mcgicp_jax._search.kd_tree import KDTreeSearch
 

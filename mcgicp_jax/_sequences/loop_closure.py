@@ -14,8 +14,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from mcgicp_jax._clouds.point_cloud import PointCloud
-from mcgicp_jax._math.poses import adjoint, inverse
-from mcgicp_jax._math.twists import exponential, logarithm
+from mcgicp_jax._math.poses import adjoint, exponential, inverse, logarithm
 from mcgicp_jax._methods.base import AbstractMethod
 from mcgicp_jax._pose_graph.edge import Edge
 from mcgicp_jax._pose_graph.graph import PoseGraph

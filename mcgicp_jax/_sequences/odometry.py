@@ -17,11 +17,10 @@ from mcgicp_jax._clouds.point_cloud import PointCloud, Values, Voxels, as_cloud
 from mcgicp_jax._clouds.preprocess import check_preprocessing, preprocess
 from mcgicp_jax._clouds.voxel_map import VoxelMap
 from mcgicp_jax._clouds.voxel_size import NUM_NEIGHBORS, VoxelSize, voxels_for
-from mcgicp_jax._compute.argument_checks import check_positive
-from mcgicp_jax._compute.lazy import Lazy
-from mcgicp_jax._compute.messages import messages_named, warn
+from mcgicp_jax._compute.cache import Lazy
+from mcgicp_jax._compute.messages import check_positive, messages_named, warn
 from mcgicp_jax._compute.threads import ReadAhead
-from mcgicp_jax._local_geometry.local_statistics import geometry_table
+from mcgicp_jax._local_geometry.local_geometry import geometry_table
 from mcgicp_jax._local_geometry.spacing_and_noise import point_spacing
 from mcgicp_jax._math.poses import Pose, nearest_rotation, pose_matrix
 from mcgicp_jax._methods.base import AbstractMethod

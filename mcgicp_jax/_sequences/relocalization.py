@@ -15,7 +15,7 @@ from mcgicp_jax._methods.base import AbstractMethod
 from mcgicp_jax._registration.options import Options
 from mcgicp_jax._registration.register_pair import register_pair
 from mcgicp_jax._registration.result import RegistrationResult, Status, is_usable
-from mcgicp_jax._search.positions import nearest_in_position
+from mcgicp_jax._search.kd_tree import nearest_in_position
 
 # Fraction of the previous overlap below which a frame is also looked for in the map. At constant speed the overlap
 # hardly changes; after jumps in simulated rooms and streets and on KITTI it fell to 0.5 to 0.7 of the previous one.

@@ -7,7 +7,7 @@ Hessian of half the cost. Any residual that is linear in T a to first order has 
 from __future__ import annotations
 
 import abc
-from typing import Any, ClassVar, NamedTuple
+from typing import Any, ClassVar, NamedTuple, Protocol, runtime_checkable
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -187,3 +187,35 @@ def linearize(terms: tuple[AbstractTerm, ...], matches: PosedMatches) -> Lineari
     """Sum of the terms."""
     first, *others = (term.linearize(matches) for term in terms)
     return sum(others, start=first)
+
+
+@runtime_checkable
+class HasInformation(Protocol):
+    """The members of an `AbstractMethod` that the term uses."""
+
+    @property
+    def needs_covariances(self) -> tuple[str, ...]: ...
+
+    def information(
+        self, target: Float[Array, "6 n"], source: Float[Array, "6 n"], rotation: Float[Array, "3 3"]
+    ) -> Float[Array, "6 n"]: ...
+
+
+class Mahalanobis(AbstractTerm):
+    """ρ(dᵀ M d), where a method defines M.
+
+    Attributes:
+        method: an `AbstractMethod`.
+    """
+
+    method: HasInformation
+
+    @property
+    def matches_slide(self) -> bool:
+        """True for points, False for voxel cells."""
+        return not self.method.needs_covariances
+
+    def linearize(self, matches: PosedMatches) -> Linearization:
+        target, source = matches.target.covariance.T, matches.source.covariance.T
+        information = self.method.information(target, source, matches.rotation)
+        return linearize_residual(matches.residual, information, self.robust)

@@ -12,8 +12,7 @@ from numpy.lib import format as npy
 
 from mcgicp_jax._clouds.columns import COLORS, INTENSITIES
 from mcgicp_jax._clouds.point_cloud import PointCloud
-from mcgicp_jax.io.columns import cloud_of
-from mcgicp_jax.io.files import check_size
+from mcgicp_jax.io.files import check_size, cloud_of
 
 # Metres: float32 resolves 8 mm at this distance; larger coordinates are not written, nor accepted as a KITTI scan.
 _KITTI_LIMIT = 1e5

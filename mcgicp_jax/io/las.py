@@ -10,8 +10,7 @@ from jaxtyping import Float, Shaped
 
 from mcgicp_jax._clouds.columns import COLORS, ORDER
 from mcgicp_jax._clouds.point_cloud import PointCloud
-from mcgicp_jax.io.columns import cloud_of
-from mcgicp_jax.io.files import check_size, optional_module
+from mcgicp_jax.io.files import check_size, cloud_of, optional_module
 
 # Points per chunk: bounds the memory that laspy needs beyond the columns that are kept.
 _LAS_ROWS_AT_ONCE = 100_000

@@ -10,8 +10,7 @@ import numpy as np
 
 from mcgicp_jax._clouds.columns import COLORS, with_unpacked_colors
 from mcgicp_jax._clouds.point_cloud import PointCloud
-from mcgicp_jax.io.columns import cloud_of, columns_of
-from mcgicp_jax.io.files import check_size, optional_module
+from mcgicp_jax.io.files import check_size, cloud_of, columns_of, optional_module
 
 # Bound on the compression ratio of LZF, whose blocks of three bytes expand to at most 264.
 _LZF_RATIO = 100

@@ -9,8 +9,7 @@ from typing import Any, BinaryIO
 import numpy as np
 
 from mcgicp_jax._clouds.point_cloud import PointCloud
-from mcgicp_jax.io.columns import cloud_of, columns_of
-from mcgicp_jax.io.files import check_size, optional_module
+from mcgicp_jax.io.files import check_size, cloud_of, columns_of, optional_module
 
 # Bytes searched for the end of a PLY header, far more than the header of a cloud needs.
 _PLY_HEADER_BYTES = 2**20

@@ -11,7 +11,7 @@ import numpy as np
 
 from mcgicp_jax._clouds.columns import COLORS, channel_name
 from mcgicp_jax._clouds.point_cloud import PointCloud
-from mcgicp_jax.io.columns import cloud_of, column_name, columns_of
+from mcgicp_jax.io.files import cloud_of, column_name, columns_of
 from mcgicp_jax.io.poses import are_poses
 
 # Number of lines from which poses are recognised: so many points are not in order of their first coordinate with unit

@@ -5,9 +5,8 @@ Every function returns its figure; none opens a window or changes matplotlib's g
 
 from mcgicp_jax.plot.before_after import before_after
 from mcgicp_jax.plot.charts import convergence, graph, trajectories
-from mcgicp_jax.plot.clouds_3d import clouds
 from mcgicp_jax.plot.drawing import check_picture
-from mcgicp_jax.plot.pictures import maps, surface_covariances
+from mcgicp_jax.plot.pictures import clouds, maps, surface_covariances
 
 __all__ = [
     "before_after",
