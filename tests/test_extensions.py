@@ -201,7 +201,6 @@ def test_a_graph_factor():
     assert both.factor_weights[0] == 1 and both.factor_residuals[0] < 1e-3 and np.isfinite(both.covariance).all()
 
 
-@pytest.mark.slow
 def feature_cost(scale, source, target):
     """Geman-McClure's kernel of the difference of the features of matched points."""
     square = jnp.sum((source.tree - target.tree) ** 2, axis=-1) / scale**2

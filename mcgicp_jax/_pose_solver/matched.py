@@ -45,7 +45,7 @@ class Motion(NamedTuple):
 
     def move(self, points: Float[AnyArray, "n 3"]) -> Float[AnyArray, "3 n"]:
         """T a for each point, metres."""
-        if is_concrete(self.rotation, points):
+        if isinstance(self.rotation, np.ndarray) and isinstance(points, np.ndarray):
             return (rotated(points, self.rotation) + self.translation).T
         return jnp.dot(self.rotation, jnp.asarray(points).T, precision="highest") + self.translation[:, None]
 
