@@ -4,6 +4,51 @@
 
 JAX keeps compiled programs for other processes if the environment has `JAX_COMPILATION_CACHE_DIR=folder` and
 `JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS=0`. The command line does so by itself.
+
+Clouds
+    PointCloud                      points (N, 3) with channels (N, C)
+    preprocess                      average in voxels, find neighbours
+    merge_clouds                    one map of many clouds
+    voxel_gaussians                 a cloud of the means and covariances of its cells
+    rgb_to_hsv, rgb_to_lab, rgb_to_yuv
+                                    channels in another colour space
+    io, datasets                    files; public data sets, folders and simulated scenes
+
+Pairs
+    register                        the pose that moves a source onto a target
+    register_batch                  the poses of many pairs, in a list
+    register_as_completed           the same, as they are computed
+    global_pose                     a pose from any start, by local features
+    image_matches                   tie points from images
+    find_correspondences            matches at a given pose
+    estimate_pose                   the pose of given matches
+    mahalanobis_cost                the cost of given matches, for losses
+
+Methods
+    MultiChannelGICP, GICP, PointToPlane, PointToPoint, ColorICP
+                                    for points
+    NDT, D2DNDT, ColorNDT           for cells of raw clouds
+    estimate_channel_covariance     their parameter Λ from clouds at known poses
+    Huber, Cauchy, GemanMcClure, Tukey, Welsch
+                                    robust kernels
+    KDTreeSearch, DenseSearch       searches, on CPUs and on accelerators
+
+Sequences and graphs
+    odometry                        frame to frame or to a map, with loops
+    multiway                        one pose for each of many clouds
+    Edge, PoseGraph, WORLD          measured motions between poses
+    optimize_poses                  the poses of a graph
+
+Results
+    RegistrationResult, Status      of a pair: pose, status, covariance
+    GlobalPoseResult, OdometryStep, MultiwayResult, PoseGraphResult
+                                    of the functions above
+    Correspondences                 matches
+    PairWarning                     why a pair of a batch has no pose
+    metrics, plot                   errors of poses; pictures
+
+To extend (see mcgicp_jax.extend)
+    AbstractMethod, AbstractKernel, AbstractSearch, AbstractTreeSearch
 """
 
 from mcgicp_jax import datasets, io, metrics, plot

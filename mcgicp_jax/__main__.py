@@ -76,7 +76,8 @@ def _run(args: Sequence[str]) -> int:
             return tyro.extras.subcommand_cli_from_dict(
                 {command.__name__: command for command in commands},
                 prog="mcgicp",
-                description="Registration of point clouds with channels. --version prints the version.",
+                description="Registration of point clouds with channels. --version prints the version, "
+                "--tyro-print-completion bash (or zsh, tcsh) a script that completes commands and options.",
                 args=args,
                 config=(tyro.conf.OmitArgPrefixes, tyro.conf.DisallowNone),
             )

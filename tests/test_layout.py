@@ -4,6 +4,7 @@ import ast
 import graphlib
 import importlib
 import pathlib
+import re
 
 import mcgicp_jax
 
@@ -135,3 +136,9 @@ def test_benchmarks_can_be_imported():
         except ModuleNotFoundError as error:
             if error.name is None or error.name.startswith(("tests", "mcgicp_jax")):
                 raise
+
+
+def test_the_index_of_the_package_lists_all_public_names():
+    """At the top of `help(mcgicp_jax)`."""
+    listed = set(re.findall(r"\w+", mcgicp_jax.__doc__))
+    assert set(mcgicp_jax.__all__) <= listed
