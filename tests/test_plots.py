@@ -100,6 +100,18 @@ def test_clouds_without_color_are_overlaid_and_black_where_they_fit(rooms):
     assert black(panels[1, 0]) > 0.6
 
 
+def test_a_sparse_cloud_is_not_hidden_by_a_dense_one(rooms):
+    source, target, truth = rooms
+    for sparse, dense in ((source, target), (target, source)):
+        rows = np.random.default_rng(0).permutation(len(sparse))[: len(sparse) // 50]
+        few = mcg.PointCloud(np.asarray(sparse.points)[rows])
+        clouds = (few, dense) if sparse is source else (dense, few)
+        panel = np.array(plot.before_after(*clouds, {"fitted": truth}).axes).reshape(2, 2)[1, 0]
+        red, _, blue = np.moveaxis(1 - shown(panel), 2, 0)
+        theirs, ours = (blue, red) if sparse is source else (red, blue)
+        assert np.sum(theirs > 0.1) > 0.3 * np.sum(ours > 0.1)
+
+
 def test_the_detail_shows_where_poses_differ(wall):
     source, target, truth = wall
 

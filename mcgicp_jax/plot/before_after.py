@@ -9,13 +9,14 @@ from jaxtyping import Float
 
 import mcgicp_jax.plot.drawing as drawing
 from mcgicp_jax._clouds.point_cloud import PointCloud
+from mcgicp_jax._clouds.voxel_size import raw_spacing
 from mcgicp_jax._math.poses import Pose, pose_matrix
 from mcgicp_jax.plot.drawing import Figure, File, Map, Picture, Points, View
 
 # The constants affect only how figures look.
 # Most rows below each other; maximum width of a row and height of a panel, inches; pixels and tiles along the longer
-# side of a panel; fraction of each side that the detail shows.
-_MOST_ROWS, _WIDEST, _HIGHEST, _PIXELS, _TILES, _DETAIL = 5, 12, 4.5, 500, 12, 0.25
+# side of a panel; fraction of each side that the detail shows; most pixels of a point of the sparser cloud.
+_MOST_ROWS, _WIDEST, _HIGHEST, _PIXELS, _TILES, _DETAIL, _LARGEST_POINT = 5, 12, 4.5, 500, 12, 0.25, 9
 
 
 def before_after(source: PointCloud, target: PointCloud, poses: Mapping[str, Pose], *, path: File = None) -> Figure:
@@ -25,7 +26,8 @@ def before_after(source: PointCloud, target: PointCloud, poses: Mapping[str, Pos
 
     If all points have the channels red, green and blue, target and source alternate in a checkerboard, in which
     patterns continue across tiles where the pose is right; a further panel shows the colour difference. Otherwise the
-    clouds are overlaid, the target in blue and the source in orange, black where both are. Upright surfaces are drawn
+    clouds are overlaid, the target in blue and the source in orange, black where both are, points of the sparser cloud
+    larger by the ratio of the spacings. Upright surfaces are drawn
     dark and flat ones pale, since the rings of a LiDAR on the ground move with the sensor. The detail shows the region
     where the poses differ most.
 
@@ -51,7 +53,8 @@ def before_after(source: PointCloud, target: PointCloud, poses: Mapping[str, Pos
         rows = _chess_boards(view, target_points, target_colors, moved, source_colors)
         headings = ["target and source in alternate tiles", "detail", "difference of colour"]
     else:
-        rows = _overlays(view, target_points, moved)
+        spacings = np.maximum([raw_spacing(target), raw_spacing(source)], np.finfo(float).tiny)
+        rows = _overlays(view, target_points, moved, *np.minimum(spacings / spacings.min(), _LARGEST_POINT))
         headings = ["target blue, source orange, both black", "detail"]
     detail = _where_they_differ([difference for _, difference in rows])
     headings[1] = f"detail, {(detail[0].stop - detail[0].start) * view.pixel:.2g} m wide"
@@ -120,27 +123,35 @@ def _smooth(picture: Picture) -> Picture:
     return padded
 
 
-def _overlays(view: View, target: Float[np.ndarray, "M 3"], moved: Sequence[Points]) -> list[tuple[Picture, Map]]:
-    """For each moved source a picture of both clouds, and the difference of their inks."""
-    ours = _ink(view, target)
+def _overlays(
+    view: View, target: Float[np.ndarray, "M 3"], moved: Sequence[Points], target_size: float, source_size: float
+) -> list[tuple[Picture, Map]]:
+    """For each moved source a picture of both clouds, whose points have these sizes in pixels, and the difference of
+    their inks."""
+    ours = _ink(view, target, target_size)
     overlays = []
     for points in moved:
-        theirs = _ink(view, points)
+        theirs = _ink(view, points, source_size)
         # Subtractive colours: the target removes all red, the source all blue, and each half of the green.
         picture = 1 - np.stack([ours, 0.5 * ours + 0.5 * theirs, theirs], axis=-1)
         overlays.append((picture, np.abs(ours - theirs)))
     return overlays
 
 
-def _ink(view: View, points: Points) -> Map:
+def _ink(view: View, points: Points, size: float) -> Map:
     """Ink per pixel: 0 without points, 0.15 on flat surfaces, 1 where the points are at least four pixels high."""
+    from scipy.ndimage import maximum_filter, minimum_filter
+
     pixels, height = view.project(points)
     lowest, highest = np.full(view.height * view.width, np.inf), np.full(view.height * view.width, -np.inf)
     inside = pixels >= 0
     np.minimum.at(lowest, pixels[inside], height[inside])
     np.maximum.at(highest, pixels[inside], height[inside])
+    pixels_wide = round(size)
+    highest = maximum_filter(highest.reshape(view.height, view.width), pixels_wide)
+    lowest = minimum_filter(lowest.reshape(view.height, view.width), pixels_wide)
     stands = np.clip((highest - lowest) / (4 * view.pixel), 0.15, 1)
-    return np.where(highest >= lowest, stands, 0).reshape(view.height, view.width)
+    return np.where(highest >= lowest, stands, 0)
 
 
 def _where_they_differ(differences: Sequence[Map]) -> tuple[slice, slice]:
