@@ -8,7 +8,6 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-import pytest
 
 import mcgicp_jax as mcg
 from mcgicp_jax import extend

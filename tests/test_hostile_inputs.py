@@ -6,6 +6,7 @@ import re
 import warnings
 from functools import partial
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -327,3 +328,35 @@ def test_a_batch_tells_what_register_tells():
         assert result.status is (Status.INVALID_INPUT if alone is None else alone.status)
         if alone is not None:
             np.testing.assert_array_equal(result.matrix, alone.matrix)
+
+
+@pytest.mark.parametrize(
+    "check",
+    [
+        partial(jax.debug_nans, True),
+        partial(jax.numpy_dtype_promotion, "strict"),
+        partial(jax.numpy_rank_promotion, "raise"),
+    ],
+    ids=["nans", "dtypes", "ranks"],
+)
+def test_checks_of_jax_that_users_turn_on_are_for_their_code(check):
+    source, target, truth = pair(size=600)
+    known = np.random.default_rng(0).random(source.channels.shape) < 0.8
+    some = mcg.preprocess(mcg.PointCloud(source.points, source.channels, channel_valid=known), None)
+    method = METHODS["mc-gicp"].resolve(source, target)
+    matches = mcg.find_correspondences(source, target, truth, method, max_distance=0.2)
+
+    def height(points):
+        return mcg.register(source.replace(points=points), target, method).centred.translation()[2]
+
+    def cost(points):
+        return mcg.mahalanobis_cost(truth, source.replace(points=points), target, matches, method)
+
+    with check():
+        for name in ("gicp", "mc-gicp", "photometric"):
+            result = mcg.register(some, target, METHODS[name])
+            assert np.isfinite(result.covariance).all() and np.isfinite(result.deviations).all()
+        gradients = [jax.grad(function)(jnp.asarray(source.points)) for function in (height, cost)]
+        gradients.append(jax.grad(jax.jit(cost))(jnp.asarray(source.points)))
+    for gradient in gradients:
+        assert np.isfinite(gradient).all() and np.any(gradient)

@@ -111,6 +111,14 @@ def test_the_result_belongs_to_the_returned_pose(room):
         np.testing.assert_allclose(result.rmse, np.sqrt(np.mean(matches.distances[matches.valid] ** 2)), rtol=1e-4)
 
 
+def test_what_a_result_keeps_cannot_be_changed(room):
+    source, target, truth = room
+    result = mcg.register(source, target, mcg.GICP(), init=truth)
+    for array in (result.deviations, result.covariance, result.information, result.directions.twists):
+        with pytest.raises(ValueError, match="read-only"):
+            np.asarray(array)[:] = 0
+
+
 def test_information_is_the_curvature_of_the_cost_with_M_held(room):
     source, target, _ = room
     method = mcg.PointToPoint()

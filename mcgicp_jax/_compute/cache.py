@@ -13,6 +13,7 @@ import jax
 import numpy as np
 
 from mcgicp_jax._compute.concrete import outside_trace
+from mcgicp_jax._compute.threads import own_checks
 
 Value = TypeVar("Value")
 Parameters = ParamSpec("Parameters")
@@ -112,7 +113,7 @@ class Lazy(Generic[Value]):
         with self._lock:
             if self._compute is not None:
                 with outside_trace():
-                    self._value = self._compute()
+                    self._value = own_checks(self._compute)()
                 # Frees the arrays that the closure holds.
                 self._compute = None
         return self._value

@@ -16,7 +16,7 @@ from jax.extend.core import Primitive
 from jax.interpreters import ad, batching, mlir
 
 from mcgicp_jax._compute.concrete import is_concrete, is_deferred
-from mcgicp_jax._compute.threads import in_new_thread, side_by_side
+from mcgicp_jax._compute.threads import in_new_thread, own_checks, side_by_side
 
 
 class AbstractLinearMap(abc.ABC):
@@ -87,6 +87,7 @@ def with_derivative(values: Sequence[np.ndarray], linear: AbstractLinearMap, inp
     def attached(*inputs: Any) -> list[jax.Array]:
         return [jnp.asarray(value) for value in values]
 
+    @own_checks
     def rule(inputs: tuple[Any, ...], tangents: tuple[Any, ...]) -> tuple[list[jax.Array], list[jax.Array]]:
         # An outer differentiation, even by other inputs, would see constants.
         for each in inputs:
@@ -135,6 +136,7 @@ _linear.multiple_results = True
 
 
 @_linear.def_impl
+@own_checks
 def _call(*operands: Any, function: Callable, transpose: Callable, inputs: Any, outputs: Any, batch: Any) -> list[Any]:
     count = math.prod(batch)
     arrays = [np.asarray(each).reshape((count, *aval.shape)) for each, aval in zip(operands, inputs, strict=True)]

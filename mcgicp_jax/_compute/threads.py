@@ -9,16 +9,42 @@ import os
 import threading
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor, wait
-from typing import Any, TypeVar
+from typing import Any, ParamSpec, TypeVar
 
 import jax
 
 from mcgicp_jax._compute.messages import Line, calling_line, shown_at
 
 Answer = TypeVar("Answer")
+Parameters = ParamSpec("Parameters")
 
 # JAX settings that are local to a thread and change what a program computes.
-_SETTINGS: tuple[Any, ...] = (jax.enable_x64, jax.default_device, jax.default_matmul_precision, jax.debug_nans)
+_SETTINGS: tuple[Any, ...] = (
+    jax.enable_x64,
+    jax.default_device,
+    jax.default_matmul_precision,
+    jax.debug_nans,
+    jax.debug_infs,
+    jax.numpy_dtype_promotion,
+    jax.numpy_rank_promotion,
+)
+
+
+def own_checks(function: Callable[Parameters, Answer]) -> Callable[Parameters, Answer]:
+    """Decorator of functions in which JAX does not check what users may let it check in their own code: that nothing is
+    NaN, which marks missing values here, and that dtypes and ranks of operands are equal."""
+
+    @functools.wraps(function)
+    def unchecked(*arguments: Parameters.args, **named: Parameters.kwargs) -> Answer:
+        with (
+            jax.debug_nans(False),
+            jax.debug_infs(False),
+            jax.numpy_dtype_promotion("standard"),
+            jax.numpy_rank_promotion("allow"),
+        ):
+            return function(*arguments, **named)
+
+    return unchecked
 
 
 def num_cores() -> int:

@@ -210,7 +210,15 @@ def registration_of(
 
 def _later(compute: Callable[[], Any], concrete: bool) -> Lazy[Any]:
     """Deferred where concrete; traced values must be computed before the trace ends."""
-    return Lazy(compute) if concrete else Lazy.of(compute())
+    return Lazy(lambda: _read_only(compute())) if concrete else Lazy.of(compute())
+
+
+def _read_only(tree: Any) -> Any:
+    """NumPy arrays that a result keeps must not change."""
+    for array in jax.tree.leaves(tree):
+        if isinstance(array, np.ndarray):
+            array.setflags(write=False)
+    return tree
 
 
 def _read(deferred: Lazy[Any]) -> Any:

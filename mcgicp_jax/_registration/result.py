@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import enum
 from collections.abc import Callable
-from typing import Any, Literal, NamedTuple
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple, TypeAlias
 
 import equinox as eqx
 import jax
@@ -69,6 +69,14 @@ _ADVICE = {
     Status.INVALID_INPUT: "register raises an error for this pair; see its warning",
     Status.WORKER_FAILED: "two workers failed with this pair; try register, or smaller clouds",
 }
+
+
+# For type checkers, those of one registration outside of transformations.
+if TYPE_CHECKING:
+    OneStatus: TypeAlias = Status
+    OneBool: TypeAlias = bool
+else:
+    OneStatus = OneBool = Any
 
 
 class Constraints(NamedTuple):
@@ -227,15 +235,16 @@ class RegistrationResult(eqx.Module):
         return self.derivative.value(cloud, field)
 
     @property
-    def status(self) -> Any:
+    def status(self) -> OneStatus:
         """The `Status`; inside a transformation or for a batch, the array `status_code`."""
         if is_concrete(self.status_code) and np.ndim(self.status_code) == 0:
             return Status(int(np.asarray(self.status_code)))
-        return self.status_code
+        code: Any = self.status_code
+        return code
 
     @property
-    def converged(self) -> Any:
-        """Whether the status is CONVERGED."""
+    def converged(self) -> OneBool:
+        """Whether the status is CONVERGED; inside a transformation or for a batch, an array."""
         return self.status == Status.CONVERGED
 
     @property
