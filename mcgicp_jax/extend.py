@@ -4,7 +4,8 @@ a factor or a loss.
 Each is one class or function:
 
 - a method: a subclass of `AbstractMethod`, or of `AbstractOneSided` or `AbstractGeneralized`, which define M;
-- a term, a further residual of each correspondence: a subclass of `AbstractTerm`, listed in `AbstractMethod.terms`;
+- a term, a further residual of each correspondence: a subclass of `AbstractTerm`, or of `AbstractAdaptiveTerm` if it
+  estimates numbers from the residuals; listed in `AbstractMethod.terms`;
 - a search on the host: a subclass of `AbstractTreeSearch` with `build` and `query`; any other: of `AbstractSearch`;
 - a robust kernel: a subclass of `AbstractKernel` with `_rho` and `_weight`;
 - a file format: two functions in a `mcgicp_jax.io.Format`, registered by the suffix;
@@ -31,7 +32,14 @@ from mcgicp_jax._methods.voxel_gaussians import cell_moments, voxel_cells
 from mcgicp_jax._pose_graph.edge import AbstractFactor
 from mcgicp_jax._search.base import AbstractIndex, AbstractSearch, Correspondences, SearchPoints
 from mcgicp_jax._search.kd_tree import AbstractTreeSearch
-from mcgicp_jax._terms.base import AbstractTerm, Linearization, Mahalanobis, PosedMatches, linearize_residual
+from mcgicp_jax._terms.base import (
+    AbstractAdaptiveTerm,
+    AbstractTerm,
+    Linearization,
+    Mahalanobis,
+    PosedMatches,
+    linearize_residual,
+)
 from mcgicp_jax.datasets import DATASETS
 from mcgicp_jax.io.clouds import FORMATS
 
@@ -41,6 +49,7 @@ __all__ = [
     "FORMATS",
     "KERNELS",
     "METHODS",
+    "AbstractAdaptiveTerm",
     "AbstractFactor",
     "AbstractGeneralized",
     "AbstractIndex",
