@@ -4,9 +4,9 @@ The way of a source point from `PointCloud` to `RegistrationResult`, in eight se
 nearest neighbours of the point. `describe` computes its `LocalGeometry` from this neighbourhood: covariance, normal,
 channel fits. `surface_of` turns these into a row of a `Surface`: position, the covariance of the method, observability.
 Both are row functions (`_compute.row_functions`): on the host their rows are computed when they are first gathered, and
-gathered rows are `Rows`. The search finds the target point nearest to the moved point in position and α · channel, and
-the rows of both are `Matched`, from which each term computes a `Linearization`: the cost of the correspondence, its
-force (−gradient/2) and stiffness (Hessian/2). `sums_of` adds them over all correspondences to `Sums`, `update` computes
+gathered rows are `Rows`. The search finds the target point nearest to the moved point in position and α · channel, as
+`Matches`, and the rows of both are `Matched`, from which each term computes a `Linearization`: the cost of the
+correspondence, its force (−gradient/2) and stiffness (Hessian/2). `sums_of` adds them over all correspondences to `Sums`, `update` computes
 the next `State` from the sums, and search, sums and update repeat until the pose converges. At the final pose
 `scores_of` computes the contribution of each correspondence to the covariance of the pose.
 
