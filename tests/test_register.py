@@ -186,6 +186,16 @@ def test_every_status_but_success_has_an_advice():
     assert [status for status in Status if not status.advice] == [Status.CONVERGED]
 
 
+@pytest.mark.parametrize("seed", [4, 6, 11, 39])
+def test_alternating_matches_end_as_converged(seed):
+    clouds = [mcg.PointCloud(*room_corner(500, seed=each)) for each in (seed, seed + 100)]
+    tolerances = {"translation_tolerance": 1e-6, "rotation_tolerance": 1e-6}
+    result = mcg.register(*clouds, mcg.GICP(), **tolerances)
+    assert result.converged and result.num_iterations < 40
+    assert result.history["translation_step"][-4:].max() < result.deviations[:3].max()
+    assert difference(result.matrix, np.eye(4)) < 4 * result.deviations[:3].max()
+
+
 def test_running_out_of_iterations_is_not_convergence(room):
     source, target, _ = room
     result = mcg.register(source, target, mcg.PointToPoint(), max_distance=0.5, max_iterations=3)

@@ -6,9 +6,9 @@ channel fits. `surface_of` turns these into a row of a `Surface`: position, the 
 Both are row functions (`_compute.row_functions`): on the host their rows are computed when they are first gathered, and
 gathered rows are `Rows`. The search finds the target point nearest to the moved point in position and α · channel, as
 `Matches`, and the rows of both are `Matched`, from which each term computes a `Linearization`: the cost of the
-correspondence, its force (−gradient/2) and stiffness (Hessian/2). `sums_of` adds them over all correspondences to `Sums`, `update` computes
-the next `State` from the sums, and search, sums and update repeat until the pose converges. At the final pose
-`scores_of` computes the contribution of each correspondence to the covariance of the pose.
+correspondence, its force (−gradient/2) and stiffness (Hessian/2). `sums_of` adds them over all correspondences to
+`Sums`, `update` computes the next `State` from the sums, and search, sums and update repeat until the pose converges.
+At the final pose `scores_of` computes the contribution of each correspondence to the covariance of the pose.
 
 The loop is written once. An executor says how its parts are done: blocks of rows on the host, whole arrays inside
 transformations, lanes of a vectorised batch.
@@ -95,7 +95,7 @@ class AbstractExecutor(abc.ABC):
     def update(self, state: State, sums: Any) -> State:
         """The state after an update of the pose, without the sums."""
         problem = self.problem
-        return update(state.pose, state.status, state.num_iterations, sums, problem.settings, problem.fusion)
+        return update(*state[:5], sums, problem.settings, problem.fusion)
 
     @abc.abstractmethod
     def scores(self, motion: Motion, matches: Matches, *arguments: Any) -> Scores:

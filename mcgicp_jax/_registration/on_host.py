@@ -7,7 +7,6 @@ from functools import cache, wraps
 from typing import Any
 
 import jax
-import jaxlie
 import numpy as np
 from jaxtyping import Float, Int
 
@@ -42,7 +41,9 @@ class HostExecutor(AbstractExecutor):
 
     def run(self, step: Callable[[LoopResult], LoopResult]) -> LoopResult:
         problem = self.problem
-        state = State(problem.start, np.asarray(problem.first_status), np.int32(0))
+        dtype = problem.source.points.dtype
+        still = np.zeros(6, dtype), np.zeros((), dtype)
+        state = State(problem.start, np.asarray(problem.first_status), np.int32(0), *still)
         loop, history = LoopResult(state, None, problem.terms, None), []
         while loop.state.status < 0:
             loop = step(loop)
@@ -110,7 +111,7 @@ class HostExecutor(AbstractExecutor):
         return parts[0] if len(parts) == 1 else _combined(parts)
 
     def update(self, state: State, sums: Packed[Sums]) -> State:
-        updated = _update(state.pose, state.status, state.num_iterations, sums, self._settings, self.problem.fusion)
+        updated = _update(state[:5], sums, self._settings, self.problem.fusion)
         return Packed(np.asarray(updated.table), updated.layout).tree
 
     def scores(self, motion: Motion, matches: Matches, *arguments: Any) -> Scores:
@@ -146,12 +147,10 @@ def _combined(parts: list[Packed[Sums]]) -> Packed[Sums]:
 
 @quickly_compiled
 def _update(
-    pose: jaxlie.SE3,
-    status: Any,
-    num_iterations: Any,
+    state: tuple[Any, ...],
     sums: Packed[Sums],
     settings: Packed[Settings],
     fusion: Fusion | None,
 ) -> Packed[State]:
     """`update` with packed arguments and result."""
-    return Packed.of(update(pose, status, num_iterations, sums.tree, settings.tree, fusion), num_axes=0)
+    return Packed.of(update(*state, sums.tree, settings.tree, fusion), num_axes=0)

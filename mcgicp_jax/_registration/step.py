@@ -16,7 +16,7 @@ from mcgicp_jax._clouds.point_cloud import PointCloud
 from mcgicp_jax._compute.concrete import AnyArray, AnyScalar, constant, numpy_for
 from mcgicp_jax._local_geometry.local_geometry import cell_edge
 from mcgicp_jax._local_geometry.spacing_and_noise import grid_spacing, point_spacing
-from mcgicp_jax._math.poses import move_pose
+from mcgicp_jax._math.poses import move_pose, units
 from mcgicp_jax._methods.base import AbstractMethod
 from mcgicp_jax._methods.surfaces import AnySurface, whole_surface
 from mcgicp_jax._pose_solver.degeneracy import Directions, find_directions
@@ -134,6 +134,8 @@ class State(NamedTuple):
         pose: the updated pose; once the loop has ended, the pose at which `sums` were measured.
         status: `COARSE`, `RUNNING` or `SETTLED` (negative) while the loop runs, then the value of a `Status`.
         num_iterations: number of updates so far.
+        since: (6,) sum of the updates since the last iteration whose number is a power of two, metres and radians.
+        extent: largest cost of a motion of the matches by `since` in that time.
         sums: at the pose before the update; this and the following are None before the first step on the host.
         information: (6, 6) at the pose before the update, about the centroid, lengths in units of the radius.
         directions: at the pose before the update, about the centroid; None for `estimate_pose`.
@@ -143,6 +145,8 @@ class State(NamedTuple):
     pose: jaxlie.SE3
     status: Int[AnyArray, "*batch"]
     num_iterations: Int[AnyArray, "*batch"]
+    since: Any = None
+    extent: Any = None
     sums: Any = None
     information: Any = None
     directions: Directions | None = None
@@ -154,11 +158,18 @@ def update(
     pose: jaxlie.SE3,
     status: Int[Array, ""],
     num_iterations: Int[Array, ""],
+    since: Float[Array, "6"],
+    extent: Float[Array, ""],
     sums: Sums,
     settings: Settings,
     fusion: Fusion | None = None,
 ) -> State:
-    """Update the pose, or end the loop with a status. Its program does not depend on the size of the clouds."""
+    """Update the pose, or end the loop with a status. Its program does not depend on the size of the clouds.
+
+    Matches may alternate for ever, and with them the pose. It then returns to that of the last iteration whose number
+    is a power of two (Brent 1980). Such a cycle ends the loop if its poses differ by less than a standard deviation
+    from independent residuals, which is less than that of the pose.
+    """
     directions, basis = None, jnp.eye(6, dtype=sums.center.dtype)
     degenerate: AnyScalar = np.bool_(False)
     with jax.default_matmul_precision("highest"):
@@ -174,16 +185,21 @@ def update(
             degenerate = ~jnp.all(directions.held)
     moved = move_pose(pose, change.twist, sums.center)
     coarse, settled = status == COARSE, status == SETTLED
-    translation_step = jnp.linalg.norm(change.twist[:3])
-    rotation_step = jnp.linalg.norm(change.twist[3:])
+    since = since + change.twist
+    sizes = jnp.linalg.norm(jnp.stack([change.twist, since]).reshape(2, 2, 3), axis=2)
+    (translation_step, rotation_step), (translation_since, rotation_since) = sizes
 
     def below(translation: Float[AnyScalar, ""], rotation: Float[AnyScalar, ""]) -> Bool[Array, ""]:
         return (translation_step <= translation) & (rotation_step <= rotation)
 
+    motion_since = since / units(sums.radius)
+    extent = jnp.maximum(extent, motion_since @ change.information @ motion_since * sums.radius**2)
+    returned = (translation_since <= settings.translation_tolerance) & (rotation_since <= settings.rotation_tolerance)
+    cycles = (status == RUNNING) & returned & (extent * sums.count <= sums.cost)
     motion = translation_step + sums.radius * rotation_step
     nearly = below(settings.coarse_translation_tolerance, settings.coarse_rotation_tolerance)
     nearly = nearly & (motion <= _FRACTION_OF_GATE * settings.fine_distance)
-    converged = below(settings.translation_tolerance, settings.rotation_tolerance) | (coarse & nearly)
+    converged = below(settings.translation_tolerance, settings.rotation_tolerance) | (coarse & nearly) | cycles
     finite = jnp.isfinite(sums.energy) & jnp.all(jnp.isfinite(moved.wxyz_xyz))
     outcomes: tuple[tuple[Array, int], ...] = (
         (sums.num_inliers < _MIN_CORRESPONDENCES, Status.TOO_FEW_CORRESPONDENCES),
@@ -197,11 +213,15 @@ def update(
     conditions, codes = zip(*outcomes, strict=True)
     status = jnp.select(list(conditions), [np.int32(code) for code in codes], np.int32(RUNNING))
     record = Record(sums.cost, sums.rmse, sums.num_inliers, translation_step, rotation_step)
+    num_iterations = num_iterations + (status < 0)
+    restart = num_iterations & (num_iterations - 1) == 0
     return State(
         # The loop returns the pose at which sums, information and directions were measured.
         pose=jaxlie.SE3(jnp.where(status < 0, moved.wxyz_xyz, pose.wxyz_xyz)),
         status=status,
-        num_iterations=num_iterations + (status < 0),
+        num_iterations=num_iterations,
+        since=jnp.where(restart, 0, since).astype(sums.center.dtype),
+        extent=jnp.where(restart, 0, extent).astype(sums.center.dtype),
         information=change.information,
         directions=directions,
         record=Record(*(number.astype(sums.center.dtype) for number in record)),

@@ -47,7 +47,8 @@ class TracedExecutor(AbstractExecutor):
         nowhere = jnp.full((problem.num_candidates, problem.source.num_points), -1, jnp.int32)
         matches = problem.matches or Matches(nowhere, jnp.zeros_like(problem.settings.fine_distance))
         terms = jax.tree.map(jnp.asarray, problem.terms)
-        loop = LoopResult(State(problem.start, first, jnp.int32(0)), matches, terms, None)
+        still = jnp.zeros((6,), problem.start.wxyz_xyz.dtype), jnp.zeros((), problem.start.wxyz_xyz.dtype)
+        loop = LoopResult(State(problem.start, first, jnp.int32(0), *still), matches, terms, None)
         state = jax.tree.map(
             lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), jax.eval_shape(lambda: self._state_after(loop))
         )
