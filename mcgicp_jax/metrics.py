@@ -8,6 +8,7 @@ from typing import Any, Literal, TypeAlias
 
 import jax
 import jax.numpy as jnp
+import jaxlie
 import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float
@@ -39,11 +40,13 @@ def pose_error(T: Pose, T_true: Pose, *, at: ArrayLike | None = None) -> tuple[S
 
     Returns:
         Translation in metres and rotation in radians, 0 to π: Python floats, or JAX scalars if an argument is traced.
+        NaN if `T` is, as that of a failed registration.
 
     Raises:
         ValueError: if an argument has the wrong shape or a pose is no rigid motion; the message names the argument.
     """
-    matrix, true = pose_matrix(T, "T"), pose_matrix(T_true, "T_true")
+    true = pose_matrix(T_true, "T_true")
+    matrix = np.full((4, 4), np.nan) if _is_nan(T) else pose_matrix(T, "T")
     point: Any = np.zeros(3) if at is None else at
     if np.shape(point) != (3,):
         raise ValueError(f"at: expected a point of shape (3,), got {np.shape(point)}")
@@ -53,6 +56,11 @@ def pose_error(T: Pose, T_true: Pose, *, at: ArrayLike | None = None) -> tuple[S
     dtype = jnp.result_type(*(each.dtype for each in (matrix, true, point) if not is_concrete(each)))
     with jax.default_matmul_precision("highest"):
         return _errors(jnp.asarray(matrix, dtype), jnp.asarray(true, dtype), jnp.asarray(point, dtype), jnp)
+
+
+def _is_nan(pose: Pose) -> bool:
+    matrix = pose.as_matrix() if isinstance(pose, jaxlie.SE3) else pose
+    return bool(is_concrete(matrix) and np.shape(matrix) == (4, 4) and np.isnan(matrix[:3]).all())
 
 
 def ate(poses: Poses, true_poses: Poses, alignment: Literal["umeyama", "first"] = "umeyama") -> float:
@@ -179,5 +187,6 @@ def _errors(matrix: Any, true: Any, point: Any, numpy: ModuleType) -> tuple[Any,
 def _norm(vector: Any, numpy: ModuleType) -> Any:
     """Euclidean norm with gradient 0, rather than NaN, at 0."""
     squared = (vector**2).sum()
-    positive = squared > 0
-    return numpy.where(positive, numpy.sqrt(numpy.where(positive, squared, 1)), 0)
+    # NaN is not 0.
+    nonzero = squared != 0
+    return numpy.where(nonzero, numpy.sqrt(numpy.where(nonzero, squared, 1)), 0)

@@ -302,16 +302,18 @@ def test_workers_leave_the_filters_of_warnings_alone(raw, monkeypatch):
 
 @pytest.mark.parametrize("search", [None, pytest.param(mcg.DenseSearch(), marks=pytest.mark.slow)])
 def test_a_batch_starts_from_anywhere(search):
-    """One pair of a room seen from afar, and one of different rooms; with threads and with lanes."""
+    """A room seen from afar, another room, and ten points; with threads and with lanes."""
     frames = datasets.box_room(2, points_per_frame=4000)
     away = motion((3, -2, 1, 1.0, 2.0, -0.5))
     other = datasets.box_room(1, points_per_frame=4000, seed=1)[0].cloud
-    sources = [frames[1].cloud.transform(away), other]
+    noise = np.random.default_rng(0).normal(size=(10, 3))
+    sources = [frames[1].cloud.transform(away), other, noise]
     truth = np.linalg.inv(frames[0].pose) @ frames[1].pose @ np.linalg.inv(away)
     options = {"init": "global", "max_distance": 0.5}
-    found, lost = mcg.register_batch(sources, frames[0].cloud, mcg.GICP(), search=search, **options)
+    found, unsure, lost = mcg.register_batch(sources, frames[0].cloud, mcg.GICP(), search=search, **options)
     assert found.converged and mcg.metrics.pose_error(found.matrix, truth)[0] < 0.05
-    assert lost.status is mcg.Status.TOO_FEW_CORRESPONDENCES and np.isnan(lost.matrix[:3]).all()
+    assert unsure.status is Status.UNVERIFIED and not unsure.converged and np.isfinite(unsure.matrix).all()
+    assert lost.status is Status.TOO_FEW_CORRESPONDENCES and np.isnan(lost.matrix[:3]).all()
     if search is None:
         alone = mcg.register(mcg.preprocess(sources[0]), mcg.preprocess(frames[0].cloud), mcg.GICP(), **options)
         np.testing.assert_array_equal(found.matrix, alone.matrix)

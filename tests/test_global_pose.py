@@ -20,6 +20,8 @@ from mcgicp_jax._global_pose.robust_pose_fit import (
     hypotheses,
     refined,
 )
+from mcgicp_jax._global_pose.surface_agreement import surface_agreement
+from mcgicp_jax._registration.result import is_usable
 from mcgicp_jax.metrics import pose_error
 from tests.compilations import compilations
 from tests.scenes import room_corner, wall
@@ -297,6 +299,56 @@ def test_different_rooms_do_not_match():
         assert not mcg.global_pose(*clouds).success
 
 
+def weight(result):
+    """Inliers × overlap per √matches, which alone tell right poses from wrong ones badly."""
+    return result.num_inliers * result.overlap / np.sqrt(result.num_matches)
+
+
+def test_few_matches_suffice_where_surfaces_coincide():
+    """Views of 200° of a room, of which two thirds overlap, without channels."""
+
+    def view(index, start):
+        frame = datasets.box_room(61, points_per_frame=6000, seed=4)[index]
+        x, y, _ = frame.cloud.points.T
+        return frame.cloud.points[(np.degrees(np.arctan2(y, x)) - start) % 360 < 200], frame.pose
+
+    (points, pose), (target, target_pose) = view(4, 110), view(0, 40)
+    source = mcg.PointCloud(points).transform(anywhere(7))
+    result = mcg.global_pose(source, target)
+    truth = np.linalg.inv(target_pose) @ pose @ np.linalg.inv(anywhere(7))
+    assert result.success and result.support > 1 and found(result, truth, source)
+    assert weight(result) < 1
+
+
+def test_many_matches_do_not_suffice_where_surfaces_differ():
+    first, second = (datasets.street(121, points_per_frame=15_000, seed=seed)[0].cloud for seed in (0, 2))
+    result = mcg.global_pose(bare(first), bare(second))
+    assert not result.success and not result.ambiguous and result.support < 1
+    assert weight(result) > 1.2
+
+
+def test_agreement_of_surfaces_weighs_all_directions():
+    """A floor coincides with itself wherever it is moved within its plane; a wall on it, with 8 % of the points,
+    does not.
+    """
+    rng = np.random.default_rng(0)
+    floor = rng.uniform(-1, 1, (15_000, 3)) * (3, 3, 0)
+    upright = rng.uniform((0, -3, 0.1), (0, 3, 1.5), (1300, 3))
+    moved = np.eye(4)
+    moved[0, 3] = 0.1
+
+    def agreement(matrix, points):
+        points = points + 0.005 * np.random.default_rng(1).normal(size=points.shape)
+        return surface_agreement(matrix, *(mcg.preprocess(points[i::2]) for i in (0, 1)), 0.2)
+
+    both = np.concatenate([floor, upright])
+    misfit, same = agreement(np.eye(4), both)
+    assert 0.5 < misfit < 3 and same > 0.8
+    assert agreement(moved, both)[0] > 3 * misfit and agreement(moved, floor)[0] < 3
+    moved[2, 3] = 9
+    assert agreement(moved, floor) == (np.inf, 0)
+
+
 def box(size, seed):
     """Points on the faces of a box."""
     rng, size = np.random.default_rng(seed), np.array(size)
@@ -384,8 +436,16 @@ def test_register_starts_from_anywhere():
     result = mcg.register(source, target, mcg.GICP(), init="global")
     assert result.converged and found(result, truth, source)
     other = datasets.box_room(1, points_per_frame=3000, seed=1)[0].cloud
-    lost = mcg.register(source, other, mcg.GICP(), init="global")
-    assert lost.status == mcg.Status.TOO_FEW_CORRESPONDENCES and np.isnan(lost.matrix[:3]).all()
+    start = mcg.global_pose(source, other)
+    unsure = mcg.register(source, other, mcg.GICP(), init="global")
+    assert not start.success and start.num_inliers
+    assert unsure.status is mcg.Status.UNVERIFIED and not unsure.converged and not is_usable(unsure)
+    registered = mcg.register(source, other, mcg.GICP(), init=start.matrix)
+    np.testing.assert_array_equal(unsure.matrix, registered.matrix)
+    np.testing.assert_array_equal(unsure.covariance, registered.covariance)
+    noise = np.random.default_rng(0).normal(size=(2, 10, 3))
+    lost = mcg.register(*noise, mcg.GICP(), init="global")
+    assert lost.status is mcg.Status.TOO_FEW_CORRESPONDENCES and np.isnan(lost.matrix[:3]).all()
     with pytest.raises(ValueError, match=r'^init: expected a pose, "global" or None'):
         mcg.register(source, target, mcg.GICP(), init="local")
     ready = mcg.preprocess(source)
@@ -426,8 +486,15 @@ def test_the_command_line_starts_from_anywhere(tmp_path, capsys):
     assert "start:     found, " in capsys.readouterr().out
     assert pose_error(mcg.io.read_poses(names[2])[0], truth, at=np.mean(source.coordinates, axis=0))[0] < 0.05
     mcg.io.write(names[1], bare(datasets.box_room(1, points_per_frame=3000, seed=1)[0].cloud))
-    assert main(["register", *names[:2], "--method", "gicp", "--init", "global"]) != 0
-    assert "--init global: found no pose, too few features match" in capsys.readouterr().err
+    assert main(["register", *names[:2], "--method", "gicp", "--init", "global", "--output", names[2]]) == 1
+    printed = capsys.readouterr()
+    assert "start:     unsure, " in printed.out and "status:    unverified" in printed.out
+    assert "gicp did not converge (unverified): the clouds may not show the same place" in printed.err
+    assert len(mcg.io.read_poses(names[2])) == 1
+    for name, points in zip(names, np.random.default_rng(0).normal(size=(2, 10, 3)), strict=False):
+        mcg.io.write(name, mcg.PointCloud(points))
+    assert main(["register", *names[:2], "--method", "gicp", "--init", "global"]) == 2
+    assert "--init global: found no pose, no features match" in capsys.readouterr().err
 
 
 def seen(shift, seed=0):

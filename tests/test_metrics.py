@@ -51,6 +51,20 @@ def test_the_same_pose_has_no_error():
     assert pose_error(rounded, rounded) == pytest.approx((0, 0), abs=1e-15)
 
 
+def test_a_nan_pose_has_nan_errors():
+    nowhere = np.eye(4)
+    nowhere[:3] = np.nan
+    for lost in (nowhere, jaxlie.SE3(jnp.full(7, jnp.nan))):
+        for error in (pose_error, jax.jit(pose_error)):
+            assert np.isnan(error(lost, np.eye(4))).all()
+    with pytest.raises(ValueError, match=r"^T_true: "):
+        pose_error(nowhere, nowhere)
+    partly = np.eye(4)
+    partly[0, 0] = np.nan
+    with pytest.raises(ValueError, match=r"^T: "):
+        pose_error(partly, np.eye(4))
+
+
 def test_the_error_is_that_of_the_point_asked_for():
     rng = np.random.default_rng(8)
     for _ in range(20):

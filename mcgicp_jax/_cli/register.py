@@ -50,6 +50,7 @@ class PreparedPair:
             path.stat()
         self.options = options
         self.start = np.eye(4) if options.init in (None, "global") else _read_pose("init", Path(options.init))
+        self.verified = True
         self.raw = io.read(source), io.read(target)
         self.files = {str(source): self.raw[0], str(target): self.raw[1]}
         self.choices = Choices.of(options, *self.raw)
@@ -64,7 +65,7 @@ class PreparedPair:
     def find_start(self) -> None:
         """With `--init global`, the pose by local features becomes the initial one."""
         if self.options.init == "global":
-            self.start = _found(self.raw, self.choices.channels)
+            self.start, self.verified = _found(self.raw, self.choices.channels)
 
     def method(self, name: MethodName) -> AbstractMethod:
         """The method with parameters from the options or else from the data."""
@@ -82,7 +83,8 @@ class PreparedPair:
             with_channels(raw, self.choices.channels) if side in method.needs_covariances else ready
             for side, raw, ready in zip(("source", "target"), self.raw, self.ready, strict=True)
         )
-        return mcg.register(source, target, method, init=self.start, **self.arguments(name))
+        result = mcg.register(source, target, method, init=self.start, **self.arguments(name))
+        return result if self.verified else result.unverified()
 
     def arguments(self, name: MethodName) -> dict[str, Any]:
         return self.choices.arguments(name, lambda: self.ready)
@@ -274,11 +276,11 @@ def _read_pose(option: str, path: Path) -> Float[np.ndarray, "4 4"]:
     return poses[0]
 
 
-def _found(clouds: Sequence[mcg.PointCloud], channels: Sequence[str]) -> Float[np.ndarray, "4 4"]:
-    """The pose from any start; raises `ValueError` if it cannot be trusted."""
+def _found(clouds: Sequence[mcg.PointCloud], channels: Sequence[str]) -> tuple[Float[np.ndarray, "4 4"], bool]:
+    """The pose from any start, and whether to trust it; raises `ValueError` if there is none."""
     result = mcg.global_pose(*(with_channels(cloud, channels) for cloud in clouds))
-    if not result.success:
-        reason = "several poses fit about equally well" if result.ambiguous else "too few features match"
-        raise ValueError(f"--init global: found no pose, {reason} ({result}); try --init with a file")
-    print(f"start:     found, {result.num_inliers:,} of {result.num_matches:,} features match")
-    return result.matrix
+    if not result.num_inliers:
+        raise ValueError(f"--init global: found no pose, no features match ({result}); try --init with a file")
+    verdict = "found" if result.success else "ambiguous" if result.ambiguous else "unsure"
+    print(f"start:     {verdict}, {result.num_inliers:,} of {result.num_matches:,} features match")
+    return result.matrix, result.success

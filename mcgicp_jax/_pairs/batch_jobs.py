@@ -82,12 +82,19 @@ class PairResult:
 
 @dataclass(frozen=True)
 class _LanePair:
-    """A pair in a lane: its index, its preprocessed clouds, and which source points can be matched."""
+    """A pair in a lane.
+
+    Attributes:
+        source, target: preprocessed.
+        used: which source points can be matched.
+        verified: False if the initial pose is one that `global_pose` doubts.
+    """
 
     index: int
     source: PointCloud
     target: PointCloud
     used: Bool[np.ndarray, "n"]
+    verified: bool
 
 
 @dataclass(frozen=True)
@@ -97,6 +104,7 @@ class _GivenPair:
     index: int
     given: Given
     init: Pose | None
+    verified: bool
 
 
 def _of_a_pair(work: Callable[..., Any]) -> Callable[..., Any]:
@@ -171,7 +179,7 @@ class BatchJob:
                 result = registration_of(
                     ended.state, ended.assessment, ended.history, pair.source, pair.target, pair.used
                 )
-                yield PairResult(pair.index, result)
+                yield PairResult(pair.index, result if pair.verified else result.unverified())
             yield from rejected
 
     @_of_a_pair
@@ -193,31 +201,35 @@ class BatchJob:
         ]
         runs = in_new_thread(partial(side_by_side, calls, num_cores()))
         both = zip(runs, ready, strict=True)
-        ended = [(run, pair.given) for run, pair in both if isinstance(run, Run) and isinstance(pair, _GivenPair)]
-        results = iter(results_of([run for run, _ in ended], [given for _, given in ended]))
+        ended = [(run, pair) for run, pair in both if isinstance(run, Run) and isinstance(pair, _GivenPair)]
+        found = results_of([run for run, _ in ended], [pair.given for _, pair in ended])
+        results = iter(
+            result if pair.verified else result.unverified() for result, (_, pair) in zip(found, ended, strict=True)
+        )
         return [next(results) if isinstance(run, Run) else run.with_warning()[1] for run in runs]
 
     @_of_a_pair
     def _given(self, pair: Pair) -> PairResult | _GivenPair:
         source, target = self._clouds(pair)
         warn_of_estimated_parameters(self.method, source, target)
-        init = self._start(pair, primal(source), primal(target))
-        if isinstance(init, PairResult):
-            return init
-        return _GivenPair(pair.index, prepared(source, target, self.method, self.options), primal(init))
+        start = self._start(pair, primal(source), primal(target))
+        if isinstance(start, PairResult):
+            return start
+        init, verified = start
+        return _GivenPair(pair.index, prepared(source, target, self.method, self.options), primal(init), verified)
 
     @_of_a_pair
     def _run(self, pair: _GivenPair, values: Given) -> PairResult | Run:
         return run_pair(values, pair.init, replace(self.options, search=self.search))
 
-    def _start(self, pair: Pair, source: PointCloud, target: PointCloud) -> PairResult | Pose | None:
-        """The initial pose of a pair, or its result if none is found."""
+    def _start(self, pair: Pair, source: PointCloud, target: PointCloud) -> PairResult | tuple[Pose | None, bool]:
+        """The initial pose of a pair and whether to trust it, or the result of the pair if no pose is found."""
         if not isinstance(pair.init, str):
-            return pair.init
+            return pair.init, True
         start = start_from_anywhere(pair.init, source, target)
-        if start.success:
-            return start.matrix
-        return PairResult(pair.index, RegistrationResult.without_pose(Status.TOO_FEW_CORRESPONDENCES))
+        if start is None:
+            return PairResult(pair.index, RegistrationResult.without_pose(Status.TOO_FEW_CORRESPONDENCES))
+        return start.matrix, start.success
 
     @_of_a_pair
     def _problem(self, pair: Pair) -> PairResult | tuple[_LanePair, Problem]:
@@ -226,14 +238,15 @@ class BatchJob:
         With `max_source_points`, the surface of the source is padded to the size class of this number at most.
         """
         source, target = self._clouds(pair)
-        init = self._start(pair, source, target)
-        if isinstance(init, PairResult):
-            return init
+        start = self._start(pair, source, target)
+        if isinstance(start, PairResult):
+            return start
+        init, verified = start
         problem, _ = pose_problem(source, target, self.method, init, self.options, num_threads=1)
         used, size = problem.source.search.valid, size_class(max(len(source.points), len(target.points)))
         few = self.options.max_source_points
         sizes = size if few is None else min(size, size_class(few)), size
-        return _LanePair(pair.index, source, target, used), _padded(problem.whole(), sizes)
+        return _LanePair(pair.index, source, target, used, verified), _padded(problem.whole(), sizes)
 
 
 def _loaded(load: Callable[[], PointCloud | Values]) -> PointCloud | Values:

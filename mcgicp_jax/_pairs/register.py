@@ -60,9 +60,9 @@ def register(
     The derivative is by points, channels, given covariances and given parameters; that by `init` is 0. Matches,
     neighbours and estimated parameters are constants. α has a derivative only with soft matches: see `estimate_pose`.
     Of a DEGENERATE pose it is that within the constrained directions, which are constants, too, and 0 along the others.
-    If registration fails otherwise, the derivative is 0, never NaN, except after MAX_ITERATIONS. Outside `jit` it costs
-    about as much as the registration, for clouds of any size; inside, each size compiles for some ten seconds, so pad
-    clouds (`PointCloud.pad`). `register_batch` differentiates many pairs at once.
+    If registration fails otherwise, the derivative is 0, never NaN, except after MAX_ITERATIONS or if UNVERIFIED.
+    Outside `jit` it costs about as much as the registration, for clouds of any size; inside, each size compiles for
+    some ten seconds, so pad clouds (`PointCloud.pad`). `register_batch` differentiates many pairs at once.
 
     Args:
         source, target: clouds from `preprocess`. Raw clouds and (N, 3) arrays, metres, are preprocessed with the
@@ -71,8 +71,8 @@ def register(
             `voxel_gaussians` or with `voxel_sizes`, `NDT()`, `ColorNDT(...)`, `D2DNDT()`. Parameters left None are
             estimated.
         init: initial T_target_source, `jaxlie.SE3` or (4, 4); the identity by default. "global": the pose found by
-            `global_pose`; if it does not succeed, the status is TOO_FEW_CORRESPONDENCES and the pose NaN. "global" is
-            not available inside transformations.
+            `global_pose`. If it does not succeed, the status is UNVERIFIED, or if it finds no pose at all,
+            TOO_FEW_CORRESPONDENCES, and the pose NaN. "global" is not available inside transformations.
         max_distance: maximum correspondence distance, metres of position; matches beyond it are rejected. One number,
             or two: for the coarse and for the fine phase. None: 10 and 2.5 times the spacing of the target (its median
             nearest-neighbour distance, or the edge of its cells). The first is also at least 10 times the spacing of a
@@ -169,24 +169,26 @@ def register_from(
 ) -> RegistrationResult:
     """`register` with its options as one object."""
     check_method(method)
+    verified = True
     if isinstance(init, str):
         start = start_from_anywhere(init, primal(source), primal(target))
-        if not start.success:
+        if start is None:
             return RegistrationResult.without_pose(Status.TOO_FEW_CORRESPONDENCES)
-        init = start.matrix
+        init, verified = start.matrix, start.success
     result = register_pair(source, target, method, init, options, tie_points, prior)
     if is_concrete(result.overlap, result.status_code) and is_usable(result):
         overlap = float(np.asarray(result.overlap))
         if overlap < _LEAST_OVERLAP:
             message = f"only {100 * overlap:.2g} % of the source points have a match, so the pose is probably wrong"
             warn(f'{message}; pass a better init, or init="global"')
-    return result
+    return result if verified else result.unverified()
 
 
-def start_from_anywhere(init: str, source: PointCloud | Values, target: PointCloud | Values) -> GlobalPoseResult:
-    """The initial pose of a registration with `init="global"`."""
+def start_from_anywhere(init: str, source: PointCloud | Values, target: PointCloud | Values) -> GlobalPoseResult | None:
+    """The initial pose of a registration with `init="global"`; None if no match supports any pose."""
     if init != "global":
         raise ValueError(f'init: expected a pose, "global" or None, got {init!r}')
     if not is_concrete(source, target):
         raise ValueError('init: expected a pose inside transformations, got "global"')
-    return global_pose(source, target)
+    start = global_pose(source, target)
+    return start if start.num_inliers else None

@@ -37,6 +37,7 @@ class Status(enum.IntEnum):
         NON_FINITE: the pose or the sums overflowed or became NaN.
         INVALID_INPUT: `register` would raise a `ValueError` for this pair. Only in batches; the pose is NaN.
         WORKER_FAILED: two workers in turn failed with this pair. Only in batches; the pose is NaN.
+        UNVERIFIED: with `init="global"`, the pose is registered, but it may be wrong: `global_pose` had no success.
     """
 
     CONVERGED = 0
@@ -46,6 +47,7 @@ class Status(enum.IntEnum):
     NON_FINITE = 4
     INVALID_INPUT = 5
     WORKER_FAILED = 6
+    UNVERIFIED = 7
 
     # Print the name: an IntEnum prints its number.
     __str__ = enum.Enum.__str__
@@ -68,6 +70,8 @@ _ADVICE = {
     Status.NON_FINITE: "numerical overflow; are the coordinates in metres?",
     Status.INVALID_INPUT: "register raises an error for this pair; see its warning",
     Status.WORKER_FAILED: "two workers failed with this pair; try register, or smaller clouds",
+    Status.UNVERIFIED: "the clouds may not show the same place, or other poses fit as well; "
+    "look at the clouds at this pose, or try clouds that show more of the scene",
 }
 
 
@@ -170,6 +174,12 @@ class RegistrationResult(eqx.Module):
             uncertainty=Lazy.of(Uncertainty(np.full((6, 6), np.nan), np.full(6, np.nan))),
             derivative=Held(),
         )
+
+    def unverified(self) -> RegistrationResult:
+        """The result, with the status UNVERIFIED if the pose is usable."""
+        if not is_usable(self):
+            return self
+        return self.build(**vars(self) | {"status_code": np.int32(Status.UNVERIFIED)})
 
     @property
     def information(self) -> Float[AnyArray, "*batch 6 6"]:
@@ -292,7 +302,8 @@ class RegistrationResult(eqx.Module):
 def is_usable(result: RegistrationResult) -> bool:
     """Whether the pose may start another registration: it is finite and based on enough matches.
 
-    This includes MAX_ITERATIONS and DEGENERATE, where unconstrained directions may still have their initial values.
+    This includes MAX_ITERATIONS and DEGENERATE, where unconstrained directions may still have their initial values, but
+    not UNVERIFIED: other registrations would inherit a wrong pose, and end as CONVERGED.
     """
     return result.status in (Status.CONVERGED, Status.DEGENERATE, Status.MAX_ITERATIONS)
 

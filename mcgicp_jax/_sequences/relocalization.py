@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 from jaxtyping import Float
 
@@ -11,6 +9,7 @@ from mcgicp_jax._clouds.point_cloud import PointCloud
 from mcgicp_jax._clouds.preprocess import with_neighbors
 from mcgicp_jax._clouds.voxel_map import VoxelMap
 from mcgicp_jax._global_pose.global_pose import global_pose
+from mcgicp_jax._global_pose.surface_agreement import spreads
 from mcgicp_jax._methods.base import AbstractMethod
 from mcgicp_jax._registration.options import Options
 from mcgicp_jax._registration.register_pair import register_pair
@@ -27,9 +26,6 @@ _WRONG = 2.0
 # Misfit of a right pose if both clouds are equally noisy: √2 times the 90 % quantile of |x| for normal x. A sensor at
 # rest that repeats its frames has less.
 _LEAST_MISFIT = 2.3
-# Least thickness of a neighbourhood, as a fraction of its standard deviation along the surface: √ε of GICP. Without
-# noise it is 0 on planes, where the misfit would be rounding.
-_THINNEST = 0.032
 # Number of points whose misfit is measured; a match is on the same surface if it is within this multiple of the
 # standard deviation of the neighbourhood along the surface.
 _SAMPLE, _WITHIN = 2048, 3.0
@@ -97,19 +93,13 @@ def misfit_of(source: PointCloud, target: PointCloud, result: RegistrationResult
         return np.inf
     points, rows = source.coordinates, np.flatnonzero(np.asarray(source.valid))
     rows = rows[np.random.default_rng(0).integers(0, len(rows), _SAMPLE)]
-    neighbors: Any = source.deferred_neighbors
-    near = neighbors[rows]
-    offsets = np.where(near[..., None] >= 0, points[near] - points[rows][:, None], 0)
-    offsets -= offsets.mean(axis=1, keepdims=True)
-    squares, axes = np.linalg.eigh(offsets.swapaxes(1, 2) @ offsets / near.shape[1])
-    thin, along, _ = np.sqrt(np.maximum(squares.T, np.finfo(np.float32).tiny))
-    thin = np.maximum(thin, _THINNEST * along)
+    thin, along, normals = spreads(points, source.deferred_neighbors, rows)
     matrix, known = np.asarray(result.matrix), target.coordinates[np.asarray(target.valid)]
     moved = points[rows] @ matrix[:3, :3].T + matrix[:3, 3]
     matches = nearest_in_position(moved, known, float(_WITHIN * along.max()))
     residuals = (known[matches] - moved) @ matrix[:3, :3]
     matched = (matches >= 0) & (np.linalg.norm(residuals, axis=1) <= _WITHIN * along)
-    across = np.abs(np.sum(residuals * axes[:, :, 0], axis=1)) / thin
+    across = np.abs(np.sum(residuals * normals, axis=1)) / thin
     return float(np.quantile(across[matched], 0.9)) if matched.any() else np.inf
 
 
