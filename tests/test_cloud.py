@@ -11,8 +11,7 @@ import numpy as np
 import pytest
 
 from mcgicp_jax import GICP, PointCloud, preprocess, register
-from mcgicp_jax._clouds.frame import Frame
-from mcgicp_jax._clouds.point_cloud import as_cloud
+from mcgicp_jax._clouds.point_cloud import Frame, as_cloud
 from tests import reference as ref
 from tests.precision import tolerance
 

@@ -1,4 +1,4 @@
-"""The point cloud: positions, channels, and optionally neighbours and given covariances."""
+"""Point clouds with channels, and frames: clouds with the pose and the time of their sensor."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.typing import ArrayLike
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Float, Int, UInt8
 
 from mcgicp_jax._clouds.columns import arrays_of
 from mcgicp_jax._compute.concrete import is_concrete
@@ -435,3 +435,24 @@ def _build(**fields: Any) -> PointCloud:
     for name, value in fields.items():
         object.__setattr__(cloud, name, value)
     return cloud
+
+
+@dataclass(frozen=True, eq=False)
+class Frame:
+    """A cloud with the pose and the time of the sensor.
+
+    The true relative pose of two frames is `T_target_source = inv(target.pose) @ source.pose`.
+
+    Attributes:
+        cloud: in the sensor's frame, metres.
+        pose: (4, 4), sensor to world, metres; None if unknown.
+        time: seconds from an arbitrary start; None if unknown.
+        image: (height, width, 3) red, green and blue from 0 to 255; None if there is none.
+        pixels: (N, 2) column and row of each point in the image, NaN where it is outside; None without an image.
+    """
+
+    cloud: PointCloud
+    pose: Float[np.ndarray, "4 4"] | None = None
+    time: float | None = None
+    image: UInt8[np.ndarray, "height width 3"] | None = None
+    pixels: Float[np.ndarray, "N 2"] | None = None

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, Int
 
-from mcgicp_jax._clouds.frame import Frame
+from mcgicp_jax._clouds.point_cloud import Frame
 from mcgicp_jax._search.kd_tree import nearest_in_position
 
 # Largest ratio of the distances to the best and the second best match (Lowe 2004).

@@ -12,8 +12,7 @@ from typing import Any, Literal, Unpack
 import numpy as np
 from jaxtyping import Float
 
-from mcgicp_jax._clouds.frame import Frame
-from mcgicp_jax._clouds.point_cloud import PointCloud, Values, Voxels, as_cloud
+from mcgicp_jax._clouds.point_cloud import Frame, PointCloud, Values, Voxels, as_cloud
 from mcgicp_jax._clouds.preprocess import check_preprocessing, preprocess
 from mcgicp_jax._clouds.voxel_map import VoxelMap
 from mcgicp_jax._clouds.voxel_size import NUM_NEIGHBORS, VoxelSize, voxels_for

@@ -1,6 +1,6 @@
 """Sequences of frames: synthetic scenes with exact poses, and readers of public data sets."""
 
-from mcgicp_jax._clouds.frame import Frame
+from mcgicp_jax._clouds.point_cloud import Frame
 from mcgicp_jax.datasets._box_room import box_room
 from mcgicp_jax.datasets._ford import ford_campus
 from mcgicp_jax.datasets._frames import AbstractFrames, SyntheticFrames

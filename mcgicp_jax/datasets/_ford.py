@@ -10,8 +10,7 @@ import numpy as np
 from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
-from mcgicp_jax._clouds.frame import Frame
-from mcgicp_jax._clouds.point_cloud import PointCloud
+from mcgicp_jax._clouds.point_cloud import Frame, PointCloud
 from mcgicp_jax.datasets._frames import AbstractFrames, pose_of
 from mcgicp_jax.datasets._images import look_up, read_image
 

@@ -9,8 +9,7 @@ import numpy as np
 from jaxtyping import Float
 
 from mcgicp_jax import io
-from mcgicp_jax._clouds.frame import Frame
-from mcgicp_jax._clouds.point_cloud import PointCloud
+from mcgicp_jax._clouds.point_cloud import Frame, PointCloud
 from mcgicp_jax.datasets._frames import AbstractFrames
 from mcgicp_jax.datasets._images import Picture, look_up, read_image
 

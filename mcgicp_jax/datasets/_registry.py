@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from mcgicp_jax import io
-from mcgicp_jax._clouds.frame import Frame
+from mcgicp_jax._clouds.point_cloud import Frame
 from mcgicp_jax.datasets._box_room import box_room
 from mcgicp_jax.datasets._ford import ford_campus
 from mcgicp_jax.datasets._frames import AbstractFrames

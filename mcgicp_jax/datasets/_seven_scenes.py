@@ -8,8 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from mcgicp_jax import io
-from mcgicp_jax._clouds.frame import Frame
-from mcgicp_jax._clouds.point_cloud import PointCloud
+from mcgicp_jax._clouds.point_cloud import Frame, PointCloud
 from mcgicp_jax.datasets._frames import AbstractFrames
 from mcgicp_jax.datasets._images import back_project, look_up, read_depth, read_image
 

@@ -11,8 +11,7 @@ from jaxtyping import Float
 from scipy.spatial.transform import Rotation, Slerp
 
 from mcgicp_jax import io
-from mcgicp_jax._clouds.frame import Frame
-from mcgicp_jax._clouds.point_cloud import PointCloud
+from mcgicp_jax._clouds.point_cloud import Frame, PointCloud
 from mcgicp_jax.datasets._frames import AbstractFrames, pose_of
 from mcgicp_jax.datasets._images import back_project, look_up, read_depth, read_image
 
