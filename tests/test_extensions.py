@@ -8,6 +8,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 
 import mcgicp_jax as mcg
 from mcgicp_jax import extend
@@ -228,6 +229,18 @@ def test_a_loss():
         forward = jax.jvp(loss, arguments, (gradients[0], jnp.asarray(0.0)))[1]
         np.testing.assert_allclose(forward, np.sum(gradients[0] ** 2, dtype=np.float64), rtol=1e-4)
     assert not found
+
+
+def test_a_loss_that_is_written_wrongly_is_refused():
+    points = np.zeros((5, 3))
+    with pytest.raises(ValueError, match="inputs: expected each to be an Input"):
+        extend.blockwise(feature_cost, 1.0, points, total=True)
+    with pytest.raises(ValueError, match="function: expected a tuple"):
+        extend.blockwise(same_rows, 1.0, extend.Input(points))
+
+
+def same_rows(_, rows):
+    return rows.tree
 
 
 def test_the_command_line_has_what_is_registered(tmp_path):

@@ -115,7 +115,8 @@ def test_too_few_matches_go_before_convergence(before, count):
     number = measured.center.dtype.type
     settings = Settings(*map(number, (0.5, 0.5)), np.int32(1), *map(number, [1e-3] * 4), np.int32(9), np.bool_(True))
     start = jaxlie.SE3(jnp.array([1, 0, 0, 0, 0, 0, 0], number))
-    status = update(start, np.int32(before), np.int32(1), measured, settings).status
+    still = jnp.zeros(6, number), jnp.zeros((), number)
+    status = update(start, np.int32(before), np.int32(1), *still, measured, settings).status
     enough = {COARSE: RUNNING, RUNNING: SETTLED, SETTLED: Status.CONVERGED}
     assert status == (enough[before] if count >= 4 else Status.TOO_FEW_CORRESPONDENCES)
 

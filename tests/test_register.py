@@ -164,6 +164,14 @@ def test_robust_kernels_resist_outliers(robust):
 # --- Outcomes
 
 
+def test_a_coarse_phase_without_matches_has_no_covariance():
+    """It ends with a part of the source points."""
+    points = np.random.default_rng(0).random((8200, 3))
+    far = motion((50, 0, 0, 0, 0, 0))
+    result = mcg.register(points, points, mcg.PointToPoint(), init=far, max_distance=(0.5, 0.1), max_source_points=None)
+    assert result.status is Status.TOO_FEW_CORRESPONDENCES and np.isnan(result.deviations).all()
+
+
 def test_clouds_without_overlap_do_not_converge(room):
     source, target, _ = room
     result = mcg.register(source, target, mcg.GICP(), init=motion((50, 0, 0, 0, 0, 0)), max_distance=0.5)

@@ -31,6 +31,7 @@ from mcgicp_jax._compute.threads import side_by_side
 from mcgicp_jax._methods.base import AbstractMethod
 from mcgicp_jax._methods.registry import METHODS
 from mcgicp_jax._pose_solver.degeneracy import describe
+from mcgicp_jax._registration.result import unverified
 from mcgicp_jax.io.clouds import format_of
 
 Source: TypeAlias = Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="SOURCE")]
@@ -84,7 +85,7 @@ class PreparedPair:
             for side, raw, ready in zip(("source", "target"), self.raw, self.ready, strict=True)
         )
         result = mcg.register(source, target, method, init=self.start, **self.arguments(name))
-        return result if self.verified else result.unverified()
+        return result if self.verified else unverified(result)
 
     def arguments(self, name: MethodName) -> dict[str, Any]:
         return self.choices.arguments(name, lambda: self.ready)

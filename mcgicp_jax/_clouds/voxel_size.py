@@ -16,6 +16,7 @@ from jaxtyping import Float
 
 from mcgicp_jax._clouds.point_cloud import LARGEST, PointCloud, Voxels
 from mcgicp_jax._clouds.voxels import VOXELS_PER_AXIS, Grid, grid_of
+from mcgicp_jax._compute.concrete import is_concrete
 from mcgicp_jax._compute.linear_maps import primal
 from mcgicp_jax._compute.messages import warn
 from mcgicp_jax._compute.threads import side_by_side
@@ -96,6 +97,9 @@ def voxels_and_grids(voxel_size: VoxelSize | Voxels, *clouds: PointCloud) -> tup
     given = [cloud.voxels for cloud in clouds if cloud.voxel_size is not None]
     if given:
         return given[0], none
+    if not is_concrete(primal(clouds)):
+        # `preprocess` says what is expected.
+        return Voxels(), none
     raw = {row: cloud for row, cloud in enumerate(clouds) if cloud.deferred_neighbors is None}
     points = {row: _finite_points(cloud) for row, cloud in raw.items()}
     counts = [len(each) for each in points.values()]

@@ -117,13 +117,15 @@ def is_symbolic_zero(tangent: object) -> bool:
 
 @jax.custom_jvp
 def once(value: Any) -> Any:
-    """The value. Its derivative raises an error, because second derivatives of the pose would be wrong."""
+    """The value. Its derivative raises an error, because second derivatives would be wrong."""
     return value
 
 
 def _once_jvp(primals: tuple[Any], tangents: tuple[Any]) -> tuple[Any, Any]:
     if not is_symbolic_zero(tangents[0]):
-        raise NotImplementedError("poses of register and estimate_pose have first derivatives only, not second ones")
+        raise NotImplementedError(
+            "poses have first derivatives only, not second ones; costs and sums over rows have them inside jit"
+        )
     return primals[0], jnp.zeros_like(primals[0])
 
 

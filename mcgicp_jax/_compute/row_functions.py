@@ -404,8 +404,15 @@ def blockwise(function: Callable[..., Any], numbers: Any, *inputs: Input, total:
         total: whether the function returns a sum.
 
     Returns:
-        What the function returns, for all rows. Trees of rows after the first are constants to autodiff.
+        What the function returns, for all rows. Of several returned trees of rows, those after the first are constants
+        to autodiff. Outside `jit`, first derivatives only.
+
+    Raises:
+        ValueError: if an input is no `Input`, or the function returns no tuple of trees, and `total` is False.
     """
+    if not all(isinstance(each, Input) for each in inputs):
+        kinds = ", ".join(type(each).__name__ for each in inputs)
+        raise ValueError(f"inputs: expected each to be an Input, as Input(array, row_numbers), got {kinds}")
     if not is_concrete(primal((numbers, [each for each in inputs if not isinstance(each.table, Table)]))):
         return over_whole(function, numbers, inputs, total)
     first = inputs[0]
@@ -525,6 +532,8 @@ def _program(function: Callable[..., Any], total: bool, packed: bool, quickly: b
         found = function(numbers, *_unpacked(packs, indices))
         if not packed:
             return found
+        if not total and type(found) is not tuple:
+            raise ValueError("function: expected a tuple of pytrees with one row each; with total=True, a sum")
         return Packed.of(found, num_axes=0) if total else tuple(Packed.of(part) for part in found)
 
     program.__name__ = function.__name__

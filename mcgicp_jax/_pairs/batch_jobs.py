@@ -31,7 +31,7 @@ from mcgicp_jax._registration.input_checks import warn_of_estimated_parameters, 
 from mcgicp_jax._registration.options import Options
 from mcgicp_jax._registration.pose_derivative import Given
 from mcgicp_jax._registration.register_pair import Run, pose_problem, prepared, preprocessed, results_of, run_pair
-from mcgicp_jax._registration.result import RegistrationResult, Status, computed
+from mcgicp_jax._registration.result import RegistrationResult, Status, computed, unverified
 from mcgicp_jax._registration.step import Problem
 from mcgicp_jax._registration.vectorized import run_problems
 from mcgicp_jax._search.base import AbstractSearch
@@ -179,7 +179,7 @@ class BatchJob:
                 result = registration_of(
                     ended.state, ended.assessment, ended.history, pair.source, pair.target, pair.used
                 )
-                yield PairResult(pair.index, result if pair.verified else result.unverified())
+                yield PairResult(pair.index, result if pair.verified else unverified(result))
             yield from rejected
 
     @_of_a_pair
@@ -204,7 +204,7 @@ class BatchJob:
         ended = [(run, pair) for run, pair in both if isinstance(run, Run) and isinstance(pair, _GivenPair)]
         found = results_of([run for run, _ in ended], [pair.given for _, pair in ended])
         results = iter(
-            result if pair.verified else result.unverified() for result, (_, pair) in zip(found, ended, strict=True)
+            result if pair.verified else unverified(result) for result, (_, pair) in zip(found, ended, strict=True)
         )
         return [next(results) if isinstance(run, Run) else run.with_warning()[1] for run in runs]
 

@@ -20,7 +20,7 @@ from mcgicp_jax._registration.input_checks import warn_of_estimated_parameters, 
 from mcgicp_jax._registration.measurements import GivenPrior, GivenTiePoints
 from mcgicp_jax._registration.options import Distance, Options, check_method
 from mcgicp_jax._registration.register_pair import register_pair
-from mcgicp_jax._registration.result import RegistrationResult, Status, is_usable
+from mcgicp_jax._registration.result import RegistrationResult, Status, is_usable, unverified
 from mcgicp_jax._search.base import AbstractSearch
 
 # Smallest overlap without a warning. Pairs of scans that overlap by 10 to 30 % count as the hardest that can be
@@ -181,7 +181,7 @@ def register_from(
         if overlap < _LEAST_OVERLAP:
             message = f"only {100 * overlap:.2g} % of the source points have a match, so the pose is probably wrong"
             warn(f'{message}; pass a better init, or init="global"')
-    return result if verified else result.unverified()
+    return result if verified else unverified(result)
 
 
 def start_from_anywhere(init: str, source: PointCloud | Values, target: PointCloud | Values) -> GlobalPoseResult | None:

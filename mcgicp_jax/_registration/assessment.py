@@ -69,7 +69,7 @@ def assessment_of(executor: AbstractExecutor, loop: LoopResult, moments: Lazy[Mo
 def moments_of(executor: AbstractExecutor, loop: LoopResult) -> Moments:
     """Sums over the scores of all correspondences at the final pose."""
     problem, state = executor.problem, loop.state
-    motion, size = Motion.of(state.pose.wxyz_xyz), problem.source.search.valid.size
+    motion, size = Motion.of(state.pose.wxyz_xyz), executor.source_of(loop.matches).valid.size
     one = np.ones((), problem.source.points.dtype)
     frame = Frame(state.sums.center, state.sums.radius, np.tile(one, 2), one, np.int32(size))
     if problem.source.observed:
@@ -84,7 +84,7 @@ def moments_of(executor: AbstractExecutor, loop: LoopResult) -> Moments:
 def _discounts_and_reach(
     executor: AbstractExecutor, motion: Motion, matches: Matches
 ) -> tuple[Float[AnyArray, "2"], Float[AnyScalar, ""]]:
-    search = executor.problem.source.search
+    search = executor.source_of(matches)
     rows, counts = sampled_rows(search.valid)
     xp = numpy_for(counts)
     nearest = executor.nearest_candidates(motion, matches.some(rows))

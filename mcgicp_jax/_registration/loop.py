@@ -109,8 +109,13 @@ class AbstractExecutor(abc.ABC):
         terms = self.problem.terms
         if not is_adaptive(terms):
             return terms
-        motion, valid = Motion.of(state.pose.wxyz_xyz), self.problem.source.search.valid
+        motion, valid = Motion.of(state.pose.wxyz_xyz), self.source_of(matches).valid
         return adapted(terms, valid, lambda term, rows: self.rows(sample_of_term, motion, matches.some(rows), term))
+
+    def source_of(self, matches: Matches) -> SearchPoints:
+        """The source points that have these matches: in the coarse phase on the host, every `coarse_stride`-th."""
+        source = self.problem.source.search
+        return source if matches.rows is None else jax.tree.map(lambda array: array[matches.rows], source)
 
     def rematched(
         self, pose: jaxlie.SE3, shift: Float[AnyArray, "3"], rows: Int[AnyArray, "n"], counts: Bool[AnyArray, "n"]

@@ -175,12 +175,6 @@ class RegistrationResult(eqx.Module):
             derivative=Held(),
         )
 
-    def unverified(self) -> RegistrationResult:
-        """The result, with the status UNVERIFIED if the pose is usable."""
-        if not is_usable(self):
-            return self
-        return self.build(**vars(self) | {"status_code": np.int32(Status.UNVERIFIED)})
-
     @property
     def information(self) -> Float[AnyArray, "*batch 6 6"]:
         """(6, 6) Σ w Jᵀ M J, the Gauss-Newton Hessian of half the cost in ξ.
@@ -311,3 +305,10 @@ def is_usable(result: RegistrationResult) -> bool:
 def computed(result: RegistrationResult) -> RegistrationResult:
     """The result with its deferred fields computed, so that it no longer references the clouds."""
     return jax.tree.map(lambda leaf: leaf, result)
+
+
+def unverified(result: RegistrationResult) -> RegistrationResult:
+    """The result, with the status UNVERIFIED if the pose is usable."""
+    if not is_usable(result):
+        return result
+    return result.build(**vars(result) | {"status_code": np.int32(Status.UNVERIFIED)})
