@@ -324,7 +324,8 @@ def test_many_matches_do_not_suffice_where_surfaces_differ():
     first, second = (datasets.street(121, points_per_frame=15_000, seed=seed)[0].cloud for seed in (0, 2))
     result = mcg.global_pose(bare(first), bare(second))
     assert not result.success and not result.ambiguous and result.support < 1
-    assert weight(result) > 1.2
+    # Their number turns on rounding: 54 on one processor.
+    assert result.num_inliers > 30
 
 
 def test_agreement_of_surfaces_weighs_all_directions():
