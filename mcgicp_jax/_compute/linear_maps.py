@@ -16,7 +16,7 @@ from jax.extend.core import Primitive
 from jax.interpreters import ad, batching, mlir
 
 from mcgicp_jax._compute.concrete import is_concrete, is_deferred
-from mcgicp_jax._compute.threads import in_new_thread, own_checks, side_by_side
+from mcgicp_jax._compute.threads import in_new_thread, side_by_side, without_checks_of_jax
 
 
 class AbstractLinearMap(abc.ABC):
@@ -87,7 +87,7 @@ def with_derivative(values: Sequence[np.ndarray], linear: AbstractLinearMap, inp
     def attached(*inputs: Any) -> list[jax.Array]:
         return [jnp.asarray(value) for value in values]
 
-    @own_checks
+    @without_checks_of_jax
     def rule(inputs: tuple[Any, ...], tangents: tuple[Any, ...]) -> tuple[list[jax.Array], list[jax.Array]]:
         # An outer differentiation, even by other inputs, would see constants.
         for each in inputs:
@@ -124,7 +124,7 @@ def once(value: Any) -> Any:
 def _once_jvp(primals: tuple[Any], tangents: tuple[Any]) -> tuple[Any, Any]:
     if not is_symbolic_zero(tangents[0]):
         raise NotImplementedError(
-            "poses have first derivatives only, not second ones; costs and sums over rows have them inside jit"
+            "poses have first derivatives only; second derivatives of costs and sums over rows exist inside jit alone"
         )
     return primals[0], jnp.zeros_like(primals[0])
 
@@ -138,7 +138,7 @@ _linear.multiple_results = True
 
 
 @_linear.def_impl
-@own_checks
+@without_checks_of_jax
 def _call(*operands: Any, function: Callable, transpose: Callable, inputs: Any, outputs: Any, batch: Any) -> list[Any]:
     count = math.prod(batch)
     arrays = [np.asarray(each).reshape((count, *aval.shape)) for each, aval in zip(operands, inputs, strict=True)]

@@ -29,7 +29,7 @@ from mcgicp_jax._compute.concrete import Deferred, is_concrete, outside_trace
 from mcgicp_jax._compute.linear_maps import AbstractLinearMap, primal, with_derivative
 from mcgicp_jax._compute.programs import quickly_compiled
 from mcgicp_jax._compute.tables import BLOCK, NEIGHBORHOOD_BLOCK, Packed, RowsOnDemand, blocks
-from mcgicp_jax._compute.threads import num_cores, own_checks, side_by_side
+from mcgicp_jax._compute.threads import num_cores, side_by_side, without_checks_of_jax
 
 # Points. Inside transformations, neighbourhoods of more points are processed in blocks, too: on CPUs XLA sums over the
 # first axis of a wider table column by column, which is twenty times slower.
@@ -224,16 +224,12 @@ class RowFunction:
                 table[places] = np.asarray(part.table)[: places.stop - places.start]
         return tuple(Packed(table, layout) for table, layout in zip(tables, layouts, strict=True))
 
-    def sums(self, num_threads: int | None = 1, packed: bool = True, in_order: bool = False) -> list[Any]:
-        """The sum over each block, packed if that is not declined; programs may not have ended.
-
-        Args:
-            in_order: whether this thread calls all programs, so that threads compute the rows of tables alone.
-        """
+    def sums(self, num_threads: int | None = 1, packed: bool = True) -> list[Any]:
+        """The sum over each block, packed if that is not declined; programs may not have ended."""
         gathered = _Gathered(self._inputs, self._size, None, num_threads)
-        return [part for _, part in self._over_blocks(gathered, 1 if in_order else num_threads, packed)]
+        return [part for _, part in self._over_blocks(gathered, num_threads, packed)]
 
-    @own_checks
+    @without_checks_of_jax
     def _over_blocks(
         self, gathered: _Gathered, num_threads: int | None, packed: bool = True
     ) -> list[tuple[slice, Any]]:
@@ -389,7 +385,7 @@ def as_table(table: Any) -> Table:
     return table if isinstance(table, Table) else GivenTable(table)
 
 
-@own_checks
+@without_checks_of_jax
 def blockwise(function: Callable[..., Any], numbers: Any, *inputs: Input, total: bool = False) -> Any:
     """Apply a row function, outside or inside of transformations.
 

@@ -30,9 +30,9 @@ _SETTINGS: tuple[Any, ...] = (
 )
 
 
-def own_checks(function: Callable[Parameters, Answer]) -> Callable[Parameters, Answer]:
-    """Decorator of functions in which JAX does not check what users may let it check in their own code: that nothing is
-    NaN, which marks missing values here, and that dtypes and ranks of operands are equal."""
+def without_checks_of_jax(function: Callable[Parameters, Answer]) -> Callable[Parameters, Answer]:
+    """Decorator of functions without the optional checks of JAX, which users turn on for their own code: `debug_nans`
+    and `debug_infs`, since NaN marks missing values here, and strict promotion of dtypes and ranks."""
 
     @functools.wraps(function)
     def unchecked(*arguments: Parameters.args, **named: Parameters.kwargs) -> Answer:

@@ -15,7 +15,7 @@ from mcgicp_jax._clouds.preprocess import finite_rows, with_neighbors
 from mcgicp_jax._clouds.voxels import grid_of, voxel_order
 from mcgicp_jax._compute.concrete import AnyArray, outside_trace
 from mcgicp_jax._compute.messages import check_positive, messages_named
-from mcgicp_jax._compute.threads import own_checks
+from mcgicp_jax._compute.threads import without_checks_of_jax
 from mcgicp_jax._global_pose.feature_matching import matches_of_features, matches_of_rows
 from mcgicp_jax._global_pose.fpfh import NUM_NEIGHBORS
 from mcgicp_jax._global_pose.robust_pose_fit import (
@@ -125,7 +125,7 @@ class GlobalPoseResult:
         )
 
 
-@own_checks
+@without_checks_of_jax
 def global_pose(
     source: PointCloud | Values,
     target: PointCloud | Values,

@@ -15,7 +15,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from mcgicp_jax._compute.concrete import AnyArray, numpy_for
-from mcgicp_jax._compute.threads import own_checks
+from mcgicp_jax._compute.threads import without_checks_of_jax
 
 
 def symmetric_from_matrix(matrix: Float[Array, "N 3 3"]) -> Float[Array, "6 N"]:
@@ -173,7 +173,7 @@ def _null_vector(xx: Array, xy: Array, xz: Array, yy: Array, yz: Array, zz: Arra
 
 
 @_smallest_eigenvector.defjvp
-@own_checks
+@without_checks_of_jax
 def _smallest_eigenvector_jvp(
     primals: tuple[Float[Array, "6 N"]], tangents: tuple[Float[Array, "6 N"]]
 ) -> tuple[Float[Array, "3 N"], Float[Array, "3 N"]]:

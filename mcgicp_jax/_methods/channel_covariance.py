@@ -10,7 +10,7 @@ from jaxtyping import Bool, Float
 
 from mcgicp_jax._clouds.point_cloud import PointCloud
 from mcgicp_jax._clouds.preprocess import preprocess
-from mcgicp_jax._compute.threads import own_checks
+from mcgicp_jax._compute.threads import without_checks_of_jax
 from mcgicp_jax._local_geometry.spacing_and_noise import point_spacing
 from mcgicp_jax._math.poses import Pose, pose_matrix
 from mcgicp_jax._search.kd_tree import nearest_in_position
@@ -23,7 +23,7 @@ _SAME_SURFACE = 0.5
 _MIN_EIGENVALUE = 1e-6
 
 
-@own_checks
+@without_checks_of_jax
 def estimate_channel_covariance(
     clouds: Sequence[PointCloud], poses: Sequence[Pose], *, max_distance: float | None = None
 ) -> Float[np.ndarray, "C C"]:

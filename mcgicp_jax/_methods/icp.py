@@ -9,7 +9,7 @@ from jaxtyping import Array, Float
 
 from mcgicp_jax._clouds.point_cloud import PointCloud, Values
 from mcgicp_jax._compute.concrete import AnyArray
-from mcgicp_jax._compute.threads import own_checks
+from mcgicp_jax._compute.threads import without_checks_of_jax
 from mcgicp_jax._local_geometry.local_geometry import LocalGeometry
 from mcgicp_jax._local_geometry.neighborhoods import Neighborhoods
 from mcgicp_jax._math import symmetric_matrices as alg
@@ -52,7 +52,7 @@ class ColorICP(AbstractOneSided):
         self.channel_weights = weights_of(channel_weights)
         self.missing_variance = None
 
-    @own_checks
+    @without_checks_of_jax
     def resolve(
         self,
         source: PointCloud,

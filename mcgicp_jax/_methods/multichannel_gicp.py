@@ -13,7 +13,7 @@ from jaxtyping import Array, Float
 
 from mcgicp_jax._clouds.point_cloud import PointCloud, Values
 from mcgicp_jax._compute.concrete import AnyArray, constant, numpy_for
-from mcgicp_jax._compute.threads import own_checks
+from mcgicp_jax._compute.threads import without_checks_of_jax
 from mcgicp_jax._local_geometry.covariances import channel_kernel, multichannel_covariance, plane_covariance
 from mcgicp_jax._local_geometry.local_geometry import LocalGeometry, local_geometries
 from mcgicp_jax._local_geometry.neighborhoods import NO_NEIGHBORS, Neighborhoods
@@ -88,7 +88,7 @@ class MultiChannelGICP(AbstractGeneralized):
         self.min_eigenvalue = None if min_eigenvalue is None else positive_scalar("min_eigenvalue", min_eigenvalue)
         self.photometric = photometric
 
-    @own_checks
+    @without_checks_of_jax
     def resolve(
         self,
         source: PointCloud,

@@ -16,7 +16,7 @@ from mcgicp_jax._clouds.voxel_size import NUM_NEIGHBORS
 from mcgicp_jax._clouds.voxels import voxel_order
 from mcgicp_jax._compute.concrete import AnyArray, numpy_for
 from mcgicp_jax._compute.messages import check_integer, check_positive, is_number
-from mcgicp_jax._compute.threads import own_checks
+from mcgicp_jax._compute.threads import without_checks_of_jax
 from mcgicp_jax._math import symmetric_matrices as alg
 from mcgicp_jax._methods.gicp import GICP
 from mcgicp_jax._methods.surfaces import covariances_of
@@ -54,7 +54,7 @@ def voxel_gaussians(
 ) -> tuple[PointCloud, Int[np.ndarray, "M"]]: ...
 
 
-@own_checks
+@without_checks_of_jax
 def voxel_gaussians(
     cloud: PointCloud | Values,
     voxel_size: float,
@@ -207,7 +207,7 @@ def _split(
     return order[again], np.flatnonzero(np.append(True, changes))
 
 
-@own_checks
+@without_checks_of_jax
 def cell_moments(
     points: Float[AnyArray, "N 3"],
     channels: Float[AnyArray, "N C"],

@@ -107,7 +107,7 @@ class HostExecutor(AbstractExecutor):
         # `update` is dispatched while they are computed, which saves half of the hand-overs between threads.
         with_slopes = bool(last) and self.problem.source.observes_channels
         applied = self._over(of_matches(sums_of, with_slopes), motion, matches, (terms,), with_slopes, total=True)
-        parts: list[Packed[Sums]] = applied.sums(self._num_threads, in_order=not with_slopes)
+        parts: list[Packed[Sums]] = applied.sums(self._num_threads if with_slopes else 1)
         return parts[0] if len(parts) == 1 else _combined(parts)
 
     def update(self, state: State, sums: Packed[Sums]) -> State:

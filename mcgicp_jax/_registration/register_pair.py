@@ -18,7 +18,7 @@ from mcgicp_jax._compute.cache import Lazy
 from mcgicp_jax._compute.concrete import AnyArray, constant, is_concrete, numpy_for, outside_trace
 from mcgicp_jax._compute.linear_maps import primal
 from mcgicp_jax._compute.messages import messages_named
-from mcgicp_jax._compute.threads import in_new_thread, own_checks
+from mcgicp_jax._compute.threads import in_new_thread, without_checks_of_jax
 from mcgicp_jax._local_geometry.channel_equalization import (
     warn_of_exposure,
     warn_of_units,
@@ -78,7 +78,7 @@ class Run(NamedTuple):
     moments: Callable[[], Moments]
 
 
-@own_checks
+@without_checks_of_jax
 def register_pair(
     source: PointCloud | Values,
     target: PointCloud | Values,
@@ -122,7 +122,7 @@ def prepared(
     return Given(source, target, method, options.robust, *known(tie_points, prior, source, target))
 
 
-@own_checks
+@without_checks_of_jax
 def run_pair(given: Given, init: Pose | None, options: Options) -> Run:
     """Register arrays that are all concrete, or some of which `jit` or `vmap` trace."""
     source, target, method, robust, ties, belief, _ = given
@@ -155,7 +155,7 @@ def run_pair(given: Given, init: Pose | None, options: Options) -> Run:
     return run._replace(gains=gains)
 
 
-@own_checks
+@without_checks_of_jax
 def results_of(runs: Sequence[Run], givens: Sequence[Given | None]) -> list[RegistrationResult]:
     """The results of registrations.
 
@@ -222,7 +222,7 @@ def run_loop(inputs: Inputs, problem: Problem, search: AbstractSearch | None, ma
     return Run(inputs, None, problem, loop, executor, lambda: loop.state, lambda: assessment, lambda: moments.value)
 
 
-@own_checks
+@without_checks_of_jax
 def pose_problem(
     source: PointCloud,
     target: PointCloud,

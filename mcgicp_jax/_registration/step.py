@@ -135,7 +135,7 @@ class State(NamedTuple):
         status: `COARSE`, `RUNNING` or `SETTLED` (negative) while the loop runs, then the value of a `Status`.
         num_iterations: number of updates so far.
         since: (6,) sum of the updates since the last iteration whose number is a power of two, metres and radians.
-        extent: largest cost of a motion of the matches by `since` in that time.
+        extent: largest cost, over these updates, of moving the matched points by `since`.
         sums: at the pose before the update; this and the following are None before the first step on the host.
         information: (6, 6) at the pose before the update, about the centroid, lengths in units of the radius.
         directions: at the pose before the update, about the centroid; None for `estimate_pose`.
@@ -166,9 +166,9 @@ def update(
 ) -> State:
     """Update the pose, or end the loop with a status. Its program does not depend on the size of the clouds.
 
-    Matches may alternate for ever, and with them the pose. It then returns to that of the last iteration whose number
-    is a power of two (Brent 1980). Such a cycle ends the loop if its poses differ by less than a standard deviation
-    from independent residuals, which is less than that of the pose.
+    Matches, and the pose with them, may alternate for ever. The pose then returns to that of the last iteration whose
+    number is a power of two (Brent 1980). Such a cycle ends the loop if its poses differ by less than one standard
+    deviation, estimated as if the residuals were independent; the deviation of the pose is larger.
     """
     directions, basis = None, jnp.eye(6, dtype=sums.center.dtype)
     degenerate: AnyScalar = np.bool_(False)
