@@ -10,7 +10,6 @@ import pytest
 
 import mcgicp_jax as mcg
 from mcgicp_jax import extend
-from mcgicp_jax._registration.multi_scale import stages_of
 from mcgicp_jax.metrics import pose_error
 from tests.differences import GATE, TO_ROUNDING, check_eager_gradient, weigh
 from tests.precision import in_both_precisions, in_float64, tolerance
@@ -195,11 +194,13 @@ def test_scales_make_the_cells(raw):
 
 
 def test_coarse_scales_register_voxels_of_a_quarter(raw):
-    stages = list(stages_of(mcg.D2DNDT(), *raw[:2], (0.8, SIZE)))
-    assert [type(stage.method) for stage in stages] == [mcg.GICP, mcg.D2DNDT]
-    for coarse, cells, cloud in zip(stages[0][1:], stages[1][1:], raw[:2], strict=True):
-        np.testing.assert_array_equal(coarse.points, mcg.preprocess(cloud, 0.2).points)
-        np.testing.assert_array_equal(cells.points, mcg.voxel_gaussians(cloud, SIZE).points)
+    voxels, cells = (
+        [make(cloud, size) for cloud in raw[:2]] for make, size in ((mcg.preprocess, 0.2), (mcg.voxel_gaussians, SIZE))
+    )
+    coarse = mcg.register(*voxels, mcg.GICP())
+    expected = mcg.register(*cells, mcg.D2DNDT(), init=coarse.matrix)
+    found = mcg.register(*raw[:2], mcg.D2DNDT(), voxel_sizes=(0.8, SIZE))
+    np.testing.assert_array_equal(found.matrix, expected.matrix)
 
 
 @pytest.mark.parametrize("method", [mcg.NDT, mcg.D2DNDT], ids=["ndt", "d2d-ndt"])

@@ -241,20 +241,12 @@ def surface_table(
     return _table(cloud, method, kinds, geometry_table(cloud, method.uses_channels) if described else None, observed)
 
 
-class Fixed(NamedTuple):
-    """The clouds and the method, with its parameters chosen, without the traces of differentiation, see `primal`."""
-
-    source: PointCloud
-    target: PointCloud
-    method: AbstractMethod
-
-
 def differentiable_inputs(
     source: PointCloud,
     target: PointCloud,
     method: AbstractMethod,
     terms: tuple[AbstractTerm, ...],
-    fixed: Fixed,
+    fixed: tuple[PointCloud, PointCloud, AbstractMethod],
     indices: Int[np.ndarray, "n m"],
     *,
     source_rows: Any = None,
@@ -265,18 +257,20 @@ def differentiable_inputs(
 
     Args:
         source, target, method, terms: differentiation may trace them.
+        fixed: the clouds and the method, its parameters chosen, without these traces, see `primal`.
         indices: rows of the target, −1 where there is no match.
         source_rows: (n,) rows of the source; None for all.
         observed: as in `surface_pair`, from which values are taken.
         soft: whether to include the descriptors.
     """
-    sides = ((source, fixed.source, source_rows), (target, fixed.target, indices))
+    *clouds, chosen = fixed
+    sides = ((source, clouds[0], source_rows), (target, clouds[1], indices))
     described = observed or all(cloud.deferred_neighbors is not None for _, cloud, _ in sides)
     inputs = []
     kinds = kinds_of(terms)
     for cloud, same, rows in sides:
         geometry = differentiable_geometry(cloud, method.uses_channels, same) if described else None
-        values = surface_table(same, fixed.method, kinds, described, observed)
+        values = surface_table(same, chosen, kinds, described, observed)
         inputs.append(Input(_table(cloud, method, kinds, geometry, observed, values), rows))
     if soft:
         inputs += [Input(_search_table(cloud, method), rows) for cloud, _, rows in sides]

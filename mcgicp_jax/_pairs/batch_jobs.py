@@ -29,7 +29,7 @@ from mcgicp_jax._pairs.register import register_from, start_from_anywhere
 from mcgicp_jax._registration.assessment import registration_of
 from mcgicp_jax._registration.input_checks import warn_of_estimated_parameters, warn_of_lengths
 from mcgicp_jax._registration.options import Options
-from mcgicp_jax._registration.pose_derivative import Given
+from mcgicp_jax._registration.pose_derivative import Inputs
 from mcgicp_jax._registration.register_pair import Run, pose_problem, prepared, preprocessed, results_of, run_pair
 from mcgicp_jax._registration.result import RegistrationResult, Status, computed, unverified
 from mcgicp_jax._registration.step import Problem
@@ -102,7 +102,7 @@ class _GivenPair:
     """A pair whose arrays differentiation traces."""
 
     index: int
-    given: Given
+    given: Inputs
     init: Pose | None
     verified: bool
 
@@ -219,7 +219,7 @@ class BatchJob:
         return _GivenPair(pair.index, prepared(source, target, self.method, self.options), primal(init), verified)
 
     @_of_a_pair
-    def _run(self, pair: _GivenPair, values: Given) -> PairResult | Run:
+    def _run(self, pair: _GivenPair, values: Inputs) -> PairResult | Run:
         return run_pair(values, pair.init, replace(self.options, search=self.search))
 
     def _start(self, pair: Pair, source: PointCloud, target: PointCloud) -> PairResult | tuple[Pose | None, bool]:
@@ -242,7 +242,8 @@ class BatchJob:
         if isinstance(start, PairResult):
             return start
         init, verified = start
-        problem, _ = pose_problem(source, target, self.method, init, self.options, num_threads=1)
+        given = Inputs(source, target, self.method, self.options.robust)
+        problem, _ = pose_problem(given, init, self.options, num_threads=1)
         used, size = problem.source.search.valid, size_class(max(len(source.points), len(target.points)))
         few = self.options.max_source_points
         sizes = size if few is None else min(size, size_class(few)), size

@@ -20,7 +20,7 @@ from mcgicp_jax._math import symmetric_matrices as alg
 from mcgicp_jax._math.poses import Pose
 from mcgicp_jax._math.robust_kernels import AbstractKernel
 from mcgicp_jax._methods.base import AbstractGeneralized, AbstractMethod, with_unset_from
-from mcgicp_jax._methods.surfaces import Fixed, differentiable_inputs, surface_pair
+from mcgicp_jax._methods.surfaces import differentiable_inputs, surface_pair
 from mcgicp_jax._pose_solver.matched import Motion, adapted, linearize_at, matched_rows, sample_of_term
 from mcgicp_jax._registration.input_checks import check_matches, warn_of_estimated_parameters
 from mcgicp_jax._search.base import Correspondences
@@ -94,16 +94,15 @@ def _problem(
     temperature: Any,
 ) -> tuple[Numbers, list[Input]]:
     """Numbers and inputs of the row function of the cost."""
-    fixed = Fixed(*primal((source, target, method)))
+    fixed = primal((source, target, method))
     given = primal((motion, temperature, matches))
     xp = numpy_for(given[2])
     indices = xp.where(xp.asarray(matches.valid), xp.asarray(matches.indices), -1)
     indices = indices.reshape(-1, indices.shape[-1]).T
     if is_concrete(fixed, given):
-        method = with_unset_from(method, fixed.method.resolve(fixed.source, fixed.target))
-        terms = method.terms(fixed.source, fixed.target, robust, False)
-        fixed, soft = fixed._replace(method=primal(method)), temperature is not None
-        inputs = differentiable_inputs(source, target, method, terms, fixed, indices, soft=soft)
+        method = with_unset_from(method, fixed[2].resolve(*fixed[:2]))
+        terms, soft = method.terms(fixed[0], fixed[1], robust, False), temperature is not None
+        inputs = differentiable_inputs(source, target, method, terms, (*fixed[:2], primal(method)), indices, soft=soft)
     else:
         pair = surface_pair(method, source, target, observed=False, robust=robust).whole()
         terms, both = pair.terms, ((pair.source, None), (pair.target, indices))
@@ -115,7 +114,7 @@ def _problem(
         (found,) = blockwise(_sample, constant(primal((motion, term))), *of_rows(inputs, rows))
         return primal(found)
 
-    return (motion, adapted(terms, fixed.source.valid, sample), temperature), inputs
+    return (motion, adapted(terms, fixed[0].valid, sample), temperature), inputs
 
 
 def _sample(numbers: tuple[Motion, AbstractAdaptiveTerm], *rows: Rows) -> tuple[Any]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from functools import partial
 
 import numpy as np
@@ -18,7 +17,7 @@ from mcgicp_jax._methods.base import AbstractMethod
 from mcgicp_jax._pose_solver.matched import Matches
 from mcgicp_jax._registration.input_checks import check_clouds, check_matches, warn_of_estimated_parameters
 from mcgicp_jax._registration.options import Options
-from mcgicp_jax._registration.pose_derivative import Given
+from mcgicp_jax._registration.pose_derivative import Inputs
 from mcgicp_jax._registration.register_pair import Run, pose_problem, results_of, run_loop
 from mcgicp_jax._registration.result import RegistrationResult
 from mcgicp_jax._search.base import Correspondences
@@ -78,7 +77,7 @@ def estimate_pose(
     check_clouds(source, target, method)
     warn_of_estimated_parameters(method, source, target, temperature)
     softness = None if temperature is None else numpy_for(temperature).asarray(temperature, source.points.dtype)
-    given = Given(source, target, method, robust, temperature=softness)
+    given = Inputs(source, target, method, robust, temperature=softness)
     values, init, fixed = given.values(), primal(init), Matches.given(primal(matches))
     if not is_concrete(values, fixed, init, options.numbers):
         values = given
@@ -88,8 +87,6 @@ def estimate_pose(
     return result
 
 
-def _estimate(given: Given, matches: Matches, init: Pose | None, options: Options) -> Run:
-    source, target, method, robust, *_, temperature = given
-    matches, options = matches._replace(temperature=temperature), replace(options, robust=robust)
-    problem, inputs = pose_problem(source, target, method, init, options, 1, matches)
+def _estimate(given: Inputs, matches: Matches, init: Pose | None, options: Options) -> Run:
+    problem, inputs = pose_problem(given, init, options, 1, matches._replace(temperature=given.temperature))
     return run_loop(inputs, problem, None, options.max_iterations)

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from typing import Any, NamedTuple
+from collections.abc import Callable, Iterator, Sequence
+from functools import partial
+from typing import Any
 
 import numpy as np
 
@@ -16,6 +17,7 @@ from mcgicp_jax._local_geometry.neighborhoods import check_neighbors
 from mcgicp_jax._methods.base import AbstractMethod
 from mcgicp_jax._methods.gicp import GICP
 from mcgicp_jax._methods.voxel_gaussians import voxel_gaussians
+from mcgicp_jax._registration.pose_derivative import Inputs
 
 # Edge of the voxels in edges of a cell, at all scales but the last, where GICP registers the voxels. Cells against
 # cells would pull partially overlapping clouds over each other: from 1.3 m and 10° off, two views of a yard with an
@@ -24,45 +26,28 @@ from mcgicp_jax._methods.voxel_gaussians import voxel_gaussians
 _COARSE_VOXEL = 0.25
 
 
-class Stage(NamedTuple):
-    """One of the registrations."""
-
-    method: AbstractMethod
-    source: PointCloud
-    target: PointCloud
-
-
-def stages_of(
-    method: AbstractMethod, source: PointCloud, target: PointCloud, voxel_sizes: Sequence[float]
-) -> Iterator[Stage]:
-    """The registrations for these voxel sizes, metres; the last one gives the result.
+def at_scales(given: Inputs, voxel_sizes: Sequence[float]) -> Iterator[Inputs]:
+    """The inputs of the registrations for these voxel sizes, metres; the last one gives the result.
 
     Methods that need cells use cells of the last size; for the other sizes, GICP registers smaller voxels. Other
     methods register the voxels of each size, and then the clouds.
-
-    Args:
-        source, target: preprocessed clouds; raw ones where the method needs cells.
     """
+
+    def with_clouds(each: Callable[[str, PointCloud], PointCloud], method: AbstractMethod) -> Inputs:
+        return given._replace(source=each("source", given.source), target=each("target", given.target), method=method)
+
+    method = given.method
     if method.needs_covariances and len(voxel_sizes):
         for size in voxel_sizes[:-1]:
-            sides = [_in_voxels(name, cloud, _COARSE_VOXEL * size) for name, cloud in _named_sides(source, target)]
-            yield Stage(GICP(), *sides)
-        sides = [_in_cells(method, name, cloud, voxel_sizes[-1]) for name, cloud in _named_sides(source, target)]
-        yield Stage(method, *sides)
+            yield with_clouds(partial(_in_voxels, _COARSE_VOXEL * size), GICP())
+        yield with_clouds(partial(_in_cells, method, voxel_sizes[-1]), method)
         return
     for size in voxel_sizes:
-        sides = [
-            preprocess(cloud, size, check_neighbors(cloud, numpy_for(cloud)).shape[-1]) for cloud in (source, target)
-        ]
-        yield Stage(method, *sides)
-    yield Stage(method, source, target)
+        yield with_clouds(partial(_smaller, size), method)
+    yield given
 
 
-def _named_sides(source: PointCloud, target: PointCloud) -> tuple[tuple[str, PointCloud], ...]:
-    return ("source", source), ("target", target)
-
-
-def _in_cells(method: AbstractMethod, name: str, cloud: PointCloud, size: float) -> PointCloud:
+def _in_cells(method: AbstractMethod, size: float, name: str, cloud: PointCloud) -> PointCloud:
     if name not in method.needs_covariances:
         return cloud
     channel_size: Any = None
@@ -74,6 +59,10 @@ def _in_cells(method: AbstractMethod, name: str, cloud: PointCloud, size: float)
         return voxel_gaussians(cloud, size, channel_size=channel_size)
 
 
-def _in_voxels(name: str, cloud: PointCloud, size: float) -> PointCloud:
+def _in_voxels(size: float, name: str, cloud: PointCloud) -> PointCloud:
     with messages_named(name):
         return with_neighbors(finite_rows(cloud), size, NUM_NEIGHBORS)
+
+
+def _smaller(size: float, _: str, cloud: PointCloud) -> PointCloud:
+    return preprocess(cloud, size, check_neighbors(cloud, numpy_for(cloud)).shape[-1])

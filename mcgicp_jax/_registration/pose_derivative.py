@@ -31,7 +31,7 @@ from mcgicp_jax._math.poses import (
 )
 from mcgicp_jax._math.robust_kernels import AbstractKernel
 from mcgicp_jax._methods.base import AbstractMethod, with_unset_from
-from mcgicp_jax._methods.surfaces import Fixed, differentiable_inputs
+from mcgicp_jax._methods.surfaces import differentiable_inputs
 from mcgicp_jax._pose_solver.implicit_derivative import (
     MAX_NEWTON_STEPS,
     ImplicitRoot,
@@ -44,32 +44,19 @@ from mcgicp_jax._pose_solver.pose_measurements import Fusion, PoseForm, Prior, T
 from mcgicp_jax._registration.loop import LoopResult
 from mcgicp_jax._registration.on_host import HostExecutor
 from mcgicp_jax._registration.step import State, root_of
-from mcgicp_jax._terms.base import AbstractTerm, with_numbers_of
+from mcgicp_jax._terms.base import with_numbers_of
 
 
 class Inputs(NamedTuple):
-    """The differentiable inputs of a registration.
+    """The arguments of a registration by which its pose can be differentiated.
 
     Attributes:
-        source, target: preprocessed clouds.
-        method: with its unset parameters chosen.
-        terms: the residuals of each correspondence.
-        form: of tie points and prior; None without them.
+        source, target: preprocessed clouds; raw ones where the method makes cells of them.
+        method: its parameters may be unset.
         temperature: of a soft assignment, metres; None without one.
         source_rows: (n,) rows of the source that are matched; None for all.
+        gains: (C,) by which the channels of the source were multiplied, constant to autodiff; None unless equalised.
     """
-
-    source: PointCloud
-    target: PointCloud
-    method: AbstractMethod
-    terms: tuple[AbstractTerm, ...]
-    form: PoseForm | None = None
-    temperature: Any = None
-    source_rows: Any = None
-
-
-class Given(NamedTuple):
-    """The arguments of a registration by which its pose can be differentiated; parameters of `method` may be unset."""
 
     source: PointCloud
     target: PointCloud
@@ -78,11 +65,13 @@ class Given(NamedTuple):
     tie_points: TiePoints | None = None
     prior: Prior | None = None
     temperature: Any = None
+    source_rows: Any = None
+    gains: Any = None
 
-    def values(self) -> Given:
+    def values(self) -> Inputs:
         """The arguments without the traces of differentiation, see `primal`. Concrete clouds remain the same objects,
         with which derived quantities are cached."""
-        return Given(*map(primal, self))
+        return Inputs(*map(primal, self))
 
 
 class PoseDerivative(AbstractLinearMap):
@@ -101,11 +90,18 @@ class PoseDerivative(AbstractLinearMap):
         problem = executor.problem
         self._pose, self._fusion = np.asarray(loop.state.pose.wxyz_xyz), problem.fusion
         self._scaling: ImplicitRoot = jax.tree.map(np.asarray, root_of(loop.state._replace(record=None), self._fusion))
-        self._form = jax.tree.leaves(inputs.form)
+        form = None if self._fusion is None else self._fusion.form
+        if self._fusion is not None and not is_concrete(inputs[4:6]):
+            place = self._fusion
+            form = _form_at(place.rotation, place.translation, place.center, place.radius, *inputs[4:6])
+        self._form = jax.tree.leaves(form)
+        equalized = any(term.estimates_gains for term in problem.terms)
+        terms = inputs.method.terms(fixed.source, fixed.target, inputs.robust, equalized)
         matches = executor.within(Motion.of(loop.state.pose.wxyz_xyz), loop.matches)
         tables = differentiable_inputs(
-            *inputs[:4],
-            Fixed(*fixed[:3]),
+            *inputs[:3],
+            terms,
+            fixed[:3],
             matches.indices.T,
             source_rows=inputs.source_rows,
             observed=problem.source.observed,
@@ -114,7 +110,7 @@ class PoseDerivative(AbstractLinearMap):
         numbers = (
             Motion.of(self._pose),
             self._scaling,
-            with_numbers_of(inputs.terms, loop.terms),
+            with_numbers_of(terms, loop.terms),
             inputs.temperature,
         )
         self._scored = RowFunction(_score_of_rows, numbers, tables, matches.indices.shape[1], total=True)
@@ -238,38 +234,32 @@ def _pull_balance(
 
 
 def jacobian(
-    inputs: Inputs, executor: HostExecutor, loop: LoopResult, gains: Any, cloud: str, field: str
+    inputs: Inputs, executor: HostExecutor, loop: LoopResult, cloud: str, field: str
 ) -> Float[np.ndarray, "6 ..."]:
     """The derivative of the final pose by an array of a cloud, see `RegistrationResult.jacobian`."""
     array = getattr(getattr(inputs, cloud), field)
     if array is None:
         raise ValueError(f"{field}: expected a {cloud} that has some, got None")
     (by_array,) = PoseDerivative(inputs, inputs, executor, loop, [array]).jacobian()
-    if gains is not None and (cloud, field) == ("source", "channels"):
-        by_array = by_array * gains
+    if inputs.gains is not None and (cloud, field) == ("source", "channels"):
+        by_array = by_array * inputs.gains
     pose, rotation = np.asarray(loop.state.pose.wxyz_xyz, np.float64), Motion.of(loop.state.pose.wxyz_xyz).rotation
     twist = np.zeros((6, 7))
     twist[:3, 4:], twist[3:, :4] = rotation.T, rotation.T @ turn_by_quaternion(pose[:4])
     return np.tensordot(translation_adjoint(np.asarray(inputs.source.origin)) @ twist, by_array, 1)
 
 
-def differentiated(
-    given: Given, inputs: Inputs, executor: HostExecutor, loop: LoopResult, gains: Any
-) -> PoseDerivative | None:
+def differentiated(given: Inputs, inputs: Inputs, executor: HostExecutor, loop: LoopResult) -> PoseDerivative | None:
     """The derivative of the final pose by the traced arrays among the arguments on which it depends; None if there are
     none. Origins are added later, see `pose_in_user_frame`."""
     if is_concrete(given):
         return None
-    method, source = with_unset_from(given.method, inputs.method), given.source
-    equalized = any(term.estimates_gains for term in inputs.terms)
-    terms = method.terms(inputs.source, inputs.target, given.robust, equalized)
-    fusion, form = executor.problem.fusion, None
-    if fusion is not None:
-        form = _form_at(fusion.rotation, fusion.translation, fusion.center, fusion.radius, *given[4:6])
-    if gains is not None and not is_concrete(source.channels):
-        (channels,) = blockwise(_multiplied, np.asarray(gains, source.channels.dtype), Input(source.channels))
+    source = given.source
+    if inputs.gains is not None and not is_concrete(source.channels):
+        (channels,) = blockwise(_multiplied, np.asarray(inputs.gains, source.channels.dtype), Input(source.channels))
         source = source.replace_rows(channels=channels)
-    traced = Inputs(source, given.target, method, terms, form, given.temperature, inputs.source_rows)
+    method = with_unset_from(given.method, inputs.method)
+    traced = given._replace(source=source, method=method, source_rows=inputs.source_rows)
     found = PoseDerivative(traced, inputs, executor, loop)
     return found if found.arrays else None
 

@@ -8,7 +8,7 @@ from functools import partial
 from typing import NamedTuple
 
 import jax
-from jaxtyping import Float, Int
+from jaxtyping import Int
 
 from mcgicp_jax._clouds.origins import centred_pose, pose_in_user_frame
 from mcgicp_jax._clouds.point_cloud import PointCloud, Values, Voxels, as_cloud
@@ -42,10 +42,10 @@ from mcgicp_jax._registration.input_checks import (
 )
 from mcgicp_jax._registration.loop import LoopResult, iterate
 from mcgicp_jax._registration.measurements import GivenPrior, GivenTiePoints, fusion_of, known
-from mcgicp_jax._registration.multi_scale import stages_of
+from mcgicp_jax._registration.multi_scale import at_scales
 from mcgicp_jax._registration.on_host import HostExecutor
 from mcgicp_jax._registration.options import Options, check_method
-from mcgicp_jax._registration.pose_derivative import Given, Inputs, differentiated, jacobian, with_derivatives
+from mcgicp_jax._registration.pose_derivative import Inputs, differentiated, jacobian, with_derivatives
 from mcgicp_jax._registration.result import RegistrationResult, is_usable
 from mcgicp_jax._registration.step import Problem, State, settings_for
 from mcgicp_jax._registration.traced import assess, differentiable, moments_traced, run_traced
@@ -61,7 +61,6 @@ class Run(NamedTuple):
 
     Attributes:
         inputs: of the problem, constant to autodiff outside `jit`.
-        gains: by which the channels of the source were multiplied; None unless equalised.
         loop: its end, constant to autodiff.
         executor: of the loop; None inside `jit`.
         state: computes the final state, whose pose is differentiable inside `jit`.
@@ -69,7 +68,6 @@ class Run(NamedTuple):
     """
 
     inputs: Inputs
-    gains: Float[AnyArray, "C"] | None
     problem: Problem
     loop: LoopResult
     executor: HostExecutor | None
@@ -109,7 +107,7 @@ def prepared(
     options: Options,
     tie_points: GivenTiePoints | None = None,
     prior: GivenPrior | None = None,
-) -> Given:
+) -> Inputs:
     """The arguments of a registration, checked; clouds preprocessed unless the method makes cells of raw ones."""
     check_method(method)
     warn_of_constant_weights(method)
@@ -119,44 +117,56 @@ def prepared(
         raise ValueError("voxel_sizes: expected none for clouds with covariances, which cannot be averaged in voxels")
     if options.voxel_sizes and method.needs_covariances and not is_concrete(source, target):
         raise ValueError("voxel_sizes: expected none for derivatives with cells; make these with voxel_gaussians")
-    return Given(source, target, method, options.robust, *known(tie_points, prior, source, target))
+    return Inputs(source, target, method, options.robust, *known(tie_points, prior, source, target))
 
 
 @without_checks_of_jax
-def run_pair(given: Given, init: Pose | None, options: Options) -> Run:
+def run_pair(given: Inputs, init: Pose | None, options: Options) -> Run:
     """Register arrays that are all concrete, or some of which `jit` or `vmap` trace."""
-    source, target, method, robust, ties, belief, _ = given
-    options, gains = replace(options, robust=robust), None
-    if isinstance(method, GICP) and is_concrete(source, target):
-        warn_of_covariances(source, target)
-    if options.equalize_channels:
-        source, gains = _equalized(source, target, method)
-    elif method.uses_channels and is_concrete(source, target):
-        warn_of_units(source, target)
-    *before, (method, source, target) = stages_of(method, source, target, options.voxel_sizes)
     search = options.search or default_search()
-    once = replace(options, max_distance=None)
-    for stage in before:
-        run = _solved(stage.source, stage.target, stage.method, init, once, search)
-        (found,) = results_of([run], [None])
+    *coarse, inputs = at_scales(_with_comparable_channels(given, options), options.voxel_sizes)
+    for each in coarse:
+        (found,) = results_of([_solved(each, init, replace(options, max_distance=None), search)], [None])
         init = found.matrix if is_usable(found) else init
-    run = _solved(source, target, method, init, options, search)
-    if options.equalize_channels and not any(term.estimates_gains for term in run.problem.terms):
-        source, more = _equalized(source, target, method, _nearest_points(source, target, run, search))
-        gains = gains * more
-        init = constant(pose_in_user_frame(run.loop.state.pose, source.origin, target.origin))
-        run = _solved(source, target, method, init, options, search)
-    elif not options.equalize_channels and method.uses_channels and is_concrete(source, target, run.loop.state.pose):
-        warn_of_exposure(source, target, lambda: _nearest_points(source, target, run, search))
-    if not (ties is None and belief is None):
-        fusion = fusion_of(run.loop.state, run.moments(), ties, belief)
-        problem = replace(run.problem, start=constant(run.loop.state.pose), fusion=fusion)
-        run = run_loop(run.inputs._replace(form=fusion.form), problem, search, options.max_iterations)
-    return run._replace(gains=gains)
+    run = _with_exposure_of_matches(_solved(inputs, init, options, search), options, search)
+    return run if given.tie_points is None and given.prior is None else _fused(run, options, search)
+
+
+def _with_comparable_channels(given: Inputs, options: Options) -> Inputs:
+    """The inputs with equalised channels, if that is wanted; else warns of different units."""
+    concrete = is_concrete(given.source, given.target)
+    if isinstance(given.method, GICP) and concrete:
+        warn_of_covariances(given.source, given.target)
+    if options.equalize_channels:
+        return _equalized(given)
+    if given.method.uses_channels and concrete:
+        warn_of_units(given.source, given.target)
+    return given
+
+
+def _with_exposure_of_matches(run: Run, options: Options, search: AbstractSearch) -> Run:
+    """The registration again with channels equalised by its matches, if that is wanted; else warns of exposure."""
+    inputs, state = run.inputs, run.loop.state
+    if options.equalize_channels:
+        if any(term.estimates_gains for term in run.problem.terms):
+            return run
+        pose = constant(pose_in_user_frame(state.pose, inputs.source.origin, inputs.target.origin))
+        return _solved(_equalized(inputs, _nearest_points(run, search)), pose, options, search)
+    if inputs.method.uses_channels and is_concrete(inputs.source, inputs.target, state.pose):
+        warn_of_exposure(inputs.source, inputs.target, lambda: _nearest_points(run, search))
+    return run
+
+
+def _fused(run: Run, options: Options, search: AbstractSearch) -> Run:
+    """The registration again with tie points and prior, from its pose."""
+    state, inputs = run.loop.state, run.inputs
+    fusion = fusion_of(state, run.moments(), inputs.tie_points, inputs.prior)
+    problem = replace(run.problem, start=constant(state.pose), fusion=fusion)
+    return run_loop(inputs, problem, search, options.max_iterations)
 
 
 @without_checks_of_jax
-def results_of(runs: Sequence[Run], givens: Sequence[Given | None]) -> list[RegistrationResult]:
+def results_of(runs: Sequence[Run], givens: Sequence[Inputs | None]) -> list[RegistrationResult]:
     """The results of registrations.
 
     Args:
@@ -164,15 +174,13 @@ def results_of(runs: Sequence[Run], givens: Sequence[Given | None]) -> list[Regi
             arguments that are traced. All derivatives are computed side by side.
     """
     traced = [
-        None
-        if given is None or run.executor is None
-        else differentiated(given, run.inputs, run.executor, run.loop, run.gains)
+        None if given is None or run.executor is None else differentiated(given, run.inputs, run.executor, run.loop)
         for run, given in zip(runs, givens, strict=True)
     ]
     states = with_derivatives([run.state() for run in runs], traced)
     results = []
     for state, run, given in zip(states, runs, givens, strict=True):
-        by = None if run.executor is None else partial(jacobian, run.inputs, run.executor, run.loop, run.gains)
+        by = None if run.executor is None else partial(jacobian, run.inputs, run.executor, run.loop)
         # Traced origins are those of the inputs, as cells, which may have others, are made of concrete clouds alone.
         traces_origins = given is not None and not is_concrete(given.source.origin, given.target.origin)
         source, target = (given if given is not None and traces_origins else run.inputs)[:2]
@@ -181,16 +189,9 @@ def results_of(runs: Sequence[Run], givens: Sequence[Given | None]) -> list[Regi
     return results
 
 
-def _solved(
-    source: PointCloud,
-    target: PointCloud,
-    method: AbstractMethod,
-    init: Pose | None,
-    options: Options,
-    search: AbstractSearch,
-) -> Run:
+def _solved(given: Inputs, init: Pose | None, options: Options, search: AbstractSearch) -> Run:
     """Pose and run the problem."""
-    problem, inputs = pose_problem(source, target, method, init, options, search.num_threads)
+    problem, inputs = pose_problem(given, init, options, search.num_threads)
     return run_loop(inputs, problem, search, options.max_iterations)
 
 
@@ -207,7 +208,7 @@ def run_loop(inputs: Inputs, problem: Problem, search: AbstractSearch | None, ma
         loop = run_traced(fixed, search, max_iterations)
         state = partial(differentiable, loop, problem)
         ended = loop, fixed, search
-        return Run(inputs, None, problem, loop, None, state, partial(assess, *ended), partial(moments_traced, *ended))
+        return Run(inputs, problem, loop, None, state, partial(assess, *ended), partial(moments_traced, *ended))
 
     def index(position_alone: bool) -> AbstractIndex:
         if search is None:
@@ -219,25 +220,20 @@ def run_loop(inputs: Inputs, problem: Problem, search: AbstractSearch | None, ma
         loop = iterate(executor)
     moments = Lazy(lambda: moments_of(executor, loop))
     assessment = assessment_of(executor, loop, None if problem.fusion is not None else moments)
-    return Run(inputs, None, problem, loop, executor, lambda: loop.state, lambda: assessment, lambda: moments.value)
+    return Run(inputs, problem, loop, executor, lambda: loop.state, lambda: assessment, lambda: moments.value)
 
 
 @without_checks_of_jax
 def pose_problem(
-    source: PointCloud,
-    target: PointCloud,
-    method: AbstractMethod,
-    init: Pose | None,
-    options: Options,
-    num_threads: int | None,
-    matches: Matches | None = None,
+    given: Inputs, init: Pose | None, options: Options, num_threads: int | None, matches: Matches | None = None
 ) -> tuple[Problem, Inputs]:
-    """Inputs of the loop for preprocessed clouds, NumPy arrays where everything is concrete; and what these were
-    computed from.
+    """The problem for preprocessed clouds, NumPy arrays where everything is concrete; and its inputs, with the
+    parameters of the method chosen.
 
     Args:
         matches: those at every pose; None to search for them.
     """
+    source, target, method = given[:3]
     check_clouds(source, target, method)
     rows = rows_to_match(source, options)
     pair = surface_pair(
@@ -245,7 +241,7 @@ def pose_problem(
         source,
         target,
         observed=matches is None,
-        robust=options.robust,
+        robust=given.robust,
         equalize_channels=options.equalize_channels,
         num_threads=num_threads,
         source_rows=rows,
@@ -262,8 +258,7 @@ def pose_problem(
         matches=matches,
         num_candidates=pair.method.num_candidates,
     )
-    temperature = None if matches is None else matches.temperature
-    return problem, Inputs(source, target, pair.method, pair.terms, temperature=temperature, source_rows=rows)
+    return problem, given._replace(method=pair.method, source_rows=rows)
 
 
 def rows_to_match(source: PointCloud, options: Options) -> Int[AnyArray, "n"] | None:
@@ -272,15 +267,15 @@ def rows_to_match(source: PointCloud, options: Options) -> Int[AnyArray, "n"] | 
     return None if most is None or most >= source.valid.size else spread_rows(source.valid, most)
 
 
-def _equalized(
-    source: PointCloud, target: PointCloud, method: AbstractMethod, matches: Correspondences | None = None
-) -> tuple[PointCloud, Float[AnyArray, "C"]]:
-    check_channels(source, target, method)
-    return with_channels_matched(source, target, matches)
+def _equalized(given: Inputs, matches: Correspondences | None = None) -> Inputs:
+    check_channels(given.source, given.target, given.method)
+    source, gains = with_channels_matched(given.source, given.target, matches)
+    return given._replace(source=source, gains=gains if given.gains is None else given.gains * gains)
 
 
-def _nearest_points(source: PointCloud, target: PointCloud, run: Run, search: AbstractSearch) -> Correspondences:
+def _nearest_points(run: Run, search: AbstractSearch) -> Correspondences:
     """Nearest matches in position at the final pose."""
+    source, target = run.inputs[:2]
     pose = constant(pose_in_user_frame(run.loop.state.pose, source.origin, target.origin))
     distance = run.problem.settings.fine_distance
     return find_correspondences(source, target, pose, PointToPoint(), max_distance=distance, search=search)
