@@ -11,6 +11,7 @@ import pytest
 import mcgicp_jax as mcg
 from mcgicp_jax import extend
 from mcgicp_jax.metrics import pose_error
+from tests.compilations import compilations
 from tests.differences import GATE, TO_ROUNDING, check_eager_gradient, weigh
 from tests.precision import in_both_precisions, in_float64, tolerance
 from tests.scenes import motion, room_corner, wall
@@ -130,13 +131,33 @@ def test_moments_in_jax():
     cloud = mcg.PointCloud(points, channels)
     cells, expected = extend.voxel_cells(cloud, SIZE), mcg.voxel_gaussians(cloud, SIZE, min_ratio=0.1)
     dtype = expected.points.dtype
-    moments = jax.jit(lambda points, channels: extend.cell_moments(points, channels, cells, min_ratio=0.1))
-    means, values, covariances = moments(points.astype(dtype), channels.astype(dtype))
-    assert means.dtype == covariances.dtype == dtype
+    moments = partial(extend.cell_moments, cells=cells, min_ratio=0.1)
     atol = tolerance(2e-6, 1e-12)
-    np.testing.assert_allclose(means, expected.points, atol=atol)
-    np.testing.assert_allclose(values, expected.channels, atol=atol)
-    np.testing.assert_allclose(covariances, expected.covariances, atol=atol)
+    for each in (jax.jit(moments), moments):
+        means, values, covariances = each(points.astype(dtype), channels.astype(dtype))
+        assert means.dtype == covariances.dtype == dtype
+        np.testing.assert_allclose(means, expected.points, atol=atol)
+        np.testing.assert_allclose(values, expected.channels, atol=atol)
+        np.testing.assert_allclose(covariances, expected.covariances, atol=atol)
+
+
+@in_float64
+def test_gradients_of_moments_compile_nothing_for_another_size():
+    def loss(points, channels, cells):
+        parts = extend.cell_moments(points, channels, cells)
+        return sum(jnp.sum(jnp.sin(3 * part)) for part in parts)
+
+    gradient = jax.value_and_grad(loss, argnums=(0, 1))
+    for size in (900, 1100):
+        points, channels = room_corner(size)
+        cells = extend.voxel_cells(mcg.PointCloud(points, channels), SIZE)
+        points, channels = map(jnp.asarray, (points, channels))
+        with compilations() as compiled:
+            found = gradient(points, channels, cells)
+    # The loss itself is compiled, operation by operation.
+    assert not [name for name in compiled if "products" in name or "raised" in name or "segment" in name]
+    expected = jax.jit(lambda *arrays: gradient(*arrays, cells))(points, channels)
+    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, atol=1e-10), found, expected)
 
 
 @in_float64

@@ -2,19 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from typing import Any, cast
 
 import jax
 import numpy as np
-from jaxtyping import Bool, Float, Int
-from scipy.sparse import csr_array
+from jaxtyping import Bool, Float
 
 from mcgicp_jax._clouds.point_cloud import LARGEST, PointCloud, Values, Voxels, as_cloud, is_far
 from mcgicp_jax._clouds.voxel_size import NUM_NEIGHBORS, VoxelSize, voxels_and_grids, warn_of_shape
 from mcgicp_jax._clouds.voxels import Grid, grid_of
 from mcgicp_jax._compute.concrete import is_concrete
-from mcgicp_jax._compute.linear_maps import AbstractLinearMap, primal, with_derivative
+from mcgicp_jax._compute.linear_maps import RowAverage, primal, with_derivative
 from mcgicp_jax._compute.messages import check_integer, check_positive, warn
 from mcgicp_jax._math.statistics import sampled_rows
 from mcgicp_jax._search.base import AbstractSearch
@@ -125,35 +124,6 @@ def _differentiable(cloud: PointCloud, found: PointCloud, fixed: PointCloud) -> 
             average = RowAverage(rows, voxels, known, (array.shape[0], len(found.points)))
             (arrays[name],) = with_derivative([getattr(found, name)], average, [array])
     return found.replace_rows(**arrays)
-
-
-class RowAverage(AbstractLinearMap):
-    """Each row of the result is the mean of some rows.
-
-    Args:
-        rows, groups: which row counts in which row of the result.
-        known: (n, C) or (n, 1), which of its entries count.
-        sizes: numbers of rows of the array and of the result.
-    """
-
-    def __init__(self, rows: Int[np.ndarray, "n"], groups: Int[np.ndarray, "n"], known: Any, sizes: tuple[int, int]):
-        ones = np.ones(len(rows))
-        self._sum = csr_array((ones, (groups, np.arange(len(rows)))), shape=(sizes[1], len(rows)))
-        counts = np.maximum(self._sum @ known.astype(np.float64), 1)
-        self._rows, self._weights, self._size = rows, known / counts[groups], sizes[0]
-
-    def push(self, tangents: Sequence[np.ndarray], moving: tuple[int, ...]) -> list[np.ndarray]:
-        (each,) = tangents
-        shape = each.shape[2:]
-        flat = each.reshape(*each.shape[:2], -1)[:, self._rows]
-        return [np.stack([(self._sum @ (self._weights * rows)).reshape(-1, *shape) for rows in flat])]
-
-    def pull(self, cotangents: Sequence[np.ndarray], moving: tuple[int, ...]) -> list[np.ndarray]:
-        (each,) = cotangents
-        found = np.zeros((len(each), self._size, *each.shape[2:]), each.dtype)
-        for rows, by in zip(found, each.reshape(*each.shape[:2], -1), strict=True):
-            rows[self._rows] = (self._weights * (self._sum.T @ by)).reshape(-1, *each.shape[2:])
-        return [found]
 
 
 def with_neighbors(

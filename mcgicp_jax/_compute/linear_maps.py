@@ -14,8 +14,10 @@ import jax.numpy as jnp
 import numpy as np
 from jax.extend.core import Primitive
 from jax.interpreters import ad, batching, mlir
+from jaxtyping import Float, Int
+from scipy.sparse import csr_array
 
-from mcgicp_jax._compute.concrete import is_concrete, is_deferred
+from mcgicp_jax._compute.concrete import AnyArray, is_concrete, is_deferred
 from mcgicp_jax._compute.threads import in_new_thread, side_by_side, without_checks_of_jax
 
 
@@ -109,6 +111,49 @@ def with_derivative(values: Sequence[np.ndarray], linear: AbstractLinearMap, inp
 
     attached.defjvp(rule, symbolic_zeros=True)
     return attached(*inputs)
+
+
+class RowAverage(AbstractLinearMap):
+    """Each row of the result is the mean of some rows.
+
+    Args:
+        rows, groups: which row counts in which row of the result.
+        known: (n, C) or (n, 1), which of its entries count.
+        sizes: numbers of rows of the array and of the result.
+    """
+
+    def __init__(self, rows: Int[np.ndarray, "n"], groups: Int[np.ndarray, "n"], known: Any, sizes: tuple[int, int]):
+        ones = np.ones(len(rows))
+        self._sum = csr_array((ones, (groups, np.arange(len(rows)))), shape=(sizes[1], len(rows)))
+        counts = np.maximum(self._sum @ known.astype(np.float64), 1)
+        self._rows, self._weights, self._size = rows, known / counts[groups], sizes[0]
+
+    def push(self, tangents: Sequence[np.ndarray], moving: tuple[int, ...]) -> list[np.ndarray]:
+        (each,) = tangents
+        shape = each.shape[2:]
+        flat = each.reshape(*each.shape[:2], -1)[:, self._rows]
+        return [np.stack([(self._sum @ (self._weights * rows)).reshape(-1, *shape) for rows in flat])]
+
+    def pull(self, cotangents: Sequence[np.ndarray], moving: tuple[int, ...]) -> list[np.ndarray]:
+        (each,) = cotangents
+        found = np.zeros((len(each), self._size, *each.shape[2:]), each.dtype)
+        for rows, by in zip(found, each.reshape(*each.shape[:2], -1), strict=True):
+            rows[self._rows] = (self._weights * (self._sum.T @ by)).reshape(-1, *each.shape[2:])
+        return [found]
+
+
+@without_checks_of_jax
+def averaged(values: Float[AnyArray, "N D"], groups: Int[np.ndarray, "N"]) -> Float[AnyArray, "M D"]:
+    """The mean of the rows of each group; −1: of none. Outside of `jit` summed in float64, and nothing is compiled."""
+    rows = np.flatnonzero(groups >= 0)
+    groups = groups[rows]
+    counts, known = np.bincount(groups), primal(values)
+    if not is_concrete(known):
+        return jax.ops.segment_sum(values[rows], groups, len(counts)) / counts[:, None].astype(values.dtype)
+    average = RowAverage(rows, groups, np.ones((len(rows), 1)), (len(known), len(counts)))
+    (mean,) = average.push([np.asarray(known)[None]], (0,))
+    found = mean[0].astype(known.dtype)
+    return found if is_concrete(values) else with_derivative([found], average, [values])[0]
 
 
 def is_symbolic_zero(tangent: object) -> bool:

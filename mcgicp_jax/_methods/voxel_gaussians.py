@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import Any, Literal, overload
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int, Shaped
@@ -14,8 +12,10 @@ from mcgicp_jax._clouds.point_cloud import PointCloud, Values, as_cloud
 from mcgicp_jax._clouds.preprocess import MIN_POINTS, finite_rows, preprocess, with_neighbors
 from mcgicp_jax._clouds.voxel_size import NUM_NEIGHBORS
 from mcgicp_jax._clouds.voxels import voxel_order
-from mcgicp_jax._compute.concrete import AnyArray, numpy_for
+from mcgicp_jax._compute.concrete import AnyArray
+from mcgicp_jax._compute.linear_maps import averaged
 from mcgicp_jax._compute.messages import check_integer, check_positive, is_number
+from mcgicp_jax._compute.row_functions import Input, Rows, blockwise
 from mcgicp_jax._compute.threads import without_checks_of_jax
 from mcgicp_jax._math import symmetric_matrices as alg
 from mcgicp_jax._methods.gicp import GICP
@@ -157,7 +157,7 @@ class _Cells:
         order: (N,) point numbers, sorted by cell.
         counts: (M,) number of points in each cell.
         kept: (M,) False for cells that are left out.
-        means, spread: (3, M) and (6, M), see `_moments`.
+        means, spread: (3, M), and (6, M) covariances as rows xx, xy, xz, yy, yz, zz.
     """
 
     def __init__(self, cloud: PointCloud, voxel_size: float, min_points: int, channel_size: Values | None):
@@ -169,12 +169,11 @@ class _Cells:
         if channel_size is not None:
             self.order, self._starts = _split(self.order, self._starts, cloud, channel_size)
         self.counts = np.diff(self._starts, append=len(self.order))
-        self.means, self.spread = _moments(
-            np.take(points, self.order, axis=1),
-            self.counts,
-            self._reduced,
-            lambda values: np.repeat(values, self.counts, axis=1),
-        )
+        points = np.take(points, self.order, axis=1)
+        self.means = self._reduced(points) / self.counts
+        x, y, z = points - np.repeat(self.means, self.counts, axis=1)
+        products = np.stack([x * x, x * y, x * z, y * y, y * z, z * z])
+        self.spread = self._reduced(products) / np.maximum(self.counts - 1, 1)
         extended = self.spread[[0, 3, 5]].sum(axis=0) > (_MIN_EXTENT * voxel_size) ** 2
         self.kept = (self.counts >= min_points) & extended
 
@@ -214,7 +213,7 @@ def cell_moments(
     cells: Int[np.ndarray, "N"],
     min_ratio: float = _MIN_RATIO,
 ) -> tuple[Float[Array, "M 3"], Float[Array, "M C"], Float[Array, "M 3 3"]]:
-    """Mean position, mean channels and covariance (m²) of each cell, as in `voxel_gaussians`. Pure JAX, differentiable.
+    """Mean position, mean channels and covariance (m²) of each cell, as in `voxel_gaussians`; differentiable.
 
     To let gradients reach the points of a cloud, replace `points`, `channels` and `covariances` of its
     `voxel_gaussians` by these. The cells are constants.
@@ -224,15 +223,23 @@ def cell_moments(
         cells: from `voxel_cells`; concrete.
         min_ratio: as in `voxel_gaussians`.
     """
-    inside = np.flatnonzero(cells >= 0)
-    number = cells[inside]
-    counts = np.bincount(number)
+    means, counts = averaged(points, cells), np.bincount(cells[cells >= 0])
+    # In two passes: one would lose digits far from zero.
+    (products,) = blockwise(_products, (), Input(points), Input(means, cells))
+    unbiased = (counts / np.maximum(counts - 1, 1)).astype(points.dtype)
+    (covariances,) = blockwise(_raised, min_ratio, Input((averaged(products, cells), unbiased)))
+    return means, averaged(channels, cells), covariances
 
-    def sum_of(columns: Float[Array, "D n"]) -> Float[Array, "D M"]:
-        return jax.ops.segment_sum(columns.T, number, len(counts)).T
 
-    columns, values = (jnp.asarray(array)[inside].T for array in (points, channels))
-    means, symmetric = _moments(columns, counts, sum_of, lambda values: values[:, number])
+def _products(_: Any, own: Rows, mean: Rows) -> tuple[Float[Array, "n 6"]]:
+    x, y, z = (own.tree - mean.tree).T
+    return (jnp.stack([x * x, x * y, x * z, y * y, y * z, z * z], axis=1),)
+
+
+def _raised(min_ratio: Any, own: Rows) -> tuple[Float[Array, "n 3 3"]]:
+    """Covariances of cells from their mean products, with eigenvalues of at least `min_ratio` times the largest."""
+    symmetric, unbiased = own.tree
+    symmetric = symmetric.T * unbiased
     normal = alg.smallest_eigenvector(symmetric)
     u, v = alg.orthonormal_basis(normal)
     within = alg.project(symmetric, u, v)
@@ -242,26 +249,7 @@ def cell_moments(
     floor = min_ratio * (0.5 * (a + c) + radius)
     across = jnp.maximum(jnp.sum(normal * alg.multiply(symmetric, normal), axis=0), floor)
     raised = alg.embed(alg.floor_eigenvalues(within, floor), u, v) + across * alg.outer(normal)
-    return means.T, (sum_of(values) / counts.astype(values.dtype)).T, alg.matrix_from_symmetric(raised)
-
-
-def _moments(
-    points: Float[AnyArray, "3 n"],
-    counts: Int[np.ndarray, "M"],
-    sum_of: Callable[[Any], Any],
-    each: Callable[[Any], Any],
-) -> tuple[Float[AnyArray, "3 M"], Float[AnyArray, "6 M"]]:
-    """Means, and covariances as rows xx, xy, xz, yy, yz, zz, in two passes: one would lose digits far from zero.
-
-    Args:
-        counts: number of points in each cell.
-        sum_of: maps values of the points, (D, n), to their sums over each cell, (D, M).
-        each: maps values of the cells, (D, M), to the value of each point's cell, (D, n).
-    """
-    means = sum_of(points) / counts.astype(points.dtype)
-    x, y, z = points - each(means)
-    products = numpy_for(points).stack([x * x, x * y, x * z, y * y, y * z, z * z])
-    return means, sum_of(products) / np.maximum(counts - 1, 1).astype(points.dtype)
+    return (alg.matrix_from_symmetric(raised),)
 
 
 def _floored(symmetric: Float[np.ndarray, "6 M"], min_ratio: float) -> Float[np.ndarray, "M 3 3"]:
