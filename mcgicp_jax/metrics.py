@@ -8,13 +8,12 @@ from typing import Any, Literal, TypeAlias
 
 import jax
 import jax.numpy as jnp
-import jaxlie
 import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
 from mcgicp_jax._compute.concrete import is_concrete
-from mcgicp_jax._math.poses import Pose, pose_matrix
+from mcgicp_jax._math.poses import Pose, matrix_of, pose_matrix
 
 __all__ = ["ate", "kitti_errors", "pose_error", "rpe"]
 
@@ -59,7 +58,7 @@ def pose_error(T: Pose, T_true: Pose, *, at: ArrayLike | None = None) -> tuple[S
 
 
 def _is_nan(pose: Pose) -> bool:
-    matrix = pose.as_matrix() if isinstance(pose, jaxlie.SE3) else pose
+    matrix = matrix_of(pose)
     return bool(is_concrete(matrix) and np.shape(matrix) == (4, 4) and np.isnan(matrix[:3]).all())
 
 

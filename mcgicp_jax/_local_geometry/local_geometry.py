@@ -17,7 +17,7 @@ from mcgicp_jax._compute.row_functions import ComputedTable, Rows, over_both
 from mcgicp_jax._compute.threads import side_by_side
 from mcgicp_jax._local_geometry.channel_fits import ChannelFits, fit_channels
 from mcgicp_jax._local_geometry.neighborhoods import Neighborhoods, neighborhoods, of_rows, with_near
-from mcgicp_jax._local_geometry.observability import geometry_observability
+from mcgicp_jax._local_geometry.observability import geometry_observability, observability_of_halves
 from mcgicp_jax._math import symmetric_matrices as alg
 from mcgicp_jax._math.statistics import median, sampled_rows
 
@@ -54,47 +54,30 @@ class LocalGeometry(NamedTuple):
 def describe(around: Neighborhoods) -> LocalGeometry:
     """Local geometry of neighbourhoods."""
     offsets = offsets_of(around)
-    covariance = weighted_covariance(offsets, around.present.astype(offsets[0].dtype))
-    normal = alg.smallest_eigenvector(covariance)
-    constants = jax.lax.stop_gradient((around, offsets, covariance, normal))
-    return _described(covariance, normal, *constants)
-
-
-def _described(
-    covariance: Float[Array, "6 n"],
-    normal: Float[Array, "3 n"],
-    around: Neighborhoods,
-    offsets: Offsets,
-    fixed_covariance: Float[Array, "6 n"],
-    fixed_normal: Float[Array, "3 n"],
-) -> LocalGeometry:
-    count = jnp.maximum(jnp.sum(around.present, axis=0), 1).astype(normal.dtype)
+    present = around.present.astype(offsets[0].dtype)
+    covariance = weighted_covariance(offsets, present)
+    a, b, c = fixed = jax.lax.stop_gradient(offsets)
+    # Of every second neighbour, from the first on and then from the second on.
+    halves = [weighted_covariance((a[i::2], b[i::2], c[i::2]), present[i::2]) for i in (0, 1)]
+    counts = jnp.concatenate([jnp.sum(some, axis=0) for some in (present, present[::2], present[1::2])])
+    # Whole neighbourhoods and their halves as one array: what is done with each array is compiled anew.
+    covariances = jnp.concatenate([covariance, *halves], axis=1)
+    normals = alg.smallest_eigenvector(covariances)
+    normal = normals[:, : covariance.shape[1]]
+    fixed_normal, covariances, normals = jax.lax.stop_gradient((normal, covariances, normals))
+    used = (counts >= 3) & ~jnp.tile(around.few, 3)
     basis = alg.orthonormal_basis(fixed_normal)
-    rank = min(_ROUGHNESS_RANK, offsets[0].shape[0] - 1)
-    height = sum(offset[rank] * axis for offset, axis in zip(offsets, fixed_normal, strict=True))
-    halves = _halves(around, offsets)
-    x, y = (sum(offset * b for offset, b in zip(offsets, axis, strict=True)) for axis in basis)
+    rank = min(_ROUGHNESS_RANK, present.shape[0] - 1)
+    height = sum(offset[rank] * axis for offset, axis in zip(fixed, fixed_normal, strict=True))
+    x, y = (sum(offset * b for offset, b in zip(fixed, axis, strict=True)) for axis in basis)
     return LocalGeometry(
         covariance=covariance.T,
         normal=normal.T,
-        observability=geometry_observability(fixed_covariance, fixed_normal, count, halves).T,
+        observability=observability_of_halves(covariances, normals, counts, used).T,
         roughness=0.5 * height**2,
-        reach=jnp.sqrt(jnp.max(sum(offset * offset for offset in offsets), axis=0)),
-        fits=fit_channels(around, x, y),
+        reach=jnp.sqrt(jnp.max(sum(offset * offset for offset in fixed), axis=0)),
+        fits=fit_channels(jax.lax.stop_gradient(around), x, y),
     )
-
-
-def _halves(
-    around: Neighborhoods, offsets: Offsets
-) -> tuple[Float[Array, "6 m"], Float[Array, "3 m"], Float[Array, "m"]]:
-    """Covariance, normal and number of every second neighbour, from the first on and then from the second on, as one
-    array, which compiles once; normals are 0 where there are too few."""
-    present = around.present.astype(offsets[0].dtype)
-    halves = [[array[first::2] for array in (*offsets, present)] for first in (0, 1)]
-    covariances = jnp.concatenate([weighted_covariance((x, y, z), weights) for x, y, z, weights in halves], axis=1)
-    counts = jnp.concatenate([jnp.sum(weights, axis=0) for *_, weights in halves])
-    used = (counts >= 3) & ~jnp.tile(around.few, 2)
-    return covariances, jnp.where(used, alg.smallest_eigenvector(covariances), 0), counts
 
 
 def offsets_of(around: Neighborhoods) -> Offsets:

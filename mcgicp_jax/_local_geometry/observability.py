@@ -10,7 +10,7 @@ subtracted, values of single points may be slightly negative.
 from __future__ import annotations
 
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from mcgicp_jax._compute.concrete import AnyArray
 from mcgicp_jax._local_geometry.channel_fits import ChannelFits
@@ -20,7 +20,7 @@ from mcgicp_jax._math import symmetric_matrices as alg
 # Of 140 walls with noise for channels (400, 2,000 and 12,000 points), channels held a direction of 6; with 0, of 80.
 _MARGIN = 0.2
 
-# κ of `geometry_observability`: 1/16 makes normals that are nearly right unbiased, 5/16 those of random directions.
+# κ of `observability_of_halves`: 1/16 makes normals that are nearly right unbiased, 5/16 those of random directions.
 # Corridors, planes, floors with a wall and crossing planes (3,000 and 10,000 points, noise of up to 1.5 spacings) had
 # at most 0.0023 along their free directions, with 0.21 up to 0.006. A street of 10,000 points had at least 0.0016 up to
 # one spacing, in 27 of 28 samples above 0.002; at 1.5 spacings it had −0.001 to 0.003 (0.0018 and more with 0.21).
@@ -28,42 +28,45 @@ _NOISE = 0.22
 
 
 def geometry_observability(
-    covariance: Float[Array, "6 N"],
-    normal: Float[Array, "3 N"],
-    count: Float[Array, "N"],
-    halves: tuple[Float[Array, "6 M"], Float[Array, "3 M"], Float[Array, "M"]] | None = None,
+    covariance: Float[Array, "6 N"], normal: Float[Array, "3 N"], count: Float[Array, "N"]
+) -> Float[Array, "6 N"]:
+    """Observability from one normal n: (n nᵀ − V) (1 − tr V), with the covariance V of n.
+
+    Args:
+        covariance: covariance of the neighbours about their mean, metres².
+        normal: unit eigenvector of its smallest eigenvalue.
+        count: number of neighbours.
+    """
+    certain, variance = _certainty(covariance, normal, count)
+    return certain * (alg.outer(normal) - variance)
+
+
+def observability_of_halves(
+    covariances: Float[Array, "6 M"], normals: Float[Array, "3 M"], counts: Float[Array, "M"], used: Bool[Array, "M"]
 ) -> Float[Array, "6 N"]:
     """Observability from the normals n₁ and n₂ of two halves of the neighbours, whose noise is independent.
 
     With the projectors Pᵢ = nᵢ nᵢᵀ, the part of noise in (P₁ P₂ + P₂ P₁) / 2 is the square of its part in each of them.
     κ sin²φ (P₁ − P₂)² estimates it, where φ is the angle between the normals, and is subtracted. The rest is multiplied
     by the certainties of both normals, which are independent, too: the certainty of the normal of all neighbours is
-    larger where both halves deviate alike.
-
-    For covariances without neighbours, in clouds of few points, and where a half has fewer than three neighbours, the
-    projector of the normal of all neighbours is used, its covariance V is subtracted, and its certainty is a factor.
+    larger where both halves deviate alike. `geometry_observability` of all neighbours where a half is not used.
 
     Args:
-        covariance: covariance of the neighbours about their mean, metres².
-        normal: unit eigenvector of its smallest eigenvalue.
-        count: number of neighbours.
-        halves: the same for the first halves and then for the second ones, M = 2 N; normals are 0 where there are too
-            few neighbours.
+        covariances, normals, counts: as of `geometry_observability`, of all neighbours, then of the first halves, and
+            then of the second ones; M = 3 N.
+        used: whether the normal may be used.
     """
-    certain, variance = _certainty(covariance, normal, count)
-    whole = certain * (alg.outer(normal) - variance)
-    if halves is None:
-        return whole
-    certain, _ = _certainty(*halves)
-    first, second = jnp.split(halves[1], 2, axis=1)
+    certain, variance = _certainty(covariances, normals, counts)
+    (whole, *of_halves), (normal, first, second) = jnp.split(certain, 3), jnp.split(normals, 3, axis=1)
+    whole = whole * (alg.outer(normal) - variance[:, : whole.size])
     # By the sum and the difference of the normals, which are orthogonal; the signs of the normals do not matter.
     cosine = jnp.sum(first * second, axis=0)
     by_sum, by_difference = (
         0.25 * sign * cosine - 0.5 * _NOISE * (1 - cosine * cosine) * (1 - sign * cosine) for sign in (1, -1)
     )
     split = by_sum * alg.outer(first + second) + by_difference * alg.outer(first - second)
-    split = jnp.prod(certain.reshape(2, -1), axis=0) * split
-    return jnp.where(jnp.any(first != 0, axis=0) & jnp.any(second != 0, axis=0), split, whole)
+    both = jnp.all(used.reshape(3, -1)[1:], axis=0)
+    return jnp.where(both, of_halves[0] * of_halves[1] * split, whole)
 
 
 def _certainty(

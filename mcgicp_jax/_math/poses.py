@@ -53,7 +53,7 @@ def pose_matrix(
     """
     if pose is None:
         return np.eye(4)
-    matrix = pose.as_matrix() if isinstance(pose, jaxlie.SE3) else pose
+    matrix = matrix_of(pose)
     if not is_concrete(matrix):
         if matrix.shape not in ((4, 4), (3, 4)):
             raise ValueError(f"{name}: expected a jaxlie.SE3 or a (4, 4) matrix, got shape {matrix.shape}")
@@ -130,6 +130,13 @@ def se3_from_matrix(matrix: Float[ArrayLike, "4 4"], dtype: DTypeLike) -> jaxlie
 def parameters_of(matrices: Float[np.ndarray, "*batch 4 4"]) -> Float[np.ndarray, "*batch 7"]:
     """Unit quaternions wxyz and translations of rigid motions; float64."""
     return np.concatenate([quaternion_from_rotation(matrices[..., :3, :3]), matrices[..., :3, 3]], axis=-1)
+
+
+def matrix_of(pose: Pose) -> Any:
+    """The (4, 4) matrices of `jaxlie.SE3`, in float64 by NumPy where it is concrete; matrices as they are."""
+    if not isinstance(pose, jaxlie.SE3):
+        return pose
+    return matrices_of(np.asarray(pose.wxyz_xyz, np.float64)) if is_concrete(pose) else pose.as_matrix()
 
 
 def matrices_of(parameters: Float[np.ndarray, "*batch 7"]) -> Float[np.ndarray, "*batch 4 4"]:

@@ -14,7 +14,7 @@ from mcgicp_jax._clouds.point_cloud import PointCloud
 from mcgicp_jax._clouds.preprocess import check_preprocessing
 from mcgicp_jax._clouds.voxel_size import NUM_NEIGHBORS, VoxelSize
 from mcgicp_jax._compute.concrete import is_concrete
-from mcgicp_jax._math.poses import Pose, pose_matrix
+from mcgicp_jax._math.poses import Pose, matrix_of, pose_matrix
 from mcgicp_jax._methods.base import AbstractMethod
 from mcgicp_jax._pairs.batch_executors import check_executor, run
 from mcgicp_jax._pairs.batch_jobs import BatchJob, Cloud, Pair
@@ -137,7 +137,7 @@ def _pairs(
                 sides[name] = pose_matrix(sides[name])
             sides[name] = itertools.repeat(sides[name])
         elif isinstance(sides[name], jaxlie.SE3):
-            sides[name] = np.asarray(sides[name].as_matrix())
+            sides[name] = np.asarray(matrix_of(sides[name]))
         elif not isinstance(sides[name], Iterable):
             raise ValueError(f"{name}: expected an iterable with one per pair, got {type(sides[name]).__name__}")
     several = {name: values for name, values in sides.items() if not one_for_all[name]}

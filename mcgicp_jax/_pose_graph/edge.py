@@ -8,13 +8,12 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import jaxlie
 import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float, Int
 
 from mcgicp_jax._compute.concrete import is_concrete, numpy_for
-from mcgicp_jax._math.poses import Pose, adjoint, inverse, logarithm, logarithm_derivative, pose_matrices
+from mcgicp_jax._math.poses import Pose, adjoint, inverse, logarithm, logarithm_derivative, matrix_of, pose_matrices
 
 # Row of the world's frame, whose pose is the identity. Unlike −1, it is not a row of any array.
 WORLD = -(2**31)
@@ -106,7 +105,7 @@ class Edge(AbstractFactor):
         if (information is None) == (covariance is None):
             raise ValueError("information: expected either an information or a covariance matrix, got both or neither")
         self.i, self.j = _rows("i", i), _rows("j", j)
-        self.T_i_j = _as_float("T_i_j", T_i_j.as_matrix() if isinstance(T_i_j, jaxlie.SE3) else T_i_j)
+        self.T_i_j = _as_float("T_i_j", matrix_of(T_i_j))
         self.information = _inverse(covariance) if information is None else _as_float("information", information)
         shape = np.shape(self.i)
         traced = isinstance(uncertain, jax.Array)

@@ -7,7 +7,6 @@ from typing import TYPE_CHECKING, Any, TypeAlias, cast
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import jaxlie
 import numpy as np
 from jaxtyping import Float
 
@@ -15,7 +14,7 @@ from mcgicp_jax._clouds.origins import centred_pose
 from mcgicp_jax._clouds.point_cloud import PointCloud
 from mcgicp_jax._compute.concrete import AnyArray, constant, is_concrete, numpy_for, outside_trace
 from mcgicp_jax._compute.linear_maps import primal
-from mcgicp_jax._math.poses import matrices_of, translation_adjoint
+from mcgicp_jax._math.poses import matrix_of, translation_adjoint
 from mcgicp_jax._math.symmetric_matrices import inverse_6
 from mcgicp_jax._pose_solver.covariance import Moments
 from mcgicp_jax._pose_solver.degeneracy import Directions
@@ -98,7 +97,7 @@ def _information(covariance: Float[np.ndarray, "6 6"], source: PointCloud) -> Fl
 def fusion_of(state: State, moments: Moments, ties: TiePoints | None, prior: Prior | None) -> Fusion:
     """The equation of the pose with tie points and prior, from the final state of a registration without them."""
     state, moments = constant((state, moments))
-    dtype, matrix = state.pose.wxyz_xyz.dtype, _matrix_of(state.pose)
+    dtype, matrix = state.pose.wxyz_xyz.dtype, matrix_of(state.pose)
     center, directions = state.sums.center, cast(Directions, state.directions)
     if is_concrete(state):
         # Reading NumPy arrays compiles nothing.
@@ -116,12 +115,6 @@ def fusion_of(state: State, moments: Moments, ties: TiePoints | None, prior: Pri
         fusion = jax.tree.map(lambda array: array if array.dtype == bool else array.astype(dtype), fusion)
     form = jax.tree.map(lambda array: jnp.asarray(array, dtype), form)
     return eqx.tree_at(lambda fusion: fusion.form, fusion, form)
-
-
-def _matrix_of(pose: jaxlie.SE3) -> Float[AnyArray, "4 4"]:
-    if is_concrete(pose):
-        return matrices_of(np.asarray(pose.wxyz_xyz, np.float64))
-    return pose.as_matrix()
 
 
 def _parts(name: str, given: Any, form: str, count: int) -> Any:
