@@ -28,7 +28,12 @@ def centred_pose(pose: Pose | None, source: PointCloud, target: PointCloud, name
     if is_concrete(source.origin, source.points) and np.any(source.origin):
         radius = float(np.abs(np.asarray(source.points)).max(initial=0))
         distance = float(np.linalg.norm(source.origin)) / radius if radius > 0 else 0.0
+    if isinstance(pose, jaxlie.SE3) and not is_concrete(pose):
+        # Outside of `jit` this compiles nothing.
+        pose = pose_in_user_frame(pose, np.zeros(3), np.zeros(3))
     matrix = pose_matrix(pose, name, distance)
+    if is_concrete(source.origin, target.origin) and not (np.any(source.origin) or np.any(target.origin)):
+        return matrix
     rotation, translation = matrix[:3, :3], matrix[:3, 3]
     # In this form two far origins cancel exactly, before the rotation is applied to either.
     shifted = (rotation - np.eye(3)) @ source.origin + (source.origin - target.origin) + translation

@@ -29,7 +29,7 @@ from mcgicp_jax._compute.concrete import Deferred, is_concrete, outside_trace
 from mcgicp_jax._compute.linear_maps import AbstractLinearMap, primal, with_derivative
 from mcgicp_jax._compute.programs import quickly_compiled
 from mcgicp_jax._compute.tables import BLOCK, NEIGHBORHOOD_BLOCK, Packed, RowsOnDemand, blocks
-from mcgicp_jax._compute.threads import num_cores, side_by_side, without_checks_of_jax
+from mcgicp_jax._compute.threads import in_new_thread, num_cores, side_by_side, without_checks_of_jax
 
 # Points. Inside transformations, neighbourhoods of more points are processed in blocks, too: on CPUs XLA sums over the
 # first axis of a wider table column by column, which is twenty times slower.
@@ -414,12 +414,14 @@ def blockwise(function: Callable[..., Any], numbers: Any, *inputs: Input, total:
     first = inputs[0]
     size = as_table(first.table).size if first.index is None else len(first.index)
     applied = RowFunction(function, numbers, inputs, size, total)
+    call = partial(applied.sums, None) if total else partial(applied.rows, None, None)
+    # Differentiation is a transformation, too: inside it, calls of programs take longer.
+    parts = in_new_thread(call) if applied.tracers else call()
     if total:
-        parts = applied.sums(None)
         added = np.sum([np.asarray(part.table, np.float64) for part in parts], axis=0)
         found: list[Packed] = [Packed(added.astype(parts[0].table.dtype), parts[0].layout)]
     else:
-        found = list(applied.rows(None, None))
+        found = list(parts)
     leaves, structure = jax.tree.flatten(found[0].tree)
     if applied.tracers:
         leaves = with_derivative(leaves, _Derivative(applied, total, leaves), applied.tracers)
