@@ -91,8 +91,15 @@ def test_the_size_goes_with_the_unit_and_not_with_far_points_or_the_order():
 
 @pytest.mark.parametrize(
     "raw",
-    [np.zeros((600, 3)), np.repeat(RNG.random((100, 3)), 6, axis=0), RNG.random((600, 3)) * [1, 0, 0], 1e30 * even()],
-    ids=["one place", "duplicates", "one line", "huge"],
+    [
+        np.zeros((600, 3)),
+        np.repeat(RNG.random((100, 3)), 6, axis=0),
+        RNG.random((600, 3)) * [1, 0, 0],
+        1e30 * even(),
+        # The smallest size for this extent, rounded to two digits, has more voxels than can be numbered.
+        np.append(lines(spacing=0.3), [[703_630, 0, 0]], axis=0),
+    ],
+    ids=["one place", "duplicates", "one line", "huge", "far point"],
 )
 def test_any_cloud_has_a_size_or_none(raw):
     size = mcg.preprocess(raw).voxel_size

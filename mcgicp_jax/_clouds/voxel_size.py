@@ -7,6 +7,7 @@ fault, if the voxels are large enough; larger ones lose detail. Hence the smalle
 
 from __future__ import annotations
 
+import bisect
 from collections.abc import Sequence
 from functools import partial
 from typing import Any, Literal, NamedTuple, TypeAlias
@@ -58,9 +59,6 @@ _DOUBLE = 3
 _DECADES, _DOUBLINGS, _INNER = 4, 4, (0.05, 0.95)
 # Number of points whose neighbourhoods are examined: a fraction of 5 % is known to within 1.3 %.
 _SAMPLE = 300
-# Bits of the hash by which voxels are counted: of 40,000, 2 % collide. Its multiplier is 2⁶⁴ over the golden ratio
-# (Knuth, The Art of Computer Programming, volume 3, 6.4); applied only once, planes collide five times as often.
-_HASH_BITS, _HALF, _GOLDEN = 20, np.uint64(32), np.uint64(0x9E3779B97F4A7C15)
 # Fractions of lines and thickness from which raw clouds are warned of.
 _MANY_LINES, _AS_THICK_AS_WIDE = 0.1, 0.6
 
@@ -108,7 +106,7 @@ def voxels_and_grids(voxel_size: VoxelSize | Voxels, *clouds: PointCloud) -> tup
         max(counts, default=0) < _LEAST_VOXELS or min(counts) < NUM_NEIGHBORS
     ):
         return Voxels(), none
-    grids = {row: grid_of(each) for row, each in points.items()}
+    grids = dict(zip(points, side_by_side([partial(grid_of, each) for each in points.values()]), strict=True))
     return _chosen(list(grids.values())), [grids.get(row) for row in range(len(clouds))]
 
 
@@ -195,10 +193,11 @@ def _shape_of(columns: Float[np.ndarray, "3 N"], neighbors: Any = None) -> Shape
         _, nearest = search.query(search.build(points), points[rows], min(NUM_NEIGHBORS, size), np.inf)
     else:
         nearest = neighbors[rows]
-    near = columns[:, nearest]
-    distances = np.linalg.norm(near[:, :, 1] - near[:, :, 0], axis=0)
-    offsets = near - near.mean(axis=2, keepdims=True)
-    squares = np.linalg.eigvalsh(np.einsum("ink,jnk->nij", offsets, offsets))
+    # Neighbours come before samples, so that NumPy's loops run over the samples.
+    near = columns[:, nearest.T]
+    distances = np.linalg.norm(near[:, 1] - near[:, 0], axis=0)
+    offsets = near - near.mean(axis=1, keepdims=True)
+    squares = np.linalg.eigvalsh(np.einsum("ikn,jkn->ijn", offsets, offsets).T)
     thin, second, first = np.sqrt(np.maximum(squares.T, np.finfo(float).tiny))
     return Shape(float(np.mean(second < _LINE * first)), float(np.median(thin / second)), float(np.median(distances)))
 
@@ -230,10 +229,6 @@ class _Candidate:
     def shows_scene(self, step: int) -> bool:
         return self._count(step) >= self._least
 
-    def last_that_shows_scene(self, steps: range) -> int:
-        """The last step at which enough voxels are left; the one before the first if there is none."""
-        return self.first_with(self._least - 1, steps, steps.stop - 1) - 1
-
     def first_with(self, limit: int, steps: range, guess: int) -> int:
         """The first step with at most so many voxels, the end of the range if there is none."""
         low, high = steps.start, steps.stop
@@ -241,8 +236,8 @@ class _Candidate:
             guess = min(max(guess, low), high - 1)
             count = self._count(guess)
             low, high = (low, guess) if count <= limit else (guess + 1, high)
-            # On a surface, the number of voxels goes with the inverse square of their size.
-            guess += round(_STEPS / 2 * np.log10(count / limit))
+            # Along scan lines the number of voxels goes with the inverse of their size, on a surface with its square.
+            guess += round(_STEPS * np.log10(count / limit))
         return low
 
     def _means(self, step: int) -> Float[np.ndarray, "3 M"]:
@@ -251,19 +246,7 @@ class _Candidate:
         return sums / np.bincount(numbers)
 
     def _count(self, step: int) -> int:
-        """The number of voxels, or up to 0.4 % more."""
-        columns = self._grid.columns
-        if step == self._step:
-            return columns.shape[1]
-        key = np.zeros(columns.shape[1], np.int64)
-        for column in columns:
-            key = key * VOXELS_PER_AXIS + np.floor(column / _size(step)).astype(np.int64)
-        occupied = np.zeros(2**_HASH_BITS, bool)
-        mixed = key.view(np.uint64) * _GOLDEN
-        occupied[(mixed ^ mixed >> _HALF) * _GOLDEN >> np.uint64(64 - _HASH_BITS)] = True
-        # The expected number that collides, and three standard deviations of that.
-        number = -occupied.size * np.log1p(-occupied.mean())
-        return int(number * (1 + 3 / np.sqrt(2 * occupied.size)))
+        return self._grid.columns.shape[1] if step == self._step else self._grid.numbers(_size(step))[1]
 
 
 def _lines(candidates: Sequence[_Candidate], step: int | None) -> float:
@@ -281,18 +264,17 @@ def _without_lines(candidates: Sequence[_Candidate], step: int | None, steps: ra
     Args:
         step: number of the current size.
     """
-    end = steps.stop
-    for candidate in candidates:
-        end = candidate.last_that_shows_scene(range(steps.start, end)) + 1
-    larger, guess = steps.start, (steps.start + end) // 2
-    # What suffices for the cloud of most lines mostly suffices for the others.
-    for candidate in sorted(candidates, key=lambda candidate: candidate.shape(step).lines, reverse=True):
-        high = end
-        while larger < high:
-            few = candidate.shape(guess).lines <= _MOST_LINES
-            larger, high = (larger, guess) if few else (guess + 1, high)
-            guess = (larger + high) // 2
-    return min(larger, end - 1) if steps.start < end else None
+
+    def suffices(candidate: _Candidate, larger: int) -> bool:
+        return not candidate.shows_scene(larger) or candidate.shape(larger).lines <= _MOST_LINES
+
+    # What suffices for the cloud of most lines mostly suffices for the others, or the next size does.
+    most, *others = sorted(candidates, key=lambda candidate: candidate.shape(step).lines, reverse=True)
+    larger = bisect.bisect_left(steps, True, key=partial(suffices, most)) + steps.start
+    for candidate in others:
+        larger = next((each for each in range(larger, steps.stop) if suffices(candidate, each)), steps.stop)
+    shown = range(larger, steps.start - 1, -1)
+    return next((each for each in shown if all(candidate.shows_scene(each) for candidate in candidates)), None)
 
 
 def _thinner(candidates: Sequence[_Candidate], step: int | None, start: int) -> int | None:
@@ -322,7 +304,8 @@ def _range_of(points: Sequence[Float[np.ndarray, "3 _"]]) -> tuple[int, int]:
     inner = max(float(np.ptp(np.quantile(sample, _INNER, axis=1), axis=0).max()) for sample in samples)
     whole = max(float(np.ptp(columns, axis=1).max()) for columns in points)
     largest = _step_of(inner or whole or 1.0)
-    return max(largest - _STEPS * _DECADES, _step_of(whole / VOXELS_PER_AXIS or 1.0)), largest
+    # 1 %, since sizes are rounded to two digits.
+    return max(largest - _STEPS * _DECADES, _step_of(1.01 * whole / VOXELS_PER_AXIS or 1.0)), largest
 
 
 def _step_of(size: float) -> int:

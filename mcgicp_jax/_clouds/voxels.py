@@ -124,8 +124,8 @@ def starts_of(sorted_keys: Int[np.ndarray, "N"]) -> Int[np.ndarray, "M"]:
 
 def _stable_order(key: Int[np.ndarray, "N"], num_keys: int) -> Int[np.ndarray, "N"]:
     """Indices of a stable sort of keys in [0, `num_keys`)."""
-    bits = (len(key) - 1).bit_length()
-    if (num_keys - 1).bit_length() + bits > 63:
-        return np.argsort(key, kind="stable")
-    # Sorting keys with the row index in their low bits is several times faster than argsort.
-    return np.sort((key << bits) | np.arange(len(key))) & ((1 << bits) - 1)
+    order = np.arange(len(key))
+    # NumPy sorts 16-bit integers by radix: one pass for each 16 bits takes a third of the time of sorting the keys.
+    for shift in range(0, (num_keys - 1).bit_length(), 16):
+        order = order[np.argsort((key[order] >> shift).astype(np.uint16), kind="stable")]
+    return order
