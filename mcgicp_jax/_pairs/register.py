@@ -61,8 +61,8 @@ def register(
     neighbours and estimated parameters are constants. α has a derivative only with soft matches: see `estimate_pose`.
     Of a DEGENERATE pose it is that within the constrained directions, which are constants, too, and 0 along the others.
     If registration fails otherwise, the derivative is 0, never NaN, except after MAX_ITERATIONS or if UNVERIFIED.
-    Outside `jit` it costs about as much as the registration, for clouds of any size; inside, each size compiles for
-    some ten seconds, so pad clouds (`PointCloud.pad`). `register_batch` differentiates many pairs at once.
+    Outside `jit`, value and gradient take two to four registrations, for clouds of any size; inside, each size compiles
+    for some ten seconds, so pad clouds (`PointCloud.pad`). `register_batch` differentiates many pairs at once.
 
     Args:
         source, target: clouds from `preprocess`. Raw clouds and (N, 3) arrays, metres, are preprocessed with the
