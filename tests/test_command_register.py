@@ -398,3 +398,10 @@ def test_a_reader_that_ends_early_is_no_error(arguments):
     done = subprocess.run(command, stdout=writer, stderr=subprocess.PIPE, text=True, timeout=120)
     os.close(writer)
     assert done.stderr == ""
+
+
+def test_methods_are_listed_in_order(capsys):
+    with pytest.raises(SystemExit):
+        main(["register", "a.ply", "b.ply", "--method", "foo"])
+    text = " ".join(capsys.readouterr().err.replace("│", " ").split())
+    assert f"Expected one of ({', '.join(map(repr, METHODS))})" in text

@@ -91,13 +91,20 @@ def warn_of_constant_weights(method: AbstractMethod) -> None:
 def warn_of_estimated_parameters(
     method: AbstractMethod, source: PointCloud, target: PointCloud, temperature: ArrayLike | None = None
 ) -> None:
-    """Warn if channels are differentiated outside of `jit` while Λ, or α with a `temperature`, is estimated from them.
+    """Warn if channels are differentiated outside of `jit` while numbers of the method are estimated from them.
 
-    Estimated parameters are constant to autodiff. Without a `temperature`, α decides matches alone, which are, too.
+    These are Λ, α with a `temperature`, or those of the photometric term, which uses neither; all are constant to
+    autodiff. Without a `temperature`, α decides matches alone, which are constant, too.
     """
     channels = source.channels, target.channels
-    # The photometric residuals use neither.
-    if not isinstance(method, MultiChannelGICP) or method.photometric or is_concrete(channels):
+    if not isinstance(method, MultiChannelGICP) or is_concrete(channels):
+        return
+    if method.photometric:
+        if is_concrete(primal(channels)):
+            warn(
+                "photometric: standard deviations, gains and offsets are estimated from the channels, but constant in "
+                "the derivative by channels, which is therefore not that of the result"
+            )
         return
     names = ["channel_covariance"] if temperature is None else ["channel_covariance", "channel_weights"]
     unset = [name for name in names if getattr(method, name) is None]
