@@ -91,20 +91,23 @@ def warn_of_constant_weights(method: AbstractMethod) -> None:
 def warn_of_estimated_parameters(
     method: AbstractMethod, source: PointCloud, target: PointCloud, temperature: ArrayLike | None = None
 ) -> None:
-    """Warn if channels are differentiated outside of `jit` while numbers of the method are estimated from them.
+    """Warn if channels are differentiated outside of `jit` while Λ, or α with a `temperature`, is estimated from them.
 
-    These are Λ, α with a `temperature`, or those of the photometric term, which uses neither; all are constant to
-    autodiff. Without a `temperature`, α decides matches alone, which are constant, too.
+    The photometric term uses neither, but estimates numbers from the residuals of points and channels. All of these are
+    constant to autodiff. Without a `temperature`, α decides matches alone, which are, too.
     """
     channels = source.channels, target.channels
-    if not isinstance(method, MultiChannelGICP) or is_concrete(channels):
+    if not isinstance(method, MultiChannelGICP):
         return
     if method.photometric:
-        if is_concrete(primal(channels)):
+        values = source.points, target.points, channels
+        if not is_concrete(values) and is_concrete(primal(values)):
             warn(
-                "photometric: standard deviations, gains and offsets are estimated from the channels, but constant in "
-                "the derivative by channels, which is therefore not that of the result"
+                "photometric: standard deviations, gains and offsets are estimated from the residuals, but constant in "
+                "the derivative by points and channels, which is therefore not that of the result"
             )
+        return
+    if is_concrete(channels):
         return
     names = ["channel_covariance"] if temperature is None else ["channel_covariance", "channel_weights"]
     unset = [name for name in names if getattr(method, name) is None]
