@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import contextlib
 import gc
+import logging
 import os
 import sys
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
 import jax
@@ -18,6 +20,7 @@ from mcgicp_jax._cli.batch import batch
 from mcgicp_jax._cli.multiway import multiway
 from mcgicp_jax._cli.odometry import odometry
 from mcgicp_jax._cli.register import compare, demo, register
+from mcgicp_jax._compute.programs import LOGGER
 
 
 def _keep_compiled_programs() -> None:
@@ -30,6 +33,20 @@ def _keep_compiled_programs() -> None:
         jax.config.update("jax_compilation_cache_dir", str(folder))
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0)
     jax.config.update("jax_persistent_cache_min_entry_size_bytes", -1)
+
+
+@contextlib.contextmanager
+def _shown_log() -> Iterator[None]:
+    """Log records of the package as lines of stderr."""
+    handler, level = logging.StreamHandler(), LOGGER.level
+    handler.setFormatter(logging.Formatter("mcgicp: %(message)s"))
+    LOGGER.addHandler(handler)
+    LOGGER.setLevel(logging.INFO)
+    try:
+        yield
+    finally:
+        LOGGER.removeHandler(handler)
+        LOGGER.setLevel(level)
 
 
 def _show_warning(message: Warning | str, *_: Any, **__: Any) -> None:
@@ -70,7 +87,7 @@ def _run(args: Sequence[str]) -> int:
     # Exclude imported modules from garbage collection, which took a tenth of the time of a short command.
     gc.freeze()
     commands: tuple[Callable[..., int], ...] = (demo, register, compare, odometry, multiway, batch)
-    with warnings.catch_warnings():
+    with warnings.catch_warnings(), _shown_log():
         warnings.showwarning = _show_warning
         try:
             return tyro.extras.subcommand_cli_from_dict(

@@ -24,6 +24,10 @@ import jax
 import pytest
 
 import mcgicp_jax
+from mcgicp_jax._compute.programs import LOGGER
+
+# Its record of a long compilation would be a line of whichever command a process runs then.
+LOGGER.disabled = True
 
 DATA = pathlib.Path(os.environ.get("MCGICP_DATA", pathlib.Path(__file__).parents[2] / "shared" / "data"))
 

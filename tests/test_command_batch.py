@@ -15,6 +15,7 @@ import mcgicp_jax as mcg
 from mcgicp_jax import io
 from mcgicp_jax.__main__ import main
 from mcgicp_jax._cli.table import POSE
+from mcgicp_jax._clouds.voxel_size import voxels_for
 from mcgicp_jax.metrics import pose_error
 from tests.scenes import motion, room_corner
 
@@ -265,3 +266,23 @@ def test_pairs_that_could_not_be_registered_are_tried_again(folder, tmp_path, ca
     assert "2, of which 1 are in" in capsys.readouterr().out
     after = table(tmp_path / "results.csv")
     assert after[0] == before[0] and after[1]["status"] == "converged"
+
+
+def test_each_pair_has_voxels_of_its_own(tmp_path):
+    """As in `register_batch`; one size for all would suit the first pair only."""
+    rng, lines = np.random.default_rng(0), np.stack(np.meshgrid(np.arange(0, 2, 0.01), np.arange(0, 2, 0.1)), -1)
+    corner = np.concatenate([np.insert(lines.reshape(-1, 2), axis, 0, axis=1) for axis in range(3)])
+    clouds = [corner + 0.002 * rng.normal(size=corner.shape) for _ in range(2)]
+    pairs = [[mcg.PointCloud(scale * cloud) for cloud in clouds] for scale in (1, 4)]
+    names = [(f"{i}_target.ply", f"{i}_source.ply") for i in range(2)]
+    for pair, files in zip(pairs, names, strict=True):
+        for cloud, file in zip(pair, files, strict=True):
+            io.write(tmp_path / file, cloud)
+    listed = write_pairs(tmp_path / "pairs.csv", [files[::-1] for files in names])
+    main(["batch", listed, "--output", str(tmp_path / "out.csv"), "--method", "gicp"])
+    targets, sources = zip(*[[io.read(tmp_path / file) for file in files] for files in names], strict=True)
+    expected = mcg.register_batch(list(sources), list(targets), mcg.GICP())
+    sizes = [voxels_for("auto", *pair).size for pair in zip(sources, targets, strict=True)]
+    assert sizes[0] is not None and sizes[1] > 2 * sizes[0]
+    for row, result in zip(table(tmp_path / "out.csv"), expected, strict=True):
+        np.testing.assert_array_equal(matrix(row)[:3], result.matrix[:3])

@@ -57,6 +57,7 @@ def test_wrong_input_gets_one_line(tmp_path, capsys):
     (alone / "frame-000000.depth.png").touch()
     for args, message in (
         (["kitti", str(tmp_path)], "expected scans in velodyne/*.bin, found none"),
+        (["kitti"], "expected the folder of a sequence after it, mcgicp odometry kitti PATH"),
         (["tum", str(tmp_path)], "depth.txt: No such file"),
         (["7-scenes", str(alone)], "expected at least 2 frames, got 1"),
         (["box-room", "--num-frames", "1"], "num_frames: expected at least 2, got 1"),

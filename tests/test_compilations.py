@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 import mcgicp_jax as mcg
+from mcgicp_jax._compute import programs
 from tests.compilations import compilations
 from tests.scenes import room_corner
 
@@ -183,3 +184,14 @@ def test_find_correspondences_computes_nothing_that_it_does_not_use():
         mcg.find_correspondences(source, target, None, mcg.GICP(), max_distance=0.5)
         mcg.find_correspondences(source, target, None, mcg.ColorICP(0.3), max_distance=0.5)
     assert not found
+
+
+def test_long_compilation_is_logged_once(caplog, monkeypatch):
+    monkeypatch.setattr(programs, "_LONG", 1e-9)
+    monkeypatch.setattr(programs.LOGGER, "disabled", False)
+    monkeypatch.setattr(programs.COMPILATIONS, "seconds", 0.0)
+    with caplog.at_level("INFO", "mcgicp_jax"):
+        for constant in (1.25, 2.25):
+            jax.jit(lambda x, constant=constant: x + constant)(1.0)
+    (record,) = caplog.records
+    assert record.name == "mcgicp_jax" and "programs are kept in" in record.getMessage()

@@ -439,6 +439,11 @@ def test_estimated_parameters_are_warned_of_where_channels_are_differentiated(of
     with pytest.warns(UserWarning, match=r"^channel_covariance: estimated .* resolve") as caught:
         jax.grad(loss)(inputs, unset)
     assert len(caught) == 1
+    photometric = mcg.MultiChannelGICP(0.05, 0.3, photometric=True)
+    for each in (inputs, {"source points": clouds[0].points}):
+        with pytest.warns(UserWarning, match="^photometric: .* estimated from the residuals") as caught:
+            jax.grad(loss)(each, photometric)
+        assert len(caught) == 1
 
 
 def test_estimated_weights_of_soft_matches_are_warned_of(clouds):

@@ -402,3 +402,4 @@ def test_a_frame_that_cannot_be_registered_is_named():
     with pytest.warns(UserWarning, match=r"frames\[3\]: TOO_FEW_CORRESPONDENCES; the motion .*recover=True"):
         found = list(steps)
     assert not found[3].registration.converged
+    assert found[3].lost and not any(step.lost for step in found[:3])

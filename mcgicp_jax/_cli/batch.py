@@ -199,7 +199,8 @@ def _settings(pairs: Sequence[FilePair], method: Method, options: Options) -> di
         raise reason
     choices = Choices.of(options, *clouds)
     name = choices.method_name(method, dict(zip((pair.source, pair.target), clouds, strict=True)))
-    print(f"points:    {choices.voxels}")
+    size = None if options.voxel_size == "off" else options.voxel_size
+    print(f"points:    {choices.voxels}{' in the first pair' if size == 'auto' else ''}")
 
     def ready() -> tuple[mcg.PointCloud, mcg.PointCloud]:
         source, target = map(choices.preprocess, clouds)
@@ -208,7 +209,7 @@ def _settings(pairs: Sequence[FilePair], method: Method, options: Options) -> di
     return choices.arguments(name, ready) | {
         "method": choices.method(name, ready),
         "channels": choices.channels,
-        "voxel_size": choices.voxels.size,
+        "voxel_size": size,
         "num_neighbors": options.num_neighbors,
     }
 

@@ -39,7 +39,7 @@ else:
     DatasetName = Literal[tuple(DATASETS)]
 
 Positional: TypeAlias = Annotated[DatasetName | Path, tyro.conf.Positional, tyro.conf.arg(metavar="{FOLDER,DATASET}")]
-Folder: TypeAlias = Annotated[Path, tyro.conf.Positional, shown("PATH")]
+Folder: TypeAlias = Annotated[Path | None, tyro.conf.Positional, shown("PATH")]
 Poses: TypeAlias = list[Float[np.ndarray, "4 4"]]
 Truth: TypeAlias = list[Float[np.ndarray, "4 4"] | None]
 
@@ -59,7 +59,7 @@ def _distances() -> str:
 @partial(with_names, datasets=_names(False), scenes=_names(True), max_distances=_distances())
 def odometry(
     dataset: Positional,
-    path: Folder = Path(),
+    path: Folder = None,
     *,
     shared: Options,
     method: Method = None,
@@ -131,13 +131,15 @@ def odometry(
 
 
 def _open(
-    dataset: DatasetName | Path, path: Path, num_frames: int | Literal["all"], map: Path | None
+    dataset: DatasetName | Path, path: Path | None, num_frames: int | Literal["all"], map: Path | None
 ) -> AbstractFrames:
     if num_frames != "all" and num_frames < 2:
         raise ValueError(f"num_frames: expected at least 2, got {num_frames}")
     if isinstance(dataset, str) and DATASETS[dataset].simulated:
         return DATASETS[dataset].frames(_FRAMES_OF_A_SCENE if num_frames == "all" else num_frames)
     if isinstance(dataset, str):
+        if path is None:
+            raise ValueError(f"{dataset}: expected the folder of a sequence after it, mcgicp odometry {dataset} PATH")
         frames = DATASETS[dataset].frames(path)
     elif dataset.is_dir():
         frames = clouds_in(dataset, map=map)

@@ -39,8 +39,17 @@ def shown(metavar: str | None = None, default: str = "") -> Any:
 
 
 File: TypeAlias = Annotated[Path | None, shown("FILE")]
+# Of a `Literal | None`, tyro would list the choices in random order, and None with them.
+_METHOD = tyro.constructors.PrimitiveConstructorSpec[str | None](
+    nargs=1,
+    metavar=f"{{{','.join(METHODS)}}}",
+    instance_from_str=lambda words: words[0],
+    is_instance=lambda value: value is None or value in METHODS,
+    str_from_instance=lambda value: [str(value)],
+    choices=tuple(METHODS),
+)
 Method: TypeAlias = Annotated[
-    MethodName | None, shown(f"{{{','.join(METHODS)}}}", "mc-gicp; gicp for clouds without common channels")
+    MethodName | None, _METHOD, shown(default="mc-gicp; gicp for clouds without common channels")
 ]
 Start: TypeAlias = Annotated[Literal["global"] | Path | None, shown("{FILE,global}")]
 Names: TypeAlias = Annotated[tuple[str, ...], shown("NAMES", "all in common")]
@@ -86,8 +95,9 @@ class Options:
     Attributes:
         channels: Channels to use, such as intensity, or red green blue, or {spaces} computed from these three. By
             default those that the first two clouds have in common.
-        voxel_size: Metres; the points of each voxel are averaged. auto: from the first two clouds, the smallest size at
-            which few neighbourhoods are lines or noise and at most 40,000 voxels remain. off: all points are kept.
+        voxel_size: Metres; the points of each voxel are averaged. auto: from the first two clouds, or for batch from
+            each pair, the smallest size at which few neighbourhoods are lines or noise and at most 40,000 voxels
+            remain. off: all points are kept.
         num_neighbors: Number of neighbours from which the covariance of a point is computed.
         max_distance: Metres; largest distance between matched points. Two numbers: one to find the pose, and a smaller
             one to refine it.

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import functools
+import logging
+import threading
 from collections.abc import Callable
 from typing import Any, TypeVar
 
@@ -11,6 +13,33 @@ import jax.numpy as jnp
 import numpy as np
 
 Result = TypeVar("Result")
+
+LOGGER = logging.getLogger("mcgicp_jax")
+# Seconds of compilation in a process, after which one log record says what takes so long.
+_LONG = 2.0
+_COMPILATION = "/jax/core/compile/backend_compile_duration"
+
+
+class _Compilations:
+    """Listener to JAX's compilations, those of programs in its cache on disk included."""
+
+    def __init__(self) -> None:
+        self.seconds = 0.0
+        self._lock = threading.Lock()
+
+    def __call__(self, event: str, duration_secs: float, **_: str | int) -> None:
+        if event != _COMPILATION or self.seconds > _LONG:
+            return
+        with self._lock:
+            before, self.seconds = self.seconds, self.seconds + duration_secs
+        if before <= _LONG < self.seconds:
+            folder = jax.config.values["jax_compilation_cache_dir"]
+            kept = f"programs are kept in {folder}" if folder else "help(mcgicp_jax) says how to keep programs"
+            LOGGER.info("compiling, once for each method; %s", kept)
+
+
+COMPILATIONS = _Compilations()
+jax.monitoring.register_event_duration_secs_listener(COMPILATIONS)
 
 # XLA's fusion emitters take half of the compilation of derivatives and of a step of the loop, and these programs run no
 # faster for it (jaxlib 0.10.2). Programs over neighbourhoods run up to 2.4 times as long without.

@@ -405,6 +405,15 @@ def blockwise(function: Callable[..., Any], numbers: Any, *inputs: Input, total:
 
     Raises:
         ValueError: if an input is no `Input`, or the function returns no tuple of trees, and `total` is False.
+
+    Example: the sum of squared differences of matched channels.
+
+        def difference(scale, source, target):
+            square = jnp.sum((source.tree - target.tree) ** 2, axis=-1) / scale**2
+            return jnp.sum(jnp.where(target.index >= 0, square, 0))
+
+        rows = np.where(matches.valid, matches.indices, -1)
+        blockwise(difference, 0.1, Input(source.channels), Input(target.channels, rows), total=True)
     """
     if not all(isinstance(each, Input) for each in inputs):
         kinds = ", ".join(type(each).__name__ for each in inputs)

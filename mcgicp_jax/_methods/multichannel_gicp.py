@@ -60,7 +60,9 @@ class MultiChannelGICP(AbstractGeneralized):
         photometric: if True, Ω and α are used in the coarse phase only. The fine phase matches by position and
             minimises point-to-plane residuals and differences of interpolated channels, each divided by its estimated
             standard deviation (see `_terms.photometric`), which is mostly more accurate. A kernel `robust` then acts in
-            the fine phase only. Its scale and `information` are in standard deviations.
+            the fine phase only. Its scale and `information` are in standard deviations. The numbers estimated from
+            the residuals are constants to autodiff, so the derivative by points and channels is approximate: for noise
+            on walls of posters, it is off by half and more.
     """
 
     uses_channels: ClassVar[bool] = True

@@ -39,13 +39,14 @@ def estimate_pose(
 ) -> RegistrationResult:
     """Compute the pose for fixed matches: update the pose, recompute M, and repeat until the pose converges.
 
-    Works under `jit`, `vmap`, `grad` and `jvp`. The first derivative follows from the implicit function theorem for
-    the root of Σ w JᵀM d = 0 near the returned pose (d = b − T a, J = ∂(T a)/∂ξ, robust weight w). Matches, neighbours
-    and estimated parameters are constants. The derivative is exact with respect to points, channels, given covariances,
-    given parameters of the method (α: only with `temperature`) and the robust scale. It is zero with respect to `init`,
-    because the root does not depend on it. If `information` is singular (DEGENERATE), it is zero along the directions
-    that the matches leave free, and exact within the others. It is zero, never NaN, if there are too few matches or if
-    Newton's method does not converge from the returned pose. Second derivatives raise `NotImplementedError`.
+    Works under `jit`, `vmap`, `grad` and `jvp`. The first derivative follows from the implicit function theorem for the
+    root of Σ w JᵀM d = 0 near the returned pose (d = b − T a, J = ∂(T a)/∂ξ, robust weight w). Matches, neighbours and
+    estimated parameters are constants. The derivative is exact with respect to points, channels, given covariances,
+    given parameters of the method (α: only with `temperature`) and the robust scale; with `photometric=True`, by points
+    and channels it is approximate. It is zero with respect to `init`, because the root does not depend on it. If
+    `information` is singular (DEGENERATE), it is zero along the directions that the matches leave free, and exact
+    within the others. It is zero, never NaN, if there are too few matches or if Newton's method does not converge from
+    the returned pose. Second derivatives raise `NotImplementedError`.
 
     Args:
         source, target: preprocessed clouds.

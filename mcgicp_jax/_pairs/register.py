@@ -61,8 +61,8 @@ def register(
     neighbours and estimated parameters are constants. α has a derivative only with soft matches: see `estimate_pose`.
     Of a DEGENERATE pose it is that within the constrained directions, which are constants, too, and 0 along the others.
     If registration fails otherwise, the derivative is 0, never NaN, except after MAX_ITERATIONS or if UNVERIFIED.
-    Outside `jit` it costs about as much as the registration, for clouds of any size; inside, each size compiles for
-    some ten seconds, so pad clouds (`PointCloud.pad`). `register_batch` differentiates many pairs at once.
+    Outside `jit`, value and gradient take two to four registrations, for clouds of any size; inside, each size compiles
+    for some ten seconds, so pad clouds (`PointCloud.pad`). `register_batch` differentiates many pairs at once.
 
     Args:
         source, target: clouds from `preprocess`. Raw clouds and (N, 3) arrays, metres, are preprocessed with the
@@ -81,6 +81,7 @@ def register(
         max_iterations: maximum number of pose updates in both phases together.
         translation_tolerance, rotation_tolerance: metres (at the centroid of the matches) and radians; the loop has
             converged when an update is below both. `translation_tolerance` None: 0.5 % of the spacing of the target.
+            In float32, updates below some 1e-7 are rounding: smaller tolerances need float64.
         robust: kernel applied to the Mahalanobis distance of each match: `Huber`, `Cauchy`, `GemanMcClure`, `Tukey` or
             `Welsch`. None: the kernel of the method (NDT: `Welsch`), if it has any. With `photometric=True` the kernel
             is applied to each residual in standard deviations.
@@ -95,8 +96,9 @@ def register(
             together with the pose.
         voxel_sizes: voxel sizes in metres, coarse to fine, for multi-scale registration. Each scale starts from the
             pose of the previous one with the default `max_distance`; a given `max_distance` applies to the final
-            registration at full resolution. For NDT these are cell sizes and the clouds must be raw: the last size
-            gives the result, and at the others `GICP` registers voxels of a quarter of the size. Not available inside
+            registration at full resolution. For NDT these are cell sizes; raw clouds have more points per cell than
+            preprocessed ones. The last size gives the result, and at the others `GICP` registers voxels of a quarter of
+            the size. Not available inside
             transformations.
         max_source_points: match at most so many points of the source, at least 4, in every phase: one random point
             (with a fixed seed) of each of as many equal runs of rows, which lie evenly in space if `preprocess`

@@ -93,11 +93,21 @@ def warn_of_estimated_parameters(
 ) -> None:
     """Warn if channels are differentiated outside of `jit` while Λ, or α with a `temperature`, is estimated from them.
 
-    Estimated parameters are constant to autodiff. Without a `temperature`, α decides matches alone, which are, too.
+    The photometric term uses neither, but estimates numbers from the residuals of points and channels. All of these are
+    constant to autodiff. Without a `temperature`, α decides matches alone, which are, too.
     """
     channels = source.channels, target.channels
-    # The photometric residuals use neither.
-    if not isinstance(method, MultiChannelGICP) or method.photometric or is_concrete(channels):
+    if not isinstance(method, MultiChannelGICP):
+        return
+    if method.photometric:
+        values = source.points, target.points, channels
+        if not is_concrete(values) and is_concrete(primal(values)):
+            warn(
+                "photometric: standard deviations, gains and offsets are estimated from the residuals, but constant in "
+                "the derivative by points and channels, which is therefore not that of the result"
+            )
+        return
+    if is_concrete(channels):
         return
     names = ["channel_covariance"] if temperature is None else ["channel_covariance", "channel_weights"]
     unset = [name for name in names if getattr(method, name) is None]

@@ -38,8 +38,8 @@ class OdometryStep:
     Attributes:
         pose: (4, 4) float64, sensor to world, metres.
         cloud: the preprocessed cloud, in the sensor's frame.
-        lost: with `recover`, whether the pose in the world is not known: it was extrapolated, or follows an
-            extrapolated one by registrations to the previous frame.
+        lost: whether the pose in the world is not known: it was extrapolated, since the frame could not be registered,
+            or with `recover`, follows an extrapolated one by registrations to the previous frame.
         deferred_registration, deferred_graph: values of the properties.
     """
 
@@ -245,7 +245,7 @@ class _Sensor(Iterator[OdometryStep]):
             return OdometryStep(self.pose, cloud, None, self.is_lost, graph)
         registration = Lazy(partial(computed, result))
         self._compute_kept(registration)
-        return OdometryStep(self.pose, cloud, registration, self.is_lost, graph)
+        return OdometryStep(self.pose, cloud, registration, self.is_lost or not is_usable(result), graph)
 
     def _compute_kept(self, registration: Lazy[RegistrationResult]) -> None:
         """Compute the registration of the step before the last if somebody keeps it, since it refers to two frames.

@@ -24,6 +24,7 @@ import mcgicp_jax as mcg
 from mcgicp_jax import datasets
 from mcgicp_jax.datasets import _poster_wall as posters
 from mcgicp_jax.datasets._frames import scene_and_path_rng
+from mcgicp_jax.datasets._images import bilinear
 from tests.benchmarks.global_pose import desk, living_room
 
 try:
@@ -200,7 +201,8 @@ def cramer_rao(seed: int, blur: float) -> float:
     hits = (arms + target.pose[:3, 3])[:, :2]
     slopes = []
     for axis in np.eye(2):
-        ends = [posters._sample(picture, (hits + sign * blur / 2 * axis) / posters._TEXEL) for sign in (1, -1)]
+        places = [(hits + sign * blur / 2 * axis) / posters._TEXEL for sign in (1, -1)]
+        ends = [bilinear(picture, place, "grid-wrap") for place in places]
         slopes.append((ends[0] - ends[1]) / blur)
     rows = np.concatenate([np.eye(3)[None].repeat(len(arms), 0), -cross(arms)], axis=2)
     color = np.einsum("anc,nad->ncd", np.array(slopes), rows[:, :2]) / (np.sqrt(2) * posters._COLOR_NOISE)
