@@ -98,8 +98,7 @@ def register(
             pose of the previous one with the default `max_distance`; a given `max_distance` applies to the final
             registration at full resolution. For NDT these are cell sizes; raw clouds have more points per cell than
             preprocessed ones. The last size gives the result, and at the others `GICP` registers voxels of a quarter of
-            the size. Not available inside
-            transformations.
+            the size. Not available inside transformations.
         max_source_points: match at most so many points of the source, at least 4, in every phase: one random point
             (with a fixed seed) of each of as many equal runs of rows, which lie evenly in space if `preprocess`
             averaged voxels, and else as densely as the points. Only for these are neighbours (among all points), local
