@@ -133,7 +133,7 @@ class Lazy(Generic[Value]):
 
 @jax.tree_util.register_pytree_node_class
 class Held(Generic[Value]):
-    """A value, or None, that copies of the pytree do not have, so that it lives no longer than the original."""
+    """A value that is dropped when the pytree is copied, pickled or returned by `jit`."""
 
     def __init__(self, value: Value | None = None):
         self.value = value

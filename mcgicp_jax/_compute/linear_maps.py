@@ -67,10 +67,9 @@ class SideBySide(AbstractLinearMap):
 
 
 def primal(tree: Any) -> Any:
-    """The tree with the values of arrays that only differentiation traces, as NumPy arrays.
+    """The tree with tracers of `grad` and `jvp` replaced by their values, NumPy arrays.
 
-    `grad`, `jvp` and the like know the values of what they trace, unless `jit` or `vmap` trace them as well. Those
-    arrays remain traced, and concrete ones remain as they are.
+    Tracers of `jit` and `vmap` have no values and remain, as concrete arrays do.
     """
 
     def value(leaf: Any) -> Any:

@@ -99,12 +99,12 @@ def register(
             registration at full resolution. For NDT these are cell sizes; raw clouds have more points per cell than
             preprocessed ones. The last size gives the result, and at the others `GICP` registers voxels of a quarter of
             the size. Not available inside transformations.
-        max_source_points: match at most so many points of the source, at least 4, in every phase: one random point
-            (with a fixed seed) of each of as many equal runs of rows, which lie evenly in space if `preprocess`
-            averaged voxels, and else as densely as the points. Only for these are neighbours (among all points), local
-            geometry and covariances computed. `num_inliers`, `overlap` and the covariance count them alone, and the
-            pose has a derivative by these points and their neighbours. The target stays complete. None: all points.
-            10,000 nearly give the pose of all.
+        max_source_points: match at most so many points of the source, at least 4, in every phase. The rows are cut into
+            so many runs of equal length, and one random row of each is used (with a fixed seed). After voxel averaging
+            these rows cover space evenly; otherwise they follow the density of the points. Neighbours (among all
+            points), local geometry and covariances are computed for them alone. `num_inliers`, `overlap` and the
+            covariance count them alone, and the pose has a derivative by these points and their neighbours. The target
+            stays complete. None: all points. 10,000 nearly give the pose of all.
         tie_points: (source_points, target_points, covariances), metres: points (n, 3) known to be the same, such as
             surveyed targets or image features (Huhle & Jenke 2008), and the covariances (n, 3, 3) of b − T a, in the
             target's axes. n may be 1 or 2. They do not replace the initial pose: if `init` is far off, pass a better
@@ -132,12 +132,12 @@ def register(
             argument. Failures to register well-formed clouds show in `RegistrationResult.status`.
 
     Warns:
-        UserWarning: if points with NaN or infinity are left out, `MultiChannelGICP` gets clouds without channels, the
-            values of a channel are so different in the two clouds that their units probably are, too, or matched points
-            have so different ones that the exposure was probably another, extent and spacing of the two clouds differ
-            so much that one is probably in another unit, or `GICP` gets one cloud with covariances that are not
-            dimensionless. Outside of `jit`: if less than 10 % of the source points have a match at the
-            end, `channel_weights` are differentiated, or channels are while `channel_covariance` is None.
+        UserWarning: if points with NaN or infinity are left out; `MultiChannelGICP` gets clouds without channels; the
+            values of a channel differ so much between the clouds that its units probably differ; the channels of
+            matched points differ by a factor, probably because of another exposure; extent and spacing of the clouds
+            differ so much that their units of length probably differ; or `GICP` gets one cloud with covariances that
+            are not dimensionless. Outside of `jit`: if less than 10 % of the source points have a match at the end,
+            `channel_weights` are differentiated, or channels are while `channel_covariance` is None.
     """
     options = Options(
         max_distance=max_distance,

@@ -16,7 +16,7 @@ from jaxtyping import Bool, Float, Int
 from mcgicp_jax._math.poses import inverse
 from mcgicp_jax._pose_graph.edge import WORLD, Edge
 
-# Information below this fraction of an edge's largest is none: it has no weight in comparison with others.
+# Eigenvalues of an edge's information below this fraction of the largest count as zero.
 _BLIND = 1e-6
 # Information about the start, as a multiple of what leaks, and at most as a fraction of that of a typical edge. Largest
 # slides in corridors of 3 to 40 poses, with σ = 0.02: 559 m without, 0.8 m with a multiple of 10, 0.4 m with 30 or 100.

@@ -108,7 +108,7 @@ def prepared(
     tie_points: GivenTiePoints | None = None,
     prior: GivenPrior | None = None,
 ) -> Inputs:
-    """The arguments of a registration, checked; clouds preprocessed unless the method makes cells of raw ones."""
+    """The arguments of a registration, checked; and the clouds, see `preprocessed`."""
     check_method(method)
     warn_of_constant_weights(method)
     sides = {"source": as_cloud("source", source), "target": as_cloud("target", target)}
@@ -288,7 +288,8 @@ def preprocessed(
     voxel_size: VoxelSize | Voxels = "auto",
     num_neighbors: int = NUM_NEIGHBORS,
 ) -> list[PointCloud]:
-    """The clouds "source" and "target", preprocessed with one voxel size unless the method makes cells of raw ones."""
+    """The clouds "source" and "target", preprocessed with one voxel size. Where the method makes cells of raw points,
+    clouds stay raw."""
     points = {name: cloud for name, cloud in sides.items() if not options.takes_raw(method, name)}
     voxels, grids = voxels_and_grids(voxel_size, *points.values())
     for (name, cloud), grid in zip(points.items(), grids, strict=True):

@@ -46,8 +46,8 @@ class MultiwayResult:
         registrations: maps each pair (i, j) to the registration of cloud j to cloud i. Registrations that failed or
             overlap by less than 40 % are listed here, but have no edge in `graph`.
         statuses: of each cloud: CONVERGED; TOO_FEW_CORRESPONDENCES if it has no edge; DEGENERATE if at least half of
-            its edges contradict the others. A cloud of another place leaves the others where they are, but is often
-            CONVERGED itself: its registrations agree with each other at a pose of mediocre overlap.
+            its edges contradict the others. A cloud of another place does not disturb the others. It is often
+            CONVERGED itself, at a wrong pose with low overlap.
         voxel_size: of the map, metres: that of the clouds, or their median point spacing.
     """
 

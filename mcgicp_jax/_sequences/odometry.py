@@ -54,7 +54,8 @@ class OdometryStep:
         """Registration of this frame, None for the first; check its `converged`.
 
         Its matrix maps to the previous frame, or with `against="map"`, or where the frame was found again by `recover`,
-        to the world. Of a lost frame, it maps to the previous frame, and that of the first lost one was not used.
+        to the world. For a lost frame it maps to the previous frame. The registration with which tracking was lost is
+        reported, but not used.
         """
         return None if self.deferred_registration is None else self.deferred_registration.value
 
