@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
-import jax
+from typing import Any
+
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 import mcgicp_jax as mcg
+from mcgicp_jax._pose_graph.edge import AbstractFactor
 from tests.scenes import motion
 
 
@@ -136,3 +138,69 @@ def with_gtsam(graph, weights=None, covariances=False):
         own = [np.ix_(order, order)] * len(poses)
         return poses, factors.error(found), np.array([marginals.marginalCovariance(k)[o] for k, o in enumerate(own)])
     return poses, factors.error(found), seconds
+
+
+SMALL = {"sphere": sphere(6, 10), "grid": grid(3), "garage": garage(2, 40)}
+
+
+def correlated(graph, seed=1, rank=3):
+    """The graph with full information matrices, the last one of that rank."""
+    rng = np.random.default_rng(seed)
+    roots = (np.eye(6) + 0.3 * rng.normal(size=(len(graph.edges), 6, 6))) * [20, 20, 20, 50, 50, 50]
+    roots[-1, rank:] = 0
+    edges = graph.edges
+    return mcg.PoseGraph(
+        graph.poses, mcg.Edge(edges.i, edges.j, edges.T_i_j, roots.swapaxes(1, 2) @ roots, uncertain=edges.uncertain)
+    )
+
+
+def shifted(graph, origin):
+    """The graph with its world's origin moved to the negative of a position."""
+    poses, motions = graph.poses.copy(), graph.edges.T_i_j.copy()
+    poses[:, :3, 3] += origin
+    motions[graph.edges.i == mcg.WORLD, :3, 3] += origin
+    edges = mcg.Edge(graph.edges.i, graph.edges.j, motions, graph.edges.information, uncertain=graph.edges.uncertain)
+    return mcg.PoseGraph(poses, edges)
+
+
+class Distance(AbstractFactor):
+    """Distances between two positions, metres."""
+
+    rows: Any
+    information: Any
+    uncertain: Any
+    metres: Any
+
+    def linearize(self, poses):
+        between = poses[:, 1, :3, 3] - poses[:, 0, :3, 3]
+        length = np.linalg.norm(between, axis=1)
+        towards = np.einsum("mi,mkij->mkj", between / length[:, None], poses[:, :, :3, :3]) * [[[-1], [1]]]
+        jacobians = np.concatenate([towards, np.zeros_like(towards)], axis=2)
+        return (length - self.metres)[:, None], jacobians[:, :, None]
+
+
+class Height(AbstractFactor):
+    """Heights of positions in the world, metres."""
+
+    rows: Any
+    information: Any
+    uncertain: Any
+    metres: Any
+
+    def linearize(self, poses):
+        jacobians = np.zeros((len(poses), 2, 1, 6))
+        jacobians[:, 1, 0, :3] = poses[:, 1, 2, :3]
+        return poses[:, 1, 2, 3:] - self.metres[:, None], jacobians
+
+
+def with_factors():
+    """A graph anchored by a prior, with distances, the last of which is wrong, and heights; and its truth."""
+    truth, loops = grid(2)
+    graph, _ = measured(truth, loops)
+    prior = mcg.Edge(mcg.WORLD, 0, truth[0], 1e4 * np.eye(6))[None]
+    a, b = np.array([0, 1, 2]), np.array([6, 5, 7])
+    metres = np.linalg.norm(truth[a, :3, 3] - truth[b, :3, 3], axis=1) + np.array([0.003, -0.005, 2.0])
+    distances = Distance(np.stack([a, b], axis=1), np.full((3, 1, 1), 1e4), np.ones(3, bool), metres)
+    rows = np.stack([np.full(4, mcg.WORLD), np.arange(4, 8)], axis=1)
+    heights = Height(rows, np.full((4, 1, 1), 2.5e3), np.zeros(4, bool), truth[4:, 2, 3] + [0.01, -0.02, 0.01, 0.0])
+    return mcg.PoseGraph(graph.poses, joined(graph.edges, prior), [distances, heights]), truth

@@ -1,0 +1,113 @@
+"""Files of pose graphs."""
+
+import importlib.util
+
+import numpy as np
+import pytest
+
+import mcgicp_jax as mcg
+from tests.graphs import (
+    SMALL,
+    Distance,
+    correlated,
+    grid,
+    measured,
+    with_priors,
+)
+
+
+def test_files(tmp_path):
+    graph = correlated(measured(*SMALL["grid"], false=0.2)[0])
+    mcg.io.write_g2o(tmp_path / "a.g2o", graph)
+    again = mcg.io.read_g2o(tmp_path / "a.g2o")
+    np.testing.assert_allclose(again.poses, graph.poses, atol=1e-12)
+    np.testing.assert_allclose(again.edges.T_i_j, graph.edges.T_i_j, atol=1e-12)
+    np.testing.assert_allclose(again.edges.information, graph.edges.information, rtol=1e-12)
+    np.testing.assert_array_equal(again.edges.uncertain, np.abs(graph.edges.i - graph.edges.j) != 1)
+    found = mcg.optimize_poses(measured(*SMALL["grid"], false=0.2)[0])
+    mcg.io.write_g2o(tmp_path / "b.g2o", found)
+    assert len(mcg.io.read_g2o(tmp_path / "b.g2o").edges) == found.kept.sum()
+    if importlib.util.find_spec("gtsam"):
+        import gtsam
+
+        factors, values = gtsam.readG2o(str(tmp_path / "a.g2o"), True)
+        assert factors.size() == len(graph.edges)
+        own = 0.5 * np.sum(mcg.optimize_poses(graph, robust=False, max_iterations=1).residuals ** 2)
+        assert own <= factors.error(values)
+    vertex = "VERTEX_SE3:QUAT 0 1 0 0 0 0 0 1\n"
+    for text, message in (
+        ("EDGE_SE3:QUAT 0 1 1 0 0 0 0 0 1" + 21 * " 1", "got EDGE_SE3:QUAT"),
+        (
+            "\nVERTEX_SE3:QUAT 0 1 0 0 0 0 0",
+            r"c\.g2o: cannot be read as a pose graph: line 2: expected 8 numbers .* got 7",
+        ),
+        (vertex + "VERTEX_SE3:QUAT 1 1 0 0 0 0 x 1", "line 2: could not convert string to float: 'x'"),
+        (
+            vertex + "EDGE_SE3:QUAT 0 2 1 0 0 0 0 0 1" + 21 * " 1",
+            "line 2: expected a vertex for each end, got none of number 2",
+        ),
+        ("VERTEX_SE3:QUAT 0 1 0 0 0 0 0 0", "line 1: expected finite numbers and a quaternion other than 0"),
+        ("VERTEX_SE2 0 1 0 0\nEDGE_SE2 0 1 1 0 0 1 0 0 1 0 1", "poses in space, got EDGE_SE2, VERTEX_SE2"),
+        (
+            vertex + "PARAMS_SE3OFFSET 0 1 0 0 0 0 0 1\nEDGE_SE3_PRIOR 0 0 0 0 0 0 0 0 1" + 21 * " 1",
+            "got PARAMS_SE3OFFSET",
+        ),
+        ("", "expected lines VERTEX_SE3:QUAT, poses in space, got none"),
+    ):
+        (tmp_path / "c.g2o").write_text(text)
+        with pytest.raises(ValueError, match=message):
+            mcg.io.read_g2o(tmp_path / "c.g2o")
+
+
+def test_files_hold_priors(tmp_path):
+    poses, loops = SMALL["grid"]
+    graph = with_priors(measured(poses, loops)[0], poses)
+    mcg.io.write_g2o(tmp_path / "a.g2o", graph)
+    again = mcg.io.read_g2o(tmp_path / "a.g2o")
+    for name in ("i", "j", "T_i_j", "information"):
+        np.testing.assert_allclose(getattr(again.edges, name), getattr(graph.edges, name), atol=1e-12)
+    prior = again.edges.i == mcg.WORLD
+    assert prior.sum() == 14 and not again.edges.uncertain[prior].any()
+    with pytest.raises(ValueError, match="graph: expected a PoseGraph or a PoseGraphResult, got NoneType"):
+        mcg.io.write_g2o(tmp_path / "b.g2o", None)
+
+
+def test_files_are_those_of_others(tmp_path):
+    """Vertices in any order and with any numbers, a quaternion of any length, and distinct numbers everywhere."""
+    upper = [100, 1, 2, 3, 4, 5, 200, 6, 7, 8, 9, 300, 10, 11, 12, 400, 13, 14, 500, 15, 600]
+    lines = [
+        "VERTEX_SE3:QUAT 7 1 2 3 0 0 1 1",
+        "FIX 3",
+        "VERTEX_SE3:QUAT 3 4 5 6 0.2 0 0 0",
+        "VERTEX_SE3:QUAT 4 0 0 0 0 0 0 1",
+        "EDGE_SE3:QUAT 3 7 7 8 9 0 0.6 0 0.8 " + " ".join(map(str, upper)),
+        "EDGE_SE3:QUAT 4 3 0 0 0 0 0 0 1 " + " ".join(map(str, upper)),
+    ]
+    (tmp_path / "a.g2o").write_text("\n".join(lines))
+    graph = mcg.io.read_g2o(tmp_path / "a.g2o")
+    turned = [[[1, 0, 0, 4], [0, -1, 0, 5], [0, 0, -1, 6]], np.eye(3, 4), [[0, -1, 0, 1], [1, 0, 0, 2], [0, 0, 1, 3]]]
+    np.testing.assert_allclose(graph.poses[:, :3], turned, atol=1e-15)
+    np.testing.assert_allclose(graph.edges.T_i_j[0, :3], [[0.28, 0, 0.96, 7], [0, 1, 0, 8], [-0.96, 0, 0.28, 9]])
+    for field, expected in (("i", [0, 1]), ("j", [2, 0]), ("uncertain", [True, False])):
+        np.testing.assert_array_equal(getattr(graph.edges, field), expected)
+    information = graph.edges.information[0]
+    np.testing.assert_array_equal(np.diag(information), [100, 200, 300, 400, 500, 600])
+    np.testing.assert_array_equal(information[0, 1:], [1, 2, 3, 4, 5])
+    np.testing.assert_array_equal(information, information.T)
+    mcg.io.write_g2o(tmp_path / "b.g2o", graph)
+    vertex, *_, edge, _ = (tmp_path / "b.g2o").read_text().splitlines()
+    assert vertex.split()[0] == "VERTEX_SE3:QUAT" and edge.split()[0] == "EDGE_SE3:QUAT"
+    np.testing.assert_allclose(np.array(vertex.split()[1:], float), [0, 4, 5, 6, 1, 0, 0, 0], atol=1e-15)
+    np.testing.assert_allclose(np.array(edge.split()[1:], float), [0, 2, 7, 8, 9, 0, 0.6, 0, 0.8, *upper], rtol=1e-12)
+
+
+def test_files_refuse_what_they_cannot_hold(tmp_path):
+    graph, _ = measured(*grid(2))
+    distance = Distance(np.array([[0, 1]]), np.ones((1, 1, 1)), np.zeros(1, bool), np.ones(1))
+    with pytest.raises(ValueError, match=r"^graph: expected edges alone, .* got 1 further factors"):
+        mcg.io.write_g2o(tmp_path / "graph.g2o", mcg.PoseGraph(graph.poses, graph.edges, [distance]))
+    key = 97 << 56
+    lines = [f"VERTEX_SE3:QUAT {key + k} 0 0 0 0 0 0 1" for k in range(2)]
+    (tmp_path / "keys.g2o").write_text("\n".join(lines))
+    with pytest.raises(ValueError, match=f"vertex numbers below 2.53, got {key}"):
+        mcg.io.read_g2o(tmp_path / "keys.g2o")
