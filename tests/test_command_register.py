@@ -398,3 +398,15 @@ def test_a_reader_that_ends_early_is_no_error(arguments):
     done = subprocess.run(command, stdout=writer, stderr=subprocess.PIPE, text=True, timeout=120)
     os.close(writer)
     assert done.stderr == ""
+
+
+def test_fixed_directions(files, capsys, tmp_path):
+    pose = tmp_path / "start.txt"
+    start = TRUTH @ motion((0, 0, 0.02, 0.01, 0, 0))
+    io.write_poses(pose, [start])
+    command = ["register", files["source"], files["target"], "--method", "gicp", "--init", str(pose)]
+    assert main([*command, "--fix", "roll", "pitch", "z"]) == 0
+    apart = np.linalg.inv(start) @ printed_matrix(capsys.readouterr().out)
+    assert np.abs(apart[2] - [0, 0, 1, 0]).max() < 1e-6
+    with pytest.raises(SystemExit, match="2"):
+        main([*command, "--fix", "north"])

@@ -341,7 +341,7 @@ def test_malformed_arguments_are_named(corner):
         r"^prior: expected \(pose, covariance\)": truth,
         r"^prior: pose: expected a rigid motion": (2 * truth, np.eye(6)),
         r"^prior: covariance: expected shape \(6, 6\)": (truth, np.eye(3)),
-        r"^prior: covariance: expected symmetric positive": (truth, np.zeros((6, 6))),
+        r"^prior: covariance: expected symmetric positive semidefinite": (truth, -np.eye(6)),
         r"^prior: covariance: expected finite": (truth, np.full((6, 6), np.nan)),
     }
     for message, given in cases.items():

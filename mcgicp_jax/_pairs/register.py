@@ -112,8 +112,9 @@ def register(
             its covariance (6, 6), metres and radians, of ξ = (v, ω) in T = pose · exp(ξ): in the order and frame of
             `RegistrationResult.covariance`. ξ is expressed at the origin and in the axes of the source. A GNSS
             covariance Σ in the target's axes becomes Rᵀ Σ R. At UTM coordinates, that of a pose measured at the cloud
-            must be transported to their origin. Use a large finite variance for unmeasured directions. The prior is
-            also the initial pose if `init` is None.
+            must be transported to their origin. Use a large finite variance for unmeasured directions. A variance of 0,
+            or any singular covariance, fixes directions: with zeros for z, roll and pitch the motion is planar. The
+            prior is also the initial pose if `init` is None.
 
     With tie points or a prior, a first registration without them measures the covariance of the score of the matches.
     A second one starts at its pose and weighs matches, tie points and prior by their covariances (Hansen 1982,
@@ -121,6 +122,11 @@ def register(
     They also constrain directions that the clouds do not (`UnconstrainedDirection.held_by_ties`). The pose is
     differentiable with respect to points, pose and covariances; the weights of the matches are constants to autodiff.
     Contradictions are averaged, not detected. Inside transformations, covariances are not checked.
+
+    Fixed directions act from the first update on: ξ along them stays exactly 0, they need no data, the covariance along
+    them is 0, `information` is that of the others' data, and their `directions.ties` are infinite. A covariance that
+    `jit` or `vmap` traces must be positive definite. The derivative by the prior's pose includes that the pose moves
+    along with it. If further variances are finite, the weights of the matches, constants to autodiff, depend on it.
 
     Returns:
         The pose with its status, quality of the fit and uncertainty; check `converged`.

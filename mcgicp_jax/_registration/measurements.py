@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from contextlib import nullcontext
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any, TypeAlias, cast
 
 import equinox as eqx
@@ -19,13 +21,14 @@ from mcgicp_jax._math.poses import matrices_of, translation_adjoint
 from mcgicp_jax._math.symmetric_matrices import inverse_6
 from mcgicp_jax._pose_solver.covariance import Moments
 from mcgicp_jax._pose_solver.degeneracy import Directions
+from mcgicp_jax._pose_solver.fixed_directions import with_fixed_directions
 from mcgicp_jax._pose_solver.fusion import fuse
 from mcgicp_jax._pose_solver.pose_measurements import Fusion, Prior, TiePoints, form_at
 from mcgicp_jax._registration.assessment import as_float64
-from mcgicp_jax._registration.step import State
+from mcgicp_jax._registration.step import Problem, State
 
 # Largest asymmetry of a correlation matrix, as rounding to float32 causes; and smallest eigenvalue with which the
-# inverse of a correlation matrix keeps four digits in float64.
+# inverse of a correlation matrix keeps four digits in float64. Below it, a direction of a prior counts as fixed.
 _ASYMMETRY, _LEAST_EIGENVALUE = 1e-5, 1e-12
 # Largest rounding of the information of a prior, with lengths in units of the cloud: a standard deviation of 3 %.
 _LARGEST_ERROR = 1e3
@@ -62,18 +65,47 @@ def _centred_prior(given: GivenPrior, source: PointCloud, target: PointCloud) ->
     matrix = centred_pose(pose, source, target, "prior: pose")
     covariance = _numbers("prior: covariance", covariance, (6, 6))
     if is_concrete(covariance, source.points, source.origin):
-        return Prior(matrix[:3, :3], matrix[:3, 3], _information(covariance, source))
-    return Prior(matrix[:3, :3], matrix[:3, 3], _information_traced(covariance, source.origin))
+        return Prior(matrix[:3, :3], matrix[:3, 3], *_information(covariance, source))
+    fixed, given = None, primal(covariance)
+    if is_concrete(given):
+        values, rows = _principal_rows(np.asarray(given, np.float64))
+        fixed = _orthonormal(rows[values <= _LEAST_EIGENVALUE])
+    return Prior(matrix[:3, :3], matrix[:3, 3], *_information_traced(covariance, fixed, source.origin))
 
 
 @jax.jit
-def _information_traced(covariance: Float[AnyArray, "6 6"], origin: Float[AnyArray, "3"]) -> Float[AnyArray, "6 6"]:
+def _information_traced(
+    covariance: Float[AnyArray, "6 6"], fixed: Float[AnyArray, "6 6"] | None, origin: Float[AnyArray, "3"]
+) -> tuple[Float[AnyArray, "6 6"], Float[AnyArray, "6 6"] | None]:
     change = translation_adjoint(-origin)
-    return inverse_6(change @ covariance @ change.T)
+    if fixed is None:
+        return inverse_6(change @ covariance @ change.T), None
+    back, across = translation_adjoint(origin), fixed.T @ fixed
+    within = (jnp.eye(6) - across) @ back
+    return within.T @ inverse_6(covariance + across) @ within, fixed @ back
 
 
-def _information(covariance: Float[np.ndarray, "6 6"], source: PointCloud) -> Float[np.ndarray, "6 6"]:
-    """Information of ξ about the origin of the cloud, from its covariance about that of the user's coordinates.
+def _principal_rows(covariance: Float[np.ndarray, "6 6"]) -> tuple[Float[np.ndarray, "6"], Float[np.ndarray, "6 6"]]:
+    """Eigenvalues of the correlations, and rows with which ξ has these variances."""
+    scale, correlations = _correlations(0.5 * (covariance + covariance.T))
+    values, vectors = np.linalg.eigh(correlations)
+    return values, vectors.T / scale
+
+
+def _orthonormal(
+    rows: Float[np.ndarray, "m 6"], lengths: Float[np.ndarray, "6"] | float = 1.0
+) -> Float[np.ndarray, "6 6"] | None:
+    """Rows that span the same space, orthonormal for ξ in these units, and rows of zeros; None if there are none."""
+    rows = rows * lengths
+    vectors = np.linalg.svd(rows / np.linalg.norm(rows, axis=1, keepdims=True))[2]
+    return np.where(np.arange(6)[:, None] < len(rows), vectors, 0) / lengths if len(rows) else None
+
+
+def _information(
+    covariance: Float[np.ndarray, "6 6"], source: PointCloud
+) -> tuple[Float[np.ndarray, "6 6"], Float[np.ndarray, "6 6"] | None]:
+    """Information of ξ about the origin of the cloud, from its covariance about that of the user's coordinates; and the
+    fixed directions, see `Prior`.
 
     One of the two has correlations that rounding does not spoil: the first for a pose that was measured at the cloud,
     the second for one measured at a far origin. A root of the information has twice the digits of the information.
@@ -81,18 +113,30 @@ def _information(covariance: Float[np.ndarray, "6 6"], source: PointCloud) -> Fl
     known = []
     for offset in (source.origin, np.zeros(3)):
         change = translation_adjoint(-np.asarray(offset, np.float64))
-        there = change @ covariance @ change.T
-        scale, correlations = _correlations(0.5 * (there + there.T))
-        values, vectors = np.linalg.eigh(correlations)
-        known.append((values[0], offset, (vectors / np.sqrt(np.maximum(values, _LEAST_EIGENVALUE))).T / scale))
-    least, offset, root = max(known, key=lambda each: each[0])
-    _require_positive("prior: covariance", _correlations(covariance)[1], least)
+        known.append((offset, *_principal_rows(change @ covariance @ change.T)))
+    # Rounding lets directions look fixed that are not.
+    offset, values, rows = max(known, key=lambda each: sorted(np.where(each[1] > _LEAST_EIGENVALUE, each[1], 0)))
+    definite = bool(values[0] >= -_LEAST_EIGENVALUE)
+    _require("prior: covariance", _correlations(covariance)[1], definite, "positive semidefinite")
+    fixed = values <= _LEAST_EIGENVALUE
+    rows = rows @ translation_adjoint(source.origin - offset)
+    root = np.where(fixed, 0, 1 / np.sqrt(np.maximum(values, _LEAST_EIGENVALUE)))[:, None] * rows
     points = np.asarray(source.points)
     lengths = np.repeat([max(float(np.abs(points).max(initial=0)), 1e-30), 1.0], 3)
-    _, values, vectors = np.linalg.svd(root @ translation_adjoint(source.origin - offset) * lengths)
+    _, values, vectors = np.linalg.svd(root * lengths)
     # The rounding of more precise directions would spoil the others.
-    rows = np.minimum(values, np.sqrt(_LARGEST_ERROR / np.finfo(points.dtype).eps))[:, None] * vectors / lengths
-    return rows.T @ rows
+    root = np.minimum(values, np.sqrt(_LARGEST_ERROR / np.finfo(points.dtype).eps))[:, None] * vectors / lengths
+    return root.T @ root, _orthonormal(rows[fixed], lengths)
+
+
+def fixed_in(problem: Problem, prior: Prior) -> Problem:
+    """The problem with the directions that the prior fixes, from the start on."""
+    dtype, (start, prior) = problem.start.wxyz_xyz.dtype, constant((problem.start, prior))
+    xp = numpy_for(start, prior)
+    prior = jax.tree.map(lambda array: xp.asarray(array, dtype), prior)
+    with jax.default_matmul_precision("highest"), outside_trace() if xp is np else nullcontext():
+        start = with_fixed_directions(start, prior)
+    return replace(problem, start=jax.tree.map(np.asarray, start) if xp is np else start, fixed=prior)
 
 
 def fusion_of(state: State, moments: Moments, ties: TiePoints | None, prior: Prior | None) -> Fusion:
@@ -148,7 +192,8 @@ def _covariances(name: str, given: Any, shape: tuple[int, ...]) -> Float[AnyArra
     array = _numbers(name, given, shape)
     if is_concrete(array):
         _, correlations = _correlations(array)
-        _require_positive(name, correlations, np.linalg.eigvalsh(correlations).min(initial=1))
+        definite = bool(np.linalg.eigvalsh(correlations).min(initial=1) > _LEAST_EIGENVALUE)
+        _require(name, correlations, definite, "positive definite")
     return array
 
 
@@ -159,8 +204,8 @@ def _correlations(covariances: Float[np.ndarray, "*n d d"]) -> tuple[np.ndarray,
     return deviations, covariances / (deviations[..., :, None] * deviations[..., None, :])
 
 
-def _require_positive(name: str, correlations: Float[np.ndarray, "*n d d"], least: float) -> None:
+def _require(name: str, correlations: Float[np.ndarray, "*n d d"], definite: bool, kind: str) -> None:
     symmetric = np.abs(correlations - correlations.swapaxes(-1, -2)).max(initial=0) < _ASYMMETRY
-    if not (symmetric and least > _LEAST_EIGENVALUE):
-        got = "one that is not positive definite" if symmetric else "one that is not symmetric"
-        raise ValueError(f"{name}: expected symmetric positive definite matrices, got {got}")
+    if not (symmetric and definite):
+        got = f"one that is not {kind if symmetric else 'symmetric'}"
+        raise ValueError(f"{name}: expected symmetric {kind} matrices, got {got}")

@@ -32,6 +32,7 @@ from mcgicp_jax._methods.icp import PointToPoint
 from mcgicp_jax._methods.surfaces import surface_pair
 from mcgicp_jax._pose_solver.covariance import Moments
 from mcgicp_jax._pose_solver.matched import Matches
+from mcgicp_jax._pose_solver.pose_measurements import Prior
 from mcgicp_jax._registration.assessment import Assessment, assessment_of, moments_of, registration_of
 from mcgicp_jax._registration.correspondences import find_correspondences, index_of
 from mcgicp_jax._registration.input_checks import (
@@ -41,7 +42,7 @@ from mcgicp_jax._registration.input_checks import (
     warn_of_covariances,
 )
 from mcgicp_jax._registration.loop import LoopResult, iterate
-from mcgicp_jax._registration.measurements import GivenPrior, GivenTiePoints, fusion_of, known
+from mcgicp_jax._registration.measurements import GivenPrior, GivenTiePoints, fixed_in, fusion_of, known
 from mcgicp_jax._registration.multi_scale import stages_of
 from mcgicp_jax._registration.on_host import HostExecutor
 from mcgicp_jax._registration.options import Options, check_method
@@ -137,15 +138,15 @@ def run_pair(given: Given, init: Pose | None, options: Options) -> Run:
     search = options.search or default_search()
     once = replace(options, max_distance=None)
     for stage in before:
-        run = _solved(stage.source, stage.target, stage.method, init, once, search)
+        run = _solved(stage.source, stage.target, stage.method, init, once, search, belief)
         (found,) = results_of([run], [None])
         init = found.matrix if is_usable(found) else init
-    run = _solved(source, target, method, init, options, search)
+    run = _solved(source, target, method, init, options, search, belief)
     if options.equalize_channels and not any(term.estimates_gains for term in run.problem.terms):
         source, more = _equalized(source, target, method, _nearest_points(source, target, run, search))
         gains = gains * more
         init = constant(pose_in_user_frame(run.loop.state.pose, source.origin, target.origin))
-        run = _solved(source, target, method, init, options, search)
+        run = _solved(source, target, method, init, options, search, belief)
     elif not options.equalize_channels and method.uses_channels and is_concrete(source, target, run.loop.state.pose):
         warn_of_exposure(source, target, lambda: _nearest_points(source, target, run, search))
     if not (ties is None and belief is None):
@@ -188,9 +189,11 @@ def _solved(
     init: Pose | None,
     options: Options,
     search: AbstractSearch,
+    prior: Prior | None,
 ) -> Run:
-    """Pose and run the problem."""
+    """Pose and run the problem, with no more of the prior than the directions that it fixes."""
     problem, inputs = pose_problem(source, target, method, init, options, search.num_threads)
+    problem = problem if prior is None or prior.fixed is None else fixed_in(problem, prior)
     return run_loop(inputs, problem, search, options.max_iterations)
 
 
