@@ -8,6 +8,7 @@ import pytest
 
 import mcgicp_jax as mcg
 from mcgicp_jax._math.poses import logarithm
+from mcgicp_jax.metrics import pose_error
 from tests.corridor import corridor
 from tests.differences import TO_ROUNDING, check_eager_gradient, check_gradient, clouds_with, weigh
 from tests.precision import in_both_precisions, in_float64, tolerance
@@ -153,3 +154,52 @@ def test_errors_of_the_free_directions_have_the_deviations():
         errors.append(error @ np.linalg.solve(np.asarray(result.covariance)[np.ix_(free, free)], error) / 3)
         assert result.converged
     assert 0.5 < np.mean(errors) < 2, np.mean(errors)
+
+
+# Starts far off
+
+
+def starts(truth, count, metres, degrees):
+    """Poses off by a horizontal shift and by a turn about the vertical."""
+    rng = np.random.default_rng(0)
+    for _ in range(count):
+        angle, sign = rng.uniform(0, 2 * np.pi), np.sign(rng.normal())
+        yield truth @ motion((metres * np.cos(angle), metres * np.sin(angle), 0, 0, 0, sign * np.radians(degrees)))
+
+
+def near(result, truth, metres):
+    shift, turn = pose_error(result.matrix, truth)
+    return result.converged and shift < metres and turn < np.radians(1)
+
+
+@pytest.mark.slow
+def test_a_planar_scan_from_far_off(data):
+    """One beam of a LiDAR, without heights, on a whole cloud, in the plane that the prior knows."""
+    source, target = (
+        np.asarray(mcg.io.read(data / "lidar_pair" / f"{name}.ply").points) for name in ("source", "target")
+    )
+    truth = np.loadtxt(data / "lidar_pair" / "T_target_source.txt")
+    ranges = np.linalg.norm(source[:, :2], axis=1)
+    beam = source[(np.hypot(ranges, source[:, 2]) > 0.5) & (np.abs(np.degrees(np.arctan2(source[:, 2], ranges))) < 0.2)]
+    clouds = mcg.preprocess((beam * [1, 1, 0])[:: len(beam) // 316], None), mcg.preprocess(target)
+    prior = truth, covariance_fixing("z roll pitch")
+    for start in starts(truth, 20, 1.0, 20):
+        result = mcg.register(*clouds, mcg.PointToPoint(), init=start, prior=prior, max_distance=(5, 0.2))
+        assert near(result, truth, 0.05)
+
+
+@pytest.mark.slow
+def test_a_precise_prior_keeps_the_pose_in_its_basin(data):
+    """Roll and pitch of an IMU and the height of a car; without them no start is near enough."""
+    frames = mcg.datasets.kitti(data / "kitti" / "sequences" / "04")
+    target, source = frames[0], frames[1]
+    truth = np.linalg.inv(target.pose) @ source.pose
+    clouds = [mcg.preprocess(frame.cloud, 0.4) for frame in (source, target)]
+    deviations = np.array([1e3, 1e3, 0.02, 1e-3, 1e-3, 10])
+    rng, found = np.random.default_rng(1), []
+    for start in starts(truth, 8, 5.0, 30):
+        prior = truth @ motion(rng.normal(size=6) * deviations * [0, 0, 1, 1, 1, 0]), np.diag(deviations**2)
+        results = (mcg.register(*clouds, mcg.GICP(), init=start, prior=each) for each in (prior, None))
+        found.append([near(result, truth, 0.2) for result in results])
+    # With the prior acting on the weighted registration alone, 1 of 8.
+    assert np.sum(found, axis=0)[0] >= 5 and np.sum(found, axis=0)[1] == 0, found

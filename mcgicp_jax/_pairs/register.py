@@ -117,16 +117,17 @@ def register(
             prior is also the initial pose if `init` is None.
 
     With tie points or a prior, a first registration without them measures the covariance of the score of the matches.
-    A second one starts at its pose and weighs matches, tie points and prior by their covariances (Hansen 1982,
-    generalised method of moments). It is the result; its `covariance` and `information` include tie points and prior.
-    They also constrain directions that the clouds do not (`UnconstrainedDirection.held_by_ties`). The pose is
-    differentiable with respect to points, pose and covariances; the weights of the matches are constants to autodiff.
-    Contradictions are averaged, not detected. Inside transformations, covariances are not checked.
+    Outside `jit`, if it ends better (converged, more matches) elsewhere with the directions fixed that the prior knows
+    to a tenth of the fine `max_distance`, it starts again there. A second one starts at its pose and weighs matches,
+    tie points and prior by their covariances (Hansen 1982, generalised method of moments). It is the result; its
+    `covariance` and `information` include tie points and prior, which also constrain directions that the clouds do not
+    (`UnconstrainedDirection.held_by_ties`). The pose has derivatives by points, pose and covariances; the weights of
+    the matches are constants. Contradictions are averaged, not detected. Inside transformations, nothing is checked.
 
-    Fixed directions act from the first update on: ξ along them stays exactly 0, they need no data, the covariance along
-    them is 0, `information` is that of the others' data, and their `directions.ties` are infinite. A covariance that
-    `jit` or `vmap` traces must be positive definite. The derivative by the prior's pose includes that the pose moves
-    along with it. If further variances are finite, the weights of the matches, constants to autodiff, depend on it.
+    Fixed directions act from the first update on: ξ along them stays exactly 0, the covariance is 0, `directions.ties`
+    are infinite, `information` leaves them out, and the clouds need not constrain them. A covariance that `jit` or
+    `vmap` traces must be positive definite. The derivative by the prior's pose moves with it; if other variances are
+    finite, it leaves out the change of the weights.
 
     Returns:
         The pose with its status, quality of the fit and uncertainty; check `converged`.
