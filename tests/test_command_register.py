@@ -407,3 +407,15 @@ def test_methods_are_listed_in_order(capsys):
         main(["register", "a.ply", "b.ply", "--method", "foo"])
     text = " ".join(capsys.readouterr().err.replace("│", " ").split())
     assert f"Expected one of ({', '.join(map(repr, METHODS))})" in text
+
+
+def test_fixed_directions(files, capsys, tmp_path):
+    pose = tmp_path / "start.txt"
+    start = TRUTH @ motion((0, 0, 0.02, 0.01, 0, 0))
+    io.write_poses(pose, [start])
+    command = ["register", files["source"], files["target"], "--method", "gicp", "--init", str(pose)]
+    assert main([*command, "--fix", "roll", "pitch", "z"]) == 0
+    apart = np.linalg.inv(start) @ printed_matrix(capsys.readouterr().out)
+    assert np.abs(apart[2] - [0, 0, 1, 0]).max() < 1e-6
+    with pytest.raises(SystemExit, match="2"):
+        main([*command, "--fix", "north"])

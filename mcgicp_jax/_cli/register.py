@@ -38,6 +38,10 @@ Source: TypeAlias = Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar=
 Target: TypeAlias = Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="TARGET")]
 
 
+# The components of ξ, for --fix.
+_DIRECTIONS = ("x", "y", "z", "roll", "pitch", "yaw")
+# Variance of the directions that --fix leaves free, metres² or radians²: far above what any cloud leaves unknown.
+_UNKNOWN = 1e12
 # Methods of the demo: two that use geometry alone, two that use channels. Each compiles for seconds.
 _DEMO = ("point-to-plane", "gicp", "color-icp", "mc-gicp")
 
@@ -88,7 +92,11 @@ class PreparedPair:
         return result if self.verified else unverified(result)
 
     def arguments(self, name: MethodName) -> dict[str, Any]:
-        return self.choices.arguments(name, lambda: self.ready)
+        arguments = self.choices.arguments(name, lambda: self.ready)
+        if self.options.fix:
+            variances = np.where(np.isin(_DIRECTIONS, self.options.fix), 0, _UNKNOWN)
+            arguments["prior"] = self.start, np.diag(variances)
+        return arguments
 
     def draw(self, results: dict[MethodName, mcg.RegistrationResult]) -> None:
         if self.options.plot is not None:

@@ -107,21 +107,27 @@ def register(
             stays complete. None: all points. 10,000 nearly give the pose of all.
         tie_points: (source_points, target_points, covariances), metres: points (n, 3) known to be the same, such as
             surveyed targets or image features (Huhle & Jenke 2008), and the covariances (n, 3, 3) of b − T a, in the
-            target's axes. n may be 1 or 2. They do not replace the initial pose: if `init` is far off, pass a better
-            one.
+            target's axes. n may be 1 or 2. They do not replace a good initial pose.
         prior: (pose, covariance): a measurement of T_target_source, as by GNSS or an IMU, `jaxlie.SE3` or (4, 4), and
             its covariance (6, 6), metres and radians, of ξ = (v, ω) in T = pose · exp(ξ): in the order and frame of
             `RegistrationResult.covariance`. ξ is expressed at the origin and in the axes of the source. A GNSS
             covariance Σ in the target's axes becomes Rᵀ Σ R. At UTM coordinates, that of a pose measured at the cloud
-            must be transported to their origin. Use a large finite variance for unmeasured directions. The prior is
-            also the initial pose if `init` is None.
+            must be transported to their origin. Use a large finite variance for unmeasured directions. A variance of 0,
+            or any singular covariance, fixes directions: with zeros for z, roll and pitch the motion is planar. The
+            prior is also the initial pose if `init` is None.
 
     With tie points or a prior, a first registration without them measures the covariance of the score of the matches.
-    A second one starts at its pose and weighs matches, tie points and prior by their covariances (Hansen 1982,
-    generalised method of moments). It is the result; its `covariance` and `information` include tie points and prior.
-    They also constrain directions that the clouds do not (`UnconstrainedDirection.held_by_ties`). The pose is
-    differentiable with respect to points, pose and covariances; the weights of the matches are constants to autodiff.
-    Contradictions are averaged, not detected. Inside transformations, covariances are not checked.
+    Outside `jit`, if it ends better (converged, more matches) elsewhere with the directions fixed that the prior knows
+    to a tenth of the fine `max_distance`, it starts again there. A second one starts at its pose and weighs matches,
+    tie points and prior by their covariances (Hansen 1982, generalised method of moments). It is the result; its
+    `covariance` and `information` include tie points and prior, which also constrain directions that the clouds do not
+    (`UnconstrainedDirection.held_by_ties`). The pose has derivatives by points, pose and covariances; the weights of
+    the matches are constants. Contradictions are averaged, not detected. Inside transformations, nothing is checked.
+
+    Fixed directions act from the first update on: ξ along them stays exactly 0, the covariance is 0, `directions.ties`
+    are infinite, `information` leaves them out, and the clouds need not constrain them. A covariance that `jit` or
+    `vmap` traces must be positive definite. The derivative by the prior's pose moves with it; if other variances are
+    finite, it leaves out the change of the weights.
 
     Returns:
         The pose with its status, quality of the fit and uncertainty; check `converged`.

@@ -50,7 +50,8 @@ class Directions(eqx.Module):
         channels: (6,) fraction that the channels observe; 0 for the directions that geometry constrains, negative where
             the channels of matched points do not agree.
         ties: (6,) information of tie points and prior, one over the squared standard deviation in radii of that motion;
-            0 for the directions that geometry or channels constrain. None without tie points and prior.
+            0 for the directions that geometry or channels constrain, infinite for those that the prior fixes. None
+            without tie points and prior.
         center: (3,) centroid of the matched source points, metres.
         radius: root mean square distance of these points from it, metres.
     """
@@ -68,9 +69,14 @@ class Directions(eqx.Module):
         return ~(self.geometry >= GEOMETRY_HOLDS)
 
     @property
+    def fixed(self) -> Bool[Array, "*batch 6"] | Bool[np.ndarray, "*batch 6"]:
+        """Which directions the prior fixes."""
+        return (0 * self.geometry if self.ties is None else self.ties) == np.inf
+
+    @property
     def held_by_matches(self) -> Bool[Array, "*batch 6"] | Bool[np.ndarray, "*batch 6"]:
-        """Which directions are constrained by geometry or by the channels."""
-        return ~self.free | (self.channels >= CHANNELS_HOLD)
+        """Which directions are constrained by geometry or by the channels; not those that are fixed."""
+        return (~self.free | (self.channels >= CHANNELS_HOLD)) & ~self.fixed
 
     @property
     def held(self) -> Bool[Array, "*batch 6"] | Bool[np.ndarray, "*batch 6"]:
@@ -78,9 +84,13 @@ class Directions(eqx.Module):
         return self.held_by_matches if self.ties is None else self.held_by_matches | (self.ties >= _TIES_HOLD)
 
 
-def find_directions(sums: Sums) -> Directions:
+def find_directions(sums: Sums, constraints: Float[Array, "6 6"] | None = None) -> Directions:
     """Eigenvectors of the observed fraction of the points' motion: by the geometry, and among the directions that
     geometry does not constrain, by the channels. Fractions do not depend on units or on the origin.
+
+    Args:
+        constraints: rows that are orthogonal to the free twists, and rows of zeros. Eigenvectors are those within the
+            free twists; the other directions are fixed. None if all are free.
     """
     if sums.mass is None or sums.observability is None:
         raise ValueError("sums: expected those of surfaces with observability")
@@ -93,16 +103,26 @@ def find_directions(sums: Sums) -> Directions:
     values, vectors = jnp.linalg.eigh(motion)
     floor = 1e-5 * jnp.max(values)
     basis = vectors / jnp.sqrt(jnp.maximum(values, jnp.where(floor > 0, floor, 1)))
-    shares, turn = jnp.linalg.eigh(basis.T @ geometry @ basis)
+    ties, fixed = None, jnp.zeros(6, bool)
+    if constraints is not None:
+        rows = constraints @ basis
+        sizes = jnp.linalg.norm(rows, axis=1, keepdims=True)
+        rows = rows / jnp.where(sizes > 0, sizes, 1)
+        basis = basis @ jnp.linalg.eigh(rows.T @ rows)[1]
+        fixed = jnp.arange(6) >= 6 - jnp.sum(sizes > 0)
+        ties = jnp.where(fixed, jnp.inf, 0)
+    # 2 and 3, above any fraction, sort the other directions last.
+    seen = jnp.where(jnp.outer(~fixed, ~fixed), basis.T @ geometry @ basis, jnp.diag(2.0 * fixed))
+    shares, turn = jnp.linalg.eigh(seen)
     basis = basis @ turn
     free = ~(shares >= GEOMETRY_HOLDS)
     if sums.channel_observability is None or sums.agreement is None or sums.surplus is None:
-        channels = jnp.zeros_like(shares)
-        return Directions(twists=basis.T, geometry=shares, channels=channels, center=center, radius=radius)
-    # Diagonalise the channels within the free directions; 2, above any fraction, sorts the other directions last.
+        channels, shares = jnp.zeros_like(shares), jnp.where(fixed, jnp.sum(basis * (geometry @ basis), axis=0), shares)
+        return Directions(twists=basis.T, geometry=shares, channels=channels, center=center, radius=radius, ties=ties)
+    # Diagonalise the channels within the free directions.
     among = jnp.outer(free, free)
     within = twist_form(sums.channel_observability / total, radius)
-    held, turn = jnp.linalg.eigh(jnp.where(among, basis.T @ within @ basis, jnp.diag(2.0 * ~free)))
+    held, turn = jnp.linalg.eigh(jnp.where(among, basis.T @ within @ basis, jnp.diag(2.0 * ~free + fixed)))
     basis = basis @ turn
     # Where the channels disagree, the directions stay those along which the pose was updated.
     forms = geometry, *(twist_form(each / total, radius) for each in (sums.agreement, sums.surplus))
@@ -110,7 +130,7 @@ def find_directions(sums: Sums) -> Directions:
     agreed = jnp.where(surplus < _PATTERN * agreed, 0, agreed)
     channels = jnp.where((held > 0) & (agreed < _AGREE * held), agreed - _AGREE * held, held)
     channels = jnp.where(held > 1.5, 0, channels)
-    return Directions(twists=basis.T, geometry=shares, channels=channels, center=center, radius=radius)
+    return Directions(twists=basis.T, geometry=shares, channels=channels, center=center, radius=radius, ties=ties)
 
 
 def directions_at_source(directions: Directions, pose: jaxlie.SE3) -> Directions:

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-import equinox as eqx
+from dataclasses import replace
+
 import jax
 import jax.numpy as jnp
 import jaxlie
@@ -23,18 +24,19 @@ def held_by_pose_form(directions: Directions, information: Float[Array, "6 6"]) 
         directions: as in the loop; those that the matches do not constrain are rotated to diagonalise the information.
         information: of tie points and prior, for twists about the centroid with lengths in units of the radius.
     """
-    basis, free = jnp.asarray(directions.twists).T, ~jnp.asarray(directions.held_by_matches)
+    basis, fixed = jnp.asarray(directions.twists).T, jnp.asarray(directions.fixed)
+    free = ~(jnp.asarray(directions.held_by_matches) | fixed)
     known = jnp.where(jnp.outer(free, free), basis.T @ information @ basis, 0)
     total = jnp.trace(known)
     scale = jnp.where(total > 0, total, 1)
-    # −1 sorts the other directions first.
-    values, turn = jnp.linalg.eigh(known / scale + jnp.diag(-1.0 * ~free))
+    # −1 and −2 sort the other directions first.
+    values, turn = jnp.linalg.eigh(known / scale + jnp.diag(-1.0 * ~free - fixed))
     squares = turn.T**2
     return Directions(
         twists=(basis @ turn).T,
         geometry=squares @ directions.geometry,
         channels=squares @ directions.channels,
-        ties=jnp.where(values < -0.5, 0, values * scale),
+        ties=jnp.where(values < -1.5, jnp.inf, jnp.where(values < -0.5, 0, values * scale)),
         center=directions.center,
         radius=directions.radius,
     )
@@ -69,17 +71,17 @@ def fuse(
         gain = jnp.where(both, response @ jnp.linalg.inv(scatter), 0)
         information = jnp.where(both, gain @ response, 0)
         information = 0.5 * (information + information.T)
-    return eqx.tree_at(
-        lambda fusion: (fusion.basis, fusion.gain, fusion.information, fusion.held),
-        fusion,
-        (basis, gain, information, directions.held),
-    )
+        fixed = None
+        if form.prior.fixed is not None:
+            basis, fixed = fusion.prior_residual(rotation, translation)[1].T @ basis, directions.fixed
+    return replace(fusion, basis=basis, gain=gain, information=information, held=directions.held, fixed=fixed)
 
 
 def fused_update(pose: jaxlie.SE3, sums: Sums, directions: Directions, fusion: Fusion) -> tuple[Directions, Update]:
     """One Newton step on P s + γ = 0, with the matches and M fixed; and the directions with tie points and prior."""
     radius, dtype = fusion.radius, sums.center.dtype
-    pull, known = fusion.pull(pose.rotation().as_matrix().astype(dtype), pose.translation())
+    rotation = pose.rotation().as_matrix().astype(dtype)
+    pull, known = fusion.pull(rotation, pose.translation())
     # Matrices from twists about the centre of `fusion` to those about the centre of the sums, and back.
     offset, lengths, lengths_here = sums.center - fusion.center, units(radius), units(sums.radius)
     outwards = translation_adjoint(-offset).astype(dtype) * lengths / lengths_here[:, None]
@@ -92,11 +94,12 @@ def fused_update(pose: jaxlie.SE3, sums: Sums, directions: Directions, fusion: F
     score = outwards.T @ wrench(sums.force, sums.radius) * ratio
     stiffness = outwards.T @ (unit_information * sums.radius**2) @ outwards / radius
     # The solution waits for the eigenvectors of the directions: two batched LAPACK calls at once can deadlock.
-    basis, _ = jax.lax.optimization_barrier((fusion.basis, directions.twists))
+    rotation, _ = jax.lax.optimization_barrier((rotation, directions.twists))
+    basis, free = fusion.twists_at(rotation, pose.translation()), fusion.free
     slope = fusion.gain @ basis.T @ stiffness @ basis + basis.T @ known @ basis
     force = fusion.gain @ (basis.T @ score) + basis.T @ pull
-    slope = jnp.where(jnp.outer(fusion.held, fusion.held), slope, jnp.diag(1.0 * ~fusion.held))
-    twist = outwards @ (basis @ jnp.linalg.solve(slope, jnp.where(fusion.held, force, 0)))
+    slope = jnp.where(jnp.outer(free, free), slope, jnp.diag(1.0 * ~free))
+    twist = outwards @ (basis @ jnp.linalg.solve(slope, jnp.where(free, force, 0)))
     # The information of tie points and prior in the unit of the matches: divided by the mean of P.
     count = jnp.sum(fusion.information.diagonal() > 0)
     mean = jnp.trace(fusion.gain) / jnp.maximum(count, 1)
@@ -111,11 +114,14 @@ def fused_update(pose: jaxlie.SE3, sums: Sums, directions: Directions, fusion: F
 @jax.jit
 def fused_covariance(pose: jaxlie.SE3, fusion: Fusion) -> Float[Array, "6 6"]:
     """Covariance of the pose, for ξ in T exp(ξ), metres and radians."""
-    dtype = fusion.basis.dtype
+    rotation = pose.rotation().as_matrix().astype(fusion.basis.dtype)
     with jax.default_matmul_precision("highest"):
-        _, known = fusion.pull(pose.rotation().as_matrix().astype(dtype), pose.translation())
-        basis = fusion.basis
+        _, known = fusion.pull(rotation, pose.translation())
+        basis = fusion.twists_at(rotation, pose.translation())
         total = fusion.information + basis.T @ known @ basis + jnp.diag(~fusion.held / UNKNOWN**2)
         change = adjoint_to_source(pose, fusion.center) * units(fusion.radius) @ basis
+        if fusion.fixed is not None:
+            total = jnp.where(jnp.outer(~fusion.fixed, ~fusion.fixed), total, jnp.diag(1.0 * fusion.fixed))
+            change = change * ~fusion.fixed
         covariance = change @ jnp.linalg.inv(total) @ change.T
     return 0.5 * (covariance + covariance.T)

@@ -8,7 +8,7 @@ the one at c, so that far origins do not enter the arithmetic.
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -30,11 +30,18 @@ class TiePoints(NamedTuple):
 
 
 class Prior(NamedTuple):
-    """The pose is R, t times exp(ξ) with ξ = (v, ω) of the given information, metres and radians."""
+    """The pose is R, t times exp(ξ) with ξ = (v, ω) of the given information, metres and radians.
+
+    `fixed`: (6, 6), rows f with f · ξ = 0 and rows of zeros; None if no direction is fixed. `root`: (6, 6), rows r such
+    that the products r · ξ have independent errors of variance 1, zeros where `fixed` has none; None inside `jit` if
+    it traces the covariance. Both are constants to autodiff.
+    """
 
     rotation: Float[AnyArray, "3 3"]
     translation: Float[AnyArray, "3"]
     information: Float[AnyArray, "6 6"]
+    fixed: Any = None
+    root: Any = None
 
 
 class PoseForm(NamedTuple):
@@ -75,7 +82,8 @@ def form_at(
     apart = (prior.rotation @ point + prior.translation - center) / radius
     # ξ about the origin of the source from ξ about the point, with lengths in units of the radius.
     change = translation_adjoint(point) * units(radius)
-    return PoseForm(stiffness, force, Prior(prior.rotation, apart, change.T @ prior.information @ change))
+    fixed = None if prior.fixed is None else prior.fixed @ change
+    return PoseForm(stiffness, force, Prior(prior.rotation, apart, change.T @ prior.information @ change, fixed))
 
 
 class Fusion(eqx.Module):
@@ -87,15 +95,19 @@ class Fusion(eqx.Module):
     method of moments, Hansen 1982). M itself is no inverse covariance, so s and γ cannot simply be added. Along
     directions that the matches do not constrain, P is zero. Constants to autodiff: all but `form`.
 
+    Where the prior fixes directions, the equation is that of the free ones, and F ξ = 0 (see `fixed_directions`). The
+    basis is then one of ξ, since the free twists at T depend on T and on the prior's pose.
+
     Twists turn about `center`, in the target's frame, with lengths in units of `radius`.
 
     Attributes:
         rotation, translation: T₀, the pose of the first registration, to which `form` refers.
         center, radius: of its matched points, metres.
         form: of tie points and prior.
-        basis: (6, 6) twists as columns.
+        basis: (6, 6) twists as columns; changes of ξ if directions are fixed.
         gain, information: P and A B⁻¹ A in this basis.
         held: whether matches, tie points or prior constrain the twist.
+        fixed: whether the prior fixes it; None if it fixes none.
     """
 
     rotation: Float[AnyArray, "3 3"]
@@ -107,20 +119,26 @@ class Fusion(eqx.Module):
     gain: Float[AnyArray, "6 6"]
     information: Float[AnyArray, "6 6"]
     held: Bool[AnyArray, "6"]
+    fixed: Bool[AnyArray, "6"] | None = None
 
-    def pull(
+    @property
+    def free(self) -> Bool[AnyArray, "6"]:
+        """Which twists of the basis tie points, prior and matches determine together."""
+        return self.held if self.fixed is None else self.held & ~self.fixed
+
+    def _change(
+        self, rotation: Float[Array, "3 3"], translation: Float[Array, "3"]
+    ) -> tuple[Float[Array, "3 3"], Float[Array, "3"]]:
+        """ΔR and Δt of a pose, metres."""
+        turn = rotation @ self.rotation.T
+        return turn, translation - self.center - turn @ (self.translation - self.center)
+
+    def prior_residual(
         self, rotation: Float[Array, "3 3"], translation: Float[Array, "3"]
     ) -> tuple[Float[Array, "6"], Float[Array, "6 6"]]:
-        """γ, and its stiffness JᵀQJ, at a pose."""
-        turn = rotation @ self.rotation.T
-        shift = translation - self.center - turn @ (self.translation - self.center)
-        now = jnp.concatenate([turn, shift[:, None] / self.radius], axis=1)
-        axes = jnp.eye(3, dtype=now.dtype)
-        along = jnp.concatenate([jnp.zeros((3, 3, 3), now.dtype), axes[:, :, None]], axis=2)
-        about = jnp.cross(axes[:, :, None], now[None], axis=1)
-        slope = jnp.concatenate([along, about]).reshape(6, 12)
-        change = (now - jnp.eye(3, 4, dtype=now.dtype)).reshape(12)
-        prior = self.form.prior
+        """ξ at a pose, and its derivative by each of six twists, one per row."""
+        _, shift = self._change(rotation, translation)
+        prior, dtype = self.form.prior, shift.dtype
 
         def apart(twist: Float[Array, "6"]) -> Float[Array, "6"]:
             turned = rotation + jnp.cross(twist[3:, None], rotation, axis=0)
@@ -128,16 +146,41 @@ class Fusion(eqx.Module):
             error = jaxlie.SE3.from_rotation_and_translation(
                 jaxlie.SO3.from_matrix(prior.rotation.T @ turned), prior.rotation.T @ (moved - prior.translation)
             )
-            return error.log().astype(now.dtype)
+            return error.log().astype(dtype)
 
-        residual, push = jax.linearize(apart, jnp.zeros(6, now.dtype))
-        rows = jax.vmap(push)(jnp.eye(6, dtype=now.dtype))
+        residual, push = jax.linearize(apart, jnp.zeros(6, dtype))
+        return residual, jax.vmap(push)(jnp.eye(6, dtype=dtype))
+
+    def twists_at(self, rotation: Float[Array, "3 3"], translation: Float[Array, "3"]) -> Float[AnyArray, "6 6"]:
+        """The basis as twists at a pose."""
+        if self.fixed is None:
+            return self.basis
+        return jnp.linalg.solve(self.prior_residual(rotation, translation)[1].T, self.basis)
+
+    def pull(
+        self, rotation: Float[Array, "3 3"], translation: Float[Array, "3"]
+    ) -> tuple[Float[Array, "6"], Float[Array, "6 6"]]:
+        """γ, and its stiffness JᵀQJ, at a pose."""
+        turn, shift = self._change(rotation, translation)
+        now = jnp.concatenate([turn, shift[:, None] / self.radius], axis=1)
+        axes = jnp.eye(3, dtype=now.dtype)
+        along = jnp.concatenate([jnp.zeros((3, 3, 3), now.dtype), axes[:, :, None]], axis=2)
+        about = jnp.cross(axes[:, :, None], now[None], axis=1)
+        slope = jnp.concatenate([along, about]).reshape(6, 12)
+        change = (now - jnp.eye(3, 4, dtype=now.dtype)).reshape(12)
+        prior = self.form.prior
+        residual, rows = self.prior_residual(rotation, translation)
         pull = slope @ (self.form.force - self.form.stiffness @ change) - rows @ prior.information @ residual
         return pull, slope @ self.form.stiffness @ slope.T + rows @ prior.information @ rows.T
 
     def balance(
         self, score: Float[Array, "6"], rotation: Float[Array, "3 3"], translation: Float[Array, "3"]
     ) -> Float[Array, "6"]:
-        """P s + γ, in the basis."""
+        """P s + γ, in the basis; F ξ instead for fixed directions."""
         pull, _ = self.pull(rotation, translation)
-        return self.gain @ (self.basis.T @ score) + self.basis.T @ pull
+        basis, fixed = self.twists_at(rotation, translation), self.form.prior.fixed
+        forces = self.gain @ (basis.T @ score) + basis.T @ pull
+        if self.fixed is None or fixed is None:
+            return forces
+        residual, _ = self.prior_residual(rotation, translation)
+        return jnp.where(self.fixed, (fixed @ self.basis).T @ (fixed @ residual), forces)

@@ -119,7 +119,7 @@ class PoseDerivative(AbstractLinearMap):
 
     def push(self, tangents: Sequence[np.ndarray], moving: tuple[int, ...]) -> list[np.ndarray]:
         slopes = {id(self.arrays[i]): tangent for i, tangent in zip(moving, tangents, strict=True)}
-        pose, inverse = self._root
+        pose, inverse, _ = self._root
         count = len(tangents[0])
         change = np.broadcast_to(self._score(pose).push(slopes, frozenset(slopes)), (count, 6))
         if self._fusion is not None:
@@ -131,7 +131,7 @@ class PoseDerivative(AbstractLinearMap):
         return [-change @ (self._by_twist(self._pose) @ inverse).T]
 
     def pull(self, cotangents: Sequence[np.ndarray], moving: tuple[int, ...]) -> list[np.ndarray]:
-        pose, inverse = self._root
+        pose, inverse, _ = self._root
         by_form: list[np.ndarray] = []
         by_score = -(cotangents[0] @ self._by_twist(self._pose)) @ inverse
         if self._fusion is not None:
@@ -148,8 +148,8 @@ class PoseDerivative(AbstractLinearMap):
 
     def _by_balance(self, cotangents: Float[np.ndarray, "c 6"]) -> tuple[np.ndarray, list[np.ndarray]]:
         """Cotangents of the score and of the leaves of the form, from those of the equation with both."""
-        pose, _ = self._root
-        found = _pull_balance(pose, self._scaling, self._fusion, cotangents.astype(pose.dtype))
+        pose, _, score = self._root
+        found = _pull_balance(pose, self._scaling, self._fusion, score, cotangents.astype(pose.dtype))
         by_score, by_form = jax.tree.map(np.asarray, found)
         return by_score, jax.tree.leaves(by_form) if self._form else []
 
@@ -158,8 +158,8 @@ class PoseDerivative(AbstractLinearMap):
         return self._scored.at(Motion.of(pose))
 
     @cached_property
-    def _root(self) -> tuple[Float[np.ndarray, "7"], Float[np.ndarray, "6 6"]]:
-        """The root near the final pose, by Newton's method, and P (Pᵀ ∂g/∂ξ P)⁻¹ Pᵀ there; 0 if there is none."""
+    def _root(self) -> tuple[Float[np.ndarray, "7"], Float[np.ndarray, "6 6"], Float[np.ndarray, "6"]]:
+        """The root near the final pose, by Newton's method, and P (Pᵀ ∂g/∂ξ P)⁻¹ Pᵀ and g there; 0 if there is none."""
         pose, root = self._pose, self._scaling
         for _ in range(MAX_NEWTON_STEPS if root.usable else 0):
             score, by_motion = self._score(pose).value_and_jacobian((0, 1))
@@ -178,8 +178,8 @@ class PoseDerivative(AbstractLinearMap):
             pose = moved.astype(pose.dtype)
             # Convergence is quadratic: after a step below √eps the remaining error is rounding.
             if np.abs(twist).max() <= np.sqrt(np.finfo(pose.dtype).eps):
-                return pose, inverse
-        return self._pose, np.zeros((6, 6))
+                return pose, inverse, score.astype(pose.dtype)
+        return self._pose, np.zeros((6, 6)), np.zeros(6, pose.dtype)
 
     def _by_twist(self, pose: Float[np.ndarray, "7"]) -> Float[np.ndarray, "7 6"]:
         """Derivative of pose parameters by a twist about the centre, lengths in units of the radius."""
@@ -219,7 +219,11 @@ def _balance_and_slope(
 
 @quickly_compiled
 def _pull_balance(
-    pose: Float[Array, "7"], root: ImplicitRoot, fusion: Fusion, cotangents: Float[Array, "m 6"]
+    pose: Float[Array, "7"],
+    root: ImplicitRoot,
+    fusion: Fusion,
+    score: Float[Array, "6"],
+    cotangents: Float[Array, "m 6"],
 ) -> tuple[Float[Array, "m 6"], PoseForm]:
     """Cotangents of the score and of the form of tie points and prior, from those of the equation."""
 
@@ -228,8 +232,7 @@ def _pull_balance(
         return balance_along(nowhere, pose, root, score, eqx.tree_at(lambda fusion: fusion.form, fusion, form))
 
     with jax.default_matmul_precision("highest"):
-        # The equation is linear in the score.
-        _, pull = jax.vjp(balance, jnp.zeros_like(pose[:6]), fusion.form)
+        _, pull = jax.vjp(balance, score, fusion.form)
         return jax.vmap(pull)(cotangents)
 
 

@@ -20,10 +20,11 @@ from mcgicp_jax._math.poses import move_pose, units
 from mcgicp_jax._methods.base import AbstractMethod
 from mcgicp_jax._methods.surfaces import AnySurface, whole_surface
 from mcgicp_jax._pose_solver.degeneracy import Directions, find_directions
+from mcgicp_jax._pose_solver.fixed_directions import constraints_at, with_fixed_directions
 from mcgicp_jax._pose_solver.fusion import fused_update
 from mcgicp_jax._pose_solver.implicit_derivative import ImplicitRoot, root_near
 from mcgicp_jax._pose_solver.matched import Matches
-from mcgicp_jax._pose_solver.pose_measurements import Fusion
+from mcgicp_jax._pose_solver.pose_measurements import Fusion, Prior
 from mcgicp_jax._pose_solver.sums import Sums
 from mcgicp_jax._pose_solver.update import rounding, solve_update
 from mcgicp_jax._registration.options import ROTATION_TOLERANCE, Options
@@ -94,6 +95,7 @@ class Problem(eqx.Module):
         source, target: the surfaces of both clouds.
         terms: the residuals of each correspondence, before any number is adapted.
         fusion: tie points and prior, weighted after a registration without them; None if there are none.
+        fixed: the prior if it fixes directions, else None; unlike the rest of `fusion` it acts from the first update.
         matches: those of `estimate_pose`, at every pose; None if the loop searches for them.
         num_candidates: number of target points that a source point is matched with.
     """
@@ -104,6 +106,7 @@ class Problem(eqx.Module):
     terms: tuple[AbstractTerm, ...]
     settings: Settings
     fusion: Fusion | None = None
+    fixed: Prior | None = None
     matches: Matches | None = None
     num_candidates: int = eqx.field(static=True, default=1)
 
@@ -163,6 +166,7 @@ def update(
     sums: Sums,
     settings: Settings,
     fusion: Fusion | None = None,
+    fixed: Prior | None = None,
 ) -> State:
     """Update the pose, or end the loop with a status. Its program does not depend on the size of the clouds.
 
@@ -174,16 +178,21 @@ def update(
     degenerate: AnyScalar = np.bool_(False)
     with jax.default_matmul_precision("highest"):
         if sums.observability is not None:
-            directions = find_directions(sums)
+            constraints = None if fixed is None else constraints_at(pose, sums.center, sums.radius, fixed)
+            directions = find_directions(sums, constraints)
             degenerate = ~jnp.all(directions.held)
             # Along unconstrained directions an update would follow arbitrary nearest-neighbour matches.
-            basis = jnp.asarray(directions.twists).T * (directions.held | ~settings.hold_unconstrained)
+            moving = (directions.held | ~settings.hold_unconstrained) & ~directions.fixed
+            basis = jnp.asarray(directions.twists).T * moving
         if fusion is None or directions is None:
             change = solve_update(sums, basis)
         else:
             directions, change = fused_update(pose, sums, directions, fusion)
             degenerate = ~jnp.all(directions.held)
-    moved = move_pose(pose, change.twist, sums.center)
+        moved = move_pose(pose, change.twist, sums.center)
+        moved = moved if fixed is None else with_fixed_directions(moved, fixed)
+    # Matches need not constrain what is fixed.
+    degenerate = degenerate | (change.degenerate & (fixed is None))
     coarse, settled = status == COARSE, status == SETTLED
     since = since + change.twist
     sizes = jnp.linalg.norm(jnp.stack([change.twist, since]).reshape(2, 2, 3), axis=2)
@@ -204,7 +213,7 @@ def update(
     outcomes: tuple[tuple[Array, int], ...] = (
         (sums.num_inliers < _MIN_CORRESPONDENCES, Status.TOO_FEW_CORRESPONDENCES),
         (~finite, Status.NON_FINITE),
-        (settled & (change.degenerate | degenerate), Status.DEGENERATE),
+        (settled & degenerate, Status.DEGENERATE),
         (settled, Status.CONVERGED),
         (num_iterations >= settings.max_iterations, Status.MAX_ITERATIONS),
         (coarse & ~converged, COARSE),
@@ -234,7 +243,8 @@ def root_of(state: State, fusion: Fusion | None) -> ImplicitRoot:
     converged = state.status == Status.CONVERGED
     usable = converged | (state.status == Status.DEGENERATE) | (state.status == Status.MAX_ITERATIONS)
     if fusion is not None:
-        basis, held = fusion.basis, fusion.held
+        rotation = state.pose.rotation().as_matrix().astype(state.sums.center.dtype)
+        basis, held = fusion.twists_at(rotation, state.pose.translation()), fusion.held
     elif state.directions is not None:
         basis, held = jnp.asarray(state.directions.twists).T, state.directions.held
     else:

@@ -1,0 +1,205 @@
+"""Directions that a prior fixes by a variance of 0: planar, 4-DoF and yaw-only registration, their derivatives."""
+
+import jax
+import jax.numpy as jnp
+import jaxlie
+import numpy as np
+import pytest
+
+import mcgicp_jax as mcg
+from mcgicp_jax._math.poses import logarithm
+from mcgicp_jax.metrics import pose_error
+from tests.corridor import corridor
+from tests.differences import TO_ROUNDING, check_eager_gradient, check_gradient, clouds_with, weigh
+from tests.precision import in_both_precisions, in_float64, tolerance
+from tests.scenes import motion, pair, room_corner
+
+OPTIONS = {"max_distance": 0.5}
+# A standard deviation of a million metres or radians.
+UNKNOWN = 1e12
+NAMES = {"x": 0, "y": 1, "z": 2, "roll": 3, "pitch": 4, "yaw": 5}
+CASES = {"planar": "z roll pitch", "4-dof": "roll pitch", "yaw": "x y z roll pitch", "without yaw": "yaw"}
+
+
+def covariance_fixing(names, turn=None):
+    """Of ξ whose components along the axes, turned, are fixed or unknown."""
+    variances = np.full(6, UNKNOWN)
+    variances[[NAMES[name] for name in names.split()]] = 0
+    axes = np.kron(np.eye(2), np.eye(3) if turn is None else turn)
+    return axes @ np.diag(variances) @ axes.T
+
+
+def remaining(matrix, pose):
+    return logarithm(np.linalg.inv(pose) @ np.asarray(matrix, float))
+
+
+def planar(yaw=0.05, seed=0):
+    """Clouds of a corner whose true motion is planar, and this motion."""
+    return pair(truth=motion((0.05, -0.03, 0, 0, 0, yaw)))
+
+
+@in_both_precisions
+@pytest.mark.parametrize("name", CASES)
+def test_what_is_fixed_stays_that_of_the_prior(name, precision):
+    source, target, truth = pair()
+    names = CASES[name].split()
+    fixed = np.isin(list(NAMES), names)
+    # Where the prior and the start are wrong, what is fixed is that of the prior.
+    prior = truth @ motion(np.array([0.02, -0.01, 0.015, 0.01, -0.015, 0.02]))
+    start = truth @ motion((0.05, 0.05, -0.05, 0.03, 0.03, -0.05))
+    result = mcg.register(
+        source, target, mcg.GICP(), init=start, prior=(prior, covariance_fixing(CASES[name])), **OPTIONS
+    )
+    assert result.converged
+    apart = remaining(result.matrix, prior)
+    assert np.abs(apart[fixed]).max() < tolerance(1e-6, 1e-12)
+    assert np.abs(apart[~fixed]).max() > 1e-3
+    directions = result.directions
+    assert np.isinf(directions.ties).sum() == len(names)
+    values = np.linalg.eigvalsh(np.asarray(result.covariance))
+    assert np.abs(values[: len(names)]).max() < tolerance(1e-10, 1e-16) and values[len(names)] > 1e-8
+    if name != "without yaw":
+        # The free directions form a group, whose motions these are at every pose.
+        assert np.abs(np.asarray(result.covariance)[fixed]).max() < tolerance(1e-10, 1e-16)
+
+
+@in_both_precisions
+def test_tilted_axes(precision):
+    """Gravity is no axis of the source: what turns the axes of the covariance turns the answer."""
+    source, target, truth = planar()
+    turn = motion((0, 0, 0, 0.3, -0.2, 0.1))
+    tilted = source.transform(np.linalg.inv(turn))
+    upright = mcg.register(source, target, mcg.GICP(), prior=(np.eye(4), covariance_fixing("z roll pitch")), **OPTIONS)
+    given = turn, covariance_fixing("z roll pitch", turn[:3, :3].T)
+    result = mcg.register(tilted, target, mcg.GICP(), prior=given, **OPTIONS)
+    assert result.converged and upright.converged
+    np.testing.assert_allclose(result.matrix, upright.matrix @ turn, atol=tolerance(2e-4, 2e-4))
+    assert np.abs(remaining(upright.matrix, truth)).max() < 5e-3
+
+
+def test_all_directions_fixed():
+    source, target, truth = pair()
+    result = mcg.register(source, target, mcg.GICP(), prior=(truth, np.zeros((6, 6))), **OPTIONS)
+    assert result.converged and np.abs(remaining(result.matrix, truth)).max() < 1e-6
+    assert not np.abs(result.covariance).max() > 1e-12
+
+
+def test_large_coordinates():
+    """A plane z = 0 of a source at UTM coordinates."""
+    source, target, truth = planar()
+    far = motion((4e5, 5e6, 20, 0, 0, 0))
+    clouds = [np.asarray(cloud.points, np.float64) + far[:3, 3] for cloud in (source, target)]
+    there = far @ truth @ np.linalg.inv(far)
+    prior = there, covariance_fixing("z roll pitch")
+    result = mcg.register(*clouds, mcg.GICP(), init=there, prior=prior, **OPTIONS)
+    apart = remaining(np.linalg.inv(far) @ result.matrix @ far, truth)
+    assert result.converged and np.abs(apart[2:5]).max() < 1e-6 and np.abs(apart).max() < 5e-3
+
+
+def test_fixed_directions_need_no_data():
+    """A floor constrains neither x, y nor yaw, a corridor not the way along it; the status asks for the rest alone."""
+    target, source = corridor(2, textured=False)
+    truth = np.linalg.inv(target.pose) @ source.pose
+    clouds = [mcg.preprocess(frame.cloud) for frame in (source, target)]
+    axis = source.pose[:3, :3].T @ [1, 0, 0]
+    given = np.zeros((6, 6))
+    given[:3, :3] = UNKNOWN * (np.eye(3) - np.outer(axis, axis))
+    given[3:, 3:] = UNKNOWN * np.eye(3)
+    result = mcg.register(*clouds, mcg.GICP(), prior=(truth, given), **OPTIONS)
+    assert result.converged and abs(remaining(result.matrix, truth)[:3] @ axis) < 1e-6
+    (direction,) = result.unconstrained_directions
+    assert direction.held_by_ties and abs(direction.axis @ axis) > 0.995
+    # Fixed directions do not hold the others.
+    result = mcg.register(*clouds, mcg.GICP(), prior=(truth, covariance_fixing("roll pitch")), **OPTIONS)
+    assert result.status is mcg.Status.DEGENERATE
+
+
+@in_float64
+@pytest.mark.slow
+@pytest.mark.parametrize("name", CASES)
+def test_gradients(name, noisy):
+    """By points, and by the prior's pose, which is wrong along the fixed directions."""
+    source, target, truth = noisy
+    pose, given = truth @ motion(0.02 * np.ones(6)), covariance_fixing(CASES[name])
+
+    def loss(inputs):
+        prior = jaxlie.SE3.from_matrix(pose) @ jaxlie.SE3.exp(inputs["twist"]), given
+        clouds = clouds_with({key: inputs[key] for key in inputs if key != "twist"}, source, target)
+        options = {"init": truth, "prior": prior, "max_distance": 0.4}
+        return weigh(mcg.register(*clouds, mcg.GICP(1e-2), **options, **TO_ROUNDING).matrix)
+
+    inputs = {"source points": source.points, "target points": target.points, "twist": np.zeros(6)}
+    inputs = jax.tree.map(jnp.asarray, inputs)
+    gradient = check_eager_gradient(loss, inputs)
+    if name == "without yaw":
+        # The free directions are no group: the free twists depend on the pose. One compilation of a minute suffices.
+        compiled = check_gradient(loss, inputs)(inputs)
+        for key in inputs:
+            np.testing.assert_allclose(compiled[key], gradient[key], rtol=1e-6, atol=1e-9)
+
+
+@pytest.mark.slow
+def test_errors_of_the_free_directions_have_the_deviations():
+    """Normalised squared errors of 40 pairs in x, y and yaw."""
+    errors = []
+    for seed in range(40):
+        truth = motion((0.05, -0.03, 0, 0, 0, 0.05))
+        points = [room_corner(2000, seed=2 * seed + i)[0] for i in (0, 1)]
+        source, target = (points[0] - truth[:3, 3]) @ truth[:3, :3], points[1]
+        clouds = mcg.preprocess(source, None), mcg.preprocess(target, None)
+        prior = np.eye(4), covariance_fixing("z roll pitch")
+        result = mcg.register(*clouds, mcg.GICP(), prior=prior, **OPTIONS)
+        free = [0, 1, 5]
+        error = remaining(result.matrix, truth)[free]
+        errors.append(error @ np.linalg.solve(np.asarray(result.covariance)[np.ix_(free, free)], error) / 3)
+        assert result.converged
+    assert 0.5 < np.mean(errors) < 2, np.mean(errors)
+
+
+# Starts far off
+
+
+def starts(truth, count, metres, degrees):
+    """Poses off by a horizontal shift and by a turn about the vertical."""
+    rng = np.random.default_rng(0)
+    for _ in range(count):
+        angle, sign = rng.uniform(0, 2 * np.pi), np.sign(rng.normal())
+        yield truth @ motion((metres * np.cos(angle), metres * np.sin(angle), 0, 0, 0, sign * np.radians(degrees)))
+
+
+def near(result, truth, metres):
+    shift, turn = pose_error(result.matrix, truth)
+    return result.converged and shift < metres and turn < np.radians(1)
+
+
+@pytest.mark.slow
+def test_a_planar_scan_from_far_off(data):
+    """One beam of a LiDAR, without heights, on a whole cloud, in the plane that the prior knows."""
+    source, target = (
+        np.asarray(mcg.io.read(data / "lidar_pair" / f"{name}.ply").points) for name in ("source", "target")
+    )
+    truth = np.loadtxt(data / "lidar_pair" / "T_target_source.txt")
+    ranges = np.linalg.norm(source[:, :2], axis=1)
+    beam = source[(np.hypot(ranges, source[:, 2]) > 0.5) & (np.abs(np.degrees(np.arctan2(source[:, 2], ranges))) < 0.2)]
+    clouds = mcg.preprocess((beam * [1, 1, 0])[:: len(beam) // 316], None), mcg.preprocess(target)
+    prior = truth, covariance_fixing("z roll pitch")
+    for start in starts(truth, 20, 1.0, 20):
+        result = mcg.register(*clouds, mcg.PointToPoint(), init=start, prior=prior, max_distance=(5, 0.2))
+        assert near(result, truth, 0.05)
+
+
+@pytest.mark.slow
+def test_a_precise_prior_keeps_the_pose_in_its_basin(data):
+    """Roll and pitch of an IMU and the height of a car; without them no start is near enough."""
+    frames = mcg.datasets.kitti(data / "kitti" / "sequences" / "04")
+    target, source = frames[0], frames[1]
+    truth = np.linalg.inv(target.pose) @ source.pose
+    clouds = [mcg.preprocess(frame.cloud, 0.4) for frame in (source, target)]
+    deviations = np.array([1e3, 1e3, 0.02, 1e-3, 1e-3, 10])
+    rng, found = np.random.default_rng(1), []
+    for start in starts(truth, 8, 5.0, 30):
+        prior = truth @ motion(rng.normal(size=6) * deviations * [0, 0, 1, 1, 1, 0]), np.diag(deviations**2)
+        results = (mcg.register(*clouds, mcg.GICP(), init=start, prior=each) for each in (prior, None))
+        found.append([near(result, truth, 0.2) for result in results])
+    # With the prior acting on the weighted registration alone, 1 of 8.
+    assert np.sum(found, axis=0)[0] >= 5 and np.sum(found, axis=0)[1] == 0, found
