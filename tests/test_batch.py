@@ -5,6 +5,7 @@ import multiprocessing
 import os
 import pickle
 import re
+import sys
 import threading
 import warnings
 from concurrent.futures import Executor, Future, ProcessPoolExecutor, ThreadPoolExecutor
@@ -328,3 +329,11 @@ def test_one_structured_cloud_for_many():
     table = np.rec.fromarrays(points.T, names="x,y,z")
     results = mcg.register_batch([points + 0.01, points - 0.01], table, mcg.PointToPoint())
     assert len(results) == 2 and all(result.num_inliers == 60 for result in results)
+
+
+def test_the_extra_is_named(monkeypatch):
+    monkeypatch.setitem(sys.modules, "loky", None)
+    with pytest.raises(ImportError, match=re.escape("pip install 'mcgicp_jax[processes]'")):
+        batch([np.eye(3)], [np.eye(3)], executor="processes")
+    with pytest.raises(ValueError, match=r'^executor: expected .*"processes" or None'):
+        batch([np.eye(3)], [np.eye(3)], executor="threads")

@@ -5,6 +5,7 @@ from __future__ import annotations
 import collections
 import functools
 import traceback
+import warnings
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Executor, Future, ThreadPoolExecutor
 from dataclasses import dataclass, replace
@@ -65,14 +66,22 @@ class Pair:
 
 @dataclass(frozen=True)
 class PairResult:
-    """The result of one pair, and the reason if it has no pose (None: it has one, or the status is the reason)."""
+    """The result of one pair.
+
+    Attributes:
+        reason: why it has no pose; None if it has one, or the status is the reason.
+        warnings: issued in another process.
+    """
 
     index: int
     registration: RegistrationResult
     reason: str | None = None
+    warnings: tuple[str, ...] = ()
 
     def with_warning(self) -> tuple[int, RegistrationResult]:
-        """Index and result; issues the `PairWarning`, if there is a reason."""
+        """Index and result; issues the warnings, and the `PairWarning` if there is a reason."""
+        for message in self.warnings:
+            warn(message)
         if self.reason is not None:
             warning = PairWarning(f"pair {self.index}: {self.reason}")
             warning.index, warning.reason = self.index, self.reason
@@ -160,6 +169,13 @@ class BatchJob:
     def register_chunk(self, chunk: list[Pair]) -> list[PairResult]:
         """Register the pairs one after the other, or in lanes."""
         return list(self.register_in_lanes(chunk, 1)) if self.uses_lanes else [self._register(pair) for pair in chunk]
+
+    def register_chunk_alone(self, chunk: list[Pair]) -> list[PairResult]:
+        """`register_chunk` in a process without other threads; the first result has the warnings."""
+        with warnings.catch_warnings(record=True) as caught:
+            warnings.simplefilter("always", UserWarning)
+            first, *others = self.register_chunk(chunk)
+        return [replace(first, warnings=tuple(str(each.message) for each in caught)), *others]
 
     def register_in_lanes(self, pairs: Iterable[Pair], num_threads: int) -> Iterator[PairResult]:
         """Register the pairs as lanes on this machine; threads preprocess them."""
