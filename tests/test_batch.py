@@ -242,11 +242,6 @@ def test_sides_that_do_not_fit(raw):
     with pytest.raises(ValueError, match=r"targets: .*expected at least 4 finite points"):
         batch(sources, np.eye(3))
 
-    def loss(points):
-        return batch([sources[0].replace(points=points)], targets[:1], executor=ThreadPoolExecutor(1))[0].cost
-
-    with pytest.raises(ValueError, match=r"^executor: expected None for derivatives"):
-        jax.grad(loss)(sources[0].points)
     assert batch([], []) == []
 
 

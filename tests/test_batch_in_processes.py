@@ -9,6 +9,7 @@ import threading
 import time
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -89,6 +90,38 @@ def test_what_cannot_be_sent_is_named(raw):
     sources[3] = lambda: lock
     with pytest.raises(ValueError, match=r"^pairs 2 to 3: expected .*sent.*cannot pickle '_thread.lock'[^\n]*$"):
         in_processes(sources, targets)
+
+
+@pytest.mark.parametrize("clouds", ["raw", "prepared", "far"])
+def test_gradients_are_those_of_threads(raw, clouds):
+    """Poses and Jacobians to the last bit; a gradient adds the rows of the Jacobian in another order."""
+    sources, targets = prepared(raw) if clouds == "prepared" else ([pair[side] for pair in raw] for side in (0, 1))
+    if clouds == "far":
+        offset = np.array([4e5, 5e6, 0])
+        sources, targets = ([each.replace(points=each.points + offset) for each in side] for side in (sources, targets))
+    sources[2], weights = np.zeros((3, 3)), np.random.default_rng(0).normal(size=7)
+
+    def poses(points, executor, pose="T_target_source"):
+        moved = [sources[0].replace(points=points), *sources[1:]]
+        method = mcg.MultiChannelGICP(0.05, 0.3 + 1e-3 * points[0, 0])
+        results = mcg.register_batch(moved, targets, method, max_distance=0.5, executor=executor)
+        assert results[2].status is Status.INVALID_INPUT
+        return jnp.stack([getattr(result, pose).wxyz_xyz for result in results[:2]])
+
+    points, executors = sources[0].points, (None, "processes")
+    with pytest.warns(mcg.PairWarning):
+        expected, found = (
+            jax.jacrev(lambda points, executor=executor: poses(points, executor, "centred")[0])(points)
+            for executor in executors
+        )
+        losses = [lambda points, executor=executor: (poses(points, executor) @ weights).sum() for executor in executors]
+        (value, gradient), (other, by_workers) = (jax.value_and_grad(loss)(points) for loss in losses)
+    np.testing.assert_array_equal(found, expected)
+    assert value == other and np.abs(expected).max() > 0
+    np.testing.assert_allclose(by_workers, gradient, rtol=1e-4, atol=1e-6 * np.abs(gradient).max())
+    with pytest.warns(mcg.PairWarning):
+        _, slope = jax.jvp(losses[1], (jnp.asarray(points),), (by_workers / np.linalg.norm(by_workers),))
+    np.testing.assert_allclose(slope, np.linalg.norm(by_workers), rtol=1e-4)
 
 
 def test_warnings_of_workers_are_shown_here():

@@ -16,7 +16,7 @@ from mcgicp_jax._clouds.voxel_size import NUM_NEIGHBORS, VoxelSize
 from mcgicp_jax._compute.concrete import is_concrete
 from mcgicp_jax._math.poses import Pose, pose_matrix
 from mcgicp_jax._methods.base import AbstractMethod
-from mcgicp_jax._pairs.batch_executors import GivenExecutor, executor_of, run
+from mcgicp_jax._pairs.batch_executors import GivenExecutor, executor_of, run, run_differentiated
 from mcgicp_jax._pairs.batch_jobs import BatchJob, Cloud, Pair
 from mcgicp_jax._registration.options import GivenOptions, check_method, options_of
 from mcgicp_jax._registration.result import RegistrationResult
@@ -40,15 +40,13 @@ def register_batch(
     Outside `jit`, the poses have derivatives, as those of `register`, by the points and channels of the clouds and the
     parameters of the method: of a DEGENERATE pose within its constrained directions, 0 of other failures but
     MAX_ITERATIONS. They are computed side by side, so that `jax.value_and_grad` of a loss over the poses of many pairs
-    is one call. Only the default `executor` is available then, and clouds must be given in lists.
+    is one call; with an `executor` by its workers, as (7, n) matrices. Clouds must be given in lists then.
     """
     job, pairs, workers = _job(sources, targets, method, init, voxel_size, num_neighbors, executor, options)
     # A look at an iterator would use it up.
     clouds = [side for side in (sources, targets) if isinstance(side, list | tuple | PointCloud)]
     if not is_concrete(clouds, job.method, job.options.robust):
-        if workers is not None:
-            raise ValueError(f"executor: expected None for derivatives, got {executor!r}")
-        return job.register_differentiated(pairs)
+        return job.register_differentiated(pairs) if workers is None else run_differentiated(job, pairs, workers)
     return [result for _, result in sorted(run(job, pairs, workers), key=lambda item: item[0])]
 
 

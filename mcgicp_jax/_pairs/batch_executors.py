@@ -25,14 +25,17 @@ from pickle import PicklingError
 from typing import Any, Literal, TypeAlias
 
 import jax
+import jaxlie
 import numpy as np
 
 from mcgicp_jax._compute.concrete import is_concrete, is_deferred
+from mcgicp_jax._compute.linear_maps import KnownJacobian, primal, with_derivative
 from mcgicp_jax._compute.messages import warn
 from mcgicp_jax._compute.threads import num_cores, with_settings
-from mcgicp_jax._pairs.batch_jobs import BatchJob, Pair, PairResult
+from mcgicp_jax._pairs.batch_jobs import BatchJob, GivenPair, Pair, PairResult
+from mcgicp_jax._registration.assessment import fields_of_pose
 from mcgicp_jax._registration.options import Options
-from mcgicp_jax._registration.result import RegistrationResult, Status
+from mcgicp_jax._registration.result import RegistrationResult, Status, unverified
 
 GivenExecutor: TypeAlias = Executor | Literal["processes"] | None
 
@@ -128,7 +131,40 @@ def run(
     job: BatchJob, pairs: Iterator[Pair], executor: Executor | None
 ) -> Generator[tuple[int, RegistrationResult], None, None]:
     """Register the pairs and yield index and result of each as soon as it is computed; see `register_as_completed`."""
-    num_workers, pairs = num_cores(), map(_concrete, pairs)
+    for result in _results(job, map(_concrete, pairs), executor):
+        yield result.index, result.registration
+
+
+def run_differentiated(job: BatchJob, pairs: Iterator[Pair], executor: Executor) -> list[RegistrationResult]:
+    """The results of pairs whose arrays differentiation traces; workers compute the poses and their derivatives."""
+    given = {pair.index: job.given(pair) for pair in pairs}
+    fixed = replace(job, method=primal(job.method), options=replace(job.options, robust=primal(job.options.robust)))
+    sent = (
+        Pair(pair.index, *pair.given.values()[:2], pair.init, pair.traced)
+        for pair in given.values()
+        if isinstance(pair, GivenPair)
+    )
+    found = {index: pair.with_warning() for index, pair in given.items() if isinstance(pair, PairResult)}
+    found |= {result.index: result for result in _results(fixed, sent, executor)}
+    return [_differentiable(found[index], pair) for index, pair in given.items()]
+
+
+def _differentiable(found: PairResult, pair: PairResult | GivenPair) -> RegistrationResult:
+    """The result with the derivative of its pose."""
+    result = found.registration
+    if isinstance(pair, PairResult) or not found.jacobian:
+        return result
+    values, inputs = [np.asarray(result.centred.wxyz_xyz)], [pair.leaves[i] for i in pair.traced]
+    (pose,) = with_derivative(values, KnownJacobian(found.jacobian), inputs)
+    origins = pair.given.source.origin, pair.given.target.origin
+    if is_concrete(origins):
+        origins = result.source_origin, result.target_origin
+    result = result.build(**vars(result) | fields_of_pose(jaxlie.SE3(pose), *origins))
+    return result if pair.verified else unverified(result)
+
+
+def _results(job: BatchJob, pairs: Iterator[Pair], executor: Executor | None) -> Iterator[PairResult]:
+    num_workers = num_cores()
     if executor is None and job.uses_lanes:
         yield from map(PairResult.with_warning, job.register_in_lanes(pairs, num_workers))
     elif executor is None:
@@ -169,9 +205,7 @@ class ChunkedExecutor:
         self._suspects: collections.deque[Pair] = collections.deque()
         self._submitted: dict[Future[list[PairResult]], list[Pair]] = {}
 
-    def run(
-        self, pairs: Iterator[Pair], chunk_size: int, max_submitted: int
-    ) -> Iterator[tuple[int, RegistrationResult]]:
+    def run(self, pairs: Iterator[Pair], chunk_size: int, max_submitted: int) -> Iterator[PairResult]:
         """Submit chunks, at most `max_submitted` at a time, and yield their results."""
         try:
             while chunk := list(itertools.islice(pairs, chunk_size)):
@@ -200,7 +234,7 @@ class ChunkedExecutor:
             future = self._executor.submit(self._register, sent)
         self._submitted[future] = chunk
 
-    def _receive(self) -> Iterator[tuple[int, RegistrationResult]]:
+    def _receive(self) -> Iterator[PairResult]:
         """Wait for at least one chunk and yield its results; the pairs of failed chunks become suspects."""
         done, _ = wait_for(self._submitted, return_when=FIRST_COMPLETED)
         for future in done:
@@ -220,7 +254,7 @@ class ChunkedExecutor:
             else:
                 yield from map(PairResult.with_warning, results)
 
-    def _retried(self, pair: Pair) -> tuple[int, RegistrationResult]:
+    def _retried(self, pair: Pair) -> PairResult:
         """Submit a suspect alone and wait for its result."""
         self._submit([pair])
         future, _ = self._submitted.popitem()
