@@ -35,6 +35,15 @@ def test_each_pair_is_as_if_it_were_alone(raw, alone):
     assert sum(result.converged for result in results) >= 5
 
 
+@pytest.mark.parametrize("search", [None, pytest.param(mcg.DenseSearch(), marks=pytest.mark.slow)])
+def test_results_without_covariances(raw, search):
+    sources, targets = prepared(raw[:2])
+    expected, found = (batch(sources, targets, search=search, covariances=wanted) for wanted in (True, False))
+    for one, other in zip(expected, found, strict=True):
+        assert np.isfinite(one.covariance).all() and np.isnan([*other.covariance.ravel(), *other.deviations]).all()
+        assert_same([other.build(**vars(other) | {"uncertainty": one.uncertainty})], [one])
+
+
 def test_every_option_of_register_is_one_of_a_batch(raw):
     options = {"equalize_channels": True, "voxel_sizes": (0.2,), "robust": mcg.Huber(1.0), "max_iterations": 20}
     source, target = (mcg.preprocess(cloud) for cloud in raw[0][:2])

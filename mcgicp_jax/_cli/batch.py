@@ -238,6 +238,7 @@ def _settings(pairs: Sequence[FilePair], method: Method, options: Options) -> di
         "channels": choices.channels,
         "voxel_size": choices.voxels.size,
         "num_neighbors": options.num_neighbors,
+        "covariances": False,
     }
 
 

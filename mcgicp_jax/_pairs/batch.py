@@ -31,6 +31,7 @@ def register_batch(
     voxel_size: VoxelSize = "auto",
     num_neighbors: int = NUM_NEIGHBORS,
     executor: GivenExecutor = None,
+    covariances: bool = True,
     **options: Unpack[GivenOptions],
 ) -> list[RegistrationResult]:
     """Register many pairs of clouds of any sizes; return one `RegistrationResult` per pair, in the order of the pairs.
@@ -42,7 +43,9 @@ def register_batch(
     MAX_ITERATIONS. They are computed side by side, so that `jax.value_and_grad` of a loss over the poses of many pairs
     is one call; with an `executor` by its workers, as (7, n) matrices. Clouds must be given in lists then.
     """
-    job, pairs, workers = _job(sources, targets, method, init, voxel_size, num_neighbors, executor, options)
+    job, pairs, workers = _job(
+        sources, targets, method, init, voxel_size, num_neighbors, executor, covariances, options
+    )
     # A look at an iterator would use it up.
     clouds = [side for side in (sources, targets) if isinstance(side, list | tuple | PointCloud)]
     if not is_concrete(clouds, job.method, job.options.robust):
@@ -59,6 +62,7 @@ def register_as_completed(
     voxel_size: VoxelSize = "auto",
     num_neighbors: int = NUM_NEIGHBORS,
     executor: GivenExecutor = None,
+    covariances: bool = True,
     **options: Unpack[GivenOptions],
 ) -> Generator[tuple[int, RegistrationResult], None, None]:
     """Register many pairs of clouds of any sizes and yield each result as soon as it is computed.
@@ -80,6 +84,7 @@ def register_as_completed(
             needed), which starts in some ten seconds, waits for the next call, and pays off with hundreds of pairs; or
             any `concurrent.futures.Executor`, such as Dask's `Client.get_executor()`. A pair whose worker dies is sent
             once more, and gets the status `WORKER_FAILED` and a warning if that fails too.
+        covariances: False saves a tenth of the time: `covariance` and `deviations` are NaN.
         options: options of `register`, except for `tie_points` and `prior`. `search` is also used to preprocess; by
             default SciPy's k-d tree with one thread per pair. With `DenseSearch`, the default on accelerators, pairs
             run as lanes of one vectorised program, spread over all local devices (not with `equalize_channels` or
@@ -93,7 +98,7 @@ def register_as_completed(
     Warns:
         PairWarning: the reason for each pair with the status `INVALID_INPUT` or `WORKER_FAILED`; a `UserWarning`.
     """
-    return run(*_job(sources, targets, method, init, voxel_size, num_neighbors, executor, options))
+    return run(*_job(sources, targets, method, init, voxel_size, num_neighbors, executor, covariances, options))
 
 
 def _job(
@@ -104,13 +109,14 @@ def _job(
     voxel_size: VoxelSize,
     num_neighbors: int,
     executor: GivenExecutor,
+    covariances: bool,
     options: GivenOptions,
 ) -> tuple[BatchJob, Iterator[Pair], Executor | None]:
     """The settings common to all pairs, checked, the pairs, and the executor."""
     check_method(method)
     check_preprocessing(voxel_size, num_neighbors)
     workers = executor_of(executor)
-    job = BatchJob(method, options_of(register_batch, options), voxel_size, num_neighbors)
+    job = BatchJob(method, options_of(register_batch, options), voxel_size, num_neighbors, covariances)
     return job, _pairs(job, sources, targets, init), workers
 
 

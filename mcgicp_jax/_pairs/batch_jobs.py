@@ -156,6 +156,7 @@ class BatchJob:
     options: Options
     voxel_size: VoxelSize
     num_neighbors: int
+    covariances: bool = True
 
     @property
     def search(self) -> AbstractSearch:
@@ -216,15 +217,22 @@ class BatchJob:
                 result = registration_of(
                     ended.state, ended.assessment, ended.history, pair.source, pair.target, pair.used
                 )
-                yield PairResult(pair.index, result if pair.verified else unverified(result))
+                yield PairResult(pair.index, self._computed(result if pair.verified else unverified(result)))
             yield from rejected
+
+    def _computed(self, result: RegistrationResult) -> RegistrationResult:
+        """The result without references to the clouds, and if so wanted without covariance."""
+        if not self.covariances:
+            unknown = RegistrationResult.without_pose(result.status).uncertainty
+            result = result.build(**vars(result) | {"uncertainty": unknown})
+        return computed(result)
 
     @_of_a_pair
     def _register(self, pair: Pair) -> PairResult:
         source, target = self._clouds(pair)
         options = replace(self.options, search=self.search)
         result = register_from(source, target, self.method, pair.init, options)
-        return PairResult(pair.index, computed(result))
+        return PairResult(pair.index, self._computed(result))
 
     @_of_a_pair
     def _register_with_jacobian(self, pair: Pair) -> PairResult:
@@ -241,7 +249,7 @@ class BatchJob:
 
         parameters, pull = jax.vjp(pose, *(leaves[i] for i in pair.traced))
         blocks = jax.vmap(pull)(jnp.eye(7, dtype=parameters.dtype))
-        return PairResult(pair.index, computed(result), jacobian=tuple(map(np.asarray, blocks)))
+        return PairResult(pair.index, self._computed(result), jacobian=tuple(map(np.asarray, blocks)))
 
     def register_differentiated(self, pairs: Iterable[Pair]) -> list[RegistrationResult]:
         """The results of pairs whose arrays differentiation traces. All derivatives are computed side by side."""
