@@ -139,7 +139,8 @@ def rates() -> None:
         pairs = lidar_pairs(count, keep, thinned)
         timed = partial(_timed_ours, pairs, voxel)
         processes, workers = Processes(pairs, voxel, cores), Workers(cores)
-        starts = [timed(executor)[0] - timed(executor)[0] for executor in (None, workers)]
+        timed(None)
+        start = timed(workers)[0] - timed(workers)[0]
         processes()
         turns = []
         for _ in range(NUM_TURNS):
@@ -159,9 +160,10 @@ def rates() -> None:
         one = Workers(1)
         timed(one)
         alone = count / statistics.median(timed(one)[0] for _ in range(3))
-        print(f"{'':12} one worker {alone:.1f}, efficiency of {cores} {in_processes / alone / cores:.2f};", end="")
-        pay = (starts[1] - starts[0]) / (1 / mine - 1 / in_processes)
-        print(f" start of threads {starts[0]:.1f} s, of processes {starts[1]:.1f} s; even at {pay:,.0f} pairs")
+        print(
+            f"{'':12} one worker {alone:.1f}, efficiency of {cores} {in_processes / alone / cores:.2f}; start", end=""
+        )
+        print(f" {start:.1f} s, which pays off from {start / (1 / mine - 1 / in_processes):,.0f} pairs")
 
 
 def _timed_ours(pairs: list[Pair], voxel: float | None, executor: Executor | None) -> tuple[float, float, Any]:
