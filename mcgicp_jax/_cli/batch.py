@@ -40,9 +40,9 @@ Pairs: TypeAlias = Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="
 _INTERRUPTED = 130
 # Status of pairs that could not be registered.
 _TRIED_AGAIN = ("invalid_input", "worker_failed")
-# Number of pairs from which processes are faster, with their start of 3 to 10 s. On two cores, pairs of 2,000 points
-# take 41 ms in threads and 23 ms in processes.
-_PAIRS_FOR_PROCESSES = 300
+# Number of pairs from which processes are faster with their start, 7 s on two cores, where pairs of 2,000 points take
+# 30 ms in threads and 18 ms in processes.
+_PAIRS_FOR_PROCESSES = 500
 
 
 @dataclass(frozen=True)
