@@ -5,6 +5,7 @@ import multiprocessing
 import os
 import pickle
 import re
+import sys
 import threading
 import warnings
 from concurrent.futures import Executor, Future, ProcessPoolExecutor, ThreadPoolExecutor
@@ -32,6 +33,15 @@ def test_each_pair_is_as_if_it_were_alone(raw, alone):
         assert max(pose_error(result.matrix, truth)) < 0.02
     # Matches of one of them circle.
     assert sum(result.converged for result in results) >= 5
+
+
+@pytest.mark.parametrize("search", [None, pytest.param(mcg.DenseSearch(), marks=pytest.mark.slow)])
+def test_results_without_covariances(raw, search):
+    sources, targets = prepared(raw[:2])
+    expected, found = (batch(sources, targets, search=search, covariances=wanted) for wanted in (True, False))
+    for one, other in zip(expected, found, strict=True):
+        assert np.isfinite(one.covariance).all() and np.isnan([*other.covariance.ravel(), *other.deviations]).all()
+        assert_same([other.build(**vars(other) | {"uncertainty": one.uncertainty})], [one])
 
 
 def test_every_option_of_register_is_one_of_a_batch(raw):
@@ -241,11 +251,6 @@ def test_sides_that_do_not_fit(raw):
     with pytest.raises(ValueError, match=r"targets: .*expected at least 4 finite points"):
         batch(sources, np.eye(3))
 
-    def loss(points):
-        return batch([sources[0].replace(points=points)], targets[:1], executor=ThreadPoolExecutor(1))[0].cost
-
-    with pytest.raises(ValueError, match=r"^executor: expected None for derivatives"):
-        jax.grad(loss)(sources[0].points)
     assert batch([], []) == []
 
 
@@ -328,3 +333,11 @@ def test_one_structured_cloud_for_many():
     table = np.rec.fromarrays(points.T, names="x,y,z")
     results = mcg.register_batch([points + 0.01, points - 0.01], table, mcg.PointToPoint())
     assert len(results) == 2 and all(result.num_inliers == 60 for result in results)
+
+
+def test_the_extra_is_named(monkeypatch):
+    monkeypatch.setitem(sys.modules, "loky", None)
+    with pytest.raises(ImportError, match=re.escape("pip install 'mcgicp_jax[processes]'")):
+        batch([np.eye(3)], [np.eye(3)], executor="processes")
+    with pytest.raises(ValueError, match=r'^executor: expected .*"processes" or None'):
+        batch([np.eye(3)], [np.eye(3)], executor="threads")

@@ -73,6 +73,16 @@ def test_a_folder_is_registered_file_by_file(folder, tmp_path, capsys):
     assert f"{NUM_FILES - 1} converged" in text and "pairs per second" in text and "intensity" in text
 
 
+@pytest.mark.slow
+def test_processes_write_the_table_of_threads(folder, tmp_path, capsys):
+    pytest.importorskip("loky")
+    tables = [tmp_path / "threads.csv", tmp_path / "processes.csv"]
+    assert run_folder(folder, tables[0]) == run_folder(folder, tables[1], "--workers", "2") == 0
+    assert tables[0].read_text() == tables[1].read_text()
+    assert run_folder(folder, tmp_path / "none.csv", "--workers", "0") == 2
+    assert "workers: expected an integer of at least 1, got 0" in capsys.readouterr().err
+
+
 def test_a_second_run_does_what_is_missing(folder, tmp_path, capsys):
     output = tmp_path / "results.csv"
     names = [f"scan_{i}.ply" for i in range(NUM_FILES)]

@@ -123,9 +123,8 @@ class PointCloud(eqx.Module):
     A cloud built from arrays is *raw*; `preprocess` returns one that is ready to register, with neighbours. Both hold
     NumPy arrays with one row per point. Quantities derived from a cloud are cached while the cloud is in use, so do
     not modify its arrays in place. To exchange values, such as channels computed by a network, use
-    `cloud.replace(channels=...)`. Rows that are not `valid` are padding (see `pad`) and are ignored everywhere. In
-    masked arrays of NumPy, a masked coordinate is NaN, so that `preprocess` leaves the point out, and a masked channel
-    is not valid.
+    `cloud.replace(channels=...)`. Rows that are not `valid` are padding (see `pad`), ignored everywhere. In masked
+    arrays, a masked coordinate is NaN, so that `preprocess` leaves the point out, and a masked channel is not valid.
 
     Attributes:
         points: (N, 3), metres, relative to `origin` (0 for raw clouds); see `coordinates`.

@@ -34,6 +34,25 @@ class AbstractLinearMap(abc.ABC):
         """Cotangents of the inputs with numbers `moving`, one array (m, ...) for each, from those of the values."""
 
 
+class KnownJacobian(AbstractLinearMap):
+    """The derivative of one value of k numbers by several arrays.
+
+    Args:
+        blocks: (k, ...) by each array.
+    """
+
+    def __init__(self, blocks: Sequence[np.ndarray]):
+        self._blocks = blocks
+
+    def push(self, tangents: Sequence[np.ndarray], moving: tuple[int, ...]) -> list[np.ndarray]:
+        blocks = [self._blocks[i] for i in moving]
+        pairs = zip(tangents, blocks, strict=True)
+        return [sum(each.reshape(len(each), -1) @ block.reshape(len(block), -1).T for each, block in pairs)]
+
+    def pull(self, cotangents: Sequence[np.ndarray], moving: tuple[int, ...]) -> list[np.ndarray]:
+        return [np.tensordot(cotangents[0], self._blocks[i], 1) for i in moving]
+
+
 class SideBySide(AbstractLinearMap):
     """Several maps, each with one value and its own inputs, computed in threads.
 

@@ -109,6 +109,11 @@ class RowsOnDemand(Generic[Tree]):
             self._missing[some] = False
             return self._tree
 
+    @property
+    def complete(self) -> bool:
+        """Whether all rows are computed."""
+        return not self._missing.any()
+
     def _fill(self, rows: Int[np.ndarray, "n"], found: Tree) -> None:
         if self._tree is None:
             size = self._missing.size

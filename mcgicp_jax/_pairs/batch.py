@@ -16,7 +16,7 @@ from mcgicp_jax._clouds.voxel_size import NUM_NEIGHBORS, VoxelSize
 from mcgicp_jax._compute.concrete import is_concrete
 from mcgicp_jax._math.poses import Pose, matrix_of, pose_matrix
 from mcgicp_jax._methods.base import AbstractMethod
-from mcgicp_jax._pairs.batch_executors import check_executor, run
+from mcgicp_jax._pairs.batch_executors import GivenExecutor, executor_of, run, run_differentiated
 from mcgicp_jax._pairs.batch_jobs import BatchJob, Cloud, Pair
 from mcgicp_jax._registration.options import GivenOptions, check_method, options_of
 from mcgicp_jax._registration.result import RegistrationResult
@@ -30,7 +30,8 @@ def register_batch(
     init: Iterable[Pose | Literal["global"] | None] | Pose | Literal["global"] | None = None,
     voxel_size: VoxelSize = "auto",
     num_neighbors: int = NUM_NEIGHBORS,
-    executor: Executor | None = None,
+    executor: GivenExecutor = None,
+    covariances: bool = True,
     **options: Unpack[GivenOptions],
 ) -> list[RegistrationResult]:
     """Register many pairs of clouds of any sizes; return one `RegistrationResult` per pair, in the order of the pairs.
@@ -40,16 +41,16 @@ def register_batch(
     Outside `jit`, the poses have derivatives, as those of `register`, by the points and channels of the clouds and the
     parameters of the method: of a DEGENERATE pose within its constrained directions, 0 of other failures but
     MAX_ITERATIONS. They are computed side by side, so that `jax.value_and_grad` of a loss over the poses of many pairs
-    is one call. Only the default `executor` is available then, and clouds must be given in lists.
+    is one call; with an `executor` by its workers, as (7, n) matrices. Clouds must be given in lists then.
     """
-    job, pairs = _job(sources, targets, method, init, voxel_size, num_neighbors, executor, options)
+    job, pairs, workers = _job(
+        sources, targets, method, init, voxel_size, num_neighbors, executor, covariances, options
+    )
     # A look at an iterator would use it up.
     clouds = [side for side in (sources, targets) if isinstance(side, list | tuple | PointCloud)]
     if not is_concrete(clouds, job.method, job.options.robust):
-        if executor is not None:
-            raise ValueError(f"executor: expected None for derivatives, got {executor!r}")
-        return job.register_differentiated(pairs)
-    return [result for _, result in sorted(run(job, pairs, executor), key=lambda item: item[0])]
+        return job.register_differentiated(pairs) if workers is None else run_differentiated(job, pairs, workers)
+    return [result for _, result in sorted(run(job, pairs, workers), key=lambda item: item[0])]
 
 
 def register_as_completed(
@@ -60,7 +61,8 @@ def register_as_completed(
     init: Iterable[Pose | Literal["global"] | None] | Pose | Literal["global"] | None = None,
     voxel_size: VoxelSize = "auto",
     num_neighbors: int = NUM_NEIGHBORS,
-    executor: Executor | None = None,
+    executor: GivenExecutor = None,
+    covariances: bool = True,
     **options: Unpack[GivenOptions],
 ) -> Generator[tuple[int, RegistrationResult], None, None]:
     """Register many pairs of clouds of any sizes and yield each result as soon as it is computed.
@@ -78,10 +80,11 @@ def register_as_completed(
             "global" the pose found by `global_pose`.
         voxel_size, num_neighbors: as in `preprocess`, for raw clouds, which the workers preprocess. "auto": one size
             for both clouds of a pair; that of a single cloud for all pairs, if it has any, applies to all.
-        executor: any `concurrent.futures.Executor`, such as a `ProcessPoolExecutor` with the start method "spawn" (its
-            start pays off with hundreds of pairs) or Dask's `Client.get_executor()`; by default one thread per core. A
-            pair whose worker dies is sent once more, and gets the status `WORKER_FAILED` and a warning if that fails
-            too.
+        executor: None, a thread per core; "processes", a process per core (extra `processes`; no `__main__` guard is
+            needed), which starts in some ten seconds, waits for the next call, and pays off with hundreds of pairs; or
+            any `concurrent.futures.Executor`, such as Dask's `Client.get_executor()`. A pair whose worker dies is sent
+            once more, and gets the status `WORKER_FAILED` and a warning if that fails too.
+        covariances: False saves a tenth of the time: `covariance` and `deviations` are NaN.
         options: options of `register`, except for `tie_points` and `prior`. `search` is also used to preprocess; by
             default SciPy's k-d tree with one thread per pair. With `DenseSearch`, the default on accelerators, pairs
             run as lanes of one vectorised program, spread over all local devices (not with `equalize_channels` or
@@ -95,7 +98,7 @@ def register_as_completed(
     Warns:
         PairWarning: the reason for each pair with the status `INVALID_INPUT` or `WORKER_FAILED`; a `UserWarning`.
     """
-    return run(*_job(sources, targets, method, init, voxel_size, num_neighbors, executor, options), executor)
+    return run(*_job(sources, targets, method, init, voxel_size, num_neighbors, executor, covariances, options))
 
 
 def _job(
@@ -105,15 +108,16 @@ def _job(
     init: Any,
     voxel_size: VoxelSize,
     num_neighbors: int,
-    executor: Executor | None,
+    executor: GivenExecutor,
+    covariances: bool,
     options: GivenOptions,
-) -> tuple[BatchJob, Iterator[Pair]]:
-    """The settings common to all pairs, checked, and the pairs."""
+) -> tuple[BatchJob, Iterator[Pair], Executor | None]:
+    """The settings common to all pairs, checked, the pairs, and the executor."""
     check_method(method)
     check_preprocessing(voxel_size, num_neighbors)
-    check_executor(executor)
-    job = BatchJob(method, options_of(register_batch, options), voxel_size, num_neighbors)
-    return job, _pairs(job, sources, targets, init)
+    workers = executor_of(executor)
+    job = BatchJob(method, options_of(register_batch, options), voxel_size, num_neighbors, covariances)
+    return job, _pairs(job, sources, targets, init), workers
 
 
 def _pairs(

@@ -4,7 +4,11 @@ from __future__ import annotations
 
 import collections
 import itertools
-from collections.abc import Generator, Iterator
+import os
+import signal
+import threading
+import time
+from collections.abc import Callable, Generator, Iterator
 from concurrent.futures import (
     FIRST_COMPLETED,
     BrokenExecutor,
@@ -15,45 +19,160 @@ from concurrent.futures import (
 )
 from concurrent.futures import wait as wait_for
 from dataclasses import replace
+from functools import partial
 from multiprocessing import get_context
-from typing import Any
+from pickle import PicklingError
+from typing import Any, Literal, TypeAlias
 
 import jax
+import jaxlie
 import numpy as np
 
-from mcgicp_jax._compute.concrete import is_concrete
+from mcgicp_jax._compute.concrete import is_concrete, is_deferred
+from mcgicp_jax._compute.linear_maps import KnownJacobian, primal, with_derivative
 from mcgicp_jax._compute.messages import warn
 from mcgicp_jax._compute.threads import num_cores, with_settings
-from mcgicp_jax._pairs.batch_jobs import BatchJob, Pair, PairResult
+from mcgicp_jax._pairs.batch_jobs import BatchJob, GivenPair, Pair, PairResult
+from mcgicp_jax._registration.assessment import fields_of_pose
 from mcgicp_jax._registration.options import Options
-from mcgicp_jax._registration.result import RegistrationResult, Status
+from mcgicp_jax._registration.result import RegistrationResult, Status, unverified
+
+GivenExecutor: TypeAlias = Executor | Literal["processes"] | None
 
 # Number of pairs per chunk for a worker that is not a thread, and maximum number of submitted chunks.
 _CHUNK_SIZE, _MAX_SUBMITTED = 8, 64
+# Number of pairs per chunk for a process of this machine: chunks of 1 to 8 are equally fast, and of small ones each
+# worker has its share of few pairs.
+_SMALL_CHUNK = 2
+# Environment of a worker of `Processes`: one thread each for XLA, the tree search and BLAS. loky would take memory that
+# grows with the clouds for a leak, and start another worker.
+_ENVIRONMENT = {
+    "PJRT_NPROC": "1",
+    "OMP_NUM_THREADS": "1",
+    "OPENBLAS_NUM_THREADS": "1",
+    "MKL_NUM_THREADS": "1",
+    "LOKY_MAX_MEMORY_LEAK_SIZE": "1e18",
+}
+# Settings of JAX for a whole process, which may differ from the environment. `with_settings` sends the others.
+_SETTINGS = (
+    "jax_platforms",
+    "jax_enable_compilation_cache",
+    "jax_compilation_cache_dir",
+    "jax_persistent_cache_min_compile_time_secs",
+    "jax_persistent_cache_min_entry_size_bytes",
+)
+# Seconds between looks of a worker at its parent.
+_LOOK = 1.0
 
 
-def check_executor(executor: Executor | None) -> None:
-    """Raises `ValueError` unless it is None or an executor that may run JAX."""
+class Processes(Executor):
+    """Single-threaded workers in other processes, from loky: they need no `__main__` guard, and wait for further calls
+    until the interpreter ends."""
+
+    def __init__(self, num_workers: int):
+        try:
+            from loky import get_reusable_executor
+        except ImportError as error:
+            raise ImportError("executor: processes need loky: pip install 'mcgicp_jax[processes]'") from error
+        settings = {name: getattr(jax.config, name) for name in _SETTINGS}
+        known = {name.upper(): str(value) for name, value in settings.items() if value is not None}
+        self._current = partial(
+            get_reusable_executor,
+            num_workers,
+            timeout=None,
+            initializer=_begin_worker,
+            initargs=(os.getpid(),),
+            env=_ENVIRONMENT | known,
+        )
+        self._pool, self.num_workers = self._current(), num_workers
+
+    def submit(self, function: Callable[..., Any], /, *arguments: Any, **named: Any) -> Future[Any]:
+        try:
+            return self._pool.submit(function, *arguments, **named)
+        except RuntimeError:
+            # A worker died, or another batch that ended early has ended the workers.
+            self._pool = self._current()
+            return self._pool.submit(function, *arguments, **named)
+
+    def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:
+        """End the workers, if futures are to be cancelled: those in loky's queue cannot."""
+        if cancel_futures:
+            self._pool.shutdown(wait, kill_workers=True)
+
+
+def _begin_worker(parent: int) -> None:
+    """Leave Ctrl-C to the parent, and end when it does, even if it is killed."""
+
+    def watch() -> None:
+        while os.getppid() == parent:
+            time.sleep(_LOOK)
+        os._exit(1)
+
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    threading.Thread(target=watch, daemon=True).start()
+
+
+def executor_of(executor: GivenExecutor) -> Executor | None:
+    """The executor to use; `ValueError` unless it is None, "processes" or an executor that may run JAX."""
+    if isinstance(executor, str) and executor == "processes":
+        return Processes(num_cores())
     if executor is not None and not hasattr(executor, "submit"):
-        raise ValueError(f"executor: expected a concurrent.futures.Executor or None, got {executor!r}")
+        raise ValueError(f'executor: expected a concurrent.futures.Executor, "processes" or None, got {executor!r}')
     context = getattr(executor, "_mp_context", None)
     if isinstance(executor, ProcessPoolExecutor) and context is not None and context.get_start_method() == "fork":
         raise ValueError(
             "executor: expected the start method spawn, got fork, with which JAX may hang; "
-            'use ProcessPoolExecutor(mp_context=multiprocessing.get_context("spawn"))'
+            'use "processes" or ProcessPoolExecutor(mp_context=multiprocessing.get_context("spawn"))'
         )
+    return executor
 
 
 def run(
     job: BatchJob, pairs: Iterator[Pair], executor: Executor | None
 ) -> Generator[tuple[int, RegistrationResult], None, None]:
     """Register the pairs and yield index and result of each as soon as it is computed; see `register_as_completed`."""
-    num_workers, pairs = num_cores(), map(_concrete, pairs)
+    for result in _results(job, map(_concrete, pairs), executor):
+        yield result.index, result.registration
+
+
+def run_differentiated(job: BatchJob, pairs: Iterator[Pair], executor: Executor) -> list[RegistrationResult]:
+    """The results of pairs whose arrays differentiation traces; workers compute the poses and their derivatives."""
+    given = {pair.index: job.given(pair) for pair in pairs}
+    fixed = replace(job, method=primal(job.method), options=replace(job.options, robust=primal(job.options.robust)))
+    sent = (
+        Pair(pair.index, *pair.given.values()[:2], pair.init, pair.traced)
+        for pair in given.values()
+        if isinstance(pair, GivenPair)
+    )
+    found = {index: pair.with_warning() for index, pair in given.items() if isinstance(pair, PairResult)}
+    found |= {result.index: result for result in _results(fixed, sent, executor)}
+    return [_differentiable(found[index], pair) for index, pair in given.items()]
+
+
+def _differentiable(found: PairResult, pair: PairResult | GivenPair) -> RegistrationResult:
+    """The result with the derivative of its pose."""
+    result = found.registration
+    if isinstance(pair, PairResult) or not found.jacobian:
+        return result
+    values, inputs = [np.asarray(result.centred.wxyz_xyz)], [pair.leaves[i] for i in pair.traced]
+    (pose,) = with_derivative(values, KnownJacobian(found.jacobian), inputs)
+    origins = pair.given.source.origin, pair.given.target.origin
+    if is_concrete(origins):
+        origins = result.source_origin, result.target_origin
+    result = result.build(**vars(result) | fields_of_pose(jaxlie.SE3(pose), *origins))
+    return result if pair.verified else unverified(result)
+
+
+def _results(job: BatchJob, pairs: Iterator[Pair], executor: Executor | None) -> Iterator[PairResult]:
+    num_workers = num_cores()
     if executor is None and job.uses_lanes:
         yield from map(PairResult.with_warning, job.register_in_lanes(pairs, num_workers))
     elif executor is None:
         with ThreadPoolExecutor(num_workers, thread_name_prefix="mcgicp") as threads:
             yield from ChunkedExecutor(job, threads).run(pairs, 1, 2 * num_workers)
+    elif isinstance(executor, Processes):
+        # More than loky's queue holds, so that no worker waits.
+        yield from ChunkedExecutor(job, executor).run(pairs, _SMALL_CHUNK, 4 * executor.num_workers)
     else:
         chunk_size = 1 if isinstance(executor, ThreadPoolExecutor) else _CHUNK_SIZE
         yield from ChunkedExecutor(job, executor).run(pairs, chunk_size, _MAX_SUBMITTED)
@@ -81,13 +200,12 @@ class ChunkedExecutor:
         self._pickled = not isinstance(executor, ThreadPoolExecutor)
         if self._pickled:
             job = _as_numpy(job)
-        self._register = with_settings(job.register_chunk, pickled=self._pickled)
+        work = job.register_chunk_alone if isinstance(executor, Processes) else job.register_chunk
+        self._register = with_settings(work, pickled=self._pickled)
         self._suspects: collections.deque[Pair] = collections.deque()
         self._submitted: dict[Future[list[PairResult]], list[Pair]] = {}
 
-    def run(
-        self, pairs: Iterator[Pair], chunk_size: int, max_submitted: int
-    ) -> Iterator[tuple[int, RegistrationResult]]:
+    def run(self, pairs: Iterator[Pair], chunk_size: int, max_submitted: int) -> Iterator[PairResult]:
         """Submit chunks, at most `max_submitted` at a time, and yield their results."""
         try:
             while chunk := list(itertools.islice(pairs, chunk_size)):
@@ -99,8 +217,11 @@ class ChunkedExecutor:
             while self._suspects:
                 yield self._retried(self._suspects.popleft())
         finally:
-            for future in self._submitted:
-                future.cancel()
+            if isinstance(self._executor, Processes):
+                self._executor.shutdown(cancel_futures=bool(self._submitted))
+            else:
+                for future in self._submitted:
+                    future.cancel()
             if self._replacement is not None:
                 self._replacement.shutdown(cancel_futures=True)
 
@@ -113,13 +234,18 @@ class ChunkedExecutor:
             future = self._executor.submit(self._register, sent)
         self._submitted[future] = chunk
 
-    def _receive(self) -> Iterator[tuple[int, RegistrationResult]]:
+    def _receive(self) -> Iterator[PairResult]:
         """Wait for at least one chunk and yield its results; the pairs of failed chunks become suspects."""
         done, _ = wait_for(self._submitted, return_when=FIRST_COMPLETED)
         for future in done:
             chunk = self._submitted.pop(future)
             try:
                 results = future.result()
+            except PicklingError as error:
+                raise ValueError(
+                    f"pairs {chunk[0].index} to {chunk[-1].index}: expected clouds and functions that can be sent to "
+                    f"other processes; {str(error.__cause__).strip().splitlines()[-2]}"
+                ) from error
             except Exception as error:
                 # A worker that dies breaks its pool, and so all chunks that were submitted.
                 if not self._suspects:
@@ -128,7 +254,7 @@ class ChunkedExecutor:
             else:
                 yield from map(PairResult.with_warning, results)
 
-    def _retried(self, pair: Pair) -> tuple[int, RegistrationResult]:
+    def _retried(self, pair: Pair) -> PairResult:
         """Submit a suspect alone and wait for its result."""
         self._submit([pair])
         future, _ = self._submitted.popitem()
@@ -162,7 +288,7 @@ def _as_numpy(sent: Any) -> Any:
         return np.asarray(value) if isinstance(value, jax.Array) else value
 
     fields = {name: getattr(sent, name) for name in sent.__dataclass_fields__}
-    return replace(sent, **{name: jax.tree.map(convert, value) for name, value in fields.items()})
+    return replace(sent, **{name: jax.tree.map(convert, value, is_leaf=is_deferred) for name, value in fields.items()})
 
 
 def _words(error: BaseException) -> str:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import collections
 import functools
 import traceback
+import warnings
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Executor, Future, ThreadPoolExecutor
 from dataclasses import dataclass, replace
@@ -13,11 +14,13 @@ from typing import Any, Literal, TypeAlias
 
 import equinox as eqx
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool
 
 from mcgicp_jax._clouds.point_cloud import PointCloud, Values
 from mcgicp_jax._clouds.voxel_size import VoxelSize
+from mcgicp_jax._compute.concrete import is_concrete, is_deferred
 from mcgicp_jax._compute.linear_maps import primal
 from mcgicp_jax._compute.messages import messages_named, warn, warnings_named
 from mcgicp_jax._compute.programs import size_class
@@ -55,29 +58,45 @@ class PairWarning(UserWarning):
 
 @dataclass(frozen=True)
 class Pair:
-    """The arguments of one pair of the batch."""
+    """The arguments of one pair of the batch.
+
+    Attributes:
+        traced: numbers of the leaves of clouds, method and kernel by which the pose is to be differentiated; the clouds
+            are then preprocessed.
+    """
 
     index: int
     source: Cloud
     target: Cloud
     init: Pose | Literal["global"] | None
+    traced: tuple[int, ...] = ()
 
 
 @dataclass(frozen=True)
 class PairResult:
-    """The result of one pair, and the reason if it has no pose (None: it has one, or the status is the reason)."""
+    """The result of one pair.
+
+    Attributes:
+        reason: why it has no pose; None if it has one, or the status is the reason.
+        warnings: issued in another process.
+        jacobian: (7, ...) derivative of the centred pose by each leaf in `Pair.traced`.
+    """
 
     index: int
     registration: RegistrationResult
     reason: str | None = None
+    warnings: tuple[str, ...] = ()
+    jacobian: tuple[np.ndarray, ...] = ()
 
-    def with_warning(self) -> tuple[int, RegistrationResult]:
-        """Index and result; issues the `PairWarning`, if there is a reason."""
+    def with_warning(self) -> PairResult:
+        """The result; issues the warnings, and the `PairWarning` if there is a reason."""
+        for message in self.warnings:
+            warn(message)
         if self.reason is not None:
             warning = PairWarning(f"pair {self.index}: {self.reason}")
             warning.index, warning.reason = self.index, self.reason
             warn(warning)
-        return self.index, self.registration
+        return self
 
 
 @dataclass(frozen=True)
@@ -98,7 +117,7 @@ class _LanePair:
 
 
 @dataclass(frozen=True)
-class _GivenPair:
+class GivenPair:
     """A pair whose arrays differentiation traces."""
 
     index: int
@@ -106,12 +125,21 @@ class _GivenPair:
     init: Pose | None
     verified: bool
 
+    @property
+    def leaves(self) -> list[Any]:
+        """Those of clouds, method and kernel."""
+        return jax.tree.leaves(self.given[:4], is_leaf=is_deferred)
+
+    @property
+    def traced(self) -> tuple[int, ...]:
+        return tuple(i for i, leaf in enumerate(self.leaves) if not is_concrete(leaf))
+
 
 def _of_a_pair(work: Callable[..., Any]) -> Callable[..., Any]:
     """Decorator of methods for one pair: a `ValueError` becomes the reason of its result."""
 
     @functools.wraps(work)
-    def caught(self: BatchJob, pair: Pair | _GivenPair, *arguments: Any) -> Any:
+    def caught(self: BatchJob, pair: Pair | GivenPair, *arguments: Any) -> Any:
         try:
             return work(self, pair, *arguments)
         except ValueError as error:
@@ -128,6 +156,7 @@ class BatchJob:
     options: Options
     voxel_size: VoxelSize
     num_neighbors: int
+    covariances: bool = True
 
     @property
     def search(self) -> AbstractSearch:
@@ -159,7 +188,16 @@ class BatchJob:
 
     def register_chunk(self, chunk: list[Pair]) -> list[PairResult]:
         """Register the pairs one after the other, or in lanes."""
-        return list(self.register_in_lanes(chunk, 1)) if self.uses_lanes else [self._register(pair) for pair in chunk]
+        if self.uses_lanes and not chunk[0].traced:
+            return list(self.register_in_lanes(chunk, 1))
+        return [self._register_with_jacobian(pair) if pair.traced else self._register(pair) for pair in chunk]
+
+    def register_chunk_alone(self, chunk: list[Pair]) -> list[PairResult]:
+        """`register_chunk` in a process without other threads; the first result has the warnings."""
+        with warnings.catch_warnings(record=True) as caught:
+            warnings.simplefilter("always", UserWarning)
+            first, *others = self.register_chunk(chunk)
+        return [replace(first, warnings=tuple(str(each.message) for each in caught)), *others]
 
     def register_in_lanes(self, pairs: Iterable[Pair], num_threads: int) -> Iterator[PairResult]:
         """Register the pairs as lanes on this machine; threads preprocess them."""
@@ -179,19 +217,43 @@ class BatchJob:
                 result = registration_of(
                     ended.state, ended.assessment, ended.history, pair.source, pair.target, pair.used
                 )
-                yield PairResult(pair.index, result if pair.verified else unverified(result))
+                yield PairResult(pair.index, self._computed(result if pair.verified else unverified(result)))
             yield from rejected
+
+    def _computed(self, result: RegistrationResult) -> RegistrationResult:
+        """The result without references to the clouds, and if so wanted without covariance."""
+        if not self.covariances:
+            unknown = RegistrationResult.without_pose(result.status).uncertainty
+            result = result.build(**vars(result) | {"uncertainty": unknown})
+        return computed(result)
 
     @_of_a_pair
     def _register(self, pair: Pair) -> PairResult:
         source, target = self._clouds(pair)
         options = replace(self.options, search=self.search)
         result = register_from(source, target, self.method, pair.init, options)
-        return PairResult(pair.index, computed(result))
+        return PairResult(pair.index, self._computed(result))
+
+    @_of_a_pair
+    def _register_with_jacobian(self, pair: Pair) -> PairResult:
+        values: Any = (pair.source, pair.target, self.method, self.options.robust)
+        init: Any = pair.init
+        run = run_pair(Inputs(*values), init, replace(self.options, search=self.search))
+        (result,) = results_of([run], [None])
+        leaves, structure = jax.tree.flatten(values, is_leaf=is_deferred)
+
+        def pose(*traced: Any) -> Any:
+            moved = dict(enumerate(leaves)) | dict(zip(pair.traced, traced, strict=True))
+            (found,) = results_of([run], [Inputs(*jax.tree.unflatten(structure, moved.values()))])
+            return found.centred.wxyz_xyz
+
+        parameters, pull = jax.vjp(pose, *(leaves[i] for i in pair.traced))
+        blocks = jax.vmap(pull)(jnp.eye(7, dtype=parameters.dtype))
+        return PairResult(pair.index, self._computed(result), jacobian=tuple(map(np.asarray, blocks)))
 
     def register_differentiated(self, pairs: Iterable[Pair]) -> list[RegistrationResult]:
         """The results of pairs whose arrays differentiation traces. All derivatives are computed side by side."""
-        ready = [self._given(pair) for pair in pairs]
+        ready = [self.given(pair) for pair in pairs]
         # What is traced is traced in this thread alone.
         calls = [
             partial(lambda each: each, pair)
@@ -201,25 +263,25 @@ class BatchJob:
         ]
         runs = in_new_thread(partial(side_by_side, calls, num_cores()))
         both = zip(runs, ready, strict=True)
-        ended = [(run, pair) for run, pair in both if isinstance(run, Run) and isinstance(pair, _GivenPair)]
+        ended = [(run, pair) for run, pair in both if isinstance(run, Run) and isinstance(pair, GivenPair)]
         found = results_of([run for run, _ in ended], [pair.given for _, pair in ended])
         results = iter(
             result if pair.verified else unverified(result) for result, (_, pair) in zip(found, ended, strict=True)
         )
-        return [next(results) if isinstance(run, Run) else run.with_warning()[1] for run in runs]
+        return [next(results) if isinstance(run, Run) else run.with_warning().registration for run in runs]
 
     @_of_a_pair
-    def _given(self, pair: Pair) -> PairResult | _GivenPair:
+    def given(self, pair: Pair) -> PairResult | GivenPair:
         source, target = self._clouds(pair)
         warn_of_estimated_parameters(self.method, source, target)
         start = self._start(pair, primal(source), primal(target))
         if isinstance(start, PairResult):
             return start
         init, verified = start
-        return _GivenPair(pair.index, prepared(source, target, self.method, self.options), primal(init), verified)
+        return GivenPair(pair.index, prepared(source, target, self.method, self.options), primal(init), verified)
 
     @_of_a_pair
-    def _run(self, pair: _GivenPair, values: Inputs) -> PairResult | Run:
+    def _run(self, pair: GivenPair, values: Inputs) -> PairResult | Run:
         return run_pair(values, pair.init, replace(self.options, search=self.search))
 
     def _start(self, pair: Pair, source: PointCloud, target: PointCloud) -> PairResult | tuple[Pose | None, bool]:

@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import jaxlie
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
@@ -181,7 +182,6 @@ def registration_of(
         # Reading NumPy arrays compiles nothing.
         state, history = jax.tree.map(np.asarray, (state, history))
         pose = state.pose if is_concrete(pose) else pose
-    matrix = pose_in_user_frame(pose, source_origin, target_origin)
     numbers: Any = {
         "status_code": state.status,
         "num_iterations": state.num_iterations,
@@ -195,17 +195,20 @@ def registration_of(
         numbers, used = jax.tree.map(lambda number: np.asarray(number)[()], (numbers, used))
     numbers["num_inliers"] = numbers["num_inliers"].astype(np.int32)
     numbers["overlap"] = (numbers["num_inliers"] / used.sum()).astype(numbers["rmse"].dtype)
-    far = not is_concrete(source_origin, target_origin) or np.any(source_origin) or np.any(target_origin)
     return RegistrationResult.build(
-        T_target_source=se3_from_matrix(matrix, pose.wxyz_xyz.dtype) if far else pose,
-        source_origin=source_origin,
-        target_origin=target_origin,
-        centred=pose,
         constraints=_later(lambda: _constraints(assessment, source.origin), concrete),
         uncertainty=_later(lambda: _uncertainty(assessment, state, source.origin), concrete),
         derivative=Held(derivative),
         **numbers,
+        **fields_of_pose(pose, source_origin, target_origin),
     )
+
+
+def fields_of_pose(pose: jaxlie.SE3, source_origin: Any, target_origin: Any) -> dict[str, Any]:
+    """Those of a `RegistrationResult` that follow from the pose and the origins of both clouds."""
+    far = not is_concrete(source_origin, target_origin) or np.any(source_origin) or np.any(target_origin)
+    user = se3_from_matrix(pose_in_user_frame(pose, source_origin, target_origin), pose.wxyz_xyz.dtype) if far else pose
+    return {"T_target_source": user, "source_origin": source_origin, "target_origin": target_origin, "centred": pose}
 
 
 def _later(compute: Callable[[], Any], concrete: bool) -> Lazy[Any]:

@@ -74,10 +74,11 @@ class NeighborsOnDemand(Deferred):
 
     Args:
         find: maps row numbers, or None for all rows, to the rows of their k nearest neighbours.
+        anew: makes the same, for pickles, so that a worker finds the neighbours.
     """
 
-    def __init__(self, find: Callable[[Any], Int[np.ndarray, "n k"]], shape: tuple[int, int]):
-        self.shape = shape
+    def __init__(self, find: Callable[[Any], Int[np.ndarray, "n k"]], shape: tuple[int, int], anew: Callable[[], Any]):
+        self.shape, self._anew = shape, anew
         self._table = RowsOnDemand(lambda rows, _: find(rows), shape[0])
 
     def __getitem__(self, rows: Any) -> Int[np.ndarray, "*n k"]:
@@ -89,6 +90,9 @@ class NeighborsOnDemand(Deferred):
         found = self._table.known()
         found.setflags(write=False)
         return found
+
+    def __reduce__(self) -> Any:
+        return super().__reduce__() if self._table.complete else (self._anew, ())
 
 
 class AbstractIndex(abc.ABC):

@@ -135,7 +135,7 @@ class AbstractTreeSearch(AbstractSearch, TreeBackend):
             neighbors[order if rows is None else slice(None), : found.shape[1]] = found
             return neighbors
 
-        return NeighborsOnDemand(find, shape)
+        return NeighborsOnDemand(find, shape, partial(self.neighbors_on_demand, points, num_neighbors))
 
 
 class KDTreeSearch(AbstractTreeSearch):

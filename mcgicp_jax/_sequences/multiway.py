@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence, Sized
-from concurrent.futures import Executor
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, Unpack
@@ -21,6 +20,7 @@ from mcgicp_jax._local_geometry.spacing_and_noise import point_spacing
 from mcgicp_jax._math.poses import Pose, exponential, logarithm, pose_matrices, rotated
 from mcgicp_jax._methods.base import AbstractMethod
 from mcgicp_jax._pairs.batch import register_batch
+from mcgicp_jax._pairs.batch_executors import GivenExecutor
 from mcgicp_jax._pose_graph.edge import Edge
 from mcgicp_jax._pose_graph.graph import PoseGraph
 from mcgicp_jax._pose_graph.optimize import PoseGraphResult, optimize_poses
@@ -81,7 +81,7 @@ def multiway(
     init: Sequence[Pose] | Float[np.ndarray, "n 4 4"] | None = None,
     voxel_size: VoxelSize = "auto",
     num_neighbors: int = NUM_NEIGHBORS,
-    executor: Executor | None = None,
+    executor: GivenExecutor = None,
     **options: Unpack[GivenOptions],
 ) -> MultiwayResult:
     """Register many clouds of one scene with each other and find one pose for each.

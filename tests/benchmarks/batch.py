@@ -14,7 +14,8 @@ import resource
 import statistics
 import time
 from collections.abc import Callable, Iterator
-from concurrent.futures import Executor, ProcessPoolExecutor
+from concurrent.futures import Executor
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -127,37 +128,46 @@ def _timed(function: Callable[[], Any]) -> tuple[float, float, Any]:
 
 
 def rates() -> None:
+    from mcgicp_jax._pairs.batch_executors import Processes as Workers
+
     cores = len(os.sched_getaffinity(0))
     print(f"\nPairs per second, preprocessing included, {cores} cores, GICP, medians of {NUM_TURNS} turns")
     print(f"{'pairs':>12} {'points':>8} {'ours':>8} {'processes':>10} {'small_gicp':>11} {'ratio':>7}", end="")
-    print(f" {'over the turns':>15} {'processor time ratio':>21} {'poses apart':>12}")
-    workers = ProcessPoolExecutor(cores, multiprocessing.get_context("spawn"))
+    print(f" {'of processes':>13} {'over the turns':>15} {'processor time ratio':>21} {'poses apart':>12}")
     # The last: 2,000 to 20,000 points per cloud.
-    for count, voxel, keep, thinned in ((64, 0.25, 0.95, None), (256, None, 0.77, 0.5), (60, None, (0.1, 1), 0.08)):
+    for count, voxel, keep, thinned in ((256, None, 0.77, 0.5), (64, 0.25, 0.95, None), (60, None, (0.1, 1), 0.08)):
         pairs = lidar_pairs(count, keep, thinned)
-        processes = Processes(pairs, voxel, cores)
-        for executor in (None, workers):
-            ours(pairs, voxel, executor)
+        timed = partial(_timed_ours, pairs, voxel)
+        processes, workers = Processes(pairs, voxel, cores), Workers(cores)
+        timed(None)
+        start = timed(workers)[0] - timed(workers)[0]
         processes()
         turns = []
         for _ in range(NUM_TURNS):
-            wall, cpu, found = _timed(lambda pairs=pairs, voxel=voxel: ours(pairs, voxel))
-            wall_processes, _, _ = _timed(lambda pairs=pairs, voxel=voxel: ours(pairs, voxel, workers))
+            wall, cpu, found = timed(None)
+            wall_processes, _, _ = timed(workers)
             wall_theirs, _, other = _timed(processes)
             _, cpu_theirs, _ = _timed(lambda pairs=pairs, voxel=voxel: theirs(pairs[:16], voxel))
-            rates_of_all = (count / seconds for seconds in (wall, wall_processes, wall_theirs))
-            turns.append((*rates_of_all, wall_theirs / wall, cpu_theirs * count / 16 / cpu))
-        mine, in_processes, rate, _, cpu_ratio = (statistics.median(column) for column in zip(*turns, strict=True))
-        ratios = sorted(turn[3] for turn in turns)
+            walls = np.array([wall, wall_processes, wall_theirs])
+            turns.append((*(count / walls), *(wall_theirs / walls[:2]), cpu_theirs * count / 16 / cpu))
+        mine, in_processes, rate, ratio, ratio_processes, cpu_ratio = np.median(turns, axis=0)
+        ratios = sorted(turn[4] for turn in turns)
         apart = max(np.linalg.norm(a[:3, 3] - b[:3, 3]) for a, b in zip(found, other, strict=True))
         processes.close()
         size = _size(pairs[0], voxel)
+        print(f"{count:12} {size:8,} {mine:8.1f} {in_processes:10.1f} {rate:11.1f} {ratio:7.2f}", end="")
+        print(f" {ratio_processes:13.2f} {ratios[0]:7.2f} to {ratios[-1]:.2f} {cpu_ratio:21.2f} {1e3 * apart:9.2f} mm")
+        one = Workers(1)
+        timed(one)
+        alone = count / statistics.median(timed(one)[0] for _ in range(3))
         print(
-            f"{count:12} {size:8,} {mine:8.1f} {in_processes:10.1f} {rate:11.1f} {statistics.median(ratios):7.2f}",
-            end="",
+            f"{'':12} one worker {alone:.1f}, efficiency of {cores} {in_processes / alone / cores:.2f}; start", end=""
         )
-        print(f" {ratios[0]:6.2f} to {ratios[-1]:.2f} {cpu_ratio:20.2f} {1e3 * apart:9.2f} mm")
-    workers.shutdown()
+        print(f" {start:.1f} s, which pays off from {start / (1 / mine - 1 / in_processes):,.0f} pairs")
+
+
+def _timed_ours(pairs: list[Pair], voxel: float | None, executor: Executor | None) -> tuple[float, float, Any]:
+    return _timed(lambda: ours(pairs, voxel, executor))
 
 
 def _size(pair: Pair, voxel: float | None) -> int:

@@ -1,0 +1,195 @@
+"""`executor="processes"`: the results of threads, and no trace of the workers that made them."""
+
+import os
+import signal
+import subprocess
+import sys
+import textwrap
+import threading
+import time
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import mcgicp_jax as mcg
+from mcgicp_jax import Status
+from mcgicp_jax._compute.threads import num_cores
+from mcgicp_jax._pairs.batch_executors import Processes
+from tests.batches import METHOD, assert_same, batch, prepared
+
+pytest.importorskip("loky")
+pytestmark = [pytest.mark.slow, pytest.mark.timeout(240)]
+
+
+@pytest.fixture(scope="module", autouse=True)
+def workers():
+    """All tests share them."""
+    yield
+    Processes(num_cores()).shutdown(cancel_futures=True)
+
+
+def in_processes(sources, targets, **settings):
+    return batch(sources, targets, executor="processes", **settings)
+
+
+def told(function):
+    """What a function returns in a worker, as a text."""
+
+    def tell():
+        raise ValueError(repr(function()))
+
+    with pytest.warns(mcg.PairWarning) as caught:
+        (result,) = in_processes([tell], [np.eye(3)])
+    assert result.status is Status.INVALID_INPUT
+    return caught[0].message.reason.removeprefix("source: ")
+
+
+def test_the_results_of_threads(raw, alone):
+    assert_same(in_processes(*prepared(raw)), alone)
+    sides = [[pair[side] for pair in raw] for side in (0, 1)]
+    assert_same(in_processes(*sides), batch(*sides))
+    functions = [lambda cloud=cloud: cloud for cloud in sides[0]]
+    assert_same(in_processes(functions, sides[1][0]), batch(*prepared(raw)[:1], sides[1][0]))
+    with jax.enable_x64(True):
+        double = [[cloud.unpad() for cloud in side] for side in prepared(raw[:2])]
+        assert_same(in_processes(*double), batch(*double))
+
+
+def test_workers_stay_and_have_one_thread_and_the_settings_of_the_caller(monkeypatch):
+    workers = {told(os.getpid) for _ in range(2 * num_cores() + 2)}
+    assert len(workers) <= num_cores() and str(os.getpid()) not in workers
+    assert told(lambda: (num_cores(), os.environ["PJRT_NPROC"], os.environ["OMP_NUM_THREADS"])) == "(1, '1', '1')"
+    settings = lambda: (  # noqa: E731
+        jax.config.jax_platforms,
+        jax.config.jax_compilation_cache_dir,
+        jax.config.jax_persistent_cache_min_compile_time_secs,
+        jax.enable_x64.value,
+        jax.default_matmul_precision.value,
+        jax.debug_nans.value,
+    )
+    with jax.enable_x64(True), jax.default_matmul_precision("highest"), jax.debug_nans(True):
+        assert told(settings) == repr(settings())
+
+
+def test_a_pair_that_ends_its_workers_is_given_up_alone(raw, alone):
+    sources, targets = prepared(raw)
+    sources[2] = lambda: os._exit(1)
+    with pytest.warns(UserWarning) as caught:
+        results = in_processes(sources, targets)
+    first, second = (str(each.message) for each in caught)
+    assert "a worker failed (TerminatedWorkerError" in first and "pair 2: its worker failed twice" in second
+    assert results[2].status is Status.WORKER_FAILED
+    assert_same(results[:2] + results[3:], alone[:2] + alone[3:])
+
+
+def test_what_cannot_be_sent_is_named(raw):
+    sources, targets = prepared(raw)
+    lock = threading.Lock()
+    sources[3] = lambda: lock
+    with pytest.raises(ValueError, match=r"^pairs 2 to 3: expected .*sent.*cannot pickle '_thread.lock'[^\n]*$"):
+        in_processes(sources, targets)
+
+
+@pytest.mark.parametrize("clouds", ["raw", "prepared", "far"])
+def test_gradients_are_those_of_threads(raw, clouds):
+    """Poses and Jacobians to the last bit; a gradient adds the rows of the Jacobian in another order."""
+    sources, targets = prepared(raw) if clouds == "prepared" else ([pair[side] for pair in raw] for side in (0, 1))
+    if clouds == "far":
+        offset = np.array([4e5, 5e6, 0])
+        sources, targets = ([each.replace(points=each.points + offset) for each in side] for side in (sources, targets))
+    sources[2], weights = np.zeros((3, 3)), np.random.default_rng(0).normal(size=7)
+
+    def poses(points, executor, pose="T_target_source"):
+        moved = [sources[0].replace(points=points), *sources[1:]]
+        method = mcg.MultiChannelGICP(0.05, 0.3 + 1e-3 * points[0, 0])
+        results = mcg.register_batch(moved, targets, method, max_distance=0.5, executor=executor)
+        assert results[2].status is Status.INVALID_INPUT
+        return jnp.stack([getattr(result, pose).wxyz_xyz for result in results[:2]])
+
+    points, executors = sources[0].points, (None, "processes")
+    with pytest.warns(mcg.PairWarning):
+        expected, found = (
+            jax.jacrev(lambda points, executor=executor: poses(points, executor, "centred")[0])(points)
+            for executor in executors
+        )
+        losses = [lambda points, executor=executor: (poses(points, executor) @ weights).sum() for executor in executors]
+        (value, gradient), (other, by_workers) = (jax.value_and_grad(loss)(points) for loss in losses)
+    np.testing.assert_array_equal(found, expected)
+    assert value == other and np.abs(expected).max() > 0
+    np.testing.assert_allclose(by_workers, gradient, rtol=1e-4, atol=1e-6 * np.abs(gradient).max())
+    with pytest.warns(mcg.PairWarning):
+        _, slope = jax.jvp(losses[1], (jnp.asarray(points),), (by_workers / np.linalg.norm(by_workers),))
+    np.testing.assert_allclose(slope, np.linalg.norm(by_workers), rtol=1e-4)
+
+
+def test_warnings_of_workers_are_shown_here():
+    cloud = np.random.default_rng(0).random((300, 3))
+    cloud[0] = np.nan
+    with pytest.warns(UserWarning, match="^pair 1: source: .*300") as caught:
+        mcg.register_batch([cloud[1:], cloud], cloud[1:], mcg.PointToPoint(), executor="processes")
+    assert len(caught) == 1 and caught[0].filename == __file__
+
+
+def test_an_early_end_ends_the_workers(raw):
+    sources, targets = prepared(raw)
+    pid = int(told(os.getpid))
+    completed = mcg.register_as_completed(20 * sources, 20 * targets, METHOD, max_distance=0.5, executor="processes")
+    next(completed)
+    completed.close()
+    assert not is_running(pid)
+
+
+def is_running(pid):
+    try:
+        with open(f"/proc/{pid}/stat", encoding="utf-8") as file:
+            return file.read().rpartition(")")[2].split()[0] != "Z"
+    except FileNotFoundError:
+        return False
+
+
+SCRIPT = """
+import os, sys, time
+import numpy as np
+import mcgicp_jax as mcg
+
+def cloud():
+    print(os.getpid(), flush=True)
+    time.sleep(0.05)
+    return np.random.default_rng(0).random((100, 3))
+
+count = int(sys.argv[1])
+results = mcg.register_batch([cloud] * count, cloud, mcg.PointToPoint(), max_iterations=1, executor="processes")
+print("done", len(results), flush=True)
+"""
+
+
+@pytest.mark.parametrize("number", [None, signal.SIGINT, signal.SIGKILL])
+def test_a_script_without_a_guard_leaves_no_process(tmp_path, number):
+    """At its end, interrupted as by Ctrl-C in a terminal, and killed."""
+    script = tmp_path / "script.py"
+    script.write_text(textwrap.dedent(SCRIPT))
+    count = 6 if number is None else 100_000
+    command = [sys.executable, str(script), str(count)]
+    output = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
+    with subprocess.Popen(command, text=True, start_new_session=True, env=os.environ, **output) as process:
+        pids = {int(process.stdout.readline()) for _ in range(6)} - {process.pid}
+        assert 1 <= len(pids) <= num_cores()
+        if number is signal.SIGINT:
+            # The terminal sends it to the whole group.
+            os.killpg(process.pid, number)
+        elif number is not None:
+            process.send_signal(number)
+        if number is signal.SIGKILL:
+            process.stdout.close()
+            process.stderr.close()
+            process.wait()
+        else:
+            text, errors = process.communicate(timeout=60)
+            assert ("done 6" in text) == (number is None)
+            assert errors.count("Traceback") == (number is not None), errors
+    deadline = time.monotonic() + 10
+    while any(map(is_running, pids)) and time.monotonic() < deadline:
+        time.sleep(0.1)
+    assert not any(map(is_running, pids))
