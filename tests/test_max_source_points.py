@@ -90,7 +90,7 @@ def test_only_some_points_are_matched_in_every_phase(clouds, monkeypatch):
 
 def test_the_pose_inside_jit_of_a_padded_cloud_and_in_a_batch_is_the_same(clouds):
     source, target = clouds
-    padded, method = source.pad(512), mcg.MultiChannelGICP()
+    padded, method = source.pad(512), mcg.GICP()
 
     def pose(source, target):
         result = mcg.register(source, target, method, max_source_points=150, search=mcg.DenseSearch())

@@ -295,6 +295,7 @@ def test_the_sum_is_more_accurate_than_the_nearest_cell():
     assert four < 0.6 * one and four < 0.005
 
 
+@pytest.mark.slow
 def test_the_sum_is_the_same_everywhere(raw):
     """On the host, inside `jit`, in batches, in lanes, and in the alignment to its final matches."""
     source, target = cells_of(raw)
