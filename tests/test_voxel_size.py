@@ -223,7 +223,8 @@ def test_neighbours_are_found_when_they_are_used():
     mcg.register(*clouds, mcg.GICP(), max_source_points=500)
     assert sum(asked) < 0.5 * 2 * len(raw)
     whole = mcg.KDTreeSearch().neighbors(np.asarray(clouds[0].points), 20)
-    for each in (clouds[0], pickle.loads(pickle.dumps(clouds[1])), jax.tree.map(lambda leaf: leaf, clouds[1])):
+    sent = pickle.loads(pickle.dumps(mcg.preprocess(raw)))
+    for each in (clouds[0], sent, jax.tree.map(lambda leaf: leaf, clouds[1])):
         assert isinstance(each.neighbors, np.ndarray) and each.neighbors.shape == (len(raw), 20)
         np.testing.assert_array_equal(each.neighbors, whole)
     assert not clouds[0].neighbors.flags.writeable
