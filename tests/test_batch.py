@@ -305,7 +305,8 @@ def test_workers_leave_the_filters_of_warnings_alone(raw, monkeypatch):
     assert not {Status.INVALID_INPUT, Status.WORKER_FAILED} & {result.status for result in results}
 
 
-@pytest.mark.parametrize("search", [None, pytest.param(mcg.DenseSearch(), marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("search", [None, mcg.DenseSearch()])
 def test_a_batch_starts_from_anywhere(search):
     """A room seen from afar, another room, and ten points; with threads and with lanes."""
     frames = datasets.box_room(2, points_per_frame=4000)

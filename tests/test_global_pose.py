@@ -414,6 +414,7 @@ def test_malformed_arguments_are_named():
 # Execution
 
 
+@pytest.mark.slow
 def test_other_sizes_compile_nothing():
     def pair(size, seed):
         return [mcg.PointCloud(*room_corner(size + size // 7 * i, seed=seed + i)) for i in (0, 1)]

@@ -122,7 +122,11 @@ def check(loss, reference, clouds, method):
 
 @in_float64
 @pytest.mark.filterwarnings("ignore:channel_weights")
-@pytest.mark.parametrize("name, hold", [*((name, True) for name in CASES), ("L", False)])
+@pytest.mark.parametrize(
+    "name, hold",
+    [pytest.param(name, True, marks=[pytest.mark.slow] * (name == "edge of a channel")) for name in CASES]
+    + [("L", False)],
+)
 def test_the_derivative_within_the_constrained_directions(name, hold):
     scene, method, free = CASES[name]
     clouds = clouds_of(scene)

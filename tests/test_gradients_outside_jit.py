@@ -406,7 +406,11 @@ def test_a_result_is_printed_in_a_gradient(clouds):
     jax.grad(loss)(source.points)
 
 
-@pytest.mark.parametrize("of", ["register", "register_batch", "estimate_pose", "mahalanobis_cost"])
+@pytest.mark.parametrize(
+    "of",
+    [pytest.param(name, marks=pytest.mark.slow) for name in ("register", "estimate_pose")]
+    + ["register_batch", "mahalanobis_cost"],
+)
 def test_estimated_parameters_are_warned_of_where_channels_are_differentiated(of, clouds):
     """The gradient is exact for parameters resolved beforehand, and by points for estimated ones."""
     unset = mcg.MultiChannelGICP()

@@ -242,6 +242,7 @@ def test_noise_of_slopes_is_discounted(noise):
     np.testing.assert_allclose(designs[0] / designs[1], reliability, rtol=0.15, atol=0.03)
 
 
+@pytest.mark.slow
 @in_float64
 def test_align_has_the_gradient_of_its_answer(noisy):
     """With its numbers held, as autodiff holds them."""

@@ -404,7 +404,10 @@ def test_gradients_against_differences_of_the_reference(argument, as_gicp):
 
 @pytest.mark.parametrize(
     "method, masked",
-    [(GICP, False), (lambda: MultiChannelGICP(0.3 * np.eye(3), 0.1), True)],
+    [
+        (GICP, False),
+        pytest.param(lambda: MultiChannelGICP(0.3 * np.eye(3), 0.1), True, marks=pytest.mark.slow),
+    ],
     ids=["GICP", "MultiChannelGICP, some channels missing"],
 )
 def test_surfaces_are_the_same_block_by_block_and_inside_transformations(method, masked, monkeypatch):
