@@ -440,8 +440,8 @@ def test_surfaces_are_the_same_block_by_block_and_inside_transformations(method,
 def test_noise_is_the_same_inside_transformations():
     points, channels = ref.scene(700, 3, seed=4)
     clouds = [preprocess(PointCloud(points, channels + i), num_neighbors=K) for i in (0, 1)]
-    expected = channel_noise(*clouds, local_geometries(*clouds, with_channels=True))
-    actual = jax.jit(lambda a, b: channel_noise(a, b, local_geometries(a, b, with_channels=True)))(*clouds)
+    expected = channel_noise(*clouds, lambda rows: local_geometries(*clouds, True, rows))
+    actual = jax.jit(lambda a, b: channel_noise(a, b, lambda rows: local_geometries(a, b, True, rows)))(*clouds)
     for one, other in zip(actual, expected, strict=True):
         np.testing.assert_allclose(one, other, rtol=tolerance(1e-4, 1e-9))
 
@@ -451,7 +451,7 @@ def test_channels_without_noise_have_some():
     points, _ = ref.scene(700, seed=4)
     points[:, 2] = 0
     cloud = preprocess(PointCloud(points, points[:, 0]), num_neighbors=K)
-    noise, uniform, _ = channel_noise(cloud, cloud, local_geometries(cloud, cloud, with_channels=True))
+    noise, uniform, _ = channel_noise(cloud, cloud, lambda rows: local_geometries(cloud, cloud, True, rows))
     np.testing.assert_allclose(noise, 1e-3 * np.std(points[:, 0]), rtol=1e-6)
     assert not uniform.any()
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from functools import partial
 from typing import Any, NamedTuple, TypeAlias
 
@@ -49,6 +50,10 @@ class LocalGeometry(NamedTuple):
     roughness: Float[AnyArray, "*batch N"]
     reach: Float[AnyArray, "*batch N"]
     fits: ChannelFits
+
+
+# Computes the local geometry of some rows of the source and of the target.
+Geometries: TypeAlias = Callable[[tuple[Any, Any]], tuple[LocalGeometry, LocalGeometry]]
 
 
 def describe(around: Neighborhoods) -> LocalGeometry:
@@ -134,29 +139,29 @@ def local_geometries(
     source: PointCloud,
     target: PointCloud,
     with_channels: bool,
+    rows: tuple[Any, Any] = (None, None),
     num_threads: int | None = 1,
-    source_rows: Any = None,
 ) -> tuple[LocalGeometry, LocalGeometry]:
     """Local geometry of two preprocessed clouds.
 
     Args:
         with_channels: whether the method uses the channels; if not, the programs do not depend on their number.
+        rows: (n,) those of the source and of the target to describe; None for all.
         num_threads: largest number of threads on the host; None for no limit.
-        source_rows: (n,) rows of the source to describe; None for all.
 
     Returns:
         Of the source and of the target.
     """
     if is_concrete(source, target):
         calls = [
-            partial(geometry_table(cloud, with_channels).trees, rows, num_threads)
-            for cloud, rows in ((target, None), (source, source_rows))
+            partial(geometry_table(cloud, with_channels).trees, some, num_threads)
+            for cloud, some in ((target, rows[1]), (source, rows[0]))
         ]
         (of_target,), (of_source,) = side_by_side(calls, num_threads)
         return of_source, of_target
     # A concrete cloud beside a traced one is traced as well, which needs no program of its own.
-    of_rows_of_source = of_rows(with_near(source, with_channels), source_rows)
-    (of_source,), (of_target,) = over_both(_geometry, None, of_rows_of_source, with_near(target, with_channels))
+    both = [of_rows(with_near(cloud, with_channels), some) for cloud, some in zip((source, target), rows, strict=True)]
+    (of_source,), (of_target,) = over_both(_geometry, None, *both)
     return of_source, of_target
 
 

@@ -13,29 +13,29 @@ from jaxtyping import Bool, Float
 
 from mcgicp_jax._clouds.point_cloud import PointCloud
 from mcgicp_jax._compute.cache import cached_with_cloud
-from mcgicp_jax._compute.concrete import AnyArray, AnyScalar, is_concrete, numpy_for
-from mcgicp_jax._local_geometry.local_geometry import LocalGeometry
+from mcgicp_jax._compute.concrete import AnyArray, AnyScalar, constant, is_concrete, numpy_for
+from mcgicp_jax._local_geometry.local_geometry import Geometries, LocalGeometry
 from mcgicp_jax._local_geometry.neighborhoods import check_neighbors
 from mcgicp_jax._math.statistics import median, of_known, sampled_rows
 
 
 def channel_noise(
-    source: PointCloud, target: PointCloud, geometries: tuple[LocalGeometry, LocalGeometry]
+    source: PointCloud, target: PointCloud, geometries: Geometries
 ) -> tuple[Float[AnyArray, "C"], Bool[AnyArray, "C"], Float[AnyScalar, ""]]:
     """Noise σ per channel, which channels are uniform (σ = 1), and the variance λ₀ along the normal, metres².
 
-    Both are medians over both clouds: σ of the residuals of linear fits, λ₀ of the variances of the neighbours.
+    Both are medians over a sample of both clouds: σ of the residuals of linear fits, λ₀ of the variances of the
+    neighbours.
     """
-    xp = numpy_for(source, target, geometries)
+    samples = [_noise_rows(cloud) for cloud in (source, target)]
+    found = constant(geometries((samples[0][0], samples[1][0])))
+    xp = numpy_for(source, target, found)
     residuals, values, across = [], [], []
-    for cloud, local in zip((source, target), geometries, strict=True):
-        valid = xp.asarray(cloud.valid)
-        # Where points lack channels, a sample might contain too few that have one.
-        rows, counts = (xp.arange(valid.size), valid) if cloud.channel_valid is not None else sampled_rows(valid)
-        deviations = xp.sqrt(local.fits.residual[rows].T)
-        residuals.append(xp.where(counts, deviations, xp.nan))
+    for cloud, local, (_, counts) in zip((source, target), found, samples, strict=True):
+        deviations = xp.sqrt(local.fits.residual.T)
+        residuals.append(xp.where(counts[:-1], deviations, xp.nan))
         values.append(known_values(cloud))
-        across.append(xp.where(counts, _smallest_variance(local, xp)[rows], xp.nan))
+        across.append(xp.where(counts[-1], _smallest_variance(local, xp), xp.nan))
     sigma = median(xp.concatenate(residuals, axis=1))
     everything = xp.concatenate(values)
     spread = of_known(partial(xp.nanstd, axis=0), everything)
@@ -43,6 +43,24 @@ def channel_noise(
     uniform = ~(spread > 1e3 * xp.finfo(spread.dtype).eps * largest)
     # Rendered channels have no noise; a floor of a thousandth of their standard deviation keeps α finite and Λ regular.
     return xp.where(uniform, 1, xp.fmax(sigma, 1e-3 * spread)), uniform, median(xp.concatenate(across))
+
+
+def _noise_rows(cloud: PointCloud) -> tuple[Any, Any]:
+    """(n,) sampled rows, and (C + 1, n) booleans: which of them are the sample of each channel, and of all points."""
+    xp = numpy_for(cloud.valid, cloud.channel_valid)
+    valid = xp.asarray(cloud.valid)
+    if cloud.channel_valid is None:
+        rows, counts = sampled_rows(valid)
+        return rows, xp.broadcast_to(counts, (cloud.channels.shape[1] + 1, rows.size))
+    # One sample of all points might contain too few that have a channel.
+    samples = []
+    for known in (*(valid & xp.asarray(cloud.channel_valid).T), valid):
+        order = xp.argsort(~known, stable=True)
+        rows, counts = sampled_rows(known[order])
+        samples.append((order[rows], counts))
+    owner = xp.repeat(xp.arange(len(samples)), samples[0][0].size)
+    rows, counts = (xp.concatenate(each) for each in zip(*samples, strict=True))
+    return rows, (owner == xp.arange(len(samples))[:, None]) & counts
 
 
 def _smallest_variance(local: LocalGeometry, xp: Any) -> Float[AnyArray, "N"]:

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import abc
-from collections.abc import Callable
-from typing import ClassVar, TypeAlias
+from typing import ClassVar
 
 import jax
 import jax.numpy as jnp
@@ -12,14 +11,13 @@ from jaxtyping import Array, Float
 
 from mcgicp_jax._clouds.point_cloud import PointCloud
 from mcgicp_jax._compute.concrete import AnyArray
-from mcgicp_jax._local_geometry.local_geometry import LocalGeometry
+from mcgicp_jax._local_geometry.local_geometry import Geometries, LocalGeometry
 from mcgicp_jax._local_geometry.neighborhoods import NO_NEIGHBORS, Neighborhoods
 from mcgicp_jax._math import symmetric_matrices as alg
 from mcgicp_jax._math.robust_kernels import AbstractKernel, Numbers
 from mcgicp_jax._terms.base import AbstractTerm, Mahalanobis
 
 # Computes the local geometry of source and target.
-Geometries: TypeAlias = Callable[[], tuple[LocalGeometry, LocalGeometry]]
 
 
 class AbstractMethod(Numbers):
@@ -83,7 +81,7 @@ class AbstractMethod(Numbers):
 
         Args:
             source: if `max_source_points` is smaller, only the points used, without neighbours.
-            geometries: computes the local geometry of both clouds; given by callers that need it too.
+            geometries: computes the local geometry of some rows of both clouds; given by callers that need it too.
 
         Raises:
             ValueError: if a parameter is unset and a cloud was not preprocessed.

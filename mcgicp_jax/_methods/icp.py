@@ -10,10 +10,10 @@ from jaxtyping import Array, Float
 from mcgicp_jax._clouds.point_cloud import PointCloud, Values
 from mcgicp_jax._compute.concrete import AnyArray
 from mcgicp_jax._compute.threads import without_checks_of_jax
-from mcgicp_jax._local_geometry.local_geometry import LocalGeometry
+from mcgicp_jax._local_geometry.local_geometry import Geometries, LocalGeometry
 from mcgicp_jax._local_geometry.neighborhoods import Neighborhoods
 from mcgicp_jax._math import symmetric_matrices as alg
-from mcgicp_jax._methods.base import AbstractOneSided, Geometries, identity, known_geometry
+from mcgicp_jax._methods.base import AbstractOneSided, identity, known_geometry
 from mcgicp_jax._methods.multichannel_gicp import MultiChannelGICP
 from mcgicp_jax._methods.parameters import per_channel, weights_of
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from typing import ClassVar
 
 import equinox as eqx
@@ -15,11 +16,11 @@ from mcgicp_jax._clouds.point_cloud import PointCloud, Values
 from mcgicp_jax._compute.concrete import AnyArray, constant, numpy_for
 from mcgicp_jax._compute.threads import without_checks_of_jax
 from mcgicp_jax._local_geometry.covariances import channel_kernel, multichannel_covariance, plane_covariance
-from mcgicp_jax._local_geometry.local_geometry import LocalGeometry, local_geometries
+from mcgicp_jax._local_geometry.local_geometry import Geometries, LocalGeometry, local_geometries
 from mcgicp_jax._local_geometry.neighborhoods import NO_NEIGHBORS, Neighborhoods
 from mcgicp_jax._local_geometry.spacing_and_noise import channel_noise, point_spacing
 from mcgicp_jax._math.robust_kernels import AbstractKernel
-from mcgicp_jax._methods.base import AbstractGeneralized, Geometries, known_geometry
+from mcgicp_jax._methods.base import AbstractGeneralized, known_geometry
 from mcgicp_jax._methods.parameters import (
     check_covariance_fits,
     covariance_of,
@@ -114,10 +115,10 @@ class MultiChannelGICP(AbstractGeneralized):
         """
         if self.channel_covariance is not None and self.channel_weights is not None:
             return self
-        both = local_geometries(source, target, with_channels=True) if geometries is None else geometries()
-        source, target, both, epsilon = constant((source, target, both, self.epsilon))
-        xp = numpy_for(source, target, both, epsilon)
-        sigma, uniform, across = channel_noise(source, target, both)
+        geometries = geometries or partial(local_geometries, source, target, True)
+        source, target, epsilon = constant((source, target, self.epsilon))
+        sigma, uniform, across = channel_noise(source, target, geometries)
+        xp = numpy_for(source, target, sigma, across, epsilon)
         spacing = point_spacing(target)
         with np.errstate(over="ignore", invalid="ignore"):
             within = xp.asarray(epsilon, spacing.dtype) * _MATCH_VARIANCE * spacing**2

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cache, cached_property, partial
+from operator import itemgetter
 from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
 
 import jax
@@ -149,7 +150,17 @@ def surface_pair(
         num_threads: largest number of threads on the host; None for no limit.
         source_rows: the rows of the surface of the source, with neighbours among all points; None for all rows.
     """
-    geometries = cache(partial(local_geometries, source, target, method.uses_channels, num_threads, source_rows))
+    of_rows_of = partial(local_geometries, source, target, method.uses_channels)
+    whole = cache(partial(of_rows_of, (source_rows, None), num_threads))
+
+    def geometries(rows: tuple[Any, Any]) -> tuple[LocalGeometry, LocalGeometry]:
+        if is_concrete(source, target):
+            own = rows[0] if source_rows is None else source_rows[rows[0]]
+            return of_rows_of((own, rows[1]), num_threads)
+        # Inside transformations all rows are needed anyway.
+        of_source, of_target = (jax.tree.map(itemgetter(some), each) for each, some in zip(whole(), rows, strict=True))
+        return of_source, of_target
+
     used = source if source_rows is None else _some_rows(source, source_rows)
     method = method.resolve(used, target, geometries)
     terms = method.terms(used, target, robust, equalize_channels)
@@ -170,7 +181,7 @@ def surface_pair(
     function = _surface_rows(kinds, observed, described, needs_neighborhoods(method, described))
     inputs = [_inputs(method, cloud, described) for cloud in (source, target)]
     if described:
-        locals, rows = geometries(), (source_rows, None)
+        locals, rows = whole(), (source_rows, None)
         inputs = [[*of_rows(each, some), Input(local)] for each, some, local in zip(inputs, rows, locals, strict=True)]
     else:
         inputs[0] = of_rows(inputs[0], source_rows)
