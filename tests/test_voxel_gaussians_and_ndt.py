@@ -141,6 +141,13 @@ def test_moments_in_jax():
         np.testing.assert_allclose(covariances, expected.covariances, atol=atol)
 
 
+def test_moments_of_cells_without_channels():
+    points, _ = room_corner(900)
+    cells = extend.voxel_cells(points, SIZE)
+    means, channels, covariances = extend.cell_moments(points, np.zeros((len(points), 0)), cells)
+    assert channels.shape == (len(means), 0) and covariances.shape == (len(means), 3, 3)
+
+
 @in_float64
 def test_gradients_of_moments_compile_nothing_for_another_size():
     def loss(points, channels, cells):

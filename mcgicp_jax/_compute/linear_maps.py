@@ -149,14 +149,16 @@ class RowAverage(AbstractLinearMap):
     def push(self, tangents: Sequence[np.ndarray], moving: tuple[int, ...]) -> list[np.ndarray]:
         (each,) = tangents
         shape = each.shape[2:]
-        flat = each.reshape(*each.shape[:2], -1)[:, self._rows]
-        return [np.stack([(self._sum @ (self._weights * rows)).reshape(-1, *shape) for rows in flat])]
+        flat = each.reshape(*each.shape[:2], math.prod(shape))[:, self._rows]
+        size = self._sum.shape[0]
+        return [np.stack([(self._sum @ (self._weights * rows)).reshape(size, *shape) for rows in flat])]
 
     def pull(self, cotangents: Sequence[np.ndarray], moving: tuple[int, ...]) -> list[np.ndarray]:
         (each,) = cotangents
         found = np.zeros((len(each), self._size, *each.shape[2:]), each.dtype)
-        for rows, by in zip(found, each.reshape(*each.shape[:2], -1), strict=True):
-            rows[self._rows] = (self._weights * (self._sum.T @ by)).reshape(-1, *each.shape[2:])
+        shape = each.shape[2:]
+        for rows, by in zip(found, each.reshape(*each.shape[:2], math.prod(shape)), strict=True):
+            rows[self._rows] = (self._weights * (self._sum.T @ by)).reshape(len(self._rows), *shape)
         return [found]
 
 
@@ -167,7 +169,8 @@ def averaged(values: Float[AnyArray, "N D"], groups: Int[np.ndarray, "N"]) -> Fl
     groups = groups[rows]
     counts, known = np.bincount(groups), primal(values)
     if not is_concrete(known):
-        return jax.ops.segment_sum(values[rows], groups, len(counts)) / counts[:, None].astype(values.dtype)
+        sums = jax.ops.segment_sum(values[rows], groups, len(counts))
+        return sums / np.maximum(counts, 1)[:, None].astype(values.dtype)
     average = RowAverage(rows, groups, np.ones((len(rows), 1)), (len(known), len(counts)))
     (mean,) = average.push([np.asarray(known)[None]], (0,))
     found = mean[0].astype(known.dtype)

@@ -50,7 +50,8 @@ def without_checks_of_jax(function: Callable[Parameters, Answer]) -> Callable[Pa
 def num_cores() -> int:
     """Number of cores that this process may use, at most as many as XLA may."""
     count = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    return min(count, int(os.environ.get("PJRT_NPROC", count)))
+    limit = os.environ.get("PJRT_NPROC", "")
+    return min(count, int(limit)) if limit.isdecimal() and int(limit) else count
 
 
 def side_by_side(calls: Sequence[Callable[[], Answer]], max_threads: int | None = None) -> list[Answer]:

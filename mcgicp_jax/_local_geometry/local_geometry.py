@@ -68,9 +68,10 @@ def describe(around: Neighborhoods) -> LocalGeometry:
     # Whole neighbourhoods and their halves as one array: what is done with each array is compiled anew.
     covariances = jnp.concatenate([covariance, *halves], axis=1)
     normals = alg.smallest_eigenvector(covariances)
-    normal = normals[:, : covariance.shape[1]]
+    size = covariance.shape[1]
+    normal = normals[:, :size]
     fixed_normal, covariances, normals = jax.lax.stop_gradient((normal, covariances, normals))
-    used = (counts >= 3) & ~jnp.tile(around.few, 3)
+    used = (counts[size:] >= 3) & ~jnp.tile(around.few, 2)
     basis = alg.orthonormal_basis(fixed_normal)
     rank = min(_ROUGHNESS_RANK, present.shape[0] - 1)
     height = sum(offset[rank] * axis for offset, axis in zip(fixed, fixed_normal, strict=True))

@@ -42,7 +42,7 @@ def geometry_observability(
 
 
 def observability_of_halves(
-    covariances: Float[Array, "6 M"], normals: Float[Array, "3 M"], counts: Float[Array, "M"], used: Bool[Array, "M"]
+    covariances: Float[Array, "6 M"], normals: Float[Array, "3 M"], counts: Float[Array, "M"], used: Bool[Array, "L"]
 ) -> Float[Array, "6 N"]:
     """Observability from the normals n₁ and n₂ of two halves of the neighbours, whose noise is independent.
 
@@ -54,7 +54,7 @@ def observability_of_halves(
     Args:
         covariances, normals, counts: as of `geometry_observability`, of all neighbours, then of the first halves, and
             then of the second ones; M = 3 N.
-        used: whether the normal may be used.
+        used: whether the normal of each half may be used; L = 2 N.
     """
     certain, variance = _certainty(covariances, normals, counts)
     (whole, *of_halves), (normal, first, second) = jnp.split(certain, 3), jnp.split(normals, 3, axis=1)
@@ -65,7 +65,7 @@ def observability_of_halves(
         0.25 * sign * cosine - 0.5 * _NOISE * (1 - cosine * cosine) * (1 - sign * cosine) for sign in (1, -1)
     )
     split = by_sum * alg.outer(first + second) + by_difference * alg.outer(first - second)
-    both = jnp.all(used.reshape(3, -1)[1:], axis=0)
+    both = jnp.all(used.reshape(2, -1), axis=0)
     return jnp.where(both, of_halves[0] * of_halves[1] * split, whole)
 
 

@@ -116,10 +116,11 @@ class MultiChannelGICP(AbstractGeneralized):
         if self.channel_covariance is not None and self.channel_weights is not None:
             return self
         geometries = geometries or partial(local_geometries, source, target, True)
-        source, target, epsilon = constant((source, target, self.epsilon))
-        sigma, uniform, across = channel_noise(source, target, geometries)
+        # Not of the clouds, whose concrete arrays would be traced, too.
+        (sigma, uniform, across), spacing, epsilon = constant(
+            (channel_noise(source, target, geometries), point_spacing(target), self.epsilon)
+        )
         xp = numpy_for(source, target, sigma, across, epsilon)
-        spacing = point_spacing(target)
         with np.errstate(over="ignore", invalid="ignore"):
             within = xp.asarray(epsilon, spacing.dtype) * _MATCH_VARIANCE * spacing**2
             smooth = ~(2 * across > within)

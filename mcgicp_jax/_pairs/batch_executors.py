@@ -152,15 +152,17 @@ def run_differentiated(job: BatchJob, pairs: Iterator[Pair], executor: Executor)
 def _differentiable(found: PairResult, pair: PairResult | GivenPair) -> RegistrationResult:
     """The result with the derivative of its pose."""
     result = found.registration
-    if isinstance(pair, PairResult) or not found.jacobian:
+    if isinstance(pair, PairResult):
+        return result
+    result = result if pair.verified else unverified(result)
+    if not found.jacobian:
         return result
     values, inputs = [np.asarray(result.centred.wxyz_xyz)], [pair.leaves[i] for i in pair.traced]
     (pose,) = with_derivative(values, KnownJacobian(found.jacobian), inputs)
     origins = pair.given.source.origin, pair.given.target.origin
     if is_concrete(origins):
         origins = result.source_origin, result.target_origin
-    result = result.build(**vars(result) | fields_of_pose(jaxlie.SE3(pose), *origins))
-    return result if pair.verified else unverified(result)
+    return result.build(**vars(result) | fields_of_pose(jaxlie.SE3(pose), *origins))
 
 
 def _results(job: BatchJob, pairs: Iterator[Pair], executor: Executor | None) -> Iterator[PairResult]:
@@ -244,7 +246,7 @@ class ChunkedExecutor:
             except PicklingError as error:
                 raise ValueError(
                     f"pairs {chunk[0].index} to {chunk[-1].index}: expected clouds and functions that can be sent to "
-                    f"other processes; {str(error.__cause__).strip().splitlines()[-2]}"
+                    f"other processes; {_reason(error)}"
                 ) from error
             except Exception as error:
                 # A worker that dies breaks its pool, and so all chunks that were submitted.
@@ -289,6 +291,12 @@ def _as_numpy(sent: Any) -> Any:
 
     fields = {name: getattr(sent, name) for name in sent.__dataclass_fields__}
     return replace(sent, **{name: jax.tree.map(convert, value, is_leaf=is_deferred) for name, value in fields.items()})
+
+
+def _reason(error: PicklingError) -> str:
+    """The message of the error in loky's thread, whose traceback is the text of the cause."""
+    lines = [line for line in str(error.__cause__ or error).splitlines() if line.strip(' "')]
+    return lines[-1] if lines else type(error).__name__
 
 
 def _words(error: BaseException) -> str:

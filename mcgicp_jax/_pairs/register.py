@@ -124,10 +124,10 @@ def register(
     (`UnconstrainedDirection.held_by_ties`). The pose has derivatives by points, pose and covariances; the weights of
     the matches are constants. Contradictions are averaged, not detected. Inside transformations, nothing is checked.
 
-    Fixed directions act from the first update on: ξ along them stays exactly 0, the covariance is 0, `directions.ties`
-    are infinite, `information` leaves them out, and the clouds need not constrain them. A covariance that `jit` or
-    `vmap` traces must be positive definite. The derivative by the prior's pose moves with it; if other variances are
-    finite, it leaves out the change of the weights.
+    Fixed directions act from the first update on: ξ along them stays 0, the covariance is 0 up to rounding,
+    `directions.ties` are infinite, `information` leaves them out, and the clouds need not constrain them. A covariance
+    that `jit` or `vmap` traces must be positive definite. The derivative by the prior's pose leaves out the change of
+    the weights if other variances are finite.
 
     Returns:
         The pose with its status, quality of the fit and uncertainty; check `converged`.

@@ -132,7 +132,7 @@ def _information(covariance: Float[np.ndarray, "6 6"], source: PointCloud) -> tu
         known.append((offset, *_principal_rows(change @ covariance @ change.T)))
     # Rounding lets directions look fixed that are not.
     offset, values, rows = max(known, key=lambda each: sorted(np.where(each[1] > _LEAST_EIGENVALUE, each[1], 0)))
-    definite = bool(values[0] >= -_LEAST_EIGENVALUE)
+    definite = bool(values[0] >= -_LEAST_EIGENVALUE and np.all(np.diagonal(covariance) >= 0))
     _require("prior: covariance", _correlations(covariance)[1], definite, "positive semidefinite")
     points = np.asarray(source.points)
     lengths = np.repeat([max(float(np.abs(points).max(initial=0)), 1e-30), 1.0], 3)
