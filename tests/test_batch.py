@@ -15,6 +15,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from jaxtyping import TypeCheckError
 
 import mcgicp_jax as mcg
 from mcgicp_jax import Status, datasets
@@ -340,5 +341,5 @@ def test_the_extra_is_named(monkeypatch):
     monkeypatch.setitem(sys.modules, "loky", None)
     with pytest.raises(ImportError, match=re.escape("pip install 'mcgicp_jax[processes]'")):
         batch([np.eye(3)], [np.eye(3)], executor="processes")
-    with pytest.raises(ValueError, match=r'^executor: expected .*"processes" or None'):
+    with pytest.raises((ValueError, TypeCheckError), match=r'^executor: expected .*"processes" or None|parameter'):
         batch([np.eye(3)], [np.eye(3)], executor="threads")

@@ -212,7 +212,7 @@ def cell_moments(
     channels: Float[AnyArray, "N C"],
     cells: Int[np.ndarray, "N"],
     min_ratio: float = _MIN_RATIO,
-) -> tuple[Float[Array, "M 3"], Float[Array, "M C"], Float[Array, "M 3 3"]]:
+) -> tuple[Float[AnyArray, "M 3"], Float[AnyArray, "M C"], Float[AnyArray, "M 3 3"]]:
     """Mean position, mean channels and covariance (m²) of each cell, as in `voxel_gaussians`; differentiable.
 
     To let gradients reach the points of a cloud, replace `points`, `channels` and `covariances` of its

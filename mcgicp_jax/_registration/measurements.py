@@ -137,7 +137,7 @@ def _information(covariance: Float[np.ndarray, "6 6"], source: PointCloud) -> tu
     points = np.asarray(source.points)
     lengths = np.repeat([max(float(np.abs(points).max(initial=0)), 1e-30), 1.0], 3)
     # The rounding of more precise directions would spoil the others.
-    largest = np.sqrt(_LARGEST_ERROR / np.finfo(points.dtype).eps)
+    largest = float(np.sqrt(_LARGEST_ERROR / np.finfo(points.dtype).eps))
     root, fixed = _root_and_fixed(values, rows @ translation_adjoint(source.origin - offset), lengths, largest)
     return root.T @ root, fixed, root
 
