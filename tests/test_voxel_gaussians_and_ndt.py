@@ -146,6 +146,7 @@ def test_moments_of_cells_without_channels():
     cells = extend.voxel_cells(points, SIZE)
     means, channels, covariances = extend.cell_moments(points, np.zeros((len(points), 0)), cells)
     assert channels.shape == (len(means), 0) and covariances.shape == (len(means), 3, 3)
+    assert means.dtype == covariances.dtype == jnp.zeros(()).dtype
 
 
 @in_float64

@@ -173,8 +173,8 @@ class PairOptions(Options):
     Attributes:
         init: File with the initial pose T_target_source: a 4x4 matrix, or 12 numbers (KITTI) or 8 (TUM) on one line. By
             default the identity. global: the pose is found from any start by local features.
-        fix: Directions in which the pose stays the initial one: along and about the axes of the source. For a planar
-            motion, z roll pitch.
+        fix: Directions in which the pose stays the initial one, in one list: along and about the axes of the source.
+            For a planar motion, z roll pitch.
         plot: File for a picture of the clouds before and after registration, such as out.png.
     """
 

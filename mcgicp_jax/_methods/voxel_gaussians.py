@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Any, Literal, overload
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int, Shaped
@@ -12,7 +13,7 @@ from mcgicp_jax._clouds.point_cloud import PointCloud, Values, as_cloud
 from mcgicp_jax._clouds.preprocess import MIN_POINTS, finite_rows, preprocess, with_neighbors
 from mcgicp_jax._clouds.voxel_size import NUM_NEIGHBORS
 from mcgicp_jax._clouds.voxels import voxel_order
-from mcgicp_jax._compute.concrete import AnyArray
+from mcgicp_jax._compute.concrete import AnyArray, numpy_for
 from mcgicp_jax._compute.linear_maps import averaged
 from mcgicp_jax._compute.messages import check_integer, check_positive, is_number
 from mcgicp_jax._compute.row_functions import Input, Rows, blockwise
@@ -223,6 +224,9 @@ def cell_moments(
         cells: from `voxel_cells`; concrete.
         min_ratio: as in `voxel_gaussians`.
     """
+    points, channels = (numpy_for(each).asarray(each) for each in (points, channels))
+    dtype = jax.dtypes.canonicalize_dtype(np.result_type(points.dtype, np.float32))
+    points, channels = points.astype(dtype), channels.astype(dtype)
     means, counts = averaged(points, cells), np.bincount(cells[cells >= 0])
     # In two passes: one would lose digits far from zero.
     (products,) = blockwise(_products, (), Input(points), Input(means, cells))

@@ -67,7 +67,7 @@ _LOOK = 1.0
 
 class Processes(Executor):
     """Single-threaded workers in other processes, from loky: they need no `__main__` guard, and wait for further calls
-    until the interpreter ends."""
+    until the interpreter ends. All batches of this process share them; one that ends early ends them for all."""
 
     def __init__(self, num_workers: int):
         try:

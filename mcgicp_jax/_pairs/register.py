@@ -117,12 +117,11 @@ def register(
             prior is also the initial pose if `init` is None.
 
     With tie points or a prior, a first registration without them measures the covariance of the score of the matches.
-    Outside `jit`, if it ends better (converged, more matches) elsewhere with the directions fixed that the prior knows
-    to a tenth of the fine `max_distance`, it starts again there. A second one starts at its pose and weighs matches,
-    tie points and prior by their covariances (Hansen 1982, generalised method of moments). It is the result; its
-    `covariance` and `information` include tie points and prior, which also constrain directions that the clouds do not
-    (`UnconstrainedDirection.held_by_ties`). The pose has derivatives by points, pose and covariances; the weights of
-    the matches are constants. Contradictions are averaged, not detected. Inside transformations, nothing is checked.
+    A second one starts at its pose and weighs matches, tie points and prior by their covariances (Hansen 1982,
+    generalised method of moments). It is the result; its `covariance` and `information` include tie points and prior.
+    They also constrain directions that the clouds do not (`UnconstrainedDirection.held_by_ties`). The pose is
+    differentiable with respect to points, pose and covariances; the weights of the matches are constants to autodiff.
+    Contradictions are averaged, not detected. Inside transformations, covariances are not checked.
 
     Fixed directions act from the first update on: ξ along them stays 0, the covariance is 0 up to rounding,
     `directions.ties` are infinite, `information` leaves them out, and the clouds need not constrain them. A covariance

@@ -32,16 +32,13 @@ class TiePoints(NamedTuple):
 class Prior(NamedTuple):
     """The pose is R, t times exp(ξ) with ξ = (v, ω) of the given information, metres and radians.
 
-    `fixed`: (6, 6), rows f with f · ξ = 0 and rows of zeros; None if no direction is fixed. `root`: (6, 6), rows r such
-    that the products r · ξ have independent errors of variance 1, zeros where `fixed` has none; None inside `jit` if
-    it traces the covariance. Both are constants to autodiff.
+    `fixed`: (6, 6), rows f with f · ξ = 0 and rows of zeros; None if no direction is fixed. A constant to autodiff.
     """
 
     rotation: Float[AnyArray, "3 3"]
     translation: Float[AnyArray, "3"]
     information: Float[AnyArray, "6 6"]
     fixed: Any = None
-    root: Any = None
 
 
 class PoseForm(NamedTuple):

@@ -16,7 +16,7 @@ from mcgicp_jax._clouds.origins import centred_pose
 from mcgicp_jax._clouds.point_cloud import PointCloud
 from mcgicp_jax._compute.concrete import AnyArray, constant, is_concrete, numpy_for, outside_trace
 from mcgicp_jax._compute.linear_maps import primal
-from mcgicp_jax._math.poses import matrix_of, skew, translation_adjoint
+from mcgicp_jax._math.poses import matrix_of, translation_adjoint
 from mcgicp_jax._math.symmetric_matrices import inverse_6
 from mcgicp_jax._pose_solver.covariance import Moments
 from mcgicp_jax._pose_solver.degeneracy import Directions
@@ -24,17 +24,11 @@ from mcgicp_jax._pose_solver.fixed_directions import with_fixed_directions
 from mcgicp_jax._pose_solver.fusion import fuse
 from mcgicp_jax._pose_solver.pose_measurements import Fusion, Prior, TiePoints, form_at
 from mcgicp_jax._registration.assessment import as_float64
-from mcgicp_jax._registration.result import Status
 from mcgicp_jax._registration.step import Problem, State
 
 # Largest asymmetry of a correlation matrix, as rounding to float32 causes; and smallest eigenvalue with which the
 # inverse of a correlation matrix keeps four digits in float64. Below it, a direction of a prior counts as fixed.
 _ASYMMETRY, _LEAST_EIGENVALUE = 1e-5, 1e-12
-# Directions whose standard deviation in a prior, as motion of the source points (rms), is below this fraction of the
-# fine maximum correspondence distance can be fixed on the way: the error is corrected afterwards.
-_PRECISE = 0.1
-# Relative increase of the squared motion of the points, so that it has an inverse for points on a line.
-_RIDGE = 1e-5
 # Largest rounding of the information of a prior, with lengths in units of the cloud: a standard deviation of 3 %.
 _LARGEST_ERROR = 1e3
 # Source points (n, 3), target points (n, 3) and covariances (n, 3, 3); pose and covariance (6, 6).
@@ -71,23 +65,23 @@ def _centred_prior(given: GivenPrior, source: PointCloud, target: PointCloud) ->
     covariance = _numbers("prior: covariance", covariance, (6, 6))
     if is_concrete(covariance, source.points, source.origin):
         return Prior(matrix[:3, :3], matrix[:3, 3], *_information(covariance, source))
-    fixed, root, given = None, None, primal(covariance)
+    fixed, given = None, primal(covariance)
     if is_concrete(given):
-        root, fixed = _root_and_fixed(*_principal_rows(np.asarray(given, np.float64)))
-    return Prior(matrix[:3, :3], matrix[:3, 3], *_information_traced(covariance, fixed, root, source.origin))
+        values, rows = _principal_rows(np.asarray(given, np.float64))
+        fixed = _orthonormal(rows[values <= _LEAST_EIGENVALUE])
+    return Prior(matrix[:3, :3], matrix[:3, 3], *_information_traced(covariance, fixed, source.origin))
 
 
 @jax.jit
 def _information_traced(
-    covariance: Float[AnyArray, "6 6"], fixed: Any, root: Any, origin: Float[AnyArray, "3"]
-) -> tuple[Float[AnyArray, "6 6"], Any, Any]:
-    change, back = translation_adjoint(-origin), translation_adjoint(origin)
-    root = None if root is None else root @ back
+    covariance: Float[AnyArray, "6 6"], fixed: Float[AnyArray, "6 6"] | None, origin: Float[AnyArray, "3"]
+) -> tuple[Float[AnyArray, "6 6"], Float[AnyArray, "6 6"] | None]:
+    change = translation_adjoint(-origin)
     if fixed is None:
-        return inverse_6(change @ covariance @ change.T), None, root
-    across = fixed.T @ fixed
+        return inverse_6(change @ covariance @ change.T), None
+    back, across = translation_adjoint(origin), fixed.T @ fixed
     within = (jnp.eye(6) - across) @ back
-    return within.T @ inverse_6(covariance + across) @ within, fixed @ back, root
+    return within.T @ inverse_6(covariance + across) @ within, fixed @ back
 
 
 def _principal_rows(covariance: Float[np.ndarray, "6 6"]) -> tuple[Float[np.ndarray, "6"], Float[np.ndarray, "6 6"]]:
@@ -97,31 +91,20 @@ def _principal_rows(covariance: Float[np.ndarray, "6 6"]) -> tuple[Float[np.ndar
     return values, vectors.T / scale
 
 
-def _root_and_fixed(
-    values: Float[np.ndarray, "6"],
-    rows: Float[np.ndarray, "6 6"],
-    lengths: Float[np.ndarray, "6"] | float = 1.0,
-    largest: float = np.inf,
+def _orthonormal(
+    rows: Float[np.ndarray, "m 6"], lengths: Float[np.ndarray, "6"] | float = 1.0
+) -> Float[np.ndarray, "6 6"] | None:
+    """Rows that span the same space, orthonormal for ξ in these units, and rows of zeros; None if there are none."""
+    rows = rows * lengths
+    vectors = np.linalg.svd(rows / np.linalg.norm(rows, axis=1, keepdims=True))[2]
+    return np.where(np.arange(6)[:, None] < len(rows), vectors, 0) / lengths if len(rows) else None
+
+
+def _information(
+    covariance: Float[np.ndarray, "6 6"], source: PointCloud
 ) -> tuple[Float[np.ndarray, "6 6"], Float[np.ndarray, "6 6"] | None]:
-    """`Prior.root` and `Prior.fixed`, orthogonal for ξ in these units, from `_principal_rows`.
-
-    Args:
-        largest: of the singular values of the root.
-    """
-    fixed, rows = values <= _LEAST_EIGENVALUE, rows * lengths
-    roots = np.where(fixed, 0, 1 / np.sqrt(np.maximum(values, _LEAST_EIGENVALUE)))
-    _, sizes, vectors = np.linalg.svd(roots[:, None] * rows)
-    root = np.minimum(sizes, largest)[:, None] * vectors / lengths
-    if not np.any(fixed):
-        return root, None
-    across = np.linalg.svd(rows[fixed] / np.linalg.norm(rows[fixed], axis=1, keepdims=True))[2][::-1]
-    last = np.arange(6)[:, None] >= 6 - np.sum(fixed)
-    return np.where(last, 0, root), np.where(last, across, 0) / lengths
-
-
-def _information(covariance: Float[np.ndarray, "6 6"], source: PointCloud) -> tuple[Float[np.ndarray, "6 6"], Any, Any]:
-    """Information of ξ about the origin of the cloud, from its covariance about that of the user's coordinates; and
-    `fixed` and `root` of `Prior`.
+    """Information of ξ about the origin of the cloud, from its covariance about that of the user's coordinates; and the
+    fixed directions, see `Prior`.
 
     One of the two has correlations that rounding does not spoil: the first for a pose that was measured at the cloud,
     the second for one measured at a far origin. A root of the information has twice the digits of the information.
@@ -134,44 +117,15 @@ def _information(covariance: Float[np.ndarray, "6 6"], source: PointCloud) -> tu
     offset, values, rows = max(known, key=lambda each: sorted(np.where(each[1] > _LEAST_EIGENVALUE, each[1], 0)))
     definite = bool(values[0] >= -_LEAST_EIGENVALUE and np.all(np.diagonal(covariance) >= 0))
     _require("prior: covariance", _correlations(covariance)[1], definite, "positive semidefinite")
+    fixed = values <= _LEAST_EIGENVALUE
+    rows = rows @ translation_adjoint(source.origin - offset)
+    root = np.where(fixed, 0, 1 / np.sqrt(np.maximum(values, _LEAST_EIGENVALUE)))[:, None] * rows
     points = np.asarray(source.points)
     lengths = np.repeat([max(float(np.abs(points).max(initial=0)), 1e-30), 1.0], 3)
+    _, values, vectors = np.linalg.svd(root * lengths)
     # The rounding of more precise directions would spoil the others.
-    largest = float(np.sqrt(_LARGEST_ERROR / np.finfo(points.dtype).eps))
-    root, fixed = _root_and_fixed(values, rows @ translation_adjoint(source.origin - offset), lengths, largest)
-    return root.T @ root, fixed, root
-
-
-def with_precise_fixed(problem: Problem, prior: Prior) -> Problem | None:
-    """The problem with those directions fixed, too, that the prior knows to a fraction of the fine maximum
-    correspondence distance; None if there are none, and inside `jit`."""
-    if prior.root is None or not is_concrete(problem, prior):
-        return None
-    # Squared motion of the points (mean) by a twist.
-    second = _second_moments(problem)
-    mean, spread = second[:3, 3], second[:3, :3]
-    motion = np.block([[np.eye(3), -skew(mean)], [skew(mean), np.trace(spread) * np.eye(3) - spread]])
-    motion = motion + _RIDGE * np.diag(np.diagonal(motion))
-    limit = _PRECISE * problem.settings.fine_distance
-    precise = np.sum(prior.root @ inverse_6(motion) * prior.root, axis=1) * limit**2 >= 1
-    fixed = np.where(precise[:, None], prior.root, 0 if prior.fixed is None else prior.fixed)
-    return fixed_in(problem, prior._replace(fixed=fixed)) if np.any(precise) else None
-
-
-def is_better(state: State, other: State, problem: Problem) -> bool:
-    """Whether the end of a loop is elsewhere than another, by more than the fine maximum correspondence distance as
-    motion of the source points (rms), and has converged or has more matches."""
-    change = (matrix_of(state.pose) - matrix_of(other.pose))[:3]
-    far = np.sum(change @ _second_moments(problem) * change) > problem.settings.fine_distance**2
-    merits = [(end.status == Status.CONVERGED, end.record.num_inliers) for end in (state, other)]
-    return bool(far and merits[0] > merits[1])
-
-
-def _second_moments(problem: Problem) -> Float[np.ndarray, "4 4"]:
-    """Mean of h hᵀ over the source points, h = (a, 1)."""
-    points = np.asarray(problem.source.search.points, np.float64)[np.asarray(problem.source.search.valid)]
-    h = np.concatenate([points, np.ones((len(points), 1))], axis=1)
-    return h.T @ h / max(len(points), 1)
+    root = np.minimum(values, np.sqrt(_LARGEST_ERROR / np.finfo(points.dtype).eps))[:, None] * vectors / lengths
+    return root.T @ root, _orthonormal(rows[fixed], lengths)
 
 
 def fixed_in(problem: Problem, prior: Prior) -> Problem:

@@ -53,6 +53,7 @@ class Inputs(NamedTuple):
     Attributes:
         source, target: preprocessed clouds; raw ones where the method makes cells of them.
         method: its parameters may be unset.
+        robust, tie_points, prior: as in `register`, the latter two relative to the origins of the clouds.
         temperature: of a soft assignment, metres; None without one.
         source_rows: (n,) rows of the source that are matched; None for all.
         gains: (C,) by which the channels of the source were multiplied, constant to autodiff; None unless equalised.

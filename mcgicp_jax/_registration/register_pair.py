@@ -41,15 +41,7 @@ from mcgicp_jax._registration.input_checks import (
     warn_of_covariances,
 )
 from mcgicp_jax._registration.loop import LoopResult, iterate
-from mcgicp_jax._registration.measurements import (
-    GivenPrior,
-    GivenTiePoints,
-    fixed_in,
-    fusion_of,
-    is_better,
-    known,
-    with_precise_fixed,
-)
+from mcgicp_jax._registration.measurements import GivenPrior, GivenTiePoints, fixed_in, fusion_of, known
 from mcgicp_jax._registration.multi_scale import at_scales
 from mcgicp_jax._registration.on_host import HostExecutor
 from mcgicp_jax._registration.options import Options, check_method
@@ -198,21 +190,11 @@ def results_of(runs: Sequence[Run], givens: Sequence[Inputs | None]) -> list[Reg
 
 
 def _solved(given: Inputs, init: Pose | None, options: Options, search: AbstractSearch) -> Run:
-    """Pose and run the problem, with no more of the prior than the directions that it fixes.
-
-    If it ends better elsewhere with precise directions fixed, too, that is the basin of convergence. Otherwise
-    the pose, from which the weights of the prior follow, is that of the matches alone from `init`.
-    """
+    """Pose and run the problem, with no more of the prior than the directions that it fixes."""
     problem, inputs = pose_problem(given, init, options, search.num_threads)
     prior = given.prior
     problem = problem if prior is None or prior.fixed is None else fixed_in(problem, prior)
-    run = run_loop(inputs, problem, search, options.max_iterations)
-    guided = None if prior is None else with_precise_fixed(problem, prior)
-    if guided is not None:
-        state = run_loop(inputs, guided, search, options.max_iterations).loop.state
-        if is_better(state, run.loop.state, problem):
-            run = run_loop(inputs, replace(problem, start=state.pose), search, options.max_iterations)
-    return run
+    return run_loop(inputs, problem, search, options.max_iterations)
 
 
 def run_loop(inputs: Inputs, problem: Problem, search: AbstractSearch | None, max_iterations: int) -> Run:
