@@ -158,6 +158,13 @@ def test_squares_of_channels_may_overflow(size):
             assert_believable(outcome(lambda n=name, c=cloud, t=target: mcg.register(c, t, METHODS[n])))
 
 
+@pytest.mark.parametrize("equalize", [False, True])
+def test_differences_of_channels_may_overflow(equalize):
+    points = np.random.default_rng(0).uniform(size=(4, 3))
+    cloud = mcg.PointCloud(points, np.float32([[-9e37], [3.3e38], [-4e37], [-3.2e37]]))
+    assert_believable(outcome(lambda: mcg.register(cloud, cloud, METHODS["color-icp"], equalize_channels=equalize)))
+
+
 @settings(max_examples=80, deadline=None)
 @given(st.data())
 def test_register_survives_anything(data):

@@ -59,7 +59,9 @@ def _ranges(cloud: PointCloud) -> list[tuple[float, float]]:
     """The 5 and 95 % quantiles of a sample of each channel; NaN if no point has the channel."""
     rows, counts = sampled_rows(np.asarray(cloud.valid))
     rows = rows[counts]
-    channels, known = np.asarray(cloud.channels)[rows], np.isfinite(np.asarray(cloud.channels)[rows])
+    # In float32, differences of quantiles may overflow.
+    channels = np.asarray(cloud.channels, np.float64)[rows]
+    known = np.isfinite(channels)
     if cloud.channel_valid is not None:
         known &= np.asarray(cloud.channel_valid)[rows]
     ranges = []
@@ -110,9 +112,9 @@ def gain_and_offset(
     """
     xp = numpy_for(values, wanted)
     levels = xp.asarray(_QUANTILES, values.dtype)
-    quantiles = [of_known(partial(xp.nanquantile, q=levels, axis=0), each) for each in (values, wanted)]
     # What overflows is not finite, and leaves its channel as it is.
     with np.errstate(over="ignore", invalid="ignore"):
+        quantiles = [of_known(partial(xp.nanquantile, q=levels, axis=0), each) for each in (values, wanted)]
         means = [xp.mean(each, axis=0) for each in quantiles]
         spreads = [xp.std(each, axis=0) for each in quantiles]
         varying = (spreads[0] > 0) & (spreads[1] > 0)
