@@ -173,7 +173,9 @@ def near(result, truth, metres):
 
 
 @pytest.mark.slow
-def test_a_planar_scan_from_far_off(data):
+@pytest.mark.parametrize("known", ["z roll pitch", "roll pitch"])
+@pytest.mark.parametrize("variance", [0, 1e-10])
+def test_a_planar_scan_from_far_off(data, known, variance):
     """One beam of a LiDAR, without heights, on a whole cloud, in the plane that the prior knows."""
     source, target = (
         np.asarray(mcg.io.read(data / "lidar_pair" / f"{name}.ply").points) for name in ("source", "target")
@@ -182,7 +184,9 @@ def test_a_planar_scan_from_far_off(data):
     ranges = np.linalg.norm(source[:, :2], axis=1)
     beam = source[(np.hypot(ranges, source[:, 2]) > 0.5) & (np.abs(np.degrees(np.arctan2(source[:, 2], ranges))) < 0.2)]
     clouds = mcg.preprocess((beam * [1, 1, 0])[:: len(beam) // 316], None), mcg.preprocess(target)
-    prior = truth, covariance_fixing("z roll pitch")
+    # Nothing else is known to better than a hundred metres or radians.
+    prior = truth, np.maximum(np.minimum(covariance_fixing(known), 1e4), variance * np.eye(6))
     for start in starts(truth, 20, 1.0, 20):
         result = mcg.register(*clouds, mcg.PointToPoint(), init=start, prior=prior, max_distance=(5, 0.2))
-        assert near(result, truth, 0.05)
+        # Walls hardly tell the height.
+        assert near(result, truth, 0.05 if "z" in known else 0.1)

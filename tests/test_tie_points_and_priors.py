@@ -151,6 +151,12 @@ def test_a_prior_is_weighed_by_its_covariance(corner, name):
     assert name == "d2d-ndt" or np.all(np.linalg.eigvalsh(added) > -0.05 * np.linalg.norm(added))
 
 
+def test_equal_clouds(corner):
+    cloud = corner[0]
+    result = mcg.register(cloud, cloud, mcg.GICP(), prior=(motion(1e-3 * np.ones(6)), 1e-4 * np.eye(6)), **OPTIONS)
+    assert result.converged and np.abs(twist_error(result.matrix, np.eye(4))).max() < 1e-5
+
+
 def test_tie_points_that_tell_nothing_change_nothing(corner):
     source, target, truth = corner
     alone = mcg.register(source, target, mcg.GICP(), **OPTIONS)

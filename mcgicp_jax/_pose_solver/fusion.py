@@ -12,9 +12,14 @@ from jaxtyping import Array, Float
 from mcgicp_jax._math.poses import adjoint_to_source, translation_adjoint, units
 from mcgicp_jax._pose_solver.covariance import UNKNOWN, Moments, response_and_scatter
 from mcgicp_jax._pose_solver.degeneracy import Directions
-from mcgicp_jax._pose_solver.pose_measurements import Fusion, PoseForm
+from mcgicp_jax._pose_solver.pose_measurements import Fusion, PoseForm, PoseMeasurements
 from mcgicp_jax._pose_solver.sums import Sums
 from mcgicp_jax._pose_solver.update import Update, twist_form, wrench
+
+# In a first registration, the standard deviations of tie points and prior count ten times, and they are at most a
+# thousand times as stiff as the matches. Planar scans whose prior knows roll, pitch and height to 1e-5 then converge
+# from where they do with fixed directions; a prior as precise as the matches moves the pose by 1e-13 of the difference.
+_FIRST_WEIGHT, _FIRST_STIFFNESS = 0.01, 1e3
 
 
 def held_by_pose_form(directions: Directions, information: Float[Array, "6 6"]) -> Directions:
@@ -64,9 +69,10 @@ def fuse(
         directions = held_by_pose_form(directions, fusion.pull(rotation, translation)[1])
         basis, by_matches = jnp.asarray(directions.twists).T, jnp.asarray(directions.held_by_matches)
         both, others = jnp.outer(by_matches, by_matches), jnp.diag(1.0 * ~by_matches)
-        response, scatter = (
-            jnp.where(both, basis.T @ each @ basis, others) for each in response_and_scatter(moments, radius)
-        )
+        response, scatter = response_and_scatter(moments, radius)
+        # Equal clouds: no residual is more precise than the rounding of float32.
+        scatter = scatter + jnp.finfo(jnp.float32).eps ** 2 * radius * response
+        response, scatter = (jnp.where(both, basis.T @ each @ basis, others) for each in (response, scatter))
         # One LAPACK call after the other: two batched ones at once can deadlock.
         gain = jnp.where(both, response @ jnp.linalg.inv(scatter), 0)
         information = jnp.where(both, gain @ response, 0)
@@ -77,15 +83,45 @@ def fuse(
     return replace(fusion, basis=basis, gain=gain, information=information, held=directions.held, fixed=fixed)
 
 
+def _to_sums(fusion: PoseMeasurements, sums: Sums) -> tuple[Float[Array, "6 6"], Float[Array, "6 6"]]:
+    """Matrices from twists about the centre of `fusion` to those about the centre of the sums, and back."""
+    offset, lengths, lengths_here = sums.center - fusion.center, units(fusion.radius), units(sums.radius)
+    outwards = translation_adjoint(-offset).astype(offset.dtype) * lengths / lengths_here[:, None]
+    return outwards, translation_adjoint(offset).astype(offset.dtype) * lengths_here / lengths[:, None]
+
+
+def first_pull(
+    pose: jaxlie.SE3, sums: Sums, directions: Directions, measurements: PoseMeasurements
+) -> tuple[Float[Array, "6"], Float[Array, "6 6"]]:
+    """Force and stiffness by which tie points and prior act in a first registration, for `solve_update`.
+
+    They keep the pose in the basin of convergence that they know. The mean cost of a match stands for the variance of a
+    residual. Let λ be the ratio of their stiffness to that of the matches along a twist: they act with a stiffness of
+    `_FIRST_STIFFNESS` (λ / (1 + λ))⁸ times that of the matches, along the directions that these constrain. So the pose
+    at which the weights of a `Fusion` are estimated depends on those alone that are far more precise than the matches.
+    """
+    rotation = pose.rotation().as_matrix().astype(sums.center.dtype)
+    pull, known = measurements.pull(rotation, pose.translation())
+    _, back = _to_sums(measurements, sums)
+    basis, held = jnp.asarray(directions.twists).T, jnp.asarray(directions.held_by_matches)
+    along, weight = back @ basis, _FIRST_WEIGHT * sums.cost / jnp.maximum(sums.count, 1) / sums.radius**2
+    both = jnp.outer(held, held)
+    # One LAPACK call after the other: two batched ones at once can deadlock.
+    inverse, known = jax.lax.optimization_barrier((jnp.linalg.inv(basis), known))
+    known, pull = jnp.where(both, weight * along.T @ known @ along, 0), jnp.where(held, weight * along.T @ pull, 0)
+    matches = jnp.where(both, basis.T @ twist_form(sums.stiffness, sums.radius) @ basis, jnp.diag(1.0 * ~held))
+    share = jnp.linalg.solve(matches + known, known).T
+    rest = _FIRST_STIFFNESS * (jnp.eye(6, dtype=share.dtype) - share)
+    filtered = inverse.T @ jnp.linalg.matrix_power(share, 7) @ rest
+    return filtered @ pull, filtered @ known @ inverse
+
+
 def fused_update(pose: jaxlie.SE3, sums: Sums, directions: Directions, fusion: Fusion) -> tuple[Directions, Update]:
     """One Newton step on P s + γ = 0, with the matches and M fixed; and the directions with tie points and prior."""
     radius, dtype = fusion.radius, sums.center.dtype
     rotation = pose.rotation().as_matrix().astype(dtype)
     pull, known = fusion.pull(rotation, pose.translation())
-    # Matrices from twists about the centre of `fusion` to those about the centre of the sums, and back.
-    offset, lengths, lengths_here = sums.center - fusion.center, units(radius), units(sums.radius)
-    outwards = translation_adjoint(-offset).astype(dtype) * lengths / lengths_here[:, None]
-    back = translation_adjoint(offset).astype(dtype) * lengths_here / lengths[:, None]
+    outwards, back = _to_sums(fusion, sums)
     known_here = back.T @ known @ back
     directions = held_by_pose_form(directions, known_here)
     unit_information = twist_form(sums.stiffness, sums.radius)

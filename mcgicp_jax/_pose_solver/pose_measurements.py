@@ -83,28 +83,15 @@ def form_at(
     return PoseForm(stiffness, force, Prior(prior.rotation, apart, change.T @ prior.information @ change, fixed))
 
 
-class Fusion(eqx.Module):
-    """The equation of a pose with tie points or a prior: P s(T) + γ(T) = 0.
-
-    s(T) is the score of the matches, force and torque, γ the force of tie points and prior. In a first registration
-    without them the score has the Jacobian A and the covariance B (see `covariance`), and P = A B⁻¹: the solution
-    minimises sᵀ B⁻¹ s and the cost of tie points and prior together, both in squared standard deviations (generalised
-    method of moments, Hansen 1982). M itself is no inverse covariance, so s and γ cannot simply be added. Along
-    directions that the matches do not constrain, P is zero. Constants to autodiff: all but `form`.
-
-    Where the prior fixes directions, the equation is that of the free ones, and F ξ = 0 (see `fixed_directions`). The
-    basis is then one of ξ, since the free twists at T depend on T and on the prior's pose.
+class PoseMeasurements(eqx.Module):
+    """Tie points and a prior as a force on the pose, γ(T).
 
     Twists turn about `center`, in the target's frame, with lengths in units of `radius`.
 
     Attributes:
-        rotation, translation: T₀, the pose of the first registration, to which `form` refers.
-        center, radius: of its matched points, metres.
+        rotation, translation: T₀, the pose to which `form` refers.
+        center, radius: of the points that are matched there, metres.
         form: of tie points and prior.
-        basis: (6, 6) twists as columns; changes of ξ if directions are fixed.
-        gain, information: P and A B⁻¹ A in this basis.
-        held: whether matches, tie points or prior constrain the twist.
-        fixed: whether the prior fixes it; None if it fixes none.
     """
 
     rotation: Float[AnyArray, "3 3"]
@@ -112,16 +99,6 @@ class Fusion(eqx.Module):
     center: Float[AnyArray, "3"]
     radius: Float[AnyScalar, ""]
     form: PoseForm
-    basis: Float[AnyArray, "6 6"]
-    gain: Float[AnyArray, "6 6"]
-    information: Float[AnyArray, "6 6"]
-    held: Bool[AnyArray, "6"]
-    fixed: Bool[AnyArray, "6"] | None = None
-
-    @property
-    def free(self) -> Bool[AnyArray, "6"]:
-        """Which twists of the basis tie points, prior and matches determine together."""
-        return self.held if self.fixed is None else self.held & ~self.fixed
 
     def _change(
         self, rotation: Float[Array, "3 3"], translation: Float[Array, "3"]
@@ -148,12 +125,6 @@ class Fusion(eqx.Module):
         residual, push = jax.linearize(apart, jnp.zeros(6, dtype))
         return residual, jax.vmap(push)(jnp.eye(6, dtype=dtype))
 
-    def twists_at(self, rotation: Float[Array, "3 3"], translation: Float[Array, "3"]) -> Float[AnyArray, "6 6"]:
-        """The basis as twists at a pose."""
-        if self.fixed is None:
-            return self.basis
-        return jnp.linalg.solve(self.prior_residual(rotation, translation)[1].T, self.basis)
-
     def pull(
         self, rotation: Float[Array, "3 3"], translation: Float[Array, "3"]
     ) -> tuple[Float[Array, "6"], Float[Array, "6 6"]]:
@@ -169,6 +140,43 @@ class Fusion(eqx.Module):
         residual, rows = self.prior_residual(rotation, translation)
         pull = slope @ (self.form.force - self.form.stiffness @ change) - rows @ prior.information @ residual
         return pull, slope @ self.form.stiffness @ slope.T + rows @ prior.information @ rows.T
+
+
+class Fusion(PoseMeasurements):
+    """The equation of a pose with tie points or a prior: P s(T) + γ(T) = 0.
+
+    s(T) is the score of the matches, force and torque. At the end of a first registration, the score has the Jacobian A
+    and the covariance B (see `covariance`), and P = A B⁻¹: the solution minimises sᵀ B⁻¹ s and the cost of tie points
+    and prior together, both in squared standard deviations (generalised method of moments, Hansen 1982). M itself is no
+    inverse covariance, so s and γ cannot simply be added. Along directions that the matches do not constrain, P is
+    zero. Constants to autodiff: all but `form`.
+
+    Where the prior fixes directions, the equation is that of the free ones, and F ξ = 0 (see `fixed_directions`). The
+    basis is then one of ξ, since the free twists at T depend on T and on the prior's pose.
+
+    Attributes:
+        basis: (6, 6) twists as columns; changes of ξ if directions are fixed.
+        gain, information: P and A B⁻¹ A in this basis.
+        held: whether matches, tie points or prior constrain the twist.
+        fixed: whether the prior fixes it; None if it fixes none.
+    """
+
+    basis: Float[AnyArray, "6 6"]
+    gain: Float[AnyArray, "6 6"]
+    information: Float[AnyArray, "6 6"]
+    held: Bool[AnyArray, "6"]
+    fixed: Bool[AnyArray, "6"] | None = None
+
+    @property
+    def free(self) -> Bool[AnyArray, "6"]:
+        """Which twists of the basis tie points, prior and matches determine together."""
+        return self.held if self.fixed is None else self.held & ~self.fixed
+
+    def twists_at(self, rotation: Float[Array, "3 3"], translation: Float[Array, "3"]) -> Float[AnyArray, "6 6"]:
+        """The basis as twists at a pose."""
+        if self.fixed is None:
+            return self.basis
+        return jnp.linalg.solve(self.prior_residual(rotation, translation)[1].T, self.basis)
 
     def balance(
         self, score: Float[Array, "6"], rotation: Float[Array, "3 3"], translation: Float[Array, "3"]

@@ -53,7 +53,12 @@ class Update(eqx.Module):
     degenerate: Bool[Array, ""]
 
 
-def solve_update(sums: Sums, basis: Float[Array, "6 6"]) -> Update:
+def solve_update(
+    sums: Sums,
+    basis: Float[Array, "6 6"],
+    pull: Float[Array, "6"] | None = None,
+    stiffness: Float[Array, "6 6"] | None = None,
+) -> Update:
     """Minimise Σ w (d − D h)ᵀ M (d − D h) = e − 2⟨D, G⟩ + ⟨D, Q(D)⟩ (symbols as in `sums`) over the pose change D =
     [ΔR − I | Δt], with M and w fixed.
 
@@ -64,9 +69,16 @@ def solve_update(sums: Sums, basis: Float[Array, "6 6"]) -> Update:
     Args:
         basis: (6, 6), columns: twists along which the pose may move, lengths in units of the radius. Zero columns
             keep the pose fixed along their directions.
+        pull, stiffness: force and stiffness of other measurements of the pose, for its twist, in units of the radius.
     """
     radius, dtype = sums.radius, sums.center.dtype
     form = _quadratic_form(sums, radius)
+    if stiffness is not None and pull is not None:
+        # D is [ω× | v] to first order.
+        twist = jnp.asarray(_TANGENT, dtype).T / jnp.asarray([1, 1, 1, 2, 2, 2], dtype)[:, None]
+        form = form + jnp.block(
+            [[twist.T @ stiffness @ twist, -(pull @ twist)[:, None]], [-pull @ twist, jnp.zeros(1, dtype)]]
+        )
     unit_information = twist_form(sums.stiffness, radius)
     trace = jnp.trace(unit_information)
     scale = _HESSIAN_SCALE / jnp.where(trace > 0, trace / 6, 1)

@@ -95,7 +95,7 @@ class AbstractExecutor(abc.ABC):
     def update(self, state: State, sums: Any) -> State:
         """The state after an update of the pose, without the sums."""
         problem = self.problem
-        return update(*state[:5], sums, problem.settings, problem.fusion, problem.fixed)
+        return update(*state[:5], sums, problem.settings, problem.measurements, problem.fixed)
 
     @abc.abstractmethod
     def scores(self, motion: Motion, matches: Matches, *arguments: Any) -> Scores:

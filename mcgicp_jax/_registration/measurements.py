@@ -22,7 +22,7 @@ from mcgicp_jax._pose_solver.covariance import Moments
 from mcgicp_jax._pose_solver.degeneracy import Directions
 from mcgicp_jax._pose_solver.fixed_directions import with_fixed_directions
 from mcgicp_jax._pose_solver.fusion import fuse
-from mcgicp_jax._pose_solver.pose_measurements import Fusion, Prior, TiePoints, form_at
+from mcgicp_jax._pose_solver.pose_measurements import Fusion, PoseMeasurements, Prior, TiePoints, form_at
 from mcgicp_jax._registration.assessment import as_float64
 from mcgicp_jax._registration.step import Problem, State
 
@@ -128,18 +128,36 @@ def _information(
     return root.T @ root, _orthonormal(rows[fixed], lengths)
 
 
-def fixed_in(problem: Problem, prior: Prior) -> Problem:
-    """The problem with the directions that the prior fixes, from the start on."""
-    dtype, (start, prior) = problem.start.wxyz_xyz.dtype, constant((problem.start, prior))
-    xp = numpy_for(start, prior)
-    prior = jax.tree.map(lambda array: xp.asarray(array, dtype), prior)
-    with jax.default_matmul_precision("highest"), outside_trace() if xp is np else nullcontext():
-        start = with_fixed_directions(start, prior)
-    return replace(problem, start=jax.tree.map(np.asarray, start) if xp is np else start, fixed=prior)
+def measured(problem: Problem, ties: TiePoints | None, prior: Prior | None) -> Problem:
+    """The problem of a first registration with tie points and a prior, which act from the start on."""
+    dtype, (start, ties, prior) = problem.start.wxyz_xyz.dtype, constant((problem.start, ties, prior))
+    rows = problem.source.search
+    xp = numpy_for(start, ties, prior, rows)
+
+    def as_dtype(tree: Any) -> Any:
+        return jax.tree.map(lambda array: xp.asarray(array, dtype), tree)
+
+    fixed = None if prior is None or prior.fixed is None else as_dtype(prior)
+    if fixed is not None:
+        with jax.default_matmul_precision("highest"), outside_trace() if xp is np else nullcontext():
+            start = with_fixed_directions(start, fixed)
+        start = jax.tree.map(np.asarray, start) if xp is np else start
+    matrix, valid = matrix_of(start), rows.valid[:, None]
+    count = xp.maximum(xp.sum(valid), 1)
+    mean = xp.sum(xp.where(valid, rows.points, 0), axis=0) / count
+    square = xp.sum(xp.where(valid, rows.points - mean, 0) ** 2) / count
+    place = (
+        matrix[:3, :3],
+        matrix[:3, 3],
+        matrix[:3, :3] @ mean + matrix[:3, 3],
+        xp.sqrt(xp.where(square > 0, square, 1)),
+    )
+    measurements = as_dtype(PoseMeasurements(*place, form_at(*place, ties, prior)))
+    return replace(problem, start=start, measurements=measurements, fixed=fixed)
 
 
 def fusion_of(state: State, moments: Moments, ties: TiePoints | None, prior: Prior | None) -> Fusion:
-    """The equation of the pose with tie points and prior, from the final state of a registration without them."""
+    """The equation of the pose with tie points and prior, from the final state of a first registration."""
     state, moments = constant((state, moments))
     dtype, matrix = state.pose.wxyz_xyz.dtype, matrix_of(state.pose)
     center, directions = state.sums.center, cast(Directions, state.directions)

@@ -15,7 +15,7 @@ from mcgicp_jax._compute.row_functions import RowFunction
 from mcgicp_jax._compute.tables import Packed
 from mcgicp_jax._pose_solver.covariance import Scores, scores_of
 from mcgicp_jax._pose_solver.matched import Matches, Motion, inputs_of, of_matches
-from mcgicp_jax._pose_solver.pose_measurements import Fusion, Prior
+from mcgicp_jax._pose_solver.pose_measurements import PoseMeasurements, Prior
 from mcgicp_jax._pose_solver.sums import Sums, combine, sums_of
 from mcgicp_jax._registration.loop import AbstractExecutor, LoopResult
 from mcgicp_jax._registration.step import COARSE, SETTLED, Problem, Record, Settings, State, update
@@ -111,7 +111,7 @@ class HostExecutor(AbstractExecutor):
         return parts[0] if len(parts) == 1 else _combined(parts)
 
     def update(self, state: State, sums: Packed[Sums]) -> State:
-        updated = _update(state[:5], sums, self._settings, self.problem.fusion, self.problem.fixed)
+        updated = _update(state[:5], sums, self._settings, self.problem.measurements, self.problem.fixed)
         return Packed(np.asarray(updated.table), updated.layout).tree
 
     def scores(self, motion: Motion, matches: Matches, *arguments: Any) -> Scores:
@@ -150,8 +150,8 @@ def _update(
     state: tuple[Any, ...],
     sums: Packed[Sums],
     settings: Packed[Settings],
-    fusion: Fusion | None,
+    measurements: PoseMeasurements | None,
     fixed: Prior | None,
 ) -> Packed[State]:
     """`update` with packed arguments and result."""
-    return Packed.of(update(*state, sums.tree, settings.tree, fusion, fixed), num_axes=0)
+    return Packed.of(update(*state, sums.tree, settings.tree, measurements, fixed), num_axes=0)

@@ -41,7 +41,7 @@ from mcgicp_jax._registration.input_checks import (
     warn_of_covariances,
 )
 from mcgicp_jax._registration.loop import LoopResult, iterate
-from mcgicp_jax._registration.measurements import GivenPrior, GivenTiePoints, fixed_in, fusion_of, known
+from mcgicp_jax._registration.measurements import GivenPrior, GivenTiePoints, fusion_of, known, measured
 from mcgicp_jax._registration.multi_scale import at_scales
 from mcgicp_jax._registration.on_host import HostExecutor
 from mcgicp_jax._registration.options import Options, check_method
@@ -158,10 +158,10 @@ def _with_exposure_of_matches(run: Run, options: Options, search: AbstractSearch
 
 
 def _fused(run: Run, options: Options, search: AbstractSearch) -> Run:
-    """The registration again with tie points and prior, from its pose."""
+    """The registration again from its pose, with tie points and prior weighed by its covariance."""
     state, inputs = run.loop.state, run.inputs
     fusion = fusion_of(state, run.moments(), inputs.tie_points, inputs.prior)
-    problem = replace(run.problem, start=constant(state.pose), fusion=fusion)
+    problem = replace(run.problem, start=constant(state.pose), measurements=fusion)
     return run_loop(inputs, problem, search, options.max_iterations)
 
 
@@ -190,10 +190,10 @@ def results_of(runs: Sequence[Run], givens: Sequence[Inputs | None]) -> list[Reg
 
 
 def _solved(given: Inputs, init: Pose | None, options: Options, search: AbstractSearch) -> Run:
-    """Pose and run the problem, with no more of the prior than the directions that it fixes."""
+    """Pose and run the problem."""
     problem, inputs = pose_problem(given, init, options, search.num_threads)
-    prior = given.prior
-    problem = problem if prior is None or prior.fixed is None else fixed_in(problem, prior)
+    if not (given.tie_points is None and given.prior is None):
+        problem = measured(problem, given.tie_points, given.prior)
     return run_loop(inputs, problem, search, options.max_iterations)
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, cast
 
 import equinox as eqx
 import jax
@@ -21,10 +21,10 @@ from mcgicp_jax._methods.base import AbstractMethod
 from mcgicp_jax._methods.surfaces import AnySurface, whole_surface
 from mcgicp_jax._pose_solver.degeneracy import Directions, find_directions
 from mcgicp_jax._pose_solver.fixed_directions import constraints_at, with_fixed_directions
-from mcgicp_jax._pose_solver.fusion import fused_update
+from mcgicp_jax._pose_solver.fusion import first_pull, fused_update
 from mcgicp_jax._pose_solver.implicit_derivative import ImplicitRoot, root_near
 from mcgicp_jax._pose_solver.matched import Matches
-from mcgicp_jax._pose_solver.pose_measurements import Fusion, Prior
+from mcgicp_jax._pose_solver.pose_measurements import Fusion, PoseMeasurements, Prior
 from mcgicp_jax._pose_solver.sums import Sums
 from mcgicp_jax._pose_solver.update import rounding, solve_update
 from mcgicp_jax._registration.options import ROTATION_TOLERANCE, Options
@@ -94,8 +94,9 @@ class Problem(eqx.Module):
         start: the initial pose.
         source, target: the surfaces of both clouds.
         terms: the residuals of each correspondence, before any number is adapted.
-        fusion: tie points and prior, weighted after a registration without them; None if there are none.
-        fixed: the prior if it fixes directions, else None; unlike the rest of `fusion` it acts from the first update.
+        measurements: tie points and prior: weighed by the residuals in a first registration, then as a `Fusion`; None
+            if there are none.
+        fixed: the prior if it fixes directions, else None.
         matches: those of `estimate_pose`, at every pose; None if the loop searches for them.
         num_candidates: number of target points that a source point is matched with.
     """
@@ -105,7 +106,7 @@ class Problem(eqx.Module):
     target: AnySurface
     terms: tuple[AbstractTerm, ...]
     settings: Settings
-    fusion: Fusion | None = None
+    measurements: PoseMeasurements | None = None
     fixed: Prior | None = None
     matches: Matches | None = None
     num_candidates: int = eqx.field(static=True, default=1)
@@ -113,6 +114,11 @@ class Problem(eqx.Module):
     def whole(self) -> Problem:
         """With all rows of both surfaces."""
         return replace(self, source=whole_surface(self.source), target=whole_surface(self.target))
+
+    @property
+    def fusion(self) -> Fusion | None:
+        """The equation of the pose; None in a first registration."""
+        return self.measurements if isinstance(self.measurements, Fusion) else None
 
     @property
     def first_status(self) -> Int[AnyScalar, ""]:
@@ -165,7 +171,7 @@ def update(
     extent: Float[Array, ""],
     sums: Sums,
     settings: Settings,
-    fusion: Fusion | None = None,
+    measurements: PoseMeasurements | None = None,
     fixed: Prior | None = None,
 ) -> State:
     """Update the pose, or end the loop with a status. Its program does not depend on the size of the clouds.
@@ -184,11 +190,13 @@ def update(
             # Along unconstrained directions an update would follow arbitrary nearest-neighbour matches.
             moving = (directions.held | ~settings.hold_unconstrained) & ~directions.fixed
             basis = jnp.asarray(directions.twists).T * moving
-        if fusion is None or directions is None:
+        if isinstance(measurements, Fusion):
+            directions, change = fused_update(pose, sums, cast(Directions, directions), measurements)
+            degenerate = ~jnp.all(directions.held)
+        elif measurements is None or directions is None:
             change = solve_update(sums, basis)
         else:
-            directions, change = fused_update(pose, sums, directions, fusion)
-            degenerate = ~jnp.all(directions.held)
+            change = solve_update(sums, basis, *first_pull(pose, sums, directions, measurements))
         moved = move_pose(pose, change.twist, sums.center)
         moved = moved if fixed is None else with_fixed_directions(moved, fixed)
     # Matches need not constrain what is fixed.
