@@ -62,11 +62,9 @@ from mcgicp_jax._global_pose.image_matches import image_matches
 from mcgicp_jax._math.robust_kernels import AbstractKernel, Cauchy, GemanMcClure, Huber, Tukey, Welsch
 from mcgicp_jax._methods.base import AbstractMethod
 from mcgicp_jax._methods.channel_covariance import estimate_channel_covariance
-from mcgicp_jax._methods.gicp import GICP
-from mcgicp_jax._methods.icp import ColorICP, PointToPlane, PointToPoint
+from mcgicp_jax._methods.icp import GICP, ColorICP, PointToPlane, PointToPoint
 from mcgicp_jax._methods.multichannel_gicp import MultiChannelGICP
-from mcgicp_jax._methods.ndt import D2DNDT, NDT, ColorNDT
-from mcgicp_jax._methods.voxel_gaussians import voxel_gaussians
+from mcgicp_jax._methods.ndt import D2DNDT, NDT, ColorNDT, voxel_gaussians
 from mcgicp_jax._pairs.batch import register_as_completed, register_batch
 from mcgicp_jax._pairs.batch_jobs import PairWarning
 from mcgicp_jax._pairs.cost import mahalanobis_cost

@@ -21,14 +21,13 @@ The command line offers the entries that the registries `METHODS` (each a `Regis
 
 from mcgicp_jax._clouds.color_spaces import COLOR_SPACES
 from mcgicp_jax._compute.row_functions import Input, Rows, blockwise
-from mcgicp_jax._local_geometry.local_geometry import LocalGeometry
+from mcgicp_jax._local_geometry.local_geometry import LocalGeometry, Surface
 from mcgicp_jax._local_geometry.neighborhoods import Neighborhoods
-from mcgicp_jax._local_geometry.surface import Surface
 from mcgicp_jax._math import symmetric_matrices
 from mcgicp_jax._math.robust_kernels import KERNELS, AbstractKernel
 from mcgicp_jax._methods.base import AbstractGeneralized, AbstractMethod, AbstractOneSided
+from mcgicp_jax._methods.ndt import cell_moments, voxel_cells
 from mcgicp_jax._methods.registry import METHODS, RegisteredMethod
-from mcgicp_jax._methods.voxel_gaussians import cell_moments, voxel_cells
 from mcgicp_jax._pose_graph.edge import AbstractFactor
 from mcgicp_jax._search.base import AbstractIndex, AbstractSearch, Correspondences, SearchPoints
 from mcgicp_jax._search.kd_tree import AbstractTreeSearch

@@ -13,7 +13,7 @@ from mcgicp_jax._cli.options import MethodName, Options
 from mcgicp_jax._clouds.color_spaces import COLOR_SPACES
 from mcgicp_jax._clouds.point_cloud import Voxels
 from mcgicp_jax._clouds.voxel_size import voxels_for
-from mcgicp_jax._local_geometry.spacing_and_noise import point_spacing
+from mcgicp_jax._local_geometry.cloud_statistics import point_spacing
 from mcgicp_jax._methods.base import AbstractMethod
 from mcgicp_jax._methods.registry import METHODS
 from mcgicp_jax._registration.step import default_distances

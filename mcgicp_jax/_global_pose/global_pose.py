@@ -16,8 +16,7 @@ from mcgicp_jax._clouds.voxels import grid_of, voxel_order
 from mcgicp_jax._compute.concrete import AnyArray, outside_trace
 from mcgicp_jax._compute.messages import check_positive, messages_named
 from mcgicp_jax._compute.threads import without_checks_of_jax
-from mcgicp_jax._global_pose.feature_matching import matches_of_features, matches_of_rows
-from mcgicp_jax._global_pose.fpfh import NUM_NEIGHBORS
+from mcgicp_jax._global_pose.features import NUM_NEIGHBORS, matches_of_features, matches_of_rows
 from mcgicp_jax._global_pose.robust_pose_fit import (
     MIN_SEPARATION,
     TOLERANCE,
@@ -28,7 +27,7 @@ from mcgicp_jax._global_pose.robust_pose_fit import (
 )
 from mcgicp_jax._global_pose.surface_agreement import surface_agreement
 from mcgicp_jax._math.poses import nearest_rotation
-from mcgicp_jax._methods.gicp import GICP
+from mcgicp_jax._methods.icp import GICP
 from mcgicp_jax._methods.multichannel_gicp import MultiChannelGICP
 from mcgicp_jax._registration.options import Options
 from mcgicp_jax._registration.register_pair import register_pair

@@ -13,7 +13,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from mcgicp_jax._compute.concrete import AnyArray
-from mcgicp_jax._local_geometry.channel_fits import ChannelFits
+from mcgicp_jax._local_geometry.neighborhoods import ChannelFits
 from mcgicp_jax._math import symmetric_matrices as alg
 
 # Fraction of the variance of a fitted gradient that is subtracted from the product of both halves: few points scatter.

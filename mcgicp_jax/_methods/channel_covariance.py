@@ -11,7 +11,7 @@ from jaxtyping import Bool, Float
 from mcgicp_jax._clouds.point_cloud import PointCloud
 from mcgicp_jax._clouds.preprocess import preprocess
 from mcgicp_jax._compute.threads import without_checks_of_jax
-from mcgicp_jax._local_geometry.spacing_and_noise import point_spacing
+from mcgicp_jax._local_geometry.cloud_statistics import point_spacing
 from mcgicp_jax._math.poses import Pose, pose_matrix
 from mcgicp_jax._search.kd_tree import nearest_in_position
 

@@ -15,16 +15,17 @@ from jaxtyping import Array, Float
 from mcgicp_jax._clouds.point_cloud import PointCloud, Values
 from mcgicp_jax._compute.concrete import AnyArray, constant, numpy_for
 from mcgicp_jax._compute.threads import without_checks_of_jax
+from mcgicp_jax._local_geometry.cloud_statistics import channel_noise, point_spacing
 from mcgicp_jax._local_geometry.covariances import channel_kernel, multichannel_covariance, plane_covariance
 from mcgicp_jax._local_geometry.local_geometry import Geometries, LocalGeometry, local_geometries
 from mcgicp_jax._local_geometry.neighborhoods import NO_NEIGHBORS, Neighborhoods
-from mcgicp_jax._local_geometry.spacing_and_noise import channel_noise, point_spacing
 from mcgicp_jax._math.robust_kernels import AbstractKernel
-from mcgicp_jax._methods.base import AbstractGeneralized, known_geometry
-from mcgicp_jax._methods.parameters import (
+from mcgicp_jax._methods.base import (
+    AbstractGeneralized,
     check_covariance_fits,
     covariance_of,
     epsilon_of,
+    known_geometry,
     per_channel,
     positive_scalar,
     weights_of,

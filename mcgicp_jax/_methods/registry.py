@@ -7,8 +7,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from mcgicp_jax._methods.base import AbstractMethod
-from mcgicp_jax._methods.gicp import GICP
-from mcgicp_jax._methods.icp import ColorICP, PointToPlane, PointToPoint
+from mcgicp_jax._methods.icp import GICP, ColorICP, PointToPlane, PointToPoint
 from mcgicp_jax._methods.multichannel_gicp import MultiChannelGICP
 from mcgicp_jax._methods.ndt import D2DNDT, NDT, ColorNDT
 

@@ -20,6 +20,8 @@ from mcgicp_jax._compute.row_functions import ComputedTable, GivenTable, Input, 
 from mcgicp_jax._compute.threads import side_by_side
 from mcgicp_jax._local_geometry.local_geometry import (
     LocalGeometry,
+    Surface,
+    SurfaceNoise,
     differentiable_geometry,
     geometry_of_cells,
     geometry_table,
@@ -34,7 +36,6 @@ from mcgicp_jax._local_geometry.neighborhoods import (
     with_near,
 )
 from mcgicp_jax._local_geometry.observability import channel_observability
-from mcgicp_jax._local_geometry.surface import Surface, SurfaceNoise
 from mcgicp_jax._math import symmetric_matrices as alg
 from mcgicp_jax._math.robust_kernels import AbstractKernel
 from mcgicp_jax._methods.base import AbstractMethod

@@ -22,7 +22,7 @@ from mcgicp_jax._compute.messages import calling_line, shown_at, warn
 from mcgicp_jax._compute.programs import call_host
 from mcgicp_jax._math.poses import logarithm_derivative, skew
 from mcgicp_jax._pose_graph.edge import WORLD, Edge, check_rows, motion_jacobians
-from mcgicp_jax._pose_graph.normal_equations import factored, typical_information
+from mcgicp_jax._pose_graph.levenberg_marquardt import factored, typical_information
 from mcgicp_jax._pose_graph.solver import Factors, Solution, covariances_at, solve
 from mcgicp_jax._registration.result import Status
 

@@ -14,8 +14,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, Int
 
-from mcgicp_jax._pose_graph.levenberg_marquardt import Minimum
-from mcgicp_jax._pose_graph.normal_equations import NormalEquations, factored
+from mcgicp_jax._pose_graph.levenberg_marquardt import Minimum, NormalEquations, factored
 
 # Unknowns of a block, a pose.
 _SIZE = 6

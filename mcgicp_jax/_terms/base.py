@@ -14,9 +14,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from mcgicp_jax._compute.concrete import AnyArray, AnyScalar
-from mcgicp_jax._local_geometry.local_geometry import LocalGeometry
+from mcgicp_jax._local_geometry.local_geometry import LocalGeometry, Surface
 from mcgicp_jax._local_geometry.neighborhoods import Neighborhoods
-from mcgicp_jax._local_geometry.surface import Surface
 from mcgicp_jax._math import symmetric_matrices as alg
 from mcgicp_jax._math.robust_kernels import AbstractKernel, Numbers
 

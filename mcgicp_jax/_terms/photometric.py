@@ -42,10 +42,9 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from mcgicp_jax._compute.concrete import AnyArray, AnyScalar, numpy_for
-from mcgicp_jax._local_geometry.channel_equalization import gain_and_offset
-from mcgicp_jax._local_geometry.channel_fits import fit_linear
+from mcgicp_jax._local_geometry.cloud_statistics import gain_and_offset
 from mcgicp_jax._local_geometry.local_geometry import LocalGeometry, offsets_of
-from mcgicp_jax._local_geometry.neighborhoods import NO_NEIGHBORS, Neighborhoods
+from mcgicp_jax._local_geometry.neighborhoods import NO_NEIGHBORS, Neighborhoods, fit_linear
 from mcgicp_jax._math import symmetric_matrices as alg
 from mcgicp_jax._math.robust_kernels import AbstractKernel, Cauchy
 from mcgicp_jax._math.statistics import cell_numbers, median

@@ -12,13 +12,11 @@ from typing import Any
 from mcgicp_jax import io
 from mcgicp_jax._clouds.point_cloud import Frame
 from mcgicp_jax.datasets._box_room import box_room
-from mcgicp_jax.datasets._ford import ford_campus
 from mcgicp_jax.datasets._frames import AbstractFrames
-from mcgicp_jax.datasets._kitti import kitti
+from mcgicp_jax.datasets._lidar import ford_campus, kitti
 from mcgicp_jax.datasets._poster_wall import poster_wall
-from mcgicp_jax.datasets._seven_scenes import seven_scenes
+from mcgicp_jax.datasets._rgbd import seven_scenes, tum_rgbd
 from mcgicp_jax.datasets._street import street
-from mcgicp_jax.datasets._tum_rgbd import tum_rgbd
 from mcgicp_jax.io.clouds import is_cloud
 
 
