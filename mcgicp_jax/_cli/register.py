@@ -29,9 +29,9 @@ from mcgicp_jax._cli.options import (
 from mcgicp_jax._compute.messages import messages_named
 from mcgicp_jax._compute.threads import side_by_side
 from mcgicp_jax._methods.base import AbstractMethod
-from mcgicp_jax._methods.registry import METHODS
 from mcgicp_jax._pose_solver.degeneracy import describe
 from mcgicp_jax._registration.result import unverified
+from mcgicp_jax.extend import METHODS
 from mcgicp_jax.io.clouds import format_of
 
 Source: TypeAlias = Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="SOURCE")]
