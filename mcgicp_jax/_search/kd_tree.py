@@ -32,8 +32,7 @@ from mcgicp_jax._search.base import (
     on_host,
     search_points,
 )
-from mcgicp_jax._search.nearest_with_ties import TiedTree, TreeBackend
-from mcgicp_jax._search.tree_index import LARGEST_UNORDERED, TreeIndex
+from mcgicp_jax._search.tree_index import LARGEST_UNORDERED, TiedTree, TreeBackend, TreeIndex
 
 # Where pykdtree is quicker than SciPy's tree: two neighbours of 2,000 to 35,000 points take 0.4 to 0.7 of the time in
 # three dimensions, 0.5 to 1 in four, and 0.7 to 1.7 in six; 20 neighbours 0.7 to 0.9 in three dimensions. (100 take up
