@@ -251,10 +251,7 @@ def _with_fewer_neighbors(clouds: tuple[PointCloud, PointCloud]) -> tuple[PointC
 
 
 def _best_pose(
-    matches: PutativeMatches,
-    clouds: tuple[PointCloud, PointCloud],
-    centers: tuple[np.ndarray, ...],
-    voxel_size: float,
+    matches: PutativeMatches, clouds: tuple[PointCloud, PointCloud], centers: tuple[np.ndarray, ...], voxel_size: float
 ) -> GlobalPoseResult:
     """The best of the verified poses, in the user's frames."""
     points = np.asarray(clouds[0].points, np.float64)

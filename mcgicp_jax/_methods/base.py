@@ -140,12 +140,7 @@ class AbstractMethod(Numbers):
         """
         return (Mahalanobis(self, robust=robust),)
 
-    def resolve(
-        self,
-        source: PointCloud,
-        target: PointCloud,
-        geometries: Geometries | None = None,
-    ) -> AbstractMethod:
+    def resolve(self, source: PointCloud, target: PointCloud, geometries: Geometries | None = None) -> AbstractMethod:
         """The method with every unset parameter chosen from two preprocessed clouds; constants to autodiff.
 
         Args:

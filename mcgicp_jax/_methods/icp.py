@@ -84,12 +84,7 @@ class ColorICP(AbstractOneSided):
         self.missing_variance = None
 
     @without_checks_of_jax
-    def resolve(
-        self,
-        source: PointCloud,
-        target: PointCloud,
-        geometries: Geometries | None = None,
-    ) -> ColorICP:
+    def resolve(self, source: PointCloud, target: PointCloud, geometries: Geometries | None = None) -> ColorICP:
         """The method with `missing_variance` set to the Λ that `MultiChannelGICP` chooses, if points lack channels;
         constant to autodiff."""
         lacking = source.channel_valid is not None or target.channel_valid is not None

@@ -104,12 +104,7 @@ class MultiChannelGICP(AbstractGeneralized):
         self.photometric = photometric
 
     @without_checks_of_jax
-    def resolve(
-        self,
-        source: PointCloud,
-        target: PointCloud,
-        geometries: Geometries | None = None,
-    ) -> MultiChannelGICP:
+    def resolve(self, source: PointCloud, target: PointCloud, geometries: Geometries | None = None) -> MultiChannelGICP:
         """The method with unset parameters chosen from the data; constants to autodiff.
 
         σ, the noise of a channel, is the median over both clouds' points of the residual deviation of linear fits in

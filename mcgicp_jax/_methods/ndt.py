@@ -144,11 +144,7 @@ def voxel_gaussians(
 
 
 def voxel_cells(
-    cloud: PointCloud | Values,
-    voxel_size: float,
-    *,
-    min_points: int = _MIN_POINTS,
-    channel_size: Values | None = None,
+    cloud: PointCloud | Values, voxel_size: float, *, min_points: int = _MIN_POINTS, channel_size: Values | None = None
 ) -> Int[np.ndarray, "N"]:
     """The cell of each point, as `voxel_gaussians` numbers its cells; input of `cell_moments`.
 

@@ -24,14 +24,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from mcgicp_jax._compute.cache import MAX_ROWS, Cache
 from mcgicp_jax._compute.programs import call_host
-from mcgicp_jax._search.base import (
-    IDENTITY,
-    AbstractSearch,
-    NeighborsOnDemand,
-    SearchPoints,
-    on_host,
-    search_points,
-)
+from mcgicp_jax._search.base import IDENTITY, AbstractSearch, NeighborsOnDemand, SearchPoints, on_host, search_points
 from mcgicp_jax._search.tree_index import LARGEST_UNORDERED, TiedTree, TreeBackend, TreeIndex
 
 # Where pykdtree is quicker than SciPy's tree: two neighbours of 2,000 to 35,000 points take 0.4 to 0.7 of the time in

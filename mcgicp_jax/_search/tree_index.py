@@ -134,10 +134,7 @@ class TiedTree:
 
 
 def _nearest_in_all(
-    points: Float[np.ndarray, "M D"],
-    queries: Float[np.ndarray, "N D"],
-    farthest: Float[np.ndarray, "N"],
-    k: int,
+    points: Float[np.ndarray, "M D"], queries: Float[np.ndarray, "N D"], farthest: Float[np.ndarray, "N"], k: int
 ) -> Int[np.ndarray, "N k"]:
     """The k nearest by brute force, for queries with long ties, e.g. where a sensor reports missing echoes as zeros.
 
@@ -199,11 +196,7 @@ class TreeIndex(AbstractIndex):
         return _MatchTracker(self, self._trees, on_host(source), max_distance, num_candidates).nearest
 
     def nearest_of(
-        self,
-        queries: Float[np.ndarray, "N D"],
-        penalty: Float[np.ndarray, "N C"] | None,
-        max_distance: float,
-        k: int,
+        self, queries: Float[np.ndarray, "N D"], penalty: Float[np.ndarray, "N C"] | None, max_distance: float, k: int
     ) -> tuple[Int[np.ndarray, "N k"], Float[np.ndarray, "N"]]:
         """The k nearest rows of each query.
 

@@ -44,9 +44,7 @@ def convergence(histories: Mapping[str, Sequence[float] | ArrayLike], *, ylabel:
 
 
 def trajectories(
-    trajectories: Mapping[str, Sequence[Pose] | Float[np.ndarray, "N 4 4"]],
-    *,
-    path: File = None,
+    trajectories: Mapping[str, Sequence[Pose] | Float[np.ndarray, "N 4 4"]], *, path: File = None
 ) -> Figure:
     """Plot trajectories in the principal plane of the first one.
 
