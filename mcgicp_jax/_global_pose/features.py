@@ -19,6 +19,7 @@ from scipy.sparse import csr_array
 
 from mcgicp_jax._clouds.point_cloud import Frame, PointCloud
 from mcgicp_jax._compute.concrete import AnyArray, AnyScalar
+from mcgicp_jax._compute.messages import optional_module
 from mcgicp_jax._compute.row_functions import Input, Rows, blockwise
 from mcgicp_jax._compute.tables import BLOCK, blocks
 from mcgicp_jax._global_pose.robust_pose_fit import NUM_MATCHES, PutativeMatches
@@ -307,7 +308,7 @@ def image_matches(source: Frame, target: Frame) -> tuple[Int[np.ndarray, "n"], I
 
 def _sift(image: Any) -> tuple[Float[np.ndarray, "n 2"], Float[np.ndarray, "n 128"]]:
     """Pixels (column, row) and SIFT features of the key points."""
-    cv2 = _opencv()
+    cv2 = optional_module("cv2", "images", "matching images")
     found, features = cv2.SIFT_create().detectAndCompute(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), None)
     if not found:
         return np.zeros((0, 2)), np.zeros((0, 128), np.float32)
@@ -319,7 +320,7 @@ def _matched(
 ) -> tuple[Int[np.ndarray, "k"], Int[np.ndarray, "k"]]:
     if min(len(source), len(target)) < 2:
         return np.zeros(0, np.int64), np.zeros(0, np.int64)
-    matcher = _opencv().BFMatcher()
+    matcher = optional_module("cv2", "images", "matching images").BFMatcher()
     back = {match.queryIdx: match.trainIdx for match in matcher.match(target, source)}
     good = [
         (first.queryIdx, first.trainIdx)
@@ -334,11 +335,3 @@ def _nearest(frame: Frame, pixels: Float[np.ndarray, "n 2"]) -> Int[np.ndarray, 
     """The row of the cloud nearest to each pixel, −1 for none."""
     queries, points = (np.pad(np.asarray(each, float), ((0, 0), (0, 1))) for each in (pixels, frame.pixels))
     return nearest_in_position(queries, points, _MAX_PIXELS).astype(np.int64)
-
-
-def _opencv() -> Any:
-    try:
-        import cv2
-    except ImportError as error:
-        raise ImportError("image features need OpenCV: pip install 'mcgicp_jax[images]'") from error
-    return cv2

@@ -60,19 +60,19 @@ class Terms(NamedTuple):
 class NormalEquations:
     """The sparse equations (H + λD) ξ = −g of a graph.
 
-    If there are measurements in the world's frame, the last pose is that of the world, the identity, and is held. Of
-    every other connected part, the first pose is held. The elimination order (minimum degree on the graph of poses) and
-    the place of every block in the matrix are computed once. Measurements that are not in use have no place: false
+    If there are measurements in the world's frame, the last pose is that of the world, the identity, and is fixed. Of
+    every other connected part, the first pose is fixed. The elimination order (minimum degree on the graph of poses)
+    and the place of every block in the matrix are computed once. Measurements that are not in use have no place: false
     loops between distant poses would fill the factors.
 
     Attributes:
         factors: all measurements, the edges first. Measurements are numbered in this order.
         rows: (m, 2) rows of the poses of every measurement.
         used: (m,) which measurements are in use.
-        place: place of each pose in the elimination order; −1 for poses that are held.
-        held: which poses do not move.
+        place: place of each pose in the elimination order; −1 for poses that are fixed.
+        fixed: which poses do not move.
         parts: number of the connected part of each pose.
-        root: the held pose to which covariances refer: the first one, or the world.
+        root: the fixed pose to which covariances refer: the first one, or the world.
         metric: the sparse matrix D, at the given poses.
     """
 
@@ -96,12 +96,12 @@ class NormalEquations:
         ends = self._first[self.used].ravel(), self._second[self.used].ravel()
         graph = coo_array((np.ones(len(ends[0])), ends), (num_poses, num_poses))
         _, self.parts = connected_components(graph, directed=False)
-        held = np.unique(self.parts, return_index=True)[1]
-        held[self.parts[self.root]] = self.root
-        self.held = np.zeros(num_poses, bool)
-        self.held[held] = True
+        fixed = np.unique(self.parts, return_index=True)[1]
+        fixed[self.parts[self.root]] = self.root
+        self.fixed = np.zeros(num_poses, bool)
+        self.fixed[fixed] = True
         self.place = np.full(num_poses, -1)
-        self.place[~self.held] = _elimination_order(graph, self.held)
+        self.place[~self.fixed] = _elimination_order(graph, self.fixed)
         self._lay_out()
         typical = typical_information(*factors)[..., None] * np.eye(6)
         self.metric = self.matrix(normal_blocks(motion_jacobians(poses[self.rows]), typical))
@@ -109,7 +109,7 @@ class NormalEquations:
     @property
     def size(self) -> int:
         """Number of unknowns."""
-        return 6 * int((~self.held).sum())
+        return 6 * int((~self.fixed).sum())
 
     def split(self, values: np.ndarray) -> list[np.ndarray]:
         """Values of all measurements, by kind."""
@@ -139,14 +139,14 @@ class NormalEquations:
 
     def gathered(self, rows: Float[np.ndarray, "n *k"]) -> Float[np.ndarray, "size"]:
         """Rows of the poses as a vector of the unknowns."""
-        vector = np.empty(((~self.held).sum(), *rows.shape[1:]))
-        vector[self.place[~self.held]] = rows[~self.held]
+        vector = np.empty(((~self.fixed).sum(), *rows.shape[1:]))
+        vector[self.place[~self.fixed]] = rows[~self.fixed]
         return vector.reshape(-1)
 
     def spread(self, vector: Float[np.ndarray, "size *k"]) -> Float[np.ndarray, "n 6 *k"]:
-        """A vector of the unknowns as rows of the poses, 0 for held poses."""
+        """A vector of the unknowns as rows of the poses, 0 for fixed poses."""
         rows = np.zeros((len(self.place), 6, *vector.shape[1:]))
-        rows[~self.held] = vector.reshape(-1, *rows.shape[1:])[self.place[~self.held]]
+        rows[~self.fixed] = vector.reshape(-1, *rows.shape[1:])[self.place[~self.fixed]]
         return rows
 
     def weighted(self, blocks: Float[np.ndarray, "m 2 2 6 6"], weights: Inexact[np.ndarray, "m"]) -> Any:
@@ -219,12 +219,12 @@ def typical_information(*factors: AbstractFactor) -> Float[np.ndarray, "m 6"]:
     return np.repeat(typical, 3, axis=1)
 
 
-def _elimination_order(graph: Any, held: Bool[np.ndarray, "n"]) -> Int[np.ndarray, "k"]:
+def _elimination_order(graph: Any, fixed: Bool[np.ndarray, "n"]) -> Int[np.ndarray, "k"]:
     """Place of each free pose in an elimination order with little fill, minimum degree by SuperLU."""
     from scipy.sparse import eye_array
     from scipy.sparse.linalg import splu
 
-    free = ~held
+    free = ~fixed
     if not free.any():
         return np.zeros(0, int)
     pattern = graph.tocsr()[free][:, free]

@@ -30,7 +30,7 @@ def pose_covariances(
     if equations.size:
         try:
             factor = factored(equations.damped(equations.weighted(found.terms.blocks, weights)))
-            covariances[~equations.held] = inverse_blocks(factor)[equations.place[~equations.held]]
+            covariances[~equations.fixed] = inverse_blocks(factor)[equations.place[~equations.fixed]]
         except (RuntimeError, np.linalg.LinAlgError):
             covariances[:] = np.nan
     covariances[equations.parts != equations.parts[equations.root]] = np.diag(np.full(6, np.inf))

@@ -160,26 +160,26 @@ def solve(
     with np.errstate(over="ignore", invalid="ignore"):
         poses, factors, origin = _centred(poses, factors)
         uncertain = np.concatenate([np.asarray(factor.uncertain) for factor in factors]) & robust
-        held = unmeasured(factors[0], poses, typical_information(*factors)[: len(factors[0])])
-        equations, found, weights = _minimum(poses, factors, held, uncertain, max_iterations)
-        status = _status(equations, found, weights, held)
+        anchors = unmeasured(factors[0], poses, typical_information(*factors)[: len(factors[0])])
+        equations, found, weights = _minimum(poses, factors, anchors, uncertain, max_iterations)
+        status = _status(equations, found, weights, anchors)
         if exact and status == Status.CONVERGED:
             found = refine(equations, found, weights)
         return Solution(equations, found, weights, origin, status, found.terms.cost(weights))
 
 
 def _minimum(
-    poses: Float[np.ndarray, "n 4 4"], factors: Factors, held: Edge, uncertain: Bool[np.ndarray, "m"], limit: int
+    poses: Float[np.ndarray, "n 4 4"], factors: Factors, anchors: Edge, uncertain: Bool[np.ndarray, "m"], limit: int
 ) -> tuple[NormalEquations, Minimum, Float[np.ndarray, "m"]]:
-    """`robust_minimum`; with the edges of `held` if the measurements do not constrain all poses without them."""
-    if not held.information.any():
+    """`robust_minimum`; with `anchors`, edges to the start, if the measurements do not constrain all poses alone."""
+    if not anchors.information.any():
         return robust_minimum(NormalEquations(factors, poses), poses, uncertain, limit)
-    both = NormalEquations((*factors, held), poses)
-    both, first, all_weights = robust_minimum(both, poses, np.append(uncertain, held.uncertain), limit)
+    both = NormalEquations((*factors, anchors), poses)
+    both, first, all_weights = robust_minimum(both, poses, np.append(uncertain, anchors.uncertain), limit)
     weights = all_weights[: len(uncertain)]
     equations = NormalEquations(factors, poses, weights > 0)
     found = first._replace(terms=equations.terms(first.poses))
-    if not _is_degenerate(equations, found, weights, held):
+    if not _is_degenerate(equations, found, weights, anchors):
         found = minimize(equations, found, weights, limit)
     elif first.converged:
         settled = settle(both, first, all_weights, np.arange(len(all_weights)) >= len(uncertain)).poses
@@ -229,16 +229,16 @@ def _rigid(matrices: np.ndarray) -> Float[np.ndarray, "_ 4 4"]:
     return matrices
 
 
-def _status(equations: NormalEquations, found: Minimum, weights: Float[np.ndarray, "m"], held: Edge) -> Status:
+def _status(equations: NormalEquations, found: Minimum, weights: Float[np.ndarray, "m"], anchors: Edge) -> Status:
     if not (np.isfinite(found.poses).all() and np.isfinite(found.terms.squares).all()):
         return Status.NON_FINITE
-    if _is_degenerate(equations, found, weights, held):
+    if _is_degenerate(equations, found, weights, anchors):
         return Status.DEGENERATE
     return Status.CONVERGED if found.converged else Status.MAX_ITERATIONS
 
 
-def _is_degenerate(equations: NormalEquations, found: Minimum, weights: Float[np.ndarray, "m"], held: Edge) -> bool:
-    """Whether poses are not connected, or H along some direction is less than `held`, or than rounding and damping.
+def _is_degenerate(equations: NormalEquations, found: Minimum, weights: Float[np.ndarray, "m"], anchors: Edge) -> bool:
+    """Whether poses are not connected, or H along some direction is less than that of `anchors`, or than damping.
 
     By inverse iteration with the least damping: that of the last step may be too large to tell.
     """
@@ -248,8 +248,8 @@ def _is_degenerate(equations: NormalEquations, found: Minimum, weights: Float[np
         return False
     matrix = equations.weighted(found.terms.blocks, weights)
     blocks = np.zeros_like(found.terms.blocks)
-    ends = found.poses[equations.rows[: len(held)]]
-    blocks[: len(held)] = normal_blocks(motion_jacobians(ends), np.asarray(held.information)) / _UNCONSTRAINED
+    ends = found.poses[equations.rows[: len(anchors)]]
+    blocks[: len(anchors)] = normal_blocks(motion_jacobians(ends), np.asarray(anchors.information)) / _UNCONSTRAINED
     least = equations.damped(equations.weighted(blocks, weights))
     try:
         factors = factored(matrix + least)

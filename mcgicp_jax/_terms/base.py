@@ -40,25 +40,13 @@ class Linearization(eqx.Module):
     information: Float[Array, "6 n"]
 
     def __add__(self, other: Linearization) -> Linearization:
-        return Linearization(
-            self.force + other.force,
-            self.stiffness + other.stiffness,
-            self.cost + other.cost,
-            self.weight,
-            self.residual,
-            self.information,
-        )
+        force, stiffness, cost = self.force + other.force, self.stiffness + other.stiffness, self.cost + other.cost
+        return Linearization(force, stiffness, cost, self.weight, self.residual, self.information)
 
     def scaled(self, factor: Float[Array, "n"]) -> Linearization:
         """Force, stiffness, cost and weight of each correspondence multiplied by a factor."""
-        return Linearization(
-            factor * self.force,
-            factor * self.stiffness,
-            factor * self.cost,
-            factor * self.weight,
-            self.residual,
-            self.information,
-        )
+        force, stiffness, cost, weight = (factor * x for x in (self.force, self.stiffness, self.cost, self.weight))
+        return Linearization(force, stiffness, cost, weight, self.residual, self.information)
 
 
 def linearize_residual(

@@ -16,6 +16,7 @@ from scipy.spatial.transform import Rotation
 
 from mcgicp_jax import io
 from mcgicp_jax._clouds.point_cloud import Frame, PointCloud
+from mcgicp_jax._compute.messages import optional_module
 from mcgicp_jax.io.clouds import is_cloud
 
 Matrix: TypeAlias = Float[np.ndarray, "4 4"]
@@ -187,10 +188,7 @@ def back_project(
 
 
 def _open(path: str | os.PathLike[str]) -> Any:
-    try:
-        from PIL import Image
-    except ImportError as error:
-        raise ImportError("reading images needs pillow: pip install 'mcgicp_jax[io]'") from error
+    Image = optional_module("PIL.Image", "io", "reading images")
     try:
         return Image.open(path)
     except Image.UnidentifiedImageError as error:

@@ -24,7 +24,7 @@ from mcgicp_jax.plot.drawing import (
     View,
     drawable,
     has_everywhere,
-    optional_module,
+    plotting,
     rgb_of,
 )
 
@@ -277,7 +277,7 @@ def _add_ellipses(
     lengths = scale * np.sqrt(np.maximum(sizes, 0))
     angles = np.degrees(np.arctan2(vectors[:, 1, 1], vectors[:, 0, 1]))
     style = {"units": "xy", "facecolors": "none", "edgecolors": "black", "linewidths": 1.2}
-    ellipses = drawing.optional_module("matplotlib.collections").EllipseCollection
+    ellipses = drawing.plotting("matplotlib.collections").EllipseCollection
     panel.add_collection(ellipses(*lengths.T[::-1], angles, offsets=offsets, transOffset=panel.transData, **style))
 
 
@@ -316,7 +316,7 @@ def clouds(*clouds: PointCloud, names: Sequence[str] | None = None) -> plotly.gr
         ValueError: if the number of names differs from that of the clouds.
         ImportError: if plotly is missing.
     """
-    graphs = optional_module("plotly.graph_objects")
+    graphs = plotting("plotly.graph_objects")
     if names is None:
         names = [f"cloud {i}" for i in range(len(clouds))]
     if len(names) != len(clouds):
