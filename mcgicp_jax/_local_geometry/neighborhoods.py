@@ -102,11 +102,6 @@ class PointRows(NamedTuple):
     few: Any = None
 
 
-def points_alone(cloud: PointCloud) -> list[Input]:
-    """The input of a row function of points without neighbours, see `neighborhoods`."""
-    return [Input(PointRows(cloud.points, given=cloud.covariances))]
-
-
 def with_near(cloud: PointCloud, with_channels: bool, with_given: bool = False) -> list[Input]:
     """The inputs of a row function of neighbourhoods, see `neighborhoods`: the points and their neighbours.
 

@@ -27,14 +27,7 @@ from mcgicp_jax._local_geometry.local_geometry import (
     geometry_table,
     local_geometries,
 )
-from mcgicp_jax._local_geometry.neighborhoods import (
-    Neighborhoods,
-    PointRows,
-    neighborhoods,
-    of_rows,
-    points_alone,
-    with_near,
-)
+from mcgicp_jax._local_geometry.neighborhoods import Neighborhoods, PointRows, neighborhoods, of_rows, with_near
 from mcgicp_jax._local_geometry.observability import channel_observability
 from mcgicp_jax._math import symmetric_matrices as alg
 from mcgicp_jax._math.robust_kernels import AbstractKernel
@@ -329,7 +322,7 @@ def needs_neighborhoods(method: AbstractMethod, described: bool) -> bool:
 def _inputs(method: AbstractMethod, cloud: PointCloud, described: bool) -> list[Input]:
     if needs_neighborhoods(method, described):
         return with_near(cloud, method.uses_channels, with_given=True)
-    return points_alone(cloud)
+    return [Input(PointRows(cloud.points, given=cloud.covariances))]
 
 
 @cache

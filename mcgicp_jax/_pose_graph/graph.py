@@ -93,16 +93,6 @@ def _stacked(edges: Sequence[Edge]) -> Edge:
     return jax.tree.map(lambda *values: xp.stack(values), *edges)
 
 
-def _initial(edges: Edge) -> Float[np.ndarray, "n 4 4"]:
-    if not is_concrete(edges) or not len(edges):
-        raise ValueError("poses: required, since initial poses can only be computed from at least one concrete edge")
-    number = int(max(np.max(edges.i), np.max(edges.j))) + 1
-    edges = checked_edges(edges, number)
-    i, j = np.where(edges.i == WORLD, number, edges.i), np.asarray(edges.j)
-    uncertain = np.asarray(edges.uncertain)
-    return initial_poses(i, j, np.asarray(edges.T_i_j), np.asarray(edges.information), uncertain, number)
-
-
 def _check_factor(name: str, factor: Any, num_poses: int) -> None:
     if not isinstance(factor, AbstractFactor):
         raise ValueError(f"{name}: expected an AbstractFactor, got {type(factor).__name__}")
@@ -113,24 +103,23 @@ def _check_factor(name: str, factor: Any, num_poses: int) -> None:
         check_rows(name, np.asarray(factor.rows), num_poses)
 
 
-def initial_poses(
-    i: Int[np.ndarray, "m"],
-    j: Int[np.ndarray, "m"],
-    motions: Float[np.ndarray, "m 4 4"],
-    information: Float[np.ndarray, "m 6 6"],
-    loop: Bool[np.ndarray, "m"],
-    number: int,
-) -> Float[np.ndarray, "number 4 4"]:
-    """Poses from edges, whose row `i` is `number` for the world.
+def _initial(edges: Edge) -> Float[np.ndarray, "n 4 4"]:
+    """Poses to start from.
 
     A spanning tree prefers edges that are no loops, then loops, then edges without information on some direction. Parts
     that are not connected with the world begin at the identity.
     """
+    if not is_concrete(edges) or not len(edges):
+        raise ValueError("poses: required, since initial poses can only be computed from at least one concrete edge")
+    number = int(max(np.max(edges.i), np.max(edges.j))) + 1
+    edges = checked_edges(edges, number)
+    information: Any = edges.information
     # An edge of the identity from the world to each pose, to be used last, keeps other parts.
-    i, j = np.concatenate([i, np.full(number, number)]), np.concatenate([j, np.arange(number)])
-    motions = np.concatenate([motions, np.tile(np.eye(4), (number, 1, 1))])
+    i = np.concatenate([np.where(edges.i == WORLD, number, edges.i), np.full(number, number)])
+    j = np.concatenate([edges.j, np.arange(number)])
+    motions = np.concatenate([edges.T_i_j, np.tile(np.eye(4), (number, 1, 1))])
     values = np.linalg.eigvalsh(information)
-    rank = np.concatenate([loop + 2 * (values[:, 0] <= _BLIND * values[:, -1]), np.full(number, 4)])
+    rank = np.concatenate([edges.uncertain + 2 * (values[:, 0] <= _BLIND * values[:, -1]), np.full(number, 4)])
     poses, used = _along_tree(i, j, motions, rank, number)
     used |= rank == 0
     if used.sum() > number:

@@ -11,13 +11,17 @@ compiled for every graph; so the loop is written out here.
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 from jaxtyping import Bool, Float, Inexact, Int
 
 from mcgicp_jax._math.poses import exponential
 from mcgicp_jax._pose_graph.edge import WORLD, AbstractFactor, motion_jacobians
+
+# Poses of the graph and, with measurements in the world's frame, the world's; a number for every measurement.
+Poses: TypeAlias = Float[np.ndarray, "n 4 4"]
+PerMeasurement: TypeAlias = Float[np.ndarray, "m"]
 
 # Least damping, as a fraction of the information of a typical edge. Directions that no measurement observes are then
 # 3e4 times as uncertain as a typical edge, and the factorisation loses half of the digits of float64.
@@ -48,11 +52,11 @@ class Terms(NamedTuple):
         blocks: JᵀΛJ of every measurement, by first and second pose.
     """
 
-    squares: Float[np.ndarray, "m"]
+    squares: PerMeasurement
     gradient: Float[np.ndarray, "m 2 6"]
     blocks: Float[np.ndarray, "m 2 2 6 6"]
 
-    def cost(self, weights: Float[np.ndarray, "m"]) -> float:
+    def cost(self, weights: PerMeasurement) -> float:
         """½ Σ w rᵀΛr."""
         return 0.5 * float(weights @ self.squares)
 
@@ -76,12 +80,7 @@ class NormalEquations:
         metric: the sparse matrix D, at the given poses.
     """
 
-    def __init__(
-        self,
-        factors: tuple[AbstractFactor, ...],
-        poses: Float[np.ndarray, "n 4 4"],
-        used: Bool[np.ndarray, "m"] | None = None,
-    ):
+    def __init__(self, factors: tuple[AbstractFactor, ...], poses: Poses, used: Bool[np.ndarray, "m"] | None = None):
         # Imported late, as SciPy's sparse matrices take a tenth of the import time of the package.
         from scipy.sparse import coo_array
         from scipy.sparse.csgraph import connected_components
@@ -119,7 +118,7 @@ class NormalEquations:
         """The equations of some of the measurements."""
         return self if np.array_equal(used, self.used) else NormalEquations(self.factors, self._start, used)
 
-    def terms(self, poses: Float[np.ndarray, "n 4 4"]) -> Terms:
+    def terms(self, poses: Poses) -> Terms:
         """Evaluate all measurements."""
         found = []
         for factor, rows in zip(self.factors, self.split(self.rows), strict=True):
@@ -131,7 +130,7 @@ class NormalEquations:
             found.append((np.einsum("mi,mi->m", residuals, forces), gradient, blocks))
         return Terms(*(np.concatenate(each) for each in zip(*found, strict=True)))
 
-    def gradient(self, terms: Terms, weights: Float[np.ndarray, "m"]) -> Float[np.ndarray, "size"]:
+    def gradient(self, terms: Terms, weights: PerMeasurement) -> Float[np.ndarray, "size"]:
         """g, in the elimination order."""
         weighted = (weights[:, None, None] * terms.gradient).reshape(-1, 6)
         ends, number = self.rows.ravel(), len(self.place)
@@ -247,16 +246,14 @@ class Minimum(NamedTuple):
         damping: λ for a next step.
     """
 
-    poses: Float[np.ndarray, "n 4 4"]
+    poses: Poses
     terms: Terms
     num_iterations: int = 0
     converged: bool = False
     damping: float = _START_DAMPING
 
 
-def minimize(
-    equations: NormalEquations, start: Minimum, weights: Float[np.ndarray, "m"], max_iterations: int
-) -> Minimum:
+def minimize(equations: NormalEquations, start: Minimum, weights: PerMeasurement, max_iterations: int) -> Minimum:
     """Lower ½ Σ w rᵀΛr by Levenberg-Marquardt steps until one lowers it by no more than tolerance and rounding.
 
     The weights of measurements that are not in use are 0.
@@ -291,7 +288,7 @@ def minimize(
     return Minimum(poses, terms, count, False, damping)
 
 
-def refine(equations: NormalEquations, found: Minimum, weights: Float[np.ndarray, "m"]) -> Minimum:
+def refine(equations: NormalEquations, found: Minimum, weights: PerMeasurement) -> Minimum:
     """The minimum to rounding, by more Gauss-Newton steps: derivatives are as exact as the poses."""
     for _ in range(_REFINEMENTS):
         after = minimize(equations, found._replace(damping=LEAST_DAMPING), weights, 1)
@@ -303,7 +300,7 @@ def refine(equations: NormalEquations, found: Minimum, weights: Float[np.ndarray
 
 
 def settle(
-    equations: NormalEquations, found: Minimum, weights: Float[np.ndarray, "m"], start: Bool[np.ndarray, "m"]
+    equations: NormalEquations, found: Minimum, weights: PerMeasurement, start: Bool[np.ndarray, "m"]
 ) -> Minimum:
     """Take back what noise has moved along directions that only the measurements of the `start` constrain.
 

@@ -20,6 +20,8 @@ from mcgicp_jax._pose_graph.graph import unmeasured
 from mcgicp_jax._pose_graph.levenberg_marquardt import (
     Minimum,
     NormalEquations,
+    PerMeasurement,
+    Poses,
     factored,
     minimize,
     normal_blocks,
@@ -51,8 +53,8 @@ Factors: TypeAlias = tuple[Any, ...]
 
 
 def robust_minimum(
-    equations: NormalEquations, start: Float[np.ndarray, "n 4 4"], uncertain: Bool[np.ndarray, "m"], max_iterations: int
-) -> tuple[NormalEquations, Minimum, Float[np.ndarray, "m"]]:
+    equations: NormalEquations, start: Poses, uncertain: Bool[np.ndarray, "m"], max_iterations: int
+) -> tuple[NormalEquations, Minimum, PerMeasurement]:
     """The equations of the measurements that are kept, the minimum, and the weights of all measurements, 0 or 1."""
     found, limits = Minimum(start, equations.terms(start)), thresholds(equations)
     largest = (found.terms.squares / limits)[uncertain].max(initial=0)
@@ -79,7 +81,7 @@ def robust_minimum(
     return equations, found, weights
 
 
-def thresholds(equations: NormalEquations) -> Float[np.ndarray, "m"]:
+def thresholds(equations: NormalEquations) -> PerMeasurement:
     """Squared Mahalanobis distances beyond which measurements are rejected: 99 % quantiles of χ²."""
     from scipy.special import chdtri
 
@@ -87,9 +89,7 @@ def thresholds(equations: NormalEquations) -> Float[np.ndarray, "m"]:
     return chdtri(np.concatenate(sizes), _LEVEL)
 
 
-def _wrongly_rejected(
-    equations: NormalEquations, found: Minimum, weights: Float[np.ndarray, "m"]
-) -> Int[np.ndarray, "k"]:
+def _wrongly_rejected(equations: NormalEquations, found: Minimum, weights: PerMeasurement) -> Int[np.ndarray, "k"]:
     """Rejected measurements whose residual is within the threshold, given the combined uncertainty of the measurement
     and of the remaining graph.
     """
@@ -131,13 +131,13 @@ class Solution(NamedTuple):
 
     equations: NormalEquations
     found: Minimum
-    weights: Float[np.ndarray, "m"]
+    weights: PerMeasurement
     origin: Float[np.ndarray, "3"]
     status: Status
     cost: float
 
     @property
-    def residuals(self) -> Float[np.ndarray, "m"]:
+    def residuals(self) -> PerMeasurement:
         """√(rᵀΛr) of every measurement."""
         return np.sqrt(np.maximum(self.found.terms.squares, 0))
 
@@ -152,9 +152,7 @@ class Solution(NamedTuple):
         return pose_covariances(self.equations, self.found, self.weights)[:number]
 
 
-def solve(
-    poses: Float[np.ndarray, "n 4 4"], factors: Factors, robust: bool, max_iterations: int, exact: bool = False
-) -> Solution:
+def solve(poses: Poses, factors: Factors, robust: bool, max_iterations: int, exact: bool = False) -> Solution:
     """Minimise ½ Σ w rᵀΛr from the given poses, to rounding if `exact`; all arrays are NumPy's."""
     # Overflow is a status.
     with np.errstate(over="ignore", invalid="ignore"):
@@ -169,8 +167,8 @@ def solve(
 
 
 def _minimum(
-    poses: Float[np.ndarray, "n 4 4"], factors: Factors, anchors: Edge, uncertain: Bool[np.ndarray, "m"], limit: int
-) -> tuple[NormalEquations, Minimum, Float[np.ndarray, "m"]]:
+    poses: Poses, factors: Factors, anchors: Edge, uncertain: Bool[np.ndarray, "m"], limit: int
+) -> tuple[NormalEquations, Minimum, PerMeasurement]:
     """`robust_minimum`; with `anchors`, edges to the start, if the measurements do not constrain all poses alone."""
     if not anchors.information.any():
         return robust_minimum(NormalEquations(factors, poses), poses, uncertain, limit)
@@ -187,9 +185,7 @@ def _minimum(
     return equations, found, weights
 
 
-def covariances_at(
-    poses: Float[np.ndarray, "n 4 4"], factors: Factors, weights: Float[np.ndarray, "m"]
-) -> Float[np.ndarray, "n 6 6"]:
+def covariances_at(poses: Poses, factors: Factors, weights: PerMeasurement) -> Float[np.ndarray, "n 6 6"]:
     """`Solution.covariances` of a solution that is known."""
     with np.errstate(over="ignore", invalid="ignore"):
         centred, factors, _ = _centred(poses, factors)
@@ -198,9 +194,7 @@ def covariances_at(
         return pose_covariances(equations, found, weights)[: len(poses)]
 
 
-def _centred(
-    poses: Float[np.ndarray, "n 4 4"], factors: Factors
-) -> tuple[Float[np.ndarray, "_ 4 4"], Factors, Float[np.ndarray, "3"]]:
+def _centred(poses: Poses, factors: Factors) -> tuple[Float[np.ndarray, "_ 4 4"], Factors, Float[np.ndarray, "3"]]:
     """Exact rigid poses and edges about another origin of the world, and that origin.
 
     It is the first position or, with priors, their median: at UTM coordinates, 1e-9 m are lost to rounding, and costs
@@ -229,7 +223,7 @@ def _rigid(matrices: np.ndarray) -> Float[np.ndarray, "_ 4 4"]:
     return matrices
 
 
-def _status(equations: NormalEquations, found: Minimum, weights: Float[np.ndarray, "m"], anchors: Edge) -> Status:
+def _status(equations: NormalEquations, found: Minimum, weights: PerMeasurement, anchors: Edge) -> Status:
     if not (np.isfinite(found.poses).all() and np.isfinite(found.terms.squares).all()):
         return Status.NON_FINITE
     if _is_degenerate(equations, found, weights, anchors):
@@ -237,7 +231,7 @@ def _status(equations: NormalEquations, found: Minimum, weights: Float[np.ndarra
     return Status.CONVERGED if found.converged else Status.MAX_ITERATIONS
 
 
-def _is_degenerate(equations: NormalEquations, found: Minimum, weights: Float[np.ndarray, "m"], anchors: Edge) -> bool:
+def _is_degenerate(equations: NormalEquations, found: Minimum, weights: PerMeasurement, anchors: Edge) -> bool:
     """Whether poses are not connected, or H along some direction is less than that of `anchors`, or than damping.
 
     By inverse iteration with the least damping: that of the last step may be too large to tell.
