@@ -50,9 +50,8 @@ _VERIFIED_WITHIN, _VERIFIED_ITERATIONS = (4.0, TOLERANCE), 40
 # Number of neighbours for that registration, the default of `preprocess`.
 _NUM_NEIGHBORS = 20
 # Smallest i/√n (a/m)² of a success (see `GlobalPoseResult.support`), in general and where the shape of the clouds
-# leaves a direction of motion unconstrained, and smallest number of inliers. On the development half of
-# `tests/benchmarks/global_pose_verdicts`, wrong poses reach 0.15 (streets) and 0.40 (corridors), and right ones with
-# ten inliers have 0.22 and 1.4 or more. On the other half, wrong poses reach 0.17 (rooms with the same walls) and 0.57.
+# leaves a direction of motion unconstrained, and smallest number of inliers: from the development half of
+# `tests/benchmarks/global_pose_verdicts`.
 _LEAST, _LEAST_UNCONSTRAINED, _MIN_INLIERS = 0.21, 0.7, 10
 # Smallest fractions of the best pose's inliers and overlap with which another pose is a rival, which makes the result
 # ambiguous. Scans of a road reach 0.75 of the inliers with 0.83 of the overlap at another place along it.

@@ -34,15 +34,12 @@ _MIN_POINTS, _MIN_RATIO = 6, 0.01
 # Smallest standard deviation of the points in a cell, in voxels. Some scanners report each beam without an echo as a
 # point at the origin; such a cell is no surface.
 _MIN_EXTENT = 1e-4
-# Scale k of the kernel, standard deviations. The usual score is −exp(−d₂ s²/2), so that k² = 2/d₂. Magnusson's formula
-# for d₂ (2009) depends on the unit of length; with the usual 55 % of outliers and cells of 1 m it gives k = 2.15. For
-# cells against cells Stoyanov et al. (2012) use d₂ = 0.05, k = 6.3; in a sum over several cells, distant ones then have
-# too much weight: the error on KITTI with cells of 1 m is 14 mm with 2.15, 15 with 3, 18 with 4 and 28 with 6.3.
+# Scale k of the kernel, standard deviations. The usual score is −exp(−d₂ s²/2), so that k² = 2/d₂; Magnusson's formula
+# for d₂ (2009), with the usual 55 % of outliers and cells of 1 m. For cells against cells: Constants in
+# `tests/benchmarks/README.md`.
 _SCALE = 2.15
-# Number of the target's cells that a cell is matched with. The voxels of the two clouds are not aligned, and the pose
-# follows the nearest cells of the other grid: on KITTI with cells of 1 m, the error is 60 mm with one, 14 with 4 and 14
-# with 7. For points against cells, a sum over seven changes nothing (16 mm with one, 4 or 7), and with cells of one
-# colour it costs accuracy (10.7 mm with one and 18.8 with 7 on a flat table).
+# Number of the target's cells that a cell is matched with: the voxels of the two clouds are not aligned, and the pose
+# follows the nearest cells of the other grid (60 mm with one on KITTI, 14 with 4 or 7). Points need one.
 _NUM_CANDIDATES = 4
 
 

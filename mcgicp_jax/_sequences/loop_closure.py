@@ -26,10 +26,8 @@ from mcgicp_jax._registration.result import RegistrationResult, Status
 # Least overlap of a registration that becomes an edge: with less, a wrong local minimum looks like a right one.
 LEAST_OVERLAP = 0.4
 # Ratio of the information along unconstrained directions to that along constrained ones. The directions are known to
-# δ = 2 mrad, so that a fraction δ² = 4e-6 of the constrained information leaks into them. With ratios below that, poses
-# slide along a corridor to correct millimetres across it. With ratios from 1e-2 on, the edges of a corridor that is 5 %
-# too long in the start contradict the loop at its end, which is then rejected. Errors with this loop, in three
-# simulated corridors: 134 to 291 mm with 1e-6, 46 to 85 with 1e-5, 6 to 13 with 1e-4, 3 to 5 with 1e-3, 117 from 1e-2.
+# δ = 2 mrad, so that a fraction δ² = 4e-6 of the constrained information leaks into them: poses slide along a corridor
+# with less. With 1e-2, edges of a corridor that is too long in the start contradict the loop at its end.
 _UNCONSTRAINED_RATIO = 1e-4
 # Two frames may close a loop if their distance is at most this many median ranges of the points, plus this many
 # standard deviations of the distance (99 % of χ² with three degrees of freedom); the overlap decides. In the benchmark,
