@@ -65,7 +65,7 @@ class LocalGeometry(NamedTuple):
 Geometries: TypeAlias = Callable[[tuple[Any, Any]], tuple[LocalGeometry, LocalGeometry]]
 
 
-def describe(around: Neighborhoods) -> LocalGeometry:
+def local_geometry_of(around: Neighborhoods) -> LocalGeometry:
     """Local geometry of neighbourhoods."""
     offsets = offsets_of(around)
     present = around.present.astype(offsets[0].dtype)
@@ -156,7 +156,7 @@ def local_geometries(
 
     Args:
         with_channels: whether the method uses the channels; if not, the programs do not depend on their number.
-        rows: (n,) those of the source and of the target to describe; None for all.
+        rows: (n,) those of the source and of the target; None for all.
         num_threads: largest number of threads on the host; None for no limit.
 
     Returns:
@@ -196,7 +196,7 @@ def _table(
 
 
 def _geometry(_: None, own: Rows, near: Rows) -> tuple[LocalGeometry]:
-    return (describe(neighborhoods(own, near)),)
+    return (local_geometry_of(neighborhoods(own, near)),)
 
 
 class SurfaceNoise(NamedTuple):

@@ -129,7 +129,7 @@ def of_rows(inputs: list[Input], rows: Any) -> list[Input]:
 
 
 def neighborhoods(own: Rows, near: Rows | None = None) -> Neighborhoods:
-    """The neighbourhoods of the rows of `with_near`, or the points of `points_alone`."""
+    """The neighbourhoods of the rows of `with_near`, or the points alone."""
     if near is None:
         return Neighborhoods(own.tree.points.T, own.tree.given)
     present, known, channels = near.index >= 0, own.tree.known, own.tree.channels.T

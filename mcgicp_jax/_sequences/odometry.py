@@ -155,7 +155,7 @@ def _read(
     options: Options,
     preprocessing: _Preprocessing,
 ) -> tuple[str, PointCloud]:
-    """The name and the cloud of the next frame, preprocessed and described as the source of a registration."""
+    """The name and the cloud of the next frame, preprocessed, with the local geometry that a source needs."""
     number, frame = next(frames)
     name = f"frames[{number}]"
     cloud = as_cloud(name, frame.cloud if isinstance(frame, Frame) else frame)
