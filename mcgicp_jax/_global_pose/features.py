@@ -172,8 +172,7 @@ def _statistics(voxel_size: Float[AnyScalar, ""], own: Rows, near: Rows) -> tupl
     _, square = _offsets(around)
     columns = []
     for channel in range(around.num_channels):
-        known = around.present if around.near_known is None else around.near_known[channel]
-        difference, here = around.difference(channel), around.own_channels[channel]
+        known, difference, here = around.known(channel), around.difference(channel), around.own_channels[channel]
         for radius in _CHANNEL_RADII:
             weights = (known & (square <= (radius * voxel_size) ** 2)).astype(square.dtype)
             total = jnp.sum(weights, axis=0)

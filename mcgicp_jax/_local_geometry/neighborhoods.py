@@ -76,7 +76,7 @@ class Neighborhoods(NamedTuple):
         return self.present if self.near_known is None else self.near_known[channel]
 
 
-def check_neighbors(cloud: PointCloud, xp: ModuleType = np) -> Any:
+def check_neighbors(cloud: PointCloud, xp: ModuleType) -> Any:
     """The (N, k) neighbours of a cloud, on the host perhaps `NeighborsOnDemand`; a raw cloud raises `ValueError`."""
     if cloud.deferred_neighbors is None:
         raise ValueError(NO_NEIGHBORS)
