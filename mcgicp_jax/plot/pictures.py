@@ -32,7 +32,7 @@ from mcgicp_jax.plot.drawing import (
 # Most rows below each other; maximum width of a row and height of a panel, inches; pixels and tiles along the longer
 # side of a panel; fraction of each side that the detail shows; most pixels of a point of the sparser cloud.
 _MOST_ROWS, _WIDEST, _HIGHEST, _PANEL_PIXELS, _TILES, _DETAIL, _LARGEST_POINT = 5, 12, 4.5, 500, 12, 0.25, 9
-# These constants affect only how figures look: pixels along the longer side of a map, and width of a figure in inches.
+# Pixels along the longer side of a map, and width of a figure in inches.
 _PIXELS, _WIDTH = 1400, 12
 
 
