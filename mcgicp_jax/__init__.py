@@ -57,16 +57,13 @@ from mcgicp_jax._clouds.color_spaces import rgb_to_hsv, rgb_to_lab, rgb_to_yuv
 from mcgicp_jax._clouds.point_cloud import PointCloud
 from mcgicp_jax._clouds.preprocess import preprocess
 from mcgicp_jax._clouds.voxel_map import merge_clouds
+from mcgicp_jax._global_pose.features import image_matches
 from mcgicp_jax._global_pose.global_pose import GlobalPoseResult, global_pose
-from mcgicp_jax._global_pose.image_matches import image_matches
 from mcgicp_jax._math.robust_kernels import AbstractKernel, Cauchy, GemanMcClure, Huber, Tukey, Welsch
 from mcgicp_jax._methods.base import AbstractMethod
-from mcgicp_jax._methods.channel_covariance import estimate_channel_covariance
-from mcgicp_jax._methods.gicp import GICP
-from mcgicp_jax._methods.icp import ColorICP, PointToPlane, PointToPoint
-from mcgicp_jax._methods.multichannel_gicp import MultiChannelGICP
-from mcgicp_jax._methods.ndt import D2DNDT, NDT, ColorNDT
-from mcgicp_jax._methods.voxel_gaussians import voxel_gaussians
+from mcgicp_jax._methods.icp import GICP, ColorICP, PointToPlane, PointToPoint
+from mcgicp_jax._methods.multichannel_gicp import MultiChannelGICP, estimate_channel_covariance
+from mcgicp_jax._methods.ndt import D2DNDT, NDT, ColorNDT, voxel_gaussians
 from mcgicp_jax._pairs.batch import register_as_completed, register_batch
 from mcgicp_jax._pairs.batch_jobs import PairWarning
 from mcgicp_jax._pairs.cost import mahalanobis_cost

@@ -19,16 +19,20 @@ The command line offers the entries that the registries `METHODS` (each a `Regis
 `DATASETS` and `COLOR_SPACES` have when `mcgicp_jax.__main__` is imported.
 """
 
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
 from mcgicp_jax._clouds.color_spaces import COLOR_SPACES
 from mcgicp_jax._compute.row_functions import Input, Rows, blockwise
-from mcgicp_jax._local_geometry.local_geometry import LocalGeometry
+from mcgicp_jax._local_geometry.local_geometry import LocalGeometry, Surface
 from mcgicp_jax._local_geometry.neighborhoods import Neighborhoods
-from mcgicp_jax._local_geometry.surface import Surface
 from mcgicp_jax._math import symmetric_matrices
 from mcgicp_jax._math.robust_kernels import KERNELS, AbstractKernel
 from mcgicp_jax._methods.base import AbstractGeneralized, AbstractMethod, AbstractOneSided
-from mcgicp_jax._methods.registry import METHODS, RegisteredMethod
-from mcgicp_jax._methods.voxel_gaussians import cell_moments, voxel_cells
+from mcgicp_jax._methods.icp import GICP, ColorICP, PointToPlane, PointToPoint
+from mcgicp_jax._methods.multichannel_gicp import MultiChannelGICP
+from mcgicp_jax._methods.ndt import D2DNDT, NDT, ColorNDT, cell_moments, voxel_cells
 from mcgicp_jax._pose_graph.edge import AbstractFactor
 from mcgicp_jax._search.base import AbstractIndex, AbstractSearch, Correspondences, SearchPoints
 from mcgicp_jax._search.kd_tree import AbstractTreeSearch
@@ -76,3 +80,27 @@ __all__ = [
     "symmetric_matrices",
     "voxel_cells",
 ]
+
+
+@dataclass(frozen=True)
+class RegisteredMethod:
+    """A class of methods, and the arguments of its constructor that select the method of this name."""
+
+    kind: type[AbstractMethod]
+    arguments: Mapping[str, Any] = field(default_factory=dict)
+
+    def __call__(self, **parameters: Any) -> AbstractMethod:
+        return self.kind(**self.arguments, **parameters)
+
+
+METHODS = {
+    "mc-gicp": RegisteredMethod(MultiChannelGICP),
+    "photometric-gicp": RegisteredMethod(MultiChannelGICP, {"photometric": True}),
+    "gicp": RegisteredMethod(GICP),
+    "color-icp": RegisteredMethod(ColorICP),
+    "point-to-plane": RegisteredMethod(PointToPlane),
+    "point-to-point": RegisteredMethod(PointToPoint),
+    "ndt": RegisteredMethod(NDT),
+    "color-ndt": RegisteredMethod(ColorNDT),
+    "d2d-ndt": RegisteredMethod(D2DNDT),
+}

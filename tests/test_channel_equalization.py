@@ -17,8 +17,7 @@ from mcgicp_jax import (
     preprocess,
     register,
 )
-from mcgicp_jax._local_geometry.channel_equalization import with_channels_matched
-from mcgicp_jax._local_geometry.spacing_and_noise import point_spacing
+from mcgicp_jax._local_geometry.cloud_statistics import point_spacing, with_channels_matched
 from tests import reference as ref
 from tests.precision import tolerance
 from tests.scenes import motion

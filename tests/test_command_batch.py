@@ -14,7 +14,7 @@ import pytest
 import mcgicp_jax as mcg
 from mcgicp_jax import io
 from mcgicp_jax.__main__ import main
-from mcgicp_jax._cli.table import POSE
+from mcgicp_jax._cli.batch import POSE
 from mcgicp_jax._clouds.voxel_size import voxels_for
 from mcgicp_jax.metrics import pose_error
 from tests.scenes import motion, room_corner

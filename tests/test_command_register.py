@@ -17,8 +17,8 @@ from mcgicp_jax.__main__ import main
 from mcgicp_jax._cli.options import Options
 from mcgicp_jax._clouds.color_spaces import COLOR_SPACES
 from mcgicp_jax._math.robust_kernels import KERNELS
-from mcgicp_jax._methods.registry import METHODS
 from mcgicp_jax.datasets import DATASETS
+from mcgicp_jax.extend import METHODS
 from tests.scenes import motion, room_corner
 
 TRUTH = motion()

@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from mcgicp_jax import io, metrics
 from mcgicp_jax.datasets import clouds, ford_campus, kitti, seven_scenes, tum_rgbd
-from mcgicp_jax.datasets._images import look_up
+from mcgicp_jax.datasets._frames import look_up
 from tests.scenes import motion
 
 

@@ -9,8 +9,8 @@ from scipy.spatial.transform import Rotation
 import mcgicp_jax as mcg
 from mcgicp_jax import datasets
 from mcgicp_jax.__main__ import main
-from mcgicp_jax._global_pose import fpfh as features
-from mcgicp_jax._global_pose.feature_matching import mutual_nearest
+from mcgicp_jax._global_pose import features
+from mcgicp_jax._global_pose.features import mutual_nearest
 from mcgicp_jax._global_pose.robust_pose_fit import (
     NUM_MATCHES,
     PoseHypotheses,

@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 
 import mcgicp_jax as mcg
 from mcgicp_jax import Status
-from mcgicp_jax._local_geometry.spacing_and_noise import point_spacing
+from mcgicp_jax._local_geometry.cloud_statistics import point_spacing
 from mcgicp_jax._registration.input_checks import warn_of_lengths
 from mcgicp_jax.metrics import pose_error
 from tests.scenes import motion, pair, room_corner

@@ -14,8 +14,8 @@ from scipy.stats import chi2
 
 import mcgicp_jax as mcg
 from mcgicp_jax._math.poses import logarithm
+from mcgicp_jax._pose_graph.levenberg_marquardt import factored
 from mcgicp_jax._pose_graph.marginal_covariances import inverse_blocks
-from mcgicp_jax._pose_graph.normal_equations import factored
 from tests.compilations import compilations
 from tests.graphs import (
     SMALL,

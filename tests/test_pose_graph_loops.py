@@ -9,10 +9,9 @@ from scipy.stats import chi2
 import mcgicp_jax as mcg
 from mcgicp_jax import metrics
 from mcgicp_jax._math.poses import logarithm
-from mcgicp_jax._pose_graph import outliers
+from mcgicp_jax._pose_graph import solver
 from mcgicp_jax._pose_graph.edge import motion_jacobians
-from mcgicp_jax._pose_graph.levenberg_marquardt import Minimum
-from mcgicp_jax._pose_graph.normal_equations import NormalEquations
+from mcgicp_jax._pose_graph.levenberg_marquardt import Minimum, NormalEquations
 from tests.graphs import SMALL, grid, measured, moved
 from tests.scenes import motion
 
@@ -57,14 +56,14 @@ def test_a_loop_is_rejected_only_beyond_its_own_uncertainty_and_that_of_the_othe
     equations = NormalEquations((edges,), poses)
     terms = equations.terms(poses)
     np.testing.assert_allclose(terms.squares[5:], squares)
-    again = outliers._wrongly_rejected(equations, Minimum(poses, terms), 1.0 * (np.arange(10) < 5))
+    again = solver._wrongly_rejected(equations, Minimum(poses, terms), 1.0 * (np.arange(10) < 5))
     np.testing.assert_array_equal(again, [5, 6])
     # Without the edge to the fourth pose, nothing contradicts the loop to it.
     used = np.isin(np.arange(10), [0, 1, 2, 4])
-    again = outliers._wrongly_rejected(equations.restricted(used), Minimum(poses, terms), 1.0 * used)
+    again = solver._wrongly_rejected(equations.restricted(used), Minimum(poses, terms), 1.0 * used)
     np.testing.assert_array_equal(again, [5, 6, 8])
     # Rejected at first, these two are kept in the end, and half of what contradicts is left in both edges.
-    monkeypatch.setattr(outliers, "truncated_weights", lambda ratio, _: 1.0 * (ratio >= 1))
+    monkeypatch.setattr(solver, "truncated_weights", lambda ratio, _: 1.0 * (ratio >= 1))
     found = mcg.optimize_poses(mcg.PoseGraph(poses, edges))
     np.testing.assert_array_equal(np.flatnonzero(~found.kept), [7, 8, 9])
     np.testing.assert_allclose(found.cost, squares[:2].sum() / 4, rtol=1e-6)
@@ -90,7 +89,7 @@ def test_false_loops_are_rejected(name, fraction):
 
 def test_the_threshold_is_the_99_percent_quantile():
     graph, _ = measured(*grid(2))
-    np.testing.assert_allclose(outliers.thresholds(NormalEquations((graph.edges,), graph.poses)), chi2.ppf(0.99, 6))
+    np.testing.assert_allclose(solver.thresholds(NormalEquations((graph.edges,), graph.poses)), chi2.ppf(0.99, 6))
 
 
 def test_outliers_are_the_same_inside_transformations():

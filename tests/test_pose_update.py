@@ -8,7 +8,7 @@ import pytest
 import scipy.optimize
 from scipy.spatial.transform import Rotation
 
-from mcgicp_jax._local_geometry.surface import Surface
+from mcgicp_jax._local_geometry.local_geometry import Surface
 from mcgicp_jax._math import symmetric_matrices as cov
 from mcgicp_jax._pose_solver import update as _solve
 from mcgicp_jax._pose_solver.matched import Matched, Motion

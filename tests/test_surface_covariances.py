@@ -7,8 +7,8 @@ import pytest
 
 from mcgicp_jax import GICP, MultiChannelGICP, PointCloud, PointToPlane, preprocess
 from mcgicp_jax._compute import row_functions
+from mcgicp_jax._local_geometry.cloud_statistics import channel_noise
 from mcgicp_jax._local_geometry.local_geometry import local_geometries, weighted_covariance
-from mcgicp_jax._local_geometry.spacing_and_noise import channel_noise
 from mcgicp_jax._methods.surfaces import surface_pair
 from tests import reference as ref
 from tests import scenes

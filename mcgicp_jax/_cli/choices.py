@@ -11,14 +11,14 @@ import numpy as np
 import mcgicp_jax as mcg
 from mcgicp_jax._cli.options import MethodName, Options
 from mcgicp_jax._clouds.color_spaces import COLOR_SPACES
+from mcgicp_jax._clouds.columns import COLORS
 from mcgicp_jax._clouds.point_cloud import Voxels
 from mcgicp_jax._clouds.voxel_size import voxels_for
-from mcgicp_jax._local_geometry.spacing_and_noise import point_spacing
+from mcgicp_jax._local_geometry.cloud_statistics import point_spacing
 from mcgicp_jax._methods.base import AbstractMethod
-from mcgicp_jax._methods.registry import METHODS
 from mcgicp_jax._registration.step import default_distances
+from mcgicp_jax.extend import METHODS
 
-_RGB = ("red", "green", "blue")
 # Preprocessed source and target, made when they are needed.
 Ready: TypeAlias = Callable[[], tuple[mcg.PointCloud, mcg.PointCloud]]
 
@@ -98,7 +98,7 @@ def _having(clouds: Mapping[str, mcg.PointCloud]) -> str:
 
 def with_channels(cloud: mcg.PointCloud, names: Sequence[str]) -> mcg.PointCloud:
     """The cloud with only the named channels, in this order; a colour space is computed from red, green and blue."""
-    needed = [name for each in names for name in (_RGB if each in COLOR_SPACES else (each,))]
+    needed = [name for each in names for name in (COLORS if each in COLOR_SPACES else (each,))]
     missing = [name for name in dict.fromkeys(needed) if name not in cloud.channel_names]
     if missing:
         raise ValueError(f"no channel {', '.join(missing)}; there are {listed(cloud.channel_names)}")
@@ -106,12 +106,12 @@ def with_channels(cloud: mcg.PointCloud, names: Sequence[str]) -> mcg.PointCloud
     channels, known, chosen = np.asarray(cloud.channels)[:, columns], cloud.channel_valid, list[str]()
     known = None if known is None else np.asarray(known)[:, columns]
     for name in names:
-        three = slice(len(chosen), len(chosen) + len(_RGB))
+        three = slice(len(chosen), len(chosen) + len(COLORS))
         if name in COLOR_SPACES:
             channels[:, three] = COLOR_SPACES[name](channels[:, three])
             if known is not None:
                 known[:, three] = known[:, three].all(axis=1, keepdims=True)
-        chosen += [f"{name}_{i}" for i in range(len(_RGB))] if name in COLOR_SPACES else [name]
+        chosen += [f"{name}_{i}" for i in range(len(COLORS))] if name in COLOR_SPACES else [name]
     return mcg.PointCloud(
         cloud.points, channels, channel_valid=known, covariances=cloud.covariances, channel_names=chosen
     )

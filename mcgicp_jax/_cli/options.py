@@ -19,9 +19,9 @@ from mcgicp_jax import datasets, plot
 from mcgicp_jax._clouds.color_spaces import COLOR_SPACES
 from mcgicp_jax._clouds.preprocess import check_preprocessing
 from mcgicp_jax._math.robust_kernels import KERNELS
-from mcgicp_jax._methods.registry import METHODS
 from mcgicp_jax._registration.options import ROTATION_TOLERANCE
 from mcgicp_jax._registration.options import Options as RegistrationOptions
+from mcgicp_jax.extend import METHODS
 from mcgicp_jax.io.clouds import FORMATS, format_of
 
 if TYPE_CHECKING:

@@ -16,22 +16,13 @@ from jaxtyping import Float
 import mcgicp_jax as mcg
 from mcgicp_jax import datasets, io, metrics, plot
 from mcgicp_jax._cli.choices import Choices, described_distance, with_channels
-from mcgicp_jax._cli.options import (
-    File,
-    Method,
-    MethodName,
-    PairOptions,
-    check_outputs,
-    enumerated,
-    with_names,
-    words,
-)
+from mcgicp_jax._cli.options import File, Method, MethodName, PairOptions, check_outputs, enumerated, with_names, words
 from mcgicp_jax._compute.messages import messages_named
 from mcgicp_jax._compute.threads import side_by_side
 from mcgicp_jax._methods.base import AbstractMethod
-from mcgicp_jax._methods.registry import METHODS
 from mcgicp_jax._pose_solver.degeneracy import describe
 from mcgicp_jax._registration.result import unverified
+from mcgicp_jax.extend import METHODS
 from mcgicp_jax.io.clouds import format_of
 
 Source: TypeAlias = Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="SOURCE")]

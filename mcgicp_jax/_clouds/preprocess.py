@@ -169,15 +169,15 @@ def _warn_of_loss(given: PointCloud, found: PointCloud, num_neighbors: int) -> N
     # Of the rows from which the spacing of a target is computed. Each point is its own first neighbour.
     rows, _ = sampled_rows(np.asarray(found.valid))
     rows = rows[:: 1 + rows.size // _SAMPLE]
-    apart = points[neighbors[rows][:, 1]] - points[rows]
+    offsets = points[neighbors[rows][:, 1]] - points[rows]
     if given.points.dtype == np.float32 and np.any(found.origin):
-        largest, spacing = np.abs(given.points).max(), np.median(np.linalg.norm(apart, axis=1))
+        largest, spacing = np.abs(given.points).max(), np.median(np.linalg.norm(offsets, axis=1))
         if np.spacing(largest) > _LARGEST_STEP * spacing:
             warn(
                 f"points: float32 has rounded coordinates of {largest:.0f} m to steps of {np.spacing(largest):.2g} m, "
                 f"and neighbours are {spacing:.2g} m apart; read them as float64, or subtract an offset before float32"
             )
-    duplicates = np.mean((apart == 0).all(axis=1))
+    duplicates = np.mean((offsets == 0).all(axis=1))
     if duplicates > 0.5:
         warn(
             f"points: {duplicates:.0%} lie exactly on another one, so that neighbourhoods do not span the surface; "

@@ -46,9 +46,7 @@ _FEWER = 0.5
 # that noise made look constrained had 0.4 and more, and 20 points that fill a ball have 0.77.
 _THICK = 0.3
 # They are used if the thickness falls below that, and to this fraction or less while they double; they are given up if
-# it rises by this factor. Averages over more points have less noise: its thickness rose by 5 % at most, and then fell
-# to half or less in doubled voxels. Vegetation and clutter are thicker in larger voxels (by 20 % in KITTI's scans), and
-# the thickness of hilly ground, which the grid causes, falls to 0.7.
+# it rises by this factor (measured: Constants in `tests/benchmarks/README.md`).
 _THINNER, _THICKER = 0.6, 1.1
 # Sizes per decade: those of the preferred numbers R10 of ISO 3, 26 % apart.
 _STEPS = 10

@@ -27,7 +27,7 @@ def voxel_of(points: Float[np.ndarray, "*N 3"], voxel_size: float) -> Float[np.n
 
 
 def voxel_keys(
-    points: Float[np.ndarray, "N 3"], voxel_size: float, first: Float[np.ndarray, "3"] | float = 0.0
+    points: Float[np.ndarray, "N 3"], voxel_size: float, first: Float[np.ndarray, "3"] | float
 ) -> Int[np.ndarray, "N"]:
     """Keys of the voxels that contain the points, the same in every call with the same voxel `first`.
 

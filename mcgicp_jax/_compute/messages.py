@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import importlib
 import sys
 import traceback
 import warnings
@@ -68,6 +69,15 @@ def warn(message: str | Warning) -> None:
     """Issue a warning, of `UserWarning` if it is a text, at the line that called the package."""
     text = f"{_prefix.get()}{message}" if isinstance(message, str) else message
     warnings.warn_explicit(text, UserWarning, *calling_line())
+
+
+def optional_module(module: str, extra: str, use: str) -> Any:
+    """Import a package of an extra of this one; the error message begins with the `use`, such as "plotting"."""
+    try:
+        return importlib.import_module(module)
+    except ImportError as error:
+        name = module.partition(".")[0]
+        raise ImportError(f"{use} needs {name}: pip install 'mcgicp_jax[{extra}]'") from error
 
 
 def check_positive(name: str, value: Any, expected: str = "a positive number") -> None:

@@ -16,8 +16,7 @@ from mcgicp_jax._clouds.voxels import grid_of, voxel_order
 from mcgicp_jax._compute.concrete import AnyArray, outside_trace
 from mcgicp_jax._compute.messages import check_positive, messages_named
 from mcgicp_jax._compute.threads import without_checks_of_jax
-from mcgicp_jax._global_pose.feature_matching import matches_of_features, matches_of_rows
-from mcgicp_jax._global_pose.fpfh import NUM_NEIGHBORS
+from mcgicp_jax._global_pose.features import NUM_NEIGHBORS, matches_of_features, matches_of_rows
 from mcgicp_jax._global_pose.robust_pose_fit import (
     MIN_SEPARATION,
     TOLERANCE,
@@ -28,7 +27,7 @@ from mcgicp_jax._global_pose.robust_pose_fit import (
 )
 from mcgicp_jax._global_pose.surface_agreement import surface_agreement
 from mcgicp_jax._math.poses import nearest_rotation
-from mcgicp_jax._methods.gicp import GICP
+from mcgicp_jax._methods.icp import GICP
 from mcgicp_jax._methods.multichannel_gicp import MultiChannelGICP
 from mcgicp_jax._registration.options import Options
 from mcgicp_jax._registration.register_pair import register_pair
@@ -51,9 +50,8 @@ _VERIFIED_WITHIN, _VERIFIED_ITERATIONS = (4.0, TOLERANCE), 40
 # Number of neighbours for that registration, the default of `preprocess`.
 _NUM_NEIGHBORS = 20
 # Smallest i/√n (a/m)² of a success (see `GlobalPoseResult.support`), in general and where the shape of the clouds
-# leaves a direction of motion unconstrained, and smallest number of inliers. On the development half of
-# `tests/benchmarks/global_pose_verdicts`, wrong poses reach 0.15 (streets) and 0.40 (corridors), and right ones with
-# ten inliers have 0.22 and 1.4 or more. On the other half, wrong poses reach 0.17 (rooms with the same walls) and 0.57.
+# leaves a direction of motion unconstrained, and smallest number of inliers: from the development half of
+# `tests/benchmarks/global_pose_verdicts`.
 _LEAST, _LEAST_UNCONSTRAINED, _MIN_INLIERS = 0.21, 0.7, 10
 # Smallest fractions of the best pose's inliers and overlap with which another pose is a rival, which makes the result
 # ambiguous. Scans of a road reach 0.75 of the inliers with 0.83 of the overlap at another place along it.
@@ -252,10 +250,7 @@ def _with_fewer_neighbors(clouds: tuple[PointCloud, PointCloud]) -> tuple[PointC
 
 
 def _best_pose(
-    matches: PutativeMatches,
-    clouds: tuple[PointCloud, PointCloud],
-    centers: tuple[np.ndarray, ...],
-    voxel_size: float,
+    matches: PutativeMatches, clouds: tuple[PointCloud, PointCloud], centers: tuple[np.ndarray, ...], voxel_size: float
 ) -> GlobalPoseResult:
     """The best of the verified poses, in the user's frames."""
     points = np.asarray(clouds[0].points, np.float64)

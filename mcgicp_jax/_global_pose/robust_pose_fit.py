@@ -85,10 +85,7 @@ def fit_pose(
     regular = length > 0
     across = jnp.where(regular, across / jnp.where(regular, length, 1), normal[:, 0])
     u, v = (axis[:, 0] for axis in alg.orthonormal_basis(across[:, None]))
-    angle = jnp.arctan2(
-        jnp.sum(v * moved[0]) - jnp.sum(u * moved[1]),
-        jnp.sum(u * moved[0]) + jnp.sum(v * moved[1]),
-    )
+    angle = jnp.arctan2(jnp.sum(v * moved[0]) - jnp.sum(u * moved[1]), jnp.sum(u * moved[0]) + jnp.sum(v * moved[1]))
     cosine, sine = jnp.cos(angle), jnp.sin(angle)
     columns = (cosine * u + sine * v, cosine * v - sine * u, across)
     rotation = sum(x[:, None] * y for x, y in zip(columns, (p, q, normal[:, 0]), strict=True))

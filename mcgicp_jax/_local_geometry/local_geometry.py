@@ -1,4 +1,6 @@
-"""Local geometry: covariance, normal, observability and channel fits of neighbourhoods, whatever the method."""
+"""Local geometry: covariance, normal, observability and channel fits of neighbourhoods, whatever the method; and the
+surface around each point as a registration sees it.
+"""
 
 from __future__ import annotations
 
@@ -16,11 +18,18 @@ from mcgicp_jax._compute.cache import cached_with_cloud
 from mcgicp_jax._compute.concrete import AnyArray, AnyScalar, is_concrete, numpy_for
 from mcgicp_jax._compute.row_functions import ComputedTable, Rows, over_both
 from mcgicp_jax._compute.threads import side_by_side
-from mcgicp_jax._local_geometry.channel_fits import ChannelFits, fit_channels
-from mcgicp_jax._local_geometry.neighborhoods import Neighborhoods, neighborhoods, of_rows, with_near
+from mcgicp_jax._local_geometry.neighborhoods import (
+    ChannelFits,
+    Neighborhoods,
+    fit_channels,
+    neighborhoods,
+    of_rows,
+    with_near,
+)
 from mcgicp_jax._local_geometry.observability import geometry_observability, observability_of_halves
 from mcgicp_jax._math import symmetric_matrices as alg
 from mcgicp_jax._math.statistics import median, sampled_rows
+from mcgicp_jax._search.base import SearchPoints
 
 # Rank of the neighbour from which roughness is measured (0 is the point itself). The nearest neighbours are biased
 # towards similar heights, and the heights of far ones include the curvature of the surface.
@@ -56,7 +65,7 @@ class LocalGeometry(NamedTuple):
 Geometries: TypeAlias = Callable[[tuple[Any, Any]], tuple[LocalGeometry, LocalGeometry]]
 
 
-def describe(around: Neighborhoods) -> LocalGeometry:
+def local_geometry_of(around: Neighborhoods) -> LocalGeometry:
     """Local geometry of neighbourhoods."""
     offsets = offsets_of(around)
     present = around.present.astype(offsets[0].dtype)
@@ -147,7 +156,7 @@ def local_geometries(
 
     Args:
         with_channels: whether the method uses the channels; if not, the programs do not depend on their number.
-        rows: (n,) those of the source and of the target to describe; None for all.
+        rows: (n,) those of the source and of the target; None for all.
         num_threads: largest number of threads on the host; None for no limit.
 
     Returns:
@@ -187,4 +196,66 @@ def _table(
 
 
 def _geometry(_: None, own: Rows, near: Rows) -> tuple[LocalGeometry]:
-    return (describe(neighborhoods(own, near)),)
+    return (local_geometry_of(neighborhoods(own, near)),)
+
+
+class SurfaceNoise(NamedTuple):
+    """What is used at the final pose alone, for its status and covariance; one row per point.
+
+    Attributes:
+        descriptors: variance of the descriptors α · channel about their linear fits, metres², summed over the channels.
+        normal: unit normal.
+        roughness: half the squared height difference along the normal between a point and a neighbour, metres².
+        reach: distance to the farthest neighbour, metres.
+        slopes: gradients of the descriptors; None where channels are not used, and for cells.
+    """
+
+    descriptors: Float[AnyArray, "*batch N"]
+    normal: Float[AnyArray, "*batch N 3"]
+    roughness: Float[AnyArray, "*batch N"]
+    reach: Float[AnyArray, "*batch N"]
+    slopes: Float[AnyArray, "*batch N C 3"] | None = None
+
+
+class Surface(NamedTuple):
+    """The points of a cloud with the values that one method needs of each; one row per point.
+
+    Rows come first, so that those of matched points can be gathered; formulas work on the transposes. Symmetric 3×3
+    matrices are stored as upper triangles.
+
+    Attributes:
+        points: positions, metres.
+        covariance: result of `AbstractMethod.covariance`.
+        observability: by the shape of the surface, see `_local_geometry.observability`; None if not needed.
+        channel_observability: by the channels; None if not needed, or if the method does not use channels.
+        columns: `AbstractTerm.columns` by name of the term, for terms that define them.
+        noise: for the covariance of the pose; None if not needed.
+        search: the points as input to the search; None for matched rows where it is not needed.
+    """
+
+    points: Float[AnyArray, "*batch N 3"]
+    covariance: Float[AnyArray, "*batch N 6"]
+    observability: Float[AnyArray, "*batch N 6"] | None
+    channel_observability: Float[AnyArray, "*batch N 6"] | None
+    columns: dict[str, Any]
+    noise: SurfaceNoise | None = None
+    search: SearchPoints | None = None
+
+    @property
+    def num_points(self) -> int:
+        return self.points.shape[-2]
+
+    @property
+    def observed(self) -> bool:
+        return self.observability is not None
+
+    @property
+    def observes_channels(self) -> bool:
+        return self.channel_observability is not None
+
+
+def searched(surface: Surface) -> SearchPoints:
+    """The input of the search of a surface of a whole cloud."""
+    if surface.search is None:
+        raise ValueError("surface: expected one with the input of the search")
+    return surface.search

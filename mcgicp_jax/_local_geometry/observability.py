@@ -13,17 +13,15 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from mcgicp_jax._compute.concrete import AnyArray
-from mcgicp_jax._local_geometry.channel_fits import ChannelFits
+from mcgicp_jax._local_geometry.neighborhoods import ChannelFits
 from mcgicp_jax._math import symmetric_matrices as alg
 
 # Fraction of the variance of a fitted gradient that is subtracted from the product of both halves: few points scatter.
 # Of 140 walls with noise for channels (400, 2,000 and 12,000 points), channels held a direction of 6; with 0, of 80.
 _MARGIN = 0.2
 
-# κ of `observability_of_halves`: 1/16 makes normals that are nearly right unbiased, 5/16 those of random directions.
-# Corridors, planes, floors with a wall and crossing planes (3,000 and 10,000 points, noise of up to 1.5 spacings) had
-# at most 0.0023 along their free directions, with 0.21 up to 0.006. A street of 10,000 points had at least 0.0016 up to
-# one spacing, in 27 of 28 samples above 0.002; at 1.5 spacings it had −0.001 to 0.003 (0.0018 and more with 0.21).
+# κ of `observability_of_halves`: 1/16 makes normals that are nearly right unbiased, 5/16 those of random directions. In
+# between by corridors, planes and a street, see Constants in `tests/benchmarks/README.md`.
 _NOISE = 0.22
 
 

@@ -1,33 +1,276 @@
-"""Normal-distributions transforms: registration to voxel Gaussians, and of voxel Gaussians to each other."""
+"""Normal-distributions transforms: voxel Gaussians, registration to them, and of them to each other."""
 
 from __future__ import annotations
 
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Literal, overload
 
 import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
 from jax.typing import ArrayLike
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int, Shaped
 
-from mcgicp_jax._clouds.point_cloud import PointCloud, Values
-from mcgicp_jax._compute.messages import check_integer
+from mcgicp_jax._clouds.point_cloud import PointCloud, Values, as_cloud
+from mcgicp_jax._clouds.preprocess import MIN_POINTS, finite_rows, preprocess, with_neighbors
+from mcgicp_jax._clouds.voxel_size import NUM_NEIGHBORS
+from mcgicp_jax._clouds.voxels import voxel_order
+from mcgicp_jax._compute.concrete import AnyArray, numpy_for
+from mcgicp_jax._compute.linear_maps import averaged
+from mcgicp_jax._compute.messages import check_integer, check_positive, is_number
+from mcgicp_jax._compute.row_functions import Input, Rows, blockwise
+from mcgicp_jax._compute.threads import without_checks_of_jax
 from mcgicp_jax._local_geometry.local_geometry import LocalGeometry
 from mcgicp_jax._local_geometry.neighborhoods import Neighborhoods
 from mcgicp_jax._math import symmetric_matrices as alg
 from mcgicp_jax._math.robust_kernels import AbstractKernel, Welsch
 from mcgicp_jax._methods.base import AbstractGeneralized, AbstractMethod, AbstractOneSided, identity
-from mcgicp_jax._methods.icp import ColorICP
+from mcgicp_jax._methods.icp import GICP, ColorICP
+from mcgicp_jax._methods.surfaces import covariances_of
 from mcgicp_jax._terms.base import AbstractTerm, Mahalanobis
 
-# Scale k of the kernel, standard deviations. The usual score is −exp(−d₂ s²/2), so that k² = 2/d₂. Magnusson's formula
-# for d₂ (2009) depends on the unit of length; with the usual 55 % of outliers and cells of 1 m it gives k = 2.15. For
-# cells against cells Stoyanov et al. (2012) use d₂ = 0.05, k = 6.3; in a sum over several cells, distant ones then have
-# too much weight: the error on KITTI with cells of 1 m is 14 mm with 2.15, 15 with 3, 18 with 4 and 28 with 6.3.
+# Smallest number of points in a cell, and smallest ratio of its eigenvalues, as in the Point Cloud Library.
+_MIN_POINTS, _MIN_RATIO = 6, 0.01
+# Smallest standard deviation of the points in a cell, in voxels. Some scanners report each beam without an echo as a
+# point at the origin; such a cell is no surface.
+_MIN_EXTENT = 1e-4
+# Scale k of the kernel, standard deviations. The usual score is −exp(−d₂ s²/2), so that k² = 2/d₂; Magnusson's formula
+# for d₂ (2009), with the usual 55 % of outliers and cells of 1 m. For cells against cells: Constants in
+# `tests/benchmarks/README.md`.
 _SCALE = 2.15
-# Number of the target's cells that a cell is matched with. The voxels of the two clouds are not aligned, and the pose
-# follows the nearest cells of the other grid: on KITTI with cells of 1 m, the error is 60 mm with one, 14 with 4 and 14
-# with 7. For points against cells, a sum over seven changes nothing (16 mm with one, 4 or 7), and with cells of one
-# colour it costs accuracy (10.7 mm with one and 18.8 with 7 on a flat table).
+# Number of the target's cells that a cell is matched with: the voxels of the two clouds are not aligned, and the pose
+# follows the nearest cells of the other grid (60 mm with one on KITTI, 14 with 4 or 7). Points need one.
 _NUM_CANDIDATES = 4
+
+
+@overload
+def voxel_gaussians(
+    cloud: PointCloud | Values,
+    voxel_size: float,
+    *,
+    min_points: int = ...,
+    min_ratio: float = ...,
+    channel_size: Values | None = ...,
+    of: Literal["points", "covariances"] = ...,
+    return_counts: Literal[False] = ...,
+) -> PointCloud: ...
+
+
+@overload
+def voxel_gaussians(
+    cloud: PointCloud | Values,
+    voxel_size: float,
+    *,
+    min_points: int = ...,
+    min_ratio: float = ...,
+    channel_size: Values | None = ...,
+    of: Literal["points", "covariances"] = ...,
+    return_counts: Literal[True],
+) -> tuple[PointCloud, Int[np.ndarray, "M"]]: ...
+
+
+@without_checks_of_jax
+def voxel_gaussians(
+    cloud: PointCloud | Values,
+    voxel_size: float,
+    *,
+    min_points: int = _MIN_POINTS,
+    min_ratio: float = _MIN_RATIO,
+    channel_size: Values | None = None,
+    of: Literal["points", "covariances"] = "points",
+    return_counts: bool = False,
+) -> PointCloud | tuple[PointCloud, Int[np.ndarray, "M"]]:
+    """Replace the points of each voxel by one Gaussian: their mean position and channels, and a covariance.
+
+    The result is the input of `NDT` and `D2DNDT`, or with `of="covariances"` the input of voxelised GICP (`GICP`; Koide
+    et al. 2021). Runs on the host, in float64.
+
+    Args:
+        cloud: raw or preprocessed cloud, or (N, 3) array in metres, of all points: not downsampled.
+        voxel_size: edge of a voxel, metres.
+        min_points: cells with fewer points are left out, as are those whose points coincide; at least 3.
+        min_ratio: eigenvalues of a covariance below this fraction of its largest one are raised to it, so that the
+            cells of planes and lines are kept; 0 to 1.
+        channel_size: splits each voxel by its channels into cells of this size, in channel units: one number, or one
+            per channel (infinity: no split by this channel). Each Gaussian then has one colour, as in the NDT of Huhle
+            & Magnusson (2008). All points of a cell have the same channels. None: one cell per voxel.
+        of: "points": sample covariance of the points, m². "covariances": mean of the covariances of the points, either
+            given with the cloud or GICP's; dimensionless.
+        return_counts: also return the number of points in each cell.
+
+    Returns:
+        Preprocessed cloud with one point and one covariance per cell. With `return_counts`, a tuple of this cloud and
+        the number of points of each cell, (M,) integers.
+
+    Raises:
+        ValueError: if an argument is out of range, the cloud is traced, or fewer than four cells are left.
+    """
+    if of not in ("points", "covariances"):
+        raise ValueError(f'of: expected "points" or "covariances", got {of!r}')
+    if not (is_number(min_ratio) and 0 <= min_ratio <= 1):
+        raise ValueError(f"min_ratio: expected a number from 0 to 1, got {min_ratio!r}")
+    cloud = finite_rows(cloud)
+    if of == "covariances" and cloud.covariances is None:
+        covariances = covariances_of(GICP(), with_neighbors(cloud, None, NUM_NEIGHBORS))
+        cloud = cloud.replace(covariances=covariances.astype(cloud.points.dtype))
+    cells = _Cells(cloud, voxel_size, min_points, channel_size)
+    kept = cells.kept
+    if kept.sum() < MIN_POINTS:
+        raise ValueError(
+            f"voxel_size: expected a size that leaves at least {MIN_POINTS} cells of {min_points} points, got "
+            f"{voxel_size} m, which leaves {kept.sum()}"
+        )
+    if of == "covariances":
+        matrices = (cells.sum(np.asarray(cloud.covariances).reshape(-1, 9)) / cells.counts).T.reshape(-1, 3, 3)[kept]
+    else:
+        matrices = _floored(cells.spread[:, kept], min_ratio)
+    counts = cells.counts if cloud.channel_valid is None else cells.sum(cloud.channel_valid)
+    # Missing values are stored as 0 and do not add to the sum.
+    channels = cells.sum(cloud.channels) / np.maximum(counts, 1)
+    dtype = cloud.points.dtype
+    made = preprocess(
+        PointCloud(
+            cells.means[:, kept].T.astype(dtype),
+            channels[:, kept].T.astype(dtype),
+            channel_valid=None if cloud.channel_valid is None else counts[:, kept].T > 0,
+            covariances=matrices.astype(dtype),
+            channel_names=cloud.channel_names,
+        )
+    )
+    return (made, cells.counts[kept]) if return_counts else made
+
+
+def voxel_cells(
+    cloud: PointCloud | Values, voxel_size: float, *, min_points: int = _MIN_POINTS, channel_size: Values | None = None
+) -> Int[np.ndarray, "N"]:
+    """The cell of each point, as `voxel_gaussians` numbers its cells; input of `cell_moments`.
+
+    Args:
+        cloud: cloud of finite points, or (N, 3) array in metres.
+        voxel_size, min_points, channel_size: as in `voxel_gaussians`.
+
+    Returns:
+        (N,) numbers from 0; −1 for points in cells that are left out.
+
+    Raises:
+        ValueError: if an argument is out of range.
+    """
+    cells = _Cells(as_cloud("cloud", cloud), voxel_size, min_points, channel_size)
+    number = np.empty(len(cells.order), np.int32)
+    number[cells.order] = np.repeat(np.where(cells.kept, np.cumsum(cells.kept) - 1, -1), cells.counts)
+    return number
+
+
+class _Cells:
+    """The points of a cloud sorted by cell, and the moments of each cell.
+
+    Attributes:
+        order: (N,) point numbers, sorted by cell.
+        counts: (M,) number of points in each cell.
+        kept: (M,) False for cells that are left out.
+        means, spread: (3, M), and (6, M) covariances as rows xx, xy, xz, yy, yz, zz.
+    """
+
+    def __init__(self, cloud: PointCloud, voxel_size: float, min_points: int, channel_size: Values | None):
+        check_positive("voxel_size", voxel_size)
+        check_integer("min_points", min_points, 3)
+        # Working by columns takes a third of the time of working by rows.
+        points = _columns(cloud.coordinates if np.any(cloud.origin) else cloud.points)
+        self.order, self._starts = voxel_order(points, voxel_size)
+        if channel_size is not None:
+            self.order, self._starts = _split(self.order, self._starts, cloud, channel_size)
+        self.counts = np.diff(self._starts, append=len(self.order))
+        points = np.take(points, self.order, axis=1)
+        self.means = self._reduced(points) / self.counts
+        x, y, z = points - np.repeat(self.means, self.counts, axis=1)
+        products = np.stack([x * x, x * y, x * z, y * y, y * z, z * z])
+        self.spread = self._reduced(products) / np.maximum(self.counts - 1, 1)
+        extended = self.spread[[0, 3, 5]].sum(axis=0) > (_MIN_EXTENT * voxel_size) ** 2
+        self.kept = (self.counts >= min_points) & extended
+
+    def _reduced(self, columns: Float[np.ndarray, "D N"]) -> Float[np.ndarray, "D M"]:
+        return np.add.reduceat(columns, self._starts, axis=1)
+
+    def sum(self, rows: Shaped[AnyArray, "N D"]) -> Float[np.ndarray, "D M"]:
+        """Sums over the points of each cell, in float64."""
+        return self._reduced(np.take(_columns(rows), self.order, axis=1))
+
+
+def _columns(rows: Shaped[AnyArray, "N D"]) -> Float[np.ndarray, "D N"]:
+    return np.ascontiguousarray(np.asarray(rows).T, np.float64)
+
+
+def _split(
+    order: Int[np.ndarray, "N"], starts: Int[np.ndarray, "M"], cloud: PointCloud, channel_size: Values
+) -> tuple[Int[np.ndarray, "N"], Int[np.ndarray, "M2"]]:
+    """Split cells by the channels of their points."""
+    sizes = np.asarray(channel_size, np.float64)
+    if sizes.shape not in ((), (cloud.channels.shape[1],)) or not np.all(sizes > 0):
+        raise ValueError(f"channel_size: expected one positive number, or one per channel, got {channel_size!r}")
+    levels = np.floor(np.asarray(cloud.channels, np.float64)[order] / sizes)
+    if cloud.channel_valid is not None:
+        # Points that lack a channel get a level of their own.
+        levels = np.where(np.asarray(cloud.channel_valid)[order], levels, -np.inf)
+    columns = [np.cumsum(np.bincount(starts, minlength=len(order))), *levels.T]
+    again = np.lexsort(columns[::-1])
+    changes = np.any([column[again][1:] != column[again][:-1] for column in columns], axis=0)
+    return order[again], np.flatnonzero(np.append(True, changes))
+
+
+@without_checks_of_jax
+def cell_moments(
+    points: Float[AnyArray, "N 3"],
+    channels: Float[AnyArray, "N C"],
+    cells: Int[np.ndarray, "N"],
+    min_ratio: float = _MIN_RATIO,
+) -> tuple[Float[AnyArray, "M 3"], Float[AnyArray, "M C"], Float[AnyArray, "M 3 3"]]:
+    """Mean position, mean channels and covariance (m²) of each cell, as in `voxel_gaussians`; differentiable.
+
+    To let gradients reach the points of a cloud, replace `points`, `channels` and `covariances` of its
+    `voxel_gaussians` by these. The cells are constants.
+
+    Args:
+        points, channels: of the cloud; metres and channel units.
+        cells: from `voxel_cells`; concrete.
+        min_ratio: as in `voxel_gaussians`.
+    """
+    points, channels = (numpy_for(each).asarray(each) for each in (points, channels))
+    dtype = jax.dtypes.canonicalize_dtype(np.result_type(points.dtype, np.float32))
+    points, channels = points.astype(dtype), channels.astype(dtype)
+    means, counts = averaged(points, cells), np.bincount(cells[cells >= 0])
+    # In two passes: one would lose digits far from zero.
+    (products,) = blockwise(_products, (), Input(points), Input(means, cells))
+    unbiased = (counts / np.maximum(counts - 1, 1)).astype(points.dtype)
+    (covariances,) = blockwise(_raised, min_ratio, Input((averaged(products, cells), unbiased)))
+    return means, averaged(channels, cells), covariances
+
+
+def _products(_: Any, own: Rows, mean: Rows) -> tuple[Float[Array, "n 6"]]:
+    x, y, z = (own.tree - mean.tree).T
+    return (jnp.stack([x * x, x * y, x * z, y * y, y * z, z * z], axis=1),)
+
+
+def _raised(min_ratio: Any, own: Rows) -> tuple[Float[Array, "n 3 3"]]:
+    """Covariances of cells from their mean products, with eigenvalues of at least `min_ratio` times the largest."""
+    symmetric, unbiased = own.tree
+    symmetric = symmetric.T * unbiased
+    normal = alg.smallest_eigenvector(symmetric)
+    u, v = alg.orthonormal_basis(normal)
+    within = alg.project(symmetric, u, v)
+    a, b, c = within
+    square = 0.25 * (a - c) ** 2 + b * b
+    radius = jnp.where(square > 0, jnp.sqrt(jnp.where(square > 0, square, 1)), 0)
+    floor = min_ratio * (0.5 * (a + c) + radius)
+    across = jnp.maximum(jnp.sum(normal * alg.multiply(symmetric, normal), axis=0), floor)
+    raised = alg.embed(alg.floor_eigenvalues(within, floor), u, v) + across * alg.outer(normal)
+    return (alg.matrix_from_symmetric(raised),)
+
+
+def _floored(symmetric: Float[np.ndarray, "6 M"], min_ratio: float) -> Float[np.ndarray, "M 3 3"]:
+    """Matrices whose eigenvalues are at least `min_ratio` times the largest one."""
+    values, vectors = np.linalg.eigh(symmetric[[0, 1, 2, 1, 3, 4, 2, 4, 5]].T.reshape(-1, 3, 3))
+    raised = np.maximum(values, min_ratio * values[:, -1:])
+    return (vectors * raised[:, None]) @ vectors.swapaxes(1, 2)
 
 
 class AbstractNDT(AbstractMethod):

@@ -20,21 +20,15 @@ from mcgicp_jax._compute.row_functions import ComputedTable, GivenTable, Input, 
 from mcgicp_jax._compute.threads import side_by_side
 from mcgicp_jax._local_geometry.local_geometry import (
     LocalGeometry,
+    Surface,
+    SurfaceNoise,
     differentiable_geometry,
     geometry_of_cells,
     geometry_table,
     local_geometries,
 )
-from mcgicp_jax._local_geometry.neighborhoods import (
-    Neighborhoods,
-    PointRows,
-    neighborhoods,
-    of_rows,
-    points_alone,
-    with_near,
-)
+from mcgicp_jax._local_geometry.neighborhoods import Neighborhoods, PointRows, neighborhoods, of_rows, with_near
 from mcgicp_jax._local_geometry.observability import channel_observability
-from mcgicp_jax._local_geometry.surface import Surface, SurfaceNoise
 from mcgicp_jax._math import symmetric_matrices as alg
 from mcgicp_jax._math.robust_kernels import AbstractKernel
 from mcgicp_jax._methods.base import AbstractMethod
@@ -166,11 +160,11 @@ def surface_pair(
     terms = method.terms(used, target, robust, equalize_channels)
     kinds = kinds_of(terms)
     # Raises an error if observability is needed and a cloud has no neighbours.
-    described = observed or (source.deferred_neighbors is not None and target.deferred_neighbors is not None)
+    with_geometry = observed or (source.deferred_neighbors is not None and target.deferred_neighbors is not None)
     if is_concrete(method, source, target):
         of_source, of_target = (
             SurfaceTable(
-                surface_table(cloud, method, kinds, described, observed), rows, searchable(method, points), observed
+                surface_table(cloud, method, kinds, with_geometry, observed), rows, searchable(method, points), observed
             )
             for cloud, points, rows in ((source, used, source_rows), (target, target, None))
         )
@@ -178,9 +172,9 @@ def surface_pair(
             # At once, and side by side: most rows are used.
             side_by_side([partial(each.table.known, None, num_threads) for each in (of_target, of_source)], num_threads)
         return SurfacePair(method, terms, of_source, of_target)
-    function = _surface_rows(kinds, observed, described, needs_neighborhoods(method, described))
-    inputs = [_inputs(method, cloud, described) for cloud in (source, target)]
-    if described:
+    function = _surface_rows(kinds, observed, with_geometry)
+    inputs = [_inputs(method, cloud, with_geometry) for cloud in (source, target)]
+    if with_geometry:
         locals, rows = whole(), (source_rows, None)
         inputs = [[*of_rows(each, some), Input(local)] for each, some, local in zip(inputs, rows, locals, strict=True)]
     else:
@@ -241,15 +235,17 @@ def search_rows(
 
 @cached_with_cloud
 def surface_table(
-    cloud: PointCloud, method: AbstractMethod, kinds: Kinds, described: bool, observed: bool
+    cloud: PointCloud, method: AbstractMethod, kinds: Kinds, with_geometry: bool, observed: bool
 ) -> ComputedTable:
     """The surface of a concrete cloud, whose rows are cached with the cloud: `Surface`, and its `noise` if `observed`.
 
     Args:
-        described: whether the cloud has neighbours, whose local geometry is used.
+        with_geometry: whether the cloud has neighbours, whose local geometry is used.
         observed: as in `surface_pair`.
     """
-    return _table(cloud, method, kinds, geometry_table(cloud, method.uses_channels) if described else None, observed)
+    return _table(
+        cloud, method, kinds, geometry_table(cloud, method.uses_channels) if with_geometry else None, observed
+    )
 
 
 def differentiable_inputs(
@@ -276,15 +272,17 @@ def differentiable_inputs(
     """
     *clouds, chosen = fixed
     sides = ((source, clouds[0], source_rows), (target, clouds[1], indices))
-    described = observed or all(cloud.deferred_neighbors is not None for _, cloud, _ in sides)
+    with_geometry = observed or all(cloud.deferred_neighbors is not None for _, cloud, _ in sides)
     inputs = []
     kinds = kinds_of(terms)
     for cloud, same, rows in sides:
-        geometry = differentiable_geometry(cloud, method.uses_channels, same) if described else None
-        values = surface_table(same, chosen, kinds, described, observed)
+        geometry = differentiable_geometry(cloud, method.uses_channels, same) if with_geometry else None
+        values = surface_table(same, chosen, kinds, with_geometry, observed)
         inputs.append(Input(_table(cloud, method, kinds, geometry, observed, values), rows))
     if soft:
-        inputs += [Input(_search_table(cloud, method), rows) for cloud, _, rows in sides]
+        for cloud, _, rows in sides:
+            given = Input(PointRows(cloud.points, cloud.channels, cloud.channel_valid))
+            inputs.append(Input(ComputedTable(_descriptors, method, [given], cloud.points.shape[0]), rows))
     return inputs
 
 
@@ -296,19 +294,14 @@ def _table(
     observed: bool,
     values: ComputedTable | None = None,
 ) -> ComputedTable:
-    described = geometry is not None
-    inputs = _inputs(method, cloud, described) + ([Input(geometry)] if described else [])
-    function = _surface_rows(kinds, observed, described, needs_neighborhoods(method, described))
+    with_geometry = geometry is not None
+    inputs = _inputs(method, cloud, with_geometry) + ([Input(geometry)] if with_geometry else [])
+    function = _surface_rows(kinds, observed, with_geometry)
     return ComputedTable(function, method, inputs, cloud.points.shape[0], values)
 
 
-def _search_table(cloud: PointCloud, method: AbstractMethod) -> ComputedTable:
-    """Descriptors and penalties of `searchable`, for the derivative of a soft assignment."""
-    given = PointRows(cloud.points, cloud.channels, cloud.channel_valid)
-    return ComputedTable(_descriptors, method, [Input(given)], cloud.points.shape[0])
-
-
 def _descriptors(method: AbstractMethod, own: Rows) -> tuple[SearchPoints]:
+    """Descriptors and penalties of `searchable`, for the derivative of a soft assignment."""
     points, channels, known, *_ = own.tree
     found = search_rows(*search_numbers(method, channels, known), points, channels, known, jnp.ones(len(points), bool))
     # A mask is no number, and positions are in the surface already.
@@ -321,23 +314,19 @@ def _surface_in(parts: tuple[Any, ...], search: SearchPoints) -> Surface:
     return surface._replace(noise=noise[0] if noise else None, search=search)
 
 
-def needs_neighborhoods(method: AbstractMethod, described: bool) -> bool:
-    return method.uses_neighborhoods and described
-
-
-def _inputs(method: AbstractMethod, cloud: PointCloud, described: bool) -> list[Input]:
-    if needs_neighborhoods(method, described):
+def _inputs(method: AbstractMethod, cloud: PointCloud, with_geometry: bool) -> list[Input]:
+    if method.uses_neighborhoods and with_geometry:
         return with_near(cloud, method.uses_channels, with_given=True)
-    return points_alone(cloud)
+    return [Input(PointRows(cloud.points, given=cloud.covariances))]
 
 
 @cache
-def _surface_rows(kinds: Kinds, observed: bool, described: bool, with_neighborhoods: bool) -> Callable[..., Any]:
+def _surface_rows(kinds: Kinds, observed: bool, with_geometry: bool) -> Callable[..., Any]:
     """The row function of `surface_of`, for `_inputs` and the local geometry."""
 
     def surface(method: AbstractMethod, own: Rows, *rest: Rows) -> tuple[Any, ...]:
-        around = neighborhoods(own, rest[0]) if with_neighborhoods else neighborhoods(own)
-        found = surface_of(method, kinds, around, rest[-1].tree if described else None, observed)
+        near, local = (rest[:-1], rest[-1].tree) if with_geometry else (rest, None)
+        found = surface_of(method, kinds, neighborhoods(own, *near), local, observed)
         return (found,) if found.noise is None else (found._replace(noise=None), found.noise)
 
     return surface

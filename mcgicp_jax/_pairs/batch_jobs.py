@@ -25,7 +25,7 @@ from mcgicp_jax._compute.linear_maps import primal
 from mcgicp_jax._compute.messages import messages_named, warn, warnings_named
 from mcgicp_jax._compute.programs import size_class
 from mcgicp_jax._compute.threads import in_new_thread, num_cores, side_by_side, with_settings
-from mcgicp_jax._local_geometry.surface import Surface
+from mcgicp_jax._local_geometry.local_geometry import Surface
 from mcgicp_jax._math.poses import Pose
 from mcgicp_jax._methods.base import AbstractMethod
 from mcgicp_jax._pairs.register import register_from, start_from_anywhere

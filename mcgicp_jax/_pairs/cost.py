@@ -14,8 +14,8 @@ from mcgicp_jax._compute.concrete import AnyArray, constant, is_concrete, numpy_
 from mcgicp_jax._compute.linear_maps import primal
 from mcgicp_jax._compute.row_functions import Input, Rows, blockwise
 from mcgicp_jax._compute.threads import without_checks_of_jax
+from mcgicp_jax._local_geometry.local_geometry import searched
 from mcgicp_jax._local_geometry.neighborhoods import of_rows
-from mcgicp_jax._local_geometry.surface import searched
 from mcgicp_jax._math import symmetric_matrices as alg
 from mcgicp_jax._math.poses import Pose
 from mcgicp_jax._math.robust_kernels import AbstractKernel

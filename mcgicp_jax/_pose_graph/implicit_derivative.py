@@ -22,7 +22,7 @@ from mcgicp_jax._compute.messages import calling_line, shown_at, warn
 from mcgicp_jax._compute.programs import call_host
 from mcgicp_jax._math.poses import logarithm_derivative, skew
 from mcgicp_jax._pose_graph.edge import WORLD, Edge, check_rows, motion_jacobians
-from mcgicp_jax._pose_graph.normal_equations import factored, typical_information
+from mcgicp_jax._pose_graph.levenberg_marquardt import factored, typical_information
 from mcgicp_jax._pose_graph.solver import Factors, Solution, covariances_at, solve
 from mcgicp_jax._registration.result import Status
 
@@ -46,7 +46,7 @@ class _Sensitivity(NamedTuple):
     """Derivatives at the solution; 0 unless the status is CONVERGED, and for edges that were rejected.
 
     Attributes:
-        inverse: (∂g/∂ξ)⁻¹, 0 for held poses.
+        inverse: (∂g/∂ξ)⁻¹, 0 for fixed poses.
         by_motion: derivative of JᵀΛr by the twist μ of T_i_j exp(μ).
         jacobians, residuals: J and r.
     """
@@ -95,10 +95,7 @@ def _moved(
     forces += einsum("mkia,mij,mj->mka", sensitivity.jacobians, information_change.astype(dtype), sensitivity.residuals)
     gradient = jnp.zeros((n + 1, 6), dtype).at[jnp.where(rows == WORLD, n, rows)].add(forces)
     twists = -einsum("iajb,jb->ia", sensitivity.inverse, gradient[:-1])
-    v, (x, y, z) = twists[:, :3], twists[:, 3:].T
-    zero = jnp.zeros_like(x)
-    turn = jnp.stack([zero, -z, y, z, zero, -x, -y, x, zero], axis=-1).reshape(n, 3, 3)
-    generators = jnp.zeros((n, 4, 4), dtype).at[:, :3, :3].set(turn).at[:, :3, 3].set(v)
+    generators = jnp.zeros((n, 4, 4), dtype).at[:, :3, :3].set(skew(twists[:, 3:])).at[:, :3, 3].set(twists[:, :3])
     moved = jnp.matmul(found.poses, generators, precision="highest")
     # Tangents that are not finite would leave NaN behind a zero derivative.
     return jnp.where(found.status == Status.CONVERGED, moved, 0)

@@ -14,8 +14,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, Int
 
-from mcgicp_jax._pose_graph.levenberg_marquardt import Minimum
-from mcgicp_jax._pose_graph.normal_equations import NormalEquations, factored
+from mcgicp_jax._pose_graph.levenberg_marquardt import Minimum, NormalEquations, PerMeasurement, factored
 
 # Unknowns of a block, a pose.
 _SIZE = 6
@@ -23,15 +22,13 @@ _SIZE = 6
 _SOLVED_AT_ONCE = 10_000_000
 
 
-def pose_covariances(
-    equations: NormalEquations, found: Minimum, weights: Float[np.ndarray, "m"]
-) -> Float[np.ndarray, "n 6 6"]:
+def pose_covariances(equations: NormalEquations, found: Minimum, weights: PerMeasurement) -> Float[np.ndarray, "n 6 6"]:
     """Covariances of all poses relative to the root; infinite if not connected with it, NaN if H is singular."""
     covariances = np.zeros((len(found.poses), 6, 6))
     if equations.size:
         try:
             factor = factored(equations.damped(equations.weighted(found.terms.blocks, weights)))
-            covariances[~equations.held] = inverse_blocks(factor)[equations.place[~equations.held]]
+            covariances[~equations.fixed] = inverse_blocks(factor)[equations.place[~equations.fixed]]
         except (RuntimeError, np.linalg.LinAlgError):
             covariances[:] = np.nan
     covariances[equations.parts != equations.parts[equations.root]] = np.diag(np.full(6, np.inf))
@@ -41,7 +38,7 @@ def pose_covariances(
 def propagated(
     equations: NormalEquations,
     found: Minimum,
-    weights: Float[np.ndarray, "m"],
+    weights: PerMeasurement,
     rows: Int[np.ndarray, "q 2"],
     jacobians: Float[np.ndarray, "q 2 d 6"],
 ) -> Float[np.ndarray, "q d d"]:

@@ -23,7 +23,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from mcgicp_jax._compute.concrete import AnyArray, AnyScalar, numpy_for
-from mcgicp_jax._local_geometry.surface import SurfaceNoise, searched
+from mcgicp_jax._local_geometry.local_geometry import SurfaceNoise, searched
 from mcgicp_jax._math import symmetric_matrices as alg
 from mcgicp_jax._math.poses import adjoint_to_source, units
 from mcgicp_jax._math.statistics import cell_numbers, median

@@ -15,7 +15,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from mcgicp_jax._compute.concrete import AnyArray, AnyScalar, constant, is_concrete, numpy_for
 from mcgicp_jax._compute.row_functions import Input, Rows, whole
-from mcgicp_jax._local_geometry.surface import Surface
+from mcgicp_jax._local_geometry.local_geometry import Surface
 from mcgicp_jax._math import symmetric_matrices as alg
 from mcgicp_jax._math.poses import rotated, rotation_from_quaternion
 from mcgicp_jax._math.statistics import sampled_rows

@@ -10,7 +10,7 @@ from mcgicp_jax._clouds.voxel_size import raw_spacing
 from mcgicp_jax._compute.concrete import is_concrete
 from mcgicp_jax._compute.linear_maps import primal
 from mcgicp_jax._compute.messages import warn
-from mcgicp_jax._local_geometry.spacing_and_noise import point_spacing
+from mcgicp_jax._local_geometry.cloud_statistics import point_spacing
 from mcgicp_jax._math.statistics import median, sampled_rows
 from mcgicp_jax._methods.base import AbstractMethod
 from mcgicp_jax._methods.multichannel_gicp import MultiChannelGICP

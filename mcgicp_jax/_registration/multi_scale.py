@@ -15,8 +15,8 @@ from mcgicp_jax._compute.concrete import numpy_for
 from mcgicp_jax._compute.messages import messages_named
 from mcgicp_jax._local_geometry.neighborhoods import check_neighbors
 from mcgicp_jax._methods.base import AbstractMethod
-from mcgicp_jax._methods.gicp import GICP
-from mcgicp_jax._methods.voxel_gaussians import voxel_gaussians
+from mcgicp_jax._methods.icp import GICP
+from mcgicp_jax._methods.ndt import voxel_gaussians
 from mcgicp_jax._registration.pose_derivative import Inputs
 
 # Edge of the voxels in edges of a cell, at all scales but the last, where GICP registers the voxels. Cells against

@@ -19,7 +19,7 @@ from mcgicp_jax._compute.concrete import AnyArray, constant, is_concrete, numpy_
 from mcgicp_jax._compute.linear_maps import primal
 from mcgicp_jax._compute.messages import messages_named
 from mcgicp_jax._compute.threads import in_new_thread, without_checks_of_jax
-from mcgicp_jax._local_geometry.channel_equalization import (
+from mcgicp_jax._local_geometry.cloud_statistics import (
     warn_of_exposure,
     warn_of_units,
     with_channels_matched,
@@ -27,8 +27,7 @@ from mcgicp_jax._local_geometry.channel_equalization import (
 from mcgicp_jax._math.poses import Pose, se3_from_matrix
 from mcgicp_jax._math.statistics import spread_rows
 from mcgicp_jax._methods.base import AbstractMethod
-from mcgicp_jax._methods.gicp import GICP
-from mcgicp_jax._methods.icp import PointToPoint
+from mcgicp_jax._methods.icp import GICP, PointToPoint
 from mcgicp_jax._methods.surfaces import surface_pair
 from mcgicp_jax._pose_solver.covariance import Moments
 from mcgicp_jax._pose_solver.matched import Matches

@@ -14,8 +14,8 @@ from jaxtyping import Array, Bool, Float, Int
 
 from mcgicp_jax._clouds.point_cloud import PointCloud
 from mcgicp_jax._compute.concrete import AnyArray, AnyScalar, constant, numpy_for
+from mcgicp_jax._local_geometry.cloud_statistics import grid_spacing, point_spacing
 from mcgicp_jax._local_geometry.local_geometry import cell_edge
-from mcgicp_jax._local_geometry.spacing_and_noise import grid_spacing, point_spacing
 from mcgicp_jax._math.poses import move_pose, units
 from mcgicp_jax._methods.base import AbstractMethod
 from mcgicp_jax._methods.surfaces import AnySurface, whole_surface

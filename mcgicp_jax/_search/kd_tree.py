@@ -24,20 +24,10 @@ from jaxtyping import Array, Bool, Float, Int
 
 from mcgicp_jax._compute.cache import MAX_ROWS, Cache
 from mcgicp_jax._compute.programs import call_host
-from mcgicp_jax._search.base import (
-    IDENTITY,
-    AbstractSearch,
-    NeighborsOnDemand,
-    SearchPoints,
-    on_host,
-    search_points,
-)
-from mcgicp_jax._search.nearest_with_ties import TiedTree, TreeBackend
-from mcgicp_jax._search.tree_index import LARGEST_UNORDERED, TreeIndex
+from mcgicp_jax._search.base import IDENTITY, AbstractSearch, NeighborsOnDemand, SearchPoints, on_host, search_points
+from mcgicp_jax._search.tree_index import LARGEST_UNORDERED, TiedTree, TreeBackend, TreeIndex
 
-# Where pykdtree is quicker than SciPy's tree: two neighbours of 2,000 to 35,000 points take 0.4 to 0.7 of the time in
-# three dimensions, 0.5 to 1 in four, and 0.7 to 1.7 in six; 20 neighbours 0.7 to 0.9 in three dimensions. (100 take up
-# to 1.5 of the time and 300 up to 3.4, but so many are only asked for to break ties.) Up to seven dimensions the
+# Where pykdtree is quicker than SciPy's tree, see Constants in `tests/benchmarks/README.md`. Up to seven dimensions the
 # distances of both agree to the last bit, since both add the squared differences in the same order.
 MAX_DIMENSIONS = 4
 

@@ -26,10 +26,8 @@ from mcgicp_jax._registration.result import RegistrationResult, Status
 # Least overlap of a registration that becomes an edge: with less, a wrong local minimum looks like a right one.
 LEAST_OVERLAP = 0.4
 # Ratio of the information along unconstrained directions to that along constrained ones. The directions are known to
-# δ = 2 mrad, so that a fraction δ² = 4e-6 of the constrained information leaks into them. With ratios below that, poses
-# slide along a corridor to correct millimetres across it. With ratios from 1e-2 on, the edges of a corridor that is 5 %
-# too long in the start contradict the loop at its end, which is then rejected. Errors with this loop, in three
-# simulated corridors: 134 to 291 mm with 1e-6, 46 to 85 with 1e-5, 6 to 13 with 1e-4, 3 to 5 with 1e-3, 117 from 1e-2.
+# δ = 2 mrad, so that a fraction δ² = 4e-6 of the constrained information leaks into them: poses slide along a corridor
+# with less. With 1e-2, edges of a corridor that is too long in the start contradict the loop at its end.
 _UNCONSTRAINED_RATIO = 1e-4
 # Two frames may close a loop if their distance is at most this many median ranges of the points, plus this many
 # standard deviations of the distance (99 % of χ² with three degrees of freedom); the overlap decides. In the benchmark,
@@ -63,11 +61,12 @@ def edge_from(i: int, j: int, result: RegistrationResult, *, uncertain: bool = F
     covariance, directions = np.asarray(result.covariance, np.float64), result.directions
     if directions is None or not np.isfinite(covariance).all():
         return None
-    held = np.asarray(directions.held)
+    constrained = np.asarray(directions.held)
+    inside = np.ix_(constrained, constrained)
     # Coordinates along the six directions: the constrained ones do not depend on the others.
     coordinates = np.linalg.inv(np.asarray(directions.twists, np.float64).T)
-    inner = (coordinates @ covariance @ coordinates.T)[np.ix_(held, held)]
-    if not held.any():
+    inner = (coordinates @ covariance @ coordinates.T)[inside]
+    if not constrained.any():
         return None
     # The coordinates are lengths. No registration is more precise than the rounding of the points. The covariance of
     # equal clouds is smaller, or even negative by rounding of its own.
@@ -75,8 +74,8 @@ def edge_from(i: int, j: int, result: RegistrationResult, *, uncertain: bool = F
     rounding = np.finfo(radius.dtype).eps * float(radius)
     values, vectors = np.linalg.eigh(inner)
     known = np.zeros((6, 6))
-    known[np.ix_(held, held)] = (vectors / np.maximum(values, rounding**2)) @ vectors.T
-    known[~held, ~held] = _UNCONSTRAINED_RATIO * np.median(np.linalg.eigvalsh(known[np.ix_(held, held)]))
+    known[inside] = (vectors / np.maximum(values, rounding**2)) @ vectors.T
+    known[~constrained, ~constrained] = _UNCONSTRAINED_RATIO * np.median(np.linalg.eigvalsh(known[inside]))
     information = coordinates.T @ known @ coordinates
     return Edge(i, j, result.matrix, 0.5 * (information + information.T), uncertain=uncertain)
 
@@ -158,8 +157,8 @@ class Trajectory:
 
     def _connect(self, edge: Edge) -> None:
         i, j = int(edge.i), int(edge.j)
-        # An assumed motion is right to the reach of the sensor and to half a turn.
-        least = np.repeat([self._reach(j), np.pi], 3) ** -2.0
+        # An assumed motion is right to twice the range of the sensor and to half a turn.
+        least = np.repeat([self._range(j), np.pi], 3) ** -2.0
         self._ends = np.append(self._ends, np.array([[i], [j]], np.int32), axis=1)
         self._between[i, j] = self._between[j, i] = len(self._edges)
         self._edges.append(edge)
@@ -176,7 +175,7 @@ class Trajectory:
         change = adjoint(self._poses[frames])
         return change @ covariances @ change.swapaxes(-1, -2)
 
-    def _reach(self, frame: int) -> float:
+    def _range(self, frame: int) -> float:
         return _RANGES * float(np.median(np.linalg.norm(self._clouds[frame].coordinates, axis=1)))
 
     def _loop(self, number: int) -> tuple[Edge, Float[np.ndarray, "6 6"]] | None:
@@ -195,7 +194,7 @@ class Trajectory:
         for i in _candidates(variances > _GAIN * self._usual, distances, variances):
             known = self._covariance(number, i, before)
             sigma = float(np.sqrt(np.linalg.eigvalsh(known[:3, :3])[-1]))
-            if distances[i] <= self._reach(number) + _DEVIATIONS * sigma:
+            if distances[i] <= self._range(number) + _DEVIATIONS * sigma:
                 edge = self._registered(i, number, sigma)
                 tries += 1
                 if edge is not None:

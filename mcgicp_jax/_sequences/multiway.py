@@ -16,7 +16,7 @@ from mcgicp_jax._clouds.voxel_map import merge_clouds
 from mcgicp_jax._clouds.voxel_size import NUM_NEIGHBORS, VoxelSize, voxels_for
 from mcgicp_jax._clouds.voxels import wrapped_keys
 from mcgicp_jax._compute.messages import messages_named
-from mcgicp_jax._local_geometry.spacing_and_noise import point_spacing
+from mcgicp_jax._local_geometry.cloud_statistics import point_spacing
 from mcgicp_jax._math.poses import Pose, exponential, logarithm, pose_matrices, rotated
 from mcgicp_jax._methods.base import AbstractMethod
 from mcgicp_jax._pairs.batch import register_batch

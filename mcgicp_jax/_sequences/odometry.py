@@ -19,8 +19,8 @@ from mcgicp_jax._clouds.voxel_size import NUM_NEIGHBORS, VoxelSize, voxels_for
 from mcgicp_jax._compute.cache import Lazy
 from mcgicp_jax._compute.messages import check_positive, messages_named, warn
 from mcgicp_jax._compute.threads import ReadAhead
+from mcgicp_jax._local_geometry.cloud_statistics import point_spacing
 from mcgicp_jax._local_geometry.local_geometry import geometry_table
-from mcgicp_jax._local_geometry.spacing_and_noise import point_spacing
 from mcgicp_jax._math.poses import Pose, nearest_rotation, pose_matrix
 from mcgicp_jax._methods.base import AbstractMethod
 from mcgicp_jax._pose_graph.graph import PoseGraph
@@ -155,7 +155,7 @@ def _read(
     options: Options,
     preprocessing: _Preprocessing,
 ) -> tuple[str, PointCloud]:
-    """The name and the cloud of the next frame, preprocessed and described as the source of a registration."""
+    """The name and the cloud of the next frame, preprocessed, with the local geometry that a source needs."""
     number, frame = next(frames)
     name = f"frames[{number}]"
     cloud = as_cloud(name, frame.cloud if isinstance(frame, Frame) else frame)

@@ -14,9 +14,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from mcgicp_jax._compute.concrete import AnyArray, AnyScalar
-from mcgicp_jax._local_geometry.local_geometry import LocalGeometry
+from mcgicp_jax._local_geometry.local_geometry import LocalGeometry, Surface
 from mcgicp_jax._local_geometry.neighborhoods import Neighborhoods
-from mcgicp_jax._local_geometry.surface import Surface
 from mcgicp_jax._math import symmetric_matrices as alg
 from mcgicp_jax._math.robust_kernels import AbstractKernel, Numbers
 
@@ -41,25 +40,13 @@ class Linearization(eqx.Module):
     information: Float[Array, "6 n"]
 
     def __add__(self, other: Linearization) -> Linearization:
-        return Linearization(
-            self.force + other.force,
-            self.stiffness + other.stiffness,
-            self.cost + other.cost,
-            self.weight,
-            self.residual,
-            self.information,
-        )
+        force, stiffness, cost = self.force + other.force, self.stiffness + other.stiffness, self.cost + other.cost
+        return Linearization(force, stiffness, cost, self.weight, self.residual, self.information)
 
     def scaled(self, factor: Float[Array, "n"]) -> Linearization:
         """Force, stiffness, cost and weight of each correspondence multiplied by a factor."""
-        return Linearization(
-            factor * self.force,
-            factor * self.stiffness,
-            factor * self.cost,
-            factor * self.weight,
-            self.residual,
-            self.information,
-        )
+        force, stiffness, cost, weight = (factor * x for x in (self.force, self.stiffness, self.cost, self.weight))
+        return Linearization(force, stiffness, cost, weight, self.residual, self.information)
 
 
 def linearize_residual(

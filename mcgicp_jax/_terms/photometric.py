@@ -42,10 +42,9 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from mcgicp_jax._compute.concrete import AnyArray, AnyScalar, numpy_for
-from mcgicp_jax._local_geometry.channel_equalization import gain_and_offset
-from mcgicp_jax._local_geometry.channel_fits import fit_linear
+from mcgicp_jax._local_geometry.cloud_statistics import gain_and_offset
 from mcgicp_jax._local_geometry.local_geometry import LocalGeometry, offsets_of
-from mcgicp_jax._local_geometry.neighborhoods import NO_NEIGHBORS, Neighborhoods
+from mcgicp_jax._local_geometry.neighborhoods import NO_NEIGHBORS, Neighborhoods, fit_linear
 from mcgicp_jax._math import symmetric_matrices as alg
 from mcgicp_jax._math.robust_kernels import AbstractKernel, Cauchy
 from mcgicp_jax._math.statistics import cell_numbers, median
@@ -62,7 +61,7 @@ _CELL = 10.0
 _VALUE_RADIUS = 1.25
 # Spacings: a match further off lies outside the neighbourhood that the channels were fitted over (the 20 nearest of
 # randomly placed points lie within 5.4).
-_REACH = 5.0
+_MAX_OFFSET = 5.0
 # Least σ, as an offset in spacings: rendered scenes leave no residuals.
 _LEAST_OFFSET = 1e-4
 # Shift of the points to either side to measure the response, spacings: most matches differ between both ends. With 0.5,
@@ -218,7 +217,7 @@ class Photometric(AbstractAdaptiveTerm):
         offset = jnp.where(valid, moved - target.points.T, 0)
         a, b = source.columns[self.name], target.columns[self.name]
         normal = _mean_direction(jnp.dot(rotation, a.normal.T, precision="highest"), b.normal.T)
-        near = valid & (alg.inner(offset, offset) <= (_REACH * self.spacing) ** 2)
+        near = valid & (alg.inner(offset, offset) <= (_MAX_OFFSET * self.spacing) ** 2)
         values, slopes = [jnp.where(valid, alg.inner(normal, offset), jnp.nan)], [jnp.where(valid, normal, 0)]
         own, products = [], []
         for channel in range(self.gains.shape[0]):

@@ -1,19 +1,26 @@
-"""Lazy sequences of frames."""
+"""Lazy sequences of frames; and images: reading, colour look-up and back-projection."""
 
 from __future__ import annotations
 
 import abc
 import operator
+import os
+import re
 from collections.abc import Callable, Sequence
+from pathlib import Path
 from typing import Any, TypeAlias, overload
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float, Shaped, UInt8, UInt16
 from scipy.spatial.transform import Rotation
 
+from mcgicp_jax import io
 from mcgicp_jax._clouds.point_cloud import Frame, PointCloud
+from mcgicp_jax._compute.messages import optional_module
+from mcgicp_jax.io.clouds import is_cloud
 
 Matrix: TypeAlias = Float[np.ndarray, "4 4"]
+Picture: TypeAlias = UInt8[np.ndarray, "height width 3"]
 
 
 class AbstractFrames(Sequence[Frame]):
@@ -134,3 +141,100 @@ def check_scene(points_per_frame: int, noise: float, most: int = 10_000_000) -> 
         raise ValueError(f"noise: expected 0 or more, got {noise}")
     if not 1 <= points_per_frame <= most:
         raise ValueError(f"points_per_frame: expected 1 to {most}, got {points_per_frame}")
+
+
+def read_image(path: str | os.PathLike[str]) -> Picture:
+    """Read an image as 8-bit red, green and blue."""
+    return np.asarray(_open(path).convert("RGB"))
+
+
+def read_depth(path: str | os.PathLike[str]) -> UInt16[np.ndarray, "height width"]:
+    """Read a 16-bit depth image, in the unit of the file; raises `ValueError` for another kind of image."""
+    depth = np.asarray(_open(path))
+    if depth.ndim != 2 or depth.dtype != np.uint16:
+        raise ValueError(f"{path}: expected a 16-bit depth image, got {depth.dtype} of shape {depth.shape}")
+    return depth
+
+
+def look_up(image: Picture, pixels: Float[np.ndarray, "N 2"]) -> tuple[Float[np.ndarray, "N 3"], Bool[np.ndarray, "N"]]:
+    """Bilinear colours from 0 to 1, and the mask of pixels inside the image.
+
+    Pixels are (column, row); the centre of the first is (0, 0).
+    """
+    height, width, _ = image.shape
+    # NaN compares false and is outside.
+    inside = np.all((pixels >= 0) & (pixels <= (width - 1, height - 1)), axis=1)
+    return bilinear(image, np.where(inside[:, None], pixels, 0), "nearest") / 255, inside
+
+
+def bilinear(
+    image: Shaped[np.ndarray, "height width 3"], pixels: Float[np.ndarray, "N 2"], mode: str
+) -> Float[np.ndarray, "N 3"]:
+    """Values at pixels (column, row) of an image; `mode` says how SciPy's `map_coordinates` continues it."""
+    from scipy.ndimage import map_coordinates
+
+    values = [map_coordinates(each, pixels.T[::-1], float, order=1, mode=mode) for each in np.moveaxis(image, 2, 0)]
+    return np.stack(values, axis=1)
+
+
+def back_project(
+    depth: Float[np.ndarray, "height width"], focal: tuple[float, float], center: tuple[float, float]
+) -> tuple[Float[np.ndarray, "N 3"], Float[np.ndarray, "N 2"]]:
+    """Points of a pinhole camera (x right, y down, z ahead), and their pixels; depth in metres, 0 if missing."""
+    row, column = np.nonzero(depth > 0)
+    pixels = np.stack([column, row], axis=1).astype(float)
+    distance = depth[row, column, None]
+    return np.hstack([(pixels - center) / focal * distance, distance]), pixels
+
+
+def _open(path: str | os.PathLike[str]) -> Any:
+    Image = optional_module("PIL.Image", "io", "reading images")
+    try:
+        return Image.open(path)
+    except Image.UnidentifiedImageError as error:
+        raise ValueError(f"{path}: cannot be read as an image") from error
+
+
+def clouds(folder: str | os.PathLike[str], glob: str = "*") -> CloudFiles:
+    """The clouds of a folder in order of name, where numbers count by value: `scan_9.ply` precedes `scan_10.ply`.
+
+    Args:
+        folder: contains files that `mcgicp_jax.io.read` reads.
+        glob: pattern for their names, such as "*.ply".
+
+    Returns:
+        Frames without poses and times. Hidden files are ignored; the attribute `left_out` lists others that are no
+        clouds by their suffix or, for text and arrays of NumPy, by their content, such as poses, tables and logs.
+
+    Raises:
+        OSError: if there is no such folder.
+        ValueError: if there are no clouds; for an invalid cloud, when its frame is read.
+    """
+    return CloudFiles(Path(folder), glob)
+
+
+class CloudFiles(AbstractFrames):
+    """See `clouds`.
+
+    Attributes:
+        paths: files of the frames.
+        left_out: files that are no clouds.
+    """
+
+    def __init__(self, folder: Path, glob: str):
+        # Raises if there is no such folder.
+        os.scandir(folder).close()
+        visible = (path for path in folder.glob(glob) if path.is_file() and not path.name.startswith("."))
+        paths = sorted(visible, key=_by_number)
+        self.paths = [path for path in paths if is_cloud(path)]
+        self.left_out = [path for path in paths if path not in self.paths]
+        if not self.paths:
+            raise ValueError(f"{folder}: expected clouds {glob}, found none")
+        super().__init__(len(self.paths))
+
+    def _frame(self, index: int) -> Frame:
+        return Frame(io.read(self.paths[index]))
+
+
+def _by_number(path: Path) -> list[tuple[str, int]]:
+    return [(text, int(number or 0)) for text, number in re.findall(r"(\D*)(\d*)", path.name)]

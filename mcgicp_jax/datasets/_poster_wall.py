@@ -11,8 +11,7 @@ from jaxtyping import Float, Int
 from scipy.spatial.transform import Rotation
 
 from mcgicp_jax._clouds.point_cloud import PointCloud
-from mcgicp_jax.datasets._frames import Matrix, SyntheticFrames, check_scene, pose_of, scene_and_path_rng
-from mcgicp_jax.datasets._images import bilinear
+from mcgicp_jax.datasets._frames import Matrix, SyntheticFrames, bilinear, check_scene, pose_of, scene_and_path_rng
 
 # The constants of this module define the scene and the camera.
 # First-generation Kinect: image size and focal length, pixels.

@@ -77,12 +77,7 @@ class _Thing:
 
 
 def street(
-    num_frames: int = 50,
-    *,
-    points_per_frame: int = 30_000,
-    step: float = 1.0,
-    noise: float = 1.0,
-    seed: int = 0,
+    num_frames: int = 50, *, points_per_frame: int = 30_000, step: float = 1.0, noise: float = 1.0, seed: int = 0
 ) -> SyntheticFrames:
     """A car drives along a street of houses with a spinning 64-beam LiDAR and a panoramic camera on its roof.
 

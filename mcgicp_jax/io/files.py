@@ -3,26 +3,17 @@
 from __future__ import annotations
 
 import contextlib
-import importlib
 import os
 import re
 import uuid
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import BinaryIO
 
 import numpy as np
 
 from mcgicp_jax._clouds.columns import COLORS, Columns, arrays_of_columns, channel_name
 from mcgicp_jax._clouds.point_cloud import PointCloud
-
-
-def optional_module(module: str, use: str) -> Any:
-    """Import a package of the extra `io`. `use`, such as "reading .ply", is part of the error message."""
-    try:
-        return importlib.import_module(module)
-    except ImportError as error:
-        raise ImportError(f"{use} files needs {module}: pip install 'mcgicp_jax[io]'") from error
 
 
 def check_size(claimed: int, size: int) -> None:

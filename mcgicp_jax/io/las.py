@@ -10,7 +10,8 @@ from jaxtyping import Float, Shaped
 
 from mcgicp_jax._clouds.columns import COLORS, ORDER
 from mcgicp_jax._clouds.point_cloud import PointCloud
-from mcgicp_jax.io.files import check_size, cloud_of, optional_module
+from mcgicp_jax._compute.messages import optional_module
+from mcgicp_jax.io.files import check_size, cloud_of
 
 # Points per chunk: bounds the memory that laspy needs beyond the columns that are kept.
 _LAS_ROWS_AT_ONCE = 100_000
@@ -19,7 +20,7 @@ _LAZ_LAYERS = {6: 9, 7: 10, 8: 11, 9: 10, 10: 12}
 
 
 def read_las(file: BinaryIO, size: int) -> PointCloud:
-    laspy = optional_module("laspy", "reading .las and .laz")
+    laspy = optional_module("laspy", "io", "reading .las and .laz files")
     head = file.read(104)
     if len(head) < 104 or head[:4] != b"LASF":
         raise ValueError("no LAS header")
@@ -50,7 +51,7 @@ def read_las(file: BinaryIO, size: int) -> PointCloud:
 
 def _check_laz(file: BinaryIO, header: Any, size: int) -> None:
     """Check the chunk table: lazrs allocates the sizes claimed there and aborts the process if it cannot."""
-    lazrs = optional_module("lazrs", "reading .laz")
+    lazrs = optional_module("lazrs", "io", "reading .laz files")
     item_bytes = lazrs.LazVlr(header.vlrs.get("LasZipVlr")[0].record_data).item_size()
     start, row_bytes = header.offset_to_point_data, header.point_format.size
     if item_bytes != row_bytes:
@@ -78,10 +79,10 @@ def _check_laz(file: BinaryIO, header: Any, size: int) -> None:
 
 
 def write_las(file: BinaryIO, cloud: PointCloud, compress: bool) -> None:
-    use = "writing .laz" if compress else "writing .las"
-    laspy = optional_module("laspy", use)
+    use = f"writing {'.laz' if compress else '.las'} files"
+    laspy = optional_module("laspy", "io", use)
     if compress:
-        optional_module("lazrs", use)
+        optional_module("lazrs", "io", use)
     names = set(cloud.channel_names)
     if len(names) < len(cloud.channel_names) or names not in (set(), {"intensity"}, set(COLORS), set(ORDER)):
         raise ValueError(

@@ -10,14 +10,15 @@ import numpy as np
 
 from mcgicp_jax._clouds.columns import COLORS, with_unpacked_colors
 from mcgicp_jax._clouds.point_cloud import PointCloud
-from mcgicp_jax.io.files import check_size, cloud_of, columns_of, optional_module
+from mcgicp_jax._compute.messages import optional_module
+from mcgicp_jax.io.files import check_size, cloud_of, columns_of
 
 # Bound on the compression ratio of LZF, whose blocks of three bytes expand to at most 264.
 _LZF_RATIO = 100
 
 
 def read_pcd(file: BinaryIO, size: int) -> PointCloud:
-    pypcd4 = optional_module("pypcd4", "reading .pcd")
+    pypcd4 = optional_module("pypcd4", "io", "reading .pcd files")
     metadata, start = pypcd4.MetaData.parse_header(_pcd_header(file)), file.tell()
     if metadata.points == 0:
         raise ValueError("it has no points")
@@ -66,7 +67,7 @@ def _check_lzf(file: BinaryIO, claimed: int, size: int) -> None:
 
 
 def write_pcd(file: BinaryIO, cloud: PointCloud) -> None:
-    pypcd4 = optional_module("pypcd4", "writing .pcd")
+    pypcd4 = optional_module("pypcd4", "io", "writing .pcd files")
     columns = columns_of(cloud)
     if all(name in columns and columns[name].dtype == np.uint8 for name in COLORS):
         colours = np.column_stack([columns.pop(name) for name in COLORS])

@@ -9,14 +9,15 @@ from typing import Any, BinaryIO
 import numpy as np
 
 from mcgicp_jax._clouds.point_cloud import PointCloud
-from mcgicp_jax.io.files import check_size, cloud_of, columns_of, optional_module
+from mcgicp_jax._compute.messages import optional_module
+from mcgicp_jax.io.files import check_size, cloud_of, columns_of
 
 # Bytes searched for the end of a PLY header, far more than the header of a cloud needs.
 _PLY_HEADER_BYTES = 2**20
 
 
 def read_ply(file: BinaryIO, size: int) -> PointCloud:
-    plyfile = optional_module("plyfile", "reading .ply")
+    plyfile = optional_module("plyfile", "io", "reading .ply files")
     head, end, _ = file.read(_PLY_HEADER_BYTES).partition(b"end_header")
     if not end:
         raise ValueError("no PLY header")
@@ -43,7 +44,7 @@ def _ply_row_bytes(element: Any, text: bool) -> int:
 
 
 def write_ply(file: BinaryIO, cloud: PointCloud) -> None:
-    plyfile = optional_module("plyfile", "writing .ply")
+    plyfile = optional_module("plyfile", "io", "writing .ply files")
     columns = columns_of(cloud)
     rows = np.empty(len(cloud), [(name, values.dtype) for name, values in columns.items()])
     for name, values in columns.items():

@@ -1,19 +1,25 @@
-"""Poses as text files."""
+"""Poses as text files, and pose graphs as g2o files."""
 
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from typing import Any
 
 import numpy as np
 from jaxtyping import Float
 
-from mcgicp_jax._math.poses import pose_matrices, pose_matrix
+from mcgicp_jax._math.poses import matrices_of, parameters_of, pose_matrices, pose_matrix
+from mcgicp_jax._pose_graph.edge import WORLD, Edge
+from mcgicp_jax._pose_graph.graph import PoseGraph
 from mcgicp_jax.io.files import reason_of, replacing
 
 # Quaternions are commonly written with four digits.
 _UNIT_TOLERANCE = 1e-3
+# Tags of the lines. A prior has a vertex and the number of the sensor's offset, which has a line of its own.
+_VERTEX, _EDGE, _PRIOR, _OFFSET = "VERTEX_SE3:QUAT", "EDGE_SE3:QUAT", "EDGE_SE3_PRIOR", "PARAMS_SE3OFFSET"
+# Per tag: number of integers at the start of a line, and total number of values.
+_WIDTHS = {_VERTEX: (1, 8), _EDGE: (2, 30), _PRIOR: (2, 30), _OFFSET: (1, 8)}
 
 
 def read_poses(path: str | os.PathLike[str]) -> Float[np.ndarray, "N 4 4"]:
@@ -99,3 +105,114 @@ def write_poses(
         rows = np.column_stack([times, matrices[:, :3, 3], quaternions])
     with replacing(path) as file:
         np.savetxt(file, rows, fmt="%.17g")
+
+
+def read_g2o(path: str | os.PathLike[str]) -> PoseGraph:
+    """Read a pose graph of `VERTEX_SE3:QUAT`, `EDGE_SE3:QUAT` and `EDGE_SE3_PRIOR` lines; others are ignored.
+
+    A line holds x y z qx qy qz qw and the upper triangle of the information matrix. As in GTSAM and Ceres, the matrix
+    refers to ξ = (v, ω). g2o itself uses the vector part of the quaternion, half of ω, in place of ω.
+
+    Args:
+        path: the file. Vertices may have any numbers; they become rows in ascending order. Edges between vertices whose
+            numbers are not consecutive are loops. Priors become edges from the world.
+
+    Raises:
+        OSError: if the file cannot be opened.
+        ValueError: if a line has the wrong format, or the graph is not valid; the message starts with the path.
+    """
+    with open(path, encoding="utf-8-sig") as file:
+        try:
+            return _graph_of(file)
+        except ValueError as error:
+            raise ValueError(f"{path}: cannot be read as a pose graph: {reason_of(error)}") from error
+
+
+def write_g2o(path: str | os.PathLike[str], graph: PoseGraph | Any) -> None:
+    """Write a pose graph, or the result of `optimize_poses` without the loops that it rejected, as `read_g2o` reads it.
+
+    Raises:
+        OSError: if the file cannot be written.
+        ValueError: if `graph` is neither, or has factors that are not edges, for which the format has no lines.
+    """
+    if not isinstance(getattr(graph, "edges", None), Edge):
+        raise ValueError(f"graph: expected a PoseGraph or a PoseGraphResult, got {type(graph).__name__}")
+    if others := getattr(graph, "factors", None) or getattr(graph, "factor_weights", None):
+        raise ValueError(f"graph: expected edges alone, which g2o files can hold, got {len(others)} further factors")
+    with replacing(path) as file:
+        for form, rows in _lines_of(graph):
+            np.savetxt(file, rows, fmt=form)
+
+
+def _graph_of(lines: Iterable[str]) -> PoseGraph:
+    words = [(number, line.split()) for number, line in enumerate(lines, 1)]
+    found = {tag: _rows(words, tag) for tag in _WIDTHS}
+    (_, vertices), (edge_lines, edges), (prior_lines, priors), (_, offsets) = found.values()
+    if not len(vertices):
+        others = ", ".join(sorted({each[0] for _, each in words if each})[:4])
+        raise ValueError(f"expected lines {_VERTEX}, poses in space, got {others or 'none'}")
+    if len(priors) and np.any(offsets[:, 1:] != [0, 0, 0, 0, 0, 0, 1]):
+        raise ValueError(f"expected priors of the poses themselves, got {_OFFSET} other than the identity")
+    ends, values = np.concatenate([edges[:, :2], priors[:, [0, 0]]]), np.concatenate([edges, priors])
+    numbers, first = np.unique(vertices[:, 0], return_index=True)
+    rows = np.searchsorted(numbers, ends).clip(max=len(numbers) - 1)
+    missing = np.argwhere(numbers[rows] != ends)
+    if len(missing):
+        line = [*edge_lines, *prior_lines][missing[0, 0]]
+        raise ValueError(f"line {line}: expected a vertex for each end, got none of number {ends[*missing[0]]:g}")
+    upper, information = np.triu_indices(6), np.zeros((len(values), 6, 6))
+    information[:, *upper] = information[:, *upper[::-1]] = values[:, 9:]
+    of_world = np.arange(len(values)) >= len(edges)
+    loop = ~of_world & (np.abs(ends[:, 0] - ends[:, 1]) != 1)
+    i = np.where(of_world, WORLD, rows[:, 0])
+    return PoseGraph(
+        _poses(vertices[first, 1:]), Edge(i, rows[:, 1], _poses(values[:, 2:9]), information, uncertain=loop)
+    )
+
+
+def _lines_of(graph: PoseGraph | Any) -> Iterator[tuple[str, Float[np.ndarray, "N _"]]]:
+    """Format and numbers of the lines of a graph, of each kind."""
+    edges, poses = graph.edges[np.asarray(getattr(graph, "kept", np.ones(len(graph.edges), bool)))], graph.poses
+    i, j, motions = np.asarray(edges.i), np.asarray(edges.j), np.asarray(edges.T_i_j)
+    upper, none = np.asarray(edges.information)[:, *np.triu_indices(6)], np.zeros((len(poses), 0))
+    of_world = i == WORLD
+    yield _formatted(_VERTEX, np.arange(len(poses))[:, None], np.asarray(poses), none)
+    yield _formatted(_EDGE, np.column_stack([i, j])[~of_world], motions[~of_world], upper[~of_world])
+    if of_world.any():
+        yield _formatted(_OFFSET, np.zeros((1, 1)), np.eye(4)[None], none[:1])
+        yield _formatted(_PRIOR, np.column_stack([j, 0 * j])[of_world], motions[of_world], upper[of_world])
+
+
+def _rows(lines: list[tuple[int, list[str]]], tag: str) -> tuple[list[int], Float[np.ndarray, "N _"]]:
+    """Line numbers and numbers of the lines with a tag."""
+    whole, width = _WIDTHS[tag]
+    chosen, rows = [], []
+    for line, words in lines:
+        if words[:1] == [tag]:
+            try:
+                row = [float(word) for word in words[1:]]
+            except ValueError as error:
+                raise ValueError(f"line {line}: {error}") from error
+            if len(row) != width:
+                raise ValueError(f"line {line}: expected {width} numbers after {tag}, got {len(row)}")
+            if not (np.isfinite(row).all() and any(row[whole + 3 : whole + 7])):
+                raise ValueError(f"line {line}: expected finite numbers and a quaternion other than 0, got {row}")
+            if any(abs(number) >= 2**53 for number in row[:whole]):
+                raise ValueError(f"line {line}: expected vertex numbers below 2^53, got {words[1]}; number them anew")
+            chosen.append(line)
+            rows.append(row)
+    return chosen, np.array(rows).reshape(-1, width)
+
+
+def _poses(rows: Float[np.ndarray, "N 7"]) -> Float[np.ndarray, "N 4 4"]:
+    """Poses from x y z qx qy qz qw, with quaternions of any norm."""
+    return matrices_of(rows[:, [6, 3, 4, 5, 0, 1, 2]])
+
+
+def _formatted(
+    tag: str, numbers: Any, poses: Float[np.ndarray, "N 4 4"], information: Float[np.ndarray, "N _"]
+) -> tuple[str, Float[np.ndarray, "N _"]]:
+    parameters = parameters_of(np.asarray(poses, np.float64))[:, [4, 5, 6, 1, 2, 3, 0]]
+    rows = np.column_stack([numbers, parameters, information])
+    whole, width = _WIDTHS[tag]
+    return " ".join([tag, *["%d"] * whole, *["%.17g"] * (width - whole)]), rows

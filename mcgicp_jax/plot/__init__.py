@@ -3,10 +3,9 @@
 Every function returns its figure; none opens a window or changes matplotlib's global state.
 """
 
-from mcgicp_jax.plot.before_after import before_after
 from mcgicp_jax.plot.charts import convergence, graph, trajectories
 from mcgicp_jax.plot.drawing import check_picture
-from mcgicp_jax.plot.pictures import clouds, maps, surface_covariances
+from mcgicp_jax.plot.pictures import before_after, clouds, maps, surface_covariances
 
 __all__ = [
     "before_after",

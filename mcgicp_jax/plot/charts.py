@@ -12,7 +12,7 @@ from jaxtyping import Float
 from mcgicp_jax._math.poses import Pose, pose_matrix
 from mcgicp_jax._pose_graph.edge import WORLD
 from mcgicp_jax._pose_graph.optimize import PoseGraphResult
-from mcgicp_jax.plot.drawing import Figure, File, new_figure, optional_module, saved
+from mcgicp_jax.plot.drawing import Figure, File, new_figure, plotting, saved
 
 # Residual at the end of the colour scale of a graph, standard deviations: loops beyond it are rejected.
 _LARGEST_RESIDUAL = 4.1
@@ -44,9 +44,7 @@ def convergence(histories: Mapping[str, Sequence[float] | ArrayLike], *, ylabel:
 
 
 def trajectories(
-    trajectories: Mapping[str, Sequence[Pose] | Float[np.ndarray, "N 4 4"]],
-    *,
-    path: File = None,
+    trajectories: Mapping[str, Sequence[Pose] | Float[np.ndarray, "N 4 4"]], *, path: File = None
 ) -> Figure:
     """Plot trajectories in the principal plane of the first one.
 
@@ -90,7 +88,7 @@ def graph(graph: PoseGraphResult, *, path: File = None) -> Figure:
     Raises:
         ImportError: if matplotlib is missing.
     """
-    collections = optional_module("matplotlib.collections")
+    collections = plotting("matplotlib.collections")
     positions = np.asarray(graph.poses)[:, :3, 3]
     centre = positions.mean(axis=0)
     # The eigenvectors of the two largest eigenvalues, which come last.

@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
-import importlib
 import os
 from dataclasses import dataclass
+from functools import partial
 from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
 from jaxtyping import Float, Int
 
 from mcgicp_jax._clouds.point_cloud import PointCloud
+from mcgicp_jax._compute.messages import optional_module
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -26,16 +27,13 @@ Map: TypeAlias = Float[np.ndarray, "height width"]
 PIXELS_PER_SPACING = 3
 
 
-def optional_module(name: str) -> Any:
-    try:
-        return importlib.import_module(name)
-    except ImportError as error:
-        raise ImportError(f"plotting needs {name.partition('.')[0]}: pip install 'mcgicp_jax[plot]'") from error
+# From a package of the extra `plot`.
+plotting = partial(optional_module, extra="plot", use="plotting")
 
 
 def new_figure(width: float | int, height: float | int) -> Figure:
     """An empty figure, inches, that belongs to no window."""
-    return optional_module("matplotlib.figure").Figure((width, height), layout="constrained")
+    return plotting("matplotlib.figure").Figure((width, height), layout="constrained")
 
 
 def saved(figure: Figure, path: File, **options: Any) -> Figure:
@@ -47,7 +45,7 @@ def saved(figure: Figure, path: File, **options: Any) -> Figure:
 
 def check_picture(path: str | os.PathLike[str]) -> None:
     """Raise `ValueError` if matplotlib cannot save figures to a file with this suffix."""
-    kinds = optional_module("matplotlib.figure").Figure().canvas.get_supported_filetypes()
+    kinds = plotting("matplotlib.figure").Figure().canvas.get_supported_filetypes()
     suffix = os.path.splitext(path)[1]
     if suffix.lower().removeprefix(".") not in kinds:
         raise ValueError(f"{os.fspath(path)}: unknown suffix {suffix!r}; expected one of .{', .'.join(kinds)}")

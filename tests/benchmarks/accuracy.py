@@ -23,8 +23,7 @@ import numpy as np
 import mcgicp_jax as mcg
 from mcgicp_jax import datasets
 from mcgicp_jax.datasets import _poster_wall as posters
-from mcgicp_jax.datasets._frames import scene_and_path_rng
-from mcgicp_jax.datasets._images import bilinear
+from mcgicp_jax.datasets._frames import bilinear, scene_and_path_rng
 from tests.benchmarks.global_pose import desk, living_room
 
 try:

@@ -86,7 +86,7 @@ def living_room() -> list[Any]:
 
 def desk() -> list[Any]:
     """The pair of TUM fr1/xyz, whose files have no lists."""
-    from mcgicp_jax.datasets._images import back_project, read_depth, read_image
+    from mcgicp_jax.datasets._frames import back_project, read_depth, read_image
 
     frames = []
     for name in ("prev", "curr"):
