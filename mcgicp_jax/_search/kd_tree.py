@@ -135,7 +135,10 @@ class AbstractTreeSearch(AbstractSearch, TreeBackend):
             neighbors[order if rows is None else slice(None), : found.shape[1]] = found
             return neighbors
 
-        return NeighborsOnDemand(find, shape, partial(self.neighbors_on_demand, points, num_neighbors))
+        # Pickles name the class of the search by its place, which is inside a function for a local one.
+        local = "<locals>" in type(self).__qualname__
+        anew = None if local else partial(self.neighbors_on_demand, points, num_neighbors)
+        return NeighborsOnDemand(find, shape, anew)
 
 
 class KDTreeSearch(AbstractTreeSearch):
