@@ -195,7 +195,7 @@ def _index_of(search: AbstractTreeSearch, target: SearchPoints) -> TreeIndex:
     digest = hashlib.blake2b(repr([search, *((array.shape, array.dtype) for array in arrays)]).encode())
     for array in arrays:
         digest.update(np.ascontiguousarray(array).data)
-    return _indices.get(digest.digest(), partial(TreeIndex, search, target))
+    return _indices.get(digest.digest(), partial(search.index, target))
 
 
 def _nearest_callback(
