@@ -103,9 +103,8 @@ def test_a_direction_is_fixed_at_the_origin_of_the_users_coordinates(traced):
     far = motion((300, -400, 100, 0, 0, 0))
     clouds = [mcg.preprocess(np.asarray(cloud.points, np.float64) + far[:3, 3]) for cloud in (source, target)]
     assert np.any(clouds[0].origin)
-    start, prior = (
-        far @ truth @ each @ np.linalg.inv(far) for each in (np.eye(4), motion((0.02, -0.01, 0.015, 0.01, -0.015, 0.02)))
-    )
+    error = motion((0.02, -0.01, 0.015, 0.01, -0.015, 0.02))
+    start, prior = (far @ truth @ each @ np.linalg.inv(far) for each in (np.eye(4), error))
 
     def register(source, target):
         given = prior, covariance_fixing("z")
