@@ -71,6 +71,10 @@ def test_swapped_arguments_are_named():
         mcg.mahalanobis_cost(cloud, cloud, np.eye(4), cloud, mcg.GICP())
     with pytest.raises(errors, match=r"pose: expected a jaxlie\.SE3|parameters of"):
         mcg.mahalanobis_cost(cloud, cloud, cloud, matches, mcg.GICP())
+    with pytest.raises(errors, match=r"^target: expected a PointCloud, got ndarray; is the order|parameters of"):
+        mcg.mahalanobis_cost(cloud, cloud, np.eye(4), matches, mcg.GICP())
+    with pytest.raises(errors, match=r"^source: expected a PointCloud, got ndarray; is the order|parameters of"):
+        mcg.find_correspondences(np.eye(4), cloud, cloud, mcg.GICP(), max_distance=1.0)
     with pytest.raises(ValueError, match="num_candidates: expected an integer"):
         mcg.D2DNDT(num_candidates=True)
 

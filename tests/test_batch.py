@@ -184,12 +184,13 @@ def test_functions_that_make_clouds_are_called_by_the_workers(raw, alone):
     assert_same(results[2:], alone[2:])
 
 
-def test_any_error_of_a_function_is_the_reason_of_its_pair(raw, alone):
+@pytest.mark.parametrize("error", [KeyError("scan"), SystemExit("scan")], ids=["error", "exit"])
+def test_any_error_of_a_function_is_the_reason_of_its_pair(error, raw, alone):
     calls = []
 
     def broken():
         calls.append(None)
-        return {}["scan"]
+        raise error
 
     class OtherProcesses(Executor):
         def submit(self, function, chunk):
@@ -199,7 +200,7 @@ def test_any_error_of_a_function_is_the_reason_of_its_pair(raw, alone):
 
     sources, targets = prepared(raw)
     for executor in (None, OtherProcesses()):
-        reason = rf"pair 1: source: KeyError: 'scan' \({re.escape(__file__)}, line \d+\)"
+        reason = rf"pair 1: source: {type(error).__name__}: '?scan'? \({re.escape(__file__)}, line \d+\)"
         with pytest.warns(mcg.PairWarning, match=reason) as caught:
             results = batch([sources[0], broken, *sources[2:]], targets, executor=executor)
         assert len(caught) == len(calls) == 1 and results[1].status is Status.INVALID_INPUT

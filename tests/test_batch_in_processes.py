@@ -142,6 +142,16 @@ def test_an_early_end_ends_the_workers(raw):
     assert not is_running(pid)
 
 
+def test_an_early_end_does_not_disturb_other_batches(raw, recwarn):
+    sources, targets = prepared(raw)
+    completed = mcg.register_as_completed(20 * sources, 20 * targets, METHOD, max_distance=0.5, executor="processes")
+    other = mcg.register_as_completed(8 * sources, 8 * targets, METHOD, max_distance=0.5, executor="processes")
+    next(completed), next(other)
+    completed.close()
+    assert sum(1 for _, result in other if result.converged) == 8 * len(sources) - 1
+    assert not recwarn.list
+
+
 def is_running(pid):
     try:
         with open(f"/proc/{pid}/stat", encoding="utf-8") as file:

@@ -10,7 +10,7 @@ import jaxlie
 import numpy as np
 import pytest
 
-from mcgicp_jax import GICP, PointCloud, preprocess, register
+from mcgicp_jax import GICP, KDTreeSearch, PointCloud, preprocess, register
 from mcgicp_jax._clouds.point_cloud import Frame, as_cloud
 from tests import reference as ref
 from tests.precision import tolerance
@@ -309,6 +309,16 @@ def pickled(cloud):
 def test_copies_are_the_same(cloud, through):
     assert_same(through(cloud), cloud)
     assert repr(through(cloud)) == repr(cloud)
+
+
+def test_a_cloud_is_pickled_whose_search_is_defined_in_a_function():
+    class Search(KDTreeSearch):
+        pass
+
+    # So many that not all neighbours are found yet.
+    cloud = preprocess(np.random.default_rng(0).random((5000, 3)), search=Search())
+    found = pickled(cloud)
+    np.testing.assert_array_equal(found.neighbors, cloud.neighbors)
 
 
 def test_a_cloud_goes_through_jit():

@@ -7,6 +7,7 @@ import time
 from concurrent.futures import ThreadPoolExecutor
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -179,13 +180,16 @@ def test_matches_of_a_cloud_are_those_of_a_new_one(cloud, arguments):
     known = np.random.default_rng(1).random(cloud.channels.shape) < 0.7
     source, target = cloud.replace(channel_valid=known[::-1]), cloud.replace(channel_valid=known)
 
-    def rows(target, given):
+    def rows(source, target, given):
         return mcg.find_correspondences(source, target, motion(), max_distance=1.0, **given).indices
 
-    found = [rows(target, given) for given in arguments]
+    found = [rows(source, target, given) for given in arguments]
     assert np.any(found[0] != found[1])
     for given, each in zip(arguments, found, strict=True):
-        np.testing.assert_array_equal(each, rows(target.replace(), given))
+        np.testing.assert_array_equal(each, rows(source, target.replace(), given))
+        # There, trees are cached by the content of the target.
+        inside = jax.jit(lambda *clouds, given=given: rows(*clouds, given))(source, target)
+        np.testing.assert_array_equal(each, inside)
 
 
 def test_rows_are_computed_once_by_threads_that_share_a_table():

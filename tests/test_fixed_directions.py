@@ -96,6 +96,25 @@ def test_large_coordinates():
     assert result.converged and np.abs(apart[2:5]).max() < 1e-6 and np.abs(apart).max() < 5e-3
 
 
+@pytest.mark.parametrize("traced", [False, True])
+def test_a_direction_is_fixed_at_the_origin_of_the_users_coordinates(traced):
+    """Where a rotation at the cloud moves by metres, and not at the origin of the cloud."""
+    source, target, truth = pair()
+    far = motion((300, -400, 100, 0, 0, 0))
+    clouds = [mcg.preprocess(np.asarray(cloud.points, np.float64) + far[:3, 3]) for cloud in (source, target)]
+    assert np.any(clouds[0].origin)
+    error = motion((0.02, -0.01, 0.015, 0.01, -0.015, 0.02))
+    start, prior = (far @ truth @ each @ np.linalg.inv(far) for each in (np.eye(4), error))
+
+    def register(source, target):
+        given = prior, covariance_fixing("z")
+        return mcg.register(source, target, mcg.GICP(), init=start, prior=given, **OPTIONS).matrix
+
+    apart = remaining((jax.jit(register) if traced else register)(*clouds), prior)
+    # float32 has steps of 3e-5 m there.
+    assert abs(apart[2]) < 2e-3 and np.abs(apart[:2]).min() > 1
+
+
 def test_fixed_directions_need_no_data():
     """A floor constrains neither x, y nor yaw, a corridor not the way along it; the status asks for the rest alone."""
     target, source = corridor(2, textured=False)

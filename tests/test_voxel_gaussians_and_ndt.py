@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from jaxtyping import TypeCheckError
 
 import mcgicp_jax as mcg
 from mcgicp_jax import extend
@@ -147,6 +148,30 @@ def test_moments_of_cells_without_channels():
     means, channels, covariances = extend.cell_moments(points, np.zeros((len(points), 0)), cells)
     assert channels.shape == (len(means), 0) and covariances.shape == (len(means), 3, 3)
     assert means.dtype == covariances.dtype == jnp.zeros(()).dtype
+
+
+@pytest.mark.parametrize(
+    ("name", "wrong"),
+    [
+        ("points", {"points": np.zeros((4, 2))}),
+        ("points", {"points": [["a", "b", "c"]] * 4}),
+        ("points", {"points": None}),
+        ("channels", {"channels": np.zeros(4)}),
+        ("channels", {"channels": np.zeros((3, 1))}),
+        ("cells", {"cells": np.zeros(4)}),
+        ("cells", {"cells": np.zeros(3, int)}),
+    ],
+)
+def test_moments_of_what_is_no_array_of_points_are_refused_by_name(name, wrong):
+    given = {"points": np.zeros((4, 3)), "channels": np.zeros((4, 1)), "cells": np.zeros(4, int)} | wrong
+    with pytest.raises((ValueError, TypeCheckError), match=f"^{name}: expected|parameter"):
+        extend.cell_moments(**given)
+
+
+def test_moments_of_traced_cells_are_refused_by_name():
+    moments = jax.jit(partial(extend.cell_moments, np.zeros((4, 3)), np.zeros((4, 1))))
+    with pytest.raises((ValueError, TypeCheckError), match=r"^cells: expected concrete|parameter"):
+        moments(np.zeros(4, int))
 
 
 @in_float64

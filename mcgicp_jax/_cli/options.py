@@ -58,7 +58,12 @@ Distances: TypeAlias = Annotated[tuple[float, ...], shown(default="10 and 2.5 sp
 Sizes: TypeAlias = Annotated[tuple[float, ...], shown(default="none")]
 Tolerance: TypeAlias = Annotated[float | None, shown("FLOAT", "0.005 spacings")]
 Kernel: TypeAlias = Annotated[tuple[KernelName, float] | None, shown("KERNEL SCALE")]
-Fixed: TypeAlias = Annotated[tuple[Literal["x", "y", "z", "roll", "pitch", "yaw"], ...], shown(default="none")]
+# Repeated options add up.
+Fixed: TypeAlias = Annotated[
+    tuple[tuple[Literal["x", "y", "z", "roll", "pitch", "yaw"], ...], ...],
+    tyro.conf.UseAppendAction,
+    shown(default="none"),
+]
 Epsilon: TypeAlias = Annotated[
     float | None, shown("FLOAT", str(inspect.signature(mcg.GICP).parameters["epsilon"].default))
 ]
@@ -173,7 +178,7 @@ class PairOptions(Options):
     Attributes:
         init: File with the initial pose T_target_source: a 4x4 matrix, or 12 numbers (KITTI) or 8 (TUM) on one line. By
             default the identity. global: the pose is found from any start by local features.
-        fix: Directions in which the pose stays the initial one, in one list: along and about the axes of the source.
+        fix: Directions in which the pose stays the initial one: along and about the axes of the source.
             For a planar motion, z roll pitch.
         plot: File for a picture of the clouds before and after registration, such as out.png.
     """

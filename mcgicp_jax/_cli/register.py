@@ -85,7 +85,7 @@ class PreparedPair:
     def arguments(self, name: MethodName) -> dict[str, Any]:
         arguments = self.choices.arguments(name, lambda: self.ready)
         if self.options.fix:
-            variances = np.where(np.isin(_DIRECTIONS, self.options.fix), 0, _UNKNOWN)
+            variances = np.where(np.isin(_DIRECTIONS, sum(self.options.fix, ())), 0, _UNKNOWN)
             arguments["prior"] = self.start, np.diag(variances)
         return arguments
 
@@ -242,9 +242,7 @@ def _parameters(method: AbstractMethod) -> str:
 def _report(pair: PreparedPair, result: mcg.RegistrationResult) -> None:
     plural = "" if result.num_iterations == 1 else "s"
     print(f"status:    {words(result)} after {result.num_iterations} iteration{plural}")
-    size = len(pair.ready[0])
-    used = min(size, pair.options.registration()["max_source_points"] or size)
-    print(f"inliers:   {result.num_inliers:,} of {used:,} ({result.overlap:.0%}), rmse {result.rmse:.4g} m")
+    print(f"inliers:   {result.num_inliers:,} ({result.overlap:.0%} of the points used), rmse {result.rmse:.4g} m")
     if result.converged and np.all(np.isfinite(result.deviations)):
         x, y, z, *angles = result.deviations
         roll, pitch, yaw = np.degrees(angles)

@@ -15,7 +15,7 @@ from mcgicp_jax._clouds.point_cloud import PointCloud, Values, as_cloud
 from mcgicp_jax._clouds.preprocess import MIN_POINTS, finite_rows, preprocess, with_neighbors
 from mcgicp_jax._clouds.voxel_size import NUM_NEIGHBORS
 from mcgicp_jax._clouds.voxels import voxel_order
-from mcgicp_jax._compute.concrete import AnyArray, numpy_for
+from mcgicp_jax._compute.concrete import AnyArray, is_concrete, numpy_for
 from mcgicp_jax._compute.linear_maps import averaged
 from mcgicp_jax._compute.messages import check_integer, check_positive, is_number
 from mcgicp_jax._compute.row_functions import Input, Rows, blockwise
@@ -233,8 +233,21 @@ def cell_moments(
         points, channels: of the cloud; metres and channel units.
         cells: from `voxel_cells`; concrete.
         min_ratio: as in `voxel_gaussians`.
+
+    Raises:
+        ValueError: if the shape or dtype of an array is wrong, or `cells` is traced.
     """
-    points, channels = (numpy_for(each).asarray(each) for each in (points, channels))
+    if not is_concrete(cells):
+        raise ValueError("cells: expected concrete integers, got tracers")
+    points, channels, cells = (numpy_for(each).asarray(each) for each in (points, channels, cells))
+    count = len(points) if points.ndim else 0
+    for name, array, fits, kind in (
+        ("points: expected (N, 3) numbers", points, points.shape == (count, 3), np.number),
+        (f"channels: expected ({count}, C) numbers", channels, channels.shape[:-1] == (count,), np.number),
+        (f"cells: expected ({count},) integers", cells, cells.shape == (count,), np.integer),
+    ):
+        if not (fits and jnp.issubdtype(array.dtype, kind)):
+            raise ValueError(f"{name}, got {array.dtype} of shape {array.shape}")
     dtype = jax.dtypes.canonicalize_dtype(np.result_type(points.dtype, np.float32))
     points, channels = points.astype(dtype), channels.astype(dtype)
     means, counts = averaged(points, cells), np.bincount(cells[cells >= 0])

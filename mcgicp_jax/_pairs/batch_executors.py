@@ -22,7 +22,7 @@ from dataclasses import replace
 from functools import partial
 from multiprocessing import get_context
 from pickle import PicklingError
-from typing import Any, Literal, TypeAlias
+from typing import Any, ClassVar, Literal, TypeAlias
 
 import jax
 import jaxlie
@@ -67,7 +67,10 @@ _LOOK = 1.0
 
 class Processes(Executor):
     """Single-threaded workers in other processes, from loky: they need no `__main__` guard, and wait for further calls
-    until the interpreter ends. All batches of this process share them; one that ends early ends them for all."""
+    until the interpreter ends. All batches of this process share them."""
+
+    # Chunks of all batches that have not ended, with their batches.
+    _unfinished: ClassVar[dict[Future[Any], Processes]] = {}
 
     def __init__(self, num_workers: int):
         try:
@@ -88,16 +91,24 @@ class Processes(Executor):
 
     def submit(self, function: Callable[..., Any], /, *arguments: Any, **named: Any) -> Future[Any]:
         try:
-            return self._pool.submit(function, *arguments, **named)
+            future = self._pool.submit(function, *arguments, **named)
         except RuntimeError:
             # A worker died, or another batch that ended early has ended the workers.
             self._pool = self._current()
-            return self._pool.submit(function, *arguments, **named)
+            future = self._pool.submit(function, *arguments, **named)
+        self._unfinished[future] = self
+        future.add_done_callback(self._unfinished.pop)
+        return future
 
     def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:
-        """End the workers, if futures are to be cancelled: those in loky's queue cannot."""
+        """Cancel the futures of this batch, if so wanted. Those in loky's queue cannot be cancelled: the workers are
+        ended, too, unless they are at work for another batch."""
         if cancel_futures:
-            self._pool.shutdown(wait, kill_workers=True)
+            batches = list(self._unfinished.items())
+            for future in (future for future, batch in batches if batch is self):
+                future.cancel()
+            if all(batch is self for _, batch in batches):
+                self._pool.shutdown(wait, kill_workers=True)
 
 
 def _begin_worker(parent: int) -> None:

@@ -318,7 +318,8 @@ def _loaded(load: Callable[[], PointCloud | Values]) -> PointCloud | Values:
         return load()
     except (ValueError, OSError):
         raise
-    except Exception as error:
+    # `sys.exit` in the reader of one cloud must not end the batch.
+    except (Exception, SystemExit) as error:
         place = traceback.extract_tb(error.__traceback__)[-1]
         reason = f"{type(error).__name__}: {error}".rstrip(": ")
         raise ValueError(f"{reason} ({place.filename}, line {place.lineno})") from error

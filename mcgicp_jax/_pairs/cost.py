@@ -70,7 +70,7 @@ def mahalanobis_cost(
             missing or not positive, a cloud lacks the neighbours that the method needs, or `log_determinant` is set for
             a method without covariances.
     """
-    check_matches(matches, source, method, temperature)
+    check_matches(matches, source, target, method, temperature)
     if log_determinant and not isinstance(method, AbstractGeneralized):
         raise ValueError(f"log_determinant: expected a method with covariances, got {type(method).__name__}")
     warn_of_estimated_parameters(method, source, target, temperature)

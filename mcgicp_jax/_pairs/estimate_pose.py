@@ -74,7 +74,7 @@ def estimate_pose(
         robust=robust,
         max_source_points=None,
     )
-    check_matches(matches, source, method, temperature)
+    check_matches(matches, source, target, method, temperature)
     check_clouds(source, target, method)
     warn_of_estimated_parameters(method, source, target, temperature)
     softness = None if temperature is None else numpy_for(temperature).asarray(temperature, source.points.dtype)

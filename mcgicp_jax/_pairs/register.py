@@ -114,7 +114,8 @@ def register(
             covariance Σ in the target's axes becomes Rᵀ Σ R. At UTM coordinates, that of a pose measured at the cloud
             must be transported to their origin. Use a large finite variance for unmeasured directions. A variance of 0,
             or any singular covariance, fixes directions: with zeros for z, roll and pitch the motion is planar. The
-            prior is also the initial pose if `init` is None.
+            prior is also the initial pose if `init` is None. Outside of `jit`, standard deviations other than 0 count
+            as at least 1.1e-5 (in float64 4.7e-10) radians, or 1.1e-5 of the largest centred coordinate of the source.
 
     With tie points or a prior, a first registration measures the covariance of the score of the matches. Only what is
     known far more precisely than by the matches acts in it. A second one starts at its pose and weighs matches, tie

@@ -74,10 +74,12 @@ class NeighborsOnDemand(Deferred):
 
     Args:
         find: maps row numbers, or None for all rows, to the rows of their k nearest neighbours.
-        anew: makes the same, for pickles, so that a worker finds the neighbours.
+        anew: makes the same, for pickles, so that a worker finds the neighbours; None: pickles have the whole array.
     """
 
-    def __init__(self, find: Callable[[Any], Int[np.ndarray, "n k"]], shape: tuple[int, int], anew: Callable[[], Any]):
+    def __init__(
+        self, find: Callable[[Any], Int[np.ndarray, "n k"]], shape: tuple[int, int], anew: Callable[[], Any] | None
+    ):
         self.shape, self._anew = shape, anew
         self._table = RowsOnDemand(lambda rows, _: find(rows), shape[0])
 
@@ -92,7 +94,7 @@ class NeighborsOnDemand(Deferred):
         return found
 
     def __reduce__(self) -> Any:
-        return super().__reduce__() if self._table.complete else (self._anew, ())
+        return super().__reduce__() if self._anew is None or self._table.complete else (self._anew, ())
 
 
 class AbstractIndex(abc.ABC):

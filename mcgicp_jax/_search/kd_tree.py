@@ -125,7 +125,10 @@ class AbstractTreeSearch(AbstractSearch, TreeBackend):
             neighbors[order if rows is None else slice(None), : found.shape[1]] = found
             return neighbors
 
-        return NeighborsOnDemand(find, shape, partial(self.neighbors_on_demand, points, num_neighbors))
+        # Pickles name the class of the search by its place, which is inside a function for a local one.
+        local = "<locals>" in type(self).__qualname__
+        anew = None if local else partial(self.neighbors_on_demand, points, num_neighbors)
+        return NeighborsOnDemand(find, shape, anew)
 
 
 class KDTreeSearch(AbstractTreeSearch):
@@ -182,7 +185,7 @@ def _index_of(search: AbstractTreeSearch, target: SearchPoints) -> TreeIndex:
     digest = hashlib.blake2b(repr([search, *((array.shape, array.dtype) for array in arrays)]).encode())
     for array in arrays:
         digest.update(np.ascontiguousarray(array).data)
-    return _indices.get(digest.digest(), partial(TreeIndex, search, target))
+    return _indices.get(digest.digest(), partial(search.index, target))
 
 
 def _nearest_callback(
