@@ -4,7 +4,7 @@ from functools import partial
 
 import numpy as np
 
-from mcgicp_jax._clouds.point_cloud import PointCloud
+from mcgicp_jax import PointCloud
 from mcgicp_jax.datasets._frames import Matrix, SyntheticFrames, check_scene, pose_of, scene_and_path_rng
 from mcgicp_jax.datasets._raycast import Box, cast, patches, random_cells, random_rays, sensor_rotation
 

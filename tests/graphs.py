@@ -9,7 +9,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 import mcgicp_jax as mcg
-from mcgicp_jax._pose_graph.edge import AbstractFactor
+from mcgicp_jax.extend import AbstractFactor
 from tests.scenes import motion
 
 

@@ -5,6 +5,8 @@ Nothing here is fast, batched or differentiable, and nothing is imported from th
 """
 
 import numpy as np
+import scipy.linalg
+from scipy.spatial.transform import Rotation
 
 
 def scene(num_points: int, num_channels: int = 0, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
@@ -55,6 +57,24 @@ def pose(axis_angle, translation=(0, 0, 0)) -> np.ndarray:
     matrix = np.eye(4)
     matrix[:3, :3], matrix[:3, 3] = rotation(axis_angle), translation
     return matrix
+
+
+def exponential(twist) -> np.ndarray:
+    """exp(ξ) of ξ = (v, ω), (4, 4)."""
+    v, (x, y, z) = np.split(np.asarray(twist, float), 2)
+    matrix = np.zeros((4, 4))
+    matrix[:3] = np.column_stack([[0, z, -y], [-z, 0, x], [y, -x, 0], v])
+    return scipy.linalg.expm(matrix)
+
+
+def logarithm(motions) -> np.ndarray:
+    """Twists (..., 6) of motions (..., 4, 4): t = V v with V = ∫ exp(s ω×) ds, by Gauss-Legendre quadrature."""
+    motions = np.asarray(motions, float)
+    turns = Rotation.from_matrix(motions[..., :3, :3].reshape(-1, 3, 3))
+    nodes, weights = np.polynomial.legendre.leggauss(12)
+    V = sum(w / 2 * (turns ** ((s + 1) / 2)).as_matrix() for s, w in zip(nodes, weights, strict=True))
+    shifts = np.linalg.solve(V, motions[..., :3, 3].reshape(-1, 3, 1))[..., 0]
+    return np.hstack([shifts, turns.as_rotvec()]).reshape(*motions.shape[:-2], 6)
 
 
 def nearest(queries, targets, k: int = 1) -> np.ndarray:

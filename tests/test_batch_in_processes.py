@@ -89,7 +89,7 @@ def test_what_cannot_be_sent_is_named(raw):
     sources, targets = prepared(raw)
     lock = threading.Lock()
     sources[3] = lambda: lock
-    with pytest.raises(ValueError, match=r"^pairs 2 to 3: expected .*sent.*cannot pickle '_thread.lock'[^\n]*$"):
+    with pytest.raises(ValueError, match=r"^pairs 2 to 3: [^\n]*_thread\.lock[^\n]*$"):
         in_processes(sources, targets)
 
 

@@ -2,10 +2,10 @@
 
 import multiprocessing
 import os
+import pathlib
 import signal
 import warnings
 from concurrent.futures import BrokenExecutor, Executor, Future, ProcessPoolExecutor
-from functools import partial
 
 import jax
 import pytest
@@ -66,10 +66,10 @@ def test_a_worker_that_dies_causes_one_warning(raw, alone):
     assert len(caught) == 1
 
 
-def die(marker):
+def die():
     """The first process that comes here is gone."""
     try:
-        marker.touch(exist_ok=False)
+        pathlib.Path("marker").touch(exist_ok=False)
     except FileExistsError:
         return mcg.PointCloud(*room_corner(300, seed=1))
     os.kill(os.getpid(), signal.SIGKILL)
@@ -79,7 +79,8 @@ def die(marker):
 def test_spawned_processes_and_one_that_is_killed(raw, alone, tmp_path):
     sources, targets = prepared(raw)
     context = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(1, mp_context=context) as processes:
+    # Its initializer runs in the pool that takes its place, too: only there is the marker found.
+    with ProcessPoolExecutor(1, context, os.chdir, (tmp_path,)) as processes:
         assert_same(batch(sources, targets, executor=processes), alone)
         # What is set for a block of code holds in the other processes, too.
         with jax.enable_x64(True):
@@ -88,7 +89,7 @@ def test_spawned_processes_and_one_that_is_killed(raw, alone, tmp_path):
             assert results[0].T_target_source.wxyz_xyz.dtype == again[0][0].points.dtype
             assert_same(results, batch(*again))
         with pytest.warns(UserWarning, match="BrokenProcessPool"):
-            results = batch([partial(die, tmp_path / "marker"), *sources], [targets[0], *targets], executor=processes)
+            results = batch([die, *sources], [targets[0], *targets], executor=processes)
     assert results[0].converged
     assert_same(results[1:], alone)
 

@@ -1,6 +1,8 @@
 """Clouds of every size run the same few programs: compilations are counted."""
 
 import gc
+import weakref
+from typing import Any, ClassVar
 
 import jax
 import numpy as np
@@ -95,51 +97,47 @@ def test_numbers_compile_nothing():
     assert not found
 
 
-def test_a_cloud_is_prepared_once(monkeypatch):
-    """Its tree and its local statistics are kept as long as it is used."""
-    from mcgicp_jax import KDTreeSearch
-    from mcgicp_jax._local_geometry import local_geometry as _local
+class Leaf:
+    """A tree that weak references can follow."""
 
-    built, described = [], []
-    build, with_near = KDTreeSearch.build, _local.with_near
-    monkeypatch.setattr(KDTreeSearch, "build", lambda self, points: built.append(len(points)) or build(self, points))
+    def __init__(self, tree):
+        self.tree = tree
 
-    def counted(cloud, *rest, **options):
-        described.append(len(cloud))
-        return with_near(cloud, *rest, **options)
 
-    monkeypatch.setattr(_local, "with_near", counted)
+class Watched(mcg.KDTreeSearch):
+    """A search that keeps weak references to its trees, with their sizes."""
+
+    trees: ClassVar[list[Any]] = []
+
+    def build(self, points):
+        tree = Leaf(super().build(points))
+        self.trees.append((len(points), weakref.ref(tree)))
+        return tree
+
+    def query(self, tree, queries, k, bound):
+        return super().query(tree.tree, queries, k, bound)
+
+
+def test_a_cloud_has_one_tree_as_long_as_it_is_used():
     first, second, third = (mcg.preprocess(room_corner(size, seed=size)[0]) for size in (300, 310, 320))
-    built.clear()
+    Watched.trees.clear()
+    search = Watched()
     for _ in range(3):
-        mcg.register(first, second, mcg.GICP())
-    assert built == [310] and sorted(described) == [300, 310]
-    mcg.register(second, third, mcg.GICP())
-    assert built == [310, 320] and sorted(described) == [300, 310, 320]
-    mcg.register_batch([first, third], second, mcg.GICP(), search=KDTreeSearch())
-    assert built == [310, 320]
+        mcg.register(first, second, mcg.GICP(), search=search)
+    mcg.register(second, third, mcg.GICP(), search=search)
+    mcg.register_batch([first, third], second, mcg.GICP(), search=search)
+    sizes, trees = zip(*Watched.trees, strict=True)
+    assert sizes == (310, 320) and all(tree() is not None for tree in trees)
     # Of another cloud nothing is taken, though all but its points are the same.
     moved = first.replace(points=first.points + np.float32(0.01))
-    result = mcg.register(moved, second, mcg.GICP())
-    assert sorted(described) == [300, 300, 310, 320]
+    result = mcg.register(moved, second, mcg.GICP(), search=search)
     assert np.abs(result.matrix - mcg.register(first, second, mcg.GICP()).matrix).max() > 5e-3
-
-
-def test_what_is_kept_of_a_cloud_goes_with_it():
-    from mcgicp_jax._compute import cache
-
-    source, target = (mcg.preprocess(room_corner(300, seed=seed)[0]) for seed in (0, 1))
-    mcg.register(source, target, mcg.GICP())
-    cached = cache._clouds._values
-    alive = [cached[id(cloud)].alive for cloud in (source, target)]
-    assert all(reference() is not None for reference in alive)
-    del source, target
+    assert len(Watched.trees) == 2
+    del second, third, result
     gc.collect()
-    assert all(reference() is None for reference in alive)
     # With the next lookup.
-    other = mcg.preprocess(room_corner(300, seed=2)[0])
-    mcg.register(other, other, mcg.GICP())
-    assert all(each.alive() is not None for each in cached.values())
+    mcg.register(first, moved, mcg.GICP(), search=search)
+    assert not any(tree() for tree in trees)
 
 
 def test_settings_of_a_block_of_code_hold_in_all_threads():

@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 
 import mcgicp_jax as mcg
-from mcgicp_jax._math.poses import logarithm
 from mcgicp_jax.metrics import pose_error
 from tests.corridor import corridor
 from tests.differences import TO_ROUNDING, check_eager_gradient, check_gradient, clouds_with, weigh
 from tests.precision import in_both_precisions, in_float64, tolerance
+from tests.reference import logarithm
 from tests.scenes import motion, pair, room_corner
 
 OPTIONS = {"max_distance": 0.5}

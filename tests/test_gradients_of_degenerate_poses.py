@@ -8,11 +8,11 @@ import pytest
 
 import mcgicp_jax as mcg
 from mcgicp_jax import Status
-from mcgicp_jax._math.poses import exponential
 from mcgicp_jax._methods.surfaces import surface_pair
 from mcgicp_jax._pose_solver.matched import Matches, Motion, linearize_at, match_surfaces
 from tests.differences import CONVERGED, GATE, clouds_with, directional_errors, inputs_of, weigh
 from tests.precision import cached, in_both_precisions, in_float64, tolerance
+from tests.reference import exponential
 from tests.scenes import motion, pair, wall
 
 SIZE = 400

@@ -24,6 +24,7 @@ from tests.differences import (
     weigh,
 )
 from tests.precision import in_float64
+from tests.refusals import refused
 from tests.scenes import motion, pair, room_corner
 
 pytestmark = in_float64
@@ -345,10 +346,10 @@ def test_the_jacobian_is_that_of_small_motions(clouds):
             expected = np.append(change[:3, 3], change[[2, 0, 1], [1, 2, 0]])
             found = np.tensordot(result.jacobian("source", field), direction, array.ndim)
             np.testing.assert_allclose(found, expected, atol=1e-5 * np.abs(expected).max())
-    with pytest.raises(ValueError, match="got a copy"):
-        jax.tree.map(lambda leaf: leaf, result).jacobian("source", "points")
-    with pytest.raises(ValueError, match="covariances: expected a source that has some"):
-        result.jacobian("source", "covariances")
+    copied = jax.tree.map(lambda leaf: leaf, result)
+    with pytest.raises(ValueError, match="copy"):
+        copied.jacobian("source", "points")
+    refused(lambda: result.jacobian("source", "covariances"), "covariances")
 
 
 def test_nested_differentiation_is_refused(clouds):
@@ -391,8 +392,7 @@ def test_a_batch_of_a_generator_is_refused_in_a_gradient(clouds):
         sources = (source.replace(points=points) for _ in range(2))
         return mcg.register_batch(sources, [target, target], mcg.GICP())[0].matrix[0, 3]
 
-    with pytest.raises(ValueError, match="pair 0: expected concrete arrays, got tracers"):
-        jax.grad(loss)(source.points)
+    refused(lambda: jax.grad(loss)(source.points), "pair 0", "tracers")
 
 
 def test_a_result_is_printed_in_a_gradient(clouds):

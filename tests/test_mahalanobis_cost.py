@@ -22,7 +22,6 @@ from mcgicp_jax import (
     mahalanobis_cost,
     preprocess,
 )
-from mcgicp_jax._compute import row_functions
 from mcgicp_jax._methods.surfaces import surface_pair
 from mcgicp_jax._pose_solver.matched import Matches, Motion, match_surfaces
 from mcgicp_jax._pose_solver.sums import sums_of
@@ -338,15 +337,16 @@ def test_matches_of_another_cloud_are_refused():
         mahalanobis_cost(T, clouds[0].pad(200), clouds[1], matches, GICP())
 
 
-def test_neighbourhoods_of_large_clouds_are_summed_inside_jit(monkeypatch):
-    monkeypatch.setattr(row_functions, "_LARGEST_WHOLE", 100)
-    _, _, (source, target), matches, _ = problem()
-    several = find_correspondences(source, target, T, GICP(), max_distance=0.3, num_candidates=3)
-    for found, temperature in ((matches, None), (several, 0.1)):
+def test_neighbourhoods_of_large_clouds_are_summed_inside_jit():
+    """Block by block beyond 16,000 rows."""
+    raw = [ref.scene(16_500, 0, seed)[0] for seed in (0, 1)]
+    source, target = (preprocess(points, None) for points in raw)
+    for number, temperature in ((1, None), (3, 0.1)):
+        matches = find_correspondences(source, target, T, PointToPoint(), max_distance=0.3, num_candidates=number)
 
-        def cost(points, found=found, temperature=temperature):
+        def cost(points, matches=matches, temperature=temperature):
             moved = source.replace(points=points)
-            return mahalanobis_cost(T, moved, target, found, PointToPoint(), temperature=temperature)
+            return mahalanobis_cost(T, moved, target, matches, PointToPoint(), temperature=temperature)
 
         np.testing.assert_allclose(jax.jit(cost)(source.points), cost(source.points), rtol=1e-9)
 

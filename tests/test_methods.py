@@ -250,6 +250,7 @@ def test_the_numbers_of_a_method_are_arrays(name):
         (lambda: MultiChannelGICP(1.0, np.array([0.1, np.inf])), "channel_weights"),
         (lambda: MultiChannelGICP(1.0, np.ones((2, 2))), "channel_weights"),
         (lambda: ColorICP(-1.0), "channel_weights"),
+        (lambda: ColorICP("red"), "channel_weights"),
         (lambda: ColorICP(np.nan), "channel_weights"),
         (lambda: prepare(ColorICP(np.array([1.0, 2.0])), ready()), "channel_weights"),
         (lambda: prepare(MultiChannelGICP(np.array([1.0, 2.0]), 0.1), ready()), "channel_covariance"),

@@ -12,8 +12,8 @@ import mcgicp_jax as mcg
 from mcgicp_jax._math.statistics import median
 from mcgicp_jax._methods.surfaces import surface_pair
 from mcgicp_jax._pose_solver.matched import Matched, Matches, Motion, adapted, match_surfaces, sample_of_term
-from mcgicp_jax._terms.base import AbstractTerm, Mahalanobis
 from mcgicp_jax._terms.photometric import Photometric, Residuals
+from mcgicp_jax.extend import AbstractTerm, Mahalanobis
 from tests.differences import CONVERGED, GATE, TO_ROUNDING, check_eager_gradient, clouds_with, inputs_of, weigh
 from tests.precision import in_float64, tolerance
 from tests.scenes import motion, pair, wall

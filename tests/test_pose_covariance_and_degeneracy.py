@@ -13,10 +13,10 @@ from scipy.spatial.transform import Rotation
 import mcgicp_jax as mcg
 from mcgicp_jax import datasets
 from mcgicp_jax._local_geometry.observability import agreement
-from mcgicp_jax._math import symmetric_matrices as cov
 from mcgicp_jax._pose_solver.covariance import Moments, response_and_scatter
 from mcgicp_jax._pose_solver.degeneracy import GEOMETRY_HOLDS, find_directions
 from mcgicp_jax._pose_solver.sums import Sums
+from mcgicp_jax.extend import symmetric_matrices as cov
 from tests.benchmarks.noise_scenes import street
 from tests.corridor import corridor
 from tests.precision import in_float64

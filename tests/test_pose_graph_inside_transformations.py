@@ -8,18 +8,9 @@ import pytest
 
 import mcgicp_jax as mcg
 from tests.compilations import compilations
-from tests.graphs import (
-    SMALL,
-    correlated,
-    grid,
-    joined,
-    measured,
-    moved,
-    shifted,
-    with_factors,
-    with_priors,
-)
+from tests.graphs import SMALL, correlated, grid, joined, measured, moved, shifted, with_factors, with_priors
 from tests.precision import in_float64
+from tests.refusals import refused
 from tests.scenes import motion
 
 
@@ -187,7 +178,7 @@ def test_eager_gradients_and_batches_are_those_of_compiled_programs():
     values, gradients = jax.jit(jax.vmap(jax.value_and_grad(loss)))(both)
     np.testing.assert_allclose(values[0], loss(information), rtol=1e-5)
     np.testing.assert_allclose(gradients, np.array([expected, expected / 2]), rtol=1e-3, atol=1e-9)
-    with pytest.raises(ValueError, match="do not support JVP"):
+    with pytest.raises(ValueError, match="JVP"):
         jax.hessian(loss)(information)
 
 
@@ -217,8 +208,7 @@ def test_other_kinds_of_measurements_take_part_inside_transformations_without_de
         moving = mcg.Edge(edges.i, edges.j, motions, edges.information, uncertain=edges.uncertain)
         return mcg.optimize_poses(mcg.PoseGraph(graph.poses, moving, graph.factors)).poses[:, 2, 3].sum()
 
-    with pytest.raises(ValueError, match=r"^graph: poses have derivatives only if edges"):
-        jax.grad(height)(jnp.asarray(graph.edges.T_i_j))
+    refused(lambda: jax.grad(height)(jnp.asarray(graph.edges.T_i_j)), "graph")
 
 
 @pytest.mark.slow
@@ -258,5 +248,5 @@ def test_rows_outside_of_the_graph_are_named_inside_transformations():
         return mcg.optimize_poses(mcg.PoseGraph(graph.poses, mcg.Edge(edges.i, j, edges.T_i_j, edges.information)))
 
     assert jax.jit(solve)(jnp.asarray(edges.j)).converged
-    with pytest.raises(Exception, match="edges: expected rows from 0 to 7"):
+    with pytest.raises(Exception, match=r"edges: .* 7"):
         jax.block_until_ready(jax.jit(solve)(jnp.asarray(edges.j).at[3].set(8)).poses)

@@ -8,11 +8,8 @@ from scipy.stats import chi2
 
 import mcgicp_jax as mcg
 from mcgicp_jax import metrics
-from mcgicp_jax._math.poses import logarithm
-from mcgicp_jax._pose_graph import solver
-from mcgicp_jax._pose_graph.edge import motion_jacobians
-from mcgicp_jax._pose_graph.levenberg_marquardt import Minimum, NormalEquations
 from tests.graphs import SMALL, grid, measured, moved
+from tests.reference import logarithm
 from tests.scenes import motion
 
 
@@ -40,33 +37,22 @@ def test_rejected_loops_leave_no_trace():
     np.testing.assert_allclose(found.covariance, expected.covariance, rtol=1e-2, atol=1e-9)
 
 
-def test_a_loop_is_rejected_only_beyond_its_own_uncertainty_and_that_of_the_others(monkeypatch):
-    """Edges of variances 1 and 1 that contradict each other by d: d² alone, d²/2 together."""
-    squares = np.array([20.0, 30.0, 40.0, 60.0, 80.0])
-    motions = np.tile(motion((0, 10, 0, 0, 0, 0)), (10, 1, 1))
-    poses = np.concatenate([np.eye(4)[None], motions[:5]])
-    motions[5:, 0, 3] = np.sqrt(squares)
-    edges = mcg.Edge(
-        np.zeros(10, int),
-        np.tile(np.arange(1, 6), 2),
-        motions,
-        np.tile(np.eye(6), (10, 1, 1)),
-        uncertain=np.arange(10) >= 5,
-    )
-    equations = NormalEquations((edges,), poses)
-    terms = equations.terms(poses)
-    np.testing.assert_allclose(terms.squares[5:], squares)
-    again = solver._wrongly_rejected(equations, Minimum(poses, terms), 1.0 * (np.arange(10) < 5))
-    np.testing.assert_array_equal(again, [5, 6])
-    # Without the edge to the fourth pose, nothing contradicts the loop to it.
-    used = np.isin(np.arange(10), [0, 1, 2, 4])
-    again = solver._wrongly_rejected(equations.restricted(used), Minimum(poses, terms), 1.0 * used)
-    np.testing.assert_array_equal(again, [5, 6, 8])
-    # Rejected at first, these two are kept in the end, and half of what contradicts is left in both edges.
-    monkeypatch.setattr(solver, "truncated_weights", lambda ratio, _: 1.0 * (ratio >= 1))
-    found = mcg.optimize_poses(mcg.PoseGraph(poses, edges))
-    np.testing.assert_array_equal(np.flatnonzero(~found.kept), [7, 8, 9])
-    np.testing.assert_allclose(found.cost, squares[:2].sum() / 4, rtol=1e-6)
+@pytest.mark.parametrize("information", [1.0, 1e9])
+def test_a_loop_is_rejected_only_beyond_its_own_uncertainty_and_that_of_the_others(information):
+    """Loops of variance 1 contradict edges by d: d² has the variance 1, or with edges of variance 1, that of 2."""
+    threshold = chi2.ppf(0.99, 6) * (1 + 1 / information)
+    squares = threshold * np.array([0.6, 0.9, 0.99, 1.01, 1.2, 2, 3])
+    number = len(squares)
+    motions = np.tile(motion((0, 10, 0, 0, 0, 0)), (2 * number, 1, 1))
+    poses = np.concatenate([np.eye(4)[None], motions[:number]])
+    motions[number:, 0, 3] = np.sqrt(squares)
+    uncertain = np.arange(2 * number) >= number
+    known = np.where(uncertain, 1, information)[:, None, None] * np.eye(6)
+    rows = np.tile(np.arange(1, number + 1), 2)
+    found = mcg.optimize_poses(mcg.PoseGraph(poses, mcg.Edge(0 * rows, rows, motions, known, uncertain=uncertain)))
+    np.testing.assert_array_equal(found.kept[number:], squares < threshold)
+    # Each kept loop and its edge share d in proportion to their variances.
+    np.testing.assert_allclose(found.cost, 0.5 * squares[squares < threshold].sum() / (1 + 1 / information), rtol=1e-6)
 
 
 @pytest.mark.parametrize("name", SMALL)
@@ -85,11 +71,6 @@ def test_false_loops_are_rejected(name, fraction):
     assert np.all(found.residuals[~true] > np.sqrt(chi2.ppf(0.99, 6)))
     plain = mcg.optimize_poses(graph, robust=False)
     assert plain.kept.all() and metrics.ate(plain.poses, poses, alignment="first") > 2 * best
-
-
-def test_the_threshold_is_the_99_percent_quantile():
-    graph, _ = measured(*grid(2))
-    np.testing.assert_allclose(solver.thresholds(NormalEquations((graph.edges,), graph.poses)), chi2.ppf(0.99, 6))
 
 
 def test_outliers_are_the_same_inside_transformations():
@@ -156,12 +137,13 @@ def test_poses_do_not_slide_along_what_edges_do_not_measure(kind):
 
 def unmeasured_motion(graph, truth, poses):
     """Twists from the true poses to others: the part along motions that no edge would measure if it saw x exactly."""
-    ends = np.stack([truth[graph.edges.i], truth[graph.edges.j]], axis=1)
-    jacobians = motion_jacobians(ends)
-    rows = np.zeros((len(ends), 6, len(truth), 6))
-    for end, each in enumerate((graph.edges.i, graph.edges.j)):
-        rows[np.arange(len(ends)), :, each] = jacobians[:, end]
-    rows = rows[:, :, 1:].reshape(len(ends), 6, -1)
+    i, j = graph.edges.i, graph.edges.j
+    exact = mcg.Edge(i, j, np.linalg.inv(truth[i]) @ truth[j], graph.edges.information)
+    _, jacobians = exact.linearize(np.stack([truth[i], truth[j]], axis=1))
+    rows = np.zeros((len(i), 6, len(truth), 6))
+    for end, each in enumerate((i, j)):
+        rows[np.arange(len(i)), :, each] = jacobians[:, end]
+    rows = rows[:, :, 1:].reshape(len(i), 6, -1)
     _, values, motions = np.linalg.svd(rows[:, 1:].reshape(-1, rows.shape[2]))
     free = motions[values < 1e-9].T
     twists = logarithm(np.linalg.inv(truth) @ poses)[1:].reshape(-1)

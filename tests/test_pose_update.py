@@ -8,14 +8,13 @@ import pytest
 import scipy.optimize
 from scipy.spatial.transform import Rotation
 
-from mcgicp_jax._local_geometry.local_geometry import Surface
-from mcgicp_jax._math import symmetric_matrices as cov
+from mcgicp_jax import Status
 from mcgicp_jax._pose_solver import update as _solve
 from mcgicp_jax._pose_solver.matched import Matched, Motion
 from mcgicp_jax._pose_solver.sums import sums_of
-from mcgicp_jax._registration.result import Status
 from mcgicp_jax._registration.step import COARSE, RUNNING, SETTLED, Settings, update
-from mcgicp_jax._terms.base import AbstractTerm, linearize_residual
+from mcgicp_jax.extend import AbstractTerm, Surface, linearize_residual
+from mcgicp_jax.extend import symmetric_matrices as cov
 from tests.precision import in_both_precisions, tolerance
 
 pytestmark = in_both_precisions

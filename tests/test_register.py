@@ -2,27 +2,18 @@
 
 import copy
 import gc
-import inspect
-import pickle
-import types
 import warnings
 import weakref
 
 import jax
-import jaxlie
-import jaxtyping
 import numpy as np
 import pytest
 
 import mcgicp_jax as mcg
 from mcgicp_jax import Status
-from mcgicp_jax._compute.cache import Lazy
-from mcgicp_jax._registration import register_pair as _register
-from mcgicp_jax._registration.assessment import Assessment, _uncertainty
-from mcgicp_jax._registration.step import State
-from mcgicp_jax._search.tree_index import TreeIndex
 from mcgicp_jax.metrics import pose_error
 from tests.precision import in_both_precisions, tolerance
+from tests.refusals import refused
 from tests.scenes import motion, pair, room_corner, wall
 
 METHODS = {
@@ -115,7 +106,7 @@ def test_what_a_result_keeps_cannot_be_changed(room):
     source, target, truth = room
     result = mcg.register(source, target, mcg.GICP(), init=truth)
     for array in (result.deviations, result.covariance, result.information, result.directions.twists):
-        with pytest.raises(ValueError, match="read-only"):
+        with pytest.raises(ValueError):
             np.asarray(array)[:] = 0
 
 
@@ -133,7 +124,7 @@ def test_information_is_the_curvature_of_the_cost_with_M_held(room):
 
 
 @in_both_precisions
-def test_align_reaches_the_balance_of_forces(room):
+def test_estimate_pose_reaches_the_balance_of_forces(room):
     source, target, truth = room
     method = METHODS["mc-gicp"]()
     matches = mcg.find_correspondences(source, target, truth, method, max_distance=0.5)
@@ -258,56 +249,39 @@ def test_bare_arrays_are_enough():
     assert result.converged and difference(result.matrix, truth) < 4e-3
 
 
-BAD_ARGUMENTS = {
-    "max_distance": [
-        {"max_distance": 0.0},
-        {"max_distance": -1.0},
-        {"max_distance": np.nan},
-        {"max_distance": (0.2, 0.5)},
-        {"max_distance": (0.5, 0.0)},
-        {"max_distance": (np.nan, 0.1)},
-        {"max_distance": np.array([0.5, 0.4, 0.3])},
+@pytest.mark.parametrize(
+    "name, value",
+    [
+        *(("max_distance", bad) for bad in (0.0, -1.0, np.nan, (0.2, 0.5), (0.5, 0.0), (np.nan, 0.1), np.ones(3))),
+        *(("init", bad) for bad in (np.eye(3), np.diag([1.0, 1, -1, 1]), np.full((4, 4), np.nan), 2 * np.eye(4))),
+        ("max_iterations", 0),
+        ("translation_tolerance", -1.0),
+        ("rotation_tolerance", np.nan),
+        ("voxel_sizes", (0.5, -1.0)),
+        ("robust", 1.0),
+        ("search", "tree"),
+        ("hold_unconstrained", 2),
+        ("equalize_channels", "yes"),
     ],
-    "max_iterations": [{"max_iterations": 0}],
-    "translation_tolerance": [{"translation_tolerance": -1.0}],
-    "rotation_tolerance": [{"rotation_tolerance": np.nan}],
-    "init": [
-        {"init": np.eye(3)},
-        {"init": np.diag([1.0, 1, -1, 1])},
-        {"init": np.full((4, 4), np.nan)},
-        {"init": 2 * np.eye(4)},
-    ],
-    "voxel_sizes": [{"voxel_sizes": (0.5, -1.0)}],
-    "robust": [{"robust": 1.0}],
-    "search": [{"search": "tree"}],
-    "hold_unconstrained": [{"hold_unconstrained": 2}],
-    "equalize_channels": [{"equalize_channels": "yes"}],
-}
-
-
-@pytest.mark.parametrize("name, arguments", [(name, bad) for name, cases in BAD_ARGUMENTS.items() for bad in cases])
-def test_a_bad_argument_is_named(name, arguments, room):
-    source, target, _ = room
-    # Run-time checks of annotations refuse the last ones first.
-    with pytest.raises((ValueError, jaxtyping.TypeCheckError), match=name):
-        mcg.register(source, target, mcg.GICP(), **{"max_distance": 0.5} | arguments)
+)
+def test_a_bad_argument_is_named(name, value, room):
+    refused(lambda: mcg.register(*room[:2], mcg.GICP(), **{"max_distance": 0.5, name: value}), name)
 
 
 @pytest.mark.parametrize(
-    "points, message",
+    "points, named, shown",
     [
-        (np.zeros((0, 3)), "source: cloud: expected at least 4 finite points, got 0"),
-        (np.zeros((1, 3)), "source: cloud: expected at least 4 finite points, got 1"),
-        (np.full((10, 3), np.nan), "source: cloud: expected at least 4 finite points, got 0 of 10"),
-        (np.zeros((10, 2)), r"source: points: expected shape \(N, 3\), got \(10, 2\)"),
-        (np.zeros((10, 3), complex), "source: points: expected real numbers, got dtype complex128"),
-        ([[1, 2, 3], [4, 5]], "source: points: expected numbers in a rectangular array"),
-        (np.array([["a", "b", "c"]]), "source: points: expected real numbers"),
+        (np.zeros((0, 3)), "source: cloud", "got 0"),
+        (np.zeros((1, 3)), "source: cloud", "got 1"),
+        (np.full((10, 3), np.nan), "source: cloud", "0 of 10"),
+        (np.zeros((10, 2)), "source: points", "(10, 2)"),
+        (np.zeros((10, 3), complex), "source: points", "complex128"),
+        ([[1, 2, 3], [4, 5]], "source: points", "rectangular"),
+        (np.array([["a", "b", "c"]]), "source: points", "real"),
     ],
 )
-def test_a_bad_cloud_is_named(points, message, room):
-    with pytest.raises(ValueError, match=message):
-        mcg.register(points, room[1], mcg.GICP(), max_distance=0.5)
+def test_a_bad_cloud_is_named(points, named, shown, room):
+    refused(lambda: mcg.register(points, room[1], mcg.GICP(), max_distance=0.5), named, shown)
 
 
 def test_two_distances_are_two_registrations_in_a_row(room):
@@ -326,22 +300,44 @@ def test_two_distances_are_two_registrations_in_a_row(room):
     np.testing.assert_array_equal(same.matrix, single.matrix)
 
 
-def test_some_of_the_points_find_the_pose_and_all_settle_it(room, monkeypatch):
-    source, target, _ = room
-    # So few points come to rest within 0.4 mm; test_agrees_with_small_gicp.py has large scans.
-    to_rest = {"max_distance": 0.3, "translation_tolerance": 1e-4, "rotation_tolerance": 1e-4}
-    plain = mcg.register(source, target, mcg.GICP(), **to_rest)
-    monkeypatch.setattr(_register, "_COARSE_ROWS", len(source) // 5)
-    result = mcg.register(source, target, mcg.GICP(), **to_rest)
-    pairs = result.history["num_inliers"]
-    assert 4 * pairs[0] < plain.history["num_inliers"][0] and pairs[-1] == result.num_inliers
-    assert result.converged and difference(result.matrix, plain.matrix) < 4e-4
-    traced = jax.jit(lambda s: mcg.register(s, target, mcg.GICP(), search=mcg.DenseSearch(), **to_rest))(source)
-    assert traced.status == Status.CONVERGED and difference(traced.matrix, result.matrix) < 4e-4
-    np.testing.assert_allclose(traced.history["num_inliers"][: len(pairs)], pairs, rtol=1e-2)
+@pytest.fixture(scope="module")
+def large(precision):
+    """A source of more than twice 4,096 points, every other one of which is matched at first; and its options."""
+    truth = motion()
+    source = (room_corner(8400, seed=1)[0] - truth[:3, 3]) @ truth[:3, :3]
+    # Points further apart come to rest within 1e-4; test_agrees_with_small_gicp.py has large scans.
+    options = {
+        "max_distance": 0.3,
+        "max_source_points": None,
+        "translation_tolerance": 1e-4,
+        "rotation_tolerance": 1e-4,
+    }
+    return mcg.preprocess(source, None), mcg.preprocess(room_corner(2000, seed=2)[0], None), options
+
+
+def test_some_of_the_points_find_the_pose_and_all_settle_it(large):
+    source, target, options = large
+    result = mcg.register(source, target, mcg.GICP(), **options)
+    numbers = result.history["num_inliers"]
+    assert result.converged and numbers[0] == 4200 and numbers[-1] == result.num_inliers == 8400
+    matches = mcg.find_correspondences(source, target, result.matrix, mcg.GICP(), max_distance=0.3)
+    settled = mcg.estimate_pose(source, target, matches, mcg.GICP(), init=result.matrix)
+    assert difference(settled.matrix, result.matrix) < 1e-4
+    half = mcg.register(source, target, mcg.GICP(), **options | {"max_source_points": 4200})
+    assert difference(half.matrix, result.matrix) > 1e-3
     # What is measured last is measured with all points, wherever the iterations have run out.
-    stopped = mcg.register(source, target, mcg.GICP(), max_distance=0.3, max_iterations=1)
-    assert stopped.status == Status.MAX_ITERATIONS and stopped.num_inliers > 0.9 * plain.num_inliers
+    stopped = mcg.register(source, target, mcg.GICP(), **options, max_iterations=1)
+    assert stopped.status == Status.MAX_ITERATIONS and stopped.num_inliers == 8400
+
+
+@pytest.mark.slow
+def test_some_of_the_points_find_the_pose_inside_jit(large):
+    source, target, options = large
+    expected = mcg.register(source, target, mcg.GICP(), **options)
+    traced = jax.jit(lambda s: mcg.register(s, target, mcg.GICP(), search=mcg.DenseSearch(), **options))(source)
+    assert traced.status == Status.CONVERGED and difference(traced.matrix, expected.matrix) < 1e-4
+    numbers = expected.history["num_inliers"]
+    np.testing.assert_allclose(traced.history["num_inliers"][: len(numbers)], numbers, rtol=1e-2)
 
 
 def test_the_default_distances_come_from_the_spacing(room):
@@ -379,7 +375,7 @@ def test_scan_lines_do_not_keep_the_pose_at_its_start():
 
 
 @pytest.mark.slow
-def test_scales_find_a_start_that_is_far_off():
+def test_voxel_sizes_register_a_start_that_is_far_off():
     truth = motion((2, 1.5, -1, 0.1, 0.1, -0.4))
     source, target, _ = pair(truth=truth, noise=0.003)
     method = METHODS["mc-gicp"]()
@@ -387,11 +383,14 @@ def test_scales_find_a_start_that_is_far_off():
     assert difference(near.matrix, truth) > 1
     far = mcg.register(source, target, method, max_distance=(0.4, 0.1), voxel_sizes=(0.3, 0.15))
     assert far.converged and difference(far.matrix, truth) < 4e-3
-    with pytest.raises(ValueError, match="tracers"):
-        jax.jit(lambda s: mcg.register(s, target, method, voxel_sizes=(0.2,)).matrix)(source)
+    refused(
+        lambda: jax.jit(lambda s: mcg.register(s, target, method, voxel_sizes=(0.2,)).matrix)(source),
+        "cloud",
+        "tracers",
+    )
 
 
-def test_matched_channels_undo_gain_and_offset():
+def test_equalized_channels_undo_gain_and_offset():
     source, target, truth = pair(wall)
     other = source.replace(channels=source.channels * np.array([0.8, 1.3, 0.5]) + np.array([0.1, -0.2, 0.3]))
     method = mcg.MultiChannelGICP()
@@ -404,7 +403,7 @@ def test_matched_channels_undo_gain_and_offset():
 
 
 @pytest.mark.slow
-def test_matched_channels_are_not_fooled_by_what_one_cloud_sees():
+def test_equalized_channels_are_not_fooled_by_what_one_cloud_sees():
     """A fifth of the source, far off to the side, is bright: by all points its gain would be wrong."""
     source, target, truth = pair(wall)
     points, channels = np.array(source.points), 0.8 * np.array(source.channels) + 0.1
@@ -425,15 +424,9 @@ def test_matched_channels_are_not_fooled_by_what_one_cloud_sees():
 
 def test_without_channels_it_says_that_it_is_gicp(room):
     bare = [cloud.replace(channels=np.zeros((*cloud.points.shape[:1], 0))) for cloud in room[:2]]
-    with pytest.warns(UserWarning, match="no channels: MultiChannelGICP equals GICP"):
+    with pytest.warns(UserWarning, match="MultiChannelGICP"):
         result = mcg.register(*bare, mcg.MultiChannelGICP())
     np.testing.assert_allclose(result.matrix, mcg.register(*bare, mcg.GICP()).matrix, atol=1e-6)
-
-
-def test_a_batch_needs_vmap(room):
-    batch = mcg.PointCloud.stack([room[0], room[0]])
-    with pytest.raises(ValueError, match=r"source: expected a single cloud, got shape .* use jax.vmap"):
-        mcg.register(batch, room[1], mcg.GICP(), max_distance=0.5)
 
 
 def test_integer_channels_count_as_numbers(room):
@@ -452,54 +445,32 @@ def test_integer_channels_count_as_numbers(room):
     np.testing.assert_array_equal(*poses)
 
 
-def test_channel_counts_must_fit(room):
+def test_clouds_that_do_not_fit_are_named(room):
     source, target, _ = room
-    with pytest.raises(ValueError, match=r"channels: expected as many .* got 1 and 2"):
-        mcg.register(source.replace(channels=source.channels[:, :1]), target, METHODS["mc-gicp"](), max_distance=0.5)
-    with pytest.raises(ValueError, match=r"channel_covariance: expected .* 2 channels, got \(3,\)"):
-        mcg.register(source, target, mcg.MultiChannelGICP(np.ones(3), 0.1), max_distance=0.5)
-    with pytest.raises(ValueError, match=r"channel_weights: expected .* 2 channels, got \(3,\)"):
-        mcg.register(source, target, mcg.ColorICP(np.ones(3)), max_distance=0.5)
+    fewer = source.replace(channels=source.channels[:, :1])
+    given = target.replace(covariances=np.broadcast_to(np.eye(3), (*target.points.shape, 3)))
+    batch = mcg.PointCloud.stack([source, source])
+    for named, shown, *arguments in (
+        ("channels", "1 and 2", fewer, target, METHODS["mc-gicp"]()),
+        ("channel_covariance", "(3,)", source, target, mcg.MultiChannelGICP(np.ones(3), 0.1)),
+        ("channel_weights", "(3,)", source, target, mcg.ColorICP(np.ones(3))),
+        ("source", "jax.vmap", batch, target, mcg.GICP()),
+    ):
+        refused(lambda arguments=arguments: mcg.register(*arguments, max_distance=0.5), named, shown)
+    refused(lambda: mcg.register(source, given, mcg.GICP(), voxel_sizes=(0.2,)), "voxel_sizes")
     # Geometry alone does not look at channels.
-    assert mcg.register(source.replace(channels=source.channels[:, :1]), target, mcg.GICP(), max_distance=0.5).converged
+    assert mcg.register(fewer, target, mcg.GICP(), max_distance=0.5).converged
 
 
-@pytest.mark.parametrize(
-    "make, message",
-    [
-        (lambda: mcg.GICP(0.0), "epsilon: expected one positive number"),
-        (lambda: mcg.GICP(-1e-3), "epsilon"),
-        (lambda: mcg.MultiChannelGICP(epsilon=np.nan), "epsilon"),
-        (lambda: mcg.MultiChannelGICP(min_eigenvalue=0.0), "min_eigenvalue"),
-        (
-            lambda: mcg.MultiChannelGICP([[1.0, 2.0], [2.0, 1.0]]),
-            "channel_covariance: expected it symmetric and positive",
-        ),
-        (lambda: mcg.MultiChannelGICP([[1.0, 0.5], [0.0, 1.0]]), "channel_covariance: expected it symmetric"),
-        (lambda: mcg.MultiChannelGICP(np.zeros((2, 3))), "channel_covariance: expected a scalar"),
-        (lambda: mcg.MultiChannelGICP(0.0), "channel_covariance"),
-        (lambda: mcg.ColorICP(-1.0), "channel_weights: expected finite numbers of at least 0"),
-        (lambda: mcg.ColorICP("red"), "channel_weights: expected numbers"),
-        (lambda: mcg.Huber(0.0), "scale: expected one positive number"),
-    ],
-)
-def test_bad_numbers_of_methods_are_named(make, message):
-    with pytest.raises(ValueError, match=message):
-        make()
+def test_results_repeat_with_any_number_of_threads(room):
+    searches = [*[None] * 5, mcg.KDTreeSearch(workers=1)]
+    first, *others = (mcg.register(*room[:2], METHODS["mc-gicp"](), max_distance=0.5, search=each) for each in searches)
+    for result in others:
+        np.testing.assert_array_equal(result.matrix, first.matrix)
+        assert result.status is first.status and result.cost == first.cost
 
 
-def test_results_repeat_and_survive_pickle(room):
-    source, target, _ = room
-    results = [mcg.register(source, target, METHODS["mc-gicp"](), max_distance=0.5) for _ in range(5)]
-    workers = mcg.register(source, target, METHODS["mc-gicp"](), max_distance=0.5, search=mcg.KDTreeSearch(workers=1))
-    for result in [*results, workers, pickle.loads(pickle.dumps(results[0])), copy.deepcopy(results[0])]:
-        np.testing.assert_array_equal(result.matrix, results[0].matrix)
-        assert result.status is results[0].status and result.cost == results[0].cost
-    for make in METHODS.values():
-        assert repr(pickle.loads(pickle.dumps(make()))) == repr(make())
-
-
-def test_scales_start_from_a_pose_that_is_degenerate():
+def test_a_coarse_pose_that_is_degenerate_is_the_next_start():
     """Geometry holds the wall's distance and tilt; the coarse pose must not be thrown away for what slides."""
     truth = motion((0.0, 0.0, 0.25, 0.12, 0.0, 0.0))
     source, target, _ = pair(wall, truth=truth)
@@ -509,13 +480,6 @@ def test_scales_start_from_a_pose_that_is_degenerate():
     normal = np.asarray(result.matrix) @ np.linalg.inv(truth)
     assert abs(normal[2, 3]) < 0.01 and np.degrees(np.arccos(normal[2, 2])) < 1
     assert mcg.register(source, target, mcg.GICP(), max_distance=0.06).num_inliers < result.num_inliers
-
-
-def test_scales_refuse_covariances_that_are_given(room):
-    source, target, _ = room
-    given = target.replace(covariances=np.broadcast_to(np.eye(3), (*target.points.shape, 3)))
-    with pytest.raises(ValueError, match="voxel_sizes: expected none for clouds with covariances"):
-        mcg.register(source, given, mcg.GICP(), voxel_sizes=(0.2,))
 
 
 def test_jit_gives_the_pose_of_the_host_before_it_has_converged(room):
@@ -575,34 +539,10 @@ def test_a_copied_result_holds_no_clouds():
     assert all(cloud() is None for cloud in clouds) and np.isfinite(result.covariance).all()
 
 
-def test_an_unread_result_does_not_hold_its_search(monkeypatch):
-    follow, alive = TreeIndex.follow, []
-
-    def followed(*arguments):
-        found = follow(*arguments)
-        alive.append(weakref.ref(found.__self__))
-        return found
-
-    monkeypatch.setattr(TreeIndex, "follow", followed)
-    source, target, _ = pair()
-    result = mcg.register(source, target, mcg.GICP(), max_distance=0.5)
-    gc.collect()
-    assert alive and not any(each() for each in alive)
-    assert np.isfinite(result.covariance).all()
-
-
 def test_a_pose_from_a_small_overlap_is_warned_of():
     target, _ = room_corner(2000, seed=0)
     near, _ = room_corner(60, seed=1)
     source = np.concatenate([near, target[:1940] + 50])
-    with pytest.warns(UserWarning, match=r"only \d.* % of the source points have a match"):
+    with pytest.warns(UserWarning, match="source"):
         result = mcg.register(source, target, mcg.PointToPlane(), max_distance=0.3)
     assert 0 < result.overlap < 0.1
-
-
-def test_a_variance_that_is_rounded_below_zero_has_a_deviation():
-    """As on noise-free points, where the variance is 0."""
-    assessment = Assessment(Lazy.of(None), Lazy.of(np.diag([4.0, -1e-43, 1, 1, -1e-43, 1])))
-    state = State(jaxlie.SE3.identity(), Status.CONVERGED, 1, sums=types.SimpleNamespace(center=np.zeros(3)))
-    found = inspect.unwrap(_uncertainty)(assessment, state, np.zeros(3))
-    np.testing.assert_array_equal(found.deviations, [2, 0, 1, 1, 0, 1])
