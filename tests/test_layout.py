@@ -1,6 +1,7 @@
 """The layers of the package: imports run downwards, without cycles; nothing is printed or asserted."""
 
 import ast
+import functools
 import graphlib
 import importlib
 import pathlib
@@ -36,10 +37,11 @@ MODULES = {name for name in LAYERS if not name.startswith("_")}
 RANK = {name: rank for rank, name in enumerate(LAYERS)}
 
 
+@functools.cache
 def files():
-    for path in sorted(ROOT.rglob("*.py")):
-        parts = path.relative_to(ROOT).with_suffix("").parts
-        yield path, parts, ast.parse(path.read_text(encoding="utf-8"))
+    paths = sorted(ROOT.rglob("*.py"))
+    parts = [path.relative_to(ROOT).with_suffix("").parts for path in paths]
+    return [(*each, ast.parse(each[0].read_text(encoding="utf-8"))) for each in zip(paths, parts, strict=True)]
 
 
 def imports(parts, tree):
