@@ -15,8 +15,8 @@ from hypothesis import strategies as st
 import mcgicp_jax as mcg
 from mcgicp_jax import DenseSearch, KDTreeSearch, Status
 from mcgicp_jax._registration import vectorized as _lanes
-from mcgicp_jax._search.base import SearchPoints
 from mcgicp_jax._search.brute_force import _nearest
+from mcgicp_jax.extend import SearchPoints
 from mcgicp_jax.metrics import pose_error
 from tests import reference as ref
 from tests.batches import METHOD, assert_same, prepared
