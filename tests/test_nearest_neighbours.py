@@ -59,20 +59,6 @@ def test_neighbors_by_brute_force(seed, k, num_points, high):
     np.testing.assert_array_equal(KDTreeSearch().neighbors(points, k), ref.nearest(points, points, k))
 
 
-@pytest.mark.parametrize("workers", [1, 2, -1])
-def test_ties_do_not_depend_on_the_number_of_threads(workers):
-    points = integers((200, 3), 4, 0)
-    found = KDTreeSearch(workers=workers).neighbors(points, 8)
-    np.testing.assert_array_equal(found, ref.nearest(points, points, 8))
-
-
-@pytest.mark.parametrize("copies", [4, 16, 300])
-def test_ties_among_copies_of_one_point(copies):
-    rng = np.random.default_rng(0)
-    target = np.repeat(rng.normal(size=(3, 3)), copies, axis=0)[rng.permutation(3 * copies)]
-    np.testing.assert_array_equal(query(np.eye(4), target, target)[0], ref.nearest(target, target)[:, 0])
-
-
 @settings(max_examples=10, deadline=None)
 @given(seed=st.integers(0, 2**31), k=st.integers(1, 25))
 def test_many_equal_distances(seed, k):
@@ -177,7 +163,7 @@ def partial_clouds(share=0.5, num_channels=3):
         seen = np.random.default_rng(i).random(len(points)) < share
         masks.append(np.stack([np.ones(len(points), bool), seen, seen], axis=1))
     ready = [
-        preprocess(PointCloud(*arrays, channel_valid=mask), num_neighbors=6)
+        preprocess(PointCloud(*arrays, channel_valid=mask), num_neighbors=4)
         for arrays, mask in zip(pair, masks, strict=True)
     ]
     return ready, pair, masks
@@ -199,16 +185,6 @@ def test_missing_channels_count_as_in_a_true_match(method):
     expected = ref.match_partial(*rows, *masks, weights**2 * variance)[:, 0]
     found = find_correspondences(source, target, T, method, max_distance=np.inf)
     np.testing.assert_array_equal(np.asarray(found.indices)[:150], expected)
-
-
-def test_missing_channels_traced_and_batched():
-    (source, target), *_ = partial_clouds()
-    whole = target.replace(channel_valid=None)
-    expected = [find(source, cloud, T, 0.3, 0.4) for cloud in (target, whole)]
-    pose = jnp.asarray(T, source.points.dtype)
-    targets = PointCloud.stack([target, whole])
-    batched = jax.jit(jax.vmap(find, in_axes=(None, 0, None, None, None)))(source, targets, pose, 0.3, 0.4)
-    np.testing.assert_array_equal(batched.indices[0], expected[0].indices)
 
 
 @pytest.mark.parametrize("max_distance", [0.05, 0.2, 1.0, np.inf])
@@ -277,7 +253,8 @@ def find(source, target, pose, weights, max_distance):
 
 
 def test_traced_and_batched_it_finds_the_same():
-    pairs = [clouds(seed=10 * i)[0] for i in range(3)]
+    # The second lacks channels, which the first does not.
+    pairs = [clouds()[0], partial_clouds()[0], clouds(seed=20)[0]]
     expected = [find(*pair, T, 0.3, 0.4) for pair in pairs]
     pose = jnp.asarray(T, pairs[0][0].points.dtype)
     jitted = jax.tree.map(np.asarray, jax.jit(find)(*pairs[0], pose, 0.3, 0.4))
