@@ -253,7 +253,7 @@ def test_warnings_name_the_cloud_and_show_the_line_of_the_caller():
 OTHER_UNIT = r"points: the source extends over .* the target over .* unit"
 
 
-@pytest.mark.parametrize("unit", [1e-3, 1e3, 1e2])
+@pytest.mark.parametrize("unit", [1e-3, 1e2])
 def test_different_units_of_length_are_warned_of(unit):
     """Of raw and preprocessed clouds, cells, and of one pair in a batch, which the warning names."""
     points = room_corner(600)[0]
