@@ -206,7 +206,11 @@ def test_only_valid_rows_in_the_users_frame(tmp_path, suffix):
     origin = np.zeros(3) if suffix == ".bin" else np.array([500_000.0, 5_400_000.0, 0.0])
     io.write(tmp_path / f"c{suffix}", raw.replace_rows(valid=valid, origin=origin))
     back = io.read(tmp_path / f"c{suffix}")
-    np.testing.assert_allclose(back.points, raw.points[valid].astype(np.float64) + origin, rtol=0, atol=1e-6)
+    atol = 1e-6 if suffix == ".bin" else 2e-8
+    np.testing.assert_allclose(back.points, raw.points[valid].astype(np.float64) + origin, rtol=0, atol=atol)
+    # Written again, it stays as it is.
+    io.write(tmp_path / f"d{suffix}", back)
+    same(io.read(tmp_path / f"d{suffix}"), back)
 
 
 def test_suffix_in_any_case(tmp_path):
@@ -385,16 +389,6 @@ def test_las_8_bit_colours(tmp_path):
     assert cloud.channel_names == RGB  # and no intensity, which is 0
     np.testing.assert_allclose(cloud.channels[:, 0], np.arange(N) / 255)
     np.testing.assert_array_equal(cloud.channels[:, 1], 1)
-
-
-@pytest.mark.parametrize("suffix", [".las", ".laz"])
-def test_las_writes_utm_and_again(tmp_path, suffix):
-    points = np.array([500_000.0, 5_400_000.0, 100.0]) + RNG.integers(0, 10**6, (N, 3)) * 1e-3
-    io.write(tmp_path / f"a{suffix}", PointCloud(points))
-    first = io.read(tmp_path / f"a{suffix}")
-    np.testing.assert_allclose(first.points, points, rtol=0, atol=2e-9)
-    io.write(tmp_path / f"b{suffix}", first)
-    same(io.read(tmp_path / f"b{suffix}"), first)
 
 
 @pytest.mark.parametrize(
