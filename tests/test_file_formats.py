@@ -823,7 +823,10 @@ def test_broken_poses(tmp_path, content):
 def test_poses_that_do_not_fit(tmp_path):
     with pytest.raises(FileNotFoundError):
         io.read_poses(tmp_path / "none.txt")
-    for named, matrices, times in ((r"poses\[1\]", [np.eye(4), 2 * np.eye(4)], None), ("timestamps", poses(8), [1, 2])):
+    for named, matrices, times in (
+        (r"poses\[1\]", [np.eye(4), 2 * np.eye(4)], None),
+        ("timestamps", poses(8), [1.0, 2.0]),
+    ):
         with pytest.raises(ValueError, match=f"^{named}"):
             io.write_poses(tmp_path / "p.txt", np.array(matrices), timestamps=times)
     assert not list(tmp_path.iterdir())
