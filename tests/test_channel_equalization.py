@@ -17,7 +17,7 @@ from mcgicp_jax import (
     preprocess,
     register,
 )
-from mcgicp_jax._local_geometry.cloud_statistics import point_spacing, with_channels_matched
+from mcgicp_jax._local_geometry.cloud_statistics import with_channels_matched
 from tests import reference as ref
 from tests.precision import tolerance
 from tests.scenes import motion
@@ -64,48 +64,45 @@ def test_channels_without_noise_have_a_covariance_that_can_be_inverted():
 
 
 @pytest.mark.parametrize(
-    "make, message",
+    "make, named",
     [
-        (lambda clouds: (clouds, POSES[:2]), "poses: expected one per cloud and at least two, got 2 for 3"),
-        (lambda clouds: (clouds[:1], POSES[:1]), "poses: expected one per cloud and at least two, got 1 for 1"),
-        (lambda clouds: (clouds[:2], [np.eye(4), 2 * np.eye(4)]), r"poses\[1\]: expected a rigid motion"),
-        (lambda clouds: ([clouds[0], PointCloud(POSES[0][:, :3])], POSES[:2]), r"clouds\[1\]: expected the channels"),
-        (
-            lambda clouds: (clouds[:2], POSES[1:]),
-            "clouds: expected at least 10 matches per channel, got .* 'channel_0'",
-        ),
+        (lambda clouds: (clouds, POSES[:2]), "poses: .* 2 for 3"),
+        (lambda clouds: (clouds[:1], POSES[:1]), "poses: .* 1 for 1"),
+        (lambda clouds: (clouds[:2], [np.eye(4), 2 * np.eye(4)]), r"poses\[1\]: "),
+        (lambda clouds: ([clouds[0], PointCloud(POSES[0][:, :3])], POSES[:2]), r"clouds\[1\]: .*channels"),
+        (lambda clouds: (clouds[:2], POSES[1:]), "clouds: .* 10 .*'channel_0'"),
     ],
     ids=["one pose short", "one cloud", "scale", "channels", "no overlap"],
 )
-def test_what_cannot_be_measured(make, message):
-    with pytest.raises(ValueError, match=message):
+def test_what_cannot_be_measured(make, named):
+    with pytest.raises(ValueError, match=named):
         estimate_channel_covariance(*make(seen_again()))
+
+
+def target_and_source(present):
+    """The same points; the source's channels have another gain and offset."""
+    points, channels = ref.scene(500, 3)
+    mask = None if present is None else np.random.default_rng(0).random(channels.shape) < present
+    target = preprocess(PointCloud(points, channels, channel_valid=mask))
+    return target, target.channels * np.array([0.5, 3.0, 1.0]) + np.array([7.0, 0.0, -1.0])
 
 
 @pytest.mark.parametrize("present", [None, 0.5])
 def test_gain_and_offset_are_undone(present):
-    points, channels = ref.scene(500, 3)
-    mask = None if present is None else np.random.default_rng(0).random(channels.shape) < present
-    target = preprocess(PointCloud(points, channels, channel_valid=mask))
-    source = target.replace(
-        channels=np.asarray(target.channels) * np.array([0.5, 3.0, 1.0]) + np.array([7.0, 0.0, -1.0])
-    )
-    matched, _ = with_channels_matched(source, target)
-    np.testing.assert_allclose(matched.channels[:500], target.channels[:500], atol=tolerance(2e-5, 1e-12))
+    target, channels = target_and_source(present)
+    matched, _ = with_channels_matched(target.replace(channels=channels), target)
+    np.testing.assert_allclose(matched.channels, target.channels, atol=tolerance(2e-5, 1e-12))
 
 
 @pytest.mark.parametrize("present", [None, 0.5])
 def test_what_only_one_cloud_sees_does_not_count_with_matches(present):
-    points, channels = ref.scene(500, 3)
-    mask = None if present is None else np.random.default_rng(0).random((500, 3)) < present
-    target = preprocess(PointCloud(points, channels, channel_valid=mask))
-    gain, offset = np.array([0.5, 3.0, 1.0]), np.array([7.0, 0.0, -1.0])
+    target, channels = target_and_source(present)
     alien = np.arange(len(target.points)) >= 300
-    source = target.replace(channels=np.where(alien[:, None], 9.0, target.channels * gain + offset))
+    source = target.replace(channels=np.where(alien[:, None], 9.0, channels))
     indices = jnp.asarray(np.roll(np.arange(len(alien)), 7), jnp.int32)
     rolled = target.replace(
         channels=np.roll(target.channels, -7, axis=0),
-        channel_valid=None if mask is None else np.roll(target.channel_valid, -7, axis=0),
+        channel_valid=None if present is None else np.roll(target.channel_valid, -7, axis=0),
         valid=np.roll(target.valid, -7),
     )
     matches = Correspondences(indices=indices, distances=jnp.zeros(len(alien)), valid=jnp.asarray(~alien))
@@ -138,20 +135,12 @@ def test_channels_that_say_nothing_are_not_matched():
     assert np.isfinite(gradient(source.channels)).all()
 
 
-def test_padding_takes_no_part_in_the_spacing():
-    points = np.random.default_rng(0).uniform(size=(300, 3))
-    cloud = preprocess(points)
-    expected = float(point_spacing(cloud))
-    for size in (5_000, 100_000):
-        assert float(point_spacing(cloud.pad(size))) == expected
-
-
 @pytest.mark.parametrize("photometric", [False, True])
 def test_another_exposure_is_told(photometric):
     target, source = (preprocess(frame.cloud, voxel_size=0.03) for frame in datasets.poster_wall(num_frames=2, seed=1))
     method = MultiChannelGICP(photometric=photometric)
     dark = source.replace(channels=0.5 * np.asarray(source.channels))
-    with pytest.warns(UserWarning, match="channel red: the spreads of its values"):
+    with pytest.warns(UserWarning, match="channel red: "):
         register(dark, target, method)
     with warnings.catch_warnings():
         warnings.simplefilter("error")

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from mcgicp_jax import GICP, KDTreeSearch, PointCloud, preprocess, register
-from mcgicp_jax._clouds.point_cloud import Frame, as_cloud
+from mcgicp_jax.datasets import Frame
 from tests import reference as ref
 from tests.precision import tolerance
 
@@ -53,15 +53,12 @@ def assert_same(a, b):
             np.testing.assert_array_equal(value, other)
 
 
-def test_a_single_channel_may_be_a_vector():
-    np.testing.assert_array_equal(PointCloud(POINTS, CHANNELS[:, 0]).channels, CHANNELS[:, :1])
-
-
-def test_without_channels_there_are_none():
-    cloud = PointCloud(POINTS)
-    assert cloud.channels.shape == (150, 0)
-    assert cloud.channel_names == ()
-    assert len(cloud) == 150
+def test_channels_may_be_a_vector_or_left_out():
+    cloud = PointCloud(POINTS, CHANNELS[:, 0], channel_valid=partial()[:, 0])
+    np.testing.assert_array_equal(cloud.channels, np.where(partial(), CHANNELS, 0)[:, :1])
+    np.testing.assert_array_equal(cloud.channel_valid, partial()[:, :1])
+    bare = PointCloud(POINTS)
+    assert bare.channels.shape == (150, 0) and bare.channel_names == () and len(bare) == 150
 
 
 def test_a_missing_channel_is_stored_as_zero():
@@ -73,17 +70,12 @@ def test_a_missing_channel_is_stored_as_zero():
         np.testing.assert_array_equal(cloud.channel_valid, partial())
 
 
-def test_the_mask_of_a_single_channel_may_be_a_vector():
-    cloud = PointCloud(POINTS, CHANNELS[:, 0], channel_valid=partial()[:, 0])
-    np.testing.assert_array_equal(cloud.channel_valid, partial()[:, :1])
-
-
 @pytest.mark.parametrize(
     "mask", [np.ones((150, 1), bool), np.ones((149, 2), bool), np.ones(150, bool), np.ones((150, 2))], ids=np.shape
 )
 def test_a_mask_that_does_not_fit(mask):
     for make in (raw, ready().replace, ready(raw(channel_valid=partial())).replace):
-        with pytest.raises(ValueError, match="channel_valid: expected"):
+        with pytest.raises(ValueError, match="channel_valid: "):
             make(channel_valid=mask)
 
 
@@ -93,12 +85,9 @@ def test_replaced_channels_keep_the_mask():
     np.testing.assert_array_equal(replaced.channels, 2 * cloud.channels)
     np.testing.assert_array_equal(replaced.channel_valid, cloud.channel_valid)
     assert cloud.replace(channel_valid=None).channel_valid is None
-    with pytest.raises(ValueError, match=r"channel_valid: expected shape \(160, 3\)"):
+    with pytest.raises(ValueError, match=r"channel_valid: .*\(160, 3\)"):
         cloud.replace(channels=jnp.zeros((160, 3)))
-
-
-def test_what_is_missing_has_no_gradient():
-    cloud = ready(raw(channel_valid=partial()))
+    # What is missing has no gradient.
     gradient = jax.grad(lambda channels: jnp.sum(cloud.replace(channels=channels).channels))(
         jnp.where(cloud.channel_valid, cloud.channels, jnp.nan)
     )
@@ -131,17 +120,21 @@ def test_masked_arrays_keep_their_mask(dtype):
     np.testing.assert_array_equal(PointCloud(Foreign(hidden)).points, cloud.points)
     structured = np.ma.masked_array(np.zeros(5, [(axis, dtype) for axis in "xyz"]))
     structured["x"] = np.ma.masked
-    with pytest.raises(ValueError, match="points: expected no masked fields in a structured array"):
+    with pytest.raises(ValueError, match="points: "):
         PointCloud(structured)
 
 
 @pytest.mark.parametrize("size", [150, 160, 333])
 def test_unpad_undoes_pad(size):
-    cloud = raw(covariances=covariances(), channel_valid=partial())
-    padded = cloud.pad(size)
-    assert padded.points.shape == (size, 3)
-    assert len(padded) == 150
-    assert_same(padded.unpad(), cloud)
+    for cloud in (raw(covariances=covariances(), channel_valid=partial()), ready()):
+        assert_same(cloud.pad(size + 10).unpad(), cloud.unpad())
+        assert cloud.pad(size + 10).points.shape == (size + 10, 3) and len(cloud.pad(size + 10)) == 150
+    unpadded = ready().unpad()
+    np.testing.assert_array_equal(unpadded.points, POINTS)
+    np.testing.assert_array_equal(unpadded.covariances, covariances())
+    assert isinstance(unpadded.points, np.ndarray)
+    with pytest.raises(ValueError, match="size: "):
+        raw().pad(149)
 
 
 def test_padding_says_so():
@@ -151,20 +144,6 @@ def test_padding_says_so():
     # They are weighed, with no weight, and must have inverses.
     np.testing.assert_array_equal(padded.covariances[160:], np.broadcast_to(np.eye(3), (80, 3, 3)))
     np.testing.assert_array_equal(padded.neighbors[:160], ready().neighbors)
-
-
-def test_a_cloud_cannot_be_padded_to_less():
-    with pytest.raises(ValueError, match="size"):
-        raw().pad(149)
-
-
-def test_unpad_after_preprocess_gives_the_input_back():
-    cloud = ready().unpad()
-    np.testing.assert_array_equal(cloud.points, POINTS)
-    np.testing.assert_array_equal(cloud.channels, CHANNELS)
-    np.testing.assert_array_equal(cloud.covariances, covariances())
-    assert cloud.channel_names == ("intensity", "heat")
-    assert isinstance(cloud.points, np.ndarray)
 
 
 def test_replace_exchanges_and_leaves_the_rest():
@@ -180,45 +159,33 @@ def test_replace_exchanges_and_leaves_the_rest():
     assert not np.any(np.asarray(cloud.channels)[:150] == 1)
 
 
-def test_replace_with_another_number_of_channels_names_them_anew():
-    replaced = ready().replace(channels=jnp.zeros((160, 5)))
-    assert len(replaced.channel_names) == 5
-
-
-@pytest.mark.parametrize(
-    "arrays, message",
-    [
-        ({"points": np.zeros((159, 3))}, "points"),
-        ({"points": np.zeros((160, 2))}, "points"),
-        ({"channels": np.zeros((159, 2))}, "channels"),
-        ({"channels": np.zeros(160)}, "channels"),
-        ({"covariances": np.zeros((160, 3))}, "covariances"),
-        ({"colour": np.zeros((160, 3))}, "colour"),
-    ],
-    ids=str,
-)
-def test_replace_refuses_what_does_not_fit(arrays, message):
-    with pytest.raises(ValueError, match=message):
-        ready().replace(**arrays)
-
-
-def test_replace_checks_covariances_where_there_were_none():
+def test_replace_renames_channels_and_takes_covariances_away():
+    assert len(ready().replace(channels=jnp.zeros((160, 5))).channel_names) == 5
+    assert ready().replace(covariances=None).covariances is None
     with pytest.raises(ValueError, match="covariances"):
         ready(raw()).replace(covariances=np.zeros((5,)))
 
 
-def test_replace_can_take_covariances_away():
-    assert ready().replace(covariances=None).covariances is None
+@pytest.mark.parametrize(
+    "name, shape",
+    [
+        ("points", (159, 3)),
+        ("points", (160, 2)),
+        ("channels", (159, 2)),
+        ("channels", (160,)),
+        ("covariances", (160, 3)),
+        ("colour", (160, 3)),
+    ],
+)
+def test_replace_refuses_what_does_not_fit(name, shape):
+    with pytest.raises(ValueError, match=name):
+        ready().replace(**{name: np.zeros(shape)})
 
 
 @pytest.mark.parametrize("form", ["numpy", "jax", "jaxlie"])
 @pytest.mark.parametrize("cloud", [raw(covariances=covariances()), ready()], ids=["raw", "ready"])
 def test_transform_moves_points_and_turns_covariances(form, cloud):
-    pose = {
-        "numpy": T,
-        "jax": jnp.asarray(T),
-        "jaxlie": jaxlie.SE3.from_matrix(jnp.asarray(T)),
-    }[form]
+    pose = {"numpy": T, "jax": jnp.asarray(T), "jaxlie": jaxlie.SE3.from_matrix(jnp.asarray(T))}[form]
     moved = cloud.transform(pose)
     R, t = T[:3, :3], T[:3, 3]
     atol = tolerance(2e-6, 1e-12)
@@ -226,13 +193,6 @@ def test_transform_moves_points_and_turns_covariances(form, cloud):
     np.testing.assert_allclose(np.asarray(moved.covariances)[:150], R @ covariances() @ R.T, atol=10 * atol)
     np.testing.assert_array_equal(moved.channels, cloud.channels)
     assert moved.points.dtype == cloud.points.dtype
-    assert len(moved) == 150
-
-
-def test_transform_there_and_back():
-    cloud = ready()
-    back = cloud.transform(T).transform(np.linalg.inv(T))
-    np.testing.assert_allclose(back.points[:150], cloud.points[:150], atol=tolerance(2e-6, 1e-12))
 
 
 def test_transform_keeps_the_digits_of_large_coordinates():
@@ -289,9 +249,6 @@ def test_stack_keeps_large_origins():
     stacked = PointCloud.stack(clouds)
     np.testing.assert_array_equal(stacked.origin, [cloud.origin for cloud in clouds])
     assert np.asarray(stacked.origin).dtype == np.float64
-
-
-def test_stack_of_nothing():
     with pytest.raises(ValueError, match="clouds"):
         PointCloud.stack([])
 
@@ -331,19 +288,6 @@ def test_a_cloud_goes_through_jit():
     assert_same(jax.tree.unflatten(structure, flat), cloud)
 
 
-def test_padded_clouds_of_one_size_share_a_program():
-    traced = []
-
-    @jax.jit
-    def total(cloud):
-        traced.append(1)
-        return jnp.sum(cloud.points)
-
-    for num_points in (129, 140, 160):
-        total(preprocess(PointCloud(np.resize(POINTS, (num_points, 3))), num_neighbors=4).pad())
-    assert len(traced) == 1
-
-
 @pytest.mark.parametrize(
     "cloud, expected",
     [
@@ -360,20 +304,17 @@ def test_repr_is_short_and_says_what_matters(cloud, expected):
     assert text.startswith("PointCloud(")
     for part in expected:
         assert part in text
+    inside = []
+    jax.jit(lambda cloud: inside.append(repr(cloud)) or cloud.points)(cloud)
+    assert str(len(cloud.points)) in inside[0]
 
 
-def test_an_argument_that_is_no_cloud_is_named():
-    cloud = raw()
-    assert as_cloud("source", cloud) is cloud
-    np.testing.assert_array_equal(as_cloud("source", POINTS).points, POINTS)
-    with pytest.raises(ValueError, match=r"^source: points: expected shape \(N, 3\), got \(3,\)"):
-        as_cloud("source", np.zeros(3))
-
-
-def test_repr_inside_a_transformation():
-    seen = []
-    jax.jit(lambda cloud: seen.append(repr(cloud)) or cloud.points)(ready())
-    assert "160" in seen[0]
+def test_arguments_may_be_arrays_and_are_named():
+    clouds = raw(), POINTS
+    expected = register(PointCloud(POINTS), PointCloud(POINTS), GICP()).matrix
+    np.testing.assert_array_equal(register(*clouds, GICP()).matrix, expected)
+    with pytest.raises(ValueError, match=r"^source: points: .*\(3,\)"):
+        register(np.zeros(3), POINTS, GICP())
 
 
 def test_transform_by_kilometres_moves_the_points_of_a_raw_cloud():
@@ -389,6 +330,13 @@ def test_transform_by_kilometres_moves_the_points_of_a_raw_cloud():
         np.testing.assert_allclose(points, expected, rtol=0, atol=tolerance(2e-6, 1e-8))
 
 
+class Foreign:
+    """Like a cloud of Open3D."""
+
+    def __init__(self, points, colors=()):
+        self.points, self.colors = points, colors
+
+
 def test_a_rotation_of_few_digits_becomes_one():
     typed = np.round(T, 4)
     assert np.abs(typed[:3, :3] @ typed[:3, :3].T - np.eye(3)).max() > 1e-6
@@ -397,25 +345,10 @@ def test_a_rotation_of_few_digits_becomes_one():
     np.testing.assert_allclose(*apart, rtol=1e-6)
 
 
-class Foreign:
-    """Like a cloud of Open3D."""
-
-    def __init__(self, points, colors=()):
-        self.points, self.colors = points, colors
-
-
 def test_clouds_of_other_libraries_are_taken(tmp_path):
     points = np.random.default_rng(0).normal(size=(5, 3))
-    fields = [
-        ("x", "f4"),
-        ("y", "f4"),
-        ("z", "f4"),
-        ("rgb", "f4"),
-        ("ring", "u2"),
-        ("name", "U3"),
-        ("reflectivity", "u2"),
-    ]
-    structured = np.zeros((1, 5), fields)
+    fields = [(name, "f4") for name in ("x", "y", "z", "rgb")] + [(name, "u2") for name in ("ring", "reflectivity")]
+    structured = np.zeros((1, 5), [*fields, ("name", "U3")])
     structured["x"], structured["y"], structured["z"] = points.T[:, None]
     structured["reflectivity"] = np.arange(5)
     # As of PCL and ROS: 0x00RRGGBB in the bits of a float.
@@ -430,23 +363,22 @@ def test_clouds_of_other_libraries_are_taken(tmp_path):
     np.testing.assert_array_equal(colored.points, points)
     for none in ([], np.zeros((0, 3))):
         assert PointCloud(Foreign(points, none)).channels.shape == (5, 0)
-    for wrong, message in (
-        ("scan.ply", r"^points: expected coordinates, got a path; mcgicp_jax.io.read\('scan.ply'\)"),
-        (tmp_path / "scan.ply", "got a path"),
-        (object(), "got object; pass its coordinates as an array"),
-        ({"x": points}, "got dict; pass its coordinates"),
-        (Frame(cloud), "got Frame; pass its cloud"),
-        (cloud, "got a PointCloud; use it as it is"),
-        (points.T, r"expected shape \(N, 3\), got \(3, 5\); pass points.T"),
-        (np.hstack([points, points]), r"expected shape \(N, 3\), got \(5, 6\); pass further columns as channels"),
-        (structured[["x", "y", "ring"]], "^points: expected the fields x, y and z, got x, y, ring"),
+    for wrong, named in (
+        ("scan.ply", r"io.read\('scan.ply'\)"),
+        (tmp_path / "scan.ply", "io.read"),
+        (object(), "object"),
+        ({"x": points}, "dict"),
+        (Frame(cloud), "Frame"),
+        (cloud, "PointCloud"),
+        (points.T, r"\(3, 5\).*points\.T"),
+        (np.hstack([points, points]), r"\(5, 6\)"),
+        (np.zeros((2, 4, 3)), r"\(2, 4, 3\).*reshape"),
+        (structured[["x", "y", "ring"]], "x, y, ring"),
     ):
-        with pytest.raises(ValueError, match=message):
+        with pytest.raises(ValueError, match=f"^points: .*{named}"):
             PointCloud(wrong)
-    with pytest.raises(ValueError, match=r"^channel_names: expected a sequence of names, got the string 'ab'"):
+    with pytest.raises(ValueError, match=r"^channel_names: .*'ab'"):
         PointCloud(points, points[:, :2], channel_names="ab")
-    with pytest.raises(ValueError, match=r"^source: points: expected coordinates, got a path"):
-        register("scan.ply", points, GICP())
 
 
 def test_tables_with_named_columns_and_clouds_of_tensors():
@@ -478,5 +410,3 @@ def test_tables_with_named_columns_and_clouds_of_tensors():
     np.testing.assert_allclose(cloud.channels, colors / 255, rtol=1e-6)
     del Tensors.point["colors"]
     assert PointCloud(Tensors()).channels.shape == (5, 0)
-    with pytest.raises(ValueError, match=r"got \(2, 4, 3\); pass points.reshape\(-1, 3\)"):
-        PointCloud(np.zeros((2, 4, 3)))

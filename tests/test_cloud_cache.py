@@ -2,9 +2,6 @@
 
 import copy
 import gc
-import threading
-import time
-from concurrent.futures import ThreadPoolExecutor
 
 import equinox as eqx
 import jax
@@ -13,10 +10,7 @@ import numpy as np
 import pytest
 
 import mcgicp_jax as mcg
-from mcgicp_jax._compute.cache import Cache, Lazy, cached_with_cloud
-from mcgicp_jax._compute.tables import RowsOnDemand
-from mcgicp_jax._methods.surfaces import surface_table
-from mcgicp_jax._terms.photometric import Photometric
+from mcgicp_jax._compute.cache import Cache, cached_with_cloud
 from tests.scenes import motion, room_corner
 
 METHOD = mcg.MultiChannelGICP(0.05, 0.3)
@@ -39,49 +33,6 @@ def test_the_least_recently_used_are_evicted_by_size():
     assert made == [4, 3, 5, 3]
     # A value that is too large alone is cached, too.
     assert [get(cache, key) for key in (99, 99)] == [99, 99] and made == [4, 3, 5, 3, 99]
-
-
-def test_a_dropped_value_is_made_again():
-    cache, made = Cache(10), []
-    for _ in range(2):
-        cache.get("a", lambda: made.append(1))
-        cache.drop("a")
-    assert len(made) == 2
-
-
-def test_making_a_value_does_not_block_other_threads():
-    cache = Cache(10)
-
-    def slow():
-        other = threading.Thread(target=cache.get, args=("fast", lambda: 1))
-        other.start()
-        other.join(10)
-        assert not other.is_alive()
-        return 2
-
-    assert cache.get("slow", slow) == 2
-
-
-def test_a_lazy_value_is_computed_once():
-    calls = []
-    lazy = Lazy(lambda: calls.append(time.sleep(0.05)))
-    with ThreadPoolExecutor(8) as threads:
-        assert list(threads.map(lambda _: lazy.value, range(8))) == [None] * 8
-    assert len(calls) == 1
-
-
-def test_two_values_of_each_function_are_cached_with_a_cloud():
-    cloud, made = mcg.PointCloud(np.eye(3)), []
-
-    def compute(cloud, number):
-        made.append(number)
-        return number
-
-    first, second = cached_with_cloud(compute), cached_with_cloud(lambda cloud, number: compute(cloud, number))
-    assert [first(cloud, number) for number in (1, 2, 1, 2, 3, 1)] == [1, 2, 1, 2, 3, 1]
-    assert made == [1, 2, 3, 1] and second(cloud, 3) == 3 and made[-1] == 3 and len(made) == 5
-    first(cloud.replace(), 1)
-    assert len(made) == 6
 
 
 def test_values_cached_with_a_cloud_are_told_apart_by_all_arguments():
@@ -130,31 +81,18 @@ def test_a_new_cloud_in_the_place_of_an_old_one_has_no_values():
     assert len(numbers) < 50
 
 
-def surface_of(cloud, kinds, observed, method=METHOD):
-    """What the surface of a cloud has beyond points and covariances, and the covariances."""
-    surface, *_ = surface_table(cloud, method, kinds, True, observed).trees()
-    return set(surface.columns), surface.observability is not None, surface.covariance
+def test_a_registration_after_others_of_the_same_clouds_is_that_of_new_clouds(cloud):
+    """The cost of matches, photometric terms and another noise each want surfaces of other columns."""
+    methods = mcg.MultiChannelGICP(0.5, 0.3), mcg.MultiChannelGICP(0.05, 0.3, photometric=True), METHOD
 
+    def directions(source, target, method):
+        return mcg.register(source, target, method, max_distance=0.2).directions.twists
 
-def test_surfaces_of_a_cloud_have_what_was_asked_for(cloud):
-    """One after the other, as the cost of matches, a registration and photometric terms ask for them."""
-    wanted = [((), False), ((), True), ((Photometric,), True), ((Photometric,), False)]
-    for kinds, observed in wanted * 2:
-        columns, observability, _ = surface_of(cloud, kinds, observed)
-        assert columns == {kind.name for kind in kinds} and observability == observed
-    other = surface_of(cloud, (), True, mcg.MultiChannelGICP(0.5, 0.3))[2]
-    assert np.abs(other - surface_of(cloud, (), True)[2]).max() > 0.01
-
-
-def test_a_registration_after_the_cost_of_its_matches_is_that_of_new_clouds(cloud):
-    def directions(before):
-        source, target = cloud.replace(), cloud.replace()
-        if before:
-            matches = mcg.find_correspondences(source, target, None, METHOD, max_distance=0.2)
-            mcg.mahalanobis_cost(np.eye(4), source, target, matches, METHOD)
-        return mcg.register(source, target, METHOD, max_distance=0.2).directions.twists
-
-    np.testing.assert_array_equal(directions(True), directions(False))
+    used = cloud.replace(), cloud.replace()
+    matches = mcg.find_correspondences(*used, None, METHOD, max_distance=0.2)
+    mcg.mahalanobis_cost(np.eye(4), *used, matches, METHOD)
+    for method in methods * 2:
+        np.testing.assert_array_equal(directions(*used, method), directions(cloud.replace(), cloud.replace(), method))
 
 
 class Shifted(mcg.KDTreeSearch):
@@ -190,20 +128,3 @@ def test_matches_of_a_cloud_are_those_of_a_new_one(cloud, arguments):
         # There, trees are cached by the content of the target.
         inside = jax.jit(lambda *clouds, given=given: rows(*clouds, given))(source, target)
         np.testing.assert_array_equal(each, inside)
-
-
-def test_rows_are_computed_once_by_threads_that_share_a_table():
-    computed = []
-
-    def compute(rows, _):
-        rows = np.arange(20) if rows is None else rows
-        time.sleep(0.02)
-        computed.extend(rows.tolist())
-        return 10 * rows
-
-    table = RowsOnDemand(compute, 20)
-    wanted = [np.arange(k, k + 10) for k in (0, 5, 0, 10, 5, 3, 0, 10)]
-    with ThreadPoolExecutor(len(wanted)) as threads:
-        found = list(threads.map(lambda rows: table.known(rows)[rows], wanted))
-    np.testing.assert_array_equal(found, 10 * np.array(wanted))
-    assert sorted(computed) == list(range(20))

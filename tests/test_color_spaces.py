@@ -27,9 +27,7 @@ def test_hsv_is_that_of_the_standard_library():
     for rgb, (x, y, value) in zip(COLORS, mcg.rgb_to_hsv(COLORS), strict=True):
         h, s, v = colorsys.rgb_to_hsv(*rgb)
         np.testing.assert_allclose([x, y, value], [s * np.cos(2 * np.pi * h), s * np.sin(2 * np.pi * h), v], atol=1e-12)
-
-
-def test_hsv_is_continuous_at_red():
+    # Continuous at red.
     below, above = mcg.rgb_to_hsv(np.array([[1, 0, 1e-9], [1, 1e-9, 0]]))
     np.testing.assert_allclose(below, above, atol=1e-8)
 
@@ -69,7 +67,7 @@ def test_derivatives(name):
 
 @pytest.mark.parametrize("name", SPACES)
 def test_shapes(name):
-    with pytest.raises(ValueError, match=r"rgb: expected shape \(\.\.\., 3\), got \(4,\)"):
+    with pytest.raises(ValueError, match=r"^rgb: .*\(4,\)"):
         SPACES[name](np.zeros(4))
 
 

@@ -14,11 +14,7 @@ import scipy.spatial
 import mcgicp_jax as mcg
 from mcgicp_jax import io, metrics, plot
 from mcgicp_jax.__main__ import main
-from mcgicp_jax._cli.options import Options
-from mcgicp_jax._clouds.color_spaces import COLOR_SPACES
-from mcgicp_jax._math.robust_kernels import KERNELS
-from mcgicp_jax.datasets import DATASETS
-from mcgicp_jax.extend import METHODS
+from mcgicp_jax.extend import COLOR_SPACES, DATASETS, FORMATS, KERNELS, METHODS
 from tests.scenes import motion, room_corner
 
 TRUTH = motion()
@@ -68,8 +64,7 @@ def test_register_prints_the_pose(files, capsys, method):
     assert errors == ""
     # Points lie around the means of their cells.
     rmse = "rmse 0.1" if method == "ndt" else "rmse 0.0"
-    for part in (f"method:    {method}", "status:    converged after", " of 1,000 (", rmse):
-        assert part in text
+    assert all(part in text for part in (method, "converged", "1,000", rmse))
     assert close_to_truth(printed_matrix(text), factor=1 if "gicp" in method or "plane" in method else 4)
 
 
@@ -105,40 +100,32 @@ def test_the_start_is_used_and_drawn(files, monkeypatch, tmp_path, capsys):
 
 def test_numbers_reach_the_method(files, capsys):
     numbers = ["--channel-covariance", "0.25", "--channel-weights", "0.5", "--epsilon", "0.01"]
-    assert main(["register", files["source"], files["target"], *numbers]) == 0
-    assert "mc-gicp, channel_covariance 0.25, channel_weights 0.5, epsilon 0.01" in capsys.readouterr().out
+    for method in ("mc-gicp", "photometric-gicp"):
+        assert main(["register", files["source"], files["target"], "--method", method, *numbers]) == 0
+        text = capsys.readouterr().out
+        assert f"{method}, channel_covariance 0.25, channel_weights 0.5, epsilon 0.01" in text
     assert main(["register", files["source"], files["target"], "--method", "color-icp", *numbers[2:4]]) == 0
     assert "color-icp, channel_weights 0.5\n" in capsys.readouterr().out
 
 
 def test_what_does_not_converge_is_no_success(files, tmp_path, capsys):
     far = save(tmp_path / "far.npz", room_corner(1000)[0] + 100)
-    assert main(["register", far, files["target"], "--method", "gicp"]) == 1
-    text, errors = capsys.readouterr()
-    assert "status:    too few correspondences" in text and "inliers:   0 (0%" in text
-    assert errors.startswith("mcgicp: gicp did not converge (too few correspondences)") and "try init" in errors
-    assert main(["register", files["source"], files["target"], "--max-iterations", "1"]) == 1
-    assert "max iterations" in capsys.readouterr().err
     flat = save(tmp_path / "flat.npz", np.random.default_rng(0).random((500, 3)) * [1, 1, 0])
-    assert main(["register", flat, flat, "--method", "point-to-plane"]) == 1
-    assert "the pose is unconstrained in at least one direction" in capsys.readouterr().err
+    for arguments, status in (
+        ([far, files["target"], "--method", "gicp"], "too few correspondences"),
+        ([files["source"], files["target"], "--max-iterations", "1"], "max iterations"),
+        ([flat, flat, "--method", "point-to-plane"], "unconstrained"),
+    ):
+        assert main(["register", *arguments]) == 1
+        text, errors = capsys.readouterr()
+        assert "status: " in text and errors.startswith("mcgicp: ") and status in errors
 
 
 def test_compare(files, capsys):
     assert main(["compare", files["source"], files["target"], "--truth", files["truth"]]) == 0
     lines = capsys.readouterr().out.splitlines()
     rows = {line.split()[0]: line.split()[1:] for line in lines if line.endswith("converged")}
-    assert list(rows) == [
-        "mc-gicp",
-        "photometric-gicp",
-        "gicp",
-        "color-icp",
-        "point-to-plane",
-        "point-to-point",
-        "ndt",
-        "color-ndt",
-        "d2d-ndt",
-    ]
+    assert list(rows) == list(METHODS)
     start = next(line.split() for line in lines if line.startswith("(start)"))
     middle = np.asarray(io.read(files["source"]).points).mean(axis=0)
     assert float(start[1]) == pytest.approx(1e3 * metrics.pose_error(np.eye(4), TRUTH, at=middle)[0], abs=0.01)
@@ -188,13 +175,12 @@ def test_common_channels_are_used(files, tmp_path, capsys):
 
 
 def test_no_common_channels_is_said(files, capsys):
-    for method in ("mc-gicp", "color-icp"):
-        assert main(["register", files["bare"], files["target"], "--method", method]) == 2
-        error = capsys.readouterr().err
-        assert "bare.npz has no channels" in error and "target.ply has intensity" in error and "--method gicp" in error
-    # Before the search for a pose, which takes seconds
-    assert main(["register", files["bare"], files["target"], "--method", "mc-gicp", "--init", "global"]) == 2
-    assert "start:" not in capsys.readouterr().out
+    # The last before the search for a pose, which takes seconds.
+    for options in (["mc-gicp"], ["color-icp"], ["mc-gicp", "--init", "global"]):
+        assert main(["register", files["bare"], files["target"], "--method", *options]) == 2
+        text, error = capsys.readouterr()
+        assert all(part in error for part in ("bare.npz", "target.ply has intensity", "--method gicp"))
+        assert "start:" not in text
 
 
 def test_clouds_without_channels_in_common_are_registered_by_gicp(files, tmp_path, capsys):
@@ -236,14 +222,6 @@ def test_voxels_are_chosen_from_the_data(tmp_path, capsys):
         np.testing.assert_allclose(distances, [10 * max(near, np.sqrt(np.pi / 20) * far), 2.5 * near], rtol=0.03)
 
 
-def test_clouds_with_covariances_keep_their_points(tmp_path, capsys):
-    points, _ = room_corner(21_000)
-    cloud = mcg.PointCloud(points, covariances=np.tile(np.eye(3), (len(points), 1, 1)))
-    io.write(tmp_path / "cloud.npz", cloud)
-    assert main(["register", str(tmp_path / "cloud.npz"), str(tmp_path / "cloud.npz"), "--method", "gicp"]) == 0
-    assert "(all points)" in capsys.readouterr().out
-
-
 def broken(folder):
     """Arguments that are wrong, and what the message must name."""
     good = save(folder / "good.npz", room_corner(200)[0])
@@ -253,25 +231,23 @@ def broken(folder):
     np.savetxt(folder / "scaled.txt", 2 * np.eye(4))
     nan = save(folder / "nan.npz", np.full((9, 3), np.nan))
     return [
-        ([str(folder / "nowhere.ply"), good], "nowhere.ply: No such file"),
-        ([good, str(folder / "cut.ply")], "cut.ply: cannot be read"),
+        ([str(folder / "nowhere.ply"), good], "nowhere.ply: "),
+        ([good, str(folder / "cut.ply")], "cut.ply: "),
         ([str(folder / "empty.pcd"), good], "empty.pcd"),
         ([str(folder), good], str(folder)),
-        ([good, nan], "nan.npz: cloud: expected at least 4 finite points"),
-        ([good, good, "--init", str(folder / "two.txt")], "two.txt: expected one pose, got 2"),
-        ([good, good, "--init", str(folder / "scaled.txt")], "scaled.txt"),
-        ([good, good, "--epsilon", "-1"], "epsilon: expected one positive number"),
+        ([good, nan], "nan.npz: "),
+        *(([good, good, "--init", path], path) for path in (good, str(folder / "two.txt"), str(folder / "scaled.txt"))),
         ([good, good, "--channel-weights", "1"], "gicp has no channel_weights"),
-        ([good, good, "--voxel-size", "-1"], "voxel_size: expected"),
-        ([good, good, "--num-neighbors", "1"], "num_neighbors: expected"),
-        ([good, good, "--max-distance", "0"], "max_distance: expected"),
-        ([good, good, "--max-iterations", "0"], "max_iterations: expected"),
-        ([good, good, "--max-source-points", "3"], "max_source_points: expected"),
-        ([good, good, "--aligned", str(folder / "out.doc")], "unknown suffix '.doc'"),
-        ([good, good, "--output", str(folder / "no" / "pose.txt")], "No such file or directory"),
-        ([good, good, "--output", str(folder)], f"{folder}: Is a directory"),
-        ([good, good, "--plot", str(folder / "picture.doc")], "picture.doc: unknown suffix '.doc'; expected one of ."),
-        ([good, good, "--init", good], "good.npz: cannot be read as poses: it is not text"),
+        *(
+            ([good, good, f"--{name}", value], f"{name.replace('-', '_')}: ")
+            for name, value in (("epsilon", "-1"), ("voxel-size", "-1"), ("num-neighbors", "1"), ("max-distance", "0"))
+        ),
+        ([good, good, "--max-iterations", "0"], "max_iterations: "),
+        ([good, good, "--max-source-points", "3"], "max_source_points: "),
+        ([good, good, "--aligned", str(folder / "out.doc")], "'.doc'"),
+        ([good, good, "--output", str(folder / "no" / "pose.txt")], "pose.txt"),
+        ([good, good, "--output", str(folder)], f"{folder}: "),
+        ([good, good, "--plot", str(folder / "picture.doc")], "picture.doc: "),
     ]
 
 
@@ -285,7 +261,7 @@ def test_wrong_input_gets_one_line(tmp_path, capsys):
         assert text == ""
     good = str(tmp_path / "good.npz")
     assert main(["compare", good, good, "--truth", str(tmp_path / "no.txt")]) == 2
-    assert capsys.readouterr().err.startswith("mcgicp: --truth: expected a file with a pose; ")
+    assert capsys.readouterr().err.startswith("mcgicp: --truth: ")
 
 
 def test_the_version(capsys):
@@ -307,60 +283,27 @@ def test_points_left_out_are_reported_in_one_line(files, tmp_path, capsys):
     assert capsys.readouterr().err == f"mcgicp: {path}: left out 1 of 1001 points with a NaN or infinity\n"
 
 
-@pytest.mark.parametrize(
-    ("command", "words"),
-    [
-        ([], ["demo", "register", "compare"]),
-        (["demo"], ["--output"]),
-        (
-            ["register"],
-            ["SOURCE TARGET", "--method {mc-gicp,", "--voxel-size", "40,000", "10 and 2.5 spacings", "--aligned"],
-        ),
-        (["compare"], ["SOURCE TARGET", "--truth", "--channel-weights", "metres per channel"]),
-    ],
-)
-def test_help(command, words, capsys):
-    with pytest.raises(SystemExit) as ended:
-        main([*command, "--help"])
-    text = " ".join(capsys.readouterr().out.replace("│", " ").split())
-    assert ended.value.code == 0
-    assert all(word in text for word in words)
-    assert "None" not in text
-
-
 def test_help_lists_the_registries(capsys):
     """A method, kernel, colour space, format or data set that is registered is an option, with its defaults."""
-    for command, registered in (("register", (METHODS, KERNELS, COLOR_SPACES, io.FORMATS)), ("odometry", (DATASETS,))):
+    for command, registered in (("register", (METHODS, KERNELS, COLOR_SPACES, FORMATS)), ("odometry", (DATASETS,))):
         with pytest.raises(SystemExit):
             main([command, "--help"])
         text = " ".join(capsys.readouterr().out.replace("│", " ").split())
         for names in registered:
             assert not [name for name in names if name not in text]
+        assert "None" not in text
     for name, dataset in DATASETS.items():
         assert f"{dataset.max_distance[0]:g} and {dataset.max_distance[1]:g} for " in text, name
 
 
-def test_every_kernel_is_an_option(files, capsys):
-    for name in KERNELS:
-        assert main(["register", files["bare"], files["target"], "--method", "gicp", "--robust", name, "2.0"]) == 0
-        assert close_to_truth(printed_matrix(capsys.readouterr().out)), name
-
-
-def test_parameters_of_registered_methods():
-    """`photometric-gicp` is MC-GICP with an argument, and takes the same parameters."""
-    assert METHODS["photometric-gicp"](epsilon=0.01).photometric and not METHODS["mc-gicp"]().photometric
-    assert Options(epsilon=0.01, channel_weights=(0.5,)).parameters_of("photometric-gicp") == {
-        "epsilon": 0.01,
-        "channel_weights": 0.5,
-    }
-
-
-@pytest.mark.parametrize("args", [[], ["align"], ["register"], ["register", "a", "b", "--method", "icp"]])
-def test_misuse_exits_with_2(args, capsys):
-    with pytest.raises(SystemExit) as ended:
-        main(args)
-    assert ended.value.code == 2
-    assert capsys.readouterr().err
+def test_a_kernel_is_an_option(files, capsys):
+    command = ["register", files["bare"], files["target"], "--method", "gicp"]
+    matrices = []
+    for options in ([], ["--robust", "cauchy", "0.5"]):
+        assert main([*command, *options]) == 0
+        matrices.append(printed_matrix(capsys.readouterr().out))
+        assert close_to_truth(matrices[-1])
+    assert np.abs(matrices[0] - matrices[1]).max() > 1e-6
 
 
 def test_an_unwritable_cache_is_no_error(files, monkeypatch, capsys):
@@ -400,13 +343,6 @@ def test_a_reader_that_ends_early_is_no_error(arguments):
     done = subprocess.run(command, stdout=writer, stderr=subprocess.PIPE, text=True, timeout=120)
     os.close(writer)
     assert done.stderr == ""
-
-
-def test_methods_are_listed_in_order(capsys):
-    with pytest.raises(SystemExit):
-        main(["register", "a.ply", "b.ply", "--method", "foo"])
-    text = " ".join(capsys.readouterr().err.replace("│", " ").split())
-    assert f"Expected one of ({', '.join(map(repr, METHODS))})" in text
 
 
 def test_fixed_directions(files, capsys, tmp_path):

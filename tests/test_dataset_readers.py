@@ -11,7 +11,6 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from mcgicp_jax import io, metrics
 from mcgicp_jax.datasets import clouds, ford_campus, kitti, seven_scenes, tum_rgbd
-from mcgicp_jax.datasets._frames import look_up
 from tests.scenes import motion
 
 
@@ -38,23 +37,9 @@ def colors_differ(first, second, reach):
     return np.abs(colors[0][chosen] - colors[1][nearest])[distance < reach].mean()
 
 
-# Looking colours up
-
-
-def test_colors_are_bilinear_and_only_inside():
-    image = ramp(11, 21).astype(np.uint8)
-    pixels = np.array([[0, 0], [20, 10], [3, 4], [3.5, 4.5], [-0.1, 3], [20.1, 3], [3, 10.1], [np.nan, 1], [np.inf, 1]])
-    colors, inside = look_up(image, pixels)
-    np.testing.assert_array_equal(inside, [True] * 4 + [False] * 5)
-    np.testing.assert_allclose(colors[0], [0, 0, 0.2])
-    np.testing.assert_allclose(colors[1], [1, 1, 0.2])
-    np.testing.assert_allclose(colors[2], image[4, 3] / 255)
-    np.testing.assert_allclose(colors[3], image[4:6, 3:5].mean(axis=(0, 1)) / 255)
-
-
 # KITTI
 
-CALIBRATION = {"P0": [100, 0, 50, 0, 0, 100, 20, 0, 0, 0, 1, 0], "P2": [100, 0, 50, 30, 0, 100, 20, 0, 0, 0, 1, 0]}
+CALIBRATION = {"P0": [100, 0, 50, 0, 0, 100, 20, 0, 0, 0, 1, 0], "P2": [100, 0, 50, 35, 0, 100, 20, 0, 0, 0, 1, 0]}
 # From x ahead, y left, z up to x right, y down, z ahead.
 TO_CAMERA = [0, -1, 0, 0, 0, 0, -1, 0, 1, 0, 0, -0.5]
 
@@ -72,7 +57,7 @@ def kitti_folder(tmp_path):
         scan.astype("<f4").tofile(folder / "velodyne" / f"{number:06d}.bin")
         save_image(folder / "image_2" / f"{number:06d}.png", ramp(41, 101).astype(np.uint8))
     lines = [f"{name}: {' '.join(map(str, row))}" for name, row in (CALIBRATION | {"Tr": TO_CAMERA}).items()]
-    (folder / "calib.txt").write_text("\n".join(lines))
+    (folder / "calib.txt").write_text("\n".join([*lines, "calib_time: 09-Jan-2012"]))
     np.savetxt(folder / "times.txt", 0.1 * np.arange(6))
     (tmp_path / "poses").mkdir()
     io.write_poses(tmp_path / "poses" / "77.txt", [motion((i, 0, 0.1 * i, 0, 0.02 * i, 0)) for i in range(6)])
@@ -86,9 +71,11 @@ def test_kitti_points_get_the_color_of_their_pixel(kitti_folder):
     cloud = frames[0].cloud
     assert cloud.channel_names == ("intensity", "red", "green", "blue")
     np.testing.assert_allclose(cloud.channels[:, 0], [0.1, 0.2, 0.3, 0.4, 0.5], atol=1e-6)
-    # Depth 10 and 5; u = (100 x + 50 z + 30) / z, with x = −y of the scan; v = 100 y / z + 20, with y = −z of the scan.
-    pixels = np.array([[53, 20], [23, 10], [96, 30]])
-    np.testing.assert_allclose(cloud.channels[:3, 1:3], pixels / (100, 40), atol=0.005)
+    # Depth 10 and 5; u = (100 x + 50 z + 35) / z, with x = −y of the scan; v = 100 y / z + 20, with y = −z of the scan.
+    # The first two lie half way between pixels.
+    image = ramp(41, 101).astype(np.uint8) / 255
+    expected = [image[20, 53:55].mean(axis=0), image[10, 23:25].mean(axis=0), image[30, 97]]
+    np.testing.assert_allclose(cloud.channels[:3, 1:], expected, atol=1e-6)
     np.testing.assert_array_equal(cloud.channel_valid[:, 0], True)
     np.testing.assert_array_equal(cloud.channel_valid[:, 1:], np.repeat([[1], [1], [1], [0], [0]], 3, axis=1) == 1)
 
@@ -106,21 +93,6 @@ def test_kitti_times_and_poses_go_by_the_number_of_the_scan(kitti_folder):
     shutil.rmtree(kitti_folder / "image_2")
     bare = kitti(kitti_folder)[0]
     assert bare.pose is None and bare.cloud.channel_names == ("intensity",) and bare.cloud.channel_valid is None
-
-
-def test_what_is_no_kitti_sequence_is_refused_by_name(kitti_folder, tmp_path):
-    with pytest.raises(ValueError, match=r"nowhere: expected scans in velodyne"):
-        kitti(tmp_path / "nowhere")
-    (kitti_folder / "calib.txt").write_text("P2: 1 2 3\n")
-    with pytest.raises(ValueError, match=r"calib.txt: expected a line P2: with 12 numbers, found none"):
-        kitti(kitti_folder)
-    (kitti_folder / "times.txt").write_text("0.1\nlater\n")
-    (kitti_folder / "calib.txt").write_text(f"P2: {' 1' * 12}\nTr: {' 1' * 12}\ncalib_time: 09-Jan-2012\n")
-    with pytest.raises(ValueError, match=r"times.txt: expected a number of seconds"):
-        kitti(kitti_folder)
-    (kitti_folder / "calib.txt").unlink()
-    with pytest.raises(FileNotFoundError, match=r"calib.txt"):
-        kitti(kitti_folder)
 
 
 def test_real_kitti_scans_have_the_colors_of_the_road(data):
@@ -184,18 +156,6 @@ def test_tum_frames_are_put_together_by_time(tum_folder):
     assert tum_rgbd(tum_folder)[0].pose is None
 
 
-def test_what_is_no_tum_sequence_is_refused_by_name(tum_folder):
-    (tum_folder / "rgb.txt").write_text("9.0 rgb/1.0.png\n")
-    with pytest.raises(ValueError, match=r"made_up: expected depth and colour images within 0.02 s"):
-        tum_rgbd(tum_folder)
-    (tum_folder / "rgb.txt").write_text("9.0\n")
-    with pytest.raises(ValueError, match=r"rgb.txt: expected lines of a time stamp"):
-        tum_rgbd(tum_folder)
-    (tum_folder / "rgb.txt").unlink()
-    with pytest.raises(FileNotFoundError, match=r"rgb.txt"):
-        tum_rgbd(tum_folder)
-
-
 def test_the_real_tum_pair_in_the_layout_of_the_data_set(data, tmp_path):
     folder = tmp_path / "rgbd_dataset_freiburg1_xyz"
     folder.mkdir()
@@ -251,18 +211,18 @@ def test_7_scenes_know_where_there_is_no_depth_and_no_color(tmp_path):
     assert 639 * frame.cloud.channels[ahead, 0] == pytest.approx(expected, abs=2.6)
     # So near, the colour camera looks past the corner.
     assert not frame.cloud.channel_valid[np.argmin(frame.cloud.points[:, 2])].any()
-    with pytest.raises(ValueError, match="expected images frame"):
-        seven_scenes(tmp_path / "nowhere")
     (tmp_path / "frame-000030.depth.png").write_bytes(b"no image")
-    with pytest.raises(ValueError, match=r"frame-000030.depth.png: cannot be read as an image"):
+    with pytest.raises(ValueError, match=r"frame-000030.depth.png: cannot be read"):
         seven_scenes(tmp_path)[0]
 
 
 # Ford Campus
 
 
-def write_ford(folder, reflectivity=None):
+@pytest.fixture
+def ford_folder(tmp_path):
     """Two scans of five points; cameras 1 and 3 of five see some of them; the second scan is too late for an image."""
+    folder = tmp_path / "ford"
     (folder / "SCANS").mkdir(parents=True)
     points = np.array([[1.0, 2, 3, 4, 5], [0, 1, 0, 1, 0], [0.5, 0.5, 0.5, 0.5, -0.5]])
     empty = {"points_index": np.zeros((1, 0)), "pixels": np.zeros((2, 0)), "xyz": np.zeros((3, 0))}
@@ -280,33 +240,38 @@ def write_ford(folder, reflectivity=None):
             "image_index": 0,
             "Cam": records,
         }
-        if reflectivity is not None:
-            scan["reflectivity"] = reflectivity
+        # The second has reflectances, too.
+        scan |= {"reflectivity": np.array([[9.0, 8, 7, 6, 5]])} if late else {}
         scipy.io.savemat(folder / "SCANS" / f"Scan{number:04d}.mat", {"SCAN": scan})
     for camera in range(5):
         save_image(folder / "IMAGES" / f"Cam{camera}" / "image0011.ppm", ramp(616, 1616).astype(np.uint8))
     (folder / "Timestamp.log").write_text(
         "frame curr_timestamp_sync\n10 1199999999900000 1 2\n11 1200000000020000 1 2\n12 1200000000140000 1 2\n"
     )
+    return folder
 
 
-def test_ford_scans_are_colored_by_the_image_of_their_time(tmp_path):
-    write_ford(tmp_path)
-    frames = ford_campus(tmp_path)
-    assert len(frames) == 2
-    cloud = frames[0].cloud
+def test_ford_scans_are_colored_by_the_image_of_their_time(ford_folder):
+    first, second = ford_campus(ford_folder)
+    cloud, late = first.cloud, second.cloud
     assert cloud.channel_names == ("red", "green", "blue")
     np.testing.assert_allclose(cloud.points[:, 0], [1, 2, 3, 4, 5])
     np.testing.assert_array_equal(cloud.channel_valid[:, 0], [True, False, True, False, True])
     # The corners of the image; the third point is seen by two cameras, of which the first counts.
     np.testing.assert_allclose(cloud.channels[[0, 2, 4], :2], [[0, 0], [1, 1], [808 / 1615, 308 / 615]], atol=0.005)
-    assert not frames[1].cloud.channel_valid.any()
-    assert frames[1].time - frames[0].time == pytest.approx(1)
+    assert second.time - first.time == pytest.approx(1)
+    assert late.channel_names == ("intensity", "red", "green", "blue")
+    np.testing.assert_allclose(late.channels[:, 0], [9, 8, 7, 6, 5])
+    assert late.channel_valid[:, 0].all() and not late.channel_valid[:, 1:].any()
+    # Without images, the points alone.
+    shutil.rmtree(ford_folder / "IMAGES")
+    assert not ford_campus(ford_folder)[0].cloud.channel_valid.any()
+    (ford_folder / "Timestamp.log").unlink()
+    assert not ford_campus(ford_folder)[0].cloud.channel_valid.any()
 
 
-def test_ford_poses_are_those_of_the_laser(tmp_path):
-    write_ford(tmp_path)
-    pose = ford_campus(tmp_path)[0].pose
+def test_ford_poses_are_those_of_the_laser(ford_folder):
+    pose = ford_campus(ford_folder)[0].pose
     vehicle, laser = np.eye(4), np.eye(4)
     vehicle[:3, :3] = Rotation.from_euler("xyz", [0.1, 0.2, 0.3]).as_matrix()
     vehicle[:3, 3] = 10, 20, -1
@@ -316,35 +281,39 @@ def test_ford_poses_are_those_of_the_laser(tmp_path):
     np.testing.assert_allclose(pose, vehicle @ laser, atol=1e-9)
 
 
-def test_ford_scans_with_reflectance_have_an_intensity(tmp_path):
-    write_ford(tmp_path, reflectivity=np.array([[9.0, 8, 7, 6, 5]]))
-    cloud = ford_campus(tmp_path)[1].cloud
-    assert cloud.channel_names == ("intensity", "red", "green", "blue")
-    np.testing.assert_allclose(cloud.channels[:, 0], [9, 8, 7, 6, 5])
-    assert cloud.channel_valid[:, 0].all()
+@pytest.mark.parametrize(
+    ("reader", "file", "content", "named"),
+    [
+        (kitti, "calib.txt", b"P2: 1 2 3\n", "calib.txt: .*P2:.* 12"),
+        (kitti, "times.txt", b"0.1\nlater\n", "times.txt: "),
+        (tum_rgbd, "rgb.txt", b"9.0 rgb/1.0.png\n", "made_up: .*0.02 s"),
+        (tum_rgbd, "rgb.txt", b"9.0\n", "rgb.txt: "),
+        (ford_campus, "SCANS/Scan0075.mat", b"no such thing", "Scan0075.mat: "),
+        (ford_campus, "Timestamp.log", b"nothing\n", "Timestamp.log: "),
+    ],
+)
+def test_a_broken_file_of_a_data_set_is_named(request, reader, file, content, named):
+    folder = request.getfixturevalue(
+        {kitti: "kitti_folder", tum_rgbd: "tum_folder", ford_campus: "ford_folder"}[reader]
+    )
+    (folder / file).write_bytes(content)
+    with pytest.raises(ValueError, match=named):
+        reader(folder)[0]
 
 
-def test_ford_without_images_has_points_alone(tmp_path):
-    write_ford(tmp_path)
-    shutil.rmtree(tmp_path / "IMAGES")
-    assert not ford_campus(tmp_path)[0].cloud.channel_valid.any()
-    (tmp_path / "Timestamp.log").unlink()
-    assert not ford_campus(tmp_path)[0].cloud.channel_valid.any()
-
-
-def test_what_is_no_ford_data_is_refused_by_name(tmp_path):
-    with pytest.raises(ValueError, match=r"nowhere: expected scans in SCANS"):
-        ford_campus(tmp_path / "nowhere")
-    write_ford(tmp_path)
-    scipy.io.savemat(tmp_path / "SCANS" / "Scan0075.mat", {"other": 1})
-    (tmp_path / "SCANS" / "Scan0076.mat").write_bytes(b"no such thing")
-    frames = ford_campus(tmp_path)
-    for i, name in enumerate(("Scan0075.mat", "Scan0076.mat")):
-        with pytest.raises(ValueError, match=f"{name}: cannot be read as a scan of Ford Campus"):
-            frames[i]
-    (tmp_path / "Timestamp.log").write_text("nothing\n")
-    with pytest.raises(ValueError, match=r"Timestamp.log: expected rows"):
-        ford_campus(tmp_path)
+@pytest.mark.parametrize(
+    ("reader", "error", "named"),
+    [
+        (kitti, ValueError, "nothing.*velodyne"),
+        (tum_rgbd, FileNotFoundError, "nothing"),
+        (seven_scenes, ValueError, "nothing.*frame"),
+        (ford_campus, ValueError, "nothing.*SCANS"),
+        (clouds, FileNotFoundError, "nothing"),
+    ],
+)
+def test_a_folder_without_a_data_set_is_named(tmp_path, reader, error, named):
+    with pytest.raises(error, match=named):
+        reader(tmp_path / "nothing")
 
 
 def test_a_folder_of_clouds(tmp_path):
@@ -386,9 +355,7 @@ def test_a_folder_of_clouds(tmp_path):
     assert {path.name for path in frames.left_out} == set(left_out)
     np.testing.assert_allclose(frames[0].cloud.points, points)
     assert frames[0].pose is None and len(clouds(tmp_path, "*.npz")) == 1
-    with pytest.raises(ValueError, match=r"16\.ply: cannot be read"):
+    with pytest.raises(ValueError, match=r"16\.ply: "):
         frames[-1]
-    with pytest.raises(ValueError, match=r"expected clouds \*\.las, found none"):
+    with pytest.raises(ValueError, match=r"\*\.las"):
         clouds(tmp_path, "*.las")
-    with pytest.raises(FileNotFoundError):
-        clouds(tmp_path / "nothing")

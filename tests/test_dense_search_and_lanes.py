@@ -7,6 +7,7 @@ import sys
 import textwrap
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -15,8 +16,7 @@ from hypothesis import strategies as st
 import mcgicp_jax as mcg
 from mcgicp_jax import DenseSearch, KDTreeSearch, Status
 from mcgicp_jax._registration import vectorized as _lanes
-from mcgicp_jax._search.base import SearchPoints
-from mcgicp_jax._search.brute_force import _nearest
+from mcgicp_jax.extend import SearchPoints
 from mcgicp_jax.metrics import pose_error
 from tests import reference as ref
 from tests.batches import METHOD, assert_same, prepared
@@ -100,14 +100,14 @@ def test_padding_and_what_is_not_finite_match_nothing():
 @pytest.mark.parametrize("num_candidates", [1, 20])
 @pytest.mark.parametrize("lanes", [None, 3])
 def test_no_table_of_pairs_is_stored(num_candidates, lanes):
+    def nearest(pose, cloud):
+        return DenseSearch().nearest_traced(pose, cloud, cloud, jnp.float32(1), jnp.array(True), num_candidates)
+
     size = 2000
-    cloud = rows(np.zeros((size, 3)), np.zeros((size, 2)))
-    pose = np.zeros(7, np.float32)
-    function = _nearest
+    arguments = np.zeros(7, np.float32), rows(np.zeros((size, 3)), np.zeros((size, 2)))
     if lanes:
-        pose, cloud = jax.tree.map(lambda array: np.stack([array] * lanes), (pose, cloud))
-        function = jax.jit(jax.vmap(_nearest, in_axes=(0, 0, 0, None)), static_argnums=3)
-    memory = function.lower(pose, cloud, cloud, num_candidates).compile().memory_analysis()
+        arguments, nearest = jax.tree.map(lambda array: np.stack([array] * lanes), arguments), jax.vmap(nearest)
+    memory = jax.jit(nearest).lower(*arguments).compile().memory_analysis()
     assert memory.temp_size_in_bytes < 0.1 * 4 * size**2
 
 

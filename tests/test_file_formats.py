@@ -2,7 +2,6 @@
 
 import dataclasses
 import io as stdio
-import pathlib
 import pickle
 import struct
 import sys
@@ -17,9 +16,9 @@ import pypcd4
 import pytest
 from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
 
-from mcgicp_jax import io
-from mcgicp_jax._clouds.point_cloud import PointCloud
+from mcgicp_jax import PointCloud, io
 
 RNG = np.random.default_rng(0)
 N = 40
@@ -64,6 +63,12 @@ def write_ply(path, rows, text=False, byte_order="<", more=()):
     plyfile.PlyData([plyfile.PlyElement.describe(rows, "vertex"), *more], text=text, byte_order=byte_order).write(path)
 
 
+def faces():
+    """Triangles, as they follow the vertices of a mesh."""
+    rows = np.array([((0, 1, 2),), ((2, 3, 4),)], [("vertex_indices", "i4", (3,))])
+    return [plyfile.PlyElement.describe(rows, "face")]
+
+
 def write_pcd(path, encoding=pypcd4.Encoding.BINARY, counts=None, **columns):
     values = [np.asarray(column) for column in columns.values()]
     types = [column.dtype for column in values]
@@ -80,9 +85,19 @@ def las_data(point_format=2, num_points=N, **columns):
     return las
 
 
-def bytes_of(suffix, folder, names=INTENSITY):
-    io.write(folder / f"seed{suffix}", make(names))
-    return (folder / f"seed{suffix}").read_bytes()
+@pytest.fixture(scope="module")
+def seeds(tmp_path_factory):
+    """Small valid files of every format and encoding, by name."""
+    folder = tmp_path_factory.mktemp("seeds")
+    for suffix in FORMATS:
+        io.write(folder / f"ours{suffix}", make(INTENSITY if suffix == ".bin" else INTENSITY + RGB))
+    for text in (True, False):
+        write_ply(folder / f"{'text' if text else 'binary'}.ply", structured(**xyz()), text, more=faces())
+    for encoding in pypcd4.Encoding:
+        write_pcd(folder / f"{encoding.value}.pcd", encoding, **dict.fromkeys("xyz", np.zeros(N)))
+    for point_format in (2, 7):
+        las_data(point_format, red=np.arange(N)).write(str(folder / f"{point_format}.laz"))
+    return {path.name: path.read_bytes() for path in sorted(folder.iterdir())}
 
 
 # Round trips
@@ -115,8 +130,7 @@ def test_round_trip(tmp_path, suffix, names, dtype):
     same(io.read(path), back)
 
 
-@pytest.mark.parametrize("suffix", NAMED)
-def test_any_name_survives(tmp_path, suffix):
+def awkward():
     names = (
         "time",
         "reflectance",
@@ -132,7 +146,16 @@ def test_any_name_survives(tmp_path, suffix):
         "scalar_a",
         "1",
     )
-    cloud = make(names)
+    extreme = make((*RGB, "heat"), np.float64)
+    extreme.points[:4, 0] = [np.nan, np.inf, -np.inf, 5_400_000.123456789]
+    extreme.channels[:5] = np.array([[np.inf], [1e308], [-1], [-0.0], [1 / 3]])
+    mixed = PointCloud(make().points, make(RGB, np.float64).channels, channel_names=RGB)
+    return {"names": make(names), "extreme values": extreme, "mixed precision": mixed}
+
+
+@pytest.mark.parametrize("suffix", NAMED)
+@pytest.mark.parametrize("cloud", awkward().values(), ids=awkward())
+def test_names_and_values_survive(tmp_path, suffix, cloud):
     io.write(tmp_path / f"c{suffix}", cloud)
     same(io.read(tmp_path / f"c{suffix}"), cloud)
 
@@ -161,37 +184,20 @@ def test_npz_keeps_everything(tmp_path):
     np.testing.assert_array_equal(back.covariances, covariances)
 
 
-@pytest.mark.parametrize("suffix", NAMED)
-def test_extreme_values_survive(tmp_path, suffix):
-    cloud = make((*RGB, "heat"), np.float64)
-    cloud.points[:4, 0] = [np.nan, np.inf, -np.inf, 5_400_000.123456789]
-    cloud.channels[:5] = np.array([[np.inf], [1e308], [-1], [-0.0], [1 / 3]])
-    io.write(tmp_path / f"c{suffix}", cloud)
-    same(io.read(tmp_path / f"c{suffix}"), cloud)
-
-
 @pytest.mark.parametrize("suffix", [*NAMED, ".npy", ".bin"])
-def test_a_missing_channel_is_missing_in_the_file(tmp_path, suffix):
+@pytest.mark.parametrize("share", [0.5, 1.0])
+def test_a_missing_channel_is_missing_in_the_file(tmp_path, suffix, share):
     cloud = make(INTENSITY if suffix == ".bin" else ("intensity", *RGB))
-    present = RNG.random(cloud.channels.shape) < 0.5
+    present = RNG.random(cloud.channels.shape) < share
     cloud = cloud.replace(channel_valid=present)
     io.write(tmp_path / f"c{suffix}", cloud)
     back = io.read(tmp_path / f"c{suffix}")
     np.testing.assert_array_equal(back.points, cloud.points)
-    np.testing.assert_array_equal(back.channel_valid, present)
     np.testing.assert_array_equal(back.channels, np.where(present, cloud.channels, 0))
-
-
-def test_nothing_missing_is_no_mask(tmp_path):
-    io.write(tmp_path / "c.ply", make().replace(channel_valid=np.ones((N, 1), bool)))
-    assert io.read(tmp_path / "c.ply").channel_valid is None
-
-
-@pytest.mark.parametrize("suffix", [".ply", ".pcd"])
-def test_colours_of_mixed_precision_survive(tmp_path, suffix):
-    cloud = PointCloud(make().points, make(RGB, np.float64).channels, channel_names=RGB)
-    io.write(tmp_path / f"c{suffix}", cloud)
-    same(io.read(tmp_path / f"c{suffix}"), cloud)
+    if share == 1:
+        assert back.channel_valid is None
+    else:
+        np.testing.assert_array_equal(back.channel_valid, present)
 
 
 @pytest.mark.parametrize("suffix", FORMATS)
@@ -200,7 +206,11 @@ def test_only_valid_rows_in_the_users_frame(tmp_path, suffix):
     origin = np.zeros(3) if suffix == ".bin" else np.array([500_000.0, 5_400_000.0, 0.0])
     io.write(tmp_path / f"c{suffix}", raw.replace_rows(valid=valid, origin=origin))
     back = io.read(tmp_path / f"c{suffix}")
-    np.testing.assert_allclose(back.points, raw.points[valid].astype(np.float64) + origin, rtol=0, atol=1e-6)
+    atol = 1e-6 if suffix == ".bin" else 2e-8
+    np.testing.assert_allclose(back.points, raw.points[valid].astype(np.float64) + origin, rtol=0, atol=atol)
+    # Written again, it stays as it is.
+    io.write(tmp_path / f"d{suffix}", back)
+    same(io.read(tmp_path / f"d{suffix}"), back)
 
 
 def test_suffix_in_any_case(tmp_path):
@@ -215,62 +225,52 @@ def test_suffix_in_any_case(tmp_path):
 
 @pytest.mark.parametrize(("text", "byte_order"), [(True, "="), (False, "<"), (False, ">")])
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])
-def test_ply_encodings(tmp_path, text, byte_order, dtype):
-    columns = xyz(dtype) | {"red": np.arange(N, dtype=np.uint8), "green": np.full(N, 255, np.uint8)}
-    columns |= {"blue": np.zeros(N, np.uint8), "scalar_intensity": RNG.random(N).astype(dtype)}
-    write_ply(tmp_path / "c.ply", structured(**columns), text, byte_order)
+def test_ply_of_a_mesh_with_normals_and_colours(tmp_path, text, byte_order, dtype):
+    noise = dict.fromkeys(("nx", "ny", "nz", "alpha", "label", "ring", "time", "curvature"), np.ones(N, np.float32))
+    columns = xyz(dtype) | noise | {"red": np.arange(N, dtype=np.uint8), "green": np.full(N, 255, np.uint8)}
+    columns |= {
+        "blue": np.zeros(N, np.uint8),
+        "heat": np.full(N, 3, dtype),
+        "scalar_intensity": RNG.random(N).astype(dtype),
+    }
+    write_ply(tmp_path / "c.ply", structured(**columns), text, byte_order, faces())
     cloud = io.read(tmp_path / "c.ply")
-    assert cloud.channel_names == ("intensity", *RGB)
+    assert cloud.channel_names == ("intensity", *RGB, "heat")
     assert cloud.points.dtype == cloud.channels.dtype == dtype
     assert cloud.points.dtype.isnative and cloud.points.flags.writeable
     np.testing.assert_array_equal(cloud.points.T, [columns[axis] for axis in "xyz"])
     np.testing.assert_array_equal(cloud.channels[:, 0], columns["scalar_intensity"])
     np.testing.assert_array_equal(cloud.channels[:, 1], np.arange(N).astype(dtype) / dtype(255))
-    np.testing.assert_array_equal(cloud.channels[:, 2:], np.tile([1.0, 0.0], (N, 1)))
+    np.testing.assert_array_equal(cloud.channels[:, 2:], np.tile([1.0, 0.0, 3.0], (N, 1)))
 
 
-@pytest.mark.parametrize(
-    "column",
-    ["intensity", "scalar_Intensity", "Intensity", "reflectance", "scalar_Reflectance", "reflectivity", "remission"],
-)
+INTENSITIES = ("intensity", "scalar_Intensity", "Intensity", "reflectance", "scalar_Reflectance", "reflectivity")
+COLOURS = [("r", "g", "b"), ("diffuse_red", "diffuse_green", "diffuse_blue"), ("Red", "Green", "Blue")]
+
+
 @pytest.mark.parametrize("dtype", [np.float32, np.uint16, np.uint8, np.float64])
-def test_ply_intensity_names(tmp_path, column, dtype):
+def test_intensity_names(tmp_path, dtype):
     values = np.arange(N).astype(dtype)
-    write_ply(tmp_path / "c.ply", structured(**xyz(), **{column: values}))
-    cloud = io.read(tmp_path / "c.ply")
-    assert cloud.channel_names == INTENSITY
-    np.testing.assert_array_equal(cloud.channels[:, 0], values)
-
-
-@pytest.mark.parametrize(
-    "names", [("r", "g", "b"), ("diffuse_red", "diffuse_green", "diffuse_blue"), ("Red", "Green", "Blue")]
-)
-@pytest.mark.parametrize(("dtype", "scale"), [(np.float32, 1), (np.uint8, 255), (np.uint16, 65535), (np.int32, 255)])
-def test_ply_colour_names(tmp_path, names, dtype, scale):
-    values = RNG.integers(0, 2, (3, N)) * (scale if scale > 1 else 0.5)
-    write_ply(tmp_path / "c.ply", structured(**xyz(), **dict(zip(names, values.astype(dtype), strict=True))))
-    cloud = io.read(tmp_path / "c.ply")
-    assert cloud.channel_names == RGB
-    np.testing.assert_allclose(cloud.channels, values.T / scale, rtol=1e-6)
-
-
-def test_ply_intensity_is_not_reflectivity(tmp_path):
-    columns = {"reflectivity": np.zeros(N, np.float32), "intensity": np.ones(N, np.float32)}
+    for column in (*INTENSITIES, "remission"):
+        write_ply(tmp_path / "c.ply", structured(**xyz(), **{column: values}))
+        cloud = io.read(tmp_path / "c.ply")
+        assert cloud.channel_names == INTENSITY
+        np.testing.assert_array_equal(cloud.channels[:, 0], values)
+    columns = {"reflectivity": np.zeros(N, dtype), "intensity": np.ones(N, dtype)}
     write_ply(tmp_path / "c.ply", structured(**xyz(), **columns))
     cloud = io.read(tmp_path / "c.ply")
     assert cloud.channel_names == ("intensity", "reflectivity")
     np.testing.assert_array_equal(cloud.channels, np.tile([1.0, 0.0], (N, 1)))
 
 
-def test_ply_of_a_mesh_with_normals(tmp_path):
-    noise = dict.fromkeys(("nx", "ny", "nz", "alpha", "label", "ring", "time", "curvature"), np.ones(N, np.float32))
-    rows = structured(**xyz(), **noise, heat=np.full(N, 3.0, np.float32))
-    faces = np.array([((0, 1, 2),), ((2, 3, 4),)], [("vertex_indices", "i4", (3,))])
-    for text in (False, True):
-        write_ply(tmp_path / "c.ply", rows, text, more=[plyfile.PlyElement.describe(faces, "face")])
+@pytest.mark.parametrize(("dtype", "scale"), [(np.float32, 1), (np.uint8, 255), (np.uint16, 65535), (np.int32, 255)])
+def test_colour_names(tmp_path, dtype, scale):
+    values = RNG.integers(0, 2, (3, N)) * (scale if scale > 1 else 0.5)
+    for names in COLOURS:
+        write_ply(tmp_path / "c.ply", structured(**xyz(), **dict(zip(names, values.astype(dtype), strict=True))))
         cloud = io.read(tmp_path / "c.ply")
-        assert cloud.channel_names == ("heat",)
-        np.testing.assert_array_equal(cloud.points[:, 1], rows["y"])
+        assert cloud.channel_names == RGB
+        np.testing.assert_allclose(cloud.channels, values.T / scale, rtol=1e-6)
 
 
 @pytest.mark.parametrize("newline", [b"\r\n", b"\r"])
@@ -281,61 +281,42 @@ def test_ply_newlines(tmp_path, newline):
     np.testing.assert_array_equal(io.read(tmp_path / "c.ply").points, [[1, 2, 3], [4, 5, 6]])
 
 
-def test_ply_as_others_read_it(tmp_path):
+def test_colours_are_written_as_others_read_them(tmp_path):
     cloud = make(("intensity", *RGB))
-    io.write(tmp_path / "c.ply", cloud)
+    colours = np.rint(cloud.channels[:, 1:] * 255).astype(np.uint8)
+    for suffix in (".ply", ".pcd"):
+        io.write(tmp_path / f"c{suffix}", cloud)
     ply = plyfile.PlyData.read(tmp_path / "c.ply")
-    assert (ply.text, ply.byte_order) == (False, "<")
-    vertex = ply["vertex"]
-    assert [(p.name, p.val_dtype) for p in vertex.properties] == [
-        *((axis, "f4") for axis in "xyz"),
-        ("intensity", "f4"),
-        *((name, "u1") for name in RGB),
-    ]
-    np.testing.assert_array_equal(vertex["red"], np.rint(cloud.channels[:, 1] * 255))
+    types = {each.name: each.val_dtype for each in ply["vertex"].properties}
+    assert not ply.text and types == dict.fromkeys(("x", "y", "z", *INTENSITY), "f4") | dict.fromkeys(RGB, "u1")
+    np.testing.assert_array_equal(np.column_stack([ply["vertex"][name] for name in RGB]), colours)
+    pcd = pypcd4.PointCloud.from_path(tmp_path / "c.pcd")
+    assert pcd.fields == ("x", "y", "z", "intensity", "rgb")
+    np.testing.assert_array_equal(pypcd4.PointCloud.decode_rgb(pcd.pc_data["rgb"]), colours)
 
 
 # PCD
 
 
-@pytest.mark.parametrize("encoding", ["ascii", "binary", "binary_compressed"])
-@pytest.mark.parametrize("num_points", [1, N, 3000])
-def test_pcd_encodings(tmp_path, encoding, num_points):
-    points = (RNG.integers(-9, 9, (3, num_points)) / 4).astype(np.float32)
-    columns = dict(zip("xyz", points, strict=True)) | {"intensity": np.arange(num_points, dtype=np.float32)}
-    columns |= {"ring": np.arange(num_points, dtype=np.uint16), "heat": np.ones(num_points)}
-    write_pcd(tmp_path / "c.pcd", pypcd4.Encoding(encoding), **columns)
-    assert f"DATA {encoding}".encode() in (tmp_path / "c.pcd").read_bytes()
-    cloud = io.read(tmp_path / "c.pcd")
-    assert cloud.channel_names == ("intensity", "heat")
-    np.testing.assert_array_equal(cloud.points.T, points)
-    np.testing.assert_array_equal(cloud.channels.T, [columns["intensity"], columns["heat"]])
-
-
-@pytest.mark.parametrize("encoding", ["binary", "binary_compressed"])
+@pytest.mark.parametrize("encoding", pypcd4.Encoding)
 @pytest.mark.parametrize(("field", "dtype"), [("rgb", np.float32), ("rgb", np.uint32), ("rgba", np.uint32)])
-def test_pcd_packed_rgb(tmp_path, encoding, field, dtype):
-    colours = RNG.integers(0, 256, (N, 3), np.uint8)
-    packed = (np.uint32(0xFE000000) if field == "rgba" else 0) + colours.astype(np.uint32) @ np.array(
-        [65536, 256, 1], "u4"
-    )
-    intensity = np.arange(N, dtype=np.float32)
-    columns = xyz() | {field: packed.astype("u4").view(dtype), "intensity": intensity}
-    write_pcd(tmp_path / "c.pcd", pypcd4.Encoding(encoding), **columns)
+def test_pcd_encodings_and_packed_colours(tmp_path, encoding, field, dtype):
+    count = 3000
+    colours = RNG.integers(0, 256, (count, 3), np.uint8)
+    packed = colours.astype(np.uint32) @ np.array([65536, 256, 1], "u4") + (field == "rgba") * np.uint32(0xFE000000)
+    points = (RNG.integers(-9, 9, (3, count)) / 4).astype(np.float32)
+    columns = dict(zip("xyz", points, strict=True)) | {"intensity": np.arange(count, dtype=np.float32)}
+    columns |= {"ring": np.arange(count, dtype=np.uint16), "heat": np.ones(count)}
+    # As text, a float of these bits has too few digits.
+    text = encoding is pypcd4.Encoding.ASCII
+    columns |= {field: packed.astype("u4").view(np.uint32 if text else dtype)}
+    write_pcd(tmp_path / "c.pcd", encoding, **columns)
+    assert f"DATA {encoding.value}".encode() in (tmp_path / "c.pcd").read_bytes()
     cloud = io.read(tmp_path / "c.pcd")
-    assert cloud.channel_names == ("intensity", *RGB)
-    np.testing.assert_array_equal(cloud.channels[:, 1:], colours.astype(np.float32) / np.float32(255))
-    np.testing.assert_array_equal(cloud.channels[:, 0], intensity)
-
-
-def test_pcd_as_others_read_it(tmp_path):
-    cloud = make(("intensity", *RGB))
-    io.write(tmp_path / "c.pcd", cloud)
-    pcd = pypcd4.PointCloud.from_path(tmp_path / "c.pcd")
-    assert pcd.fields == ("x", "y", "z", "intensity", "rgb")
-    np.testing.assert_array_equal(
-        pypcd4.PointCloud.decode_rgb(pcd.pc_data["rgb"]), np.rint(cloud.channels[:, 1:] * 255).astype(np.uint8)
-    )
+    assert cloud.channel_names == ("intensity", *RGB, "heat")
+    np.testing.assert_array_equal(cloud.points.T, points)
+    np.testing.assert_array_equal(cloud.channels[:, [0, 4]].T, [columns["intensity"], columns["heat"]])
+    np.testing.assert_allclose(cloud.channels[:, 1:4], colours / 255, rtol=1e-6)
 
 
 def test_pcd_padding_and_vectors_are_no_channels(tmp_path):
@@ -388,28 +369,18 @@ def test_real_pair_is_the_same_in_both_formats(data):
 @pytest.mark.parametrize("suffix", [".las", ".laz"])
 @pytest.mark.parametrize("point_format", [0, 2, 3, 6, 7, 8])
 def test_las_in_utm_is_exact(tmp_path, suffix, point_format):
-    colour = point_format in (2, 3, 7, 8)
-    columns = {name: RNG.integers(0, 65536, 120_000) for name in (INTENSITY + RGB if colour else INTENSITY)}
+    names = INTENSITY + RGB * (point_format in (2, 3, 7, 8))
+    columns = {name: RNG.integers(0, 65536, 120_000) for name in names}
     las = las_data(point_format, 120_000, **columns)
+    if point_format == 6:
+        las.add_extra_dim(laspy.ExtraBytesParams("amplitude", np.float64))
     las.write(str(tmp_path / f"c{suffix}"))
     cloud = io.read(tmp_path / f"c{suffix}")
     assert cloud.points.dtype == np.float64
     np.testing.assert_array_equal(cloud.points, las.xyz)
-    assert cloud.channel_names == (INTENSITY + RGB if colour else INTENSITY)
-    np.testing.assert_array_equal(cloud.channels[:, 0], columns["intensity"])
-    if colour:
-        np.testing.assert_array_equal(cloud.channels[:, 1:].T, np.array([columns[name] for name in RGB]) / 65535)
-
-
-@pytest.mark.parametrize("suffix", [".las", ".laz"])
-def test_las_with_extra_dimensions(tmp_path, suffix):
-    las = las_data(6, intensity=np.arange(N))
-    las.add_extra_dim(laspy.ExtraBytesParams("amplitude", np.float64))
-    las["amplitude"] = RNG.random(N)
-    las.write(str(tmp_path / f"c{suffix}"))
-    cloud = io.read(tmp_path / f"c{suffix}")
-    assert cloud.channel_names == INTENSITY
-    np.testing.assert_array_equal(cloud.points, las.xyz)
+    assert cloud.channel_names == names
+    for name, values in zip(names, cloud.channels.T, strict=True):
+        np.testing.assert_array_equal(values, columns[name] / (1 if name == "intensity" else 65535))
 
 
 def test_las_8_bit_colours(tmp_path):
@@ -420,32 +391,19 @@ def test_las_8_bit_colours(tmp_path):
     np.testing.assert_array_equal(cloud.channels[:, 1], 1)
 
 
-@pytest.mark.parametrize("suffix", [".las", ".laz"])
-def test_las_writes_utm_and_again(tmp_path, suffix):
-    points = np.array([500_000.0, 5_400_000.0, 100.0]) + RNG.integers(0, 10**6, (N, 3)) * 1e-3
-    io.write(tmp_path / f"a{suffix}", PointCloud(points))
-    first = io.read(tmp_path / f"a{suffix}")
-    np.testing.assert_allclose(first.points, points, rtol=0, atol=2e-9)
-    io.write(tmp_path / f"b{suffix}", first)
-    same(io.read(tmp_path / f"b{suffix}"), first)
-
-
 @pytest.mark.parametrize(
-    ("cloud", "message"),
+    ("named", "channels", "names"),
     [
-        (PointCloud(np.ones((2, 3)), np.array([[0.5], [1]]), channel_names=INTENSITY), "whole numbers"),
-        (PointCloud(np.ones((2, 3)), np.array([[-1], [1]]), channel_names=INTENSITY), "whole numbers"),
-        (PointCloud(np.ones((2, 3)), np.array([[70_000], [1]]), channel_names=INTENSITY), "whole numbers"),
-        (PointCloud(np.ones((2, 3)), np.array([[np.nan], [1]]), channel_names=INTENSITY), "whole numbers"),
-        (PointCloud(np.ones((2, 3)), np.full((2, 3), 1.5), channel_names=RGB), "0 to 1"),
-        (PointCloud(np.ones((2, 3)), np.full((2, 3), 0.001), channel_names=RGB), "dark"),
-        (PointCloud(np.ones((2, 3)), np.ones((2, 2)), channel_names=("red", "green")), "LAS holds intensity and"),
-        (PointCloud(np.full((2, 3), np.nan)), "finite"),
+        *[("channels: LAS holds intensity", [[value], [1]], INTENSITY) for value in (0.5, -1, 70_000, np.nan)],
+        *[("channels: ", np.full((2, 3), value), RGB) for value in (1.5, 0.001)],
+        ("channel_names: ", np.ones((2, 2)), ("red", "green")),
     ],
 )
-def test_las_cannot_hold(tmp_path, cloud, message):
-    with pytest.raises(ValueError, match=rf"{message}.*\.ply"):
-        io.write(tmp_path / "c.las", cloud)
+def test_las_cannot_hold(tmp_path, named, channels, names):
+    with pytest.raises(ValueError, match=rf"{named}.*\.ply"):
+        io.write(tmp_path / "c.las", PointCloud(np.ones((2, 3)), np.array(channels), channel_names=names))
+    with pytest.raises(ValueError, match=r"points: .*\.ply"):
+        io.write(tmp_path / "c.las", PointCloud(np.full((2, 3), np.nan)))
     assert not list(tmp_path.iterdir())
 
 
@@ -460,9 +418,7 @@ def test_kitti(tmp_path, data):
     assert cloud.channel_names == INTENSITY
     scan = io.read(data / "kitti/sequences/04/velodyne/000000.bin")
     assert len(scan) > 100_000 and scan.channels.min() >= 0 and scan.channels.max() < 1
-
-
-def test_kitti_refuses_large_coordinates(tmp_path):
+    # Coordinates that float32 cannot hold.
     with pytest.raises(ValueError, match=r"float32.*\.ply"):
         io.write(tmp_path / "c.bin", PointCloud(np.full((2, 3), 5e5), np.ones(2)))
 
@@ -495,11 +451,7 @@ def test_npy_of_others(tmp_path, array):
         ("x,y,z,Intensity,time\n1,2,3,8,0\n4,5,6,9,0\n", INTENSITY, [[8], [9]]),
         ("\ufeffX;Y;Z;i\n1;2;3;8\n4;5;6;9\n", INTENSITY, [[8], [9]]),
         ("//X Y Z R G B\n1 2 3 0 51 255\n4 5 6 255 0 0\n", RGB, [[0, 0.2, 1], [1, 0, 0]]),
-        (
-            "# made by hand\n\n# x y z red green blue\n1 2 3 0 65535 0\n4 5 6 1 0 0\n",
-            RGB,
-            [[0, 1, 0], [1 / 65535, 0, 0]],
-        ),
+        ("# hand-made\n\n# x y z red green blue\n1 2 3 0 65535 0\n4 5 6 1 0 0\n", RGB, [[0, 1, 0], [1 / 65535, 0, 0]]),
         ("x y z r g b\n1 2 3 0.0 1.0 0.5\n4 5 6 1.0 1.0 1.0\n", RGB, [[0, 1, 0.5], [1, 1, 1]]),
         ("x y z r g b\n1 2 3 0.0 1.0 0.0\n4 5 6 1.0 1.0 1.0\n", RGB, [[0, 1, 0], [1, 1, 1]]),
         ("x y z r g b\n1 2 3 0 1 0\n4 5 6 0.5 1 1\n", RGB, [[0, 1, 0], [0.5, 1, 1]]),
@@ -531,13 +483,12 @@ def refuses(path, match=None):
     assert peak < 50e6
 
 
-@pytest.mark.parametrize("suffix", FORMATS)
-def test_no_such_file(tmp_path, suffix):
+def test_no_such_file(tmp_path):
     with pytest.raises(FileNotFoundError):
-        io.read(tmp_path / f"none{suffix}")
-    (tmp_path / f"folder{suffix}").mkdir()
+        io.read(tmp_path / "none.ply")
+    (tmp_path / "folder.ply").mkdir()
     with pytest.raises(IsADirectoryError):
-        io.read(tmp_path / f"folder{suffix}")
+        io.read(tmp_path / "folder.ply")
 
 
 @pytest.mark.parametrize("name", ["c.obj", "c", "c.ply.gz", ".ply"])
@@ -572,28 +523,36 @@ def test_no_cloud(tmp_path, suffix, content):
 
 @pytest.mark.parametrize("true_suffix", FORMATS)
 @pytest.mark.parametrize("suffix", FORMATS)
-def test_mislabelled(tmp_path, suffix, true_suffix):
+def test_mislabelled(tmp_path, seeds, suffix, true_suffix):
     kind = {".laz": ".las", ".xyz": ".csv", ".txt": ".csv"}
     if kind.get(suffix, suffix) != kind.get(true_suffix, true_suffix):
-        (tmp_path / f"c{suffix}").write_bytes(bytes_of(true_suffix, tmp_path))
+        (tmp_path / f"c{suffix}").write_bytes(seeds[f"ours{true_suffix}"])
         refuses(tmp_path / f"c{suffix}")
 
 
 @pytest.mark.parametrize("suffix", [s for s in FORMATS if s not in (".xyz", ".txt", ".csv")])
 @pytest.mark.parametrize("fraction", [0.02, 0.2, 0.5, 0.9, 0.999])
-def test_truncated(tmp_path, suffix, fraction):
-    whole = bytes_of(suffix, tmp_path)
+def test_truncated(tmp_path, seeds, suffix, fraction):
+    whole = seeds[f"ours{suffix}"]
     (tmp_path / f"c{suffix}").write_bytes(whole[: int(fraction * len(whole)) - 1 | 1])  # odd: within a row
     refuses(tmp_path / f"c{suffix}")
 
 
-@pytest.mark.parametrize("encoding", ["ascii", "binary", "binary_compressed"])
-def test_truncated_pcd_at_a_row(tmp_path, encoding):
-    write_pcd(tmp_path / "c.pcd", pypcd4.Encoding(encoding), **dict.fromkeys("xyz", np.zeros(N)))
-    whole = (tmp_path / "c.pcd").read_bytes()
-    cut = {"ascii": len(whole) - len(whole.splitlines(True)[-1]), "binary": -24, "binary_compressed": -1}[encoding]
-    (tmp_path / "c.pcd").write_bytes(whole[:cut])
-    refuses(tmp_path / "c.pcd")
+# Numbers in headers of text; some of N points or less leave bytes at the end, which are no harm.
+NUMBERS = {name: ["face 2", f"vertex {N}"] for name in ("text.ply", "binary.ply")} | {
+    f"{encoding.value}.pcd": ["COUNT 1 1 1", f"POINTS {N}"] for encoding in pypcd4.Encoding
+}
+
+
+@pytest.mark.parametrize("claim", [0, N - 1, N + 1, 2 * N, 10**6, 10**9, 10**15])
+@pytest.mark.parametrize(("name", "number"), [(name, number) for name in NUMBERS for number in NUMBERS[name]])
+def test_a_wrong_number_in_a_header(tmp_path, seeds, name, number, claim):
+    # The bytes of the faces make up one more vertex.
+    if claim > N + 1 or name in ("ascii.pcd", "binary_compressed.pcd") or (number, claim) == (f"POINTS {N}", 0):
+        assert seeds[name].count(number.encode()) == 1
+        changed = seeds[name].replace(number.encode(), f"{number.rpartition(' ')[0]} {claim}".encode())
+        (tmp_path / name).write_bytes(changed)
+        refuses(tmp_path / name)
 
 
 @pytest.mark.parametrize(
@@ -604,100 +563,51 @@ def test_broken_text(tmp_path, text):
     refuses(tmp_path / "c.csv")
 
 
-def lie(whole, old, new):
-    assert whole.count(old) == 1
-    return whole.replace(old, new)
-
-
-@pytest.mark.parametrize("claim", [N + 1, 2 * N, 10**6, 10**9, 10**15])
-@pytest.mark.parametrize("text", [False, True])
-def test_lying_ply(tmp_path, text, claim):
-    faces = np.array([((0, 1, 2),), ((2, 3, 4),)], [("vertex_indices", "i4", (3,))])
-    write_ply(tmp_path / "a.ply", structured(**xyz()), text, more=[plyfile.PlyElement.describe(faces, "face")])
-    whole = (tmp_path / "a.ply").read_bytes()
-    # In the binary file the faces' bytes do make up one more vertex.
-    lies = [("face 2", f"face {claim}")] + [(f"vertex {N}", f"vertex {claim}")] * (text or claim > N + 1)
-    for old, new in lies:
-        (tmp_path / "c.ply").write_bytes(lie(whole, old.encode(), new.encode()))
-        refuses(tmp_path / "c.ply")
-
-
-@pytest.mark.parametrize("claim", [0, N - 1, N + 1, 2 * N, 10**6, 10**9, 10**15])
-@pytest.mark.parametrize("encoding", ["ascii", "binary", "binary_compressed"])
-def test_lying_pcd(tmp_path, encoding, claim):
-    write_pcd(tmp_path / "c.pcd", pypcd4.Encoding(encoding), **dict.fromkeys("xyz", np.zeros(N)))
-    whole = (tmp_path / "c.pcd").read_bytes()
-    if (encoding, claim) != ("binary", N - 1):  # bytes at the end are no harm
-        (tmp_path / "c.pcd").write_bytes(lie(whole, f"POINTS {N}".encode(), f"POINTS {claim}".encode()))
-        refuses(tmp_path / "c.pcd")
-    (tmp_path / "c.pcd").write_bytes(lie(whole, b"COUNT 1 1 1", f"COUNT 1 1 {max(claim, 2)}".encode()))
-    refuses(tmp_path / "c.pcd")
-
-
-def test_lying_compressed_pcd(tmp_path):
-    write_pcd(tmp_path / "c.pcd", pypcd4.Encoding.BINARY_COMPRESSED, **dict.fromkeys("xyz", np.zeros(N)))
-    whole = (tmp_path / "c.pcd").read_bytes()
+def test_lying_compressed_pcd(tmp_path, seeds):
+    whole = seeds["binary_compressed.pcd"]
     at = whole.index(b"compressed\n") + 11
     for lengths in [(2**32 - 1, 24 * N), (2**20, 24 * N), (20, 2**32 - 1), (0, 0), (0, 24 * N)]:
         (tmp_path / "c.pcd").write_bytes(whole[:at] + struct.pack("<II", *lengths) + whole[at + 8 :])
         refuses(tmp_path / "c.pcd")
-    claim = lie(whole[:at], f"POINTS {N}".encode(), b"POINTS 100000000")
-    (tmp_path / "c.pcd").write_bytes(claim + whole[at : at + 4] + struct.pack("<I", 24 * 10**8) + whole[at + 8 :])
-    refuses(tmp_path / "c.pcd", "more than the file can hold")
+    claim = whole[:at].replace(f"POINTS {N}".encode(), b"POINTS 100000000") + whole[at : at + 4]
+    (tmp_path / "c.pcd").write_bytes(claim + struct.pack("<I", 24 * 10**8) + whole[at + 8 :])
+    refuses(tmp_path / "c.pcd")
 
 
-def test_pcd_with_no_points_of_many_values(tmp_path):
-    write_pcd(tmp_path / "c.pcd", **dict.fromkeys("xyz", np.zeros(N)))
-    whole = lie((tmp_path / "c.pcd").read_bytes(), f"POINTS {N}".encode(), b"POINTS 0")
-    (tmp_path / "c.pcd").write_bytes(lie(whole, b"COUNT 1 1 1", b"COUNT 1 1 300000"))
-    refuses(tmp_path / "c.pcd", "no points")
+def claims(path, whole, at, form, *values):
+    """Each value, alone, at a place of a binary file is refused."""
+    for value in values:
+        changed = bytearray(whole)
+        struct.pack_into(form, changed, at, *[value] * (len(form) - 1))
+        path.write_bytes(changed)
+        refuses(path)
 
 
-# Where a LAS header says: its points' place, the number of records before them, bytes per point, the number of points.
-@pytest.mark.parametrize(("at", "form"), [(96, "<I"), (100, "<I"), (105, "<H"), (107, "<I")])
 @pytest.mark.parametrize("suffix", [".las", ".laz"])
-def test_lying_las(tmp_path, suffix, at, form):
-    whole = bytearray(bytes_of(suffix, tmp_path))
-    for claim in (10**4, 2**16 - 1) if form == "<H" else (10**4, 10**9, 2**32 - 1):
-        struct.pack_into(form, whole, at, claim)
-        (tmp_path / f"c{suffix}").write_bytes(whole)
-        refuses(tmp_path / f"c{suffix}")
-
-
-def test_las_of_absurd_scale(tmp_path):
-    whole = bytearray(bytes_of(".las", tmp_path))
-    struct.pack_into("<d", whole, 131, 1e305)
-    (tmp_path / "c.las").write_bytes(whole)
-    refuses(tmp_path / "c.las", "overflow")
+def test_lying_las(tmp_path, seeds, suffix):
+    path, whole = tmp_path / f"c{suffix}", seeds[f"ours{suffix}"]
+    # Where the points start, the number of records before them, the number of points; bytes per point; the scale of x.
+    for at in (96, 100, 107):
+        claims(path, whole, at, "<I", 10**4, 10**9, 2**32 - 1)
+    claims(path, whole, 105, "<H", 10**4, 2**16 - 1)
+    claims(path, whole, 131, "<d", 1e305)
 
 
 @pytest.mark.parametrize("point_format", [2, 7])
-def test_lying_laz_tables(tmp_path, point_format):
+def test_lying_laz_tables(tmp_path, seeds, point_format):
     resource = pytest.importorskip("resource")  # lazrs allocates out of tracemalloc's sight
-    las_data(point_format).write(str(tmp_path / "c.laz"))
-    whole = (tmp_path / "c.laz").read_bytes()
+    path, whole = tmp_path / "c.laz", seeds[f"{point_format}.laz"]
     header_size, start = struct.unpack_from("<HI", whole, 94)
     (table,) = struct.unpack_from("<q", whole, start)
-    # The place of the chunk table, its length, the bytes per point that LASzip knows of, the lengths of the layers.
-    places = [(start, "<q", 1), (table + 4, "<I", 1), (header_size + 54 + 36, "<H", 1)]
-    places += [(start + 12 + laspy.PointFormat(7).size, "<4I", 4)] * (point_format == 7)
     before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    for at, form, count in places:
-        for claim in (10**4, 2**16 - 1) if form == "<H" else (10**5, 2**31 - 1, 2**32 - 1):
-            changed = bytearray(whole)
-            struct.pack_into(form, changed, at, *[claim] * count)
-            (tmp_path / "c.laz").write_bytes(changed)
-            refuses(tmp_path / "c.laz")
+    # The place of the chunk table, its length, the bytes per point that LASzip knows of.
+    claims(path, whole, start, "<q", 10**5, 2**31 - 1, 2**32 - 1)
+    claims(path, whole, table + 4, "<I", 10**5, 2**31 - 1, 2**32 - 1)
+    claims(path, whole, header_size + 54 + 36, "<H", 10**4, 2**16 - 1)
+    if point_format == 7:  # the lengths of the layers, and one point more or less
+        claims(path, whole, start + 12 + laspy.PointFormat(7).size, "<IIII", 10**5, 2**31 - 1, 2**32 - 1)
+        claims(path, whole, 247, "<Q", N - 1, N + 1)
     assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss < before + 500_000  # KiB
-
-
-@pytest.mark.parametrize("claim", [N - 1, N + 1])
-def test_laz_by_one_point(tmp_path, claim):
-    las_data(7).write(str(tmp_path / "c.laz"))
-    whole = bytearray((tmp_path / "c.laz").read_bytes())
-    struct.pack_into("<Q", whole, 247, claim)
-    (tmp_path / "c.laz").write_bytes(whole)
-    refuses(tmp_path / "c.laz", f"claims {claim} points, the file has {N}")
 
 
 def array_bytes(array, shape=None):
@@ -708,29 +618,31 @@ def array_bytes(array, shape=None):
     return stream.getvalue() + array.tobytes()
 
 
-@pytest.mark.parametrize("shape", [(N + 1, 3), (10**9, 3), (2**62, 3), (N * 3,), (N, 1, 3)])
-def test_lying_arrays(tmp_path, shape):
-    content = array_bytes(make().points, shape)
-    (tmp_path / "c.npy").write_bytes(content)
-    with zipfile.ZipFile(tmp_path / "c.npz", "w") as archive:
-        archive.writestr("points.npy", content)
-    refuses(tmp_path / "c.npy")
-    refuses(tmp_path / "c.npz")
-
-
 class Trap:
     def __reduce__(self):
         return exit, (3,)
+
+
+@pytest.mark.parametrize("shape", [(N + 1, 3), (10**9, 3), (2**62, 3), (N * 3,), (N, 1, 3)])
+def test_lying_arrays(tmp_path, shape):
+    refuses_array(tmp_path, array_bytes(make().points, shape))
 
 
 @pytest.mark.parametrize(
     "array", [np.array([[Trap()] * 3], object), np.array([["1", "2", "3"]]), np.ones((2, 3), complex)]
 )
 def test_arrays_of_no_numbers(tmp_path, array):
-    np.save(tmp_path / "c.npy", array)
-    np.savez(tmp_path / "c.npz", points=array)
-    refuses(tmp_path / "c.npy")
-    refuses(tmp_path / "c.npz")
+    stream = stdio.BytesIO()
+    np.save(stream, array)
+    refuses_array(tmp_path, stream.getvalue())
+
+
+def refuses_array(folder, content):
+    (folder / "c.npy").write_bytes(content)
+    with zipfile.ZipFile(folder / "c.npz", "w") as archive:
+        archive.writestr("points.npy", content)
+    refuses(folder / "c.npy")
+    refuses(folder / "c.npz")
 
 
 @pytest.mark.parametrize(
@@ -750,98 +662,70 @@ def test_broken_npz(tmp_path, arrays):
     refuses(tmp_path / "c.npz")
 
 
-def test_what_a_library_raises(tmp_path, monkeypatch):
-    panic = type("PanicException", (BaseException,), {})
+@pytest.mark.parametrize(
+    ("error", "expected"),
+    [
+        (type("PanicException", (BaseException,), {}), ValueError),
+        (AssertionError, ValueError),
+        (KeyboardInterrupt, KeyboardInterrupt),
+        (ImportError, ImportError),
+    ],
+)
+def test_what_a_library_raises(tmp_path, monkeypatch, error, expected):
+    def fail(file, size):
+        raise error
+
     (tmp_path / "c.laz").write_bytes(b"LASF")
-    for error, expected in [(panic("index"), ValueError), (AssertionError(), ValueError)] + [
-        (error(), error) for error in (KeyboardInterrupt, ImportError)
-    ]:
-
-        def fail(file, size, error=error):
-            raise error
-
-        monkeypatch.setitem(io.FORMATS, ".laz", dataclasses.replace(io.FORMATS[".laz"], read=fail))
-        with pytest.raises(expected):
-            io.read(tmp_path / "c.laz")
+    monkeypatch.setitem(io.FORMATS, ".laz", dataclasses.replace(io.FORMATS[".laz"], read=fail))
+    with pytest.raises(expected):
+        io.read(tmp_path / "c.laz")
 
 
 def test_no_coordinates(tmp_path):
     write_ply(tmp_path / "c.ply", structured(x=np.ones(3), y=np.ones(3), intensity=np.ones(3)))
-    refuses(tmp_path / "c.ply", r"no numeric columns x, y, z; found x, y, intensity")
+    refuses(tmp_path / "c.ply", "x, y, intensity")
     plyfile.PlyData([plyfile.PlyElement.describe(structured(a=np.ones(3)), "face")]).write(tmp_path / "c.ply")
-    refuses(tmp_path / "c.ply", "no vertices")
+    refuses(tmp_path / "c.ply")
 
 
-@pytest.mark.parametrize("suffix", FORMATS)
-def test_nothing_to_write(tmp_path, suffix):
-    with pytest.raises(ValueError, match="at least one point"):
-        io.write(tmp_path / f"c{suffix}", make(num_points=0))
-    with pytest.raises(ValueError, match="single cloud"):
-        io.write(tmp_path / f"c{suffix}", jax.tree.map(lambda *rows: np.stack(rows), make(), make()))
+@pytest.mark.parametrize("cloud", [make(num_points=0), jax.tree.map(lambda *rows: np.stack(rows), make(), make())])
+def test_nothing_to_write(tmp_path, cloud):
+    with pytest.raises(ValueError, match="cloud: "):
+        io.write(tmp_path / "c.ply", cloud)
 
 
-@pytest.mark.parametrize("suffix", FORMATS)
-def test_a_failed_write_leaves_the_old_file(tmp_path, suffix, monkeypatch):
-    path = tmp_path / f"c{suffix}"
+def test_a_failed_write_leaves_the_old_file(tmp_path, monkeypatch):
+    path = tmp_path / "c.ply"
     path.write_bytes(b"old")
 
     def fail(file, cloud):
         file.write(b"half")
         raise OSError("disk full")
 
-    monkeypatch.setitem(io.FORMATS, suffix, dataclasses.replace(io.FORMATS[suffix], write=fail))
+    monkeypatch.setitem(io.FORMATS, ".ply", dataclasses.replace(io.FORMATS[".ply"], write=fail))
     with pytest.raises(OSError, match="disk full"):
         io.write(path, make())
     assert path.read_bytes() == b"old" and list(tmp_path.iterdir()) == [path]
 
 
-@pytest.mark.parametrize("suffix", EXTRAS)
-def test_missing_extra(tmp_path, suffix, monkeypatch):
+@pytest.mark.parametrize(("suffix", "package"), [*EXTRAS.items(), (".laz", "lazrs")])
+def test_missing_extra(tmp_path, suffix, package, monkeypatch):
     io.write(tmp_path / f"c{suffix}", make())
-    monkeypatch.setitem(sys.modules, EXTRAS[suffix], None)
-    for action, call in [("reading", lambda p: io.read(p)), ("writing", lambda p: io.write(p, make()))]:
-        with pytest.raises(
-            ImportError, match=rf"{action} .*{suffix} .*{EXTRAS[suffix]}.*pip install 'mcgicp_jax\[io\]'"
-        ):
-            call(tmp_path / f"c{suffix}")
-    assert len(list(tmp_path.iterdir())) == 1
-
-
-def test_missing_lazrs(tmp_path, monkeypatch):
-    io.write(tmp_path / "c.laz", make())
     io.write(tmp_path / "c.las", make())
-    monkeypatch.setitem(sys.modules, "lazrs", None)
-    io.read(tmp_path / "c.las")
-    for call in (lambda p: io.read(p), lambda p: io.write(p, make())):
-        with pytest.raises(ImportError, match=r"needs lazrs: pip install"):
-            call(tmp_path / "c.laz")
+    monkeypatch.setitem(sys.modules, package, None)
+    for call in (io.read, lambda path: io.write(path, make())):
+        with pytest.raises(ImportError, match=rf"{package}.*pip install 'mcgicp_jax\[io\]'"):
+            call(tmp_path / f"c{suffix}")
+    if package == "lazrs":
+        io.read(tmp_path / "c.las")
 
 
 # Mutations
 
 
-def make_seeds(folder):
-    """Small valid files, of every format and encoding."""
-    files = [
-        (suffix, bytes_of(suffix, folder, INTENSITY if suffix == ".bin" else INTENSITY + RGB)) for suffix in FORMATS
-    ]
-    rows = structured(**xyz(), red=np.ones(N, np.uint8))
-    faces = np.array([((0, 1, 2),), ((2, 3, 4),)], [("vertex_indices", "i4", (3,))])
-    for text in (True, False):
-        write_ply(folder / "a.ply", rows, text, more=[plyfile.PlyElement.describe(faces, "face")])
-        files.append((".ply", (folder / "a.ply").read_bytes()))
-    for encoding in ("ascii", "binary_compressed"):
-        write_pcd(folder / "a.pcd", pypcd4.Encoding(encoding), **xyz(), ring=np.zeros(N, np.uint16))
-        files.append((".pcd", (folder / "a.pcd").read_bytes()))
-    las_data(7, red=np.arange(N)).write(str(folder / "a.laz"))
-    files.append((".laz", (folder / "a.laz").read_bytes()))
-    return files
-
-
 @pytest.fixture(scope="module")
-def seeds(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("seeds")
-    return folder, make_seeds(folder)
+def folder(tmp_path_factory):
+    return tmp_path_factory.mktemp("mutated")
 
 
 CHANGE = st.tuples(
@@ -854,16 +738,16 @@ CHANGE = st.tuples(
 @settings(max_examples=800, deadline=None, derandomize=True, suppress_health_check=list(HealthCheck))
 @given(which=st.integers(0, 99), header=st.booleans(), changes=st.lists(CHANGE, min_size=1, max_size=4))
 @example(which=3, header=False, changes=[("put", 0.9, b"\xff" * 8)])
-def test_mutations(seeds, which, header, changes):
-    folder, files = seeds
-    suffix, content = files[which % len(files)]
+def test_mutations(seeds, folder, which, header, changes):
+    name = sorted(seeds)[which % len(seeds)]
+    content = seeds[name]
     for kind, place, new in changes:
         at = int(place * min(len(content), 600 if header else len(content)))
         if kind == "digits":
             content = content[:at] + content[at:].replace(b"0", b"9" * len(new), 1)
         else:
             content = content[:at] + (b"" if kind == "cut" else new) + content[at + len(new) * (kind != "insert") :]
-    path = pathlib.Path(folder / f"mutated{suffix}")
+    path = folder / name
     path.write_bytes(content)
     try:
         cloud = io.read(path)
@@ -881,14 +765,8 @@ def poses(num_poses=50):
     quaternions = RNG.normal(size=(num_poses, 4))
     quaternions[:8] = np.vstack([np.eye(4), [1, 1, 0, 1e-9], [0, 1, 1, 0], [1e-9, 0, 0, 1], [1e-5, 0, 1, 0]])
     matrices = np.tile(np.eye(4), (num_poses, 1, 1))
+    matrices[:, :3, :3] = Rotation.from_quat(quaternions).as_matrix()
     matrices[:, :3, 3] = RNG.uniform(-1e4, 1e4, (num_poses, 3))
-    for matrix, q in zip(matrices, quaternions / np.linalg.norm(quaternions, axis=1, keepdims=True), strict=True):
-        x, y, z, w = q
-        matrix[:3, :3] = [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
-            [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
-            [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
-        ]
     return matrices
 
 
@@ -917,22 +795,10 @@ def test_pose_conventions(tmp_path):
         np.testing.assert_allclose(read, quarter[None], atol=1e-15)
 
 
-def test_real_poses(data):
-    np.testing.assert_array_equal(
-        io.read_poses(data / "lidar_pair/T_target_source.txt")[0], np.loadtxt(data / "lidar_pair/T_target_source.txt")
-    )
-    assert io.read_poses(data / "kitti/poses/04.txt").shape == (10, 4, 4)
-    assert io.read_poses(data / "tum_fr1_xyz/pose_curr.txt").shape == (1, 4, 4)
-    assert io.read_poses(data / "icl_livingroom1/poses.txt").shape == (4, 4, 4)
-
-
 @pytest.mark.parametrize(
     "content",
     [
-        b"",
-        b"\n\n",
         b"# nothing\n",
-        b"some words\n",
         b"\xff\xfe\x00",
         b"1 2 3\n",
         b"0 1 2 3 0 0 0 0\n",
@@ -957,8 +823,10 @@ def test_broken_poses(tmp_path, content):
 def test_poses_that_do_not_fit(tmp_path):
     with pytest.raises(FileNotFoundError):
         io.read_poses(tmp_path / "none.txt")
-    with pytest.raises(ValueError, match=r"poses\[1\]"):
-        io.write_poses(tmp_path / "p.txt", np.stack([np.eye(4), 2 * np.eye(4)]))
-    with pytest.raises(ValueError, match="timestamps"):
-        io.write_poses(tmp_path / "p.txt", poses()[:4], timestamps=[1.0, 2.0])
+    for named, matrices, times in (
+        (r"poses\[1\]", [np.eye(4), 2 * np.eye(4)], None),
+        ("timestamps", poses(8), [1.0, 2.0]),
+    ):
+        with pytest.raises(ValueError, match=f"^{named}"):
+            io.write_poses(tmp_path / "p.txt", np.array(matrices), timestamps=times)
     assert not list(tmp_path.iterdir())

@@ -19,9 +19,7 @@ from mcgicp_jax import (
     find_correspondences,
     preprocess,
 )
-from mcgicp_jax._search.base import SearchPoints
-from mcgicp_jax._search.kd_tree import nearest_in_position
-from mcgicp_jax._search.tree_index import TreeIndex
+from mcgicp_jax.extend import SearchPoints
 from tests import reference as ref
 from tests.precision import tolerance
 
@@ -48,45 +46,17 @@ def query(pose, source, target, max_distance=np.inf, source_channels=None, targe
     return index.nearest(parameters, source_rows, float(max_distance), num_candidates)
 
 
-@settings(max_examples=25, deadline=None)
-@given(seed=st.integers(0, 2**31), k=st.integers(1, 25), num_points=st.integers(4, 60))
-def test_neighbors_of_random_points(seed, k, num_points):
-    points = np.random.default_rng(seed).normal(size=(num_points, 3))
+@settings(max_examples=50, deadline=None)
+@given(
+    seed=st.integers(0, 2**31),
+    k=st.integers(1, 25),
+    num_points=st.integers(4, 80),
+    high=st.sampled_from([None, 2, 3, 5]),
+)
+def test_neighbors_by_brute_force(seed, k, num_points, high):
+    """Of random points, and of few integers: there most distances are shared, and many points coincide."""
+    points = np.random.default_rng(seed).normal(size=(num_points, 3)) if high is None else integers((80, 3), high, seed)
     np.testing.assert_array_equal(KDTreeSearch().neighbors(points, k), ref.nearest(points, points, k))
-
-
-def test_nearest_in_position():
-    rng = np.random.default_rng(0)
-    queries, points = rng.random((50, 3)), rng.random((40, 3)).astype(np.float32)
-    queries[3], points[5] = np.nan, np.nan
-    distances = np.nan_to_num(np.linalg.norm(queries[:, None] - points, axis=2), nan=np.inf)
-    expected = np.where(distances.min(axis=1) <= 0.2, distances.argmin(axis=1), -1)
-    assert 0 < np.sum(expected == -1) < 50
-    np.testing.assert_array_equal(nearest_in_position(queries, points, 0.2), expected)
-    np.testing.assert_array_equal(nearest_in_position(queries, points[:0], 0.2), -1)
-    assert nearest_in_position(queries[:0], points, 0.2).shape == (0,)
-
-
-@settings(max_examples=25, deadline=None)
-@given(seed=st.integers(0, 2**31), k=st.integers(1, 12), high=st.integers(2, 5))
-def test_ties_are_ordered_by_row(seed, k, high):
-    """Few integer coordinates: most distances are shared, and many points coincide."""
-    points = integers((80, 3), high, seed)
-    np.testing.assert_array_equal(KDTreeSearch().neighbors(points, k), ref.nearest(points, points, k))
-
-
-@pytest.mark.parametrize("workers", [1, 2, -1])
-def test_ties_do_not_depend_on_the_number_of_threads(workers):
-    points = integers((200, 3), 4, 0)
-    found = KDTreeSearch(workers=workers).neighbors(points, 8)
-    np.testing.assert_array_equal(found, ref.nearest(points, points, 8))
-
-
-@pytest.mark.parametrize("copies", [4, 16, 300])
-def test_ties_among_copies_of_one_point(copies):
-    rng = np.random.default_rng(0)
-    target = np.repeat(rng.normal(size=(3, 3)), copies, axis=0)[rng.permutation(3 * copies)]
-    np.testing.assert_array_equal(query(np.eye(4), target, target)[0], ref.nearest(target, target)[:, 0])
 
 
 @settings(max_examples=10, deadline=None)
@@ -108,19 +78,6 @@ def test_many_equal_distances(seed, k):
     np.testing.assert_array_equal(
         query(np.eye(4), queries, sphere, num_candidates=k).T, ref.nearest(queries, sphere, k)
     )
-
-
-def test_the_point_itself_comes_first():
-    points, _ = ref.scene(500)
-    np.testing.assert_array_equal(KDTreeSearch().neighbors(points, 6)[:, 0], np.arange(500))
-
-
-def test_fewer_points_than_neighbors():
-    points = np.random.default_rng(0).normal(size=(5, 3))
-    found = KDTreeSearch().neighbors(points, 8)
-    assert found.shape == (5, 8)
-    assert (found[:, 5:] == -1).all()
-    np.testing.assert_array_equal(np.sort(found[:, :5], axis=1), np.broadcast_to(np.arange(5), (5, 5)))
 
 
 @settings(max_examples=25, deadline=None)
@@ -178,7 +135,7 @@ def test_many_sets_of_missing_channels(k):
         SearchPoints(row[:, :3], np.where(mask, row[:, 3:], 0), np.ones(len(row), bool), np.where(mask, 0, squares))
         for row, mask in zip(rows, masks, strict=True)
     )
-    index = KDTreeSearch().index(target)
+    index = Counted().index(target)
     still = np.array([1.0, 0, 0, 0, 0, 0, 0])
     expected = ref.match_partial(*rows, *masks, squares, k)
     np.testing.assert_array_equal(index.nearest(still, source, np.inf, k).T, expected)
@@ -197,7 +154,7 @@ def partial_clouds(share=0.5, num_channels=3):
         seen = np.random.default_rng(i).random(len(points)) < share
         masks.append(np.stack([np.ones(len(points), bool), seen, seen], axis=1))
     ready = [
-        preprocess(PointCloud(*arrays, channel_valid=mask), num_neighbors=6)
+        preprocess(PointCloud(*arrays, channel_valid=mask), num_neighbors=4)
         for arrays, mask in zip(pair, masks, strict=True)
     ]
     return ready, pair, masks
@@ -221,24 +178,16 @@ def test_missing_channels_count_as_in_a_true_match(method):
     np.testing.assert_array_equal(np.asarray(found.indices)[:150], expected)
 
 
-def test_missing_channels_traced_and_batched():
-    (source, target), *_ = partial_clouds()
-    whole = target.replace(channel_valid=None)
-    expected = [find(source, cloud, T, 0.3, 0.4) for cloud in (target, whole)]
-    pose = jnp.asarray(T, source.points.dtype)
-    np.testing.assert_array_equal(jax.jit(find)(source, target, pose, 0.3, 0.4).indices, expected[0].indices)
-    targets = PointCloud.stack([target, whole])
-    batched = jax.jit(jax.vmap(find, in_axes=(None, 0, None, None, None)))(source, targets, pose, 0.3, 0.4)
-    np.testing.assert_array_equal(batched.indices[0], expected[0].indices)
-
-
 @pytest.mark.parametrize("max_distance", [0.05, 0.2, 1.0, np.inf])
-@pytest.mark.parametrize("weights", [0.0, 0.3, np.array([0.1, 0.0, 2.0])], ids=str)
+@pytest.mark.parametrize("weights", [None, 0.0, 0.3, np.array([0.1, 0.0, 2.0])], ids=str)
 def test_correspondences_against_the_reference(weights, max_distance):
-    """Only the position turns; channels take part in the search, and not in the gate."""
+    """Only the position turns; channels take part in the search, if the method uses them, and not in the gate."""
     (source, target), ((a, ca), (b, cb)) = clouds()
-    found = find_correspondences(source, target, T, ColorICP(weights), max_distance=max_distance)
-    expected = ref.match(a, b, T, max_distance, ca, cb, weights)
+    method = PointToPoint() if weights is None else ColorICP(weights)
+    found = find_correspondences(source, target, T, method, max_distance=max_distance)
+    expected = (
+        ref.match(a, b, T, max_distance) if weights is None else ref.match(a, b, T, max_distance, ca, cb, weights)
+    )
     valid = np.asarray(found.valid)
     np.testing.assert_array_equal(np.where(valid, found.indices, -1)[:150], expected)
     moved = a @ T[:3, :3].T + T[:3, 3]
@@ -246,12 +195,6 @@ def test_correspondences_against_the_reference(weights, max_distance):
     np.testing.assert_allclose(
         np.asarray(found.distances)[:150][valid[:150]], apart[expected >= 0], atol=tolerance(1e-6, 1e-12)
     )
-
-
-def test_without_channels_only_the_position_counts():
-    (source, target), ((a, _), (b, _)) = clouds()
-    found = find_correspondences(source, target, T, PointToPoint(), max_distance=0.3)
-    np.testing.assert_array_equal(np.where(found.valid, found.indices, -1)[:150], ref.match(a, b, T, 0.3))
 
 
 def test_the_gate_is_in_metres_of_position():
@@ -301,7 +244,8 @@ def find(source, target, pose, weights, max_distance):
 
 
 def test_traced_and_batched_it_finds_the_same():
-    pairs = [clouds(seed=10 * i)[0] for i in range(3)]
+    # The second lacks channels, which the first does not.
+    pairs = [clouds()[0], partial_clouds()[0], clouds(seed=20)[0]]
     expected = [find(*pair, T, 0.3, 0.4) for pair in pairs]
     pose = jnp.asarray(T, pairs[0][0].points.dtype)
     jitted = jax.tree.map(np.asarray, jax.jit(find)(*pairs[0], pose, 0.3, 0.4))
@@ -333,7 +277,7 @@ def test_values_that_are_not_finite_match_nothing(which, what):
 
 @pytest.mark.parametrize("max_distance", [0, -1.0, np.nan, np.ones(2)])
 def test_a_gate_that_makes_no_sense(max_distance):
-    with pytest.raises(ValueError, match="max_distance"):
+    with pytest.raises(ValueError, match="max_distance: "):
         find_correspondences(*clouds()[0], T, PointToPoint(), max_distance=max_distance)
 
 
@@ -387,17 +331,20 @@ def test_a_pose_that_is_not_a_number_matches_nothing():
     assert (nearest(np.array([1.0, 0, 0, 0, 0, 0, 0])) >= 0).any(axis=1).all()
 
 
-def test_lanes_that_have_ended_are_not_searched(monkeypatch):
+def test_lanes_that_have_ended_are_not_searched():
     """In a batched loop the body runs for them, too."""
     (source, target), _ = clouds()
     poses = np.stack([np.eye(4), ref.pose([0.08, -0.05, 0.1], [0.02, 0.05, -0.03])]).astype(source.points.dtype)
-    asked, nearest = [], TreeIndex.nearest
-    monkeypatch.setattr(TreeIndex, "nearest", lambda *arguments: asked.append(1) or nearest(*arguments))
+    asked = []
+
+    class Counted(KDTreeSearch):
+        def query(self, *arguments):
+            asked.append(1)
+            return super().query(*arguments)
 
     def register(init):
-        return mcg.register(
-            source, target, PointToPoint(), init=init, max_distance=0.3, max_iterations=30
-        ).num_iterations
+        options = {"max_distance": 0.3, "max_iterations": 30, "search": Counted(workers=1)}
+        return mcg.register(source, target, PointToPoint(), init=init, **options).num_iterations
 
     single = [int(jax.jit(register)(pose)) for pose in poses]
     alone = len(asked)

@@ -1,6 +1,5 @@
 """Figures: what they show, not only that they appear."""
 
-import subprocess
 import sys
 
 import matplotlib.image
@@ -112,28 +111,13 @@ def test_a_sparse_cloud_is_not_hidden_by_a_dense_one(rooms):
         assert np.sum(theirs > 0.1) > 0.3 * np.sum(ours > 0.1)
 
 
-def test_the_detail_shows_where_poses_differ(wall):
-    source, target, truth = wall
-
-    # Paint everything grey but for one patch, in the target's upper right.
-    def grey(cloud, points):
-        patch = (np.abs(points[:, 0] - 0.4) < 0.1) & (np.abs(points[:, 1] + 0.3) < 0.1)
-        return cloud.replace(channels=np.where(patch[:, None], [0.9, 0.1, 0.1], 0.5), channel_names=cloud.channel_names)
-
-    figure = plot.before_after(
-        grey(source, source.transform(truth).points), grey(target, target.points), {"truth": truth}
-    )
-    height, width, _ = shown(figure.axes[0]).shape
-    column, row = np.mean(figure.axes[1].get_xlim()), np.mean(figure.axes[1].get_ylim())
-    assert 0.6 * width < column < 0.85 * width and 0.6 * height < row < 0.85 * height
-
-
 def test_poses_without_overlap_and_odd_clouds_are_drawn(wall):
     source, target, _ = wall
     away = np.eye(4)
     away[0, 3] = 100
-    figure = plot.before_after(source, target, {"away": away})
-    assert figure.axes[5].get_xlabel() == "no overlap"
+    figure = plot.before_after(source, target, {f"away {i}": away for i in range(8)})
+    assert "no overlap" in [panel.get_xlabel() for panel in figure.axes]
+    assert {panel.get_ylabel() for panel in figure.axes} >= {"start", *(f"away {i}" for i in range(8))}
     points = np.array(target.points)
     points[::7] = np.nan
     plot.before_after(source, PointCloud(points, target.channels, channel_names=target.channel_names), {})
@@ -152,22 +136,27 @@ def test_padding_and_origin_change_nothing(wall):
     assert difference.mean() < 1e-3
 
 
-def test_many_poses_are_laid_out_side_by_side(rooms, tmp_path):
-    source, target, truth = rooms
-    figure = plot.before_after(source, target, {f"pose {i}": truth for i in range(8)})
-    width, height = figure.get_size_inches()
-    assert width > height
-    names = [panel.get_ylabel() for panel in figure.axes if panel.get_ylabel()]
-    assert sorted(names) == ["pose 0", "pose 1", "pose 2", "pose 3", "pose 4", "pose 5", "pose 6", "pose 7", "start"]
-    assert sum(not panel.get_visible() for panel in figure.axes) == 2
+CLOUD = PointCloud(np.eye(3))
 
 
-def test_before_after_refuses_what_it_cannot_draw(wall):
-    source, target, _ = wall
-    with pytest.raises(ValueError, match=r"poses\['mirror'\]: .*rigid"):
-        plot.before_after(source, target, {"mirror": np.diag([1.0, 1, -1, 1])})
-    with pytest.raises(ValueError, match="target: expected at least 3 points, got 2"):
-        plot.before_after(source, PointCloud(np.eye(3)[:2]), {})
+@pytest.mark.parametrize(
+    ("draw", "named"),
+    [
+        (lambda: plot.before_after(CLOUD, CLOUD, {"mirror": np.diag([1.0, 1, -1, 1])}), r"poses\['mirror'\]: "),
+        (lambda: plot.before_after(CLOUD, PointCloud(np.eye(3)[:2]), {}), "target: .* 2"),
+        (lambda: plot.clouds(CLOUD, CLOUD, names=["one"]), "names: .* 2"),
+        (lambda: plot.convergence({"x": np.array([[1.0, 2.0]])}), r"histories\['x'\]: .* \(1, 2\)"),
+        (lambda: plot.trajectories({"none": []}), r"trajectories\['none'\]: "),
+        (lambda: plot.maps({}), "maps: "),
+        (
+            lambda: plot.surface_covariances(CLOUD, {"short": np.ones((2, 3, 3))}, indices=[0]),
+            r"\['short'\]: .*\(3, 3,",
+        ),
+    ],
+)
+def test_what_cannot_be_drawn_is_named(draw, named):
+    with pytest.raises(ValueError, match=named):
+        draw()
 
 
 def test_clouds_take_their_own_colors(wall):
@@ -198,8 +187,6 @@ def test_large_clouds_are_thinned_and_padding_is_left_out():
     drawn = [len(trace.x) for trace in plot.clouds(large, small).data]
     assert drawn == [45_000, 5_000]
     assert [len(trace.x) for trace in plot.clouds(small).data] == [10_000]
-    with pytest.raises(ValueError, match="names: expected 2"):
-        plot.clouds(large, small, names=["one"])
 
 
 def test_convergence_has_a_line_per_method():
@@ -210,33 +197,21 @@ def test_convergence_has_a_line_per_method():
         assert line.get_label() == name
         np.testing.assert_array_equal(line.get_ydata(), history)
     assert (panel.get_yscale(), panel.get_ylabel(), panel.get_xlabel()) == ("log", "rmse (m)", "iteration")
-    with pytest.raises(ValueError, match=r"histories\['x'\]: .* \(1, 2\)"):
-        plot.convergence({"x": np.array([[1.0, 2.0]])})
 
 
-@pytest.mark.parametrize("package", ["matplotlib", "plotly"])
-def test_a_missing_package_is_named(monkeypatch, wall, package):
-    source, target, _ = wall
+@pytest.mark.parametrize(
+    ("package", "draw"),
+    [
+        ("matplotlib", lambda: plot.before_after(CLOUD, CLOUD, {})),
+        ("matplotlib", lambda: plot.convergence({"x": [1.0]})),
+        ("plotly", lambda: plot.clouds(CLOUD)),
+    ],
+)
+def test_a_missing_package_is_named(monkeypatch, package, draw):
     for name in [name for name in sys.modules if name.partition(".")[0] == package]:
         monkeypatch.setitem(sys.modules, name, None)
-    draw = {
-        "matplotlib": [lambda: plot.before_after(source, target, {}), lambda: plot.convergence({"x": [1.0]})],
-        "plotly": [lambda: plot.clouds(source)],
-    }
-    for function in draw[package]:
-        with pytest.raises(ImportError, match=rf"plotting needs {package}: pip install 'mcgicp_jax\[plot\]'"):
-            function()
-
-
-def test_nothing_is_imported_before_it_is_needed_and_no_window_opens():
-    program = (
-        "import sys, mcgicp_jax.plot as plot\n"
-        "loaded = {name.partition('.')[0] for name in sys.modules}\n"
-        "sys.exit(1) if loaded & {'matplotlib', 'plotly'} else None\n"
-        "plot.convergence({'x': [1.0, 0.5]})\n"
-        "sys.exit(2 if 'matplotlib.pyplot' in sys.modules else 0)\n"
-    )
-    assert subprocess.run([sys.executable, "-c", program], check=False).returncode == 0
+    with pytest.raises(ImportError, match=rf"{package}.*pip install 'mcgicp_jax\[plot\]'"):
+        draw()
 
 
 def test_trajectories_are_drawn_in_their_plane(tmp_path):
@@ -249,8 +224,6 @@ def test_trajectories_are_drawn_in_their_plane(tmp_path):
         np.testing.assert_allclose(line.get_ydata(), 0, atol=1e-9)
     assert [text.get_text() for text in panel.get_legend().get_texts()] == ["truth", "gicp"]
     assert (tmp_path / "way.png").stat().st_size > 1000
-    with pytest.raises(ValueError, match=r"trajectories\['none'\]: expected at least one pose"):
-        plot.trajectories({"none": []})
 
 
 def test_maps_show_the_same_part_of_the_world():
@@ -267,8 +240,6 @@ def test_maps_show_the_same_part_of_the_world():
     assert np.ptp(one, axis=-1).max() > 0.3 and np.ptp(grey, axis=-1).max() == 0
     part = plot.maps({"part": whole}, limits=np.array([[-0.2, 0.3], [-0.1, 0.1]])).axes[0]
     assert part.get_xlim()[1] == pytest.approx(0.5, rel=0.1) and part.get_ylim()[1] == pytest.approx(0.2, rel=0.1)
-    with pytest.raises(ValueError, match="maps: expected at least one"):
-        plot.maps({})
 
 
 def test_covariances_within_a_surface_are_drawn_as_they_are():
@@ -285,11 +256,6 @@ def test_covariances_within_a_surface_are_drawn_as_they_are():
     np.testing.assert_allclose(np.abs(np.tan(np.radians(second.get_angles()))), 1)
     assert len(first.get_offsets()) == 3
     np.testing.assert_allclose(np.diff(first.get_offsets()[:, 0]), 0.5)
-    limits = np.array([[-0.2, 0.3], [-0.1, 0.1]])
-    part = plot.surface_covariances(cloud, {"along": along}, indices=[0], limits=limits).axes[0]
-    assert part.get_xlim()[1] == pytest.approx(0.5, rel=0.1) and part.get_ylim()[1] == pytest.approx(0.2, rel=0.1)
-    with pytest.raises(ValueError, match=r"covariances\['short'\]: expected shape \(200, 3, 3\)"):
-        plot.surface_covariances(cloud, {"short": along[:5]}, indices=[0])
 
 
 def test_graphs_show_poses_and_edges(tmp_path):

@@ -1,6 +1,5 @@
 """From raw clouds to ready ones: voxels, size classes, far origins, and what is turned away."""
 
-import itertools
 import warnings
 
 import jax
@@ -12,7 +11,6 @@ from hypothesis import strategies as st
 
 from mcgicp_jax import GICP, PointCloud, preprocess
 from mcgicp_jax._clouds.voxels import grid_of
-from mcgicp_jax._compute.programs import size_class
 from tests import reference as ref
 from tests.precision import tolerance
 from tests.scenes import prepare
@@ -67,18 +65,14 @@ def test_a_voxel_averages_each_channel_over_the_points_that_have_it(seed, voxel_
     np.testing.assert_array_equal(cloud.points, whole.points)
 
 
-def test_what_turns_out_whole_has_no_mask():
-    """Points without a channel that are left out, or fall into a voxel with others: the cloud lacks nothing."""
-    points, present = POINTS.copy(), np.ones((150, 2), bool)
+def test_the_mask_is_that_of_the_points_that_are_kept():
+    """A channel that is said to be there must be finite; of a cloud that lacks nothing there is no mask."""
+    points, channels, present = POINTS.copy(), CHANNELS.copy(), np.ones((150, 2), bool)
+    assert ready(PointCloud(points, channels, channel_valid=present)).channel_valid is None
     points[3], present[3] = np.nan, False
     with pytest.warns(UserWarning, match="1 of 150"):
-        assert ready(PointCloud(points, CHANNELS, channel_valid=present)).channel_valid is None
-    assert ready(PointCloud(POINTS, CHANNELS, channel_valid=np.ones((150, 2), bool))).channel_valid is None
-
-
-def test_a_channel_that_is_said_to_be_there_must_be_finite():
-    channels, present = CHANNELS.copy(), np.ones((150, 2), bool)
-    channels[3:5, 1], present[3, 1] = np.nan, False
+        assert ready(PointCloud(points, channels, channel_valid=present)).channel_valid is None
+    channels[3:5, 1], present[3] = np.nan, [True, False]
     with pytest.warns(UserWarning, match="1 of 150"):
         cloud = ready(PointCloud(POINTS, channels, channel_valid=present))
     assert len(cloud) == 149 and np.sum(~np.asarray(cloud.channel_valid)[:149]) == 1
@@ -120,11 +114,11 @@ def test_the_order_of_the_rows_does_not_matter_to_voxels():
 
 
 def test_size_classes():
-    sizes = [size_class(n) for n in range(1, 20_000)]
-    assert all(size >= n for n, size in enumerate(sizes, 1))
-    assert all(a <= b for a, b in itertools.pairwise(sizes))
-    assert len({size_class(n) for n in range(100, 200_000)}) == 12
-    assert all(size_class(size) == size for size in set(sizes))
+    numbers = [*range(1, 600), *range(600, 200_000, 997)]
+    sizes = [len(PointCloud(np.zeros((number, 3))).pad().points) for number in numbers]
+    assert all(size >= number for size, number in zip(sizes, numbers, strict=True)) and sizes == sorted(sizes)
+    assert len({size for size, number in zip(sizes, numbers, strict=True) if number >= 100}) == 12
+    assert all(len(PointCloud(np.zeros((size, 3))).pad().points) == size for size in set(sizes))
 
 
 @pytest.mark.parametrize("num_points", [4, 128, 129, 150])
@@ -134,16 +128,6 @@ def test_rows_are_the_points(num_points):
     np.testing.assert_array_equal(cloud.points, POINTS[:num_points])
     np.testing.assert_array_equal(cloud.channels, CHANNELS[:num_points])
     np.testing.assert_array_equal(cloud.neighbors, ref.nearest(POINTS[:num_points], POINTS[:num_points], 6))
-
-
-def test_a_cloud_can_be_padded_for_functions_that_one_compiles():
-    cloud = ready(PointCloud(POINTS, CHANNELS), num_neighbors=6)
-    for padded, size in ((cloud.pad(), 256), (cloud.pad(160), 160)):
-        assert padded.points.shape == (size, 3) and len(padded) == len(POINTS)
-        np.testing.assert_array_equal(padded.valid, np.arange(size) < len(POINTS))
-        np.testing.assert_array_equal(padded.points[: len(POINTS)], POINTS)
-        assert (padded.neighbors[len(POINTS) :] == -1).all()
-        np.testing.assert_array_equal(padded.unpad().points, POINTS)
 
 
 def test_arrays_are_not_to_be_changed_in_place():
@@ -159,18 +143,14 @@ def test_rows_that_are_not_finite_are_left_out_with_one_warning():
     points[3, 1], points[9, 2], channels[17, 0], channels[3, 1] = np.nan, -np.inf, np.inf, np.nan
     covariances = np.tile(np.eye(3), (150, 1, 1))
     covariances[20, 1, 1] = np.nan
+    for array in (points, channels, covariances):
+        array.setflags(write=False)
     with pytest.warns(UserWarning, match="4 of 150") as caught:
         cloud = ready(PointCloud(points, channels, covariances=covariances))
     assert len(caught) == 1
     keep = ~np.isin(np.arange(150), [3, 9, 17, 20])
     np.testing.assert_array_equal(cloud.unpad().points, POINTS[keep])
     np.testing.assert_array_equal(cloud.unpad().channels, CHANNELS[keep])
-
-
-def test_a_finite_cloud_warns_of_nothing():
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        ready(PointCloud(POINTS, CHANNELS), voxel_size=0.1)
 
 
 def test_large_coordinates_lose_nothing():
@@ -182,36 +162,15 @@ def test_large_coordinates_lose_nothing():
     np.testing.assert_array_equal(cloud.neighbors, local.neighbors)
     found = prepare(GICP(), cloud).covariance, prepare(GICP(), local).covariance
     np.testing.assert_allclose(*found, atol=tolerance(1e-4, 1e-6))
-
-
-def test_large_coordinates_in_voxels():
-    points = POINTS + UTM
+    # In voxels, and preprocessed again.
     expected = ref.voxel_means(points, in_grid(points), 0.5)
     actual = ready(points, voxel_size=0.5).unpad().points
     np.testing.assert_allclose(actual[np.lexsort(actual.T[::-1])], expected, rtol=0, atol=tolerance(2e-7, 1e-8))
-
-
-def test_a_cloud_about_zero_keeps_its_origin():
-    assert not np.any(ready(POINTS).origin)
-    assert not np.any(ready(POINTS + np.array([5.0, -5, 0])).origin)
-
-
-def test_preprocessing_again_starts_from_what_is_there():
-    once = ready(PointCloud(POINTS + UTM, CHANNELS), num_neighbors=20)
-    again = preprocess(once, num_neighbors=6)
-    np.testing.assert_allclose(again.unpad().points, POINTS + UTM, rtol=0, atol=tolerance(5e-7, 1e-9))
-    np.testing.assert_array_equal(again.channels, once.channels)
+    again = preprocess(cloud, num_neighbors=6)
+    np.testing.assert_allclose(again.unpad().points, points, rtol=0, atol=tolerance(5e-7, 1e-9))
     assert again.neighbors.shape == (150, 6)
-
-
-def strided(array):
-    return np.repeat(array, 2, axis=0)[::2]
-
-
-def read_only(array):
-    array = array.copy()
-    array.setflags(write=False)
-    return array
+    # About zero, a cloud keeps its origin.
+    assert not np.any(local.origin) and not np.any(ready(POINTS + np.array([5.0, -5, 0])).origin)
 
 
 FORMS = {
@@ -224,9 +183,8 @@ FORMS = {
     "big-endian": lambda a: a.astype(">f4"),
     "lists": lambda a: a.tolist(),
     "Fortran order": np.asfortranarray,
-    "non-contiguous": strided,
+    "non-contiguous": lambda a: np.repeat(a, 2, axis=0)[::2],
     "reversed": lambda a: a[::-1],
-    "read-only": read_only,
     "jax": jnp.asarray,
     "jax int32": lambda a: jnp.asarray(np.round(100 * a), jnp.int32),
     "jax float16": lambda a: jnp.asarray(a, jnp.float16),
@@ -242,16 +200,6 @@ def test_every_real_form_of_numbers_is_taken(form):
     assert cloud.channels.dtype == cloud.points.dtype
     np.testing.assert_array_equal(np.asarray(cloud.points)[:150], np.asarray(points, float))
     np.testing.assert_array_equal(np.asarray(cloud.channels)[:150], np.asarray(channels, float))
-
-
-def test_the_input_is_not_written_to():
-    points, channels = POINTS.copy(), CHANNELS.copy()
-    points[5] = np.nan
-    copies = points.copy(), channels.copy()
-    with pytest.warns(UserWarning):
-        ready(PointCloud(points, channels), voxel_size=0.2)
-    np.testing.assert_array_equal(points, copies[0])
-    np.testing.assert_array_equal(channels, copies[1])
 
 
 BAD_CLOUDS = {
@@ -279,10 +227,8 @@ BAD_CLOUDS = {
     "three points": ("4 finite points.*3", lambda: ready(POINTS[:3])),
     "no points": ("4 finite points.*0", lambda: ready(np.zeros((0, 3)))),
     "nothing finite": ("4 finite points.*0 of 150", lambda: ready(POINTS * np.nan)),
-    "three finite": (
-        "4 finite points.*3 of 5",
-        lambda: ready(POINTS[:5] + np.array([[np.inf], [np.nan], [0], [0], [0]])),
-    ),
+    "channels NaN": ("0 of 150, .*channel_valid", lambda: ready(PointCloud(POINTS, np.nan * CHANNELS))),
+    "three finite": ("4 finite points.*3 of 5", lambda: ready(np.add(POINTS[:5], [[np.inf], [np.nan], [0], [0], [0]]))),
     "k of 2": ("num_neighbors", lambda: ready(num_neighbors=2)),
     "k of 0": ("num_neighbors", lambda: ready(num_neighbors=0)),
     "k of -1": ("num_neighbors", lambda: ready(num_neighbors=-1)),
@@ -299,6 +245,9 @@ BAD_CLOUDS = {
 }
 
 
+BAD_CLOUDS["tracers"] = "tracers", lambda: jax.jit(lambda points: ready(points).points)(jnp.asarray(POINTS))
+
+
 @pytest.mark.parametrize("case", BAD_CLOUDS)
 def test_malformed_input_is_turned_away_by_name(case):
     message, make = BAD_CLOUDS[case]
@@ -306,34 +255,30 @@ def test_malformed_input_is_turned_away_by_name(case):
         make()
 
 
-def test_points_inside_a_transformation_cannot_be_preprocessed():
-    with pytest.raises(ValueError, match="tracers"):
-        jax.jit(lambda points: ready(points).points)(jnp.asarray(POINTS))
+CHANNELS_WITH_NAN = np.where(np.arange(300).reshape(150, 2) < 10, [0, np.nan], CHANNELS)
+MANY = np.random.default_rng(0).random((500, 3))
 
 
-def test_too_few_voxels_for_the_neighbours():
-    points = np.random.default_rng(0).random((500, 3))
-    with pytest.warns(UserWarning, match=r"^voxel_size: 1.0 m leaves 8 of 500 points, fewer than the 20 neighbours"):
-        preprocess(points, 1.0)
+@pytest.mark.parametrize(
+    ("told", "make", "silent"),
+    [
+        ("voxel_size: 1.0 m leaves 8 of 500", lambda: preprocess(MANY, 1.0), lambda: preprocess(MANY, 1.0, 5)),
+        (
+            "left out 5 of 150 .* 5 of them .*channel_valid",
+            lambda: ready(PointCloud(POINTS, CHANNELS_WITH_NAN)),
+            lambda: ready(PointCloud(POINTS, CHANNELS), voxel_size=0.1),
+        ),
+        (
+            "points: 100% .*voxel_size=",
+            lambda: ready(np.repeat(POINTS, 2, axis=0)),
+            lambda: ready(np.repeat(POINTS, 2, axis=0), voxel_size=1e-3),
+        ),
+    ],
+    ids=["few voxels", "channels", "duplicates"],
+)
+def test_warnings(told, make, silent):
+    with pytest.warns(UserWarning, match=f"^{told}"):
+        make()
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        preprocess(points, 1.0, num_neighbors=5)
-        preprocess(points[:8])
-
-
-def test_points_left_out_for_their_channels_are_told():
-    channels = CHANNELS.copy()
-    channels[:5, 1] = np.nan
-    with pytest.warns(UserWarning, match=r"^left out 5 of 150 .*, 5 of them with finite coordinates; .*channel_valid$"):
-        ready(PointCloud(POINTS, channels))
-    with pytest.raises(ValueError, match=r"got 0 of 150, left out 150, 150 of them with finite .*channel_valid$"):
-        ready(PointCloud(POINTS, np.nan * CHANNELS))
-
-
-def test_clouds_of_duplicates_are_told():
-    with pytest.warns(UserWarning, match=r"^points: 100% lie exactly on another one, .* voxel_size=\.\.\.\)$"):
-        ready(np.repeat(POINTS, 2, axis=0))
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        ready(np.repeat(POINTS, 2, axis=0), voxel_size=1e-3)
-        ready(np.concatenate([POINTS, POINTS[:40]]))
+        silent()

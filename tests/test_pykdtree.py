@@ -1,16 +1,19 @@
 """pykdtree in place of SciPy's tree: the same matches, bit for bit."""
 
 import itertools
+import subprocess
+import sys
+import textwrap
 
 import jax
 import numpy as np
 import pytest
+import scipy.spatial
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import mcgicp_jax as mcg
-from mcgicp_jax._search.base import SearchPoints
-from mcgicp_jax._search.kd_tree import PyKDTree
+from mcgicp_jax.extend import SearchPoints
 from tests.benchmarks import accuracy
 
 pytest.importorskip("pykdtree")
@@ -44,18 +47,36 @@ def test_it_finds_the_same(seed, size, k, num_channels, high, max_distance):
     np.testing.assert_array_equal(*found)
 
 
-def test_it_is_used_where_it_wins(monkeypatch):
+def test_it_is_used_where_it_wins():
     points = np.random.default_rng(0).normal(size=(50, 6))
-    for search in (mcg.KDTreeSearch(), PYKDTREE):
-        assert isinstance(search.build(points[:, :3]), PyKDTree)
-        assert not isinstance(search.build(points), PyKDTree)
-    assert not isinstance(SCIPY.build(points[:, :3]), PyKDTree)
-    monkeypatch.setattr("mcgicp_jax._search.kd_tree.has_pykdtree", lambda: False)
-    assert not isinstance(mcg.KDTreeSearch().build(points[:, :3]), PyKDTree)
-    with pytest.raises(ValueError, match=r"pip install 'mcgicp_jax\[fast\]'"):
-        mcg.KDTreeSearch(backend="pykdtree")
-    with pytest.raises(ValueError, match="backend: expected"):
+    for search, columns, used in (
+        (mcg.KDTreeSearch(), 3, True),
+        (PYKDTREE, 3, True),
+        (mcg.KDTreeSearch(), 6, False),
+        (PYKDTREE, 6, False),
+        (SCIPY, 3, False),
+    ):
+        assert isinstance(search.build(points[:, :columns]), scipy.spatial.cKDTree) != used
+    with pytest.raises(ValueError, match="backend: "):
         mcg.KDTreeSearch(backend="nanoflann")
+
+
+@pytest.mark.slow
+def test_without_it_its_extra_is_named():
+    """In a process of its own: whether the package is installed is looked up once."""
+    code = """
+        import importlib.util
+        find, importlib.util.find_spec = importlib.util.find_spec, lambda name, *rest: name != "pykdtree" and find(name)
+        import numpy as np, mcgicp_jax as mcg
+        mcg.KDTreeSearch().neighbors(np.eye(3), 2)
+        try:
+            mcg.KDTreeSearch(backend="pykdtree")
+        except ValueError as error:
+            assert "pip install 'mcgicp_jax[fast]'" in str(error)
+        else:
+            raise AssertionError
+    """
+    subprocess.run([sys.executable, "-c", textwrap.dedent(code)], check=True, timeout=120)
 
 
 def test_many_neighbors():

@@ -1,4 +1,4 @@
-"""Work side by side: every answer in its place, and no waiting for those who wait."""
+"""Queries in several threads: every answer in its place, and no waiting for those who wait."""
 
 import subprocess
 import sys
@@ -6,126 +6,98 @@ import textwrap
 import threading
 import time
 from concurrent.futures import ThreadPoolExecutor
-from functools import partial
 
-import jax
+import numpy as np
 import pytest
+from scipy.spatial import cKDTree
 
-from mcgicp_jax._compute import threads as _threads
-from mcgicp_jax._compute.threads import ReadAhead, side_by_side
+import mcgicp_jax as mcg
+from tests.scenes import room_corner
 
-
-@pytest.fixture(autouse=True)
-def cores(monkeypatch):
-    """On a single core, no other threads take part."""
-    monkeypatch.setattr(_threads, "num_cores", lambda: 3)
+# Some blocks of queries.
+POINTS = room_corner(9000)[0]
 
 
-def test_answers_come_in_order_and_the_first_from_this_thread():
-    calls = [partial(lambda i: (i, threading.get_ident()), i) for i in range(20)]
-    answers = side_by_side(calls)
-    assert [i for i, _ in answers] == list(range(20))
-    assert answers[0][1] == threading.get_ident()
+class Watched(mcg.KDTreeSearch):
+    """Each query first calls `before` with its number."""
+
+    def query(self, *arguments):
+        with LOCK:
+            CALLS.append(len(CALLS))
+            number = CALLS[-1]
+        BEFORE[0](number)
+        return super().query(*arguments)
 
 
-@pytest.mark.timeout(30)
-def test_other_threads_have_the_settings_of_this_one():
-    both = threading.Barrier(2)
-
-    def setting():
-        both.wait()
-        return jax.enable_x64.value
-
-    with jax.enable_x64(True):
-        assert side_by_side([setting] * 2) == [True, True]
+CALLS, BEFORE, LOCK = [], [None], threading.Lock()
 
 
-@pytest.mark.timeout(30)
-def test_calls_may_themselves_work_side_by_side():
-    def fan(depth):
-        return 1 if depth == 0 else sum(side_by_side([partial(fan, depth - 1)] * 3))
-
-    with ThreadPoolExecutor(8) as users:
-        assert list(users.map(fan, [4] * 8)) == [81] * 8
+def watched(before, workers):
+    """Neighbours of the points by some workers."""
+    CALLS.clear()
+    BEFORE[0] = before
+    return Watched(workers=workers, backend="scipy").neighbors(POINTS, 5)
 
 
-def test_without_threads_this_one_does_it_all(monkeypatch):
-    ended = ThreadPoolExecutor(1)
-    ended.shutdown()
-    monkeypatch.setattr(_threads, "_threads", lambda: ended)
-    assert side_by_side([partial(int, text) for text in "123"]) == [1, 2, 3]
-
-
-def test_an_error_is_raised():
-    with pytest.raises(ZeroDivisionError):
-        side_by_side([lambda: 1, lambda: 1 // 0])
-
-
-def test_no_more_threads_than_asked_for_are_at_work(monkeypatch):
+@pytest.mark.parametrize("workers", [1, 2, -1])
+def test_answers_come_in_order_from_no_more_threads_than_asked_for(workers):
     running, peak = [], []
 
-    def work():
+    def before(_):
         running.append(1)
         peak.append(len(running))
         time.sleep(0.01)
         running.pop()
 
-    with ThreadPoolExecutor(8) as threads:
-        monkeypatch.setattr(_threads, "_threads", lambda: threads)
-        monkeypatch.setattr(_threads, "num_cores", lambda: 8)
-        side_by_side([work] * 20, 3)
-        assert max(peak) == 3
-        peak.clear()
-        side_by_side([work] * 20, 1)
-        assert max(peak) == 1
-        peak.clear()
-        monkeypatch.setattr(_threads, "num_cores", lambda: 1)
-        side_by_side([work] * 20)
-        assert max(peak) == 1
+    np.testing.assert_array_equal(watched(before, workers), cKDTree(POINTS).query(POINTS, 5)[1])
+    assert workers == -1 or max(peak) <= workers < max(len(CALLS), 2)
 
 
-@pytest.mark.timeout(30)
-def test_an_error_in_another_thread_is_raised():
-    started = threading.Event()
-
-    def fail():
-        started.set()
-        raise ZeroDivisionError
+@pytest.mark.timeout(60)
+@pytest.mark.parametrize("failing", range(4))
+def test_an_error_in_any_thread_is_raised(failing):
+    def before(number):
+        if number == failing:
+            raise ZeroDivisionError
 
     with pytest.raises(ZeroDivisionError):
-        side_by_side([lambda: started.wait(10), fail])
+        watched(before, 2)
 
 
-def test_after_an_error_nobody_goes_on(monkeypatch):
-    calls = []
-
-    def fail():
-        raise ZeroDivisionError
-
-    def slow():
-        calls.append(1)
-        # Far longer than the first call, on a busy machine, too.
+def test_after_an_error_nobody_goes_on():
+    def before(_):
+        if threading.current_thread() is threading.main_thread():
+            time.sleep(0.1)  # The other thread has begun.
+            raise ZeroDivisionError
+        # Far longer than the call that fails, on a busy machine, too.
         time.sleep(0.5)
 
-    with ThreadPoolExecutor(1) as threads:
-        monkeypatch.setattr(_threads, "_threads", lambda: threads)
-        with pytest.raises(ZeroDivisionError):
-            side_by_side([fail, *[slow] * 50])
-    assert len(calls) <= 1
-
-
-def test_what_is_read_ahead_survives_an_interruption_and_an_error_is_raised_in_its_place(monkeypatch):
-    numbers = iter([1, 2, 0, 4])
-    ahead = ReadAhead(lambda: 1 / next(numbers))
-    assert next(ahead) == 1
-    with monkeypatch.context() as patch:
-        patch.setattr(_threads, "wait", lambda futures: (_ for _ in ()).throw(KeyboardInterrupt))
-        with pytest.raises(KeyboardInterrupt):
-            next(ahead)
-    assert next(ahead) == 0.5
     with pytest.raises(ZeroDivisionError):
-        next(ahead)
-    assert list(ahead) == [0.25]
+        watched(before, 2)
+    assert len(CALLS) <= 3
+
+
+@pytest.mark.timeout(60)
+def test_users_may_have_threads_of_their_own():
+    """More than there are cores, each of which shares its queries with the threads of the package."""
+    expected = mcg.KDTreeSearch().neighbors(POINTS, 5)
+    with ThreadPoolExecutor(8) as users:
+        for found in users.map(lambda _: mcg.KDTreeSearch().neighbors(POINTS, 5), range(16)):
+            np.testing.assert_array_equal(found, expected)
+
+
+def test_threads_may_share_clouds():
+    """And what is computed of their rows, by one of them."""
+    first, second = (mcg.preprocess(room_corner(2000, seed=seed)[0]) for seed in (0, 1))
+    sizes = (200, 500, None, 300) * 2
+
+    def matrix(clouds, size):
+        return mcg.register(*clouds, mcg.GICP(), max_distance=0.3, max_source_points=size).matrix
+
+    expected = [matrix((first.replace(), second.replace()), size) for size in sizes[:4]]
+    with ThreadPoolExecutor(len(sizes)) as users:
+        found = list(users.map(lambda size: matrix((first, second), size), sizes))
+    np.testing.assert_array_equal(found, expected * 2)
 
 
 def test_the_interpreter_does_not_wait_for_a_source_of_frames():

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from mcgicp_jax._math import symmetric_matrices as cov
+from mcgicp_jax.extend import symmetric_matrices as cov
 from tests import reference as ref
 from tests.precision import in_both_precisions, tolerance
 
