@@ -20,7 +20,7 @@ from mcgicp_jax import (
 from mcgicp_jax._local_geometry.cloud_statistics import with_channels_matched
 from tests import reference as ref
 from tests.precision import tolerance
-from tests.scenes import motion
+from tests.scenes import motion, room_corner
 
 NOISE = np.array([[0.04, 0.03, 0.0], [0.03, 0.09, -0.02], [0.0, -0.02, 0.01]])
 POSES = [np.eye(4), motion((0.5, -0.2, 0.1, 0.1, 0.2, -0.1)), motion((1, 2, 3, 0.3, 0, 0.2))]
@@ -147,3 +147,22 @@ def test_another_exposure_is_told(photometric):
         assert register(source, target, method).converged
         assert register(dark, target, method, equalize_channels=True).converged
         register(dark, target, GICP())
+
+
+def test_parameters_are_chosen_from_the_channels_as_they_are_equalised():
+    """A fourth of the source is alien, so that all of its points give another gain than those that match."""
+    points, channels = room_corner(600, seed=1)
+    target = preprocess(PointCloud(points, channels), None)
+    source = PointCloud(np.concatenate([points, points[:200] + 20]), np.concatenate([2 * channels, channels[:200] + 3]))
+    calls = []
+
+    class Recorded(MultiChannelGICP):
+        def resolve(self, source, target, geometries=None):
+            calls.append((self.channel_covariance, np.asarray(source.channels)))
+            return super().resolve(source, target, geometries)
+
+    register(preprocess(source, None), target, Recorded(), equalize_channels=True)
+    (first, by_all), (second, by_matches) = calls
+    assert first is None and second is None
+    wrong = [np.abs(each[:600] - channels).max() for each in (by_all, by_matches)]
+    assert wrong[1] < 1e-3 < 0.1 < wrong[0]

@@ -43,13 +43,14 @@ class Deferred:
         return np.asarray, (self.whole,)
 
 
-# `isinstance(leaf, Deferred)` without a Python function: it is asked of every node of a tree.
+# `isinstance` without a Python function: the first is asked of every node of a tree, the second of every array.
 is_deferred: Callable[[object], bool] = Deferred.__instancecheck__
+_is_tracer: Callable[[object], bool] = jax.core.Tracer.__instancecheck__
 
 
 def is_concrete(*trees: object) -> bool:
     """Whether every array in the trees is concrete, that is, none is a tracer of a JAX transformation."""
-    return not any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(trees, is_leaf=is_deferred))
+    return not any(map(_is_tracer, jax.tree.leaves(trees, is_leaf=is_deferred)))
 
 
 def outside_trace() -> contextlib.AbstractContextManager[None]:

@@ -127,7 +127,7 @@ def run_pair(given: Inputs, init: Pose | None, options: Options) -> Run:
     for each in coarse:
         (found,) = results_of([_solved(each, init, replace(options, max_distance=None), search)], [None])
         init = found.matrix if is_usable(found) else init
-    run = _with_exposure_of_matches(_solved(inputs, init, options, search), options, search)
+    run = _with_exposure_of_matches(_solved(inputs, init, options, search), inputs.method, options, search)
     return run if given.tie_points is None and given.prior is None else _fused(run, options, search)
 
 
@@ -143,14 +143,19 @@ def _with_comparable_channels(given: Inputs, options: Options) -> Inputs:
     return given
 
 
-def _with_exposure_of_matches(run: Run, options: Options, search: AbstractSearch) -> Run:
-    """The registration again with channels equalised by its matches, if that is wanted; else warns of exposure."""
+def _with_exposure_of_matches(run: Run, method: AbstractMethod, options: Options, search: AbstractSearch) -> Run:
+    """The registration again with channels equalised by its matches, if that is wanted; else warns of exposure.
+
+    Args:
+        method: as it was given: parameters left None are chosen anew, from the channels as they are then.
+    """
     inputs, state = run.inputs, run.loop.state
     if options.equalize_channels:
         if any(term.estimates_gains for term in run.problem.terms):
             return run
         pose = constant(pose_in_user_frame(state.pose, inputs.source.origin, inputs.target.origin))
-        return _solved(_equalized(inputs, _nearest_points(run, search)), pose, options, search)
+        again = _equalized(inputs._replace(method=method), _nearest_points(run, search))
+        return _solved(again, pose, options, search)
     if inputs.method.uses_channels and is_concrete(inputs.source, inputs.target, state.pose):
         warn_of_exposure(inputs.source, inputs.target, lambda: _nearest_points(run, search))
     return run
