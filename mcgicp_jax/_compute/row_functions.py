@@ -470,11 +470,11 @@ def over_whole(function: Callable[..., Any], numbers: Any, inputs: Sequence[Inpu
     num_rows = len(jax.tree.leaves(own.table)[0] if own.index is None else own.index)
     wide = any(each.index is not None and each.index.ndim == 2 for each in inputs)
     if total or not wide or num_rows <= _LARGEST_WHOLE:
-        return function(numbers, *(whole(each) for each in inputs))
+        return function(numbers, *(whole(each, spread=not total) for each in inputs))
     num_blocks = -(-num_rows // _LARGEST_BLOCK)
     size = -(-num_rows // num_blocks)
     padded = jnp.minimum(jnp.arange(num_blocks * size), num_rows - 1).reshape(num_blocks, size)
-    found = jax.lax.map(lambda rows: function(numbers, *(whole(each, rows) for each in inputs)), padded)
+    found = jax.lax.map(lambda rows: function(numbers, *(whole(each, rows, True) for each in inputs)), padded)
     return jax.tree.map(lambda leaf: leaf.reshape(padded.size, *leaf.shape[2:])[:num_rows], found)
 
 
@@ -506,13 +506,21 @@ def _found(given: Input) -> Input:
     return given._replace(index=given.index.whole) if isinstance(given.index, Deferred) else given
 
 
-def whole(given: Input, rows: Any = None) -> Rows:
-    """All rows, or some, of a pytree of arrays, some of which are traced."""
+def whole(given: Input, rows: Any = None, spread: bool = False) -> Rows:
+    """All rows, or some, of a pytree of arrays, some of which are traced.
+
+    Args:
+        spread: whether a row that does not exist is filled with the row of the result's own number, not with the first:
+            in the derivative, GPUs add cotangents of the same row one after the other, those that are 0 included.
+    """
     tree, index = jax.tree.map(jnp.asarray, given.table), given.index
+    size = len(jax.tree.leaves(tree)[0])
     if index is None and rows is None:
-        return Rows(tree, jnp.arange(len(jax.tree.leaves(tree)[0])))
+        return Rows(tree, jnp.arange(size))
     index = rows if index is None else jnp.asarray(index)[slice(None) if rows is None else rows].T
-    return Rows(jax.tree.map(lambda array: array[jnp.maximum(index, 0)], tree), index)
+    missing = (jnp.arange(index.shape[-1]) if rows is None else rows) % size if spread else 0
+    found = jnp.where(index < 0, missing, index)
+    return Rows(jax.tree.map(lambda array: array[found], tree), index)
 
 
 def _add_rows(

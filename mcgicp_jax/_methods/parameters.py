@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.typing import ArrayLike
@@ -10,6 +9,7 @@ from jaxtyping import Array, Float
 
 from mcgicp_jax._clouds.point_cloud import Values
 from mcgicp_jax._compute.concrete import AnyArray, canonical_float, is_concrete, numpy_for
+from mcgicp_jax._compute.devices import put_on_cpu
 
 
 def per_channel(name: str, numbers: Float[AnyArray, "..."], num_channels: int) -> Float[AnyArray, "C"]:
@@ -34,7 +34,7 @@ def check_covariance_fits(covariance: Float[AnyArray, "..."], count: int) -> Non
 def _number(name: str, value: Values) -> Array:
     try:
         # NumPy converts concrete values without compiling a program.
-        return jax.device_put(np.asarray(value, canonical_float())) if is_concrete(value) else jnp.asarray(value)
+        return put_on_cpu(np.asarray(value, canonical_float())) if is_concrete(value) else jnp.asarray(value)
     except (TypeError, ValueError) as error:
         raise ValueError(f"{name}: expected numbers, got {value!r}") from error
 

@@ -55,7 +55,7 @@ def find_correspondences(
         ValueError: if `max_distance` is not positive, `num_candidates` is below 1, `pose` is not a rigid motion, or
             channels or dtypes do not fit.
     """
-    search = search or default_search()
+    search = search or default_search(source, target, pose, method, max_distance)
     # Matches are constants to autodiff.
     source, target, pose, method, max_distance = map(primal, (source, target, pose, method, max_distance))
     check_clouds(source, target, method)

@@ -1,0 +1,34 @@
+"""The devices that JAX computes on by default, and the CPU, on which programs between host code run."""
+
+from __future__ import annotations
+
+import contextlib
+from typing import Any
+
+import jax
+
+
+def default_devices() -> list[jax.Device]:
+    """JAX's default device if one is chosen, else all local devices of its default platform."""
+    chosen = jax.default_device.value
+    return [chosen] if isinstance(chosen, jax.Device) else jax.local_devices(backend=chosen)
+
+
+def on_accelerator() -> bool:
+    """Whether JAX computes on a GPU or TPU by default."""
+    chosen = jax.default_device.value
+    return getattr(chosen, "platform", chosen or jax.default_backend()) != "cpu"
+
+
+def on_cpu() -> contextlib.AbstractContextManager[None]:
+    """Context in which JAX computes on the CPU.
+
+    Programs between host code are small: a GPU would spend most of the time on launches and transfers.
+    """
+    return jax.default_device(jax.local_devices(backend="cpu")[0]) if on_accelerator() else contextlib.nullcontext()
+
+
+def put_on_cpu(array: Any) -> jax.Array:
+    """A JAX array that host code reads without a transfer, and that programs on any device may use."""
+    with on_cpu():
+        return jax.device_put(array)
