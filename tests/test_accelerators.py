@@ -1,5 +1,6 @@
 """Accelerators, without one: where programs run, on which devices, in what precision, and with how many lanes."""
 
+import importlib.util
 import os
 import pathlib
 import re
@@ -144,9 +145,59 @@ IN_LANES = """
 """
 
 
+def run(script, folder, **environment):
+    root = pathlib.Path(__file__).parents[1]
+    environment = os.environ | environment | {"PYTHONPATH": os.pathsep.join([str(root), *sys.path])}
+    subprocess.run([sys.executable, "-c", textwrap.dedent(script)], cwd=folder, env=environment, check=True)
+
+
 @pytest.mark.slow
 def test_lanes_follow_the_default_device(tmp_path):
-    root = pathlib.Path(__file__).parents[1]
-    flags = os.environ["XLA_FLAGS"] + " --xla_force_host_platform_device_count=4"
-    environment = os.environ | {"XLA_FLAGS": flags, "PYTHONPATH": os.pathsep.join([str(root), *sys.path])}
-    subprocess.run([sys.executable, "-c", textwrap.dedent(IN_LANES)], cwd=tmp_path, env=environment, check=True)
+    run(IN_LANES, tmp_path, XLA_FLAGS=os.environ["XLA_FLAGS"] + " --xla_force_host_platform_device_count=4")
+
+
+FOR_H100 = """
+    import re
+    import jax, numpy as np
+    import mcgicp_jax as mcg
+    from jax.experimental import topologies
+    from jax.sharding import SingleDeviceSharding
+    from tests.batches import METHOD
+    from tests.scenes import room_corner
+
+    TARGET = '''
+        gpu_device_info {
+            threads_per_block_limit: 1024 threads_per_warp: 32 shared_memory_per_block: 49152
+            shared_memory_per_core: 233472 shared_memory_per_block_optin: 232448 threads_per_core_limit: 2048
+            core_count: 132 fpus_per_core: 128 block_dim_limit_x: 2147483647 block_dim_limit_y: 65535
+            block_dim_limit_z: 65535 memory_bandwidth: 3352320000000 l2_cache_size: 52428800 clock_rate_ghz: 1.98
+            device_memory_size: 84978434048 registers_per_core_limit: 65536 registers_per_block_limit: 65536
+            cuda_compute_capability { major: 9 }
+        }
+        platform_name: "CUDA" device_description_str: "NVIDIA H100 80GB HBM3"
+    '''
+    LANES, SIZE = 4, 4096
+    clouds = [mcg.PointCloud(*room_corner(SIZE, seed=seed)) for seed in (0, 1)]
+    source, target = (mcg.preprocess(cloud, voxel_size=None) for cloud in clouds)
+
+    def pose(points):
+        moving = source.replace(points=points)
+        return mcg.register(moving, target, METHOD, max_distance=0.5, search=mcg.DenseSearch()).matrix
+
+    (device,) = topologies.get_topology_desc("", "cuda", target_config=TARGET, topology="1x1x1").devices
+    points = jax.ShapeDtypeStruct((LANES, SIZE, 3), np.float32, sharding=SingleDeviceSharding(device))
+    program = jax.jit(jax.vmap(pose)).lower(points).compile()
+    products = re.findall(" dot[(].*", program.as_text())
+    assert products and all("operand_precision={highest,highest}" in product for product in products)
+    assert "callback" not in program.as_text()
+    # The distances of all pairs of points are never stored.
+    assert program.memory_analysis().temp_size_in_bytes < 0.2 * LANES * 4 * SIZE**2
+"""
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(
+    importlib.util.find_spec("jax_cuda12_plugin") is None, reason="needs jax[cuda12], whose compiler needs no GPU"
+)
+def test_program_for_an_h100(tmp_path):
+    run(FOR_H100, tmp_path, JAX_PLATFORMS="cpu", JAX_SKIP_CUDA_CONSTRAINTS_CHECK="1", XLA_FLAGS="")

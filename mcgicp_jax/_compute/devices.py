@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import contextlib
-from typing import Any
+from collections.abc import Iterator
 
 import jax
 
@@ -20,15 +20,15 @@ def on_accelerator() -> bool:
     return getattr(chosen, "platform", chosen or jax.default_backend()) != "cpu"
 
 
-def on_cpu() -> contextlib.AbstractContextManager[None]:
-    """Context in which JAX computes on the CPU.
+@contextlib.contextmanager
+def on_cpu() -> Iterator[None]:
+    """Context, and as `on_cpu()` a decorator, in which JAX computes on the CPU.
 
     Programs between host code are small: a GPU would spend most of the time on launches and transfers.
     """
-    return jax.default_device(jax.local_devices(backend="cpu")[0]) if on_accelerator() else contextlib.nullcontext()
+    with jax.default_device(jax.local_devices(backend="cpu")[0]) if on_accelerator() else contextlib.nullcontext():
+        yield
 
 
-def put_on_cpu(array: Any) -> jax.Array:
-    """A JAX array that host code reads without a transfer, and that programs on any device may use."""
-    with on_cpu():
-        return jax.device_put(array)
+# Makes a JAX array that host code reads without a transfer, and that programs on any device may use.
+put_on_cpu = on_cpu()(jax.device_put)

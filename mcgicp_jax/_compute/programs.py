@@ -55,12 +55,7 @@ def quickly_compiled(function: Callable[..., Result], **settings: Any) -> Callab
     def program() -> Callable[..., Result]:
         return jax.jit(function, compiler_options=_known_options(), **settings)
 
-    @functools.wraps(function)
-    def call(*arguments: Any) -> Result:
-        with on_cpu():
-            return program()(*arguments)
-
-    return call
+    return functools.wraps(function)(on_cpu()(lambda *arguments: program()(*arguments)))
 
 
 @functools.cache
@@ -81,8 +76,7 @@ _SMALLEST_CLASS = 128
 def size_class(num_points: int) -> int:
     """The smallest of 128, 192, 256, 384, 512, ... that is at least `num_points`."""
     power = max(_SMALLEST_CLASS, 1 << (num_points - 1).bit_length())
-    smaller = 3 * power // 4
-    return smaller if max(num_points, _SMALLEST_CLASS) <= smaller else power
+    return 3 * power // 4 if max(num_points, _SMALLEST_CLASS) <= 3 * power // 4 else power
 
 
 # Bytes. JAX (jaxlib 0.10.2) copies smaller arrays for a callback in the calling thread, up to 100 KiB.

@@ -507,12 +507,8 @@ def _found(given: Input) -> Input:
 
 
 def whole(given: Input, rows: Any = None, spread: bool = False) -> Rows:
-    """All rows, or some, of a pytree of arrays, some of which are traced.
-
-    Args:
-        spread: whether a row that does not exist is filled with the row of the result's own number, not with the first:
-            in the derivative, GPUs add cotangents of the same row one after the other, those that are 0 included.
-    """
+    """All rows, or some, of a pytree of arrays, some of which are traced. Where there is none it is the first, or with
+    `spread` that of the same number: GPUs add the cotangents of a row, zeros included, one after the other."""
     tree, index = jax.tree.map(jnp.asarray, given.table), given.index
     size = len(jax.tree.leaves(tree)[0])
     if index is None and rows is None:
@@ -596,10 +592,9 @@ def _pull_program(function: Callable[..., Any], total: bool, chosen: Chosen) -> 
     columns of each input, (c, n, W) or (c, k, n, W)."""
 
     def program(numbers: Any, packs: Any, indices: Any, cotangents: Any) -> Any:
-        with jax.default_matmul_precision("highest"):
-            result, here = _of_chosen(function, total, chosen, (numbers, packs, indices))
-            _, pull = jax.vjp(result, *here)
-            by_numbers, by_rows = jax.vmap(pull, in_axes=0 if total else 1)(cotangents)
+        result, here = _of_chosen(function, total, chosen, (numbers, packs, indices))
+        _, pull = jax.vjp(result, *here)
+        by_numbers, by_rows = jax.vmap(pull, in_axes=0 if total else 1)(cotangents)
         axes = [1 + index.ndim for index in indices]
         return by_numbers, [_joined(each, count) for each, count in zip(by_rows, axes, strict=True)]
 
@@ -613,15 +608,14 @@ def _push_program(function: Callable[..., Any], total: bool, chosen: Chosen) -> 
     `_pull_program`."""
 
     def program(numbers: Any, packs: Any, indices: Any, by_numbers: Any, by_rows: Any) -> Any:
-        with jax.default_matmul_precision("highest"):
-            result, here = _of_chosen(function, total, chosen, (numbers, packs, indices))
-            _, push = jax.linearize(result, *here)
-            slopes = []
-            for columns, joined, index in zip(here[1], by_rows, indices, strict=True):
-                ends = np.cumsum([math.prod(each.shape[index.ndim :]) for each in columns])
-                parts = jnp.split(joined, ends[:-1], axis=-1) if columns else []
-                slopes.append([part.reshape(len(part), *each.shape) for part, each in zip(parts, columns, strict=True)])
-            return jax.vmap(push)(by_numbers, slopes)
+        result, here = _of_chosen(function, total, chosen, (numbers, packs, indices))
+        _, push = jax.linearize(result, *here)
+        slopes = []
+        for columns, joined, index in zip(here[1], by_rows, indices, strict=True):
+            ends = np.cumsum([math.prod(each.shape[index.ndim :]) for each in columns])
+            parts = jnp.split(joined, ends[:-1], axis=-1) if columns else []
+            slopes.append([part.reshape(len(part), *each.shape) for part, each in zip(parts, columns, strict=True)])
+        return jax.vmap(push)(by_numbers, slopes)
 
     program.__name__ = f"push_{function.__name__}"
     return quickly_compiled(program)
@@ -632,11 +626,10 @@ def _jacobian_program(function: Callable[..., Any], chosen: tuple[int, ...]) -> 
     """A sum over a block, packed, and its derivative by some leaves of the numbers."""
 
     def program(numbers: Any, packs: Any, indices: Any) -> Any:
-        with jax.default_matmul_precision("highest"):
-            some = chosen, tuple(() for _ in packs)
-            result, here = _of_chosen(function, True, some, (numbers, packs, indices))
-            value, pull = jax.vjp(result, *here)
-            return value, jax.vmap(pull)(jnp.eye(len(value), dtype=value.dtype))[0]
+        some = chosen, tuple(() for _ in packs)
+        result, here = _of_chosen(function, True, some, (numbers, packs, indices))
+        value, pull = jax.vjp(result, *here)
+        return value, jax.vmap(pull)(jnp.eye(len(value), dtype=value.dtype))[0]
 
     program.__name__ = f"jacobian_{function.__name__}"
     return quickly_compiled(program)

@@ -186,10 +186,10 @@ class BatchJob:
             warn_of_lengths(*clouds)
             return clouds
 
+    @on_cpu()
     def register_chunk(self, chunk: list[Pair]) -> list[PairResult]:
         """Register the pairs one after the other, on the CPU: workers would compete for an accelerator."""
-        with on_cpu():
-            return [self._register_with_jacobian(pair) if pair.traced else self._register(pair) for pair in chunk]
+        return [self._register_with_jacobian(pair) if pair.traced else self._register(pair) for pair in chunk]
 
     def register_chunk_alone(self, chunk: list[Pair]) -> list[PairResult]:
         """`register_chunk` in a process without other threads; the first result has the warnings."""

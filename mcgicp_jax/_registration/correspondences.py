@@ -46,7 +46,8 @@ def find_correspondences(
         max_distance: maximum correspondence distance, metres of position; matches beyond it are not `valid`.
         num_candidates: m, number of target points to find for each source point; more than one for the soft assignment
             of `estimate_pose` and `mahalanobis_cost`. None: as many as the method matches, one but for NDT.
-        search: nearest-neighbour search; by default `KDTreeSearch` on CPUs and `DenseSearch` on accelerators.
+        search: nearest-neighbour search; by default `KDTreeSearch`, and inside `jit` or `vmap` on accelerators
+            `DenseSearch`.
 
     Returns:
         One match per source row; for m > 1 arrays of shape (m, N), nearest first. Constant to autodiff.

@@ -64,7 +64,7 @@ def run_problems(
         if kind not in groups:
             groups[kind] = _Group(search, max_iterations)
         last[kind] = number
-        groups[kind].add(key, problem)
+        groups[kind].waiting.append((key, problem))
         while groups[kind].is_full():
             yield from groups[kind].run()
         for waiting in [kind for kind in groups if number - last[kind] > _PATIENCE]:
@@ -87,59 +87,50 @@ class _Group(Generic[Key]):
         self._max_iterations = max_iterations
         self._devices = default_devices()
         self._per_device = _LANES_ON_CPU if self._devices[0].platform == "cpu" else _LANES
-        self._waiting: collections.deque[tuple[Key, Problem]] = collections.deque()
+        self.waiting: collections.deque[tuple[Key, Problem]] = collections.deque()
         self._running: dict[int, tuple[Key, Problem]] = {}
-        # Of type `Lanes` once there are any.
         self._lanes: Any = None
         sharding = NamedSharding(Mesh(np.array(self._devices), ("lanes",)), PartitionSpec("lanes"))
         self._empty = jax.jit(_empty, static_argnums=1, out_shardings=sharding)
         self._put = jax.jit(_put, donate_argnums=0, out_shardings=sharding)
 
     def is_full(self) -> bool:
-        return len(self._waiting) + len(self._running) >= self._per_device * len(self._devices)
+        return len(self.waiting) + len(self._running) >= self._per_device * len(self._devices)
 
     def is_busy(self) -> bool:
-        return bool(self._waiting or self._running)
-
-    def add(self, key: Key, problem: Problem) -> None:
-        self._waiting.append((key, problem))
+        return bool(self.waiting or self._running)
 
     def run(self) -> Iterator[Ended[Key]]:
         """Fill free lanes and run `_STEPS` steps of all; yield the results of finished lanes and free these lanes."""
         try:
-            ended = self._run()
+            found = self._run()
         except jax.errors.JaxRuntimeError as error:
             if self._per_device == 1 or "RESOURCE_EXHAUSTED" not in str(error):
                 raise
             self._per_device //= 2
-            self._waiting.extendleft(self._running.values())
-            self._running, self._lanes = {}, None
-        else:
-            yield from ended
+            self.waiting.extendleft(self._running.values())
+            self._running, self._lanes, found = {}, None, None
+        for lane in [] if found is None else [lane for lane in self._running if found[0].status[lane] >= 0]:
+            state, assessed, history = jax.tree.map(lambda leaf, lane=lane: leaf[lane], found)
+            # One history entry per update, and one at the returned pose.
+            count = int(state.num_iterations) + 1
+            history = jax.tree.map(lambda entries, count=count: entries[:count], history)
+            yield Ended(self._running.pop(lane)[0], state, assessed, history)
 
-    def _run(self) -> Iterator[Ended[Key]]:
+    def _run(self) -> tuple[State, Assessment, Record] | None:
+        """Those of all lanes; None if none of the running ones has finished."""
         count = self._per_device * len(self._devices)
-        for lane in [lane for lane in range(count) if lane not in self._running][: len(self._waiting)]:
-            self._running[lane] = _, problem = self._waiting.popleft()
+        for lane in [lane for lane in range(count) if lane not in self._running][: len(self.waiting)]:
+            self._running[lane] = _, problem = self.waiting.popleft()
             begun = problem, begin_lane(problem, self._search, self._max_iterations)
             self._lanes = self._put(self._lanes or self._empty(begun, count), begun, lane)
         problems, loops = self._lanes
         loops = run_lanes(problems, loops, self._search, _STEPS)
         self._lanes = problems, loops
         # The matches are not copied to the host.
-        status = np.asarray(loops.state.status)
-        ended = [lane for lane in self._running if status[lane] >= 0]
-        if not ended:
-            return iter(())
-        found = jax.device_get((loops.state, assess_lanes(problems, loops, self._search), loops.history))
-        results = []
-        for lane in ended:
-            state, assessed, history = jax.tree.map(lambda leaf, lane=lane: leaf[lane], found)
-            # One history entry per update, and one at the returned pose.
-            count = int(state.num_iterations) + 1
-            entries = jax.tree.map(lambda entries, count=count: entries[:count], history)
-            results.append(Ended(self._running.pop(lane)[0], state, assessed, entries))
-        return iter(results)
+        if not (np.asarray(loops.state.status)[list(self._running)] >= 0).any():
+            return None
+        return jax.device_get((loops.state, assess_lanes(problems, loops, self._search), loops.history))
 
 
 def _empty(lane: Lanes, count: int) -> Lanes:

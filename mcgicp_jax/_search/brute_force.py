@@ -32,7 +32,8 @@ class DenseSearch(AbstractSearch):
     Squared differences are summed and reduced at once, so that the N × M table of distances is never stored. (A matrix
     product for |a|² − 2ab + |b|² would have to store it, and in float32 would lose the distances of near neighbours to
     cancellation.) Distances are computed in the clouds' precision, in `KDTreeSearch` in float64: the two may choose
-    different points where two distances agree to rounding.
+    different points where two distances agree to rounding. `register` searches concrete clouds on the CPU, where
+    `KDTreeSearch` is faster.
     """
 
     def index(self, target: SearchPoints) -> DenseIndex:
