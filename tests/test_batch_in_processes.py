@@ -62,8 +62,9 @@ def test_workers_stay_and_have_one_thread_and_the_settings_of_the_caller(monkeyp
     workers = {told(os.getpid) for _ in range(2 * num_cores() + 2)}
     assert len(workers) <= num_cores() and str(os.getpid()) not in workers
     assert told(lambda: (num_cores(), os.environ["PJRT_NPROC"], os.environ["OMP_NUM_THREADS"])) == "(1, '1', '1')"
+    # Each worker would reserve memory of an accelerator.
+    assert told(lambda: jax.config.jax_platforms) == "'cpu'"
     settings = lambda: (  # noqa: E731
-        jax.config.jax_platforms,
         jax.config.jax_compilation_cache_dir,
         jax.config.jax_persistent_cache_min_compile_time_secs,
         jax.enable_x64.value,

@@ -54,7 +54,7 @@ def preprocess(
             covariances. The repr of the result says what was chosen and why. None keeps every point.
         num_neighbors: number k of neighbours, including the point itself, from which a covariance is computed; at
             least 3. All points are used if the cloud has fewer.
-        search: neighbour search; by default SciPy's k-d tree, or `DenseSearch` on an accelerator.
+        search: neighbour search; by default SciPy's k-d tree.
 
     Returns:
         Cloud with read-only NumPy arrays, float64 if the input is and JAX's x64 is on, else float32. If the

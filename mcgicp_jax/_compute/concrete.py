@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from types import ModuleType
 from typing import TYPE_CHECKING, Any, TypeAlias
 
@@ -12,6 +12,8 @@ import jax.numpy as jnp
 import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array
+
+from mcgicp_jax._compute.devices import on_cpu
 
 # NumPy arrays (outside transformations) or JAX arrays, and scalars of either kind.
 if TYPE_CHECKING:
@@ -53,13 +55,14 @@ def is_concrete(*trees: object) -> bool:
     return not any(map(_is_tracer, jax.tree.leaves(trees, is_leaf=is_deferred)))
 
 
-def outside_trace() -> contextlib.AbstractContextManager[None]:
-    """Context in which concrete arrays are computed at once, even while a caller's `jit` is being traced.
-
-    Outside a trace it does nothing, since `jax.ensure_compile_time_eval` evaluates operation by operation.
-    """
-    staged = isinstance(_zero(), jax.core.Tracer)
-    return jax.ensure_compile_time_eval() if staged else contextlib.nullcontext()
+@contextlib.contextmanager
+def outside_trace() -> Iterator[None]:
+    """Context in which concrete arrays are computed at once and on the CPU, even while a caller's `jit` is traced."""
+    with on_cpu():
+        # Only inside a trace, since `jax.ensure_compile_time_eval` evaluates operation by operation.
+        staged = isinstance(_zero(), jax.core.Tracer)
+        with jax.ensure_compile_time_eval() if staged else contextlib.nullcontext():
+            yield
 
 
 @jax.jit

@@ -470,11 +470,11 @@ def over_whole(function: Callable[..., Any], numbers: Any, inputs: Sequence[Inpu
     num_rows = len(jax.tree.leaves(own.table)[0] if own.index is None else own.index)
     wide = any(each.index is not None and each.index.ndim == 2 for each in inputs)
     if total or not wide or num_rows <= _LARGEST_WHOLE:
-        return function(numbers, *(whole(each) for each in inputs))
+        return function(numbers, *(whole(each, spread=not total) for each in inputs))
     num_blocks = -(-num_rows // _LARGEST_BLOCK)
     size = -(-num_rows // num_blocks)
     padded = jnp.minimum(jnp.arange(num_blocks * size), num_rows - 1).reshape(num_blocks, size)
-    found = jax.lax.map(lambda rows: function(numbers, *(whole(each, rows) for each in inputs)), padded)
+    found = jax.lax.map(lambda rows: function(numbers, *(whole(each, rows, True) for each in inputs)), padded)
     return jax.tree.map(lambda leaf: leaf.reshape(padded.size, *leaf.shape[2:])[:num_rows], found)
 
 
@@ -506,13 +506,17 @@ def _found(given: Input) -> Input:
     return given._replace(index=given.index.whole) if isinstance(given.index, Deferred) else given
 
 
-def whole(given: Input, rows: Any = None) -> Rows:
-    """All rows, or some, of a pytree of arrays, some of which are traced."""
+def whole(given: Input, rows: Any = None, spread: bool = False) -> Rows:
+    """All rows, or some, of a pytree of arrays, some of which are traced. Where there is none it is the first, or with
+    `spread` that of the same number: GPUs add the cotangents of a row, zeros included, one after the other."""
     tree, index = jax.tree.map(jnp.asarray, given.table), given.index
+    size = len(jax.tree.leaves(tree)[0])
     if index is None and rows is None:
-        return Rows(tree, jnp.arange(len(jax.tree.leaves(tree)[0])))
+        return Rows(tree, jnp.arange(size))
     index = rows if index is None else jnp.asarray(index)[slice(None) if rows is None else rows].T
-    return Rows(jax.tree.map(lambda array: array[jnp.maximum(index, 0)], tree), index)
+    missing = (jnp.arange(index.shape[-1]) if rows is None else rows) % size if spread else 0
+    found = jnp.where(index < 0, missing, index)
+    return Rows(jax.tree.map(lambda array: array[found], tree), index)
 
 
 def _add_rows(
@@ -588,10 +592,9 @@ def _pull_program(function: Callable[..., Any], total: bool, chosen: Chosen) -> 
     columns of each input, (c, n, W) or (c, k, n, W)."""
 
     def program(numbers: Any, packs: Any, indices: Any, cotangents: Any) -> Any:
-        with jax.default_matmul_precision("highest"):
-            result, here = _of_chosen(function, total, chosen, (numbers, packs, indices))
-            _, pull = jax.vjp(result, *here)
-            by_numbers, by_rows = jax.vmap(pull, in_axes=0 if total else 1)(cotangents)
+        result, here = _of_chosen(function, total, chosen, (numbers, packs, indices))
+        _, pull = jax.vjp(result, *here)
+        by_numbers, by_rows = jax.vmap(pull, in_axes=0 if total else 1)(cotangents)
         axes = [1 + index.ndim for index in indices]
         return by_numbers, [_joined(each, count) for each, count in zip(by_rows, axes, strict=True)]
 
@@ -605,15 +608,14 @@ def _push_program(function: Callable[..., Any], total: bool, chosen: Chosen) -> 
     `_pull_program`."""
 
     def program(numbers: Any, packs: Any, indices: Any, by_numbers: Any, by_rows: Any) -> Any:
-        with jax.default_matmul_precision("highest"):
-            result, here = _of_chosen(function, total, chosen, (numbers, packs, indices))
-            _, push = jax.linearize(result, *here)
-            slopes = []
-            for columns, joined, index in zip(here[1], by_rows, indices, strict=True):
-                ends = np.cumsum([math.prod(each.shape[index.ndim :]) for each in columns])
-                parts = jnp.split(joined, ends[:-1], axis=-1) if columns else []
-                slopes.append([part.reshape(len(part), *each.shape) for part, each in zip(parts, columns, strict=True)])
-            return jax.vmap(push)(by_numbers, slopes)
+        result, here = _of_chosen(function, total, chosen, (numbers, packs, indices))
+        _, push = jax.linearize(result, *here)
+        slopes = []
+        for columns, joined, index in zip(here[1], by_rows, indices, strict=True):
+            ends = np.cumsum([math.prod(each.shape[index.ndim :]) for each in columns])
+            parts = jnp.split(joined, ends[:-1], axis=-1) if columns else []
+            slopes.append([part.reshape(len(part), *each.shape) for part, each in zip(parts, columns, strict=True)])
+        return jax.vmap(push)(by_numbers, slopes)
 
     program.__name__ = f"push_{function.__name__}"
     return quickly_compiled(program)
@@ -624,11 +626,10 @@ def _jacobian_program(function: Callable[..., Any], chosen: tuple[int, ...]) -> 
     """A sum over a block, packed, and its derivative by some leaves of the numbers."""
 
     def program(numbers: Any, packs: Any, indices: Any) -> Any:
-        with jax.default_matmul_precision("highest"):
-            some = chosen, tuple(() for _ in packs)
-            result, here = _of_chosen(function, True, some, (numbers, packs, indices))
-            value, pull = jax.vjp(result, *here)
-            return value, jax.vmap(pull)(jnp.eye(len(value), dtype=value.dtype))[0]
+        some = chosen, tuple(() for _ in packs)
+        result, here = _of_chosen(function, True, some, (numbers, packs, indices))
+        value, pull = jax.vjp(result, *here)
+        return value, jax.vmap(pull)(jnp.eye(len(value), dtype=value.dtype))[0]
 
     program.__name__ = f"jacobian_{function.__name__}"
     return quickly_compiled(program)

@@ -32,7 +32,8 @@ _SETTINGS: tuple[Any, ...] = (
 
 def without_checks_of_jax(function: Callable[Parameters, Answer]) -> Callable[Parameters, Answer]:
     """Decorator of functions without the optional checks of JAX, which users turn on for their own code: `debug_nans`
-    and `debug_infs`, since NaN marks missing values here, and strict promotion of dtypes and ranks."""
+    and `debug_infs`, since NaN marks missing values here, and strict promotion of dtypes and ranks. Products of
+    matrices are in full precision: by default, GPUs round factors to 11 bits (TF32), 5 cm at 100 m."""
 
     @functools.wraps(function)
     def unchecked(*arguments: Parameters.args, **named: Parameters.kwargs) -> Answer:
@@ -41,6 +42,7 @@ def without_checks_of_jax(function: Callable[Parameters, Answer]) -> Callable[Pa
             jax.debug_infs(False),
             jax.numpy_dtype_promotion("standard"),
             jax.numpy_rank_promotion("allow"),
+            jax.default_matmul_precision("highest"),
         ):
             return function(*arguments, **named)
 

@@ -6,13 +6,13 @@ import abc
 import dataclasses
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
 from mcgicp_jax._compute.concrete import AnyArray, AnyScalar, canonical_float, is_concrete, numpy_for
+from mcgicp_jax._compute.devices import put_on_cpu
 
 
 class Numbers(eqx.Module):
@@ -43,7 +43,7 @@ class AbstractKernel(Numbers):
     def __init__(self, scale: ArrayLike):
         """`scale` is k. Raises `ValueError` unless it is one positive, finite number."""
         concrete = is_concrete(scale)
-        self.scale = jax.device_put(np.asarray(scale, canonical_float())) if concrete else jnp.asarray(scale)
+        self.scale = put_on_cpu(np.asarray(scale, canonical_float())) if concrete else jnp.asarray(scale)
         if self.scale.shape != () or (is_concrete(self.scale) and not 0 < float(self.scale) < np.inf):
             raise ValueError(f"scale: expected one positive number, got {scale!r}")
 

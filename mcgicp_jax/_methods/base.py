@@ -13,6 +13,7 @@ from jaxtyping import Array, Float
 
 from mcgicp_jax._clouds.point_cloud import PointCloud, Values
 from mcgicp_jax._compute.concrete import AnyArray, canonical_float, is_concrete, numpy_for
+from mcgicp_jax._compute.devices import put_on_cpu
 from mcgicp_jax._local_geometry.local_geometry import Geometries, LocalGeometry
 from mcgicp_jax._local_geometry.neighborhoods import NO_NEIGHBORS, Neighborhoods
 from mcgicp_jax._math import symmetric_matrices as alg
@@ -44,7 +45,7 @@ def check_covariance_fits(covariance: Float[AnyArray, "..."], count: int) -> Non
 def _number(name: str, value: Values) -> Array:
     try:
         # NumPy converts concrete values without compiling a program.
-        return jax.device_put(np.asarray(value, canonical_float())) if is_concrete(value) else jnp.asarray(value)
+        return put_on_cpu(np.asarray(value, canonical_float())) if is_concrete(value) else jnp.asarray(value)
     except (TypeError, ValueError) as error:
         raise ValueError(f"{name}: expected numbers, got {value!r}") from error
 

@@ -8,7 +8,6 @@ from functools import partial
 from typing import ClassVar
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.typing import ArrayLike
@@ -17,6 +16,7 @@ from jaxtyping import Array, Bool, Float
 from mcgicp_jax._clouds.point_cloud import PointCloud, Values
 from mcgicp_jax._clouds.preprocess import preprocess
 from mcgicp_jax._compute.concrete import AnyArray, constant, numpy_for
+from mcgicp_jax._compute.devices import put_on_cpu
 from mcgicp_jax._compute.threads import without_checks_of_jax
 from mcgicp_jax._local_geometry.cloud_statistics import channel_noise, point_spacing
 from mcgicp_jax._local_geometry.covariances import channel_kernel, multichannel_covariance, plane_covariance
@@ -133,7 +133,7 @@ class MultiChannelGICP(AbstractGeneralized):
             smooth = ~(2 * across > within)
             floor = xp.where(smooth, 1, xp.maximum(within / xp.where(smooth, 1, 2 * across), _MIN_EIGENVALUE))
             numbers = [2 * (_SPREAD * sigma) ** 2, xp.where(uniform, 0, _OFFSET_PER_SIGMA * spacing / sigma), floor]
-        covariance, weights, floor = (jax.device_put(xp.asarray(number, epsilon.dtype)) for number in numbers)
+        covariance, weights, floor = (put_on_cpu(xp.asarray(number, epsilon.dtype)) for number in numbers)
         if self.channel_covariance is not None or self.min_eigenvalue is not None:
             floor = self.min_eigenvalue
         if self.channel_covariance is not None:

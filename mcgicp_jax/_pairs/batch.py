@@ -86,9 +86,9 @@ def register_as_completed(
             once more, and gets the status `WORKER_FAILED` and a warning if that fails too.
         covariances: False saves a tenth of the time: `covariance` and `deviations` are NaN.
         options: options of `register`, except for `tie_points` and `prior`. `search` is also used to preprocess; by
-            default SciPy's k-d tree with one thread per pair. With `DenseSearch`, the default on accelerators, pairs
-            run as lanes of one vectorised program, spread over all local devices (not with `equalize_channels` or
-            `voxel_sizes`).
+            default SciPy's k-d tree with one thread per pair. With `DenseSearch`, or without a search on accelerators,
+            pairs run as lanes of one vectorised program on `jax.default_device`, or spread over all local devices (not
+            with an `executor`, `equalize_channels` or `voxel_sizes`).
 
     Returns:
         A generator of the index of the pair, from 0, and its `RegistrationResult`.

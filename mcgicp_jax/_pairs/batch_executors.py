@@ -44,9 +44,11 @@ _CHUNK_SIZE, _MAX_SUBMITTED = 8, 64
 # Number of pairs per chunk for a process of this machine: chunks of 1 to 8 are equally fast, and of small ones each
 # worker has its share of few pairs.
 _SMALL_CHUNK = 2
-# Environment of a worker of `Processes`: one thread each for XLA, the tree search and BLAS. loky would take memory that
-# grows with the clouds for a leak, and start another worker.
+# Environment of a worker of `Processes`: one thread each for XLA, the tree search and BLAS, and no accelerator, three
+# quarters of whose memory each would reserve. loky would take memory that grows with the clouds for a leak, and start
+# another worker.
 _ENVIRONMENT = {
+    "JAX_PLATFORMS": "cpu",
     "PJRT_NPROC": "1",
     "OMP_NUM_THREADS": "1",
     "OPENBLAS_NUM_THREADS": "1",
@@ -55,7 +57,6 @@ _ENVIRONMENT = {
 }
 # Settings of JAX for a whole process, which may differ from the environment. `with_settings` sends the others.
 _SETTINGS = (
-    "jax_platforms",
     "jax_enable_compilation_cache",
     "jax_compilation_cache_dir",
     "jax_persistent_cache_min_compile_time_secs",

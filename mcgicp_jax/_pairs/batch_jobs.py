@@ -12,7 +12,6 @@ from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any, Literal, TypeAlias
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -21,11 +20,11 @@ from jaxtyping import Bool
 from mcgicp_jax._clouds.point_cloud import PointCloud, Values
 from mcgicp_jax._clouds.voxel_size import VoxelSize
 from mcgicp_jax._compute.concrete import is_concrete, is_deferred
+from mcgicp_jax._compute.devices import on_accelerator, on_cpu
 from mcgicp_jax._compute.linear_maps import primal
 from mcgicp_jax._compute.messages import messages_named, warn, warnings_named
 from mcgicp_jax._compute.programs import size_class
 from mcgicp_jax._compute.threads import in_new_thread, num_cores, side_by_side, with_settings
-from mcgicp_jax._local_geometry.local_geometry import Surface
 from mcgicp_jax._math.poses import Pose
 from mcgicp_jax._methods.base import AbstractMethod
 from mcgicp_jax._pairs.register import register_from, start_from_anywhere
@@ -160,14 +159,15 @@ class BatchJob:
 
     @property
     def search(self) -> AbstractSearch:
-        """The requested search, or the default of the machine that registers the pair."""
+        """The requested search, or the default outside of lanes."""
         return self.options.search or default_search(workers=1)
 
     @property
     def uses_lanes(self) -> bool:
-        """Whether pairs run as lanes of one vectorised program."""
+        """Whether pairs run as lanes of one vectorised program, if no executor is given."""
         repeated = self.options.equalize_channels or len(self.options.voxel_sizes) > 0
-        return isinstance(self.search, DenseSearch) and not repeated
+        search = self.options.search
+        return (on_accelerator() if search is None else isinstance(search, DenseSearch)) and not repeated
 
     def ready(self, clouds: dict[str, Cloud]) -> list[PointCloud]:
         """Clouds by their names, read and preprocessed if necessary; errors become a `ValueError` that names one."""
@@ -186,10 +186,9 @@ class BatchJob:
             warn_of_lengths(*clouds)
             return clouds
 
+    @on_cpu()
     def register_chunk(self, chunk: list[Pair]) -> list[PairResult]:
-        """Register the pairs one after the other, or in lanes."""
-        if self.uses_lanes and not chunk[0].traced:
-            return list(self.register_in_lanes(chunk, 1))
+        """Register the pairs one after the other, on the CPU: workers would compete for an accelerator."""
         return [self._register_with_jacobian(pair) if pair.traced else self._register(pair) for pair in chunk]
 
     def register_chunk_alone(self, chunk: list[Pair]) -> list[PairResult]:
@@ -212,7 +211,7 @@ class BatchJob:
                         yield problem
 
             limit = self.options.max_iterations
-            for ended in run_problems(problems(), self.search, limit):
+            for ended in run_problems(problems(), self.options.search or DenseSearch(), limit):
                 pair = ended.key
                 result = registration_of(
                     ended.state, ended.assessment, ended.history, pair.source, pair.target, pair.used
@@ -295,10 +294,7 @@ class BatchJob:
 
     @_of_a_pair
     def _problem(self, pair: Pair) -> PairResult | tuple[_LanePair, Problem]:
-        """The pair as input of a lane, with both surfaces padded to one size class so that few programs are compiled.
-
-        With `max_source_points`, the surface of the source is padded to the size class of this number at most.
-        """
+        """The pair as input of a lane, with each surface padded to a size class so that few programs are compiled."""
         source, target = self._clouds(pair)
         start = self._start(pair, source, target)
         if isinstance(start, PairResult):
@@ -306,10 +302,8 @@ class BatchJob:
         init, verified = start
         given = Inputs(source, target, self.method, self.options.robust)
         problem, _ = pose_problem(given, init, self.options, num_threads=1)
-        used, size = problem.source.search.valid, size_class(max(len(source.points), len(target.points)))
-        few = self.options.max_source_points
-        sizes = size if few is None else min(size, size_class(few)), size
-        return _LanePair(pair.index, source, target, used, verified), _padded(problem.whole(), sizes)
+        used, problem = problem.source.search.valid, problem.whole()
+        return _LanePair(pair.index, source, target, used, verified), _padded(problem)
 
 
 def _loaded(load: Callable[[], PointCloud | Values]) -> PointCloud | Values:
@@ -325,17 +319,13 @@ def _loaded(load: Callable[[], PointCloud | Values]) -> PointCloud | Values:
         raise ValueError(f"{reason} ({place.filename}, line {place.lineno})") from error
 
 
-def _padded(problem: Problem, sizes: tuple[int, int]) -> Problem:
-    """Pad the surfaces of source and target to these numbers of rows; padding matches nothing."""
+def _padded(problem: Problem) -> Problem:
+    """Pad each surface to its size class; padding matches nothing."""
 
-    def grown(surface: Surface, size: int) -> Surface:
-        def grow(array: np.ndarray) -> np.ndarray:
-            return np.pad(array, [(0, size - len(array))] + [(0, 0)] * (array.ndim - 1))
+    def grow(array: np.ndarray) -> np.ndarray:
+        return np.pad(array, [(0, size_class(len(array)) - len(array))] + [(0, 0)] * (array.ndim - 1))
 
-        return jax.tree.map(grow, surface)
-
-    source, target = map(grown, (problem.source, problem.target), sizes)
-    return eqx.tree_at(lambda problem: (problem.source, problem.target), problem, (source, target))
+    return replace(problem, **{side: jax.tree.map(grow, getattr(problem, side)) for side in ("source", "target")})
 
 
 def _computed_ahead(

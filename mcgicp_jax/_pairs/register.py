@@ -85,7 +85,8 @@ def register(
         robust: kernel applied to the Mahalanobis distance of each match: `Huber`, `Cauchy`, `GemanMcClure`, `Tukey` or
             `Welsch`. None: the kernel of the method (NDT: `Welsch`), if it has any. With `photometric=True` the kernel
             is applied to each residual in standard deviations.
-        search: nearest-neighbour search; by default `KDTreeSearch` on CPUs and `DenseSearch` on accelerators.
+        search: nearest-neighbour search; by default `KDTreeSearch`, and inside `jit` or `vmap` on accelerators
+            `DenseSearch`.
         hold_unconstrained: if True, the pose is not updated along directions that neither the shape of the clouds nor
             the channels (if the method uses them) constrain. If False, arbitrary nearest-neighbour matches determine
             it there. The status is DEGENERATE in either case.

@@ -254,8 +254,10 @@ def moments_from(scores: Scores, num_cells: int) -> Moments:
         columns = [np.bincount(scores.cells, column, num_cells) for column in rows.T]
         rows = np.stack(columns, axis=1)
     elif scores.cells is not None:
-        # Row-major, so that one scatter adds seven numbers.
-        rows = jnp.zeros_like(rows, shape=(num_cells, 7)).at[scores.cells].add(rows)
+        # Row-major, so that one scatter adds seven numbers. Rows out of bounds, which do not count, are left out: GPUs
+        # would add all of them to the same cell, one after the other.
+        cells = jnp.where(scores.valid > 0, scores.cells, num_cells)
+        rows = jnp.zeros_like(rows, shape=(num_cells, 7)).at[cells].add(rows, mode="drop")
     sums, counts = rows[:, :6], rows[:, 6]
     product = sums.T @ sums if xp is np else jnp.dot(sums.T, sums, precision="highest")
     number = xp.sum(counts > 0)

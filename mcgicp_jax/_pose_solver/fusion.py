@@ -61,25 +61,22 @@ def fuse(
     """
     radius = jnp.asarray(directions.radius)
     rotation, translation = pose.rotation().as_matrix().astype(radius.dtype), pose.translation()
-    with jax.default_matmul_precision("highest"):
-        nothing, identity = jnp.zeros((6, 6), radius.dtype), jnp.eye(6, dtype=radius.dtype)
-        fusion = Fusion(
-            rotation, translation, center, radius, form, identity, nothing, nothing, directions.held_by_matches
-        )
-        directions = held_by_pose_form(directions, fusion.pull(rotation, translation)[1])
-        basis, by_matches = jnp.asarray(directions.twists).T, jnp.asarray(directions.held_by_matches)
-        both, others = jnp.outer(by_matches, by_matches), jnp.diag(1.0 * ~by_matches)
-        response, scatter = response_and_scatter(moments, radius)
-        # Equal clouds: no residual is more precise than the rounding of float32.
-        scatter = scatter + jnp.finfo(jnp.float32).eps ** 2 * radius * response
-        response, scatter = (jnp.where(both, basis.T @ each @ basis, others) for each in (response, scatter))
-        # One LAPACK call after the other: two batched ones at once can deadlock.
-        gain = jnp.where(both, response @ jnp.linalg.inv(scatter), 0)
-        information = jnp.where(both, gain @ response, 0)
-        information = 0.5 * (information + information.T)
-        fixed = None
-        if form.prior.fixed is not None:
-            basis, fixed = fusion.prior_residual(rotation, translation)[1].T @ basis, directions.fixed
+    nothing, identity = jnp.zeros((6, 6), radius.dtype), jnp.eye(6, dtype=radius.dtype)
+    fusion = Fusion(rotation, translation, center, radius, form, identity, nothing, nothing, directions.held_by_matches)
+    directions = held_by_pose_form(directions, fusion.pull(rotation, translation)[1])
+    basis, by_matches = jnp.asarray(directions.twists).T, jnp.asarray(directions.held_by_matches)
+    both, others = jnp.outer(by_matches, by_matches), jnp.diag(1.0 * ~by_matches)
+    response, scatter = response_and_scatter(moments, radius)
+    # Equal clouds: no residual is more precise than the rounding of float32.
+    scatter = scatter + jnp.finfo(jnp.float32).eps ** 2 * radius * response
+    response, scatter = (jnp.where(both, basis.T @ each @ basis, others) for each in (response, scatter))
+    # One LAPACK call after the other: two batched ones at once can deadlock.
+    gain = jnp.where(both, response @ jnp.linalg.inv(scatter), 0)
+    information = jnp.where(both, gain @ response, 0)
+    information = 0.5 * (information + information.T)
+    fixed = None
+    if form.prior.fixed is not None:
+        basis, fixed = fusion.prior_residual(rotation, translation)[1].T @ basis, directions.fixed
     return replace(fusion, basis=basis, gain=gain, information=information, held=directions.held, fixed=fixed)
 
 
@@ -151,13 +148,12 @@ def fused_update(pose: jaxlie.SE3, sums: Sums, directions: Directions, fusion: F
 def fused_covariance(pose: jaxlie.SE3, fusion: Fusion) -> Float[Array, "6 6"]:
     """Covariance of the pose, for ξ in T exp(ξ), metres and radians."""
     rotation = pose.rotation().as_matrix().astype(fusion.basis.dtype)
-    with jax.default_matmul_precision("highest"):
-        _, known = fusion.pull(rotation, pose.translation())
-        basis = fusion.twists_at(rotation, pose.translation())
-        total = fusion.information + basis.T @ known @ basis + jnp.diag(~fusion.held / UNKNOWN**2)
-        change = adjoint_to_source(pose, fusion.center) * units(fusion.radius) @ basis
-        if fusion.fixed is not None:
-            total = jnp.where(jnp.outer(~fusion.fixed, ~fusion.fixed), total, jnp.diag(1.0 * fusion.fixed))
-            change = change * ~fusion.fixed
-        covariance = change @ jnp.linalg.inv(total) @ change.T
+    _, known = fusion.pull(rotation, pose.translation())
+    basis = fusion.twists_at(rotation, pose.translation())
+    total = fusion.information + basis.T @ known @ basis + jnp.diag(~fusion.held / UNKNOWN**2)
+    change = adjoint_to_source(pose, fusion.center) * units(fusion.radius) @ basis
+    if fusion.fixed is not None:
+        total = jnp.where(jnp.outer(~fusion.fixed, ~fusion.fixed), total, jnp.diag(1.0 * fusion.fixed))
+        change = change * ~fusion.fixed
+    covariance = change @ jnp.linalg.inv(total) @ change.T
     return 0.5 * (covariance + covariance.T)

@@ -117,8 +117,7 @@ def _with_derivative_jvp(
         return pose, jnp.zeros_like(pose)
     leaves = [once(leaf) if jnp.issubdtype(leaf.dtype, jnp.inexact) else leaf for leaf in leaves]
     constants = jax.lax.stop_gradient((pose, root, leaves))
-    with jax.default_matmul_precision("highest"):
-        at_root, inverse = _newton(constants[0], constants[1], jax.tree.unflatten(structure, constants[2]))
+    at_root, inverse = _newton(constants[0], constants[1], jax.tree.unflatten(structure, constants[2]))
 
     def balance_of(values: list[Array]) -> Float[Array, "6"]:
         changed = list(constants[2])

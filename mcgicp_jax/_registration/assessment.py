@@ -132,11 +132,10 @@ def as_float64(tree: Any) -> Any:
 def constraints_of(state: State) -> Constraints:
     """Information matrix and directions at the final pose, for ξ in T exp(ξ), metres and radians."""
     sums, directions = state.sums, state.directions
-    with jax.default_matmul_precision("highest"):
-        adjoint = adjoint_to_center(state.pose, sums.center) / units(sums.radius)[:, None]
-        information = adjoint.T @ (state.information * sums.radius**2) @ adjoint
-        at_source = None if directions is None else directions_at_source(directions, state.pose)
-        return Constraints(information, at_source)
+    adjoint = adjoint_to_center(state.pose, sums.center) / units(sums.radius)[:, None]
+    information = adjoint.T @ (state.information * sums.radius**2) @ adjoint
+    at_source = None if directions is None else directions_at_source(directions, state.pose)
+    return Constraints(information, at_source)
 
 
 @jax.jit
@@ -150,11 +149,10 @@ def covariance_of_pose(state: State, known: Moments | Fusion) -> Float[Array, "6
     if state.directions is None:
         found = found & (state.status != Status.DEGENERATE)
     center, radius = state.sums.center, state.sums.radius
-    with jax.default_matmul_precision("highest"):
-        if isinstance(known, Fusion):
-            covariance = fused_covariance(state.pose, known)
-        else:
-            covariance = sandwich(state.pose, center, radius, known, state.directions)
+    if isinstance(known, Fusion):
+        covariance = fused_covariance(state.pose, known)
+    else:
+        covariance = sandwich(state.pose, center, radius, known, state.directions)
     return jnp.where(found, covariance, jnp.nan)
 
 

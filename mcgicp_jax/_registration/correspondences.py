@@ -46,7 +46,8 @@ def find_correspondences(
         max_distance: maximum correspondence distance, metres of position; matches beyond it are not `valid`.
         num_candidates: m, number of target points to find for each source point; more than one for the soft assignment
             of `estimate_pose` and `mahalanobis_cost`. None: as many as the method matches, one but for NDT.
-        search: nearest-neighbour search; by default `KDTreeSearch` on CPUs and `DenseSearch` on accelerators.
+        search: nearest-neighbour search; by default `KDTreeSearch`, and inside `jit` or `vmap` on accelerators
+            `DenseSearch`.
 
     Returns:
         One match per source row; for m > 1 arrays of shape (m, N), nearest first. Constant to autodiff.
@@ -55,7 +56,7 @@ def find_correspondences(
         ValueError: if `max_distance` is not positive, `num_candidates` is below 1, `pose` is not a rigid motion, or
             channels or dtypes do not fit.
     """
-    search = search or default_search()
+    search = search or default_search(source, target, pose, method, max_distance)
     # Matches are constants to autodiff.
     source, target, pose, method, max_distance = map(primal, (source, target, pose, method, max_distance))
     check_clouds(source, target, method)

@@ -20,9 +20,11 @@ from jaxtyping import Array, Float
 
 from mcgicp_jax._clouds.point_cloud import PointCloud
 from mcgicp_jax._compute.concrete import is_concrete
+from mcgicp_jax._compute.devices import on_cpu
 from mcgicp_jax._compute.linear_maps import AbstractLinearMap, SideBySide, primal, with_derivative
 from mcgicp_jax._compute.programs import quickly_compiled
 from mcgicp_jax._compute.row_functions import Input, RowFunction, Rows, blockwise
+from mcgicp_jax._compute.threads import without_checks_of_jax
 from mcgicp_jax._math.poses import (
     parameters_by_twist,
     rotation_from_quaternion,
@@ -90,7 +92,8 @@ class PoseDerivative(AbstractLinearMap):
     ):
         problem = executor.problem
         self._pose, self._fusion = np.asarray(loop.state.pose.wxyz_xyz), problem.fusion
-        self._scaling: ImplicitRoot = jax.tree.map(np.asarray, root_of(loop.state._replace(record=None), self._fusion))
+        root = on_cpu()(root_of)(loop.state._replace(record=None), self._fusion)
+        self._scaling: ImplicitRoot = jax.tree.map(np.asarray, root)
         form = None if self._fusion is None else self._fusion.form
         if self._fusion is not None and not is_concrete(inputs[4:6]):
             place = self._fusion
@@ -210,12 +213,11 @@ def _balance_and_slope(
     Args:
         known: g of all matches without these, and its derivative by a twist.
     """
-    with jax.default_matmul_precision("highest"):
-        value, slope = value_and_jacobian(
-            lambda twist: balance_along(twist, pose, root, known[:, 0] + known[:, 1:] @ twist, fusion),
-            jnp.zeros_like(pose[:6]),
-        )
-        return jnp.concatenate([value[:, None], slope], axis=1)
+    value, slope = value_and_jacobian(
+        lambda twist: balance_along(twist, pose, root, known[:, 0] + known[:, 1:] @ twist, fusion),
+        jnp.zeros_like(pose[:6]),
+    )
+    return jnp.concatenate([value[:, None], slope], axis=1)
 
 
 @quickly_compiled
@@ -232,11 +234,11 @@ def _pull_balance(
         nowhere = jnp.zeros_like(score)
         return balance_along(nowhere, pose, root, score, eqx.tree_at(lambda fusion: fusion.form, fusion, form))
 
-    with jax.default_matmul_precision("highest"):
-        _, pull = jax.vjp(balance, score, fusion.form)
-        return jax.vmap(pull)(cotangents)
+    _, pull = jax.vjp(balance, score, fusion.form)
+    return jax.vmap(pull)(cotangents)
 
 
+@without_checks_of_jax
 def jacobian(
     inputs: Inputs, executor: HostExecutor, loop: LoopResult, cloud: str, field: str
 ) -> Float[np.ndarray, "6 ..."]:

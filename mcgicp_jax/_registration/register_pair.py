@@ -122,7 +122,7 @@ def prepared(
 @without_checks_of_jax
 def run_pair(given: Inputs, init: Pose | None, options: Options) -> Run:
     """Register arrays that are all concrete, or some of which `jit` or `vmap` trace."""
-    search = options.search or default_search()
+    search = options.search or default_search(given, init, options.numbers)
     *coarse, inputs = at_scales(_with_comparable_channels(given, options), options.voxel_sizes)
     for each in coarse:
         (found,) = results_of([_solved(each, init, replace(options, max_distance=None), search)], [None])

@@ -182,23 +182,22 @@ def update(
     """
     directions, basis = None, jnp.eye(6, dtype=sums.center.dtype)
     degenerate: AnyScalar = np.bool_(False)
-    with jax.default_matmul_precision("highest"):
-        if sums.observability is not None:
-            constraints = None if fixed is None else constraints_at(pose, sums.center, sums.radius, fixed)
-            directions = find_directions(sums, constraints)
-            degenerate = ~jnp.all(directions.held)
-            # Along unconstrained directions an update would follow arbitrary nearest-neighbour matches.
-            moving = (directions.held | ~settings.hold_unconstrained) & ~directions.fixed
-            basis = jnp.asarray(directions.twists).T * moving
-        if isinstance(measurements, Fusion):
-            directions, change = fused_update(pose, sums, cast(Directions, directions), measurements)
-            degenerate = ~jnp.all(directions.held)
-        elif measurements is None or directions is None:
-            change = solve_update(sums, basis)
-        else:
-            change = solve_update(sums, basis, *first_pull(pose, sums, directions, measurements))
-        moved = move_pose(pose, change.twist, sums.center)
-        moved = moved if fixed is None else with_fixed_directions(moved, fixed)
+    if sums.observability is not None:
+        constraints = None if fixed is None else constraints_at(pose, sums.center, sums.radius, fixed)
+        directions = find_directions(sums, constraints)
+        degenerate = ~jnp.all(directions.held)
+        # Along unconstrained directions an update would follow arbitrary nearest-neighbour matches.
+        moving = (directions.held | ~settings.hold_unconstrained) & ~directions.fixed
+        basis = jnp.asarray(directions.twists).T * moving
+    if isinstance(measurements, Fusion):
+        directions, change = fused_update(pose, sums, cast(Directions, directions), measurements)
+        degenerate = ~jnp.all(directions.held)
+    elif measurements is None or directions is None:
+        change = solve_update(sums, basis)
+    else:
+        change = solve_update(sums, basis, *first_pull(pose, sums, directions, measurements))
+    moved = move_pose(pose, change.twist, sums.center)
+    moved = moved if fixed is None else with_fixed_directions(moved, fixed)
     # Matches need not constrain what is fixed.
     degenerate = degenerate | (change.degenerate & (fixed is None))
     coarse, settled = status == COARSE, status == SETTLED

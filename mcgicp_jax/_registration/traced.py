@@ -149,8 +149,7 @@ def differentiable(loop: LoopResult, problem: Problem) -> State:
         matches = matches._replace(temperature=problem.matches.temperature)
     source, target = (surface._replace(noise=None) for surface in (problem.source, problem.target))
     model = Model(match_surfaces(source, target, matches), with_numbers_of(problem.terms, loop.terms), problem.fusion)
-    with jax.default_matmul_precision("highest"):
-        pose = with_derivative(state.pose.wxyz_xyz, root_of(state, fixed.fusion), model)
+    pose = with_derivative(state.pose.wxyz_xyz, root_of(state, fixed.fusion), model)
     return state._replace(pose=jaxlie.SE3(pose))
 
 

@@ -5,6 +5,7 @@ A lane is one registration of the vectorised batch. When it ends, another proble
 
 from __future__ import annotations
 
+import collections
 from collections.abc import Iterable, Iterator
 from functools import partial
 from typing import Any, Generic, NamedTuple, TypeAlias, TypeVar
@@ -15,6 +16,7 @@ import numpy as np
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from jaxtyping import Array, Bool, Int
 
+from mcgicp_jax._compute.devices import default_devices
 from mcgicp_jax._compute.threads import without_checks_of_jax
 from mcgicp_jax._registration.assessment import Assessment
 from mcgicp_jax._registration.loop import LoopResult, step
@@ -51,8 +53,8 @@ def run_problems(
 ) -> Iterator[Ended[Key]]:
     """Run the loop of `register` on many problems at a time, and yield each result as soon as it is known.
 
-    Problems of the same shapes share a program. Its number of lanes is fixed, so that a result does not depend on the
-    other problems. The lanes are spread over all local devices.
+    Problems of the same shapes share a program. Its number of lanes is fixed, as long as memory suffices, so that a
+    result does not depend on the other problems. The lanes are spread over the `default_devices`.
     """
     groups: dict[Any, _Group[Key]] = {}
     last: dict[Any, int] = {}
@@ -60,9 +62,9 @@ def run_problems(
         leaves, structure = jax.tree.flatten(problem)
         kind = structure, tuple((leaf.shape, leaf.dtype) for leaf in leaves)
         if kind not in groups:
-            groups[kind] = _Group(problem, search, max_iterations)
+            groups[kind] = _Group(search, max_iterations)
         last[kind] = number
-        groups[kind].add(key, problem)
+        groups[kind].waiting.append((key, problem))
         while groups[kind].is_full():
             yield from groups[kind].run()
         for waiting in [kind for kind in groups if number - last[kind] > _PATIENCE]:
@@ -75,47 +77,60 @@ def run_problems(
 
 
 class _Group(Generic[Key]):
-    """Lanes for problems of the same shapes."""
+    """Lanes for problems of the same shapes, and problems that wait for one.
 
-    def __init__(self, example: Problem, search: AbstractSearch, max_iterations: int):
+    Where memory does not suffice, half of the lanes are left, and the problems that were in lanes begin again.
+    """
+
+    def __init__(self, search: AbstractSearch, max_iterations: int):
         self._search = search
         self._max_iterations = max_iterations
-        devices = jax.local_devices()
-        per_device = _LANES_ON_CPU if devices[0].platform == "cpu" else _LANES
-        self._keys: list[Key | None] = [None] * (per_device * len(devices))
-        sharding = NamedSharding(Mesh(np.array(devices), ("lanes",)), PartitionSpec("lanes"))
+        self._devices = default_devices()
+        self._per_device = _LANES_ON_CPU if self._devices[0].platform == "cpu" else _LANES
+        self.waiting: collections.deque[tuple[Key, Problem]] = collections.deque()
+        self._running: dict[int, tuple[Key, Problem]] = {}
+        self._lanes: Any = None
+        sharding = NamedSharding(Mesh(np.array(self._devices), ("lanes",)), PartitionSpec("lanes"))
+        self._empty = jax.jit(_empty, static_argnums=1, out_shardings=sharding)
         self._put = jax.jit(_put, donate_argnums=0, out_shardings=sharding)
-        lane = example, begin_lane(example, search, max_iterations)
-        self._lanes: Lanes = jax.jit(_empty, static_argnums=1, out_shardings=sharding)(lane, len(self._keys))
 
     def is_full(self) -> bool:
-        return None not in self._keys
+        return len(self.waiting) + len(self._running) >= self._per_device * len(self._devices)
 
     def is_busy(self) -> bool:
-        return any(key is not None for key in self._keys)
-
-    def add(self, key: Key, problem: Problem) -> None:
-        free = self._keys.index(None)
-        self._keys[free] = key
-        self._lanes = self._put(self._lanes, (problem, begin_lane(problem, self._search, self._max_iterations)), free)
+        return bool(self.waiting or self._running)
 
     def run(self) -> Iterator[Ended[Key]]:
-        """Run `_STEPS` steps of all lanes; yield the results of finished lanes and free these lanes."""
+        """Fill free lanes and run `_STEPS` steps of all; yield the results of finished lanes and free these lanes."""
+        try:
+            found = self._run()
+        except jax.errors.JaxRuntimeError as error:
+            if self._per_device == 1 or "RESOURCE_EXHAUSTED" not in str(error):
+                raise
+            self._per_device //= 2
+            self.waiting.extendleft(self._running.values())
+            self._running, self._lanes, found = {}, None, None
+        for lane in [] if found is None else [lane for lane in self._running if found[0].status[lane] >= 0]:
+            state, assessed, history = jax.tree.map(lambda leaf, lane=lane: leaf[lane], found)
+            # One history entry per update, and one at the returned pose.
+            count = int(state.num_iterations) + 1
+            history = jax.tree.map(lambda entries, count=count: entries[:count], history)
+            yield Ended(self._running.pop(lane)[0], state, assessed, history)
+
+    def _run(self) -> tuple[State, Assessment, Record] | None:
+        """Those of all lanes; None if none of the running ones has finished."""
+        count = self._per_device * len(self._devices)
+        for lane in [lane for lane in range(count) if lane not in self._running][: len(self.waiting)]:
+            self._running[lane] = _, problem = self.waiting.popleft()
+            begun = problem, begin_lane(problem, self._search, self._max_iterations)
+            self._lanes = self._put(self._lanes or self._empty(begun, count), begun, lane)
         problems, loops = self._lanes
         loops = run_lanes(problems, loops, self._search, _STEPS)
         self._lanes = problems, loops
         # The matches are not copied to the host.
-        ended = np.asarray(loops.state.status) >= 0
-        if not any(ended[lane] and key is not None for lane, key in enumerate(self._keys)):
-            return
-        found = jax.device_get((loops.state, assess_lanes(problems, loops, self._search), loops.history))
-        for lane, key in enumerate(self._keys):
-            if key is not None and ended[lane]:
-                self._keys[lane] = None
-                state, assessed, history = jax.tree.map(lambda leaf, lane=lane: leaf[lane], found)
-                # One history entry per update, and one at the returned pose.
-                count = int(state.num_iterations) + 1
-                yield Ended(key, state, assessed, jax.tree.map(lambda entries, count=count: entries[:count], history))
+        if not (np.asarray(loops.state.status)[list(self._running)] >= 0).any():
+            return None
+        return jax.device_get((loops.state, assess_lanes(problems, loops, self._search), loops.history))
 
 
 def _empty(lane: Lanes, count: int) -> Lanes:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import partial
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -13,14 +14,16 @@ import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float, Int
 
+from mcgicp_jax._compute.concrete import is_concrete
+from mcgicp_jax._compute.devices import on_accelerator
 from mcgicp_jax._compute.programs import size_class
 from mcgicp_jax._search.base import IDENTITY, AbstractIndex, AbstractSearch, SearchPoints, on_host, search_points
 from mcgicp_jax._search.kd_tree import KDTreeSearch
 
 
-def default_search(workers: int = -1) -> AbstractSearch:
-    """`DenseSearch` if JAX's default backend is an accelerator, else `KDTreeSearch(workers)`."""
-    return KDTreeSearch(workers) if jax.default_backend() == "cpu" else DenseSearch()
+def default_search(*arguments: Any, workers: int = -1) -> AbstractSearch:
+    """`DenseSearch` for traced arguments on an accelerator, else `KDTreeSearch(workers)`."""
+    return KDTreeSearch(workers) if is_concrete(arguments) or not on_accelerator() else DenseSearch()
 
 
 class DenseSearch(AbstractSearch):
@@ -29,7 +32,8 @@ class DenseSearch(AbstractSearch):
     Squared differences are summed and reduced at once, so that the N × M table of distances is never stored. (A matrix
     product for |a|² − 2ab + |b|² would have to store it, and in float32 would lose the distances of near neighbours to
     cancellation.) Distances are computed in the clouds' precision, in `KDTreeSearch` in float64: the two may choose
-    different points where two distances agree to rounding.
+    different points where two distances agree to rounding. `register` searches concrete clouds on the CPU, where
+    `KDTreeSearch` is faster.
     """
 
     def index(self, target: SearchPoints) -> DenseIndex:

@@ -1,0 +1,203 @@
+"""Accelerators, without one: where programs run, on which devices, in what precision, and with how many lanes."""
+
+import importlib.util
+import os
+import pathlib
+import re
+import subprocess
+import sys
+import textwrap
+from concurrent.futures import ThreadPoolExecutor
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import mcgicp_jax as mcg
+from mcgicp_jax import extend
+from mcgicp_jax.metrics import pose_error
+from tests.batches import METHOD, assert_same, raw_pair
+from tests.scenes import pair
+
+
+@pytest.fixture(scope="module")
+def clouds():
+    return [mcg.preprocess(cloud.unpad()) for cloud in pair(size=300)[:2]]
+
+
+def test_concrete_clouds_are_registered_on_the_cpu():
+    """The default device is one that is not there: a program that runs on it raises an error."""
+    raw = [cloud.unpad() for cloud in pair(size=300)[:2]]
+    prior = (np.eye(4), np.diag([1e-4] * 5 + [0]))
+    with jax.default_device("tpu"), ThreadPoolExecutor(1) as executor:
+        source, target = (mcg.preprocess(cloud) for cloud in raw)
+        results = [mcg.register(source, target, mcg.MultiChannelGICP(), prior=given) for given in (None, prior)]
+        results += mcg.register_batch([source], [target], mcg.GICP(), executor=executor)
+        assert all(result.converged and np.isfinite(result.deviations).all() for result in results)
+        assert np.isfinite(results[0].jacobian("source")).all()
+        assert mcg.find_correspondences(source, target, None, mcg.GICP(), max_distance=0.5).valid.any()
+
+
+def test_rows_that_are_missing_do_not_share_one_row():
+    table, index = jnp.arange(5.0) + 10, jnp.array([[1, -1], [-1, -1], [0, 2], [-1, 3], [4, -1]])
+
+    def gathered(table, index):
+        return extend.blockwise(
+            lambda _, own, near: (near.tree.T,), None, extend.Input(table), extend.Input(table, index)
+        )[0]
+
+    np.testing.assert_array_equal(jax.jit(gathered)(table, index) - 10, [[1, 0], [1, 1], [0, 2], [3, 3], [4, 4]])
+
+
+@pytest.mark.slow
+def test_products_are_in_full_precision(clouds):
+    """By default, GPUs round the factors of products to 11 bits."""
+    source, target = (cloud.pad() for cloud in clouds)
+
+    def loss(points, others, origin, init):
+        moving, still = source.replace(points=points, origin=origin), target.replace(points=others)
+        result = mcg.register(moving, still, METHOD, init=init, prior=(np.eye(4), np.eye(6)), search=mcg.DenseSearch())
+        numbers = result.matrix, result.covariance, result.deviations, result.information
+        return sum(map(jnp.sum, (*numbers, moving.transform(result.T_target_source).points)))
+
+    arrays = source.points, target.points, np.zeros(3, np.float32), np.eye(4, dtype=np.float32)
+    gradient = jax.vmap(jax.grad(jax.jit(loss), argnums=(0, 1)))
+    text = jax.jit(gradient).lower(*(jnp.stack([array] * 2) for array in arrays)).as_text()
+    products = [line for line in text.splitlines() if re.search(r"stablehlo\.(dot|convolution)", line)]
+    # Of products without a sum, XLA makes multiplications.
+    inexact = [line for line in products if not re.search(r"HIGHEST, HIGHEST|contracting_dims = \[\] x \[\]", line)]
+    assert len(products) > 100 and not inexact
+
+
+def test_executors_do_not_run_lanes(clouds):
+    """One pair of a chunk would have all lanes for itself."""
+    source, target = clouds
+    options = {"search": mcg.DenseSearch(), "max_distance": 0.5}
+    with ThreadPoolExecutor(2) as executor:
+        found = mcg.register_batch([source] * 2, [target] * 2, mcg.GICP(), executor=executor, **options)
+    alone = mcg.register(source, target, mcg.GICP(), **options)
+    assert_same(found, [alone] * 2)
+
+
+# Number of lanes and rows of source and target of each search that is compiled.
+COMPILED = []
+
+
+class ForFewLanes(mcg.DenseSearch):
+    """A search for which memory suffices in some lanes."""
+
+    most: int = eqx.field(static=True)
+
+    def nearest_traced(self, pose, source, target, *rest):
+        found = super().nearest_traced(pose, source, target, *rest)
+
+        @jax.custom_batching.custom_vmap
+        def within_memory(indices):
+            return indices
+
+        @within_memory.def_vmap
+        def _(count, batched, indices):
+            COMPILED.append((count, source.valid.size, target.valid.size))
+            if count > self.most:
+                raise jax.errors.JaxRuntimeError("RESOURCE_EXHAUSTED: Out of memory")
+            return indices, batched[0]
+
+        return within_memory(found)
+
+
+def test_fewer_lanes_where_memory_does_not_suffice():
+    """No pair is lost. The surfaces are padded to a size class of each side."""
+    sides = [[mcg.preprocess(raw_pair(185 + i, i)[side]) for i in range(7)] for side in (0, 1)]
+    expected = mcg.register_batch(*sides, mcg.GICP(), max_distance=0.5, search=ForFewLanes(1000))
+    first = COMPILED.copy()
+    few = jax.local_device_count()
+    found = mcg.register_batch(*sides, mcg.GICP(), max_distance=0.5, search=ForFewLanes(few))
+    assert [result.status for result in found] == [result.status for result in expected]
+    for one, other in zip(found, expected, strict=True):
+        assert max(pose_error(one.matrix, other.matrix)) < 1e-5
+    assert {tuple(rows) for _, *rows in first} == {(192, 256)}
+    assert min(count for count, *_ in first) > few == COMPILED[-1][0]
+
+
+IN_LANES = """
+    import jax, numpy as np
+    import mcgicp_jax as mcg
+    from tests.batches import raw_pair
+
+    def registered():
+        clouds = [[mcg.preprocess(raw_pair(120, seed)[side]) for seed in range(5)] for side in (0, 1)]
+        poses, devices, before = {}, set(), jax.live_arrays()
+        options = {"max_distance": 0.5, "search": mcg.DenseSearch()}
+        for number, result in mcg.register_as_completed(*clouds, mcg.GICP(), **options):
+            poses[number] = result.matrix
+            arrays = [array for array in jax.live_arrays() if not any(array is each for each in before)]
+            devices |= {device.id for array in arrays for device in array.devices()}
+        return [poses[number] for number in sorted(poses)], devices
+
+    with jax.default_device(jax.local_devices()[2]):
+        alone, devices = registered()
+    assert devices == {2}, devices
+    everywhere, devices = registered()
+    assert devices == {0, 1, 2, 3}, devices
+    np.testing.assert_allclose(alone, everywhere, atol=1e-5)
+"""
+
+
+def run(script, folder, **environment):
+    root = pathlib.Path(__file__).parents[1]
+    environment = os.environ | environment | {"PYTHONPATH": os.pathsep.join([str(root), *sys.path])}
+    subprocess.run([sys.executable, "-c", textwrap.dedent(script)], cwd=folder, env=environment, check=True)
+
+
+@pytest.mark.slow
+def test_lanes_follow_the_default_device(tmp_path):
+    run(IN_LANES, tmp_path, XLA_FLAGS=os.environ["XLA_FLAGS"] + " --xla_force_host_platform_device_count=4")
+
+
+FOR_H100 = """
+    import re
+    import jax, numpy as np
+    import mcgicp_jax as mcg
+    from jax.experimental import topologies
+    from jax.sharding import SingleDeviceSharding
+    from tests.batches import METHOD
+    from tests.scenes import room_corner
+
+    TARGET = '''
+        gpu_device_info {
+            threads_per_block_limit: 1024 threads_per_warp: 32 shared_memory_per_block: 49152
+            shared_memory_per_core: 233472 shared_memory_per_block_optin: 232448 threads_per_core_limit: 2048
+            core_count: 132 fpus_per_core: 128 block_dim_limit_x: 2147483647 block_dim_limit_y: 65535
+            block_dim_limit_z: 65535 memory_bandwidth: 3352320000000 l2_cache_size: 52428800 clock_rate_ghz: 1.98
+            device_memory_size: 84978434048 registers_per_core_limit: 65536 registers_per_block_limit: 65536
+            cuda_compute_capability { major: 9 }
+        }
+        platform_name: "CUDA" device_description_str: "NVIDIA H100 80GB HBM3"
+    '''
+    LANES, SIZE = 4, 4096
+    clouds = [mcg.PointCloud(*room_corner(SIZE, seed=seed)) for seed in (0, 1)]
+    source, target = (mcg.preprocess(cloud, voxel_size=None) for cloud in clouds)
+
+    def pose(points):
+        moving = source.replace(points=points)
+        return mcg.register(moving, target, METHOD, max_distance=0.5, search=mcg.DenseSearch()).matrix
+
+    (device,) = topologies.get_topology_desc("", "cuda", target_config=TARGET, topology="1x1x1").devices
+    points = jax.ShapeDtypeStruct((LANES, SIZE, 3), np.float32, sharding=SingleDeviceSharding(device))
+    program = jax.jit(jax.vmap(pose)).lower(points).compile()
+    products = re.findall(" dot[(].*", program.as_text())
+    assert products and all("operand_precision={highest,highest}" in product for product in products)
+    assert "callback" not in program.as_text()
+    # The distances of all pairs of points are never stored.
+    assert program.memory_analysis().temp_size_in_bytes < 0.2 * LANES * 4 * SIZE**2
+"""
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(
+    importlib.util.find_spec("jax_cuda12_plugin") is None, reason="needs jax[cuda12], whose compiler needs no GPU"
+)
+def test_program_for_an_h100(tmp_path):
+    run(FOR_H100, tmp_path, JAX_PLATFORMS="cpu", JAX_SKIP_CUDA_CONSTRAINTS_CHECK="1", XLA_FLAGS="")
