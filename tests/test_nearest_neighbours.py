@@ -135,7 +135,7 @@ def test_many_sets_of_missing_channels(k):
         SearchPoints(row[:, :3], np.where(mask, row[:, 3:], 0), np.ones(len(row), bool), np.where(mask, 0, squares))
         for row, mask in zip(rows, masks, strict=True)
     )
-    index = Counted().index(target)
+    index = KDTreeSearch().index(target)
     still = np.array([1.0, 0, 0, 0, 0, 0, 0])
     expected = ref.match_partial(*rows, *masks, squares, k)
     np.testing.assert_array_equal(index.nearest(still, source, np.inf, k).T, expected)

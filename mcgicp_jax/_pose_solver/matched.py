@@ -123,7 +123,7 @@ class Matched(eqx.Module):
 def match_surfaces(source: Surface, target: Surface, matches: Matches) -> Matched:
     """Gather the matched rows of both surfaces, for their derivative; pure JAX."""
     # Points without a match are filled with the rows of other matches in turn, see `whole`.
-    known = matches.indices.reshape(-1)
+    known = jnp.asarray(matches.indices).reshape(-1)
     (found,) = jnp.nonzero(known >= 0, size=known.size)
     others = known[found[jnp.arange(known.size) % jnp.maximum(jnp.sum(known >= 0), 1)]]
     filled = jnp.where(known >= 0, known, others).reshape(matches.indices.shape)
