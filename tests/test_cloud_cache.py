@@ -2,6 +2,8 @@
 
 import copy
 import gc
+import time
+from concurrent.futures import ThreadPoolExecutor
 
 import equinox as eqx
 import jax
@@ -11,6 +13,7 @@ import pytest
 
 import mcgicp_jax as mcg
 from mcgicp_jax._compute.cache import Cache, cached_with_cloud
+from mcgicp_jax._compute.tables import RowsOnDemand
 from tests.scenes import motion, room_corner
 
 METHOD = mcg.MultiChannelGICP(0.05, 0.3)
@@ -128,3 +131,20 @@ def test_matches_of_a_cloud_are_those_of_a_new_one(cloud, arguments):
         # There, trees are cached by the content of the target.
         inside = jax.jit(lambda *clouds, given=given: rows(*clouds, given))(source, target)
         np.testing.assert_array_equal(each, inside)
+
+
+def test_rows_are_computed_once_by_threads_that_share_a_table():
+    computed = []
+
+    def compute(rows, _):
+        rows = np.arange(20) if rows is None else rows
+        time.sleep(0.02)
+        computed.extend(rows.tolist())
+        return 10 * rows
+
+    table = RowsOnDemand(compute, 20)
+    wanted = [np.arange(k, k + 10) for k in (0, 5, 0, 10, 5, 3, 0, 10)]
+    with ThreadPoolExecutor(len(wanted)) as threads:
+        found = list(threads.map(lambda rows: table.known(rows)[rows], wanted))
+    np.testing.assert_array_equal(found, 10 * np.array(wanted))
+    assert sorted(computed) == list(range(20))
