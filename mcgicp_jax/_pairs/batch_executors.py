@@ -103,13 +103,15 @@ class Processes(Executor):
 
     def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:
         """Cancel the futures of this batch, if so wanted. Those in loky's queue cannot be cancelled: the workers are
-        ended, too, unless they are at work for another batch."""
-        if cancel_futures:
-            batches = list(self._unfinished.items())
-            for future in (future for future, batch in batches if batch is self):
-                future.cancel()
-            if all(batch is self for _, batch in batches):
-                self._pool.shutdown(wait, kill_workers=True)
+        ended instead, unless they are at work for another batch."""
+        if not cancel_futures:
+            return
+        batches = list(self._unfinished.items())
+        # Ended workers fail all futures, which loky cannot do to cancelled ones.
+        if all(batch is self for _, batch in batches):
+            self._pool.shutdown(wait, kill_workers=True)
+        for future in (future for future, batch in batches if batch is self):
+            future.cancel()
 
 
 def _begin_worker(parent: int) -> None:
