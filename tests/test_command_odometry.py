@@ -126,3 +126,13 @@ def test_frames_before_an_invalid_one_are_written(tmp_path, capsys, monkeypatch,
 def test_cells_have_default_sizes(capsys):
     assert main(["odometry", "box-room", "--num-frames", "2", "--method", "ndt"]) == 0
     assert "1 of 1 converged" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("method", [[], ["--method", "gicp"]])
+def test_frames_without_common_channels_are_registered_by_gicp(tmp_path, capsys, method):
+    for i, frame in enumerate(datasets.box_room(2, points_per_frame=2000)):
+        names = ("red", "green", "blue") if i == 0 else ("a", "b", "c")
+        io.write(tmp_path / f"{i}.npz", PointCloud(frame.cloud.points, frame.cloud.channels, channel_names=names))
+    assert main(["odometry", str(tmp_path), *method]) == 0
+    text = capsys.readouterr().out
+    assert "1 of 1 converged" in text and "channels:  no" in text

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import contextlib
 import itertools
 import sys
 from collections.abc import Iterator
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeAlias
@@ -105,8 +107,15 @@ def odometry(
     }
     first = frames[0]
     print(f"frames:    {len(frames)} of {dataset}, {len(first.cloud):,} points in the first")
+    start = {"the first frame": first.cloud}
+    # Where the second frame cannot be read, the odometry names the error.
+    with contextlib.suppress(ValueError, OSError):
+        start["the second"] = frames[1].cloud
     choices = Choices.of(shared, first.cloud)
-    name = choices.method_name(method, {"the first frame": first.cloud})
+    if not shared.channels:
+        common = set.intersection(*(set(cloud.channel_names) for cloud in start.values()))
+        choices = replace(choices, channels=tuple(name for name in choices.channels if name in common))
+    name = choices.method_name(method, start)
     print(f"points:    {choices.voxels}")
 
     def first_two() -> tuple[mcg.PointCloud, mcg.PointCloud]:
