@@ -6,7 +6,6 @@ import contextlib
 import itertools
 import sys
 from collections.abc import Iterator
-from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeAlias
@@ -111,10 +110,7 @@ def odometry(
     # Where the second frame cannot be read, the odometry names the error.
     with contextlib.suppress(ValueError, OSError):
         start["the second"] = frames[1].cloud
-    choices = Choices.of(shared, first.cloud)
-    if not shared.channels:
-        common = set.intersection(*(set(cloud.channel_names) for cloud in start.values()))
-        choices = replace(choices, channels=tuple(name for name in choices.channels if name in common))
+    choices = Choices.of(shared, *start.values())
     name = choices.method_name(method, start)
     print(f"points:    {choices.voxels}")
 

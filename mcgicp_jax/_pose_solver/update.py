@@ -54,10 +54,7 @@ class Update(eqx.Module):
 
 
 def solve_update(
-    sums: Sums,
-    basis: Float[Array, "6 6"],
-    pull: Float[Array, "6"] | None = None,
-    stiffness: Float[Array, "6 6"] | None = None,
+    sums: Sums, basis: Float[Array, "6 6"], others: tuple[Float[Array, "6"], Float[Array, "6 6"]] | None = None
 ) -> Update:
     """Minimise Σ w (d − D h)ᵀ M (d − D h) = e − 2⟨D, G⟩ + ⟨D, Q(D)⟩ (symbols as in `sums`) over the pose change D =
     [ΔR − I | Δt], with M and w fixed.
@@ -69,11 +66,12 @@ def solve_update(
     Args:
         basis: (6, 6), columns: twists along which the pose may move, lengths in units of the radius. Zero columns
             keep the pose fixed along their directions.
-        pull, stiffness: force and stiffness of other measurements of the pose, for its twist, in units of the radius.
+        others: force and stiffness of other measurements of the pose, for its twist with lengths in units of the radius.
     """
     radius, dtype = sums.radius, sums.center.dtype
     form = _quadratic_form(sums, radius)
-    if stiffness is not None and pull is not None:
+    if others is not None:
+        pull, stiffness = others
         # D is [ω× | v] to first order.
         twist = jnp.asarray(_TANGENT, dtype).T / jnp.asarray([1, 1, 1, 2, 2, 2], dtype)[:, None]
         form = form + jnp.block(

@@ -195,7 +195,7 @@ def update(
     elif measurements is None or directions is None:
         change = solve_update(sums, basis)
     else:
-        change = solve_update(sums, basis, *first_pull(pose, sums, directions, measurements))
+        change = solve_update(sums, basis, first_pull(pose, sums, directions, measurements))
     moved = move_pose(pose, change.twist, sums.center)
     moved = moved if fixed is None else with_fixed_directions(moved, fixed)
     # Matches need not constrain what is fixed.
