@@ -13,11 +13,11 @@ from jaxtyping import Array
 from mcgicp_jax._clouds.point_cloud import PointCloud
 from mcgicp_jax._compute.concrete import is_concrete
 from mcgicp_jax._compute.linear_maps import AbstractLinearMap, primal, with_derivative
-from mcgicp_jax._compute.threads import without_checks_of_jax
+from mcgicp_jax._compute.threads import with_settings_of_package
 from mcgicp_jax._math.poses import Pose, matrices_of, pose_matrix, rotation_from_quaternion, turn_by_quaternion
 
 
-@without_checks_of_jax
+@with_settings_of_package
 def centred_pose(pose: Pose | None, source: PointCloud, target: PointCloud, name: str = "init") -> Array | np.ndarray:
     """T(−o_t) · T · T(o_s), (4, 4): the pose between coordinates relative to the clouds' origins, in its own precision.
 
@@ -44,7 +44,7 @@ def centred_pose(pose: Pose | None, source: PointCloud, target: PointCloud, name
     return jnp.asarray(matrix).at[:3, 3].set(shifted)
 
 
-@without_checks_of_jax
+@with_settings_of_package
 def pose_in_user_frame(
     centred: jaxlie.SE3, source_origin: Array | np.ndarray, target_origin: Array | np.ndarray
 ) -> Array | np.ndarray:

@@ -17,7 +17,7 @@ from mcgicp_jax._clouds.columns import arrays_of
 from mcgicp_jax._compute.concrete import is_concrete
 from mcgicp_jax._compute.messages import messages_named
 from mcgicp_jax._compute.programs import size_class
-from mcgicp_jax._compute.threads import without_checks_of_jax
+from mcgicp_jax._compute.threads import with_settings_of_package
 from mcgicp_jax._math.poses import Pose, pose_matrix, rotated
 from mcgicp_jax._search.base import NeighborsOnDemand
 
@@ -366,7 +366,7 @@ class PointCloud(eqx.Module):
         """Replace fields without checks; the number of rows may change."""
         return _build(**vars(self) | arrays)
 
-    @without_checks_of_jax
+    @with_settings_of_package
     def transform(self, pose: Pose) -> PointCloud:
         """Transform the cloud by a pose: points p become R p + t, covariances C become R C Rᵀ.
 

@@ -13,7 +13,7 @@ import jax
 import numpy as np
 
 from mcgicp_jax._compute.concrete import outside_trace
-from mcgicp_jax._compute.threads import without_checks_of_jax
+from mcgicp_jax._compute.threads import with_settings_of_package
 
 Value = TypeVar("Value")
 Parameters = ParamSpec("Parameters")
@@ -113,7 +113,7 @@ class Lazy(Generic[Value]):
         with self._lock:
             if self._compute is not None:
                 with outside_trace():
-                    self._value = without_checks_of_jax(self._compute)()
+                    self._value = with_settings_of_package(self._compute)()
                 # Frees the arrays that the closure holds.
                 self._compute = None
         return self._value

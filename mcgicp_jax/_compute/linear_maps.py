@@ -18,7 +18,7 @@ from jaxtyping import Float, Int
 from scipy.sparse import csr_array
 
 from mcgicp_jax._compute.concrete import AnyArray, is_concrete, is_deferred
-from mcgicp_jax._compute.threads import in_new_thread, side_by_side, without_checks_of_jax
+from mcgicp_jax._compute.threads import in_new_thread, side_by_side, with_settings_of_package
 
 
 class AbstractLinearMap(abc.ABC):
@@ -107,7 +107,7 @@ def with_derivative(values: Sequence[np.ndarray], linear: AbstractLinearMap, inp
     def attached(*inputs: Any) -> list[jax.Array]:
         return [jnp.asarray(value) for value in values]
 
-    @without_checks_of_jax
+    @with_settings_of_package
     def rule(inputs: tuple[Any, ...], tangents: tuple[Any, ...]) -> tuple[list[jax.Array], list[jax.Array]]:
         # An outer differentiation, even by other inputs, would see constants.
         for each in inputs:
@@ -162,7 +162,7 @@ class RowAverage(AbstractLinearMap):
         return [found]
 
 
-@without_checks_of_jax
+@with_settings_of_package
 def averaged(values: Float[AnyArray, "N D"], groups: Int[np.ndarray, "N"]) -> Float[AnyArray, "M D"]:
     """The mean of the rows of each group; −1: of none. Outside of `jit` summed in float64, and nothing is compiled."""
     rows = np.flatnonzero(groups >= 0)
@@ -204,7 +204,7 @@ _linear.multiple_results = True
 
 
 @_linear.def_impl
-@without_checks_of_jax
+@with_settings_of_package
 def _call(*operands: Any, function: Callable, transpose: Callable, inputs: Any, outputs: Any, batch: Any) -> list[Any]:
     count = math.prod(batch)
     arrays = [np.asarray(each).reshape((count, *aval.shape)) for each, aval in zip(operands, inputs, strict=True)]

@@ -29,7 +29,7 @@ from mcgicp_jax._compute.concrete import Deferred, is_concrete, outside_trace
 from mcgicp_jax._compute.linear_maps import AbstractLinearMap, primal, with_derivative
 from mcgicp_jax._compute.programs import quickly_compiled
 from mcgicp_jax._compute.tables import BLOCK, NEIGHBORHOOD_BLOCK, Packed, RowsOnDemand, blocks
-from mcgicp_jax._compute.threads import in_new_thread, num_cores, side_by_side, without_checks_of_jax
+from mcgicp_jax._compute.threads import in_new_thread, num_cores, side_by_side, with_settings_of_package
 
 # Points. Inside transformations, neighbourhoods of more points are processed in blocks, too: on CPUs XLA sums over the
 # first axis of a wider table column by column, which is twenty times slower.
@@ -229,7 +229,7 @@ class RowFunction:
         gathered = _Gathered(self._inputs, self._size, None, num_threads)
         return [part for _, part in self._over_blocks(gathered, num_threads, packed)]
 
-    @without_checks_of_jax
+    @with_settings_of_package
     def _over_blocks(
         self, gathered: _Gathered, num_threads: int | None, packed: bool = True
     ) -> list[tuple[slice, Any]]:
@@ -385,7 +385,7 @@ def as_table(table: Any) -> Table:
     return table if isinstance(table, Table) else GivenTable(table)
 
 
-@without_checks_of_jax
+@with_settings_of_package
 def blockwise(function: Callable[..., Any], numbers: Any, *inputs: Input, total: bool = False) -> Any:
     """Apply a row function, outside or inside of transformations.
 

@@ -30,13 +30,16 @@ _SETTINGS: tuple[Any, ...] = (
 )
 
 
-def without_checks_of_jax(function: Callable[Parameters, Answer]) -> Callable[Parameters, Answer]:
-    """Decorator of functions without the optional checks of JAX, which users turn on for their own code: `debug_nans`
-    and `debug_infs`, since NaN marks missing values here, and strict promotion of dtypes and ranks. Products of
-    matrices are in full precision: by default, GPUs round factors to 11 bits (TF32), 5 cm at 100 m."""
+def with_settings_of_package(function: Callable[Parameters, Answer]) -> Callable[Parameters, Answer]:
+    """Decorator of functions in which JAX has the settings that the package needs, whatever users chose for their code.
+
+    Optional checks are off: `debug_nans` and `debug_infs`, since NaN marks missing values here, and strict promotion of
+    dtypes and ranks. Products of matrices are in full precision: by default, GPUs round factors to 11 bits (TF32), that
+    is 5 cm at 100 m.
+    """
 
     @functools.wraps(function)
-    def unchecked(*arguments: Parameters.args, **named: Parameters.kwargs) -> Answer:
+    def configured(*arguments: Parameters.args, **named: Parameters.kwargs) -> Answer:
         with (
             jax.debug_nans(False),
             jax.debug_infs(False),
@@ -46,7 +49,7 @@ def without_checks_of_jax(function: Callable[Parameters, Answer]) -> Callable[Pa
         ):
             return function(*arguments, **named)
 
-    return unchecked
+    return configured
 
 
 def num_cores() -> int:

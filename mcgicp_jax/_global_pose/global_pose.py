@@ -15,7 +15,7 @@ from mcgicp_jax._clouds.preprocess import finite_rows, with_neighbors
 from mcgicp_jax._clouds.voxels import grid_of, voxel_order
 from mcgicp_jax._compute.concrete import AnyArray, outside_trace
 from mcgicp_jax._compute.messages import check_positive, messages_named
-from mcgicp_jax._compute.threads import without_checks_of_jax
+from mcgicp_jax._compute.threads import with_settings_of_package
 from mcgicp_jax._global_pose.features import NUM_NEIGHBORS, matches_of_features, matches_of_rows
 from mcgicp_jax._global_pose.robust_pose_fit import (
     MIN_SEPARATION,
@@ -123,7 +123,7 @@ class GlobalPoseResult:
         )
 
 
-@without_checks_of_jax
+@with_settings_of_package
 def global_pose(
     source: PointCloud | Values,
     target: PointCloud | Values,

@@ -16,7 +16,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from mcgicp_jax._compute.concrete import AnyArray, numpy_for
-from mcgicp_jax._compute.threads import without_checks_of_jax
+from mcgicp_jax._compute.threads import with_settings_of_package
 
 # Row and column of each entry of a symmetric matrix.
 _ROWS, _COLUMNS = np.array([[0, 0, 0, 1, 1, 2], [0, 1, 2, 1, 2, 2]], np.int32)
@@ -177,7 +177,7 @@ def _null_vector(xx: Array, xy: Array, xz: Array, yy: Array, yz: Array, zz: Arra
 
 
 @_smallest_eigenvector.defjvp
-@without_checks_of_jax
+@with_settings_of_package
 def _smallest_eigenvector_jvp(
     primals: tuple[Float[Array, "6 N"]], tangents: tuple[Float[Array, "6 N"]]
 ) -> tuple[Float[Array, "3 N"], Float[Array, "3 N"]]:

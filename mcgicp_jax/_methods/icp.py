@@ -10,7 +10,7 @@ from jaxtyping import Array, Float
 
 from mcgicp_jax._clouds.point_cloud import PointCloud, Values
 from mcgicp_jax._compute.concrete import AnyArray
-from mcgicp_jax._compute.threads import without_checks_of_jax
+from mcgicp_jax._compute.threads import with_settings_of_package
 from mcgicp_jax._local_geometry.covariances import plane_covariance
 from mcgicp_jax._local_geometry.local_geometry import Geometries, LocalGeometry
 from mcgicp_jax._local_geometry.neighborhoods import Neighborhoods
@@ -83,7 +83,7 @@ class ColorICP(AbstractOneSided):
         self.channel_weights = weights_of(channel_weights)
         self.missing_variance = None
 
-    @without_checks_of_jax
+    @with_settings_of_package
     def resolve(self, source: PointCloud, target: PointCloud, geometries: Geometries | None = None) -> ColorICP:
         """The method with `missing_variance` set to the Λ that `MultiChannelGICP` chooses, if points lack channels;
         constant to autodiff."""

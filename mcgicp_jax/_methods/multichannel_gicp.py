@@ -17,7 +17,7 @@ from mcgicp_jax._clouds.point_cloud import PointCloud, Values
 from mcgicp_jax._clouds.preprocess import preprocess
 from mcgicp_jax._compute.concrete import AnyArray, constant, numpy_for
 from mcgicp_jax._compute.devices import put_on_cpu
-from mcgicp_jax._compute.threads import without_checks_of_jax
+from mcgicp_jax._compute.threads import with_settings_of_package
 from mcgicp_jax._local_geometry.cloud_statistics import channel_noise, point_spacing
 from mcgicp_jax._local_geometry.covariances import channel_kernel, multichannel_covariance, plane_covariance
 from mcgicp_jax._local_geometry.local_geometry import Geometries, LocalGeometry, local_geometries
@@ -103,7 +103,7 @@ class MultiChannelGICP(AbstractGeneralized):
         self.min_eigenvalue = None if min_eigenvalue is None else positive_scalar("min_eigenvalue", min_eigenvalue)
         self.photometric = photometric
 
-    @without_checks_of_jax
+    @with_settings_of_package
     def resolve(self, source: PointCloud, target: PointCloud, geometries: Geometries | None = None) -> MultiChannelGICP:
         """The method with unset parameters chosen from the data; constants to autodiff.
 
@@ -187,7 +187,7 @@ class MultiChannelGICP(AbstractGeneralized):
         return xp.broadcast_to(xp.diagonal(covariance) if covariance.ndim == 2 else covariance, (num_channels,))
 
 
-@without_checks_of_jax
+@with_settings_of_package
 def estimate_channel_covariance(
     clouds: Sequence[PointCloud], poses: Sequence[Pose], *, max_distance: float | None = None
 ) -> Float[np.ndarray, "C C"]:

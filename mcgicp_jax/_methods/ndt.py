@@ -19,7 +19,7 @@ from mcgicp_jax._compute.concrete import AnyArray, is_concrete, numpy_for
 from mcgicp_jax._compute.linear_maps import averaged
 from mcgicp_jax._compute.messages import check_integer, check_positive, is_number
 from mcgicp_jax._compute.row_functions import Input, Rows, blockwise
-from mcgicp_jax._compute.threads import without_checks_of_jax
+from mcgicp_jax._compute.threads import with_settings_of_package
 from mcgicp_jax._local_geometry.local_geometry import LocalGeometry
 from mcgicp_jax._local_geometry.neighborhoods import Neighborhoods
 from mcgicp_jax._math import symmetric_matrices as alg
@@ -69,7 +69,7 @@ def voxel_gaussians(
 ) -> tuple[PointCloud, Int[np.ndarray, "M"]]: ...
 
 
-@without_checks_of_jax
+@with_settings_of_package
 def voxel_gaussians(
     cloud: PointCloud | Values,
     voxel_size: float,
@@ -217,7 +217,7 @@ def _split(
     return order[again], np.flatnonzero(np.append(True, changes))
 
 
-@without_checks_of_jax
+@with_settings_of_package
 def cell_moments(
     points: Float[AnyArray, "N 3"],
     channels: Float[AnyArray, "N C"],

@@ -13,7 +13,7 @@ from mcgicp_jax._clouds.point_cloud import PointCloud
 from mcgicp_jax._compute.concrete import AnyArray, constant, is_concrete, numpy_for
 from mcgicp_jax._compute.linear_maps import primal
 from mcgicp_jax._compute.row_functions import Input, Rows, blockwise
-from mcgicp_jax._compute.threads import without_checks_of_jax
+from mcgicp_jax._compute.threads import with_settings_of_package
 from mcgicp_jax._local_geometry.local_geometry import searched
 from mcgicp_jax._local_geometry.neighborhoods import of_rows
 from mcgicp_jax._math import symmetric_matrices as alg
@@ -27,7 +27,7 @@ from mcgicp_jax._search.base import Correspondences
 from mcgicp_jax._terms.base import AbstractAdaptiveTerm, AbstractTerm
 
 
-@without_checks_of_jax
+@with_settings_of_package
 def mahalanobis_cost(
     pose: Pose,
     source: PointCloud,

@@ -10,7 +10,7 @@ from jax.typing import ArrayLike
 from mcgicp_jax._clouds.point_cloud import PointCloud
 from mcgicp_jax._compute.concrete import is_concrete, numpy_for
 from mcgicp_jax._compute.linear_maps import primal
-from mcgicp_jax._compute.threads import in_new_thread, without_checks_of_jax
+from mcgicp_jax._compute.threads import in_new_thread, with_settings_of_package
 from mcgicp_jax._math.poses import Pose
 from mcgicp_jax._math.robust_kernels import AbstractKernel
 from mcgicp_jax._methods.base import AbstractMethod
@@ -23,7 +23,7 @@ from mcgicp_jax._registration.result import RegistrationResult
 from mcgicp_jax._search.base import Correspondences
 
 
-@without_checks_of_jax
+@with_settings_of_package
 def estimate_pose(
     source: PointCloud,
     target: PointCloud,

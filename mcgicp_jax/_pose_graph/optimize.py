@@ -15,7 +15,7 @@ from jaxtyping import Array, Bool, Float, Int
 from mcgicp_jax._compute.cache import Lazy
 from mcgicp_jax._compute.concrete import AnyArray, is_concrete, numpy_for
 from mcgicp_jax._compute.messages import check_integer
-from mcgicp_jax._compute.threads import without_checks_of_jax
+from mcgicp_jax._compute.threads import with_settings_of_package
 from mcgicp_jax._pose_graph.edge import WORLD, Edge
 from mcgicp_jax._pose_graph.graph import PoseGraph
 from mcgicp_jax._pose_graph.implicit_derivative import Found, covariances_traced, solve_traced
@@ -109,7 +109,7 @@ class PoseGraphResult:
         )
 
 
-@without_checks_of_jax
+@with_settings_of_package
 def optimize_poses(graph: PoseGraph, *, robust: bool = True, max_iterations: int = 100) -> PoseGraphResult:
     """Find the poses that minimise Σ rᵀΛr over all measurements of a graph.
 

@@ -13,7 +13,7 @@ from jaxtyping import Array, Bool, Float
 
 from mcgicp_jax._compute.concrete import AnyArray, numpy_for
 from mcgicp_jax._compute.linear_maps import is_symbolic_zero, once
-from mcgicp_jax._compute.threads import without_checks_of_jax
+from mcgicp_jax._compute.threads import with_settings_of_package
 from mcgicp_jax._math.poses import parameters_by_twist, units
 from mcgicp_jax._pose_solver.matched import Matched, Motion, linearize_at
 from mcgicp_jax._pose_solver.pose_measurements import Fusion
@@ -105,7 +105,7 @@ def with_derivative(pose: Float[Array, "7"], root: ImplicitRoot, model: Model) -
     return pose
 
 
-@without_checks_of_jax
+@with_settings_of_package
 def _with_derivative_jvp(
     primals: tuple[Float[Array, "7"], ImplicitRoot, Model], tangents: tuple[Any, Any, Any]
 ) -> tuple[Float[Array, "7"], Float[Array, "7"]]:

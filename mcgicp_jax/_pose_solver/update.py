@@ -66,7 +66,7 @@ def solve_update(
     Args:
         basis: (6, 6), columns: twists along which the pose may move, lengths in units of the radius. Zero columns
             keep the pose fixed along their directions.
-        others: force and stiffness of other measurements of the pose, for its twist with lengths in units of the radius.
+        others: force and stiffness of other measurements of the pose, for its twist, lengths in units of the radius.
     """
     radius, dtype = sums.radius, sums.center.dtype
     form = _quadratic_form(sums, radius)

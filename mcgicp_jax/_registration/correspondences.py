@@ -16,7 +16,7 @@ from mcgicp_jax._compute.cache import cached_with_cloud
 from mcgicp_jax._compute.concrete import constant, is_concrete
 from mcgicp_jax._compute.linear_maps import primal
 from mcgicp_jax._compute.messages import check_integer, check_positive
-from mcgicp_jax._compute.threads import without_checks_of_jax
+from mcgicp_jax._compute.threads import with_settings_of_package
 from mcgicp_jax._math.poses import Pose, rotated, se3_from_matrix
 from mcgicp_jax._methods.base import AbstractMethod
 from mcgicp_jax._methods.surfaces import search_numbers, search_rows, searchable
@@ -26,7 +26,7 @@ from mcgicp_jax._search.base import AbstractIndex, AbstractSearch, Correspondenc
 from mcgicp_jax._search.brute_force import default_search
 
 
-@without_checks_of_jax
+@with_settings_of_package
 def find_correspondences(
     source: PointCloud,
     target: PointCloud,

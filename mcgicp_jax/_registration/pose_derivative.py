@@ -24,7 +24,7 @@ from mcgicp_jax._compute.devices import on_cpu
 from mcgicp_jax._compute.linear_maps import AbstractLinearMap, SideBySide, primal, with_derivative
 from mcgicp_jax._compute.programs import quickly_compiled
 from mcgicp_jax._compute.row_functions import Input, RowFunction, Rows, blockwise
-from mcgicp_jax._compute.threads import without_checks_of_jax
+from mcgicp_jax._compute.threads import with_settings_of_package
 from mcgicp_jax._math.poses import (
     parameters_by_twist,
     rotation_from_quaternion,
@@ -238,7 +238,7 @@ def _pull_balance(
     return jax.vmap(pull)(cotangents)
 
 
-@without_checks_of_jax
+@with_settings_of_package
 def jacobian(
     inputs: Inputs, executor: HostExecutor, loop: LoopResult, cloud: str, field: str
 ) -> Float[np.ndarray, "6 ..."]:

@@ -18,7 +18,7 @@ from mcgicp_jax._compute.cache import Lazy
 from mcgicp_jax._compute.concrete import AnyArray, constant, is_concrete, numpy_for, outside_trace
 from mcgicp_jax._compute.linear_maps import primal
 from mcgicp_jax._compute.messages import messages_named
-from mcgicp_jax._compute.threads import in_new_thread, without_checks_of_jax
+from mcgicp_jax._compute.threads import in_new_thread, with_settings_of_package
 from mcgicp_jax._local_geometry.cloud_statistics import (
     warn_of_exposure,
     warn_of_units,
@@ -75,7 +75,7 @@ class Run(NamedTuple):
     moments: Callable[[], Moments]
 
 
-@without_checks_of_jax
+@with_settings_of_package
 def register_pair(
     source: PointCloud | Values,
     target: PointCloud | Values,
@@ -119,7 +119,7 @@ def prepared(
     return Inputs(source, target, method, options.robust, *known(tie_points, prior, source, target))
 
 
-@without_checks_of_jax
+@with_settings_of_package
 def run_pair(given: Inputs, init: Pose | None, options: Options) -> Run:
     """Register arrays that are all concrete, or some of which `jit` or `vmap` trace."""
     search = options.search or default_search(given, init, options.numbers)
@@ -169,7 +169,7 @@ def _fused(run: Run, options: Options, search: AbstractSearch) -> Run:
     return run_loop(inputs, problem, search, options.max_iterations)
 
 
-@without_checks_of_jax
+@with_settings_of_package
 def results_of(runs: Sequence[Run], givens: Sequence[Inputs | None]) -> list[RegistrationResult]:
     """The results of registrations.
 
@@ -229,7 +229,7 @@ def run_loop(inputs: Inputs, problem: Problem, search: AbstractSearch | None, ma
     return Run(inputs, problem, loop, executor, lambda: loop.state, lambda: assessment, lambda: moments.value)
 
 
-@without_checks_of_jax
+@with_settings_of_package
 def pose_problem(
     given: Inputs, init: Pose | None, options: Options, num_threads: int | None, matches: Matches | None = None
 ) -> tuple[Problem, Inputs]:

@@ -17,7 +17,7 @@ from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from jaxtyping import Array, Bool, Int
 
 from mcgicp_jax._compute.devices import default_devices
-from mcgicp_jax._compute.threads import without_checks_of_jax
+from mcgicp_jax._compute.threads import with_settings_of_package
 from mcgicp_jax._registration.assessment import Assessment
 from mcgicp_jax._registration.loop import LoopResult, step
 from mcgicp_jax._registration.step import Problem, Record, State
@@ -142,14 +142,14 @@ def _put(lanes: Lanes, lane: Lanes, number: Int[Array, ""]) -> Lanes:
     return jax.tree.map(lambda leaves, leaf: leaves.at[number].set(leaf), lanes, lane)
 
 
-@without_checks_of_jax
+@with_settings_of_package
 @partial(jax.jit, static_argnames="max_iterations")
 def begin_lane(problem: Problem, search: AbstractSearch, max_iterations: int) -> LoopResult:
     """The loop before its first step, compiled."""
     return TracedExecutor(problem, search, max_iterations).begin()
 
 
-@without_checks_of_jax
+@with_settings_of_package
 @partial(jax.jit, static_argnames="num_steps")
 def run_lanes(problems: Problem, loops: LoopResult, search: AbstractSearch, num_steps: int) -> LoopResult:
     """Run at most `num_steps` steps of many stacked loops; finished loops do not change."""
@@ -167,7 +167,7 @@ def run_lanes(problems: Problem, loops: LoopResult, search: AbstractSearch, num_
     return jax.vmap(run)(problems, loops)
 
 
-@without_checks_of_jax
+@with_settings_of_package
 @jax.jit
 def assess_lanes(problems: Problem, loops: LoopResult, search: AbstractSearch) -> Assessment:
     """Information matrices, directions and covariances of stacked loops, at their current poses."""
