@@ -139,7 +139,7 @@ def measured(problem: Problem, ties: TiePoints | None, prior: Prior | None) -> P
 
     fixed = None if prior is None or prior.fixed is None else as_dtype(prior)
     if fixed is not None:
-        with jax.default_matmul_precision("highest"), outside_trace() if xp is np else nullcontext():
+        with outside_trace() if xp is np else nullcontext():
             start = with_fixed_directions(start, fixed)
         start = jax.tree.map(np.asarray, start) if xp is np else start
     matrix, valid = matrix_of(start), rows.valid[:, None]
