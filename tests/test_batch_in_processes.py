@@ -162,9 +162,12 @@ def is_running(pid):
 
 
 SCRIPT = """
-import os, sys, time
+import os, signal, sys, time
 import numpy as np
 import mcgicp_jax as mcg
+
+# Shells start what they run in the background with this signal ignored, and the tests may be among that.
+signal.signal(signal.SIGINT, signal.default_int_handler)
 
 def cloud():
     # One write: lines of several processes must not mix.
