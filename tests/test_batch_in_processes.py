@@ -82,7 +82,17 @@ def test_a_pair_that_ends_its_workers_is_given_up_alone(raw, alone):
         results = in_processes(sources, targets)
     first, second = (str(each.message) for each in caught)
     assert "a worker failed (TerminatedWorkerError" in first and "pair 2: its worker failed twice" in second
+    assert "\n" not in first + second
     assert results[2].status is Status.WORKER_FAILED
+    assert_same(results[:2] + results[3:], alone[:2] + alone[3:])
+
+
+def test_a_pair_without_enough_memory_is_given_up_alone(raw, alone):
+    sources, targets = prepared(raw)
+    sources[2] = lambda: np.ones(10**14)
+    with pytest.warns(mcg.PairWarning, match="^pair 2: source: MemoryError: Unable to allocate") as caught:
+        results = in_processes(sources, targets)
+    assert len(caught) == 1 and results[2].status is Status.INVALID_INPUT
     assert_same(results[:2] + results[3:], alone[:2] + alone[3:])
 
 

@@ -314,4 +314,5 @@ def _reason(error: PicklingError) -> str:
 
 
 def _words(error: BaseException) -> str:
-    return f"{type(error).__name__}: {error}".rstrip(": ")
+    # The first line: loky goes on with exit codes and advice.
+    return f"{type(error).__name__}: {error}".partition("\n")[0].rstrip(": ")
