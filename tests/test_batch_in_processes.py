@@ -171,6 +171,14 @@ def is_running(pid):
         return False
 
 
+def all_ended(pids):
+    """Whether no process is running, ten seconds from now at the latest."""
+    deadline = time.monotonic() + 10
+    while any(map(is_running, pids)) and time.monotonic() < deadline:
+        time.sleep(0.1)
+    return not any(map(is_running, pids))
+
+
 SCRIPT = """
 import os, signal, sys, time
 import numpy as np
@@ -215,7 +223,42 @@ def test_a_script_without_a_guard_leaves_no_process(tmp_path, number):
             text, errors = process.communicate(timeout=60)
             assert ("done 6" in text) == (number is None)
             assert errors.count("Traceback") == (number is not None), errors
-    deadline = time.monotonic() + 10
-    while any(map(is_running, pids)) and time.monotonic() < deadline:
-        time.sleep(0.1)
-    assert not any(map(is_running, pids))
+    assert all_ended(pids)
+
+
+CELL = """
+import os, signal, threading
+import numpy as np
+import mcgicp_jax as mcg
+
+def cloud():
+    return np.random.default_rng(0).random((100, 3))
+
+def register(count):
+    results = mcg.register_batch([cloud] * count, cloud, mcg.PointToPoint(), max_iterations=1, executor="processes")
+    print(len(results))
+"""
+INTERRUPTED = """
+threading.Timer(1, lambda: os.kill(os.getpid(), signal.SIGINT)).start()
+try:
+    register(100_000)
+except KeyboardInterrupt:
+    print("interrupted")
+"""
+# The workers are children of the kernel.
+CHILDREN = """
+with open(f"/proc/self/task/{os.getpid()}/children") as file:
+    print(file.read())
+"""
+
+
+def test_cells_of_a_notebook_share_workers_that_end_with_it():
+    """Functions of a cell are sent to the workers, and after an interrupted cell the next one runs."""
+    nbclient, nbformat = pytest.importorskip("nbclient"), pytest.importorskip("nbformat")
+    sources = [CELL, "register(6)", INTERRUPTED, "register(6)", CHILDREN]
+    notebook = nbformat.v4.new_notebook(cells=list(map(nbformat.v4.new_code_cell, sources)))
+    nbclient.NotebookClient(notebook, timeout=120).execute()
+    _, first, interrupted, second, children = ("".join(o.get("text", "") for o in c.outputs) for c in notebook.cells)
+    assert first == second == "6\n" and interrupted == "interrupted\n"
+    pids = set(map(int, children.split()))
+    assert pids and all_ended(pids)
