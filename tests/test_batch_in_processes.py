@@ -194,9 +194,24 @@ def cloud():
     return np.random.default_rng(0).random((100, 3))
 
 count = int(sys.argv[1])
+print(os.getpid(), flush=True)
 results = mcg.register_batch([cloud] * count, cloud, mcg.PointToPoint(), max_iterations=1, executor="processes")
 print("done", len(results), flush=True)
 """
+
+
+def test_workers_that_are_starting_do_not_report_an_interrupt(tmp_path):
+    script = tmp_path / "script.py"
+    script.write_text(textwrap.dedent(SCRIPT))
+    output = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
+    command = [sys.executable, str(script), "100000"]
+    with subprocess.Popen(command, text=True, start_new_session=True, **output) as process:
+        process.stdout.readline()
+        # They import NumPy and JAX for some seconds.
+        time.sleep(0.7)
+        os.killpg(process.pid, signal.SIGINT)
+        _, errors = process.communicate(timeout=60)
+    assert errors.count("KeyboardInterrupt") == 1, errors
 
 
 @pytest.mark.parametrize("number", [None, signal.SIGINT, signal.SIGKILL])
@@ -208,7 +223,7 @@ def test_a_script_without_a_guard_leaves_no_process(tmp_path, number):
     command = [sys.executable, str(script), str(count)]
     output = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
     with subprocess.Popen(command, text=True, start_new_session=True, env=os.environ, **output) as process:
-        pids = {int(process.stdout.readline()) for _ in range(6)} - {process.pid}
+        pids = {int(process.stdout.readline()) for _ in range(7)} - {process.pid}
         assert 1 <= len(pids) <= num_cores()
         if number is signal.SIGINT:
             # The terminal sends it to the whole group.

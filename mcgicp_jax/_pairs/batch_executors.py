@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import collections
+import contextlib
 import itertools
 import os
 import signal
@@ -20,7 +21,7 @@ from concurrent.futures import (
 from concurrent.futures import wait as wait_for
 from dataclasses import replace
 from functools import partial
-from multiprocessing import get_context
+from multiprocessing import get_context, resource_tracker
 from pickle import PicklingError
 from typing import Any, ClassVar, Literal, TypeAlias
 
@@ -89,14 +90,18 @@ class Processes(Executor):
             env=_ENVIRONMENT | known,
         )
         self._pool, self.num_workers = self._current(), num_workers
+        # Or else this would begin beside the first worker, and let Ctrl-C through.
+        resource_tracker.ensure_running()
 
     def submit(self, function: Callable[..., Any], /, *arguments: Any, **named: Any) -> Future[Any]:
-        try:
-            future = self._pool.submit(function, *arguments, **named)
-        except RuntimeError:
-            # A worker died, or another batch that ended early has ended the workers.
-            self._pool = self._current()
-            future = self._pool.submit(function, *arguments, **named)
+        # loky starts workers here, and later one for each that has died.
+        with _without_interrupt():
+            try:
+                future = self._pool.submit(function, *arguments, **named)
+            except RuntimeError:
+                # A worker died, or another batch that ended early has ended the workers.
+                self._pool = self._current()
+                future = self._pool.submit(function, *arguments, **named)
         self._unfinished[future] = self
         future.add_done_callback(self._unfinished.pop)
         return future
@@ -112,6 +117,20 @@ class Processes(Executor):
             self._pool.shutdown(wait, kill_workers=True)
         for future in (future for future, batch in batches if batch is self):
             future.cancel()
+
+
+@contextlib.contextmanager
+def _without_interrupt() -> Iterator[None]:
+    """Context in which Ctrl-C waits. Processes that start in it never get it, so they do not report it either."""
+    if not hasattr(signal, "pthread_sigmask"):
+        # On Windows.
+        yield
+        return
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
 def _begin_worker(parent: int) -> None:
