@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-from functools import partial
-
 import numpy as np
 from jax.typing import ArrayLike
 
 from mcgicp_jax._clouds.point_cloud import PointCloud
-from mcgicp_jax._compute.concrete import is_concrete, numpy_for
+from mcgicp_jax._compute.concrete import numpy_for
 from mcgicp_jax._compute.linear_maps import primal
-from mcgicp_jax._compute.threads import in_new_thread, with_settings_of_package
+from mcgicp_jax._compute.threads import with_settings_of_package
 from mcgicp_jax._math.poses import Pose
 from mcgicp_jax._math.robust_kernels import AbstractKernel
 from mcgicp_jax._methods.base import AbstractMethod
@@ -18,7 +16,7 @@ from mcgicp_jax._pose_solver.matched import Matches
 from mcgicp_jax._registration.input_checks import check_clouds, check_matches, warn_of_estimated_parameters
 from mcgicp_jax._registration.options import Options
 from mcgicp_jax._registration.pose_derivative import Inputs
-from mcgicp_jax._registration.register_pair import Run, pose_problem, results_of, run_loop
+from mcgicp_jax._registration.register_pair import Run, pose_problem, result_of, run_loop
 from mcgicp_jax._registration.result import RegistrationResult
 from mcgicp_jax._search.base import Correspondences
 
@@ -79,15 +77,9 @@ def estimate_pose(
     warn_of_estimated_parameters(method, source, target, temperature)
     softness = None if temperature is None else numpy_for(temperature).asarray(temperature, source.points.dtype)
     given = Inputs(source, target, method, robust, temperature=softness)
-    values, init, fixed = given.values(), primal(init), Matches.given(primal(matches))
-    if not is_concrete(values, fixed, init, options.numbers):
-        values = given
-    estimate = partial(_estimate, values, fixed, init, options)
-    run = estimate() if values is given or is_concrete(given) else in_new_thread(estimate)
-    (result,) = results_of([run], [given])
-    return result
+    return result_of(given, _estimate, Matches.given(primal(matches)), primal(init), options)
 
 
-def _estimate(given: Inputs, matches: Matches, init: Pose | None, options: Options) -> Run:
+def _estimate(given: Inputs, matches: Matches, init: Pose | None, options: Options, traced: bool = False) -> Run:
     problem, inputs = pose_problem(given, init, options, 1, matches._replace(temperature=given.temperature))
-    return run_loop(inputs, problem, None, options.max_iterations)
+    return run_loop(inputs, problem, None, options.max_iterations, traced)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import partial
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -51,20 +50,19 @@ def assessment_of(executor: AbstractExecutor, loop: LoopResult, moments: Lazy[Mo
     Args:
         moments: `moments_of` the loop; None for a problem with tie points or a prior, which contains its own.
     """
-    state, fusion = loop.state, executor.problem.fusion
+    state = loop.state
 
-    def covariance() -> Float[AnyArray, "6 6"]:
-        known: Any = fusion if moments is None else moments.value
-        if not is_concrete(state, known):
-            return covariance_of_pose(state, known)
+    def known() -> Any:
+        return executor.problem.fusion if moments is None else moments.value
+
+    def covariance() -> Float[np.ndarray, "6 6"]:
         # In float64: unconstrained directions have large variances, next to which others would be lost to rounding.
         with jax.enable_x64(True):
-            return np.asarray(covariance_of_pose(*as_float64((state._replace(record=None), known))))
+            return np.asarray(covariance_of_pose(*as_float64((state._replace(record=None), known()))))
 
-    constraints = partial(constraints_of, state)
-    if is_concrete(state):
-        return Assessment(Lazy(constraints), Lazy(covariance))
-    return Assessment(Lazy.of(constraints()), Lazy.of(covariance()))
+    if not is_concrete(state):
+        return Assessment(Lazy.of(constraints_of(state)), Lazy.of(covariance_of_pose(state, known())))
+    return Assessment(Lazy(lambda: jax.tree.map(np.asarray, constraints_of(state))), Lazy(covariance))
 
 
 def moments_of(executor: AbstractExecutor, loop: LoopResult) -> Moments:
@@ -177,8 +175,8 @@ def registration_of(
     state, source, target = map(primal, (state, source, target))
     concrete = is_concrete(state, history)
     if concrete:
-        # Reading NumPy arrays compiles nothing.
-        state, history = jax.tree.map(np.asarray, (state, history))
+        # Reading NumPy arrays compiles nothing, and NumPy scalars print as numbers.
+        state, history, used = jax.tree.map(lambda array: np.asarray(array)[()], (state, history, used))
         pose = state.pose if is_concrete(pose) else pose
     numbers: Any = {
         "status_code": state.status,
@@ -188,9 +186,6 @@ def registration_of(
         "rmse": state.record.rmse,
         "history": history,
     }
-    if is_concrete(numbers, used):
-        # NumPy scalars print as numbers, arrays without dimensions do not.
-        numbers, used = jax.tree.map(lambda number: np.asarray(number)[()], (numbers, used))
     numbers["num_inliers"] = numbers["num_inliers"].astype(np.int32)
     numbers["overlap"] = (numbers["num_inliers"] / used.sum()).astype(numbers["rmse"].dtype)
     return RegistrationResult.build(
@@ -222,15 +217,9 @@ def _read_only(tree: Any) -> Any:
     return tree
 
 
-def _read(deferred: Lazy[Any]) -> Any:
-    """The value, as NumPy arrays where concrete: arithmetic with a large origin needs float64."""
-    value = deferred.value
-    return jax.tree.map(np.asarray, value) if is_concrete(value) else value
-
-
 def _constraints(assessment: Assessment, origin: Any) -> Constraints:
     """Information matrix and directions in the frame of the user's source."""
-    information, directions = _read(assessment.constraints)
+    information, directions = assessment.constraints.value
     if is_concrete(origin) and not np.any(origin):
         return Constraints(information, directions)
     to_centred, from_centred = translation_adjoint(-origin), translation_adjoint(origin)
@@ -245,7 +234,7 @@ def _constraints(assessment: Assessment, origin: Any) -> Constraints:
 def _uncertainty(assessment: Assessment, state: State, origin: Any) -> Uncertainty:
     """The covariance in the frame of the user's source, and the deviations at the centroid of the matched points."""
     pose, center = constant((state.pose, state.sums.center))
-    covariance = _read(assessment.covariance)
+    covariance = assessment.covariance.value
     xp = numpy_for(covariance, pose, center)
     with np.errstate(invalid="ignore", over="ignore"):
         matrix = pose_in_user_frame(pose, np.zeros(3), np.zeros(3))

@@ -56,9 +56,10 @@ def find_correspondences(
         ValueError: if `max_distance` is not positive, `num_candidates` is below 1, `pose` is not a rigid motion, or
             channels or dtypes do not fit.
     """
-    search = search or default_search(source, target, pose, method, max_distance)
     # Matches are constants to autodiff.
     source, target, pose, method, max_distance = map(primal, (source, target, pose, method, max_distance))
+    traced = not is_concrete(source, target, pose, method, max_distance)
+    search = search or default_search(traced)
     check_clouds(source, target, method)
     method = method.resolve(source, target)
     check_positive("max_distance", max_distance)
@@ -69,7 +70,7 @@ def find_correspondences(
     rows, target_rows = (searchable(method, constant(cloud)) for cloud in (source, target))
     dtype = rows.points.dtype
     start = se3_from_matrix(matrix, dtype).wxyz_xyz
-    if is_concrete(matrix, max_distance, rows, target_rows):
+    if not traced:
         gate = float(np.asarray(max_distance))
         nearest = index_of(search, method, target).nearest(np.asarray(start), rows, gate, num_candidates)
         matches = _correspondences_at(np.asarray(matrix), rows, target_rows, nearest, gate)

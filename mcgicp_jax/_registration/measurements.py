@@ -14,7 +14,7 @@ from jaxtyping import Float
 
 from mcgicp_jax._clouds.origins import centred_pose
 from mcgicp_jax._clouds.point_cloud import PointCloud
-from mcgicp_jax._compute.concrete import AnyArray, constant, is_concrete, numpy_for, outside_trace
+from mcgicp_jax._compute.concrete import AnyArray, constant, is_concrete, outside_trace
 from mcgicp_jax._compute.linear_maps import primal
 from mcgicp_jax._math.poses import matrix_of, translation_adjoint
 from mcgicp_jax._math.symmetric_matrices import inverse_6
@@ -128,20 +128,19 @@ def _information(
     return root.T @ root, _orthonormal(rows[fixed], lengths)
 
 
-def measured(problem: Problem, ties: TiePoints | None, prior: Prior | None) -> Problem:
+def measured(problem: Problem, ties: TiePoints | None, prior: Prior | None, traced: bool) -> Problem:
     """The problem of a first registration with tie points and a prior, which act from the start on."""
     dtype, (start, ties, prior) = problem.start.wxyz_xyz.dtype, constant((problem.start, ties, prior))
     rows = problem.source.search
-    xp = numpy_for(start, ties, prior, rows)
+    xp: Any = jnp if traced else np
 
     def as_dtype(tree: Any) -> Any:
         return jax.tree.map(lambda array: xp.asarray(array, dtype), tree)
 
     fixed = None if prior is None or prior.fixed is None else as_dtype(prior)
     if fixed is not None:
-        with outside_trace() if xp is np else nullcontext():
-            start = with_fixed_directions(start, fixed)
-        start = jax.tree.map(np.asarray, start) if xp is np else start
+        with nullcontext() if traced else outside_trace():
+            start = jax.tree.map(xp.asarray, with_fixed_directions(start, fixed))
     matrix, valid = matrix_of(start), rows.valid[:, None]
     count = xp.maximum(xp.sum(valid), 1)
     mean = xp.sum(xp.where(valid, rows.points, 0), axis=0) / count
@@ -156,27 +155,23 @@ def measured(problem: Problem, ties: TiePoints | None, prior: Prior | None) -> P
     return replace(problem, start=start, measurements=measurements, fixed=fixed)
 
 
-def fusion_of(state: State, moments: Moments, ties: TiePoints | None, prior: Prior | None) -> Fusion:
+def fusion_of(state: State, moments: Moments, ties: TiePoints | None, prior: Prior | None, traced: bool) -> Fusion:
     """The equation of the pose with tie points and prior, from the final state of a first registration."""
     state, moments = constant((state, moments))
     dtype, matrix = state.pose.wxyz_xyz.dtype, matrix_of(state.pose)
     center, directions = state.sums.center, cast(Directions, state.directions)
-    if is_concrete(state):
+    if not traced:
         # Reading NumPy arrays compiles nothing.
         center, directions = jax.tree.map(np.asarray, (center, directions))
     form = form_at(matrix[:3, :3], matrix[:3, 3], center, directions.radius, ties, prior)
-    fixed = primal(form)
-    if is_concrete(state, moments, fixed):
+    if not traced:
         with jax.enable_x64(True), outside_trace():
-            fusion = fuse(*as_float64((state.pose, center, directions, moments, fixed)))
-        fusion = jax.tree.map(lambda array: np.asarray(array, None if array.dtype == bool else dtype), fusion)
-        if form is fixed:
-            return fusion
-    else:
-        fusion = fuse(state.pose, center, directions, moments, constant(fixed))
-        fusion = jax.tree.map(lambda array: array if array.dtype == bool else array.astype(dtype), fusion)
-    form = jax.tree.map(lambda array: jnp.asarray(array, dtype), form)
-    return eqx.tree_at(lambda fusion: fusion.form, fusion, form)
+            fusion = fuse(*as_float64((state.pose, center, directions, moments, form)))
+        return jax.tree.map(lambda array: np.asarray(array, None if array.dtype == bool else dtype), fusion)
+    fusion = fuse(state.pose, center, directions, moments, constant(form))
+    # The form alone has a derivative.
+    fusion = eqx.tree_at(lambda fusion: fusion.form, fusion, form)
+    return jax.tree.map(lambda array: array if array.dtype == bool else array.astype(dtype), fusion)
 
 
 def _parts(name: str, given: Any, form: str, count: int) -> Any:
@@ -187,13 +182,14 @@ def _parts(name: str, given: Any, form: str, count: int) -> Any:
 
 def _numbers(name: str, given: Any, shape: tuple[int, ...]) -> Any:
     """The array, in float64 if it is concrete."""
+    concrete = is_concrete(given)
     try:
-        array = numpy_for(given).asarray(given, np.float64 if is_concrete(given) else None)
+        array = np.asarray(given, np.float64) if concrete else jnp.asarray(given)
     except (TypeError, ValueError) as error:
         raise ValueError(f"{name}: expected numbers of shape {shape}, got {type(given).__name__}") from error
     if array.shape != shape:
         raise ValueError(f"{name}: expected shape {shape}, got {array.shape}")
-    if is_concrete(array) and not np.isfinite(array).all():
+    if concrete and not np.isfinite(array).all():
         raise ValueError(f"{name}: expected finite numbers, got NaN or infinity")
     return array
 

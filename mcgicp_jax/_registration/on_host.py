@@ -63,7 +63,9 @@ class HostExecutor(AbstractExecutor):
         stride = int(settings.stride(status, state.num_iterations))
         alone = bool(status != COARSE and any(term.by_position for term in problem.terms))
         every = slice(None, None, stride)
-        source: SearchPoints = jax.tree.map(lambda array: array[every], problem.source.search)
+        source: SearchPoints = problem.source.search
+        if stride > 1:
+            source = jax.tree.map(lambda array: array[every], source)
         if self._follow is None or (stride, alone) != self._followed:
             self._followed, limit = (stride, alone), float(settings.max_distance)
             among = by_position(source) if alone else source

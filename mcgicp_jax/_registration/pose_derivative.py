@@ -20,7 +20,7 @@ from jaxtyping import Array, Float
 
 from mcgicp_jax._clouds.point_cloud import PointCloud
 from mcgicp_jax._compute.concrete import is_concrete
-from mcgicp_jax._compute.devices import on_cpu
+from mcgicp_jax._compute.devices import computed_on_cpu
 from mcgicp_jax._compute.linear_maps import AbstractLinearMap, SideBySide, primal, with_derivative
 from mcgicp_jax._compute.programs import quickly_compiled
 from mcgicp_jax._compute.row_functions import Input, RowFunction, Rows, blockwise
@@ -92,7 +92,7 @@ class PoseDerivative(AbstractLinearMap):
     ):
         problem = executor.problem
         self._pose, self._fusion = np.asarray(loop.state.pose.wxyz_xyz), problem.fusion
-        root = on_cpu()(root_of)(loop.state._replace(record=None), self._fusion)
+        root = computed_on_cpu(root_of)(loop.state._replace(record=None), self._fusion)
         self._scaling: ImplicitRoot = jax.tree.map(np.asarray, root)
         form = None if self._fusion is None else self._fusion.form
         if self._fusion is not None and not is_concrete(inputs[4:6]):

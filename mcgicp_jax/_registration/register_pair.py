@@ -89,13 +89,28 @@ def register_pair(
     given = prepared(source, target, method, options, tie_points, prior)
     if init is None and prior is not None:
         init = prior[0]
-    values, init = given.values(), primal(init)
-    if not is_concrete(values, init, options.numbers):
-        values = given
-    register = partial(run_pair, values, init, options)
-    # Differentiation is a transformation, too: inside it, calls of programs take longer.
-    run = register() if values is given or is_concrete(given) else in_new_thread(register)
-    (result,) = results_of([run], [given])
+    return result_of(given, run_pair, primal(init), options)
+
+
+def result_of(given: Inputs, run: Callable[..., Run], *arguments: Any) -> RegistrationResult:
+    """The result of a registration, differentiable by its inputs.
+
+    This is where it is decided whether it runs on the host or is traced.
+
+    Args:
+        run: `run(inputs, *arguments, traced)`, such as `run_pair`.
+        arguments: constants to autodiff: no traces of differentiation. `Options` stand for their numbers.
+    """
+    values = given.values()
+    numbers = [each.numbers if isinstance(each, Options) else each for each in arguments]
+    if not is_concrete(values, numbers):
+        ended = run(given, *arguments, traced=True)
+    elif is_concrete(given):
+        ended = run(given, *arguments)
+    else:
+        # Differentiation is a transformation, too: inside it, calls of programs take longer.
+        ended = in_new_thread(partial(run, values, *arguments))
+    (result,) = results_of([ended], [given])
     return result
 
 
@@ -120,53 +135,36 @@ def prepared(
 
 
 @with_settings_of_package
-def run_pair(given: Inputs, init: Pose | None, options: Options) -> Run:
+def run_pair(given: Inputs, init: Pose | None, options: Options, traced: bool = False) -> Run:
     """Register arrays that are all concrete, or some of which `jit` or `vmap` trace."""
-    search = options.search or default_search(given, init, options.numbers)
-    *coarse, inputs = at_scales(_with_comparable_channels(given, options), options.voxel_sizes)
+    search = options.search or default_search(traced)
+    solve = partial(_solved, options=options, search=search, traced=traced)
+    if not traced:
+        _warn_of_inputs(given, options)
+    *coarse, inputs = at_scales(_equalized(given) if options.equalize_channels else given, options.voxel_sizes)
     for each in coarse:
-        (found,) = results_of([_solved(each, init, replace(options, max_distance=None), search)], [None])
+        (found,) = results_of([solve(each, init, options=replace(options, max_distance=None))], [None])
         init = found.matrix if is_usable(found) else init
-    run = _with_exposure_of_matches(_solved(inputs, init, options, search), inputs.method, options, search)
-    return run if given.tie_points is None and given.prior is None else _fused(run, options, search)
-
-
-def _with_comparable_channels(given: Inputs, options: Options) -> Inputs:
-    """The inputs with equalised channels, if that is wanted; else warns of different units."""
-    concrete = is_concrete(given.source, given.target)
-    if isinstance(given.method, GICP) and concrete:
-        warn_of_covariances(given.source, given.target)
-    if options.equalize_channels:
-        return _equalized(given)
-    if given.method.uses_channels and concrete:
-        warn_of_units(given.source, given.target)
-    return given
-
-
-def _with_exposure_of_matches(run: Run, method: AbstractMethod, options: Options, search: AbstractSearch) -> Run:
-    """The registration again with channels equalised by its matches, if that is wanted; else warns of exposure.
-
-    Args:
-        method: as it was given: parameters left None are chosen anew, from the channels as they are then.
-    """
-    inputs, state = run.inputs, run.loop.state
-    if options.equalize_channels:
-        if any(term.estimates_gains for term in run.problem.terms):
-            return run
-        pose = constant(pose_in_user_frame(state.pose, inputs.source.origin, inputs.target.origin))
-        again = _equalized(inputs._replace(method=method), _nearest_points(run, search))
-        return _solved(again, pose, options, search)
-    if inputs.method.uses_channels and is_concrete(inputs.source, inputs.target, state.pose):
+    run = solve(inputs, init)
+    if options.equalize_channels and not any(term.estimates_gains for term in run.problem.terms):
+        # Parameters left None are chosen anew, from the channels as they are then.
+        again = _equalized(run.inputs._replace(method=inputs.method), _nearest_points(run, search))
+        run = solve(again, _final_pose(run))
+    elif not traced and inputs.method.uses_channels and not options.equalize_channels:
         warn_of_exposure(inputs.source, inputs.target, lambda: _nearest_points(run, search))
-    return run
+    if given.tie_points is None and given.prior is None:
+        return run
+    # Again from its pose, with tie points and prior weighed by its covariance.
+    fusion = fusion_of(run.loop.state, run.moments(), run.inputs.tie_points, run.inputs.prior, traced)
+    problem = replace(run.problem, start=constant(run.loop.state.pose), measurements=fusion)
+    return run_loop(run.inputs, problem, search, options.max_iterations, traced)
 
 
-def _fused(run: Run, options: Options, search: AbstractSearch) -> Run:
-    """The registration again from its pose, with tie points and prior weighed by its covariance."""
-    state, inputs = run.loop.state, run.inputs
-    fusion = fusion_of(state, run.moments(), inputs.tie_points, inputs.prior)
-    problem = replace(run.problem, start=constant(state.pose), measurements=fusion)
-    return run_loop(inputs, problem, search, options.max_iterations)
+def _warn_of_inputs(given: Inputs, options: Options) -> None:
+    if isinstance(given.method, GICP):
+        warn_of_covariances(given.source, given.target)
+    if given.method.uses_channels and not options.equalize_channels:
+        warn_of_units(given.source, given.target)
 
 
 @with_settings_of_package
@@ -193,21 +191,21 @@ def results_of(runs: Sequence[Run], givens: Sequence[Inputs | None]) -> list[Reg
     return results
 
 
-def _solved(given: Inputs, init: Pose | None, options: Options, search: AbstractSearch) -> Run:
+def _solved(given: Inputs, init: Pose | None, options: Options, search: AbstractSearch, traced: bool) -> Run:
     """Pose and run the problem."""
     problem, inputs = pose_problem(given, init, options, search.num_threads)
     if not (given.tie_points is None and given.prior is None):
-        problem = measured(problem, given.tie_points, given.prior)
-    return run_loop(inputs, problem, search, options.max_iterations)
+        problem = measured(problem, given.tie_points, given.prior, traced)
+    return run_loop(inputs, problem, search, options.max_iterations, traced)
 
 
-def run_loop(inputs: Inputs, problem: Problem, search: AbstractSearch | None, max_iterations: int) -> Run:
+def run_loop(inputs: Inputs, problem: Problem, search: AbstractSearch | None, max_iterations: int, traced: bool) -> Run:
     """Run the loop on the host or inside `jit`.
 
     Args:
         search: None for a problem with fixed matches.
     """
-    if not is_concrete(inputs, problem):
+    if traced:
         problem = problem.whole()
         # Gradients stop here, so that autodiff does not enter the compiled functions.
         fixed = jax.lax.stop_gradient(problem)
@@ -279,12 +277,16 @@ def _equalized(given: Inputs, matches: Correspondences | None = None) -> Inputs:
     return given._replace(source=source, gains=gains if given.gains is None else given.gains * gains)
 
 
+def _final_pose(run: Run) -> Pose:
+    """In the user's frames, constant to autodiff."""
+    return constant(pose_in_user_frame(run.loop.state.pose, run.inputs.source.origin, run.inputs.target.origin))
+
+
 def _nearest_points(run: Run, search: AbstractSearch) -> Correspondences:
     """Nearest matches in position at the final pose."""
     source, target = run.inputs[:2]
-    pose = constant(pose_in_user_frame(run.loop.state.pose, source.origin, target.origin))
     distance = run.problem.settings.fine_distance
-    return find_correspondences(source, target, pose, PointToPoint(), max_distance=distance, search=search)
+    return find_correspondences(source, target, _final_pose(run), PointToPoint(), max_distance=distance, search=search)
 
 
 def preprocessed(

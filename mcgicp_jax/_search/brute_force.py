@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import partial
-from typing import Any
 
 import equinox as eqx
 import jax
@@ -14,16 +13,15 @@ import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float, Int
 
-from mcgicp_jax._compute.concrete import is_concrete
 from mcgicp_jax._compute.devices import on_accelerator
 from mcgicp_jax._compute.programs import size_class
 from mcgicp_jax._search.base import IDENTITY, AbstractIndex, AbstractSearch, SearchPoints, on_host, search_points
 from mcgicp_jax._search.kd_tree import KDTreeSearch
 
 
-def default_search(*arguments: Any, workers: int = -1) -> AbstractSearch:
-    """`DenseSearch` for traced arguments on an accelerator, else `KDTreeSearch(workers)`."""
-    return KDTreeSearch(workers) if is_concrete(arguments) or not on_accelerator() else DenseSearch()
+def default_search(traced: bool = False, workers: int = -1) -> AbstractSearch:
+    """`DenseSearch` for traced arrays on an accelerator, else `KDTreeSearch(workers)`."""
+    return DenseSearch() if traced and on_accelerator() else KDTreeSearch(workers)
 
 
 class DenseSearch(AbstractSearch):
