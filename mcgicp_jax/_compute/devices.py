@@ -3,9 +3,14 @@
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Iterator
+import functools
+from collections.abc import Callable
+from typing import Any, ParamSpec, TypeVar
 
 import jax
+
+Answer = TypeVar("Answer")
+Parameters = ParamSpec("Parameters")
 
 
 def default_devices() -> list[jax.Device]:
@@ -20,20 +25,28 @@ def on_accelerator() -> bool:
     return getattr(chosen, "platform", chosen or jax.default_backend()) != "cpu"
 
 
-@contextlib.contextmanager
-def on_cpu() -> Iterator[None]:
-    """Context, and as `on_cpu()` a decorator, in which JAX computes on the CPU.
+def on_cpu() -> contextlib.AbstractContextManager[Any]:
+    """Context in which JAX computes on the CPU.
 
     Programs between host code are small: a GPU would spend most of the time on launches and transfers.
     """
-    cpu: jax.Device | None = None
     if on_accelerator():
         # `jax_platforms` may leave the CPU out.
         with contextlib.suppress(RuntimeError):
-            (cpu, *_) = jax.local_devices(backend="cpu")
-    with contextlib.nullcontext() if cpu is None else jax.default_device(cpu):
-        yield
+            return jax.default_device(jax.local_devices(backend="cpu")[0])
+    return contextlib.nullcontext()
+
+
+def computed_on_cpu(function: Callable[Parameters, Answer]) -> Callable[Parameters, Answer]:
+    """Decorator of functions in which JAX computes on the CPU."""
+
+    @functools.wraps(function)
+    def computed(*arguments: Parameters.args, **named: Parameters.kwargs) -> Answer:
+        with on_cpu():
+            return function(*arguments, **named)
+
+    return computed
 
 
 # Makes a JAX array that host code reads without a transfer, and that programs on any device may use.
-put_on_cpu = on_cpu()(jax.device_put)
+put_on_cpu = computed_on_cpu(jax.device_put)

@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from mcgicp_jax._compute.devices import on_cpu
+from mcgicp_jax._compute.devices import computed_on_cpu
 
 Result = TypeVar("Result")
 
@@ -55,7 +55,7 @@ def quickly_compiled(function: Callable[..., Result], **settings: Any) -> Callab
     def program() -> Callable[..., Result]:
         return jax.jit(function, compiler_options=_known_options(), **settings)
 
-    return functools.wraps(function)(on_cpu()(lambda *arguments: program()(*arguments)))
+    return computed_on_cpu(functools.wraps(function)(lambda *arguments: program()(*arguments)))
 
 
 @functools.cache

@@ -70,6 +70,8 @@ def side_by_side(calls: Sequence[Callable[[], Answer]], max_threads: int | None 
         calls: at least one function without arguments.
         max_threads: largest number of threads, including the calling one; one per call by default.
     """
+    if len(calls) == 1:
+        return [calls[0]()]
     answers: dict[int, Answer] = {}
     waiting = collections.deque(enumerate(calls))
     first, call = waiting.popleft()

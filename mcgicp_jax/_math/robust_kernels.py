@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import abc
 import dataclasses
+from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -29,6 +30,22 @@ class Numbers(eqx.Module):
         return f"{type(self).__name__}({', '.join(parts)})"
 
 
+def number_of(name: str, value: Any) -> Array:
+    """The array of a parameter with this name, in the default precision; raises `ValueError` if it is none."""
+    try:
+        # NumPy converts concrete values without compiling a program.
+        return put_on_cpu(np.asarray(value, canonical_float())) if is_concrete(value) else jnp.asarray(value)
+    except (TypeError, ValueError) as error:
+        raise ValueError(f"{name}: expected numbers, got {value!r}") from error
+
+
+def positive_scalar(name: str, value: ArrayLike) -> Float[Array, ""]:
+    number = number_of(name, value)
+    if number.shape != () or (is_concrete(number) and not 0 < float(number) < np.inf):
+        raise ValueError(f"{name}: expected one positive number, got {value!r}")
+    return number
+
+
 class AbstractKernel(Numbers):
     """A robust kernel: cost ρ(s²) and weight dρ/d(s²) of a correspondence with Mahalanobis distance s; ρ ≈ s² near 0.
 
@@ -42,10 +59,7 @@ class AbstractKernel(Numbers):
 
     def __init__(self, scale: ArrayLike):
         """`scale` is k. Raises `ValueError` unless it is one positive, finite number."""
-        concrete = is_concrete(scale)
-        self.scale = put_on_cpu(np.asarray(scale, canonical_float())) if concrete else jnp.asarray(scale)
-        if self.scale.shape != () or (is_concrete(self.scale) and not 0 < float(self.scale) < np.inf):
-            raise ValueError(f"scale: expected one positive number, got {scale!r}")
+        self.scale = positive_scalar("scale", scale)
 
     @abc.abstractmethod
     def _rho(self, square: Float[Array, "N"], scale: Float[Array, ""]) -> Float[Array, "N"]: ...

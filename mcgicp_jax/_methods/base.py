@@ -12,12 +12,11 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
 from mcgicp_jax._clouds.point_cloud import PointCloud, Values
-from mcgicp_jax._compute.concrete import AnyArray, canonical_float, is_concrete, numpy_for
-from mcgicp_jax._compute.devices import put_on_cpu
+from mcgicp_jax._compute.concrete import AnyArray, is_concrete, numpy_for
 from mcgicp_jax._local_geometry.local_geometry import Geometries, LocalGeometry
 from mcgicp_jax._local_geometry.neighborhoods import NO_NEIGHBORS, Neighborhoods
 from mcgicp_jax._math import symmetric_matrices as alg
-from mcgicp_jax._math.robust_kernels import AbstractKernel, Numbers
+from mcgicp_jax._math.robust_kernels import AbstractKernel, Numbers, number_of, positive_scalar
 from mcgicp_jax._terms.base import AbstractTerm, Mahalanobis
 
 # Computes the local geometry of source and target.
@@ -42,21 +41,6 @@ def check_covariance_fits(covariance: Float[AnyArray, "..."], count: int) -> Non
         )
 
 
-def _number(name: str, value: Values) -> Array:
-    try:
-        # NumPy converts concrete values without compiling a program.
-        return put_on_cpu(np.asarray(value, canonical_float())) if is_concrete(value) else jnp.asarray(value)
-    except (TypeError, ValueError) as error:
-        raise ValueError(f"{name}: expected numbers, got {value!r}") from error
-
-
-def positive_scalar(name: str, value: ArrayLike) -> Float[Array, ""]:
-    number = _number(name, value)
-    if number.shape != () or (is_concrete(number) and not 0 < float(number) < np.inf):
-        raise ValueError(f"{name}: expected one positive number, got {value!r}")
-    return number
-
-
 def epsilon_of(value: ArrayLike) -> Float[Array, ""]:
     epsilon = positive_scalar("epsilon", value)
     # For smaller ε, 1 − (1 − ε) loses it to rounding, and the covariance becomes singular.
@@ -67,7 +51,7 @@ def epsilon_of(value: ArrayLike) -> Float[Array, ""]:
 
 
 def weights_of(value: Values) -> Float[Array, "..."]:
-    weights = _number("channel_weights", value)
+    weights = number_of("channel_weights", value)
     if weights.ndim > 1:
         raise ValueError(f"channel_weights: expected a scalar or shape (C,), got {weights.shape}")
     if is_concrete(weights) and not np.all((np.asarray(weights) >= 0) & np.isfinite(weights)):
@@ -76,7 +60,7 @@ def weights_of(value: Values) -> Float[Array, "..."]:
 
 
 def covariance_of(value: Values) -> Float[Array, "..."]:
-    covariance = _number("channel_covariance", value)
+    covariance = number_of("channel_covariance", value)
     if covariance.ndim > 2 or (covariance.ndim == 2 and covariance.shape[0] != covariance.shape[1]):
         raise ValueError(f"channel_covariance: expected a scalar, shape (C,) or (C, C), got {covariance.shape}")
     if is_concrete(covariance):

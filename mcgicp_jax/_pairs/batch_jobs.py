@@ -20,7 +20,7 @@ from jaxtyping import Bool
 from mcgicp_jax._clouds.point_cloud import PointCloud, Values
 from mcgicp_jax._clouds.voxel_size import VoxelSize
 from mcgicp_jax._compute.concrete import is_concrete, is_deferred
-from mcgicp_jax._compute.devices import on_accelerator, on_cpu
+from mcgicp_jax._compute.devices import computed_on_cpu, on_accelerator
 from mcgicp_jax._compute.linear_maps import primal
 from mcgicp_jax._compute.messages import messages_named, warn, warnings_named
 from mcgicp_jax._compute.programs import size_class
@@ -186,7 +186,7 @@ class BatchJob:
             warn_of_lengths(*clouds)
             return clouds
 
-    @on_cpu()
+    @computed_on_cpu
     def register_chunk(self, chunk: list[Pair]) -> list[PairResult]:
         """Register the pairs one after the other, on the CPU: workers would compete for an accelerator."""
         return [self._register_with_jacobian(pair) if pair.traced else self._register(pair) for pair in chunk]
