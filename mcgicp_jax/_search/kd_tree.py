@@ -20,6 +20,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import scipy.spatial
+from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float, Int
 
 from mcgicp_jax._compute.cache import MAX_ROWS, Cache
@@ -204,7 +205,7 @@ def _nearest_callback(
 
 
 def nearest_in_position(
-    queries: Float[AnyArray, "N 3"], points: Float[AnyArray, "M 3"], max_distance: float
+    queries: Float[ArrayLike, "N 3"], points: Float[ArrayLike, "M 3"], max_distance: float
 ) -> Int[np.ndarray, "N"]:
     """Row of the point nearest to each query; −1 if none is within `max_distance`, metres. NaN matches nothing."""
     queries, points = np.asarray(queries), np.asarray(points)
