@@ -12,7 +12,8 @@ from mcgicp_jax import Status
 from mcgicp_jax._pose_solver import update as _solve
 from mcgicp_jax._pose_solver.matched import Matched, Motion
 from mcgicp_jax._pose_solver.sums import sums_of
-from mcgicp_jax._registration.step import COARSE, RUNNING, SETTLED, Settings, update
+from mcgicp_jax._registration.loop import update
+from mcgicp_jax._registration.settings import COARSE, RUNNING, SETTLED, Settings
 from mcgicp_jax.extend import AbstractTerm, Surface, linearize_residual
 from mcgicp_jax.extend import symmetric_matrices as cov
 from tests.precision import in_both_precisions, tolerance

@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 import mcgicp_jax as mcg
 from mcgicp_jax import datasets
 from mcgicp_jax._pose_solver.pose_measurements import Fusion, Prior, TiePoints, form_at
-from mcgicp_jax._registration.measurements import known
+from mcgicp_jax._registration.tie_points_and_prior import known
 from mcgicp_jax.extend import symmetric_matrices as alg
 from tests.compilations import compilations
 from tests.corridor import corridor

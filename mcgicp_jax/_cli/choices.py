@@ -16,7 +16,7 @@ from mcgicp_jax._clouds.point_cloud import Voxels
 from mcgicp_jax._clouds.voxel_size import voxels_for
 from mcgicp_jax._local_geometry.cloud_statistics import point_spacing
 from mcgicp_jax._methods.base import AbstractMethod
-from mcgicp_jax._registration.step import default_distances
+from mcgicp_jax._registration.settings import default_distances
 from mcgicp_jax.extend import METHODS
 
 # Preprocessed source and target, made when they are needed.

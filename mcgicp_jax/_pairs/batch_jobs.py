@@ -30,11 +30,11 @@ from mcgicp_jax._methods.base import AbstractMethod
 from mcgicp_jax._pairs.register import register_from, start_from_anywhere
 from mcgicp_jax._registration.assessment import registration_of
 from mcgicp_jax._registration.input_checks import warn_of_estimated_parameters, warn_of_lengths
+from mcgicp_jax._registration.loop import Problem
 from mcgicp_jax._registration.options import Options
 from mcgicp_jax._registration.pose_derivative import Inputs
-from mcgicp_jax._registration.register_pair import Run, pose_problem, prepared, preprocessed, results_of, run_pair
+from mcgicp_jax._registration.register_pair import Run, prepared, preprocessed, problem_of, results_of, run_pair
 from mcgicp_jax._registration.result import RegistrationResult, Status, computed, unverified
-from mcgicp_jax._registration.step import Problem
 from mcgicp_jax._registration.vectorized import run_problems
 from mcgicp_jax._search.base import AbstractSearch
 from mcgicp_jax._search.brute_force import DenseSearch, default_search
@@ -301,7 +301,7 @@ class BatchJob:
             return start
         init, verified = start
         given = Inputs(source, target, self.method, self.options.robust)
-        problem, _ = pose_problem(given, init, self.options, num_threads=1)
+        problem, _ = problem_of(given, init, self.options, num_threads=1)
         used, problem = problem.source.search.valid, problem.whole()
         return _LanePair(pair.index, source, target, used, verified), _padded(problem)
 

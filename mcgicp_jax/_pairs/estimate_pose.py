@@ -16,7 +16,7 @@ from mcgicp_jax._pose_solver.matched import Matches
 from mcgicp_jax._registration.input_checks import check_clouds, check_matches, warn_of_estimated_parameters
 from mcgicp_jax._registration.options import Options
 from mcgicp_jax._registration.pose_derivative import Inputs
-from mcgicp_jax._registration.register_pair import Run, pose_problem, result_of, run_loop
+from mcgicp_jax._registration.register_pair import Run, problem_of, result_of, run_loop
 from mcgicp_jax._registration.result import RegistrationResult
 from mcgicp_jax._search.base import Correspondences
 
@@ -81,5 +81,5 @@ def estimate_pose(
 
 
 def _estimate(given: Inputs, matches: Matches, init: Pose | None, options: Options, traced: bool = False) -> Run:
-    problem, inputs = pose_problem(given, init, options, 1, matches._replace(temperature=given.temperature))
+    problem, inputs = problem_of(given, init, options, 1, matches._replace(temperature=given.temperature))
     return run_loop(inputs, problem, None, options.max_iterations, traced)

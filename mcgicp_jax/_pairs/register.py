@@ -17,10 +17,10 @@ from mcgicp_jax._math.poses import Pose
 from mcgicp_jax._math.robust_kernels import AbstractKernel
 from mcgicp_jax._methods.base import AbstractMethod
 from mcgicp_jax._registration.input_checks import warn_of_estimated_parameters, warn_of_lengths
-from mcgicp_jax._registration.measurements import GivenPrior, GivenTiePoints
 from mcgicp_jax._registration.options import Distance, Options, check_method
 from mcgicp_jax._registration.register_pair import register_pair
 from mcgicp_jax._registration.result import RegistrationResult, Status, is_usable, unverified
+from mcgicp_jax._registration.tie_points_and_prior import GivenPrior, GivenTiePoints
 from mcgicp_jax._search.base import AbstractSearch
 
 # Smallest overlap without a warning. Pairs of scans that overlap by 10 to 30 % count as the hardest that can be

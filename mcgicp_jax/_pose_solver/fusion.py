@@ -51,7 +51,7 @@ def held_by_pose_form(directions: Directions, information: Float[Array, "6 6"]) 
 def fuse(
     pose: jaxlie.SE3, center: Float[Array, "3"], directions: Directions, moments: Moments, form: PoseForm
 ) -> Fusion:
-    """The equation of the pose, from the final pose of a registration without tie points and prior.
+    """The equation of the pose, from the final pose of a first registration, see `register`.
 
     Args:
         center: `Sums.center`, metres.

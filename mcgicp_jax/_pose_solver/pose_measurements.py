@@ -4,6 +4,10 @@ A tie point has the residual b − T a. Let D = [ΔR − I | Δt] be the change 
 T a − c = ΔR (T₀ a − c) + Δt. Then the cost of all tie points is e − 2 ⟨D, G⟩ + ⟨D, Q D⟩ with constant Q (12, 12) and
 G (12), for any number of them. A prior P has the residual ξ = log(P⁻¹ T), a twist about any fixed source point: here
 the one at c, so that far origins do not enter the arithmetic.
+
+A prior may fix directions: T = P exp(ξ) with F ξ = 0, where the rows of F are `Prior.fixed`. For free directions that
+form a group, such as x, y and yaw, these are the poses P H of that group. Otherwise the poses depend on the
+parametrisation by one exponential: with yaw fixed, say, its component of log(P⁻¹ T) stays 0.
 """
 
 from __future__ import annotations
@@ -17,8 +21,8 @@ import jaxlie
 from jaxtyping import Array, Bool, Float
 
 from mcgicp_jax._compute.concrete import AnyArray, AnyScalar, numpy_for
-from mcgicp_jax._math.poses import translation_adjoint, units
-from mcgicp_jax._math.symmetric_matrices import inverse_3
+from mcgicp_jax._math.poses import adjoint_to_source, translation_adjoint, units
+from mcgicp_jax._math.symmetric_matrices import inverse_3, inverse_6
 
 
 class TiePoints(NamedTuple):
@@ -189,3 +193,27 @@ class Fusion(PoseMeasurements):
             return forces
         residual, _ = self.prior_residual(rotation, translation)
         return jnp.where(self.fixed, (fixed @ self.basis).T @ (fixed @ residual), forces)
+
+
+def constraints_at(
+    pose: jaxlie.SE3, center: Float[Array, "3"], radius: Float[Array, ""], prior: Prior
+) -> Float[Array, "6 6"]:
+    """Derivative of F ξ by a twist about a centre, lengths in units of the radius."""
+    slope = _pose_of(prior).inverse().multiply(pose).jlog().astype(center.dtype)
+    return prior.fixed @ slope @ (adjoint_to_source(pose, center) * units(radius))
+
+
+@jax.jit
+def with_fixed_directions(pose: jaxlie.SE3, prior: Prior) -> jaxlie.SE3:
+    """The pose with ξ projected onto F ξ = 0."""
+    fixed = prior.fixed
+    apart = _pose_of(prior).inverse().multiply(pose).log()
+    gram = fixed @ fixed.T + jnp.diag(1.0 * ~jnp.any(fixed != 0, axis=1))
+    apart = apart - fixed.T @ (inverse_6(gram) @ (fixed @ apart))
+    moved = _pose_of(prior).multiply(jaxlie.SE3.exp(apart)).normalize()
+    # jaxlie promotes to the default precision.
+    return jaxlie.SE3(moved.wxyz_xyz.astype(pose.wxyz_xyz.dtype))
+
+
+def _pose_of(prior: Prior) -> jaxlie.SE3:
+    return jaxlie.SE3.from_rotation_and_translation(jaxlie.SO3.from_matrix(prior.rotation), prior.translation)

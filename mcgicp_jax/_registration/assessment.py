@@ -31,9 +31,8 @@ from mcgicp_jax._pose_solver.degeneracy import directions_at_source
 from mcgicp_jax._pose_solver.fusion import fused_covariance
 from mcgicp_jax._pose_solver.matched import Matches, Motion, sample_of_term
 from mcgicp_jax._pose_solver.pose_measurements import Fusion
-from mcgicp_jax._registration.loop import AbstractExecutor, LoopResult
+from mcgicp_jax._registration.loop import AbstractExecutor, LoopResult, Record, State
 from mcgicp_jax._registration.result import Constraints, RegistrationResult, Status, Uncertainty
-from mcgicp_jax._registration.step import Record, State
 from mcgicp_jax._terms.base import AbstractAdaptiveTerm, AbstractTerm, is_adaptive
 
 
@@ -48,7 +47,7 @@ def assessment_of(executor: AbstractExecutor, loop: LoopResult, moments: Lazy[Mo
     """The assessment of a loop that has ended.
 
     Args:
-        moments: `moments_of` the loop; None for a problem with tie points or a prior, which contains its own.
+        moments: `moments_of` the loop; None if the problem has a `Fusion`, which takes their place.
     """
     state = loop.state
 
@@ -170,7 +169,7 @@ def registration_of(
         derivative: computes `RegistrationResult.jacobian`.
     """
     history: dict[str, Any] = records._asdict()
-    # Outside `jit`, the derivative of the pose, by the origins too, is all that may be traced.
+    # Outside `jit`, only the pose and the origins may be traced, by differentiation.
     pose, source_origin, target_origin = state.pose, source.origin, target.origin
     state, source, target = map(primal, (state, source, target))
     concrete = is_concrete(state, history)
@@ -189,8 +188,8 @@ def registration_of(
     numbers["num_inliers"] = numbers["num_inliers"].astype(np.int32)
     numbers["overlap"] = (numbers["num_inliers"] / used.sum()).astype(numbers["rmse"].dtype)
     return RegistrationResult.build(
-        constraints=_later(lambda: _constraints(assessment, source.origin), concrete),
-        uncertainty=_later(lambda: _uncertainty(assessment, state, source.origin), concrete),
+        constraints=_later(lambda: _constraints_in_user_frame(assessment, source.origin), concrete),
+        uncertainty=_later(lambda: _uncertainty_in_user_frame(assessment, state, source.origin), concrete),
         derivative=Held(derivative),
         **numbers,
         **fields_of_pose(pose, source_origin, target_origin),
@@ -217,8 +216,8 @@ def _read_only(tree: Any) -> Any:
     return tree
 
 
-def _constraints(assessment: Assessment, origin: Any) -> Constraints:
-    """Information matrix and directions in the frame of the user's source."""
+def _constraints_in_user_frame(assessment: Assessment, origin: Any) -> Constraints:
+    """Information matrix and directions, for the user's source."""
     information, directions = assessment.constraints.value
     if is_concrete(origin) and not np.any(origin):
         return Constraints(information, directions)
@@ -231,7 +230,7 @@ def _constraints(assessment: Assessment, origin: Any) -> Constraints:
         return Constraints(to_centred.T @ information @ to_centred, directions)
 
 
-def _uncertainty(assessment: Assessment, state: State, origin: Any) -> Uncertainty:
+def _uncertainty_in_user_frame(assessment: Assessment, state: State, origin: Any) -> Uncertainty:
     """The covariance in the frame of the user's source, and the deviations at the centroid of the matched points."""
     pose, center = constant((state.pose, state.sums.center))
     covariance = assessment.covariance.value

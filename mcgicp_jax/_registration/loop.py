@@ -1,37 +1,137 @@
 """The registration loop: find matches at this pose; sum their forces; update the pose; stop when it no longer moves.
 
 The way of a source point from `PointCloud` to `RegistrationResult`, in eight sentences. `preprocess` finds the k
-nearest neighbours of the point. `describe` computes its `LocalGeometry` from this neighbourhood: covariance, normal,
-channel fits. `surface_of` turns these into a row of a `Surface`: position, the covariance of the method, observability.
-Both are row functions (`_compute.row_functions`): on the host their rows are computed when they are first gathered, and
-gathered rows are `Rows`. The search finds the target point nearest to the moved point in position and α · channel, as
-`Matches`, and the rows of both are `Matched`, from which each term computes a `Linearization`: the cost of the
-correspondence, its force (−gradient/2) and stiffness (Hessian/2). `sums_of` adds them over all correspondences to
-`Sums`, `update` computes the next `State` from the sums, and search, sums and update repeat until the pose converges.
-At the final pose `scores_of` computes the contribution of each correspondence to the covariance of the pose.
+nearest neighbours of the point. `local_geometry_of` computes its `LocalGeometry` from this neighbourhood: covariance,
+normal, channel fits. `surface_of` turns these into a row of a `Surface`: position, the covariance of the method,
+observability. Both are row functions (`_compute.row_functions`): on the host their rows are computed when they are
+first gathered, and gathered rows are `Rows`. The search finds the target point nearest to the moved point in position
+and α · channel, as `Matches`, and the rows of both are `Matched`, from which each term computes a `Linearization`: the
+cost of the correspondence, its force (−gradient/2) and stiffness (Hessian/2). `sums_of` adds them over all
+correspondences to `Sums`, `update` computes the next `State` from the sums, and search, sums and update repeat until
+the pose converges. At the final pose `scores_of` computes the contribution of each correspondence to the covariance of
+the pose.
 
 The loop is written once. An executor says how its parts are done: blocks of rows on the host, whole arrays inside
-transformations, lanes of a vectorised batch.
+transformations, lanes of a vectorised batch. The status is decided in `update`.
 """
 
 from __future__ import annotations
 
 import abc
 from collections.abc import Callable
+from dataclasses import replace
 from functools import partial
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, cast
 
+import equinox as eqx
 import jax
+import jax.numpy as jnp
 import jaxlie
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from mcgicp_jax._compute.concrete import AnyArray, AnyScalar, numpy_for
+from mcgicp_jax._math.poses import move_pose, units
+from mcgicp_jax._methods.surfaces import AnySurface, whole_surface
 from mcgicp_jax._pose_solver.covariance import Scores
+from mcgicp_jax._pose_solver.degeneracy import Directions, find_directions
+from mcgicp_jax._pose_solver.fusion import first_pull, fused_update
+from mcgicp_jax._pose_solver.implicit_derivative import ImplicitRoot, root_near
 from mcgicp_jax._pose_solver.matched import Matches, Motion, adapted, sample_of_term
-from mcgicp_jax._registration.step import SETTLED, Problem, State, update
+from mcgicp_jax._pose_solver.pose_measurements import (
+    Fusion,
+    PoseMeasurements,
+    Prior,
+    constraints_at,
+    with_fixed_directions,
+)
+from mcgicp_jax._pose_solver.sums import Sums
+from mcgicp_jax._pose_solver.update import rounding, solve_update
+from mcgicp_jax._registration.result import Status
+from mcgicp_jax._registration.settings import COARSE, RUNNING, SETTLED, Settings
 from mcgicp_jax._search.base import SearchPoints, by_position
 from mcgicp_jax._terms.base import AbstractTerm, is_adaptive
+
+# The coarse phase ends with an update below its tolerances that moves the points by at most this fraction of the fine
+# maximum correspondence distance. It need not converge further: the fine phase starts from its pose.
+_FRACTION_OF_GATE = 0.25
+# Three points determine a pose; a fourth makes residuals possible.
+_MIN_CORRESPONDENCES = 4
+
+
+class Problem(eqx.Module):
+    """Inputs of the registration loop.
+
+    Attributes:
+        start: the initial pose.
+        source, target: the surfaces of both clouds.
+        terms: the residuals of each correspondence, before any number is adapted.
+        measurements: tie points and prior: weighed by the residuals in a first registration, then as a `Fusion`; None
+            if there are none.
+        fixed: the prior if it fixes directions, else None.
+        matches: those of `estimate_pose`, at every pose; None if the loop searches for them.
+        num_candidates: number of target points that a source point is matched with.
+    """
+
+    start: jaxlie.SE3
+    source: AnySurface
+    target: AnySurface
+    terms: tuple[AbstractTerm, ...]
+    settings: Settings
+    measurements: PoseMeasurements | None = None
+    fixed: Prior | None = None
+    matches: Matches | None = None
+    num_candidates: int = eqx.field(static=True, default=1)
+
+    def whole(self) -> Problem:
+        """With all rows of both surfaces."""
+        return replace(self, source=whole_surface(self.source), target=whole_surface(self.target))
+
+    @property
+    def fusion(self) -> Fusion | None:
+        """The equation of the pose; None in a first registration."""
+        return self.measurements if isinstance(self.measurements, Fusion) else None
+
+    @property
+    def first_status(self) -> Int[AnyScalar, ""]:
+        adapts = is_adaptive(self.terms) and self.matches is None
+        return np.int32(COARSE) if adapts else self.settings.first_status()
+
+
+class Record(NamedTuple):
+    """Entries of `RegistrationResult.history`, recorded before each update."""
+
+    cost: Float[AnyArray, "*batch"]
+    rmse: Float[AnyArray, "*batch"]
+    num_inliers: Float[AnyArray, "*batch"]
+    translation_step: Float[AnyArray, "*batch"]
+    rotation_step: Float[AnyArray, "*batch"]
+
+
+class State(NamedTuple):
+    """State of the loop after one step.
+
+    Attributes:
+        pose: the updated pose; once the loop has ended, the pose at which `sums` were measured.
+        status: `COARSE`, `RUNNING` or `SETTLED` (negative) while the loop runs, then the value of a `Status`.
+        num_iterations: number of updates so far.
+        since: (6,) sum of the updates since the last iteration whose number is a power of two, metres and radians.
+        extent: largest cost, over these updates, of moving the matched points by `since`.
+        sums: at the pose before the update; this and the following are None before the first step on the host.
+        information: (6, 6) at the pose before the update, about the centroid, lengths in units of the radius.
+        directions: at the pose before the update, about the centroid; None for `estimate_pose`.
+        record: of this step.
+    """
+
+    pose: jaxlie.SE3
+    status: Int[AnyArray, "*batch"]
+    num_iterations: Int[AnyArray, "*batch"]
+    since: Any = None
+    extent: Any = None
+    sums: Any = None
+    information: Any = None
+    directions: Directions | None = None
+    record: Any = None
 
 
 class LoopResult(NamedTuple):
@@ -169,3 +269,101 @@ def step(executor: AbstractExecutor, loop: LoopResult) -> LoopResult:
     # The sums are not an output of the compiled update, which would copy them.
     state = executor.update(state, sums)._replace(sums=sums)
     return LoopResult(state, matches, terms, loop.history)
+
+
+@jax.jit
+def update(
+    pose: jaxlie.SE3,
+    status: Int[Array, ""],
+    num_iterations: Int[Array, ""],
+    since: Float[Array, "6"],
+    extent: Float[Array, ""],
+    sums: Sums,
+    settings: Settings,
+    measurements: PoseMeasurements | None = None,
+    fixed: Prior | None = None,
+) -> State:
+    """Update the pose, or end the loop with a status. Its program does not depend on the size of the clouds.
+
+    Matches, and the pose with them, may alternate for ever. The pose then returns to that of the last iteration whose
+    number is a power of two (Brent 1980). Such a cycle ends the loop if its poses differ by less than one standard
+    deviation, estimated as if the residuals were independent; the deviation of the pose is larger.
+    """
+    directions, basis = None, jnp.eye(6, dtype=sums.center.dtype)
+    degenerate: AnyScalar = np.bool_(False)
+    if sums.observability is not None:
+        constraints = None if fixed is None else constraints_at(pose, sums.center, sums.radius, fixed)
+        directions = find_directions(sums, constraints)
+        degenerate = ~jnp.all(directions.held)
+        # Along unconstrained directions an update would follow arbitrary nearest-neighbour matches.
+        moving = (directions.held | ~settings.hold_unconstrained) & ~directions.fixed
+        basis = jnp.asarray(directions.twists).T * moving
+    if isinstance(measurements, Fusion):
+        directions, change = fused_update(pose, sums, cast(Directions, directions), measurements)
+        degenerate = ~jnp.all(directions.held)
+    elif measurements is None or directions is None:
+        change = solve_update(sums, basis)
+    else:
+        change = solve_update(sums, basis, first_pull(pose, sums, directions, measurements))
+    moved = move_pose(pose, change.twist, sums.center)
+    moved = moved if fixed is None else with_fixed_directions(moved, fixed)
+    # Matches need not constrain what is fixed.
+    degenerate = degenerate | (change.degenerate & (fixed is None))
+    coarse, settled = status == COARSE, status == SETTLED
+    since = since + change.twist
+    sizes = jnp.linalg.norm(jnp.stack([change.twist, since]).reshape(2, 2, 3), axis=2)
+    (translation_step, rotation_step), (translation_since, rotation_since) = sizes
+
+    def below(translation: Float[AnyScalar, ""], rotation: Float[AnyScalar, ""]) -> Bool[Array, ""]:
+        return (translation_step <= translation) & (rotation_step <= rotation)
+
+    motion_since = since / units(sums.radius)
+    extent = jnp.maximum(extent, motion_since @ change.information @ motion_since * sums.radius**2)
+    returned = (translation_since <= settings.translation_tolerance) & (rotation_since <= settings.rotation_tolerance)
+    cycles = (status == RUNNING) & returned & (extent * sums.count <= sums.cost)
+    motion = translation_step + sums.radius * rotation_step
+    nearly = below(settings.coarse_translation_tolerance, settings.coarse_rotation_tolerance)
+    nearly = nearly & (motion <= _FRACTION_OF_GATE * settings.fine_distance)
+    converged = below(settings.translation_tolerance, settings.rotation_tolerance) | (coarse & nearly) | cycles
+    finite = jnp.isfinite(sums.energy) & jnp.all(jnp.isfinite(moved.wxyz_xyz))
+    outcomes: tuple[tuple[Array, int], ...] = (
+        (sums.num_inliers < _MIN_CORRESPONDENCES, Status.TOO_FEW_CORRESPONDENCES),
+        (~finite, Status.NON_FINITE),
+        (settled & degenerate, Status.DEGENERATE),
+        (settled, Status.CONVERGED),
+        (num_iterations >= settings.max_iterations, Status.MAX_ITERATIONS),
+        (coarse & ~converged, COARSE),
+        (converged & ~coarse, SETTLED),
+    )
+    conditions, codes = zip(*outcomes, strict=True)
+    status = jnp.select(list(conditions), [np.int32(code) for code in codes], np.int32(RUNNING))
+    record = Record(sums.cost, sums.rmse, sums.num_inliers, translation_step, rotation_step)
+    num_iterations = num_iterations + (status < 0)
+    restart = num_iterations & (num_iterations - 1) == 0
+    return State(
+        # The loop returns the pose at which sums, information and directions were measured.
+        pose=jaxlie.SE3(jnp.where(status < 0, moved.wxyz_xyz, pose.wxyz_xyz)),
+        status=status,
+        num_iterations=num_iterations,
+        since=jnp.where(restart, 0, since).astype(sums.center.dtype),
+        extent=jnp.where(restart, 0, extent).astype(sums.center.dtype),
+        information=change.information,
+        directions=directions,
+        record=Record(*(number.astype(sums.center.dtype) for number in record)),
+    )
+
+
+@jax.jit
+def root_of(state: State, fusion: Fusion | None) -> ImplicitRoot:
+    """The equation that defines the final pose, for its derivative."""
+    converged = state.status == Status.CONVERGED
+    usable = converged | (state.status == Status.DEGENERATE) | (state.status == Status.MAX_ITERATIONS)
+    if fusion is not None:
+        rotation = state.pose.rotation().as_matrix().astype(state.sums.center.dtype)
+        basis, held = fusion.twists_at(rotation, state.pose.translation()), fusion.held
+    elif state.directions is not None:
+        basis, held = jnp.asarray(state.directions.twists).T, state.directions.held
+    else:
+        values, basis = jnp.linalg.eigh(state.information)
+        held = converged | (values > rounding(values))
+    return root_near(state.sums, usable, basis, held, fusion)

@@ -17,8 +17,8 @@ from mcgicp_jax._pose_solver.covariance import Scores, scores_of
 from mcgicp_jax._pose_solver.matched import Matches, Motion, inputs_of, of_matches
 from mcgicp_jax._pose_solver.pose_measurements import PoseMeasurements, Prior
 from mcgicp_jax._pose_solver.sums import Sums, combine, sums_of
-from mcgicp_jax._registration.loop import AbstractExecutor, LoopResult
-from mcgicp_jax._registration.step import COARSE, SETTLED, Problem, Record, Settings, State, update
+from mcgicp_jax._registration.loop import AbstractExecutor, LoopResult, Problem, Record, State, update
+from mcgicp_jax._registration.settings import COARSE, SETTLED, Settings
 from mcgicp_jax._search.base import AbstractIndex, SearchPoints, by_position
 from mcgicp_jax._terms.base import AbstractTerm
 

@@ -43,9 +43,8 @@ from mcgicp_jax._pose_solver.implicit_derivative import (
 )
 from mcgicp_jax._pose_solver.matched import Motion, matched_rows
 from mcgicp_jax._pose_solver.pose_measurements import Fusion, PoseForm, Prior, TiePoints, form_at
-from mcgicp_jax._registration.loop import LoopResult
+from mcgicp_jax._registration.loop import LoopResult, State, root_of
 from mcgicp_jax._registration.on_host import HostExecutor
-from mcgicp_jax._registration.step import State, root_of
 from mcgicp_jax._terms.base import with_numbers_of
 
 

@@ -39,14 +39,14 @@ from mcgicp_jax._registration.input_checks import (
     warn_of_constant_weights,
     warn_of_covariances,
 )
-from mcgicp_jax._registration.loop import LoopResult, iterate
-from mcgicp_jax._registration.measurements import GivenPrior, GivenTiePoints, fusion_of, known, measured
+from mcgicp_jax._registration.loop import LoopResult, Problem, State, iterate
 from mcgicp_jax._registration.multi_scale import at_scales
 from mcgicp_jax._registration.on_host import HostExecutor
 from mcgicp_jax._registration.options import Options, check_method
 from mcgicp_jax._registration.pose_derivative import Inputs, differentiated, jacobian, with_derivatives
 from mcgicp_jax._registration.result import RegistrationResult, is_usable
-from mcgicp_jax._registration.step import Problem, State, settings_for
+from mcgicp_jax._registration.settings import settings_for
+from mcgicp_jax._registration.tie_points_and_prior import GivenPrior, GivenTiePoints, fusion_of, known, measured
 from mcgicp_jax._registration.traced import assess, differentiable, moments_traced, run_traced
 from mcgicp_jax._search.base import AbstractIndex, AbstractSearch, Correspondences
 from mcgicp_jax._search.brute_force import default_search
@@ -98,17 +98,19 @@ def result_of(given: Inputs, run: Callable[..., Run], *arguments: Any) -> Regist
     This is where it is decided whether it runs on the host or is traced.
 
     Args:
-        run: `run(inputs, *arguments, traced)`, such as `run_pair`.
-        arguments: constants to autodiff: no traces of differentiation. `Options` stand for their numbers.
+        run: `run(inputs, *arguments, traced=False)`, such as `run_pair`.
+        arguments: without traces of differentiation, to which they are constants.
     """
     values = given.values()
     numbers = [each.numbers if isinstance(each, Options) else each for each in arguments]
     if not is_concrete(values, numbers):
+        # Inside `jit` or `vmap`, whose tracers have no values.
         ended = run(given, *arguments, traced=True)
     elif is_concrete(given):
         ended = run(given, *arguments)
     else:
-        # Differentiation is a transformation, too: inside it, calls of programs take longer.
+        # Inside `grad` or `jvp`: the values are registered, and `results_of` adds the derivative. In a thread, since
+        # calls of programs take longer inside transformations.
         ended = in_new_thread(partial(run, values, *arguments))
     (result,) = results_of([ended], [given])
     return result
@@ -147,7 +149,7 @@ def run_pair(given: Inputs, init: Pose | None, options: Options, traced: bool = 
         init = found.matrix if is_usable(found) else init
     run = solve(inputs, init)
     if options.equalize_channels and not any(term.estimates_gains for term in run.problem.terms):
-        # Parameters left None are chosen anew, from the channels as they are then.
+        # Parameters left None are chosen anew, from the channels as equalised by the matches.
         again = _equalized(run.inputs._replace(method=inputs.method), _nearest_points(run, search))
         run = solve(again, _final_pose(run))
     elif not traced and inputs.method.uses_channels and not options.equalize_channels:
@@ -175,25 +177,25 @@ def results_of(runs: Sequence[Run], givens: Sequence[Inputs | None]) -> list[Reg
         givens: the arguments of each, or None. Outside `jit`, the poses get derivatives by those arrays of these
             arguments that are traced. All derivatives are computed side by side.
     """
-    traced = [
+    derivatives = [
         None if given is None or run.executor is None else differentiated(given, run.inputs, run.executor, run.loop)
         for run, given in zip(runs, givens, strict=True)
     ]
-    states = with_derivatives([run.state() for run in runs], traced)
+    states = with_derivatives([run.state() for run in runs], derivatives)
     results = []
     for state, run, given in zip(states, runs, givens, strict=True):
-        by = None if run.executor is None else partial(jacobian, run.inputs, run.executor, run.loop)
-        # Traced origins are those of the inputs, as cells, which may have others, are made of concrete clouds alone.
+        jacobian_by = None if run.executor is None else partial(jacobian, run.inputs, run.executor, run.loop)
+        # Cells, whose origin may differ, are made of concrete clouds alone: a traced origin is that of the argument.
         traces_origins = given is not None and not is_concrete(given.source.origin, given.target.origin)
         source, target = (given if given is not None and traces_origins else run.inputs)[:2]
         used = run.problem.source.search.valid
-        results.append(registration_of(state, run.assessment(), run.loop.history, source, target, used, by))
+        results.append(registration_of(state, run.assessment(), run.loop.history, source, target, used, jacobian_by))
     return results
 
 
 def _solved(given: Inputs, init: Pose | None, options: Options, search: AbstractSearch, traced: bool) -> Run:
-    """Pose and run the problem."""
-    problem, inputs = pose_problem(given, init, options, search.num_threads)
+    """State the problem and run its loop."""
+    problem, inputs = problem_of(given, init, options, search.num_threads)
     if not (given.tie_points is None and given.prior is None):
         problem = measured(problem, given.tie_points, given.prior, traced)
     return run_loop(inputs, problem, search, options.max_iterations, traced)
@@ -228,7 +230,7 @@ def run_loop(inputs: Inputs, problem: Problem, search: AbstractSearch | None, ma
 
 
 @with_settings_of_package
-def pose_problem(
+def problem_of(
     given: Inputs, init: Pose | None, options: Options, num_threads: int | None, matches: Matches | None = None
 ) -> tuple[Problem, Inputs]:
     """The problem for preprocessed clouds, NumPy arrays where everything is concrete; and its inputs, with the

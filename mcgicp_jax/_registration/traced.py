@@ -23,8 +23,8 @@ from mcgicp_jax._pose_solver.implicit_derivative import Model, with_derivative
 from mcgicp_jax._pose_solver.matched import Matches, Motion, inputs_of, match_surfaces, of_matches
 from mcgicp_jax._pose_solver.sums import Sums, sums_of
 from mcgicp_jax._registration.assessment import Assessment, assessment_of, moments_of
-from mcgicp_jax._registration.loop import AbstractExecutor, LoopResult, iterate
-from mcgicp_jax._registration.step import COARSE, RUNNING, SETTLED, Problem, State, root_of
+from mcgicp_jax._registration.loop import AbstractExecutor, LoopResult, Problem, State, iterate, root_of
+from mcgicp_jax._registration.settings import COARSE, RUNNING, SETTLED
 from mcgicp_jax._search.base import AbstractSearch, SearchPoints, by_position
 from mcgicp_jax._terms.base import AbstractTerm, is_adaptive, with_numbers_of
 

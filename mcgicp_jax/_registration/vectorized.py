@@ -19,8 +19,7 @@ from jaxtyping import Array, Bool, Int
 from mcgicp_jax._compute.devices import default_devices
 from mcgicp_jax._compute.threads import with_settings_of_package
 from mcgicp_jax._registration.assessment import Assessment
-from mcgicp_jax._registration.loop import LoopResult, step
-from mcgicp_jax._registration.step import Problem, Record, State
+from mcgicp_jax._registration.loop import LoopResult, Problem, Record, State, step
 from mcgicp_jax._registration.traced import TracedExecutor, assess, recorded
 from mcgicp_jax._search.base import AbstractSearch
 

@@ -26,7 +26,8 @@ from jaxtyping import Array, Bool, Float, Int
 from mcgicp_jax._compute.cache import MAX_ROWS, Cache
 from mcgicp_jax._compute.programs import call_host
 from mcgicp_jax._search.base import IDENTITY, AbstractSearch, NeighborsOnDemand, SearchPoints, on_host, search_points
-from mcgicp_jax._search.tree_index import LARGEST_UNORDERED, TiedTree, TreeBackend, TreeIndex
+from mcgicp_jax._search.ties import TiedTree, TreeBackend
+from mcgicp_jax._search.tree_index import LARGEST_UNORDERED, TreeIndex
 
 # Where pykdtree is quicker than SciPy's tree, see Constants in `tests/benchmarks/README.md`. Up to seven dimensions the
 # distances of both agree to the last bit, since both add the squared differences in the same order.

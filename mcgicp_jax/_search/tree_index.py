@@ -1,166 +1,24 @@
-"""The k nearest points of each query by any kind of tree, on several threads: ordered by distance and then row, with
-descriptors and missing channels, and with matches reused from pose to pose.
-"""
+"""The index of a target by trees: with descriptors and missing channels, and with matches reused from pose to pose."""
 
 from __future__ import annotations
 
-import abc
 from collections.abc import Callable
-from functools import partial
-from typing import Any
 
 import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Float, Int
 
 from mcgicp_jax._compute.cache import Cache
-from mcgicp_jax._compute.threads import num_cores, side_by_side
 from mcgicp_jax._math.poses import rotated, rotation_from_quaternion
 from mcgicp_jax._search.base import AbstractIndex, SearchPoints, on_host
+from mcgicp_jax._search.ties import TiedTree, TreeBackend, slack_of
 
-# Largest number of candidates per query with which the tree breaks a tie by row: a multiple of the neighbours wanted,
-# but at least the second number. Longer ties are mostly due to coincident points, and are left to brute force.
-_TIE_CANDIDATES = 8
-_MIN_TIE_CANDIDATES = 64
-# Smallest number of queries that a thread is given at a time, and largest number of such parts per thread: several,
-# since a thread may start late. With 2,000 to 100,000 queries, a factor of two in either hardly matters.
-_MIN_PART, _PARTS_PER_THREAD = 1000, 8
 # Number of sets of missing channels of queries whose trees, of all target rows each, are kept: two cameras, each of
 # which sees a point or not, make four. Trees of further sets are built anew for each pose.
 _MAX_SETS = 16
 # Points. A larger tree does not fit into a processor's caches; queries are then sorted so that neighbours follow each
 # other: 20 neighbours of 60,000 points then take 0.6 of the time, of a million points a quarter.
 LARGEST_UNORDERED = 50_000
-
-
-class TreeBackend(abc.ABC):
-    """A kind of tree: how it is built and queried."""
-
-    # Largest number of threads that query it; −1 for all cores.
-    workers: int
-
-    @abc.abstractmethod
-    def build(self, points: Float[np.ndarray, "M D"]) -> Any:
-        """A tree of (M, D) finite points, metres; M is at least 1, D at least 3."""
-
-    @abc.abstractmethod
-    def query(
-        self, tree: Any, queries: Float[np.ndarray, "N D"], k: int, bound: float
-    ) -> tuple[Float[np.ndarray, "N k"], Int[np.ndarray, "N k"]]:
-        """The k nearest points of each query. Several threads may call this function at once.
-
-        Args:
-            tree: from `build`, of M points.
-            queries: (N, D) finite points, metres.
-            k: number of neighbours, at most M.
-            bound: metres in all D dimensions; only neighbours nearer than this are reported.
-
-        Returns:
-            (N, k) distances in metres and rows, nearest first, ties in any order. Where fewer than k points lie within
-            the bound, the distance is infinite and the row is M.
-        """
-
-    def leaf_order(self, tree: Any, num_points: int) -> Int[np.ndarray, "M"]:
-        """An order of the tree's points in which neighbouring points follow each other, for faster queries."""
-        return np.arange(num_points)
-
-
-class TiedTree:
-    """A tree of points that finds the same neighbours whatever its kind: ordered by distance, ties by row.
-
-    Attributes:
-        points: (M, D) finite points, metres.
-    """
-
-    def __init__(self, trees: TreeBackend, points: Float[np.ndarray, "M D"]):
-        self.points = points
-        self._trees, self._tree = trees, trees.build(points)
-        # equinox creates an object whenever it binds a method.
-        self._query = trees.query
-        self._threads = num_cores() if trees.workers == -1 else trees.workers
-
-    def leaf_order(self) -> Int[np.ndarray, "M"]:
-        """An order of the points in which neighbouring points follow each other."""
-        return self._trees.leaf_order(self._tree, len(self.points))
-
-    def query(
-        self, queries: Float[np.ndarray, "N D"], k: int, bound: float = np.inf
-    ) -> tuple[Float[np.ndarray, "N k"], Int[np.ndarray, "N k"]]:
-        """Distances and rows of the k nearest points as from `AbstractTreeSearch.query`, on several threads."""
-        count = 1 if self._threads == 1 else min(_PARTS_PER_THREAD * self._threads, len(queries) // _MIN_PART)
-        if count <= 1:
-            return self._query(self._tree, queries, k, bound)
-        parts = np.array_split(queries, count)
-        calls = [partial(self._query, self._tree, part, k, bound) for part in parts]
-        distances, rows = zip(*side_by_side(calls, self._threads), strict=True)
-        return np.concatenate(distances), np.concatenate(rows)
-
-    def nearest(
-        self, queries: Float[np.ndarray, "N D"], k: int, bound: float = np.inf
-    ) -> tuple[Int[np.ndarray, "N k"], Float[np.ndarray, "N"]]:
-        """The k nearest points of each query (all points if there are fewer), ordered by distance and then row.
-
-        Trees return ties in any order. Searching for k + 1 neighbours reveals ties, which are then resolved.
-
-        Returns:
-            Rows of `points`, M standing for none within `bound`; and the slack: half the gap between the k-th nearest
-            and the next, which is taken to lie at the bound if none is within it; 0 without a k-th nearest.
-        """
-        size = len(self.points)
-        k = min(k, size)
-        asked = min(k + 1, size)
-        max_asked = min(max(_TIE_CANDIDATES * (k + 1), _MIN_TIE_CANDIDATES), size)
-        distances, rows = self.query(queries, asked, bound)
-        nearest = rows[:, :k].astype(np.int32)
-        farthest = distances[:, k - 1]
-        slack = slack_of(farthest, np.minimum(distances[:, asked - 1], bound))
-        equal = distances[:, 1:] == distances[:, :-1]
-        # Usually none are equal, and one check of all takes a tenth of the time of one per query.
-        tied = np.flatnonzero(equal.any(axis=1) & np.isfinite(distances[:, 0])) if equal.any() else np.arange(0)
-        distances, rows = distances[tied], rows[tied]
-        while tied.size:
-            order = np.lexsort((rows, distances), axis=1)
-            nearest[tied] = np.take_along_axis(rows, order, axis=1)[:, :k]
-            # A tie that includes the last candidate may extend beyond it.
-            tied = tied[np.isfinite(distances[:, -1]) & (distances[:, k - 1] == distances[:, -1])]
-            if asked == max_asked:
-                break
-            asked = min(2 * asked, max_asked)
-            if tied.size:
-                distances, rows = self.query(queries[tied], asked, bound)
-        if tied.size and asked < size:
-            nearest[tied] = _nearest_in_all(self.points, queries[tied], farthest[tied], k)
-        return nearest, slack
-
-
-def _nearest_in_all(
-    points: Float[np.ndarray, "M D"], queries: Float[np.ndarray, "N D"], farthest: Float[np.ndarray, "N"], k: int
-) -> Int[np.ndarray, "N k"]:
-    """The k nearest by brute force, for queries with long ties, e.g. where a sensor reports missing echoes as zeros.
-
-    Args:
-        farthest: distance of the k-th neighbour, metres.
-    """
-    # Such queries mostly coincide, too.
-    queries, first, whose = np.unique(queries, axis=0, return_index=True, return_inverse=True)
-    nearest = np.empty((len(queries), k), np.int32)
-    for i, (query, limit) in enumerate(zip(queries, farthest[first], strict=True)):
-        squares = np.zeros(len(points))
-        # In float64, as trees compute.
-        for column, value in zip(points.T.astype(np.float64), query, strict=True):
-            squares += (column - value) ** 2
-        # A part in a billion covers rounding.
-        near = np.flatnonzero(squares <= limit**2 * (1 + 1e-9))
-        nearest[i] = near[np.lexsort((near, squares[near]))[:k]]
-    return nearest[whose.ravel()]
-
-
-def slack_of(farthest: Float[np.ndarray, "N"], following: Float[np.ndarray, "N"]) -> Float[np.ndarray, "N"]:
-    """Distance, metres, that a query may move before its k nearest rows can change: half the gap between the distances
-    of the k-th and the following row."""
-    # The margin of 1e-6 covers rounding. Without a k-th nearest row the gap is NaN or −inf, and the slack 0.
-    with np.errstate(invalid="ignore"):
-        return 0.5 * (1 - 1e-6) * np.fmax(following - farthest, 0)
 
 
 class TreeIndex(AbstractIndex):

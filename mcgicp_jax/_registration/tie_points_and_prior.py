@@ -20,11 +20,17 @@ from mcgicp_jax._math.poses import matrix_of, translation_adjoint
 from mcgicp_jax._math.symmetric_matrices import inverse_6
 from mcgicp_jax._pose_solver.covariance import Moments
 from mcgicp_jax._pose_solver.degeneracy import Directions
-from mcgicp_jax._pose_solver.fixed_directions import with_fixed_directions
 from mcgicp_jax._pose_solver.fusion import fuse
-from mcgicp_jax._pose_solver.pose_measurements import Fusion, PoseMeasurements, Prior, TiePoints, form_at
+from mcgicp_jax._pose_solver.pose_measurements import (
+    Fusion,
+    PoseMeasurements,
+    Prior,
+    TiePoints,
+    form_at,
+    with_fixed_directions,
+)
 from mcgicp_jax._registration.assessment import as_float64
-from mcgicp_jax._registration.step import Problem, State
+from mcgicp_jax._registration.loop import Problem, State
 
 # Largest asymmetry of a correlation matrix, as rounding to float32 causes; and smallest eigenvalue with which the
 # inverse of a correlation matrix keeps four digits in float64. Below it, a direction of a prior counts as fixed.
