@@ -121,6 +121,13 @@ def test_fewer_lanes_where_memory_does_not_suffice():
     assert min(count for count, *_ in first) > few == COMPILED[-1][0]
 
 
+def test_pairs_that_begin_again_keep_their_order():
+    source, target = (mcg.preprocess(cloud) for cloud in raw_pair(185, 0)[:2])
+    search = ForFewLanes(jax.local_device_count())
+    ended = mcg.register_as_completed([source] * 9, [target] * 9, mcg.GICP(), max_distance=0.5, search=search)
+    assert [number for number, _ in ended] == list(range(9))
+
+
 IN_LANES = """
     import jax, numpy as np
     import mcgicp_jax as mcg

@@ -17,6 +17,7 @@ from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from jaxtyping import Array, Bool, Int
 
 from mcgicp_jax._compute.devices import default_devices
+from mcgicp_jax._compute.tables import Packed
 from mcgicp_jax._compute.threads import with_settings_of_package
 from mcgicp_jax._registration.assessment import Assessment
 from mcgicp_jax._registration.loop import LoopResult, step
@@ -77,9 +78,10 @@ def run_problems(
 
 
 class _Group(Generic[Key]):
-    """Lanes for problems of the same shapes, and problems that wait for one.
+    """Lanes for problems of the same shapes, a chunk of problems on the devices that are the next to enter a lane, and
+    problems on the host that wait for the next chunk. A chunk has as many problems as there are lanes.
 
-    Where memory does not suffice, half of the lanes are left, and the problems that were in lanes begin again.
+    Where memory does not suffice, half of the lanes are left, and the problems on the devices begin again.
     """
 
     def __init__(self, search: AbstractSearch, max_iterations: int):
@@ -88,17 +90,23 @@ class _Group(Generic[Key]):
         self._devices = default_devices()
         self._per_device = _LANES_ON_CPU if self._devices[0].platform == "cpu" else _LANES
         self.waiting: collections.deque[tuple[Key, Problem]] = collections.deque()
+        self._chunk: collections.deque[tuple[int, tuple[Key, Problem]]] = collections.deque()
         self._running: dict[int, tuple[Key, Problem]] = {}
+        self._begun: Any = None
         self._lanes: Any = None
-        sharding = NamedSharding(Mesh(np.array(self._devices), ("lanes",)), PartitionSpec("lanes"))
-        self._empty = jax.jit(_empty, static_argnums=1, out_shardings=sharding)
-        self._put = jax.jit(_put, donate_argnums=0, out_shardings=sharding)
+        self._sharding = NamedSharding(Mesh(np.array(self._devices), ("lanes",)), PartitionSpec("lanes"))
+        self._put = jax.jit(_put, donate_argnums=0, out_shardings=self._sharding)
+
+    @property
+    def _size(self) -> int:
+        return self._per_device * len(self._devices)
 
     def is_full(self) -> bool:
-        return len(self.waiting) + len(self._running) >= self._per_device * len(self._devices)
+        """Whether the lanes are filled, and once the chunk is used up, enough problems wait to fill the next one."""
+        return len(self.waiting) + len(self._chunk) + len(self._running) >= 2 * self._size
 
     def is_busy(self) -> bool:
-        return bool(self.waiting or self._running)
+        return bool(self.waiting or self._chunk or self._running)
 
     def run(self) -> Iterator[Ended[Key]]:
         """Fill free lanes and run `_STEPS` steps of all; yield the results of finished lanes and free these lanes."""
@@ -108,8 +116,10 @@ class _Group(Generic[Key]):
             if self._per_device == 1 or "RESOURCE_EXHAUSTED" not in str(error):
                 raise
             self._per_device //= 2
-            self.waiting.extendleft(self._running.values())
-            self._running, self._lanes, found = {}, None, None
+            begun = [*self._running.values(), *(problem for _, problem in self._chunk)]
+            self.waiting.extendleft(reversed(begun))
+            self._chunk.clear()
+            self._running, self._begun, self._lanes, found = {}, None, None, None
         for lane in [] if found is None else [lane for lane in self._running if found[0].status[lane] >= 0]:
             state, assessed, history = jax.tree.map(lambda leaf, lane=lane: leaf[lane], found)
             # One history entry per update, and one at the returned pose.
@@ -119,34 +129,54 @@ class _Group(Generic[Key]):
 
     def _run(self) -> tuple[State, Assessment, Record] | None:
         """Those of all lanes; None if none of the running ones has finished."""
-        count = self._per_device * len(self._devices)
-        for lane in [lane for lane in range(count) if lane not in self._running][: len(self.waiting)]:
-            self._running[lane] = _, problem = self.waiting.popleft()
-            begun = problem, begin_lane(problem, self._search, self._max_iterations)
-            self._lanes = self._put(self._lanes or self._empty(begun, count), begun, lane)
+        while self._fill() and self.waiting:
+            self._begin()
         problems, loops = self._lanes
         loops = run_lanes(problems, loops, self._search, _STEPS)
         self._lanes = problems, loops
+        if not self._chunk and self.waiting:
+            # While the devices work.
+            self._begin()
         # The matches are not copied to the host.
         if not (np.asarray(loops.state.status)[list(self._running)] >= 0).any():
             return None
-        return jax.device_get((loops.state, assess_lanes(problems, loops, self._search), loops.history))
+        return jax.device_get(results_of_lanes(problems, loops, self._search)).tree
+
+    def _begin(self) -> None:
+        """Move the next problems from the host to the devices; the last one fills up the chunk."""
+        count = min(len(self.waiting), self._size)
+        self._chunk.extend(enumerate(self.waiting.popleft() for _ in range(count)))
+        problems = [problem for _, (_, problem) in self._chunk]
+        problems += problems[-1:] * (self._size - count)
+        stacked = jax.device_put(jax.tree.map(lambda *leaves: np.stack(leaves), *problems), self._sharding)
+        self._begun = stacked, begin_lanes(stacked, self._search, self._max_iterations)
+
+    def _fill(self) -> bool:
+        """Move problems of the chunk to free lanes; whether any lane is left free."""
+        free = [lane for lane in range(self._size) if lane not in self._running]
+        # Of as many numbers as there are lanes, so that one program serves; this one is out of range.
+        lanes, rows = np.full(self._size, self._size, np.int32), np.zeros(self._size, np.int32)
+        for place, lane in enumerate(free[: len(self._chunk)]):
+            rows[place], self._running[lane] = self._chunk.popleft()
+            lanes[place] = lane
+        if self._lanes is None and self._begun is not None:
+            # Lanes without a problem: their status is 0, which counts as finished.
+            self._lanes = jax.tree.map(jnp.zeros_like, self._begun)
+        if lanes[0] < self._size:
+            self._lanes = self._put(self._lanes, self._begun, lanes, rows)
+        return len(self._running) < self._size
 
 
-def _empty(lane: Lanes, count: int) -> Lanes:
-    """Lanes without a problem: their status is 0, which counts as finished."""
-    return jax.tree.map(lambda leaf: jnp.zeros((count, *leaf.shape), leaf.dtype), lane)
-
-
-def _put(lanes: Lanes, lane: Lanes, number: Int[Array, ""]) -> Lanes:
-    return jax.tree.map(lambda leaves, leaf: leaves.at[number].set(leaf), lanes, lane)
+def _put(lanes: Lanes, chunk: Lanes, numbers: Int[Array, "n"], rows: Int[Array, "n"]) -> Lanes:
+    """Rows of the chunk as the lanes with these numbers."""
+    return jax.tree.map(lambda old, new: old.at[numbers].set(new[rows], mode="drop"), lanes, chunk)
 
 
 @with_settings_of_package
 @partial(jax.jit, static_argnames="max_iterations")
-def begin_lane(problem: Problem, search: AbstractSearch, max_iterations: int) -> LoopResult:
-    """The loop before its first step, compiled."""
-    return TracedExecutor(problem, search, max_iterations).begin()
+def begin_lanes(problems: Problem, search: AbstractSearch, max_iterations: int) -> LoopResult:
+    """Many stacked loops before their first step, compiled."""
+    return jax.vmap(lambda problem: TracedExecutor(problem, search, max_iterations).begin())(problems)
 
 
 @with_settings_of_package
@@ -169,7 +199,9 @@ def run_lanes(problems: Problem, loops: LoopResult, search: AbstractSearch, num_
 
 @with_settings_of_package
 @jax.jit
-def assess_lanes(problems: Problem, loops: LoopResult, search: AbstractSearch) -> Assessment:
-    """Information matrices, directions and covariances of stacked loops, at their current poses."""
-
-    return jax.vmap(lambda problem, loop: assess(loop, problem, search))(problems, loops)
+def results_of_lanes(
+    problems: Problem, loops: LoopResult, search: AbstractSearch
+) -> Packed[tuple[State, Assessment, Record]]:
+    """States, assessments at their poses and histories of stacked loops, in one array."""
+    assessed = jax.vmap(lambda problem, loop: assess(loop, problem, search))(problems, loops)
+    return Packed.of((loops.state, assessed, loops.history))
