@@ -121,13 +121,55 @@ def test_fewer_lanes_where_memory_does_not_suffice():
     assert min(count for count, *_ in first) > few == COMPILED[-1][0]
 
 
+def test_pairs_that_begin_again_keep_their_order():
+    source, target = (mcg.preprocess(cloud) for cloud in raw_pair(185, 0)[:2])
+    search = ForFewLanes(jax.local_device_count())
+    ended = mcg.register_as_completed([source] * 9, [target] * 9, mcg.GICP(), max_distance=0.5, search=search)
+    assert [number for number, _ in ended] == list(range(9))
+
+
+def test_one_line_says_that_memory_does_not_suffice_for_one_lane():
+    source, target = (mcg.preprocess(cloud) for cloud in raw_pair(185, 0)[:2])
+    with pytest.raises(MemoryError, match="padded to 192 and 256 points"):
+        mcg.register_batch([source], [target], mcg.GICP(), max_distance=0.5, search=ForFewLanes(0))
+
+
+# Number of clouds of each search of neighbours that is compiled.
+CLOUDS = []
+
+
+class CountsClouds(mcg.DenseSearch):
+    def nearest_traced(self, pose, source, target, max_distance, running, num_candidates=1):
+        found = super().nearest_traced(pose, source, target, max_distance, running, num_candidates)
+
+        @jax.custom_batching.custom_vmap
+        def counted(indices):
+            return indices
+
+        @counted.def_vmap
+        def _(count, batched, indices):
+            CLOUDS.extend([count] * (num_candidates == 20))
+            return indices, batched[0]
+
+        return counted(found)
+
+
+def test_equal_clouds_of_several_pairs_are_prepared_once():
+    """Also if they are other objects, and the source in one pair and the target in another one."""
+    clouds = [np.asarray(cloud.points) for cloud in raw_pair(100, 0)[:2]]
+    pairs = {"sources": [clouds[i % 2].copy() for i in range(6)], "targets": [clouds[1 - i % 2] for i in range(6)]}
+    results = mcg.register_batch(**pairs, method=mcg.GICP(), max_distance=0.5, search=CountsClouds())
+    assert 0 < max(CLOUDS) <= 2 * jax.local_device_count()
+    assert_same(results[:2], results[4:])
+
+
 IN_LANES = """
     import jax, numpy as np
     import mcgicp_jax as mcg
     from tests.batches import raw_pair
 
     def registered():
-        clouds = [[mcg.preprocess(raw_pair(120, seed)[side]) for seed in range(5)] for side in (0, 1)]
+        clouds = [[raw_pair(100, seed)[side] for seed in range(5)] for side in (0, 1)]
         poses, devices, before = {}, set(), jax.live_arrays()
         options = {"max_distance": 0.5, "search": mcg.DenseSearch()}
         for number, result in mcg.register_as_completed(*clouds, mcg.GICP(), **options):

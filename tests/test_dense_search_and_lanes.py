@@ -5,6 +5,7 @@ import pathlib
 import subprocess
 import sys
 import textwrap
+from concurrent.futures import ThreadPoolExecutor
 
 import jax
 import jax.numpy as jnp
@@ -168,6 +169,31 @@ def test_a_batch_in_lanes_is_its_pairs(raw, clouds):
     # In another order, and without one of the others.
     order = np.random.default_rng(0).permutation(len(raw))[1:]
     assert_same(lanes(*([side[i] for i in order] for side in clouds)), [results[i] for i in order])
+
+
+def test_raw_clouds_in_lanes_are_prepared_as_one_by_one(raw):
+    """Neighbours, surfaces and parameters are computed on the device. A pair without enough points does no harm."""
+    sides = [[raw[i][side] for i in (0, 1, 3, 5)] for side in (0, 1)]
+    sides[0][1] = np.zeros((3, 3))
+    spoilt = sides[1][2]
+    sides[1][2] = spoilt.replace(points=np.where(np.arange(310)[:, None] % 10, spoilt.points, np.nan))
+    options = {"method": mcg.MultiChannelGICP(), "max_distance": 0.5, "search": DenseSearch()}
+    with pytest.warns(UserWarning, match="pair 1"), ThreadPoolExecutor(1) as executor:
+        found = mcg.register_batch(*sides, **options)
+        expected = mcg.register_batch(*sides, executor=executor, **options)
+    assert [result.status for result in found] == [result.status for result in expected]
+    assert [result.converged for result in found] == [True, False, True, True]
+    for i in (0, 2, 3):
+        assert max(pose_error(found[i].matrix, expected[i].matrix)) < 1e-5
+        assert found[i].overlap == expected[i].overlap
+
+
+def test_pairs_of_shapes_that_the_method_refuses(raw):
+    sides = [[pair[side] for pair in raw[:2]] for side in (0, 1)]
+    method = mcg.MultiChannelGICP(0.05, [0.1, 0.2, 0.3])
+    with pytest.warns(UserWarning, match="pair [01]: channel_weights: expected a scalar"):
+        results = mcg.register_batch(*sides, method, max_distance=0.5, search=DenseSearch())
+    assert [result.status for result in results] == [Status.INVALID_INPUT] * 2
 
 
 def test_a_bad_pair_spoils_no_other_lane(clouds):

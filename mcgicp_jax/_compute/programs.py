@@ -73,10 +73,10 @@ def _known_options() -> dict[str, bool]:
 _SMALLEST_CLASS = 128
 
 
-def size_class(num_points: int) -> int:
-    """The smallest of 128, 192, 256, 384, 512, ... that is at least `num_points`."""
-    power = max(_SMALLEST_CLASS, 1 << (num_points - 1).bit_length())
-    return 3 * power // 4 if max(num_points, _SMALLEST_CLASS) <= 3 * power // 4 else power
+def size_class(count: int, smallest: int = _SMALLEST_CLASS) -> int:
+    """The smallest of 128, 192, 256, 384, 512, ... that is at least `count`; or from another power of two on."""
+    power = max(smallest, 1 << (count - 1).bit_length())
+    return 3 * power // 4 if max(count, smallest) <= 3 * power // 4 else power
 
 
 # Bytes. JAX (jaxlib 0.10.2) copies smaller arrays for a callback in the calling thread, up to 100 KiB.

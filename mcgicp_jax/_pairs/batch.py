@@ -88,7 +88,7 @@ def register_as_completed(
         options: options of `register`, except for `tie_points` and `prior`. `search` is also used to preprocess; by
             default SciPy's k-d tree with one thread per pair. With `DenseSearch`, or without a search on accelerators,
             pairs run as lanes of one vectorised program on `jax.default_device`, or spread over all local devices (not
-            with an `executor`, `equalize_channels` or `voxel_sizes`).
+            with an `executor`, `equalize_channels` or `voxel_sizes`), which finds neighbours by brute force.
 
     Returns:
         A generator of the index of the pair, from 0, and its `RegistrationResult`.

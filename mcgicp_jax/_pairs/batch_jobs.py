@@ -15,27 +15,25 @@ from typing import Any, Literal, TypeAlias
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Bool
 
+from mcgicp_jax._clouds.origins import centred_pose
 from mcgicp_jax._clouds.point_cloud import PointCloud, Values
 from mcgicp_jax._clouds.voxel_size import VoxelSize
 from mcgicp_jax._compute.concrete import is_concrete, is_deferred
 from mcgicp_jax._compute.devices import computed_on_cpu, on_accelerator
 from mcgicp_jax._compute.linear_maps import primal
 from mcgicp_jax._compute.messages import messages_named, warn, warnings_named
-from mcgicp_jax._compute.programs import size_class
 from mcgicp_jax._compute.threads import in_new_thread, num_cores, side_by_side, with_settings
-from mcgicp_jax._math.poses import Pose
+from mcgicp_jax._math.poses import Pose, se3_from_matrix
 from mcgicp_jax._methods.base import AbstractMethod
 from mcgicp_jax._pairs.register import register_from, start_from_anywhere
 from mcgicp_jax._registration.assessment import registration_of
-from mcgicp_jax._registration.input_checks import warn_of_estimated_parameters, warn_of_lengths
-from mcgicp_jax._registration.loop import Problem
+from mcgicp_jax._registration.input_checks import check_clouds, warn_of_estimated_parameters, warn_of_lengths
 from mcgicp_jax._registration.options import Options
 from mcgicp_jax._registration.pose_derivative import Inputs
-from mcgicp_jax._registration.register_pair import Run, prepared, preprocessed, problem_of, results_of, run_pair
+from mcgicp_jax._registration.register_pair import Run, prepared, preprocessed, results_of, run_pair
 from mcgicp_jax._registration.result import RegistrationResult, Status, computed, unverified
-from mcgicp_jax._registration.vectorized import run_problems
+from mcgicp_jax._registration.vectorized import LanePair, Refused, run_pairs
 from mcgicp_jax._search.base import AbstractSearch
 from mcgicp_jax._search.brute_force import DenseSearch, default_search
 
@@ -99,19 +97,17 @@ class PairResult:
 
 
 @dataclass(frozen=True)
-class _LanePair:
+class _PairInLane:
     """A pair in a lane.
 
     Attributes:
         source, target: preprocessed.
-        used: which source points can be matched.
         verified: False if the initial pose is one that `global_pose` doubts.
     """
 
     index: int
     source: PointCloud
     target: PointCloud
-    used: Bool[np.ndarray, "n"]
     verified: bool
 
 
@@ -142,7 +138,7 @@ def _of_a_pair(work: Callable[..., Any]) -> Callable[..., Any]:
         try:
             return work(self, pair, *arguments)
         except ValueError as error:
-            return PairResult(pair.index, RegistrationResult.without_pose(Status.INVALID_INPUT), str(error))
+            return _invalid(pair.index, error)
 
     return caught
 
@@ -171,13 +167,8 @@ class BatchJob:
 
     def ready(self, clouds: dict[str, Cloud]) -> list[PointCloud]:
         """Clouds by their names, read and preprocessed if necessary; errors become a `ValueError` that names one."""
-        sides = dict[str, PointCloud]()
-        for name, cloud in clouds.items():
-            with messages_named(name):
-                given: Any = _loaded(cloud) if callable(cloud) and not isinstance(cloud, PointCloud) else cloud
-                sides[name] = given if isinstance(given, PointCloud) else PointCloud(given)
         options = replace(self.options, search=self.search)
-        return preprocessed(sides, self.method, options, self.voxel_size, self.num_neighbors)
+        return preprocessed(_read(clouds), self.method, options, self.voxel_size, self.num_neighbors)
 
     def _clouds(self, pair: Pair) -> list[PointCloud]:
         """Both clouds by `ready`. Warnings of the pair as a whole do not name it, so that Python shows each once."""
@@ -200,22 +191,27 @@ class BatchJob:
 
     def register_in_lanes(self, pairs: Iterable[Pair], num_threads: int) -> Iterator[PairResult]:
         """Register the pairs as lanes on this machine; threads preprocess them."""
+        # On the host neighbours are needed for warnings alone, of a sample of points.
+        on_host = replace(self, options=replace(self.options, search=None))
+        search = self.options.search or DenseSearch()
         with ThreadPoolExecutor(num_threads, thread_name_prefix="mcgicp") as threads:
             rejected: list[PairResult] = []
 
-            def problems() -> Iterator[tuple[_LanePair, Problem]]:
-                for problem in _computed_ahead(threads, with_settings(self._problem), pairs, 2 * num_threads):
-                    if isinstance(problem, PairResult):
-                        rejected.append(problem)
+            def ready() -> Iterator[tuple[_PairInLane, LanePair]]:
+                for each in _computed_ahead(threads, with_settings(on_host._lane_pair), pairs, 2 * num_threads):
+                    if isinstance(each, PairResult):
+                        rejected.append(each)
                     else:
-                        yield problem
+                        yield each
 
-            limit = self.options.max_iterations
-            for ended in run_problems(problems(), self.options.search or DenseSearch(), limit):
+            most = self.options.max_source_points
+            for ended in run_pairs(ready(), self.method, self.options, search, self.num_neighbors):
                 pair = ended.key
-                result = registration_of(
-                    ended.state, ended.assessment, ended.history, pair.source, pair.target, pair.used
-                )
+                if isinstance(ended, Refused):
+                    yield _invalid(pair.index, ended.reason)
+                    continue
+                used = np.ones(min(len(pair.source), most or len(pair.source)), bool)
+                result = registration_of(ended.state, ended.assessment, ended.history, pair.source, pair.target, used)
                 yield PairResult(pair.index, self._computed(result if pair.verified else unverified(result)))
             yield from rejected
 
@@ -293,17 +289,44 @@ class BatchJob:
         return start.matrix, start.success
 
     @_of_a_pair
-    def _problem(self, pair: Pair) -> PairResult | tuple[_LanePair, Problem]:
-        """The pair as input of a lane, with each surface padded to a size class so that few programs are compiled."""
-        source, target = self._clouds(pair)
+    def _lane_pair(self, pair: Pair) -> PairResult | tuple[_PairInLane, LanePair]:
+        """The pair as input of a lane, with each cloud padded to a size class so that few programs are compiled."""
+        with warnings_named(f"pair {pair.index}"):
+            given = _read({"source": pair.source, "target": pair.target})
+        source, target = self._clouds(replace(pair, source=given["source"], target=given["target"]))
         start = self._start(pair, source, target)
         if isinstance(start, PairResult):
             return start
         init, verified = start
-        given = Inputs(source, target, self.method, self.options.robust)
-        problem, _ = problem_of(given, init, self.options, num_threads=1)
-        used, problem = problem.source.search.valid, problem.whole()
-        return _LanePair(pair.index, source, target, used, verified), _padded(problem)
+        check_clouds(source, target, self.method)
+        pose = se3_from_matrix(centred_pose(init, source, target), source.points.dtype)
+        sides = [
+            self._padded(cloud, cloud is not given[name]) for name, cloud in (("source", source), ("target", target))
+        ]
+        return _PairInLane(pair.index, source, target, verified), LanePair(pose, *sides)
+
+    def _padded(self, cloud: PointCloud, without_neighbors: bool) -> PointCloud:
+        """The cloud with all that a lane needs of it."""
+        arrays: dict[str, Any] = {"origin": np.zeros(3, cloud.points.dtype), "channel_names": ()}
+        if not self.method.uses_channels:
+            arrays |= {"channels": cloud.points[:, :0], "channel_valid": None}
+        if without_neighbors:
+            arrays["deferred_neighbors"] = None
+        return cloud.replace_rows(**arrays).pad()
+
+
+def _invalid(index: int, error: ValueError) -> PairResult:
+    return PairResult(index, RegistrationResult.without_pose(Status.INVALID_INPUT), str(error))
+
+
+def _read(clouds: dict[str, Cloud]) -> dict[str, PointCloud]:
+    """Clouds by their names, read if they are functions; errors become a `ValueError` that names one."""
+    sides = dict[str, PointCloud]()
+    for name, cloud in clouds.items():
+        with messages_named(name):
+            given: Any = _loaded(cloud) if callable(cloud) and not isinstance(cloud, PointCloud) else cloud
+            sides[name] = given if isinstance(given, PointCloud) else PointCloud(given)
+    return sides
 
 
 def _loaded(load: Callable[[], PointCloud | Values]) -> PointCloud | Values:
@@ -317,15 +340,6 @@ def _loaded(load: Callable[[], PointCloud | Values]) -> PointCloud | Values:
         place = traceback.extract_tb(error.__traceback__)[-1]
         reason = f"{type(error).__name__}: {error}".rstrip(": ")
         raise ValueError(f"{reason} ({place.filename}, line {place.lineno})") from error
-
-
-def _padded(problem: Problem) -> Problem:
-    """Pad each surface to its size class; padding matches nothing."""
-
-    def grow(array: np.ndarray) -> np.ndarray:
-        return np.pad(array, [(0, size_class(len(array)) - len(array))] + [(0, 0)] * (array.ndim - 1))
-
-    return replace(problem, **{side: jax.tree.map(grow, getattr(problem, side)) for side in ("source", "target")})
 
 
 def _computed_ahead(
