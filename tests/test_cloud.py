@@ -10,7 +10,7 @@ import jaxlie
 import numpy as np
 import pytest
 
-from mcgicp_jax import GICP, KDTreeSearch, PointCloud, preprocess, register
+from mcgicp_jax import KDTreeSearch, PointCloud, preprocess
 from mcgicp_jax.datasets import Frame
 from tests import reference as ref
 from tests.precision import tolerance
@@ -307,14 +307,6 @@ def test_repr_is_short_and_says_what_matters(cloud, expected):
     inside = []
     jax.jit(lambda cloud: inside.append(repr(cloud)) or cloud.points)(cloud)
     assert str(len(cloud.points)) in inside[0]
-
-
-def test_arguments_may_be_arrays_and_are_named():
-    clouds = raw(), POINTS
-    expected = register(PointCloud(POINTS), PointCloud(POINTS), GICP()).matrix
-    np.testing.assert_array_equal(register(*clouds, GICP()).matrix, expected)
-    with pytest.raises(ValueError, match=r"^source: points: .*\(3,\)"):
-        register(np.zeros(3), POINTS, GICP())
 
 
 def test_transform_by_kilometres_moves_the_points_of_a_raw_cloud():

@@ -8,7 +8,7 @@ import pytest
 
 import mcgicp_jax as mcg
 from mcgicp_jax.metrics import pose_error
-from tests.corridor import corridor
+from tests.corridor import bare_pair
 from tests.differences import TO_ROUNDING, check_eager_gradient, check_gradient, clouds_with, weigh
 from tests.precision import in_both_precisions, in_float64, tolerance
 from tests.reference import logarithm
@@ -117,10 +117,7 @@ def test_a_direction_is_fixed_at_the_origin_of_the_users_coordinates(traced):
 
 def test_fixed_directions_need_no_data():
     """A floor constrains neither x, y nor yaw, a corridor not the way along it; the status asks for the rest alone."""
-    target, source = corridor(2, textured=False)
-    truth = np.linalg.inv(target.pose) @ source.pose
-    clouds = [mcg.preprocess(frame.cloud) for frame in (source, target)]
-    axis = source.pose[:3, :3].T @ [1, 0, 0]
+    *clouds, truth, axis = bare_pair()
     given = np.zeros((6, 6))
     given[:3, :3] = UNKNOWN * (np.eye(3) - np.outer(axis, axis))
     given[3:, 3:] = UNKNOWN * np.eye(3)

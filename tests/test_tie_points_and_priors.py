@@ -13,7 +13,7 @@ from mcgicp_jax._pose_solver.pose_measurements import Fusion, Prior, TiePoints, 
 from mcgicp_jax._registration.measurements import known
 from mcgicp_jax.extend import symmetric_matrices as alg
 from tests.compilations import compilations
-from tests.corridor import corridor
+from tests.corridor import bare_pair, corridor
 from tests.differences import TO_ROUNDING, check_gradient, weigh
 from tests.precision import in_float64
 from tests.reference import exponential, logarithm
@@ -59,11 +59,7 @@ def corner(precision):
 
 @pytest.fixture(scope="module")
 def hall(precision):
-    """Two clouds of a bare corridor, the true pose, and the direction of its axis in the source's frame."""
-    target, source = corridor(2, textured=False)
-    truth = np.linalg.inv(target.pose) @ source.pose
-    clouds = [mcg.preprocess(frame.cloud) for frame in (source, target)]
-    return *clouds, truth, source.pose[:3, :3].T @ [1, 0, 0]
+    return bare_pair()
 
 
 # Algebra
