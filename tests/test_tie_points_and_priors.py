@@ -103,8 +103,8 @@ def test_the_form_is_the_cost(kind):
     nothing = np.zeros((6, 6))
     fusion = Fusion(start[:3, :3], start[:3, 3], center, radius, form, np.eye(6), nothing, nothing, np.ones(6, bool))
     with jax.enable_x64(True):
-        pull, stiffness = jax.jit(Fusion.pull)(fusion, pose[:3, :3], pose[:3, 3])
-    np.testing.assert_allclose(pull, -slope.T @ residuals(np.zeros(6)), rtol=1e-6)
+        force, stiffness = jax.jit(Fusion.force_and_stiffness)(fusion, pose[:3, :3], pose[:3, 3])
+    np.testing.assert_allclose(force, -slope.T @ residuals(np.zeros(6)), rtol=1e-6)
     np.testing.assert_allclose(stiffness, slope.T @ slope, rtol=1e-6)
 
 

@@ -28,10 +28,10 @@ def constraints_at(
 def with_fixed_directions(pose: jaxlie.SE3, prior: Prior) -> jaxlie.SE3:
     """The pose with ξ projected onto F ξ = 0."""
     fixed = prior.fixed
-    apart = _pose_of(prior).inverse().multiply(pose).log()
+    twist = _pose_of(prior).inverse().multiply(pose).log()
     gram = fixed @ fixed.T + jnp.diag(1.0 * ~jnp.any(fixed != 0, axis=1))
-    apart = apart - fixed.T @ (inverse_6(gram) @ (fixed @ apart))
-    moved = _pose_of(prior).multiply(jaxlie.SE3.exp(apart)).normalize()
+    twist = twist - fixed.T @ (inverse_6(gram) @ (fixed @ twist))
+    moved = _pose_of(prior).multiply(jaxlie.SE3.exp(twist)).normalize()
     # jaxlie promotes to the default precision.
     return jaxlie.SE3(moved.wxyz_xyz.astype(pose.wxyz_xyz.dtype))
 
