@@ -333,8 +333,8 @@ def test_a_rotation_of_few_digits_becomes_one():
     typed = np.round(T, 4)
     assert np.abs(typed[:3, :3] @ typed[:3, :3].T - np.eye(3)).max() > 1e-6
     moved = raw().transform(typed)
-    apart = [np.linalg.norm(points[1:] - points[:-1], axis=1) for points in (np.asarray(moved.points), POINTS)]
-    np.testing.assert_allclose(*apart, rtol=1e-6)
+    lengths = [np.linalg.norm(points[1:] - points[:-1], axis=1) for points in (np.asarray(moved.points), POINTS)]
+    np.testing.assert_allclose(*lengths, rtol=1e-6)
 
 
 def test_clouds_of_other_libraries_are_taken(tmp_path):

@@ -31,7 +31,7 @@ class Still(AbstractTerm):
         return self.term.linearize(matches)
 
 
-class Held(mcg.MultiChannelGICP):
+class WithFixedTerm(mcg.MultiChannelGICP):
     """The photometric term alone, with its numbers as they are."""
 
     term: Any
@@ -60,11 +60,11 @@ def sampled(term, matched, motion):
     return term.sample(matched.at(motion))
 
 
-def held(source, target, method, pose, matches):
-    """The method with its numbers from the matches at a pose, held; and the term with these."""
+def with_fixed_numbers(source, target, method, pose, matches):
+    """The method with its numbers fixed to those of the matches at a pose; and the term with these."""
     matched, both, motion = matched_at(source, target, method, pose, matches)
     (term,) = numbers_at(motion, matched, both.terms, source.valid)
-    return Held(both.method, term), term
+    return WithFixedTerm(both.method, term), term
 
 
 def raised(size, **settings):
@@ -135,7 +135,7 @@ def test_the_cost_of_matches_is_that_of_estimate_pose():
 
 def test_forces_are_the_gradient_of_the_cost():
     source, target, truth, matches = at_truth()
-    _, term = held(source, target, PHOTOMETRIC, truth, matches)
+    _, term = with_fixed_numbers(source, target, PHOTOMETRIC, truth, matches)
     matched, _, motion = matched_at(source, target, PHOTOMETRIC, truth, matches)
     moved = motion.move(matched.source.points)
 
@@ -154,7 +154,7 @@ def test_forces_are_the_gradient_of_the_cost():
 
 def test_gains_and_offsets_apply_to_values_and_slopes():
     source, target, truth, matches = at_truth()
-    _, term = held(source, target, PHOTOMETRIC, truth, matches)
+    _, term = with_fixed_numbers(source, target, PHOTOMETRIC, truth, matches)
     darker = source.replace(channels=np.float32(0.7) * source.channels - np.float32(0.2))
     brighter = replace(term, gains=term.gains / 0.7, offsets=term.offsets + 0.2 / 0.7)
     samples = []
@@ -168,7 +168,7 @@ def test_gains_and_offsets_apply_to_values_and_slopes():
 
 def test_estimates_are_scales_and_correlations_of_the_residuals():
     source, target, truth, matches = at_truth(raised, size=2500)
-    _, term = held(source, target, PHOTOMETRIC, truth, matches)
+    _, term = with_fixed_numbers(source, target, PHOTOMETRIC, truth, matches)
     matched, _, motion = matched_at(source, target, PHOTOMETRIC, truth, matches)
     moved = motion.move(matched.source.points)
     residuals = sampled(term, matched, motion)
@@ -236,10 +236,10 @@ def test_noise_of_slopes_is_discounted(noise):
 @pytest.mark.slow
 @in_float64
 def test_estimate_pose_has_the_gradient_of_its_answer(noisy):
-    """With its numbers held, as autodiff holds them."""
+    """With its numbers fixed, as they are for autodiff."""
     source, target, start = noisy
     matches = mcg.find_correspondences(source, target, start, mcg.PointToPoint(), max_distance=GATE)
-    method, _ = held(source, target, PHOTOMETRIC, start, matches)
+    method, _ = with_fixed_numbers(source, target, PHOTOMETRIC, start, matches)
     start = mcg.estimate_pose(source, target, matches, method, init=start, **TO_ROUNDING).matrix
 
     def loss(inputs):
@@ -259,7 +259,7 @@ def test_register_has_the_gradient_of_estimate_pose():
     found = mcg.register(source, target, PHOTOMETRIC, max_distance=GATE, **CONVERGED)
     assert found.converged
     matches = mcg.find_correspondences(source, target, found.matrix, mcg.PointToPoint(), max_distance=GATE)
-    method, _ = held(source, target, PHOTOMETRIC, found.matrix, matches)
+    method, _ = with_fixed_numbers(source, target, PHOTOMETRIC, found.matrix, matches)
 
     def registered(clouds):
         return mcg.register(*clouds, PHOTOMETRIC, init=found.matrix, max_distance=GATE, **CONVERGED)

@@ -110,7 +110,7 @@ def test_what_a_result_keeps_cannot_be_changed(room):
             np.asarray(array)[:] = 0
 
 
-def test_information_is_the_curvature_of_the_cost_with_M_held(room):
+def test_information_is_the_curvature_of_the_cost_with_fixed_M(room):
     source, target, _ = room
     method = mcg.PointToPoint()
     result = mcg.register(source, target, method, max_distance=0.5)
@@ -177,7 +177,7 @@ def test_a_flat_wall_is_degenerate_for_point_to_plane():
     source, target = mcg.preprocess(points + np.array([0.1, 0.0, 0.02])), mcg.preprocess(points)
     result = mcg.register(source, target, mcg.PointToPlane(), max_distance=0.5)
     assert result.status is Status.DEGENERATE and not result.converged
-    # What is held is found; what is free stays where it was.
+    # Constrained directions are found, the others stay where they were.
     np.testing.assert_allclose(result.matrix[:3, 3], [0, 0, -0.02], atol=1e-4)
 
 

@@ -90,9 +90,9 @@ def test_the_form_is_the_cost(kind):
         rotation = turn @ pose[:3, :3]
         translation = center + turn @ (pose[:3, 3] - center) + radius * twist[:3]
         if ties is not None:
-            apart = ties.target - ties.source @ rotation.T - translation
+            differences = ties.target - ties.source @ rotation.T - translation
             return np.concatenate(
-                [np.linalg.cholesky(np.linalg.inv(c)).T @ d for c, d in zip(ties.covariances, apart, strict=True)]
+                [np.linalg.cholesky(np.linalg.inv(c)).T @ d for c, d in zip(ties.covariances, differences, strict=True)]
             )
         moved = np.eye(4)
         moved[:3, :3], moved[:3, 3] = rotation, translation

@@ -298,16 +298,16 @@ def test_the_cost_is_the_sum_over_the_nearest_cells(raw):
     method, gate = mcg.D2DNDT(2.0), 3 * SIZE
     pose = motion((0.06, -0.02, 0.03, 0.03, -0.02, 0.04))
     moved = np.asarray(source.points, float) @ pose[:3, :3].T + pose[:3, 3]
-    apart = np.linalg.norm(moved[:, None] - target.points, axis=2)
-    rows = np.argsort(apart, axis=1)[:, :4]
+    distances = np.linalg.norm(moved[:, None] - target.points, axis=2)
+    rows = np.argsort(distances, axis=1)[:, :4]
     cost, square = 0.0, 0.0
     for i in range(len(moved)):
-        near = [j for j in rows[i] if apart[i, j] <= gate]
+        near = [j for j in rows[i] if distances[i, j] <= gate]
         for j in near:
             d = target.points[j] - moved[i]
             spread = target.covariances[j] + pose[:3, :3] @ source.covariances[i] @ pose[:3, :3].T
             cost += 4 * (1 - np.exp(-d @ np.linalg.solve(spread, d) / 4))
-        square += np.mean([apart[i, j] ** 2 for j in near])
+        square += np.mean([distances[i, j] ** 2 for j in near])
     matches = mcg.find_correspondences(source, target, pose, method, max_distance=gate)
     np.testing.assert_array_equal(np.sort(matches.indices.T, axis=1), np.sort(rows, axis=1))
     rtol = tolerance(1e-3, 1e-9)
