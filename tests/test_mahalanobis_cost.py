@@ -22,12 +22,11 @@ from mcgicp_jax import (
     mahalanobis_cost,
     preprocess,
 )
-from mcgicp_jax._pose_solver.sums import sums_of
 from mcgicp_jax.extend import KERNELS
 from tests import reference as ref
 from tests.compilations import compilations
 from tests.precision import cached, in_both_precisions, in_float64, tolerance
-from tests.scenes import matched_at
+from tests.scenes import matched_at, sums_at
 
 pytestmark = in_float64
 N, K, ROWS = 150, 12, 160
@@ -372,8 +371,8 @@ def test_the_sums_say_what_the_correspondences_say(kernel):
     """e − 2⟨D, G⟩ + ⟨D, Q(D)⟩ = Σ w (d − D h)ᵀ M (d − D h) for any D."""
     _, _, (source, target), matches, matched = problem()
     robust = None if kernel is None else Huber(SCALE)
-    rows, both, there = matched_at(source, target, METHODS["MultiChannelGICP"](), T, matches, robust)
-    found = jax.jit(lambda: sums_of(there, rows, both.terms))()
+    rows, both, _ = matched_at(source, target, METHODS["MultiChannelGICP"](), T, matches, robust)
+    found = jax.jit(sums_at)(jnp.asarray(T, source.points.dtype), rows, both)
 
     raw, neighbors, _, _, _ = problem()
     pair_information = information("MultiChannelGICP", *raw, neighbors)

@@ -23,7 +23,7 @@ from tests.differences import (
 )
 from tests.precision import in_float64
 from tests.refusals import refused
-from tests.scenes import matched_at, motion, pair
+from tests.scenes import matched_at, motion, pair, sums_at
 
 PADDED = 512
 
@@ -123,8 +123,6 @@ def test_implicit_gradient_is_that_of_the_unrolled_loop(noisy):
     source, target, _ = noisy
     method, _ = case("gicp")
     from mcgicp_jax._math.poses import move_pose, se3_from_matrix
-    from mcgicp_jax._pose_solver.matched import Motion
-    from mcgicp_jax._pose_solver.sums import sums_of
 
     matches = mcg.find_correspondences(source, target, motion(), method, max_distance=GATE)
 
@@ -132,7 +130,7 @@ def test_implicit_gradient_is_that_of_the_unrolled_loop(noisy):
         matched, both, _ = matched_at(source.replace(points=points), target, method, motion(), matches)
 
         def body(pose, _):
-            sums = sums_of(Motion(pose.rotation().as_matrix(), pose.translation()), matched, both.terms)
+            sums = sums_at(pose.as_matrix(), matched, both)
             information, gradient = _normal_equations(sums)
             twist = jnp.linalg.solve(information, gradient)
             return move_pose(pose, twist, sums.center), None
