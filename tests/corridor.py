@@ -4,7 +4,7 @@ from functools import partial
 
 import numpy as np
 
-from mcgicp_jax import PointCloud
+from mcgicp_jax import PointCloud, preprocess
 from mcgicp_jax.datasets._frames import Matrix, SyntheticFrames, check_scene, pose_of, scene_and_path_rng
 from mcgicp_jax.datasets._raycast import Box, cast, patches, random_cells, random_rays, sensor_rotation
 
@@ -65,6 +65,13 @@ def _pose(step: float, sway: float, yaw: float, tilt: float, index: int) -> Matr
     phase = index * step / 3 / _SWAY
     rotation = sensor_rotation(_YAW * np.sin(yaw + index / 3), _TILT, tilt + index * _TILT_PHASE)
     return pose_of(rotation, (index * step, _SWAY * np.cos(sway + phase), _SENSOR_HEIGHT))
+
+
+def bare_pair() -> tuple[PointCloud, PointCloud, Matrix, np.ndarray]:
+    """Source and target without texture, the true pose, and the axis of the corridor in the source's frame."""
+    target, source = corridor(2, textured=False)
+    clouds = preprocess(source.cloud), preprocess(target.cloud)
+    return *clouds, np.linalg.inv(target.pose) @ source.pose, source.pose[:3, :3].T @ [1, 0, 0]
 
 
 def _observe(pattern: int | None, size: int, noise: float, rng: np.random.Generator, pose: Matrix) -> PointCloud:

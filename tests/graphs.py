@@ -44,8 +44,8 @@ def grid(side=5, step=1.0):
             cells += [(x, y, z) for x in range(side)[:: 1 if (y + z) % 2 == 0 else -1]]
     cells = np.array(cells)
     poses = np.array([motion((*(step * cell), *(0.5 * rng.normal(size=3)))) for cell in cells])
-    apart = np.abs(cells[:, None] - cells).sum(axis=2)
-    return poses, [(i, j) for i, j in np.argwhere(apart == 1) if j > i + 1 and rng.random() < 0.9]
+    steps = np.abs(cells[:, None] - cells).sum(axis=2)
+    return poses, [(i, j) for i, j in np.argwhere(steps == 1) if j > i + 1 and rng.random() < 0.9]
 
 
 def garage(floors=4, per_floor=400, size=(60.0, 30.0)):

@@ -98,8 +98,8 @@ def match(source, target, T, max_distance, source_channels=None, target_channels
         a = np.concatenate([a, weights * np.asarray(source_channels, float)], axis=1)
         b = np.concatenate([b, weights * np.asarray(target_channels, float)], axis=1)
     index = nearest(a, b)[:, 0]
-    apart = np.linalg.norm(np.asarray(target, float)[index] - moved, axis=1)
-    return np.where(apart <= max_distance, index, -1)
+    distances = np.linalg.norm(np.asarray(target, float)[index] - moved, axis=1)
+    return np.where(distances <= max_distance, index, -1)
 
 
 def match_partial(source, target, source_present, target_present, penalty, k: int = 1) -> np.ndarray:
@@ -154,21 +154,21 @@ def full_covariance(value, num_channels: int) -> np.ndarray:
     return value if value.ndim == 2 else np.diag(np.broadcast_to(value, (num_channels,)))
 
 
-def kernel(apart, common, others, channel_covariance) -> np.ndarray:
-    """Eq. 7 for the neighbours of one point, given channel differences `apart`, (k, C), valid where `common`.
+def kernel(differences, common, others, channel_covariance) -> np.ndarray:
+    """Eq. 7 for the neighbours of one point, given the `differences` of channels, (k, C), valid where `common`.
 
     Uses the marginal of Λ on the common channels. For a missing channel, the factor is the mean over the `others`
     (the neighbours without the point itself) that have it.
     """
-    full = full_covariance(channel_covariance, apart.shape[1])
-    result = np.ones(len(apart))
+    full = full_covariance(channel_covariance, differences.shape[1])
+    result = np.ones(len(differences))
     for j, both in enumerate(common):
-        d = apart[j, both]
+        d = differences[j, both]
         result[j] = np.exp(-0.5 * d @ np.linalg.inv(full[np.ix_(both, both)]) @ d)
         for c in np.flatnonzero(~both):
             known = common[:, c] & others
             if known.any():
-                result[j] *= np.mean(np.exp(-0.5 * apart[known, c] ** 2 / full[c, c]))
+                result[j] *= np.mean(np.exp(-0.5 * differences[known, c] ** 2 / full[c, c]))
     return result
 
 

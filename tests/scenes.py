@@ -2,10 +2,14 @@
 
 from collections.abc import Callable
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 
 import mcgicp_jax as mcg
 from mcgicp_jax._methods.surfaces import searchable, surface_pair, surface_table
+from mcgicp_jax._pose_solver.matched import Matches, Motion, match_surfaces
+from mcgicp_jax._pose_solver.sums import sums_of
 from tests.reference import pose
 
 
@@ -54,6 +58,19 @@ def prepare(method, cloud, observed=False):
 def covariances(method, cloud):
     """Packed covariances (6, N) of a resolved method, for concrete and traced clouds."""
     return surface_pair(method, cloud, cloud, observed=False).whole().source.covariance.T
+
+
+def matched_at(source, target, method, pose, matches, robust=None):
+    """The matched surfaces of a method, both surfaces with the terms, and the motion of a pose."""
+    both = surface_pair(method, source, target, observed=False, robust=robust).whole()
+    pose = jnp.asarray(pose, source.points.dtype)
+    matched = jax.jit(match_surfaces)(both.source, both.target, Matches.given(matches))
+    return matched, both, Motion(pose[:3, :3], pose[:3, 3])
+
+
+def sums_at(pose, matched, both):
+    """The sums that update a pose, (4, 4), from `matched_at`."""
+    return sums_of(Motion(pose[:3, :3], pose[:3, 3]), matched, both.terms)
 
 
 def rectangles(*sides: tuple[tuple[float, ...], tuple[float, ...], tuple[float, ...]]) -> Callable[..., np.ndarray]:

@@ -352,7 +352,7 @@ def test_fixed_directions(files, capsys, tmp_path):
     command = ["register", files["source"], files["target"], "--method", "gicp", "--init", str(pose)]
     for fixed in (["--fix", "roll", "pitch", "z"], ["--fix", "roll", "pitch", "--fix", "z"]):
         assert main([*command, *fixed]) == 0
-        apart = np.linalg.inv(start) @ printed_matrix(capsys.readouterr().out)
-        assert np.abs(apart[2] - [0, 0, 1, 0]).max() < 1e-6
+        change = np.linalg.inv(start) @ printed_matrix(capsys.readouterr().out)
+        assert np.abs(change[2] - [0, 0, 1, 0]).max() < 1e-6
     with pytest.raises(SystemExit, match="2"):
         main([*command, "--fix", "north"])

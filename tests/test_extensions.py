@@ -53,10 +53,10 @@ class BruteForce(mcg.AbstractTreeSearch):
         return points
 
     def query(self, tree, queries, k, bound):
-        apart = np.linalg.norm(queries[:, None] - tree, axis=2)
-        rows = np.argpartition(apart, min(k, len(tree)) - 1, axis=1)[:, :k]
-        rows = np.take_along_axis(rows, np.argsort(np.take_along_axis(apart, rows, axis=1), axis=1), axis=1)
-        distances = np.take_along_axis(apart, rows, axis=1)
+        lengths = np.linalg.norm(queries[:, None] - tree, axis=2)
+        rows = np.argpartition(lengths, min(k, len(tree)) - 1, axis=1)[:, :k]
+        rows = np.take_along_axis(rows, np.argsort(np.take_along_axis(lengths, rows, axis=1), axis=1), axis=1)
+        distances = np.take_along_axis(lengths, rows, axis=1)
         near = distances < bound
         return np.where(near, distances, np.inf), np.where(near, rows, len(tree))
 

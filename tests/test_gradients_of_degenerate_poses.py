@@ -8,12 +8,11 @@ import pytest
 
 import mcgicp_jax as mcg
 from mcgicp_jax import Status
-from mcgicp_jax._methods.surfaces import surface_pair
-from mcgicp_jax._pose_solver.matched import Matches, Motion, linearize_at, match_surfaces
+from mcgicp_jax._pose_solver.matched import linearize_at
 from tests.differences import CONVERGED, GATE, clouds_with, directional_errors, inputs_of, weigh
 from tests.precision import cached, in_both_precisions, in_float64, tolerance
 from tests.reference import exponential
-from tests.scenes import motion, pair, wall
+from tests.scenes import matched_at, motion, pair, wall
 
 SIZE = 400
 TRUTH = motion((0.02, 0.01, 0.02, 0.01, -0.01, 0.005))
@@ -85,9 +84,9 @@ class Reference:
         self._slope = np.stack(forces, axis=1) / 2e-5
 
     def _force(self, clouds, method, moved):
-        surfaces, pose = surface_pair(method, *clouds, observed=False).whole(), self._at(moved)
-        matched = match_surfaces(surfaces.source, surfaces.target, Matches.given(self._matches))
-        force = np.asarray(_forces(Motion(pose[:3, :3], pose[:3, 3]), matched, surfaces.terms)).T
+        pose = self._at(moved)
+        matched, both, there = matched_at(*clouds, method, pose, self._matches)
+        force = np.asarray(_forces(there, matched, both.terms)).T
         points = np.asarray(clouds[0].points) @ pose[:3, :3].T + pose[:3, 3]
         return self._along.T @ np.append(force.sum(axis=0), np.cross(points, force).sum(axis=0))
 

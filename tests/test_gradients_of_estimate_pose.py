@@ -26,7 +26,7 @@ pytestmark = in_float64
 @pytest.mark.parametrize(
     "name", [name if name == "gicp" else pytest.param(name, marks=pytest.mark.slow) for name in CASES]
 )
-def test_align_has_the_gradient_of_its_answer(name, noisy):
+def test_estimate_pose_has_the_gradient_of_its_answer(name, noisy):
     source, target, _ = noisy
     method, robust = case(name)
     matches = mcg.find_correspondences(source, target, motion(), method, max_distance=GATE)
@@ -42,7 +42,7 @@ def test_align_has_the_gradient_of_its_answer(name, noisy):
 
 
 @pytest.mark.parametrize("name", [pytest.param("mc-gicp", marks=pytest.mark.slow), "color-icp"])
-def test_align_has_the_gradient_where_channels_are_missing(name, noisy):
+def test_estimate_pose_has_the_gradient_where_channels_are_missing(name, noisy):
     source, target, _ = noisy
     method, robust = case(name)
     clouds = []
@@ -70,7 +70,7 @@ def test_align_has_the_gradient_where_channels_are_missing(name, noisy):
 
 
 @pytest.mark.slow
-def test_align_has_the_gradient_of_given_covariances(noisy):
+def test_estimate_pose_has_the_gradient_of_given_covariances(noisy):
     source, target, _ = noisy
     method, robust = case("gicp")
     rng = np.random.default_rng(0)

@@ -22,13 +22,11 @@ from mcgicp_jax import (
     mahalanobis_cost,
     preprocess,
 )
-from mcgicp_jax._methods.surfaces import surface_pair
-from mcgicp_jax._pose_solver.matched import Matches, Motion, match_surfaces
-from mcgicp_jax._pose_solver.sums import sums_of
 from mcgicp_jax.extend import KERNELS
 from tests import reference as ref
 from tests.compilations import compilations
 from tests.precision import cached, in_both_precisions, in_float64, tolerance
+from tests.scenes import matched_at, sums_at
 
 pytestmark = in_float64
 N, K, ROWS = 150, 12, 160
@@ -372,13 +370,9 @@ def test_a_batch_is_its_lanes():
 def test_the_sums_say_what_the_correspondences_say(kernel):
     """e − 2⟨D, G⟩ + ⟨D, Q(D)⟩ = Σ w (d − D h)ᵀ M (d − D h) for any D."""
     _, _, (source, target), matches, matched = problem()
-    dtype = source.points.dtype
-    method = METHODS["MultiChannelGICP"]()
     robust = None if kernel is None else Huber(SCALE)
-    pair = surface_pair(method, source, target, observed=False, robust=robust).whole()
-    there = Motion(jnp.asarray(T[:3, :3], dtype), jnp.asarray(T[:3, 3], dtype))
-    given = Matches.given(matches)
-    found = jax.jit(lambda: sums_of(there, match_surfaces(pair.source, pair.target, given), pair.terms))()
+    rows, both, _ = matched_at(source, target, METHODS["MultiChannelGICP"](), T, matches, robust)
+    found = jax.jit(sums_at)(jnp.asarray(T, source.points.dtype), rows, both)
 
     raw, neighbors, _, _, _ = problem()
     pair_information = information("MultiChannelGICP", *raw, neighbors)

@@ -99,7 +99,7 @@ def test_the_pose_inside_jit_of_a_padded_cloud_and_in_a_batch_is_the_same(clouds
 
 
 @pytest.mark.slow
-def test_compiled_programs_get_all_rows_of_a_target_that_is_described_on_demand(clouds):
+def test_compiled_programs_get_all_rows_of_a_target_that_is_computed_on_demand(clouds):
     """For lanes, and where only the initial pose is traced. New clouds, of which nothing is computed yet."""
     options = {"max_distance": GATE, "max_source_points": 150, "search": mcg.DenseSearch()}
 

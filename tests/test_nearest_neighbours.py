@@ -191,9 +191,9 @@ def test_correspondences_against_the_reference(weights, max_distance):
     valid = np.asarray(found.valid)
     np.testing.assert_array_equal(np.where(valid, found.indices, -1)[:150], expected)
     moved = a @ T[:3, :3].T + T[:3, 3]
-    apart = np.linalg.norm(b[expected] - moved, axis=1)
+    distances = np.linalg.norm(b[expected] - moved, axis=1)
     np.testing.assert_allclose(
-        np.asarray(found.distances)[:150][valid[:150]], apart[expected >= 0], atol=tolerance(1e-6, 1e-12)
+        np.asarray(found.distances)[:150][valid[:150]], distances[expected >= 0], atol=tolerance(1e-6, 1e-12)
     )
 
 

@@ -102,7 +102,7 @@ def test_a_target_has_one_tree_and_a_map_slides(room, against, radius):
 
 
 @in_both_precisions
-def test_rows_described_when_they_are_used_change_nothing(room):
+def test_rows_computed_when_they_are_used_change_nothing(room):
     """And each pair starts from the motion before."""
     frames, _ = room
     given, init = {"max_distance": 0.5, "max_source_points": 300}, motion((0.05, 0, 0, 0, 0, 0.05))

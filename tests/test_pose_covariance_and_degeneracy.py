@@ -73,8 +73,8 @@ def test_noise_as_large_as_the_spacing_constrains_nothing(name, free, noise):
         warnings.simplefilter("ignore")
         cloud = mcg.preprocess(SURFACES[name](np.random.default_rng(0), 3000, noise), None)
     geometry, _ = mean_evidence(cloud, mcg.GICP())
-    held = np.delete(np.arange(3), free)
-    assert np.all(np.diag(geometry)[list(free)] < GEOMETRY_HOLDS) and np.all(np.diag(geometry)[held] > 0.02)
+    constrained = np.delete(np.arange(3), free)
+    assert np.all(np.diag(geometry)[list(free)] < GEOMETRY_HOLDS) and np.all(np.diag(geometry)[constrained] > 0.02)
 
 
 @pytest.mark.parametrize("seed", range(4))
@@ -110,7 +110,7 @@ def test_noise_of_the_channels_holds_nothing():
     noise = np.random.default_rng(1).normal(size=(2000, 3))
     cloud = mcg.preprocess(mcg.PointCloud(points, noise))
     _, channels = mean_evidence(cloud, mcg.MultiChannelGICP().resolve(cloud, cloud))
-    # What is taken off is a little more than the noise leaves behind: below zero, nothing is held either.
+    # What is taken off is a little more than the noise leaves behind: below zero, nothing is constrained either.
     assert np.linalg.eigvalsh(channels).min() > -0.05 and np.linalg.eigvalsh(channels).max() < 5e-3
 
 
@@ -167,9 +167,9 @@ def test_channels_that_do_not_agree_constrain_nothing(start, status):
 
 
 @settings(deadline=None, max_examples=30)
-@given(seed=st.integers(0, 2**32 - 1), held=st.integers(0, 6), radius=st.sampled_from([1e-3, 1.0, 300.0]))
-def test_directions_are_the_eigenvectors_of_the_share_of_motion(seed, held, radius):
-    """Against SciPy's generalised eigenvalues of random pairs that feel motions along `held` random twists."""
+@given(seed=st.integers(0, 2**32 - 1), constrained=st.integers(0, 6), radius=st.sampled_from([1e-3, 1.0, 300.0]))
+def test_directions_are_the_eigenvectors_of_the_share_of_motion(seed, constrained, radius):
+    """Against SciPy's generalised eigenvalues of random pairs that constrain `constrained` random twists."""
     import scipy.linalg
 
     rng = np.random.default_rng(seed)
@@ -177,7 +177,7 @@ def test_directions_are_the_eigenvectors_of_the_share_of_motion(seed, held, radi
     weight = rng.uniform(0.5, 1.5, 200)
     normals = rng.normal(size=(200, 3))
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
-    matrices = np.einsum("ni,nj->nij", normals, normals) * (held / 6)
+    matrices = np.einsum("ni,nj->nij", normals, normals) * (constrained / 6)
     h = np.concatenate([p, np.ones((1, 200))])
     upper = matrices[:, *np.triu_indices(3)].T
     sums = Sums(
@@ -219,7 +219,7 @@ def test_geometry_slides_on_a_wall_and_stays_where_it_started(flat):
     for direction in result.unconstrained_directions[:2]:
         assert abs(direction.axis[2]) < 0.05
     assert abs(result.unconstrained_directions[2].axis[2]) > 0.99
-    # What is held is found: height and tilt. What is not stays: the way along the wall, and the turn about its normal.
+    # Height and tilt are found. The way along the wall and the turn about its normal, not constrained, are unchanged.
     left = np.linalg.inv(truth) @ result.matrix
     assert abs(left[2, 3]) < 2e-3 and np.abs(left[:2, 2]).max() < 2e-3
     centroid = result.directions.center

@@ -96,7 +96,7 @@ def test_priors_give_the_minimum_and_the_covariances_of_gtsam():
 
 
 def test_a_prior_alone_moves_the_graph_and_makes_it_uncertain():
-    """Next to motions known to a millimetre, a start known to 100 m: no pose is held, and no digit is lost."""
+    """Next to motions known to a millimetre, a start known to 100 m: no pose is fixed, and no digit is lost."""
     graph, _ = measured(*grid(2), deviations=(1e-3, 1e-3))
     start = motion((3e5, 5e6, 100, 0.1, 0.2, -2.0))
     covariance = np.diag([1e4, 1e4, 1e4, 0.1, 0.1, 0.2])
@@ -152,19 +152,19 @@ def test_rounding_of_poses_in_float32_is_warned_of():
 def test_parts_that_have_priors_are_well_defined():
     poses, loops = SMALL["grid"]
     graph, _ = measured(poses, loops)
-    apart = graph.edges[(graph.edges.i < 13) == (graph.edges.j < 13)]
+    parts = graph.edges[(graph.edges.i < 13) == (graph.edges.j < 13)]
     covariance = np.diag([1e-4] * 6)
     priors = [mcg.Edge(mcg.WORLD, k, poses[k], covariance=covariance)[None] for k in (3, 20)]
-    found = mcg.optimize_poses(mcg.PoseGraph(graph.poses, joined(apart, *priors)))
+    found = mcg.optimize_poses(mcg.PoseGraph(graph.poses, joined(parts, *priors)))
     assert found.converged and np.isfinite(found.covariance).all()
     np.testing.assert_allclose(found.poses[[3, 20]], poses[[3, 20]], atol=1e-4)
     np.testing.assert_allclose(found.covariance[[3, 20]], np.array([covariance] * 2), rtol=1e-4, atol=1e-9)
-    one = mcg.optimize_poses(mcg.PoseGraph(graph.poses, joined(apart, priors[1])))
+    one = mcg.optimize_poses(mcg.PoseGraph(graph.poses, joined(parts, priors[1])))
     assert one.status == mcg.Status.DEGENERATE
     assert np.all(np.isinf(np.diagonal(one.covariance[:13], 0, 1, 2))) and np.all(np.isfinite(one.covariance[13:]))
     # A wrong prior is rejected like a loop.
     wrong = mcg.Edge(mcg.WORLD, 5, motion((50, 0, 0, 0, 0, 1)), covariance=covariance, uncertain=True)[None]
-    again = mcg.optimize_poses(mcg.PoseGraph(graph.poses, joined(apart, *priors, wrong)))
+    again = mcg.optimize_poses(mcg.PoseGraph(graph.poses, joined(parts, *priors, wrong)))
     assert not again.kept[-1]
     np.testing.assert_array_equal(again.kept[:-1], found.kept)
     np.testing.assert_allclose(again.poses, found.poses, atol=1e-6)
@@ -192,9 +192,9 @@ def test_a_start_is_composed_from_the_edges():
         mcg.PoseGraph(None, joined(exact[gap | mixed.uncertain], prior[None])).poses, poses, atol=1e-9
     )
     # What has no prior begins at the identity; an edge that knows no heading comes last.
-    apart = mcg.PoseGraph(None, joined(exact[gap], prior[None])).poses
-    np.testing.assert_allclose(apart[:30], np.linalg.inv(poses[0]) @ poses[:30], atol=1e-9)
-    np.testing.assert_allclose(apart[30:], poses[30:], atol=1e-9)
+    parts = mcg.PoseGraph(None, joined(exact[gap], prior[None])).poses
+    np.testing.assert_allclose(parts[:30], np.linalg.inv(poses[0]) @ poses[:30], atol=1e-9)
+    np.testing.assert_allclose(parts[30:], poses[30:], atol=1e-9)
     blind = mcg.Edge(0, 1, motion((9, 9, 9, 0, 0, 1)), np.diag([1.0, 1, 1, 1, 1, 0]))
     sure = mcg.Edge(0, 1, motion((1, 0, 0, 0, 0, 0)), np.eye(6), uncertain=True)
     np.testing.assert_allclose(mcg.PoseGraph(None, [blind, sure]).poses[1], sure.T_i_j, atol=1e-12)

@@ -112,8 +112,8 @@ def se3s_of(twists):
 def test_failures_inside_transformations_are_statuses(both):
     graph = both[0]
     edges, last = graph.edges, len(graph.poses) - 1
-    apart = (edges.i != last) & (edges.j != last)
-    cut = mcg.Edge(edges.i, edges.j, edges.T_i_j, apart[:, None, None] * edges.information)
+    others = (edges.i != last) & (edges.j != last)
+    cut = mcg.Edge(edges.i, edges.j, edges.T_i_j, others[:, None, None] * edges.information)
     found, _ = differentiated(mcg.PoseGraph(graph.poses, cut), *direction(graph))
     assert found.status == mcg.Status.DEGENERATE and not found.converged
     twists, change = direction(graph)
@@ -187,8 +187,8 @@ def test_degenerate_graphs_are_finite_inside_transformations():
     position = mcg.Edge(mcg.WORLD, 0, graph.poses[0], np.diag([1.0, 1, 1, 0, 0, 0]))[None]
     open_ended = mcg.PoseGraph(graph.poses, joined(graph.edges, position))
     edges = graph.edges
-    apart = mcg.PoseGraph(graph.poses, edges[(edges.i < 4) == (edges.j < 4)])
-    for each in (open_ended, apart):
+    parts = mcg.PoseGraph(graph.poses, edges[(edges.i < 4) == (edges.j < 4)])
+    for each in (open_ended, parts):
         expected, (found, slope) = mcg.optimize_poses(each, robust=False), differentiated(each, *direction(each))
         assert found.status == expected.status == mcg.Status.DEGENERATE
         np.testing.assert_allclose(found.poses, expected.poses, atol=1e-4)

@@ -145,12 +145,12 @@ def test_rounding_at_the_minimum_costs_no_steps():
 
 
 @pytest.mark.parametrize("missing", ["no pairs", "one direction"])
-def test_free_directions_are_named_and_held(missing):
+def test_unconstrained_directions_stay_where_they_are(missing):
     moved, residual, information, weight, valid = random_pairs(3)
     if missing == "no pairs":
         valid[:], weight[:], residual[:] = False, 0, 0
     else:
-        # Planes through a common axis: nothing holds the translation along it.
+        # Planes through a common axis do not constrain the translation along it.
         normals = np.random.default_rng(0).normal(size=(N, 3)) * [1, 1, 0]
         information = np.einsum("ni,nj->nij", normals, normals)
     _, update = solve(moved, residual, information, weight, valid)

@@ -94,7 +94,7 @@ def test_the_result_belongs_to_the_returned_pose(room):
     method = METHODS["mc-gicp"]()
     for iterations, status in ((2, Status.MAX_ITERATIONS), (64, Status.CONVERGED)):
         result = mcg.register(source, target, method, max_distance=0.5, max_iterations=iterations, **tight())
-        assert result.status is status
+        assert result.status is status and (result.num_iterations == iterations or result.converged)
         matches = mcg.find_correspondences(source, target, result.matrix, method, max_distance=0.5)
         cost = mcg.mahalanobis_cost(result.matrix, source, target, matches, method)
         np.testing.assert_allclose(result.cost, cost, rtol=1e-4)
@@ -110,7 +110,7 @@ def test_what_a_result_keeps_cannot_be_changed(room):
             np.asarray(array)[:] = 0
 
 
-def test_information_is_the_curvature_of_the_cost_with_M_held(room):
+def test_information_is_the_curvature_of_the_cost_with_fixed_M(room):
     source, target, _ = room
     method = mcg.PointToPoint()
     result = mcg.register(source, target, method, max_distance=0.5)
@@ -177,7 +177,7 @@ def test_a_flat_wall_is_degenerate_for_point_to_plane():
     source, target = mcg.preprocess(points + np.array([0.1, 0.0, 0.02])), mcg.preprocess(points)
     result = mcg.register(source, target, mcg.PointToPlane(), max_distance=0.5)
     assert result.status is Status.DEGENERATE and not result.converged
-    # What is held is found; what is free stays where it was.
+    # Constrained directions are found, the others stay where they were.
     np.testing.assert_allclose(result.matrix[:3, 3], [0, 0, -0.02], atol=1e-4)
 
 
@@ -193,12 +193,6 @@ def test_alternating_matches_end_as_converged(seed):
     assert result.converged and result.num_iterations < 40
     assert result.history["translation_step"][-4:].max() < result.deviations[:3].max()
     assert difference(result.matrix, np.eye(4)) < 4 * result.deviations[:3].max()
-
-
-def test_running_out_of_iterations_is_not_convergence(room):
-    source, target, _ = room
-    result = mcg.register(source, target, mcg.PointToPoint(), max_distance=0.5, max_iterations=3)
-    assert result.status is Status.MAX_ITERATIONS and result.num_iterations == 3
 
 
 def with_value(array, where, value):
@@ -254,7 +248,6 @@ def test_bare_arrays_are_enough():
     [
         *(("max_distance", bad) for bad in (0.0, -1.0, np.nan, (0.2, 0.5), (0.5, 0.0), (np.nan, 0.1), np.ones(3))),
         *(("init", bad) for bad in (np.eye(3), np.diag([1.0, 1, -1, 1]), np.full((4, 4), np.nan), 2 * np.eye(4))),
-        ("max_iterations", 0),
         ("translation_tolerance", -1.0),
         ("rotation_tolerance", np.nan),
         ("voxel_sizes", (0.5, -1.0)),
@@ -268,20 +261,9 @@ def test_a_bad_argument_is_named(name, value, room):
     refused(lambda: mcg.register(*room[:2], mcg.GICP(), **{"max_distance": 0.5, name: value}), name)
 
 
-@pytest.mark.parametrize(
-    "points, named, shown",
-    [
-        (np.zeros((0, 3)), "source: cloud", "got 0"),
-        (np.zeros((1, 3)), "source: cloud", "got 1"),
-        (np.full((10, 3), np.nan), "source: cloud", "0 of 10"),
-        (np.zeros((10, 2)), "source: points", "(10, 2)"),
-        (np.zeros((10, 3), complex), "source: points", "complex128"),
-        ([[1, 2, 3], [4, 5]], "source: points", "rectangular"),
-        (np.array([["a", "b", "c"]]), "source: points", "real"),
-    ],
-)
-def test_a_bad_cloud_is_named(points, named, shown, room):
-    refused(lambda: mcg.register(points, room[1], mcg.GICP(), max_distance=0.5), named, shown)
+@pytest.mark.parametrize("size, named, shown", [((0, 3), "cloud", "got 0"), ((10, 2), "points", "(10, 2)")])
+def test_a_bad_cloud_is_named(size, named, shown, room):
+    refused(lambda: mcg.register(np.zeros(size), room[1], mcg.GICP(), max_distance=0.5), f"source: {named}", shown)
 
 
 def test_two_distances_are_two_registrations_in_a_row(room):
@@ -460,14 +442,6 @@ def test_clouds_that_do_not_fit_are_named(room):
     refused(lambda: mcg.register(source, given, mcg.GICP(), voxel_sizes=(0.2,)), "voxel_sizes")
     # Geometry alone does not look at channels.
     assert mcg.register(fewer, target, mcg.GICP(), max_distance=0.5).converged
-
-
-def test_results_repeat_with_any_number_of_threads(room):
-    searches = [*[None] * 5, mcg.KDTreeSearch(workers=1)]
-    first, *others = (mcg.register(*room[:2], METHODS["mc-gicp"](), max_distance=0.5, search=each) for each in searches)
-    for result in others:
-        np.testing.assert_array_equal(result.matrix, first.matrix)
-        assert result.status is first.status and result.cost == first.cost
 
 
 def test_a_coarse_pose_that_is_degenerate_is_the_next_start():

@@ -23,7 +23,7 @@ from tests.differences import (
 )
 from tests.precision import in_float64
 from tests.refusals import refused
-from tests.scenes import motion, pair
+from tests.scenes import matched_at, motion, pair, sums_at
 
 PADDED = 512
 
@@ -123,18 +123,14 @@ def test_implicit_gradient_is_that_of_the_unrolled_loop(noisy):
     source, target, _ = noisy
     method, _ = case("gicp")
     from mcgicp_jax._math.poses import move_pose, se3_from_matrix
-    from mcgicp_jax._methods.surfaces import surface_pair
-    from mcgicp_jax._pose_solver.matched import Matches, Motion, match_surfaces
-    from mcgicp_jax._pose_solver.sums import sums_of
 
     matches = mcg.find_correspondences(source, target, motion(), method, max_distance=GATE)
 
     def unrolled(points):
-        pair = surface_pair(method, source.replace(points=points), target, observed=False)
-        matched = match_surfaces(pair.source, pair.target, Matches.given(matches))
+        matched, both, _ = matched_at(source.replace(points=points), target, method, motion(), matches)
 
         def body(pose, _):
-            sums = sums_of(Motion(pose.rotation().as_matrix(), pose.translation()), matched, pair.terms)
+            sums = sums_at(pose.as_matrix(), matched, both)
             information, gradient = _normal_equations(sums)
             twist = jnp.linalg.solve(information, gradient)
             return move_pose(pose, twist, sums.center), None
@@ -277,8 +273,8 @@ def test_towards_zero_temperature_the_nearest_counts_alone(noisy):
     np.testing.assert_allclose(costs[2], cost, rtol=1e-4)
     # At a pose that the hard matches balance, so do the soft ones.
     soft = mcg.estimate_pose(source, target, many, method, init=start, temperature=1e-4)
-    aligned = mcg.estimate_pose(source, target, hard, method, init=start)
-    np.testing.assert_allclose(soft.matrix, aligned.matrix, atol=1e-6)
+    expected = mcg.estimate_pose(source, target, hard, method, init=start)
+    np.testing.assert_allclose(soft.matrix, expected.matrix, atol=1e-6)
 
 
 def test_candidates_need_a_temperature(noisy):

@@ -13,7 +13,7 @@ from mcgicp_jax._pose_solver.pose_measurements import Fusion, Prior, TiePoints, 
 from mcgicp_jax._registration.tie_points_and_prior import known
 from mcgicp_jax.extend import symmetric_matrices as alg
 from tests.compilations import compilations
-from tests.corridor import corridor
+from tests.corridor import bare_pair, corridor
 from tests.differences import TO_ROUNDING, check_gradient, weigh
 from tests.precision import in_float64
 from tests.reference import exponential, logarithm
@@ -59,11 +59,7 @@ def corner(precision):
 
 @pytest.fixture(scope="module")
 def hall(precision):
-    """Two clouds of a bare corridor, the true pose, and the direction of its axis in the source's frame."""
-    target, source = corridor(2, textured=False)
-    truth = np.linalg.inv(target.pose) @ source.pose
-    clouds = [mcg.preprocess(frame.cloud) for frame in (source, target)]
-    return *clouds, truth, source.pose[:3, :3].T @ [1, 0, 0]
+    return bare_pair()
 
 
 # Algebra
@@ -94,9 +90,9 @@ def test_the_form_is_the_cost(kind):
         rotation = turn @ pose[:3, :3]
         translation = center + turn @ (pose[:3, 3] - center) + radius * twist[:3]
         if ties is not None:
-            apart = ties.target - ties.source @ rotation.T - translation
+            differences = ties.target - ties.source @ rotation.T - translation
             return np.concatenate(
-                [np.linalg.cholesky(np.linalg.inv(c)).T @ d for c, d in zip(ties.covariances, apart, strict=True)]
+                [np.linalg.cholesky(np.linalg.inv(c)).T @ d for c, d in zip(ties.covariances, differences, strict=True)]
             )
         moved = np.eye(4)
         moved[:3, :3], moved[:3, 3] = rotation, translation
@@ -107,8 +103,8 @@ def test_the_form_is_the_cost(kind):
     nothing = np.zeros((6, 6))
     fusion = Fusion(start[:3, :3], start[:3, 3], center, radius, form, np.eye(6), nothing, nothing, np.ones(6, bool))
     with jax.enable_x64(True):
-        pull, stiffness = jax.jit(Fusion.pull)(fusion, pose[:3, :3], pose[:3, 3])
-    np.testing.assert_allclose(pull, -slope.T @ residuals(np.zeros(6)), rtol=1e-6)
+        force, stiffness = jax.jit(Fusion.force_and_stiffness)(fusion, pose[:3, :3], pose[:3, 3])
+    np.testing.assert_allclose(force, -slope.T @ residuals(np.zeros(6)), rtol=1e-6)
     np.testing.assert_allclose(stiffness, slope.T @ slope, rtol=1e-6)
 
 

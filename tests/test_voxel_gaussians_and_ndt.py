@@ -232,7 +232,7 @@ def test_the_pose_is_found(method, raw):
         np.testing.assert_allclose(inside, result.matrix, atol=1e-4)
 
 
-def test_scales_make_the_cells(raw):
+def test_voxel_sizes_make_the_cells(raw):
     source, target, truth = raw
     far = motion((0.15, -0.1, 0.1, 0.05, -0.05, 0.1))
     moved = source.transform(np.linalg.inv(far))
@@ -240,7 +240,7 @@ def test_scales_make_the_cells(raw):
     for moving, method in ((moved, mcg.D2DNDT()), (thinned, mcg.NDT())):
         result = mcg.register(moving, target, method, voxel_sizes=(0.8, SIZE))
         assert result.converged and max(pose_error(result.matrix, truth @ far)) < 0.03
-        # The last scale is the result.
+        # The last size is the result.
         cells = mcg.voxel_gaussians(target, SIZE)
         end = mcg.voxel_gaussians(moved, SIZE) if isinstance(method, mcg.D2DNDT) else thinned
         again = mcg.register(end, cells, method, init=result.matrix)
@@ -248,7 +248,7 @@ def test_scales_make_the_cells(raw):
         assert again.num_inliers == result.num_inliers
 
 
-def test_coarse_scales_register_voxels_of_a_quarter(raw):
+def test_coarse_sizes_register_voxels_of_a_quarter(raw):
     voxels, cells = (
         [make(cloud, size) for cloud in raw[:2]] for make, size in ((mcg.preprocess, 0.2), (mcg.voxel_gaussians, SIZE))
     )
@@ -298,16 +298,16 @@ def test_the_cost_is_the_sum_over_the_nearest_cells(raw):
     method, gate = mcg.D2DNDT(2.0), 3 * SIZE
     pose = motion((0.06, -0.02, 0.03, 0.03, -0.02, 0.04))
     moved = np.asarray(source.points, float) @ pose[:3, :3].T + pose[:3, 3]
-    apart = np.linalg.norm(moved[:, None] - target.points, axis=2)
-    rows = np.argsort(apart, axis=1)[:, :4]
+    distances = np.linalg.norm(moved[:, None] - target.points, axis=2)
+    rows = np.argsort(distances, axis=1)[:, :4]
     cost, square = 0.0, 0.0
     for i in range(len(moved)):
-        near = [j for j in rows[i] if apart[i, j] <= gate]
+        near = [j for j in rows[i] if distances[i, j] <= gate]
         for j in near:
             d = target.points[j] - moved[i]
             spread = target.covariances[j] + pose[:3, :3] @ source.covariances[i] @ pose[:3, :3].T
             cost += 4 * (1 - np.exp(-d @ np.linalg.solve(spread, d) / 4))
-        square += np.mean([apart[i, j] ** 2 for j in near])
+        square += np.mean([distances[i, j] ** 2 for j in near])
     matches = mcg.find_correspondences(source, target, pose, method, max_distance=gate)
     np.testing.assert_array_equal(np.sort(matches.indices.T, axis=1), np.sort(rows, axis=1))
     rtol = tolerance(1e-3, 1e-9)
@@ -344,8 +344,8 @@ def test_the_sum_is_the_same_everywhere(raw):
         np.testing.assert_allclose(result.matrix, alone.matrix, atol=atol)
         assert result.num_inliers == alone.num_inliers
     matches = mcg.find_correspondences(source, target, alone.matrix, method, max_distance=1.0)
-    aligned = mcg.estimate_pose(source, target, matches, method, init=alone.matrix)
-    np.testing.assert_allclose(aligned.matrix, alone.matrix, atol=1e-3)
+    again = mcg.estimate_pose(source, target, matches, method, init=alone.matrix)
+    np.testing.assert_allclose(again.matrix, alone.matrix, atol=1e-3)
     refused(lambda: mcg.estimate_pose(source, target, matches, mcg.NDT()), "temperature", 4)
 
 

@@ -86,7 +86,7 @@ class Choices:
         return arguments
 
 
-def described_distance(options: Options, target: mcg.PointCloud) -> str:
+def distance_in_words(options: Options, target: mcg.PointCloud) -> str:
     """`max_distance` in words."""
     distances = options.max_distance or default_distances(point_spacing(target), target)
     return " m, then ".join(f"{float(distance):.3g}" for distance in distances) + " m"

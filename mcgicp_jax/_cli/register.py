@@ -15,7 +15,7 @@ from jaxtyping import Float
 
 import mcgicp_jax as mcg
 from mcgicp_jax import datasets, io, metrics, plot
-from mcgicp_jax._cli.choices import Choices, described_distance, with_channels
+from mcgicp_jax._cli.choices import Choices, distance_in_words, with_channels
 from mcgicp_jax._cli.options import File, Method, MethodName, PairOptions, check_outputs, enumerated, with_names, words
 from mcgicp_jax._compute.messages import messages_named
 from mcgicp_jax._compute.threads import side_by_side
@@ -125,7 +125,7 @@ def register(
     chosen = pair.method(name)
     print(f"method:    {name}{_parameters(chosen)}")
     if not chosen.needs_covariances:
-        print(f"matches:   up to {described_distance(shared, pair.ready[1])} apart")
+        print(f"matches:   up to {distance_in_words(shared, pair.ready[1])} apart")
     else:
         sizes = pair.arguments(name)["voxel_sizes"]
         print(f"cells:     of {', '.join(f'{size:g}' for size in sizes)} m")
@@ -189,7 +189,7 @@ def _compare(
 ) -> dict[MethodName, mcg.RegistrationResult]:
     true_pose = None if truth is None else _read_pose("truth", truth)
     pair = PreparedPair(source, target, options)
-    print(f"matches:   up to {described_distance(options, pair.ready[1])} apart")
+    print(f"matches:   up to {distance_in_words(options, pair.ready[1])} apart")
     pair.choices.print_channels(pair.files)
     pair.find_start()
     results: dict[MethodName, mcg.RegistrationResult] = {}

@@ -44,7 +44,7 @@ def mahalanobis_cost(
 
     Differentiable with respect to all inputs but the matches, also inside `jit` and `vmap`. Outside of these, the cost
     and its gradient compile nothing for another size of clouds, and second derivatives raise `NotImplementedError`.
-    Here M is a function of the rotation R, whereas `estimate_pose`, like every GICP, holds M fixed during each update:
+    Here M is a function of the rotation R, whereas `estimate_pose`, like every GICP, keeps M fixed during each update:
     its pose is not exactly the minimum of F. With `photometric=True`, the standard deviations of the residuals are
     estimated at the given pose, as constants to autodiff, so that values at different poses do not compare.
 

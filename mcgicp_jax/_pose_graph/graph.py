@@ -34,7 +34,7 @@ class PoseGraph(eqx.Module):
     """Poses of a sensor, measured motions between them, and other measurements; a pytree.
 
     Attributes:
-        poses: (n, 4, 4), sensor to world, metres, the initial poses of `optimize_poses`. The first one is held fixed,
+        poses: (n, 4, 4), sensor to world, metres, the initial poses of `optimize_poses`. The first one is fixed,
             unless there are measurements in the world's frame.
         edges: the m measured motions: one `Edge` whose fields have a leading axis of length m.
         factors: measurements of other kinds; none by default.

@@ -114,7 +114,7 @@ def optimize_poses(graph: PoseGraph, *, robust: bool = True, max_iterations: int
     """Find the poses that minimise Σ rᵀΛr over all measurements of a graph.
 
     The residual of an edge is r = log(T_i_j⁻¹ T_i⁻¹ T_j). Levenberg-Marquardt starts from the poses of the graph; it
-    runs on the host with sparse factorisations, also inside transformations. The first pose is held fixed, unless there
+    runs on the host with sparse factorisations, also inside transformations. The first pose is fixed, unless there
     are measurements in the world's frame, such as priors.
 
     Inside transformations the poses are differentiable with respect to the motions and information matrices of edges,

@@ -31,11 +31,11 @@ def held_by_pose_form(directions: Directions, information: Float[Array, "6 6"]) 
     """
     basis, fixed = jnp.asarray(directions.twists).T, jnp.asarray(directions.fixed)
     free = ~(jnp.asarray(directions.held_by_matches) | fixed)
-    known = jnp.where(jnp.outer(free, free), basis.T @ information @ basis, 0)
-    total = jnp.trace(known)
+    stiffness = jnp.where(jnp.outer(free, free), basis.T @ information @ basis, 0)
+    total = jnp.trace(stiffness)
     scale = jnp.where(total > 0, total, 1)
     # −1 and −2 sort the other directions first.
-    values, turn = jnp.linalg.eigh(known / scale + jnp.diag(-1.0 * ~free - fixed))
+    values, turn = jnp.linalg.eigh(stiffness / scale + jnp.diag(-1.0 * ~free - fixed))
     squares = turn.T**2
     return Directions(
         twists=(basis @ turn).T,
@@ -63,7 +63,7 @@ def fuse(
     rotation, translation = pose.rotation().as_matrix().astype(radius.dtype), pose.translation()
     nothing, identity = jnp.zeros((6, 6), radius.dtype), jnp.eye(6, dtype=radius.dtype)
     fusion = Fusion(rotation, translation, center, radius, form, identity, nothing, nothing, directions.held_by_matches)
-    directions = held_by_pose_form(directions, fusion.pull(rotation, translation)[1])
+    directions = held_by_pose_form(directions, fusion.force_and_stiffness(rotation, translation)[1])
     basis, by_matches = jnp.asarray(directions.twists).T, jnp.asarray(directions.held_by_matches)
     both, others = jnp.outer(by_matches, by_matches), jnp.diag(1.0 * ~by_matches)
     response, scatter = response_and_scatter(moments, radius)
@@ -98,29 +98,30 @@ def first_pull(
     at which the weights of a `Fusion` are estimated depends on those alone that are far more precise than the matches.
     """
     rotation = pose.rotation().as_matrix().astype(sums.center.dtype)
-    pull, known = measurements.pull(rotation, pose.translation())
+    force, stiffness = measurements.force_and_stiffness(rotation, pose.translation())
     _, back = _to_sums(measurements, sums)
     basis, held = jnp.asarray(directions.twists).T, jnp.asarray(directions.held_by_matches)
     along, weight = back @ basis, _FIRST_WEIGHT * sums.cost / jnp.maximum(sums.count, 1) / sums.radius**2
     both = jnp.outer(held, held)
     # One LAPACK call after the other: two batched ones at once can deadlock.
-    inverse, known = jax.lax.optimization_barrier((jnp.linalg.inv(basis), known))
-    known, pull = jnp.where(both, weight * along.T @ known @ along, 0), jnp.where(held, weight * along.T @ pull, 0)
+    inverse, stiffness = jax.lax.optimization_barrier((jnp.linalg.inv(basis), stiffness))
+    stiffness = jnp.where(both, weight * along.T @ stiffness @ along, 0)
+    force = jnp.where(held, weight * along.T @ force, 0)
     matches = jnp.where(both, basis.T @ twist_form(sums.stiffness, sums.radius) @ basis, jnp.diag(1.0 * ~held))
-    share = jnp.linalg.solve(matches + known, known).T
+    share = jnp.linalg.solve(matches + stiffness, stiffness).T
     rest = _FIRST_STIFFNESS * (jnp.eye(6, dtype=share.dtype) - share)
     filtered = inverse.T @ jnp.linalg.matrix_power(share, 7) @ rest
-    return filtered @ pull, filtered @ known @ inverse
+    return filtered @ force, filtered @ stiffness @ inverse
 
 
 def fused_update(pose: jaxlie.SE3, sums: Sums, directions: Directions, fusion: Fusion) -> tuple[Directions, Update]:
     """One Newton step on P s + γ = 0, with the matches and M fixed; and the directions with tie points and prior."""
     radius, dtype = fusion.radius, sums.center.dtype
     rotation = pose.rotation().as_matrix().astype(dtype)
-    pull, known = fusion.pull(rotation, pose.translation())
+    pose_force, pose_stiffness = fusion.force_and_stiffness(rotation, pose.translation())
     outwards, back = _to_sums(fusion, sums)
-    known_here = back.T @ known @ back
-    directions = held_by_pose_form(directions, known_here)
+    centred_stiffness = back.T @ pose_stiffness @ back
+    directions = held_by_pose_form(directions, centred_stiffness)
     unit_information = twist_form(sums.stiffness, sums.radius)
     # Force and energy of twists in units of the radius: of `fusion` on the left, of the sums on the right.
     ratio = sums.radius / radius
@@ -129,8 +130,8 @@ def fused_update(pose: jaxlie.SE3, sums: Sums, directions: Directions, fusion: F
     # The solution waits for the eigenvectors of the directions: two batched LAPACK calls at once can deadlock.
     rotation, _ = jax.lax.optimization_barrier((rotation, directions.twists))
     basis, free = fusion.twists_at(rotation, pose.translation()), fusion.free
-    slope = fusion.gain @ basis.T @ stiffness @ basis + basis.T @ known @ basis
-    force = fusion.gain @ (basis.T @ score) + basis.T @ pull
+    slope = fusion.gain @ basis.T @ stiffness @ basis + basis.T @ pose_stiffness @ basis
+    force = fusion.gain @ (basis.T @ score) + basis.T @ pose_force
     slope = jnp.where(jnp.outer(free, free), slope, jnp.diag(1.0 * ~free))
     twist = outwards @ (basis @ jnp.linalg.solve(slope, jnp.where(free, force, 0)))
     # The information of tie points and prior in the unit of the matches: divided by the mean of P.
@@ -139,7 +140,7 @@ def fused_update(pose: jaxlie.SE3, sums: Sums, directions: Directions, fusion: F
     unit = radius / jnp.where(mean > 0, mean, 1) / sums.radius**2
     return directions, Update(
         twist=twist * units(sums.radius),
-        information=unit_information + unit * known_here,
+        information=unit_information + unit * centred_stiffness,
         degenerate=~jnp.all(fusion.held),
     )
 
@@ -148,9 +149,9 @@ def fused_update(pose: jaxlie.SE3, sums: Sums, directions: Directions, fusion: F
 def fused_covariance(pose: jaxlie.SE3, fusion: Fusion) -> Float[Array, "6 6"]:
     """Covariance of the pose, for ξ in T exp(ξ), metres and radians."""
     rotation = pose.rotation().as_matrix().astype(fusion.basis.dtype)
-    _, known = fusion.pull(rotation, pose.translation())
+    _, stiffness = fusion.force_and_stiffness(rotation, pose.translation())
     basis = fusion.twists_at(rotation, pose.translation())
-    total = fusion.information + basis.T @ known @ basis + jnp.diag(~fusion.held / UNKNOWN**2)
+    total = fusion.information + basis.T @ stiffness @ basis + jnp.diag(~fusion.held / UNKNOWN**2)
     change = adjoint_to_source(pose, fusion.center) * units(fusion.radius) @ basis
     if fusion.fixed is not None:
         total = jnp.where(jnp.outer(~fusion.fixed, ~fusion.fixed), total, jnp.diag(1.0 * fusion.fixed))

@@ -66,7 +66,7 @@ def root_near(
     """The scaling of g, from the sums at the returned pose or from `Fusion`.
 
     Args:
-        usable: False if the loop ended without a pose at rest.
+        usable: False if the loop ended before its updates were below the tolerances.
         basis: (6, 6), columns: twists about the centre, lengths in units of the radius.
         held: which of them are constrained.
     """

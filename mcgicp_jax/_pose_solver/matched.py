@@ -97,7 +97,7 @@ class Matched(eqx.Module):
     Attributes:
         source, target: rows of the surfaces; the first candidates of all source points come first.
         valid: (n,) False for correspondences to ignore.
-        apart: (n,) squared distance of the descriptors α · channel, metres²; only for soft assignment.
+        descriptor_distances: (n,) squared distances of descriptors α · channel, metres²; only for soft assignment.
         temperature: of the soft assignment, metres; None otherwise.
         num_candidates: m.
     """
@@ -105,7 +105,7 @@ class Matched(eqx.Module):
     source: Surface
     target: Surface
     valid: Bool[AnyArray, "n"]
-    apart: Float[AnyArray, "n"] | None = None
+    descriptor_distances: Float[AnyArray, "n"] | None = None
     temperature: Float[AnyScalar, ""] | None = None
     num_candidates: int = eqx.field(static=True, default=1)
 
@@ -177,12 +177,12 @@ def matched_rows(
     surfaces = sources[0], targets[0]
     if with_noise:
         surfaces = surfaces[0]._replace(noise=sources[1]), surfaces[1]._replace(noise=targets[1])
-    apart = None
+    descriptor_distances = None
     if temperature is not None:
-        apart = square_apart(sources[-1], targets[-1])
+        descriptor_distances = squared_descriptor_distances(sources[-1], targets[-1])
     elif len(sources) > 1 + with_noise:
         surfaces = surfaces[0]._replace(search=sources[-1]), surfaces[1]._replace(search=targets[-1])
-    return Matched(*surfaces, target.index.reshape(-1) >= 0, apart, temperature, count)
+    return Matched(*surfaces, target.index.reshape(-1) >= 0, descriptor_distances, temperature, count)
 
 
 def distances_within(
@@ -190,12 +190,12 @@ def distances_within(
 ) -> tuple[Float[Array, "n"], Bool[Array, "n"]]:
     """Distance of each match, and whether it is at most `max_distance`, both in metres of position: channels affect
     which match is found, but not whether it is accepted."""
-    apart = target.T - moved
-    distances = jnp.sqrt(alg.inner(apart, apart))
+    residual = target.T - moved
+    distances = jnp.sqrt(alg.inner(residual, residual))
     return distances, distances <= max_distance
 
 
-def square_apart(source: SearchPoints, target: SearchPoints) -> Float[AnyArray, "*m n"]:
+def squared_descriptor_distances(source: SearchPoints, target: SearchPoints) -> Float[AnyArray, "*m n"]:
     """Squared distance of the descriptors of matched rows, with the penalties for missing channels, metres²."""
     xp = numpy_for(source, target)
     square = (source.descriptors - target.descriptors) ** 2
@@ -212,8 +212,8 @@ def linearize_at(
     posed = matched.at(motion)
     found = linearize(terms, posed)
     counts = jnp.asarray(matched.valid).astype(posed.moved.dtype)
-    if matched.temperature is not None and matched.apart is not None:
-        far = alg.inner(found.residual, found.residual) + matched.apart
+    if matched.temperature is not None and matched.descriptor_distances is not None:
+        far = alg.inner(found.residual, found.residual) + matched.descriptor_distances
         shape = (matched.num_candidates, -1)
         counts = _softmax((-0.5 * far / matched.temperature**2).reshape(shape), matched.valid.reshape(shape))
     return posed, found.scaled(counts), counts

@@ -74,17 +74,17 @@ def form_at(
         information = inverse_3(ties.covariances)
         moved = ties.source @ rotation.T + translation
         arms = xp.concatenate([moved - center, xp.broadcast_to(radius, (len(moved), 1))], axis=1)
-        pull = xp.einsum("nij,nj->ni", information, ties.target - moved)
+        forces = xp.einsum("nij,nj->ni", information, ties.target - moved)
         stiffness = stiffness + xp.einsum("nij,nk,nl->ikjl", information, arms, arms).reshape(12, 12)
-        force = force + xp.einsum("ni,nk->ik", pull, arms).reshape(12)
+        force = force + xp.einsum("ni,nk->ik", forces, arms).reshape(12)
     if prior is None:
         return PoseForm(stiffness, force, Prior(rotation, xp.zeros(3), xp.zeros((6, 6))))
     point = rotation.T @ (center - translation)
-    apart = (prior.rotation @ point + prior.translation - center) / radius
+    offset = (prior.rotation @ point + prior.translation - center) / radius
     # ξ about the origin of the source from ξ about the point, with lengths in units of the radius.
     change = translation_adjoint(point) * units(radius)
     fixed = None if prior.fixed is None else prior.fixed @ change
-    return PoseForm(stiffness, force, Prior(prior.rotation, apart, change.T @ prior.information @ change, fixed))
+    return PoseForm(stiffness, force, Prior(prior.rotation, offset, change.T @ prior.information @ change, fixed))
 
 
 class PoseMeasurements(eqx.Module):
@@ -118,7 +118,7 @@ class PoseMeasurements(eqx.Module):
         _, shift = self._change(rotation, translation)
         prior, dtype = self.form.prior, shift.dtype
 
-        def apart(twist: Float[Array, "6"]) -> Float[Array, "6"]:
+        def residual_at(twist: Float[Array, "6"]) -> Float[Array, "6"]:
             turned = rotation + jnp.cross(twist[3:, None], rotation, axis=0)
             moved = (shift + jnp.cross(twist[3:], shift)) / self.radius + twist[:3]
             error = jaxlie.SE3.from_rotation_and_translation(
@@ -126,10 +126,10 @@ class PoseMeasurements(eqx.Module):
             )
             return error.log().astype(dtype)
 
-        residual, push = jax.linearize(apart, jnp.zeros(6, dtype))
+        residual, push = jax.linearize(residual_at, jnp.zeros(6, dtype))
         return residual, jax.vmap(push)(jnp.eye(6, dtype=dtype))
 
-    def pull(
+    def force_and_stiffness(
         self, rotation: Float[Array, "3 3"], translation: Float[Array, "3"]
     ) -> tuple[Float[Array, "6"], Float[Array, "6 6"]]:
         """γ, and its stiffness JᵀQJ, at a pose."""
@@ -142,8 +142,8 @@ class PoseMeasurements(eqx.Module):
         change = (now - jnp.eye(3, 4, dtype=now.dtype)).reshape(12)
         prior = self.form.prior
         residual, rows = self.prior_residual(rotation, translation)
-        pull = slope @ (self.form.force - self.form.stiffness @ change) - rows @ prior.information @ residual
-        return pull, slope @ self.form.stiffness @ slope.T + rows @ prior.information @ rows.T
+        force = slope @ (self.form.force - self.form.stiffness @ change) - rows @ prior.information @ residual
+        return force, slope @ self.form.stiffness @ slope.T + rows @ prior.information @ rows.T
 
 
 class Fusion(PoseMeasurements):
@@ -186,9 +186,9 @@ class Fusion(PoseMeasurements):
         self, score: Float[Array, "6"], rotation: Float[Array, "3 3"], translation: Float[Array, "3"]
     ) -> Float[Array, "6"]:
         """P s + γ, in the basis; F ξ instead for fixed directions."""
-        pull, _ = self.pull(rotation, translation)
+        force, _ = self.force_and_stiffness(rotation, translation)
         basis, fixed = self.twists_at(rotation, translation), self.form.prior.fixed
-        forces = self.gain @ (basis.T @ score) + basis.T @ pull
+        forces = self.gain @ (basis.T @ score) + basis.T @ force
         if self.fixed is None or fixed is None:
             return forces
         residual, _ = self.prior_residual(rotation, translation)
@@ -207,10 +207,10 @@ def constraints_at(
 def with_fixed_directions(pose: jaxlie.SE3, prior: Prior) -> jaxlie.SE3:
     """The pose with ξ projected onto F ξ = 0."""
     fixed = prior.fixed
-    apart = _pose_of(prior).inverse().multiply(pose).log()
+    twist = _pose_of(prior).inverse().multiply(pose).log()
     gram = fixed @ fixed.T + jnp.diag(1.0 * ~jnp.any(fixed != 0, axis=1))
-    apart = apart - fixed.T @ (inverse_6(gram) @ (fixed @ apart))
-    moved = _pose_of(prior).multiply(jaxlie.SE3.exp(apart)).normalize()
+    twist = twist - fixed.T @ (inverse_6(gram) @ (fixed @ twist))
+    moved = _pose_of(prior).multiply(jaxlie.SE3.exp(twist)).normalize()
     # jaxlie promotes to the default precision.
     return jaxlie.SE3(moved.wxyz_xyz.astype(pose.wxyz_xyz.dtype))
 

@@ -15,18 +15,10 @@ from mcgicp_jax._clouds.voxel_size import raw_spacing
 from mcgicp_jax._math.poses import Pose, pose_matrix
 from mcgicp_jax._methods.base import AbstractMethod
 from mcgicp_jax._methods.surfaces import covariances_of
-from mcgicp_jax.plot.drawing import (
-    Figure,
-    File,
-    Map,
-    Picture,
-    Points,
-    View,
-    drawable,
-    has_everywhere,
-    plotting,
-    rgb_of,
-)
+from mcgicp_jax.plot.drawing import Figure, File, Map, Picture, Points, View
+
+if TYPE_CHECKING:
+    import plotly.graph_objects
 
 # The constants affect only how figures look.
 # Most rows below each other; maximum width of a row and height of a panel, inches; pixels and tiles along the longer
@@ -34,6 +26,9 @@ from mcgicp_jax.plot.drawing import (
 _MOST_ROWS, _WIDEST, _HIGHEST, _PANEL_PIXELS, _TILES, _DETAIL, _LARGEST_POINT = 5, 12, 4.5, 500, 12, 0.25, 9
 # Pixels along the longer side of a map, and width of a figure in inches.
 _PIXELS, _WIDTH = 1400, 12
+# Points drawn in one 3-D figure, and colours there of clouds without channels.
+_MOST_POINTS = 50_000
+_COLORS = ("#1f77d0", "#e8741c", "#2b9c5a", "#b03a8c", "#7a5230", "#707070")
 
 
 def before_after(source: PointCloud, target: PointCloud, poses: Mapping[str, Pose], *, path: File = None) -> Figure:
@@ -295,14 +290,6 @@ def _shades(cloud: PointCloud, view: View) -> Points:
     return np.repeat(0.85 * np.nan_to_num(grey, nan=0.5)[:, None], 3, axis=1)
 
 
-if TYPE_CHECKING:
-    import plotly.graph_objects
-
-# These constants affect only how figures look: points drawn in one figure, and colours of clouds without channels.
-_MOST_POINTS = 50_000
-_COLORS = ("#1f77d0", "#e8741c", "#2b9c5a", "#b03a8c", "#7a5230", "#707070")
-
-
 def clouds(*clouds: PointCloud, names: Sequence[str] | None = None) -> plotly.graph_objects.Figure:
     """Show clouds in one 3-D view, coloured by red, green and blue, else by intensity, else in one colour per cloud.
 
@@ -316,7 +303,7 @@ def clouds(*clouds: PointCloud, names: Sequence[str] | None = None) -> plotly.gr
         ValueError: if the number of names differs from that of the clouds.
         ImportError: if plotly is missing.
     """
-    graphs = plotting("plotly.graph_objects")
+    graphs = drawing.plotting("plotly.graph_objects")
     if names is None:
         names = [f"cloud {i}" for i in range(len(clouds))]
     if len(names) != len(clouds):
@@ -331,13 +318,13 @@ def clouds(*clouds: PointCloud, names: Sequence[str] | None = None) -> plotly.gr
 
 def _scatter(graphs: Any, cloud: PointCloud, name: str, color: str, fraction: float) -> Any:
     """Draw a reproducible random fraction of the points, in `color` if the cloud has neither colours nor intensity."""
-    cloud = drawable(cloud)
+    cloud = drawing.drawable(cloud)
     kept = np.random.default_rng(0).permutation(len(cloud))[: round(fraction * len(cloud))]
-    rgb = rgb_of(cloud)
+    rgb = drawing.rgb_of(cloud)
     marker: dict[str, Any] = {"size": 1.5, "color": color}
     if rgb is not None:
         marker["color"] = [f"rgb({r},{g},{b})" for r, g, b in np.round(255 * rgb[kept]).astype(int)]
-    elif has_everywhere(cloud, ("intensity",)) and len(cloud):
+    elif drawing.has_everywhere(cloud, ("intensity",)) and len(cloud):
         intensity = np.asarray(cloud.channels)[:, cloud.channel_names.index("intensity")]
         low, high = np.nanpercentile(intensity, [2, 98])
         marker |= {"color": intensity[kept], "colorscale": "Viridis", "cmin": low, "cmax": high}
