@@ -1,4 +1,4 @@
-"""Pairs per second of `register_batch` and of small_gicp with one process per core, and the memory used by a stream.
+"""Pairs per second of `register_batch` and of small_gicp with one process per core, memory of a stream, and gradients.
 
 Run `python -m tests.benchmarks.batch`; see README.md. Libraries take turns; ratios are computed within one turn.
 """
@@ -166,6 +166,32 @@ def rates() -> None:
         print(f" {start:.1f} s, which pays off from {start / (1 / mine - 1 / in_processes):,.0f} pairs")
 
 
+def gradients() -> None:
+    """Value and gradient of a batch in processes by the points of its sources, relative to the batch alone."""
+    import jax
+    import jax.numpy as jnp
+
+    import mcgicp_jax as mcg
+
+    pairs = lidar_pairs(60, (0.1, 1), 0.08)
+    targets = [pair[1].astype(np.float32) for pair in pairs]
+    options = {"max_distance": MAX_DISTANCE, "voxel_size": None, "executor": "processes", **TOLERANCES}
+
+    def loss(sources: list[Any]) -> Any:
+        results = mcg.register_batch(sources, targets, mcg.GICP(), **options)
+        return sum(jnp.sum(result.matrix[:3, 3]) for result in results)
+
+    ratios = []
+    for turn in range(NUM_TURNS + 1):
+        forward = _timed(lambda: loss([pair[0] for pair in pairs]))[0]
+        gradient = _timed(lambda: jax.block_until_ready(jax.grad(loss)([jnp.asarray(pair[0]) for pair in pairs])))[0]
+        # The first turn starts the workers and compiles.
+        if turn:
+            ratios.append(gradient / forward)
+    print(f"\ngradient of a batch of {len(pairs)} ragged pairs in processes:", end=" ")
+    print(f"{statistics.median(ratios):.2f} times its forward call ({min(ratios):.2f} to {max(ratios):.2f})")
+
+
 def _timed_ours(pairs: list[Pair], voxel: float | None, executor: Executor | None) -> tuple[float, float, Any]:
     return _timed(lambda: ours(pairs, voxel, executor))
 
@@ -203,15 +229,13 @@ def memory() -> None:
 
 
 def main() -> None:
+    parts = {"rates": rates, "memory": memory, "gradients": gradients}
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("parts", nargs="*", help="which of rates, memory; both by default")
-    chosen = parser.parse_args().parts or ["rates", "memory"]
+    parser.add_argument("parts", nargs="*", help=f"which of {', '.join(parts)}; all by default")
     print(f"{os.cpu_count()} cores, load {os.getloadavg()[0]:.1f} before")
     with contextlib.suppress(KeyboardInterrupt):
-        if "rates" in chosen:
-            rates()
-        if "memory" in chosen:
-            memory()
+        for name in parser.parse_args().parts or parts:
+            parts[name]()
     print(f"load {os.getloadavg()[0]:.1f} after")
 
 

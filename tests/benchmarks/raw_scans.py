@@ -14,6 +14,7 @@ from __future__ import annotations
 import argparse
 import time
 import warnings
+from collections import Counter, defaultdict
 from collections.abc import Callable, Iterator
 from typing import Any
 
@@ -103,7 +104,8 @@ def small_gicp(pair: Pair, kind: str) -> tuple[float, str]:
     return pose_error(result.T_target_source, pair.truth)[0], "CONVERGED" if result.converged else "no"
 
 
-def report(name: str, method: str, errors: list[float], wrong: int, converged: int, others: str = "") -> None:
+def report(name: str, method: str, errors: list[float], wrong: int, converged: int, others: str = "") -> Counter[str]:
+    """Prints a line and returns its counts."""
     count = len(errors)
     millimetres = 1e3 * np.array(errors)
     print(
@@ -111,6 +113,7 @@ def report(name: str, method: str, errors: list[float], wrong: int, converged: i
         f"  wrong {wrong}/{count}  converged {converged}/{count}{others}",
         flush=True,
     )
+    return Counter(pairs=count, converged=converged, wrong=wrong)
 
 
 def main() -> None:
@@ -119,6 +122,7 @@ def main() -> None:
     parser.add_argument("--quick", action="store_true", help="without voxel sizes by hand and peers")
     options = parser.parse_args()
     warnings.simplefilter("ignore")
+    totals: defaultdict[str, Counter[str]] = defaultdict(Counter)
     for name in (name for name in SETS if any(name.startswith(part) for part in options.only)):
         pairs, sizes, noise = SETS[name]
         pairs = list(pairs())
@@ -143,14 +147,17 @@ def main() -> None:
                 good = int(np.sum(np.array(errors) <= np.maximum(GOOD * hand, noise)))
                 by_hand = f"{1e3 * np.median(hand):.1f} {1e3 * hand.max():.1f} in {size} m"
                 others = f"  by hand {by_hand}  good {good}/{len(pairs)}{others}"
-            report(name, method_name, errors, wrong, converged, others)
+            totals[method_name].update(report(name, method_name, errors, wrong, converged, others))
         if not options.quick:
             for kind in ("GICP", "PLANE_ICP"):
                 found = [small_gicp(pair, kind) for pair in pairs]
                 errors = [error for error, _ in found]
                 converged = sum(status == "CONVERGED" for _, status in found)
                 wrong = sum(error > WRONG and status == "CONVERGED" for error, status in found)
-                report(name, f"small_gicp {kind[:5]}", errors, wrong, converged)
+                label = f"small_gicp {kind[:5]}"
+                totals[label].update(report(name, label, errors, wrong, converged))
+    for method_name, total in totals.items():
+        print(f"all sets: {method_name:16}", ", ".join(f"{what} {count}" for what, count in total.items()))
 
 
 if __name__ == "__main__":

@@ -9,6 +9,7 @@ from __future__ import annotations
 import argparse
 import concurrent.futures
 import importlib.util
+import itertools
 import os
 import pathlib
 import resource
@@ -17,7 +18,6 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable
-from functools import partial
 from typing import Any
 
 import numpy as np
@@ -31,6 +31,8 @@ NUM_TURNS = 9
 TOLERANCES = {"translation_tolerance": 1e-3, "rotation_tolerance": np.radians(0.1)}
 MAX_ITERATIONS = 20
 NUM_NEIGHBORS = 20
+# Of the source of `million`, metres
+SHIFT = np.array([0.3, -0.2, 0.1])
 THREADS = concurrent.futures.ThreadPoolExecutor(2)
 
 Stages = tuple[float, float, np.ndarray]
@@ -54,7 +56,7 @@ def million() -> tuple[np.ndarray, np.ndarray]:
     for seed in (0, 1):
         x, y = np.random.default_rng(seed).random((2, 1_000_000)) * 200
         clouds.append(np.stack([x, y, 3 * np.sin(x / 7) * np.cos(y / 5) + np.sin(x + y / 3)], axis=1))
-    return clouds[0] + [0.3, -0.2, 0.1], clouds[1]
+    return clouds[0] + SHIFT, clouds[1]
 
 
 CASES: dict[str, tuple[Callable[[], tuple[np.ndarray, np.ndarray]], float | None, float, int]] = {
@@ -217,30 +219,41 @@ def defaults() -> None:
     """Raw arrays to pose with all defaults, small_gicp in the same voxels, and small_gicp with its own defaults."""
     import small_gicp
 
-    print("\nRaw arrays, all defaults: ms, medians of 9 turns; ratio to small_gicp in the same voxels, two threads")
-    print(f"{'clouds':>20} {'points':>9} {'voxels':>9} {'size, m':>8} {'ours':>6} {'small':>6} {'own':>6} {'ratio':>6}")
-    for name, load in (("lidar_pair", lidar_pair), ("kitti", kitti), ("a million", million)):
+    frames = list(itertools.islice(mcg.datasets.kitti(DATA / "kitti" / "sequences" / "04"), 2))
+    shift = np.eye(4)
+    shift[:3, 3] = -SHIFT
+    cases = (
+        ("lidar_pair", lidar_pair, np.loadtxt(DATA / "lidar_pair" / "T_target_source.txt")),
+        ("kitti", kitti, np.linalg.inv(frames[0].pose) @ frames[1].pose),
+        ("a million", million, shift),
+    )
+    print("\nRaw arrays, all defaults: ms, medians of 9 turns; ratio to small_gicp in the same voxels; errors in mm")
+    columns = f"{'ours':>6} {'small':>6} {'own':>6}"
+    print(f"{'clouds':>20} {'points':>9} {'voxels':>9} {'size, m':>8} {columns} {'ratio':>6} {columns}")
+    for name, load, truth in cases:
         source, target = (cloud.astype(np.float32) for cloud in load())
         voxel = voxels_for("auto", mcg.PointCloud(source), mcg.PointCloud(target)).size
         points = source.astype(float), target.astype(float)
-        calls: list[Callable[[], Any]] = [
-            partial(mcg.register, source, target, mcg.GICP()),
-            partial(small(2), *points, voxel, 10 * (voxel or 1)),
-            partial(small_gicp.align, points[1], points[0], num_threads=2),
+        calls: list[Callable[[], np.ndarray]] = [
+            lambda source=source, target=target: mcg.register(source, target, mcg.GICP()).matrix,
+            lambda points=points, voxel=voxel: small(2)(*points, voxel, 10 * (voxel or 1))[-1],
+            lambda points=points: small_gicp.align(points[1], points[0], num_threads=2).T_target_source,
         ]
         rows = []
         for _ in range(NUM_TURNS + 1):
-            row = []
+            row, poses = [], []
             for call in calls:
                 begin = time.perf_counter()
-                call()
+                poses.append(call())
                 row.append(1e3 * (time.perf_counter() - begin))
             rows.append(row)
         ours_, same, own = np.median(rows[1:], axis=0)
         ratio = statistics.median(row[0] / row[1] for row in rows[1:])
         size = len(mcg.preprocess(source, voxel))
+        mine, theirs, their_own = (1e3 * mcg.metrics.pose_error(pose, truth)[0] for pose in poses)
         print(
             f"{name:>20} {len(source):9,} {size:9,} {voxel or 0:8.2g} {ours_:6.0f} {same:6.0f} {own:6.0f} {ratio:6.2f}"
+            f" {mine:6.1f} {theirs:6.1f} {their_own:6.1f}"
         )
 
 
@@ -267,23 +280,44 @@ def _draw(path: pathlib.Path, drawn: dict[str, list[tuple[int, float]]]) -> None
     print(f"chart: {path}")
 
 
+# A pair of raw scans of KITTI in a new process: seconds to import a library and to register, and peak memory in KiB.
 _FIRST_CALL = """
-import time; begin = time.perf_counter()
-import numpy as np, mcgicp_jax as mcg
+import sys, time
+import numpy as np
+source, target = (np.fromfile(path, np.float32).reshape(-1, 4)[:, :3].astype(float) for path in sys.argv[1:])
+begin = time.perf_counter()
+import {module} as library
 imported = time.perf_counter()
-rng = np.random.default_rng(0)
-target = rng.random((6000, 3)); target[np.arange(6000), np.arange(6000) % 3] = 0
-mcg.register(target + 0.01, target, mcg.GICP(), max_distance=0.2)
-print(imported - begin, time.perf_counter() - imported)
+{call}
+done = time.perf_counter()
+with open("/proc/self/status") as status:
+    peak, = (line.split()[1] for line in status if line.startswith("VmHWM"))
+print(imported - begin, done - imported, peak)
 """
+# All defaults; Open3D, which has none for these, in the voxels of the others and with the matches of `CASES`.
+_FIRST_CALLS = {
+    "mcgicp_jax": "library.register(source, target, library.GICP())",
+    "small_gicp": "library.align(target, source, num_threads=2)",
+    "open3d": """
+clouds = []
+for points in (source, target):
+    clouds.append(library.geometry.PointCloud(library.utility.Vector3dVector(points)).voxel_down_sample(0.25))
+    clouds[-1].estimate_normals(library.geometry.KDTreeSearchParamKNN(20))
+library.pipelines.registration.registration_generalized_icp(*clouds, 2.5)
+""",
+}
 
 
 def starts(folder: pathlib.Path) -> None:
-    """Seconds to import, for a first call, and for a first call with cached programs, each in a new process."""
+    """Seconds to import, and import, first call and peak memory beside the other libraries, each in a new process."""
 
-    def run(code: str, **environment: str) -> list[float]:
+    def run(code: str, *arguments: str, **environment: str) -> list[float]:
         text = subprocess.run(
-            [sys.executable, "-c", code], env=os.environ | environment, capture_output=True, text=True, check=True
+            [sys.executable, "-c", code, *arguments],
+            env=os.environ | environment,
+            capture_output=True,
+            text=True,
+            check=True,
         ).stdout
         return [float(number) for number in text.split()]
 
@@ -298,8 +332,18 @@ def starts(folder: pathlib.Path) -> None:
         "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0",
         "JAX_PERSISTENT_CACHE_MIN_ENTRY_SIZE_BYTES": "-1",
     }
-    first, second = (run(_FIRST_CALL, **cache)[1] for _ in range(2))
-    print(f"first call of two raw clouds of 6,000 points: {first:.1f} s; in a second process: {second:.1f} s")
+    scans = [str(path) for path in sorted((DATA / "kitti/sequences/04/velodyne").glob("*.bin"))[1::-1]]
+    print("\nFirst call of a process, a pair of raw scans of KITTI, GICP")
+    for name, module in (
+        ("mcgicp_jax, empty cache", "mcgicp_jax"),
+        ("mcgicp_jax, filled cache", "mcgicp_jax"),
+        ("small_gicp", "small_gicp"),
+        ("open3d", "open3d"),
+    ):
+        if importlib.util.find_spec(module) is not None:
+            code = _FIRST_CALL.format(module=module, call=_FIRST_CALLS[module])
+            seconds, call, peak = run(code, *scans, **cache)
+            print(f"{name:>26}: import {seconds:.2f} s, call {call:.2f} s, peak memory {peak / 1024:.0f} MB")
 
 
 def main() -> None:
