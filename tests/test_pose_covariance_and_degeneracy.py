@@ -17,6 +17,7 @@ from mcgicp_jax._pose_solver.covariance import Moments, response_and_scatter
 from mcgicp_jax._pose_solver.degeneracy import GEOMETRY_HOLDS, find_directions
 from mcgicp_jax._pose_solver.sums import Sums
 from mcgicp_jax.extend import symmetric_matrices as cov
+from tests.batches import raw_pair
 from tests.benchmarks.noise_scenes import street
 from tests.corridor import corridor
 from tests.precision import in_float64
@@ -63,6 +64,17 @@ def test_padding_is_no_points():
     cloud = mcg.preprocess(SURFACES["room"](np.random.default_rng(0), 900, 0.5))
     observed, padded = (prepare(mcg.GICP(), each, observed=True).observability for each in (cloud, cloud.pad(1024)))
     np.testing.assert_array_equal(padded[:900], observed)
+
+
+@pytest.mark.parametrize("method", [mcg.GICP(), mcg.MultiChannelGICP(photometric=True)])
+def test_padding_changes_no_pose_and_no_deviation(method):
+    """Of points so sparse that each has its own cell, by whose number those cells are chosen that share a sum."""
+    clouds = [mcg.preprocess(cloud, 0.3) for cloud in raw_pair(300, 2)[:2]]
+    result, padded = (
+        mcg.register(*each, method, max_distance=0.5) for each in (clouds, [cloud.pad(700) for cloud in clouds])
+    )
+    np.testing.assert_allclose(padded.matrix, result.matrix, atol=1e-6)
+    np.testing.assert_allclose(padded.deviations, result.deviations, rtol=1e-4)
 
 
 @pytest.mark.parametrize("noise", [0.25, 0.75, 1.0])

@@ -67,16 +67,18 @@ def assessment_of(executor: AbstractExecutor, loop: LoopResult, moments: Lazy[Mo
 def moments_of(executor: AbstractExecutor, loop: LoopResult) -> Moments:
     """Sums over the scores of all correspondences at the final pose."""
     problem, state = executor.problem, loop.state
-    motion, size = Motion.of(state.pose.wxyz_xyz), executor.source_of(loop.matches).valid.size
+    motion, valid = Motion.of(state.pose.wxyz_xyz), executor.source_of(loop.matches).valid
     one = np.ones((), problem.source.points.dtype)
-    frame = Frame(state.sums.center, state.sums.radius, np.tile(one, 2), one, np.int32(size))
+    # Padding does not change which cells share a sum.
+    num_cells = numpy_for(valid).maximum(valid.sum(), 1).astype(np.int32)
+    frame = Frame(state.sums.center, state.sums.radius, np.tile(one, 2), one, num_cells)
     if problem.source.observed:
         discount, reach = _discounts_and_reach(executor, motion, loop.matches)
         frame = frame._replace(discount=discount, reach=reach)
     # Fixed matches do not respond to a motion.
     responding = _responding(executor, loop) if problem.matches is None and is_adaptive(loop.terms) else None
     scores = executor.scores(motion, loop.matches, frame, loop.terms, responding)
-    return moments_from(scores, size)
+    return moments_from(scores, valid.size)
 
 
 def _discounts_and_reach(
