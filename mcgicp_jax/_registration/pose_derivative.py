@@ -140,7 +140,10 @@ class PoseDerivative(AbstractLinearMap):
         if self._fusion is not None:
             by_score, by_form = self._by_balance(by_score)
         arrays = [self.arrays[i] for i in moving]
-        found = self._score(pose).cotangents(by_score.astype(pose.dtype), arrays)
+        # No more cotangents than the score has numbers, of which others are combinations.
+        some = by_score if len(by_score) <= 6 else np.eye(6)
+        found = self._score(pose).cotangents(some.astype(pose.dtype), arrays)
+        found = found if some is by_score else [np.tensordot(by_score, each, 1) for each in found]
         for leaf, by in zip(self._form, by_form, strict=True):
             found = [by if array is leaf else each for array, each in zip(arrays, found, strict=True)]
         return found
