@@ -330,3 +330,15 @@ def test_the_extra_is_named(monkeypatch):
     with pytest.raises(ImportError, match=re.escape("pip install 'mcgicp_jax[processes]'")):
         batch([np.eye(3)], [np.eye(3)], executor="processes")
     refused(lambda: batch([np.eye(3)], [np.eye(3)], executor="threads"), "executor")
+
+
+@pytest.mark.parametrize("transformation", [jax.jit, jax.vmap, lambda function: jax.jit(jax.grad(function))])
+def test_inside_transformations_a_batch_says_what_to_use(transformation, raw):
+    sources, targets = prepared(raw[:1])
+
+    def cost(channels):
+        return batch([sources[0].replace(channels=channels)], targets)[0].cost
+
+    channels = np.asarray(sources[0].channels)
+    channels = channels[None] if transformation is jax.vmap else channels
+    refused(lambda: transformation(cost)(channels), "sources, targets", "register inside")

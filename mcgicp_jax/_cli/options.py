@@ -207,7 +207,7 @@ def clouds_in(folder: Path, glob: str = "*", map: File = None) -> datasets.Cloud
         raise ValueError(f"{map}: expected a map outside of {folder}, where it would be one of the clouds")
     found = datasets.clouds(folder, glob)
     if len(found) < 2:
-        raise ValueError(f"{folder}: expected at least 2 clouds {glob}, found {len(found)}")
+        raise ValueError(f"{folder}: expected at least 2 clouds, found {len(found)} among {glob!r}")
     if found.left_out:
         names = [path.name for path in found.left_out]
         more = f" and {len(names) - _MOST_NAMES:,} more" if len(names) > _MOST_NAMES else ""

@@ -62,7 +62,7 @@ def _advice(shape: tuple[int, ...]) -> str:
         return "; pass points.T"
     if len(shape) == 3 and shape[2] == 3:
         return "; pass points.reshape(-1, 3)"
-    return "; pass further columns as channels" if len(shape) == 2 and shape[1] > 3 else ""
+    return "; pass PointCloud(points, channels)" if len(shape) == 2 and shape[1] > 3 else ""
 
 
 def _as_mask(values: Values, shape: tuple[int, ...]) -> Any:

@@ -14,6 +14,7 @@ from mcgicp_jax._clouds.point_cloud import PointCloud
 from mcgicp_jax._clouds.preprocess import check_preprocessing
 from mcgicp_jax._clouds.voxel_size import NUM_NEIGHBORS, VoxelSize
 from mcgicp_jax._compute.concrete import is_concrete
+from mcgicp_jax._compute.linear_maps import primal
 from mcgicp_jax._math.poses import Pose, matrix_of, pose_matrix
 from mcgicp_jax._methods.base import AbstractMethod
 from mcgicp_jax._pairs.batch_executors import GivenExecutor, executor_of, run, run_differentiated
@@ -41,14 +42,21 @@ def register_batch(
     Outside `jit`, the poses have derivatives, as those of `register`, by the points and channels of the clouds and the
     parameters of the method: of a DEGENERATE pose within its constrained directions, 0 of other failures but
     MAX_ITERATIONS. They are computed side by side, so that `jax.value_and_grad` of a loss over the poses of many pairs
-    is one call; with an `executor` by its workers, as (7, n) matrices. Clouds must be given in lists then.
+    is one call; with an `executor` by its workers, as (7, n) matrices. Clouds must be given in lists then. Inside `jit`
+    and `vmap`, use `register`.
     """
     job, pairs, workers = _job(
         sources, targets, method, init, voxel_size, num_neighbors, executor, covariances, options
     )
     # A look at an iterator would use it up.
     clouds = [side for side in (sources, targets) if isinstance(side, list | tuple | PointCloud)]
-    if not is_concrete(clouds, job.method, job.options.robust):
+    given = clouds, job.method, job.options.robust
+    if not is_concrete(primal(given)):
+        raise ValueError(
+            "sources, targets: expected concrete arrays, got tracers; call register_batch outside of jit and vmap, "
+            "or register inside of them"
+        )
+    if not is_concrete(given):
         return job.register_differentiated(pairs) if workers is None else run_differentiated(job, pairs, workers)
     return [result for _, result in sorted(run(job, pairs, workers), key=lambda item: item[0])]
 

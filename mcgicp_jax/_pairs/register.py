@@ -105,7 +105,8 @@ def register(
             these rows cover space evenly; otherwise they follow the density of the points. Neighbours (among all
             points), local geometry and covariances are computed for them alone. `num_inliers`, `overlap` and the
             covariance count them alone, and the pose has a derivative by these points and their neighbours. The target
-            stays complete. None: all points. 10,000 nearly give the pose of all.
+            stays complete. Parameters of the method left None are estimated from these rows, too. None: all points.
+            10,000 nearly give the pose of all.
         tie_points: (source_points, target_points, covariances), metres: points (n, 3) known to be the same, such as
             surveyed targets or image features (Huhle & Jenke 2008), and the covariances (n, 3, 3) of b − T a, in the
             target's axes. n may be 1 or 2. They do not replace a good initial pose.

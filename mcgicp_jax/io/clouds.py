@@ -65,7 +65,8 @@ def format_of(path: Path) -> Format:
     try:
         return FORMATS[path.suffix.lower()]
     except KeyError:
-        raise ValueError(f"{path}: unknown suffix {path.suffix!r}; expected one of {', '.join(FORMATS)}") from None
+        kind = "a folder" if path.is_dir() else f"unknown suffix {path.suffix!r}"
+        raise ValueError(f"{path}: {kind}; expected one of {', '.join(FORMATS)}") from None
 
 
 def is_cloud(path: Path) -> bool:
