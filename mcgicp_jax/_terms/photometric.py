@@ -276,8 +276,9 @@ class Photometric(AbstractAdaptiveTerm):
         scores = (weights * scaled / scale)[:, None] * slopes
         expected = xp.sum(weights * lengths / scale**2, axis=1)
         size = xp.where(self.spacing > 0, _CELL * self.spacing, 1)
-        # Padding is NaN, and does not change which cells share a sum.
-        num_cells = xp.maximum(xp.sum(~xp.isnan(moved[0])), 1).astype(np.int32)
+        # Padding, which is NaN, does not change which cells share a sum. Samples of some points have equally many rows.
+        num_points = xp.maximum(xp.sum(~xp.isnan(moved[0])), 1)
+        num_cells = xp.where(fraction < 1, moved.shape[1], num_points).astype(np.int32)
         cells = cell_numbers(tuple(xp.nan_to_num(xp.floor(moved / size)).astype(np.int32)), num_cells)
         seen = _squared_sums(scores, cells)
         # Of independent scores, `expected` without the factor.
