@@ -260,9 +260,9 @@ def _begin_with(
         "max_distance": np.asarray(distance) if isinstance(distance, tuple) else distance,
         "translation_tolerance": options.translation_tolerance,
         "rotation_tolerance": options.rotation_tolerance,
+        "hold_unconstrained": options.hold_unconstrained,
     }
-    names = ("max_iterations", "hold_unconstrained", "max_source_points", "reach")
-    fixed = Options(**{name: getattr(options, name) for name in names})
+    fixed = Options(**{name: getattr(options, name) for name in ("max_iterations", "max_source_points", "reach")})
 
     def begin(*chunk: Any) -> Lanes:
         pairs = with_neighbors(*chunk, search, num_neighbors)
