@@ -300,6 +300,7 @@ class BatchJob:
         init, verified = start
         check_clouds(source, target, self.method)
         pose = se3_from_matrix(centred_pose(init, source, target), source.points.dtype)
+        # `preprocess` returns clouds that have neighbours as they are; the others get theirs on the devices.
         sides = [
             self._padded(cloud, cloud is not given[name]) for name, cloud in (("source", source), ("target", target))
         ]

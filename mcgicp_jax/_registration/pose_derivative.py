@@ -140,7 +140,7 @@ class PoseDerivative(AbstractLinearMap):
         if self._fusion is not None:
             by_score, by_form = self._by_balance(by_score)
         arrays = [self.arrays[i] for i in moving]
-        # No more cotangents than the score has numbers, of which others are combinations.
+        # The score has six numbers, so more cotangents of it are combinations of six.
         some = by_score if len(by_score) <= 6 else np.eye(6)
         found = self._score(pose).cotangents(some.astype(pose.dtype), arrays)
         found = found if some is by_score else [np.tensordot(by_score, each, 1) for each in found]
