@@ -40,7 +40,7 @@ def register(
     rotation_tolerance: ArrayLike = Options.rotation_tolerance,
     robust: AbstractKernel | None = None,
     search: AbstractSearch | None = None,
-    hold_unconstrained: bool = True,
+    hold_unconstrained: ArrayLike = True,
     equalize_channels: bool = False,
     voxel_sizes: Sequence[float] = (),
     max_source_points: int | None = Options.max_source_points,

@@ -44,7 +44,7 @@ class Options:
     rotation_tolerance: ArrayLike = ROTATION_TOLERANCE
     robust: AbstractKernel | None = None
     search: AbstractSearch | None = None
-    hold_unconstrained: bool = True
+    hold_unconstrained: ArrayLike = True
     equalize_channels: bool = False
     voxel_sizes: Sequence[float] = ()
     max_source_points: int | None = _ENOUGH_SOURCE_POINTS
@@ -99,7 +99,7 @@ class GivenOptions(TypedDict, total=False):
     rotation_tolerance: ArrayLike
     robust: AbstractKernel | None
     search: AbstractSearch | None
-    hold_unconstrained: bool
+    hold_unconstrained: ArrayLike
     equalize_channels: bool
     voxel_sizes: Sequence[float]
     max_source_points: int | None
