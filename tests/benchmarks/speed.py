@@ -69,15 +69,22 @@ CASES: dict[str, tuple[Callable[[], tuple[np.ndarray, np.ndarray]], float | None
 }
 
 
-def ours(source: np.ndarray, target: np.ndarray, voxel: float | None, max_distance: float) -> Stages:
-    begin = time.perf_counter()
-    # Preprocess the two clouds in parallel.
-    clouds = list(
-        THREADS.map(lambda cloud: mcg.preprocess(cloud.astype(np.float32), voxel, NUM_NEIGHBORS), (source, target))
-    )
-    ready = time.perf_counter()
-    result = mcg.register(*clouds, mcg.GICP(), max_distance=max_distance, max_iterations=MAX_ITERATIONS, **TOLERANCES)
-    return ready - begin, time.perf_counter() - ready, np.asarray(result.matrix)
+def ours(backend: str | None) -> Callable[..., Stages]:
+    search = mcg.KDTreeSearch(backend=backend)
+
+    def prepared(cloud: np.ndarray, voxel: float | None) -> mcg.PointCloud:
+        return mcg.preprocess(cloud.astype(np.float32), voxel, NUM_NEIGHBORS, search=search)
+
+    def run(source: np.ndarray, target: np.ndarray, voxel: float | None, max_distance: float) -> Stages:
+        begin = time.perf_counter()
+        # Preprocess the two clouds in parallel.
+        clouds = list(THREADS.map(prepared, (source, target), (voxel, voxel)))
+        ready = time.perf_counter()
+        options = {"max_distance": max_distance, "max_iterations": MAX_ITERATIONS, "search": search, **TOLERANCES}
+        result = mcg.register(*clouds, mcg.GICP(), **options)
+        return ready - begin, time.perf_counter() - ready, np.asarray(result.matrix)
+
+    return run
 
 
 def small(num_threads: int) -> Callable[..., Stages]:
@@ -171,13 +178,18 @@ def colored() -> None:
 
 
 def turns(chart: pathlib.Path | None, chosen: list[str]) -> None:
-    libraries: dict[str, Callable[..., Stages]] = {"ours": ours, "small 1": small(1), "small 2": small(2)}
+    libraries: dict[str, Callable[..., Stages]] = {
+        "ours": ours(None),
+        "SciPy's tree": ours("scipy"),
+        "small 1": small(1),
+        "small 2": small(2),
+    }
     if importlib.util.find_spec("open3d") is not None:
         libraries["open3d"] = open3d
     print("\nMilliseconds: prepare + align, medians; and ours / the better of small_gicp, median of the turns")
-    print("work: processor time of the whole, ours / small_gicp with one thread")
+    print("work: processor time of the whole, ours / small_gicp with one thread; / scipy: to ours without `fast`")
     header = "".join(f"{name:>20}" for name in libraries)
-    ratios_header = f"{'prepare':>8} {'align':>6} {'whole':>6} {'/ open3d':>9} {'work':>6} {'apart':>8}"
+    ratios_header = f"{'prepare':>8} {'align':>6} {'whole':>6} {'/ scipy':>8} {'/ open3d':>9} {'work':>6} {'apart':>8}"
     print(f"{'clouds':>20} {'points':>9}{header} {ratios_header}")
     drawn: dict[str, list[tuple[int, float]]] = {name: [] for name in libraries}
     for case in chosen:
@@ -201,12 +213,14 @@ def turns(chart: pathlib.Path | None, chosen: list[str]) -> None:
             cells.append(f"{f'{prepare:.0f} + {align:.0f}':>20}")
             drawn[name].append((size, prepare + align))
         ratios = [_ratio(times, stage) for stage in (slice(0, 1), slice(1, 2), slice(0, 2))]
+        scipy_ratio = _ratio_to(times, "SciPy's tree")
         beside = _ratio_to(times, "open3d") if "open3d" in times else float("nan")
         effort = statistics.median(a / b for a, b in zip(work["ours"], work["small 1"], strict=True))
         apart = 1e3 * np.linalg.norm(poses["ours"][:3, 3] - poses["small 1"][:3, 3])
         print(f"{case:>20} {size:9,}{''.join(cells)} ", end="")
         print(
-            f"{ratios[0]:8.2f} {ratios[1]:6.2f} {ratios[2]:6.2f} {beside:9.2f} {effort:6.2f} {apart:5.1f} mm",
+            f"{ratios[0]:8.2f} {ratios[1]:6.2f} {ratios[2]:6.2f} {scipy_ratio:8.2f} {beside:9.2f} {effort:6.2f}"
+            f" {apart:5.1f} mm",
             flush=True,
         )
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
