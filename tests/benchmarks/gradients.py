@@ -156,7 +156,7 @@ def our_worker(
     import mcgicp_jax as mcg
 
     method = getattr(mcg, method_name)()
-    moving, fixed = (mcg.preprocess(mcg.PointCloud(*cloud)) for cloud in (source, target))
+    moving, fixed = (mcg.preprocess(mcg.PointCloud(*cloud), voxel_size=None) for cloud in (source, target))
     # A row of padding in the target, changed in every call.
     fixed = fixed.pad(len(fixed) + 1)
     stamped = jax.numpy.asarray(fixed.points)
