@@ -60,7 +60,7 @@ _FIRST = """
 
 _GRADIENT = """
     import jax.numpy as jnp
-    source, target = (mcg.preprocess(cloud) for cloud in clouds(int(sys.argv[2])))
+    source, target = (mcg.preprocess(cloud, None) for cloud in clouds(int(sys.argv[2])))
 
     def loss(channels):
         result = mcg.register(source.replace(channels=channels), target, mcg.MultiChannelGICP(), max_distance=0.2)
@@ -82,7 +82,7 @@ _GRADIENT = """
 _EAGER = """
     import jax.numpy as jnp
     import resource
-    several = {size: [mcg.preprocess(cloud) for cloud in clouds(size)] for size in (9000, 8000, 34000)}
+    several = {size: [mcg.preprocess(cloud, None) for cloud in clouds(size)] for size in (9000, 8000, 34000)}
 
     def loss(channels, points, pair):
         arrays = {"channels": channels} if points is None else {"channels": channels, "points": points}
@@ -120,7 +120,7 @@ _COST = """
     method = mcg.MultiChannelGICP(0.05, 0.3)
 
     def prepared(size):
-        source, target = (mcg.preprocess(cloud) for cloud in clouds(size))
+        source, target = (mcg.preprocess(cloud, None) for cloud in clouds(size))
         return source, target, mcg.find_correspondences(source, target, np.eye(4), method, max_distance=0.3)
 
     def cost(channels, pose, problem):
@@ -145,7 +145,7 @@ _COST = """
 _EPOCH = """
     import jax.numpy as jnp
     sizes = np.random.default_rng(0).integers(2000, 10_000, 60)
-    sources, targets = zip(*[[mcg.preprocess(cloud) for cloud in clouds(int(size), i)] for i, size in enumerate(sizes)])
+    sources, targets = zip(*[[mcg.preprocess(cloud, None) for cloud in clouds(int(size), i)] for i, size in enumerate(sizes)])
     channels = [jnp.asarray(source.channels) for source in sources]
 
     def loss(channels):
