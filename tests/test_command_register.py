@@ -7,7 +7,6 @@ import sys
 import jax
 import matplotlib.image
 import numpy as np
-import platformdirs
 import pytest
 import scipy.spatial
 
@@ -92,20 +91,17 @@ def test_the_start_is_used_and_drawn(files, monkeypatch, tmp_path, capsys):
     assert main(["register", files["source"], files["target"], *options]) == 0
     np.testing.assert_allclose(drawn["start"], TRUTH)
     np.testing.assert_allclose(drawn["gicp"], printed_matrix(capsys.readouterr().out), atol=1e-8)
-    far = np.eye(4)
-    far[:3, 3] = 50
-    io.write_poses(tmp_path / "far.txt", [far])
+    io.write_poses(tmp_path / "far.txt", [motion((50, 0, 0, 0, 0, 0))])
     assert main(["register", files["source"], files["target"], "--init", str(tmp_path / "far.txt")]) == 1
 
 
 def test_numbers_reach_the_method(files, capsys):
     numbers = ["--channel-covariance", "0.25", "--channel-weights", "0.5", "--epsilon", "0.01"]
-    for method in ("mc-gicp", "photometric-gicp"):
-        assert main(["register", files["source"], files["target"], "--method", method, *numbers]) == 0
+    for method, given in (("mc-gicp", numbers), ("color-icp", numbers[2:4])):
+        assert main(["register", files["source"], files["target"], "--method", method, *given]) == 0
         text = capsys.readouterr().out
-        assert f"{method}, channel_covariance 0.25, channel_weights 0.5, epsilon 0.01" in text
-    assert main(["register", files["source"], files["target"], "--method", "color-icp", *numbers[2:4]]) == 0
-    assert "color-icp, channel_weights 0.5\n" in capsys.readouterr().out
+        named = [f"{name[2:].replace('-', '_')} {value}" for name, value in zip(given[::2], given[1::2], strict=True)]
+        assert ", ".join([method, *named]) + "\n" in text
 
 
 def test_what_does_not_converge_is_no_success(files, tmp_path, capsys):
@@ -131,14 +127,10 @@ def test_compare(files, capsys):
     assert float(start[1]) == pytest.approx(1e3 * metrics.pose_error(np.eye(4), TRUTH, at=middle)[0], abs=0.01)
     assert float(rows["gicp"][0]) < 10 < float(start[1])
     assert float(rows["gicp"][1]) < 0.6 < float(start[2])
-
-
-def test_compare_without_channels_or_truth(files, capsys):
-    assert main(["compare", files["bare"], files["target"]]) == 0
-    text = capsys.readouterr().out
-    assert "error" not in text and text.count("left out") == 4 and text.count("converged") == 5
+    # Without channels or truth.
     assert main(["compare", files["bare"], files["target"], "--max-iterations", "1"]) == 1
-    assert "gicp did not converge" in capsys.readouterr().err
+    text, errors = capsys.readouterr()
+    assert "error" not in text and text.count("left out") == 4 and "gicp did not converge" in errors
 
 
 @pytest.mark.slow
@@ -226,24 +218,23 @@ def broken(folder):
     """Arguments that are wrong, and what the message must name."""
     good = save(folder / "good.npz", room_corner(200)[0])
     (folder / "cut.ply").write_bytes(b"ply\nformat ascii 1.0\nelement vertex 9\nproperty float x\n")
-    (folder / "empty.pcd").write_bytes(b"")
     io.write_poses(folder / "two.txt", [TRUTH, TRUTH])
     np.savetxt(folder / "scaled.txt", 2 * np.eye(4))
     nan = save(folder / "nan.npz", np.full((9, 3), np.nan))
     return [
         ([str(folder / "nowhere.ply"), good], "nowhere.ply: "),
         ([good, str(folder / "cut.ply")], "cut.ply: "),
-        ([str(folder / "empty.pcd"), good], "empty.pcd"),
         ([str(folder), good], str(folder)),
         ([good, nan], "nan.npz: "),
         *(([good, good, "--init", path], path) for path in (good, str(folder / "two.txt"), str(folder / "scaled.txt"))),
         ([good, good, "--channel-weights", "1"], "gicp has no channel_weights"),
         *(
-            ([good, good, f"--{name}", value], f"{name.replace('-', '_')}: ")
-            for name, value in (("epsilon", "-1"), ("voxel-size", "-1"), ("num-neighbors", "1"), ("max-distance", "0"))
+            ([good, good, f"--{name.replace('_', '-')}", value], f"{name}: ")
+            for name, value in (
+                *(("epsilon", "-1"), ("voxel_size", "-1"), ("num_neighbors", "1"), ("max_distance", "0")),
+                *(("max_iterations", "0"), ("max_source_points", "3")),
+            )
         ),
-        ([good, good, "--max-iterations", "0"], "max_iterations: "),
-        ([good, good, "--max-source-points", "3"], "max_source_points: "),
         ([good, good, "--aligned", str(folder / "out.doc")], "'.doc'"),
         ([good, good, "--output", str(folder / "no" / "pose.txt")], "pose.txt"),
         ([good, good, "--output", str(folder)], f"{folder}: "),
@@ -262,11 +253,6 @@ def test_wrong_input_gets_one_line(tmp_path, capsys):
     good = str(tmp_path / "good.npz")
     assert main(["compare", good, good, "--truth", str(tmp_path / "no.txt")]) == 2
     assert capsys.readouterr().err.startswith("mcgicp: --truth: ")
-
-
-def test_the_version(capsys):
-    assert main(["--version"]) == 0
-    assert capsys.readouterr().out == f"mcgicp {mcg.__version__}\n"
 
 
 def test_a_missing_package_is_named(files, monkeypatch, capsys):
@@ -306,12 +292,10 @@ def test_a_kernel_is_an_option(files, capsys):
     assert np.abs(matrices[0] - matrices[1]).max() > 1e-6
 
 
-def test_an_unwritable_cache_is_no_error(files, monkeypatch, capsys):
-    def refuse(*args, **kwargs):
-        raise PermissionError(13, "Permission denied", "/cache")
-
+def test_an_unwritable_cache_is_no_error(files, monkeypatch, capsys, tmp_path):
+    (tmp_path / "file").touch()
     monkeypatch.delenv("JAX_COMPILATION_CACHE_DIR", raising=False)
-    monkeypatch.setattr(platformdirs, "user_cache_path", refuse)
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "file"))
     before = jax.config.jax_compilation_cache_dir
     assert main(["register", files["bare"], files["target"], "--method", "gicp"]) == 0
     assert capsys.readouterr().err == ""
@@ -334,12 +318,11 @@ def test_compiled_programs_are_kept(files, tmp_path):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("arguments", [["--help"], ["register", "--help"], ["--version"]])
-def test_a_reader_that_ends_early_is_no_error(arguments):
-    """As in `mcgicp --help | head`."""
+def test_a_reader_that_ends_early_is_no_error():
+    """As in `mcgicp register --help | head`."""
     reader, writer = os.pipe()
     os.close(reader)
-    command = [sys.executable, "-m", "mcgicp_jax", *arguments]
+    command = [sys.executable, "-m", "mcgicp_jax", "register", "--help"]
     done = subprocess.run(command, stdout=writer, stderr=subprocess.PIPE, text=True, timeout=120)
     os.close(writer)
     assert done.stderr == ""
@@ -350,9 +333,8 @@ def test_fixed_directions(files, capsys, tmp_path):
     start = TRUTH @ motion((0, 0, 0.02, 0.01, 0, 0))
     io.write_poses(pose, [start])
     command = ["register", files["source"], files["target"], "--method", "gicp", "--init", str(pose)]
-    for fixed in (["--fix", "roll", "pitch", "z"], ["--fix", "roll", "pitch", "--fix", "z"]):
-        assert main([*command, *fixed]) == 0
-        change = np.linalg.inv(start) @ printed_matrix(capsys.readouterr().out)
-        assert np.abs(change[2] - [0, 0, 1, 0]).max() < 1e-6
+    assert main([*command, "--fix", "roll", "pitch", "--fix", "z"]) == 0
+    change = np.linalg.inv(start) @ printed_matrix(capsys.readouterr().out)
+    assert np.abs(change[2] - [0, 0, 1, 0]).max() < 1e-6
     with pytest.raises(SystemExit, match="2"):
         main([*command, "--fix", "north"])
