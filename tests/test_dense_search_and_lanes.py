@@ -24,6 +24,8 @@ from tests.batches import METHOD, assert_same, prepared
 from tests.compilations import compilations
 from tests.scenes import motion
 
+# Its parameters are computed for each lane.
+UNSET = mcg.MultiChannelGICP()
 T = ref.pose([0.1, -0.2, 0.3], [0.05, 0.1, -0.02])
 
 
@@ -150,15 +152,15 @@ def test_register_with_it_is_one_program_without_callbacks(clouds):
     assert max(pose_error(np.asarray(jax.jit(answer)(clouds[0][0].points), float), expected.matrix)) < 1e-5
 
 
-def lanes(sources, targets, **arguments):
-    return mcg.register_batch(sources, targets, METHOD, max_distance=0.5, search=DenseSearch(), **arguments)
+def lanes(sources, targets, **options):
+    return mcg.register_batch(sources, targets, UNSET, max_distance=0.5, search=DenseSearch(), **options)
 
 
 def test_a_batch_in_lanes_is_its_pairs(raw, clouds):
     """With more pairs than lanes of a size, so that lanes are used again."""
     results = lanes(*clouds)
     for result, source, target in zip(results, *clouds, strict=True):
-        alone = mcg.register(source, target, METHOD, max_distance=0.5, max_iterations=64)
+        alone = mcg.register(source, target, UNSET, max_distance=0.5, max_iterations=64)
         assert result.status is alone.status
         assert list(result.history) == list(alone.history)
         if alone.converged:
@@ -177,10 +179,8 @@ def test_raw_clouds_in_lanes_are_prepared_as_one_by_one(raw):
     sides[0][1] = np.zeros((3, 3))
     spoilt = sides[1][2]
     sides[1][2] = spoilt.replace(points=np.where(np.arange(310)[:, None] % 10, spoilt.points, np.nan))
-    options = {"method": mcg.MultiChannelGICP(), "max_distance": 0.5, "search": DenseSearch()}
-    with pytest.warns(UserWarning, match="pair 1"), ThreadPoolExecutor(1) as executor:
-        found = mcg.register_batch(*sides, **options)
-        expected = mcg.register_batch(*sides, executor=executor, **options)
+    with pytest.warns(mcg.PairWarning, match="pair 1"), ThreadPoolExecutor(1) as executor:
+        found, expected = lanes(*sides), lanes(*sides, executor=executor)
     assert [result.status for result in found] == [result.status for result in expected]
     assert [result.converged for result in found] == [True, False, True, True]
     for i in (0, 2, 3):
@@ -213,7 +213,7 @@ SHARDED = """
     import jax, numpy as np
     import mcgicp_jax as mcg
     from mcgicp_jax._registration import vectorized as _lanes
-    from tests.batches import METHOD, SIZES, prepared, raw_pair
+    from tests.batches import SIZES, prepared, raw_pair
     assert jax.local_device_count() == 4
     clouds = prepared([raw_pair(size, seed) for seed, size in enumerate(SIZES)])
     devices, run_lanes = set(), _lanes.run_lanes
@@ -224,7 +224,7 @@ SHARDED = """
         return carries
 
     _lanes.run_lanes = spy
-    results = mcg.register_batch(*clouds, METHOD, max_distance=0.5, search=mcg.DenseSearch())
+    results = mcg.register_batch(*clouds, mcg.MultiChannelGICP(), max_distance=0.5, search=mcg.DenseSearch())
     assert devices == {4}
     np.save("poses.npy", [result.matrix for result in results])
 """
@@ -244,13 +244,13 @@ def test_lanes_are_spread_over_the_devices(clouds, tmp_path):
 
 def test_a_rare_size_does_not_wait_for_the_end(clouds, monkeypatch):
     monkeypatch.setattr(_lanes, "_PATIENCE", 2)
-    # 500 points fill the larger size class, the others the smaller.
+    # 490 points fill the larger size class, the others the smaller.
     rare, usual = 2, [0, 1, 3, 5] * 3
     order = [rare, *usual]
 
     def ended():
         completed = mcg.register_as_completed(
-            *([side[i] for i in order] for side in clouds), METHOD, max_distance=0.5, search=DenseSearch()
+            *([side[i] for i in order] for side in clouds), UNSET, max_distance=0.5, search=DenseSearch()
         )
         return [number for number, _ in completed]
 
