@@ -33,10 +33,10 @@ def test_concrete_clouds_are_registered_on_the_cpu():
     prior = (np.eye(4), np.diag([1e-4] * 5 + [0]))
     with jax.default_device("tpu"), ThreadPoolExecutor(1) as executor:
         source, target = (mcg.preprocess(cloud) for cloud in raw)
-        results = [mcg.register(source, target, mcg.MultiChannelGICP(), prior=given) for given in (None, prior)]
-        results += mcg.register_batch([source], [target], mcg.GICP(), executor=executor)
+        results = mcg.register_batch([source], [target], mcg.GICP(), executor=executor)
+        results.append(mcg.register(source, target, mcg.MultiChannelGICP(), prior=prior))
         assert all(result.converged and np.isfinite(result.deviations).all() for result in results)
-        assert np.isfinite(results[0].jacobian("source")).all()
+        assert np.isfinite(results[1].jacobian("source")).all()
         assert mcg.find_correspondences(source, target, None, mcg.GICP(), max_distance=0.5).valid.any()
 
 
@@ -109,16 +109,15 @@ class ForFewLanes(mcg.DenseSearch):
 
 def test_fewer_lanes_where_memory_does_not_suffice():
     """No pair is lost. The surfaces are padded to a size class of each side."""
-    sides = [[mcg.preprocess(raw_pair(185 + i, i)[side]) for i in range(7)] for side in (0, 1)]
-    expected = mcg.register_batch(*sides, mcg.GICP(), max_distance=0.5, search=ForFewLanes(1000))
-    first = COMPILED.copy()
+    sides = [[mcg.preprocess(raw_pair(185 + i, i)[side]) for i in range(3)] for side in (0, 1)]
     few = jax.local_device_count()
+    COMPILED.clear()
     found = mcg.register_batch(*sides, mcg.GICP(), max_distance=0.5, search=ForFewLanes(few))
-    assert [result.status for result in found] == [result.status for result in expected]
-    for one, other in zip(found, expected, strict=True):
-        assert max(pose_error(one.matrix, other.matrix)) < 1e-5
-    assert {tuple(rows) for _, *rows in first} == {(192, 256)}
-    assert min(count for count, *_ in first) > few == COMPILED[-1][0]
+    for result, source, target in zip(found, *sides, strict=True):
+        alone = mcg.register(source, target, mcg.GICP(), max_distance=0.5)
+        assert result.status is alone.status and max(pose_error(result.matrix, alone.matrix)) < 1e-5
+    assert {tuple(rows) for _, *rows in COMPILED} == {(192, 256)}
+    assert COMPILED[0][0] > few == COMPILED[-1][0]
 
 
 def test_pairs_that_begin_again_keep_their_order():
