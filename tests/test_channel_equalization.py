@@ -122,7 +122,7 @@ def test_channels_that_say_nothing_are_not_matched():
     assert np.isfinite(gradient(source.channels)).all()
 
 
-@pytest.mark.parametrize("photometric", [False, True])
+@pytest.mark.parametrize("photometric", [False, pytest.param(True, marks=pytest.mark.slow)])
 def test_another_exposure_is_told(photometric):
     target, source = (
         mcg.preprocess(frame.cloud, voxel_size=0.03) for frame in mcg.datasets.poster_wall(num_frames=2, seed=1)
