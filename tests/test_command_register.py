@@ -44,6 +44,17 @@ def files(tmp_path_factory):
     }
 
 
+@pytest.fixture
+def register(files, capsys):
+    """Runs the command on two of these files; the exit code, output and errors."""
+
+    def run(*options, source="source"):
+        code = main(["register", files.get(source, source), files["target"], *options])
+        return code, *capsys.readouterr()
+
+    return run
+
+
 def close_to_truth(pose, factor=1.0):
     translation, rotation = metrics.pose_error(pose, TRUTH)
     return translation < 0.01 * factor and rotation < 0.01 * factor
@@ -57,10 +68,9 @@ def printed_matrix(text):
 @pytest.mark.parametrize(
     "method", ["mc-gicp", "photometric-gicp", "gicp", "color-icp", "point-to-plane", "point-to-point", "ndt"]
 )
-def test_register_prints_the_pose(files, capsys, method):
-    assert main(["register", files["source"], files["target"], "--method", method]) == 0
-    text, errors = capsys.readouterr()
-    assert errors == ""
+def test_register_prints_the_pose(register, method):
+    code, text, errors = register("--method", method)
+    assert code == 0 and errors == ""
     # Points lie around the means of their cells.
     rmse = "rmse 0.1" if method == "ndt" else "rmse 0.0"
     assert all(part in text for part in (method, "converged", "1,000", rmse))
@@ -95,13 +105,12 @@ def test_the_start_is_used_and_drawn(files, monkeypatch, tmp_path, capsys):
     assert main(["register", files["source"], files["target"], "--init", str(tmp_path / "far.txt")]) == 1
 
 
-def test_numbers_reach_the_method(files, capsys):
+def test_numbers_reach_the_method(register):
     numbers = ["--channel-covariance", "0.25", "--channel-weights", "0.5", "--epsilon", "0.01"]
     for method, given in (("mc-gicp", numbers), ("color-icp", numbers[2:4])):
-        assert main(["register", files["source"], files["target"], "--method", method, *given]) == 0
-        text = capsys.readouterr().out
+        code, text, _ = register("--method", method, *given)
         named = [f"{name[2:].replace('-', '_')} {value}" for name, value in zip(given[::2], given[1::2], strict=True)]
-        assert ", ".join([method, *named]) + "\n" in text
+        assert code == 0 and ", ".join([method, *named]) + "\n" in text
 
 
 def test_what_does_not_converge_is_no_success(files, tmp_path, capsys):
@@ -152,27 +161,21 @@ def test_demo(tmp_path, capsys):
     assert len(source) > 10_000
 
 
-def test_common_channels_are_used(files, tmp_path, capsys):
+def test_common_channels_are_used(files, tmp_path, register):
     cloud = io.read(files["source"])
     junk = np.random.default_rng(0).normal(size=(len(cloud), 1))
     several = save(tmp_path / "several.npz", cloud.points, np.hstack([junk, cloud.channels]), ["humidity", "intensity"])
-    assert main(["register", files["source"], files["target"]]) == 0
-    text = capsys.readouterr().out
-    assert "channels:  intensity\n" in text
-    expected = printed_matrix(text)
-    assert main(["register", several, files["target"]]) == 0
-    text = capsys.readouterr().out
-    assert "several.npz has humidity, intensity" in text
-    np.testing.assert_allclose(printed_matrix(text), expected, atol=1e-6)
+    (code, text, _), (again, other, _) = register(), register(source=several)
+    assert code == again == 0 and "channels:  intensity\n" in text and "several.npz has humidity, intensity" in other
+    np.testing.assert_allclose(printed_matrix(other), printed_matrix(text), atol=1e-6)
 
 
-def test_no_common_channels_is_said(files, capsys):
+def test_no_common_channels_is_said(register):
     # The last before the search for a pose, which takes seconds.
     for options in (["mc-gicp"], ["color-icp"], ["mc-gicp", "--init", "global"]):
-        assert main(["register", files["bare"], files["target"], "--method", *options]) == 2
-        text, error = capsys.readouterr()
+        code, text, error = register("--method", *options, source="bare")
+        assert code == 2 and "start:" not in text
         assert all(part in error for part in ("bare.npz", "target.ply has intensity", "--method gicp"))
-        assert "start:" not in text
 
 
 def test_clouds_without_channels_in_common_are_registered_by_gicp(files, tmp_path, capsys):
@@ -255,18 +258,16 @@ def test_wrong_input_gets_one_line(tmp_path, capsys):
     assert capsys.readouterr().err.startswith("mcgicp: --truth: ")
 
 
-def test_a_missing_package_is_named(files, monkeypatch, capsys):
+def test_a_missing_package_is_named(register, monkeypatch):
     monkeypatch.setitem(sys.modules, "plyfile", None)
-    assert main(["register", files["source"], files["target"]]) == 2
-    assert "pip install 'mcgicp_jax[io]'" in capsys.readouterr().err
+    code, _, errors = register()
+    assert code == 2 and "mcgicp_jax[io]" in errors
 
 
-def test_points_left_out_are_reported_in_one_line(files, tmp_path, capsys):
-    cloud = io.read(files["bare"])
-    points = np.vstack([cloud.points, [[np.nan, 0, 0]]])
-    path = save(tmp_path / "nan.npz", points)
-    assert main(["register", path, files["target"], "--method", "gicp"]) == 0
-    assert capsys.readouterr().err == f"mcgicp: {path}: left out 1 of 1001 points with a NaN or infinity\n"
+def test_points_left_out_are_reported_in_one_line(files, tmp_path, register):
+    path = save(tmp_path / "nan.npz", np.vstack([io.read(files["bare"]).points, [[np.nan, 0, 0]]]))
+    code, _, errors = register("--method", "gicp", source=path)
+    assert code == 0 and errors.startswith(f"mcgicp: {path}: left out 1 of 1001") and errors.count("\n") == 1
 
 
 def test_help_lists_the_registries(capsys):
@@ -282,14 +283,10 @@ def test_help_lists_the_registries(capsys):
         assert f"{dataset.max_distance[0]:g} and {dataset.max_distance[1]:g} for " in text, name
 
 
-def test_a_kernel_is_an_option(files, capsys):
-    command = ["register", files["bare"], files["target"], "--method", "gicp"]
-    matrices = []
-    for options in ([], ["--robust", "cauchy", "0.5"]):
-        assert main([*command, *options]) == 0
-        matrices.append(printed_matrix(capsys.readouterr().out))
-        assert close_to_truth(matrices[-1])
-    assert np.abs(matrices[0] - matrices[1]).max() > 1e-6
+def test_a_kernel_is_an_option(register):
+    texts = [register("--method", "gicp", *given, source="bare")[1] for given in ([], ["--robust", "cauchy", "0.5"])]
+    without, robust = map(printed_matrix, texts)
+    assert close_to_truth(without) and close_to_truth(robust) and np.abs(without - robust).max() > 1e-6
 
 
 def test_an_unwritable_cache_is_no_error(files, monkeypatch, capsys, tmp_path):
@@ -328,13 +325,12 @@ def test_a_reader_that_ends_early_is_no_error():
     assert done.stderr == ""
 
 
-def test_fixed_directions(files, capsys, tmp_path):
-    pose = tmp_path / "start.txt"
+def test_fixed_directions(register, tmp_path):
     start = TRUTH @ motion((0, 0, 0.02, 0.01, 0, 0))
-    io.write_poses(pose, [start])
-    command = ["register", files["source"], files["target"], "--method", "gicp", "--init", str(pose)]
-    assert main([*command, "--fix", "roll", "pitch", "--fix", "z"]) == 0
-    change = np.linalg.inv(start) @ printed_matrix(capsys.readouterr().out)
-    assert np.abs(change[2] - [0, 0, 1, 0]).max() < 1e-6
+    io.write_poses(tmp_path / "start.txt", [start])
+    command = ["--method", "gicp", "--init", str(tmp_path / "start.txt"), "--fix"]
+    code, text, _ = register(*command, "roll", "pitch", "--fix", "z")
+    change = np.linalg.inv(start) @ printed_matrix(text)
+    assert code == 0 and np.abs(change[2] - [0, 0, 1, 0]).max() < 1e-6
     with pytest.raises(SystemExit, match="2"):
-        main([*command, "--fix", "north"])
+        register(*command, "north")
