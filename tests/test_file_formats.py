@@ -215,28 +215,26 @@ INTENSITIES = ("intensity", "scalar_Intensity", "reflectance", "scalar_Reflectan
 COLOURS = [("r", "g", "b"), ("diffuse_red", "diffuse_green", "diffuse_blue"), ("Red", "Green", "Blue")]
 
 
-@pytest.mark.parametrize("dtype", [np.float32, np.uint16, np.uint8, np.float64])
-def test_intensity_names(tmp_path, dtype):
-    values = np.arange(N).astype(dtype)
-    for column in INTENSITIES:
-        write_ply(tmp_path / "c.ply", structured(**xyz(), **{column: values}))
-        cloud = io.read(tmp_path / "c.ply")
-        assert cloud.channel_names == INTENSITY
-        np.testing.assert_array_equal(cloud.channels[:, 0], values)
-    write_ply(tmp_path / "c.ply", structured(**xyz(), reflectivity=np.zeros(N, dtype), intensity=np.ones(N, dtype)))
-    cloud = io.read(tmp_path / "c.ply")
-    assert cloud.channel_names == ("intensity", "reflectivity")
-    np.testing.assert_array_equal(cloud.channels, np.tile([1.0, 0.0], (N, 1)))
-
-
 @pytest.mark.parametrize(("dtype", "scale"), [(np.float32, 1), (np.uint8, 255), (np.uint16, 65535), (np.int32, 255)])
-def test_colour_names(tmp_path, dtype, scale):
-    values = RNG.integers(0, 2, (3, N)) * (scale if scale > 1 else 0.5)
-    for names in COLOURS:
-        write_ply(tmp_path / "c.ply", structured(**xyz(), **dict(zip(names, values.astype(dtype), strict=True))))
+def test_names_of_intensities_and_colours(tmp_path, dtype, scale):
+    def read(**columns):
+        write_ply(tmp_path / "c.ply", structured(**xyz(), **columns))
         cloud = io.read(tmp_path / "c.ply")
-        assert cloud.channel_names == RGB
-        np.testing.assert_allclose(cloud.channels, values.T / scale, rtol=1e-6)
+        return cloud.channel_names, cloud.channels.T
+
+    intensity, other = np.arange(2 * N).astype(dtype).reshape(2, N)
+    for name in INTENSITIES:
+        names, channels = read(**{name: intensity})
+        assert names == INTENSITY
+        np.testing.assert_array_equal(channels, intensity[None])
+    names, channels = read(reflectivity=other, intensity=intensity)
+    assert names == ("intensity", "reflectivity")
+    np.testing.assert_array_equal(channels, [intensity, other])
+    values = RNG.integers(0, 2, (3, N)) * (scale if scale > 1 else 0.5)
+    for colours in COLOURS:
+        names, channels = read(**dict(zip(colours, values.astype(dtype), strict=True)))
+        assert names == RGB
+        np.testing.assert_allclose(channels, values / scale, rtol=1e-6)
 
 
 @pytest.mark.parametrize("newline", [b"\r\n", b"\r"])
