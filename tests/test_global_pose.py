@@ -10,7 +10,7 @@ import mcgicp_jax as mcg
 from mcgicp_jax import datasets
 from mcgicp_jax.__main__ import main
 from mcgicp_jax._global_pose import features
-from mcgicp_jax._global_pose.robust_pose_fit import NUM_MATCHES, PutativeMatches, _support, fit_pose
+from mcgicp_jax._global_pose.robust_pose_fit import NUM_MATCHES, PutativeMatches, _support, fit_pose, hypotheses
 from mcgicp_jax._global_pose.surface_agreement import surface_agreement
 from mcgicp_jax.metrics import pose_error
 from tests.compilations import compilations
@@ -181,6 +181,15 @@ def test_matches_whose_normals_differ_do_not_support_each_other():
         matches = PutativeMatches(*columns, np.arange(NUM_MATCHES) < 4)
         assert np.max(_support(matches, np.float32(0.05))) == support
         columns[3, :2] = [1, 0, 0]
+
+
+def test_padding_is_no_match():
+    points = np.zeros((NUM_MATCHES, 3), np.float32)
+    points[:40] = np.random.default_rng(0).uniform(-2, 2, (40, 3))
+    none = np.zeros_like(points)
+    matches = PutativeMatches(points, points, none, none, np.arange(NUM_MATCHES) < 40)
+    # They fit as they are, and so would zeros.
+    assert 30 < hypotheses(matches, np.float32(0.05), np.float32(2.0)).score.max() <= 40.001
 
 
 # Clouds
