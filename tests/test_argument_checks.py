@@ -5,20 +5,15 @@ import numpy as np
 import pytest
 
 import mcgicp_jax as mcg
+from tests.refusals import refused
 
 POINTS = np.random.default_rng(0).random((50, 3))
-# Checks of annotations, where they are on, come first, and name the parameter otherwise.
-ERRORS = ValueError, TypeError
 
 
 @pytest.mark.parametrize("value", ["x", None, [1.0], np.nan, 0, -1.0])
 def test_numbers_are_checked(value):
-    for name, call in (
-        ("max_iterations", lambda: mcg.register(POINTS, POINTS, mcg.GICP(), max_iterations=value)),
-        ("voxel_size", lambda: mcg.voxel_gaussians(POINTS, value)),
-    ):
-        with pytest.raises(ERRORS, match=rf"^{name}: |parameter '{name}'"):
-            call()
+    refused(lambda: mcg.register(POINTS, POINTS, mcg.GICP(), max_iterations=value), "max_iterations")
+    refused(lambda: mcg.voxel_gaussians(POINTS, value), "voxel_size")
 
 
 @pytest.mark.parametrize("function", [mcg.register_batch, mcg.odometry, mcg.multiway])
@@ -35,16 +30,16 @@ def test_swapped_arguments_are_named():
     cloud = mcg.preprocess(POINTS)
     matches = mcg.find_correspondences(cloud, cloud, None, mcg.GICP(), max_distance=1.0)
     for named, call in (
-        ("matches: ", lambda: mcg.mahalanobis_cost(cloud, cloud, np.eye(4), cloud, mcg.GICP())),
-        ("pose: ", lambda: mcg.mahalanobis_cost(cloud, cloud, cloud, matches, mcg.GICP())),
-        ("target: .*order", lambda: mcg.mahalanobis_cost(cloud, cloud, np.eye(4), matches, mcg.GICP())),
-        ("source: .*order", lambda: mcg.find_correspondences(np.eye(4), cloud, cloud, mcg.GICP(), max_distance=1.0)),
-        ("num_candidates: ", lambda: mcg.D2DNDT(num_candidates=True)),
-        ("voxel_sizes: ", lambda: mcg.register(POINTS, POINTS, mcg.NDT(), voxel_sizes=(0.25, 1.0))),
-        (r"method: .*GICP\(\)", lambda: mcg.register(POINTS, POINTS, mcg.GICP)),
+        ("matches", lambda: mcg.mahalanobis_cost(cloud, cloud, np.eye(4), cloud, mcg.GICP())),
+        ("pose", lambda: mcg.mahalanobis_cost(cloud, cloud, cloud, matches, mcg.GICP())),
+        ("target", lambda: mcg.mahalanobis_cost(cloud, cloud, np.eye(4), matches, mcg.GICP())),
+        ("source", lambda: mcg.find_correspondences(np.eye(4), cloud, cloud, mcg.GICP(), max_distance=1.0)),
+        ("num_candidates", lambda: mcg.D2DNDT(num_candidates=True)),
+        ("voxel_sizes", lambda: mcg.register(POINTS, POINTS, mcg.NDT(), voxel_sizes=(0.25, 1.0))),
+        ("method", lambda: mcg.register(POINTS, POINTS, mcg.GICP)),
+        ("init", lambda: mcg.register(cloud, cloud, mcg.GICP(), init=np.diag([1, 1, 1, 1.001]))),
     ):
-        with pytest.raises(ERRORS, match=rf"{named}|parameter"):
-            call()
+        refused(call, named)
 
 
 def test_poses_with_rounding_in_the_last_row_and_of_three_rows():
@@ -59,5 +54,3 @@ def test_poses_with_rounding_in_the_last_row_and_of_three_rows():
     matches = mcg.find_correspondences(cloud, cloud, pose, mcg.GICP(), max_distance=1.0)
     inside = jax.jit(lambda pose: mcg.mahalanobis_cost(pose, cloud, cloud, matches, mcg.PointToPoint()))(pose[:3])
     np.testing.assert_allclose(inside, mcg.mahalanobis_cost(pose, cloud, cloud, matches, mcg.PointToPoint()), rtol=1e-5)
-    with pytest.raises(ValueError, match="init: expected a rigid motion"):
-        mcg.register(cloud, cloud, mcg.GICP(), init=pose + 1e-3 * np.eye(4)[3:])

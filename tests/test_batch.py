@@ -76,16 +76,16 @@ SPOILED = {
 
 
 @pytest.mark.parametrize("what", SPOILED)
-@pytest.mark.parametrize("side", ["source", "target"])
-def test_a_bad_pair_has_its_status_and_spoils_no_other(raw, alone, what, side):
-    clouds = dict(zip(("source", "target"), prepared(raw), strict=True))
-    clouds[side][2] = SPOILED[what]
-    with pytest.warns(UserWarning, match=r"pair 2: (source|target|channels)"):
-        results = batch(*clouds.values())
-    assert results[2].status is Status.INVALID_INPUT and not results[2].converged
-    assert np.isnan(results[2].matrix).any() and "INVALID_INPUT" in repr(results[2])
-    del results[2]
-    assert_same(results, alone[:2] + alone[3:])
+def test_a_bad_pair_has_its_status_and_spoils_no_other(raw, alone, what):
+    for side in (0, 1):
+        clouds = prepared(raw)
+        clouds[side][2] = SPOILED[what]
+        with pytest.warns(mcg.PairWarning, match=r"pair 2: (source|target|channels)"):
+            results = batch(*clouds)
+        assert results[2].status is Status.INVALID_INPUT and not results[2].converged
+        assert np.isnan(results[2].matrix).any() and "INVALID_INPUT" in repr(results[2])
+        del results[2]
+        assert_same(results, alone[:2] + alone[3:])
 
 
 def test_the_warning_can_be_sent_copied_and_repeated():
@@ -100,22 +100,12 @@ def test_the_warning_can_be_sent_copied_and_repeated():
 
 def test_pairs_without_overlap_or_far_from_rest_have_the_status_of_register(raw, alone):
     sources, targets = prepared(raw)
-    starts = [None] * len(raw)
-    starts[1] = motion((100.0, 0, 0, 0, 0, 0))
-    results = batch(sources, targets, init=starts)
-    assert results[1].status is Status.TOO_FEW_CORRESPONDENCES
-    del results[1]
-    assert_same(results, alone[:1] + alone[2:])
+    starts = [motion((100.0, 0, 0, 0, 0, 0)), *[np.eye(4)] * (len(raw) - 2), 2 * np.eye(4)]
+    with pytest.warns(mcg.PairWarning, match="pair 5: init: "):
+        results = batch(sources, targets, init=starts)
+    assert results[0].status is Status.TOO_FEW_CORRESPONDENCES and results[5].status is Status.INVALID_INPUT
+    assert_same(results[1:5], alone[1:5])
     assert {result.status for result in batch(sources, targets, max_iterations=1)} == {Status.MAX_ITERATIONS}
-
-
-def test_a_start_that_is_no_rigid_motion_is_the_pairs_own_affair(raw, alone):
-    starts = [np.eye(4)] * len(raw)
-    starts[0] = 2 * np.eye(4)
-    with pytest.warns(UserWarning, match="pair 0: init: "):
-        results = batch(*prepared(raw), init=starts)
-    assert results[0].status is Status.INVALID_INPUT
-    assert_same(results[1:], alone[1:])
 
 
 def test_one_target_for_all(raw):
@@ -123,22 +113,24 @@ def test_one_target_for_all(raw):
     expected = [mcg.register(source, targets[0], METHOD, max_distance=0.5) for source in sources]
     assert_same(batch(sources, targets[0]), expected)
     assert_same(batch(sources, raw[0][1]), expected)
-    backward = [mcg.register(targets[0], source, METHOD, max_distance=0.5) for source in sources]
-    assert_same(batch(targets[0], sources), backward)
+    backward = [mcg.register(targets[0], source, METHOD, max_distance=0.5) for source in sources[:2]]
+    assert_same(batch(targets[0], sources[:2]), backward)
+    points = np.random.default_rng(0).normal(size=(60, 3))
+    table = np.rec.fromarrays(points.T, names="x,y,z")
+    results = mcg.register_batch([points + 0.01, points - 0.01], table, mcg.PointToPoint())
+    assert [result.num_inliers for result in results] == [60, 60]
 
 
 def test_starts_for_all_or_for_each(raw):
-    sources, targets = prepared(raw)
-    starts = np.stack([motion(0.01 * np.arange(6) * i) for i in range(len(raw))])
+    sources, targets = (side[:3] for side in prepared(raw))
+    starts = np.stack([motion(0.01 * np.arange(6) * i) for i in range(3)])
     expected = [
         mcg.register(source, target, METHOD, init=start, max_distance=0.5)
         for source, target, start in zip(sources, targets, starts, strict=True)
     ]
     assert_same(batch(sources, targets, init=starts), expected)
     assert_same(batch(sources, targets, init=iter(starts)), expected)
-    one = batch(sources, targets, init=starts[1])
-    assert_same(one[1:2], expected[1:2])
-    assert_same(one[:1], [mcg.register(sources[0], targets[0], METHOD, init=starts[1], max_distance=0.5)])
+    assert_same(batch(sources[1:2], targets[1:2], init=starts[1]), expected[1:2])
 
 
 def test_iterators_are_consumed_as_needed(raw):
@@ -228,30 +220,23 @@ def test_results_come_as_they_finish(raw):
     assert sorted(numbers) == [0, 1, 2] and numbers[0] != 0
 
 
-@pytest.mark.parametrize(
-    ("name", "value"),
-    [
-        ("max_distance", -1.0),
-        ("translation_tolerance", -1.0),
-        ("max_iterations", 0),
-        ("voxel_size", 0.0),
-        ("num_neighbors", 2),
-        ("init", 2 * np.eye(4)),
-        ("init", "local"),
-    ],
-)
-def test_what_concerns_all_pairs_is_raised_at_once(raw, name, value):
+def test_what_concerns_all_pairs_is_raised_at_once(raw):
     sides = prepared(raw)
-    refused(lambda: mcg.register_as_completed(*sides, METHOD, **{"max_distance": 0.5, name: value}), name)
+    for name, value in (
+        *(("max_distance", -1.0), ("translation_tolerance", -1.0), ("max_iterations", 0), ("voxel_size", 0.0)),
+        *(("num_neighbors", 2), ("init", 2 * np.eye(4)), ("init", "local"), ("executor", "threads")),
+    ):
+        options = {"max_distance": 0.5, name: value}
+        refused(lambda options=options: mcg.register_as_completed(*sides, METHOD, **options), name)
 
 
 def test_sides_that_do_not_fit(raw):
     sources, targets = prepared(raw)
     for named, shown, *sides in (
-        ("sources", "'targets': 2", sources, targets[:2]),
-        ("targets", "got 2", iter(sources), iter(targets[:2])),
-        ("sources", "several", sources[0], targets[0]),
-        ("targets: cloud", "got 3", sources, np.eye(3)),
+        ("sources", 2, sources, targets[:2]),
+        ("targets", 2, iter(sources), iter(targets[:2])),
+        ("sources", "", sources[0], targets[0]),
+        ("targets: cloud", 3, sources, np.eye(3)),
     ):
         refused(lambda sides=sides: batch(*sides), named, shown)
     assert batch([], []) == []
@@ -275,12 +260,12 @@ def test_workers_have_the_settings_of_the_caller(raw):
         seen.append((jax.enable_x64.value, jax.default_matmul_precision.value))
         return source
 
+    options = {"method": mcg.PointToPoint(), "max_distance": 0.5}
     with jax.enable_x64(True), jax.default_matmul_precision("highest"):
-        (result,) = batch([make], [target])
+        (result,) = mcg.register_batch([make], [target], **options)
         # Numbers of float64 stay what they are on the way to another process.
-        method, options = mcg.MultiChannelGICP(0.05, 0.3), {"robust": mcg.Huber(0.3), "max_distance": 0.5}
         sent, expected = (
-            mcg.register_batch([source], [target], method, executor=executor, **options)
+            mcg.register_batch([source], [target], robust=mcg.Huber(0.3), executor=executor, **options)
             for executor in (Elsewhere(sends=True), None)
         )
         assert_same(sent, expected)
@@ -318,27 +303,17 @@ def test_a_batch_starts_from_anywhere(search):
         mcg.register_batch(sources[:1], frames[0].cloud, mcg.GICP(), init=["local"])
 
 
-def test_one_structured_cloud_for_many():
-    points = np.random.default_rng(0).normal(size=(60, 3))
-    table = np.rec.fromarrays(points.T, names="x,y,z")
-    results = mcg.register_batch([points + 0.01, points - 0.01], table, mcg.PointToPoint())
-    assert len(results) == 2 and all(result.num_inliers == 60 for result in results)
-
-
 def test_the_extra_is_named(monkeypatch):
     monkeypatch.setitem(sys.modules, "loky", None)
-    with pytest.raises(ImportError, match=re.escape("pip install 'mcgicp_jax[processes]'")):
+    with pytest.raises(ImportError, match=re.escape("mcgicp_jax[processes]")):
         batch([np.eye(3)], [np.eye(3)], executor="processes")
-    refused(lambda: batch([np.eye(3)], [np.eye(3)], executor="threads"), "executor")
 
 
-@pytest.mark.parametrize("transformation", [jax.jit, jax.vmap, lambda function: jax.jit(jax.grad(function))])
-def test_inside_transformations_a_batch_says_what_to_use(transformation, raw):
-    sources, targets = prepared(raw[:1])
+def test_inside_transformations_a_batch_says_what_to_use(raw):
+    (source,), targets = prepared(raw[:1])
 
     def cost(channels):
-        return batch([sources[0].replace(channels=channels)], targets)[0].cost
+        return batch([source.replace(channels=channels)], targets)[0].cost
 
-    channels = np.asarray(sources[0].channels)
-    channels = channels[None] if transformation is jax.vmap else channels
-    refused(lambda: transformation(cost)(channels), "sources, targets", "register inside")
+    for transformed in (jax.jit(cost), jax.jit(jax.grad(cost)), lambda channels: jax.vmap(cost)(channels[None])):
+        refused(lambda transformed=transformed: transformed(np.asarray(source.channels)), "sources, targets")

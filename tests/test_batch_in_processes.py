@@ -1,11 +1,11 @@
 """`executor="processes"`: the results of threads, and no trace of the workers that made them."""
 
 import ast
+import contextlib
 import os
 import signal
 import subprocess
 import sys
-import textwrap
 import threading
 import time
 
@@ -200,12 +200,18 @@ print("done", len(results), flush=True)
 """
 
 
+@contextlib.contextmanager
+def started(folder, count):
+    """A process group of its own that runs the script."""
+    script = folder / "script.py"
+    script.write_text(SCRIPT)
+    command, pipes = [sys.executable, str(script), str(count)], {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
+    with subprocess.Popen(command, text=True, start_new_session=True, **pipes) as process:
+        yield process
+
+
 def test_workers_that_are_starting_do_not_report_an_interrupt(tmp_path):
-    script = tmp_path / "script.py"
-    script.write_text(textwrap.dedent(SCRIPT))
-    output = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
-    command = [sys.executable, str(script), "100000"]
-    with subprocess.Popen(command, text=True, start_new_session=True, **output) as process:
+    with started(tmp_path, 100_000) as process:
         process.stdout.readline()
         # They import NumPy and JAX for some seconds.
         time.sleep(0.7)
@@ -217,12 +223,7 @@ def test_workers_that_are_starting_do_not_report_an_interrupt(tmp_path):
 @pytest.mark.parametrize("number", [None, signal.SIGINT, signal.SIGKILL])
 def test_a_script_without_a_guard_leaves_no_process(tmp_path, number):
     """At its end, interrupted as by Ctrl-C in a terminal, and killed."""
-    script = tmp_path / "script.py"
-    script.write_text(textwrap.dedent(SCRIPT))
-    count = 6 if number is None else 100_000
-    command = [sys.executable, str(script), str(count)]
-    output = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
-    with subprocess.Popen(command, text=True, start_new_session=True, env=os.environ, **output) as process:
+    with started(tmp_path, 6 if number is None else 100_000) as process:
         pids = {int(process.stdout.readline()) for _ in range(7)} - {process.pid}
         assert 1 <= len(pids) <= num_cores()
         if number is signal.SIGINT:

@@ -7,19 +7,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from mcgicp_jax import (
-    GICP,
-    Correspondences,
-    MultiChannelGICP,
-    PointCloud,
-    datasets,
-    estimate_channel_covariance,
-    preprocess,
-    register,
-)
+import mcgicp_jax as mcg
 from mcgicp_jax._local_geometry.cloud_statistics import with_channels_matched
 from tests import reference as ref
 from tests.precision import tolerance
+from tests.refusals import refused
 from tests.scenes import motion, room_corner
 
 NOISE = np.array([[0.04, 0.03, 0.0], [0.03, 0.09, -0.02], [0.0, -0.02, 0.01]])
@@ -35,16 +27,15 @@ def seen_again(num_points=1500, present=None, exposure=0.0):
         noise = rng.multivariate_normal(np.zeros(3), NOISE, num_points) + exposure * i
         mask = None if present is None else rng.random((num_points, 3)) < present
         local = (points - pose[:3, 3]) @ pose[:3, :3]
-        clouds.append(PointCloud(local + 1e-4 * rng.normal(size=local.shape), channels + noise, channel_valid=mask))
+        clouds.append(mcg.PointCloud(local + 1e-4 * rng.normal(size=local.shape), channels + noise, channel_valid=mask))
     return clouds
 
 
-@pytest.mark.parametrize("prepared", [False, True])
-@pytest.mark.parametrize("present", [None, 0.7])
+@pytest.mark.parametrize("prepared, present", [(False, None), (True, 0.7)])
 def test_the_covariance_of_a_difference_is_found(present, prepared):
     clouds = seen_again(present=present, exposure=0.4)
-    clouds = [preprocess(cloud) for cloud in clouds] if prepared else clouds
-    found = estimate_channel_covariance(clouds, POSES)
+    clouds = [mcg.preprocess(cloud) for cloud in clouds] if prepared else clouds
+    found = mcg.estimate_channel_covariance(clouds, POSES)
     np.testing.assert_allclose(found, 2 * NOISE, atol=0.015)
     assert np.linalg.eigvalsh(found).min() > 0
 
@@ -53,37 +44,33 @@ def test_channels_that_are_never_seen_together_have_no_covariance():
     clouds = seen_again()
     half = np.arange(1500) < 750
     mask = np.stack([half, ~half, ~half], axis=1)
-    found = estimate_channel_covariance([cloud.replace(channel_valid=mask) for cloud in clouds], POSES)
+    found = mcg.estimate_channel_covariance([cloud.replace(channel_valid=mask) for cloud in clouds], POSES)
     np.testing.assert_allclose(found, 2 * NOISE * [[1, 0, 0], [0, 1, 1], [0, 1, 1]], atol=0.02)
 
 
 def test_channels_without_noise_have_a_covariance_that_can_be_inverted():
     points, channels = ref.scene(500, 2)
-    found = estimate_channel_covariance([PointCloud(points, channels)] * 2, POSES[:1] * 2)
+    found = mcg.estimate_channel_covariance([mcg.PointCloud(points, channels)] * 2, POSES[:1] * 2)
     assert np.isfinite(found).all() and np.linalg.eigvalsh(found).min() > 0
 
 
-@pytest.mark.parametrize(
-    "make, named",
-    [
-        (lambda clouds: (clouds, POSES[:2]), "poses: .* 2 for 3"),
-        (lambda clouds: (clouds[:1], POSES[:1]), "poses: .* 1 for 1"),
-        (lambda clouds: (clouds[:2], [np.eye(4), 2 * np.eye(4)]), r"poses\[1\]: "),
-        (lambda clouds: ([clouds[0], PointCloud(POSES[0][:, :3])], POSES[:2]), r"clouds\[1\]: .*channels"),
-        (lambda clouds: (clouds[:2], POSES[1:]), "clouds: .* 10 .*'channel_0'"),
-    ],
-    ids=["one pose short", "one cloud", "scale", "channels", "no overlap"],
-)
-def test_what_cannot_be_measured(make, named):
-    with pytest.raises(ValueError, match=named):
-        estimate_channel_covariance(*make(seen_again()))
+def test_what_cannot_be_measured():
+    clouds = seen_again()
+    for named, *given in (
+        ("poses", clouds, POSES[:2]),
+        ("poses", clouds[:1], POSES[:1]),
+        ("poses[1]", clouds[:2], [np.eye(4), 2 * np.eye(4)]),
+        ("clouds[1]", [clouds[0], mcg.PointCloud(POSES[0][:, :3])], POSES[:2]),
+        ("clouds", clouds[:2], POSES[1:]),
+    ):
+        refused(lambda given=given: mcg.estimate_channel_covariance(*given), named)
 
 
 def target_and_source(present):
     """The same points; the source's channels have another gain and offset."""
     points, channels = ref.scene(500, 3)
     mask = None if present is None else np.random.default_rng(0).random(channels.shape) < present
-    target = preprocess(PointCloud(points, channels, channel_valid=mask))
+    target = mcg.preprocess(mcg.PointCloud(points, channels, channel_valid=mask))
     return target, target.channels * np.array([0.5, 3.0, 1.0]) + np.array([7.0, 0.0, -1.0])
 
 
@@ -105,7 +92,7 @@ def test_what_only_one_cloud_sees_does_not_count_with_matches(present):
         channel_valid=None if present is None else np.roll(target.channel_valid, -7, axis=0),
         valid=np.roll(target.valid, -7),
     )
-    matches = Correspondences(indices=indices, distances=jnp.zeros(len(alien)), valid=jnp.asarray(~alien))
+    matches = mcg.Correspondences(indices=indices, distances=jnp.zeros(len(alien)), valid=jnp.asarray(~alien))
     matched, _ = with_channels_matched(source, rolled, matches)
     np.testing.assert_allclose(matched.channels[:300], target.channels[:300], atol=tolerance(2e-5, 1e-12))
     fooled, _ = with_channels_matched(source, rolled)
@@ -113,10 +100,10 @@ def test_what_only_one_cloud_sees_does_not_count_with_matches(present):
 
 
 def test_a_few_matches_change_nothing():
-    cloud = preprocess(PointCloud(*ref.scene(500, 3)))
+    cloud = mcg.preprocess(mcg.PointCloud(*ref.scene(500, 3)))
     rows = jnp.arange(len(cloud.points), dtype=jnp.int32)
     for count in (0, 3):
-        matches = Correspondences(indices=rows, distances=jnp.zeros(rows.size), valid=rows < count)
+        matches = mcg.Correspondences(indices=rows, distances=jnp.zeros(rows.size), valid=rows < count)
         matched, _ = with_channels_matched(cloud.replace(channels=2 * cloud.channels), cloud, matches)
         np.testing.assert_array_equal(matched.channels, 2 * cloud.channels)
 
@@ -127,7 +114,7 @@ def test_channels_that_say_nothing_are_not_matched():
     channels[:, 1] = 4.0
     mask = np.ones(channels.shape, bool)
     mask[:, 2] = False
-    target = preprocess(PointCloud(points, channels, channel_valid=mask))
+    target = mcg.preprocess(mcg.PointCloud(points, channels, channel_valid=mask))
     source = target.replace(channels=target.channels + 1)
     matched, _ = with_channels_matched(source, target)
     np.testing.assert_allclose(matched.channels[:500], target.channels[:500], atol=1e-5)
@@ -135,33 +122,37 @@ def test_channels_that_say_nothing_are_not_matched():
     assert np.isfinite(gradient(source.channels)).all()
 
 
-@pytest.mark.parametrize("photometric", [False, True])
+@pytest.mark.parametrize("photometric", [False, pytest.param(True, marks=pytest.mark.slow)])
 def test_another_exposure_is_told(photometric):
-    target, source = (preprocess(frame.cloud, voxel_size=0.03) for frame in datasets.poster_wall(num_frames=2, seed=1))
-    method = MultiChannelGICP(photometric=photometric)
+    target, source = (
+        mcg.preprocess(frame.cloud, voxel_size=0.03) for frame in mcg.datasets.poster_wall(num_frames=2, seed=1)
+    )
+    method = mcg.MultiChannelGICP(photometric=photometric)
     dark = source.replace(channels=0.5 * np.asarray(source.channels))
     with pytest.warns(UserWarning, match="channel red: "):
-        register(dark, target, method)
+        mcg.register(dark, target, method)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        assert register(source, target, method).converged
-        assert register(dark, target, method, equalize_channels=True).converged
-        register(dark, target, GICP())
+        assert mcg.register(source, target, method).converged
+        assert mcg.register(dark, target, method, equalize_channels=True).converged
+        mcg.register(dark, target, mcg.GICP())
 
 
 def test_parameters_are_chosen_from_the_channels_as_they_are_equalised():
     """A fourth of the source is alien, so that all of its points give another gain than those that match."""
     points, channels = room_corner(600, seed=1)
-    target = preprocess(PointCloud(points, channels), None)
-    source = PointCloud(np.concatenate([points, points[:200] + 20]), np.concatenate([2 * channels, channels[:200] + 3]))
+    target = mcg.preprocess(mcg.PointCloud(points, channels), None)
+    source = mcg.PointCloud(
+        np.concatenate([points, points[:200] + 20]), np.concatenate([2 * channels, channels[:200] + 3])
+    )
     calls = []
 
-    class Recorded(MultiChannelGICP):
+    class Recorded(mcg.MultiChannelGICP):
         def resolve(self, source, target, geometries=None):
             calls.append((self.channel_covariance, np.asarray(source.channels)))
             return super().resolve(source, target, geometries)
 
-    register(preprocess(source, None), target, Recorded(), equalize_channels=True)
+    mcg.register(mcg.preprocess(source, None), target, Recorded(), equalize_channels=True)
     (first, by_all), (second, by_matches) = calls
     assert first is None and second is None
     wrong = [np.abs(each[:600] - channels).max() for each in (by_all, by_matches)]

@@ -42,26 +42,14 @@ def test_values_cached_with_a_cloud_are_told_apart_by_all_arguments():
     cloud, made = mcg.PointCloud(np.eye(3)), []
     compute = cached_with_cloud(lambda cloud, *arguments, **named: made.append(1))
     weights = np.array([1.0, 2.0])
-    different = [
-        (mcg.ColorICP(weights),),
-        (mcg.ColorICP(weights[::-1].copy()),),
-        (mcg.MultiChannelGICP(0.1, weights),),
-        (mcg.MultiChannelGICP(0.2, weights),),
-        (mcg.MultiChannelGICP(0.2, weights, photometric=True),),
-        (mcg.KDTreeSearch(workers=1),),
-        (mcg.KDTreeSearch(workers=2),),
-        (mcg.KDTreeSearch(workers=1, backend="scipy"),),
-        (weights,),
-        (weights.astype(np.float32),),
-        (weights[:, None],),
-        (jnp.asarray(weights), None),
-        (None, jnp.asarray(weights)),
-        (1, True),
-        (1.0, True),
-        (1, False),
-        ((mcg.GICP,), True),
-        ((mcg.GICP, mcg.NDT), True),
-    ]
+    arrays = weights, weights.astype(np.float32), weights[:, None]
+    methods = [mcg.ColorICP(each) for each in (weights, weights[::-1].copy())]
+    methods += [mcg.MultiChannelGICP(*each) for each in ((0.1, weights), (0.2, weights))]
+    methods += [mcg.MultiChannelGICP(0.2, weights, photometric=True)]
+    searches = [mcg.KDTreeSearch(*each) for each in ((1,), (2,), (1, "scipy"))]
+    several = [(jnp.asarray(weights), None), (None, jnp.asarray(weights)), (1, True), (1.0, True), (1, False)]
+    several += [((mcg.GICP,), True), ((mcg.GICP, mcg.NDT), True)]
+    different = [*((each,) for each in (*arrays, *methods, *searches)), *several]
     for i, arguments in enumerate(different):
         for _ in range(2):
             compute(cloud, *copy.deepcopy(arguments))
@@ -112,10 +100,12 @@ class Shifted(mcg.KDTreeSearch):
     [
         [{"method": mcg.MultiChannelGICP(variance, 0.3)} for variance in (1e-4, 1.0)],
         [{"method": mcg.MultiChannelGICP(0.05, weight)} for weight in (0.01, 0.3)],
-        [{"method": METHOD, "search": Shifted(shift=shift)} for shift in (0.0, 0.2)],
-        [{"method": METHOD, "search": search} for search in (mcg.KDTreeSearch(), Shifted(shift=0.2))],
+        [
+            {"method": METHOD, "search": search}
+            for search in (Shifted(shift=0.0), Shifted(shift=0.2), mcg.KDTreeSearch())
+        ],
     ],
-    ids=["missing variances", "weights", "number of a search", "type of a search"],
+    ids=["missing variances", "weights", "number and type of a search"],
 )
 def test_matches_of_a_cloud_are_those_of_a_new_one(cloud, arguments):
     known = np.random.default_rng(1).random(cloud.channels.shape) < 0.7

@@ -108,14 +108,11 @@ def test_frames_before_an_invalid_one_are_written(tmp_path, capsys, monkeypatch,
     scans.mkdir()
     for k, frame in enumerate(datasets.box_room(3, points_per_frame=1500)):
         io.write(scans / f"{k}.npz", frame.cloud)
-    io.write(
-        scans / "3.npz",
-        frame.cloud
-        if reason == "interrupted"
-        else PointCloud(np.eye(3), np.eye(3), channel_names=frame.cloud.channel_names),
-    )
+    last = PointCloud(np.eye(3), np.eye(3), channel_names=frame.cloud.channel_names)
     if reason == "interrupted":
+        last = frame.cloud
         monkeypatch.setattr(mcg, "odometry", interrupted)
+    io.write(scans / "3.npz", last)
     files = ["--max-distance", "0.5", "--output", str(poses), "--map", str(map)]
     assert main(["odometry", str(scans), "--method", "gicp", *files]) == 1
     text, errors = capsys.readouterr()

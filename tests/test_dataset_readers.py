@@ -11,6 +11,7 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from mcgicp_jax import io, metrics
 from mcgicp_jax.datasets import clouds, ford_campus, kitti, seven_scenes, tum_rgbd
+from tests.refusals import refused
 from tests.scenes import motion
 
 
@@ -76,8 +77,8 @@ def test_kitti_points_get_the_color_of_their_pixel(kitti_folder):
     image = ramp(41, 101).astype(np.uint8) / 255
     expected = [image[20, 53:55].mean(axis=0), image[10, 23:25].mean(axis=0), image[30, 97]]
     np.testing.assert_allclose(cloud.channels[:3, 1:], expected, atol=1e-6)
-    np.testing.assert_array_equal(cloud.channel_valid[:, 0], True)
-    np.testing.assert_array_equal(cloud.channel_valid[:, 1:], np.repeat([[1], [1], [1], [0], [0]], 3, axis=1) == 1)
+    known = np.repeat([[1, 1, 1, 1], [1, 0, 0, 0]], (3, 2), axis=0)
+    np.testing.assert_array_equal(cloud.channel_valid, known == 1)
 
 
 def test_kitti_times_and_poses_go_by_the_number_of_the_scan(kitti_folder):
@@ -212,8 +213,7 @@ def test_7_scenes_know_where_there_is_no_depth_and_no_color(tmp_path):
     # So near, the colour camera looks past the corner.
     assert not frame.cloud.channel_valid[np.argmin(frame.cloud.points[:, 2])].any()
     (tmp_path / "frame-000030.depth.png").write_bytes(b"no image")
-    with pytest.raises(ValueError, match=r"frame-000030.depth.png: cannot be read"):
-        seven_scenes(tmp_path)[0]
+    refused(lambda: seven_scenes(tmp_path)[0], str(tmp_path / "frame-000030.depth.png"))
 
 
 # Ford Campus
@@ -282,37 +282,25 @@ def test_ford_poses_are_those_of_the_laser(ford_folder):
 
 
 @pytest.mark.parametrize(
-    ("reader", "file", "content", "named"),
+    ("reader", "file", "content"),
     [
-        (kitti, "calib.txt", b"P2: 1 2 3\n", "calib.txt: .*P2:.* 12"),
-        (kitti, "times.txt", b"0.1\nlater\n", "times.txt: "),
-        (tum_rgbd, "rgb.txt", b"9.0 rgb/1.0.png\n", "made_up: .*0.02 s"),
-        (tum_rgbd, "rgb.txt", b"9.0\n", "rgb.txt: "),
-        (ford_campus, "SCANS/Scan0075.mat", b"no such thing", "Scan0075.mat: "),
-        (ford_campus, "Timestamp.log", b"nothing\n", "Timestamp.log: "),
+        (kitti, "calib.txt", b"P2: 1 2 3\n"),
+        (kitti, "times.txt", b"0.1\nlater\n"),
+        (tum_rgbd, "rgb.txt", b"9.0\n"),
+        (tum_rgbd, ".", b"9.0 rgb/1.0.png\n"),
+        (ford_campus, "SCANS/Scan0075.mat", b"no such thing"),
+        (ford_campus, "Timestamp.log", b"nothing\n"),
     ],
 )
-def test_a_broken_file_of_a_data_set_is_named(request, reader, file, content, named):
-    folder = request.getfixturevalue(
-        {kitti: "kitti_folder", tum_rgbd: "tum_folder", ford_campus: "ford_folder"}[reader]
-    )
-    (folder / file).write_bytes(content)
-    with pytest.raises(ValueError, match=named):
-        reader(folder)[0]
+def test_a_broken_file_of_a_data_set_is_named(request, reader, file, content):
+    folder = request.getfixturevalue(f"{reader.__name__.split('_')[0]}_folder")
+    (folder / ("rgb.txt" if file == "." else file)).write_bytes(content)
+    refused(lambda: reader(folder)[0], str(folder / file))
 
 
-@pytest.mark.parametrize(
-    ("reader", "error", "named"),
-    [
-        (kitti, ValueError, "nothing.*velodyne"),
-        (tum_rgbd, FileNotFoundError, "nothing"),
-        (seven_scenes, ValueError, "nothing.*frame"),
-        (ford_campus, ValueError, "nothing.*SCANS"),
-        (clouds, FileNotFoundError, "nothing"),
-    ],
-)
-def test_a_folder_without_a_data_set_is_named(tmp_path, reader, error, named):
-    with pytest.raises(error, match=named):
+@pytest.mark.parametrize("reader", [kitti, tum_rgbd, seven_scenes, ford_campus, clouds])
+def test_a_folder_without_a_data_set_is_named(tmp_path, reader):
+    with pytest.raises((ValueError, FileNotFoundError), match="nothing"):
         reader(tmp_path / "nothing")
 
 
@@ -328,7 +316,6 @@ def test_a_folder_of_clouds(tmp_path):
         "10.txt": lambda path: np.savetxt(path, np.hstack([points, rng.normal(size=(50, 9))])),
         "11.txt": lambda path: np.savetxt(path, seven),
         "12.txt": lambda path: np.savetxt(path, np.insert(seven, 3, 0.5, axis=1)),
-        "13.csv": lambda path: np.savetxt(path, points, delimiter=",", header="x,y,z", comments=""),
         "14.npy": lambda path: np.save(path, points),
         "15.npz": lambda path: np.savez(path, points=points),
         "16.ply": lambda path: path.write_text("broken"),
@@ -355,7 +342,5 @@ def test_a_folder_of_clouds(tmp_path):
     assert {path.name for path in frames.left_out} == set(left_out)
     np.testing.assert_allclose(frames[0].cloud.points, points)
     assert frames[0].pose is None and len(clouds(tmp_path, "*.npz")) == 1
-    with pytest.raises(ValueError, match=r"16\.ply: "):
-        frames[-1]
-    with pytest.raises(ValueError, match=r"\*\.las"):
-        clouds(tmp_path, "*.las")
+    refused(lambda: frames[-1], str(tmp_path / "16.ply"))
+    refused(lambda: clouds(tmp_path, "*.las"), str(tmp_path), "*.las")

@@ -8,7 +8,6 @@ import sys
 import tracemalloc
 import zipfile
 
-import jax
 import laspy
 import numpy as np
 import plyfile
@@ -19,6 +18,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from mcgicp_jax import PointCloud, io
+from tests.refusals import refused
 
 RNG = np.random.default_rng(0)
 N = 40
@@ -38,6 +38,12 @@ def make(names=INTENSITY, dtype=np.float32, num_points=N):
     ]
     points = RNG.uniform(-10, 10, (num_points, 3)).astype(dtype)
     return PointCloud(points, np.array(channels, dtype).reshape(len(names), num_points).T, channel_names=names)
+
+
+def through(path, cloud):
+    """The cloud, written and read."""
+    io.write(path, cloud)
+    return io.read(path)
 
 
 def same(actual, expected, points_atol=0.0, channels_atol=0.0):
@@ -104,48 +110,29 @@ def seeds(tmp_path_factory):
 
 
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])
-@pytest.mark.parametrize(
-    "names", [(), INTENSITY, RGB, INTENSITY + RGB, ("channel_0",), ("channel_0", "heat", *INTENSITY)]
-)
+@pytest.mark.parametrize("names", [(), INTENSITY, INTENSITY + RGB, ("channel_0", "heat", *INTENSITY)])
 @pytest.mark.parametrize("suffix", FORMATS)
 def test_round_trip(tmp_path, suffix, names, dtype):
-    cloud, path = make(names, dtype), tmp_path / f"cloud{suffix}"
-    fits = {".bin": len(names) == 1, ".las": {*names} <= {*INTENSITY, *RGB}}
-    fits[".laz"] = fits[".las"]
-    if not fits.get(suffix, True):
+    cloud, path = make(names, dtype), tmp_path / f"cloud{suffix.upper()}"
+    las, kitti = suffix in (".las", ".laz"), suffix == ".bin"
+    if (kitti and len(names) != 1) or (las and not {*names} <= {*INTENSITY, *RGB}):
         with pytest.raises(ValueError, match=r"channel.*\.ply"):
             io.write(path, cloud)
         assert not list(tmp_path.iterdir())
         return
-    io.write(path, cloud)
-    back = io.read(path)
+    back = through(path, cloud)
     if suffix in (".npy", ".bin"):
         unnamed = [f"channel_{i}" for i in range(len(names))]
         cloud = cloud.replace(channel_names=tuple(unnamed) if suffix == ".npy" else INTENSITY)
-    las, kitti = suffix in (".las", ".laz"), suffix == ".bin"
-    same(back, cloud, 1e-7 if las else 1e-6 * kitti, 1e-7 if las else 1e-6 * kitti)
+    same(back, cloud, 1e-7 * las + 1e-6 * kitti, 1e-7 * las + 1e-6 * kitti)
     if suffix in (".ply", ".pcd", ".npz", ".npy"):
         assert back.points.dtype == dtype
         assert back.channels.dtype == dtype or not names
-    same(io.read(path), back)
 
 
 def awkward():
-    names = (
-        "time",
-        "reflectance",
-        "intensity",
-        "channel_time",
-        "x",
-        "X",
-        "Red",
-        "r",
-        "rgb",
-        "_",
-        "list",
-        "scalar_a",
-        "1",
-    )
+    taken = ("x", "X", "Red", "r", "rgb", "_", "list", "scalar_a", "1")
+    names = ("time", "reflectance", "intensity", "channel_time", *taken)
     extreme = make((*RGB, "heat"), np.float64)
     extreme.points[:4, 0] = [np.nan, np.inf, -np.inf, 5_400_000.123456789]
     extreme.channels[:5] = np.array([[np.inf], [1e308], [-1], [-0.0], [1 / 3]])
@@ -154,18 +141,12 @@ def awkward():
 
 
 @pytest.mark.parametrize("suffix", NAMED)
-@pytest.mark.parametrize("cloud", awkward().values(), ids=awkward())
-def test_names_and_values_survive(tmp_path, suffix, cloud):
-    io.write(tmp_path / f"c{suffix}", cloud)
-    same(io.read(tmp_path / f"c{suffix}"), cloud)
-
-
-@pytest.mark.parametrize("suffix", NAMED)
-def test_channel_order(tmp_path, suffix):
+def test_names_and_values_survive(tmp_path, suffix):
+    for cloud in awkward().values():
+        same(through(tmp_path / f"c{suffix}", cloud), cloud)
     names = ("heat", *RGB, "intensity", "dust")
-    io.write(tmp_path / f"c{suffix}", make(names))
-    back = io.read(tmp_path / f"c{suffix}")
-    assert back.channel_names == (names if suffix == ".npz" else ("intensity", *RGB, "heat", "dust"))
+    ordered = names if suffix == ".npz" else ("intensity", *RGB, "heat", "dust")
+    assert through(tmp_path / f"c{suffix}", make(names)).channel_names == ordered
 
 
 @pytest.mark.parametrize("suffix", [s for s in NAMED if s != ".npz"])
@@ -178,8 +159,7 @@ def test_names_that_do_not_fit(tmp_path, suffix, names):
 def test_npz_keeps_everything(tmp_path):
     covariances = RNG.random((N, 3, 3))
     cloud = PointCloud(make().points, RNG.random((N, 2)), covariances=covariances, channel_names=("two words", "ü"))
-    io.write(tmp_path / "c.npz", cloud)
-    back = io.read(tmp_path / "c.npz")
+    back = through(tmp_path / "c.npz", cloud)
     same(back, cloud)
     np.testing.assert_array_equal(back.covariances, covariances)
 
@@ -190,8 +170,7 @@ def test_a_missing_channel_is_missing_in_the_file(tmp_path, suffix, share):
     cloud = make(INTENSITY if suffix == ".bin" else ("intensity", *RGB))
     present = RNG.random(cloud.channels.shape) < share
     cloud = cloud.replace(channel_valid=present)
-    io.write(tmp_path / f"c{suffix}", cloud)
-    back = io.read(tmp_path / f"c{suffix}")
+    back = through(tmp_path / f"c{suffix}", cloud)
     np.testing.assert_array_equal(back.points, cloud.points)
     np.testing.assert_array_equal(back.channels, np.where(present, cloud.channels, 0))
     if share == 1:
@@ -204,73 +183,58 @@ def test_a_missing_channel_is_missing_in_the_file(tmp_path, suffix, share):
 def test_only_valid_rows_in_the_users_frame(tmp_path, suffix):
     raw, valid = make(), np.arange(N) % 3 > 0
     origin = np.zeros(3) if suffix == ".bin" else np.array([500_000.0, 5_400_000.0, 0.0])
-    io.write(tmp_path / f"c{suffix}", raw.replace_rows(valid=valid, origin=origin))
-    back = io.read(tmp_path / f"c{suffix}")
+    back = through(tmp_path / f"c{suffix}", raw.replace_rows(valid=valid, origin=origin))
     atol = 1e-6 if suffix == ".bin" else 2e-8
     np.testing.assert_allclose(back.points, raw.points[valid].astype(np.float64) + origin, rtol=0, atol=atol)
     # Written again, it stays as it is.
-    io.write(tmp_path / f"d{suffix}", back)
-    same(io.read(tmp_path / f"d{suffix}"), back)
-
-
-def test_suffix_in_any_case(tmp_path):
-    for suffix in FORMATS:
-        io.write(tmp_path / f"c{suffix.upper()}", make())
-        io.read(str(tmp_path / f"c{suffix.upper()}"))
-    assert len(list(tmp_path.iterdir())) == len(FORMATS)
+    same(through(tmp_path / f"d{suffix}", back), back)
 
 
 # PLY
 
 
-@pytest.mark.parametrize(("text", "byte_order"), [(True, "="), (False, "<"), (False, ">")])
-@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+@pytest.mark.parametrize(
+    ("text", "byte_order", "dtype"), [(True, "=", np.float32), (False, "<", np.float64), (False, ">", np.float32)]
+)
 def test_ply_of_a_mesh_with_normals_and_colours(tmp_path, text, byte_order, dtype):
     noise = dict.fromkeys(("nx", "ny", "nz", "alpha", "label", "ring", "time", "curvature"), np.ones(N, np.float32))
-    columns = xyz(dtype) | noise | {"red": np.arange(N, dtype=np.uint8), "green": np.full(N, 255, np.uint8)}
-    columns |= {
-        "blue": np.zeros(N, np.uint8),
-        "heat": np.full(N, 3, dtype),
-        "scalar_intensity": RNG.random(N).astype(dtype),
-    }
+    columns = xyz(dtype) | noise | dict.fromkeys(RGB, np.arange(N, dtype=np.uint8)) | {"heat": np.full(N, 3, dtype)}
+    columns["scalar_intensity"] = RNG.random(N).astype(dtype)
     write_ply(tmp_path / "c.ply", structured(**columns), text, byte_order, faces())
     cloud = io.read(tmp_path / "c.ply")
     assert cloud.channel_names == ("intensity", *RGB, "heat")
     assert cloud.points.dtype == cloud.channels.dtype == dtype
     assert cloud.points.dtype.isnative and cloud.points.flags.writeable
     np.testing.assert_array_equal(cloud.points.T, [columns[axis] for axis in "xyz"])
-    np.testing.assert_array_equal(cloud.channels[:, 0], columns["scalar_intensity"])
-    np.testing.assert_array_equal(cloud.channels[:, 1], np.arange(N).astype(dtype) / dtype(255))
-    np.testing.assert_array_equal(cloud.channels[:, 2:], np.tile([1.0, 0.0, 3.0], (N, 1)))
+    expected = [columns["scalar_intensity"], *[np.arange(N).astype(dtype) / dtype(255)] * 3, columns["heat"]]
+    np.testing.assert_array_equal(cloud.channels.T, expected)
 
 
-INTENSITIES = ("intensity", "scalar_Intensity", "Intensity", "reflectance", "scalar_Reflectance", "reflectivity")
+# Accepted names of intensities and colours.
+INTENSITIES = ("intensity", "scalar_Intensity", "reflectance", "scalar_Reflectance", "reflectivity", "remission")
 COLOURS = [("r", "g", "b"), ("diffuse_red", "diffuse_green", "diffuse_blue"), ("Red", "Green", "Blue")]
 
 
-@pytest.mark.parametrize("dtype", [np.float32, np.uint16, np.uint8, np.float64])
-def test_intensity_names(tmp_path, dtype):
-    values = np.arange(N).astype(dtype)
-    for column in (*INTENSITIES, "remission"):
-        write_ply(tmp_path / "c.ply", structured(**xyz(), **{column: values}))
-        cloud = io.read(tmp_path / "c.ply")
-        assert cloud.channel_names == INTENSITY
-        np.testing.assert_array_equal(cloud.channels[:, 0], values)
-    columns = {"reflectivity": np.zeros(N, dtype), "intensity": np.ones(N, dtype)}
-    write_ply(tmp_path / "c.ply", structured(**xyz(), **columns))
-    cloud = io.read(tmp_path / "c.ply")
-    assert cloud.channel_names == ("intensity", "reflectivity")
-    np.testing.assert_array_equal(cloud.channels, np.tile([1.0, 0.0], (N, 1)))
-
-
 @pytest.mark.parametrize(("dtype", "scale"), [(np.float32, 1), (np.uint8, 255), (np.uint16, 65535), (np.int32, 255)])
-def test_colour_names(tmp_path, dtype, scale):
-    values = RNG.integers(0, 2, (3, N)) * (scale if scale > 1 else 0.5)
-    for names in COLOURS:
-        write_ply(tmp_path / "c.ply", structured(**xyz(), **dict(zip(names, values.astype(dtype), strict=True))))
+def test_names_of_intensities_and_colours(tmp_path, dtype, scale):
+    def read(**columns):
+        write_ply(tmp_path / "c.ply", structured(**xyz(), **columns))
         cloud = io.read(tmp_path / "c.ply")
-        assert cloud.channel_names == RGB
-        np.testing.assert_allclose(cloud.channels, values.T / scale, rtol=1e-6)
+        return cloud.channel_names, cloud.channels.T
+
+    intensity, other = np.arange(2 * N).astype(dtype).reshape(2, N)
+    for name in INTENSITIES:
+        names, channels = read(**{name: intensity})
+        assert names == INTENSITY
+        np.testing.assert_array_equal(channels, intensity[None])
+    names, channels = read(reflectivity=other, intensity=intensity)
+    assert names == ("intensity", "reflectivity")
+    np.testing.assert_array_equal(channels, [intensity, other])
+    values = RNG.integers(0, 2, (3, N)) * (scale if scale > 1 else 0.5)
+    for colours in COLOURS:
+        names, channels = read(**dict(zip(colours, values.astype(dtype), strict=True)))
+        assert names == RGB
+        np.testing.assert_allclose(channels, values / scale, rtol=1e-6)
 
 
 @pytest.mark.parametrize("newline", [b"\r\n", b"\r"])
@@ -299,58 +263,49 @@ def test_colours_are_written_as_others_read_them(tmp_path):
 
 
 @pytest.mark.parametrize("encoding", pypcd4.Encoding)
-@pytest.mark.parametrize(("field", "dtype"), [("rgb", np.float32), ("rgb", np.uint32), ("rgba", np.uint32)])
+@pytest.mark.parametrize(("field", "dtype"), [("rgb", np.float32), ("rgba", np.uint32)])
 def test_pcd_encodings_and_packed_colours(tmp_path, encoding, field, dtype):
-    count = 3000
-    colours = RNG.integers(0, 256, (count, 3), np.uint8)
+    colours = RNG.integers(0, 256, (N, 3), np.uint8)
     packed = colours.astype(np.uint32) @ np.array([65536, 256, 1], "u4") + (field == "rgba") * np.uint32(0xFE000000)
-    points = (RNG.integers(-9, 9, (3, count)) / 4).astype(np.float32)
-    columns = dict(zip("xyz", points, strict=True)) | {"intensity": np.arange(count, dtype=np.float32)}
-    columns |= {"ring": np.arange(count, dtype=np.uint16), "heat": np.ones(count)}
+    points = (RNG.integers(-9, 9, (3, N)) / 4).astype(np.float32)
+    columns = dict(zip("xyz", points, strict=True)) | {"intensity": np.arange(N, dtype=np.float32)}
     # As text, a float of these bits has too few digits.
     text = encoding is pypcd4.Encoding.ASCII
-    columns |= {field: packed.astype("u4").view(np.uint32 if text else dtype)}
+    columns |= {"ring": np.arange(N, dtype=np.uint16), field: packed.astype("u4").view(np.uint32 if text else dtype)}
     write_pcd(tmp_path / "c.pcd", encoding, **columns)
-    assert f"DATA {encoding.value}".encode() in (tmp_path / "c.pcd").read_bytes()
     cloud = io.read(tmp_path / "c.pcd")
-    assert cloud.channel_names == ("intensity", *RGB, "heat")
+    assert cloud.channel_names == ("intensity", *RGB)
     np.testing.assert_array_equal(cloud.points.T, points)
-    np.testing.assert_array_equal(cloud.channels[:, [0, 4]].T, [columns["intensity"], columns["heat"]])
+    np.testing.assert_array_equal(cloud.channels[:, 0], columns["intensity"])
     np.testing.assert_allclose(cloud.channels[:, 1:4], colours / 255, rtol=1e-6)
 
 
 def test_pcd_padding_and_vectors_are_no_channels(tmp_path):
-    header = (
-        "VERSION .7\nFIELDS x y z _ intensity fpfh _\nSIZE 4 4 4 1 4 4 1\nTYPE F F F U F F U\nCOUNT 1 1 1 4 1 2 1\n"
-    )
-    header += "WIDTH 2\nHEIGHT 1\nVIEWPOINT 0 0 0 1 0 0 0\nPOINTS 2\nDATA binary\n"
+    header = "# a comment\nVERSION .7\nFIELDS x y z _ intensity fpfh _\nSIZE 4 4 4 1 4 4 1\nTYPE F F F U F F U\n"
+    header += "COUNT 1 1 1 4 1 2 1\nWIDTH 2\nHEIGHT 1\nVIEWPOINT 0 0 0 1 0 0 0\nPOINTS 2\nDATA binary\n"
     rows = struct.pack("<3f4xf2fx", 1, 2, 3, 7, 0, 0) + struct.pack("<3f4xf2fx", 4, 5, 6, 8, 0, 0)
-    (tmp_path / "c.pcd").write_bytes(b"# a comment\n" + header.encode() + rows)
+    (tmp_path / "c.pcd").write_bytes(header.encode() + rows)
     cloud = io.read(tmp_path / "c.pcd")
     assert cloud.channel_names == INTENSITY
     np.testing.assert_array_equal(cloud.points, [[1, 2, 3], [4, 5, 6]])
     np.testing.assert_array_equal(cloud.channels, [[7], [8]])
 
 
-@pytest.mark.parametrize("version", [".5", ".6"])
-@pytest.mark.parametrize("counts", ["COUNT 1 1 1\n", ""])
+@pytest.mark.parametrize(("version", "counts"), [(".5", "COUNT 1 1 1\n"), (".6", "")])
 def test_pcd_of_old_versions(tmp_path, version, counts):
     """As PCL's own `bun4.pcd`: no viewpoint."""
     points = np.arange(12, dtype=np.float32).reshape(4, 3)
     header = f"# .PCD v{version}\nVERSION {version}\nFIELDS x y z\nSIZE 4 4 4\nTYPE F F F\n{counts}"
     header += "WIDTH 4\nHEIGHT 1\nPOINTS 4\n"
-    text, binary = tmp_path / "text.pcd", tmp_path / "binary.pcd"
-    text.write_text(header + "DATA ascii\n" + "\n".join(" ".join(map(str, row)) for row in points) + "\n")
-    binary.write_bytes(header.encode() + b"DATA binary\n" + points.tobytes())
-    for file in (text, binary):
-        np.testing.assert_array_equal(io.read(file).points, points)
+    text = "\n".join(" ".join(map(str, row)) for row in points)
+    for data in (b"DATA ascii\n" + text.encode(), b"DATA binary\n" + points.tobytes()):
+        (tmp_path / "c.pcd").write_bytes(header.encode() + data)
+        np.testing.assert_array_equal(io.read(tmp_path / "c.pcd").points, points)
 
 
 def test_pcd_text_with_any_white_space(tmp_path):
-    header = (
-        "FIELDS x y z i _\nSIZE 4 4 4 4 1\nTYPE F F F F U\nCOUNT 1 1 1 1 1\nWIDTH 2\nHEIGHT 1\nPOINTS 2\nDATA ascii\n"
-    )
-    (tmp_path / "c.pcd").write_text(header + "1  2\t3 4 0 \n5 nan 7 8 0\r\n")
+    header = "FIELDS x y z i _\nSIZE 4 4 4 4 1\nTYPE F F F F U\nCOUNT 1 1 1 1 1\nWIDTH 2\nHEIGHT 1\nPOINTS 2\n"
+    (tmp_path / "c.pcd").write_text(header + "DATA ascii\n1  2\t3 4 0 \n5 nan 7 8 0\r\n")
     cloud = io.read(tmp_path / "c.pcd")
     np.testing.assert_array_equal(cloud.points, [[1, 2, 3], [5, np.nan, 7]])
     assert cloud.channel_names == INTENSITY
@@ -366,19 +321,18 @@ def test_real_pair_is_the_same_in_both_formats(data):
 # LAS
 
 
-@pytest.mark.parametrize("suffix", [".las", ".laz"])
-@pytest.mark.parametrize("point_format", [0, 2, 3, 6, 7, 8])
+@pytest.mark.parametrize(("suffix", "point_format"), [(".las", 3), (".laz", 2), (".laz", 6), (".laz", 7)])
 def test_las_in_utm_is_exact(tmp_path, suffix, point_format):
-    names = INTENSITY + RGB * (point_format in (2, 3, 7, 8))
+    """In several chunks."""
+    names = INTENSITY + RGB * (point_format != 6)
     columns = {name: RNG.integers(0, 65536, 120_000) for name in names}
     las = las_data(point_format, 120_000, **columns)
     if point_format == 6:
         las.add_extra_dim(laspy.ExtraBytesParams("amplitude", np.float64))
     las.write(str(tmp_path / f"c{suffix}"))
     cloud = io.read(tmp_path / f"c{suffix}")
-    assert cloud.points.dtype == np.float64
+    assert cloud.points.dtype == np.float64 and cloud.channel_names == names
     np.testing.assert_array_equal(cloud.points, las.xyz)
-    assert cloud.channel_names == names
     for name, values in zip(names, cloud.channels.T, strict=True):
         np.testing.assert_array_equal(values, columns[name] / (1 if name == "intensity" else 65535))
 
@@ -392,18 +346,17 @@ def test_las_8_bit_colours(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("named", "channels", "names"),
+    ("named", "points", "channels", "names"),
     [
-        *[("channels: LAS holds intensity", [[value], [1]], INTENSITY) for value in (0.5, -1, 70_000, np.nan)],
-        *[("channels: ", np.full((2, 3), value), RGB) for value in (1.5, 0.001)],
-        ("channel_names: ", np.ones((2, 2)), ("red", "green")),
+        *[("channels", 1.0, [[value], [1]], INTENSITY) for value in (0.5, -1, 70_000, np.nan)],
+        *[("channels", 1.0, np.full((2, 3), value), RGB) for value in (1.5, 0.001)],
+        ("channel_names", 1.0, np.ones((2, 2)), ("red", "green")),
+        ("points", np.nan, np.ones((2, 0)), ()),
     ],
 )
-def test_las_cannot_hold(tmp_path, named, channels, names):
-    with pytest.raises(ValueError, match=rf"{named}.*\.ply"):
-        io.write(tmp_path / "c.las", PointCloud(np.ones((2, 3)), np.array(channels), channel_names=names))
-    with pytest.raises(ValueError, match=r"points: .*\.ply"):
-        io.write(tmp_path / "c.las", PointCloud(np.full((2, 3), np.nan)))
+def test_las_cannot_hold(tmp_path, named, points, channels, names):
+    cloud = PointCloud(np.full((2, 3), points), np.array(channels), channel_names=names)
+    refused(lambda: io.write(tmp_path / "c.las", cloud), named, ".ply")
     assert not list(tmp_path.iterdir())
 
 
@@ -418,9 +371,7 @@ def test_kitti(tmp_path, data):
     assert cloud.channel_names == INTENSITY
     scan = io.read(data / "kitti/sequences/04/velodyne/000000.bin")
     assert len(scan) > 100_000 and scan.channels.min() >= 0 and scan.channels.max() < 1
-    # Coordinates that float32 cannot hold.
-    with pytest.raises(ValueError, match=r"float32.*\.ply"):
-        io.write(tmp_path / "c.bin", PointCloud(np.full((2, 3), 5e5), np.ones(2)))
+    refused(lambda: io.write(tmp_path / "c.bin", PointCloud(np.full((2, 3), 5e5), np.ones(2))), "points", ".ply")
 
 
 def test_npz_of_others(tmp_path, data):
@@ -447,12 +398,9 @@ def test_npy_of_others(tmp_path, array):
     [
         ("1 2 3\n4 5 6\n", (), np.empty((2, 0))),
         ("1,2,3,.5\n4, 5, 6, .6", ("channel_0",), [[0.5], [0.6]]),
-        ("1;2;3;.5\n4;5;6;.6", ("channel_0",), [[0.5], [0.6]]),
-        ("x,y,z,Intensity,time\n1,2,3,8,0\n4,5,6,9,0\n", INTENSITY, [[8], [9]]),
-        ("\ufeffX;Y;Z;i\n1;2;3;8\n4;5;6;9\n", INTENSITY, [[8], [9]]),
+        ("\ufeffX;Y;Z;i;time\n1;2;3;8;0\n4;5;6;9;0\n", INTENSITY, [[8], [9]]),
         ("//X Y Z R G B\n1 2 3 0 51 255\n4 5 6 255 0 0\n", RGB, [[0, 0.2, 1], [1, 0, 0]]),
         ("# hand-made\n\n# x y z red green blue\n1 2 3 0 65535 0\n4 5 6 1 0 0\n", RGB, [[0, 1, 0], [1 / 65535, 0, 0]]),
-        ("x y z r g b\n1 2 3 0.0 1.0 0.5\n4 5 6 1.0 1.0 1.0\n", RGB, [[0, 1, 0.5], [1, 1, 1]]),
         ("x y z r g b\n1 2 3 0.0 1.0 0.0\n4 5 6 1.0 1.0 1.0\n", RGB, [[0, 1, 0], [1, 1, 1]]),
         ("x y z r g b\n1 2 3 0 1 0\n4 5 6 0.5 1 1\n", RGB, [[0, 1, 0], [0.5, 1, 1]]),
         ("z,y,x,heat\n3,2,1,7\n6,5,4,8\n", ("heat",), [[7], [8]]),
@@ -470,11 +418,11 @@ def test_text_of_others(tmp_path, text, names, channels):
 # Broken files
 
 
-def refuses(path, match=None):
+def refuses(path):
     """One ValueError that starts with the path, and no memory of the size that a header claims."""
     tracemalloc.start()
     try:
-        with pytest.raises(ValueError, match=match) as caught:
+        with pytest.raises(ValueError) as caught:
             io.read(path)
         peak = tracemalloc.get_traced_memory()[1]
     finally:
@@ -494,48 +442,39 @@ def test_no_such_file(tmp_path):
 @pytest.mark.parametrize("name", ["c.obj", "c", "c.ply.gz", ".ply"])
 def test_unknown_suffix(tmp_path, name):
     (tmp_path / name).write_bytes(b"1 2 3")
-    refuses(tmp_path / name, "unknown suffix")
-    with pytest.raises(ValueError, match="unknown suffix"):
-        io.write(tmp_path / name, make())
+    refuses(tmp_path / name)
+    refused(lambda: io.write(tmp_path / name, make()), str(tmp_path / name))
 
 
 CONTENTS = {
     "empty": b"",
     "prose": b"It was a bright cold day in April, and the clocks were striking.\n" * 20,
     "numbers": b"1 2 3\n4 5 6\n" * 20,
-    "zeros": bytes(1600),
     "noise": np.random.default_rng(5).bytes(1600),
     "ply": b"ply\n" + b"x" * 2000,
-    "image": b"\x89PNG\r\n\x1a\n" + np.random.default_rng(6).bytes(1592),
     "pickle": pickle.dumps([print]),
 }
 
 
-@pytest.mark.parametrize("content", CONTENTS)
 @pytest.mark.parametrize("suffix", FORMATS)
-def test_no_cloud(tmp_path, suffix, content):
-    (tmp_path / f"c{suffix}").write_bytes(CONTENTS[content])
-    if (suffix, content) in {(".bin", "zeros"), *((text, "numbers") for text in (".xyz", ".txt", ".csv"))}:
-        assert len(io.read(tmp_path / f"c{suffix}"))
-    else:
-        refuses(tmp_path / f"c{suffix}")
-
-
-@pytest.mark.parametrize("true_suffix", FORMATS)
-@pytest.mark.parametrize("suffix", FORMATS)
-def test_mislabelled(tmp_path, seeds, suffix, true_suffix):
+def test_no_cloud(tmp_path, seeds, suffix):
+    """Neither what is no cloud nor a cloud in another format."""
     kind = {".laz": ".las", ".xyz": ".csv", ".txt": ".csv"}
-    if kind.get(suffix, suffix) != kind.get(true_suffix, true_suffix):
-        (tmp_path / f"c{suffix}").write_bytes(seeds[f"ours{true_suffix}"])
+    others = [other for other in FORMATS if kind.get(suffix, suffix) != kind.get(other, other)]
+    contents = CONTENTS | {other: seeds[f"ours{other}"] for other in others}
+    if suffix in (".xyz", ".txt", ".csv"):
+        contents.pop("numbers")
+    for content in contents.values():
+        (tmp_path / f"c{suffix}").write_bytes(content)
         refuses(tmp_path / f"c{suffix}")
 
 
 @pytest.mark.parametrize("suffix", [s for s in FORMATS if s not in (".xyz", ".txt", ".csv")])
-@pytest.mark.parametrize("fraction", [0.02, 0.2, 0.5, 0.9, 0.999])
-def test_truncated(tmp_path, seeds, suffix, fraction):
+def test_truncated(tmp_path, seeds, suffix):
     whole = seeds[f"ours{suffix}"]
-    (tmp_path / f"c{suffix}").write_bytes(whole[: int(fraction * len(whole)) - 1 | 1])  # odd: within a row
-    refuses(tmp_path / f"c{suffix}")
+    for fraction in (0.02, 0.2, 0.5, 0.9, 0.999):
+        (tmp_path / f"c{suffix}").write_bytes(whole[: int(fraction * len(whole)) - 1 | 1])  # odd: within a row
+        refuses(tmp_path / f"c{suffix}")
 
 
 # Numbers in headers of text; some of N points or less leave bytes at the end, which are no harm.
@@ -544,23 +483,21 @@ NUMBERS = {name: ["face 2", f"vertex {N}"] for name in ("text.ply", "binary.ply"
 }
 
 
-@pytest.mark.parametrize("claim", [0, N - 1, N + 1, 2 * N, 10**6, 10**9, 10**15])
 @pytest.mark.parametrize(("name", "number"), [(name, number) for name in NUMBERS for number in NUMBERS[name]])
-def test_a_wrong_number_in_a_header(tmp_path, seeds, name, number, claim):
-    # The bytes of the faces make up one more vertex.
-    if claim > N + 1 or name in ("ascii.pcd", "binary_compressed.pcd") or (number, claim) == (f"POINTS {N}", 0):
-        assert seeds[name].count(number.encode()) == 1
-        changed = seeds[name].replace(number.encode(), f"{number.rpartition(' ')[0]} {claim}".encode())
-        (tmp_path / name).write_bytes(changed)
-        refuses(tmp_path / name)
+def test_a_wrong_number_in_a_header(tmp_path, seeds, name, number):
+    for claim in (0, N - 1, N + 1, 2 * N, 10**6, 10**9, 10**15):
+        # The bytes of the faces make up one more vertex.
+        if claim > N + 1 or name in ("ascii.pcd", "binary_compressed.pcd") or (number, claim) == (f"POINTS {N}", 0):
+            assert seeds[name].count(number.encode()) == 1
+            changed = seeds[name].replace(number.encode(), f"{number.rpartition(' ')[0]} {claim}".encode())
+            (tmp_path / name).write_bytes(changed)
+            refuses(tmp_path / name)
 
 
-@pytest.mark.parametrize(
-    "text", ["1 2\n3 4\n", "1 2 3\n4 5\n", "1 2 3\n4 5 six\n", "x,y,z\n", "lat lon\n1 2\n", "x y z i\n1 2 3\n"]
-)
-def test_broken_text(tmp_path, text):
-    (tmp_path / "c.csv").write_text(text)
-    refuses(tmp_path / "c.csv")
+def test_broken_text(tmp_path):
+    for text in ("1 2\n3 4\n", "1 2 3\n4 5\n", "1 2 3\n4 5 six\n", "x,y,z\n", "lat lon\n1 2\n", "x y z i\n1 2 3\n"):
+        (tmp_path / "c.csv").write_text(text)
+        refuses(tmp_path / "c.csv")
 
 
 def test_lying_compressed_pcd(tmp_path, seeds):
@@ -623,75 +560,58 @@ class Trap:
         return exit, (3,)
 
 
-@pytest.mark.parametrize("shape", [(N + 1, 3), (10**9, 3), (2**62, 3), (N * 3,), (N, 1, 3)])
-def test_lying_arrays(tmp_path, shape):
-    refuses_array(tmp_path, array_bytes(make().points, shape))
+def test_lying_arrays_and_arrays_of_no_numbers(tmp_path):
+    contents = [
+        array_bytes(make().points, shape) for shape in ((N + 1, 3), (10**9, 3), (2**62, 3), (N * 3,), (N, 1, 3))
+    ]
+    for array in (np.array([[Trap()] * 3], object), np.array([["1", "2", "3"]]), np.ones((2, 3), complex)):
+        stream = stdio.BytesIO()
+        np.save(stream, array)
+        contents.append(stream.getvalue())
+    for content in contents:
+        (tmp_path / "c.npy").write_bytes(content)
+        with zipfile.ZipFile(tmp_path / "c.npz", "w") as archive:
+            archive.writestr("points.npy", content)
+        refuses(tmp_path / "c.npy")
+        refuses(tmp_path / "c.npz")
 
 
-@pytest.mark.parametrize(
-    "array", [np.array([[Trap()] * 3], object), np.array([["1", "2", "3"]]), np.ones((2, 3), complex)]
-)
-def test_arrays_of_no_numbers(tmp_path, array):
-    stream = stdio.BytesIO()
-    np.save(stream, array)
-    refuses_array(tmp_path, stream.getvalue())
-
-
-def refuses_array(folder, content):
-    (folder / "c.npy").write_bytes(content)
-    with zipfile.ZipFile(folder / "c.npz", "w") as archive:
-        archive.writestr("points.npy", content)
-    refuses(folder / "c.npy")
-    refuses(folder / "c.npz")
-
-
-@pytest.mark.parametrize(
-    "arrays",
-    [
+def test_broken_npz(tmp_path):
+    points = {"points": np.ones((N, 3))}
+    for arrays in (
         {"channels": np.ones((N, 1))},
-        {"points": np.ones((N, 3)), "channels": np.ones((N + 1, 1))},
-        {"points": np.ones((N, 3)), "channels": np.ones((N, 1)), "channel_names": np.array(["a", "b"])},
-        {"points": np.ones((N, 3)), "rgb": np.ones((N, 2))},
-        {"points": np.ones((N, 3)), "intensity": np.ones(N - 1)},
+        points | {"channels": np.ones((N + 1, 1))},
+        points | {"channels": np.ones((N, 1)), "channel_names": np.array(["a", "b"])},
+        points | {"rgb": np.ones((N, 2))},
+        points | {"intensity": np.ones(N - 1)},
         {"points": np.ones((N, 2))},
         {"points": np.ones((0, 3))},
-    ],
-)
-def test_broken_npz(tmp_path, arrays):
-    np.savez(tmp_path / "c.npz", **arrays)
-    refuses(tmp_path / "c.npz")
+    ):
+        np.savez(tmp_path / "c.npz", **arrays)
+        refuses(tmp_path / "c.npz")
 
 
-@pytest.mark.parametrize(
-    ("error", "expected"),
-    [
-        (type("PanicException", (BaseException,), {}), ValueError),
-        (AssertionError, ValueError),
-        (KeyboardInterrupt, KeyboardInterrupt),
-        (ImportError, ImportError),
-    ],
-)
-def test_what_a_library_raises(tmp_path, monkeypatch, error, expected):
+def test_what_a_library_raises(tmp_path, monkeypatch):
     def fail(file, size):
         raise error
 
     (tmp_path / "c.laz").write_bytes(b"LASF")
     monkeypatch.setitem(io.FORMATS, ".laz", dataclasses.replace(io.FORMATS[".laz"], read=fail))
-    with pytest.raises(expected):
-        io.read(tmp_path / "c.laz")
+    for error in (type("PanicException", (BaseException,), {}), AssertionError, KeyboardInterrupt, ImportError):
+        with pytest.raises(error if error in (KeyboardInterrupt, ImportError) else ValueError):
+            io.read(tmp_path / "c.laz")
 
 
 def test_no_coordinates(tmp_path):
     write_ply(tmp_path / "c.ply", structured(x=np.ones(3), y=np.ones(3), intensity=np.ones(3)))
-    refuses(tmp_path / "c.ply", "x, y, intensity")
+    refuses(tmp_path / "c.ply")
     plyfile.PlyData([plyfile.PlyElement.describe(structured(a=np.ones(3)), "face")]).write(tmp_path / "c.ply")
     refuses(tmp_path / "c.ply")
 
 
-@pytest.mark.parametrize("cloud", [make(num_points=0), jax.tree.map(lambda *rows: np.stack(rows), make(), make())])
-def test_nothing_to_write(tmp_path, cloud):
-    with pytest.raises(ValueError, match="cloud: "):
-        io.write(tmp_path / "c.ply", cloud)
+def test_nothing_to_write(tmp_path):
+    for cloud in (make(num_points=0), PointCloud.stack([make(), make()])):
+        refused(lambda cloud=cloud: io.write(tmp_path / "c.ply", cloud), "cloud")
 
 
 def test_a_failed_write_leaves_the_old_file(tmp_path, monkeypatch):
@@ -711,13 +631,10 @@ def test_a_failed_write_leaves_the_old_file(tmp_path, monkeypatch):
 @pytest.mark.parametrize(("suffix", "package"), [*EXTRAS.items(), (".laz", "lazrs")])
 def test_missing_extra(tmp_path, suffix, package, monkeypatch):
     io.write(tmp_path / f"c{suffix}", make())
-    io.write(tmp_path / "c.las", make())
     monkeypatch.setitem(sys.modules, package, None)
     for call in (io.read, lambda path: io.write(path, make())):
-        with pytest.raises(ImportError, match=rf"{package}.*pip install 'mcgicp_jax\[io\]'"):
+        with pytest.raises(ImportError, match=rf"{package}.*mcgicp_jax\[io\]"):
             call(tmp_path / f"c{suffix}")
-    if package == "lazrs":
-        io.read(tmp_path / "c.las")
 
 
 # Mutations
@@ -735,7 +652,7 @@ CHANGE = st.tuples(
 )
 
 
-@settings(max_examples=800, deadline=None, derandomize=True, suppress_health_check=list(HealthCheck))
+@settings(max_examples=300, deadline=None, derandomize=True, suppress_health_check=list(HealthCheck))
 @given(which=st.integers(0, 99), header=st.booleans(), changes=st.lists(CHANGE, min_size=1, max_size=4))
 @example(which=3, header=False, changes=[("put", 0.9, b"\xff" * 8)])
 def test_mutations(seeds, folder, which, header, changes):
@@ -770,7 +687,7 @@ def poses(num_poses=50):
     return matrices
 
 
-@pytest.mark.parametrize("num_poses", [1, 4, 8, 50])
+@pytest.mark.parametrize("num_poses", [1, 4, 50])
 def test_poses_round_trip(tmp_path, num_poses):
     matrices = poses()[:num_poses]
     times = 1305031102.175304 + np.arange(num_poses)
@@ -795,38 +712,21 @@ def test_pose_conventions(tmp_path):
         np.testing.assert_allclose(read, quarter[None], atol=1e-15)
 
 
-@pytest.mark.parametrize(
-    "content",
-    [
-        b"# nothing\n",
-        b"\xff\xfe\x00",
-        b"1 2 3\n",
-        b"0 1 2 3 0 0 0 0\n",
-        b"0 1 2 3 0 0 nan 1\n",
-        b"2 0 0 0 0 1 0 0 0 0 1 0\n",
-        b"1 0 0 0 0 1 0 0 0 0 -1 0\n",
-        b"1 0 0 inf 0 1 0 0 0 0 1 0\n",
-        b"1 0 0 0 0 1 0 0 0 0 1 0\n1 0 0\n",
-        b"1 0 0 0\n0 1 0 0\n0 0 1 0\n0 0 0 2\n",
-        b"1 0 0 0\n0 1 0 0\n0 0 1 0\n",
-    ],
-)
 @pytest.mark.filterwarnings("error")
-def test_broken_poses(tmp_path, content):
+def test_broken_poses(tmp_path):
     path = tmp_path / "poses.txt"
-    path.write_bytes(content)
-    with pytest.raises(ValueError) as caught:
-        io.read_poses(path)
-    assert str(caught.value).startswith(str(path))
+    for content in (
+        *(b"# nothing\n", b"\xff\xfe\x00", b"1 2 3\n", b"0 1 2 3 0 0 0 0\n", b"0 1 2 3 0 0 nan 1\n"),
+        *(b"2 0 0 0 0 1 0 0 0 0 1 0\n", b"1 0 0 0 0 1 0 0 0 0 -1 0\n", b"1 0 0 inf 0 1 0 0 0 0 1 0\n"),
+        *(b"1 0 0 0 0 1 0 0 0 0 1 0\n1 0 0\n", b"1 0 0 0\n0 1 0 0\n0 0 1 0\n0 0 0 2\n", b"1 0 0 0\n0 1 0 0\n0 0 1 0\n"),
+    ):
+        path.write_bytes(content)
+        refused(lambda: io.read_poses(path), str(path).removesuffix(": "))
 
 
 def test_poses_that_do_not_fit(tmp_path):
     with pytest.raises(FileNotFoundError):
         io.read_poses(tmp_path / "none.txt")
-    for named, matrices, times in (
-        (r"poses\[1\]", [np.eye(4), 2 * np.eye(4)], None),
-        ("timestamps", poses(8), [1.0, 2.0]),
-    ):
-        with pytest.raises(ValueError, match=f"^{named}"):
-            io.write_poses(tmp_path / "p.txt", np.array(matrices), timestamps=times)
+    refused(lambda: io.write_poses(tmp_path / "p.txt", np.array([np.eye(4), 2 * np.eye(4)])), "poses[1]")
+    refused(lambda: io.write_poses(tmp_path / "p.txt", poses(8), timestamps=[1.0, 2.0]), "timestamps")
     assert not list(tmp_path.iterdir())

@@ -10,15 +10,7 @@ import mcgicp_jax as mcg
 from mcgicp_jax import datasets
 from mcgicp_jax.__main__ import main
 from mcgicp_jax._global_pose import features
-from mcgicp_jax._global_pose.features import mutual_nearest
-from mcgicp_jax._global_pose.robust_pose_fit import (
-    NUM_MATCHES,
-    PutativeMatches,
-    _support,
-    fit_pose,
-    hypotheses,
-    refined,
-)
+from mcgicp_jax._global_pose.robust_pose_fit import NUM_MATCHES, PutativeMatches, _support, fit_pose, hypotheses
 from mcgicp_jax._global_pose.surface_agreement import surface_agreement
 from mcgicp_jax.metrics import pose_error
 from tests.compilations import compilations
@@ -58,7 +50,7 @@ def found(result, truth, source):
 
 @pytest.fixture(scope="module")
 def small():
-    points, channels = room_corner(300, noise=0.02, seed=3)
+    points, channels = room_corner(200, noise=0.02, seed=3)
     cloud = mcg.preprocess(mcg.PointCloud(points, channels), num_neighbors=50)
     return cloud, features.normals_of(cloud, VOXEL)
 
@@ -133,34 +125,10 @@ def test_statistics_are_those_of_the_neighbours_that_have_the_channel(small):
         np.testing.assert_allclose(made[i], expected, atol=1e-4)
 
 
-def test_a_motion_does_not_change_features(small):
-    cloud, normals = small
-    pose = anywhere(1, 0.3)
-    moved = cloud.transform(pose).replace_rows(deferred_neighbors=cloud.neighbors)
-    again = features.normals_of(moved, VOXEL)
-    flips = np.where(np.arange(len(normals)) % 2, -1, 1)[:, None]
-    first = features.histograms_of(cloud, normals, VOXEL)
-    for turned in (again, again * flips):
-        second = features.histograms_of(moved, turned.astype(np.float32), VOXEL)
-        assert np.median(np.abs(first - second).max(axis=1)) < 0.05
-
-
-def test_units_of_channels_do_not_matter(small):
-    cloud, normals = small
-    histograms = features.histograms_of(cloud, normals, VOXEL)
-    made = []
-    for gain in (1.0, 255.0):
-        scaled = cloud.replace(channels=cloud.channels * gain)
-        statistics = features.statistics_of(scaled, VOXEL)
-        made.append(features.comparable((histograms, histograms), (statistics, statistics))[0])
-    assert np.mean(made[0] != made[1]) < 0.01 and np.abs(made[0]).max() <= 127
-    np.testing.assert_array_equal(made[0], np.rint(made[0]))
-
-
 def test_mutual_neighbours_are_those_of_a_tree():
     rng = np.random.default_rng(0)
     source, target = (rng.integers(-127, 128, (size, 6)).astype(np.float32) for size in (5000, 6000))
-    rows, matched = mutual_nearest(source, target, 5000)
+    rows, matched = features.mutual_nearest(source, target, 5000)
     (distances, nearest), (back, row) = cKDTree(target).query(source, 2), cKDTree(source).query(target)
     # Of rows at the same distance, the tree may find another one.
     matched_distances = np.linalg.norm(source[rows].astype(float) - target[matched], axis=1)
@@ -171,7 +139,7 @@ def test_mutual_neighbours_are_those_of_a_tree():
     ratios = (distances[rows, 0] / np.maximum(distances[rows, 1], 1)) ** 2
     assert np.all(np.diff(ratios) >= -1e-6)
     # Where few are wanted, they are the first ones.
-    for found, expected in zip(mutual_nearest(source, target, 50), (rows, matched), strict=True):
+    for found, expected in zip(features.mutual_nearest(source, target, 50), (rows, matched), strict=True):
         assert 50 <= len(found) < len(expected)
         np.testing.assert_array_equal(found, expected[: len(found)])
 
@@ -204,16 +172,15 @@ def test_poses_are_those_of_scipy(kind):
         assert np.linalg.det(rotation) > 0.99
 
 
-@pytest.mark.parametrize("same", [True, False])
-def test_matches_whose_normals_differ_do_not_support_each_other(same):
+def test_matches_whose_normals_differ_do_not_support_each_other():
     columns = np.zeros((4, NUM_MATCHES, 3), np.float32)
     columns[:2, :4] = [[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]]
     columns[2:, :4] = [0, 0, 1]
-    if not same:
-        columns[3, :2] = [1, 0, 0]
-    matches = PutativeMatches(*columns, np.arange(NUM_MATCHES) < 4)
     # Of two of the four matches, the other two.
-    assert np.max(_support(matches, np.float32(0.05))) == (2 if same else 0)
+    for support in (2, 0):
+        matches = PutativeMatches(*columns, np.arange(NUM_MATCHES) < 4)
+        assert np.max(_support(matches, np.float32(0.05))) == support
+        columns[3, :2] = [1, 0, 0]
 
 
 def test_padding_is_no_match():
@@ -223,23 +190,6 @@ def test_padding_is_no_match():
     matches = PutativeMatches(points, points, none, none, np.arange(NUM_MATCHES) < 40)
     # They fit as they are, and so would zeros.
     assert 30 < hypotheses(matches, np.float32(0.05), np.float32(2.0)).score.max() <= 40.001
-
-
-def test_ninety_percent_of_wrong_matches_do_not_matter():
-    rng = np.random.default_rng(5)
-    truth = anywhere(2, 1.0)
-    source = rng.uniform(-2, 2, (NUM_MATCHES, 3))
-    target = source @ truth[:3, :3].T + truth[:3, 3] + 0.02 * rng.normal(size=source.shape)
-    wrong = rng.random(NUM_MATCHES) < 0.9
-    target[wrong] = rng.uniform(-2, 2, (wrong.sum(), 3)) @ truth[:3, :3].T + truth[:3, 3]
-    none = np.zeros((NUM_MATCHES, 3), np.float32)
-    matches = PutativeMatches(
-        source.astype(np.float32), target.astype(np.float32), none, none, np.ones(NUM_MATCHES, bool)
-    )
-    poses = refined(hypotheses(matches, np.float32(0.05), np.float32(2.0)), matches, np.float32(0.05))
-    best = int(np.argmax(poses.score))
-    np.testing.assert_allclose(poses.rotation[best], truth[:3, :3], atol=0.01)
-    np.testing.assert_allclose(poses.translation[best], truth[:3, 3], atol=0.01)
 
 
 # Clouds
@@ -257,9 +207,11 @@ def test_a_room_is_found_from_anywhere(channels):
 
 
 def test_on_a_plane_channels_decide():
+    """In any unit."""
+    walls = ((points, 1e-3 * channels) for points, channels in (wall(8000, seed=seed) for seed in (1, 2)))
+    source, target = (mcg.PointCloud(*each) for each in walls)
     away = anywhere(3)
-    source, target = mcg.PointCloud(*wall(8000, seed=1)).transform(away), mcg.PointCloud(*wall(8000, seed=2))
-    truth = np.linalg.inv(away)
+    source, truth = source.transform(away), np.linalg.inv(away)
     result = mcg.global_pose(source, target)
     assert result.success and found(result, truth, source)
     alone = mcg.global_pose(bare(source), bare(target))
@@ -267,14 +219,15 @@ def test_on_a_plane_channels_decide():
 
 
 def test_given_matches_replace_features():
+    """Nine of ten may be wrong."""
     points, _ = wall(3000, seed=1)
     away = anywhere(4)
     source, target = mcg.PointCloud(points).transform(away), mcg.PointCloud(points)
     rng = np.random.default_rng(0)
-    rows = rng.permutation(3000)[:60]
-    matched = np.where(np.arange(60) < 30, rows, rng.integers(0, 3000, 60))
+    rows = rng.permutation(3000)[:600]
+    matched = np.where(np.arange(600) < 60, rows, rng.integers(0, 3000, 600))
     result = mcg.global_pose(source, target, correspondences=(rows, matched))
-    assert result.success and found(result, np.linalg.inv(away), source) and result.num_matches == 60
+    assert result.success and found(result, np.linalg.inv(away), source) and result.num_matches == 600
     many = np.tile(rows, 100)
     assert mcg.global_pose(source, target, correspondences=(many, many)).num_matches == NUM_MATCHES
     assert not mcg.global_pose(source, target, correspondences=(rows[:0], rows[:0])).success
@@ -291,10 +244,10 @@ def test_large_coordinates_lose_nothing():
 # Verdicts
 
 
-def test_different_rooms_do_not_match():
-    first, second = (datasets.box_room(1, points_per_frame=3000, seed=seed)[0].cloud for seed in (0, 1))
-    for clouds in ((first, second), (bare(first), bare(second))):
-        assert not mcg.global_pose(*clouds).success
+@pytest.mark.parametrize("channels", [False, pytest.param(True, marks=pytest.mark.slow)])
+def test_different_rooms_do_not_match(channels):
+    clouds = [datasets.box_room(1, points_per_frame=3000, seed=seed)[0].cloud for seed in (0, 1)]
+    assert not mcg.global_pose(*(clouds if channels else map(bare, clouds))).success
 
 
 def weight(result):
@@ -357,7 +310,8 @@ def box(size, seed):
     return points + 0.005 * rng.normal(size=points.shape)
 
 
-@pytest.mark.parametrize("size", [(1.5, 1.4, 0.7), pytest.param((2.2, 1.2, 1), marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("size", [(1.5, 1.4, 0.7), (2.2, 1.2, 1)])
 def test_two_boxes_do_not_match(size):
     source = mcg.PointCloud(box((2, 1.2, 1), 1)).transform(anywhere(6))
     assert not mcg.global_pose(source, box(size, 2)).success
@@ -400,8 +354,8 @@ def test_malformed_arguments_are_named():
     source, target, _ = rooms()
     for named, shown, *clouds, options in (
         ("voxel_size", 0.0, source, target, {"voxel_size": 0.0}),
-        ("target: cloud", "got 3", source, np.zeros((3, 3)), {}),
-        ("source: points", "(3,)", np.zeros(3), target, {}),
+        ("target: cloud", 3, source, np.zeros((3, 3)), {}),
+        ("source: points", (3,), np.zeros(3), target, {}),
         *(
             ("correspondences", "", source, target, {"correspondences": rows})
             for rows in (([0, 1], [0]), ([0.5], [1.0]), ([0], [10**6]))
@@ -476,23 +430,19 @@ def test_a_lost_frame_is_found_in_the_map(against):
 
 
 def test_the_command_line_starts_from_anywhere(tmp_path, capsys):
-    source, target, truth = rooms()
     names = [str(tmp_path / name) for name in ("source.npz", "target.npz", "pose.txt")]
-    for name, cloud in zip(names, (source, target), strict=False):
-        mcg.io.write(name, cloud)
-    assert main(["register", *names[:2], "--method", "gicp", "--init", "global", "--output", names[2]]) == 0
-    assert "start:     found, " in capsys.readouterr().out
-    assert pose_error(mcg.io.read_poses(names[2])[0], truth, at=np.mean(source.coordinates, axis=0))[0] < 0.05
-    mcg.io.write(names[1], bare(datasets.box_room(1, points_per_frame=3000, seed=1)[0].cloud))
-    assert main(["register", *names[:2], "--method", "gicp", "--init", "global", "--output", names[2]]) == 1
+    command = ["register", *names[:2], "--method", "gicp", "--init", "global", "--output", names[2]]
+    other = datasets.box_room(1, points_per_frame=3000, seed=1)[0].cloud
+    for name, cloud in zip(names, (rooms()[0], other), strict=False):
+        mcg.io.write(name, bare(cloud))
+    assert main(command) == 1
     printed = capsys.readouterr()
     assert "start:     unsure, " in printed.out and "status:    unverified" in printed.out
-    assert "gicp did not converge (unverified): the clouds may not show the same place" in printed.err
-    assert len(mcg.io.read_poses(names[2])) == 1
+    assert "gicp did not converge (unverified)" in printed.err and len(mcg.io.read_poses(names[2])) == 1
     for name, points in zip(names, np.random.default_rng(0).normal(size=(2, 10, 3)), strict=False):
         mcg.io.write(name, mcg.PointCloud(points))
-    assert main(["register", *names[:2], "--method", "gicp", "--init", "global"]) == 2
-    assert "--init global: found no pose, no features match" in capsys.readouterr().err
+    assert main(command) == 2
+    assert "--init global: found no pose" in capsys.readouterr().err
 
 
 def seen(shift, seed=0):

@@ -23,6 +23,18 @@ from tests.scenes import motion
 pytestmark = in_float64
 
 
+def answer(source, target, matches, **options):
+    """A scalar of the pose of some inputs."""
+
+    def loss(inputs):
+        given = {"robust": inputs["robust"], "init": motion()} | TO_ROUNDING | options
+        given |= {name: inputs[name] for name in ("temperature",) if name in inputs}
+        clouds = clouds_with(inputs, source, target)
+        return weigh(mcg.estimate_pose(*clouds, matches, inputs["method"], **given).matrix)
+
+    return loss
+
+
 @pytest.mark.parametrize(
     "name", [name if name == "gicp" else pytest.param(name, marks=pytest.mark.slow) for name in CASES]
 )
@@ -30,36 +42,21 @@ def test_estimate_pose_has_the_gradient_of_its_answer(name, noisy):
     source, target, _ = noisy
     method, robust = case(name)
     matches = mcg.find_correspondences(source, target, motion(), method, max_distance=GATE)
-
-    def loss(inputs):
-        clouds = clouds_with(inputs, source, target)
-        result = mcg.estimate_pose(
-            *clouds, matches, inputs["method"], robust=inputs["robust"], init=motion(), **TO_ROUNDING
-        )
-        return weigh(result.matrix)
-
-    check_gradient(loss, inputs_of(source, target, method, robust))
+    check_gradient(answer(source, target, matches), inputs_of(source, target, method, robust))
 
 
-@pytest.mark.parametrize("name", [pytest.param("mc-gicp", marks=pytest.mark.slow), "color-icp"])
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["mc-gicp", "color-icp"])
 def test_estimate_pose_has_the_gradient_where_channels_are_missing(name, noisy):
-    source, target, _ = noisy
     method, robust = case(name)
-    clouds = []
-    for i, cloud in enumerate((source, target)):
-        mask = np.random.default_rng(i).random(cloud.channels.shape) < 0.7
-        clouds.append(cloud.replace(channel_valid=mask))
-    source, target = clouds
+    source, target = (
+        cloud.replace(channel_valid=np.random.default_rng(i).random(cloud.channels.shape) < 0.7)
+        for i, cloud in enumerate(noisy[:2])
+    )
     method = method.resolve(source, target)
     matches = mcg.find_correspondences(source, target, motion(), method, max_distance=GATE, num_candidates=2)
-
-    def loss(inputs):
-        clouds = clouds_with(inputs, source, target)
-        settings = {"robust": inputs["robust"], "init": motion(), "temperature": 0.1, **TO_ROUNDING}
-        return weigh(mcg.estimate_pose(*clouds, matches, inputs["method"], **settings).matrix)
-
     inputs = inputs_of(source, target, method, robust)
-    compiled = check_gradient(loss, inputs)
+    compiled = check_gradient(answer(source, target, matches, temperature=0.1), inputs)
     # What stands where nothing is, NaN for one, is not seen.
     for side, cloud in (("source", source), ("target", target)):
         inputs[f"{side} channels"] = jnp.where(cloud.channel_valid, cloud.channels, jnp.nan)
@@ -71,54 +68,28 @@ def test_estimate_pose_has_the_gradient_where_channels_are_missing(name, noisy):
 
 @pytest.mark.slow
 def test_estimate_pose_has_the_gradient_of_given_covariances(noisy):
-    source, target, _ = noisy
     method, robust = case("gicp")
-    rng = np.random.default_rng(0)
-    clouds = []
-    for cloud in (source, target):
-        factor = rng.normal(size=(cloud.points.shape[0], 3, 3))
-        covariances = factor @ factor.swapaxes(1, 2) / 3 + 0.1 * np.eye(3)
-        clouds.append(cloud.replace(covariances=jnp.asarray(covariances)))
-    source, target = clouds
+    factors = np.random.default_rng(0).normal(size=(2, 400, 3, 3))
+    source, target = (
+        cloud.replace(covariances=factor @ factor.swapaxes(1, 2) / 3 + 0.1 * np.eye(3))
+        for cloud, factor in zip(noisy[:2], factors, strict=True)
+    )
     matches = mcg.find_correspondences(source, target, motion(), method, max_distance=GATE)
-
-    def loss(inputs):
-        clouds = clouds_with(inputs, source, target)
-        result = mcg.estimate_pose(
-            *clouds, matches, inputs["method"], robust=inputs["robust"], init=motion(), **TO_ROUNDING
-        )
-        return weigh(result.matrix)
-
-    check_gradient(loss, inputs_of(source, target, method, robust))
+    check_gradient(answer(source, target, matches), inputs_of(source, target, method, robust))
 
 
 @pytest.mark.slow
 def test_soft_matches_give_every_number_a_gradient(noisy):
     source, target, _ = noisy
     method = mcg.MultiChannelGICP([[0.05, 0.01], [0.01, 0.08]], [0.3, 0.2], epsilon=1e-2)
-    robust = mcg.Cauchy(0.5)
     matches = mcg.find_correspondences(source, target, motion(), method, max_distance=GATE, num_candidates=4)
     assert matches.indices.shape == (4, source.points.shape[0])
-
-    def loss(inputs):
-        clouds = clouds_with(inputs, source, target)
-        temperature = inputs["temperature"]
-        result = mcg.estimate_pose(
-            *clouds,
-            matches,
-            inputs["method"],
-            robust=inputs["robust"],
-            init=motion(),
-            temperature=temperature,
-            **TO_ROUNDING,
-        )
-        return weigh(result.matrix)
-
-    inputs = inputs_of(source, target, method, robust) | {"temperature": jnp.asarray(0.1)}
-    gradient = check_gradient(loss, inputs)(inputs)
+    inputs = inputs_of(source, target, method, mcg.Cauchy(0.5)) | {"temperature": jnp.asarray(0.1)}
+    gradient = check_gradient(answer(source, target, matches), inputs)(inputs)
     assert np.abs(gradient["method"].channel_weights).min() > 1e-4
 
 
+@pytest.mark.slow
 def test_jacobians_agree_forward_and_backward(noisy):
     source, target, _ = noisy
     method, _ = case("point-to-point")
