@@ -26,6 +26,7 @@ from mcgicp_jax.extend import KERNELS
 from tests import reference as ref
 from tests.compilations import compilations
 from tests.precision import cached, in_both_precisions, in_float64, tolerance
+from tests.refusals import refused
 from tests.scenes import matched_at, sums_at
 
 pytestmark = in_float64
@@ -87,8 +88,9 @@ def reference_cost(name, pose=T, source=None, target=None, rho=None, **numbers):
 
 
 @in_both_precisions
-@pytest.mark.parametrize("kernel", [None, *KERNELS])
-@pytest.mark.parametrize("name", METHODS)
+@pytest.mark.parametrize(
+    ("name", "kernel"), [*((name, None) for name in METHODS), *(("MultiChannelGICP", kernel) for kernel in KERNELS)]
+)
 def test_cost_against_the_reference(name, kernel):
     _, _, clouds, matches, _ = problem()
     robust = None if kernel is None else KERNELS[kernel](SCALE)
@@ -130,24 +132,21 @@ def test_soft_matches_against_the_reference(name):
     assert float(actual) == pytest.approx(expected, rel=tolerance(1e-4, 1e-10))
 
 
-@pytest.mark.parametrize("form", ["jax", "jaxlie"])
-def test_every_form_of_pose(form):
+def test_every_form_of_pose():
     _, _, clouds, matches, _ = problem()
-    pose = jnp.asarray(T) if form == "jax" else jaxlie.SE3.from_matrix(jnp.asarray(T))
-    actual = mahalanobis_cost(pose, *clouds, matches, METHODS["GICP"]())
-    assert float(actual) == pytest.approx(reference_cost("GICP"), rel=tolerance(1e-4, 1e-10))
+    for pose in (jnp.asarray(T), jaxlie.SE3.from_matrix(jnp.asarray(T))):
+        actual = mahalanobis_cost(pose, *clouds, matches, METHODS["GICP"]())
+        assert float(actual) == pytest.approx(reference_cost("GICP"), rel=1e-10)
 
 
-@pytest.mark.parametrize("kernel", [None, "cauchy"])
-def test_at_large_coordinates_the_cost_is_the_same(kernel):
+def test_at_large_coordinates_the_cost_is_the_same():
     utm = np.array([512_345.6, 5_403_210.9, 312.3])
     raw, _, _, matches, _ = problem()
     clouds = [preprocess(PointCloud(points + utm, channels), num_neighbors=K).pad(ROWS) for points, channels in raw]
     shift, back = np.eye(4), np.eye(4)
     shift[:3, 3], back[:3, 3] = utm, -utm
-    robust = None if kernel is None else Cauchy(SCALE)
-    rho = None if kernel is None else functools.partial(ref.ROBUST["cauchy"], c=SCALE)
-    actual = mahalanobis_cost(shift @ T @ back, *clouds, matches, METHODS["MultiChannelGICP"](), robust=robust)
+    rho = functools.partial(ref.ROBUST["cauchy"], c=SCALE)
+    actual = mahalanobis_cost(shift @ T @ back, *clouds, matches, METHODS["MultiChannelGICP"](), robust=Cauchy(SCALE))
     assert float(actual) == pytest.approx(reference_cost("MultiChannelGICP", rho=rho), rel=tolerance(1e-3, 1e-6))
 
 
@@ -194,11 +193,10 @@ def test_gradients_of_kernels_are_finite(name):
         assert np.isfinite(jax.jit(jax.grad(lambda s2, function=function: jnp.sum(function(s2))))(squares)).all()
 
 
-@pytest.mark.parametrize("scale", [0, -1.0, np.nan, np.inf, np.ones(2)])
 @pytest.mark.parametrize("name", KERNELS)
-def test_a_scale_that_makes_no_sense(name, scale):
-    with pytest.raises(ValueError, match="scale"):
-        KERNELS[name](scale)
+def test_a_scale_that_makes_no_sense(name):
+    for scale in (0, -1.0, np.nan, np.inf, np.ones(2)):
+        refused(lambda scale=scale: KERNELS[name](scale), "scale")
 
 
 ARGUMENTS = ("pose", "source points", "target points", "source channels", "target channels", "Λ", "ε")
@@ -263,9 +261,10 @@ def test_gradients_against_differences_of_the_reference(name, argument):
 
 def test_the_gradients_are_not_all_zero():
     """What each method depends on, and on nothing else."""
-    sensitive = {name: {a for a, g in gradients(name).items() if np.any(g)} for name in METHODS}
+    names = ("ColorICP", "PointToPlane", "GICP", "MultiChannelGICP")
+    sensitive = {name: {a for a, g in gradients(name).items() if np.any(g)} for name in names}
     points = {"pose", "source points", "target points"}
-    assert sensitive["PointToPoint"] == sensitive["ColorICP"] == sensitive["PointToPlane"] == points
+    assert sensitive["ColorICP"] == sensitive["PointToPlane"] == points
     assert sensitive["GICP"] == points | {"ε"}
     assert sensitive["MultiChannelGICP"] == set(ARGUMENTS)
 
@@ -331,8 +330,7 @@ def test_no_matches_cost_nothing():
 
 def test_matches_of_another_cloud_are_refused():
     _, _, clouds, matches, _ = problem()
-    with pytest.raises(ValueError, match="matches"):
-        mahalanobis_cost(T, clouds[0].pad(200), clouds[1], matches, GICP())
+    refused(lambda: mahalanobis_cost(T, clouds[0].pad(200), clouds[1], matches, GICP()), "matches")
 
 
 def test_neighbourhoods_of_large_clouds_are_summed_inside_jit():

@@ -13,6 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from mcgicp_jax.metrics import ate, kitti_errors, pose_error, rpe
 from tests.reference import pose
+from tests.refusals import refused
 
 EASY_ANGLES = [1e-9, 1e-5, 0.3, 1.7, 3.0, np.pi - 1e-5, np.pi - 1e-9]
 
@@ -50,32 +51,23 @@ def test_a_nan_pose_has_nan_errors():
             assert np.isnan(error(lost, np.eye(4))).all()
 
 
-PARTLY = np.eye(4)
-PARTLY[0, 0] = np.nan
-
-
-@pytest.mark.parametrize(
-    ("named", "call"),
-    [
-        ("T_true: ", lambda: pose_error(np.eye(4), PARTLY)),
-        ("T_true: ", lambda: pose_error(np.eye(4), 2 * np.eye(4))),
-        ("T: ", lambda: pose_error(PARTLY, np.eye(4))),
-        ("T: ", lambda: jax.jit(pose_error)(jnp.eye(3), jnp.eye(4))),
-        *[
-            ("at: ", lambda at=at: pose_error(np.eye(4), np.eye(4), at=at))
-            for at in (0.0, np.zeros(2), np.zeros((1, 3)))
-        ],
-        ("poses: .* 4 and 5", lambda: ate([np.eye(4)] * 4, [np.eye(4)] * 5)),
-        ("poses: ", lambda: ate([], [])),
-        (r"poses\[0\]: ", lambda: ate([2 * np.eye(4)], [np.eye(4)])),
-        ("delta: .* 2 poses, got 2", lambda: rpe([np.eye(4)] * 2, [np.eye(4)] * 2, 2)),
-        ("lengths: .* 0.0 m", lambda: kitti_errors([np.eye(4)] * 2, [np.eye(4)] * 2)),
-        ("alignment|parameter", lambda: ate([np.eye(4)], [np.eye(4)], alignment="best")),
-    ],
-)
-def test_wrong_arguments_are_refused_by_name(named, call):
-    with pytest.raises((ValueError, TypeError), match=f"^{named}" if named.endswith(" ") else named):
-        call()
+def test_wrong_arguments_are_refused_by_name():
+    here, partly = [np.eye(4)], np.eye(4)
+    partly[0, 0] = np.nan
+    for named, shown, call in (
+        ("T_true", "", lambda: pose_error(np.eye(4), partly)),
+        ("T_true", "", lambda: pose_error(np.eye(4), 2 * np.eye(4))),
+        ("T", "", lambda: pose_error(partly, np.eye(4))),
+        ("T", (3, 3), lambda: jax.jit(pose_error)(jnp.eye(3), jnp.eye(4))),
+        *(("at", "", lambda at=at: pose_error(*here, *here, at=at)) for at in (0.0, np.zeros(2), np.zeros((1, 3)))),
+        ("poses", "4 and 5", lambda: ate(here * 4, here * 5)),
+        ("poses", "", lambda: ate([], [])),
+        ("poses[0]", "", lambda: ate([2 * np.eye(4)], here)),
+        ("delta", 2, lambda: rpe(here * 2, here * 2, 2)),
+        ("lengths", 0.0, lambda: kitti_errors(here * 2, here * 2)),
+        ("alignment", "best", lambda: ate(here, here, alignment="best")),
+    ):
+        refused(call, named, shown)
 
 
 def test_the_error_is_that_of_the_point_asked_for():

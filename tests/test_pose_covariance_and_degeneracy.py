@@ -21,7 +21,7 @@ from tests.batches import raw_pair
 from tests.benchmarks.noise_scenes import street
 from tests.corridor import corridor
 from tests.precision import in_float64
-from tests.scenes import SURFACES, motion, pair, prepare, room_corner, wall
+from tests.scenes import SURFACES, motion, pair, prepare, wall
 
 
 def matrices(symmetric):
@@ -260,12 +260,6 @@ def test_the_channels_hold_what_geometry_leaves_free(flat):
     assert repr(result).count("constrained by channels: all") == 1
 
 
-def test_nothing_is_free_in_a_corner():
-    source, target, _ = pair()
-    result = mcg.register(source, target, mcg.GICP(), max_distance=0.5)
-    assert result.converged and result.unconstrained_directions == () and "unconstrained" not in repr(result)
-
-
 @pytest.mark.parametrize("textured", [True, False])
 def test_a_corridor_is_free_along_its_axis(textured):
     target, source = corridor(2, textured=textured)
@@ -378,6 +372,7 @@ def test_the_covariance_is_a_covariance():
         assert np.linalg.eigvalsh(covariance / np.sqrt(np.outer(*[np.diagonal(covariance)] * 2))).min() > 0
         # 2000 points of 1 cm noise: millimetres, milliradians
         assert np.all(np.sqrt(np.diagonal(covariance)) < 6e-3) and np.all(np.sqrt(np.diagonal(covariance)) > 1e-4)
+        assert result.converged and result.unconstrained_directions == () and "unconstrained" not in repr(result)
 
 
 @in_float64
@@ -413,16 +408,6 @@ def test_what_nothing_holds_is_not_known(flat):
         # A motion of one metre, of ten times the radius
         scaled = direction.twist / (direction.twist @ direction.twist)
         assert scaled @ np.asarray(result.covariance) @ scaled > 1
-    held = np.asarray(result.directions.twists)[np.asarray(result.directions.held)]
-    coefficients = np.linalg.inv(np.asarray(result.directions.twists, np.float64).T)[np.asarray(result.directions.held)]
-    assert len(held) == 3
-    assert np.sqrt(np.diagonal(coefficients @ result.covariance @ coefficients.T)).max() < 5e-3
-
-
-def test_without_a_pose_there_is_no_covariance():
-    source, target, _ = pair()
-    result = mcg.register(source, target, mcg.GICP(), init=motion((50, 0, 0, 0, 0, 0)), max_distance=0.5)
-    assert np.all(np.isnan(result.covariance)) and result.unconstrained_directions == () and result.overlap == 0
 
 
 def test_large_coordinates_keep_the_covariance_of_the_points():
@@ -448,7 +433,7 @@ def test_large_coordinates_keep_the_covariance_of_the_points():
 
 def test_traced_and_batched_results_carry_the_same():
     """Clouds of several sizes, stacked."""
-    clouds = [pair(size=2000 - 100 * i, truth=motion((0.02 * i, 0.01, 0, 0.01, 0, 0.02)))[:2] for i in range(3)]
+    clouds = [pair(size=500 - 50 * i, truth=motion((0.02 * i, 0.01, 0, 0.01, 0, 0.02)))[:2] for i in range(3)]
     stacked = [mcg.PointCloud.stack([clouds[i][which] for i in range(3)]) for which in (0, 1)]
     options = {"max_distance": 0.5, "search": mcg.DenseSearch()}
     batch = jax.jit(jax.vmap(lambda s, t: mcg.register(s, t, mcg.GICP(), **options)))(*stacked)
@@ -459,12 +444,17 @@ def test_traced_and_batched_results_carry_the_same():
         assert batch.status[i] == alone.status
         np.testing.assert_allclose(batch.matrix[i], alone.matrix, atol=1e-3)
         np.testing.assert_allclose(batch.directions.geometry[i], alone.directions.geometry, atol=1e-3)
-        np.testing.assert_allclose(
-            np.sqrt(np.diagonal(batch.covariance[i])), np.sqrt(np.diagonal(alone.covariance)), rtol=0.05
-        )
+        np.testing.assert_allclose(batch.deviations[i], alone.deviations, rtol=0.05)
 
 
-@pytest.mark.parametrize("method", [mcg.GICP(), mcg.NDT(), mcg.D2DNDT()], ids=["gicp", "ndt", "d2d-ndt"])
+@pytest.mark.parametrize(
+    "method",
+    [
+        pytest.param(mcg.GICP(), id="gicp"),
+        pytest.param(mcg.NDT(), id="ndt", marks=pytest.mark.slow),
+        pytest.param(mcg.D2DNDT(), id="d2d-ndt"),
+    ],
+)
 def test_the_claims_hold_on_average(method):
     """A few simulated pairs: enough to see a covariance that is wrong by a factor of two in standard deviation."""
     room = datasets.box_room(2, points_per_frame=2000 if method.needs_covariances == () else 5000)
@@ -484,13 +474,6 @@ def test_the_claims_hold_on_average(method):
     assert 0.5 < np.mean(squares) < 1.9
 
 
-def test_the_corner_of_a_room_is_what_it_says():
-    """The painted corner: evidence of geometry and of channels are both plenty."""
-    cloud = mcg.preprocess(mcg.PointCloud(*room_corner(2000)))
-    geometry, channels = mean_evidence(cloud, mcg.MultiChannelGICP().resolve(cloud, cloud))
-    assert np.linalg.eigvalsh(geometry).min() > 0.2 and np.linalg.eigvalsh(channels).min() > 0.05
-
-
 def test_deviations_are_those_of_the_matched_points():
     """By sampling: poses drawn from the covariance move the centroid, and turn, as much as the deviations say."""
     source, target, _ = pair(truth=motion((0.1, -0.2, 0.05, 0.3, 0.2, 1.2)))
@@ -504,9 +487,6 @@ def test_deviations_are_those_of_the_matched_points():
     shifts = moved @ centroid - matrix @ centroid
     turns = Rotation.from_matrix(moved[:, :3, :3] @ matrix[:3, :3].T).as_rotvec()
     np.testing.assert_allclose(result.deviations, [*np.std(shifts, axis=0)[:3], *np.std(turns, axis=0)], rtol=0.06)
-    options = {"init": result.matrix, "max_distance": 0.5, "search": mcg.DenseSearch()}
-    inside = jax.jit(lambda source: mcg.register(source, target, mcg.GICP(), **options))
-    np.testing.assert_allclose(inside(source).deviations, result.deviations, rtol=0.05)
 
 
 def test_constrained_directions_keep_their_variances_beside_free_ones():
