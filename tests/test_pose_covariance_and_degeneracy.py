@@ -21,6 +21,7 @@ from tests.batches import raw_pair
 from tests.benchmarks.noise_scenes import street
 from tests.corridor import corridor
 from tests.precision import in_float64
+from tests.refusals import refused
 from tests.scenes import SURFACES, motion, pair, prepare, wall
 
 
@@ -294,7 +295,7 @@ def test_units_and_origin_change_nothing(scale, shift):
 
 @pytest.mark.slow
 def test_real_scenes(data):
-    """A flat table and a road leave three directions free, a street none."""
+    """A flat table leaves three directions free, a street none."""
     file = np.load(data / "planar_table" / "pair_000015_000025.npz")
     table = [
         mcg.preprocess(mcg.PointCloud(file[f"{which}_points_flat"], file[f"{which}_rgb"]), 0.01)
@@ -302,35 +303,15 @@ def test_real_scenes(data):
     ]
     scans = [np.fromfile(data / f"kitti/sequences/04/velodyne/{i:06d}.bin", np.float32).reshape(-1, 4) for i in (1, 0)]
     street = [mcg.preprocess(mcg.PointCloud(scan[:, :3], scan[:, 3:]), 0.25) for scan in scans]
-    road = [mcg.preprocess(mcg.PointCloud(scan[:, :3], scan[:, 3:]), 0.1) for scan in map(on_the_road, scans)]
 
     result = mcg.register(*table, mcg.GICP(), max_distance=0.1)
     assert result.status is mcg.Status.DEGENERATE
     assert [direction.is_rotation for direction in result.unconstrained_directions] == [False, False, True]
     result = mcg.register(*table, mcg.MultiChannelGICP(), max_distance=0.1)
-    assert (
-        result.converged and [direction.held_by_channels for direction in result.unconstrained_directions] == [True] * 3
-    )
-
-    result = mcg.register(*road, mcg.GICP(), init=motion((1.3, 0, 0, 0, 0, 0)), max_distance=0.5)
-    assert result.status is mcg.Status.DEGENERATE
-    forward, sideways, yaw = result.unconstrained_directions
-    assert abs(forward.axis[0]) > 0.99 and abs(sideways.axis[1]) > 0.99
-    assert yaw.is_rotation and abs(yaw.axis[2]) > 0.99
+    assert result.converged and [each.held_by_channels for each in result.unconstrained_directions] == [True] * 3
 
     result = mcg.register(*street, mcg.GICP(), max_distance=1.5)
     assert result.converged and result.unconstrained_directions == ()
-
-
-def on_the_road(scan):
-    """Points of the ground ahead: within 25 m, 6 m to each side, 6 cm of its plane."""
-    scan = scan[(np.abs(scan[:, 1]) < 6) & (np.hypot(scan[:, 0], scan[:, 1]) < 25)]
-    plane, near = None, np.abs(scan[:, 2] + 1.73) < 0.3
-    for _ in range(10):
-        x, y, z = scan[near, :3].T
-        plane = np.linalg.lstsq(np.stack([x, y, np.ones_like(x)], axis=1), z, rcond=None)[0]
-        near = np.abs(scan[:, 2] - scan[:, :2] @ plane[:2] - plane[2]) < 0.06
-    return scan[near]
 
 
 # Covariance
@@ -437,8 +418,7 @@ def test_traced_and_batched_results_carry_the_same():
     stacked = [mcg.PointCloud.stack([clouds[i][which] for i in range(3)]) for which in (0, 1)]
     options = {"max_distance": 0.5, "search": mcg.DenseSearch()}
     batch = jax.jit(jax.vmap(lambda s, t: mcg.register(s, t, mcg.GICP(), **options)))(*stacked)
-    with pytest.raises(ValueError, match="unconstrained_directions"):
-        _ = batch.unconstrained_directions
+    refused(lambda: batch.unconstrained_directions, "unconstrained_directions")
     for i, (source, target) in enumerate(clouds):
         alone = mcg.register(source, target, mcg.GICP(), **options)
         assert batch.status[i] == alone.status

@@ -10,13 +10,12 @@ from scipy.spatial.transform import Rotation
 import mcgicp_jax as mcg
 from mcgicp_jax import datasets
 from mcgicp_jax._pose_solver.pose_measurements import Fusion, Prior, TiePoints, form_at
-from mcgicp_jax._registration.tie_points_and_prior import known
 from mcgicp_jax.extend import symmetric_matrices as alg
 from tests.compilations import compilations
 from tests.corridor import bare_pair, corridor
 from tests.differences import TO_ROUNDING, check_gradient, weigh
 from tests.precision import in_float64
-from tests.reference import exponential, logarithm
+from tests.reference import logarithm
 from tests.refusals import refused
 from tests.scenes import motion, pair
 
@@ -41,10 +40,6 @@ def measured(truth, deviations, seed=0):
     """A measurement P of a pose T = P exp(ξ), and its covariance."""
     given = np.diag(np.square(deviations))
     return truth @ motion(-np.random.default_rng(seed).normal(size=6) * deviations), given
-
-
-def translated(offset):
-    return motion((*offset, 0, 0, 0))
 
 
 def twist_error(matrix, truth):
@@ -124,7 +119,9 @@ def test_precise_tie_points_decide(corner):
     assert result.converged and result.deviations.max() < 1e-5
 
 
-@pytest.mark.parametrize("method", [mcg.GICP(), mcg.PointToPlane(), mcg.D2DNDT()], ids=lambda each: each.name)
+@pytest.mark.parametrize(
+    "method", [mcg.GICP(), mcg.PointToPlane(), mcg.D2DNDT()], ids=["gicp", "point-to-plane", "d2d-ndt"]
+)
 def test_a_prior_is_weighed_by_its_covariance(corner, method):
     """The product of two Gaussians: that of the registration alone, and the prior."""
     source, target, _ = corner
@@ -187,32 +184,6 @@ def test_large_coordinates_lose_nothing(corner):
     assert result.converged and np.abs(twist_error(found, pose)).max() < 5e-5
     back = np.linalg.inv(change)
     np.testing.assert_allclose(np.diagonal(back @ result.covariance @ back.T), np.diagonal(given), rtol=0.1)
-
-
-@pytest.mark.parametrize("at_cloud", [True, False])
-def test_the_information_of_a_prior_belongs_to_the_origin_of_the_cloud(corner, at_cloud):
-    """The same error of a pose has the same Mahalanobis distance in the user's coordinates and in the cloud's."""
-    rng, far = np.random.default_rng(0), np.array([300.0, -400.0, 100.0])
-    source, target = (mcg.preprocess(np.asarray(cloud.points, np.float64) + far) for cloud in corner[:2])
-    assert np.any(source.origin)
-    given = covariance(rng, 6, 0.01)
-    if at_cloud:
-        there = np.eye(6)
-        there[:3, 3:] = np.cross(far, np.eye(3)).T
-        given = there @ given @ there.T
-    pose = motion((1, 2, 3, 0.1, 0.2, 0.3))
-    _, prior = known(None, (pose, given), source, target)
-    with jax.enable_x64(True):
-        traced = np.asarray(jax.jit(lambda given: known(None, (pose, given), source, target)[1].information)(given))
-    # So small that the transport of the error is linear.
-    for twist in np.linalg.cholesky(given).T * 1e-3:
-        start, end = (
-            translated(-target.origin) @ each @ translated(source.origin) for each in (pose, pose @ exponential(twist))
-        )
-        error = logarithm(np.linalg.inv(start) @ end)
-        expected = twist @ np.linalg.solve(given, twist)
-        for information in (prior.information, traced):
-            np.testing.assert_allclose(error @ information @ error, expected, rtol=1e-4)
 
 
 # What geometry leaves free
