@@ -148,6 +148,7 @@ def test_the_gradient_is_that_of_differences(clouds, method):
     assert by_points.shape == (6, 400, 3) and by_points[:, used].any(axis=(0, 2)).mean() > 0.8
 
 
+@pytest.mark.slow
 def test_gradients_with_given_covariances_and_inside_jit(clouds):
     source, target = clouds
     source = source.replace(covariances=_matrices(mcg.GICP(), source))

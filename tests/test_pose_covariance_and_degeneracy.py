@@ -52,7 +52,7 @@ def test_a_flat_wall_is_observed_along_its_normal_alone(size, turn):
     assert within[0] > -2e-3 and within[1] < 5e-4
 
 
-@pytest.mark.parametrize("size", [100, 300, 1000])
+@pytest.mark.parametrize("size", [100, 1000])
 def test_random_points_are_registered(size):
     """Their neighbourhoods are no surfaces."""
     target, truth = np.random.default_rng(size).random((size, 3)), motion((0.02, -0.01, 0.03, 0.02, -0.03, 0.01))
@@ -78,7 +78,7 @@ def test_padding_changes_no_pose_and_no_deviation(method):
     np.testing.assert_allclose(padded.deviations, result.deviations, rtol=1e-4)
 
 
-@pytest.mark.parametrize("noise", [0.25, 0.75, 1.0])
+@pytest.mark.parametrize("noise", [0.25, 1.0])
 @pytest.mark.parametrize("name, free", [("plane", (0, 1)), ("crossing planes", (0,)), ("room", ())])
 def test_noise_as_large_as_the_spacing_constrains_nothing(name, free, noise):
     """Noise in units of the spacing. With one normal of all neighbours, up to 0.05 of the free motions was observed."""
@@ -90,7 +90,7 @@ def test_noise_as_large_as_the_spacing_constrains_nothing(name, free, noise):
     assert np.all(np.diag(geometry)[list(free)] < GEOMETRY_HOLDS) and np.all(np.diag(geometry)[constrained] > 0.02)
 
 
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("seed", range(2))
 def test_a_noisy_street_is_observed_along_the_road(seed):
     """By the 4 % of its points that lie on surfaces across it, such as the ends of parked cars."""
     cloud = mcg.preprocess(street(np.random.default_rng(seed), 3000, 0.5), None)
@@ -412,6 +412,7 @@ def test_large_coordinates_keep_the_covariance_of_the_points():
     assert far.deviations.max() < 5e-3 < np.sqrt(far.covariance[0, 0])
 
 
+@pytest.mark.slow
 def test_traced_and_batched_results_carry_the_same():
     """Clouds of several sizes, stacked."""
     clouds = [pair(size=500 - 50 * i, truth=motion((0.02 * i, 0.01, 0, 0.01, 0, 0.02)))[:2] for i in range(3)]

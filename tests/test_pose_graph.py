@@ -143,7 +143,7 @@ def test_rounding_of_poses_in_float32_is_warned_of():
         mcg.optimize_poses(far)
         with jax.enable_x64(True):
             np.testing.assert_allclose(np.subtract(solve(far), near)[1:, :3, 3] - (5e5, 5e6, 100), 0, atol=1e-4)
-    with pytest.warns(UserWarning, match=r"poses up to 5e\+06 m .* rounded to 0.5 m in float32. Subtract") as caught:
+    with pytest.warns(UserWarning, match=r"poses .* 0\.5 m") as caught:
         jax.block_until_ready(solve(far))
     # Run-time checks of annotations wrap each function of the package.
     assert caught[0].filename == __file__ or "jaxtyping" in caught[0].filename

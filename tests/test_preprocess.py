@@ -125,7 +125,7 @@ def test_arrays_are_not_to_be_changed_in_place():
     """What is computed of a cloud is kept as long as it is used."""
     cloud = ready(PointCloud(POINTS, CHANNELS))
     for array in (cloud.points, cloud.channels, cloud.neighbors):
-        with pytest.raises(ValueError, match="read-only"):
+        with pytest.raises(ValueError):
             array[0] = 0
 
 

@@ -126,7 +126,7 @@ def test_estimate_pose_reaches_the_balance_of_forces(room):
     assert difference(result.matrix, again.matrix) < tolerance(2e-6, 1e-10)
 
 
-@pytest.mark.parametrize("robust", [mcg.Huber, mcg.Cauchy, mcg.GemanMcClure, mcg.Tukey])
+@pytest.mark.parametrize("robust", [mcg.Huber, mcg.Tukey])
 def test_robust_kernels_resist_outliers(robust):
     truth = motion()
     points, channels = room_corner(2000, seed=1)
