@@ -119,15 +119,6 @@ def test_too_few_matches_go_before_convergence(before, count):
     assert status == (enough[before] if count >= 4 else Status.TOO_FEW_CORRESPONDENCES)
 
 
-def test_exact_pairs_need_no_second_update():
-    moved, residual, information, weight, valid = random_pairs(2, noise=0.0)
-    measured, update = solve(moved, residual, information, weight, valid)
-    turn = Rotation.from_rotvec(np.array(update.twist[3:], float))
-    center = np.asarray(measured.center, float)
-    change = turn.apply(moved - center) + center + np.asarray(update.twist[:3], float) - moved
-    np.testing.assert_allclose(change[valid], residual[valid], atol=tolerance(1e-5, 1e-10))
-
-
 @pytest.mark.parametrize("missing", ["no pairs", "one direction"])
 def test_unconstrained_directions_stay_where_they_are(missing):
     moved, residual, information, weight, valid = random_pairs(3)

@@ -10,12 +10,13 @@ from scipy.spatial.transform import Rotation
 import mcgicp_jax as mcg
 from mcgicp_jax import datasets
 from mcgicp_jax._pose_solver.pose_measurements import Fusion, Prior, TiePoints, form_at
+from mcgicp_jax._registration.tie_points_and_prior import known
 from mcgicp_jax.extend import symmetric_matrices as alg
 from tests.compilations import compilations
 from tests.corridor import bare_pair, corridor
 from tests.differences import TO_ROUNDING, check_gradient, weigh
 from tests.precision import in_float64
-from tests.reference import logarithm
+from tests.reference import exponential, logarithm
 from tests.refusals import refused
 from tests.scenes import motion, pair
 
@@ -154,13 +155,6 @@ def test_tie_points_that_tell_nothing_change_nothing(corner):
         np.testing.assert_allclose(result.information, alone.information, rtol=0.02, atol=30)
 
 
-def test_tie_points_far_from_the_clouds_leave_no_matches(corner):
-    source, target, truth = corner
-    away = motion((30, 0, 0, 0, 0, 0)) @ truth
-    result = mcg.register(source, target, mcg.GICP(), tie_points=tie_points(away, source.points, 1e-6), **OPTIONS)
-    assert result.status is mcg.Status.TOO_FEW_CORRESPONDENCES and np.isnan(result.covariance).all()
-
-
 def test_large_coordinates_lose_nothing(corner):
     """Precise measurements decide the pose, with a source far from its origin and a target at UTM coordinates."""
     source, target, truth = corner
@@ -184,6 +178,33 @@ def test_large_coordinates_lose_nothing(corner):
     assert result.converged and np.abs(twist_error(found, pose)).max() < 5e-5
     back = np.linalg.inv(change)
     np.testing.assert_allclose(np.diagonal(back @ result.covariance @ back.T), np.diagonal(given), rtol=0.1)
+
+
+@pytest.mark.parametrize("at_cloud", [True, False])
+def test_the_information_of_a_prior_belongs_to_the_origin_of_the_cloud(corner, at_cloud):
+    """The same error of a pose has the same Mahalanobis distance in the user's coordinates and in the cloud's."""
+    rng, far = np.random.default_rng(0), np.array([300.0, -400.0, 100.0])
+    source, target = (mcg.preprocess(np.asarray(cloud.points, np.float64) + far) for cloud in corner[:2])
+    assert np.any(source.origin)
+    given = covariance(rng, 6, 0.01)
+    if at_cloud:
+        there = np.eye(6)
+        there[:3, 3:] = np.cross(far, np.eye(3)).T
+        given = there @ given @ there.T
+    pose = motion((1, 2, 3, 0.1, 0.2, 0.3))
+    _, prior = known(None, (pose, given), source, target)
+    with jax.enable_x64(True):
+        traced = np.asarray(jax.jit(lambda given: known(None, (pose, given), source, target)[1].information)(given))
+    # So small that the transport of the error is linear.
+    for twist in np.linalg.cholesky(given).T * 1e-3:
+        start, end = (
+            motion((*-target.origin, 0, 0, 0)) @ each @ motion((*source.origin, 0, 0, 0))
+            for each in (pose, pose @ exponential(twist))
+        )
+        error = logarithm(np.linalg.inv(start) @ end)
+        expected = twist @ np.linalg.solve(given, twist)
+        for information in (prior.information, traced):
+            np.testing.assert_allclose(error @ information @ error, expected, rtol=1e-4)
 
 
 # What geometry leaves free
