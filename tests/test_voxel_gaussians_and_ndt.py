@@ -189,7 +189,8 @@ def test_gradients_reach_the_points(name):
     for cloud in (source, target):
         cells.append(mcg.voxel_gaussians(cloud, SIZE))
         number = extend.voxel_cells(cloud, SIZE)
-        moments.append(partial(extend.cell_moments, channels=cloud.channels, cells=number))
+        of_cells = partial(extend.cell_moments, channels=cloud.channels, cells=number)
+        moments.append(jax.jit(of_cells) if cloud is source else of_cells)
     matches = mcg.find_correspondences(*cells, start, method, max_distance=GATE)
 
     def loss(inputs):
