@@ -11,6 +11,7 @@ import mcgicp_jax as mcg
 from mcgicp_jax import io
 from mcgicp_jax.__main__ import main
 from mcgicp_jax.metrics import pose_error
+from tests.refusals import refused
 from tests.scenes import motion, room_corner
 
 UTM = np.array([4.5e5, 5.2e6, 300.0])
@@ -53,8 +54,7 @@ def test_a_start_of_too_few_digits_is_refused():
     source, target = scene(UTM)
     typed = UTM_TRUTH.copy()
     typed[:3, :3] = np.round(typed[:3, :3], 6)
-    with pytest.raises(ValueError, match=r"^init: .*digits"):
-        mcg.register(source, target, mcg.GICP(), init=typed)
+    refused(lambda: mcg.register(source, target, mcg.GICP(), init=typed), "init", "digits")
 
 
 def test_register_from_raw_clouds_and_arrays(near):
@@ -102,7 +102,7 @@ def test_inside_a_transformation():
     assert_as_near(far.matrix, near)
 
 
-@pytest.fixture(scope="module", params=[".ply", ".las", ".npz", ".txt"])
+@pytest.fixture(scope="module", params=[".las", ".txt"])
 def files(request, tmp_path_factory):
     folder = tmp_path_factory.mktemp("utm")
     for name, cloud in zip(("source", "target"), scene(UTM), strict=True):
@@ -125,7 +125,8 @@ def test_files_and_the_command(files, near, capsys):
     assert main(["register", *pair, *OPTIONS, "--init", str(folder / "pose.txt"), "--max-iterations", "3"]) == 0
 
 
-@pytest.mark.parametrize("files", [".npz"], indirect=True)
+@pytest.mark.slow
+@pytest.mark.parametrize("files", [".las"], indirect=True)
 def test_compare_measures_at_the_cloud(files, capsys):
     folder, pair = files
     assert main(["compare", *pair, *OPTIONS, "--truth", str(folder / "truth.txt")]) == 0
@@ -137,10 +138,10 @@ def test_compare_measures_at_the_cloud(files, capsys):
     assert float(far["mc-gicp"][0]) < 5 and float(far["gicp"][0]) < 5
 
 
-def test_the_batch_command(files, near, capsys):
-    folder, pair = files
-    suffix = pair[0][-4:]
-    (folder / "pairs.csv").write_text(f"source,target\nsource{suffix},target{suffix}\n")
+@pytest.mark.parametrize("files", [".las"], indirect=True)
+def test_the_batch_command(files, near):
+    folder, _ = files
+    (folder / "pairs.csv").write_text("source,target\nsource.las,target.las\n")
     assert main(["batch", str(folder / "pairs.csv"), "--output", str(folder / "out.csv"), *OPTIONS]) == 0
     with open(folder / "out.csv", newline="", encoding="utf-8") as file:
         (row,) = csv.DictReader(file)
@@ -150,13 +151,9 @@ def test_the_batch_command(files, near, capsys):
 
 def test_coordinates_that_float32_has_rounded_are_warned_of():
     points = np.random.default_rng(0).uniform(0, 10, (500, 3))
-    with pytest.warns(UserWarning, match=r"^points: float32 .* 5200010 m to steps of 0.5 m"):
+    with pytest.warns(UserWarning, match=r"^points: .* 0\.5 m"):
         mcg.preprocess((points + UTM).astype(np.float32))
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        for resolved in (
-            points + UTM,
-            (points + np.array([0, 0, 1000.0])).astype(np.float32),
-            points.astype(np.float32),
-        ):
+        for resolved in (points + UTM, (points + 1000).astype(np.float32), points.astype(np.float32)):
             mcg.preprocess(resolved)

@@ -57,10 +57,6 @@ def imports(parts, tree):
             yield from (f"{base}.{alias.name}" for alias in node.names)
 
 
-def test_every_folder_has_its_place():
-    assert {parts[0] for _, parts, _ in files()} - {"__init__"} == set(LAYERS)
-
-
 def edges():
     """Which module imports which, for every pair, as paths without the name of the package."""
     modules = {".".join(parts).removesuffix(".__init__") for _, parts, _ in files()}

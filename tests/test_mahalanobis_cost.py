@@ -1,6 +1,7 @@
 """The cost, its kernels and its gradients, against NumPy and central differences."""
 
 import functools
+from dataclasses import replace
 
 import jax
 import jax.numpy as jnp
@@ -26,6 +27,7 @@ from mcgicp_jax.extend import KERNELS
 from tests import reference as ref
 from tests.compilations import compilations
 from tests.precision import cached, in_both_precisions, in_float64, tolerance
+from tests.refusals import refused
 from tests.scenes import matched_at, sums_at
 
 pytestmark = in_float64
@@ -87,8 +89,9 @@ def reference_cost(name, pose=T, source=None, target=None, rho=None, **numbers):
 
 
 @in_both_precisions
-@pytest.mark.parametrize("kernel", [None, *KERNELS])
-@pytest.mark.parametrize("name", METHODS)
+@pytest.mark.parametrize(
+    ("name", "kernel"), [*((name, None) for name in METHODS), *(("MultiChannelGICP", kernel) for kernel in KERNELS)]
+)
 def test_cost_against_the_reference(name, kernel):
     _, _, clouds, matches, _ = problem()
     robust = None if kernel is None else KERNELS[kernel](SCALE)
@@ -130,24 +133,21 @@ def test_soft_matches_against_the_reference(name):
     assert float(actual) == pytest.approx(expected, rel=tolerance(1e-4, 1e-10))
 
 
-@pytest.mark.parametrize("form", ["jax", "jaxlie"])
-def test_every_form_of_pose(form):
+def test_every_form_of_pose():
     _, _, clouds, matches, _ = problem()
-    pose = jnp.asarray(T) if form == "jax" else jaxlie.SE3.from_matrix(jnp.asarray(T))
-    actual = mahalanobis_cost(pose, *clouds, matches, METHODS["GICP"]())
-    assert float(actual) == pytest.approx(reference_cost("GICP"), rel=tolerance(1e-4, 1e-10))
+    for pose in (jnp.asarray(T), jaxlie.SE3.from_matrix(jnp.asarray(T))):
+        actual = mahalanobis_cost(pose, *clouds, matches, METHODS["GICP"]())
+        assert float(actual) == pytest.approx(reference_cost("GICP"), rel=1e-10)
 
 
-@pytest.mark.parametrize("kernel", [None, "cauchy"])
-def test_at_large_coordinates_the_cost_is_the_same(kernel):
+def test_at_large_coordinates_the_cost_is_the_same():
     utm = np.array([512_345.6, 5_403_210.9, 312.3])
     raw, _, _, matches, _ = problem()
     clouds = [preprocess(PointCloud(points + utm, channels), num_neighbors=K).pad(ROWS) for points, channels in raw]
     shift, back = np.eye(4), np.eye(4)
     shift[:3, 3], back[:3, 3] = utm, -utm
-    robust = None if kernel is None else Cauchy(SCALE)
-    rho = None if kernel is None else functools.partial(ref.ROBUST["cauchy"], c=SCALE)
-    actual = mahalanobis_cost(shift @ T @ back, *clouds, matches, METHODS["MultiChannelGICP"](), robust=robust)
+    rho = functools.partial(ref.ROBUST["cauchy"], c=SCALE)
+    actual = mahalanobis_cost(shift @ T @ back, *clouds, matches, METHODS["MultiChannelGICP"](), robust=Cauchy(SCALE))
     assert float(actual) == pytest.approx(reference_cost("MultiChannelGICP", rho=rho), rel=tolerance(1e-3, 1e-6))
 
 
@@ -164,15 +164,10 @@ def values_weights_and_slopes(kernel, squares):
 @pytest.mark.parametrize("scale", [0.1, 1.0, 7.0])
 @pytest.mark.parametrize("name", KERNELS)
 def test_kernels_against_the_reference(name, scale):
-    values, _, _ = values_weights_and_slopes(KERNELS[name](scale), SQUARES)
+    """And the weight is the derivative of ρ."""
+    values, weights, slopes = values_weights_and_slopes(KERNELS[name](scale), SQUARES)
     expected = [ref.ROBUST[name](s2, scale) for s2 in SQUARES]
     np.testing.assert_allclose(values, expected, rtol=tolerance(2e-5, 1e-9), atol=tolerance(3e-7, 1e-15) * scale**2)
-
-
-@in_both_precisions
-@pytest.mark.parametrize("scale", [0.1, 1.0, 7.0])
-@pytest.mark.parametrize("name", KERNELS)
-def test_the_weight_is_the_derivative_of_rho(name, scale):
     # Away from the corners of Huber and Tukey, where a central difference straddles two branches.
     away = (SQUARES > 1e-5) & (np.abs(SQUARES / scale**2 - 1) > 0.01)
     squares, step = SQUARES[away], 3e-4 * SQUARES[away]
@@ -180,7 +175,6 @@ def test_the_weight_is_the_derivative_of_rho(name, scale):
         (ref.ROBUST[name](s2 + h, scale) - ref.ROBUST[name](s2 - h, scale)) / (2 * h)
         for s2, h in zip(squares, step, strict=True)
     ]
-    _, weights, slopes = values_weights_and_slopes(KERNELS[name](scale), SQUARES)
     np.testing.assert_allclose(weights[SQUARES == 0], 1)
     np.testing.assert_allclose(weights[away], expected, rtol=tolerance(1e-4, 1e-5), atol=tolerance(1e-6, 1e-8))
     np.testing.assert_allclose(slopes[away], weights[away], rtol=tolerance(1e-4, 1e-10), atol=1e-6)
@@ -194,11 +188,10 @@ def test_gradients_of_kernels_are_finite(name):
         assert np.isfinite(jax.jit(jax.grad(lambda s2, function=function: jnp.sum(function(s2))))(squares)).all()
 
 
-@pytest.mark.parametrize("scale", [0, -1.0, np.nan, np.inf, np.ones(2)])
 @pytest.mark.parametrize("name", KERNELS)
-def test_a_scale_that_makes_no_sense(name, scale):
-    with pytest.raises(ValueError, match="scale"):
-        KERNELS[name](scale)
+def test_a_scale_that_makes_no_sense(name):
+    for scale in (0, -1.0, np.nan, np.inf, np.ones(2)):
+        refused(lambda scale=scale: KERNELS[name](scale), "scale")
 
 
 ARGUMENTS = ("pose", "source points", "target points", "source channels", "target channels", "Λ", "ε")
@@ -261,38 +254,25 @@ def test_gradients_against_differences_of_the_reference(name, argument):
     assert actual == pytest.approx(expected, rel=tolerance(5e-3, 1e-6), abs=tolerance(1e-4, 1e-9))
 
 
-def test_the_gradients_are_not_all_zero():
-    """What each method depends on, and on nothing else."""
-    sensitive = {name: {a for a, g in gradients(name).items() if np.any(g)} for name in METHODS}
-    points = {"pose", "source points", "target points"}
-    assert sensitive["PointToPoint"] == sensitive["ColorICP"] == sensitive["PointToPlane"] == points
-    assert sensitive["GICP"] == points | {"ε"}
-    assert sensitive["MultiChannelGICP"] == set(ARGUMENTS)
-
-
 def test_rows_without_a_match_add_nothing():
-    """Whatever they point at, and whatever lies there: the value and the gradient do not move."""
+    """Whatever they point at, and whatever lies there, even NaN: the value and the gradient do not move."""
     _, _, (source, target), matches, matched = problem()
     free = np.flatnonzero(matched < 0)[:5]
-    elsewhere = Correspondences(
-        indices=matches.indices.at[free].set(3), distances=matches.distances, valid=matches.valid
-    )
     for method in (make() for make in METHODS.values()):
         cost = mahalanobis_cost(T, source, target, matches, method)
-        np.testing.assert_allclose(mahalanobis_cost(T, source, target, elsewhere, method), cost, rtol=1e-6)
-
-
-def test_not_even_nan_where_there_is_no_match():
-    _, _, (source, target), matches, matched = problem()
-    free = np.flatnonzero(matched < 0)[:5]
-    points = jnp.asarray(source.points).at[free].set(jnp.nan)
+        elsewhere = mahalanobis_cost(
+            T, source, target, replace(matches, indices=matches.indices.at[free].set(3)), method
+        )
+        np.testing.assert_allclose(elsewhere, cost, rtol=1e-6)
+        assert mahalanobis_cost(T, source, target, replace(matches, valid=jnp.zeros(ROWS, bool)), method) == 0
 
     @jax.jit
     @jax.value_and_grad
     def cost(points):
         return mahalanobis_cost(T, source.replace(points=points), target, matches, PointToPoint(), robust=Huber(SCALE))
 
-    (value, gradient), (expected, gradient_of_all) = cost(points), cost(source.points)
+    nowhere = jnp.asarray(source.points).at[free].set(jnp.nan)
+    (value, gradient), (expected, gradient_of_all) = cost(nowhere), cost(source.points)
     assert value == expected
     np.testing.assert_array_equal(gradient, gradient_of_all)
 
@@ -322,31 +302,22 @@ def test_padding_of_given_covariances_adds_nothing():
         np.testing.assert_array_equal(gradient[N:], 0)
 
 
-def test_no_matches_cost_nothing():
-    _, _, clouds, matches, _ = problem()
-    none = Correspondences(indices=matches.indices, distances=matches.distances, valid=jnp.zeros(ROWS, bool))
-    for method in (make() for make in METHODS.values()):
-        assert mahalanobis_cost(T, *clouds, none, method) == 0
-
-
 def test_matches_of_another_cloud_are_refused():
     _, _, clouds, matches, _ = problem()
-    with pytest.raises(ValueError, match="matches"):
-        mahalanobis_cost(T, clouds[0].pad(200), clouds[1], matches, GICP())
+    refused(lambda: mahalanobis_cost(T, clouds[0].pad(200), clouds[1], matches, GICP()), "matches")
 
 
 def test_neighbourhoods_of_large_clouds_are_summed_inside_jit():
     """Block by block beyond 16,000 rows."""
     raw = [ref.scene(16_500, 0, seed)[0] for seed in (0, 1)]
     source, target = (preprocess(points, None) for points in raw)
-    for number, temperature in ((1, None), (3, 0.1)):
-        matches = find_correspondences(source, target, T, PointToPoint(), max_distance=0.3, num_candidates=number)
+    matches = find_correspondences(source, target, T, PointToPoint(), max_distance=0.3, num_candidates=3)
 
-        def cost(points, matches=matches, temperature=temperature):
-            moved = source.replace(points=points)
-            return mahalanobis_cost(T, moved, target, matches, PointToPoint(), temperature=temperature)
+    def cost(points):
+        moved = source.replace(points=points)
+        return mahalanobis_cost(T, moved, target, matches, PointToPoint(), temperature=0.1)
 
-        np.testing.assert_allclose(jax.jit(cost)(source.points), cost(source.points), rtol=1e-9)
+    np.testing.assert_allclose(jax.jit(cost)(source.points), cost(source.points), rtol=1e-9)
 
 
 def test_a_batch_is_its_lanes():
@@ -355,12 +326,12 @@ def test_a_batch_is_its_lanes():
     poses = jnp.asarray(np.stack([T, ref.pose([0.02, 0, 0], [0, 0.1, 0]), np.eye(4)]), dtype)
 
     def cost(pose):
-        return mahalanobis_cost(pose, source, target, matches, METHODS["MultiChannelGICP"]())
+        return mahalanobis_cost(pose, source, target, matches, METHODS["PointToPlane"]())
 
     values, slopes = jax.jit(jax.vmap(jax.value_and_grad(cost)))(poses)
     for i, pose in enumerate(poses):
         assert float(values[i]) == pytest.approx(
-            reference_cost("MultiChannelGICP", np.asarray(pose, float)), rel=tolerance(1e-4, 1e-6)
+            reference_cost("PointToPlane", np.asarray(pose, float)), rel=tolerance(1e-4, 1e-6)
         )
     assert np.isfinite(slopes).all()
 

@@ -86,10 +86,7 @@ def test_the_pose_inside_jit_of_a_padded_cloud_and_in_a_batch_is_the_same(clouds
         return result.matrix, result.overlap, result.covariance
 
     expected = mcg.register(source, target, method, max_source_points=150)
-    for name, found in {
-        "jit": jax.jit(pose)(padded, target),
-        "padded": pose(padded, target),
-    }.items():
+    for name, found in {"jit": jax.jit(pose)(padded, target), "padded": pose(padded, target)}.items():
         np.testing.assert_allclose(found[0], expected.matrix, atol=1e-9, err_msg=name)
         np.testing.assert_allclose(found[1], expected.overlap, atol=1e-9, err_msg=name)
         np.testing.assert_allclose(found[2], expected.covariance, rtol=1e-6, err_msg=name)
@@ -124,7 +121,7 @@ def test_compiled_programs_get_all_rows_of_a_target_that_is_computed_on_demand(c
     [
         pytest.param(mcg.MultiChannelGICP([0.05, 0.08], 0.3, epsilon=1e-2), id="mc-gicp", marks=pytest.mark.slow),
         pytest.param(mcg.GICP(epsilon=1e-2), id="gicp"),
-        pytest.param(mcg.PointToPoint(), id="point-to-point"),
+        pytest.param(mcg.PointToPoint(), id="point-to-point", marks=pytest.mark.slow),
     ],
 )
 def test_the_gradient_is_that_of_differences(clouds, method):
@@ -151,6 +148,7 @@ def test_the_gradient_is_that_of_differences(clouds, method):
     assert by_points.shape == (6, 400, 3) and by_points[:, used].any(axis=(0, 2)).mean() > 0.8
 
 
+@pytest.mark.slow
 def test_gradients_with_given_covariances_and_inside_jit(clouds):
     source, target = clouds
     source = source.replace(covariances=_matrices(mcg.GICP(), source))
@@ -169,20 +167,19 @@ def test_gradients_with_given_covariances_and_inside_jit(clouds):
         np.testing.assert_allclose(outside, inside, atol=1e-9 * np.abs(inside).max())
 
 
-@pytest.mark.parametrize("value", [0, -3, 3])
-def test_the_number_is_checked(clouds, value):
-    refused(lambda: mcg.register_batch(clouds, clouds, mcg.GICP(), max_source_points=value), "max_source_points", value)
+def test_the_number_is_checked(clouds):
+    for wrong in (0, -3, 3):
+        options = {"max_source_points": wrong}
+        refused(lambda o=options: mcg.register_batch(clouds, clouds, mcg.GICP(), **o), "max_source_points", wrong)
 
 
 def test_odometry_and_multiway_match_at_most_10000_points():
-    source, target, _ = pair(size=10_500)
-    *_, step = mcg.odometry([target, source], mcg.PointToPoint())
-    assert step.registration.num_inliers == round(float(step.registration.overlap) * 10_000)
-    *_, step = mcg.odometry([target, source], mcg.PointToPoint(), max_source_points=None)
-    assert step.registration.num_inliers == round(float(step.registration.overlap) * 10_500)
-    found = mcg.multiway([target, source], mcg.PointToPoint())
-    for result in found.registrations.values():
-        assert result.num_inliers == round(float(result.overlap) * 10_000)
+    clouds = pair(size=10_500)[1::-1]
+    steps = [list(mcg.odometry(clouds, mcg.PointToPoint(), **given))[1] for given in ({}, {"max_source_points": None})]
+    found = [step.registration for step in steps]
+    found += mcg.multiway(clouds, mcg.PointToPoint()).registrations.values()
+    matched = [round(result.num_inliers / float(result.overlap)) for result in found]
+    assert matched == [10_000, 10_500, 10_000]
 
 
 def test_the_command_line_takes_a_number_or_all(tmp_path, capsys):

@@ -13,6 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from mcgicp_jax.metrics import ate, kitti_errors, pose_error, rpe
 from tests.reference import pose
+from tests.refusals import refused
 
 EASY_ANGLES = [1e-9, 1e-5, 0.3, 1.7, 3.0, np.pi - 1e-5, np.pi - 1e-9]
 
@@ -50,32 +51,23 @@ def test_a_nan_pose_has_nan_errors():
             assert np.isnan(error(lost, np.eye(4))).all()
 
 
-PARTLY = np.eye(4)
-PARTLY[0, 0] = np.nan
-
-
-@pytest.mark.parametrize(
-    ("named", "call"),
-    [
-        ("T_true: ", lambda: pose_error(np.eye(4), PARTLY)),
-        ("T_true: ", lambda: pose_error(np.eye(4), 2 * np.eye(4))),
-        ("T: ", lambda: pose_error(PARTLY, np.eye(4))),
-        ("T: ", lambda: jax.jit(pose_error)(jnp.eye(3), jnp.eye(4))),
-        *[
-            ("at: ", lambda at=at: pose_error(np.eye(4), np.eye(4), at=at))
-            for at in (0.0, np.zeros(2), np.zeros((1, 3)))
-        ],
-        ("poses: .* 4 and 5", lambda: ate([np.eye(4)] * 4, [np.eye(4)] * 5)),
-        ("poses: ", lambda: ate([], [])),
-        (r"poses\[0\]: ", lambda: ate([2 * np.eye(4)], [np.eye(4)])),
-        ("delta: .* 2 poses, got 2", lambda: rpe([np.eye(4)] * 2, [np.eye(4)] * 2, 2)),
-        ("lengths: .* 0.0 m", lambda: kitti_errors([np.eye(4)] * 2, [np.eye(4)] * 2)),
-        ("alignment|parameter", lambda: ate([np.eye(4)], [np.eye(4)], alignment="best")),
-    ],
-)
-def test_wrong_arguments_are_refused_by_name(named, call):
-    with pytest.raises((ValueError, TypeError), match=f"^{named}" if named.endswith(" ") else named):
-        call()
+def test_wrong_arguments_are_refused_by_name():
+    here, partly = [np.eye(4)], np.eye(4)
+    partly[0, 0] = np.nan
+    for named, shown, call in (
+        ("T_true", "", lambda: pose_error(np.eye(4), partly)),
+        ("T_true", "", lambda: pose_error(np.eye(4), 2 * np.eye(4))),
+        ("T", "", lambda: pose_error(partly, np.eye(4))),
+        ("T", (3, 3), lambda: jax.jit(pose_error)(jnp.eye(3), jnp.eye(4))),
+        *(("at", "", lambda at=at: pose_error(*here, *here, at=at)) for at in (0.0, np.zeros(2), np.zeros((1, 3)))),
+        ("poses", "4 and 5", lambda: ate(here * 4, here * 5)),
+        ("poses", "", lambda: ate([], [])),
+        ("poses[0]", "", lambda: ate([2 * np.eye(4)], here)),
+        ("delta", 2, lambda: rpe(here * 2, here * 2, 2)),
+        ("lengths", 0.0, lambda: kitti_errors(here * 2, here * 2)),
+        ("alignment", "best", lambda: ate(here, here, alignment="best")),
+    ):
+        refused(call, named, shown)
 
 
 def test_the_error_is_that_of_the_point_asked_for():
@@ -101,22 +93,14 @@ def test_at_utm_coordinates_the_error_is_that_of_the_cloud():
         assert pose_error(T, np.eye(4))[0] > 1e-3
 
 
-@pytest.mark.parametrize("make", [jnp.asarray, lambda T: jaxlie.SE3.from_matrix(jnp.asarray(T))])
-def test_takes_every_form_of_pose(make):
-    rng = np.random.default_rng(3)
-    T, truth = random_pose(rng), random_pose(rng)
-    expected = pose_error(T, truth)
-    for got in (pose_error(make(T), truth), pose_error(T, make(truth)), pose_error(make(T), make(truth))):
-        assert all(isinstance(value, float) for value in got)
-        assert got == pytest.approx(expected, abs=1e-5)
-
-
 def test_jit_and_vmap_agree_with_the_concrete_answer():
     rng = np.random.default_rng(4)
     poses = np.stack([random_pose(rng) for _ in range(6)])
     truths = np.stack([random_pose(rng) for _ in range(6)])
     expected = np.array([pose_error(T, truth) for T, truth in zip(poses, truths, strict=True)]).T
     T, T_true = jnp.asarray(poses), jnp.asarray(truths)
+    for got in (pose_error(T[0], truths[0]), pose_error(jaxlie.SE3.from_matrix(T[0]), T_true[0])):
+        assert all(isinstance(value, float) for value in got) and got == pytest.approx(expected[:, 0], abs=2e-5)
     np.testing.assert_allclose(jax.vmap(pose_error)(T, T_true), expected, atol=2e-5)
     np.testing.assert_allclose(jax.jit(pose_error)(T[0], truths[0]), expected[:, 0], atol=2e-5)
     as_se3 = jax.jit(jax.vmap(jaxlie.SE3.from_matrix))(T)
@@ -159,14 +143,6 @@ def test_the_gradient_along_a_turn_or_a_shift_is_one(distance):
             gradient = FORWARD(direction, distance, truth)
             assert float(gradient[i]) == pytest.approx(1, abs=1e-7)
             np.testing.assert_allclose(BACKWARD(direction, distance, truth), gradient, atol=1e-9)
-
-
-def test_vmap_of_grad_is_finite_where_some_lanes_have_no_error():
-    truth = jnp.eye(4)
-    poses = jnp.stack([truth, truth.at[0, 3].set(0.5)])
-    gradients = jax.jit(jax.vmap(jax.grad(lambda T: sum(pose_error(T, truth)))))(poses)
-    assert np.isfinite(gradients).all()
-    np.testing.assert_allclose(gradients[1, 0, 3], 1, atol=1e-6)
 
 
 # Trajectories

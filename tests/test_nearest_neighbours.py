@@ -22,6 +22,7 @@ from mcgicp_jax import (
 from mcgicp_jax.extend import SearchPoints
 from tests import reference as ref
 from tests.precision import tolerance
+from tests.refusals import refused
 
 SIZES = {"source": 150, "target": 140}
 T = ref.pose([0.1, -0.2, 0.3], [0.05, 0.1, -0.02])
@@ -99,46 +100,42 @@ def test_several_candidates(num_candidates):
     np.testing.assert_array_equal(found.T, ref.nearest(source, target, num_candidates))
 
 
+STILL = np.array([1.0, 0, 0, 0, 0, 0, 0])
+
+
+def rows_with_missing_channels(seed, sizes, high, squares, share):
+    """Integers everywhere, hence with ties: as plain rows, with their masks, and as what is searched."""
+    rows = [integers((size, 3 + len(squares)), high, seed + i) for i, size in enumerate(sizes)]
+    masks = np.split(np.random.default_rng(seed).random((sum(sizes), len(squares))) < share, [sizes[0]])
+    searched = [
+        SearchPoints(row[:, :3], np.where(mask, row[:, 3:], 0), np.ones(len(row), bool), np.where(mask, 0, squares))
+        for row, mask in zip(rows, masks, strict=True)
+    ]
+    return rows, masks, searched
+
+
 @settings(max_examples=25, deadline=None)
 @given(seed=st.integers(0, 2**31), share=st.floats(0, 1), k=st.sampled_from([1, 3]), missing=st.integers(1, 4))
 def test_nearest_with_missing_channels(seed, share, k, missing):
-    """By brute force, with ties: integers everywhere."""
-    rows = [integers((size, 5), 4, seed + i) for i, size in enumerate((40, 50))]
-    masks = np.split(np.random.default_rng(seed).random((90, 2)) < share, [40])
     squares = np.array([float(missing), 2.0])
-    source, target = (
-        SearchPoints(
-            points=row[:, :3],
-            descriptors=np.where(mask, row[:, 3:], 0),
-            valid=np.ones(len(row), bool),
-            penalty=np.where(mask, 0, squares),
-        )
-        for row, mask in zip(rows, masks, strict=True)
-    )
-    still = np.array([1.0, 0, 0, 0, 0, 0, 0])
-    found = KDTreeSearch().index(target).nearest(still, source, np.inf, k)
+    rows, masks, (source, target) = rows_with_missing_channels(seed, (40, 50), 4, squares, share)
+    found = KDTreeSearch().index(target).nearest(STILL, source, np.inf, k)
     np.testing.assert_array_equal(found.T, ref.match_partial(*rows, *masks, squares, k))
     # One of the two clouds may lack nothing.
     whole = eqx.tree_at(lambda rows: rows.penalty, target, None)
-    found = KDTreeSearch().index(whole).nearest(still, source, np.inf, k)
+    found = KDTreeSearch().index(whole).nearest(STILL, source, np.inf, k)
     expected = ref.match_partial(rows[0], np.hstack([rows[1][:, :3], whole.descriptors]), masks[0], True, squares, k)
     np.testing.assert_array_equal(found.T, expected)
 
 
 @pytest.mark.parametrize("k", [1, 3])
 def test_many_sets_of_missing_channels(k):
-    """Five channels, each there or not at random, hence more sets than have their trees kept: by brute force."""
-    rows = [integers((size, 8), 50, i) for i, size in enumerate((150, 200))]
-    masks = np.split(np.random.default_rng(0).random((350, 5)) < 0.6, [150])
+    """Five channels, each there or not at random, hence more sets than have their trees kept."""
     squares = np.arange(1.0, 6.0)
-    source, target = (
-        SearchPoints(row[:, :3], np.where(mask, row[:, 3:], 0), np.ones(len(row), bool), np.where(mask, 0, squares))
-        for row, mask in zip(rows, masks, strict=True)
-    )
+    rows, masks, (source, target) = rows_with_missing_channels(0, (150, 200), 50, squares, 0.6)
     index = KDTreeSearch().index(target)
-    still = np.array([1.0, 0, 0, 0, 0, 0, 0])
     expected = ref.match_partial(*rows, *masks, squares, k)
-    np.testing.assert_array_equal(index.nearest(still, source, np.inf, k).T, expected)
+    np.testing.assert_array_equal(index.nearest(STILL, source, np.inf, k).T, expected)
     # From pose to pose, too, where what is known from the pose before is used.
     follow = index.follow(source, np.inf)
     for i in range(4):
@@ -178,8 +175,8 @@ def test_missing_channels_count_as_in_a_true_match(method):
     np.testing.assert_array_equal(np.asarray(found.indices)[:150], expected)
 
 
-@pytest.mark.parametrize("max_distance", [0.05, 0.2, 1.0, np.inf])
-@pytest.mark.parametrize("weights", [None, 0.0, 0.3, np.array([0.1, 0.0, 2.0])], ids=str)
+@pytest.mark.parametrize("max_distance", [0.05, 0.2, np.inf])
+@pytest.mark.parametrize("weights", [None, 0.3, np.array([0.1, 0.0, 2.0])], ids=str)
 def test_correspondences_against_the_reference(weights, max_distance):
     """Only the position turns; channels take part in the search, if the method uses them, and not in the gate."""
     (source, target), ((a, ca), (b, cb)) = clouds()
@@ -275,17 +272,12 @@ def test_values_that_are_not_finite_match_nothing(which, what):
     assert np.sum(found.valid) > 50
 
 
-@pytest.mark.parametrize("max_distance", [0, -1.0, np.nan, np.ones(2)])
-def test_a_gate_that_makes_no_sense(max_distance):
-    with pytest.raises(ValueError, match="max_distance: "):
-        find_correspondences(*clouds()[0], T, PointToPoint(), max_distance=max_distance)
-
-
-def test_channels_that_do_not_fit():
-    source, target = clouds(3)[0][0], clouds(1)[0][1]
-    with pytest.raises(ValueError, match=r"channels.*3 and 1"):
-        find_correspondences(source, target, T, ColorICP(0.1), max_distance=1.0)
-    find_correspondences(source, target, T, PointToPoint(), max_distance=1.0)
+def test_what_makes_no_sense_is_named():
+    (source, target), (_, single) = clouds()[0], clouds(1)[0]
+    for gate in (0, -1.0, np.nan, np.ones(2)):
+        refused(lambda g=gate: find_correspondences(source, target, T, PointToPoint(), max_distance=g), "max_distance")
+    refused(lambda: find_correspondences(source, single, T, ColorICP(0.1), max_distance=1.0), "channels", "3 and 1")
+    find_correspondences(source, single, T, PointToPoint(), max_distance=1.0)
 
 
 @settings(max_examples=25, deadline=None)
@@ -331,6 +323,7 @@ def test_a_pose_that_is_not_a_number_matches_nothing():
     assert (nearest(np.array([1.0, 0, 0, 0, 0, 0, 0])) >= 0).any(axis=1).all()
 
 
+@pytest.mark.slow
 def test_lanes_that_have_ended_are_not_searched():
     """In a batched loop the body runs for them, too."""
     (source, target), _ = clouds()

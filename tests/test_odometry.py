@@ -14,7 +14,6 @@ from hypothesis import strategies as st
 
 import mcgicp_jax as mcg
 from mcgicp_jax import datasets, metrics
-from tests.precision import in_both_precisions
 from tests.refusals import refused
 from tests.scenes import motion
 
@@ -101,7 +100,6 @@ def test_a_target_has_one_tree_and_a_map_slides(room, against, radius):
     assert used <= 300 * sum(int(step.registration.num_iterations) + 1 for step in steps[1:])
 
 
-@in_both_precisions
 def test_rows_computed_when_they_are_used_change_nothing(room):
     """And each pair starts from the motion before."""
     frames, _ = room
@@ -199,14 +197,6 @@ def test_a_map_is_the_mean_of_each_voxel(seed, count, voxel_size, partial):
                 assert channel[column] == pytest.approx(present.mean(), abs=1e-9)
 
 
-def test_a_map_of_the_room_is_sharp_at_the_true_poses(room):
-    frames, truth = room
-    clouds = [frame.cloud for frame in frames]
-    sharp = mcg.merge_clouds(clouds, truth, 0.05)
-    blurred = mcg.merge_clouds(clouds, [pose @ motion((0, 0, 0, 0.1 * i, 0, 0)) for i, pose in enumerate(truth)], 0.05)
-    assert len(sharp) < len(blurred) < sum(map(len, clouds))
-
-
 def test_a_map_may_lie_at_utm_coordinates(room):
     frames, truth = room
     clouds, offset = [frame.cloud for frame in frames[:2]], np.array([500_000, 5_400_000, 100])
@@ -233,13 +223,6 @@ def test_what_makes_no_map_is_refused_by_name(room):
         refused(lambda arguments=arguments: mcg.merge_clouds(*arguments), named, shown)
 
 
-def test_a_frame_that_is_no_cloud_is_named_by_its_number(room):
-    frames, _ = room
-    steps = mcg.odometry([frames[0], np.zeros((2, 3))], mcg.GICP(), num_neighbors=12)
-    assert next(steps).cloud.neighbors.shape[1] == 12
-    refused(lambda: next(steps), "frames[1]: cloud", "got 2")
-
-
 def test_a_map_drifts_less():
     frames = datasets.box_room(10, points_per_frame=2000, step=0.08)
     truth = [frames.path(i) for i in range(10)]
@@ -259,8 +242,10 @@ def test_a_map_drifts_less():
 def test_the_frames_after_an_invalid_one_go_on(room):
     frames, truth = room
     broken = [frames[0], frames[1], mcg.PointCloud(np.zeros((2, 3))), frames[2], frames[3]]
-    steps = mcg.odometry(broken, mcg.GICP(), max_distance=0.5, start=truth[0])
-    poses = [next(steps).pose for _ in range(2)]
+    steps = mcg.odometry(broken, mcg.GICP(), max_distance=0.5, start=truth[0], num_neighbors=12)
+    first, second = next(steps), next(steps)
+    assert first.cloud.neighbors.shape[1] == 12
+    poses = [first.pose, second.pose]
     refused(lambda: next(steps), "frames[2]: cloud", "got 2")
     poses += [step.pose for step in steps]
     assert len(poses) == 4 and metrics.ate(poses, truth[:4], alignment="first") < 0.03

@@ -21,7 +21,8 @@ from tests.batches import raw_pair
 from tests.benchmarks.noise_scenes import street
 from tests.corridor import corridor
 from tests.precision import in_float64
-from tests.scenes import SURFACES, motion, pair, prepare, room_corner, wall
+from tests.refusals import refused
+from tests.scenes import SURFACES, motion, pair, prepare, wall
 
 
 def matrices(symmetric):
@@ -51,7 +52,7 @@ def test_a_flat_wall_is_observed_along_its_normal_alone(size, turn):
     assert within[0] > -2e-3 and within[1] < 5e-4
 
 
-@pytest.mark.parametrize("size", [100, 300, 1000])
+@pytest.mark.parametrize("size", [100, 1000])
 def test_random_points_are_registered(size):
     """Their neighbourhoods are no surfaces."""
     target, truth = np.random.default_rng(size).random((size, 3)), motion((0.02, -0.01, 0.03, 0.02, -0.03, 0.01))
@@ -77,7 +78,7 @@ def test_padding_changes_no_pose_and_no_deviation(method):
     np.testing.assert_allclose(padded.deviations, result.deviations, rtol=1e-4)
 
 
-@pytest.mark.parametrize("noise", [0.25, 0.75, 1.0])
+@pytest.mark.parametrize("noise", [0.25, 1.0])
 @pytest.mark.parametrize("name, free", [("plane", (0, 1)), ("crossing planes", (0,)), ("room", ())])
 def test_noise_as_large_as_the_spacing_constrains_nothing(name, free, noise):
     """Noise in units of the spacing. With one normal of all neighbours, up to 0.05 of the free motions was observed."""
@@ -89,7 +90,7 @@ def test_noise_as_large_as_the_spacing_constrains_nothing(name, free, noise):
     assert np.all(np.diag(geometry)[list(free)] < GEOMETRY_HOLDS) and np.all(np.diag(geometry)[constrained] > 0.02)
 
 
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("seed", range(2))
 def test_a_noisy_street_is_observed_along_the_road(seed):
     """By the 4 % of its points that lie on surfaces across it, such as the ends of parked cars."""
     cloud = mcg.preprocess(street(np.random.default_rng(seed), 3000, 0.5), None)
@@ -260,12 +261,6 @@ def test_the_channels_hold_what_geometry_leaves_free(flat):
     assert repr(result).count("constrained by channels: all") == 1
 
 
-def test_nothing_is_free_in_a_corner():
-    source, target, _ = pair()
-    result = mcg.register(source, target, mcg.GICP(), max_distance=0.5)
-    assert result.converged and result.unconstrained_directions == () and "unconstrained" not in repr(result)
-
-
 @pytest.mark.parametrize("textured", [True, False])
 def test_a_corridor_is_free_along_its_axis(textured):
     target, source = corridor(2, textured=textured)
@@ -300,7 +295,7 @@ def test_units_and_origin_change_nothing(scale, shift):
 
 @pytest.mark.slow
 def test_real_scenes(data):
-    """A flat table and a road leave three directions free, a street none."""
+    """A flat table leaves three directions free, a street none."""
     file = np.load(data / "planar_table" / "pair_000015_000025.npz")
     table = [
         mcg.preprocess(mcg.PointCloud(file[f"{which}_points_flat"], file[f"{which}_rgb"]), 0.01)
@@ -308,35 +303,15 @@ def test_real_scenes(data):
     ]
     scans = [np.fromfile(data / f"kitti/sequences/04/velodyne/{i:06d}.bin", np.float32).reshape(-1, 4) for i in (1, 0)]
     street = [mcg.preprocess(mcg.PointCloud(scan[:, :3], scan[:, 3:]), 0.25) for scan in scans]
-    road = [mcg.preprocess(mcg.PointCloud(scan[:, :3], scan[:, 3:]), 0.1) for scan in map(on_the_road, scans)]
 
     result = mcg.register(*table, mcg.GICP(), max_distance=0.1)
     assert result.status is mcg.Status.DEGENERATE
     assert [direction.is_rotation for direction in result.unconstrained_directions] == [False, False, True]
     result = mcg.register(*table, mcg.MultiChannelGICP(), max_distance=0.1)
-    assert (
-        result.converged and [direction.held_by_channels for direction in result.unconstrained_directions] == [True] * 3
-    )
-
-    result = mcg.register(*road, mcg.GICP(), init=motion((1.3, 0, 0, 0, 0, 0)), max_distance=0.5)
-    assert result.status is mcg.Status.DEGENERATE
-    forward, sideways, yaw = result.unconstrained_directions
-    assert abs(forward.axis[0]) > 0.99 and abs(sideways.axis[1]) > 0.99
-    assert yaw.is_rotation and abs(yaw.axis[2]) > 0.99
+    assert result.converged and [each.held_by_channels for each in result.unconstrained_directions] == [True] * 3
 
     result = mcg.register(*street, mcg.GICP(), max_distance=1.5)
     assert result.converged and result.unconstrained_directions == ()
-
-
-def on_the_road(scan):
-    """Points of the ground ahead: within 25 m, 6 m to each side, 6 cm of its plane."""
-    scan = scan[(np.abs(scan[:, 1]) < 6) & (np.hypot(scan[:, 0], scan[:, 1]) < 25)]
-    plane, near = None, np.abs(scan[:, 2] + 1.73) < 0.3
-    for _ in range(10):
-        x, y, z = scan[near, :3].T
-        plane = np.linalg.lstsq(np.stack([x, y, np.ones_like(x)], axis=1), z, rcond=None)[0]
-        near = np.abs(scan[:, 2] - scan[:, :2] @ plane[:2] - plane[2]) < 0.06
-    return scan[near]
 
 
 # Covariance
@@ -378,6 +353,7 @@ def test_the_covariance_is_a_covariance():
         assert np.linalg.eigvalsh(covariance / np.sqrt(np.outer(*[np.diagonal(covariance)] * 2))).min() > 0
         # 2000 points of 1 cm noise: millimetres, milliradians
         assert np.all(np.sqrt(np.diagonal(covariance)) < 6e-3) and np.all(np.sqrt(np.diagonal(covariance)) > 1e-4)
+        assert result.converged and result.unconstrained_directions == () and "unconstrained" not in repr(result)
 
 
 @in_float64
@@ -413,16 +389,6 @@ def test_what_nothing_holds_is_not_known(flat):
         # A motion of one metre, of ten times the radius
         scaled = direction.twist / (direction.twist @ direction.twist)
         assert scaled @ np.asarray(result.covariance) @ scaled > 1
-    held = np.asarray(result.directions.twists)[np.asarray(result.directions.held)]
-    coefficients = np.linalg.inv(np.asarray(result.directions.twists, np.float64).T)[np.asarray(result.directions.held)]
-    assert len(held) == 3
-    assert np.sqrt(np.diagonal(coefficients @ result.covariance @ coefficients.T)).max() < 5e-3
-
-
-def test_without_a_pose_there_is_no_covariance():
-    source, target, _ = pair()
-    result = mcg.register(source, target, mcg.GICP(), init=motion((50, 0, 0, 0, 0, 0)), max_distance=0.5)
-    assert np.all(np.isnan(result.covariance)) and result.unconstrained_directions == () and result.overlap == 0
 
 
 def test_large_coordinates_keep_the_covariance_of_the_points():
@@ -446,25 +412,30 @@ def test_large_coordinates_keep_the_covariance_of_the_points():
     assert far.deviations.max() < 5e-3 < np.sqrt(far.covariance[0, 0])
 
 
+@pytest.mark.slow
 def test_traced_and_batched_results_carry_the_same():
     """Clouds of several sizes, stacked."""
-    clouds = [pair(size=2000 - 100 * i, truth=motion((0.02 * i, 0.01, 0, 0.01, 0, 0.02)))[:2] for i in range(3)]
+    clouds = [pair(size=500 - 50 * i, truth=motion((0.02 * i, 0.01, 0, 0.01, 0, 0.02)))[:2] for i in range(3)]
     stacked = [mcg.PointCloud.stack([clouds[i][which] for i in range(3)]) for which in (0, 1)]
     options = {"max_distance": 0.5, "search": mcg.DenseSearch()}
     batch = jax.jit(jax.vmap(lambda s, t: mcg.register(s, t, mcg.GICP(), **options)))(*stacked)
-    with pytest.raises(ValueError, match="unconstrained_directions"):
-        _ = batch.unconstrained_directions
+    refused(lambda: batch.unconstrained_directions, "unconstrained_directions")
     for i, (source, target) in enumerate(clouds):
         alone = mcg.register(source, target, mcg.GICP(), **options)
         assert batch.status[i] == alone.status
         np.testing.assert_allclose(batch.matrix[i], alone.matrix, atol=1e-3)
         np.testing.assert_allclose(batch.directions.geometry[i], alone.directions.geometry, atol=1e-3)
-        np.testing.assert_allclose(
-            np.sqrt(np.diagonal(batch.covariance[i])), np.sqrt(np.diagonal(alone.covariance)), rtol=0.05
-        )
+        np.testing.assert_allclose(batch.deviations[i], alone.deviations, rtol=0.05)
 
 
-@pytest.mark.parametrize("method", [mcg.GICP(), mcg.NDT(), mcg.D2DNDT()], ids=["gicp", "ndt", "d2d-ndt"])
+@pytest.mark.parametrize(
+    "method",
+    [
+        pytest.param(mcg.GICP(), id="gicp"),
+        pytest.param(mcg.NDT(), id="ndt", marks=pytest.mark.slow),
+        pytest.param(mcg.D2DNDT(), id="d2d-ndt"),
+    ],
+)
 def test_the_claims_hold_on_average(method):
     """A few simulated pairs: enough to see a covariance that is wrong by a factor of two in standard deviation."""
     room = datasets.box_room(2, points_per_frame=2000 if method.needs_covariances == () else 5000)
@@ -484,13 +455,6 @@ def test_the_claims_hold_on_average(method):
     assert 0.5 < np.mean(squares) < 1.9
 
 
-def test_the_corner_of_a_room_is_what_it_says():
-    """The painted corner: evidence of geometry and of channels are both plenty."""
-    cloud = mcg.preprocess(mcg.PointCloud(*room_corner(2000)))
-    geometry, channels = mean_evidence(cloud, mcg.MultiChannelGICP().resolve(cloud, cloud))
-    assert np.linalg.eigvalsh(geometry).min() > 0.2 and np.linalg.eigvalsh(channels).min() > 0.05
-
-
 def test_deviations_are_those_of_the_matched_points():
     """By sampling: poses drawn from the covariance move the centroid, and turn, as much as the deviations say."""
     source, target, _ = pair(truth=motion((0.1, -0.2, 0.05, 0.3, 0.2, 1.2)))
@@ -504,9 +468,6 @@ def test_deviations_are_those_of_the_matched_points():
     shifts = moved @ centroid - matrix @ centroid
     turns = Rotation.from_matrix(moved[:, :3, :3] @ matrix[:3, :3].T).as_rotvec()
     np.testing.assert_allclose(result.deviations, [*np.std(shifts, axis=0)[:3], *np.std(turns, axis=0)], rtol=0.06)
-    options = {"init": result.matrix, "max_distance": 0.5, "search": mcg.DenseSearch()}
-    inside = jax.jit(lambda source: mcg.register(source, target, mcg.GICP(), **options))
-    np.testing.assert_allclose(inside(source).deviations, result.deviations, rtol=0.05)
 
 
 def test_constrained_directions_keep_their_variances_beside_free_ones():

@@ -54,27 +54,16 @@ def test_rounding_does_not_decide_the_status_inside_transformations():
 
 
 @in_float64
-def test_covariances_are_blocks_of_the_inverse(both):
-    _, found, inside, _ = both
-    dense = np.asarray(inside.covariance)
-    deviations = np.sqrt(np.diagonal(found.covariance, 0, 1, 2))[1:]
-    difference = (found.covariance - dense)[1:] / deviations[:, :, None] / deviations[:, None]
-    assert np.abs(difference).max() < 1e-4
-
-
-@in_float64
-def test_transformations_give_the_same_poses(both):
-    _, expected, found, _ = both
+def test_transformations_give_the_same_poses_and_derivatives(both):
+    graph, expected, found, slope = both
+    check_slope(graph, slope)
     assert found.converged and found.status == mcg.Status.CONVERGED
     np.testing.assert_allclose(found.cost, expected.cost, rtol=1e-4)
     np.testing.assert_allclose(found.poses, expected.poses, atol=2e-3)
     np.testing.assert_allclose(found.residuals, expected.residuals, atol=0.05)
-
-
-@in_float64
-def test_the_derivative_is_that_of_finite_differences(both):
-    graph, _, _, slope = both
-    check_slope(graph, slope)
+    deviations = np.sqrt(np.diagonal(expected.covariance, 0, 1, 2))[1:]
+    difference = np.asarray(expected.covariance - found.covariance)[1:] / deviations[:, :, None] / deviations[:, None]
+    assert np.abs(difference).max() < 1e-4
 
 
 def test_priors_give_the_same_inside_transformations(both):
@@ -139,7 +128,7 @@ def weighted_sum(step, graph, twists, scale):
 compiled_gradient = jax.jit(jax.grad(weighted_sum))
 
 
-@pytest.mark.parametrize("seed", range(8))
+@pytest.mark.parametrize("seed", range(3))
 def test_gradients_of_precise_graphs_are_right_in_float32(seed):
     graph, rng = circle(seed), np.random.default_rng(seed)
     twists, scale = 1e-3 * rng.normal(size=(len(graph.edges), 6)), rng.normal(size=(len(graph.poses), 4, 4))

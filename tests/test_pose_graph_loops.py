@@ -56,7 +56,7 @@ def test_a_loop_is_rejected_only_beyond_its_own_uncertainty_and_that_of_the_othe
 
 
 @pytest.mark.parametrize("name", SMALL)
-@pytest.mark.parametrize("fraction", [0.1, 0.3, 0.5])
+@pytest.mark.parametrize("fraction", [0.1, 0.5])
 def test_false_loops_are_rejected(name, fraction):
     poses, loops = SMALL[name]
     clean, _ = measured(poses, loops)

@@ -53,8 +53,6 @@ class Given(AbstractTerm):
 # With data as arguments, so that all tests share a program.
 measure = jax.jit(lambda matched, term: sums_of(Motion(jnp.eye(3), jnp.zeros(3)), matched, (term,)))
 update_of = jax.jit(_solve.solve_update)
-least_squares = jax.jit(lambda root: _solve._least_squares(root, jnp.eye(6)).stats["num_steps"])
-semidefinite_root = jax.jit(_solve._semidefinite_root)
 
 
 def solve(moved, residual, information, weight, valid):
@@ -89,7 +87,7 @@ def test_update_is_the_least_squares_answer_on_all_residuals(scale, offset):
     assert not update.degenerate
 
 
-@pytest.mark.parametrize("scale", [1, 1e-3, 1e3])
+@pytest.mark.parametrize("scale", [1, 1e-3])
 def test_information_is_the_sum_of_jacobians(scale):
     moved, residual, information, weight, valid = random_pairs(1, scale)
     measured, update = solve(moved, residual, information, weight, valid)
@@ -121,29 +119,6 @@ def test_too_few_matches_go_before_convergence(before, count):
     assert status == (enough[before] if count >= 4 else Status.TOO_FEW_CORRESPONDENCES)
 
 
-def test_exact_pairs_need_no_second_update():
-    moved, residual, information, weight, valid = random_pairs(2, noise=0.0)
-    measured, update = solve(moved, residual, information, weight, valid)
-    turn = Rotation.from_rotvec(np.array(update.twist[3:], float))
-    center = np.asarray(measured.center, float)
-    change = turn.apply(moved - center) + center + np.asarray(update.twist[:3], float) - moved
-    np.testing.assert_allclose(change[valid], residual[valid], atol=tolerance(1e-5, 1e-10))
-
-
-def test_rounding_at_the_minimum_costs_no_steps():
-    """There, chance decides whether the rounded cost falls and whether the last digits rest: either alone can take
-    all steps that there are."""
-
-    @jax.jit
-    def root_of(measured, update):
-        scale = _solve._HESSIAN_SCALE / jnp.mean(jnp.diagonal(update.information))
-        root, _ = semidefinite_root(_solve._quadratic_form(measured, measured.radius) * scale)
-        return root
-
-    steps = [least_squares(root_of(*solve(*random_pairs(seed)))) for seed in range(10)]
-    assert max(steps) < 16
-
-
 @pytest.mark.parametrize("missing", ["no pairs", "one direction"])
 def test_unconstrained_directions_stay_where_they_are(missing):
     moved, residual, information, weight, valid = random_pairs(3)
@@ -157,12 +132,3 @@ def test_unconstrained_directions_stay_where_they_are(missing):
     assert update.degenerate
     assert np.isfinite(update.twist).all()
     np.testing.assert_allclose(update.twist[2] if missing == "one direction" else update.twist, 0, atol=1e-2)
-
-
-@pytest.mark.parametrize("rank", [13, 7, 0])
-def test_square_root_of_semidefinite_matrices(rank):
-    factor = np.random.default_rng(rank).normal(size=(13, max(rank, 1))) * (rank > 0)
-    form = factor @ factor.T
-    root, pivots = semidefinite_root(jnp.asarray(form, float))
-    np.testing.assert_allclose(root @ root.T, form, atol=tolerance(1e-3, 1e-10))
-    assert np.sum(np.asarray(pivots) > 1e-3) == rank

@@ -53,17 +53,8 @@ def test_every_method_finds_the_pose(name, room):
     np.testing.assert_allclose(result.T_target_source.as_matrix(), result.matrix, atol=1e-6)
 
 
-@pytest.mark.parametrize("name", ["gicp", "mc-gicp"])
-def test_swapped_clouds_give_the_inverse(name, room):
-    source, target, _ = room
-    forward = mcg.register(source, target, METHODS[name](), max_distance=0.5, **tight())
-    backward = mcg.register(target, source, METHODS[name](), max_distance=0.5, **tight())
-    # Each direction has its own matches, so the answers agree to the noise of matching.
-    assert difference(forward.matrix @ backward.matrix, np.eye(4)) < 2e-3
-
-
 @in_both_precisions
-@pytest.mark.parametrize("name", ["gicp", "mc-gicp", "point-to-plane", "color-icp"])
+@pytest.mark.parametrize("name", ["mc-gicp", "point-to-plane"])
 def test_moving_a_cloud_moves_the_answer(name, room):
     source, target, _ = room
     move = motion((0.3, -0.2, 0.5, 0.4, -0.7, 1.1))
@@ -76,14 +67,13 @@ def test_moving_a_cloud_moves_the_answer(name, room):
     assert difference(np.linalg.inv(move) @ moved.matrix, before.matrix) < tolerance(5e-5, 1e-8)
 
 
-@pytest.mark.parametrize("name", ["gicp", "mc-gicp"])
-def test_four_noisy_starts_reach_one_pose(name, room):
+def test_four_noisy_starts_reach_one_pose(room):
     source, target, truth = room
     rng = np.random.default_rng(0)
     poses = []
     for _ in range(4):
         start = truth @ motion(np.concatenate([rng.normal(scale=0.05, size=3), rng.normal(scale=0.03, size=3)]))
-        result = mcg.register(source, target, METHODS[name](), init=start, max_distance=0.5, **tight())
+        result = mcg.register(source, target, METHODS["mc-gicp"](), init=start, max_distance=0.5, **tight())
         assert difference(start, truth) > 0.01
         poses.append(result.matrix)
     assert max(difference(pose, poses[0]) for pose in poses) < 1e-3
@@ -136,7 +126,7 @@ def test_estimate_pose_reaches_the_balance_of_forces(room):
     assert difference(result.matrix, again.matrix) < tolerance(2e-6, 1e-10)
 
 
-@pytest.mark.parametrize("robust", [mcg.Huber, mcg.Cauchy, mcg.GemanMcClure, mcg.Tukey])
+@pytest.mark.parametrize("robust", [mcg.Huber, mcg.Tukey])
 def test_robust_kernels_resist_outliers(robust):
     truth = motion()
     points, channels = room_corner(2000, seed=1)
@@ -167,7 +157,8 @@ def test_clouds_without_overlap_do_not_converge(room):
     source, target, _ = room
     result = mcg.register(source, target, mcg.GICP(), init=motion((50, 0, 0, 0, 0, 0)), max_distance=0.5)
     assert result.status is Status.TOO_FEW_CORRESPONDENCES
-    assert not result.converged and result.num_inliers == 0 and result.cost == 0 and np.isnan(result.rmse)
+    assert not result.converged and result.num_inliers == result.overlap == result.cost == 0 and np.isnan(result.rmse)
+    assert np.isnan(result.covariance).all() and result.unconstrained_directions == ()
     np.testing.assert_allclose(result.matrix, motion((50, 0, 0, 0, 0, 0)))
     assert "TOO_FEW_CORRESPONDENCES" in repr(result)
 
@@ -185,7 +176,7 @@ def test_every_status_but_success_has_an_advice():
     assert [status for status in Status if not status.advice] == [Status.CONVERGED]
 
 
-@pytest.mark.parametrize("seed", [4, 6, 11, 39])
+@pytest.mark.parametrize("seed", [4, 39])
 def test_alternating_matches_end_as_converged(seed):
     clouds = [mcg.PointCloud(*room_corner(500, seed=each)) for each in (seed, seed + 100)]
     tolerances = {"translation_tolerance": 1e-6, "rotation_tolerance": 1e-6}
@@ -225,22 +216,7 @@ def test_points_that_are_not_finite_are_reported(value, room):
     assert difference(broken_row.matrix, whole.matrix) < 1e-3
 
 
-def test_identical_clouds_converge_at_once(room):
-    source, _, _ = room
-    result = mcg.register(source, source, METHODS["mc-gicp"](), max_distance=0.5)
-    assert result.converged and result.num_iterations == 1
-    np.testing.assert_allclose(result.matrix, np.eye(4), atol=1e-6)
-
-
 # --- Input
-
-
-def test_bare_arrays_are_enough():
-    truth = motion()
-    points, _ = room_corner(2000, seed=1)
-    target, _ = room_corner(2000, seed=2)
-    result = mcg.register((points - truth[:3, 3]) @ truth[:3, :3], target.tolist(), mcg.GICP(), max_distance=0.5)
-    assert result.converged and difference(result.matrix, truth) < 4e-3
 
 
 @pytest.mark.parametrize(
@@ -259,11 +235,6 @@ def test_bare_arrays_are_enough():
 )
 def test_a_bad_argument_is_named(name, value, room):
     refused(lambda: mcg.register(*room[:2], mcg.GICP(), **{"max_distance": 0.5, name: value}), name)
-
-
-@pytest.mark.parametrize("size, named, shown", [((0, 3), "cloud", "got 0"), ((10, 2), "points", "(10, 2)")])
-def test_a_bad_cloud_is_named(size, named, shown, room):
-    refused(lambda: mcg.register(np.zeros(size), room[1], mcg.GICP(), max_distance=0.5), f"source: {named}", shown)
 
 
 def test_two_distances_are_two_registrations_in_a_row(room):
@@ -288,12 +259,7 @@ def large(precision):
     truth = motion()
     source = (room_corner(8400, seed=1)[0] - truth[:3, 3]) @ truth[:3, :3]
     # Points further apart come to rest within 1e-4; test_agrees_with_small_gicp.py has large scans.
-    options = {
-        "max_distance": 0.3,
-        "max_source_points": None,
-        "translation_tolerance": 1e-4,
-        "rotation_tolerance": 1e-4,
-    }
+    options = {"max_distance": 0.3, "max_source_points": None} | dict.fromkeys(tight(), 1e-4)
     return mcg.preprocess(source, None), mcg.preprocess(room_corner(2000, seed=2)[0], None), options
 
 
@@ -334,8 +300,6 @@ def test_the_default_distances_come_from_the_spacing(room):
     assert grid > 1.2 * spacing
     assert result.converged and difference(result.matrix, truth) < 4e-3
     assert difference(result.matrix, given.matrix) < 1e-6
-    traced = jax.jit(lambda s: mcg.register(s, target, method, search=mcg.DenseSearch()).matrix)
-    assert difference(traced(source), result.matrix) < 2e-4
 
 
 def test_scan_lines_do_not_keep_the_pose_at_its_start():
@@ -365,11 +329,8 @@ def test_voxel_sizes_register_a_start_that_is_far_off():
     assert difference(near.matrix, truth) > 1
     far = mcg.register(source, target, method, max_distance=(0.4, 0.1), voxel_sizes=(0.3, 0.15))
     assert far.converged and difference(far.matrix, truth) < 4e-3
-    refused(
-        lambda: jax.jit(lambda s: mcg.register(s, target, method, voxel_sizes=(0.2,)).matrix)(source),
-        "cloud",
-        "tracers",
-    )
+    inside = jax.jit(lambda source: mcg.register(source, target, method, voxel_sizes=(0.2,)).matrix)
+    refused(lambda: inside(source), "cloud", "tracers")
 
 
 def test_equalized_channels_undo_gain_and_offset():
@@ -413,18 +374,12 @@ def test_without_channels_it_says_that_it_is_gicp(room):
 
 def test_integer_channels_count_as_numbers(room):
     source, target, _ = room
-    poses = [
-        mcg.register(
-            *(
-                cloud.replace(channels=np.round(100 * np.asarray(cloud.channels)).astype(kind))
-                for cloud in (source, target)
-            ),
-            mcg.ColorICP(0.003),
-            max_distance=0.5,
-        ).matrix
-        for kind in (int, float)
-    ]
-    np.testing.assert_array_equal(*poses)
+
+    def pose(kind):
+        clouds = (cloud.replace(channels=np.round(100 * cloud.channels).astype(kind)) for cloud in (source, target))
+        return mcg.register(*clouds, mcg.ColorICP(0.003), max_distance=0.5).matrix
+
+    np.testing.assert_array_equal(pose(int), pose(float))
 
 
 def test_clouds_that_do_not_fit_are_named(room):
@@ -437,6 +392,8 @@ def test_clouds_that_do_not_fit_are_named(room):
         ("channel_covariance", "(3,)", source, target, mcg.MultiChannelGICP(np.ones(3), 0.1)),
         ("channel_weights", "(3,)", source, target, mcg.ColorICP(np.ones(3))),
         ("source", "jax.vmap", batch, target, mcg.GICP()),
+        ("source: cloud", "got 0", np.zeros((0, 3)), target, mcg.GICP()),
+        ("source: points", "(10, 2)", np.zeros((10, 2)), target, mcg.GICP()),
     ):
         refused(lambda arguments=arguments: mcg.register(*arguments, max_distance=0.5), named, shown)
     refused(lambda: mcg.register(source, given, mcg.GICP(), voxel_sizes=(0.2,)), "voxel_sizes")
@@ -456,6 +413,7 @@ def test_a_coarse_pose_that_is_degenerate_is_the_next_start():
     assert mcg.register(source, target, mcg.GICP(), max_distance=0.06).num_inliers < result.num_inliers
 
 
+@pytest.mark.slow
 def test_jit_gives_the_pose_of_the_host_before_it_has_converged(room):
     source, target, _ = room
     options = {"max_distance": 0.5, "max_iterations": 1}

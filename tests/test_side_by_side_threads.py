@@ -54,7 +54,7 @@ def test_answers_come_in_order_from_no_more_threads_than_asked_for(workers):
 
 
 @pytest.mark.timeout(60)
-@pytest.mark.parametrize("failing", range(4))
+@pytest.mark.parametrize("failing", [0, 3])
 def test_an_error_in_any_thread_is_raised(failing):
     def before(number):
         if number == failing:
@@ -62,19 +62,6 @@ def test_an_error_in_any_thread_is_raised(failing):
 
     with pytest.raises(ZeroDivisionError):
         watched(before, 2)
-
-
-def test_after_an_error_nobody_goes_on():
-    def before(_):
-        if threading.current_thread() is threading.main_thread():
-            time.sleep(0.1)  # The other thread has begun.
-            raise ZeroDivisionError
-        # Far longer than the call that fails, on a busy machine, too.
-        time.sleep(0.5)
-
-    with pytest.raises(ZeroDivisionError):
-        watched(before, 2)
-    assert len(CALLS) <= 3
 
 
 @pytest.mark.timeout(60)
@@ -100,6 +87,7 @@ def test_threads_may_share_clouds():
     np.testing.assert_array_equal(found, expected * 2)
 
 
+@pytest.mark.slow
 def test_the_interpreter_does_not_wait_for_a_source_of_frames():
     """Which is read ahead while the odometry of the last frame is in use."""
     code = """

@@ -6,9 +6,7 @@ import numpy as np
 import pytest
 
 from mcgicp_jax import GICP, MultiChannelGICP, PointCloud, PointToPlane, preprocess
-from mcgicp_jax._compute import row_functions
 from mcgicp_jax._local_geometry.local_geometry import weighted_covariance
-from mcgicp_jax._methods.surfaces import surface_pair
 from tests import reference as ref
 from tests import scenes
 from tests.precision import cached, in_both_precisions, in_float64, tolerance
@@ -52,11 +50,9 @@ def full_lambda(num_channels, seed=0):
 
 
 @in_both_precisions
-@pytest.mark.parametrize("num_points", [150, 600])
-def test_gicp_against_the_reference(num_points):
-    points, _ = ref.scene(num_points, 3, seed=3)
-    expected = ref.gicp_covariances(points, neighbors_of(num_points, 3), EPSILON)
-    compare(covariances(GICP(EPSILON), cloud_of(num_points, 3)), expected)
+def test_gicp_against_the_reference():
+    points, _ = ref.scene(600, 3, seed=3)
+    compare(covariances(GICP(EPSILON), cloud_of(600, 3)), ref.gicp_covariances(points, neighbors_of(600, 3), EPSILON))
 
 
 def test_point_to_plane_against_the_reference():
@@ -67,54 +63,38 @@ def test_point_to_plane_against_the_reference():
 
 @in_both_precisions
 @pytest.mark.parametrize(
-    "num_points, num_channels, channel_covariance",
-    [
-        (150, 3, full_lambda(3)),
-        (600, 1, 0.3),
-        (600, 3, 0.3),
-        (600, 3, np.array([0.1, 0.3, 0.9])),
-        (600, 3, full_lambda(3)),
-        (600, 5, full_lambda(5)),
-    ],
-    ids=["small", "1-scalar", "3-scalar", "3-variances", "3-full", "5-full"],
+    "num_channels, channel_covariance",
+    [(1, 0.3), (3, np.array([0.1, 0.3, 0.9])), (3, full_lambda(3))],
+    ids=["1-scalar", "3-variances", "3-full"],
 )
-def test_multichannel_against_the_reference(num_points, num_channels, channel_covariance):
-    points, channels = ref.scene(num_points, num_channels, seed=num_channels)
-    args = (points, channels, neighbors_of(num_points, num_channels), channel_covariance, EPSILON)
+def test_multichannel_against_the_reference(num_channels, channel_covariance):
+    """No eigenvalue is capped: a point in a dark neighbourhood whose like lie at its rim varies more than all of it."""
+    points, channels = ref.scene(600, num_channels, seed=num_channels)
+    args = (points, channels, neighbors_of(600, num_channels), channel_covariance, EPSILON)
     method = MultiChannelGICP(channel_covariance, 0.1, EPSILON, min_eigenvalue=1e-3)
-    actual = covariances(method, cloud_of(num_points, num_channels))
+    actual = covariances(method, cloud_of(600, num_channels))
+    assert np.linalg.eigvalsh(actual).max() > 1.1
     compare(actual, ref.multi_channel_covariances(*args, 1e-3, REGULARISATION))
     # Against the paper's own formula, without the regularisation that ours needs elsewhere.
     compare(actual, ref.multi_channel_covariances(*args, 1e-3), 3e-4, 2e-4)
 
 
-def partial(num_points, num_channels, share=0.6, seed=0):
-    """Which points have which channels: some all, some none, some here and there."""
-    present = np.random.default_rng(seed).random((num_points, num_channels)) < share
-    present[: num_points // 4] = True
-    present[num_points // 4 : num_points // 3] = False
+def some_channels():
+    """Which of 150 points have which channels: some all, some none, some here and there."""
+    present = np.random.default_rng(0).random((150, 3)) < 0.6
+    present[:37] = True
+    present[37:50] = False
     return present
 
 
-@pytest.mark.parametrize(
-    "num_points, channel_covariance",
-    [(150, 0.3), (150, np.array([0.1, 0.3, 0.9])), (150, full_lambda(3)), (600, full_lambda(3))],
-    ids=["scalar", "variances", "full", "full-600"],
-)
-def test_missing_channels_against_the_reference(num_points, channel_covariance):
-    points, channels = ref.scene(num_points, 3, seed=3)
-    present = partial(num_points, 3)
-    args = (points, channels, neighbors_of(num_points, 3), channel_covariance, EPSILON, 1e-3, REGULARISATION)
+@pytest.mark.parametrize("channel_covariance", [0.3, full_lambda(3)], ids=["scalar", "full"])
+def test_missing_channels_against_the_reference(channel_covariance):
+    points, channels = ref.scene(150, 3, seed=3)
+    present = some_channels()
+    args = (points, channels, neighbors_of(150, 3), channel_covariance, EPSILON, 1e-3, REGULARISATION)
     cloud = preprocess(PointCloud(points, np.where(present, channels, np.nan), channel_valid=present), num_neighbors=K)
     actual = covariances(MultiChannelGICP(channel_covariance, 0.1, EPSILON, min_eigenvalue=1e-3), cloud)
     compare(actual, ref.multi_channel_covariances(*args, present))
-
-
-@pytest.mark.parametrize("channel_covariance", [0.3, full_lambda(3)], ids=["scalar", "full"])
-def test_a_mask_that_misses_nothing_changes_nothing(channel_covariance):
-    cloud, method = cloud_of(150, 3), MultiChannelGICP(channel_covariance, 0.1)
-    whole = cloud.replace(channel_valid=np.ones(cloud.channels.shape, bool))
-    compare(covariances(method, whole), covariances(method, cloud), 1e-5, 1e-12)
 
 
 def test_a_channel_that_nobody_has_changes_nothing():
@@ -143,54 +123,6 @@ def test_without_contrast_it_is_gicp(channels):
     np.testing.assert_allclose(*compiled, rtol=0, atol=8 * np.finfo(dtype()).eps)
 
 
-def test_a_wide_kernel_tends_to_gicp():
-    cloud = cloud_of(600, 3)
-    compare(covariances(MultiChannelGICP(1e12, 0.1, EPSILON), cloud), covariances(GICP(EPSILON), cloud), 1e-5, 1e-9)
-
-
-@pytest.mark.parametrize("seed", range(3))
-def test_it_turns_with_the_cloud(seed):
-    """Which orthonormal tangent basis was chosen cannot be seen from outside."""
-    R = ref.rotation(np.random.default_rng(seed).normal(size=3) * 2)
-    cloud = cloud_of(600, 3)
-    method = MultiChannelGICP(full_lambda(3), 0.1, EPSILON)
-    turned = cloud.replace(points=jnp.asarray(np.asarray(cloud.points, float) @ R.T, cloud.points.dtype))
-    compare(covariances(method, turned), R @ covariances(method, cloud) @ R.T, 5e-4, 1e-9)
-
-
-@cached
-def edge(angle):
-    """A flat grid, half of it of another colour; the line between runs at the angle through the middle."""
-    x, y = (axis.ravel() for axis in np.meshgrid(np.arange(-7, 8) * 0.1, np.arange(-7, 8) * 0.1))
-    across = -np.sin(angle) * x + np.cos(angle) * y
-    cloud = preprocess(PointCloud(np.stack([x, y, 0 * x], axis=1), (across > -1e-9).astype(float)), num_neighbors=25)
-    return covariances(MultiChannelGICP(0.02, 0.1, EPSILON), cloud)[7 * 15 + 7]
-
-
-def test_an_edge_at_45_degrees_is_seen_in_the_off_diagonal():
-    C = edge(np.pi / 4)
-    along, across = np.array([1, 1, 0]) / np.sqrt(2), np.array([-1, 1, 0]) / np.sqrt(2)
-    assert C[0, 1] > 0.2
-    assert along @ C @ along > 0.9 > 0.6 > across @ C @ across
-    assert across @ C @ along == pytest.approx(0, abs=1e-5)
-    assert C[2, 2] == pytest.approx(EPSILON, abs=1e-6)
-
-
-def test_an_edge_along_an_axis_is_on_the_diagonal():
-    C = edge(0.0)
-    assert C[0, 0] > 0.9 > 0.6 > C[1, 1]
-    assert C[0, 1] == pytest.approx(0, abs=1e-5)
-
-
-def test_eigenvalues_of_omega_may_exceed_one():
-    """No cap: a point in the middle of a dark neighbourhood whose like lie at its rim varies more than all of it."""
-    largest = np.linalg.eigvalsh(covariances(MultiChannelGICP(0.3, 0.1, EPSILON), cloud_of(600, 3)))[:, 2]
-    assert largest.max() > 1.5
-    points, channels = ref.scene(600, 3, seed=3)
-    expected = ref.multi_channel_covariances(points, channels, neighbors_of(600, 3), 0.3, EPSILON, 1e-3)
-    compare(largest, np.linalg.eigvalsh(expected)[:, 2], 3e-4, 2e-4)
-
-
 @pytest.mark.parametrize("floor", [1e-4, 1e-2, 0.3])
 def test_the_floor_of_omega(floor):
     """Every point unlike all others: Ω would be 0, the covariance singular."""
@@ -206,15 +138,6 @@ def test_the_floor_of_omega(floor):
     compare(actual, floor * plane + EPSILON * (np.eye(3) - plane), 1e-5, 2e-4 * floor)
 
 
-def test_a_doubled_channel_with_doubled_variances_changes_nothing():
-    """dᵀΛ⁻¹d = 2 dᵀ(2Λ)⁻¹d."""
-    cloud, single = cloud_of(600, 3), full_lambda(3)
-    doubled = np.kron(np.eye(2), 2 * single)
-    twice = cloud.replace(channels=jnp.concatenate([cloud.channels, cloud.channels], axis=1))
-    actual = covariances(MultiChannelGICP(doubled, 0.1, EPSILON), twice)
-    compare(actual, covariances(MultiChannelGICP(single, 0.1, EPSILON), cloud), 1e-5, 1e-9)
-
-
 def test_the_unit_of_a_channel_does_not_matter():
     cloud, single = cloud_of(600, 3), full_lambda(3)
     units = np.array([1e-3, 1.0, 255.0])
@@ -224,46 +147,11 @@ def test_the_unit_of_a_channel_does_not_matter():
 
 
 @in_both_precisions
-@pytest.mark.parametrize("scale", [1e-6, 1e-3, 1e3, 1e6])
+@pytest.mark.parametrize("scale", [1e-6, 1e6])
 def test_the_unit_of_length_does_not_matter(scale):
     cloud, method = cloud_of(600, 3), MultiChannelGICP(0.3, 0.1, EPSILON)
     scaled = cloud.replace(points=cloud.points * jnp.asarray(scale, cloud.points.dtype))
     compare(covariances(method, scaled), covariances(method, cloud), 5e-4, 1e-9)
-
-
-@pytest.mark.parametrize("argument", [1, 2], ids=["channels", "Λ"])
-def test_gradients_through_missing_channels(argument):
-    """Exact where there is something, and 0, never NaN, where there is not."""
-    rng = np.random.default_rng(argument)
-    points, channels = ref.scene(150, 3, seed=3)
-    present, neighbors = partial(150, 3), neighbors_of(150, 3)
-    cloud = preprocess(PointCloud(points, channels, channel_valid=present), num_neighbors=K).pad(160)
-    weights = rng.normal(size=(150, 3, 3))
-    weights += weights.swapaxes(1, 2)
-    at = [channels, full_lambda(3)]
-    direction = rng.normal(size=at[argument - 1].shape)
-    direction = direction + direction.T if argument == 2 else direction
-
-    def expected_sum(value):
-        args = [points, *at[: argument - 1], value, *at[argument:]]
-        args.insert(2, neighbors)
-        found = ref.multi_channel_covariances(*args, EPSILON, 1e-3, REGULARISATION, present)
-        return np.sum(weights * found)
-
-    expected = ref.difference(expected_sum, at[argument - 1], direction, 1e-6)
-    packed = np.zeros((6, cloud.points.shape[0]))
-    packed[:, :150] = ref.packed(2 * weights * (1 - np.eye(3)) + weights * np.eye(3))
-    dtype = cloud.points.dtype
-    inputs = [jnp.full((160, 3), jnp.nan, dtype).at[:150].set(channels.astype(dtype)), jnp.asarray(at[1], dtype)]
-    inputs[0] = jnp.where(cloud.channel_valid, inputs[0], jnp.nan)
-    _, gradients = weighted_sum_and_gradients(
-        cloud.points, *inputs, jnp.asarray(EPSILON, dtype), cloud, jnp.asarray(packed, dtype), False
-    )
-    gradient = np.asarray(gradients[argument], float)
-    if argument == 1:
-        np.testing.assert_array_equal(gradient[~np.asarray(cloud.channel_valid)], 0)
-        gradient = gradient[:150]
-    assert np.sum(gradient * direction) == pytest.approx(expected, rel=tolerance(3e-3, 1e-6))
 
 
 def weighted_sum(points, channels, channel_covariance, epsilon, cloud, weights, as_gicp):
@@ -309,31 +197,26 @@ AWKWARD = [
 
 @in_both_precisions
 @pytest.mark.parametrize("kind", AWKWARD)
-@pytest.mark.parametrize("as_gicp", [False, True])
-def test_awkward_neighbourhoods_stay_finite_in_value_and_gradient(kind, as_gicp):
+def test_awkward_neighbourhoods_stay_finite_in_value_and_gradient(kind):
     cloud = awkward(kind)
     dtype = cloud.points.dtype
     weights = jnp.asarray(np.random.default_rng(1).normal(size=(6, cloud.points.shape[0])), dtype)
     arguments = (cloud.points, cloud.channels, 0.3 * jnp.eye(3, dtype=dtype), jnp.asarray(EPSILON, dtype))
-    value, gradients = weighted_sum_and_gradients(*arguments, cloud, weights, as_gicp)
+    value, gradients = weighted_sum_and_gradients(*arguments, cloud, weights, False)
     assert np.isfinite(value)
     for gradient in gradients:
         assert np.isfinite(gradient).all()
-    method = GICP(EPSILON) if as_gicp else MultiChannelGICP(0.3 * np.eye(3), 0.1, EPSILON)
+    method = MultiChannelGICP(0.3 * np.eye(3), 0.1, EPSILON)
     values = np.linalg.eigvalsh(covariances(method, cloud))
     assert values.min() > 0.5 * EPSILON
     assert values.max() < 10
 
 
-@pytest.mark.parametrize("as_gicp", [False, True])
-def test_fewer_points_than_neighbours(as_gicp):
-    points, channels = (array[:7] for array in ref.scene(150, 3, seed=3))
+def test_fewer_points_than_neighbours():
     everyone = np.tile(np.arange(7), (7, 1))
-    method = GICP(EPSILON) if as_gicp else MultiChannelGICP(0.3 * np.eye(3), 0.1, EPSILON)
-    expected = ref.gicp_covariances(points, everyone, EPSILON)
-    if not as_gicp:
-        expected = ref.multi_channel_covariances(points, channels, everyone, 0.3, EPSILON, 1e-3, REGULARISATION)
-    compare(covariances(method, awkward("fewer than k")), expected)
+    args = *(array[:7] for array in ref.scene(150, 3, seed=3)), everyone, 0.3, EPSILON, 1e-3, REGULARISATION
+    found = covariances(MultiChannelGICP(0.3 * np.eye(3), 0.1, EPSILON), awkward("fewer than k"))
+    compare(found, ref.multi_channel_covariances(*args))
 
 
 def test_on_a_line_omega_is_one_across_it():
@@ -355,24 +238,26 @@ def test_on_a_line_omega_is_one_across_it():
     np.testing.assert_allclose(across, 1 + EPSILON, atol=tolerance(0.2, 1e-4))
 
 
-def test_coincident_neighbours_make_the_identity_and_no_gradient():
-    found = covariances(MultiChannelGICP(0.3 * np.eye(3), 0.1), awkward("coincident"))
-    np.testing.assert_array_equal(found, np.broadcast_to(np.eye(3), (150, 3, 3)))
+def test_coincident_neighbours_and_padding_make_the_identity():
+    for cloud, rows in ((awkward("coincident"), slice(None)), (cloud_of(150, 3), slice(150, None))):
+        found = ref.symmetric(prepare(MultiChannelGICP(0.3 * np.eye(3), 0.1), cloud).covariance.T)[rows]
+        np.testing.assert_array_equal(found, np.broadcast_to(np.eye(3), found.shape))
 
 
-def test_padding_makes_the_identity():
-    surface = prepare(MultiChannelGICP(0.3 * np.eye(3), 0.1), cloud_of(150, 3))
-    np.testing.assert_array_equal(ref.symmetric(surface.covariance.T)[150:], np.broadcast_to(np.eye(3), (10, 3, 3)))
-
-
-@pytest.mark.parametrize("argument", range(4), ids=["points", "channels", "Λ", "ε"])
-@pytest.mark.parametrize("as_gicp", [False, True])
-def test_gradients_against_differences_of_the_reference(argument, as_gicp):
-    if as_gicp and argument in (1, 2):
-        pytest.skip("GICP has none")
+@pytest.mark.parametrize(
+    ("as_gicp", "some_missing", "argument"),
+    [
+        *((True, False, each) for each in (0, 3)),
+        *((False, False, each) for each in range(4)),
+        *((False, True, each) for each in (1, 2)),
+    ],
+)
+def test_gradients_against_differences_of_the_reference(as_gicp, some_missing, argument):
+    """By points, channels, Λ and ε. Where a channel is missing, 0, never NaN."""
     rng = np.random.default_rng(argument)
-    cloud, neighbors = cloud_of(150, 3), neighbors_of(150, 3)
-    points, channels = ref.scene(150, 3, seed=3)
+    neighbors, (points, channels) = neighbors_of(150, 3), ref.scene(150, 3, seed=3)
+    present = some_channels() if some_missing else None
+    cloud = preprocess(PointCloud(points, channels, channel_valid=present), num_neighbors=K).pad(160)
     weights = rng.normal(size=(150, 3, 3))
     weights += weights.swapaxes(1, 2)
     at = [points, channels, full_lambda(3), np.array(EPSILON)]
@@ -384,56 +269,40 @@ def test_gradients_against_differences_of_the_reference(argument, as_gicp):
         args = [*at[:argument], value, *at[argument + 1 :]]
         if as_gicp:
             return np.sum(weights * ref.gicp_covariances(args[0], neighbors, args[3]))
-        found = ref.multi_channel_covariances(args[0], args[1], neighbors, args[2], args[3], 1e-3, REGULARISATION)
-        return np.sum(weights * found)
+        numbers = args[2], args[3], 1e-3, REGULARISATION, present
+        return np.sum(weights * ref.multi_channel_covariances(args[0], args[1], neighbors, *numbers))
 
     expected = ref.difference(expected_sum, at[argument], direction, 1e-6)
     dtype = cloud.points.dtype
-    twice = 2 * weights * (1 - np.eye(3)) + weights * np.eye(3)
-    packed = np.zeros((6, cloud.points.shape[0]))
-    packed[:, :150] = ref.packed(twice)
-    inputs = [cloud.points, cloud.channels, *(jnp.asarray(value, dtype) for value in at[2:])]
+    packed = np.zeros((6, 160))
+    packed[:, :150] = ref.packed(2 * weights * (1 - np.eye(3)) + weights * np.eye(3))
+    given = jnp.where(cloud.channel_valid, cloud.channels, jnp.nan) if some_missing else cloud.channels
+    inputs = [cloud.points, given, *(jnp.asarray(value, dtype) for value in at[2:])]
     _, gradients = weighted_sum_and_gradients(*inputs, cloud, jnp.asarray(packed, dtype), as_gicp)
     gradient = np.asarray(gradients[argument], float)
     if argument < 2:
         assert not gradient[150:].any()
         gradient = gradient[:150]
+    if some_missing and argument == 1:
+        assert not gradient[~present].any()
     assert np.sum(gradient * direction) == pytest.approx(expected, rel=tolerance(3e-3, 1e-6))
 
 
-@pytest.mark.parametrize(
-    "method, masked",
-    [
-        (GICP, False),
-        pytest.param(lambda: MultiChannelGICP(0.3 * np.eye(3), 0.1), True, marks=pytest.mark.slow),
-    ],
-    ids=["GICP", "MultiChannelGICP, some channels missing"],
-)
-def test_surfaces_are_the_same_block_by_block_and_inside_transformations(method, masked, monkeypatch):
-    """Blocks that do not come out even, on the host; whole arrays, and the blocks of large ones, inside; gradients."""
-    method = method()
-    points, channels = ref.scene(700, 3, seed=4)
-    mask = np.random.default_rng(0).random((700, 3)) < 0.8 if masked else None
-    cloud = preprocess(PointCloud(points, channels, channel_valid=mask), num_neighbors=K)
-    weights = jnp.asarray(np.random.default_rng(1).normal(size=(700, 9)), cloud.points.dtype)
-    everything = jax.tree.leaves(surface_pair(method, cloud, cloud, observed=True).whole().source)
+def test_surfaces_are_the_same_block_by_block_and_inside_transformations():
+    """16,500 rows, in blocks that do not come out even: on the host, inside, and the gradient."""
+    points, _ = ref.scene(16_500, 0, seed=4)
+    cloud = preprocess(points, num_neighbors=8)
+    weights = np.random.default_rng(1).normal(size=(6, 16_500))
 
-    def traced():
-        def surface(points):
-            found = surface_pair(method, cloud.replace(points=points), cloud, observed=True).source
-            return jnp.sum(weights * jnp.concatenate([found.points, found.covariance], axis=1)), found
+    def loss(points):
+        found = scenes.covariances(GICP(), cloud.replace(points=points))
+        return jnp.sum(weights * found), found
 
-        return jax.jit(jax.grad(surface, has_aux=True))(jnp.asarray(cloud.points))
-
-    slope, whole = traced()
-    monkeypatch.setattr(row_functions, "_LARGEST_WHOLE", 100)
-    monkeypatch.setattr(row_functions, "_LARGEST_BLOCK", 128)
-    slope_by_blocks, by_blocks = traced()
-    for found in (whole, by_blocks):
-        for one, other in zip(jax.tree.leaves(found), everything, strict=True):
-            np.testing.assert_allclose(one, other, rtol=tolerance(1e-3, 1e-9), atol=tolerance(2e-4, 1e-9))
-    scale = np.abs(slope).max()
-    np.testing.assert_allclose(slope_by_blocks, slope, atol=scale * tolerance(1e-4, 1e-9))
+    slope, found = jax.jit(jax.grad(loss, has_aux=True))(jnp.asarray(cloud.points))
+    np.testing.assert_allclose(found, scenes.covariances(GICP(), cloud), atol=1e-9)
+    direction = np.random.default_rng(2).normal(size=slope.shape)
+    expected = ref.difference(lambda at: float(loss(at)[0]), np.asarray(cloud.points), direction, 1e-7)
+    np.testing.assert_allclose(np.sum(slope * direction), expected, rtol=1e-5)
 
 
 def numbers_for(source, target):

@@ -15,7 +15,7 @@ pytestmark = in_both_precisions
 SEEDS = st.integers(0, 2**31)
 SCALES = st.floats(-6, 6).map(lambda power: 10.0**power)
 KINDS = ("random", "flat", "line", "near line", "isotropic", "near isotropic", "zero")
-EXAMPLES = settings(max_examples=15, deadline=None)
+EXAMPLES = settings(max_examples=8, deadline=None)
 
 
 def dtype():

@@ -9,6 +9,7 @@ from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from mcgicp_jax.datasets import box_room, poster_wall, street
+from tests.refusals import refused
 
 SCENES = [poster_wall, box_room, street]
 LIDAR = [box_room, street]
@@ -52,24 +53,18 @@ def test_a_frame_is_the_same_however_many_there_are(scene):
     assert not np.array_equal(two[0].cloud.channels[:100], other[0].cloud.channels[:100])
 
 
-@pytest.mark.parametrize("scene", SCENES)
-def test_a_sequence_is_lazy_and_behaves_like_a_list(scene):
-    frames = scene(6, points_per_frame=500, step=0.05)
-    assert len(frames) == 6 and len(list(frames)) == 6
-    np.testing.assert_array_equal(frames[-1].pose, frames[5].pose)
+def test_a_sequence_is_lazy_and_behaves_like_a_list():
+    # However long: nothing is made before it is asked for.
+    frames = box_room(10**6, points_per_frame=500)
+    assert len(frames) == 10**6 and len(list(frames[:6])) == 6
+    np.testing.assert_array_equal(frames[-1].pose, frames[10**6 - 1].pose)
     part = frames[4:1:-2]
-    assert len(part) == 2
-    np.testing.assert_array_equal([frame.time for frame in part], [frames[4].time, frames[2].time])
-    assert len(part[5:]) == 0
-    for index in (6, -7):
-        with pytest.raises(IndexError, match=rf"expected -6 to 5, got {index}"):
+    assert [frame.time for frame in part] == [frames[4].time, frames[2].time] and len(part[5:]) == 0
+    for index in (10**6, -(10**6) - 1):
+        with pytest.raises(IndexError):
             frames[index]
-    with pytest.raises(ValueError, match="num_frames: expected at least 1, got 0"):
-        scene(0)
     again = pickle.loads(pickle.dumps(frames))
     np.testing.assert_array_equal(again[3].cloud.points, frames[3].cloud.points)
-    # However long: nothing is made before it is asked for.
-    assert len(scene(100, points_per_frame=500)) == 100
 
 
 @pytest.mark.parametrize("scene", SCENES)
@@ -99,10 +94,9 @@ def test_noise_scales(scene):
     np.testing.assert_allclose(changed[1][inside], 2 * changed[0][inside], atol=1e-12)
     assert 0.003 < changed[0][inside].std() < 0.03
     for value in (-0.1, np.nan):
-        with pytest.raises(ValueError, match=rf"^noise: expected 0 or more, got {value}"):
-            scene(noise=value)
-    with pytest.raises(ValueError, match=r"^points_per_frame: expected"):
-        scene(points_per_frame=0)
+        refused(lambda value=value: scene(noise=value), "noise", value)
+    refused(lambda: scene(points_per_frame=0), "points_per_frame", 0)
+    refused(lambda: scene(0), "num_frames", 0)
 
 
 @pytest.mark.parametrize("scene", LIDAR)
@@ -121,7 +115,7 @@ def test_the_sensor_moves_by_steps_and_poses_are_rigid(scene):
 # Each scene
 
 
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", range(2))
 def test_the_room_is_closed_and_its_points_are_on_its_walls_and_boxes(seed):
     frames = box_room(30, points_per_frame=3000, noise=0.0, step=0.35, seed=seed)
     boxes = frames.observer.args[0]
@@ -176,13 +170,6 @@ def test_two_views_of_the_street_agree_about_its_colors():
     assert np.median(difference[:, 1:]) < 0.02 and np.median(difference[:, 0]) < 0.03
 
 
-def test_a_wall_from_right_to_left():
-    frames = poster_wall(5, heading=np.pi, step=0.1, points_per_frame=100)
-    places = np.array([frame.pose[:3, 3] for frame in frames])
-    np.testing.assert_allclose(np.diff(places[:, 0]), -0.1)
-    np.testing.assert_allclose(np.diff(places[:, 1]), 0, atol=1e-12)
-
-
 # The poster wall: exact truth, noise as stated, and a scene in which colour alone can tell the motion
 
 
@@ -217,7 +204,7 @@ def test_the_noise_is_that_of_a_kinect():
     assert np.std((noisy.channels - clean.channels)[inside]) == pytest.approx(0.02, rel=0.03)
 
 
-@pytest.mark.parametrize("seed", range(5))
+@pytest.mark.parametrize("seed", range(2))
 def test_the_camera_moves_along_the_wall(seed):
     frames = poster_wall(12, points_per_frame=100, step=0.04, seed=seed)
     for frame in frames:
@@ -229,20 +216,3 @@ def test_the_camera_moves_along_the_wall(seed):
         assert abs(move[2]) <= 0.3 * 0.04
         turn = Rotation.from_matrix(relative(after, before)[:3, :3]).magnitude()
         assert np.rad2deg(turn) == pytest.approx(1.5, abs=0.01)
-
-
-def test_neighboring_frames_overlap_and_share_no_point():
-    target, source = poster_wall(2, noise=0.0, seed=3)
-    distance, _ = cKDTree(in_world(target)).query(in_world(source))
-    assert np.mean(distance < 0.015) > 0.9
-    assert distance.min() > 0
-    # Points of the two grids do not fall in step anywhere: half of the spacing is as usual as any less.
-    assert 0.003 < np.median(distance) < 0.008
-
-
-def test_the_wall_repeats_without_a_seam():
-    # A long way, past several repetitions: still nothing but wall, and as colourful.
-    frames = poster_wall(3, points_per_frame=2000, step=4.0, noise=0.0, seed=4)
-    for frame in frames:
-        np.testing.assert_allclose(in_world(frame)[:, 2], 0, atol=1e-12)
-        assert frame.cloud.channels.std(axis=0).min() > 0.05

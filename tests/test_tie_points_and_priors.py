@@ -43,10 +43,6 @@ def measured(truth, deviations, seed=0):
     return truth @ motion(-np.random.default_rng(seed).normal(size=6) * deviations), given
 
 
-def translated(offset):
-    return motion((*offset, 0, 0, 0))
-
-
 def twist_error(matrix, truth):
     left = np.linalg.inv(truth) @ matrix
     return np.append(left[:3, 3], Rotation.from_matrix(left[:3, :3]).as_rotvec())
@@ -124,14 +120,15 @@ def test_precise_tie_points_decide(corner):
     assert result.converged and result.deviations.max() < 1e-5
 
 
-@pytest.mark.parametrize("name", ["gicp", "mc-gicp", "point-to-plane", "d2d-ndt"])
-def test_a_prior_is_weighed_by_its_covariance(corner, name):
+@pytest.mark.parametrize(
+    "method", [mcg.GICP(), mcg.PointToPlane(), mcg.D2DNDT()], ids=["gicp", "point-to-plane", "d2d-ndt"]
+)
+def test_a_prior_is_weighed_by_its_covariance(corner, method):
     """The product of two Gaussians: that of the registration alone, and the prior."""
     source, target, _ = corner
-    methods = {"gicp": mcg.GICP(), "mc-gicp": mcg.MultiChannelGICP(), "point-to-plane": mcg.PointToPlane()}
-    method = methods.get(name, mcg.D2DNDT())
     options = OPTIONS | {"translation_tolerance": 1e-5, "rotation_tolerance": 1e-5}
-    if name == "d2d-ndt":
+    cells = isinstance(method, mcg.D2DNDT)
+    if cells:
         source, target = (mcg.voxel_gaussians(cloud, 0.2) for cloud in (source, target))
     alone = mcg.register(source, target, method, **options)
     prior = measured(alone.matrix, 3 * np.sqrt(np.diagonal(alone.covariance)), seed=2)
@@ -145,13 +142,7 @@ def test_a_prior_is_weighed_by_its_covariance(corner, name):
     np.testing.assert_allclose(np.sqrt(np.diagonal(result.covariance)), deviations, rtol=0.02)
     added = np.asarray(result.information) - np.asarray(alone.information)
     # At another pose, the kernel of D2D-NDT gives its few cells other weights.
-    assert name == "d2d-ndt" or np.all(np.linalg.eigvalsh(added) > -0.05 * np.linalg.norm(added))
-
-
-def test_equal_clouds(corner):
-    cloud = corner[0]
-    result = mcg.register(cloud, cloud, mcg.GICP(), prior=(motion(1e-3 * np.ones(6)), 1e-4 * np.eye(6)), **OPTIONS)
-    assert result.converged and np.abs(twist_error(result.matrix, np.eye(4))).max() < 1e-5
+    assert cells or np.all(np.linalg.eigvalsh(added) > -0.05 * np.linalg.norm(added))
 
 
 def test_tie_points_that_tell_nothing_change_nothing(corner):
@@ -162,13 +153,6 @@ def test_tie_points_that_tell_nothing_change_nothing(corner):
         assert result.converged and np.abs(twist_error(result.matrix, alone.matrix)).max() < 5e-4
         np.testing.assert_allclose(result.deviations, alone.deviations, rtol=0.01)
         np.testing.assert_allclose(result.information, alone.information, rtol=0.02, atol=30)
-
-
-def test_tie_points_far_from_the_clouds_leave_no_matches(corner):
-    source, target, truth = corner
-    away = motion((30, 0, 0, 0, 0, 0)) @ truth
-    result = mcg.register(source, target, mcg.GICP(), tie_points=tie_points(away, source.points, 1e-6), **OPTIONS)
-    assert result.status is mcg.Status.TOO_FEW_CORRESPONDENCES and np.isnan(result.covariance).all()
 
 
 def test_large_coordinates_lose_nothing(corner):
@@ -214,7 +198,8 @@ def test_the_information_of_a_prior_belongs_to_the_origin_of_the_cloud(corner, a
     # So small that the transport of the error is linear.
     for twist in np.linalg.cholesky(given).T * 1e-3:
         start, end = (
-            translated(-target.origin) @ each @ translated(source.origin) for each in (pose, pose @ exponential(twist))
+            motion((*-target.origin, 0, 0, 0)) @ each @ motion((*source.origin, 0, 0, 0))
+            for each in (pose, pose @ exponential(twist))
         )
         error = logarithm(np.linalg.inv(start) @ end)
         expected = twist @ np.linalg.solve(given, twist)

@@ -9,6 +9,7 @@ import pytest
 import mcgicp_jax as mcg
 from mcgicp_jax import datasets
 from tests.precision import in_float64
+from tests.refusals import refused
 
 RNG = np.random.default_rng(0)
 
@@ -61,6 +62,11 @@ def test_points_that_are_spread_evenly_are_kept():
     cloud = mcg.preprocess(raw)
     assert cloud.voxel_size is None and "voxels" not in repr(cloud)
     np.testing.assert_array_equal(cloud.points, raw.astype(np.float32))
+    # As are clouds with covariances, and small ones.
+    given = mcg.PointCloud(lines(), covariances=np.tile(np.eye(3), (len(lines()), 1, 1)))
+    assert mcg.preprocess(given).voxel_size is mcg.preprocess(lines()[:499]).voxel_size is None
+    for wrong in ("large", 0.0, -1.0, (1.0,), float("nan")):
+        refused(lambda wrong=wrong: mcg.preprocess(raw, wrong), "voxel_size")
 
 
 def test_noise_is_averaged():
@@ -103,12 +109,6 @@ def test_the_size_goes_with_the_unit_and_not_with_far_points_or_the_order():
 def test_any_cloud_has_a_size_or_none(raw):
     size = mcg.preprocess(raw).voxel_size
     assert size is None or size > 0
-
-
-def test_clouds_with_covariances_and_small_ones_are_kept():
-    raw = lines()
-    assert mcg.preprocess(mcg.PointCloud(raw, covariances=np.tile(np.eye(3), (len(raw), 1, 1)))).voxel_size is None
-    assert mcg.preprocess(raw[:499]).voxel_size is None
 
 
 def test_a_planar_scan_is_kept_and_sparse_lines_are_averaged_as_far_as_the_scene_is_shown():
@@ -176,18 +176,6 @@ def test_the_size_survives_what_users_do_with_clouds():
 def test_a_given_none_is_warned_of_with_figures(raw, figure):
     with pytest.warns(UserWarning, match=rf"^voxel_size: .*{figure}"):
         mcg.preprocess(raw, None)
-
-
-@pytest.mark.filterwarnings("error:voxel_size")
-def test_few_neighbours_are_not_warned_of():
-    mcg.preprocess(even(5000), None, 4)
-
-
-@pytest.mark.parametrize("wrong", ["large", 0.0, -1.0, (1.0,), float("nan")])
-def test_what_is_no_size_is_turned_away(wrong):
-    # Run-time checks of annotations refuse what is no number first.
-    with pytest.raises((ValueError, TypeError), match=r"^voxel_size: |parameter 'voxel_size'"):
-        mcg.preprocess(lines(), wrong)
 
 
 @in_float64
