@@ -145,7 +145,6 @@ CLOUD = PointCloud(np.eye(3))
         (lambda: plot.before_after(CLOUD, CLOUD, {"mirror": np.diag([1.0, 1, -1, 1])}), r"poses\['mirror'\]: "),
         (lambda: plot.before_after(CLOUD, PointCloud(np.eye(3)[:2]), {}), "target: .* 2"),
         (lambda: plot.clouds(CLOUD, CLOUD, names=["one"]), "names: .* 2"),
-        (lambda: plot.convergence({"x": np.array([[1.0, 2.0]])}), r"histories\['x'\]: .* \(1, 2\)"),
         (lambda: plot.trajectories({"none": []}), r"trajectories\['none'\]: "),
         (lambda: plot.maps({}), "maps: "),
         (
@@ -189,21 +188,10 @@ def test_large_clouds_are_thinned_and_padding_is_left_out():
     assert [len(trace.x) for trace in plot.clouds(small).data] == [10_000]
 
 
-def test_convergence_has_a_line_per_method():
-    histories = {"GICP": [1.0, 0.5, 0.4], "MC-GICP": np.array([1.0, 0.1])}
-    figure = plot.convergence(histories, ylabel="rmse (m)")
-    (panel,) = figure.axes
-    for line, (name, history) in zip(panel.lines, histories.items(), strict=True):
-        assert line.get_label() == name
-        np.testing.assert_array_equal(line.get_ydata(), history)
-    assert (panel.get_yscale(), panel.get_ylabel(), panel.get_xlabel()) == ("log", "rmse (m)", "iteration")
-
-
 @pytest.mark.parametrize(
     ("package", "draw"),
     [
         ("matplotlib", lambda: plot.before_after(CLOUD, CLOUD, {})),
-        ("matplotlib", lambda: plot.convergence({"x": [1.0]})),
         ("plotly", lambda: plot.clouds(CLOUD)),
     ],
 )
