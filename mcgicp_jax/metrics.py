@@ -45,21 +45,18 @@ def pose_error(T: Pose, T_true: Pose, *, at: ArrayLike | None = None) -> tuple[S
         ValueError: if an argument has the wrong shape or a pose is no rigid motion; the message names the argument.
     """
     true = pose_matrix(T_true, "T_true")
-    matrix = np.full((4, 4), np.nan) if _is_nan(T) else pose_matrix(T, "T")
+    estimate = matrix_of(T)
+    failed = is_concrete(estimate) and np.shape(estimate) == (4, 4) and np.isnan(estimate[:3]).all()
+    matrix = np.full((4, 4), np.nan) if failed else pose_matrix(T, "T")
     point: Any = np.zeros(3) if at is None else at
     if np.shape(point) != (3,):
         raise ValueError(f"at: expected a point of shape (3,), got {np.shape(point)}")
     if is_concrete(matrix, true, point):
         translation, rotation = _errors(matrix, true, np.asarray(point, np.float64), np)
         return float(translation), float(rotation)
-    dtype = jnp.result_type(*(each.dtype for each in (matrix, true, point) if not is_concrete(each)))
+    dtype = jnp.result_type(*(value.dtype for value in (matrix, true, point) if not is_concrete(value)))
     with jax.default_matmul_precision("highest"):
         return _errors(jnp.asarray(matrix, dtype), jnp.asarray(true, dtype), jnp.asarray(point, dtype), jnp)
-
-
-def _is_nan(pose: Pose) -> bool:
-    matrix = matrix_of(pose)
-    return bool(is_concrete(matrix) and np.shape(matrix) == (4, 4) and np.isnan(matrix[:3]).all())
 
 
 def ate(poses: Poses, true_poses: Poses, alignment: Literal["umeyama", "first"] = "umeyama") -> float:
@@ -107,7 +104,8 @@ def rpe(poses: Poses, true_poses: Poses, delta: int = 1) -> tuple[Float[np.ndarr
     if not 1 <= delta < len(true):
         raise ValueError(f"delta: expected 1 to {len(true) - 1} for {len(true)} poses, got {delta}")
     first = np.arange(len(true) - delta)
-    return _relative_errors(estimated, true, first, first + delta)
+    translation, rotation = _relative_errors(estimated, true, first, first + delta)
+    return translation, rotation
 
 
 def kitti_errors(
@@ -137,17 +135,14 @@ def kitti_errors(
     complete = last < len(true)
     if not complete.any():
         raise ValueError(f"lengths: expected one below {along[-1]:.1f} m, the length of the path, got {tuple(lengths)}")
-    translation, rotation = _relative_errors(estimated, true, first[complete], last[complete])
-    return (
-        float(100 * np.mean(translation / length[complete])),
-        float(np.degrees(np.mean(rotation / length[complete]))),
-    )
+    translation, rotation = _relative_errors(estimated, true, first[complete], last[complete]) / length[complete]
+    return float(100 * np.mean(translation)), float(np.degrees(np.mean(rotation)))
 
 
 def _trajectories(poses: Poses, true_poses: Poses) -> tuple[Float[np.ndarray, "N 4 4"], Float[np.ndarray, "N 4 4"]]:
     estimated, true = (
-        np.array([pose_matrix(pose, f"{name}[{i}]") for i, pose in enumerate(each)]).reshape(-1, 4, 4)
-        for name, each in (("poses", poses), ("true_poses", true_poses))
+        np.array([pose_matrix(pose, f"{name}[{i}]") for i, pose in enumerate(trajectory)]).reshape(-1, 4, 4)
+        for name, trajectory in (("poses", poses), ("true_poses", true_poses))
     )
     if len(estimated) != len(true) or not len(true):
         raise ValueError(f"poses: expected as many as true_poses, at least one, got {len(estimated)} and {len(true)}")
@@ -156,13 +151,10 @@ def _trajectories(poses: Poses, true_poses: Poses) -> tuple[Float[np.ndarray, "N
 
 def _relative_errors(
     estimated: Float[np.ndarray, "N 4 4"], true: Float[np.ndarray, "N 4 4"], first: np.ndarray, last: np.ndarray
-) -> tuple[Float[np.ndarray, "M"], Float[np.ndarray, "M"]]:
-    moved, moved_truly = (np.linalg.inv(each[first]) @ each[last] for each in (estimated, true))
-    errors = [
-        _errors(matrix, matrix_true, np.zeros(3), np) for matrix, matrix_true in zip(moved, moved_truly, strict=True)
-    ]
-    translation, rotation = np.array(errors).reshape(-1, 2).T
-    return translation, rotation
+) -> Float[np.ndarray, "2 M"]:
+    """Translation and rotation errors of the motions from frames `first` to frames `last`."""
+    motions = (np.linalg.inv(poses[first]) @ poses[last] for poses in (estimated, true))
+    return np.array([_errors(motion, truth, np.zeros(3), np) for motion, truth in zip(*motions, strict=True)]).T
 
 
 def _best_rotation(points: Float[np.ndarray, "N 3"], onto: Float[np.ndarray, "N 3"]) -> Float[np.ndarray, "3 3"]:

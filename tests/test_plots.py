@@ -155,7 +155,7 @@ def test_what_cannot_be_drawn_is_named():
 
 @pytest.mark.parametrize(
     ("package", "draw"),
-    [("matplotlib", lambda: plot.convergence({"x": [1.0]})), ("plotly", lambda: plot.clouds(CLOUD))],
+    [("matplotlib", lambda: plot.before_after(CLOUD, CLOUD, {})), ("plotly", lambda: plot.clouds(CLOUD))],
 )
 def test_a_missing_package_is_named(monkeypatch, package, draw):
     for name in [name for name in sys.modules if name.partition(".")[0] == package]:

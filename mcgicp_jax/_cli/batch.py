@@ -310,10 +310,9 @@ def _settings(pairs: Sequence[FilePair], method: Method, options: Options) -> di
     for pair in pairs:
         try:
             clouds = [io.read(path) for path in pair.paths()]
+            break
         except (ValueError, OSError) as error:
             reason = error
-            continue
-        break
     else:
         raise reason
     choices = Choices.of(options, *clouds)

@@ -25,13 +25,7 @@ Ready: TypeAlias = Callable[[], tuple[mcg.PointCloud, mcg.PointCloud]]
 
 @dataclass(frozen=True)
 class Choices:
-    """Options of a command, and what is chosen for its clouds.
-
-    Attributes:
-        options: those of the user.
-        channels: names of the channels to use.
-        voxels: in which raw clouds are averaged.
-    """
+    """The user's options, the names of the channels to use, and the voxels in which raw clouds are averaged."""
 
     options: Options
     channels: tuple[str, ...]

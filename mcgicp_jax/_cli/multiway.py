@@ -62,31 +62,31 @@ def multiway(
         return clouds[1], clouds[0]
 
     arguments = choices.arguments(name, ready)
-    found = mcg.multiway(clouds, choices.method(name, ready), init=start, voxel_size=voxels.size, **arguments)
-    _report(found)
+    result = mcg.multiway(clouds, choices.method(name, ready), init=start, voxel_size=voxels.size, **arguments)
+    _report(result)
     if output is not None:
-        io.write_poses(output, found.poses)
+        io.write_poses(output, result.poses)
     if map is not None:
-        io.write(map, found.map)
-        print(f"map:       {map}, {len(found.map):,} points")
+        io.write(map, result.map)
+        print(f"map:       {map}, {len(result.map):,} points")
     if graph is not None:
-        io.write_g2o(graph, found.graph)
+        io.write_g2o(graph, result.graph)
     if plot is not None:
-        plots.graph(found.graph, path=plot)
+        plots.graph(result.graph, path=plot)
         print(f"picture:   {plot}")
-    if not found.graph.converged:
-        print(f"mcgicp: the poses are {found.graph.status.name}", file=sys.stderr)
-    for path, status in zip(paths, found.statuses, strict=True):
+    if not result.graph.converged:
+        print(f"mcgicp: the poses are {result.graph.status.name}", file=sys.stderr)
+    for path, status in zip(paths, result.statuses, strict=True):
         if status != mcg.Status.CONVERGED:
             print(f"mcgicp: {path}: {status.name}, its pose contradicts the others or is unknown", file=sys.stderr)
-    return 0 if found.converged else 1
+    return 0 if result.converged else 1
 
 
-def _report(found: mcg.MultiwayResult) -> None:
-    edges, total = found.graph.edges, len(found.registrations)
-    kept = np.asarray(found.graph.kept)
+def _report(result: mcg.MultiwayResult) -> None:
+    edges, total = result.graph.edges, len(result.registrations)
+    kept = np.asarray(result.graph.kept)
     print(f"pairs:     {total} registered, {len(edges)} with a result, {int((~kept).sum())} of them rejected")
-    deviations = np.sqrt(np.diagonal(np.asarray(found.graph.covariance), 0, 1, 2))
+    deviations = np.sqrt(np.diagonal(np.asarray(result.graph.covariance), 0, 1, 2))
     worst = deviations[:, :3].max(), np.degrees(deviations[:, 3:].max())
-    print(f"chi²:      {found.graph.chi_squared:.3g} per redundant number (1: as the covariances predict)")
-    print(f"poses:     {found.graph.status.name}, at most {1e3 * worst[0]:.1f} mm and {worst[1]:.3f} deg uncertain")
+    print(f"chi²:      {result.graph.chi_squared:.3g} per redundant number (1: as the covariances predict)")
+    print(f"poses:     {result.graph.status.name}, at most {1e3 * worst[0]:.1f} mm and {worst[1]:.3f} deg uncertain")

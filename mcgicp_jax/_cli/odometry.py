@@ -16,19 +16,10 @@ from jaxtyping import Float
 from tqdm import tqdm
 
 import mcgicp_jax as mcg
-from mcgicp_jax import io, metrics, plot
+from mcgicp_jax import io, metrics
+from mcgicp_jax import plot as plots
 from mcgicp_jax._cli.choices import Choices, with_channels
-from mcgicp_jax._cli.options import (
-    File,
-    Method,
-    MethodName,
-    Options,
-    check_outputs,
-    clouds_in,
-    enumerated,
-    shown,
-    with_names,
-)
+from mcgicp_jax._cli.options import File, Method, Options, check_outputs, clouds_in, enumerated, shown, with_names
 from mcgicp_jax._clouds.voxel_map import VoxelMap
 from mcgicp_jax._clouds.voxel_size import map_voxel_size
 from mcgicp_jax._sequences.odometry import OdometryStep
@@ -127,7 +118,9 @@ def odometry(
     if output is not None:
         io.write_poses(output, poses)
     if plot is not None:
-        _draw(plot, name, poses, truth)
+        true_poses = [pose for pose in truth if pose is not None]
+        plots.trajectories(({"truth": true_poses} if true_poses else {}) | {name: poses}, path=plot)
+        print(f"picture:   {plot}")
     if failure:
         print(f"mcgicp: {failure}; stopped after {len(poses)} of {len(frames)} frames", file=sys.stderr)
     if failed := sum(not result.converged for result in results):
@@ -221,9 +214,3 @@ def _report(poses: Poses, truth: Truth, results: list[mcg.RegistrationResult]) -
     percent, degrees = metrics.kitti_errors(estimated, true, lengths=segments, step=1)
     shown = ", ".join(f"{segment:.3g}" for segment in segments)
     print(f"drift:     {percent:.2f} %, {degrees:.4f} deg/m over segments of {shown} m")
-
-
-def _draw(path: Path, method: MethodName, poses: Poses, truth: Truth) -> None:
-    known = [pose for pose in truth if pose is not None]
-    plot.trajectories(({"truth": known} if known else {}) | {method: poses}, path=path)
-    print(f"picture:   {path}")

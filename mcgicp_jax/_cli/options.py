@@ -1,4 +1,4 @@
-"""Shared by the commands: their options, checks of files, and results in words."""
+"""Shared by the commands: their options and checks of files."""
 
 from __future__ import annotations
 
@@ -71,7 +71,7 @@ Epsilon: TypeAlias = Annotated[
 # Number of files that a message lists.
 _MOST_NAMES = 5
 # Parameters of methods that have an option.
-_PARAMETERS = ("channel_covariance", "channel_weights", "epsilon")
+PARAMETERS = ("channel_covariance", "channel_weights", "epsilon")
 
 
 def enumerated(names: Sequence[str], last: str = "and") -> str:
@@ -80,7 +80,7 @@ def enumerated(names: Sequence[str], last: str = "and") -> str:
 
 def with_names(documented: Documented, **others: str) -> Documented:
     """Fill the names from the registries, and others, into the help text of a command or of its options."""
-    having = {name: [m for m in METHODS if name in METHODS[m].kind.__dataclass_fields__] for name in _PARAMETERS}
+    having = {name: [m for m in METHODS if name in METHODS[m].kind.__dataclass_fields__] for name in PARAMETERS}
     documented.__doc__ = (documented.__doc__ or "").format(
         formats=enumerated(list(FORMATS), "or"),
         spaces=enumerated(list(COLOR_SPACES), "or"),
@@ -153,7 +153,7 @@ class Options:
         return {name: value for name, value in self._parameters().items() if name in known}
 
     def _parameters(self) -> dict[str, Any]:
-        given = {name: getattr(self, name) for name in _PARAMETERS if getattr(self, name) not in (None, ())}
+        given = {name: getattr(self, name) for name in PARAMETERS if getattr(self, name) not in (None, ())}
         return {name: value[0] if np.shape(value) == (1,) else value for name, value in given.items()}
 
     def registration(self) -> dict[str, Any]:
@@ -205,15 +205,11 @@ def clouds_in(folder: Path, glob: str = "*", map: File = None) -> datasets.Cloud
     """The clouds of a folder; `map`, a cloud that the command writes, may not become one of them."""
     if map is not None and map.resolve().parent == folder.resolve() and fnmatch(map.name, glob):
         raise ValueError(f"{map}: expected a map outside of {folder}, where it would be one of the clouds")
-    found = datasets.clouds(folder, glob)
-    if len(found) < 2:
-        raise ValueError(f"{folder}: expected at least 2 clouds, found {len(found)} among {glob!r}")
-    if found.left_out:
-        names = [path.name for path in found.left_out]
+    files = datasets.clouds(folder, glob)
+    if len(files) < 2:
+        raise ValueError(f"{folder}: expected at least 2 clouds, found {len(files)} among {glob!r}")
+    if files.left_out:
+        names = [path.name for path in files.left_out]
         more = f" and {len(names) - _MOST_NAMES:,} more" if len(names) > _MOST_NAMES else ""
         print(f"left out:  {', '.join(names[:_MOST_NAMES])}{more}, since they are no clouds")
-    return found
-
-
-def words(result: mcg.RegistrationResult) -> str:
-    return result.status.name.lower().replace("_", " ")
+    return files

@@ -16,7 +16,16 @@ from jaxtyping import Float
 import mcgicp_jax as mcg
 from mcgicp_jax import datasets, io, metrics, plot
 from mcgicp_jax._cli.choices import Choices, distance_in_words, with_channels
-from mcgicp_jax._cli.options import File, Method, MethodName, PairOptions, check_outputs, enumerated, with_names, words
+from mcgicp_jax._cli.options import (
+    PARAMETERS,
+    File,
+    Method,
+    MethodName,
+    PairOptions,
+    check_outputs,
+    enumerated,
+    with_names,
+)
 from mcgicp_jax._compute.messages import messages_named
 from mcgicp_jax._compute.threads import side_by_side
 from mcgicp_jax._methods.base import AbstractMethod
@@ -59,9 +68,15 @@ class PreparedPair:
             return self.choices.preprocess(cloud)
 
     def find_start(self) -> None:
-        """With `--init global`, the pose by local features becomes the initial one."""
-        if self.options.init == "global":
-            self.start, self.verified = _found(self.raw, self.choices.channels)
+        """With `--init global`, start from the pose by local features; raises `ValueError` if there is none."""
+        if self.options.init != "global":
+            return
+        result = mcg.global_pose(*(with_channels(cloud, self.choices.channels) for cloud in self.raw))
+        if not result.num_inliers:
+            raise ValueError(f"--init global: found no pose, no features match ({result}); try --init with a file")
+        verdict = "found" if result.success else "ambiguous" if result.ambiguous else "unsure"
+        print(f"start:     {verdict}, {result.num_inliers:,} of {result.num_matches:,} features match")
+        self.start, self.verified = result.matrix, result.success
 
     def method(self, name: MethodName) -> AbstractMethod:
         """The method with parameters from the options or else from the data."""
@@ -211,7 +226,7 @@ def _compare(
         values = f"{result.num_inliers:9,}  {result.rmse:11.4g}"
         if true_pose is not None:
             values = pair.errors(np.asarray(result.matrix), true_pose)
-        print(f"{name:{width}}  {values}  {result.num_iterations:10}  {milliseconds:8.0f}  {words(result)}")
+        print(f"{name:{width}}  {values}  {result.num_iterations:10}  {milliseconds:8.0f}  {_words(result)}")
     print("(times do not include compilation, preprocessing and the choice of parameters)\n")
     pair.draw(results)
     return results
@@ -234,14 +249,17 @@ def _compiled(pair: PreparedPair, names: Sequence[MethodName]) -> dict[MethodNam
 
 def _parameters(method: AbstractMethod) -> str:
     """The parameters of a method, as in `, epsilon 0.001`."""
-    shown = [name for name in ("channel_covariance", "channel_weights", "epsilon") if hasattr(method, name)]
-    numbers = [(name, np.atleast_1d(getattr(method, name))) for name in shown]
+    numbers = [(name, np.atleast_1d(getattr(method, name))) for name in PARAMETERS if hasattr(method, name)]
     return "".join(f", {name} {' '.join(f'{value:.3g}' for value in values)}" for name, values in numbers)
+
+
+def _words(result: mcg.RegistrationResult) -> str:
+    return result.status.name.lower().replace("_", " ")
 
 
 def _report(pair: PreparedPair, result: mcg.RegistrationResult) -> None:
     plural = "" if result.num_iterations == 1 else "s"
-    print(f"status:    {words(result)} after {result.num_iterations} iteration{plural}")
+    print(f"status:    {_words(result)} after {result.num_iterations} iteration{plural}")
     print(f"inliers:   {result.num_inliers:,} ({result.overlap:.0%} of the points used), rmse {result.rmse:.4g} m")
     if result.converged and np.all(np.isfinite(result.deviations)):
         x, y, z, *angles = result.deviations
@@ -260,7 +278,7 @@ def _verdict(results: dict[MethodName, mcg.RegistrationResult]) -> int:
     """Return the exit code, and print to stderr which methods did not converge."""
     failed = {name: result for name, result in results.items() if not result.converged}
     for name, result in failed.items():
-        print(f"mcgicp: {name} did not converge ({words(result)}): {result.status.advice}", file=sys.stderr)
+        print(f"mcgicp: {name} did not converge ({_words(result)}): {result.status.advice}", file=sys.stderr)
     return 1 if failed else 0
 
 
@@ -272,13 +290,3 @@ def _read_pose(option: str, path: Path) -> Float[np.ndarray, "4 4"]:
     if len(poses) != 1:
         raise ValueError(f"{path}: expected one pose, got {len(poses)}")
     return poses[0]
-
-
-def _found(clouds: Sequence[mcg.PointCloud], channels: Sequence[str]) -> tuple[Float[np.ndarray, "4 4"], bool]:
-    """The pose from any start, and whether to trust it; raises `ValueError` if there is none."""
-    result = mcg.global_pose(*(with_channels(cloud, channels) for cloud in clouds))
-    if not result.num_inliers:
-        raise ValueError(f"--init global: found no pose, no features match ({result}); try --init with a file")
-    verdict = "found" if result.success else "ambiguous" if result.ambiguous else "unsure"
-    print(f"start:     {verdict}, {result.num_inliers:,} of {result.num_matches:,} features match")
-    return result.matrix, result.success

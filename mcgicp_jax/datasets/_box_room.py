@@ -7,6 +7,7 @@ from functools import partial
 import numpy as np
 from jaxtyping import Float
 
+from mcgicp_jax._clouds.columns import COLORS
 from mcgicp_jax._clouds.point_cloud import PointCloud
 from mcgicp_jax.datasets._frames import Matrix, SyntheticFrames, check_scene, pose_of, scene_and_path_rng
 from mcgicp_jax.datasets._raycast import Box, cast, patches, random_rays, sensor_rotation
@@ -90,7 +91,7 @@ def _observe(
     points = hits.distance[:, None] * rays + noise * _POINT_NOISE * error
     painted = colors[hits.solid] + patches(hits.points, _PAINT, pattern)[:, None] * _PAINT_COLOR
     seen = np.clip(painted + noise * _COLOR_NOISE * rng.normal(size=painted.shape), 0, 1)
-    return PointCloud(points, seen, channel_names=("red", "green", "blue"))
+    return PointCloud(points, seen, channel_names=COLORS)
 
 
 def _shell() -> list[Box]:

@@ -157,14 +157,15 @@ def read_depth(path: str | os.PathLike[str]) -> UInt16[np.ndarray, "height width
 
 
 def look_up(image: Picture, pixels: Float[np.ndarray, "N 2"]) -> tuple[Float[np.ndarray, "N 3"], Bool[np.ndarray, "N"]]:
-    """Bilinear colours from 0 to 1, and the mask of pixels inside the image.
+    """Bilinear colours from 0 to 1 in float32, and the mask of pixels inside the image.
 
     Pixels are (column, row); the centre of the first is (0, 0).
     """
     height, width, _ = image.shape
     # NaN compares false and is outside.
     inside = np.all((pixels >= 0) & (pixels <= (width - 1, height - 1)), axis=1)
-    return bilinear(image, np.where(inside[:, None], pixels, 0), "nearest") / 255, inside
+    colors = bilinear(image, np.where(inside[:, None], pixels, 0), "nearest") / 255
+    return colors.astype(np.float32), inside
 
 
 def bilinear(

@@ -11,6 +11,7 @@ from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
 from mcgicp_jax import io
+from mcgicp_jax._clouds.columns import COLORS
 from mcgicp_jax._clouds.point_cloud import Frame, PointCloud
 from mcgicp_jax.datasets._frames import AbstractFrames, Picture, look_up, pose_of, read_image
 
@@ -82,12 +83,8 @@ class KITTIFrames(AbstractFrames):
         pixels = np.where(ahead, homogeneous[:, :2] / np.where(ahead, homogeneous[:, 2:], 1), -1)
         colors, inside = look_up(image, pixels)
         valid = np.column_stack([np.ones(len(inside), bool), *[inside] * 3])
-        painted = PointCloud(
-            cloud.points,
-            np.hstack([cloud.channels, colors.astype(np.float32)]),
-            channel_valid=valid,
-            channel_names=("intensity", "red", "green", "blue"),
-        )
+        channels, names = np.hstack([cloud.channels, colors]), ("intensity", *COLORS)
+        painted = PointCloud(cloud.points, channels, channel_valid=valid, channel_names=names)
         return painted, np.where(inside[:, None], pixels, np.nan)
 
 
@@ -165,7 +162,7 @@ class FordFrames(AbstractFrames):
             raise
         except Exception as error:  # SciPy raises arbitrary exceptions for malformed files.
             raise ValueError(f"{path}: cannot be read as a scan of Ford Campus: {error!r}") from error
-        channels, valid, names = colors, np.repeat(seen[:, None], 3, axis=1), ["red", "green", "blue"]
+        channels, valid, names = colors, np.repeat(seen[:, None], 3, axis=1), list(COLORS)
         if "reflectivity" in scan:
             intensity = np.asarray(scan["reflectivity"], float).reshape(-1, 1)
             channels = np.hstack([intensity, channels])

@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Float, Int
 from scipy.spatial.transform import Rotation
 
+from mcgicp_jax._clouds.columns import COLORS
 from mcgicp_jax._clouds.point_cloud import PointCloud
 from mcgicp_jax.datasets._frames import Matrix, SyntheticFrames, bilinear, check_scene, pose_of, scene_and_path_rng
 
@@ -124,7 +125,7 @@ def _observe(wall: Image, size: int, noise: float, rng: np.random.Generator, pos
     depth_noise = noise * (0.0012 + 0.0019 * (depth - 0.4) ** 2)
     depth = depth + depth_noise * rng.normal(size=depth.shape)
     colors = np.clip(colors + noise * _COLOR_NOISE * rng.normal(size=colors.shape), 0, 1)
-    return PointCloud(depth[:, None] * rays, colors, channel_names=("red", "green", "blue"))
+    return PointCloud(depth[:, None] * rays, colors, channel_names=COLORS)
 
 
 def _rays(rng: np.random.Generator, size: int) -> Float[np.ndarray, "N 3"]:

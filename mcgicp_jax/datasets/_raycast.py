@@ -54,12 +54,7 @@ class Box(AbstractSolid):
 
 @dataclass(frozen=True, eq=False)
 class Cylinder(AbstractSolid):
-    """The lateral surface of an upright cylinder.
-
-    Attributes:
-        foot: (3,), metres, centre of the lower end.
-        radius, height: metres.
-    """
+    """The lateral surface of an upright cylinder, whose lower end is centred at `foot`; metres."""
 
     foot: Vector
     radius: float
@@ -85,12 +80,8 @@ class Cylinder(AbstractSolid):
 class Hits:
     """The hits of rays on solids, without the rays that miss.
 
-    Attributes:
-        rays: (N, 3), unit directions in the world.
-        distance: (N,), metres along the ray.
-        points: (N, 3), in the world, metres.
-        normals: (N, 3), unit, towards the sensor.
-        solid: (N,), index of the solid.
+    The rays and the normals, which point towards the sensor, have unit length. All is in the world frame, in metres;
+    `solid` is the index of the solid.
     """
 
     rays: Rays

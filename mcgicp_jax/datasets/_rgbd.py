@@ -11,6 +11,7 @@ from jaxtyping import Float
 from scipy.spatial.transform import Rotation, Slerp
 
 from mcgicp_jax import io
+from mcgicp_jax._clouds.columns import COLORS
 from mcgicp_jax._clouds.point_cloud import Frame, PointCloud
 from mcgicp_jax.datasets._frames import AbstractFrames, back_project, look_up, pose_of, read_depth, read_image
 
@@ -92,7 +93,7 @@ class TUMFrames(AbstractFrames):
         points, pixels = back_project(depth, self._focal, self._center)
         image = read_image(self.folder / self._colors[index])
         colors, _ = look_up(image, pixels)
-        cloud = PointCloud(points.astype(np.float32), colors.astype(np.float32), channel_names=("red", "green", "blue"))
+        cloud = PointCloud(points.astype(np.float32), colors, channel_names=COLORS)
         return Frame(cloud, self._pose(self._times[index]), float(self._times[index]), image, pixels)
 
     def _pose(self, time: float) -> Float[np.ndarray, "4 4"] | None:
@@ -158,12 +159,8 @@ class SevenScenesFrames(AbstractFrames):
         file = path.with_name(f"{name}.color.png")
         image = read_image(file if file.is_file() else file.with_suffix(".jpg"))
         colors, inside = look_up(image, pixels)
-        cloud = PointCloud(
-            points.astype(np.float32),
-            colors.astype(np.float32),
-            channel_valid=np.repeat(inside[:, None], 3, axis=1),
-            channel_names=("red", "green", "blue"),
-        )
+        valid = np.repeat(inside[:, None], 3, axis=1)
+        cloud = PointCloud(points.astype(np.float32), colors, channel_valid=valid, channel_names=COLORS)
         poses = io.read_poses(path.with_name(f"{name}.pose.txt"))
         time = _PERIOD * int(name.removeprefix("frame-"))
         return Frame(cloud, poses[0], time, image, np.where(inside[:, None], pixels, np.nan))

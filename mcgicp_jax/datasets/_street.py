@@ -10,6 +10,7 @@ from functools import partial
 import numpy as np
 from jaxtyping import Bool, Float
 
+from mcgicp_jax._clouds.columns import COLORS
 from mcgicp_jax._clouds.point_cloud import PointCloud
 from mcgicp_jax.datasets._frames import Matrix, SyntheticFrames, check_scene, pose_of, scene_and_path_rng
 from mcgicp_jax.datasets._raycast import (
@@ -135,9 +136,7 @@ def _observe(
     )
     channels = np.clip(channels + noise * sigma * rng.normal(size=channels.shape), 0, 1)
     distance = hits.distance + noise * _RANGE_NOISE * rng.normal(size=hits.distance.shape)
-    return PointCloud(
-        distance[:, None] * (hits.rays @ rotation), channels, channel_names=("intensity", "red", "green", "blue")
-    )
+    return PointCloud(distance[:, None] * (hits.rays @ rotation), channels, channel_names=("intensity", *COLORS))
 
 
 # The street

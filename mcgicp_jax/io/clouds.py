@@ -11,17 +11,8 @@ from typing import BinaryIO
 
 import numpy as np
 
+import mcgicp_jax.io.arrays as arrays
 from mcgicp_jax._clouds.point_cloud import PointCloud
-from mcgicp_jax.io.arrays import (
-    is_npy_cloud,
-    is_npz_cloud,
-    read_kitti,
-    read_npy,
-    read_npz,
-    write_kitti,
-    write_npy,
-    write_npz,
-)
 from mcgicp_jax.io.files import reason_of, replacing
 from mcgicp_jax.io.las import read_las, write_las
 from mcgicp_jax.io.pcd import read_pcd, write_pcd
@@ -51,9 +42,9 @@ FORMATS = {
     ".pcd": Format(read_pcd, write_pcd),
     ".las": Format(read_las, partial(write_las, compress=False)),
     ".laz": Format(read_las, partial(write_las, compress=True)),
-    ".bin": Format(read_kitti, write_kitti),
-    ".npy": Format(read_npy, write_npy, is_npy_cloud),
-    ".npz": Format(read_npz, write_npz, is_npz_cloud),
+    ".bin": Format(arrays.read_kitti, arrays.write_kitti),
+    ".npy": Format(arrays.read_npy, arrays.write_npy, arrays.is_npy_cloud),
+    ".npz": Format(arrays.read_npz, arrays.write_npz, arrays.is_npz_cloud),
     ".xyz": _SPACES,
     ".txt": _SPACES,
     ".csv": Format(read_text, partial(write_text, delimiter=",", mark=""), is_text_cloud),
@@ -144,8 +135,7 @@ def write(path: str | os.PathLike[str], cloud: PointCloud) -> None:
     cannot represent. A failed write leaves an existing file unchanged.
 
     Args:
-        path: the suffix selects the format: `.ply`, `.pcd`, `.las`, `.laz`, `.bin` (KITTI), `.npy`, `.npz`, `.xyz`,
-            `.txt` or `.csv`.
+        path: the suffix selects the format, as in `read`.
         cloud: one cloud, raw or preprocessed; points in metres.
 
     Raises:

@@ -146,10 +146,9 @@ def write_g2o(path: str | os.PathLike[str], graph: PoseGraph | Any) -> None:
 
 def _graph_of(lines: Iterable[str]) -> PoseGraph:
     words = [(number, line.split()) for number, line in enumerate(lines, 1)]
-    found = {tag: _rows(words, tag) for tag in _WIDTHS}
-    (_, vertices), (edge_lines, edges), (prior_lines, priors), (_, offsets) = found.values()
+    (_, vertices), (edge_lines, edges), (prior_lines, priors), (_, offsets) = (_rows(words, tag) for tag in _WIDTHS)
     if not len(vertices):
-        others = ", ".join(sorted({each[0] for _, each in words if each})[:4])
+        others = ", ".join(sorted({line[0] for _, line in words if line})[:4])
         raise ValueError(f"expected lines {_VERTEX}, poses in space, got {others or 'none'}")
     if len(priors) and np.any(offsets[:, 1:] != [0, 0, 0, 0, 0, 0, 1]):
         raise ValueError(f"expected priors of the poses themselves, got {_OFFSET} other than the identity")

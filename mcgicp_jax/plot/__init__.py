@@ -3,7 +3,7 @@
 Every function returns its figure; none opens a window or changes matplotlib's global state.
 """
 
-from mcgicp_jax.plot.charts import convergence, graph, trajectories
+from mcgicp_jax.plot.charts import graph, trajectories
 from mcgicp_jax.plot.drawing import check_picture
 from mcgicp_jax.plot.pictures import before_after, clouds, maps, surface_covariances
 
@@ -11,7 +11,6 @@ __all__ = [
     "before_after",
     "check_picture",
     "clouds",
-    "convergence",
     "graph",
     "maps",
     "surface_covariances",

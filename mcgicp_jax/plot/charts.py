@@ -1,12 +1,10 @@
-"""Charts: convergence, trajectories and pose graphs."""
+"""Charts of trajectories and pose graphs."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any
 
 import numpy as np
-from jax.typing import ArrayLike
 from jaxtyping import Float
 
 from mcgicp_jax._math.poses import Pose, pose_matrix
@@ -16,31 +14,6 @@ from mcgicp_jax.plot.drawing import Figure, File, new_figure, plotting, saved
 
 # Residual at the end of the colour scale of a graph, standard deviations: loops beyond it are rejected.
 _LARGEST_RESIDUAL = 4.1
-
-
-def convergence(histories: Mapping[str, Sequence[float] | ArrayLike], *, ylabel: str = "cost") -> Figure:
-    """Plot the cost or RMSE per iteration, on a logarithmic scale.
-
-    Args:
-        histories: one number per iteration, by the name of the method.
-        ylabel: label of the y axis: the quantity and its unit.
-
-    Raises:
-        ValueError: if a history is not one-dimensional.
-        ImportError: if matplotlib is missing.
-    """
-    figure = new_figure(6, 4)
-    panel: Any = figure.subplots()
-    for name, history in histories.items():
-        values = np.asarray(history)
-        if values.ndim != 1:
-            raise ValueError(f"histories[{name!r}]: expected one number per iteration, got shape {values.shape}")
-        panel.plot(values, marker="o", markersize=3, label=name)
-    panel.set(xlabel="iteration", ylabel=ylabel, yscale="log")
-    panel.xaxis.get_major_locator().set_params(integer=True)
-    panel.grid(alpha=0.3)
-    panel.legend()
-    return figure
 
 
 def trajectories(

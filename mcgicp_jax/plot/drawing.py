@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 import numpy as np
 from jaxtyping import Float, Int
 
+from mcgicp_jax._clouds.columns import COLORS
 from mcgicp_jax._clouds.point_cloud import PointCloud
 from mcgicp_jax._compute.messages import optional_module
 
@@ -53,14 +54,10 @@ def check_picture(path: str | os.PathLike[str]) -> None:
 
 @dataclass(frozen=True)
 class View:
-    """An orthographic projection of points to the pixels of a plane.
+    """An orthographic projection of points to `height` × `width` pixels of a plane.
 
-    Attributes:
-        center: (3,), metres, a point of the plane.
-        axes: (3, 3), columns: right, up, and the normal towards the viewer.
-        low: (2,), metres, the lower left corner in the plane.
-        pixel: side of a pixel, metres.
-        width, height: pixels.
+    `center` is a point of the plane, `low` the lower left corner in it, and `pixel` the side of a pixel, in metres. The
+    columns of `axes` point right, up, and towards the viewer.
     """
 
     center: Float[np.ndarray, "3"]
@@ -135,10 +132,9 @@ def has_everywhere(cloud: PointCloud, names: tuple[str, ...]) -> bool:
 
 def rgb_of(cloud: PointCloud) -> Points | None:
     """Colours in 0..1 from channels in 0..1, 0..255 or 0..65535; None unless every point has a colour."""
-    names = ("red", "green", "blue")
-    if not has_everywhere(cloud, names):
+    if not has_everywhere(cloud, COLORS):
         return None
-    channels = np.asarray(cloud.channels, float)[:, [cloud.channel_names.index(name) for name in names]]
+    channels = np.asarray(cloud.channels, float)[:, [cloud.channel_names.index(name) for name in COLORS]]
     largest = channels.max(initial=0)
     full_scale = next((scale for scale in (1, 255) if largest <= scale), 65535)
     return np.clip(channels / full_scale, 0, 1)

@@ -39,9 +39,8 @@ def before_after(source: PointCloud, target: PointCloud, poses: Mapping[str, Pos
     If all points have the channels red, green and blue, target and source alternate in a checkerboard, in which
     patterns continue across tiles where the pose is right; a further panel shows the colour difference. Otherwise the
     clouds are overlaid, the target in blue and the source in orange, black where both are, points of the sparser cloud
-    larger by the ratio of the spacings. Upright surfaces are drawn
-    dark and flat ones pale, since the rings of a LiDAR on the ground move with the sensor. The detail shows the region
-    where the poses differ most.
+    larger by the ratio of the spacings. Upright surfaces are drawn dark and flat ones pale, since the rings of a LiDAR
+    on the ground move with the sensor. The detail shows the region where the poses differ most.
 
     Args:
         source, target: clouds in their own frames.
@@ -252,8 +251,8 @@ def surface_covariances(
     figure = drawing.new_figure(_WIDTH, width * view.height / view.width + 0.35)
     panels = figure.subplots(1, len(covariances), squeeze=False)[0]
     for panel, (name, values) in zip(panels, covariances.items(), strict=True):
-        given = covariances_of(values, cloud) if isinstance(values, AbstractMethod) else values
-        matrices, size = np.asarray(given, np.float64), cloud.points.shape[0]
+        values = covariances_of(values, cloud) if isinstance(values, AbstractMethod) else values
+        matrices, size = np.asarray(values, np.float64), cloud.points.shape[0]
         if matrices.shape != (size, 3, 3):
             raise ValueError(f"covariances[{name!r}]: expected shape ({size}, 3, 3), got {matrices.shape}")
         flat = view.axes[:, :2].T @ matrices[rows] @ view.axes[:, :2]
