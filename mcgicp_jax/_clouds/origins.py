@@ -66,12 +66,8 @@ def pose_in_user_frame(
 
 
 class _InUserFrame(AbstractLinearMap):
-    """The derivative of `pose_in_user_frame` by `wxyz_xyz` and both origins, which compiles nothing.
-
-    Args:
-        parameters, rotation: of the pose.
-        start: origin of the source.
-    """
+    """The derivative of `pose_in_user_frame` by the parameters `wxyz_xyz` and both origins, which compiles nothing;
+    `start` is the origin of the source."""
 
     def __init__(self, parameters: np.ndarray, rotation: np.ndarray, start: np.ndarray):
         turn = turn_by_quaternion(parameters[..., :4])

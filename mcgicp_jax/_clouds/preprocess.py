@@ -99,11 +99,8 @@ def preprocessed_in(
 
 
 def _differentiable(cloud: PointCloud, found: PointCloud, fixed: PointCloud) -> PointCloud:
-    """The preprocessed cloud `found` with the derivative by the arrays of a raw one that differentiation traces.
-
-    Args:
-        fixed: the raw cloud without these traces.
-    """
+    """The preprocessed cloud `found` with the derivative by the traced arrays of a raw one; `fixed` is the raw cloud
+    without these traces."""
     raw = fixed.unpad()
     finite = _is_finite(raw)
     rows, voxels = np.flatnonzero(np.asarray(fixed.valid))[finite], np.arange(np.sum(finite))
@@ -116,11 +113,8 @@ def _differentiable(cloud: PointCloud, found: PointCloud, fixed: PointCloud) -> 
             # The sum is what was averaged; the origin of the result is a constant.
             array = array + cloud.origin
         if not is_concrete(array):
-            known = (
-                np.ones((len(rows), 1))
-                if raw.channel_valid is None or name != "channels"
-                else raw.channel_valid[finite]
-            )
+            mask = raw.channel_valid if name == "channels" else None
+            known = np.ones((len(rows), 1)) if mask is None else mask[finite]
             average = RowAverage(rows, voxels, known, (array.shape[0], len(found.points)))
             (arrays[name],) = with_derivative([getattr(found, name)], average, [array])
     return found.replace_rows(**arrays)

@@ -62,13 +62,8 @@ _MANY_LINES, _AS_THICK_AS_WIDE = 0.1, 0.6
 
 
 class Shape(NamedTuple):
-    """The shape of the neighbourhoods of a cloud.
-
-    Attributes:
-        lines: fraction of the neighbourhoods that are lines.
-        thickness: median of their third extent over the second.
-        spacing: median distance of the nearest neighbour, metres.
-    """
+    """The neighbourhoods of a cloud: the fraction that are lines, the median of their third extent over the second, and
+    the median distance of the nearest neighbour, metres."""
 
     lines: float
     thickness: float
@@ -179,11 +174,7 @@ def _chosen(grids: Sequence[Grid]) -> Voxels:
 
 
 def _shape_of(columns: Float[np.ndarray, "3 N"], neighbors: Any = None) -> Shape:
-    """The shape of a sample of the neighbourhoods.
-
-    Args:
-        neighbors: (N, k) rows or `NeighborsOnDemand`; found if None.
-    """
+    """The shape of a sample of the neighbourhoods: of (N, k) rows or `NeighborsOnDemand`; searched if None."""
     size = columns.shape[1]
     rows = np.random.default_rng(0).integers(0, size, _SAMPLE)
     if neighbors is None:
@@ -201,13 +192,8 @@ def _shape_of(columns: Float[np.ndarray, "3 N"], neighbors: Any = None) -> Shape
 
 
 class _Candidate:
-    """A cloud for which a voxel size is chosen, and the shapes of its neighbourhoods in voxels.
-
-    Args:
-        grid: of the points, or of means in voxels.
-        step: number of the size of these voxels; None for points.
-        least: smallest number of voxels that show the scene.
-    """
+    """A cloud for which a voxel size is chosen, and the shapes of its neighbourhoods in voxels: points, or means in
+    voxels of the size number `step`. At least so many voxels show the scene."""
 
     def __init__(self, grid: Grid, step: int | None, least: int):
         self._grid, self._step, self._least = grid, step, least
@@ -257,11 +243,7 @@ def _thickness(candidates: Sequence[_Candidate], step: int | None) -> float:
 
 def _without_lines(candidates: Sequence[_Candidate], step: int | None, steps: range) -> int | None:
     """The smallest size at which few neighbourhoods are lines, or else the largest at which all clouds show the scene;
-    None if there is none.
-
-    Args:
-        step: number of the current size.
-    """
+    None if there is none. `step` is the number of the current size."""
 
     def suffices(candidate: _Candidate, larger: int) -> bool:
         return not candidate.shows_scene(larger) or candidate.shape(larger).lines <= _MOST_LINES
@@ -276,11 +258,8 @@ def _without_lines(candidates: Sequence[_Candidate], step: int | None, steps: ra
 
 
 def _thinner(candidates: Sequence[_Candidate], step: int | None, start: int) -> int | None:
-    """The smallest size in whose voxels the neighbourhoods are clearly thinner; None if there is none.
-
-    Args:
-        start: number of the size that is doubled, the current one or the spacing.
-    """
+    """The smallest size in whose voxels the neighbourhoods are clearly thinner; None if there is none. `start` is the
+    number of the size that is doubled, the current one or the spacing."""
     before = _thickness(candidates, step)
     for larger in range(start + _DOUBLE, start + _DOUBLE * _DOUBLINGS + 1, _DOUBLE):
         if not all(candidate.shows_scene(larger) for candidate in candidates):

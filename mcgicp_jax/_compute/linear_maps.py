@@ -35,11 +35,7 @@ class AbstractLinearMap(abc.ABC):
 
 
 class KnownJacobian(AbstractLinearMap):
-    """The derivative of one value of k numbers by several arrays.
-
-    Args:
-        blocks: (k, ...) by each array.
-    """
+    """The derivative of one value of k numbers, (k, ...) by each of several arrays."""
 
     def __init__(self, blocks: Sequence[np.ndarray]):
         self._blocks = blocks
@@ -54,11 +50,7 @@ class KnownJacobian(AbstractLinearMap):
 
 
 class SideBySide(AbstractLinearMap):
-    """Several maps, each with one value and its own inputs, computed in threads.
-
-    Args:
-        counts: number of inputs of each map, in the order of all inputs.
-    """
+    """Several maps, each with one value and its own inputs, of which `counts` are the numbers; computed in threads."""
 
     def __init__(self, maps: Sequence[AbstractLinearMap], counts: Sequence[int]):
         self._maps, self._starts = maps, np.cumsum([0, *counts])
@@ -72,17 +64,14 @@ class SideBySide(AbstractLinearMap):
 
     def push(self, tangents: Sequence[np.ndarray], moving: tuple[int, ...]) -> list[np.ndarray]:
         rest = iter(tangents)
-        parts = [
-            (each, [next(rest) for _ in some], some)
-            for each, some in zip(self._maps, self._moving(moving), strict=True)
-        ]
-        calls = [partial(each.push, tangent, some) for each, tangent, some in parts]
-        return [value for (value,) in side_by_side(calls)]
+        parts = zip(self._maps, self._moving(moving), strict=True)
+        values = side_by_side([partial(each.push, [next(rest) for _ in own], own) for each, own in parts])
+        return [value for (value,) in values]
 
     def pull(self, cotangents: Sequence[np.ndarray], moving: tuple[int, ...]) -> list[np.ndarray]:
         parts = zip(self._maps, cotangents, self._moving(moving), strict=True)
-        results = side_by_side([partial(each.pull, [cotangent], some) for each, cotangent, some in parts])
-        return [found for result in results for found in result]
+        results = side_by_side([partial(each.pull, [cotangent], own) for each, cotangent, own in parts])
+        return list(itertools.chain.from_iterable(results))
 
 
 def primal(tree: Any) -> Any:
@@ -112,20 +101,19 @@ def with_derivative(values: Sequence[np.ndarray], linear: AbstractLinearMap, inp
         # An outer differentiation, even by other inputs, would see constants.
         for each in inputs:
             once(each)
-        found = [jnp.asarray(value) for value in values]
+        outputs = [jnp.asarray(value) for value in values]
         moving = tuple(i for i, tangent in enumerate(tangents) if not is_symbolic_zero(tangent))
         if not moving:
-            return found, [jnp.zeros_like(value) for value in found]
-        shapes = tuple(jax.typeof(inputs[i]) for i in moving)
+            return outputs, [jnp.zeros_like(value) for value in outputs]
         slopes = _linear.bind(
             *(tangents[i] for i in moving),
             function=partial(linear.push, moving=moving),
             transpose=partial(linear.pull, moving=moving),
-            inputs=shapes,
-            outputs=tuple(jax.typeof(value) for value in found),
+            inputs=tuple(jax.typeof(inputs[i]) for i in moving),
+            outputs=tuple(map(jax.typeof, outputs)),
             batch=(),
         )
-        return found, slopes
+        return outputs, slopes
 
     attached.defjvp(rule, symbolic_zeros=True)
     return attached(*inputs)
@@ -155,11 +143,11 @@ class RowAverage(AbstractLinearMap):
 
     def pull(self, cotangents: Sequence[np.ndarray], moving: tuple[int, ...]) -> list[np.ndarray]:
         (each,) = cotangents
-        found = np.zeros((len(each), self._size, *each.shape[2:]), each.dtype)
         shape = each.shape[2:]
-        for rows, by in zip(found, each.reshape(*each.shape[:2], math.prod(shape)), strict=True):
+        by_rows = np.zeros((len(each), self._size, *shape), each.dtype)
+        for rows, by in zip(by_rows, each.reshape(*each.shape[:2], math.prod(shape)), strict=True):
             rows[self._rows] = (self._weights * (self._sum.T @ by)).reshape(len(self._rows), *shape)
-        return [found]
+        return [by_rows]
 
 
 @with_settings_of_package
@@ -217,17 +205,15 @@ def _call(*operands: Any, function: Callable, transpose: Callable, inputs: Any, 
 
 
 @_linear.def_abstract_eval
-def _shapes(*operands: Any, function: Callable, transpose: Callable, inputs: Any, outputs: Any, batch: Any) -> Any:
+def _shapes(*_: Any, outputs: Any, batch: Any, **__: Any) -> Any:
     return [aval.update(shape=(*batch, *aval.shape)) for aval in outputs]
 
 
 def _transposed(
-    cotangents: Any, *operands: Any, function: Callable, transpose: Callable, inputs: Any, outputs: Any, batch: Any
+    cotangents: Any, *_: Any, function: Callable, transpose: Callable, inputs: Any, outputs: Any, batch: Any
 ) -> Any:
-    cotangents = [ad.instantiate_zeros(each) for each in cotangents]
-    return _linear.bind(
-        *cotangents, function=transpose, transpose=function, inputs=outputs, outputs=inputs, batch=batch
-    )
+    swapped = {"function": transpose, "transpose": function, "inputs": outputs, "outputs": inputs}
+    return _linear.bind(*map(ad.instantiate_zeros, cotangents), **swapped, batch=batch)
 
 
 def _batched(operands: Any, axes: Any, *, batch: Any, **parameters: Any) -> Any:

@@ -12,11 +12,10 @@ number of threads. Inside `jit` and `vmap` the function is applied to whole arra
 
 from __future__ import annotations
 
-import abc
 import copy
 import math
 from collections.abc import Callable, Iterator, Sequence
-from functools import cache, cached_property, partial
+from functools import cache, cached_property, partial, reduce
 from typing import Any, NamedTuple
 
 import jax
@@ -28,7 +27,7 @@ from scipy.sparse import csc_array
 from mcgicp_jax._compute.concrete import Deferred, is_concrete, outside_trace
 from mcgicp_jax._compute.linear_maps import AbstractLinearMap, primal, with_derivative
 from mcgicp_jax._compute.programs import quickly_compiled
-from mcgicp_jax._compute.tables import BLOCK, NEIGHBORHOOD_BLOCK, Packed, RowsOnDemand, blocks
+from mcgicp_jax._compute.tables import BLOCK, NEIGHBORHOOD_BLOCK, Layout, Packed, RowsOnDemand, blocks
 from mcgicp_jax._compute.threads import in_new_thread, num_cores, side_by_side, with_settings_of_package
 
 # Points. Inside transformations, neighbourhoods of more points are processed in blocks, too: on CPUs XLA sums over the
@@ -40,6 +39,8 @@ _LARGEST_BLOCK = 8192
 # Arrays by which a derivative is taken, by identity; and (c, ...) or (N, c, ...) tangents or cotangents of these.
 Moving = frozenset[int]
 Slopes = dict[int, Any]
+# The places of the leaves of the numbers, and of the leaves of each input, by which a derivative is taken.
+Chosen = tuple[tuple[int, ...], ...]
 
 
 class Rows(NamedTuple):
@@ -52,45 +53,6 @@ class Rows(NamedTuple):
 
     tree: Any
     index: Int[Any, "*k n"]
-
-
-class Table(abc.ABC):
-    """A pytree of arrays that share their rows, packed in one array, or several such trees.
-
-    Attributes:
-        size: number of rows.
-    """
-
-    size: int
-
-    @property
-    @abc.abstractmethod
-    def arrays(self) -> dict[int, Any]:
-        """The arrays that it depends on, by identity: its own, or those that it is computed from."""
-
-    @abc.abstractmethod
-    def known(self, rows: Int[np.ndarray, "n"] | None = None, num_threads: int | None = 1) -> tuple[Packed, ...]:
-        """The packed trees, in which these rows (None: all) are computed, and others may not be."""
-
-    def trees(self, rows: Int[np.ndarray, "n"] | None = None, num_threads: int | None = 1) -> tuple[Any, ...]:
-        """The trees: of all rows, views that must not be changed, or copies of some rows."""
-        known = self.known(rows, num_threads)
-        return tuple((part if rows is None else part.rows(rows)).tree for part in known)
-
-    @abc.abstractmethod
-    def columns(self, moving: Moving) -> tuple[int, ...]:
-        """The numbers of the arrays of the first tree that depend on those that are moving. Further trees are constants
-        to autodiff."""
-
-    @abc.abstractmethod
-    def pull(
-        self, rows: Int[np.ndarray, "n"], cotangents: Float[np.ndarray, "N c W"], moving: Moving, into: Slopes
-    ) -> None:
-        """Add the cotangents of what is moving to `into`, from those of the `columns`, which are 0 in other rows."""
-
-    @abc.abstractmethod
-    def push(self, rows: Int[np.ndarray, "n"], tangents: Slopes, moving: Moving) -> Float[np.ndarray, "N c W"]:
-        """Tangents of the `columns`, in these rows, from those of what is moving."""
 
 
 class Input(NamedTuple):
@@ -107,8 +69,8 @@ class Input(NamedTuple):
     part: int = 0
 
 
-class GivenTable(Table):
-    """A table of NumPy arrays, some of which differentiation may trace."""
+class GivenTable:
+    """A table of NumPy arrays, some of which differentiation may trace. The methods are those of `ComputedTable`."""
 
     def __init__(self, tree: Any):
         self._leaves = jax.tree.leaves(tree)
@@ -125,7 +87,7 @@ class GivenTable(Table):
     def columns(self, moving: Moving) -> tuple[int, ...]:
         return tuple(i for i, leaf in enumerate(self._leaves) if id(leaf) in moving)
 
-    def pull(self, rows: Any, cotangents: Any, moving: Moving, into: Slopes) -> None:
+    def pull(self, cotangents: Any, moving: Moving, into: Slopes, rows: Any = None) -> None:
         start = 0
         for leaf in (self._leaves[i] for i in self.columns(moving)):
             stop = start + math.prod(leaf.shape[1:])
@@ -133,46 +95,9 @@ class GivenTable(Table):
             into[id(leaf)] = into.get(id(leaf), 0) + found.reshape(len(found), *leaf.shape)
             start = stop
 
-    def push(self, rows: Any, tangents: Slopes, moving: Moving) -> Any:
+    def push(self, tangents: Slopes, moving: Moving, rows: Any) -> np.ndarray:
         leaves = [tangents[id(self._leaves[i])] for i in self.columns(moving)]
-        return np.concatenate([leaf.reshape(*leaf.shape[:2], -1) for leaf in leaves], axis=-1).swapaxes(0, 1)
-
-
-class ComputedTable(Table):
-    """The result of a row function, whose rows are computed when they are first used. Threads may share it.
-
-    Args:
-        function, numbers, inputs: as of `RowFunction`; the function returns a tuple of trees.
-        size: number of rows.
-        values: a table with the same values, from which rows are taken.
-    """
-
-    def __init__(self, function: Any, numbers: Any, inputs: Sequence[Input], size: int, values: Any = None):
-        self._of = RowFunction(function, numbers, inputs, size)
-        self._rows = RowsOnDemand(self._of.rows, size) if values is None else values._rows
-        self.size = size
-
-    @property
-    def arrays(self) -> dict[int, Any]:
-        return self._of.arrays
-
-    def known(self, rows: Any = None, num_threads: int | None = 1) -> tuple[Packed, ...]:
-        return self._rows.known(rows, num_threads)
-
-    def columns(self, moving: Moving) -> tuple[int, ...]:
-        if moving.isdisjoint(self.arrays):
-            return ()
-        layout = self.known(np.zeros(0, int))[0].layout
-        return tuple(i for i, dtype in enumerate(layout.dtypes) if dtype is None)
-
-    def pull(self, rows: Any, cotangents: Any, moving: Moving, into: Slopes) -> None:
-        self._of.pull(cotangents, moving, into, rows)
-
-    def push(self, rows: Any, tangents: Slopes, moving: Moving) -> Any:
-        found = self._of.push(tangents, moving, rows)
-        whole = np.zeros((self.size, *found.shape[1:]), found.dtype)
-        whole[rows] = found
-        return whole
+        return np.concatenate([leaf.reshape(*leaf.shape[:2], -1) for leaf in leaves], axis=-1).swapaxes(0, 1)[rows]
 
 
 class RowFunction:
@@ -188,8 +113,10 @@ class RowFunction:
     """
 
     def __init__(self, function: Any, numbers: Any, inputs: Sequence[Input], size: int, total: bool = False):
-        self._function, self._size, self._total = function, size, total
-        self._inputs = [each._replace(table=as_table(each.table)) for each in inputs]
+        self._function, self.size, self._total = function, size, total
+        self._inputs = [
+            each if isinstance(each.table, Table) else each._replace(table=GivenTable(each.table)) for each in inputs
+        ]
         self._leaves = jax.tree.leaves(numbers)
         self._numbers = primal(numbers)
 
@@ -215,24 +142,22 @@ class RowFunction:
 
     def rows(self, rows: Int[np.ndarray, "n"] | None = None, num_threads: int | None = 1) -> tuple[Packed, ...]:
         """The trees of rows; of all rows by default."""
-        gathered = _Gathered(self._inputs, self._size, rows, num_threads)
-        found = self._over_blocks(gathered, num_threads)
+        found = self._over_blocks(rows, num_threads)
         layouts = [part.layout for part in found[0][1]]
-        tables = [np.empty((gathered.size, *part.table.shape[1:]), part.table.dtype) for part in found[0][1]]
+        size = found[-1][0].stop
+        tables = [np.empty((size, *part.table.shape[1:]), part.table.dtype) for part in found[0][1]]
         for places, parts in found:
             for table, part in zip(tables, parts, strict=True):
                 table[places] = np.asarray(part.table)[: places.stop - places.start]
-        return tuple(Packed(table, layout) for table, layout in zip(tables, layouts, strict=True))
+        return tuple(map(Packed, tables, layouts))
 
     def sums(self, num_threads: int | None = 1, packed: bool = True) -> list[Any]:
         """The sum over each block, packed if that is not declined; programs may not have ended."""
-        gathered = _Gathered(self._inputs, self._size, None, num_threads)
-        return [part for _, part in self._over_blocks(gathered, num_threads, packed)]
+        return [part for _, part in self._over_blocks(None, num_threads, packed)]
 
     @with_settings_of_package
-    def _over_blocks(
-        self, gathered: _Gathered, num_threads: int | None, packed: bool = True
-    ) -> list[tuple[slice, Any]]:
+    def _over_blocks(self, rows: Any, num_threads: int | None, packed: bool = True) -> list[tuple[slice, Any]]:
+        gathered = _Gathered(self._inputs, self.size, rows, num_threads)
         # Without its fusion emitters XLA compiles in half the time; programs over neighbourhoods would run longer.
         run = _program(self._function, self._total, packed, gathered.block_size == BLOCK)
         # Worker threads run outside a trace that is active in this thread; this thread leaves it for the same results.
@@ -243,13 +168,11 @@ class RowFunction:
 
     def value_and_jacobian(self, wanted: Sequence[int]) -> tuple[np.ndarray, list[np.ndarray]]:
         """A sum, packed, and its derivative (L, ...) by the leaves of `numbers` with these numbers; float64."""
-        total: Any = None
-        program = _jacobian_program(self._function, tuple(wanted))
-        gathered = _Gathered(self._inputs, self._size, None)
-        for _, found in self._in_order(gathered, lambda block, _: program(self._numbers, *block), num_cores()):
-            found = jax.tree.map(lambda leaf: np.asarray(leaf, np.float64), found)
-            total = found if total is None else jax.tree.map(np.add, total, found)
-        return total
+        program = _jacobian_program(self._function, (tuple(wanted), *(() for _ in self._inputs)))
+        gathered = _Gathered(self._inputs, self.size, None)
+        results = self._in_order(gathered, lambda block, _: program(self._numbers, *block), num_cores())
+        parts = [jax.tree.map(lambda leaf: np.asarray(leaf, np.float64), part) for _, part in results]
+        return reduce(partial(jax.tree.map, np.add), parts)
 
     def cotangents(self, cotangents: np.ndarray, leaves: Sequence[Any]) -> list[np.ndarray]:
         """Cotangents (c, ...) of some arrays, from those of the sum or of the rows, as `pull` takes them."""
@@ -265,10 +188,10 @@ class RowFunction:
             cotangents: (c, L) of the sum, packed, or (N, c, L) of the rows.
             rows: those whose cotangents are not 0; None for all.
         """
-        numbers, columns = chosen = self._chosen(moving)
-        if not (numbers or any(columns)):
+        numbers, *columns = chosen = self._chosen(moving)
+        if not any(chosen):
             return
-        gathered = _Gathered(self._inputs, self._size, rows)
+        gathered = _Gathered(self._inputs, self.size, rows)
         program, count = _pull_program(self._function, self._total, chosen), cotangents.shape[0 if self._total else 1]
 
         def call(block: Any, places: slice) -> Any:
@@ -277,53 +200,54 @@ class RowFunction:
                 here = cotangents[places if rows is None else rows[places]]
                 some = np.zeros((gathered.block_size, *here.shape[1:]), here.dtype)
                 some[: len(here)] = here
-            return [jax.tree.map(np.asarray, program(self._numbers, *block, some)), block[1]]
+            return jax.tree.map(np.asarray, program(self._numbers, *block, some)), block[1]
 
-        slopes: list[Any] = [None] * len(columns)
+        slopes: dict[int, np.ndarray] = {}
         for places, ((by_numbers, by_rows), indices) in self._in_order(gathered, call, num_cores()):
             for i, by in zip(numbers, by_numbers, strict=True):
                 key = id(self._leaves[i])
                 into[key] = into.get(key, 0) + by.astype(np.float64)
+            live = (..., slice(0, places.stop - places.start))
             for j, by in enumerate(by_rows):
-                if by is not None:
-                    if slopes[j] is None:
+                if columns[j]:
+                    if j not in slopes:
                         slopes[j] = np.zeros((self._inputs[j].table.size, count, by.shape[-1]), by.dtype)
-                    live = (..., slice(0, places.stop - places.start))
                     _add_rows(slopes[j], indices[j][live], np.moveaxis(by, 0, -2)[(*live, slice(None), slice(None))])
-        for j, slope in enumerate(slopes):
-            if slope is not None:
-                self._inputs[j].table.pull(gathered.used(j), slope, moving, into)
+        for j, slope in slopes.items():
+            self._inputs[j].table.pull(slope, moving, into, gathered.used(j))
 
     def push(self, tangents: Slopes, moving: Moving, rows: Int[np.ndarray, "n"] | None = None) -> np.ndarray:
         """Tangents (c, L) of the sum, packed, or (n, c, L) of the rows, from those (c, ...) of what is moving. A scalar
         0 if it does not depend on that."""
-        numbers, columns = chosen = self._chosen(moving)
-        if not (numbers or any(columns)):
+        numbers, *columns = chosen = self._chosen(moving)
+        if not any(chosen):
             return np.zeros(())
-        gathered = _Gathered(self._inputs, self._size, rows)
+        gathered = _Gathered(self._inputs, self.size, rows)
         program = _push_program(self._function, self._total, chosen)
-        slopes = [
-            each.table.push(gathered.used(j), tangents, moving) if columns[j] else None
-            for j, each in enumerate(self._inputs)
-        ]
         by_numbers = [tangents[id(self._leaves[i])].astype(np.result_type(self._leaves[i])) for i in numbers]
+        slopes: dict[int, np.ndarray] = {}
+        for j, table in ((j, self._inputs[j].table) for j, some in enumerate(columns) if some):
+            used = gathered.used(j)
+            found = table.push(tangents, moving, used)
+            slopes[j] = np.zeros((table.size, *found.shape[1:]), found.dtype)
+            slopes[j][used] = found
 
         def call(block: Any, _: slice) -> Any:
             by_rows = [
-                None if slope is None else np.moveaxis(slope[np.maximum(index, 0)], -2, 0).astype(pack.table.dtype)
-                for slope, pack, index in zip(slopes, *block, strict=True)
+                np.moveaxis(slopes[j][np.maximum(index, 0)], -2, 0).astype(pack.table.dtype) if j in slopes else None
+                for j, (pack, index) in enumerate(zip(*block, strict=True))
             ]
             return np.asarray(program(self._numbers, *block, by_numbers, by_rows))
 
-        found = list(self._in_order(gathered, call, num_cores()))
+        parts = list(self._in_order(gathered, call, num_cores()))
         if self._total:
-            return np.sum([part.astype(np.float64) for _, part in found], axis=0)
-        return np.concatenate([part[:, : places.stop - places.start] for places, part in found], axis=1).swapaxes(0, 1)
+            return np.sum([part.astype(np.float64) for _, part in parts], axis=0)
+        return np.concatenate([part[:, : places.stop - places.start] for places, part in parts], axis=1).swapaxes(0, 1)
 
-    def _chosen(self, moving: Moving) -> tuple[tuple[int, ...], tuple[tuple[int, ...], ...]]:
-        """The numbers of the leaves of `numbers`, and of the columns of each input, that depend on what is moving."""
+    def _chosen(self, moving: Moving) -> Chosen:
+        """What depends on what is moving."""
         numbers = tuple(i for i, leaf in enumerate(self._leaves) if id(leaf) in moving)
-        return numbers, tuple(() if each.part else each.table.columns(moving) for each in self._inputs)
+        return numbers, *(() if each.part else each.table.columns(moving) for each in self._inputs)
 
     def _in_order(
         self, gathered: _Gathered, call: Callable[[Any, slice], Any], at_once: int, num_threads: int | None = None
@@ -338,6 +262,41 @@ class RowFunction:
             some = cut[start : start + at_once]
             results = side_by_side([partial(work, *each) for each in some], num_threads)
             yield from zip((places for places, _ in some), results, strict=True)
+
+
+class ComputedTable(RowFunction):
+    """The result of a row function, whose rows are computed when they are first used. Threads may share it.
+
+    Args:
+        function, numbers, inputs, size: as of `RowFunction`; the function returns a tuple of trees, of which those
+            after the first are constants to autodiff.
+        values: a table with the same values, from which rows are taken.
+    """
+
+    def __init__(self, function: Any, numbers: Any, inputs: Sequence[Input], size: int, values: Any = None):
+        super().__init__(function, numbers, inputs, size)
+        # Not `self.rows`, whose cycle would keep the table until garbage is collected.
+        computed = RowFunction(function, numbers, self._inputs, size)
+        self._rows = RowsOnDemand(computed.rows, size) if values is None else values._rows
+
+    def known(self, rows: Int[np.ndarray, "n"] | None = None, num_threads: int | None = 1) -> tuple[Packed, ...]:
+        """The packed trees, in which these rows (None: all) are computed, and others may not be."""
+        return self._rows.known(rows, num_threads)
+
+    def trees(self, rows: Int[np.ndarray, "n"] | None = None, num_threads: int | None = 1) -> tuple[Any, ...]:
+        """The trees: of all rows, views that must not be changed, or copies of some rows."""
+        known = self.known(rows, num_threads)
+        return tuple((part if rows is None else part.rows(rows)).tree for part in known)
+
+    def columns(self, moving: Moving) -> tuple[int, ...]:
+        """The numbers of the arrays of the first tree that depend on those that are moving."""
+        if moving.isdisjoint(self.arrays):
+            return ()
+        layout = self.known(np.zeros(0, int))[0].layout
+        return tuple(i for i, dtype in enumerate(layout.dtypes) if dtype is None)
+
+
+Table = GivenTable | ComputedTable
 
 
 class _Gathered:
@@ -381,10 +340,6 @@ class _Gathered:
         return np.unique(index[index >= 0])
 
 
-def as_table(table: Any) -> Table:
-    return table if isinstance(table, Table) else GivenTable(table)
-
-
 @with_settings_of_package
 def blockwise(function: Callable[..., Any], numbers: Any, *inputs: Input, total: bool = False) -> Any:
     """Apply a row function, outside or inside of transformations.
@@ -420,45 +375,43 @@ def blockwise(function: Callable[..., Any], numbers: Any, *inputs: Input, total:
         raise ValueError(f"inputs: expected each to be an Input, as Input(array, row_numbers), got {kinds}")
     if not is_concrete(primal((numbers, [each for each in inputs if not isinstance(each.table, Table)]))):
         return over_whole(function, numbers, inputs, total)
-    first = inputs[0]
-    size = as_table(first.table).size if first.index is None else len(first.index)
-    applied = RowFunction(function, numbers, inputs, size, total)
+    applied = RowFunction(function, numbers, inputs, size_of(inputs[0]), total)
     call = partial(applied.sums, None) if total else partial(applied.rows, None, None)
     # Differentiation is a transformation, too: inside it, calls of programs take longer.
-    parts = in_new_thread(call) if applied.tracers else call()
+    packs = in_new_thread(call) if applied.tracers else call()
     if total:
-        added = np.sum([np.asarray(part.table, np.float64) for part in parts], axis=0)
-        found: list[Packed] = [Packed(added.astype(parts[0].table.dtype), parts[0].layout)]
-    else:
-        found = list(parts)
-    leaves, structure = jax.tree.flatten(found[0].tree)
+        table = np.sum([np.asarray(part.table, np.float64) for part in packs], axis=0)
+        packs = [Packed(table.astype(packs[0].table.dtype), packs[0].layout)]
+    leaves, structure = jax.tree.flatten(packs[0].tree)
     if applied.tracers:
-        leaves = with_derivative(leaves, _Derivative(applied, total, leaves), applied.tracers)
+        leaves = with_derivative(leaves, _Derivative(applied, total, packs[0].layout), applied.tracers)
     elif total:
         leaves = [jax.device_put(leaf) for leaf in leaves]
-    trees = (jax.tree.unflatten(structure, leaves), *(each.tree for each in found[1:]))
-    return trees[0] if total else trees
+    first = jax.tree.unflatten(structure, leaves)
+    return first if total else (first, *(each.tree for each in packs[1:]))
+
+
+def size_of(first: Input) -> int:
+    """The number of rows of a result, from its first input."""
+    if first.index is not None:
+        return len(first.index)
+    return first.table.size if isinstance(first.table, Table) else len(jax.tree.leaves(first.table)[0])
 
 
 class _Derivative(AbstractLinearMap):
     """The derivative of the arrays that a row function returns."""
 
-    def __init__(self, applied: RowFunction, total: bool, values: Sequence[np.ndarray]):
-        self._applied, self._total = applied, total
+    def __init__(self, applied: RowFunction, total: bool, layout: Layout):
+        self._applied, self._total, self._layout = applied, total, layout
         self._leaves = applied.tracers
-        self._shapes = [value.shape if total else value.shape[1:] for value in values]
 
     def push(self, tangents: Sequence[np.ndarray], moving: tuple[int, ...]) -> list[np.ndarray]:
         slopes = {id(self._leaves[i]): tangent for i, tangent in zip(moving, tangents, strict=True)}
         found = self._applied.push(slopes, frozenset(slopes))
-        found = found if self._total else found.swapaxes(0, 1)
-        ends = np.cumsum([math.prod(shape) for shape in self._shapes])
-        parts = np.split(found, ends[:-1], axis=-1)
-        return [part.reshape(*part.shape[:-1], *shape) for part, shape in zip(parts, self._shapes, strict=True)]
+        return jax.tree.leaves(Packed(found if self._total else found.swapaxes(0, 1), self._layout).tree)
 
     def pull(self, cotangents: Sequence[np.ndarray], moving: tuple[int, ...]) -> list[np.ndarray]:
-        axes = 1 if self._total else 2
-        packed = np.concatenate([each.reshape(*each.shape[:axes], -1) for each in cotangents], axis=-1)
+        packed = Packed.of(list(cotangents), num_axes=1 if self._total else 2).table
         packed = packed if self._total else packed.swapaxes(0, 1)
         return self._applied.cotangents(packed, [self._leaves[i] for i in moving])
 
@@ -466,8 +419,7 @@ class _Derivative(AbstractLinearMap):
 def over_whole(function: Callable[..., Any], numbers: Any, inputs: Sequence[Input], total: bool = False) -> Any:
     """A row function of whole arrays, inside transformations; rows of many neighbourhoods are computed in blocks."""
     numbers, inputs = jax.tree.map(jnp.asarray, numbers), [_found(each) for each in inputs]
-    own = inputs[0]
-    num_rows = len(jax.tree.leaves(own.table)[0] if own.index is None else own.index)
+    num_rows = size_of(inputs[0])
     wide = any(each.index is not None and each.index.ndim == 2 for each in inputs)
     if total or not wide or num_rows <= _LARGEST_WHOLE:
         return function(numbers, *(whole(each, spread=not total) for each in inputs))
@@ -530,17 +482,13 @@ def _add_rows(
     total[used] += sums.reshape(len(used), *total.shape[1:])
 
 
-def _unpacked(packs: tuple[Packed, ...], indices: tuple[Any, ...]) -> list[Rows]:
-    return [Rows(pack.tree, index) for pack, index in zip(packs, indices, strict=True)]
-
-
 @cache
 def _program(function: Callable[..., Any], total: bool, packed: bool, quickly: bool) -> Callable[..., Any]:
     """A row function for a block, with packed arguments and results: to pass dozens of arrays takes longer than to use
     them."""
 
     def program(numbers: Any, packs: Any, indices: Any) -> Any:
-        found = function(numbers, *_unpacked(packs, indices))
+        found = function(numbers, *(Rows(pack.tree, index) for pack, index in zip(packs, indices, strict=True)))
         if not packed:
             return found
         if not total and type(found) is not tuple:
@@ -551,52 +499,39 @@ def _program(function: Callable[..., Any], total: bool, packed: bool, quickly: b
     return quickly_compiled(program) if quickly else jax.jit(program)
 
 
-Chosen = tuple[tuple[int, ...], tuple[tuple[int, ...], ...]]
+def _of_chosen(
+    function: Callable[..., Any], total: bool, chosen: Chosen, numbers: Any, packs: Any, indices: Any
+) -> tuple[Callable[[Any], Any], list[list[Any]]]:
+    """The packed result as a function of the chosen leaves; and these leaves."""
+    trees = [jax.tree.flatten(tree) for tree in (numbers, *(pack.tree for pack in packs))]
 
-
-def _of_chosen(function: Callable[..., Any], total: bool, chosen: Chosen, arguments: Any) -> tuple[Any, Any]:
-    """The packed result as a function of the chosen leaves of the numbers and of each input; and these leaves."""
-    numbers, packs, indices = arguments
-    leaves, structure = jax.tree.flatten(numbers)
-    rows = [jax.tree.flatten(each) for each in _unpacked(packs, indices)]
-    here = (
-        [leaves[i] for i in chosen[0]],
-        [[columns[i] for i in some] for (columns, _), some in zip(rows, chosen[1], strict=True)],
-    )
-
-    def put(leaves: list[Any], some: tuple[int, ...], values: list[Any]) -> list[Any]:
-        by_place = dict(zip(some, values, strict=True))
-        return [by_place.get(i, leaf) for i, leaf in enumerate(leaves)]
-
-    def result(some_numbers: Any, some_rows: Any) -> Any:
-        moved = [
-            jax.tree.unflatten(tree, put(columns, some, values))
-            for (columns, tree), some, values in zip(rows, chosen[1], some_rows, strict=True)
-        ]
-        found = function(jax.tree.unflatten(structure, put(leaves, chosen[0], some_numbers)), *moved)
+    def result(moved: list[list[Any]]) -> Any:
+        replaced = []
+        for (leaves, structure), places, values in zip(trees, chosen, moved, strict=True):
+            leaves = leaves.copy()
+            for i, value in zip(places, values, strict=True):
+                leaves[i] = value
+            replaced.append(jax.tree.unflatten(structure, leaves))
+        found = function(replaced[0], *map(Rows, replaced[1:], indices))
         return Packed.of(found if total else found[0], num_axes=0 if total else 1).table
 
-    return result, here
-
-
-def _joined(columns: list[Any], num_axes: int) -> Any:
-    """Arrays that share their first axes side by side; None if there are none."""
-    if not columns:
-        return None
-    return jnp.concatenate([each.reshape(*each.shape[:num_axes], -1) for each in columns], axis=-1)
+    return result, [[leaves[i] for i in places] for (leaves, _), places in zip(trees, chosen, strict=True)]
 
 
 @cache
 def _pull_program(function: Callable[..., Any], total: bool, chosen: Chosen) -> Callable[..., Any]:
     """The vector-Jacobian product of a block for several cotangents: of the chosen numbers, (c, ...), and of the chosen
-    columns of each input, (c, n, W) or (c, k, n, W)."""
+    columns of each input side by side, (c, n, W) or (c, k, n, W); None where there are none."""
 
     def program(numbers: Any, packs: Any, indices: Any, cotangents: Any) -> Any:
-        result, here = _of_chosen(function, total, chosen, (numbers, packs, indices))
-        _, pull = jax.vjp(result, *here)
-        by_numbers, by_rows = jax.vmap(pull, in_axes=0 if total else 1)(cotangents)
-        axes = [1 + index.ndim for index in indices]
-        return by_numbers, [_joined(each, count) for each, count in zip(by_rows, axes, strict=True)]
+        result, here = _of_chosen(function, total, chosen, numbers, packs, indices)
+        ((by_numbers, *by_rows),) = jax.vmap(jax.vjp(result, here)[1], in_axes=0 if total else 1)(cotangents)
+        return by_numbers, [
+            jnp.concatenate([by.reshape(*by.shape[: 1 + index.ndim], -1) for by in columns], axis=-1)
+            if columns
+            else None
+            for columns, index in zip(by_rows, indices, strict=True)
+        ]
 
     program.__name__ = f"pull_{function.__name__}"
     return quickly_compiled(program)
@@ -608,28 +543,26 @@ def _push_program(function: Callable[..., Any], total: bool, chosen: Chosen) -> 
     `_pull_program`."""
 
     def program(numbers: Any, packs: Any, indices: Any, by_numbers: Any, by_rows: Any) -> Any:
-        result, here = _of_chosen(function, total, chosen, (numbers, packs, indices))
-        _, push = jax.linearize(result, *here)
-        slopes = []
-        for columns, joined, index in zip(here[1], by_rows, indices, strict=True):
+        result, here = _of_chosen(function, total, chosen, numbers, packs, indices)
+        slopes = [by_numbers]
+        for columns, joined, index in zip(here[1:], by_rows, indices, strict=True):
             ends = np.cumsum([math.prod(each.shape[index.ndim :]) for each in columns])
             parts = jnp.split(joined, ends[:-1], axis=-1) if columns else []
             slopes.append([part.reshape(len(part), *each.shape) for part, each in zip(parts, columns, strict=True)])
-        return jax.vmap(push)(by_numbers, slopes)
+        return jax.vmap(jax.linearize(result, here)[1])(slopes)
 
     program.__name__ = f"push_{function.__name__}"
     return quickly_compiled(program)
 
 
 @cache
-def _jacobian_program(function: Callable[..., Any], chosen: tuple[int, ...]) -> Callable[..., Any]:
-    """A sum over a block, packed, and its derivative by some leaves of the numbers."""
+def _jacobian_program(function: Callable[..., Any], chosen: Chosen) -> Callable[..., Any]:
+    """A sum over a block, packed, and its derivative by the chosen numbers."""
 
-    def program(numbers: Any, packs: Any, indices: Any) -> Any:
-        some = chosen, tuple(() for _ in packs)
-        result, here = _of_chosen(function, True, some, (numbers, packs, indices))
-        value, pull = jax.vjp(result, *here)
-        return value, jax.vmap(pull)(jnp.eye(len(value), dtype=value.dtype))[0]
+    def program(*arguments: Any) -> Any:
+        result, here = _of_chosen(function, True, chosen, *arguments)
+        value, pull = jax.vjp(result, here)
+        return value, jax.vmap(pull)(jnp.eye(len(value), dtype=value.dtype))[0][0]
 
     program.__name__ = f"jacobian_{function.__name__}"
     return quickly_compiled(program)

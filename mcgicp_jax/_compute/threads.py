@@ -13,7 +13,7 @@ from typing import Any, ParamSpec, TypeVar
 
 import jax
 
-from mcgicp_jax._compute.messages import Line, calling_line, shown_at
+from mcgicp_jax._compute.messages import calling_line, shown_at
 
 Answer = TypeVar("Answer")
 Parameters = ParamSpec("Parameters")
@@ -144,9 +144,9 @@ class ReadAhead(Iterator[Answer]):
         # An interruption while waiting loses nothing.
         wait([self._next])
         done, self._next = self._next, None
-        found = done.result()
+        result = done.result()
         self._next = started(self._read)
-        return found
+        return result
 
 
 def with_settings(work: Callable[..., Answer], *, pickled: bool = False) -> Callable[..., Answer]:
@@ -158,14 +158,9 @@ def with_settings(work: Callable[..., Answer], *, pickled: bool = False) -> Call
             first device of the same platform; nor can the line.
     """
     if not pickled:
-        return functools.partial(_run_with, _settings(), functools.partial(_shown_at, calling_line(), work))
+        return functools.partial(_run_with, _settings(), shown_at(calling_line())(work))
     values = [value.platform if isinstance(value, jax.Device) else value for value in _settings()]
     return functools.partial(_run_with, values, work)
-
-
-def _shown_at(line: Line, work: Callable[..., Answer], *arguments: Any) -> Answer:
-    with shown_at(line):
-        return work(*arguments)
 
 
 def _settings() -> list[Any]:

@@ -111,7 +111,7 @@ def grid_spacing(cloud: PointCloud) -> Float[AnyScalar, ""]:
 
 def _spacings(cloud: PointCloud) -> tuple[Float[AnyScalar, ""], Float[AnyScalar, ""]]:
     """`point_spacing` and `grid_spacing`; cached with a concrete cloud."""
-    return _known_spacings(cloud) if is_concrete(cloud) else _measured_spacings(cloud)
+    return cached_with_cloud(_measured_spacings)(cloud) if is_concrete(cloud) else _measured_spacings(cloud)
 
 
 def _measured_spacings(cloud: PointCloud) -> tuple[Float[AnyScalar, ""], Float[AnyScalar, ""]]:
@@ -123,9 +123,6 @@ def _measured_spacings(cloud: PointCloud) -> tuple[Float[AnyScalar, ""], Float[A
     count = xp.sum(known, axis=0)
     grid = xp.sqrt(xp.max(xp.where(known, squares, 0), axis=0)) * xp.sqrt(xp.pi / xp.maximum(count, 1))
     return spacing, xp.nan_to_num(median(xp.where(count > 1, grid, xp.nan))).astype(squares.dtype)
-
-
-_known_spacings = cached_with_cloud(_measured_spacings)
 
 
 def _squared_neighbor_distances(cloud: PointCloud) -> Float[AnyArray, "k n"]:
@@ -184,8 +181,8 @@ def _ranges(cloud: PointCloud) -> list[tuple[float, float]]:
     if cloud.channel_valid is not None:
         known &= np.asarray(cloud.channel_valid)[rows]
     ranges = []
-    for values in (column[there] for column, there in zip(channels.T, known.T, strict=True)):
-        low, high = np.quantile(values, [_QUANTILES[0], _QUANTILES[-1]]) if values.size else (np.nan, np.nan)
+    for column, there in zip(channels.T, known.T, strict=True):
+        low, high = np.quantile(column[there], [_QUANTILES[0], _QUANTILES[-1]]) if there.any() else (np.nan, np.nan)
         ranges.append((float(low), float(high)))
     return ranges
 

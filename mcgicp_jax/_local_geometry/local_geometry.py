@@ -124,13 +124,8 @@ def cell_edge(cells: PointCloud) -> Float[AnyScalar, ""]:
 
 
 def geometry_of_cells(local: LocalGeometry, given: Float[Array, "6 n"], num_candidates: int) -> LocalGeometry:
-    """Local geometry of cells: channel fits from their neighbourhoods, everything else from their covariances.
-
-    Args:
-        local: of the neighbourhoods.
-        given: covariances of the cells, metres².
-        num_candidates: number of cells matched with each point or cell.
-    """
+    """Local geometry of cells: channel fits from that of their neighbourhoods, everything else from the covariances of
+    the cells, metres², of which `num_candidates` are matched with each point or cell."""
     given = jax.lax.stop_gradient(given)
     normal = alg.smallest_eigenvector(given)
     across = alg.inner(normal, alg.multiply(given, normal))
@@ -152,16 +147,8 @@ def local_geometries(
     rows: tuple[Any, Any] = (None, None),
     num_threads: int | None = 1,
 ) -> tuple[LocalGeometry, LocalGeometry]:
-    """Local geometry of two preprocessed clouds.
-
-    Args:
-        with_channels: whether the method uses the channels; if not, the programs do not depend on their number.
-        rows: (n,) those of the source and of the target; None for all.
-        num_threads: largest number of threads on the host; None for no limit.
-
-    Returns:
-        Of the source and of the target.
-    """
+    """Local geometry of some rows (None: all) of two preprocessed clouds; `with_channels` as in `with_near`. The host
+    uses at most `num_threads` threads (None: no limit)."""
     if is_concrete(source, target):
         calls = [
             partial(geometry_table(cloud, with_channels).trees, some, num_threads)

@@ -78,27 +78,23 @@ class Neighborhoods(NamedTuple):
 
 def check_neighbors(cloud: PointCloud, xp: ModuleType) -> Any:
     """The (N, k) neighbours of a cloud, on the host perhaps `NeighborsOnDemand`; a raw cloud raises `ValueError`."""
-    if cloud.deferred_neighbors is None:
-        raise ValueError(NO_NEIGHBORS)
     deferred = cloud.deferred_neighbors
+    if deferred is None:
+        raise ValueError(NO_NEIGHBORS)
     return deferred if xp is np and is_deferred(deferred) else xp.asarray(cloud.neighbors)
 
 
 class PointRows(NamedTuple):
-    """The columns of a cloud from which its surface is computed; None for what is not needed.
+    """The columns of a cloud from which its surface is computed; None for what is not needed."""
 
-    Attributes:
-        points: (N, 3) positions, metres.
-        channels: (N, C).
-        known: (N, C) which channels the points have; None if no point lacks any.
-        given: (N, 3, 3) covariances that were given with the cloud.
-        few: (N,) whether the cloud has fewer points than `FEW_POINTS`.
-    """
-
+    # (N, 3), metres.
     points: Any
+    # (N, C), and which of them the points have; None if no point lacks any.
     channels: Any = None
     known: Any = None
+    # (N, 3, 3) covariances that were given with the cloud.
     given: Any = None
+    # (N,) whether the cloud has fewer points than `FEW_POINTS`.
     few: Any = None
 
 
@@ -184,17 +180,15 @@ def fit_channels(around: Neighborhoods, x: Float[Array, "k n"], y: Float[Array, 
 class LinearFit(NamedTuple):
     """Linear fit of values over a plane, by weighted least squares.
 
-    Attributes:
-        gradient: derivatives of the values along x and y; 0 where the points lie on a line.
-        residual: variance of the values about the fit; meaningless for three points or fewer.
-        inverse: (3, N) inverse normal matrix (symmetric): times `residual`, the covariance of the gradient. 0 on a
-            line.
-        weight: sum of the weights.
+    Gradient and inverse are 0 where the points lie on a line; the residual is meaningless for three points or fewer.
     """
 
+    # Derivatives along x and y, variance about the fit, and the inverse normal matrix: times the variance, the
+    # covariance of the gradient.
     gradient: tuple[Float[Array, "N"], Float[Array, "N"]]
     residual: Float[Array, "N"]
     inverse: Float[Array, "3 N"]
+    # The sum of the weights.
     weight: Float[Array, "N"]
 
 

@@ -182,14 +182,6 @@ def _scipy_tree(points: Float[np.ndarray, "M D"]) -> scipy.spatial.cKDTree:
 _indices = Cache(MAX_ROWS, lambda index: index.num_rows)
 
 
-def _index_of(search: AbstractTreeSearch, target: SearchPoints) -> TreeIndex:
-    arrays = jax.tree.leaves(target)
-    digest = hashlib.blake2b(repr([search, *((array.shape, array.dtype) for array in arrays)]).encode())
-    for array in arrays:
-        digest.update(np.ascontiguousarray(array).data)
-    return _indices.get(digest.digest(), partial(search.index, target))
-
-
 def _nearest_callback(
     search: AbstractTreeSearch,
     num_candidates: int,
@@ -202,7 +194,12 @@ def _nearest_callback(
     """`TreeIndex.nearest` for the arguments of `AbstractSearch.nearest_traced`."""
     if not running:
         return np.full((num_candidates, source.valid.size), -1, np.int32)
-    return _index_of(search, target).nearest(pose, source, float(max_distance), num_candidates)
+    arrays = jax.tree.leaves(target)
+    digest = hashlib.blake2b(repr([search, *((array.shape, array.dtype) for array in arrays)]).encode())
+    for array in arrays:
+        digest.update(np.ascontiguousarray(array).data)
+    index = _indices.get(digest.digest(), partial(search.index, target))
+    return index.nearest(pose, source, float(max_distance), num_candidates)
 
 
 def nearest_in_position(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 
 import numpy as np
 from jax.typing import ArrayLike
@@ -90,7 +91,7 @@ class TreeIndex(AbstractIndex):
         self, queries: Float[np.ndarray, "N D"], penalty: Float[np.ndarray, "C"], k: int, bound: float
     ) -> tuple[Int[np.ndarray, "N m"], Float[np.ndarray, "N"]]:
         """`nearest_of` for queries that lack the same channels."""
-        parts = self._parts_for(penalty)
+        parts = self._parts.get(penalty.tobytes(), partial(self._built, penalty))
         if len(parts) == 1:
             found, slack = parts[0].nearest(queries, k, bound)
             return parts[0].rows[found], slack
@@ -98,20 +99,19 @@ class TreeIndex(AbstractIndex):
         each = [part.nearest(queries, k + 1, bound)[0] for part in parts]
         rows = np.hstack([part.rows[found] for part, found in zip(parts, each, strict=True)])
         squares = np.hstack([part.squares(queries, found) for part, found in zip(parts, each, strict=True)])
-        rows, squares = _ordered(rows, squares, k + 1)
+        order = np.lexsort((rows, squares), axis=1)[:, : k + 1]
+        rows, squares = (np.take_along_axis(each, order, axis=1) for each in (rows, squares))
         return rows[:, :k], slack_of(*np.sqrt(squares[:, [min(k, squares.shape[1]) - 1, -1]]).T)
 
-    def _parts_for(self, penalty: Float[np.ndarray, "C"]) -> list[_TreeForChannels]:
-        def build() -> list[_TreeForChannels]:
-            common, alike = _patterns(np.maximum(self._patterns, penalty))
-            which = alike[self._which]
-            groups = [slice(None) if len(common) == 1 else which == i for i in range(len(common))]
-            return [
-                _TreeForChannels(self._trees, self._points[group], self._rows[group], pattern)
-                for group, pattern in zip(groups, common, strict=True)
-            ]
-
-        return self._parts.get(penalty.tobytes(), build)
+    def _built(self, penalty: Float[np.ndarray, "C"]) -> list[_TreeForChannels]:
+        """The trees for queries that lack the same channels."""
+        common, alike = _patterns(np.maximum(self._patterns, penalty))
+        which = alike[self._which]
+        groups = [slice(None) if len(common) == 1 else which == i for i in range(len(common))]
+        return [
+            _TreeForChannels(self._trees, self._points[group], self._rows[group], pattern)
+            for group, pattern in zip(groups, common, strict=True)
+        ]
 
 
 class _TreeForChannels:
@@ -200,14 +200,6 @@ def _patterns(penalty: Float[np.ndarray, "N C"]) -> tuple[Float[np.ndarray, "P C
     example = np.zeros(which.max(initial=-1) + 1, np.intp)
     example[which] = np.arange(len(penalty))
     return penalty[example], which
-
-
-def _ordered(
-    rows: Int[np.ndarray, "N m"], squares: Float[np.ndarray, "N m"], k: int
-) -> tuple[Int[np.ndarray, "N k"], Float[np.ndarray, "N k"]]:
-    """The first k rows by squared distance, ties by row, and their squared distances."""
-    order = np.lexsort((rows, squares), axis=1)[:, :k]
-    return np.take_along_axis(rows, order, axis=1), np.take_along_axis(squares, order, axis=1)
 
 
 def _moved(pose: Float[ArrayLike, "7"], points: Float[np.ndarray, "N 3"]) -> Float[np.ndarray, "N 3"]:
