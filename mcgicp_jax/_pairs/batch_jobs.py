@@ -54,8 +54,8 @@ class PairWarning(UserWarning):
 
 @dataclass(frozen=True)
 class Pair:
-    """The arguments of one pair; with preprocessed clouds, and the numbers of the leaves of clouds, method and kernel
-    by which the pose is to be differentiated, if there are any."""
+    """The arguments of one pair. `traced` numbers the leaves of clouds, method and kernel by which the pose is to be
+    differentiated; if there are any, the clouds are preprocessed."""
 
     index: int
     source: Cloud
@@ -269,7 +269,7 @@ class BatchJob:
         return ready, LanePair(pose, *sides)
 
     def _padded(self, cloud: PointCloud, before: PointCloud) -> PointCloud:
-        """What a lane needs of a cloud, which was another one `before` it got neighbours."""
+        """What a lane needs of a preprocessed cloud: neighbours only if it had them `before`."""
         arrays: dict[str, Any] = {"origin": np.zeros(3, cloud.points.dtype), "channel_names": ()}
         if not self.method.uses_channels:
             arrays |= {"channels": cloud.points[:, :0], "channel_valid": None}

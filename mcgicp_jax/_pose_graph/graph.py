@@ -103,8 +103,8 @@ def _check_factor(name: str, factor: Any, num_poses: int) -> None:
 
 
 def _initial(edges: Edge) -> Float[np.ndarray, "n 4 4"]:
-    """Poses to start from, by a spanning tree that prefers certain edges to loops, and loops to edges without
-    information on some direction; then by relaxation."""
+    """Poses to start from, by a spanning tree that prefers certain edges to uncertain ones, and these to edges without
+    information on some direction; then by relaxation of the certain edges and of the tree."""
     if not is_concrete(edges) or not len(edges):
         raise ValueError("poses: required, since initial poses can only be computed from at least one concrete edge")
     number = int(max(np.max(edges.i), np.max(edges.j))) + 1

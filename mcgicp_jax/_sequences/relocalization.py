@@ -31,7 +31,8 @@ _SAMPLE, _WITHIN = 2048, 3.0
 
 
 class Relocalizer:
-    """A map of all frames whose poses are known, in which a lost frame is found again. Tracking `is_lost` if not."""
+    """A map of all frames whose poses are known, in which lost frames are found again. `is_lost` tells whether tracking
+    is lost at the last frame."""
 
     def __init__(self, voxel_size: float, method: AbstractMethod, options: Options, num_neighbors: int):
         self._world, self._settings = VoxelMap(voxel_size), (method, options, num_neighbors)
