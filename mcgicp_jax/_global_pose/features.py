@@ -3,12 +3,12 @@ of the channels.
 
 FPFH (Rusu, Blodow & Beetz, Fast Point Feature Histograms for 3D Registration, ICRA 2009) depends on the signs of the
 normals, which are known for single scans at best. Here the normal of each neighbour is flipped to the side of the
-point's own normal, and histograms are averaged over both signs of the latter. (Normals that point to the sensor gave
-about 1.4 times as many correct matches on nine real pairs without channels.)
+point's own normal, and histograms are averaged over both signs of the latter.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import jax
@@ -40,7 +40,7 @@ NUM_BINS = 11
 # scans have 30 to 50 % more inliers than without channels.
 _CHANNEL_WEIGHT = 0.5
 # Features are rounded to integers up to this magnitude, and the standard deviation of a bin of the histograms to this
-# number. Sums of products of up to 1,000 such integers are exact in float32, in any order and on any device.
+# number. Sums of products of 1,000 such integers are exact in float32, in any order.
 _LARGEST, _DEVIATION = 127, 16
 # Largest ratio of the distances to the best and the second best match (Lowe 2004).
 _RATIO = 0.8
@@ -56,10 +56,8 @@ def normals_of(cloud: PointCloud, voxel_size: float) -> Float[np.ndarray, "N 3"]
 
 
 def histograms_of(cloud: PointCloud, normals: Float[np.ndarray, "N 3"], voxel_size: float) -> Float[np.ndarray, "N 33"]:
-    """FPFH of each point of a preprocessed cloud: eleven bins for each of the angles α, φ, θ, which add up to two.
-
-    A point that has no neighbours within five voxels has zeros.
-    """
+    """FPFH of each point of a preprocessed cloud: eleven bins for each of the angles α, φ, θ, which add up to two, or
+    are zero without neighbours within five voxels."""
     size, radius = cloud.points.shape[0], np.float32(_RADIUS * voxel_size)
     inputs = with_near(cloud.replace_rows(channels=normals, channel_valid=None), True)
     simple, weights = blockwise(_simple_histograms, radius, *inputs)
@@ -76,31 +74,27 @@ def statistics_of(cloud: PointCloud, voxel_size: float) -> Float[np.ndarray, "N 
 
 
 def comparable(
-    histograms: tuple[Float[np.ndarray, "N 33"], Float[np.ndarray, "M 33"]],
-    statistics: tuple[Float[np.ndarray, "N D"], Float[np.ndarray, "M D"]] | None,
+    histograms: Sequence[Float[np.ndarray, "_ 33"]], statistics: Sequence[Float[np.ndarray, "_ D"]] | None
 ) -> tuple[Float[np.ndarray, "N L"], Float[np.ndarray, "M L"]]:
-    """Features of two clouds on one scale: small integers as float32, whose distances are exact.
-
-    Each statistic of a channel is divided by its standard deviation in both clouds, so that the unit of the channel
-    does not matter. Missing ones are set to the mean.
-    """
+    """Features of two clouds on one scale: small integers as float32, whose distances are exact. Statistics of channels
+    are divided by their standard deviations in both clouds; missing ones are set to the mean."""
     deviation = max(float(np.concatenate(histograms).astype(np.float64).std()), float(np.finfo(np.float32).tiny))
     scale = _DEVIATION / deviation
     center = np.concatenate(histograms).mean(axis=0, dtype=np.float64)
-    found = [[scale * (each - center)] for each in histograms]
+    parts = [[scale * (histogram - center)] for histogram in histograms]
     if statistics is not None:
         both = np.concatenate(statistics).astype(np.float64)
-        known = np.isfinite(both)
-        count = np.maximum(known.sum(axis=0), 1)
-        mean = np.where(known, both, 0).sum(axis=0) / count
-        spread = np.sqrt(np.where(known, (both - mean) ** 2, 0).sum(axis=0) / count)
+        finite = np.isfinite(both)
+        count = np.maximum(finite.sum(axis=0), 1)
+        mean = np.where(finite, both, 0).sum(axis=0) / count
+        spread = np.sqrt(np.where(finite, (both - mean) ** 2, 0).sum(axis=0) / count)
         varying = spread > 1e3 * np.finfo(np.float32).eps * np.abs(mean)
         weight = _CHANNEL_WEIGHT * _DEVIATION * np.sqrt(histograms[0].shape[1] / both.shape[1])
         scales = np.where(varying, weight / np.where(varying, spread, 1), 0)
-        for each, part in zip(statistics, found, strict=True):
-            part.append(np.nan_to_num((each - mean) * scales))
-    rounded = [np.clip(np.rint(np.hstack(part)), -_LARGEST, _LARGEST).astype(np.float32) for part in found]
-    return rounded[0], rounded[1]
+        for values, part in zip(statistics, parts, strict=True):
+            part.append(np.nan_to_num((values - mean) * scales))
+    source, target = (np.clip(np.rint(np.hstack(part)), -_LARGEST, _LARGEST).astype(np.float32) for part in parts)
+    return source, target
 
 
 def _offsets(around: Neighborhoods) -> tuple[Offsets, Float[Array, "k n"]]:
@@ -147,11 +141,10 @@ def _simple_histograms(
     w = alg.cross(u, v)
     # The angle between the flipped normals is at most π/2.
     theta = jnp.arctan2(alg.dot(w, n), alg.dot(u, n)) / jnp.pi
-    alpha, phi, theta = (
-        _histogram(value, counted) for value in (0.5 + 0.5 * alg.dot(v, n), 0.5 + 0.5 * phi, 0.5 + theta)
-    )
+    angles = 0.5 + 0.5 * alg.dot(v, n), 0.5 + 0.5 * phi, 0.5 + theta
+    alpha, *others = (_histogram(angle, counted) for angle in angles)
     # With the other sign of both normals, φ and θ change theirs.
-    even = [0.5 * (each + each[:, ::-1]) for each in (phi, theta)]
+    even = [0.5 * (histogram + histogram[:, ::-1]) for histogram in others]
     weights = jnp.where(near, 1 / jnp.where(near, square, 1), 0)
     weights = weights / jnp.where(jnp.any(near, axis=0), jnp.sum(weights, axis=0), 1)
     return jnp.concatenate([alpha, *even], axis=1), weights.T
@@ -172,14 +165,14 @@ def _statistics(voxel_size: Float[AnyScalar, ""], own: Rows, near: Rows) -> tupl
     _, square = _offsets(around)
     columns = []
     for channel in range(around.num_channels):
-        known, difference, here = around.known(channel), around.difference(channel), around.own_channels[channel]
+        valid, difference, here = around.known(channel), around.difference(channel), around.own_channels[channel]
         for radius in _CHANNEL_RADII:
-            weights = (known & (square <= (radius * voxel_size) ** 2)).astype(square.dtype)
+            weights = (valid & (square <= (radius * voxel_size) ** 2)).astype(square.dtype)
             total = jnp.sum(weights, axis=0)
             count = jnp.maximum(total, 1)
             mean = jnp.sum(weights * difference, axis=0) / count
             variance = jnp.sum(weights * (difference - mean) ** 2, axis=0) / count
-            columns += [jnp.where(total > 0, each, jnp.nan) for each in (here + mean, jnp.sqrt(variance))]
+            columns += [jnp.where(total > 0, value, jnp.nan) for value in (here + mean, jnp.sqrt(variance))]
     return (jnp.stack(columns, axis=1),)
 
 
@@ -187,13 +180,11 @@ def matches_of_features(source: PointCloud, target: PointCloud, voxel_size: floa
     """The mutual nearest neighbours in feature space; the most distinctive ones, if there are too many."""
     clouds = source, target
     normals = [normals_of(cloud, voxel_size) for cloud in clouds]
-    histograms = [histograms_of(cloud, each, voxel_size) for cloud, each in zip(clouds, normals, strict=True)]
-    statistics = None
-    if source.channels.shape[1]:
-        statistics = statistics_of(source, voxel_size), statistics_of(target, voxel_size)
-    rows = mutual_nearest(*comparable((histograms[0], histograms[1]), statistics), NUM_MATCHES)
-    points = [np.asarray(cloud.points)[each] for cloud, each in zip(clouds, rows, strict=True)]
-    return _padded(*points, *(each[chosen] for each, chosen in zip(normals, rows, strict=True)))
+    histograms = [histograms_of(*both, voxel_size) for both in zip(clouds, normals, strict=True)]
+    statistics = [statistics_of(cloud, voxel_size) for cloud in clouds] if source.channels.shape[1] else None
+    rows = mutual_nearest(*comparable(histograms, statistics), NUM_MATCHES)
+    columns = [*(np.asarray(cloud.points) for cloud in clouds), *normals]
+    return _padded(*(column[chosen] for column, chosen in zip(columns, (*rows, *rows), strict=True)))
 
 
 def matches_of_rows(
@@ -205,16 +196,15 @@ def matches_of_rows(
     if finite.size > NUM_MATCHES:
         finite = finite[np.arange(NUM_MATCHES) * finite.size // NUM_MATCHES]
     unknown = np.zeros((finite.size, 3), np.float32)
-    return _padded(*(each[finite].astype(np.float32) for each in points), unknown, unknown)
+    return _padded(*(side[finite].astype(np.float32) for side in points), unknown, unknown)
 
 
 def _padded(*columns: Float[np.ndarray, "n 3"]) -> PutativeMatches:
-    """The first `NUM_MATCHES` matches."""
+    """The first `NUM_MATCHES` matches: points of both clouds and normals of both."""
+    padded = np.zeros((len(columns), NUM_MATCHES, 3), np.float32)
     count = min(len(columns[0]), NUM_MATCHES)
-    points, targets, normals, target_normals = np.zeros((4, NUM_MATCHES, 3), np.float32)
-    for array, column in zip((points, targets, normals, target_normals), columns, strict=True):
-        array[:count] = column[:count]
-    return PutativeMatches(points, targets, normals, target_normals, np.arange(NUM_MATCHES) < count)
+    padded[:, :count] = [column[:count] for column in columns]
+    return PutativeMatches._make([*padded, np.arange(NUM_MATCHES) < count])
 
 
 def mutual_nearest(
@@ -222,13 +212,9 @@ def mutual_nearest(
 ) -> tuple[Int[np.ndarray, "n"], Int[np.ndarray, "n"]]:
     """Source and target rows that are nearest to each other in feature space; the most distinctive matches first.
 
-    A match is the more distinctive, the smaller its squared distance is relative to the squared distance of the second
-    nearest target row. Ties go to the first row. All pairs of rows are compared in blocks: trees are no faster in so
-    many dimensions.
-
-    Args:
-        source, target: features, integers as float32.
-        count: the search ends when so many matches are found.
+    These have the smallest ratio of the squared distances to the nearest and to the second nearest target row. Ties go
+    to the first row. Features are integers as float32, and trees are no faster in so many dimensions. The search ends
+    with `count` matches.
     """
     nearest, squares = _two_nearest(source, target)
     order = np.argsort(squares[:, 0] / np.maximum(squares[:, 1], 1), kind="stable")
@@ -240,8 +226,8 @@ def mutual_nearest(
     for start in range(0, len(hit), BLOCK):
         rows = wanted[start : start + BLOCK]
         back[rows] = _two_nearest(target[hit[rows]], source)[0][:, 0]
-        known = first[wanted[start + BLOCK]] if start + BLOCK < len(hit) else len(order)
-        mutual = np.flatnonzero(back[number[:known]] == order[:known])
+        searched = first[wanted[start + BLOCK]] if start + BLOCK < len(hit) else len(order)
+        mutual = np.flatnonzero(back[number[:searched]] == order[:searched])
         if len(mutual) >= count:
             break
     return order[mutual], matched[mutual]
@@ -251,15 +237,13 @@ def _two_nearest(
     queries: Float[np.ndarray, "N L"], rows: Float[np.ndarray, "M L"]
 ) -> tuple[Int[np.ndarray, "N 2"], Float[np.ndarray, "N 2"]]:
     """The two nearest rows of each query, the first one first where distances tie; and the squared distances."""
-    # The last block is filled by repeating its last row, which must count once.
-    parts = [
-        (rows[index], np.ones(BLOCK, bool) if isinstance(index, slice) else np.diff(index, prepend=-1) > 0)
-        for _, index in blocks(len(rows))
-    ]
-
-    found = [blockwise(_two_nearest_of_block, part, Input(queries)) for part in parts]
-    squares = np.hstack([square for square, _ in found])
-    numbers = np.hstack([number + i * BLOCK for i, (_, number) in enumerate(found)])
+    parts: list[tuple[np.ndarray, np.ndarray]] = []
+    for _, index in blocks(len(rows)):
+        # The last block is filled by repeating its last row, which must count once.
+        counted = np.ones(BLOCK, bool) if isinstance(index, slice) else np.diff(index, prepend=-1) > 0
+        square, number = blockwise(_two_nearest_of_block, (rows[index], counted), Input(queries))
+        parts.append((square, number + len(parts) * BLOCK))
+    squares, numbers = map(np.hstack, zip(*parts, strict=True))
     best = np.argsort(squares, axis=1, kind="stable")[:, :2]
     return np.take_along_axis(numbers, best, axis=1), np.take_along_axis(squares, best, axis=1)
 
@@ -269,7 +253,7 @@ def _two_nearest_of_block(
 ) -> tuple[Float[Array, "m 2"], Int[Array, "m 2"]]:
     """Squared distances and numbers of the two nearest rows. All terms are integers, hence exact."""
     (rows, counted), queries = block, own.tree
-    squares = [jnp.sum(each * each, axis=1) for each in (queries, rows)]
+    squares = [jnp.sum(values * values, axis=1) for values in (queries, rows)]
     product = jnp.matmul(queries, rows.T, precision="highest")
     square = squares[0][:, None] + jnp.where(counted, squares[1], jnp.inf) - 2 * product
     # XLA's top_k takes a third of the time of its argmin.
@@ -298,39 +282,31 @@ def image_matches(source: Frame, target: Frame) -> tuple[Int[np.ndarray, "n"], I
     for name, frame in (("source", source), ("target", target)):
         if frame.image is None or frame.pixels is None:
             raise ValueError(f"{name}: expected a frame with an image, got one without")
-    (pixels, features), (target_pixels, target_features) = _sift(source.image), _sift(target.image)
-    rows, matched = _matched(features, target_features)
-    source_rows, target_rows = _nearest(source, pixels[rows]), _nearest(target, target_pixels[matched])
-    found = (source_rows >= 0) & (target_rows >= 0)
-    return source_rows[found], target_rows[found]
-
-
-def _sift(image: Any) -> tuple[Float[np.ndarray, "n 2"], Float[np.ndarray, "n 128"]]:
-    """Pixels (column, row) and SIFT features of the key points."""
     cv2 = optional_module("cv2", "images", "matching images")
-    found, features = cv2.SIFT_create().detectAndCompute(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), None)
-    if not found:
-        return np.zeros((0, 2)), np.zeros((0, 128), np.float32)
-    return np.array([point.pt for point in found], float), features
-
-
-def _matched(
-    source: Float[np.ndarray, "n 128"], target: Float[np.ndarray, "m 128"]
-) -> tuple[Int[np.ndarray, "k"], Int[np.ndarray, "k"]]:
-    if min(len(source), len(target)) < 2:
+    (pixels, features), (target_pixels, target_features) = _sift(cv2, source.image), _sift(cv2, target.image)
+    if min(len(features), len(target_features)) < 2:
         return np.zeros(0, np.int64), np.zeros(0, np.int64)
-    matcher = optional_module("cv2", "images", "matching images").BFMatcher()
-    back = {match.queryIdx: match.trainIdx for match in matcher.match(target, source)}
+    matcher = cv2.BFMatcher()
+    back = {match.queryIdx: match.trainIdx for match in matcher.match(target_features, features)}
     good = [
         (first.queryIdx, first.trainIdx)
-        for first, second in matcher.knnMatch(source, target, k=2)
+        for first, second in matcher.knnMatch(features, target_features, k=2)
         if first.distance < _RATIO * second.distance and back[first.trainIdx] == first.queryIdx
     ]
-    rows, matched = np.array(good, np.int64).reshape(-1, 2).T
-    return rows, matched
+    rows, target_rows = np.array(good, np.int64).reshape(-1, 2).T
+    rows, target_rows = _nearest(source, pixels[rows]), _nearest(target, target_pixels[target_rows])
+    matched = (rows >= 0) & (target_rows >= 0)
+    return rows[matched], target_rows[matched]
+
+
+def _sift(cv2: Any, image: Any) -> tuple[Float[np.ndarray, "n 2"], Float[np.ndarray, "n 128"]]:
+    """Pixels (column, row) and SIFT features of the key points."""
+    points, features = cv2.SIFT_create().detectAndCompute(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), None)
+    pixels = np.array([point.pt for point in points], float).reshape(-1, 2)
+    return pixels, features if points else np.zeros((0, 128), np.float32)
 
 
 def _nearest(frame: Frame, pixels: Float[np.ndarray, "n 2"]) -> Int[np.ndarray, "n"]:
     """The row of the cloud nearest to each pixel, −1 for none."""
-    queries, points = (np.pad(np.asarray(each, float), ((0, 0), (0, 1))) for each in (pixels, frame.pixels))
+    queries, points = (np.pad(np.asarray(side, float), ((0, 0), (0, 1))) for side in (pixels, frame.pixels))
     return nearest_in_position(queries, points, _MAX_PIXELS).astype(np.int64)

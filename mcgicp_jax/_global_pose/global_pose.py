@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
-from typing import Any, TypeAlias
+from dataclasses import dataclass
+from typing import Any, NamedTuple, TypeAlias
 
 import jax
 import numpy as np
@@ -165,16 +165,24 @@ def global_pose(
     if one.channels.shape[1] != other.channels.shape[1]:
         one, other = PointCloud(one.points), PointCloud(other.points)
     size = _voxel_size((one, other)) if voxel_size is None else float(voxel_size)
-    voxels = _with_neighbors((one, other), size)
-    if voxels is None:
+    try:
+        voxels = [with_neighbors(cloud, size, NUM_NEIGHBORS) for cloud in (one, other)] if size else []
+    except ValueError:
+        # A cloud has too few voxels.
+        voxels = []
+    if not voxels:
         return _no_pose(0, size)
     with outside_trace():
         if rows is None:
-            matches = matches_of_features(*voxels, size)
+            matches = matches_of_features(voxels[0], voxels[1], size)
         else:
             points = source.coordinates - source_center, target.coordinates - target_center
             matches = matches_of_rows(*points, rows)
-        return _best_pose(matches, _with_fewer_neighbors(voxels), (source_center, target_center), size)
+        near = [np.ascontiguousarray(np.asarray(cloud.neighbors)[:, :_NUM_NEIGHBORS]) for cloud in voxels]
+        voxels = [cloud.replace_rows(deferred_neighbors=kept) for cloud, kept in zip(voxels, near, strict=True)]
+        positions = np.asarray(voxels[0].points, np.float64)
+        radius = float(np.sqrt(np.mean(np.sum(positions * positions, axis=1))))
+        return _best_pose(_Scene(matches, voxels[0], voxels[1], size, radius), source_center, target_center)
 
 
 def _no_pose(num_matches: int, voxel_size: float) -> GlobalPoseResult:
@@ -183,7 +191,7 @@ def _no_pose(num_matches: int, voxel_size: float) -> GlobalPoseResult:
 
 def _checked(correspondences: RowMatches, source: PointCloud, target: PointCloud) -> Int[np.ndarray, "2 n"]:
     try:
-        rows = np.stack([np.asarray(each) for each in correspondences])
+        rows = np.stack([np.asarray(side) for side in correspondences])
     except (TypeError, ValueError) as error:
         raise ValueError("correspondences: expected two arrays of rows, of one length") from error
     sizes = np.array([[source.points.shape[0]], [target.points.shape[0]]])
@@ -211,13 +219,14 @@ def _centred(name: str, cloud: PointCloud) -> tuple[PointCloud, Float[np.ndarray
 def _voxel_size(clouds: tuple[PointCloud, ...]) -> float:
     """The smallest size with few enough voxels, metres; 0 if the clouds have no finite extent."""
     grids = [grid_of(np.asarray(cloud.points)).columns for cloud in clouds]
-    extent = max(float(np.ptp(each, axis=1).max()) for each in grids)
+    extent = max(float(np.ptp(columns, axis=1).max()) for columns in grids)
     if not 0 < extent < np.inf:
         return 0.0
     limits = [max(min(_MAX_VOXELS, _MAX_FRACTION * len(cloud)), 8) for cloud in clouds]
 
     def few(step: int, stride: int) -> bool:
-        counts = [len(voxel_order(each[:, ::stride], 2.0 ** (step / _STEPS_PER_OCTAVE))[1]) for each in grids]
+        size = 2.0 ** (step / _STEPS_PER_OCTAVE)
+        counts = [len(voxel_order(columns[:, ::stride], size)[1]) for columns in grids]
         return min(counts) <= _VOXELS and all(count <= limit for count, limit in zip(counts, limits, strict=True))
 
     high = int(np.ceil(_STEPS_PER_OCTAVE * np.log2(extent))) + 1
@@ -231,40 +240,51 @@ def _voxel_size(clouds: tuple[PointCloud, ...]) -> float:
     return float(2.0 ** (high / _STEPS_PER_OCTAVE))
 
 
-def _with_neighbors(clouds: tuple[PointCloud, ...], voxel_size: float) -> tuple[PointCloud, PointCloud] | None:
-    """The mean points of the voxels with their neighbours; None if a cloud has too few voxels."""
-    if voxel_size == 0:
-        return None
-    try:
-        found = [with_neighbors(cloud, voxel_size, NUM_NEIGHBORS) for cloud in clouds]
-    except ValueError:
-        return None
-    return found[0], found[1]
+class _Scene(NamedTuple):
+    """Matches of two centred clouds of voxels, metres.
 
+    Attributes:
+        radius: root mean square distance of the source's points from the centre, about which poses turn.
+    """
 
-def _with_fewer_neighbors(clouds: tuple[PointCloud, PointCloud]) -> tuple[PointCloud, PointCloud]:
-    """The clouds with as many neighbours as `preprocess` gives."""
-    near = [np.ascontiguousarray(np.asarray(cloud.neighbors)[:, :_NUM_NEIGHBORS]) for cloud in clouds]
-    source, target = (cloud.replace_rows(deferred_neighbors=rows) for cloud, rows in zip(clouds, near, strict=True))
-    return source, target
+    matches: PutativeMatches
+    source: PointCloud
+    target: PointCloud
+    voxel_size: float
+    radius: float
+
+    def is_near(self, matrix: Float[np.ndarray, "4 4"], points: Float[AnyArray, "n 3"]) -> Bool[np.ndarray, "n"]:
+        """Which points of the source are within the overlap."""
+        moved = np.asarray(points, np.float64) @ matrix[:3, :3].T + matrix[:3, 3]
+        return nearest_in_position(moved, self.target.points, TOLERANCE * self.voxel_size) >= 0
+
+    def are_same(self, a: Float[np.ndarray, "4 4"], b: Float[np.ndarray, "4 4"]) -> bool:
+        square = np.sum((a - b)[:3, 3] ** 2) + 0.5 * self.radius**2 * np.sum((a - b)[:3, :3] ** 2)
+        return bool(square <= (MIN_SEPARATION * self.voxel_size) ** 2)
+
+    def candidate(self, matrix: Float[np.ndarray, "4 4"]) -> Candidate:
+        matches = self.matches
+        moved = np.asarray(matches.source, np.float64) @ matrix[:3, :3].T + matrix[:3, 3]
+        within = np.linalg.norm(moved - matches.target, axis=1) <= TOLERANCE * self.voxel_size
+        overlap = float(np.mean(self.is_near(matrix, self.source.points)))
+        return Candidate(matrix, int(np.sum(np.asarray(matches.valid) & within)), overlap)
 
 
 def _best_pose(
-    matches: PutativeMatches, clouds: tuple[PointCloud, PointCloud], centers: tuple[np.ndarray, ...], voxel_size: float
+    scene: _Scene, source_center: Float[np.ndarray, "3"], target_center: Float[np.ndarray, "3"]
 ) -> GlobalPoseResult:
     """The best of the verified poses, in the user's frames."""
-    points = np.asarray(clouds[0].points, np.float64)
-    # The root mean square distance from the centre, about which the poses turn.
-    radius = float(np.sqrt(np.mean(np.sum(points * points, axis=1))))
-    poses = hypotheses(matches, np.float32(voxel_size), np.float32(radius))
-    poses = jax.tree.map(np.asarray, refined(poses, matches, np.float32(voxel_size)))
-    found = _verified(poses, matches, clouds, voxel_size, radius)
+    matches, voxel_size = scene.matches, np.float32(scene.voxel_size)
+    poses = hypotheses(matches, voxel_size, np.float32(scene.radius))
+    verified = _verified(jax.tree.map(np.asarray, refined(poses, matches, voxel_size)), scene)
     num_matches = int(matches.valid.sum())
-    if not found:
-        return _no_pose(num_matches, voxel_size)
-    found = sorted(found, key=lambda pair: -pair[0].evidence)
-    support = _support(*found[0], matches, clouds, voxel_size)
-    best, *others = (replace(pose, matrix=_in_user_frames(pose.matrix, centers)) for pose, _ in found)
+    if not verified:
+        return _no_pose(num_matches, scene.voxel_size)
+    verified = sorted(verified, key=lambda pair: -pair[0].evidence)
+    support = _support(*verified[0], scene)
+    for pose, _ in verified:
+        pose.matrix[:3, 3] += target_center - pose.matrix[:3, :3] @ source_center
+    best, *others = (pose for pose, _ in verified)
     enough = best.num_inliers >= _MIN_INLIERS and support >= 1
     rivals = any(other.rivals(best) for other in others)
     return GlobalPoseResult(
@@ -276,83 +296,43 @@ def _best_pose(
         overlap=best.overlap,
         support=support,
         runner_up=others[0] if others else None,
-        voxel_size=voxel_size,
+        voxel_size=scene.voxel_size,
     )
 
 
-def _support(
-    pose: Candidate,
-    registered: RegistrationResult,
-    matches: PutativeMatches,
-    clouds: tuple[PointCloud, PointCloud],
-    voxel_size: float,
-) -> float:
-    misfit, agreement = surface_agreement(pose.matrix, *clouds, TOLERANCE * voxel_size)
-    within = _is_near(pose.matrix, matches.source[np.asarray(matches.valid)], clouds[1], voxel_size).sum()
+def _support(pose: Candidate, registered: RegistrationResult, scene: _Scene) -> float:
+    """See `GlobalPoseResult.support`."""
+    misfit, agreement = surface_agreement(pose.matrix, scene.source, scene.target, TOLERANCE * scene.voxel_size)
+    within = scene.is_near(pose.matrix, scene.matches.source[np.asarray(scene.matches.valid)]).sum()
     evidence = pose.num_inliers / np.sqrt(max(within, 1)) * (agreement / max(misfit, 1.0)) ** 2
     constrained = is_usable(registered) and not registered.unconstrained_directions
     return float(evidence / (_LEAST if constrained else _LEAST_UNCONSTRAINED))
 
 
-def _in_user_frames(matrix: Float[np.ndarray, "4 4"], centers: tuple[np.ndarray, ...]) -> Float[np.ndarray, "4 4"]:
-    """The pose of centred clouds as a pose between the user's frames."""
-    matrix = matrix.copy()
-    matrix[:3, 3] += centers[1] - matrix[:3, :3] @ centers[0]
-    return matrix
-
-
-def _verified(
-    poses: PoseHypotheses,
-    matches: PutativeMatches,
-    clouds: tuple[PointCloud, PointCloud],
-    voxel_size: float,
-    radius: float,
-) -> list[tuple[Candidate, RegistrationResult]]:
+def _verified(poses: PoseHypotheses, scene: _Scene) -> list[tuple[Candidate, RegistrationResult]]:
     """The best pose and its rivals, registered; without repetitions."""
-    source, target = clouds
-    method = MultiChannelGICP() if source.channels.shape[1] else GICP()
-    options = Options(
-        max_distance=(_VERIFIED_WITHIN[0] * voxel_size, _VERIFIED_WITHIN[1] * voxel_size),
-        max_iterations=_VERIFIED_ITERATIONS,
-    )
-    found: list[tuple[Candidate, RegistrationResult]] = []
+    method = MultiChannelGICP() if scene.source.channels.shape[1] else GICP()
+    distances = _VERIFIED_WITHIN[0] * scene.voxel_size, _VERIFIED_WITHIN[1] * scene.voxel_size
+    options = Options(max_distance=distances, max_iterations=_VERIFIED_ITERATIONS)
+    verified: list[tuple[Candidate, RegistrationResult]] = []
     started: list[np.ndarray] = []
-    for matrix in _rivals(poses):
-        if any(_same(matrix, other, voxel_size, radius) for other in started):
+    for start in _rivals(poses):
+        if any(scene.are_same(start, other) for other in started):
             continue
-        started.append(matrix)
-        result = register_pair(source, target, method, matrix, options)
+        started.append(start)
+        result = register_pair(scene.source, scene.target, method, start, options)
         # A registration that fails, as of clouds with a few coincident points, is no evidence against the matches.
-        matrix = np.asarray(result.matrix) if is_usable(result) else matrix
-        if not any(_same(matrix, other.matrix, voxel_size, radius) for other, _ in found):
-            overlap = float(np.mean(_is_near(matrix, source.points, target, voxel_size)))
-            found.append((Candidate(matrix, _num_inliers(matrix, matches, voxel_size), overlap), result))
-    return found
+        matrix = np.array(result.matrix if is_usable(result) else start)
+        if not any(scene.are_same(matrix, other.matrix) for other, _ in verified):
+            verified.append((scene.candidate(matrix), result))
+    return verified
 
 
 def _rivals(poses: PoseHypotheses) -> Iterator[Float[np.ndarray, "4 4"]]:
+    """The best pose and those with at least `_RIVAL` of its score."""
     order = np.argsort(-poses.score, kind="stable")
     for i in order:
         if poses.score[i] > 0 and poses.score[i] >= _RIVAL * poses.score[order[0]]:
             matrix = np.eye(4)
             matrix[:3, :3], matrix[:3, 3] = poses.rotation[i], poses.translation[i]
             yield nearest_rotation(matrix)
-
-
-def _same(a: Float[np.ndarray, "4 4"], b: Float[np.ndarray, "4 4"], voxel_size: float, radius: float) -> bool:
-    square = np.sum((a - b)[:3, 3] ** 2) + 0.5 * radius**2 * np.sum((a - b)[:3, :3] ** 2)
-    return bool(square <= (MIN_SEPARATION * voxel_size) ** 2)
-
-
-def _num_inliers(matrix: Float[np.ndarray, "4 4"], matches: PutativeMatches, voxel_size: float) -> int:
-    moved = np.asarray(matches.source, np.float64) @ matrix[:3, :3].T + matrix[:3, 3]
-    distances = np.linalg.norm(moved - matches.target, axis=1)
-    return int(np.sum(np.asarray(matches.valid) & (distances <= TOLERANCE * voxel_size)))
-
-
-def _is_near(
-    matrix: Float[np.ndarray, "4 4"], points: Float[AnyArray, "n 3"], target: PointCloud, voxel_size: float
-) -> Bool[np.ndarray, "n"]:
-    """Which points of the source are within the overlap."""
-    moved = np.asarray(points, np.float64) @ matrix[:3, :3].T + matrix[:3, 3]
-    return nearest_in_position(moved, target.points, TOLERANCE * voxel_size) >= 0

@@ -10,7 +10,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Float
 
 from mcgicp_jax._compute.concrete import AnyArray, AnyScalar
 from mcgicp_jax._math import symmetric_matrices as alg
@@ -108,7 +108,7 @@ def hypotheses(
     """
     support = _support(matches, voxel_size)
     _, partners = jax.lax.top_k(support, _NUM_PARTNERS)
-    draw = _drawn()
+    draw = np.random.default_rng(0).permutation(np.transpose(np.triu_indices(_NUM_PARTNERS, 1)))[:_NUM_TRIPLETS]
     first = jnp.repeat(jnp.arange(NUM_MATCHES), _NUM_TRIPLETS)
     second, third = (partners[:, draw[:, i]].reshape(-1) for i in (0, 1))
     (from_frame, a), (to_frame, b) = (
@@ -137,12 +137,6 @@ def _support(matches: PutativeMatches, voxel_size: Float[AnyScalar, ""]) -> Floa
     ).astype(jnp.float32)
     # Counts are exact in float32, in any order of the sum.
     return agree * jnp.matmul(agree, agree, precision="highest")
-
-
-def _drawn() -> Int[np.ndarray, "T 2"]:
-    """Two different partners for each triplet of a match, by a fixed draw."""
-    every = np.stack(np.triu_indices(_NUM_PARTNERS, 1), axis=1)
-    return np.random.default_rng(0).permutation(every)[:_NUM_TRIPLETS]
 
 
 def _triangles(
@@ -217,8 +211,8 @@ def refined(poses: PoseHypotheses, matches: PutativeMatches, voxel_size: Float[A
 
     matches = jax.tree.map(jnp.asarray, matches)
     rotation, translation = jax.vmap(fit)(poses.rotation, poses.translation)
-    found = poses.score > 0
-    rotation = jnp.where(found[:, None, None], rotation, jnp.eye(3, dtype=rotation.dtype))
-    translation = jnp.where(found[:, None], translation, 0)
-    score = jnp.where(found, _scores(rotation, translation, matches, voxel_size), 0)
+    supported = poses.score > 0
+    rotation = jnp.where(supported[:, None, None], rotation, jnp.eye(3, dtype=rotation.dtype))
+    translation = jnp.where(supported[:, None], translation, 0)
+    score = jnp.where(supported, _scores(rotation, translation, matches, voxel_size), 0)
     return PoseHypotheses(rotation, translation, score)

@@ -27,19 +27,13 @@ _QUANTILE = 0.9
 def surface_agreement(
     matrix: Float[np.ndarray, "4 4"], source: PointCloud, target: PointCloud, max_distance: float
 ) -> tuple[float, float]:
-    """Misfit and agreement of the normals of matched points of preprocessed clouds at a pose.
+    """Misfit and agreement of the normals of matched points of preprocessed clouds at a pose; ∞ and 0 without matches.
 
     The misfit is a quantile of the distances along the normals, in thicknesses of the neighbourhoods; the agreement is
     the fraction of normals that agree. Both weigh each direction of surfaces equally, so that the ground does not
-    outvote the few surfaces that make a place.
-
-    Args:
-        max_distance: of matches, metres.
-
-    Returns:
-        Infinity and 0 if no points match.
+    outvote the few surfaces that make a place. `max_distance` of matches is in metres.
     """
-    points, known = (np.asarray(cloud.points, np.float64) for cloud in (source, target))
+    points, others = (np.asarray(cloud.points, np.float64) for cloud in (source, target))
     count = min(len(points), _SAMPLE)
     rows = np.arange(count) * len(points) // count
     rotation = matrix[:3, :3]
@@ -48,12 +42,12 @@ def surface_agreement(
     matched = matches >= 0
     if not matched.any():
         return np.inf, 0.0
-    rows, matches, offsets = rows[matched], matches[matched], known[matches[matched]] - moved[matched]
+    rows, matches, offsets = rows[matched], matches[matched], others[matches[matched]] - moved[matched]
     thin, _, normals = spreads(points, source.deferred_neighbors, rows)
-    known_thin, _, known_normals = spreads(known, target.deferred_neighbors, matches)
+    other_thin, _, other_normals = spreads(others, target.deferred_neighbors, matches)
     normals = rotated(normals, rotation)
-    across = [np.abs(np.sum(offsets * each, axis=1)) for each in (normals, known_normals)]
-    distances = np.maximum(*across) / np.sqrt(0.5 * (thin**2 + known_thin**2))
+    across = [np.abs(np.sum(offsets * axes, axis=1)) for axes in (normals, other_normals)]
+    distances = np.maximum(*across) / np.sqrt(0.5 * (thin**2 + other_thin**2))
     sample = normals[:: -(-len(normals) // _NUM_NORMALS)]
     same = np.abs(np.einsum("ik,jk->ij", sample, normals)) > _SAME_DIRECTION
     # A normal that resembles no other of the sample counts as if it were one more.
@@ -61,19 +55,15 @@ def surface_agreement(
     order = np.argsort(distances, kind="stable")
     cumulative = np.cumsum(weights[order])
     misfit = distances[order[np.searchsorted(cumulative, _QUANTILE * cumulative[-1])]]
-    agrees = np.abs(np.sum(normals * known_normals, axis=1)) > _AGREES
+    agrees = np.abs(np.sum(normals * other_normals, axis=1)) > _AGREES
     return float(misfit), float(np.sum(weights * agrees) / cumulative[-1])
 
 
 def spreads(
     points: Float[np.ndarray, "N 3"], neighbors: Any, rows: Int[np.ndarray, "n"]
 ) -> tuple[Float[np.ndarray, "n"], Float[np.ndarray, "n"], Float[np.ndarray, "n 3"]]:
-    """Standard deviations of neighbourhoods along the normal and along the surface (the smaller one), and the normals.
-
-    Args:
-        neighbors: (N, k) rows of neighbours, −1 for none.
-        rows: of the points whose neighbourhoods they are.
-    """
+    """Standard deviations of the neighbourhoods of some rows along the normal and along the surface (the smaller one),
+    and the normals. `neighbors` are (N, k) rows, −1 for none."""
     near = neighbors[rows]
     offsets = np.where(near[..., None] >= 0, points[near] - points[rows][:, None], 0)
     offsets -= offsets.mean(axis=1, keepdims=True)

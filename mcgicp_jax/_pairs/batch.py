@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Generator, Iterable, Iterator
-from concurrent.futures import Executor
-from typing import Any, Literal, Unpack
+from typing import Any, Literal, TypeAlias, Unpack
 
 import jaxlie
 import numpy as np
@@ -22,13 +21,15 @@ from mcgicp_jax._pairs.batch_jobs import BatchJob, Cloud, Pair
 from mcgicp_jax._registration.options import GivenOptions, check_method, options_of
 from mcgicp_jax._registration.result import RegistrationResult
 
+Start: TypeAlias = Pose | Literal["global"] | None
+
 
 def register_batch(
     sources: Iterable[Cloud] | Cloud,
     targets: Iterable[Cloud] | Cloud,
     method: AbstractMethod,
     *,
-    init: Iterable[Pose | Literal["global"] | None] | Pose | Literal["global"] | None = None,
+    init: Iterable[Start] | Start = None,
     voxel_size: VoxelSize = "auto",
     num_neighbors: int = NUM_NEIGHBORS,
     executor: GivenExecutor = None,
@@ -40,23 +41,21 @@ def register_batch(
     Waits for all pairs. See `register_as_completed` for arguments, errors and warnings.
 
     Outside `jit`, the poses have derivatives, as those of `register`, by the points and channels of the clouds and the
-    parameters of the method: of a DEGENERATE pose within its constrained directions, 0 of other failures but
-    MAX_ITERATIONS. They are computed side by side, so that `jax.value_and_grad` of a loss over the poses of many pairs
-    is one call; with an `executor` by its workers, as (7, n) matrices. Clouds must be given in lists then. Inside `jit`
-    and `vmap`, use `register`.
+    parameters of the method. They are computed side by side, so that `jax.value_and_grad` of a loss over the poses of
+    many pairs is one call; with an `executor` by its workers, as (7, n) matrices. Clouds must be given in lists then.
+    Inside `jit` and `vmap`, use `register`.
     """
-    job, pairs, workers = _job(
-        sources, targets, method, init, voxel_size, num_neighbors, executor, covariances, options
-    )
+    job = _job(method, options, voxel_size, num_neighbors, covariances)
+    pairs, workers = _pairs(job, sources, targets, init), executor_of(executor)
     # A look at an iterator would use it up.
     clouds = [side for side in (sources, targets) if isinstance(side, list | tuple | PointCloud)]
-    given = clouds, job.method, job.options.robust
-    if not is_concrete(primal(given)):
+    inputs = clouds, job.method, job.options.robust
+    if not is_concrete(primal(inputs)):
         raise ValueError(
             "sources, targets: expected concrete arrays, got tracers; call register_batch outside of jit and vmap, "
             "or register inside of them"
         )
-    if not is_concrete(given):
+    if not is_concrete(inputs):
         return job.register_differentiated(pairs) if workers is None else run_differentiated(job, pairs, workers)
     return [result for _, result in sorted(run(job, pairs, workers), key=lambda item: item[0])]
 
@@ -66,7 +65,7 @@ def register_as_completed(
     targets: Iterable[Cloud] | Cloud,
     method: AbstractMethod,
     *,
-    init: Iterable[Pose | Literal["global"] | None] | Pose | Literal["global"] | None = None,
+    init: Iterable[Start] | Start = None,
     voxel_size: VoxelSize = "auto",
     num_neighbors: int = NUM_NEIGHBORS,
     executor: GivenExecutor = None,
@@ -106,80 +105,66 @@ def register_as_completed(
     Warns:
         PairWarning: the reason for each pair with the status `INVALID_INPUT` or `WORKER_FAILED`; a `UserWarning`.
     """
-    return run(*_job(sources, targets, method, init, voxel_size, num_neighbors, executor, covariances, options))
+    job = _job(method, options, voxel_size, num_neighbors, covariances)
+    return run(job, _pairs(job, sources, targets, init), executor_of(executor))
 
 
 def _job(
-    sources: Iterable[Cloud] | Cloud,
-    targets: Iterable[Cloud] | Cloud,
-    method: AbstractMethod,
-    init: Any,
-    voxel_size: VoxelSize,
-    num_neighbors: int,
-    executor: GivenExecutor,
-    covariances: bool,
-    options: GivenOptions,
-) -> tuple[BatchJob, Iterator[Pair], Executor | None]:
-    """The settings common to all pairs, checked, the pairs, and the executor."""
+    method: AbstractMethod, options: GivenOptions, voxel_size: VoxelSize, num_neighbors: int, covariances: bool
+) -> BatchJob:
     check_method(method)
     check_preprocessing(voxel_size, num_neighbors)
-    workers = executor_of(executor)
-    job = BatchJob(method, options_of(register_batch, options), voxel_size, num_neighbors, covariances)
-    return job, _pairs(job, sources, targets, init), workers
+    return BatchJob(method, options_of(register_batch, options), voxel_size, num_neighbors, covariances)
 
 
 def _pairs(
-    job: BatchJob,
-    sources: Iterable[Cloud] | Cloud,
-    targets: Iterable[Cloud] | Cloud,
-    init: Iterable[Pose | Literal["global"] | None] | Pose | Literal["global"] | None,
+    job: BatchJob, sources: Iterable[Cloud] | Cloud, targets: Iterable[Cloud] | Cloud, init: Iterable[Start] | Start
 ) -> Iterator[Pair]:
     """Iterate lazily over the pairs; arguments common to all pairs are checked immediately."""
     if isinstance(init, str) and init != "global":
         raise ValueError(f'init: expected a pose, "global", or one per pair, got {init!r}')
     sides: dict[str, Any] = {"sources": sources, "targets": targets, "init": init}
-    one_for_all = {"sources": _is_one_cloud(sources), "targets": _is_one_cloud(targets), "init": _is_one_pose(init)}
-    if one_for_all["sources"] and one_for_all["targets"]:
+    common = {"sources": _is_one_cloud(sources), "targets": _is_one_cloud(targets), "init": _is_one_pose(init)}
+    if common["sources"] and common["targets"]:
         raise ValueError("sources: expected several clouds on at least one side, got one on each; call register")
-    for name in sides:
-        if one_for_all[name]:
+    for name, value in sides.items():
+        if common[name]:
             if name != "init":
-                (sides[name],) = job.ready({name: sides[name]})
-            elif not isinstance(init, str):
-                sides[name] = pose_matrix(sides[name])
-            sides[name] = itertools.repeat(sides[name])
-        elif isinstance(sides[name], jaxlie.SE3):
-            sides[name] = np.asarray(matrix_of(sides[name]))
-        elif not isinstance(sides[name], Iterable):
-            raise ValueError(f"{name}: expected an iterable with one per pair, got {type(sides[name]).__name__}")
-    several = {name: values for name, values in sides.items() if not one_for_all[name]}
-    sizes = {name: len(values) for name, values in several.items() if hasattr(values, "__len__")}
+                (value,) = job.ready({name: value})
+            elif not isinstance(value, str):
+                value = pose_matrix(value)
+            sides[name] = itertools.repeat(value)
+        elif isinstance(value, jaxlie.SE3):
+            sides[name] = np.asarray(matrix_of(value))
+        elif not isinstance(value, Iterable):
+            raise ValueError(f"{name}: expected an iterable with one per pair, got {type(value).__name__}")
+    several = [name for name in sides if not common[name]]
+    sizes = {name: len(sides[name]) for name in several if hasattr(sides[name], "__len__")}
     if len(set(sizes.values())) > 1:
         raise ValueError(f"{next(iter(sizes))}: expected one per pair on all sides, got {sizes}")
-    return _zip_pairs(sides, tuple(several))
+    return _zip_pairs(sides, several)
 
 
-def _zip_pairs(sides: dict[str, Any], several: tuple[str, ...]) -> Iterator[Pair]:
-    iterators = {name: iter(values) for name, values in sides.items()}
-    end: Any = object()
+def _zip_pairs(sides: dict[str, Any], several: list[str]) -> Iterator[Pair]:
+    iterators, end = {name: iter(values) for name, values in sides.items()}, object()
     for index in itertools.count():
-        values = {name: next(iterator, end) for name, iterator in iterators.items()}
+        values: dict[str, Any] = {name: next(iterator, end) for name, iterator in iterators.items()}
         ended = [name for name in several if values[name] is end]
-        if ended:
-            if len(ended) < len(several):
-                raise ValueError(f"{ended[0]}: expected one per pair, got {index}, fewer than on the other side")
+        if len(ended) == len(several):
             return
-        yield Pair(index, values["sources"], values["targets"], values["init"])
+        if ended:
+            raise ValueError(f"{ended[0]}: expected one per pair, got {index}, fewer than on the other side")
+        yield Pair(index, *values.values())
 
 
-def _is_one_cloud(given: object) -> bool:
-    if isinstance(given, PointCloud):
+def _is_one_cloud(value: object) -> bool:
+    if isinstance(value, PointCloud):
         return True
-    structured = getattr(getattr(given, "dtype", None), "names", None) is not None
-    return callable(given) or structured or getattr(given, "ndim", None) == 2
+    structured = getattr(getattr(value, "dtype", None), "names", None) is not None
+    return callable(value) or structured or getattr(value, "ndim", None) == 2
 
 
-def _is_one_pose(given: object) -> bool:
-    if isinstance(given, jaxlie.SE3):
-        return given.wxyz_xyz.ndim == 1
-    return given is None or isinstance(given, str) or getattr(given, "ndim", None) == 2
+def _is_one_pose(value: object) -> bool:
+    if isinstance(value, jaxlie.SE3):
+        return value.wxyz_xyz.ndim == 1
+    return value is None or isinstance(value, str) or getattr(value, "ndim", None) == 2

@@ -10,15 +10,8 @@ import signal
 import threading
 import time
 from collections.abc import Callable, Generator, Iterator
-from concurrent.futures import (
-    FIRST_COMPLETED,
-    BrokenExecutor,
-    Executor,
-    Future,
-    ProcessPoolExecutor,
-    ThreadPoolExecutor,
-)
-from concurrent.futures import wait as wait_for
+from concurrent import futures
+from concurrent.futures import BrokenExecutor, Executor, Future, ProcessPoolExecutor, ThreadPoolExecutor
 from dataclasses import replace
 from functools import partial
 from multiprocessing import get_context, resource_tracker
@@ -33,17 +26,16 @@ from mcgicp_jax._compute.concrete import is_concrete, is_deferred
 from mcgicp_jax._compute.linear_maps import KnownJacobian, primal, with_derivative
 from mcgicp_jax._compute.messages import warn
 from mcgicp_jax._compute.threads import num_cores, with_settings
-from mcgicp_jax._pairs.batch_jobs import BatchJob, GivenPair, Pair, PairResult
+from mcgicp_jax._pairs.batch_jobs import BatchJob, Pair, PairResult, PreparedPair
 from mcgicp_jax._registration.assessment import fields_of_pose
 from mcgicp_jax._registration.options import Options
-from mcgicp_jax._registration.result import RegistrationResult, Status, unverified
+from mcgicp_jax._registration.result import RegistrationResult, Status
 
 GivenExecutor: TypeAlias = Executor | Literal["processes"] | None
 
 # Number of pairs per chunk for a worker that is not a thread, and maximum number of submitted chunks.
 _CHUNK_SIZE, _MAX_SUBMITTED = 8, 64
-# Number of pairs per chunk for a process of this machine: chunks of 1 to 8 are equally fast, and of small ones each
-# worker has its share of few pairs.
+# Number of pairs per chunk for a process of this machine: 1 to 8 are equally fast, and few pairs are shared evenly.
 _SMALL_CHUNK = 2
 # Environment of a worker of `Processes`: one thread each for XLA, the tree search and BLAS, and no accelerator, three
 # quarters of whose memory each would reserve. loky would take memory that grows with the clouds for a leak, and start
@@ -79,16 +71,10 @@ class Processes(Executor):
             from loky import get_reusable_executor
         except ImportError as error:
             raise ImportError("executor: processes need loky: pip install 'mcgicp_jax[processes]'") from error
-        settings = {name: getattr(jax.config, name) for name in _SETTINGS}
-        known = {name.upper(): str(value) for name, value in settings.items() if value is not None}
-        self._current = partial(
-            get_reusable_executor,
-            num_workers,
-            timeout=None,
-            initializer=_begin_worker,
-            initargs=(os.getpid(),),
-            env=_ENVIRONMENT | known,
-        )
+        values = {name.upper(): getattr(jax.config, name) for name in _SETTINGS}
+        environment = _ENVIRONMENT | {name: str(value) for name, value in values.items() if value is not None}
+        begin = {"initializer": _begin_worker, "initargs": (os.getpid(),), "env": environment}
+        self._current = partial(get_reusable_executor, num_workers, timeout=None, **begin)
         self._pool, self.num_workers = self._current(), num_workers
         # Or else this would begin beside the first worker, and let Ctrl-C through.
         resource_tracker.ensure_running()
@@ -111,12 +97,13 @@ class Processes(Executor):
         ended instead, unless they are at work for another batch."""
         if not cancel_futures:
             return
-        batches = list(self._unfinished.items())
+        unfinished = dict(self._unfinished)
         # Ended workers fail all futures, which loky cannot do to cancelled ones.
-        if all(batch is self for _, batch in batches):
+        if all(batch is self for batch in unfinished.values()):
             self._pool.shutdown(wait, kill_workers=True)
-        for future in (future for future, batch in batches if batch is self):
-            future.cancel()
+        for future, batch in unfinished.items():
+            if batch is self:
+                future.cancel()
 
 
 @contextlib.contextmanager
@@ -164,35 +151,41 @@ def run(
     job: BatchJob, pairs: Iterator[Pair], executor: Executor | None
 ) -> Generator[tuple[int, RegistrationResult], None, None]:
     """Register the pairs and yield index and result of each as soon as it is computed; see `register_as_completed`."""
-    for result in _results(job, map(_concrete, pairs), executor):
+
+    def concrete(pair: Pair) -> Pair:
+        if not is_concrete(pair.source, pair.target):
+            raise ValueError(
+                f"pair {pair.index}: expected concrete arrays, got tracers; for derivatives, call register_batch "
+                "outside of jit with lists of clouds"
+            )
+        return pair
+
+    for result in _results(job, map(concrete, pairs), executor):
         yield result.index, result.registration
 
 
 def run_differentiated(job: BatchJob, pairs: Iterator[Pair], executor: Executor) -> list[RegistrationResult]:
     """The results of pairs whose arrays differentiation traces; workers compute the poses and their derivatives."""
-    given = {pair.index: job.given(pair) for pair in pairs}
+    outcomes = {pair.index: job.prepare(pair) for pair in pairs}
+    ready = {index: pair for index, pair in outcomes.items() if isinstance(pair, PreparedPair)}
     fixed = replace(job, method=primal(job.method), options=replace(job.options, robust=primal(job.options.robust)))
-    sent = (
-        Pair(pair.index, *pair.given.values()[:2], pair.init, pair.traced)
-        for pair in given.values()
-        if isinstance(pair, GivenPair)
-    )
-    found = {index: pair.with_warning() for index, pair in given.items() if isinstance(pair, PairResult)}
-    found |= {result.index: result for result in _results(fixed, sent, executor)}
-    return [_differentiable(found[index], pair) for index, pair in given.items()]
+    sent = (Pair(pair.index, *pair.inputs.values()[:2], pair.init, pair.traced) for pair in ready.values())
+    results = {index: result.with_warning() for index, result in outcomes.items() if index not in ready}
+    results |= {result.index: result for result in _results(fixed, sent, executor)}
+    return [
+        _differentiable(results[index], ready[index]) if index in ready else results[index].registration
+        for index in outcomes
+    ]
 
 
-def _differentiable(found: PairResult, pair: PairResult | GivenPair) -> RegistrationResult:
+def _differentiable(answer: PairResult, pair: PreparedPair) -> RegistrationResult:
     """The result with the derivative of its pose."""
-    result = found.registration
-    if isinstance(pair, PairResult):
-        return result
-    result = result if pair.verified else unverified(result)
-    if not found.jacobian:
+    result = pair.checked(answer.registration)
+    if not answer.jacobian:
         return result
     values, inputs = [np.asarray(result.centred.wxyz_xyz)], [pair.leaves[i] for i in pair.traced]
-    (pose,) = with_derivative(values, KnownJacobian(found.jacobian), inputs)
-    origins = pair.given.source.origin, pair.given.target.origin
+    (pose,) = with_derivative(values, KnownJacobian(answer.jacobian), inputs)
+    origins = pair.inputs.source.origin, pair.inputs.target.origin
     if is_concrete(origins):
         origins = result.source_origin, result.target_origin
     return result.build(**vars(result) | fields_of_pose(jaxlie.SE3(pose), *origins))
@@ -213,15 +206,6 @@ def _results(job: BatchJob, pairs: Iterator[Pair], executor: Executor | None) ->
         yield from ChunkedExecutor(job, executor).run(pairs, chunk_size, _MAX_SUBMITTED)
 
 
-def _concrete(pair: Pair) -> Pair:
-    if not is_concrete(pair.source, pair.target):
-        raise ValueError(
-            f"pair {pair.index}: expected concrete arrays, got tracers; for derivatives, call register_batch outside "
-            "of jit with lists of clouds"
-        )
-    return pair
-
-
 class ChunkedExecutor:
     """Chunks of pairs submitted to an executor, and pairs to retry.
 
@@ -233,8 +217,7 @@ class ChunkedExecutor:
         self._executor = executor
         self._replacement: Executor | None = None
         self._pickled = not isinstance(executor, ThreadPoolExecutor)
-        if self._pickled:
-            job = _as_numpy(job)
+        job = _as_numpy(job) if self._pickled else job
         work = job.register_chunk_alone if isinstance(executor, Processes) else job.register_chunk
         self._register = with_settings(work, pickled=self._pickled)
         self._suspects: collections.deque[Pair] = collections.deque()
@@ -271,7 +254,7 @@ class ChunkedExecutor:
 
     def _receive(self) -> Iterator[PairResult]:
         """Wait for at least one chunk and yield its results; the pairs of failed chunks become suspects."""
-        done, _ = wait_for(self._submitted, return_when=FIRST_COMPLETED)
+        done, _ = futures.wait(self._submitted, return_when=futures.FIRST_COMPLETED)
         for future in done:
             chunk = self._submitted.pop(future)
             try:
@@ -322,8 +305,7 @@ def _as_numpy(sent: Any) -> Any:
             return _as_numpy(value)
         return np.asarray(value) if isinstance(value, jax.Array) else value
 
-    fields = {name: getattr(sent, name) for name in sent.__dataclass_fields__}
-    return replace(sent, **{name: jax.tree.map(convert, value, is_leaf=is_deferred) for name, value in fields.items()})
+    return replace(sent, **jax.tree.map(convert, dict(vars(sent)), is_leaf=is_deferred))
 
 
 def _reason(error: PicklingError) -> str:

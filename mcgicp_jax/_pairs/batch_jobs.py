@@ -17,7 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from mcgicp_jax._clouds.origins import centred_pose
-from mcgicp_jax._clouds.point_cloud import PointCloud, Values
+from mcgicp_jax._clouds.point_cloud import PointCloud, Values, as_cloud
 from mcgicp_jax._clouds.voxel_size import VoxelSize
 from mcgicp_jax._compute.concrete import is_concrete, is_deferred
 from mcgicp_jax._compute.devices import computed_on_cpu, on_accelerator
@@ -34,7 +34,6 @@ from mcgicp_jax._registration.pose_derivative import Inputs
 from mcgicp_jax._registration.register_pair import Run, prepared, preprocessed, results_of, run_pair
 from mcgicp_jax._registration.result import RegistrationResult, Status, computed, unverified
 from mcgicp_jax._registration.vectorized import LanePair, Refused, run_pairs
-from mcgicp_jax._search.base import AbstractSearch
 from mcgicp_jax._search.brute_force import DenseSearch, default_search
 
 Cloud: TypeAlias = PointCloud | Values | Callable[[], PointCloud | Values]
@@ -55,12 +54,8 @@ class PairWarning(UserWarning):
 
 @dataclass(frozen=True)
 class Pair:
-    """The arguments of one pair of the batch.
-
-    Attributes:
-        traced: numbers of the leaves of clouds, method and kernel by which the pose is to be differentiated; the clouds
-            are then preprocessed.
-    """
+    """The arguments of one pair. `traced` numbers the leaves of clouds, method and kernel by which the pose is to be
+    differentiated; if there are any, the clouds are preprocessed."""
 
     index: int
     source: Cloud
@@ -97,44 +92,34 @@ class PairResult:
 
 
 @dataclass(frozen=True)
-class _PairInLane:
-    """A pair in a lane.
-
-    Attributes:
-        source, target: preprocessed.
-        verified: False if the initial pose is one that `global_pose` doubts.
-    """
+class PreparedPair:
+    """A pair of preprocessed clouds; `verified` unless the initial pose is one that `global_pose` doubts."""
 
     index: int
-    source: PointCloud
-    target: PointCloud
-    verified: bool
-
-
-@dataclass(frozen=True)
-class GivenPair:
-    """A pair whose arrays differentiation traces."""
-
-    index: int
-    given: Inputs
+    inputs: Inputs
     init: Pose | None
     verified: bool
 
     @property
     def leaves(self) -> list[Any]:
         """Those of clouds, method and kernel."""
-        return jax.tree.leaves(self.given[:4], is_leaf=is_deferred)
+        return jax.tree.leaves(self.inputs[:4], is_leaf=is_deferred)
 
     @property
     def traced(self) -> tuple[int, ...]:
+        """Numbers of the leaves that differentiation traces."""
         return tuple(i for i, leaf in enumerate(self.leaves) if not is_concrete(leaf))
+
+    def checked(self, result: RegistrationResult) -> RegistrationResult:
+        """The result, UNVERIFIED if the initial pose is."""
+        return result if self.verified else unverified(result)
 
 
 def _of_a_pair(work: Callable[..., Any]) -> Callable[..., Any]:
     """Decorator of methods for one pair: a `ValueError` becomes the reason of its result."""
 
     @functools.wraps(work)
-    def caught(self: BatchJob, pair: Pair | GivenPair, *arguments: Any) -> Any:
+    def caught(self: BatchJob, pair: Pair | PreparedPair, *arguments: Any) -> Any:
         try:
             return work(self, pair, *arguments)
         except ValueError as error:
@@ -154,9 +139,9 @@ class BatchJob:
     covariances: bool = True
 
     @property
-    def search(self) -> AbstractSearch:
-        """The requested search, or the default outside of lanes."""
-        return self.options.search or default_search(workers=1)
+    def _options(self) -> Options:
+        """The options, with the default search outside of lanes."""
+        return replace(self.options, search=self.options.search or default_search(workers=1))
 
     @property
     def uses_lanes(self) -> bool:
@@ -167,8 +152,7 @@ class BatchJob:
 
     def ready(self, clouds: dict[str, Cloud]) -> list[PointCloud]:
         """Clouds by their names, read and preprocessed if necessary; errors become a `ValueError` that names one."""
-        options = replace(self.options, search=self.search)
-        return preprocessed(_read(clouds), self.method, options, self.voxel_size, self.num_neighbors)
+        return preprocessed(_read(clouds), self.method, self._options, self.voxel_size, self.num_neighbors)
 
     def _clouds(self, pair: Pair) -> list[PointCloud]:
         """Both clouds by `ready`. Warnings of the pair as a whole do not name it, so that Python shows each once."""
@@ -176,6 +160,19 @@ class BatchJob:
             clouds = self.ready({"source": pair.source, "target": pair.target})
             warn_of_lengths(*clouds)
             return clouds
+
+    @_of_a_pair
+    def prepare(self, pair: Pair) -> PreparedPair | PairResult:
+        """The pair with its initial pose, or its result if it has none."""
+        source, target = self._clouds(pair)
+        warn_of_estimated_parameters(self.method, source, target)
+        init, verified = pair.init, True
+        if isinstance(init, str):
+            start = start_from_anywhere(init, primal(source), primal(target))
+            if start is None:
+                return PairResult(pair.index, RegistrationResult.without_pose(Status.TOO_FEW_CORRESPONDENCES))
+            init, verified = start.matrix, start.success
+        return PreparedPair(pair.index, prepared(source, target, self.method, self.options), primal(init), verified)
 
     @computed_on_cpu
     def register_chunk(self, chunk: list[Pair]) -> list[PairResult]:
@@ -187,133 +184,105 @@ class BatchJob:
         with warnings.catch_warnings(record=True) as caught:
             warnings.simplefilter("always", UserWarning)
             first, *others = self.register_chunk(chunk)
-        return [replace(first, warnings=tuple(str(each.message) for each in caught)), *others]
-
-    def register_in_lanes(self, pairs: Iterable[Pair], num_threads: int) -> Iterator[PairResult]:
-        """Register the pairs as lanes on this machine; threads preprocess them."""
-        # On the host neighbours are needed for warnings alone, of a sample of points.
-        on_host = replace(self, options=replace(self.options, search=None))
-        search = self.options.search or DenseSearch()
-        with ThreadPoolExecutor(num_threads, thread_name_prefix="mcgicp") as threads:
-            rejected: list[PairResult] = []
-
-            def ready() -> Iterator[tuple[_PairInLane, LanePair]]:
-                for each in _computed_ahead(threads, with_settings(on_host._lane_pair), pairs, 2 * num_threads):
-                    if isinstance(each, PairResult):
-                        rejected.append(each)
-                    else:
-                        yield each
-
-            most = self.options.max_source_points
-            for ended in run_pairs(ready(), self.method, self.options, search, self.num_neighbors):
-                pair = ended.key
-                if isinstance(ended, Refused):
-                    yield _invalid(pair.index, ended.reason)
-                    continue
-                used = np.ones(min(len(pair.source), most or len(pair.source)), bool)
-                result = registration_of(ended.state, ended.assessment, ended.history, pair.source, pair.target, used)
-                yield PairResult(pair.index, self._computed(result if pair.verified else unverified(result)))
-            yield from rejected
-
-    def _computed(self, result: RegistrationResult) -> RegistrationResult:
-        """The result without references to the clouds, and if so wanted without covariance."""
-        if not self.covariances:
-            unknown = RegistrationResult.without_pose(result.status).uncertainty
-            result = result.build(**vars(result) | {"uncertainty": unknown})
-        return computed(result)
+        return [replace(first, warnings=tuple(str(warning.message) for warning in caught)), *others]
 
     @_of_a_pair
     def _register(self, pair: Pair) -> PairResult:
         source, target = self._clouds(pair)
-        options = replace(self.options, search=self.search)
-        result = register_from(source, target, self.method, pair.init, options)
-        return PairResult(pair.index, self._computed(result))
+        return self._result(pair.index, register_from(source, target, self.method, pair.init, self._options))
 
     @_of_a_pair
     def _register_with_jacobian(self, pair: Pair) -> PairResult:
         values: Any = (pair.source, pair.target, self.method, self.options.robust)
-        init: Any = pair.init
-        run = run_pair(Inputs(*values), init, replace(self.options, search=self.search))
+        run = self._run(PreparedPair(pair.index, Inputs(*values), pair.init, True))  # type: ignore[arg-type]
+        if isinstance(run, PairResult):
+            return run
         (result,) = results_of([run], [None])
         leaves, structure = jax.tree.flatten(values, is_leaf=is_deferred)
 
         def pose(*traced: Any) -> Any:
             moved = dict(enumerate(leaves)) | dict(zip(pair.traced, traced, strict=True))
-            (found,) = results_of([run], [Inputs(*jax.tree.unflatten(structure, moved.values()))])
-            return found.centred.wxyz_xyz
+            (moved_result,) = results_of([run], [Inputs(*jax.tree.unflatten(structure, moved.values()))])
+            return moved_result.centred.wxyz_xyz
 
-        parameters, pull = jax.vjp(pose, *(leaves[i] for i in pair.traced))
-        blocks = jax.vmap(pull)(jnp.eye(7, dtype=parameters.dtype))
-        return PairResult(pair.index, self._computed(result), jacobian=tuple(map(np.asarray, blocks)))
+        parameters, vjp = jax.vjp(pose, *(leaves[i] for i in pair.traced))
+        blocks = jax.vmap(vjp)(jnp.eye(7, dtype=parameters.dtype))
+        return replace(self._result(pair.index, result), jacobian=tuple(map(np.asarray, blocks)))
 
     def register_differentiated(self, pairs: Iterable[Pair]) -> list[RegistrationResult]:
         """The results of pairs whose arrays differentiation traces. All derivatives are computed side by side."""
-        ready = [self.given(pair) for pair in pairs]
+        outcomes = {pair.index: self.prepare(pair) for pair in pairs}
+        ready = [pair for pair in outcomes.values() if isinstance(pair, PreparedPair)]
         # What is traced is traced in this thread alone.
-        calls = [
-            partial(lambda each: each, pair)
-            if isinstance(pair, PairResult)
-            else partial(self._run, pair, pair.given.values())
-            for pair in ready
-        ]
-        runs = in_new_thread(partial(side_by_side, calls, num_cores()))
-        both = zip(runs, ready, strict=True)
-        ended = [(run, pair) for run, pair in both if isinstance(run, Run) and isinstance(pair, GivenPair)]
-        found = results_of([run for run, _ in ended], [pair.given for _, pair in ended])
-        results = iter(
-            result if pair.verified else unverified(result) for result, (_, pair) in zip(found, ended, strict=True)
-        )
-        return [next(results) if isinstance(run, Run) else run.with_warning().registration for run in runs]
+        calls = [partial(self._run, replace(pair, inputs=pair.inputs.values())) for pair in ready]
+        runs = in_new_thread(partial(side_by_side, calls, num_cores())) if calls else []
+        outcomes |= {pair.index: run for pair, run in zip(ready, runs, strict=True)}
+        ended = [pair for pair in ready if isinstance(outcomes[pair.index], Run)]
+        results = results_of([outcomes[pair.index] for pair in ended], [pair.inputs for pair in ended])
+        for pair, result in zip(ended, results, strict=True):
+            outcomes[pair.index] = PairResult(pair.index, pair.checked(result))
+        return [outcome.with_warning().registration for outcome in outcomes.values()]
 
     @_of_a_pair
-    def given(self, pair: Pair) -> PairResult | GivenPair:
-        source, target = self._clouds(pair)
-        warn_of_estimated_parameters(self.method, source, target)
-        start = self._start(pair, primal(source), primal(target))
-        if isinstance(start, PairResult):
-            return start
-        init, verified = start
-        return GivenPair(pair.index, prepared(source, target, self.method, self.options), primal(init), verified)
+    def _run(self, pair: PreparedPair) -> PairResult | Run:
+        return run_pair(pair.inputs, pair.init, self._options)
+
+    def register_in_lanes(self, pairs: Iterable[Pair], num_threads: int) -> Iterator[PairResult]:
+        """Register the pairs as lanes on this machine; threads preprocess them."""
+        # On the host neighbours are needed for warnings alone, of a sample of points.
+        on_host = replace(self, options=replace(self.options, search=None))
+        search, most = self.options.search or DenseSearch(), self.options.max_source_points
+        with ThreadPoolExecutor(num_threads, thread_name_prefix="mcgicp") as threads:
+            rejected: list[PairResult] = []
+
+            def ready() -> Iterator[tuple[PreparedPair, LanePair]]:
+                for pair in _computed_ahead(threads, with_settings(on_host._lane_pair), pairs, 2 * num_threads):
+                    if isinstance(pair, PairResult):
+                        rejected.append(pair)
+                    else:
+                        yield pair
+
+            for ended in run_pairs(ready(), self.method, self.options, search, self.num_neighbors):
+                pair = ended.key
+                if isinstance(ended, Refused):
+                    yield _invalid(pair.index, ended.reason)
+                    continue
+                source, target = pair.inputs[:2]
+                used = np.ones(min(len(source), most or len(source)), bool)
+                result = registration_of(ended.state, ended.assessment, ended.history, source, target, used)
+                yield self._result(pair.index, pair.checked(result))
+            yield from rejected
 
     @_of_a_pair
-    def _run(self, pair: GivenPair, values: Inputs) -> PairResult | Run:
-        return run_pair(values, pair.init, replace(self.options, search=self.search))
-
-    def _start(self, pair: Pair, source: PointCloud, target: PointCloud) -> PairResult | tuple[Pose | None, bool]:
-        """The initial pose of a pair and whether to trust it, or the result of the pair if no pose is found."""
-        if not isinstance(pair.init, str):
-            return pair.init, True
-        start = start_from_anywhere(pair.init, source, target)
-        if start is None:
-            return PairResult(pair.index, RegistrationResult.without_pose(Status.TOO_FEW_CORRESPONDENCES))
-        return start.matrix, start.success
-
-    @_of_a_pair
-    def _lane_pair(self, pair: Pair) -> PairResult | tuple[_PairInLane, LanePair]:
+    def _lane_pair(self, pair: Pair) -> PairResult | tuple[PreparedPair, LanePair]:
         """The pair as input of a lane, with each cloud padded to a size class so that few programs are compiled."""
         with warnings_named(f"pair {pair.index}"):
-            given = _read({"source": pair.source, "target": pair.target})
-        source, target = self._clouds(replace(pair, source=given["source"], target=given["target"]))
-        start = self._start(pair, source, target)
-        if isinstance(start, PairResult):
-            return start
-        init, verified = start
+            clouds = _read({"source": pair.source, "target": pair.target})
+        ready = self.prepare(replace(pair, source=clouds["source"], target=clouds["target"]))
+        if isinstance(ready, PairResult):
+            return ready
+        source, target = ready.inputs[:2]
         check_clouds(source, target, self.method)
-        pose = se3_from_matrix(centred_pose(init, source, target), source.points.dtype)
+        pose = se3_from_matrix(centred_pose(ready.init, source, target), source.points.dtype)
         # `preprocess` returns clouds that have neighbours as they are; the others get theirs on the devices.
-        sides = [
-            self._padded(cloud, cloud is not given[name]) for name, cloud in (("source", source), ("target", target))
-        ]
-        return _PairInLane(pair.index, source, target, verified), LanePair(pose, *sides)
+        sides = [self._padded(*both) for both in zip((source, target), clouds.values(), strict=True)]
+        return ready, LanePair(pose, *sides)
 
-    def _padded(self, cloud: PointCloud, without_neighbors: bool) -> PointCloud:
-        """The cloud with all that a lane needs of it."""
+    def _padded(self, cloud: PointCloud, before: PointCloud) -> PointCloud:
+        """What a lane needs of a preprocessed cloud: neighbours only if it had them `before`."""
         arrays: dict[str, Any] = {"origin": np.zeros(3, cloud.points.dtype), "channel_names": ()}
         if not self.method.uses_channels:
             arrays |= {"channels": cloud.points[:, :0], "channel_valid": None}
-        if without_neighbors:
+        if cloud is not before:
             arrays["deferred_neighbors"] = None
         return cloud.replace_rows(**arrays).pad()
+
+    def _result(self, index: int, result: RegistrationResult) -> PairResult:
+        """The result without references to the clouds, and if so wanted without covariance."""
+        if not self.covariances:
+            unknown = RegistrationResult.without_pose(result.status).uncertainty
+            result = result.build(**vars(result) | {"uncertainty": unknown})
+        return PairResult(index, computed(result))
 
 
 def _invalid(index: int, error: ValueError) -> PairResult:
@@ -324,9 +293,10 @@ def _read(clouds: dict[str, Cloud]) -> dict[str, PointCloud]:
     """Clouds by their names, read if they are functions; errors become a `ValueError` that names one."""
     sides = dict[str, PointCloud]()
     for name, cloud in clouds.items():
-        with messages_named(name):
-            given: Any = _loaded(cloud) if callable(cloud) and not isinstance(cloud, PointCloud) else cloud
-            sides[name] = given if isinstance(given, PointCloud) else PointCloud(given)
+        if callable(cloud) and not isinstance(cloud, PointCloud):
+            with messages_named(name):
+                cloud = _loaded(cloud)
+        sides[name] = as_cloud(name, cloud)
     return sides
 
 

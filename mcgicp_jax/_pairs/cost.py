@@ -24,7 +24,7 @@ from mcgicp_jax._methods.surfaces import differentiable_inputs, surface_pair
 from mcgicp_jax._pose_solver.matched import Motion, adapted, linearize_at, matched_rows, sample_of_term
 from mcgicp_jax._registration.input_checks import check_matches, warn_of_estimated_parameters
 from mcgicp_jax._search.base import Correspondences
-from mcgicp_jax._terms.base import AbstractAdaptiveTerm, AbstractTerm
+from mcgicp_jax._terms.base import AbstractAdaptiveTerm
 
 
 @with_settings_of_package
@@ -77,29 +77,12 @@ def mahalanobis_cost(
     matrix, dtype = centred_pose(pose, source, target, "pose"), source.points.dtype
     motion = Motion(matrix[:3, :3].astype(dtype), matrix[:3, 3].astype(dtype))
     temperature = None if temperature is None else numpy_for(temperature).asarray(temperature, dtype)
-    numbers, inputs = _problem(motion, source, target, matches, method, robust, temperature)
-    return blockwise(_likelihood if log_determinant else _cost, numbers, *inputs, total=True)
-
-
-Numbers = tuple[Motion, tuple[AbstractTerm, ...], Any]
-
-
-def _problem(
-    motion: Motion,
-    source: PointCloud,
-    target: PointCloud,
-    matches: Correspondences,
-    method: AbstractMethod,
-    robust: AbstractKernel | None,
-    temperature: Any,
-) -> tuple[Numbers, list[Input]]:
-    """Numbers and inputs of the row function of the cost."""
     fixed = primal((source, target, method))
-    given = primal((motion, temperature, matches))
-    xp = numpy_for(given[2])
+    constants = primal((motion, temperature, matches))
+    xp = numpy_for(constants[2])
     indices = xp.where(xp.asarray(matches.valid), xp.asarray(matches.indices), -1)
     indices = indices.reshape(-1, indices.shape[-1]).T
-    if is_concrete(fixed, given):
+    if is_concrete(fixed, constants):
         method = with_unset_from(method, fixed[2].resolve(*fixed[:2]))
         terms, soft = method.terms(fixed[0], fixed[1], robust, False), temperature is not None
         inputs = differentiable_inputs(source, target, method, terms, (*fixed[:2], primal(method)), indices, soft=soft)
@@ -111,10 +94,11 @@ def _problem(
             inputs += [Input(searched(surface), rows) for surface, rows in both]
 
     def sample(term: AbstractAdaptiveTerm, rows: Int[AnyArray, "n"]) -> Any:
-        (found,) = blockwise(_sample, constant(primal((motion, term))), *of_rows(inputs, rows))
-        return primal(found)
+        (values,) = blockwise(_sample, constant(primal((motion, term))), *of_rows(inputs, rows))
+        return primal(values)
 
-    return (motion, adapted(terms, fixed[0].valid, sample), temperature), inputs
+    numbers = motion, adapted(terms, fixed[0].valid, sample), temperature
+    return blockwise(_likelihood if log_determinant else _cost, numbers, *inputs, total=True)
 
 
 def _sample(numbers: tuple[Motion, AbstractAdaptiveTerm], *rows: Rows) -> tuple[Any]:
@@ -124,13 +108,13 @@ def _sample(numbers: tuple[Motion, AbstractAdaptiveTerm], *rows: Rows) -> tuple[
 
 def _cost(numbers: Any, *rows: Rows) -> Float[Array, ""]:
     motion, terms, temperature = numbers
-    _, found, _ = linearize_at(motion, matched_rows(rows, temperature), terms)
-    return jnp.sum(found.cost)
+    _, linearization, _ = linearize_at(motion, matched_rows(rows, temperature), terms)
+    return jnp.sum(linearization.cost)
 
 
 def _likelihood(numbers: Any, *rows: Rows) -> Float[Array, ""]:
     motion, terms, temperature = numbers
     matched = matched_rows(rows, temperature)
-    _, found, counts = linearize_at(motion, matched, terms)
-    determinant = jnp.where(matched.valid, alg.determinant(found.information), 1)
-    return jnp.sum(found.cost) - jnp.sum(counts * jnp.log(determinant))
+    _, linearization, counts = linearize_at(motion, matched, terms)
+    determinant = jnp.where(matched.valid, alg.determinant(linearization.information), 1)
+    return jnp.sum(linearization.cost) - jnp.sum(counts * jnp.log(determinant))

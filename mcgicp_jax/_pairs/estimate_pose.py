@@ -76,10 +76,10 @@ def estimate_pose(
     check_clouds(source, target, method)
     warn_of_estimated_parameters(method, source, target, temperature)
     softness = None if temperature is None else numpy_for(temperature).asarray(temperature, source.points.dtype)
-    given = Inputs(source, target, method, robust, temperature=softness)
-    return result_of(given, _estimate, Matches.given(primal(matches)), primal(init), options)
+    inputs = Inputs(source, target, method, robust, temperature=softness)
+    return result_of(inputs, _estimate, Matches.given(primal(matches)), primal(init), options)
 
 
-def _estimate(given: Inputs, matches: Matches, init: Pose | None, options: Options, traced: bool = False) -> Run:
-    problem, inputs = problem_of(given, init, options, 1, matches._replace(temperature=given.temperature))
+def _estimate(inputs: Inputs, matches: Matches, init: Pose | None, options: Options, traced: bool = False) -> Run:
+    problem, inputs = problem_of(inputs, init, options, 1, matches._replace(temperature=inputs.temperature))
     return run_loop(inputs, problem, None, options.max_iterations, traced)

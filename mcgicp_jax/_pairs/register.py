@@ -49,8 +49,8 @@ def register(
 ) -> RegistrationResult:
     """Register two clouds: find matches at the current pose, update the pose, and repeat until it converges.
 
-    A coarse phase uses the larger `max_distance`, and of a source of 8,192 points or more an even subset of at least
-    4,096. Near convergence, a fine phase with all points and the smaller `max_distance` takes over.
+    A coarse phase uses the larger `max_distance`, and of 8,192 source points or more an even subset of at least 4,096.
+    Near convergence, a fine phase with all points and the smaller `max_distance` takes over.
 
     Outside `jit` and `vmap`, also inside `grad` or `jvp`, the loop runs on the host and calls compiled programs whose
     shapes do not depend on the sizes of the clouds. Inside `jit`, it is one program per size of clouds, whose matches
@@ -75,9 +75,9 @@ def register(
             TOO_FEW_CORRESPONDENCES, and the pose NaN. "global" is not available inside transformations.
         max_distance: maximum correspondence distance, metres of position; matches beyond it are rejected. One number,
             or two: for the coarse and for the fine phase. None: 10 and 2.5 times the spacing of the target (its median
-            nearest-neighbour distance, or the edge of its cells). The first is also at least 10 times the spacing of a
-            square grid with the density of the target, since in LiDAR scans the lines are further apart than the points
-            of a line. If `init` is further off, pass a larger value.
+            nearest-neighbour distance, or the edge of its cells); the first is also at least 10 times the spacing of a
+            square grid of the target's density, as the lines of LiDAR scans are far apart. Pass a larger value if
+            `init` is further off.
         max_iterations: maximum number of pose updates in both phases together.
         translation_tolerance, rotation_tolerance: metres (at the centroid of the matches) and radians; the loop has
             converged when an update is below both. `translation_tolerance` None: 0.5 % of the spacing of the target.
@@ -92,9 +92,8 @@ def register(
             it there. The status is DEGENERATE in either case.
         equalize_channels: scale and shift each channel of the source to the distribution of the target's, for scans
             with different exposure or gain. A first registration uses the distributions of all points, and a second
-            one, which starts at the pose of the first, those of matched points. With
-            `MultiChannelGICP(photometric=True)`, gains and offsets are instead estimated from interpolated channels,
-            together with the pose.
+            one from its pose those of matched points. With `MultiChannelGICP(photometric=True)`, gains and offsets are
+            instead estimated from interpolated channels, together with the pose.
         voxel_sizes: voxel sizes in metres, coarse to fine, for multi-scale registration. Each scale starts from the
             pose of the previous one with the default `max_distance`; a given `max_distance` applies to the final
             registration at full resolution. For NDT these are cell sizes; raw clouds have more points per cell than
@@ -103,10 +102,9 @@ def register(
         max_source_points: match at most so many points of the source, at least 4, in every phase. The rows are cut into
             so many runs of equal length, and one random row of each is used (with a fixed seed). After voxel averaging
             these rows cover space evenly; otherwise they follow the density of the points. Neighbours (among all
-            points), local geometry and covariances are computed for them alone. `num_inliers`, `overlap` and the
-            covariance count them alone, and the pose has a derivative by these points and their neighbours. The target
-            stays complete. Parameters of the method left None are estimated from these rows, too. None: all points.
-            10,000 nearly give the pose of all.
+            points), covariances, estimated parameters, `num_inliers`, `overlap` and the covariance of the pose are of
+            these rows alone, and the pose has a derivative by them and their neighbours. The target stays complete.
+            None: all points. 10,000 nearly give the pose of all.
         tie_points: (source_points, target_points, covariances), metres: points (n, 3) known to be the same, such as
             surveyed targets or image features (Huhle & Jenke 2008), and the covariances (n, 3, 3) of b − T a, in the
             target's axes. n may be 1 or 2. They do not replace a good initial pose.

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import abc
-from typing import Any
+from typing import Any, TypeAlias
 
 import equinox as eqx
 import jax
@@ -20,6 +20,8 @@ WORLD = -(2**31)
 # Largest negative eigenvalue of an information matrix that counts as rounding, as a fraction of the largest one; and
 # largest asymmetry. g2o files have six digits.
 _ROUNDING = 1e-6
+# All measurements of a graph by kind, `AbstractFactor`s; the first are the edges.
+Factors: TypeAlias = tuple[Any, ...]
 
 
 class AbstractFactor(eqx.Module):
@@ -100,7 +102,7 @@ class Edge(AbstractFactor):
 
         Raises:
             ValueError: if not exactly one of `information` and `covariance` is given, if a covariance is not positive
-                definite, if `i` or `j` is not an integer, or if the shapes do not fit.
+                definite, `i` or `j` is not an integer, or the shapes do not fit.
         """
         if (information is None) == (covariance is None):
             raise ValueError("information: expected either an information or a covariance matrix, got both or neither")
@@ -143,8 +145,8 @@ def motion_jacobians(poses: Float[np.ndarray, "m 2 4 4"]) -> Float[np.ndarray, "
 def checked_edges(edges: Edge, num_poses: int) -> Edge:
     """The edges as NumPy arrays, with exact rotations and symmetric information."""
     i, j = np.asarray(edges.i), np.asarray(edges.j)
-    for name, rows, other in (("i", i, i == WORLD), ("j", j, False)):
-        outside = ((rows < 0) | (rows >= num_poses)) & ~np.asarray(other)
+    for name, rows, of_world in (("i", i, i == WORLD), ("j", j, np.zeros(len(j), bool))):
+        outside = ((rows < 0) | (rows >= num_poses)) & ~of_world
         _refuse(f"{name}: expected a row from 0 to {num_poses - 1}", outside, rows)
     _refuse("expected two different poses", i == j, i)
     transforms = pose_matrices(edges.T_i_j, "edges[{}].T_i_j") if len(i) else np.zeros((0, 4, 4))
@@ -196,5 +198,5 @@ def _inverse(covariance: Any) -> Any:
         np.linalg.cholesky(covariance)
     except np.linalg.LinAlgError as error:
         raise ValueError("covariance: expected a positive definite matrix") from error
-    inverse = np.linalg.inv(covariance)
-    return 0.5 * (inverse + np.swapaxes(inverse, -1, -2))
+    information = np.linalg.inv(covariance)
+    return 0.5 * (information + information.swapaxes(-1, -2))

@@ -1,10 +1,8 @@
 """Pose graphs: poses, measured motions between them, and other measurements; and poses to start from.
 
-The start is a spanning tree of the edges, and a chordal relaxation of those that are trusted. The relaxation solves two
-sparse linear least-squares problems in closed form: rotations as free 3×3 matrices, which are then made orthonormal,
-and positions at these rotations (Martinec & Pajdla, CVPR 2007; Carlone et al., ICRA 2015). It comes near the minimum
-where a tree, whose errors add up, does not. Edges that keep the poses near the start act along directions that are not
-measured.
+The start is a spanning tree of the edges, whose errors add up, and a chordal relaxation of those that are trusted: two
+sparse linear least-squares problems, for rotations as free 3×3 matrices, which are then made orthonormal, and for
+positions at these rotations (Martinec & Pajdla, CVPR 2007; Carlone et al., ICRA 2015).
 """
 
 from __future__ import annotations
@@ -22,11 +20,12 @@ from jaxtyping import Array, Bool, Float, Int
 from mcgicp_jax._compute.concrete import is_concrete
 from mcgicp_jax._math.poses import Pose, inverse, pose_matrices
 from mcgicp_jax._pose_graph.edge import WORLD, AbstractFactor, Edge, check_rows, checked_edges
+from mcgicp_jax._pose_graph.levenberg_marquardt import factored
 
 # Eigenvalues of an edge's information below this fraction of the largest count as zero.
 _BLIND = 1e-6
-# Information about the start, as a multiple of what leaks, and at most as a fraction of that of a typical edge. Largest
-# slides in corridors of 3 to 40 poses, with σ = 0.02: 559 m without, 0.8 m with a multiple of 10, 0.4 m with 30 or 100.
+# Information about the start, as a multiple of what leaks, and at most as a fraction of that of a typical edge: poses
+# slide least in corridors with multiples of 30 to 100.
 _OF_LEAK, _MOST = 30.0, 1e-2
 
 
@@ -104,11 +103,8 @@ def _check_factor(name: str, factor: Any, num_poses: int) -> None:
 
 
 def _initial(edges: Edge) -> Float[np.ndarray, "n 4 4"]:
-    """Poses to start from.
-
-    A spanning tree prefers edges that are no loops, then loops, then edges without information on some direction. Parts
-    that are not connected with the world begin at the identity.
-    """
+    """Poses to start from, by a spanning tree that prefers certain edges to uncertain ones, and these to edges without
+    information on some direction; then by relaxation of the certain edges and of the tree."""
     if not is_concrete(edges) or not len(edges):
         raise ValueError("poses: required, since initial poses can only be computed from at least one concrete edge")
     number = int(max(np.max(edges.i), np.max(edges.j))) + 1
@@ -145,16 +141,16 @@ def _along_tree(
     _, first = np.unique((np.minimum(i, j) * (number + 1) + np.maximum(i, j))[order], return_index=True)
     rows = order[first]
     size = (number + 1, number + 1)
-    tree = minimum_spanning_tree(coo_array((first + 1.0, (i[rows], j[rows])), size)).tocoo()
-    edges = order[tree.data.astype(int) - 1]
-    between = {frozenset(ends): edge for *ends, edge in zip(tree.row, tree.col, edges, strict=True)}
-    nodes, before = breadth_first_order(tree.tocsr(), number, directed=False)
-    poses = np.tile(np.eye(4), (number + 1, 1, 1))
-    for node in nodes[1:]:
-        edge = between[frozenset((before[node], node))]
+    tree = minimum_spanning_tree(coo_array((first + 1.0, (i[rows], j[rows])), size))
+    tree = (tree + tree.T).tocsr()
+    nodes, before = breadth_first_order(tree, number)
+    edges = order[tree[before[nodes[1:]], nodes[1:]].astype(int) - 1]
+    poses, used = np.tile(np.eye(4), (number + 1, 1, 1)), np.zeros(len(i), bool)
+    for node, edge in zip(nodes[1:], edges, strict=True):
         motion = motions[edge] if j[edge] == node else np.linalg.inv(motions[edge])
         poses[node] = poses[before[node]] @ motion
-    return poses[:number], np.isin(np.arange(len(i)), edges)
+    used[edges] = True
+    return poses[:number], used
 
 
 def _relaxed(
@@ -165,44 +161,38 @@ def _relaxed(
     number: int,
 ) -> Float[np.ndarray, "number 4 4"]:
     """The chordal relaxation; `roots` are those of the information, of translation and rotation."""
-    m, three = len(i), np.arange(3)
-    turns, shifts = motions[:, :3, :3], motions[:, :3, 3]
+    ends = np.stack([i, j], axis=1)
     # R_jᵀ = R_i_jᵀ R_iᵀ, for the three columns at once.
-    rows = 3 * np.arange(m)[:, None, None] + three[:, None]
-    entries = [
-        (roots[:, 1, None, None] * np.eye(3), rows + 0 * three, 3 * j[:, None, None] + three),
-        (-roots[:, 1, None, None] * turns.swapaxes(1, 2), rows + 0 * three, 3 * i[:, None, None] + three),
-    ]
-    columns = _least_squares(entries, np.zeros((3 * m, 3)), np.eye(3), (3 * m, 3 * number + 3))
-    free = columns.reshape(number + 1, 3, 3).swapaxes(1, 2)
-    left, _, right = np.linalg.svd(free)
+    turns = motions[:, :3, :3].swapaxes(1, 2)
+    blocks = roots[:, 1, None, None, None] * np.stack([-turns, np.broadcast_to(np.eye(3), turns.shape)], axis=1)
+    columns = _least_squares(blocks, ends, np.zeros((3 * len(i), 3)), np.eye(3), number)
+    left, _, right = np.linalg.svd(columns.reshape(number + 1, 3, 3).swapaxes(1, 2))
     left[:, :, 2] *= np.linalg.det(left @ right)[:, None]
     rotations = left @ right
     # t_j − t_i = R_i t_i_j.
-    rows, weights = np.arange(m), roots[:, 0]
-    aims = weights[:, None] * np.einsum("mij,mj->mi", rotations[i], shifts)
-    positions = _least_squares([(weights, rows, j), (-weights, rows, i)], aims, np.zeros((1, 3)), (m, number + 1))
+    aims = roots[:, :1] * np.einsum("mij,mj->mi", rotations[i], motions[:, :3, 3])
+    blocks = roots[:, 0, None, None, None] * np.array([-1.0, 1.0])[:, None, None]
     poses = np.tile(np.eye(4), (number, 1, 1))
-    poses[:, :3, :3], poses[:, :3, 3] = rotations[:-1], positions[:-1]
+    poses[:, :3, :3] = rotations[:-1]
+    poses[:, :3, 3] = _least_squares(blocks, ends, aims, np.zeros((1, 3)), number)[:-1]
     return poses
 
 
 def _least_squares(
-    entries: list[tuple[Any, Any, Any]], aims: Float[np.ndarray, "r 3"], last: Float[np.ndarray, "h 3"], shape: Any
-) -> Float[np.ndarray, "c 3"]:
-    """Least squares of a sparse system, of which the last unknowns are given."""
-    from scipy.sparse import coo_array
-    from scipy.sparse.linalg import splu
+    blocks: Float[np.ndarray, "m 2 b b"],
+    ends: Int[np.ndarray, "m 2"],
+    aims: Float[np.ndarray, "_ 3"],
+    last: Float[np.ndarray, "b 3"],
+    number: int,
+) -> Float[np.ndarray, "_ 3"]:
+    """Least squares of a sparse system with two blocks in each row, of whose unknowns the last are given."""
+    from scipy.sparse import bsr_array
 
-    values, rows, columns = (
-        np.concatenate([np.broadcast_to(each[k], each[0].shape).ravel() for each in entries]) for k in range(3)
-    )
-    whole = coo_array((values, (rows, columns)), shape).tocsc()
-    count = shape[1] - len(last)
-    system, aims = whole[:, :count], aims - whole[:, count:] @ last
-    normal = (system.T @ system).tocsc()
-    options = {"SymmetricMode": True}
-    factors = splu(normal, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options=options)
+    m, _, b, _ = blocks.shape
+    pointers = 2 * np.arange(m + 1)
+    whole = bsr_array((blocks.reshape(-1, b, b), ends.ravel(), pointers), (b * m, b * (number + 1))).tocsc()
+    system, aims = whole[:, : b * number], aims - whole[:, b * number :] @ last
+    factors = factored((system.T @ system).tocsc(), "MMD_AT_PLUS_A")
     return np.concatenate([factors.solve(system.T @ aims), last])
 
 
@@ -211,18 +201,13 @@ def unmeasured(edges: Edge, poses: Float[np.ndarray, "n 4 4"], typical: Float[np
 
     The axes of an edge are only known to its standard deviation σ of rotation, in radians, so that a fraction σ² of its
     information leaks into the directions that it does not measure: poses would slide along these by many metres to
-    explain the noise in the others.
-
-    Args:
-        edges: those of the graph. Priors get no information, since the world's axes are exact.
-        poses: at the start.
-        typical: `typical_information` of the edges.
+    explain the noise in the others. Priors get no information, since the world's axes are exact.
     """
     between, roots = edges.i != WORLD, np.sqrt(typical)
     i = np.where(between, edges.i, edges.j)
     values, vectors = np.linalg.eigh(np.nan_to_num(edges.information) / (roots[:, :, None] * roots[:, None]))
     blind = between[:, None] & (values <= _BLIND * values[:, -1:])
-    some = np.minimum(_OF_LEAK / typical[:, 5:], _MOST)
+    least = np.minimum(_OF_LEAK / typical[:, 5:], _MOST)
     scaled = roots[:, :, None] * vectors
-    information = (scaled * (blind * some)[:, None]) @ scaled.swapaxes(1, 2)
+    information = (scaled * (blind * least)[:, None]) @ scaled.swapaxes(1, 2)
     return Edge(edges.i, edges.j, inverse(poses[i]) @ poses[edges.j], information)

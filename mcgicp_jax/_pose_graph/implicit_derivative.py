@@ -21,35 +21,18 @@ from mcgicp_jax._compute.concrete import AnyArray, is_concrete
 from mcgicp_jax._compute.messages import calling_line, shown_at, warn
 from mcgicp_jax._compute.programs import call_host
 from mcgicp_jax._math.poses import logarithm_derivative, skew
-from mcgicp_jax._pose_graph.edge import WORLD, Edge, check_rows, motion_jacobians
-from mcgicp_jax._pose_graph.levenberg_marquardt import factored, typical_information
-from mcgicp_jax._pose_graph.solver import Factors, Solution, covariances_at, solve
+from mcgicp_jax._pose_graph.edge import WORLD, Edge, Factors, check_rows, motion_jacobians
+from mcgicp_jax._pose_graph.levenberg_marquardt import GraphState, factored, typical_information
+from mcgicp_jax._pose_graph.solver import GraphPoses, covariances_at, solve
 from mcgicp_jax._registration.result import Status
 
-# Step of the central differences of `logarithm_derivative`, metres or radians: errors are of the order of 1e-10, and of
-# 1e-11 by rounding.
+# Step of the central differences of `logarithm_derivative`, metres or radians: errors are of the order of 1e-10.
 _STEP = 1e-5
 
 
-class Found(NamedTuple):
-    """The solution of a graph. Poses are differentiable, the other fields are constants."""
-
-    poses: Float[AnyArray, "n 4 4"]
-    residuals: Float[AnyArray, "m"]
-    weights: Float[AnyArray, "m"]
-    cost: Float[AnyArray, ""]
-    status: Int[AnyArray, ""]
-    num_iterations: Int[AnyArray, ""]
-
-
 class _Sensitivity(NamedTuple):
-    """Derivatives at the solution; 0 unless the status is CONVERGED, and for edges that were rejected.
-
-    Attributes:
-        inverse: (∂g/∂ξ)⁻¹, 0 for fixed poses.
-        by_motion: derivative of JᵀΛr by the twist μ of T_i_j exp(μ).
-        jacobians, residuals: J and r.
-    """
+    """(∂g/∂ξ)⁻¹, the derivative of JᵀΛr by the twist μ of T_i_j exp(μ), J and r. All are 0 unless the status is
+    CONVERGED, and for fixed poses and rejected edges."""
 
     inverse: Float[AnyArray, "n 6 n 6"]
     by_motion: Float[AnyArray, "m 2 6 6"]
@@ -58,27 +41,27 @@ class _Sensitivity(NamedTuple):
 
 
 @partial(jax.custom_jvp, nondiff_argnums=(2, 3))
-def solve_traced(poses: Float[AnyArray, "n 4 4"], factors: Factors, robust: bool, max_iterations: int) -> Found:
+def solve_traced(poses: Float[AnyArray, "n 4 4"], factors: Factors, robust: bool, max_iterations: int) -> GraphPoses:
     """`solver.solve` inside transformations, differentiable by the edges, not by the initial poses."""
     return _solved(poses, factors, robust, max_iterations, False)[0]
 
 
 @solve_traced.defjvp
-def _derivative(robust: bool, max_iterations: int, primals: Any, tangents: Any) -> tuple[Found, Found]:
+def _derivative(robust: bool, max_iterations: int, primals: Any, tangents: Any) -> tuple[GraphPoses, GraphPoses]:
     (poses, factors), (_, changes) = primals, tangents
     if len(factors) > 1:
         raise ValueError("graph: poses have derivatives only if edges are the only measurements, got further factors")
-    found, sensitivity = _solved(poses, factors, robust, max_iterations, True)
+    solution, sensitivity = _solved(poses, factors, robust, max_iterations, True)
     (edges,), (change,) = factors, changes
-    moved = _moved(found, sensitivity, edges.rows, edges.T_i_j, change.T_i_j, change.information)
-    constants = jax.tree.map(lambda value: jax.custom_derivatives.zero_from_primal(value), found)
-    return found, constants._replace(poses=moved)
+    moved = _moved(solution, sensitivity, edges.rows, edges.T_i_j, change.T_i_j, change.information)
+    constants = jax.tree.map(lambda value: jax.custom_derivatives.zero_from_primal(value), solution)
+    return solution, constants._replace(poses=moved)
 
 
 # Compiled as a whole: outside of `jit`, each of some fifty operations would be compiled alone.
 @jax.jit
 def _moved(
-    found: Found,
+    solution: GraphPoses,
     sensitivity: _Sensitivity,
     rows: Int[AnyArray, "m 2"],
     motions: Float[AnyArray, "m 4 4"],
@@ -86,7 +69,7 @@ def _moved(
     information_change: Float[AnyArray, "m 6 6"],
 ) -> Float[Array, "n 4 4"]:
     """Tangents of the poses, given those of the motions and information matrices of the edges."""
-    n, dtype = len(found.poses), found.poses.dtype
+    n, dtype = len(solution.poses), solution.poses.dtype
     einsum = partial(jnp.einsum, precision="highest")
     local = einsum("mji,mjk->mik", motions[:, :3, :3], motion_change[:, :3]).astype(dtype)
     turn = (local[:, :, :3] - local[:, :, :3].swapaxes(1, 2)) / 2
@@ -96,9 +79,9 @@ def _moved(
     gradient = jnp.zeros((n + 1, 6), dtype).at[jnp.where(rows == WORLD, n, rows)].add(forces)
     twists = -einsum("iajb,jb->ia", sensitivity.inverse, gradient[:-1])
     generators = jnp.zeros((n, 4, 4), dtype).at[:, :3, :3].set(skew(twists[:, 3:])).at[:, :3, 3].set(twists[:, :3])
-    moved = jnp.matmul(found.poses, generators, precision="highest")
+    moved = jnp.matmul(solution.poses, generators, precision="highest")
     # Tangents that are not finite would leave NaN behind a zero derivative.
-    return jnp.where(found.status == Status.CONVERGED, moved, 0)
+    return jnp.where(solution.status == Status.CONVERGED, moved, 0)
 
 
 def covariances_traced(poses: Float[AnyArray, "n 4 4"], factors: Factors, weights: Float[AnyArray, "m"]) -> Lazy[Any]:
@@ -120,7 +103,7 @@ def _floats(tree: Any) -> list[Any]:
 
 def _solved(
     poses: Float[AnyArray, "n 4 4"], factors: Factors, robust: bool, max_iterations: int, differentiated: bool
-) -> tuple[Found, Any]:
+) -> tuple[GraphPoses, Any]:
     """On the host, or by a callback if an argument is traced; with a `_Sensitivity` if differentiated."""
     dtype, n = jnp.result_type(*_floats((poses, factors))), len(poses)
     line = calling_line()
@@ -129,27 +112,25 @@ def _solved(
         for k, factor in enumerate(factors):
             # Indices of traced arrays are not known before.
             check_rows(f"factors[{k - 1}]" if k else "edges", np.asarray(factor.rows), n)
-        solution = solve(poses, factors, robust, max_iterations, exact=True)
+        result, state = solve(poses, factors, robust, max_iterations, exact=True)
+        result = jax.tree.map(lambda value: value.astype(dtype) if value.dtype.kind == "f" else value, result)
         with shown_at(line):
-            _warn_of_rounding(solution.poses(n)[:, :3, 3].astype(dtype), factors)
-        numbers: Any = (solution.poses(n), solution.residuals, solution.weights, solution.cost)
-        counts: Any = (np.int32(solution.status), np.int32(solution.found.num_iterations))
-        found = Found(*(np.asarray(each, dtype) for each in numbers), *counts)
-        return found, _sensitivity(solution, n, dtype) if differentiated else None
+            _warn_of_rounding(result.poses[:, :3, 3], factors)
+        return result, _sensitivity(state, result, dtype) if differentiated else None
 
     if is_concrete(poses, factors):
         return jax.tree.map(jnp.asarray, on_host(*jax.tree.map(np.asarray, (poses, factors))))
     m, number = sum(len(factor.information) for factor in factors), jax.ShapeDtypeStruct((), np.int32)
     shape = partial(jax.ShapeDtypeStruct, dtype=dtype)
-    found = Found(shape((n, 4, 4)), shape((m,)), shape((m,)), shape(()), number, number)
+    result: Any = GraphPoses(shape((n, 4, 4)), shape((m,)), shape((m,)), shape(()), number, number)
     sizes: Any = (n, 6, n, 6), (m, 2, 6, 6), (m, 2, 6, 6), (m, 6)
     sensitivity = _Sensitivity(*map(shape, sizes)) if differentiated else None
-    return call_host(on_host, (found, sensitivity), poses, factors)
+    return call_host(on_host, (result, sensitivity), poses, factors)
 
 
 def _warn_of_rounding(positions: Float[np.ndarray, "n 3"], factors: Factors) -> None:
     """Warn if the spacing of floats at the positions exceeds the standard deviation of a typical edge."""
-    largest, typical = np.abs(positions).max(), typical_information(*factors)[:, 0].max(initial=0)
+    largest, typical = np.abs(positions).max(), typical_information(factors)[:, 0].max(initial=0)
     # NaN and overflow are a status.
     spacing = np.spacing(largest) if np.isfinite(largest) else 0
     if spacing**2 * typical > 1:
@@ -159,21 +140,18 @@ def _warn_of_rounding(positions: Float[np.ndarray, "n 3"], factors: Factors) -> 
         )
 
 
-def _sensitivity(solution: Solution, number: int, dtype: DTypeLike) -> _Sensitivity:
-    equations, poses = solution.equations, solution.found.poses
-    edges: Any = equations.factors[0]
-    ends = poses[equations.rows]
-    inverse = np.zeros((len(poses), 6, len(poses), 6))
-    found = [np.zeros((len(ends), *shape)) for shape in ((2, 6, 6), (2, 6, 6), (6,))]
-    if solution.status == Status.CONVERGED:
-        used = solution.weights > 0
-        blocks, *values = _derivatives(edges, ends)
-        for array, each in zip(found, values, strict=True):
-            array[used] = each[used]
+def _sensitivity(state: GraphState, result: GraphPoses, dtype: DTypeLike) -> _Sensitivity:
+    equations, weights, poses, *_ = state
+    inverse, ends, n = np.zeros((len(poses), 6, len(poses), 6)), poses[equations.rows], len(result.poses)
+    values = [np.zeros((len(ends), *shape)) for shape in ((2, 6, 6), (2, 6, 6), (6,))]
+    if result.status == Status.CONVERGED:
+        blocks, *derivatives = _derivatives(equations.factors[0], ends)
+        for value, derivative in zip(values, derivatives, strict=True):
+            value[weights > 0] = derivative[weights > 0]
         if equations.size:
             dense = equations.spread(factored(equations.matrix(blocks)).solve(np.eye(equations.size)))
             inverse = equations.spread(np.moveaxis(dense, 2, 0))
-    return _Sensitivity(*(each.astype(dtype) for each in (inverse[:number, :, :number], *found)))
+    return _Sensitivity(*(value.astype(dtype) for value in (inverse[:n, :, :n], *values)))
 
 
 def _derivatives(edges: Edge, poses: Float[np.ndarray, "m 2 4 4"]) -> tuple[np.ndarray, ...]:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import partial
 from typing import Any
 
 import jax
@@ -18,7 +17,8 @@ from mcgicp_jax._compute.messages import check_integer
 from mcgicp_jax._compute.threads import with_settings_of_package
 from mcgicp_jax._pose_graph.edge import WORLD, Edge
 from mcgicp_jax._pose_graph.graph import PoseGraph
-from mcgicp_jax._pose_graph.implicit_derivative import Found, covariances_traced, solve_traced
+from mcgicp_jax._pose_graph.implicit_derivative import covariances_traced, solve_traced
+from mcgicp_jax._pose_graph.marginal_covariances import pose_covariances
 from mcgicp_jax._pose_graph.solver import solve
 from mcgicp_jax._registration.result import Status
 
@@ -146,26 +146,24 @@ def optimize_poses(graph: PoseGraph, *, robust: bool = True, max_iterations: int
     if not isinstance(graph, PoseGraph):
         raise ValueError(f"graph: expected a PoseGraph, got {type(graph).__name__}")
     check_integer("max_iterations", max_iterations, 1)
-    factors, n = (graph.edges, *graph.factors), len(graph.poses)
+    factors = graph.edges, *graph.factors
     if is_concrete(graph):
         poses, factors = jax.tree.map(np.asarray, (graph.poses, factors))
-        solution = solve(poses, factors, bool(robust), int(max_iterations))
-        numbers = solution.poses(n), solution.residuals, solution.weights, np.float64(solution.cost)
-        found = Found(*numbers, np.int32(solution.status), np.int32(solution.found.num_iterations))
-        uncertainty = Lazy(partial(solution.covariances, n))
+        solution, state = solve(poses, factors, bool(robust), int(max_iterations))
+        uncertainty = Lazy(lambda: pose_covariances(state)[: len(poses)])
     else:
-        found = solve_traced(graph.poses, factors, bool(robust), int(max_iterations))
-        uncertainty = covariances_traced(found.poses, factors, found.weights)
+        solution = solve_traced(graph.poses, factors, bool(robust), int(max_iterations))
+        uncertainty = covariances_traced(solution.poses, factors, solution.weights)
     ends = np.cumsum([len(factor.information) for factor in factors])[:-1]
-    xp = np if is_concrete(found) else jnp
-    residuals, *factor_residuals = xp.split(found.residuals, ends)
-    weights, *factor_weights = xp.split(found.weights, ends)
+    xp = np if is_concrete(solution) else jnp
+    residuals, *factor_residuals = xp.split(solution.residuals, ends)
+    weights, *factor_weights = xp.split(solution.weights, ends)
     return PoseGraphResult(
-        poses=found.poses,
+        poses=solution.poses,
         edges=graph.edges,
-        status_code=found.status,
-        num_iterations=found.num_iterations,
-        cost=found.cost,
+        status_code=solution.status,
+        num_iterations=solution.num_iterations,
+        cost=solution.cost,
         residuals=residuals,
         weights=weights,
         factor_residuals=tuple(factor_residuals),

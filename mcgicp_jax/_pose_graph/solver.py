@@ -7,18 +7,19 @@ approached from a function whose convex part contains the largest residual (Yang
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple, TypeAlias
+from typing import NamedTuple
 
 import jax
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from mcgicp_jax._compute.concrete import AnyArray
 from mcgicp_jax._math.poses import matrices_of, parameters_of
 from mcgicp_jax._math.robust_kernels import truncated_weights
-from mcgicp_jax._pose_graph.edge import WORLD, Edge, motion_jacobians
+from mcgicp_jax._pose_graph.edge import WORLD, Edge, Factors, motion_jacobians
 from mcgicp_jax._pose_graph.graph import unmeasured
 from mcgicp_jax._pose_graph.levenberg_marquardt import (
-    Minimum,
+    GraphState,
     NormalEquations,
     PerMeasurement,
     Poses,
@@ -34,9 +35,8 @@ from mcgicp_jax._registration.result import Status
 
 # Probability that a true measurement exceeds the threshold on its squared Mahalanobis distance.
 _LEVEL = 0.01
-# Factor by which the non-convexity grows, with one step at each. In ten grids with 30 % of false loops, 1.4
-# (Yang et al. 2020) keeps the same loops; with 4, 0.4 % of the true loops more are lost. The first steps cannot be
-# left out: if the non-convexity begins 32 times as large, errors grow by a factor of 30 in the garage of 1,600 poses.
+# Factor by which the non-convexity grows, with one step at each: 1.4 (Yang et al. 2020) keeps the same loops, with 4
+# some true ones are lost. The first steps cannot be left out: errors then grow by a factor of 30 in large graphs.
 _GROWTH = 2.0
 # Largest number of selections at the minimum, which end when a selection repeats itself.
 _SELECTIONS = 5
@@ -48,160 +48,56 @@ _UNCONSTRAINED = 10.0
 # Inverse iterations for the least constrained direction: unconstrained ones stand out by factors of 1e3 and more.
 _INVERSE_ITERATIONS = 4
 
-# All measurements of a graph by kind, `AbstractFactor`s; the first are the edges.
-Factors: TypeAlias = tuple[Any, ...]
+
+class GraphPoses(NamedTuple):
+    """The solution of a graph in the user's frame. Only poses have derivatives."""
+
+    poses: Float[AnyArray, "n 4 4"]
+    residuals: Float[AnyArray, "m"]
+    weights: Float[AnyArray, "m"]
+    cost: Float[AnyArray, ""]
+    status: Int[AnyArray, ""]
+    num_iterations: Int[AnyArray, ""]
 
 
-def robust_minimum(
-    equations: NormalEquations, start: Poses, uncertain: Bool[np.ndarray, "m"], max_iterations: int
-) -> tuple[NormalEquations, Minimum, PerMeasurement]:
-    """The equations of the measurements that are kept, the minimum, and the weights of all measurements, 0 or 1."""
-    found, limits = Minimum(start, equations.terms(start)), thresholds(equations)
-    largest = (found.terms.squares / limits)[uncertain].max(initial=0)
-    if not largest > 1:
-        weights = np.ones(len(uncertain))
-        return equations, minimize(equations, found, weights, max_iterations), weights
-    control = 1 / (2 * largest - 1)
-    while True:
-        ratio = np.sqrt(limits / np.maximum(found.terms.squares, np.finfo(float).tiny))
-        weights = np.where(uncertain, truncated_weights(ratio, control), 1)
-        if np.all((weights == 0) | (weights == 1)):
-            break
-        equations = equations.restricted(weights > 0)
-        found = minimize(equations, found, weights, 1)
-        control *= _GROWTH
-    selected = weights
-    for _ in range(_SELECTIONS):
-        weights, equations = selected, equations.restricted(selected > 0)
-        found = minimize(equations, found, weights, max_iterations)
-        selected = np.where(uncertain, 1.0 * (found.terms.squares <= limits), 1)
-        selected[_wrongly_rejected(equations, found, weights)] = 1
-        if np.array_equal(selected, weights):
-            break
-    return equations, found, weights
-
-
-def thresholds(equations: NormalEquations) -> PerMeasurement:
-    """Squared Mahalanobis distances beyond which measurements are rejected: 99 % quantiles of χ²."""
-    from scipy.special import chdtri
-
-    sizes = [np.full(len(f.information), f.information.shape[-1]) for f in equations.factors]
-    return chdtri(np.concatenate(sizes), _LEVEL)
-
-
-def _wrongly_rejected(equations: NormalEquations, found: Minimum, weights: PerMeasurement) -> Int[np.ndarray, "k"]:
-    """Rejected measurements whose residual is within the threshold, given the combined uncertainty of the measurement
-    and of the remaining graph.
-    """
-    squares, limits = found.terms.squares, thresholds(equations)
-    near = (weights == 0) & (squares > limits) & (squares <= _NEAR * limits)
-    accepted = []
-    values = (equations.split(each) for each in (equations.rows, near, limits))
-    for factor, all_rows, chosen, all_limits in zip(equations.factors, *values, strict=True):
-        within = np.zeros(len(chosen), bool)
-        if chosen.any():
-            part, rows = (
-                jax.tree.map(lambda values, chosen=chosen: np.asarray(values)[chosen], factor),
-                all_rows[chosen],
-            )
-            residuals, jacobians = part.linearize(found.poses[rows])
-            spread = propagated(equations, found, weights, rows, jacobians)
-            # rᵀ(Λ⁻¹ + Σ)⁻¹r without the inverse of Λ, which may be singular. An infinite Σ leaves 0.
-            finite = np.isfinite(spread).all(axis=(1, 2))
-            spread[~finite] = 0
-            system = np.eye(spread.shape[-1]) + part.information @ spread
-            inner = np.linalg.solve(system, part.information @ residuals[..., None])[..., 0]
-            combined = np.where(finite, np.einsum("ki,ki->k", residuals, inner), 0)
-            within[chosen] = combined <= all_limits[chosen]
-        accepted.append(within)
-    return np.flatnonzero(np.concatenate(accepted))
-
-
-class Solution(NamedTuple):
-    """The solution of a graph.
-
-    Attributes:
-        equations: of the measurements that are kept.
-        found: the minimum, in the world whose origin is `origin`.
-        weights: 1 for the measurements that are kept, 0 for the others.
-        origin: metres.
-        status: CONVERGED, MAX_ITERATIONS, DEGENERATE or NON_FINITE.
-        cost: ½ Σ w rᵀΛr.
-    """
-
-    equations: NormalEquations
-    found: Minimum
-    weights: PerMeasurement
-    origin: Float[np.ndarray, "3"]
-    status: Status
-    cost: float
-
-    @property
-    def residuals(self) -> PerMeasurement:
-        """√(rᵀΛr) of every measurement."""
-        return np.sqrt(np.maximum(self.found.terms.squares, 0))
-
-    def poses(self, number: int) -> Float[np.ndarray, "number 4 4"]:
-        """The poses of the graph, without that of the world."""
-        poses = self.found.poses[:number].copy()
-        poses[:, :3, 3] += self.origin
-        return poses
-
-    def covariances(self, number: int) -> Float[np.ndarray, "number 6 6"]:
-        """The covariances of the poses of the graph."""
-        return pose_covariances(self.equations, self.found, self.weights)[:number]
-
-
-def solve(poses: Poses, factors: Factors, robust: bool, max_iterations: int, exact: bool = False) -> Solution:
-    """Minimise ½ Σ w rᵀΛr from the given poses, to rounding if `exact`; all arrays are NumPy's."""
+def solve(
+    start: Poses, factors: Factors, robust: bool, max_iterations: int, exact: bool = False
+) -> tuple[GraphPoses, GraphState]:
+    """Minimise ½ Σ w rᵀΛr, to rounding if `exact`; NumPy arrays. The state refers to another origin of the world."""
     # Overflow is a status.
     with np.errstate(over="ignore", invalid="ignore"):
-        poses, factors, origin = _centred(poses, factors)
+        centred, factors, origin = _centred(start, factors)
         uncertain = np.concatenate([np.asarray(factor.uncertain) for factor in factors]) & robust
-        anchors = unmeasured(factors[0], poses, typical_information(*factors)[: len(factors[0])])
-        equations, found, weights = _minimum(poses, factors, anchors, uncertain, max_iterations)
-        status = _status(equations, found, weights, anchors)
-        if exact and status == Status.CONVERGED:
-            found = refine(equations, found, weights)
-        return Solution(equations, found, weights, origin, status, found.terms.cost(weights))
-
-
-def _minimum(
-    poses: Poses, factors: Factors, anchors: Edge, uncertain: Bool[np.ndarray, "m"], limit: int
-) -> tuple[NormalEquations, Minimum, PerMeasurement]:
-    """`robust_minimum`; with `anchors`, edges to the start, if the measurements do not constrain all poses alone."""
-    if not anchors.information.any():
-        return robust_minimum(NormalEquations(factors, poses), poses, uncertain, limit)
-    both = NormalEquations((*factors, anchors), poses)
-    both, first, all_weights = robust_minimum(both, poses, np.append(uncertain, anchors.uncertain), limit)
-    weights = all_weights[: len(uncertain)]
-    equations = NormalEquations(factors, poses, weights > 0)
-    found = first._replace(terms=equations.terms(first.poses))
-    if not _is_degenerate(equations, found, weights, anchors):
-        found = minimize(equations, found, weights, limit)
-    elif first.converged:
-        settled = settle(both, first, all_weights, np.arange(len(all_weights)) >= len(uncertain)).poses
-        found = found._replace(poses=settled, terms=equations.terms(settled))
-    return equations, found, weights
+        anchors = unmeasured(factors[0], centred, typical_information(factors)[: len(factors[0])])
+        state = _minimum(centred, factors, anchors, uncertain, max_iterations)
+        if not (np.isfinite(state.poses).all() and np.isfinite(state.terms.squares).all()):
+            status = Status.NON_FINITE
+        elif _is_degenerate(state, anchors):
+            status = Status.DEGENERATE
+        else:
+            status = Status.CONVERGED if state.converged else Status.MAX_ITERATIONS
+        state = refine(state) if exact and status == Status.CONVERGED else state
+        poses = state.poses[: len(start)].copy()
+        poses[:, :3, 3] += origin
+        residuals, counts = np.sqrt(np.maximum(state.terms.squares, 0)), np.array([status, state.num_iterations])
+        return GraphPoses(poses, residuals, state.weights, np.float64(state.cost), *counts.astype(np.int32)), state
 
 
 def covariances_at(poses: Poses, factors: Factors, weights: PerMeasurement) -> Float[np.ndarray, "n 6 6"]:
-    """`Solution.covariances` of a solution that is known."""
+    """The covariances of the poses at a minimum that is known."""
     with np.errstate(over="ignore", invalid="ignore"):
         centred, factors, _ = _centred(poses, factors)
         equations = NormalEquations(factors, centred, weights > 0)
-        found = Minimum(centred, equations.terms(centred))
-        return pose_covariances(equations, found, weights)[: len(poses)]
+        return pose_covariances(GraphState.at(equations, weights, centred))[: len(poses)]
 
 
 def _centred(poses: Poses, factors: Factors) -> tuple[Float[np.ndarray, "_ 4 4"], Factors, Float[np.ndarray, "3"]]:
-    """Exact rigid poses and edges about another origin of the world, and that origin.
+    """Exact rigid poses and edges about the first position or the median of the priors, and that origin.
 
-    It is the first position or, with priors, their median: at UTM coordinates, 1e-9 m are lost to rounding, and costs
-    next to the minimum could not be told apart. Measurements of other kinds may depend on the origin, which then stays.
-    If there are measurements in the world's frame, the pose of the world is appended.
+    At UTM coordinates, rounding would hide differences of the cost next to the minimum. Measurements of other kinds may
+    depend on the origin, which then stays. With measurements in the world's frame, the pose of the world is appended.
     """
-    edges, others = factors[0], factors[1:]
+    edges, *others = factors
     poses, motions = _rigid(poses), _rigid(edges.T_i_j)
     of_world = np.asarray(edges.i) == WORLD
     origin = np.zeros(3)
@@ -223,28 +119,93 @@ def _rigid(matrices: np.ndarray) -> Float[np.ndarray, "_ 4 4"]:
     return matrices
 
 
-def _status(equations: NormalEquations, found: Minimum, weights: PerMeasurement, anchors: Edge) -> Status:
-    if not (np.isfinite(found.poses).all() and np.isfinite(found.terms.squares).all()):
-        return Status.NON_FINITE
-    if _is_degenerate(equations, found, weights, anchors):
-        return Status.DEGENERATE
-    return Status.CONVERGED if found.converged else Status.MAX_ITERATIONS
+def _minimum(poses: Poses, factors: Factors, anchors: Edge, uncertain: Bool[np.ndarray, "m"], limit: int) -> GraphState:
+    """`_robust_minimum`; with `anchors`, edges to the start, if the measurements do not constrain all poses alone."""
+    if not anchors.information.any():
+        return _robust_minimum(NormalEquations(factors, poses), poses, uncertain, limit)
+    both = NormalEquations((*factors, anchors), poses)
+    anchored = _robust_minimum(both, poses, np.append(uncertain, anchors.uncertain), limit)
+    weights = anchored.weights[: len(uncertain)]
+    state = GraphState.at(NormalEquations(factors, poses, weights > 0), weights, anchored.poses)
+    state = state._replace(num_iterations=anchored.num_iterations, damping=anchored.damping)
+    if not _is_degenerate(state, anchors):
+        return minimize(state, limit)
+    if anchored.converged:
+        settled = settle(anchored, np.arange(len(both.rows)) >= len(uncertain))
+        state = state._replace(poses=settled, terms=state.equations.terms(settled), converged=True)
+    return state
 
 
-def _is_degenerate(equations: NormalEquations, found: Minimum, weights: PerMeasurement, anchors: Edge) -> bool:
+def _robust_minimum(
+    equations: NormalEquations, start: Poses, uncertain: Bool[np.ndarray, "m"], max_iterations: int
+) -> GraphState:
+    """The minimum over the measurements that are kept, whose weight is 1; that of the others is 0."""
+    state, limits = GraphState.at(equations, np.ones(len(uncertain)), start), _thresholds(equations)
+    largest = (state.terms.squares / limits)[uncertain].max(initial=0)
+    if not largest > 1:
+        return minimize(state, max_iterations)
+    control = 1 / (2 * largest - 1)
+    while True:
+        ratio = np.sqrt(limits / np.maximum(state.terms.squares, np.finfo(float).tiny))
+        weights = np.where(uncertain, truncated_weights(ratio, control), 1)
+        if np.all((weights == 0) | (weights == 1)):
+            break
+        state = minimize(state.weighted(weights), 1)
+        control *= _GROWTH
+    for _ in range(_SELECTIONS):
+        state = minimize(state.weighted(weights), max_iterations)
+        weights = np.where(uncertain, 1.0 * (state.terms.squares <= limits), 1)
+        weights[_wrongly_rejected(state, limits)] = 1
+        if np.array_equal(weights, state.weights):
+            break
+    return state
+
+
+def _thresholds(equations: NormalEquations) -> PerMeasurement:
+    """Squared Mahalanobis distances beyond which measurements are rejected: 99 % quantiles of χ²."""
+    from scipy.special import chdtri
+
+    sizes = [np.full(len(f.information), f.information.shape[-1]) for f in equations.factors]
+    return chdtri(np.concatenate(sizes), _LEVEL)
+
+
+def _wrongly_rejected(state: GraphState, limits: PerMeasurement) -> Bool[np.ndarray, "m"]:
+    """Which rejected measurements have a residual within the threshold, given the combined uncertainty of the
+    measurement and of the remaining graph."""
+    squares, equations = state.terms.squares, state.equations
+    accepted = (state.weights == 0) & (squares > limits) & (squares <= _NEAR * limits)
+    parts = map(equations.split, (equations.rows, accepted, limits))
+    for factor, rows, chosen, factor_limits in zip(equations.factors, *parts, strict=True):
+        if not chosen.any():
+            continue
+        part = jax.tree.map(lambda values, chosen=chosen: np.asarray(values)[chosen], factor)
+        residuals, jacobians = part.linearize(state.poses[rows[chosen]])
+        spread = propagated(state, rows[chosen], jacobians)
+        # rᵀ(Λ⁻¹ + Σ)⁻¹r without the inverse of Λ, which may be singular. An infinite Σ leaves 0.
+        finite = np.isfinite(spread).all(axis=(1, 2))
+        spread[~finite] = 0
+        system = np.eye(spread.shape[-1]) + part.information @ spread
+        inner = np.linalg.solve(system, part.information @ residuals[..., None])[..., 0]
+        combined = np.where(finite, np.einsum("ki,ki->k", residuals, inner), 0)
+        # A view of `accepted`.
+        chosen[chosen] = combined <= factor_limits[chosen]
+    return accepted
+
+
+def _is_degenerate(state: GraphState, anchors: Edge) -> bool:
     """Whether poses are not connected, or H along some direction is less than that of `anchors`, or than damping.
 
     By inverse iteration with the least damping: that of the last step may be too large to tell.
     """
+    equations = state.equations
     if np.any(equations.parts != equations.parts[equations.root]):
         return True
     if not equations.size:
         return False
-    matrix = equations.weighted(found.terms.blocks, weights)
-    blocks = np.zeros_like(found.terms.blocks)
-    ends = found.poses[equations.rows[: len(anchors)]]
+    matrix, blocks = state.hessian, np.zeros_like(state.terms.blocks)
+    ends = state.poses[equations.rows[: len(anchors)]]
     blocks[: len(anchors)] = normal_blocks(motion_jacobians(ends), np.asarray(anchors.information)) / _UNCONSTRAINED
-    least = equations.damped(equations.weighted(blocks, weights))
+    least = equations.damped(equations.weighted(blocks, state.weights))
     try:
         factors = factored(matrix + least)
     except RuntimeError:

@@ -1,7 +1,7 @@
 """Edges from registrations, and loop closure: registration to earlier frames where the sensor returns to a known place.
 
 The uncertainty of the motion between two frames is that along the most certain path of edges between them, an upper
-bound, for which no equations need to be solved.
+bound that needs no equations.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 
 from mcgicp_jax._clouds.point_cloud import PointCloud
 from mcgicp_jax._math.poses import adjoint, exponential, inverse, logarithm
@@ -27,19 +27,18 @@ from mcgicp_jax._registration.result import RegistrationResult, Status
 LEAST_OVERLAP = 0.4
 # Ratio of the information along unconstrained directions to that along constrained ones. The directions are known to
 # δ = 2 mrad, so that a fraction δ² = 4e-6 of the constrained information leaks into them: poses slide along a corridor
-# with less. With 1e-2, edges of a corridor that is too long in the start contradict the loop at its end.
+# with less. With 1e-2, its edges contradict loops.
 _UNCONSTRAINED_RATIO = 1e-4
 # Two frames may close a loop if their distance is at most this many median ranges of the points, plus this many
-# standard deviations of the distance (99 % of χ² with three degrees of freedom); the overlap decides. In the benchmark,
-# a range factor of 1 leaves 14 mm in the street instead of 9, and no more in the room.
+# standard deviations of the distance (99 % of χ² with three degrees of freedom); the overlap decides.
 _RANGES, _DEVIATIONS = 2.0, 3.37
 # A loop is tried if the motion between two frames is less certain than a registration: its variance is larger by this
 # factor, in the geometric mean over the six directions.
 _GAIN = 4.0
 # Squared Mahalanobis distance beyond which a loop contradicts the path: 99 % of χ² with six degrees of freedom.
 _CONTRADICTION = 16.8
-# All poses are optimised where a loop contradicts the path, or if this many times as many frames as the last time are
-# known, so that all optimisations take as long as some of the last. Other loops move the last pose alone.
+# All poses are optimised where a loop contradicts the path, or if the number of frames has grown by this factor since
+# the last time, so that all optimisations take as long as a few of the last. Other loops move the last pose alone.
 _GROWTH = 1.1
 # Largest number of registrations per frame.
 _TRIES = 2
@@ -62,21 +61,21 @@ def edge_from(i: int, j: int, result: RegistrationResult, *, uncertain: bool = F
     if directions is None or not np.isfinite(covariance).all():
         return None
     constrained = np.asarray(directions.held)
+    if not constrained.any():
+        return None
     inside = np.ix_(constrained, constrained)
     # Coordinates along the six directions: the constrained ones do not depend on the others.
     coordinates = np.linalg.inv(np.asarray(directions.twists, np.float64).T)
     inner = (coordinates @ covariance @ coordinates.T)[inside]
-    if not constrained.any():
-        return None
     # The coordinates are lengths. No registration is more precise than the rounding of the points. The covariance of
     # equal clouds is smaller, or even negative by rounding of its own.
     radius = np.asarray(directions.radius)
     rounding = np.finfo(radius.dtype).eps * float(radius)
     values, vectors = np.linalg.eigh(inner)
-    known = np.zeros((6, 6))
-    known[inside] = (vectors / np.maximum(values, rounding**2)) @ vectors.T
-    known[~constrained, ~constrained] = _UNCONSTRAINED_RATIO * np.median(np.linalg.eigvalsh(known[inside]))
-    information = coordinates.T @ known @ coordinates
+    along = np.zeros((6, 6))
+    along[inside] = (vectors / np.maximum(values, rounding**2)) @ vectors.T
+    along[~constrained, ~constrained] = _UNCONSTRAINED_RATIO * np.median(np.linalg.eigvalsh(along[inside]))
+    information = coordinates.T @ along @ coordinates
     return Edge(i, j, result.matrix, 0.5 * (information + information.T), uncertain=uncertain)
 
 
@@ -88,11 +87,11 @@ class Trajectory:
         self._clouds: list[PointCloud] = []
         self._poses = np.zeros((0, 4, 4))
         self._edges: list[Edge] = []
-        # Of each edge, its frames, its covariance, the same for twists of the world (the rows beyond the last edge are
-        # spare), and the geometric mean of the covariance over the six directions.
+        # Of each edge, its frames, its covariance, the same for twists of the world, and the geometric mean of the
+        # covariance over the six directions.
         self._ends = np.zeros((2, 0), np.int32)
-        self._covariances: list[Float[np.ndarray, "6 6"]] = []
-        self._in_world = np.zeros((1, 6, 6))
+        self._covariances = np.zeros((0, 6, 6))
+        self._in_world = np.zeros((0, 6, 6))
         self._variances = np.zeros(0)
         # This mean of the last edge with information; 0 before there is one.
         self._usual = 0.0
@@ -131,18 +130,16 @@ class Trajectory:
         # A view would keep the poses of all frames until then in memory.
         return self._poses[-1].copy()
 
-    def _close(self, loop: Edge, known: Float[np.ndarray, "6 6"]) -> None:
-        """Add a loop to the last frame, and correct poses.
-
-        Args:
-            known: covariance of the motion between the two frames without the loop, for the twists of the edge.
-        """
+    def _close(self, loop: Edge, before: Float[np.ndarray, "6 6"]) -> None:
+        """Add a loop to the last frame, and correct poses. `before` is the covariance of the motion between the two
+        frames without the loop, for the twists of the edge."""
         self._connect(loop)
         self._stale = True
         pose = self._poses[-1]
         residual = logarithm(inverse(self._poses[int(loop.i)] @ np.asarray(loop.T_i_j)) @ pose)
-        gain = np.linalg.solve(known + self._covariances[-1], known).T
-        contradicts = residual @ np.linalg.solve(known + self._covariances[-1], residual) > _CONTRADICTION
+        total = before + self._covariances[-1]
+        gain = np.linalg.solve(total, before).T
+        contradicts = residual @ np.linalg.solve(total, residual) > _CONTRADICTION
         if contradicts or len(self._poses) >= _GROWTH * self._optimized:
             self._optimize()
         else:
@@ -150,10 +147,10 @@ class Trajectory:
 
     def _optimize(self) -> None:
         if self._stale:
-            found = optimize_poses(PoseGraph(self._poses, self._edges))
-            self._poses, self._kept, self._stale = np.array(found.poses), np.asarray(found.kept), False
+            result = optimize_poses(PoseGraph(self._poses, self._edges))
+            self._poses, self._kept, self._stale = np.array(result.poses), np.asarray(result.kept), False
             self._optimized = len(self._poses)
-            self._in_world[: len(self._edges)] = self._moved(np.array(self._covariances), self._ends[1])
+            self._in_world = self._moved(self._covariances, self._ends[1])
 
     def _connect(self, edge: Edge) -> None:
         i, j = int(edge.i), int(edge.j)
@@ -162,11 +159,10 @@ class Trajectory:
         self._ends = np.append(self._ends, np.array([[i], [j]], np.int32), axis=1)
         self._between[i, j] = self._between[j, i] = len(self._edges)
         self._edges.append(edge)
-        self._covariances.append(np.linalg.inv(np.asarray(edge.information) + np.diag(least)))
-        if len(self._edges) > len(self._in_world):
-            self._in_world = np.concatenate([self._in_world, np.zeros_like(self._in_world)])
-        self._in_world[len(self._edges) - 1] = self._moved(self._covariances[-1], j)
-        mean = float(np.exp(np.linalg.slogdet(self._covariances[-1])[1] / 6))
+        covariance = np.linalg.inv(np.asarray(edge.information) + np.diag(least))
+        self._covariances = np.append(self._covariances, covariance[None], axis=0)
+        self._in_world = np.append(self._in_world, self._moved(covariance, j)[None], axis=0)
+        mean = float(np.exp(np.linalg.slogdet(covariance)[1] / 6))
         self._variances = np.append(self._variances, mean)
         self._usual = mean if np.any(edge.information) else self._usual
 
@@ -190,17 +186,22 @@ class Trajectory:
         variances, before = dijkstra(graph, directed=False, indices=number, return_predecessors=True)
         before = before.tolist()
         distances = np.linalg.norm(self._poses[:, :3, 3] - self._poses[number, :3, 3], axis=1)
+        distances[variances <= _GAIN * self._usual] = np.inf
+        # The nearest frames of all would be the latest ones of a slow sensor.
+        nearest = [rows.start + int(np.argmin(distances[rows.start : rows.stop])) for rows in rows_before(number)]
         tries = 0
-        for i in _candidates(variances > _GAIN * self._usual, distances, variances):
-            known = self._covariance(number, i, before)
-            sigma = float(np.sqrt(np.linalg.eigvalsh(known[:3, :3])[-1]))
-            if distances[i] <= self._range(number) + _DEVIATIONS * sigma:
-                edge = self._registered(i, number, sigma)
+        for i in sorted((i for i in nearest if np.isfinite(distances[i])), key=lambda i: -variances[i]):
+            covariance = self._covariance(number, i, before)
+            sigma = float(np.sqrt(np.linalg.eigvalsh(covariance[:3, :3])[-1]))
+            if tries < _TRIES and distances[i] <= self._range(number) + _DEVIATIONS * sigma:
                 tries += 1
+                # The coarse `max_distance` covers the uncertainty of the motion.
+                options = replace(self._options, reach=_DEVIATIONS * sigma)
+                init = inverse(self._poses[i]) @ self._poses[number]
+                result = register_pair(self._clouds[number], self._clouds[i], self._method, init, options)
+                edge = edge_from(i, number, result, uncertain=True)
                 if edge is not None:
-                    return edge, known
-                if tries == _TRIES:
-                    break
+                    return edge, covariance
         return None
 
     def _covariance(self, number: int, i: int, before: list[int]) -> Float[np.ndarray, "6 6"]:
@@ -212,26 +213,8 @@ class Trajectory:
         change = adjoint(inverse(self._poses[number]))
         return change @ total @ change.T
 
-    def _registered(self, i: int, j: int, sigma: float) -> Edge | None:
-        """The edge of a registration whose coarse `max_distance` covers the uncertainty of the motion."""
-        init = inverse(self._poses[i]) @ self._poses[j]
-        options = replace(self._options, reach=_DEVIATIONS * sigma)
-        result = register_pair(self._clouds[j], self._clouds[i], self._method, init, options)
-        return edge_from(i, j, result, uncertain=True)
 
-
-def _candidates(
-    chosen: Bool[np.ndarray, "n"], distances: Float[np.ndarray, "n"], variances: Float[np.ndarray, "n"]
-) -> list[int]:
-    """Of the chosen frames 2 to 3, 4 to 7, 8 to 15, ... before the last one, the nearest; the least certain ones first.
-
-    The nearest frames of all would be the latest ones of a slow sensor.
-    """
-    last = len(chosen) - 1
-    found = []
-    for gap in (2**octave for octave in range(1, last.bit_length())):
-        rows = np.arange(max(last + 1 - 2 * gap, 0), last + 1 - gap)
-        rows = rows[chosen[rows]]
-        if len(rows):
-            found.append(int(rows[np.argmin(distances[rows])]))
-    return sorted(found, key=lambda row: -variances[row])
+def rows_before(last: int) -> list[range]:
+    """The rows 2 to 3, 4 to 7, 8 to 15, … before the last one."""
+    gaps = [2**octave for octave in range(1, last.bit_length())]
+    return [range(max(last + 1 - 2 * gap, 0), last + 1 - gap) for gap in gaps]

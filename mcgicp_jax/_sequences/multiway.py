@@ -27,7 +27,7 @@ from mcgicp_jax._pose_graph.optimize import PoseGraphResult, optimize_poses
 from mcgicp_jax._registration.options import GivenOptions, Options, check_method, options_of
 from mcgicp_jax._registration.register_pair import register_pair
 from mcgicp_jax._registration.result import RegistrationResult, Status, computed, is_usable
-from mcgicp_jax._sequences.loop_closure import LEAST_OVERLAP, edge_from
+from mcgicp_jax._sequences.loop_closure import LEAST_OVERLAP, edge_from, rows_before
 
 # Size of the cells in which overlap is counted, in spacings of the points: two samples of one surface then occupy
 # nearly the same cells.
@@ -121,14 +121,17 @@ def multiway(
         if cloud.deferred_neighbors is None:
             with messages_named(f"clouds[{k}]"):
                 ready[k] = preprocess(cloud, voxels, num_neighbors)
-    given = None if pairs is None else _checked(pairs, len(ready))
-    poses, found = _given(init, len(ready)) if init is not None else _start(ready, method, settings)
-    if given is not None:
-        found = {pair: result for pair, result in found.items() if pair in given}
+    pairs = None if pairs is None else _checked(pairs, len(ready))
+    if init is None:
+        poses, registrations = _start(ready, method, settings)
+    else:
+        poses, registrations = _checked_poses(init, len(ready)), {}
+    if pairs is not None:
+        registrations = {pair: result for pair, result in registrations.items() if pair in pairs}
     spacing = float(np.median([point_spacing(cloud) for cloud in ready]))
-    for _ in range(_ROUNDS if given is None else 1):
-        wanted = _overlapping(ready, poses, _CELL * spacing) if given is None else given
-        new = [pair for pair in wanted if pair not in found]
+    for _ in range(_ROUNDS if pairs is None else 1):
+        overlapping = _overlapping(ready, poses, _CELL * spacing) if pairs is None else pairs
+        new = [pair for pair in overlapping if pair not in registrations]
         results = register_batch(
             [ready[j] for _, j in new],
             [ready[i] for i, _ in new],
@@ -137,37 +140,32 @@ def multiway(
             executor=executor,
             **options,
         )
-        found |= dict(zip(new, results, strict=True))
-        graph, statuses = _solved(poses, found)
+        registrations |= dict(zip(new, results, strict=True))
+        graph, statuses = _solved(poses, registrations)
         poses = np.asarray(graph.poses)
         if not new:
             break
-    return MultiwayResult(ready, graph, found, statuses, voxels.size or spacing)
+    return MultiwayResult(ready, graph, registrations, statuses, voxels.size or spacing)
 
 
-def _given(
-    init: Sequence[Pose] | Float[np.ndarray, "n 4 4"], num_clouds: int
-) -> tuple[Float[np.ndarray, "n 4 4"], Any]:
+def _checked_poses(init: Any, num_clouds: int) -> Float[np.ndarray, "n 4 4"]:
     if isinstance(init, str) or not isinstance(init, Sized):
         raise ValueError(f"init: expected one pose per cloud, got {init!r}; global_pose finds poses of pairs")
     if len(init) != num_clouds:
         raise ValueError(f"init: expected one pose per cloud, {num_clouds}, got {len(init)}")
-    return pose_matrices(init, "init[{}]"), {}
+    return pose_matrices(init, "init[{}]")
 
 
 def _start(
     clouds: list[PointCloud], method: AbstractMethod, options: Options
 ) -> tuple[Float[np.ndarray, "n 4 4"], dict[tuple[int, int], RegistrationResult]]:
-    """Initial poses, and the registrations that they follow from.
-
-    The clouds are registered from both ends, and the poses of larger fit are used: a wrong first motion, as that to a
-    cloud of another place, may spoil those that follow.
-    """
-    poses, found, fit = _chained(clouds, method, options)
+    """Initial poses, and the registrations that they follow from: from both ends, since a wrong first motion, as that
+    to a cloud of another place, may spoil those that follow; the better fit is used."""
+    poses, registrations, fit = _chained(clouds, method, options)
     back, _, other_fit = _chained(clouds[::-1], method, options)
     if other_fit > fit:
         return np.linalg.inv(back[-1]) @ back[::-1], {}
-    return poses, {rows: computed(result) for rows, result in found.items()}
+    return poses, {rows: computed(result) for rows, result in registrations.items()}
 
 
 def _chained(
@@ -175,32 +173,29 @@ def _chained(
 ) -> tuple[Float[np.ndarray, "n 4 4"], dict[tuple[int, int], RegistrationResult], float]:
     """Poses of clouds that are registered in order, the registrations that they follow from, and the sum of the fits.
 
-    Each cloud is registered to each of the two before it, from the motion of that one, and the better fit is used.
-    Neither pose nor motion of the cloud between them, which may be of another place, enters the second registration.
+    Each cloud is registered to both clouds before it, from their motions, and the better fit is used: the cloud between
+    may be of another place.
     """
     poses, steps, total = [np.eye(4)], [np.zeros(6)], 0.0
-    found: dict[tuple[int, int], RegistrationResult] = {}
+    registrations: dict[tuple[int, int], RegistrationResult] = {}
     for k in range(1, len(clouds)):
         rows = range(max(k - 2, 0), k)
         starts = [exponential((k - i) * steps[i]) for i in rows]
-        results = [
-            register_pair(clouds[k], clouds[i], method, start, options) for i, start in zip(rows, starts, strict=True)
-        ]
+        both = zip(rows, starts, strict=True)
+        results = [register_pair(clouds[k], clouds[i], method, start, options) for i, start in both]
         fits = [_fit(result) for result in results]
         best = int(np.argmax(fits))
         i, result, total = rows[best], results[best], total + fits[best]
-        found[i, k] = result
+        registrations[i, k] = result
         motion = np.asarray(result.matrix, np.float64) if is_usable(result) else starts[best]
         poses.append(poses[i] @ motion)
         steps.append(logarithm(motion) / (k - i))
-    return np.array(poses), found, total
+    return np.array(poses), registrations, total
 
 
 def _fit(result: RegistrationResult) -> float:
-    """Overlap per distance of the matches, 1/m; 0 without a pose.
-
-    MAX_ITERATIONS counts as well: on sparse points, the updates may go to and fro at the right pose.
-    """
+    """Overlap per distance of the matches, 1/m; 0 without a pose. MAX_ITERATIONS has one: on sparse points, updates may
+    go to and fro at the right pose."""
     with np.errstate(divide="ignore"):
         return float(np.asarray(result.overlap) / np.asarray(result.rmse)) if is_usable(result) else 0.0
 
@@ -214,30 +209,26 @@ def _checked(pairs: Sequence[tuple[int, int]], num_clouds: int) -> list[tuple[in
 
 
 def _solved(
-    poses: Float[np.ndarray, "n 4 4"], found: dict[tuple[int, int], RegistrationResult]
+    poses: Float[np.ndarray, "n 4 4"], registrations: dict[tuple[int, int], RegistrationResult]
 ) -> tuple[PoseGraphResult, tuple[Status, ...]]:
     """The poses from all edges, and the status of each cloud. Edges are rejected unless they alone connect clouds."""
     from scipy.sparse import coo_array
     from scipy.sparse.csgraph import minimum_spanning_tree
 
-    all_edges = [edge_from(i, j, result, uncertain=True) for (i, j), result in found.items()]
+    all_edges = [edge_from(i, j, result, uncertain=True) for (i, j), result in registrations.items()]
     graph = PoseGraph(poses, [edge for edge in all_edges if edge is not None])
     result = optimize_poses(graph)
-    edges, kept = graph.edges, np.asarray(result.kept)
-    size = (len(poses), len(poses))
-    tree = minimum_spanning_tree(
-        coo_array((np.where(kept, 1e-3, 1 + np.asarray(result.residuals)), (edges.i, edges.j)), size)
-    ).toarray()
+    edges, kept, n = graph.edges, np.asarray(result.kept), len(poses)
+    costs = np.where(kept, 1e-3, 1 + np.asarray(result.residuals))
+    tree = minimum_spanning_tree(coo_array((costs, (edges.i, edges.j)), (n, n))).toarray()
     needed = ~kept & (tree[edges.i, edges.j] > 0)
     if needed.any():
-        known = Edge(edges.i, edges.j, edges.T_i_j, edges.information, uncertain=~needed)
-        result = optimize_poses(PoseGraph(result.poses, known))
-    agree, total = (
-        np.bincount(np.concatenate([edges.i, edges.j]), np.tile(each, 2), len(poses))
-        for each in (kept, np.ones(len(kept)))
-    )
+        trusted = Edge(edges.i, edges.j, edges.T_i_j, edges.information, uncertain=~needed)
+        result = optimize_poses(PoseGraph(result.poses, trusted))
+    ends = np.concatenate([edges.i, edges.j])
+    agree, total = np.bincount(ends, np.tile(kept, 2), n), np.bincount(ends, minlength=n)
     few = np.where(total == 0, Status.TOO_FEW_CORRESPONDENCES, Status.DEGENERATE)
-    codes = np.where(agree > 0.5 * total, Status.CONVERGED, few) if len(poses) > 1 else [Status.CONVERGED]
+    codes = np.where(agree > 0.5 * total, Status.CONVERGED, few) if n > 1 else [Status.CONVERGED]
     return result, tuple(Status(int(code)) for code in codes)
 
 
@@ -249,7 +240,7 @@ def _overlapping(clouds: list[PointCloud], poses: Float[np.ndarray, "n 4 4"], ce
         np.unique(wrapped_keys(rotated(cloud.coordinates, T[:3, :3]) + T[:3, 3], cell))
         for cloud, T in zip(clouds, poses, strict=True)
     ]
-    sizes = np.array([len(each) for each in keys])
+    sizes = np.array(list(map(len, keys)))
     columns = np.unique(np.concatenate(keys), return_inverse=True)[1]
     occupied = csr_array((np.ones(len(columns)), columns, np.concatenate([[0], np.cumsum(sizes)])))
     common = csr_array(occupied @ occupied.T)
@@ -257,8 +248,7 @@ def _overlapping(clouds: list[PointCloud], poses: Float[np.ndarray, "n 4 4"], ce
     for j in range(1, len(clouds)):
         pairs.append((j - 1, j))
         overlaps = common[[j]].toarray()[0] / np.minimum(sizes, sizes[j])
-        for gap in (2**octave for octave in range(1, j.bit_length())):
-            rows = range(max(j + 1 - 2 * gap, 0), j + 1 - gap)
+        for rows in rows_before(j):
             best = max(rows, key=lambda row: overlaps[row])
             if overlaps[best] >= LEAST_OVERLAP:
                 pairs.append((best, j))

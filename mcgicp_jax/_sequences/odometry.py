@@ -101,10 +101,10 @@ def odometry(
         map_radius: metres; by default the distance of the farthest point of the first frame from its sensor.
         recover: relocalise after a jump: if a registration does not converge, its overlap drops by a fifth, or the
             distances along the normals double, in units of the thickness of the neighbourhoods, find the frame by
-            `global_pose` in a map of all previous frames, which is kept in memory. If relocalisation fails and the
-            registration has too few matches or such distances, tracking is lost: the pose is extrapolated with constant
-            velocity, and the next frames follow it, registered to the previous frame, outside of the map, until one is
-            relocalised. A place whose surfaces coincide with known ones cannot be told from these.
+            `global_pose` in a map of all previous frames, which is kept in memory. If that fails and the registration
+            has too few matches or such distances, tracking is lost: the pose is extrapolated with constant velocity,
+            and the next frames are registered to the previous one, outside of the map, until one is relocalised. A
+            place whose surfaces coincide with known ones cannot be told from these.
         loops: close loops: register a frame to an earlier one whose position is near, within the uncertainty of the
             poses, and correct all poses by `optimize_poses`. Steps keep the pose known at their time; the corrected
             poses are in the `graph` of the last step. All clouds are kept in memory. Not with `against="map"` or
@@ -134,49 +134,43 @@ def odometry(
         raise ValueError(
             'loops: expected against="previous" and no recover: registrations to the previous frame become edges'
         )
-    given = options_of(odometry, options)
+    settings = options_of(odometry, options)
     return _Sensor(
-        frames=ReadAhead(partial(_read, enumerate(frames), method, given, _Preprocessing(voxel_size, num_neighbors))),
+        frames=ReadAhead(_Reader(enumerate(frames), method, settings, voxel_size, num_neighbors)),
         method=method,
-        options=given,
+        options=settings,
         num_neighbors=num_neighbors,
         motion=pose_matrix(init),
         pose=np.asarray(pose_matrix(start, "start")),
         against_map=against == "map",
         radius=map_radius,
         recover=recover,
-        trajectory=Trajectory(method, given) if loops else None,
+        trajectory=Trajectory(method, settings) if loops else None,
     )
 
 
-def _read(
-    frames: Iterator[tuple[int, Frame | PointCloud | Values]],
-    method: AbstractMethod,
-    options: Options,
-    preprocessing: _Preprocessing,
-) -> tuple[str, PointCloud]:
-    """The name and the cloud of the next frame, preprocessed, with the local geometry that a source needs."""
-    number, frame = next(frames)
-    name = f"frames[{number}]"
-    cloud = as_cloud(name, frame.cloud if isinstance(frame, Frame) else frame)
-    if cloud.deferred_neighbors is None:
-        with messages_named(name):
-            cloud = preprocessing.of(cloud)
-    if not (options.equalize_channels or options.takes_raw(method, "source")):
-        geometry_table(cloud, method.uses_channels).known(rows_to_match(cloud, options))
-    return name, cloud
-
-
 @dataclass
-class _Preprocessing:
-    """Arguments of `preprocess` for the frames of a sequence; the first one decides about an automatic voxel size."""
+class _Reader:
+    """Names and clouds of the frames, preprocessed, with the local geometry that a source needs. The first raw frame
+    decides about an automatic voxel size."""
 
+    frames: Iterator[tuple[int, Frame | PointCloud | Values]]
+    method: AbstractMethod
+    options: Options
     voxel_size: VoxelSize | Voxels
     num_neighbors: int
 
-    def of(self, cloud: PointCloud) -> PointCloud:
-        self.voxel_size = voxels_for(self.voxel_size, cloud)
-        return preprocess(cloud, self.voxel_size, self.num_neighbors)
+    def __call__(self) -> tuple[str, PointCloud]:
+        number, frame = next(self.frames)
+        name = f"frames[{number}]"
+        cloud = as_cloud(name, frame.cloud if isinstance(frame, Frame) else frame)
+        if cloud.deferred_neighbors is None:
+            with messages_named(name):
+                self.voxel_size = voxels_for(self.voxel_size, cloud)
+                cloud = preprocess(cloud, self.voxel_size, self.num_neighbors)
+        if not (self.options.equalize_channels or self.options.takes_raw(self.method, "source")):
+            geometry_table(cloud, self.method.uses_channels).known(rows_to_match(cloud, self.options))
+        return name, cloud
 
 
 @dataclass
@@ -184,12 +178,10 @@ class _Sensor(Iterator[OdometryStep]):
     """The sensor at its last frame, and the maps of the previous frames. A class, as generators end when they raise.
 
     Attributes:
-        frames: names and clouds of the frames.
-        num_neighbors: from which covariances are computed.
         motion: (4, 4), between the last two frames.
         pose: (4, 4), sensor to world.
         radius: metres around the sensor beyond which points leave the map.
-        trajectory: poses and edges; None without loop closure.
+        trajectory: None without loop closure.
         cloud: the last frame; None before the first.
         world: the map that frames are registered to; None registers them to the previous frame.
         places: the map in which lost frames are found; None without relocalisation.
@@ -221,7 +213,8 @@ class _Sensor(Iterator[OdometryStep]):
         if self.cloud is None:
             voxel = cloud.voxel_size or float(point_spacing(cloud))
             self.world = VoxelMap(voxel) if self.against_map else None
-            self.places = Relocalizer(voxel) if self.recover else None
+            if self.recover:
+                self.places = Relocalizer(voxel, self.method, self.options, self.num_neighbors)
             if self.radius is None:
                 self.radius = float(np.linalg.norm(cloud.coordinates, axis=1).max())
         result = None if self.cloud is None else self._located(cloud, self.cloud)
@@ -230,9 +223,9 @@ class _Sensor(Iterator[OdometryStep]):
                 f"{name}: {result.status.name}; the motion of the previous frame is used instead. "
                 "mcgicp_jax.odometry(..., recover=True) finds lost frames again"
             )
-        for known in (self.places, self.world):
-            if known is not None and not self.is_lost:
-                known.add(name, cloud, self.pose)
+        for points in (self.places, self.world):
+            if points is not None and not self.is_lost:
+                points.add(name, cloud, self.pose)
         if self.world is not None:
             self.world.forget(self.pose[:3, 3], self.radius)
             if not len(self.world):
@@ -245,34 +238,27 @@ class _Sensor(Iterator[OdometryStep]):
         if result is None:
             return OdometryStep(self.pose, cloud, None, self.is_lost, graph)
         registration = Lazy(partial(computed, result))
-        self._compute_kept(registration)
-        return OdometryStep(self.pose, cloud, registration, self.is_lost or not is_usable(result), graph)
-
-    def _compute_kept(self, registration: Lazy[RegistrationResult]) -> None:
-        """Compute the registration of the step before the last if somebody keeps it, since it refers to two frames.
-
-        The caller of a loop still holds the last step. What nobody reads is not computed.
-        """
+        # The registration of the step before the last is computed if somebody keeps it, since it refers to two frames.
+        # The caller of a loop still holds the last step. What nobody reads is not computed.
         kept = self.unread[0]() if len(self.unread) == 2 else None
         if kept is not None:
             _ = kept.value
         self.unread.append(weakref.ref(registration))
+        return OdometryStep(self.pose, cloud, registration, self.is_lost or not is_usable(result), graph)
 
     def _located(self, cloud: PointCloud, before: PointCloud) -> RegistrationResult:
         """Update motion and pose by a registration."""
         follows = self.world is None or self.is_lost
-        if follows:
-            target = before
-            result = register_pair(cloud, target, self.method, self.motion, self.options)
-        else:
+        target, start = before, self.motion
+        if not follows:
             target = map_target(self.world.cloud(), self.method, self.options, self.num_neighbors)
-            result = register_pair(cloud, target, self.method, self.pose @ self.motion, self.options)
-        known, found = not self.is_lost, None
-        if self.places is not None:
-            found = self.places.corrected(cloud, target, result, self.method, self.options, self.num_neighbors)
+            start = self.pose @ self.motion
+        result = register_pair(cloud, target, self.method, start, self.options)
+        was_lost = self.is_lost
+        corrected = None if self.places is None else self.places.corrected(cloud, target, result)
         # The result with which tracking is lost is not used, those of the frames that follow are.
-        if found is None and not (known and self.is_lost) and is_usable(result):
+        if corrected is None and (was_lost or not self.is_lost) and is_usable(result):
             self.motion = np.asarray(result.matrix) if follows else np.linalg.solve(self.pose, result.matrix)
         # The product of thousands of rounded rotations would drift away from a rotation.
-        self.pose = nearest_rotation(self.pose @ self.motion if found is None else np.asarray(found.matrix))
-        return result if found is None else found
+        self.pose = nearest_rotation(self.pose @ self.motion if corrected is None else np.asarray(corrected.matrix))
+        return result if corrected is None else corrected
