@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import abc
-from typing import ClassVar
+from typing import ClassVar, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -18,8 +18,6 @@ from mcgicp_jax._local_geometry.neighborhoods import NO_NEIGHBORS, Neighborhoods
 from mcgicp_jax._math import symmetric_matrices as alg
 from mcgicp_jax._math.robust_kernels import AbstractKernel, Numbers, number_of, positive_scalar
 from mcgicp_jax._terms.base import AbstractTerm, Mahalanobis
-
-# Computes the local geometry of source and target.
 
 
 def per_channel(name: str, numbers: Float[AnyArray, "..."], num_channels: int) -> Float[AnyArray, "C"]:
@@ -149,7 +147,10 @@ class AbstractMethod(Numbers):
         raise NotImplementedError(f"{type(self).__name__} defines weights, but not missing_variances")
 
 
-def with_unset_from(method: AbstractMethod, resolved: AbstractMethod) -> AbstractMethod:
+Method = TypeVar("Method", bound=AbstractMethod)
+
+
+def with_unset_from(method: Method, resolved: Method) -> Method:
     """The method, with the parameters that are None taken from the result of `resolve`."""
     return jax.tree.map(
         lambda own, other: other if own is None else own, method, resolved, is_leaf=lambda leaf: leaf is None

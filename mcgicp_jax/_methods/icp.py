@@ -43,10 +43,9 @@ class GICP(AbstractGeneralized):
         self.epsilon = epsilon_of(epsilon)
 
     def covariance(self, around: Neighborhoods, local: LocalGeometry | None) -> Float[Array, "6 n"]:
-        given = around.given_covariance
-        return (
-            plane_covariance(known_geometry(local), self.epsilon.astype(around.own.dtype)) if given is None else given
-        )
+        if around.given_covariance is not None:
+            return around.given_covariance
+        return plane_covariance(known_geometry(local), self.epsilon.astype(around.own.dtype))
 
 
 class PointToPoint(AbstractOneSided):

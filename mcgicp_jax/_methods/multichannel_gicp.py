@@ -33,6 +33,7 @@ from mcgicp_jax._methods.base import (
     per_channel,
     positive_scalar,
     weights_of,
+    with_unset_from,
 )
 from mcgicp_jax._search.kd_tree import nearest_in_position
 from mcgicp_jax._terms.base import AbstractTerm, Mahalanobis
@@ -136,16 +137,13 @@ class MultiChannelGICP(AbstractGeneralized):
         covariance, weights, floor = (put_on_cpu(xp.asarray(number, epsilon.dtype)) for number in numbers)
         if self.channel_covariance is not None or self.min_eigenvalue is not None:
             floor = self.min_eigenvalue
-        if self.channel_covariance is not None:
-            covariance = self.channel_covariance
-        if self.channel_weights is not None:
-            weights = self.channel_weights
-        return eqx.tree_at(
+        chosen = eqx.tree_at(
             lambda method: (method.channel_covariance, method.channel_weights, method.min_eigenvalue),
             self,
             (covariance, weights, floor),
             is_leaf=lambda leaf: leaf is None,
         )
+        return with_unset_from(self, chosen)
 
     def terms(
         self, source: PointCloud, target: PointCloud, robust: AbstractKernel | None, equalize_channels: bool

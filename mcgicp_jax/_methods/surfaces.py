@@ -38,7 +38,6 @@ from mcgicp_jax._terms.base import AbstractTerm
 # Terms that define `columns`, by class: columns do not depend on the numbers of a term.
 Kinds = tuple[type[AbstractTerm], ...]
 
-
 # The parts of a surface that row functions get as inputs of their own.
 SURFACE, NOISE, SEARCH = range(3)
 
@@ -140,8 +139,6 @@ def surface_pair(
 
     Args:
         observed: whether to compute observability, which `register` needs and the cost of given matches does not.
-        robust, equalize_channels: as in `AbstractMethod.terms`.
-        num_threads: largest number of threads on the host; None for no limit.
         source_rows: the rows of the surface of the source, with neighbours among all points; None for all rows.
     """
     of_rows_of = partial(local_geometries, source, target, method.uses_channels)
@@ -237,15 +234,10 @@ def search_rows(
 def surface_table(
     cloud: PointCloud, method: AbstractMethod, kinds: Kinds, with_geometry: bool, observed: bool
 ) -> ComputedTable:
-    """The surface of a concrete cloud, whose rows are cached with the cloud: `Surface`, and its `noise` if `observed`.
-
-    Args:
-        with_geometry: whether the cloud has neighbours, whose local geometry is used.
-        observed: as in `surface_pair`.
-    """
-    return _table(
-        cloud, method, kinds, geometry_table(cloud, method.uses_channels) if with_geometry else None, observed
-    )
+    """The surface of a concrete cloud, whose rows are cached with the cloud: `Surface`, and its `noise` if `observed`;
+    from its local geometry if the cloud has neighbours (`with_geometry`)."""
+    geometry = geometry_table(cloud, method.uses_channels) if with_geometry else None
+    return _table(cloud, method, kinds, geometry, observed)
 
 
 def differentiable_inputs(
@@ -266,8 +258,6 @@ def differentiable_inputs(
         source, target, method, terms: differentiation may trace them.
         fixed: the clouds and the method, its parameters chosen, without these traces, see `primal`.
         indices: rows of the target, −1 where there is no match.
-        source_rows: (n,) rows of the source; None for all.
-        observed: as in `surface_pair`, from which values are taken.
         soft: whether to include the descriptors.
     """
     *clouds, chosen = fixed
@@ -335,12 +325,7 @@ def _surface_rows(kinds: Kinds, observed: bool, with_geometry: bool) -> Callable
 def surface_of(
     method: AbstractMethod, kinds: Kinds, around: Neighborhoods, local: LocalGeometry | None, observed: bool
 ) -> Surface:
-    """The surface at n points, without `search`.
-
-    Args:
-        around, local: as in `AbstractMethod.covariance`.
-        observed: as in `surface_pair`.
-    """
+    """The surface at n points, without `search`; see `AbstractMethod.covariance` and `surface_pair`."""
     given = around.given_covariance
     if local is not None and method.needs_covariances and given is not None:
         local = geometry_of_cells(local, given, method.num_candidates)

@@ -14,7 +14,7 @@ Three steps: medians over sampled rows (`discounts_and_reach`), scores of all ro
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import NamedTuple, cast
 
 import jax
 import jax.numpy as jnp
@@ -83,10 +83,7 @@ def noise_sample(motion: Motion, matched: Matched) -> NoiseSample:
 
 
 def _noises(matched: Matched) -> tuple[SurfaceNoise, SurfaceNoise]:
-    source, target = matched.source.noise, matched.target.noise
-    if source is None or target is None:
-        raise ValueError("matched: expected surfaces with noise")
-    return source, target
+    return cast(SurfaceNoise, matched.source.noise), cast(SurfaceNoise, matched.target.noise)
 
 
 def discounts_and_reach(
@@ -157,17 +154,16 @@ def scores_of(
     terms: tuple[AbstractTerm, ...],
     responding: tuple[AbstractTerm, ...] | None,
 ) -> Scores:
-    """The scores of correspondences at a pose.
+    """The scores of correspondences at a pose; O = I for surfaces without `noise`.
 
     Args:
-        matched: where the surfaces have no `noise`, O = I.
         responding: the terms with their response (`AbstractAdaptiveTerm.with_response`). Their stiffness replaces K O,
             and their forces replace w M O d. None for terms that do not adapt, and where matches are fixed.
     """
-    posed, found, counts = linearize_at(motion, matched, terms)
+    posed, total, counts = linearize_at(motion, matched, terms)
     moved = posed.moved
     arms = jnp.where(matched.valid, (moved - frame.center[:, None]) / frame.radius, 0)
-    bias, cells, stiffness = jnp.zeros(6, moved.dtype), None, found.stiffness
+    bias, cells, stiffness = jnp.zeros(6, moved.dtype), None, total.stiffness
     if matched.source.noise is not None:
         edge = max(term.correlation_length for term in (responding or terms))
         source, target = _noises(matched)
@@ -176,18 +172,18 @@ def scores_of(
         cells = _cells(arms * (frame.radius / (edge * frame.reach)), matched.valid, relative, frame.num_cells)
     if responding is not None:
         seen = linearize_at(motion, matched, responding)[1]
-        stiffness, bias = seen.stiffness, jnp.sum(_wrench(arms, found.force - seen.force), axis=1)
+        stiffness, bias = seen.stiffness, jnp.sum(_wrench(arms, total.force - seen.force), axis=1)
     else:
         if any(term.robust is not None for term in terms):
             stiffness = _tangent_stiffness(posed, counts, terms)
         if matched.source.noise is not None:
             shown = _discounted_observability(posed, frame.discount, terms)
-            left_out = found.force - alg.multiply(found.stiffness, alg.multiply(shown, found.residual))
+            left_out = total.force - alg.multiply(total.stiffness, alg.multiply(shown, total.residual))
             bias = jnp.sum(_wrench(arms, left_out), axis=1)
             if all(term.matches_slide for term in terms):
                 stiffness = alg.symmetric_product(stiffness, shown)
     jacobian = moments_about(stiffness, with_one(arms * frame.radius))
-    return Scores(_wrench(arms, found.force).T, matched.valid.astype(moved.dtype), cells, jacobian, bias)
+    return Scores(_wrench(arms, total.force).T, matched.valid.astype(moved.dtype), cells, jacobian, bias)
 
 
 def _discounted_observability(

@@ -16,6 +16,7 @@ import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float
 
+from mcgicp_jax._compute.concrete import AnyArray
 from mcgicp_jax._math.poses import adjoint_to_source, units
 from mcgicp_jax._pose_solver.sums import Sums
 from mcgicp_jax._pose_solver.update import twist_form
@@ -56,30 +57,30 @@ class Directions(eqx.Module):
         radius: root mean square distance of these points from it, metres.
     """
 
-    twists: Float[Array, "*batch 6 6"] | Float[np.ndarray, "*batch 6 6"]
-    geometry: Float[Array, "*batch 6"] | Float[np.ndarray, "*batch 6"]
-    channels: Float[Array, "*batch 6"] | Float[np.ndarray, "*batch 6"]
-    center: Float[Array, "*batch 3"] | Float[np.ndarray, "*batch 3"]
+    twists: Float[AnyArray, "*batch 6 6"]
+    geometry: Float[AnyArray, "*batch 6"]
+    channels: Float[AnyArray, "*batch 6"]
+    center: Float[AnyArray, "*batch 3"]
     radius: Float[ArrayLike, "*batch"]
-    ties: Float[Array, "*batch 6"] | Float[np.ndarray, "*batch 6"] | None = None
+    ties: Float[AnyArray, "*batch 6"] | None = None
 
     @property
-    def free(self) -> Bool[Array, "*batch 6"] | Bool[np.ndarray, "*batch 6"]:
+    def free(self) -> Bool[AnyArray, "*batch 6"]:
         """Which directions geometry does not constrain."""
         return ~(self.geometry >= GEOMETRY_HOLDS)
 
     @property
-    def fixed(self) -> Bool[Array, "*batch 6"] | Bool[np.ndarray, "*batch 6"]:
+    def fixed(self) -> Bool[AnyArray, "*batch 6"]:
         """Which directions the prior fixes."""
         return (0 * self.geometry if self.ties is None else self.ties) == np.inf
 
     @property
-    def held_by_matches(self) -> Bool[Array, "*batch 6"] | Bool[np.ndarray, "*batch 6"]:
+    def held_by_matches(self) -> Bool[AnyArray, "*batch 6"]:
         """Which directions are constrained by geometry or by the channels; not those that are fixed."""
         return (~self.free | (self.channels >= CHANNELS_HOLD)) & ~self.fixed
 
     @property
-    def held(self) -> Bool[Array, "*batch 6"] | Bool[np.ndarray, "*batch 6"]:
+    def held(self) -> Bool[AnyArray, "*batch 6"]:
         """Which directions are constrained, by geometry, by the channels, or by tie points and prior."""
         return self.held_by_matches if self.ties is None else self.held_by_matches | (self.ties >= _TIES_HOLD)
 
@@ -122,14 +123,14 @@ def find_directions(sums: Sums, constraints: Float[Array, "6 6"] | None = None) 
     # Diagonalise the channels within the free directions.
     among = jnp.outer(free, free)
     within = twist_form(sums.channel_observability / total, radius)
-    held, turn = jnp.linalg.eigh(jnp.where(among, basis.T @ within @ basis, jnp.diag(2.0 * ~free + fixed)))
+    seen, turn = jnp.linalg.eigh(jnp.where(among, basis.T @ within @ basis, jnp.diag(2.0 * ~free + fixed)))
     basis = basis @ turn
     # Where the channels disagree, the directions stay those along which the pose was updated.
     forms = geometry, *(twist_form(each / total, radius) for each in (sums.agreement, sums.surplus))
     shares, agreed, surplus = (jnp.sum(basis * (form @ basis), axis=0) for form in forms)
     agreed = jnp.where(surplus < _PATTERN * agreed, 0, agreed)
-    channels = jnp.where((held > 0) & (agreed < _AGREE * held), agreed - _AGREE * held, held)
-    channels = jnp.where(held > 1.5, 0, channels)
+    channels = jnp.where((seen > 0) & (agreed < _AGREE * seen), agreed - _AGREE * seen, seen)
+    channels = jnp.where(seen > 1.5, 0, channels)
     return Directions(twists=basis.T, geometry=shares, channels=channels, center=center, radius=radius, ties=ties)
 
 
@@ -175,37 +176,23 @@ class UnconstrainedDirection:
 
 def unconstrained_directions(directions: Directions) -> tuple[UnconstrainedDirection, ...]:
     """Directions that geometry does not constrain: unconstrained ones first, translations before rotations."""
-    free, held, by_matches = (
-        np.asarray(each) for each in (directions.free, directions.held, directions.held_by_matches)
-    )
-    motions = _motions(directions)
-    found: list[UnconstrainedDirection] = []
+    free, held, by_matches = map(np.asarray, (directions.free, directions.held, directions.held_by_matches))
+    twists, center = (np.asarray(array, np.float64) for array in (directions.twists, directions.center))
+    radius = np.asarray(directions.radius)
+    # Motion of the centroid, and by rotation about it, both in metres of rms motion.
+    motions = np.concatenate([twists[:, :3] + np.cross(twists[:, 3:], center), radius * twists[:, 3:]], axis=1)
+
+    def named(motion: Float[np.ndarray, "6"], by_channels: bool, by_ties: bool) -> UnconstrainedDirection:
+        turning = bool(np.linalg.norm(motion[3:]) > _PURE * np.linalg.norm(motion))
+        axis, omega = motion[3:] if turning else motion[:3], motion[3:] / radius
+        twist = np.concatenate([motion[:3] - np.cross(omega, center), omega])
+        return UnconstrainedDirection(twist, by_channels, axis / np.linalg.norm(axis), turning, by_ties)
+
+    unconstrained: list[UnconstrainedDirection] = []
     for by_channels, by_ties in ((False, False), (False, True), (True, False)):
         group = motions[free & (by_matches == by_channels) & ((held & ~by_matches) == by_ties)]
-        found += [_named(motion, directions, by_channels, by_ties) for motion in _separate(group) @ group]
-    return tuple(found)
-
-
-def _motions(directions: Directions) -> Float[np.ndarray, "6 6"]:
-    """(6, 6) motion of each direction: of the centroid, and by rotation about it, both in metres of rms motion."""
-    twists = np.asarray(directions.twists, np.float64)
-    center, radius = np.asarray(directions.center, np.float64), np.asarray(directions.radius)
-    return np.concatenate([twists[:, :3] + np.cross(twists[:, 3:], center), radius * twists[:, 3:]], axis=1)
-
-
-def _named(
-    motion: Float[np.ndarray, "6"], directions: Directions, by_channels: bool = False, by_ties: bool = False
-) -> UnconstrainedDirection:
-    center, radius = np.asarray(directions.center, np.float64), np.asarray(directions.radius)
-    turning = np.linalg.norm(motion[3:]) > _PURE * np.linalg.norm(motion)
-    axis, omega = motion[3:] if turning else motion[:3], motion[3:] / radius
-    return UnconstrainedDirection(
-        twist=np.concatenate([motion[:3] - np.cross(omega, center), omega]),
-        held_by_channels=by_channels,
-        axis=axis / np.linalg.norm(axis),
-        is_rotation=bool(turning),
-        held_by_ties=by_ties,
-    )
+        unconstrained += [named(motion, by_channels, by_ties) for motion in _separate(group) @ group]
+    return tuple(unconstrained)
 
 
 def _separate(motions: Float[np.ndarray, "m 6"]) -> Float[np.ndarray, "m m"]:
@@ -225,17 +212,12 @@ def _separate(motions: Float[np.ndarray, "m 6"]) -> Float[np.ndarray, "m m"]:
     return mixing
 
 
-def describe(found: Sequence[UnconstrainedDirection]) -> str:
+def describe(directions: Sequence[UnconstrainedDirection]) -> str:
     """The names of free directions and which of them the channels constrain; "" if there are none."""
-    if not found:
+    if not directions:
         return ""
-    held = [direction for direction in found if direction.held_by_channels]
-    everything = ", ".join(direction.name for direction in found)
-    if not held:
-        verdict = "constrained by channels: none"
-    elif len(held) == len(found):
-        verdict = "constrained by channels: all"
-    else:
-        verdict = "constrained by channels: " + ", ".join(direction.name for direction in held)
-    tied = ", ".join(direction.name for direction in found if direction.held_by_ties)
-    return f"{everything}; {verdict}{'; by tie points or prior: ' if tied else ''}{tied}"
+    names = ", ".join(direction.name for direction in directions)
+    by_channels = ", ".join(direction.name for direction in directions if direction.held_by_channels)
+    by_ties = ", ".join(direction.name for direction in directions if direction.held_by_ties)
+    verdict = "all" if by_channels == names else by_channels or "none"
+    return f"{names}; constrained by channels: {verdict}{'; by tie points or prior: ' if by_ties else ''}{by_ties}"

@@ -23,12 +23,8 @@ _FIRST_WEIGHT, _FIRST_STIFFNESS = 0.01, 1e3
 
 
 def held_by_pose_form(directions: Directions, information: Float[Array, "6 6"]) -> Directions:
-    """Add to `directions` how well tie points and prior constrain the directions that the matches do not.
-
-    Args:
-        directions: as in the loop; those that the matches do not constrain are rotated to diagonalise the information.
-        information: of tie points and prior, for twists about the centroid with lengths in units of the radius.
-    """
+    """Add how well tie points and prior constrain the directions that the matches do not, which are rotated to
+    diagonalise the information (for twists about the centroid with lengths in units of the radius)."""
     basis, fixed = jnp.asarray(directions.twists).T, jnp.asarray(directions.fixed)
     free = ~(jnp.asarray(directions.held_by_matches) | fixed)
     stiffness = jnp.where(jnp.outer(free, free), basis.T @ information @ basis, 0)
@@ -51,14 +47,8 @@ def held_by_pose_form(directions: Directions, information: Float[Array, "6 6"]) 
 def fuse(
     pose: jaxlie.SE3, center: Float[Array, "3"], directions: Directions, moments: Moments, form: PoseForm
 ) -> Fusion:
-    """The equation of the pose, from the final pose of a first registration, see `register`.
-
-    Args:
-        center: `Sums.center`, metres.
-        directions: as in the loop; `radius` is `Sums.radius`.
-        moments: of the scores at that pose.
-        form: of tie points and prior, relative to that pose, about the centre.
-    """
+    """The equation of the pose, from the final pose of a first registration, see `register`: its `Sums.center`, its
+    directions as in the loop, and the moments of its scores. `form` refers to that pose and centre."""
     radius = jnp.asarray(directions.radius)
     rotation, translation = pose.rotation().as_matrix().astype(radius.dtype), pose.translation()
     nothing, identity = jnp.zeros((6, 6), radius.dtype), jnp.eye(6, dtype=radius.dtype)

@@ -63,13 +63,8 @@ def root_near(
     held: Bool[AnyArray, "6"],
     fusion: Fusion | None,
 ) -> ImplicitRoot:
-    """The scaling of g, from the sums at the returned pose or from `Fusion`.
-
-    Args:
-        usable: False if the loop ended before its updates were below the tolerances.
-        basis: (6, 6), columns: twists about the centre, lengths in units of the radius.
-        held: which of them are constrained.
-    """
+    """The scaling of g, from the sums at the returned pose or from `Fusion`. Columns of `basis` are twists about the
+    centre, lengths in units of the radius; `held` says which of them are constrained."""
     identity, degenerate = jnp.eye(6, dtype=sums.center.dtype), usable & ~jnp.all(held)
     columns = jnp.where(degenerate, basis * held, identity)
     if fusion is not None:

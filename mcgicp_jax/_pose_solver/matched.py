@@ -143,13 +143,15 @@ def inputs_of(
 
 
 @cache
-def of_matches(function: Callable[..., Any], with_noise: bool) -> Callable[..., Any]:
-    """A function of a motion, `Matched` and further arguments as a row function of `inputs_of`."""
+def of_matches(function: Callable[..., Any], with_noise: bool, total: bool = True) -> Callable[..., Any]:
+    """A function of a motion, `Matched` and further arguments as a row function of `inputs_of`. If it returns rows
+    (not `total`), these are the only tree of the result."""
 
     def of_rows(numbers: tuple[Motion, Any, Any, tuple[Any, ...]], *rows: Rows) -> Any:
         motion, max_distance, temperature, arguments = numbers
         matched = matched_rows(rows, temperature, with_noise)
-        return function(motion, matched.within(motion.move(matched.source.points), max_distance), *arguments)
+        result = function(motion, matched.within(motion.move(matched.source.points), max_distance), *arguments)
+        return result if total else (result,)
 
     of_rows.__name__ = function.__name__
     return of_rows
@@ -158,12 +160,7 @@ def of_matches(function: Callable[..., Any], with_noise: bool) -> Callable[..., 
 def matched_rows(
     rows: Sequence[Rows], temperature: Float[AnyScalar, ""] | None = None, with_noise: bool = False
 ) -> Matched:
-    """Matches from gathered rows of the source and of the target, whose index is −1 for correspondences to ignore.
-
-    Args:
-        rows: of both surfaces; of the noise of both if `with_noise`; of the inputs of the search of both if the matches
-            are to have these, or `temperature` is given.
-    """
+    """Matches from rows gathered from `inputs_of`; the index in the target is −1 for correspondences to ignore."""
     target = rows[1]
     count = len(target.index) if target.index.ndim == 2 else 1
 
@@ -179,7 +176,7 @@ def matched_rows(
         surfaces = surfaces[0]._replace(noise=sources[1]), surfaces[1]._replace(noise=targets[1])
     descriptor_distances = None
     if temperature is not None:
-        descriptor_distances = squared_descriptor_distances(sources[-1], targets[-1])
+        descriptor_distances = _squared_descriptor_distances(sources[-1], targets[-1])
     elif len(sources) > 1 + with_noise:
         surfaces = surfaces[0]._replace(search=sources[-1]), surfaces[1]._replace(search=targets[-1])
     return Matched(*surfaces, target.index.reshape(-1) >= 0, descriptor_distances, temperature, count)
@@ -188,21 +185,19 @@ def matched_rows(
 def distances_within(
     moved: Float[Array, "3 n"], target: Float[Array, "n 3"], max_distance: Float[Array, ""]
 ) -> tuple[Float[Array, "n"], Bool[Array, "n"]]:
-    """Distance of each match, and whether it is at most `max_distance`, both in metres of position: channels affect
-    which match is found, but not whether it is accepted."""
+    """Distance of each match in position, and whether it is at most `max_distance`, metres. Channels do not count."""
     residual = target.T - moved
     distances = jnp.sqrt(alg.inner(residual, residual))
     return distances, distances <= max_distance
 
 
-def squared_descriptor_distances(source: SearchPoints, target: SearchPoints) -> Float[AnyArray, "*m n"]:
+def _squared_descriptor_distances(source: SearchPoints, target: SearchPoints) -> Float[Array, "n"]:
     """Squared distance of the descriptors of matched rows, with the penalties for missing channels, metres²."""
-    xp = numpy_for(source, target)
     square = (source.descriptors - target.descriptors) ** 2
     for penalty in (source.penalty, target.penalty):
         if penalty is not None:
-            square = xp.where(penalty > 0, penalty, square)
-    return xp.sum(square, axis=-1)
+            square = jnp.where(penalty > 0, penalty, square)
+    return jnp.sum(square, axis=-1)
 
 
 def linearize_at(
@@ -233,12 +228,8 @@ def adapted(
     valid: Bool[AnyArray, "N"],
     sample: Callable[[AbstractAdaptiveTerm, Int[AnyArray, "n"]], Any],
 ) -> tuple[AbstractTerm, ...]:
-    """The terms with their numbers estimated; constants to autodiff.
-
-    Args:
-        valid: which source points are no padding.
-        sample: computes `sample_of_term` for the matches of some source points.
-    """
+    """The terms with their numbers estimated; constants to autodiff. `valid` is False for padding of the source, and
+    `sample` computes `sample_of_term` for the matches of some source points."""
     rows, counts = sampled_rows(valid)
     xp = numpy_for(counts, valid)
     fraction = xp.sum(counts) / xp.maximum(xp.sum(valid), 1)

@@ -43,24 +43,19 @@ class Assessment(NamedTuple):
     covariance: Lazy[Float[AnyArray, "*batch 6 6"]]
 
 
-def assessment_of(executor: AbstractExecutor, loop: LoopResult, moments: Lazy[Moments] | None) -> Assessment:
-    """The assessment of a loop that has ended.
-
-    Args:
-        moments: `moments_of` the loop; None if the problem has a `Fusion`, which takes their place.
-    """
-    state = loop.state
-
-    def known() -> Any:
-        return executor.problem.fusion if moments is None else moments.value
+def assessment_of(executor: AbstractExecutor, loop: LoopResult, moments: Callable[[], Moments]) -> Assessment:
+    """The assessment of a loop that has ended; `moments` computes `moments_of` the loop."""
+    state, fusion = loop.state, executor.problem.fusion
 
     def covariance() -> Float[np.ndarray, "6 6"]:
         # In float64: unconstrained directions have large variances, next to which others would be lost to rounding.
         with jax.enable_x64(True):
-            return np.asarray(covariance_of_pose(*as_float64((state._replace(record=None), known()))))
+            weights = moments() if fusion is None else fusion
+            return np.asarray(covariance_of_pose(*as_float64((state._replace(record=None), weights))))
 
     if not is_concrete(state):
-        return Assessment(Lazy.of(constraints_of(state)), Lazy.of(covariance_of_pose(state, known())))
+        covariances = covariance_of_pose(state, moments() if fusion is None else fusion)
+        return Assessment(Lazy.of(constraints_of(state)), Lazy.of(covariances))
     return Assessment(Lazy(lambda: jax.tree.map(np.asarray, constraints_of(state))), Lazy(covariance))
 
 
@@ -104,17 +99,14 @@ def _responding(executor: AbstractExecutor, loop: LoopResult) -> tuple[AbstractT
         def sample(shift: Float[AnyArray, "3"]) -> Any:
             return executor.rows(sample_of_term, *executor.rematched(loop.state.pose, shift, rows, counts), term)
 
-        return term.with_response(_for_each(sample, term.shifts))
+        if is_concrete(term.shifts):
+            samples = jax.tree.map(lambda *results: np.stack(results), *map(sample, np.asarray(term.shifts)))
+        else:
+            samples = jax.lax.map(sample, term.shifts)
+        return term.with_response(samples)
 
     with np.errstate(over="ignore", invalid="ignore"):
         return tuple(map(responding, loop.terms))
-
-
-def _for_each(function: Callable[[Any], Any], items: Any) -> Any:
-    """The results of a function for each item along the first axis, stacked."""
-    if not is_concrete(items):
-        return jax.lax.map(function, items)
-    return jax.tree.map(lambda *results: np.stack(results), *map(function, np.asarray(items)))
 
 
 def as_float64(tree: Any) -> Any:
@@ -138,21 +130,17 @@ def constraints_of(state: State) -> Constraints:
 
 
 @jax.jit
-def covariance_of_pose(state: State, known: Moments | Fusion) -> Float[Array, "6 6"]:
-    """Covariance of the final pose, for ξ in T exp(ξ), metres and radians; NaN if the status allows none.
-
-    Args:
-        known: sums over the scores; with tie points or a prior, `Fusion` from the first registration.
-    """
-    found = (state.status != Status.TOO_FEW_CORRESPONDENCES) & (state.status != Status.NON_FINITE)
+def covariance_of_pose(state: State, weights: Moments | Fusion) -> Float[Array, "6 6"]:
+    """Covariance of the final pose, for ξ in T exp(ξ), metres and radians; NaN if the status allows none."""
+    exists = (state.status != Status.TOO_FEW_CORRESPONDENCES) & (state.status != Status.NON_FINITE)
     if state.directions is None:
-        found = found & (state.status != Status.DEGENERATE)
+        exists = exists & (state.status != Status.DEGENERATE)
     center, radius = state.sums.center, state.sums.radius
-    if isinstance(known, Fusion):
-        covariance = fused_covariance(state.pose, known)
+    if isinstance(weights, Fusion):
+        covariance = fused_covariance(state.pose, weights)
     else:
-        covariance = sandwich(state.pose, center, radius, known, state.directions)
-    return jnp.where(found, covariance, jnp.nan)
+        covariance = sandwich(state.pose, center, radius, weights, state.directions)
+    return jnp.where(exists, covariance, jnp.nan)
 
 
 def registration_of(
@@ -164,7 +152,7 @@ def registration_of(
     used: Bool[AnyArray, "n"],
     derivative: Callable[[str, str], np.ndarray] | None = None,
 ) -> RegistrationResult:
-    """Build the `RegistrationResult` of a final state, in the user's frames; NumPy where everything is concrete.
+    """The `RegistrationResult` of a final state, in the user's frames; NumPy where everything is concrete.
 
     Args:
         used: which source points could be matched; False for padding.
@@ -179,21 +167,18 @@ def registration_of(
         # Reading NumPy arrays compiles nothing, and NumPy scalars print as numbers.
         state, history, used = jax.tree.map(lambda array: np.asarray(array)[()], (state, history, used))
         pose = state.pose if is_concrete(pose) else pose
-    numbers: Any = {
-        "status_code": state.status,
-        "num_iterations": state.num_iterations,
-        "num_inliers": state.record.num_inliers,
-        "cost": state.record.cost,
-        "rmse": state.record.rmse,
-        "history": history,
-    }
-    numbers["num_inliers"] = numbers["num_inliers"].astype(np.int32)
-    numbers["overlap"] = (numbers["num_inliers"] / used.sum()).astype(numbers["rmse"].dtype)
+    record, num_inliers = state.record, state.record.num_inliers.astype(np.int32)
     return RegistrationResult.build(
+        status_code=state.status,
+        num_iterations=state.num_iterations,
+        num_inliers=num_inliers,
+        cost=record.cost,
+        rmse=record.rmse,
+        overlap=(num_inliers / used.sum()).astype(record.rmse.dtype),
+        history=history,
         constraints=_later(lambda: _constraints_in_user_frame(assessment, source.origin), concrete),
         uncertainty=_later(lambda: _uncertainty_in_user_frame(assessment, state, source.origin), concrete),
         derivative=Held(derivative),
-        **numbers,
         **fields_of_pose(pose, source_origin, target_origin),
     )
 

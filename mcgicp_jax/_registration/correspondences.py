@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
+from operator import itemgetter
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.typing import ArrayLike
-from jaxtyping import Float, Int
 
 from mcgicp_jax._clouds.origins import centred_pose
 from mcgicp_jax._clouds.point_cloud import PointCloud
@@ -22,7 +22,7 @@ from mcgicp_jax._methods.base import AbstractMethod
 from mcgicp_jax._methods.surfaces import search_numbers, search_rows, searchable
 from mcgicp_jax._pose_solver.matched import Motion, distances_within
 from mcgicp_jax._registration.input_checks import check_clouds
-from mcgicp_jax._search.base import AbstractIndex, AbstractSearch, Correspondences, SearchPoints
+from mcgicp_jax._search.base import AbstractIndex, AbstractSearch, Correspondences
 from mcgicp_jax._search.brute_force import default_search
 
 
@@ -67,45 +67,32 @@ def find_correspondences(
     check_integer("num_candidates", num_candidates, 1)
     matrix = centred_pose(pose, source, target, "pose")
     matrix, max_distance, method = constant((matrix, max_distance, method))
+    nearest: Any
     rows, target_rows = (searchable(method, constant(cloud)) for cloud in (source, target))
     dtype = rows.points.dtype
     start = se3_from_matrix(matrix, dtype).wxyz_xyz
     if not traced:
         gate = float(np.asarray(max_distance))
         nearest = index_of(search, method, target).nearest(np.asarray(start), rows, gate, num_candidates)
-        matches = _correspondences_at(np.asarray(matrix), rows, target_rows, nearest, gate)
-        return _unless_several(matches, num_candidates)
-    limit = jnp.asarray(max_distance, dtype)
-    found = search.nearest_traced(start, rows, target_rows, limit, jnp.bool_(True), num_candidates)
-    here = jnp.maximum(found, 0)
-    moved = Motion(jnp.asarray(matrix[:3, :3], dtype), jnp.asarray(matrix[:3, 3], dtype)).move(rows.points)
-    there = (found >= 0) & rows.valid & jnp.asarray(target_rows.valid)[here]
-    targets = jnp.asarray(target_rows.points)[here]
-    distances, near = (
-        jnp.stack(each) for each in zip(*(distances_within(moved, some, limit) for some in targets), strict=True)
-    )
-    valid = there & near
-    return _unless_several(Correspondences(here, distances, valid), num_candidates)
-
-
-def _unless_several(matches: Correspondences, num_candidates: int) -> Correspondences:
-    return matches if num_candidates > 1 else jax.tree.map(lambda rows: rows[0], matches)
-
-
-def _correspondences_at(
-    matrix: Float[np.ndarray, "4 4"],
-    source: SearchPoints,
-    target: SearchPoints,
-    indices: Int[np.ndarray, "m N"],
-    max_distance: float,
-) -> Correspondences:
-    """Matches at a pose, valid within `max_distance` metres of position; NumPy, so that nothing is compiled."""
-    rows, dtype = np.maximum(indices, 0), source.points.dtype
-    with np.errstate(invalid="ignore"):
-        moved = rotated(source.points.astype(np.float64), matrix[:3, :3]) + matrix[:3, 3]
-        distances = np.linalg.norm(target.points[rows] - moved, axis=-1).astype(dtype)
-        valid = (indices >= 0) & source.valid & target.valid[rows] & (distances <= max_distance)
-    return Correspondences(rows.astype(np.int32), distances, valid)
+        indices = np.maximum(nearest, 0)
+        matrix = np.asarray(matrix)
+        # By NumPy, so that nothing is compiled.
+        with np.errstate(invalid="ignore"):
+            moved: Any = rotated(rows.points.astype(np.float64), matrix[:3, :3]) + matrix[:3, 3]
+            distances = np.linalg.norm(target_rows.points[indices] - moved, axis=-1).astype(dtype)
+            valid = (nearest >= 0) & rows.valid & target_rows.valid[indices] & (distances <= gate)
+        matches = Correspondences(indices.astype(np.int32), distances, valid)
+    else:
+        limit = jnp.asarray(max_distance, dtype)
+        nearest = search.nearest_traced(start, rows, target_rows, limit, jnp.bool_(True), num_candidates)
+        indices = jnp.maximum(nearest, 0)
+        moved = Motion(jnp.asarray(matrix[:3, :3], dtype), jnp.asarray(matrix[:3, 3], dtype)).move(rows.points)
+        valid = (nearest >= 0) & rows.valid & jnp.asarray(target_rows.valid)[indices]
+        targets = jnp.asarray(target_rows.points)[indices]
+        within = [distances_within(moved, candidate, limit) for candidate in targets]
+        distances, near = map(jnp.stack, zip(*within, strict=True))
+        matches = Correspondences(indices, distances, valid & near)
+    return matches if num_candidates > 1 else jax.tree.map(itemgetter(0), matches)
 
 
 def index_of(search: AbstractSearch, method: AbstractMethod, target: PointCloud) -> AbstractIndex:

@@ -20,7 +20,6 @@ from __future__ import annotations
 import abc
 from collections.abc import Callable
 from dataclasses import replace
-from functools import partial
 from typing import Any, NamedTuple, cast
 
 import equinox as eqx
@@ -94,8 +93,12 @@ class Problem(eqx.Module):
 
     @property
     def first_status(self) -> Int[AnyScalar, ""]:
-        adapts = is_adaptive(self.terms) and self.matches is None
-        return np.int32(COARSE) if adapts else self.settings.first_status()
+        """`COARSE` where the coarse phase differs from the fine one, and always for terms that adapt."""
+        if is_adaptive(self.terms) and self.matches is None:
+            return np.int32(COARSE)
+        settings = self.settings
+        coarse: Any = (settings.fine_distance < settings.max_distance) | (settings.coarse_stride > 1)
+        return numpy_for(coarse).where(coarse, np.int32(COARSE), np.int32(RUNNING))
 
 
 class Record(NamedTuple):
@@ -161,8 +164,17 @@ class AbstractExecutor(abc.ABC):
         self.problem = problem
 
     @abc.abstractmethod
-    def run(self, step: Callable[[LoopResult], LoopResult]) -> LoopResult:
+    def run(self) -> LoopResult:
         """Repeat the step while the status is negative, and keep the history."""
+
+    def step(self, loop: LoopResult) -> LoopResult:
+        """One step: find matches at this pose; sum their forces; update the pose."""
+        state = loop.state
+        matches = self.match(state, loop.matches)
+        terms = self.adapt(state, matches, loop.terms)
+        sums = self.sums(Motion.of(state.pose.wxyz_xyz), matches, terms, state.status == SETTLED)
+        # The sums are not an output of the compiled update, which would copy them.
+        return LoopResult(self.update(state, sums)._replace(sums=sums), matches, terms, loop.history)
 
     @abc.abstractmethod
     def match(self, state: State, before: Any) -> Matches:
@@ -177,19 +189,13 @@ class AbstractExecutor(abc.ABC):
     def rows(
         self, function: Callable[..., Any], motion: Motion, matches: Matches, *arguments: Any, with_noise: bool = False
     ) -> Any:
-        """Apply a function that returns one row per correspondence.
-
-        Args:
-            with_noise: whether the surfaces include `noise` and `search`.
-        """
+        """Apply a function that returns one row per correspondence, to surfaces with `noise` and `search` if asked."""
 
     @abc.abstractmethod
     def sums(self, motion: Motion, matches: Matches, terms: tuple[AbstractTerm, ...], last: Bool[AnyScalar, ""]) -> Any:
         """`sums_of` all correspondences, as the executor keeps them while the loop runs.
 
-        Args:
-            last: whether the channels of matched points must agree. Far from the right pose they do not, and there the
-                channels that each cloud observes guide the pose.
+        In the `last` step, the channels of matched points must agree. Far from the right pose they do not.
         """
 
     def update(self, state: State, sums: Any) -> State:
@@ -202,10 +208,8 @@ class AbstractExecutor(abc.ABC):
         """`scores_of` all correspondences; further arguments are those of that function."""
 
     def adapt(self, state: State, matches: Matches, before: tuple[AbstractTerm, ...]) -> tuple[AbstractTerm, ...]:
-        """The terms with their numbers estimated at the pose of a state, from a sample of the matches.
-
-        They are estimated anew, not from those `before`, which an executor keeps outside the fine phase.
-        """
+        """The terms with their numbers estimated at the pose of a state, from a sample of the matches. Executors keep
+        those `before` outside the fine phase."""
         terms = self.problem.terms
         if not is_adaptive(terms):
             return terms
@@ -220,11 +224,7 @@ class AbstractExecutor(abc.ABC):
     def rematched(
         self, pose: jaxlie.SE3, shift: Float[AnyArray, "3"], rows: Int[AnyArray, "n"], counts: Bool[AnyArray, "n"]
     ) -> tuple[Motion, Matches]:
-        """A pose that is moved by `shift` metres, and new matches of some source points there, in position alone.
-
-        Args:
-            counts: False for rows to leave unmatched.
-        """
+        """A pose moved by `shift` metres, and new matches of the source points that count, in position alone."""
         source, target, xp = self.problem.source.search, self.problem.target.search, numpy_for(rows, counts)
         motion = Motion.of(pose.wxyz_xyz)
         motion = motion._replace(translation=motion.translation + shift)
@@ -239,8 +239,8 @@ class AbstractExecutor(abc.ABC):
         points, targets = xp.asarray(self.problem.source.points), xp.asarray(self.problem.target.points)
         with np.errstate(invalid="ignore", over="ignore"):
             moved = motion.move(points if matches.rows is None else points[matches.rows]).T
-            apart = targets[xp.maximum(matches.indices, 0)] - moved
-            return xp.where(matches.indices >= 0, xp.linalg.norm(apart, axis=-1), np.inf)
+            residual = targets[xp.maximum(matches.indices, 0)] - moved
+            return xp.where(matches.indices >= 0, xp.linalg.norm(residual, axis=-1), np.inf)
 
     def nearest_candidates(self, motion: Motion, matches: Matches) -> Matches:
         """The nearest candidate of each source point alone. Followed candidates are in any order."""
@@ -250,25 +250,9 @@ class AbstractExecutor(abc.ABC):
         return matches._replace(indices=xp.take_along_axis(matches.indices, first, axis=0))
 
     def within(self, motion: Motion, matches: Matches) -> Matches:
-        """The matches without those that are further apart than `max_distance`."""
+        """The matches whose distance is at most `max_distance`."""
         near = self.distances(motion, matches) <= matches.max_distance
         return matches._replace(indices=numpy_for(near).where(near, matches.indices, -1))
-
-
-def iterate(executor: AbstractExecutor) -> LoopResult:
-    """Run the loop: find matches at this pose; sum their forces; update the pose; stop when it no longer moves."""
-    return executor.run(partial(step, executor))
-
-
-def step(executor: AbstractExecutor, loop: LoopResult) -> LoopResult:
-    """One step of the loop."""
-    state = loop.state
-    matches = executor.match(state, loop.matches)
-    terms = executor.adapt(state, matches, loop.terms)
-    sums = executor.sums(Motion.of(state.pose.wxyz_xyz), matches, terms, state.status == SETTLED)
-    # The sums are not an output of the compiled update, which would copy them.
-    state = executor.update(state, sums)._replace(sums=sums)
-    return LoopResult(state, matches, terms, loop.history)
 
 
 @jax.jit

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import cache, wraps
 from typing import Any
 
 import jax
@@ -26,9 +25,7 @@ from mcgicp_jax._terms.base import AbstractTerm
 class HostExecutor(AbstractExecutor):
     """Blocks of rows on the host for one pair of concrete clouds.
 
-    Args:
-        index_of: the index of the target; for a search in position alone if called with True.
-        num_threads: largest number of threads; None for no limit.
+    `index_of` returns the index of the target; called with True, that for a search in position alone.
     """
 
     def __init__(self, problem: Problem, index_of: Callable[[bool], AbstractIndex], num_threads: int | None):
@@ -39,14 +36,14 @@ class HostExecutor(AbstractExecutor):
         self._follow: Callable[[Any], Int[np.ndarray, "m N"]] | None = None
         self._settings = Packed.of(problem.settings, num_axes=0)
 
-    def run(self, step: Callable[[LoopResult], LoopResult]) -> LoopResult:
+    def run(self) -> LoopResult:
         problem = self.problem
         dtype = problem.source.points.dtype
         still = np.zeros(6, dtype), np.zeros((), dtype)
         state = State(problem.start, np.asarray(problem.first_status), np.int32(0), *still)
         loop, history = LoopResult(state, None, problem.terms, None), []
         while loop.state.status < 0:
-            loop = step(loop)
+            loop = self.step(loop)
             history.append(loop.state.record)
         # Frees the tree: deferred parts of the result keep the executor.
         self._followed = self._follow = None
@@ -85,30 +82,23 @@ class HostExecutor(AbstractExecutor):
     def rows(
         self, function: Callable[..., Any], motion: Motion, matches: Matches, *arguments: Any, with_noise: bool = False
     ) -> Any:
-        applied = self._over(_rows_of(function, with_noise), motion, matches, arguments, with_noise, with_noise)
-        (found,) = applied.rows(None, self._num_threads if with_noise else 1)
-        return found.tree
+        applied = self._over(function, motion, matches, arguments, with_noise, total=False)
+        (rows,) = applied.rows(None, self._num_threads if with_noise else 1)
+        return rows.tree
 
     def _over(
-        self,
-        function: Callable[..., Any],
-        motion: Motion,
-        matches: Matches,
-        arguments: tuple[Any, ...],
-        with_noise: bool,
-        with_search: bool = False,
-        total: bool = False,
+        self, function: Any, motion: Motion, matches: Matches, arguments: Any, with_noise: bool, total: bool = True
     ) -> RowFunction:
-        """A row function of matches with its arguments."""
-        inputs = inputs_of(self.problem.source, self.problem.target, matches, with_noise, with_search)
+        """A function of matches, such as `sums_of`, as a row function with its arguments; a sum if `total`."""
+        inputs = inputs_of(self.problem.source, self.problem.target, matches, with_noise, with_noise and not total)
         numbers = motion, matches.max_distance, matches.temperature, arguments
-        return RowFunction(function, numbers, inputs, matches.indices.shape[1], total)
+        return RowFunction(of_matches(function, with_noise, total), numbers, inputs, matches.indices.shape[1], total)
 
     def sums(self, motion: Motion, matches: Matches, terms: tuple[AbstractTerm, ...], last: Any) -> Packed[Sums]:
         # Packed until the loop ends: to pass and to return dozens of arrays takes longer than to use them. Not awaited:
         # `update` is dispatched while they are computed, which saves half of the hand-overs between threads.
         with_slopes = bool(last) and self.problem.source.observes_channels
-        applied = self._over(of_matches(sums_of, with_slopes), motion, matches, (terms,), with_slopes, total=True)
+        applied = self._over(sums_of, motion, matches, (terms,), with_slopes)
         parts: list[Packed[Sums]] = applied.sums(self._num_threads if with_slopes else 1)
         return parts[0] if len(parts) == 1 else _combined(parts)
 
@@ -117,8 +107,7 @@ class HostExecutor(AbstractExecutor):
         return Packed(np.asarray(updated.table), updated.layout).tree
 
     def scores(self, motion: Motion, matches: Matches, *arguments: Any) -> Scores:
-        noise = self.problem.source.observed
-        applied = self._over(of_matches(scores_of, noise), motion, matches, arguments, noise, total=True)
+        applied = self._over(scores_of, motion, matches, arguments, self.problem.source.observed)
         parts: list[Scores] = [jax.tree.map(np.asarray, part) for part in applied.sums(self._num_threads, packed=False)]
         jacobian, bias = (
             np.sum([getattr(part, name).astype(np.float64) for part in parts], axis=0) for name in ("jacobian", "bias")
@@ -129,13 +118,6 @@ class HostExecutor(AbstractExecutor):
             for name in ("wrenches", "valid", "cells")
         )
         return Scores(wrenches, valid, cells, jacobian, bias)
-
-
-@cache
-def _rows_of(function: Callable[..., Any], with_noise: bool) -> Callable[..., Any]:
-    """`of_matches` of a function that returns one row for each match."""
-    over = of_matches(function, with_noise)
-    return wraps(over)(lambda numbers, *rows: (over(numbers, *rows),))
 
 
 def _combined(parts: list[Packed[Sums]]) -> Packed[Sums]:

@@ -51,8 +51,8 @@ class Options:
     reach: float = 0.0
 
     def __post_init__(self) -> None:
-        for name in ("max_distance", "translation_tolerance", "rotation_tolerance", "hold_unconstrained"):
-            object.__setattr__(self, name, primal(getattr(self, name)))
+        for name, number in self.numbers.items():
+            object.__setattr__(self, name, primal(number))
         if self.max_distance is not None:
             _check_distances(self.max_distance)
         check_integer("max_iterations", self.max_iterations, 1)
@@ -80,9 +80,10 @@ class Options:
             check_integer("max_source_points", self.max_source_points, MIN_POINTS)
 
     @property
-    def numbers(self) -> tuple[Any, ...]:
+    def numbers(self) -> dict[str, Any]:
         """The options that may be arrays, constants to autodiff."""
-        return self.max_distance, self.translation_tolerance, self.rotation_tolerance, self.hold_unconstrained
+        names = ("max_distance", "translation_tolerance", "rotation_tolerance", "hold_unconstrained")
+        return {name: getattr(self, name) for name in names}
 
     def takes_raw(self, method: AbstractMethod, name: str) -> bool:
         """Whether the method makes its cells of the cloud "source" or "target" itself, of all points."""

@@ -80,9 +80,7 @@ class PoseDerivative(AbstractLinearMap):
     """The derivative of the parameters `jaxlie.SE3.wxyz_xyz` of a final pose by some inputs; 0 if there is none.
 
     Args:
-        inputs: of the registration; differentiation may trace them.
-        fixed: the same, concrete.
-        executor, loop: the registration.
+        inputs, fixed: of the registration; as differentiation may trace them, and concrete.
         arrays: those of `inputs` by which it is; by default all that are traced.
     """
 
@@ -93,10 +91,11 @@ class PoseDerivative(AbstractLinearMap):
         self._pose, self._fusion = np.asarray(loop.state.pose.wxyz_xyz), problem.fusion
         root = computed_on_cpu(root_of)(loop.state._replace(record=None), self._fusion)
         self._scaling: ImplicitRoot = jax.tree.map(np.asarray, root)
-        form = None if self._fusion is None else self._fusion.form
-        if self._fusion is not None and not is_concrete(inputs[4:6]):
-            place = self._fusion
-            form = _form_at(place.rotation, place.translation, place.center, place.radius, *inputs[4:6])
+        fusion: Any = self._fusion
+        form = None if fusion is None else fusion.form
+        if fusion is not None and not is_concrete(inputs.tie_points, inputs.prior):
+            place = fusion.rotation, fusion.translation, fusion.center, fusion.radius
+            form = _form_at(*place, inputs.tie_points, inputs.prior)
         self._form = jax.tree.leaves(form)
         equalized = any(term.estimates_gains for term in problem.terms)
         terms = inputs.method.terms(fixed.source, fixed.target, inputs.robust, equalized)
@@ -110,12 +109,7 @@ class PoseDerivative(AbstractLinearMap):
             observed=problem.source.observed,
             soft=matches.temperature is not None,
         )
-        numbers = (
-            Motion.of(self._pose),
-            self._scaling,
-            with_numbers_of(terms, loop.terms),
-            inputs.temperature,
-        )
+        numbers = Motion.of(self._pose), self._scaling, with_numbers_of(terms, loop.terms), inputs.temperature
         self._scored = RowFunction(_score_of_rows, numbers, tables, matches.indices.shape[1], total=True)
         traced = [leaf for leaf in self._form if not is_concrete(leaf)]
         self.arrays = list(arrays) or self._scored.tracers + traced
@@ -141,12 +135,11 @@ class PoseDerivative(AbstractLinearMap):
             by_score, by_form = self._by_balance(by_score)
         arrays = [self.arrays[i] for i in moving]
         # The score has six numbers, so more cotangents of it are combinations of six.
-        some = by_score if len(by_score) <= 6 else np.eye(6)
-        found = self._score(pose).cotangents(some.astype(pose.dtype), arrays)
-        found = found if some is by_score else [np.tensordot(by_score, each, 1) for each in found]
-        for leaf, by in zip(self._form, by_form, strict=True):
-            found = [by if array is leaf else each for array, each in zip(arrays, found, strict=True)]
-        return found
+        rows = by_score if len(by_score) <= 6 else np.eye(6)
+        slopes = self._score(pose).cotangents(rows.astype(pose.dtype), arrays)
+        slopes = slopes if rows is by_score else [np.tensordot(by_score, slope, 1) for slope in slopes]
+        by_leaf = {id(leaf): by for leaf, by in zip(self._form, by_form, strict=True)}
+        return [by_leaf.get(id(array), slope) for array, slope in zip(arrays, slopes, strict=True)]
 
     def jacobian(self) -> list[np.ndarray]:
         """(7, ...) derivative of the pose parameters by each of the arrays."""
@@ -155,8 +148,8 @@ class PoseDerivative(AbstractLinearMap):
     def _by_balance(self, cotangents: Float[np.ndarray, "c 6"]) -> tuple[np.ndarray, list[np.ndarray]]:
         """Cotangents of the score and of the leaves of the form, from those of the equation with both."""
         pose, _, score = self._root
-        found = _pull_balance(pose, self._scaling, self._fusion, score, cotangents.astype(pose.dtype))
-        by_score, by_form = jax.tree.map(np.asarray, found)
+        slopes = _pull_balance(pose, self._scaling, self._fusion, score, cotangents.astype(pose.dtype))
+        by_score, by_form = jax.tree.map(np.asarray, slopes)
         return by_score, jax.tree.leaves(by_form) if self._form else []
 
     def _score(self, pose: Float[np.ndarray, "7"]) -> RowFunction:
@@ -169,11 +162,11 @@ class PoseDerivative(AbstractLinearMap):
         pose, root = self._pose, self._scaling
         for _ in range(MAX_NEWTON_STEPS if root.usable else 0):
             score, by_motion = self._score(pose).value_and_jacobian((0, 1))
-            slopes = np.column_stack([each.reshape(6, -1) for each in by_motion]) @ self._motion_by_twist(pose)
-            known = np.column_stack([score, slopes])
+            slopes = np.column_stack([slope.reshape(6, -1) for slope in by_motion]) @ self._motion_by_twist(pose)
+            both = np.column_stack([score, slopes])
             if self._fusion is not None:
-                known = np.asarray(_balance_and_slope(pose, root, self._fusion, known.astype(pose.dtype)), np.float64)
-            balance, slope = np.split(known, [1], axis=1)
+                both = np.asarray(_balance_and_slope(pose, root, self._fusion, both.astype(pose.dtype)), np.float64)
+            balance, slope = np.split(both, [1], axis=1)
             within = root.within(slope)
             if not np.linalg.cond(within) < 1 / np.finfo(slope.dtype).eps:
                 break
@@ -194,11 +187,11 @@ class PoseDerivative(AbstractLinearMap):
 
     def _motion_by_twist(self, pose: Float[np.ndarray, "7"]) -> Float[np.ndarray, "12 6"]:
         """Derivative of rotation matrix and translation by the same twist."""
-        identity, found = np.eye(3), np.zeros((12, 6))
         rotation = rotation_from_quaternion(pose[:4].astype(np.float64))
-        found[:9, 3:] = np.cross(identity[:, :, None], rotation[None], axis=1).reshape(3, 9).T
-        found[9:] = self._by_twist(pose)[4:]
-        return found
+        slope = np.zeros((12, 6))
+        slope[:9, 3:] = np.cross(np.eye(3)[:, :, None], rotation[None], axis=1).reshape(3, 9).T
+        slope[9:] = self._by_twist(pose)[4:]
+        return slope
 
 
 def _score_of_rows(numbers: tuple[Motion, ImplicitRoot, Any, Any], *rows: Rows) -> Float[Array, "6"]:
@@ -208,17 +201,14 @@ def _score_of_rows(numbers: tuple[Motion, ImplicitRoot, Any, Any], *rows: Rows) 
 
 @quickly_compiled
 def _balance_and_slope(
-    pose: Float[Array, "7"], root: ImplicitRoot, fusion: Fusion, known: Float[Array, "6 7"]
+    pose: Float[Array, "7"], root: ImplicitRoot, fusion: Fusion, matches: Float[Array, "6 7"]
 ) -> Float[Array, "6 7"]:
-    """The equation with tie points and a prior, and its derivative by a twist.
+    """The equation with tie points and a prior, and its derivative by a twist, from those of g."""
 
-    Args:
-        known: g of all matches without these, and its derivative by a twist.
-    """
-    value, slope = value_and_jacobian(
-        lambda twist: balance_along(twist, pose, root, known[:, 0] + known[:, 1:] @ twist, fusion),
-        jnp.zeros_like(pose[:6]),
-    )
+    def balance(twist: Float[Array, "6"]) -> Float[Array, "6"]:
+        return balance_along(twist, pose, root, matches[:, 0] + matches[:, 1:] @ twist, fusion)
+
+    value, slope = value_and_jacobian(balance, jnp.zeros_like(pose[:6]))
     return jnp.concatenate([value[:, None], slope], axis=1)
 
 
@@ -268,8 +258,8 @@ def differentiated(given: Inputs, inputs: Inputs, executor: HostExecutor, loop: 
         source = source.replace_rows(channels=channels)
     method = with_unset_from(given.method, inputs.method)
     traced = given._replace(source=source, method=method, source_rows=inputs.source_rows)
-    found = PoseDerivative(traced, inputs, executor, loop)
-    return found if found.arrays else None
+    derivative = PoseDerivative(traced, inputs, executor, loop)
+    return derivative if derivative.arrays else None
 
 
 def _multiplied(gains: Float[Array, "C"], channels: Rows) -> tuple[Float[Array, "n C"]]:
@@ -279,13 +269,14 @@ def _multiplied(gains: Float[Array, "C"], channels: Rows) -> tuple[Float[Array, 
 _form_at = jax.jit(form_at)
 
 
-def with_derivatives(states: Sequence[State], found: Sequence[PoseDerivative | None]) -> list[State]:
+def with_derivatives(states: Sequence[State], derivatives: Sequence[PoseDerivative | None]) -> list[State]:
     """The final states; their poses have derivatives, which are computed side by side."""
-    some = [(i, each) for i, each in enumerate(found) if each is not None]
-    if not some:
+    present = {i: derivative for i, derivative in enumerate(derivatives) if derivative is not None}
+    if not present:
         return list(states)
-    together = SideBySide([each for _, each in some], [len(each.arrays) for _, each in some])
-    values = [np.asarray(states[i].pose.wxyz_xyz) for i, _ in some]
-    poses = with_derivative(values, together, [array for _, each in some for array in each.arrays])
-    attached = {i: jaxlie.SE3(pose) for (i, _), pose in zip(some, poses, strict=True)}
+    maps = list(present.values())
+    together = SideBySide(maps, [len(derivative.arrays) for derivative in maps])
+    values = [np.asarray(states[i].pose.wxyz_xyz) for i in present]
+    poses = with_derivative(values, together, [array for derivative in maps for array in derivative.arrays])
+    attached = {i: jaxlie.SE3(pose) for i, pose in zip(present, poses, strict=True)}
     return [state._replace(pose=attached.get(i, state.pose)) for i, state in enumerate(states)]

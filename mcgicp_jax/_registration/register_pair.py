@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, cast
 
 import jax
 from jaxtyping import Int
@@ -39,7 +39,7 @@ from mcgicp_jax._registration.input_checks import (
     warn_of_constant_weights,
     warn_of_covariances,
 )
-from mcgicp_jax._registration.loop import LoopResult, Problem, State, iterate
+from mcgicp_jax._registration.loop import LoopResult, Problem, State
 from mcgicp_jax._registration.multi_scale import at_scales
 from mcgicp_jax._registration.on_host import HostExecutor
 from mcgicp_jax._registration.options import Options, check_method
@@ -93,16 +93,13 @@ def register_pair(
 
 
 def result_of(given: Inputs, run: Callable[..., Run], *arguments: Any) -> RegistrationResult:
-    """The result of a registration, differentiable by its inputs.
+    """The result of `run(given, *arguments, traced=False)`, such as `run_pair`; differentiable by the inputs. The
+    arguments are constants to autodiff.
 
-    This is where it is decided whether it runs on the host or is traced.
-
-    Args:
-        run: `run(inputs, *arguments, traced=False)`, such as `run_pair`.
-        arguments: without traces of differentiation, to which they are constants.
+    This is where it is decided whether a registration runs on the host or is traced.
     """
     values = given.values()
-    numbers = [each.numbers if isinstance(each, Options) else each for each in arguments]
+    numbers = [argument.numbers if isinstance(argument, Options) else argument for argument in arguments]
     if not is_concrete(values, numbers):
         # Inside `jit` or `vmap`, whose tracers have no values.
         ended = run(given, *arguments, traced=True)
@@ -140,21 +137,31 @@ def prepared(
 def run_pair(given: Inputs, init: Pose | None, options: Options, traced: bool = False) -> Run:
     """Register arrays that are all concrete, or some of which `jit` or `vmap` trace."""
     search = options.search or default_search(traced)
-    solve = partial(_solved, options=options, search=search, traced=traced)
-    if not traced:
-        _warn_of_inputs(given, options)
+    measures = not (given.tie_points is None and given.prior is None)
+    compares_channels = not traced and given.method.uses_channels and not options.equalize_channels
+
+    def solve(inputs: Inputs, init: Pose | None, options: Options = options) -> Run:
+        problem, inputs = problem_of(inputs, init, options, search.num_threads)
+        if measures:
+            problem = measured(problem, given.tie_points, given.prior, traced)
+        return run_loop(inputs, problem, search, options.max_iterations, traced)
+
+    if not traced and isinstance(given.method, GICP):
+        warn_of_covariances(given.source, given.target)
+    if compares_channels:
+        warn_of_units(given.source, given.target)
     *coarse, inputs = at_scales(_equalized(given) if options.equalize_channels else given, options.voxel_sizes)
-    for each in coarse:
-        (found,) = results_of([solve(each, init, options=replace(options, max_distance=None))], [None])
-        init = found.matrix if is_usable(found) else init
+    for scale in coarse:
+        (result,) = results_of([solve(scale, init, replace(options, max_distance=None))], [None])
+        init = result.matrix if is_usable(result) else init
     run = solve(inputs, init)
     if options.equalize_channels and not any(term.estimates_gains for term in run.problem.terms):
         # Parameters left None are chosen anew, from the channels as equalised by the matches.
         again = _equalized(run.inputs._replace(method=inputs.method), _nearest_points(run, search))
         run = solve(again, _final_pose(run))
-    elif not traced and inputs.method.uses_channels and not options.equalize_channels:
+    elif compares_channels:
         warn_of_exposure(inputs.source, inputs.target, lambda: _nearest_points(run, search))
-    if given.tie_points is None and given.prior is None:
+    if not measures:
         return run
     # Again from its pose, with tie points and prior weighed by its covariance.
     fusion = fusion_of(run.loop.state, run.moments(), run.inputs.tie_points, run.inputs.prior, traced)
@@ -162,21 +169,10 @@ def run_pair(given: Inputs, init: Pose | None, options: Options, traced: bool = 
     return run_loop(run.inputs, problem, search, options.max_iterations, traced)
 
 
-def _warn_of_inputs(given: Inputs, options: Options) -> None:
-    if isinstance(given.method, GICP):
-        warn_of_covariances(given.source, given.target)
-    if given.method.uses_channels and not options.equalize_channels:
-        warn_of_units(given.source, given.target)
-
-
 @with_settings_of_package
 def results_of(runs: Sequence[Run], givens: Sequence[Inputs | None]) -> list[RegistrationResult]:
-    """The results of registrations.
-
-    Args:
-        givens: the arguments of each, or None. Outside `jit`, the poses get derivatives by those arrays of these
-            arguments that are traced. All derivatives are computed side by side.
-    """
+    """The results of registrations, given the arguments of each, or None. Outside `jit`, the poses get derivatives by
+    those arrays of these arguments that are traced, all of which are computed side by side."""
     derivatives = [
         None if given is None or run.executor is None else differentiated(given, run.inputs, run.executor, run.loop)
         for run, given in zip(runs, givens, strict=True)
@@ -193,20 +189,8 @@ def results_of(runs: Sequence[Run], givens: Sequence[Inputs | None]) -> list[Reg
     return results
 
 
-def _solved(given: Inputs, init: Pose | None, options: Options, search: AbstractSearch, traced: bool) -> Run:
-    """State the problem and run its loop."""
-    problem, inputs = problem_of(given, init, options, search.num_threads)
-    if not (given.tie_points is None and given.prior is None):
-        problem = measured(problem, given.tie_points, given.prior, traced)
-    return run_loop(inputs, problem, search, options.max_iterations, traced)
-
-
 def run_loop(inputs: Inputs, problem: Problem, search: AbstractSearch | None, max_iterations: int, traced: bool) -> Run:
-    """Run the loop on the host or inside `jit`.
-
-    Args:
-        search: None for a problem with fixed matches.
-    """
+    """Run the loop on the host or inside `jit`; without a search for a problem with fixed matches."""
     if traced:
         problem = problem.whole()
         # Gradients stop here, so that autodiff does not enter the compiled functions.
@@ -217,16 +201,19 @@ def run_loop(inputs: Inputs, problem: Problem, search: AbstractSearch | None, ma
         return Run(inputs, problem, loop, None, state, partial(assess, *ended), partial(moments_traced, *ended))
 
     def index(position_alone: bool) -> AbstractIndex:
-        if search is None:
-            raise ValueError("matches: expected a registration that searches for them")
-        return index_of(search, PointToPoint() if position_alone else inputs.method, inputs.target)
+        method = PointToPoint() if position_alone else inputs.method
+        return index_of(cast(AbstractSearch, search), method, inputs.target)
 
     executor = HostExecutor(problem, index, 1 if search is None else search.num_threads)
     with outside_trace():
-        loop = iterate(executor)
-    moments = Lazy(lambda: moments_of(executor, loop))
-    assessment = assessment_of(executor, loop, None if problem.fusion is not None else moments)
-    return Run(inputs, problem, loop, executor, lambda: loop.state, lambda: assessment, lambda: moments.value)
+        loop = executor.run()
+    lazy = Lazy(partial(moments_of, executor, loop))
+
+    def moments() -> Moments:
+        return lazy.value
+
+    assessment = partial(assessment_of, executor, loop, moments)
+    return Run(inputs, problem, loop, executor, lambda: loop.state, assessment, moments)
 
 
 @with_settings_of_package
@@ -234,11 +221,7 @@ def problem_of(
     given: Inputs, init: Pose | None, options: Options, num_threads: int | None, matches: Matches | None = None
 ) -> tuple[Problem, Inputs]:
     """The problem for preprocessed clouds, NumPy arrays where everything is concrete; and its inputs, with the
-    parameters of the method chosen.
-
-    Args:
-        matches: those at every pose; None to search for them.
-    """
+    parameters of the method chosen. `matches` are those at every pose; None to search for them."""
     source, target, method = given[:3]
     check_clouds(source, target, method)
     rows = rows_to_match(source, options)
@@ -269,8 +252,8 @@ def problem_of(
 
 def rows_to_match(source: PointCloud, options: Options) -> Int[AnyArray, "n"] | None:
     """The source rows that `max_source_points` leaves; None for all."""
-    most = options.max_source_points
-    return None if most is None or most >= source.valid.size else spread_rows(source.valid, most)
+    limit = options.max_source_points
+    return None if limit is None or limit >= source.valid.size else spread_rows(source.valid, limit)
 
 
 def _equalized(given: Inputs, matches: Correspondences | None = None) -> Inputs:

@@ -274,15 +274,10 @@ class RegistrationResult(eqx.Module):
     def __repr__(self) -> str:
         if not is_concrete(primal(self.centred), self.history) or np.ndim(self.status_code):
             return f"RegistrationResult(batch of shape {np.shape(self.status_code)})"
-        matrix = np.asarray(primal(self.matrix))
-        start = np.asarray(primal(self.source_origin))
-        if np.any(start):
-            # The translation column is the motion of a far point; print the motion of the source's origin instead.
-            origin = np.append(start, 1)
-            moved, where = (matrix @ origin - origin)[:3], "of the source's origin "
-        else:
-            moved, where = matrix[:3, 3], ""
-        translation = np.array2string(moved, precision=4, suppress_small=True)
+        matrix, origin = np.asarray(primal(self.matrix)), np.append(np.asarray(primal(self.source_origin)), 1)
+        # At large coordinates, the translation column would be the motion of a far point.
+        where = "of the source's origin " if np.any(origin[:3]) else ""
+        translation = np.array2string((matrix @ origin - origin)[:3], precision=4, suppress_small=True)
         cosine = (np.trace(matrix[:3, :3]) - 1) / 2
         angle = np.degrees(np.arccos(np.clip(cosine, -1, 1)))
         free = describe(self.unconstrained_directions)

@@ -63,24 +63,12 @@ class Settings(NamedTuple):
         coarse = (status == COARSE) & (num_iterations < self.max_iterations)
         return _either(coarse, self.coarse_stride, np.int32(1))
 
-    def first_status(self) -> Int[AnyScalar, ""]:
-        """`COARSE` where the coarse phase differs from the fine one."""
-        coarse = (self.fine_distance < self.max_distance) | (self.coarse_stride > 1)
-        return numpy_for(self).where(coarse, np.int32(COARSE), np.int32(RUNNING))
-
 
 def _either(condition: Bool[AnyScalar, ""], one: AnyScalar, other: AnyScalar) -> AnyScalar:
     """One number or the other; on the host without a call of NumPy, which would take longer than the rest."""
     if isinstance(condition, np.bool_):
         return one if condition else other
     return jnp.where(condition, one, other)
-
-
-def matching_spacing(method: AbstractMethod, target: PointCloud) -> Float[AnyScalar, ""]:
-    """Unit of the default maximum correspondence distances, metres: the edge of the cells for a method that matches
-    voxel Gaussians, else the spacing of the points."""
-    cells = method.needs_covariances and target.covariances is not None
-    return cell_edge(target) if cells else point_spacing(target)
 
 
 def default_distances(spacing: Any, target: PointCloud) -> tuple[Any, Any]:
@@ -91,17 +79,18 @@ def default_distances(spacing: Any, target: PointCloud) -> tuple[Any, Any]:
 
 
 def settings_for(options: Options, method: AbstractMethod, target: PointCloud, stride: Any, dtype: Any) -> Settings:
+    """The settings of a registration to this target; `stride` is that of the coarse phase."""
     max_distance: Any = options.max_distance
     tolerance: Any = options.translation_tolerance
-    # Options are constants to autodiff, even if they are derived from a differentiated cloud.
-    spacing = constant(matching_spacing(method, target))
+    cells = method.needs_covariances and target.covariances is not None
+    # Settings are constants to autodiff, even if they are derived from a differentiated cloud.
+    spacing = constant(cell_edge(target) if cells else point_spacing(target))
     max_distance = default_distances(spacing, target) if max_distance is None else max_distance
     least = spacing * _TOLERANCE_IN_SPACINGS
     tolerance = least if tolerance is None else tolerance
 
     def number(value: Any, kind: Any) -> Any:
-        xp = numpy_for(value)
-        return xp.asarray(value, kind)
+        return numpy_for(value).asarray(value, kind)
 
     def coarse_tolerance(value: Any, least: Any) -> Any:
         return number(_COARSE_TOLERANCE * numpy_for(value, least).maximum(value, least), dtype)

@@ -57,11 +57,13 @@ def known(
 def _centred_tie_points(given: GivenTiePoints, source: PointCloud, target: PointCloud) -> TiePoints:
     points, targets, covariances = _parts("tie_points", given, "(source_points, target_points, covariances)", 3)
     count = np.shape(points)[0] if np.ndim(points) else 0
-    points, targets = (
-        _numbers(f"tie_points: {side}", each, (count, 3))
-        for side, each in (("source_points", points), ("target_points", targets))
-    )
-    covariances = _covariances("tie_points: covariances", covariances, (count, 3, 3))
+    points = _numbers("tie_points: source_points", points, (count, 3))
+    targets = _numbers("tie_points: target_points", targets, (count, 3))
+    covariances = _numbers("tie_points: covariances", covariances, (count, 3, 3))
+    if is_concrete(covariances):
+        _, correlations = _correlations(covariances)
+        definite = bool(np.linalg.eigvalsh(correlations).min(initial=1) > _LEAST_EIGENVALUE)
+        _require("tie_points: covariances", correlations, definite, "positive definite")
     return TiePoints(points - source.origin, targets - target.origin, covariances)
 
 
@@ -197,16 +199,6 @@ def _numbers(name: str, given: Any, shape: tuple[int, ...]) -> Any:
         raise ValueError(f"{name}: expected shape {shape}, got {array.shape}")
     if concrete and not np.isfinite(array).all():
         raise ValueError(f"{name}: expected finite numbers, got NaN or infinity")
-    return array
-
-
-def _covariances(name: str, given: Any, shape: tuple[int, ...]) -> Float[AnyArray, "*n d d"]:
-    """The array, checked to be symmetric and positive definite if it is concrete."""
-    array = _numbers(name, given, shape)
-    if is_concrete(array):
-        _, correlations = _correlations(array)
-        definite = bool(np.linalg.eigvalsh(correlations).min(initial=1) > _LEAST_EIGENVALUE)
-        _require(name, correlations, definite, "positive definite")
     return array
 
 

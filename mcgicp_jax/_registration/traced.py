@@ -16,26 +16,21 @@ import jax.numpy as jnp
 import jaxlie
 from jaxtyping import Array, Bool, Float, Int
 
-from mcgicp_jax._compute.cache import Lazy
 from mcgicp_jax._compute.row_functions import whole
 from mcgicp_jax._pose_solver.covariance import Moments, Scores, scores_of
 from mcgicp_jax._pose_solver.implicit_derivative import Model, with_derivative
 from mcgicp_jax._pose_solver.matched import Matches, Motion, inputs_of, match_surfaces, of_matches
 from mcgicp_jax._pose_solver.sums import Sums, sums_of
 from mcgicp_jax._registration.assessment import Assessment, assessment_of, moments_of
-from mcgicp_jax._registration.loop import AbstractExecutor, LoopResult, Problem, State, iterate, root_of
+from mcgicp_jax._registration.loop import AbstractExecutor, LoopResult, Problem, State, root_of
 from mcgicp_jax._registration.settings import COARSE, RUNNING, SETTLED
 from mcgicp_jax._search.base import AbstractSearch, SearchPoints, by_position
 from mcgicp_jax._terms.base import AbstractTerm, is_adaptive, with_numbers_of
 
 
 class TracedExecutor(AbstractExecutor):
-    """Whole arrays inside transformations.
-
-    Args:
-        search: finds the matches; None if they are fixed.
-        max_iterations: static number of updates that the history has room for.
-    """
+    """Whole arrays inside transformations. `search` finds the matches; None if they are fixed. The history has room for
+    `max_iterations` updates."""
 
     def __init__(self, problem: Problem, search: Any, max_iterations: int):
         super().__init__(problem)
@@ -49,22 +44,22 @@ class TracedExecutor(AbstractExecutor):
         terms = jax.tree.map(jnp.asarray, problem.terms)
         still = jnp.zeros((6,), problem.start.wxyz_xyz.dtype), jnp.zeros((), problem.start.wxyz_xyz.dtype)
         loop = LoopResult(State(problem.start, first, jnp.int32(0), *still), matches, terms, None)
-        state = jax.tree.map(
-            lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), jax.eval_shape(lambda: self._state_after(loop))
-        )
+        after = jax.eval_shape(lambda: super(TracedExecutor, self).step(loop).state)
+        state = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), after)
         # One entry per update, and one at the returned pose.
         history = jax.tree.map(lambda leaf: jnp.full(self._max_iterations + 1, jnp.nan, leaf.dtype), state.record)
         return loop._replace(state=state._replace(pose=problem.start, status=first), history=history)
 
-    def _state_after(self, loop: LoopResult) -> State:
-        """The state after one step, for its shapes."""
-        state = loop.state
-        matches = self.match(state, loop.matches)
-        sums = self.sums(Motion.of(state.pose.wxyz_xyz), matches, loop.terms, jnp.bool_(False))
-        return self.update(state, sums)._replace(sums=sums)
+    def run(self) -> LoopResult:
+        return jax.lax.while_loop(lambda loop: loop.state.status < 0, self.step, self.begin())
 
-    def run(self, step: Callable[[LoopResult], LoopResult]) -> LoopResult:
-        return jax.lax.while_loop(lambda loop: loop.state.status < 0, lambda loop: recorded(step(loop)), self.begin())
+    def step(self, loop: LoopResult) -> LoopResult:
+        loop = super().step(loop)
+        state = loop.state
+        # `num_iterations` counts this update, if it was one.
+        place = state.num_iterations - (state.status < 0)
+        history = jax.tree.map(lambda entries, entry: entries.at[place].set(entry), loop.history, state.record)
+        return loop._replace(history=history)
 
     def match(self, state: State, before: Matches) -> Matches:
         problem, status, settings = self.problem, state.status, self.problem.settings
@@ -110,27 +105,16 @@ class TracedExecutor(AbstractExecutor):
         return self.rows(scores_of, motion, matches, *arguments, with_noise=self.problem.source.observed)
 
 
-def recorded(loop: LoopResult) -> LoopResult:
-    """The loop after a step, with the record of this step in its history."""
-    state = loop.state
-    # `num_iterations` counts this update, if it was one.
-    place = state.num_iterations - (state.status < 0)
-    return loop._replace(
-        history=jax.tree.map(lambda entries, entry: entries.at[place].set(entry), loop.history, state.record)
-    )
-
-
 @partial(jax.jit, static_argnames="max_iterations")
 def run_traced(problem: Problem, search: AbstractSearch | None, max_iterations: int) -> LoopResult:
     """The loop, compiled."""
-    return iterate(TracedExecutor(problem, search, max_iterations))
+    return TracedExecutor(problem, search, max_iterations).run()
 
 
 @jax.jit
 def assess(loop: LoopResult, problem: Problem, search: AbstractSearch | None) -> Assessment:
     """The assessment of the loop."""
-    moments = None if problem.fusion is not None else Lazy.of(moments_traced(loop, problem, search))
-    return assessment_of(TracedExecutor(problem, search, 0), loop, moments)
+    return assessment_of(TracedExecutor(problem, search, 0), loop, partial(moments_traced, loop, problem, search))
 
 
 @jax.jit

@@ -30,11 +30,11 @@ from mcgicp_jax._compute.threads import with_settings_of_package
 from mcgicp_jax._math.robust_kernels import AbstractKernel
 from mcgicp_jax._methods.base import AbstractMethod
 from mcgicp_jax._registration.assessment import Assessment
-from mcgicp_jax._registration.loop import LoopResult, Problem, Record, State, step
+from mcgicp_jax._registration.loop import LoopResult, Problem, Record, State
 from mcgicp_jax._registration.options import Options
 from mcgicp_jax._registration.pose_derivative import Inputs
 from mcgicp_jax._registration.register_pair import problem_of
-from mcgicp_jax._registration.traced import TracedExecutor, assess, recorded
+from mcgicp_jax._registration.traced import TracedExecutor, assess
 from mcgicp_jax._search.base import IDENTITY, AbstractSearch, SearchPoints
 
 Key = TypeVar("Key")
@@ -89,15 +89,22 @@ def run_pairs(
     search: AbstractSearch,
     num_neighbors: int,
 ) -> Iterator[Ended[Key] | Refused[Key]]:
-    """Register many pairs at a time, and yield each result as soon as it is known.
+    """Register many pairs at a time, and yield each result as soon as it is known. `num_neighbors` is that of
+    clouds that have no neighbours yet.
 
     Pairs of the same shapes share a program. Its number of lanes is fixed, as long as memory suffices, so that a result
     does not depend on the other pairs. The lanes are spread over the `default_devices`.
-
-    Args:
-        num_neighbors: of the clouds that have no neighbours yet.
     """
-    begin = _begin_with(method, options, search, num_neighbors)
+    # Numbers are traced, so that others compile nothing.
+    numbers = options.numbers
+    if isinstance(options.max_distance, tuple):
+        numbers["max_distance"] = np.asarray(options.max_distance)
+    fixed = Options(**{name: getattr(options, name) for name in ("max_iterations", "max_source_points", "reach")})
+
+    def begin(*chunk: Any) -> Lanes:
+        ready = with_neighbors(*chunk, search, num_neighbors)
+        return begin_lanes(ready, method, options.robust, numbers, search, fixed)
+
     groups: dict[Any, _Group[Key]] = {}
     last: dict[Any, int] = {}
     for number, (key, pair) in enumerate(pairs):
@@ -251,26 +258,6 @@ def _put(lanes: Lanes, chunk: Lanes, numbers: Int[Array, "n"], rows: Int[Array, 
     return jax.tree.map(lambda old, new: old.at[numbers].set(new[rows], mode="drop"), lanes, chunk)
 
 
-def _begin_with(
-    method: AbstractMethod, options: Options, search: AbstractSearch, num_neighbors: int
-) -> Callable[..., Lanes]:
-    """`begin_lanes` with the arguments that all pairs share. Numbers are traced, so that others compile nothing."""
-    distance = options.max_distance
-    numbers = {
-        "max_distance": np.asarray(distance) if isinstance(distance, tuple) else distance,
-        "translation_tolerance": options.translation_tolerance,
-        "rotation_tolerance": options.rotation_tolerance,
-        "hold_unconstrained": options.hold_unconstrained,
-    }
-    fixed = Options(**{name: getattr(options, name) for name in ("max_iterations", "max_source_points", "reach")})
-
-    def begin(*chunk: Any) -> Lanes:
-        pairs = with_neighbors(*chunk, search, num_neighbors)
-        return begin_lanes(pairs, method, options.robust, numbers, search, fixed)
-
-    return begin
-
-
 @with_settings_of_package
 @partial(jax.jit, static_argnames="num_neighbors")
 def with_neighbors(
@@ -287,7 +274,7 @@ def with_neighbors(
         rows: those of source and target in them.
     """
 
-    def found(cloud: PointCloud) -> PointCloud:
+    def with_own(cloud: PointCloud) -> PointCloud:
         if cloud.deferred_neighbors is not None:
             return cloud
         points = SearchPoints(cloud.points, cloud.points[:, :0], cloud.valid)
@@ -295,9 +282,9 @@ def with_neighbors(
         neighbors = search.nearest_traced(pose, points, points, everywhere, jnp.bool_(True), num_neighbors)
         return cloud.replace_rows(deferred_neighbors=neighbors.T)
 
-    ready = [jax.vmap(found)(each) for each in clouds]
+    ready = [jax.vmap(with_own)(stacked) for stacked in clouds]
     sides = zip((ready[0], ready[-1]), rows.T, strict=True)
-    return LanePair(starts, *(jax.tree.map(itemgetter(some), each) for each, some in sides))
+    return LanePair(starts, *(jax.tree.map(itemgetter(numbers), stacked) for stacked, numbers in sides))
 
 
 @with_settings_of_package
@@ -311,10 +298,7 @@ def begin_lanes(
     options: Options,
 ) -> Lanes:
     """Stacked pairs as problems with their loops before the first step: surfaces and parameters in one program.
-
-    Args:
-        numbers: the options that are numbers, by name.
-    """
+    `numbers` are the options that are numbers, by name."""
     options = replace(options, **numbers)
 
     def begin(pair: LanePair) -> Lanes:
@@ -336,9 +320,8 @@ def run_lanes(problems: Problem, loops: LoopResult, search: AbstractSearch, num_
         def unfinished(counted: tuple[LoopResult, Int[Array, ""]]) -> Bool[Array, ""]:
             return (counted[0].state.status < 0) & (counted[1] < num_steps)
 
-        return jax.lax.while_loop(
-            unfinished, lambda counted: (recorded(step(executor, counted[0])), counted[1] + 1), (loop, jnp.int32(0))
-        )[0]
+        start = loop, jnp.int32(0)
+        return jax.lax.while_loop(unfinished, lambda counted: (executor.step(counted[0]), counted[1] + 1), start)[0]
 
     return jax.vmap(run)(problems, loops)
 
@@ -349,5 +332,5 @@ def results_of_lanes(
     problems: Problem, loops: LoopResult, search: AbstractSearch
 ) -> Packed[tuple[State, Assessment, Record]]:
     """States, assessments at their poses and histories of stacked loops, in one array."""
-    assessed = jax.vmap(lambda problem, loop: assess(loop, problem, search))(problems, loops)
-    return Packed.of((loops.state, assessed, loops.history))
+    assessments = jax.vmap(lambda problem, loop: assess(loop, problem, search))(problems, loops)
+    return Packed.of((loops.state, assessments, loops.history))

@@ -39,7 +39,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Float, Int
 
 from mcgicp_jax._compute.concrete import AnyArray, AnyScalar, numpy_for
 from mcgicp_jax._local_geometry.cloud_statistics import gain_and_offset
@@ -179,26 +179,20 @@ class Photometric(AbstractAdaptiveTerm):
         zeros, ones = (make(1 + num_channels, spacing.dtype) for make in (xp.zeros, xp.ones))
         return cls(spacing, zeros, ones, ones[1:], zeros[1:], coarse, equalizes_channels, robust=robust)
 
-    @staticmethod
-    def columns(around: Neighborhoods, local: LocalGeometry | None) -> FittedChannels:
-        return fitted_channels(around, local)
-
-    @property
-    def is_known(self) -> Bool[AnyScalar, ""]:
-        """Whether the numbers have been estimated."""
-        return self.deviations[0] > 0
+    columns = staticmethod(fitted_channels)
 
     @property
     def estimates_gains(self) -> bool:
         return self.equalizes_channels
 
     def linearize(self, matches: PosedMatches) -> Linearization:
-        def known() -> Linearization:
-            residuals, residual = self._residuals(matches), matches.target.points.T - matches.moved
+        def photometric() -> Linearization:
+            values, slopes, *_ = self._residuals(matches)
+            residual = matches.target.points.T - matches.moved
             scale: Any = _KERNEL_SCALE
             robust = Cauchy(scale) if self.robust is None else self.robust
             parts = []
-            for k, (value, slope) in enumerate(zip(residuals.values, residuals.slopes, strict=True)):
+            for k, (value, slope) in enumerate(zip(values, slopes, strict=True)):
                 counts = (self.deviations[k] > 0) & ~jnp.isnan(value)
                 deviation = jnp.where(self.deviations[k] > 0, self.deviations[k], 1)
                 share = jnp.where(counts, 1 / self.designs[k], 0)
@@ -210,9 +204,11 @@ class Photometric(AbstractAdaptiveTerm):
                 parts.append(Linearization(force, weight * information, cost, weight, residual, information))
             return sum(parts[1:], start=parts[0])
 
-        return jax.lax.cond(self.is_known, known, lambda: self.coarse.linearize(matches))
+        # Before the first estimate the deviations are 0.
+        return jax.lax.cond(self.deviations[0] > 0, photometric, lambda: self.coarse.linearize(matches))
 
-    def _residuals(self, matches: PosedMatches) -> _Columns:
+    def _residuals(self, matches: PosedMatches) -> tuple[list[Any], list[Any], list[Any], list[Any]]:
+        """The columns of `Residuals` but the last, as one array (n,) or (3, n) per residual or channel."""
         source, target, moved, rotation, valid = matches
         offset = jnp.where(valid, moved - target.points.T, 0)
         a, b = source.columns[self.name], target.columns[self.name]
@@ -232,18 +228,13 @@ class Photometric(AbstractAdaptiveTerm):
             slopes.append(jnp.where(known, slope, 0))
             own.append(jnp.where(known, fitted, jnp.nan))
             products.append(jnp.where(known, alg.inner(turned, gradient), 0))
-        return _Columns(values, slopes, own, products)
+        return values, slopes, own, products
 
     def sample(self, matches: PosedMatches) -> Residuals:
-        found = self._residuals(matches)
-        own, products = (
-            jnp.stack(each, axis=1) if each else jnp.zeros((matches.valid.size, 0), matches.moved.dtype)
-            for each in (found.own, found.products)
-        )
-        slopes = jnp.stack(found.slopes).transpose(2, 0, 1)
-        return Residuals(
-            jnp.stack(found.values, axis=1), slopes, own, products, jnp.where(matches.valid, matches.moved, 0).T
-        )
+        values, slopes, own, products = self._residuals(matches)
+        rows = [jnp.stack(columns, axis=1) for columns in (values, own, products)]
+        moved = jnp.where(matches.valid, matches.moved, 0).T
+        return Residuals(rows[0], jnp.stack(slopes).transpose(2, 0, 1), rows[1], rows[2], moved)
 
     def adapt(self, sample: Residuals, fraction: Float[AnyScalar, ""]) -> Photometric:
         """The term with its numbers estimated from the residuals of an even sample of the correspondences.
@@ -324,15 +315,6 @@ class Photometric(AbstractAdaptiveTerm):
         response = change / xp.where(predicted > 0, predicted, 1)
         response = xp.where(predicted > 0, xp.clip(response, _LEAST_RESPONSE, 1), 1)
         return replace(self, designs=self.designs / response.astype(self.designs.dtype))
-
-
-class _Columns(NamedTuple):
-    """`Residuals` as one array per residual and channel, (n,) or (3, n)."""
-
-    values: list[Float[Array, "n"]]
-    slopes: list[Float[Array, "3 n"]]
-    own: list[Float[Array, "n"]]
-    products: list[Float[Array, "n"]]
 
 
 def _squared_sums(scores: Float[AnyArray, "K 3 n"], cells: Int[AnyArray, "n"]) -> Float[AnyArray, "K"]:
