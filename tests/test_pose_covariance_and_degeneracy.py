@@ -76,6 +76,7 @@ def test_padding_changes_no_pose_and_no_deviation(method):
     )
     np.testing.assert_allclose(padded.matrix, result.matrix, atol=1e-6)
     np.testing.assert_allclose(padded.deviations, result.deviations, rtol=1e-4)
+    np.testing.assert_allclose(padded.overlap, result.overlap, rtol=0.01)
 
 
 @pytest.mark.parametrize("noise", [0.25, 1.0])

@@ -81,6 +81,19 @@ def test_priors_give_the_same_inside_transformations(both):
     check_slope(graph, slope)
 
 
+def test_a_rejected_edge_has_no_gradient():
+    poses, i, j = np.tile(np.eye(4), (3, 1, 1)), np.array([0, 1, 0, 0]), np.array([1, 2, 2, 2])
+    motions, information = np.tile(np.eye(4), (4, 1, 1)), np.tile(100 * np.eye(6), (4, 1, 1))
+    motions[3, 0, 3] = 10
+
+    def along(motions):
+        edges = mcg.Edge(i, j, motions, information, uncertain=np.arange(4) == 3)
+        return mcg.optimize_poses(mcg.PoseGraph(poses, edges)).poses[2, 0, 3]
+
+    gradient = jax.grad(along)(jnp.asarray(motions))
+    assert np.any(gradient[:3]) and not np.any(gradient[3])
+
+
 def check_slope(graph, slope):
     twists, change = direction(graph)
     edges, h = graph.edges, 0.02

@@ -142,6 +142,13 @@ def test_moments_in_jax():
         np.testing.assert_allclose(covariances, expected.covariances, atol=atol)
 
 
+@in_float64
+def test_the_gradient_of_a_cell_that_is_as_wide_as_long_is_finite():
+    points, channels = jnp.array([[1.0, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0]]), jnp.zeros((4, 0))
+    gradient = jax.grad(lambda points: jnp.sum(extend.cell_moments(points, channels, np.zeros(4, int))[2][:, 0, 0]))
+    np.testing.assert_allclose(gradient(points), 2 / 3 * points * jnp.array([1, 0, 0]), atol=1e-12)
+
+
 def test_moments_of_cells_without_channels():
     points, _ = room_corner(900)
     cells = extend.voxel_cells(points, SIZE)
