@@ -102,21 +102,6 @@ def test_a_second_run_does_what_is_missing(folder, tmp_path, capsys):
     assert output.read_text() == complete
 
 
-def test_arrays_instead_of_rows(folder, tmp_path):
-    output = tmp_path / "results.npz"
-    assert run_folder(folder, tmp_path / "results.csv") == 0
-    expected = {row["source"]: row for row in table(tmp_path / "results.csv")}
-    # The second time there is nothing to do.
-    for _ in range(2):
-        assert run_folder(folder, output) == 0
-        with np.load(output) as arrays:
-            assert len(arrays["source"]) == NUM_FILES - 1
-            for name, found in zip(arrays["source"], arrays["T_target_source"], strict=True):
-                np.testing.assert_array_equal(found, matrix(expected[name]))
-            assert (arrays["status"] == "converged").all() and arrays["iterations"].dtype.kind == "i"
-    assert {path.name for path in tmp_path.iterdir()} == {"results.npz", "results.csv"}
-
-
 def test_pairs_that_fail_have_messages_of_their_own(folder, tmp_path, capsys):
     far, start = motion((50.0, 0, 0, 0, 0, 0))[:3].ravel(), np.eye(4)[:3].ravel()
     sources = {"missing.ply": start, "scan_1.ply": start, "notes.txt": start, "scan_2.ply": far}
@@ -132,8 +117,7 @@ def test_pairs_that_fail_have_messages_of_their_own(folder, tmp_path, capsys):
     assert "mcgicp: missing.ply scan_0.ply: source:" in errors and "3 of 4 pairs" in errors
 
 
-@pytest.mark.parametrize("name", ["results.csv", "results.npz"])
-def test_a_pair_from_several_starts(folder, tmp_path, capsys, name):
+def test_a_pair_from_several_starts(folder, tmp_path, capsys):
     """Rows are in the order of the pairs, which tells the starts apart; a start that is added is run alone."""
     starts = [motion((50.0, 0, 0, 0, 0, 0)), np.eye(4), pose(1)]
     lines = [["scan_1.ply", "scan_0.ply", *start[:3].ravel()] for start in starts]
@@ -141,14 +125,10 @@ def test_a_pair_from_several_starts(folder, tmp_path, capsys, name):
         shutil.copy2(folder / scan, tmp_path)
     for rows, done in ((lines[::2], 0), (lines, 2)):
         pairs = write_pairs(tmp_path / "pairs.csv", rows, ("source", "target", *POSE))
-        assert main(["batch", pairs, "--output", str(tmp_path / name), *OPTIONS]) == 1
+        assert main(["batch", pairs, "--output", str(tmp_path / "results.csv"), *OPTIONS]) == 1
         assert (f"of which {done}" in capsys.readouterr().out) == bool(done)
-    found = (
-        np.load(tmp_path / name)["status"]
-        if name.endswith("npz")
-        else [row["status"] for row in table(tmp_path / name)]
-    )
-    assert list(found) == ["too_few_correspondences", "converged", "converged"]
+    statuses = [row["status"] for row in table(tmp_path / "results.csv")]
+    assert statuses == ["too_few_correspondences", "converged", "converged"]
 
 
 def test_a_list_that_makes_no_sense(tmp_path, capsys):
@@ -172,7 +152,7 @@ def test_a_table_of_something_else_is_left_alone(folder, tmp_path, capsys):
     assert run_folder(folder, tmp_path / "precious.csv") == 2
     assert (tmp_path / "precious.csv").read_text() == "a,b\n1,2\n"
     assert run_folder(folder, tmp_path / "results.txt") == 2
-    assert ".npz" in capsys.readouterr().err
+    assert ".csv" in capsys.readouterr().err
 
 
 @pytest.mark.slow
@@ -204,8 +184,7 @@ class Interrupts:
 
 @pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
 @pytest.mark.parametrize("lost", [False, True])
-@pytest.mark.parametrize("name", ["results.csv", "results.npz"])
-def test_an_interrupted_run_is_completed_by_the_next(folder, tmp_path, capsys, monkeypatch, name, lost):
+def test_an_interrupted_run_is_completed_by_the_next(folder, tmp_path, capsys, monkeypatch, lost):
     for path in sorted(folder.glob("*.ply"))[:3]:
         shutil.copy(path, tmp_path)
     # Neither these nor the table of the first runs is a cloud.
@@ -222,7 +201,7 @@ def test_an_interrupted_run_is_completed_by_the_next(folder, tmp_path, capsys, m
             raise KeyboardInterrupt
         yield from answers
 
-    command = ["batch", str(tmp_path), "--output", str(tmp_path / name), *OPTIONS]
+    command = ["batch", str(tmp_path), "--output", str(tmp_path / "results.csv"), *OPTIONS]
     before = signal.getsignal(signal.SIGINT)
     monkeypatch.setattr(mcg, "register_as_completed", interrupted)
     assert main(command) == 130

@@ -165,8 +165,8 @@ def test_a_first_gradient_compiles_each_program_once():
     jax.clear_caches()
     with compilations() as found:
         jax.grad(loss)(source.channels)
-    programs = ("_geometry", "surface", "_update", "root_of", "jacobian__score_of_rows", "pull__score_of_rows")
-    assert [found.count(f"jit({name})") for name in (*programs, "pull_surface")] == [1] * 7, found
+    programs = ("_geometry", "surface", "_update", "root_of", "jacobian__score_of_rows", "vjp__score_of_rows")
+    assert [found.count(f"jit({name})") for name in (*programs, "vjp_surface")] == [1] * 7, found
     # The last sums have slopes of the channels, too.
     assert found.count("jit(sums_of)") == 2, found
 

@@ -236,6 +236,23 @@ def test_a_loss_that_is_written_wrongly_is_refused():
     refused(lambda: extend.blockwise(lambda _, rows: rows.tree, 1.0, extend.Input(points)), "function")
 
 
+def counted(scale, rows):
+    """The integers come first."""
+    return ({"above": jnp.sum(rows.tree > 0, axis=1), "mean": scale * jnp.mean(rows.tree, axis=1)},)
+
+
+def test_integers_beside_other_numbers_leave_these_as_they_are():
+    points = np.random.default_rng(0).normal(size=(2500, 3)).astype(np.float32)
+    (rows,) = extend.blockwise(counted, 0.5, extend.Input(points))
+    np.testing.assert_array_equal(rows["above"], np.sum(points > 0, axis=1))
+    np.testing.assert_allclose(rows["mean"], 0.5 * points.mean(axis=1), atol=1e-6)
+
+    def loss(points):
+        return jnp.sum(extend.blockwise(counted, 0.5, extend.Input(points))[0]["mean"])
+
+    refused(lambda: jax.grad(loss)(points), "function", "int32")
+
+
 @pytest.mark.slow
 def test_the_command_line_has_what_is_registered(tmp_path):
     """If it is registered before the commands are imported."""

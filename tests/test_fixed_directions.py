@@ -122,7 +122,7 @@ def test_fixed_directions_need_no_data():
     result = mcg.register(*clouds, mcg.GICP(), prior=(truth, given), **OPTIONS)
     assert result.converged and abs(remaining(result.matrix, truth)[:3] @ axis) < 1e-6
     (direction,) = result.unconstrained_directions
-    assert direction.held_by_ties and abs(direction.axis @ axis) > 0.995
+    assert direction.constrained_by_ties and abs(direction.axis @ axis) > 0.995
     # Fixed directions do not hold the others.
     result = mcg.register(*clouds, mcg.GICP(), prior=(truth, covariance_fixing("roll pitch")), **OPTIONS)
     assert result.status is mcg.Status.DEGENERATE

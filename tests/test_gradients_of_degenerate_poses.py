@@ -78,7 +78,7 @@ class Reference:
         self._pose = result.matrix
         self._matches = mcg.find_correspondences(*clouds, self._pose, method, max_distance=GATE)
         directions, adjoint = result.directions, jaxlie.SE3.from_matrix(result.matrix).adjoint()
-        self._along = np.asarray(adjoint) @ directions.twists[directions.held].T
+        self._along = np.asarray(adjoint) @ directions.twists[directions.constrained].T
         steps = 1e-5 * np.eye(self._along.shape[1])
         forces = [self._force(clouds, method, step) - self._force(clouds, method, -step) for step in steps]
         self._slope = np.stack(forces, axis=1) / 2e-5
@@ -137,10 +137,10 @@ def test_the_derivative_within_the_constrained_directions(name, hold):
         return weigh(registered(clouds_with(inputs, *clouds), inputs["method"], **options).matrix)
 
     check(loss, Reference(clouds, method, result), clouds, method)
-    held, directions = result.directions.held, np.asarray(result.directions.twists)
-    assert (~held).sum() == free
+    constrained, directions = result.directions.constrained, np.asarray(result.directions.twists)
+    assert (~constrained).sum() == free
     along = np.tensordot(np.linalg.inv(directions.T), result.jacobian("source", "points"), 1)
-    assert np.abs(along[~held]).max() < 1e-12 < 1e-4 < np.abs(along[held]).max(axis=(1, 2)).min()
+    assert np.abs(along[~constrained]).max() < 1e-12 < 1e-4 < np.abs(along[constrained]).max(axis=(1, 2)).min()
 
 
 @in_float64
@@ -155,7 +155,7 @@ def test_the_pose_follows_the_cloud():
         moved = clouds[0].replace(points=points @ turn.rotation().as_matrix().T + turn.translation())
         return registered((moved, clouds[1]), method, init=result.matrix).matrix
 
-    for twist in directions.twists[directions.held]:
+    for twist in directions.twists[directions.constrained]:
         _, slope = jax.jvp(lambda step, twist=twist: pose(step, twist), (0.0,), (1.0,))
         difference = (pose(1e-5, twist) - pose(-1e-5, twist)) / 2e-5
         np.testing.assert_allclose(slope, difference, atol=1e-6 * np.abs(difference).max())
@@ -246,13 +246,13 @@ def test_tie_points_and_a_prior_constrain_what_the_clouds_do_not():
             options["prior"] = (jaxlie.SE3.from_matrix(start) @ jaxlie.SE3.exp(inputs["twist"]), loose)
         moved = clouds[0].replace(points=inputs.get("points", clouds[0].points)), clouds[1]
         result = registered(moved, method, **options)
-        return weigh(result.matrix), (result.status_code, result.directions.held)
+        return weigh(result.matrix), (result.status_code, result.directions.constrained)
 
     gradient = jax.grad(loss, has_aux=True)
     tied = {"target": points @ start[:3, :3].T + start[:3, 3]}
     for inputs in (tied, {"twist": np.zeros(6)}):
-        found, (status, held) = gradient(inputs)
-        assert status == Status.DEGENERATE and held.sum() == 5
+        found, (status, constrained) = gradient(inputs)
+        assert status == Status.DEGENERATE and constrained.sum() == 5
         for name, actual, expected in directional_errors(lambda inputs: loss(inputs)[0], inputs, found):
             assert abs(actual - expected) <= 1e-6 * abs(expected), name
 

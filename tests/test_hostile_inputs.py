@@ -137,7 +137,7 @@ def assert_believable(result, init=None):
     if status is Status.CONVERGED:
         assert result.num_inliers >= 4 and 0 < result.overlap <= 1
         assert np.isfinite([result.cost, result.rmse]).all() and np.isfinite(result.information).all()
-        assert all(direction.held_by_channels for direction in result.unconstrained_directions)
+        assert all(direction.constrained_by_channels for direction in result.unconstrained_directions)
     assert status.name in repr(result)
 
 

@@ -37,9 +37,9 @@ def test_an_edge_knows_next_to_nothing_of_free_directions():
     source, target, _ = pair(wall, 2000, motion((0.01, 0.01, 0.0, 0, 0, 0.01)))
     result, edges = edges_between(target, source, mcg.GICP())
     assert result.status == mcg.Status.DEGENERATE
-    held, twists = (np.asarray(each) for each in (result.directions.held, result.directions.twists))
+    constrained, twists = (np.asarray(each) for each in (result.directions.constrained, result.directions.twists))
     along = np.einsum("ki,ij,kj->k", twists, edges.information[0], twists)
-    assert np.max(along[~held]) < 1e-2 * np.min(along[held])
+    assert np.max(along[~constrained]) < 1e-2 * np.min(along[constrained])
     channels, known = edges_between(target, source, mcg.MultiChannelGICP())
     assert channels.converged
     # The variances scatter by up to 75 % with the cells in which scores are added.

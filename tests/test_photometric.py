@@ -86,7 +86,7 @@ def test_samples_are_interpolated():
     errors = [mcg.metrics.pose_error(result.matrix, truth)[0] for result in (plain, fine)]
     assert plain.converged and fine.converged
     assert errors[1] < 3e-4 < 2e-3 < errors[0]
-    assert all(direction.held_by_channels for direction in fine.unconstrained_directions)
+    assert all(direction.constrained_by_channels for direction in fine.unconstrained_directions)
 
 
 @pytest.mark.parametrize(("seed", "method", "largest"), [(24, PHOTOMETRIC, 1e-3), (104, mcg.MultiChannelGICP(), 5e-3)])

@@ -145,7 +145,6 @@ def test_what_cannot_be_drawn_is_named():
         ("poses['mirror']", "", lambda: plot.before_after(CLOUD, CLOUD, {"mirror": np.diag([1.0, 1, -1, 1])})),
         ("target", 2, lambda: plot.before_after(CLOUD, PointCloud(np.eye(3)[:2]), {})),
         ("names", 2, lambda: plot.clouds(CLOUD, CLOUD, names=["one"])),
-        ("histories['x']", (1, 2), lambda: plot.convergence({"x": np.array([[1.0, 2.0]])})),
         ("trajectories['none']", "", lambda: plot.trajectories({"none": []})),
         ("maps", "", lambda: plot.maps({})),
         ("covariances['short']", "(3, 3,", lambda: plot.surface_covariances(CLOUD, {"short": WRONG}, indices=[0])),

@@ -228,7 +228,9 @@ def test_geometry_slides_on_a_wall_and_stays_where_it_started(flat):
     source, target, truth = flat
     result = mcg.register(source, target, mcg.GICP(), max_distance=0.3)
     assert result.status is mcg.Status.DEGENERATE and not result.converged
-    kinds = [(direction.is_rotation, direction.held_by_channels) for direction in result.unconstrained_directions]
+    kinds = [
+        (direction.is_rotation, direction.constrained_by_channels) for direction in result.unconstrained_directions
+    ]
     assert kinds == [(False, False), (False, False), (True, False)]
     for direction in result.unconstrained_directions[:2]:
         assert abs(direction.axis[2]) < 0.05
@@ -257,7 +259,7 @@ def test_the_channels_hold_what_geometry_leaves_free(flat):
     source, target, truth = flat
     result = mcg.register(source, target, mcg.MultiChannelGICP(), max_distance=0.3)
     assert result.converged and len(result.unconstrained_directions) == 3
-    assert all(direction.held_by_channels for direction in result.unconstrained_directions)
+    assert all(direction.constrained_by_channels for direction in result.unconstrained_directions)
     assert mcg.metrics.pose_error(result.matrix, truth)[0] < 3e-3
     assert repr(result).count("constrained by channels: all") == 1
 
@@ -269,7 +271,7 @@ def test_a_corridor_is_free_along_its_axis(textured):
     clouds = [mcg.preprocess(frame.cloud) for frame in (source, target)]
     result = mcg.register(*clouds, mcg.MultiChannelGICP(), max_distance=0.5)
     (direction,) = result.unconstrained_directions
-    assert not direction.is_rotation and direction.held_by_channels == textured
+    assert not direction.is_rotation and direction.constrained_by_channels == textured
     axis = source.pose[:3, :3].T @ [1, 0, 0]
     assert abs(direction.axis @ axis) > 0.995
     assert result.status is (mcg.Status.CONVERGED if textured else mcg.Status.DEGENERATE)
@@ -309,7 +311,7 @@ def test_real_scenes(data):
     assert result.status is mcg.Status.DEGENERATE
     assert [direction.is_rotation for direction in result.unconstrained_directions] == [False, False, True]
     result = mcg.register(*table, mcg.MultiChannelGICP(), max_distance=0.1)
-    assert result.converged and [each.held_by_channels for each in result.unconstrained_directions] == [True] * 3
+    assert result.converged and [each.constrained_by_channels for each in result.unconstrained_directions] == [True] * 3
 
     result = mcg.register(*street, mcg.GICP(), max_distance=1.5)
     assert result.converged and result.unconstrained_directions == ()
@@ -477,7 +479,9 @@ def test_constrained_directions_keep_their_variances_beside_free_ones():
     source, target = (mcg.preprocess(wall(3000, seed=seed)[0] @ turned[:3, :3].T) for seed in (1, 2))
     result = mcg.register(source, target, mcg.GICP(), max_distance=0.3)
     assert result.status == mcg.Status.DEGENERATE and result.covariance.dtype == np.float64
-    held = np.linalg.inv(np.asarray(result.directions.twists, np.float64).T)[np.asarray(result.directions.held)]
-    values = np.linalg.eigvalsh(held @ result.covariance @ held.T)
+    constrained = np.linalg.inv(np.asarray(result.directions.twists, np.float64).T)[
+        np.asarray(result.directions.constrained)
+    ]
+    values = np.linalg.eigvalsh(constrained @ result.covariance @ constrained.T)
     assert len(values) == 3 and values.min() > 0 and np.sqrt(values.max()) < 1e-3
     assert np.linalg.eigvalsh(result.covariance).max() > 1

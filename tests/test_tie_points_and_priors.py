@@ -221,7 +221,9 @@ def test_a_tie_point_holds_the_axis_of_a_corridor(hall):
     result = mcg.register(source, target, mcg.GICP(), tie_points=one, **options)
     assert result.converged and result.deviations.max() < 0.03
     (direction,) = result.unconstrained_directions
-    assert direction.held_by_ties and not direction.held_by_channels and abs(direction.axis @ axis) > 0.995
+    assert (
+        direction.constrained_by_ties and not direction.constrained_by_channels and abs(direction.axis @ axis) > 0.995
+    )
     assert "constrained by tie points or prior" in repr(direction) and "by tie points or prior" in repr(result)
     error = twist_error(result.matrix, truth)
     assert abs(error[:3] @ axis) < 0.03
@@ -356,10 +358,14 @@ def test_covariances_are_right(scene):
         for name, options in given.items():
             result = mcg.register(*clouds, mcg.GICP(), init=start, **options, **OPTIONS)
             coordinates = np.linalg.inv(np.asarray(result.directions.twists, float).T)
-            held = np.asarray(result.directions.held)
+            constrained = np.asarray(result.directions.constrained)
             error = coordinates @ twist_error(result.matrix, truth)
             spread = coordinates @ np.asarray(result.covariance) @ coordinates.T
-            value = error[held] @ np.linalg.solve(spread[np.ix_(held, held)], error[held]) / held.sum()
+            value = (
+                error[constrained]
+                @ np.linalg.solve(spread[np.ix_(constrained, constrained)], error[constrained])
+                / constrained.sum()
+            )
             nees.setdefault(name, []).append(value)
             squares.setdefault(name, []).append(error @ error)
             if name != "nothing":

@@ -29,7 +29,7 @@ from mcgicp_jax._cli.options import (
 from mcgicp_jax._compute.messages import messages_named
 from mcgicp_jax._compute.threads import side_by_side
 from mcgicp_jax._methods.base import AbstractMethod
-from mcgicp_jax._pose_solver.degeneracy import describe
+from mcgicp_jax._pose_solver.degeneracy import as_text
 from mcgicp_jax._registration.result import unverified
 from mcgicp_jax.extend import METHODS
 from mcgicp_jax.io.clouds import format_of
@@ -266,7 +266,7 @@ def _report(pair: PreparedPair, result: mcg.RegistrationResult) -> None:
         roll, pitch, yaw = np.degrees(angles)
         print(f"deviation: x {x:.2g}, y {y:.2g}, z {z:.2g} m; about x {roll:.2g}, y {pitch:.2g}, z {yaw:.2g} degrees")
     if result.unconstrained_directions:
-        print(f"unconstr.: {describe(result.unconstrained_directions)}")
+        print(f"unconstr.: {as_text(result.unconstrained_directions)}")
     print("T_target_source:")
     # At UTM coordinates, 1e-8 in a rotation entry moves a point by centimetres.
     form = "22.14f" if np.any(pair.ready[0].origin) else "15.8f"

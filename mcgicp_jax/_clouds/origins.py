@@ -79,11 +79,11 @@ class _InUserFrame(AbstractLinearMap):
         by_source[..., :3, 3, :] = -rotation
         self._slopes = by_pose, by_source, by_target
 
-    def push(self, tangents: Sequence[np.ndarray], moving: tuple[int, ...]) -> list[np.ndarray]:
+    def jvp(self, tangents: Sequence[np.ndarray], moving: tuple[int, ...]) -> list[np.ndarray]:
         each = zip(moving, tangents, strict=True)
         return [sum(np.einsum("...ijp,m...p->m...ij", self._slopes[i], tangent) for i, tangent in each)]
 
-    def pull(self, cotangents: Sequence[np.ndarray], moving: tuple[int, ...]) -> list[np.ndarray]:
+    def vjp(self, cotangents: Sequence[np.ndarray], moving: tuple[int, ...]) -> list[np.ndarray]:
         return [np.einsum("...ijp,m...ij->m...p", self._slopes[i], cotangents[0]) for i in moving]
 
 

@@ -26,11 +26,11 @@ class AbstractLinearMap(abc.ABC):
     cotangents."""
 
     @abc.abstractmethod
-    def push(self, tangents: Sequence[np.ndarray], moving: tuple[int, ...]) -> Sequence[np.ndarray]:
+    def jvp(self, tangents: Sequence[np.ndarray], moving: tuple[int, ...]) -> Sequence[np.ndarray]:
         """Tangents of the values, one array (m, ...) for each, from those of the inputs with numbers `moving`."""
 
     @abc.abstractmethod
-    def pull(self, cotangents: Sequence[np.ndarray], moving: tuple[int, ...]) -> Sequence[np.ndarray]:
+    def vjp(self, cotangents: Sequence[np.ndarray], moving: tuple[int, ...]) -> Sequence[np.ndarray]:
         """Cotangents of the inputs with numbers `moving`, one array (m, ...) for each, from those of the values."""
 
 
@@ -40,12 +40,12 @@ class KnownJacobian(AbstractLinearMap):
     def __init__(self, blocks: Sequence[np.ndarray]):
         self._blocks = blocks
 
-    def push(self, tangents: Sequence[np.ndarray], moving: tuple[int, ...]) -> list[np.ndarray]:
+    def jvp(self, tangents: Sequence[np.ndarray], moving: tuple[int, ...]) -> list[np.ndarray]:
         blocks = [self._blocks[i] for i in moving]
         pairs = zip(tangents, blocks, strict=True)
         return [sum(each.reshape(len(each), -1) @ block.reshape(len(block), -1).T for each, block in pairs)]
 
-    def pull(self, cotangents: Sequence[np.ndarray], moving: tuple[int, ...]) -> list[np.ndarray]:
+    def vjp(self, cotangents: Sequence[np.ndarray], moving: tuple[int, ...]) -> list[np.ndarray]:
         return [np.tensordot(cotangents[0], self._blocks[i], 1) for i in moving]
 
 
@@ -62,15 +62,15 @@ class SideBySide(AbstractLinearMap):
             for start, stop in itertools.pairwise(self._starts.tolist())
         ]
 
-    def push(self, tangents: Sequence[np.ndarray], moving: tuple[int, ...]) -> list[np.ndarray]:
+    def jvp(self, tangents: Sequence[np.ndarray], moving: tuple[int, ...]) -> list[np.ndarray]:
         rest = iter(tangents)
         parts = zip(self._maps, self._moving(moving), strict=True)
-        values = side_by_side([partial(each.push, [next(rest) for _ in own], own) for each, own in parts])
+        values = side_by_side([partial(each.jvp, [next(rest) for _ in own], own) for each, own in parts])
         return [value for (value,) in values]
 
-    def pull(self, cotangents: Sequence[np.ndarray], moving: tuple[int, ...]) -> list[np.ndarray]:
+    def vjp(self, cotangents: Sequence[np.ndarray], moving: tuple[int, ...]) -> list[np.ndarray]:
         parts = zip(self._maps, cotangents, self._moving(moving), strict=True)
-        results = side_by_side([partial(each.pull, [cotangent], own) for each, cotangent, own in parts])
+        results = side_by_side([partial(each.vjp, [cotangent], own) for each, cotangent, own in parts])
         return list(itertools.chain.from_iterable(results))
 
 
@@ -107,8 +107,8 @@ def with_derivative(values: Sequence[np.ndarray], linear: AbstractLinearMap, inp
             return outputs, [jnp.zeros_like(value) for value in outputs]
         slopes = _linear.bind(
             *(tangents[i] for i in moving),
-            function=partial(linear.push, moving=moving),
-            transpose=partial(linear.pull, moving=moving),
+            function=partial(linear.jvp, moving=moving),
+            transpose=partial(linear.vjp, moving=moving),
             inputs=tuple(jax.typeof(inputs[i]) for i in moving),
             outputs=tuple(map(jax.typeof, outputs)),
             batch=(),
@@ -134,14 +134,14 @@ class RowAverage(AbstractLinearMap):
         counts = np.maximum(self._sum @ known.astype(np.float64), 1)
         self._rows, self._weights, self._size = rows, known / counts[groups], sizes[0]
 
-    def push(self, tangents: Sequence[np.ndarray], moving: tuple[int, ...]) -> list[np.ndarray]:
+    def jvp(self, tangents: Sequence[np.ndarray], moving: tuple[int, ...]) -> list[np.ndarray]:
         (each,) = tangents
         shape = each.shape[2:]
         flat = each.reshape(*each.shape[:2], math.prod(shape))[:, self._rows]
         size = self._sum.shape[0]
         return [np.stack([(self._sum @ (self._weights * rows)).reshape(size, *shape) for rows in flat])]
 
-    def pull(self, cotangents: Sequence[np.ndarray], moving: tuple[int, ...]) -> list[np.ndarray]:
+    def vjp(self, cotangents: Sequence[np.ndarray], moving: tuple[int, ...]) -> list[np.ndarray]:
         (each,) = cotangents
         shape = each.shape[2:]
         by_rows = np.zeros((len(each), self._size, *shape), each.dtype)
@@ -160,7 +160,7 @@ def averaged(values: Float[AnyArray, "N D"], groups: Int[np.ndarray, "N"]) -> Fl
         sums = jax.ops.segment_sum(values[rows], groups, len(counts))
         return sums / np.maximum(counts, 1)[:, None].astype(values.dtype)
     average = RowAverage(rows, groups, np.ones((len(rows), 1)), (len(known), len(counts)))
-    (mean,) = average.push([np.asarray(known)[None]], (0,))
+    (mean,) = average.jvp([np.asarray(known)[None]], (0,))
     found = mean[0].astype(known.dtype)
     return found if is_concrete(values) else with_derivative([found], average, [values])[0]
 

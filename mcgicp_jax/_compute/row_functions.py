@@ -87,7 +87,7 @@ class GivenTable:
     def columns(self, moving: Moving) -> tuple[int, ...]:
         return tuple(i for i, leaf in enumerate(self._leaves) if id(leaf) in moving)
 
-    def pull(self, cotangents: Any, moving: Moving, into: Slopes, rows: Any = None) -> None:
+    def vjp(self, cotangents: Any, moving: Moving, into: Slopes, rows: Any = None) -> None:
         start = 0
         for leaf in (self._leaves[i] for i in self.columns(moving)):
             stop = start + math.prod(leaf.shape[1:])
@@ -95,7 +95,7 @@ class GivenTable:
             into[id(leaf)] = into.get(id(leaf), 0) + found.reshape(len(found), *leaf.shape)
             start = stop
 
-    def push(self, tangents: Slopes, moving: Moving, rows: Any) -> np.ndarray:
+    def jvp(self, tangents: Slopes, moving: Moving, rows: Any) -> np.ndarray:
         leaves = [tangents[id(self._leaves[i])] for i in self.columns(moving)]
         return np.concatenate([leaf.reshape(*leaf.shape[:2], -1) for leaf in leaves], axis=-1).swapaxes(0, 1)[rows]
 
@@ -175,13 +175,13 @@ class RowFunction:
         return reduce(partial(jax.tree.map, np.add), parts)
 
     def cotangents(self, cotangents: np.ndarray, leaves: Sequence[Any]) -> list[np.ndarray]:
-        """Cotangents (c, ...) of some arrays, from those of the sum or of the rows, as `pull` takes them."""
+        """Cotangents (c, ...) of some arrays, from those of the sum or of the rows, as `vjp` takes them."""
         into: Slopes = {}
-        self.pull(cotangents, frozenset(map(id, leaves)), into)
+        self.vjp(cotangents, frozenset(map(id, leaves)), into)
         count = cotangents.shape[0 if self._total else 1]
         return [into.get(id(leaf), np.zeros((count, *np.shape(leaf)))) for leaf in leaves]
 
-    def pull(self, cotangents: Any, moving: Moving, into: Slopes, rows: Int[np.ndarray, "n"] | None = None) -> None:
+    def vjp(self, cotangents: Any, moving: Moving, into: Slopes, rows: Int[np.ndarray, "n"] | None = None) -> None:
         """Add the cotangents of what is moving to `into`.
 
         Args:
@@ -192,7 +192,7 @@ class RowFunction:
         if not any(chosen):
             return
         gathered = _Gathered(self._inputs, self.size, rows)
-        program, count = _pull_program(self._function, self._total, chosen), cotangents.shape[0 if self._total else 1]
+        program, count = _vjp_program(self._function, self._total, chosen), cotangents.shape[0 if self._total else 1]
 
         def call(block: Any, places: slice) -> Any:
             some = cotangents
@@ -214,21 +214,21 @@ class RowFunction:
                         slopes[j] = np.zeros((self._inputs[j].table.size, count, by.shape[-1]), by.dtype)
                     _add_rows(slopes[j], indices[j][live], np.moveaxis(by, 0, -2)[(*live, slice(None), slice(None))])
         for j, slope in slopes.items():
-            self._inputs[j].table.pull(slope, moving, into, gathered.used(j))
+            self._inputs[j].table.vjp(slope, moving, into, gathered.used(j))
 
-    def push(self, tangents: Slopes, moving: Moving, rows: Int[np.ndarray, "n"] | None = None) -> np.ndarray:
+    def jvp(self, tangents: Slopes, moving: Moving, rows: Int[np.ndarray, "n"] | None = None) -> np.ndarray:
         """Tangents (c, L) of the sum, packed, or (n, c, L) of the rows, from those (c, ...) of what is moving. A scalar
         0 if it does not depend on that."""
         numbers, *columns = chosen = self._chosen(moving)
         if not any(chosen):
             return np.zeros(())
         gathered = _Gathered(self._inputs, self.size, rows)
-        program = _push_program(self._function, self._total, chosen)
+        program = _jvp_program(self._function, self._total, chosen)
         by_numbers = [tangents[id(self._leaves[i])].astype(np.result_type(self._leaves[i])) for i in numbers]
         slopes: dict[int, np.ndarray] = {}
         for j, table in ((j, self._inputs[j].table) for j, some in enumerate(columns) if some):
             used = gathered.used(j)
-            found = table.push(tangents, moving, used)
+            found = table.jvp(tangents, moving, used)
             slopes[j] = np.zeros((table.size, *found.shape[1:]), found.dtype)
             slopes[j][used] = found
 
@@ -359,7 +359,8 @@ def blockwise(function: Callable[..., Any], numbers: Any, *inputs: Input, total:
         to autodiff. Outside `jit`, first derivatives only.
 
     Raises:
-        ValueError: if an input is no `Input`, or the function returns no tuple of trees, and `total` is False.
+        ValueError: if an input is no `Input`; if the function returns no tuple of trees, and `total` is False; if it is
+            differentiated and returns integers or booleans in the first tree, or in the sum.
 
     Example: the sum of squared differences of matched channels.
 
@@ -384,6 +385,11 @@ def blockwise(function: Callable[..., Any], numbers: Any, *inputs: Input, total:
         packs = [Packed(table.astype(packs[0].table.dtype), packs[0].layout)]
     leaves, structure = jax.tree.flatten(packs[0].tree)
     if applied.tracers:
+        for leaf in leaves:
+            if not jnp.issubdtype(leaf.dtype, jnp.floating):
+                raise ValueError(
+                    f"function: expected floats to differentiate, and others in a second tree, got {leaf.dtype}"
+                )
         leaves = with_derivative(leaves, _Derivative(applied, total, packs[0].layout), applied.tracers)
     elif total:
         leaves = [jax.device_put(leaf) for leaf in leaves]
@@ -405,12 +411,12 @@ class _Derivative(AbstractLinearMap):
         self._applied, self._total, self._layout = applied, total, layout
         self._leaves = applied.tracers
 
-    def push(self, tangents: Sequence[np.ndarray], moving: tuple[int, ...]) -> list[np.ndarray]:
+    def jvp(self, tangents: Sequence[np.ndarray], moving: tuple[int, ...]) -> list[np.ndarray]:
         slopes = {id(self._leaves[i]): tangent for i, tangent in zip(moving, tangents, strict=True)}
-        found = self._applied.push(slopes, frozenset(slopes))
+        found = self._applied.jvp(slopes, frozenset(slopes))
         return jax.tree.leaves(Packed(found if self._total else found.swapaxes(0, 1), self._layout).tree)
 
-    def pull(self, cotangents: Sequence[np.ndarray], moving: tuple[int, ...]) -> list[np.ndarray]:
+    def vjp(self, cotangents: Sequence[np.ndarray], moving: tuple[int, ...]) -> list[np.ndarray]:
         packed = Packed.of(list(cotangents), num_axes=1 if self._total else 2).table
         packed = packed if self._total else packed.swapaxes(0, 1)
         return self._applied.cotangents(packed, [self._leaves[i] for i in moving])
@@ -519,7 +525,7 @@ def _of_chosen(
 
 
 @cache
-def _pull_program(function: Callable[..., Any], total: bool, chosen: Chosen) -> Callable[..., Any]:
+def _vjp_program(function: Callable[..., Any], total: bool, chosen: Chosen) -> Callable[..., Any]:
     """The vector-Jacobian product of a block for several cotangents: of the chosen numbers, (c, ...), and of the chosen
     columns of each input side by side, (c, n, W) or (c, k, n, W); None where there are none."""
 
@@ -533,14 +539,14 @@ def _pull_program(function: Callable[..., Any], total: bool, chosen: Chosen) -> 
             for columns, index in zip(by_rows, indices, strict=True)
         ]
 
-    program.__name__ = f"pull_{function.__name__}"
+    program.__name__ = f"vjp_{function.__name__}"
     return quickly_compiled(program)
 
 
 @cache
-def _push_program(function: Callable[..., Any], total: bool, chosen: Chosen) -> Callable[..., Any]:
+def _jvp_program(function: Callable[..., Any], total: bool, chosen: Chosen) -> Callable[..., Any]:
     """The Jacobian-vector products of a block, (c, L) or (c, n, L), for several tangents, shaped as the results of
-    `_pull_program`."""
+    `_vjp_program`."""
 
     def program(numbers: Any, packs: Any, indices: Any, by_numbers: Any, by_rows: Any) -> Any:
         result, here = _of_chosen(function, total, chosen, numbers, packs, indices)
@@ -551,7 +557,7 @@ def _push_program(function: Callable[..., Any], total: bool, chosen: Chosen) -> 
             slopes.append([part.reshape(len(part), *each.shape) for part, each in zip(parts, columns, strict=True)])
         return jax.vmap(jax.linearize(result, here)[1])(slopes)
 
-    program.__name__ = f"push_{function.__name__}"
+    program.__name__ = f"jvp_{function.__name__}"
     return quickly_compiled(program)
 
 
@@ -561,8 +567,8 @@ def _jacobian_program(function: Callable[..., Any], chosen: Chosen) -> Callable[
 
     def program(*arguments: Any) -> Any:
         result, here = _of_chosen(function, True, chosen, *arguments)
-        value, pull = jax.vjp(result, here)
-        return value, jax.vmap(pull)(jnp.eye(len(value), dtype=value.dtype))[0][0]
+        value, vjp = jax.vjp(result, here)
+        return value, jax.vmap(vjp)(jnp.eye(len(value), dtype=value.dtype))[0][0]
 
     program.__name__ = f"jacobian_{function.__name__}"
     return quickly_compiled(program)

@@ -37,7 +37,8 @@ class Packed(Generic[Tree]):
     """A tree of arrays in one; a pytree, whose layout is static.
 
     Attributes:
-        table: (..., L). Its dtype is that of the first array; integers up to 2²⁴ and booleans are exact in it.
+        table: (..., L). Its dtype is that of the floats, if there are any; integers up to 2²⁴ and booleans are exact in
+            it.
     """
 
     table: Any
@@ -47,11 +48,12 @@ class Packed(Generic[Tree]):
     def of(tree: Tree, num_axes: int = 1) -> Packed[Tree]:
         """Pack NumPy or traced arrays that share their first `num_axes` axes."""
         leaves, structure = jax.tree.flatten(tree)
-        dtype = leaves[0].dtype
+        dtypes = [leaf.dtype for leaf in leaves]
+        dtype = np.result_type(*([dtype for dtype in dtypes if jnp.issubdtype(dtype, jnp.floating)] or dtypes))
         layout = Layout(
             structure,
             tuple(leaf.shape[num_axes:] for leaf in leaves),
-            tuple(None if leaf.dtype == dtype else leaf.dtype for leaf in leaves),
+            tuple(None if own == dtype else own for own in dtypes),
         )
         xp: Any = np if isinstance(leaves[0], np.ndarray) else jnp
         shared = leaves[0].shape[:num_axes]

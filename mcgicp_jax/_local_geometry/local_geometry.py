@@ -49,7 +49,7 @@ class LocalGeometry(NamedTuple):
         normal: unit eigenvector of its smallest eigenvalue.
         observability: by the shape of the surface (symmetric), see `_local_geometry.observability`.
         roughness: half the squared height difference along the normal between the point and a neighbour, metres².
-        reach: distance to the farthest neighbour, metres.
+        neighborhood_radius: distance to the farthest neighbour, metres.
         fits: linear fits of the channels.
     """
 
@@ -57,7 +57,7 @@ class LocalGeometry(NamedTuple):
     normal: Float[AnyArray, "*batch N 3"]
     observability: Float[AnyArray, "*batch N 6"]
     roughness: Float[AnyArray, "*batch N"]
-    reach: Float[AnyArray, "*batch N"]
+    neighborhood_radius: Float[AnyArray, "*batch N"]
     fits: ChannelFits
 
 
@@ -90,7 +90,7 @@ def local_geometry_of(around: Neighborhoods) -> LocalGeometry:
         normal=normal.T,
         observability=observability_of_halves(covariances, normals, counts, used).T,
         roughness=0.5 * height**2,
-        reach=jnp.sqrt(jnp.max(sum(offset * offset for offset in fixed), axis=0)),
+        neighborhood_radius=jnp.sqrt(jnp.max(sum(offset * offset for offset in fixed), axis=0)),
         fits=fit_channels(jax.lax.stop_gradient(around), x, y),
     )
 
@@ -135,7 +135,7 @@ def geometry_of_cells(local: LocalGeometry, given: Float[Array, "6 n"], num_cand
         normal=normal.T,
         observability=geometry_observability(given, normal, count).T,
         roughness=across,
-        reach=0.5 * jnp.sqrt(num_candidates * _SQUARE_EDGE * (given[0] + given[3] + given[5])),
+        neighborhood_radius=0.5 * jnp.sqrt(num_candidates * _SQUARE_EDGE * (given[0] + given[3] + given[5])),
         fits=local.fits,
     )
 
@@ -193,14 +193,14 @@ class SurfaceNoise(NamedTuple):
         descriptors: variance of the descriptors α · channel about their linear fits, metres², summed over the channels.
         normal: unit normal.
         roughness: half the squared height difference along the normal between a point and a neighbour, metres².
-        reach: distance to the farthest neighbour, metres.
+        neighborhood_radius: distance to the farthest neighbour, metres.
         slopes: gradients of the descriptors; None where channels are not used, and for cells.
     """
 
     descriptors: Float[AnyArray, "*batch N"]
     normal: Float[AnyArray, "*batch N 3"]
     roughness: Float[AnyArray, "*batch N"]
-    reach: Float[AnyArray, "*batch N"]
+    neighborhood_radius: Float[AnyArray, "*batch N"]
     slopes: Float[AnyArray, "*batch N C 3"] | None = None
 
 

@@ -348,6 +348,6 @@ def surface_of(
             # Slopes between cells are not those between points.
             slopes = None
     # Observability is constant to autodiff.
-    details = SurfaceNoise(noise, local.normal, local.roughness, local.reach, slopes)
+    details = SurfaceNoise(noise, local.normal, local.roughness, local.neighborhood_radius, slopes)
     by_shape, by_channels, details = jax.lax.stop_gradient((local.observability, by_channels, details))
     return surface._replace(observability=by_shape, channel_observability=by_channels, noise=details)

@@ -121,9 +121,9 @@ def register(
     points and prior act only in directions that they know far more precisely than the matches do. A second one starts
     at its pose and weighs matches, tie points and prior by their covariances (Hansen 1982, generalised method of
     moments). It is the result; its `covariance` and `information` include tie points and prior. They also constrain
-    directions that the clouds do not (`UnconstrainedDirection.held_by_ties`). The pose is differentiable with respect
-    to points, pose and covariances; the weights of the matches are constants to autodiff. Contradictions are averaged,
-    not detected. Inside transformations, covariances are not checked.
+    directions that the clouds do not (`UnconstrainedDirection.constrained_by_ties`). The pose is differentiable with
+    respect to points, pose and covariances; the weights of the matches are constants to autodiff. Contradictions are
+    averaged, not detected. Inside transformations, covariances are not checked.
 
     Fixed directions act from the first update on: ξ along them stays 0, the covariance is 0 up to rounding,
     `directions.ties` are infinite, `information` leaves them out, and the clouds need not constrain them. A covariance

@@ -8,7 +8,7 @@ of the forces, w M(I − O)d, sums to a bias of nearest-neighbour matching, whic
 `voxel_gaussians` stand still instead: A = Σ w JᵀMJ (`matches_slide`). (Including the derivative of M with respect to
 the rotation in A changed the result by less than 1 %.)
 
-Three steps: medians over sampled rows (`discounts_and_reach`), scores of all rows (`scores_of`), and 6×6 algebra
+Three steps: medians over sampled rows (`discounts_and_radius`), scores of all rows (`scores_of`), and 6×6 algebra
 (`sandwich`). The first two work row by row, in blocks or over whole arrays.
 """
 
@@ -49,13 +49,13 @@ class NoiseSample(NamedTuple):
         expected: its variance expected from roughness, metres².
         quotient: squared descriptor difference over its variance expected from channel noise; NaN also where a point
             lacks a channel.
-        reach: mean distance of both points to their farthest neighbours, metres.
+        neighborhood_radius: mean distance of both points to their farthest neighbours, metres.
     """
 
     residual: Float[AnyArray, "n"]
     expected: Float[AnyArray, "n"]
     quotient: Float[AnyArray, "n"]
-    reach: Float[AnyArray, "n"]
+    neighborhood_radius: Float[AnyArray, "n"]
 
 
 def noise_sample(motion: Motion, matched: Matched) -> NoiseSample:
@@ -78,7 +78,7 @@ def noise_sample(motion: Motion, matched: Matched) -> NoiseSample:
         jnp.where(matched.valid, seen, jnp.nan),
         jnp.where(matched.valid, expected, jnp.nan),
         jnp.where(complete, quotient, jnp.nan),
-        jnp.where(matched.valid, 0.5 * (noises[0].reach + noises[1].reach), jnp.nan),
+        jnp.where(matched.valid, 0.5 * (noises[0].neighborhood_radius + noises[1].neighborhood_radius), jnp.nan),
     )
 
 
@@ -86,7 +86,7 @@ def _noises(matched: Matched) -> tuple[SurfaceNoise, SurfaceNoise]:
     return cast(SurfaceNoise, matched.source.noise), cast(SurfaceNoise, matched.target.noise)
 
 
-def discounts_and_reach(
+def discounts_and_radius(
     sample: NoiseSample, num_channels: Int[AnyScalar, ""]
 ) -> tuple[Float[AnyArray, "2"], Float[AnyScalar, ""]]:
     """(2,) factors, 0.2 to 1, by which observability must be reduced: of the geometry and of the channels; and the
@@ -103,14 +103,14 @@ def discounts_and_reach(
         num_channels: number of channels with a nonzero weight α.
     """
     xp = numpy_for(sample, num_channels)
-    seen, expected, quotient, reach = median(xp.stack([xp.asarray(column) for column in sample]))
+    seen, expected, quotient, neighborhood_radius = median(xp.stack([xp.asarray(column) for column in sample]))
     geometry = (seen / _MEDIAN_SQUARE) / (xp.where(expected > 0, expected, xp.nan) / _MEDIAN_MEAN_OF_TWO)
     # Divided by the median of χ²/C with C degrees of freedom, after Wilson & Hilferty 1931.
     channels = quotient / (1 - 2 / (9 * xp.maximum(num_channels, 1))) ** 3
     ratios = xp.stack([geometry, channels])
     factors = xp.where(xp.isfinite(ratios), xp.clip(ratios, _LEAST_FRACTION, 1), 1)
-    reach = xp.where(reach > 0, reach, 1)
-    return factors.astype(sample.residual.dtype), reach.astype(sample.residual.dtype)
+    neighborhood_radius = xp.where(neighborhood_radius > 0, neighborhood_radius, 1)
+    return factors.astype(sample.residual.dtype), neighborhood_radius.astype(sample.residual.dtype)
 
 
 class Scores(NamedTuple):
@@ -136,14 +136,14 @@ class Frame(NamedTuple):
 
     Attributes:
         center, radius: `Sums.center` and `Sums.radius` over all correspondences, metres.
-        discount, reach: from `discounts_and_reach`.
+        discount, neighborhood_radius: from `discounts_and_radius`.
         num_cells: size of the hash table of cells.
     """
 
     center: Float[AnyArray, "3"]
     radius: Float[AnyScalar, ""]
     discount: Float[AnyArray, "2"]
-    reach: Float[AnyScalar, ""]
+    neighborhood_radius: Float[AnyScalar, ""]
     num_cells: Int[AnyScalar, ""]
 
 
@@ -168,8 +168,10 @@ def scores_of(
         edge = max(term.correlation_length for term in (responding or terms))
         source, target = _noises(matched)
         # In units of the data about their centre, so that cells do not depend on the unit of length or on the origin.
-        relative = 0.5 * (source.reach + target.reach) / frame.reach
-        cells = _cells(arms * (frame.radius / (edge * frame.reach)), matched.valid, relative, frame.num_cells)
+        relative = 0.5 * (source.neighborhood_radius + target.neighborhood_radius) / frame.neighborhood_radius
+        cells = _cells(
+            arms * (frame.radius / (edge * frame.neighborhood_radius)), matched.valid, relative, frame.num_cells
+        )
     if responding is not None:
         seen = linearize_at(motion, matched, responding)[1]
         stiffness, bias = seen.stiffness, jnp.sum(_wrench(arms, total.force - seen.force), axis=1)
@@ -278,12 +280,12 @@ def sandwich(
 ) -> Float[Array, "6 6"]:
     """(6, 6) covariance of ξ = (v, ω) in T exp(ξ), metres and radians; NaN with six cells or fewer."""
     response, scatter = response_and_scatter(moments, radius)
-    basis, held = jnp.eye(6, dtype=scatter.dtype), jnp.ones(6, bool)
+    basis, constrained = jnp.eye(6, dtype=scatter.dtype), jnp.ones(6, bool)
     if directions is not None:
-        basis, held = jnp.asarray(directions.twists).T, jnp.asarray(directions.held)
-    both = jnp.outer(held, held)
-    response = jnp.where(both, basis.T @ response @ basis, jnp.diag(1.0 * ~held))
-    scatter = jnp.where(both, basis.T @ scatter @ basis, jnp.diag(UNKNOWN**2 * ~held))
+        basis, constrained = jnp.asarray(directions.twists).T, jnp.asarray(directions.constrained)
+    both = jnp.outer(constrained, constrained)
+    response = jnp.where(both, basis.T @ response @ basis, jnp.diag(1.0 * ~constrained))
+    scatter = jnp.where(both, basis.T @ scatter @ basis, jnp.diag(UNKNOWN**2 * ~constrained))
     # A single LAPACK call: two batched ones at once can deadlock.
     inverse = jnp.linalg.inv(response)
     covariance = basis @ inverse @ scatter @ inverse.T @ basis.T

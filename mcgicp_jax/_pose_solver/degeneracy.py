@@ -75,14 +75,18 @@ class Directions(eqx.Module):
         return (0 * self.geometry if self.ties is None else self.ties) == np.inf
 
     @property
-    def held_by_matches(self) -> Bool[AnyArray, "*batch 6"]:
+    def constrained_by_matches(self) -> Bool[AnyArray, "*batch 6"]:
         """Which directions are constrained by geometry or by the channels; not those that are fixed."""
         return (~self.free | (self.channels >= CHANNELS_HOLD)) & ~self.fixed
 
     @property
-    def held(self) -> Bool[AnyArray, "*batch 6"]:
+    def constrained(self) -> Bool[AnyArray, "*batch 6"]:
         """Which directions are constrained, by geometry, by the channels, or by tie points and prior."""
-        return self.held_by_matches if self.ties is None else self.held_by_matches | (self.ties >= _TIES_HOLD)
+        return (
+            self.constrained_by_matches
+            if self.ties is None
+            else self.constrained_by_matches | (self.ties >= _TIES_HOLD)
+        )
 
 
 def find_directions(sums: Sums, constraints: Float[Array, "6 6"] | None = None) -> Directions:
@@ -149,22 +153,22 @@ class UnconstrainedDirection:
     Attributes:
         twist: (6,) ξ = (v, ω) of T exp(ξ), metres and radians, scaled so that the matched points move by 1 m (root mean
             square).
-        held_by_channels: whether the channels constrain the direction.
-        held_by_ties: whether tie points or a prior do. If neither is True, the direction is unconstrained.
+        constrained_by_channels: whether the channels constrain the direction.
+        constrained_by_ties: whether tie points or a prior do. If neither is True, the direction is unconstrained.
         axis: (3,) unit vector in the source's frame: direction of the translation, or axis of the rotation.
         is_rotation: False if the direction is named a translation: rotation causes at most 0.3 of the points' motion.
     """
 
     twist: Float[np.ndarray, "6"]
-    held_by_channels: bool
+    constrained_by_channels: bool
     axis: Float[np.ndarray, "3"]
     is_rotation: bool
-    held_by_ties: bool = False
+    constrained_by_ties: bool = False
 
     def __repr__(self) -> str:
-        by_ties = "constrained by tie points or prior" if self.held_by_ties else "unconstrained"
-        held = "constrained by channels" if self.held_by_channels else by_ties
-        return f"{self.name} ({held})"
+        by_ties = "constrained by tie points or prior" if self.constrained_by_ties else "unconstrained"
+        reason = "constrained by channels" if self.constrained_by_channels else by_ties
+        return f"{self.name} ({reason})"
 
     @property
     def name(self) -> str:
@@ -176,7 +180,9 @@ class UnconstrainedDirection:
 
 def unconstrained_directions(directions: Directions) -> tuple[UnconstrainedDirection, ...]:
     """Directions that geometry does not constrain: unconstrained ones first, translations before rotations."""
-    free, held, by_matches = map(np.asarray, (directions.free, directions.held, directions.held_by_matches))
+    free, constrained, by_matches = map(
+        np.asarray, (directions.free, directions.constrained, directions.constrained_by_matches)
+    )
     twists, center = (np.asarray(array, np.float64) for array in (directions.twists, directions.center))
     radius = np.asarray(directions.radius)
     # Motion of the centroid, and by rotation about it, both in metres of rms motion.
@@ -190,7 +196,7 @@ def unconstrained_directions(directions: Directions) -> tuple[UnconstrainedDirec
 
     unconstrained: list[UnconstrainedDirection] = []
     for by_channels, by_ties in ((False, False), (False, True), (True, False)):
-        group = motions[free & (by_matches == by_channels) & ((held & ~by_matches) == by_ties)]
+        group = motions[free & (by_matches == by_channels) & ((constrained & ~by_matches) == by_ties)]
         unconstrained += [named(motion, by_channels, by_ties) for motion in _separate(group) @ group]
     return tuple(unconstrained)
 
@@ -212,12 +218,12 @@ def _separate(motions: Float[np.ndarray, "m 6"]) -> Float[np.ndarray, "m m"]:
     return mixing
 
 
-def describe(directions: Sequence[UnconstrainedDirection]) -> str:
+def as_text(directions: Sequence[UnconstrainedDirection]) -> str:
     """The names of free directions and which of them the channels constrain; "" if there are none."""
     if not directions:
         return ""
     names = ", ".join(direction.name for direction in directions)
-    by_channels = ", ".join(direction.name for direction in directions if direction.held_by_channels)
-    by_ties = ", ".join(direction.name for direction in directions if direction.held_by_ties)
+    by_channels = ", ".join(direction.name for direction in directions if direction.constrained_by_channels)
+    by_ties = ", ".join(direction.name for direction in directions if direction.constrained_by_ties)
     verdict = "all" if by_channels == names else by_channels or "none"
     return f"{names}; constrained by channels: {verdict}{'; by tie points or prior: ' if by_ties else ''}{by_ties}"

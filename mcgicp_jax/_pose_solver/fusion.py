@@ -22,11 +22,11 @@ from mcgicp_jax._pose_solver.update import Update, twist_form, wrench
 _FIRST_WEIGHT, _FIRST_STIFFNESS = 0.01, 1e3
 
 
-def held_by_pose_form(directions: Directions, information: Float[Array, "6 6"]) -> Directions:
+def constrained_by_pose_form(directions: Directions, information: Float[Array, "6 6"]) -> Directions:
     """Add how well tie points and prior constrain the directions that the matches do not, which are rotated to
     diagonalise the information (for twists about the centroid with lengths in units of the radius)."""
     basis, fixed = jnp.asarray(directions.twists).T, jnp.asarray(directions.fixed)
-    free = ~(jnp.asarray(directions.held_by_matches) | fixed)
+    free = ~(jnp.asarray(directions.constrained_by_matches) | fixed)
     stiffness = jnp.where(jnp.outer(free, free), basis.T @ information @ basis, 0)
     total = jnp.trace(stiffness)
     scale = jnp.where(total > 0, total, 1)
@@ -52,9 +52,11 @@ def fuse(
     radius = jnp.asarray(directions.radius)
     rotation, translation = pose.rotation().as_matrix().astype(radius.dtype), pose.translation()
     nothing, identity = jnp.zeros((6, 6), radius.dtype), jnp.eye(6, dtype=radius.dtype)
-    fusion = Fusion(rotation, translation, center, radius, form, identity, nothing, nothing, directions.held_by_matches)
-    directions = held_by_pose_form(directions, fusion.force_and_stiffness(rotation, translation)[1])
-    basis, by_matches = jnp.asarray(directions.twists).T, jnp.asarray(directions.held_by_matches)
+    fusion = Fusion(
+        rotation, translation, center, radius, form, identity, nothing, nothing, directions.constrained_by_matches
+    )
+    directions = constrained_by_pose_form(directions, fusion.force_and_stiffness(rotation, translation)[1])
+    basis, by_matches = jnp.asarray(directions.twists).T, jnp.asarray(directions.constrained_by_matches)
     both, others = jnp.outer(by_matches, by_matches), jnp.diag(1.0 * ~by_matches)
     response, scatter = response_and_scatter(moments, radius)
     # Equal clouds: no residual is more precise than the rounding of float32.
@@ -67,7 +69,9 @@ def fuse(
     fixed = None
     if form.prior.fixed is not None:
         basis, fixed = fusion.prior_residual(rotation, translation)[1].T @ basis, directions.fixed
-    return replace(fusion, basis=basis, gain=gain, information=information, held=directions.held, fixed=fixed)
+    return replace(
+        fusion, basis=basis, gain=gain, information=information, constrained=directions.constrained, fixed=fixed
+    )
 
 
 def _to_sums(fusion: PoseMeasurements, sums: Sums) -> tuple[Float[Array, "6 6"], Float[Array, "6 6"]]:
@@ -77,7 +81,7 @@ def _to_sums(fusion: PoseMeasurements, sums: Sums) -> tuple[Float[Array, "6 6"],
     return outwards, translation_adjoint(offset).astype(offset.dtype) * lengths_here / lengths[:, None]
 
 
-def first_pull(
+def first_force(
     pose: jaxlie.SE3, sums: Sums, directions: Directions, measurements: PoseMeasurements
 ) -> tuple[Float[Array, "6"], Float[Array, "6 6"]]:
     """Force and stiffness by which tie points and prior act in a first registration, for `solve_update`.
@@ -90,14 +94,14 @@ def first_pull(
     rotation = pose.rotation().as_matrix().astype(sums.center.dtype)
     force, stiffness = measurements.force_and_stiffness(rotation, pose.translation())
     _, back = _to_sums(measurements, sums)
-    basis, held = jnp.asarray(directions.twists).T, jnp.asarray(directions.held_by_matches)
+    basis, constrained = jnp.asarray(directions.twists).T, jnp.asarray(directions.constrained_by_matches)
     along, weight = back @ basis, _FIRST_WEIGHT * sums.cost / jnp.maximum(sums.count, 1) / sums.radius**2
-    both = jnp.outer(held, held)
+    both = jnp.outer(constrained, constrained)
     # One LAPACK call after the other: two batched ones at once can deadlock.
     inverse, stiffness = jax.lax.optimization_barrier((jnp.linalg.inv(basis), stiffness))
     stiffness = jnp.where(both, weight * along.T @ stiffness @ along, 0)
-    force = jnp.where(held, weight * along.T @ force, 0)
-    matches = jnp.where(both, basis.T @ twist_form(sums.stiffness, sums.radius) @ basis, jnp.diag(1.0 * ~held))
+    force = jnp.where(constrained, weight * along.T @ force, 0)
+    matches = jnp.where(both, basis.T @ twist_form(sums.stiffness, sums.radius) @ basis, jnp.diag(1.0 * ~constrained))
     share = jnp.linalg.solve(matches + stiffness, stiffness).T
     rest = _FIRST_STIFFNESS * (jnp.eye(6, dtype=share.dtype) - share)
     filtered = inverse.T @ jnp.linalg.matrix_power(share, 7) @ rest
@@ -111,7 +115,7 @@ def fused_update(pose: jaxlie.SE3, sums: Sums, directions: Directions, fusion: F
     pose_force, pose_stiffness = fusion.force_and_stiffness(rotation, pose.translation())
     outwards, back = _to_sums(fusion, sums)
     centred_stiffness = back.T @ pose_stiffness @ back
-    directions = held_by_pose_form(directions, centred_stiffness)
+    directions = constrained_by_pose_form(directions, centred_stiffness)
     unit_information = twist_form(sums.stiffness, sums.radius)
     # Force and energy of twists in units of the radius: of `fusion` on the left, of the sums on the right.
     ratio = sums.radius / radius
@@ -131,7 +135,7 @@ def fused_update(pose: jaxlie.SE3, sums: Sums, directions: Directions, fusion: F
     return directions, Update(
         twist=twist * units(sums.radius),
         information=unit_information + unit * centred_stiffness,
-        degenerate=~jnp.all(fusion.held),
+        degenerate=~jnp.all(fusion.constrained),
     )
 
 
@@ -141,7 +145,7 @@ def fused_covariance(pose: jaxlie.SE3, fusion: Fusion) -> Float[Array, "6 6"]:
     rotation = pose.rotation().as_matrix().astype(fusion.basis.dtype)
     _, stiffness = fusion.force_and_stiffness(rotation, pose.translation())
     basis = fusion.twists_at(rotation, pose.translation())
-    total = fusion.information + basis.T @ stiffness @ basis + jnp.diag(~fusion.held / UNKNOWN**2)
+    total = fusion.information + basis.T @ stiffness @ basis + jnp.diag(~fusion.constrained / UNKNOWN**2)
     change = adjoint_to_source(pose, fusion.center) * units(fusion.radius) @ basis
     if fusion.fixed is not None:
         total = jnp.where(jnp.outer(~fusion.fixed, ~fusion.fixed), total, jnp.diag(1.0 * fusion.fixed))

@@ -60,15 +60,15 @@ def root_near(
     sums: Sums,
     usable: Bool[Array, ""],
     basis: Float[AnyArray, "6 6"],
-    held: Bool[AnyArray, "6"],
+    constrained: Bool[AnyArray, "6"],
     fusion: Fusion | None,
 ) -> ImplicitRoot:
     """The scaling of g, from the sums at the returned pose or from `Fusion`. Columns of `basis` are twists about the
-    centre, lengths in units of the radius; `held` says which of them are constrained."""
-    identity, degenerate = jnp.eye(6, dtype=sums.center.dtype), usable & ~jnp.all(held)
-    columns = jnp.where(degenerate, basis * held, identity)
+    centre, lengths in units of the radius; `constrained` says which of them are constrained."""
+    identity, degenerate = jnp.eye(6, dtype=sums.center.dtype), usable & ~jnp.all(constrained)
+    columns = jnp.where(degenerate, basis * constrained, identity)
     if fusion is not None:
-        radius, rows = jnp.asarray(fusion.radius), jnp.where(degenerate, jnp.diag(1.0 * held), identity)
+        radius, rows = jnp.asarray(fusion.radius), jnp.where(degenerate, jnp.diag(1.0 * constrained), identity)
         return ImplicitRoot(jnp.asarray(fusion.center), radius, radius, usable, columns, rows)
     radius = jnp.where(usable, sums.radius, 1)
     # The trace of Σ K, in the unit of g.
@@ -169,8 +169,8 @@ def value_and_jacobian(
     function: Callable[[Float[Array, "6"]], Float[Array, "6"]], twist: Float[Array, "6"]
 ) -> tuple[Float[Array, "6"], Float[Array, "6 6"]]:
     """A sum over points at a twist, and its derivative. In forward mode the program takes fifteen times as long."""
-    value, pull = jax.vjp(function, twist)
-    return value, jax.vmap(lambda row: pull(row)[0])(jnp.eye(6, dtype=twist.dtype))
+    value, vjp = jax.vjp(function, twist)
+    return value, jax.vmap(lambda row: vjp(row)[0])(jnp.eye(6, dtype=twist.dtype))
 
 
 def _balance(twist: Float[Array, "6"], pose: Float[Array, "7"], root: ImplicitRoot, model: Model) -> Float[Array, "6"]:

@@ -161,20 +161,20 @@ class Fusion(PoseMeasurements):
     Attributes:
         basis: (6, 6) twists as columns; changes of ξ if directions are fixed.
         gain, information: P and A B⁻¹ A in this basis.
-        held: whether matches, tie points or prior constrain the twist.
+        constrained: whether matches, tie points or prior constrain the twist.
         fixed: whether the prior fixes it; None if it fixes none.
     """
 
     basis: Float[AnyArray, "6 6"]
     gain: Float[AnyArray, "6 6"]
     information: Float[AnyArray, "6 6"]
-    held: Bool[AnyArray, "6"]
+    constrained: Bool[AnyArray, "6"]
     fixed: Bool[AnyArray, "6"] | None = None
 
     @property
     def free(self) -> Bool[AnyArray, "6"]:
         """Which twists of the basis tie points, prior and matches determine together."""
-        return self.held if self.fixed is None else self.held & ~self.fixed
+        return self.constrained if self.fixed is None else self.constrained & ~self.fixed
 
     def twists_at(self, rotation: Float[Array, "3 3"], translation: Float[Array, "3"]) -> Float[AnyArray, "6 6"]:
         """The basis as twists at a pose."""

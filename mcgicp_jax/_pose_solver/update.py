@@ -71,11 +71,11 @@ def solve_update(
     radius, dtype = sums.radius, sums.center.dtype
     form = _quadratic_form(sums, radius)
     if others is not None:
-        pull, stiffness = others
+        force, stiffness = others
         # D is [ω× | v] to first order.
         twist = jnp.asarray(_TANGENT, dtype).T / jnp.asarray([1, 1, 1, 2, 2, 2], dtype)[:, None]
         form = form + jnp.block(
-            [[twist.T @ stiffness @ twist, -(pull @ twist)[:, None]], [-pull @ twist, jnp.zeros(1, dtype)]]
+            [[twist.T @ stiffness @ twist, -(force @ twist)[:, None]], [-force @ twist, jnp.zeros(1, dtype)]]
         )
     unit_information = twist_form(sums.stiffness, radius)
     trace = jnp.trace(unit_information)

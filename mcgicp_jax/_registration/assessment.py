@@ -22,7 +22,7 @@ from mcgicp_jax._math.statistics import sampled_rows
 from mcgicp_jax._pose_solver.covariance import (
     Frame,
     Moments,
-    discounts_and_reach,
+    discounts_and_radius,
     moments_from,
     noise_sample,
     sandwich,
@@ -68,15 +68,15 @@ def moments_of(executor: AbstractExecutor, loop: LoopResult) -> Moments:
     num_cells = numpy_for(valid).maximum(valid.sum(), 1).astype(np.int32)
     frame = Frame(state.sums.center, state.sums.radius, np.tile(one, 2), one, num_cells)
     if problem.source.observed:
-        discount, reach = _discounts_and_reach(executor, motion, loop.matches)
-        frame = frame._replace(discount=discount, reach=reach)
+        discount, neighborhood_radius = _discounts_and_radius(executor, motion, loop.matches)
+        frame = frame._replace(discount=discount, neighborhood_radius=neighborhood_radius)
     # Fixed matches do not respond to a motion.
     responding = _responding(executor, loop) if problem.matches is None and is_adaptive(loop.terms) else None
     scores = executor.scores(motion, loop.matches, frame, loop.terms, responding)
     return moments_from(scores, valid.size)
 
 
-def _discounts_and_reach(
+def _discounts_and_radius(
     executor: AbstractExecutor, motion: Motion, matches: Matches
 ) -> tuple[Float[AnyArray, "2"], Float[AnyScalar, ""]]:
     search = executor.source_of(matches)
@@ -85,7 +85,7 @@ def _discounts_and_reach(
     nearest = executor.nearest_candidates(motion, matches.some(rows))
     sample = executor.rows(noise_sample, motion, nearest, with_noise=True)
     sample = jax.tree.map(lambda column: xp.where(counts, column, np.asarray(np.nan, column.dtype)), sample)
-    return discounts_and_reach(sample, xp.sum(xp.any(search.descriptors != 0, axis=0)))
+    return discounts_and_radius(sample, xp.sum(xp.any(search.descriptors != 0, axis=0)))
 
 
 def _responding(executor: AbstractExecutor, loop: LoopResult) -> tuple[AbstractTerm, ...]:

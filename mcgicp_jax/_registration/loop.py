@@ -34,7 +34,7 @@ from mcgicp_jax._math.poses import move_pose, units
 from mcgicp_jax._methods.surfaces import AnySurface, whole_surface
 from mcgicp_jax._pose_solver.covariance import Scores
 from mcgicp_jax._pose_solver.degeneracy import Directions, find_directions
-from mcgicp_jax._pose_solver.fusion import first_pull, fused_update
+from mcgicp_jax._pose_solver.fusion import first_force, fused_update
 from mcgicp_jax._pose_solver.implicit_derivative import ImplicitRoot, root_near
 from mcgicp_jax._pose_solver.matched import Matches, Motion, adapted, sample_of_term
 from mcgicp_jax._pose_solver.pose_measurements import (
@@ -278,17 +278,17 @@ def update(
     if sums.observability is not None:
         constraints = None if fixed is None else constraints_at(pose, sums.center, sums.radius, fixed)
         directions = find_directions(sums, constraints)
-        degenerate = ~jnp.all(directions.held)
+        degenerate = ~jnp.all(directions.constrained)
         # Along unconstrained directions an update would follow arbitrary nearest-neighbour matches.
-        moving = (directions.held | ~settings.hold_unconstrained) & ~directions.fixed
+        moving = (directions.constrained | ~settings.hold_unconstrained) & ~directions.fixed
         basis = jnp.asarray(directions.twists).T * moving
     if isinstance(measurements, Fusion):
         directions, change = fused_update(pose, sums, cast(Directions, directions), measurements)
-        degenerate = ~jnp.all(directions.held)
+        degenerate = ~jnp.all(directions.constrained)
     elif measurements is None or directions is None:
         change = solve_update(sums, basis)
     else:
-        change = solve_update(sums, basis, first_pull(pose, sums, directions, measurements))
+        change = solve_update(sums, basis, first_force(pose, sums, directions, measurements))
     moved = move_pose(pose, change.twist, sums.center)
     moved = moved if fixed is None else with_fixed_directions(moved, fixed)
     # Matches need not constrain what is fixed.
@@ -344,10 +344,10 @@ def root_of(state: State, fusion: Fusion | None) -> ImplicitRoot:
     usable = converged | (state.status == Status.DEGENERATE) | (state.status == Status.MAX_ITERATIONS)
     if fusion is not None:
         rotation = state.pose.rotation().as_matrix().astype(state.sums.center.dtype)
-        basis, held = fusion.twists_at(rotation, state.pose.translation()), fusion.held
+        basis, constrained = fusion.twists_at(rotation, state.pose.translation()), fusion.constrained
     elif state.directions is not None:
-        basis, held = jnp.asarray(state.directions.twists).T, state.directions.held
+        basis, constrained = jnp.asarray(state.directions.twists).T, state.directions.constrained
     else:
         values, basis = jnp.linalg.eigh(state.information)
-        held = converged | (values > rounding(values))
-    return root_near(state.sums, usable, basis, held, fusion)
+        constrained = converged | (values > rounding(values))
+    return root_near(state.sums, usable, basis, constrained, fusion)

@@ -35,7 +35,7 @@ class Options:
     """Options of `register`, documented there; batches, odometry and the command line take the same ones.
 
     Attributes:
-        reach: least coarse `max_distance` at all scales, metres: for initial poses known to be that far off.
+        min_coarse_distance: least coarse `max_distance` at all scales, metres: how far off the initial pose may be.
     """
 
     max_distance: Distance | None = None
@@ -48,7 +48,7 @@ class Options:
     equalize_channels: bool = False
     voxel_sizes: Sequence[float] = ()
     max_source_points: int | None = _ENOUGH_SOURCE_POINTS
-    reach: float = 0.0
+    min_coarse_distance: float = 0.0
 
     def __post_init__(self) -> None:
         for name, number in self.numbers.items():

@@ -114,11 +114,11 @@ class PoseDerivative(AbstractLinearMap):
         traced = [leaf for leaf in self._form if not is_concrete(leaf)]
         self.arrays = list(arrays) or self._scored.tracers + traced
 
-    def push(self, tangents: Sequence[np.ndarray], moving: tuple[int, ...]) -> list[np.ndarray]:
+    def jvp(self, tangents: Sequence[np.ndarray], moving: tuple[int, ...]) -> list[np.ndarray]:
         slopes = {id(self.arrays[i]): tangent for i, tangent in zip(moving, tangents, strict=True)}
         pose, inverse, _ = self._root
         count = len(tangents[0])
-        change = np.broadcast_to(self._score(pose).push(slopes, frozenset(slopes)), (count, 6))
+        change = np.broadcast_to(self._score(pose).jvp(slopes, frozenset(slopes)), (count, 6))
         if self._fusion is not None:
             by_score, by_form = self._by_balance(np.eye(6))
             change = change @ by_score.T
@@ -127,7 +127,7 @@ class PoseDerivative(AbstractLinearMap):
                     change = change + slopes[id(leaf)].reshape(count, -1) @ by.reshape(6, -1).T
         return [-change @ (self._by_twist(self._pose) @ inverse).T]
 
-    def pull(self, cotangents: Sequence[np.ndarray], moving: tuple[int, ...]) -> list[np.ndarray]:
+    def vjp(self, cotangents: Sequence[np.ndarray], moving: tuple[int, ...]) -> list[np.ndarray]:
         pose, inverse, _ = self._root
         by_form: list[np.ndarray] = []
         by_score = -(cotangents[0] @ self._by_twist(self._pose)) @ inverse
@@ -143,12 +143,12 @@ class PoseDerivative(AbstractLinearMap):
 
     def jacobian(self) -> list[np.ndarray]:
         """(7, ...) derivative of the pose parameters by each of the arrays."""
-        return self.pull([np.eye(7)], tuple(range(len(self.arrays))))
+        return self.vjp([np.eye(7)], tuple(range(len(self.arrays))))
 
     def _by_balance(self, cotangents: Float[np.ndarray, "c 6"]) -> tuple[np.ndarray, list[np.ndarray]]:
         """Cotangents of the score and of the leaves of the form, from those of the equation with both."""
         pose, _, score = self._root
-        slopes = _pull_balance(pose, self._scaling, self._fusion, score, cotangents.astype(pose.dtype))
+        slopes = _vjp_of_balance(pose, self._scaling, self._fusion, score, cotangents.astype(pose.dtype))
         by_score, by_form = jax.tree.map(np.asarray, slopes)
         return by_score, jax.tree.leaves(by_form) if self._form else []
 
@@ -213,7 +213,7 @@ def _balance_and_slope(
 
 
 @quickly_compiled
-def _pull_balance(
+def _vjp_of_balance(
     pose: Float[Array, "7"],
     root: ImplicitRoot,
     fusion: Fusion,
@@ -226,8 +226,8 @@ def _pull_balance(
         nowhere = jnp.zeros_like(score)
         return balance_along(nowhere, pose, root, score, eqx.tree_at(lambda fusion: fusion.form, fusion, form))
 
-    _, pull = jax.vjp(balance, score, fusion.form)
-    return jax.vmap(pull)(cotangents)
+    _, vjp = jax.vjp(balance, score, fusion.form)
+    return jax.vmap(vjp)(cotangents)
 
 
 @with_settings_of_package

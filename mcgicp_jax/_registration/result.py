@@ -18,7 +18,7 @@ from mcgicp_jax._compute.cache import Held, Lazy
 from mcgicp_jax._compute.concrete import AnyArray, canonical_float, is_concrete
 from mcgicp_jax._compute.linear_maps import primal
 from mcgicp_jax._math.poses import se3
-from mcgicp_jax._pose_solver.degeneracy import Directions, UnconstrainedDirection, describe, unconstrained_directions
+from mcgicp_jax._pose_solver.degeneracy import Directions, UnconstrainedDirection, as_text, unconstrained_directions
 
 
 class Status(enum.IntEnum):
@@ -280,7 +280,7 @@ class RegistrationResult(eqx.Module):
         translation = np.array2string((matrix @ origin - origin)[:3], precision=4, suppress_small=True)
         cosine = (np.trace(matrix[:3, :3]) - 1) / 2
         angle = np.degrees(np.arccos(np.clip(cosine, -1, 1)))
-        free = describe(self.unconstrained_directions)
+        free = as_text(self.unconstrained_directions)
         return (
             f"RegistrationResult({self.status.name}: translation {where}{translation} m, rotation {angle:.3f}°, "
             f"{self.num_iterations} iterations, {self.num_inliers} inliers ({self.overlap:.0%}), "

@@ -96,7 +96,7 @@ def settings_for(options: Options, method: AbstractMethod, target: PointCloud, s
         return number(_COARSE_TOLERANCE * numpy_for(value, least).maximum(value, least), dtype)
 
     coarse, fine = max_distance if isinstance(max_distance, tuple) or np.shape(max_distance) else [max_distance] * 2
-    coarse = numpy_for(coarse).maximum(coarse, options.reach)
+    coarse = numpy_for(coarse).maximum(coarse, options.min_coarse_distance)
     return Settings(
         max_distance=number(coarse, dtype),
         fine_distance=number(fine, dtype),

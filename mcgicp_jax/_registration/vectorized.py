@@ -99,7 +99,9 @@ def run_pairs(
     numbers = options.numbers
     if isinstance(options.max_distance, tuple):
         numbers["max_distance"] = np.asarray(options.max_distance)
-    fixed = Options(**{name: getattr(options, name) for name in ("max_iterations", "max_source_points", "reach")})
+    fixed = Options(
+        **{name: getattr(options, name) for name in ("max_iterations", "max_source_points", "min_coarse_distance")}
+    )
 
     def begin(*chunk: Any) -> Lanes:
         ready = with_neighbors(*chunk, search, num_neighbors)

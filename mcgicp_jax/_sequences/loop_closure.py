@@ -60,7 +60,7 @@ def edge_from(i: int, j: int, result: RegistrationResult, *, uncertain: bool = F
     covariance, directions = np.asarray(result.covariance, np.float64), result.directions
     if directions is None or not np.isfinite(covariance).all():
         return None
-    constrained = np.asarray(directions.held)
+    constrained = np.asarray(directions.constrained)
     if not constrained.any():
         return None
     inside = np.ix_(constrained, constrained)
@@ -196,7 +196,7 @@ class Trajectory:
             if tries < _TRIES and distances[i] <= self._range(number) + _DEVIATIONS * sigma:
                 tries += 1
                 # The coarse `max_distance` covers the uncertainty of the motion.
-                options = replace(self._options, reach=_DEVIATIONS * sigma)
+                options = replace(self._options, min_coarse_distance=_DEVIATIONS * sigma)
                 init = inverse(self._poses[i]) @ self._poses[number]
                 result = register_pair(self._clouds[number], self._clouds[i], self._method, init, options)
                 edge = edge_from(i, number, result, uncertain=True)

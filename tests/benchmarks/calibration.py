@@ -65,7 +65,7 @@ def twist_error(matrix: np.ndarray, truth: np.ndarray) -> np.ndarray:
 
 def normalised(error: np.ndarray, covariance: np.ndarray, directions: Directions) -> float:
     """eᵀ C⁻¹ e / d in the subspace of the constrained directions."""
-    coefficients = np.linalg.inv(np.asarray(directions.twists, np.float64).T)[np.asarray(directions.held)]
+    coefficients = np.linalg.inv(np.asarray(directions.twists, np.float64).T)[np.asarray(directions.constrained)]
     error, covariance = coefficients @ error, coefficients @ covariance @ coefficients.T
     return float(error @ np.linalg.solve(covariance, error) / len(error))
 
@@ -106,7 +106,7 @@ def calibrate(scene: str, noise: float, pairs: int) -> dict[str, list[float]]:
             claims.setdefault(f"{name} covariance", []).append(normalised(error, np.asarray(result.covariance), held))
             claims.setdefault(f"{name} H⁻¹", []).append(normalised(error, inverse, held))
             claims.setdefault(f"{name} σ² H⁻¹", []).append(normalised(error, variance * inverse, held))
-            claims.setdefault(f"{name} held", []).append(np.sum(held.held))
+            claims.setdefault(f"{name} held", []).append(np.sum(held.constrained))
             if name == "GICP":
                 raw = [np.asarray(frame.cloud.points, np.float64) for frame in (source, target)]
                 error, inverse = peers_hessian(*raw, truth, max_distance)

@@ -145,7 +145,8 @@ _COST = """
 _EPOCH = """
     import jax.numpy as jnp
     sizes = np.random.default_rng(0).integers(2000, 10_000, 60)
-    sources, targets = zip(*[[mcg.preprocess(cloud, None) for cloud in clouds(int(size), i)] for i, size in enumerate(sizes)])
+    pairs = [clouds(int(size), i) for i, size in enumerate(sizes)]
+    sources, targets = zip(*[[mcg.preprocess(cloud, None) for cloud in pair] for pair in pairs])
     channels = [jnp.asarray(source.channels) for source in sources]
 
     def loss(channels):

@@ -86,7 +86,7 @@ def main() -> None:
 
 def normalised_error(result: mcg.RegistrationResult, truth: np.ndarray) -> float:
     """NaN where nothing is constrained or the registration failed."""
-    if not np.any(result.directions.held) or not np.all(np.isfinite(result.matrix)):
+    if not np.any(result.directions.constrained) or not np.all(np.isfinite(result.matrix)):
         return float("nan")
     return normalised(twist_error(result.matrix, truth), np.asarray(result.covariance), result.directions)
 
