@@ -459,6 +459,15 @@ def test_tight_tolerances_do_not_keep_the_coarse_phase_from_ending(room):
     np.testing.assert_allclose(never.matrix, exact.matrix, atol=1e-6)
 
 
+def test_translation_and_rotation_must_both_be_below_their_tolerances(room):
+    source, target, _ = room
+    loose, translation, rotation = (
+        mcg.register(source, target, mcg.GICP(), translation_tolerance=a, rotation_tolerance=b).num_iterations
+        for a, b in ((1.0, 1.0), (1e-6, 1.0), (1.0, 1e-6))
+    )
+    assert loose < min(translation, rotation)
+
+
 def test_a_copied_result_holds_no_clouds():
     source, target, _ = pair()
     clouds = [weakref.ref(cloud) for cloud in (source, target)]
