@@ -135,6 +135,6 @@ def test_rows_are_computed_once_by_threads_that_share_a_table():
     table = RowsOnDemand(compute, 20)
     wanted = [np.arange(k, k + 10) for k in (0, 5, 0, 10, 5, 3, 0, 10)]
     with ThreadPoolExecutor(len(wanted)) as threads:
-        found = list(threads.map(lambda rows: table.known(rows)[rows], wanted))
+        found = list(threads.map(lambda rows: table.computed(rows)[rows], wanted))
     np.testing.assert_array_equal(found, 10 * np.array(wanted))
     assert sorted(computed) == list(range(20))

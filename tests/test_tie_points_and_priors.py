@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 import mcgicp_jax as mcg
 from mcgicp_jax import datasets
 from mcgicp_jax._pose_solver.pose_measurements import Fusion, Prior, TiePoints, form_at
-from mcgicp_jax._registration.tie_points_and_prior import known
+from mcgicp_jax._registration.tie_points_and_prior import checked_measurements
 from mcgicp_jax.extend import symmetric_matrices as alg
 from tests.compilations import compilations
 from tests.corridor import bare_pair, corridor
@@ -192,9 +192,11 @@ def test_the_information_of_a_prior_belongs_to_the_origin_of_the_cloud(corner, a
         there[:3, 3:] = np.cross(far, np.eye(3)).T
         given = there @ given @ there.T
     pose = motion((1, 2, 3, 0.1, 0.2, 0.3))
-    _, prior = known(None, (pose, given), source, target)
+    _, prior = checked_measurements(None, (pose, given), source, target)
     with jax.enable_x64(True):
-        traced = np.asarray(jax.jit(lambda given: known(None, (pose, given), source, target)[1].information)(given))
+        traced = np.asarray(
+            jax.jit(lambda given: checked_measurements(None, (pose, given), source, target)[1].information)(given)
+        )
     # So small that the transport of the error is linear.
     for twist in np.linalg.cholesky(given).T * 1e-3:
         start, end = (

@@ -161,8 +161,8 @@ def batch(
     missing = {key: pair for key, pair in wanted.items() if key not in rows}
     settings["executor"] = _executor(workers, len(missing))
     finished = len(wanted) - len(missing)
-    known = f", of which {finished:,} are in {output} and are kept, whatever the options were" if finished else ""
-    print(f"pairs:     {len(wanted):,}{known}")
+    kept = f", of which {finished:,} are in {output} and are kept, whatever the options were" if finished else ""
+    print(f"pairs:     {len(wanted):,}{kept}")
     interrupted = bool(missing) and _register_missing(missing, settings, table, rows, finished)
     rows = {key: rows[key] for key in wanted if key in rows} | rows
     table.write(rows.values())

@@ -97,17 +97,17 @@ def with_channels(cloud: mcg.PointCloud, names: Sequence[str]) -> mcg.PointCloud
     if missing:
         raise ValueError(f"no channel {', '.join(missing)}; there are {listed(cloud.channel_names)}")
     columns = [cloud.channel_names.index(name) for name in needed]
-    channels, known, chosen = np.asarray(cloud.channels)[:, columns], cloud.channel_valid, list[str]()
-    known = None if known is None else np.asarray(known)[:, columns]
+    channels, measured, chosen = np.asarray(cloud.channels)[:, columns], cloud.channel_valid, list[str]()
+    measured = None if measured is None else np.asarray(measured)[:, columns]
     for name in names:
         three = slice(len(chosen), len(chosen) + len(COLORS))
         if name in COLOR_SPACES:
             channels[:, three] = COLOR_SPACES[name](channels[:, three])
-            if known is not None:
-                known[:, three] = known[:, three].all(axis=1, keepdims=True)
+            if measured is not None:
+                measured[:, three] = measured[:, three].all(axis=1, keepdims=True)
         chosen += [f"{name}_{i}" for i in range(len(COLORS))] if name in COLOR_SPACES else [name]
     return mcg.PointCloud(
-        cloud.points, channels, channel_valid=known, covariances=cloud.covariances, channel_names=chosen
+        cloud.points, channels, channel_valid=measured, covariances=cloud.covariances, channel_names=chosen
     )
 
 

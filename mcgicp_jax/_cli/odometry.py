@@ -197,11 +197,11 @@ def _report(poses: Poses, truth: Truth, results: list[mcg.RegistrationResult]) -
     iterations = np.mean([np.asarray(result.num_iterations) for result in results]) if results else 0
     converged = sum(bool(result.converged) for result in results)
     print(f"pairs:     {converged} of {len(results)} converged, {iterations:.1f} iterations on average")
-    known = [row for row, pose in enumerate(truth) if pose is not None]
-    if len(known) < 2:
+    rows = [row for row, pose in enumerate(truth) if pose is not None]
+    if len(rows) < 2:
         print("errors:    unknown, since there are no true poses")
         return
-    estimated, true = [poses[row] for row in known], [truth[row] for row in known]
+    estimated, true = [poses[row] for row in rows], [truth[row] for row in rows]
     translation, rotation = metrics.rpe(estimated, true)
     print(f"per pair:  {1e3 * translation.mean():.1f} mm, {np.degrees(rotation.mean()):.3f} deg on average")
     whole = metrics.ate(estimated, true)

@@ -149,8 +149,8 @@ class Options:
 
     def parameters_of(self, method: MethodName) -> dict[str, Any]:
         """The parameters that the user gave and that this method has."""
-        known = METHODS[method].kind.__dataclass_fields__
-        return {name: value for name, value in self._parameters().items() if name in known}
+        fields = METHODS[method].kind.__dataclass_fields__
+        return {name: value for name, value in self._parameters().items() if name in fields}
 
     def _parameters(self) -> dict[str, Any]:
         given = {name: getattr(self, name) for name in PARAMETERS if getattr(self, name) not in (None, ())}

@@ -30,8 +30,8 @@ def channel_name(column: str) -> str | None:
     bare = column.removeprefix("channel_")
     if bare != column and channel_name(bare) != bare:
         return bare
-    known = column.lower().removeprefix("scalar_")
-    return None if _NOT_CHANNELS.fullmatch(known) else _ALIASES.get(known, column)
+    name = column.lower().removeprefix("scalar_")
+    return None if _NOT_CHANNELS.fullmatch(name) else _ALIASES.get(name, column)
 
 
 def arrays_of_columns(columns: Columns) -> tuple[Float[np.ndarray, "N 3"], Float[np.ndarray, "N C"], list[str]]:

@@ -82,8 +82,8 @@ def _without_masked(channels: Any, channel_valid: Values | None, shape: tuple[in
     valid = None if channel_valid is None else _as_mask(channel_valid, shape)
     if not np.ma.is_masked(channels):
         return valid
-    known = ~np.ma.getmaskarray(channels).reshape(shape)
-    return known if valid is None else known & valid
+    measured = ~np.ma.getmaskarray(channels).reshape(shape)
+    return measured if valid is None else measured & valid
 
 
 def _blank(channels: Any, channel_valid: Any) -> Any:

@@ -114,8 +114,8 @@ def _differentiable(cloud: PointCloud, found: PointCloud, fixed: PointCloud) -> 
             array = array + cloud.origin
         if not is_concrete(array):
             mask = raw.channel_valid if name == "channels" else None
-            known = np.ones((len(rows), 1)) if mask is None else mask[finite]
-            average = RowAverage(rows, voxels, known, (array.shape[0], len(found.points)))
+            counted = np.ones((len(rows), 1)) if mask is None else mask[finite]
+            average = RowAverage(rows, voxels, counted, (array.shape[0], len(found.points)))
             (arrays[name],) = with_derivative([getattr(found, name)], average, [array])
     return found.replace_rows(**arrays)
 
@@ -128,9 +128,9 @@ def with_neighbors(
     grid: Grid | None = None,
 ) -> PointCloud:
     """`preprocess` for a cloud of `finite_rows`, whose grid may be known."""
-    voxels, (known,) = voxels_and_grids(voxel_size, cloud)
+    voxels, (own_grid,) = voxels_and_grids(voxel_size, cloud)
     if voxels.size is not None:
-        cloud = _downsampled(cloud, grid or known or grid_of(np.asarray(cloud.points)), voxels.size)
+        cloud = _downsampled(cloud, grid or own_grid or grid_of(np.asarray(cloud.points)), voxels.size)
     points, channel_valid, covariances = np.asarray(cloud.points), cloud.channel_valid, cloud.covariances
     dtype = jax.dtypes.canonicalize_dtype(points.dtype)
     origin = _far_origin(points)

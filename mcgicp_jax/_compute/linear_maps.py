@@ -124,15 +124,15 @@ class RowAverage(AbstractLinearMap):
 
     Args:
         rows, groups: which row counts in which row of the result.
-        known: (n, C) or (n, 1), which of its entries count.
+        counted: (n, C) or (n, 1), which of its entries count.
         sizes: numbers of rows of the array and of the result.
     """
 
-    def __init__(self, rows: Int[np.ndarray, "n"], groups: Int[np.ndarray, "n"], known: Any, sizes: tuple[int, int]):
+    def __init__(self, rows: Int[np.ndarray, "n"], groups: Int[np.ndarray, "n"], counted: Any, sizes: tuple[int, int]):
         ones = np.ones(len(rows))
         self._sum = csr_array((ones, (groups, np.arange(len(rows)))), shape=(sizes[1], len(rows)))
-        counts = np.maximum(self._sum @ known.astype(np.float64), 1)
-        self._rows, self._weights, self._size = rows, known / counts[groups], sizes[0]
+        counts = np.maximum(self._sum @ counted.astype(np.float64), 1)
+        self._rows, self._weights, self._size = rows, counted / counts[groups], sizes[0]
 
     def jvp(self, tangents: Sequence[np.ndarray], moving: tuple[int, ...]) -> list[np.ndarray]:
         (each,) = tangents
@@ -155,13 +155,13 @@ def averaged(values: Float[AnyArray, "N D"], groups: Int[np.ndarray, "N"]) -> Fl
     """The mean of the rows of each group; −1: of none. Outside of `jit` summed in float64, and nothing is compiled."""
     rows = np.flatnonzero(groups >= 0)
     groups = groups[rows]
-    counts, known = np.bincount(groups), primal(values)
-    if not is_concrete(known):
+    counts, fixed = np.bincount(groups), primal(values)
+    if not is_concrete(fixed):
         sums = jax.ops.segment_sum(values[rows], groups, len(counts))
         return sums / np.maximum(counts, 1)[:, None].astype(values.dtype)
-    average = RowAverage(rows, groups, np.ones((len(rows), 1)), (len(known), len(counts)))
-    (mean,) = average.jvp([np.asarray(known)[None]], (0,))
-    found = mean[0].astype(known.dtype)
+    average = RowAverage(rows, groups, np.ones((len(rows), 1)), (len(fixed), len(counts)))
+    (mean,) = average.jvp([np.asarray(fixed)[None]], (0,))
+    found = mean[0].astype(fixed.dtype)
     return found if is_concrete(values) else with_derivative([found], average, [values])[0]
 
 

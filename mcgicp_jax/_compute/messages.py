@@ -45,8 +45,8 @@ def messages_named(name: str) -> Iterator[None]:
 
 def calling_line() -> Line:
     """The line that called the package; in a thread of the package, the one that caused its work."""
-    if (known := _line.get()) is not None:
-        return known
+    if (line := _line.get()) is not None:
+        return line
     frames = [frame for frame, _ in traceback.walk_stack(sys._getframe())]
     names = [frame.f_globals.get("__name__", "") for frame in frames]
     inside = [i for i, name in enumerate(names) if name.split(".", maxsplit=1)[0] == _PACKAGE]

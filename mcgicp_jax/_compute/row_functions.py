@@ -81,7 +81,7 @@ class GivenTable:
     def arrays(self) -> dict[int, Any]:
         return {id(leaf): leaf for leaf in self._leaves}
 
-    def known(self, rows: Any = None, num_threads: int | None = 1) -> tuple[Packed, ...]:
+    def computed(self, rows: Any = None, num_threads: int | None = 1) -> tuple[Packed, ...]:
         return self._packed
 
     def columns(self, moving: Moving) -> tuple[int, ...]:
@@ -279,20 +279,20 @@ class ComputedTable(RowFunction):
         computed = RowFunction(function, numbers, self._inputs, size)
         self._rows = RowsOnDemand(computed.rows, size) if values is None else values._rows
 
-    def known(self, rows: Int[np.ndarray, "n"] | None = None, num_threads: int | None = 1) -> tuple[Packed, ...]:
+    def computed(self, rows: Int[np.ndarray, "n"] | None = None, num_threads: int | None = 1) -> tuple[Packed, ...]:
         """The packed trees, in which these rows (None: all) are computed, and others may not be."""
-        return self._rows.known(rows, num_threads)
+        return self._rows.computed(rows, num_threads)
 
     def trees(self, rows: Int[np.ndarray, "n"] | None = None, num_threads: int | None = 1) -> tuple[Any, ...]:
         """The trees: of all rows, views that must not be changed, or copies of some rows."""
-        known = self.known(rows, num_threads)
-        return tuple((part if rows is None else part.rows(rows)).tree for part in known)
+        packs = self.computed(rows, num_threads)
+        return tuple((part if rows is None else part.rows(rows)).tree for part in packs)
 
     def columns(self, moving: Moving) -> tuple[int, ...]:
         """The numbers of the arrays of the first tree that depend on those that are moving."""
         if moving.isdisjoint(self.arrays):
             return ()
-        layout = self.known(np.zeros(0, int))[0].layout
+        layout = self.computed(np.zeros(0, int))[0].layout
         return tuple(i for i, dtype in enumerate(layout.dtypes) if dtype is None)
 
 
@@ -310,7 +310,7 @@ class _Gathered:
             # Of all rows at once: neighbours are found on the way.
             chosen = None if index is None else np.asarray(index[slice(None) if rows is None else rows], np.int32)
             used = rows if chosen is None else np.maximum(chosen, 0).reshape(-1)
-            self._packs.append(table.known(used, num_threads)[part])
+            self._packs.append(table.computed(used, num_threads)[part])
             self.indices.append(chosen)
         wide = any(index is not None and index.ndim == 2 and index.shape[1] > 1 for index in self.indices)
         self.block_size = NEIGHBORHOOD_BLOCK if wide else BLOCK

@@ -93,7 +93,7 @@ class RowsOnDemand(Generic[Tree]):
         # The arrays are never replaced, since views of them are in use.
         self._tree: Any = None
 
-    def known(self, rows: slice | Int[np.ndarray, "*n"] | None = None, num_threads: int | None = 1) -> Tree:
+    def computed(self, rows: slice | Int[np.ndarray, "*n"] | None = None, num_threads: int | None = 1) -> Tree:
         """The whole arrays, in which these rows (None: all), or any, are computed, and others may not be."""
         with self._lock:
             missing = self._missing

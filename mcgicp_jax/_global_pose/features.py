@@ -165,7 +165,7 @@ def _statistics(voxel_size: Float[AnyScalar, ""], own: Rows, near: Rows) -> tupl
     _, square = _offsets(around)
     columns = []
     for channel in range(around.num_channels):
-        valid, difference, here = around.known(channel), around.difference(channel), around.own_channels[channel]
+        valid, difference, here = around.measured(channel), around.difference(channel), around.own_channels[channel]
         for radius in _CHANNEL_RADII:
             weights = (valid & (square <= (radius * voxel_size) ** 2)).astype(square.dtype)
             total = jnp.sum(weights, axis=0)

@@ -66,9 +66,9 @@ def _noise_rows(cloud: PointCloud) -> tuple[Any, Any]:
         return rows, xp.broadcast_to(counts, (cloud.channels.shape[1] + 1, rows.size))
     # One sample of all points might contain too few that have a channel.
     samples = []
-    for known in (*(valid & xp.asarray(cloud.channel_valid).T), valid):
-        order = xp.argsort(~known, stable=True)
-        rows, counts = sampled_rows(known[order])
+    for measured in (*(valid & xp.asarray(cloud.channel_valid).T), valid):
+        order = xp.argsort(~measured, stable=True)
+        rows, counts = sampled_rows(measured[order])
         samples.append((order[rows], counts))
     owner = xp.repeat(xp.arange(len(samples)), samples[0][0].size)
     rows, counts = (xp.concatenate(each) for each in zip(*samples, strict=True))
@@ -119,9 +119,9 @@ def _measured_spacings(cloud: PointCloud) -> tuple[Float[AnyScalar, ""], Float[A
     xp = numpy_for(squares)
     nearest = xp.sqrt(xp.min(xp.where(squares > 0, squares, xp.inf), axis=0))
     spacing = xp.nan_to_num(median(xp.where(xp.isfinite(nearest), nearest, xp.nan)))
-    known = xp.isfinite(squares)
-    count = xp.sum(known, axis=0)
-    grid = xp.sqrt(xp.max(xp.where(known, squares, 0), axis=0)) * xp.sqrt(xp.pi / xp.maximum(count, 1))
+    measured = xp.isfinite(squares)
+    count = xp.sum(measured, axis=0)
+    grid = xp.sqrt(xp.max(xp.where(measured, squares, 0), axis=0)) * xp.sqrt(xp.pi / xp.maximum(count, 1))
     return spacing, xp.nan_to_num(median(xp.where(count > 1, grid, xp.nan))).astype(squares.dtype)
 
 
@@ -177,11 +177,11 @@ def _ranges(cloud: PointCloud) -> list[tuple[float, float]]:
     rows = rows[counts]
     # In float32, differences of quantiles may overflow.
     channels = np.asarray(cloud.channels, np.float64)[rows]
-    known = np.isfinite(channels)
+    measured = np.isfinite(channels)
     if cloud.channel_valid is not None:
-        known &= np.asarray(cloud.channel_valid)[rows]
+        measured &= np.asarray(cloud.channel_valid)[rows]
     ranges = []
-    for column, there in zip(channels.T, known.T, strict=True):
+    for column, there in zip(channels.T, measured.T, strict=True):
         low, high = np.quantile(column[there], [_QUANTILES[0], _QUANTILES[-1]]) if there.any() else (np.nan, np.nan)
         ranges.append((float(low), float(high)))
     return ranges
@@ -236,5 +236,5 @@ def gain_and_offset(
         varying = (spreads[0] > 0) & (spreads[1] > 0)
         gain = xp.where(varying, spreads[1] / xp.where(varying, spreads[0], 1), 1)
         offset = means[1] - gain * means[0]
-    known = xp.isfinite(gain) & xp.isfinite(offset)
-    return xp.where(known, gain, 1), xp.where(known, offset, 0)
+    measured = xp.isfinite(gain) & xp.isfinite(offset)
+    return xp.where(measured, gain, 1), xp.where(measured, offset, 0)

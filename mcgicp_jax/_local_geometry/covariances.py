@@ -29,16 +29,16 @@ def channel_kernel(around: Neighborhoods, covariance: Float[Array, "..."]) -> Fl
     count = around.num_channels
     differences = [around.difference(channel) for channel in range(count)]
     matrix = covariance if covariance.ndim == 2 else jnp.diag(jnp.broadcast_to(covariance, (count,)))
-    if around.near_known is None:
+    if around.near_measured is None:
         return jnp.exp(-0.5 * _marginal_square(differences, None, matrix, covariance.ndim == 2))
-    common, others = list(around.near_known), around.other
+    common, others = list(around.near_measured), around.other
     differences = [jnp.where(both, each, 0) for each, both in zip(differences, common, strict=True)]
     kernel = jnp.exp(-0.5 * _marginal_square(differences, common, matrix, covariance.ndim == 2))
     for i, both in enumerate(common):
-        known = both & others
-        number = jnp.sum(known, axis=0)
+        compared = both & others
+        number = jnp.sum(compared, axis=0)
         alike = jnp.exp(-0.5 * differences[i] ** 2 / matrix[i, i])
-        average = jnp.sum(jnp.where(known, alike, 0), axis=0) / jnp.maximum(number, 1)
+        average = jnp.sum(jnp.where(compared, alike, 0), axis=0) / jnp.maximum(number, 1)
         kernel = kernel * jnp.where(both, 1, jnp.where(number > 0, average, 1))
     return kernel
 

@@ -35,8 +35,8 @@ class Neighborhoods(NamedTuple):
         own_channels: (C, n) channels of the points; C is 0 where channels are not used.
         near_channels: (C, k, n) channels of their neighbours.
         present: (k, n) which neighbours exist.
-        own_known: (C, n) which channels the points have; None if no point lacks any.
-        near_known: (C, k, n) which channels both a point and its neighbour have; None if no point lacks any.
+        own_measured: (C, n) which channels the points have; None if no point lacks any.
+        near_measured: (C, k, n) which channels both a point and its neighbour have; None if no point lacks any.
         other: (k, n) which neighbours exist and are not the point itself; None if no point lacks a channel.
         few: (n,) whether the cloud of a point has fewer points than `FEW_POINTS`.
     """
@@ -47,8 +47,8 @@ class Neighborhoods(NamedTuple):
     own_channels: Any = None
     near_channels: Any = None
     present: Any = None
-    own_known: Any = None
-    near_known: Any = None
+    own_measured: Any = None
+    near_measured: Any = None
     other: Any = None
     few: Any = None
 
@@ -71,9 +71,9 @@ class Neighborhoods(NamedTuple):
         """Channel of each neighbour minus that of the point, channel units; 0 where there is no neighbour."""
         return jnp.where(self.present, self.near_channels[channel] - self.own_channels[channel], 0)
 
-    def known(self, channel: int) -> Bool[AnyArray, "k n"]:
+    def measured(self, channel: int) -> Bool[AnyArray, "k n"]:
         """Which neighbours have a channel that the point has, too."""
-        return self.present if self.near_known is None else self.near_known[channel]
+        return self.present if self.near_measured is None else self.near_measured[channel]
 
 
 def check_neighbors(cloud: PointCloud, xp: ModuleType) -> Any:
@@ -91,7 +91,7 @@ class PointRows(NamedTuple):
     points: Any
     # (N, C), and which of them the points have; None if no point lacks any.
     channels: Any = None
-    known: Any = None
+    measured: Any = None
     # (N, 3, 3) covariances that were given with the cloud.
     given: Any = None
     # (N,) whether the cloud has fewer points than `FEW_POINTS`.
@@ -128,16 +128,16 @@ def neighborhoods(own: Rows, near: Rows | None = None) -> Neighborhoods:
     """The neighbourhoods of the rows of `with_near`, or the points alone."""
     if near is None:
         return Neighborhoods(own.tree.points.T, own.tree.given)
-    present, known, channels = near.index >= 0, own.tree.known, own.tree.channels.T
+    present, measured, channels = near.index >= 0, own.tree.measured, own.tree.channels.T
     # Without the barrier XLA would gather each number again for each of its uses.
     points, others = jax.lax.optimization_barrier(
         (near.tree.points.transpose(2, 0, 1), near.tree.channels.transpose(2, 0, 1))
     )
     around = Neighborhoods(own.tree.points.T, own.tree.given, points, channels, others, present, few=own.tree.few)
-    if known is None:
+    if measured is None:
         return around
-    both = present & near.tree.known.transpose(2, 0, 1) & known.T[:, None]
-    return around._replace(own_known=known.T, near_known=both, other=present & (near.index != own.index))
+    both = present & near.tree.measured.transpose(2, 0, 1) & measured.T[:, None]
+    return around._replace(own_measured=measured.T, near_measured=both, other=present & (near.index != own.index))
 
 
 class ChannelFits(NamedTuple):
@@ -162,10 +162,10 @@ def fit_channels(around: Neighborhoods, x: Float[Array, "k n"], y: Float[Array, 
     size = around.own.shape[1]
     gradients, residuals, inverses = [], [], []
     for channel in range(around.num_channels):
-        values, known = around.difference(channel), around.known(channel).astype(x.dtype)
-        fit = fit_linear(x, y, values, known)
-        halves = [fit_linear(*(array[first::2] for array in (x, y, values, known))).gradient for first in (0, 1)]
-        enough = fit.weight > 3 if around.own_known is None else (fit.weight > 3) & around.own_known[channel]
+        values, measured = around.difference(channel), around.measured(channel).astype(x.dtype)
+        fit = fit_linear(x, y, values, measured)
+        halves = [fit_linear(*(array[first::2] for array in (x, y, values, measured))).gradient for first in (0, 1)]
+        enough = fit.weight > 3 if around.own_measured is None else (fit.weight > 3) & around.own_measured[channel]
         gradients.append(jnp.where(enough, jnp.stack([jnp.stack(half) for half in halves]), 0))
         residuals.append(jnp.where(enough, fit.residual, jnp.nan))
         inverses.append(jnp.where(enough, fit.inverse, 0))

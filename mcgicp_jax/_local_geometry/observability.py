@@ -87,13 +87,13 @@ def _certainty(
     noise = smallest * jnp.stack([a, b, c])
     p, q, r = count * square + noise
     determinant = p * r - q * q
-    known = determinant > 64 * jnp.finfo(covariance.dtype).eps * (p + r) ** 2
-    inverse = jnp.stack([r, -q, p]) / jnp.where(known, determinant, 1)
+    regular = determinant > 64 * jnp.finfo(covariance.dtype).eps * (p + r) ** 2
+    inverse = jnp.stack([r, -q, p]) / jnp.where(regular, determinant, 1)
     # Both factors are polynomials of the same matrix; they commute, so that their product is symmetric.
     x, y, z = noise
     i, j, k = inverse
     variance = jnp.stack([x * i + y * j, x * j + y * k, y * j + z * k])
-    certain = jnp.where(known, jnp.maximum(1 - variance[0] - variance[2], 0), 0)
+    certain = jnp.where(regular, jnp.maximum(1 - variance[0] - variance[2], 0), 0)
     return certain, alg.embed(variance, *basis)
 
 

@@ -64,7 +64,7 @@ class SurfaceTable:
 
     @property
     def observes_channels(self) -> bool:
-        return self.table.known(np.zeros(0, int))[0].tree.channel_observability is not None
+        return self.table.computed(np.zeros(0, int))[0].tree.channel_observability is not None
 
     @property
     def points(self) -> Float[np.ndarray, "n 3"]:
@@ -167,7 +167,8 @@ def surface_pair(
         )
         if source_rows is None:
             # At once, and side by side: most rows are used.
-            side_by_side([partial(each.table.known, None, num_threads) for each in (of_target, of_source)], num_threads)
+            calls = [partial(each.table.computed, None, num_threads) for each in (of_target, of_source)]
+            side_by_side(calls, num_threads)
         return SurfacePair(method, terms, of_source, of_target)
     function = _surface_rows(kinds, observed, with_geometry)
     inputs = [_inputs(method, cloud, with_geometry) for cloud in (source, target)]
@@ -292,8 +293,10 @@ def _table(
 
 def _descriptors(method: AbstractMethod, own: Rows) -> tuple[SearchPoints]:
     """Descriptors and penalties of `searchable`, for the derivative of a soft assignment."""
-    points, channels, known, *_ = own.tree
-    found = search_rows(*search_numbers(method, channels, known), points, channels, known, jnp.ones(len(points), bool))
+    points, channels, measured, *_ = own.tree
+    found = search_rows(
+        *search_numbers(method, channels, measured), points, channels, measured, jnp.ones(len(points), bool)
+    )
     # A mask is no number, and positions are in the surface already.
     return (found._replace(points=None, valid=None),)
 

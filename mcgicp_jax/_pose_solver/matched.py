@@ -123,10 +123,10 @@ class Matched(eqx.Module):
 def match_surfaces(source: Surface, target: Surface, matches: Matches) -> Matched:
     """Gather the matched rows of both surfaces, for their derivative; pure JAX."""
     # Points without a match are filled with the rows of other matches in turn, see `whole`.
-    known = jnp.asarray(matches.indices).reshape(-1)
-    (found,) = jnp.nonzero(known >= 0, size=known.size)
-    others = known[found[jnp.arange(known.size) % jnp.maximum(jnp.sum(known >= 0), 1)]]
-    filled = jnp.where(known >= 0, known, others).reshape(matches.indices.shape)
+    indices = jnp.asarray(matches.indices).reshape(-1)
+    (found,) = jnp.nonzero(indices >= 0, size=indices.size)
+    others = indices[found[jnp.arange(indices.size) % jnp.maximum(jnp.sum(indices >= 0), 1)]]
+    filled = jnp.where(indices >= 0, indices, others).reshape(matches.indices.shape)
     rows = [whole(each) for each in inputs_of(source, target, matches._replace(indices=filled))]
     rows[1::2] = [each._replace(index=matches.indices) for each in rows[1::2]]
     return matched_rows(rows, matches.temperature)

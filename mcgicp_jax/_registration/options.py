@@ -113,8 +113,8 @@ def options_of(function: Callable[..., Any], given: Any) -> Options:
     names = [*GivenOptions.__annotations__, *named]
     for name in given.keys() - names:
         close = difflib.get_close_matches(name, names)
-        known = f"did you mean {' or '.join(close)}?" if close else f"expected one of {', '.join(sorted(names))}"
-        raise TypeError(f"{function.__name__}: got an unexpected argument {name!r}; {known}")
+        hint = f"did you mean {' or '.join(close)}?" if close else f"expected one of {', '.join(sorted(names))}"
+        raise TypeError(f"{function.__name__}: got an unexpected argument {name!r}; {hint}")
     return Options(**given)
 
 

@@ -48,7 +48,13 @@ from mcgicp_jax._registration.options import Options, check_method
 from mcgicp_jax._registration.pose_derivative import Inputs, differentiated, jacobian, with_derivatives
 from mcgicp_jax._registration.result import RegistrationResult, is_usable
 from mcgicp_jax._registration.settings import settings_for
-from mcgicp_jax._registration.tie_points_and_prior import GivenPrior, GivenTiePoints, fusion_of, known, measured
+from mcgicp_jax._registration.tie_points_and_prior import (
+    GivenPrior,
+    GivenTiePoints,
+    checked_measurements,
+    fusion_of,
+    measured,
+)
 from mcgicp_jax._registration.traced import assess, differentiable, moments_traced, run_traced
 from mcgicp_jax._search.base import AbstractIndex, AbstractSearch, Correspondences
 from mcgicp_jax._search.brute_force import default_search
@@ -137,7 +143,7 @@ def prepared(
         raise ValueError("voxel_sizes: expected none for clouds with covariances, which cannot be averaged in voxels")
     if options.voxel_sizes and method.needs_covariances and not is_concrete(source, target):
         raise ValueError("voxel_sizes: expected none for derivatives with cells; make these with voxel_gaussians")
-    return Inputs(source, target, method, options.robust, *known(tie_points, prior, source, target))
+    return Inputs(source, target, method, options.robust, *checked_measurements(tie_points, prior, source, target))
 
 
 @with_settings_of_package

@@ -42,11 +42,11 @@ if TYPE_CHECKING:
     GivenTiePoints: TypeAlias = tuple[Any, Any, Any]
     GivenPrior: TypeAlias = tuple[Any, Any]
 else:
-    # Not checked at run time: `known` has better messages.
+    # Not checked at run time: `checked_measurements` has better messages.
     GivenTiePoints = GivenPrior = Any
 
 
-def known(
+def checked_measurements(
     tie_points: GivenTiePoints | None, prior: GivenPrior | None, source: PointCloud, target: PointCloud
 ) -> tuple[TiePoints | None, Prior | None]:
     """Tie points and prior, checked, relative to the origins of the clouds."""
@@ -117,12 +117,12 @@ def _information(
     One of the two has correlations that rounding does not spoil: the first for a pose that was measured at the cloud,
     the second for one measured at a far origin. A root of the information has twice the digits of the information.
     """
-    known = []
+    references = []
     for offset in (source.origin, np.zeros(3)):
         change = translation_adjoint(-np.asarray(offset, np.float64))
-        known.append((offset, *_principal_rows(change @ covariance @ change.T)))
+        references.append((offset, *_principal_rows(change @ covariance @ change.T)))
     # Rounding lets directions look fixed that are not.
-    offset, values, rows = max(known, key=lambda each: sorted(np.where(each[1] > _LEAST_EIGENVALUE, each[1], 0)))
+    offset, values, rows = max(references, key=lambda each: sorted(np.where(each[1] > _LEAST_EIGENVALUE, each[1], 0)))
     definite = bool(values[0] >= -_LEAST_EIGENVALUE and np.all(np.diagonal(covariance) >= 0))
     _require("prior: covariance", _correlations(covariance)[1], definite, "positive semidefinite")
     fixed = values <= _LEAST_EIGENVALUE

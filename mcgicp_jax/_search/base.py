@@ -84,12 +84,12 @@ class NeighborsOnDemand(Deferred):
         self._table = RowsOnDemand(lambda rows, _: find(rows), shape[0])
 
     def __getitem__(self, rows: Any) -> Int[np.ndarray, "*n k"]:
-        return self._table.known(rows)[rows]
+        return self._table.computed(rows)[rows]
 
     @property
     def whole(self) -> Int[np.ndarray, "N k"]:
         """All rows, as a read-only array."""
-        found = self._table.known()
+        found = self._table.computed()
         found.setflags(write=False)
         return found
 

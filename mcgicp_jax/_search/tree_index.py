@@ -174,15 +174,15 @@ class _MatchTracker:
         moved = _moved(pose, self._points)
         shift = moved - self._asked
         # Comparisons with NaN, which marks points not yet searched for, are false.
-        known = np.einsum("ij,ij->i", shift, shift) < self._slack**2
-        stale = np.flatnonzero(~known)
+        unchanged = np.einsum("ij,ij->i", shift, shift) < self._slack**2
+        stale = np.flatnonzero(~unchanged)
         self._queries[:, :3] = moved
         penalty = None if self._penalty is None else self._penalty[stale]
         # `take` takes a quarter of the time of an index array.
         found, self._slack[stale] = self._index.nearest_of(
             self._queries.take(stale, axis=0), penalty, self._max_distance, len(self._rows)
         )
-        self._asked = np.where(known[:, None], self._asked, moved)
+        self._asked = np.where(unchanged[:, None], self._asked, moved)
         # Arrays returned earlier must not change.
         self._rows = self._rows.copy()
         self._rows[:, self._order[stale]] = found.T

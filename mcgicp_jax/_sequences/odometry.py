@@ -169,7 +169,7 @@ class _Reader:
                 self.voxel_size = voxels_for(self.voxel_size, cloud)
                 cloud = preprocess(cloud, self.voxel_size, self.num_neighbors)
         if not (self.options.equalize_channels or self.options.takes_raw(self.method, "source")):
-            geometry_table(cloud, self.method.uses_channels).known(rows_to_match(cloud, self.options))
+            geometry_table(cloud, self.method.uses_channels).computed(rows_to_match(cloud, self.options))
         return name, cloud
 
 

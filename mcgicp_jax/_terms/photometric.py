@@ -121,15 +121,15 @@ def fitted_channels(around: Neighborhoods, local: LocalGeometry | None) -> Fitte
     kernel = 1 - square / jnp.where(farthest > 0, farthest, 1)
     fitted, gradients = [], []
     for channel in range(around.num_channels):
-        known, values = around.known(channel), around.difference(channel)
-        fit = fit_linear(x, y, values, known.astype(x.dtype))
+        measured, values = around.measured(channel), around.difference(channel)
+        fit = fit_linear(x, y, values, measured.astype(x.dtype))
         gx, gy = fit.gradient
-        weights = jnp.where(known, kernel, 0)
+        weights = jnp.where(measured, kernel, 0)
         total = jnp.sum(weights, axis=0)
         value = jnp.sum(weights * (values - gx * x - gy * y), axis=0) / jnp.where(total > 0, total, 1)
         enough = (fit.weight > 3) & (fit.inverse[0] > 0)
-        if around.own_known is not None:
-            enough = enough & around.own_known[channel]
+        if around.own_measured is not None:
+            enough = enough & around.own_measured[channel]
         fitted.append(jnp.where(enough, around.own_channels[channel] + value, jnp.nan))
         gradients.append(jnp.where(enough, gx * basis[0] + gy * basis[1], 0))
     return FittedChannels(local.normal, jnp.stack(fitted, axis=1), jnp.stack(gradients).transpose(2, 0, 1))
@@ -218,16 +218,18 @@ class Photometric(AbstractAdaptiveTerm):
         own, products = [], []
         for channel in range(self.gains.shape[0]):
             here, there = a.value[:, channel], b.value[:, channel]
-            known = near & ~jnp.isnan(here) & ~jnp.isnan(there)
+            measured = near & ~jnp.isnan(here) & ~jnp.isnan(there)
             turned = self.gains[channel] * jnp.dot(rotation, a.gradient[:, channel].T, precision="highest")
             gradient = b.gradient[:, channel].T
             slope = 0.5 * (gradient + turned)
-            fitted = jnp.where(known, here, 0)
-            predicted = jnp.where(known, there, 0) + alg.inner(slope, offset)
-            values.append(jnp.where(known, predicted - self.gains[channel] * fitted - self.offsets[channel], jnp.nan))
-            slopes.append(jnp.where(known, slope, 0))
-            own.append(jnp.where(known, fitted, jnp.nan))
-            products.append(jnp.where(known, alg.inner(turned, gradient), 0))
+            fitted = jnp.where(measured, here, 0)
+            predicted = jnp.where(measured, there, 0) + alg.inner(slope, offset)
+            values.append(
+                jnp.where(measured, predicted - self.gains[channel] * fitted - self.offsets[channel], jnp.nan)
+            )
+            slopes.append(jnp.where(measured, slope, 0))
+            own.append(jnp.where(measured, fitted, jnp.nan))
+            products.append(jnp.where(measured, alg.inner(turned, gradient), 0))
         return values, slopes, own, products
 
     def sample(self, matches: PosedMatches) -> Residuals:
@@ -253,16 +255,16 @@ class Photometric(AbstractAdaptiveTerm):
             predicted = values[1:] + gains[:, None] * own + offsets[:, None]
             gains, offsets = gain_and_offset(own.T, predicted.T)
             values = xp.concatenate([values[:1], predicted - gains[:, None] * own - offsets[:, None]])
-        known = ~xp.isnan(values)
-        slopes = xp.where(known[:, None], slopes, 0)
+        measured = ~xp.isnan(values)
+        slopes = xp.where(measured[:, None], slopes, 0)
         middle = median(values)[:, None]
         spread = _PER_MEDIAN * median(xp.abs(values - middle))
         lengths = xp.sum(slopes**2, axis=1)
-        number = xp.maximum(xp.sum(known, axis=1), 1)
+        number = xp.maximum(xp.sum(measured, axis=1), 1)
         least = _LEAST_OFFSET * self.spacing * xp.sqrt(xp.sum(lengths, axis=1) / number)
         deviations = xp.where(xp.isfinite(spread), xp.maximum(spread, least), 0)
         scale = xp.where(deviations > 0, deviations, 1)[:, None]
-        scaled = xp.where(known, values, 0) / scale
+        scaled = xp.where(measured, values, 0) / scale
         weights = 1 / (1 + scaled**2 / _KERNEL_SCALE**2)
         scores = (weights * scaled / scale)[:, None] * slopes
         expected = xp.sum(weights * lengths / scale**2, axis=1)
@@ -276,7 +278,7 @@ class Photometric(AbstractAdaptiveTerm):
         alone = xp.sum((scores**2).sum(axis=1), axis=1)
         expected = xp.where(expected > 0, expected, 1)
         designs = xp.maximum((alone + (seen - alone) / fraction) / expected, 1)
-        agreeing = xp.sum(weights[1:] * xp.where(known[1:], products, 0), axis=1)
+        agreeing = xp.sum(weights[1:] * xp.where(measured[1:], products, 0), axis=1)
         assumed = xp.sum(weights[1:] * lengths[1:], axis=1)
         reliability = xp.clip(agreeing / xp.where(assumed > 0, assumed, 1), _LEAST_RELIABILITY, 1)
         designs = designs / xp.concatenate([xp.ones_like(reliability[:1]), reliability])
@@ -303,9 +305,12 @@ class Photometric(AbstractAdaptiveTerm):
         """
         xp = numpy_for(self, samples)
         values, slopes = xp.asarray(samples.values), xp.asarray(samples.slopes)
-        known = ~xp.isnan(values) & (self.deviations > 0)
+        measured = ~xp.isnan(values) & (self.deviations > 0)
         scale = xp.where(self.deviations > 0, self.deviations, 1)
-        scaled, slopes = xp.where(known, values, 0) / scale, xp.where(known[..., None], slopes, 0) / scale[:, None]
+        scaled, slopes = (
+            xp.where(measured, values, 0) / scale,
+            xp.where(measured[..., None], slopes, 0) / scale[:, None],
+        )
         weights = 1 / (1 + scaled**2 / _KERNEL_SCALE**2)
         forces = xp.sum((weights * scaled)[..., None] * slopes, axis=1)
         change = sum(forces[2 * axis, :, axis] - forces[2 * axis + 1, :, axis] for axis in range(3)) / (

@@ -62,11 +62,11 @@ def format_of(path: Path) -> Format:
 
 def is_cloud(path: Path) -> bool:
     """Whether a file is a cloud by its suffix and, where this is not enough, by the start of its content."""
-    known = FORMATS.get(path.suffix.lower())
-    if known is None:
+    file_format = FORMATS.get(path.suffix.lower())
+    if file_format is None:
         return False
     with open(path, "rb") as file:
-        return known.is_cloud(file)
+        return file_format.is_cloud(file)
 
 
 def read(path: str | os.PathLike[str]) -> PointCloud:
