@@ -11,7 +11,7 @@ from jaxtyping import Array, Float
 from mcgicp_jax._clouds.point_cloud import PointCloud, Values
 from mcgicp_jax._compute.concrete import AnyArray
 from mcgicp_jax._compute.threads import with_settings_of_package
-from mcgicp_jax._local_geometry.covariances import plane_covariance
+from mcgicp_jax._local_geometry.channel_covariances import plane_covariance
 from mcgicp_jax._local_geometry.local_geometry import Geometries, LocalGeometry
 from mcgicp_jax._local_geometry.neighborhoods import Neighborhoods
 from mcgicp_jax._math import symmetric_matrices as alg

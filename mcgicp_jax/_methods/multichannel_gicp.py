@@ -18,8 +18,8 @@ from mcgicp_jax._clouds.preprocess import preprocess
 from mcgicp_jax._compute.concrete import AnyArray, constant, numpy_for
 from mcgicp_jax._compute.devices import put_on_cpu
 from mcgicp_jax._compute.threads import with_settings_of_package
+from mcgicp_jax._local_geometry.channel_covariances import channel_kernel, multichannel_covariance, plane_covariance
 from mcgicp_jax._local_geometry.cloud_statistics import channel_noise, point_spacing
-from mcgicp_jax._local_geometry.covariances import channel_kernel, multichannel_covariance, plane_covariance
 from mcgicp_jax._local_geometry.local_geometry import Geometries, LocalGeometry, local_geometries
 from mcgicp_jax._local_geometry.neighborhoods import NO_NEIGHBORS, Neighborhoods
 from mcgicp_jax._math.poses import Pose, pose_matrix
