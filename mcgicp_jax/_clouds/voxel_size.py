@@ -193,7 +193,7 @@ def _shape_of(columns: Float[np.ndarray, "3 N"], neighbors: Any = None) -> Shape
 
 class _Candidate:
     """A cloud for which a voxel size is chosen, and the shapes of its neighbourhoods in voxels: points, or means in
-    voxels of the size number `step`. At least so many voxels show the scene."""
+    voxels of the size number `step`. Fewer than `least` voxels do not show the scene."""
 
     def __init__(self, grid: Grid, step: int | None, least: int):
         self._grid, self._step, self._least = grid, step, least

@@ -70,7 +70,7 @@ class Input(NamedTuple):
 
 
 class GivenTable:
-    """A table of NumPy arrays, some of which differentiation may trace. The methods are those of `ComputedTable`."""
+    """A table of NumPy arrays, some of which differentiation may trace. Methods are as of `ComputedTable`."""
 
     def __init__(self, tree: Any):
         self._leaves = jax.tree.leaves(tree)
@@ -245,7 +245,7 @@ class RowFunction:
         return np.concatenate([part[:, : places.stop - places.start] for places, part in parts], axis=1).swapaxes(0, 1)
 
     def _chosen(self, moving: Moving) -> Chosen:
-        """What depends on what is moving."""
+        """The places of the numbers, and of the columns of each input, that depend on the moving arrays."""
         numbers = tuple(i for i, leaf in enumerate(self._leaves) if id(leaf) in moving)
         return numbers, *(() if each.part else each.table.columns(moving) for each in self._inputs)
 
@@ -266,6 +266,8 @@ class RowFunction:
 
 class ComputedTable(RowFunction):
     """The result of a row function, whose rows are computed when they are first used. Threads may share it.
+
+    Tangents and cotangents are those of the `columns` that move alone.
 
     Args:
         function, numbers, inputs, size: as of `RowFunction`; the function returns a tuple of trees, of which those
@@ -293,7 +295,7 @@ class ComputedTable(RowFunction):
         if moving.isdisjoint(self.arrays):
             return ()
         layout = self.computed(np.zeros(0, int))[0].layout
-        return tuple(i for i, dtype in enumerate(layout.dtypes) if dtype is None)
+        return tuple(i for i, dtype in enumerate(layout.dtypes) if dtype is None or jnp.issubdtype(dtype, jnp.floating))
 
 
 Table = GivenTable | ComputedTable

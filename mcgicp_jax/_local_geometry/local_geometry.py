@@ -124,8 +124,8 @@ def cell_edge(cells: PointCloud) -> Float[AnyScalar, ""]:
 
 
 def geometry_of_cells(local: LocalGeometry, given: Float[Array, "6 n"], num_candidates: int) -> LocalGeometry:
-    """Local geometry of cells: channel fits from that of their neighbourhoods, everything else from the covariances of
-    the cells, metres², of which `num_candidates` are matched with each point or cell."""
+    """Local geometry of cells: channel fits from `local`, that of their neighbourhoods, everything else from the
+    covariances of the cells, metres², of which `num_candidates` are matched with each point or cell."""
     given = jax.lax.stop_gradient(given)
     normal = alg.smallest_eigenvector(given)
     across = alg.inner(normal, alg.multiply(given, normal))

@@ -17,7 +17,7 @@ from mcgicp_jax._local_geometry.neighborhoods import ChannelFits
 from mcgicp_jax._math import symmetric_matrices as alg
 
 # Fraction of the variance of a fitted gradient that is subtracted from the product of both halves: few points scatter.
-# Of 140 walls with noise for channels (400, 2,000 and 12,000 points), channels held a direction of 6; with 0, of 80.
+# Channels that are noise constrained a direction of 6 of 140 walls (400, 2,000 and 12,000 points); with 0, of 80.
 _MARGIN = 0.2
 
 # κ of `observability_of_halves`: 1/16 makes normals that are nearly right unbiased, 5/16 those of random directions. In

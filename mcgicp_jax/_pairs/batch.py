@@ -45,8 +45,8 @@ def register_batch(
     many pairs is one call; with an `executor` by its workers, as (7, n) matrices. Clouds must be given in lists then.
     Inside `jit` and `vmap`, use `register`.
     """
-    job = _job(method, options, voxel_size, num_neighbors, covariances)
-    pairs, workers = _pairs(job, sources, targets, init), executor_of(executor)
+    job, workers = _job(method, options, voxel_size, num_neighbors, covariances), executor_of(executor)
+    pairs = _pairs(job, sources, targets, init)
     # A look at an iterator would use it up.
     clouds = [side for side in (sources, targets) if isinstance(side, list | tuple | PointCloud)]
     inputs = clouds, job.method, job.options.robust
@@ -105,8 +105,8 @@ def register_as_completed(
     Warns:
         PairWarning: the reason for each pair with the status `INVALID_INPUT` or `WORKER_FAILED`; a `UserWarning`.
     """
-    job = _job(method, options, voxel_size, num_neighbors, covariances)
-    return run(job, _pairs(job, sources, targets, init), executor_of(executor))
+    job, workers = _job(method, options, voxel_size, num_neighbors, covariances), executor_of(executor)
+    return run(job, _pairs(job, sources, targets, init), workers)
 
 
 def _job(

@@ -35,8 +35,9 @@ from mcgicp_jax._registration.result import Status
 
 # Probability that a true measurement exceeds the threshold on its squared Mahalanobis distance.
 _LEVEL = 0.01
-# Factor by which the non-convexity grows, with one step at each: 1.4 (Yang et al. 2020) keeps the same loops, with 4
-# some true ones are lost. The first steps cannot be left out: errors then grow by a factor of 30 in large graphs.
+# Factor by which the non-convexity grows, with one step at each: 1.4 (Yang et al. 2020) keeps the same loops, 4 loses
+# 0.4 % of the true ones (ten grids, 30 % of false loops). Without the first steps, errors are 30 times as large in a
+# garage of 1,600 poses.
 _GROWTH = 2.0
 # Largest number of selections at the minimum, which end when a selection repeats itself.
 _SELECTIONS = 5

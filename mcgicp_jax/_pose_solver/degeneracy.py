@@ -25,7 +25,7 @@ from mcgicp_jax._pose_solver.update import twist_form
 # below 0.0016 in flat scenes (posters on a wall, a road, a table with 2 mm noise) and from 0.1 on in others; GICP's
 # artificial in-plane stiffness equals a true fraction of ε, 0.001 by default. Channels: 0.003 from noise alone, from
 # 0.008 on with the markings of a road.
-GEOMETRY_HOLDS, CHANNELS_HOLD = 2e-3, 5e-3
+LEAST_BY_GEOMETRY, LEAST_BY_CHANNELS = 2e-3, 5e-3
 # At right poses, the slopes of the channels at matched points agree to at least 0.7 of what each cloud observes (walls
 # and tables); at poses 0.2 to 0.4 m off, on walls and a road, to 0.3 at most.
 _AGREE = 0.5
@@ -36,7 +36,7 @@ _AGREE = 0.5
 _PATTERN = -1 / 16
 # Smallest information of tie points and prior for a direction to count as constrained: a standard deviation of one
 # radius of the matched points. Useful tie points and priors are far above it.
-_TIES_HOLD = 1.0
+_LEAST_BY_TIES = 1.0
 _IDENTITY = np.array([1, 0, 0, 1, 0, 1])
 # A direction is named a translation if its rotation causes at most this fraction of the points' motion (rms).
 _PURE = 0.3
@@ -67,7 +67,7 @@ class Directions(eqx.Module):
     @property
     def free(self) -> Bool[AnyArray, "*batch 6"]:
         """Which directions geometry does not constrain."""
-        return ~(self.geometry >= GEOMETRY_HOLDS)
+        return ~(self.geometry >= LEAST_BY_GEOMETRY)
 
     @property
     def fixed(self) -> Bool[AnyArray, "*batch 6"]:
@@ -77,7 +77,7 @@ class Directions(eqx.Module):
     @property
     def constrained_by_matches(self) -> Bool[AnyArray, "*batch 6"]:
         """Which directions are constrained by geometry or by the channels; not those that are fixed."""
-        return (~self.free | (self.channels >= CHANNELS_HOLD)) & ~self.fixed
+        return (~self.free | (self.channels >= LEAST_BY_CHANNELS)) & ~self.fixed
 
     @property
     def constrained(self) -> Bool[AnyArray, "*batch 6"]:
@@ -85,7 +85,7 @@ class Directions(eqx.Module):
         return (
             self.constrained_by_matches
             if self.ties is None
-            else self.constrained_by_matches | (self.ties >= _TIES_HOLD)
+            else self.constrained_by_matches | (self.ties >= _LEAST_BY_TIES)
         )
 
 
@@ -120,7 +120,7 @@ def find_directions(sums: Sums, constraints: Float[Array, "6 6"] | None = None) 
     seen = jnp.where(jnp.outer(~fixed, ~fixed), basis.T @ geometry @ basis, jnp.diag(2.0 * fixed))
     shares, turn = jnp.linalg.eigh(seen)
     basis = basis @ turn
-    free = ~(shares >= GEOMETRY_HOLDS)
+    free = ~(shares >= LEAST_BY_GEOMETRY)
     if sums.channel_observability is None or sums.agreement is None or sums.surplus is None:
         channels, shares = jnp.zeros_like(shares), jnp.where(fixed, jnp.sum(basis * (geometry @ basis), axis=0), shares)
         return Directions(twists=basis.T, geometry=shares, channels=channels, center=center, radius=radius, ties=ties)

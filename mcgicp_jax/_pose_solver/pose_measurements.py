@@ -126,8 +126,8 @@ class PoseMeasurements(eqx.Module):
             )
             return error.log().astype(dtype)
 
-        residual, push = jax.linearize(residual_at, jnp.zeros(6, dtype))
-        return residual, jax.vmap(push)(jnp.eye(6, dtype=dtype))
+        residual, jvp = jax.linearize(residual_at, jnp.zeros(6, dtype))
+        return residual, jax.vmap(jvp)(jnp.eye(6, dtype=dtype))
 
     def force_and_stiffness(
         self, rotation: Float[Array, "3 3"], translation: Float[Array, "3"]

@@ -195,7 +195,8 @@ class AbstractExecutor(abc.ABC):
     def sums(self, motion: Motion, matches: Matches, terms: tuple[AbstractTerm, ...], last: Bool[AnyScalar, ""]) -> Any:
         """`sums_of` all correspondences, as the executor keeps them while the loop runs.
 
-        In the `last` step, the channels of matched points must agree. Far from the right pose they do not.
+        In the `last` step, the channels of matched points must agree. Far from the right pose they do not, and before
+        that step the channels that each cloud observes guide the pose.
         """
 
     def update(self, state: State, sums: Any) -> State:
@@ -208,8 +209,8 @@ class AbstractExecutor(abc.ABC):
         """`scores_of` all correspondences; further arguments are those of that function."""
 
     def adapt(self, state: State, matches: Matches, before: tuple[AbstractTerm, ...]) -> tuple[AbstractTerm, ...]:
-        """The terms with their numbers estimated at the pose of a state, from a sample of the matches. Executors keep
-        those `before` outside the fine phase."""
+        """The terms with their numbers estimated anew at the pose of a state, from a sample of the matches. Outside the
+        fine phase, executors keep those `before`."""
         terms = self.problem.terms
         if not is_adaptive(terms):
             return terms

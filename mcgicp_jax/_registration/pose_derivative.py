@@ -80,8 +80,10 @@ class PoseDerivative(AbstractLinearMap):
     """The derivative of the parameters `jaxlie.SE3.wxyz_xyz` of a final pose by some inputs; 0 if there is none.
 
     Args:
-        inputs, fixed: of the registration; as differentiation may trace them, and concrete.
-        arrays: those of `inputs` by which it is; by default all that are traced.
+        inputs: of the registration, which differentiation may trace.
+        fixed: the same, concrete.
+        executor, loop: of the registration that ended.
+        arrays: those of `inputs` that the derivative is with respect to; by default all that are traced.
     """
 
     def __init__(
@@ -203,7 +205,8 @@ def _score_of_rows(numbers: tuple[Motion, ImplicitRoot, Any, Any], *rows: Rows) 
 def _balance_and_slope(
     pose: Float[Array, "7"], root: ImplicitRoot, fusion: Fusion, matches: Float[Array, "6 7"]
 ) -> Float[Array, "6 7"]:
-    """The equation with tie points and a prior, and its derivative by a twist, from those of g."""
+    """The equation with tie points and a prior, and its derivative by a twist. `matches` has the same of the
+    matches alone: g in its first column."""
 
     def balance(twist: Float[Array, "6"]) -> Float[Array, "6"]:
         return balance_along(twist, pose, root, matches[:, 0] + matches[:, 1:] @ twist, fusion)

@@ -106,7 +106,7 @@ def calibrate(scene: str, noise: float, pairs: int) -> dict[str, list[float]]:
             claims.setdefault(f"{name} covariance", []).append(normalised(error, np.asarray(result.covariance), held))
             claims.setdefault(f"{name} H⁻¹", []).append(normalised(error, inverse, held))
             claims.setdefault(f"{name} σ² H⁻¹", []).append(normalised(error, variance * inverse, held))
-            claims.setdefault(f"{name} held", []).append(np.sum(held.constrained))
+            claims.setdefault(f"{name} constrained", []).append(np.sum(held.constrained))
             if name == "GICP":
                 raw = [np.asarray(frame.cloud.points, np.float64) for frame in (source, target)]
                 error, inverse = peers_hessian(*raw, truth, max_distance)
