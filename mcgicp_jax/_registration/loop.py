@@ -45,7 +45,7 @@ from mcgicp_jax._pose_solver.pose_measurements import (
     with_fixed_directions,
 )
 from mcgicp_jax._pose_solver.sums import Sums
-from mcgicp_jax._pose_solver.update import rounding, solve_update
+from mcgicp_jax._pose_solver.update import Update, rounding, solve_update
 from mcgicp_jax._registration.result import Status
 from mcgicp_jax._registration.settings import COARSE, RUNNING, SETTLED, Settings
 from mcgicp_jax._search.base import SearchPoints, by_position
@@ -256,6 +256,30 @@ class AbstractExecutor(abc.ABC):
         return matches._replace(indices=numpy_for(near).where(near, matches.indices, -1))
 
 
+def _change(
+    pose: jaxlie.SE3, sums: Sums, settings: Settings, measurements: PoseMeasurements | None, fixed: Prior | None
+) -> tuple[Update, Directions | None, Bool[AnyScalar, ""]]:
+    """The change of the pose, the directions in which it is constrained, and whether some are not."""
+    directions, basis = None, jnp.eye(6, dtype=sums.center.dtype)
+    degenerate: AnyScalar = np.bool_(False)
+    if sums.observability is not None:
+        constraints = None if fixed is None else constraints_at(pose, sums.center, sums.radius, fixed)
+        directions = find_directions(sums, constraints)
+        degenerate = ~jnp.all(directions.constrained)
+        # Along unconstrained directions an update would follow arbitrary nearest-neighbour matches.
+        moving = (directions.constrained | ~settings.hold_unconstrained) & ~directions.fixed
+        basis = jnp.asarray(directions.twists).T * moving
+    if isinstance(measurements, Fusion):
+        directions, change = fused_update(pose, sums, cast(Directions, directions), measurements)
+        degenerate = ~jnp.all(directions.constrained)
+    elif measurements is None or directions is None:
+        change = solve_update(sums, basis)
+    else:
+        change = solve_update(sums, basis, first_force(pose, sums, directions, measurements))
+    # Matches need not constrain what is fixed.
+    return change, directions, degenerate | (change.degenerate & (fixed is None))
+
+
 @jax.jit
 def update(
     pose: jaxlie.SE3,
@@ -274,26 +298,9 @@ def update(
     number is a power of two (Brent 1980). Such a cycle ends the loop if its poses differ by less than one standard
     deviation, estimated as if the residuals were independent; the deviation of the pose is larger.
     """
-    directions, basis = None, jnp.eye(6, dtype=sums.center.dtype)
-    degenerate: AnyScalar = np.bool_(False)
-    if sums.observability is not None:
-        constraints = None if fixed is None else constraints_at(pose, sums.center, sums.radius, fixed)
-        directions = find_directions(sums, constraints)
-        degenerate = ~jnp.all(directions.constrained)
-        # Along unconstrained directions an update would follow arbitrary nearest-neighbour matches.
-        moving = (directions.constrained | ~settings.hold_unconstrained) & ~directions.fixed
-        basis = jnp.asarray(directions.twists).T * moving
-    if isinstance(measurements, Fusion):
-        directions, change = fused_update(pose, sums, cast(Directions, directions), measurements)
-        degenerate = ~jnp.all(directions.constrained)
-    elif measurements is None or directions is None:
-        change = solve_update(sums, basis)
-    else:
-        change = solve_update(sums, basis, first_force(pose, sums, directions, measurements))
+    change, directions, degenerate = _change(pose, sums, settings, measurements, fixed)
     moved = move_pose(pose, change.twist, sums.center)
     moved = moved if fixed is None else with_fixed_directions(moved, fixed)
-    # Matches need not constrain what is fixed.
-    degenerate = degenerate | (change.degenerate & (fixed is None))
     coarse, settled = status == COARSE, status == SETTLED
     since = since + change.twist
     sizes = jnp.linalg.norm(jnp.stack([change.twist, since]).reshape(2, 2, 3), axis=2)
