@@ -140,14 +140,15 @@ def test_every_form_of_pose():
         assert float(actual) == pytest.approx(reference_cost("GICP"), rel=1e-10)
 
 
-def test_at_large_coordinates_the_cost_is_the_same():
+@pytest.mark.parametrize("robust", [None, Cauchy(SCALE)])
+def test_at_large_coordinates_the_cost_is_the_same(robust):
     utm = np.array([512_345.6, 5_403_210.9, 312.3])
     raw, _, _, matches, _ = problem()
     clouds = [preprocess(PointCloud(points + utm, channels), num_neighbors=K).pad(ROWS) for points, channels in raw]
     shift, back = np.eye(4), np.eye(4)
     shift[:3, 3], back[:3, 3] = utm, -utm
-    rho = functools.partial(ref.ROBUST["cauchy"], c=SCALE)
-    actual = mahalanobis_cost(shift @ T @ back, *clouds, matches, METHODS["MultiChannelGICP"](), robust=Cauchy(SCALE))
+    rho = None if robust is None else functools.partial(ref.ROBUST["cauchy"], c=SCALE)
+    actual = mahalanobis_cost(shift @ T @ back, *clouds, matches, METHODS["MultiChannelGICP"](), robust=robust)
     assert float(actual) == pytest.approx(reference_cost("MultiChannelGICP", rho=rho), rel=tolerance(1e-3, 1e-6))
 
 
@@ -254,6 +255,15 @@ def test_gradients_against_differences_of_the_reference(name, argument):
     assert actual == pytest.approx(expected, rel=tolerance(5e-3, 1e-6), abs=tolerance(1e-4, 1e-9))
 
 
+def test_the_gradients_are_not_all_zero():
+    """What each method depends on, and on nothing else."""
+    sensitive = {name: {a for a, g in gradients(name).items() if np.any(g)} for name in METHODS}
+    points = {"pose", "source points", "target points"}
+    assert sensitive["PointToPoint"] == sensitive["ColorICP"] == sensitive["PointToPlane"] == points
+    assert sensitive["GICP"] == points | {"ε"}
+    assert sensitive["MultiChannelGICP"] == set(ARGUMENTS)
+
+
 def test_rows_without_a_match_add_nothing():
     """Whatever they point at, and whatever lies there, even NaN: the value and the gradient do not move."""
     _, _, (source, target), matches, matched = problem()
@@ -320,18 +330,19 @@ def test_neighbourhoods_of_large_clouds_are_summed_inside_jit():
     np.testing.assert_allclose(jax.jit(cost)(source.points), cost(source.points), rtol=1e-9)
 
 
-def test_a_batch_is_its_lanes():
+@pytest.mark.parametrize("name", ["PointToPlane", pytest.param("MultiChannelGICP", marks=pytest.mark.slow)])
+def test_a_batch_is_its_lanes(name):
     _, _, (source, target), matches, _ = problem()
     dtype = source.points.dtype
     poses = jnp.asarray(np.stack([T, ref.pose([0.02, 0, 0], [0, 0.1, 0]), np.eye(4)]), dtype)
 
     def cost(pose):
-        return mahalanobis_cost(pose, source, target, matches, METHODS["PointToPlane"]())
+        return mahalanobis_cost(pose, source, target, matches, METHODS[name]())
 
     values, slopes = jax.jit(jax.vmap(jax.value_and_grad(cost)))(poses)
     for i, pose in enumerate(poses):
         assert float(values[i]) == pytest.approx(
-            reference_cost("PointToPlane", np.asarray(pose, float)), rel=tolerance(1e-4, 1e-6)
+            reference_cost(name, np.asarray(pose, float)), rel=tolerance(1e-4, 1e-6)
         )
     assert np.isfinite(slopes).all()
 

@@ -233,3 +233,11 @@ def test_kitti_errors_by_their_definition(step):
     stretched[:, :3, 3] *= 1.02
     assert kitti_errors(stretched, straight) == pytest.approx((2.0, 0), rel=0.01)
     assert kitti_errors(stretched, straight, lengths=(100.0,)) == pytest.approx((2.02, 0), abs=1e-9)
+
+
+def test_vmap_of_grad_is_finite_where_some_lanes_have_no_error():
+    truth = jnp.eye(4)
+    poses = jnp.stack([truth, truth.at[0, 3].set(0.5)])
+    gradients = jax.jit(jax.vmap(jax.grad(lambda T: sum(pose_error(T, truth)))))(poses)
+    assert np.isfinite(gradients).all()
+    np.testing.assert_allclose(gradients[1, 0, 3], 1, atol=1e-6)

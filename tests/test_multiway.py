@@ -269,3 +269,9 @@ def test_outputs_in_the_folder_are_no_inputs(room, tmp_path, capsys):
     assert main(["multiway", str(tmp_path), *options, "--map", str(tmp_path / "map.ply")]) == 2
     assert "map.ply: expected a map outside of" in capsys.readouterr().err
     assert main(["multiway", str(tmp_path), *options, "--glob", "?.ply", "--map", str(tmp_path / "map.ply")]) == 0
+
+
+def test_equal_clouds_are_registered():
+    points = np.random.default_rng(0).uniform(-1, 1, (300, 3))
+    found = mcg.multiway([points, points], mcg.GICP())
+    np.testing.assert_allclose(found.poses, np.tile(np.eye(4), (2, 1, 1)), atol=1e-6)

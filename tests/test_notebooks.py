@@ -43,6 +43,24 @@ def near(stored, found):
     return abs(float(found) - float(stored)) <= max(share * abs(float(stored)), least) * (1 + 1e-9)
 
 
+@pytest.mark.parametrize(
+    ("stored", "found", "expected"),
+    [
+        ("54 edges, cost 17.7", "53 edges, cost 16.1", True),
+        ("54 edges", "49 edges", False),
+        ("GICP 40.1 mm  CONVERGED", "GICP  49.0 mm CONVERGED", True),
+        ("GICP 40.1 mm CONVERGED", "GICP 60.1 mm CONVERGED", False),
+        ("CONVERGED", "DEGENERATE", False),
+        ("1,166 and 2,369", "1,168 and 2,354", True),
+        ("1.31e-06", "1.33e-06", True),
+        ("1.31e-06", "1.31e-05", False),
+        ("[-0.02  0.001]", "[ 0.00  0.002]", True),
+    ],
+)
+def test_lines_agree_within_their_noise(stored, found, expected):
+    assert agree(stored, found) == expected
+
+
 @pytest.mark.slow
 @pytest.mark.timeout(LIMIT)
 @pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)

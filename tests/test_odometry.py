@@ -319,3 +319,11 @@ def test_a_frame_that_cannot_be_registered_is_named():
         found = list(steps)
     assert not found[3].registration.converged
     assert found[3].lost and not any(step.lost for step in found[:3])
+
+
+def test_a_map_of_the_room_is_sharp_at_the_true_poses(room):
+    frames, truth = room
+    clouds = [frame.cloud for frame in frames]
+    sharp = mcg.merge_clouds(clouds, truth, 0.05)
+    blurred = mcg.merge_clouds(clouds, [pose @ motion((0, 0, 0, 0.1 * i, 0, 0)) for i, pose in enumerate(truth)], 0.05)
+    assert len(sharp) < len(blurred) < sum(map(len, clouds))

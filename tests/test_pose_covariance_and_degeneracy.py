@@ -298,7 +298,7 @@ def test_units_and_origin_change_nothing(scale, shift):
 
 @pytest.mark.slow
 def test_real_scenes(data):
-    """A flat table leaves three directions free, a street none."""
+    """A flat table and a road leave three directions free, a street none."""
     file = np.load(data / "planar_table" / "pair_000015_000025.npz")
     table = [
         mcg.preprocess(mcg.PointCloud(file[f"{which}_points_flat"], file[f"{which}_rgb"]), 0.01)
@@ -306,6 +306,7 @@ def test_real_scenes(data):
     ]
     scans = [np.fromfile(data / f"kitti/sequences/04/velodyne/{i:06d}.bin", np.float32).reshape(-1, 4) for i in (1, 0)]
     street = [mcg.preprocess(mcg.PointCloud(scan[:, :3], scan[:, 3:]), 0.25) for scan in scans]
+    road = [mcg.preprocess(mcg.PointCloud(scan[:, :3], scan[:, 3:]), 0.1) for scan in map(on_the_road, scans)]
 
     result = mcg.register(*table, mcg.GICP(), max_distance=0.1)
     assert result.status is mcg.Status.DEGENERATE
@@ -313,8 +314,25 @@ def test_real_scenes(data):
     result = mcg.register(*table, mcg.MultiChannelGICP(), max_distance=0.1)
     assert result.converged and [each.constrained_by_channels for each in result.unconstrained_directions] == [True] * 3
 
+    result = mcg.register(*road, mcg.GICP(), init=motion((1.3, 0, 0, 0, 0, 0)), max_distance=0.5)
+    assert result.status is mcg.Status.DEGENERATE
+    forward, sideways, yaw = result.unconstrained_directions
+    assert abs(forward.axis[0]) > 0.99 and abs(sideways.axis[1]) > 0.99
+    assert yaw.is_rotation and abs(yaw.axis[2]) > 0.99
+
     result = mcg.register(*street, mcg.GICP(), max_distance=1.5)
     assert result.converged and result.unconstrained_directions == ()
+
+
+def on_the_road(scan):
+    """Points of the ground ahead: within 25 m, 6 m to each side, 6 cm of its plane."""
+    scan = scan[(np.abs(scan[:, 1]) < 6) & (np.hypot(scan[:, 0], scan[:, 1]) < 25)]
+    plane, near = None, np.abs(scan[:, 2] + 1.73) < 0.3
+    for _ in range(10):
+        x, y, z = scan[near, :3].T
+        plane = np.linalg.lstsq(np.stack([x, y, np.ones_like(x)], axis=1), z, rcond=None)[0]
+        near = np.abs(scan[:, 2] - scan[:, :2] @ plane[:2] - plane[2]) < 0.06
+    return scan[near]
 
 
 # Covariance
@@ -392,6 +410,16 @@ def test_what_nothing_holds_is_not_known(flat):
         # A motion of one metre, of ten times the radius
         scaled = direction.twist / (direction.twist @ direction.twist)
         assert scaled @ np.asarray(result.covariance) @ scaled > 1
+    constrained = np.asarray(result.directions.constrained)
+    coefficients = np.linalg.inv(np.asarray(result.directions.twists, np.float64).T)[constrained]
+    assert len(coefficients) == 3
+    assert np.sqrt(np.diagonal(coefficients @ result.covariance @ coefficients.T)).max() < 5e-3
+
+
+def test_without_a_pose_there_is_no_covariance():
+    source, target, _ = pair()
+    result = mcg.register(source, target, mcg.GICP(), init=motion((50, 0, 0, 0, 0, 0)), max_distance=0.5)
+    assert np.all(np.isnan(result.covariance)) and result.unconstrained_directions == () and result.overlap == 0
 
 
 def test_large_coordinates_keep_the_covariance_of_the_points():

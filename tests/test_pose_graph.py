@@ -354,3 +354,45 @@ def test_chi_squared_tells_whether_the_information_is_right():
     precise = mcg.Edge(edges.i, edges.j, edges.T_i_j, 100 * edges.information)
     assert mcg.optimize_poses(mcg.PoseGraph(graph.poses, precise), robust=False).chi_squared > 50
     assert np.isnan(mcg.optimize_poses(mcg.PoseGraph(graph.poses, edges[: len(graph.poses) - 1])).chi_squared)
+
+
+def test_an_exact_graph_ends_at_the_truth():
+    poses, loops = SMALL["sphere"]
+    graph, _ = measured(poses, loops, deviations=(0.05, 0.02))
+    i, j = graph.edges.i, graph.edges.j
+    exact = mcg.Edge(i, j, np.linalg.inv(poses[i]) @ poses[j], graph.edges.information)
+    found = mcg.optimize_poses(mcg.PoseGraph(graph.poses, exact))
+    assert found.converged and found.cost < 1e-10
+    np.testing.assert_allclose(found.poses, poses, atol=1e-7)
+
+
+def test_covariances_are_those_of_simulation():
+    """NEES of the poses over many noises; and the spread, pose by pose."""
+    poses, loops = grid(2)
+    squares, twists = [], []
+    for seed in range(60):
+        found = mcg.optimize_poses(measured(poses, loops, seed=seed)[0], robust=False)
+        error = logarithm(np.linalg.inv(found.poses) @ poses)
+        twists.append(error)
+        squares.append([e @ np.linalg.solve(c, e) for e, c in zip(error[1:], found.covariance[1:], strict=True)])
+    assert 0.9 < np.mean(squares) / 6 < 1.1
+    np.testing.assert_allclose(np.std(twists, axis=0)[-1], np.sqrt(np.diag(found.covariance[-1])), rtol=0.35)
+    np.testing.assert_array_equal(found.covariance[0], np.zeros((6, 6)))
+
+
+def test_parts_that_are_not_connected():
+    graph, _ = measured(*SMALL["grid"])
+    cut = (graph.edges.i < 13) == (graph.edges.j < 13)
+    found = mcg.optimize_poses(mcg.PoseGraph(graph.poses, graph.edges[cut]))
+    assert found.status == mcg.Status.DEGENERATE and not found.converged
+    assert np.isfinite(found.poses).all()
+    np.testing.assert_allclose(found.poses[13], graph.poses[13], atol=1e-14)
+    assert np.all(np.isfinite(found.covariance[:13])) and np.all(np.isinf(np.diagonal(found.covariance[13:], 0, 1, 2)))
+
+
+def test_double_edges_count_twice():
+    graph, _ = measured(*grid(2))
+    twice = mcg.PoseGraph(graph.poses, [graph.edges[k] for k in range(len(graph.edges))] * 2)
+    found, expected = (mcg.optimize_poses(each, robust=False) for each in (twice, graph))
+    np.testing.assert_allclose(found.poses, expected.poses, atol=1e-6)
+    np.testing.assert_allclose(found.covariance, expected.covariance / 2, rtol=1e-4, atol=1e-12)

@@ -95,3 +95,9 @@ def test_real_pairs_have_the_same_poses(data, name):
             results += [[mcg.register(*clouds, method, init=init, search=search, **options) for method in METHODS]]
         for one, other in zip(*map(jax.tree.leaves, results), strict=True):
             np.testing.assert_array_equal(np.asarray(one), np.asarray(other))
+
+
+def test_many_neighbors():
+    points = np.random.default_rng(0).normal(size=(400, 3))
+    for k in (100, 300):
+        np.testing.assert_array_equal(PYKDTREE.neighbors(points, k), SCIPY.neighbors(points, k))

@@ -126,6 +126,22 @@ def test_estimate_pose_reaches_the_balance_of_forces(room):
     assert difference(result.matrix, again.matrix) < tolerance(2e-6, 1e-10)
 
 
+@pytest.mark.parametrize("name", ["gicp", "mc-gicp"])
+def test_swapped_clouds_give_the_inverse(name, room):
+    source, target, _ = room
+    forward = mcg.register(source, target, METHODS[name](), max_distance=0.5, **tight())
+    backward = mcg.register(target, source, METHODS[name](), max_distance=0.5, **tight())
+    # Each direction has its own matches, so the answers agree to the noise of matching.
+    assert difference(forward.matrix @ backward.matrix, np.eye(4)) < 2e-3
+
+
+def test_identical_clouds_converge_at_once(room):
+    source, _, _ = room
+    result = mcg.register(source, source, METHODS["mc-gicp"](), max_distance=0.5)
+    assert result.converged and result.num_iterations == 1
+    np.testing.assert_allclose(result.matrix, np.eye(4), atol=1e-6)
+
+
 @pytest.mark.parametrize("robust", [mcg.Huber, mcg.Tukey])
 def test_robust_kernels_resist_outliers(robust):
     truth = motion()

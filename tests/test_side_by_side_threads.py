@@ -65,6 +65,19 @@ def test_an_error_in_any_thread_is_raised(failing):
         watched(before, 2)
 
 
+def test_after_an_error_nobody_goes_on():
+    def before(_):
+        if threading.current_thread() is threading.main_thread():
+            time.sleep(0.1)  # The other thread has begun.
+            raise ZeroDivisionError
+        # Far longer than the call that fails, on a busy machine, too.
+        time.sleep(0.5)
+
+    with pytest.raises(ZeroDivisionError):
+        watched(before, 2)
+    assert len(CALLS) <= 3
+
+
 @pytest.mark.timeout(60)
 def test_users_may_have_threads_of_their_own():
     """More than there are cores, each of which shares its queries with the threads of the package."""

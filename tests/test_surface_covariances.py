@@ -123,6 +123,53 @@ def test_without_contrast_it_is_gicp(channels):
     np.testing.assert_allclose(*compiled, rtol=0, atol=8 * np.finfo(dtype()).eps)
 
 
+def test_a_wide_kernel_tends_to_gicp():
+    cloud = cloud_of(600, 3)
+    compare(covariances(MultiChannelGICP(1e12, 0.1, EPSILON), cloud), covariances(GICP(EPSILON), cloud), 1e-5, 1e-9)
+
+
+def test_it_turns_with_the_cloud():
+    """Which orthonormal tangent basis was chosen cannot be seen from outside."""
+    R = ref.rotation(np.random.default_rng(0).normal(size=3) * 2)
+    cloud = cloud_of(600, 3)
+    method = MultiChannelGICP(full_lambda(3), 0.1, EPSILON)
+    turned = cloud.replace(points=jnp.asarray(np.asarray(cloud.points, float) @ R.T, cloud.points.dtype))
+    compare(covariances(method, turned), R @ covariances(method, cloud) @ R.T, 5e-4, 1e-9)
+
+
+@cached
+def edge(angle):
+    """A flat grid, half of it of another colour; the line between runs at the angle through the middle."""
+    x, y = (axis.ravel() for axis in np.meshgrid(np.arange(-7, 8) * 0.1, np.arange(-7, 8) * 0.1))
+    across = -np.sin(angle) * x + np.cos(angle) * y
+    cloud = preprocess(PointCloud(np.stack([x, y, 0 * x], axis=1), (across > -1e-9).astype(float)), num_neighbors=25)
+    return covariances(MultiChannelGICP(0.02, 0.1, EPSILON), cloud)[7 * 15 + 7]
+
+
+def test_an_edge_at_45_degrees_is_seen_in_the_off_diagonal():
+    C = edge(np.pi / 4)
+    along, across = np.array([1, 1, 0]) / np.sqrt(2), np.array([-1, 1, 0]) / np.sqrt(2)
+    assert C[0, 1] > 0.2
+    assert along @ C @ along > 0.9 > 0.6 > across @ C @ across
+    assert across @ C @ along == pytest.approx(0, abs=1e-5)
+    assert C[2, 2] == pytest.approx(EPSILON, abs=1e-6)
+
+
+def test_an_edge_along_an_axis_is_on_the_diagonal():
+    C = edge(0.0)
+    assert C[0, 0] > 0.9 > 0.6 > C[1, 1]
+    assert C[0, 1] == pytest.approx(0, abs=1e-5)
+
+
+def test_a_doubled_channel_with_doubled_variances_changes_nothing():
+    """dᵀΛ⁻¹d = 2 dᵀ(2Λ)⁻¹d."""
+    cloud, single = cloud_of(600, 3), full_lambda(3)
+    doubled = np.kron(np.eye(2), 2 * single)
+    twice = cloud.replace(channels=jnp.concatenate([cloud.channels, cloud.channels], axis=1))
+    actual = covariances(MultiChannelGICP(doubled, 0.1, EPSILON), twice)
+    compare(actual, covariances(MultiChannelGICP(single, 0.1, EPSILON), cloud), 1e-5, 1e-9)
+
+
 @pytest.mark.parametrize("floor", [1e-4, 1e-2, 0.3])
 def test_the_floor_of_omega(floor):
     """Every point unlike all others: Ω would be 0, the covariance singular."""

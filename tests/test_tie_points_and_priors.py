@@ -417,3 +417,16 @@ def test_a_result_is_a_prior_wherever_it_is(corner, far):
     weak = mcg.register(*clouds, mcg.GICP(), init=there, prior=(there, 1e-4 * np.eye(6)), **OPTIONS)
     error = twist_error(np.linalg.inv(move) @ weak.matrix @ move, truth)
     assert weak.converged and np.all(np.abs(error) < 5 * alone.deviations.max())
+
+
+def test_equal_clouds(corner):
+    cloud = corner[0]
+    result = mcg.register(cloud, cloud, mcg.GICP(), prior=(motion(1e-3 * np.ones(6)), 1e-4 * np.eye(6)), **OPTIONS)
+    assert result.converged and np.abs(twist_error(result.matrix, np.eye(4))).max() < 1e-5
+
+
+def test_tie_points_far_from_the_clouds_leave_no_matches(corner):
+    source, target, truth = corner
+    away = motion((30, 0, 0, 0, 0, 0)) @ truth
+    result = mcg.register(source, target, mcg.GICP(), tie_points=tie_points(away, source.points, 1e-6), **OPTIONS)
+    assert result.status is mcg.Status.TOO_FEW_CORRESPONDENCES and np.isnan(result.covariance).all()
