@@ -1,5 +1,7 @@
 """Arguments of the wrong kind are named."""
 
+from concurrent.futures import ThreadPoolExecutor
+
 import jax
 import numpy as np
 import pytest
@@ -38,8 +40,29 @@ def test_swapped_arguments_are_named():
         ("voxel_sizes", lambda: mcg.register(POINTS, POINTS, mcg.NDT(), voxel_sizes=(0.25, 1.0))),
         ("method", lambda: mcg.register(POINTS, POINTS, mcg.GICP)),
         ("init", lambda: mcg.register(cloud, cloud, mcg.GICP(), init=np.diag([1, 1, 1, 1.001]))),
+        ("robust", lambda: mcg.register(cloud, cloud, mcg.GICP(), robust=mcg.Huber)),
+        ("tie_points", lambda: mcg.register(cloud, cloud, mcg.GICP(), tie_points=(POINTS, POINTS))),
+        ("executor", lambda: mcg.register_batch([cloud], [cloud], mcg.GICP(), executor=ThreadPoolExecutor)),
+        ("cloud", lambda: mcg.io.write("cloud.ply", POINTS)),
+        ("cloud", lambda: mcg.io.write(cloud, "cloud.ply")),
     ):
         refused(call, named)
+
+
+def test_channels_are_told_apart_by_name():
+    """Names of arrays that have none fit any; methods without channels do not ask."""
+    points, channels = np.random.default_rng(0).normal(size=(2, 50, 3))
+    one, other, unnamed = (
+        mcg.preprocess(mcg.PointCloud(points, channels, channel_names=names))
+        for names in (("r", "g", "b"), ("g", "b", "r"), None)
+    )
+    method = mcg.MultiChannelGICP(1.0, 0.1)
+    refused(lambda: mcg.register(one, other, method), "source", ("g", "b", "r"), ("r", "g", "b"))
+    with pytest.warns(mcg.PairWarning, match="pair 0: source: "):
+        (result,) = mcg.register_batch([one], [other], method)
+    assert result.status == mcg.Status.INVALID_INPUT
+    for source, target, allowed in ((one, unnamed, method), (unnamed, one, method), (one, other, mcg.GICP())):
+        assert mcg.register(source, target, allowed).num_inliers == 50
 
 
 def test_poses_with_rounding_in_the_last_row_and_of_three_rows():

@@ -19,7 +19,7 @@ from mcgicp_jax import Status, datasets
 from mcgicp_jax.metrics import pose_error
 from tests.batches import METHOD, assert_same, batch, prepared
 from tests.refusals import refused
-from tests.scenes import motion
+from tests.scenes import motion, room_corner
 
 
 def test_each_pair_is_as_if_it_were_alone(raw, alone):
@@ -96,6 +96,14 @@ def test_the_warning_can_be_sent_copied_and_repeated():
         assert same.index == 0 and str(same) == f"pair 0: {same.reason}" and "source" in same.reason
     bare = mcg.PairWarning(str(warning))
     assert str(bare) == str(warning) and bare.index is None and bare.reason == ""
+
+
+def test_a_pose_from_a_small_overlap_is_warned_of_with_its_pair():
+    target, near = (room_corner(size, seed=seed)[0] for size, seed in ((2000, 0), (60, 1)))
+    source = np.concatenate([near, target[:1940] + 50])
+    with pytest.warns(mcg.PairWarning, match="pair 1: only .* %") as caught:
+        results = mcg.register_batch([target, source], [target, target], mcg.PointToPlane(), max_distance=0.3)
+    assert len(caught) == 1 and 0 < results[1].overlap < 0.1 < results[0].overlap
 
 
 def test_pairs_without_overlap_or_far_from_rest_have_the_status_of_register(raw, alone):

@@ -147,6 +147,13 @@ def test_a_list_that_makes_no_sense(tmp_path, capsys):
         assert message in errors and errors.count("\n") == 1
 
 
+def test_a_list_from_a_spreadsheet(folder, tmp_path):
+    """With a byte order mark, and blanks after the commas."""
+    pairs = folder / "marked.csv"
+    pairs.write_text("source, target\nscan_1.ply, scan_0.ply\n", encoding="utf-8-sig")
+    assert main(["batch", str(pairs), "--output", str(tmp_path / "results.csv"), *OPTIONS]) == 0
+
+
 def test_a_table_of_something_else_is_left_alone(folder, tmp_path, capsys):
     (tmp_path / "precious.csv").write_text("a,b\n1,2\n")
     assert run_folder(folder, tmp_path / "precious.csv") == 2

@@ -78,7 +78,7 @@ def test_a_plain_folder_is_followed(tmp_path, capsys):
     for left_out in ("readme.md, run_log.txt", "poses.txt, readme.md, run_log.txt"):
         assert main(command) == 0
         text, errors = capsys.readouterr()
-        assert errors == "" and f"left out:  {left_out}, since they are no clouds\n" in text
+        assert errors == "" and f"left out:  {left_out} (not clouds)\n" in text
         assert "frames:    3 of " in text and "therefore gicp" in text and "2 of 2 converged" in text
     poses = io.read_poses(tmp_path / "poses.txt")
     truth = [frames.path(0) @ pose for pose in poses]

@@ -101,6 +101,9 @@ def test_the_start_is_used_and_drawn(files, monkeypatch, tmp_path, capsys):
     assert main(["register", files["source"], files["target"], *options]) == 0
     np.testing.assert_allclose(drawn["start"], TRUTH)
     np.testing.assert_allclose(drawn["gicp"], printed_matrix(capsys.readouterr().out), atol=1e-8)
+    drawn.clear()
+    assert main(["register", files["source"], files["target"], "--init", "global", "--plot", "x.png"]) == 0
+    assert "start" not in drawn
     io.write_poses(tmp_path / "far.txt", [motion((50, 0, 0, 0, 0, 0))])
     assert main(["register", files["source"], files["target"], "--init", str(tmp_path / "far.txt")]) == 1
 
@@ -241,6 +244,8 @@ def broken(folder):
         ([good, good, "--aligned", str(folder / "out.doc")], "'.doc'"),
         ([good, good, "--output", str(folder / "no" / "pose.txt")], "pose.txt"),
         ([good, good, "--output", str(folder)], f"{folder}: "),
+        ([good, good, "--output", str(folder / "moved.ply")], "output: "),
+        ([good, good, "--aligned", good], "output: "),
         ([good, good, "--plot", str(folder / "picture.doc")], "picture.doc: "),
     ]
 

@@ -234,12 +234,13 @@ def _interrupts() -> Iterator[list[int]]:
 
 
 def _pairs_of_table(path: Path) -> list[FilePair]:
-    with open(path, newline="", encoding="utf-8") as file:
+    # Spreadsheets write a byte order mark, people a blank after the comma.
+    with open(path, newline="", encoding="utf-8-sig") as file:
         try:
             lines = file.readlines()
         except UnicodeError as error:
             raise ValueError(f"{path}: expected a CSV file or a folder; the file is not text") from error
-        reader = csv.DictReader(lines)
+        reader = csv.DictReader(lines, skipinitialspace=True)
         columns = reader.fieldnames or []
         if not {"source", "target"} <= set(columns):
             raise ValueError(f"{path}: expected the columns source and target, got {listed(columns)}")

@@ -68,6 +68,8 @@ Epsilon: TypeAlias = Annotated[
     float | None, shown("FLOAT", str(inspect.signature(mcg.GICP).parameters["epsilon"].default))
 ]
 
+# Formats of clouds that poses may be named like.
+_TEXTS = {".txt", ".csv", ".xyz"}
 # Number of files that a message lists.
 _MOST_NAMES = 5
 # Parameters of methods that have an option.
@@ -188,9 +190,16 @@ class PairOptions(Options):
     plot: File = None
 
 
-def check_outputs(*files: Path | None, cloud: Path | None = None, picture: Path | None = None) -> None:
-    """Raise `ValueError` or `OSError` for files that cannot be written, before any work is done."""
+def check_outputs(
+    *files: Path | None, cloud: Path | None = None, picture: Path | None = None, inputs: Sequence[Path] = ()
+) -> None:
+    """Raise `ValueError` or `OSError` for files that cannot be written, before any work is done. `files` are texts."""
+    for path in files:
+        if path is not None and path.suffix.lower() in FORMATS.keys() - _TEXTS:
+            raise ValueError(f"output: expected a text file such as poses.txt, got {path}")
     for path in (*files, cloud, picture):
+        if path is not None and path.resolve() in [each.resolve() for each in inputs]:
+            raise ValueError(f"output: expected another file than the clouds, got {path}")
         if path is not None and path.is_dir():
             raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), str(path))
         if path is not None and not path.parent.is_dir():
@@ -211,5 +220,5 @@ def clouds_in(folder: Path, glob: str = "*", map: File = None) -> datasets.Cloud
     if files.left_out:
         names = [path.name for path in files.left_out]
         more = f" and {len(names) - _MOST_NAMES:,} more" if len(names) > _MOST_NAMES else ""
-        print(f"left out:  {', '.join(names[:_MOST_NAMES])}{more}, since they are no clouds")
+        print(f"left out:  {', '.join(names[:_MOST_NAMES])}{more} (not clouds)")
     return files

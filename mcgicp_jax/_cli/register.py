@@ -106,7 +106,9 @@ class PreparedPair:
 
     def draw(self, results: dict[MethodName, mcg.RegistrationResult]) -> None:
         if self.options.plot is not None:
-            poses: dict[str, Any] = {"start": self.start, **{name: result.matrix for name, result in results.items()}}
+            poses: dict[str, Any] = {name: result.matrix for name, result in results.items()}
+            if self.options.init != "global":
+                poses = {"start": self.start, **poses}
             plot.before_after(*self.raw, poses, path=self.options.plot)
             print(f"picture:   {self.options.plot}")
 
@@ -133,7 +135,7 @@ def register(
         aligned: File for the whole source cloud moved by the pose, such as out.ply.
     """
     shared.check(method)
-    check_outputs(output, cloud=aligned, picture=shared.plot)
+    check_outputs(output, cloud=aligned, picture=shared.plot, inputs=(source, target))
     pair = PreparedPair(source, target, shared)
     name = pair.choices.method_name(method, pair.files)
     pair.find_start()

@@ -118,6 +118,11 @@ class Voxels:
         return "all points" if self.size is None else f"voxels of {self.size:g} m{because}"
 
 
+def default_names(count: int) -> tuple[str, ...]:
+    """The names of channels that have none."""
+    return tuple(f"channel_{i}" for i in range(count))
+
+
 class PointCloud(eqx.Module):
     """Points with channels; a pytree whose arrays may all have leading batch dimensions.
 
@@ -202,7 +207,7 @@ class PointCloud(eqx.Module):
             raise ValueError(f"covariances: expected shape ({size}, 3, 3), got {self.covariances.shape}")
         count = self.channels.shape[1]
         if channel_names is None:
-            channel_names = [f"channel_{i}" for i in range(count)]
+            channel_names = default_names(count)
         if isinstance(channel_names, str):
             raise ValueError(f"channel_names: expected a sequence of names, got the string {channel_names!r}")
         if len(channel_names) != count:
@@ -252,7 +257,7 @@ class PointCloud(eqx.Module):
             if np.shape(channels)[:-1] != np.shape(self.points)[:-1]:
                 raise ValueError(f"channels: expected shape ({self.points.shape[-2]}, C), got {np.shape(channels)}")
             if channels.shape[-1] != self.channels.shape[-1] and "channel_names" not in arrays:
-                arrays["channel_names"] = tuple(f"channel_{i}" for i in range(channels.shape[-1]))
+                arrays["channel_names"] = default_names(channels.shape[-1])
         fields |= arrays
         if fields["channel_valid"] is not None and arrays.keys() & {"channels", "channel_valid"}:
             fields["channel_valid"] = _as_mask(fields["channel_valid"], np.shape(fields["channels"]))

@@ -103,7 +103,8 @@ def register_as_completed(
     Raises:
         ValueError: if an argument common to all pairs is malformed, or the iterables differ in length.
     Warns:
-        PairWarning: the reason for each pair with the status `INVALID_INPUT` or `WORKER_FAILED`; a `UserWarning`.
+        PairWarning: the reason for each pair with the status `INVALID_INPUT` or `WORKER_FAILED`, or with matches for
+            less than 10 % of the source points; a `UserWarning`.
     """
     job, workers = _job(method, options, voxel_size, num_neighbors, covariances), executor_of(executor)
     return run(job, _pairs(job, sources, targets, init), workers)
@@ -141,7 +142,8 @@ def _pairs(
     several = [name for name in sides if not common[name]]
     sizes = {name: len(sides[name]) for name in several if hasattr(sides[name], "__len__")}
     if len(set(sizes.values())) > 1:
-        raise ValueError(f"{next(iter(sizes))}: expected one per pair on all sides, got {sizes}")
+        counts = ", ".join(f"{count} {name}" for name, count in sizes.items())
+        raise ValueError(f"{next(iter(sizes))}: expected one per pair, got {counts}")
     return _zip_pairs(sides, several)
 
 

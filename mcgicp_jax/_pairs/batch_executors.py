@@ -136,7 +136,7 @@ def executor_of(executor: GivenExecutor) -> Executor | None:
     """The executor to use; `ValueError` unless it is None, "processes" or an executor that may run JAX."""
     if isinstance(executor, str) and executor == "processes":
         return Processes(num_cores())
-    if executor is not None and not hasattr(executor, "submit"):
+    if executor is not None and (isinstance(executor, type) or not hasattr(executor, "submit")):
         raise ValueError(f'executor: expected a concurrent.futures.Executor, "processes" or None, got {executor!r}')
     context = getattr(executor, "_mp_context", None)
     if isinstance(executor, ProcessPoolExecutor) and context is not None and context.get_start_method() == "fork":

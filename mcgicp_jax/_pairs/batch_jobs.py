@@ -26,7 +26,7 @@ from mcgicp_jax._compute.messages import messages_named, warn, warnings_named
 from mcgicp_jax._compute.threads import in_new_thread, num_cores, side_by_side, with_settings
 from mcgicp_jax._math.poses import Pose, se3_from_matrix
 from mcgicp_jax._methods.base import AbstractMethod
-from mcgicp_jax._pairs.register import register_from, start_from_anywhere
+from mcgicp_jax._pairs.register import doubt_of, register_from, start_from_anywhere
 from mcgicp_jax._registration.assessment import registration_of
 from mcgicp_jax._registration.input_checks import check_clouds, warn_of_estimated_parameters, warn_of_lengths
 from mcgicp_jax._registration.options import Options
@@ -40,11 +40,11 @@ Cloud: TypeAlias = PointCloud | Values | Callable[[], PointCloud | Values]
 
 
 class PairWarning(UserWarning):
-    """A pair of a batch could not be registered.
+    """A pair of a batch could not be registered, or its pose is probably wrong.
 
     Attributes:
         index: of the pair, from 0.
-        reason: why the pair has no pose.
+        reason: why.
     """
 
     # Not arguments of the constructor: code that copies or repeats warnings may construct them from a message alone.
@@ -69,7 +69,7 @@ class PairResult:
     """The result of one pair.
 
     Attributes:
-        reason: why it has no pose; None if it has one, or the status is the reason.
+        reason: why it has no pose, or one that is probably wrong; None if there is nothing to say beside the status.
         warnings: issued in another process.
         jacobian: (7, ...) derivative of the centred pose by each leaf in `Pair.traced`.
     """
@@ -282,7 +282,7 @@ class BatchJob:
         if not self.covariances:
             unknown = RegistrationResult.without_pose(result.status).uncertainty
             result = result.build(**vars(result) | {"uncertainty": unknown})
-        return PairResult(index, computed(result))
+        return PairResult(index, computed(result), doubt_of(result))
 
 
 def _invalid(index: int, error: ValueError) -> PairResult:

@@ -134,8 +134,8 @@ def register(
         The pose with its status, quality of the fit and uncertainty; check `converged`.
 
     Raises:
-        ValueError: if an argument is malformed, for instance in shape or dtype, numbers of channels differ where they
-            are used, a cloud has fewer than four finite points, or `init` is not a rigid motion. The message names the
+        ValueError: if an argument is malformed, for instance in shape or dtype, channels that are used differ in number
+            or name, a cloud has fewer than four finite points, or `init` is not a rigid motion. The message names the
             argument. Failures to register well-formed clouds show in `RegistrationResult.status`.
 
     Warns:
@@ -163,7 +163,11 @@ def register(
     source, target = as_cloud("source", source), as_cloud("target", target)
     warn_of_lengths(source, target)
     warn_of_estimated_parameters(method, source, target)
-    return register_from(source, target, method, init, options, tie_points, prior)
+    result = register_from(source, target, method, init, options, tie_points, prior)
+    doubt = doubt_of(result)
+    if doubt:
+        warn(f'{doubt}; pass a better init, or init="global"')
+    return result
 
 
 def register_from(
@@ -184,12 +188,17 @@ def register_from(
             return RegistrationResult.without_pose(Status.TOO_FEW_CORRESPONDENCES)
         init, verified = start.matrix, start.success
     result = register_pair(source, target, method, init, options, tie_points, prior)
-    if is_concrete(result.overlap, result.status_code) and is_usable(result):
-        overlap = float(np.asarray(result.overlap))
-        if overlap < _LEAST_OVERLAP:
-            message = f"only {100 * overlap:.2g} % of the source points have a match, so the pose is probably wrong"
-            warn(f'{message}; pass a better init, or init="global"')
     return result if verified else unverified(result)
+
+
+def doubt_of(result: RegistrationResult) -> str | None:
+    """Why a pose of a usable status is probably wrong; None if nothing speaks against it."""
+    if not is_concrete(result.overlap, result.status_code) or not is_usable(result):
+        return None
+    percent = 100 * float(np.asarray(result.overlap))
+    if percent >= 100 * _LEAST_OVERLAP:
+        return None
+    return f"only {percent:.2g} % of the source points have a match, so the pose is probably wrong"
 
 
 def start_from_anywhere(init: str, source: PointCloud | Values, target: PointCloud | Values) -> GlobalPoseResult | None:

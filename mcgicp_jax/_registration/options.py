@@ -64,6 +64,8 @@ class Options:
             ("search", AbstractSearch, "KDTreeSearch()"),
         ):
             value = getattr(self, name)
+            if isinstance(value, type) and issubclass(value, kind):
+                raise ValueError(f"{name}: expected an object such as {example}, got the class {value.__name__}")
             if value is not None and not isinstance(value, kind):
                 raise ValueError(f"{name}: expected an object such as {example}, or None, got {value!r}")
         for name in ("hold_unconstrained", "equalize_channels"):

@@ -184,7 +184,8 @@ def fusion_of(state: State, moments: Moments, ties: TiePoints | None, prior: Pri
 
 def _parts(name: str, given: Any, form: str, count: int) -> Any:
     if not isinstance(given, tuple | list) or len(given) != count:
-        raise ValueError(f"{name}: expected {form}, got {type(given).__name__}")
+        got = f"{len(given)} items" if isinstance(given, tuple | list) else type(given).__name__
+        raise ValueError(f"{name}: expected {form}, got {got}")
     return given
 
 
