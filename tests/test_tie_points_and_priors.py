@@ -8,44 +8,17 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 import mcgicp_jax as mcg
-from mcgicp_jax import datasets
 from mcgicp_jax._pose_solver.pose_measurements import Fusion, Prior, TiePoints, form_at
 from mcgicp_jax._registration.tie_points_and_prior import checked_measurements
 from mcgicp_jax.extend import symmetric_matrices as alg
+from tests.benchmarks.tie_points import OPTIONS, covariance, measured, simulate, tie_points, twist_error
 from tests.compilations import compilations
-from tests.corridor import bare_pair, corridor
+from tests.corridor import bare_pair
 from tests.differences import TO_ROUNDING, check_gradient, weigh
 from tests.precision import in_float64
 from tests.reference import exponential, logarithm
 from tests.refusals import refused
 from tests.scenes import motion, pair
-
-OPTIONS = {"max_distance": 0.5}
-
-
-def covariance(rng, size, deviation):
-    root = rng.normal(size=(size, size))
-    return deviation**2 * (root @ root.T / size + 0.3 * np.eye(size))
-
-
-def tie_points(truth, points, deviation, count=6, seed=0):
-    """Some of the points and where they are in the target, with errors."""
-    rng = np.random.default_rng(seed)
-    points = np.asarray(points, float)[rng.permutation(len(points))[:count]]
-    covariances = np.array([covariance(rng, 3, deviation) for _ in range(count)]).reshape(count, 3, 3)
-    errors = [rng.multivariate_normal(np.zeros(3), each) for each in covariances]
-    return points, points @ truth[:3, :3].T + truth[:3, 3] + np.reshape(errors, (count, 3)), covariances
-
-
-def measured(truth, deviations, seed=0):
-    """A measurement P of a pose T = P exp(ξ), and its covariance."""
-    given = np.diag(np.square(deviations))
-    return truth @ motion(-np.random.default_rng(seed).normal(size=6) * deviations), given
-
-
-def twist_error(matrix, truth):
-    left = np.linalg.inv(truth) @ matrix
-    return np.append(left[:3, 3], Rotation.from_matrix(left[:3, :3]).as_rotvec())
 
 
 @pytest.fixture(scope="module")
@@ -346,42 +319,10 @@ def test_malformed_arguments_are_named(corner):
 @pytest.mark.parametrize("scene", ["room", "corridor"])
 def test_covariances_are_right(scene):
     """40 simulated pairs: normalised error squared, and errors smaller than those of each source alone."""
-    make = datasets.box_room(2, points_per_frame=5000) if scene == "room" else corridor(2, textured=False)
-    near, deviations = (2e-3, (7e-4, 4e-4)) if scene == "room" else (0.01, (3e-3, 1e-3))
-    squares, nees = {}, {}
-    for seed in range(40):
-        target, source = (make.observe(i, noise_seed=2 * seed + i) for i in (0, 1))
-        truth = np.linalg.inv(target.pose) @ source.pose
-        clouds = [mcg.preprocess(frame.cloud) for frame in (source, target)]
-        ties = tie_points(truth, source.cloud.points, near, seed=seed)
-        prior = measured(truth, np.repeat(deviations, 3), seed=1000 + seed)
-        start = truth @ motion(np.random.default_rng(seed).normal(size=6) * (0.03, 0.03, 0.03, 0, 0, 0))
-        given = {"nothing": {}, "ties": {"tie_points": ties}, "prior": {"prior": prior}}
-        for name, options in given.items():
-            result = mcg.register(*clouds, mcg.GICP(), init=start, **options, **OPTIONS)
-            coordinates = np.linalg.inv(np.asarray(result.directions.twists, float).T)
-            constrained = np.asarray(result.directions.constrained)
-            error = coordinates @ twist_error(result.matrix, truth)
-            spread = coordinates @ np.asarray(result.covariance) @ coordinates.T
-            value = (
-                error[constrained]
-                @ np.linalg.solve(spread[np.ix_(constrained, constrained)], error[constrained])
-                / constrained.sum()
-            )
-            nees.setdefault(name, []).append(value)
-            squares.setdefault(name, []).append(error @ error)
-            if name != "nothing":
-                assert result.converged
-        means = ties[1].mean(axis=0), ties[0].mean(axis=0)
-        fit = np.eye(4)
-        fit[:3, :3] = Rotation.align_vectors(ties[1] - means[0], ties[0] - means[1])[0].as_matrix()
-        fit[:3, 3] = means[0] - fit[:3, :3] @ means[1]
-        for name, matrix in (("ties alone", fit), ("prior alone", prior[0])):
-            squares.setdefault(name, []).append(np.sum((coordinates @ twist_error(matrix, truth)) ** 2))
-    errors = {name: np.sqrt(np.mean(each)) for name, each in squares.items()}
-    assert all(0.5 < np.mean(each) < 2 for each in nees.values()), nees
-    for name in ("ties", "prior"):
-        assert errors[name] < min(errors["nothing"], errors[f"{name} alone"]), errors
+    errors, nees, converged = simulate(scene, 40)
+    assert converged == 1 and all(0.5 < value < 2 for value in nees.values()), nees
+    for name in ("tie points", "prior"):
+        assert errors[name] < min(errors["clouds alone"], errors[f"{name} alone"]), errors
 
 
 @pytest.mark.parametrize("degrees", [80, 150])
