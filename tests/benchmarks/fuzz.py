@@ -36,8 +36,8 @@ import numpy as np
 import pypcd4
 
 from mcgicp_jax import io
-from tests import test_file_formats as cases
 from tests.conftest import DATA
+from tests.test_file_formats import N, las_data, small_files, write_pcd, xyz
 
 _SECONDS = 20
 _MEMORY = 2**30
@@ -73,9 +73,9 @@ Seeds = list[tuple[str, bytes]]
 def seeds() -> Seeds:
     with tempfile.TemporaryDirectory() as name:
         folder = pathlib.Path(name)
-        files = cases.make_seeds(folder)
+        files = [(pathlib.Path(name).suffix, content) for name, content in small_files(folder).items()]
         files += [(".las", bytes_of_las(folder, point_format)) for point_format in (1, 3, 6, 8)]
-        cases.write_pcd(folder / "b.pcd", pypcd4.Encoding.BINARY, **cases.xyz(np.float64), rgb=np.zeros(cases.N, "f4"))
+        write_pcd(folder / "b.pcd", pypcd4.Encoding.BINARY, **xyz(np.float64), rgb=np.zeros(N, "f4"))
         files.append((".pcd", (folder / "b.pcd").read_bytes()))
         np.save(folder / "object.npy", np.array([[print, 1, 2]], object), allow_pickle=True)
         files.append((".npy", (folder / "object.npy").read_bytes()))
@@ -85,7 +85,7 @@ def seeds() -> Seeds:
 
 
 def bytes_of_las(folder: pathlib.Path, point_format: int) -> bytes:
-    cases.las_data(point_format, intensity=np.arange(cases.N)).write(str(folder / "seed.las"))
+    las_data(point_format, intensity=np.arange(N)).write(str(folder / "seed.las"))
     return (folder / "seed.las").read_bytes()
 
 
