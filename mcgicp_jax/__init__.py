@@ -45,7 +45,7 @@ Results
     GlobalPoseResult, OdometryStep, MultiwayResult, PoseGraphResult
                                     of the functions above
     Correspondences                 matches
-    PairWarning                     why a pair of a batch has no pose, or a doubtful one
+    PairWarning                     why a pair of a batch is invalid, or its pose doubtful
     metrics, plot                   errors of poses; pictures
 
 To extend (see mcgicp_jax.extend)

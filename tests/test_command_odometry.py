@@ -59,6 +59,7 @@ def test_wrong_input_gets_one_line(tmp_path, capsys):
     for args, message in (
         (["kitti", str(tmp_path)], str(tmp_path)),
         (["kitti"], "mcgicp odometry kitti PATH"),
+        (["kitti", str(tmp_path), "--map", str(tmp_path / "velodyne" / "000000.bin")], "output: "),
         (["tum", str(tmp_path)], "depth.txt: "),
         (["7-scenes", str(alone)], "2 frames, got 1"),
         (["box-room", "--num-frames", "1"], "num_frames: "),
@@ -83,6 +84,9 @@ def test_a_plain_folder_is_followed(tmp_path, capsys):
     poses = io.read_poses(tmp_path / "poses.txt")
     truth = [frames.path(0) @ pose for pose in poses]
     np.testing.assert_allclose(truth, [frames.path(k) for k in range(3)], atol=0.03)
+    kept = (tmp_path / "scan_8.xyz").read_bytes()
+    assert main([*command, "--output", str(tmp_path / "scan_8.xyz")]) == 2
+    assert (tmp_path / "scan_8.xyz").read_bytes() == kept and "output: " in capsys.readouterr().err
     assert main([*command, "--map", str(tmp_path / "map.ply")]) == 2
     assert main(["odometry", str(tmp_path / "nothing")]) == 2
     outside, unknown = capsys.readouterr().err.splitlines()

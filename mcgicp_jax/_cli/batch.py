@@ -142,7 +142,7 @@ def batch(
         pairs: CSV file or folder.
         output: Table to write or to resume, .csv. A row per pair, at the end in the order of PAIRS: source,
             target, initial pose if given, status, iterations, inliers, cost, rmse, the upper three rows of the pose,
-            and the reason if it could not be registered.
+            and the reason if it could not be registered or its pose is doubtful.
         method: {channel_methods} use channels (intensity, colours, ...), the others geometry alone.
         glob: Pattern for the files of a folder, such as "*.ply".
         workers: Number of processes; needs pip install 'mcgicp_jax[processes]'. auto: one per core for many pairs, else

@@ -85,7 +85,7 @@ def odometry(
             that is off, the spacing of the points.
         plot: File for a picture of the trajectory from above, such as way.png.
     """
-    check_outputs(output, cloud=map, picture=plot)
+    check_outputs(output, cloud=map, picture=plot, inputs=[path] if path else [])
     shared.check(method)
     frames = _open(dataset, path, num_frames, map)
     options: dict[str, Any] = {

@@ -22,7 +22,7 @@ from mcgicp_jax._math.robust_kernels import KERNELS
 from mcgicp_jax._registration.options import ROTATION_TOLERANCE
 from mcgicp_jax._registration.options import Options as RegistrationOptions
 from mcgicp_jax.extend import METHODS
-from mcgicp_jax.io.clouds import FORMATS, format_of
+from mcgicp_jax.io.clouds import FORMATS, format_of, is_cloud
 
 if TYPE_CHECKING:
     MethodName: TypeAlias = str
@@ -103,9 +103,9 @@ class Options:
     Attributes:
         channels: Channels to use, such as intensity, or red green blue, or {spaces} computed from these three. By
             default those that the first two clouds have in common.
-        voxel_size: Metres; the points of each voxel are averaged. auto: from the first two clouds, or for batch from
-            each pair, the smallest size at which few neighbourhoods are lines or noise and at most 40,000 voxels
-            remain. off: all points are kept.
+        voxel_size: Metres; the points of each voxel are averaged. auto: from the clouds (odometry: the first two,
+            batch: each pair), the smallest size at which few neighbourhoods are lines or noise and at most 40,000
+            voxels remain. off: all points are kept.
         num_neighbors: Number of neighbours from which the covariance of a point is computed.
         max_distance: Metres; largest distance between matched points. Two numbers: one to find the pose, and a smaller
             one to refine it.
@@ -193,13 +193,18 @@ class PairOptions(Options):
 def check_outputs(
     *files: Path | None, cloud: Path | None = None, picture: Path | None = None, inputs: Sequence[Path] = ()
 ) -> None:
-    """Raise `ValueError` or `OSError` for files that cannot be written, before any work is done. `files` are texts."""
+    """Raise `ValueError` or `OSError` for files that may not be written, before any work is done. `files` are texts.
+
+    `inputs` are clouds, or folders of them, among which no cloud is written.
+    """
     for path in files:
-        if path is not None and path.suffix.lower() in FORMATS.keys() - _TEXTS:
-            raise ValueError(f"output: expected a text file such as poses.txt, got {path}")
+        # Texts of clouds, too, are told from texts of poses by their content.
+        if path is not None and (path.suffix.lower() in FORMATS.keys() - _TEXTS or (path.is_file() and is_cloud(path))):
+            raise ValueError(f"output: expected a text file such as poses.txt, got a cloud, {path}")
+    for given in inputs:
+        if cloud is not None and cloud.resolve().is_relative_to(given.resolve()):
+            raise ValueError(f"output: expected a file that is not among the clouds read from {given}, got {cloud}")
     for path in (*files, cloud, picture):
-        if path is not None and path.resolve() in [each.resolve() for each in inputs]:
-            raise ValueError(f"output: expected another file than the clouds, got {path}")
         if path is not None and path.is_dir():
             raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), str(path))
         if path is not None and not path.parent.is_dir():

@@ -54,7 +54,7 @@ def preprocess(
             covariances. The repr of the result says what was chosen and why. None keeps every point.
         num_neighbors: number k of neighbours, including the point itself, from which a covariance is computed; at
             least 3. All points are used if the cloud has fewer.
-        search: neighbour search; by default SciPy's k-d tree.
+        search: neighbour search; by default `KDTreeSearch`.
 
     Returns:
         Cloud with read-only NumPy arrays, float64 if the input is and JAX's x64 is on, else float32. If the
@@ -68,7 +68,7 @@ def preprocess(
         UserWarning: once per call, if points with NaN or infinity were left out, if downsampling leaves fewer points
             than `num_neighbors`, if more than half of the points lie exactly on another one, if coordinates far from
             zero are float32 and too coarse for the points' spacing, or if `voxel_size` is None and more than a tenth of
-            the neighbourhoods are lines, or most are as thick as wide.
+            the neighbourhoods are lines, or most are more than 0.6 times as thick as wide.
     """
     return preprocessed_in(None, cloud, voxel_size, num_neighbors, search)
 

@@ -90,10 +90,10 @@ class GlobalPoseResult:
         matrix: (4, 4) float64, T_target_source, metres; accurate to a fraction of a voxel. The identity if no pose was
             found.
         success: whether to trust the pose: it has at least ten inliers and a `support` of 1, which clouds of different
-            scenes do not reach, and the result is not `ambiguous`.
+            scenes did not reach in `tests/benchmarks`, and the result is not `ambiguous`.
         ambiguous: whether another pose is about as good as the best one, as in symmetric or repetitive scenes. False if
             the best pose has too little support.
-        num_inliers, overlap: number of inliers and overlap of the best pose; see `Candidate`.
+        num_inliers, overlap: number of inliers of the best pose, and the overlapping fraction of the source.
         num_matches: number of matches, inliers and outliers.
         support: i/√n (a/m)² of the best pose, for i inliers of the n matches within the overlap; a, the fraction of
             normals that agree within 30°; and m, at least 1, the 90 % quantile of the distances along the normals, in

@@ -88,12 +88,12 @@ def register_as_completed(
         voxel_size, num_neighbors: as in `preprocess`, for raw clouds, which the workers preprocess. "auto": one size
             for both clouds of a pair; that of a single cloud for all pairs, if it has any, applies to all.
         executor: None, a thread per core; "processes", a process per core (extra `processes`; no `__main__` guard is
-            needed), which starts in some ten seconds, waits for the next call, and pays off with hundreds of pairs; or
+            needed), which starts in 3 to 7 s, waits for the next call, and pays off with hundreds of pairs; or
             any `concurrent.futures.Executor`, such as Dask's `Client.get_executor()`. A pair whose worker dies is sent
             once more, and gets the status `WORKER_FAILED` and a warning if that fails too.
         covariances: False saves a tenth of the time: `covariance` and `deviations` are NaN.
         options: options of `register`, except for `tie_points` and `prior`. `search` is also used to preprocess; by
-            default SciPy's k-d tree with one thread per pair. With `DenseSearch`, or without a search on accelerators,
+            default `KDTreeSearch` with one thread per pair. With `DenseSearch`, or without a search on accelerators,
             pairs run as lanes of one vectorised program on `jax.default_device`, or spread over all local devices (not
             with an `executor`, `equalize_channels` or `voxel_sizes`), which finds neighbours by brute force.
 

@@ -139,7 +139,7 @@ class KDTreeSearch(AbstractTreeSearch):
     Attributes:
         workers: largest number of threads per registration; −1 uses all cores.
         backend: "scipy", or "pykdtree" (the extra `fast`; LGPL), which is quicker and finds the same; by default
-            pykdtree if it is installed.
+            pykdtree if the extra is installed. In more than four dimensions always SciPy's, which is quicker there.
 
     Raises:
         ValueError: if `backend` is none of these, or pykdtree is not installed.

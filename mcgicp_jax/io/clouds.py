@@ -129,10 +129,10 @@ def write(path: str | os.PathLike[str], cloud: PointCloud) -> None:
     """Write the valid points of a cloud, in the user's frame, to a file.
 
     `read` restores the cloud within the limits of the format. PLY, PCD and NPZ preserve float32 and float64; colours
-    that are all multiples of 1/255 are stored as 8-bit integers. Only `.npz` preserves the channel order and the
-    covariances; `.npy` has no channel names; KITTI is float32. LAS rounds coordinates to a power of ten, with an error
-    of at most 5·10⁻⁹ of the cloud's extent, and colours to 16 bits. Missing channels are written as NaN, which LAS
-    cannot represent. A failed write leaves an existing file unchanged.
+    that are all multiples of 1/255 are stored as 8-bit integers. Only `.npz` preserves the covariances, only `.npz` and
+    `.npy` the channel order; `.npy` has no channel names; KITTI is float32. LAS rounds coordinates to a power of ten,
+    with an error of at most 5·10⁻⁹ of the cloud's extent, and colours to 16 bits. Missing channels are written as NaN,
+    which LAS cannot represent. A failed write leaves an existing file unchanged.
 
     Args:
         path: the suffix selects the format, as in `read`.
