@@ -59,7 +59,7 @@ def test_wrong_input_gets_one_line(tmp_path, capsys):
     for args, message in (
         (["kitti", str(tmp_path)], str(tmp_path)),
         (["kitti"], "mcgicp odometry kitti PATH"),
-        (["kitti", str(tmp_path), "--map", str(tmp_path / "velodyne" / "000000.bin")], "output: "),
+        (["kitti", str(tmp_path), "--map", str(tmp_path / "velodyne" / "000000.bin")], "000000.bin: "),
         (["tum", str(tmp_path)], "depth.txt: "),
         (["7-scenes", str(alone)], "2 frames, got 1"),
         (["box-room", "--num-frames", "1"], "num_frames: "),

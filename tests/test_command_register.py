@@ -245,7 +245,7 @@ def broken(folder):
         ([good, good, "--output", str(folder / "no" / "pose.txt")], "pose.txt"),
         ([good, good, "--output", str(folder)], f"{folder}: "),
         ([good, good, "--output", str(folder / "moved.ply")], "output: "),
-        ([good, good, "--aligned", good], "output: "),
+        ([good, good, "--aligned", good], f"{good}: expected a file outside of the input"),
         ([good, good, "--plot", str(folder / "picture.doc")], "picture.doc: "),
     ]
 

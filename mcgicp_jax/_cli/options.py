@@ -23,6 +23,7 @@ from mcgicp_jax._registration.options import ROTATION_TOLERANCE
 from mcgicp_jax._registration.options import Options as RegistrationOptions
 from mcgicp_jax.extend import METHODS
 from mcgicp_jax.io.clouds import FORMATS, format_of, is_cloud
+from mcgicp_jax.io.text import read_text
 
 if TYPE_CHECKING:
     MethodName: TypeAlias = str
@@ -68,8 +69,8 @@ Epsilon: TypeAlias = Annotated[
     float | None, shown("FLOAT", str(inspect.signature(mcg.GICP).parameters["epsilon"].default))
 ]
 
-# Formats of clouds that poses may be named like.
-_TEXTS = {".txt", ".csv", ".xyz"}
+# Suffixes of clouds that texts such as poses do not have.
+_BINARY = {suffix for suffix, each in FORMATS.items() if each.read is not read_text}
 # Number of files that a message lists.
 _MOST_NAMES = 5
 # Parameters of methods that have an option.
@@ -193,17 +194,17 @@ class PairOptions(Options):
 def check_outputs(
     *files: Path | None, cloud: Path | None = None, picture: Path | None = None, inputs: Sequence[Path] = ()
 ) -> None:
-    """Raise `ValueError` or `OSError` for files that may not be written, before any work is done. `files` are texts.
+    """Raise `ValueError` or `OSError` for files that may not be written, before any work is done.
 
-    `inputs` are clouds, or folders of them, among which no cloud is written.
+    `files` are texts. `inputs` are clouds, which `cloud` may not replace, or folders, into which it may not go.
     """
     for path in files:
-        # Texts of clouds, too, are told from texts of poses by their content.
-        if path is not None and (path.suffix.lower() in FORMATS.keys() - _TEXTS or (path.is_file() and is_cloud(path))):
-            raise ValueError(f"output: expected a text file such as poses.txt, got a cloud, {path}")
+        # A text file that exists is a cloud or not by its content.
+        if path is not None and (path.suffix.lower() in _BINARY or (path.is_file() and is_cloud(path))):
+            raise ValueError(f"output: expected a text file such as poses.txt, got the cloud {path}")
     for given in inputs:
         if cloud is not None and cloud.resolve().is_relative_to(given.resolve()):
-            raise ValueError(f"output: expected a file that is not among the clouds read from {given}, got {cloud}")
+            raise ValueError(f"{cloud}: expected a file outside of the input, {given}")
     for path in (*files, cloud, picture):
         if path is not None and path.is_dir():
             raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), str(path))

@@ -118,8 +118,7 @@ class Voxels:
         return "all points" if self.size is None else f"voxels of {self.size:g} m{because}"
 
 
-def default_names(count: int) -> tuple[str, ...]:
-    """The names of channels that have none."""
+def _default_names(count: int) -> tuple[str, ...]:
     return tuple(f"channel_{i}" for i in range(count))
 
 
@@ -207,7 +206,7 @@ class PointCloud(eqx.Module):
             raise ValueError(f"covariances: expected shape ({size}, 3, 3), got {self.covariances.shape}")
         count = self.channels.shape[1]
         if channel_names is None:
-            channel_names = default_names(count)
+            channel_names = _default_names(count)
         if isinstance(channel_names, str):
             raise ValueError(f"channel_names: expected a sequence of names, got the string {channel_names!r}")
         if len(channel_names) != count:
@@ -257,7 +256,7 @@ class PointCloud(eqx.Module):
             if np.shape(channels)[:-1] != np.shape(self.points)[:-1]:
                 raise ValueError(f"channels: expected shape ({self.points.shape[-2]}, C), got {np.shape(channels)}")
             if channels.shape[-1] != self.channels.shape[-1] and "channel_names" not in arrays:
-                arrays["channel_names"] = default_names(channels.shape[-1])
+                arrays["channel_names"] = _default_names(channels.shape[-1])
         fields |= arrays
         if fields["channel_valid"] is not None and arrays.keys() & {"channels", "channel_valid"}:
             fields["channel_valid"] = _as_mask(fields["channel_valid"], np.shape(fields["channels"]))
@@ -433,6 +432,12 @@ def as_cloud(name: str, cloud: PointCloud | Values) -> PointCloud:
         return cloud
     with messages_named(name):
         return PointCloud(cloud)
+
+
+def same_channels(one: PointCloud, other: PointCloud) -> bool:
+    """Whether the channels of two clouds are as many and named alike; channels without names are like any."""
+    count, names = one.channels.shape[-1], (one.channel_names, other.channel_names)
+    return other.channels.shape[-1] == count and (names[0] == names[1] or _default_names(count) in names)
 
 
 def _build(**fields: Any) -> PointCloud:

@@ -177,7 +177,7 @@ def once(value: Any) -> Any:
 
 def _once_jvp(primals: tuple[Any], tangents: tuple[Any]) -> tuple[Any, Any]:
     if not is_symbolic_zero(tangents[0]):
-        raise NotImplementedError("poses have first derivatives only, and costs outside of jit, too")
+        raise NotImplementedError("poses have first derivatives only; so have costs outside of jit")
     return primals[0], jnp.zeros_like(primals[0])
 
 

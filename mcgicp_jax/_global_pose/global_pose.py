@@ -10,7 +10,7 @@ import jax
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from mcgicp_jax._clouds.point_cloud import PointCloud, Values, as_cloud
+from mcgicp_jax._clouds.point_cloud import PointCloud, Values, as_cloud, same_channels
 from mcgicp_jax._clouds.preprocess import finite_rows, with_neighbors
 from mcgicp_jax._clouds.voxels import grid_of, voxel_order
 from mcgicp_jax._compute.concrete import AnyArray, outside_trace
@@ -133,12 +133,12 @@ def global_pose(
 ) -> GlobalPoseResult:
     """Estimate the pose between two clouds without an initial pose. To refine it, pass its `matrix` to `register`.
 
-    The steps are: (1) describe each voxel by FPFH (Rusu et al. 2009) and, if both clouds have the same number of
-    channels, by the means and standard deviations of the channels around it; (2) match voxels that are mutual nearest
-    neighbours in these features, of which most may be wrong; (3) compute poses from triplets of matches that agree with
-    each other; (4) refine them by graduated non-convexity (Yang et al. 2020); (5) verify the best by a coarse
-    registration, which uses the channels. On one machine, the same clouds give the same result, to the last bit. Runs
-    on the host, with programs whose shapes do not depend on the clouds.
+    The steps are: (1) describe each voxel by FPFH (Rusu et al. 2009) and, if both clouds have the same channels, by the
+    means and standard deviations of the channels around it; (2) match voxels that are mutual nearest neighbours in
+    these features, of which most may be wrong; (3) compute poses from triplets of matches that agree with each other;
+    (4) refine them by graduated non-convexity (Yang et al. 2020); (5) verify the best by a coarse registration, which
+    uses the channels. On one machine, the same clouds give the same result, to the last bit. Runs on the host, with
+    programs whose shapes do not depend on the clouds.
 
     Args:
         source, target: raw or preprocessed clouds, or (N, 3) arrays in metres; they may lie anywhere, in any rotation.
@@ -162,7 +162,7 @@ def global_pose(
     source, target = as_cloud("source", source), as_cloud("target", target)
     rows = None if correspondences is None else _checked(correspondences, source, target)
     (one, source_center), (other, target_center) = _centred("source", source), _centred("target", target)
-    if one.channels.shape[1] != other.channels.shape[1]:
+    if not same_channels(source, target):
         one, other = PointCloud(one.points), PointCloud(other.points)
     size = _voxel_size((one, other)) if voxel_size is None else float(voxel_size)
     try:

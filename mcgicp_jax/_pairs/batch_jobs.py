@@ -69,7 +69,7 @@ class PairResult:
     """The result of one pair.
 
     Attributes:
-        reason: why it has no pose, or one that is probably wrong; None if there is nothing to say beside the status.
+        reason: why it has no pose; None if it has one, or the status is the reason.
         warnings: issued in another process.
         jacobian: (7, ...) derivative of the centred pose by each leaf in `Pair.traced`.
     """
@@ -81,12 +81,13 @@ class PairResult:
     jacobian: tuple[np.ndarray, ...] = ()
 
     def with_warning(self) -> PairResult:
-        """The result; issues the warnings, and the `PairWarning` if there is a reason."""
+        """The result; issues the warnings, and a `PairWarning` if there is a reason for it."""
         for message in self.warnings:
             warn(message)
-        if self.reason is not None:
-            warning = PairWarning(f"pair {self.index}: {self.reason}")
-            warning.index, warning.reason = self.index, self.reason
+        reason = self.reason or doubt_of(self.registration)
+        if reason is not None:
+            warning = PairWarning(f"pair {self.index}: {reason}")
+            warning.index, warning.reason = self.index, reason
             warn(warning)
         return self
 
@@ -282,7 +283,7 @@ class BatchJob:
         if not self.covariances:
             unknown = RegistrationResult.without_pose(result.status).uncertainty
             result = result.build(**vars(result) | {"uncertainty": unknown})
-        return PairResult(index, computed(result), doubt_of(result))
+        return PairResult(index, computed(result))
 
 
 def _invalid(index: int, error: ValueError) -> PairResult:

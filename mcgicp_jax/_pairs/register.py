@@ -195,10 +195,10 @@ def doubt_of(result: RegistrationResult) -> str | None:
     """Why a pose of a usable status is probably wrong; None if nothing speaks against it."""
     if not is_concrete(result.overlap, result.status_code) or not is_usable(result):
         return None
-    percent = 100 * float(np.asarray(result.overlap))
-    if percent >= 100 * _LEAST_OVERLAP:
+    overlap = float(np.asarray(result.overlap))
+    if overlap >= _LEAST_OVERLAP:
         return None
-    return f"only {percent:.2g} % of the source points have a match, so the pose is probably wrong"
+    return f"only {100 * overlap:.2g} % of the source points have a match, so the pose is probably wrong"
 
 
 def start_from_anywhere(init: str, source: PointCloud | Values, target: PointCloud | Values) -> GlobalPoseResult | None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from jax.typing import ArrayLike
 
-from mcgicp_jax._clouds.point_cloud import LARGEST, PointCloud, default_names
+from mcgicp_jax._clouds.point_cloud import LARGEST, PointCloud, same_channels
 from mcgicp_jax._clouds.voxel_size import raw_spacing
 from mcgicp_jax._compute.concrete import is_concrete
 from mcgicp_jax._compute.linear_maps import primal
@@ -69,10 +69,11 @@ def check_channels(source: PointCloud, target: PointCloud, method: AbstractMetho
             f"channels: expected as many in the source as in the target for {type(method).__name__}, "
             f"got {source.channels.shape[-1]} and {target.channels.shape[-1]}"
         )
-    names = [cloud.channel_names for cloud in (source, target)]
-    # Arrays without names may go with any.
-    if names[0] != names[1] and default_names(len(names[0])) not in names:
-        raise ValueError(f"source: expected the channels of the target, {names[1]}, got {names[0]}; order them alike")
+    if not same_channels(source, target):
+        raise ValueError(
+            f"source: expected the channels of the target, {target.channel_names}, got {source.channel_names}; "
+            "order and name them alike"
+        )
 
 
 def check_matches(

@@ -100,9 +100,9 @@ class Uncertainty(NamedTuple):
 class RegistrationResult(eqx.Module):
     """Result of `register` or `estimate_pose`; a pytree.
 
-    All fields are evaluated at the returned pose, with the matches of the last update, which moved the pose by less
-    than the tolerances. They are NumPy scalars and arrays; inside `jit`, `vmap` or `grad`, and when returned by these,
-    JAX arrays. Only the pose carries a gradient; for the gradient of a cost, call `mahalanobis_cost` at the pose.
+    All fields are evaluated at the returned pose, with the matches of the last update. They are NumPy scalars and
+    arrays; inside `jit`, `vmap` or `grad`, and when returned by these, JAX arrays. Only the pose carries a gradient;
+    for the gradient of a cost, call `mahalanobis_cost` at the pose.
 
     The result of a call outside of transformations keeps both clouds and their surfaces in memory for the deferred
     values and `jacobian`: 10 MB for two clouds of 20,000 points. `copy.deepcopy(result)`, like a pickle, holds the

@@ -139,7 +139,8 @@ class KDTreeSearch(AbstractTreeSearch):
     Attributes:
         workers: largest number of threads per registration; −1 uses all cores.
         backend: "scipy", or "pykdtree" (the extra `fast`; LGPL), which is quicker and finds the same; by default
-            pykdtree if the extra is installed. In more than four dimensions always SciPy's, which is quicker there.
+            pykdtree if the extra is installed. SciPy's in more than four dimensions, where pykdtree is no
+            quicker.
 
     Raises:
         ValueError: if `backend` is none of these, or pykdtree is not installed.

@@ -141,7 +141,7 @@ def write(path: str | os.PathLike[str], cloud: PointCloud) -> None:
     Raises:
         OSError: if the file cannot be written.
         ImportError: if the format needs a package that is not installed.
-        ValueError: if the cloud is none, is empty, is a batch, or cannot be represented in the format.
+        ValueError: if it is no `PointCloud`, is empty, is a batch, or cannot be represented in the format.
     """
     if not isinstance(cloud, PointCloud):
         raise ValueError(f"cloud: expected a PointCloud, got {type(cloud).__name__}; the order is write(path, cloud)")
