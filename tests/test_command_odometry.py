@@ -86,7 +86,7 @@ def test_a_plain_folder_is_followed(tmp_path, capsys):
     np.testing.assert_allclose(truth, [frames.path(k) for k in range(3)], atol=0.03)
     kept = (tmp_path / "scan_8.xyz").read_bytes()
     assert main([*command, "--output", str(tmp_path / "scan_8.xyz")]) == 2
-    assert (tmp_path / "scan_8.xyz").read_bytes() == kept and "output: " in capsys.readouterr().err
+    assert (tmp_path / "scan_8.xyz").read_bytes() == kept and "scan_8.xyz: " in capsys.readouterr().err
     assert main([*command, "--map", str(tmp_path / "map.ply")]) == 2
     assert main(["odometry", str(tmp_path / "nothing")]) == 2
     outside, unknown = capsys.readouterr().err.splitlines()

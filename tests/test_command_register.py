@@ -244,7 +244,8 @@ def broken(folder):
         ([good, good, "--aligned", str(folder / "out.doc")], "'.doc'"),
         ([good, good, "--output", str(folder / "no" / "pose.txt")], "pose.txt"),
         ([good, good, "--output", str(folder)], f"{folder}: "),
-        ([good, good, "--output", str(folder / "moved.ply")], "output: "),
+        ([good, good, "--output", str(folder / "moved.ply")], "moved.ply: expected a text file"),
+        ([good, good, "--output", str(folder / "a.txt"), "--aligned", str(folder / "a.txt")], "output: "),
         ([good, good, "--aligned", good], f"{good}: expected a file outside of the input"),
         ([good, good, "--plot", str(folder / "picture.doc")], "picture.doc: "),
     ]

@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 import mcgicp_jax as mcg
 from mcgicp_jax import datasets, metrics
 from tests.refusals import refused
-from tests.scenes import motion
+from tests.scenes import motion, room_corner
 
 
 @pytest.fixture(scope="module")
@@ -154,6 +154,14 @@ def test_a_frame_that_does_not_overlap_is_passed_by_at_constant_velocity(room, a
         # A registration without matches ends at its start, whose rotation is rounded to float32, at 1,700 m.
         np.testing.assert_allclose(steps[2].registration.matrix, before @ before, atol=1e-4)
         assert steps[3].registration.converged
+
+
+def test_a_frame_that_hardly_overlaps_is_warned_of():
+    target, near = (room_corner(size, seed=seed)[0] for size, seed in ((2000, 0), (60, 1)))
+    frames = [target, np.concatenate([near, target[:1940] + 50])]
+    with pytest.warns(UserWarning, match=r"frames\[1\]: only .* %"):
+        last = list(mcg.odometry(frames, mcg.PointToPlane(), max_distance=0.3))[-1]
+    assert 0 < last.registration.overlap < 0.1
 
 
 def test_rotations_stay_rotations():

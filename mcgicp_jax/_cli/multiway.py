@@ -45,7 +45,7 @@ def multiway(
         output: File for the poses, cloud to world, in KITTI format.
         map: File for the map in the frame of the first cloud, such as map.ply.
         graph: File for the poses and the pairs that were kept, in g2o format.
-        plot: File for a picture of poses and pairs from above, such as graph.png.
+        plot: File for a picture of poses and pairs in their principal plane, such as graph.png.
     """
     check_outputs(output, graph, cloud=map, picture=plot)
     shared.check(method)

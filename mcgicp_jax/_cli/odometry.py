@@ -83,7 +83,7 @@ def odometry(
         output: File for the poses, sensor to world, in KITTI format: the upper three rows of each matrix on one line.
         map: File for the map in the world frame, such as map.ply. Its voxels have the size used for registration; if
             that is off, the spacing of the points.
-        plot: File for a picture of the trajectory from above, such as way.png.
+        plot: File for a picture of the trajectory in its principal plane, such as way.png.
     """
     check_outputs(output, cloud=map, picture=plot, inputs=[path] if path else [])
     shared.check(method)

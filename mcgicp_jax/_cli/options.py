@@ -201,14 +201,17 @@ def check_outputs(
     for path in files:
         # A text file that exists is a cloud or not by its content.
         if path is not None and (path.suffix.lower() in _BINARY or (path.is_file() and is_cloud(path))):
-            raise ValueError(f"output: expected a text file such as poses.txt, got the cloud {path}")
+            raise ValueError(f"{path}: expected a text file, such as poses.txt, instead of a cloud")
     for given in inputs:
         if cloud is not None and cloud.resolve().is_relative_to(given.resolve()):
             raise ValueError(f"{cloud}: expected a file outside of the input, {given}")
-    for path in (*files, cloud, picture):
-        if path is not None and path.is_dir():
+    written = [path for path in (*files, cloud, picture) if path is not None]
+    if len({path.resolve() for path in written}) < len(written):
+        raise ValueError(f"output: expected a file for each output, got {', '.join(map(str, written))}")
+    for path in written:
+        if path.is_dir():
             raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), str(path))
-        if path is not None and not path.parent.is_dir():
+        if not path.parent.is_dir():
             raise FileNotFoundError(errno.ENOENT, f"{os.strerror(errno.ENOENT)}: {path.parent}", str(path))
     if cloud is not None:
         format_of(cloud)

@@ -72,7 +72,7 @@ def check_channels(source: PointCloud, target: PointCloud, method: AbstractMetho
     if not same_channels(source, target):
         raise ValueError(
             f"source: expected the channels of the target, {target.channel_names}, got {source.channel_names}; "
-            "order and name them alike"
+            "give both the same names in the same order"
         )
 
 

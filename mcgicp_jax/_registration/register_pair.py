@@ -162,6 +162,7 @@ def run_pair(given: Inputs, init: Pose | None, options: Options, traced: bool = 
     if not traced and isinstance(given.method, GICP):
         warn_of_covariances(given.source, given.target)
     if compares_channels:
+        check_channels(given.source, given.target, given.method)
         warn_of_units(given.source, given.target)
     *coarse, inputs = _at_scales(_equalized(given) if options.equalize_channels else given, options.voxel_sizes)
     for scale in coarse:

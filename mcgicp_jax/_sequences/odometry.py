@@ -23,6 +23,7 @@ from mcgicp_jax._local_geometry.cloud_statistics import point_spacing
 from mcgicp_jax._local_geometry.local_geometry import geometry_table
 from mcgicp_jax._math.poses import Pose, nearest_rotation, pose_matrix
 from mcgicp_jax._methods.base import AbstractMethod
+from mcgicp_jax._pairs.register import doubt_of
 from mcgicp_jax._pose_graph.graph import PoseGraph
 from mcgicp_jax._registration.options import GivenOptions, Options, check_method, options_of
 from mcgicp_jax._registration.register_pair import register_pair, rows_to_match
@@ -119,8 +120,8 @@ def odometry(
             iteration may go on with the next one: that one is registered to the last valid frame.
 
     Warns:
-        UserWarning: on iteration, if a frame cannot be registered and there is no `recover`. The next one is registered
-            to it all the same.
+        UserWarning: on iteration without `recover`, if a frame cannot be registered, or less than 10 % of its points
+            have a match. The next one is registered to it all the same.
     """
     check_preprocessing(voxel_size, num_neighbors)
     check_method(method)
@@ -218,11 +219,14 @@ class _Sensor(Iterator[OdometryStep]):
             if self.radius is None:
                 self.radius = float(np.linalg.norm(cloud.coordinates, axis=1).max())
         result = None if self.cloud is None else self._located(cloud, self.cloud)
-        if result is not None and not is_usable(result) and self.places is None:
-            warn(
-                f"{name}: {result.status.name}; the motion of the previous frame is used instead. "
-                "mcgicp_jax.odometry(..., recover=True) finds lost frames again"
-            )
+        if result is not None and self.places is None:
+            if not is_usable(result):
+                warn(
+                    f"{name}: {result.status.name}; the motion of the previous frame is used instead. "
+                    "mcgicp_jax.odometry(..., recover=True) finds lost frames again"
+                )
+            elif doubt := doubt_of(result):
+                warn(f"{name}: {doubt}")
         for points in (self.places, self.world):
             if points is not None and not self.is_lost:
                 points.add(name, cloud, self.pose)
