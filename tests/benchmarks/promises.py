@@ -1,0 +1,94 @@
+"""Whether a status is a promise: scenes whose registrations were once CONVERGED and wrong, and scenes that must stay.
+
+    python -m tests.benchmarks.promises [--seeds 8] [--groups starts ...] [--cases NAME ...]
+
+Each row counts registrations by what they say. right: CONVERGED and within the noise of the points; honest: another
+status, or deviations that cover the error; false: CONVERGED, and further off than the deviations allow.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+import warnings
+from collections import Counter
+from collections.abc import Callable, Iterator
+from typing import Any, NamedTuple
+
+import numpy as np
+
+import mcgicp_jax as mcg
+from tests.promise_scenes import NOISE, Pair, office
+
+# Errors in deviations that a right covariance exceeds in one of a million registrations (six degrees of freedom: 37).
+_DEVIATIONS = 6.0
+# Metres: a smaller error is right, whatever the deviations say.
+_RIGHT = 2 * NOISE
+
+
+class Case(NamedTuple):
+    """One row: `run` registers the clouds of a seed."""
+
+    group: str
+    name: str
+    run: Callable[[int], tuple[mcg.RegistrationResult, np.ndarray]]
+
+
+def registered(pair: Pair, method: Any, **options: Any) -> tuple[mcg.RegistrationResult, np.ndarray]:
+    """The result of a registration, and the true pose."""
+    return mcg.register(pair.source, pair.target, method, **options), pair.T_target_source
+
+
+def verdict(result: mcg.RegistrationResult, truth: np.ndarray) -> str:
+    """right, honest or false: see above. The error is that of the centroid of the matched points and of the rotation,
+    the latter at the distance of one radius."""
+    if result.status != mcg.Status.CONVERGED:
+        return "honest"
+    change = np.linalg.inv(truth) @ np.asarray(result.matrix, np.float64)
+    center = np.asarray(result.directions.center, np.float64)
+    angle = np.arccos(np.clip((np.trace(change[:3, :3]) - 1) / 2, -1, 1))
+    shift = np.linalg.norm(change[:3, :3] @ center + change[:3, 3] - center)
+    error = max(float(shift), float(angle * result.directions.radius))
+    deviations = np.asarray(result.deviations)
+    allowed = max(np.linalg.norm(deviations[:3]), np.linalg.norm(deviations[3:]) * float(result.directions.radius))
+    if error <= _RIGHT:
+        return "right"
+    return "honest" if error <= _DEVIATIONS * allowed else "false"
+
+
+def start_cases() -> Iterator[Case]:
+    """A start that is right is left."""
+    prior = np.diag(np.r_[[0.05**2] * 3, [np.deg2rad(1) ** 2] * 3])
+    for count in (2000, 4000, 8000):
+        for name, options in (("truth", {}), ("global", {"init": "global"}), ("prior", {"prior": (np.eye(4), prior)})):
+
+            def run(seed: int, count: int = count, options: Any = options) -> Any:
+                return registered(office(seed, count), mcg.GICP(), **options)
+
+            yield Case("starts", f"office, {count:,} points, from {name}", run)
+
+
+GROUPS: dict[str, Callable[[], Iterator[Case]]] = {"starts": start_cases}
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--seeds", type=int, default=8)
+    parser.add_argument("--groups", nargs="*", choices=list(GROUPS), default=list(GROUPS))
+    parser.add_argument("--cases", nargs="*", default=[], help="words of which a row's name has at least one")
+    arguments = parser.parse_args()
+    warnings.simplefilter("ignore")
+    print("| scene | right | honest | false |\n|---|---|---|---|")
+    total = 0
+    for case in (case for group in arguments.groups for case in GROUPS[group]()):
+        if arguments.cases and not any(word in case.name for word in arguments.cases):
+            continue
+        counts = Counter(verdict(*case.run(seed)) for seed in range(arguments.seeds))
+        total += counts["false"]
+        print(f"| {case.name} | {counts['right']} | {counts['honest']} | {counts['false']} |", flush=True)
+    print(f"\n{total} false")
+    sys.exit(min(total, 1))
+
+
+if __name__ == "__main__":
+    main()

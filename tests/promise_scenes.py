@@ -1,0 +1,179 @@
+"""Scenes of rectangles in which a rule may promise too much: their registrations were once CONVERGED and wrong.
+
+Positions are metres, in a world whose x axis is the direction of the motion.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+import mcgicp_jax as mcg
+
+Side = tuple[Sequence[float], Sequence[float], Sequence[float]]
+# Metres: standard deviation of points, and the true motion along x.
+NOISE, STEP = 0.01, 0.3
+
+
+class Pair(NamedTuple):
+    """Two clouds and the true pose (4, 4)."""
+
+    source: mcg.PointCloud
+    target: mcg.PointCloud
+    T_target_source: np.ndarray
+
+
+def rects(rng: np.random.Generator, count: int, sides: Sequence[Side]) -> np.ndarray:
+    """Points (count, 3) spread evenly over rectangles, each given by a corner and two edges."""
+    corners, first, second = (np.array(part, float) for part in zip(*sides, strict=True))
+    areas = np.linalg.norm(np.cross(first, second), axis=1)
+    rows = rng.choice(len(areas), count, p=areas / areas.sum())
+    along, across = rng.random((2, count, 1))
+    return corners[rows] + along * first[rows] + across * second[rows]
+
+
+def box(low: Sequence[float], high: Sequence[float], lid: bool = True) -> list[Side]:
+    """The sides of a box, without its floor, and with its lid."""
+    (x, y, z), (a, b, c) = low, np.subtract(high, low)
+    walls = [((x, y, z), (a, 0, 0), (0, 0, c)), ((x, y + b, z), (a, 0, 0), (0, 0, c))]
+    walls += [((x, y, z), (0, b, 0), (0, 0, c)), ((x + a, y, z), (0, b, 0), (0, 0, c))]
+    return [*walls, ((x, y, z + c), (a, 0, 0), (0, b, 0))] if lid else walls
+
+
+def translation(*metres: float) -> np.ndarray:
+    """A rigid motion (4, 4) without rotation."""
+    matrix = np.eye(4)
+    matrix[:3, 3] = metres
+    return matrix
+
+
+def moved(matrix: np.ndarray, points: np.ndarray) -> np.ndarray:
+    """Points (N, 3) after a rigid motion (4, 4)."""
+    return points @ matrix[:3, :3].T + matrix[:3, 3]
+
+
+def office(seed: int, count: int = 4000, common: float = 0.8) -> Pair:
+    """Two parts of a furnished room of 6 × 4 × 2.5 m, cut as scans are that were merged from many views.
+
+    The target is the part with x < c, the source that with x > −c; they have the fraction `common` of each in common.
+    Source coordinates are the target's: the true pose is the identity.
+    """
+    rng = np.random.default_rng(seed)
+    sides = [((-3, -2, 0), (6, 0, 0), (0, 4, 0)), *box((-3, -2, 0), (3, 2, 2.5), lid=False)]
+    for _ in range(6):
+        size, place = rng.uniform(0.3, 0.8, 3), rng.uniform((-2.6, -1.6), (1.8, 0.8))
+        sides += box((*place, 0), (place[0] + size[0], place[1] + size[1], size[2]))
+    # A part extends from -3 to c, the common part from -c to c.
+    cut = 3 * common / (2 - common)
+    target, source = (rects(rng, 3 * count, sides) for _ in range(2))
+    target, source = target[target[:, 0] < cut][:count], source[source[:, 0] > -cut][:count]
+    clouds = (mcg.PointCloud(part + NOISE * rng.normal(size=part.shape)) for part in (source, target))
+    return Pair(*clouds, np.eye(4))
+
+
+FLOOR_AND_WALL: list[Side] = [((-10, -3, 0), (20, 0, 0), (0, 6, 0)), ((-10, 3, 0), (20, 0, 0), (0, 0, 3))]
+CORRIDOR: list[Side] = [
+    *(((-10, -1, z), (20, 0, 0), (0, 2, 0)) for z in (0, 2.5)),
+    *(((-10, y, 0), (20, 0, 0), (0, 0, 2.5)) for y in (-1, 1)),
+]
+ROAD: list[Side] = [((-20, -6, 0), (40, 0, 0), (0, 12, 0))]
+SCENES = {"floor and wall": FLOOR_AND_WALL, "corridor": CORRIDOR, "road": ROAD}
+# Metres: height of the sensor above the floor.
+_HEIGHT = 1.2
+
+Channel = Callable[[np.ndarray, np.ndarray], np.ndarray]
+"""A channel (N,), of points (N, 3) in the sensor's frame, with x forward and z up, and of points in the world."""
+
+
+def tiles(amplitude: float, size: float = 0.4, seed: int = 0) -> Channel:
+    """Reflectance that is fixed to the world: tiles whose values differ by up to ± `amplitude`."""
+    table = np.random.default_rng(seed).uniform(-amplitude, amplitude, 4096)
+
+    def value(_: np.ndarray, world: np.ndarray) -> np.ndarray:
+        cell = np.floor((world + 1e-3) / size).astype(int)
+        return table[(cell @ (73_856_093, 19_349_663, 83_492_791)) % 4096]
+
+    return value
+
+
+def _range(points: np.ndarray) -> np.ndarray:
+    return np.linalg.norm(points, axis=1)
+
+
+MOVING_CHANNELS: dict[str, Channel] = {
+    # Channels that are functions of a point's place in the frame of the sensor, and say nothing of the world.
+    "range": lambda points, _: 1 / (1 + 0.1 * _range(points)),
+    "distance": lambda points, _: _range(points),
+    "elevation": lambda points, _: np.arcsin(points[:, 2] / _range(points)),
+    "azimuth": lambda points, _: np.cos(np.arctan2(points[:, 1], points[:, 0])),
+    "time": lambda points, _: (np.arctan2(points[:, 1], points[:, 0]) / (2 * np.pi)) % 1,
+    "vignetting": lambda points, _: np.clip(points[:, 0] / _range(points), 0, 1) ** 4,
+    "saturation": lambda points, _: np.minimum(4 / _range(points) ** 2, 1),
+    "ring": lambda points, _: np.random.default_rng(3).normal(1, 0.1, 64)[
+        (32 * (1 + points[:, 2] / _range(points))).astype(int).clip(0, 63)
+    ],
+    "coordinate": lambda points, _: points[:, 0],
+}
+
+
+def seen(
+    sides: Sequence[Side],
+    seed: int,
+    channel: Channel | None = None,
+    *,
+    count: int = 4000,
+    channel_noise: float = 0.01,
+    step: float = STEP,
+    maximum_range: float = 9.0,
+    forward_only: bool = False,
+) -> Pair:
+    """A sensor sees rectangles from the origin, and again after a step along x; clouds are in the sensor's frame.
+
+    The channel has noise as a fraction of its standard deviation over the target.
+    """
+    rng = np.random.default_rng(seed)
+
+    def view(along: float) -> tuple[np.ndarray, np.ndarray]:
+        at = np.array([along, 0, _HEIGHT])
+        world = rects(rng, 6 * count, sides)
+        near = _range(world - at) < maximum_range
+        ahead = world[:, 0] > along if forward_only else np.ones(len(world), bool)
+        world = world[near & ahead][:count]
+        return world - at + NOISE * rng.normal(size=world.shape), world
+
+    target, source = view(0.0), view(step)
+    if channel is None:
+        return Pair(mcg.PointCloud(source[0]), mcg.PointCloud(target[0]), translation(step, 0, 0))
+    values = [channel(*part) for part in (source, target)]
+    deviation = channel_noise * np.std(values[1])
+    noisy = [part + deviation * rng.normal(size=part.shape) for part in values]
+    clouds = (
+        mcg.PointCloud(part[0], part_values[:, None]) for part, part_values in zip((source, target), noisy, strict=True)
+    )
+    return Pair(*clouds, translation(step, 0, 0))
+
+
+def in_frames(pair: Pair, source: np.ndarray, target: np.ndarray) -> Pair:
+    """The same pair after a rigid motion (4, 4) of each cloud's coordinates."""
+    clouds = (
+        cloud.replace(points=moved(matrix, np.asarray(cloud.points, np.float64)).astype(np.float32))
+        for cloud, matrix in ((pair.source, source), (pair.target, target))
+    )
+    return Pair(*clouds, target @ pair.T_target_source @ np.linalg.inv(source))
+
+
+def stairs(seed: int, count: int = 6000, steps: int = 12, step: float = STEP) -> Pair:
+    """Stairs with a period of 0.34 m between two walls, from `step` metres off along them."""
+    rng = np.random.default_rng(seed)
+    tread, rise = 0.28, 0.19
+    sides: list[Side] = []
+    for number in range(steps):
+        x, z = number * tread, number * rise
+        sides += [((x, -0.7, z), (0, 1.4, 0), (0, 0, rise)), ((x, -0.7, z + rise), (tread, 0, 0), (0, 1.4, 0))]
+    length, height = steps * tread, steps * rise + 2
+    sides += [((-1, y, -0.5), (length + 2, 0, 0), (0, 0, height)) for y in (-0.7, 0.7)]
+    along = step * np.array([tread, 0, rise]) / np.hypot(tread, rise)
+    target, source = (rects(rng, count, sides) + NOISE * rng.normal(size=(count, 3)) for _ in range(2))
+    return Pair(mcg.PointCloud(source - along), mcg.PointCloud(target), translation(*along))
