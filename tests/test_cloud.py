@@ -132,13 +132,35 @@ def test_unpad_undoes_pad(size):
     refused(lambda: raw().pad(149), "size")
 
 
-def test_padding_says_so():
+def test_padding_repeats_the_last_row_and_says_so():
     padded = ready().pad(240)
-    for name, fill in {"points": 0, "channels": 0, "valid": False, "neighbors": -1}.items():
-        assert (np.asarray(getattr(padded, name))[150:] == fill).all()
-    # They are weighed, with no weight, and must have inverses.
-    np.testing.assert_array_equal(padded.covariances[160:], np.broadcast_to(np.eye(3), (80, 3, 3)))
+    for name in ("points", "channels", "covariances"):
+        rows = np.asarray(getattr(padded, name))
+        np.testing.assert_array_equal(rows[150:], np.broadcast_to(rows[149], rows[150:].shape))
+    assert not padded.valid[150:].any() and (padded.neighbors[150:] == -1).all()
     np.testing.assert_array_equal(padded.neighbors[:160], ready().neighbors)
+    assert not raw(channel_valid=partial()).pad(160).channel_valid[150:].any()
+    assert PointCloud(np.zeros((0, 3))).pad(4).points.shape == (4, 3)
+
+
+def test_features_of_padded_clouds_have_the_derivatives_of_unpadded_ones():
+    """The features are not defined at the origin: a NaN in a row that nothing reads would be one in each gradient."""
+
+    def loss(weights, cloud):
+        x, y, z = cloud.points.T
+        features = jnp.stack([x / z, y / z, jnp.linalg.norm(cloud.points, axis=1), jnp.log(cloud.channels[:, 0])])
+        return jnp.sum(jnp.where(cloud.valid, jnp.sin(weights @ features), 0))
+
+    cloud, weights = PointCloud(POINTS + 2, np.abs(CHANNELS) + 0.5), jnp.array([0.3, -0.2, 0.1, 0.5])
+    expected, gradient = jax.grad(loss)(weights, cloud), jax.grad(loss)
+    batch = PointCloud.stack([cloud, cloud])
+    for found in (
+        gradient(weights, cloud.pad(200)),
+        jax.jit(gradient)(weights, cloud.pad(200)),
+        *jax.jit(jax.vmap(gradient, (None, 0)))(weights, batch),
+        jax.jit(lambda weights, cloud: gradient(weights, cloud.pad(200)))(weights, cloud),
+    ):
+        np.testing.assert_allclose(found, expected, rtol=1e-4)
 
 
 def test_replace_exchanges_and_leaves_the_rest():

@@ -215,9 +215,10 @@ def test_a_match_beyond_the_gate_is_not_replaced_by_a_nearer_one():
 
 
 def test_padding_is_never_matched():
-    """Rows of padding lie at the origin, right on top of the source."""
+    """Here, padding of the target lies at the origin, right on top of the source."""
     points, channels = ref.scene(140, 3)
     target = preprocess(PointCloud(points + np.array([3.0, 0, 0]), channels), num_neighbors=4).pad(160)
+    target = target.replace(points=np.where(target.valid[:, None], target.points, 0))
     source = preprocess(PointCloud(0.01 * points[:100], channels[:100]), num_neighbors=4).pad(160)
     for method in (PointToPoint(), ColorICP(0.1)):
         found = find_correspondences(source, target, None, method, max_distance=10.0)

@@ -328,7 +328,9 @@ class PointCloud(eqx.Module):
     def pad(self, size: int | None = None) -> PointCloud:
         """Append padding rows until the cloud has `size` rows.
 
-        Inside your own `jax.jit`, clouds padded to the same size share one compiled program.
+        Inside your own `jax.jit`, clouds padded to the same size share one compiled program. Padding repeats the last
+        point, so that features of all rows, such as x / z or the logarithm of a channel, and their derivatives are
+        finite; no other function reads it.
 
         Args:
             size: number of rows; by default the smallest of 128, 192, 256, 384, 512, ... that holds the cloud.
@@ -341,29 +343,25 @@ class PointCloud(eqx.Module):
         if missing < 0:
             raise ValueError(f"size: expected at least {self.points.shape[0]}, the rows of the cloud, got {size}")
 
-        def grow(array: Any, fill: int = 0) -> Any:
+        def grow(array: Any, fill: int | None = None) -> Any:
             if array is None:
                 return None
+            fill = 0 if fill is None and not len(array) else fill
             if not isinstance(array, np.ndarray):
-                return jnp.pad(array, [(0, missing)] + [(0, 0)] * (array.ndim - 1), constant_values=fill)
+                how: dict[str, Any] = {"mode": "edge"} if fill is None else {"constant_values": fill}
+                return jnp.pad(array, [(0, missing)] + [(0, 0)] * (array.ndim - 1), **how)
             # Takes a tenth of the time of `np.pad`.
-            grown = np.full((size, *array.shape[1:]), fill, array.dtype)
-            grown[: len(array)] = array
+            grown = np.empty((size, *array.shape[1:]), array.dtype)
+            grown[: len(array)], grown[len(array) :] = array, array[-1] if fill is None else fill
             return grown
 
-        covariances = grow(self.covariances)
-        if covariances is not None:
-            # Padded rows are computed and then masked, so their covariances must be invertible.
-            xp = np if isinstance(covariances, np.ndarray) else jnp
-            padding = xp.arange(size)[:, None, None] >= size - missing
-            covariances = xp.where(padding, xp.eye(3, dtype=covariances.dtype), covariances)
         return self.replace_rows(
             points=grow(self.points),
             channels=grow(self.channels),
-            channel_valid=grow(self.channel_valid),
-            valid=grow(self.valid),
+            channel_valid=grow(self.channel_valid, False),
+            valid=grow(self.valid, False),
             deferred_neighbors=grow(self.neighbors, -1),
-            covariances=covariances,
+            covariances=grow(self.covariances),
         )
 
     def replace_rows(self, **arrays: Any) -> PointCloud:
