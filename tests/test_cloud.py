@@ -391,3 +391,34 @@ def test_tables_with_named_columns_and_clouds_of_tensors():
     np.testing.assert_allclose(cloud.channels, colors / 255, rtol=1e-6)
     del Tensors.point["colors"]
     assert PointCloud(Tensors()).channels.shape == (5, 0)
+
+
+def test_points_of_a_depth_image():
+    """Against a loop over the pixels, for whole millimetres and for metres."""
+    rng = np.random.default_rng(0)
+    depth = rng.integers(300, 4000, (5, 7)).astype(np.uint16)
+    depth[0, 1], depth[2, 3] = 0, 65535
+    color, (fx, fy, cx, cy) = rng.integers(0, 256, (5, 7, 3)).astype(np.uint8), (6.5, 6.0, 3.1, 2.2)
+    points, colors = [], []
+    for row in range(5):
+        for column in range(7):
+            if depth[row, column] not in (0, 65535) and depth[row, column] <= 3000:
+                z = depth[row, column] / 1000
+                points.append([(column - cx) * z / fx, (row - cy) * z / fy, z])
+                colors.append(color[row, column] / 255)
+    cloud = PointCloud.from_depth(depth, (fx, fy, cx, cy), color, max_depth=3)
+    np.testing.assert_allclose(cloud.points, points, rtol=1e-6)
+    np.testing.assert_allclose(cloud.channels, colors, rtol=1e-6)
+    assert cloud.channel_names == ("red", "green", "blue") and cloud.points.dtype == np.float32
+    metres = np.where(np.isin(depth, (0, 65535)), np.nan, depth / 1000)
+    camera = [[fx, 0, cx], [0, fy, cy], [0, 0, 1]]
+    grey = PointCloud.from_depth(metres, camera, color[..., 0] / 255, max_depth=3)
+    np.testing.assert_allclose(grey.points, points, rtol=1e-12)
+    np.testing.assert_allclose(grey.channels[:, 0], np.array(colors)[:, 0])
+    assert grey.channel_names == ("intensity",)
+    half = PointCloud.from_depth(depth, (fx, fy, cx, cy), scale=2000, max_depth=1.5)
+    np.testing.assert_allclose(half.points, np.array(points) / 2, rtol=1e-6)
+    refused(lambda: PointCloud.from_depth(depth[None], camera), "depth")
+    refused(lambda: PointCloud.from_depth(depth, np.eye(4)), "intrinsics")
+    refused(lambda: PointCloud.from_depth(depth, camera, color[:, :3]), "color")
+    refused(lambda: PointCloud.from_depth(depth, camera, scale=0), "scale")

@@ -13,7 +13,8 @@ import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float, Int, UInt8
 
-from mcgicp_jax._clouds.columns import arrays_of
+from mcgicp_jax._clouds.columns import COLORS, arrays_of
+from mcgicp_jax._clouds.depth_images import back_project
 from mcgicp_jax._compute.concrete import is_concrete
 from mcgicp_jax._compute.messages import messages_named
 from mcgicp_jax._compute.programs import size_class
@@ -216,6 +217,46 @@ class PointCloud(eqx.Module):
         self.deferred_neighbors = None
         self.origin = np.zeros(3)
         self.voxels = Voxels()
+
+    @classmethod
+    def from_depth(
+        cls,
+        depth: Values,
+        intrinsics: Values,
+        color: Values | None = None,
+        *,
+        scale: float | None = None,
+        max_depth: float | None = None,
+    ) -> PointCloud:
+        """Create a raw cloud from a depth image: one point per pixel with a depth, row by row.
+
+        Args:
+            depth: (height, width), distances along the optical axis. Pixels that are 0, negative, NaN or infinite, or
+                65535 in an image of 16 bits, have no depth and give no point.
+            intrinsics: (fx, fy, cx, cy) or the (3, 3) camera matrix, pixels; the centre of the first pixel is (0, 0).
+            color: image of the same size, aligned pixel by pixel: (height, width, 3) becomes the channels red, green
+                and blue, (height, width) the channel intensity. Whole numbers are scaled to 0..1.
+            scale: depth units per metre; by default 1000 for whole numbers (millimetres), 1 for floating point.
+            max_depth: metres; points further away are left out. None: all are kept.
+
+        Returns:
+            The cloud in the frame of the camera: x right, y down, z ahead; float32, float64 if `depth` is.
+
+        Raises:
+            ValueError: if a shape, dtype or number does not fit; the message names the argument.
+        """
+        points, pixels = back_project(depth, intrinsics, scale, max_depth)
+        points = points if np.asarray(depth).dtype == np.float64 else points.astype(np.float32)
+        if color is None:
+            return cls(points)
+        image, shape = np.asarray(color), np.shape(depth)
+        if image.shape not in (shape, (*shape, 3)):
+            raise ValueError(f"color: expected shape {shape} or {(*shape, 3)} to go with depth, got {image.shape}")
+        column, row = pixels.astype(int).T
+        values = image[row, column]
+        if values.dtype.kind in "iu":
+            values = (values / np.iinfo(values.dtype).max).astype(points.dtype)
+        return cls(points, values, channel_names=COLORS if image.ndim == 3 else ("intensity",))
 
     def replace(self, **arrays: Any) -> PointCloud:
         """Return a copy with the given fields replaced (`points`, `channels`, `covariances`, ...).

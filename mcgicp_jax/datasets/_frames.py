@@ -1,4 +1,4 @@
-"""Lazy sequences of frames; and images: reading, colour look-up and back-projection."""
+"""Lazy sequences of frames; and images: reading and colour look-up."""
 
 from __future__ import annotations
 
@@ -176,16 +176,6 @@ def bilinear(
 
     values = [map_coordinates(each, pixels.T[::-1], float, order=1, mode=mode) for each in np.moveaxis(image, 2, 0)]
     return np.stack(values, axis=1)
-
-
-def back_project(
-    depth: Float[np.ndarray, "height width"], focal: tuple[float, float], center: tuple[float, float]
-) -> tuple[Float[np.ndarray, "N 3"], Float[np.ndarray, "N 2"]]:
-    """Points of a pinhole camera (x right, y down, z ahead), and their pixels; depth in metres, 0 if missing."""
-    row, column = np.nonzero(depth > 0)
-    pixels = np.stack([column, row], axis=1).astype(float)
-    distance = depth[row, column, None]
-    return np.hstack([(pixels - center) / focal * distance, distance]), pixels
 
 
 def _open(path: str | os.PathLike[str]) -> Any:

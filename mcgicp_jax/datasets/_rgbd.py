@@ -12,18 +12,19 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from mcgicp_jax import io
 from mcgicp_jax._clouds.columns import COLORS
+from mcgicp_jax._clouds.depth_images import back_project
 from mcgicp_jax._clouds.point_cloud import Frame, PointCloud
-from mcgicp_jax.datasets._frames import AbstractFrames, back_project, look_up, pose_of, read_depth, read_image
+from mcgicp_jax.datasets._frames import AbstractFrames, look_up, pose_of, read_depth, read_image
 
 # Pixels: focal lengths and principal point of the three calibrated cameras, and the default of the camera driver.
 _CAMERAS = {
-    "1": ((517.3, 516.5), (318.6, 255.3)),
-    "2": ((520.9, 521.0), (325.1, 249.7)),
-    "3": ((535.4, 539.2), (320.1, 247.6)),
+    "1": (517.3, 516.5, 318.6, 255.3),
+    "2": (520.9, 521.0, 325.1, 249.7),
+    "3": (535.4, 539.2, 320.1, 247.6),
 }
-_OTHER_CAMERA = ((525.0, 525.0), (319.5, 239.5))
-# Metres per unit of the depth images.
-_DEPTH_UNIT = 1 / 5000
+_OTHER_CAMERA = (525.0, 525.0, 319.5, 239.5)
+# Units of the depth images per metre.
+_DEPTH_SCALE = 5000
 # Seconds: maximum difference between a depth image and its colour image, and maximum gap between two measured poses.
 _MAX_DIFFERENCE, _MAX_GAP = 0.02, 0.1
 # Pixels: focal lengths of the depth and colour cameras, and their common principal point.
@@ -40,8 +41,6 @@ _TO_COLOR = np.array(
 )
 # Seconds between frames.
 _PERIOD = 1 / 30
-# Value of pixels without depth.
-_NO_DEPTH = 65535
 
 
 def tum_rgbd(folder: str | os.PathLike[str]) -> TUMFrames:
@@ -72,7 +71,7 @@ class TUMFrames(AbstractFrames):
     def __init__(self, folder: Path):
         self.folder = folder
         number = re.search(r"(?:freiburg|fr)(\d)", folder.absolute().name)
-        self._focal, self._center = _CAMERAS.get(number[1] if number else "", _OTHER_CAMERA)
+        self._camera = _CAMERAS.get(number[1] if number else "", _OTHER_CAMERA)
         times, self._depths = _read_list(folder / "depth.txt")
         color_times, colors = _read_list(folder / "rgb.txt")
         nearest = np.abs(times[:, None] - color_times).argmin(axis=1)
@@ -89,11 +88,10 @@ class TUMFrames(AbstractFrames):
         self._truth = None if poses is None else (np.loadtxt(truth, usecols=0, ndmin=1), poses)
 
     def _frame(self, index: int) -> Frame:
-        depth = read_depth(self.folder / self._depths[index]) * _DEPTH_UNIT
-        points, pixels = back_project(depth, self._focal, self._center)
+        depth = read_depth(self.folder / self._depths[index])
         image = read_image(self.folder / self._colors[index])
-        colors, _ = look_up(image, pixels)
-        cloud = PointCloud(points.astype(np.float32), colors, channel_names=COLORS)
+        cloud = PointCloud.from_depth(depth, self._camera, image, scale=_DEPTH_SCALE)
+        _, pixels = back_project(depth, self._camera)
         return Frame(cloud, self._pose(self._times[index]), float(self._times[index]), image, pixels)
 
     def _pose(self, time: float) -> Float[np.ndarray, "4 4"] | None:
@@ -151,9 +149,7 @@ class SevenScenesFrames(AbstractFrames):
     def _frame(self, index: int) -> Frame:
         path = self._depths[index]
         name = path.name.removesuffix(".depth.png")
-        depth = read_depth(path)
-        metres = np.where(depth == _NO_DEPTH, 0, depth) / 1000
-        points, _ = back_project(metres, (_DEPTH_FOCAL, _DEPTH_FOCAL), _CENTER)
+        points, _ = back_project(read_depth(path), (_DEPTH_FOCAL, _DEPTH_FOCAL, *_CENTER))
         in_camera = points @ _TO_COLOR[:, :3].T + _TO_COLOR[:, 3]
         pixels = _COLOR_FOCAL * in_camera[:, :2] / in_camera[:, 2:] + _CENTER
         file = path.with_name(f"{name}.color.png")

@@ -86,18 +86,16 @@ def living_room() -> list[Any]:
 
 def desk() -> list[Any]:
     """The pair of TUM fr1/xyz, whose files have no lists."""
-    from mcgicp_jax.datasets._frames import back_project, read_depth, read_image
+    from mcgicp_jax.datasets._frames import read_depth, read_image
 
-    frames = []
+    frames, camera = [], (517.3, 516.5, 318.6, 255.3)
     for name in ("prev", "curr"):
-        depth = read_depth(DATA / "tum_fr1_xyz" / f"dep_{name}.png") / 5000
-        points, pixels = back_project(depth, (517.3, 516.5), (318.6, 255.3))
-        column, row = pixels.astype(int).T
+        depth = read_depth(DATA / "tum_fr1_xyz" / f"dep_{name}.png")
         numbers = np.loadtxt(DATA / "tum_fr1_xyz" / f"pose_{name}.txt").ravel()[-7:]
         pose = np.eye(4)
         pose[:3, :3], pose[:3, 3] = Rotation.from_quat(numbers[3:]).as_matrix(), numbers[:3]
         image = read_image(DATA / "tum_fr1_xyz" / f"img_{name}.png")
-        frames.append(datasets.Frame(colored(points, image[row, column]), pose))
+        frames.append(datasets.Frame(mcg.PointCloud.from_depth(depth, camera, image, scale=5000), pose))
     return frames
 
 
