@@ -340,6 +340,14 @@ def test_las_in_utm_is_exact(tmp_path, suffix, point_format):
         np.testing.assert_array_equal(values, columns[name] / (1 if name == "intensity" else 65535))
 
 
+def test_las_rounds_means_of_intensities_and_has_no_colours_that_are_all_black(tmp_path):
+    values = np.array([[3.4], [250.5], [65535.0]])
+    io.write(tmp_path / "c.las", PointCloud(np.eye(3), values, channel_names=INTENSITY))
+    np.testing.assert_array_equal(io.read(tmp_path / "c.las").channels, np.rint(values))
+    las_data(3, red=np.zeros(N), intensity=np.arange(N)).write(str(tmp_path / "black.las"))
+    assert io.read(tmp_path / "black.las").channel_names == INTENSITY
+
+
 def test_las_8_bit_colours(tmp_path):
     las_data(2, red=np.arange(N), green=np.full(N, 255), blue=np.zeros(N)).write(str(tmp_path / "c.las"))
     cloud = io.read(tmp_path / "c.las")

@@ -60,6 +60,8 @@ def odometry(
     map_radius: Annotated[float | None, shown("FLOAT")] = None,
     loops: bool = False,
     output: File = None,
+    pose_format: Literal["kitti", "tum"] = "kitti",
+    pose_frame: Literal["sensor", "camera"] = "sensor",
     map: File = None,
     plot: File = None,
 ) -> int:
@@ -80,7 +82,11 @@ def odometry(
         against: Register each frame to the one before it, or to a map of all frames before it, which drifts less.
         map_radius: Metres; points further from the sensor leave the map. By default the range of the first frame.
         loops: Register frames with earlier ones that saw the same place, and correct all poses.
-        output: File for the poses, sensor to world, in KITTI format: the upper three rows of each matrix on one line.
+        output: File for the poses, sensor to world.
+        pose_format: kitti writes the upper three rows of each matrix on one line; tum writes time, position and
+            quaternion, for frames whose times are known.
+        pose_frame: camera writes the poses of camera 0, as the true poses of KITTI are, by the calibration of the
+            sequence; the world is camera 0 at the start.
         map: File for the map in the world frame, such as map.ply. Its voxels have the size used for registration; if
             that is off, the spacing of the points.
         plot: File for a picture of the trajectory in its principal plane, such as way.png.
@@ -88,6 +94,8 @@ def odometry(
     check_outputs(output, cloud=map, picture=plot, inputs=[path] if path else [])
     shared.check(method)
     frames = _open(dataset, path, num_frames, map)
+    if pose_frame == "camera" and frames.to_camera is None:
+        raise ValueError(f"pose_frame: expected sensor, since {dataset} has no calibration of a camera, got camera")
     options: dict[str, Any] = {
         "max_distance": DATASETS[dataset].max_distance if isinstance(dataset, str) else None,
         "num_neighbors": shared.num_neighbors,
@@ -96,6 +104,8 @@ def odometry(
         "loops": loops,
     }
     first = frames[0]
+    if pose_format == "tum" and first.time is None:
+        raise ValueError(f"pose_format: expected kitti, since the frames of {dataset} have no times, got tum")
     print(f"frames:    {len(frames)} of {dataset}, {len(first.cloud):,} points in the first")
     start = {"the first frame": first.cloud}
     # Where the second frame cannot be read, the odometry names the error.
@@ -109,14 +119,17 @@ def odometry(
         return choices.preprocess(frames[1].cloud), choices.preprocess(first.cloud)
 
     truth: Truth = []
-    clouds, chosen = _clouds(frames, choices.channels, truth), choices.method(name, first_two)
+    times: list[Any] = []
+    clouds, chosen = _clouds(frames, choices.channels, truth, times), choices.method(name, first_two)
     options |= choices.arguments(name, first_two)
     steps = mcg.odometry(clouds, chosen, voxel_size=choices.voxels.size, start=first.pose, **options)
     poses, results, failure = _follow(steps, len(frames), loops, map)
     del truth[len(poses) :]
     _report(poses, truth, results)
     if output is not None:
-        io.write_poses(output, poses)
+        camera = frames.to_camera if pose_frame == "camera" else None
+        in_frame = poses if camera is None else [camera @ pose @ np.linalg.inv(camera) for pose in poses]
+        io.write_poses(output, in_frame, None if pose_format == "kitti" else times[: len(poses)])
     if plot is not None:
         true_poses = [pose for pose in truth if pose is not None]
         plots.trajectories(({"truth": true_poses} if true_poses else {}) | {name: poses}, path=plot)
@@ -140,7 +153,12 @@ def _open(
             raise ValueError(f"{dataset}: expected the folder of a sequence after it, mcgicp odometry {dataset} PATH")
         frames = DATASETS[dataset].frames(path)
     elif dataset.is_dir():
-        frames = clouds_in(dataset, map=map)
+        try:
+            frames = clouds_in(dataset, map=map)
+        except ValueError as error:
+            if name := _dataset_of(dataset):
+                raise ValueError(f"{error}; it is a sequence: mcgicp odometry {name} {dataset}") from error
+            raise
     else:
         raise ValueError(f"{dataset}: expected a folder of clouds or one of {enumerated(list(DATASETS), 'or')}")
     if len(frames) < 2:
@@ -148,10 +166,20 @@ def _open(
     return frames if num_frames == "all" else frames[:num_frames]
 
 
-def _clouds(frames: AbstractFrames, names: tuple[str, ...], truth: Truth) -> Iterator[mcg.PointCloud]:
-    """Yield the cloud of each frame, and append its true pose to `truth`."""
+def _dataset_of(folder: Path) -> str | None:
+    """The data set whose layout a folder has."""
+    for name in (name for name, each in DATASETS.items() if not each.simulated):
+        with contextlib.suppress(ValueError, OSError):
+            DATASETS[name].frames(folder)
+            return name
+    return None
+
+
+def _clouds(frames: AbstractFrames, names: tuple[str, ...], truth: Truth, times: list[Any]) -> Iterator[mcg.PointCloud]:
+    """Yield the cloud of each frame, and append its true pose to `truth` and its time to `times`."""
     for frame in frames:
         truth.append(frame.pose)
+        times.append(frame.time)
         yield with_channels(frame.cloud, names)
 
 

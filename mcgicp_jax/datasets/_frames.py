@@ -27,7 +27,12 @@ class AbstractFrames(Sequence[Frame]):
     """A lazy sequence of frames: each is generated or read on access and not kept.
 
     It supports `len`, iteration, negative indices, and slices, which are lazy too.
+
+    Attributes:
+        to_camera: (4, 4) from the sensor to the camera whose poses the data set has; None if these are the sensor's.
     """
+
+    to_camera: Matrix | None = None
 
     def __init__(self, num_frames: int):
         self._num_frames = num_frames
@@ -65,7 +70,7 @@ class AbstractFrames(Sequence[Frame]):
 class _Slice(AbstractFrames):
     def __init__(self, whole: AbstractFrames, rows: range):
         super().__init__(len(rows))
-        self._whole, self._rows = whole, rows
+        self._whole, self._rows, self.to_camera = whole, rows, whole.to_camera
 
     def _frame(self, index: int) -> Frame:
         return self._whole[self._rows[index]]

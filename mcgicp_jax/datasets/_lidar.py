@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 from mcgicp_jax import io
 from mcgicp_jax._clouds.columns import COLORS
 from mcgicp_jax._clouds.point_cloud import Frame, PointCloud
-from mcgicp_jax.datasets._frames import AbstractFrames, Picture, look_up, pose_of, read_image
+from mcgicp_jax.datasets._frames import AbstractFrames, Matrix, Picture, look_up, pose_of, read_image
 
 # Pose of the laser in the vehicle's frame: x, y, z in metres; roll, pitch, yaw in radians.
 _LASER_IN_VEHICLE = np.array([2.4, -0.01, -2.3, np.pi, 0, np.pi / 2])
@@ -34,7 +34,7 @@ def kitti(folder: str | os.PathLike[str]) -> KITTIFrames:
         Frames of the Velodyne (x ahead, y left, z up) with the channel intensity, from 0 to 0.99, and, if there are
         images, red, green and blue, from 0 to 1. Colours are valid where a point projects into the image, about a sixth
         of a scan; points occluded from the camera are not detected. Poses map the Velodyne to the world, the
-        frame of camera 0 at the start.
+        frame of the Velodyne at the start.
 
     Raises:
         OSError: if a file is missing; for a scan or image, when its frame is read.
@@ -55,8 +55,8 @@ class KITTIFrames(AbstractFrames):
         super().__init__(len(self._scans))
         calibration = _read_calibration(folder / "calib.txt")
         # Transform from the Velodyne to camera 0, and projection to the pixels of camera 2.
-        self._to_camera = np.vstack([calibration["Tr"], [0, 0, 0, 1]])
-        self._projection = calibration["P2"] @ self._to_camera
+        self.to_camera: Matrix = np.vstack([calibration["Tr"], [0, 0, 0, 1]])
+        self._projection = calibration["P2"] @ self.to_camera
         self._times = _read_times(folder / "times.txt")
         poses = folder.absolute().parents[1] / "poses" / f"{folder.absolute().name}.txt"
         self._poses = io.read_poses(poses) if poses.is_file() else None
@@ -72,7 +72,7 @@ class KITTIFrames(AbstractFrames):
             cloud, pixels = self._paint(cloud, image)
         pose = None
         if self._poses is not None and number < len(self._poses):
-            pose = np.linalg.inv(self._to_camera) @ self._poses[number] @ self._to_camera
+            pose = np.linalg.inv(self.to_camera) @ self._poses[number] @ self.to_camera
         time = float(self._times[number]) if number < len(self._times) else None
         return Frame(cloud, pose, time, image, pixels)
 

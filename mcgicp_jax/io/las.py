@@ -42,8 +42,10 @@ def read_las(file: BinaryIO, size: int) -> PointCloud:
     with np.errstate(over="raise"):
         for axis, scale, offset in zip("XYZ", header.scales, header.offsets, strict=True):
             columns[axis] = columns[axis] * scale + offset
-    if not columns["intensity"].any():
-        del columns["intensity"]
+    # Where the format has fields that were not measured, they are 0 everywhere.
+    for group in (("intensity",), COLORS):
+        if not any(columns[name].any() for name in group if name in columns):
+            columns = {name: values for name, values in columns.items() if name not in group}
     if "red" in columns and max(columns[name].max() for name in COLORS) < 256:
         columns |= {name: columns[name].astype(np.uint8) for name in COLORS}
     return cloud_of(columns)
@@ -106,8 +108,10 @@ def write_las(file: BinaryIO, cloud: PointCloud, compress: bool) -> None:
 
 
 def _las_integers(name: str, values: Float[np.ndarray, "N"]) -> Shaped[np.ndarray, "N"]:
-    scaled = values if name == "intensity" else np.rint(values.astype(np.float64) * 65535)
-    if not ((scaled >= 0) & (scaled <= 65535) & (scaled == np.rint(scaled))).all():
+    # Means of whole intensities are rounded; intensities from 0 to 1 would be lost.
+    scaled = np.rint(values if name == "intensity" else values.astype(np.float64) * 65535)
+    lost = name == "intensity" and values.max(initial=0) <= 1 and (scaled != values).any()
+    if lost or not ((scaled >= 0) & (scaled <= 65535)).all():
         unit = "whole numbers from 0 to 65535" if name == "intensity" else "colours from 0 to 1"
         raise ValueError(f"channels: LAS holds {name} as {unit}; .ply holds any number")
     return scaled.astype(np.uint16)
