@@ -75,10 +75,12 @@ def multiway(
         plots.graph(result.graph, path=plot)
         print(f"picture:   {plot}")
     if not result.graph.converged:
-        print(f"mcgicp: the poses are {result.graph.status.name}", file=sys.stderr)
+        status = result.graph.status
+        why = ": no pair constrains some directions of motion" if status == mcg.Status.DEGENERATE else ""
+        print(f"mcgicp: the poses are {status.name}{why}", file=sys.stderr)
     for path, status in zip(paths, result.statuses, strict=True):
         if status != mcg.Status.CONVERGED:
-            print(f"mcgicp: {path}: {status.name}, its pose contradicts the others or is unknown", file=sys.stderr)
+            print(f"mcgicp: {path}: {status.name}, its pose contradicts the others or is not known", file=sys.stderr)
     return 0 if result.converged else 1
 
 

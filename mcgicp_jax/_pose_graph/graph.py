@@ -27,6 +27,9 @@ _BLIND = 1e-6
 # Information about the start, as a multiple of what leaks, and at most as a fraction of that of a typical edge: poses
 # slide least in corridors with multiples of 30 to 100.
 _OF_LEAK, _MOST = 30.0, 1e-2
+# Radians to which an edge knows the axes of its unmeasured directions at best: registrations in corridors, whose
+# rotation is known to 0.2 mrad, differ by 2 mrad.
+_AXES = 2e-3
 
 
 class PoseGraph(eqx.Module):
@@ -199,15 +202,19 @@ def _least_squares(
 def unmeasured(edges: Edge, poses: Float[np.ndarray, "n 4 4"], typical: Float[np.ndarray, "m 6"]) -> Edge:
     """Edges between the same poses that measure the motions at the start, along unmeasured directions alone.
 
-    The axes of an edge are only known to its standard deviation σ of rotation, in radians, so that a fraction σ² of its
-    information leaks into the directions that it does not measure: poses would slide along these by many metres to
-    explain the noise in the others. Priors get no information, since the world's axes are exact.
+    The axes of an edge are only known to its standard deviation σ of rotation, in radians, and at best to 2 mrad: a
+    fraction σ² of its information leaks into the directions that it does not measure. Poses would slide along these by
+    many metres to explain the noise in the others. Priors get no information, since the world's axes are exact.
     """
     between, roots = edges.i != WORLD, np.sqrt(typical)
     i = np.where(between, edges.i, edges.j)
     values, vectors = np.linalg.eigh(np.nan_to_num(edges.information) / (roots[:, :, None] * roots[:, None]))
     blind = between[:, None] & (values <= _BLIND * values[:, -1:])
-    least = np.minimum(_OF_LEAK / typical[:, 5:], _MOST)
     scaled = roots[:, :, None] * vectors
-    information = (scaled * (blind * least)[:, None]) @ scaled.swapaxes(1, 2)
+    information = (scaled * (blind * about_start(typical)[:, None])[:, None]) @ scaled.swapaxes(1, 2)
     return Edge(edges.i, edges.j, inverse(poses[i]) @ poses[edges.j], information)
+
+
+def about_start(typical: Float[np.ndarray, "m 6"]) -> Float[np.ndarray, "m"]:
+    """Information of `unmeasured` edges, as a fraction of that of a typical edge."""
+    return np.minimum(_OF_LEAK * np.maximum(1 / typical[:, 5], _AXES**2), _MOST)

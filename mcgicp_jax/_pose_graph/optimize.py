@@ -18,8 +18,7 @@ from mcgicp_jax._compute.threads import with_settings_of_package
 from mcgicp_jax._pose_graph.edge import WORLD, Edge
 from mcgicp_jax._pose_graph.graph import PoseGraph
 from mcgicp_jax._pose_graph.implicit_derivative import covariances_traced, solve_traced
-from mcgicp_jax._pose_graph.marginal_covariances import pose_covariances
-from mcgicp_jax._pose_graph.solver import solve
+from mcgicp_jax._pose_graph.solver import solve, uncertainty
 from mcgicp_jax._registration.result import Status
 
 
@@ -150,10 +149,10 @@ def optimize_poses(graph: PoseGraph, *, robust: bool = True, max_iterations: int
     if is_concrete(graph):
         poses, factors = jax.tree.map(np.asarray, (graph.poses, factors))
         solution, state = solve(poses, factors, bool(robust), int(max_iterations))
-        uncertainty = Lazy(lambda: pose_covariances(state)[: len(poses)])
+        covariances = Lazy(lambda: uncertainty(state)[: len(poses)])
     else:
         solution = solve_traced(graph.poses, factors, bool(robust), int(max_iterations))
-        uncertainty = covariances_traced(solution.poses, factors, solution.weights)
+        covariances = covariances_traced(solution.poses, factors, solution.weights)
     ends = np.cumsum([len(factor.information) for factor in factors])[:-1]
     xp = np if is_concrete(solution) else jnp
     residuals, *factor_residuals = xp.split(solution.residuals, ends)
@@ -168,5 +167,5 @@ def optimize_poses(graph: PoseGraph, *, robust: bool = True, max_iterations: int
         weights=weights,
         factor_residuals=tuple(factor_residuals),
         factor_weights=tuple(factor_weights),
-        uncertainty=uncertainty,
+        uncertainty=covariances,
     )

@@ -17,8 +17,9 @@ from mcgicp_jax._compute.concrete import AnyArray
 from mcgicp_jax._math.poses import matrices_of, parameters_of
 from mcgicp_jax._math.robust_kernels import truncated_weights
 from mcgicp_jax._pose_graph.edge import WORLD, Edge, Factors, motion_jacobians
-from mcgicp_jax._pose_graph.graph import unmeasured
+from mcgicp_jax._pose_graph.graph import about_start, unmeasured
 from mcgicp_jax._pose_graph.levenberg_marquardt import (
+    LEAST_DAMPING,
     GraphState,
     NormalEquations,
     PerMeasurement,
@@ -69,7 +70,7 @@ def solve(
     with np.errstate(over="ignore", invalid="ignore"):
         centred, factors, origin = _centred(start, factors)
         uncertain = np.concatenate([np.asarray(factor.uncertain) for factor in factors]) & robust
-        anchors = unmeasured(factors[0], centred, typical_information(factors)[: len(factors[0])])
+        anchors = _anchors(factors, centred)
         state = _minimum(centred, factors, anchors, uncertain, max_iterations)
         if not (np.isfinite(state.poses).all() and np.isfinite(state.terms.squares).all()):
             status = Status.NON_FINITE
@@ -89,7 +90,30 @@ def covariances_at(poses: Poses, factors: Factors, weights: PerMeasurement) -> F
     with np.errstate(over="ignore", invalid="ignore"):
         centred, factors, _ = _centred(poses, factors)
         equations = NormalEquations(factors, centred, weights > 0)
-        return pose_covariances(GraphState.at(equations, weights, centred))[: len(poses)]
+        return uncertainty(GraphState.at(equations, weights, centred))[: len(poses)]
+
+
+def uncertainty(state: GraphState) -> Float[np.ndarray, "n 6 6"]:
+    """Covariances of the poses. Information that leaks into unmeasured directions (see `unmeasured`) does not count.
+
+    For a degenerate graph they are (H + E)⁻¹ + 2 ε/λ ((H + E)⁻¹ − (H + 2E)⁻¹), with information E of relative size ε
+    along the unmeasured directions alone, and the least damping λ: 1/λ where H is far less than E, H⁻¹ where E is 0.
+    """
+    factors = state.equations.factors
+    anchors = _anchors(factors, state.poses)
+    if not (anchors.information.any() and _is_degenerate(state, anchors)):
+        return pose_covariances(state)
+    equations, kept = NormalEquations((*factors, anchors), state.poses), state.weights[: len(anchors)] > 0
+    weights = [np.append(state.weights, times * kept) for times in (1.0, 2.0)]
+    once, twice = (pose_covariances(GraphState.at(equations, each, state.poses)) for each in weights)
+    share = about_start(typical_information(factors)[: len(anchors)])[anchors.i != WORLD][0]
+    difference = np.subtract(once, twice, out=np.zeros_like(once), where=np.isfinite(once))
+    return once + 2 * share / LEAST_DAMPING * difference
+
+
+def _anchors(factors: Factors, poses: Poses) -> Edge:
+    """Edges to the given poses along what the edges do not measure."""
+    return unmeasured(factors[0], poses, typical_information(factors)[: len(factors[0])])
 
 
 def _centred(poses: Poses, factors: Factors) -> tuple[Float[np.ndarray, "_ 4 4"], Factors, Float[np.ndarray, "3"]]:

@@ -14,6 +14,7 @@ import numpy as np
 from jaxtyping import Float
 
 from mcgicp_jax._clouds.point_cloud import PointCloud
+from mcgicp_jax._local_geometry.cloud_statistics import point_spacing
 from mcgicp_jax._math.poses import adjoint, exponential, inverse, logarithm
 from mcgicp_jax._methods.base import AbstractMethod
 from mcgicp_jax._pose_graph.edge import Edge
@@ -25,10 +26,10 @@ from mcgicp_jax._registration.result import RegistrationResult, Status
 
 # Least overlap of a registration that becomes an edge: with less, a wrong local minimum looks like a right one.
 LEAST_OVERLAP = 0.4
-# Ratio of the information along unconstrained directions to that along constrained ones. The directions are known to
-# δ = 2 mrad, so that a fraction δ² = 4e-6 of the constrained information leaks into them: poses slide along a corridor
-# with less. With 1e-2, its edges contradict loops.
-_UNCONSTRAINED_RATIO = 1e-4
+# Along unconstrained directions a motion is assumed, which is right to its size, and at best to this number of spacings
+# of the points, the default coarse distance. With twice the range instead, loops are sought all over a corridor, whose
+# poses slide by 1 m instead of 0.1 m.
+_LEAST_ASSUMED = 10.0
 # Two frames may close a loop if their distance is at most this many median ranges of the points, plus this many
 # standard deviations of the distance (99 % of χ² with three degrees of freedom); the overlap decides. In simulation, a
 # range factor of 1 leaves 14 mm in the street instead of 9, and no more in the room.
@@ -48,8 +49,8 @@ _TRIES = 2
 def edge_from(i: int, j: int, result: RegistrationResult, *, uncertain: bool = False) -> Edge | None:
     """The edge that a registration of cloud j to cloud i measures.
 
-    The information matrix is the inverse covariance within the constrained directions, and a small fraction of it along
-    the others, so that DEGENERATE registrations contribute as well.
+    The information matrix is the inverse covariance within the constrained directions, and 0 along the others, so that
+    DEGENERATE registrations contribute as well.
 
     Returns:
         The edge; None unless the status is CONVERGED or DEGENERATE, the overlap is at least 40 % and the covariance is
@@ -75,7 +76,6 @@ def edge_from(i: int, j: int, result: RegistrationResult, *, uncertain: bool = F
     values, vectors = np.linalg.eigh(inner)
     along = np.zeros((6, 6))
     along[inside] = (vectors / np.maximum(values, rounding**2)) @ vectors.T
-    along[~constrained, ~constrained] = _UNCONSTRAINED_RATIO * np.median(np.linalg.eigvalsh(along[inside]))
     information = coordinates.T @ along @ coordinates
     return Edge(i, j, result.matrix, 0.5 * (information + information.T), uncertain=uncertain)
 
@@ -155,8 +155,14 @@ class Trajectory:
 
     def _connect(self, edge: Edge) -> None:
         i, j = int(edge.i), int(edge.j)
-        # An assumed motion is right to twice the range of the sensor and to half a turn.
-        least = np.repeat([self._range(j), np.pi], 3) ** -2.0
+        # A lost frame may be anywhere within twice the range of the sensor, turned by half a turn.
+        range_j = self._range(j)
+        assumed = range_j, np.pi
+        if np.any(edge.information):
+            spacing = float(point_spacing(self._clouds[j]))
+            size = max(float(np.linalg.norm(edge.T_i_j[:3, 3])), _LEAST_ASSUMED * spacing)
+            assumed = size, size / range_j
+        least = np.repeat(assumed, 3) ** -2.0
         self._ends = np.append(self._ends, np.array([[i], [j]], np.int32), axis=1)
         self._between[i, j] = self._between[j, i] = len(self._edges)
         self._edges.append(edge)

@@ -23,6 +23,7 @@ from mcgicp_jax._pairs.batch import register_batch
 from mcgicp_jax._pairs.batch_executors import GivenExecutor
 from mcgicp_jax._pose_graph.edge import Edge
 from mcgicp_jax._pose_graph.graph import PoseGraph
+from mcgicp_jax._pose_graph.levenberg_marquardt import typical_information
 from mcgicp_jax._pose_graph.optimize import PoseGraphResult, optimize_poses
 from mcgicp_jax._registration.options import GivenOptions, Options, check_method, options_of
 from mcgicp_jax._registration.register_pair import register_pair
@@ -32,6 +33,9 @@ from mcgicp_jax._sequences.loop_closure import LEAST_OVERLAP, edge_from, rows_be
 # Size of the cells in which overlap is counted, in spacings of the points: two samples of one surface then occupy
 # nearly the same cells.
 _CELL = 5.0
+# Largest variance of a pose whose directions are all constrained, as a multiple of that of a typical edge: chains of n
+# edges have n, and unconstrained directions 1e9.
+_UNKNOWN = 1e6
 # Largest number of rounds of registration. From the second on, only newly overlapping pairs are registered.
 _ROUNDS = 5
 
@@ -46,8 +50,9 @@ class MultiwayResult:
         registrations: maps each pair (i, j) to the registration of cloud j to cloud i. Registrations that failed or
             overlap by less than 40 % are listed here, but have no edge in `graph`.
         statuses: of each cloud: CONVERGED; TOO_FEW_CORRESPONDENCES if it has no edge; DEGENERATE if at least half of
-            its edges contradict the others. A cloud of another place does not disturb the others. It is often
-            CONVERGED itself, at a wrong pose with low overlap.
+            its edges contradict the others, or if its edges leave a direction of its pose in the frame of the first
+            cloud unconstrained. A cloud of another place does not disturb the others. It is often CONVERGED itself, at
+            a wrong pose with low overlap.
         voxel_size: of the map, metres: that of the clouds, or their median point spacing.
     """
 
@@ -229,6 +234,9 @@ def _solved(
     agree, total = np.bincount(ends, np.tile(kept, 2), n), np.bincount(ends, minlength=n)
     few = np.where(total == 0, Status.TOO_FEW_CORRESPONDENCES, Status.DEGENERATE)
     codes = np.where(agree > 0.5 * total, Status.CONVERGED, few) if n > 1 else [Status.CONVERGED]
+    if result.status == Status.DEGENERATE and len(edges):
+        variances = np.diagonal(result.covariance, 0, 1, 2) * typical_information((edges,))[0]
+        codes = np.where((codes == Status.CONVERGED) & ~(variances.max(axis=1) <= _UNKNOWN), Status.DEGENERATE, codes)
     return result, tuple(Status(int(code)) for code in codes)
 
 
