@@ -252,3 +252,18 @@ def test_warnings(told, make, silent):
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         silent()
+
+
+@pytest.mark.parametrize("first", [True, False])
+def test_the_share_of_duplicates_is_that_of_all_points(first):
+    # 4,096 points are sampled with a stride of 2.
+    points = np.random.default_rng(0).random((4096, 3)) * [1, 1, 0]
+    few, many = points.copy(), points.copy()
+    few[1] = few[0]
+    rows = np.arange(2458) if first else np.arange(4096 - 2458, 4096)
+    many[rows] = np.repeat(many[rows[::2]], 2, axis=0)
+    with pytest.warns(UserWarning, match="^points: (59|60|61)% lie exactly"):
+        preprocess(many, None)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        preprocess(few, None)

@@ -161,8 +161,8 @@ def _warn_of_loss(given: PointCloud, found: PointCloud, num_neighbors: int) -> N
     """Warn of float32 coordinates that are too large for it, such as those of UTM, of duplicates and few voxels."""
     points, neighbors = np.asarray(found.points), cast(Any, found.deferred_neighbors)
     # Of the rows from which the spacing of a target is computed. Each point is its own first neighbour.
-    rows, _ = sampled_rows(np.asarray(found.valid))
-    rows = rows[:: 1 + rows.size // _SAMPLE]
+    rows, counts = sampled_rows(np.asarray(found.valid))
+    rows = rows[counts][:: 1 + rows.size // _SAMPLE]
     offsets = points[neighbors[rows][:, 1]] - points[rows]
     if given.points.dtype == np.float32 and np.any(found.origin):
         largest, spacing = np.abs(given.points).max(), np.median(np.linalg.norm(offsets, axis=1))

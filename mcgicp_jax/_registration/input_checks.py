@@ -173,8 +173,8 @@ def warn_of_covariances(source: PointCloud, target: PointCloud) -> None:
     """Warn if one cloud has covariances in another unit than GICP's, which are computed for the other cloud."""
     for name, cloud, other in (("source", source, target), ("target", target, source)):
         if cloud.covariances is not None and other.covariances is None:
-            rows, _ = sampled_rows(cloud.valid)
-            trace = float(median(np.trace(np.asarray(cloud.covariances)[rows], axis1=1, axis2=2)))
+            rows, counts = sampled_rows(cloud.valid)
+            trace = float(median(np.trace(np.asarray(cloud.covariances)[rows[counts]], axis1=1, axis2=2)))
             if not _LEAST_TRACE <= trace / 2 <= _LARGEST_TRACE:
                 warn(
                     f"{name}: covariances look like m² (median trace {trace:.2g}; GICP's are dimensionless with trace "
