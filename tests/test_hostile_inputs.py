@@ -226,6 +226,19 @@ def test_points_in_one_place_do_not_set_the_default_distance(beams):
     assert result.converged and max(pose_error(result.matrix, truth)) < 1e-2
 
 
+@pytest.mark.parametrize(("place", "count"), [(0.0, 700), (999.0, 10), (-9999.0, 10)])
+def test_rays_without_return_hold_no_pose(place, count):
+    """They lie at one place in both clouds, wherever the sensor is, and far ones beyond all points."""
+    clouds, truth = pair(size=2000)[:2], motion()
+    for method in (mcg.PointToPoint(), mcg.GICP()):
+        expected = mcg.register(*clouds, method)
+        spoiled = [np.concatenate([cloud.points, np.full((count, 3), place, np.float32)]) for cloud in clouds]
+        with pytest.warns(UserWarning, match="as sensors report rays without return"):
+            result = mcg.register(*spoiled, method)
+        assert result.status == expected.status == Status.CONVERGED
+        assert max(pose_error(result.matrix, truth)) < 1.1 * max(pose_error(expected.matrix, truth)) + 1e-3
+
+
 def test_what_no_float32_holds_is_left_out():
     """In both precisions alike, and without a warning from the arithmetic."""
     points, channels = room_corner(100)

@@ -81,6 +81,18 @@ def test_many_equal_distances(seed, k):
     )
 
 
+@pytest.mark.parametrize("k", [5, 40])
+def test_trees_hold_few_of_many_equal_points(k, monkeypatch):
+    """A leaf of n equal points, each of which asks for its neighbours, would cost n²."""
+    built, build = [], KDTreeSearch.build
+    monkeypatch.setattr(KDTreeSearch, "build", lambda self, points: built.append(len(points)) or build(self, points))
+    points = np.random.default_rng(0).normal(size=(300, 3))
+    points[::2] = [-0.0, 0.0, 1.0]
+    points[::4] = [0.0, 0.0, 1.0]
+    np.testing.assert_array_equal(KDTreeSearch().neighbors(points, k), ref.nearest(points, points, k))
+    assert built[-1] == 150 + max(32, k + 1)
+
+
 @settings(max_examples=25, deadline=None)
 @given(seed=st.integers(0, 2**31), high=st.integers(2, 6), num_channels=st.integers(0, 3))
 def test_nearest_with_ties_in_position_and_channels(seed, high, num_channels):

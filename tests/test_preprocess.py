@@ -144,6 +144,29 @@ def test_rows_that_are_not_finite_are_left_out_with_one_warning():
     np.testing.assert_array_equal(cloud.unpad().channels, CHANNELS[keep])
 
 
+@pytest.mark.parametrize(("place", "count", "kept"), [(0.0, 2, 1), (0.0, 70, 1), (-0.0, 70, 1), (999.0, 6, 0)])
+def test_rays_without_return_are_left_out(place, count, kept):
+    """They lie at exactly one place; a single point at zero may be one of the sensor."""
+    rows = np.random.default_rng(0).permutation(150)[:count]
+    keep = np.ones(150, bool)
+    keep[np.sort(rows)[kept:]] = False
+    points = POINTS.copy()
+    points[rows] = place
+    with pytest.warns(UserWarning, match=f"^left out {count - kept} of 150 points that lie at exactly one place"):
+        cloud = ready(PointCloud(points, CHANNELS))
+    np.testing.assert_array_equal(cloud.points, points[keep])
+    np.testing.assert_array_equal(cloud.channels, CHANNELS[keep])
+    slopes = jax.grad(lambda points: jnp.sum(ready(points).points))(jnp.asarray(points))
+    np.testing.assert_array_equal(slopes, np.tile(keep[:, None], 3))
+
+
+@pytest.mark.parametrize("step", [0.5, 1.0])
+def test_equal_points_of_rounded_clouds_are_measurements(step):
+    points = np.rint(4 * POINTS / step)[np.arange(900) % 150] * step + 100
+    assert np.unique(points, axis=0, return_counts=True)[1].max() > 5
+    assert len(ready(points)) == 900
+
+
 def test_large_coordinates_lose_nothing():
     points = POINTS + UTM
     cloud, local = ready(points, num_neighbors=20), ready(POINTS, num_neighbors=20)

@@ -9,6 +9,7 @@ import jax
 import numpy as np
 from jaxtyping import Bool, Float
 
+from mcgicp_jax._clouds.placeholders import measured_rows
 from mcgicp_jax._clouds.point_cloud import LARGEST, PointCloud, Values, Voxels, as_cloud, is_far
 from mcgicp_jax._clouds.voxel_size import NUM_NEIGHBORS, VoxelSize, voxels_and_grids, warn_of_shape
 from mcgicp_jax._clouds.voxels import Grid, grid_of
@@ -65,10 +66,11 @@ def preprocess(
             with covariances is to be downsampled, the cloud is a batch, or an argument is out of range.
 
     Warns:
-        UserWarning: once per call, if points with NaN or infinity were left out, if downsampling leaves fewer points
-            than `num_neighbors`, if more than half of the points lie exactly on another one, if coordinates far from
-            zero are float32 and too coarse for the points' spacing, or if `voxel_size` is None and more than a tenth of
-            the neighbourhoods are lines, or most are more than 0.6 times as thick as wide.
+        UserWarning: once per call, if points with NaN or infinity were left out, or points that share exactly one
+            place, as sensors report rays without return (the first at (0, 0, 0) is kept), if downsampling leaves fewer
+            points than `num_neighbors`, if more than half of the points lie exactly on another one, if coordinates far
+            from zero are float32 and too coarse for the points' spacing, or if `voxel_size` is None and more than a
+            tenth of the neighbourhoods are lines, or most are more than 0.6 times as thick as wide.
     """
     return preprocessed_in(None, cloud, voxel_size, num_neighbors, search)
 
@@ -102,10 +104,10 @@ def _differentiable(cloud: PointCloud, found: PointCloud, fixed: PointCloud) -> 
     """The preprocessed cloud `found` with the derivative by the traced arrays of a raw one; `fixed` is the raw cloud
     without these traces."""
     raw = fixed.unpad()
-    finite = _is_finite(raw)
-    rows, voxels = np.flatnonzero(np.asarray(fixed.valid))[finite], np.arange(np.sum(finite))
+    kept = measured_rows(np.asarray(raw.points), _is_finite(raw))
+    rows, voxels = np.flatnonzero(np.asarray(fixed.valid))[kept], np.arange(np.sum(kept))
     if found.voxel_size is not None:
-        voxels, _ = grid_of(np.asarray(raw.points)[finite]).numbers(found.voxel_size)
+        voxels, _ = grid_of(np.asarray(raw.points)[kept]).numbers(found.voxel_size)
     arrays: dict[str, Any] = {}
     for name in ("points", "channels", "covariances"):
         array = getattr(cloud, name)
@@ -114,7 +116,7 @@ def _differentiable(cloud: PointCloud, found: PointCloud, fixed: PointCloud) -> 
             array = array + cloud.origin
         if not is_concrete(array):
             mask = raw.channel_valid if name == "channels" else None
-            counted = np.ones((len(rows), 1)) if mask is None else mask[finite]
+            counted = np.ones((len(rows), 1)) if mask is None else mask[kept]
             average = RowAverage(rows, voxels, counted, (array.shape[0], len(found.points)))
             (arrays[name],) = with_derivative([getattr(found, name)], average, [array])
     return found.replace_rows(**arrays)
@@ -193,22 +195,32 @@ def check_preprocessing(voxel_size: VoxelSize | Voxels, num_neighbors: int) -> N
 
 
 def finite_rows(cloud: PointCloud | Values) -> PointCloud:
-    """A raw cloud without padding and without rows that have a NaN or infinity in any array; warns of the latter."""
+    """A raw cloud without padding, rows that have a NaN or infinity in any array, and placeholders; warns of the latter
+    two."""
     cloud = as_cloud("cloud", cloud)
     if not is_concrete(cloud):
         raise ValueError("cloud: expected concrete arrays, got tracers; preprocess outside of jit and vmap")
     if cloud.points.ndim != 2:
         raise ValueError(f"cloud: expected a single cloud, got a batch of shape {cloud.points.shape}")
     cloud = cloud.unpad()
-    keep = _is_finite(cloud)
+    points, finite = np.asarray(cloud.points), _is_finite(cloud)
+    keep = measured_rows(points, finite)
     if len(keep) >= MIN_POINTS and keep.all():
         return cloud
-    others = np.sum(~keep & (np.abs(cloud.points) <= LARGEST).all(axis=1))
+    others = np.sum(~finite & (np.abs(points) <= LARGEST).all(axis=1))
     advice = f", {others} of them with finite coordinates; mark missing channels by channel_valid" if others else ""
+    placeholders = finite & ~keep
     if keep.sum() < MIN_POINTS:
-        left = f", left out {np.sum(~keep)}{advice}" if others else ""
+        left = f", left out {np.sum(~keep)}{advice}" if others or placeholders.any() else ""
         raise ValueError(f"cloud: expected at least {MIN_POINTS} finite points, got {keep.sum()} of {keep.size}{left}")
-    warn(f"left out {np.sum(~keep)} of {keep.size} points with a NaN or infinity{advice}")
+    if not finite.all():
+        warn(f"left out {np.sum(~finite)} of {keep.size} points with a NaN or infinity{advice}")
+    if placeholders.any():
+        x, y, z = points[np.argmax(placeholders)]
+        warn(
+            f"left out {placeholders.sum()} of {keep.size} points that lie at exactly one place, such as "
+            f"({x:g}, {y:g}, {z:g}), as sensors report rays without return"
+        )
     return PointCloud(
         cloud.points[keep],
         cloud.channels[keep],

@@ -15,6 +15,7 @@ from typing import Any, Literal, NamedTuple, TypeAlias
 import numpy as np
 from jaxtyping import Float
 
+from mcgicp_jax._clouds.placeholders import measured_rows
 from mcgicp_jax._clouds.point_cloud import LARGEST, PointCloud, Voxels
 from mcgicp_jax._clouds.voxels import VOXELS_PER_AXIS, Grid, grid_of
 from mcgicp_jax._compute.concrete import is_concrete
@@ -296,7 +297,8 @@ def _size(step: int) -> float:
 
 
 def _finite_points(cloud: PointCloud) -> Float[np.ndarray, "N 3"]:
-    """The finite points, float64."""
+    """The finite points without placeholders, float64."""
     points, kept = np.asarray(primal(cloud.points), np.float64), np.asarray(cloud.valid)
     kept = np.logical_and.reduce([kept, *(np.abs(column) <= LARGEST for column in points.T)])
+    kept = measured_rows(points, kept)
     return points if kept.all() else points[kept]
