@@ -73,7 +73,7 @@ def mahalanobis_cost(
     check_matches(matches, source, target, method, temperature)
     if log_determinant and not isinstance(method, AbstractGeneralized):
         raise ValueError(f"log_determinant: expected a method with covariances, got {type(method).__name__}")
-    warn_of_estimated_parameters(method, source, target, temperature)
+    warn_of_estimated_parameters(method, source, target, soft=temperature is not None)
     matrix, dtype = centred_pose(pose, source, target, "pose"), source.points.dtype
     motion = Motion(matrix[:3, :3].astype(dtype), matrix[:3, 3].astype(dtype))
     temperature = None if temperature is None else numpy_for(temperature).asarray(temperature, dtype)

@@ -74,7 +74,7 @@ def estimate_pose(
     )
     check_matches(matches, source, target, method, temperature)
     check_clouds(source, target, method)
-    warn_of_estimated_parameters(method, source, target, temperature)
+    warn_of_estimated_parameters(method, source, target, soft=temperature is not None)
     softness = None if temperature is None else numpy_for(temperature).asarray(temperature, source.points.dtype)
     inputs = Inputs(source, target, method, robust, temperature=softness)
     return result_of(inputs, _estimate, Matches.given(primal(matches)), primal(init), options)

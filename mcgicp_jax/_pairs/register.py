@@ -44,6 +44,7 @@ def register(
     equalize_channels: bool = False,
     voxel_sizes: Sequence[float] = (),
     max_source_points: int | None = Options.max_source_points,
+    soft_matches: bool = Options.soft_matches,
     tie_points: GivenTiePoints | None = None,
     prior: GivenPrior | None = None,
 ) -> RegistrationResult:
@@ -157,12 +158,13 @@ def register(
         equalize_channels=equalize_channels,
         voxel_sizes=voxel_sizes,
         max_source_points=max_source_points,
+        soft_matches=soft_matches,
     )
     if not (tie_points is None and prior is None) and not hold_unconstrained:
         raise ValueError("hold_unconstrained: expected True with tie_points or prior, got False")
     source, target = as_cloud("source", source), as_cloud("target", target)
     warn_of_lengths(source, target)
-    warn_of_estimated_parameters(method, source, target)
+    warn_of_estimated_parameters(method, source, target, options.soft_matches)
     result = register_from(source, target, method, init, options, tie_points, prior)
     doubt = doubt_of(result)
     if doubt:

@@ -98,20 +98,29 @@ def check_matches(
         raise ValueError(f"temperature: expected a positive number of metres, got {temperature!r}")
 
 
-def warn_of_constant_weights(method: AbstractMethod) -> None:
-    """Warn if α is differentiated outside of `jit`: it decides matches alone, which are constant to autodiff."""
+def warn_of_hard_matches(method: AbstractMethod, source: PointCloud, target: PointCloud) -> None:
+    """Warn if α or channels are differentiated outside of `jit`: α decides matches alone, and channels act mostly by
+    them, unless the photometric term compares them. Hard matches are constant to autodiff."""
     weights = getattr(method, "channel_weights", None)
     if not is_concrete(weights) and is_concrete(primal(weights)):
-        warn("channel_weights: the derivative is 0, since they decide matches alone, which are constant in derivatives")
+        warn(
+            "channel_weights: the derivative is 0, since they decide matches alone, which are constant in derivatives; "
+            "pass soft_matches=True"
+        )
+    channels = source.channels, target.channels
+    compared = isinstance(method, MultiChannelGICP) and method.photometric
+    if method.uses_channels and not compared and not is_concrete(channels) and is_concrete(primal(channels)):
+        warn(
+            "channels: they act mostly by the matches, which are constant in derivatives, so that this one is often a "
+            "hundred times too small; pass soft_matches=True"
+        )
 
 
-def warn_of_estimated_parameters(
-    method: AbstractMethod, source: PointCloud, target: PointCloud, temperature: ArrayLike | None = None
-) -> None:
-    """Warn if channels are differentiated outside of `jit` while Λ, or α with a `temperature`, is estimated from them.
+def warn_of_estimated_parameters(method: AbstractMethod, source: PointCloud, target: PointCloud, soft: bool) -> None:
+    """Warn if channels are differentiated outside of `jit` while Λ, or α of soft matches, is estimated from them.
 
     The photometric term uses neither, but estimates numbers from the residuals of points and channels. All of these are
-    constant to autodiff. Without a `temperature`, α decides matches alone, which are, too.
+    constant to autodiff. Of hard matches, α decides the matches alone, which are, too.
     """
     channels = source.channels, target.channels
     if not isinstance(method, MultiChannelGICP):
@@ -126,7 +135,7 @@ def warn_of_estimated_parameters(
         return
     if is_concrete(channels):
         return
-    names = ["channel_covariance"] if temperature is None else ["channel_covariance", "channel_weights"]
+    names = ["channel_covariance", "channel_weights"] if soft else ["channel_covariance"]
     unset = [name for name in names if getattr(method, name) is None]
     if unset and is_concrete(primal(channels)):
         warn(

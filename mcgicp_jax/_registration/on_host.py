@@ -73,8 +73,11 @@ class HostExecutor(AbstractExecutor):
         rows = None if stride == 1 else np.arange(problem.source.num_points)[every]
         return Matches.of(source, problem.target.search, indices, settings.distance(status), rows)
 
-    def nearest(self, pose: Float[np.ndarray, "7"], source: SearchPoints) -> Int[np.ndarray, "1 n"]:
-        return self._index_of(True).nearest(pose, source, float(self.problem.settings.fine_distance))
+    def nearest(
+        self, pose: Float[np.ndarray, "7"], source: SearchPoints, alone: bool = True, num_candidates: int = 1
+    ) -> Int[np.ndarray, "m n"]:
+        limit = float(self.problem.settings.fine_distance)
+        return self._index_of(alone).nearest(pose, source, limit, num_candidates)
 
     def adapt(self, state: State, matches: Matches, before: tuple[AbstractTerm, ...]) -> tuple[AbstractTerm, ...]:
         return before if state.status in (COARSE, SETTLED) else super().adapt(state, matches, before)

@@ -48,6 +48,7 @@ class Options:
     equalize_channels: bool = False
     voxel_sizes: Sequence[float] = ()
     max_source_points: int | None = _ENOUGH_SOURCE_POINTS
+    soft_matches: bool = False
     min_coarse_distance: float = 0.0
 
     def __post_init__(self) -> None:
@@ -68,7 +69,7 @@ class Options:
                 raise ValueError(f"{name}: expected an object such as {example}, got the class {value.__name__}")
             if value is not None and not isinstance(value, kind):
                 raise ValueError(f"{name}: expected an object such as {example}, or None, got {value!r}")
-        for name in ("hold_unconstrained", "equalize_channels"):
+        for name in ("hold_unconstrained", "equalize_channels", "soft_matches"):
             value = getattr(self, name)
             if is_concrete(value) and np.asarray(value).dtype != bool:
                 raise ValueError(f"{name}: expected True or False, got {value!r}")
@@ -106,6 +107,7 @@ class GivenOptions(TypedDict, total=False):
     equalize_channels: bool
     voxel_sizes: Sequence[float]
     max_source_points: int | None
+    soft_matches: bool
 
 
 def options_of(function: Callable[..., Any], given: Any) -> Options:

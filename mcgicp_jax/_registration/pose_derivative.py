@@ -101,7 +101,7 @@ class PoseDerivative(AbstractLinearMap):
         self._form = jax.tree.leaves(form)
         equalized = any(term.estimates_gains for term in problem.terms)
         terms = inputs.method.terms(fixed.source, fixed.target, inputs.robust, equalized)
-        matches = executor.within(Motion.of(loop.state.pose.wxyz_xyz), loop.matches)
+        matches = executor.differentiable_matches(loop)
         tables = differentiable_inputs(
             *inputs[:3],
             terms,
@@ -111,7 +111,8 @@ class PoseDerivative(AbstractLinearMap):
             observed=problem.source.observed,
             soft=matches.temperature is not None,
         )
-        numbers = Motion.of(self._pose), self._scaling, with_numbers_of(terms, loop.terms), inputs.temperature
+        temperature = matches.temperature if inputs.temperature is None else inputs.temperature
+        numbers = Motion.of(self._pose), self._scaling, with_numbers_of(terms, loop.terms), temperature
         self._scored = RowFunction(_score_of_rows, numbers, tables, matches.indices.shape[1], total=True)
         traced = [leaf for leaf in self._form if not is_concrete(leaf)]
         self.arrays = list(arrays) or self._scored.tracers + traced

@@ -39,15 +39,15 @@ from mcgicp_jax._registration.correspondences import find_correspondences, index
 from mcgicp_jax._registration.input_checks import (
     check_channels,
     check_clouds,
-    warn_of_constant_weights,
     warn_of_covariances,
+    warn_of_hard_matches,
 )
 from mcgicp_jax._registration.loop import LoopResult, Problem, State
 from mcgicp_jax._registration.on_host import HostExecutor
 from mcgicp_jax._registration.options import Options, check_method
 from mcgicp_jax._registration.pose_derivative import Inputs, differentiated, jacobian, with_derivatives
 from mcgicp_jax._registration.result import RegistrationResult, is_usable
-from mcgicp_jax._registration.settings import settings_for
+from mcgicp_jax._registration.settings import settings_for, spacing_of
 from mcgicp_jax._registration.tie_points_and_prior import (
     GivenPrior,
     GivenTiePoints,
@@ -136,9 +136,10 @@ def prepared(
 ) -> Inputs:
     """The arguments of a registration, checked; and the clouds, see `preprocessed`."""
     check_method(method)
-    warn_of_constant_weights(method)
     sides = {"source": as_cloud("source", source), "target": as_cloud("target", target)}
     source, target = preprocessed(sides, method, options)
+    if not options.soft_matches:
+        warn_of_hard_matches(method, source, target)
     if options.voxel_sizes and not (source.covariances is None and target.covariances is None):
         raise ValueError("voxel_sizes: expected none for clouds with covariances, which cannot be averaged in voxels")
     if options.voxel_sizes and method.needs_covariances and not is_concrete(source, target):
@@ -210,7 +211,7 @@ def run_loop(inputs: Inputs, problem: Problem, search: AbstractSearch | None, ma
         # Gradients stop here, so that autodiff does not enter the compiled functions.
         fixed = jax.lax.stop_gradient(problem)
         loop = run_traced(fixed, search, max_iterations)
-        state = partial(differentiable, loop, problem)
+        state = partial(differentiable, loop, problem, search)
         ended = loop, fixed, search
         return Run(inputs, problem, loop, None, state, partial(assess, *ended), partial(moments_traced, *ended))
 
@@ -260,6 +261,7 @@ def problem_of(
         settings_for(options, pair.method, target, stride, dtype),
         matches=matches,
         num_candidates=pair.method.num_candidates,
+        temperature=constant(spacing_of(pair.method, target)) if options.soft_matches else None,
     )
     return problem, given._replace(method=pair.method, source_rows=rows)
 

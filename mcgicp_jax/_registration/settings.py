@@ -71,6 +71,12 @@ def _either(condition: Bool[AnyScalar, ""], one: AnyScalar, other: AnyScalar) ->
     return jnp.where(condition, one, other)
 
 
+def spacing_of(method: AbstractMethod, target: PointCloud) -> Any:
+    """The spacing of the target, metres: of its points, or the edge of its cells."""
+    cells = method.needs_covariances and target.covariances is not None
+    return cell_edge(target) if cells else point_spacing(target)
+
+
 def default_distances(spacing: Any, target: PointCloud) -> tuple[Any, Any]:
     """Default `max_distance` of the coarse and the fine phase, metres, for a target with this spacing."""
     # Cells have the spacing of their grid.
@@ -82,9 +88,8 @@ def settings_for(options: Options, method: AbstractMethod, target: PointCloud, s
     """The settings of a registration to this target; `stride` is that of the coarse phase."""
     max_distance: Any = options.max_distance
     tolerance: Any = options.translation_tolerance
-    cells = method.needs_covariances and target.covariances is not None
     # Settings are constants to autodiff, even if they are derived from a differentiated cloud.
-    spacing = constant(cell_edge(target) if cells else point_spacing(target))
+    spacing = constant(spacing_of(method, target))
     max_distance = default_distances(spacing, target) if max_distance is None else max_distance
     least = spacing * _TOLERANCE_IN_SPACINGS
     tolerance = least if tolerance is None else tolerance

@@ -78,9 +78,12 @@ class TracedExecutor(AbstractExecutor):
         matches = Matches.of(source, target, found, settings.distance(status))
         return matches._replace(indices=jnp.where(running, matches.indices, before.indices))
 
-    def nearest(self, pose: Float[Array, "7"], source: SearchPoints) -> Int[Array, "1 n"]:
-        target, limit = by_position(self.problem.target.search), self.problem.settings.fine_distance
-        return self._search.nearest_traced(pose, source, target, limit, jnp.bool_(True))
+    def nearest(
+        self, pose: Float[Array, "7"], source: SearchPoints, alone: bool = True, num_candidates: int = 1
+    ) -> Int[Array, "m n"]:
+        target, limit = self.problem.target.search, self.problem.settings.fine_distance
+        target = by_position(target) if alone else target
+        return self._search.nearest_traced(pose, source, target, limit, jnp.bool_(True), num_candidates)
 
     def adapt(self, state: State, matches: Matches, before: tuple[AbstractTerm, ...]) -> tuple[AbstractTerm, ...]:
         if not is_adaptive(before):
@@ -124,11 +127,11 @@ def moments_traced(loop: LoopResult, problem: Problem, search: AbstractSearch | 
 
 
 @jax.jit
-def differentiable(loop: LoopResult, problem: Problem) -> State:
+def differentiable(loop: LoopResult, problem: Problem, search: AbstractSearch | None) -> State:
     """The final state with the implicit derivative by the problem attached to its pose, see `with_derivative`."""
     loop, fixed = jax.lax.stop_gradient((loop, problem))
-    executor, state = TracedExecutor(fixed, None, 0), loop.state
-    matches = executor.within(Motion.of(state.pose.wxyz_xyz), loop.matches)
+    executor, state = TracedExecutor(fixed, search, 0), loop.state
+    matches = executor.differentiable_matches(loop)
     if problem.matches is not None:
         matches = matches._replace(temperature=problem.matches.temperature)
     source, target = (surface._replace(noise=None) for surface in (problem.source, problem.target))
