@@ -8,6 +8,7 @@ seconds, the logger "mcgicp_jax" has a record of the level INFO.
 
 Clouds
     PointCloud                      points (N, 3) with channels (N, C)
+    deskew                          undo the motion of the sensor during a scan
     preprocess                      average in voxels, find neighbours
     merge_clouds                    one map of many clouds
     voxel_gaussians                 a cloud of the means and covariances of its cells
@@ -54,6 +55,7 @@ To extend (see mcgicp_jax.extend)
 
 from mcgicp_jax import datasets, io, metrics, plot
 from mcgicp_jax._clouds.color_spaces import rgb_to_hsv, rgb_to_lab, rgb_to_yuv
+from mcgicp_jax._clouds.deskew import deskew
 from mcgicp_jax._clouds.point_cloud import PointCloud
 from mcgicp_jax._clouds.preprocess import preprocess
 from mcgicp_jax._clouds.voxel_map import merge_clouds
@@ -113,6 +115,7 @@ __all__ = [
     "Tukey",
     "Welsch",
     "datasets",
+    "deskew",
     "estimate_channel_covariance",
     "estimate_pose",
     "find_correspondences",

@@ -108,7 +108,7 @@ def with_channels(cloud: mcg.PointCloud, names: Sequence[str]) -> mcg.PointCloud
         chosen += [f"{name}_{i}" for i in range(len(COLORS))] if name in COLOR_SPACES else [name]
     return mcg.PointCloud(
         cloud.points, channels, channel_valid=measured, covariances=cloud.covariances, channel_names=chosen
-    )
+    ).replace_rows(times=cloud.times)
 
 
 def listed(names: Sequence[str]) -> str:

@@ -59,6 +59,7 @@ def odometry(
     against: Literal["previous", "map"] = "previous",
     map_radius: Annotated[float | None, shown("FLOAT")] = None,
     loops: bool = False,
+    deskew: bool = False,
     output: File = None,
     pose_format: Literal["kitti", "tum"] = "kitti",
     pose_frame: Literal["sensor", "camera"] = "sensor",
@@ -82,6 +83,7 @@ def odometry(
         against: Register each frame to the one before it, or to a map of all frames before it, which drifts less.
         map_radius: Metres; points further from the sensor leave the map. By default the range of the first frame.
         loops: Register frames with earlier ones that saw the same place, and correct all poses.
+        deskew: Undo the motion of the sensor during each scan, whose points have times.
         output: File for the poses, sensor to world.
         pose_format: kitti writes the upper three rows of each matrix on one line; tum writes time, position and
             quaternion, for frames whose times are known.
@@ -102,6 +104,7 @@ def odometry(
         "against": against,
         "map_radius": map_radius,
         "loops": loops,
+        "deskew": deskew,
     }
     first = frames[0]
     if pose_format == "tum" and first.time is None:

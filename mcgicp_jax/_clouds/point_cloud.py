@@ -87,6 +87,18 @@ def _without_masked(channels: Any, channel_valid: Values | None, shape: tuple[in
     return measured if valid is None else measured & valid
 
 
+def _fractions(times: Values, size: int) -> Any:
+    """Check `times`, and scale them so that the earliest is 0 and the latest 1; if all are equal, all are 1."""
+    values = _as_float("times", times)
+    if values.shape != (size,):
+        raise ValueError(f"times: expected shape ({size},) to go with points, got {values.shape}")
+    if is_concrete(values) and not np.isfinite(values).all():
+        raise ValueError("times: expected finite numbers, got NaN or infinity")
+    xp = np if isinstance(values, np.ndarray) else jnp
+    first, last = xp.min(values, initial=np.inf), xp.max(values, initial=-np.inf)
+    return xp.where(last > first, (values - first) / xp.where(last > first, last - first, 1), 1)
+
+
 def _blank(channels: Any, channel_valid: Any) -> Any:
     """Set missing channel values, often NaN, to 0, so that they never enter arithmetic."""
     xp = np if isinstance(channels, np.ndarray) and isinstance(channel_valid, np.ndarray) else jnp
@@ -145,6 +157,8 @@ class PointCloud(eqx.Module):
         origin: (3,) float64, metres, subtracted from the points so that float32 stays precise at large (UTM)
             coordinates; 0 otherwise.
         channel_names: C names, such as ("intensity",) or ("red", "green", "blue"); used as column names in files.
+        times: (N,) when each point was measured, from 0 at the start of the scan to 1 at its end, for `deskew`; None if
+            unknown.
     """
 
     points: Float[Array, "*batch N 3"] | Float[np.ndarray, "*batch N 3"]
@@ -156,6 +170,7 @@ class PointCloud(eqx.Module):
     origin: Float[Array, "*batch 3"] | Float[np.ndarray, "*batch 3"]
     voxels: Voxels
     channel_names: tuple[str, ...] = eqx.field(static=True)
+    times: Float[Array, "*batch N"] | Float[np.ndarray, "*batch N"] | None
     # Methods are Python's own. equinox would bind them as pytrees, which takes 40 µs for each call.
     __getattribute__ = object.__getattribute__
 
@@ -167,6 +182,7 @@ class PointCloud(eqx.Module):
         channel_valid: Values | None = None,
         covariances: Values | None = None,
         channel_names: Sequence[str] | None = None,
+        times: Values | None = None,
     ):
         """Create a raw cloud.
 
@@ -181,6 +197,8 @@ class PointCloud(eqx.Module):
             covariances: (N, 3, 3), dimensionless as in GICP (1 in the tangent plane, ε along the normal), or m² as for
                 NDT.
             channel_names: one name per channel; "channel_0", "channel_1", ... by default.
+            times: (N,), when each point of a scan was measured, in any unit, such as seconds: the earliest is the start
+                of the scan, the latest its end.
 
         Raises:
             ValueError: if a shape or dtype does not fit; the message names the argument.
@@ -213,6 +231,7 @@ class PointCloud(eqx.Module):
         if len(channel_names) != count:
             raise ValueError(f"channel_names: expected {count} names, got {len(channel_names)}")
         self.channel_names = tuple(channel_names)
+        self.times = None if times is None else _fractions(times, size)
         self.valid = np.ones(size, bool)
         self.deferred_neighbors = None
         self.origin = np.zeros(3)
@@ -276,6 +295,7 @@ class PointCloud(eqx.Module):
             "valid": np.shape(self.valid),
             "covariances": (*np.shape(self.points), 3),
             "origin": np.shape(self.origin),
+            "times": np.shape(self.valid),
         }
         given: Any = arrays.get("channels")
         for name in arrays.keys() & {"points", "channels", "covariances"}:
@@ -290,7 +310,7 @@ class PointCloud(eqx.Module):
             arrays["channel_valid"] = _without_masked(given, valid, np.shape(given))
         for name, value in arrays.items():
             expected = shapes.get(name, np.shape(value))
-            if np.shape(value) != expected and not (name == "covariances" and value is None):
+            if np.shape(value) != expected and not (name in ("covariances", "times") and value is None):
                 raise ValueError(f"{name}: expected shape {expected}, got {np.shape(value)}")
         if "channels" in arrays:
             channels = arrays["channels"]
@@ -364,7 +384,7 @@ class PointCloud(eqx.Module):
             channel_valid=kept(self.channel_valid),
             covariances=kept(self.covariances),
             channel_names=self.channel_names,
-        )
+        ).replace_rows(times=kept(self.times))
 
     def pad(self, size: int | None = None) -> PointCloud:
         """Append padding rows until the cloud has `size` rows.
@@ -403,6 +423,7 @@ class PointCloud(eqx.Module):
             valid=grow(self.valid, False),
             deferred_neighbors=grow(self.neighbors, -1),
             covariances=grow(self.covariances),
+            times=grow(self.times),
         )
 
     def replace_rows(self, **arrays: Any) -> PointCloud:
@@ -460,6 +481,8 @@ class PointCloud(eqx.Module):
                 cloud if cloud.channel_valid is not None else cloud.replace(channel_valid=mask)
                 for cloud, mask in zip(clouds, everywhere, strict=True)
             ]
+        if any(cloud.times is None for cloud in clouds):
+            clouds = [cloud.replace_rows(times=None) for cloud in clouds]
         padded = [cloud.pad(size) for cloud in clouds]
         xp = np if is_concrete(padded) else jnp
         return jax.tree.map(lambda *rows: xp.stack([xp.asarray(row) for row in rows]), *padded)

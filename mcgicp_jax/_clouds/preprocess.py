@@ -150,6 +150,8 @@ def with_neighbors(
         "valid": np.ones(len(points), bool),
         "deferred_neighbors": neighbors,
         "covariances": None if covariances is None else np.asarray(covariances, dtype),
+        # Averages of points have no time: `deskew` comes first.
+        "times": None,
         "origin": origin,
     }
     for array in arrays.values():

@@ -82,24 +82,28 @@ class SyntheticFrames(AbstractFrames):
     Frame i does not depend on the number of frames.
 
     Attributes:
-        path: function from the index i to the pose of frame i, (4, 4), sensor to world, metres.
-        observer: function from a random generator, for rays and noise, and a pose to the observed cloud.
+        path: function from the index i, or a time between two, to the pose of frame i, (4, 4), sensor to world, metres.
+        observer: function from a random generator, for rays and noise, and a pose to the observed cloud; or poses
+            (num_poses, 4, 4).
         period: seconds between frames.
         seed: seed of the rays and the noise of all frames.
+        num_poses: number of poses of a scan, from that of the frame before to that of its own, evenly in time; 1 if all
+            points are measured at once.
     """
 
     def __init__(
         self,
         num_frames: int,
-        path: Callable[[int], Matrix],
-        observer: Callable[[np.random.Generator, Matrix], PointCloud],
+        path: Callable[[float], Matrix],
+        observer: Callable[[np.random.Generator, Any], PointCloud],
         period: float,
         seed: int,
+        num_poses: int = 1,
     ):
         if num_frames < 1:
             raise ValueError(f"num_frames: expected at least 1, got {num_frames}")
         super().__init__(num_frames)
-        self.path, self.observer, self.period, self.seed = path, observer, period, seed
+        self.path, self.observer, self.period, self.seed, self.num_poses = path, observer, period, seed, num_poses
 
     def _frame(self, index: int) -> Frame:
         return self.observe(index)
@@ -121,7 +125,8 @@ class SyntheticFrames(AbstractFrames):
         key = (_FIRST_FRAME + row,) if noise_seed is None else (_FIRST_FRAME + row, noise_seed)
         rng = np.random.default_rng(np.random.SeedSequence(self.seed, spawn_key=key))
         pose = self.path(row)
-        return Frame(self.observer(rng, pose), pose, row * self.period)
+        during = [self.path(row - time) for time in np.linspace(1, 0, self.num_poses)]
+        return Frame(self.observer(rng, np.stack(during) if len(during) > 1 else pose), pose, row * self.period)
 
 
 # Independent random streams of one seed: the scene, the path of the sensor, and one per frame.

@@ -33,6 +33,9 @@ _MAX_RANGE, _SENSOR_HEIGHT, _PERIOD = 80.0, 1.9, 0.1
 # Path of the car: middle of its lane and amplitude of the sideways motion, metres; amplitudes of heading and of tilt,
 # radians.
 _LANE, _SWAY, _YAW, _TILT = -1.6, 0.25, np.deg2rad(1.5), np.deg2rad(0.8)
+# Poses during one turn: the beams within 4° are measured at once. Frames per radian of the smooth path: velocities
+# change by a tenth from frame to frame, as those of a car on a road do.
+_POSES_OF_A_TURN, _SMOOTH = 90, 10
 # Standard deviations: range, metres; intensity, absolute and relative; colours.
 _RANGE_NOISE, _INTENSITY_NOISE, _INTENSITY_SPECKLE, _COLOR_NOISE = 0.02, 0.01, 0.05, 0.02
 # Metres: range at which the intensity has fallen to half.
@@ -78,7 +81,13 @@ class _Thing:
 
 
 def street(
-    num_frames: int = 50, *, points_per_frame: int = 30_000, step: float = 1.0, noise: float = 1.0, seed: int = 0
+    num_frames: int = 50,
+    *,
+    points_per_frame: int = 30_000,
+    step: float = 1.0,
+    noise: float = 1.0,
+    seed: int = 0,
+    spin: bool = False,
 ) -> SyntheticFrames:
     """A car drives along a street of houses with a spinning 64-beam LiDAR and a panoramic camera on its roof.
 
@@ -94,6 +103,8 @@ def street(
         noise: factor on the standard deviations: 0.02 m of the range; of the intensity, 0.01 and 5 % of its value; 0.02
             of each colour. 0 for none.
         seed: determines the street, path, rays and noise. `observe` draws the latter two anew.
+        spin: the car moves while the LiDAR turns: the points of a frame are measured one after the other, as their
+            `times` say, from the pose of the frame before to that of the frame; see `deskew`. The path is smoother.
 
     Returns:
         Frames whose clouds have the channels intensity, red, green and blue, from 0 to 1. The intensity decreases with
@@ -106,14 +117,19 @@ def street(
     scene_rng, path_rng = scene_and_path_rng(seed)
     things = _things(scene_rng, -2 * _MAX_RANGE, num_frames * step + 2 * _MAX_RANGE)
     observer = partial(_observe, things, int(scene_rng.integers(2**31)), points_per_frame, noise)
-    path = partial(_pose, step, *path_rng.uniform(0, 2 * np.pi, 3))
-    return SyntheticFrames(num_frames, path, observer, _PERIOD, seed)
+    path = partial(_smooth_pose if spin else _pose, step, *path_rng.uniform(0, 2 * np.pi, 3))
+    return SyntheticFrames(num_frames, path, observer, _PERIOD, seed, _POSES_OF_A_TURN if spin else 1)
 
 
 # The sensor
 
 
-def _pose(step: float, sway: float, yaw: float, tilt: float, index: int) -> Matrix:
+def _smooth_pose(step: float, sway: float, yaw: float, tilt: float, time: float) -> Matrix:
+    rotation = sensor_rotation(_YAW * np.sin(yaw + time / _SMOOTH), _TILT, tilt + time / _SMOOTH)
+    return pose_of(rotation, (time * step, _LANE + _SWAY * np.sin(sway + time / _SMOOTH), _SENSOR_HEIGHT))
+
+
+def _pose(step: float, sway: float, yaw: float, tilt: float, index: float) -> Matrix:
     rotation = sensor_rotation(_YAW * np.sin(yaw + index / 4), _TILT, tilt + 0.7 * index)
     aside = _LANE + _SWAY * np.sin(sway + index * step / (6 * _SWAY))
     return pose_of(rotation, (index * step, aside, _SENSOR_HEIGHT))
@@ -122,9 +138,14 @@ def _pose(step: float, sway: float, yaw: float, tilt: float, index: int) -> Matr
 def _observe(
     things: list[_Thing], pattern: int, size: int, noise: float, rng: np.random.Generator, pose: Matrix
 ) -> PointCloud:
-    rotation, center = pose[:3, :3], pose[:3, 3]
-    rays = spinning_rays(rng, size, _BEAMS, _LOWEST, _HIGHEST) @ rotation.T
-    hits = cast(center, rays, [thing.solid for thing in things], _MAX_RANGE)
+    poses, solids = pose.reshape(-1, 4, 4), [thing.solid for thing in things]
+    rays = np.array_split(spinning_rays(rng, size, _BEAMS, _LOWEST, _HIGHEST), len(poses))
+    parts = [
+        cast(each[:3, 3], part @ each[:3, :3].T, solids, _MAX_RANGE) for each, part in zip(poses, rays, strict=True)
+    ]
+    hits = Hits(*(np.concatenate([getattr(part, name) for part in parts]) for name in vars(parts[0])))
+    directions = np.concatenate([part.rays @ each[:3, :3] for each, part in zip(poses, parts, strict=True)])
+    numbers = np.repeat(np.arange(len(poses)), [len(part.distance) for part in parts])
     hits, glass = _into_windows(hits, things)
     colors, reflectance = _paint(hits, glass, things, pattern)
     incidence = np.abs(np.sum(hits.rays * hits.normals, axis=1))
@@ -136,7 +157,8 @@ def _observe(
     )
     channels = np.clip(channels + noise * sigma * rng.normal(size=channels.shape), 0, 1)
     distance = hits.distance + noise * _RANGE_NOISE * rng.normal(size=hits.distance.shape)
-    return PointCloud(distance[:, None] * (hits.rays @ rotation), channels, channel_names=("intensity", *COLORS))
+    names, times = ("intensity", *COLORS), None if len(poses) == 1 else numbers
+    return PointCloud(distance[:, None] * directions, channels, channel_names=names, times=times)
 
 
 # The street

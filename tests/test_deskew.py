@@ -1,0 +1,107 @@
+"""Deskewing: points of a moving sensor against the exact pose of each, and odometry of a spinning LiDAR."""
+
+import jax
+import jax.numpy as jnp
+import jaxlie
+import numpy as np
+import pytest
+
+import mcgicp_jax as mcg
+from mcgicp_jax import datasets, metrics
+from tests.precision import in_both_precisions, in_float64, tolerance
+from tests.refusals import refused
+
+TWIST = np.array([0.8, -0.1, 0.05, 0.02, -0.03, 0.15])
+
+
+def scan(count=300):
+    """Points of a room at rest, in the frame of the sensor at the end, and as it measured them on the way."""
+    rng = np.random.default_rng(0)
+    still, times = rng.uniform(-3, 3, (count, 3)), rng.permutation(np.linspace(0, 1, count))
+    poses = [np.asarray(jaxlie.SE3.exp((time - 1) * TWIST).as_matrix(), np.float64) for time in times]
+    seen = np.stack([pose[:3, :3].T @ (point - pose[:3, 3]) for point, pose in zip(still, poses, strict=True)])
+    return still, mcg.PointCloud(seen, np.arange(count), times=1.7e9 + 0.1 * times)
+
+
+def motion():
+    return np.asarray(jaxlie.SE3.exp(TWIST).as_matrix(), np.float64)
+
+
+@in_both_precisions
+def test_points_are_where_the_sensor_would_have_seen_them_at_the_end():
+    still, cloud = scan()
+    found = mcg.deskew(cloud, motion())
+    np.testing.assert_allclose(found.points, still, atol=tolerance(1e-5, 4e-6))  # the times have 0.2 µs
+    assert found.times is None and found.points.dtype == np.float64
+    np.testing.assert_array_equal(found.channels, cloud.channels)
+    np.testing.assert_allclose(mcg.deskew(cloud, np.eye(4)).points, cloud.points, atol=1e-12)
+    inside = jax.jit(mcg.deskew)(cloud.pad(384), motion())
+    np.testing.assert_allclose(inside.points[:300], still, atol=tolerance(1e-5, 4e-6))
+    refused(lambda: mcg.deskew(found, motion()), "cloud")
+    refused(lambda: mcg.deskew(cloud, 2 * motion()), "motion")
+
+
+@in_float64
+@pytest.mark.parametrize("transformation", [lambda gradient: gradient, jax.jit])
+def test_derivative_by_the_motion_points_and_times(transformation):
+    _, cloud = scan(40)
+    weights = np.random.default_rng(1).normal(size=(40, 3))
+
+    def total(twist, points, times):
+        moved = mcg.deskew(cloud.replace(points=points, times=times), jaxlie.SE3.exp(twist))
+        return jnp.sum(weights * moved.points)
+
+    arguments = [jnp.asarray(TWIST), jnp.asarray(cloud.points), jnp.asarray(cloud.times)]
+    gradients = transformation(jax.grad(total, argnums=(0, 1, 2)))(*arguments)
+    for place, gradient in enumerate(gradients):
+        direction = np.random.default_rng(2).normal(size=gradient.shape)
+        ends = [
+            total(*(each + sign * 1e-6 * direction if i == place else each for i, each in enumerate(arguments)))
+            for sign in (1, -1)
+        ]
+        np.testing.assert_allclose(np.sum(gradient * direction), (ends[0] - ends[1]) / 2e-6, rtol=1e-6)
+    at_rest = jax.grad(lambda twist: total(twist, *arguments[1:]))(jnp.zeros(6))
+    assert np.isfinite(at_rest).all()
+
+
+def test_times_are_fractions_of_the_scan_and_follow_their_points():
+    points = np.random.default_rng(0).random((5, 3))
+    cloud = mcg.PointCloud(points, times=np.array([30, 10, 20, 10, 50], np.uint32))
+    np.testing.assert_allclose(cloud.times, [0.5, 0, 0.25, 0, 1])
+    np.testing.assert_array_equal(mcg.PointCloud(points, times=np.full(5, 7.0)).times, 1)
+    padded = cloud.pad(8)
+    assert padded.times.shape == (8,)
+    part = padded.replace(valid=np.arange(8) < 3).unpad()
+    np.testing.assert_allclose(part.times, [0.5, 0, 0.25])  # not scaled again
+    assert mcg.PointCloud.stack([cloud, mcg.PointCloud(points)]).times is None
+    assert mcg.PointCloud.stack([cloud, cloud]).times.shape == (2, 128)
+    assert mcg.preprocess(cloud, None).times is None
+    refused(lambda: mcg.PointCloud(points, times=np.arange(4)), "times")
+    refused(lambda: mcg.PointCloud(points, times=[0, 1, 2, 3, np.nan]), "times")
+    refused(lambda: cloud.replace(times=np.arange(4.0)), "times")
+
+
+def errors(frames, **options):
+    """Translation errors from frame to frame, metres, without the first."""
+    poses = [step.pose for step in mcg.odometry(frames, mcg.GICP(), max_distance=(2.5, 0.6), **options)]
+    return metrics.rpe(poses, [frame.pose for frame in frames])[0]
+
+
+@pytest.mark.parametrize(
+    "options", [{}, pytest.param({"against": "map"}, marks=pytest.mark.slow)], ids=["previous", "map"]
+)
+def test_odometry_of_a_spinning_lidar(options):
+    """At 20 m/s, without deskewing stretched scans of a street are off by centimetres; the first pair counts, too."""
+    frames = list(datasets.street(3, points_per_frame=8000, step=2.0, spin=True, noise=0.5))
+    smeared, found = errors(frames, **options), errors(frames, deskew=True, **options)
+    assert found.mean() < 0.5 * smeared.mean() and found.max() < 0.02
+
+
+def test_odometry_needs_times_to_deskew_and_else_ignores_them():
+    frames = list(datasets.street(2, points_per_frame=4000, spin=True))
+    timed, untimed = (
+        [step.pose for step in mcg.odometry(clouds, mcg.GICP())]
+        for clouds in ([frame.cloud for frame in frames], [frame.cloud.replace(times=None) for frame in frames])
+    )
+    np.testing.assert_array_equal(timed, untimed)
+    refused(lambda: list(mcg.odometry([frames[0].cloud.replace(times=None)], mcg.GICP(), deskew=True)), "frames[0]")
