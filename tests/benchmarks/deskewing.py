@@ -2,9 +2,9 @@
 
     python -m tests.benchmarks.deskewing [--seeds 3] [--frames 15]
 
-Simulated streets at 1, 10 and 20 m/s, and at 5 m/s in a curve of 90° per second. "at rest": the same scans, measured all
-at once at their poses. Errors are mean translations from frame to frame, millimetres, without the first two pairs, in
-which KISS-ICP does not know its velocity yet.
+Simulated streets at 1, 10 and 20 m/s, and at 5 m/s in a curve of 90° per second. "at rest": the same scans, measured
+all at once at their poses. Errors are mean translations from frame to frame, millimetres, without the first two pairs,
+in which KISS-ICP does not know its velocity yet.
 """
 
 from __future__ import annotations
