@@ -422,3 +422,16 @@ def test_points_of_a_depth_image():
     refused(lambda: PointCloud.from_depth(depth, np.eye(4)), "intrinsics")
     refused(lambda: PointCloud.from_depth(depth, camera, color[:, :3]), "color")
     refused(lambda: PointCloud.from_depth(depth, camera, scale=0), "scale")
+
+
+def test_crop_keeps_points_of_a_range():
+    cloud = raw(covariances=covariances(), channel_valid=partial())
+    ranges = np.linalg.norm(POINTS, axis=1)
+    low, high = np.quantile(ranges, [0.2, 0.7])
+    for found in (cloud.crop(low, high), cloud.pad(160).crop(low, high)):
+        kept = (ranges >= low) & (ranges <= high)
+        np.testing.assert_array_equal(found.points, POINTS[kept])
+        np.testing.assert_array_equal(found.channel_valid, partial()[kept])
+        np.testing.assert_array_equal(found.covariances, covariances()[kept])
+    assert_same(cloud.crop(), cloud)
+    refused(lambda: cloud.crop(2, 1), "min_range")

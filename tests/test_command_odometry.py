@@ -70,6 +70,8 @@ def test_wrong_input_gets_one_line(tmp_path, capsys):
         (["tum", str(tmp_path)], "depth.txt: "),
         (["7-scenes", str(alone)], "2 frames, got 1"),
         (["box-room", "--num-frames", "1"], "num_frames: "),
+        (["box-room", "--every", "0"], "every: "),
+        (["box-room", "--min-range", "9", "--max-range", "3"], "min_range: "),
         (["box-room", "--pose-frame", "camera"], "pose_frame: "),
         ([str(alone)], f"mcgicp odometry 7-scenes {alone}"),
     ):
@@ -101,6 +103,20 @@ def test_a_plain_folder_is_followed(tmp_path, capsys):
     outside, unknown = capsys.readouterr().err.splitlines()
     assert "map.ply: expected a map outside of" in outside
     assert "nothing: expected a folder of clouds or one of kitti, " in unknown
+
+
+def test_frames_are_cropped_and_left_out(tmp_path, capsys):
+    poses, map = tmp_path / "poses.txt", tmp_path / "map.ply"
+    ranges = ["--min-range", "1", "--max-range", "6", "--every", "2"]
+    files = ["--output", str(poses), "--map", str(map)]
+    assert main(["odometry", "box-room", "--num-frames", "2", "--method", "gicp", *ranges, *files]) == 0
+    frames, written = datasets.box_room(3), io.read_poses(poses)
+    assert len(written) == 2
+    np.testing.assert_allclose(written[1][:3, 3], frames.path(2)[:3, 3], atol=0.03)
+    distance = np.linalg.norm(io.read(map).points[:, None] - written[:, :3, 3], axis=2).min(axis=1)
+    # From either pose, and averaged in voxels.
+    assert distance.min() > 0.8 and distance.max() < 6.1
+    capsys.readouterr()
 
 
 @pytest.mark.slow

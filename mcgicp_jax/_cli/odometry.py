@@ -22,6 +22,7 @@ from mcgicp_jax._cli.choices import Choices, with_channels
 from mcgicp_jax._cli.options import File, Method, Options, check_outputs, clouds_in, enumerated, shown, with_names
 from mcgicp_jax._clouds.voxel_map import VoxelMap
 from mcgicp_jax._clouds.voxel_size import map_voxel_size
+from mcgicp_jax._compute.messages import check_integer
 from mcgicp_jax._sequences.odometry import OdometryStep
 from mcgicp_jax.datasets import DATASETS, AbstractFrames
 
@@ -56,6 +57,9 @@ def odometry(
     shared: Options,
     method: Method = None,
     num_frames: int | Literal["all"] = "all",
+    every: int = 1,
+    min_range: float = 0.0,
+    max_range: float = float("inf"),
     against: Literal["previous", "map"] = "previous",
     map_radius: Annotated[float | None, shown("FLOAT")] = None,
     loops: bool = False,
@@ -80,6 +84,9 @@ def odometry(
         path: Folder of the sequence, such as sequences/04.
         method: {channel_methods} use channels, the others geometry alone.
         num_frames: Number of frames to use, from the start; all means 20 for a simulated scene.
+        every: Use every n-th frame.
+        min_range: Metres; points nearer to the sensor are left out, such as those on its own vehicle.
+        max_range: Metres; points further from the sensor are left out.
         against: Register each frame to the one before it, or to a map of all frames before it, which drifts less.
         map_radius: Metres; points further from the sensor leave the map. By default the range of the first frame.
         loops: Register frames with earlier ones that saw the same place, and correct all poses.
@@ -95,7 +102,10 @@ def odometry(
     """
     check_outputs(output, cloud=map, picture=plot, inputs=[path] if path else [])
     shared.check(method)
-    frames = _open(dataset, path, num_frames, map)
+    check_integer("every", every, 1)
+    frames = _open(dataset, path, num_frames, every, map)
+    if (min_range, max_range) != (0, np.inf):
+        frames = frames.crop(min_range, max_range)
     if pose_frame == "camera" and frames.to_camera is None:
         raise ValueError(f"pose_frame: expected sensor, since {dataset} has no calibration of a camera, got camera")
     options: dict[str, Any] = {
@@ -145,12 +155,12 @@ def odometry(
 
 
 def _open(
-    dataset: DatasetName | Path, path: Path | None, num_frames: int | Literal["all"], map: Path | None
+    dataset: DatasetName | Path, path: Path | None, num_frames: int | Literal["all"], every: int, map: Path | None
 ) -> AbstractFrames:
     if num_frames != "all" and num_frames < 2:
         raise ValueError(f"num_frames: expected at least 2, got {num_frames}")
     if isinstance(dataset, str) and DATASETS[dataset].simulated:
-        return DATASETS[dataset].frames(_FRAMES_OF_A_SCENE if num_frames == "all" else num_frames)
+        return DATASETS[dataset].frames(every * (_FRAMES_OF_A_SCENE if num_frames == "all" else num_frames))[::every]
     if isinstance(dataset, str):
         if path is None:
             raise ValueError(f"{dataset}: expected the folder of a sequence after it, mcgicp odometry {dataset} PATH")
@@ -164,8 +174,9 @@ def _open(
             raise
     else:
         raise ValueError(f"{dataset}: expected a folder of clouds or one of {enumerated(list(DATASETS), 'or')}")
+    frames = frames[::every]
     if len(frames) < 2:
-        raise ValueError(f"{path}: expected at least 2 frames, got {len(frames)}")
+        raise ValueError(f"{path or dataset}: expected at least 2 frames, got {len(frames)}")
     return frames if num_frames == "all" else frames[:num_frames]
 
 

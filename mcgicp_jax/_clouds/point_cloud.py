@@ -386,6 +386,24 @@ class PointCloud(eqx.Module):
             channel_names=self.channel_names,
         ).replace_rows(times=kept(self.times))
 
+    def crop(self, min_range: float = 0.0, max_range: float = np.inf) -> PointCloud:
+        """Return the valid points of a cloud in its sensor's frame whose distance from the sensor lies in a range, as a
+        raw cloud. The nearest returns are often from the sensor's own vehicle or holder, which moves with it.
+
+        Args:
+            min_range, max_range: metres, inclusive.
+
+        Raises:
+            ValueError: if `min_range` is negative or larger than `max_range`, or the cloud is traced.
+        """
+        if not 0 <= min_range <= max_range:
+            raise ValueError(f"min_range: expected 0 to max_range = {max_range}, got {min_range}")
+        if not is_concrete(self):
+            raise ValueError("cloud: expected concrete arrays, got tracers; crop outside of jit and vmap")
+        ranges = np.linalg.norm(self.coordinates, axis=-1)
+        kept = np.asarray(self.valid) & (ranges >= min_range) & (ranges <= max_range)
+        return self.replace_rows(valid=kept).unpad()
+
     def pad(self, size: int | None = None) -> PointCloud:
         """Append padding rows until the cloud has `size` rows.
 

@@ -56,6 +56,10 @@ class AbstractFrames(Sequence[Frame]):
             return _Slice(self, range(len(self))[index])
         return self._frame(self._row(index))
 
+    def crop(self, min_range: float = 0.0, max_range: float = np.inf) -> AbstractFrames:
+        """The frames, lazily, with the points whose distance from the sensor is in a range, metres; without images."""
+        return _Cropped(self, min_range, max_range)
+
     def _row(self, index: int) -> int:
         """The non-negative index that is equivalent to `index`."""
         row = operator.index(index)
@@ -74,6 +78,16 @@ class _Slice(AbstractFrames):
 
     def _frame(self, index: int) -> Frame:
         return self._whole[self._rows[index]]
+
+
+class _Cropped(AbstractFrames):
+    def __init__(self, whole: AbstractFrames, min_range: float, max_range: float):
+        super().__init__(len(whole))
+        self._whole, self._range, self.to_camera = whole, (min_range, max_range), whole.to_camera
+
+    def _frame(self, index: int) -> Frame:
+        frame = self._whole[index]
+        return Frame(frame.cloud.crop(*self._range), frame.pose, frame.time)
 
 
 class SyntheticFrames(AbstractFrames):
