@@ -14,6 +14,7 @@ from hypothesis import strategies as st
 
 import mcgicp_jax as mcg
 from mcgicp_jax import datasets, metrics
+from tests.corridor import corridor
 from tests.refusals import refused
 from tests.scenes import motion, room_corner
 
@@ -335,3 +336,31 @@ def test_a_map_of_the_room_is_sharp_at_the_true_poses(room):
     sharp = mcg.merge_clouds(clouds, truth, 0.05)
     blurred = mcg.merge_clouds(clouds, [pose @ motion((0, 0, 0, 0.1 * i, 0, 0)) for i, pose in enumerate(truth)], 0.05)
     assert len(sharp) < len(blurred) < sum(map(len, clouds))
+
+
+@pytest.mark.parametrize("against", ["previous", "map"])
+def test_priors_hold_what_a_corridor_does_not(against):
+    """Wheels measure the way along a bare corridor to 1 cm and know no rotation."""
+    frames = list(corridor(3, points_per_frame=2000, textured=False))
+    covariance = np.diag(np.r_[[1e-4] * 3, [1.0] * 3])
+    motions = [np.linalg.inv(a.pose) @ b.pose for a, b in itertools.pairwise(frames)]
+    wheels = [np.block([[np.eye(3), each[:3, 3:]], [np.zeros((1, 3)), np.ones((1, 1))]]) for each in motions]
+    priors = [None, *((each, covariance) for each in wheels)]
+    options = {"against": against, "max_distance": 0.5, "start": frames[0].pose}
+    steps = list(mcg.odometry([frame.cloud for frame in frames], mcg.GICP(), priors=priors, **options))
+    assert all(step.registration.status == mcg.Status.CONVERGED for step in steps[1:])
+    np.testing.assert_allclose([step.pose for step in steps], [frame.pose for frame in frames], atol=0.03)
+    # None is no prior.
+    (_, alone) = mcg.odometry([frame.cloud for frame in frames[:2]], mcg.GICP(), priors=[None, None], **options)
+    assert alone.registration.status == mcg.Status.DEGENERATE
+
+
+def test_priors_that_do_not_fit_are_refused(room):
+    frames, _ = room
+    few = mcg.odometry(frames[:2], mcg.GICP(), priors=[None])
+    next(few)
+    refused(lambda: next(few), "priors[1]")
+    wrong = mcg.odometry(frames[:2], mcg.GICP(), priors=[None, (2 * np.eye(4), np.eye(6))])
+    next(wrong)
+    refused(lambda: next(wrong), "priors[1]: pose")
+    refused(lambda: mcg.odometry(frames, mcg.GICP(), priors=[], hold_unconstrained=False), "hold_unconstrained")

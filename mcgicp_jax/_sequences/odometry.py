@@ -29,6 +29,7 @@ from mcgicp_jax._pose_graph.graph import PoseGraph
 from mcgicp_jax._registration.options import GivenOptions, Options, check_method, options_of
 from mcgicp_jax._registration.register_pair import register_pair, rows_to_match
 from mcgicp_jax._registration.result import RegistrationResult, computed, is_usable
+from mcgicp_jax._registration.tie_points_and_prior import GivenPrior
 from mcgicp_jax._sequences.loop_closure import Trajectory
 from mcgicp_jax._sequences.relocalization import Relocalizer, map_target
 
@@ -88,6 +89,7 @@ def odometry(
     recover: bool = False,
     loops: bool = False,
     deskew: bool = False,
+    priors: Iterable[GivenPrior | None] | None = None,
     **options: Unpack[GivenOptions],
 ) -> Iterator[OdometryStep]:
     """Register each frame to the previous one, or to a map, starting from the previous motion (constant velocity).
@@ -121,6 +123,9 @@ def odometry(
             and where the registration measures another one, with that. Frames are raw and have `PointCloud.times`, the
             scans follow each other without gaps, and poses are those at the ends of the scans. The first scan is
             deskewed by `init`, or if there is none, in hindsight by the motion to the second.
+        priors: one for each frame: a measurement of the motion from the frame before, as by wheels or an IMU, in the
+            form of the `prior` of `register`, or None. The registration starts from this pose and weighs it; variances
+            of 0 fix directions, such as height, roll and pitch of a robot on a floor. The first is not used.
         options: options of `register`, except for `tie_points` and `prior`.
 
     Returns:
@@ -147,7 +152,11 @@ def odometry(
             'loops: expected against="previous" and no recover: registrations to the previous frame become edges'
         )
     settings = options_of(odometry, options)
-    reader = _Reader(enumerate(frames), method, settings, voxel_size, num_neighbors, deskew)
+    if priors is not None and not settings.hold_unconstrained:
+        raise ValueError("hold_unconstrained: expected True with priors, got False")
+    reader = _Reader(
+        enumerate(frames), method, settings, voxel_size, num_neighbors, deskew, None if priors is None else iter(priors)
+    )
     return _Sensor(
         frames=ReadAhead(reader),
         reader=reader,
@@ -174,17 +183,23 @@ class _Reader:
     voxel_size: VoxelSize | Voxels
     num_neighbors: int
     deskew: bool
+    priors: Iterator[GivenPrior | None] | None
 
-    def __call__(self) -> tuple[str, PointCloud]:
-        """The name and the cloud of the next frame, raw if it is to be deskewed."""
+    def __call__(self) -> tuple[str, PointCloud, GivenPrior | None]:
+        """Name, cloud and prior of the next frame; the cloud is raw if it is to be deskewed."""
         number, frame = next(self.frames)
         name = f"frames[{number}]"
+        prior = None if self.priors is None else next(self.priors, ())
+        if prior is not None and len(prior) != 2:
+            raise ValueError(f"priors[{number}]: expected (pose, covariance) or None for each frame, got {prior!r}")
+        if prior is not None:
+            prior = pose_matrix(prior[0], f"priors[{number}]: pose"), prior[1]
         cloud = as_cloud(name, frame.cloud if isinstance(frame, Frame) else frame)
         if not self.deskew:
-            return name, self.prepared(name, cloud)
+            return name, self.prepared(name, cloud), prior
         if cloud.times is None:
             raise ValueError(f"{name}: expected times of the points to deskew, PointCloud(points, times=...), got none")
-        return name, cloud
+        return name, cloud, prior
 
     def prepared(self, name: str, cloud: PointCloud) -> PointCloud:
         """The cloud preprocessed, with the local geometry that a source needs."""
@@ -214,7 +229,7 @@ class _Sensor(Iterator[OdometryStep]):
         unread: registrations of the last two steps.
     """
 
-    frames: Iterator[tuple[str, PointCloud]]
+    frames: Iterator[tuple[str, PointCloud, GivenPrior | None]]
     reader: _Reader
     method: AbstractMethod
     options: Options
@@ -239,13 +254,13 @@ class _Sensor(Iterator[OdometryStep]):
 
     def __next__(self) -> OdometryStep:
         """Locate the sensor at the next frame, and add the frame to the maps."""
-        name, cloud = next(self.frames)
+        name, cloud, prior = next(self.frames)
         if self.cloud is None:
             result, self.first = None, (name, cloud) if self.in_hindsight else None
             cloud = self._deskewed(name, cloud, self.motion)
             self._begin(cloud)
         else:
-            cloud, result = self._located(name, cloud, self.cloud)
+            cloud, result = self._located(name, cloud, self.cloud, prior)
         if result is not None and self.places is None:
             if not is_usable(result):
                 warn(
@@ -300,10 +315,12 @@ class _Sensor(Iterator[OdometryStep]):
             self.trajectory.add(before, self.pose, None)
         return before
 
-    def _located(self, name: str, frame: PointCloud, before: PointCloud) -> tuple[PointCloud, RegistrationResult]:
+    def _located(
+        self, name: str, frame: PointCloud, before: PointCloud, prior: GivenPrior | None
+    ) -> tuple[PointCloud, RegistrationResult]:
         """Update motion and pose by a registration; the frame as it was registered, and the result."""
         follows = not self.against_map or self.is_lost
-        was_lost, motion = self.is_lost, self.motion
+        was_lost, motion = self.is_lost, self.motion if prior is None else prior[0]
         for _ in range(_ROUNDS if self.reader.deskew else 1):
             cloud = self._deskewed(name, frame, motion)
             if self.first is not None:
@@ -312,7 +329,9 @@ class _Sensor(Iterator[OdometryStep]):
             if not follows:
                 target = map_target(self.world.cloud(), self.method, self.options, self.num_neighbors)
                 start = self.pose @ motion
-            result = register_pair(cloud, target, self.method, start, self.options)
+            # Its covariance is that of a motion in the frame of the source, which the target's frame does not change.
+            given = None if prior is None else (prior[0] if follows else self.pose @ prior[0], prior[1])
+            result = register_pair(cloud, target, self.method, start, self.options, prior=given)
             if not is_usable(result):
                 break
             predicted, motion = motion, np.asarray(result.matrix)
