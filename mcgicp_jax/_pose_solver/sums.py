@@ -171,8 +171,9 @@ def observability(posed: PosedMatches) -> list[Float[Array, "6 n"]]:
     slopes = [None if surface.noise is None else surface.noise.slopes for surface in (source, target)]
     if target.noise is not None and slopes[0] is not None and slopes[1] is not None:
         turned = jnp.einsum("ij,ncj->cin", rotation, slopes[0], precision="highest")
-        # The sensor is at the origin of the target's frame.
-        tangent = jnp.cross(target.noise.normal, target.points).T
+        # The source's sensor is at the origin of its frame; the target may be a map.
+        sight = jnp.dot(rotation, source.points.T, precision="highest")
+        tangent = jnp.cross(target.noise.normal.T, sight, axis=0)
         length = jnp.sqrt(alg.inner(tangent, tangent))
         found += agreement(turned, slopes[1].transpose(1, 2, 0), tangent / jnp.where(length > 0, length, 1))
     return found

@@ -282,7 +282,7 @@ def _change(
     degenerate: AnyScalar = np.bool_(False)
     if sums.observability is not None:
         constraints = None if fixed is None else constraints_at(pose, sums.center, sums.radius, fixed)
-        directions = find_directions(sums, constraints)
+        directions = find_directions(sums, constraints, settings.channels_constrain)
         degenerate = ~jnp.all(directions.constrained)
         # Along unconstrained directions an update would follow arbitrary nearest-neighbour matches.
         moving = (directions.constrained | ~settings.hold_unconstrained) & ~directions.fixed

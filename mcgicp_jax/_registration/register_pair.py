@@ -26,6 +26,7 @@ from mcgicp_jax._local_geometry.cloud_statistics import (
     with_channels_matched,
 )
 from mcgicp_jax._local_geometry.neighborhoods import check_neighbors
+from mcgicp_jax._local_geometry.sensor_patterns import channels_constrain, without_patterns
 from mcgicp_jax._math.poses import Pose, se3_from_matrix
 from mcgicp_jax._math.statistics import spread_rows
 from mcgicp_jax._methods.base import AbstractMethod
@@ -140,6 +141,8 @@ def prepared(
     source, target = preprocessed(sides, method, options)
     if not options.soft_matches:
         warn_of_hard_matches(method, source, target)
+    if method.uses_channels:
+        source, target = without_patterns(source, target)
     if options.voxel_sizes and not (source.covariances is None and target.covariances is None):
         raise ValueError("voxel_sizes: expected none for clouds with covariances, which cannot be averaged in voxels")
     if options.voxel_sizes and method.needs_covariances and not is_concrete(source, target):
@@ -253,12 +256,15 @@ def problem_of(
     dtype, valid = source.points.dtype, pair.source.search.valid
     xp = numpy_for(valid)
     stride = xp.maximum(xp.sum(xp.asarray(valid)) // _COARSE_ROWS, 1) if matches is None else 1
+    uses_channels = method.uses_channels and matches is None
     problem = Problem(
         se3_from_matrix(centred_pose(init, source, target), dtype),
         pair.source,
         pair.target,
         pair.terms,
-        settings_for(options, pair.method, target, stride, dtype),
+        settings_for(
+            options, pair.method, target, stride, not uses_channels or channels_constrain(source, target), dtype
+        ),
         matches=matches,
         num_candidates=pair.method.num_candidates,
         temperature=constant(spacing_of(pair.method, target)) if options.soft_matches else None,

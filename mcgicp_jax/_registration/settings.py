@@ -42,6 +42,7 @@ class Settings(NamedTuple):
         coarse_translation_tolerance, coarse_rotation_tolerance: an update below both ends the coarse phase.
         max_iterations: maximum number of updates, both phases together.
         hold_unconstrained: whether the pose is kept fixed along unconstrained directions.
+        channels_constrain: whether channels may constrain directions that geometry does not.
     """
 
     max_distance: Float[AnyArray, "*batch"]
@@ -53,6 +54,7 @@ class Settings(NamedTuple):
     coarse_rotation_tolerance: Float[AnyArray, "*batch"]
     max_iterations: Int[AnyArray, "*batch"]
     hold_unconstrained: Bool[AnyArray, "*batch"]
+    channels_constrain: Bool[AnyArray, "*batch"]
 
     def distance(self, status: Int[AnyScalar, ""]) -> Float[AnyScalar, ""]:
         """Maximum correspondence distance at this status, metres."""
@@ -84,7 +86,9 @@ def default_distances(spacing: Any, target: PointCloud) -> tuple[Any, Any]:
     return _COARSE_SPACINGS * numpy_for(spacing, between).maximum(spacing, between), _FINE_SPACINGS * spacing
 
 
-def settings_for(options: Options, method: AbstractMethod, target: PointCloud, stride: Any, dtype: Any) -> Settings:
+def settings_for(
+    options: Options, method: AbstractMethod, target: PointCloud, stride: Any, channels_constrain: Any, dtype: Any
+) -> Settings:
     """The settings of a registration to this target; `stride` is that of the coarse phase."""
     max_distance: Any = options.max_distance
     tolerance: Any = options.translation_tolerance
@@ -112,4 +116,5 @@ def settings_for(options: Options, method: AbstractMethod, target: PointCloud, s
         coarse_rotation_tolerance=coarse_tolerance(options.rotation_tolerance, ROTATION_TOLERANCE),
         max_iterations=number(options.max_iterations, np.int32),
         hold_unconstrained=number(options.hold_unconstrained, bool),
+        channels_constrain=number(channels_constrain, bool),
     )
