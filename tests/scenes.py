@@ -60,11 +60,11 @@ def covariances(method, cloud):
     return surface_pair(method, cloud, cloud, observed=False).whole().source.covariance.T
 
 
-def matched_at(source, target, method, pose, matches, robust=None):
+def matched_at(source, target, method, pose, matches, robust=None, temperature=None):
     """The matched surfaces of a method, both surfaces with the terms, and the motion of a pose."""
     both = surface_pair(method, source, target, observed=False, robust=robust).whole()
     pose = jnp.asarray(pose, source.points.dtype)
-    matched = jax.jit(match_surfaces)(both.source, both.target, Matches.given(matches))
+    matched = jax.jit(match_surfaces)(both.source, both.target, Matches.given(matches, temperature))
     return matched, both, Motion(pose[:3, :3], pose[:3, 3])
 
 

@@ -1,4 +1,4 @@
-"""`register(..., soft_matches=True)`: the pose of the hard matches, with the derivative of soft ones at this pose."""
+"""Soft matches, the default where channels are used: the pose of hard ones has the derivative of soft ones at it."""
 
 import warnings
 from functools import partial
@@ -25,7 +25,7 @@ def clouds(noisy):
 
 
 def registered(clouds, method=METHOD, **options):
-    settings = {"init": motion(), "max_distance": GATE, "soft_matches": True} | TO_ROUNDING
+    settings = {"init": motion(), "max_distance": GATE} | TO_ROUNDING
     return mcg.register(*clouds, method, **settings | options)
 
 
@@ -85,7 +85,7 @@ def test_inside_jit_and_vmap_the_derivative_is_the_same(name, clouds):
 def test_a_batch_has_the_gradients_of_its_pairs():
     """Of different sizes, and with fewer points of the source than it has."""
     sources, targets, _ = zip(*(pair(size=size) for size in (300, 400)), strict=True)
-    options = {"max_distance": GATE, "soft_matches": True, "max_source_points": 250}
+    options = {"max_distance": GATE, "max_source_points": 250}
 
     def loss(channels):
         moved = [source.replace(channels=each) for source, each in zip(sources, channels, strict=True)]
@@ -128,7 +128,7 @@ def test_hard_matches_are_warned_of_where_channels_are_differentiated(clouds):
         jax.vjp(loss, channels)
         jax.vjp(partial(loss, soft_matches=False), points)
     for method in (METHOD, mcg.ColorICP(0.3)):
-        with pytest.warns(UserWarning, match=r"^channels: .* soft_matches=True") as caught:
+        with pytest.warns(UserWarning, match=r"^channels: .* soft_matches=False") as caught:
             jax.vjp(partial(loss, method=method, soft_matches=False), channels)
         assert len(caught) == 1
     with pytest.warns(UserWarning, match=r"^channel_weights: estimated"):

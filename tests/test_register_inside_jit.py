@@ -50,7 +50,7 @@ def gradient_of_register(inputs, source, target, start):
 
 
 def registered(inputs, source, target, start, search=None):
-    options = {"init": start, "max_distance": GATE, "search": search, **TO_ROUNDING}
+    options = {"init": start, "max_distance": GATE, "search": search, "soft_matches": False, **TO_ROUNDING}
     clouds = clouds_with(inputs, source, target)
     return mcg.register(*clouds, inputs["method"], robust=inputs["robust"], **options)
 

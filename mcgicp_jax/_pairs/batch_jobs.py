@@ -166,7 +166,7 @@ class BatchJob:
     def prepare(self, pair: Pair) -> PreparedPair | PairResult:
         """The pair with its initial pose, or its result if it has none."""
         source, target = self._clouds(pair)
-        warn_of_estimated_parameters(self.method, source, target, self.options.soft_matches)
+        warn_of_estimated_parameters(self.method, source, target, self.options.soft_matches is not False)
         init, verified = pair.init, True
         if isinstance(init, str):
             start = start_from_anywhere(init, primal(source), primal(target))

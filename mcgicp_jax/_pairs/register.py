@@ -44,7 +44,7 @@ def register(
     equalize_channels: bool = False,
     voxel_sizes: Sequence[float] = (),
     max_source_points: int | None = Options.max_source_points,
-    soft_matches: bool = Options.soft_matches,
+    soft_matches: bool | None = Options.soft_matches,
     tie_points: GivenTiePoints | None = None,
     prior: GivenPrior | None = None,
 ) -> RegistrationResult:
@@ -56,10 +56,11 @@ def register(
     Outside `jit` and `vmap`, also inside `grad` or `jvp`, the loop runs on the host and calls compiled programs whose
     shapes do not depend on the sizes of the clouds. Inside `jit`, it is one program per size of clouds, whose matches
     come from host callbacks, one batch element at a time (with `DenseSearch`, from XLA). The pose is the same up to
-    rounding; its derivative is that of `estimate_pose` at the final matches.
+    rounding; its derivative is that of `estimate_pose` at matches found at this pose.
 
     The derivative is by points, channels, given covariances and given parameters; that by `init` is 0. Matches,
-    neighbours and estimated parameters are constants. α has a derivative only with soft matches: see `estimate_pose`.
+    neighbours and estimated parameters are constants. Since channels act mostly by the matches, and α by them alone,
+    these are several candidates per point whose weights have derivatives: see `soft_matches`.
     Of a DEGENERATE pose it is that within the constrained directions, which are constants, too, and 0 along the others.
     If registration fails otherwise, the derivative is 0, never NaN, except after MAX_ITERATIONS or if UNVERIFIED.
     Outside `jit`, value and gradient take two to four registrations, for clouds of any size; inside, each size compiles
@@ -106,6 +107,14 @@ def register(
             points), covariances, estimated parameters, `num_inliers`, `overlap` and the covariance of the pose are of
             these rows alone, and the pose has a derivative by them and their neighbours. The target stays complete.
             None: all points. 10,000 nearly give the pose of all.
+        soft_matches: whether the derivative of the pose is that of soft matches. The pose, its status and all else are
+            those of the nearest matches in either case. The derivative is that of the root of `estimate_pose` near the
+            pose, over the 8 target points nearest to each source point in position and α · channel, within the fine
+            `max_distance`, with a `temperature` of one spacing of the target (its median nearest-neighbour distance,
+            or the edge of its cells). It approximates the change of the whole registration over steps that move
+            α · channel by about one spacing, but is not the slope over tiny steps, which change no match. That one is
+            the derivative with False: by channels, mostly a hundred times too small, and of any sign. None: True for
+            methods and clouds with channels, but not with `photometric=True`.
         tie_points: (source_points, target_points, covariances), metres: points (n, 3) known to be the same, such as
             surveyed targets or image features (Huhle & Jenke 2008), and the covariances (n, 3, 3) of b − T a, in the
             target's axes. n may be 1 or 2. They do not replace a good initial pose.
@@ -144,8 +153,9 @@ def register(
             values of a channel differ so much between the clouds that its units probably differ; the channels of
             matched points differ by a factor, probably because of another exposure; extent and spacing of the clouds
             differ so much that their units of length probably differ; or `GICP` gets one cloud with covariances that
-            are not dimensionless. Outside of `jit`: if less than 10 % of the source points have a match at the end,
-            `channel_weights` are differentiated, or channels are while `channel_covariance` is None.
+            are not dimensionless. Outside of `jit`: if less than 10 % of the source points have a match at the end;
+            channels or `channel_weights` are differentiated with `soft_matches=False`; or channels are while
+            `channel_covariance` or, unless it is False, `channel_weights` is None.
     """
     options = Options(
         max_distance=max_distance,
@@ -164,7 +174,7 @@ def register(
         raise ValueError("hold_unconstrained: expected True with tie_points or prior, got False")
     source, target = as_cloud("source", source), as_cloud("target", target)
     warn_of_lengths(source, target)
-    warn_of_estimated_parameters(method, source, target, options.soft_matches)
+    warn_of_estimated_parameters(method, source, target, soft_matches is not False)
     result = register_from(source, target, method, init, options, tie_points, prior)
     doubt = doubt_of(result)
     if doubt:

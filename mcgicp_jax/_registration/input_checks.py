@@ -105,14 +105,14 @@ def warn_of_hard_matches(method: AbstractMethod, source: PointCloud, target: Poi
     if not is_concrete(weights) and is_concrete(primal(weights)):
         warn(
             "channel_weights: the derivative is 0, since they decide matches alone, which are constant in derivatives; "
-            "pass soft_matches=True"
+            "leave out soft_matches=False"
         )
     channels = source.channels, target.channels
     compared = isinstance(method, MultiChannelGICP) and method.photometric
     if method.uses_channels and not compared and not is_concrete(channels) and is_concrete(primal(channels)):
         warn(
             "channels: they act mostly by the matches, which are constant in derivatives, so that this one is often a "
-            "hundred times too small; pass soft_matches=True"
+            "hundred times too small; leave out soft_matches=False"
         )
 
 

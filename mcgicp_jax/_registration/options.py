@@ -48,7 +48,7 @@ class Options:
     equalize_channels: bool = False
     voxel_sizes: Sequence[float] = ()
     max_source_points: int | None = _ENOUGH_SOURCE_POINTS
-    soft_matches: bool = False
+    soft_matches: bool | None = None
     min_coarse_distance: float = 0.0
 
     def __post_init__(self) -> None:
@@ -71,6 +71,8 @@ class Options:
                 raise ValueError(f"{name}: expected an object such as {example}, or None, got {value!r}")
         for name in ("hold_unconstrained", "equalize_channels", "soft_matches"):
             value = getattr(self, name)
+            if name == "soft_matches" and value is None:
+                continue
             if is_concrete(value) and np.asarray(value).dtype != bool:
                 raise ValueError(f"{name}: expected True or False, got {value!r}")
         if isinstance(self.voxel_sizes, str) or np.ndim(self.voxel_sizes) != 1:
@@ -107,7 +109,7 @@ class GivenOptions(TypedDict, total=False):
     equalize_channels: bool
     voxel_sizes: Sequence[float]
     max_source_points: int | None
-    soft_matches: bool
+    soft_matches: bool | None
 
 
 def options_of(function: Callable[..., Any], given: Any) -> Options:

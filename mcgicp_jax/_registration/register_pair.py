@@ -139,7 +139,7 @@ def prepared(
     check_method(method)
     sides = {"source": as_cloud("source", source), "target": as_cloud("target", target)}
     source, target = preprocessed(sides, method, options)
-    if not options.soft_matches:
+    if options.soft_matches is False:
         warn_of_hard_matches(method, source, target)
     if method.uses_channels:
         source, target = without_patterns(source, target)
@@ -257,6 +257,11 @@ def problem_of(
     xp = numpy_for(valid)
     stride = xp.maximum(xp.sum(xp.asarray(valid)) // _COARSE_ROWS, 1) if matches is None else 1
     uses_channels = method.uses_channels and matches is None
+    soft = options.soft_matches
+    if soft is None:
+        # By points, too, soft matches are better where channels are compared, and hard ones where they are not.
+        compared = method.uses_channels and target.channels.shape[-1] > 0
+        soft = compared and matches is None and not any(term.by_position for term in pair.terms)
     problem = Problem(
         se3_from_matrix(centred_pose(init, source, target), dtype),
         pair.source,
@@ -267,7 +272,7 @@ def problem_of(
         ),
         matches=matches,
         num_candidates=pair.method.num_candidates,
-        temperature=constant(spacing_of(pair.method, target)) if options.soft_matches else None,
+        temperature=constant(spacing_of(pair.method, target)) if soft else None,
     )
     return problem, given._replace(method=pair.method, source_rows=rows)
 
