@@ -443,6 +443,20 @@ def test_large_coordinates_keep_the_covariance_of_the_points():
     assert far.deviations.max() < 5e-3 < np.sqrt(far.covariance[0, 0])
 
 
+@pytest.mark.parametrize("step", [0.05, 0.2])
+def test_deviations_contain_the_steps_of_coordinates(step):
+    """Lattices match lattices: the error does not average out over the points."""
+    source, target, truth = pair(size=2000)
+    rounded = [mcg.preprocess(np.rint(cloud.coordinates / step) * step, None) for cloud in (source, target)]
+    result = mcg.register(*rounded, mcg.GICP(), init=truth)
+    least = step / np.sqrt(12)
+    assert (result.deviations[:3] > 1.4 * least).all() and (result.deviations[:3] < 2 * least + 0.01).all()
+    # Of one of them, and of neither.
+    one = mcg.register(source, rounded[1], mcg.GICP(), init=truth).deviations[:3]
+    assert (one > 0.99 * least).all() and (one < result.deviations[:3]).all()
+    assert (mcg.register(source, target, mcg.GICP(), init=truth).deviations[:3] < 0.005).all()
+
+
 @pytest.mark.slow
 def test_traced_and_batched_results_carry_the_same():
     """Clouds of several sizes, stacked."""

@@ -1,5 +1,6 @@
 """From raw clouds to ready ones: voxels, size classes, far origins, and what is turned away."""
 
+import re
 import warnings
 
 import jax
@@ -10,6 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from mcgicp_jax import GICP, PointCloud, preprocess
+from mcgicp_jax._clouds.coordinate_steps import harmful_step
 from mcgicp_jax._clouds.voxels import grid_of
 from tests import reference as ref
 from tests.precision import tolerance
@@ -165,6 +167,41 @@ def test_equal_points_of_rounded_clouds_are_measurements(step):
     points = np.rint(4 * POINTS / step)[np.arange(900) % 150] * step + 100
     assert np.unique(points, axis=0, return_counts=True)[1].max() > 5
     assert len(ready(points)) == 900
+
+
+def height_map():
+    x, y = np.mgrid[:60, :60].reshape(2, -1)
+    return np.stack([x, y, np.round(np.sin(x / 5) + np.cos(y / 7), 3)], axis=1)
+
+
+SPREAD = np.random.default_rng(0).random((3000, 3)) * [60, 60, 3] @ ref.pose([0.3, 0.2, 0.1], np.zeros(3))[:3, :3]
+# Points, and the step to which they are rounded, metres; 0 where it does no harm.
+ROUNDED = {
+    "as they are": (SPREAD, 0),
+    "voxel centres": (np.unique(np.floor(SPREAD / 0.7), axis=0) * 0.7 + 0.35, 0.7),
+    "whole metres of UTM": (np.rint(SPREAD + UTM), 1),
+    "integers": (np.rint(SPREAD).astype(int), 1),
+    "six digits": (np.array([[float(f"{x:g}") for x in row] for row in SPREAD + UTM]), 10),
+    "float32": ((SPREAD + UTM).astype(np.float32), 0.5),
+    "float32 as float64": ((SPREAD + UTM).astype(np.float32).astype(float), 0.5),
+    "centimetres": (np.round(SPREAD + UTM, 2), 0),
+    "height map": (height_map(), 0),
+    "height map in float32": ((height_map() + np.rint(UTM)).astype(np.float32), 0),
+    "each of ten points five times": (np.tile(POINTS[:10], (5, 1)), 0),
+}
+
+
+@pytest.mark.parametrize("name", ROUNDED)
+def test_coarse_steps_of_coordinates_are_found(name):
+    points, step = ROUNDED[name]
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        cloud = preprocess(points, None)
+    told = [str(each.message) for each in caught if "rounded" in str(each.message)]
+    assert [float(re.search("steps of ([^ ]*) m", text)[1]) for text in told] == [step] * (step > 0)
+    spacing = np.float32(0.7 * np.sqrt(60 * 60 / 3000))
+    assert harmful_step(cloud, spacing) == pytest.approx(step, rel=1e-4)
+    assert jax.jit(harmful_step)(cloud.pad(4096), spacing) == harmful_step(cloud, spacing)
 
 
 def test_large_coordinates_lose_nothing():

@@ -9,6 +9,7 @@ import jax
 import numpy as np
 from jaxtyping import Bool, Float
 
+from mcgicp_jax._clouds.coordinate_steps import harmful_step
 from mcgicp_jax._clouds.placeholders import measured_rows
 from mcgicp_jax._clouds.point_cloud import LARGEST, PointCloud, Values, Voxels, as_cloud, is_far
 from mcgicp_jax._clouds.voxel_size import NUM_NEIGHBORS, VoxelSize, voxels_and_grids, warn_of_shape
@@ -16,15 +17,12 @@ from mcgicp_jax._clouds.voxels import Grid, grid_of
 from mcgicp_jax._compute.concrete import is_concrete
 from mcgicp_jax._compute.linear_maps import RowAverage, primal, with_derivative
 from mcgicp_jax._compute.messages import check_integer, check_positive, warn
-from mcgicp_jax._math.statistics import sampled_rows
+from mcgicp_jax._math.statistics import median, sampled_rows
 from mcgicp_jax._search.base import AbstractSearch
 from mcgicp_jax._search.brute_force import default_search
 
 # Fewest finite points of a cloud: four points are the fewest that are not always coplanar.
 MIN_POINTS = 4
-# Coordinates rounded to steps of more than this fraction of the spacing of the points are warned of. The error, uniform
-# over a step, then has a standard deviation of 3 % of the spacing, the noise of a good sensor.
-_LARGEST_STEP = 0.1
 # Number of points among which duplicates are counted: half of them is known to within 2 %.
 _SAMPLE = 500
 
@@ -68,8 +66,8 @@ def preprocess(
     Warns:
         UserWarning: once per call, if points with NaN or infinity were left out, or points that share exactly one
             place, as sensors report rays without return (the first at (0, 0, 0) is kept), if downsampling leaves fewer
-            points than `num_neighbors`, if more than half of the points lie exactly on another one, if coordinates far
-            from zero are float32 and too coarse for the points' spacing, or if `voxel_size` is None and more than a
+            points than `num_neighbors`, if more than half of the points lie exactly on another one, if coordinates
+            are rounded to steps of more than a third of the points' spacing, or if `voxel_size` is None and more than a
             tenth of the neighbourhoods are lines, or most are more than 0.6 times as thick as wide.
     """
     return preprocessed_in(None, cloud, voxel_size, num_neighbors, search)
@@ -162,20 +160,24 @@ def with_neighbors(
 
 
 def _warn_of_loss(given: PointCloud, found: PointCloud, num_neighbors: int) -> None:
-    """Warn of float32 coordinates that are too large for it, such as those of UTM, of duplicates and few voxels."""
+    """Warn of coordinates that are rounded to coarse steps, of duplicates and few voxels."""
     points, neighbors = np.asarray(found.points), cast(Any, found.deferred_neighbors)
     # Of the rows from which the spacing of a target is computed. Each point is its own first neighbour.
     rows, counts = sampled_rows(np.asarray(found.valid))
     rows = rows[counts][:: 1 + rows.size // _SAMPLE]
-    offsets = points[neighbors[rows][:, 1]] - points[rows]
-    if given.points.dtype == np.float32 and np.any(found.origin):
-        largest, spacing = np.abs(given.points).max(), np.median(np.linalg.norm(offsets, axis=1))
-        if np.spacing(largest) > _LARGEST_STEP * spacing:
-            warn(
-                f"points: float32 has rounded coordinates of {largest:.0f} m to steps of {np.spacing(largest):.2g} m, "
-                f"and neighbours are {spacing:.2g} m apart; read them as float64, or subtract an offset before float32"
-            )
-    duplicates = np.mean((offsets == 0).all(axis=1))
+    near = neighbors[rows][:, 1:]
+    distances = np.linalg.norm(points[near] - points[rows, None], axis=2)
+    # Without coincident neighbours; 0 where all are.
+    nearest = np.where((distances > 0) & (near >= 0), distances, np.inf).min(axis=1)
+    spacing = float(np.nan_to_num(median(np.where(np.isfinite(nearest), nearest, np.nan))))
+    step = float(harmful_step(found, spacing))
+    if step > 0:
+        warn(
+            f"points: coordinates are rounded to steps of {step:.2g} m, and neighbours are {spacing:.2g} m apart; read "
+            "them as float64 and with all digits, subtract an offset before float32, or average them: "
+            "preprocess(cloud, voxel_size=...)"
+        )
+    duplicates = np.mean(distances[:, 0] == 0)
     if duplicates > 0.5:
         warn(
             f"points: {duplicates:.0%} lie exactly on another one, so that neighbourhoods do not span the surface; "

@@ -73,7 +73,7 @@ def moments_of(executor: AbstractExecutor, loop: LoopResult) -> Moments:
     # Fixed matches do not respond to a motion.
     responding = _responding(executor, loop) if problem.matches is None and is_adaptive(loop.terms) else None
     scores = executor.scores(motion, loop.matches, frame, loop.terms, responding)
-    return moments_from(scores, valid.size)
+    return moments_from(scores, valid.size)._replace(rounding=problem.settings.rounding)
 
 
 def _discounts_and_radius(

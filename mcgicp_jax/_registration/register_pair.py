@@ -268,7 +268,7 @@ def problem_of(
         pair.target,
         pair.terms,
         settings_for(
-            options, pair.method, target, stride, not uses_channels or channels_constrain(source, target), dtype
+            options, pair.method, source, target, stride, not uses_channels or channels_constrain(source, target), dtype
         ),
         matches=matches,
         num_candidates=pair.method.num_candidates,

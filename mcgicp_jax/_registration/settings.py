@@ -8,8 +8,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from mcgicp_jax._clouds.coordinate_steps import harmful_step
 from mcgicp_jax._clouds.point_cloud import PointCloud
-from mcgicp_jax._compute.concrete import AnyArray, AnyScalar, constant, numpy_for
+from mcgicp_jax._compute.cache import cached_with_cloud
+from mcgicp_jax._compute.concrete import AnyArray, AnyScalar, constant, is_concrete, numpy_for
 from mcgicp_jax._local_geometry.cloud_statistics import grid_spacing, point_spacing
 from mcgicp_jax._local_geometry.local_geometry import cell_edge
 from mcgicp_jax._methods.base import AbstractMethod
@@ -43,6 +45,7 @@ class Settings(NamedTuple):
         max_iterations: maximum number of updates, both phases together.
         hold_unconstrained: whether the pose is kept fixed along unconstrained directions.
         channels_constrain: whether channels may constrain directions that geometry does not.
+        rounding: variance of the pose, metres², since the coordinates of both clouds are rounded to coarse steps.
     """
 
     max_distance: Float[AnyArray, "*batch"]
@@ -55,6 +58,7 @@ class Settings(NamedTuple):
     max_iterations: Int[AnyArray, "*batch"]
     hold_unconstrained: Bool[AnyArray, "*batch"]
     channels_constrain: Bool[AnyArray, "*batch"]
+    rounding: Float[AnyArray, "*batch"]
 
     def distance(self, status: Int[AnyScalar, ""]) -> Float[AnyScalar, ""]:
         """Maximum correspondence distance at this status, metres."""
@@ -87,9 +91,15 @@ def default_distances(spacing: Any, target: PointCloud) -> tuple[Any, Any]:
 
 
 def settings_for(
-    options: Options, method: AbstractMethod, target: PointCloud, stride: Any, channels_constrain: Any, dtype: Any
+    options: Options,
+    method: AbstractMethod,
+    source: PointCloud,
+    target: PointCloud,
+    stride: Any,
+    channels_constrain: Any,
+    dtype: Any,
 ) -> Settings:
-    """The settings of a registration to this target; `stride` is that of the coarse phase."""
+    """The settings of a registration; `stride` is that of the coarse phase."""
     max_distance: Any = options.max_distance
     tolerance: Any = options.translation_tolerance
     # Settings are constants to autodiff, even if they are derived from a differentiated cloud.
@@ -97,6 +107,9 @@ def settings_for(
     max_distance = default_distances(spacing, target) if max_distance is None else max_distance
     least = spacing * _TOLERANCE_IN_SPACINGS
     tolerance = least if tolerance is None else tolerance
+
+    find_step = cached_with_cloud(harmful_step) if is_concrete(source, target, spacing) else harmful_step
+    steps = [find_step(constant(cloud), spacing) for cloud in (source, target)]
 
     def number(value: Any, kind: Any) -> Any:
         return numpy_for(value).asarray(value, kind)
@@ -117,4 +130,6 @@ def settings_for(
         max_iterations=number(options.max_iterations, np.int32),
         hold_unconstrained=number(options.hold_unconstrained, bool),
         channels_constrain=number(channels_constrain, bool),
+        # An error that is uniform over a step. It does not average out: points on lattices match the lattice.
+        rounding=number((steps[0] ** 2 + steps[1] ** 2) / 12, dtype),
     )
