@@ -151,6 +151,38 @@ def test_a_channel_that_nobody_has_says_nothing():
     np.testing.assert_array_equal(np.asarray(method.channel_weights) > 0, [True, False, True])
 
 
+@in_both_precisions
+def test_a_few_extreme_values_change_little():
+    """The files of some scanners hold them. Without a bound, Λ is 160 times as large."""
+    clouds = [noisy(seed)[1] for seed in (0, 1)]
+    extreme = [np.array(cloud.channels) for cloud in clouds]
+    for channels in extreme:
+        channels[[3, 500, 1200]] = 1e5
+    plain = MultiChannelGICP().resolve(*clouds)
+    found = MultiChannelGICP().resolve(*(c.replace(channels=new) for c, new in zip(clouds, extreme, strict=True)))
+    np.testing.assert_allclose(found.channel_covariance, plain.channel_covariance, rtol=0.1)
+    np.testing.assert_allclose(found.channel_weights, plain.channel_weights, rtol=0.05)
+
+
+@in_both_precisions
+def test_an_offset_of_a_channel_changes_nothing():
+    """As long as rounding leaves some of the channel."""
+    clouds = [noisy(seed)[1] for seed in (0, 1)]
+    plain = MultiChannelGICP().resolve(*clouds)
+    found = MultiChannelGICP().resolve(*(c.replace(channels=c.channels + np.float32(1e4)) for c in clouds))
+    np.testing.assert_allclose(found.channel_covariance, plain.channel_covariance, rtol=0.01)
+    np.testing.assert_allclose(found.channel_weights, plain.channel_weights, rtol=0.01)
+
+
+def test_rare_marks_have_a_spread():
+    """One point in a thousand differs: no quantile shows it, and all values count."""
+    cloud = ready(2000, 1)
+    channels = np.zeros((len(cloud.points), 1))
+    channels[[700, 1500]] = 1
+    method = MultiChannelGICP().resolve(*[cloud.replace(channels=channels)] * 2)
+    assert np.all(np.isfinite(method.channel_weights) & (np.asarray(method.channel_weights) > 0))
+
+
 def test_padding_takes_no_part_in_the_choice():
     (_, target), (_, source) = noisy(0), noisy(1)
     method = MultiChannelGICP().resolve(source, target)

@@ -365,12 +365,15 @@ def test_chosen_numbers_are_the_same_inside_transformations():
 
 
 def test_channels_without_noise_have_some():
-    """A ramp, which a linear fit leaves nothing of: σ is a thousandth of its standard deviation, and Λ = 2 (1.5 σ)²."""
+    """A ramp, which a linear fit leaves nothing of: σ is a thousandth of its standard deviation, and Λ = 2 (1.5 σ)².
+
+    But for its outermost hundredth, which may be extreme values.
+    """
     points, _ = ref.scene(700, seed=4)
     points[:, 2] = 0
     cloud = preprocess(PointCloud(points, points[:, 0]), num_neighbors=K)
     covariance, weights, _ = numbers_for(cloud, cloud)
-    np.testing.assert_allclose(covariance, 2 * (1.5e-3 * np.std(points[:, 0])) ** 2, rtol=1e-6)
+    np.testing.assert_allclose(covariance, 2 * (1.5e-3 * np.std(points[:, 0])) ** 2, rtol=1e-3)
     assert np.all(weights > 0)
 
 

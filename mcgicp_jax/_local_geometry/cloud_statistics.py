@@ -21,6 +21,12 @@ from mcgicp_jax._local_geometry.neighborhoods import check_neighbors
 from mcgicp_jax._math.statistics import median, of_known, sampled_rows
 from mcgicp_jax._search.base import Correspondences
 
+# Quantiles between which the spread of a channel is measured: a few extreme values, of reflectors or flags, do not raise
+# the floor of its noise, and with it Λ. Where both are equal, as for rare marks, all values count. They are taken from
+# every fourth row of the sample: in 2,000, they are the eleventh from either end.
+_INNER, _STRIDE = (0.005, 0.995), 4
+# Smallest spread of a channel that is not uniform, in roundings of its largest value: what sums of constants leave.
+_ROUNDINGS = 10
 # Quantiles (5 to 95 %) from which gain and offset are estimated: robust against parts that only one cloud sees.
 _QUANTILES = tuple(step / 20 for step in range(1, 20))
 # Ratio of the ranges of a channel in two clouds above which its units probably differ: files hold intensities from 0 to
@@ -42,19 +48,32 @@ def channel_noise(
     samples = [_noise_rows(cloud) for cloud in (source, target)]
     found = constant(geometries((samples[0][0], samples[1][0])))
     xp = numpy_for(source, target, found)
-    residuals, values, across = [], [], []
-    for cloud, local, (_, counts) in zip((source, target), found, samples, strict=True):
+    residuals, values, sampled, across = [], [], [], []
+    for cloud, local, (rows, counts) in zip((source, target), found, samples, strict=True):
         deviations = xp.sqrt(local.fits.residual.T)
         residuals.append(xp.where(counts[:-1], deviations, xp.nan))
         values.append(known_values(cloud))
+        sampled.append(xp.where(counts[:-1].T, values[-1][rows], xp.nan))
         across.append(xp.where(counts[-1], _smallest_variance(local, xp), xp.nan))
     sigma = median(xp.concatenate(residuals, axis=1))
+    low, high = _inner_range(xp.concatenate(sampled)[::_STRIDE])
     everything = xp.concatenate(values)
+    everything = xp.where(low < high, xp.clip(everything, low, high), everything)
     spread = of_known(partial(xp.nanstd, axis=0), everything)
     largest = of_known(partial(xp.nanmax, axis=0), xp.abs(everything))
-    uniform = ~(spread > 1e3 * xp.finfo(spread.dtype).eps * largest)
+    uniform = ~(spread > _ROUNDINGS * xp.finfo(spread.dtype).eps * largest)
     # Rendered channels have no noise; a floor of a thousandth of their standard deviation keeps α finite and Λ regular.
     return xp.where(uniform, 1, xp.fmax(sigma, 1e-3 * spread)), uniform, median(xp.concatenate(across))
+
+
+def _inner_range(sample: Float[AnyArray, "n C"]) -> tuple[Float[AnyArray, "C"], Float[AnyArray, "C"]]:
+    """The quantiles `_INNER` of each channel, without NaN, NaN if there is no other value."""
+    xp = numpy_for(sample)
+    # NaN comes last.
+    ordered, last = xp.sort(sample, axis=0), xp.sum(~xp.isnan(sample), axis=0, keepdims=True) - 1
+    rows = (xp.maximum(last, 0) * xp.asarray(q, sample.dtype) for q in _INNER)
+    low, high = (xp.take_along_axis(ordered, xp.round(row).astype(np.int32), axis=0)[0] for row in rows)
+    return low, high
 
 
 def _noise_rows(cloud: PointCloud) -> tuple[Any, Any]:
