@@ -82,3 +82,24 @@ def test_poses_with_rounding_in_the_last_row_and_of_three_rows():
     matches = mcg.find_correspondences(cloud, cloud, pose, mcg.GICP(), max_distance=1.0)
     inside = jax.jit(lambda pose: mcg.mahalanobis_cost(pose, cloud, cloud, matches, mcg.PointToPoint()))(pose[:3])
     np.testing.assert_allclose(inside, mcg.mahalanobis_cost(pose, cloud, cloud, matches, mcg.PointToPoint()), rtol=1e-5)
+
+
+@pytest.mark.parametrize("transformation", [jax.jit, jax.grad])
+def test_functions_of_many_clouds_name_what_is_traced(transformation):
+    cloud, method, still = mcg.PointCloud(POINTS.astype(np.float32)), mcg.GICP(), np.eye(4)
+    for named, call in (
+        ("frames[1]", lambda traced, _: list(mcg.odometry([cloud, traced], method))),
+        ("start", lambda _, pose: mcg.odometry([cloud, cloud], method, start=pose)),
+        ("clouds[1]", lambda traced, _: mcg.multiway([cloud, traced], method)),
+        ("init", lambda _, pose: mcg.multiway([cloud, cloud], method, init=[still, pose])),
+        ("clouds[0]", lambda traced, _: mcg.merge_clouds([traced, cloud], [still, still])),
+        ("poses[1]", lambda _, pose: mcg.merge_clouds([cloud, cloud], [still, pose])),
+        ("clouds[1]", lambda traced, _: mcg.estimate_channel_covariance([cloud, traced], [still, still])),
+        ("poses[0]", lambda _, pose: mcg.estimate_channel_covariance([cloud, cloud], [pose, still])),
+    ):
+
+        def inside(points, call=call):
+            call(cloud.replace(points=points), still + 0 * points[0, 0])
+            return 0.0
+
+        refused(lambda inside=inside: transformation(inside)(cloud.points), named, "tracers")

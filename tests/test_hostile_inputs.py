@@ -350,8 +350,11 @@ def checks():
 def test_checks_of_jax_that_users_turn_on_are_for_their_code(name, checks):
     (points, channels), target = (room_corner(600, seed=seed) for seed in (1, 2))
     known = np.random.default_rng(0).random(channels.shape) < 0.8
-    result = mcg.register(mcg.PointCloud(points, channels, channel_valid=known), mcg.PointCloud(*target), METHODS[name])
-    assert np.isfinite(result.covariance).all() and np.isfinite(result.deviations).all()
+    # Gradients of JAX's own functions fail under this guard.
+    with jax.transfer_guard("disallow"):
+        source = mcg.PointCloud(points, channels, channel_valid=known)
+        result = mcg.register(source, mcg.PointCloud(*target), METHODS[name])
+        assert np.isfinite(result.covariance).all() and np.isfinite(result.deviations).all()
 
 
 @pytest.mark.slow

@@ -12,7 +12,7 @@ from jaxtyping import Float
 from mcgicp_jax._clouds.point_cloud import PointCloud, Values, Voxels, as_cloud
 from mcgicp_jax._clouds.voxel_size import map_voxel_size
 from mcgicp_jax._clouds.voxels import starts_of, voxel_keys, voxel_of
-from mcgicp_jax._compute.messages import check_positive, messages_named
+from mcgicp_jax._compute.messages import check_concrete, check_positive, messages_named
 from mcgicp_jax._math.poses import Pose, pose_matrix, rotated
 
 
@@ -35,7 +35,7 @@ def merge_clouds(
 
     Raises:
         ValueError: if there are no clouds, the number of poses differs, a pose is no rigid motion, the channels
-            differ, or a point lies more than 2²⁰ voxels from the first one along an axis.
+            differ, an array is traced, or a point lies more than 2²⁰ voxels from the first one along an axis.
     """
     if voxel_size != "auto":
         check_positive("voxel_size", voxel_size, 'a positive number or "auto"')
@@ -46,6 +46,8 @@ def merge_clouds(
             raise ValueError(f"poses: expected one per cloud, got {'more' if cloud is end else f'only {i}'}")
         name = f"clouds[{i}]"
         cloud = as_cloud(name, cloud)
+        check_concrete(name, cloud)
+        check_concrete(f"poses[{i}]", pose)
         if world is None:
             world = VoxelMap(map_voxel_size(cloud) if voxel_size == "auto" else voxel_size)
         world.add(name, cloud, np.asarray(pose_matrix(pose, f"poses[{i}]")))

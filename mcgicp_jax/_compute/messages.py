@@ -80,6 +80,12 @@ def optional_module(module: str, extra: str, use: str) -> Any:
         raise ImportError(f"{use} needs {name}: pip install 'mcgicp_jax[{extra}]'") from error
 
 
+def check_concrete(name: str, *values: object) -> None:
+    """Raise `ValueError` for arguments that are traced, of functions that run outside of transformations alone."""
+    if not is_concrete(*values):
+        raise ValueError(f"{name}: expected concrete arrays, got tracers; call this outside of jit, vmap and grad")
+
+
 def check_positive(name: str, value: Any, expected: str = "a positive number") -> None:
     if is_concrete(value) and not (is_number(value) and np.asarray(value) > 0):
         raise ValueError(f"{name}: expected {expected}, got {value!r}")

@@ -21,9 +21,9 @@ from mcgicp_jax._local_geometry.neighborhoods import check_neighbors
 from mcgicp_jax._math.statistics import median, of_known, sampled_rows
 from mcgicp_jax._search.base import Correspondences
 
-# Quantiles between which the spread of a channel is measured: a few extreme values, of reflectors or flags, do not raise
-# the floor of its noise, and with it Λ. Where both are equal, as for rare marks, all values count. They are taken from
-# every fourth row of the sample: in 2,000, they are the eleventh from either end.
+# Quantiles between which the spread of a channel is measured: a few extreme values, of reflectors or flags, do not
+# raise the floor of its noise, and with it Λ. Where both are equal, as for rare marks, all values count. They are taken
+# from every fourth row of the sample: in 2,000, they are the eleventh from either end.
 _INNER, _STRIDE = (0.005, 0.995), 4
 # Smallest spread of a channel that is not uniform, in roundings of its largest value: what sums of constants leave.
 _ROUNDINGS = 10

@@ -17,6 +17,7 @@ from mcgicp_jax._clouds.point_cloud import PointCloud, Values
 from mcgicp_jax._clouds.preprocess import preprocess
 from mcgicp_jax._compute.concrete import AnyArray, constant, numpy_for
 from mcgicp_jax._compute.devices import put_on_cpu
+from mcgicp_jax._compute.messages import check_concrete
 from mcgicp_jax._compute.threads import with_settings_of_package
 from mcgicp_jax._local_geometry.channel_covariances import channel_kernel, multichannel_covariance, plane_covariance
 from mcgicp_jax._local_geometry.cloud_statistics import channel_noise, point_spacing
@@ -206,11 +207,14 @@ def estimate_channel_covariance(
         (C, C), channel units², float64, symmetric and positive definite.
 
     Raises:
-        ValueError: if there are fewer than two clouds, the number of poses differs, the channels differ, or a channel
-            has fewer than ten matches.
+        ValueError: if there are fewer than two clouds, the number of poses differs, the channels differ, a channel has
+            fewer than ten matches, or an array is traced.
     """
     if len(clouds) < 2 or len(clouds) != len(poses):
         raise ValueError(f"poses: expected one per cloud and at least two, got {len(poses)} for {len(clouds)} clouds")
+    for i, (cloud, pose) in enumerate(zip(clouds, poses, strict=True)):
+        check_concrete(f"clouds[{i}]", cloud)
+        check_concrete(f"poses[{i}]", pose)
     matrices = [np.asarray(pose_matrix(pose, f"poses[{i}]")) for i, pose in enumerate(poses)]
     ready = [cloud if cloud.deferred_neighbors is not None else preprocess(cloud, None) for cloud in clouds]
     names = ready[0].channel_names

@@ -15,7 +15,7 @@ from mcgicp_jax._clouds.preprocess import check_preprocessing, preprocess
 from mcgicp_jax._clouds.voxel_map import merge_clouds
 from mcgicp_jax._clouds.voxel_size import NUM_NEIGHBORS, VoxelSize, voxels_for
 from mcgicp_jax._clouds.voxels import wrapped_keys
-from mcgicp_jax._compute.messages import messages_named
+from mcgicp_jax._compute.messages import check_concrete, messages_named
 from mcgicp_jax._local_geometry.cloud_statistics import point_spacing
 from mcgicp_jax._math.poses import Pose, exponential, logarithm, pose_matrices, rotated
 from mcgicp_jax._methods.base import AbstractMethod
@@ -112,7 +112,7 @@ def multiway(
         Clouds, poses, registrations and map.
 
     Raises:
-        ValueError: if there is no cloud, or a cloud or an argument is invalid; the message names it. Failures to
+        ValueError: if there is no cloud, or a cloud or an argument is invalid or traced; the message names it. Failures to
             register show in the status of the graph and of the registrations.
     """
     check_method(method)
@@ -121,6 +121,9 @@ def multiway(
     ready = [as_cloud(f"clouds[{k}]", cloud) for k, cloud in enumerate(clouds)]
     if not ready:
         raise ValueError("clouds: expected at least one, got none")
+    named = {f"clouds[{k}]": cloud for k, cloud in enumerate(ready)} | {"init": init, "method": method}
+    for name, value in (named | options).items():
+        check_concrete(name, value)
     voxels = voxels_for(voxel_size, *ready)
     for k, cloud in enumerate(ready):
         if cloud.deferred_neighbors is None:

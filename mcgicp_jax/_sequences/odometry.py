@@ -18,7 +18,7 @@ from mcgicp_jax._clouds.preprocess import check_preprocessing, preprocess
 from mcgicp_jax._clouds.voxel_map import VoxelMap
 from mcgicp_jax._clouds.voxel_size import NUM_NEIGHBORS, VoxelSize, voxels_for
 from mcgicp_jax._compute.cache import Lazy
-from mcgicp_jax._compute.messages import check_positive, messages_named, warn
+from mcgicp_jax._compute.messages import check_concrete, check_positive, messages_named, warn
 from mcgicp_jax._compute.threads import ReadAhead
 from mcgicp_jax._local_geometry.cloud_statistics import point_spacing
 from mcgicp_jax._local_geometry.local_geometry import geometry_table
@@ -132,7 +132,7 @@ def odometry(
         Iterator over one `OdometryStep` per frame, including the first.
 
     Raises:
-        ValueError: if an argument is invalid; on iteration, if a cloud is. The message names the frame, and the
+        ValueError: if an argument is invalid or traced; on iteration, if a cloud is. The message names the frame, and the
             iteration may go on with the next one: that one is registered to the last valid frame.
 
     Warns:
@@ -141,6 +141,9 @@ def odometry(
     """
     check_preprocessing(voxel_size, num_neighbors)
     check_method(method)
+    named: dict[str, Any] = {"init": init, "start": start, "method": method}
+    for name, value in (named | {**options}).items():
+        check_concrete(name, value)
     if against not in ("previous", "map"):
         raise ValueError(f'against: expected "previous" or "map", got {against!r}')
     if map_radius is not None:
@@ -195,6 +198,7 @@ class _Reader:
         if prior is not None:
             prior = pose_matrix(prior[0], f"priors[{number}]: pose"), prior[1]
         cloud = as_cloud(name, frame.cloud if isinstance(frame, Frame) else frame)
+        check_concrete(name, cloud)
         if not self.deskew:
             return name, self.prepared(name, cloud), prior
         if cloud.times is None:
