@@ -11,7 +11,7 @@ from mcgicp_jax import datasets
 from mcgicp_jax.__main__ import main
 from mcgicp_jax._global_pose import features
 from mcgicp_jax._global_pose.robust_pose_fit import NUM_MATCHES, PutativeMatches, _support, fit_pose, hypotheses
-from mcgicp_jax._global_pose.surface_agreement import surface_agreement
+from mcgicp_jax._local_geometry.surface_agreement import surface_agreement
 from mcgicp_jax.metrics import pose_error
 from tests.compilations import compilations
 from tests.refusals import refused

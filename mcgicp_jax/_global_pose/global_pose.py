@@ -25,7 +25,7 @@ from mcgicp_jax._global_pose.robust_pose_fit import (
     hypotheses,
     refined,
 )
-from mcgicp_jax._global_pose.surface_agreement import surface_agreement
+from mcgicp_jax._local_geometry.surface_agreement import surface_agreement
 from mcgicp_jax._math.poses import nearest_rotation
 from mcgicp_jax._methods.icp import GICP
 from mcgicp_jax._methods.multichannel_gicp import MultiChannelGICP

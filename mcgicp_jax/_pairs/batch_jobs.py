@@ -26,7 +26,7 @@ from mcgicp_jax._compute.messages import messages_named, warn, warnings_named
 from mcgicp_jax._compute.threads import in_new_thread, num_cores, side_by_side, with_settings
 from mcgicp_jax._math.poses import Pose, se3_from_matrix
 from mcgicp_jax._methods.base import AbstractMethod
-from mcgicp_jax._pairs.register import doubt_of, register_from, start_from_anywhere
+from mcgicp_jax._pairs.register import coarse_distance_from, doubt_of, register_from, start_from_anywhere
 from mcgicp_jax._registration.assessment import registration_of
 from mcgicp_jax._registration.input_checks import check_clouds, warn_of_estimated_parameters, warn_of_lengths
 from mcgicp_jax._registration.options import Options
@@ -94,12 +94,16 @@ class PairResult:
 
 @dataclass(frozen=True)
 class PreparedPair:
-    """A pair of preprocessed clouds; `verified` unless the initial pose is one that `global_pose` doubts."""
+    """A pair of preprocessed clouds; `verified` unless the initial pose is one that `global_pose` doubts.
+
+    `max_coarse_distance` is that of `Options`.
+    """
 
     index: int
     inputs: Inputs
     init: Pose | None
-    verified: bool
+    verified: bool = True
+    max_coarse_distance: float = np.inf
 
     @property
     def leaves(self) -> list[Any]:
@@ -167,13 +171,13 @@ class BatchJob:
         """The pair with its initial pose, or its result if it has none."""
         source, target = self._clouds(pair)
         warn_of_estimated_parameters(self.method, source, target, self.options.soft_matches is not False)
-        init, verified = pair.init, True
-        if isinstance(init, str):
-            start = start_from_anywhere(init, primal(source), primal(target))
-            if start is None:
-                return PairResult(pair.index, RegistrationResult.without_pose(Status.TOO_FEW_CORRESPONDENCES))
-            init, verified = start.matrix, start.success
-        return PreparedPair(pair.index, prepared(source, target, self.method, self.options), primal(init), verified)
+        inputs = prepared(source, target, self.method, self.options)
+        if not isinstance(pair.init, str):
+            return PreparedPair(pair.index, inputs, primal(pair.init))
+        start = start_from_anywhere(pair.init, primal(source), primal(target))
+        if start is None:
+            return PairResult(pair.index, RegistrationResult.without_pose(Status.TOO_FEW_CORRESPONDENCES))
+        return PreparedPair(pair.index, inputs, start.matrix, start.success, coarse_distance_from(start, self.options))
 
     @computed_on_cpu
     def register_chunk(self, chunk: list[Pair]) -> list[PairResult]:
@@ -195,7 +199,7 @@ class BatchJob:
     @_of_a_pair
     def _register_with_jacobian(self, pair: Pair) -> PairResult:
         values: Any = (pair.source, pair.target, self.method, self.options.robust)
-        run = self._run(PreparedPair(pair.index, Inputs(*values), pair.init, True))  # type: ignore[arg-type]
+        run = self._run(PreparedPair(pair.index, Inputs(*values), pair.init))  # type: ignore[arg-type]
         if isinstance(run, PairResult):
             return run
         (result,) = results_of([run], [None])
@@ -226,7 +230,8 @@ class BatchJob:
 
     @_of_a_pair
     def _run(self, pair: PreparedPair) -> PairResult | Run:
-        return run_pair(pair.inputs, pair.init, self._options)
+        options = replace(self._options, max_coarse_distance=pair.max_coarse_distance)
+        return run_pair(pair.inputs, pair.init, options)
 
     def register_in_lanes(self, pairs: Iterable[Pair], num_threads: int) -> Iterator[PairResult]:
         """Register the pairs as lanes on this machine; threads preprocess them."""
@@ -267,7 +272,7 @@ class BatchJob:
         pose = se3_from_matrix(centred_pose(ready.init, source, target), source.points.dtype)
         # `preprocess` returns clouds that have neighbours as they are; the others get theirs on the devices.
         sides = [self._padded(*both) for both in zip((source, target), clouds.values(), strict=True)]
-        return ready, LanePair(pose, *sides)
+        return ready, LanePair(pose, source.points.dtype.type(ready.max_coarse_distance), *sides)
 
     def _padded(self, cloud: PointCloud, before: PointCloud) -> PointCloud:
         """What a lane needs of a preprocessed cloud: neighbours only if it had them `before`."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any, Literal
 
 import numpy as np
@@ -53,6 +54,11 @@ def register(
     A coarse phase uses the larger `max_distance`, and of 8,192 source points or more an even subset of at least 4,096.
     Near convergence, a fine phase with all points and the smaller `max_distance` takes over.
 
+    The coarse phase may leave a right `init`, for instance where clouds were cut out of merged scans. If it has moved
+    the points by more than the fine `max_distance` to a pose at which the surfaces do not coincide, a second
+    registration from `init` uses the fine `max_distance` alone, and is the result if they coincide better. Not inside
+    transformations and with `DenseSearch` in batches: pass a smaller `max_distance` there if `init` is near.
+
     Outside `jit` and `vmap`, also inside `grad` or `jvp`, the loop runs on the host and calls compiled programs whose
     shapes do not depend on the sizes of the clouds. Inside `jit`, it is one program per size of clouds, whose matches
     come from host callbacks, one batch element at a time (with `DenseSearch`, from XLA). The pose is the same up to
@@ -79,7 +85,8 @@ def register(
             or two: for the coarse and for the fine phase. None: 10 and 2.5 times the spacing of the target (its median
             nearest-neighbour distance, or the edge of its cells); the first is also at least 10 times the spacing of a
             square grid of the target's density, as the lines of LiDAR scans are far apart. Pass a larger value if
-            `init` is further off.
+            `init` is further off. With "global" and with a prior, it is at most a voxel of `global_pose`, or three
+            standard deviations of the prior beside the distance from its pose to `init`.
         max_iterations: maximum number of pose updates in both phases together.
         translation_tolerance, rotation_tolerance: metres (at the centroid of the matches) and radians; the loop has
             converged when an update is below both. `translation_tolerance` None: 0.5 % of the spacing of the target.
@@ -133,7 +140,7 @@ def register(
     moments). It is the result; its `covariance` and `information` include tie points and prior. They also constrain
     directions that the clouds do not (`UnconstrainedDirection.constrained_by_ties`). The pose is differentiable with
     respect to points, pose and covariances; the weights of the matches are constants to autodiff. Contradictions are
-    averaged, not detected. Inside transformations, covariances are not checked.
+    averaged; a pose that contradicts the prior is UNVERIFIED. Inside transformations, covariances are not checked.
 
     Fixed directions act from the first update on: ξ along them stays 0, the covariance is 0 up to rounding,
     `directions.ties` are infinite, `information` leaves them out, and the clouds need not constrain them. A covariance
@@ -199,8 +206,14 @@ def register_from(
         if start is None:
             return RegistrationResult.without_pose(Status.TOO_FEW_CORRESPONDENCES)
         init, verified = start.matrix, start.success
+        options = replace(options, max_coarse_distance=coarse_distance_from(start, options))
     result = register_pair(source, target, method, init, options, tie_points, prior)
     return result if verified else unverified(result)
+
+
+def coarse_distance_from(start: GlobalPoseResult, options: Options) -> float:
+    """Largest coarse `max_distance` from a pose of `global_pose`, metres."""
+    return start.voxel_size if start.success and options.max_distance is None else np.inf
 
 
 def doubt_of(result: RegistrationResult) -> str | None:

@@ -54,6 +54,9 @@ from mcgicp_jax._terms.base import AbstractTerm, is_adaptive
 # The coarse phase ends with an update below its tolerances that moves the points by at most this fraction of the fine
 # maximum correspondence distance. It need not converge further: the fine phase starts from its pose.
 _FRACTION_OF_GATE = 0.25
+# Squared standard deviations of a prior beyond which a pose contradicts it: a right one in one of a million cases (χ²
+# with six degrees of freedom).
+_CONTRADICTION = 38.3
 # Three points determine a pose; a fourth makes residuals possible.
 _MIN_CORRESPONDENCES = 4
 # Candidates of each source point in soft matches. Their weights fall off with a temperature of one spacing of the
@@ -340,6 +343,7 @@ def update(
         (sums.num_inliers < _MIN_CORRESPONDENCES, Status.TOO_FEW_CORRESPONDENCES),
         (~finite, Status.NON_FINITE),
         (settled & degenerate, Status.DEGENERATE),
+        (settled & _contradicts_prior(pose, measurements), Status.UNVERIFIED),
         (settled, Status.CONVERGED),
         (num_iterations >= settings.max_iterations, Status.MAX_ITERATIONS),
         (coarse & ~converged, COARSE),
@@ -363,10 +367,19 @@ def update(
     )
 
 
+def _contradicts_prior(pose: jaxlie.SE3, measurements: PoseMeasurements | None) -> Bool[AnyScalar, ""]:
+    """Whether a pose that is the result is much further from the prior than its covariance allows."""
+    if not isinstance(measurements, Fusion):
+        return np.bool_(False)
+    rotation = pose.rotation().as_matrix().astype(measurements.center.dtype)
+    residual, _ = measurements.prior_residual(rotation, pose.translation())
+    return residual @ measurements.form.prior.information @ residual > _CONTRADICTION
+
+
 @jax.jit
 def root_of(state: State, fusion: Fusion | None) -> ImplicitRoot:
     """The equation that defines the final pose, for its derivative."""
-    converged = state.status == Status.CONVERGED
+    converged = (state.status == Status.CONVERGED) | (state.status == Status.UNVERIFIED)
     usable = converged | (state.status == Status.DEGENERATE) | (state.status == Status.MAX_ITERATIONS)
     if fusion is not None:
         rotation = state.pose.rotation().as_matrix().astype(state.sums.center.dtype)

@@ -35,7 +35,8 @@ class Options:
     """Options of `register`, documented there; batches, odometry and the command line take the same ones.
 
     Attributes:
-        min_coarse_distance: least coarse `max_distance` at all scales, metres: how far off the initial pose may be.
+        min_coarse_distance, max_coarse_distance: least and largest coarse `max_distance` at all scales, metres, but
+            not below the fine one: how far off the initial pose may be.
     """
 
     max_distance: Distance | None = None
@@ -50,6 +51,7 @@ class Options:
     max_source_points: int | None = _ENOUGH_SOURCE_POINTS
     soft_matches: bool | None = None
     min_coarse_distance: float = 0.0
+    max_coarse_distance: Any = np.inf
 
     def __post_init__(self) -> None:
         for name, number in self.numbers.items():

@@ -47,8 +47,9 @@ from mcgicp_jax._registration.loop import LoopResult, Problem, State
 from mcgicp_jax._registration.on_host import HostExecutor
 from mcgicp_jax._registration.options import Options, check_method
 from mcgicp_jax._registration.pose_derivative import Inputs, differentiated, jacobian, with_derivatives
-from mcgicp_jax._registration.result import RegistrationResult, is_usable
+from mcgicp_jax._registration.result import USABLE, RegistrationResult, is_usable
 from mcgicp_jax._registration.settings import settings_for, spacing_of
+from mcgicp_jax._registration.start_check import BETTER, LEAST_FIT, distance_moved, surface_fit
 from mcgicp_jax._registration.tie_points_and_prior import (
     GivenPrior,
     GivenTiePoints,
@@ -160,7 +161,8 @@ def run_pair(given: Inputs, init: Pose | None, options: Options, traced: bool = 
     def solve(inputs: Inputs, init: Pose | None, options: Options = options) -> Run:
         problem, inputs = problem_of(inputs, init, options, search.num_threads)
         if measures:
-            problem = measured(problem, given.tie_points, given.prior, traced)
+            limits = options.max_distance is None
+            problem = measured(problem, given.tie_points, given.prior, traced, limits=limits)
         return run_loop(inputs, problem, search, options.max_iterations, traced)
 
     if not traced and isinstance(given.method, GICP):
@@ -169,21 +171,26 @@ def run_pair(given: Inputs, init: Pose | None, options: Options, traced: bool = 
         check_channels(given.source, given.target, given.method)
         warn_of_units(given.source, given.target)
     *coarse, inputs = _at_scales(_equalized(given) if options.equalize_channels else given, options.voxel_sizes)
+    start, near = init, replace(options, max_coarse_distance=0.0)
     for scale in coarse:
-        (result,) = results_of([solve(scale, init, replace(options, max_distance=None))], [None])
-        init = result.matrix if is_usable(result) else init
-    run = solve(inputs, init)
+        (result,) = results_of([solve(scale, start, replace(options, max_distance=None))], [None])
+        start = result.matrix if is_usable(result) else start
+    run = solve(inputs, start)
+    if not traced and _may_have_left(run, init, len(coarse) > 0):
+        run = _better(run, solve(inputs, init, near))
     if options.equalize_channels and not any(term.estimates_gains for term in run.problem.terms):
         # Parameters left None are chosen anew, from the channels as equalised by the matches.
         again = _equalized(run.inputs._replace(method=inputs.method), _nearest_points(run, search))
-        run = solve(again, _final_pose(run))
+        run = solve(again, _final_pose(run), near)
     elif compares_channels:
         warn_of_exposure(inputs.source, inputs.target, lambda: _nearest_points(run, search))
     if not measures:
         return run
     # Again from its pose, with tie points and prior weighed by its covariance.
     fusion = fusion_of(run.loop.state, run.moments(), run.inputs.tie_points, run.inputs.prior, traced)
-    problem = replace(run.problem, start=constant(run.loop.state.pose), measurements=fusion)
+    settings = run.problem.settings
+    settings = settings._replace(max_distance=settings.fine_distance)
+    problem = replace(run.problem, start=constant(run.loop.state.pose), settings=settings, measurements=fusion)
     return run_loop(run.inputs, problem, search, options.max_iterations, traced)
 
 
@@ -281,6 +288,27 @@ def rows_to_match(source: PointCloud, options: Options) -> Int[AnyArray, "n"] | 
     """The source rows that `max_source_points` leaves; None for all."""
     limit = options.max_source_points
     return None if limit is None or limit >= source.valid.size else spread_rows(source.valid, limit)
+
+
+def _may_have_left(run: Run, init: Pose | None, at_scales: bool) -> bool:
+    """Whether a registration on the host may have left a right initial pose: it has moved the points by more than the
+    fine `max_distance`, and surfaces do not coincide at its pose."""
+    settings, state = run.problem.settings, run.loop.state
+    if not (at_scales or settings.max_distance > settings.fine_distance) or state.status not in USABLE:
+        return False
+    source, target = run.inputs[:2]
+    start = se3_from_matrix(centred_pose(init, source, target), source.points.dtype)
+    return distance_moved(start, state) > settings.fine_distance and _fit(run) < LEAST_FIT
+
+
+def _better(run: Run, other: Run) -> Run:
+    """The other registration of the same clouds, if its surfaces coincide better."""
+    evidence = [float(each.loop.state.record.num_inliers) * _fit(each) for each in (run, other)]
+    return other if other.loop.state.status in USABLE and evidence[1] > BETTER * evidence[0] else run
+
+
+def _fit(run: Run) -> float:
+    return surface_fit(run.inputs, cast(HostExecutor, run.executor), run.loop)
 
 
 def _equalized(given: Inputs, matches: Correspondences | None = None) -> Inputs:

@@ -37,7 +37,8 @@ class Status(enum.IntEnum):
         NON_FINITE: the pose or the sums overflowed or became NaN.
         INVALID_INPUT: `register` would raise a `ValueError` for this pair. Only in batches; the pose is NaN.
         WORKER_FAILED: two workers in turn failed with this pair. Only in batches; the pose is NaN.
-        UNVERIFIED: with `init="global"`, the pose is registered, but it may be wrong: `global_pose` had no success.
+        UNVERIFIED: the pose is registered, but it may be wrong: with `init="global"`, `global_pose` had no success; or
+            the pose contradicts the `prior`, by more standard deviations than in one of a million right cases.
     """
 
     CONVERGED = 0
@@ -70,7 +71,7 @@ _ADVICE = {
     Status.NON_FINITE: "numerical overflow; are the coordinates in metres?",
     Status.INVALID_INPUT: "register raises an error for this pair; see its warning",
     Status.WORKER_FAILED: "two workers failed with this pair; try register, or smaller clouds",
-    Status.UNVERIFIED: "the clouds may not show the same place, or other poses fit as well; "
+    Status.UNVERIFIED: "the clouds may not show the same place, other poses fit as well, or the prior contradicts it; "
     "look at the clouds at this pose, or try clouds that show more of the scene",
 }
 
@@ -289,13 +290,16 @@ class RegistrationResult(eqx.Module):
         )
 
 
+USABLE = (Status.CONVERGED, Status.DEGENERATE, Status.MAX_ITERATIONS)
+
+
 def is_usable(result: RegistrationResult) -> bool:
     """Whether the pose may start another registration: it is finite and based on enough matches.
 
     This includes MAX_ITERATIONS and DEGENERATE, where unconstrained directions may still have their initial values, but
     not UNVERIFIED: other registrations would inherit a wrong pose, and end as CONVERGED.
     """
-    return result.status in (Status.CONVERGED, Status.DEGENERATE, Status.MAX_ITERATIONS)
+    return result.status in USABLE
 
 
 def computed(result: RegistrationResult) -> RegistrationResult:

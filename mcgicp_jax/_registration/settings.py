@@ -118,7 +118,9 @@ def settings_for(
         return number(_COARSE_TOLERANCE * numpy_for(value, least).maximum(value, least), dtype)
 
     coarse, fine = max_distance if isinstance(max_distance, tuple) or np.shape(max_distance) else [max_distance] * 2
-    coarse = numpy_for(coarse).maximum(coarse, options.min_coarse_distance)
+    limits = options.min_coarse_distance, options.max_coarse_distance
+    xp = numpy_for(coarse, fine, limits)
+    coarse = xp.maximum(xp.clip(coarse, *limits), fine)
     return Settings(
         max_distance=number(coarse, dtype),
         fine_distance=number(fine, dtype),

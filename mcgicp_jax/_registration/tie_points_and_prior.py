@@ -14,7 +14,7 @@ from jaxtyping import Float
 
 from mcgicp_jax._clouds.origins import centred_pose
 from mcgicp_jax._clouds.point_cloud import PointCloud
-from mcgicp_jax._compute.concrete import AnyArray, constant, is_concrete, outside_trace
+from mcgicp_jax._compute.concrete import AnyArray, AnyScalar, constant, is_concrete, numpy_for, outside_trace
 from mcgicp_jax._compute.linear_maps import primal
 from mcgicp_jax._math.poses import matrix_of, translation_adjoint
 from mcgicp_jax._math.symmetric_matrices import inverse_6
@@ -37,6 +37,8 @@ from mcgicp_jax._registration.loop import Problem, State
 _ASYMMETRY, _LEAST_EIGENVALUE = 1e-5, 1e-12
 # Largest rounding of the information of a prior, with lengths in units of the cloud: a standard deviation of 3 %.
 _LARGEST_ERROR = 1e3
+# Standard deviations of a prior, of the motion of a point, within which the right pose is expected.
+_DEVIATIONS = 3.0
 # Source points (n, 3), target points (n, 3) and covariances (n, 3, 3); pose and covariance (6, 6).
 if TYPE_CHECKING:
     GivenTiePoints: TypeAlias = tuple[Any, Any, Any]
@@ -136,8 +138,12 @@ def _information(
     return root.T @ root, _orthonormal(rows[fixed], lengths)
 
 
-def measured(problem: Problem, ties: TiePoints | None, prior: Prior | None, traced: bool) -> Problem:
-    """The problem of a first registration with tie points and a prior, which act from the start on."""
+def measured(
+    problem: Problem, ties: TiePoints | None, prior: Prior | None, traced: bool, *, limits: bool = False
+) -> Problem:
+    """The problem of a first registration with tie points and a prior, which act from the start on. If the prior
+    `limits` it, the coarse `max_distance` is at most what the prior leaves between the initial pose and the right one.
+    """
     dtype, (start, ties, prior) = problem.start.wxyz_xyz.dtype, constant((problem.start, ties, prior))
     rows = problem.source.search
     xp: Any = jnp if traced else np
@@ -159,8 +165,26 @@ def measured(problem: Problem, ties: TiePoints | None, prior: Prior | None, trac
         matrix[:3, :3] @ mean + matrix[:3, 3],
         xp.sqrt(xp.where(square > 0, square, 1)),
     )
-    measurements = as_dtype(PoseMeasurements(*place, form_at(*place, ties, prior)))
-    return replace(problem, start=start, measurements=measurements, fixed=fixed)
+    form, settings = form_at(*place, ties, prior), problem.settings
+    if limits and prior is not None:
+        most = xp.asarray(place[3] * _distance_to_prior(place[0], form.prior), dtype)
+        nearer = xp.maximum(xp.minimum(settings.max_distance, most), settings.fine_distance)
+        settings = settings._replace(max_distance=nearer)
+    measurements = as_dtype(PoseMeasurements(*place, form))
+    return replace(problem, start=start, measurements=measurements, fixed=fixed, settings=settings)
+
+
+def _distance_to_prior(rotation: Float[AnyArray, "3 3"], prior: Prior) -> Float[AnyScalar, ""]:
+    """Largest probable distance of a pose with this rotation, to which `PoseForm.prior` refers, from the right one, in
+    units of the radius; infinite if some direction is not known."""
+    xp = numpy_for(rotation, prior)
+    fixed = 0.0 if prior.fixed is None else prior.fixed.T @ prior.fixed
+    # Fixed directions count as if they were the most certain ones.
+    variance = xp.trace(inverse_6(prior.information + fixed * (1 + xp.trace(prior.information))))
+    turn = xp.linalg.norm(prior.rotation - rotation) / np.sqrt(2)
+    known = xp.isfinite(variance) & (variance > 0)
+    deviation = xp.sqrt(xp.where(known, variance, 1))
+    return xp.where(known, xp.linalg.norm(prior.translation) + turn + _DEVIATIONS * deviation, xp.inf)
 
 
 def fusion_of(state: State, moments: Moments, ties: TiePoints | None, prior: Prior | None, traced: bool) -> Fusion:

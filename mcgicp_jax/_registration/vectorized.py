@@ -20,7 +20,7 @@ import jax.numpy as jnp
 import jaxlie
 import numpy as np
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
-from jaxtyping import Array, Bool, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from mcgicp_jax._clouds.point_cloud import PointCloud
 from mcgicp_jax._compute.devices import default_devices
@@ -57,11 +57,13 @@ class LanePair(NamedTuple):
 
     Attributes:
         start: initial pose of the centred clouds.
+        max_coarse_distance: as in `Options`.
         source, target: finite points, padded to a size class, origin and names left out; neighbours that are None are
             found on the devices.
     """
 
     start: jaxlie.SE3
+    max_coarse_distance: Any
     source: PointCloud
     target: PointCloud
 
@@ -165,7 +167,7 @@ class _Group(Generic[Key]):
                 raise
             begun = [*self._running.values(), *(pair for _, pair in self._chunk)]
             if self._per_device == 1:
-                rows = " and ".join(str(cloud.valid.size) for cloud in begun[0][1][1:])
+                rows = " and ".join(str(cloud.valid.size) for cloud in begun[0][1][2:])
                 raise MemoryError(
                     f"the memory of the device does not suffice for a pair padded to {rows} points; average the points "
                     "in larger voxels, or use KDTreeSearch()"
@@ -210,11 +212,11 @@ class _Group(Generic[Key]):
         pairs = [pair for _, (_, pair) in self._chunk]
         pairs += pairs[-1:] * (self._size - count)
         alike = _shapes(pairs[0].source) == _shapes(pairs[0].target)
-        starts, *sides = zip(*pairs, strict=True)
+        starts, distances, *sides = zip(*pairs, strict=True)
         # A cloud that is the source of one pair and the target of another one is prepared once.
         distinct = [_distinct(clouds, len(self._devices)) for clouds in ([sides[0] + sides[1]] if alike else sides)]
         clouds, rows = zip(*distinct, strict=True)
-        chunk = _stacked(starts), clouds, np.concatenate(rows).reshape(2, self._size).T
+        chunk = _stacked(starts), np.stack(distances), clouds, np.concatenate(rows).reshape(2, self._size).T
         self._begun = self._begin_lanes(*jax.device_put(chunk, self._sharding))
 
     def _fill(self) -> bool:
@@ -264,6 +266,7 @@ def _put(lanes: Lanes, chunk: Lanes, numbers: Int[Array, "n"], rows: Int[Array, 
 @partial(jax.jit, static_argnames="num_neighbors")
 def with_neighbors(
     starts: jaxlie.SE3,
+    max_coarse_distances: Float[Array, "n"],
     clouds: tuple[PointCloud, ...],
     rows: Int[Array, "pairs 2"],
     search: AbstractSearch,
@@ -286,7 +289,9 @@ def with_neighbors(
 
     ready = [jax.vmap(with_own)(stacked) for stacked in clouds]
     sides = zip((ready[0], ready[-1]), rows.T, strict=True)
-    return LanePair(starts, *(jax.tree.map(itemgetter(numbers), stacked) for stacked, numbers in sides))
+    return LanePair(
+        starts, max_coarse_distances, *(jax.tree.map(itemgetter(numbers), stacked) for stacked, numbers in sides)
+    )
 
 
 @with_settings_of_package
@@ -304,7 +309,8 @@ def begin_lanes(
     options = replace(options, **numbers)
 
     def begin(pair: LanePair) -> Lanes:
-        problem, _ = problem_of(Inputs(pair.source, pair.target, method, robust), None, options, 1)
+        own = replace(options, max_coarse_distance=pair.max_coarse_distance)
+        problem, _ = problem_of(Inputs(pair.source, pair.target, method, robust), None, own, 1)
         problem = replace(problem, start=pair.start)
         return problem, TracedExecutor(problem, search, options.max_iterations).begin()
 

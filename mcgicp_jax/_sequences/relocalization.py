@@ -9,7 +9,7 @@ from mcgicp_jax._clouds.point_cloud import PointCloud
 from mcgicp_jax._clouds.preprocess import with_neighbors
 from mcgicp_jax._clouds.voxel_map import VoxelMap
 from mcgicp_jax._global_pose.global_pose import global_pose
-from mcgicp_jax._global_pose.surface_agreement import spreads
+from mcgicp_jax._local_geometry.surface_agreement import spreads
 from mcgicp_jax._methods.base import AbstractMethod
 from mcgicp_jax._registration.options import Options
 from mcgicp_jax._registration.register_pair import register_pair

@@ -13,7 +13,7 @@ from mcgicp_jax._search.kd_tree import nearest_in_position
 
 # Least thickness of a neighbourhood, as a fraction of its standard deviation along the surface: √ε of GICP. Without
 # noise it is 0 on planes, where the misfit would be rounding.
-_THINNEST = 0.032
+THINNEST = 0.032
 # Numbers of points that are compared, and of normals by which the directions of surfaces are counted. Twice as many
 # points cost 2 % of the time of `global_pose`.
 _SAMPLE, _NUM_NORMALS = 2048, 400
@@ -29,9 +29,7 @@ def surface_agreement(
 ) -> tuple[float, float]:
     """Misfit and agreement of the normals of matched points of preprocessed clouds at a pose; ∞ and 0 without matches.
 
-    The misfit is a quantile of the distances along the normals, in thicknesses of the neighbourhoods; the agreement is
-    the fraction of normals that agree. Both weigh each direction of surfaces equally, so that the ground does not
-    outvote the few surfaces that make a place. `max_distance` of matches is in metres.
+    See `agreement_of`; `max_distance` of matches is in metres.
     """
     points, others = (np.asarray(cloud.points, np.float64) for cloud in (source, target))
     count = min(len(points), _SAMPLE)
@@ -45,9 +43,24 @@ def surface_agreement(
     rows, matches, offsets = rows[matched], matches[matched], others[matches[matched]] - moved[matched]
     thin, _, normals = spreads(points, source.deferred_neighbors, rows)
     other_thin, _, other_normals = spreads(others, target.deferred_neighbors, matches)
-    normals = rotated(normals, rotation)
-    across = [np.abs(np.sum(offsets * axes, axis=1)) for axes in (normals, other_normals)]
-    distances = np.maximum(*across) / np.sqrt(0.5 * (thin**2 + other_thin**2))
+    return agreement_of(offsets, (rotated(normals, rotation), other_normals), (thin, other_thin))
+
+
+def agreement_of(
+    offsets: Float[np.ndarray, "n 3"],
+    both_normals: tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3"]],
+    thicknesses: tuple[Float[np.ndarray, "n"], Float[np.ndarray, "n"]],
+) -> tuple[float, float]:
+    """Misfit and agreement of the normals of matches, from the difference of their points, their normals in one frame,
+    and the thicknesses of their neighbourhoods, metres.
+
+    The misfit is a quantile of the distances along the normals, in thicknesses of the neighbourhoods; the agreement is
+    the fraction of normals that agree. Both weigh each direction of surfaces equally, so that the ground does not
+    outvote the few surfaces that make a place.
+    """
+    normals, other_normals = both_normals
+    across = [np.abs(np.sum(offsets * axes, axis=1)) for axes in both_normals]
+    distances = np.maximum(*across) / np.sqrt(0.5 * np.sum(np.square(thicknesses), axis=0))
     sample = normals[:: -(-len(normals) // _NUM_NORMALS)]
     same = np.abs(np.einsum("ik,jk->ij", sample, normals)) > _SAME_DIRECTION
     # A normal that resembles no other of the sample counts as if it were one more.
@@ -69,4 +82,4 @@ def spreads(
     offsets -= offsets.mean(axis=1, keepdims=True)
     squares, axes = np.linalg.eigh(offsets.swapaxes(1, 2) @ offsets / near.shape[1])
     thin, along, _ = np.sqrt(np.maximum(squares.T, np.finfo(np.float32).tiny))
-    return np.maximum(thin, _THINNEST * along), along, axes[:, :, 0]
+    return np.maximum(thin, THINNEST * along), along, axes[:, :, 0]

@@ -1,0 +1,106 @@
+"""What is known of an initial pose decides how far matches may be; a right one is not left."""
+
+import jax
+import numpy as np
+import pytest
+
+import mcgicp_jax as mcg
+from mcgicp_jax import Status
+from tests.promise_scenes import office, translation
+from tests.scenes import motion
+
+GICP = mcg.GICP()
+# Metres and radians.
+PRIOR = np.diag(np.repeat([0.05, np.radians(1)], 3) ** 2)
+
+
+def error(result, truth=None):
+    """Largest distance between the two positions of a point within 3 m of the origin, metres; the truth is the identity
+    if it is None."""
+    matrix = np.asarray(result.matrix, np.float64)
+    change = (matrix if truth is None else np.linalg.inv(truth) @ matrix) - np.eye(4)
+    return np.linalg.norm(change[:3, 3]) + 3 * np.linalg.norm(change[:3, :3], 2)
+
+
+# Pairs whose coarse phase leaves the right pose, and the fraction that they have in common.
+LEFT = [(2000, 0, 0.8), (2000, 1, 0.8), (4000, 1, 0.8), (2000, 0, 0.67), (4000, 1, 0.5)]
+
+
+@pytest.mark.parametrize(("count", "seed", "common"), LEFT)
+def test_a_right_pose_is_not_left(count, seed, common):
+    pair = office(seed, count, common)
+    near = motion((0.03, -0.04, 0.01, 0.0, 0.01, -0.02))
+    for init in (None, near):
+        result = mcg.register(pair.source, pair.target, GICP, init=init)
+        assert result.converged and error(result) < 0.08 and result.overlap < 0.75
+
+
+def test_a_far_pose_is_left():
+    """Without the coarse phase the pose is wrong."""
+    target, *_, source = mcg.datasets.box_room(4, seed=2)
+    truth = np.linalg.inv(target.pose) @ source.pose
+    near = mcg.register(source.cloud, target.cloud, GICP, max_distance=0.15)
+    far = mcg.register(source.cloud, target.cloud, GICP)
+    assert error(near, truth) > 0.3 and far.converged and error(far, truth) < 0.03
+
+
+def test_scales_do_not_leave_a_right_pose():
+    pair = office(1, 4000)
+    result = mcg.register(pair.source, pair.target, GICP, voxel_sizes=(0.4,))
+    assert result.converged and error(result) < 0.03
+
+
+def test_batches_find_the_same():
+    pairs = [office(seed, 2000) for seed in (0, 1)]
+    sources, targets, _ = zip(*pairs, strict=True)
+    batch = mcg.register_batch(sources, targets, GICP)
+    for source, target, result in zip(sources, targets, batch, strict=True):
+        np.testing.assert_array_equal(result.matrix, mcg.register(source, target, GICP).matrix)
+
+
+@pytest.mark.parametrize(
+    ("search", "seed", "count"), [(None, 1, 4000), pytest.param(mcg.DenseSearch(), 2, 2000, marks=pytest.mark.slow)]
+)
+def test_global_poses_are_not_left(search, seed, count):
+    pair = office(seed, count)
+    (result,) = mcg.register_batch([pair.source], [pair.target], GICP, init="global", search=search)
+    assert result.converged and error(result) < 0.05
+
+
+# --- Priors
+
+
+def test_a_prior_decides_how_far_matches_may_be():
+    pair = office(1, 4000)
+    for pose in (np.eye(4), motion((0.05, 0.03, -0.04, 0.01, 0.01, -0.01))):
+        result = mcg.register(pair.source, pair.target, GICP, prior=(pose, PRIOR))
+        assert result.converged and error(result) < 0.03
+
+
+@pytest.mark.slow
+def test_a_prior_decides_inside_jit():
+    """Where no second attempt is made."""
+    pair = office(1, 2000)
+    source, target = (mcg.preprocess(cloud) for cloud in pair[:2])
+
+    @jax.jit
+    def registered(pose, covariance):
+        result = mcg.register(source, target, GICP, prior=(pose, covariance))
+        return result.status_code, result.T_target_source.as_matrix()
+
+    host = mcg.register(source, target, GICP, prior=(np.eye(4), PRIOR))
+    status, matrix = registered(np.eye(4, dtype=np.float32), PRIOR.astype(np.float32))
+    assert status == Status.CONVERGED
+    np.testing.assert_allclose(matrix, host.matrix, atol=1e-3)
+    # Half a metre off along the room, ten deviations.
+    status, _ = registered(translation(0.5, 0, 0).astype(np.float32), PRIOR.astype(np.float32))
+    assert status == Status.UNVERIFIED
+
+
+@pytest.mark.parametrize(("metres", "status"), [(0.1, Status.CONVERGED), (0.5, Status.UNVERIFIED)])
+def test_a_pose_that_contradicts_its_prior_is_unverified(metres, status):
+    pair = office(3, 4000)
+    away = translation(metres, 0, 0)
+    result = mcg.register(pair.source, pair.target, GICP, init=np.eye(4), prior=(away, PRIOR))
+    assert result.status is status and error(result) < 0.03
+    assert np.isfinite(result.covariance).all()
