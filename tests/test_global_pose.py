@@ -14,6 +14,8 @@ from mcgicp_jax._global_pose.robust_pose_fit import NUM_MATCHES, PutativeMatches
 from mcgicp_jax._local_geometry.surface_agreement import surface_agreement
 from mcgicp_jax.metrics import pose_error
 from tests.compilations import compilations
+from tests.promise_scenes import NOISE, office, rects
+from tests.promise_scenes import box as furniture
 from tests.refusals import refused
 from tests.scenes import room_corner, wall
 
@@ -318,6 +320,51 @@ def box(size, seed):
 def test_two_boxes_do_not_match(size):
     source = mcg.PointCloud(box((2, 1.2, 1), 1)).transform(anywhere(6))
     assert not mcg.global_pose(source, box(size, 2)).success
+
+
+def parted(seed, count, common):
+    """Two parts of a furnished room, the source moved far away, and the true pose."""
+    pair, away = office(seed, count, common), anywhere(seed)
+    return pair.source.transform(away), pair.target, np.linalg.inv(away)
+
+
+@pytest.mark.parametrize("common", [0.8, 0.67, 0.5])
+def test_walls_alone_do_not_suffice_in_sparse_clouds(common):
+    """After half a turn the walls of two parts of a room coincide, and in voxels of 0.25 m furniture hardly shows."""
+    source, target, truth = parted(4, 2000, common)
+    result = mcg.global_pose(source, target)
+    # It may find the right pose.
+    assert not result.success or found(result, truth, source)
+
+
+@pytest.mark.parametrize(("seed", "common"), [(3, 0.67), (1, 0.5)])
+def test_furniture_decides_where_walls_coincide_twice(seed, common):
+    """The wrong pose has more overlap and half of the inliers, or more, but its surfaces coincide less."""
+    source, target, truth = parted(seed, 8000, common)
+    result = mcg.global_pose(source, target)
+    assert result.success and found(result, truth, source)
+    other = result.runner_up
+    assert other.num_inliers >= 0.5 * result.num_inliers and other.overlap > 1.2 * result.overlap
+
+
+def bays(seed, number=3, period=2.0):
+    """Equal bays in front of a wall."""
+    rng, length = np.random.default_rng(seed), number * period
+    sides = [((0, 0, 0), (length, 0, 0), (0, 3, 0)), ((0, 3, 0), (length, 0, 0), (0, 0, 3))]
+    for x in period * np.arange(number):
+        sides += furniture((x + 0.3, 2.2, 0), (x + 1, 3, 1.1)) + furniture((x + 1.3, 1, 0), (x + 1.6, 1.3, 2))
+        sides += furniture((x + 0.2, 0.4, 0), (x + 0.5, 1.2, 0.5))
+    return mcg.PointCloud(rects(rng, 8000, sides) + NOISE * rng.normal(size=(8000, 3)))
+
+
+def test_overlap_decides_where_a_scene_repeats():
+    """One bay further along the wall all surfaces coincide as well, but one bay of three has no counterpart."""
+    source, target, away = bays(0), bays(1), anywhere(0)
+    source = source.transform(away)
+    result = mcg.global_pose(source, target)
+    assert result.success and found(result, np.linalg.inv(away), source)
+    other = result.runner_up
+    assert other.num_inliers >= 0.5 * result.num_inliers and other.overlap < 0.8 * result.overlap
 
 
 def test_a_symmetric_scene_is_ambiguous():

@@ -31,7 +31,7 @@ from mcgicp_jax._methods.icp import GICP
 from mcgicp_jax._methods.multichannel_gicp import MultiChannelGICP
 from mcgicp_jax._registration.options import Options
 from mcgicp_jax._registration.register_pair import register_pair
-from mcgicp_jax._registration.result import RegistrationResult, is_usable
+from mcgicp_jax._registration.result import is_usable
 from mcgicp_jax._search.kd_tree import nearest_in_position
 
 # Source rows and target rows of the matches.
@@ -53,9 +53,17 @@ _NUM_NEIGHBORS = 20
 # leaves a direction of motion unconstrained, and smallest number of inliers: from the development half of
 # `tests/benchmarks/global_pose_verdicts`.
 _LEAST, _LEAST_UNCONSTRAINED, _MIN_INLIERS = 0.21, 0.7, 10
-# Smallest fractions of the best pose's inliers and overlap with which another pose is a rival, which makes the result
-# ambiguous. Scans of a road reach 0.75 of the inliers with 0.83 of the overlap at another place along it.
-_RIVAL, _RIVAL_OVERLAP = 0.5, 0.9
+# With fewer voxels than this, a success needs more, by the power 3/2 of their number. Where walls coincide at a wrong
+# pose, 15 to 40 matches are inliers by chance, however few there are, and furniture is no larger than a neighbourhood
+# of a sparse cloud. On the development half no wrong pose is accepted with powers of 1.5 to 2 and 3,000 to 4,000
+# voxels; larger ones accept fewer right poses.
+_DENSE, _SPARSE_POWER = 3000, 1.5
+# Smallest fractions of the best pose's inliers, overlap and (a/m)² with which another pose is a rival, which makes the
+# result ambiguous; with more support than the best pose, any overlap. Scans of a road reach 0.75 of the inliers with
+# 0.83 of the overlap at another place along it. Parts of a furnished room reach 0.5 to 1.9 of the inliers with up to
+# twice the overlap after half a turn, but 0.3 to 0.75 of (a/m)²; the two poses of halls that are the same after half a
+# turn, 0.86 to 1.2.
+_RIVAL_INLIERS, _RIVAL_OVERLAP, _RIVAL_AGREEMENT = 0.5, 0.9, 0.8
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,20 +74,28 @@ class Candidate:
         matrix: (4, 4) float64, T_target_source, metres.
         num_inliers: number of matches whose points are at most 1.5 voxels apart at this pose.
         overlap: fraction of the source's voxels with a voxel of the target within 1.5 voxels.
+        agreement, support: (a/m)² and the support, see `GlobalPoseResult.support`.
     """
 
     matrix: Float[np.ndarray, "4 4"]
     num_inliers: int
     overlap: float
+    agreement: float
+    support: float
 
     @property
     def evidence(self) -> float:
-        """Inliers × overlap, by which poses are ranked."""
-        return self.num_inliers * self.overlap
+        """Inliers × agreement, by which poses are ranked. Overlap does not count: it is larger where the walls of two
+        parts of a room coincide after half a turn than at the right pose."""
+        return self.num_inliers * self.agreement
 
     def rivals(self, best: Candidate) -> bool:
         """Whether this pose is about as good as the best one."""
-        return self.num_inliers >= _RIVAL * best.num_inliers and self.overlap >= _RIVAL_OVERLAP * best.overlap
+        return (
+            self.num_inliers >= _RIVAL_INLIERS * best.num_inliers
+            and self.agreement >= _RIVAL_AGREEMENT * best.agreement
+            and (self.overlap >= _RIVAL_OVERLAP * best.overlap or self.support > best.support)
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -97,11 +113,12 @@ class GlobalPoseResult:
         num_matches: number of matches, inliers and outliers.
         support: i/√n (a/m)² of the best pose, for i inliers of the n matches within the overlap; a, the fraction of
             normals that agree within 30°; and m, at least 1, the 90 % quantile of the distances along the normals, in
-            thicknesses of the neighbourhoods; divided by 0.21, or by 0.7 where the shape of the clouds leaves a
-            direction of motion unconstrained, as on a plane or in a corridor, so that surfaces coincide at wrong poses,
-            too. a and m weigh all directions of surfaces equally.
-        runner_up: the second-best pose that differs from the best one by more than five voxels. None if no such pose
-            had at least half as many inliers as the best one before the verification.
+            thicknesses of the neighbourhoods. a and m weigh all directions of surfaces equally. Divided by what wrong
+            poses do not reach: 0.21; 0.21 (3000 / N)^1.5 for N < 3000 voxels of the smaller cloud, which show little
+            but walls; and at least 0.7 where the shape of the clouds leaves a direction of motion unconstrained, as on
+            a plane or in a corridor, so that surfaces coincide at wrong poses, too.
+        runner_up: the second-best pose that differs from the best one by more than five voxels; one that is about as
+            good, if there is any. None if no other pose was verified: all had less than half the inliers.
         voxel_size: metres; edge of the voxels for which features are computed.
     """
 
@@ -262,12 +279,21 @@ class _Scene(NamedTuple):
         square = np.sum((a - b)[:3, 3] ** 2) + 0.5 * self.radius**2 * np.sum((a - b)[:3, :3] ** 2)
         return bool(square <= (MIN_SEPARATION * self.voxel_size) ** 2)
 
-    def candidate(self, matrix: Float[np.ndarray, "4 4"]) -> Candidate:
-        matches = self.matches
-        moved = np.asarray(matches.source, np.float64) @ matrix[:3, :3].T + matrix[:3, 3]
-        within = np.linalg.norm(moved - matches.target, axis=1) <= TOLERANCE * self.voxel_size
+    def candidate(self, matrix: Float[np.ndarray, "4 4"], constrained: bool) -> Candidate:
+        """The pose with its support: see `GlobalPoseResult.support`."""
+        distance, valid = TOLERANCE * self.voxel_size, np.asarray(self.matches.valid)
+        matched, targets = (np.asarray(side, np.float64)[valid] for side in (self.matches.source, self.matches.target))
+        moved = matched @ matrix[:3, :3].T + matrix[:3, 3]
+        inliers = int(np.sum(np.linalg.norm(moved - targets, axis=1) <= distance))
+        misfit, same = surface_agreement(matrix, self.source, self.target, distance)
+        agreement = (same / max(misfit, 1.0)) ** 2
+        num_voxels = min(len(cloud.points) for cloud in (self.source, self.target))
+        support = inliers / np.sqrt(max(self.is_near(matrix, matched).sum(), 1)) * agreement
+        least = _LEAST * max(_DENSE / num_voxels, 1.0) ** _SPARSE_POWER
+        if not constrained:
+            least = max(least, _LEAST_UNCONSTRAINED)
         overlap = float(np.mean(self.is_near(matrix, self.source.points)))
-        return Candidate(matrix, int(np.sum(np.asarray(matches.valid) & within)), overlap)
+        return Candidate(matrix, inliers, overlap, agreement, float(support / least))
 
 
 def _best_pose(
@@ -280,41 +306,31 @@ def _best_pose(
     num_matches = int(matches.valid.sum())
     if not verified:
         return _no_pose(num_matches, scene.voxel_size)
-    verified = sorted(verified, key=lambda pair: -pair[0].evidence)
-    support = _support(*verified[0], scene)
-    for pose, _ in verified:
+    for pose in verified:
         pose.matrix[:3, 3] += target_center - pose.matrix[:3, :3] @ source_center
-    best, *others = (pose for pose, _ in verified)
-    enough = best.num_inliers >= _MIN_INLIERS and support >= 1
-    rivals = any(other.rivals(best) for other in others)
+    best, *others = sorted(verified, key=lambda pose: -pose.evidence)
+    runner_up = max(others, key=lambda pose: (pose.rivals(best), pose.evidence), default=None)
+    enough = best.num_inliers >= _MIN_INLIERS and best.support >= 1
+    rivalled = runner_up is not None and runner_up.rivals(best)
     return GlobalPoseResult(
         matrix=best.matrix,
-        success=bool(enough and not rivals),
-        ambiguous=bool(enough and rivals),
+        success=bool(enough and not rivalled),
+        ambiguous=bool(enough and rivalled),
         num_inliers=best.num_inliers,
         num_matches=num_matches,
         overlap=best.overlap,
-        support=support,
-        runner_up=others[0] if others else None,
+        support=best.support,
+        runner_up=runner_up,
         voxel_size=scene.voxel_size,
     )
 
 
-def _support(pose: Candidate, registered: RegistrationResult, scene: _Scene) -> float:
-    """See `GlobalPoseResult.support`."""
-    misfit, agreement = surface_agreement(pose.matrix, scene.source, scene.target, TOLERANCE * scene.voxel_size)
-    within = scene.is_near(pose.matrix, scene.matches.source[np.asarray(scene.matches.valid)]).sum()
-    evidence = pose.num_inliers / np.sqrt(max(within, 1)) * (agreement / max(misfit, 1.0)) ** 2
-    constrained = is_usable(registered) and not registered.unconstrained_directions
-    return float(evidence / (_LEAST if constrained else _LEAST_UNCONSTRAINED))
-
-
-def _verified(poses: PoseHypotheses, scene: _Scene) -> list[tuple[Candidate, RegistrationResult]]:
+def _verified(poses: PoseHypotheses, scene: _Scene) -> list[Candidate]:
     """The best pose and its rivals, registered; without repetitions."""
     method = MultiChannelGICP() if scene.source.channels.shape[1] else GICP()
     distances = _VERIFIED_WITHIN[0] * scene.voxel_size, _VERIFIED_WITHIN[1] * scene.voxel_size
     options = Options(max_distance=distances, max_iterations=_VERIFIED_ITERATIONS)
-    verified: list[tuple[Candidate, RegistrationResult]] = []
+    verified: list[Candidate] = []
     started: list[np.ndarray] = []
     for start in _rivals(poses):
         if any(scene.are_same(start, other) for other in started):
@@ -322,17 +338,18 @@ def _verified(poses: PoseHypotheses, scene: _Scene) -> list[tuple[Candidate, Reg
         started.append(start)
         result = register_pair(scene.source, scene.target, method, start, options)
         # A registration that fails, as of clouds with a few coincident points, is no evidence against the matches.
-        matrix = np.array(result.matrix if is_usable(result) else start)
-        if not any(scene.are_same(matrix, other.matrix) for other, _ in verified):
-            verified.append((scene.candidate(matrix), result))
+        usable = is_usable(result)
+        matrix = np.array(result.matrix if usable else start)
+        if not any(scene.are_same(matrix, other.matrix) for other in verified):
+            verified.append(scene.candidate(matrix, usable and not result.unconstrained_directions))
     return verified
 
 
 def _rivals(poses: PoseHypotheses) -> Iterator[Float[np.ndarray, "4 4"]]:
-    """The best pose and those with at least `_RIVAL` of its score."""
+    """The best pose and those with at least `_RIVAL_INLIERS` of its score."""
     order = np.argsort(-poses.score, kind="stable")
     for i in order:
-        if poses.score[i] > 0 and poses.score[i] >= _RIVAL * poses.score[order[0]]:
+        if poses.score[i] > 0 and poses.score[i] >= _RIVAL_INLIERS * poses.score[order[0]]:
             matrix = np.eye(4)
             matrix[:3, :3], matrix[:3, 3] = poses.rotation[i], poses.translation[i]
             yield nearest_rotation(matrix)
