@@ -113,7 +113,7 @@ class Reference:
 _forces = jax.jit(lambda motion, matched, terms: linearize_at(motion, matched, terms)[1].force)
 
 
-def check(loss, reference, clouds, method, after=np.eye(4), accuracy=1e-6):
+def check(loss, reference, clouds, method, after=None, accuracy=1e-6):
     """The gradient of a loss of the pose of some inputs agrees with differences of the reference."""
     inputs = inputs_of(*clouds, method, None)
     if not method.uses_channels:
@@ -121,7 +121,8 @@ def check(loss, reference, clouds, method, after=np.eye(4), accuracy=1e-6):
     gradient = jax.grad(loss)(inputs)
 
     def expected(inputs):
-        return weigh(reference.pose(clouds_with(inputs, *clouds), inputs["method"]) @ after)
+        pose = reference.pose(clouds_with(inputs, *clouds), inputs["method"])
+        return weigh(pose if after is None else pose @ after)
 
     for name, actual, difference in directional_errors(expected, inputs, gradient):
         assert abs(actual - difference) <= accuracy * max(abs(difference), 1e-3), name

@@ -18,8 +18,7 @@ def test_snippets_run_as_printed(tmp_path, monkeypatch, capsys):
     for snippet in snippets:
         exec(compile(snippet, str(README), "exec"), namespace)
     assert "CONVERGED" in capsys.readouterr().out
-    gradient = namespace["gradient"]
-    assert gradient.shape == namespace["source_cloud"].channels.shape
-    assert abs(gradient).max() > 0
-    assert namespace["error"] < 0.02 and len(namespace["world"]) > 5000
+    # It trains: the error before is 0.014.
+    assert namespace["error"] < 0.005 and abs(namespace["weights"] - [1.5, 0]).max() < 0.5
+    assert len(namespace["world"]) > 5000
     assert len(namespace["results"]) == 4

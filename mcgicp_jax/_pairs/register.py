@@ -69,7 +69,7 @@ def register(
     these are several candidates per point whose weights have derivatives: see `soft_matches`.
     Of a DEGENERATE pose it is that within the constrained directions, which are constants, too, and 0 along the others.
     If registration fails otherwise, the derivative is 0, never NaN, except after MAX_ITERATIONS or if UNVERIFIED.
-    Outside `jit`, value and gradient take two to four registrations, for clouds of any size; inside, each size compiles
+    Outside `jit`, value and gradient take two to five registrations, for clouds of any size; inside, each size compiles
     for some ten seconds, so pad clouds (`PointCloud.pad`). `register_batch` differentiates many pairs at once.
 
     Args:

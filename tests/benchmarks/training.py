@@ -8,7 +8,10 @@ from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 from typing import Any, NamedTuple
 
+import jax
+import jax.numpy as jnp
 import numpy as np
+import optax
 
 import mcgicp_jax as mcg
 from tests.benchmarks import accuracy
@@ -17,12 +20,21 @@ from tests.benchmarks import accuracy
 # Shorter ones measure single matches that change, longer ones other minima.
 STEPS = (0.5, 1.0, 2.0)
 TIGHT = {"translation_tolerance": 1e-7, "rotation_tolerance": 1e-7, "max_iterations": 200}
-# Name: matches are soft, photometric term.
-DERIVATIVES = {"hard": (False, False), "soft": (True, False), "photometric": (False, True)}
+# By the resolved method of a pair.
+METHODS: dict[str, Callable[[Any], Any]] = {
+    "MC-GICP": lambda resolved: resolved,
+    "Color ICP": lambda resolved: mcg.ColorICP(resolved.channel_weights),
+    "photometric": lambda _: mcg.MultiChannelGICP(photometric=True),
+}
 LUMINANCE = np.array([[0.299], [0.587], [0.114]])
-# Pairs of a training step, at most so many errors of which count, metres + radians: lost pairs teach nothing.
-LARGEST_ERROR = 0.1
-NUM_STEPS, RATE, SEEDS = 60, 0.02, (0, 1, 2)
+# Training: number of views of the table for it (of six, each flat and as recorded), steps, and seeds of the network.
+NUM_TRAINING, NUM_STEPS, SEEDS = 4, 60, (0, 1, 2)
+# Adam's step; the largest error of a pair that counts, metres + radians, since lost pairs teach nothing.
+RATE, LARGEST_ERROR = 0.02, 0.1
+# Four inputs, hidden units and one output: 199 weights.
+HIDDEN = 33
+# How far off the parameters of the method begin: factors of those chosen from the data.
+START = {"α": 0.1, "Λ": 100.0}
 
 
 class Pair(NamedTuple):
@@ -66,11 +78,15 @@ def tables(suffix: str) -> Iterator[Pair]:
     return pairs_of(accuracy.table(suffix), lambda cloud: with_lamp(grey(cloud)), 0.02)
 
 
-SETS: dict[str, Callable[[], Iterator[Pair]]] = {
-    "flat tables": lambda: tables("_flat"),
-    "tables as recorded": lambda: tables(""),
-    "posters": lambda: pairs_of(itertools.islice(accuracy.wall(1.0), 4), with_lamp, None),
-    "LiDAR": lambda: pairs_of(itertools.islice(accuracy.kitti(("intensity",)), 0, 8, 2), with_falling_gain, 0.5),
+# Name: pairs, and `max_distance`.
+SETS: dict[str, tuple[Callable[[], Iterator[Pair]], float | None]] = {
+    "flat tables": (lambda: tables("_flat"), 0.05),
+    "tables as recorded": (lambda: tables(""), 0.05),
+    "posters": (lambda: pairs_of(itertools.islice(accuracy.wall(1.0), 4), with_lamp, None), None),
+    "LiDAR": (
+        lambda: pairs_of(itertools.islice(accuracy.kitti(("intensity",)), 0, 8, 2), with_falling_gain, 0.5),
+        None,
+    ),
 }
 
 
@@ -86,47 +102,147 @@ def fields(pair: Pair) -> Iterator[np.ndarray]:
     yield from ((along**2 - 1) * channels for along in (x, y))
 
 
-def error_of(pair: Pair, method: Any, channels: Any, **options: Any) -> Any:
-    """Error of the pose, metres + radians."""
-    moved = pair.source.replace(channels=channels)
-    result = mcg.register(moved, pair.target, method, **{"init": pair.truth} | TIGHT | options)
-    return sum(mcg.metrics.pose_error(result.matrix, pair.truth))
+def slopes(pair: Pair, method: Any, resolved: Any, options: dict[str, Any]) -> dict[str, list[float]]:
+    """Slopes of the pose error (metres + radians) along the fields: differences of whole registrations from the truth,
+    and derivatives by hard and by soft matches."""
+    channels, weights = np.asarray(pair.source.channels), np.asarray(resolved.channel_weights)
+    points, nearest = pair.target.points, pair.target.neighbors[:, 1]
+    spacing = np.median(np.linalg.norm(points[nearest] - points, axis=1))
+    moves = [spacing / np.sqrt(np.mean(np.sum((weights * each) ** 2, axis=1))) * each for each in fields(pair)]
+
+    def registered(channels: Any, **given: Any) -> Any:
+        moved = pair.source.replace(channels=channels)
+        return mcg.register(moved, pair.target, method, **{"init": pair.truth} | TIGHT | options | given)
+
+    def error(channels: Any, **given: Any) -> Any:
+        return sum(mcg.metrics.pose_error(registered(channels, **given).matrix, pair.truth))
+
+    def difference(move: np.ndarray) -> float:
+        changes = [(error(channels + step * move) - error(channels - step * move)) / (2 * step) for step in STEPS]
+        return float(np.mean(changes))
+
+    found = {"differences": [difference(move) for move in moves]}
+    pose = registered(channels).matrix
+    for name, soft in (("hard", False), ("soft", True)):
+        gradient = np.asarray(jax.grad(partial(error, init=pose, soft_matches=soft))(channels))
+        found[name] = [float((gradient * move).sum()) for move in moves]
+    return found
 
 
-def cosines(make: Callable[[Any], Any], names: Sequence[str]) -> list[list[str]]:
-    """Rows of a table: derivatives along smooth fields, against differences of the whole registration from the truth.
-
-    `make` makes the method from the resolved one of a pair.
-    """
-    import jax
-
-    rows = []
-    for name in names:
-        found: dict[str, list[float]] = {each: [] for each in ("differences", *DERIVATIVES)}
-        for pair in SETS[name]():
-            resolved = mcg.MultiChannelGICP().resolve(pair.source, pair.target)
-            channels, weights = np.asarray(pair.source.channels), np.asarray(resolved.channel_weights)
-            spacing = np.median(
-                np.linalg.norm(pair.target.points[pair.target.neighbors[:, 1]] - pair.target.points, axis=1)
-            )
-            scaled = [spacing / np.sqrt(((weights * field) ** 2).sum(axis=1).mean()) * field for field in fields(pair)]
-            error = partial(error_of, pair, make(resolved))
-            for field in scaled:
-                slopes = [(error(channels + s * field) - error(channels - s * field)) / (2 * s) for s in STEPS]
-                found["differences"].append(float(np.mean(slopes)))
-            start = mcg.register(pair.source, pair.target, make(resolved), init=pair.truth, **TIGHT).matrix
-            for label, (soft, photometric) in DERIVATIVES.items():
-                method = mcg.MultiChannelGICP(photometric=True) if photometric else make(resolved)
-                loss = partial(error_of, pair, method, soft_matches=soft, init=pair.truth if photometric else start)
-                gradient = np.asarray(jax.grad(loss)(channels))
-                found[label] += [float((gradient * field).sum()) for field in scaled]
-        expected = np.array(found.pop("differences"))
-        for label, slopes in found.items():
-            ours = np.array(slopes)
+def cosines(name: str, methods: Sequence[str]) -> Iterator[list[str]]:
+    """Rows of the table: how the derivatives of all pairs and fields of a set agree with the differences."""
+    make, max_distance = SETS[name]
+    pairs = [(pair, mcg.MultiChannelGICP().resolve(pair.source, pair.target)) for pair in make()]
+    for method in methods:
+        each = [
+            slopes(pair, METHODS[method](resolved), resolved, {"max_distance": max_distance})
+            for pair, resolved in pairs
+        ]
+        expected, *others = (
+            np.concatenate([found[label] for found in each]) for label in ("differences", "hard", "soft")
+        )
+        for label, ours in zip(("hard", "soft"), others, strict=True):
             lengths = np.linalg.norm(ours), np.linalg.norm(expected)
             cosine = ours @ expected / max(lengths[0] * lengths[1], 1e-300)
             same = f"{(ours * expected > 0).sum()} of {len(ours)}"
-            rows.append(
-                [name, type(make(resolved)).__name__, label, f"{cosine:.2f}", f"{lengths[0] / lengths[1]:.2f}", same]
-            )
-    return rows
+            yield [name, method, label, f"{cosine:.2f}", f"{lengths[0] / lengths[1]:.2f}", same]
+
+
+# Training
+
+
+def weights_of(seed: int) -> dict[str, Any]:
+    """A network of 199 weights that changes nothing yet."""
+    rng = np.random.default_rng(seed)
+    return {
+        "in": jnp.asarray(rng.normal(size=(4, HIDDEN))),
+        "bias": jnp.zeros(HIDDEN),
+        "out": jnp.zeros((HIDDEN, 1)),
+        "gain": jnp.zeros(1),
+    }
+
+
+@jax.jit
+def gain_of(weights: dict[str, Any], points: Any, channels: Any) -> Any:
+    """A factor of the channel of each point, from its place in the view, its distance and its channel."""
+    distance = jnp.linalg.norm(points, axis=1, keepdims=True)
+    inputs = jnp.concatenate([3 * points[:, :2] / points[:, 2:], distance - 1, channels], axis=1)
+    return jnp.exp(jnp.tanh(inputs @ weights["in"] + weights["bias"]) @ weights["out"] + weights["gain"])
+
+
+def corrected(weights: dict[str, Any], cloud: Any) -> Any:
+    return cloud.replace(channels=cloud.channels * gain_of(weights, cloud.points, cloud.channels))
+
+
+def with_parameters(factors: dict[str, Any], method: Any) -> Any:
+    """The method with α and Λ multiplied."""
+    return mcg.MultiChannelGICP(
+        method.channel_covariance * jnp.exp(factors.get("Λ", 0.0)),
+        method.channel_weights * jnp.exp(factors.get("α", 0.0)),
+        min_eigenvalue=method.min_eigenvalue,
+    )
+
+
+def trained(name: str, seed: int, raw: Sequence[Any], method: Any) -> list[str]:
+    """A row of the table: errors of plain registration of the test pairs from the identity, before and after."""
+    parameters: Any = weights_of(seed) if name in ("network", "raw points") else {name: jnp.log(START[name])}
+    ready = [Pair(*(mcg.preprocess(cloud, 0.02) for cloud in pair[:2]), pair.truth) for pair in raw]
+    pairs = raw if name == "raw points" else ready
+    training, test = pairs[: 2 * NUM_TRAINING], pairs[2 * NUM_TRAINING :]
+
+    def errors(parameters: Any, pairs: Sequence[Pair], init: Any, max_distance: float) -> list[Any]:
+        given = method if name in ("network", "raw points") else with_parameters(parameters, method)
+        sides: list[Any] = [[pair[side] for pair in pairs] for side in (0, 1)]
+        if name in ("network", "raw points"):
+            sides = [[corrected(parameters, cloud) for cloud in clouds] for clouds in sides]
+        options = {"init": init, "max_distance": max_distance, "voxel_size": 0.02}
+        found = mcg.register_batch(*sides, given, **options)
+        return [sum(mcg.metrics.pose_error(each.matrix, pair.truth)) for each, pair in zip(found, pairs, strict=True)]
+
+    @jax.value_and_grad
+    def loss(parameters: Any) -> Any:
+        found = errors(parameters, training, [pair.truth for pair in training], 0.05)
+        return sum(jnp.minimum(error, LARGEST_ERROR) for error in found) / len(found)
+
+    def tested(parameters: Any) -> float:
+        return 1e3 * float(np.mean(errors(parameters, test, None, 0.1)))
+
+    optimizer = optax.adam(RATE if name in ("network", "raw points") else 10 * RATE)
+    state, before, losses, begin = optimizer.init(parameters), tested(parameters), [], 0.0
+    for _ in range(NUM_STEPS):
+        value, gradient = loss(parameters)
+        change, state = optimizer.update(gradient, state)
+        parameters = optax.apply_updates(parameters, change)
+        losses.append(1e3 * float(value))
+        # The first step compiles.
+        begin = begin or time.perf_counter()
+    seconds = (time.perf_counter() - begin) / (NUM_STEPS - 1)
+    after = tested(parameters)
+    fell = f"{100 * (1 - after / before):.0f} %"
+    return [
+        name,
+        str(seed),
+        f"{losses[0]:.1f}",
+        f"{np.mean(losses[-5:]):.1f}",
+        f"{before:.1f}",
+        f"{after:.1f}",
+        fell,
+        f"{seconds:.1f} s",
+    ]
+
+
+def training() -> Iterator[list[str]]:
+    """Rows of the table of training: eight pairs of four views of the table, tested on four pairs of two others."""
+    sets = [
+        [
+            Pair(*(with_lamp(grey(cloud)) for cloud in (pair.source, pair.target)), pair.truth)
+            for pair in accuracy.table(suffix)
+        ]
+        for suffix in ("_flat", "")
+    ]
+    raw = [pair for both in zip(*sets, strict=True) for pair in both]
+    resolved = [mcg.MultiChannelGICP().resolve(*(mcg.preprocess(cloud, 0.02) for cloud in pair[:2])) for pair in raw]
+    method = jax.tree.map(lambda *numbers: np.median(np.stack(numbers), axis=0), *resolved)
+    for name in ("network", "raw points", *START):
+        for seed in SEEDS if name == "network" else SEEDS[:1]:
+            yield trained(name, seed, raw, method)
