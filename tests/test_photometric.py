@@ -308,6 +308,21 @@ def test_units_and_useless_channels_do_not_matter(change):
     assert after.converged and mcg.metrics.pose_error(after.matrix, before.matrix)[0] < 1e-4
 
 
+def black(size, **settings):
+    """Seven tenths of the wall have no channels but 0."""
+    points, channels = wall(size, **settings)
+    return points, np.where(points[:, :1] < 1.4, 0, channels)
+
+
+def test_constant_parts_do_not_set_the_scale():
+    """Their residuals are 0 at any pose."""
+    source, target, truth = pair(black, 2000, truth=SMALL)
+    result = mcg.register(source, target, PHOTOMETRIC, max_distance=0.2)
+    assert result.status == mcg.Status.CONVERGED
+    shift = (result.matrix - truth)[:3] @ np.append(result.directions.center, 1)
+    assert (np.abs(shift) < 4 * result.deviations[:3]).all() and (result.deviations[:3] < 0.02).all()
+
+
 def test_gain_and_offset_are_estimated_with_the_pose():
     source, target, truth = pair(wall, 2000, truth=SMALL)
     darker = source.replace(channels=np.float32(0.7) * source.channels - np.float32(0.2))
