@@ -39,8 +39,8 @@ def with_settings_of_package(function: Callable[Parameters, Answer]) -> Callable
     """Decorator of functions in which JAX has the settings that the package needs, whatever users chose for their code.
 
     Optional checks are off: `debug_nans` and `debug_infs`, since NaN marks missing values here, strict promotion of
-    dtypes and ranks, and guards of transfers, since the host computes between programs. Products of matrices are in full precision: by default, GPUs round factors to 11 bits (TF32), that
-    is 5 cm at 100 m.
+    dtypes and ranks, and guards of transfers, since the host computes between programs. Products of matrices are in
+    full precision: by default, GPUs round factors to 11 bits (TF32), that is 5 cm at 100 m.
     """
 
     @functools.wraps(function)

@@ -112,8 +112,8 @@ def multiway(
         Clouds, poses, registrations and map.
 
     Raises:
-        ValueError: if there is no cloud, or a cloud or an argument is invalid or traced; the message names it. Failures to
-            register show in the status of the graph and of the registrations.
+        ValueError: if there is no cloud, or a cloud or an argument is invalid or traced; the message names it. Failures
+            to register show in the status of the graph and of the registrations.
     """
     check_method(method)
     check_preprocessing(voxel_size, num_neighbors)

@@ -132,8 +132,8 @@ def odometry(
         Iterator over one `OdometryStep` per frame, including the first.
 
     Raises:
-        ValueError: if an argument is invalid or traced; on iteration, if a cloud is. The message names the frame, and the
-            iteration may go on with the next one: that one is registered to the last valid frame.
+        ValueError: if an argument is invalid or traced; on iteration, if a cloud is. The message names the frame, and
+            the iteration may go on with the next one: that one is registered to the last valid frame.
 
     Warns:
         UserWarning: on iteration without `recover`, if a frame cannot be registered, or less than 10 % of its points
