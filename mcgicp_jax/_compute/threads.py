@@ -28,11 +28,11 @@ _SETTINGS: tuple[Any, ...] = (
     jax.numpy_dtype_promotion,
     jax.numpy_rank_promotion,
 )
-_GUARDS: tuple[Any, ...] = (
-    jax.transfer_guard_host_to_device,
-    jax.transfer_guard_device_to_device,
-    jax.transfer_guard_device_to_host,
-)
+_TO_DEVICE: Any = jax.transfer_guard_host_to_device
+_BETWEEN_DEVICES: Any = jax.transfer_guard_device_to_device
+_TO_HOST: Any = jax.transfer_guard_device_to_host
+# Values of guards that are not set.
+_OPEN = (None, "allow")
 
 
 def with_settings_of_package(function: Callable[Parameters, Answer]) -> Callable[Parameters, Answer]:
@@ -60,7 +60,7 @@ def with_settings_of_package(function: Callable[Parameters, Answer]) -> Callable
 
 def _unguarded() -> contextlib.AbstractContextManager[None]:
     """Context in which JAX transfers arrays as it needs to; only if a guard is set, since entering it takes 30 µs."""
-    unset = all(guard.value in (None, "allow") for guard in _GUARDS)
+    unset = _TO_DEVICE.value in _OPEN and _BETWEEN_DEVICES.value in _OPEN and _TO_HOST.value in _OPEN
     return contextlib.nullcontext() if unset else jax.transfer_guard("allow")
 
 
