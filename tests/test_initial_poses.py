@@ -7,7 +7,7 @@ import pytest
 import mcgicp_jax as mcg
 from mcgicp_jax import Status
 from tests.promise_scenes import office, translation
-from tests.scenes import motion
+from tests.scenes import motion, room_corner
 
 GICP = mcg.GICP()
 # Metres and radians.
@@ -104,3 +104,27 @@ def test_a_pose_that_contradicts_its_prior_is_unverified(metres, status):
     result = mcg.register(pair.source, pair.target, GICP, init=np.eye(4), prior=(away, PRIOR))
     assert result.status is status and error(result) < 0.03
     assert np.isfinite(result.covariance).all()
+
+
+# --- Robust kernels
+
+
+@pytest.fixture(scope="module")
+def corner():
+    return tuple(mcg.preprocess(room_corner(2000, seed=seed)[0]) for seed in (0, 50))
+
+
+@pytest.mark.parametrize("kernel", [mcg.Tukey, mcg.Welsch, mcg.GemanMcClure, mcg.Huber])
+def test_a_narrow_kernel_leaves_a_wrong_pose(corner, kernel):
+    result = mcg.register(*corner, GICP, init=motion((0.08, -0.05, 0.05, 0.01, 0.02, -0.01)), robust=kernel(0.05))
+    assert result.converged and error(result) < 0.03
+
+
+@pytest.mark.slow
+def test_kernels_are_wide_inside_jit(corner):
+    init = motion((0.08, -0.05, 0.05, 0.01, 0.02, -0.01))
+
+    def registered(scale):
+        return mcg.register(*corner, GICP, init=init, robust=mcg.Welsch(scale)).T_target_source.as_matrix()
+
+    np.testing.assert_allclose(jax.jit(registered)(0.05), registered(0.05), atol=1e-3)

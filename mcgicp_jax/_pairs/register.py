@@ -92,8 +92,9 @@ def register(
             converged when an update is below both. `translation_tolerance` None: 0.5 % of the spacing of the target.
             In float32, updates below some 1e-7 are rounding: smaller tolerances need float64.
         robust: kernel applied to the Mahalanobis distance of each match: `Huber`, `Cauchy`, `GemanMcClure`, `Tukey` or
-            `Welsch`. None: the kernel of the method (NDT: `Welsch`), if it has any. With `photometric=True` the kernel
-            is applied to each residual in standard deviations.
+            `Welsch`. None: the kernel of the method (NDT: `Welsch`), if it has any. In the coarse phase its scale is
+            multiplied by the ratio of the two `max_distance`. With `photometric=True` the kernel is applied to each
+            residual in standard deviations, in the fine phase.
         search: nearest-neighbour search; by default `KDTreeSearch`, and inside `jit` or `vmap` on accelerators
             `DenseSearch`.
         hold_unconstrained: if True, the pose is not updated along directions that neither the shape of the clouds nor

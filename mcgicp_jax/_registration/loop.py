@@ -78,6 +78,7 @@ class Problem(eqx.Module):
         matches: those of `estimate_pose`, at every pose; None if the loop searches for them.
         num_candidates: number of target points that a source point is matched with.
         temperature: of the soft matches by which the final pose is differentiated, metres; None for those of the loop.
+        widens_kernels: whether kernels are wide in the coarse phase: those of the user, not those of a method.
     """
 
     start: jaxlie.SE3
@@ -90,6 +91,7 @@ class Problem(eqx.Module):
     matches: Matches | None = None
     num_candidates: int = eqx.field(static=True, default=1)
     temperature: Any = None
+    widens_kernels: bool = eqx.field(static=True, default=False)
 
     def whole(self) -> Problem:
         """With all rows of both surfaces."""
@@ -108,6 +110,20 @@ class Problem(eqx.Module):
         settings = self.settings
         coarse: Any = (settings.fine_distance < settings.max_distance) | (settings.coarse_stride > 1)
         return numpy_for(coarse).where(coarse, np.int32(COARSE), np.int32(RUNNING))
+
+    def terms_at(self, status: Int[AnyScalar, ""], terms: tuple[AbstractTerm, ...]) -> tuple[AbstractTerm, ...]:
+        """The terms as they act at this status: kernels are wide in the coarse phase, if they are to be widened."""
+        if not self.widens_kernels:
+            return terms
+        factor = self.settings.kernel_width(status)
+
+        def widened(term: AbstractTerm) -> AbstractTerm:
+            if term.robust is None:
+                return term
+            scale = numpy_for(term.robust.scale, factor).asarray(term.robust.scale) * factor
+            return eqx.tree_at(lambda each: each.robust.scale, term, scale)
+
+        return tuple(map(widened, terms))
 
 
 class Record(NamedTuple):
@@ -181,7 +197,8 @@ class AbstractExecutor(abc.ABC):
         state = loop.state
         matches = self.match(state, loop.matches)
         terms = self.adapt(state, matches, loop.terms)
-        sums = self.sums(Motion.of(state.pose.wxyz_xyz), matches, terms, state.status == SETTLED)
+        used = self.problem.terms_at(state.status, terms)
+        sums = self.sums(Motion.of(state.pose.wxyz_xyz), matches, used, state.status == SETTLED)
         # The sums are not an output of the compiled update, which would copy them.
         return LoopResult(self.update(state, sums)._replace(sums=sums), matches, terms, loop.history)
 

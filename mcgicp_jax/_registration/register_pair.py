@@ -280,6 +280,7 @@ def problem_of(
         matches=matches,
         num_candidates=pair.method.num_candidates,
         temperature=constant(spacing_of(pair.method, target)) if soft else None,
+        widens_kernels=given.robust is not None and matches is None,
     )
     return problem, given._replace(method=pair.method, source_rows=rows)
 

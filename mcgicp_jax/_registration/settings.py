@@ -64,13 +64,18 @@ class Settings(NamedTuple):
         """Maximum correspondence distance at this status, metres."""
         return _either(status == COARSE, self.max_distance, self.fine_distance)
 
+    def kernel_width(self, status: Int[AnyScalar, ""]) -> AnyScalar:
+        """Factor of the scale of robust kernels at this status: residuals grow with the distance of the matches, and a
+        kernel that redescends would ignore all that could move the pose."""
+        return _either(status == COARSE, self.max_distance / self.fine_distance, 1.0)
+
     def stride(self, status: Int[AnyScalar, ""], num_iterations: Int[AnyScalar, ""]) -> Int[AnyScalar, ""]:
         """Stride of the source points at this status. Once `max_iterations` are done, all points are measured."""
         coarse = (status == COARSE) & (num_iterations < self.max_iterations)
         return _either(coarse, self.coarse_stride, np.int32(1))
 
 
-def _either(condition: Bool[AnyScalar, ""], one: AnyScalar, other: AnyScalar) -> AnyScalar:
+def _either(condition: Bool[AnyScalar, ""], one: AnyScalar, other: Any) -> Any:
     """One number or the other; on the host without a call of NumPy, which would take longer than the rest."""
     if isinstance(condition, np.bool_):
         return one if condition else other
