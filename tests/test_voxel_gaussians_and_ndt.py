@@ -10,6 +10,7 @@ import pytest
 
 import mcgicp_jax as mcg
 from mcgicp_jax import extend
+from mcgicp_jax._clouds.voxels import grid_of
 from mcgicp_jax.metrics import pose_error
 from tests.compilations import compilations
 from tests.differences import GATE, TO_ROUNDING, check_eager_gradient, weigh
@@ -45,10 +46,20 @@ def test_statistics_are_those_of_numpy():
     np.testing.assert_allclose(found.coordinates, means, atol=tolerance(1e-5, 1e-12))
     values = [np.mean(channels[cells == i], axis=0) for i in range(len(found))]
     np.testing.assert_allclose(found.channels, values, atol=tolerance(1e-6, 1e-12))
-    # Cells are voxels: no two have points in the same one.
-    voxels = np.floor((points + 100.0) / SIZE).astype(int)
-    assert all(len(np.unique(voxels[cells == i], axis=0)) == 1 for i in range(len(found)))
+    # Cells are voxels of the turned grid: each is one, and no two are the same.
+    voxels = np.floor(grid_of(cloud.coordinates).columns.T / SIZE).astype(int)
+    rows = [np.unique(voxels[cells == i], axis=0) for i in range(len(found))]
+    assert all(len(row) == 1 for row in rows) and len(np.unique(np.concatenate(rows), axis=0)) == len(found)
     assert np.bincount(cells[cells >= 0]).min() >= 6
+
+
+def test_cells_of_a_plane_along_the_axes_are_not_biased():
+    """At z = 0 a grid along the axes would cut it in two layers of cells, whose means are 0.8 σ off."""
+    rng = np.random.default_rng(0)
+    points = np.column_stack([rng.uniform(-3, 3, (6000, 2)), 0.01 * rng.normal(size=6000)])
+    cells, counts = mcg.voxel_gaussians(points, SIZE, return_counts=True)
+    heights = cells.points[:, 2] / (0.01 / np.sqrt(counts))
+    assert len(cells) > 200 and np.sqrt(np.mean(heights**2)) < 1.3
 
 
 def test_counts():

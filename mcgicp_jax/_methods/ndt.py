@@ -14,7 +14,7 @@ from jaxtyping import Array, Float, Int, Shaped
 from mcgicp_jax._clouds.point_cloud import PointCloud, Values, as_cloud
 from mcgicp_jax._clouds.preprocess import MIN_POINTS, finite_rows, preprocess, with_neighbors
 from mcgicp_jax._clouds.voxel_size import NUM_NEIGHBORS
-from mcgicp_jax._clouds.voxels import voxel_order
+from mcgicp_jax._clouds.voxels import grid_of, voxel_order
 from mcgicp_jax._compute.concrete import AnyArray, is_concrete, numpy_for
 from mcgicp_jax._compute.linear_maps import averaged
 from mcgicp_jax._compute.messages import check_integer, check_positive, is_number
@@ -87,7 +87,8 @@ def voxel_gaussians(
 
     Args:
         cloud: raw or preprocessed cloud, or (N, 3) array in metres, of all points: not downsampled.
-        voxel_size: edge of a voxel, metres.
+        voxel_size: edge of a voxel, metres. The grid of voxels is turned, differently for each cloud, as in
+            `preprocess`: errors of the cells of a plane along the grid are common to all of them.
         min_points: cells with fewer points are left out, as are those whose points coincide; at least 3.
         min_ratio: eigenvalues of a covariance below this fraction of its largest one are raised to it, so that the
             cells of planes and lines are kept; 0 to 1.
@@ -176,7 +177,7 @@ class _Cells:
         check_integer("min_points", min_points, 3)
         # Working by columns takes a third of the time of working by rows.
         points = _columns(cloud.coordinates if np.any(cloud.origin) else cloud.points)
-        self.order, self._starts = voxel_order(points, voxel_size)
+        self.order, self._starts = voxel_order(grid_of(points.T).columns, voxel_size)
         if channel_size is not None:
             self.order, self._starts = _split(self.order, self._starts, cloud, channel_size)
         self.counts = np.diff(self._starts, append=len(self.order))
