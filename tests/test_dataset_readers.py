@@ -54,6 +54,7 @@ def kitti_folder(tmp_path):
         [[10.5, 0, 0, 0.1], [10.5, 3, 1, 0.2], [5.5, -2, -0.5, 0.3], [-10.5, 0, 0, 0.4], [10.5, 9, 0, 0.5]]
     )
     around = np.random.default_rng(0).normal(scale=10, size=(50, 4))
+    around[:, 3] = np.abs(around[:, 3])
     for number, scan in ((3, ahead), (4, around)):
         scan.astype("<f4").tofile(folder / "velodyne" / f"{number:06d}.bin")
         save_image(folder / "image_2" / f"{number:06d}.png", ramp(41, 101).astype(np.uint8))

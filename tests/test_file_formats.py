@@ -1,6 +1,7 @@
 """Files: what is written comes back, what others write is understood, and what is broken says so in one ValueError."""
 
 import dataclasses
+import gzip
 import io as stdio
 import pickle
 import struct
@@ -18,6 +19,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from mcgicp_jax import PointCloud, io
+from mcgicp_jax.io.clouds import is_cloud
 from tests.refusals import refused
 
 RNG = np.random.default_rng(0)
@@ -375,7 +377,7 @@ def test_las_cannot_hold(tmp_path, named, points, channels, names):
 
 
 def test_kitti(tmp_path, data):
-    rows = RNG.uniform(-50, 50, (N, 4)).astype("<f4")
+    rows = (RNG.uniform(-50, 50, (N, 4)) * [1, 1, 1, 0] + RNG.random((N, 4)) * [0, 0, 0, 1]).astype("<f4")
     rows.tofile(tmp_path / "c.bin")
     cloud = io.read(tmp_path / "c.bin")
     np.testing.assert_array_equal(np.column_stack([cloud.points, cloud.channels]), rows)
@@ -383,6 +385,71 @@ def test_kitti(tmp_path, data):
     scan = io.read(data / "kitti/sequences/04/velodyne/000000.bin")
     assert len(scan) > 100_000 and scan.channels.min() >= 0 and scan.channels.max() < 1
     refused(lambda: io.write(tmp_path / "c.bin", PointCloud(np.full((2, 3), 5e5), np.ones(2))), "points", ".ply")
+
+
+def scan(num_points=480):
+    """Rays of four rings around a sensor, in the order of a scan: x, y, z, intensity, ring, time."""
+    time = np.linspace(0, 0.1, num_points)
+    angle, ring = 80 * np.pi * time, np.floor(40 * time)
+    radius = 5 + np.sin(5 * angle)
+    columns = [radius * np.cos(angle), radius * np.sin(angle), ring - 1.7, RNG.integers(0, 256, num_points), ring, time]
+    return np.stack(columns, axis=1)
+
+
+LAYOUTS = {
+    "KITTI": lambda rows: rows[:, :4],
+    "nuScenes": lambda rows: rows[:, :5],
+    "ring and time": lambda rows: rows,
+    "PCL": lambda rows: np.insert(np.insert(rows[:, :4], 3, 1, axis=1), [5, 5, 5], 0, axis=1),
+    "x, y, z": lambda rows: rows[:, :3],
+}
+
+
+@pytest.mark.parametrize("shuffled", [False, True])
+@pytest.mark.parametrize("name", LAYOUTS)
+def test_layouts_of_floats_are_told_apart(tmp_path, name, shuffled):
+    rows = scan()
+    rows = RNG.permutation(rows) if shuffled else rows
+    LAYOUTS[name](rows).astype("<f4").tofile(tmp_path / "c.bin")
+    if shuffled and name == "x, y, z":
+        # Nothing tells them from other columns.
+        with pytest.raises(ValueError, match=r"np\.fromfile.*reshape"):
+            io.read(tmp_path / "c.bin")
+        return
+    cloud = io.read(tmp_path / "c.bin")
+    np.testing.assert_array_equal(cloud.points, rows[:, :3].astype(np.float32))
+    np.testing.assert_array_equal(cloud.channels, rows[:, 3 : 3 + (name != "x, y, z")])
+
+
+@pytest.mark.parametrize("columns", [[0, 1, 2, 3, 5], [5, 0, 1, 2], [0, 1, 2, 3, 5, 5, 5]])
+def test_unknown_layouts_of_floats_are_refused(tmp_path, columns):
+    """The sensor would stand still in them."""
+    scan()[:, columns].astype("<f4").tofile(tmp_path / "c.bin")
+    with pytest.raises(ValueError, match=r"np\.fromfile.*reshape"):
+        io.read(tmp_path / "c.bin")
+
+
+def test_nuscenes_by_suffix(tmp_path):
+    rows = scan()[:, [0, 1, 2, 3, 5]].astype("<f4")
+    rows.tofile(tmp_path / "scan.PCD.bin")
+    cloud = io.read(tmp_path / "scan.PCD.bin")
+    np.testing.assert_array_equal(np.column_stack([cloud.points, cloud.channels]), rows[:, :4])
+    refused(lambda: io.write(tmp_path / "scan.pcd.bin", cloud), "path", ".ply")
+    (tmp_path / "other.pcd.bin").write_bytes(rows.tobytes()[:-4])
+    with pytest.raises(ValueError, match="five"):
+        io.read(tmp_path / "other.pcd.bin")
+
+
+@pytest.mark.parametrize("suffix", [suffix for suffix in FORMATS if suffix not in (".las", ".laz")])
+def test_gzip(tmp_path, seeds, suffix):
+    path = tmp_path / f"c{suffix}.gz"
+    path.write_bytes(gzip.compress(seeds[f"ours{suffix}"]))
+    (tmp_path / f"c{suffix}").write_bytes(seeds[f"ours{suffix}"])
+    same(io.read(path), io.read(tmp_path / f"c{suffix}"))
+    assert is_cloud(path)
+    path.write_bytes(gzip.compress(seeds[f"ours{suffix}"])[:-20])
+    refused(lambda: io.read(path), str(path))
+    refused(lambda: io.write(path, make()), "path", ".ply")
 
 
 def test_npz_of_others(tmp_path, data):
@@ -415,6 +482,20 @@ def test_npy_of_others(tmp_path, array):
         ("x y z r g b\n1 2 3 0.0 1.0 0.0\n4 5 6 1.0 1.0 1.0\n", RGB, [[0, 1, 0], [1, 1, 1]]),
         ("x y z r g b\n1 2 3 0 1 0\n4 5 6 0.5 1 1\n", RGB, [[0, 1, 0], [0.5, 1, 1]]),
         ("z,y,x,heat\n3,2,1,7\n6,5,4,8\n", ("heat",), [[7], [8]]),
+        # Names only where their number fits.
+        ("# format: x y z\n1 2 3 .5\n4 5 6 .6\n", ("channel_0",), [[0.5], [0.6]]),
+        ("# columns: x y z intensity\n1 2 3 8\n4 5 6 9\n", INTENSITY, [[8], [9]]),
+        ("// x, y, z, intensity\n1, 2, 3, 8\n4, 5, 6, 9\n", INTENSITY, [[8], [9]]),
+        # The index of pandas, and of R with its quotes.
+        (",x,y,z,intensity\n0,1,2,3,8\n1,4,5,6,9\n", INTENSITY, [[8], [9]]),
+        ('"x" "y" "z" "heat"\n"1" 1 2 3 8\n"2" 4 5 6 9\n', ("heat",), [[8], [9]]),
+        # The number of points, as CloudCompare writes it.
+        ("2\n1 2 3 8\n4 5 6 9\n", ("channel_0",), [[8], [9]]),
+        ("//X Y Z i\n2\n1 2 3 8\n4 5 6 9\n", INTENSITY, [[8], [9]]),
+        # Missing values.
+        ("x,y,z,i,heat\n1,2,3,,7\n4,5,6,9,\n", (*INTENSITY, "heat"), [[None, 7], [9, None]]),
+        ("x y z i\n1 2 3 -nan(ind)\n4 5 6 9\n", INTENSITY, [[None], [9]]),
+        ("x y z i\n1 2 3 1.#QNAN\n4 5 6 NA\n", INTENSITY, [[None], [None]]),
     ],
 )
 def test_text_of_others(tmp_path, text, names, channels):
@@ -423,7 +504,19 @@ def test_text_of_others(tmp_path, text, names, channels):
         cloud = io.read(tmp_path / f"c{suffix}")
         np.testing.assert_array_equal(cloud.points, [[1, 2, 3], [4, 5, 6]])
         assert cloud.channel_names == names
-        np.testing.assert_array_equal(cloud.channels, channels)
+        measured = np.array([[value is not None for value in row] for row in channels], bool).reshape(2, -1)
+        np.testing.assert_array_equal(True if cloud.channel_valid is None else cloud.channel_valid, measured)
+        np.testing.assert_array_equal(cloud.channels, np.where(measured, np.array(channels, float), 0))
+
+
+def test_comments_of_any_encoding(tmp_path):
+    (tmp_path / "c.txt").write_bytes("# Straße\n1 2 3\n4 5 6\n".encode("latin-1"))
+    np.testing.assert_array_equal(io.read(tmp_path / "c.txt").points, [[1, 2, 3], [4, 5, 6]])
+
+
+def test_text_with_another_number_of_names(tmp_path):
+    (tmp_path / "c.csv").write_text("x,y,z\n1,2,3,4,5\n")
+    refuses(tmp_path / "c.csv")
 
 
 # Broken files
@@ -450,7 +543,7 @@ def test_no_such_file(tmp_path):
         io.read(tmp_path / "folder.ply")
 
 
-@pytest.mark.parametrize("name", ["c.obj", "c", "c.ply.gz", ".ply"])
+@pytest.mark.parametrize("name", ["c.obj", "c", "c.obj.gz", ".ply"])
 def test_unknown_suffix(tmp_path, name):
     (tmp_path / name).write_bytes(b"1 2 3")
     refuses(tmp_path / name)

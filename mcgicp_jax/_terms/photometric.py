@@ -63,8 +63,8 @@ _VALUE_RADIUS = 1.25
 # randomly placed points lie within 5.4).
 _MAX_OFFSET = 5.0
 # Least slope of a residual that counts for its σ, relative to the root mean square: that of a constant part, as black
-# outside an image, is 0 up to rounding, and one of noise is below it once in 10⁶. (1e-4 to 0.03 differ by 3 % on posters
-# of which 0 to 60 % are black.)
+# outside an image, is 0 up to rounding, and one of noise is below it once in 10⁶. (1e-4 to 0.03 differ by 3 % on
+# posters of which 0 to 60 % are black.)
 _LEAST_SLOPE = 1e-3
 # Least σ, as an offset in spacings: rendered scenes leave no residuals.
 _LEAST_OFFSET = 1e-4

@@ -12,24 +12,36 @@ from numpy.lib import format as npy
 
 from mcgicp_jax._clouds.columns import COLORS, INTENSITIES
 from mcgicp_jax._clouds.point_cloud import PointCloud
+from mcgicp_jax.io.bin_layouts import columns_of_floats
 from mcgicp_jax.io.files import check_size, cloud_of
 
 # Metres: float32 resolves 8 mm at this distance; larger coordinates are not written, nor accepted as a KITTI scan.
 _KITTI_LIMIT = 1e5
 # Bound on the compression ratio of deflate.
-_DEFLATE_RATIO = 1032
+DEFLATE_RATIO = 1032
 _RGB_ARRAYS = ("rgb", "color", "colors", "colour", "colours")
 
 
 def read_kitti(file: BinaryIO, size: int) -> PointCloud:
     data = file.read()
-    if size % 16:
-        raise ValueError(f"expected rows of four float32 values, got {size} bytes")
-    rows = np.frombuffer(data, "<f4").reshape(-1, 4)
+    if size % 4:
+        raise ValueError(f"expected rows of float32 values, got {size} bytes")
     # The format has no signature. Text is recognised by its bytes, most other files by implausibly large coordinates.
-    if (data.isascii() and b"\0" not in data) or _beyond_kitti(rows[:, :3]):
+    if data.isascii() and b"\0" not in data:
         raise ValueError("it does not hold float32 coordinates in metres")
-    rows = rows.astype(np.float32)
+    cloud = cloud_of(columns_of_floats(np.frombuffer(data, "<f4").astype(np.float32)))
+    if _beyond_kitti(np.asarray(cloud.points)):
+        raise ValueError("it does not hold float32 coordinates in metres")
+    return cloud
+
+
+def read_nuscenes(file: BinaryIO, size: int) -> PointCloud:
+    """Five columns: x, y, z, intensity, ring."""
+    if size % 20:
+        raise ValueError(f"expected rows of five float32 values, got {size} bytes")
+    rows = np.frombuffer(file.read(), "<f4").reshape(-1, 5).astype(np.float32)
+    if _beyond_kitti(rows[:, :3]):
+        raise ValueError("it does not hold float32 coordinates in metres")
     return PointCloud(rows[:, :3], rows[:, 3], channel_names=["intensity"])
 
 
@@ -81,7 +93,7 @@ def read_npz(file: BinaryIO, size: int) -> PointCloud:
         def load(name: str) -> Shaped[np.ndarray, "..."]:
             entry = archive.getinfo(f"{name}.npy")
             with archive.open(entry) as stream:
-                return _read_array(stream, min(entry.file_size, _DEFLATE_RATIO * size))
+                return _read_array(stream, min(entry.file_size, DEFLATE_RATIO * size))
 
         names = [name.removesuffix(".npy") for name in archive.namelist()]
         if "points" not in names:

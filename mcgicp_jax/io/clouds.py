@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import gzip
+import io
 import os
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -35,6 +37,10 @@ class Format:
     is_cloud: Callable[[BinaryIO], bool] = lambda _: True
 
 
+def _not_written(file: BinaryIO, cloud: PointCloud) -> None:
+    raise ValueError("path: files of this kind are only read; .ply holds any cloud")
+
+
 _SPACES = Format(read_text, partial(write_text, delimiter=" ", mark="# "), is_text_cloud)
 # By lower-case suffix.
 FORMATS = {
@@ -43,6 +49,7 @@ FORMATS = {
     ".las": Format(read_las, partial(write_las, compress=False)),
     ".laz": Format(read_las, partial(write_las, compress=True)),
     ".bin": Format(arrays.read_kitti, arrays.write_kitti),
+    ".pcd.bin": Format(arrays.read_nuscenes, _not_written),
     ".npy": Format(arrays.read_npy, arrays.write_npy, arrays.is_npy_cloud),
     ".npz": Format(arrays.read_npz, arrays.write_npz, arrays.is_npz_cloud),
     ".xyz": _SPACES,
@@ -53,16 +60,34 @@ FORMATS = {
 
 def format_of(path: Path) -> Format:
     """The format for the suffix of a path; raises `ValueError` for an unknown suffix."""
-    try:
-        return FORMATS[path.suffix.lower()]
-    except KeyError:
+    file_format = _known_format(path)
+    if file_format is None:
         kind = "a folder" if path.is_dir() else f"unknown suffix {path.suffix!r}"
-        raise ValueError(f"{path}: {kind}; expected one of {', '.join(FORMATS)}") from None
+        raise ValueError(f"{path}: {kind}; expected one of {', '.join(FORMATS)}")
+    return file_format
+
+
+def _known_format(path: Path) -> Format | None:
+    """The format for the last two suffixes of a path or the last one, also of a file that gzip compressed."""
+    suffixes = [suffix.lower() for suffix in path.suffixes]
+    if suffixes[-1:] == [".gz"]:
+        inner = _known_format(path.with_suffix(""))
+        return inner and Format(
+            lambda file, size: inner.read(*_decompressed(file, size)),
+            _not_written,
+            lambda file: inner.is_cloud(_decompressed(file, os.fstat(file.fileno()).st_size)[0]),
+        )
+    return FORMATS.get("".join(suffixes[-2:])) or FORMATS.get("".join(suffixes[-1:]))
+
+
+def _decompressed(file: BinaryIO, size: int) -> tuple[BinaryIO, int]:
+    data = gzip.GzipFile(fileobj=file).read(arrays.DEFLATE_RATIO * size)
+    return io.BytesIO(data), len(data)
 
 
 def is_cloud(path: Path) -> bool:
     """Whether a file is a cloud by its suffix and, where this is not enough, by the start of its content."""
-    file_format = FORMATS.get(path.suffix.lower())
+    file_format = _known_format(path)
     if file_format is None:
         return False
     with open(path, "rb") as file:
@@ -90,8 +115,9 @@ def read(path: str | os.PathLike[str]) -> PointCloud:
     In every format, NaN in a channel means that the point lacks the channel; see `PointCloud.channel_valid`.
 
     Args:
-        path: the suffix, in any case, selects the format: `.ply`, `.pcd`, `.las`, `.laz`, `.bin` (KITTI), `.npy`,
-            `.npz`, `.xyz`, `.txt` or `.csv`.
+        path: the suffix, in any case, selects the format: `.ply`, `.pcd`, `.las`, `.laz`, `.bin` (float32: KITTI, or
+            nuScenes, with ring and time, PCL's 32 bytes or x, y, z alone where the columns fit), `.pcd.bin` (nuScenes),
+            `.npy`, `.npz`, `.xyz`, `.txt` or `.csv`, each also followed by `.gz`.
 
     Returns:
         Cloud of NumPy arrays: points (N, 3), metres, float64 if the file stores float64 (always for LAS and text);

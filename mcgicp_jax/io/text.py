@@ -19,11 +19,20 @@ from mcgicp_jax.io.poses import are_poses
 _MOST_LINES = 1000
 
 
+# Missing numbers as Windows, R and databases write them.
+_NO_NUMBER = re.compile(r"[+-]?(?:nan\([^)\s]*\)|1\.#(?:QNAN|SNAN|IND)\d*|\bNA\b|\bNULL\b)", re.IGNORECASE)
+
+
 def read_text(file: BinaryIO, size: int) -> PointCloud:
-    with io.TextIOWrapper(file, "utf-8-sig") as text:
+    with _as_text(file) as text:
         names, line, cells = _text_start(text)
-        delimiter = next((mark for mark in ",;" if mark in line), None)
-        table = np.loadtxt(itertools.chain([line], text), delimiter=delimiter, ndmin=2)
+        lines = _plain(line + text.read())
+    delimiter = _delimiter(line)
+    if delimiter is not None:
+        lines = re.sub(
+            rf"^[ \t]*(?={delimiter})|(?<={delimiter})[ \t]*(?={delimiter}|$)", "nan", lines, flags=re.MULTILINE
+        )
+    table = np.loadtxt(lines.splitlines(), delimiter=delimiter, ndmin=2)
     names = names or ["x", "y", "z", *(f"channel_{i}" for i in range(table.shape[1] - 3))]
     columns = dict(zip(names, table.T, strict=True))
     whole = [name for name, cell in zip(names, cells, strict=True) if cell.isdigit()]
@@ -35,9 +44,23 @@ def read_text(file: BinaryIO, size: int) -> PointCloud:
     return cloud_of(columns)
 
 
+def _as_text(file: BinaryIO) -> io.TextIOWrapper:
+    """Comments may have any encoding."""
+    return io.TextIOWrapper(file, "utf-8-sig", errors="replace")
+
+
+def _plain(lines: str) -> str:
+    """Without quotes, and with missing numbers as NaN."""
+    return _NO_NUMBER.sub("nan", lines.replace('"', ""))
+
+
+def _delimiter(line: str) -> str | None:
+    return next((mark for mark in ",;" if mark in line), None)
+
+
 def is_text_cloud(file: BinaryIO) -> bool:
     """Whether the first lines are rows of coordinates, and not of poses, a log or another table."""
-    with io.TextIOWrapper(file, "utf-8-sig") as text:
+    with _as_text(file) as text:
         try:
             names, line, cells = _text_start(text)
         except ValueError:
@@ -46,16 +69,31 @@ def is_text_cloud(file: BinaryIO) -> bool:
 
 
 def _text_start(text: io.TextIOWrapper) -> tuple[list[str], str, list[str]]:
-    """The column names, if given, the first line of numbers, and its cells."""
+    """The column names, if their number is that of the columns, the first line of numbers, and its cells.
+
+    A comment may have names after a colon. A name that is missing, first, is that of the index of pandas or R. A first
+    line with one number is that of the points.
+    """
     names: list[str] = []
+    commented = counted = False
     for line in text:
         comment = line.startswith(("#", "//"))
-        cells = re.split(r"[,;\s]+", line.strip("#/,; \t\r\n"))
-        if not comment and all(map(_is_number, cells)):
-            return names, line, cells
+        plain = _plain(line).strip("#/ \t\r\n" if comment else " \t\r\n")
+        cells = [cell.strip() for cell in plain.split(_delimiter(plain))]
+        if not comment and any(cells) and all(_is_number(cell or "nan") for cell in cells):
+            if len(cells) == 1 and cells[0].isdigit() and not counted:
+                counted = True
+                continue
+            if len(names) == len(cells) - 1 and not commented and names:
+                names = ["index", *names]
+            if len(names) != len(cells) and names and not commented:
+                raise ValueError(f"it names {len(names)} columns, and its rows have {len(cells)}")
+            return names if len(names) == len(cells) else [], line, cells
+        if comment:
+            cells = cells[1 + max((i for i, cell in enumerate(cells) if cell.endswith(":")), default=-1) :]
         if {"x", "y", "z"} <= {cell.lower() for cell in cells}:
-            names = cells
-        elif not comment and cells != [""]:
+            names, commented = [cell or "index" for cell in cells], comment
+        elif not comment and any(cells):
             raise ValueError(f"expected numbers or column names with x, y, z, got {line.strip()[:60]!r}")
     raise ValueError("it has no row of numbers")
 

@@ -1,0 +1,75 @@
+"""The columns of files of float32 values without a header: KITTI's, and others that have the same suffix."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+# Bound of the whole numbers of rings; the densest LiDARs have 128, and some count from 1.
+_MOST_RINGS = 256
+# Numbers of columns whose repetition is compared. A file is not of four columns if it repeats with another period that
+# is no multiple, so that values that far apart differ by less than this fraction of what those four apart do. (Of
+# periods that are not those of the file, 1.5 and more: KITTI, streets and rooms in scan order and shuffled.)
+_PERIODS, _REPEATS = (3, 5, 6, 7, 9, 10), 0.5
+# Values that are compared.
+_SAMPLE = 120_000
+
+# Padding of PCL's points is 0, or the bits of small integers, such as a ring, as float32.
+_PADDING = 1e-30
+
+
+def columns_of_floats(values: Float[np.ndarray, "n"]) -> dict[str, Float[np.ndarray, "N"]]:
+    """x, y, z and perhaps intensity, by the layout whose columns fit: KITTI (x, y, z, intensity), nuScenes (ring last),
+    ring and time last, PCL's points of 32 bytes (x, y, z, padding, intensity, padding), or x, y, z.
+
+    Raises:
+        ValueError: if none fits.
+    """
+
+    def split(size: int) -> Any:
+        return values.reshape(-1, size).T if values.size % size == 0 else None
+
+    def named(columns: Any, *others: int) -> dict[str, Float[np.ndarray, "N"]]:
+        return dict(zip(("x", "y", "z", "intensity"), [*columns[:3], *(columns[i] for i in others)], strict=False))
+
+    columns = split(8)
+    if columns is not None and _is_constant(columns[3]) and (np.abs(columns[5:]) < _PADDING).all():
+        return named(columns, 4)
+    for size in (6, 5):
+        columns = split(size)
+        if columns is not None and _is_intensity(columns[3]) and _is_ring(columns[4]):
+            return named(columns, 3)
+    steps = {size: _step(values[:_SAMPLE], size) for size in (4, *_PERIODS)}
+    columns = split(4)
+    if columns is not None and _is_intensity(columns[3]) and min(steps.values()) >= _REPEATS * steps[4]:
+        return named(columns, 3)
+    columns = split(3)
+    if columns is not None and steps[3] < _REPEATS * min(steps[size] for size in (4, 5, 7, 10)):
+        return named(columns)
+    raise ValueError(
+        "its columns are neither those of KITTI (x, y, z, intensity) nor of another known layout; with k columns, of "
+        "which the first are x, y, z: mcg.PointCloud(np.fromfile(path, '<f4').reshape(-1, k)[:, :3])"
+    )
+
+
+def _step(values: Float[np.ndarray, "n"], size: int) -> float:
+    """Median difference of values that are `size` apart."""
+    differences = np.abs(values[size:] - values[: max(values.size - size, 0)])
+    differences = differences[np.isfinite(differences)]
+    return float(np.median(differences)) if differences.size else np.inf
+
+
+def _is_constant(column: Float[np.ndarray, "N"]) -> bool:
+    return bool((column == column[:1]).all())
+
+
+def _is_intensity(column: Float[np.ndarray, "N"]) -> bool:
+    return not (column < 0).any()
+
+
+def _is_ring(column: Float[np.ndarray, "N"]) -> bool:
+    """Small whole numbers, not all the same."""
+    whole = (column == np.rint(column)) & (column >= 0) & (column < _MOST_RINGS)
+    return bool(whole.all()) and not _is_constant(column)
