@@ -316,6 +316,39 @@ def test_pcd_text_with_any_white_space(tmp_path):
     assert cloud.channel_names == INTENSITY
 
 
+@pytest.mark.parametrize("data", ["ascii", "binary"])
+def test_pcd_of_others(tmp_path, data):
+    """A byte order mark, a comment in another encoding, a field without values."""
+    header = b"\xef\xbb\xbf# Stra\xdfe\nFIELDS x y z i none\nSIZE 4 4 4 4 8\nTYPE F F F F F\nCOUNT 1 1 1 1 0\n"
+    header += b"WIDTH 2\nHEIGHT 1\nPOINTS 2\n"
+    rows = np.array([[1, 2, 3, 4], [5, 6, 7, np.nan]], "<f4")
+    body = b"1 2 3 4\n5 6 7 -nan(ind)\n" if data == "ascii" else rows.tobytes()
+    (tmp_path / "c.pcd").write_bytes(header + f"DATA {data}\n".encode() + body)
+    cloud = io.read(tmp_path / "c.pcd")
+    np.testing.assert_array_equal(cloud.points, rows[:, :3])
+    np.testing.assert_array_equal(np.where(cloud.channel_valid, cloud.channels, np.nan), rows[:, 3:])
+
+
+def test_a_packed_colour_that_is_no_number_is_missing(tmp_path):
+    header = "FIELDS x y z rgb\nSIZE 4 4 4 4\nTYPE F F F F\nCOUNT 1 1 1 1\nWIDTH 3\nHEIGHT 1\nPOINTS 3\nDATA ascii\n"
+    grey = repr(np.uint32(0x808080).view(np.float32).item())
+    (tmp_path / "c.pcd").write_text(header + f"1 2 3 {grey}\n4 5 6 nan\n7 8 9 -nan\n")
+    cloud = io.read(tmp_path / "c.pcd")
+    np.testing.assert_array_equal(cloud.channel_valid, np.repeat([[True], [False], [False]], 3, axis=1))
+    np.testing.assert_allclose(cloud.channels[0], 128 / 255, rtol=1e-6)
+
+
+@pytest.mark.parametrize("text", [True, False])
+def test_ply_with_comments_of_any_kind(tmp_path, text):
+    rows = structured(**xyz(), heat=np.arange(N, dtype=np.float32))
+    write_ply(tmp_path / "plain.ply", rows, text)
+    for comment in (b"comment Stra\xdfe", b"comment end_header", b"obj_info end_header \xff"):
+        for mark in (b"", b"\xef\xbb\xbf"):
+            content = (tmp_path / "plain.ply").read_bytes().replace(b"element", comment + b"\nelement", 1)
+            (tmp_path / "c.ply").write_bytes(mark + content)
+            same(io.read(tmp_path / "c.ply"), io.read(tmp_path / "plain.ply"))
+
+
 def test_real_pair_is_the_same_in_both_formats(data):
     for ply, pcd, num_points in [("source", "251371071", 69792), ("target", "251370668", 69088)]:
         a, b = (io.read(data / "lidar_pair" / name) for name in (f"{ply}.ply", f"{pcd}.pcd"))
@@ -469,6 +502,14 @@ def test_npy_of_others(tmp_path, array):
     np.save(tmp_path / "c.npy", array)
     cloud = io.read(tmp_path / "c.npy")
     np.testing.assert_array_equal(np.column_stack([cloud.points, cloud.channels]), array)
+
+
+def test_npy_of_named_columns(tmp_path):
+    rows = structured(**xyz(), intensity=np.arange(N), ring=np.arange(N))
+    np.save(tmp_path / "c.npy", rows)
+    cloud = io.read(tmp_path / "c.npy")
+    assert is_cloud(tmp_path / "c.npy") and cloud.channel_names == INTENSITY
+    np.testing.assert_array_equal(cloud.channels[:, 0], np.arange(N))
 
 
 @pytest.mark.parametrize(

@@ -23,6 +23,8 @@ _NOT_CHANNELS = re.compile(
     "[xyz_]|rgba?|a|(diffuse_)?alpha|n[xyz]|normal_[xyz]|curvature|vp_[xyz]|label|class|classification|object|instance|"
     "id|index|ring|line|tag|row|column|range|t|time|timestamp|gps_time|offset_time"
 )
+# The bits of NaN in float32, which stand for no colour where four bytes hold one.
+_NO_COLOR = np.float32(np.nan).view(np.uint32)
 
 
 def channel_name(column: str) -> str | None:
@@ -67,6 +69,9 @@ def with_unpacked_colors(columns: Columns) -> Columns:
         if columns[packed].dtype.itemsize == 4:
             bits = np.ascontiguousarray(columns[packed]).view(np.uint32)
             colors = {name: (bits >> shift).astype(np.uint8) for name, shift in zip(COLORS, (16, 8, 0), strict=True)}
+            missing = bits == _NO_COLOR
+            if missing.any():
+                colors = {name: np.where(missing, np.nan, values / np.float32(255)) for name, values in colors.items()}
             columns = {name: values for name, values in columns.items() if name != packed} | colors
     return columns
 

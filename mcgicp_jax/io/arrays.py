@@ -59,14 +59,18 @@ def write_kitti(file: BinaryIO, cloud: PointCloud) -> None:
 
 def read_npy(file: BinaryIO, size: int) -> PointCloud:
     array = _read_array(file, size)
+    if array.dtype.names is not None:
+        return PointCloud(array)
     if array.ndim != 2 or array.shape[1] < 3:
         raise ValueError(f"expected an array of shape (N, 3 + C), got {array.shape}")
     return PointCloud(array[:, :3], array[:, 3:])
 
 
 def is_npy_cloud(file: BinaryIO) -> bool:
-    """Whether it holds rows of numbers, and not a pose or several."""
-    shape, _ = _npy_header(file)
+    """Whether it holds rows of numbers or of named columns, and not a pose or several."""
+    shape, dtype = _npy_header(file)
+    if dtype.names is not None:
+        return {"x", "y", "z"} <= {name.lower() for name in dtype.names}
     return len(shape) == 2 and shape[1] >= 3 and shape != (4, 4)
 
 

@@ -15,6 +15,14 @@ import numpy as np
 from mcgicp_jax._clouds.columns import COLORS, Columns, arrays_of_columns, channel_name
 from mcgicp_jax._clouds.point_cloud import PointCloud
 
+# Missing numbers as Windows, R and databases write them.
+_NO_NUMBER = re.compile(r"[+-]?(?:nan\([^)\s]*\)|1\.#(?:QNAN|SNAN|IND)\d*|\bNA\b|\bNULL\b)", re.IGNORECASE)
+
+
+def plain_numbers(text: str) -> str:
+    """Text without quotes, and with missing numbers as NaN."""
+    return _NO_NUMBER.sub("nan", text.replace('"', ""))
+
 
 def check_size(claimed: int, size: int) -> None:
     """Raise `ValueError` if a header claims more bytes than there are, before a library allocates them."""

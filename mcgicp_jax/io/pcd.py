@@ -11,7 +11,7 @@ import numpy as np
 from mcgicp_jax._clouds.columns import COLORS, with_unpacked_colors
 from mcgicp_jax._clouds.point_cloud import PointCloud
 from mcgicp_jax._compute.messages import optional_module
-from mcgicp_jax.io.files import check_size, cloud_of, columns_of
+from mcgicp_jax.io.files import check_size, cloud_of, columns_of, plain_numbers
 
 # Bound on the compression ratio of LZF, whose blocks of three bytes expand to at most 264.
 _LZF_RATIO = 100
@@ -26,7 +26,12 @@ def read_pcd(file: BinaryIO, size: int) -> PointCloud:
     if metadata.data == pypcd4.Encoding.ASCII:
         check_size(2 * metadata.points * sum(metadata.count), size + 1)
         # pypcd4's own ASCII reader accepts only single spaces between numbers.
-        rows = np.loadtxt(file, metadata.build_dtype(), ndmin=1)
+        text = plain_numbers(file.read().decode("ascii", errors="replace"))
+        rows = np.loadtxt(text.splitlines(), metadata.build_dtype(), ndmin=1)
+        for name in rows.dtype.names:
+            if rows[name].dtype.kind == "f":
+                # The bits of a colour that the text does not have.
+                rows[name][np.isnan(rows[name])] = np.nan
     else:
         if metadata.data == pypcd4.Encoding.BINARY:
             check_size(metadata.points * sum(widths), size - file.tell())
@@ -50,11 +55,16 @@ def _pcd_header(file: BinaryIO) -> list[str]:
         line = file.readline()
         if not line:
             raise ValueError("no complete PCD header")
-        lines += [text for text in [line.decode().strip()] if text and not text.startswith("#")]
+        lines += [text for text in [line.decode("utf-8-sig", "replace").strip()] if text and not text.startswith("#")]
     lines = [line for line in lines if not line.startswith("VERSION")]
-    fields = next((line for line in lines if line.startswith("FIELDS")), "")
-    counted = any(line.startswith("COUNT") for line in lines)
-    return lines if counted else [*lines, "COUNT" + " 1" * len(fields.split()[1:])]
+    columns = {key: values for key, *values in map(str.split, lines)}
+    counts = columns.setdefault("COUNT", ["1"] * len(columns.get("FIELDS", [])))
+    # Fields without values take no place in the rows.
+    kept = [number for number, count in enumerate(counts) if count != "0"]
+    for key in ("FIELDS", "SIZE", "TYPE", "COUNT"):
+        if len(columns.get(key, [])) == len(counts):
+            columns[key] = [columns[key][number] for number in kept]
+    return [" ".join([key, *values]) for key, values in columns.items()]
 
 
 def _check_lzf(file: BinaryIO, claimed: int, size: int) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import codecs
 import io
 import re
 from typing import Any, BinaryIO
@@ -18,10 +19,17 @@ _PLY_HEADER_BYTES = 2**20
 
 def read_ply(file: BinaryIO, size: int) -> PointCloud:
     plyfile = optional_module("plyfile", "io", "reading .ply files")
-    head, end, _ = file.read(_PLY_HEADER_BYTES).partition(b"end_header")
-    if not end:
+    start = file.read(_PLY_HEADER_BYTES)
+    end = re.search(rb"(?:^|[\r\n])end_header[ \t]*(?:\r\n|\r|\n)", start)
+    if end is None:
         raise ValueError("no PLY header")
-    text = (head + end).decode("ascii").replace("\r\n", "\n").replace("\r", "\n") + "\n"
+    head, rest = start[: end.end()], start[end.end() :]
+    header, plain = head, head.isascii() and head.count(b"end_header") == 1
+    if not plain:
+        # plyfile reads neither comments in other encodings nor a byte order mark.
+        lines = head.removeprefix(codecs.BOM_UTF8).splitlines(keepends=True)
+        header = b"".join(line for line in lines if line.split()[:1] not in ([b"comment"], [b"obj_info"]))
+    text = header.decode("ascii").replace("\r\n", "\n").replace("\r", "\n")
     # plyfile allocates what the header claims, so the header is first parsed alone, with all counts set to 0.
     element = re.compile(r"^(\s*element\s+\S+\s+)(\S+)", re.MULTILINE)
     counts = [int(count) for _, count in element.findall(text)]
@@ -31,7 +39,8 @@ def read_ply(file: BinaryIO, size: int) -> PointCloud:
     if "vertex" not in layout:
         raise ValueError("it has no vertices")
     file.seek(0)
-    with io.TextIOWrapper(file, "ascii") if layout.text else file as stream:
+    body = file if plain else io.BytesIO(header + rest + file.read()[len(start) :])
+    with io.TextIOWrapper(body, "ascii") if layout.text else body as stream:
         vertex: Any = np.array(plyfile.PlyData.read(stream)["vertex"].data)  # copied, since plyfile maps the file
     return cloud_of({name: vertex[name] for name in vertex.dtype.names})
 

@@ -11,7 +11,7 @@ import numpy as np
 
 from mcgicp_jax._clouds.columns import COLORS, channel_name
 from mcgicp_jax._clouds.point_cloud import PointCloud
-from mcgicp_jax.io.files import cloud_of, column_name, columns_of
+from mcgicp_jax.io.files import cloud_of, column_name, columns_of, plain_numbers
 from mcgicp_jax.io.poses import are_poses
 
 # Number of lines from which poses are recognised: so many points are not in order of their first coordinate with unit
@@ -19,14 +19,10 @@ from mcgicp_jax.io.poses import are_poses
 _MOST_LINES = 1000
 
 
-# Missing numbers as Windows, R and databases write them.
-_NO_NUMBER = re.compile(r"[+-]?(?:nan\([^)\s]*\)|1\.#(?:QNAN|SNAN|IND)\d*|\bNA\b|\bNULL\b)", re.IGNORECASE)
-
-
 def read_text(file: BinaryIO, size: int) -> PointCloud:
     with _as_text(file) as text:
         names, line, cells = _text_start(text)
-        lines = _plain(line + text.read())
+        lines = plain_numbers(line + text.read())
     delimiter = _delimiter(line)
     if delimiter is not None:
         lines = re.sub(
@@ -47,11 +43,6 @@ def read_text(file: BinaryIO, size: int) -> PointCloud:
 def _as_text(file: BinaryIO) -> io.TextIOWrapper:
     """Comments may have any encoding."""
     return io.TextIOWrapper(file, "utf-8-sig", errors="replace")
-
-
-def _plain(lines: str) -> str:
-    """Without quotes, and with missing numbers as NaN."""
-    return _NO_NUMBER.sub("nan", lines.replace('"', ""))
 
 
 def _delimiter(line: str) -> str | None:
@@ -78,7 +69,7 @@ def _text_start(text: io.TextIOWrapper) -> tuple[list[str], str, list[str]]:
     commented = counted = False
     for line in text:
         comment = line.startswith(("#", "//"))
-        plain = _plain(line).strip("#/ \t\r\n" if comment else " \t\r\n")
+        plain = plain_numbers(line).strip("#/ \t\r\n" if comment else " \t\r\n")
         cells = [cell.strip() for cell in plain.split(_delimiter(plain))]
         if not comment and any(cells) and all(_is_number(cell or "nan") for cell in cells):
             if len(cells) == 1 and cells[0].isdigit() and not counted:
