@@ -10,7 +10,7 @@ import jaxlie
 import numpy as np
 import pytest
 
-from mcgicp_jax import KDTreeSearch, PointCloud, preprocess
+from mcgicp_jax import KDTreeSearch, PointCloud, PointToPoint, preprocess, register
 from mcgicp_jax.datasets import Frame
 from tests import reference as ref
 from tests.precision import tolerance
@@ -360,6 +360,38 @@ def test_clouds_of_other_libraries_are_taken(tmp_path):
     ):
         refused(lambda wrong=wrong: PointCloud(wrong), "points", shown)
     refused(lambda: PointCloud(points, points[:, :2], channel_names="ab"), "channel_names", "ab")
+
+
+def test_what_other_libraries_have_instead_of_arrays():
+    laspy, small_gicp = pytest.importorskip("laspy"), pytest.importorskip("small_gicp")
+    las = laspy.LasData(laspy.LasHeader(point_format=3))
+    las.xyz = points = np.random.default_rng(0).normal(size=(5, 3))
+    for wrong in (las, las.points, las.points.array):
+        refused(lambda wrong=wrong: PointCloud(wrong), "points", "las.xyz")
+    refused(lambda: PointCloud(small_gicp.PointCloud(points)), "points", "cloud.points()[:, :3]")
+    refused(lambda: PointCloud(points[None]), "points", "register_batch")
+
+    class Tensor:
+        """As one of torch that requires a gradient."""
+
+        def __array__(self, *_, **__):
+            raise RuntimeError("Can't call numpy() on Tensor that requires grad.")
+
+        def __len__(self):
+            return 5
+
+    refused(lambda: PointCloud(Tensor()), "points", "requires grad", ".detach()")
+    refused(lambda: PointCloud(points, Tensor()), "channels", "requires grad", ".detach()")
+    result = register(POINTS, POINTS, PointToPoint())
+    refused(lambda: register(POINTS, POINTS, PointToPoint(), init=result), "init", "pass its .matrix")
+
+
+def test_nan_in_a_table_is_a_missing_channel():
+    rows = np.zeros(5, [(name, "f4") for name in ("x", "y", "z", "heat", "dust")])
+    rows["heat"] = [1, np.nan, 3, 4, np.nan]
+    cloud = PointCloud(rows)
+    np.testing.assert_array_equal(cloud.channel_valid, np.stack([~np.isnan(rows["heat"]), np.ones(5, bool)], axis=1))
+    np.testing.assert_array_equal(cloud.channels[:, 0], [1, 0, 3, 4, 0])
 
 
 def test_tables_with_named_columns_and_clouds_of_tensors():

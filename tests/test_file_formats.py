@@ -550,6 +550,12 @@ def test_text_of_others(tmp_path, text, names, channels):
         np.testing.assert_array_equal(cloud.channels, np.where(measured, np.array(channels, float), 0))
 
 
+def test_columns_of_sensors_are_no_channels(tmp_path):
+    columns = "distance depth azimuth elevation time_stamp timestamp ScanAngleRank laser_id GpsTime return_type"
+    (tmp_path / "c.txt").write_text(f"x y z i {columns} distance_to_wall\n" + " ".join(map(str, range(15))))
+    assert io.read(tmp_path / "c.txt").channel_names == ("intensity", "distance_to_wall")
+
+
 def test_comments_of_any_encoding(tmp_path):
     (tmp_path / "c.txt").write_bytes("# Straße\n1 2 3\n4 5 6\n".encode("latin-1"))
     np.testing.assert_array_equal(io.read(tmp_path / "c.txt").points, [[1, 2, 3], [4, 5, 6]])

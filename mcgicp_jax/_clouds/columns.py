@@ -19,10 +19,16 @@ INTENSITIES = ("intensity", "intensities", "i", "reflectance", "reflectivity", "
 _ALIASES = dict.fromkeys(INTENSITIES, "intensity") | {
     alias: colour for colour in COLORS for alias in (colour, colour[0], f"diffuse_{colour}")
 }
+# Geometry, and what files say of a point besides its colour: by PCL, LAS, VeloView, Autoware, Livox and Ouster.
 _NOT_CHANNELS = re.compile(
-    "[xyz_]|rgba?|a|(diffuse_)?alpha|n[xyz]|normal_[xyz]|curvature|vp_[xyz]|label|class|classification|object|instance|"
-    "id|index|ring|line|tag|row|column|range|t|time|timestamp|gps_time|offset_time"
+    "[xyz_]|rgba?|a|(diffuse_)?alpha|n[xyz]|normal_[xyz]|curvature|vp_[xyz]|label|class|(raw_?)?classification|object|"
+    "instance|id|index|ring|line|tag|row|column|range|distance|depth|azimuth|elevation|(vertical|horizontal)_?angle|"
+    "t|time|time_?stamp|adjusted_?time|gps_?time|offset_?time|laser_?id|scan_?angle(_?rank)?|scan_?direction_?flag|"
+    "scanner_?channel|bit_fields|user_?data|point_?(source_?)?id|return_?(type|number)|num(ber_?of)?_?returns|"
+    "edge_?of_?flight_?line|key_?point|synthetic|withheld|overlap"
 )
+
+
 # The bits of NaN in float32, which stand for no colour where four bytes hold one.
 _NO_COLOR = np.float32(np.nan).view(np.uint32)
 
@@ -82,10 +88,15 @@ def arrays_of(points: Any) -> tuple[Any, Any, Sequence[str] | None]:
     is.
 
     Raises:
-        ValueError: if it is a path, a `PointCloud`, an object without points, or a structured array with masked fields.
+        ValueError: if it is a path, a `PointCloud`, an object without points, a structured array with masked fields, or
+            of a library whose coordinates have another name.
     """
     if isinstance(points, str | os.PathLike):
         raise ValueError(f"points: expected coordinates, got a path; mcgicp_jax.io.read({str(points)!r}) reads a file")
+    for member, advice in (("point_format", "las.xyz"), ("covs", "cloud.points()[:, :3]")):
+        # Of laspy and small_gicp.
+        if hasattr(points, member):
+            raise ValueError(f"points: expected coordinates, got {type(points).__name__}; pass {advice}")
     if hasattr(points, "to_records"):
         # A table of pandas with named columns.
         points = points.to_records(index=False)
@@ -99,6 +110,8 @@ def arrays_of(points: Any) -> tuple[Any, Any, Sequence[str] | None]:
     if fields is not None:
         if not {"x", "y", "z"} <= {field.lower() for field in fields}:
             raise ValueError(f"points: expected the fields x, y and z, got {', '.join(fields)}")
+        if "point_source_id" in fields and all(points.dtype[axis].kind in "iu" for axis in "XYZ" if axis in fields):
+            raise ValueError("points: expected metres, got the whole numbers of LAS without their scale; pass las.xyz")
         if any(np.ma.getmaskarray(points)[field].any() for field in fields):
             raise ValueError("points: expected no masked fields in a structured array; pass points and channels apart")
         flat = np.asarray(points).reshape(-1)

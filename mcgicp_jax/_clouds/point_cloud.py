@@ -51,6 +51,11 @@ def _as_float(name: str, values: Any) -> Any:
         array = np.asarray(values)
     except ValueError as error:
         raise ValueError(f"{name}: expected numbers in a rectangular array, got rows of unequal length") from error
+    except (TypeError, RuntimeError) as error:
+        kind = type(values).__name__
+        raise ValueError(
+            f"{name}: expected an array, got {kind}: {error}; pass NumPy's, of torch tensor.detach().float().numpy()"
+        ) from error
     if array.dtype.kind not in "fiub":
         raise ValueError(f"{name}: expected real numbers, got dtype {array.dtype}")
     array = array if array.dtype in (np.float32, np.float64) else array.astype(np.float64)
@@ -62,7 +67,7 @@ def _advice(shape: tuple[int, ...]) -> str:
     if len(shape) == 2 and shape[0] == 3:
         return "; pass points.T"
     if len(shape) == 3 and shape[2] == 3:
-        return "; pass points.reshape(-1, 3)"
+        return "; pass points.reshape(-1, 3) of one cloud in a grid, or a list of clouds to register_batch"
     return "; pass PointCloud(points, channels)" if len(shape) == 2 and shape[1] > 3 else ""
 
 
@@ -190,7 +195,7 @@ class PointCloud(eqx.Module):
             points: (N, 3), metres: nested lists or arrays of any real dtype, NumPy or JAX; at large (UTM) coordinates
                 float64 NumPy arrays, as float32 is too coarse there. Also a structured array or a table of pandas with
                 the columns x, y and z, or a cloud of Open3D. Without `channels`, their other numbers become channels,
-                as `io.read` says.
+                as `io.read` says; NaN is a missing one.
             channels: (N, C), or (N,) for a single channel, in any unit; none by default.
             channel_valid: booleans in the shape of `channels`, False where a point lacks the channel; the value there
                 is ignored and may be NaN. None: all points have all channels.
@@ -206,6 +211,8 @@ class PointCloud(eqx.Module):
         points, found, names = arrays_of(points)
         if channels is None and found is not None:
             channels, channel_names = found, channel_names or names
+            if channel_valid is None and np.isnan(found).any():
+                channel_valid = ~np.isnan(found)
         self.points = _as_float("points", points)
         if self.points.ndim != 2 or self.points.shape[1] != 3:
             raise ValueError(f"points: expected shape (N, 3), got {self.points.shape}{_advice(self.points.shape)}")

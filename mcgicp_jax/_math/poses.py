@@ -53,6 +53,9 @@ def pose_matrix(
     """
     if pose is None:
         return np.eye(4)
+    if not isinstance(pose, jaxlie.SE3) and hasattr(pose, "matrix"):
+        kind = type(pose).__name__
+        raise ValueError(f"{name}: expected a jaxlie.SE3 or a (4, 4) matrix, got {kind}; pass its .matrix")
     matrix = matrix_of(pose)
     if not is_concrete(matrix):
         if matrix.shape not in ((4, 4), (3, 4)):
