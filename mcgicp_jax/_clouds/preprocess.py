@@ -166,7 +166,8 @@ def _warn_of_loss(given: PointCloud, found: PointCloud, num_neighbors: int) -> N
     rows, counts = sampled_rows(np.asarray(found.valid))
     rows = rows[counts][:: 1 + rows.size // _SAMPLE]
     near = neighbors[rows][:, 1:]
-    distances = np.linalg.norm(points[near] - points[rows, None], axis=2)
+    with np.errstate(over="ignore", invalid="ignore"):
+        distances = np.linalg.norm(points[near] - points[rows, None], axis=2)
     # Without coincident neighbours; 0 where all are.
     nearest = np.where((distances > 0) & (near >= 0), distances, np.inf).min(axis=1)
     spacing = float(np.nan_to_num(median(np.where(np.isfinite(nearest), nearest, np.nan))))
