@@ -134,3 +134,11 @@ def test_unconstrained_directions_stay_where_they_are(missing):
     assert update.degenerate
     assert np.isfinite(update.twist).all()
     np.testing.assert_allclose(update.twist[2] if missing == "one direction" else update.twist, 0, atol=1e-2)
+
+
+def test_updates_run_on_several_devices():
+    """Here on one: what differs from `vmap` is how arrays are traced."""
+    measured, update = solve(*random_pairs(0))
+    both = jax.tree.map(lambda array: jnp.asarray(array)[None], measured)
+    (twist,) = jax.pmap(lambda sums: _solve.solve_update(sums, jnp.eye(6)).twist)(both)
+    np.testing.assert_allclose(twist, update.twist, atol=tolerance(1e-6, 1e-12))

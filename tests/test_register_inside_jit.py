@@ -305,3 +305,23 @@ def _normal_equations(sums):
     tangent = jnp.asarray(_solve._TANGENT, sums.force.dtype)
     form = _solve._quadratic_form(sums, jnp.ones_like(sums.radius))
     return tangent.T @ form[:12, :12] @ tangent, -tangent.T @ form[:12, 12]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", ["pmap", "shard_map"])
+def test_pairs_are_registered_on_several_devices(kind):
+    """Here on one: what differs from `vmap` is how arrays are traced."""
+    source, target, _ = pair(size=200)
+    clouds = [jax.tree.map(lambda array: jnp.asarray(array)[None], cloud) for cloud in (source, target)]
+
+    def poses(source, target):
+        return mcg.register(source, target, mcg.GICP(), max_distance=0.3).matrix
+
+    if kind == "pmap":
+        found = jax.pmap(poses)(*clouds)
+    else:
+        mesh, spec = jax.sharding.Mesh(jax.devices()[:1], ("pairs",)), jax.sharding.PartitionSpec("pairs")
+        sharded = jax.shard_map(jax.vmap(poses), mesh=mesh, in_specs=spec, out_specs=spec, check_vma=False)
+        found = jax.jit(sharded)(*clouds)
+    expected = mcg.register(source, target, mcg.GICP(), max_distance=0.3).matrix
+    np.testing.assert_allclose(found[0], expected, atol=1e-5)

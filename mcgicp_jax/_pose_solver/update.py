@@ -103,10 +103,37 @@ def _least_squares(root: Float[Array, "13 13"], basis: Float[Array, "6 6"]) -> o
     # steps would never fall below it.
     tolerance = 64 * float(jnp.finfo(root.dtype).eps)
     solver: optx.LevenbergMarquardt = optx.LevenbergMarquardt(
-        rtol=tolerance, atol=tolerance, linear_solver=lx.Normal(lx.Cholesky())
+        rtol=tolerance, atol=tolerance, linear_solver=_NormalEquations()
     )
     solver = eqx.tree_at(lambda solver: solver.search, solver, _TrustRegion(solver.search))
     return optx.least_squares(_residuals, solver, jnp.zeros(6), (root, basis), max_steps=_MAX_STEPS, throw=False)
+
+
+class _NormalEquations(lx.AbstractLinearSolver):
+    """Least squares by the Cholesky factor of JᵀJ.
+
+    As `lx.Normal(lx.Cholesky())`, whose operators refuse to be composed inside `pmap` and `shard_map`.
+    """
+
+    def init(self, operator: lx.AbstractLinearOperator, options: dict[str, Any]) -> tuple[Array, Array]:
+        jacobian = operator.as_matrix()
+        return jacobian, jnp.linalg.cholesky(jacobian.T @ jacobian)
+
+    def compute(
+        self, state: tuple[Array, Array], vector: Any, options: dict[str, Any]
+    ) -> tuple[Array, lx.RESULTS, dict[str, Any]]:
+        jacobian, root = state
+        flat, _ = jax.flatten_util.ravel_pytree(vector)
+        return jax.scipy.linalg.cho_solve((root, True), jacobian.T @ flat), lx.RESULTS.successful, {}
+
+    def transpose(self, state: Any, options: dict[str, Any]) -> Any:
+        raise NotImplementedError
+
+    def conj(self, state: Any, options: dict[str, Any]) -> Any:
+        raise NotImplementedError
+
+    def assume_full_rank(self) -> bool:
+        return True
 
 
 class _TrustRegion(optx.AbstractSearch):
