@@ -68,6 +68,9 @@ def test_a_folder_is_registered_file_by_file(folder, tmp_path, capsys):
         assert row["status"] == "converged" and row["reason"] == ""
         assert max(pose_error(matrix(row), np.linalg.inv(pose(i)) @ pose(i + 1))) < 0.03
         assert int(row["inliers"]) > 900
+        assert float(row["overlap"]) == int(row["inliers"]) / 1000
+        deviations = [float(row[f"deviation_{axis}"]) for axis in ("x", "y", "z", "rx", "ry", "rz")]
+        assert np.all(np.array(deviations) > 1e-5) and np.all(np.array(deviations) < 0.01)
     text = capsys.readouterr().out
     assert f"{NUM_FILES - 1} converged" in text and "intensity" in text
 

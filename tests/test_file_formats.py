@@ -418,6 +418,13 @@ def test_kitti(tmp_path, data):
     scan = io.read(data / "kitti/sequences/04/velodyne/000000.bin")
     assert len(scan) > 100_000 and scan.channels.min() >= 0 and scan.channels.max() < 1
     refused(lambda: io.write(tmp_path / "c.bin", PointCloud(np.full((2, 3), 5e5), np.ones(2))), "points", ".ply")
+    # It would be read as an intensity. One without a name is taken for it.
+    for name, fits in (("time", False), ("ring", False), ("Reflectance", True), (None, True)):
+        cloud = PointCloud(np.ones((2, 3)), np.ones(2), channel_names=name and [name])
+        if fits:
+            assert through(tmp_path / "c.bin", cloud).channel_names == INTENSITY
+        else:
+            refused(lambda cloud=cloud: io.write(tmp_path / "d.bin", cloud), "channels", name, ".ply")
 
 
 def scan(num_points=480):

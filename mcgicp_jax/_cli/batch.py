@@ -42,7 +42,10 @@ Key: TypeAlias = tuple[str, str, str]
 
 # Columns of the upper three rows of the pose matrix
 POSE = tuple(f"m{row}{column}" for row in range(3) for column in range(4))
-COLUMNS = ("source", "target", "init", "status", "iterations", "inliers", "cost", "rmse", *POSE, "reason")
+# Columns of `RegistrationResult.deviations`, metres and radians.
+DEVIATIONS = tuple(f"deviation_{axis}" for axis in ("x", "y", "z", "rx", "ry", "rz"))
+NUMBERS = ("iterations", "inliers", "overlap", "cost", "rmse", *POSE, *DEVIATIONS)
+COLUMNS = ("source", "target", "init", "status", *NUMBERS, "reason")
 Pairs: TypeAlias = Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="PAIRS")]
 
 _INTERRUPTED = 130
@@ -141,8 +144,8 @@ def batch(
     Args:
         pairs: CSV file or folder.
         output: Table to write or to resume, .csv. A row per pair, at the end in the order of PAIRS: source,
-            target, initial pose if given, status, iterations, inliers, cost, rmse, the upper three rows of the pose,
-            and the reason if it could not be registered or its pose is doubtful.
+            target, initial pose if given, status, iterations, inliers, overlap, cost, rmse, the upper three rows of the
+            pose, its deviations (m, rad), and the reason if it could not be registered or its pose is doubtful.
         method: {channel_methods} use channels (intensity, colours, ...), the others geometry alone.
         glob: Pattern for the files of a folder, such as "*.ply".
         workers: Number of processes; needs pip install 'mcgicp_jax[processes]'. auto: one per core for many pairs, else
@@ -298,7 +301,6 @@ def _settings(pairs: Sequence[FilePair], method: Method, options: Options) -> di
         "channels": choices.channels,
         "voxel_size": size,
         "num_neighbors": options.num_neighbors,
-        "covariances": False,
     }
 
 
@@ -334,7 +336,8 @@ def _read(path: Path, channels: Sequence[str]) -> mcg.PointCloud:
 
 
 def _row(key: Key, result: mcg.RegistrationResult, reason: str) -> Row:
-    numbers = (result.num_iterations, result.num_inliers, result.cost, result.rmse, *result.matrix[:3].ravel())
+    quality = result.num_iterations, result.num_inliers, result.overlap, result.cost, result.rmse
+    numbers = *quality, *result.matrix[:3].ravel(), *result.deviations
     values = (np.asarray(number).item() for number in numbers)
     texts = (*key, _word(result.status), *map(repr, values), " ".join(reason.split()))
     return dict(zip(COLUMNS, texts, strict=True))

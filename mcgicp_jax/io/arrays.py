@@ -52,6 +52,8 @@ def _beyond_kitti(points: Float[np.ndarray, "N 3"]) -> bool:
 def write_kitti(file: BinaryIO, cloud: PointCloud) -> None:
     if cloud.channels.shape[1] != 1:
         raise ValueError(f"channels: .bin holds exactly one, got {cloud.channel_names}; .ply holds any number")
+    if cloud.channel_names[0].lower() not in (*INTENSITIES, "channel_0"):
+        raise ValueError(f"channels: .bin holds the intensity alone, got {cloud.channel_names[0]!r}; .ply holds any")
     if _beyond_kitti(np.asarray(cloud.points)):
         raise ValueError(f"points: .bin holds float32, too coarse beyond {_KITTI_LIMIT:.0f} m; .ply holds float64")
     file.write(np.column_stack([cloud.points, cloud.channels]).astype("<f4").tobytes())
