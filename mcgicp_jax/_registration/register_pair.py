@@ -26,7 +26,7 @@ from mcgicp_jax._local_geometry.cloud_statistics import (
     with_channels_matched,
 )
 from mcgicp_jax._local_geometry.neighborhoods import check_neighbors
-from mcgicp_jax._local_geometry.sensor_patterns import channels_constrain, without_patterns
+from mcgicp_jax._local_geometry.sensor_patterns import channels_constrain, warn_of_patterns, without_patterns
 from mcgicp_jax._math.poses import Pose, se3_from_matrix
 from mcgicp_jax._math.statistics import spread_rows
 from mcgicp_jax._methods.base import AbstractMethod
@@ -47,7 +47,7 @@ from mcgicp_jax._registration.loop import LoopResult, Problem, State
 from mcgicp_jax._registration.on_host import HostExecutor
 from mcgicp_jax._registration.options import Options, check_method
 from mcgicp_jax._registration.pose_derivative import Inputs, differentiated, jacobian, with_derivatives
-from mcgicp_jax._registration.result import USABLE, RegistrationResult, is_usable
+from mcgicp_jax._registration.result import USABLE, RegistrationResult, Status, is_usable
 from mcgicp_jax._registration.settings import settings_for, spacing_of
 from mcgicp_jax._registration.start_check import BETTER, LEAST_FIT, distance_moved, surface_fit
 from mcgicp_jax._registration.tie_points_and_prior import (
@@ -183,6 +183,8 @@ def run_pair(given: Inputs, init: Pose | None, options: Options, traced: bool = 
         again = _equalized(run.inputs._replace(method=inputs.method), _nearest_points(run, search))
         run = solve(again, _final_pose(run), near)
     elif compares_channels:
+        if run.loop.state.status == Status.DEGENERATE and not run.problem.settings.channels_constrain:
+            warn_of_patterns(run.inputs.source)
         warn_of_exposure(inputs.source, inputs.target, lambda: _nearest_points(run, search))
     if not measures:
         return run
@@ -263,20 +265,19 @@ def problem_of(
     dtype, valid = source.points.dtype, pair.source.search.valid
     xp = numpy_for(valid)
     stride = xp.maximum(xp.sum(xp.asarray(valid)) // _COARSE_ROWS, 1) if matches is None else 1
-    uses_channels = method.uses_channels and matches is None
     soft = options.soft_matches
     if soft is None:
         # By points, too, soft matches are better where channels are compared, and hard ones where they are not.
         compared = method.uses_channels and target.channels.shape[-1] > 0
         soft = compared and matches is None and not any(term.by_position for term in pair.terms)
+    observes_channels = method.uses_channels and matches is None and source.channels.shape[-1]
+    constrain = channels_constrain(source) if observes_channels else True
     problem = Problem(
         se3_from_matrix(centred_pose(init, source, target), dtype),
         pair.source,
         pair.target,
         pair.terms,
-        settings_for(
-            options, pair.method, source, target, stride, not uses_channels or channels_constrain(source, target), dtype
-        ),
+        settings_for(options, pair.method, source, target, stride, constrain, dtype),
         matches=matches,
         num_candidates=pair.method.num_candidates,
         temperature=constant(spacing_of(pair.method, target)) if soft else None,

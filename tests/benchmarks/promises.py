@@ -9,6 +9,7 @@ status, or deviations that cover the error; false: CONVERGED, and further off th
 from __future__ import annotations
 
 import argparse
+import itertools
 import sys
 import warnings
 from collections import Counter
@@ -17,10 +18,25 @@ from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 import mcgicp_jax as mcg
 from mcgicp_jax import datasets
-from tests.promise_scenes import NOISE, Pair, in_frames, office, stairs, tiles
+from tests.benchmarks.accuracy import DATA, consecutive, road, table
+from tests.promise_scenes import (
+    MOVING_CHANNELS,
+    NOISE,
+    SCENES,
+    STEP,
+    Channel,
+    Pair,
+    in_frames,
+    office,
+    seen,
+    stairs,
+    tiles,
+    translation,
+)
 from tests.scenes import motion
 
 # Errors in deviations that a right covariance exceeds in one of a million registrations (six degrees of freedom: 37).
@@ -112,7 +128,60 @@ def room(seed: int) -> Pair:
     return Pair(source.cloud, target.cloud, np.linalg.inv(target.pose) @ source.pose)
 
 
-GROUPS: dict[str, Callable[[], Iterator[Case]]] = {"starts": start_cases}
+def beside_tiles(channel: Channel, amplitude: float) -> Channel:
+    """A channel multiplied by the reflectance of tiles."""
+    reflectance = tiles(amplitude)
+    return lambda points, world: channel(points, world) * (1 + reflectance(points, world))
+
+
+def evidence_cases() -> Iterator[Case]:
+    """Channels that move with the sensor, alone and beside a texture, in three frames; and what must stay right."""
+    turned = translation(15, 8, 3)
+    turned[:3, :3] = Rotation.from_rotvec([0.4, 0.5, 1.0]).as_matrix()
+    still = np.eye(4)
+    frames = {"": (still, still), ", both clouds moved": (turned, turned), ", target moved": (still, turned)}
+
+    def run(make: Callable[[int], Pair], start: Any, seed: int) -> Any:
+        return registered(make(seed), mcg.MultiChannelGICP(), init=start)
+
+    def pattern(sides: Any, channel: Channel, step: float, frame: Any, seed: int) -> Pair:
+        return in_frames(seen(sides, seed, channel, step=step), *frame)
+
+    for (scene, sides), (where, frame) in itertools.product(SCENES.items(), frames.items()):
+        start = frame[1] @ np.linalg.inv(frame[0])
+        for step, motion in ((STEP, ""), (0.0, ", at rest")):
+            make = partial(pattern, sides, tiles(0.05, 1.0), step, frame)
+            yield Case("evidence", f"{scene}, tiles alone{where}{motion}", partial(run, make, start))
+        for (name, channel), amplitude in itertools.product(MOVING_CHANNELS.items(), (0, 0.02, 0.05, 0.1)):
+            make = partial(pattern, sides, beside_tiles(channel, amplitude), STEP, frame)
+            beside = f", tiles ± {amplitude:.0%}" if amplitude else ""
+            yield Case("evidence", f"{scene}, {name}{beside}{where}", partial(run, make, start))
+
+    def nth(pairs: Callable[[], Iterator[Any]], seed: int) -> Any:
+        every = list(pairs())
+        pair = every[seed % len(every)]
+        return registered(Pair(pair.source, pair.target, pair.truth), mcg.MultiChannelGICP(), init=pair.start)
+
+    def simulated(frames_of: Any, seed: int) -> Any:
+        return nth(lambda: consecutive(frames_of(2, seed=seed)), 0)
+
+    for name, frames_of in {
+        "posters": datasets.poster_wall,
+        "rooms": datasets.box_room,
+        "street": datasets.street,
+    }.items():
+        yield Case("evidence", name, partial(simulated, frames_of))
+    sets: dict[str, Callable[[], Iterator[Any]]] = {
+        "KITTI": partial(consecutive, datasets.kitti(DATA / "kitti/sequences/04")),
+        "table, flat": partial(table, "_flat"),
+        "7-Scenes": partial(consecutive, datasets.seven_scenes(DATA / "sevenscenes_redkitchen")),
+        "KITTI, bare road": road,
+    }
+    for name, pairs in sets.items():
+        yield Case("evidence", name, partial(nth, pairs))
+
+
+GROUPS: dict[str, Callable[[], Iterator[Case]]] = {"starts": start_cases, "evidence": evidence_cases}
 
 
 def main() -> None:

@@ -1,0 +1,158 @@
+"""Channels that move with the sensor fit perfectly where it has not moved; they constrain no motion."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import mcgicp_jax as mcg
+from mcgicp_jax._local_geometry.sensor_patterns import channels_constrain, explained, without_patterns
+from tests.promise_scenes import CORRIDOR, FLOOR_AND_WALL, MOVING_CHANNELS, in_frames, moved, seen, tiles, translation
+from tests.reference import pose
+from tests.scenes import wall
+
+METHOD = mcg.MultiChannelGICP()
+# Far from the sensor, and turned.
+ELSEWHERE = pose([0.4, 0.5, 1.0], [15, 8, 3])
+
+
+def status(pair, **options):
+    with pytest.warns(UserWarning, match="may move|seems to move"):
+        return mcg.register(pair.source, pair.target, METHOD, **options).status
+
+
+@pytest.mark.parametrize("channel", ["range", "elevation", "azimuth", "time", "vignetting", "coordinate", "ring"])
+def test_a_pattern_that_moves_with_the_sensor_constrains_nothing(channel):
+    assert status(seen(CORRIDOR, 0, MOVING_CHANNELS[channel])) == mcg.Status.DEGENERATE
+
+
+@pytest.mark.parametrize("channel", ["range", "time"])
+def test_a_status_does_not_depend_on_the_frame_of_both_clouds(channel):
+    pair = in_frames(seen(FLOOR_AND_WALL, 0, MOVING_CHANNELS[channel]), ELSEWHERE, ELSEWHERE)
+    assert status(pair) == mcg.Status.DEGENERATE
+
+
+def test_the_target_may_be_a_map():
+    pair = in_frames(seen(FLOOR_AND_WALL, 0, MOVING_CHANNELS["ring"]), np.eye(4), ELSEWHERE)
+    assert status(pair, init=ELSEWHERE) == mcg.Status.DEGENERATE
+
+
+@pytest.mark.parametrize("frame", [np.eye(4), ELSEWHERE])
+def test_gradients_along_the_lines_of_sight_from_the_source_constrain_nothing(frame):
+    """A road with lanes nearly as strong as the pattern of ranges that moves with the sensor, so that ranges alone do
+    not explain the channel. The lines of sight are not those from the centroid, nor from the origin of a map."""
+    rng = np.random.default_rng(0)
+    clouds = []
+    for _ in range(2):
+        points = np.column_stack([rng.uniform(-4, 8, 8000), rng.uniform(-4, 4, 8000), 0.01 * rng.normal(size=8000) - 2])
+        pattern = 0.7 * np.sin(3 * points[:, 1]) + np.sin(4 * np.hypot(*points[:, :2].T))
+        clouds.append(mcg.PointCloud(points, pattern + 0.05 * rng.normal(size=8000)))
+    source, target = clouds
+    assert channels_constrain(source)
+    target = target.replace(points=moved(frame, target.points))
+    init = frame @ translation(0.1, 0, 0)
+    assert mcg.register(source, target, METHOD, init=init).status == mcg.Status.DEGENERATE
+
+
+def test_tiles_beside_a_pattern_do_not_hide_it():
+    faint = tiles(0.05)
+    pair = seen(
+        CORRIDOR, 0, lambda points, world: MOVING_CHANNELS["azimuth"](points, world) * (1 + faint(points, world))
+    )
+    assert status(pair) == mcg.Status.DEGENERATE
+
+
+@pytest.mark.parametrize("step", [0.0, 0.3])
+@pytest.mark.parametrize("frame", [np.eye(4), ELSEWHERE])
+def test_a_texture_holds_a_sensor_at_rest_and_in_motion(step, frame):
+    pair = in_frames(seen(CORRIDOR, 0, tiles(0.05, 1.0), step=step), frame, frame)
+    result = mcg.register(pair.source, pair.target, METHOD)
+    assert result.status == mcg.Status.CONVERGED
+    assert mcg.metrics.pose_error(result.matrix, pair.T_target_source)[0] < 0.05
+
+
+def test_columns_of_the_sensor_are_left_out_beside_a_texture():
+    """Which finds the pose alone; distance and azimuth would hold it where the sensor stands still."""
+    faint = tiles(0.05, 1.0)
+    pair = seen(CORRIDOR, 0, faint)
+    columns = [
+        cloud.replace(
+            channels=np.column_stack([cloud.channels, *(MOVING_CHANNELS[name](cloud.points, None) for name in names)]),
+            channel_names=("reflectance", *names),
+        )
+        for cloud, names in ((pair.source, ("distance", "azimuth")), (pair.target, ("distance", "azimuth")))
+    ]
+    alone = mcg.register(pair.source, pair.target, METHOD)
+    with pytest.warns(UserWarning, match="channel distance: 100% .* is left out"):
+        result = mcg.register(*columns, METHOD)
+    assert result.status == mcg.Status.CONVERGED
+    np.testing.assert_allclose(result.matrix, alone.matrix, atol=2e-3)
+
+
+def test_inside_jit_the_same_channels_are_left_out_and_the_status_is_the_same():
+    pair = seen(CORRIDOR, 0, MOVING_CHANNELS["range"], count=1000)
+    clouds = [mcg.preprocess(cloud, None) for cloud in (pair.source, pair.target)]
+    far = clouds[0].replace(points=moved(ELSEWHERE, clouds[0].points))
+
+    @jax.jit
+    def inside(source, target, far):
+        return [cloud.channels for cloud in without_patterns(source, target)], channels_constrain(far), explained(far)
+
+    channels, constrain, traced = inside(*clouds, far)
+    assert not np.any(channels) and not constrain and not channels_constrain(far)
+    np.testing.assert_allclose(traced, explained(far), atol=0.01)
+
+
+def shares(points, channels, **fields):
+    return explained(mcg.preprocess(mcg.PointCloud(points, channels, **fields), None))
+
+
+def test_shares_do_not_depend_on_units_gains_padding_or_missing_values():
+    points, paint = wall(2000)
+    paint = np.column_stack([paint, points[:, 0]])
+    expected = shares(points, paint)
+    assert np.all(expected.smooth[:3] < 0.65) and expected.smooth[3] > 0.99
+    scaled = shares(1e3 * points, 50 + 7 * paint)
+    padded = explained(mcg.preprocess(mcg.PointCloud(points, paint), None).pad(2500))
+    # A fifth of the values of all channels but the last are missing.
+    present = np.random.default_rng(0).random(paint.shape) < [0.8, 0.8, 0.8, 1]
+    missing = shares(points, np.where(present, paint, np.nan), channel_valid=present)
+    for found, tolerance in ((scaled, 0.01), (padded, 0.05), (missing, 0.1)):
+        np.testing.assert_allclose(found.smooth, expected.smooth, atol=tolerance)
+
+
+def test_a_polynomial_of_position_is_smooth_in_any_frame_and_noise_is_not():
+    rng = np.random.default_rng(0)
+    points = rng.normal(size=(3000, 3))
+    x, y, z = points.T
+    channels = np.column_stack([x * y - z**2 + x, rng.normal(size=3000), np.ones(3000)])
+    for frame in (np.eye(4), ELSEWHERE):
+        _, smooth = shares(moved(frame, points), channels)
+        assert smooth[0] > 0.95 and smooth[1] < 0.05 and smooth[2] == 1
+
+
+def test_from_afar_range_and_angles_are_coordinates():
+    """Stripes across the line of sight are then a function of range, and remain a texture."""
+    rng = np.random.default_rng(0)
+    points = np.column_stack([rng.uniform(-1, 1, (3000, 2)), np.zeros(3000)])
+    stripes = np.sin(20 * points[:, 0])
+    near, far = (shares(points + np.array([distance, 0, -1]), stripes).by_angles[0] for distance in (0, 5))
+    assert near < 0.5 and far == 0
+
+
+def test_gradients_by_channels_that_are_left_out_are_zero():
+    pair = seen(CORRIDOR, 0, MOVING_CHANNELS["range"], count=1000)
+    source, target = (mcg.preprocess(cloud, None) for cloud in (pair.source, pair.target))
+
+    def along(channels):
+        return mcg.register(source.replace(channels=channels), target, METHOD).T_target_source.translation()[0]
+
+    with pytest.warns(UserWarning, match="is left out"):
+        assert not np.any(jax.grad(along)(jnp.asarray(source.channels)))
+
+
+def test_few_points_and_huge_values_explain_nothing():
+    rng = np.random.default_rng(0)
+    few = shares(rng.random((12, 3)), rng.random(12))
+    huge = shares(rng.random((500, 3)), 1e37 * rng.random(500).astype(np.float32))
+    assert not np.any(few.by_angles > 0.7) and not np.any(huge.by_angles > 0.7)
