@@ -49,7 +49,7 @@ from mcgicp_jax._registration.options import Options, check_method
 from mcgicp_jax._registration.pose_derivative import Inputs, differentiated, jacobian, with_derivatives
 from mcgicp_jax._registration.result import USABLE, RegistrationResult, Status, is_usable
 from mcgicp_jax._registration.settings import settings_for, spacing_of
-from mcgicp_jax._registration.start_check import BETTER, LEAST_FIT, distance_moved, surface_fit
+from mcgicp_jax._registration.start_check import BETTER, GOOD_FIT, LEAST_FIT, distance_moved, surface_fit
 from mcgicp_jax._registration.tie_points_and_prior import (
     GivenPrior,
     GivenTiePoints,
@@ -305,8 +305,13 @@ def _may_have_left(run: Run, init: Pose | None, at_scales: bool) -> bool:
 
 def _better(run: Run, other: Run) -> Run:
     """The other registration of the same clouds, if its surfaces coincide better."""
-    evidence = [float(each.loop.state.record.num_inliers) * _fit(each) for each in (run, other)]
-    return other if other.loop.state.status in USABLE and evidence[1] > BETTER * evidence[0] else run
+    if other.loop.state.status not in USABLE:
+        return run
+    fits, matches = zip(
+        *((_fit(each), float(each.loop.state.record.num_inliers)) for each in (run, other)), strict=True
+    )
+    coincide = fits[1] * matches[1] > BETTER * fits[0] * matches[0]
+    return other if coincide and (matches[1] <= matches[0] or fits[1] > GOOD_FIT) else run
 
 
 def _fit(run: Run) -> float:

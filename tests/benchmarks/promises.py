@@ -149,9 +149,9 @@ def evidence_cases() -> Iterator[Case]:
 
     for (scene, sides), (where, frame) in itertools.product(SCENES.items(), frames.items()):
         start = frame[1] @ np.linalg.inv(frame[0])
-        for step, motion in ((STEP, ""), (0.0, ", at rest")):
+        for step, rest in ((STEP, ""), (0.0, ", at rest")):
             make = partial(pattern, sides, tiles(0.05, 1.0), step, frame)
-            yield Case("evidence", f"{scene}, tiles alone{where}{motion}", partial(run, make, start))
+            yield Case("evidence", f"{scene}, tiles alone{where}{rest}", partial(run, make, start))
         for (name, channel), amplitude in itertools.product(MOVING_CHANNELS.items(), (0, 0.02, 0.05, 0.1)):
             make = partial(pattern, sides, beside_tiles(channel, amplitude), STEP, frame)
             beside = f", tiles ± {amplitude:.0%}" if amplitude else ""
