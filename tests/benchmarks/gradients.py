@@ -16,6 +16,7 @@ import os
 import resource
 import statistics
 import time
+import warnings
 from collections.abc import Callable
 from typing import Any
 
@@ -364,11 +365,27 @@ def correctness(with_pypose: bool) -> None:
     )
 
 
+def training() -> None:
+    """Derivatives by channels against whole registrations, and training by them; in this process."""
+    import jax
+
+    from tests.benchmarks import training as by_channels
+
+    with warnings.catch_warnings():
+        # Of hard matches, which are compared on purpose.
+        warnings.simplefilter("ignore", UserWarning)
+        _table("Training, float32", by_channels.TRAINING_COLUMNS, list(by_channels.training()))
+        jax.config.update("jax_enable_x64", True)
+        rows = [row for name in by_channels.SETS for row in by_channels.cosines(name, ["MC-GICP"])]
+        rows += by_channels.cosines("flat tables", ["Color ICP", "photometric"])
+        _table("Derivatives by channels against differences of the registration, float64", by_channels.COLUMNS, rows)
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parts = ("correctness", "pypose", "plain")
-    parser.add_argument("parts", nargs="*", help=f"which of {', '.join(parts)}; all by default")
-    chosen = parser.parse_args().parts or parts
+    parts = ("correctness", "pypose", "plain", "training")
+    parser.add_argument("parts", nargs="*", help=f"which of {', '.join(parts)}; all but training by default")
+    chosen = parser.parse_args().parts or parts[:-1]
     if unknown := set(chosen) - set(parts):
         parser.error(f"unknown parts: {', '.join(sorted(unknown))}")
     with_pypose = importlib.util.find_spec("pypose") is not None
@@ -386,6 +403,8 @@ def _run(chosen: tuple[str, ...] | list[str], with_pypose: bool) -> None:
         against_pypose()
     if "plain" in chosen:
         against_plain()
+    if "training" in chosen:
+        training()
 
 
 if __name__ == "__main__":

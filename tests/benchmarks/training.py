@@ -20,6 +20,8 @@ from tests.benchmarks import accuracy
 # Shorter ones measure single matches that change, longer ones other minima.
 STEPS = (0.5, 1.0, 2.0)
 TIGHT = {"translation_tolerance": 1e-7, "rotation_tolerance": 1e-7, "max_iterations": 200}
+COLUMNS = ["clouds", "method", "matches", "cosine", "ratio of norms", "same sign"]
+TRAINING_COLUMNS = ["trained", "seed", "loss at first", "at last", "test before", "after", "fell by", "a step"]
 # By the resolved method of a pair.
 METHODS: dict[str, Callable[[Any], Any]] = {
     "MC-GICP": lambda resolved: resolved,
