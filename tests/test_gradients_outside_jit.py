@@ -446,3 +446,43 @@ def test_a_gradient_by_weights_of_the_matches_is_warned_of():
     with pytest.warns(UserWarning, match="channel_weights: the derivative is 0"):
         gradient = jax.grad(loss)(jnp.full(2, 0.1))
     np.testing.assert_array_equal(gradient, 0)
+
+
+def test_only_the_pose_has_a_derivative_and_nothing_is_0_without_a_word(clouds):
+    source, target = clouds[:2]
+    method, kept = mcg.GICP(), []
+
+    def result(points):
+        kept.append(mcg.register(source.replace(points=points), target, method, max_distance=0.4))
+        return kept[-1]
+
+    points = jnp.asarray(source.points)
+    for name in ("cost", "rmse", "covariance", "deviations"):
+
+        def loss(points, name=name):
+            return jnp.sum(getattr(result(points), name))
+
+        with pytest.raises(NotImplementedError, match=r"only the pose has a derivative.*mahalanobis_cost"):
+            jax.grad(loss)(points)
+        assert np.isnan(jax.jvp(loss, (points,), (points,))[1])
+
+    def both(points):
+        found = result(points)
+        assert "rmse" in repr(found)
+        return found.centred.translation()[0] + jax.lax.stop_gradient(found.cost)
+
+    assert np.any(jax.grad(both)(points))
+    # After the differentiation, what is no derivative can still be read.
+    assert np.isfinite(kept[-1].covariance).all()
+
+
+def test_gradients_by_channels_that_are_equalised_are_warned_of(clouds):
+    source, target = clouds[:2]
+
+    def loss(channels):
+        moved = source.replace(channels=channels)
+        method = mcg.MultiChannelGICP(0.1, 0.1)
+        return mcg.register(moved, target, method, max_distance=0.4, equalize_channels=True).matrix[0, 3]
+
+    with pytest.warns(UserWarning, match="equalize_channels: gain and offset"):
+        jax.grad(loss)(jnp.asarray(source.channels))

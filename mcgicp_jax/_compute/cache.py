@@ -98,8 +98,10 @@ def _by_value(leaf: Any) -> Hashable:
 class Lazy(Generic[Value]):
     """A pytree that is computed on first access: by `value`, or when it is flattened, copied or pickled."""
 
-    def __init__(self, compute: Callable[[], Value]):
+    def __init__(self, compute: Callable[[], Value], finish: Callable[[Value], Value] | None = None):
+        """`finish` is applied to the value inside the caller's transformations, `compute` outside of them."""
         self._compute: Callable[[], Value] | None = compute
+        self._finish = finish
         self._lock = threading.Lock()
         self._value: Value
 
@@ -114,8 +116,9 @@ class Lazy(Generic[Value]):
             if self._compute is not None:
                 with outside_trace():
                     self._value = with_settings_of_package(self._compute)()
-                # Frees the arrays that the closure holds.
-                self._compute = None
+                self._value = self._value if self._finish is None else self._finish(self._value)
+                # Frees the arrays that the closures hold.
+                self._compute = self._finish = None
         return self._value
 
     def tree_flatten(self) -> tuple[tuple[Value], None]:
@@ -124,7 +127,7 @@ class Lazy(Generic[Value]):
     @classmethod
     def tree_unflatten(cls, _: None, children: tuple[Value]) -> Lazy[Value]:
         deferred = object.__new__(cls)
-        deferred._compute, deferred._lock, deferred._value = None, threading.Lock(), children[0]
+        deferred._compute, deferred._finish, deferred._lock, deferred._value = None, None, threading.Lock(), children[0]
         return deferred
 
     def __reduce__(self) -> Any:

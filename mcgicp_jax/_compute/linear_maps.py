@@ -234,3 +234,54 @@ def _not_compiled(*_: Any, **__: Any) -> Any:
 ad.deflinear2(_linear, _transposed)
 batching.primitive_batchers[_linear] = _batched
 mlir.register_lowering(_linear, _not_compiled)
+
+
+def without_derivative(tree: Any, inputs: Any, message: str) -> Any:
+    """The arrays of a tree, which depend on `inputs`, but have no derivative by them: reverse mode raises
+    `NotImplementedError` with the message where it would use it, and forward mode gives NaN."""
+    tracers = [leaf for leaf in jax.tree.leaves(inputs) if not is_concrete(leaf) and _is_float(leaf)]
+    if not tracers:
+        return tree
+
+    @jax.custom_jvp
+    def constant_by(value: Any, *inputs: Any) -> Any:
+        return value
+
+    def rule(primals: tuple[Any, ...], tangents: tuple[Any, ...]) -> tuple[Any, Any]:
+        value = primals[0]
+        moving = [tangent for tangent in tangents if not is_symbolic_zero(tangent)]
+        tangent = _unknown.bind(*moving, aval=jax.typeof(value), message=message) if moving else jnp.zeros_like(value)
+        return value, tangent
+
+    constant_by.defjvp(rule, symbolic_zeros=True)
+    return jax.tree.map(lambda leaf: constant_by(jnp.asarray(leaf), *tracers) if _is_float(leaf) else leaf, tree)
+
+
+def _is_float(leaf: Any) -> bool:
+    return jnp.issubdtype(jnp.result_type(leaf), jnp.floating)
+
+
+# The tangent of what has no derivative.
+_unknown = Primitive("mcgicp_unknown")
+
+
+@_unknown.def_impl
+def _nan(*_: Any, aval: Any, message: str) -> Any:
+    return jnp.full(aval.shape, jnp.nan, aval.dtype)
+
+
+_unknown.def_abstract_eval(lambda *_, aval, message: aval)
+
+
+def _refused(*_: Any, message: str, **__: Any) -> Any:
+    raise NotImplementedError(message)
+
+
+def _unknown_batched(operands: Any, axes: Any, *, aval: Any, message: str) -> Any:
+    (size,) = {each.shape[axis] for each, axis in zip(operands, axes, strict=True) if axis is not None}
+    return _unknown.bind(*operands, aval=aval.update(shape=(size, *aval.shape)), message=message), 0
+
+
+ad.primitive_transposes[_unknown] = _refused
+batching.primitive_batchers[_unknown] = _unknown_batched
+mlir.register_lowering(_unknown, mlir.lower_fun(_nan, multiple_results=False))

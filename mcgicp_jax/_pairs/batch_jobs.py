@@ -170,7 +170,9 @@ class BatchJob:
     def prepare(self, pair: Pair) -> PreparedPair | PairResult:
         """The pair with its initial pose, or its result if it has none."""
         source, target = self._clouds(pair)
-        warn_of_estimated_parameters(self.method, source, target, self.options.soft_matches is not False)
+        options = self.options
+        soft, equalized = options.soft_matches is not False, options.equalize_channels
+        warn_of_estimated_parameters(self.method, source, target, soft, equalized)
         inputs = prepared(source, target, self.method, self.options)
         if not isinstance(pair.init, str):
             return PreparedPair(pair.index, inputs, primal(pair.init))

@@ -182,7 +182,7 @@ def register(
         raise ValueError("hold_unconstrained: expected True with tie_points or prior, got False")
     source, target = as_cloud("source", source), as_cloud("target", target)
     warn_of_lengths(source, target)
-    warn_of_estimated_parameters(method, source, target, soft_matches is not False)
+    warn_of_estimated_parameters(method, source, target, soft_matches is not False, equalize_channels)
     result = register_from(source, target, method, init, options, tie_points, prior)
     doubt = doubt_of(result)
     if doubt:

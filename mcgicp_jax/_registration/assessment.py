@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -16,7 +17,7 @@ from mcgicp_jax._clouds.origins import pose_in_user_frame
 from mcgicp_jax._clouds.point_cloud import PointCloud
 from mcgicp_jax._compute.cache import Held, Lazy
 from mcgicp_jax._compute.concrete import AnyArray, AnyScalar, constant, is_concrete, numpy_for
-from mcgicp_jax._compute.linear_maps import primal
+from mcgicp_jax._compute.linear_maps import primal, without_derivative
 from mcgicp_jax._math.poses import adjoint_to_center, se3_from_matrix, translation_adjoint, units
 from mcgicp_jax._math.statistics import sampled_rows
 from mcgicp_jax._pose_solver.covariance import (
@@ -34,6 +35,11 @@ from mcgicp_jax._pose_solver.pose_measurements import Fusion
 from mcgicp_jax._registration.loop import AbstractExecutor, LoopResult, Record, State
 from mcgicp_jax._registration.result import Constraints, RegistrationResult, Status, Uncertainty
 from mcgicp_jax._terms.base import AbstractAdaptiveTerm, AbstractTerm, is_adaptive
+
+_NO_DERIVATIVE = (
+    "RegistrationResult: only the pose has a derivative, not cost, rmse, covariance or deviations; for that of the "
+    "cost, call mahalanobis_cost at the pose, with the matches of find_correspondences"
+)
 
 
 class Assessment(NamedTuple):
@@ -151,12 +157,14 @@ def registration_of(
     target: PointCloud,
     used: Bool[AnyArray, "n"],
     derivative: Callable[[str, str], np.ndarray] | None = None,
+    inputs: Any = None,
 ) -> RegistrationResult:
     """The `RegistrationResult` of a final state, in the user's frames; NumPy where everything is concrete.
 
     Args:
         used: which source points could be matched; False for padding.
         derivative: computes `RegistrationResult.jacobian`.
+        inputs: of the registration; only the pose has a derivative by those that are traced.
     """
     history: dict[str, Any] = records._asdict()
     # Outside `jit`, only the pose and the origins may be traced, by differentiation.
@@ -168,16 +176,17 @@ def registration_of(
         state, history, used = jax.tree.map(lambda array: np.asarray(array)[()], (state, history, used))
         pose = state.pose if is_concrete(pose) else pose
     record, num_inliers = state.record, state.record.num_inliers.astype(np.int32)
+    constant_by = partial(without_derivative, inputs=inputs, message=_NO_DERIVATIVE)
     return RegistrationResult.build(
         status_code=state.status,
         num_iterations=state.num_iterations,
         num_inliers=num_inliers,
-        cost=record.cost,
-        rmse=record.rmse,
+        cost=constant_by(record.cost),
+        rmse=constant_by(record.rmse),
         overlap=(num_inliers / used.sum()).astype(record.rmse.dtype),
         history=history,
         constraints=_later(lambda: _constraints_in_user_frame(assessment, source.origin), concrete),
-        uncertainty=_later(lambda: _uncertainty_in_user_frame(assessment, state, source.origin), concrete),
+        uncertainty=_later(lambda: _uncertainty_in_user_frame(assessment, state, source.origin), concrete, constant_by),
         derivative=Held(derivative),
         **fields_of_pose(pose, source_origin, target_origin),
     )
@@ -190,9 +199,17 @@ def fields_of_pose(pose: jaxlie.SE3, source_origin: Any, target_origin: Any) -> 
     return {"T_target_source": user, "source_origin": source_origin, "target_origin": target_origin, "centred": pose}
 
 
-def _later(compute: Callable[[], Any], concrete: bool) -> Lazy[Any]:
+def _later(compute: Callable[[], Any], concrete: bool, constant_by: Callable[[Any], Any] = lambda value: value) -> Lazy:
     """Deferred where concrete; traced values must be computed before the trace ends."""
-    return Lazy(lambda: _read_only(compute())) if concrete else Lazy.of(compute())
+
+    def finish(values: Any) -> Any:
+        try:
+            return constant_by(values)
+        except jax.errors.UnexpectedTracerError:
+            # Read after the end of the differentiation.
+            return values
+
+    return Lazy(lambda: _read_only(compute()), finish) if concrete else Lazy.of(constant_by(compute()))
 
 
 def _read_only(tree: Any) -> Any:

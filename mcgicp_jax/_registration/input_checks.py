@@ -116,8 +116,10 @@ def warn_of_hard_matches(method: AbstractMethod, source: PointCloud, target: Poi
         )
 
 
-def warn_of_estimated_parameters(method: AbstractMethod, source: PointCloud, target: PointCloud, soft: bool) -> None:
-    """Warn if channels are differentiated outside of `jit` while Λ, or α of soft matches, is estimated from them.
+def warn_of_estimated_parameters(
+    method: AbstractMethod, source: PointCloud, target: PointCloud, soft: bool, equalize_channels: bool = False
+) -> None:
+    """Warn if channels are differentiated outside of `jit` while Λ, α of soft matches, or gains are estimated from them.
 
     The photometric term uses neither, but estimates numbers from the residuals of points and channels. All of these are
     constant to autodiff. Of hard matches, α decides the matches alone, which are, too.
@@ -135,6 +137,11 @@ def warn_of_estimated_parameters(method: AbstractMethod, source: PointCloud, tar
         return
     if is_concrete(channels):
         return
+    if equalize_channels and is_concrete(primal(channels)):
+        warn(
+            "equalize_channels: gain and offset are estimated from the channels, but constant in the derivative by "
+            "channels, which is therefore not that of the result; equalise the channels before"
+        )
     names = ["channel_covariance", "channel_weights"] if soft else ["channel_covariance"]
     unset = [name for name in names if getattr(method, name) is None]
     if unset and is_concrete(primal(channels)):

@@ -212,7 +212,8 @@ def results_of(runs: Sequence[Run], givens: Sequence[Inputs | None]) -> list[Reg
         traces_origins = given is not None and not is_concrete(given.source.origin, given.target.origin)
         source, target = (given if given is not None and traces_origins else run.inputs)[:2]
         used = run.problem.source.search.valid
-        results.append(registration_of(state, run.assessment(), run.loop.history, source, target, used, jacobian_by))
+        ended = state, run.assessment(), run.loop.history, source, target, used, jacobian_by
+        results.append(registration_of(*ended, run.inputs if given is None else given))
     return results
 
 

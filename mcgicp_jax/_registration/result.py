@@ -103,7 +103,8 @@ class RegistrationResult(eqx.Module):
 
     All fields are evaluated at the returned pose, with the matches of the last update. They are NumPy scalars and
     arrays; inside `jit`, `vmap` or `grad`, and when returned by these, JAX arrays. Only the pose carries a gradient;
-    for the gradient of a cost, call `mahalanobis_cost` at the pose.
+    that of cost, rmse, covariance and deviations raises `NotImplementedError`, and is NaN in forward mode. For the
+    gradient of a cost, call `mahalanobis_cost` at the pose.
 
     The result of a call outside of transformations keeps both clouds and their surfaces in memory for the deferred
     values and `jacobian`: 10 MB for two clouds of 20,000 points. `copy.deepcopy(result)`, like a pickle, holds the
@@ -288,7 +289,7 @@ class RegistrationResult(eqx.Module):
         return (
             f"RegistrationResult({self.status.name}: translation {where}{translation} m, rotation {angle:.3f}°, "
             f"{self.num_iterations} iterations, {self.num_inliers} inliers ({self.overlap:.0%}), "
-            f"rmse {np.asarray(self.rmse):.4g} m{'; unconstrained by geometry: ' if free else ''}{free})"
+            f"rmse {np.asarray(primal(self.rmse)):.4g} m{'; unconstrained by geometry: ' if free else ''}{free})"
         )
 
 
