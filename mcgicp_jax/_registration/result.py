@@ -208,7 +208,8 @@ class RegistrationResult(eqx.Module):
         some by 75 %. It does not cover a wrong local minimum, errors common to all points (calibration, motion during a
         scan), or moving objects. An unconstrained direction gets a standard deviation of 10 times the radius of the
         matched points, next to which float32 would round the others away: the matrix is float64, except inside
-        transformations and from `DenseSearch` in batches. NaN for too few matches, a NON_FINITE status, or a degenerate alignment.
+        transformations and from `DenseSearch` in batches. NaN for too few matches, a NON_FINITE status, or a degenerate
+        alignment.
         """
         return self.uncertainty.value.covariance
 
