@@ -119,7 +119,7 @@ def warn_of_hard_matches(method: AbstractMethod, source: PointCloud, target: Poi
 def warn_of_estimated_parameters(
     method: AbstractMethod, source: PointCloud, target: PointCloud, soft: bool, equalize_channels: bool = False
 ) -> None:
-    """Warn if channels are differentiated outside of `jit` while Λ, α of soft matches, or gains are estimated from them.
+    """Warn if channels are differentiated outside `jit` while Λ, α of soft matches, or gains are estimated from them.
 
     The photometric term uses neither, but estimates numbers from the residuals of points and channels. All of these are
     constant to autodiff. Of hard matches, α decides the matches alone, which are, too.
