@@ -888,3 +888,22 @@ def test_poses_that_do_not_fit(tmp_path):
     refused(lambda: io.write_poses(tmp_path / "p.txt", np.array([np.eye(4), 2 * np.eye(4)])), "poses[1]")
     refused(lambda: io.write_poses(tmp_path / "p.txt", poses(8), timestamps=[1.0, 2.0]), "timestamps")
     assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("suffix", [".ply", ".pcd", ".npz", ".csv", ".xyz"])
+def test_times_are_no_channel_and_come_back(tmp_path, suffix):
+    cloud = PointCloud(RNG.random((6, 3)), RNG.random(6), channel_names=INTENSITY, times=RNG.permutation(6))
+    io.write(tmp_path / f"c{suffix}", cloud)
+    back = io.read(tmp_path / f"c{suffix}")
+    assert back.channel_names == INTENSITY
+    np.testing.assert_allclose(back.times, cloud.times, atol=1e-7)
+
+
+def test_times_of_other_programs(tmp_path):
+    """Whole nanoseconds of a clock, or of LAS; a column of equal numbers is no time."""
+    (tmp_path / "c.csv").write_text("x,y,z,timestamp\n" + "".join(f"{i},0,1,{1_700_000_000 + i}\n" for i in range(5)))
+    np.testing.assert_allclose(io.read(tmp_path / "c.csv").times, np.arange(5) / 4)
+    las_data(3, gps_time=np.arange(N)[::-1]).write(str(tmp_path / "c.las"))
+    np.testing.assert_allclose(io.read(tmp_path / "c.las").times, np.linspace(1, 0, N))
+    (tmp_path / "d.csv").write_text("x,y,z,t\n0,0,1,7\n1,0,1,7\n")
+    assert io.read(tmp_path / "d.csv").times is None

@@ -29,6 +29,7 @@ _NOT_CHANNELS = re.compile(
 )
 
 
+_TIMES = re.compile("(scalar_)?(t|time|time_?stamp|adjusted_?time|gps_?time|offset_?time)")
 # The bits of NaN in float32, which stand for no colour where four bytes hold one.
 _NO_COLOR = np.float32(np.nan).view(np.uint32)
 
@@ -59,6 +60,15 @@ def arrays_of_columns(columns: Columns) -> tuple[Float[np.ndarray, "N 3"], Float
     names = sorted(channels, key=lambda name: ORDER.get(name, len(ORDER)))
     values = np.column_stack([channels[name] for name in names]) if names else np.zeros((len(points), 0), points.dtype)
     return points, values, names
+
+
+def times_of(columns: Columns) -> Shaped[np.ndarray, "N"] | None:
+    """The first column of times that differ, in any unit; None if there is none."""
+    for column, values in columns.items():
+        timed = values.dtype.kind in "fiu" and _TIMES.fullmatch(column.lower())
+        if timed and np.isfinite(values).all() and (values != values[:1]).any():
+            return values
+    return None
 
 
 def _channel(name: str, values: Shaped[np.ndarray, "N"], dtype: np.dtype) -> Float[np.ndarray, "N"]:

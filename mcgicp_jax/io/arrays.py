@@ -111,6 +111,7 @@ def read_npz(file: BinaryIO, size: int) -> PointCloud:
                 load("channels"),
                 covariances=load("covariances") if "covariances" in names else None,
                 channel_names=load("channel_names").astype(str).tolist() if "channel_names" in names else None,
+                times=load("times") if "times" in names else None,
             )
         columns = dict(zip("xyz", points.T, strict=True))
         columns |= {name: load(name).ravel() for name in names if name.lower() in INTENSITIES}
@@ -132,4 +133,6 @@ def write_npz(file: BinaryIO, cloud: PointCloud) -> None:
     }
     if cloud.covariances is not None:
         arrays["covariances"] = cloud.covariances
+    if cloud.times is not None:
+        arrays["times"] = cloud.times
     np.savez(file, **arrays)

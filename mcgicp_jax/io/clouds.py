@@ -112,6 +112,8 @@ def read(path: str | os.PathLike[str]) -> PointCloud:
     are otherwise x, y, z, channel_0, ... as in `.npy` (N, 3 + C). `.npz`: `points` (N, 3), with `channels` (N, C) and
     `channel_names`, or with `intensity` (N,) and `rgb` or `colors` (N, 3).
 
+    A column `time`, `t`, `timestamp`, `gps_time`, `offset_time` or the like becomes `PointCloud.times`, and no channel.
+
     In every format, NaN in a channel means that the point lacks the channel; see `PointCloud.channel_valid`.
 
     Args:
@@ -155,7 +157,8 @@ def write(path: str | os.PathLike[str], cloud: PointCloud) -> None:
     """Write the valid points of a cloud, in the user's frame, to a file.
 
     `read` restores the cloud within the limits of the format. PLY, PCD and NPZ preserve float32 and float64; colours
-    that are all multiples of 1/255 are stored as 8-bit integers. Only `.npz` preserves the covariances, only `.npz` and
+    that are all multiples of 1/255 are stored as 8-bit integers. Times are written as a column `time`
+    by PLY, PCD, NPZ and text. Only `.npz` preserves the covariances, only `.npz` and
     `.npy` the channel order; `.npy` has no channel names; KITTI is float32. LAS rounds coordinates to a power of ten,
     with an error of at most 5·10⁻⁹ of the cloud's extent, and colours to 16 bits. Missing channels are written as NaN,
     which LAS cannot represent. A failed write leaves an existing file unchanged.

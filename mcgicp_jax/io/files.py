@@ -12,7 +12,7 @@ from typing import BinaryIO
 
 import numpy as np
 
-from mcgicp_jax._clouds.columns import COLORS, Columns, arrays_of_columns, channel_name
+from mcgicp_jax._clouds.columns import COLORS, Columns, arrays_of_columns, channel_name, times_of
 from mcgicp_jax._clouds.point_cloud import PointCloud
 
 # Missing numbers as Windows, R and databases write them.
@@ -54,7 +54,7 @@ def replacing(path: str | os.PathLike[str]) -> Iterator[BinaryIO]:
 def cloud_of(columns: Columns) -> PointCloud:
     """Build a cloud from the named columns of a file, which must include x, y and z."""
     points, channels, names = arrays_of_columns(columns)
-    return PointCloud(points, channels, channel_names=names)
+    return PointCloud(points, channels, channel_names=names, times=times_of(columns))
 
 
 def columns_of(cloud: PointCloud) -> Columns:
@@ -67,6 +67,8 @@ def columns_of(cloud: PointCloud) -> Columns:
             )
     columns = dict(zip("xyz", cloud.points.T, strict=True))
     columns |= {column_name(name): values for name, values in zip(names, cloud.channels.T, strict=True)}
+    if cloud.times is not None:
+        columns["time"] = np.asarray(cloud.times)
     colours = {name: columns[name] for name in COLORS if name in columns}
     whole = {name: np.rint(np.clip(values, 0, 1) * 255) for name, values in colours.items()}
     if all(np.array_equal(whole[name].astype(cloud.points.dtype) / 255, colours[name]) for name in colours):

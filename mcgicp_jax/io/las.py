@@ -34,7 +34,7 @@ def read_las(file: BinaryIO, size: int) -> PointCloud:
             _check_laz(file, header, size)
         else:
             check_size(start + header.point_count * header.point_format.size, size)
-        names = {"X", "Y", "Z", "intensity", *COLORS} & set(header.point_format.dimension_names)
+        names = {"X", "Y", "Z", "intensity", "gps_time", *COLORS} & set(header.point_format.dimension_names)
         chunks = [{name: np.array(chunk[name]) for name in names} for chunk in reader.chunk_iterator(_LAS_ROWS_AT_ONCE)]
     if not chunks:
         raise ValueError("it has no points")

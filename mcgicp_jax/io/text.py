@@ -99,7 +99,8 @@ def _is_number(cell: str) -> bool:
 
 def write_text(file: BinaryIO, cloud: PointCloud, delimiter: str, mark: str) -> None:
     columns_of(cloud)
-    names = ["x", "y", "z", *map(column_name, cloud.channel_names)]
+    times = [] if cloud.times is None else [np.asarray(cloud.times)]
+    names = ["x", "y", "z", *map(column_name, cloud.channel_names), *["time"] * len(times)]
     # "%s" prints the shortest number that is exact in its own dtype, so all values are converted to float64 first.
-    table = np.column_stack([cloud.points, cloud.channels]).astype(np.float64)
+    table = np.column_stack([cloud.points, cloud.channels, *times]).astype(np.float64)
     np.savetxt(file, table, fmt="%s", delimiter=delimiter, header=delimiter.join(names), comments=mark)
