@@ -169,7 +169,7 @@ def measured(
     if limits and prior is not None:
         most = xp.asarray(place[3] * _distance_to_prior(place[0], form.prior), dtype)
         nearer = xp.maximum(xp.minimum(settings.max_distance, most), settings.fine_distance)
-        settings = settings._replace(max_distance=nearer)
+        settings = settings._replace(max_distance=xp.asarray(nearer))
     measurements = as_dtype(PoseMeasurements(*place, form))
     return replace(problem, start=start, measurements=measurements, fixed=fixed, settings=settings)
 
