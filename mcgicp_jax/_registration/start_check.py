@@ -41,16 +41,16 @@ _SAMPLE = 1024
 def surface_fit(inputs: Inputs, executor: HostExecutor, loop: LoopResult) -> float:
     """(a/m)² at the end of a registration, for the agreement a and the misfit m, at least 1, of the surfaces of matched
     points: see `agreement_of`. 0 without matches."""
-    motion = Motion.of(loop.state.pose.wxyz_xyz)
-    rows = np.flatnonzero((loop.matches.indices >= 0).any(axis=0))
+    points = executor.problem.source.points
+    rows = np.flatnonzero(executor.problem.source.search.valid)
     rows = rows[:: -(-len(rows) // _SAMPLE) or 1]
-    matches = executor.nearest_candidates(motion, executor.within(motion, loop.matches.some(rows)))
+    # In position alone: matches in position and channels lie further apart, also at right poses.
+    motion, matches = executor.rematched(loop.state.pose, np.zeros(3, points.dtype), rows, np.ones(len(rows), bool))
     targets = matches.indices[0]
     rows, targets = rows[targets >= 0], targets[targets >= 0]
     if not len(rows):
         return 0.0
-    points = executor.problem.source.points[rows]
-    offsets = executor.problem.target.points[targets] - motion.move(points).T
+    offsets = executor.problem.target.points[targets] - motion.move(points[rows]).T
     own = rows if inputs.source_rows is None else inputs.source_rows[rows]
     source, target = (
         geometry_table(cloud, inputs.method.uses_channels).trees(some)[0]
