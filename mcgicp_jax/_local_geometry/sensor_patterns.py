@@ -19,7 +19,7 @@ from jaxtyping import Bool, Float, Int
 
 from mcgicp_jax._clouds.point_cloud import PointCloud
 from mcgicp_jax._compute.cache import cached_with_cloud
-from mcgicp_jax._compute.concrete import AnyArray, constant, is_concrete, numpy_for
+from mcgicp_jax._compute.concrete import AnyArray, AnyScalar, constant, is_concrete, numpy_for
 from mcgicp_jax._compute.linear_maps import primal
 from mcgicp_jax._compute.messages import warn
 from mcgicp_jax._math.statistics import median, sampled_rows
@@ -65,7 +65,7 @@ class _Sample(NamedTuple):
     weights: Float[AnyArray, "W n"]
 
 
-def channels_constrain(source: PointCloud) -> Bool[AnyArray, ""]:
+def channels_constrain(source: PointCloud) -> Bool[AnyScalar, ""]:
     """Whether any channel is a texture, which may constrain a motion that geometry does not."""
     by_angles, smooth = explained(source)
     return (~(by_angles > _NO_TEXTURE) & ~(smooth > _NO_TEXTURE)).any()

@@ -301,7 +301,7 @@ def _may_have_left(run: Run, init: Pose | None, at_scales: bool) -> bool:
         return False
     source, target = run.inputs[:2]
     start = se3_from_matrix(centred_pose(init, source, target), source.points.dtype)
-    return distance_moved(start, state) > settings.fine_distance and _fit(run) < LEAST_FIT
+    return bool(distance_moved(start, state) > settings.fine_distance) and _fit(run) < LEAST_FIT
 
 
 def _better(run: Run, other: Run) -> Run:

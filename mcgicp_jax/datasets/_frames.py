@@ -139,8 +139,10 @@ class SyntheticFrames(AbstractFrames):
         key = (_FIRST_FRAME + row,) if noise_seed is None else (_FIRST_FRAME + row, noise_seed)
         rng = np.random.default_rng(np.random.SeedSequence(self.seed, spawn_key=key))
         pose = self.path(row)
-        during = [self.path(row - time) for time in np.linspace(1, 0, self.num_poses)]
-        return Frame(self.observer(rng, np.stack(during) if len(during) > 1 else pose), pose, row * self.period)
+        during = pose
+        if self.num_poses > 1:
+            during = np.stack([self.path(row - float(time)) for time in np.linspace(1, 0, self.num_poses)])
+        return Frame(self.observer(rng, during), pose, row * self.period)
 
 
 # Independent random streams of one seed: the scene, the path of the sensor, and one per frame.

@@ -124,12 +124,12 @@ def street(
 # The sensor
 
 
-def _smooth_pose(step: float, sway: float, yaw: float, tilt: float, time: float) -> Matrix:
+def _smooth_pose(step: float, sway: float, yaw: float, tilt: float, time: float | int) -> Matrix:
     rotation = sensor_rotation(_YAW * np.sin(yaw + time / _SMOOTH), _TILT, tilt + time / _SMOOTH)
     return pose_of(rotation, (time * step, _LANE + _SWAY * np.sin(sway + time / _SMOOTH), _SENSOR_HEIGHT))
 
 
-def _pose(step: float, sway: float, yaw: float, tilt: float, index: float) -> Matrix:
+def _pose(step: float, sway: float, yaw: float, tilt: float, index: float | int) -> Matrix:
     rotation = sensor_rotation(_YAW * np.sin(yaw + index / 4), _TILT, tilt + 0.7 * index)
     aside = _LANE + _SWAY * np.sin(sway + index * step / (6 * _SWAY))
     return pose_of(rotation, (index * step, aside, _SENSOR_HEIGHT))
