@@ -136,7 +136,12 @@ def _pose(step: float, sway: float, yaw: float, tilt: float, index: float | int)
 
 
 def _observe(
-    things: list[_Thing], pattern: int, size: int, noise: float, rng: np.random.Generator, pose: Matrix
+    things: list[_Thing],
+    pattern: int,
+    size: int,
+    noise: float,
+    rng: np.random.Generator,
+    pose: Float[np.ndarray, "*poses 4 4"],
 ) -> PointCloud:
     poses, solids = pose.reshape(-1, 4, 4), [thing.solid for thing in things]
     rays = np.array_split(spinning_rays(rng, size, _BEAMS, _LOWEST, _HIGHEST), len(poses))
