@@ -55,7 +55,7 @@ def register(
     Near convergence, a fine phase with all points and the smaller `max_distance` takes over.
 
     The coarse phase may leave a right `init`, for instance where clouds were cut out of merged scans. If it has moved
-    the points by more than the fine `max_distance` to a pose at which the surfaces do not coincide, a second
+    the points by more than the fine `max_distance` to a pose at which the surfaces do not coincide, and `max_distance` is None, a second
     registration from `init` uses the fine `max_distance` alone, and is the result if they coincide better. Not inside
     transformations and with `DenseSearch` in batches: pass a smaller `max_distance` there if `init` is near.
 

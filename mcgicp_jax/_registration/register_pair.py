@@ -176,7 +176,8 @@ def run_pair(given: Inputs, init: Pose | None, options: Options, traced: bool = 
         (result,) = results_of([solve(scale, start, replace(options, max_distance=None))], [None])
         start = result.matrix if is_usable(result) else start
     run = solve(inputs, start)
-    if not traced and _may_have_left(run, init, len(coarse) > 0):
+    # A given coarse distance says how far off the initial pose may be.
+    if not traced and options.max_distance is None and _may_have_left(run, init, len(coarse) > 0):
         run = _better(run, solve(inputs, init, near))
     if options.equalize_channels and not any(term.estimates_gains for term in run.problem.terms):
         # Parameters left None are chosen anew, from the channels as equalised by the matches.
@@ -191,7 +192,8 @@ def run_pair(given: Inputs, init: Pose | None, options: Options, traced: bool = 
     # Again from its pose, with tie points and prior weighed by its covariance.
     fusion = fusion_of(run.loop.state, run.moments(), run.inputs.tie_points, run.inputs.prior, traced)
     settings = run.problem.settings
-    settings = settings._replace(max_distance=settings.fine_distance)
+    if options.max_distance is None:
+        settings = settings._replace(max_distance=settings.fine_distance)
     problem = replace(run.problem, start=constant(run.loop.state.pose), settings=settings, measurements=fusion)
     return run_loop(run.inputs, problem, search, options.max_iterations, traced)
 
