@@ -44,7 +44,8 @@ def walls(size, seed, planes, lengths):
 def edge(size, seed):
     """A plane with stripes, between which the channel changes from −1 to 1 within 10 cm."""
     points, _ = wall(size, 0.01, seed)
-    return points, np.tanh(np.sin(4 * np.pi * points[:, :1]) / 0.3) + 0.01 * np.random.default_rng(seed).normal(size=(size, 1))
+    stripes = np.tanh(np.sin(4 * np.pi * points[:, :1]) / 0.3)
+    return points, stripes + 0.01 * np.random.default_rng(seed).normal(size=(size, 1))
 
 
 # Scene, method, and number of unconstrained directions.
