@@ -405,11 +405,12 @@ def test_estimated_parameters_are_warned_of_where_channels_are_differentiated(of
         warnings.simplefilter("error", UserWarning)
         jax.vjp(loss, inputs)
         jax.vjp(partial(loss, method=unset), {"source points": clouds[0].points})
-        # α decides matches alone.
-        jax.vjp(partial(loss, method=mcg.MultiChannelGICP(0.05)), inputs)
+        # Of hard matches, α decides the matches alone.
+        if not of.startswith("register"):
+            jax.vjp(partial(loss, method=mcg.MultiChannelGICP(0.05)), inputs)
         if of == "mahalanobis_cost":
             jax.eval_shape(jax.jit(jax.grad(partial(loss, method=unset))), inputs)
-    with pytest.warns(UserWarning, match=r"^channel_covariance: estimated .* resolve") as caught:
+    with pytest.warns(UserWarning, match=r"^channel_covariance.*: estimated .* resolve") as caught:
         jax.vjp(partial(loss, method=unset), inputs)
     assert len(caught) == 1
 
