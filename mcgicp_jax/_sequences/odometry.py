@@ -33,9 +33,9 @@ from mcgicp_jax._registration.tie_points_and_prior import GivenPrior
 from mcgicp_jax._sequences.loop_closure import Trajectory
 from mcgicp_jax._sequences.relocalization import Relocalizer, map_target
 
-# Deskewing is repeated where the motion that a registration measured differs from that of the prediction by more than
-# this fraction of the spacing, as rms displacement of the points; at most so many times. In simulated streets, from 1
-# to 20 m/s, the second registration suffices, after the first frame the third.
+# Deskewing is repeated where a registration measures another motion than the one that the scan was deskewed by: one
+# that displaces the points by more than this fraction of the spacing (rms). At most so many registrations per frame,
+# since a constant velocity during the scan is an approximation itself.
 _SAME_MOTION, _ROUNDS = 0.1, 3
 
 
