@@ -117,14 +117,16 @@ class _NormalEquations(lx.AbstractLinearSolver):
 
     def init(self, operator: lx.AbstractLinearOperator, options: dict[str, Any]) -> tuple[Array, Array]:
         jacobian = operator.as_matrix()
-        return jacobian, jnp.linalg.cholesky(jacobian.T @ jacobian)
+        return jacobian, jnp.linalg.cholesky(jnp.dot(jacobian.T, jacobian, precision="highest"))
 
     def compute(
         self, state: tuple[Array, Array], vector: Any, options: dict[str, Any]
     ) -> tuple[Array, lx.RESULTS, dict[str, Any]]:
         jacobian, root = state
         flat, _ = jax.flatten_util.ravel_pytree(vector)
-        return jax.scipy.linalg.cho_solve((root, True), jacobian.T @ flat), lx.RESULTS.successful, {}
+        # lineax calls this outside of the settings of the package.
+        projected = jnp.dot(jacobian.T, flat, precision="highest")
+        return jax.scipy.linalg.cho_solve((root, True), projected), lx.RESULTS.successful, {}
 
     def transpose(self, state: Any, options: dict[str, Any]) -> Any:
         raise NotImplementedError
