@@ -26,9 +26,8 @@ def test_a_pattern_that_moves_with_the_sensor_constrains_nothing(channel):
     assert status(seen(CORRIDOR, 0, MOVING_CHANNELS[channel])) == mcg.Status.DEGENERATE
 
 
-@pytest.mark.parametrize("channel", ["range", "time"])
-def test_a_status_does_not_depend_on_the_frame_of_both_clouds(channel):
-    pair = in_frames(seen(FLOOR_AND_WALL, 0, MOVING_CHANNELS[channel]), ELSEWHERE, ELSEWHERE)
+def test_a_status_does_not_depend_on_the_frame_of_both_clouds():
+    pair = in_frames(seen(FLOOR_AND_WALL, 0, MOVING_CHANNELS["range"]), ELSEWHERE, ELSEWHERE)
     assert status(pair) == mcg.Status.DEGENERATE
 
 

@@ -59,7 +59,7 @@ def test_batches_find_the_same():
 
 
 @pytest.mark.parametrize(
-    ("search", "seed", "count"), [(None, 1, 4000), pytest.param(mcg.DenseSearch(), 2, 2000, marks=pytest.mark.slow)]
+    ("search", "seed", "count"), [(None, 1, 4000), pytest.param(mcg.DenseSearch(), 2, 4000, marks=pytest.mark.slow)]
 )
 def test_global_poses_are_not_left(search, seed, count):
     pair = office(seed, count)
