@@ -6,12 +6,14 @@ import numpy as np
 import pytest
 
 import mcgicp_jax as mcg
-from mcgicp_jax._local_geometry.sensor_patterns import channels_constrain, explained, without_patterns
+from mcgicp_jax._local_geometry.sensor_patterns import channels_may_move, explained, without_patterns
 from tests.promise_scenes import CORRIDOR, FLOOR_AND_WALL, MOVING_CHANNELS, in_frames, moved, seen, tiles, translation
 from tests.reference import pose
 from tests.scenes import wall
 
 METHOD = mcg.MultiChannelGICP()
+# Where a channel is left out, or simple but not left out.
+HONEST = (mcg.Status.DEGENERATE, mcg.Status.UNVERIFIED)
 # Far from the sensor, and turned.
 ELSEWHERE = pose([0.4, 0.5, 1.0], [15, 8, 3])
 
@@ -23,17 +25,18 @@ def status(pair, **options):
 
 @pytest.mark.parametrize("channel", ["range", "elevation", "azimuth", "time", "vignetting", "coordinate", "ring"])
 def test_a_pattern_that_moves_with_the_sensor_constrains_nothing(channel):
-    assert status(seen(CORRIDOR, 0, MOVING_CHANNELS[channel])) == mcg.Status.DEGENERATE
+    assert status(seen(CORRIDOR, 0, MOVING_CHANNELS[channel])) in HONEST
 
 
-def test_a_status_does_not_depend_on_the_frame_of_both_clouds():
-    pair = in_frames(seen(FLOOR_AND_WALL, 0, MOVING_CHANNELS["range"]), ELSEWHERE, ELSEWHERE)
-    assert status(pair) == mcg.Status.DEGENERATE
+@pytest.mark.parametrize("channel", ["range", "time"])
+def test_a_pattern_is_found_out_in_any_frame_of_both_clouds(channel):
+    pair = in_frames(seen(FLOOR_AND_WALL, 0, MOVING_CHANNELS[channel]), ELSEWHERE, ELSEWHERE)
+    assert status(pair) in HONEST
 
 
 def test_the_target_may_be_a_map():
     pair = in_frames(seen(FLOOR_AND_WALL, 0, MOVING_CHANNELS["ring"]), np.eye(4), ELSEWHERE)
-    assert status(pair, init=ELSEWHERE) == mcg.Status.DEGENERATE
+    assert status(pair, init=ELSEWHERE) in HONEST
 
 
 @pytest.mark.parametrize("frame", [np.eye(4), ELSEWHERE])
@@ -47,7 +50,7 @@ def test_gradients_along_the_lines_of_sight_from_the_source_constrain_nothing(fr
         pattern = 0.7 * np.sin(3 * points[:, 1]) + np.sin(4 * np.hypot(*points[:, :2].T))
         clouds.append(mcg.PointCloud(points, pattern + 0.05 * rng.normal(size=8000)))
     source, target = clouds
-    assert channels_constrain(source)
+    assert not channels_may_move(source)
     target = target.replace(points=moved(frame, target.points))
     init = frame @ translation(0.1, 0, 0)
     assert mcg.register(source, target, METHOD, init=init).status == mcg.Status.DEGENERATE
@@ -95,10 +98,10 @@ def test_inside_jit_the_same_channels_are_left_out_and_the_status_is_the_same():
 
     @jax.jit
     def inside(source, target, far):
-        return [cloud.channels for cloud in without_patterns(source, target)], channels_constrain(far), explained(far)
+        return [cloud.channels for cloud in without_patterns(source, target)], channels_may_move(far), explained(far)
 
-    channels, constrain, traced = inside(*clouds, far)
-    assert not np.any(channels) and not constrain and not channels_constrain(far)
+    channels, may_move, traced = inside(*clouds, far)
+    assert not np.any(channels) and may_move and channels_may_move(far)
     np.testing.assert_allclose(traced, explained(far), atol=0.01)
 
 

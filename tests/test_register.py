@@ -367,7 +367,7 @@ def test_equalized_channels_are_not_fooled_by_what_one_cloud_sees():
     source, target, truth = pair(wall)
     points, channels = np.array(source.points), 0.8 * np.array(source.channels) + 0.1
     points[:400, 0] += 5
-    channels[:400] = 2.0
+    channels[:400] = 1.5
     source = mcg.preprocess(mcg.PointCloud(points[:2000], channels[:2000]))
     method = mcg.MultiChannelGICP()
     right = mcg.PointCloud(points[:2000], (channels[:2000] - 0.1) / 0.8)

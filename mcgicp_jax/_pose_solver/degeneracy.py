@@ -16,7 +16,7 @@ import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float
 
-from mcgicp_jax._compute.concrete import AnyArray, AnyScalar
+from mcgicp_jax._compute.concrete import AnyArray
 from mcgicp_jax._math.poses import adjoint_to_source, units
 from mcgicp_jax._pose_solver.sums import Sums
 from mcgicp_jax._pose_solver.update import twist_form
@@ -75,9 +75,14 @@ class Directions(eqx.Module):
         return (0 * self.geometry if self.ties is None else self.ties) == np.inf
 
     @property
+    def constrained_by_channels(self) -> Bool[AnyArray, "*batch 6"]:
+        """Which directions are constrained by the channels alone; not those that are fixed."""
+        return self.free & (self.channels >= LEAST_BY_CHANNELS) & ~self.fixed
+
+    @property
     def constrained_by_matches(self) -> Bool[AnyArray, "*batch 6"]:
         """Which directions are constrained by geometry or by the channels; not those that are fixed."""
-        return (~self.free | (self.channels >= LEAST_BY_CHANNELS)) & ~self.fixed
+        return (~self.free & ~self.fixed) | self.constrained_by_channels
 
     @property
     def constrained(self) -> Bool[AnyArray, "*batch 6"]:
@@ -89,16 +94,13 @@ class Directions(eqx.Module):
         )
 
 
-def find_directions(
-    sums: Sums, constraints: Float[Array, "6 6"] | None = None, channels_constrain: Bool[AnyScalar, ""] = True
-) -> Directions:
+def find_directions(sums: Sums, constraints: Float[Array, "6 6"] | None = None) -> Directions:
     """Eigenvectors of the observed fraction of the points' motion: by the geometry, and among the directions that
     geometry does not constrain, by the channels. Fractions do not depend on units or on the origin.
 
     Args:
         constraints: rows that are orthogonal to the free twists, and rows of zeros. Eigenvectors are those within the
             free twists; the other directions are fixed. None if all are free.
-        channels_constrain: whether channels may constrain a direction.
     """
     if sums.mass is None or sums.observability is None:
         raise ValueError("sums: expected those of surfaces with observability")
@@ -137,7 +139,7 @@ def find_directions(
     shares, agreed, surplus = (jnp.sum(basis * (form @ basis), axis=0) for form in forms)
     agreed = jnp.where(surplus < _PATTERN * agreed, 0, agreed)
     channels = jnp.where((seen > 0) & (agreed < _AGREE * seen), agreed - _AGREE * seen, seen)
-    channels = jnp.where((seen > 1.5) | ~jnp.asarray(channels_constrain), 0, channels)
+    channels = jnp.where(seen > 1.5, 0, channels)
     return Directions(twists=basis.T, geometry=shares, channels=channels, center=center, radius=radius, ties=ties)
 
 

@@ -302,7 +302,7 @@ def _change(
     degenerate: AnyScalar = np.bool_(False)
     if sums.observability is not None:
         constraints = None if fixed is None else constraints_at(pose, sums.center, sums.radius, fixed)
-        directions = find_directions(sums, constraints, settings.channels_constrain)
+        directions = find_directions(sums, constraints)
         degenerate = ~jnp.all(directions.constrained)
         # Along unconstrained directions an update would follow arbitrary nearest-neighbour matches.
         moving = (directions.constrained | ~settings.hold_unconstrained) & ~directions.fixed
@@ -356,11 +356,12 @@ def update(
     nearly = nearly & (motion <= _FRACTION_OF_GATE * settings.fine_distance)
     converged = below(settings.translation_tolerance, settings.rotation_tolerance) | (coarse & nearly) | cycles
     finite = jnp.isfinite(sums.energy) & jnp.all(jnp.isfinite(moved.wxyz_xyz))
+    doubtful = settings.channels_may_move & _depends_on_channels(directions)
     outcomes: tuple[tuple[Array, int], ...] = (
         (sums.num_inliers < _MIN_CORRESPONDENCES, Status.TOO_FEW_CORRESPONDENCES),
         (~finite, Status.NON_FINITE),
         (settled & degenerate, Status.DEGENERATE),
-        (settled & _contradicts_prior(pose, measurements), Status.UNVERIFIED),
+        (settled & (_contradicts_prior(pose, measurements) | doubtful), Status.UNVERIFIED),
         (settled, Status.CONVERGED),
         (num_iterations >= settings.max_iterations, Status.MAX_ITERATIONS),
         (coarse & ~converged, COARSE),
@@ -382,6 +383,10 @@ def update(
         directions=directions,
         record=Record(*(number.astype(sums.center.dtype) for number in record)),
     )
+
+
+def _depends_on_channels(directions: Directions | None) -> Bool[AnyScalar, ""]:
+    return np.bool_(False) if directions is None else jnp.any(directions.constrained_by_channels)
 
 
 def _contradicts_prior(pose: jaxlie.SE3, measurements: PoseMeasurements | None) -> Bool[AnyScalar, ""]:

@@ -26,7 +26,7 @@ from mcgicp_jax._local_geometry.cloud_statistics import (
     with_channels_matched,
 )
 from mcgicp_jax._local_geometry.neighborhoods import check_neighbors
-from mcgicp_jax._local_geometry.sensor_patterns import channels_constrain, warn_of_patterns, without_patterns
+from mcgicp_jax._local_geometry.sensor_patterns import channels_may_move, warn_of_patterns, without_patterns
 from mcgicp_jax._math.poses import Pose, se3_from_matrix
 from mcgicp_jax._math.statistics import spread_rows
 from mcgicp_jax._methods.base import AbstractMethod
@@ -184,7 +184,7 @@ def run_pair(given: Inputs, init: Pose | None, options: Options, traced: bool = 
         again = _equalized(run.inputs._replace(method=inputs.method), _nearest_points(run, search))
         run = solve(again, _final_pose(run), near)
     elif compares_channels:
-        if run.loop.state.status == Status.DEGENERATE and not run.problem.settings.channels_constrain:
+        if run.loop.state.status == Status.UNVERIFIED and run.problem.settings.channels_may_move:
             warn_of_patterns(run.inputs.source)
         warn_of_exposure(inputs.source, inputs.target, lambda: _nearest_points(run, search))
     if not measures:
@@ -274,13 +274,13 @@ def problem_of(
         compared = method.uses_channels and target.channels.shape[-1] > 0
         soft = compared and matches is None and not any(term.by_position for term in pair.terms)
     observes_channels = method.uses_channels and matches is None and source.channels.shape[-1]
-    constrain = channels_constrain(source) if observes_channels else True
+    may_move = channels_may_move(source) if observes_channels else False
     problem = Problem(
         se3_from_matrix(centred_pose(init, source, target), dtype),
         pair.source,
         pair.target,
         pair.terms,
-        settings_for(options, pair.method, source, target, stride, constrain, dtype),
+        settings_for(options, pair.method, source, target, stride, may_move, dtype),
         matches=matches,
         num_candidates=pair.method.num_candidates,
         temperature=constant(spacing_of(pair.method, target)) if soft else None,

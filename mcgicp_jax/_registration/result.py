@@ -38,7 +38,9 @@ class Status(enum.IntEnum):
         INVALID_INPUT: `register` would raise a `ValueError` for this pair. Only in batches; the pose is NaN.
         WORKER_FAILED: two workers in turn failed with this pair. Only in batches; the pose is NaN.
         UNVERIFIED: the pose is registered, but it may be wrong: with `init="global"`, `global_pose` had no success; or
-            the pose contradicts the `prior`, by more standard deviations than in one of a million right cases.
+            the pose contradicts the `prior`, by more standard deviations than in one of a million right cases; or
+            channels alone hold it along some direction, and are so simple a function of position that they may move
+            with the sensor.
     """
 
     CONVERGED = 0

@@ -44,7 +44,7 @@ class Settings(NamedTuple):
         coarse_translation_tolerance, coarse_rotation_tolerance: an update below both ends the coarse phase.
         max_iterations: maximum number of updates, both phases together.
         hold_unconstrained: whether the pose is kept fixed along unconstrained directions.
-        channels_constrain: whether channels may constrain directions that geometry does not.
+        channels_may_move: whether the channels may move with the sensor, so that a pose that they hold is UNVERIFIED.
         rounding: variance of the pose, metres², since the coordinates of both clouds are rounded to coarse steps.
     """
 
@@ -57,7 +57,7 @@ class Settings(NamedTuple):
     coarse_rotation_tolerance: Float[AnyArray, "*batch"]
     max_iterations: Int[AnyArray, "*batch"]
     hold_unconstrained: Bool[AnyArray, "*batch"]
-    channels_constrain: Bool[AnyArray, "*batch"]
+    channels_may_move: Bool[AnyArray, "*batch"]
     rounding: Float[AnyArray, "*batch"]
 
     def distance(self, status: Int[AnyScalar, ""]) -> Float[AnyScalar, ""]:
@@ -101,7 +101,7 @@ def settings_for(
     source: PointCloud,
     target: PointCloud,
     stride: Any,
-    channels_constrain: Any,
+    channels_may_move: Any,
     dtype: Any,
 ) -> Settings:
     """The settings of a registration; `stride` is that of the coarse phase."""
@@ -136,7 +136,7 @@ def settings_for(
         coarse_rotation_tolerance=coarse_tolerance(options.rotation_tolerance, ROTATION_TOLERANCE),
         max_iterations=number(options.max_iterations, np.int32),
         hold_unconstrained=number(options.hold_unconstrained, bool),
-        channels_constrain=number(channels_constrain, bool),
+        channels_may_move=number(channels_may_move, bool),
         # An error that is uniform over a step. It does not average out: points on lattices match the lattice.
         rounding=number((steps[0] ** 2 + steps[1] ** 2) / 12, dtype),
     )

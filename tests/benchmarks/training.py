@@ -20,7 +20,7 @@ from tests.benchmarks import accuracy
 # Shorter ones measure single matches that change, longer ones other minima.
 STEPS = (0.5, 1.0, 2.0)
 TIGHT = {"translation_tolerance": 1e-7, "rotation_tolerance": 1e-7, "max_iterations": 200}
-COLUMNS = ["clouds", "method", "matches", "cosine", "ratio of norms", "same sign"]
+COLUMNS = ["clouds", "method", "matches", "cosine", "ratio of norms", "same sign", "steps agree"]
 TRAINING_COLUMNS = ["trained", "seed", "loss at first", "at last", "test before", "after", "fell by", "a step"]
 # By the resolved method of a pair.
 METHODS: dict[str, Callable[[Any], Any]] = {
@@ -119,16 +119,19 @@ def slopes(pair: Pair, method: Any, resolved: Any, options: dict[str, Any]) -> d
     def error(channels: Any, **given: Any) -> Any:
         return sum(mcg.metrics.pose_error(registered(channels, **given).matrix, pair.truth))
 
-    def difference(move: np.ndarray) -> float:
-        changes = [(error(channels + step * move) - error(channels - step * move)) / (2 * step) for step in STEPS]
-        return float(np.mean(changes))
+    def differences(move: np.ndarray) -> list[float]:
+        return [float(error(channels + step * move) - error(channels - step * move)) / (2 * step) for step in STEPS]
 
-    found = {"differences": [difference(move) for move in moves]}
+    found: dict[str, Any] = {"differences": [differences(move) for move in moves]}
     pose = registered(channels).matrix
     for name, soft in (("hard", False), ("soft", True)):
         gradient = np.asarray(jax.grad(partial(error, init=pose, soft_matches=soft))(channels))
         found[name] = [float((gradient * move).sum()) for move in moves]
     return found
+
+
+def cosine(left: np.ndarray, right: np.ndarray) -> float:
+    return float(left @ right / max(np.linalg.norm(left) * np.linalg.norm(right), 1e-300))
 
 
 def cosines(name: str, methods: Sequence[str]) -> Iterator[list[str]]:
@@ -140,14 +143,14 @@ def cosines(name: str, methods: Sequence[str]) -> Iterator[list[str]]:
             slopes(pair, METHODS[method](resolved), resolved, {"max_distance": max_distance})
             for pair, resolved in pairs
         ]
-        expected, *others = (
+        by_step, *others = (
             np.concatenate([found[label] for found in each]) for label in ("differences", "hard", "soft")
         )
+        expected, agree = by_step.mean(axis=1), cosine(by_step[:, 0], by_step[:, -1])
         for label, ours in zip(("hard", "soft"), others, strict=True):
-            lengths = np.linalg.norm(ours), np.linalg.norm(expected)
-            cosine = ours @ expected / max(lengths[0] * lengths[1], 1e-300)
+            ratio = np.linalg.norm(ours) / np.linalg.norm(expected)
             same = f"{(ours * expected > 0).sum()} of {len(ours)}"
-            yield [name, method, label, f"{cosine:.2f}", f"{lengths[0] / lengths[1]:.2f}", same]
+            yield [name, method, label, f"{cosine(ours, expected):.2f}", f"{ratio:.2f}", same, f"{agree:.2f}"]
 
 
 # Training
