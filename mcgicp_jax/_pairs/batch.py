@@ -88,7 +88,7 @@ def register_as_completed(
         voxel_size, num_neighbors: as in `preprocess`, for raw clouds, which the workers preprocess. "auto": one size
             for both clouds of a pair; that of a single cloud for all pairs, if it has any, applies to all.
         executor: None, a thread per core; "processes", a process per core (extra `processes`; no `__main__` guard is
-            needed), which starts in 3 to 7 s, waits for the next call, and pays off with hundreds of pairs; or
+            needed), which starts in 3 to 16 s, waits for the next call, and pays off with hundreds of pairs; or
             any `concurrent.futures.Executor`, such as Dask's `Client.get_executor()`. A pair whose worker dies is sent
             once more, and gets the status `WORKER_FAILED` and a warning if that fails too.
         covariances: False saves a tenth of the time: `covariance` and `deviations` are NaN.
