@@ -162,6 +162,17 @@ def test_rays_without_return_are_left_out(place, count, kept):
     np.testing.assert_array_equal(slopes, np.tile(keep[:, None], 3))
 
 
+@pytest.mark.parametrize(("count", "distance"), [(25, 30), (25, 300), (250, 300)])
+def test_far_surfaces_are_kept_and_far_points_are_not(count, distance):
+    """Of a room of 4 m; a window shows a facade a third as wide as it is far."""
+    rng = np.random.default_rng(0)
+    room = rng.uniform(-2, 2, (2000, 3))
+    facade = np.column_stack([np.full(count, distance), distance * rng.uniform(-0.15, 0.15, (count, 2))])
+    assert len(ready(np.concatenate([room, facade]))) == 2000 + count
+    with pytest.warns(UserWarning, match="left out 19 of 2019 points .* far from all others"):
+        assert len(ready(np.concatenate([room, facade[:19]]))) == 2000
+
+
 @pytest.mark.parametrize("step", [0.5, 1.0])
 def test_equal_points_of_rounded_clouds_are_measurements(step):
     points = np.rint(4 * POINTS / step)[np.arange(900) % 150] * step + 100

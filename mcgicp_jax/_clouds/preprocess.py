@@ -65,10 +65,11 @@ def preprocess(
 
     Warns:
         UserWarning: once per call, if points with NaN or infinity were left out, or points that share exactly one
-            place, as sensors report rays without return (the first at (0, 0, 0) is kept), if downsampling leaves fewer
-            points than `num_neighbors`, if more than half of the points lie exactly on another one, if coordinates
-            are rounded to steps of more than a third of the points' spacing, or if `voxel_size` is None and more than a
-            tenth of the neighbourhoods are lines, or most are more than 0.6 times as thick as wide.
+            place, as sensors report rays without return (the first at (0, 0, 0) is kept), or lie so far from the others
+            that they are no surface, if downsampling leaves fewer points than `num_neighbors`, if more than half of the
+            points lie exactly on another one, if coordinates are rounded to steps of more than a third of the points'
+            spacing, or if `voxel_size` is None and more than a tenth of the neighbourhoods are lines, or most are more
+            than 0.6 times as thick as wide.
     """
     return preprocessed_in(None, cloud, voxel_size, num_neighbors, search)
 
@@ -223,8 +224,8 @@ def finite_rows(cloud: PointCloud | Values) -> PointCloud:
     if placeholders.any():
         x, y, z = points[np.argmax(placeholders)]
         warn(
-            f"left out {placeholders.sum()} of {keep.size} points that lie at exactly one place, such as "
-            f"({x:g}, {y:g}, {z:g}), as sensors report rays without return"
+            f"left out {placeholders.sum()} of {keep.size} points that lie at exactly one place or far from all "
+            f"others, such as ({x:g}, {y:g}, {z:g}), as sensors report rays without return"
         )
     return PointCloud(
         cloud.points[keep],
