@@ -10,8 +10,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from mcgicp_jax import GICP, PointCloud, preprocess
-from mcgicp_jax._clouds.coordinate_steps import harmful_step
+from mcgicp_jax import GICP, PointCloud, datasets, preprocess
+from mcgicp_jax._clouds.coordinate_steps import harmful_steps
 from mcgicp_jax._clouds.voxels import grid_of
 from tests import reference as ref
 from tests.precision import tolerance
@@ -180,12 +180,15 @@ def test_equal_points_of_rounded_clouds_are_measurements(step):
     assert len(ready(points)) == 900
 
 
-def height_map():
-    x, y = np.mgrid[:60, :60].reshape(2, -1)
+def height_map(size=60):
+    x, y = np.mgrid[:size, :size].reshape(2, -1)
     return np.stack([x, y, np.round(np.sin(x / 5) + np.cos(y / 7), 3)], axis=1)
 
 
 SPREAD = np.random.default_rng(0).random((3000, 3)) * [60, 60, 3] @ ref.pose([0.3, 0.2, 0.1], np.zeros(3))[:3, :3]
+# A room of 30 m, and circles on a sphere of 5 m.
+ROOM = 10 * np.asarray(datasets.box_room(1, points_per_frame=3000)[0].cloud.points, np.float64)
+LEVELS, AROUND = np.clip(np.rint(SPREAD[:, 0] / 6) - 5, -5, 5), 2 * np.pi * np.random.default_rng(0).random(3000)
 # Points, and the step to which they are rounded, metres; 0 where it does no harm.
 ROUNDED = {
     "as they are": (SPREAD, 0),
@@ -196,7 +199,11 @@ ROUNDED = {
     "float32": ((SPREAD + UTM).astype(np.float32), 0.5),
     "float32 as float64": ((SPREAD + UTM).astype(np.float32).astype(float), 0.5),
     "centimetres": (np.round(SPREAD + UTM, 2), 0),
+    "heights of a room": (np.stack([*ROOM.T[:2], np.rint(ROOM.T[2])], axis=1), 1),
+    "directions of a room": (np.stack([*np.rint(ROOM.T[:2] / 2) * 2, ROOM.T[2]], axis=1), 2),
     "height map": (height_map(), 0),
+    "height map of more points than are sampled": (height_map(70), 0),
+    "sections": (np.stack([*np.sqrt(25 - LEVELS**2) * [np.cos(AROUND), np.sin(AROUND)], LEVELS], axis=1), 0),
     "height map in float32": ((height_map() + np.rint(UTM)).astype(np.float32), 0),
     "each of ten points five times": (np.tile(POINTS[:10], (5, 1)), 0),
 }
@@ -211,8 +218,8 @@ def test_coarse_steps_of_coordinates_are_found(name):
     told = [str(each.message) for each in caught if "rounded" in str(each.message)]
     assert [float(re.search("steps of ([^ ]*) m", text)[1]) for text in told] == [step] * (step > 0)
     spacing = np.float32(0.7 * np.sqrt(60 * 60 / 3000))
-    assert harmful_step(cloud, spacing) == pytest.approx(step, rel=1e-4)
-    assert jax.jit(harmful_step)(cloud.pad(4096), spacing) == harmful_step(cloud, spacing)
+    assert harmful_steps(cloud, spacing).max() == pytest.approx(step, rel=1e-4)
+    np.testing.assert_array_equal(jax.jit(harmful_steps)(cloud.pad(4900), spacing), harmful_steps(cloud, spacing))
 
 
 def test_large_coordinates_lose_nothing():

@@ -9,7 +9,7 @@ import jax
 import numpy as np
 from jaxtyping import Bool, Float
 
-from mcgicp_jax._clouds.coordinate_steps import harmful_step
+from mcgicp_jax._clouds.coordinate_steps import harmful_steps
 from mcgicp_jax._clouds.placeholders import measured_rows
 from mcgicp_jax._clouds.point_cloud import LARGEST, PointCloud, Values, Voxels, as_cloud, is_far
 from mcgicp_jax._clouds.voxel_size import NUM_NEIGHBORS, VoxelSize, voxels_and_grids, warn_of_shape
@@ -172,11 +172,12 @@ def _warn_of_loss(given: PointCloud, found: PointCloud, num_neighbors: int) -> N
     # Without coincident neighbours; 0 where all are.
     nearest = np.where((distances > 0) & (near >= 0), distances, np.inf).min(axis=1)
     spacing = float(np.nan_to_num(median(np.where(np.isfinite(nearest), nearest, np.nan))))
-    step = float(harmful_step(found, spacing))
-    if step > 0:
+    steps = harmful_steps(found, spacing)
+    if steps.any():
+        names = "" if steps.all() else " " + " and ".join(np.array(["x", "y", "z"])[steps > 0])
         warn(
-            f"points: coordinates are rounded to steps of {step:.2g} m, and neighbours are {spacing:.2g} m apart; read "
-            "them as float64 and with all digits, subtract an offset before float32, or average them: "
+            f"points: coordinates{names} are rounded to steps of {steps.max():.2g} m, and neighbours are {spacing:.2g} "
+            "m apart; read them as float64 and with all digits, subtract an offset before float32, or average them: "
             "preprocess(cloud, voxel_size=...)"
         )
     duplicates = np.mean(distances[:, 0] == 0)
