@@ -73,6 +73,7 @@ def test_wrong_input_gets_one_line(tmp_path, capsys):
         (["box-room", "--every", "0"], "every: "),
         (["box-room", "--min-range", "9", "--max-range", "3"], "min_range: "),
         (["box-room", "--pose-frame", "camera"], "pose_frame: "),
+        (["box-room", "--columns", "5"], "columns: "),
         ([str(alone)], f"mcgicp odometry 7-scenes {alone}"),
     ):
         assert main(["odometry", *args]) == 2

@@ -55,6 +55,25 @@ def register(files, capsys):
     return run
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize("command", ["register", "compare", "odometry", "multiway", "batch"])
+def test_all_commands_read_bin_files_of_given_columns(tmp_path, capsys, command):
+    """x, y, z, intensity and time, which is no known layout."""
+    scans = tmp_path / "scans"
+    scans.mkdir()
+    for seed in (1, 2):
+        points, channels = room_corner(1000, seed=seed, channels=1)
+        rows = np.column_stack([points, channels - channels.min(), np.linspace(0, 0.1, 1000)])
+        rows.astype("<f4").tofile(scans / f"{seed}.bin")
+    files = [str(scans / "2.bin"), str(scans / "1.bin")] if command in ("register", "compare") else [str(scans)]
+    options = ["--output", str(tmp_path / "table.csv")] if command == "batch" else []
+    assert main([command, *files, *options]) == 2
+    assert "--columns 5" in capsys.readouterr().err
+    assert main([command, *files, *options, "--columns", "5"]) == 0
+    assert main([command, *files, *options, "--columns", "2"]) == 2
+    assert "columns: expected" in capsys.readouterr().err
+
+
 def close_to_truth(pose, factor=1.0):
     translation, rotation = metrics.pose_error(pose, TRUTH)
     return translation < 0.01 * factor and rotation < 0.01 * factor

@@ -453,7 +453,7 @@ def test_layouts_of_floats_are_told_apart(tmp_path, name, shuffled):
     LAYOUTS[name](rows).astype("<f4").tofile(tmp_path / "c.bin")
     if shuffled and name == "x, y, z":
         # Nothing tells them from other columns.
-        with pytest.raises(ValueError, match=r"np\.fromfile.*reshape"):
+        with pytest.raises(ValueError, match=r"columns=5\), or --columns 5"):
             io.read(tmp_path / "c.bin")
         return
     cloud = io.read(tmp_path / "c.bin")
@@ -465,8 +465,26 @@ def test_layouts_of_floats_are_told_apart(tmp_path, name, shuffled):
 def test_unknown_layouts_of_floats_are_refused(tmp_path, columns):
     """The sensor would stand still in them."""
     scan()[:, columns].astype("<f4").tofile(tmp_path / "c.bin")
-    with pytest.raises(ValueError, match=r"np\.fromfile.*reshape"):
+    with pytest.raises(ValueError, match=r"columns=5\), or --columns 5"):
         io.read(tmp_path / "c.bin")
+
+
+@pytest.mark.parametrize("name", ["PCL", "x, y, z", "intensity, time", "velocity, time"])
+def test_a_given_number_of_columns(tmp_path, name):
+    """A negative fourth value is no intensity."""
+    rows = RNG.permutation(scan())
+    others = {"intensity, time": rows[:, [0, 1, 2, 3, 5, 5, 5]], "velocity, time": rows[:, [0, 1, 2, 0, 5]]}
+    columns = (others[name] if name in others else LAYOUTS[name](rows)).astype("<f4")
+    for suffix, opened in ((".bin", open), (".bin.gz", gzip.open)):
+        with opened(tmp_path / f"c{suffix}", "wb") as file:
+            file.write(columns.tobytes())
+        cloud = io.read(tmp_path / f"c{suffix}", columns=columns.shape[1])
+        np.testing.assert_array_equal(cloud.points, rows[:, :3].astype(np.float32))
+        np.testing.assert_array_equal(cloud.channels, rows[:, 3 : 3 + (name in ("PCL", "intensity, time"))])
+        with pytest.raises(ValueError, match="rows of 11 float32 values"):
+            io.read(tmp_path / f"c{suffix}", columns=11)
+    with pytest.raises(ValueError, match="columns: expected an integer of at least 3, got 2"):
+        io.read(tmp_path / "c.bin", columns=2)
 
 
 def test_nuscenes_by_suffix(tmp_path):

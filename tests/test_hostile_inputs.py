@@ -226,13 +226,24 @@ def test_points_in_one_place_do_not_set_the_default_distance(beams):
     assert result.converged and max(pose_error(result.matrix, truth)) < 1e-2
 
 
-@pytest.mark.parametrize(("place", "count"), [(0.0, 700), (999.0, 10), (-9999.0, 10)])
+def around(radius, count):
+    """Places at a distance from the sensor, metres."""
+    directions = np.random.default_rng(0).normal(size=(count, 3))
+    return radius * directions / np.linalg.norm(directions, axis=1, keepdims=True)
+
+
+@pytest.mark.parametrize(
+    ("place", "count"),
+    [(0.0, 700), (999.0, 10), (-9999.0, 10), (999.0, 1), (65.535, 5), (around(999, 20), 20), (around(100, 5), 5)],
+)
 def test_rays_without_return_hold_no_pose(place, count):
-    """They lie at one place in both clouds, wherever the sensor is, and far ones beyond all points."""
+    """They lie at one place in both clouds, wherever the sensor is, and far ones beyond all points, few ones also at
+    different places."""
     clouds, truth = pair(size=2000)[:2], motion()
     for method in (mcg.PointToPoint(), mcg.GICP()):
         expected = mcg.register(*clouds, method)
-        spoiled = [np.concatenate([cloud.points, np.full((count, 3), place, np.float32)]) for cloud in clouds]
+        rows = np.broadcast_to(place, (count, 3))
+        spoiled = [np.concatenate([cloud.points, rows.astype(np.float32)]) for cloud in clouds]
         with pytest.warns(UserWarning, match="as sensors report rays without return"):
             result = mcg.register(*spoiled, method)
         assert result.status == expected.status == Status.CONVERGED

@@ -21,6 +21,7 @@ from tests.batches import raw_pair
 from tests.benchmarks.noise_scenes import street
 from tests.corridor import corridor
 from tests.precision import in_float64
+from tests.reference import pose
 from tests.refusals import refused
 from tests.scenes import SURFACES, motion, pair, prepare, wall
 
@@ -455,6 +456,21 @@ def test_deviations_contain_the_steps_of_coordinates(step):
     one = mcg.register(source, rounded[1], mcg.GICP(), init=truth).deviations[:3]
     assert (one > 0.99 * least).all() and (one < result.deviations[:3]).all()
     assert (mcg.register(source, target, mcg.GICP(), init=truth).deviations[:3] < 0.005).all()
+
+
+def test_deviations_contain_the_steps_of_one_axis():
+    """Of the source, whose heights are along y of the target: along this axis, and about the others."""
+    target, source, truth = pair(size=2000)
+    turn, step = pose([np.pi / 2, 0, 0]), 0.1
+    points = np.asarray(source.coordinates) @ turn[:3, :3]
+    rounded = points.copy()
+    rounded[:, 2] = np.rint(points[:, 2] / step) * step
+    fine, coarse = (
+        mcg.register(mcg.preprocess(each, None), target, mcg.GICP(), init=truth @ turn) for each in (points, rounded)
+    )
+    assert (fine.deviations < 0.005).all()
+    assert coarse.deviations[1] > 0.99 * step / np.sqrt(12) and (coarse.deviations[[0, 2, 4]] < 0.005).all()
+    assert (coarse.deviations[[3, 5]] > 0.005).all()
 
 
 @pytest.mark.slow

@@ -10,8 +10,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from mcgicp_jax import GICP, PointCloud, preprocess
-from mcgicp_jax._clouds.coordinate_steps import harmful_step
+from mcgicp_jax import GICP, PointCloud, datasets, preprocess
+from mcgicp_jax._clouds.coordinate_steps import harmful_steps
 from mcgicp_jax._clouds.voxels import grid_of
 from tests import reference as ref
 from tests.precision import tolerance
@@ -162,6 +162,17 @@ def test_rays_without_return_are_left_out(place, count, kept):
     np.testing.assert_array_equal(slopes, np.tile(keep[:, None], 3))
 
 
+@pytest.mark.parametrize(("count", "distance"), [(25, 30), (25, 300), (250, 300)])
+def test_far_surfaces_are_kept_and_far_points_are_not(count, distance):
+    """Of a room of 4 m; a window shows a facade a third as wide as it is far."""
+    rng = np.random.default_rng(0)
+    room = rng.uniform(-2, 2, (2000, 3))
+    facade = np.column_stack([np.full(count, distance), distance * rng.uniform(-0.15, 0.15, (count, 2))])
+    assert len(ready(np.concatenate([room, facade]))) == 2000 + count
+    with pytest.warns(UserWarning, match="left out 19 of 2019 points .* far from all others"):
+        assert len(ready(np.concatenate([room, facade[:19]]))) == 2000
+
+
 @pytest.mark.parametrize("step", [0.5, 1.0])
 def test_equal_points_of_rounded_clouds_are_measurements(step):
     points = np.rint(4 * POINTS / step)[np.arange(900) % 150] * step + 100
@@ -169,12 +180,15 @@ def test_equal_points_of_rounded_clouds_are_measurements(step):
     assert len(ready(points)) == 900
 
 
-def height_map():
-    x, y = np.mgrid[:60, :60].reshape(2, -1)
+def height_map(size=60):
+    x, y = np.mgrid[:size, :size].reshape(2, -1)
     return np.stack([x, y, np.round(np.sin(x / 5) + np.cos(y / 7), 3)], axis=1)
 
 
 SPREAD = np.random.default_rng(0).random((3000, 3)) * [60, 60, 3] @ ref.pose([0.3, 0.2, 0.1], np.zeros(3))[:3, :3]
+# A room of 30 m, and circles on a sphere of 5 m.
+ROOM = 10 * np.asarray(datasets.box_room(1, points_per_frame=3000)[0].cloud.points, np.float64)
+LEVELS, AROUND = np.clip(np.rint(SPREAD[:, 0] / 6) - 5, -5, 5), 2 * np.pi * np.random.default_rng(0).random(3000)
 # Points, and the step to which they are rounded, metres; 0 where it does no harm.
 ROUNDED = {
     "as they are": (SPREAD, 0),
@@ -185,7 +199,11 @@ ROUNDED = {
     "float32": ((SPREAD + UTM).astype(np.float32), 0.5),
     "float32 as float64": ((SPREAD + UTM).astype(np.float32).astype(float), 0.5),
     "centimetres": (np.round(SPREAD + UTM, 2), 0),
+    "heights of a room": (np.stack([*ROOM.T[:2], np.rint(ROOM.T[2])], axis=1), 1),
+    "directions of a room": (np.stack([*np.rint(ROOM.T[:2] / 2) * 2, ROOM.T[2]], axis=1), 2),
     "height map": (height_map(), 0),
+    "height map of more points than are sampled": (height_map(70), 0),
+    "sections": (np.stack([*np.sqrt(25 - LEVELS**2) * [np.cos(AROUND), np.sin(AROUND)], LEVELS], axis=1), 0),
     "height map in float32": ((height_map() + np.rint(UTM)).astype(np.float32), 0),
     "each of ten points five times": (np.tile(POINTS[:10], (5, 1)), 0),
 }
@@ -200,8 +218,8 @@ def test_coarse_steps_of_coordinates_are_found(name):
     told = [str(each.message) for each in caught if "rounded" in str(each.message)]
     assert [float(re.search("steps of ([^ ]*) m", text)[1]) for text in told] == [step] * (step > 0)
     spacing = np.float32(0.7 * np.sqrt(60 * 60 / 3000))
-    assert harmful_step(cloud, spacing) == pytest.approx(step, rel=1e-4)
-    assert jax.jit(harmful_step)(cloud.pad(4096), spacing) == harmful_step(cloud, spacing)
+    assert harmful_steps(cloud, spacing).max() == pytest.approx(step, rel=1e-4)
+    np.testing.assert_array_equal(jax.jit(harmful_steps)(cloud.pad(4900), spacing), harmful_steps(cloud, spacing))
 
 
 def test_large_coordinates_lose_nothing():

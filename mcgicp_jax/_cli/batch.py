@@ -281,7 +281,7 @@ def _settings(pairs: Sequence[FilePair], method: Method, options: Options) -> di
     """Options common to all pairs, with defaults chosen from the first pair whose files can be read."""
     for pair in pairs:
         try:
-            clouds = [io.read(path) for path in pair.paths()]
+            clouds = [io.read(path, columns=options.columns) for path in pair.paths()]
             break
         except (ValueError, OSError) as error:
             reason = error
@@ -299,6 +299,7 @@ def _settings(pairs: Sequence[FilePair], method: Method, options: Options) -> di
     return choices.arguments(name, ready) | {
         "method": choices.method(name, ready),
         "channels": choices.channels,
+        "columns": options.columns,
         "voxel_size": size,
         "num_neighbors": options.num_neighbors,
     }
@@ -317,8 +318,8 @@ def _rows(pairs: Mapping[Key, FilePair], settings: dict[str, Any], bar: tqdm) ->
             show(message, *rest, **options)
 
     arguments = settings.copy()
-    method, names = arguments.pop("method"), arguments.pop("channels")
-    sources, targets = ([partial(_read, pair.paths()[side], names) for pair in pairs.values()] for side in (0, 1))
+    method, read = arguments.pop("method"), partial(_read, *map(arguments.pop, ("channels", "columns")))
+    sources, targets = ([partial(read, pair.paths()[side]) for pair in pairs.values()] for side in (0, 1))
     starts = [pair.init for pair in pairs.values()]
     completed = mcg.register_as_completed(sources, targets, method, init=starts, **arguments)
     with warnings.catch_warnings(), contextlib.closing(completed):
@@ -328,9 +329,9 @@ def _rows(pairs: Mapping[Key, FilePair], settings: dict[str, Any], bar: tqdm) ->
             yield _row(keys[index], result, reasons.pop(index, ""))
 
 
-def _read(path: Path, channels: Sequence[str]) -> mcg.PointCloud:
+def _read(channels: Sequence[str], columns: int | None, path: Path) -> mcg.PointCloud:
     try:
-        return with_channels(io.read(path), channels)
+        return with_channels(io.read(path, columns=columns), channels)
     except ValueError as error:
         raise error if str(path) in str(error) else ValueError(f"{path}: {error}") from error
 

@@ -50,7 +50,7 @@ def multiway(
     check_outputs(output, graph, cloud=map, picture=plot)
     shared.check(method)
     paths = clouds_in(folder, glob, map).paths
-    raw = [io.read(path) for path in paths]
+    raw = [io.read(path, columns=shared.columns) for path in paths]
     choices = Choices.of(shared, *raw)
     clouds = [choices.preprocess(cloud) for cloud in raw]
     voxels = choices.voxels

@@ -103,7 +103,9 @@ def odometry(
     check_outputs(output, cloud=map, picture=plot, inputs=[path] if path else [])
     shared.check(method)
     check_integer("every", every, 1)
-    frames = _open(dataset, path, num_frames, every, map)
+    if shared.columns is not None and isinstance(dataset, str):
+        raise ValueError(f"columns: expected none, since {dataset} has a layout of its own, got {shared.columns}")
+    frames = _open(dataset, path, num_frames, every, map, shared.columns)
     if (min_range, max_range) != (0, np.inf):
         frames = frames.crop(min_range, max_range)
     if pose_frame == "camera" and frames.to_camera is None:
@@ -155,7 +157,12 @@ def odometry(
 
 
 def _open(
-    dataset: DatasetName | Path, path: Path | None, num_frames: int | Literal["all"], every: int, map: Path | None
+    dataset: DatasetName | Path,
+    path: Path | None,
+    num_frames: int | Literal["all"],
+    every: int,
+    map: Path | None,
+    columns: int | None,
 ) -> AbstractFrames:
     if num_frames != "all" and num_frames < 2:
         raise ValueError(f"num_frames: expected at least 2, got {num_frames}")
@@ -167,7 +174,7 @@ def _open(
         frames = DATASETS[dataset].frames(path)
     elif dataset.is_dir():
         try:
-            frames = clouds_in(dataset, map=map)
+            frames = clouds_in(dataset, map=map, columns=columns)
         except ValueError as error:
             if name := _dataset_of(dataset):
                 raise ValueError(f"{error}; it is a sequence: mcgicp odometry {name} {dataset}") from error

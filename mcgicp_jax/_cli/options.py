@@ -18,6 +18,7 @@ import mcgicp_jax as mcg
 from mcgicp_jax import datasets, plot
 from mcgicp_jax._clouds.color_spaces import COLOR_SPACES
 from mcgicp_jax._clouds.preprocess import check_preprocessing
+from mcgicp_jax._compute.messages import check_integer
 from mcgicp_jax._math.robust_kernels import KERNELS
 from mcgicp_jax._registration.options import ROTATION_TOLERANCE
 from mcgicp_jax._registration.options import Options as RegistrationOptions
@@ -65,6 +66,7 @@ Fixed: TypeAlias = Annotated[
     tyro.conf.UseAppendAction,
     shown(default="none"),
 ]
+Columns: TypeAlias = Annotated[int | None, shown("INT", "recognised")]
 Epsilon: TypeAlias = Annotated[
     float | None, shown("FLOAT", str(inspect.signature(mcg.GICP).parameters["epsilon"].default))
 ]
@@ -123,6 +125,7 @@ class Options:
             squared.
         channel_weights: For {channel_weights}: one weight for all channels, or one for each; metres per channel unit.
         epsilon: For {epsilon}: variance along the normal relative to that within the surface.
+        columns: Number of float32 values of each point of .bin files, the first of which are x, y, z and intensity.
     """
 
     channels: Names = ()
@@ -140,9 +143,12 @@ class Options:
     channel_covariance: Numbers = ()
     channel_weights: Numbers = ()
     epsilon: Epsilon = None
+    columns: Columns = None
 
     def check(self, method: MethodName | None = None) -> None:
         """Raise `ValueError` or `OSError` for invalid options, or parameters that the method lacks; reads no cloud."""
+        if self.columns is not None:
+            check_integer("columns", self.columns, 3)
         check_preprocessing(None if isinstance(self.voxel_size, str) else self.voxel_size, self.num_neighbors)
         mcg.MultiChannelGICP(**self._parameters())
         RegistrationOptions(**self.registration())
@@ -219,11 +225,11 @@ def check_outputs(
         plot.check_picture(picture)
 
 
-def clouds_in(folder: Path, glob: str = "*", map: File = None) -> datasets.CloudFiles:
+def clouds_in(folder: Path, glob: str = "*", map: File = None, columns: Columns = None) -> datasets.CloudFiles:
     """The clouds of a folder; `map`, a cloud that the command writes, may not become one of them."""
     if map is not None and map.resolve().parent == folder.resolve() and fnmatch(map.name, glob):
         raise ValueError(f"{map}: expected a map outside of {folder}, where it would be one of the clouds")
-    files = datasets.clouds(folder, glob)
+    files = datasets.clouds(folder, glob, columns=columns)
     if len(files) < 2:
         raise ValueError(f"{folder}: expected at least 2 clouds, found {len(files)} among {glob!r}")
     if files.left_out:

@@ -56,7 +56,8 @@ class PreparedPair:
         self.options = options
         self.start = np.eye(4) if options.init in (None, "global") else _read_pose("init", Path(options.init))
         self.verified = True
-        self.raw = io.read(source), io.read(target)
+        read = partial(io.read, columns=options.columns)
+        self.raw = read(source), read(target)
         self.files = {str(source): self.raw[0], str(target): self.raw[1]}
         self.choices = Choices.of(options, *self.raw)
         self.ready = self._preprocess(source, self.raw[0]), self._preprocess(target, self.raw[1])

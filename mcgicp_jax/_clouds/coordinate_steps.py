@@ -9,10 +9,10 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float, Int
 
 from mcgicp_jax._clouds.point_cloud import PointCloud
-from mcgicp_jax._compute.concrete import AnyScalar, numpy_for
+from mcgicp_jax._compute.concrete import AnyArray, AnyScalar, numpy_for
 from mcgicp_jax._math.statistics import sampled_rows
 
 # Steps below this fraction of the spacing do no harm: in rooms of 5,000 points, errors are those without steps up to
@@ -24,15 +24,18 @@ _ROUNDINGS = 8
 # be within `_TOLERANCE` steps of a multiple; of arbitrary gaps, a fifth is, so that ten on three axes, of which three
 # are the steps themselves, fit by chance in one of 0.2⁻⁷ = 80,000 clouds.
 _QUANTILE, _MULTIPLES, _FIT, _TOLERANCE, _LEAST_GAPS = 10, 10, 0.95, 0.1, 10
-# Ratio of the steps of two axes from which they are different.
-_DIFFERENT = 1.5
+# Least share of points that show a rounding of one or two axes, see `_shows_rounding`: 0.09 to 0.8 where heights are
+# rounded in terrains, rooms, streets and KITTI, 0.06 of exact contour lines, and 0 to 0.05 of sections, profiles and
+# height maps. Coordinates are the same within a fraction of a step. The spread is the ratio of determinant to squared
+# trace, 1/4 for a disc.
+_SHARE, _SAME, _SPREAD = 0.08, 0.4, 0.05
 
 
-def harmful_step(cloud: PointCloud, spacing: Float[AnyScalar, ""]) -> Float[AnyScalar, ""]:
-    """The step of the coordinates of a cloud, the largest of the axes, metres; 0 if it is below a third of the spacing.
+def harmful_steps(cloud: PointCloud, spacing: Float[AnyScalar, ""]) -> Float[AnyArray, "3"]:
+    """The step of the coordinates of a cloud on each axis, metres; 0 if it is below a third of the spacing.
 
-    Counted are coarse steps of all axes, different ones of two, as with six digits of UTM, and those of float32. One or
-    two axes with another step are those of a regular sample of surfaces, such as a height map, whose points are exact.
+    Counted are coarse steps of all axes, those of float32, and those that are no regular sample of surfaces, such as a
+    height map, sections or profiles, whose points are exact.
     """
     xp = numpy_for(cloud.points, cloud.valid, spacing)
     rows, counts = sampled_rows(xp.asarray(cloud.valid))
@@ -55,7 +58,31 @@ def harmful_step(cloud: PointCloud, spacing: Float[AnyScalar, ""]) -> Float[AnyS
         # The step of float32 at these coordinates, by its 23 bits of fraction.
         place = xp.max(xp.where(counts, xp.abs(values + xp.asarray(cloud.origin)[:, None]), 0), axis=1, keepdims=True)
         float32 = coarse & (xp.abs(step * 2.0 ** (23 - xp.floor(xp.log2(place))) - 1) < _TOLERANCE)
-    axes, widest = xp.sum(coarse), xp.max(xp.where(coarse, step, 0))
-    narrowest = xp.min(xp.where(coarse, step, xp.inf))
-    counted = (axes == 3) | ((axes == 2) & (widest > _DIFFERENT * narrowest)) | xp.any(float32)
-    return xp.where(counted, widest, 0).astype(gaps.dtype)
+    if xp is np and not coarse.any():
+        return np.zeros(3, gaps.dtype)
+    counted = coarse.all() | float32.any() | _shows_rounding(cloud, rows, counts, coarse[:, 0], step[:, 0])
+    return xp.where(coarse & counted, step, 0)[:, 0].astype(gaps.dtype)
+
+
+def _shows_rounding(
+    cloud: PointCloud,
+    rows: Int[AnyArray, "n"],
+    counts: Bool[AnyArray, "n"],
+    coarse: Bool[AnyArray, "3"],
+    steps: Float[AnyArray, "3"],
+) -> Any:
+    """Whether points with the same coordinates on the coarse axes are more than an exact sample of surfaces has: one
+    point for two axes, a line for one. False for clouds without neighbours."""
+    if cloud.deferred_neighbors is None:
+        return False
+    xp = numpy_for(cloud.points, counts, steps)
+    points, neighbors = xp.asarray(cloud.points), xp.asarray(cloud.deferred_neighbors[rows])
+    found = (neighbors >= 0) & counts[:, None]
+    offsets = points[neighbors] - points[rows][:, None]
+    same = found & ((xp.abs(offsets) < _SAME * steps) | ~coarse).all(axis=2)
+    x, y, z = xp.where(same[..., None] & ~coarse, offsets, 0).transpose(2, 0, 1)
+    xx, yy, zz, xy, yz, zx = (xp.sum(a * b, axis=1) for a, b in ((x, x), (y, y), (z, z), (x, y), (y, z), (z, x)))
+    minors = xx * yy - xy**2 + yy * zz - yz**2 + zz * xx - zx**2
+    mostly = 2 * xp.sum(same, axis=1) > xp.sum(found, axis=1)
+    rounded = xp.where(xp.sum(coarse) > 1, xx + yy + zz > 0, mostly & (minors > _SPREAD * (xx + yy + zz) ** 2))
+    return xp.sum(rounded) > _SHARE * xp.sum(counts)

@@ -9,7 +9,7 @@ import jax
 import numpy as np
 from jaxtyping import Bool, Float
 
-from mcgicp_jax._clouds.coordinate_steps import harmful_step
+from mcgicp_jax._clouds.coordinate_steps import harmful_steps
 from mcgicp_jax._clouds.placeholders import measured_rows
 from mcgicp_jax._clouds.point_cloud import LARGEST, PointCloud, Values, Voxels, as_cloud, is_far
 from mcgicp_jax._clouds.voxel_size import NUM_NEIGHBORS, VoxelSize, voxels_and_grids, warn_of_shape
@@ -65,10 +65,11 @@ def preprocess(
 
     Warns:
         UserWarning: once per call, if points with NaN or infinity were left out, or points that share exactly one
-            place, as sensors report rays without return (the first at (0, 0, 0) is kept), if downsampling leaves fewer
-            points than `num_neighbors`, if more than half of the points lie exactly on another one, if coordinates
-            are rounded to steps of more than a third of the points' spacing, or if `voxel_size` is None and more than a
-            tenth of the neighbourhoods are lines, or most are more than 0.6 times as thick as wide.
+            place, as sensors report rays without return (the first at (0, 0, 0) is kept), or lie so far from the others
+            that they are no surface, if downsampling leaves fewer points than `num_neighbors`, if more than half of the
+            points lie exactly on another one, if coordinates are rounded to steps of more than a third of the points'
+            spacing, or if `voxel_size` is None and more than a tenth of the neighbourhoods are lines, or most are more
+            than 0.6 times as thick as wide.
     """
     return preprocessed_in(None, cloud, voxel_size, num_neighbors, search)
 
@@ -171,11 +172,12 @@ def _warn_of_loss(given: PointCloud, found: PointCloud, num_neighbors: int) -> N
     # Without coincident neighbours; 0 where all are.
     nearest = np.where((distances > 0) & (near >= 0), distances, np.inf).min(axis=1)
     spacing = float(np.nan_to_num(median(np.where(np.isfinite(nearest), nearest, np.nan))))
-    step = float(harmful_step(found, spacing))
-    if step > 0:
+    steps = harmful_steps(found, spacing)
+    if steps.any():
+        names = "" if steps.all() else " " + " and ".join(np.array(["x", "y", "z"])[steps > 0])
         warn(
-            f"points: coordinates are rounded to steps of {step:.2g} m, and neighbours are {spacing:.2g} m apart; read "
-            "them as float64 and with all digits, subtract an offset before float32, or average them: "
+            f"points: coordinates{names} are rounded to steps of {steps.max():.2g} m, and neighbours are {spacing:.2g} "
+            "m apart; read them as float64 and with all digits, subtract an offset before float32, or average them: "
             "preprocess(cloud, voxel_size=...)"
         )
     duplicates = np.mean(distances[:, 0] == 0)
@@ -223,8 +225,8 @@ def finite_rows(cloud: PointCloud | Values) -> PointCloud:
     if placeholders.any():
         x, y, z = points[np.argmax(placeholders)]
         warn(
-            f"left out {placeholders.sum()} of {keep.size} points that lie at exactly one place, such as "
-            f"({x:g}, {y:g}, {z:g}), as sensors report rays without return"
+            f"left out {placeholders.sum()} of {keep.size} points that lie at exactly one place or far from all "
+            f"others, such as ({x:g}, {y:g}, {z:g}), as sensors report rays without return"
         )
     return PointCloud(
         cloud.points[keep],

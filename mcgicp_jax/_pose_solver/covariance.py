@@ -236,14 +236,14 @@ class Moments(NamedTuple):
         jacobian, bias: see `Scores`.
         scatter: Σ_c u_c u_cᵀ.
         num_cells: number of cells with valid correspondences.
-        rounding: variance of the pose since coordinates are rounded to coarse steps, metres².
+        rounding: covariance of positions since coordinates are rounded to coarse steps, metres².
     """
 
     jacobian: Float[AnyArray, "6 4 4"]
     bias: Float[AnyArray, "6"]
     scatter: Float[AnyArray, "6 6"]
     num_cells: Int[AnyArray, ""]
-    rounding: Float[AnyScalar, ""] = 0.0
+    rounding: Float[AnyArray, "3 3"] = np.zeros((3, 3))
 
 
 def moments_from(scores: Scores, num_cells: int) -> Moments:
@@ -270,8 +270,11 @@ def response_and_scatter(moments: Moments, radius: Float[Array, ""]) -> tuple[Fl
     # Small-sample correction: the pose takes six of the cells' degrees of freedom.
     count = moments.num_cells.astype(response.dtype)
     correction = count / jnp.where(count > 6, count - 6, jnp.nan)
-    rounding = moments.rounding / radius**2 * response @ response.T
-    return response, moments.scatter * correction + jnp.outer(moments.bias, moments.bias) + rounding
+    # A rotation moves points across its axis.
+    turning = (jnp.trace(moments.rounding) * np.eye(3) - moments.rounding) / 2
+    rounding = jax.scipy.linalg.block_diag(moments.rounding, turning).astype(response.dtype) / radius**2
+    scatter = moments.scatter * correction + jnp.outer(moments.bias, moments.bias)
+    return response, scatter + response @ rounding @ response.T
 
 
 def sandwich(

@@ -79,7 +79,9 @@ def moments_of(executor: AbstractExecutor, loop: LoopResult) -> Moments:
     # Fixed matches do not respond to a motion.
     responding = _responding(executor, loop) if problem.matches is None and is_adaptive(loop.terms) else None
     scores = executor.scores(motion, loop.matches, frame, loop.terms, responding)
-    return moments_from(scores, valid.size)._replace(rounding=problem.settings.rounding)
+    ours, theirs = problem.settings.rounding
+    rounding = (motion.rotation * ours) @ motion.rotation.T + numpy_for(theirs).diag(theirs)
+    return moments_from(scores, valid.size)._replace(rounding=rounding)
 
 
 def _discounts_and_radius(

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from mcgicp_jax._clouds.coordinate_steps import harmful_step
+from mcgicp_jax._clouds.coordinate_steps import harmful_steps
 from mcgicp_jax._clouds.point_cloud import PointCloud
 from mcgicp_jax._compute.cache import cached_with_cloud
 from mcgicp_jax._compute.concrete import AnyArray, AnyScalar, constant, is_concrete, numpy_for
@@ -45,7 +45,7 @@ class Settings(NamedTuple):
         max_iterations: maximum number of updates, both phases together.
         hold_unconstrained: whether the pose is kept fixed along unconstrained directions.
         channels_may_move: whether the channels may move with the sensor, so that a pose that they hold is UNVERIFIED.
-        rounding: variance of the pose, metres², since the coordinates of both clouds are rounded to coarse steps.
+        rounding: variances of the coordinates of source and target, metres², that are rounded to coarse steps.
     """
 
     max_distance: Float[AnyArray, "*batch"]
@@ -58,7 +58,7 @@ class Settings(NamedTuple):
     max_iterations: Int[AnyArray, "*batch"]
     hold_unconstrained: Bool[AnyArray, "*batch"]
     channels_may_move: Bool[AnyArray, "*batch"]
-    rounding: Float[AnyArray, "*batch"]
+    rounding: Float[AnyArray, "*batch 2 3"]
 
     def distance(self, status: Int[AnyScalar, ""]) -> Float[AnyScalar, ""]:
         """Maximum correspondence distance at this status, metres."""
@@ -113,8 +113,8 @@ def settings_for(
     least = spacing * _TOLERANCE_IN_SPACINGS
     tolerance = least if tolerance is None else tolerance
 
-    find_step = cached_with_cloud(harmful_step) if is_concrete(source, target, spacing) else harmful_step
-    steps = [find_step(constant(cloud), spacing) for cloud in (source, target)]
+    find_steps = cached_with_cloud(harmful_steps) if is_concrete(source, target, spacing) else harmful_steps
+    steps = [find_steps(constant(cloud), spacing) for cloud in (source, target)]
 
     def number(value: Any, kind: Any) -> Any:
         return numpy_for(value).asarray(value, kind)
@@ -138,5 +138,5 @@ def settings_for(
         hold_unconstrained=number(options.hold_unconstrained, bool),
         channels_may_move=number(channels_may_move, bool),
         # An error that is uniform over a step. It does not average out: points on lattices match the lattice.
-        rounding=number((steps[0] ** 2 + steps[1] ** 2) / 12, dtype),
+        rounding=number(numpy_for(steps).stack(steps) ** 2 / 12, dtype),
     )

@@ -212,12 +212,13 @@ def _open(path: str | os.PathLike[str]) -> Any:
         raise ValueError(f"{path}: cannot be read as an image") from error
 
 
-def clouds(folder: str | os.PathLike[str], glob: str = "*") -> CloudFiles:
+def clouds(folder: str | os.PathLike[str], glob: str = "*", *, columns: int | None = None) -> CloudFiles:
     """The clouds of a folder in order of name, where numbers count by value: `scan_9.ply` precedes `scan_10.ply`.
 
     Args:
         folder: contains files that `mcgicp_jax.io.read` reads.
         glob: pattern for their names, such as "*.ply".
+        columns: of `.bin` files, as in `mcgicp_jax.io.read`.
 
     Returns:
         Frames without poses and times. Hidden files are ignored; the attribute `left_out` lists others that are no
@@ -227,7 +228,7 @@ def clouds(folder: str | os.PathLike[str], glob: str = "*") -> CloudFiles:
         OSError: if there is no such folder.
         ValueError: if there are no clouds; for an invalid cloud, when its frame is read.
     """
-    return CloudFiles(Path(folder), glob)
+    return CloudFiles(Path(folder), glob, columns)
 
 
 class CloudFiles(AbstractFrames):
@@ -238,7 +239,7 @@ class CloudFiles(AbstractFrames):
         left_out: files that are no clouds.
     """
 
-    def __init__(self, folder: Path, glob: str):
+    def __init__(self, folder: Path, glob: str, columns: int | None = None):
         # Raises if there is no such folder.
         os.scandir(folder).close()
         visible = (path for path in folder.glob(glob) if path.is_file() and not path.name.startswith("."))
@@ -247,10 +248,11 @@ class CloudFiles(AbstractFrames):
         self.left_out = [path for path in paths if path not in self.paths]
         if not self.paths:
             raise ValueError(f"{folder}: expected clouds {glob}, found none")
+        self._columns = columns
         super().__init__(len(self.paths))
 
     def _frame(self, index: int) -> Frame:
-        return Frame(io.read(self.paths[index]))
+        return Frame(io.read(self.paths[index], columns=self._columns))
 
 
 def _by_number(path: Path) -> list[tuple[str, int]]:

@@ -22,14 +22,14 @@ DEFLATE_RATIO = 1032
 _RGB_ARRAYS = ("rgb", "color", "colors", "colour", "colours")
 
 
-def read_kitti(file: BinaryIO, size: int) -> PointCloud:
+def read_kitti(file: BinaryIO, size: int, columns: int | None = None) -> PointCloud:
     data = file.read()
     if size % 4:
         raise ValueError(f"expected rows of float32 values, got {size} bytes")
     # The format has no signature. Text is recognised by its bytes, most other files by implausibly large coordinates.
     if data.isascii() and b"\0" not in data:
         raise ValueError("it does not hold float32 coordinates in metres")
-    cloud = cloud_of(columns_of_floats(np.frombuffer(data, "<f4").astype(np.float32)))
+    cloud = cloud_of(columns_of_floats(np.frombuffer(data, "<f4").astype(np.float32), columns))
     if _beyond_kitti(np.asarray(cloud.points)):
         raise ValueError("it does not hold float32 coordinates in metres")
     return cloud

@@ -20,9 +20,10 @@ _SAMPLE = 120_000
 _PADDING = 1e-30
 
 
-def columns_of_floats(values: Float[np.ndarray, "n"]) -> dict[str, Float[np.ndarray, "N"]]:
+def columns_of_floats(values: Float[np.ndarray, "n"], given: int | None = None) -> dict[str, Float[np.ndarray, "N"]]:
     """x, y, z and perhaps intensity, by the layout whose columns fit: KITTI (x, y, z, intensity), nuScenes (ring last),
-    ring and time last, PCL's points of 32 bytes (x, y, z, padding, intensity, padding), or x, y, z.
+    ring and time last, PCL's points of 32 bytes (x, y, z, padding, intensity, padding), or x, y, z. Of a given number
+    of columns, the first are x, y, z, and the fourth is the intensity unless it has negative values.
 
     Raises:
         ValueError: if none fits.
@@ -34,9 +35,14 @@ def columns_of_floats(values: Float[np.ndarray, "n"]) -> dict[str, Float[np.ndar
     def named(columns: Any, *others: int) -> dict[str, Float[np.ndarray, "N"]]:
         return dict(zip(("x", "y", "z", "intensity"), [*columns[:3], *(columns[i] for i in others)], strict=False))
 
-    columns = split(8)
+    columns = split(8) if given in (None, 8) else None
     if columns is not None and _is_constant(columns[3]) and (np.abs(columns[5:]) < _PADDING).all():
         return named(columns, 4)
+    if given is not None:
+        columns = split(given)
+        if columns is None:
+            raise ValueError(f"expected rows of {given} float32 values, got {4 * values.size} bytes")
+        return named(columns, *([3] if given > 3 and _is_intensity(columns[3]) else []))
     for size in (6, 5):
         columns = split(size)
         if columns is not None and _is_intensity(columns[3]) and _is_ring(columns[4]):
@@ -49,8 +55,8 @@ def columns_of_floats(values: Float[np.ndarray, "n"]) -> dict[str, Float[np.ndar
     if columns is not None and steps[3] < _REPEATS * min(steps[size] for size in (4, 5, 7, 10)):
         return named(columns)
     raise ValueError(
-        "its columns are neither those of KITTI (x, y, z, intensity) nor of another known layout; with k columns, of "
-        "which the first are x, y, z: mcg.PointCloud(np.fromfile(path, '<f4').reshape(-1, k)[:, :3])"
+        "its columns are neither those of KITTI (x, y, z, intensity) nor of another known layout; say how many there "
+        "are if the first are x, y, z: mcg.io.read(path, columns=5), or --columns 5"
     )
 
 

@@ -6,7 +6,7 @@ import gzip
 import io
 import os
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import BinaryIO
@@ -15,6 +15,7 @@ import numpy as np
 
 import mcgicp_jax.io.arrays as arrays
 from mcgicp_jax._clouds.point_cloud import PointCloud
+from mcgicp_jax._compute.messages import check_integer
 from mcgicp_jax.io.files import reason_of, replacing
 from mcgicp_jax.io.las import read_las, write_las
 from mcgicp_jax.io.pcd import read_pcd, write_pcd
@@ -58,26 +59,29 @@ FORMATS = {
 }
 
 
-def format_of(path: Path) -> Format:
-    """The format for the suffix of a path; raises `ValueError` for an unknown suffix."""
-    file_format = _known_format(path)
+def format_of(path: Path, columns: int | None = None) -> Format:
+    """The format for the suffix of a path; raises `ValueError` for an unknown suffix. `columns` as in `read`."""
+    file_format = _known_format(path, columns)
     if file_format is None:
         kind = "a folder" if path.is_dir() else f"unknown suffix {path.suffix!r}"
         raise ValueError(f"{path}: {kind}; expected one of {', '.join(FORMATS)}")
     return file_format
 
 
-def _known_format(path: Path) -> Format | None:
+def _known_format(path: Path, columns: int | None = None) -> Format | None:
     """The format for the last two suffixes of a path or the last one, also of a file that gzip compressed."""
     suffixes = [suffix.lower() for suffix in path.suffixes]
     if suffixes[-1:] == [".gz"]:
-        inner = _known_format(path.with_suffix(""))
+        inner = _known_format(path.with_suffix(""), columns)
         return inner and Format(
             lambda file, size: inner.read(*_decompressed(file, size)),
             _not_written,
             lambda file: inner.is_cloud(_decompressed(file, os.fstat(file.fileno()).st_size)[0]),
         )
-    return FORMATS.get("".join(suffixes[-2:])) or FORMATS.get("".join(suffixes[-1:]))
+    found = FORMATS.get("".join(suffixes[-2:])) or FORMATS.get("".join(suffixes[-1:]))
+    if columns is not None and found is not None and found.read is arrays.read_kitti:
+        return replace(found, read=partial(arrays.read_kitti, columns=columns))
+    return found
 
 
 def _decompressed(file: BinaryIO, size: int) -> tuple[BinaryIO, int]:
@@ -94,7 +98,7 @@ def is_cloud(path: Path) -> bool:
         return file_format.is_cloud(file)
 
 
-def read(path: str | os.PathLike[str]) -> PointCloud:
+def read(path: str | os.PathLike[str], *, columns: int | None = None) -> PointCloud:
     """Read a raw cloud from a file.
 
     Every numeric column with one value per point becomes a channel, except coordinates, normals and per-point metadata
@@ -120,6 +124,8 @@ def read(path: str | os.PathLike[str]) -> PointCloud:
         path: the suffix, in any case, selects the format: `.ply`, `.pcd`, `.las`, `.laz`, `.bin` (float32: KITTI, or
             nuScenes, with ring and time, PCL's 32 bytes or x, y, z alone where the columns fit), `.pcd.bin` (nuScenes),
             `.npy`, `.npz`, `.xyz`, `.txt` or `.csv`, each also followed by `.gz`.
+        columns: number of float32 values of each point of a `.bin` file whose columns fit none of these, at least 3:
+            x, y, z, and fourth the intensity, unless it has negative values. Other formats state or show theirs.
 
     Returns:
         Cloud of NumPy arrays: points (N, 3), metres, float64 if the file stores float64 (always for LAS and text);
@@ -131,7 +137,9 @@ def read(path: str | os.PathLike[str]) -> PointCloud:
         ValueError: if the file is not a valid cloud or has no points; the message starts with the path.
     """
     path = Path(path)
-    reader = format_of(path).read
+    if columns is not None:
+        check_integer("columns", columns, 3)
+    reader = format_of(path, columns).read
     with open(path, "rb") as file:
         try:
             size = os.fstat(file.fileno()).st_size
