@@ -104,7 +104,7 @@ def register_as_completed(
         ValueError: if an argument common to all pairs is malformed, or the iterables differ in length.
     Warns:
         PairWarning: the reason for each pair with the status `INVALID_INPUT` or `WORKER_FAILED`, or with matches for
-            less than 10 % of the source points; a `UserWarning`.
+            less than 10 % of the source points (UNVERIFIED); a `UserWarning`.
     """
     job, workers = _job(method, options, voxel_size, num_neighbors, covariances), executor_of(executor)
     return run(job, _pairs(job, sources, targets, init), workers)

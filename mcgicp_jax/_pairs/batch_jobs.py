@@ -32,7 +32,7 @@ from mcgicp_jax._registration.input_checks import check_clouds, warn_of_estimate
 from mcgicp_jax._registration.options import Options
 from mcgicp_jax._registration.pose_derivative import Inputs
 from mcgicp_jax._registration.register_pair import Run, prepared, preprocessed, results_of, run_pair
-from mcgicp_jax._registration.result import RegistrationResult, Status, computed, unverified
+from mcgicp_jax._registration.result import RegistrationResult, Status, computed, verified
 from mcgicp_jax._registration.vectorized import LanePair, Refused, run_pairs
 from mcgicp_jax._search.brute_force import DenseSearch, default_search
 
@@ -116,8 +116,8 @@ class PreparedPair:
         return tuple(i for i, leaf in enumerate(self.leaves) if not is_concrete(leaf))
 
     def checked(self, result: RegistrationResult) -> RegistrationResult:
-        """The result, UNVERIFIED if the initial pose is."""
-        return result if self.verified else unverified(result)
+        """The result, UNVERIFIED if the initial pose is, or the overlap is small."""
+        return verified(result, self.verified)
 
 
 def _of_a_pair(work: Callable[..., Any]) -> Callable[..., Any]:
@@ -204,7 +204,7 @@ class BatchJob:
         run = self._run(PreparedPair(pair.index, Inputs(*values), pair.init))  # type: ignore[arg-type]
         if isinstance(run, PairResult):
             return run
-        (result,) = results_of([run], [None])
+        (result,) = map(verified, results_of([run], [None]))
         leaves, structure = jax.tree.flatten(values, is_leaf=is_deferred)
 
         def pose(*traced: Any) -> Any:

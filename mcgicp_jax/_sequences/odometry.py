@@ -28,7 +28,7 @@ from mcgicp_jax._pairs.register import doubt_of
 from mcgicp_jax._pose_graph.graph import PoseGraph
 from mcgicp_jax._registration.options import GivenOptions, Options, check_method, options_of
 from mcgicp_jax._registration.register_pair import register_pair, rows_to_match
-from mcgicp_jax._registration.result import RegistrationResult, computed, is_usable
+from mcgicp_jax._registration.result import RegistrationResult, computed, is_usable, verified
 from mcgicp_jax._registration.tie_points_and_prior import GivenPrior
 from mcgicp_jax._sequences.loop_closure import Trajectory
 from mcgicp_jax._sequences.relocalization import Relocalizer, map_target
@@ -137,7 +137,7 @@ def odometry(
 
     Warns:
         UserWarning: on iteration without `recover`, if a frame cannot be registered, or less than 10 % of its points
-            have a match. The next one is registered to it all the same.
+            have a match (UNVERIFIED; its pose is used). The next one is registered to it all the same.
     """
     check_preprocessing(voxel_size, num_neighbors)
     check_method(method)
@@ -287,7 +287,7 @@ class _Sensor(Iterator[OdometryStep]):
         self.cloud = cloud
         if result is None:
             return OdometryStep(self.pose, cloud, None, self.is_lost, graph)
-        registration = Lazy(partial(computed, result))
+        registration = Lazy(partial(computed, verified(result)))
         # The registration of the step before the last is computed if somebody keeps it, since it refers to two frames.
         # The caller of a loop still holds the last step. What nobody reads is not computed.
         kept = self.unread[0]() if len(self.unread) == 2 else None
