@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any, Literal
+from typing import Any, Literal, Never
 
 import numpy as np
 from jax.typing import ArrayLike
@@ -18,7 +18,7 @@ from mcgicp_jax._math.poses import Pose
 from mcgicp_jax._math.robust_kernels import AbstractKernel
 from mcgicp_jax._methods.base import AbstractMethod
 from mcgicp_jax._registration.input_checks import warn_of_estimated_parameters, warn_of_lengths
-from mcgicp_jax._registration.options import Distance, Options, check_method
+from mcgicp_jax._registration.options import Distance, Options, check_method, options_of
 from mcgicp_jax._registration.register_pair import register_pair
 from mcgicp_jax._registration.result import LEAST_OVERLAP, USABLE, RegistrationResult, Status, verified
 from mcgicp_jax._registration.tie_points_and_prior import GivenPrior, GivenTiePoints
@@ -44,6 +44,7 @@ def register(
     soft_matches: bool | None = Options.soft_matches,
     tie_points: GivenTiePoints | None = None,
     prior: GivenPrior | None = None,
+    **unknown: Never,
 ) -> RegistrationResult:
     """Register two clouds: find matches at the current pose, update the pose, and repeat until it converges.
 
@@ -161,6 +162,8 @@ def register(
             pose is UNVERIFIED); channels or `channel_weights` are differentiated with `soft_matches=False`; or
             channels are while `channel_covariance` or, unless it is False, `channel_weights` is None.
     """
+    options_of(register, unknown)
+    check_method(method)
     options = Options(
         max_distance=max_distance,
         max_iterations=max_iterations,

@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Float
 
 from mcgicp_jax._clouds.deskew import deskew as deskewed
-from mcgicp_jax._clouds.point_cloud import Frame, PointCloud, Values, Voxels, as_cloud
+from mcgicp_jax._clouds.point_cloud import Frame, PointCloud, Values, Voxels, as_cloud, check_several
 from mcgicp_jax._clouds.preprocess import check_preprocessing, preprocess
 from mcgicp_jax._clouds.voxel_map import VoxelMap
 from mcgicp_jax._clouds.voxel_size import NUM_NEIGHBORS, VoxelSize, voxels_for
@@ -141,6 +141,7 @@ def odometry(
     """
     check_preprocessing(voxel_size, num_neighbors)
     check_method(method)
+    check_several("frames", frames)
     named: dict[str, Any] = {"init": init, "start": start, "method": method}
     for name, value in (named | {**options}).items():
         check_concrete(name, value)
