@@ -4,10 +4,12 @@ import warnings
 from concurrent.futures import ThreadPoolExecutor
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
 import mcgicp_jax as mcg
+from mcgicp_jax import extend
 from tests.refusals import refused
 
 POINTS = np.random.default_rng(0).random((50, 3))
@@ -19,12 +21,14 @@ def test_numbers_are_checked(value):
     refused(lambda: mcg.voxel_gaussians(POINTS, value), "voxel_size")
 
 
-@pytest.mark.parametrize("function", [mcg.register_batch, mcg.odometry, mcg.multiway])
+@pytest.mark.parametrize("function", [mcg.register, mcg.register_batch, mcg.odometry, mcg.multiway])
 def test_unknown_options_are_named(function):
     clouds = [POINTS] * 2
-    given = (clouds, clouds, mcg.GICP()) if function is mcg.register_batch else (clouds, mcg.GICP())
+    given = (clouds, clouds, mcg.GICP()) if function in (mcg.register, mcg.register_batch) else (clouds, mcg.GICP())
     # Only one pair can have tie points.
-    for option, told in (("max_distanc", "did you mean max_distance"), ("tie_points", "voxel_sizes")):
+    for option, told in (("max_distanc", "did you mean max_distance or max_iter"), ("tie_points", "voxel_sizes")):
+        if option == "tie_points" and function is mcg.register:
+            continue
         with pytest.raises(TypeError, match=rf"^{function.__name__}: .*'{option}'.*{told}"):
             list(function(*given, **{option: None}).__iter__())
 
@@ -48,6 +52,59 @@ def test_swapped_arguments_are_named():
         ("cloud", lambda: mcg.io.write(cloud, "cloud.ply")),
     ):
         refused(call, named)
+
+
+def test_clouds_and_methods_in_the_wrong_form_are_named():
+    cloud, method = mcg.PointCloud(POINTS, POINTS), mcg.GICP()
+    for named, call, *told in (
+        ("source", lambda: mcg.register((POINTS, POINTS), cloud, method), "PointCloud(points, channels)"),
+        ("points", lambda: mcg.PointCloud([POINTS, POINTS[:, 0]]), "PointCloud(points, channels)"),
+        ("method", lambda: mcg.register(method, cloud, cloud), "Clouds come first"),
+        ("source", lambda: mcg.register(POINTS[:, :2], cloud, method), "copies", "prior"),
+        ("frames", lambda: mcg.odometry(cloud, method), "one PointCloud"),
+        ("frames", lambda: mcg.odometry(POINTS, method), "one ndarray"),
+        ("clouds", lambda: mcg.multiway(mcg.datasets.Frame(cloud), method), "one Frame"),
+        ("poses", lambda: mcg.plot.before_after(cloud, cloud, [np.eye(4)]), "poses by name", "list"),
+        ("channel_names", lambda: cloud.replace(channels=POINTS, channel_names=()), 3, 0),
+    ):
+        refused(call, named, *told)
+    with pytest.raises(AttributeError, match=r"^points: .* cloud\.replace\(points=\.\.\.\)"):
+        cloud.points = POINTS
+
+
+@pytest.mark.parametrize("method", [mcg.ColorICP(0.1), mcg.MultiChannelGICP()])
+def test_methods_of_channels_warn_where_there_are_none(method):
+    with pytest.warns(UserWarning, match=f"no channels: {type(method).__name__} uses geometry alone"):
+        mcg.register(POINTS, POINTS, method)
+
+
+class NoNumbers(mcg.GICP):
+    def covariance(self, around, local):
+        return super().covariance(around, local).at[:, :5].set(jnp.nan)
+
+
+class NoResidual(extend.AbstractTerm):
+    def linearize(self, matches):
+        infinite = jnp.full_like(matches.moved[0], jnp.inf)
+        return extend.linearize_residual(matches.residual, jnp.stack([infinite] * 6), self.robust)
+
+
+class WithNoResidual(mcg.GICP):
+    def terms(self, source, target, robust, equalize_channels):
+        return (*super().terms(source, target, robust, equalize_channels), NoResidual())
+
+
+@pytest.mark.parametrize(
+    ("method", "told"),
+    [
+        (NoNumbers(), r"^NoNumbers\.covariance: .* at \d+ of 50 points of the source, first at row 0"),
+        (WithNoResidual(), "^NoResidual: .* after 0 updates"),
+    ],
+    ids=["method", "term"],
+)
+def test_extensions_whose_numbers_are_not_finite_are_named(method, told):
+    with pytest.warns(UserWarning, match=told):
+        assert mcg.register(POINTS, POINTS, method).status is mcg.Status.NON_FINITE
 
 
 def test_channels_are_told_apart_by_name():

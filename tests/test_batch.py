@@ -98,12 +98,16 @@ def test_the_warning_can_be_sent_copied_and_repeated():
     assert str(bare) == str(warning) and bare.index is None and bare.reason == ""
 
 
-def test_a_pose_from_a_small_overlap_is_warned_of_with_its_pair():
+@pytest.mark.parametrize("search", [None, pytest.param(mcg.DenseSearch(), marks=pytest.mark.slow)])
+def test_a_pose_from_a_small_overlap_is_warned_of_with_its_pair(search):
     target, near = (room_corner(size, seed=seed)[0] for size, seed in ((2000, 0), (60, 1)))
     source = np.concatenate([near, target[:1940] + 50])
     with pytest.warns(mcg.PairWarning, match="pair 1: only .* %") as caught:
-        results = mcg.register_batch([target, source], [target, target], mcg.PointToPlane(), max_distance=0.3)
+        results = mcg.register_batch(
+            [target, source], [target] * 2, mcg.PointToPlane(), max_distance=0.3, search=search
+        )
     assert len(caught) == 1 and 0 < results[1].overlap < 0.1 < results[0].overlap
+    assert [result.status.name for result in results] == ["CONVERGED", "UNVERIFIED"]
 
 
 def test_pairs_without_overlap_or_far_from_rest_have_the_status_of_register(raw, alone):

@@ -106,6 +106,15 @@ def test_a_plain_folder_is_followed(tmp_path, capsys):
     assert "nothing: expected a folder of clouds or one of kitti, " in unknown
 
 
+def test_options_that_contradict_each_other_are_named_as_flags(capsys):
+    for given, told in (
+        (["--against", "map", "--loops"], "--loops: expected --against previous"),
+        (["--map-radius", "5"], "--map-radius: expected --against map"),
+    ):
+        assert main(["odometry", "box-room", *given]) == 2
+        assert capsys.readouterr().err.startswith(f"mcgicp: {told}")
+
+
 def test_frames_are_cropped_and_left_out(tmp_path, capsys):
     poses, map = tmp_path / "poses.txt", tmp_path / "map.ply"
     ranges = ["--min-range", "1", "--max-range", "6", "--every", "2"]

@@ -1,6 +1,7 @@
 """The command line, as a stranger meets it: exit codes, files, and messages of one line."""
 
 import os
+import re
 import subprocess
 import sys
 
@@ -310,10 +311,16 @@ def test_help_lists_the_registries(capsys):
         assert f"{dataset.max_distance[0]:g} and {dataset.max_distance[1]:g} for " in text, name
 
 
-def test_a_kernel_is_an_option(register):
+def test_a_kernel_is_an_option(register, capsys):
     texts = [register("--method", "gicp", *given, source="bare")[1] for given in ([], ["--robust", "cauchy", "0.5"])]
     without, robust = map(printed_matrix, texts)
     assert close_to_truth(without) and close_to_truth(robust) and np.abs(without - robust).max() > 1e-6
+    for given in (["huber"], ["hubr", "1"], ["huber", "x"]):
+        with pytest.raises(SystemExit):
+            main(["register", "a.ply", "b.ply", "--robust", *given])
+        assert f"and a scale, such as huber 1.0; got {' '.join(given)} " in re.sub(
+            r"[\s│]+", " ", capsys.readouterr().err
+        )
 
 
 def test_an_unwritable_cache_is_no_error(files, monkeypatch, capsys, tmp_path):

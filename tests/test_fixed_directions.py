@@ -62,6 +62,22 @@ def test_what_is_fixed_stays_that_of_the_prior(name):
         assert np.abs(np.asarray(result.covariance)[fixed]).max() < 1e-10
 
 
+def test_a_planar_scan_lifted_to_3d():
+    """As the message for points (N, 2) says: copies at several heights, and a prior."""
+    wall = np.linspace(0, 3, 250)
+    corner = np.concatenate([np.stack([wall, 0 * wall], axis=1), np.stack([0 * wall, wall], axis=1)]) + 0.3
+
+    def lifted(seed):
+        seen = corner + 0.005 * np.random.default_rng(seed).normal(size=corner.shape)
+        return np.concatenate([np.c_[seen, np.full(len(seen), z)] for z in 0.02 * np.arange(5)])
+
+    truth = motion((0.05, -0.03, 0, 0, 0, 0.05))
+    source = mcg.PointCloud(lifted(0)).transform(np.linalg.inv(truth))
+    prior = np.eye(4), covariance_fixing("z roll pitch")
+    result = mcg.register(source, lifted(1), mcg.GICP(), max_distance=(0.5, 0.1), prior=prior)
+    assert result.converged and max(pose_error(result.matrix, truth)) < 5e-3
+
+
 def test_tilted_axes():
     """Gravity is no axis of the source: what turns the axes of the covariance turns the answer."""
     source, target, truth = planar()

@@ -162,7 +162,7 @@ def test_a_frame_that_hardly_overlaps_is_warned_of():
     frames = [target, np.concatenate([near, target[:1940] + 50])]
     with pytest.warns(UserWarning, match=r"frames\[1\]: only .* %"):
         last = list(mcg.odometry(frames, mcg.PointToPlane(), max_distance=0.3))[-1]
-    assert 0 < last.registration.overlap < 0.1
+    assert 0 < last.registration.overlap < 0.1 and last.registration.status is mcg.Status.UNVERIFIED and not last.lost
 
 
 def test_rotations_stay_rotations():

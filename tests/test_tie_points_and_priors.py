@@ -1,5 +1,8 @@
 """Tie points and priors: against plain sums, SciPy and Gaussian fusion; what they constrain; derivatives; honesty."""
 
+from concurrent.futures import ThreadPoolExecutor
+from functools import partial
+
 import jax
 import jax.numpy as jnp
 import jaxlie
@@ -245,6 +248,47 @@ def test_gradients_of_tie_points_and_prior(scene, noisy, hall):
 
     inputs = {"ties": (points, targets, covariances / size), "twist": np.zeros(6), "covariance": given / size}
     check_gradient(loss, jax.tree.map(jnp.asarray, inputs))
+
+
+def test_priors_of_a_batch(corner):
+    """Each pair as by `register`, by threads, by an executor and where lanes would run; with its derivatives."""
+    source, target, truth = corner
+    away = truth @ motion((0.01, 0, 0, 0, 0.01, 0))
+    priors = [(away, 1e-6 * np.eye(6)), None, (jaxlie.SE3.from_matrix(away), np.eye(5))]
+    alone = [mcg.register(source, target, mcg.GICP(), prior=prior, **OPTIONS) for prior in priors[:2]]
+    for how in ({}, {"executor": ThreadPoolExecutor(1)}, {"search": mcg.DenseSearch()}):
+        with pytest.warns(mcg.PairWarning, match=r"pair 2: prior: covariance: expected shape \(6, 6\)"):
+            found = mcg.register_batch([source] * 3, target, mcg.GICP(), priors=iter(priors), **OPTIONS, **how)
+        for result, expected in zip(found[:2], alone, strict=True):
+            np.testing.assert_allclose(result.matrix, expected.matrix, atol=1e-5 if "search" in how else 0)
+        assert found[2].status is mcg.Status.INVALID_INPUT
+    refused(lambda: mcg.register_batch([source], target, mcg.GICP(), priors=priors), "sources", "3 priors")
+    refused(lambda: mcg.register_batch([source], target, mcg.GICP(), priors=5), "priors")
+    given = {"priors": [None], "hold_unconstrained": False}
+    refused(lambda: mcg.register_batch([source], target, mcg.GICP(), **given), "hold_unconstrained")
+
+
+@pytest.mark.slow
+def test_derivatives_of_a_batch_with_priors(corner):
+    source, target, truth = corner
+
+    def loss(arguments, executor=None, batch=True):
+        points, covariance = arguments
+        moved, prior = source.replace(points=points), (truth, covariance)
+        if not batch:
+            return weigh(mcg.register(moved, target, mcg.GICP(), prior=prior, **OPTIONS).matrix)
+        options = {"priors": [prior], "executor": executor} | OPTIONS
+        return weigh(mcg.register_batch([moved], [target], mcg.GICP(), **options)[0].matrix)
+
+    given = source.points, 1e-6 * np.eye(6)
+    expected, found = (jax.grad(partial(loss, batch=batch))(given) for batch in (False, True))
+    for one, other in zip(expected, found, strict=True):
+        np.testing.assert_array_equal(one, other)
+    assert np.abs(expected[1]).max() > 0
+    with ThreadPoolExecutor(1) as executor:
+        by_points = jax.grad(lambda points: loss((points, given[1]), executor))(given[0])
+        refused(lambda: jax.grad(partial(loss, executor=executor))(given), "priors[0]")
+    np.testing.assert_allclose(by_points, expected[0], rtol=1e-3, atol=1e-5 * np.abs(expected[0]).max())
 
 
 @pytest.mark.slow

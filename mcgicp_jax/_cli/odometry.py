@@ -103,6 +103,10 @@ def odometry(
     check_outputs(output, cloud=map, picture=plot, inputs=[path] if path else [])
     shared.check(method)
     check_integer("every", every, 1)
+    if loops and against == "map":
+        raise ValueError("--loops: expected --against previous, whose registrations become edges, got --against map")
+    if map_radius is not None and against != "map":
+        raise ValueError(f"--map-radius: expected --against map with {map_radius:g}, got --against {against}")
     if shared.columns is not None and isinstance(dataset, str):
         raise ValueError(f"columns: expected none, since {dataset} has a layout of its own, got {shared.columns}")
     frames = _open(dataset, path, num_frames, every, map, shared.columns)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import errno
 import inspect
 import os
@@ -59,7 +60,28 @@ Numbers: TypeAlias = Annotated[tuple[float, ...], shown(default="from the data")
 Distances: TypeAlias = Annotated[tuple[float, ...], shown(default="10 and 2.5 spacings")]
 Sizes: TypeAlias = Annotated[tuple[float, ...], shown(default="none")]
 Tolerance: TypeAlias = Annotated[float | None, shown("FLOAT", "0.005 spacings")]
-Kernel: TypeAlias = Annotated[tuple[KernelName, float] | None, shown("KERNEL SCALE")]
+
+
+def _kernel(words: list[str]) -> tuple[str, float]:
+    with contextlib.suppress(ValueError):
+        name, scale = words
+        if name in KERNELS:
+            return name, float(scale)
+    expected = f"{enumerated(list(KERNELS), 'or')}, and a scale, such as huber 1.0"
+    raise ValueError(f"expected {expected}; got {' '.join(words)}")
+
+
+Kernel: TypeAlias = Annotated[
+    tuple[KernelName, float] | None,
+    tyro.constructors.PrimitiveConstructorSpec(
+        nargs=(1, 2),
+        metavar="KERNEL SCALE",
+        instance_from_str=_kernel,
+        is_instance=lambda value: value is None or isinstance(value, tuple),
+        str_from_instance=lambda value: [str(value)],
+    ),
+    shown(default="none"),
+]
 # Repeated options add up.
 Fixed: TypeAlias = Annotated[
     tuple[tuple[Literal["x", "y", "z", "roll", "pitch", "yaw"], ...], ...],

@@ -30,7 +30,7 @@ from mcgicp_jax._compute.messages import messages_named
 from mcgicp_jax._compute.threads import side_by_side
 from mcgicp_jax._methods.base import AbstractMethod
 from mcgicp_jax._pose_solver.degeneracy import as_text
-from mcgicp_jax._registration.result import unverified
+from mcgicp_jax._registration.result import verified
 from mcgicp_jax.extend import METHODS
 from mcgicp_jax.io.clouds import format_of
 
@@ -96,7 +96,7 @@ class PreparedPair:
             for side, raw, ready in zip(("source", "target"), self.raw, self.ready, strict=True)
         )
         result = mcg.register(source, target, method, init=self.start, **self.arguments(name))
-        return result if self.verified else unverified(result)
+        return verified(result, self.verified)
 
     def arguments(self, name: MethodName) -> dict[str, Any]:
         arguments = self.choices.arguments(name, lambda: self.ready)

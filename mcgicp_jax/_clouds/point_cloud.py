@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import FrozenInstanceError, dataclass
 from typing import TYPE_CHECKING, Any, TypeAlias
 
 import equinox as eqx
@@ -68,7 +68,21 @@ def _advice(shape: tuple[int, ...]) -> str:
         return "; pass points.T"
     if len(shape) == 3 and shape[2] == 3:
         return "; pass points.reshape(-1, 3) of one cloud in a grid, or a list of clouds to register_batch"
+    if len(shape) == 2 and shape[1] == 2:
+        return (
+            "; lift a planar scan to 3-D: stack copies of it at several z, about one spacing apart, and fix z, roll "
+            "and pitch by a prior"
+        )
     return "; pass PointCloud(points, channels)" if len(shape) == 2 and shape[1] > 3 else ""
+
+
+def _check_one_array(points: Any) -> None:
+    """Raise `ValueError` for several arrays, which NumPy would stack to one."""
+    if isinstance(points, tuple | list) and points and getattr(points[0], "ndim", 0) == 2:
+        raise ValueError(
+            f"points: expected shape (N, 3), got a {type(points).__name__} of {len(points)} arrays; pass "
+            "PointCloud(points, channels), or several clouds to register_batch"
+        )
 
 
 def _as_mask(values: Values, shape: tuple[int, ...]) -> Any:
@@ -140,6 +154,15 @@ def _default_names(count: int) -> tuple[str, ...]:
     return tuple(f"channel_{i}" for i in range(count))
 
 
+def _checked_names(names: Sequence[str] | None, count: int) -> tuple[str, ...]:
+    if isinstance(names, str):
+        raise ValueError(f"channel_names: expected a sequence of names, got the string {names!r}")
+    names = _default_names(count) if names is None else tuple(names)
+    if len(names) != count:
+        raise ValueError(f"channel_names: expected {count} names, got {len(names)}")
+    return names
+
+
 class PointCloud(eqx.Module):
     """Points with channels; a pytree whose arrays may all have leading batch dimensions.
 
@@ -208,6 +231,7 @@ class PointCloud(eqx.Module):
         Raises:
             ValueError: if a shape or dtype does not fit; the message names the argument.
         """
+        _check_one_array(points)
         points, found, names = arrays_of(points)
         if channels is None and found is not None:
             channels, channel_names = found, channel_names or names
@@ -230,14 +254,7 @@ class PointCloud(eqx.Module):
         self.covariances = None if covariances is None else _as_float("covariances", covariances)
         if self.covariances is not None and self.covariances.shape != (size, 3, 3):
             raise ValueError(f"covariances: expected shape ({size}, 3, 3), got {self.covariances.shape}")
-        count = self.channels.shape[1]
-        if channel_names is None:
-            channel_names = _default_names(count)
-        if isinstance(channel_names, str):
-            raise ValueError(f"channel_names: expected a sequence of names, got the string {channel_names!r}")
-        if len(channel_names) != count:
-            raise ValueError(f"channel_names: expected {count} names, got {len(channel_names)}")
-        self.channel_names = tuple(channel_names)
+        self.channel_names = _checked_names(channel_names, self.channels.shape[1])
         self.times = None if times is None else _fractions(times, size)
         self.valid = np.ones(size, bool)
         self.deferred_neighbors = None
@@ -326,6 +343,8 @@ class PointCloud(eqx.Module):
             if channels.shape[-1] != self.channels.shape[-1] and "channel_names" not in arrays:
                 arrays["channel_names"] = _default_names(channels.shape[-1])
         fields |= arrays
+        if "channel_names" in arrays:
+            fields["channel_names"] = _checked_names(arrays["channel_names"], fields["channels"].shape[-1])
         if fields["channel_valid"] is not None and arrays.keys() & {"channels", "channel_valid"}:
             fields["channel_valid"] = _as_mask(fields["channel_valid"], np.shape(fields["channels"]))
             fields["channels"] = _blank(fields["channels"], fields["channel_valid"])
@@ -513,12 +532,33 @@ class PointCloud(eqx.Module):
         return jax.tree.map(lambda *rows: xp.stack([xp.asarray(row) for row in rows]), *padded)
 
 
+_set_field = PointCloud.__setattr__
+
+
+def _set_or_advise(cloud: PointCloud, name: str, value: Any) -> None:
+    """Set a field in the constructor; name `replace` afterwards."""
+    try:
+        _set_field(cloud, name, value)
+    except FrozenInstanceError as error:
+        raise FrozenInstanceError(f"{name}: clouds are immutable; use the copy cloud.replace({name}=...)") from error
+
+
+# Modules of equinox must not define it in their body.
+PointCloud.__setattr__ = _set_or_advise  # type: ignore[assignment,method-assign]
+
+
 def as_cloud(name: str, cloud: PointCloud | Values) -> PointCloud:
     """The argument `name` as a `PointCloud`. Raises `ValueError`, which starts with the name, if it cannot be one."""
     if isinstance(cloud, PointCloud):
         return cloud
     with messages_named(name):
         return PointCloud(cloud)
+
+
+def check_several(name: str, clouds: object) -> None:
+    """Raise `ValueError` for one cloud instead of several."""
+    if isinstance(clouds, PointCloud | Frame) or getattr(clouds, "ndim", None) == 2:
+        raise ValueError(f"{name}: expected a sequence of clouds, got one {type(clouds).__name__}; pass a list")
 
 
 def same_channels(one: PointCloud, other: PointCloud) -> bool:

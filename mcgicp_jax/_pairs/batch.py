@@ -20,6 +20,7 @@ from mcgicp_jax._pairs.batch_executors import GivenExecutor, executor_of, run, r
 from mcgicp_jax._pairs.batch_jobs import BatchJob, Cloud, Pair
 from mcgicp_jax._registration.options import GivenOptions, check_method, options_of
 from mcgicp_jax._registration.result import RegistrationResult
+from mcgicp_jax._registration.tie_points_and_prior import GivenPrior
 
 Start: TypeAlias = Pose | Literal["global"] | None
 
@@ -30,6 +31,7 @@ def register_batch(
     method: AbstractMethod,
     *,
     init: Iterable[Start] | Start = None,
+    priors: Iterable[GivenPrior | None] | None = None,
     voxel_size: VoxelSize = "auto",
     num_neighbors: int = NUM_NEIGHBORS,
     executor: GivenExecutor = None,
@@ -40,16 +42,17 @@ def register_batch(
 
     Waits for all pairs. See `register_as_completed` for arguments, errors and warnings.
 
-    Outside `jit`, the poses have derivatives, as those of `register`, by the points and channels of the clouds and the
-    parameters of the method. They are computed side by side, so that `jax.value_and_grad` of a loss over the poses of
-    many pairs is one call; with an `executor` by its workers, as (7, n) matrices. Clouds must be given in lists then.
-    Inside `jit` and `vmap`, use `register`.
+    Outside `jit`, the poses have derivatives, as those of `register`, by the points and channels of the clouds, the
+    parameters of the method and the priors. They are computed side by side, so that `jax.value_and_grad` of a loss over
+    the poses of many pairs is one call; with an `executor` by its workers, as (7, n) matrices. Clouds and priors must
+    be given in lists then. Inside `jit` and `vmap`, use `register`.
     """
-    job, workers = _job(method, options, voxel_size, num_neighbors, covariances), executor_of(executor)
-    pairs = _pairs(job, sources, targets, init)
+    has_priors = priors is not None
+    job = _job(method, options, voxel_size, num_neighbors, covariances, has_priors)
+    workers, pairs = executor_of(executor), _pairs(job, sources, targets, init, priors)
     # A look at an iterator would use it up.
     clouds = [side for side in (sources, targets) if isinstance(side, list | tuple | PointCloud)]
-    inputs = clouds, job.method, job.options.robust
+    inputs = clouds, job.method, job.options.robust, priors if isinstance(priors, list | tuple) else None
     if not is_concrete(primal(inputs)):
         raise ValueError(
             "sources, targets: expected concrete arrays, got tracers; call register_batch outside of jit and vmap, "
@@ -66,6 +69,7 @@ def register_as_completed(
     method: AbstractMethod,
     *,
     init: Iterable[Start] | Start = None,
+    priors: Iterable[GivenPrior | None] | None = None,
     voxel_size: VoxelSize = "auto",
     num_neighbors: int = NUM_NEIGHBORS,
     executor: GivenExecutor = None,
@@ -83,8 +87,10 @@ def register_as_completed(
             one side may be a single cloud for all pairs. An item may also be a function without arguments that returns
             a cloud, such as `functools.partial(mcgicp_jax.io.read, path)`, which the worker calls.
         method: as in `register`; parameters left None are estimated for each pair.
-        init: initial T_target_source: one for all pairs, or an iterable with one per pair. None is the identity, and
-            "global" the pose found by `global_pose`.
+        init: initial T_target_source: one for all pairs, or an iterable with one per pair. None is the pose of the
+            prior, if there is one, or the identity, and "global" the pose found by `global_pose`.
+        priors: one per pair: a measurement of T_target_source, in the form of the `prior` of `register`, or None. Pairs
+            with priors do not run as lanes. With an `executor`, the poses have no derivatives by them.
         voxel_size, num_neighbors: as in `preprocess`, for raw clouds, which the workers preprocess. "auto": one size
             for both clouds of a pair; that of a single cloud for all pairs, if it has any, applies to all.
         executor: None, a thread per core; "processes", a process per core (extra `processes`; no `__main__` guard is
@@ -95,7 +101,7 @@ def register_as_completed(
         options: options of `register`, except for `tie_points` and `prior`. `search` is also used to preprocess; by
             default `KDTreeSearch` with one thread per pair. With `DenseSearch`, or without a search on accelerators,
             pairs run as lanes of one vectorised program on `jax.default_device`, or spread over all local devices (not
-            with an `executor`, `equalize_channels` or `voxel_sizes`), which finds neighbours by brute force.
+            with an `executor`, `priors`, `equalize_channels` or `voxel_sizes`), which finds neighbours by brute force.
 
     Returns:
         A generator of the index of the pair, from 0, and its `RegistrationResult`.
@@ -104,35 +110,49 @@ def register_as_completed(
         ValueError: if an argument common to all pairs is malformed, or the iterables differ in length.
     Warns:
         PairWarning: the reason for each pair with the status `INVALID_INPUT` or `WORKER_FAILED`, or with matches for
-            less than 10 % of the source points; a `UserWarning`.
+            less than 10 % of the source points (UNVERIFIED); a `UserWarning`.
     """
-    job, workers = _job(method, options, voxel_size, num_neighbors, covariances), executor_of(executor)
-    return run(job, _pairs(job, sources, targets, init), workers)
+    job = _job(method, options, voxel_size, num_neighbors, covariances, priors is not None)
+    workers = executor_of(executor)
+    return run(job, _pairs(job, sources, targets, init, priors), workers)
 
 
 def _job(
-    method: AbstractMethod, options: GivenOptions, voxel_size: VoxelSize, num_neighbors: int, covariances: bool
+    method: AbstractMethod,
+    given: GivenOptions,
+    voxel_size: VoxelSize,
+    num_neighbors: int,
+    covariances: bool,
+    has_priors: bool,
 ) -> BatchJob:
     check_method(method)
     check_preprocessing(voxel_size, num_neighbors)
-    return BatchJob(method, options_of(register_batch, options), voxel_size, num_neighbors, covariances)
+    options = options_of(register_batch, given)
+    if has_priors and not options.hold_unconstrained:
+        raise ValueError("hold_unconstrained: expected True with priors, got False")
+    return BatchJob(method, options, voxel_size, num_neighbors, covariances, has_priors)
 
 
 def _pairs(
-    job: BatchJob, sources: Iterable[Cloud] | Cloud, targets: Iterable[Cloud] | Cloud, init: Iterable[Start] | Start
+    job: BatchJob,
+    sources: Iterable[Cloud] | Cloud,
+    targets: Iterable[Cloud] | Cloud,
+    init: Iterable[Start] | Start,
+    priors: Iterable[GivenPrior | None] | None,
 ) -> Iterator[Pair]:
     """Iterate lazily over the pairs; arguments common to all pairs are checked immediately."""
     if isinstance(init, str) and init != "global":
         raise ValueError(f'init: expected a pose, "global", or one per pair, got {init!r}')
-    sides: dict[str, Any] = {"sources": sources, "targets": targets, "init": init}
+    sides: dict[str, Any] = {"sources": sources, "targets": targets, "init": init, "priors": priors}
     common = {"sources": _is_one_cloud(sources), "targets": _is_one_cloud(targets), "init": _is_one_pose(init)}
+    common["priors"] = priors is None
     if common["sources"] and common["targets"]:
         raise ValueError("sources: expected several clouds on at least one side, got one on each; call register")
     for name, value in sides.items():
         if common[name]:
-            if name != "init":
+            if name in ("sources", "targets"):
                 (value,) = job.ready({name: value})
-            elif not isinstance(value, str):
+            elif name == "init" and value is not None and not isinstance(value, str):
                 value = pose_matrix(value)
             sides[name] = itertools.repeat(value)
         elif isinstance(value, jaxlie.SE3):

@@ -153,7 +153,7 @@ def run(
     """Register the pairs and yield index and result of each as soon as it is computed; see `register_as_completed`."""
 
     def concrete(pair: Pair) -> Pair:
-        if not is_concrete(pair.source, pair.target):
+        if not is_concrete(pair.source, pair.target, pair.prior):
             raise ValueError(
                 f"pair {pair.index}: expected concrete arrays, got tracers; for derivatives, call register_batch "
                 "outside of jit with lists of clouds"
@@ -166,10 +166,14 @@ def run(
 
 def run_differentiated(job: BatchJob, pairs: Iterator[Pair], executor: Executor) -> list[RegistrationResult]:
     """The results of pairs whose arrays differentiation traces; workers compute the poses and their derivatives."""
-    outcomes = {pair.index: job.prepare(pair) for pair in pairs}
+    outcomes = {}
+    for pair in pairs:
+        if not is_concrete(pair.prior):
+            raise ValueError(f"priors[{pair.index}]: expected concrete arrays with an executor, got tracers")
+        outcomes[pair.index] = job.prepare(pair)
     ready = {index: pair for index, pair in outcomes.items() if isinstance(pair, PreparedPair)}
     fixed = replace(job, method=primal(job.method), options=replace(job.options, robust=primal(job.options.robust)))
-    sent = (Pair(pair.index, *pair.inputs.values()[:2], pair.init, pair.traced) for pair in ready.values())
+    sent = (Pair(each.index, *each.inputs.values()[:2], each.init, each.prior, each.traced) for each in ready.values())
     results = {index: result.with_warning() for index, result in outcomes.items() if index not in ready}
     results |= {result.index: result for result in _results(fixed, sent, executor)}
     return [

@@ -32,7 +32,8 @@ from mcgicp_jax._registration.input_checks import check_clouds, warn_of_estimate
 from mcgicp_jax._registration.options import Options
 from mcgicp_jax._registration.pose_derivative import Inputs
 from mcgicp_jax._registration.register_pair import Run, prepared, preprocessed, results_of, run_pair
-from mcgicp_jax._registration.result import RegistrationResult, Status, computed, unverified
+from mcgicp_jax._registration.result import RegistrationResult, Status, computed, verified
+from mcgicp_jax._registration.tie_points_and_prior import GivenPrior, checked_measurements
 from mcgicp_jax._registration.vectorized import LanePair, Refused, run_pairs
 from mcgicp_jax._search.brute_force import DenseSearch, default_search
 
@@ -61,6 +62,7 @@ class Pair:
     source: Cloud
     target: Cloud
     init: Pose | Literal["global"] | None
+    prior: GivenPrior | None = None
     traced: tuple[int, ...] = ()
 
 
@@ -96,12 +98,13 @@ class PairResult:
 class PreparedPair:
     """A pair of preprocessed clouds; `verified` unless the initial pose is one that `global_pose` doubts.
 
-    `max_coarse_distance` is that of `Options`.
+    `max_coarse_distance` is that of `Options`; `prior` is that of the `Pair`.
     """
 
     index: int
     inputs: Inputs
     init: Pose | None
+    prior: GivenPrior | None = None
     verified: bool = True
     max_coarse_distance: float = np.inf
 
@@ -116,8 +119,8 @@ class PreparedPair:
         return tuple(i for i, leaf in enumerate(self.leaves) if not is_concrete(leaf))
 
     def checked(self, result: RegistrationResult) -> RegistrationResult:
-        """The result, UNVERIFIED if the initial pose is."""
-        return result if self.verified else unverified(result)
+        """The result, UNVERIFIED if the initial pose is, or the overlap is small."""
+        return verified(result, self.verified)
 
 
 def _of_a_pair(work: Callable[..., Any]) -> Callable[..., Any]:
@@ -142,6 +145,7 @@ class BatchJob:
     voxel_size: VoxelSize
     num_neighbors: int
     covariances: bool = True
+    has_priors: bool = False
 
     @property
     def _options(self) -> Options:
@@ -151,7 +155,7 @@ class BatchJob:
     @property
     def uses_lanes(self) -> bool:
         """Whether pairs run as lanes of one vectorised program, if no executor is given."""
-        repeated = self.options.equalize_channels or len(self.options.voxel_sizes) > 0
+        repeated = self.options.equalize_channels or len(self.options.voxel_sizes) > 0 or self.has_priors
         search = self.options.search
         return (on_accelerator() if search is None else isinstance(search, DenseSearch)) and not repeated
 
@@ -173,13 +177,15 @@ class BatchJob:
         options = self.options
         soft, equalized = options.soft_matches is not False, options.equalize_channels
         warn_of_estimated_parameters(self.method, source, target, soft, equalized)
-        inputs = prepared(source, target, self.method, self.options)
+        inputs = prepared(source, target, self.method, self.options, prior=pair.prior)
         if not isinstance(pair.init, str):
-            return PreparedPair(pair.index, inputs, primal(pair.init))
+            init = pair.prior[0] if pair.init is None and pair.prior is not None else pair.init
+            return PreparedPair(pair.index, inputs, primal(init), pair.prior)
         start = start_from_anywhere(pair.init, primal(source), primal(target))
         if start is None:
             return PairResult(pair.index, RegistrationResult.without_pose(Status.TOO_FEW_CORRESPONDENCES))
-        return PreparedPair(pair.index, inputs, start.matrix, start.success, coarse_distance_from(start, self.options))
+        distance = coarse_distance_from(start, self.options)
+        return PreparedPair(pair.index, inputs, start.matrix, pair.prior, start.success, distance)
 
     @computed_on_cpu
     def register_chunk(self, chunk: list[Pair]) -> list[PairResult]:
@@ -196,20 +202,23 @@ class BatchJob:
     @_of_a_pair
     def _register(self, pair: Pair) -> PairResult:
         source, target = self._clouds(pair)
-        return self._result(pair.index, register_from(source, target, self.method, pair.init, self._options))
+        given = source, target, self.method, pair.init, self._options
+        return self._result(pair.index, register_from(*given, prior=pair.prior))
 
     @_of_a_pair
     def _register_with_jacobian(self, pair: Pair) -> PairResult:
         values: Any = (pair.source, pair.target, self.method, self.options.robust)
-        run = self._run(PreparedPair(pair.index, Inputs(*values), pair.init))  # type: ignore[arg-type]
+        inputs = Inputs(*values)._replace(prior=checked_measurements(None, pair.prior, *values[:2])[1])
+        run = self._run(PreparedPair(pair.index, inputs, pair.init))  # type: ignore[arg-type]
         if isinstance(run, PairResult):
             return run
-        (result,) = results_of([run], [None])
+        (result,) = map(verified, results_of([run], [None]))
         leaves, structure = jax.tree.flatten(values, is_leaf=is_deferred)
 
         def pose(*traced: Any) -> Any:
             moved = dict(enumerate(leaves)) | dict(zip(pair.traced, traced, strict=True))
-            (moved_result,) = results_of([run], [Inputs(*jax.tree.unflatten(structure, moved.values()))])
+            moved_inputs = Inputs(*jax.tree.unflatten(structure, moved.values()))._replace(prior=inputs.prior)
+            (moved_result,) = results_of([run], [moved_inputs])
             return moved_result.centred.wxyz_xyz
 
         parameters, vjp = jax.vjp(pose, *(leaves[i] for i in pair.traced))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any, Literal
+from typing import Any, Literal, Never
 
 import numpy as np
 from jax.typing import ArrayLike
@@ -18,15 +18,11 @@ from mcgicp_jax._math.poses import Pose
 from mcgicp_jax._math.robust_kernels import AbstractKernel
 from mcgicp_jax._methods.base import AbstractMethod
 from mcgicp_jax._registration.input_checks import warn_of_estimated_parameters, warn_of_lengths
-from mcgicp_jax._registration.options import Distance, Options, check_method
+from mcgicp_jax._registration.options import Distance, Options, check_method, options_of
 from mcgicp_jax._registration.register_pair import register_pair
-from mcgicp_jax._registration.result import RegistrationResult, Status, is_usable, unverified
+from mcgicp_jax._registration.result import LEAST_OVERLAP, USABLE, RegistrationResult, Status, verified
 from mcgicp_jax._registration.tie_points_and_prior import GivenPrior, GivenTiePoints
 from mcgicp_jax._search.base import AbstractSearch
-
-# Smallest overlap without a warning. Pairs of scans that overlap by 10 to 30 % count as the hardest that can be
-# registered (3DLoMatch, Huang et al. 2021).
-_LEAST_OVERLAP = 0.1
 
 
 def register(
@@ -48,6 +44,7 @@ def register(
     soft_matches: bool | None = Options.soft_matches,
     tie_points: GivenTiePoints | None = None,
     prior: GivenPrior | None = None,
+    **unknown: Never,
 ) -> RegistrationResult:
     """Register two clouds: find matches at the current pose, update the pose, and repeat until it converges.
 
@@ -161,10 +158,12 @@ def register(
             values of a channel differ so much between the clouds that its units probably differ; the channels of
             matched points differ by a factor, probably because of another exposure; extent and spacing of the clouds
             differ so much that their units of length probably differ; or `GICP` gets one cloud with covariances that
-            are not dimensionless. Outside of `jit`: if less than 10 % of the source points have a match at the end;
-            channels or `channel_weights` are differentiated with `soft_matches=False`; or channels are while
-            `channel_covariance` or, unless it is False, `channel_weights` is None.
+            are not dimensionless. Outside of `jit`: if less than 10 % of the source points have a match at the end (the
+            pose is UNVERIFIED); channels or `channel_weights` are differentiated with `soft_matches=False`; or
+            channels are while `channel_covariance` or, unless it is False, `channel_weights` is None.
     """
+    options_of(register, unknown)
+    check_method(method)
     options = Options(
         max_distance=max_distance,
         max_iterations=max_iterations,
@@ -186,7 +185,7 @@ def register(
     result = register_from(source, target, method, init, options, tie_points, prior)
     doubt = doubt_of(result)
     if doubt:
-        warn(f'{doubt}; pass a better init, or init="global"')
+        warn(doubt if isinstance(init, str) else f'{doubt}; pass a better init, or init="global"')
     return result
 
 
@@ -201,15 +200,14 @@ def register_from(
 ) -> RegistrationResult:
     """`register` with its options as one object."""
     check_method(method)
-    verified = True
+    trusted = True
     if isinstance(init, str):
         start = start_from_anywhere(init, primal(source), primal(target))
         if start is None:
             return RegistrationResult.without_pose(Status.TOO_FEW_CORRESPONDENCES)
-        init, verified = start.matrix, start.success
+        init, trusted = start.matrix, start.success
         options = replace(options, max_coarse_distance=coarse_distance_from(start, options))
-    result = register_pair(source, target, method, init, options, tie_points, prior)
-    return result if verified else unverified(result)
+    return verified(register_pair(source, target, method, init, options, tie_points, prior), trusted)
 
 
 def coarse_distance_from(start: GlobalPoseResult, options: Options) -> float:
@@ -218,11 +216,11 @@ def coarse_distance_from(start: GlobalPoseResult, options: Options) -> float:
 
 
 def doubt_of(result: RegistrationResult) -> str | None:
-    """Why a pose of a usable status is probably wrong; None if nothing speaks against it."""
-    if not is_concrete(result.overlap, result.status_code) or not is_usable(result):
+    """Why a pose is probably wrong; None if it is no result of matches, or they do not speak against it."""
+    if not is_concrete(result.overlap, result.status_code):
         return None
     overlap = float(np.asarray(result.overlap))
-    if overlap >= _LEAST_OVERLAP:
+    if overlap >= LEAST_OVERLAP or result.status not in (*USABLE, Status.UNVERIFIED):
         return None
     return f"only {100 * overlap:.2g} % of the source points have a match, so the pose is probably wrong"
 

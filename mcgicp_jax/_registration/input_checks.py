@@ -1,4 +1,4 @@
-"""Checks of the clouds and matches of a registration."""
+"""Checks of the clouds, matches and extensions of a registration."""
 
 from __future__ import annotations
 
@@ -14,6 +14,9 @@ from mcgicp_jax._local_geometry.cloud_statistics import point_spacing
 from mcgicp_jax._math.statistics import median, sampled_rows
 from mcgicp_jax._methods.base import AbstractMethod
 from mcgicp_jax._methods.multichannel_gicp import MultiChannelGICP
+from mcgicp_jax._pose_solver.matched import Motion
+from mcgicp_jax._registration.loop import LoopResult
+from mcgicp_jax._registration.on_host import HostExecutor
 from mcgicp_jax._registration.options import check_method
 from mcgicp_jax._search.base import Correspondences
 
@@ -48,8 +51,8 @@ def check_clouds(source: PointCloud, target: PointCloud, method: AbstractMethod)
             )
     if method.uses_channels:
         check_channels(source, target, method)
-        if isinstance(method, MultiChannelGICP) and source.channels.shape[-1] == 0:
-            warn("the clouds have no channels: MultiChannelGICP equals GICP")
+        if source.channels.shape[-1] == 0:
+            warn(f"the clouds have no channels: {type(method).__name__} uses geometry alone")
     if source.points.dtype != target.points.dtype:
         raise ValueError(
             f"points: expected one precision in both clouds, got {source.points.dtype} in the source and "
@@ -96,6 +99,32 @@ def check_matches(
         raise ValueError(f"temperature: expected metres to go with {matches.indices.shape[0]} candidates, got None")
     if temperature is not None and is_concrete(temperature) and not np.asarray(temperature) > 0:
         raise ValueError(f"temperature: expected a positive number of metres, got {temperature!r}")
+
+
+def warn_of_extensions(method: AbstractMethod, executor: HostExecutor, loop: LoopResult) -> None:
+    """Warn where numbers of a method, term or kernel from outside of the package are not finite."""
+    for side in ("source", "target"):
+        covariance = getattr(executor.problem, side).whole().covariance
+        rows = np.flatnonzero(~np.isfinite(covariance).all(axis=1))
+        if _is_extension(method) and len(rows):
+            warn(
+                f"{type(method).__name__}.covariance: expected finite numbers, got NaN or infinity at {len(rows)} of "
+                f"{len(covariance)} points of the {side}, first at row {rows[0]}"
+            )
+            return
+    motion = Motion.of(loop.state.pose.wxyz_xyz)
+    for term in loop.terms:
+        sums = executor.sums(motion, loop.matches, (term,), np.bool_(False))
+        extensions = [each for each in (term, term.robust) if _is_extension(each)]
+        if extensions and not np.isfinite(sums.table).all():
+            warn(
+                f"{type(extensions[0]).__name__}: expected finite numbers, got NaN or infinity at the matches after "
+                f"{int(loop.state.num_iterations)} updates"
+            )
+
+
+def _is_extension(part: object) -> bool:
+    return part is not None and not type(part).__module__.startswith("mcgicp_jax.")
 
 
 def warn_of_hard_matches(method: AbstractMethod, source: PointCloud, target: PointCloud) -> None:

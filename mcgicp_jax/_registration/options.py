@@ -12,6 +12,7 @@ from typing import Any, TypeAlias, TypedDict
 import numpy as np
 from jax.typing import ArrayLike
 
+from mcgicp_jax._clouds.point_cloud import PointCloud
 from mcgicp_jax._clouds.preprocess import MIN_POINTS
 from mcgicp_jax._compute.concrete import is_concrete
 from mcgicp_jax._compute.linear_maps import primal
@@ -118,7 +119,7 @@ def options_of(function: Callable[..., Any], given: Any) -> Options:
     """The options of `register` given to another function; raises `TypeError` for a name that neither function has."""
     parameters = inspect.signature(function).parameters.values()
     named = [each.name for each in parameters if each.kind is not inspect.Parameter.VAR_KEYWORD]
-    names = [*GivenOptions.__annotations__, *named]
+    names = list(dict.fromkeys([*GivenOptions.__annotations__, *named]))
     for name in given.keys() - names:
         close = difflib.get_close_matches(name, names)
         hint = f"did you mean {' or '.join(close)}?" if close else f"expected one of {', '.join(sorted(names))}"
@@ -130,7 +131,8 @@ def check_method(method: AbstractMethod) -> None:
     if isinstance(method, type) and issubclass(method, AbstractMethod):
         raise ValueError(f"method: expected {method.__name__}(), got the class {method.__name__}")
     if not isinstance(method, AbstractMethod):
-        raise ValueError(f"method: expected a method such as MultiChannelGICP(), got {reprlib.repr(method)}")
+        order = "; is the order right? Clouds come first" if isinstance(method, PointCloud | np.ndarray) else ""
+        raise ValueError(f"method: expected a method such as MultiChannelGICP(), got {reprlib.repr(method)}{order}")
 
 
 def _check_tolerance(name: str, value: Any) -> None:

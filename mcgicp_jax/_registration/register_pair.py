@@ -41,6 +41,7 @@ from mcgicp_jax._registration.input_checks import (
     check_channels,
     check_clouds,
     warn_of_covariances,
+    warn_of_extensions,
     warn_of_hard_matches,
 )
 from mcgicp_jax._registration.loop import LoopResult, Problem, State
@@ -237,6 +238,8 @@ def run_loop(inputs: Inputs, problem: Problem, search: AbstractSearch | None, ma
     executor = HostExecutor(problem, index, 1 if search is None else search.num_threads)
     with outside_trace():
         loop = executor.run()
+        if loop.state.status == Status.NON_FINITE:
+            warn_of_extensions(inputs.method, executor, loop)
     lazy = Lazy(partial(moments_of, executor, loop))
 
     def moments() -> Moments:

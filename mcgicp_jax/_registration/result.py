@@ -15,7 +15,7 @@ from jaxtyping import Array, Float, Int
 
 from mcgicp_jax._clouds.origins import pose_in_user_frame
 from mcgicp_jax._compute.cache import Held, Lazy
-from mcgicp_jax._compute.concrete import AnyArray, canonical_float, is_concrete
+from mcgicp_jax._compute.concrete import AnyArray, canonical_float, is_concrete, numpy_for
 from mcgicp_jax._compute.linear_maps import primal
 from mcgicp_jax._math.poses import se3
 from mcgicp_jax._pose_solver.degeneracy import Directions, UnconstrainedDirection, as_text, unconstrained_directions
@@ -37,10 +37,16 @@ class Status(enum.IntEnum):
         NON_FINITE: the pose or the sums overflowed or became NaN.
         INVALID_INPUT: `register` would raise a `ValueError` for this pair. Only in batches; the pose is NaN.
         WORKER_FAILED: two workers in turn failed with this pair. Only in batches; the pose is NaN.
+<<<<<<< HEAD
         UNVERIFIED: the pose is registered, but it may be wrong: with `init="global"`, `global_pose` had no success; or
             the pose contradicts the `prior`, by more standard deviations than in one of a million right cases; or
             channels alone hold it along some direction, and are so simple a function of position that they may move
             with the sensor.
+=======
+        UNVERIFIED: the pose is registered, but it may be wrong: less than 10 % of the source points have a match; with
+            `init="global"`, `global_pose` had no success; or the pose contradicts the `prior`, by more standard
+            deviations than in one of a million right cases.
+>>>>>>> sequences
     """
 
     CONVERGED = 0
@@ -73,8 +79,8 @@ _ADVICE = {
     Status.NON_FINITE: "numerical overflow; are the coordinates in metres?",
     Status.INVALID_INPUT: "register raises an error for this pair; see its warning",
     Status.WORKER_FAILED: "two workers failed with this pair; try register, or smaller clouds",
-    Status.UNVERIFIED: "the clouds may not show the same place, other poses fit as well, or the prior contradicts it; "
-    "look at the clouds at this pose, or try clouds that show more of the scene",
+    Status.UNVERIFIED: "the clouds may not show the same place, few points match, other poses fit as well, or the "
+    "prior contradicts it; look at the clouds at this pose, or try clouds that show more of the scene",
 }
 
 
@@ -296,6 +302,9 @@ class RegistrationResult(eqx.Module):
         )
 
 
+# Smallest overlap of a verified pose. Pairs of scans that overlap by 10 to 30 % count as the hardest that can be
+# registered (3DLoMatch, Huang et al. 2021).
+LEAST_OVERLAP = 0.1
 USABLE = (Status.CONVERGED, Status.DEGENERATE, Status.MAX_ITERATIONS)
 
 
@@ -313,8 +322,13 @@ def computed(result: RegistrationResult) -> RegistrationResult:
     return jax.tree.map(lambda leaf: leaf, result)
 
 
-def unverified(result: RegistrationResult) -> RegistrationResult:
-    """The result, with the status UNVERIFIED if the pose is usable."""
-    if not is_usable(result):
-        return result
-    return result.build(**vars(result) | {"status_code": np.int32(Status.UNVERIFIED)})
+def verified(result: RegistrationResult, trusted: bool = True) -> RegistrationResult:
+    """The result, UNVERIFIED instead of usable if few points match or the start is in doubt.
+
+    Not part of `register_pair`, whose results odometry, loops and global poses compare at any overlap.
+    """
+    code: Any = result.status_code
+    overlap: Any = result.overlap
+    xp = numpy_for(code, overlap)
+    doubtful = xp.isin(code, np.array(USABLE)) & ~(trusted & (overlap >= LEAST_OVERLAP))
+    return result.build(**vars(result) | {"status_code": xp.where(doubtful, np.int32(Status.UNVERIFIED), code)[()]})

@@ -10,7 +10,7 @@ from typing import Any, Unpack
 import numpy as np
 from jaxtyping import Float
 
-from mcgicp_jax._clouds.point_cloud import PointCloud, Values, as_cloud
+from mcgicp_jax._clouds.point_cloud import PointCloud, Values, as_cloud, check_several
 from mcgicp_jax._clouds.preprocess import check_preprocessing, preprocess
 from mcgicp_jax._clouds.voxel_map import merge_clouds
 from mcgicp_jax._clouds.voxel_size import NUM_NEIGHBORS, VoxelSize, voxels_for
@@ -117,6 +117,7 @@ def multiway(
     """
     check_method(method)
     check_preprocessing(voxel_size, num_neighbors)
+    check_several("clouds", clouds)
     settings = options_of(multiway, options)
     ready = [as_cloud(f"clouds[{k}]", cloud) for k, cloud in enumerate(clouds)]
     if not ready:

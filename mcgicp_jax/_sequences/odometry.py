@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Float
 
 from mcgicp_jax._clouds.deskew import deskew as deskewed
-from mcgicp_jax._clouds.point_cloud import Frame, PointCloud, Values, Voxels, as_cloud
+from mcgicp_jax._clouds.point_cloud import Frame, PointCloud, Values, Voxels, as_cloud, check_several
 from mcgicp_jax._clouds.preprocess import check_preprocessing, preprocess
 from mcgicp_jax._clouds.voxel_map import VoxelMap
 from mcgicp_jax._clouds.voxel_size import NUM_NEIGHBORS, VoxelSize, voxels_for
@@ -28,7 +28,7 @@ from mcgicp_jax._pairs.register import doubt_of
 from mcgicp_jax._pose_graph.graph import PoseGraph
 from mcgicp_jax._registration.options import GivenOptions, Options, check_method, options_of
 from mcgicp_jax._registration.register_pair import register_pair, rows_to_match
-from mcgicp_jax._registration.result import RegistrationResult, computed, is_usable
+from mcgicp_jax._registration.result import RegistrationResult, computed, is_usable, verified
 from mcgicp_jax._registration.tie_points_and_prior import GivenPrior
 from mcgicp_jax._sequences.loop_closure import Trajectory
 from mcgicp_jax._sequences.relocalization import Relocalizer, map_target
@@ -137,10 +137,11 @@ def odometry(
 
     Warns:
         UserWarning: on iteration without `recover`, if a frame cannot be registered, or less than 10 % of its points
-            have a match. The next one is registered to it all the same.
+            have a match (UNVERIFIED; its pose is used). The next one is registered to it all the same.
     """
     check_preprocessing(voxel_size, num_neighbors)
     check_method(method)
+    check_several("frames", frames)
     named: dict[str, Any] = {"init": init, "start": start, "method": method}
     for name, value in (named | {**options}).items():
         check_concrete(name, value)
@@ -287,7 +288,7 @@ class _Sensor(Iterator[OdometryStep]):
         self.cloud = cloud
         if result is None:
             return OdometryStep(self.pose, cloud, None, self.is_lost, graph)
-        registration = Lazy(partial(computed, result))
+        registration = Lazy(partial(computed, verified(result)))
         # The registration of the step before the last is computed if somebody keeps it, since it refers to two frames.
         # The caller of a loop still holds the last step. What nobody reads is not computed.
         kept = self.unread[0]() if len(self.unread) == 2 else None

@@ -52,6 +52,10 @@ def before_after(source: PointCloud, target: PointCloud, poses: Mapping[str, Pos
         ValueError: if a pose is no rigid motion, or the target has fewer than 3 points.
         ImportError: if matplotlib is missing.
     """
+    if not isinstance(poses, Mapping):
+        raise ValueError(
+            f'poses: expected poses by name, such as {{"GICP": result.matrix}}, got {type(poses).__name__}'
+        )
     named = {name: pose_matrix(pose, f"poses[{name!r}]") for name, pose in ({"start": np.eye(4)} | dict(poses)).items()}
     source, target = drawing.drawable(source), drawing.drawable(target)
     if len(target) < 3:
