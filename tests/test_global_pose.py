@@ -448,6 +448,10 @@ def test_register_starts_from_anywhere():
     registered = mcg.register(source, other, mcg.GICP(), init=start.matrix)
     np.testing.assert_array_equal(unsure.matrix, registered.matrix)
     np.testing.assert_array_equal(unsure.covariance, registered.covariance)
+    # Whatever the registration says of itself.
+    stopped = mcg.register(source, other, mcg.GICP(), init=start.matrix, max_iterations=1)
+    unsure = mcg.register(source, other, mcg.GICP(), init="global", max_iterations=1)
+    assert stopped.status is mcg.Status.MAX_ITERATIONS and unsure.status is mcg.Status.UNVERIFIED
     noise = np.random.default_rng(0).normal(size=(2, 10, 3))
     lost = mcg.register(*noise, mcg.GICP(), init="global")
     assert lost.status is mcg.Status.TOO_FEW_CORRESPONDENCES and np.isnan(lost.matrix[:3]).all()
