@@ -153,6 +153,24 @@ def test_gradients_by_channels_that_are_left_out_are_zero():
         assert not np.any(jax.grad(along)(jnp.asarray(source.channels)))
 
 
+def test_a_pose_that_smooth_channels_hold_has_a_derivative_by_them():
+    """Training may find what makes them move with the sensor."""
+    rng, clouds = np.random.default_rng(0), []
+    for _ in range(2):
+        points = rng.uniform(-1, 1, (1000, 3)) * [1, 1, 0.003] + [0, 0, 4]
+        paint = np.sin(2 * points[:, 0]) + np.cos(2 * points[:, 1])
+        clouds.append(mcg.preprocess(mcg.PointCloud(points, paint), None))
+    source, target = clouds
+
+    def along(channels):
+        result = mcg.register(source.replace(channels=channels), target, METHOD)
+        return result.T_target_source.translation()[0], result.status_code
+
+    with pytest.warns(UserWarning, match="may move"):
+        slope, code = jax.grad(along, has_aux=True)(jnp.asarray(source.channels))
+    assert code == mcg.Status.UNVERIFIED and np.abs(slope @ np.ones(1)).max() > 1e-6
+
+
 def test_few_points_and_huge_values_explain_nothing():
     rng = np.random.default_rng(0)
     few = shares(rng.random((12, 3)), rng.random(12))

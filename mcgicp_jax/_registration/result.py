@@ -73,8 +73,9 @@ _ADVICE = {
     Status.NON_FINITE: "numerical overflow; are the coordinates in metres?",
     Status.INVALID_INPUT: "register raises an error for this pair; see its warning",
     Status.WORKER_FAILED: "two workers failed with this pair; try register, or smaller clouds",
-    Status.UNVERIFIED: "the clouds may not show the same place, few points match, other poses fit as well, or the "
-    "prior contradicts it; look at the clouds at this pose, or try clouds that show more of the scene",
+    Status.UNVERIFIED: "the clouds may not show the same place, few points match, other poses fit as well, the prior "
+    "contradicts it, or channels that may move with the sensor hold it; look at the clouds at this pose, or try clouds "
+    "that show more of the scene",
 }
 
 
