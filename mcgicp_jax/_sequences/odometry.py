@@ -39,8 +39,7 @@ from mcgicp_jax._sequences.relocalization import Relocalizer, map_target
 _SAME_MOTION, _ROUNDS = 0.3, 3
 # The error of a motion moves all points that are deskewed by it, half as far on average, and so goes into the next
 # motions, unless scan and target are deskewed by nearly the same one. It therefore follows the measured motions by this
-# fraction: one that follows them wholly, or is repeated below the noise of the motions (0.1 spacings), has the errors
-# of the table in tests/benchmarks.
+# fraction, and only displacements above the noise of the motions repeat it; tests/benchmarks has the errors of others.
 _FOLLOWED = 0.5
 
 
