@@ -110,6 +110,8 @@ def test_options_that_contradict_each_other_are_named_as_flags(capsys):
     for given, told in (
         (["--against", "map", "--loops"], "--loops: expected --against previous"),
         (["--map-radius", "5"], "--map-radius: expected --against map"),
+        (["--deskew"], "--deskew: expected points with times"),
+        (["--deskew", "--every", "2"], "--deskew: expected scans that follow each other"),
     ):
         assert main(["odometry", "box-room", *given]) == 2
         assert capsys.readouterr().err.startswith(f"mcgicp: {told}")

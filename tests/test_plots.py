@@ -213,6 +213,7 @@ def test_maps_show_the_same_part_of_the_world():
     one, other, grey = (panel.images[0].get_array() for panel in figure.axes)
     assert one.shape == other.shape == grey.shape
     assert [panel.get_title() for panel in figure.axes] == ["one", "moved", "bare"]
+    assert {label for panel in figure.axes for label in (panel.get_xlabel(), panel.get_ylabel())} == {"metres"}
     # Where the moved map has left, the paper is white; without channels it is grey.
     assert np.mean(np.all(other == 1, axis=-1)) > np.mean(np.all(one == 1, axis=-1)) + 0.1
     assert np.ptp(one, axis=-1).max() > 0.3 and np.ptp(grey, axis=-1).max() == 0
@@ -228,7 +229,8 @@ def test_covariances_within_a_surface_are_drawn_as_they_are():
     slanted = np.tile(np.diag([1.0, 1.0, 1e-3]), (200, 1, 1))
     slanted[:, 0, 1] = slanted[:, 1, 0] = 0.6
     figure = plot.surface_covariances(cloud, {"along": along, "slanted": slanted}, indices=[0, 5, 10])
-    (first,), (second,) = (panel.collections for panel in figure.axes)
+    # Each is black with a white rim.
+    (_, first), (_, second) = (panel.collections for panel in figure.axes)
     np.testing.assert_allclose(first.get_widths() / first.get_heights(), 2)
     np.testing.assert_allclose(np.abs(np.sin(np.radians(first.get_angles()))), 0, atol=1e-9)
     np.testing.assert_allclose(np.abs(np.tan(np.radians(second.get_angles()))), 1)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import inspect
 import itertools
 import sys
 from collections.abc import Iterator
@@ -90,7 +91,7 @@ def odometry(
         against: Register each frame to the one before it, or to a map of all frames before it, which drifts less.
         map_radius: Metres; points further from the sensor leave the map. By default the range of the first frame.
         loops: Register frames with earlier ones that saw the same place, and correct all poses.
-        deskew: Undo the motion of the sensor during each scan, whose points have times.
+        deskew: Undo the motion of the sensor during each scan, whose points have times; the street is simulated so.
         output: File for the poses, sensor to world.
         pose_format: kitti writes the upper three rows of each matrix on one line; tum writes time, position and
             quaternion, for frames whose times are known.
@@ -109,7 +110,9 @@ def odometry(
         raise ValueError(f"--map-radius: expected --against map with {map_radius:g}, got --against {against}")
     if shared.columns is not None and isinstance(dataset, str):
         raise ValueError(f"columns: expected none, since {dataset} has a layout of its own, got {shared.columns}")
-    frames = _open(dataset, path, num_frames, every, map, shared.columns)
+    if deskew and every > 1:
+        raise ValueError(f"--deskew: expected scans that follow each other without gaps, got --every {every}")
+    frames = _open(dataset, path, num_frames, every, map, shared.columns, deskew)
     if (min_range, max_range) != (0, np.inf):
         frames = frames.crop(min_range, max_range)
     if pose_frame == "camera" and frames.to_camera is None:
@@ -125,6 +128,8 @@ def odometry(
     first = frames[0]
     if pose_format == "tum" and first.time is None:
         raise ValueError(f"pose_format: expected kitti, since the frames of {dataset} have no times, got tum")
+    if deskew and first.cloud.times is None:
+        raise ValueError(f"--deskew: expected points with times, such as a column time in files, got none in {dataset}")
     print(f"frames:    {len(frames)} of {dataset}, {len(first.cloud):,} points in the first")
     start = {"the first frame": first.cloud}
     # Where the second frame cannot be read, the odometry names the error.
@@ -167,11 +172,15 @@ def _open(
     every: int,
     map: Path | None,
     columns: int | None,
+    deskew: bool,
 ) -> AbstractFrames:
     if num_frames != "all" and num_frames < 2:
         raise ValueError(f"num_frames: expected at least 2, got {num_frames}")
     if isinstance(dataset, str) and DATASETS[dataset].simulated:
-        return DATASETS[dataset].frames(every * (_FRAMES_OF_A_SCENE if num_frames == "all" else num_frames))[::every]
+        simulate: Any = DATASETS[dataset].frames
+        if deskew and "spin" in inspect.signature(simulate).parameters:
+            simulate = partial(simulate, spin=True)
+        return simulate(every * (_FRAMES_OF_A_SCENE if num_frames == "all" else num_frames))[::every]
     if isinstance(dataset, str):
         if path is None:
             raise ValueError(f"{dataset}: expected the folder of a sequence after it, mcgicp odometry {dataset} PATH")

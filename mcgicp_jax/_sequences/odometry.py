@@ -22,7 +22,7 @@ from mcgicp_jax._compute.messages import check_concrete, check_positive, message
 from mcgicp_jax._compute.threads import ReadAhead
 from mcgicp_jax._local_geometry.cloud_statistics import point_spacing
 from mcgicp_jax._local_geometry.local_geometry import geometry_table
-from mcgicp_jax._math.poses import Pose, nearest_rotation, pose_matrix
+from mcgicp_jax._math.poses import Pose, exponential, logarithm, nearest_rotation, pose_matrix
 from mcgicp_jax._methods.base import AbstractMethod
 from mcgicp_jax._pairs.register import doubt_of
 from mcgicp_jax._pose_graph.graph import PoseGraph
@@ -36,7 +36,11 @@ from mcgicp_jax._sequences.relocalization import Relocalizer, map_target
 # Deskewing is repeated where a registration measures another motion than the one that the scan was deskewed by: one
 # that displaces the points by more than this fraction of the spacing (rms). At most so many registrations per frame,
 # since a constant velocity during the scan is an approximation itself.
-_SAME_MOTION, _ROUNDS = 0.1, 3
+_SAME_MOTION, _ROUNDS = 0.3, 3
+# The error of a motion moves all points that are deskewed by it, half as far on average, and so goes into the next
+# motions, unless scan and target are deskewed by nearly the same one. It therefore follows the measured motions by this
+# fraction, and only displacements above the noise of the motions repeat it; tests/benchmarks has the errors of others.
+_FOLLOWED = 0.5
 
 
 @dataclass(frozen=True, eq=False)
@@ -119,7 +123,7 @@ def odometry(
             poses, and correct all poses by `optimize_poses`. Steps keep the pose known at their time; the corrected
             poses are in the `graph` of the last step. All clouds are kept in memory. Not with `against="map"` or
             `recover`.
-        deskew: undo the motion of the sensor during each scan, by `mcgicp_jax.deskew`: first with the previous motion,
+        deskew: undo the motion of the sensor during each scan, by `mcgicp_jax.deskew`: first with the previous motions,
             and where the registration measures another one, with that. Frames are raw and have `PointCloud.times`, the
             scans follow each other without gaps, and poses are those at the ends of the scans. The first scan is
             deskewed by `init`, or if there is none, in hindsight by the motion to the second.
@@ -168,6 +172,7 @@ def odometry(
         options=settings,
         num_neighbors=num_neighbors,
         motion=pose_matrix(init),
+        scanned=pose_matrix(init),
         pose=np.asarray(pose_matrix(start, "start")),
         against_map=against == "map",
         radius=map_radius,
@@ -223,6 +228,7 @@ class _Sensor(Iterator[OdometryStep]):
 
     Attributes:
         motion: (4, 4), between the last two frames.
+        scanned: (4, 4), motion by which the next scan is deskewed first.
         pose: (4, 4), sensor to world.
         radius: metres around the sensor beyond which points leave the map.
         in_hindsight: whether the next registration decides how the first frame is deskewed.
@@ -240,6 +246,7 @@ class _Sensor(Iterator[OdometryStep]):
     options: Options
     num_neighbors: int
     motion: Any
+    scanned: Any
     pose: Float[np.ndarray, "4 4"]
     against_map: bool
     radius: Any
@@ -262,7 +269,7 @@ class _Sensor(Iterator[OdometryStep]):
         name, cloud, prior = next(self.frames)
         if self.cloud is None:
             result, self.first = None, (name, cloud) if self.in_hindsight else None
-            cloud = self._deskewed(name, cloud, self.motion)
+            cloud = self._deskewed(name, cloud, self.scanned)
             self._begin(cloud)
         else:
             cloud, result = self._located(name, cloud, self.cloud, prior)
@@ -325,11 +332,11 @@ class _Sensor(Iterator[OdometryStep]):
     ) -> tuple[PointCloud, RegistrationResult]:
         """Update motion and pose by a registration; the frame as it was registered, and the result."""
         follows = not self.against_map or self.is_lost
-        was_lost, motion = self.is_lost, self.motion if prior is None else prior[0]
+        was_lost, (motion, scanned) = self.is_lost, (self.motion, self.scanned) if prior is None else 2 * (prior[0],)
         for _ in range(_ROUNDS if self.reader.deskew else 1):
-            cloud = self._deskewed(name, frame, motion)
+            cloud = self._deskewed(name, frame, scanned)
             if self.first is not None:
-                before = self._first_again(*self.first, motion)
+                before = self._first_again(*self.first, scanned)
             target, start = before, motion
             if not follows:
                 target = map_target(self.world.cloud(), self.method, self.options, self.num_neighbors)
@@ -339,16 +346,18 @@ class _Sensor(Iterator[OdometryStep]):
             result = register_pair(cloud, target, self.method, start, self.options, prior=given)
             if not is_usable(result):
                 break
-            predicted, motion = motion, np.asarray(result.matrix)
+            motion = np.asarray(result.matrix)
             if not follows:
                 motion = np.linalg.solve(self.pose, motion)
-            if not self.reader.deskew or _displacement(cloud, predicted, motion) <= _SAME_MOTION * point_spacing(cloud):
+            if not self.reader.deskew or _displacement(cloud, scanned, motion) <= _SAME_MOTION * point_spacing(cloud):
                 break
+            scanned = motion
         self.first = None
         corrected = None if self.places is None else self.places.corrected(cloud, target, result)
         # The result with which tracking is lost is not used, those of the frames that follow are.
         if corrected is None and (was_lost or not self.is_lost) and is_usable(result):
             self.motion = motion
+            self.scanned = scanned @ exponential(_FOLLOWED * logarithm(np.linalg.solve(scanned, motion)))
         # The product of thousands of rounded rotations would drift away from a rotation.
         self.pose = nearest_rotation(self.pose @ self.motion if corrected is None else np.asarray(corrected.matrix))
         return cloud, result if corrected is None else corrected

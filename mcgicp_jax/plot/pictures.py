@@ -213,6 +213,8 @@ def maps(
         extent = (0, view.width * view.pixel, 0, view.height * view.pixel)
         panel.imshow(picture, origin="lower", interpolation="nearest", extent=extent)
         panel.set_title(name, fontsize="medium")
+        panel.set_xlabel("metres", fontsize="small")
+        panel.set_ylabel("metres", fontsize="small")
         panel.tick_params(labelsize="x-small")
     return drawing.saved(figure, path, bbox_inches="tight")
 
@@ -274,9 +276,11 @@ def _add_ellipses(
     sizes, vectors = np.linalg.eigh(covariances)
     lengths = scale * np.sqrt(np.maximum(sizes, 0))
     angles = np.degrees(np.arctan2(vectors[:, 1, 1], vectors[:, 0, 1]))
-    style = {"units": "xy", "facecolors": "none", "edgecolors": "black", "linewidths": 1.2}
     ellipses = drawing.plotting("matplotlib.collections").EllipseCollection
-    panel.add_collection(ellipses(*lengths.T[::-1], angles, offsets=offsets, transOffset=panel.transData, **style))
+    # Black lines alone would hide on dark surfaces.
+    for color, width in (("white", 3.6), ("black", 1.2)):
+        style = {"units": "xy", "facecolors": "none", "edgecolors": color, "linewidths": width}
+        panel.add_collection(ellipses(*lengths.T[::-1], angles, offsets=offsets, transOffset=panel.transData, **style))
 
 
 def _shades(cloud: PointCloud, view: View) -> Points:

@@ -1,10 +1,12 @@
 """Odometry of a spinning LiDAR that measures while it moves, with and without deskewing, beside KISS-ICP.
 
-    python -m tests.benchmarks.deskewing [--seeds 3] [--frames 15]
+    python -m tests.benchmarks.deskewing [--seeds 2] [--frames 10]
 
 Simulated streets at 1, 10 and 20 m/s, and at 5 m/s in a curve of 90° per second. "at rest": the same scans, measured
-all at once at their poses. Errors are mean translations from frame to frame, millimetres, without the first two pairs,
-in which KISS-ICP does not know its velocity yet.
+all at once at their poses. Errors are mean translations from frame to frame, millimetres, without the first two pairs.
+
+KISS-ICP gets the true first motion, without which it takes the faster cars for standing ones, and voxels of 0.3 m, with
+which it is better here than with those of 0.5 m or 1 m, its default.
 """
 
 from __future__ import annotations
@@ -24,20 +26,25 @@ from mcgicp_jax import metrics
 # Name, metres and radians between frames, of which there are ten a second.
 DRIVES = (("1 m/s", 0.1, 0.0), ("10 m/s", 1.0, 0.0), ("20 m/s", 2.0, 0.0), ("5 m/s, 90°/s", 0.5, np.pi / 20))
 _FIRST = 2
+_POINTS = 15_000
+_KISS_VOXEL = 0.3
 
 
 def frames_of(step: float, turn: float, count: int, seed: int, spin: bool) -> list[mcg.datasets.Frame]:
-    """Frames of a street; with `turn`, the sensor also turns about its vertical axis."""
-    frames: Any = mcg.datasets.street(count, step=step, seed=seed, spin=True)
+    """Frames of a street; with `turn`, the car drives in a circle of step / turn metres, with the same sway."""
+    frames: Any = mcg.datasets.street(count, points_per_frame=_POINTS, step=step, seed=seed, spin=True)
     straight = frames.path
 
-    def turning(time: float) -> np.ndarray:
+    def curved(time: float) -> np.ndarray:
         cosine, sine = np.cos(turn * time), np.sin(turn * time)
-        rotation = np.eye(4)
-        rotation[:2, :2] = [[cosine, -sine], [sine, cosine]]
-        return straight(time) @ rotation
+        ahead, aside = (step * time, 0.0) if turn == 0 else (step / turn * sine, step / turn * (1 - cosine))
+        pose = np.eye(4)
+        pose[:2, [0, 1, 3]] = [[cosine, -sine, ahead], [sine, cosine, aside]]
+        sway = straight(time)
+        sway[0, 3] -= step * time
+        return pose @ sway
 
-    frames.path = turning
+    frames.path = curved
     frames.num_poses = frames.num_poses if spin else 1
     return list(frames)
 
@@ -50,8 +57,11 @@ def ours(**options: Any) -> Callable[[list[mcg.datasets.Frame]], list[np.ndarray
 
 
 def kiss(frames: list[mcg.datasets.Frame]) -> list[np.ndarray]:
-    """KISS-ICP at its defaults, with its own deskewing where there are times."""
-    pipeline, poses = KissICP(load_config(None)), []
+    """KISS-ICP with its own deskewing where there are times; see the module about its settings."""
+    config = load_config(None)
+    config.mapping.voxel_size = _KISS_VOXEL
+    pipeline, poses = KissICP(config), []
+    pipeline.last_delta = np.linalg.inv(frames[0].pose) @ frames[1].pose
     for frame in frames:
         times = np.zeros(0) if frame.cloud.times is None else np.asarray(frame.cloud.times, np.float64)
         pipeline.register_frame(np.asarray(frame.cloud.points, np.float64), times)
@@ -61,8 +71,8 @@ def kiss(frames: list[mcg.datasets.Frame]) -> list[np.ndarray]:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--seeds", type=int, default=3)
-    parser.add_argument("--frames", type=int, default=15)
+    parser.add_argument("--seeds", type=int, default=2)
+    parser.add_argument("--frames", type=int, default=10)
     arguments = parser.parse_args()
     warnings.simplefilter("ignore")
     methods: dict[str, tuple[bool, Callable[[list[mcg.datasets.Frame]], list[np.ndarray]]]] = {
