@@ -289,9 +289,10 @@ def directions_of_wall(scale, shift):
     return mcg.register(*clouds, mcg.MultiChannelGICP(), **options).directions
 
 
-@pytest.mark.parametrize("scale, shift", [(1, 3), (1e-4, 0), (1e4, 3)])
+@pytest.mark.parametrize("scale, shift", [(1, 6), (1e-4, 3), (1e4, 6)])
 def test_units_and_origin_change_nothing(scale, shift):
-    first, second = directions_of_wall(1, 0), directions_of_wall(scale, shift)
+    """But for an origin, the place of the sensor, within the wall."""
+    first, second = directions_of_wall(1, 3), directions_of_wall(scale, shift)
     np.testing.assert_allclose(first.geometry, second.geometry, atol=5e-3)
     np.testing.assert_allclose(first.channels, second.channels, atol=5e-3)
 
@@ -403,7 +404,7 @@ def test_what_nothing_holds_is_not_known(flat):
     points = np.asarray(source.points)[: len(source)]
     radius = np.sqrt(np.mean(np.sum((points - points.mean(axis=0)) ** 2, axis=1)))
     # Ten radii along the wall, and ten radians about its normal.
-    np.testing.assert_allclose(result.deviations[[0, 1, 5]], [10 * radius, 10 * radius, 10], rtol=0.01)
+    np.testing.assert_allclose(result.deviations[[0, 1, 5]], [10 * radius, 10 * radius, 10], rtol=0.02)
     for direction in result.unconstrained_directions:
         deviation = np.sqrt(direction.twist @ np.linalg.pinv(np.asarray(result.information)) @ direction.twist)
         assert np.isfinite(deviation)
