@@ -13,7 +13,8 @@ from scipy.spatial.transform import Rotation
 import mcgicp_jax as mcg
 from mcgicp_jax import datasets
 from mcgicp_jax._local_geometry.observability import agreement
-from mcgicp_jax._pose_solver.covariance import Moments, response_and_scatter
+from mcgicp_jax._pose_solver import covariance
+from mcgicp_jax._pose_solver.covariance import Moments, NoiseSample, discounts_and_radius, response_and_scatter
 from mcgicp_jax._pose_solver.degeneracy import LEAST_BY_GEOMETRY, find_directions
 from mcgicp_jax._pose_solver.sums import Sums
 from mcgicp_jax.extend import symmetric_matrices as cov
@@ -360,6 +361,20 @@ def test_the_bias_of_matching_is_one_more_score():
     moments = Moments(jnp.zeros((6, 4, 4)), bias, root @ root.T, np.int32(10))
     _, scatter = response_and_scatter(moments, jnp.asarray(1.0))
     np.testing.assert_allclose(scatter, 10 / 4 * root @ root.T + np.outer(bias, bias), rtol=1e-5)
+
+
+def test_geometry_and_channels_have_discounts_of_their_own(monkeypatch):
+    """Matches of rough surfaces follow 0.6 of a motion, and those of noisy channels 0.3."""
+    rng = np.random.default_rng(0)
+    squares = rng.normal(size=(6, 100_000)) ** 2
+    sample = NoiseSample(0.4 * squares[0], squares[1:3].mean(axis=0), 0.7 * squares[3:].mean(axis=0), squares[0])
+    discount, _ = discounts_and_radius(sample, 3)
+    np.testing.assert_allclose(discount, [0.4, 0.7], rtol=0.02)
+    information = rng.random((6, 5))
+    trace = information[[0, 3, 5]].sum(axis=0)
+    monkeypatch.setattr(covariance, "observability", lambda _: [information, information / (1 + trace)])
+    shown = covariance._discounted_observability(None, np.array([0.4, 0.7]), ())
+    np.testing.assert_allclose(shown, 0.4 * information + 0.7 * information / (1 + 0.7 * trace), rtol=1e-5)
 
 
 def test_the_covariance_is_a_covariance():
