@@ -164,6 +164,23 @@ def in_frames(pair: Pair, source: np.ndarray, target: np.ndarray) -> Pair:
     return Pair(*clouds, target @ pair.T_target_source @ np.linalg.inv(source))
 
 
+# Metres, about the sensor: a vehicle that it stands on.
+_VEHICLE = box((-0.4, -0.3, -0.6), (0.4, 0.3, -0.1))
+
+
+def on_vehicle(pair: Pair, seed: int, fraction: float) -> Pair:
+    """The same pair, where a fraction of the points are returns from the sensor's own vehicle."""
+    rng = np.random.default_rng(seed)
+
+    def replaced(cloud: mcg.PointCloud) -> mcg.PointCloud:
+        points = np.array(cloud.points)
+        count = round(fraction * len(points))
+        points[:count] = rects(rng, count, _VEHICLE) + NOISE * rng.normal(size=(count, 3))
+        return cloud.replace(points=points)
+
+    return Pair(replaced(pair.source), replaced(pair.target), pair.T_target_source)
+
+
 def stairs(seed: int, count: int = 6000, steps: int = 12, step: float = STEP) -> Pair:
     """Stairs with a period of 0.34 m between two walls, from `step` metres off along them."""
     rng = np.random.default_rng(seed)

@@ -1,4 +1,4 @@
-"""Channels that move with the sensor fit perfectly where it has not moved; they constrain no motion."""
+"""Channels and points that move with the sensor fit perfectly where it has not moved; they constrain no motion."""
 
 import jax
 import jax.numpy as jnp
@@ -7,7 +7,18 @@ import pytest
 
 import mcgicp_jax as mcg
 from mcgicp_jax._local_geometry.sensor_patterns import channels_may_move, explained, without_patterns
-from tests.promise_scenes import CORRIDOR, FLOOR_AND_WALL, MOVING_CHANNELS, in_frames, moved, seen, tiles, translation
+from tests.promise_scenes import (
+    CORRIDOR,
+    FLOOR_AND_WALL,
+    MOVING_CHANNELS,
+    box,
+    in_frames,
+    moved,
+    on_vehicle,
+    seen,
+    tiles,
+    translation,
+)
 from tests.reference import pose
 from tests.scenes import wall
 
@@ -176,3 +187,39 @@ def test_few_points_and_huge_values_explain_nothing():
     few = shares(rng.random((12, 3)), rng.random(12))
     huge = shares(rng.random((500, 3)), 1e37 * rng.random(500).astype(np.float32))
     assert not np.any(few.by_angles > 0.7) and not np.any(huge.by_angles > 0.7)
+
+
+@pytest.mark.parametrize("method", [mcg.GICP(), METHOD])
+@pytest.mark.parametrize("frame", [np.eye(4), ELSEWHERE])
+def test_returns_from_the_own_vehicle_constrain_nothing(method, frame):
+    pair = in_frames(on_vehicle(seen(CORRIDOR, 0, count=2000), 0, 0.05), np.eye(4), frame)
+    source, target = pair.source, pair.target
+    if method is METHOD:
+        # A channel that is nothing but noise.
+        rng = np.random.default_rng(0)
+        source, target = (cloud.replace(channels=rng.normal(size=(2000, 1))) for cloud in (source, target))
+    with pytest.warns(UserWarning, match=r"within 0.\d* m of the origin .* PointCloud.crop"):
+        result = mcg.register(source, target, method, init=frame)
+    assert result.status == mcg.Status.DEGENERATE
+    (direction,) = (each for each in result.unconstrained_directions if not each.constrained_by_channels)
+    assert not direction.is_rotation and abs(direction.axis[0]) > 0.999
+
+
+def test_a_cabinet_holds_the_pose_beside_the_own_vehicle():
+    cabinet = box((1.5, 0.2, 0), (2.3, 1, 2), lid=False)
+    pair = on_vehicle(seen([*CORRIDOR, *cabinet], 0, count=2000), 0, 0.02)
+    result = mcg.register(pair.source, pair.target, mcg.GICP(), init=pair.T_target_source)
+    assert result.status == mcg.Status.CONVERGED
+    assert mcg.metrics.pose_error(result.matrix, pair.T_target_source)[0] < 0.05
+
+
+@pytest.mark.slow
+def test_the_own_vehicle_is_found_out_inside_jit_in_lanes_and_beside_a_prior():
+    pair = on_vehicle(seen(CORRIDOR, 0, count=1000), 0, 0.05)
+    source, target = (mcg.preprocess(cloud, None) for cloud in (pair.source, pair.target))
+    inside = jax.jit(lambda source, target: mcg.register(source, target, mcg.GICP()).status)(source, target)
+    (lane,) = mcg.register_batch([source], [target], mcg.GICP(), search=mcg.DenseSearch())
+    assert inside == lane.status == mcg.Status.DEGENERATE
+    result = mcg.register(source, target, mcg.GICP(), prior=(pair.T_target_source, np.diag([0.02**2] * 6)))
+    assert result.status == mcg.Status.CONVERGED
+    assert mcg.metrics.pose_error(result.matrix, pair.T_target_source)[0] < 0.03

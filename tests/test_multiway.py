@@ -5,10 +5,13 @@ from concurrent.futures import ThreadPoolExecutor
 import jax
 import numpy as np
 import pytest
+from scipy.stats import chi2
 
 import mcgicp_jax as mcg
 from mcgicp_jax import datasets, io, metrics
 from mcgicp_jax.__main__ import main
+from mcgicp_jax._registration.options import Options
+from mcgicp_jax._sequences import loop_closure
 from tests.corridor import corridor
 from tests.graphs import joined
 from tests.reference import logarithm
@@ -330,3 +333,36 @@ def test_the_command_says_that_poses_hang_on_free_directions(tmp_path, capsys):
     text, errors = capsys.readouterr()
     assert "poses:     DEGENERATE" in text and "no pair constrains some directions" in errors
     assert "1.ply: DEGENERATE" in errors and "2.ply: DEGENERATE" in errors and "0.ply" not in errors
+
+
+def test_a_loop_moves_the_last_pose_as_an_optimisation_of_all_would(monkeypatch):
+    """Once round a circle, with edges that know some directions best. The first loop, which is optimised, is vague."""
+    rng, sigma = np.random.default_rng(0), np.array([0.02, 0.002, 0.005, 0.002, 0.001, 0.004])
+    step, mixed = motion((0.6, 0, 0.05, 0, 0, 2 * np.pi / 21)), np.eye(6) + 0.3 * rng.normal(size=(6, 6))
+    loops = {20: (step, 1e-4 * np.eye(6)), 21: (motion((0.2, 0.1, 1.05, 0.01, 0, 0.02)), 400 * mixed @ mixed.T)}
+    clouds = [mcg.preprocess(2 * rng.normal(size=(50, 3))) for _ in range(22)]
+    poses, tries = [], []
+
+    def register_pair(source, target, method, init, options):
+        tries.append(([cloud is target for cloud in clouds].index(True), len(poses), options.min_coarse_distance))
+        return loops.get(len(poses))
+
+    def edge_from(i, j, measured, uncertain=False):
+        return None if measured is None else mcg.Edge(i, j, *measured, uncertain=uncertain)
+
+    monkeypatch.setattr(loop_closure, "register_pair", register_pair)
+    monkeypatch.setattr(loop_closure, "edge_from", edge_from)
+    trajectory = loop_closure.Trajectory(mcg.GICP(), Options())
+    for k, cloud in enumerate(clouds):
+        pose = poses[-1] @ step if poses else np.eye(4)
+        poses.append(trajectory.add(cloud, pose, (step, np.diag(sigma**-2)) if k else None))
+    graph = trajectory.graph()
+    assert np.linalg.norm(poses[-1][:3, 3] - pose[:3, 3]) > 0.1
+    np.testing.assert_allclose(poses[-1], graph.poses[-1], atol=1e-3)
+    # 99 % of χ² with three degrees of freedom, in the direction of the largest deviation.
+    assert {number for _, number, _ in tries} >= {10, 19, 21}
+    for i, number, distance in tries:
+        rows = np.arange(number - i)
+        path = mcg.Edge(rows, rows + 1, *(np.tile(each, (len(rows), 1, 1)) for each in (step, np.diag(sigma**-2))))
+        variance = np.linalg.eigvalsh(mcg.optimize_poses(mcg.PoseGraph(None, path)).covariance[-1, :3, :3])[-1]
+        np.testing.assert_allclose(distance, np.sqrt(chi2.ppf(0.99, 3) * variance), rtol=0.01)

@@ -13,7 +13,8 @@ from scipy.spatial.transform import Rotation
 import mcgicp_jax as mcg
 from mcgicp_jax import datasets
 from mcgicp_jax._local_geometry.observability import agreement
-from mcgicp_jax._pose_solver.covariance import Moments, response_and_scatter
+from mcgicp_jax._pose_solver import covariance
+from mcgicp_jax._pose_solver.covariance import Moments, NoiseSample, discounts_and_radius, response_and_scatter
 from mcgicp_jax._pose_solver.degeneracy import LEAST_BY_GEOMETRY, find_directions
 from mcgicp_jax._pose_solver.sums import Sums
 from mcgicp_jax.extend import symmetric_matrices as cov
@@ -310,9 +311,10 @@ def directions_of_wall(scale, shift):
     return mcg.register(*clouds, mcg.MultiChannelGICP(), **options).directions
 
 
-@pytest.mark.parametrize("scale, shift", [(1, 3), (1e-4, 0), (1e4, 3)])
+@pytest.mark.parametrize("scale, shift", [(1, 6), (1e-4, 3), (1e4, 6)])
 def test_units_and_origin_change_nothing(scale, shift):
-    first, second = directions_of_wall(1, 0), directions_of_wall(scale, shift)
+    """But for an origin, the place of the sensor, within the wall."""
+    first, second = directions_of_wall(1, 3), directions_of_wall(scale, shift)
     np.testing.assert_allclose(first.geometry, second.geometry, atol=5e-3)
     np.testing.assert_allclose(first.channels, second.channels, atol=5e-3)
 
@@ -382,6 +384,20 @@ def test_the_bias_of_matching_is_one_more_score():
     np.testing.assert_allclose(scatter, 10 / 4 * root @ root.T + np.outer(bias, bias), rtol=1e-5)
 
 
+def test_geometry_and_channels_have_discounts_of_their_own(monkeypatch):
+    """Matches of rough surfaces follow 0.6 of a motion, and those of noisy channels 0.3."""
+    rng = np.random.default_rng(0)
+    squares = rng.normal(size=(6, 100_000)) ** 2
+    sample = NoiseSample(0.4 * squares[0], squares[1:3].mean(axis=0), 0.7 * squares[3:].mean(axis=0), squares[0])
+    discount, _ = discounts_and_radius(sample, 3)
+    np.testing.assert_allclose(discount, [0.4, 0.7], rtol=0.02)
+    information = rng.random((6, 5))
+    trace = information[[0, 3, 5]].sum(axis=0)
+    monkeypatch.setattr(covariance, "observability", lambda _: [information, information / (1 + trace)])
+    shown = covariance._discounted_observability(None, np.array([0.4, 0.7]), ())
+    np.testing.assert_allclose(shown, 0.4 * information + 0.7 * information / (1 + 0.7 * trace), rtol=1e-5)
+
+
 def test_the_covariance_is_a_covariance():
     source, target, _ = pair()
     matches = mcg.find_correspondences(source, target, motion(), mcg.GICP(), max_distance=0.5)
@@ -424,7 +440,7 @@ def test_what_nothing_holds_is_not_known(flat):
     points = np.asarray(source.points)[: len(source)]
     radius = np.sqrt(np.mean(np.sum((points - points.mean(axis=0)) ** 2, axis=1)))
     # Ten radii along the wall, and ten radians about its normal.
-    np.testing.assert_allclose(result.deviations[[0, 1, 5]], [10 * radius, 10 * radius, 10], rtol=0.01)
+    np.testing.assert_allclose(result.deviations[[0, 1, 5]], [10 * radius, 10 * radius, 10], rtol=0.02)
     for direction in result.unconstrained_directions:
         deviation = np.sqrt(direction.twist @ np.linalg.pinv(np.asarray(result.information)) @ direction.twist)
         assert np.isfinite(deviation)

@@ -51,7 +51,7 @@ class Given(AbstractTerm):
 
 
 # With data as arguments, so that all tests share a program.
-measure = jax.jit(lambda matched, term: sums_of(Motion(jnp.eye(3), jnp.zeros(3)), matched, (term,)))
+measure = jax.jit(lambda matched, term: sums_of(Motion(jnp.eye(3), jnp.zeros(3)), matched, (term,), 0.0))
 update_of = jax.jit(_solve.solve_update)
 
 
@@ -113,7 +113,7 @@ def test_too_few_matches_go_before_convergence(before, count):
     number = measured.center.dtype.type
     yes = np.bool_(True)
     settings = Settings(
-        *map(number, (0.5, 0.5)), np.int32(1), *map(number, [1e-3] * 4), np.int32(9), yes, yes, number(0)
+        *map(number, (0.5, 0.5)), np.int32(1), *map(number, [1e-3] * 4), np.int32(9), yes, yes, *map(number, (0, 0))
     )
     start = jaxlie.SE3(jnp.array([1, 0, 0, 0, 0, 0, 0], number))
     still = jnp.zeros(6, number), jnp.zeros((), number)

@@ -41,8 +41,9 @@ class Sums(NamedTuple):
         num_matched: number of source points with a match.
         force: G.
         stiffness: Q.
-        mass: Σ w h hᵀ; None where observability is not known.
-        observability: Σ w O ⊗ h hᵀ by the shape of the surfaces; None where it is not known.
+        mass: Σ w h hᵀ without points near the sensor, as the following; None where observability is not known.
+        observability: Σ w O ⊗ h hᵀ by the shape of the surfaces, less that of points near the sensor; None where it is
+            not known.
         channel_observability: the same by the channels; None also where they are not used.
         agreement: the same by slopes of the channels that agree in both clouds; `channel_observability` where the
             slopes are not known, as before the last step.
@@ -81,11 +82,16 @@ class Sums(NamedTuple):
         return jnp.sqrt(self.square_distance / self.num_matched)
 
 
-def sums_of(motion: Motion, matched: Matched, terms: tuple[AbstractTerm, ...]) -> Sums:
+def sums_of(motion: Motion, matched: Matched, terms: tuple[AbstractTerm, ...], near: Float[AnyScalar, ""]) -> Sums:
     """Compute the sums at a pose in one pass over the correspondences, the only part of a step that touches points.
 
     All sums but those for the centre are rows of one product with h hᵀ: sums of their own would be programs of several
     loops each, which evaluate the same expressions again.
+
+    Args:
+        near: metres; source points within this distance of the sensor, the origin of their frame, may be the sensor's
+            own vehicle, which moves with it. By shape they count against a motion, which they would hold wherever
+            others say less; their channels do not count.
     """
     posed, found, counts = linearize_at(motion, matched, terms)
     mask = jnp.asarray(matched.valid).astype(posed.moved.dtype)
@@ -108,7 +114,12 @@ def sums_of(motion: Motion, matched: Matched, terms: tuple[AbstractTerm, ...]) -
         ),
     ]
     if shown:
-        rows += [found.weight[None], *(found.weight * each for each in shown)]
+        square = jnp.sum(jnp.square(jnp.asarray(posed.source.points)), axis=1)
+        geometry, *channels = shown
+        far = square >= near**2
+        evidence = jnp.where(far, found.weight, 0)
+        rows += [evidence[None], jnp.where(far, found.weight, -found.weight) * geometry]
+        rows += [evidence * each for each in channels]
     stiffness, force, numbers, *others = jnp.split(
         moments_about(jnp.concatenate(rows), h), np.cumsum([len(row) for row in rows])[:-1]
     )

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
+from dataclasses import replace
+from typing import Any, cast
 
 import jax
 import numpy as np
@@ -13,6 +14,7 @@ from mcgicp_jax._compute.programs import quickly_compiled
 from mcgicp_jax._compute.row_functions import RowFunction
 from mcgicp_jax._compute.tables import Packed
 from mcgicp_jax._pose_solver.covariance import Scores, scores_of
+from mcgicp_jax._pose_solver.degeneracy import Directions
 from mcgicp_jax._pose_solver.matched import Matches, Motion, inputs_of, of_matches
 from mcgicp_jax._pose_solver.pose_measurements import PoseMeasurements, Prior
 from mcgicp_jax._pose_solver.sums import Sums, combine, sums_of
@@ -101,13 +103,21 @@ class HostExecutor(AbstractExecutor):
         # Packed until the loop ends: to pass and to return dozens of arrays takes longer than to use them. Not awaited:
         # `update` is dispatched while they are computed, which saves half of the hand-overs between threads.
         with_slopes = bool(last) and self.problem.source.observes_channels
-        applied = self._over(sums_of, motion, matches, (terms,), with_slopes)
+        applied = self._over(sums_of, motion, matches, (terms, self.problem.settings.near), with_slopes)
         parts: list[Packed[Sums]] = applied.sums(self._num_threads if with_slopes else 1)
         return parts[0] if len(parts) == 1 else _combined(parts)
 
     def update(self, state: State, sums: Packed[Sums]) -> State:
         updated = _update(state[:5], sums, self._settings, self.problem.measurements, self.problem.fixed)
         return Packed(np.asarray(updated.table), updated.layout).tree
+
+    def directions_by_all_points(self, loop: LoopResult) -> Directions:
+        """The directions at the end of a loop, if points near the sensor counted as all others do."""
+        settings = self.problem.settings
+        settings = settings._replace(near=np.zeros_like(settings.near))
+        other = HostExecutor(replace(self.problem, settings=settings), self._index_of, self._num_threads)
+        sums = other.sums(Motion.of(loop.state.pose.wxyz_xyz), loop.matches, loop.terms, True)
+        return cast(Directions, other.update(loop.state, sums).directions)
 
     def scores(self, motion: Motion, matches: Matches, *arguments: Any) -> Scores:
         applied = self._over(scores_of, motion, matches, arguments, self.problem.source.observed)

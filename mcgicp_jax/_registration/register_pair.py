@@ -18,7 +18,7 @@ from mcgicp_jax._clouds.voxel_size import NUM_NEIGHBORS, VoxelSize, voxels_and_g
 from mcgicp_jax._compute.cache import Lazy
 from mcgicp_jax._compute.concrete import AnyArray, constant, is_concrete, numpy_for, outside_trace
 from mcgicp_jax._compute.linear_maps import primal
-from mcgicp_jax._compute.messages import messages_named
+from mcgicp_jax._compute.messages import messages_named, warn
 from mcgicp_jax._compute.threads import in_new_thread, with_settings_of_package
 from mcgicp_jax._local_geometry.cloud_statistics import (
     warn_of_exposure,
@@ -34,6 +34,7 @@ from mcgicp_jax._methods.icp import GICP, PointToPoint
 from mcgicp_jax._methods.ndt import voxel_gaussians
 from mcgicp_jax._methods.surfaces import surface_pair
 from mcgicp_jax._pose_solver.covariance import Moments
+from mcgicp_jax._pose_solver.degeneracy import Directions
 from mcgicp_jax._pose_solver.matched import Matches
 from mcgicp_jax._registration.assessment import Assessment, assessment_of, moments_of, registration_of
 from mcgicp_jax._registration.correspondences import find_correspondences, index_of
@@ -189,6 +190,8 @@ def run_pair(given: Inputs, init: Pose | None, options: Options, traced: bool = 
             warn_of_patterns(run.inputs.source)
         warn_of_exposure(inputs.source, inputs.target, lambda: _nearest_points(run, search))
     if not measures:
+        if not traced and run.loop.state.status == Status.DEGENERATE and run.loop.state.directions is not None:
+            _warn_of_near_points(run)
         return run
     # Again from its pose, with tie points and prior weighed by its covariance.
     fusion = fusion_of(run.loop.state, run.moments(), run.inputs.tie_points, run.inputs.prior, traced)
@@ -290,6 +293,18 @@ def problem_of(
         widens_kernels=given.robust is not None and matches is None,
     )
     return problem, given._replace(method=pair.method, source_rows=rows)
+
+
+def _warn_of_near_points(run: Run) -> None:
+    """Warn of a pose that is DEGENERATE since points near the sensor count as no evidence."""
+    before = cast(Directions, run.loop.state.directions)
+    after = cast(HostExecutor, run.executor).directions_by_all_points(run.loop)
+    if after.constrained.sum() > before.constrained.sum():
+        warn(
+            f"source: little but points within {float(run.problem.settings.near):.2g} m of the origin constrains the "
+            "pose in some direction. They may be the sensor's own vehicle, which moves with it, so the status is "
+            "DEGENERATE; leave them out by PointCloud.crop, or pass a prior"
+        )
 
 
 def rows_to_match(source: PointCloud, options: Options) -> Int[AnyArray, "n"] | None:

@@ -32,8 +32,9 @@ class Status(enum.IntEnum):
         DEGENERATE: the last update was below both tolerances, but at least one direction of motion is unconstrained
             (see `RegistrationResult.unconstrained_directions`). With `hold_unconstrained`, `register` keeps the initial
             pose along it. Tie points or a prior constrain a direction if its standard deviation is then below
-            the radius of the clouds. The derivative of the pose is that within the constrained directions, and 0 along
-            the others.
+            the radius of the clouds. Source points within a fifth of their median distance from the sensor, the origin
+            of their frame, constrain nothing: they may be the sensor's own vehicle. The derivative of the pose is that
+            within the constrained directions, and 0 along the others.
         NON_FINITE: the pose or the sums overflowed or became NaN.
         INVALID_INPUT: `register` would raise a `ValueError` for this pair. Only in batches; the pose is NaN.
         WORKER_FAILED: two workers in turn failed with this pair. Only in batches; the pose is NaN.

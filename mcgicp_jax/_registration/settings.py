@@ -14,6 +14,7 @@ from mcgicp_jax._compute.cache import cached_with_cloud
 from mcgicp_jax._compute.concrete import AnyArray, AnyScalar, constant, is_concrete, numpy_for
 from mcgicp_jax._local_geometry.cloud_statistics import grid_spacing, point_spacing
 from mcgicp_jax._local_geometry.local_geometry import cell_edge
+from mcgicp_jax._math.statistics import median, sampled_rows
 from mcgicp_jax._methods.base import AbstractMethod
 from mcgicp_jax._registration.options import ROTATION_TOLERANCE, Options
 
@@ -31,6 +32,10 @@ _TOLERANCE_IN_SPACINGS = 0.005
 # Tolerances of the coarse phase, as a multiple of the tolerances or of their defaults, whichever is larger. With
 # smaller ones, the small cycles of nearest-neighbour matching would keep the coarse phase from ending.
 _COARSE_TOLERANCE = 10.0
+# Distance from the sensor, in median distances of the source's points, within which they may be the sensor's own
+# vehicle. A vehicle of 0.8 × 0.6 × 0.6 m extends to 0.17 in a corridor, and a pole 1 m from the sensor is at 0.22. Of
+# KITTI 1.7 % of the voxels are nearer, of 7-Scenes and tables none: what constrains rooms and streets is further away.
+_NEAR = 0.2
 
 
 class Settings(NamedTuple):
@@ -46,6 +51,7 @@ class Settings(NamedTuple):
         hold_unconstrained: whether the pose is kept fixed along unconstrained directions.
         channels_may_move: whether the channels may move with the sensor, so that a pose that they hold is UNVERIFIED.
         rounding: variances of the coordinates of source and target, metres², that are rounded to coarse steps.
+        near: source points within this distance of the sensor, metres, constrain no direction of motion.
     """
 
     max_distance: Float[AnyArray, "*batch"]
@@ -59,6 +65,7 @@ class Settings(NamedTuple):
     hold_unconstrained: Bool[AnyArray, "*batch"]
     channels_may_move: Bool[AnyArray, "*batch"]
     rounding: Float[AnyArray, "*batch 2 3"]
+    near: Float[AnyArray, "*batch"]
 
     def distance(self, status: Int[AnyScalar, ""]) -> Float[AnyScalar, ""]:
         """Maximum correspondence distance at this status, metres."""
@@ -93,6 +100,15 @@ def default_distances(spacing: Any, target: PointCloud) -> tuple[Any, Any]:
     # Cells have the spacing of their grid.
     between = spacing if target.covariances is not None else constant(grid_spacing(target))
     return _COARSE_SPACINGS * numpy_for(spacing, between).maximum(spacing, between), _FINE_SPACINGS * spacing
+
+
+def _median_range(source: PointCloud) -> Float[AnyScalar, ""]:
+    """Median distance of the points from the sensor, the origin of their frame, metres."""
+    rows, counts = sampled_rows(source.valid)
+    xp = numpy_for(source, counts)
+    # Squares of huge coordinates overflow.
+    with np.errstate(over="ignore"):
+        return median(xp.where(counts, xp.linalg.norm(xp.asarray(source.points)[rows], axis=1), np.nan))
 
 
 def settings_for(
@@ -139,4 +155,5 @@ def settings_for(
         channels_may_move=number(channels_may_move, bool),
         # An error that is uniform over a step. It does not average out: points on lattices match the lattice.
         rounding=number(numpy_for(steps).stack(steps) ** 2 / 12, dtype),
+        near=number(_NEAR * _median_range(constant(source)), dtype),
     )

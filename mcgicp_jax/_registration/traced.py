@@ -98,7 +98,10 @@ class TracedExecutor(AbstractExecutor):
         return of_matches(function, with_noise)(numbers, *map(whole, inputs))
 
     def sums(self, motion: Motion, matches: Matches, terms: tuple[AbstractTerm, ...], last: Bool[Array, ""]) -> Sums:
-        sums = self.rows(sums_of, motion, matches, terms, with_noise=self.problem.source.observes_channels)
+        problem = self.problem
+        sums = self.rows(
+            sums_of, motion, matches, terms, problem.settings.near, with_noise=problem.source.observes_channels
+        )
         if sums.channel_observability is None or sums.agreement is None or sums.surplus is None:
             return sums
         agreement = jnp.where(last, sums.agreement, sums.channel_observability)

@@ -30,8 +30,10 @@ from tests.promise_scenes import (
     STEP,
     Channel,
     Pair,
+    box,
     in_frames,
     office,
+    on_vehicle,
     seen,
     stairs,
     tiles,
@@ -181,7 +183,39 @@ def evidence_cases() -> Iterator[Case]:
         yield Case("evidence", name, partial(nth, pairs))
 
 
-GROUPS: dict[str, Callable[[], Iterator[Case]]] = {"starts": start_cases, "evidence": evidence_cases}
+def vehicle_cases() -> Iterator[Case]:
+    """Returns from the sensor's own vehicle, where nothing else constrains a direction; and what must stay right."""
+    frames = {"": np.eye(4), ", target moved": _FRAME}
+    cabinet = box((1.5, 0.2, 0), (2.3, 1, 2), lid=False)
+
+    def run(scene: Callable[[int], Pair], fraction: float, method: mcg.AbstractMethod, frame: Any, seed: int) -> Any:
+        pair = in_frames(on_vehicle(scene(seed), seed, fraction), np.eye(4), frame)
+        if method.uses_channels:
+            # Channels that are nothing but noise.
+            rng = np.random.default_rng(seed)
+            clouds = (cloud.replace(channels=rng.normal(size=(cloud.valid.size, 1))) for cloud in pair[:2])
+            pair = Pair(*clouds, pair.T_target_source)
+        return registered(pair, method, init=frame)
+
+    methods = mcg.GICP(), mcg.PointToPlane(), mcg.MultiChannelGICP()
+    own = itertools.product(("corridor", "floor and wall"), (0.01, 0.02, 0.05, 0.1), methods, frames.items())
+    for name, fraction, method, (where, frame) in own:
+        words = f"{name}, {fraction:.0%} own vehicle, {type(method).__name__}{where}"
+        yield Case("vehicle", words, partial(run, partial(seen, SCENES[name]), fraction, method, frame))
+    for name, scene in {
+        "room": room,
+        "corridor with a cabinet": partial(seen, [*SCENES["corridor"], *cabinet]),
+    }.items():
+        for fraction in (0.0, 0.02):
+            words = f"{name}, {fraction:.0%} own vehicle"
+            yield Case("vehicle", words, partial(run, scene, fraction, mcg.GICP(), np.eye(4)))
+
+
+GROUPS: dict[str, Callable[[], Iterator[Case]]] = {
+    "starts": start_cases,
+    "evidence": evidence_cases,
+    "vehicle": vehicle_cases,
+}
 
 
 def main() -> None:
