@@ -53,17 +53,20 @@ _NUM_NEIGHBORS = 20
 # leaves a direction of motion unconstrained, and smallest number of inliers: from the development half of
 # `tests/benchmarks/global_pose_verdicts`.
 _LEAST, _LEAST_UNCONSTRAINED, _MIN_INLIERS = 0.21, 0.7, 10
-# With fewer voxels than this, a success needs more, by the power 3/2 of their number. Where walls coincide at a wrong
-# pose, 15 to 40 matches are inliers by chance, however few there are, and furniture is no larger than a neighbourhood
-# of a sparse cloud. On the development half no wrong pose is accepted with powers of 1.5 to 2 and 3,000 to 4,000
-# voxels; larger ones accept fewer right poses.
-_DENSE, _SPARSE_POWER = 3000, 1.5
+# With fewer voxels than each of these, a success needs more, by the power 3/2 of their number. Where walls coincide at
+# a wrong pose, 15 to 60 matches are inliers by chance, however few there are, and furniture is no larger than a
+# neighbourhood of a sparse cloud. 3,000: on the development half no wrong pose is accepted with powers of 1.5 to 2 and
+# 3,000 to 4,000 voxels; larger ones accept fewer right poses. 1,400: in 900 to 990 voxels of a room whose furniture is
+# nearly the same after half a turn, that pose reaches 1.7 times what else suffices, with two to five times the inliers
+# of the right pose, which is then no rival.
+_SPARSE, _SPARSE_POWER = np.array([3000, 1400]), 1.5
 # Smallest fractions of the best pose's inliers, overlap and (a/m)² with which another pose is a rival, which makes the
-# result ambiguous; with more support than the best pose, any overlap. Scans of a road reach 0.75 of the inliers with
-# 0.83 of the overlap at another place along it. Parts of a furnished room reach 0.5 to 1.9 of the inliers with up to
-# twice the overlap after half a turn, but 0.3 to 0.75 of (a/m)²; the two poses of halls that are the same after half a
-# turn, 0.86 to 1.2.
-_RIVAL_INLIERS, _RIVAL_OVERLAP, _RIVAL_AGREEMENT = 0.5, 0.9, 0.8
+# result ambiguous; and of its support, with which any inliers and overlap do. Scans of a road reach 0.75 of the inliers
+# with 0.83 of the overlap at another place along it. Parts of a furnished room reach 0.5 to 1.9 of the inliers with up
+# to twice the overlap after half a turn, but 0.3 to 0.75 of (a/m)²; the two poses of halls that are the same after half
+# a turn, 0.86 to 1.2. Where furniture is nearly the same after it, the right pose had 0.4 of the inliers and 0.45 of
+# the overlap of the wrong one, but 1.7 times its (a/m)² and the same support.
+_RIVAL_INLIERS, _RIVAL_OVERLAP, _RIVAL_AGREEMENT, _RIVAL_SUPPORT = 0.5, 0.9, 0.8, 0.9
 
 
 @dataclass(frozen=True, eq=False)
@@ -91,10 +94,10 @@ class Candidate:
 
     def rivals(self, best: Candidate) -> bool:
         """Whether this pose is about as good as the best one."""
-        return (
-            self.num_inliers >= _RIVAL_INLIERS * best.num_inliers
-            and self.agreement >= _RIVAL_AGREEMENT * best.agreement
-            and (self.overlap >= _RIVAL_OVERLAP * best.overlap or self.support > best.support)
+        as_many = self.num_inliers >= _RIVAL_INLIERS * best.num_inliers
+        as_much = as_many and self.overlap >= _RIVAL_OVERLAP * best.overlap
+        return self.agreement >= _RIVAL_AGREEMENT * best.agreement and (
+            as_much or self.support >= _RIVAL_SUPPORT * best.support
         )
 
 
@@ -114,9 +117,10 @@ class GlobalPoseResult:
         support: i/√n (a/m)² of the best pose, for i inliers of the n matches within the overlap; a, the fraction of
             normals that agree within 30°; and m, at least 1, the 90 % quantile of the distances along the normals, in
             thicknesses of the neighbourhoods. a and m weigh all directions of surfaces equally. Divided by what wrong
-            poses do not reach: 0.21; 0.21 (3000 / N)^1.5 for N < 3000 voxels of the smaller cloud, which show little
-            but walls; and at least 0.7 where the shape of the clouds leaves a direction of motion unconstrained, as on
-            a plane or in a corridor, so that surfaces coincide at wrong poses, too.
+            poses do not reach: 0.21; (3000 / N)^1.5 times that for N < 3000 voxels of the smaller cloud, which show
+            little but walls, and (1400 / N)^1.5 times that for N < 1400; and at least 0.7 where the shape of the clouds
+            leaves a direction of motion unconstrained, as on a plane or in a corridor, so that surfaces coincide at
+            wrong poses, too.
         runner_up: the second-best pose that differs from the best one by more than five voxels; one that is about as
             good, if there is any. None if no other pose was verified: all had less than half the inliers.
         voxel_size: metres; edge of the voxels for which features are computed.
@@ -289,7 +293,7 @@ class _Scene(NamedTuple):
         agreement = (same / max(misfit, 1.0)) ** 2
         num_voxels = min(len(cloud.points) for cloud in (self.source, self.target))
         support = inliers / np.sqrt(max(self.is_near(matrix, matched).sum(), 1)) * agreement
-        least = _LEAST * max(_DENSE / num_voxels, 1.0) ** _SPARSE_POWER
+        least = _LEAST * float(np.prod(np.maximum(_SPARSE / num_voxels, 1))) ** _SPARSE_POWER
         if not constrained:
             least = max(least, _LEAST_UNCONSTRAINED)
         overlap = float(np.mean(self.is_near(matrix, self.source.points)))

@@ -177,7 +177,7 @@ def overlapping() -> Iterator[Labelled]:
 
 def offices() -> Iterator[Labelled]:
     """Parts of furnished rooms with few points, whose walls coincide after half a turn, too."""
-    for seed, count, common in itertools.product((*range(6), *range(100, 106)), OFFICE_POINTS, (0.8, 0.67, 0.5)):
+    for seed, count, common in itertools.product((*range(6), *range(100, 106), 6), OFFICE_POINTS, (0.8, 0.67, 0.5)):
         pair = office(seed, count, common)
         frames = Frame(pair.source, pair.T_target_source), Frame(pair.target, np.eye(4))
         yield Labelled(f"office, {count:>6,} points", seed >= 100, *frames, False)
