@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any, Literal, Never
+from typing import TYPE_CHECKING, Any, Literal, Never, TypeAlias
 
 import numpy as np
 from jax.typing import ArrayLike
@@ -23,6 +23,12 @@ from mcgicp_jax._registration.register_pair import register_pair
 from mcgicp_jax._registration.result import LEAST_OVERLAP, USABLE, RegistrationResult, Status, verified
 from mcgicp_jax._registration.tie_points_and_prior import GivenPrior, GivenTiePoints
 from mcgicp_jax._search.base import AbstractSearch
+
+# Misspelt options, for a message that names those that exist; type checkers refuse them.
+if TYPE_CHECKING:
+    Unknown: TypeAlias = Never
+else:
+    Unknown = Any
 
 
 def register(
@@ -44,7 +50,7 @@ def register(
     soft_matches: bool | None = Options.soft_matches,
     tie_points: GivenTiePoints | None = None,
     prior: GivenPrior | None = None,
-    **unknown: Never,
+    **unknown: Unknown,
 ) -> RegistrationResult:
     """Register two clouds: find matches at the current pose, update the pose, and repeat until it converges.
 

@@ -278,7 +278,7 @@ def _add_ellipses(
     angles = np.degrees(np.arctan2(vectors[:, 1, 1], vectors[:, 0, 1]))
     ellipses = drawing.plotting("matplotlib.collections").EllipseCollection
     # Black lines alone would hide on dark surfaces.
-    for color, width in (("white", 3.6), ("black", 1.2)):
+    for color, width in (("white", 2.4), ("black", 1.2)):
         style = {"units": "xy", "facecolors": "none", "edgecolors": color, "linewidths": width}
         panel.add_collection(ellipses(*lengths.T[::-1], angles, offsets=offsets, transOffset=panel.transData, **style))
 
