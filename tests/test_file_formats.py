@@ -529,6 +529,18 @@ def test_npy_of_others(tmp_path, array):
     np.testing.assert_array_equal(np.column_stack([cloud.points, cloud.channels]), array)
 
 
+def test_transposed_npy_is_refused(tmp_path):
+    np.save(tmp_path / "c.npy", np.ones((4, 100)))
+    with pytest.raises(ValueError, match=r"got \(4, 100\); transpose it"):
+        io.read(tmp_path / "c.npy")
+
+
+def test_text_in_utf_16(tmp_path):
+    (tmp_path / "c.csv").write_text("x,y,z,intensity\n1,2,3,4\n", encoding="utf-16")
+    cloud = io.read(tmp_path / "c.csv")
+    assert is_cloud(tmp_path / "c.csv") and cloud.channel_names == INTENSITY and cloud.channels == 4
+
+
 def test_npy_of_named_columns(tmp_path):
     rows = structured(**xyz(), intensity=np.arange(N), ring=np.arange(N))
     np.save(tmp_path / "c.npy", rows)
@@ -542,6 +554,7 @@ def test_npy_of_named_columns(tmp_path):
     [
         ("1 2 3\n4 5 6\n", (), np.empty((2, 0))),
         ("1,2,3,.5\n4, 5, 6, .6", ("channel_0",), [[0.5], [0.6]]),
+        ("X [m];Y [m];Z (m);Intensity [0-255];time [s]\n1;2;3;8;0\n4;5;6;9;0\n", INTENSITY, [[8], [9]]),
         ("\ufeffX;Y;Z;i;time\n1;2;3;8;0\n4;5;6;9;0\n", INTENSITY, [[8], [9]]),
         ("//X Y Z R G B\n1 2 3 0 51 255\n4 5 6 255 0 0\n", RGB, [[0, 0.2, 1], [1, 0, 0]]),
         ("# hand-made\n\n# x y z red green blue\n1 2 3 0 65535 0\n4 5 6 1 0 0\n", RGB, [[0, 1, 0], [1 / 65535, 0, 0]]),

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 import mcgicp_jax as mcg
+from mcgicp_jax._local_geometry.sensor_patterns import without_constant_part
 from mcgicp_jax._pose_solver.matched import Matched, adapted, sample_of_term
 from mcgicp_jax._terms.photometric import Photometric, Residuals
 from mcgicp_jax.extend import AbstractTerm, Mahalanobis
@@ -321,6 +322,35 @@ def test_constant_parts_do_not_set_the_scale():
     assert result.status == mcg.Status.CONVERGED
     shift = (result.matrix - truth)[:3] @ np.append(result.directions.center, 1)
     assert (np.abs(shift) < 4 * result.deviations[:3]).all() and (result.deviations[:3] < 0.02).all()
+
+
+def seen_by_a_camera(frame, share, shape):
+    """A share of the points is black, since they lie outside of the image, a disc or a half."""
+    angles = frame.cloud.points[:, :2] / frame.cloud.points[:, 2:]
+    middle = angles - np.median(angles, axis=0)
+    place = np.hypot(*middle.T) if shape == "disc" else middle[:, 0]
+    outside = place > np.quantile(place, 1 - share)
+    return mcg.PointCloud(frame.cloud.points, np.where(outside[:, None], 0, frame.cloud.channels))
+
+
+@pytest.mark.parametrize(("share", "shape"), [(0.6, "disc"), (0.75, "disc"), (0.6, "half")])
+def test_the_edge_of_an_image_moves_with_the_camera(share, shape):
+    """It held the pose of this wall where the camera was."""
+    frames = mcg.datasets.poster_wall(2, seed=1)
+    truth = np.linalg.inv(frames[0].pose) @ frames[1].pose
+    target, source = (seen_by_a_camera(frame, share, shape) for frame in frames)
+    with pytest.warns(UserWarning, match="as outside of an image"):
+        result = mcg.register(source, target, PHOTOMETRIC)
+    assert result.converged and mcg.metrics.pose_error(result.matrix, truth, at=source.points.mean(axis=0))[0] < 3e-3
+
+
+def test_only_values_that_lie_together_are_no_texture():
+    """Posters of two levels, of which one is that of most points, remain."""
+    cloud = mcg.datasets.poster_wall(1, seed=1)[0].cloud
+    red = cloud.channels[:, :1]
+    for share in (0.4, 0.6, 0.9):
+        levels = mcg.preprocess(mcg.PointCloud(cloud.points, red > np.quantile(red, share)), None)
+        assert without_constant_part(levels) is levels
 
 
 def test_gain_and_offset_are_estimated_with_the_pose():

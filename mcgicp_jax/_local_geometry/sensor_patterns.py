@@ -31,6 +31,12 @@ from mcgicp_jax._math.statistics import median, sampled_rows
 _NO_TEXTURE = 0.7
 # Share by angles above which a channel is left out: distance, elevation, azimuth and time have at least 0.96.
 _LEFT_OUT = 0.9
+# Share of the variance above which equal values are a part such as that outside of an image: of views cut to a disc, a
+# box or a half and of the camera in KITTI's scans they have 0.73 to 0.98 (half of the points or more), of posters,
+# streets and intensities below a quantile at most 0.38.
+_ONE_PART = 0.55
+# Neighbours of the part that count as its rim: a point itself and those around it.
+_RIM = 7
 # Bins of range, elevation and azimuth, of equally many points, and least number of points of each, half of which
 # predict. With 64 and 256 bins, patterns and textures are as far apart, but narrow beams less so with 64.
 _BINS, _PER_BIN = 128, 16
@@ -108,6 +114,52 @@ def _blank(cloud: PointCloud, left_out: Bool[AnyArray, "C"]) -> PointCloud:
 
 # The same copy each time, with all that is cached of it.
 _cached_blank = cached_with_cloud(_blank)
+
+
+def without_constant_part(cloud: PointCloud) -> PointCloud:
+    """The cloud without the channels that more than half of its points have in common, where these points lie together,
+    such as black outside of an image: the edge of this part may move with the sensor."""
+    if not cloud.channels.shape[1]:
+        return cloud
+    constant_part = _cached_constant_part if is_concrete(primal(cloud)) else _constant_part
+    part = constant_part(primal(cloud))
+    if is_concrete(part) and not part.any():
+        return cloud
+    if is_concrete(part):
+        names = [name for name, each in zip(cloud.channel_names, part.T, strict=True) if each.any()]
+        warn(
+            f"channels {', '.join(names)}: {part.any(axis=1).sum()} of {len(part)} points lie together and have one "
+            "value, as outside of an image; it counts as missing. Mark missing channels by channel_valid"
+        )
+    return _cached_missing(cloud, part) if is_concrete(cloud, part) else _missing(cloud, part)
+
+
+def _constant_part(cloud: PointCloud) -> Bool[AnyArray, "N C"]:
+    xp = numpy_for(cloud)
+    channels, rows = xp.asarray(cloud.channels), sampled_rows(xp.asarray(cloud.valid))
+    ordered = xp.sort(xp.where(rows[1][:, None], channels[rows[0]], xp.inf), axis=0)
+    middle = xp.take_along_axis(ordered, xp.full((1, channels.shape[1]), xp.sum(rows[1]) // 2), axis=0)
+    part = channels == middle
+    share = xp.sum(part[rows[0]] & rows[1][:, None], axis=0) / xp.maximum(xp.sum(rows[1]), 1)
+    parts = cloud.replace_rows(channels=part.astype(channels.dtype))
+    constant_channels = (share > 0.5) & (share < 1) & (xp.maximum(*_measured(parts)) > _ONE_PART)
+    together = (part | ~constant_channels).all(axis=1) & constant_channels.any()
+    if cloud.deferred_neighbors is not None and (xp is not np or together.any()):
+        # Voxels across the edge hold means of both sides.
+        near = xp.asarray(cloud.neighbors)[:, :_RIM]
+        together = together | (together[near] & (near >= 0)).any(axis=1)
+    return constant_channels & together[:, None]
+
+
+_cached_constant_part = cached_with_cloud(_constant_part)
+
+
+def _missing(cloud: PointCloud, part: Bool[AnyArray, "N C"]) -> PointCloud:
+    present = ~part if cloud.channel_valid is None else cloud.channel_valid & ~part
+    return cloud.replace_rows(channel_valid=present)
+
+
+_cached_missing = cached_with_cloud(_missing)
 
 
 def explained(cloud: PointCloud) -> Explained:

@@ -26,11 +26,17 @@ from mcgicp_jax._local_geometry.cloud_statistics import (
     with_channels_matched,
 )
 from mcgicp_jax._local_geometry.neighborhoods import check_neighbors
-from mcgicp_jax._local_geometry.sensor_patterns import channels_may_move, warn_of_patterns, without_patterns
+from mcgicp_jax._local_geometry.sensor_patterns import (
+    channels_may_move,
+    warn_of_patterns,
+    without_constant_part,
+    without_patterns,
+)
 from mcgicp_jax._math.poses import Pose, se3_from_matrix
 from mcgicp_jax._math.statistics import spread_rows
 from mcgicp_jax._methods.base import AbstractMethod
 from mcgicp_jax._methods.icp import GICP, PointToPoint
+from mcgicp_jax._methods.multichannel_gicp import MultiChannelGICP
 from mcgicp_jax._methods.ndt import voxel_gaussians
 from mcgicp_jax._methods.surfaces import surface_pair
 from mcgicp_jax._pose_solver.covariance import Moments
@@ -146,6 +152,8 @@ def prepared(
         warn_of_hard_matches(method, source, target)
     if method.uses_channels:
         source, target = without_patterns(source, target)
+    if isinstance(method, MultiChannelGICP) and method.photometric:
+        source, target = without_constant_part(source), without_constant_part(target)
     if options.voxel_sizes and not (source.covariances is None and target.covariances is None):
         raise ValueError("voxel_sizes: expected none for clouds with covariances, which cannot be averaged in voxels")
     if options.voxel_sizes and method.needs_covariances and not is_concrete(source, target):

@@ -65,6 +65,8 @@ def read_npy(file: BinaryIO, size: int) -> PointCloud:
         return PointCloud(array)
     if array.ndim != 2 or array.shape[1] < 3:
         raise ValueError(f"expected an array of shape (N, 3 + C), got {array.shape}")
+    if array.shape[1] > 10 * array.shape[0]:
+        raise ValueError(f"expected an array of shape (N, 3 + C), got {array.shape}; transpose it")
     return PointCloud(array[:, :3], array[:, 3:])
 
 

@@ -157,7 +157,8 @@ def read(path: str | os.PathLike[str], *, columns: int | None = None) -> PointCl
             # The libraries raise arbitrary exceptions; lazrs raises Rust's PanicException, a BaseException.
             if not isinstance(error, Exception) and type(error).__name__ != "PanicException":
                 raise
-            raise ValueError(f"{path}: cannot be read as {path.suffix.lower()}: {reason_of(error)}") from error
+            suffix = "".join(path.suffixes[-2:] if path.suffix.lower() == ".gz" else [path.suffix]).lower()
+            raise ValueError(f"{path}: cannot be read as {suffix}: {reason_of(error)}") from error
     return cloud
 
 

@@ -41,8 +41,10 @@ def read_text(file: BinaryIO, size: int) -> PointCloud:
 
 
 def _as_text(file: BinaryIO) -> io.TextIOWrapper:
-    """Comments may have any encoding."""
-    return io.TextIOWrapper(file, "utf-8-sig", errors="replace")
+    """Comments may have any encoding. UTF-16, as PowerShell writes it, has a mark."""
+    marked = file.read(2) in (b"\xff\xfe", b"\xfe\xff")
+    file.seek(0)
+    return io.TextIOWrapper(file, "utf-16" if marked else "utf-8-sig", errors="replace")
 
 
 def _delimiter(line: str) -> str | None:
@@ -62,8 +64,8 @@ def is_text_cloud(file: BinaryIO) -> bool:
 def _text_start(text: io.TextIOWrapper) -> tuple[list[str], str, list[str]]:
     """The column names, if their number is that of the columns, the first line of numbers, and its cells.
 
-    A comment may have names after a colon. A name that is missing, first, is that of the index of pandas or R. A first
-    line with one number is that of the points.
+    A comment may have names after a colon. Units in brackets are no part of a name. A name that is missing, first, is
+    that of the index of pandas or R. A first line with one number is that of the points.
     """
     names: list[str] = []
     commented = counted = False
@@ -82,6 +84,8 @@ def _text_start(text: io.TextIOWrapper) -> tuple[list[str], str, list[str]]:
             return names if len(names) == len(cells) else [], line, cells
         if comment:
             cells = cells[1 + max((i for i, cell in enumerate(cells) if cell.endswith(":")), default=-1) :]
+        if not comment:
+            cells = [re.sub(r"\s*[\[(].*[\])]$", "", cell) for cell in cells]
         if {"x", "y", "z"} <= {cell.lower() for cell in cells}:
             names, commented = [cell or "index" for cell in cells], comment
         elif not comment and any(cells):
