@@ -213,6 +213,16 @@ def test_a_cabinet_holds_the_pose_beside_the_own_vehicle():
     assert mcg.metrics.pose_error(result.matrix, pair.T_target_source)[0] < 0.05
 
 
+def test_a_pole_that_says_less_than_the_own_vehicle_does_not_hold_the_pose():
+    pole = box((2.4, 0.4, 0), (2.6, 0.6, 2.5), lid=False)
+    pair = seen([*CORRIDOR, *pole], 0, count=2000)
+    alone = mcg.register(pair.source, pair.target, mcg.GICP(), init=pair.T_target_source)
+    assert alone.status == mcg.Status.CONVERGED
+    with pytest.warns(UserWarning, match="little but points within"):
+        result = mcg.register(*on_vehicle(pair, 0, 0.05)[:2], mcg.GICP(), init=pair.T_target_source)
+    assert result.status == mcg.Status.DEGENERATE
+
+
 @pytest.mark.slow
 def test_the_own_vehicle_is_found_out_inside_jit_in_lanes_and_beside_a_prior():
     pair = on_vehicle(seen(CORRIDOR, 0, count=1000), 0, 0.05)
