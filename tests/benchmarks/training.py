@@ -64,7 +64,7 @@ def with_falling_gain(cloud: Any) -> Any:
 
 
 def grey(cloud: Any) -> Any:
-    return cloud.replace(channels=cloud.channels @ LUMINANCE, channel_names=())
+    return cloud.replace(channels=cloud.channels @ LUMINANCE)
 
 
 def pairs_of(pairs: Iterator[Any], change: Callable[[Any], Any], voxel_size: float | None) -> Iterator[Pair]:
