@@ -77,7 +77,8 @@ class MultiChannelGICP(AbstractGeneralized):
             standard deviation (see `_terms.photometric`), which is mostly more accurate. A kernel `robust` then acts in
             the fine phase only. Its scale and `information` are in standard deviations. The numbers estimated from
             the residuals are constants to autodiff, so the derivative by points and channels is approximate: for noise
-            on walls of posters, it is off by half and more.
+            on walls of posters, it is off by half and more. A value that more than half of the points have is missing
+            where these lie together, such as black outside of an image.
     """
 
     uses_channels: ClassVar[bool] = True
