@@ -15,7 +15,8 @@ from tests.reference import exponential
 from tests.scenes import matched_at, motion, pair, wall
 
 SIZE = 400
-TRUTH = motion((0.02, 0.01, 0.02, 0.01, -0.01, 0.005))
+# With some others, matches alternate for ever at these tolerances.
+TRUTH = motion((0.02, -0.01, 0.02, 0.01, -0.01, 0.005))
 
 
 def plane(size, seed):
