@@ -100,8 +100,8 @@ def test_the_warning_can_be_sent_copied_and_repeated():
 
 @pytest.mark.parametrize("search", [None, pytest.param(mcg.DenseSearch(), marks=pytest.mark.slow)])
 def test_a_pose_from_a_small_overlap_is_warned_of_with_its_pair(search):
-    target, near = (room_corner(size, seed=seed)[0] for size, seed in ((2000, 0), (60, 1)))
-    source = np.concatenate([near, target[:1940] + 50])
+    target, near = (room_corner(size, seed=seed)[0] + 40 for size, seed in ((2000, 0), (60, 1)))
+    source = np.concatenate([near, target[:1940] - 50])
     with pytest.warns(mcg.PairWarning, match="pair 1: only .* %") as caught:
         results = mcg.register_batch(
             [target, source], [target] * 2, mcg.PointToPlane(), max_distance=0.3, search=search

@@ -507,8 +507,8 @@ def test_a_copied_result_holds_no_clouds():
     ids=["outside", "jit", "vjp"],
 )
 def test_a_pose_from_a_small_overlap_is_unverified(transformation):
-    target, near = (room_corner(size, seed=seed)[0] for size, seed in ((300, 0), (10, 1)))
-    source, target = (mcg.preprocess(points, None) for points in (np.concatenate([near, target[:290] + 50]), target))
+    target, near = (room_corner(size, seed=seed)[0] + 40 for size, seed in ((300, 0), (25, 1)))
+    source, target = (mcg.preprocess(points, None) for points in (np.concatenate([near, target[:275] - 50]), target))
 
     def registered(points):
         result = mcg.register(source.replace(points=points), target, mcg.PointToPlane(), max_distance=1.0)

@@ -76,7 +76,9 @@ def _shows_rounding(
     if cloud.deferred_neighbors is None:
         return False
     xp = numpy_for(cloud.points, counts, steps)
-    points, neighbors = xp.asarray(cloud.points), xp.asarray(cloud.deferred_neighbors[rows])
+    points = xp.asarray(cloud.points)
+    # Traced rows need those of all.
+    neighbors = cloud.deferred_neighbors[rows] if xp is np else xp.asarray(cloud.neighbors)[rows]
     found = (neighbors >= 0) & counts[:, None]
     offsets = points[neighbors] - points[rows][:, None]
     same = found & ((xp.abs(offsets) < _SAME * steps) | ~coarse).all(axis=2)

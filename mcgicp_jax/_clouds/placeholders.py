@@ -59,7 +59,7 @@ def _without_far(
     if len(points) <= 2 * _SURFACE:
         return measured
     stride = 1 + len(points) // _SAMPLE
-    columns = np.ascontiguousarray(points.T, np.float64)
+    columns = points.T.astype(np.float64, order="C")
     columns -= np.median(columns[:, ::stride], axis=1, keepdims=True)
     distance = np.sqrt((columns * columns).sum(axis=0))
     limit = _FAR * np.median(distance[::stride])
