@@ -27,6 +27,7 @@ def clouds():
     return [mcg.preprocess(cloud.unpad()) for cloud in pair(size=300)[:2]]
 
 
+@pytest.mark.slow
 def test_concrete_clouds_are_registered_on_the_cpu():
     """The default device is one that is not there: a program that runs on it raises an error."""
     raw = [cloud.unpad() for cloud in pair(size=300)[:2]]
@@ -134,6 +135,7 @@ def test_pairs_that_begin_again_keep_their_order():
     assert [number for number, _ in ended] == list(range(9))
 
 
+@pytest.mark.slow
 def test_one_line_says_that_memory_does_not_suffice_for_one_lane():
     source, target = (mcg.preprocess(cloud) for cloud in raw_pair(185, 0)[:2])
     with pytest.raises(MemoryError, match="padded to 192 and 256 points"):
@@ -150,6 +152,7 @@ class CountsClouds(mcg.DenseSearch):
         return noted(found, lambda count: CLOUDS.extend([count] * (num_candidates == 20)))
 
 
+@pytest.mark.slow
 def test_equal_clouds_of_several_pairs_are_prepared_once():
     """Also if they are other objects, and the source in one pair and the target in another one."""
     clouds = [np.asarray(cloud.points) for cloud in raw_pair(100, 0)[:2]]

@@ -72,6 +72,7 @@ def test_a_new_cloud_in_the_place_of_an_old_one_has_no_values():
     assert len(numbers) < 50
 
 
+@pytest.mark.slow
 def test_a_registration_after_others_of_the_same_clouds_is_that_of_new_clouds(cloud):
     """The cost of matches, photometric terms and another noise each want surfaces of other columns."""
     methods = mcg.MultiChannelGICP(0.5, 0.3), mcg.MultiChannelGICP(0.05, 0.3, photometric=True), METHOD

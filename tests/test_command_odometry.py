@@ -165,6 +165,7 @@ def test_frames_before_an_invalid_one_are_written(tmp_path, capsys, monkeypatch,
     assert "pairs:     2 of 2 converged" in text and len(io.read_poses(poses)) == 3 and len(io.read(map)) > 1000
 
 
+@pytest.mark.slow
 def test_cells_have_default_sizes(capsys):
     assert main(["odometry", "box-room", "--num-frames", "2", "--method", "ndt"]) == 0
     assert "1 of 1 converged" in capsys.readouterr().out

@@ -86,7 +86,15 @@ def printed_matrix(text):
 
 
 @pytest.mark.parametrize(
-    "method", ["mc-gicp", "photometric-gicp", "gicp", "color-icp", "point-to-plane", "point-to-point", "ndt"]
+    "method",
+    [
+        "mc-gicp",
+        "gicp",
+        *(
+            pytest.param(name, marks=pytest.mark.slow)
+            for name in ("photometric-gicp", "color-icp", "point-to-plane", "point-to-point", "ndt")
+        ),
+    ],
 )
 def test_register_prints_the_pose(register, method):
     code, text, errors = register("--method", method)
@@ -114,6 +122,7 @@ def test_register_writes_its_files(files, tmp_path, capsys):
     assert main(again) == 0
 
 
+@pytest.mark.slow
 def test_the_start_is_used_and_drawn(files, monkeypatch, tmp_path, capsys):
     drawn = {}
     monkeypatch.setattr(plot, "before_after", lambda source, target, poses, path: drawn.update(poses))
@@ -151,6 +160,7 @@ def test_what_does_not_converge_is_no_success(files, tmp_path, capsys):
         assert "status: " in text and errors.startswith("mcgicp: ") and status in errors
 
 
+@pytest.mark.slow
 def test_compare(files, capsys):
     assert main(["compare", files["source"], files["target"], "--truth", files["truth"]]) == 0
     lines = capsys.readouterr().out.splitlines()
@@ -359,6 +369,7 @@ def test_a_reader_that_ends_early_is_no_error():
     assert done.stderr == ""
 
 
+@pytest.mark.slow
 def test_fixed_directions(register, tmp_path):
     start = TRUTH @ motion((0, 0, 0.02, 0.01, 0, 0))
     io.write_poses(tmp_path / "start.txt", [start])

@@ -134,6 +134,7 @@ def test_preprocess_and_register_agree_with_the_tree(raw):
     assert results[0].num_inliers == results[1].num_inliers
 
 
+@pytest.mark.slow
 def test_register_with_it_is_one_program_without_callbacks(clouds):
     # Inside a transformation the pose is refined further, by about a tolerance.
     options = {"max_distance": 0.5, "translation_tolerance": 1e-6, "rotation_tolerance": 1e-6}
@@ -152,6 +153,7 @@ def lanes(sources, targets, **options):
     return mcg.register_batch(sources, targets, UNSET, max_distance=0.5, search=DenseSearch(), **options)
 
 
+@pytest.mark.slow
 def test_a_batch_in_lanes_is_its_pairs(raw, clouds):
     """With more pairs than lanes of a size, so that lanes are used again."""
     results = lanes(*clouds)

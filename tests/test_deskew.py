@@ -42,6 +42,7 @@ def test_points_are_where_the_sensor_would_have_seen_them_at_the_end():
     refused(lambda: mcg.deskew(cloud, 2 * motion()), "motion")
 
 
+@pytest.mark.slow
 @in_float64
 @pytest.mark.parametrize("transformation", [lambda gradient: gradient, jax.jit])
 def test_derivative_by_the_motion_points_and_times(transformation):
@@ -88,9 +89,8 @@ def errors(frames, **options):
     return metrics.rpe(poses, [frame.pose for frame in frames])[0]
 
 
-@pytest.mark.parametrize(
-    "options", [{}, pytest.param({"against": "map"}, marks=pytest.mark.slow)], ids=["previous", "map"]
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("options", [{}, {"against": "map"}], ids=["previous", "map"])
 def test_odometry_of_a_spinning_lidar(options):
     """At 20 m/s, without deskewing stretched scans of a street are off by centimetres; the first pair counts, too."""
     frames = list(datasets.street(3, points_per_frame=8000, step=2.0, spin=True, noise=0.5))

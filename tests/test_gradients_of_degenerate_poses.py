@@ -260,6 +260,7 @@ def test_walls_of_a_batch_follow_motions_along_their_normals():
     np.testing.assert_allclose(jax.jacrev(heights)(jnp.zeros(2)), -np.eye(2), atol=1e-3)
 
 
+@pytest.mark.slow
 @in_float64
 def test_tie_points_and_a_prior_constrain_what_the_clouds_do_not():
     """Differences of the registration itself, by what was measured: the directions do not depend on it.

@@ -37,7 +37,7 @@ def spacing_of(cloud):
     return np.median(scipy.spatial.cKDTree(cloud.points).query(cloud.points, 2)[0][:, 1])
 
 
-@pytest.mark.parametrize("name", ["mc-gicp", "color-icp"])
+@pytest.mark.parametrize("name", [pytest.param("mc-gicp", marks=pytest.mark.slow), "color-icp"])
 def test_the_derivative_is_that_of_one_soft_root(name, clouds):
     """Differences of `estimate_pose` over the eight candidates at the pose of the hard matches, which is returned."""
     method, robust = case(name)

@@ -54,6 +54,7 @@ def test_every_input_of_every_method(name, clouds):
     check_eager_gradient(loss, inputs_of(*clouds, method, robust))
 
 
+@pytest.mark.slow
 def test_a_soft_assignment_has_gradients_by_weights_and_temperature(clouds):
     method, robust = mcg.ColorICP(0.3), mcg.Cauchy(0.5)
     matches = mcg.find_correspondences(*clouds, motion(), method, max_distance=GATE, num_candidates=3)
@@ -259,6 +260,7 @@ def test_another_size_compiles_nothing(two_blocks):
     assert len(compiled) <= 2
 
 
+@pytest.mark.slow
 def test_several_blocks_of_rows(two_blocks):
     source, target, truth = two_blocks
     # Of so many matches, some would flip.

@@ -88,6 +88,7 @@ def test_a_batch(search, near):
         assert_as_near(result.matrix, near)
 
 
+@pytest.mark.slow
 def test_inside_a_transformation():
     @jax.jit
     def pose(source, target):

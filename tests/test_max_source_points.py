@@ -77,6 +77,7 @@ def test_only_some_points_are_matched_in_every_phase(clouds, count, matched):
     assert result.num_inliers == round(float(result.overlap) * matched)
 
 
+@pytest.mark.slow
 def test_the_pose_inside_jit_of_a_padded_cloud_and_in_a_batch_is_the_same(clouds):
     source, target = clouds
     padded, method = source.pad(512), mcg.GICP()
@@ -116,13 +117,11 @@ def test_compiled_programs_get_all_rows_of_a_target_that_is_computed_on_demand(c
     np.testing.assert_allclose(traced(np.eye(4)), expected.matrix, atol=1e-9)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "method",
-    [
-        pytest.param(mcg.MultiChannelGICP([0.05, 0.08], 0.3, epsilon=1e-2), id="mc-gicp", marks=pytest.mark.slow),
-        pytest.param(mcg.GICP(epsilon=1e-2), id="gicp"),
-        pytest.param(mcg.PointToPoint(), id="point-to-point", marks=pytest.mark.slow),
-    ],
+    [mcg.MultiChannelGICP([0.05, 0.08], 0.3, epsilon=1e-2), mcg.GICP(epsilon=1e-2), mcg.PointToPoint()],
+    ids=["mc-gicp", "gicp", "point-to-point"],
 )
 def test_the_gradient_is_that_of_differences(clouds, method):
     source, target = clouds

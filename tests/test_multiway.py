@@ -182,6 +182,7 @@ def test_the_command_of_odometry(tmp_path, capsys):
     assert "loops:     " in capsys.readouterr().out and len(io.read(map)) > 1000
 
 
+@pytest.mark.slow
 def test_a_cloud_of_another_place_leaves_the_others_where_they_are():
     size = {"points_per_frame": 1500, "step": 0.4}
     frames, other = datasets.box_room(6, seed=3, **size), datasets.box_room(6, seed=1003, **size)

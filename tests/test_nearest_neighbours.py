@@ -140,7 +140,7 @@ def test_nearest_with_missing_channels(seed, share, k, missing):
     np.testing.assert_array_equal(found.T, expected)
 
 
-@pytest.mark.parametrize("k", [1, 3])
+@pytest.mark.parametrize("k", [1, pytest.param(3, marks=pytest.mark.slow)])
 def test_many_sets_of_missing_channels(k):
     """Five channels, each there or not at random, hence more sets than have their trees kept."""
     squares = np.arange(1.0, 6.0)
@@ -253,6 +253,7 @@ def find(source, target, pose, weights, max_distance):
     return find_correspondences(source, target, pose, ColorICP(weights), max_distance=max_distance)
 
 
+@pytest.mark.slow
 def test_traced_and_batched_it_finds_the_same():
     # The second lacks channels, which the first does not.
     pairs = [clouds()[0], partial_clouds()[0], clouds(seed=20)[0]]

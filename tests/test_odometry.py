@@ -232,6 +232,7 @@ def test_what_makes_no_map_is_refused_by_name(room):
         refused(lambda arguments=arguments: mcg.merge_clouds(*arguments), named, shown)
 
 
+@pytest.mark.slow
 def test_a_map_drifts_less():
     frames = datasets.box_room(10, points_per_frame=2000, step=0.08)
     truth = [frames.path(i) for i in range(10)]
@@ -261,6 +262,7 @@ def test_the_frames_after_an_invalid_one_go_on(room):
     assert len(poses) == 4 and metrics.ate(poses, truth[:4], alignment="first") < 0.03
 
 
+@pytest.mark.slow
 def test_a_sensor_that_moves_on_after_a_rest_is_not_lost():
     """Its overlap falls once."""
     frames = datasets.box_room(4, points_per_frame=1500, step=1.2)
@@ -271,6 +273,7 @@ def test_a_sensor_that_moves_on_after_a_rest_is_not_lost():
     assert not any(step.lost for step in steps)
 
 
+@pytest.mark.slow
 def test_lost_frames_are_named_and_follow_each_other(room):
     """In another, larger room, poses follow an extrapolated one until the first is seen again."""
     frames, truth = room
@@ -339,6 +342,7 @@ def test_a_map_of_the_room_is_sharp_at_the_true_poses(room):
     assert len(sharp) < len(blurred) < sum(map(len, clouds))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("against", ["previous", "map"])
 def test_priors_hold_what_a_corridor_does_not(against):
     """Wheels measure the way along a bare corridor to 1 cm and know no rotation."""

@@ -124,6 +124,7 @@ def test_transformations_find_the_same_pose():
     np.testing.assert_allclose(inside.covariance, outside.covariance, rtol=0.05, atol=0.02 * outside.covariance.max())
 
 
+@pytest.mark.slow
 def test_the_cost_of_matches_is_that_of_estimate_pose():
     source, target, truth, matches = at_truth()
     # The numbers of the term are those at the start: the solution, near which the cost hardly changes.
@@ -133,6 +134,7 @@ def test_the_cost_of_matches_is_that_of_estimate_pose():
     assert found.converged and float(cost) == pytest.approx(float(found.cost), rel=1e-5)
 
 
+@pytest.mark.slow
 def test_forces_are_the_gradient_of_the_cost():
     source, target, truth, matches = at_truth()
     _, term = with_fixed_numbers(source, target, PHOTOMETRIC, truth, matches)
@@ -166,6 +168,7 @@ def test_gains_and_offsets_apply_to_values_and_slopes():
         np.testing.assert_allclose(found, expected, atol=1e-3 * np.nanmax(np.abs(expected)), err_msg=name)
 
 
+@pytest.mark.slow
 def test_estimates_are_scales_and_correlations_of_the_residuals():
     source, target, truth, matches = at_truth(raised, size=2500)
     _, term = with_fixed_numbers(source, target, PHOTOMETRIC, truth, matches)
@@ -315,6 +318,7 @@ def black(size, **settings):
     return points, np.where(points[:, :1] < 1.4, 0, channels)
 
 
+@pytest.mark.slow
 def test_constant_parts_do_not_set_the_scale():
     """Their residuals are 0 at any pose."""
     source, target, truth = pair(black, 2000, truth=SMALL)

@@ -56,9 +56,8 @@ def registered(inputs, source, target, start, search=None):
 
 
 @in_float64
-@pytest.mark.parametrize(
-    "name", [name if name == "mc-gicp" else pytest.param(name, marks=pytest.mark.slow) for name in CASES]
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("name", CASES)
 def test_register_has_the_gradient_of_its_answer(name, padded):
     """Where no match flips within the step of the difference, which is checked; in each lane of a batch."""
     source, target, _ = padded

@@ -198,8 +198,9 @@ def test_gradients_of_moments_compile_nothing_for_another_size():
     assert not [name for name in compiled if "products" in name or "raised" in name or "segment" in name]
 
 
+@pytest.mark.slow
 @in_float64
-@pytest.mark.parametrize("name", [pytest.param("ndt", marks=pytest.mark.slow), "d2d-ndt"])
+@pytest.mark.parametrize("name", ["ndt", "d2d-ndt"])
 def test_gradients_reach_the_points(name):
     source, target, start = raw_pair(2000)
     method = {"ndt": mcg.NDT(), "d2d-ndt": mcg.D2DNDT()}[name]
