@@ -104,9 +104,9 @@ def fields(pair: Pair) -> Iterator[np.ndarray]:
     yield from ((along**2 - 1) * channels for along in (x, y))
 
 
-def slopes(pair: Pair, method: Any, resolved: Any, options: dict[str, Any]) -> dict[str, list[float]]:
+def slopes(pair: Pair, method: Any, resolved: Any, options: dict[str, Any]) -> dict[str, list[Any]] | None:
     """Slopes of the pose error (metres + radians) along the fields: differences of whole registrations from the truth,
-    and derivatives by hard and by soft matches."""
+    and derivatives by hard and by soft matches. None for a pair that is lost, whose error counts no more."""
     channels, weights = np.asarray(pair.source.channels), np.asarray(resolved.channel_weights)
     points, nearest = pair.target.points, pair.target.neighbors[:, 1]
     spacing = np.median(np.linalg.norm(points[nearest] - points, axis=1))
@@ -122,8 +122,10 @@ def slopes(pair: Pair, method: Any, resolved: Any, options: dict[str, Any]) -> d
     def differences(move: np.ndarray) -> list[float]:
         return [float(error(channels + step * move) - error(channels - step * move)) / (2 * step) for step in STEPS]
 
-    found: dict[str, Any] = {"differences": [differences(move) for move in moves]}
     pose = registered(channels).matrix
+    if sum(mcg.metrics.pose_error(pose, pair.truth)) > LARGEST_ERROR:
+        return None
+    found: dict[str, Any] = {"differences": [differences(move) for move in moves]}
     for name, soft in (("hard", False), ("soft", True)):
         gradient = np.asarray(jax.grad(partial(error, init=pose, soft_matches=soft))(channels))
         found[name] = [float((gradient * move).sum()) for move in moves]
@@ -144,7 +146,7 @@ def cosines(name: str, methods: Sequence[str]) -> Iterator[list[str]]:
             for pair, resolved in pairs
         ]
         by_step, *others = (
-            np.concatenate([found[label] for found in each]) for label in ("differences", "hard", "soft")
+            np.concatenate([found[label] for found in each if found]) for label in ("differences", "hard", "soft")
         )
         expected, agree = by_step.mean(axis=1), cosine(by_step[:, 0], by_step[:, -1])
         for label, ours in zip(("hard", "soft"), others, strict=True):
