@@ -349,7 +349,10 @@ def test_a_loop_moves_the_last_pose_as_an_optimisation_of_all_would(monkeypatch)
         tries.append(([cloud is target for cloud in clouds].index(True), len(poses), options.min_coarse_distance))
         return loops.get(len(poses))
 
-    def edge_from(i, j, measured, uncertain=False):
+    registered = mcg.RegistrationResult.without_pose(mcg.Status.CONVERGED)
+
+    def edge_from(i, j, result, uncertain=False):
+        measured = (step, np.diag(sigma**-2)) if result is registered else result
         return None if measured is None else mcg.Edge(i, j, *measured, uncertain=uncertain)
 
     monkeypatch.setattr(loop_closure, "register_pair", register_pair)
@@ -357,7 +360,7 @@ def test_a_loop_moves_the_last_pose_as_an_optimisation_of_all_would(monkeypatch)
     trajectory = loop_closure.Trajectory(mcg.GICP(), Options())
     for k, cloud in enumerate(clouds):
         pose = poses[-1] @ step if poses else np.eye(4)
-        poses.append(trajectory.add(cloud, pose, (step, np.diag(sigma**-2)) if k else None))
+        poses.append(trajectory.add(cloud, pose, registered if k else None))
     graph = trajectory.graph()
     assert np.linalg.norm(poses[-1][:3, 3] - pose[:3, 3]) > 0.1
     np.testing.assert_allclose(poses[-1], graph.poses[-1], atol=1e-3)
