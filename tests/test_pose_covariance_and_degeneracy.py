@@ -17,6 +17,7 @@ from mcgicp_jax._pose_solver import covariance
 from mcgicp_jax._pose_solver.covariance import Moments, NoiseSample, discounts_and_radius, response_and_scatter
 from mcgicp_jax._pose_solver.degeneracy import LEAST_BY_GEOMETRY, find_directions
 from mcgicp_jax._pose_solver.sums import Sums
+from mcgicp_jax._terms.base import PosedMatches
 from mcgicp_jax.extend import symmetric_matrices as cov
 from tests.batches import raw_pair
 from tests.benchmarks.noise_scenes import street
@@ -394,7 +395,8 @@ def test_geometry_and_channels_have_discounts_of_their_own(monkeypatch):
     information = rng.random((6, 5))
     trace = information[[0, 3, 5]].sum(axis=0)
     monkeypatch.setattr(covariance, "observability", lambda _: [information, information / (1 + trace)])
-    shown = covariance._discounted_observability(None, np.array([0.4, 0.7]), ())
+    posed = PosedMatches._make([None] * len(PosedMatches._fields))
+    shown = covariance._discounted_observability(posed, jnp.array([0.4, 0.7]), ())
     np.testing.assert_allclose(shown, 0.4 * information + 0.7 * information / (1 + 0.7 * trace), rtol=1e-5)
 
 

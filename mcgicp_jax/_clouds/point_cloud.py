@@ -268,8 +268,8 @@ class PointCloud(eqx.Module):
         intrinsics: Values,
         color: Values | None = None,
         *,
-        scale: float | None = None,
-        max_depth: float | None = None,
+        scale: int | float | None = None,
+        max_depth: int | float | None = None,
     ) -> PointCloud:
         """Create a raw cloud from a depth image: one point per pixel with a depth, row by row.
 

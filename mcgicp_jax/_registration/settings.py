@@ -142,6 +142,9 @@ def settings_for(
     limits = options.min_coarse_distance, options.max_coarse_distance
     xp = numpy_for(coarse, fine, limits)
     coarse = xp.maximum(xp.clip(coarse, *limits), fine)
+    # Steps of huge coordinates overflow.
+    with np.errstate(over="ignore"):
+        rounding = numpy_for(steps).stack(steps) ** 2 / 12
     return Settings(
         max_distance=number(coarse, dtype),
         fine_distance=number(fine, dtype),
@@ -154,6 +157,6 @@ def settings_for(
         hold_unconstrained=number(options.hold_unconstrained, bool),
         channels_may_move=number(channels_may_move, bool),
         # An error that is uniform over a step. It does not average out: points on lattices match the lattice.
-        rounding=number(numpy_for(steps).stack(steps) ** 2 / 12, dtype),
+        rounding=number(rounding, dtype),
         near=number(_NEAR * _median_range(constant(source)), dtype),
     )

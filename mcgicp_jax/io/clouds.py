@@ -84,7 +84,7 @@ def _known_format(path: Path, columns: int | None = None) -> Format | None:
     return found
 
 
-def _decompressed(file: BinaryIO, size: int) -> tuple[BinaryIO, int]:
+def _decompressed(file: BinaryIO, size: int) -> tuple[io.BytesIO, int]:
     data = gzip.GzipFile(fileobj=file).read(arrays.DEFLATE_RATIO * size)
     return io.BytesIO(data), len(data)
 
