@@ -12,7 +12,7 @@ _NO_DEPTH = 65535
 
 
 def back_project(
-    depth: Any, intrinsics: Any, scale: float | None = None, max_depth: float | None = None
+    depth: Any, intrinsics: Any, scale: int | float | None = None, max_depth: int | float | None = None
 ) -> tuple[Float[np.ndarray, "N 3"], Float[np.ndarray, "N 2"]]:
     """Points of a pinhole camera (x right, y down, z ahead) and their pixels (column, row), row by row of the image.
     The arguments are those of `PointCloud.from_depth`, which says what raises."""
