@@ -84,9 +84,15 @@ def _known_format(path: Path, columns: int | None = None) -> Format | None:
     return found
 
 
-def _decompressed(file: BinaryIO, size: int) -> tuple[io.BytesIO, int]:
+class _Decompressed(io.BytesIO):
+    """With what `BinaryIO` names beside it."""
+
+    name, mode = "", "rb"
+
+
+def _decompressed(file: BinaryIO, size: int) -> tuple[BinaryIO, int]:
     data = gzip.GzipFile(fileobj=file).read(arrays.DEFLATE_RATIO * size)
-    return io.BytesIO(data), len(data)
+    return _Decompressed(data), len(data)
 
 
 def is_cloud(path: Path) -> bool:
