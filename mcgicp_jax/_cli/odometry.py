@@ -194,7 +194,7 @@ def _open(
             raise
     else:
         raise ValueError(f"{dataset}: expected a folder of clouds or one of {enumerated(list(DATASETS), 'or')}")
-    frames = frames[::every]
+    frames = frames if every == 1 else frames[::every]
     if len(frames) < 2:
         raise ValueError(f"{path or dataset}: expected at least 2 frames, got {len(frames)}")
     return frames if num_frames == "all" else frames[:num_frames]
