@@ -437,12 +437,13 @@ def test_the_covariance_follows_the_unit_of_length_and_a_shift():
 
 
 def test_what_nothing_holds_is_not_known(flat):
-    source, target, _ = flat
+    # Points near the origin would not count.
+    source, target = (mcg.preprocess(mcg.PointCloud(cloud.points).crop(0.2), None) for cloud in flat[:2])
     result = mcg.register(source, target, mcg.GICP(), max_distance=0.3)
-    points = np.asarray(source.points)[: len(source)]
+    points = np.asarray(source.points)
     radius = np.sqrt(np.mean(np.sum((points - points.mean(axis=0)) ** 2, axis=1)))
     # Ten radii along the wall, and ten radians about its normal.
-    np.testing.assert_allclose(result.deviations[[0, 1, 5]], [10 * radius, 10 * radius, 10], rtol=0.02)
+    np.testing.assert_allclose(result.deviations[[0, 1, 5]], [10 * radius, 10 * radius, 10], rtol=0.01)
     for direction in result.unconstrained_directions:
         deviation = np.sqrt(direction.twist @ np.linalg.pinv(np.asarray(result.information)) @ direction.twist)
         assert np.isfinite(deviation)

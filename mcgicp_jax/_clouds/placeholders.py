@@ -20,9 +20,9 @@ from mcgicp_jax._search.kd_tree import KDTreeSearch
 _MANY, _NEAR = 5, 8
 # A point is no surface if it is further from the middle than `_FAR` times the median of the points, and if the nearest
 # `_SURFACE` others, as many as a covariance is computed from, reach back over more than half of the way to the middle.
-# (Facades of 25 points 30 to 300 m from a room reach over a third of it at most; of KITTI, streets and rooms, none is
-# left out. Nearer ones, up to 20 at fixed places in both clouds of a room of 5,000 points, move the pose by 0.1 mm.)
-_FAR, _SURFACE = 10, 20
+# (Facades of 25 points 30 to 300 m from a room reach over a third of it at most. KITTI and streets extend over 7 to 15
+# medians. Up to 20 nearer points at fixed places in both clouds of a room of 5,000 points move the pose by 0.1 mm.)
+_FAR, _SURFACE = 20, 20
 # Points from which the middle and the median are computed.
 _SAMPLE = 10_000
 

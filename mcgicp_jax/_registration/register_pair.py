@@ -305,13 +305,16 @@ def problem_of(
 
 def _warn_of_near_points(run: Run) -> None:
     """Warn of a pose that is DEGENERATE since points near the sensor count as no evidence."""
+    points, near = np.asarray(run.inputs.source.points)[run.inputs.source.valid], run.problem.settings.near
+    if not (np.square(points).sum(axis=1) < near**2).any():
+        return
     before = cast(Directions, run.loop.state.directions)
     after = cast(HostExecutor, run.executor).directions_by_all_points(run.loop)
     if after.constrained.sum() > before.constrained.sum():
         warn(
-            f"source: little but points within {float(run.problem.settings.near):.2g} m of the origin constrains the "
-            "pose in some direction. They may be the sensor's own vehicle, which moves with it, so the status is "
-            "DEGENERATE; leave them out by PointCloud.crop, or pass a prior"
+            f"source: little but points within {float(near):.2g} m of the origin constrains the pose in some "
+            "direction. They may be the sensor's own vehicle, which moves with it, so the status is DEGENERATE; leave "
+            "them out by PointCloud.crop, pass a prior, or move the clouds if the sensor is not at their origin"
         )
 
 
