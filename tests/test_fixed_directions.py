@@ -62,20 +62,40 @@ def test_what_is_fixed_stays_that_of_the_prior(name):
         assert np.abs(np.asarray(result.covariance)[fixed]).max() < 1e-10
 
 
-def test_a_planar_scan_lifted_to_3d():
-    """As the message for points (N, 2) says: copies at several heights, and a prior."""
+def lifted(scan, spacing, seed):
+    """A planar scan with noise of 5 mm in 3-D, as the message for points (N, 2) says."""
+    seen = scan + 0.005 * np.random.default_rng(seed).normal(size=scan.shape)
+    return np.concatenate([np.c_[seen, np.full(len(seen), z)] for z in 5 * spacing * np.arange(5)])
+
+
+def test_a_planar_scan_lifted_to_3d(recwarn):
     wall = np.linspace(0, 3, 250)
     corner = np.concatenate([np.stack([wall, 0 * wall], axis=1), np.stack([0 * wall, wall], axis=1)]) + 0.3
-
-    def lifted(seed):
-        seen = corner + 0.005 * np.random.default_rng(seed).normal(size=corner.shape)
-        return np.concatenate([np.c_[seen, np.full(len(seen), z)] for z in 0.02 * np.arange(5)])
-
     truth = motion((0.05, -0.03, 0, 0, 0, 0.05))
-    source = mcg.PointCloud(lifted(0)).transform(np.linalg.inv(truth))
+    source = mcg.PointCloud(lifted(corner, 0.012, 0)).transform(np.linalg.inv(truth))
     prior = np.eye(4), covariance_fixing("z roll pitch")
-    result = mcg.register(source, lifted(1), mcg.GICP(), max_distance=(0.5, 0.1), prior=prior)
+    result = mcg.register(source, lifted(corner, 0.012, 1), mcg.GICP(), max_distance=(0.5, 0.1), prior=prior)
     assert result.converged and max(pose_error(result.matrix, truth)) < 5e-3
+    # The heights of the copies are no rounding of coordinates.
+    assert not recwarn
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_walls_of_a_planar_scan_hold_nothing_along_them(seed):
+    """Copies closer than that are matched with one another's, as if the walls had ends everywhere."""
+    rng = np.random.default_rng(seed)
+    truth = motion((0.2, 0.01, 0, 0, 0, 0.01))
+    # Of a sensor in the middle, whose points are denser near it; each scan with its own rays.
+    angles = [np.linspace(-np.pi, np.pi, 720, endpoint=False) + rng.uniform(0, 0.01) for _ in range(2)]
+    scans = [np.stack([1 / np.tan(each), np.ones_like(each)], 1) * np.sign(np.sin(each))[:, None] for each in angles]
+    target, source = (scan[np.abs(scan[:, 0]) < 6] for scan in scans)
+    clouds = [lifted(scan, 0.011, seed + 10 * i) for i, scan in enumerate((target, source))]
+    source = mcg.PointCloud(clouds[1] + [0.2, 0, 0]).transform(np.linalg.inv(truth))
+    wheels = truth @ motion((*rng.normal(0, 0.02, 2), 0, 0, 0, 0))
+    prior = wheels, covariance_fixing("z roll pitch") * 0 + np.diag([0.02**2, 0.02**2, 0, 0, 0, 0.01**2])
+    result = mcg.register(source, clouds[0], mcg.GICP(), prior=prior)
+    error = remaining(result.matrix, truth)
+    assert abs(error[0]) < 4 * np.sqrt(result.covariance[0, 0])
 
 
 def test_tilted_axes():

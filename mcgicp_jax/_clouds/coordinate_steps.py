@@ -72,7 +72,8 @@ def _shows_rounding(
     steps: Float[AnyArray, "3"],
 ) -> Any:
     """Whether points with the same coordinates on the coarse axes are more than an exact sample of surfaces has: one
-    point for two axes, a line for one. False for clouds without neighbours."""
+    point for two axes, a line for one. Copies of a planar scan at several heights are exact. False for clouds without
+    neighbours."""
     if cloud.deferred_neighbors is None:
         return False
     xp = numpy_for(cloud.points, counts, steps)
@@ -82,9 +83,10 @@ def _shows_rounding(
     found = (neighbors >= 0) & counts[:, None]
     offsets = points[neighbors] - points[rows][:, None]
     same = found & ((xp.abs(offsets) < _SAME * steps) | ~coarse).all(axis=2)
+    copied = (found & ((offsets == 0) | coarse).all(axis=2) & (offsets != 0).any(axis=2)).any(axis=1)
     x, y, z = xp.where(same[..., None] & ~coarse, offsets, 0).transpose(2, 0, 1)
     xx, yy, zz, xy, yz, zx = (xp.sum(a * b, axis=1) for a, b in ((x, x), (y, y), (z, z), (x, y), (y, z), (z, x)))
     minors = xx * yy - xy**2 + yy * zz - yz**2 + zz * xx - zx**2
     mostly = 2 * xp.sum(same, axis=1) > xp.sum(found, axis=1)
     rounded = xp.where(xp.sum(coarse) > 1, xx + yy + zz > 0, mostly & (minors > _SPREAD * (xx + yy + zz) ** 2))
-    return xp.sum(rounded) > _SHARE * xp.sum(counts)
+    return xp.sum(rounded & ~copied) > _SHARE * xp.sum(counts)

@@ -70,8 +70,8 @@ def _advice(shape: tuple[int, ...]) -> str:
         return "; pass points.reshape(-1, 3) of one cloud in a grid, or a list of clouds to register_batch"
     if len(shape) == 2 and shape[1] == 2:
         return (
-            "; lift a planar scan to 3-D: stack copies of it at several z, about one spacing apart, and fix z, roll "
-            "and pitch by a prior"
+            "; lift a planar scan to 3-D: stack five copies of it, about five spacings apart in z, and fix z, roll and "
+            "pitch by a prior"
         )
     return "; pass PointCloud(points, channels)" if len(shape) == 2 and shape[1] > 3 else ""
 

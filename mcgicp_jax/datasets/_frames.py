@@ -247,7 +247,8 @@ class CloudFiles(AbstractFrames):
         self.paths = [path for path in paths if is_cloud(path)]
         self.left_out = [path for path in paths if path not in self.paths]
         if not self.paths:
-            raise ValueError(f"{folder}: expected clouds {glob}, found none")
+            named = "" if glob == "*" else f" {glob}"
+            raise ValueError(f"{folder}: expected clouds{named}, found none")
         self._columns = columns
         super().__init__(len(self.paths))
 

@@ -15,6 +15,8 @@ _MOST_RINGS = 256
 _PERIODS, _REPEATS = (3, 5, 6, 7, 9, 10), 0.5
 # Values that are compared.
 _SAMPLE = 120_000
+# Numbers of columns that a refusal suggests where they fill the file.
+_SIZES = range(3, 11)
 
 # Padding of PCL's points is 0, or the bits of small integers, such as a ring, as float32.
 _PADDING = 1e-30
@@ -54,9 +56,11 @@ def columns_of_floats(values: Float[np.ndarray, "n"], given: int | None = None) 
     columns = split(3)
     if columns is not None and steps[3] < _REPEATS * min(steps[size] for size in (4, 5, 7, 10)):
         return named(columns)
+    fitting = [str(size) for size in _SIZES if values.size % size == 0]
+    advice = f"if they begin with x, y, z, say how many there are, columns=N or --columns N; {', '.join(fitting)} fit"
     raise ValueError(
-        "its columns are neither those of KITTI (x, y, z, intensity) nor of another known layout; say how many there "
-        "are if the first are x, y, z: mcg.io.read(path, columns=5), or --columns 5"
+        "its columns are neither those of KITTI (x, y, z, intensity) nor of another known layout; "
+        + (advice if fitting else f"no number of {_SIZES[0]} to {_SIZES[-1]} fills {4 * values.size} bytes")
     )
 
 
