@@ -4,7 +4,6 @@ import copy
 import os
 import pickle
 import re
-import sys
 import threading
 import warnings
 from concurrent.futures import Executor, Future, ThreadPoolExecutor
@@ -236,7 +235,7 @@ def test_what_concerns_all_pairs_is_raised_at_once(raw):
     sides = prepared(raw)
     for name, value in (
         *(("max_distance", -1.0), ("translation_tolerance", -1.0), ("max_iterations", 0), ("voxel_size", 0.0)),
-        *(("num_neighbors", 2), ("init", 2 * np.eye(4)), ("init", "local"), ("executor", "threads")),
+        *(("num_neighbors", 2), ("init", 2 * np.eye(4)), ("init", "local"), ("executor", "thread")),
     ):
         options = {"max_distance": 0.5, name: value}
         refused(lambda options=options: mcg.register_as_completed(*sides, METHOD, **options), name)
@@ -313,12 +312,6 @@ def test_a_batch_starts_from_anywhere(search):
         np.testing.assert_array_equal(found.matrix, alone.matrix)
     with pytest.warns(mcg.PairWarning, match="pair 0: init: "):
         mcg.register_batch(sources[:1], frames[0].cloud, mcg.GICP(), init=["local"])
-
-
-def test_the_extra_is_named(monkeypatch):
-    monkeypatch.setitem(sys.modules, "loky", None)
-    with pytest.raises(ImportError, match=re.escape("mcgicp_jax[processes]")):
-        batch([np.eye(3)], [np.eye(3)], executor="processes")
 
 
 def test_inside_transformations_a_batch_says_what_to_use(raw):

@@ -1,7 +1,8 @@
-"""`executor="processes"`: the results of threads, and no trace of the workers that made them."""
+"""Batches in processes, asked for or chosen: the results of threads, and no trace of the workers that made them."""
 
 import ast
 import contextlib
+import logging
 import os
 import signal
 import subprocess
@@ -17,10 +18,10 @@ import pytest
 import mcgicp_jax as mcg
 from mcgicp_jax import Status
 from mcgicp_jax._compute.threads import num_cores
+from mcgicp_jax._pairs import batch_executors
 from mcgicp_jax._pairs.batch_executors import Processes
 from tests.batches import METHOD, assert_same, batch, prepared
 
-pytest.importorskip("loky")
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(240)]
 
 
@@ -56,6 +57,73 @@ def test_the_results_of_threads(raw, alone):
     with jax.enable_x64(True):
         double = [[cloud.unpad() for cloud in side] for side in prepared(raw[:2])]
         assert_same(in_processes(*double), batch(*double))
+
+
+@pytest.fixture
+def pays(monkeypatch):
+    """Processes start as soon as the time of a pair is known."""
+    monkeypatch.setattr(batch_executors, "_PAYS", 0.0)
+
+
+def in_turn(folder, cloud, count, lock=None):
+    """Functions that note in which process they ran; those with a lock cannot be sent to another one."""
+
+    def load(i):
+        with lock or contextlib.nullcontext():
+            (folder / f"{i}.txt").write_text(str(os.getpid()))
+        time.sleep(0.02)
+        return cloud
+
+    return [lambda i=i: load(i) for i in range(count)]
+
+
+def pids_in(folder):
+    return {int(path.read_text()) for path in folder.glob("*.txt")}
+
+
+def test_processes_take_over_where_they_pay(raw, tmp_path, pays, caplog, monkeypatch):
+    (source,), (target,) = prepared(raw[:1])
+    monkeypatch.setattr(batch_executors.LOGGER, "disabled", False)
+    with caplog.at_level(logging.INFO, "mcgicp_jax"):
+        results = batch(in_turn(tmp_path, source, 500), target)
+    assert_same(results, 500 * batch([source], target, executor="threads"))
+    assert os.getpid() in pids_in(tmp_path) and len(pids_in(tmp_path)) == 1 + num_cores()
+    assert f"pairs go on in {num_cores()} processes" in caplog.text
+
+
+def test_processes_take_over_from_an_iterator_of_any_length(raw, tmp_path, pays):
+    (source,), (target,) = prepared(raw[:1])
+    found = mcg.register_as_completed(iter(in_turn(tmp_path, source, 500)), target, METHOD, max_distance=0.5)
+    assert sorted(index for index, _ in found) == list(range(500))
+    assert len(pids_in(tmp_path)) == 1 + num_cores()
+
+
+def test_threads_go_on_where_processes_do_not_pay(raw, tmp_path, monkeypatch):
+    (source,), (target,) = prepared(raw[:1])
+    monkeypatch.setattr(Processes, "are_warm", False)
+    batch(in_turn(tmp_path, source, 20), target)
+    assert pids_in(tmp_path) == {os.getpid()}
+
+
+@pytest.mark.parametrize("sendable", [0, 1000])
+def test_what_cannot_be_sent_stays_at_home(raw, tmp_path, pays, sendable):
+    """All pairs, or those after the processes have started."""
+    (source,), (target,) = prepared(raw[:1])
+    functions = in_turn(tmp_path, source, sendable) + in_turn(tmp_path, source, 40, threading.Lock())
+    results = batch(functions, target)
+    assert all(result.converged for result in results)
+    assert (len(pids_in(tmp_path)) > 1) == (sendable > 0)
+
+
+def test_a_worker_starts_no_processes(raw, tmp_path, pays):
+    (source,), (target,) = prepared(raw[:1])
+
+    def inside():
+        batch_executors._PAYS = 0.0
+        results = batch(in_turn(tmp_path, source, 60), target)
+        return all(result.converged for result in results)
+
+    assert told(inside) == "True" and len(pids_in(tmp_path)) == 1
 
 
 def test_workers_stay_and_have_one_thread_and_the_settings_of_the_caller(monkeypatch):

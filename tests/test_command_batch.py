@@ -77,7 +77,6 @@ def test_a_folder_is_registered_file_by_file(folder, tmp_path, capsys):
 
 @pytest.mark.slow
 def test_processes_write_the_table_of_threads(folder, tmp_path, capsys):
-    pytest.importorskip("loky")
     tables = [tmp_path / "threads.csv", tmp_path / "processes.csv"]
     assert run_folder(folder, tables[0]) == run_folder(folder, tables[1], "--workers", "2") == 0
     assert tables[0].read_text() == tables[1].read_text()

@@ -5,7 +5,6 @@ from __future__ import annotations
 import collections
 import contextlib
 import csv
-import importlib.util
 import itertools
 import signal
 import sys
@@ -13,7 +12,6 @@ import threading
 import time
 import warnings
 from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
-from concurrent.futures import Executor
 from dataclasses import dataclass
 from functools import partial
 from io import StringIO
@@ -21,7 +19,6 @@ from pathlib import Path
 from types import FrameType
 from typing import Annotated, Any, Literal, TypeAlias
 
-import jax
 import numpy as np
 import tyro
 from jaxtyping import Float
@@ -32,7 +29,6 @@ from mcgicp_jax import io
 from mcgicp_jax._cli.choices import Choices, listed, with_channels
 from mcgicp_jax._cli.options import Method, Options, check_outputs, clouds_in, with_names
 from mcgicp_jax._compute.messages import check_integer
-from mcgicp_jax._compute.threads import num_cores
 from mcgicp_jax._pairs.batch_executors import Processes
 from mcgicp_jax.io.files import replacing
 
@@ -51,9 +47,6 @@ Pairs: TypeAlias = Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="
 _INTERRUPTED = 130
 # Status of pairs that could not be registered.
 _TRIED_AGAIN = ("invalid_input", "worker_failed")
-# Number of pairs from which processes are faster with their start, 7 s on two cores, where pairs of 2,000 points take
-# 30 ms in threads and 18 ms in processes.
-_PAIRS_FOR_PROCESSES = 500
 
 
 class Table:
@@ -148,8 +141,7 @@ def batch(
             pose, its deviations (m, rad), and the reason if it could not be registered or its pose is doubtful.
         method: {channel_methods} use channels (intensity, colours, ...), the others geometry alone.
         glob: Pattern for the files of a folder, such as "*.ply".
-        workers: Number of processes; needs pip install 'mcgicp_jax[processes]'. auto: one per core for many pairs, else
-            threads.
+        workers: Number of processes. auto: threads, or one process per core where that is faster.
     """
     shared.check(method)
     if workers != "auto":
@@ -162,7 +154,7 @@ def batch(
     rows = {key: row for key, row in rows.items() if key not in wanted or row["status"] not in _TRIED_AGAIN}
     settings = _settings(everything, method, shared)
     missing = {key: pair for key, pair in wanted.items() if key not in rows}
-    settings["executor"] = _executor(workers, len(missing))
+    settings["executor"] = None if workers == "auto" else Processes(workers)
     finished = len(wanted) - len(missing)
     kept = f", of which {finished:,} are in {output} and are kept, whatever the options were" if finished else ""
     print(f"pairs:     {len(wanted):,}{kept}")
@@ -178,13 +170,6 @@ def batch(
     if failed:
         print(f"mcgicp: {failed} of {len(everything)} pairs did not converge; see {output}", file=sys.stderr)
     return 1 if failed else 0
-
-
-def _executor(workers: int | Literal["auto"], num_pairs: int) -> Executor | None:
-    if workers != "auto":
-        return Processes(workers)
-    pay = num_pairs >= _PAIRS_FOR_PROCESSES and num_cores() > 1 and jax.default_backend() == "cpu"
-    return Processes(num_cores()) if pay and importlib.util.find_spec("loky") else None
 
 
 def _register_missing(

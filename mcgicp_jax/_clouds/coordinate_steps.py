@@ -9,10 +9,11 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float
 
 from mcgicp_jax._clouds.point_cloud import PointCloud
-from mcgicp_jax._compute.concrete import AnyArray, AnyScalar, numpy_for
+from mcgicp_jax._compute.cache import cached_with_cloud
+from mcgicp_jax._compute.concrete import AnyArray, AnyScalar, is_concrete, numpy_for
 from mcgicp_jax._math.statistics import sampled_rows
 
 # Steps below this fraction of the spacing do no harm: in rooms of 5,000 points, errors are those without steps up to
@@ -37,8 +38,20 @@ def harmful_steps(cloud: PointCloud, spacing: Float[AnyScalar, ""]) -> Float[Any
     Counted are coarse steps of all axes, those of float32, and those that are no regular sample of surfaces, such as a
     height map, sections or profiles, whose points are exact.
     """
-    xp = numpy_for(cloud.points, cloud.valid, spacing)
-    rows, counts = sampled_rows(xp.asarray(cloud.valid))
+    find = cached_with_cloud(_steps) if is_concrete(cloud) else _steps
+    step, float32 = find(cloud)
+    xp = numpy_for(step, spacing)
+    coarse = step > _HARMFUL * spacing
+    if xp is np and not coarse.any():
+        return np.zeros(3, step.dtype)
+    counted = coarse.all() | (coarse & float32).any() | _shows_rounding(cloud, coarse, step)
+    return xp.where(coarse & counted, step, 0)
+
+
+def _steps(cloud: PointCloud) -> tuple[Float[AnyArray, "3"], Bool[AnyArray, "3"]]:
+    """The step of the coordinates on each axis, metres, 0 if there is none; and whether it is that of float32."""
+    rows, counts = sampled_rows(cloud.valid)
+    xp = numpy_for(cloud.points, counts)
     values = xp.where(counts, xp.asarray(cloud.points)[rows].T, xp.nan)
     largest = xp.max(xp.where(xp.isfinite(values), xp.abs(values), 0), axis=1, keepdims=True)
     # Coordinates that overflow, or are missing, leave no gap.
@@ -52,30 +65,22 @@ def harmful_steps(cloud: PointCloud, spacing: Float[AnyScalar, ""]) -> Float[Any
         fits = xp.abs(multiple - xp.round(multiple)) < _TOLERANCE
         near = apart & (multiple < _MULTIPLES)
         # Rounded coordinates repeat.
-        coarse = (step > _HARMFUL * spacing) & xp.isfinite(step) & (number > 1) & (2 * number < xp.sum(counts))
-        coarse = coarse & (xp.sum(near) >= _LEAST_GAPS)
-        coarse = coarse & (xp.sum(near & fits, axis=1, keepdims=True) >= _FIT * xp.sum(near, axis=1, keepdims=True))
+        rounded = xp.isfinite(step) & (number > 1) & (2 * number < xp.sum(counts))
+        rounded = rounded & (xp.sum(near) >= _LEAST_GAPS)
+        rounded = rounded & (xp.sum(near & fits, axis=1, keepdims=True) >= _FIT * xp.sum(near, axis=1, keepdims=True))
         # The step of float32 at these coordinates, by its 23 bits of fraction.
         place = xp.max(xp.where(counts, xp.abs(values + xp.asarray(cloud.origin)[:, None]), 0), axis=1, keepdims=True)
-        float32 = coarse & (xp.abs(step * 2.0 ** (23 - xp.floor(xp.log2(place))) - 1) < _TOLERANCE)
-    if xp is np and not coarse.any():
-        return np.zeros(3, gaps.dtype)
-    counted = coarse.all() | float32.any() | _shows_rounding(cloud, rows, counts, coarse[:, 0], step[:, 0])
-    return xp.where(coarse & counted, step, 0)[:, 0].astype(gaps.dtype)
+        float32 = xp.abs(step * 2.0 ** (23 - xp.floor(xp.log2(place))) - 1) < _TOLERANCE
+    return xp.where(rounded, step, 0)[:, 0].astype(gaps.dtype), float32[:, 0]
 
 
-def _shows_rounding(
-    cloud: PointCloud,
-    rows: Int[AnyArray, "n"],
-    counts: Bool[AnyArray, "n"],
-    coarse: Bool[AnyArray, "3"],
-    steps: Float[AnyArray, "3"],
-) -> Any:
+def _shows_rounding(cloud: PointCloud, coarse: Bool[AnyArray, "3"], steps: Float[AnyArray, "3"]) -> Any:
     """Whether points with the same coordinates on the coarse axes are more than an exact sample of surfaces has: one
     point for two axes, a line for one. Copies of a planar scan at several heights are exact. False for clouds without
     neighbours."""
     if cloud.deferred_neighbors is None:
         return False
+    rows, counts = sampled_rows(cloud.valid)
     xp = numpy_for(cloud.points, counts, steps)
     points = xp.asarray(cloud.points)
     # Traced rows need those of all.

@@ -12,6 +12,7 @@ from jaxtyping import Bool, Float
 from mcgicp_jax._clouds.coordinate_steps import harmful_steps
 from mcgicp_jax._clouds.placeholders import measured_rows
 from mcgicp_jax._clouds.point_cloud import LARGEST, PointCloud, Values, Voxels, as_cloud, is_far
+from mcgicp_jax._clouds.preprocess_inside_jit import preprocess_traced
 from mcgicp_jax._clouds.voxel_size import NUM_NEIGHBORS, VoxelSize, voxels_and_grids, warn_of_shape
 from mcgicp_jax._clouds.voxels import Grid, grid_of
 from mcgicp_jax._compute.concrete import is_concrete
@@ -33,15 +34,18 @@ def preprocess(
     num_neighbors: int = NUM_NEIGHBORS,
     *,
     search: AbstractSearch | None = None,
+    size: int | None = None,
 ) -> PointCloud:
     """Prepare a cloud for registration: drop points with NaN or infinity, downsample to voxels, find neighbours.
 
     A NaN drops the point in a channel as well, unless `channel_valid` says that the channel is missing. The neighbours
     of a point are found when they are first needed.
 
-    Preprocess each cloud once and register it as often as needed. Runs on the host; not inside `jit` or `vmap`. Points,
-    channels and covariances of the result can be differentiated by those of the raw cloud; voxels and neighbours are
-    constants.
+    Preprocess each cloud once and register it as often as needed. Points, channels and covariances of the result can be
+    differentiated by those of the raw cloud; voxels and neighbours are constants.
+
+    Runs on the host, or inside `jit` and `vmap`. There, `voxel_size` is None or a number, coordinates are not centred,
+    points that are not finite become padding, all others are kept, and nothing is warned of.
 
     Args:
         cloud: raw cloud, or (N, 3) array in metres. Padding and old neighbours are dropped first.
@@ -53,15 +57,19 @@ def preprocess(
             covariances. The repr of the result says what was chosen and why. None keeps every point.
         num_neighbors: number k of neighbours, including the point itself, from which a covariance is computed; at
             least 3. All points are used if the cloud has fewer.
-        search: neighbour search; by default `KDTreeSearch`.
+        search: neighbour search; by default `KDTreeSearch`, and inside `jit` or `vmap` on accelerators `DenseSearch`.
+        size: number of rows of the result, which is padded to it. Inside `jit` and `vmap`, it must be given with a
+            `voxel_size`; if more voxels are occupied, no row of the result is valid, and registrations with it have
+            the status TOO_FEW_CORRESPONDENCES.
 
     Returns:
         Cloud with read-only NumPy arrays, float64 if the input is and JAX's x64 is on, else float32. If the
         coordinates are large relative to the cloud's size, they are centred and `PointCloud.origin` keeps the offset.
 
     Raises:
-        ValueError: if fewer than four points are finite (or remain after downsampling), the cloud is traced, a cloud
-            with covariances is to be downsampled, the cloud is a batch, or an argument is out of range.
+        ValueError: if fewer than four points are finite (or remain after downsampling), outside of `jit` more than
+            `size` remain, a cloud with covariances is to be downsampled, the cloud is a batch, or an argument is out
+            of range.
 
     Warns:
         UserWarning: once per call, if points with NaN or infinity were left out, or points that share exactly one
@@ -71,7 +79,12 @@ def preprocess(
             spacing, or if `voxel_size` is None and more than a tenth of the neighbourhoods are lines, or most are more
             than 0.6 times as thick as wide.
     """
-    return preprocessed_in(None, cloud, voxel_size, num_neighbors, search)
+    cloud = as_cloud("cloud", cloud)
+    if not is_concrete(primal(cloud)):
+        check_preprocessing(voxel_size, num_neighbors)
+        return preprocess_traced(cloud, voxel_size, num_neighbors, search, size)
+    found = preprocessed_in(None, cloud, voxel_size, num_neighbors, search)
+    return found if size is None else found.pad(size)
 
 
 def preprocessed_in(
@@ -206,7 +219,10 @@ def finite_rows(cloud: PointCloud | Values) -> PointCloud:
     two."""
     cloud = as_cloud("cloud", cloud)
     if not is_concrete(cloud):
-        raise ValueError("cloud: expected concrete arrays, got tracers; preprocess outside of jit and vmap")
+        raise ValueError(
+            "cloud: expected a preprocessed cloud inside jit and vmap; call preprocess(cloud, voxel_size, size=...), "
+            "or preprocess(cloud, None) for all points"
+        )
     if cloud.points.ndim != 2:
         raise ValueError(f"cloud: expected a single cloud, got a batch of shape {cloud.points.shape}")
     cloud = cloud.unpad()

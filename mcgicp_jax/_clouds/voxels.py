@@ -18,7 +18,7 @@ VOXELS_PER_AXIS = 2**21
 # Angles in radians by which grids are turned: about the diagonal, so that the axes of a grid are 48 degrees from those
 # of the cloud, along which scenes often lie; and at most about each axis, to make grids differ. The axes then come no
 # nearer than 18 degrees. Variations of 0.1 to 0.3, and grids of any direction, give the same errors.
-_TURN, _VARIATION = np.pi / 3, 0.3
+TURN, VARIATION = np.pi / 3, 0.3
 
 
 def voxel_of(points: Float[np.ndarray, "*N 3"], voxel_size: float) -> Float[np.ndarray, "*N 3"]:
@@ -111,8 +111,8 @@ def grid_of(points: Float[np.ndarray, "N 3"]) -> Grid:
     columns = np.ascontiguousarray(points.T, np.float64)
     middle = 0.5 * (columns.min(axis=1) + columns.max(axis=1))
     sides = [int(np.sum(column > value)) for column, value in zip(columns, middle, strict=True)]
-    variation = np.random.default_rng([len(points), *sides]).uniform(-_VARIATION, _VARIATION, 3)
-    return Grid(rotated(columns.T, Rotation.from_rotvec(_TURN / np.sqrt(3) + variation).as_matrix()).T)
+    variation = np.random.default_rng([len(points), *sides]).uniform(-VARIATION, VARIATION, 3)
+    return Grid(rotated(columns.T, Rotation.from_rotvec(TURN / np.sqrt(3) + variation).as_matrix()).T)
 
 
 def starts_of(sorted_keys: Int[np.ndarray, "N"]) -> Int[np.ndarray, "M"]:

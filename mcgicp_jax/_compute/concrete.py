@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 from collections.abc import Callable, Iterator
+from contextvars import ContextVar
 from types import ModuleType
 from typing import TYPE_CHECKING, Any, TypeAlias
 
@@ -55,14 +56,24 @@ def is_concrete(*trees: object) -> bool:
     return not any(map(_is_tracer, jax.tree.leaves(trees, is_leaf=is_deferred)))
 
 
+_is_outside: ContextVar[bool] = ContextVar("is_outside", default=False)
+
+
 @contextlib.contextmanager
 def outside_trace() -> Iterator[None]:
     """Context in which concrete arrays are computed at once and on the CPU, even while a caller's `jit` is traced."""
+    if _is_outside.get():
+        yield
+        return
     with on_cpu():
         # Only inside a trace, since `jax.ensure_compile_time_eval` evaluates operation by operation.
         staged = isinstance(_zero(), jax.core.Tracer)
-        with jax.ensure_compile_time_eval() if staged else contextlib.nullcontext():
-            yield
+        before = _is_outside.set(True)
+        try:
+            with jax.ensure_compile_time_eval() if staged else contextlib.nullcontext():
+                yield
+        finally:
+            _is_outside.reset(before)
 
 
 @jax.jit

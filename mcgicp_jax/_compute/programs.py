@@ -30,7 +30,7 @@ class _Compilations:
         self._lock = threading.Lock()
 
     def __call__(self, event: str, duration_secs: float, **_: str | int) -> None:
-        if event != _COMPILATION or self.seconds > _LONG:
+        if event != _COMPILATION:
             return
         with self._lock:
             before, self.seconds = self.seconds, self.seconds + duration_secs

@@ -19,6 +19,9 @@ from mcgicp_jax._compute.devices import put_on_cpu
 class Numbers(eqx.Module):
     """An equinox module with numeric fields, whose `repr` shows their values."""
 
+    # As in `PointCloud`.
+    __getattribute__ = object.__getattribute__
+
     def __repr__(self) -> str:
         parts = []
         for field in dataclasses.fields(self):

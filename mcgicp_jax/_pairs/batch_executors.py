@@ -14,24 +14,29 @@ from concurrent import futures
 from concurrent.futures import BrokenExecutor, Executor, Future, ProcessPoolExecutor, ThreadPoolExecutor
 from dataclasses import replace
 from functools import partial
-from multiprocessing import get_context, resource_tracker
+from multiprocessing import current_process, get_context, resource_tracker
 from pickle import PicklingError
 from typing import Any, ClassVar, Literal, TypeAlias
 
 import jax
 import jaxlie
 import numpy as np
+import psutil
+from loky import get_reusable_executor
 
 from mcgicp_jax._compute.concrete import is_concrete, is_deferred
 from mcgicp_jax._compute.linear_maps import KnownJacobian, primal, with_derivative
 from mcgicp_jax._compute.messages import warn
+from mcgicp_jax._compute.programs import COMPILATIONS, LOGGER
 from mcgicp_jax._compute.threads import num_cores, with_settings
 from mcgicp_jax._pairs.batch_jobs import BatchJob, Pair, PairResult, PreparedPair
 from mcgicp_jax._registration.assessment import fields_of_pose
 from mcgicp_jax._registration.options import Options
 from mcgicp_jax._registration.result import RegistrationResult, Status
 
-GivenExecutor: TypeAlias = Executor | Literal["processes"] | None
+GivenExecutor: TypeAlias = Executor | Literal["processes", "threads"] | None
+# An executor; threads; or, if None, what is faster.
+ChosenExecutor: TypeAlias = Executor | Literal["threads"] | None
 
 # Number of pairs per chunk for a worker that is not a thread, and maximum number of submitted chunks.
 _CHUNK_SIZE, _MAX_SUBMITTED = 8, 64
@@ -57,6 +62,12 @@ _SETTINGS = (
 )
 # Seconds between looks of a worker at its parent.
 _LOOK = 1.0
+# Processes start if the time that they save is so many times their start. Their rate is that of threads times the
+# number of cores and a factor: 1.5 times that of threads on two cores, 8.6 times on sixteen (pairs of 2,000 points).
+_PAYS, _RATE = 1.5, 0.55
+# Seconds in which two workers start on two cores, besides what they compile; and memory of a worker, bytes, with pairs
+# of some 10,000 points.
+_START, _MEMORY = 3.2, 2**29
 
 
 class Processes(Executor):
@@ -65,12 +76,10 @@ class Processes(Executor):
 
     # Chunks of all batches that have not ended, with their batches.
     _unfinished: ClassVar[dict[Future[Any], Processes]] = {}
+    # Whether workers of this process have compiled, and wait for more.
+    are_warm: ClassVar[bool] = False
 
     def __init__(self, num_workers: int):
-        try:
-            from loky import get_reusable_executor
-        except ImportError as error:
-            raise ImportError("executor: processes need loky: pip install 'mcgicp_jax[processes]'") from error
         values = {name.upper(): getattr(jax.config, name) for name in _SETTINGS}
         environment = _ENVIRONMENT | {name: str(value) for name, value in values.items() if value is not None}
         begin = {"initializer": _begin_worker, "initargs": (os.getpid(),), "env": environment}
@@ -101,6 +110,7 @@ class Processes(Executor):
         # Ended workers fail all futures, which loky cannot do to cancelled ones.
         if all(batch is self for batch in unfinished.values()):
             self._pool.shutdown(wait, kill_workers=True)
+            Processes.are_warm = False
         for future, batch in unfinished.items():
             if batch is self:
                 future.cancel()
@@ -132,12 +142,16 @@ def _begin_worker(parent: int) -> None:
     threading.Thread(target=watch, daemon=True).start()
 
 
-def executor_of(executor: GivenExecutor) -> Executor | None:
-    """The executor to use; `ValueError` unless it is None, "processes" or an executor that may run JAX."""
+def executor_of(executor: GivenExecutor) -> ChosenExecutor:
+    """The executor to use; `ValueError` unless it is None, "processes", "threads" or an executor that may run JAX."""
     if isinstance(executor, str) and executor == "processes":
         return Processes(num_cores())
+    if isinstance(executor, str) and executor == "threads":
+        return "threads"
     if executor is not None and (isinstance(executor, type) or not hasattr(executor, "submit")):
-        raise ValueError(f'executor: expected a concurrent.futures.Executor, "processes" or None, got {executor!r}')
+        raise ValueError(
+            f'executor: expected a concurrent.futures.Executor, "processes", "threads" or None, got {executor!r}'
+        )
     context = getattr(executor, "_mp_context", None)
     if isinstance(executor, ProcessPoolExecutor) and context is not None and context.get_start_method() == "fork":
         raise ValueError(
@@ -148,9 +162,10 @@ def executor_of(executor: GivenExecutor) -> Executor | None:
 
 
 def run(
-    job: BatchJob, pairs: Iterator[Pair], executor: Executor | None
+    job: BatchJob, pairs: Iterator[Pair], executor: ChosenExecutor, count: int | None
 ) -> Generator[tuple[int, RegistrationResult], None, None]:
-    """Register the pairs and yield index and result of each as soon as it is computed; see `register_as_completed`."""
+    """Register the pairs and yield index and result of each as soon as it is computed; see `register_as_completed`.
+    `count` is the number of pairs, if it is known."""
 
     def concrete(pair: Pair) -> Pair:
         if not is_concrete(pair.source, pair.target, pair.prior):
@@ -160,7 +175,7 @@ def run(
             )
         return pair
 
-    for result in _results(job, map(concrete, pairs), executor):
+    for result in _results(job, map(concrete, pairs), executor, count):
         yield result.index, result.registration
 
 
@@ -175,7 +190,7 @@ def run_differentiated(job: BatchJob, pairs: Iterator[Pair], executor: Executor)
     fixed = replace(job, method=primal(job.method), options=replace(job.options, robust=primal(job.options.robust)))
     sent = (Pair(each.index, *each.inputs.values()[:2], each.init, each.prior, each.traced) for each in ready.values())
     results = {index: result.with_warning() for index, result in outcomes.items() if index not in ready}
-    results |= {result.index: result for result in _results(fixed, sent, executor)}
+    results |= {result.index: result for result in _results(fixed, sent, executor, len(ready))}
     return [
         _differentiable(results[index], ready[index]) if index in ready else results[index].registration
         for index in outcomes
@@ -195,19 +210,101 @@ def _differentiable(answer: PairResult, pair: PreparedPair) -> RegistrationResul
     return result.build(**vars(result) | fields_of_pose(jaxlie.SE3(pose), *origins))
 
 
-def _results(job: BatchJob, pairs: Iterator[Pair], executor: Executor | None) -> Iterator[PairResult]:
-    num_workers = num_cores()
+def _results(job: BatchJob, pairs: Iterator[Pair], executor: ChosenExecutor, count: int | None) -> Iterator[PairResult]:
     if executor is None and job.uses_lanes:
-        yield from map(PairResult.with_warning, job.register_in_lanes(pairs, num_workers))
+        yield from map(PairResult.with_warning, job.register_in_lanes(pairs, num_cores()))
     elif executor is None:
-        with ThreadPoolExecutor(num_workers, thread_name_prefix="mcgicp") as threads:
-            yield from ChunkedExecutor(job, threads).run(pairs, 1, 2 * num_workers)
+        yield from _by_threads_then_processes(job, pairs, count)
+    elif executor == "threads":
+        yield from _by_threads(job, pairs)
     elif isinstance(executor, Processes):
-        # More than loky's queue holds, so that no worker waits.
-        yield from ChunkedExecutor(job, executor).run(pairs, _SMALL_CHUNK, 4 * executor.num_workers)
+        yield from _by_processes(job, pairs, executor)
     else:
         chunk_size = 1 if isinstance(executor, ThreadPoolExecutor) else _CHUNK_SIZE
         yield from ChunkedExecutor(job, executor).run(pairs, chunk_size, _MAX_SUBMITTED)
+
+
+def _by_threads(job: BatchJob, pairs: Iterator[Pair]) -> Iterator[PairResult]:
+    with ThreadPoolExecutor(num_cores(), thread_name_prefix="mcgicp") as threads:
+        yield from ChunkedExecutor(job, threads).run(pairs, 1, 2 * num_cores())
+
+
+def _by_processes(
+    job: BatchJob, pairs: Iterator[Pair], processes: Processes, at_home: bool = False
+) -> Iterator[PairResult]:
+    # More than loky's queue holds, so that no worker waits.
+    yield from ChunkedExecutor(job, processes, at_home).run(pairs, _SMALL_CHUNK, 4 * processes.num_workers)
+    Processes.are_warm = True
+
+
+def _by_threads_then_processes(job: BatchJob, pairs: Iterator[Pair], count: int | None) -> Iterator[PairResult]:
+    """The first pairs by threads, which measure how long a pair takes. If processes pay, they start while threads go
+    on, and register the rest."""
+    rest: Iterator[Pair] | None = None
+    start = _Start(job, count)
+
+    def until_processes_run() -> Iterator[Pair]:
+        nonlocal rest
+        for pair in pairs:
+            if start.has_ended(pair):
+                rest = itertools.chain([pair], pairs)
+                return
+            yield pair
+
+    for result in _by_threads(job, until_processes_run()):
+        start.finished += 1
+        yield result
+    if rest is not None and start.processes is not None:
+        yield from _by_processes(job, rest, start.processes, at_home=True)
+
+
+class _Start:
+    """The start of processes for the rest of a batch, if they pay.
+
+    Attributes:
+        finished: number of pairs that threads have registered.
+        processes: None until they are started, and if they cannot run the job.
+    """
+
+    def __init__(self, job: BatchJob, count: int | None):
+        self._job, self._count = job, count
+        self.finished = 0
+        self.processes: Processes | None = None
+        # At the first call, and once each thread has compiled.
+        self._begun: tuple[int, float] | None = None
+        self._first: Future[None] | None = None
+        self._num_workers = min(num_cores(), psutil.virtual_memory().available // _MEMORY)
+        # Workers of other pools have their cores to themselves.
+        self._possible = self._num_workers > 1 and current_process().name == "MainProcess"
+
+    def has_ended(self, pair: Pair) -> bool:
+        """Whether the processes run; starts them if they pay. `pair` is the next one, of which it is tried whether it
+        can be sent."""
+        if not self._possible:
+            return False
+        if self._first is None and self._pays(pair.index):
+            LOGGER.info("register_batch: pairs go on in %d processes from about pair %d", self._num_workers, pair.index)
+            self.processes = Processes(self._num_workers)
+            sent = with_settings(_as_numpy(self._job).received, pickled=True)
+            self._first = self.processes.submit(sent, _as_numpy(pair))
+        if self._first is None or not self._first.done():
+            return False
+        # Not what can be pickled, or imported by a worker.
+        self._possible = self._first.exception() is None
+        self.processes = self.processes if self._possible else None
+        return self._possible
+
+    def _pays(self, sent: int) -> bool:
+        now = time.perf_counter()
+        if self._begun is None and self.finished >= num_cores():
+            self._begun = self.finished, now
+        if self._begun is None or self.finished < self._begun[0] + num_cores():
+            return False
+        by_threads = (now - self._begun[1]) / (self.finished - self._begun[0])
+        # As many as were sent, if nobody knows.
+        left = sent if self._count is None else self._count - sent
+        saved = left * by_threads * (1 - 1 / (_RATE * self._num_workers))
+        return saved > _PAYS * (0.0 if Processes.are_warm else _START + COMPILATIONS.seconds)
 
 
 class ChunkedExecutor:
@@ -215,10 +312,13 @@ class ChunkedExecutor:
 
     A chunk may fail because one of its pairs killed the worker, or because another chunk broke the pool. The pairs of
     failed chunks are suspects, submitted again at the end one by one: only those that fail alone get `WORKER_FAILED`.
+
+    Args:
+        at_home: whether pairs that cannot be sent to another process are registered in this one, instead of an error.
     """
 
-    def __init__(self, job: BatchJob, executor: Executor):
-        self._executor = executor
+    def __init__(self, job: BatchJob, executor: Executor, at_home: bool = False):
+        self._executor, self._at_home = executor, job if at_home else None
         self._replacement: Executor | None = None
         self._pickled = not isinstance(executor, ThreadPoolExecutor)
         job = _as_numpy(job) if self._pickled else job
@@ -264,6 +364,9 @@ class ChunkedExecutor:
             try:
                 results = future.result()
             except PicklingError as error:
+                if self._at_home is not None:
+                    yield from map(PairResult.with_warning, self._at_home.register_chunk(chunk))
+                    continue
                 raise ValueError(
                     f"pairs {chunk[0].index} to {chunk[-1].index}: expected clouds and functions that can be sent to "
                     f"other processes; {_reason(error)}"

@@ -192,6 +192,9 @@ class BatchJob:
         """Register the pairs one after the other, on the CPU: workers would compete for an accelerator."""
         return [self._register_with_jacobian(pair) if pair.traced else self._register(pair) for pair in chunk]
 
+    def received(self, pair: Pair) -> None:
+        """Nothing: that this job and the pair could be sent to a worker is all that is asked."""
+
     def register_chunk_alone(self, chunk: list[Pair]) -> list[PairResult]:
         """`register_chunk` in a process without other threads; the first result has the warnings."""
         with warnings.catch_warnings(record=True) as caught:

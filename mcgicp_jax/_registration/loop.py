@@ -92,6 +92,8 @@ class Problem(eqx.Module):
     num_candidates: int = eqx.field(static=True, default=1)
     temperature: Any = None
     widens_kernels: bool = eqx.field(static=True, default=False)
+    # As in `PointCloud`.
+    __getattribute__ = object.__getattribute__
 
     def whole(self) -> Problem:
         """With all rows of both surfaces."""

@@ -10,8 +10,7 @@ from jaxtyping import Bool, Float, Int
 
 from mcgicp_jax._clouds.coordinate_steps import harmful_steps
 from mcgicp_jax._clouds.point_cloud import PointCloud
-from mcgicp_jax._compute.cache import cached_with_cloud
-from mcgicp_jax._compute.concrete import AnyArray, AnyScalar, constant, is_concrete, numpy_for
+from mcgicp_jax._compute.concrete import AnyArray, AnyScalar, constant, numpy_for
 from mcgicp_jax._local_geometry.cloud_statistics import grid_spacing, point_spacing
 from mcgicp_jax._local_geometry.local_geometry import cell_edge
 from mcgicp_jax._math.statistics import median, sampled_rows
@@ -129,8 +128,7 @@ def settings_for(
     least = spacing * _TOLERANCE_IN_SPACINGS
     tolerance = least if tolerance is None else tolerance
 
-    find_steps = cached_with_cloud(harmful_steps) if is_concrete(source, target, spacing) else harmful_steps
-    steps = [find_steps(constant(cloud), spacing) for cloud in (source, target)]
+    steps = [harmful_steps(constant(cloud), spacing) for cloud in (source, target)]
 
     def number(value: Any, kind: Any) -> Any:
         return numpy_for(value).asarray(value, kind)

@@ -23,6 +23,7 @@ from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from jaxtyping import Array, Bool, Float, Int
 
 from mcgicp_jax._clouds.point_cloud import PointCloud
+from mcgicp_jax._clouds.preprocess_inside_jit import traced_neighbors
 from mcgicp_jax._compute.devices import default_devices
 from mcgicp_jax._compute.programs import size_class
 from mcgicp_jax._compute.tables import Packed
@@ -35,7 +36,7 @@ from mcgicp_jax._registration.options import Options
 from mcgicp_jax._registration.pose_derivative import Inputs
 from mcgicp_jax._registration.register_pair import problem_of
 from mcgicp_jax._registration.traced import TracedExecutor, assess
-from mcgicp_jax._search.base import IDENTITY, AbstractSearch, SearchPoints
+from mcgicp_jax._search.base import AbstractSearch
 
 Key = TypeVar("Key")
 
@@ -282,10 +283,7 @@ def with_neighbors(
     def with_own(cloud: PointCloud) -> PointCloud:
         if cloud.deferred_neighbors is not None:
             return cloud
-        points = SearchPoints(cloud.points, cloud.points[:, :0], cloud.valid)
-        pose, everywhere = jnp.asarray(IDENTITY, cloud.points.dtype), jnp.asarray(jnp.inf, cloud.points.dtype)
-        neighbors = search.nearest_traced(pose, points, points, everywhere, jnp.bool_(True), num_neighbors)
-        return cloud.replace_rows(deferred_neighbors=neighbors.T)
+        return cloud.replace_rows(deferred_neighbors=traced_neighbors(cloud, num_neighbors, search))
 
     ready = [jax.vmap(with_own)(stacked) for stacked in clouds]
     sides = zip((ready[0], ready[-1]), rows.T, strict=True)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import partial
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -17,6 +18,10 @@ from mcgicp_jax._compute.devices import on_accelerator
 from mcgicp_jax._compute.programs import size_class
 from mcgicp_jax._search.base import IDENTITY, AbstractIndex, AbstractSearch, SearchPoints, on_host, search_points
 from mcgicp_jax._search.kd_tree import KDTreeSearch
+
+# Rows of a run and of its parts, and of the smallest target with which several neighbours are sought by runs; and rows
+# of queries whose distances to parts are stored at a time.
+_RUN, _PART, _LEAST_FOR_RUNS, _QUERIES = 64, 8, 512, 512
 
 
 def default_search(traced: bool = False, workers: int = -1) -> AbstractSearch:
@@ -86,29 +91,86 @@ def _nearest(
     rotation = jaxlie.SO3(pose[:4]).as_matrix().astype(pose.dtype)
     moved = jnp.dot(source.points, rotation.T, precision="highest") + pose[4:]
     queries = eqx.tree_at(lambda rows: rows.points, source, moved)
+    complete = source.penalty is None and target.penalty is None
+    if num_candidates > 1 and complete and target.valid.size >= _LEAST_FOR_RUNS:
+        return _nearest_by_runs(queries, target, num_candidates)
     rows = jnp.arange(target.valid.size, dtype=jnp.int32)
 
-    def following(
-        before: tuple[Float[Array, "N"], Int[Array, "N"]], _: None
-    ) -> tuple[tuple[Float[Array, "N"], Int[Array, "N"]], Int[Array, "N"]]:
-        """For each query, the target row next after `before` in the order of (squared distance, row)."""
-        # Without the barrier the compiler would hoist the loop-invariant distances out of the loop and store them.
-        before, *again = jax.lax.optimization_barrier((before, queries, target, rows))
-        square = _squares(*again[:2])
-        numbers = jnp.broadcast_to(again[2], square.shape)
-        distance, row = (values[:, None] for values in before)
-        # False where the distance is NaN.
-        after = (square > distance) | ((square == distance) & (numbers > row))
-        smallest, nearest = jax.lax.reduce(
-            (jnp.where(after & target.valid, square, jnp.inf), numbers),
-            (jnp.asarray(jnp.inf, square.dtype), jnp.int32(rows.size)),
+    def squares(source: SearchPoints, target: SearchPoints, rows: Int[Array, "M"]) -> tuple[Array, Array]:
+        square = jnp.where(target.valid, _squares(source, target), jnp.inf)
+        return square, jnp.broadcast_to(rows, square.shape)
+
+    square, nearest = _first(squares, (queries, target, rows), source.valid.size, num_candidates)
+    return jnp.where(jnp.isfinite(square) & source.valid, nearest, -1)
+
+
+def _first(
+    numbered: Callable[..., tuple[Float[Array, "N M"], Int[Array, "N M"]]], arguments: Any, size: int, count: int
+) -> tuple[Float[Array, "m N"], Int[Array, "m N"]]:
+    """The `count` smallest squares of each of N rows, and their numbers, by which ties are broken; of the table that
+    `numbered(*arguments)` computes, which is not stored."""
+
+    def following(before: tuple[Array, Array], _: None) -> tuple[tuple[Array, Array], tuple[Array, Array]]:
+        """The next after `before` in the order of (square, number)."""
+        # Without the barrier the compiler would hoist the loop-invariant squares out of the loop and store them.
+        before, again = jax.lax.optimization_barrier((before, arguments))
+        square, numbers = numbered(*again)
+        least, number = (values[:, None] for values in before)
+        # False where the square is NaN.
+        after = (square > least) | ((square == least) & (numbers > number))
+        found = jax.lax.reduce(
+            (jnp.where(after, square, jnp.inf), numbers),
+            (jnp.asarray(jnp.inf, square.dtype), jnp.int32(np.iinfo(np.int32).max)),
             _nearer,
             dimensions=(1,),
         )
-        return (smallest, nearest), jnp.where(jnp.isfinite(smallest) & source.valid, nearest, -1)
+        return found, found
 
-    start = (jnp.full(source.valid.size, -1, moved.dtype), jnp.full(source.valid.size, -1, jnp.int32))
-    return jax.lax.scan(following, start, length=num_candidates)[1]
+    dtype = jax.eval_shape(numbered, *arguments)[0].dtype
+    start = (jnp.full(size, -1, dtype), jnp.full(size, -1, jnp.int32))
+    return jax.lax.scan(following, start, length=count)[1]
+
+
+def _given(square: Float[Array, "N M"], numbers: Int[Array, "N M"]) -> tuple[Array, Array]:
+    return square, numbers
+
+
+def _nearest_by_runs(queries: SearchPoints, target: SearchPoints, num_candidates: int) -> Int[Array, "m N"]:
+    """Several nearest target rows, in three levels: the nearest runs of rows, of these the nearest parts, and of those
+    the nearest rows. Exact, since as many runs, or parts, each with a row at its distance, come before any other one.
+    """
+
+    def column_of(array: Float[Array, "n"], multiple: int) -> Float[Array, "m"]:
+        return jnp.pad(array, (0, -array.size % multiple), constant_values=jnp.nan)
+
+    pairs = zip((queries, target), (_QUERIES, _RUN), strict=True)
+    blocks, columns = (
+        [column_of(column, multiple) for column in (*rows.points.T, *rows.descriptors.T)] for rows, multiple in pairs
+    )
+    valid = jnp.pad(target.valid, (0, -target.valid.size % _RUN))
+    columns = [jnp.where(valid, column, jnp.inf) for column in columns]
+
+    def of_block(block: list[Float[Array, "n"]]) -> Int[Array, "m n"]:
+        numbers = jnp.broadcast_to(jnp.arange(valid.size // _RUN, dtype=jnp.int32), (_QUERIES, valid.size // _RUN))
+        for width, finer in ((_RUN, _PART), (_PART, 1)):
+            # Distances of all rows of these runs, or parts, reduced at once.
+            chosen = slice(None) if width == _RUN else numbers
+            squares = [
+                (query[:, None, None] - column.reshape(-1, width)[chosen]) ** 2
+                for query, column in zip(block, columns, strict=True)
+            ]
+            least = jnp.min(sum(squares[1:], squares[0]), axis=2)
+            _, nearest = _first(_given, (least, numbers), _QUERIES, num_candidates)
+            # Numbers beyond the last are those of no run.
+            nearest = jnp.minimum(nearest.T, valid.size // width - 1)
+            numbers = (nearest[:, :, None] * (width // finer) + jnp.arange(width // finer)).reshape(_QUERIES, -1)
+        squares = [(query[:, None] - column[numbers]) ** 2 for query, column in zip(block, columns, strict=True)]
+        square, rows = _first(_given, (sum(squares[1:], squares[0]), numbers), _QUERIES, num_candidates)
+        return jnp.where(jnp.isfinite(square), rows, -1)
+
+    found = jax.lax.map(of_block, [block.reshape(-1, _QUERIES) for block in blocks])
+    found = found.transpose(1, 0, 2).reshape(num_candidates, -1)[:, : queries.valid.size]
+    return jnp.where(queries.valid, found, -1)
 
 
 def _squares(source: SearchPoints, target: SearchPoints) -> Float[Array, "N M"]:

@@ -1,0 +1,124 @@
+"""Preprocessing of traced clouds, inside `jit` and `vmap`: all shapes are known before the points are."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import jaxlie
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
+
+from mcgicp_jax._clouds.point_cloud import LARGEST, PointCloud, Voxels
+from mcgicp_jax._clouds.voxels import TURN, VARIATION
+from mcgicp_jax._compute.concrete import is_concrete
+from mcgicp_jax._compute.messages import check_integer
+from mcgicp_jax._compute.threads import with_settings_of_package
+from mcgicp_jax._search.base import IDENTITY, AbstractSearch, SearchPoints
+from mcgicp_jax._search.brute_force import default_search
+
+
+@with_settings_of_package
+def preprocess_traced(
+    cloud: PointCloud, voxel_size: Any, num_neighbors: int, search: AbstractSearch | None, size: int | None
+) -> PointCloud:
+    """`preprocess` of a traced cloud."""
+    edge = voxel_size.size if isinstance(voxel_size, Voxels) else voxel_size
+    if isinstance(edge, str) or not is_concrete(edge):
+        raise ValueError(f"voxel_size: expected a number or None inside jit and vmap, got {edge!r}")
+    if cloud.points.ndim != 2:
+        raise ValueError(f"cloud: expected a single cloud, got a batch of shape {cloud.points.shape}; use jax.vmap")
+    arrays = [array for array in (cloud.points, cloud.channels, cloud.covariances) if array is not None]
+    valid = jnp.asarray(cloud.valid)
+    for array in arrays:
+        valid = valid & jnp.all(jnp.abs(array) <= LARGEST, axis=tuple(range(1, array.ndim)))
+    cloud = cloud.replace_rows(times=None, deferred_neighbors=None, valid=valid)
+    if edge is None:
+        cloud = _valid_first(cloud)
+        cloud = cloud if size is None else cloud.pad(size)
+    else:
+        if cloud.covariances is not None:
+            raise ValueError("voxel_size: expected None for a cloud with covariances, which cannot be averaged")
+        if size is None:
+            raise ValueError("size: expected a number of rows with a voxel_size inside jit and vmap, got None")
+        check_integer("size", size, 1)
+        cloud = _averaged(cloud, float(edge), size)
+    return cloud.replace_rows(
+        deferred_neighbors=traced_neighbors(cloud, num_neighbors, search or default_search(traced=True)),
+        voxels=Voxels(edge),
+    )
+
+
+def traced_neighbors(cloud: PointCloud, num_neighbors: int, search: AbstractSearch) -> Int[Array, "N k"]:
+    """Rows of the nearest neighbours of each valid point; −1 where there is none."""
+    points = jax.lax.stop_gradient(jnp.asarray(cloud.points))
+    rows = SearchPoints(points, points[:, :0], jnp.asarray(cloud.valid))
+    pose, everywhere = jnp.asarray(IDENTITY, points.dtype), jnp.asarray(jnp.inf, points.dtype)
+    return search.nearest_traced(pose, rows, rows, everywhere, jnp.bool_(True), num_neighbors).T
+
+
+def _valid_first(cloud: PointCloud) -> PointCloud:
+    """The cloud with its valid rows first, in their order; the last of them fills up the others."""
+    valid = jnp.asarray(cloud.valid)
+    rows = jnp.argsort(~valid, stable=True)
+    place = jnp.arange(valid.size)
+    rows = rows[jnp.minimum(place, jnp.maximum(jnp.sum(valid) - 1, 0))]
+
+    def taken(array: Any) -> Any:
+        # A cloud without any valid row has zeros, whose derivative is 0.
+        known = valid[rows].reshape(-1, *[1] * (array.ndim - 1))
+        return jnp.where(known, jnp.asarray(array)[rows], 0)
+
+    names = ("points", "channels", "channel_valid", "covariances")
+    some = {name: taken(getattr(cloud, name)) for name in names if getattr(cloud, name) is not None}
+    return cloud.replace_rows(valid=place < jnp.sum(valid), **some)
+
+
+def _averaged(cloud: PointCloud, voxel_size: float, size: int) -> PointCloud:
+    """The mean points and channels of each voxel, sorted by voxel; no row is valid if there are more than `size`."""
+    points, valid = jnp.asarray(cloud.points), jnp.asarray(cloud.valid)
+    order, numbers, count = _voxels_of(jax.lax.stop_gradient(points), valid, voxel_size)
+
+    def means(array: Float[Array, "N D"], counts: Bool[Array, "N D"]) -> tuple[Array, Bool[Array, "M D"]]:
+        values, weights = jnp.where(counts, array, 0)[order], counts[order].astype(points.dtype)
+        # Rows beyond the last voxel are dropped.
+        total, weight = (jax.ops.segment_sum(each, numbers, size) for each in (values, weights))
+        return total / jnp.maximum(weight, 1), weight > 0
+
+    channels = jnp.asarray(cloud.channels)
+    measured = jnp.ones_like(channels, bool) if cloud.channel_valid is None else jnp.asarray(cloud.channel_valid)
+    mean, occupied = means(points, jnp.broadcast_to(valid[:, None], points.shape))
+    mean_channels, channel_valid = means(channels, measured & valid[:, None])
+    return _valid_first(
+        cloud.replace_rows(
+            points=mean,
+            channels=mean_channels,
+            channel_valid=None if cloud.channel_valid is None else channel_valid,
+            valid=occupied[:, 0] & (count <= size),
+        )
+    )
+
+
+def _voxels_of(
+    points: Float[Array, "N 3"], valid: Bool[Array, "N"], voxel_size: float
+) -> tuple[Int[Array, "N"], Int[Array, "N"], Int[Array, ""]]:
+    """An order that sorts rows by voxel, the number of the voxel of each row in it, and how many are occupied. The
+    numbers of invalid rows, which come last, are beyond all others."""
+    # Turned as the grids of the host are, by other random numbers.
+    middle = 0.5 * sum(end(jnp.where(valid[:, None], points, far), axis=0) for end, far in _ENDS)
+    key = jax.random.key(0)
+    for number in (jnp.sum(valid), *jnp.sum(valid[:, None] & (points > middle), axis=0)):
+        key = jax.random.fold_in(key, number)
+    angles = TURN / np.sqrt(3) + jax.random.uniform(key, (3,), points.dtype, -VARIATION, VARIATION)
+    turn = jaxlie.SO3.exp(angles).as_matrix().astype(points.dtype)
+    x, y, z = jnp.floor(jnp.dot(points, turn.T, precision="highest") / voxel_size).T
+    order = jnp.lexsort((z, y, x, ~valid))
+    cells = jnp.stack([x, y, z, ~valid])[:, order]
+    begins = jnp.any(cells[:, 1:] != cells[:, :-1], axis=0)
+    numbers = jnp.concatenate([jnp.zeros(1, jnp.int32), jnp.cumsum(begins, dtype=jnp.int32)])
+    count = jnp.max(jnp.where(valid[order], numbers + 1, 0))
+    return order, jnp.where(valid[order], numbers, np.iinfo(np.int32).max), count
+
+
+_ENDS = ((jnp.min, np.inf), (jnp.max, -np.inf))

@@ -1,0 +1,167 @@
+"""`preprocess` of traced clouds: neighbours as those of trees, voxel means, what does not fit, derivatives."""
+
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import jax.test_util
+import numpy as np
+import pytest
+
+import mcgicp_jax as mcg
+from mcgicp_jax import PointCloud
+from mcgicp_jax._clouds.preprocess_inside_jit import _voxels_of
+from tests.precision import in_float64
+from tests.refusals import refused
+from tests.scenes import pair
+
+SIZE = 700
+# Metres.
+VOXEL = 0.3
+
+
+def surface(count=1500, seed=0):
+    rng = np.random.default_rng(seed)
+    points = rng.uniform(-2, 2, (count, 3))
+    points[:, 2] = 0.1 * np.sin(3 * points[:, 0])
+    return points.astype(np.float32), rng.normal(size=(count, 2)).astype(np.float32)
+
+
+def lattice():
+    """Nearly all distances are equal to others."""
+    points = np.stack(np.meshgrid(*[np.arange(9)] * 3), axis=-1).reshape(-1, 3)
+    return np.random.default_rng(0).permutation(points).astype(np.float32)
+
+
+@pytest.mark.filterwarnings("ignore:points", "ignore:voxel_size")
+@pytest.mark.parametrize("search", [None, mcg.DenseSearch()], ids=["trees", "brute force"])
+@pytest.mark.parametrize("points", [surface()[0], lattice(), surface(300)[0], surface(15)[0]], ids=len)
+def test_neighbours_are_those_of_the_host(points, search):
+    found = jax.jit(partial(mcg.preprocess, voxel_size=None, search=search))(points)
+    np.testing.assert_array_equal(found.neighbors, mcg.preprocess(points, None).neighbors)
+
+
+def test_rows_that_are_not_finite_become_padding():
+    points, channels = surface(600)
+    bad = points.copy()
+    bad[[0, 17, 599], [0, 1, 2]] = np.nan, np.inf, -np.inf
+    finite = np.isfinite(bad).all(axis=1)
+
+    def preprocessed(points):
+        return mcg.preprocess(PointCloud(points, channels), None)
+
+    found, expected = jax.jit(preprocessed)(bad), mcg.preprocess(PointCloud(bad[finite], channels[finite]), None)
+    np.testing.assert_array_equal(found.valid, np.arange(600) < 597)
+    np.testing.assert_array_equal(found.points[:597], expected.points)
+    np.testing.assert_array_equal(found.channels[:597], expected.channels)
+    np.testing.assert_array_equal(found.neighbors[:597], expected.neighbors)
+    # Features of padding are finite.
+    np.testing.assert_array_equal(found.points[597:], np.broadcast_to(expected.points[-1], (3, 3)))
+    slopes = jax.jit(jax.grad(lambda points: jnp.sum(preprocessed(points).points[:597] ** 2)))(bad)
+    assert np.isfinite(slopes).all() and (slopes[~finite] == 0).all()
+    nothing = jax.jit(preprocessed)(np.full_like(points, np.nan))
+    assert not nothing.valid.any() and (nothing.points == 0).all()
+
+
+def averaged(points, channels, channel_valid=None, size=SIZE):
+    return mcg.preprocess(PointCloud(points, channels, channel_valid=channel_valid), VOXEL, size=size)
+
+
+def test_means_of_voxels():
+    points, channels = surface()
+    measured = np.random.default_rng(1).random(channels.shape) < 0.7
+    found = jax.jit(averaged)(points, channels, measured)
+    order, numbers, count = (np.asarray(each) for each in _voxels_of(points, np.ones(len(points), bool), VOXEL))
+    count = int(count)
+    assert np.sum(found.valid) == count == numbers.max() + 1
+    for number in range(count):
+        rows = order[numbers == number]
+        np.testing.assert_allclose(found.points[number], points[rows].mean(axis=0), atol=1e-6)
+        # Edges of a voxel are that long.
+        assert np.ptp(points[rows], axis=0).max() < np.sqrt(3) * VOXEL
+        for channel, (values, known) in enumerate(zip(channels[rows].T, measured[rows].T, strict=True)):
+            assert found.channel_valid[number, channel] == known.any()
+            if known.any():
+                np.testing.assert_allclose(found.channels[number, channel], values[known].mean(), atol=1e-6)
+    # As many as on the host, in a grid that is turned otherwise.
+    assert count == pytest.approx(len(mcg.preprocess(points, VOXEL)), rel=0.1)
+    expected = mcg.preprocess(found.points[:count], None)
+    np.testing.assert_array_equal(found.neighbors[:count], expected.neighbors)
+
+
+def test_order_and_padding_of_the_points_do_not_matter():
+    points, channels = surface()
+    rows = np.random.default_rng(2).permutation(len(points))
+    padded = PointCloud(points[rows], channels[rows]).pad(2048)
+    one = jax.jit(averaged)(points, channels)
+    other = jax.jit(partial(mcg.preprocess, voxel_size=VOXEL, size=SIZE))(padded)
+    np.testing.assert_allclose(one.points, other.points, atol=1e-5)
+    np.testing.assert_allclose(one.channels, other.channels, atol=1e-5)
+
+
+def test_too_many_voxels_show_in_the_status():
+    points, channels = surface()
+
+    @jax.jit
+    def registered(points):
+        cloud = averaged(points, channels, size=100)
+        return mcg.register(cloud, cloud, mcg.GICP(), max_distance=0.5)
+
+    assert registered(points).status is mcg.Status.TOO_FEW_CORRESPONDENCES
+
+
+@in_float64
+def test_derivatives_of_means():
+    points, channels = (array.astype(float) for array in surface(200))
+    weights = np.random.default_rng(3).normal(size=(SIZE, 5))
+    mask = np.random.default_rng(4).random(channels.shape) < 0.8
+
+    @jax.jit
+    def weighed(points, channels):
+        found = averaged(points, channels, mask)
+        return jnp.sum(weights * jnp.where(found.valid[:, None], jnp.hstack([found.points, found.channels]), 0))
+
+    jax.test_util.check_grads(weighed, (points, channels), order=1, eps=1e-6, atol=1e-7, rtol=1e-7)
+
+
+def test_from_raw_points_to_a_loss_under_vmap():
+    source, target, truth = pair()
+    sides = np.asarray(source.unpad().points), np.asarray(target.unpad().points)
+
+    def loss(source, target, offset):
+        ready = [mcg.preprocess(points, 0.05, size=2048) for points in (source + offset, target)]
+        result = mcg.register(*ready, mcg.GICP(), max_distance=0.5)
+        apart = jnp.linalg.inv(truth) @ result.T_target_source.as_matrix()
+        return jnp.sum(apart[:3, 3] ** 2), result.status_code
+
+    offsets = np.array([[0.0, 0, 0], [0.02, -0.01, 0.01]], np.float32)
+    (values, statuses), slopes = jax.jit(jax.vmap(jax.value_and_grad(loss, has_aux=True), (None, None, 0)))(
+        *sides, offsets
+    )
+    assert (statuses == mcg.Status.CONVERGED).all() and np.isfinite(slopes).all()
+    # The pose takes the offset back.
+    assert values[0] < 1e-4 and np.sqrt(values[1]) == pytest.approx(np.linalg.norm(offsets[1]), rel=0.1)
+
+
+def test_what_is_missing_is_said():
+    points, channels = surface()
+    cloud = PointCloud(points, channels)
+    for name, options in (
+        ("voxel_size", {}),
+        ("size", {"voxel_size": 0.1}),
+        ("size", {"voxel_size": 0.1, "size": 0}),
+        ("voxel_size", {"voxel_size": -1.0}),
+        ("num_neighbors", {"voxel_size": None, "num_neighbors": 2}),
+    ):
+        call = jax.jit(partial(mcg.preprocess, **options))
+        refused(lambda call=call: call(cloud), name)
+    refused(lambda: jax.jit(partial(mcg.preprocess, voxel_size=None))(points[None]), "cloud")
+    refused(lambda: jax.jit(lambda points: mcg.register(points, points, mcg.GICP()).cost)(points), "source: cloud")
+
+
+def test_the_size_of_a_concrete_cloud():
+    points, channels = surface()
+    found, whole = averaged(points, channels), mcg.preprocess(PointCloud(points, channels), VOXEL)
+    assert found.points.shape[0] == SIZE and len(found) == len(whole)
+    np.testing.assert_array_equal(found.points[: len(whole)], whole.points)
+    refused(lambda: averaged(points, channels, size=100), "size", len(whole), 100)
