@@ -299,7 +299,7 @@ BAD_CLOUDS = {
         "voxel_size",
         lambda: ready(PointCloud(POINTS, covariances=np.tile(np.eye(3), (150, 1, 1))), voxel_size=0.1),
     ),
-    "tracers": ("tracers", lambda: jax.jit(lambda points: ready(points).points)(jnp.asarray(POINTS))),
+    "tracers": ("voxel_size.*auto", lambda: jax.jit(lambda points: ready(points).points)(jnp.asarray(POINTS))),
 }
 
 

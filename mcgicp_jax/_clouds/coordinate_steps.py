@@ -59,14 +59,16 @@ def _steps(cloud: PointCloud) -> tuple[Float[AnyArray, "3"], Bool[AnyArray, "3"]
         gaps = xp.diff(xp.sort(values, axis=1), axis=1)
         apart = gaps > _ROUNDINGS * xp.finfo(gaps.dtype).eps * largest
         number: Any = xp.sum(apart, axis=1, keepdims=True)
+        # Rounded coordinates repeat.
+        rounded = (number > 1) & (2 * number < xp.sum(counts))
+        if xp is np and not rounded.any():
+            return np.zeros(3, gaps.dtype), np.zeros(3, bool)
         ordered = xp.sort(xp.where(apart, gaps, xp.inf), axis=1)
         step = xp.take_along_axis(ordered, number // _QUANTILE, axis=1)
         multiple = xp.where(apart, gaps, 0) / step
         fits = xp.abs(multiple - xp.round(multiple)) < _TOLERANCE
         near = apart & (multiple < _MULTIPLES)
-        # Rounded coordinates repeat.
-        rounded = xp.isfinite(step) & (number > 1) & (2 * number < xp.sum(counts))
-        rounded = rounded & (xp.sum(near) >= _LEAST_GAPS)
+        rounded = rounded & xp.isfinite(step) & (xp.sum(near) >= _LEAST_GAPS)
         rounded = rounded & (xp.sum(near & fits, axis=1, keepdims=True) >= _FIT * xp.sum(near, axis=1, keepdims=True))
         # The step of float32 at these coordinates, by its 23 bits of fraction.
         place = xp.max(xp.where(counts, xp.abs(values + xp.asarray(cloud.origin)[:, None]), 0), axis=1, keepdims=True)

@@ -10,6 +10,7 @@ from __future__ import annotations
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from mcgicp_jax._clouds.point_cloud import LARGEST, PointCloud
 from mcgicp_jax._math.statistics import equal_rows
 from mcgicp_jax._search.kd_tree import KDTreeSearch
 
@@ -27,8 +28,13 @@ _FAR, _SURFACE = 20, 20
 _SAMPLE = 10_000
 
 
-def measured_rows(points: Float[np.ndarray, "N 3"], finite: Bool[np.ndarray, "N"]) -> Bool[np.ndarray, "N"]:
-    """Which of the finite points are measurements; of those at (0, 0, 0), where a sensor may be, the first counts."""
+def measured_rows(cloud: PointCloud) -> Bool[np.ndarray, "N"]:
+    """Which valid and finite points of a concrete cloud are measurements; of those at (0, 0, 0), where a sensor may be,
+    the first counts."""
+    points, finite = np.asarray(cloud.points), np.asarray(cloud.valid)
+    # One check of all values is much faster than one per row.
+    if not (np.abs(points) <= LARGEST).all():
+        finite = np.logical_and.reduce([finite, *(np.abs(column) <= LARGEST for column in points.T)])
     rows = np.flatnonzero(finite)
     points = points if rows.size == len(points) else points[rows]
     zero = np.flatnonzero((points == 0).all(axis=1))[1:]

@@ -101,7 +101,7 @@ def preprocessed_in(
     if is_concrete(fixed) and not is_concrete(cloud):
         found = preprocessed_in(grid, fixed, voxel_size, num_neighbors, search)
         return _differentiable(cloud, found, fixed)
-    cloud = finite_rows(cloud)
+    cloud = finite_rows(cloud, None if grid is None else grid.measured)
     if grid is not None and grid.columns.shape[1] != len(cloud):
         # Rows without a finite channel were left out.
         grid = None
@@ -116,7 +116,7 @@ def _differentiable(cloud: PointCloud, found: PointCloud, fixed: PointCloud) -> 
     """The preprocessed cloud `found` with the derivative by the traced arrays of a raw one; `fixed` is the raw cloud
     without these traces."""
     raw = fixed.unpad()
-    kept = measured_rows(np.asarray(raw.points), _is_finite(raw))
+    kept = measured_rows(raw) & _is_finite(raw)
     rows, voxels = np.flatnonzero(np.asarray(fixed.valid))[kept], np.arange(np.sum(kept))
     if found.voxel_size is not None:
         voxels, _ = grid_of(np.asarray(raw.points)[kept]).numbers(found.voxel_size)
@@ -214,9 +214,9 @@ def check_preprocessing(voxel_size: VoxelSize | Voxels, num_neighbors: int) -> N
     check_integer("num_neighbors", num_neighbors, 3)
 
 
-def finite_rows(cloud: PointCloud | Values) -> PointCloud:
+def finite_rows(cloud: PointCloud | Values, measured: Bool[np.ndarray, "N"] | None = None) -> PointCloud:
     """A raw cloud without padding, rows that have a NaN or infinity in any array, and placeholders; warns of the latter
-    two."""
+    two. `measured_rows` of the cloud, if they are known."""
     cloud = as_cloud("cloud", cloud)
     if not is_concrete(cloud):
         raise ValueError(
@@ -225,9 +225,10 @@ def finite_rows(cloud: PointCloud | Values) -> PointCloud:
         )
     if cloud.points.ndim != 2:
         raise ValueError(f"cloud: expected a single cloud, got a batch of shape {cloud.points.shape}")
+    keep = (measured_rows(cloud) if measured is None else measured)[np.asarray(cloud.valid)]
     cloud = cloud.unpad()
     points, finite = np.asarray(cloud.points), _is_finite(cloud)
-    keep = measured_rows(points, finite)
+    keep = keep & finite
     if len(keep) >= MIN_POINTS and keep.all():
         return cloud
     others = np.sum(~finite & (np.abs(points) <= LARGEST).all(axis=1))

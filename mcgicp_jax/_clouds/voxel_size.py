@@ -13,10 +13,10 @@ from functools import partial
 from typing import Any, Literal, NamedTuple, TypeAlias
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from mcgicp_jax._clouds.placeholders import measured_rows
-from mcgicp_jax._clouds.point_cloud import LARGEST, PointCloud, Voxels
+from mcgicp_jax._clouds.point_cloud import PointCloud, Voxels
 from mcgicp_jax._clouds.voxels import VOXELS_PER_AXIS, Grid, grid_of
 from mcgicp_jax._compute.concrete import is_concrete
 from mcgicp_jax._compute.linear_maps import primal
@@ -94,13 +94,13 @@ def voxels_and_grids(voxel_size: VoxelSize | Voxels, *clouds: PointCloud) -> tup
         return Voxels(), none
     raw = {row: cloud for row, cloud in enumerate(clouds) if cloud.deferred_neighbors is None}
     points = {row: _finite_points(cloud) for row, cloud in raw.items()}
-    counts = [len(each) for each in points.values()]
+    counts = [len(each) for each, _ in points.values()]
     # Clouds with covariances cannot be averaged.
     if any(cloud.covariances is not None for cloud in raw.values()) or (
         max(counts, default=0) < _LEAST_VOXELS or min(counts) < NUM_NEIGHBORS
     ):
         return Voxels(), none
-    grids = dict(zip(points, side_by_side([partial(grid_of, each) for each in points.values()]), strict=True))
+    grids = dict(zip(points, side_by_side([partial(grid_of, *each) for each in points.values()]), strict=True))
     return _chosen(list(grids.values())), [grids.get(row) for row in range(len(clouds))]
 
 
@@ -111,7 +111,7 @@ def map_voxel_size(cloud: PointCloud) -> float:
 
 def raw_spacing(cloud: PointCloud) -> float:
     """Median distance of the nearest neighbour of some of the finite points, metres; 0 if there is only one."""
-    points = _finite_points(cloud)
+    points, _ = _finite_points(cloud)
     return _shape_of(points.T).spacing if len(points) > 1 else 0.0
 
 
@@ -296,9 +296,8 @@ def _size(step: int) -> float:
     return float(f"{10 ** (step / _STEPS):.2g}")
 
 
-def _finite_points(cloud: PointCloud) -> Float[np.ndarray, "N 3"]:
-    """The finite points without placeholders, float64."""
-    points, kept = np.asarray(primal(cloud.points), np.float64), np.asarray(cloud.valid)
-    kept = np.logical_and.reduce([kept, *(np.abs(column) <= LARGEST for column in points.T)])
-    kept = measured_rows(points, kept)
-    return points if kept.all() else points[kept]
+def _finite_points(cloud: PointCloud) -> tuple[Float[np.ndarray, "N 3"], Bool[np.ndarray, "M"]]:
+    """The finite points without placeholders, float64, and which rows they are."""
+    cloud = primal(cloud)
+    points, kept = np.asarray(cloud.points, np.float64), measured_rows(cloud)
+    return points if kept.all() else points[kept], kept

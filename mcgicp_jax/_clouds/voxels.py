@@ -9,7 +9,7 @@ coincide: the error of the pose was then up to twice as large as with different 
 from __future__ import annotations
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 
 from mcgicp_jax._math.poses import rotated
 
@@ -81,10 +81,11 @@ class Grid:
 
     Attributes:
         columns: coordinates along the axes of the grid, metres.
+        measured: which rows of the cloud these points are; None for all.
     """
 
-    def __init__(self, columns: Float[np.ndarray, "3 N"]):
-        self.columns = columns
+    def __init__(self, columns: Float[np.ndarray, "3 N"], measured: Bool[np.ndarray, "M"] | None = None):
+        self.columns, self.measured = columns, measured
         self._numbers: dict[float, tuple[Int[np.ndarray, "N"], int]] = {}
 
     def numbers(self, voxel_size: float) -> tuple[Int[np.ndarray, "N"], int]:
@@ -98,8 +99,8 @@ class Grid:
         return self._numbers[voxel_size]
 
 
-def grid_of(points: Float[np.ndarray, "N 3"]) -> Grid:
-    """The grid of finite points.
+def grid_of(points: Float[np.ndarray, "N 3"], measured: Bool[np.ndarray, "M"] | None = None) -> Grid:
+    """The grid of finite points; `measured` is that of `Grid`.
 
     Its angles depend on how many points lie on either side of the middle: at random from cloud to cloud, but the same
     for any order of the points, and constant to derivatives.
@@ -112,7 +113,7 @@ def grid_of(points: Float[np.ndarray, "N 3"]) -> Grid:
     middle = 0.5 * (columns.min(axis=1) + columns.max(axis=1))
     sides = [int(np.sum(column > value)) for column, value in zip(columns, middle, strict=True)]
     variation = np.random.default_rng([len(points), *sides]).uniform(-VARIATION, VARIATION, 3)
-    return Grid(rotated(columns.T, Rotation.from_rotvec(TURN / np.sqrt(3) + variation).as_matrix()).T)
+    return Grid(rotated(columns.T, Rotation.from_rotvec(TURN / np.sqrt(3) + variation).as_matrix()).T, measured)
 
 
 def starts_of(sorted_keys: Int[np.ndarray, "N"]) -> Int[np.ndarray, "M"]:
