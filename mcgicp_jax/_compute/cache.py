@@ -81,8 +81,9 @@ def cached_with_cloud(compute: Callable[Parameters, Value]) -> Callable[Paramete
         leaves, structure = jax.tree.flatten((rest, named))
         key = (structure, *map(_by_value, leaves))
         with_cloud = _clouds.get(id(cloud), partial(_CachedWithCloud, cloud))
-        values = with_cloud.values.setdefault(compute, Cache(_VALUES_PER_FUNCTION))
-        return values.get(key, lambda: compute(*arguments, **named))
+        if compute not in with_cloud.values:
+            with_cloud.values.setdefault(compute, Cache(_VALUES_PER_FUNCTION))
+        return with_cloud.values[compute].get(key, lambda: compute(*arguments, **named))
 
     return cached
 

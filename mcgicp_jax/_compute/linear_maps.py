@@ -239,6 +239,8 @@ mlir.register_lowering(_linear, _not_compiled)
 def without_derivative(tree: Any, inputs: Any, message: str) -> Any:
     """The arrays of a tree, which depend on `inputs`, but have no derivative by them: reverse mode raises
     `NotImplementedError` with the message where it would use it, and forward mode gives NaN."""
+    if is_concrete(inputs):
+        return tree
     leaves = jax.tree.leaves(inputs, is_leaf=is_deferred)
     tracers = [leaf for leaf in leaves if not is_concrete(leaf) and _is_float(leaf)]
     if not tracers:

@@ -175,7 +175,9 @@ def registration_of(
     concrete = is_concrete(state, history)
     if concrete:
         # Reading NumPy arrays compiles nothing, and NumPy scalars print as numbers.
-        state, history, used = jax.tree.map(lambda array: np.asarray(array)[()], (state, history, used))
+        numbers = state.status, state.num_iterations, state.record, history, used
+        status, num_iterations, record, history, used = jax.tree.map(lambda array: np.asarray(array)[()], numbers)
+        state = state._replace(status=status, num_iterations=num_iterations, record=record)
         pose = state.pose if is_concrete(pose) else pose
     record, num_inliers = state.record, state.record.num_inliers.astype(np.int32)
     constant_by = partial(without_derivative, inputs=inputs, message=_NO_DERIVATIVE)

@@ -73,7 +73,7 @@ class Inputs(NamedTuple):
     def values(self) -> Inputs:
         """The arguments without the traces of differentiation, see `primal`. Concrete clouds remain the same objects,
         with which derived quantities are cached."""
-        return Inputs(*map(primal, self))
+        return self if is_concrete(self) else Inputs(*map(primal, self))
 
 
 class PoseDerivative(AbstractLinearMap):

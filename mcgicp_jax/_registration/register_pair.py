@@ -181,18 +181,18 @@ def run_pair(given: Inputs, init: Pose | None, options: Options, traced: bool = 
         check_channels(given.source, given.target, given.method)
         warn_of_units(given.source, given.target)
     *coarse, inputs = _at_scales(_equalized(given) if options.equalize_channels else given, options.voxel_sizes)
-    start, near = init, replace(options, max_coarse_distance=0.0)
+    start = init
     for scale in coarse:
         (result,) = results_of([solve(scale, start, replace(options, max_distance=None))], [None])
         start = result.matrix if is_usable(result) else start
     run = solve(inputs, start)
     # A given coarse distance says how far off the initial pose may be.
     if not traced and options.max_distance is None and _may_have_left(run, init, len(coarse) > 0):
-        run = _better(run, solve(inputs, init, near))
+        run = _better(run, solve(inputs, init, replace(options, max_coarse_distance=0.0)))
     if options.equalize_channels and not any(term.estimates_gains for term in run.problem.terms):
         # Parameters left None are chosen anew, from the channels as equalised by the matches.
         again = _equalized(run.inputs._replace(method=inputs.method), _nearest_points(run, search))
-        run = solve(again, _final_pose(run), near)
+        run = solve(again, _final_pose(run), replace(options, max_coarse_distance=0.0))
     elif compares_channels:
         if run.loop.state.status == Status.UNVERIFIED and run.problem.settings.channels_may_move:
             warn_of_patterns(run.inputs.source)

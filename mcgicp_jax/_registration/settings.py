@@ -129,32 +129,26 @@ def settings_for(
     tolerance = least if tolerance is None else tolerance
 
     steps = [harmful_steps(constant(cloud), spacing) for cloud in (source, target)]
-
-    def number(value: Any, kind: Any) -> Any:
-        return numpy_for(value).asarray(value, kind)
-
-    def coarse_tolerance(value: Any, least: Any) -> Any:
-        return number(_COARSE_TOLERANCE * numpy_for(value, least).maximum(value, least), dtype)
-
+    near = _NEAR * _median_range(constant(source))
     coarse, fine = max_distance if isinstance(max_distance, tuple) or np.shape(max_distance) else [max_distance] * 2
-    limits = options.min_coarse_distance, options.max_coarse_distance
-    xp = numpy_for(coarse, fine, limits)
-    coarse = xp.maximum(xp.clip(coarse, *limits), fine)
+    limits, turn = (options.min_coarse_distance, options.max_coarse_distance), options.rotation_tolerance
+    others = options.hold_unconstrained, channels_may_move, stride
+    xp: Any = numpy_for(coarse, fine, limits, tolerance, least, turn, others, steps, near)
     # Steps of huge coordinates overflow.
     with np.errstate(over="ignore"):
-        rounding = numpy_for(steps).stack(steps) ** 2 / 12
-    return Settings(
-        max_distance=number(coarse, dtype),
-        fine_distance=number(fine, dtype),
-        coarse_stride=number(stride, np.int32),
-        translation_tolerance=number(tolerance, dtype),
-        rotation_tolerance=number(options.rotation_tolerance, dtype),
-        coarse_translation_tolerance=coarse_tolerance(tolerance, least),
-        coarse_rotation_tolerance=coarse_tolerance(options.rotation_tolerance, ROTATION_TOLERANCE),
-        max_iterations=number(options.max_iterations, np.int32),
-        hold_unconstrained=number(options.hold_unconstrained, bool),
-        channels_may_move=number(channels_may_move, bool),
         # An error that is uniform over a step. It does not average out: points on lattices match the lattice.
-        rounding=number(rounding, dtype),
-        near=number(_NEAR * _median_range(constant(source)), dtype),
+        rounding = xp.stack(steps) ** 2 / 12
+    return Settings(
+        max_distance=xp.asarray(xp.maximum(xp.clip(coarse, *limits), fine), dtype),
+        fine_distance=xp.asarray(fine, dtype),
+        coarse_stride=xp.asarray(stride, np.int32),
+        translation_tolerance=xp.asarray(tolerance, dtype),
+        rotation_tolerance=xp.asarray(turn, dtype),
+        coarse_translation_tolerance=xp.asarray(_COARSE_TOLERANCE * xp.maximum(tolerance, least), dtype),
+        coarse_rotation_tolerance=xp.asarray(_COARSE_TOLERANCE * xp.maximum(turn, ROTATION_TOLERANCE), dtype),
+        max_iterations=xp.asarray(options.max_iterations, np.int32),
+        hold_unconstrained=xp.asarray(options.hold_unconstrained, bool),
+        channels_may_move=xp.asarray(channels_may_move, bool),
+        rounding=xp.asarray(rounding, dtype),
+        near=xp.asarray(near, dtype),
     )
