@@ -13,6 +13,7 @@ import time
 import jax
 import jax.numpy as jnp
 import numpy as np
+import psutil
 import pytest
 
 import mcgicp_jax as mcg
@@ -113,6 +114,50 @@ def test_what_cannot_be_sent_stays_at_home(raw, tmp_path, pays, sendable):
     results = batch(functions, target)
     assert all(result.converged for result in results)
     assert (len(pids_in(tmp_path)) > 1) == (sendable > 0)
+
+
+def test_the_time_of_the_caller_is_not_that_of_the_pairs(raw, tmp_path, monkeypatch):
+    """Processes would not save it."""
+    (source,), (target,) = prepared(raw[:1])
+    monkeypatch.setattr(Processes, "are_warm", False)
+    functions = in_turn(tmp_path, source, 1000)
+
+    def slow():
+        for function in functions:
+            time.sleep(1.0)
+            yield function
+
+    for turn in (slow(), functions):
+        # Enough pairs for several answers; each would seem to take a second.
+        completed = mcg.register_as_completed(turn, target, METHOD, max_distance=0.5)
+        for _ in range(2 * num_cores() + 4):
+            next(completed)
+            time.sleep(0 if turn is not functions else 1.0)
+        completed.close()
+    assert pids_in(tmp_path) == {os.getpid()}
+
+
+def test_threads_go_on_if_processes_cannot_start(raw, tmp_path, pays, monkeypatch):
+    (source,), (target,) = prepared(raw[:1])
+
+    def refuse(*_, **__):
+        raise OSError("no semaphores")
+
+    monkeypatch.setattr(batch_executors, "get_reusable_executor", refuse)
+    results = batch(in_turn(tmp_path, source, 40), target)
+    assert all(result.converged for result in results) and pids_in(tmp_path) == {os.getpid()}
+
+
+def test_an_early_end_while_processes_start_ends_them(raw, tmp_path, pays):
+    (source,), (target,) = prepared(raw[:1])
+    Processes(num_cores()).shutdown(cancel_futures=True)
+    completed = mcg.register_as_completed(in_turn(tmp_path, source, 1000), target, METHOD, max_distance=0.5)
+    for _ in range(3 * num_cores()):
+        next(completed)
+    completed.close()
+    assert not Processes._unfinished
+    children = psutil.Process().children(recursive=True)
+    assert not [child for child in children if "loky.backend.popen" in " ".join(child.cmdline())]
 
 
 def test_a_worker_starts_no_processes(raw, tmp_path, pays):

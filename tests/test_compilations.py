@@ -5,11 +5,14 @@ import weakref
 from typing import Any, ClassVar
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
 import mcgicp_jax as mcg
 from mcgicp_jax._compute import programs
+from mcgicp_jax._compute.cache import Lazy
+from mcgicp_jax._compute.concrete import outside_trace
 from tests.compilations import compilations
 from tests.scenes import room_corner
 
@@ -189,3 +192,11 @@ def test_long_compilation_is_logged_once(caplog, monkeypatch):
             jax.jit(lambda x, constant=constant: x + constant)(1.0)
     (record,) = caplog.records
     assert record.name == "mcgicp_jax" and "programs are kept in" in record.getMessage()
+
+
+def test_what_is_computed_outside_of_a_trace_stays_outside():
+    """A `jit` that is traced within the context is one."""
+    lazy = Lazy(lambda: jnp.arange(3.0) + 1)
+    with outside_trace():
+        assert jax.jit(lambda x: x + lazy.value.sum())(1.0) == 7
+    assert not isinstance(lazy.value, jax.core.Tracer)

@@ -17,6 +17,7 @@ from mcgicp_jax.metrics import pose_error
 from tests import reference as ref
 from tests.batches import METHOD, assert_same, prepared
 from tests.compilations import compilations
+from tests.precision import in_both_precisions
 from tests.scenes import motion
 
 # Its parameters are computed for each lane.
@@ -227,3 +228,20 @@ def test_a_rare_size_does_not_wait_for_the_end(clouds, monkeypatch):
     with compilations() as found:
         assert ended() == first
     assert not found
+
+
+@in_both_precisions
+def test_several_neighbours_are_those_of_trees():
+    points = np.random.default_rng(0).normal(size=(1500, 3)).astype(float if jax.enable_x64.value else np.float32)
+    np.testing.assert_array_equal(DenseSearch().neighbors(points, 20), KDTreeSearch().neighbors(points, 20))
+
+
+def test_a_row_that_is_not_a_number_hides_no_others():
+    points = np.random.default_rng(1).normal(size=(1000, 3)).astype(np.float32)
+    known = np.setdiff1d(np.arange(1000), [3, 500])
+    bad = points.copy()
+    bad[[3, 500]] = np.nan
+    search, here = DenseSearch(), np.array([1, 0, 0, 0, 0, 0, 0], np.float32)
+    found = search.nearest_traced(here, rows(points), rows(bad), jnp.float32(1), jnp.array(True), 5)
+    expected = search.index(rows(points[known])).nearest(here, rows(points), np.inf, 5)
+    np.testing.assert_array_equal(found, known[expected])

@@ -352,3 +352,11 @@ def test_the_share_of_duplicates_is_that_of_all_points(first):
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         preprocess(few, None)
+
+
+def test_the_first_zero_that_is_complete_is_kept():
+    points, channels = POINTS.copy(), CHANNELS.copy()
+    points[[3, 4, 5]], channels[3] = 0, np.nan
+    with pytest.warns(UserWarning, match="left out 1 of 150 points"):
+        found = ready(PointCloud(points, channels))
+    assert len(found) == 148 and np.sum((found.points == 0).all(axis=1)) == 1

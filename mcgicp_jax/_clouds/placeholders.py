@@ -28,10 +28,10 @@ _FAR, _SURFACE = 20, 20
 _SAMPLE = 10_000
 
 
-def measured_rows(cloud: PointCloud) -> Bool[np.ndarray, "N"]:
+def measured_rows(cloud: PointCloud, complete: Bool[np.ndarray, "N"] | None = None) -> Bool[np.ndarray, "N"]:
     """Which valid and finite points of a concrete cloud are measurements; of those at (0, 0, 0), where a sensor may be,
-    the first counts."""
-    points, finite = np.asarray(cloud.points), np.asarray(cloud.valid)
+    the first counts. `complete`: which rows count at all; None: all valid ones."""
+    points, finite = np.asarray(cloud.points), np.asarray(cloud.valid) if complete is None else complete
     # One check of all values is much faster than one per row.
     if not (np.abs(points) <= LARGEST).all():
         finite = np.logical_and.reduce([finite, *(np.abs(column) <= LARGEST for column in points.T)])

@@ -58,9 +58,10 @@ def preprocess(
         num_neighbors: number k of neighbours, including the point itself, from which a covariance is computed; at
             least 3. All points are used if the cloud has fewer.
         search: neighbour search; by default `KDTreeSearch`, and inside `jit` or `vmap` on accelerators `DenseSearch`.
-        size: number of rows of the result, which is padded to it. Inside `jit` and `vmap`, it must be given with a
-            `voxel_size`; if more voxels are occupied, no row of the result is valid, and registrations with it have
-            the status TOO_FEW_CORRESPONDENCES.
+        size: number of rows of the result, which is padded to it by copies of the last point; sums over rows must leave
+            those out that are not `valid`. Inside `jit` and `vmap`, it must be given with a `voxel_size`; if more
+            voxels are occupied, no row of the result is valid, and registrations with it have the status
+            TOO_FEW_CORRESPONDENCES. Without voxels it must be at least the number of rows.
 
     Returns:
         Cloud with read-only NumPy arrays, float64 if the input is and JAX's x64 is on, else float32. If the
@@ -80,6 +81,8 @@ def preprocess(
             than 0.6 times as thick as wide.
     """
     cloud = as_cloud("cloud", cloud)
+    if size is not None:
+        check_integer("size", size, 1)
     if not is_concrete(primal(cloud)):
         check_preprocessing(voxel_size, num_neighbors)
         return preprocess_traced(cloud, voxel_size, num_neighbors, search, size)
@@ -116,7 +119,7 @@ def _differentiable(cloud: PointCloud, found: PointCloud, fixed: PointCloud) -> 
     """The preprocessed cloud `found` with the derivative by the traced arrays of a raw one; `fixed` is the raw cloud
     without these traces."""
     raw = fixed.unpad()
-    kept = measured_rows(raw) & _is_finite(raw)
+    kept = measured_rows(raw, _is_finite(raw))
     rows, voxels = np.flatnonzero(np.asarray(fixed.valid))[kept], np.arange(np.sum(kept))
     if found.voxel_size is not None:
         voxels, _ = grid_of(np.asarray(raw.points)[kept]).numbers(found.voxel_size)
@@ -225,10 +228,10 @@ def finite_rows(cloud: PointCloud | Values, measured: Bool[np.ndarray, "N"] | No
         )
     if cloud.points.ndim != 2:
         raise ValueError(f"cloud: expected a single cloud, got a batch of shape {cloud.points.shape}")
-    keep = (measured_rows(cloud) if measured is None else measured)[np.asarray(cloud.valid)]
+    measured = None if measured is None else measured[np.asarray(cloud.valid)]
     cloud = cloud.unpad()
     points, finite = np.asarray(cloud.points), _is_finite(cloud)
-    keep = keep & finite
+    keep = measured_rows(cloud, finite) if measured is None or not finite.all() else measured
     if len(keep) >= MIN_POINTS and keep.all():
         return cloud
     others = np.sum(~finite & (np.abs(points) <= LARGEST).all(axis=1))

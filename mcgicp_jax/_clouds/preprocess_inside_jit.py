@@ -13,7 +13,6 @@ from jaxtyping import Array, Bool, Float, Int
 from mcgicp_jax._clouds.point_cloud import LARGEST, PointCloud, Voxels
 from mcgicp_jax._clouds.voxels import TURN, VARIATION
 from mcgicp_jax._compute.concrete import is_concrete
-from mcgicp_jax._compute.messages import check_integer
 from mcgicp_jax._compute.threads import with_settings_of_package
 from mcgicp_jax._search.base import IDENTITY, AbstractSearch, SearchPoints
 from mcgicp_jax._search.brute_force import default_search
@@ -26,9 +25,11 @@ def preprocess_traced(
     """`preprocess` of a traced cloud."""
     edge = voxel_size.size if isinstance(voxel_size, Voxels) else voxel_size
     if isinstance(edge, str) or not is_concrete(edge):
-        raise ValueError(f"voxel_size: expected a number or None inside jit and vmap, got {edge!r}")
+        raise ValueError(f"voxel_size: expected a Python number or None inside jit and vmap, got {edge!r}")
     if cloud.points.ndim != 2:
         raise ValueError(f"cloud: expected a single cloud, got a batch of shape {cloud.points.shape}; use jax.vmap")
+    if not cloud.points.shape[0]:
+        raise ValueError("cloud: expected points, got none")
     arrays = [array for array in (cloud.points, cloud.channels, cloud.covariances) if array is not None]
     valid = jnp.asarray(cloud.valid)
     for array in arrays:
@@ -42,7 +43,6 @@ def preprocess_traced(
             raise ValueError("voxel_size: expected None for a cloud with covariances, which cannot be averaged")
         if size is None:
             raise ValueError("size: expected a number of rows with a voxel_size inside jit and vmap, got None")
-        check_integer("size", size, 1)
         cloud = _averaged(cloud, float(edge), size)
     return cloud.replace_rows(
         deferred_neighbors=traced_neighbors(cloud, num_neighbors, search or default_search(traced=True)),

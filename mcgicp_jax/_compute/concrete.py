@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.extend.core import get_opaque_trace_state
 from jax.typing import ArrayLike
 from jaxtyping import Array
 
@@ -56,24 +57,26 @@ def is_concrete(*trees: object) -> bool:
     return not any(map(_is_tracer, jax.tree.leaves(trees, is_leaf=is_deferred)))
 
 
-_is_outside: ContextVar[bool] = ContextVar("is_outside", default=False)
+# The state of JAX's transformations inside the context below; None outside of it.
+_outside: ContextVar[Any] = ContextVar("outside", default=None)
 
 
 @contextlib.contextmanager
 def outside_trace() -> Iterator[None]:
     """Context in which concrete arrays are computed at once and on the CPU, even while a caller's `jit` is traced."""
-    if _is_outside.get():
+    # Nested contexts are frequent. A `jit` may be traced between them, too.
+    if _outside.get() == get_opaque_trace_state():
         yield
         return
     with on_cpu():
         # Only inside a trace, since `jax.ensure_compile_time_eval` evaluates operation by operation.
         staged = isinstance(_zero(), jax.core.Tracer)
-        before = _is_outside.set(True)
-        try:
-            with jax.ensure_compile_time_eval() if staged else contextlib.nullcontext():
+        with jax.ensure_compile_time_eval() if staged else contextlib.nullcontext():
+            before = _outside.set(get_opaque_trace_state())
+            try:
                 yield
-        finally:
-            _is_outside.reset(before)
+            finally:
+                _outside.reset(before)
 
 
 @jax.jit

@@ -18,6 +18,7 @@ from multiprocessing import current_process, get_context, resource_tracker
 from pickle import PicklingError
 from typing import Any, ClassVar, Literal, TypeAlias
 
+import cloudpickle
 import jax
 import jaxlie
 import numpy as np
@@ -245,15 +246,21 @@ def _by_threads_then_processes(job: BatchJob, pairs: Iterator[Pair], count: int 
 
     def until_processes_run() -> Iterator[Pair]:
         nonlocal rest
-        for pair in pairs:
+        while (pair := start.waited_for(partial(next, pairs, None))) is not None:
             if start.has_ended(pair):
                 rest = itertools.chain([pair], pairs)
                 return
             yield pair
 
-    for result in _by_threads(job, until_processes_run()):
-        start.finished += 1
-        yield result
+    try:
+        for result in _by_threads(job, until_processes_run()):
+            start.finished += 1
+            begin = time.perf_counter()
+            yield result
+            start.idle += time.perf_counter() - begin
+    finally:
+        if rest is None and start.processes is not None:
+            start.processes.shutdown(cancel_futures=True)
     if rest is not None and start.processes is not None:
         yield from _by_processes(job, rest, start.processes, at_home=True)
 
@@ -263,48 +270,71 @@ class _Start:
 
     Attributes:
         finished: number of pairs that threads have registered.
+        idle: seconds in which the caller had the results, or made the next pair; processes would not save them.
         processes: None until they are started, and if they cannot run the job.
     """
 
     def __init__(self, job: BatchJob, count: int | None):
         self._job, self._count = job, count
-        self.finished = 0
+        self.finished, self.idle = 0, 0.0
         self.processes: Processes | None = None
         # At the first call, and once each thread has compiled.
         self._begun: tuple[int, float] | None = None
         self._first: Future[None] | None = None
+        # Seconds that it takes to send a pair, once it is known.
+        self._sending: float | None = None
         self._num_workers = min(num_cores(), psutil.virtual_memory().available // _MEMORY)
         # Workers of other pools have their cores to themselves.
         self._possible = self._num_workers > 1 and current_process().name == "MainProcess"
+
+    def waited_for(self, make: Callable[[], Pair | None]) -> Pair | None:
+        """The next pair, made by the caller."""
+        begin = time.perf_counter()
+        try:
+            return make()
+        finally:
+            self.idle += time.perf_counter() - begin
 
     def has_ended(self, pair: Pair) -> bool:
         """Whether the processes run; starts them if they pay. `pair` is the next one, of which it is tried whether it
         can be sent."""
         if not self._possible:
             return False
-        if self._first is None and self._pays(pair.index):
-            LOGGER.info("register_batch: pairs go on in %d processes from about pair %d", self._num_workers, pair.index)
-            self.processes = Processes(self._num_workers)
-            sent = with_settings(_as_numpy(self._job).received, pickled=True)
-            self._first = self.processes.submit(sent, _as_numpy(pair))
-        if self._first is None or not self._first.done():
-            return False
-        # Not what can be pickled, or imported by a worker.
-        self._possible = self._first.exception() is None
-        self.processes = self.processes if self._possible else None
+        try:
+            if self._first is None and self._pays(pair):
+                self._begin(pair)
+            if self._first is None or not self._first.done():
+                return False
+            self._first.result()
+        # Not what can be pickled, or imported by a worker; or this platform starts none.
+        except Exception as error:
+            LOGGER.info("register_batch: pairs stay in threads; %s", _words(error))
+            self._possible, self.processes = False, None
         return self._possible
 
-    def _pays(self, sent: int) -> bool:
-        now = time.perf_counter()
+    def _begin(self, pair: Pair) -> None:
+        LOGGER.info("register_batch: pairs go on in %d processes from about pair %d", self._num_workers, pair.index)
+        processes = Processes(self._num_workers)
+        self._first = processes.submit(with_settings(_as_numpy(self._job).received, pickled=True), _as_numpy(pair))
+        self.processes = processes
+
+    def _pays(self, pair: Pair) -> bool:
+        now = time.perf_counter() - self.idle
         if self._begun is None and self.finished >= num_cores():
             self._begun = self.finished, now
         if self._begun is None or self.finished < self._begun[0] + num_cores():
             return False
         by_threads = (now - self._begun[1]) / (self.finished - self._begun[0])
         # As many as were sent, if nobody knows.
-        left = sent if self._count is None else self._count - sent
-        saved = left * by_threads * (1 - 1 / (_RATE * self._num_workers))
-        return saved > _PAYS * (0.0 if Processes.are_warm else _START + COMPILATIONS.seconds)
+        left = pair.index if self._count is None else self._count - pair.index
+        each = by_threads * (1 - 1 / (_RATE * self._num_workers))
+        start = 0.0 if Processes.are_warm else _START + COMPILATIONS.seconds
+        if self._sending is None and left * each > _PAYS * start:
+            begin = time.perf_counter()
+            # Functions are sent with all that they refer to.
+            cloudpickle.dumps(_as_numpy(pair))
+            self._sending = time.perf_counter() - begin
+        return self._sending is not None and left * (each - self._sending) > _PAYS * start
 
 
 class ChunkedExecutor:

@@ -147,7 +147,8 @@ def _nearest_by_runs(queries: SearchPoints, target: SearchPoints, num_candidates
     blocks, columns = (
         [column_of(column, multiple) for column in (*rows.points.T, *rows.descriptors.T)] for rows, multiple in pairs
     )
-    valid = jnp.pad(target.valid, (0, -target.valid.size % _RUN))
+    # A run with NaN would be no nearest one.
+    valid = jnp.pad(target.valid, (0, -target.valid.size % _RUN)) & ~jnp.isnan(sum(columns[1:], columns[0]))
     columns = [jnp.where(valid, column, jnp.inf) for column in columns]
 
     def of_block(block: list[Float[Array, "n"]]) -> Int[Array, "m n"]:
@@ -163,7 +164,8 @@ def _nearest_by_runs(queries: SearchPoints, target: SearchPoints, num_candidates
             _, nearest = _first(_given, (least, numbers), _QUERIES, num_candidates)
             # Numbers beyond the last are those of no run.
             nearest = jnp.minimum(nearest.T, valid.size // width - 1)
-            numbers = (nearest[:, :, None] * (width // finer) + jnp.arange(width // finer)).reshape(_QUERIES, -1)
+            within = jnp.arange(width // finer, dtype=jnp.int32)
+            numbers = (nearest[:, :, None] * (width // finer) + within).reshape(_QUERIES, -1)
         squares = [(query[:, None] - column[numbers]) ** 2 for query, column in zip(block, columns, strict=True)]
         square, rows = _first(_given, (sum(squares[1:], squares[0]), numbers), _QUERIES, num_candidates)
         return jnp.where(jnp.isfinite(square), rows, -1)
