@@ -83,7 +83,7 @@ def _shows_rounding(cloud: PointCloud, coarse: Bool[AnyArray, "3"], steps: Float
     if cloud.deferred_neighbors is None:
         return False
     rows, counts = sampled_rows(cloud.valid)
-    xp = numpy_for(cloud.points, counts, steps)
+    xp = numpy_for(cloud.points, counts, coarse, steps)
     points = xp.asarray(cloud.points)
     # Traced rows need those of all.
     neighbors = cloud.deferred_neighbors[rows] if xp is np else xp.asarray(cloud.neighbors)[rows]

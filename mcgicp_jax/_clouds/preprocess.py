@@ -104,6 +104,11 @@ def preprocessed_in(
     if is_concrete(fixed) and not is_concrete(cloud):
         found = preprocessed_in(grid, fixed, voxel_size, num_neighbors, search)
         return _differentiable(cloud, found, fixed)
+    if not is_concrete(cloud):
+        raise ValueError(
+            "cloud: expected a preprocessed cloud inside jit and vmap; call preprocess(cloud, voxel_size, size=...), "
+            "or preprocess(cloud, None) for all points"
+        )
     cloud = finite_rows(cloud, None if grid is None else grid.measured)
     if grid is not None and grid.columns.shape[1] != len(cloud):
         # Rows without a finite channel were left out.
@@ -222,10 +227,7 @@ def finite_rows(cloud: PointCloud | Values, measured: Bool[np.ndarray, "N"] | No
     two. `measured_rows` of the cloud, if they are known."""
     cloud = as_cloud("cloud", cloud)
     if not is_concrete(cloud):
-        raise ValueError(
-            "cloud: expected a preprocessed cloud inside jit and vmap; call preprocess(cloud, voxel_size, size=...), "
-            "or preprocess(cloud, None) for all points"
-        )
+        raise ValueError("cloud: expected concrete arrays, got tracers; call this outside of jit and vmap")
     if cloud.points.ndim != 2:
         raise ValueError(f"cloud: expected a single cloud, got a batch of shape {cloud.points.shape}")
     measured = None if measured is None else measured[np.asarray(cloud.valid)]
