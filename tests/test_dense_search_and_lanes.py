@@ -241,7 +241,7 @@ def test_a_row_that_is_not_a_number_hides_no_others():
     known = np.setdiff1d(np.arange(1000), [3, 500])
     bad = points.copy()
     bad[[3, 500]] = np.nan
-    search, here = DenseSearch(), np.array([1, 0, 0, 0, 0, 0, 0], np.float32)
+    search, here = DenseSearch(), jnp.array([1, 0, 0, 0, 0, 0, 0], jnp.float32)
     found = search.nearest_traced(here, rows(points), rows(bad), jnp.float32(1), jnp.array(True), 5)
     expected = search.index(rows(points[known])).nearest(here, rows(points), np.inf, 5)
     np.testing.assert_array_equal(found, known[expected])

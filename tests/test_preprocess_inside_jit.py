@@ -71,7 +71,10 @@ def test_means_of_voxels():
     points, channels = surface()
     measured = np.random.default_rng(1).random(channels.shape) < 0.7
     found = jax.jit(averaged)(points, channels, measured)
-    order, numbers, count = (np.asarray(each) for each in _voxels_of(points, np.ones(len(points), bool), VOXEL))
+    assert found.channel_valid.dtype == bool and found.points.dtype == found.channels.dtype == np.float32
+    order, numbers, count = (
+        np.asarray(each) for each in _voxels_of(*map(jnp.asarray, (points, np.ones(len(points), bool))), VOXEL)
+    )
     count = int(count)
     assert np.sum(found.valid) == count == numbers.max() + 1
     for number in range(count):

@@ -68,7 +68,7 @@ def _valid_first(cloud: PointCloud) -> PointCloud:
     def taken(array: Any) -> Any:
         # A cloud without any valid row has zeros, whose derivative is 0.
         known = valid[rows].reshape(-1, *[1] * (array.ndim - 1))
-        return jnp.where(known, jnp.asarray(array)[rows], 0)
+        return jnp.where(known, jnp.asarray(array)[rows], jnp.zeros((), array.dtype))
 
     names = ("points", "channels", "channel_valid", "covariances")
     some = {name: taken(getattr(cloud, name)) for name in names if getattr(cloud, name) is not None}
