@@ -127,6 +127,7 @@ def test_derivatives_of_means():
     jax.test_util.check_grads(weighed, (points, channels), order=1, eps=1e-6, atol=1e-7, rtol=1e-7)
 
 
+@pytest.mark.slow
 def test_from_raw_points_to_a_loss_under_vmap():
     source, target, truth = pair()
     sides = np.asarray(source.unpad().points), np.asarray(target.unpad().points)
