@@ -92,9 +92,13 @@ class RowsOnDemand(Generic[Tree]):
         self._missing = np.ones(num_rows, bool)
         # The arrays are never replaced, since views of them are in use.
         self._tree: Any = None
+        # Whether all rows are computed.
+        self.complete = False
 
     def computed(self, rows: slice | Int[np.ndarray, "*n"] | None = None, num_threads: int | None = 1) -> Tree:
         """The whole arrays, in which these rows (None: all), or any, are computed, and others may not be."""
+        if self.complete:
+            return self._tree
         with self._lock:
             missing = self._missing
             if rows is not None:
@@ -114,12 +118,8 @@ class RowsOnDemand(Generic[Tree]):
                 for whole, part in zip(jax.tree.leaves(self._tree), jax.tree.leaves(computed), strict=True):
                     whole[new] = part
             self._missing[new] = False
+            self.complete = not self._missing.any()
             return self._tree
-
-    @property
-    def complete(self) -> bool:
-        """Whether all rows are computed."""
-        return not self._missing.any()
 
 
 # Rows of a block. One size for all clouds, so that few programs are compiled. Measured with 34,000 rows: blocks of
