@@ -194,6 +194,20 @@ def test_the_command_line_takes_a_number_or_all(tmp_path, capsys):
 
 
 @pytest.mark.slow
+def test_the_command_line_chooses_parameters_as_register_does(tmp_path):
+    """Of the points that are matched."""
+    source, target, _ = pair(size=900)
+    files = [str(tmp_path / name) for name in ("source.npz", "target.npz", "pose.txt")]
+    for path, cloud in zip(files, (source, target), strict=False):
+        io.write(path, cloud)
+    clouds = [io.read(path) for path in files[:2]]
+    options = ["--method", "mc-gicp", "--output", files[2], "--max-source-points", "150"]
+    assert main(["register", *files[:2], *options]) == 0
+    expected = mcg.register(*clouds, mcg.MultiChannelGICP(), max_source_points=150)
+    np.testing.assert_allclose(io.read_poses(files[2])[0], expected.matrix, atol=1e-9)
+
+
+@pytest.mark.slow
 def test_the_covariance_is_calibrated():
     """ξᵀ Σ⁻¹ ξ of the pose errors is distributed as χ² with six degrees of freedom: over 40 pairs, its mean of 6 has a
     standard error of 0.55. As for all points, a factor of two either way is the design effect's own error."""

@@ -29,7 +29,10 @@ from mcgicp_jax._cli.options import (
 from mcgicp_jax._compute.messages import messages_named
 from mcgicp_jax._compute.threads import side_by_side
 from mcgicp_jax._methods.base import AbstractMethod
+from mcgicp_jax._methods.surfaces import resolved
 from mcgicp_jax._pose_solver.degeneracy import as_text
+from mcgicp_jax._registration.options import Options as RegistrationOptions
+from mcgicp_jax._registration.register_pair import prepared, rows_to_match
 from mcgicp_jax._registration.result import verified
 from mcgicp_jax.extend import METHODS
 from mcgicp_jax.io.clouds import format_of
@@ -80,8 +83,10 @@ class PreparedPair:
         self.start, self.verified = result.matrix, result.success
 
     def method(self, name: MethodName) -> AbstractMethod:
-        """The method with parameters from the options or else from the data."""
-        return self.choices.method(name, lambda: self.ready).resolve(*self.ready)
+        """The method with parameters from the options or else from the data, as `mcgicp_jax.register` chooses them."""
+        options = RegistrationOptions(max_source_points=self.options.registration()["max_source_points"])
+        given = prepared(*self.ready, self.choices.method(name, lambda: self.ready), options)
+        return resolved(given.method, given.source, given.target, rows_to_match(given.source, options))
 
     def errors(self, pose: Float[np.ndarray, "4 4"], true_pose: Float[np.ndarray, "4 4"]) -> str:
         """Translation error in mm at the centroid of the source, and rotation error in degrees, as two columns."""

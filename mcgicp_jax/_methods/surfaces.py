@@ -141,19 +141,9 @@ def surface_pair(
         observed: whether to compute observability, which `register` needs and the cost of given matches does not.
         source_rows: the rows of the surface of the source, with neighbours among all points; None for all rows.
     """
-    of_rows_of = partial(local_geometries, source, target, method.uses_channels)
-    whole = cache(partial(of_rows_of, (source_rows, None), num_threads))
-
-    def geometries(rows: tuple[Any, Any]) -> tuple[LocalGeometry, LocalGeometry]:
-        if is_concrete(source, target):
-            own = rows[0] if source_rows is None else source_rows[rows[0]]
-            return of_rows_of((own, rows[1]), num_threads)
-        # Inside transformations all rows are needed anyway.
-        of_source, of_target = (jax.tree.map(itemgetter(some), each) for each, some in zip(whole(), rows, strict=True))
-        return of_source, of_target
-
     used = source if source_rows is None else _some_rows(source, source_rows)
-    method = method.resolve(used, target, geometries)
+    whole = cache(partial(local_geometries, source, target, method.uses_channels, (source_rows, None), num_threads))
+    method = resolved(method, source, target, source_rows, num_threads, whole)
     terms = method.terms(used, target, robust, equalize_channels)
     kinds = kinds_of(terms)
     # Raises an error if observability is needed and a cloud has no neighbours.
@@ -180,6 +170,31 @@ def surface_pair(
     parts = over_both(function, method, *inputs)
     both = [_surface_in(each, searchable(method, cloud)) for each, cloud in zip(parts, (used, target), strict=True)]
     return SurfacePair(method, terms, *both)
+
+
+def resolved(
+    method: AbstractMethod,
+    source: PointCloud,
+    target: PointCloud,
+    source_rows: Any = None,
+    num_threads: int | None = 1,
+    whole: Callable[[], tuple[LocalGeometry, LocalGeometry]] | None = None,
+) -> AbstractMethod:
+    """The method with its unset parameters chosen as a registration of these rows of the source chooses them.
+
+    Args:
+        whole: computes the local geometry of these rows and of the target, for traced clouds.
+    """
+
+    def geometries(rows: tuple[Any, Any]) -> tuple[LocalGeometry, LocalGeometry]:
+        if whole is None or is_concrete(source, target):
+            own = rows[0] if source_rows is None else source_rows[rows[0]]
+            return local_geometries(source, target, method.uses_channels, (own, rows[1]), num_threads)
+        # Inside transformations all rows are needed anyway.
+        of_source, of_target = (jax.tree.map(itemgetter(some), each) for each, some in zip(whole(), rows, strict=True))
+        return of_source, of_target
+
+    return method.resolve(source if source_rows is None else _some_rows(source, source_rows), target, geometries)
 
 
 def kinds_of(terms: tuple[AbstractTerm, ...]) -> Kinds:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from operator import attrgetter
 from typing import Any, cast
 
 import jax
@@ -60,7 +61,7 @@ class HostExecutor(AbstractExecutor):
         if status == SETTLED:
             return before
         stride = int(settings.stride(status, state.num_iterations))
-        alone = bool(status != COARSE and any(term.by_position for term in problem.terms))
+        alone = bool(status != COARSE and any(map(attrgetter("by_position"), problem.terms)))
         every = slice(None, None, stride)
         source: SearchPoints = problem.source.search
         if stride > 1:
