@@ -9,14 +9,14 @@ import numpy as np
 import pytest
 
 import mcgicp_jax as mcg
-from mcgicp_jax import extend
+from mcgicp_jax import Status, extend
 from mcgicp_jax._clouds.voxels import grid_of
 from mcgicp_jax.metrics import pose_error
 from tests.compilations import compilations
 from tests.differences import GATE, TO_ROUNDING, check_eager_gradient, weigh
 from tests.precision import in_both_precisions, in_float64, tolerance
 from tests.refusals import refused
-from tests.scenes import motion, room_corner, wall
+from tests.scenes import SURFACES, motion, room_corner, wall
 
 SIZE = 0.4
 
@@ -389,3 +389,16 @@ def test_what_is_wrong_is_named(raw):
             refused(lambda given={name: value}: mcg.voxel_gaussians(target, **{"voxel_size": SIZE} | given), name)
     traced = jax.jit(lambda points: mcg.voxel_gaussians(target.replace(points=points), SIZE).points)
     refused(lambda: traced(target.points), "cloud", "concrete")
+
+
+@pytest.mark.parametrize("noise", [0.25, 1.0])
+@pytest.mark.parametrize("scene", ["plane", "floor and wall", "corridor", "crossing planes", "room"])
+def test_cells_of_noisy_surfaces_hold_nothing_by_chance(scene, noise):
+    """Noise in spacings of the points. The truth is the start."""
+    for seed in range(2):
+        rng = np.random.default_rng(seed)
+        source, target = (SURFACES[scene](rng, 10_000, noise) for _ in range(2))
+        cells = [mcg.voxel_gaussians(points, np.ptp(source, axis=0).max() / 16) for points in (source, target)]
+        for moving, method in ((cells[0], mcg.D2DNDT()), (mcg.preprocess(source, None), mcg.NDT())):
+            result = mcg.register(moving, cells[1], method)
+            assert result.status is (Status.CONVERGED if scene == "room" else Status.DEGENERATE)
