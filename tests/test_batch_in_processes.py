@@ -19,8 +19,8 @@ import pytest
 import mcgicp_jax as mcg
 from mcgicp_jax import Status
 from mcgicp_jax._compute.threads import num_cores
-from mcgicp_jax._pairs import batch_executors
-from mcgicp_jax._pairs.batch_executors import Processes
+from mcgicp_jax._pairs import batch_executors, processes
+from mcgicp_jax._pairs.processes import Processes
 from tests.batches import METHOD, assert_same, batch, prepared
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(240)]
@@ -143,7 +143,7 @@ def test_threads_go_on_if_processes_cannot_start(raw, tmp_path, pays, monkeypatc
     def refuse(*_, **__):
         raise OSError("no semaphores")
 
-    monkeypatch.setattr(batch_executors, "get_reusable_executor", refuse)
+    monkeypatch.setattr(processes, "get_reusable_executor", refuse)
     results = batch(in_turn(tmp_path, source, 40), target)
     assert all(result.converged for result in results) and pids_in(tmp_path) == {os.getpid()}
 

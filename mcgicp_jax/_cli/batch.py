@@ -29,7 +29,7 @@ from mcgicp_jax import io
 from mcgicp_jax._cli.choices import Choices, listed, with_channels
 from mcgicp_jax._cli.options import Method, Options, check_outputs, clouds_in, with_names
 from mcgicp_jax._compute.messages import check_integer
-from mcgicp_jax._pairs.batch_executors import Processes
+from mcgicp_jax._pairs.processes import Processes
 from mcgicp_jax.io.files import replacing
 
 Row: TypeAlias = dict[str, str]

@@ -224,7 +224,7 @@ def check_preprocessing(voxel_size: VoxelSize | Voxels, num_neighbors: int) -> N
 
 def finite_rows(cloud: PointCloud | Values, measured: Bool[np.ndarray, "N"] | None = None) -> PointCloud:
     """A raw cloud without padding, rows that have a NaN or infinity in any array, and placeholders; warns of the latter
-    two. `measured_rows` of the cloud, if they are known."""
+    two. `measured` are its `measured_rows`, if they are known."""
     cloud = as_cloud("cloud", cloud)
     if not is_concrete(cloud):
         raise ValueError("cloud: expected concrete arrays, got tracers; call this outside of jit and vmap")

@@ -106,7 +106,8 @@ def _voxels_of(
     """An order that sorts rows by voxel, the number of the voxel of each row in it, and how many are occupied. The
     numbers of invalid rows, which come last, are beyond all others."""
     # Turned as the grids of the host are, by other random numbers.
-    middle = 0.5 * sum(end(jnp.where(valid[:, None], points, far), axis=0) for end, far in _ENDS)
+    low = jnp.min(jnp.where(valid[:, None], points, jnp.inf), axis=0)
+    middle = 0.5 * (low + jnp.max(jnp.where(valid[:, None], points, -jnp.inf), axis=0))
     key = jax.random.key(0)
     for number in (jnp.sum(valid), *jnp.sum(valid[:, None] & (points > middle), axis=0)):
         key = jax.random.fold_in(key, number)
@@ -119,6 +120,3 @@ def _voxels_of(
     numbers = jnp.concatenate([jnp.zeros(1, jnp.int32), jnp.cumsum(begins, dtype=jnp.int32)])
     count = jnp.max(jnp.where(valid[order], numbers + 1, 0))
     return order, jnp.where(valid[order], numbers, np.iinfo(np.int32).max), count
-
-
-_ENDS = ((jnp.min, np.inf), (jnp.max, -np.inf))

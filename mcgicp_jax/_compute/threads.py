@@ -32,7 +32,7 @@ _TO_DEVICE: Any = jax.transfer_guard_host_to_device
 _BETWEEN_DEVICES: Any = jax.transfer_guard_device_to_device
 _TO_HOST: Any = jax.transfer_guard_device_to_host
 # Values of guards that are not set.
-_OPEN = (None, "allow")
+_OPEN = {None, "allow"}
 
 
 def with_settings_of_package(function: Callable[Parameters, Answer]) -> Callable[Parameters, Answer]:
@@ -68,15 +68,13 @@ def _has_settings_of_package() -> bool:
         and not (jax.debug_nans.value or jax.debug_infs.value)
         and getattr(promotion, "value", promotion) == "standard"
         and jax.numpy_rank_promotion.value == "allow"
-        and _TO_DEVICE.value in _OPEN
-        and _BETWEEN_DEVICES.value in _OPEN
-        and _TO_HOST.value in _OPEN
+        and {_TO_DEVICE.value, _BETWEEN_DEVICES.value, _TO_HOST.value} <= _OPEN
     )
 
 
 def _unguarded() -> contextlib.AbstractContextManager[None]:
     """Context in which JAX transfers arrays as it needs to; only if a guard is set, since entering it takes 30 µs."""
-    unset = _TO_DEVICE.value in _OPEN and _BETWEEN_DEVICES.value in _OPEN and _TO_HOST.value in _OPEN
+    unset = {_TO_DEVICE.value, _BETWEEN_DEVICES.value, _TO_HOST.value} <= _OPEN
     return contextlib.nullcontext() if unset else jax.transfer_guard("allow")
 
 

@@ -133,12 +133,11 @@ def geometry_of_cells(local: LocalGeometry, given: Float[Array, "6 n"], num_cand
     given = jax.lax.stop_gradient(given)
     normal = alg.smallest_eigenvector(given)
     across = alg.inner(normal, alg.multiply(given, normal))
-    count, dtype = jnp.full_like(across, _COUNT), across.dtype
+    shape = geometry_observability(given, normal, jnp.full_like(across, _COUNT))
     return LocalGeometry(
         covariance=given.T,
         normal=normal.T,
-        observability=geometry_observability(given, normal, count).T
-        - _BY_CHANCE * jnp.array([1, 0, 0, 1, 0, 1], dtype),
+        observability=shape.T - _BY_CHANCE * jnp.array([1, 0, 0, 1, 0, 1], shape.dtype),
         roughness=across,
         neighborhood_radius=0.5 * jnp.sqrt(num_candidates * _SQUARE_EDGE * (given[0] + given[3] + given[5])),
         fits=local.fits,

@@ -47,7 +47,8 @@ class Directions(eqx.Module):
 
     Attributes:
         twists: (6, 6), one direction per row, scaled so that the matched points move by 1 (root mean square).
-        geometry: (6,) fraction of that squared motion that the shape of the surfaces observes, 0 to 1.
+        geometry: (6,) fraction of that squared motion that the shape of the surfaces observes, 0 to 1; slightly
+            negative where it is less than what noise, or cells, observe on average.
         channels: (6,) fraction that the channels observe; 0 for the directions that geometry constrains, negative where
             the channels of matched points do not agree.
         ties: (6,) information of tie points and prior, one over the squared standard deviation in radii of that motion;

@@ -19,8 +19,9 @@ from mcgicp_jax._compute.programs import size_class
 from mcgicp_jax._search.base import IDENTITY, AbstractIndex, AbstractSearch, SearchPoints, on_host, search_points
 from mcgicp_jax._search.kd_tree import KDTreeSearch
 
-# Rows of a run and of its parts, and of the smallest target with which several neighbours are sought by runs; and rows
-# of queries whose distances to parts are stored at a time.
+# Rows of a run and of its parts: on an H200, 20 neighbours of 6,144 points took 0.2 ms by these, and 1.45 ms by passes
+# over all distances. Fewer than eight runs exclude nothing. Rows of queries whose distances to the rows of parts are
+# stored at a time: 14 MB for 20 neighbours and five dimensions.
 _RUN, _PART, _LEAST_FOR_RUNS, _QUERIES = 64, 8, 512, 512
 
 
