@@ -89,7 +89,7 @@ def test_processes_take_over_where_they_pay(raw, tmp_path, pays, caplog, monkeyp
         results = batch(in_turn(tmp_path, source, 500), target)
     assert_same(results, 500 * batch([source], target, executor="threads"))
     assert os.getpid() in pids_in(tmp_path) and len(pids_in(tmp_path)) == 1 + num_cores()
-    assert f"pairs go on in {num_cores()} processes" in caplog.text
+    assert f"{num_cores()} processes start" in caplog.text
 
 
 def test_processes_take_over_from_an_iterator_of_any_length(raw, tmp_path, pays):

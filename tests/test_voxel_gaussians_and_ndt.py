@@ -402,3 +402,14 @@ def test_cells_of_noisy_surfaces_hold_nothing_by_chance(scene, noise):
         for moving, method in ((cells[0], mcg.D2DNDT()), (mcg.preprocess(source, None), mcg.NDT())):
             result = mcg.register(moving, cells[1], method)
             assert result.status is (Status.CONVERGED if scene == "room" else Status.DEGENERATE)
+
+
+@pytest.mark.parametrize(("count", "cell"), [(3000, 0.25), (10_000, 0.15), (1000, 0.4)])
+@pytest.mark.parametrize("method", [mcg.NDT, mcg.D2DNDT])
+def test_a_plane_as_thick_as_the_cells_holds_nothing(method, count, cell):
+    """Its cells have normals in all directions."""
+    for seed in range(3):
+        rng = np.random.default_rng(seed)
+        source, target = (np.c_[rng.uniform(-3, 3, (count, 2)), rng.normal(0, cell / 4, count)] for _ in range(2))
+        result = mcg.register(source + np.array([0.1, 0.05, 0.02]), target, method(), voxel_sizes=[cell])
+        assert result.status is Status.DEGENERATE

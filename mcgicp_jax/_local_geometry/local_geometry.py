@@ -112,10 +112,6 @@ def weighted_covariance(offsets: Offsets, weights: Float[Array, "k N"]) -> Float
 _SQUARE_EDGE = 6.0
 # Assumed number of points from which the normal of a cell was estimated: the fewest of a cell by default.
 _COUNT = 6
-# Observability that cells have by chance, where they hold parts of two planes: in crossing planes, planes, corridors
-# and floors with a wall it was up to 0.013 along free directions (assuming 20 points in a cell, up to 0.034). It was
-# 0.030 in a yard, and from 0.05 on in rooms and streets.
-_BY_CHANCE = 0.022
 
 
 def cell_edge(cells: PointCloud) -> Float[AnyScalar, ""]:
@@ -133,11 +129,10 @@ def geometry_of_cells(local: LocalGeometry, given: Float[Array, "6 n"], num_cand
     given = jax.lax.stop_gradient(given)
     normal = alg.smallest_eigenvector(given)
     across = alg.inner(normal, alg.multiply(given, normal))
-    shape = geometry_observability(given, normal, jnp.full_like(across, _COUNT))
     return LocalGeometry(
         covariance=given.T,
         normal=normal.T,
-        observability=shape.T - _BY_CHANCE * jnp.array([1, 0, 0, 1, 0, 1], shape.dtype),
+        observability=geometry_observability(given, normal, jnp.full_like(across, _COUNT)).T,
         roughness=across,
         neighborhood_radius=0.5 * jnp.sqrt(num_candidates * _SQUARE_EDGE * (given[0] + given[3] + given[5])),
         fits=local.fits,
