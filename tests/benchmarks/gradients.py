@@ -377,7 +377,7 @@ def training() -> None:
         _table("Training, float32", by_channels.TRAINING_COLUMNS, list(by_channels.training()))
         jax.config.update("jax_enable_x64", True)
         rows = [row for name in by_channels.SETS for row in by_channels.cosines(name, ["MC-GICP"])]
-        rows += by_channels.cosines("flat tables", ["Color ICP", "photometric"])
+        rows += by_channels.cosines("flat tables", ["Color ICP", "photometric", "Color NDT"])
         _table("Derivatives by channels against differences of the registration, float64", by_channels.COLUMNS, rows)
 
 

@@ -100,6 +100,8 @@ def start_cases() -> Iterator[Case]:
             yield case(words, partial(office, common=common), mcg.GICP(), starts[name])
     yield case("office, point-to-plane, from truth", office, mcg.PointToPlane(), {})
     yield case("office, MC-GICP, from truth", with_tiles, mcg.MultiChannelGICP(), {})
+    for cells in (mcg.NDT(), mcg.D2DNDT()):
+        yield case(f"office, {type(cells).__name__}, from truth", office, cells, {"voxel_sizes": (0.5,)})
 
     def framed(seed: int) -> Pair:
         return in_frames(office(seed), _FRAME, _FRAME)
