@@ -45,27 +45,31 @@ jax.monitoring.register_event_duration_secs_listener(COMPILATIONS)
 
 # XLA's fusion emitters take half of the compilation of derivatives and of a step of the loop, and these programs run no
 # faster for it (jaxlib 0.10.2). Programs over neighbourhoods run up to 2.4 times as long without.
-_OPTIONS = {"xla_cpu_use_fusion_emitters": False}
+_QUICK = (("xla_cpu_use_fusion_emitters", False),)
+# Programs of a few small matrices run as long without LLVM's optimizations, which take half of what is left.
+_SMALL = (*_QUICK, ("xla_backend_optimization_level", 0))
 
 
-def quickly_compiled(function: Callable[..., Result], **settings: Any) -> Callable[..., Result]:
-    """`jax.jit` of a function that is called outside of other transformations; it runs on the CPU."""
+def quickly_compiled(function: Callable[..., Result], *, small: bool = False) -> Callable[..., Result]:
+    """`jax.jit` of a function that is called outside of other transformations, of `small` matrices alone or of rows; it
+    runs on the CPU."""
 
     @functools.cache
     def program() -> Callable[..., Result]:
-        return jax.jit(function, compiler_options=_known_options(), **settings)
+        return jax.jit(function, compiler_options=_known(_SMALL if small else _QUICK))
 
     return computed_on_cpu(functools.wraps(function)(lambda *arguments: program()(*arguments)))
 
 
 @functools.cache
-def _known_options() -> dict[str, bool]:
+def _known(options: tuple[tuple[str, bool | int], ...]) -> dict[str, bool | int]:
     """The options, or none if this version of XLA no longer knows them."""
+    known = dict(options)
     try:
-        jax.jit(jnp.negative, compiler_options=_OPTIONS).lower(0.0).compile()
+        jax.jit(jnp.negative, compiler_options=known).lower(0.0).compile()
     except Exception:
         return {}
-    return _OPTIONS
+    return known
 
 
 # Rows. Clouds of 100 to 200,000 points then fall into 23 classes, each compiled once, and brute force takes at most

@@ -74,9 +74,10 @@ def local_geometry_of(around: Neighborhoods) -> LocalGeometry:
     # Of every second neighbour, from the first on and then from the second on.
     halves = [weighted_covariance((a[i::2], b[i::2], c[i::2]), present[i::2]) for i in (0, 1)]
     counts = jnp.concatenate([jnp.sum(some, axis=0) for some in (present, present[::2], present[1::2])])
-    # Whole neighbourhoods and their halves as one array: what is done with each array is compiled anew.
-    covariances = jnp.concatenate([covariance, *halves], axis=1)
-    normals = alg.smallest_eigenvector(covariances)
+    # Whole neighbourhoods and their halves as one array: what is done with each array is compiled anew. Without the
+    # barriers, so is how they are computed, for each of their uses.
+    covariances = jax.lax.optimization_barrier(jnp.concatenate([covariance, *halves], axis=1))
+    normals = jax.lax.optimization_barrier(alg.smallest_eigenvector(covariances))
     size = covariance.shape[1]
     normal = normals[:, :size]
     fixed_normal, covariances, normals = jax.lax.stop_gradient((normal, covariances, normals))

@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from mcgicp_jax._compute.concrete import AnyArray, AnyScalar
+from mcgicp_jax._compute.concrete import AnyArray, AnyScalar, numpy_for
 from mcgicp_jax._local_geometry.observability import agreement
 from mcgicp_jax._math import symmetric_matrices as alg
 from mcgicp_jax._pose_solver.matched import Matched, Motion, linearize_at
@@ -71,8 +71,9 @@ class Sums(NamedTuple):
     @property
     def radius(self) -> Float[AnyScalar, ""]:
         """Root mean square distance of the moved, matched points from the centre, metres; 1 if it is 0."""
-        square = self.square_extent / jnp.maximum(self.count, 1)
-        return jnp.where(square > 0, jnp.sqrt(jnp.where(square > 0, square, 1)), 1)
+        xp = numpy_for(self.square_extent, self.count)
+        square = self.square_extent / xp.maximum(self.count, 1)
+        return xp.where(square > 0, xp.sqrt(xp.where(square > 0, square, 1)), xp.ones_like(square))
 
     @property
     def num_inliers(self) -> Int[Array, ""]:

@@ -18,6 +18,7 @@ from mcgicp_jax._clouds.point_cloud import PointCloud
 from mcgicp_jax._compute.cache import Held, Lazy
 from mcgicp_jax._compute.concrete import AnyArray, AnyScalar, constant, is_concrete, numpy_for
 from mcgicp_jax._compute.linear_maps import primal, without_derivative
+from mcgicp_jax._compute.programs import quickly_compiled
 from mcgicp_jax._math.poses import adjoint_to_center, se3_from_matrix, translation_adjoint, units
 from mcgicp_jax._math.statistics import sampled_rows
 from mcgicp_jax._pose_solver.covariance import (
@@ -57,12 +58,12 @@ def assessment_of(executor: AbstractExecutor, loop: LoopResult, moments: Callabl
         # In float64: unconstrained directions have large variances, next to which others would be lost to rounding.
         with jax.enable_x64(True):
             weights = moments() if fusion is None else fusion
-            return np.asarray(covariance_of_pose(*as_float64((state._replace(record=None), weights))))
+            return np.asarray(_covariance_on_host(*as_float64((state._replace(record=None), weights))))
 
     if not is_concrete(state):
         covariances = covariance_of_pose(state, moments() if fusion is None else fusion)
         return Assessment(Lazy.of(constraints_of(state)), Lazy.of(covariances))
-    return Assessment(Lazy(lambda: jax.tree.map(np.asarray, constraints_of(state))), Lazy(covariance))
+    return Assessment(Lazy(lambda: jax.tree.map(np.asarray, _constraints_on_host(state))), Lazy(covariance))
 
 
 def moments_of(executor: AbstractExecutor, loop: LoopResult) -> Moments:
@@ -127,7 +128,6 @@ def as_float64(tree: Any) -> Any:
     return jax.tree.map(convert, tree)
 
 
-@jax.jit
 def constraints_of(state: State) -> Constraints:
     """Information matrix and directions at the final pose, for ξ in T exp(ξ), metres and radians."""
     sums, directions = state.sums, state.directions
@@ -137,7 +137,6 @@ def constraints_of(state: State) -> Constraints:
     return Constraints(information, at_source)
 
 
-@jax.jit
 def covariance_of_pose(state: State, weights: Moments | Fusion) -> Float[Array, "6 6"]:
     """Covariance of the final pose, for ξ in T exp(ξ), metres and radians; NaN if the status allows none."""
     exists = (state.status != Status.TOO_FEW_CORRESPONDENCES) & (state.status != Status.NON_FINITE)
@@ -149,6 +148,10 @@ def covariance_of_pose(state: State, weights: Moments | Fusion) -> Float[Array, 
     else:
         covariance = sandwich(state.pose, center, radius, weights, state.directions)
     return jnp.where(exists, covariance, jnp.nan)
+
+
+_constraints_on_host = quickly_compiled(constraints_of, small=True)
+_covariance_on_host = quickly_compiled(covariance_of_pose, small=True)
 
 
 def registration_of(

@@ -400,7 +400,6 @@ def _contradicts_prior(pose: jaxlie.SE3, measurements: PoseMeasurements | None) 
     return residual @ measurements.form.prior.information @ residual > _CONTRADICTION
 
 
-@jax.jit
 def root_of(state: State, fusion: Fusion | None) -> ImplicitRoot:
     """The equation that defines the final pose, for its derivative."""
     converged = (state.status == Status.CONVERGED) | (state.status == Status.UNVERIFIED)

@@ -20,7 +20,6 @@ from jaxtyping import Array, Float
 
 from mcgicp_jax._clouds.point_cloud import PointCloud
 from mcgicp_jax._compute.concrete import is_concrete
-from mcgicp_jax._compute.devices import computed_on_cpu
 from mcgicp_jax._compute.linear_maps import AbstractLinearMap, SideBySide, primal, with_derivative
 from mcgicp_jax._compute.programs import quickly_compiled
 from mcgicp_jax._compute.row_functions import Input, RowFunction, Rows, blockwise
@@ -91,7 +90,7 @@ class PoseDerivative(AbstractLinearMap):
     ):
         problem = executor.problem
         self._pose, self._fusion = np.asarray(loop.state.pose.wxyz_xyz), problem.fusion
-        root = computed_on_cpu(root_of)(loop.state._replace(record=None), self._fusion)
+        root = _root_on_host(loop.state._replace(record=None), self._fusion)
         self._scaling: ImplicitRoot = jax.tree.map(np.asarray, root)
         fusion: Any = self._fusion
         form = None if fusion is None else fusion.form
@@ -271,6 +270,7 @@ def _multiplied(gains: Float[Array, "C"], channels: Rows) -> tuple[Float[Array, 
 
 
 _form_at = jax.jit(form_at)
+_root_on_host = quickly_compiled(root_of, small=True)
 
 
 def with_derivatives(states: Sequence[State], derivatives: Sequence[PoseDerivative | None]) -> list[State]:
