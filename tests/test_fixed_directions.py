@@ -80,6 +80,19 @@ def test_a_planar_scan_lifted_to_3d(recwarn):
     assert not recwarn
 
 
+def test_what_to_do_with_a_planar_scan_in_3d():
+    wall = np.linspace(0, 3, 250)
+    corner = np.concatenate([np.stack([wall, 0 * wall], axis=1), np.stack([0 * wall, wall], axis=1)]) + 0.3
+    for voxel_size in ("auto", None):
+        with pytest.warns(UserWarning, match="same z, and most lie on lines; lift a planar scan to 3-D"):
+            mcg.preprocess(np.c_[corner, np.full(len(corner), 1.5)], voxel_size)
+
+
+def test_a_flat_picture_is_no_planar_scan(recwarn):
+    mcg.preprocess(np.c_[np.random.default_rng(0).random((1000, 2)), np.zeros(1000)])
+    assert not recwarn
+
+
 @pytest.mark.parametrize("seed", range(4))
 def test_walls_of_a_planar_scan_hold_nothing_along_them(seed):
     """Points of copies one spacing apart are matched across copies, and errors are up to 15 deviations."""

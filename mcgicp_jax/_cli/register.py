@@ -284,9 +284,13 @@ def _report(pair: PreparedPair, result: mcg.RegistrationResult) -> None:
 
 def _verdict(results: dict[MethodName, mcg.RegistrationResult]) -> int:
     """Return the exit code, and print to stderr which methods did not converge."""
-    failed = {name: result for name, result in results.items() if not result.converged}
-    for name, result in failed.items():
-        print(f"mcgicp: {name} did not converge ({_words(result)}): {result.status.advice}", file=sys.stderr)
+    failed: dict[mcg.Status, list[str]] = {}
+    for name, result in results.items():
+        if not result.converged:
+            failed.setdefault(result.status, []).append(name)
+    for status, names in failed.items():
+        words = f"{', '.join(names)} did not converge ({_words(results[names[0]])})"
+        print(f"mcgicp: {words}: {status.advice}", file=sys.stderr)
     return 1 if failed else 0
 
 

@@ -62,6 +62,13 @@ def _as_float(name: str, values: Any) -> Any:
     return np.where(np.ma.getmaskarray(values), np.nan, array) if np.ma.is_masked(values) else array
 
 
+# What to do with a planar scan.
+PLANAR_ADVICE = (
+    "lift a planar scan to 3-D: stack five copies of it, about five spacings apart in z, and fix z, roll and pitch by "
+    "a prior"
+)
+
+
 def _advice(shape: tuple[int, ...]) -> str:
     """What to do with points of another shape."""
     if len(shape) == 2 and shape[0] == 3:
@@ -69,10 +76,7 @@ def _advice(shape: tuple[int, ...]) -> str:
     if len(shape) == 3 and shape[2] == 3:
         return "; pass points.reshape(-1, 3) of one cloud in a grid, or a list of clouds to register_batch"
     if len(shape) == 2 and shape[1] == 2:
-        return (
-            "; lift a planar scan to 3-D: stack five copies of it, about five spacings apart in z, and fix z, roll and "
-            "pitch by a prior"
-        )
+        return f"; {PLANAR_ADVICE}"
     return "; pass PointCloud(points, channels)" if len(shape) == 2 and shape[1] > 3 else ""
 
 

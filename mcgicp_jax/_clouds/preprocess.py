@@ -115,8 +115,8 @@ def preprocessed_in(
         grid = None
     found = with_neighbors(cloud, voxel_size, num_neighbors, search, grid)
     _warn_of_loss(cloud, found, num_neighbors)
-    if voxel_size is None and found.covariances is None:
-        warn_of_shape(found)
+    if found.covariances is None:
+        warn_of_shape(found, averaged=voxel_size is not None)
     return found
 
 

@@ -10,13 +10,13 @@ from __future__ import annotations
 import bisect
 from collections.abc import Sequence
 from functools import partial
-from typing import Any, Literal, NamedTuple, TypeAlias
+from typing import Any, Literal, NamedTuple, TypeAlias, cast
 
 import numpy as np
 from jaxtyping import Bool, Float
 
 from mcgicp_jax._clouds.placeholders import measured_rows
-from mcgicp_jax._clouds.point_cloud import PointCloud, Voxels
+from mcgicp_jax._clouds.point_cloud import PLANAR_ADVICE, PointCloud, Voxels
 from mcgicp_jax._clouds.voxels import VOXELS_PER_AXIS, Grid, grid_of
 from mcgicp_jax._compute.concrete import is_concrete
 from mcgicp_jax._compute.linear_maps import primal
@@ -58,8 +58,9 @@ _DOUBLE = 3
 _DECADES, _DOUBLINGS, _INNER = 4, 4, (0.05, 0.95)
 # Number of points whose neighbourhoods are examined: a fraction of 5 % is known to within 1.3 %.
 _SAMPLE = 300
-# Fractions of lines and thickness from which raw clouds are warned of.
+# Fractions of lines and thickness from which raw clouds are warned of; lines of which a plane is a planar scan.
 _MANY_LINES, _AS_THICK_AS_WIDE = 0.1, 0.6
+_MOSTLY_LINES = 0.5
 
 
 class Shape(NamedTuple):
@@ -115,19 +116,23 @@ def raw_spacing(cloud: PointCloud) -> float:
     return _shape_of(points.T).spacing if len(points) > 1 else 0.0
 
 
-def warn_of_shape(cloud: PointCloud) -> None:
-    """Warn if the neighbourhoods of a preprocessed cloud do not span the surface."""
-    if len(cloud) < _LEAST_VOXELS:
+def warn_of_shape(cloud: PointCloud, averaged: bool) -> None:
+    """Warn of a preprocessed cloud that is a planar scan, or whose neighbourhoods do not span the surface though it is
+    not `averaged` in voxels."""
+    points, neighbors = np.asarray(cloud.points, np.float64), cast(Any, cloud.deferred_neighbors)
+    same, examined = (points == points[0]).all(axis=0), not averaged and len(cloud) >= _LEAST_VOXELS
+    if not examined and same.sum() != 1:
         return
-    neighbors: Any = cloud.deferred_neighbors
     # Fewer neighbours are often lines by chance.
-    found = neighbors if neighbors.shape[1] >= NUM_NEIGHBORS else None
-    shape, seen = _shape_of(np.asarray(cloud.points, np.float64).T, found), []
+    shape, seen = _shape_of(points.T, neighbors if neighbors.shape[1] >= NUM_NEIGHBORS else None), []
+    if same.sum() == 1 and shape.lines > _MOSTLY_LINES:
+        warn(f"points: all have the same {'xyz'[int(same.argmax())]}, and most lie on lines; {PLANAR_ADVICE}")
+        return
     if shape.lines > _MANY_LINES:
         seen.append(f"{shape.lines:.0%} of the neighbourhoods are lines")
     if shape.thickness > _AS_THICK_AS_WIDE:
         seen.append(f"the neighbourhoods are {shape.thickness:.2f} times as thick as wide")
-    if seen:
+    if seen and examined:
         warn(f'voxel_size: without voxels, {" and ".join(seen)}, so they do not describe the surface; use "auto"')
 
 
