@@ -13,7 +13,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from mcgicp_jax._compute.concrete import AnyArray, AnyScalar, numpy_for
 from mcgicp_jax._local_geometry.observability import agreement
@@ -24,6 +24,7 @@ from mcgicp_jax._terms.base import AbstractTerm, PosedMatches
 # Observability that cells have in common by chance: planes whose noise is a third to a half of the edge of a cell had
 # up to 0.017 along free directions (D2D-NDT), crossing planes 0.0025; yards, streets, rooms and RGB-D at least 0.025.
 _BY_CHANCE = 0.02
+_LAST = np.bool_(True)
 # Fields of `Sums` that are sums over h hᵀ.
 _SECOND_MOMENTS = ("stiffness", "mass", "observability", "channel_observability", "agreement", "surplus")
 
@@ -86,7 +87,13 @@ class Sums(NamedTuple):
         return jnp.sqrt(self.square_distance / self.num_matched)
 
 
-def sums_of(motion: Motion, matched: Matched, terms: tuple[AbstractTerm, ...], near: Float[AnyScalar, ""]) -> Sums:
+def sums_of(
+    motion: Motion,
+    matched: Matched,
+    terms: tuple[AbstractTerm, ...],
+    near: Float[AnyScalar, ""],
+    last: Bool[AnyScalar, ""] = _LAST,
+) -> Sums:
     """Compute the sums at a pose in one pass over the correspondences, the only part of a step that touches points.
 
     All sums but those for the centre are rows of one product with h hᵀ: sums of their own would be programs of several
@@ -96,6 +103,7 @@ def sums_of(motion: Motion, matched: Matched, terms: tuple[AbstractTerm, ...], n
         near: metres; source points within this distance of the sensor, the origin of their frame, may be the sensor's
             own vehicle, which moves with it. By shape they count against a motion, which they would hold wherever
             others say less; their channels do not count.
+        last: whether the loop ends with these sums, see `observability`.
     """
     posed, found, counts = linearize_at(motion, matched, terms)
     mask = jnp.asarray(matched.valid).astype(posed.moved.dtype)
@@ -103,7 +111,7 @@ def sums_of(motion: Motion, matched: Matched, terms: tuple[AbstractTerm, ...], n
     center = jnp.stack(total) / jnp.maximum(count, 1)
     h = with_one(mask * (posed.moved - center[:, None]))
     share = _share(counts, matched.num_candidates)
-    shown = observability(posed, terms)
+    shown = observability(posed, terms, last)
     rows = [
         found.stiffness,
         found.force,
@@ -174,13 +182,16 @@ def _share(counts: Float[Array, "n"], num_candidates: int) -> Float[Array, "n"]:
     return (each / jnp.where(total > 0, total, 1)).reshape(-1)
 
 
-def observability(posed: PosedMatches, terms: tuple[AbstractTerm, ...]) -> list[Float[Array, "6 n"]]:
+def observability(
+    posed: PosedMatches, terms: tuple[AbstractTerm, ...], last: Bool[AnyScalar, ""] = _LAST
+) -> list[Float[Array, "6 n"]]:
     """O per correspondence, in the target's frame: mean over its two points, by shape, and where channels are used, by
     channels; then, if the surfaces have `noise` with slopes, by the agreement of the channels, and its surplus.
 
     The O of a cell is biased: its normal comes from few points, and is a random one where noise is as large as the
     cell. For cells it is therefore the product of both, whose noise is independent, less what they have in common by
-    chance.
+    chance. Before the `last` sums it is the mean of both, less the same: far from the right pose the cells of a match
+    have nothing in common, and the directions that each cloud observes guide the pose.
     """
     source, target, rotation = posed.source, posed.target, posed.rotation
     if source.observability is None or target.observability is None:
@@ -189,9 +200,8 @@ def observability(posed: PosedMatches, terms: tuple[AbstractTerm, ...]) -> list[
     if all(term.matches_slide for term in terms):
         found = [0.5 * (ours + theirs)]
     else:
-        found = [
-            alg.symmetric_product(ours, theirs) - _BY_CHANCE * jnp.array([[1], [0], [0], [1], [0], [1]], ours.dtype)
-        ]
+        agreed = jnp.where(last, alg.symmetric_product(ours, theirs), 0.5 * (ours + theirs))
+        found = [agreed - _BY_CHANCE * jnp.array([[1], [0], [0], [1], [0], [1]], ours.dtype)]
     if source.channel_observability is not None and target.channel_observability is not None:
         found.append(0.5 * (alg.rotate(rotation, source.channel_observability.T) + target.channel_observability.T))
     slopes = [None if surface.noise is None else surface.noise.slopes for surface in (source, target)]

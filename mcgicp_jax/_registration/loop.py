@@ -225,8 +225,8 @@ class AbstractExecutor(abc.ABC):
     def sums(self, motion: Motion, matches: Matches, terms: tuple[AbstractTerm, ...], last: Bool[AnyScalar, ""]) -> Any:
         """`sums_of` all correspondences, as the executor keeps them while the loop runs.
 
-        In the `last` step, the channels of matched points must agree. Far from the right pose they do not, and before
-        that step the channels that each cloud observes guide the pose.
+        In the `last` step, the channels of matched points must agree, and so must the shapes of cells. Far from the
+        right pose they do not, and before that step what each cloud observes guides the pose.
         """
 
     def update(self, state: State, sums: Any) -> State:

@@ -104,7 +104,8 @@ class HostExecutor(AbstractExecutor):
         # Packed until the loop ends: to pass and to return dozens of arrays takes longer than to use them. Not awaited:
         # `update` is dispatched while they are computed, which saves half of the hand-overs between threads.
         with_slopes = bool(last) and self.problem.source.observes_channels
-        applied = self._over(sums_of, motion, matches, (terms, self.problem.settings.near), with_slopes)
+        arguments = terms, self.problem.settings.near, np.bool_(last)
+        applied = self._over(sums_of, motion, matches, arguments, with_slopes)
         parts: list[Packed[Sums]] = applied.sums(self._num_threads if with_slopes else 1)
         return parts[0] if len(parts) == 1 else _combined(parts)
 

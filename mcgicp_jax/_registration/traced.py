@@ -99,9 +99,8 @@ class TracedExecutor(AbstractExecutor):
 
     def sums(self, motion: Motion, matches: Matches, terms: tuple[AbstractTerm, ...], last: Bool[Array, ""]) -> Sums:
         problem = self.problem
-        sums = self.rows(
-            sums_of, motion, matches, terms, problem.settings.near, with_noise=problem.source.observes_channels
-        )
+        arguments = terms, problem.settings.near, last
+        sums = self.rows(sums_of, motion, matches, *arguments, with_noise=problem.source.observes_channels)
         if sums.channel_observability is None or sums.agreement is None or sums.surplus is None:
             return sums
         agreement = jnp.where(last, sums.agreement, sums.channel_observability)
