@@ -244,10 +244,11 @@ def test_a_map_drifts_less():
     pairs = list(mcg.odometry(frames, mcg.GICP(), **options))
     errors = [metrics.ate([step.pose for step in each], truth, alignment="first") for each in (steps, pairs)]
     assert errors[0] < 0.8 * errors[1]
+    # Of 2,000 points, a cell has hardly the six from which it is made.
+    frames = datasets.box_room(10, points_per_frame=4000, step=0.08)
     cells = list(mcg.odometry(frames, mcg.NDT(), against="map", voxel_sizes=(0.5,), **options | {"max_distance": 1.0}))
-    # The few cells of the first frame, which lie across the walls, may leave a direction unconstrained.
-    assert all(step.registration.converged for step in cells[2:])
-    assert metrics.ate([step.pose for step in cells], truth, alignment="first") < 0.05
+    assert all(step.registration.converged for step in cells[1:])
+    assert metrics.ate([step.pose for step in cells], truth, alignment="first") < 0.01
 
 
 def test_the_frames_after_an_invalid_one_go_on(room):

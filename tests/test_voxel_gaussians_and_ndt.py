@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import mcgicp_jax as mcg
-from mcgicp_jax import Status, extend
+from mcgicp_jax import Status, datasets, extend
 from mcgicp_jax._clouds.voxels import grid_of
 from mcgicp_jax.metrics import pose_error
 from tests.compilations import compilations
@@ -413,3 +413,13 @@ def test_a_plane_as_thick_as_the_cells_holds_nothing(method, count, cell):
         source, target = (np.c_[rng.uniform(-3, 3, (count, 2)), rng.normal(0, cell / 4, count)] for _ in range(2))
         result = mcg.register(source + np.array([0.1, 0.05, 0.02]), target, method(), voxel_sizes=[cell])
         assert result.status is Status.DEGENERATE
+
+
+@pytest.mark.parametrize("seed", range(2))
+def test_large_cells_leave_a_wrong_start(seed):
+    """At the start, cells that are matched have little in common."""
+    target, source = datasets.street(2, seed=seed, points_per_frame=8000)
+    truth = np.linalg.inv(target.pose) @ source.pose
+    start = truth @ motion((0.4, -0.3, 0, 0.01, -0.02, 0.09))
+    result = mcg.register(source.cloud, target.cloud, mcg.D2DNDT(), init=start, voxel_sizes=[3.0])
+    assert max(pose_error(result.matrix, truth)) < 0.1

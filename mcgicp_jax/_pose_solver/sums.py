@@ -190,18 +190,17 @@ def observability(
 
     The O of a cell is biased: its normal comes from few points, and is a random one where noise is as large as the
     cell. For cells it is therefore the product of both, whose noise is independent, less what they have in common by
-    chance. Before the `last` sums it is the mean of both, less the same: far from the right pose the cells of a match
-    have nothing in common, and the directions that each cloud observes guide the pose.
+    chance. Before the `last` sums it is their mean: far from the right pose the cells of a match have nothing in
+    common, and the directions that each cloud observes guide the pose.
     """
     source, target, rotation = posed.source, posed.target, posed.rotation
     if source.observability is None or target.observability is None:
         return []
     ours, theirs = alg.rotate(rotation, source.observability.T), target.observability.T
-    if all(term.matches_slide for term in terms):
-        found = [0.5 * (ours + theirs)]
-    else:
-        agreed = jnp.where(last, alg.symmetric_product(ours, theirs), 0.5 * (ours + theirs))
-        found = [agreed - _BY_CHANCE * jnp.array([[1], [0], [0], [1], [0], [1]], ours.dtype)]
+    found = [0.5 * (ours + theirs)]
+    if not all(term.matches_slide for term in terms):
+        by_chance = _BY_CHANCE * jnp.array([[1], [0], [0], [1], [0], [1]], ours.dtype)
+        found = [jnp.where(last, alg.symmetric_product(ours, theirs) - by_chance, *found)]
     if source.channel_observability is not None and target.channel_observability is not None:
         found.append(0.5 * (alg.rotate(rotation, source.channel_observability.T) + target.channel_observability.T))
     slopes = [None if surface.noise is None else surface.noise.slopes for surface in (source, target)]
