@@ -60,7 +60,7 @@ def box_room(
     """
     check_scene(points_per_frame, noise)
     scene_rng, path_rng = scene_and_path_rng(seed)
-    boxes = [*_shell(), *_furniture(scene_rng)]
+    boxes = _boxes(scene_rng)
     colors = scene_rng.uniform(0.25, 0.75, (len(boxes), 3))
     observer = partial(_observe, boxes, colors, int(scene_rng.integers(2**31)), points_per_frame, noise, along_rays)
     path = partial(_pose, step, *path_rng.uniform(0, 2 * np.pi, 2))
@@ -89,32 +89,27 @@ def _observe(
     rays = hits.rays @ rotation
     error = rng.normal(size=(len(rays), 1)) * rays if along_rays else rng.normal(size=rays.shape)
     points = hits.distance[:, None] * rays + noise * _POINT_NOISE * error
-    painted = colors[hits.solid] + patches(hits.points, _PAINT, pattern)[:, None] * _PAINT_COLOR
-    seen = np.clip(painted + noise * _COLOR_NOISE * rng.normal(size=painted.shape), 0, 1)
-    return PointCloud(points, seen, channel_names=COLORS)
+    paint = colors[hits.solid] + patches(hits.points, _PAINT, pattern)[:, None] * _PAINT_COLOR
+    channels = np.clip(paint + noise * _COLOR_NOISE * rng.normal(size=paint.shape), 0, 1)
+    return PointCloud(points, channels, channel_names=COLORS)
 
 
-def _shell() -> list[Box]:
-    """Floor, ceiling and four walls, overlapping at their edges."""
-    shell = []
-    for axis in range(3):
-        for side in (0.0, _SIZE[axis]):
-            low, high = np.full(3, -_WALL), _SIZE + _WALL
-            low[axis], high[axis] = (side - _WALL, side) if side == 0 else (side, side + _WALL)
-            shell.append(Box(low, high))
-    return shell
-
-
-def _furniture(rng: np.random.Generator) -> list[Box]:
-    """Boxes on the floor, most of them against the walls; they may intersect."""
+def _boxes(rng: np.random.Generator) -> list[Box]:
     boxes = []
+    # Floor, ceiling and four walls, overlapping at their edges.
+    for axis in range(3):
+        for start, end in ((-_WALL, 0.0), (_SIZE[axis], _SIZE[axis] + _WALL)):
+            low, high = np.full(3, -_WALL), _SIZE + _WALL
+            low[axis], high[axis] = start, end
+            boxes.append(Box(low, high))
+    # Furniture on the floor, most of it against the walls; boxes may intersect.
     for _ in range(_NUM_BOXES):
         size = rng.uniform((0.3, 0.3, 0.3), (1.6, 1.0, _HIGHEST_BOX))
         if rng.uniform() < 0.5:
             size[:2] = size[1::-1]
         low = np.append(rng.uniform(0, _SIZE[:2] - size[:2]), 0)
         if rng.uniform() < 0.7:
-            axis = rng.integers(2)
+            axis = int(rng.integers(2))
             low[axis] = rng.choice([0, _SIZE[axis] - size[axis]])
         boxes.append(Box(low, low + size))
     return boxes

@@ -15,7 +15,9 @@ from jaxtyping import Bool, Float, Shaped, UInt8, UInt16
 from scipy.spatial.transform import Rotation
 
 from mcgicp_jax import io
+from mcgicp_jax._clouds.columns import COLORS
 from mcgicp_jax._clouds.point_cloud import Frame, PointCloud
+from mcgicp_jax._compute.concrete import AnyArray
 from mcgicp_jax._compute.messages import optional_module
 from mcgicp_jax.io.clouds import is_cloud
 
@@ -138,11 +140,10 @@ class SyntheticFrames(AbstractFrames):
         row = self._row(index)
         key = (_FIRST_FRAME + row,) if noise_seed is None else (_FIRST_FRAME + row, noise_seed)
         rng = np.random.default_rng(np.random.SeedSequence(self.seed, spawn_key=key))
-        pose = self.path(row)
-        during = pose
+        pose = poses_of_scan = self.path(row)
         if self.num_poses > 1:
-            during = np.stack([self.path(row - float(time)) for time in np.linspace(1, 0, self.num_poses)])
-        return Frame(self.observer(rng, during), pose, row * self.period)
+            poses_of_scan = np.stack([self.path(row - float(time)) for time in np.linspace(1, 0, self.num_poses)])
+        return Frame(self.observer(rng, poses_of_scan), pose, row * self.period)
 
 
 # Independent random streams of one seed: the scene, the path of the sensor, and one per frame.
@@ -200,8 +201,24 @@ def bilinear(
     """Values at pixels (column, row) of an image; `mode` says how SciPy's `map_coordinates` continues it."""
     from scipy.ndimage import map_coordinates
 
-    values = [map_coordinates(each, pixels.T[::-1], float, order=1, mode=mode) for each in np.moveaxis(image, 2, 0)]
+    channels = np.moveaxis(image, 2, 0)
+    values = [map_coordinates(channel, pixels.T[::-1], float, order=1, mode=mode) for channel in channels]
     return np.stack(values, axis=1)
+
+
+def colored_cloud(
+    points: Float[AnyArray, "N 3"],
+    colors: Float[np.ndarray, "N 3"],
+    colored: Bool[np.ndarray, "N"],
+    intensity: Float[AnyArray, "N 1"] | None = None,
+) -> PointCloud:
+    """A cloud whose colours are valid where `colored`; an intensity becomes the first channel, valid everywhere."""
+    channels, valid, names = colors, np.repeat(colored[:, None], 3, axis=1), list(COLORS)
+    if intensity is not None:
+        channels = np.hstack([intensity, colors])
+        valid = np.hstack([np.ones_like(intensity, bool), valid])
+        names = ["intensity", *COLORS]
+    return PointCloud(points, channels, channel_valid=valid, channel_names=names)
 
 
 def _open(path: str | os.PathLike[str]) -> Any:
@@ -243,18 +260,18 @@ class CloudFiles(AbstractFrames):
         # Raises if there is no such folder.
         os.scandir(folder).close()
         visible = (path for path in folder.glob(glob) if path.is_file() and not path.name.startswith("."))
-        paths = sorted(visible, key=_by_number)
+        # Numbers count by value: scan_10.ply is ordered as ("scan_", 10), (".ply", 0).
+        paths = sorted(
+            visible,
+            key=lambda path: [(text, int(number or 0)) for text, number in re.findall(r"(\D*)(\d*)", path.name)],
+        )
         self.paths = [path for path in paths if is_cloud(path)]
         self.left_out = [path for path in paths if path not in self.paths]
         if not self.paths:
-            named = "" if glob == "*" else f" {glob}"
-            raise ValueError(f"{folder}: expected clouds{named}, found none")
+            pattern = "" if glob == "*" else f" {glob}"
+            raise ValueError(f"{folder}: expected clouds{pattern}, found none")
         self._columns = columns
         super().__init__(len(self.paths))
 
     def _frame(self, index: int) -> Frame:
         return Frame(io.read(self.paths[index], columns=self._columns))
-
-
-def _by_number(path: Path) -> list[tuple[str, int]]:
-    return [(text, int(number or 0)) for text, number in re.findall(r"(\D*)(\d*)", path.name)]

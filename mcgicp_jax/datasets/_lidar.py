@@ -7,16 +7,15 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from scipy.spatial.transform import Rotation
 
 from mcgicp_jax import io
-from mcgicp_jax._clouds.columns import COLORS
 from mcgicp_jax._clouds.point_cloud import Frame, PointCloud
-from mcgicp_jax.datasets._frames import AbstractFrames, Matrix, Picture, look_up, pose_of, read_image
+from mcgicp_jax.datasets._frames import AbstractFrames, Matrix, Picture, colored_cloud, look_up, pose_of, read_image
 
-# Pose of the laser in the vehicle's frame: x, y, z in metres; roll, pitch, yaw in radians.
-_LASER_IN_VEHICLE = np.array([2.4, -0.01, -2.3, np.pi, 0, np.pi / 2])
+# Pose of the laser in the vehicle's frame: roll, pitch, yaw in radians; x, y, z in metres.
+_LASER_IN_VEHICLE = pose_of(Rotation.from_euler("xyz", [np.pi, 0, np.pi / 2]), [2.4, -0.01, -2.3])
 # Seconds: the unit of the time stamps.
 _MICROSECOND = 1e-6
 # Seconds between a scan and its images: half the interval of the cameras, which take about eight images a second.
@@ -57,7 +56,11 @@ class KITTIFrames(AbstractFrames):
         # Transform from the Velodyne to camera 0, and projection to the pixels of camera 2.
         self.to_camera: Matrix = np.vstack([calibration["Tr"], [0, 0, 0, 1]])
         self._projection = calibration["P2"] @ self.to_camera
-        self._times = _read_times(folder / "times.txt")
+        times = folder / "times.txt"
+        try:
+            self._times = np.array(times.read_text().split(), float)
+        except ValueError as error:
+            raise ValueError(f"{times}: expected a number of seconds in each line: {error}") from error
         poses = folder.absolute().parents[1] / "poses" / f"{folder.absolute().name}.txt"
         self._poses = io.read_poses(poses) if poses.is_file() else None
         self._colored = (folder / "image_2").is_dir()
@@ -82,18 +85,8 @@ class KITTIFrames(AbstractFrames):
         ahead = homogeneous[:, 2:] > 0
         pixels = np.where(ahead, homogeneous[:, :2] / np.where(ahead, homogeneous[:, 2:], 1), -1)
         colors, inside = look_up(image, pixels)
-        valid = np.column_stack([np.ones(len(inside), bool), *[inside] * 3])
-        channels, names = np.hstack([cloud.channels, colors]), ("intensity", *COLORS)
-        painted = PointCloud(cloud.points, channels, channel_valid=valid, channel_names=names)
+        painted = colored_cloud(cloud.points, colors, inside, cloud.channels)
         return painted, np.where(inside[:, None], pixels, np.nan)
-
-
-def _read_times(path: Path) -> Float[np.ndarray, "N"]:
-    """Read the times in seconds, one per line."""
-    try:
-        return np.array(path.read_text().split(), float)
-    except ValueError as error:
-        raise ValueError(f"{path}: expected a number of seconds in each line: {error}") from error
 
 
 def _read_calibration(path: Path) -> dict[str, Float[np.ndarray, "3 4"]]:
@@ -142,9 +135,14 @@ class FordFrames(AbstractFrames):
         if not self._scans:
             raise ValueError(f"{folder}: expected scans in SCANS/Scan*.mat, found none")
         super().__init__(len(self._scans))
-        log = folder / "Timestamp.log"
         # Number and time in microseconds of each image.
-        self._images = _read_log(log) if log.is_file() else np.empty((0, 2))
+        self._images = np.empty((0, 2))
+        log = folder / "Timestamp.log"
+        if log.is_file():
+            rows = [line.split()[:2] for line in log.read_text().splitlines() if line[:1].isdigit()]
+            if not rows:
+                raise ValueError(f"{log}: expected rows of image number and time stamp, found none")
+            self._images = np.array(rows, float)
 
     def _frame(self, index: int) -> Frame:
         import scipy.io
@@ -155,39 +153,30 @@ class FordFrames(AbstractFrames):
             points = np.asarray(scan["XYZ"], float).reshape(3, -1).T
             vehicle = np.asarray(scan["X_wv"], float).reshape(6)
             time = float(scan["timestamp_laser"])
-            image = self._image_number(float(scan["timestamp_camera"]))
             cameras = [scan["Cam"]] if isinstance(scan["Cam"], dict) else list(scan["Cam"])
-            colors, seen = self._paint(len(points), cameras, image)
+            colors, colored = self._paint(len(points), cameras, float(scan["timestamp_camera"]))
         except OSError:
             raise
         except Exception as error:  # SciPy raises arbitrary exceptions for malformed files.
             raise ValueError(f"{path}: cannot be read as a scan of Ford Campus: {error!r}") from error
-        channels, valid, names = colors, np.repeat(seen[:, None], 3, axis=1), list(COLORS)
+        intensity = None
         if "reflectivity" in scan:
-            intensity = np.asarray(scan["reflectivity"], float).reshape(-1, 1)
-            channels = np.hstack([intensity, channels])
-            valid = np.hstack([np.ones_like(intensity, bool), valid])
-            names = ["intensity", *names]
-        cloud = PointCloud(
-            points.astype(np.float32), channels.astype(np.float32), channel_valid=valid, channel_names=names
-        )
-        return Frame(cloud, _pose(vehicle) @ _pose(_LASER_IN_VEHICLE), _MICROSECOND * time)
-
-    def _image_number(self, time: float) -> int | None:
-        """The image nearest in time, in microseconds, if near enough. (The `image_index` of the scans is always 0.)"""
-        if not len(self._images):
-            return None
-        difference = np.abs(self._images[:, 1] - time)
-        nearest = int(difference.argmin())
-        return int(self._images[nearest, 0]) if difference[nearest] <= _MAX_DIFFERENCE / _MICROSECOND else None
+            intensity = np.asarray(scan["reflectivity"], float).reshape(-1, 1).astype(np.float32)
+        cloud = colored_cloud(points.astype(np.float32), colors, colored, intensity)
+        # The vehicle's pose is x, y, z in metres and roll, pitch, yaw in radians: Rz(yaw) Ry(pitch) Rx(roll).
+        pose = pose_of(Rotation.from_euler("xyz", vehicle[3:]), vehicle[:3]) @ _LASER_IN_VEHICLE
+        return Frame(cloud, pose, _MICROSECOND * time)
 
     def _paint(
-        self, size: int, cameras: list[dict[str, Any]], image: int | None
-    ) -> tuple[Float[np.ndarray, "N 3"], np.ndarray]:
+        self, size: int, cameras: list[dict[str, Any]], time: float
+    ) -> tuple[Float[np.ndarray, "N 3"], Bool[np.ndarray, "N"]]:
         """Colours of the points and the mask of coloured points; the first camera that saw a point determines it."""
-        colors, seen = np.zeros((size, 3)), np.zeros(size, bool)
-        if image is None:
-            return colors, seen
+        colors, colored = np.zeros((size, 3), np.float32), np.zeros(size, bool)
+        # The image nearest in time, in microseconds, if near enough. (The `image_index` of the scans is always 0.)
+        difference = np.abs(self._images[:, 1] - time)
+        if not np.any(difference <= _MAX_DIFFERENCE / _MICROSECOND):
+            return colors, colored
+        image = int(self._images[difference.argmin(), 0])
         for number, camera in enumerate(cameras):
             path = self.folder / "IMAGES" / f"Cam{number}" / f"image{image:04d}.ppm"
             if not path.is_file():
@@ -195,19 +184,8 @@ class FordFrames(AbstractFrames):
             rows = np.asarray(camera["points_index"], int).reshape(-1) - 1
             pixels = np.asarray(camera["pixels"], float).reshape(2, -1).T
             # MATLAB indices start at 1, and the images are stored at half their height.
-            found, inside = look_up(read_image(path), np.stack([pixels[:, 0] - 1, pixels[:, 1] / 2 - 0.75], axis=1))
-            new = inside & ~seen[rows]
-            colors[rows[new]], seen[rows[new]] = found[new], True
-        return colors, seen
-
-
-def _read_log(path: Path) -> Float[np.ndarray, "N 2"]:
-    rows = [line.split()[:2] for line in path.read_text().splitlines() if line[:1].isdigit()]
-    if not rows:
-        raise ValueError(f"{path}: expected rows of image number and time stamp, found none")
-    return np.array(rows, float)
-
-
-def _pose(numbers: Float[np.ndarray, "6"]) -> Float[np.ndarray, "4 4"]:
-    """The pose Rz(yaw) Ry(pitch) Rx(roll) from x, y, z in metres and roll, pitch, yaw in radians."""
-    return pose_of(Rotation.from_euler("xyz", numbers[3:]), numbers[:3])
+            pixels = np.stack([pixels[:, 0] - 1, pixels[:, 1] / 2 - 0.75], axis=1)
+            image_colors, inside = look_up(read_image(path), pixels)
+            new = inside & ~colored[rows]
+            colors[rows[new]], colored[rows[new]] = image_colors[new], True
+        return colors, colored

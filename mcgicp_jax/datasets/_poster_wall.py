@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from functools import partial
 from typing import TypeAlias
 
@@ -116,7 +115,15 @@ def _pose(
 
 
 def _observe(wall: Image, size: int, noise: float, rng: np.random.Generator, pose: Matrix) -> PointCloud:
-    rays = _rays(rng, size)
+    # Rays (x, y, 1) on a regular image grid with a random offset, each jittered within its pixel.
+    columns = max(round(np.sqrt(size * _WIDTH / _HEIGHT)), 1)
+    rows = max(round(size / columns), 1)
+    u, v = np.meshgrid(np.arange(columns) + rng.uniform(), np.arange(rows) + rng.uniform())
+    pixels = np.stack([u.ravel() * _WIDTH / columns, v.ravel() * _HEIGHT / rows], axis=1)
+    pixels += rng.uniform(-0.5, 0.5, pixels.shape)
+    xy = (pixels - (_WIDTH / 2, _HEIGHT / 2)) / _FOCAL
+    rays = np.concatenate([xy, np.ones((len(xy), 1))], axis=1)
+
     rotation, center = pose[:3, :3], pose[:3, 3]
     depth = -center[2] / (rays @ rotation[2])
     hits = (depth[:, None] * rays) @ rotation.T + center
@@ -128,17 +135,6 @@ def _observe(wall: Image, size: int, noise: float, rng: np.random.Generator, pos
     return PointCloud(depth[:, None] * rays, colors, channel_names=COLORS)
 
 
-def _rays(rng: np.random.Generator, size: int) -> Float[np.ndarray, "N 3"]:
-    """Rays (x, y, 1) on a regular image grid with a random offset, each jittered within its pixel."""
-    columns = max(round(np.sqrt(size * _WIDTH / _HEIGHT)), 1)
-    rows = max(round(size / columns), 1)
-    u, v = np.meshgrid(np.arange(columns) + rng.uniform(), np.arange(rows) + rng.uniform())
-    pixels = np.stack([u.ravel() * _WIDTH / columns, v.ravel() * _HEIGHT / rows], axis=1)
-    pixels += rng.uniform(-0.5, 0.5, pixels.shape)
-    xy = (pixels - (_WIDTH / 2, _HEIGHT / 2)) / _FOCAL
-    return np.concatenate([xy, np.ones((len(xy), 1))], axis=1)
-
-
 # The wall
 
 
@@ -147,20 +143,16 @@ def _paint_wall(rng: np.random.Generator) -> Image:
     wall = np.empty((_ROWS * cell[1], _COLUMNS * cell[0], 3), np.float32)
     wall[:] = _WALL_COLOR
     designs = [_gradient, _stripes, _text, _discs, _diamonds]
-    for i, which in enumerate(rng.permutation(_ROWS * _COLUMNS)):
+    for i, design in enumerate(rng.permutation(_ROWS * _COLUMNS)):
         size = (cell * rng.uniform(0.62, 0.92, 2)).astype(int)
-        x, y = cell * (i % _COLUMNS, i // _COLUMNS) + rng.integers(0, cell - size)
-        wall[y : y + size[1], x : x + size[0]] = _poster(rng, designs[which % len(designs)], size)
+        left, top = cell * (i % _COLUMNS, i // _COLUMNS) + rng.integers(0, cell - size)
+        width, height = size * _TEXEL
+        x, y = np.meshgrid((np.arange(size[0]) + 0.5) * _TEXEL, (np.arange(size[1]) + 0.5) * _TEXEL)
+        frame, *colors = rng.permutation(_PALETTE)
+        poster = designs[design % len(designs)](rng, x, y, np.array(colors))
+        poster[np.minimum(np.minimum(x, width - x), np.minimum(y, height - y)) < _BORDER] = frame
+        wall[top : top + size[1], left : left + size[0]] = poster
     return wall
-
-
-def _poster(rng: np.random.Generator, design: Callable[..., Image], size: Int[np.ndarray, "2"]) -> Image:
-    width, height = size * _TEXEL
-    x, y = np.meshgrid((np.arange(size[0]) + 0.5) * _TEXEL, (np.arange(size[1]) + 0.5) * _TEXEL)
-    frame, *colors = rng.permutation(_PALETTE)
-    picture = design(rng, x, y, np.array(colors))
-    picture[np.minimum(np.minimum(x, width - x), np.minimum(y, height - y)) < _BORDER] = frame
-    return picture
 
 
 def _gradient(rng: np.random.Generator, x: Grid, y: Grid, colors: Colors) -> Image:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import abc
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TypeAlias
@@ -16,45 +15,34 @@ Rays: TypeAlias = Float[np.ndarray, "N 3"]
 Distances: TypeAlias = Float[np.ndarray, "N"]
 
 
-class AbstractSolid(abc.ABC):
-    """A solid; the sensor must be outside of it."""
-
-    @property
-    @abc.abstractmethod
-    def bounds(self) -> tuple[Vector, Vector]:
-        """Lowest and highest coordinates, metres."""
-
-    @abc.abstractmethod
-    def meet(self, origin: Vector, rays: Rays) -> tuple[Distances, Rays]:
-        """Distance along unit rays to their entry into the solid, metres, infinite if they miss; and unit normals."""
-
-
 @dataclass(frozen=True, eq=False)
-class Box(AbstractSolid):
-    """An axis-aligned box between its lowest and highest corner, (3,), metres."""
+class Box:
+    """An axis-aligned box between its lowest and highest corner, (3,), metres; the sensor must be outside of it."""
 
     low: Vector
     high: Vector
 
     @property
     def bounds(self) -> tuple[Vector, Vector]:
+        """Lowest and highest coordinates, metres."""
         return self.low, self.high
 
     def meet(self, origin: Vector, rays: Rays) -> tuple[Distances, Rays]:
+        """Distance along unit rays to their entry into the solid, metres, infinite if they miss; and unit normals."""
         # A ray parallel to a face divides by zero: the result is an infinity of the right sign, or NaN, a miss.
         with np.errstate(divide="ignore", invalid="ignore"):
-            first, second = (self.low - origin) / rays, (self.high - origin) / rays
-        near, far = np.minimum(first, second), np.maximum(first, second)
-        axis = np.argmax(near, axis=1)
-        entry, leave = near[np.arange(len(rays)), axis], far.min(axis=1)
+            to_low, to_high = (self.low - origin) / rays, (self.high - origin) / rays
+        near, far = np.minimum(to_low, to_high), np.maximum(to_low, to_high)
+        ray, axis = np.arange(len(rays)), np.argmax(near, axis=1)
+        entry, leave = near[ray, axis], far.min(axis=1)
         normals = np.zeros_like(rays)
-        normals[np.arange(len(rays)), axis] = -np.sign(rays[np.arange(len(rays)), axis])
+        normals[ray, axis] = -np.sign(rays[ray, axis])
         return np.where((entry > 0) & (entry <= leave), entry, np.inf), normals
 
 
 @dataclass(frozen=True, eq=False)
-class Cylinder(AbstractSolid):
-    """The lateral surface of an upright cylinder, whose lower end is centred at `foot`; metres."""
+class Cylinder:
+    """The lateral surface of an upright cylinder, whose lower end is centred at `foot`; metres. See `Box`."""
 
     foot: Vector
     radius: float
@@ -76,6 +64,9 @@ class Cylinder(AbstractSolid):
         return np.where((entry > 0) & (height >= 0) & (height <= self.height), entry, np.inf), normals
 
 
+Solid: TypeAlias = Box | Cylinder
+
+
 @dataclass(frozen=True, eq=False)
 class Hits:
     """The hits of rays on solids, without the rays that miss.
@@ -91,13 +82,21 @@ class Hits:
     solid: Int[np.ndarray, "N"]
 
 
-def cast(origin: Vector, rays: Rays, solids: Sequence[AbstractSolid], max_range: float) -> Hits:
+def cast(origin: Vector, rays: Rays, solids: Sequence[Solid], max_range: float) -> Hits:
     """The nearest hit of each ray within `max_range` metres; ties go to the first solid."""
     distance = np.full(len(rays), max_range)
     normals = np.zeros_like(rays)
     solid = np.full(len(rays), -1)
     for number, candidate in enumerate(solids):
-        rows = _towards(candidate, origin, rays, max_range)
+        # Only the rays in the cone around its bounding sphere may hit the solid.
+        low, high = candidate.bounds
+        center, radius = (low + high) / 2 - origin, np.linalg.norm(high - low) / 2
+        away = np.linalg.norm(center)
+        if away - radius > max_range:
+            continue
+        rows = np.arange(len(rays))
+        if away > radius:
+            rows = np.flatnonzero(rays @ (center / away) >= np.sqrt(1 - (radius / away) ** 2))
         entry, facing = candidate.meet(origin, rays[rows])
         nearer = entry < distance[rows]
         rows = rows[nearer]
@@ -105,18 +104,6 @@ def cast(origin: Vector, rays: Rays, solids: Sequence[AbstractSolid], max_range:
     met = solid >= 0
     points = origin + distance[met, None] * rays[met]
     return Hits(rays[met], distance[met], points, normals[met], solid[met])
-
-
-def _towards(solid: AbstractSolid, origin: Vector, rays: Rays, max_range: float) -> Int[np.ndarray, "K"]:
-    """Indices of the rays that may hit the solid: those in the cone around its bounding sphere."""
-    low, high = solid.bounds
-    center, radius = (low + high) / 2 - origin, np.linalg.norm(high - low) / 2
-    away = np.linalg.norm(center)
-    if away - radius > max_range:
-        return np.empty(0, int)
-    if away <= radius:
-        return np.arange(len(rays))
-    return np.flatnonzero(rays @ (center / away) >= np.sqrt(1 - (radius / away) ** 2))
 
 
 # Sensors

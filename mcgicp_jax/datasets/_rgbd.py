@@ -11,10 +11,9 @@ from jaxtyping import Float
 from scipy.spatial.transform import Rotation, Slerp
 
 from mcgicp_jax import io
-from mcgicp_jax._clouds.columns import COLORS
 from mcgicp_jax._clouds.depth_images import back_project
 from mcgicp_jax._clouds.point_cloud import Frame, PointCloud
-from mcgicp_jax.datasets._frames import AbstractFrames, look_up, pose_of, read_depth, read_image
+from mcgicp_jax.datasets._frames import AbstractFrames, colored_cloud, look_up, pose_of, read_depth, read_image
 
 # Pixels: focal lengths and principal point of the three calibrated cameras, and the default of the camera driver.
 _CAMERAS = {
@@ -72,16 +71,16 @@ class TUMFrames(AbstractFrames):
         self.folder = folder
         number = re.search(r"(?:freiburg|fr)(\d)", folder.absolute().name)
         self._camera = _CAMERAS.get(number[1] if number else "", _OTHER_CAMERA)
-        times, self._depths = _read_list(folder / "depth.txt")
+        times, depths = _read_list(folder / "depth.txt")
         color_times, colors = _read_list(folder / "rgb.txt")
         nearest = np.abs(times[:, None] - color_times).argmin(axis=1)
-        together = np.abs(times - color_times[nearest]) <= _MAX_DIFFERENCE
-        if not together.any():
+        colored = np.abs(times - color_times[nearest]) <= _MAX_DIFFERENCE
+        if not colored.any():
             raise ValueError(f"{folder}: expected depth and colour images within {_MAX_DIFFERENCE} s, found none")
-        self._times = times[together]
+        self._times = times[colored]
         super().__init__(len(self._times))
-        self._depths = [self._depths[row] for row in np.flatnonzero(together)]
-        self._colors = [colors[row] for row in nearest[together]]
+        self._depths = [depths[row] for row in np.flatnonzero(colored)]
+        self._colors = [colors[row] for row in nearest[colored]]
         truth = folder / "groundtruth.txt"
         # read_poses runs before loadtxt because its errors name the file.
         poses = io.read_poses(truth) if truth.is_file() else None
@@ -155,8 +154,7 @@ class SevenScenesFrames(AbstractFrames):
         file = path.with_name(f"{name}.color.png")
         image = read_image(file if file.is_file() else file.with_suffix(".jpg"))
         colors, inside = look_up(image, pixels)
-        valid = np.repeat(inside[:, None], 3, axis=1)
-        cloud = PointCloud(points.astype(np.float32), colors, channel_valid=valid, channel_names=COLORS)
+        cloud = colored_cloud(points.astype(np.float32), colors, inside)
         poses = io.read_poses(path.with_name(f"{name}.pose.txt"))
         time = _PERIOD * int(name.removeprefix("frame-"))
         return Frame(cloud, poses[0], time, image, np.where(inside[:, None], pixels, np.nan))

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import enum
-from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import partial
 
@@ -12,18 +11,8 @@ from jaxtyping import Bool, Float
 
 from mcgicp_jax._clouds.columns import COLORS
 from mcgicp_jax._clouds.point_cloud import PointCloud
+from mcgicp_jax.datasets import _raycast as raycast
 from mcgicp_jax.datasets._frames import Matrix, SyntheticFrames, check_scene, pose_of, scene_and_path_rng
-from mcgicp_jax.datasets._raycast import (
-    AbstractSolid,
-    Box,
-    Cylinder,
-    Hits,
-    cast,
-    patches,
-    random_cells,
-    sensor_rotation,
-    spinning_rays,
-)
 
 # The constants of this module define the scene and the sensor.
 # The LiDAR, a Velodyne HDL-64E on the roof of a car: beams and their elevations, radians; range and height, metres;
@@ -74,7 +63,7 @@ class _Thing:
     """
 
     kind: _Kind
-    solid: AbstractSolid
+    solid: raycast.Solid
     color: Float[np.ndarray, "3"]
     reflectance: float
     windows: Float[np.ndarray, "5"] | None = None
@@ -117,22 +106,21 @@ def street(
     scene_rng, path_rng = scene_and_path_rng(seed)
     things = _things(scene_rng, -2 * _MAX_RANGE, num_frames * step + 2 * _MAX_RANGE)
     observer = partial(_observe, things, int(scene_rng.integers(2**31)), points_per_frame, noise)
-    path = partial(_smooth_pose if spin else _pose, step, *path_rng.uniform(0, 2 * np.pi, 3))
+    path = partial(_pose, spin, step, *path_rng.uniform(0, 2 * np.pi, 3))
     return SyntheticFrames(num_frames, path, observer, _PERIOD, seed, _POSES_OF_A_TURN if spin else 1)
 
 
 # The sensor
 
 
-def _smooth_pose(step: float, sway: float, yaw: float, tilt: float, time: float | int) -> Matrix:
-    rotation = sensor_rotation(_YAW * np.sin(yaw + time / _SMOOTH), _TILT, tilt + time / _SMOOTH)
-    return pose_of(rotation, (time * step, _LANE + _SWAY * np.sin(sway + time / _SMOOTH), _SENSOR_HEIGHT))
-
-
-def _pose(step: float, sway: float, yaw: float, tilt: float, index: float | int) -> Matrix:
-    rotation = sensor_rotation(_YAW * np.sin(yaw + index / 4), _TILT, tilt + 0.7 * index)
-    aside = _LANE + _SWAY * np.sin(sway + index * step / (6 * _SWAY))
-    return pose_of(rotation, (index * step, aside, _SENSOR_HEIGHT))
+def _pose(smooth: bool, step: float, sway: float, yaw: float, tilt: float, time: float) -> Matrix:
+    """The pose at a time in frames."""
+    if smooth:
+        sway_phase = yaw_phase = tilt_phase = time / _SMOOTH
+    else:
+        sway_phase, yaw_phase, tilt_phase = time * step / (6 * _SWAY), time / 4, 0.7 * time
+    rotation = raycast.sensor_rotation(_YAW * np.sin(yaw + yaw_phase), _TILT, tilt + tilt_phase)
+    return pose_of(rotation, (time * step, _LANE + _SWAY * np.sin(sway + sway_phase), _SENSOR_HEIGHT))
 
 
 def _observe(
@@ -144,26 +132,27 @@ def _observe(
     pose: Float[np.ndarray, "*poses 4 4"],
 ) -> PointCloud:
     poses, solids = pose.reshape(-1, 4, 4), [thing.solid for thing in things]
-    rays = np.array_split(spinning_rays(rng, size, _BEAMS, _LOWEST, _HIGHEST), len(poses))
-    parts = [
-        cast(each[:3, 3], part @ each[:3, :3].T, solids, _MAX_RANGE) for each, part in zip(poses, rays, strict=True)
-    ]
-    hits = Hits(*(np.concatenate([getattr(part, name) for part in parts]) for name in vars(parts[0])))
-    directions = np.concatenate([part.rays @ each[:3, :3] for each, part in zip(poses, parts, strict=True)])
-    numbers = np.repeat(np.arange(len(poses)), [len(part.distance) for part in parts])
+    rays = np.array_split(raycast.spinning_rays(rng, size, _BEAMS, _LOWEST, _HIGHEST), len(poses))
+    parts, directions = [], []
+    for part_pose, part_rays in zip(poses, rays, strict=True):
+        rotation, center = part_pose[:3, :3], part_pose[:3, 3]
+        parts.append(raycast.cast(center, part_rays @ rotation.T, solids, _MAX_RANGE))
+        directions.append(parts[-1].rays @ rotation)
+    hits = raycast.Hits(*(np.concatenate([getattr(part, name) for part in parts]) for name in vars(parts[0])))
+    times = None if len(poses) == 1 else np.repeat(np.arange(len(poses)), [len(part.distance) for part in parts])
+
     hits, glass = _into_windows(hits, things)
     colors, reflectance = _paint(hits, glass, things, pattern)
     incidence = np.abs(np.sum(hits.rays * hits.normals, axis=1))
     intensity = reflectance * np.sqrt(incidence) / (1 + (hits.distance / _HALF_INTENSITY) ** 2)
     light = 0.5 + 0.5 * np.maximum(hits.normals @ _SUN, 0)
     channels = np.column_stack([intensity, light[:, None] * colors])
-    sigma = np.column_stack(
-        [np.hypot(_INTENSITY_NOISE, _INTENSITY_SPECKLE * intensity), *[light * 0 + _COLOR_NOISE] * 3]
-    )
+    sigma = np.full_like(channels, _COLOR_NOISE)
+    sigma[:, 0] = np.hypot(_INTENSITY_NOISE, _INTENSITY_SPECKLE * intensity)
     channels = np.clip(channels + noise * sigma * rng.normal(size=channels.shape), 0, 1)
     distance = hits.distance + noise * _RANGE_NOISE * rng.normal(size=hits.distance.shape)
-    names, times = ("intensity", *COLORS), None if len(poses) == 1 else numbers
-    return PointCloud(distance[:, None] * directions, channels, channel_names=names, times=times)
+    points = distance[:, None] * np.concatenate(directions)
+    return PointCloud(points, channels, channel_names=("intensity", *COLORS), times=times)
 
 
 # The street
@@ -171,106 +160,99 @@ def _observe(
 
 def _things(rng: np.random.Generator, start: float, end: float) -> list[_Thing]:
     """The objects of the street, each kind in order of x, so that a longer street begins like a shorter one."""
-    road = Box(np.array([start, -60.0, -1.0]), np.array([end, 60.0, 0.0]))
+    road = raycast.Box(np.array([start, -60.0, -1.0]), np.array([end, 60.0, 0.0]))
     things = [_Thing(_Kind.GROUND, road, np.full(3, 0.33), 0.2)]
     for side, side_rng in zip((-1, 1), rng.spawn(2), strict=True):
         low, high = np.array([start, _KERB, -1.0]), np.array([end, 30.0, _KERB_HEIGHT])
         things.append(_Thing(_Kind.PAVEMENT, _box(low, high, side), np.full(3, 0.52), 0.3))
-        for make, own_rng in zip((_buildings, _cars, _poles, _bins), side_rng.spawn(4), strict=True):
-            things += make(own_rng, side, start, end)
+        for make, kind_rng in zip((_building, _car, _pole, _bin), side_rng.spawn(4), strict=True):
+            x = start
+            while x < end:
+                new_things, advance = make(kind_rng, side, x)
+                things += new_things
+                x += advance
     return things
 
 
-def _box(low: Float[np.ndarray, "3"], high: Float[np.ndarray, "3"], side: int) -> Box:
+def _box(low: Float[np.ndarray, "3"], high: Float[np.ndarray, "3"], side: int) -> raycast.Box:
     """A box on the left of the street (side 1), or its mirror image on the right (−1)."""
     mirror = np.array([1, side, 1])
-    return Box(np.minimum(mirror * low, mirror * high), np.maximum(mirror * low, mirror * high))
+    return raycast.Box(np.minimum(mirror * low, mirror * high), np.maximum(mirror * low, mirror * high))
 
 
-def _buildings(rng: np.random.Generator, side: int, start: float, end: float) -> Iterator[_Thing]:
-    x = start
-    while x < end:
-        width, height, setback = rng.uniform((7, 6, 0), (16, 15, 0.8))
-        pitch, opening = rng.uniform((1.8, 2.9), (3.2, 3.5)), rng.uniform((0.8, 1.3), (1.4, 1.9))
-        # Fit a whole number of windows and storeys, so that no window is cut off.
-        pitch = np.array([width, height]) / np.round((width, height) / pitch)
-        low, high = np.array([x, _FACADE + setback, 0.0]), np.array([x + width, _FACADE + setback + _DEPTH, height])
-        yield _Thing(
-            _Kind.BUILDING,
-            _box(low, high, side),
-            rng.choice(_PALETTE) * rng.uniform(0.85, 1.1),
-            rng.uniform(0.25, 0.55),
-            np.array([*pitch, *opening, rng.uniform(0.08, 0.25)]),
-        )
-        # The next building is adjacent, behind a passage, or across a side street.
-        x += width + rng.choice([0, rng.uniform(1.5, 4), 9], p=[0.7, 0.2, 0.1])
+# Each of these makes the things of one kind that begin at `x`, and says how far from there the next begins, metres.
 
 
-def _cars(rng: np.random.Generator, side: int, start: float, end: float) -> Iterator[_Thing]:
-    x = start
-    while x < end:
-        length, width, sill, roof = rng.uniform((3.6, 1.65, 0.85, 1.40), (4.9, 1.85, 1.05, 1.60))
-        y = rng.uniform(_PARKING + 0.1, _KERB - width - 0.05)
-        color, reflectance = rng.choice(_CAR_PALETTE), rng.uniform(0.15, 0.6)
-        body = np.array([x, y, 0.2]), np.array([x + length, y + width, sill])
-        bonnet, boot = rng.uniform((0.8, 0.2), (1.3, 0.8))
-        cabin = np.array([x + bonnet, y + 0.12, sill]), np.array([x + length - boot, y + width - 0.12, roof])
-        yield _Thing(_Kind.CAR, _box(*body, side), color, reflectance)
-        yield _Thing(_Kind.CAR, _box(*cabin, side), 0.5 * color + 0.5 * _GLASS, 0.1)
-        x += length + rng.choice([rng.uniform(0.6, 1.5), rng.uniform(4, 14)])
+def _building(rng: np.random.Generator, side: int, x: float) -> tuple[list[_Thing], float]:
+    width, height, setback = rng.uniform((7, 6, 0), (16, 15, 0.8))
+    pitch, opening = rng.uniform((1.8, 2.9), (3.2, 3.5)), rng.uniform((0.8, 1.3), (1.4, 1.9))
+    # Fit a whole number of windows and storeys, so that no window is cut off.
+    pitch = np.array([width, height]) / np.round((width, height) / pitch)
+    low, high = np.array([x, _FACADE + setback, 0.0]), np.array([x + width, _FACADE + setback + _DEPTH, height])
+    color, reflectance = rng.choice(_PALETTE) * rng.uniform(0.85, 1.1), rng.uniform(0.25, 0.55)
+    windows = np.array([*pitch, *opening, rng.uniform(0.08, 0.25)])
+    building = _Thing(_Kind.BUILDING, _box(low, high, side), color, reflectance, windows)
+    # The next building is adjacent, behind a passage, or across a side street.
+    return [building], width + rng.choice([0, rng.uniform(1.5, 4), 9], p=[0.7, 0.2, 0.1])
 
 
-def _poles(rng: np.random.Generator, side: int, start: float, end: float) -> Iterator[_Thing]:
-    x = start
-    while x < end:
-        radius, height = rng.uniform((0.06, 4.0), (0.18, 8.0))
-        foot = np.array([x, side * (_KERB + rng.uniform(0.4, 0.9)), 0.0])
-        yield _Thing(_Kind.POLE, Cylinder(foot, radius, height), rng.uniform(0.2, 0.5, 3), rng.uniform(0.3, 0.7))
-        x += rng.uniform(8, 22)
+def _car(rng: np.random.Generator, side: int, x: float) -> tuple[list[_Thing], float]:
+    length, width, sill, roof = rng.uniform((3.6, 1.65, 0.85, 1.40), (4.9, 1.85, 1.05, 1.60))
+    y = rng.uniform(_PARKING + 0.1, _KERB - width - 0.05)
+    color, reflectance = rng.choice(_CAR_PALETTE), rng.uniform(0.15, 0.6)
+    body = _box(np.array([x, y, 0.2]), np.array([x + length, y + width, sill]), side)
+    bonnet, boot = rng.uniform((0.8, 0.2), (1.3, 0.8))
+    low, high = np.array([x + bonnet, y + 0.12, sill]), np.array([x + length - boot, y + width - 0.12, roof])
+    cabin = _Thing(_Kind.CAR, _box(low, high, side), 0.5 * color + 0.5 * _GLASS, 0.1)
+    gap = rng.choice([rng.uniform(0.6, 1.5), rng.uniform(4, 14)])
+    return [_Thing(_Kind.CAR, body, color, reflectance), cabin], length + gap
 
 
-def _bins(rng: np.random.Generator, side: int, start: float, end: float) -> Iterator[_Thing]:
-    x = start
-    while x < end:
-        size = rng.uniform((0.4, 0.4, 0.8), (1.2, 0.7, 1.3))
-        low = np.array([x, rng.uniform(_KERB + 1.2, _FACADE - 0.9), 0.0])
-        yield _Thing(_Kind.BIN, _box(low, low + size, side), rng.uniform(0.1, 0.6, 3), rng.uniform(0.2, 0.5))
-        x += rng.uniform(6, 25)
+def _pole(rng: np.random.Generator, side: int, x: float) -> tuple[list[_Thing], float]:
+    radius, height = rng.uniform((0.06, 4.0), (0.18, 8.0))
+    cylinder = raycast.Cylinder(np.array([x, side * (_KERB + rng.uniform(0.4, 0.9)), 0.0]), radius, height)
+    pole = _Thing(_Kind.POLE, cylinder, rng.uniform(0.2, 0.5, 3), rng.uniform(0.3, 0.7))
+    return [pole], rng.uniform(8, 22)
 
 
-def _into_windows(hits: Hits, things: list[_Thing]) -> tuple[Hits, Bool[np.ndarray, "N"]]:
+def _bin(rng: np.random.Generator, side: int, x: float) -> tuple[list[_Thing], float]:
+    size = rng.uniform((0.4, 0.4, 0.8), (1.2, 0.7, 1.3))
+    low = np.array([x, rng.uniform(_KERB + 1.2, _FACADE - 0.9), 0.0])
+    box = _box(low, low + size, side)
+    return [_Thing(_Kind.BIN, box, rng.uniform(0.1, 0.6, 3), rng.uniform(0.2, 0.5))], rng.uniform(6, 25)
+
+
+def _into_windows(hits: raycast.Hits, things: list[_Thing]) -> tuple[raycast.Hits, Bool[np.ndarray, "N"]]:
     """Move hits in the opening of a window on to the glass or the reveal, and return the mask of hits on glass."""
-    kinds = np.array([thing.kind for thing in things])
-    front = np.flatnonzero((kinds[hits.solid] == _Kind.BUILDING) & (hits.normals[:, 1] != 0))
-    pitch, opening, recess = np.split(_windows(things)[hits.solid[front]], [2, 4], axis=1)
-    corner = np.array([thing.solid.bounds[0] for thing in things])[hits.solid[front]]
+    kinds = np.array([thing.kind for thing in things])[hits.solid]
+    rows = np.flatnonzero((kinds == _Kind.BUILDING) & (hits.normals[:, 1] != 0))
+    none = np.full(5, np.nan)
+    windows = np.array([none if thing.windows is None else thing.windows for thing in things])[hits.solid[rows]]
+    pitch, opening, recess = np.split(windows, [2, 4], axis=1)
+    corner = np.array([thing.solid.bounds[0] for thing in things])[hits.solid[rows]]
     # Offset from the centre of the window, along the façade and upwards.
-    offset = (hits.points[front] - corner)[:, [0, 2]] % pitch - pitch / 2
+    offset = (hits.points[rows] - corner)[:, [0, 2]] % pitch - pitch / 2
     within = (np.abs(offset) < opening / 2).all(axis=1)
-    front, offset, opening, recess = front[within], offset[within], opening[within], recess[within, 0]
-    rays = hits.rays[front]
+    rows, offset, opening, recess = rows[within], offset[within], opening[within], recess[within, 0]
+
+    rays = hits.rays[rows]
     with np.errstate(divide="ignore"):
         # Remaining distance to the plane of the glass, and to the two sides that the ray approaches.
         to_glass = recess / np.abs(rays[:, 1])
         to_sides = (np.sign(rays[:, [0, 2]]) * opening / 2 - offset) / rays[:, [0, 2]]
-    further = np.column_stack([to_glass, to_sides])
-    first = np.argmin(further, axis=1)
-    extra = further[np.arange(len(front)), first]
+    remaining = np.column_stack([to_glass, to_sides])
+    ray, plane = np.arange(len(rows)), np.argmin(remaining, axis=1)
+    depth = remaining[ray, plane]
+
     distance, points, normals = hits.distance.copy(), hits.points.copy(), hits.normals.copy()
-    distance[front] += extra
-    points[front] += extra[:, None] * rays
-    axis = np.array([1, 0, 2])[first]
-    normals[front] = 0
-    normals[front, axis] = -np.sign(rays[np.arange(len(front)), axis])
+    distance[rows] += depth
+    points[rows] += depth[:, None] * rays
+    axis = np.array([1, 0, 2])[plane]
+    normals[rows] = 0
+    normals[rows, axis] = -np.sign(rays[ray, axis])
     glass = np.zeros(len(points), bool)
-    glass[front[first == 0]] = True
-    return Hits(hits.rays, distance, points, normals, hits.solid), glass
-
-
-def _windows(things: list[_Thing]) -> Float[np.ndarray, "B 5"]:
-    """The window parameters of every object; NaN if it is not a building."""
-    none = np.full(5, np.nan)
-    return np.array([none if thing.windows is None else thing.windows for thing in things])
+    glass[rows[plane == 0]] = True
+    return raycast.Hits(hits.rays, distance, points, normals, hits.solid), glass
 
 
 # Surface patterns
@@ -283,7 +265,7 @@ _SLAB, _PIECE, _SIGN = 0.6, np.array([3.1, 1.55]), 3.7
 
 
 def _paint(
-    hits: Hits, glass: Bool[np.ndarray, "N"], things: list[_Thing], pattern: int
+    hits: raycast.Hits, glass: Bool[np.ndarray, "N"], things: list[_Thing], pattern: int
 ) -> tuple[Float[np.ndarray, "N 3"], Float[np.ndarray, "N"]]:
     """Colour and laser reflectance of the surface at each hit."""
     kinds = np.array([thing.kind for thing in things])[hits.solid]
@@ -292,26 +274,26 @@ def _paint(
 
     rows = np.flatnonzero(kinds == _Kind.GROUND)
     ground = hits.points[rows, :2]
-    stain = patches(ground, _ASPHALT, pattern)
-    mended = np.where(random_cells(np.floor(ground / _PIECE).astype(int), pattern + 3) < 0.15, -0.09, 0)
+    stain = raycast.patches(ground, _ASPHALT, pattern)
+    mended = np.where(raycast.random_cells(np.floor(ground / _PIECE).astype(int), pattern + 3) < 0.15, -0.09, 0)
     marked = _is_marked(ground, pattern + 4)
     colors[rows] = np.where(marked[:, None], 0.85, colors[rows] + (stain + mended)[:, None])
     reflectance[rows] = np.where(marked, 0.85, reflectance[rows] + 0.6 * (stain + mended))
 
     rows = np.flatnonzero(kinds == _Kind.PAVEMENT)
-    slab = random_cells(np.floor(hits.points[rows, :2] / _SLAB).astype(int), pattern + 5) - 0.5
-    stain = 0.12 * slab + patches(hits.points[rows, :2], _ASPHALT, pattern + 6)
+    slab = raycast.random_cells(np.floor(hits.points[rows, :2] / _SLAB).astype(int), pattern + 5) - 0.5
+    stain = 0.12 * slab + raycast.patches(hits.points[rows, :2], _ASPHALT, pattern + 6)
     colors[rows] += stain[:, None]
     reflectance[rows] += 0.6 * stain
 
     rows = np.flatnonzero(kinds == _Kind.BUILDING)
-    stain = patches(hits.points[rows], _PLASTER, pattern + 9)
+    stain = raycast.patches(hits.points[rows], _PLASTER, pattern + 9)
     colors[rows] += stain[:, None]
     reflectance[rows] += stain
     shop = (hits.points[rows, 2] > 2.55) & (hits.points[rows, 2] < 3.05)
     cell = np.stack([np.floor(hits.points[rows, 0] / _SIGN), np.sign(hits.points[rows, 1])], axis=1).astype(int)
-    sign = shop & (random_cells(cell, pattern + 12) < 0.6)
-    hue = np.stack([random_cells(cell, pattern + 13 + channel) for channel in range(3)], axis=1)
+    sign = shop & (raycast.random_cells(cell, pattern + 12) < 0.6)
+    hue = np.stack([raycast.random_cells(cell, pattern + 13 + channel) for channel in range(3)], axis=1)
     colors[rows] = np.where(sign[:, None], 0.15 + 0.7 * hue, colors[rows])
     reflectance[rows] = np.where(sign, 0.6, reflectance[rows])
     colors[glass] = _GLASS
@@ -326,6 +308,6 @@ def _is_marked(ground: Float[np.ndarray, "N 2"], pattern: int) -> Bool[np.ndarra
     bays = (np.abs(np.abs(y) - _PARKING) < 0.06) & (x % 6 < 5.4)
     ends = (np.abs(y) > _PARKING) & (np.abs(y) < _KERB) & (x % 6 < 0.12)
     block = np.floor(x / 30).astype(int)[:, None]
-    place = 4 + 20 * random_cells(block, pattern)
+    place = 4 + 20 * raycast.random_cells(block, pattern)
     crossing = (np.abs(x % 30 - place) < 1.5) & (y % 1.0 < 0.5) & (np.abs(y) < _KERB)
     return dashes | bays | ends | crossing
