@@ -8,8 +8,7 @@ import logging
 import os
 import sys
 import warnings
-from collections.abc import Callable, Iterator, Sequence
-from typing import Any
+from collections.abc import Callable, Sequence
 
 import jax
 import platformdirs
@@ -21,49 +20,6 @@ from mcgicp_jax._cli.multiway import multiway
 from mcgicp_jax._cli.odometry import odometry
 from mcgicp_jax._cli.register import compare, demo, register
 from mcgicp_jax._compute.programs import LOGGER
-
-
-def _keep_compiled_programs() -> None:
-    """Cache compiled programs on disk, in JAX's cache folder if one is set; do without if none can be written."""
-    if "JAX_COMPILATION_CACHE_DIR" not in os.environ:
-        try:
-            folder = platformdirs.user_cache_path("mcgicp_jax", ensure_exists=True)
-        except OSError:
-            return
-        jax.config.update("jax_compilation_cache_dir", str(folder))
-    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0)
-    jax.config.update("jax_persistent_cache_min_entry_size_bytes", -1)
-
-
-@contextlib.contextmanager
-def _shown_log() -> Iterator[None]:
-    """Log records of the package as lines of stderr."""
-    handler, level = logging.StreamHandler(), LOGGER.level
-    handler.setFormatter(logging.Formatter("mcgicp: %(message)s"))
-    LOGGER.addHandler(handler)
-    LOGGER.setLevel(logging.INFO)
-    try:
-        yield
-    finally:
-        LOGGER.removeHandler(handler)
-        LOGGER.setLevel(level)
-
-
-def _show_warning(message: Warning | str, *_: Any, **__: Any) -> None:
-    print(f"mcgicp: {message}", file=sys.stderr)
-
-
-def _has_platform() -> bool:
-    try:
-        return len(jax.devices()) > 0
-    except (RuntimeError, AssertionError):
-        return False
-
-
-def _explanation(error: Exception) -> str:
-    if isinstance(error, OSError) and error.filename is not None:
-        return f"{error.filename}: {error.strerror}"
-    return " ".join(str(error).split())
 
 
 def main(args: Sequence[str] | None = None) -> int:
@@ -83,12 +39,23 @@ def _run(args: Sequence[str]) -> int:
     if list(args) == ["--version"]:
         print(f"mcgicp {__version__}")
         return 0
-    _keep_compiled_programs()
+    # Cache compiled programs on disk, in JAX's cache folder if one is set; do without if none can be written.
+    with contextlib.suppress(OSError):
+        if "JAX_COMPILATION_CACHE_DIR" not in os.environ:
+            folder = platformdirs.user_cache_path("mcgicp_jax", ensure_exists=True)
+            jax.config.update("jax_compilation_cache_dir", str(folder))
+        jax.config.update("jax_persistent_cache_min_compile_time_secs", 0)
+        jax.config.update("jax_persistent_cache_min_entry_size_bytes", -1)
     # Exclude imported modules from garbage collection, which took a tenth of the time of a short command.
     gc.freeze()
     commands: tuple[Callable[..., int], ...] = (demo, register, compare, odometry, multiway, batch)
-    with warnings.catch_warnings(), _shown_log():
-        warnings.showwarning = _show_warning
+    # Show log records of the package and warnings as lines of stderr.
+    handler, level = logging.StreamHandler(), LOGGER.level
+    handler.setFormatter(logging.Formatter("mcgicp: %(message)s"))
+    LOGGER.addHandler(handler)
+    LOGGER.setLevel(logging.INFO)
+    with warnings.catch_warnings():
+        warnings.showwarning = lambda message, *_, **__: print(f"mcgicp: {message}", file=sys.stderr)
         try:
             return tyro.extras.subcommand_cli_from_dict(
                 {command.__name__: command for command in commands},
@@ -102,17 +69,24 @@ def _run(args: Sequence[str]) -> int:
             raise
         except (RuntimeError, AssertionError):
             # JAX looks for its platform at the first computation.
-            if _has_platform():
+            try:
+                has_device = len(jax.devices()) > 0
+            except (RuntimeError, AssertionError):
+                has_device = False
+            if has_device:
                 raise
-            platform = os.environ.get("JAX_PLATFORMS")
-            print(
-                f"mcgicp: JAX has no device for JAX_PLATFORMS={platform}; unset it, or install its plugin",
-                file=sys.stderr,
-            )
+            problem = f"JAX has no device for JAX_PLATFORMS={os.environ.get('JAX_PLATFORMS')}"
+            print(f"mcgicp: {problem}; unset it, or install its plugin", file=sys.stderr)
             return 2
         except (ValueError, OSError, ImportError) as error:
-            print(f"mcgicp: {_explanation(error)}", file=sys.stderr)
+            reason = " ".join(str(error).split())
+            if isinstance(error, OSError) and error.filename is not None:
+                reason = f"{error.filename}: {error.strerror}"
+            print(f"mcgicp: {reason}", file=sys.stderr)
             return 2
+        finally:
+            LOGGER.removeHandler(handler)
+            LOGGER.setLevel(level)
 
 
 if __name__ == "__main__":

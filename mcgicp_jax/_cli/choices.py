@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, TypeAlias
 
@@ -16,7 +16,6 @@ from mcgicp_jax._clouds.point_cloud import Voxels
 from mcgicp_jax._clouds.voxel_size import voxels_for
 from mcgicp_jax._local_geometry.cloud_statistics import point_spacing
 from mcgicp_jax._methods.base import AbstractMethod
-from mcgicp_jax._registration.settings import default_distances
 from mcgicp_jax.extend import METHODS
 
 # Preprocessed source and target, made when they are needed.
@@ -25,34 +24,43 @@ Ready: TypeAlias = Callable[[], tuple[mcg.PointCloud, mcg.PointCloud]]
 
 @dataclass(frozen=True)
 class Choices:
-    """The user's options, the names of the channels to use, and the voxels in which raw clouds are averaged."""
+    """The user's options, the names of the channels to use, and the voxels in which raw clouds are averaged.
+
+    `first_two` are the first two raw clouds and what messages call them.
+    """
 
     options: Options
     channels: tuple[str, ...]
     voxels: Voxels
+    first_two: dict[str, mcg.PointCloud]
 
     @classmethod
-    def of(cls, options: Options, *clouds: mcg.PointCloud) -> Choices:
+    def of(cls, options: Options, names: Sequence[str], clouds: Sequence[mcg.PointCloud]) -> Choices:
         """The choices for raw clouds, of which the first two decide on the channels."""
-        common = [name for name in clouds[0].channel_names if all(name in each.channel_names for each in clouds[:2])]
+        common = [name for name in clouds[0].channel_names if all(name in cloud.channel_names for cloud in clouds[:2])]
         voxels = voxels_for(None if options.voxel_size == "off" else options.voxel_size, *clouds)
-        return cls(options, options.channels or tuple(common), voxels)
+        first_two = dict(zip(names, clouds[:2], strict=False))
+        return cls(options, options.channels or tuple(common), voxels, first_two)
 
-    def method_name(self, given: MethodName | None, clouds: Mapping[str, mcg.PointCloud]) -> MethodName:
-        """The method that the user gave or else suits the channels, which are printed."""
-        name = given or ("mc-gicp" if self.channels else "gicp")
+    def method_name(self, wanted: MethodName | None) -> MethodName:
+        """The method that the user wants or else suits the channels, which are printed."""
+        name = wanted or ("mc-gicp" if self.channels else "gicp")
         if METHODS[name].kind.uses_channels and not self.channels:
             raise ValueError(
-                f"{name} needs channels in common, but {_having(clouds)}; use gicp instead (--method gicp)"
+                f"{name} needs channels in common, but {self._channels_of_each()}; use gicp instead (--method gicp)"
             )
         self.options.check(name)
-        self.print_channels(clouds, "" if given or self.channels else " in common, therefore gicp")
+        self.print_channels("" if wanted or self.channels else " in common, therefore gicp")
         return name
 
-    def print_channels(self, clouds: Mapping[str, mcg.PointCloud], words: str = "") -> None:
+    def print_channels(self, consequence: str = "") -> None:
         """Print the channels that are used, and those of each cloud if these differ."""
-        differ = not self.options.channels and len({cloud.channel_names for cloud in clouds.values()}) > 1
-        print(f"channels:  {listed(self.channels)}{words}{f' ({_having(clouds)})' if differ else ''}")
+        differ = not self.options.channels and len({cloud.channel_names for cloud in self.first_two.values()}) > 1
+        details = f" ({self._channels_of_each()})" if differ else ""
+        print(f"channels:  {listed(self.channels)}{consequence}{details}")
+
+    def _channels_of_each(self) -> str:
+        return ", ".join(f"{name} has {listed(cloud.channel_names)}" for name, cloud in self.first_two.items())
 
     def preprocess(self, cloud: mcg.PointCloud) -> mcg.PointCloud:
         """A raw cloud with the chosen channels, ready to register."""
@@ -62,12 +70,12 @@ class Choices:
 
     def method(self, name: MethodName, ready: Ready) -> AbstractMethod:
         """The method with the user's parameters; Color ICP's weights, if not given, come from the data."""
-        given = self.options.parameters_of(name)
-        if issubclass(METHODS[name].kind, mcg.ColorICP) and not given:
+        parameters = self.options.parameters(name)
+        if issubclass(METHODS[name].kind, mcg.ColorICP) and not parameters:
             # As mc-gicp chooses them.
             resolved: Any = mcg.MultiChannelGICP().resolve(*ready())
-            given["channel_weights"] = resolved.channel_weights
-        return METHODS[name](**given)
+            parameters["channel_weights"] = resolved.channel_weights
+        return METHODS[name](**parameters)
 
     def arguments(self, name: MethodName, ready: Ready) -> dict[str, Any]:
         """Keyword arguments of `mcgicp_jax.register`; sizes of cells, if not given, come from the target."""
@@ -80,34 +88,27 @@ class Choices:
         return arguments
 
 
-def distance_in_words(options: Options, target: mcg.PointCloud) -> str:
-    """`max_distance` in words."""
-    distances = options.max_distance or default_distances(point_spacing(target), target)
-    return " m, then ".join(f"{float(distance):.3g}" for distance in distances) + " m"
-
-
-def _having(clouds: Mapping[str, mcg.PointCloud]) -> str:
-    return ", ".join(f"{name} has {listed(cloud.channel_names)}" for name, cloud in clouds.items())
-
-
 def with_channels(cloud: mcg.PointCloud, names: Sequence[str]) -> mcg.PointCloud:
     """The cloud with only the named channels, in this order; a colour space is computed from red, green and blue."""
-    needed = [name for each in names for name in (COLORS if each in COLOR_SPACES else (each,))]
+    needed = [channel for name in names for channel in (COLORS if name in COLOR_SPACES else (name,))]
     missing = [name for name in dict.fromkeys(needed) if name not in cloud.channel_names]
     if missing:
         raise ValueError(f"no channel {', '.join(missing)}; there are {listed(cloud.channel_names)}")
     columns = [cloud.channel_names.index(name) for name in needed]
-    channels, measured, chosen = np.asarray(cloud.channels)[:, columns], cloud.channel_valid, list[str]()
-    measured = None if measured is None else np.asarray(measured)[:, columns]
+    channels = np.asarray(cloud.channels)[:, columns]
+    valid = None if cloud.channel_valid is None else np.asarray(cloud.channel_valid)[:, columns]
+    new_names: list[str] = []
     for name in names:
-        three = slice(len(chosen), len(chosen) + len(COLORS))
-        if name in COLOR_SPACES:
-            channels[:, three] = COLOR_SPACES[name](channels[:, three])
-            if measured is not None:
-                measured[:, three] = measured[:, three].all(axis=1, keepdims=True)
-        chosen += [f"{name}_{i}" for i in range(len(COLORS))] if name in COLOR_SPACES else [name]
+        if name not in COLOR_SPACES:
+            new_names.append(name)
+            continue
+        colors = slice(len(new_names), len(new_names) + len(COLORS))
+        channels[:, colors] = COLOR_SPACES[name](channels[:, colors])
+        if valid is not None:
+            valid[:, colors] = valid[:, colors].all(axis=1, keepdims=True)
+        new_names += [f"{name}_{i}" for i in range(len(COLORS))]
     return mcg.PointCloud(
-        cloud.points, channels, channel_valid=measured, covariances=cloud.covariances, channel_names=chosen
+        cloud.points, channels, channel_valid=valid, covariances=cloud.covariances, channel_names=new_names
     ).replace_rows(times=cloud.times)
 
 

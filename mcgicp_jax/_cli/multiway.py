@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 from pathlib import Path
-from typing import Annotated, TypeAlias
+from typing import Annotated
 
 import numpy as np
 import tyro
@@ -15,12 +15,10 @@ from mcgicp_jax import plot as plots
 from mcgicp_jax._cli.choices import Choices
 from mcgicp_jax._cli.options import File, Method, Options, check_outputs, clouds_in, with_names
 
-Folder: TypeAlias = Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="FOLDER")]
-
 
 @with_names
 def multiway(
-    folder: Folder,
+    folder: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="FOLDER")],
     *,
     shared: Options,
     method: Method = None,
@@ -51,11 +49,11 @@ def multiway(
     shared.check(method)
     paths = clouds_in(folder, glob, map).paths
     raw = [io.read(path, columns=shared.columns) for path in paths]
-    choices = Choices.of(shared, *raw)
+    choices = Choices.of(shared, [path.name for path in paths], raw)
     clouds = [choices.preprocess(cloud) for cloud in raw]
     voxels = choices.voxels
     print(f"clouds:    {len(clouds)}, {len(raw[0]):,} points in the first, {len(clouds[0]):,} used ({voxels})")
-    name = choices.method_name(method, {path.name: cloud for path, cloud in zip(paths[:2], raw, strict=False)})
+    name = choices.method_name(method)
     start = None if init is None else list(io.read_poses(init))
 
     def ready() -> tuple[mcg.PointCloud, mcg.PointCloud]:
@@ -63,7 +61,14 @@ def multiway(
 
     arguments = choices.arguments(name, ready)
     result = mcg.multiway(clouds, choices.method(name, ready), init=start, voxel_size=voxels.size, **arguments)
-    _report(result)
+
+    edges, rejected = result.graph.edges, int((~np.asarray(result.graph.kept)).sum())
+    print(f"pairs:     {len(result.registrations)} registered, {len(edges)} with a result, {rejected} of them rejected")
+    print(f"chi²:      {result.graph.chi_squared:.3g} per redundant number (1: as the covariances predict)")
+    deviations = np.sqrt(np.diagonal(np.asarray(result.graph.covariance), 0, 1, 2))
+    millimetres, degrees = 1e3 * deviations[:, :3].max(), np.degrees(deviations[:, 3:].max())
+    print(f"poses:     {result.graph.status.name}, at most {millimetres:.1f} mm and {degrees:.3f} deg uncertain")
+
     if output is not None:
         io.write_poses(output, result.poses)
     if map is not None:
@@ -74,6 +79,7 @@ def multiway(
     if plot is not None:
         plots.graph(result.graph, path=plot)
         print(f"picture:   {plot}")
+
     if not result.graph.converged:
         status = result.graph.status
         why = ": no pair constrains some directions of motion" if status == mcg.Status.DEGENERATE else ""
@@ -82,13 +88,3 @@ def multiway(
         if status != mcg.Status.CONVERGED:
             print(f"mcgicp: {path}: {status.name}, its pose contradicts the others or is not known", file=sys.stderr)
     return 0 if result.converged else 1
-
-
-def _report(result: mcg.MultiwayResult) -> None:
-    edges, total = result.graph.edges, len(result.registrations)
-    kept = np.asarray(result.graph.kept)
-    print(f"pairs:     {total} registered, {len(edges)} with a result, {int((~kept).sum())} of them rejected")
-    deviations = np.sqrt(np.diagonal(np.asarray(result.graph.covariance), 0, 1, 2))
-    worst = deviations[:, :3].max(), np.degrees(deviations[:, 3:].max())
-    print(f"chi²:      {result.graph.chi_squared:.3g} per redundant number (1: as the covariances predict)")
-    print(f"poses:     {result.graph.status.name}, at most {1e3 * worst[0]:.1f} mm and {worst[1]:.3f} deg uncertain")

@@ -32,28 +32,26 @@ if TYPE_CHECKING:
 else:
     DatasetName = Literal[tuple(DATASETS)]
 
-Positional: TypeAlias = Annotated[DatasetName | Path, tyro.conf.Positional, tyro.conf.arg(metavar="{FOLDER,DATASET}")]
-Folder: TypeAlias = Annotated[Path | None, tyro.conf.Positional, shown("PATH")]
-Poses: TypeAlias = list[Float[np.ndarray, "4 4"]]
-Truth: TypeAlias = list[Float[np.ndarray, "4 4"] | None]
+Pose: TypeAlias = Float[np.ndarray, "4 4"]
 
 _FRAMES_OF_A_SCENE = 20
+_RECORDED = [name for name, dataset in DATASETS.items() if not dataset.simulated]
+_SIMULATED = [name for name, dataset in DATASETS.items() if dataset.simulated]
+_MAX_DISTANCES = ", ".join(
+    f"{far:g} and {near:g} for {enumerated(list(names))}"
+    for (far, near), names in itertools.groupby(DATASETS, lambda name: DATASETS[name].max_distance)
+)
 
 
-def _names(simulated: bool) -> str:
-    return enumerated([name for name, each in DATASETS.items() if each.simulated == simulated], "or")
-
-
-def _distances() -> str:
-    """The default of `max_distance` for each data set."""
-    groups = itertools.groupby(DATASETS, lambda name: DATASETS[name].max_distance)
-    return ", ".join(f"{far:g} and {near:g} for {enumerated(list(names))}" for (far, near), names in groups)
-
-
-@partial(with_names, datasets=_names(False), scenes=_names(True), max_distances=_distances())
+@partial(
+    with_names,
+    datasets=enumerated(_RECORDED, "or"),
+    scenes=enumerated(_SIMULATED, "or"),
+    max_distances=_MAX_DISTANCES,
+)
 def odometry(
-    dataset: Positional,
-    path: Folder = None,
+    dataset: Annotated[DatasetName | Path, tyro.conf.Positional, tyro.conf.arg(metavar="{FOLDER,DATASET}")],
+    path: Annotated[Path | None, tyro.conf.Positional, shown("PATH")] = None,
     *,
     shared: Options,
     method: Method = None,
@@ -117,47 +115,53 @@ def odometry(
         frames = frames.crop(min_range, max_range)
     if pose_frame == "camera" and frames.to_camera is None:
         raise ValueError(f"pose_frame: expected sensor, since {dataset} has no calibration of a camera, got camera")
-    options: dict[str, Any] = {
-        "max_distance": DATASETS[dataset].max_distance if isinstance(dataset, str) else None,
-        "num_neighbors": shared.num_neighbors,
-        "against": against,
-        "map_radius": map_radius,
-        "loops": loops,
-        "deskew": deskew,
-    }
     first = frames[0]
     if pose_format == "tum" and first.time is None:
         raise ValueError(f"pose_format: expected kitti, since the frames of {dataset} have no times, got tum")
     if deskew and first.cloud.times is None:
         raise ValueError(f"--deskew: expected points with times, such as a column time in files, got none in {dataset}")
+
     print(f"frames:    {len(frames)} of {dataset}, {len(first.cloud):,} points in the first")
-    start = {"the first frame": first.cloud}
+    start = [first.cloud]
     # Where the second frame cannot be read, the odometry names the error.
     with contextlib.suppress(ValueError, OSError):
-        start["the second"] = frames[1].cloud
-    choices = Choices.of(shared, *start.values())
-    name = choices.method_name(method, start)
+        start.append(frames[1].cloud)
+    choices = Choices.of(shared, ("the first frame", "the second"), start)
+    name = choices.method_name(method)
     print(f"points:    {choices.voxels}")
 
     def first_two() -> tuple[mcg.PointCloud, mcg.PointCloud]:
         return choices.preprocess(frames[1].cloud), choices.preprocess(first.cloud)
 
-    truth: Truth = []
+    resolved_method = choices.method(name, first_two)
+    options = choices.arguments(name, first_two)
+    if isinstance(dataset, str):
+        options.setdefault("max_distance", DATASETS[dataset].max_distance)
+    options |= {"num_neighbors": shared.num_neighbors, "against": against, "map_radius": map_radius}
+    options |= {"loops": loops, "deskew": deskew, "start": first.pose}
+    truth: list[Pose | None] = []
     times: list[Any] = []
-    clouds, chosen = _clouds(frames, choices.channels, truth, times), choices.method(name, first_two)
-    options |= choices.arguments(name, first_two)
-    steps = mcg.odometry(clouds, chosen, voxel_size=choices.voxels.size, start=first.pose, **options)
+
+    def clouds() -> Iterator[mcg.PointCloud]:
+        for frame in frames:
+            truth.append(frame.pose)
+            times.append(frame.time)
+            yield with_channels(frame.cloud, choices.channels)
+
+    steps = mcg.odometry(clouds(), resolved_method, voxel_size=choices.voxels.size, **options)
     poses, results, failure = _follow(steps, len(frames), loops, map)
-    del truth[len(poses) :]
+    del truth[len(poses) :], times[len(poses) :]
     _report(poses, truth, results)
+
     if output is not None:
         camera = frames.to_camera if pose_frame == "camera" else None
         in_frame = poses if camera is None else [camera @ pose @ np.linalg.inv(camera) for pose in poses]
-        io.write_poses(output, in_frame, None if pose_format == "kitti" else times[: len(poses)])
+        io.write_poses(output, in_frame, None if pose_format == "kitti" else times)
     if plot is not None:
         true_poses = [pose for pose in truth if pose is not None]
         plots.trajectories(({"truth": true_poses} if true_poses else {}) | {name: poses}, path=plot)
         print(f"picture:   {plot}")
+
     if failure:
         print(f"mcgicp: {failure}; stopped after {len(poses)} of {len(frames)} frames", file=sys.stderr)
     if failed := sum(not result.converged for result in results):
@@ -189,7 +193,11 @@ def _open(
         try:
             frames = clouds_in(dataset, map=map, columns=columns)
         except ValueError as error:
-            if name := _dataset_of(dataset):
+            for name in _RECORDED:
+                try:
+                    DATASETS[name].frames(dataset)
+                except (ValueError, OSError):
+                    continue
                 raise ValueError(f"{error}; it is a sequence: mcgicp odometry {name} {dataset}") from error
             raise
     else:
@@ -200,31 +208,14 @@ def _open(
     return frames if num_frames == "all" else frames[:num_frames]
 
 
-def _dataset_of(folder: Path) -> str | None:
-    """The data set whose layout a folder has."""
-    for name in (name for name, each in DATASETS.items() if not each.simulated):
-        with contextlib.suppress(ValueError, OSError):
-            DATASETS[name].frames(folder)
-            return name
-    return None
-
-
-def _clouds(frames: AbstractFrames, names: tuple[str, ...], truth: Truth, times: list[Any]) -> Iterator[mcg.PointCloud]:
-    """Yield the cloud of each frame, and append its true pose to `truth` and its time to `times`."""
-    for frame in frames:
-        truth.append(frame.pose)
-        times.append(frame.time)
-        yield with_channels(frame.cloud, names)
-
-
 def _follow(
     steps: Iterator[OdometryStep], num_frames: int, loops: bool, map: Path | None
-) -> tuple[Poses, list[mcg.RegistrationResult], str]:
+) -> tuple[list[Pose], list[mcg.RegistrationResult], str]:
     """Run the odometry, write the map if it has a file; return the poses, the registrations and why it stopped early.
 
     Raises the error of the first frame, since nothing is known then.
     """
-    poses: Poses = []
+    poses: list[Pose] = []
     results: list[mcg.RegistrationResult] = []
     clouds: list[mcg.PointCloud] = []
     world, last, failure = None, None, ""
@@ -255,7 +246,7 @@ def _follow(
     return poses, results, failure
 
 
-def _report(poses: Poses, truth: Truth, results: list[mcg.RegistrationResult]) -> None:
+def _report(poses: list[Pose], truth: list[Pose | None], results: list[mcg.RegistrationResult]) -> None:
     iterations = np.mean([np.asarray(result.num_iterations) for result in results]) if results else 0
     converged = sum(bool(result.converged) for result in results)
     print(f"pairs:     {converged} of {len(results)} converged, {iterations:.1f} iterations on average")
@@ -266,13 +257,10 @@ def _report(poses: Poses, truth: Truth, results: list[mcg.RegistrationResult]) -
     estimated, true = [poses[row] for row in rows], [truth[row] for row in rows]
     translation, rotation = metrics.rpe(estimated, true)
     print(f"per pair:  {1e3 * translation.mean():.1f} mm, {np.degrees(rotation.mean()):.3f} deg on average")
-    whole = metrics.ate(estimated, true)
-    first = metrics.ate(estimated, true, alignment="first")
-    print(
-        f"ATE:       {1e3 * whole:.1f} mm rms after the best alignment, {1e3 * first:.1f} mm aligned at the first pose"
-    )
+    best, first = 1e3 * metrics.ate(estimated, true), 1e3 * metrics.ate(estimated, true, alignment="first")
+    print(f"ATE:       {best:.1f} mm rms after the best alignment, {first:.1f} mm aligned at the first pose")
     length = float(np.linalg.norm(np.diff(np.array(true)[:, :3, 3], axis=0), axis=1).sum())
-    segments = [each for each in metrics.KITTI_LENGTHS if each < length] or [length / 2]
+    segments = [segment for segment in metrics.KITTI_LENGTHS if segment < length] or [length / 2]
     percent, degrees = metrics.kitti_errors(estimated, true, lengths=segments, step=1)
-    shown = ", ".join(f"{segment:.3g}" for segment in segments)
-    print(f"drift:     {percent:.2f} %, {degrees:.4f} deg/m over segments of {shown} m")
+    lengths = ", ".join(f"{segment:.3g}" for segment in segments)
+    print(f"drift:     {percent:.2f} %, {degrees:.4f} deg/m over segments of {lengths} m")

@@ -54,12 +54,7 @@ _METHOD = tyro.constructors.PrimitiveConstructorSpec[str | None](
 Method: TypeAlias = Annotated[
     MethodName | None, _METHOD, shown(default="mc-gicp; gicp for clouds without common channels")
 ]
-Start: TypeAlias = Annotated[Literal["global"] | Path | None, shown("{FILE,global}")]
-Names: TypeAlias = Annotated[tuple[str, ...], shown("NAMES", "all in common")]
 Numbers: TypeAlias = Annotated[tuple[float, ...], shown(default="from the data")]
-Distances: TypeAlias = Annotated[tuple[float, ...], shown(default="10 and 2.5 spacings")]
-Sizes: TypeAlias = Annotated[tuple[float, ...], shown(default="none")]
-Tolerance: TypeAlias = Annotated[float | None, shown("FLOAT", "0.005 spacings")]
 
 
 def _kernel(words: list[str]) -> tuple[str, float]:
@@ -71,30 +66,16 @@ def _kernel(words: list[str]) -> tuple[str, float]:
     raise ValueError(f"expected {expected}; got {' '.join(words)}")
 
 
-Kernel: TypeAlias = Annotated[
-    tuple[KernelName, float] | None,
-    tyro.constructors.PrimitiveConstructorSpec(
-        nargs=(1, 2),
-        metavar="KERNEL SCALE",
-        instance_from_str=_kernel,
-        is_instance=lambda value: value is None or isinstance(value, tuple),
-        str_from_instance=lambda value: [str(value)],
-    ),
-    shown(default="none"),
-]
-# Repeated options add up.
-Fixed: TypeAlias = Annotated[
-    tuple[tuple[Literal["x", "y", "z", "roll", "pitch", "yaw"], ...], ...],
-    tyro.conf.UseAppendAction,
-    shown(default="none"),
-]
-Columns: TypeAlias = Annotated[int | None, shown("INT", "recognised")]
-Epsilon: TypeAlias = Annotated[
-    float | None, shown("FLOAT", str(inspect.signature(mcg.GICP).parameters["epsilon"].default))
-]
-
+_KERNEL = tyro.constructors.PrimitiveConstructorSpec[tuple[str, float] | None](
+    nargs=(1, 2),
+    metavar="KERNEL SCALE",
+    instance_from_str=_kernel,
+    is_instance=lambda value: value is None or isinstance(value, tuple),
+    str_from_instance=lambda value: [str(value)],
+)
+_EPSILON = str(inspect.signature(mcg.GICP).parameters["epsilon"].default)
 # Suffixes of clouds that texts such as poses do not have.
-_BINARY = {suffix for suffix, each in FORMATS.items() if each.read is not read_text}
+_BINARY = {suffix for suffix, cloud_format in FORMATS.items() if cloud_format.read is not read_text}
 # Number of files that a message lists.
 _MOST_NAMES = 5
 # Parameters of methods that have an option.
@@ -107,14 +88,17 @@ def enumerated(names: Sequence[str], last: str = "and") -> str:
 
 def with_names(documented: Documented, **others: str) -> Documented:
     """Fill the names from the registries, and others, into the help text of a command or of its options."""
-    having = {name: [m for m in METHODS if name in METHODS[m].kind.__dataclass_fields__] for name in PARAMETERS}
+    kinds = {name: method.kind for name, method in METHODS.items()}
     documented.__doc__ = (documented.__doc__ or "").format(
         formats=enumerated(list(FORMATS), "or"),
         spaces=enumerated(list(COLOR_SPACES), "or"),
         kernels=enumerated(list(KERNELS), "or"),
-        channel_methods=enumerated([name for name in METHODS if METHODS[name].kind.uses_channels]),
-        cell_methods=enumerated([name for name in METHODS if METHODS[name].kind.needs_covariances]),
-        **{name: enumerated(methods) for name, methods in having.items()},
+        channel_methods=enumerated([name for name, kind in kinds.items() if kind.uses_channels]),
+        cell_methods=enumerated([name for name, kind in kinds.items() if kind.needs_covariances]),
+        **{
+            parameter: enumerated([name for name, kind in kinds.items() if parameter in kind.__dataclass_fields__])
+            for parameter in PARAMETERS
+        },
         **others,
     )
     return documented
@@ -150,42 +134,43 @@ class Options:
         columns: Number of float32 values of each point of .bin files, the first of which are x, y, z and intensity.
     """
 
-    channels: Names = ()
+    channels: Annotated[tuple[str, ...], shown("NAMES", "all in common")] = ()
     voxel_size: float | Literal["auto", "off"] = "auto"
     num_neighbors: int = 20
-    max_distance: Distances = ()
+    max_distance: Annotated[tuple[float, ...], shown(default="10 and 2.5 spacings")] = ()
     max_iterations: int = RegistrationOptions.max_iterations
-    translation_tolerance: Tolerance = None
+    translation_tolerance: Annotated[float | None, shown("FLOAT", "0.005 spacings")] = None
     rotation_tolerance: float = ROTATION_TOLERANCE
-    robust: Kernel = None
+    robust: Annotated[tuple[KernelName, float] | None, _KERNEL, shown(default="none")] = None
     hold_unconstrained: bool = True
     equalize_channels: bool = False
-    voxel_sizes: Sizes = ()
+    voxel_sizes: Annotated[tuple[float, ...], shown(default="none")] = ()
     max_source_points: int | Literal["all"] | None = RegistrationOptions.max_source_points
     channel_covariance: Numbers = ()
     channel_weights: Numbers = ()
-    epsilon: Epsilon = None
-    columns: Columns = None
+    epsilon: Annotated[float | None, shown("FLOAT", _EPSILON)] = None
+    columns: Annotated[int | None, shown("INT", "recognised")] = None
 
     def check(self, method: MethodName | None = None) -> None:
         """Raise `ValueError` or `OSError` for invalid options, or parameters that the method lacks; reads no cloud."""
         if self.columns is not None:
             check_integer("columns", self.columns, 3)
         check_preprocessing(None if isinstance(self.voxel_size, str) else self.voxel_size, self.num_neighbors)
-        mcg.MultiChannelGICP(**self._parameters())
+        parameters = self.parameters()
+        mcg.MultiChannelGICP(**parameters)
         RegistrationOptions(**self.registration())
-        unknown = self._parameters().keys() - self.parameters_of(method).keys() if method else set()
-        if unknown:
+        if unknown := parameters.keys() - self.parameters(method).keys():
             raise ValueError(f"{method} has no {' and no '.join(sorted(unknown))}")
 
-    def parameters_of(self, method: MethodName) -> dict[str, Any]:
-        """The parameters that the user gave and that this method has."""
-        fields = METHODS[method].kind.__dataclass_fields__
-        return {name: value for name, value in self._parameters().items() if name in fields}
-
-    def _parameters(self) -> dict[str, Any]:
-        given = {name: getattr(self, name) for name in PARAMETERS if getattr(self, name) not in (None, ())}
-        return {name: value[0] if np.shape(value) == (1,) else value for name, value in given.items()}
+    def parameters(self, method: MethodName | None = None) -> dict[str, Any]:
+        """The parameters of methods that the user gave; only those that this method has, if one is named."""
+        parameters = {}
+        for name in PARAMETERS:
+            value = getattr(self, name)
+            applies = method is None or name in METHODS[method].kind.__dataclass_fields__
+            if applies and value not in (None, ()):
+                parameters[name] = value[0] if np.shape(value) == (1,) else value
+        return parameters
 
     def registration(self) -> dict[str, Any]:
         """Keyword arguments of `mcgicp_jax.register`."""
@@ -214,8 +199,13 @@ class PairOptions(Options):
         plot: File for a picture of the clouds before and after registration, such as out.png.
     """
 
-    init: Start = None
-    fix: Fixed = ()
+    init: Annotated[Literal["global"] | Path | None, shown("{FILE,global}")] = None
+    # Repeated options add up.
+    fix: Annotated[
+        tuple[tuple[Literal["x", "y", "z", "roll", "pitch", "yaw"], ...], ...],
+        tyro.conf.UseAppendAction,
+        shown(default="none"),
+    ] = ()
     plot: File = None
 
 
@@ -230,9 +220,9 @@ def check_outputs(
         # A text file that exists is a cloud or not by its content.
         if path is not None and (path.suffix.lower() in _BINARY or (path.is_file() and is_cloud(path))):
             raise ValueError(f"{path}: expected a text file, such as poses.txt, instead of a cloud")
-    for given in inputs:
-        if cloud is not None and cloud.resolve().is_relative_to(given.resolve()):
-            raise ValueError(f"{cloud}: expected a file outside of the input, {given}")
+    for path in inputs:
+        if cloud is not None and cloud.resolve().is_relative_to(path.resolve()):
+            raise ValueError(f"{cloud}: expected a file outside of the input, {path}")
     written = [path for path in (*files, cloud, picture) if path is not None]
     if len({path.resolve() for path in written}) < len(written):
         raise ValueError(f"output: expected a file for each output, got {', '.join(map(str, written))}")
@@ -247,7 +237,7 @@ def check_outputs(
         plot.check_picture(picture)
 
 
-def clouds_in(folder: Path, glob: str = "*", map: File = None, columns: Columns = None) -> datasets.CloudFiles:
+def clouds_in(folder: Path, glob: str = "*", map: File = None, columns: int | None = None) -> datasets.CloudFiles:
     """The clouds of a folder; `map`, a cloud that the command writes, may not become one of them."""
     if map is not None and map.resolve().parent == folder.resolve() and fnmatch(map.name, glob):
         raise ValueError(f"{map}: expected a map outside of {folder}, where it would be one of the clouds")

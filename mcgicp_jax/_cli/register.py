@@ -15,7 +15,7 @@ from jaxtyping import Float
 
 import mcgicp_jax as mcg
 from mcgicp_jax import datasets, io, metrics, plot
-from mcgicp_jax._cli.choices import Choices, distance_in_words, with_channels
+from mcgicp_jax._cli.choices import Choices, with_channels
 from mcgicp_jax._cli.options import (
     PARAMETERS,
     File,
@@ -28,18 +28,19 @@ from mcgicp_jax._cli.options import (
 )
 from mcgicp_jax._compute.messages import messages_named
 from mcgicp_jax._compute.threads import side_by_side
+from mcgicp_jax._local_geometry.cloud_statistics import point_spacing
 from mcgicp_jax._methods.base import AbstractMethod
 from mcgicp_jax._methods.surfaces import resolved
 from mcgicp_jax._pose_solver.degeneracy import as_text
 from mcgicp_jax._registration.options import Options as RegistrationOptions
 from mcgicp_jax._registration.register_pair import prepared, rows_to_match
 from mcgicp_jax._registration.result import verified
+from mcgicp_jax._registration.settings import default_distances
 from mcgicp_jax.extend import METHODS
 from mcgicp_jax.io.clouds import format_of
 
 Source: TypeAlias = Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="SOURCE")]
 Target: TypeAlias = Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="TARGET")]
-
 
 # The components of ξ, for --fix.
 _DIRECTIONS = ("x", "y", "z", "roll", "pitch", "yaw")
@@ -61,15 +62,20 @@ class PreparedPair:
         self.verified = True
         read = partial(io.read, columns=options.columns)
         self.raw = read(source), read(target)
-        self.files = {str(source): self.raw[0], str(target): self.raw[1]}
-        self.choices = Choices.of(options, *self.raw)
+        self.choices = Choices.of(options, (str(source), str(target)), self.raw)
         self.ready = self._preprocess(source, self.raw[0]), self._preprocess(target, self.raw[1])
-        counts = (f"{len(used):,} of {len(raw):,}" for used, raw in zip(self.ready, self.raw, strict=True))
-        print("points:    source {}, target {} ({})".format(*counts, self.choices.voxels))
+        in_source, in_target = (f"{len(self.ready[side]):,} of {len(self.raw[side]):,}" for side in (0, 1))
+        print(f"points:    source {in_source}, target {in_target} ({self.choices.voxels})")
 
     def _preprocess(self, path: Path, cloud: mcg.PointCloud) -> mcg.PointCloud:
         with messages_named(str(path)):
             return self.choices.preprocess(cloud)
+
+    def print_distances(self) -> None:
+        """Print how far apart matches may be."""
+        target = self.ready[1]
+        distances = self.options.max_distance or default_distances(point_spacing(target), target)
+        print(f"matches:   up to {' m, then '.join(f'{float(distance):.3g}' for distance in distances)} m apart")
 
     def find_start(self) -> None:
         """With `--init global`, start from the pose by local features; raises `ValueError` if there is none."""
@@ -85,8 +91,8 @@ class PreparedPair:
     def method(self, name: MethodName) -> AbstractMethod:
         """The method with parameters from the options or else from the data, as `mcgicp_jax.register` chooses them."""
         options = RegistrationOptions(max_source_points=self.options.registration()["max_source_points"])
-        given = prepared(*self.ready, self.choices.method(name, lambda: self.ready), options)
-        return resolved(given.method, given.source, given.target, rows_to_match(given.source, options))
+        pair = prepared(*self.ready, self.choices.method(name, lambda: self.ready), options)
+        return resolved(pair.method, pair.source, pair.target, rows_to_match(pair.source, options))
 
     def errors(self, pose: Float[np.ndarray, "4 4"], true_pose: Float[np.ndarray, "4 4"]) -> str:
         """Translation error in mm at the centroid of the source, and rotation error in degrees, as two columns."""
@@ -143,17 +149,36 @@ def register(
     shared.check(method)
     check_outputs(output, cloud=aligned, picture=shared.plot, inputs=(source, target))
     pair = PreparedPair(source, target, shared)
-    name = pair.choices.method_name(method, pair.files)
+    name = pair.choices.method_name(method)
     pair.find_start()
-    chosen = pair.method(name)
-    print(f"method:    {name}{_parameters(chosen)}")
-    if not chosen.needs_covariances:
-        print(f"matches:   up to {distance_in_words(shared, pair.ready[1])} apart")
+    resolved_method = pair.method(name)
+    print(f"method:    {name}", end="")
+    for parameter in PARAMETERS:
+        if hasattr(resolved_method, parameter):
+            values = np.atleast_1d(getattr(resolved_method, parameter))
+            print(f", {parameter} {' '.join(f'{value:.3g}' for value in values)}", end="")
+    print()
+    if resolved_method.needs_covariances:
+        print(f"cells:     of {', '.join(f'{size:g}' for size in pair.arguments(name)['voxel_sizes'])} m")
     else:
-        sizes = pair.arguments(name)["voxel_sizes"]
-        print(f"cells:     of {', '.join(f'{size:g}' for size in sizes)} m")
-    result = pair.register(name, chosen)
-    _report(pair, result)
+        pair.print_distances()
+    result = pair.register(name, resolved_method)
+
+    plural = "" if result.num_iterations == 1 else "s"
+    print(f"status:    {_words(result)} after {result.num_iterations} iteration{plural}")
+    print(f"inliers:   {result.num_inliers:,} ({result.overlap:.0%} of the points used), rmse {result.rmse:.4g} m")
+    if result.converged and np.all(np.isfinite(result.deviations)):
+        x, y, z, *angles = result.deviations
+        roll, pitch, yaw = np.degrees(angles)
+        print(f"deviation: x {x:.2g}, y {y:.2g}, z {z:.2g} m; about x {roll:.2g}, y {pitch:.2g}, z {yaw:.2g} degrees")
+    if result.unconstrained_directions:
+        print(f"unconstr.: {as_text(result.unconstrained_directions)}")
+    print("T_target_source:")
+    # At UTM coordinates, 1e-8 in a rotation entry moves a point by centimetres.
+    form = "22.14f" if np.any(pair.ready[0].origin) else "15.8f"
+    for row in result.matrix:
+        print("".join(f" {number:{form}}" for number in row))
+
     if output is not None:
         io.write_poses(output, [result.matrix])
     if aligned is not None:
@@ -212,8 +237,8 @@ def _compare(
 ) -> dict[MethodName, mcg.RegistrationResult]:
     true_pose = None if truth is None else _read_pose("truth", truth)
     pair = PreparedPair(source, target, options)
-    print(f"matches:   up to {distance_in_words(options, pair.ready[1])} apart")
-    pair.choices.print_channels(pair.files)
+    pair.print_distances()
+    pair.choices.print_channels()
     pair.find_start()
     results: dict[MethodName, mcg.RegistrationResult] = {}
     measures = "inliers      rmse, m" if true_pose is None else "error, mm   error, deg"
@@ -251,35 +276,13 @@ def _compiled(pair: PreparedPair, names: Sequence[MethodName]) -> dict[MethodNam
                 pair.register(name, methods[name])
 
     # Methods with and without channels share no programs.
-    side_by_side([partial(run, kind) for kind in ([True, False] if pair.choices.channels else [False])])
+    groups = [True, False] if pair.choices.channels else [False]
+    side_by_side([partial(run, uses_channels) for uses_channels in groups])
     return methods
-
-
-def _parameters(method: AbstractMethod) -> str:
-    """The parameters of a method, as in `, epsilon 0.001`."""
-    numbers = [(name, np.atleast_1d(getattr(method, name))) for name in PARAMETERS if hasattr(method, name)]
-    return "".join(f", {name} {' '.join(f'{value:.3g}' for value in values)}" for name, values in numbers)
 
 
 def _words(result: mcg.RegistrationResult) -> str:
     return result.status.name.lower().replace("_", " ")
-
-
-def _report(pair: PreparedPair, result: mcg.RegistrationResult) -> None:
-    plural = "" if result.num_iterations == 1 else "s"
-    print(f"status:    {_words(result)} after {result.num_iterations} iteration{plural}")
-    print(f"inliers:   {result.num_inliers:,} ({result.overlap:.0%} of the points used), rmse {result.rmse:.4g} m")
-    if result.converged and np.all(np.isfinite(result.deviations)):
-        x, y, z, *angles = result.deviations
-        roll, pitch, yaw = np.degrees(angles)
-        print(f"deviation: x {x:.2g}, y {y:.2g}, z {z:.2g} m; about x {roll:.2g}, y {pitch:.2g}, z {yaw:.2g} degrees")
-    if result.unconstrained_directions:
-        print(f"unconstr.: {as_text(result.unconstrained_directions)}")
-    print("T_target_source:")
-    # At UTM coordinates, 1e-8 in a rotation entry moves a point by centimetres.
-    form = "22.14f" if np.any(pair.ready[0].origin) else "15.8f"
-    for row in result.matrix:
-        print("".join(f" {number:{form}}" for number in row))
 
 
 def _verdict(results: dict[MethodName, mcg.RegistrationResult]) -> int:
