@@ -145,26 +145,27 @@ def motion_jacobians(poses: Float[np.ndarray, "m 2 4 4"]) -> Float[np.ndarray, "
 def checked_edges(edges: Edge, num_poses: int) -> Edge:
     """The edges as NumPy arrays, with exact rotations and symmetric information."""
     i, j = np.asarray(edges.i), np.asarray(edges.j)
-    for name, rows, of_world in (("i", i, i == WORLD), ("j", j, np.zeros(len(j), bool))):
-        outside = ((rows < 0) | (rows >= num_poses)) & ~of_world
-        _refuse(f"{name}: expected a row from 0 to {num_poses - 1}", outside, rows)
+    _refuse(f"i: expected a row from 0 to {num_poses - 1}", (i != WORLD) & ((i < 0) | (i >= num_poses)), i)
+    _refuse(f"j: expected a row from 0 to {num_poses - 1}", (j < 0) | (j >= num_poses), j)
     _refuse("expected two different poses", i == j, i)
     transforms = pose_matrices(edges.T_i_j, "edges[{}].T_i_j") if len(i) else np.zeros((0, 4, 4))
     information = np.asarray(edges.information, np.float64)
     _refuse("information: expected finite numbers", np.isnan(information.sum(axis=(1, 2)) * 0.0), information)
     symmetric = 0.5 * (information + information.swapaxes(1, 2))
-    values = np.linalg.eigvalsh(symmetric)
-    limit = _ROUNDING * np.abs(values).max(axis=1, initial=0)
+    eigenvalues = np.linalg.eigvalsh(symmetric)
+    limit = _ROUNDING * np.abs(eigenvalues).max(axis=1, initial=0)
     asymmetry = np.abs(information - symmetric).max(axis=(1, 2), initial=0)
     _refuse("information: expected a symmetric matrix", asymmetry > limit, information)
-    _refuse("information: expected a positive semidefinite matrix; eigenvalues", values[:, 0] < -limit, values)
+    negative = eigenvalues[:, 0] < -limit
+    _refuse("information: expected a positive semidefinite matrix; eigenvalues", negative, eigenvalues)
     return Edge(i, j, transforms, symmetric, uncertain=np.asarray(edges.uncertain, bool))
 
 
-def _refuse(what: str, bad: np.ndarray, values: np.ndarray) -> None:
-    if bad.any():
-        k = int(np.argmax(bad))
-        raise ValueError(f"edges[{k}]: {what}, got {values[k]}")
+def _refuse(expected: str, wrong: Bool[np.ndarray, "m"], values: np.ndarray) -> None:
+    """Raise `ValueError` for the first edge that is wrong."""
+    if wrong.any():
+        k = int(np.argmax(wrong))
+        raise ValueError(f"edges[{k}]: {expected}, got {values[k]}")
 
 
 def _rows(name: str, values: ArrayLike) -> Any:

@@ -8,7 +8,6 @@ positions at these rotations (Martinec & Pajdla, CVPR 2007; Carlone et al., ICRA
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
 
 import equinox as eqx
 import jax
@@ -19,8 +18,8 @@ from jaxtyping import Array, Bool, Float, Int
 
 from mcgicp_jax._compute.concrete import is_concrete
 from mcgicp_jax._math.poses import Pose, inverse, pose_matrices
-from mcgicp_jax._pose_graph.edge import WORLD, AbstractFactor, Edge, check_rows, checked_edges
-from mcgicp_jax._pose_graph.levenberg_marquardt import factored
+from mcgicp_jax._pose_graph.edge import WORLD, AbstractFactor, Edge, Factors, check_rows, checked_edges
+from mcgicp_jax._pose_graph.levenberg_marquardt import factored, typical_information
 
 # Eigenvalues of an edge's information below this fraction of the largest count as zero.
 _BLIND = 1e-6
@@ -80,7 +79,14 @@ class PoseGraph(eqx.Module):
         if is_concrete(self.edges):
             self.edges = checked_edges(self.edges, len(self.poses))
         for k, factor in enumerate(factors):
-            _check_factor(f"factors[{k}]", factor, len(self.poses))
+            name = f"factors[{k}]"
+            if not isinstance(factor, AbstractFactor):
+                raise ValueError(f"{name}: expected an AbstractFactor, got {type(factor).__name__}")
+            rows, shape = np.shape(factor.rows), np.shape(factor.information)
+            if len(shape) != 3 or shape[1] != shape[2] or rows != (shape[0], 2):
+                raise ValueError(f"{name}: expected rows (m, 2) and information (m, d, d), got {rows} and {shape}")
+            if is_concrete(factor.rows):
+                check_rows(name, np.asarray(factor.rows), len(self.poses))
         self.factors = tuple(factors)
 
 
@@ -95,16 +101,6 @@ def _stacked(edges: Sequence[Edge]) -> Edge:
     return jax.tree.map(lambda *values: xp.stack(values), *edges)
 
 
-def _check_factor(name: str, factor: Any, num_poses: int) -> None:
-    if not isinstance(factor, AbstractFactor):
-        raise ValueError(f"{name}: expected an AbstractFactor, got {type(factor).__name__}")
-    rows, information = np.shape(factor.rows), np.shape(factor.information)
-    if len(information) != 3 or information[1] != information[2] or rows != (information[0], 2):
-        raise ValueError(f"{name}: expected rows (m, 2) and information (m, d, d), got {rows} and {information}")
-    if is_concrete(factor.rows):
-        check_rows(name, np.asarray(factor.rows), num_poses)
-
-
 def _initial(edges: Edge) -> Float[np.ndarray, "n 4 4"]:
     """Poses to start from, by a spanning tree that prefers certain edges to uncertain ones, and these to edges without
     information on some direction; then by relaxation of the certain edges and of the tree."""
@@ -112,79 +108,71 @@ def _initial(edges: Edge) -> Float[np.ndarray, "n 4 4"]:
         raise ValueError("poses: required, since initial poses can only be computed from at least one concrete edge")
     number = int(max(np.max(edges.i), np.max(edges.j))) + 1
     edges = checked_edges(edges, number)
-    information: Any = edges.information
-    # An edge of the identity from the world to each pose, to be used last, keeps other parts.
-    i = np.concatenate([np.where(edges.i == WORLD, number, edges.i), np.full(number, number)])
-    j = np.concatenate([edges.j, np.arange(number)])
+    # The world comes after the poses. An edge of the identity from it to each, to be used last, keeps other parts.
+    from_world = np.stack([np.full(number, number), np.arange(number)], axis=1)
+    ends = np.concatenate([np.where(edges.rows == WORLD, number, edges.rows), from_world])
     motions = np.concatenate([edges.T_i_j, np.tile(np.eye(4), (number, 1, 1))])
-    values = np.linalg.eigvalsh(information)
-    rank = np.concatenate([edges.uncertain + 2 * (values[:, 0] <= _BLIND * values[:, -1]), np.full(number, 4)])
-    poses, used = _along_tree(i, j, motions, rank, number)
-    used |= rank == 0
-    if used.sum() > number:
-        scales = np.diagonal(information, axis1=1, axis2=2).reshape(-1, 2, 3).mean(axis=2)
-        scales = np.concatenate([np.where(scales > 0, scales, 1), np.ones((number, 2))])[used]
-        poses = _relaxed(i[used], j[used], motions[used], np.sqrt(scales), number)
+    eigenvalues = np.linalg.eigvalsh(edges.information)
+    blind = eigenvalues[:, 0] <= _BLIND * eigenvalues[:, -1]
+    rank = np.concatenate([edges.uncertain + 2 * blind, np.full(number, 4)])
+    poses, trusted = _along_tree(ends, motions, rank)
+    trusted |= rank == 0
+    if trusted.sum() > number:
+        # Mean information in translation and rotation.
+        means = np.diagonal(edges.information, axis1=1, axis2=2).reshape(-1, 2, 3).mean(axis=2)
+        means = np.concatenate([np.where(means > 0, means, 1), np.ones((number, 2))])
+        poses = _relaxed(ends[trusted], motions[trusted], np.sqrt(means[trusted]), number)
     return poses
 
 
 def _along_tree(
-    i: Int[np.ndarray, "m"],
-    j: Int[np.ndarray, "m"],
-    motions: Float[np.ndarray, "m 4 4"],
-    rank: Int[np.ndarray, "m"],
-    number: int,
-) -> tuple[Float[np.ndarray, "number 4 4"], Bool[np.ndarray, "m"]]:
+    ends: Int[np.ndarray, "m 2"], motions: Float[np.ndarray, "m 4 4"], rank: Int[np.ndarray, "m"]
+) -> tuple[Float[np.ndarray, "n 4 4"], Bool[np.ndarray, "m"]]:
     """Poses along a spanning tree from the world, of edges of lowest rank, and which edges it has."""
     from scipy.sparse import coo_array
     from scipy.sparse.csgraph import breadth_first_order, minimum_spanning_tree
 
+    world = int(ends.max())
     order = np.argsort(rank, kind="stable")
-    # Of several edges between two poses, the first in this order.
-    _, first = np.unique((np.minimum(i, j) * (number + 1) + np.maximum(i, j))[order], return_index=True)
-    rows = order[first]
-    size = (number + 1, number + 1)
-    tree = minimum_spanning_tree(coo_array((first + 1.0, (i[rows], j[rows])), size))
+    # Of several edges between two poses, the first in this order. Their weights are their places in it, from 1.
+    _, places = np.unique((ends.min(axis=1) * (world + 1) + ends.max(axis=1))[order], return_index=True)
+    tree = minimum_spanning_tree(coo_array((places + 1.0, tuple(ends[order[places]].T)), (world + 1, world + 1)))
     tree = (tree + tree.T).tocsr()
-    nodes, before = breadth_first_order(tree, number)
+    nodes, before = breadth_first_order(tree, world)
     edges = order[tree[before[nodes[1:]], nodes[1:]].astype(int) - 1]
-    poses, used = np.tile(np.eye(4), (number + 1, 1, 1)), np.zeros(len(i), bool)
+    poses = np.tile(np.eye(4), (world + 1, 1, 1))
     for node, edge in zip(nodes[1:], edges, strict=True):
-        motion = motions[edge] if j[edge] == node else np.linalg.inv(motions[edge])
+        motion = motions[edge] if ends[edge, 1] == node else np.linalg.inv(motions[edge])
         poses[node] = poses[before[node]] @ motion
-    used[edges] = True
-    return poses[:number], used
+    in_tree = np.zeros(len(ends), bool)
+    in_tree[edges] = True
+    return poses[:world], in_tree
 
 
 def _relaxed(
-    i: Int[np.ndarray, "m"],
-    j: Int[np.ndarray, "m"],
-    motions: Float[np.ndarray, "m 4 4"],
-    roots: Float[np.ndarray, "m 2"],
-    number: int,
+    ends: Int[np.ndarray, "m 2"], motions: Float[np.ndarray, "m 4 4"], roots: Float[np.ndarray, "m 2"], number: int
 ) -> Float[np.ndarray, "number 4 4"]:
     """The chordal relaxation; `roots` are those of the information, of translation and rotation."""
-    ends = np.stack([i, j], axis=1)
     # R_jᵀ = R_i_jᵀ R_iᵀ, for the three columns at once.
     turns = motions[:, :3, :3].swapaxes(1, 2)
     blocks = roots[:, 1, None, None, None] * np.stack([-turns, np.broadcast_to(np.eye(3), turns.shape)], axis=1)
-    columns = _least_squares(blocks, ends, np.zeros((3 * len(i), 3)), np.eye(3), number)
+    columns = _least_squares(blocks, ends, np.zeros((3 * len(ends), 3)), np.eye(3), number)
     left, _, right = np.linalg.svd(columns.reshape(number + 1, 3, 3).swapaxes(1, 2))
     left[:, :, 2] *= np.linalg.det(left @ right)[:, None]
     rotations = left @ right
     # t_j − t_i = R_i t_i_j.
-    aims = roots[:, :1] * np.einsum("mij,mj->mi", rotations[i], motions[:, :3, 3])
     blocks = roots[:, 0, None, None, None] * np.array([-1.0, 1.0])[:, None, None]
+    steps = roots[:, :1] * np.einsum("mij,mj->mi", rotations[ends[:, 0]], motions[:, :3, 3])
     poses = np.tile(np.eye(4), (number, 1, 1))
     poses[:, :3, :3] = rotations[:-1]
-    poses[:, :3, 3] = _least_squares(blocks, ends, aims, np.zeros((1, 3)), number)[:-1]
+    poses[:, :3, 3] = _least_squares(blocks, ends, steps, np.zeros((1, 3)), number)[:-1]
     return poses
 
 
 def _least_squares(
     blocks: Float[np.ndarray, "m 2 b b"],
     ends: Int[np.ndarray, "m 2"],
-    aims: Float[np.ndarray, "_ 3"],
+    right: Float[np.ndarray, "_ 3"],
     last: Float[np.ndarray, "b 3"],
     number: int,
 ) -> Float[np.ndarray, "_ 3"]:
@@ -193,23 +181,26 @@ def _least_squares(
 
     m, _, b, _ = blocks.shape
     pointers = 2 * np.arange(m + 1)
-    whole = bsr_array((blocks.reshape(-1, b, b), ends.ravel(), pointers), (b * m, b * (number + 1))).tocsc()
-    system, aims = whole[:, : b * number], aims - whole[:, b * number :] @ last
-    factors = factored((system.T @ system).tocsc(), "MMD_AT_PLUS_A")
-    return np.concatenate([factors.solve(system.T @ aims), last])
+    matrix = bsr_array((blocks.reshape(-1, b, b), ends.ravel(), pointers), (b * m, b * (number + 1))).tocsc()
+    free, right = matrix[:, : b * number], right - matrix[:, b * number :] @ last
+    solver = factored((free.T @ free).tocsc(), "MMD_AT_PLUS_A")
+    return np.concatenate([solver.solve(free.T @ right), last])
 
 
-def unmeasured(edges: Edge, poses: Float[np.ndarray, "n 4 4"], typical: Float[np.ndarray, "m 6"]) -> Edge:
-    """Edges between the same poses that measure the motions at the start, along unmeasured directions alone.
+def unmeasured(factors: Factors, poses: Float[np.ndarray, "n 4 4"]) -> Edge:
+    """Edges between the same poses as the given ones that measure the motions at the given poses, the start, along
+    unmeasured directions alone.
 
     The axes of an edge are only known to its standard deviation σ of rotation, in radians, and at best to 2 mrad: a
     fraction σ² of its information leaks into the directions that it does not measure. Poses would slide along these by
     many metres to explain the noise in the others. Priors get no information, since the world's axes are exact.
     """
+    edges = factors[0]
+    typical = typical_information(factors)[: len(edges)]
     between, roots = edges.i != WORLD, np.sqrt(typical)
     i = np.where(between, edges.i, edges.j)
-    values, vectors = np.linalg.eigh(np.nan_to_num(edges.information) / (roots[:, :, None] * roots[:, None]))
-    blind = between[:, None] & (values <= _BLIND * values[:, -1:])
+    eigenvalues, vectors = np.linalg.eigh(np.nan_to_num(edges.information) / (roots[:, :, None] * roots[:, None]))
+    blind = between[:, None] & (eigenvalues <= _BLIND * eigenvalues[:, -1:])
     scaled = roots[:, :, None] * vectors
     information = (scaled * (blind * about_start(typical)[:, None])[:, None]) @ scaled.swapaxes(1, 2)
     return Edge(edges.i, edges.j, inverse(poses[i]) @ poses[edges.j], information)

@@ -48,11 +48,11 @@ def solve_traced(poses: Float[AnyArray, "n 4 4"], factors: Factors, robust: bool
 
 @solve_traced.defjvp
 def _derivative(robust: bool, max_iterations: int, primals: Any, tangents: Any) -> tuple[GraphPoses, GraphPoses]:
-    (poses, factors), (_, changes) = primals, tangents
+    (poses, factors), (_, (change, *_)) = primals, tangents
     if len(factors) > 1:
         raise ValueError("graph: poses have derivatives only if edges are the only measurements, got further factors")
     solution, sensitivity = _solved(poses, factors, robust, max_iterations, True)
-    (edges,), (change,) = factors, changes
+    edges = factors[0]
     moved = _moved(solution, sensitivity, edges.rows, edges.T_i_j, change.T_i_j, change.information)
     constants = jax.tree.map(lambda value: jax.custom_derivatives.zero_from_primal(value), solution)
     return solution, constants._replace(poses=moved)
@@ -87,7 +87,7 @@ def _moved(
 def covariances_traced(poses: Float[AnyArray, "n 4 4"], factors: Factors, weights: Float[AnyArray, "m"]) -> Lazy[Any]:
     """Covariances at a solution, (n, 6, 6), constants; `jit` leaves them out where they are not read."""
     arguments = jax.lax.stop_gradient((poses, factors, weights))
-    dtype = jnp.result_type(*_floats(arguments))
+    dtype = _precision(arguments)
 
     def on_host(*arguments: Any) -> Any:
         return covariances_at(*arguments).astype(dtype)
@@ -97,16 +97,15 @@ def covariances_traced(poses: Float[AnyArray, "n 4 4"], factors: Factors, weight
     return Lazy.of(call_host(on_host, jax.ShapeDtypeStruct((len(poses), 6, 6), dtype), *arguments))
 
 
-def _floats(tree: Any) -> list[Any]:
-    return [leaf for leaf in jax.tree.leaves(tree) if jnp.issubdtype(leaf.dtype, jnp.floating)]
+def _precision(tree: Any) -> Any:
+    return jnp.result_type(*[leaf for leaf in jax.tree.leaves(tree) if jnp.issubdtype(leaf.dtype, jnp.floating)])
 
 
 def _solved(
     poses: Float[AnyArray, "n 4 4"], factors: Factors, robust: bool, max_iterations: int, differentiated: bool
 ) -> tuple[GraphPoses, Any]:
     """On the host, or by a callback if an argument is traced; with a `_Sensitivity` if differentiated."""
-    dtype, n = jnp.result_type(*_floats((poses, factors))), len(poses)
-    line = calling_line()
+    dtype, n, line = _precision((poses, factors)), len(poses), calling_line()
 
     def on_host(poses: Any, factors: Any) -> Any:
         for k, factor in enumerate(factors):
@@ -114,44 +113,41 @@ def _solved(
             check_rows(f"factors[{k - 1}]" if k else "edges", np.asarray(factor.rows), n)
         result, state = solve(poses, factors, robust, max_iterations, exact=True)
         result = jax.tree.map(lambda value: value.astype(dtype) if value.dtype.kind == "f" else value, result)
-        with shown_at(line):
-            _warn_of_rounding(result.poses[:, :3, 3], factors)
+        # Warns if the spacing of floats at the positions exceeds the standard deviation of a typical edge. NaN and
+        # overflow are a status.
+        farthest = np.abs(result.poses[:, :3, 3]).max()
+        spacing = np.spacing(farthest) if np.isfinite(farthest) else 0
+        if spacing**2 * typical_information(factors)[:, 0].max(initial=0) > 1:
+            with shown_at(line):
+                warn(
+                    f"optimize_poses: poses up to {farthest:.3g} m from the origin are rounded to {spacing:.1g} m in "
+                    f"{dtype}. Subtract an origin from poses and priors before, or enable jax_enable_x64"
+                )
         return result, _sensitivity(state, result, dtype) if differentiated else None
 
     if is_concrete(poses, factors):
         return jax.tree.map(jnp.asarray, on_host(*jax.tree.map(np.asarray, (poses, factors))))
-    m, number = sum(len(factor.information) for factor in factors), jax.ShapeDtypeStruct((), np.int32)
-    shape = partial(jax.ShapeDtypeStruct, dtype=dtype)
-    result: Any = GraphPoses(shape((n, 4, 4)), shape((m,)), shape((m,)), shape(()), number, number)
-    sizes: Any = (n, 6, n, 6), (m, 2, 6, 6), (m, 2, 6, 6), (m, 6)
-    sensitivity = _Sensitivity(*map(shape, sizes)) if differentiated else None
+    m, integer = sum(len(factor.information) for factor in factors), jax.ShapeDtypeStruct((), np.int32)
+    floats: Any = partial(jax.ShapeDtypeStruct, dtype=dtype)
+    result = GraphPoses(floats((n, 4, 4)), floats((m,)), floats((m,)), floats(()), integer, integer)
+    shapes = (n, 6, n, 6), (m, 2, 6, 6), (m, 2, 6, 6), (m, 6)
+    sensitivity = _Sensitivity(*map(floats, shapes)) if differentiated else None
     return call_host(on_host, (result, sensitivity), poses, factors)
 
 
-def _warn_of_rounding(positions: Float[np.ndarray, "n 3"], factors: Factors) -> None:
-    """Warn if the spacing of floats at the positions exceeds the standard deviation of a typical edge."""
-    largest, typical = np.abs(positions).max(), typical_information(factors)[:, 0].max(initial=0)
-    # NaN and overflow are a status.
-    spacing = np.spacing(largest) if np.isfinite(largest) else 0
-    if spacing**2 * typical > 1:
-        warn(
-            f"optimize_poses: poses up to {largest:.3g} m from the origin are rounded to {spacing:.1g} m in "
-            f"{positions.dtype}. Subtract an origin from poses and priors before, or enable jax_enable_x64"
-        )
-
-
 def _sensitivity(state: GraphState, result: GraphPoses, dtype: DTypeLike) -> _Sensitivity:
-    equations, weights, poses, *_ = state
-    inverse, ends, n = np.zeros((len(poses), 6, len(poses), 6)), poses[equations.rows], len(result.poses)
-    values = [np.zeros((len(ends), *shape)) for shape in ((2, 6, 6), (2, 6, 6), (6,))]
+    equations, poses, n = state.equations, state.poses, len(result.poses)
+    inverse = np.zeros((len(poses), 6, len(poses), 6))
+    by_edge = [np.zeros((len(equations.rows), *shape)) for shape in ((2, 6, 6), (2, 6, 6), (6,))]
     if result.status == Status.CONVERGED:
-        blocks, *derivatives = _derivatives(equations.factors[0], ends)
-        for value, derivative in zip(values, derivatives, strict=True):
-            value[weights > 0] = derivative[weights > 0]
+        blocks, *derivatives = _derivatives(equations.factors[0], poses[equations.rows])
+        for values, derivative in zip(by_edge, derivatives, strict=True):
+            values[state.weights > 0] = derivative[state.weights > 0]
         if equations.size:
-            dense = equations.spread(factored(equations.matrix(blocks)).solve(np.eye(equations.size)))
-            inverse = equations.spread(np.moveaxis(dense, 2, 0))
-    return _Sensitivity(*(value.astype(dtype) for value in (inverse[:n, :, :n], *values)))
+            # Columns of the inverse, and then its rows, from unknowns to poses.
+            columns = equations.spread(factored(equations.matrix(blocks)).solve(np.eye(equations.size)))
+            inverse = equations.spread(np.moveaxis(columns, 2, 0))
+    return _Sensitivity(*(values.astype(dtype) for values in (inverse[:n, :, :n], *by_edge)))
 
 
 def _derivatives(edges: Edge, poses: Float[np.ndarray, "m 2 4 4"]) -> tuple[np.ndarray, ...]:

@@ -45,10 +45,6 @@ class Terms(NamedTuple):
     gradient: Float[np.ndarray, "m 2 6"]
     blocks: Float[np.ndarray, "m 2 2 6 6"]
 
-    def cost(self, weights: PerMeasurement) -> float:
-        """½ Σ w rᵀΛr."""
-        return 0.5 * float(weights @ self.squares)
-
 
 class NormalEquations:
     """The sparse equations (H + λD) ξ = −g of a graph.
@@ -79,19 +75,19 @@ class NormalEquations:
         self.rows = np.where(rows == WORLD, self.root, rows)
         self.used = np.ones(len(rows), bool) if used is None else used
         # Poses of the rows and of the columns of the four blocks of each measurement.
-        first, second = np.repeat(self.rows, 2, axis=1), np.tile(self.rows, 2)
-        ends = first[self.used].ravel(), second[self.used].ravel()
-        graph = coo_array((np.ones(len(ends[0])), ends), (num_poses, num_poses))
+        of_rows, of_columns = np.repeat(self.rows, 2, axis=1), np.tile(self.rows, 2)
+        pairs = of_rows[self.used].ravel(), of_columns[self.used].ravel()
+        graph = coo_array((np.ones(len(pairs[0])), pairs), (num_poses, num_poses))
         _, self.parts = connected_components(graph, directed=False)
-        fixed = np.unique(self.parts, return_index=True)[1]
-        fixed[self.parts[self.root]] = self.root
+        first_of_parts = np.unique(self.parts, return_index=True)[1]
+        first_of_parts[self.parts[self.root]] = self.root
         self.fixed = np.zeros(num_poses, bool)
-        self.fixed[fixed] = True
+        self.fixed[first_of_parts] = True
         self.size = 6 * int((~self.fixed).sum())
         self.place = np.full(num_poses, -1)
         self.place[~self.fixed] = _elimination_order(graph, self.fixed)
-        # Places of the blocks in compressed rows of blocks.
-        rows, columns = self.place[first].ravel(), self.place[second].ravel()
+        # Places of the blocks in compressed rows of blocks; blocks at the same place are summed.
+        rows, columns = self.place[of_rows].ravel(), self.place[of_columns].ravel()
         inside = np.flatnonzero((rows >= 0) & (columns >= 0) & np.repeat(self.used, 4))
         self._order = inside[np.lexsort((columns[inside], rows[inside]))]
         rows, columns = rows[self._order], columns[self._order]
@@ -113,21 +109,21 @@ class NormalEquations:
 
     def terms(self, poses: Poses) -> Terms:
         """Evaluate all measurements."""
-        parts = []
+        of_kinds = []
         for factor, rows in zip(self.factors, self.split(self.rows), strict=True):
             residuals, jacobians = factor.linearize(poses[rows])
             information = np.asarray(factor.information)
             forces = (information @ residuals[..., None])[..., 0]
+            squares = np.einsum("mi,mi->m", residuals, forces)
             gradient = (jacobians.swapaxes(2, 3) @ forces[:, None, :, None])[..., 0]
-            blocks = normal_blocks(jacobians, information)
-            parts.append((np.einsum("mi,mi->m", residuals, forces), gradient, blocks))
-        return Terms(*map(np.concatenate, zip(*parts, strict=True)))
+            of_kinds.append((squares, gradient, normal_blocks(jacobians, information)))
+        return Terms(*map(np.concatenate, zip(*of_kinds, strict=True)))
 
     def gradient(self, terms: Terms, weights: PerMeasurement) -> Float[np.ndarray, "_"]:
         """g, in the elimination order."""
         weighted = (weights[:, None, None] * terms.gradient).reshape(-1, 6)
-        ends, number = self.rows.ravel(), len(self.place)
-        return self.gathered(np.stack([np.bincount(ends, column, number) for column in weighted.T], axis=1))
+        sums = [np.bincount(self.rows.ravel(), column, len(self.place)) for column in weighted.T]
+        return self.gathered(np.stack(sums, axis=1))
 
     def gathered(self, rows: Float[np.ndarray, "n *k"]) -> Float[np.ndarray, "_"]:
         """Rows of the poses as a vector of the unknowns."""
@@ -152,9 +148,9 @@ class NormalEquations:
         if not self.size:
             return csc_array((0, 0))
         summed = np.add.reduceat(blocks.reshape(-1, 6, 6)[self._order], self._starts)
-        rows = bsr_array((summed, self._columns, self._pointers), (self.size, self.size)).tocsr()
+        matrix = bsr_array((summed, self._columns, self._pointers), (self.size, self.size)).tocsr()
         # Rows of a symmetric matrix are its columns.
-        return csc_array((rows.data, rows.indices, rows.indptr), rows.shape)
+        return csc_array((matrix.data, matrix.indices, matrix.indptr), matrix.shape)
 
     def damped(self, matrix: Any, damping: float = LEAST_DAMPING) -> Any:
         """H + λD; all matrices have their entries at the same places."""
@@ -187,11 +183,11 @@ def typical_information(factors: Factors) -> Float[np.ndarray, "m 6"]:
     of_world = np.concatenate([(np.asarray(factor.rows) == WORLD).any(axis=1) for factor in factors])
     diagonal = np.diagonal(np.asarray(factors[0].information), axis1=1, axis2=2).reshape(-1, 2, 3).mean(axis=2)
     typical, edges_of_world = np.ones((len(of_world), 2)), of_world[: len(diagonal)]
-    for counted, chosen in ((~edges_of_world, slice(None)), (edges_of_world, of_world)):
+    for edges, measurements in ((~edges_of_world, slice(None)), (edges_of_world, of_world)):
         for kind, values in enumerate(diagonal.T):
-            positive = values[counted & (values > 0)]
+            positive = values[edges & (values > 0)]
             if len(positive):
-                typical[chosen, kind] = np.median(positive)
+                typical[measurements, kind] = np.median(positive)
     return np.repeat(typical, 3, axis=1)
 
 
@@ -239,7 +235,8 @@ class GraphState(NamedTuple):
 
     @property
     def cost(self) -> float:
-        return self.terms.cost(self.weights)
+        """½ Σ w rᵀΛr."""
+        return 0.5 * float(self.weights @ self.terms.squares)
 
     @property
     def hessian(self) -> Any:
@@ -277,10 +274,10 @@ def minimize(state: GraphState, max_iterations: int) -> GraphState:
 def refine(state: GraphState) -> GraphState:
     """The minimum to rounding, by more Gauss-Newton steps: derivatives are as exact as the poses."""
     for _ in range(_REFINEMENTS):
-        after = minimize(state._replace(damping=LEAST_DAMPING), 1)
-        step = np.abs(after.poses - state.poses).max()
-        state = after._replace(num_iterations=state.num_iterations, converged=True)
-        if step <= _ROUNDING * np.abs(state.poses).max():
+        before = state.poses
+        refined = minimize(state._replace(damping=LEAST_DAMPING), 1)
+        state = refined._replace(num_iterations=state.num_iterations, converged=True)
+        if np.abs(state.poses - before).max() <= _ROUNDING * np.abs(state.poses).max():
             break
     return state
 
@@ -292,14 +289,15 @@ def settle(state: GraphState, start: Bool[np.ndarray, "m"]) -> Poses:
     imaginary, the real part of the step is −(μg + ε²b)/(μ² + ε²), for gradients g and εb of both: where it vanishes,
     they weigh (μ/ε)², and the start weighs no more than (ε/μ)² along the directions that are measured.
     """
-    equations, size, measured, started = state.equations, np.inf, state.weights * ~start, _START_WEIGHT * start
+    equations, last = state.equations, np.inf
+    measured, started = state.weights * ~start, _START_WEIGHT * start
     for _ in range(_REFINEMENTS):
         system = equations.weighted(state.terms.blocks, measured + 1j * started)
         gradient = equations.gradient(state.terms, measured) + 1j * equations.gradient(state.terms, started)
         step = -factored(equations.damped(system)).solve(gradient).real
+        largest = np.abs(step).max()
         # Rounding, or no contraction.
-        if not np.abs(step).max() < size:
+        if not largest < last:
             break
-        size = np.abs(step).max()
-        state = state.moved(step)
+        state, last = state.moved(step), largest
     return state.poses

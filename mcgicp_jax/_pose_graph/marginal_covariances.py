@@ -50,16 +50,18 @@ def propagated(
         except RuntimeError:
             return np.full_like(covariances, np.nan)
         step = max(_SOLVED_AT_ONCE // (equations.size * d), 1)
-        for q in (slice(start, start + step) for start in range(0, number, step)):
-            columns = np.zeros((len(state.poses), 6, len(rows[q]), d))
-            ends = list(zip(rows[q].T, jacobians[q].swapaxes(0, 1), strict=True))
-            numbers = np.arange(len(rows[q]))
-            for row, jacobian in ends:
-                columns[row, :, numbers] += jacobian.swapaxes(1, 2)
-            gathered = equations.gathered(columns.reshape(*columns.shape[:2], -1)).reshape(equations.size, -1)
-            solved = equations.spread(solver.solve(gathered)).reshape(columns.shape)
-            for row, jacobian in ends:
-                covariances[q] += jacobian @ solved[row, :, numbers]
+        for start in range(0, number, step):
+            q = slice(start, start + step)
+            functions = np.arange(len(rows[q]))
+            of_poses = list(zip(rows[q].T, jacobians[q].swapaxes(0, 1), strict=True))
+            # Jᵀ, H⁻¹Jᵀ and JH⁻¹Jᵀ.
+            right = np.zeros((len(state.poses), 6, len(functions), d))
+            for row, jacobian in of_poses:
+                right[row, :, functions] += jacobian.swapaxes(1, 2)
+            gathered = equations.gathered(right.reshape(*right.shape[:2], -1)).reshape(equations.size, -1)
+            solved = equations.spread(solver.solve(gathered)).reshape(right.shape)
+            for row, jacobian in of_poses:
+                covariances[q] += jacobian @ solved[row, :, functions]
     first, second = equations.parts[rows].T
     covariances[first != second] = np.diag(np.full(d, np.inf))
     return covariances
@@ -81,26 +83,28 @@ def inverse_blocks(factor: Any) -> Float[np.ndarray, "n 6 6"]:
     number, pivots = len(place), factor.U.diagonal().reshape(-1, _SIZE)
     columns = factor.L.T.tobsr((_SIZE, _SIZE))
     columns.sort_indices()
-    owns, blocks = (np.split(values, columns.indptr[1:-1]) for values in (columns.indices, columns.data.swapaxes(1, 2)))
-    below = _rows_below(owns)
+    entries = np.split(columns.indices, columns.indptr[1:-1])
+    blocks = np.split(columns.data.swapaxes(1, 2), columns.indptr[1:-1])
+    below = _rows_below(entries)
     diagonal = np.empty((number, _SIZE, _SIZE))
     children = np.bincount([rows[0] for rows in below if len(rows)], minlength=number)
+    # Of blocks k with children still to be visited, the rows k and N, and Z between these.
     fronts: dict[int, tuple[Any, Any]] = {}
     here, there = slice(0, _SIZE), slice(_SIZE, None)
     for k in reversed(range(number)):
         rows, members = below[k], np.append(k, below[k])
         # The columns of L of block k.
         panel = np.zeros((len(members), _SIZE, _SIZE))
-        panel[np.searchsorted(members, owns[k])] = blocks[k]
+        panel[np.searchsorted(members, entries[k])] = blocks[k]
         inner, outer = panel[0], panel[1:].reshape(-1, _SIZE)
         front = np.empty((_SIZE * len(members),) * 2)
         front[here, here] = np.linalg.inv((inner * pivots[k]) @ inner.T)
         if len(rows):
             parent = int(rows[0])
-            inherited, inverse = fronts[parent]
-            chosen = (_SIZE * np.searchsorted(inherited, rows)[:, None] + np.arange(_SIZE)).reshape(-1)
+            of_parent, inverse = fronts[parent]
+            places = (_SIZE * np.searchsorted(of_parent, rows)[:, None] + np.arange(_SIZE)).reshape(-1)
             ratio = np.linalg.solve(inner.T, outer.T).T
-            front[there, there] = inverse[chosen[:, None], chosen]
+            front[there, there] = inverse[places[:, None], places]
             front[there, here] = -front[there, there] @ ratio
             front[here, there] = front[there, here].T
             front[here, here] -= ratio.T @ front[there, here]
@@ -113,14 +117,14 @@ def inverse_blocks(factor: Any) -> Float[np.ndarray, "n 6 6"]:
     return diagonal[place]
 
 
-def _rows_below(owns: list[Int[np.ndarray, "_"]]) -> list[Int[np.ndarray, "_"]]:
+def _rows_below(entries: list[Int[np.ndarray, "_"]]) -> list[Int[np.ndarray, "_"]]:
     """The rows of blocks below every block in L, with those that the inverse needs, from the rows of its entries."""
-    inherited: list[list[Any]] = [[] for _ in owns]
+    of_children: list[list[Any]] = [[] for _ in entries]
     below = []
-    for k, own in enumerate(owns):
-        rows = np.unique(np.concatenate([own, *inherited[k]]))
+    for k, rows in enumerate(entries):
+        rows = np.unique(np.concatenate([rows, *of_children[k]]))
         below.append(rows[rows > k])
         if len(below[k]):
-            inherited[below[k][0]].append(below[k][1:])
-        inherited[k] = []
+            of_children[below[k][0]].append(below[k][1:])
+        of_children[k] = []
     return below

@@ -6,7 +6,6 @@ from dataclasses import dataclass
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float, Int
@@ -68,9 +67,8 @@ class PoseGraphResult:
         xp = numpy_for(self.weights, self.residuals)
         of_world = xp.any(xp.asarray(self.edges.i) == WORLD)
         redundant = 6.0 * (xp.sum(self.weights) - (len(self.poses) - 1 + of_world))
-        return xp.where(
-            redundant > 0, xp.sum(self.weights * self.residuals**2) / xp.where(redundant > 0, redundant, 1), xp.nan
-        )[()]
+        total = xp.sum(self.weights * self.residuals**2)
+        return xp.where(redundant > 0, total / xp.where(redundant > 0, redundant, 1), xp.nan)[()]
 
     @property
     def covariance(self) -> Float[Array, "n 6 6"] | Float[np.ndarray, "n 6 6"]:
@@ -154,7 +152,7 @@ def optimize_poses(graph: PoseGraph, *, robust: bool = True, max_iterations: int
         solution = solve_traced(graph.poses, factors, bool(robust), int(max_iterations))
         covariances = covariances_traced(solution.poses, factors, solution.weights)
     ends = np.cumsum([len(factor.information) for factor in factors])[:-1]
-    xp = np if is_concrete(solution) else jnp
+    xp = numpy_for(solution)
     residuals, *factor_residuals = xp.split(solution.residuals, ends)
     weights, *factor_weights = xp.split(solution.weights, ends)
     return PoseGraphResult(

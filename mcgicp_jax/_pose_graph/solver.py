@@ -34,7 +34,7 @@ from mcgicp_jax._pose_graph.levenberg_marquardt import (
 from mcgicp_jax._pose_graph.marginal_covariances import pose_covariances, propagated
 from mcgicp_jax._registration.result import Status
 
-# Probability that a true measurement exceeds the threshold on its squared Mahalanobis distance.
+# Probability that a true measurement exceeds the threshold on its squared Mahalanobis distance, a quantile of χ².
 _LEVEL = 0.01
 # Factor by which the non-convexity grows, with one step at each: 1.4 (Yang et al. 2020) keeps the same loops, 4 loses
 # 0.4 % of the true ones (ten grids, 30 % of false loops). Without the first steps, errors are 30 times as large in a
@@ -70,7 +70,7 @@ def solve(
     with np.errstate(over="ignore", invalid="ignore"):
         centred, factors, origin = _centred(start, factors)
         uncertain = np.concatenate([np.asarray(factor.uncertain) for factor in factors]) & robust
-        anchors = _anchors(factors, centred)
+        anchors = unmeasured(factors, centred)
         state = _minimum(centred, factors, anchors, uncertain, max_iterations)
         if not (np.isfinite(state.poses).all() and np.isfinite(state.terms.squares).all()):
             status = Status.NON_FINITE
@@ -78,11 +78,13 @@ def solve(
             status = Status.DEGENERATE
         else:
             status = Status.CONVERGED if state.converged else Status.MAX_ITERATIONS
-        state = refine(state) if exact and status == Status.CONVERGED else state
+        if exact and status == Status.CONVERGED:
+            state = refine(state)
         poses = state.poses[: len(start)].copy()
         poses[:, :3, 3] += origin
-        residuals, counts = np.sqrt(np.maximum(state.terms.squares, 0)), np.array([status, state.num_iterations])
-        return GraphPoses(poses, residuals, state.weights, np.float64(state.cost), *counts.astype(np.int32)), state
+        residuals, cost = np.sqrt(np.maximum(state.terms.squares, 0)), np.float64(state.cost)
+        counts = np.int32(status), np.int32(state.num_iterations)
+        return GraphPoses(poses, residuals, state.weights, cost, *counts), state
 
 
 def covariances_at(poses: Poses, factors: Factors, weights: PerMeasurement) -> Float[np.ndarray, "n 6 6"]:
@@ -100,20 +102,15 @@ def uncertainty(state: GraphState) -> Float[np.ndarray, "n 6 6"]:
     along the unmeasured directions alone, and the least damping λ: 1/λ where H is far less than E, H⁻¹ where E is 0.
     """
     factors = state.equations.factors
-    anchors = _anchors(factors, state.poses)
+    anchors = unmeasured(factors, state.poses)
     if not (anchors.information.any() and _is_degenerate(state, anchors)):
         return pose_covariances(state)
-    equations, kept = NormalEquations((*factors, anchors), state.poses), state.weights[: len(anchors)] > 0
-    weights = [np.append(state.weights, times * kept) for times in (1.0, 2.0)]
-    once, twice = (pose_covariances(GraphState.at(equations, each, state.poses)) for each in weights)
+    equations, accepted = NormalEquations((*factors, anchors), state.poses), state.weights[: len(anchors)] > 0
+    weights = [np.append(state.weights, times * accepted) for times in (1.0, 2.0)]
+    once, twice = (pose_covariances(GraphState.at(equations, w, state.poses)) for w in weights)
     share = about_start(typical_information(factors)[: len(anchors)])[anchors.i != WORLD][0]
     difference = np.subtract(once, twice, out=np.zeros_like(once), where=np.isfinite(once))
     return once + 2 * share / LEAST_DAMPING * difference
-
-
-def _anchors(factors: Factors, poses: Poses) -> Edge:
-    """Edges to the given poses along what the edges do not measure."""
-    return unmeasured(factors[0], poses, typical_information(factors)[: len(factors[0])])
 
 
 def _centred(poses: Poses, factors: Factors) -> tuple[Float[np.ndarray, "_ 4 4"], Factors, Float[np.ndarray, "3"]]:
@@ -148,15 +145,15 @@ def _minimum(poses: Poses, factors: Factors, anchors: Edge, uncertain: Bool[np.n
     """`_robust_minimum`; with `anchors`, edges to the start, if the measurements do not constrain all poses alone."""
     if not anchors.information.any():
         return _robust_minimum(NormalEquations(factors, poses), poses, uncertain, limit)
-    both = NormalEquations((*factors, anchors), poses)
-    anchored = _robust_minimum(both, poses, np.append(uncertain, anchors.uncertain), limit)
+    with_anchors = NormalEquations((*factors, anchors), poses)
+    anchored = _robust_minimum(with_anchors, poses, np.append(uncertain, anchors.uncertain), limit)
     weights = anchored.weights[: len(uncertain)]
     state = GraphState.at(NormalEquations(factors, poses, weights > 0), weights, anchored.poses)
     state = state._replace(num_iterations=anchored.num_iterations, damping=anchored.damping)
     if not _is_degenerate(state, anchors):
         return minimize(state, limit)
     if anchored.converged:
-        settled = settle(anchored, np.arange(len(both.rows)) >= len(uncertain))
+        settled = settle(anchored, np.arange(len(with_anchors.rows)) >= len(uncertain))
         state = state._replace(poses=settled, terms=state.equations.terms(settled), converged=True)
     return state
 
@@ -165,7 +162,11 @@ def _robust_minimum(
     equations: NormalEquations, start: Poses, uncertain: Bool[np.ndarray, "m"], max_iterations: int
 ) -> GraphState:
     """The minimum over the measurements that are kept, whose weight is 1; that of the others is 0."""
-    state, limits = GraphState.at(equations, np.ones(len(uncertain)), start), _thresholds(equations)
+    from scipy.special import chdtri
+
+    state = GraphState.at(equations, np.ones(len(uncertain)), start)
+    sizes = [np.full(len(factor.information), factor.information.shape[-1]) for factor in equations.factors]
+    limits = chdtri(np.concatenate(sizes), _LEVEL)
     largest = (state.terms.squares / limits)[uncertain].max(initial=0)
     if not largest > 1:
         return minimize(state, max_iterations)
@@ -186,35 +187,27 @@ def _robust_minimum(
     return state
 
 
-def _thresholds(equations: NormalEquations) -> PerMeasurement:
-    """Squared Mahalanobis distances beyond which measurements are rejected: 99 % quantiles of χ²."""
-    from scipy.special import chdtri
-
-    sizes = [np.full(len(f.information), f.information.shape[-1]) for f in equations.factors]
-    return chdtri(np.concatenate(sizes), _LEVEL)
-
-
 def _wrongly_rejected(state: GraphState, limits: PerMeasurement) -> Bool[np.ndarray, "m"]:
     """Which rejected measurements have a residual within the threshold, given the combined uncertainty of the
     measurement and of the remaining graph."""
     squares, equations = state.terms.squares, state.equations
-    accepted = (state.weights == 0) & (squares > limits) & (squares <= _NEAR * limits)
-    parts = map(equations.split, (equations.rows, accepted, limits))
-    for factor, rows, chosen, factor_limits in zip(equations.factors, *parts, strict=True):
-        if not chosen.any():
+    wrong = (state.weights == 0) & (squares > limits) & (squares <= _NEAR * limits)
+    of_kinds = map(equations.split, (equations.rows, wrong, limits))
+    for factor, rows, tested, factor_limits in zip(equations.factors, *of_kinds, strict=True):
+        if not tested.any():
             continue
-        part = jax.tree.map(lambda values, chosen=chosen: np.asarray(values)[chosen], factor)
-        residuals, jacobians = part.linearize(state.poses[rows[chosen]])
-        spread = propagated(state, rows[chosen], jacobians)
+        measurements = jax.tree.map(lambda values, tested=tested: np.asarray(values)[tested], factor)
+        residuals, jacobians = measurements.linearize(state.poses[rows[tested]])
+        covariances = propagated(state, rows[tested], jacobians)
         # rᵀ(Λ⁻¹ + Σ)⁻¹r without the inverse of Λ, which may be singular. An infinite Σ leaves 0.
-        finite = np.isfinite(spread).all(axis=(1, 2))
-        spread[~finite] = 0
-        system = np.eye(spread.shape[-1]) + part.information @ spread
-        inner = np.linalg.solve(system, part.information @ residuals[..., None])[..., 0]
+        finite = np.isfinite(covariances).all(axis=(1, 2))
+        covariances[~finite] = 0
+        system = np.eye(covariances.shape[-1]) + measurements.information @ covariances
+        inner = np.linalg.solve(system, measurements.information @ residuals[..., None])[..., 0]
         combined = np.where(finite, np.einsum("ki,ki->k", residuals, inner), 0)
-        # A view of `accepted`.
-        chosen[chosen] = combined <= factor_limits[chosen]
-    return accepted
+        # A view of `wrong`.
+        tested[tested] = combined <= factor_limits[tested]
+    return wrong
 
 
 def _is_degenerate(state: GraphState, anchors: Edge) -> bool:
@@ -227,16 +220,16 @@ def _is_degenerate(state: GraphState, anchors: Edge) -> bool:
         return True
     if not equations.size:
         return False
-    matrix, blocks = state.hessian, np.zeros_like(state.terms.blocks)
-    ends = state.poses[equations.rows[: len(anchors)]]
-    blocks[: len(anchors)] = normal_blocks(motion_jacobians(ends), np.asarray(anchors.information)) / _UNCONSTRAINED
+    hessian, blocks, number = state.hessian, np.zeros_like(state.terms.blocks), len(anchors)
+    jacobians = motion_jacobians(state.poses[equations.rows[:number]])
+    blocks[:number] = normal_blocks(jacobians, np.asarray(anchors.information)) / _UNCONSTRAINED
     least = equations.damped(equations.weighted(blocks, state.weights))
     try:
-        factors = factored(matrix + least)
+        solver = factored(hessian + least)
     except RuntimeError:
         return True
-    vector = np.random.default_rng(0).normal(size=equations.size)
+    direction = np.random.default_rng(0).normal(size=equations.size)
     for _ in range(_INVERSE_ITERATIONS):
-        pushed = least @ vector
-        vector = factors.solve(pushed / np.sqrt(vector @ pushed))
-    return bool(vector @ (matrix @ vector) < _UNCONSTRAINED * (vector @ (least @ vector)))
+        force = least @ direction
+        direction = solver.solve(force / np.sqrt(direction @ force))
+    return bool(direction @ (hessian @ direction) < _UNCONSTRAINED * (direction @ (least @ direction)))

@@ -68,15 +68,14 @@ def edge_from(i: int, j: int, result: RegistrationResult, *, uncertain: bool = F
     inside = np.ix_(constrained, constrained)
     # Coordinates along the six directions: the constrained ones do not depend on the others.
     coordinates = np.linalg.inv(np.asarray(directions.twists, np.float64).T)
-    inner = (coordinates @ covariance @ coordinates.T)[inside]
+    variances, vectors = np.linalg.eigh((coordinates @ covariance @ coordinates.T)[inside])
     # The coordinates are lengths. No registration is more precise than the rounding of the points. The covariance of
     # equal clouds is smaller, or even negative by rounding of its own.
     radius = np.asarray(directions.radius)
     rounding = np.finfo(radius.dtype).eps * float(radius)
-    values, vectors = np.linalg.eigh(inner)
-    along = np.zeros((6, 6))
-    along[inside] = (vectors / np.maximum(values, rounding**2)) @ vectors.T
-    information = coordinates.T @ along @ coordinates
+    of_coordinates = np.zeros((6, 6))
+    of_coordinates[inside] = (vectors / np.maximum(variances, rounding**2)) @ vectors.T
+    information = coordinates.T @ of_coordinates @ coordinates
     return Edge(i, j, result.matrix, 0.5 * (information + information.T), uncertain=uncertain)
 
 
@@ -96,7 +95,7 @@ class Trajectory:
         self._variances = np.zeros(0)
         # This mean of the last edge with information; 0 before there is one.
         self._usual = 0.0
-        # Which edges the last optimisation kept; later ones are.
+        # Which edges the last optimisation kept, and later ones.
         self._kept = np.zeros(0, bool)
         # Whether loops were closed since the last optimisation, and the number of frames then.
         self._stale, self._optimized = False, 0
@@ -131,15 +130,15 @@ class Trajectory:
         # A view would keep the poses of all frames until then in memory.
         return self._poses[-1].copy()
 
-    def _close(self, loop: Edge, before: Float[np.ndarray, "6 6"]) -> None:
-        """Add a loop to the last frame, and correct poses. `before` is the covariance of the motion between the two
-        frames without the loop, for the twists of the edge."""
+    def _close(self, loop: Edge, covariance: Float[np.ndarray, "6 6"]) -> None:
+        """Add a loop to the last frame, and correct poses. The covariance is that of the motion between the two frames
+        without the loop, for the twists of the edge."""
         self._connect(loop)
         self._stale = True
         pose = self._poses[-1]
         residual = logarithm(inverse(self._poses[int(loop.i)] @ np.asarray(loop.T_i_j)) @ pose)
-        total = before + self._covariances[-1]
-        gain = np.linalg.solve(total, before).T
+        total = covariance + self._covariances[-1]
+        gain = np.linalg.solve(total, covariance).T
         contradicts = residual @ np.linalg.solve(total, residual) > _CONTRADICTION
         if contradicts or len(self._poses) >= _GROWTH * self._optimized:
             self._optimize()
@@ -149,29 +148,31 @@ class Trajectory:
     def _optimize(self) -> None:
         if self._stale:
             result = optimize_poses(PoseGraph(self._poses, self._edges))
-            self._poses, self._kept, self._stale = np.array(result.poses), np.asarray(result.kept), False
-            self._optimized = len(self._poses)
+            self._poses, self._kept = np.array(result.poses), np.asarray(result.kept)
+            self._stale, self._optimized = False, len(self._poses)
             self._in_world = self._moved(self._covariances, self._ends[1])
 
     def _connect(self, edge: Edge) -> None:
-        i, j = int(edge.i), int(edge.j)
+        i, j, information = int(edge.i), int(edge.j), np.asarray(edge.information)
         # A lost frame may be anywhere within twice the range of the sensor, turned by half a turn.
         range_j = self._range(j)
-        assumed = range_j, np.pi
-        if np.any(edge.information):
+        deviations = range_j, np.pi
+        if information.any():
             spacing = float(point_spacing(self._clouds[j]))
             size = max(float(np.linalg.norm(edge.T_i_j[:3, 3])), _LEAST_ASSUMED * spacing)
-            assumed = size, size / range_j
-        least = np.repeat(assumed, 3) ** -2.0
-        self._ends = np.append(self._ends, np.array([[i], [j]], np.int32), axis=1)
+            deviations = size, size / range_j
+        assumed = np.repeat(deviations, 3) ** -2.0
+        covariance = np.linalg.inv(information + np.diag(assumed))
+        variance = float(np.exp(np.linalg.slogdet(covariance)[1] / 6))
         self._between[i, j] = self._between[j, i] = len(self._edges)
         self._edges.append(edge)
-        covariance = np.linalg.inv(np.asarray(edge.information) + np.diag(least))
+        self._ends = np.append(self._ends, np.array([[i], [j]], np.int32), axis=1)
         self._covariances = np.append(self._covariances, covariance[None], axis=0)
         self._in_world = np.append(self._in_world, self._moved(covariance, j)[None], axis=0)
-        mean = float(np.exp(np.linalg.slogdet(covariance)[1] / 6))
-        self._variances = np.append(self._variances, mean)
-        self._usual = mean if np.any(edge.information) else self._usual
+        self._variances = np.append(self._variances, variance)
+        self._kept = np.append(self._kept, True)
+        if information.any():
+            self._usual = variance
 
     def _moved(self, covariances: Float[np.ndarray, "*m 6 6"], frames: Any) -> Float[np.ndarray, "*m 6 6"]:
         """Covariances for twists of frames, for those of the world."""
@@ -187,11 +188,10 @@ class Trajectory:
         from scipy.sparse import coo_array
         from scipy.sparse.csgraph import dijkstra
 
-        kept = np.append(self._kept, np.ones(len(self._edges) - len(self._kept), bool))
-        edges = self._variances[kept], self._ends[:, kept]
+        edges = self._variances[self._kept], self._ends[:, self._kept]
         graph = coo_array(edges, (number + 1, number + 1)).tocsr()
-        variances, before = dijkstra(graph, directed=False, indices=number, return_predecessors=True)
-        before = before.tolist()
+        variances, towards = dijkstra(graph, directed=False, indices=number, return_predecessors=True)
+        towards = towards.tolist()
         distances = np.linalg.norm(self._poses[:, :3, 3] - self._poses[number, :3, 3], axis=1)
         distances[variances <= _GAIN * self._usual] = np.inf
         # The nearest frames of all would be the latest ones of a slow sensor.
@@ -200,7 +200,7 @@ class Trajectory:
         for i in sorted((i for i in nearest if np.isfinite(distances[i])), key=lambda i: -variances[i]):
             if tries == _TRIES:
                 break
-            covariance = self._covariance(number, i, before)
+            covariance = self._covariance(number, i, towards)
             sigma = float(np.sqrt(np.linalg.eigvalsh(covariance[:3, :3])[-1]))
             if distances[i] <= self._range(number) + _DEVIATIONS * sigma:
                 tries += 1
@@ -213,11 +213,12 @@ class Trajectory:
                     return edge, covariance
         return None
 
-    def _covariance(self, number: int, i: int, before: list[int]) -> Float[np.ndarray, "6 6"]:
-        """Covariance of the motion from frame `i` to the last one along the path, for twists of the last frame."""
+    def _covariance(self, number: int, i: int, towards: list[int]) -> Float[np.ndarray, "6 6"]:
+        """Covariance of the motion from frame `i` to the last one along the path, for twists of the last frame, by the
+        next frame on the path from each."""
         path = [i]
         while path[-1] != number:
-            path.append(before[path[-1]])
+            path.append(towards[path[-1]])
         total = np.sum(self._in_world[[self._between[ends] for ends in itertools.pairwise(path)]], axis=0)
         change = adjoint(inverse(self._poses[number]))
         return change @ total @ change.T

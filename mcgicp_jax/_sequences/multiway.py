@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence, Sized
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, Unpack
+from typing import Unpack
 
 import numpy as np
 from jaxtyping import Float
@@ -130,11 +130,21 @@ def multiway(
         if cloud.deferred_neighbors is None:
             with messages_named(f"clouds[{k}]"):
                 ready[k] = preprocess(cloud, voxels, num_neighbors)
-    pairs = None if pairs is None else _checked(pairs, len(ready))
+    if pairs is not None:
+        for k, pair in enumerate(pairs):
+            valid = [isinstance(row, int | np.integer) and 0 <= row < len(ready) for row in pair]
+            if len(pair) != 2 or not all(valid) or pair[0] == pair[1]:
+                raise ValueError(f"pairs[{k}]: expected two different rows from 0 to {len(ready) - 1}, got {pair}")
+        pairs = [(int(i), int(j)) for i, j in pairs]
+    registrations: dict[tuple[int, int], RegistrationResult] = {}
     if init is None:
         poses, registrations = _start(ready, method, settings)
+    elif isinstance(init, str) or not isinstance(init, Sized):
+        raise ValueError(f"init: expected one pose per cloud, got {init!r}; global_pose finds poses of pairs")
+    elif len(init) != len(ready):
+        raise ValueError(f"init: expected one pose per cloud, {len(ready)}, got {len(init)}")
     else:
-        poses, registrations = _checked_poses(init, len(ready)), {}
+        poses = pose_matrices(init, "init[{}]")
     if pairs is not None:
         registrations = {pair: result for pair, result in registrations.items() if pair in pairs}
     spacing = float(np.median([point_spacing(cloud) for cloud in ready]))
@@ -157,24 +167,16 @@ def multiway(
     return MultiwayResult(ready, graph, registrations, statuses, voxels.size or spacing)
 
 
-def _checked_poses(init: Any, num_clouds: int) -> Float[np.ndarray, "n 4 4"]:
-    if isinstance(init, str) or not isinstance(init, Sized):
-        raise ValueError(f"init: expected one pose per cloud, got {init!r}; global_pose finds poses of pairs")
-    if len(init) != num_clouds:
-        raise ValueError(f"init: expected one pose per cloud, {num_clouds}, got {len(init)}")
-    return pose_matrices(init, "init[{}]")
-
-
 def _start(
     clouds: list[PointCloud], method: AbstractMethod, options: Options
 ) -> tuple[Float[np.ndarray, "n 4 4"], dict[tuple[int, int], RegistrationResult]]:
     """Initial poses, and the registrations that they follow from: from both ends, since a wrong first motion, as that
     to a cloud of another place, may spoil those that follow; the better fit is used."""
     poses, registrations, fit = _chained(clouds, method, options)
-    back, _, other_fit = _chained(clouds[::-1], method, options)
-    if other_fit > fit:
-        return np.linalg.inv(back[-1]) @ back[::-1], {}
-    return poses, {rows: computed(result) for rows, result in registrations.items()}
+    backward, _, backward_fit = _chained(clouds[::-1], method, options)
+    if backward_fit > fit:
+        return np.linalg.inv(backward[-1]) @ backward[::-1], {}
+    return poses, {pair: computed(result) for pair, result in registrations.items()}
 
 
 def _chained(
@@ -190,9 +192,12 @@ def _chained(
     for k in range(1, len(clouds)):
         rows = range(max(k - 2, 0), k)
         starts = [exponential((k - i) * steps[i]) for i in rows]
-        both = zip(rows, starts, strict=True)
-        results = [register_pair(clouds[k], clouds[i], method, start, options) for i, start in both]
-        fits = [_fit(result) for result in results]
+        targets = zip(rows, starts, strict=True)
+        results = [register_pair(clouds[k], clouds[i], method, start, options) for i, start in targets]
+        # Overlap per distance of the matches, 1/m; 0 without a pose. MAX_ITERATIONS has one: on sparse points, updates
+        # may go to and fro at the right pose.
+        with np.errstate(divide="ignore"):
+            fits = [float(np.asarray(r.overlap) / np.asarray(r.rmse)) if is_usable(r) else 0.0 for r in results]
         best = int(np.argmax(fits))
         i, result, total = rows[best], results[best], total + fits[best]
         registrations[i, k] = result
@@ -202,21 +207,6 @@ def _chained(
     return np.array(poses), registrations, total
 
 
-def _fit(result: RegistrationResult) -> float:
-    """Overlap per distance of the matches, 1/m; 0 without a pose. MAX_ITERATIONS has one: on sparse points, updates may
-    go to and fro at the right pose."""
-    with np.errstate(divide="ignore"):
-        return float(np.asarray(result.overlap) / np.asarray(result.rmse)) if is_usable(result) else 0.0
-
-
-def _checked(pairs: Sequence[tuple[int, int]], num_clouds: int) -> list[tuple[int, int]]:
-    for k, pair in enumerate(pairs):
-        valid = [isinstance(row, int | np.integer) and 0 <= row < num_clouds for row in pair]
-        if len(pair) != 2 or not all(valid) or pair[0] == pair[1]:
-            raise ValueError(f"pairs[{k}]: expected two different rows from 0 to {num_clouds - 1}, got {pair}")
-    return [(int(i), int(j)) for i, j in pairs]
-
-
 def _solved(
     poses: Float[np.ndarray, "n 4 4"], registrations: dict[tuple[int, int], RegistrationResult]
 ) -> tuple[PoseGraphResult, tuple[Status, ...]]:
@@ -224,8 +214,8 @@ def _solved(
     from scipy.sparse import coo_array
     from scipy.sparse.csgraph import minimum_spanning_tree
 
-    all_edges = [edge_from(i, j, result, uncertain=True) for (i, j), result in registrations.items()]
-    graph = PoseGraph(poses, [edge for edge in all_edges if edge is not None])
+    measured = [edge_from(i, j, result, uncertain=True) for (i, j), result in registrations.items()]
+    graph = PoseGraph(poses, [edge for edge in measured if edge is not None])
     result = optimize_poses(graph)
     edges, kept, n = graph.edges, np.asarray(result.kept), len(poses)
     costs = np.where(kept, 1e-3, 1 + np.asarray(result.residuals))
@@ -236,8 +226,8 @@ def _solved(
         result = optimize_poses(PoseGraph(result.poses, trusted))
     ends = np.concatenate([edges.i, edges.j])
     agree, total = np.bincount(ends, np.tile(kept, 2), n), np.bincount(ends, minlength=n)
-    few = np.where(total == 0, Status.TOO_FEW_CORRESPONDENCES, Status.DEGENERATE)
-    codes = np.where(agree > 0.5 * total, Status.CONVERGED, few) if n > 1 else [Status.CONVERGED]
+    failed = np.where(total == 0, Status.TOO_FEW_CORRESPONDENCES, Status.DEGENERATE)
+    codes = np.where(agree > 0.5 * total, Status.CONVERGED, failed) if n > 1 else [Status.CONVERGED]
     if result.status == Status.DEGENERATE and len(edges):
         variances = np.diagonal(result.covariance, 0, 1, 2) * typical_information((edges,))[0]
         codes = np.where((codes == Status.CONVERGED) & ~(variances.max(axis=1) <= _UNKNOWN), Status.DEGENERATE, codes)

@@ -199,9 +199,9 @@ class _Reader:
         number, frame = next(self.frames)
         name = f"frames[{number}]"
         prior = None if self.priors is None else next(self.priors, ())
-        if prior is not None and len(prior) != 2:
-            raise ValueError(f"priors[{number}]: expected (pose, covariance) or None for each frame, got {prior!r}")
         if prior is not None:
+            if len(prior) != 2:
+                raise ValueError(f"priors[{number}]: expected (pose, covariance) or None for each frame, got {prior!r}")
             prior = pose_matrix(prior[0], f"priors[{number}]: pose"), prior[1]
         cloud = as_cloud(name, frame.cloud if isinstance(frame, Frame) else frame)
         check_concrete(name, cloud)
@@ -270,86 +270,88 @@ class _Sensor(Iterator[OdometryStep]):
         if self.cloud is None:
             result, self.first = None, (name, cloud) if self.in_hindsight else None
             cloud = self._deskewed(name, cloud, self.scanned)
-            self._begin(cloud)
+            self._begin(name, cloud)
         else:
             cloud, result = self._located(name, cloud, self.cloud, prior)
-        if result is not None and self.places is None:
-            if not is_usable(result):
-                warn(
-                    f"{name}: {result.status.name}; the motion of the previous frame is used instead. "
-                    "mcgicp_jax.odometry(..., recover=True) finds lost frames again"
-                )
-            elif doubt := doubt_of(result):
-                warn(f"{name}: {doubt}")
-        for points in (self.places, self.world):
-            if points is not None and not self.is_lost:
-                points.add(name, cloud, self.pose)
+            if self.places is None:
+                if not is_usable(result):
+                    warn(
+                        f"{name}: {result.status.name}; the motion of the previous frame is used instead. "
+                        "mcgicp_jax.odometry(..., recover=True) finds lost frames again"
+                    )
+                elif doubt := doubt_of(result):
+                    warn(f"{name}: {doubt}")
+            self._add_to_maps(name, cloud, result)
         if self.world is not None:
             self.world.forget(self.pose[:3, 3], self.radius)
             if not len(self.world):
                 raise ValueError(f"map_radius: expected metres within which the sensor sees points, got {self.radius}")
+        self.cloud = cloud
         graph = None
         if self.trajectory is not None:
-            self.pose = self.trajectory.add(cloud, self.pose, result)
             graph = Lazy(partial(self.trajectory.graph, *self.trajectory.size))
-        self.cloud = cloud
         if result is None:
             return OdometryStep(self.pose, cloud, None, self.is_lost, graph)
         registration = Lazy(partial(computed, verified(result)))
         # The registration of the step before the last is computed if somebody keeps it, since it refers to two frames.
         # The caller of a loop still holds the last step. What nobody reads is not computed.
-        kept = self.unread[0]() if len(self.unread) == 2 else None
-        if kept is not None:
-            _ = kept.value
+        before_last = self.unread[0]() if len(self.unread) == 2 else None
+        if before_last is not None:
+            _ = before_last.value
         self.unread.append(weakref.ref(registration))
         return OdometryStep(self.pose, cloud, registration, self.is_lost or not is_usable(result), graph)
 
-    def _begin(self, cloud: PointCloud) -> None:
-        """Make the empty maps; `cloud` is the first frame."""
+    def _begin(self, name: str, cloud: PointCloud) -> None:
+        """Make the maps, of the first frame."""
         voxel = cloud.voxel_size or float(point_spacing(cloud))
         self.world = VoxelMap(voxel) if self.against_map else None
         self.places = Relocalizer(voxel, self.method, self.options, self.num_neighbors) if self.recover else None
         self.trajectory = Trajectory(self.method, self.options) if self.loops else None
         if self.radius is None:
             self.radius = float(np.linalg.norm(cloud.coordinates, axis=1).max())
+        self._add_to_maps(name, cloud, None)
+
+    def _add_to_maps(self, name: str, cloud: PointCloud, result: RegistrationResult | None) -> None:
+        for points in (self.places, self.world):
+            if points is not None and not self.is_lost:
+                points.add(name, cloud, self.pose)
+        if self.trajectory is not None:
+            self.pose = self.trajectory.add(cloud, self.pose, result)
 
     def _deskewed(self, name: str, cloud: PointCloud, motion: Any) -> PointCloud:
         return self.reader.prepared(name, deskewed(cloud, motion)) if self.reader.deskew else cloud
-
-    def _first_again(self, name: str, cloud: PointCloud, motion: Any) -> PointCloud:
-        """The first frame deskewed by the motion to the second, in maps of its own."""
-        before = self._deskewed(name, cloud, motion)
-        self._begin(before)
-        for points in (self.places, self.world):
-            if points is not None:
-                points.add(name, before, self.pose)
-        if self.trajectory is not None:
-            self.trajectory.add(before, self.pose, None)
-        return before
 
     def _located(
         self, name: str, frame: PointCloud, before: PointCloud, prior: GivenPrior | None
     ) -> tuple[PointCloud, RegistrationResult]:
         """Update motion and pose by a registration; the frame as it was registered, and the result."""
-        follows = not self.against_map or self.is_lost
-        was_lost, (motion, scanned) = self.is_lost, (self.motion, self.scanned) if prior is None else 2 * (prior[0],)
+        was_lost, to_map = self.is_lost, self.against_map and not self.is_lost
+        motion, scanned = (self.motion, self.scanned) if prior is None else (prior[0], prior[0])
         for _ in range(_ROUNDS if self.reader.deskew else 1):
             cloud = self._deskewed(name, frame, scanned)
             if self.first is not None:
-                before = self._first_again(*self.first, scanned)
-            target, start = before, motion
-            if not follows:
+                # The first frame deskewed by the motion to the second, in maps of its own.
+                before = self._deskewed(*self.first, scanned)
+                self._begin(self.first[0], before)
+            target, start, prior_of_pair = before, motion, prior
+            if to_map:
                 target = map_target(self.world.cloud(), self.method, self.options, self.num_neighbors)
                 start = self.pose @ motion
-            # Its covariance is that of a motion in the frame of the source, which the target's frame does not change.
-            given = None if prior is None else (prior[0] if follows else self.pose @ prior[0], prior[1])
-            result = register_pair(cloud, target, self.method, start, self.options, prior=given)
+                if prior is not None:
+                    # The covariance is that of a motion in the source's frame, which the target's does not change.
+                    prior_of_pair = self.pose @ prior[0], prior[1]
+            result = register_pair(cloud, target, self.method, start, self.options, prior=prior_of_pair)
             if not is_usable(result):
                 break
             motion = np.asarray(result.matrix)
-            if not follows:
+            if to_map:
                 motion = np.linalg.solve(self.pose, motion)
-            if not self.reader.deskew or _displacement(cloud, scanned, motion) <= _SAME_MOTION * point_spacing(cloud):
+            if not self.reader.deskew:
+                break
+            # Root mean square distance between the points moved by the motion that was assumed and the measured one.
+            change = np.linalg.solve(scanned, motion)
+            shifts = cloud.coordinates @ (change[:3, :3] - np.eye(3)).T + change[:3, 3]
+            if float(np.sqrt(np.mean(np.sum(shifts**2, axis=1)))) <= _SAME_MOTION * point_spacing(cloud):
                 break
             scanned = motion
         self.first = None
@@ -361,11 +363,3 @@ class _Sensor(Iterator[OdometryStep]):
         # The product of thousands of rounded rotations would drift away from a rotation.
         self.pose = nearest_rotation(self.pose @ self.motion if corrected is None else np.asarray(corrected.matrix))
         return cloud, result if corrected is None else corrected
-
-
-def _displacement(cloud: PointCloud, one: Any, other: Any) -> float:
-    """Root mean square distance between the points moved by two poses, metres."""
-    change = np.linalg.solve(one, other)
-    return float(
-        np.sqrt(np.mean(np.sum((cloud.coordinates @ (change[:3, :3] - np.eye(3)).T + change[:3, 3]) ** 2, axis=1)))
-    )

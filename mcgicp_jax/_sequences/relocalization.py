@@ -45,19 +45,19 @@ class Relocalizer:
     def corrected(self, cloud: PointCloud, target: PointCloud, result: RegistrationResult) -> RegistrationResult | None:
         """The registration of a frame to the map, in the world's frame, if that to the target is doubtful and worse."""
         overlap, misfit = float(np.asarray(result.overlap)), misfit_of(cloud, target, result)
-        most = _WRONG * max(self._misfit, _LEAST_MISFIT)
-        settled = result.status in (Status.CONVERGED, Status.DEGENERATE) and misfit <= most
+        limit = _WRONG * max(self._misfit, _LEAST_MISFIT)
+        settled = result.status in (Status.CONVERGED, Status.DEGENERATE) and misfit <= limit
         if self.is_lost or not settled or overlap < _DOUBTFUL * self._overlap:
             world, (method, options, _) = self._world.cloud(), self._settings
             start = global_pose(cloud, world)
             if start.success:
                 target = map_target(world, *self._settings)
-                other = register_pair(cloud, target, method, start.matrix, options)
-                better = self.is_lost or not settled or float(np.asarray(other.overlap)) > overlap
-                if better and misfit_of(cloud, target, other) <= most:
+                to_map = register_pair(cloud, target, method, start.matrix, options)
+                better = self.is_lost or not settled or float(np.asarray(to_map.overlap)) > overlap
+                if better and misfit_of(cloud, target, to_map) <= limit:
                     self.is_lost = False
-                    return other
-            self.is_lost = self.is_lost or misfit > most
+                    return to_map
+            self.is_lost = self.is_lost or misfit > limit
         if not self.is_lost:
             # Even if doubtful: else every frame after a rest of the sensor would be looked for in the map.
             self._overlap, self._misfit = overlap, misfit
@@ -71,13 +71,13 @@ def misfit_of(source: PointCloud, target: PointCloud, result: RegistrationResult
         return np.inf
     points, rows = source.coordinates, np.flatnonzero(np.asarray(source.valid))
     rows = rows[np.random.default_rng(0).integers(0, len(rows), _SAMPLE)]
-    thin, along, normals = spreads(points, source.deferred_neighbors, rows)
-    matrix, others = np.asarray(result.matrix), target.coordinates[np.asarray(target.valid)]
+    thickness, along, normals = spreads(points, source.deferred_neighbors, rows)
+    matrix, of_target = np.asarray(result.matrix), target.coordinates[np.asarray(target.valid)]
     moved = points[rows] @ matrix[:3, :3].T + matrix[:3, 3]
-    matches = nearest_in_position(moved, others, float(_WITHIN * along.max()))
-    residuals = (others[matches] - moved) @ matrix[:3, :3]
+    matches = nearest_in_position(moved, of_target, float(_WITHIN * along.max()))
+    residuals = (of_target[matches] - moved) @ matrix[:3, :3]
     matched = (matches >= 0) & (np.linalg.norm(residuals, axis=1) <= _WITHIN * along)
-    across = np.abs(np.sum(residuals * normals, axis=1)) / thin
+    across = np.abs(np.sum(residuals * normals, axis=1)) / thickness
     return float(np.quantile(across[matched], 0.9)) if matched.any() else np.inf
 
 
