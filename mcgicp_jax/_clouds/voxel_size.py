@@ -87,22 +87,23 @@ def voxels_and_grids(voxel_size: VoxelSize | Voxels, *clouds: PointCloud) -> tup
         return voxel_size, none
     if voxel_size != "auto":
         return Voxels(voxel_size), none
-    given = [cloud.voxels for cloud in clouds if cloud.voxel_size is not None]
-    if given:
-        return given[0], none
+    preprocessed = [cloud for cloud in clouds if cloud.voxel_size is not None]
+    if preprocessed:
+        return preprocessed[0].voxels, none
     if not is_concrete(primal(clouds)):
         # `preprocess` says what is expected.
         return Voxels(), none
     raw = {row: cloud for row, cloud in enumerate(clouds) if cloud.deferred_neighbors is None}
-    points = {row: _finite_points(cloud) for row, cloud in raw.items()}
-    counts = [len(each) for each, _ in points.values()]
+    points = [_finite_points(cloud) for cloud in raw.values()]
+    counts = [len(finite) for finite, _ in points]
     # Clouds with covariances cannot be averaged.
     if any(cloud.covariances is not None for cloud in raw.values()) or (
         max(counts, default=0) < _LEAST_VOXELS or min(counts) < NUM_NEIGHBORS
     ):
         return Voxels(), none
-    grids = dict(zip(points, side_by_side([partial(grid_of, *each) for each in points.values()]), strict=True))
-    return _chosen(list(grids.values())), [grids.get(row) for row in range(len(clouds))]
+    grids = side_by_side([partial(grid_of, finite, rows) for finite, rows in points])
+    grid_of_row = dict(zip(raw, grids, strict=True))
+    return _suitable_voxels(grids), [grid_of_row.get(row) for row in range(len(clouds))]
 
 
 def map_voxel_size(cloud: PointCloud) -> float:
@@ -120,14 +121,16 @@ def warn_of_shape(cloud: PointCloud, averaged: bool) -> None:
     """Warn of a preprocessed cloud that is a planar scan, or whose neighbourhoods do not span the surface though it is
     not `averaged` in voxels."""
     points, neighbors = np.asarray(cloud.points, np.float64), cast(Any, cloud.deferred_neighbors)
-    same, examined = (points == points[0]).all(axis=0), not averaged and len(cloud) >= _LEAST_VOXELS
-    if not examined and same.sum() != 1:
+    constant = (points == points[0]).all(axis=0)
+    planar, examined = constant.sum() == 1, not averaged and len(cloud) >= _LEAST_VOXELS
+    if not examined and not planar:
         return
     # Fewer neighbours are often lines by chance.
-    shape, seen = _shape_of(points.T, neighbors if neighbors.shape[1] >= NUM_NEIGHBORS else None), []
-    if same.sum() == 1 and shape.lines > _MOSTLY_LINES:
-        warn(f"points: all have the same {'xyz'[int(same.argmax())]}, and most lie on lines; {PLANAR_ADVICE}")
+    shape = _shape_of(points.T, neighbors if neighbors.shape[1] >= NUM_NEIGHBORS else None)
+    if planar and shape.lines > _MOSTLY_LINES:
+        warn(f"points: all have the same {'xyz'[int(constant.argmax())]}, and most lie on lines; {PLANAR_ADVICE}")
         return
+    seen = []
     if shape.lines > _MANY_LINES:
         seen.append(f"{shape.lines:.0%} of the neighbourhoods are lines")
     if shape.thickness > _AS_THICK_AS_WIDE:
@@ -136,47 +139,132 @@ def warn_of_shape(cloud: PointCloud, averaged: bool) -> None:
         warn(f'voxel_size: without voxels, {" and ".join(seen)}, so they do not describe the surface; use "auto"')
 
 
-def _chosen(grids: Sequence[Grid]) -> Voxels:
+def _suitable_voxels(grids: Sequence[Grid]) -> Voxels:
     """One voxel size for some raw clouds, metres, and the reason; None where their points are spread evenly.
 
     It is the smallest at which no cloud has more than 5 % of linear neighbourhoods or more than 40,000 voxels. If the
     neighbourhoods are thicker than 0.3 of their width, but thinner in larger voxels, it is increased. A constant to
     autodiff.
     """
-    counts = [grid.columns.shape[1] for grid in grids]
     # Sizes are numbered, ten for each decade of metres; None stands for all points.
-    smallest, largest = _range_of([grid.columns for grid in grids])
-    # What suffices for the largest cloud mostly suffices for the others.
-    ordered = sorted(zip(counts, grids, strict=True), key=lambda each: each[0], reverse=True)
-    candidates = [_Candidate(grid, None, min(_LEAST_VOXELS, count // 2)) for count, grid in ordered]
     step: int | None = None
     reason = ""
-    most = max(counts)
+    smallest, largest = _range_of([grid.columns for grid in grids])
+    # What suffices for the largest cloud mostly suffices for the others.
+    clouds = [_Averages(grid) for grid in sorted(grids, key=lambda grid: grid.columns.shape[1], reverse=True)]
+    most = clouds[0].count(None)
     if most > _MOST_VOXELS:
         # The size in which a square of the extent of the clouds has as many voxels, where the search begins.
         first, step = smallest, largest - round(_STEPS / 2 * np.log10(_MOST_VOXELS))
-        for candidate in candidates:
-            first = step = candidate.first_with(_MOST_VOXELS, range(first, largest), step)
+        for cloud in clouds:
+            first = step = cloud.first_with_few(range(first, largest), step)
         reason = f"at most {_MOST_VOXELS:,} of {most:,} points"
-        # Larger voxels are examined on these averages, which takes a third of the time.
-        candidates = side_by_side([partial(candidate.averaged, step) for candidate in candidates])
-        if not all(candidate.shows_scene(step) for candidate in candidates):
+        side_by_side([partial(cloud.average, step) for cloud in clouds])
+        if not _show_scene(clouds, step):
             return Voxels()
-    shapes = side_by_side([partial(candidate.shape, step) for candidate in candidates])
+    shape = _worst_shape(clouds, step)
     # Voxels below the spacing would average nothing.
-    spacing = max(shape.spacing for shape in shapes)
-    start = max(smallest, _step_of(spacing or 1.0)) if step is None else step
-    lines = max(shape.lines for shape in shapes)
-    if lines > _MOST_LINES:
-        larger = _without_lines(candidates, step, range(start, largest))
-        if larger is not None and _lines(candidates, larger) <= max(_MOST_LINES, _FEWER * lines):
-            step, reason = larger, f"{lines:.0%} of the neighbourhoods were lines"
-    thickness = _thickness(candidates, step)
+    start = max(smallest, _step_of(shape.spacing or 1.0)) if step is None else step
+    if shape.lines > _MOST_LINES:
+        larger = _without_lines(clouds, step, range(start, largest))
+        if larger is not None and _worst_shape(clouds, larger).lines <= max(_MOST_LINES, _FEWER * shape.lines):
+            step, reason = larger, f"{shape.lines:.0%} of the neighbourhoods were lines"
+    thickness = _worst_shape(clouds, step).thickness
     if thickness > _THICK:
-        thinner = _thinner(candidates, step, start if step is None else step)
+        thinner = _thinner(clouds, thickness, start if step is None else step)
         if thinner is not None:
             step, reason = thinner, f"the neighbourhoods were {thickness:.2f} times as thick as wide"
     return Voxels(None if step is None else _size(step), reason)
+
+
+class _Averages:
+    """The means of a cloud in voxels of each numbered size, and the shapes of their neighbourhoods."""
+
+    def __init__(self, grid: Grid):
+        # Points, or means in voxels of the size number `step`, whose means would be the same.
+        self._grid = grid
+        self._step: int | None = None
+        # Fewer voxels do not show the scene.
+        self._least = min(_LEAST_VOXELS, grid.columns.shape[1] // 2)
+        self._shapes: dict[int | None, Shape] = {}
+
+    def average(self, step: int) -> None:
+        """Take these means for the points: larger voxels are then examined in a third of the time."""
+        self._grid, self._step = Grid(self._means(step)), step
+
+    def count(self, step: int | None) -> int:
+        if step is None or step == self._step:
+            return self._grid.columns.shape[1]
+        return self._grid.numbers(_size(step))[1]
+
+    def shows_scene(self, step: int) -> bool:
+        return self.count(step) >= self._least
+
+    def shape(self, step: int | None) -> Shape:
+        if step not in self._shapes:
+            self._shapes[step] = _shape_of(self._means(step))
+        return self._shapes[step]
+
+    def first_with_few(self, steps: range, guess: int) -> int:
+        """The first step with at most `_MOST_VOXELS` voxels, the end of the range if there is none."""
+        low, high = steps.start, steps.stop
+        while low < high:
+            guess = min(max(guess, low), high - 1)
+            count = self.count(guess)
+            low, high = (low, guess) if count <= _MOST_VOXELS else (guess + 1, high)
+            # Along scan lines the number of voxels goes with the inverse of their size, on a surface with its square.
+            guess += round(_STEPS * np.log10(count / _MOST_VOXELS))
+        return low
+
+    def _means(self, step: int | None) -> Float[np.ndarray, "3 M"]:
+        if step is None or step == self._step:
+            return self._grid.columns
+        numbers, count = self._grid.numbers(_size(step))
+        sums = np.stack([np.bincount(numbers, column, count) for column in self._grid.columns])
+        return sums / np.bincount(numbers)
+
+
+def _show_scene(clouds: Sequence[_Averages], step: int) -> bool:
+    return all(cloud.shows_scene(step) for cloud in clouds)
+
+
+def _worst_shape(clouds: Sequence[_Averages], step: int | None) -> Shape:
+    """The largest fraction of lines, thickness and spacing in any cloud."""
+    shapes = side_by_side([partial(cloud.shape, step) for cloud in clouds])
+    return Shape(*np.max(shapes, axis=0).tolist())
+
+
+def _without_lines(clouds: Sequence[_Averages], step: int | None, steps: range) -> int | None:
+    """The smallest size at which few neighbourhoods are lines, or else the largest at which all clouds show the scene;
+    None if there is none. `step` is the number of the current size."""
+
+    def suffices(cloud: _Averages, larger: int) -> bool:
+        return not cloud.shows_scene(larger) or cloud.shape(larger).lines <= _MOST_LINES
+
+    # What suffices for the cloud of most lines mostly suffices for the others, or the next size does.
+    worst, *others = sorted(clouds, key=lambda cloud: cloud.shape(step).lines, reverse=True)
+    larger = bisect.bisect_left(steps, True, key=partial(suffices, worst)) + steps.start
+    for cloud in others:
+        while larger < steps.stop and not suffices(cloud, larger):
+            larger += 1
+    while larger >= steps.start and not _show_scene(clouds, larger):
+        larger -= 1
+    return larger if larger >= steps.start else None
+
+
+def _thinner(clouds: Sequence[_Averages], thickness: float, start: int) -> int | None:
+    """The smallest size in whose voxels the neighbourhoods are clearly thinner than `thickness`, as they are now; None
+    if there is none. `start` is the number of the size that is doubled, the current one or the spacing."""
+    for larger in range(start + _DOUBLE, start + _DOUBLE * _DOUBLINGS + 1, _DOUBLE):
+        if not _show_scene(clouds, larger):
+            return None
+        before, thickness = thickness, _worst_shape(clouds, larger).thickness
+        if thickness > _THICKER * before:
+            return None
+        if thickness <= min(_THICK, _THINNER * before):
+            between = range(larger - _DOUBLE + 1, larger)
+            return next((finer for finer in between if _worst_shape(clouds, finer).thickness <= _THICK), larger)
+    return None
 
 
 def _shape_of(columns: Float[np.ndarray, "3 N"], neighbors: Any = None) -> Shape:
@@ -195,90 +283,6 @@ def _shape_of(columns: Float[np.ndarray, "3 N"], neighbors: Any = None) -> Shape
     squares = np.linalg.eigvalsh(np.einsum("ikn,jkn->ijn", offsets, offsets).T)
     thin, second, first = np.sqrt(np.maximum(squares.T, np.finfo(float).tiny))
     return Shape(float(np.mean(second < _LINE * first)), float(np.median(thin / second)), float(np.median(distances)))
-
-
-class _Candidate:
-    """A cloud for which a voxel size is chosen, and the shapes of its neighbourhoods in voxels: points, or means in
-    voxels of the size number `step`. Fewer than `least` voxels do not show the scene."""
-
-    def __init__(self, grid: Grid, step: int | None, least: int):
-        self._grid, self._step, self._least = grid, step, least
-        self._shapes: dict[int | None, Shape] = {}
-
-    def averaged(self, step: int) -> _Candidate:
-        """The same cloud with the means of its voxels as its points."""
-        return _Candidate(Grid(self._means(step)), step, self._least)
-
-    def shape(self, step: int | None) -> Shape:
-        if step not in self._shapes:
-            # Means of means in the same voxels would be the same.
-            columns = self._grid.columns if step is None or step == self._step else self._means(step)
-            self._shapes[step] = _shape_of(columns)
-        return self._shapes[step]
-
-    def shows_scene(self, step: int) -> bool:
-        return self._count(step) >= self._least
-
-    def first_with(self, limit: int, steps: range, guess: int) -> int:
-        """The first step with at most so many voxels, the end of the range if there is none."""
-        low, high = steps.start, steps.stop
-        while low < high:
-            guess = min(max(guess, low), high - 1)
-            count = self._count(guess)
-            low, high = (low, guess) if count <= limit else (guess + 1, high)
-            # Along scan lines the number of voxels goes with the inverse of their size, on a surface with its square.
-            guess += round(_STEPS * np.log10(count / limit))
-        return low
-
-    def _means(self, step: int) -> Float[np.ndarray, "3 M"]:
-        numbers, count = self._grid.numbers(_size(step))
-        sums = np.stack([np.bincount(numbers, column, count) for column in self._grid.columns])
-        return sums / np.bincount(numbers)
-
-    def _count(self, step: int) -> int:
-        return self._grid.columns.shape[1] if step == self._step else self._grid.numbers(_size(step))[1]
-
-
-def _lines(candidates: Sequence[_Candidate], step: int | None) -> float:
-    return max(candidate.shape(step).lines for candidate in candidates)
-
-
-def _thickness(candidates: Sequence[_Candidate], step: int | None) -> float:
-    return max(candidate.shape(step).thickness for candidate in candidates)
-
-
-def _without_lines(candidates: Sequence[_Candidate], step: int | None, steps: range) -> int | None:
-    """The smallest size at which few neighbourhoods are lines, or else the largest at which all clouds show the scene;
-    None if there is none. `step` is the number of the current size."""
-
-    def suffices(candidate: _Candidate, larger: int) -> bool:
-        return not candidate.shows_scene(larger) or candidate.shape(larger).lines <= _MOST_LINES
-
-    # What suffices for the cloud of most lines mostly suffices for the others, or the next size does.
-    most, *others = sorted(candidates, key=lambda candidate: candidate.shape(step).lines, reverse=True)
-    larger = bisect.bisect_left(steps, True, key=partial(suffices, most)) + steps.start
-    for candidate in others:
-        larger = next((each for each in range(larger, steps.stop) if suffices(candidate, each)), steps.stop)
-    shown = range(larger, steps.start - 1, -1)
-    return next((each for each in shown if all(candidate.shows_scene(each) for candidate in candidates)), None)
-
-
-def _thinner(candidates: Sequence[_Candidate], step: int | None, start: int) -> int | None:
-    """The smallest size in whose voxels the neighbourhoods are clearly thinner; None if there is none. `start` is the
-    number of the size that is doubled, the current one or the spacing."""
-    before = _thickness(candidates, step)
-    for larger in range(start + _DOUBLE, start + _DOUBLE * _DOUBLINGS + 1, _DOUBLE):
-        if not all(candidate.shows_scene(larger) for candidate in candidates):
-            return None
-        # One cloud that is thicker settles it.
-        if any(candidate.shape(larger).thickness > _THICKER * before for candidate in candidates):
-            return None
-        now = _thickness(candidates, larger)
-        if now <= min(_THICK, _THINNER * before):
-            between = range(larger - _DOUBLE + 1, larger)
-            return next((finer for finer in between if _thickness(candidates, finer) <= _THICK), larger)
-        before = now
-    return None
 
 
 def _range_of(points: Sequence[Float[np.ndarray, "3 _"]]) -> tuple[int, int]:
@@ -304,5 +308,5 @@ def _size(step: int) -> float:
 def _finite_points(cloud: PointCloud) -> tuple[Float[np.ndarray, "N 3"], Bool[np.ndarray, "M"]]:
     """The finite points without placeholders, float64, and which rows they are."""
     cloud = primal(cloud)
-    points, kept = np.asarray(cloud.points, np.float64), measured_rows(cloud)
-    return points if kept.all() else points[kept], kept
+    points, measured = np.asarray(cloud.points, np.float64), measured_rows(cloud)
+    return points if measured.all() else points[measured], measured

@@ -9,7 +9,7 @@ point's own normal, and histograms are averaged over both signs of the latter.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, cast
 
 import jax
 import jax.numpy as jnp
@@ -78,18 +78,18 @@ def comparable(
 ) -> tuple[Float[np.ndarray, "N L"], Float[np.ndarray, "M L"]]:
     """Features of two clouds on one scale: small integers as float32, whose distances are exact. Statistics of channels
     are divided by their standard deviations in both clouds; missing ones are set to the mean."""
-    deviation = max(float(np.concatenate(histograms).astype(np.float64).std()), float(np.finfo(np.float32).tiny))
-    scale = _DEVIATION / deviation
-    center = np.concatenate(histograms).mean(axis=0, dtype=np.float64)
+    all_histograms = np.concatenate(histograms).astype(np.float64)
+    scale = _DEVIATION / max(float(all_histograms.std()), float(np.finfo(np.float32).tiny))
+    center = all_histograms.mean(axis=0)
     parts = [[scale * (histogram - center)] for histogram in histograms]
     if statistics is not None:
-        both = np.concatenate(statistics).astype(np.float64)
-        finite = np.isfinite(both)
+        all_statistics = np.concatenate(statistics).astype(np.float64)
+        finite = np.isfinite(all_statistics)
         count = np.maximum(finite.sum(axis=0), 1)
-        mean = np.where(finite, both, 0).sum(axis=0) / count
-        spread = np.sqrt(np.where(finite, (both - mean) ** 2, 0).sum(axis=0) / count)
+        mean = np.where(finite, all_statistics, 0).sum(axis=0) / count
+        spread = np.sqrt(np.where(finite, (all_statistics - mean) ** 2, 0).sum(axis=0) / count)
         varying = spread > 1e3 * np.finfo(np.float32).eps * np.abs(mean)
-        weight = _CHANNEL_WEIGHT * _DEVIATION * np.sqrt(histograms[0].shape[1] / both.shape[1])
+        weight = _CHANNEL_WEIGHT * _DEVIATION * np.sqrt(all_histograms.shape[1] / all_statistics.shape[1])
         scales = np.where(varying, weight / np.where(varying, spread, 1), 0)
         for values, part in zip(statistics, parts, strict=True):
             part.append(np.nan_to_num((values - mean) * scales))
@@ -124,15 +124,16 @@ def _simple_histograms(
     near = around.present & (square > 0) & (square <= radius * radius)
     distance = jnp.sqrt(jnp.where(near, square, 1))
     line = [offset / distance for offset in offsets]
-    own = [normal[None] for normal in around.own_channels]
-    other = list(around.near_channels)
-    side = jnp.where(alg.dot(own, other) >= 0, 1, -1).astype(square.dtype)
-    other = [side * axis for axis in other]
-    along = alg.dot(own, line), alg.dot(other, line)
-    swapped = jnp.abs(along[0]) < jnp.abs(along[1])
-    u, n = ([jnp.where(swapped, b, a) for a, b in zip(*pair, strict=True)] for pair in ((own, other), (other, own)))
+    own = [axis[None] for axis in around.own_channels]
+    # Normals of the neighbours, on the side of the point's own.
+    side = jnp.where(alg.dot(own, around.near_channels) >= 0, 1, -1).astype(square.dtype)
+    other = [side * axis for axis in around.near_channels]
+    own_along, other_along = alg.dot(own, line), alg.dot(other, line)
+    swapped = jnp.abs(own_along) < jnp.abs(other_along)
+    u = [jnp.where(swapped, b, a) for a, b in zip(own, other, strict=True)]
+    n = [jnp.where(swapped, a, b) for a, b in zip(own, other, strict=True)]
     line = [jnp.where(swapped, -axis, axis) for axis in line]
-    phi = jnp.where(swapped, -along[1], along[0])
+    phi = jnp.where(swapped, -other_along, own_along)
     v = alg.cross(line, u)
     length = jnp.sqrt(alg.dot(v, v))
     # Where a normal is the line between the points, the frame is undefined.
@@ -180,11 +181,11 @@ def matches_of_features(source: PointCloud, target: PointCloud, voxel_size: floa
     """The mutual nearest neighbours in feature space; the most distinctive ones, if there are too many."""
     clouds = source, target
     normals = [normals_of(cloud, voxel_size) for cloud in clouds]
-    histograms = [histograms_of(*both, voxel_size) for both in zip(clouds, normals, strict=True)]
+    histograms = [histograms_of(cloud, sides, voxel_size) for cloud, sides in zip(clouds, normals, strict=True)]
     statistics = [statistics_of(cloud, voxel_size) for cloud in clouds] if source.channels.shape[1] else None
     rows = mutual_nearest(*comparable(histograms, statistics), NUM_MATCHES)
-    columns = [*(np.asarray(cloud.points) for cloud in clouds), *normals]
-    return _padded(*(column[chosen] for column, chosen in zip(columns, (*rows, *rows), strict=True)))
+    points = [np.asarray(cloud.points)[matched] for cloud, matched in zip(clouds, rows, strict=True)]
+    return _padded(*points, normals[0][rows[0]], normals[1][rows[1]])
 
 
 def matches_of_rows(
@@ -283,30 +284,28 @@ def image_matches(source: Frame, target: Frame) -> tuple[Int[np.ndarray, "n"], I
         if frame.image is None or frame.pixels is None:
             raise ValueError(f"{name}: expected a frame with an image, got one without")
     cv2 = optional_module("cv2", "images", "matching images")
-    (pixels, features), (target_pixels, target_features) = _sift(cv2, source.image), _sift(cv2, target.image)
-    if min(len(features), len(target_features)) < 2:
+    # Key points of both images, (column, row), and their features.
+    pixels, features = [], []
+    for frame in (source, target):
+        gray = cv2.cvtColor(cast(Any, frame.image), cv2.COLOR_RGB2GRAY)
+        key_points, descriptors = cv2.SIFT_create().detectAndCompute(gray, None)
+        pixels.append(np.array([point.pt for point in key_points], float).reshape(-1, 2))
+        features.append(descriptors)
+    if min(len(pixels[0]), len(pixels[1])) < 2:
         return np.zeros(0, np.int64), np.zeros(0, np.int64)
     matcher = cv2.BFMatcher()
-    back = {match.queryIdx: match.trainIdx for match in matcher.match(target_features, features)}
+    back = {match.queryIdx: match.trainIdx for match in matcher.match(features[1], features[0])}
     good = [
         (first.queryIdx, first.trainIdx)
-        for first, second in matcher.knnMatch(features, target_features, k=2)
+        for first, second in matcher.knnMatch(features[0], features[1], k=2)
         if first.distance < _RATIO * second.distance and back[first.trainIdx] == first.queryIdx
     ]
-    rows, target_rows = np.array(good, np.int64).reshape(-1, 2).T
-    rows, target_rows = _nearest(source, pixels[rows]), _nearest(target, target_pixels[target_rows])
-    matched = (rows >= 0) & (target_rows >= 0)
-    return rows[matched], target_rows[matched]
-
-
-def _sift(cv2: Any, image: Any) -> tuple[Float[np.ndarray, "n 2"], Float[np.ndarray, "n 128"]]:
-    """Pixels (column, row) and SIFT features of the key points."""
-    points, features = cv2.SIFT_create().detectAndCompute(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), None)
-    pixels = np.array([point.pt for point in points], float).reshape(-1, 2)
-    return pixels, features if points else np.zeros((0, 128), np.float32)
-
-
-def _nearest(frame: Frame, pixels: Float[np.ndarray, "n 2"]) -> Int[np.ndarray, "n"]:
-    """The row of the cloud nearest to each pixel, −1 for none."""
-    queries, points = (np.pad(np.asarray(side, float), ((0, 0), (0, 1))) for side in (pixels, frame.pixels))
-    return nearest_in_position(queries, points, _MAX_PIXELS).astype(np.int64)
+    matches = np.array(good, np.int64).reshape(-1, 2).T
+    rows = []
+    for frame, positions, matched in zip((source, target), pixels, matches, strict=True):
+        # The search is in three dimensions.
+        queries = np.pad(positions[matched], ((0, 0), (0, 1)))
+        points = np.pad(np.asarray(frame.pixels, float), ((0, 0), (0, 1)))
+        rows.append(nearest_in_position(queries, points, _MAX_PIXELS).astype(np.int64))
+    both = (rows[0] >= 0) & (rows[1] >= 0)
+    return rows[0][both], rows[1][both]

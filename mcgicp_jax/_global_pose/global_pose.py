@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any, NamedTuple, TypeAlias
 
@@ -24,6 +23,7 @@ from mcgicp_jax._global_pose.robust_pose_fit import (
     PutativeMatches,
     hypotheses,
     refined,
+    squared_separation,
 )
 from mcgicp_jax._local_geometry.surface_agreement import surface_agreement
 from mcgicp_jax._math.poses import nearest_rotation
@@ -186,12 +186,12 @@ def global_pose(
     if not same_channels(source, target):
         one, other = PointCloud(one.points), PointCloud(other.points)
     size = _voxel_size((one, other)) if voxel_size is None else float(voxel_size)
+    if not size:
+        return _no_pose(0, size)
     try:
-        voxels = [with_neighbors(cloud, size, NUM_NEIGHBORS) for cloud in (one, other)] if size else []
+        voxels = [with_neighbors(cloud, size, NUM_NEIGHBORS) for cloud in (one, other)]
     except ValueError:
         # A cloud has too few voxels.
-        voxels = []
-    if not voxels:
         return _no_pose(0, size)
     with outside_trace():
         if rows is None:
@@ -199,8 +199,8 @@ def global_pose(
         else:
             points = source.coordinates - source_center, target.coordinates - target_center
             matches = matches_of_rows(*points, rows)
-        near = [np.ascontiguousarray(np.asarray(cloud.neighbors)[:, :_NUM_NEIGHBORS]) for cloud in voxels]
-        voxels = [cloud.replace_rows(deferred_neighbors=kept) for cloud, kept in zip(voxels, near, strict=True)]
+        nearest = [np.ascontiguousarray(np.asarray(cloud.neighbors)[:, :_NUM_NEIGHBORS]) for cloud in voxels]
+        voxels = [cloud.replace_rows(deferred_neighbors=near) for cloud, near in zip(voxels, nearest, strict=True)]
         positions = np.asarray(voxels[0].points, np.float64)
         radius = float(np.sqrt(np.mean(np.sum(positions * positions, axis=1))))
         return _best_pose(_Scene(matches, voxels[0], voxels[1], size, radius), source_center, target_center)
@@ -280,7 +280,7 @@ class _Scene(NamedTuple):
         return nearest_in_position(moved, self.target.points, TOLERANCE * self.voxel_size) >= 0
 
     def are_same(self, a: Float[np.ndarray, "4 4"], b: Float[np.ndarray, "4 4"]) -> bool:
-        square = np.sum((a - b)[:3, 3] ** 2) + 0.5 * self.radius**2 * np.sum((a - b)[:3, :3] ** 2)
+        square = squared_separation((a - b)[:3, :3], (a - b)[:3, 3], self.radius)
         return bool(square <= (MIN_SEPARATION * self.voxel_size) ** 2)
 
     def candidate(self, matrix: Float[np.ndarray, "4 4"], constrained: bool) -> Candidate:
@@ -336,7 +336,13 @@ def _verified(poses: PoseHypotheses, scene: _Scene) -> list[Candidate]:
     options = Options(max_distance=distances, max_iterations=_VERIFIED_ITERATIONS)
     verified: list[Candidate] = []
     started: list[np.ndarray] = []
-    for start in _rivals(poses):
+    order = np.argsort(-poses.score, kind="stable")
+    for i in order:
+        if not (poses.score[i] > 0 and poses.score[i] >= _RIVAL_INLIERS * poses.score[order[0]]):
+            break
+        start = np.eye(4)
+        start[:3, :3], start[:3, 3] = poses.rotation[i], poses.translation[i]
+        start = nearest_rotation(start)
         if any(scene.are_same(start, other) for other in started):
             continue
         started.append(start)
@@ -347,13 +353,3 @@ def _verified(poses: PoseHypotheses, scene: _Scene) -> list[Candidate]:
         if not any(scene.are_same(matrix, other.matrix) for other in verified):
             verified.append(scene.candidate(matrix, usable and not result.unconstrained_directions))
     return verified
-
-
-def _rivals(poses: PoseHypotheses) -> Iterator[Float[np.ndarray, "4 4"]]:
-    """The best pose and those with at least `_RIVAL_INLIERS` of its score."""
-    order = np.argsort(-poses.score, kind="stable")
-    for i in order:
-        if poses.score[i] > 0 and poses.score[i] >= _RIVAL_INLIERS * poses.score[order[0]]:
-            matrix = np.eye(4)
-            matrix[:3, :3], matrix[:3, 3] = poses.rotation[i], poses.translation[i]
-            yield nearest_rotation(matrix)

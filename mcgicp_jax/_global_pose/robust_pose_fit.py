@@ -5,7 +5,7 @@ All programs have fixed shapes: a fixed number of matches, padded, and of hypoth
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -182,12 +182,17 @@ def _different(poses: PoseHypotheses, voxel_size: AnyScalar, radius: AnyScalar) 
         best = jnp.argmax(left)
         shift = poses.translation - poses.translation[best]
         turn = poses.rotation - poses.rotation[best]
-        # |R − R'| = √8 sin(angle / 2), about √2 times the angle.
-        square = jnp.sum(shift**2, axis=-1) + 0.5 * radius**2 * jnp.sum(turn**2, axis=(-1, -2))
-        return jnp.where(square > (MIN_SEPARATION * voxel_size) ** 2, left, 0), (best, left[best])
+        different = squared_separation(turn, shift, radius) > (MIN_SEPARATION * voxel_size) ** 2
+        return jnp.where(different, left, 0), (best, left[best])
 
     _, (rows, score) = jax.lax.scan(step, poses.score, None, NUM_REFINED)
     return PoseHypotheses(poses.rotation[rows], poses.translation[rows], score)
+
+
+def squared_separation(turn: Float[AnyArray, "*n 3 3"], shift: Float[AnyArray, "*n 3"], radius: AnyScalar) -> Any:
+    """About the squared distance, m², by which two poses move points apart, from the differences of their rotations
+    and translations: |R − R'| = √8 sin(angle / 2), about √2 times the angle."""
+    return (shift**2).sum(axis=-1) + 0.5 * radius**2 * (turn**2).sum(axis=(-1, -2))
 
 
 @jax.jit

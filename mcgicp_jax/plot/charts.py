@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
@@ -29,8 +30,7 @@ def trajectories(
         ValueError: if a trajectory is empty, or a pose is no rigid motion.
         ImportError: if matplotlib is missing.
     """
-    figure = new_figure(7, 5)
-    panel = figure.subplots()
+    figure, panel = _chart()
     plane, start = None, None
     for name, poses in trajectories.items():
         positions = np.array([pose_matrix(pose, f"trajectories[{name!r}][{i}]")[:3, 3] for i, pose in enumerate(poses)])
@@ -43,8 +43,6 @@ def trajectories(
             plane[0] *= 1 if (positions[-1] - start) @ plane[0] >= 0 else -1
         along, across = plane @ (positions - start).T
         panel.plot(along, across, marker=".", markersize=4, linewidth=1, label=name)
-    panel.set(xlabel="metres", ylabel="metres", aspect="equal", adjustable="datalim")
-    panel.grid(alpha=0.3)
     panel.legend()
     return saved(figure, path)
 
@@ -66,20 +64,27 @@ def graph(graph: PoseGraphResult, *, path: File = None) -> Figure:
     centre = positions.mean(axis=0)
     # The eigenvectors of the two largest eigenvalues, which come last.
     axes = np.linalg.eigh((positions - centre).T @ (positions - centre))[1][:, :0:-1]
-    kept, residuals, i = np.asarray(graph.kept), np.asarray(graph.residuals), np.asarray(graph.edges.i)
-    priors = (i == WORLD)[:, None]
-    starts = np.where(priors, np.asarray(graph.edges.T_i_j)[:, :3, 3], positions[np.where(priors[:, 0], 0, i)])
+    accepted, residuals, i = np.asarray(graph.kept), np.asarray(graph.residuals), np.asarray(graph.edges.i)
+    priors = i == WORLD
+    measured = np.asarray(graph.edges.T_i_j)[:, :3, 3]
+    starts = np.where(priors[:, None], measured, positions[np.where(priors, 0, i)])
     segments = (np.stack([starts, positions[np.asarray(graph.edges.j)]], axis=1) - centre) @ axes
-    figure = new_figure(7, 5)
-    panel = figure.subplots()
-    for chosen, style in ((kept, "solid"), (~kept, "dashed")):
-        lines = collections.LineCollection(segments[chosen], linestyles=style, linewidths=1, cmap="viridis")
-        lines.set_array(residuals[chosen])
+    figure, panel = _chart()
+    for edges, style in ((accepted, "solid"), (~accepted, "dashed")):
+        lines = collections.LineCollection(segments[edges], linestyles=style, linewidths=1, cmap="viridis")
+        lines.set_array(residuals[edges])
         lines.set_clim(0, _LARGEST_RESIDUAL)
         panel.add_collection(lines)
         if style == "solid":
             figure.colorbar(lines, ax=panel, label="residual, standard deviations", extend="max")
     panel.plot(*((positions - centre) @ axes).T, marker=".", markersize=4, linestyle="none", color="black")
+    return saved(figure, path)
+
+
+def _chart() -> tuple[Figure, Any]:
+    """A figure and its only panel, of equal scales in metres."""
+    figure = new_figure(7, 5)
+    panel = figure.subplots()
     panel.set(xlabel="metres", ylabel="metres", aspect="equal", adjustable="datalim")
     panel.grid(alpha=0.3)
-    return saved(figure, path)
+    return figure, panel

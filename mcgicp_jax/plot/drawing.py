@@ -27,7 +27,6 @@ Map: TypeAlias = Float[np.ndarray, "height width"]
 # Affects only how figures look: pixels per point spacing, unless the limit on the pixels makes them coarser.
 PIXELS_PER_SPACING = 3
 
-
 # From a package of the extra `plot`.
 plotting = partial(optional_module, extra="plot", use="plotting")
 
@@ -66,6 +65,11 @@ class View:
     pixel: float
     width: int
     height: int
+
+    @property
+    def extent(self) -> tuple[float, float, float, float]:
+        """Left, right, lower and upper end of a picture from its lower left corner, metres."""
+        return 0, self.width * self.pixel, 0, self.height * self.pixel
 
     def project(self, points: Points) -> tuple[Int[np.ndarray, "N"], Float[np.ndarray, "N"]]:
         """The row-major pixel index of each point, −1 if outside, and its height above the plane in metres."""
@@ -122,19 +126,21 @@ def drawable(cloud: PointCloud) -> PointCloud:
     )
 
 
-def has_everywhere(cloud: PointCloud, names: tuple[str, ...]) -> bool:
-    """Whether every point has all of these channels."""
+def channels_of(cloud: PointCloud, names: tuple[str, ...]) -> Float[np.ndarray, "N D"] | None:
+    """The channels with these names; None unless every point has all of them."""
     if not set(names) <= set(cloud.channel_names):
-        return False
+        return None
     columns = [cloud.channel_names.index(name) for name in names]
-    return cloud.channel_valid is None or bool(np.asarray(cloud.channel_valid)[:, columns].all())
+    if cloud.channel_valid is not None and not np.asarray(cloud.channel_valid)[:, columns].all():
+        return None
+    return np.asarray(cloud.channels)[:, columns]
 
 
 def rgb_of(cloud: PointCloud) -> Points | None:
     """Colours in 0..1 from channels in 0..1, 0..255 or 0..65535; None unless every point has a colour."""
-    if not has_everywhere(cloud, COLORS):
+    channels = channels_of(cloud, COLORS)
+    if channels is None:
         return None
-    channels = np.asarray(cloud.channels, float)[:, [cloud.channel_names.index(name) for name in COLORS]]
     largest = channels.max(initial=0)
     full_scale = next((scale for scale in (1, 255) if largest <= scale), 65535)
-    return np.clip(channels / full_scale, 0, 1)
+    return np.clip(channels.astype(float) / full_scale, 0, 1)

@@ -81,8 +81,8 @@ def before_after(source: PointCloud, target: PointCloud, poses: Mapping[str, Pos
     figure = drawing.new_figure(beside * (len(headings) * width + 0.3), below * height + 0.3)
     columns = figure.subplots(below, beside * len(headings), squeeze=False)
     panels = np.concatenate(np.split(columns, beside, axis=1))
-    for first in panels[::below]:
-        for panel, heading in zip(first, headings, strict=True):
+    for top_row in panels[::below]:
+        for panel, heading in zip(top_row, headings, strict=True):
             panel.set_title(heading)
     for row, name, (picture, difference) in zip(panels, named, rows, strict=False):
         _draw_row(row, name, picture, difference, detail)
@@ -120,12 +120,12 @@ def _chess_boards(
     tile = max(view.width, view.height) // _TILES + 1
     row, column = np.mgrid[: view.height, : view.width] // tile
     target_tiles = ((row + column) % 2 == 0)[..., None]
-    ours = drawing.paint(view, target, target_colors)
-    ours_smooth, boards = _smooth(ours), []
+    target_picture = drawing.paint(view, target, target_colors)
+    target_smooth, boards = _smooth(target_picture), []
     for points in moved:
-        theirs = drawing.paint(view, points, source_colors)
-        picture = np.nan_to_num(np.where(target_tiles, ours, theirs), nan=1)
-        boards.append((picture, np.abs(ours_smooth - _smooth(theirs)).mean(axis=-1)))
+        source_picture = drawing.paint(view, points, source_colors)
+        board = np.nan_to_num(np.where(target_tiles, target_picture, source_picture), nan=1)
+        boards.append((board, np.abs(target_smooth - _smooth(source_picture)).mean(axis=-1)))
     return boards
 
 
@@ -143,13 +143,12 @@ def _overlays(
 ) -> list[tuple[Picture, Map]]:
     """For each moved source a picture of both clouds, whose points have these sizes in pixels, and the difference of
     their inks."""
-    ours = _ink(view, target, target_size)
-    overlays = []
+    target_ink, overlays = _ink(view, target, target_size), []
     for points in moved:
-        theirs = _ink(view, points, source_size)
+        source_ink = _ink(view, points, source_size)
         # Subtractive colours: the target removes all red, the source all blue, and each half of the green.
-        picture = 1 - np.stack([ours, 0.5 * ours + 0.5 * theirs, theirs], axis=-1)
-        overlays.append((picture, np.abs(ours - theirs)))
+        picture = 1 - np.stack([target_ink, 0.5 * target_ink + 0.5 * source_ink, source_ink], axis=-1)
+        overlays.append((picture, np.abs(target_ink - source_ink)))
     return overlays
 
 
@@ -162,9 +161,8 @@ def _ink(view: View, points: Points, size: float) -> Map:
     inside = pixels >= 0
     np.minimum.at(lowest, pixels[inside], height[inside])
     np.maximum.at(highest, pixels[inside], height[inside])
-    pixels_wide = round(size)
-    highest = maximum_filter(highest.reshape(view.height, view.width), pixels_wide)
-    lowest = minimum_filter(lowest.reshape(view.height, view.width), pixels_wide)
+    highest = maximum_filter(highest.reshape(view.height, view.width), round(size))
+    lowest = minimum_filter(lowest.reshape(view.height, view.width), round(size))
     stands = np.clip((highest - lowest) / (4 * view.pixel), 0.15, 1)
     return np.where(highest >= lowest, stands, 0)
 
@@ -200,18 +198,17 @@ def maps(
         ImportError: if matplotlib is missing.
     """
     drawn = {name: drawing.drawable(cloud) for name, cloud in maps.items()}
-    if not drawn or len(next(iter(drawn.values()))) < 3:
+    first = next(iter(drawn.values()), None)
+    if first is None or len(first) < 3:
         raise ValueError("maps: expected at least one cloud, the first with at least 3 points")
-    view = drawing.view_onto(np.asarray(next(iter(drawn.values())).points), _PIXELS, limits)
+    view = drawing.view_onto(np.asarray(first.points), _PIXELS, limits)
     wide = view.width > 1.5 * view.height
     shape = (len(drawn), 1) if wide else (1, len(drawn))
     aspect = view.height / view.width
     width = _WIDTH if wide else _WIDTH / len(drawn)
     figure = drawing.new_figure(width * shape[1], (width * aspect + 0.35) * shape[0])
     for panel, (name, cloud) in zip(figure.subplots(*shape, squeeze=False).ravel(), drawn.items(), strict=True):
-        picture = np.nan_to_num(drawing.paint(view, np.asarray(cloud.points), _shades(cloud, view)), nan=1)
-        extent = (0, view.width * view.pixel, 0, view.height * view.pixel)
-        panel.imshow(picture, origin="lower", interpolation="nearest", extent=extent)
+        panel.imshow(_shaded(cloud, view), origin="lower", interpolation="nearest", extent=view.extent)
         panel.set_title(name, fontsize="medium")
         panel.set_xlabel("metres", fontsize="small")
         panel.set_ylabel("metres", fontsize="small")
@@ -243,6 +240,7 @@ def surface_covariances(
         ValueError: if covariances have the wrong shape.
         ImportError: if matplotlib is missing.
     """
+    collections = drawing.plotting("matplotlib.collections")
     raw, rows = drawing.drawable(cloud), np.asarray(indices, int)
     view = drawing.view_onto(np.asarray(raw.points), _PIXELS, limits)
     # The indices refer to the rows of `cloud`; `raw`, which the picture shows, lacks padding and non-finite points.
@@ -252,7 +250,7 @@ def surface_covariances(
     distances = np.linalg.norm(centers[:, None] - centers, axis=-1)
     np.fill_diagonal(distances, np.inf)
     room = min(float(np.median(distances.min(axis=1))), extent / 5)
-    picture = np.nan_to_num(drawing.paint(view, np.asarray(raw.points), _shades(raw, view)), nan=1)
+    picture = _shaded(raw, view)
     width = _WIDTH / len(covariances)
     figure = drawing.new_figure(_WIDTH, width * view.height / view.width + 0.35)
     panels = figure.subplots(1, len(covariances), squeeze=False)[0]
@@ -262,39 +260,33 @@ def surface_covariances(
         if matrices.shape != (size, 3, 3):
             raise ValueError(f"covariances[{name!r}]: expected shape ({size}, 3, 3), got {matrices.shape}")
         flat = view.axes[:, :2].T @ matrices[rows] @ view.axes[:, :2]
-        panel.imshow(picture, origin="lower", extent=(0, view.width * view.pixel, 0, view.height * view.pixel))
-        _add_ellipses(panel, offsets, flat, room)
+        panel.imshow(picture, origin="lower", extent=view.extent)
+        # Axes are `room` metres long per standard deviation.
+        variances, vectors = np.linalg.eigh(flat)
+        lengths = room * np.sqrt(np.maximum(variances, 0))
+        angles = np.degrees(np.arctan2(vectors[:, 1, 1], vectors[:, 0, 1]))
+        # Black lines alone would hide on dark surfaces.
+        for color, thickness in (("white", 2.4), ("black", 1.2)):
+            style = {"units": "xy", "facecolors": "none", "edgecolors": color, "linewidths": thickness}
+            place = {"offsets": offsets, "transOffset": panel.transData}
+            panel.add_collection(collections.EllipseCollection(*lengths.T[::-1], angles, **place, **style))
         panel.set_title(name, fontsize="medium")
-        panel.set(xticks=[], yticks=[], xlim=(0, view.width * view.pixel), ylim=(0, view.height * view.pixel))
+        panel.set(xticks=[], yticks=[], xlim=view.extent[:2], ylim=view.extent[2:])
     return drawing.saved(figure, path)
 
 
-def _add_ellipses(
-    panel: Any, offsets: Float[np.ndarray, "M 2"], covariances: Float[np.ndarray, "M 2 2"], scale: float
-) -> None:
-    """Draw ellipses at `offsets`, metres, whose axes are `scale` metres long per standard deviation."""
-    sizes, vectors = np.linalg.eigh(covariances)
-    lengths = scale * np.sqrt(np.maximum(sizes, 0))
-    angles = np.degrees(np.arctan2(vectors[:, 1, 1], vectors[:, 0, 1]))
-    ellipses = drawing.plotting("matplotlib.collections").EllipseCollection
-    # Black lines alone would hide on dark surfaces.
-    for color, width in (("white", 2.4), ("black", 1.2)):
-        style = {"units": "xy", "facecolors": "none", "edgecolors": color, "linewidths": width}
-        panel.add_collection(ellipses(*lengths.T[::-1], angles, offsets=offsets, transOffset=panel.transData, **style))
-
-
-def _shades(cloud: PointCloud, view: View) -> Points:
-    """Colours of the points from red, green and blue if present, else grey from intensity or height."""
-    colors = drawing.rgb_of(cloud)
-    if colors is not None:
-        return np.nan_to_num(colors, nan=0.5)
-    if "intensity" in cloud.channel_names:
-        values = np.asarray(cloud.channels)[:, cloud.channel_names.index("intensity")]
-    else:
-        values = view.project(np.asarray(cloud.points))[1]
-    low, high = np.nanpercentile(values, [2, 98])
-    grey = np.clip((values - low) / max(high - low, np.finfo(float).tiny), 0, 1)
-    return np.repeat(0.85 * np.nan_to_num(grey, nan=0.5)[:, None], 3, axis=1)
+def _shaded(cloud: PointCloud, view: View) -> Picture:
+    """The points in colour if they have red, green and blue, else in grey by intensity or height; on white."""
+    points, colors = np.asarray(cloud.points), drawing.rgb_of(cloud)
+    if colors is None:
+        if "intensity" in cloud.channel_names:
+            values = np.asarray(cloud.channels)[:, cloud.channel_names.index("intensity")]
+        else:
+            values = view.project(points)[1]
+        low, high = np.nanpercentile(values, [2, 98])
+        grey = np.clip((values - low) / max(high - low, np.finfo(float).tiny), 0, 1)
+        colors = np.repeat(0.85 * np.nan_to_num(grey, nan=0.5)[:, None], 3, axis=1)
+    return np.nan_to_num(drawing.paint(view, points, np.nan_to_num(colors, nan=0.5)), nan=1)
 
 
 def clouds(*clouds: PointCloud, names: Sequence[str] | None = None) -> plotly.graph_objects.Figure:
@@ -319,21 +311,15 @@ def clouds(*clouds: PointCloud, names: Sequence[str] | None = None) -> plotly.gr
     layout = {"scene": {"aspectmode": "data"}, "legend": {"itemsizing": "constant"}, "margin": dict.fromkeys("lrtb", 0)}
     figure = graphs.Figure(layout=layout)
     for i, (cloud, name) in enumerate(zip(clouds, names, strict=True)):
-        figure.add_trace(_scatter(graphs, cloud, name, _COLORS[i % len(_COLORS)], fraction))
+        cloud = drawing.drawable(cloud)
+        rows = np.random.default_rng(0).permutation(len(cloud))[: round(fraction * len(cloud))]
+        rgb, intensity = drawing.rgb_of(cloud), drawing.channels_of(cloud, ("intensity",))
+        marker: dict[str, Any] = {"size": 1.5, "color": _COLORS[i % len(_COLORS)]}
+        if rgb is not None:
+            marker["color"] = [f"rgb({r},{g},{b})" for r, g, b in np.round(255 * rgb[rows]).astype(int)]
+        elif intensity is not None and len(cloud):
+            low, high = np.nanpercentile(intensity, [2, 98])
+            marker |= {"color": intensity[rows, 0], "colorscale": "Viridis", "cmin": low, "cmax": high}
+        x, y, z = np.asarray(cloud.points)[rows].T
+        figure.add_trace(graphs.Scatter3d(x=x, y=y, z=z, mode="markers", name=name, marker=marker, showlegend=True))
     return figure
-
-
-def _scatter(graphs: Any, cloud: PointCloud, name: str, color: str, fraction: float) -> Any:
-    """Draw a reproducible random fraction of the points, in `color` if the cloud has neither colours nor intensity."""
-    cloud = drawing.drawable(cloud)
-    kept = np.random.default_rng(0).permutation(len(cloud))[: round(fraction * len(cloud))]
-    rgb = drawing.rgb_of(cloud)
-    marker: dict[str, Any] = {"size": 1.5, "color": color}
-    if rgb is not None:
-        marker["color"] = [f"rgb({r},{g},{b})" for r, g, b in np.round(255 * rgb[kept]).astype(int)]
-    elif drawing.has_everywhere(cloud, ("intensity",)) and len(cloud):
-        intensity = np.asarray(cloud.channels)[:, cloud.channel_names.index("intensity")]
-        low, high = np.nanpercentile(intensity, [2, 98])
-        marker |= {"color": intensity[kept], "colorscale": "Viridis", "cmin": low, "cmax": high}
-    x, y, z = np.asarray(cloud.points)[kept].T
-    return graphs.Scatter3d(x=x, y=y, z=z, mode="markers", name=name, marker=marker, showlegend=True)
