@@ -9,6 +9,7 @@ from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 import mcgicp_jax as mcg
 
@@ -194,3 +195,39 @@ def stairs(seed: int, count: int = 6000, steps: int = 12, step: float = STEP) ->
     along = step * np.array([tread, 0, rise]) / np.hypot(tread, rise)
     target, source = (rects(rng, count, sides) + NOISE * rng.normal(size=(count, 3)) for _ in range(2))
     return Pair(mcg.PointCloud(source - along), mcg.PointCloud(target), translation(*along))
+
+
+def views(seed: int, field: float = 1.6, turn: float = 1.1, apart: float = 0.5, count: int = 5000) -> Pair:
+    """Two views of a furnished room of 10 × 8 × 3 m, with real lines of sight and little in common.
+
+    The sensor sees `field` radians to the sides and one up and down; between the views it turns by `turn` radians and
+    moves by `apart` metres. The source is 0.15 m and 2.5° from where the pose is the identity.
+    """
+    rng = np.random.default_rng(seed)
+    boxes = []
+    for _ in range(6):
+        low = np.r_[rng.uniform((-4, -3), (4, 3)), 0]
+        if np.linalg.norm(low[:2]) >= 1.5:
+            boxes.append((low, low + rng.uniform(0.4, 1.2, 3)))
+    yaw = rng.uniform(0, 2 * np.pi)
+
+    def view(place: np.ndarray, yaw: float) -> np.ndarray:
+        azimuth, elevation = yaw + rng.uniform(-field / 2, field / 2, count), rng.uniform(-0.5, 0.5, count)
+        flat = np.cos(elevation)
+        rays = np.stack([flat * np.cos(azimuth), flat * np.sin(azimuth), np.sin(elevation)], axis=1)
+        # Distances at which rays leave the room, and enter and leave boxes.
+        distance = np.where(rays > 0, (np.array([5, 4, 3]) - place) / rays, (np.array([-5, -4, 0]) - place) / rays)
+        distance = distance.min(axis=1)
+        for low, high in boxes:
+            sides = np.sort([(low - place) / rays, (high - place) / rays], axis=0)
+            enters, leaves = sides[0].max(axis=1), sides[1].min(axis=1)
+            seen = (enters < leaves) & (enters > 0) & (enters < distance)
+            distance = np.where(seen, enters, distance)
+        return place + rays * (distance + NOISE * rng.normal(size=count))[:, None]
+
+    target = view(np.array([0, 0, 1.2]), yaw)
+    source = view(np.array([apart, 0.1, 1.2]), yaw + turn)
+    shift, axis = rng.normal(size=(2, 3))
+    pose = translation(*(0.15 * shift / np.linalg.norm(shift)))
+    pose[:3, :3] = Rotation.from_rotvec(np.deg2rad(2.5) * axis / np.linalg.norm(axis)).as_matrix()
+    return Pair(mcg.PointCloud(moved(np.linalg.inv(pose), source)), mcg.PointCloud(target), pose)

@@ -6,7 +6,7 @@ import pytest
 
 import mcgicp_jax as mcg
 from mcgicp_jax import Status
-from tests.promise_scenes import office, translation
+from tests.promise_scenes import office, translation, views
 from tests.scenes import motion, room_corner
 
 GICP = mcg.GICP()
@@ -128,3 +128,20 @@ def test_kernels_are_wide_inside_jit(corner):
         return mcg.register(*corner, GICP, init=init, robust=mcg.Welsch(scale)).T_target_source.as_matrix()
 
     np.testing.assert_allclose(jax.jit(registered)(0.05), registered(0.05), atol=1e-3)
+
+
+@pytest.mark.parametrize("field", [1.6, 2.2])
+def test_a_pose_that_only_more_points_fit_is_not_promised(field):
+    """1.3 m from the truth more points of these views lie on surfaces than at the truth, where the pose begins."""
+    pair = views(2, field)
+    result = mcg.register(pair.source, pair.target, GICP, init=pair.T_target_source)
+    assert error(result, pair.T_target_source) > 1 and result.status is Status.UNVERIFIED
+    (same,) = mcg.register_batch([pair.source], [pair.target], GICP, init=[pair.T_target_source])
+    assert same.status is result.status
+
+
+def test_views_with_little_in_common_that_agree_are_promised():
+    pair = views(1)
+    for init in (None, pair.T_target_source):
+        result = mcg.register(pair.source, pair.target, GICP, init=init)
+        assert result.converged and error(result, pair.T_target_source) < 0.02

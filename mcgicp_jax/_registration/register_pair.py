@@ -57,7 +57,14 @@ from mcgicp_jax._registration.options import Options, check_method
 from mcgicp_jax._registration.pose_derivative import Inputs, differentiated, jacobian, with_derivatives
 from mcgicp_jax._registration.result import USABLE, RegistrationResult, Status, is_usable
 from mcgicp_jax._registration.settings import settings_for, spacing_of
-from mcgicp_jax._registration.start_check import BETTER, GOOD_FIT, LEAST_FIT, distance_moved, surface_fit
+from mcgicp_jax._registration.start_check import (
+    BETTER,
+    GOOD_FIT,
+    LEAST_FIT,
+    LITTLE_IN_COMMON,
+    distance_moved,
+    surface_fit,
+)
 from mcgicp_jax._registration.tie_points_and_prior import (
     GivenPrior,
     GivenTiePoints,
@@ -186,9 +193,11 @@ def run_pair(given: Inputs, init: Pose | None, options: Options, traced: bool = 
         (result,) = results_of([solve(scale, start, replace(options, max_distance=None))], [None])
         start = result.matrix if is_usable(result) else start
     run = solve(inputs, start)
+    ambiguous = False
     # A given coarse distance says how far off the initial pose may be.
-    if not traced and options.max_distance is None and _may_have_left(run, init, len(coarse) > 0):
-        run = _better(run, solve(inputs, init, replace(options, max_coarse_distance=0.0)))
+    if not traced and options.max_distance is None:
+        finely = partial(solve, inputs, init, replace(options, max_coarse_distance=0.0))
+        run, ambiguous = _unless_left(run, init, len(coarse) > 0, finely)
     if options.equalize_channels and not any(term.estimates_gains for term in run.problem.terms):
         # Parameters left None are chosen anew, from the channels as equalised by the matches.
         again = _equalized(run.inputs._replace(method=inputs.method), _nearest_points(run, search))
@@ -200,6 +209,9 @@ def run_pair(given: Inputs, init: Pose | None, options: Options, traced: bool = 
     if not measures:
         if not traced and run.loop.state.status == Status.DEGENERATE and run.loop.state.directions is not None:
             _warn_of_near_points(run)
+        if ambiguous and run.loop.state.status == Status.CONVERGED:
+            state = run.loop.state._replace(status=np.asarray(Status.UNVERIFIED, np.int32))
+            run = run._replace(loop=run.loop._replace(state=state), state=lambda: state)
         return run
     # Again from its pose, with tie points and prior weighed by its covariance.
     fusion = fusion_of(run.loop.state, run.moments(), run.inputs.tie_points, run.inputs.prior, traced)
@@ -324,29 +336,36 @@ def rows_to_match(source: PointCloud, options: Options) -> Int[AnyArray, "n"] | 
     return None if limit is None or limit >= source.valid.size else spread_rows(source.valid, limit)
 
 
-def _may_have_left(run: Run, init: Pose | None, at_scales: bool) -> bool:
-    """Whether a registration on the host may have left a right initial pose: it has moved the points by more than the
-    fine `max_distance`, and surfaces do not coincide at its pose."""
+def _unless_left(run: Run, init: Pose | None, at_scales: bool, finely: Callable[[], Run]) -> tuple[Run, bool]:
+    """A registration, or `finely()`, the one with the fine `max_distance` alone, if it may have left a right initial
+    pose and surfaces coincide better there; and whether it is ambiguous.
+
+    It may have left it if it has moved the points by more than that distance, and surfaces do not coincide at its pose,
+    or have little in common. Then the pose is ambiguous unless both end at the same one. (At several scales the initial
+    pose is known to be far off, where the fine distance leads nowhere.)
+    """
     settings, state = run.problem.settings, run.loop.state
     if not (at_scales or settings.max_distance > settings.fine_distance) or state.status not in USABLE:
-        return False
+        return run, False
     source, target = run.inputs[:2]
     start = se3_from_matrix(centred_pose(init, source, target), source.points.dtype)
-    return bool(distance_moved(start, state) > settings.fine_distance) and _fit(run) < LEAST_FIT
-
-
-def _better(run: Run, other: Run) -> Run:
-    """The other registration of the same clouds, if its surfaces coincide better."""
+    if distance_moved(start, state) <= settings.fine_distance:
+        return run, False
+    fit, common = _fit(run)
+    little = common < LITTLE_IN_COMMON and not at_scales
+    if fit >= LEAST_FIT and not little:
+        return run, False
+    other = finely()
     if other.loop.state.status not in USABLE:
-        return run
-    fits, matches = zip(
-        *((_fit(each), float(each.loop.state.record.num_inliers)) for each in (run, other)), strict=True
-    )
-    coincide = fits[1] * matches[1] > BETTER * fits[0] * matches[0]
-    return other if coincide and (matches[1] <= matches[0] or fits[1] > GOOD_FIT) else run
+        return run, little
+    other_fit, _ = _fit(other)
+    matches, other_matches = (float(each.loop.state.record.num_inliers) for each in (run, other))
+    better = other_fit * other_matches > BETTER * fit * matches
+    apart = distance_moved(state.pose, other.loop.state) > settings.fine_distance
+    return other if better and (other_matches <= matches or other_fit > GOOD_FIT) else run, little and apart
 
 
-def _fit(run: Run) -> float:
+def _fit(run: Run) -> tuple[float, float]:
     return surface_fit(run.inputs, cast(HostExecutor, run.executor), run.loop)
 
 

@@ -38,6 +38,7 @@ from tests.promise_scenes import (
     stairs,
     tiles,
     translation,
+    views,
 )
 from tests.scenes import motion
 
@@ -109,12 +110,22 @@ def start_cases() -> Iterator[Case]:
     yield case("office, in another frame, from truth", framed, mcg.GICP(), {"init": np.eye(4)})
     for kernel in (mcg.Tukey, mcg.Welsch, mcg.GemanMcClure):
         yield case(f"room, {kernel.__name__}(0.05), from 0.19 m", room, mcg.GICP(), {"robust": kernel(0.05)})
+    for (field, turn, apart), start in itertools.product(
+        ((1.6, 1.1, 0.5), (2.2, 1.1, 0.5), (1.6, 0.8, 0.5), (1.6, 1.1, 1.5)), ("identity", "truth")
+    ):
+        words = f"views of {np.degrees(field):.0f}°, {np.degrees(turn):.0f}° and {apart} m apart, from {start}"
+        yield Case("starts", words, partial(from_start, partial(views, field=field, turn=turn, apart=apart), start))
     yield case("stairs, from 0.3 m (a limit)", stairs, mcg.GICP(), {})
     yield case("stairs, from global", stairs, mcg.GICP(), {"init": "global"})
 
 
 def case(name: str, scene: Callable[[int], Pair], method: mcg.AbstractMethod, options: dict[str, Any]) -> Case:
     return Case("starts", name, lambda seed: registered(scene(seed), method, **options))
+
+
+def from_start(scene: Callable[[int], Pair], start: str, seed: int) -> tuple[mcg.RegistrationResult, np.ndarray]:
+    pair = scene(seed)
+    return registered(pair, mcg.GICP(), init=pair.T_target_source if start == "truth" else None)
 
 
 def with_tiles(seed: int) -> Pair:
