@@ -9,9 +9,9 @@ from functools import partial
 import numpy as np
 from jaxtyping import Bool, Float
 
+import mcgicp_jax.datasets._raycast as raycast
 from mcgicp_jax._clouds.columns import COLORS
 from mcgicp_jax._clouds.point_cloud import PointCloud
-from mcgicp_jax.datasets import _raycast as raycast
 from mcgicp_jax.datasets._frames import Matrix, SyntheticFrames, check_scene, pose_of, scene_and_path_rng
 
 # The constants of this module define the scene and the sensor.
