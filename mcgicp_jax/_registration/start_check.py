@@ -2,7 +2,8 @@
 
 The coarse phase is made for initial poses that are several spacings off. Where the clouds are parts of a scene that
 were cut, it may leave a right initial pose: all points beyond the cut match its border, and pull it to themselves. At
-such a pose more points have matches than at the right one, but the surfaces do not coincide.
+such a pose more points have matches than at the right one, but the surfaces do not coincide. Where views have little in
+common, the surfaces may coincide there, too, and neither pose can be promised.
 """
 
 from __future__ import annotations
