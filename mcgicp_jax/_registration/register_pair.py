@@ -163,6 +163,11 @@ def prepared(
         source, target = without_constant_part(source), without_constant_part(target)
     if options.voxel_sizes and not (source.covariances is None and target.covariances is None):
         raise ValueError("voxel_sizes: expected none for clouds with covariances, which cannot be averaged in voxels")
+    if options.voxel_sizes and not is_concrete(primal((source, target))):
+        raise ValueError(
+            "voxel_sizes: expected none inside jit and vmap, where preprocess(cloud, voxel_size, size=...) averages the "
+            "points"
+        )
     if options.voxel_sizes and method.needs_covariances and not is_concrete(source, target):
         raise ValueError("voxel_sizes: expected none for derivatives with cells; make these with voxel_gaussians")
     return Inputs(source, target, method, options.robust, *checked_measurements(tie_points, prior, source, target))
