@@ -165,7 +165,7 @@ def prepared(
         raise ValueError("voxel_sizes: expected none for clouds with covariances, which cannot be averaged in voxels")
     if options.voxel_sizes and not is_concrete(primal((source, target))):
         raise ValueError(
-            "voxel_sizes: expected none inside jit and vmap, where preprocess(cloud, voxel_size, size=...) averages the "
+            "voxel_sizes: expected none inside jit and vmap, where preprocess(cloud, voxel_size, size=...) averages "
             "points"
         )
     if options.voxel_sizes and method.needs_covariances and not is_concrete(source, target):
