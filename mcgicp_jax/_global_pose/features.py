@@ -124,10 +124,10 @@ def _simple_histograms(
     near = around.present & (square > 0) & (square <= radius * radius)
     distance = jnp.sqrt(jnp.where(near, square, 1))
     line = [offset / distance for offset in offsets]
-    own = [axis[None] for axis in around.own_channels]
+    own, other = [axis[None] for axis in around.own_channels], list(around.near_channels)
     # Normals of the neighbours, on the side of the point's own.
-    side = jnp.where(alg.dot(own, around.near_channels) >= 0, 1, -1).astype(square.dtype)
-    other = [side * axis for axis in around.near_channels]
+    side = jnp.where(alg.dot(own, other) >= 0, 1, -1).astype(square.dtype)
+    other = [side * axis for axis in other]
     own_along, other_along = alg.dot(own, line), alg.dot(other, line)
     swapped = jnp.abs(own_along) < jnp.abs(other_along)
     u = [jnp.where(swapped, b, a) for a, b in zip(own, other, strict=True)]

@@ -357,7 +357,7 @@ def _unless_left(run: Run, init: Pose | None, at_scales: bool, finely: Callable[
     if distance_moved(start, state) <= settings.fine_distance:
         return run, False
     fit, common = _fit(run)
-    little = common < LITTLE_IN_COMMON and not at_scales
+    little = bool(common < LITTLE_IN_COMMON) and not at_scales
     if fit >= LEAST_FIT and not little:
         return run, False
     other = finely()
@@ -366,7 +366,7 @@ def _unless_left(run: Run, init: Pose | None, at_scales: bool, finely: Callable[
     other_fit, _ = _fit(other)
     matches, other_matches = (float(each.loop.state.record.num_inliers) for each in (run, other))
     better = other_fit * other_matches > BETTER * fit * matches
-    apart = distance_moved(state.pose, other.loop.state) > settings.fine_distance
+    apart = bool(distance_moved(state.pose, other.loop.state) > settings.fine_distance)
     return other if better and (other_matches <= matches or other_fit > GOOD_FIT) else run, little and apart
 
 

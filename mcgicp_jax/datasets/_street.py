@@ -113,7 +113,7 @@ def street(
 # The sensor
 
 
-def _pose(smooth: bool, step: float, sway: float, yaw: float, tilt: float, time: float) -> Matrix:
+def _pose(smooth: bool, step: float, sway: float, yaw: float, tilt: float, time: float | int) -> Matrix:
     """The pose at a time in frames."""
     if smooth:
         sway_phase = yaw_phase = tilt_phase = time / _SMOOTH
