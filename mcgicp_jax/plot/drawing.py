@@ -69,7 +69,7 @@ class View:
     @property
     def extent(self) -> tuple[float, float, float, float]:
         """Left, right, lower and upper end of a picture from its lower left corner, metres."""
-        return 0, self.width * self.pixel, 0, self.height * self.pixel
+        return 0.0, self.width * self.pixel, 0.0, self.height * self.pixel
 
     def project(self, points: Points) -> tuple[Int[np.ndarray, "N"], Float[np.ndarray, "N"]]:
         """The row-major pixel index of each point, −1 if outside, and its height above the plane in metres."""
