@@ -70,7 +70,7 @@ def matched_at(source, target, method, pose, matches, robust=None, temperature=N
 
 def sums_at(pose, matched, both):
     """The sums that update a pose, (4, 4), from `matched_at`."""
-    return sums_of(Motion(pose[:3, :3], pose[:3, 3]), matched, both.terms, 0.0)
+    return sums_of(Motion(pose[:3, :3], pose[:3, 3]), matched, both.terms, 0.0, np.bool_(True))
 
 
 def rectangles(*sides: tuple[tuple[float, ...], tuple[float, ...], tuple[float, ...]]) -> Callable[..., np.ndarray]:

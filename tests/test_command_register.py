@@ -180,6 +180,18 @@ def test_compare(files, capsys):
 
 
 @pytest.mark.slow
+def test_compare_leaves_out_methods_that_refuse_the_clouds(tmp_path, capsys):
+    """Of sixty points, cells of six are too few."""
+    names = [str(tmp_path / f"{name}.npz") for name in ("source", "target")]
+    for seed, name in enumerate(names):
+        io.write(name, mcg.PointCloud(*room_corner(60, seed=seed)))
+    assert main(["compare", *names]) in (0, 1)
+    lines = capsys.readouterr().out.splitlines()
+    assert sum("left out: " in line and "4 cells of 6 points" in line for line in lines) == 3
+    assert any(line.startswith("gicp ") and line.endswith("converged") for line in lines)
+
+
+@pytest.mark.slow
 def test_demo(tmp_path, capsys):
     folder = tmp_path / "some" / "folder"
     assert main(["demo", "--output", str(folder)]) == 0

@@ -366,6 +366,7 @@ def test_priors_that_do_not_fit_are_refused(room):
     few = mcg.odometry(frames[:2], mcg.GICP(), priors=[None])
     next(few)
     refused(lambda: next(few), "priors[1]")
+    refused(lambda: next(mcg.odometry(frames, mcg.GICP(), priors=[3])), "priors[0]")
     wrong = mcg.odometry(frames[:2], mcg.GICP(), priors=[None, (2 * np.eye(4), np.eye(6))])
     next(wrong)
     refused(lambda: next(wrong), "priors[1]: pose")

@@ -51,7 +51,9 @@ class Given(AbstractTerm):
 
 
 # With data as arguments, so that all tests share a program.
-measure = jax.jit(lambda matched, term: sums_of(Motion(jnp.eye(3), jnp.zeros(3)), matched, (term,), 0.0))
+measure = jax.jit(
+    lambda matched, term: sums_of(Motion(jnp.eye(3), jnp.zeros(3)), matched, (term,), 0.0, np.bool_(True))
+)
 update_of = jax.jit(_solve.solve_update)
 
 

@@ -246,10 +246,10 @@ def _compare(
     print(f"\n{'method':{width}}  {measures:>22}  iterations  time, ms  status")
     if true_pose is not None:
         print(f"{'(start)':{width}}  {pair.errors(pair.start, true_pose)}")
-    methods = _compiled(pair, names)
+    methods, refusals = _compiled(pair, names)
     for name in names:
         if name not in methods:
-            print(f"{name:{width}}  left out: no channels in common")
+            print(f"{name:{width}}  left out: {refusals.get(name, 'no channels in common')}")
             continue
         method = methods[name]
         pair.register(name, method)
@@ -265,20 +265,30 @@ def _compare(
     return results
 
 
-def _compiled(pair: PreparedPair, names: Sequence[MethodName]) -> dict[MethodName, AbstractMethod]:
-    """The methods that the pair has channels for, each run once so that its programs are compiled."""
+def _compiled(
+    pair: PreparedPair, names: Sequence[MethodName]
+) -> tuple[dict[MethodName, AbstractMethod], dict[MethodName, str]]:
+    """The methods that the pair has channels for, each run once so that its programs are compiled; and the reasons of
+    those that refuse the clouds, such as too few points in cells."""
     methods: dict[MethodName, AbstractMethod] = {}
+    refusals: dict[MethodName, str] = {}
 
     def run(uses_channels: bool) -> None:
         for name in names:
             if METHODS[name].kind.uses_channels == uses_channels:
-                methods[name] = pair.method(name)
-                pair.register(name, methods[name])
+                method = pair.method(name)
+                try:
+                    pair.register(name, method)
+                    methods[name] = method
+                except ValueError as error:
+                    refusals[name] = str(error)
 
     # Methods with and without channels share no programs.
     groups = [True, False] if pair.choices.channels else [False]
     side_by_side([partial(run, uses_channels) for uses_channels in groups])
-    return methods
+    if not methods:
+        raise ValueError("; ".join(f"{name}: {reason}" for name, reason in refusals.items()))
+    return methods, refusals
 
 
 def _words(result: mcg.RegistrationResult) -> str:

@@ -116,7 +116,7 @@ def preprocessed_in(
     found = with_neighbors(cloud, voxel_size, num_neighbors, search, grid)
     _warn_of_loss(cloud, found, num_neighbors)
     if found.covariances is None:
-        warn_of_shape(found, averaged=voxel_size is not None)
+        warn_of_shape(found, all_points=voxel_size is None)
     return found
 
 

@@ -117,12 +117,12 @@ def raw_spacing(cloud: PointCloud) -> float:
     return _shape_of(points.T).spacing if len(points) > 1 else 0.0
 
 
-def warn_of_shape(cloud: PointCloud, averaged: bool) -> None:
-    """Warn of a preprocessed cloud that is a planar scan, or whose neighbourhoods do not span the surface though it is
-    not `averaged` in voxels."""
+def warn_of_shape(cloud: PointCloud, all_points: bool) -> None:
+    """Warn of a preprocessed cloud that is a planar scan; or whose neighbourhoods do not span the surface, if the user
+    asked for `all_points`."""
     points, neighbors = np.asarray(cloud.points, np.float64), cast(Any, cloud.deferred_neighbors)
     constant = (points == points[0]).all(axis=0)
-    planar, examined = constant.sum() == 1, not averaged and len(cloud) >= _LEAST_VOXELS
+    planar, examined = constant.sum() == 1, all_points and len(cloud) >= _LEAST_VOXELS
     if not examined and not planar:
         return
     # Fewer neighbours are often lines by chance.

@@ -191,7 +191,7 @@ def scores_of(
 def _discounted_observability(
     posed: PosedMatches, discount: Float[Array, "2"], terms: tuple[AbstractTerm, ...]
 ) -> Float[Array, "6 n"]:
-    geometry, *channels = observability(posed, terms)
+    geometry, *channels = observability(posed, terms, np.bool_(True))
     shown = discount[0] * geometry
     if channels:
         # Their agreement is unbiased only for matches that are nearest in position.

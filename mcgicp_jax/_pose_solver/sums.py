@@ -24,7 +24,6 @@ from mcgicp_jax._terms.base import AbstractTerm, PosedMatches
 # Observability that cells have in common by chance: planes whose noise is a third to a half of the edge of a cell had
 # up to 0.017 along free directions (D2D-NDT), crossing planes 0.0025; yards, streets, rooms and RGB-D at least 0.025.
 _BY_CHANCE = 0.02
-_LAST = np.bool_(True)
 # Fields of `Sums` that are sums over h hᵀ.
 _SECOND_MOMENTS = ("stiffness", "mass", "observability", "channel_observability", "agreement", "surplus")
 
@@ -92,7 +91,7 @@ def sums_of(
     matched: Matched,
     terms: tuple[AbstractTerm, ...],
     near: Float[AnyScalar, ""],
-    last: Bool[AnyScalar, ""] = _LAST,
+    last: Bool[AnyScalar, ""],
 ) -> Sums:
     """Compute the sums at a pose in one pass over the correspondences, the only part of a step that touches points.
 
@@ -183,7 +182,7 @@ def _share(counts: Float[Array, "n"], num_candidates: int) -> Float[Array, "n"]:
 
 
 def observability(
-    posed: PosedMatches, terms: tuple[AbstractTerm, ...], last: Bool[AnyScalar, ""] = _LAST
+    posed: PosedMatches, terms: tuple[AbstractTerm, ...], last: Bool[AnyScalar, ""]
 ) -> list[Float[Array, "6 n"]]:
     """O per correspondence, in the target's frame: mean over its two points, by shape, and where channels are used, by
     channels; then, if the surfaces have `noise` with slopes, by the agreement of the channels, and its surplus.

@@ -198,9 +198,9 @@ class _Reader:
         """Name, cloud and prior of the next frame; the cloud is raw if it is to be deskewed."""
         number, frame = next(self.frames)
         name = f"frames[{number}]"
-        prior = None if self.priors is None else next(self.priors, ())
+        prior = None if self.priors is None else next(self.priors, "no more")
         if prior is not None:
-            if len(prior) != 2:
+            if not isinstance(prior, tuple | list) or len(prior) != 2:
                 raise ValueError(f"priors[{number}]: expected (pose, covariance) or None for each frame, got {prior!r}")
             prior = pose_matrix(prior[0], f"priors[{number}]: pose"), prior[1]
         cloud = as_cloud(name, frame.cloud if isinstance(frame, Frame) else frame)
