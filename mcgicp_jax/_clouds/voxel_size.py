@@ -120,13 +120,13 @@ def raw_spacing(cloud: PointCloud) -> float:
 def warn_of_shape(cloud: PointCloud, all_points: bool) -> None:
     """Warn of a preprocessed cloud that is a planar scan; or whose neighbourhoods do not span the surface, if the user
     asked for `all_points`."""
-    points, neighbors = np.asarray(cloud.points, np.float64), cast(Any, cloud.deferred_neighbors)
+    points, neighbors = np.asarray(cloud.points), cast(Any, cloud.deferred_neighbors)
     constant = (points == points[0]).all(axis=0)
     planar, examined = constant.sum() == 1, all_points and len(cloud) >= _LEAST_VOXELS
     if not examined and not planar:
         return
     # Fewer neighbours are often lines by chance.
-    shape = _shape_of(points.T, neighbors if neighbors.shape[1] >= NUM_NEIGHBORS else None)
+    shape = _shape_of(points.T.astype(np.float64), neighbors if neighbors.shape[1] >= NUM_NEIGHBORS else None)
     if planar and shape.lines > _MOSTLY_LINES:
         warn(f"points: all have the same {'xyz'[int(constant.argmax())]}, and most lie on lines; {PLANAR_ADVICE}")
         return
