@@ -26,9 +26,11 @@ def test_unknown_options_are_named(function):
     clouds = [POINTS] * 2
     given = (clouds, clouds, mcg.GICP()) if function in (mcg.register, mcg.register_batch) else (clouds, mcg.GICP())
     # Only one pair can have tie points.
-    for option, told in (("max_distanc", "did you mean max_distance or max_iter"), ("tie_points", "voxel_sizes")):
-        if option == "tie_points" and function is mcg.register:
-            continue
+    asked = {"max_distanc": "did you mean max_distance or max_iter", "tie_points": "voxel_sizes"}
+    if function is mcg.register:
+        asked = asked | {"voxel_size": "average the clouds by preprocess"}
+        del asked["tie_points"]
+    for option, told in asked.items():
         with pytest.raises(TypeError, match=rf"^{function.__name__}: .*'{option}'.*{told}"):
             list(function(*given, **{option: None}).__iter__())
 

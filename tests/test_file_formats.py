@@ -535,6 +535,12 @@ def test_transposed_npy_is_refused(tmp_path):
         io.read(tmp_path / "c.npy")
 
 
+def test_a_table_of_two_columns_is_no_cloud(tmp_path):
+    (tmp_path / "two.xyz").write_text("1 2\n3 4\n")
+    with pytest.raises(ValueError, match=r"two\.xyz.*at least three columns, x, y and z, got 2"):
+        io.read(tmp_path / "two.xyz")
+
+
 def test_text_in_utf_16(tmp_path):
     (tmp_path / "c.csv").write_text("x,y,z,intensity\n1,2,3,4\n", encoding="utf-16")
     cloud = io.read(tmp_path / "c.csv")

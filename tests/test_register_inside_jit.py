@@ -160,7 +160,7 @@ def test_the_traced_loop_is_the_host_loop(noisy):
 @pytest.mark.slow
 @pytest.mark.timeout(280)
 def test_nothing_dead_locks():
-    """Large clouds, two threads, hundreds of calls, gradients under vmap: a hang fails by its time limit."""
+    """Large clouds, two threads, thousands of callbacks, gradients under vmap: a hang fails by its time limit."""
     source, target, _ = pair(size=20_000)
     method = mcg.MultiChannelGICP(0.05, 0.3)
 
@@ -190,7 +190,7 @@ def test_nothing_dead_locks():
     small, other, _ = pair(size=2000)
     batch = jnp.stack([small.channels + 0.01 * i for i in range(8)])
     batched = jax.jit(jax.vmap(jax.grad(of(small, other))))
-    for _ in range(100):
+    for _ in range(30):
         gradient = jax.block_until_ready(batched(batch))
     assert np.isfinite(gradient).all()
 

@@ -84,7 +84,7 @@ def warn_of_patterns(source: PointCloud) -> None:
     if shares:
         warn(
             f"channels: a smooth function of position, or one of range, elevation or azimuth, explains "
-            f"{', '.join(shares)} (variance); such channels may move with the sensor, and hold the pose where it was"
+            f"{', '.join(shares)} (variance); such channels may move with the sensor, and the pose is UNVERIFIED"
         )
 
 

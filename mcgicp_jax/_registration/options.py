@@ -123,6 +123,7 @@ def options_of(function: Callable[..., Any], given: Any) -> Options:
     for name in given.keys() - names:
         close = difflib.get_close_matches(name, names)
         hint = f"did you mean {' or '.join(close)}?" if close else f"expected one of {', '.join(sorted(names))}"
+        hint = "average the clouds by preprocess(cloud, voxel_size=...)" if name == "voxel_size" else hint
         raise TypeError(f"{function.__name__}: got an unexpected argument {name!r}; {hint}")
     return Options(**given)
 

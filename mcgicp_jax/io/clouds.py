@@ -107,8 +107,8 @@ def is_cloud(path: Path) -> bool:
 def read(path: str | os.PathLike[str], *, columns: int | None = None) -> PointCloud:
     """Read a raw cloud from a file.
 
-    Every numeric column with one value per point becomes a channel, except coordinates, normals and per-point metadata
-    (label, ring, time, index and the like). The channels are, in this order:
+    Every numeric column with one value per point becomes a channel, except coordinates, normals, alpha (`a`) and
+    per-point metadata (label, class, ring, range, depth, time, index and the like). The channels are, in this order:
 
     - "intensity", in the file's unit; aliases such as reflectance, reflectivity and remission are recognised;
     - "red", "green", "blue", also from r, g, b, diffuse_* or packed rgb; integers are scaled to 0..1 (divided by 65535

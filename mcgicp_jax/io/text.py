@@ -29,6 +29,8 @@ def read_text(file: BinaryIO, size: int) -> PointCloud:
             rf"^[ \t]*(?={delimiter})|(?<={delimiter})[ \t]*(?={delimiter}|$)", "nan", lines, flags=re.MULTILINE
         )
     table = np.loadtxt(lines.splitlines(), delimiter=delimiter, ndmin=2)
+    if not names and table.shape[1] < 3:
+        raise ValueError(f"expected at least three columns, x, y and z, got {table.shape[1]}")
     names = names or ["x", "y", "z", *(f"channel_{i}" for i in range(table.shape[1] - 3))]
     columns = dict(zip(names, table.T, strict=True))
     whole = [name for name, cell in zip(names, cells, strict=True) if cell.isdigit()]
