@@ -37,7 +37,7 @@ from mcgicp_jax._terms.base import AbstractTerm, PosedMatches, linearize
 UNKNOWN = 10.0
 # Lower bound of the factors that reduce observability, dimensionless: a median of few rows may be 0.
 _LEAST_FRACTION = 0.2
-# The least number of cells along the radius. With ten cells in all, one direction hardly scatters: the least variance of
+# The least number of cells along the radius. With ten cells in all, one direction hardly scatters: its variance of
 # photometric poses was 14 (rooms) to 75 times (spheres) too small; with two along the radius, some fifty, 2.2 times.
 _LEAST_CELLS = 2.0
 # Medians of the square of a standard normal variate, and of the mean of two such squares.
