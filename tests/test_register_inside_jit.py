@@ -1,5 +1,6 @@
 """Gradients against finite differences, and registration under jit, vmap and their compositions."""
 
+import re
 import threading
 
 import equinox as eqx
@@ -155,6 +156,16 @@ def test_the_traced_loop_is_the_host_loop(noisy):
     # jit inside jit, and grad of jit of jit: no value may be one of the other trace.
     nested = jax.jit(lambda points: jnp.sum(traced(source.replace(points=points), target, method, robust)[0]))
     jax.eval_shape(jax.grad(nested), source.points)
+
+
+@pytest.mark.parametrize("photometric", [False, True])
+def test_no_program_solves_batches_of_matrices_by_lapack(photometric):
+    """Two such calls at once wait for each other forever, where XLA has a thread for each (jax 0.10.2, two cores)."""
+    source, target, _ = pair(size=200)
+    method = mcg.MultiChannelGICP(photometric=photometric)
+    program = jax.jit(lambda source, target: mcg.register(source, target, method)).lower(source, target).as_text()
+    operands = re.findall(r"@lapack_\w+\(.*?: \(tensor<([^>]*)>", program)
+    assert operands and {operand.count("x") for operand in operands} == {2}, operands
 
 
 @pytest.mark.slow

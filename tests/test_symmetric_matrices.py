@@ -173,6 +173,19 @@ def test_gradient_of_the_floor_is_finite():
 
 
 @EXAMPLES
+@given(seed=SEEDS, scale=SCALES)
+def test_solve(seed, scale):
+    rng = np.random.default_rng(seed)
+    rows = rng.normal(size=(4, 35, 40))
+    matrices = np.asarray(scale * (rows @ rows.swapaxes(1, 2) + np.eye(35)), dtype())
+    sides = np.asarray(rng.normal(size=(4, 35)), dtype())
+    expected = cov.solve(matrices.astype(float), sides.astype(float))
+    np.testing.assert_allclose(np.einsum("nij,nj->ni", matrices, expected), sides, atol=1e-6)
+    actual = jax.jit(cov.solve)(jnp.asarray(matrices), jnp.asarray(sides))
+    np.testing.assert_allclose(actual, expected, atol=tolerance(1e-3, 1e-11) * np.abs(expected).max())
+
+
+@EXAMPLES
 @given(seed=SEEDS)
 def test_rotate_multiply_and_outer(seed):
     rng = np.random.default_rng(seed)

@@ -22,6 +22,7 @@ from mcgicp_jax._compute.cache import cached_with_cloud
 from mcgicp_jax._compute.concrete import AnyArray, AnyScalar, constant, is_concrete, numpy_for
 from mcgicp_jax._compute.linear_maps import primal
 from mcgicp_jax._compute.messages import warn
+from mcgicp_jax._math import symmetric_matrices as alg
 from mcgicp_jax._math.statistics import median, sampled_rows
 
 # Share of the variance above which a channel is no texture. By angles, nine patterns on three scenes have 0.82 to 1.00
@@ -246,7 +247,7 @@ def _smooth(sample: _Sample) -> Float[AnyArray, "C"]:
     scale = xp.trace(matrix, axis1=-2, axis2=-1)[..., None, None] / len(basis)
     matrix = matrix + _RIDGE * xp.where(scale > 0, scale, 1) * np.eye(len(basis), dtype=matrix.dtype)
     matrix = xp.broadcast_to(matrix, (*side.shape, len(basis)))
-    second, first = xp.linalg.solve(matrix, side[..., None])[..., 0]
+    second, first = alg.solve(matrix, side)
     predicted = xp.concatenate([first @ halves[0][0], second @ halves[0][1]], axis=1)
     return _share(sample, xp.clip(predicted, -_LARGEST, _LARGEST))
 

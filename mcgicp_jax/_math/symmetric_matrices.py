@@ -13,7 +13,7 @@ from typing import TypeAlias
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
 from mcgicp_jax._compute.concrete import AnyArray, numpy_for
 from mcgicp_jax._compute.threads import with_settings_of_package
@@ -278,3 +278,19 @@ def inverse_6(matrix: Float[AnyArray, "6 6"]) -> Float[AnyArray, "6 6"]:
     return xp.concatenate(
         [xp.concatenate([first, across], axis=1), xp.concatenate([across.T, corner - ratio.T @ across], axis=1)]
     )
+
+
+def solve(matrices: Float[AnyArray, "*n m m"], sides: Float[AnyArray, "*n m"]) -> Float[AnyArray, "*n m"]:
+    """A⁻¹ b of positive definite matrices A."""
+    if numpy_for(matrices, sides) is np:
+        return np.linalg.solve(matrices, sides[..., None])[..., 0]
+    size = sides.shape[-1]
+
+    def eliminate(i: Int[Array, ""], rows: Float[Array, "*n m k"]) -> Float[Array, "*n m k"]:
+        pivot = rows[..., i, :] / rows[..., i, i, None]
+        rest = rows - rows[..., i, None] * pivot[..., None, :]
+        return rest.at[..., i, :].set(pivot)
+
+    # Gauss and Jordan, without a search for pivots.
+    rows = jnp.concatenate([matrices, sides[..., None]], axis=-1)
+    return jax.lax.fori_loop(0, size, eliminate, rows)[..., -1]
