@@ -19,7 +19,7 @@ import mcgicp_jax as mcg
 from mcgicp_jax import datasets, plot
 from mcgicp_jax._clouds.color_spaces import COLOR_SPACES
 from mcgicp_jax._clouds.preprocess import check_preprocessing
-from mcgicp_jax._compute.messages import check_integer
+from mcgicp_jax._compute.messages import check_integer, check_positive
 from mcgicp_jax._math.robust_kernels import KERNELS
 from mcgicp_jax._registration.options import ROTATION_TOLERANCE
 from mcgicp_jax._registration.options import Options as RegistrationOptions
@@ -155,7 +155,9 @@ class Options:
         """Raise `ValueError` or `OSError` for invalid options, or parameters that the method lacks; reads no cloud."""
         if self.columns is not None:
             check_integer("columns", self.columns, 3)
-        check_preprocessing(None if isinstance(self.voxel_size, str) else self.voxel_size, self.num_neighbors)
+        if not isinstance(self.voxel_size, str):
+            check_positive("voxel_size", self.voxel_size, "a positive number, auto or off")
+        check_preprocessing(None, self.num_neighbors)
         parameters = self.parameters()
         mcg.MultiChannelGICP(**parameters)
         RegistrationOptions(**self.registration())
