@@ -160,7 +160,7 @@ def test_the_traced_loop_is_the_host_loop(noisy):
 
 @pytest.mark.parametrize("photometric", [False, True])
 def test_no_program_solves_batches_of_matrices_by_lapack(photometric):
-    """Two such calls at once wait for each other forever, where XLA has a thread for each (jax 0.10.2, two cores)."""
+    """On two cores, two such calls at once wait for each other forever (jax 0.10.2)."""
     source, target, _ = pair(size=200)
     method = mcg.MultiChannelGICP(photometric=photometric)
     program = jax.jit(lambda source, target: mcg.register(source, target, method)).lower(source, target).as_text()
@@ -171,7 +171,7 @@ def test_no_program_solves_batches_of_matrices_by_lapack(photometric):
 @pytest.mark.slow
 @pytest.mark.timeout(280)
 def test_nothing_dead_locks():
-    """Large clouds, two threads, thousands of callbacks, gradients under vmap: a hang fails by its time limit."""
+    """Large clouds, two threads, over a thousand callbacks, gradients under vmap: a hang fails by its time limit."""
     source, target, _ = pair(size=20_000)
     method = mcg.MultiChannelGICP(0.05, 0.3)
 

@@ -291,6 +291,6 @@ def solve(matrices: Float[AnyArray, "*n m m"], sides: Float[AnyArray, "*n m"]) -
         rest = rows - rows[..., i, None] * pivot[..., None, :]
         return rest.at[..., i, :].set(pivot)
 
-    # Gauss and Jordan, without a search for pivots.
+    # Gauss-Jordan elimination; positive definite matrices need no pivoting.
     rows = jnp.concatenate([matrices, sides[..., None]], axis=-1)
     return jax.lax.fori_loop(0, size, eliminate, rows)[..., -1]

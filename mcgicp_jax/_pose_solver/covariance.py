@@ -37,8 +37,9 @@ from mcgicp_jax._terms.base import AbstractTerm, PosedMatches, linearize
 UNKNOWN = 10.0
 # Lower bound of the factors that reduce observability, dimensionless: a median of few rows may be 0.
 _LEAST_FRACTION = 0.2
-# The least number of cells along the radius. With ten cells in all, one direction hardly scatters: its variance of
-# photometric poses was 14 (rooms) to 75 times (spheres) too small; with two along the radius, some fifty, 2.2 times.
+# The least number of cells along the radius of the matched points. Of ten cells in all, the sums hardly scatter in one
+# direction, whose variance was 14 (rooms) to 75 times (spheres) too small with the photometric term. Two along the
+# radius make some fifty in all, with which it was at most 2.2 times too small.
 _LEAST_CELLS = 2.0
 # Medians of the square of a standard normal variate, and of the mean of two such squares.
 _MEDIAN_SQUARE, _MEDIAN_MEAN_OF_TWO = 0.455, 0.693
