@@ -26,7 +26,7 @@ def test_unknown_options_are_named(function):
     clouds = [POINTS] * 2
     given = (clouds, clouds, mcg.GICP()) if function in (mcg.register, mcg.register_batch) else (clouds, mcg.GICP())
     # Only `register` takes tie points, and it alone does not take `voxel_size`.
-    other = ("voxel_size", "average the .* by preprocess") if function is mcg.register else ("tie_points", "voxel_sizes")
+    other = ("voxel_size", "average .* by preprocess") if function is mcg.register else ("tie_points", "voxel_sizes")
     for option, told in (("max_distanc", "did you mean max_distance or max_iter"), other):
         with pytest.raises(TypeError, match=rf"^{function.__name__}: .*'{option}'.*{told}"):
             list(function(*given, **{option: None}).__iter__())
