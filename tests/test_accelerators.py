@@ -1,4 +1,4 @@
-"""Accelerators, without one: where programs run, on which devices, in what precision, and with how many lanes."""
+"""Accelerators, without one: where programs run, on which devices, in what precision, and for how many pairs."""
 
 import importlib.util
 import os
@@ -73,8 +73,8 @@ def test_products_are_in_full_precision(clouds):
     assert len(products) > 100 and not inexact
 
 
-def test_executors_do_not_run_lanes(clouds):
-    """One pair of a chunk would have all lanes for itself."""
+def test_executors_register_pairs_one_by_one(clouds):
+    """One pair would have a whole chunk for itself."""
     source, target = clouds
     options = {"search": mcg.DenseSearch(), "max_distance": 0.5}
     with ThreadPoolExecutor(2) as executor:
@@ -83,43 +83,35 @@ def test_executors_do_not_run_lanes(clouds):
     assert_same(found, [alone] * 2)
 
 
-# Number of lanes and rows of source and target of each search that is compiled.
+# Number of pairs and rows of source and target of each search that is compiled.
 COMPILED = []
 
 
-def noted(indices, note):
-    """The indices; `note` is called with the number of lanes when they are vectorised."""
-    same = jax.custom_batching.custom_vmap(lambda indices: indices)
-
-    @same.def_vmap
-    def _(count, batched, indices):
-        note(count)
-        return indices, batched[0]
-
-    return same(indices)
-
-
-class ForFewLanes(mcg.DenseSearch):
-    """A search for which memory suffices in some lanes."""
+class ForFewPairs(mcg.DenseSearch):
+    """A search for which memory suffices for some pairs."""
 
     most: int = eqx.field(static=True)
 
     def nearest_traced(self, pose, source, target, *rest):
-        def note(count):
+        same = jax.custom_batching.custom_vmap(lambda indices: indices)
+
+        @same.def_vmap
+        def _(count, batched, indices):
             COMPILED.append((count, source.valid.size, target.valid.size))
             if count > self.most:
                 raise jax.errors.JaxRuntimeError("RESOURCE_EXHAUSTED: Out of memory")
+            return indices, batched[0]
 
-        return noted(super().nearest_traced(pose, source, target, *rest), note)
+        return same(super().nearest_traced(pose, source, target, *rest))
 
 
 @pytest.mark.slow
-def test_fewer_lanes_where_memory_does_not_suffice():
+def test_smaller_chunks_where_memory_does_not_suffice():
     """No pair is lost. The surfaces are padded to a size class of each side."""
     sides = [[mcg.preprocess(raw_pair(185 + i, i)[side]) for i in range(3)] for side in (0, 1)]
     few = jax.local_device_count()
     COMPILED.clear()
-    found = mcg.register_batch(*sides, mcg.GICP(), max_distance=0.5, search=ForFewLanes(few))
+    found = mcg.register_batch(*sides, mcg.GICP(), max_distance=0.5, search=ForFewPairs(few))
     for result, source, target in zip(found, *sides, strict=True):
         alone = mcg.register(source, target, mcg.GICP(), max_distance=0.5)
         assert result.status is alone.status and max(pose_error(result.matrix, alone.matrix)) < 1e-5
@@ -130,57 +122,38 @@ def test_fewer_lanes_where_memory_does_not_suffice():
 @pytest.mark.slow
 def test_pairs_that_begin_again_keep_their_order():
     source, target = (mcg.preprocess(cloud) for cloud in raw_pair(185, 0)[:2])
-    search = ForFewLanes(jax.local_device_count())
+    search = ForFewPairs(jax.local_device_count())
     ended = mcg.register_as_completed([source] * 9, [target] * 9, mcg.GICP(), max_distance=0.5, search=search)
     assert [number for number, _ in ended] == list(range(9))
 
 
 @pytest.mark.slow
-def test_one_line_says_that_memory_does_not_suffice_for_one_lane():
+def test_one_line_says_that_memory_does_not_suffice_for_one_pair():
     source, target = (mcg.preprocess(cloud) for cloud in raw_pair(185, 0)[:2])
     with pytest.raises(MemoryError, match="padded to 192 and 256 points"):
-        mcg.register_batch([source], [target], mcg.GICP(), max_distance=0.5, search=ForFewLanes(0))
+        mcg.register_batch([source], [target], mcg.GICP(), max_distance=0.5, search=ForFewPairs(0))
 
 
-# Number of clouds of each search of neighbours that is compiled.
-CLOUDS = []
-
-
-class CountsClouds(mcg.DenseSearch):
-    def nearest_traced(self, pose, source, target, max_distance, running, num_candidates=1):
-        found = super().nearest_traced(pose, source, target, max_distance, running, num_candidates)
-        return noted(found, lambda count: CLOUDS.extend([count] * (num_candidates == 20)))
-
-
-@pytest.mark.slow
-def test_equal_clouds_of_several_pairs_are_prepared_once():
-    """Also if they are other objects, and the source in one pair and the target in another one."""
-    clouds = [np.asarray(cloud.points) for cloud in raw_pair(100, 0)[:2]]
-    pairs = {"sources": [clouds[i % 2].copy() for i in range(6)], "targets": [clouds[1 - i % 2] for i in range(6)]}
-    results = mcg.register_batch(**pairs, method=mcg.GICP(), max_distance=0.5, search=CountsClouds())
-    assert 0 < max(CLOUDS) <= 2 * jax.local_device_count()
-    assert_same(results[:2], results[4:])
-
-
-IN_LANES = """
+IN_CHUNKS = """
     import jax, numpy as np
     import mcgicp_jax as mcg
     from tests.batches import raw_pair
 
-    def registered():
-        clouds = [[raw_pair(100, seed)[side] for seed in range(5)] for side in (0, 1)]
-        poses, devices, before = {}, set(), jax.live_arrays()
+    def registered(num_devices):
+        # More than two chunks of four pairs for each device: while the first results are read, others are computed.
+        clouds = [[raw_pair(100, number % 5)[side] for number in range(9 * num_devices)] for side in (0, 1)]
+        poses, devices = {}, set()
         options = {"max_distance": 0.5, "search": mcg.DenseSearch()}
         for number, result in mcg.register_as_completed(*clouds, mcg.GICP(), **options):
             poses[number] = result.matrix
-            arrays = [array for array in jax.live_arrays() if not any(array is each for each in before)]
-            devices |= {device.id for array in arrays for device in array.devices()}
-        return [poses[number] for number in sorted(poses)], devices
+            chunks = [array for array in jax.live_arrays() if array.ndim and len(array) == 4 * num_devices]
+            devices |= {device.id for array in chunks for device in array.devices()}
+        return [poses[number] for number in range(5)], devices
 
     with jax.default_device(jax.local_devices()[2]):
-        alone, devices = registered()
+        alone, devices = registered(1)
     assert devices == {2}, devices
-    everywhere, devices = registered()
+    everywhere, devices = registered(4)
     assert devices == {0, 1, 2, 3}, devices
     np.testing.assert_allclose(alone, everywhere, atol=1e-5)
 """
@@ -193,8 +166,12 @@ def run(script, folder, **environment):
 
 
 @pytest.mark.slow
-def test_lanes_follow_the_default_device(tmp_path):
-    run(IN_LANES, tmp_path, XLA_FLAGS=os.environ["XLA_FLAGS"] + " --xla_force_host_platform_device_count=4")
+def test_chunks_follow_the_default_device(tmp_path):
+    dump = f" --xla_dump_to={tmp_path} --xla_dump_hlo_module_re=.*registered.*"
+    run(IN_CHUNKS, tmp_path, XLA_FLAGS=f"{os.environ['XLA_FLAGS']} --xla_force_host_platform_device_count=4 {dump}")
+    programs = [path.read_text() for path in tmp_path.glob("*after_optimizations.txt")]
+    # No device waits for another one.
+    assert programs and not any(re.search("all-reduce|all-gather|all-to-all|permute[(]", text) for text in programs)
 
 
 FOR_H100 = """
@@ -217,7 +194,7 @@ FOR_H100 = """
         }
         platform_name: "CUDA" device_description_str: "NVIDIA H100 80GB HBM3"
     '''
-    LANES, SIZE = 4, 4096
+    PAIRS, SIZE = 4, 4096
     clouds = [mcg.PointCloud(*room_corner(SIZE, seed=seed)) for seed in (0, 1)]
     source, target = (mcg.preprocess(cloud, voxel_size=None) for cloud in clouds)
 
@@ -226,13 +203,13 @@ FOR_H100 = """
         return mcg.register(moving, target, METHOD, max_distance=0.5, search=mcg.DenseSearch()).matrix
 
     (device,) = topologies.get_topology_desc("", "cuda", target_config=TARGET, topology="1x1x1").devices
-    points = jax.ShapeDtypeStruct((LANES, SIZE, 3), np.float32, sharding=SingleDeviceSharding(device))
+    points = jax.ShapeDtypeStruct((PAIRS, SIZE, 3), np.float32, sharding=SingleDeviceSharding(device))
     program = jax.jit(jax.vmap(pose)).lower(points).compile()
     products = re.findall(" dot[(].*", program.as_text())
     assert products and all("operand_precision={highest,highest}" in product for product in products)
     assert "callback" not in program.as_text()
     # The distances of all pairs of points are never stored.
-    assert program.memory_analysis().temp_size_in_bytes < 0.2 * LANES * 4 * SIZE**2
+    assert program.memory_analysis().temp_size_in_bytes < 0.2 * PAIRS * 4 * SIZE**2
 """
 
 

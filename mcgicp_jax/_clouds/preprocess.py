@@ -96,13 +96,15 @@ def preprocessed_in(
     voxel_size: VoxelSize | Voxels,
     num_neighbors: int,
     search: AbstractSearch | None,
+    checked: bool = True,
 ) -> PointCloud:
-    """`preprocess` for a cloud whose grid may be known, from `voxels_and_grids`."""
+    """`preprocess` for a cloud whose grid may be known, from `voxels_and_grids`. `checked`: whether to look at
+    neighbourhoods, for warnings."""
     check_preprocessing(voxel_size, num_neighbors)
     cloud = as_cloud("cloud", cloud)
     fixed = primal(cloud)
     if is_concrete(fixed) and not is_concrete(cloud):
-        found = preprocessed_in(grid, fixed, voxel_size, num_neighbors, search)
+        found = preprocessed_in(grid, fixed, voxel_size, num_neighbors, search, checked)
         return _differentiable(cloud, found, fixed)
     if not is_concrete(cloud):
         raise ValueError(
@@ -114,8 +116,9 @@ def preprocessed_in(
         # Rows without a finite channel were left out.
         grid = None
     found = with_neighbors(cloud, voxel_size, num_neighbors, search, grid)
-    _warn_of_loss(cloud, found, num_neighbors)
-    if found.covariances is None:
+    if checked:
+        _warn_of_loss(cloud, found, num_neighbors)
+    if checked and found.covariances is None:
         warn_of_shape(found, all_points=voxel_size is None)
     return found
 

@@ -1,4 +1,4 @@
-"""Registration of many pairs of clouds, independently of each other, by threads, lanes or any executor."""
+"""Registration of many pairs of clouds, independently of each other, by threads, on a device or by any executor."""
 
 from __future__ import annotations
 
@@ -92,7 +92,7 @@ def register_as_completed(
         init: initial T_target_source: one for all pairs, or an iterable with one per pair. None is the pose of the
             prior, if there is one, or the identity, and "global" the pose found by `global_pose`.
         priors: one per pair: a measurement of T_target_source, in the form of the `prior` of `register`, or None. Pairs
-            with priors do not run as lanes. With an `executor`, the poses have no derivatives by them.
+            with priors run on the CPU. With an `executor`, the poses have no derivatives by them.
         voxel_size, num_neighbors: as in `preprocess`, for raw clouds, which the workers preprocess. "auto": one size
             for both clouds of a pair; that of a single cloud for all pairs, if it has any, applies to all.
         executor: None: threads, one per core, and once the time that processes would save is 1.5 times their start,
@@ -104,8 +104,10 @@ def register_as_completed(
         covariances: False saves a tenth of the time: `covariance` and `deviations` are NaN.
         options: options of `register`, except for `tie_points` and `prior`. `search` is also used to preprocess; by
             default `KDTreeSearch` with one thread per pair. With `DenseSearch`, or without a search on accelerators,
-            pairs run as lanes of one vectorised program on `jax.default_device`, or spread over all local devices (not
+            pairs run in chunks of one vectorised program on `jax.default_device`, or spread over all local devices (not
             with an `executor`, `priors`, `equalize_channels` or `voxel_sizes`), which finds neighbours by brute force.
+            It compiles for each combination of sizes, rounded up to 128, 192, 256, 384, ... points, and only the first
+            eight pairs are looked at for the warnings of `preprocess` about neighbourhoods.
 
     Returns:
         A generator of the index of the pair, from 0, and its `RegistrationResult`.

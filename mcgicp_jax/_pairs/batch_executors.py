@@ -1,5 +1,5 @@
-"""Running the pairs of a batch: in lanes, by threads, by processes from where these pay, or in chunks by any executor,
-whose workers may die."""
+"""Running the pairs of a batch: on a device, by threads, by processes from where these pay, or by any executor, whose
+workers may die."""
 
 from __future__ import annotations
 
@@ -116,8 +116,8 @@ def _differentiable(answer: PairResult, pair: PreparedPair) -> RegistrationResul
 
 
 def _results(job: BatchJob, pairs: Iterator[Pair], executor: ChosenExecutor, count: int | None) -> Iterator[PairResult]:
-    if executor is None and job.uses_lanes:
-        yield from map(PairResult.with_warning, job.register_in_lanes(pairs, num_cores()))
+    if executor is None and job.uses_chunks:
+        yield from map(PairResult.with_warning, job.register_in_chunks(pairs, num_cores()))
     elif executor is None:
         yield from _by_threads_then_processes(job, pairs, count)
     elif executor == "threads":

@@ -12,7 +12,7 @@ the pose converges. At the final pose `scores_of` computes the contribution of e
 the pose.
 
 The loop is written once. An executor says how its parts are done: blocks of rows on the host, whole arrays inside
-transformations, lanes of a vectorised batch. The status is decided in `update`.
+transformations and in chunks of pairs on accelerators. The status is decided in `update`.
 """
 
 from __future__ import annotations

@@ -398,6 +398,7 @@ def preprocessed(
     options: Options,
     voxel_size: VoxelSize | Voxels = "auto",
     num_neighbors: int = NUM_NEIGHBORS,
+    checked: bool = True,
 ) -> list[PointCloud]:
     """The clouds "source" and "target", preprocessed with one voxel size. Where the method makes cells of raw points,
     clouds stay raw."""
@@ -406,7 +407,7 @@ def preprocessed(
     for (name, cloud), grid in zip(points.items(), grids, strict=True):
         if cloud.deferred_neighbors is None:
             with messages_named(name):
-                sides[name] = preprocessed_in(grid, cloud, voxels, num_neighbors, options.search)
+                sides[name] = preprocessed_in(grid, cloud, voxels, num_neighbors, options.search, checked)
     return list(sides.values())
 
 

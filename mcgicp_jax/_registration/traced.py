@@ -50,8 +50,14 @@ class TracedExecutor(AbstractExecutor):
         history = jax.tree.map(lambda leaf: jnp.full(self._max_iterations + 1, jnp.nan, leaf.dtype), state.record)
         return loop._replace(state=state._replace(pose=problem.start, status=first), history=history)
 
-    def run(self) -> LoopResult:
-        return jax.lax.while_loop(lambda loop: loop.state.status < 0, self.step, self.begin())
+    def run(self, max_updates: Any = None) -> LoopResult:
+        """The loop at its end, or after `max_updates`, with a negative status."""
+
+        def runs(loop: LoopResult) -> Bool[Array, ""]:
+            state = loop.state
+            return (state.status < 0) & (max_updates is None or state.num_iterations < max_updates)
+
+        return jax.lax.while_loop(runs, self.step, self.begin())
 
     def step(self, loop: LoopResult) -> LoopResult:
         loop = super().step(loop)
@@ -65,7 +71,7 @@ class TracedExecutor(AbstractExecutor):
         problem, status, settings = self.problem, state.status, self.problem.settings
         if problem.matches is not None:
             return before
-        # Under `vmap` the body also runs for finished lanes: no search for them.
+        # Under `vmap` the body also runs for registrations that have ended: no search for them.
         running = (status < 0) & (status != SETTLED)
         source, target = (
             _every(settings.stride(status, state.num_iterations), problem.source.search),

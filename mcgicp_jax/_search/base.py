@@ -156,7 +156,8 @@ class AbstractSearch(eqx.Module):
 
         Args:
             target: the points to search; the other arguments and the result are those of `AbstractIndex.nearest`.
-            running: False if the result will not be used, as in a finished lane; it may then be arbitrary.
+            running: False if the result will not be used, as of a registration that has ended under `vmap`; it is
+                arbitrary then.
         """
 
     @abc.abstractmethod

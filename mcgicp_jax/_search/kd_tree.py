@@ -117,12 +117,12 @@ class AbstractTreeSearch(AbstractSearch, TreeBackend):
         return self.neighbors_on_demand(points, num_neighbors).whole
 
     def neighbors_on_demand(self, points: Float[np.ndarray, "N 3"], num_neighbors: int) -> NeighborsOnDemand:
-        tree, shape = TiedTree(self, points), (len(points), num_neighbors)
+        tree = functools.cache(lambda: TiedTree(self, points))
 
         def find(rows: Any) -> Int[np.ndarray, "n k"]:
             # In the order of the leaves, each query finds the nodes it needs in the processor's caches.
-            order = tree.leaf_order() if rows is None else rows
-            found, _ = tree.nearest(points[order], num_neighbors)
+            order = tree().leaf_order() if rows is None else rows
+            found, _ = tree().nearest(points[order], num_neighbors)
             neighbors = np.full((len(order), num_neighbors), -1, np.int32)
             neighbors[order if rows is None else slice(None), : found.shape[1]] = found
             return neighbors
@@ -130,7 +130,7 @@ class AbstractTreeSearch(AbstractSearch, TreeBackend):
         # Pickles name the class of the search by its place, which is inside a function for a local one.
         local = "<locals>" in type(self).__qualname__
         anew = None if local else partial(self.neighbors_on_demand, points, num_neighbors)
-        return NeighborsOnDemand(find, shape, anew)
+        return NeighborsOnDemand(find, (len(points), num_neighbors), anew)
 
 
 class KDTreeSearch(AbstractTreeSearch):

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 import mcgicp_jax as mcg
 from mcgicp_jax import DenseSearch, KDTreeSearch, Status
-from mcgicp_jax._registration import vectorized as _lanes
+from mcgicp_jax._registration import chunks
 from mcgicp_jax.extend import SearchPoints
 from mcgicp_jax.metrics import pose_error
 from tests import reference as ref
@@ -20,7 +20,7 @@ from tests.compilations import compilations
 from tests.precision import in_both_precisions
 from tests.scenes import motion
 
-# Its parameters are computed for each lane.
+# Its parameters are computed for each pair.
 UNSET = mcg.MultiChannelGICP()
 T = ref.pose([0.1, -0.2, 0.3], [0.05, 0.1, -0.02])
 
@@ -151,14 +151,14 @@ def test_register_with_it_is_one_program_without_callbacks(clouds):
     assert max(pose_error(np.asarray(lowered.compile()(clouds[0][0].points), float), expected.matrix)) < 1e-5
 
 
-def lanes(sources, targets, **options):
+def in_chunks(sources, targets, **options):
     return mcg.register_batch(sources, targets, UNSET, max_distance=0.5, search=DenseSearch(), **options)
 
 
 @pytest.mark.slow
-def test_a_batch_in_lanes_is_its_pairs(raw, clouds):
-    """With more pairs than lanes of a size, so that lanes are used again."""
-    results = lanes(*clouds)
+def test_a_batch_in_chunks_is_its_pairs(raw, clouds):
+    """Of two shapes, the pairs of one of which fill more than one chunk."""
+    results = in_chunks(*clouds)
     for result, source, target in zip(results, *clouds, strict=True):
         alone = mcg.register(source, target, UNSET, max_distance=0.5, max_iterations=64)
         assert result.status is alone.status
@@ -170,17 +170,17 @@ def test_a_batch_in_lanes_is_its_pairs(raw, clouds):
             np.testing.assert_allclose(result.information, alone.information, rtol=1e-2, atol=1)
     # In another order, and without one of the others.
     order = np.random.default_rng(0).permutation(len(raw))[1:]
-    assert_same(lanes(*([side[i] for i in order] for side in clouds)), [results[i] for i in order])
+    assert_same(in_chunks(*([side[i] for i in order] for side in clouds)), [results[i] for i in order])
 
 
-def test_raw_clouds_in_lanes_are_prepared_as_one_by_one(raw):
+def test_raw_clouds_in_chunks_are_prepared_as_one_by_one(raw):
     """Neighbours, surfaces and parameters are computed on the device. A pair without enough points does no harm."""
     sides = [[raw[i][side] for i in (0, 1, 3, 5)] for side in (0, 1)]
     sides[0][1] = np.zeros((3, 3))
     spoilt = sides[1][2]
     sides[1][2] = spoilt.replace(points=np.where(np.arange(310)[:, None] % 10, spoilt.points, np.nan))
     with pytest.warns(mcg.PairWarning, match="pair 1"), ThreadPoolExecutor(1) as executor:
-        found, expected = lanes(*sides), lanes(*sides, executor=executor)
+        found, expected = in_chunks(*sides), in_chunks(*sides, executor=executor)
     assert [result.status for result in found] == [result.status for result in expected]
     assert [result.converged for result in found] == [True, False, True, True]
     for i in (0, 2, 3):
@@ -196,21 +196,30 @@ def test_pairs_of_shapes_that_the_method_refuses(raw):
     assert [result.status for result in results] == [Status.INVALID_INPUT] * 2
 
 
-def test_a_bad_pair_spoils_no_other_lane(clouds):
-    expected = lanes(*clouds)
+def test_a_bad_pair_spoils_no_other(clouds):
+    expected = in_chunks(*clouds)
     sources, targets = (list(side) for side in clouds)
     sources[0], targets[4] = np.zeros((3, 3)), np.full((9, 3), np.nan)
     starts = [None, motion((100.0, 0, 0, 0, 0, 0)), None, None, None, None]
     with pytest.warns(UserWarning, match="pair [04]"):
-        results = lanes(sources, targets, init=starts)
+        results = in_chunks(sources, targets, init=starts)
     assert [result.status for result in results[:2]] == [Status.INVALID_INPUT, Status.TOO_FEW_CORRESPONDENCES]
     assert results[4].status is Status.INVALID_INPUT
     for i in (2, 3, 5):
         assert_same(results[i : i + 1], expected[i : i + 1])
 
 
+def test_pairs_of_many_updates_leave_their_chunk_and_lose_nothing(clouds, monkeypatch):
+    expected = in_chunks(*clouds)
+    updates = sorted(int(result.num_iterations) for result in expected)
+    monkeypatch.setattr(chunks, "_FIRST_UPDATES", updates[len(updates) // 2])
+    with compilations() as found:
+        assert_same(in_chunks(*clouds), expected)
+    assert not found
+
+
 def test_a_rare_size_does_not_wait_for_the_end(clouds, monkeypatch):
-    monkeypatch.setattr(_lanes, "_PATIENCE", 2)
+    monkeypatch.setattr(chunks, "_PATIENCE", 2)
     # 490 points fill the larger size class, the others the smaller.
     rare, usual = 2, [0, 1, 3, 5] * 3
     order = [rare, *usual]
@@ -224,7 +233,7 @@ def test_a_rare_size_does_not_wait_for_the_end(clouds, monkeypatch):
     first = ended()
     assert sorted(first) == list(range(len(order)))
     assert first.index(0) < len(order) - 4
-    # Lanes that are made again use the programs of the first.
+    # Another batch uses the programs of the first.
     with compilations() as found:
         assert ended() == first
     assert not found

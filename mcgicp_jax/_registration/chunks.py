@@ -1,0 +1,274 @@
+"""Many registrations as chunks of one program without callbacks, for accelerators.
+
+The host reads clouds, averages them in voxels and leaves out points, whose number decides shapes; it copies the rows of
+a chunk of pairs into one array. All else is done on the devices: neighbours, surfaces, the loop, its assessment.
+"""
+
+from __future__ import annotations
+
+import collections
+from collections.abc import Iterable, Iterator
+from dataclasses import replace
+from functools import partial
+from typing import Any, Generic, NamedTuple, TypeVar
+
+import jax
+import jaxlie
+import numpy as np
+from jax.sharding import Mesh, NamedSharding, PartitionSpec
+from jaxtyping import Array, Int
+
+from mcgicp_jax._clouds.point_cloud import PointCloud
+from mcgicp_jax._clouds.preprocess_inside_jit import traced_neighbors
+from mcgicp_jax._compute.devices import default_devices
+from mcgicp_jax._compute.tables import Packed
+from mcgicp_jax._compute.threads import with_settings_of_package
+from mcgicp_jax._math.robust_kernels import AbstractKernel
+from mcgicp_jax._methods.base import AbstractMethod
+from mcgicp_jax._registration.assessment import Assessment
+from mcgicp_jax._registration.loop import Record, State
+from mcgicp_jax._registration.options import Options
+from mcgicp_jax._registration.pose_derivative import Inputs
+from mcgicp_jax._registration.register_pair import problem_of
+from mcgicp_jax._registration.traced import TracedExecutor, assess
+from mcgicp_jax._search.base import AbstractSearch
+
+Key = TypeVar("Key")
+
+# Largest number of pairs of a chunk per device: on an H200, chunks of 256 pairs took 0.7 (2,000 points) to 0.95 (6,000
+# points) of the time of chunks of 64. Batches of fewer pairs have smaller chunks; a few sizes, each of which compiles.
+_SIZES = (16, 64, 256)
+# Rows of both clouds of all pairs of a chunk per device, at most: 256 pairs of two clouds of 4,096 rows.
+_ROWS = 2**21
+# On a CPU, where pairs that have ended cost as much as others until all have.
+_SIZE_ON_CPU = 4
+# Updates of the pose after which pairs that have not ended leave their chunk, and begin again in one with others like
+# them: of 1,024 pairs of 2,000 points, 19 took up to 64 updates, and the others 6 to 20. Twice as many for further
+# chunks where more than this fraction of the pairs had to leave.
+_FIRST_UPDATES, _MANY = 24, 0.1
+# Chunks that are dispatched before the results of the first are fetched: the host prepares one while the devices work.
+_DISPATCHED = 2
+# A chunk runs partly filled after this many pairs of other shapes: a stream of pairs yields results while it goes on.
+_PATIENCE = 256
+# Clouds whose neighbours are found at a time: 14 MB each with 20 neighbours.
+_CLOUDS = 16
+
+
+class ChunkPair(NamedTuple):
+    """A pair of clouds that waits for a chunk, as NumPy arrays.
+
+    Attributes:
+        start: initial pose of the centred clouds.
+        max_coarse_distance: as in `Options`.
+        source, target: finite points, padded to a size class, origin and names left out; neighbours that are None are
+            found on the devices.
+    """
+
+    start: jaxlie.SE3
+    max_coarse_distance: Any
+    source: PointCloud
+    target: PointCloud
+
+
+class Ended(NamedTuple, Generic[Key]):
+    """A registration that has ended, with the key of its pair."""
+
+    key: Key
+    state: State
+    assessment: Assessment
+    history: Record
+
+
+class Refused(NamedTuple, Generic[Key]):
+    """The key of a pair whose shapes the method refuses, and its reason."""
+
+    key: Key
+    reason: ValueError
+
+
+def run_pairs(
+    pairs: Iterable[tuple[Key, ChunkPair]],
+    method: AbstractMethod,
+    options: Options,
+    search: AbstractSearch,
+    num_neighbors: int,
+) -> Iterator[Ended[Key] | Refused[Key]]:
+    """Register many pairs, spread over the `default_devices`, and yield their results. `num_neighbors` is that of
+    clouds that have no neighbours yet. Pairs of the same shapes share a program."""
+    # Numbers are traced, so that others compile nothing.
+    numbers = options.numbers
+    if isinstance(options.max_distance, tuple):
+        numbers["max_distance"] = np.asarray(options.max_distance)
+    fixed = Options(
+        **{name: getattr(options, name) for name in ("max_iterations", "max_source_points", "min_coarse_distance")}
+    )
+    devices = np.array(default_devices())
+    program = partial(
+        _registered,
+        method=method,
+        robust=options.robust,
+        numbers=numbers,
+        search=search,
+        options=fixed,
+        num_neighbors=num_neighbors,
+        mesh=Mesh(devices, ("pairs",)),
+    )
+    groups: dict[Any, _Group[Key]] = {}
+    last: dict[Any, int] = {}
+    for number, (key, pair) in enumerate(pairs):
+        kind = _shapes(pair)
+        if kind not in groups:
+            groups[kind] = _Group(program, devices, fixed.max_iterations)
+        last[kind] = number
+        groups[kind].waiting.append((key, pair))
+        while groups[kind].is_full():
+            yield from groups[kind].run()
+        for rare in [kind for kind in groups if number - last[kind] > _PATIENCE]:
+            yield from groups.pop(rare).finish()
+    for group in groups.values():
+        yield from group.finish()
+
+
+class _Group(Generic[Key]):
+    """Pairs of the same shapes, and their chunks. Where memory does not suffice, chunks have half the size, and the
+    pairs on the devices begin again."""
+
+    def __init__(self, program: Any, devices: np.ndarray, max_iterations: int):
+        self._program, self._devices, self._on_cpu = program, devices, devices[0].platform == "cpu"
+        # A loop that has not ended has made at most one update less.
+        self._all_updates = max_iterations + 1
+        self._first_updates = min(_FIRST_UPDATES, self._all_updates)
+        self._per_device = 0
+        self.waiting: collections.deque[tuple[Key, ChunkPair]] = collections.deque()
+        self._slow: collections.deque[tuple[Key, ChunkPair]] = collections.deque()
+        self._dispatched: collections.deque[tuple[list[tuple[Key, ChunkPair]], bool, Any]] = collections.deque()
+
+    def _largest(self) -> int:
+        """The largest number of pairs of a chunk per device."""
+        if self._on_cpu:
+            return _SIZE_ON_CPU
+        rows = sum(cloud.valid.size for cloud in self.waiting[0][1][2:])
+        return max(size for size in _SIZES if size * rows <= _ROWS or size == _SIZES[0])
+
+    def is_full(self) -> bool:
+        return len(self.waiting) >= (self._per_device or self._largest()) * len(self._devices)
+
+    def finish(self) -> Iterator[Ended[Key] | Refused[Key]]:
+        """Run until no pair is left."""
+        while self.waiting or self._slow or self._dispatched:
+            yield from self.run()
+
+    def run(self) -> Iterator[Ended[Key] | Refused[Key]]:
+        """Dispatch a chunk, if pairs wait, and yield the results of the oldest one if enough are dispatched."""
+        ended: list[Ended[Key] | Refused[Key]] = []
+        try:
+            waits = bool(self.waiting or (self._slow and not self._dispatched))
+            if waits:
+                self._dispatch()
+            if not waits or len(self._dispatched) >= _DISPATCHED:
+                ended = self._fetched()
+        except jax.errors.JaxRuntimeError as error:
+            if "RESOURCE_EXHAUSTED" not in str(error):
+                raise
+            begun = [pair for pairs, *_ in self._dispatched for pair in pairs]
+            if self._per_device == 1:
+                rows = " and ".join(str(cloud.valid.size) for cloud in begun[0][1][2:])
+                raise MemoryError(
+                    f"the memory of the device does not suffice for a pair padded to {rows} points; average the points "
+                    "in larger voxels, or use KDTreeSearch()"
+                ) from error
+            self._per_device //= 2
+            self.waiting.extendleft(reversed(begun))
+            self._dispatched.clear()
+        except ValueError as error:
+            # While the program is traced: no pair of these shapes can be registered.
+            pairs, *_ = self._dispatched.pop()
+            ended = [Refused(key, error) for key, _ in pairs]
+        yield from ended
+
+    def _dispatch(self) -> None:
+        """Start the program for the next pairs; copies of the last one fill up the chunk."""
+        if not self._per_device:
+            most = self._largest()
+            wanted = -(-len(self.waiting) // len(self._devices))
+            self._per_device = next((size for size in _SIZES if wanted <= size < most), most)
+        size, first = self._per_device * len(self._devices), bool(self.waiting)
+        queue = self.waiting if first else self._slow
+        pairs = [queue.popleft() for _ in range(min(len(queue), size))]
+        self._dispatched.append((pairs, first, None))
+        filled = [pair for _, pair in pairs] + [pairs[-1][1]] * (size - len(pairs))
+        chunk = jax.tree.map(lambda *leaves: np.stack(leaves), *filled)
+        limit = np.int32(self._first_updates if first else self._all_updates)
+        mesh = self._program.keywords["mesh"]
+        placed = jax.device_put(chunk, NamedSharding(mesh, PartitionSpec("pairs")))
+        self._dispatched[-1] = pairs, first, self._program(placed, limit)
+
+    def _fetched(self) -> list[Ended[Key] | Refused[Key]]:
+        """The results of the oldest chunk; those of its pairs that have not ended join the slow ones."""
+        pairs, first, packed = self._dispatched[0]
+        results = jax.device_get(packed).tree
+        self._dispatched.popleft()
+        ended: list[Ended[Key] | Refused[Key]] = []
+        for row, (key, pair) in enumerate(pairs):
+            state, assessment, history = jax.tree.map(lambda leaf, row=row: leaf[row], results)
+            if state.status < 0:
+                self._slow.append((key, pair))
+                continue
+            # One history entry per update, and one at the returned pose.
+            count = int(state.num_iterations) + 1
+            history = jax.tree.map(lambda entries, count=count: entries[:count], history)
+            ended.append(Ended(key, state, assessment, history))
+        if first and len(pairs) - len(ended) > _MANY * len(pairs):
+            self._first_updates = min(2 * self._first_updates, self._all_updates)
+        return ended
+
+
+def _shapes(tree: Any) -> Any:
+    leaves, structure = jax.tree.flatten(tree)
+    return structure, tuple((leaf.shape, leaf.dtype) for leaf in leaves)
+
+
+@with_settings_of_package
+@partial(jax.jit, static_argnames=("options", "num_neighbors", "mesh"))
+def _registered(
+    chunk: ChunkPair,
+    max_updates: Int[Array, ""],
+    *,
+    method: AbstractMethod,
+    robust: AbstractKernel | None,
+    numbers: dict[str, Any],
+    search: AbstractSearch,
+    options: Options,
+    num_neighbors: int,
+    mesh: Mesh,
+) -> Packed[tuple[State, Assessment, Record]]:
+    """States, assessments at their poses and histories of stacked pairs, in one array; a status is negative where a
+    loop has not ended after `max_updates`. `numbers` are the options that are numbers, by name."""
+
+    def registered(pair: ChunkPair, common: Any) -> Any:
+        method, robust, numbers, max_updates = common
+        own = replace(options, **numbers | {"max_coarse_distance": pair.max_coarse_distance})
+        problem, _ = problem_of(Inputs(pair.source, pair.target, method, robust), None, own, 1)
+        problem = replace(problem, start=pair.start)
+        loop = TracedExecutor(problem, search, options.max_iterations).run(max_updates)
+        return loop.state, assess(loop, problem, search), loop.history
+
+    def on_a_device(chunk: ChunkPair, common: Any) -> Any:
+        source, target = (_with_neighbors(clouds, search, num_neighbors) for clouds in chunk[2:])
+        return Packed.of(jax.vmap(registered, (0, None))(chunk._replace(source=source, target=target), common))
+
+    common = method, robust, numbers, max_updates
+    if mesh.size == 1:
+        return on_a_device(chunk, common)
+    # No device waits for the loops of the others.
+    pairs = PartitionSpec("pairs")
+    sharded = jax.shard_map(on_a_device, mesh=mesh, in_specs=(pairs, PartitionSpec()), out_specs=pairs, check_vma=False)
+    return sharded(chunk, common)
+
+
+def _with_neighbors(clouds: PointCloud, search: AbstractSearch, num_neighbors: int) -> PointCloud:
+    """Stacked clouds with their neighbours."""
+    if clouds.deferred_neighbors is not None:
+        return clouds
+    find = partial(traced_neighbors, num_neighbors=num_neighbors, search=search)
+    return clouds.replace_rows(deferred_neighbors=jax.lax.map(find, clouds, batch_size=_CLOUDS))
