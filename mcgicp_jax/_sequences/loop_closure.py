@@ -1,14 +1,13 @@
 """Edges from registrations, and loop closure: registration to earlier frames where the sensor returns to a known place.
 
-The uncertainty of the motion between two frames is that along the most certain path of edges between them, an upper
-bound that needs no equations.
+The covariance of the motion between two frames is summed along the most certain path of edges between them: an upper
+bound, without solving for the whole graph.
 """
 
 from __future__ import annotations
 
 import itertools
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 from jaxtyping import Float
@@ -26,16 +25,16 @@ from mcgicp_jax._registration.result import RegistrationResult, Status
 
 # Least overlap of a registration that becomes an edge: with less, a wrong local minimum looks like a right one.
 LEAST_OVERLAP = 0.4
-# Along unconstrained directions a motion is assumed, which is right to its size, and at best to this number of spacings
-# of the points, the default coarse distance. With twice the range instead, loops are sought all over a corridor, whose
-# poses slide by 1 m instead of 0.1 m.
+# Standard deviation assumed along unconstrained directions: the length of the motion, and at least this number of point
+# spacings, the default coarse distance. With twice the range instead, loops are sought all over a corridor, whose poses
+# slide by 1 m instead of 0.1 m.
 _LEAST_ASSUMED = 10.0
 # Two frames may close a loop if their distance is at most this many median ranges of the points, plus this many
 # standard deviations of the distance (99 % of χ² with three degrees of freedom); the overlap decides. In simulation, a
 # range factor of 1 leaves 14 mm in the street instead of 9, and no more in the room.
 _RANGES, _DEVIATIONS = 2.0, 3.37
-# A loop is tried if the motion between two frames is less certain than a registration: its variance is larger by this
-# factor, in the geometric mean over the six directions.
+# A loop is tried if the variance of the motion between two frames, the geometric mean over the six directions, is more
+# than this multiple of that of a registration.
 _GAIN = 4.0
 # Squared Mahalanobis distance beyond which a loop contradicts the path: 99 % of χ² with six degrees of freedom.
 _CONTRADICTION = 16.8
@@ -49,12 +48,9 @@ _TRIES = 2
 def edge_from(i: int, j: int, result: RegistrationResult, *, uncertain: bool = False) -> Edge | None:
     """The edge that a registration of cloud j to cloud i measures.
 
-    The information matrix is the inverse covariance within the constrained directions, and 0 along the others, so that
-    DEGENERATE registrations contribute as well.
-
-    Returns:
-        The edge; None unless the status is CONVERGED or DEGENERATE, the overlap is at least 40 % and the covariance is
-        known.
+    Its information is the inverse covariance within the constrained directions, and 0 along the others, so that
+    DEGENERATE registrations contribute as well. None unless the status is CONVERGED or DEGENERATE, the overlap is at
+    least 40 % and the covariance is known.
     """
     overlap = float(np.asarray(result.overlap))
     if result.status not in (Status.CONVERGED, Status.DEGENERATE) or overlap < LEAST_OVERLAP:
@@ -65,17 +61,17 @@ def edge_from(i: int, j: int, result: RegistrationResult, *, uncertain: bool = F
     constrained = np.asarray(directions.constrained)
     if not constrained.any():
         return None
-    inside = np.ix_(constrained, constrained)
+    block = np.ix_(constrained, constrained)
     # Coordinates along the six directions: the constrained ones do not depend on the others.
     coordinates = np.linalg.inv(np.asarray(directions.twists, np.float64).T)
-    variances, vectors = np.linalg.eigh((coordinates @ covariance @ coordinates.T)[inside])
+    variances, vectors = np.linalg.eigh((coordinates @ covariance @ coordinates.T)[block])
     # The coordinates are lengths. No registration is more precise than the rounding of the points. The covariance of
     # equal clouds is smaller, or even negative by rounding of its own.
     radius = np.asarray(directions.radius)
     rounding = np.finfo(radius.dtype).eps * float(radius)
-    of_coordinates = np.zeros((6, 6))
-    of_coordinates[inside] = (vectors / np.maximum(variances, rounding**2)) @ vectors.T
-    information = coordinates.T @ of_coordinates @ coordinates
+    information = np.zeros((6, 6))
+    information[block] = (vectors / np.maximum(variances, rounding**2)) @ vectors.T
+    information = coordinates.T @ information @ coordinates
     return Edge(i, j, result.matrix, 0.5 * (information + information.T), uncertain=uncertain)
 
 
@@ -87,23 +83,25 @@ class Trajectory:
         self._clouds: list[PointCloud] = []
         self._poses = np.zeros((0, 4, 4))
         self._edges: list[Edge] = []
-        # Of each edge, its frames, its covariance, the same for twists of the world, and the geometric mean of the
-        # covariance over the six directions.
+        # Row of the edge between two frames, in either order.
+        self._edge_between: dict[tuple[int, int], int] = {}
+        # For each edge: its frames, its covariance for twists of frame j and of the world, and the geometric mean of
+        # the variances over the six directions.
         self._ends = np.zeros((2, 0), np.int32)
         self._covariances = np.zeros((0, 6, 6))
-        self._in_world = np.zeros((0, 6, 6))
+        self._world_covariances = np.zeros((0, 6, 6))
         self._variances = np.zeros(0)
-        # This mean of the last edge with information; 0 before there is one.
-        self._usual = 0.0
-        # Which edges the last optimisation kept, and later ones.
-        self._kept = np.zeros(0, bool)
+        # The last such mean of an edge with information; 0 before there is one.
+        self._usual_variance = 0.0
+        # For each edge, whether the last optimisation accepted it or it is newer.
+        self._accepted = np.zeros(0, bool)
         # Whether loops were closed since the last optimisation, and the number of frames then.
-        self._stale, self._optimized = False, 0
-        self._between: dict[tuple[int, int], int] = {}
+        self._stale, self._num_optimized = False, 0
 
     def graph(self, num_frames: int | None = None, num_edges: int | None = None) -> PoseGraph:
         """The poses of the first frames, corrected by the loops so far, and the first edges."""
-        self._optimize()
+        if self._stale:
+            self._optimize()
         return PoseGraph(self._poses[:num_frames], self._edges[:num_edges])
 
     @property
@@ -114,43 +112,19 @@ class Trajectory:
     def add(
         self, cloud: PointCloud, pose: Float[np.ndarray, "4 4"], result: RegistrationResult | None
     ) -> Float[np.ndarray, "4 4"]:
-        """Add a frame with its registration to the previous one, close loops with earlier ones, and return its pose."""
-        number = len(self._clouds)
+        """Add a frame with its registration to the previous one, close a loop if there is one, and return the pose."""
+        last = len(self._clouds)
         self._clouds.append(cloud)
         self._poses = np.concatenate([self._poses, pose[None]])
         if result is not None:
-            edge = edge_from(number - 1, number, result)
+            edge = edge_from(last - 1, last, result)
             if edge is None:
                 # The assumed motion becomes an edge without information, which connects the poses.
-                edge = Edge(number - 1, number, inverse(self._poses[-2]) @ pose, np.zeros((6, 6)))
+                edge = Edge(last - 1, last, inverse(self._poses[-2]) @ pose, np.zeros((6, 6)))
             self._connect(edge)
-            loop = self._loop(number)
-            if loop is not None:
-                self._close(*loop)
+            self._close_loop(last)
         # A view would keep the poses of all frames until then in memory.
         return self._poses[-1].copy()
-
-    def _close(self, loop: Edge, covariance: Float[np.ndarray, "6 6"]) -> None:
-        """Add a loop to the last frame, and correct poses. The covariance is that of the motion between the two frames
-        without the loop, for the twists of the edge."""
-        self._connect(loop)
-        self._stale = True
-        pose = self._poses[-1]
-        residual = logarithm(inverse(self._poses[int(loop.i)] @ np.asarray(loop.T_i_j)) @ pose)
-        total = covariance + self._covariances[-1]
-        gain = np.linalg.solve(total, covariance).T
-        contradicts = residual @ np.linalg.solve(total, residual) > _CONTRADICTION
-        if contradicts or len(self._poses) >= _GROWTH * self._optimized:
-            self._optimize()
-        else:
-            self._poses[-1] = pose @ exponential(-gain @ residual)
-
-    def _optimize(self) -> None:
-        if self._stale:
-            result = optimize_poses(PoseGraph(self._poses, self._edges))
-            self._poses, self._kept = np.array(result.poses), np.asarray(result.kept)
-            self._stale, self._optimized = False, len(self._poses)
-            self._in_world = self._moved(self._covariances, self._ends[1])
 
     def _connect(self, edge: Edge) -> None:
         i, j, information = int(edge.i), int(edge.j), np.asarray(edge.information)
@@ -164,64 +138,83 @@ class Trajectory:
         assumed = np.repeat(deviations, 3) ** -2.0
         covariance = np.linalg.inv(information + np.diag(assumed))
         variance = float(np.exp(np.linalg.slogdet(covariance)[1] / 6))
-        self._between[i, j] = self._between[j, i] = len(self._edges)
+        self._edge_between[i, j] = self._edge_between[j, i] = len(self._edges)
         self._edges.append(edge)
         self._ends = np.append(self._ends, np.array([[i], [j]], np.int32), axis=1)
         self._covariances = np.append(self._covariances, covariance[None], axis=0)
-        self._in_world = np.append(self._in_world, self._moved(covariance, j)[None], axis=0)
+        world_covariance = _transported(covariance, self._poses[j])
+        self._world_covariances = np.append(self._world_covariances, world_covariance[None], axis=0)
         self._variances = np.append(self._variances, variance)
-        self._kept = np.append(self._kept, True)
+        self._accepted = np.append(self._accepted, True)
         if information.any():
-            self._usual = variance
-
-    def _moved(self, covariances: Float[np.ndarray, "*m 6 6"], frames: Any) -> Float[np.ndarray, "*m 6 6"]:
-        """Covariances for twists of frames, for those of the world."""
-        change = adjoint(self._poses[frames])
-        return change @ covariances @ change.swapaxes(-1, -2)
+            self._usual_variance = variance
 
     def _range(self, frame: int) -> float:
         return _RANGES * float(np.median(np.linalg.norm(self._clouds[frame].coordinates, axis=1)))
 
-    def _loop(self, number: int) -> tuple[Edge, Float[np.ndarray, "6 6"]] | None:
-        """An edge to an earlier frame nearby, if the motion between the two is less certain than a registration; and
-        the covariance of this motion."""
+    def _close_loop(self, last: int) -> None:
+        """Register the last frame to an earlier one nearby, if the motion between the two is less certain than a
+        registration, and correct the poses."""
         from scipy.sparse import coo_array
         from scipy.sparse.csgraph import dijkstra
 
-        edges = self._variances[self._kept], self._ends[:, self._kept]
-        graph = coo_array(edges, (number + 1, number + 1)).tocsr()
-        variances, towards = dijkstra(graph, directed=False, indices=number, return_predecessors=True)
-        towards = towards.tolist()
-        distances = np.linalg.norm(self._poses[:, :3, 3] - self._poses[number, :3, 3], axis=1)
-        distances[variances <= _GAIN * self._usual] = np.inf
-        # The nearest frames of all would be the latest ones of a slow sensor.
-        nearest = [rows.start + int(np.argmin(distances[rows.start : rows.stop])) for rows in rows_before(number)]
+        edges = self._variances[self._accepted], self._ends[:, self._accepted]
+        graph = coo_array(edges, (last + 1, last + 1)).tocsr()
+        variances, predecessors = dijkstra(graph, directed=False, indices=last, return_predecessors=True)
+        distances = np.linalg.norm(self._poses[:, :3, 3] - self._poses[last, :3, 3], axis=1)
+        distances[variances <= _GAIN * self._usual_variance] = np.inf
+        # The nearest frame in each range of gaps: the nearest ones of all would be the latest ones of a slow sensor.
+        nearest = [rows.start + int(np.argmin(distances[rows.start : rows.stop])) for rows in rows_before(last)]
         tries = 0
         for i in sorted((i for i in nearest if np.isfinite(distances[i])), key=lambda i: -variances[i]):
-            if tries == _TRIES:
-                break
-            covariance = self._covariance(number, i, towards)
+            path = [i]
+            while path[-1] != last:
+                path.append(int(predecessors[path[-1]]))
+            rows = [self._edge_between[ends] for ends in itertools.pairwise(path)]
+            total = np.sum(self._world_covariances[rows], axis=0)
+            covariance = _transported(total, inverse(self._poses[last]))
             sigma = float(np.sqrt(np.linalg.eigvalsh(covariance[:3, :3])[-1]))
-            if distances[i] <= self._range(number) + _DEVIATIONS * sigma:
-                tries += 1
-                # The coarse `max_distance` covers the uncertainty of the motion.
-                options = replace(self._options, min_coarse_distance=_DEVIATIONS * sigma)
-                init = inverse(self._poses[i]) @ self._poses[number]
-                result = register_pair(self._clouds[number], self._clouds[i], self._method, init, options)
-                edge = edge_from(i, number, result, uncertain=True)
-                if edge is not None:
-                    return edge, covariance
-        return None
+            if distances[i] > self._range(last) + _DEVIATIONS * sigma:
+                continue
+            # The coarse `max_distance` covers the uncertainty of the motion.
+            options = replace(self._options, min_coarse_distance=_DEVIATIONS * sigma)
+            init = inverse(self._poses[i]) @ self._poses[last]
+            result = register_pair(self._clouds[last], self._clouds[i], self._method, init, options)
+            edge = edge_from(i, last, result, uncertain=True)
+            if edge is not None:
+                self._connect(edge)
+                self._correct(edge, covariance)
+                return
+            tries += 1
+            if tries == _TRIES:
+                return
 
-    def _covariance(self, number: int, i: int, towards: list[int]) -> Float[np.ndarray, "6 6"]:
-        """Covariance of the motion from frame `i` to the last one along the path, for twists of the last frame, by the
-        next frame on the path from each."""
-        path = [i]
-        while path[-1] != number:
-            path.append(towards[path[-1]])
-        total = np.sum(self._in_world[[self._between[ends] for ends in itertools.pairwise(path)]], axis=0)
-        change = adjoint(inverse(self._poses[number]))
-        return change @ total @ change.T
+    def _correct(self, loop: Edge, covariance: Float[np.ndarray, "6 6"]) -> None:
+        """Correct the poses by the loop added last. `covariance`: of the motion between its frames without the loop."""
+        self._stale = True
+        pose = self._poses[-1]
+        residual = logarithm(inverse(self._poses[int(loop.i)] @ np.asarray(loop.T_i_j)) @ pose)
+        total = covariance + self._covariances[-1]
+        contradicts = residual @ np.linalg.solve(total, residual) > _CONTRADICTION
+        if contradicts or len(self._poses) >= _GROWTH * self._num_optimized:
+            self._optimize()
+        else:
+            gain = np.linalg.solve(total, covariance).T
+            self._poses[-1] = pose @ exponential(-gain @ residual)
+
+    def _optimize(self) -> None:
+        result = optimize_poses(PoseGraph(self._poses, self._edges))
+        self._poses, self._accepted = np.array(result.poses), np.asarray(result.kept)
+        self._stale, self._num_optimized = False, len(self._poses)
+        self._world_covariances = _transported(self._covariances, self._poses[self._ends[1]])
+
+
+def _transported(
+    covariances: Float[np.ndarray, "*m 6 6"], poses: Float[np.ndarray, "*m 4 4"]
+) -> Float[np.ndarray, "*m 6 6"]:
+    """Covariances of twists of frames, for twists of the world, by the poses of the frames."""
+    change = adjoint(poses)
+    return change @ covariances @ change.swapaxes(-1, -2)
 
 
 def rows_before(last: int) -> list[range]:

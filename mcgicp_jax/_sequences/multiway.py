@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence, Sized
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Unpack
+from typing import Any, TypeAlias, Unpack
 
 import numpy as np
 from jaxtyping import Float
@@ -35,9 +35,12 @@ from mcgicp_jax._sequences.loop_closure import LEAST_OVERLAP, edge_from, rows_be
 _CELL = 5.0
 # Largest variance of a pose whose directions are all constrained, as a multiple of that of a typical edge: chains of n
 # edges have n, and unconstrained directions 1e9.
-_UNKNOWN = 1e6
+_LARGEST_VARIANCE = 1e6
 # Largest number of rounds of registration. From the second on, only newly overlapping pairs are registered.
 _ROUNDS = 5
+
+_Poses: TypeAlias = Float[np.ndarray, "n 4 4"]
+_Registrations: TypeAlias = dict[tuple[int, int], RegistrationResult]
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,12 +50,12 @@ class MultiwayResult:
     Attributes:
         clouds: the n preprocessed clouds, each in its own frame.
         graph: result of `optimize_poses`: the poses of the clouds with status and covariances, and the edges.
-        registrations: maps each pair (i, j) to the registration of cloud j to cloud i. Registrations that failed or
-            overlap by less than 40 % are listed here, but have no edge in `graph`.
+        registrations: maps each pair (i, j) to the registration of cloud j to cloud i. Those that failed or overlap by
+            less than 40 % have no edge in `graph`.
         statuses: of each cloud: CONVERGED; TOO_FEW_CORRESPONDENCES if it has no edge; DEGENERATE if at least half of
-            its edges contradict the others, or if its edges leave a direction of its pose in the frame of the first
-            cloud unconstrained. A cloud of another place does not disturb the others. It is often CONVERGED itself, at
-            a wrong pose with low overlap.
+            its edges contradict the others, or its edges leave a direction of its pose, in the frame of the first
+            cloud, unconstrained. A cloud of another place does not disturb the others, and is often CONVERGED itself,
+            at a wrong pose with low overlap.
         voxel_size: of the map, metres: that of the clouds, or their median point spacing.
     """
 
@@ -91,17 +94,17 @@ def multiway(
 ) -> MultiwayResult:
     """Register many clouds of one scene with each other and find one pose for each.
 
-    Pairs of overlapping clouds are registered, and the registrations with their covariances become the edges of a pose
-    graph, which `optimize_poses` solves. Pairs that overlap only at the new poses are registered next, in up to five
-    rounds. All edges are uncertain: those that contradict the others are rejected, unless a cloud has no others.
+    Registrations of overlapping pairs, with their covariances, become the edges of a pose graph, which `optimize_poses`
+    solves. Pairs that overlap only at the new poses are registered next, in up to five rounds. All edges are uncertain:
+    those that contradict the others are rejected, unless a cloud has no others.
 
     Args:
         clouds: n clouds or (N, 3) arrays, metres. Preprocessed clouds are used unchanged.
         method: registration method.
         pairs: pairs (i, j) of rows of the clouds to register; no others are. By default each cloud is paired with the
-            one before it, and with the earlier cloud of largest overlap among those 2 to 3 places before it, among
-            those 4 to 7 places before it, 8 to 15, and so on, if that overlap is at least 40 %. More pairs would add
-            little: the errors of edges that share a cloud are not independent.
+            one before it, and with the cloud of largest overlap among those 2 to 3 places before it, 4 to 7, 8 to 15,
+            and so on, if that overlap is at least 40 %. More pairs would add little: the errors of edges that share a
+            cloud are not independent.
         init: n poses to start from, cloud to world, `jaxlie.SE3` or (4, 4), metres. By default the clouds are
             registered in order, each to the two before it, and again in the opposite order; the better fits are used.
         voxel_size, num_neighbors: arguments of `preprocess`. "auto": one size for all clouds.
@@ -122,8 +125,8 @@ def multiway(
     ready = [as_cloud(f"clouds[{k}]", cloud) for k, cloud in enumerate(clouds)]
     if not ready:
         raise ValueError("clouds: expected at least one, got none")
-    named = {f"clouds[{k}]": cloud for k, cloud in enumerate(ready)} | {"init": init, "method": method}
-    for name, value in (named | options).items():
+    arguments = {f"clouds[{k}]": cloud for k, cloud in enumerate(ready)} | {"init": init, "method": method}
+    for name, value in (arguments | options).items():
         check_concrete(name, value)
     voxels = voxels_for(voxel_size, *ready)
     for k, cloud in enumerate(ready):
@@ -136,15 +139,7 @@ def multiway(
             if len(pair) != 2 or not all(valid) or pair[0] == pair[1]:
                 raise ValueError(f"pairs[{k}]: expected two different rows from 0 to {len(ready) - 1}, got {pair}")
         pairs = [(int(i), int(j)) for i, j in pairs]
-    registrations: dict[tuple[int, int], RegistrationResult] = {}
-    if init is None:
-        poses, registrations = _start(ready, method, settings)
-    elif isinstance(init, str) or not isinstance(init, Sized):
-        raise ValueError(f"init: expected one pose per cloud, got {init!r}; global_pose finds poses of pairs")
-    elif len(init) != len(ready):
-        raise ValueError(f"init: expected one pose per cloud, {len(ready)}, got {len(init)}")
-    else:
-        poses = pose_matrices(init, "init[{}]")
+    poses, registrations = _initial_poses(init, ready, method, settings)
     if pairs is not None:
         registrations = {pair: result for pair, result in registrations.items() if pair in pairs}
     spacing = float(np.median([point_spacing(cloud) for cloud in ready]))
@@ -167,28 +162,33 @@ def multiway(
     return MultiwayResult(ready, graph, registrations, statuses, voxels.size or spacing)
 
 
-def _start(
-    clouds: list[PointCloud], method: AbstractMethod, options: Options
-) -> tuple[Float[np.ndarray, "n 4 4"], dict[tuple[int, int], RegistrationResult]]:
-    """Initial poses, and the registrations that they follow from: from both ends, since a wrong first motion, as that
-    to a cloud of another place, may spoil those that follow; the better fit is used."""
-    poses, registrations, fit = _chained(clouds, method, options)
-    backward, _, backward_fit = _chained(clouds[::-1], method, options)
-    if backward_fit > fit:
-        return np.linalg.inv(backward[-1]) @ backward[::-1], {}
-    return poses, {pair: computed(result) for pair, result in registrations.items()}
+def _initial_poses(
+    init: Any, clouds: list[PointCloud], method: AbstractMethod, options: Options
+) -> tuple[_Poses, _Registrations]:
+    """`init`, checked, or poses from registrations in order, and these registrations."""
+    if init is None:
+        poses, registrations, fit = _chained(clouds, method, options)
+        # Also from the other end: a wrong first motion, as to a cloud of another place, may spoil those that follow.
+        backward, _, backward_fit = _chained(clouds[::-1], method, options)
+        if backward_fit > fit:
+            return np.linalg.inv(backward[-1]) @ backward[::-1], {}
+        return poses, {pair: computed(result) for pair, result in registrations.items()}
+    if isinstance(init, str) or not isinstance(init, Sized):
+        raise ValueError(f"init: expected one pose per cloud, got {init!r}; global_pose finds poses of pairs")
+    if len(init) != len(clouds):
+        raise ValueError(f"init: expected one pose per cloud, {len(clouds)}, got {len(init)}")
+    return pose_matrices(init, "init[{}]"), {}
 
 
 def _chained(
     clouds: list[PointCloud], method: AbstractMethod, options: Options
-) -> tuple[Float[np.ndarray, "n 4 4"], dict[tuple[int, int], RegistrationResult], float]:
-    """Poses of clouds that are registered in order, the registrations that they follow from, and the sum of the fits.
+) -> tuple[_Poses, _Registrations, float]:
+    """Poses of clouds registered in order, the registrations that they follow from, and the sum of the fits.
 
-    Each cloud is registered to both clouds before it, from their motions, and the better fit is used: the cloud between
-    may be of another place.
+    Each cloud is registered to both clouds before it, of which one may be of another place; the better fit is used.
     """
+    registrations: _Registrations = {}
     poses, steps, total = [np.eye(4)], [np.zeros(6)], 0.0
-    registrations: dict[tuple[int, int], RegistrationResult] = {}
     for k in range(1, len(clouds)):
         rows = range(max(k - 2, 0), k)
         starts = [exponential((k - i) * steps[i]) for i in rows]
@@ -207,9 +207,7 @@ def _chained(
     return np.array(poses), registrations, total
 
 
-def _solved(
-    poses: Float[np.ndarray, "n 4 4"], registrations: dict[tuple[int, int], RegistrationResult]
-) -> tuple[PoseGraphResult, tuple[Status, ...]]:
+def _solved(poses: _Poses, registrations: _Registrations) -> tuple[PoseGraphResult, tuple[Status, ...]]:
     """The poses from all edges, and the status of each cloud. Edges are rejected unless they alone connect clouds."""
     from scipy.sparse import coo_array
     from scipy.sparse.csgraph import minimum_spanning_tree
@@ -217,32 +215,32 @@ def _solved(
     measured = [edge_from(i, j, result, uncertain=True) for (i, j), result in registrations.items()]
     graph = PoseGraph(poses, [edge for edge in measured if edge is not None])
     result = optimize_poses(graph)
-    edges, kept, n = graph.edges, np.asarray(result.kept), len(poses)
-    costs = np.where(kept, 1e-3, 1 + np.asarray(result.residuals))
+    edges, accepted, n = graph.edges, np.asarray(result.kept), len(poses)
+    costs = np.where(accepted, 1e-3, 1 + np.asarray(result.residuals))
     tree = minimum_spanning_tree(coo_array((costs, (edges.i, edges.j)), (n, n))).toarray()
-    needed = ~kept & (tree[edges.i, edges.j] > 0)
+    needed = ~accepted & (tree[edges.i, edges.j] > 0)
     if needed.any():
         trusted = Edge(edges.i, edges.j, edges.T_i_j, edges.information, uncertain=~needed)
         result = optimize_poses(PoseGraph(result.poses, trusted))
     ends = np.concatenate([edges.i, edges.j])
-    agree, total = np.bincount(ends, np.tile(kept, 2), n), np.bincount(ends, minlength=n)
+    agreeing, total = np.bincount(ends, np.tile(accepted, 2), n), np.bincount(ends, minlength=n)
     failed = np.where(total == 0, Status.TOO_FEW_CORRESPONDENCES, Status.DEGENERATE)
-    codes = np.where(agree > 0.5 * total, Status.CONVERGED, failed) if n > 1 else [Status.CONVERGED]
+    codes = np.where(agreeing > 0.5 * total, Status.CONVERGED, failed) if n > 1 else [Status.CONVERGED]
     if result.status == Status.DEGENERATE and len(edges):
         variances = np.diagonal(result.covariance, 0, 1, 2) * typical_information((edges,))[0]
-        codes = np.where((codes == Status.CONVERGED) & ~(variances.max(axis=1) <= _UNKNOWN), Status.DEGENERATE, codes)
+        unconstrained = ~(variances.max(axis=1) <= _LARGEST_VARIANCE)
+        codes = np.where((codes == Status.CONVERGED) & unconstrained, Status.DEGENERATE, codes)
     return result, tuple(Status(int(code)) for code in codes)
 
 
-def _overlapping(clouds: list[PointCloud], poses: Float[np.ndarray, "n 4 4"], cell: float) -> list[tuple[int, int]]:
-    """Each cloud with the previous one, and with the one of largest overlap in each range of gaps 2-3, 4-7, 8-15, …"""
+def _overlapping(clouds: list[PointCloud], poses: _Poses, cell: float) -> list[tuple[int, int]]:
+    """Each cloud with the previous one, and with that of largest overlap in each range of gaps 2-3, 4-7, 8-15, …"""
     from scipy.sparse import csr_array
 
-    keys = [
-        np.unique(wrapped_keys(rotated(cloud.coordinates, T[:3, :3]) + T[:3, 3], cell))
-        for cloud, T in zip(clouds, poses, strict=True)
-    ]
-    sizes = np.array(list(map(len, keys)))
+    # Unique cells of each cloud in the world's frame, and the numbers of cells that two clouds have in common.
+    moved = [rotated(cloud.coordinates, T[:3, :3]) + T[:3, 3] for cloud, T in zip(clouds, poses, strict=True)]
+    keys = [np.unique(wrapped_keys(points, cell)) for points in moved]
+    sizes = np.array([len(cells) for cells in keys])
     columns = np.unique(np.concatenate(keys), return_inverse=True)[1]
     occupied = csr_array((np.ones(len(columns)), columns, np.concatenate([[0], np.cumsum(sizes)])))
     common = csr_array(occupied @ occupied.T)

@@ -5,14 +5,14 @@ from __future__ import annotations
 import collections
 import weakref
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import partial
 from typing import Any, Literal, Unpack
 
 import numpy as np
 from jaxtyping import Float
 
-from mcgicp_jax._clouds.deskew import deskew as deskewed
+from mcgicp_jax._clouds.deskew import deskew as deskew_scan
 from mcgicp_jax._clouds.point_cloud import Frame, PointCloud, Values, Voxels, as_cloud, check_several
 from mcgicp_jax._clouds.preprocess import check_preprocessing, preprocess
 from mcgicp_jax._clouds.voxel_map import VoxelMap
@@ -33,13 +33,14 @@ from mcgicp_jax._registration.tie_points_and_prior import GivenPrior
 from mcgicp_jax._sequences.loop_closure import Trajectory
 from mcgicp_jax._sequences.relocalization import Relocalizer, map_target
 
-# Deskewing is repeated where a registration measures another motion than the one that the scan was deskewed by: one
-# that displaces the points by more than this fraction of the spacing (rms). At most so many registrations per frame,
-# since a constant velocity during the scan is an approximation itself.
+# A scan is deskewed again if the motion that deskewed it and the measured one displace the points differently by more
+# than this fraction of their spacing (rms); at most this number of registrations per frame, since a constant velocity
+# during the scan is an approximation itself.
 _SAME_MOTION, _ROUNDS = 0.3, 3
 # The error of a motion moves all points that are deskewed by it, half as far on average, and so goes into the next
-# motions, unless scan and target are deskewed by nearly the same one. It therefore follows the measured motions by this
-# fraction, and only displacements above the noise of the motions repeat it; tests/benchmarks has the errors of others.
+# motions, unless scan and target are deskewed by nearly the same one. The deskewing motion therefore follows the
+# measured ones by this fraction only, and displacements below the noise of the motions do not deskew a scan again;
+# tests/benchmarks has the errors of other fractions.
 _FOLLOWED = 0.5
 
 
@@ -50,8 +51,8 @@ class OdometryStep:
     Attributes:
         pose: (4, 4) float64, sensor to world, metres.
         cloud: the preprocessed cloud, in the sensor's frame.
-        lost: whether the pose in the world is not known: it was extrapolated, since the frame could not be registered,
-            or with `recover`, follows an extrapolated one by registrations to the previous frame.
+        lost: whether the pose in the world is unknown: extrapolated, since the frame could not be registered, or with
+            `recover`, derived from an extrapolated one by registrations to the previous frame.
         deferred_registration, deferred_graph: values of the properties.
     """
 
@@ -65,9 +66,8 @@ class OdometryStep:
     def registration(self) -> RegistrationResult | None:
         """Registration of this frame, None for the first; check its `converged`.
 
-        Its matrix maps to the previous frame, or with `against="map"`, or where the frame was found again by `recover`,
-        to the world. For a lost frame it maps to the previous frame. The registration with which tracking was lost is
-        reported, but not used.
+        Its matrix maps to the world with `against="map"` or where `recover` found the frame again; otherwise, and for a
+        lost frame, to the previous frame. The registration with which tracking was lost is reported, but not used.
         """
         return None if self.deferred_registration is None else self.deferred_registration.value
 
@@ -110,8 +110,8 @@ def odometry(
         init: motion of the sensor between the first two frames, to start from, `jaxlie.SE3` or (4, 4); the identity by
             default.
         start: pose of the first frame, sensor to world; the identity by default.
-        against: "previous": register to the previous frame. "map": to the points of all frames before that lie within
-            `map_radius` of the last pose, averaged per voxel. Errors then accumulate more slowly.
+        against: "previous": register to the previous frame. "map": to the points of all previous frames within
+            `map_radius` of the last pose, averaged per voxel, so that errors accumulate more slowly.
         map_radius: metres; by default the distance of the farthest point of the first frame from its sensor.
         recover: relocalise after a jump: if a registration does not converge, its overlap drops by a fifth, or the
             distances along the normals double, in units of the thickness of the neighbourhoods, find the frame by
@@ -119,17 +119,16 @@ def odometry(
             has too few matches or such distances, tracking is lost: the pose is extrapolated with constant velocity,
             and the next frames are registered to the previous one, outside of the map, until one is relocalised. A
             place whose surfaces coincide with known ones cannot be told from these.
-        loops: close loops: register a frame to an earlier one whose position is near, within the uncertainty of the
-            poses, and correct all poses by `optimize_poses`. Steps keep the pose known at their time; the corrected
-            poses are in the `graph` of the last step. All clouds are kept in memory. Not with `against="map"` or
-            `recover`.
-        deskew: undo the motion of the sensor during each scan, by `mcgicp_jax.deskew`: first with the previous motions,
-            and where the registration measures another one, with that. Frames are raw and have `PointCloud.times`, the
-            scans follow each other without gaps, and poses are those at the ends of the scans. The first scan is
-            deskewed by `init`, or if there is none, in hindsight by the motion to the second.
-        priors: one for each frame: a measurement of the motion from the frame before, as by wheels or an IMU, in the
-            form of the `prior` of `register`, or None. The registration starts from this pose and weighs it; variances
-            of 0 fix directions, such as height, roll and pitch of a robot on a floor. The first is not used.
+        loops: close loops: register frames to earlier ones nearby, within the uncertainty of the poses, and correct all
+            poses by `optimize_poses`. Steps keep the pose known at their time; the `graph` of the last step has the
+            corrected ones. All clouds are kept in memory. Not with `against="map"` or `recover`.
+        deskew: undo the motion of the sensor during each scan, by `mcgicp_jax.deskew`: first with the previous motion,
+            and if the registration measures another one, again with that. Frames must be raw and have
+            `PointCloud.times`, scans follow each other without gaps, and poses are those at the ends of the scans. The
+            first scan is deskewed by `init`, or without it, in hindsight by the motion to the second.
+        priors: for each frame, a measurement of the motion from the frame before, as by wheels or an IMU, in the form
+            of the `prior` of `register`, or None. The registration starts from this pose and weighs it; variances of 0
+            fix directions, such as height, roll and pitch of a robot on a floor. The first is not used.
         options: options of `register`, except for `tie_points` and `prior`.
 
     Returns:
@@ -146,8 +145,8 @@ def odometry(
     check_preprocessing(voxel_size, num_neighbors)
     check_method(method)
     check_several("frames", frames)
-    named: dict[str, Any] = {"init": init, "start": start, "method": method}
-    for name, value in (named | {**options}).items():
+    arguments: dict[str, Any] = {"init": init, "start": start, "method": method, **options}
+    for name, value in arguments.items():
         check_concrete(name, value)
     if against not in ("previous", "map"):
         raise ValueError(f'against: expected "previous" or "map", got {against!r}')
@@ -165,21 +164,7 @@ def odometry(
     reader = _Reader(
         enumerate(frames), method, settings, voxel_size, num_neighbors, deskew, None if priors is None else iter(priors)
     )
-    return _Sensor(
-        frames=ReadAhead(reader),
-        reader=reader,
-        method=method,
-        options=settings,
-        num_neighbors=num_neighbors,
-        motion=pose_matrix(init),
-        scanned=pose_matrix(init),
-        pose=np.asarray(pose_matrix(start, "start")),
-        against_map=against == "map",
-        radius=map_radius,
-        recover=recover,
-        loops=loops,
-        in_hindsight=deskew and init is None,
-    )
+    return _Sensor(reader, init, start, against == "map", map_radius, recover, loops)
 
 
 @dataclass
@@ -221,59 +206,61 @@ class _Reader:
             geometry_table(cloud, self.method.uses_channels).computed(rows_to_match(cloud, self.options))
         return cloud
 
+    def deskewed(self, name: str, cloud: PointCloud, motion: Any) -> PointCloud:
+        """The frame, ready to be registered: if it is raw, deskewed by the motion during its scan."""
+        return self.prepared(name, deskew_scan(cloud, motion)) if self.deskew else cloud
 
-@dataclass
+
 class _Sensor(Iterator[OdometryStep]):
-    """The sensor at its last frame, and the maps of the previous frames. A class, as generators end when they raise.
+    """The sensor at its last frame, and maps of the frames so far. A class, since generators end when they raise."""
 
-    Attributes:
-        motion: (4, 4), between the last two frames.
-        scanned: (4, 4), motion by which the next scan is deskewed first.
-        pose: (4, 4), sensor to world.
-        radius: metres around the sensor beyond which points leave the map.
-        in_hindsight: whether the next registration decides how the first frame is deskewed.
-        first: the first frame, raw, until then.
-        trajectory: None without loop closure.
-        cloud: the last frame; None before the first.
-        world: the map that frames are registered to; None registers them to the previous frame.
-        places: the map in which lost frames are found; None without relocalisation.
-        unread: registrations of the last two steps.
-    """
-
-    frames: Iterator[tuple[str, PointCloud, GivenPrior | None]]
-    reader: _Reader
-    method: AbstractMethod
-    options: Options
-    num_neighbors: int
-    motion: Any
-    scanned: Any
-    pose: Float[np.ndarray, "4 4"]
-    against_map: bool
-    radius: Any
-    recover: bool
-    loops: bool
-    in_hindsight: bool
-    first: tuple[str, PointCloud] | None = None
-    trajectory: Trajectory | None = None
-    cloud: PointCloud | None = None
-    world: Any = None
-    places: Relocalizer | None = None
-    unread: collections.deque[Any] = field(default_factory=partial(collections.deque, maxlen=2))
+    def __init__(
+        self,
+        reader: _Reader,
+        init: Pose | None,
+        start: Pose | None,
+        against_map: bool,
+        radius: float | None,
+        recover: bool,
+        loops: bool,
+    ):
+        self.reader, self.frames = reader, ReadAhead(reader)
+        self.method, self.options, self.num_neighbors = reader.method, reader.options, reader.num_neighbors
+        self.against_map, self.recover, self.loops = against_map, recover, loops
+        # Motion between the last two frames, and motion by which the next scan is first deskewed.
+        self.motion: Any = pose_matrix(init)
+        self.scan_motion: Any = self.motion
+        # Sensor to world.
+        self.pose = np.asarray(pose_matrix(start, "start"))
+        # Metres around the sensor beyond which points leave the map; None: to be taken from the first frame.
+        self.radius = radius
+        # The first frame is deskewed by the motion that the second registration measures, and is kept raw until then.
+        self.in_hindsight = reader.deskew and init is None
+        self.first: tuple[str, PointCloud] | None = None
+        # The last frame, None before the first.
+        self.cloud: PointCloud | None = None
+        # The map that frames are registered to, that in which lost frames are found, and the poses to close loops with;
+        # None: not used.
+        self.world: Any = None
+        self.relocalizer: Relocalizer | None = None
+        self.trajectory: Trajectory | None = None
+        # Registrations of the last two steps.
+        self.unread: collections.deque[Any] = collections.deque(maxlen=2)
 
     @property
     def is_lost(self) -> bool:
-        return self.places is not None and self.places.is_lost
+        return self.relocalizer is not None and self.relocalizer.is_lost
 
     def __next__(self) -> OdometryStep:
         """Locate the sensor at the next frame, and add the frame to the maps."""
         name, cloud, prior = next(self.frames)
         if self.cloud is None:
             result, self.first = None, (name, cloud) if self.in_hindsight else None
-            cloud = self._deskewed(name, cloud, self.scanned)
+            cloud = self.reader.deskewed(name, cloud, self.scan_motion)
             self._begin(name, cloud)
         else:
             cloud, result = self._located(name, cloud, self.cloud, prior)
-            if self.places is None:
+            if self.relocalizer is None:
                 if not is_usable(result):
                     warn(
                         f"{name}: {result.status.name}; the motion of the previous frame is used instead. "
@@ -304,43 +291,43 @@ class _Sensor(Iterator[OdometryStep]):
     def _begin(self, name: str, cloud: PointCloud) -> None:
         """Make the maps, of the first frame."""
         voxel = cloud.voxel_size or float(point_spacing(cloud))
-        self.world = VoxelMap(voxel) if self.against_map else None
-        self.places = Relocalizer(voxel, self.method, self.options, self.num_neighbors) if self.recover else None
-        self.trajectory = Trajectory(self.method, self.options) if self.loops else None
+        if self.against_map:
+            self.world = VoxelMap(voxel)
+        if self.recover:
+            self.relocalizer = Relocalizer(voxel, self.method, self.options, self.num_neighbors)
+        if self.loops:
+            self.trajectory = Trajectory(self.method, self.options)
         if self.radius is None:
             self.radius = float(np.linalg.norm(cloud.coordinates, axis=1).max())
         self._add_to_maps(name, cloud, None)
 
     def _add_to_maps(self, name: str, cloud: PointCloud, result: RegistrationResult | None) -> None:
-        for points in (self.places, self.world):
+        for points in (self.relocalizer, self.world):
             if points is not None and not self.is_lost:
                 points.add(name, cloud, self.pose)
         if self.trajectory is not None:
             self.pose = self.trajectory.add(cloud, self.pose, result)
 
-    def _deskewed(self, name: str, cloud: PointCloud, motion: Any) -> PointCloud:
-        return self.reader.prepared(name, deskewed(cloud, motion)) if self.reader.deskew else cloud
-
     def _located(
-        self, name: str, frame: PointCloud, before: PointCloud, prior: GivenPrior | None
+        self, name: str, frame: PointCloud, previous: PointCloud, prior: GivenPrior | None
     ) -> tuple[PointCloud, RegistrationResult]:
         """Update motion and pose by a registration; the frame as it was registered, and the result."""
         was_lost, to_map = self.is_lost, self.against_map and not self.is_lost
-        motion, scanned = (self.motion, self.scanned) if prior is None else (prior[0], prior[0])
+        motion, scan_motion = (self.motion, self.scan_motion) if prior is None else (prior[0], prior[0])
         for _ in range(_ROUNDS if self.reader.deskew else 1):
-            cloud = self._deskewed(name, frame, scanned)
+            cloud = self.reader.deskewed(name, frame, scan_motion)
             if self.first is not None:
                 # The first frame deskewed by the motion to the second, in maps of its own.
-                before = self._deskewed(*self.first, scanned)
-                self._begin(self.first[0], before)
-            target, start, prior_of_pair = before, motion, prior
+                previous = self.reader.deskewed(*self.first, scan_motion)
+                self._begin(self.first[0], previous)
+            target, init, prior_of_pair = previous, motion, prior
             if to_map:
                 target = map_target(self.world.cloud(), self.method, self.options, self.num_neighbors)
-                start = self.pose @ motion
+                init = self.pose @ motion
                 if prior is not None:
                     # The covariance is that of a motion in the source's frame, which the target's does not change.
                     prior_of_pair = self.pose @ prior[0], prior[1]
-            result = register_pair(cloud, target, self.method, start, self.options, prior=prior_of_pair)
+            result = register_pair(cloud, target, self.method, init, self.options, prior=prior_of_pair)
             if not is_usable(result):
                 break
             motion = np.asarray(result.matrix)
@@ -349,17 +336,17 @@ class _Sensor(Iterator[OdometryStep]):
             if not self.reader.deskew:
                 break
             # Root mean square distance between the points moved by the motion that was assumed and the measured one.
-            change = np.linalg.solve(scanned, motion)
+            change = np.linalg.solve(scan_motion, motion)
             shifts = cloud.coordinates @ (change[:3, :3] - np.eye(3)).T + change[:3, 3]
             if float(np.sqrt(np.mean(np.sum(shifts**2, axis=1)))) <= _SAME_MOTION * point_spacing(cloud):
                 break
-            scanned = motion
+            scan_motion = motion
         self.first = None
-        corrected = None if self.places is None else self.places.corrected(cloud, target, result)
+        corrected = None if self.relocalizer is None else self.relocalizer.corrected(cloud, target, result)
         # The result with which tracking is lost is not used, those of the frames that follow are.
         if corrected is None and (was_lost or not self.is_lost) and is_usable(result):
             self.motion = motion
-            self.scanned = scanned @ exponential(_FOLLOWED * logarithm(np.linalg.solve(scanned, motion)))
+            self.scan_motion = scan_motion @ exponential(_FOLLOWED * logarithm(np.linalg.solve(scan_motion, motion)))
         # The product of thousands of rounded rotations would drift away from a rotation.
         self.pose = nearest_rotation(self.pose @ self.motion if corrected is None else np.asarray(corrected.matrix))
         return cloud, result if corrected is None else corrected

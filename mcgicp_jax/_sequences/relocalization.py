@@ -16,8 +16,8 @@ from mcgicp_jax._registration.register_pair import register_pair
 from mcgicp_jax._registration.result import RegistrationResult, Status, is_usable
 from mcgicp_jax._search.kd_tree import nearest_in_position
 
-# Fraction of the previous overlap below which a frame is also looked for in the map: at constant speed it hardly
-# changes, and jumps in simulated scenes and on KITTI lower it to 0.5 to 0.7.
+# Fraction of the previous overlap below which a frame is also looked for in the map: at constant speed the overlap
+# hardly changes, and jumps in simulated scenes and on KITTI lower it to 0.5 to 0.7.
 _DOUBTFUL = 0.8
 # Multiple of the previous misfit above which a pose is wrong. On KITTI, 7-Scenes and simulated scenes, it was at most
 # 1.3 at right poses, and at least 2.7 after jumps to a street that was never seen.
@@ -25,14 +25,14 @@ _WRONG = 2.0
 # Misfit of a right pose if both clouds are equally noisy: √2 times the 90 % quantile of |x| for normal x. A sensor at
 # rest that repeats its frames has less.
 _LEAST_MISFIT = 2.3
-# Number of points whose misfit is measured; a match is on the same surface if it is within this multiple of the
-# standard deviation of the neighbourhood along the surface.
-_SAMPLE, _WITHIN = 2048, 3.0
+# Number of points whose misfit is measured; and largest distance of a match on the same surface, in standard deviations
+# of the neighbourhood along the surface.
+_SAMPLE, _SAME_SURFACE = 2048, 3.0
 
 
 class Relocalizer:
-    """A map of all frames whose poses are known, in which lost frames are found again. `is_lost` tells whether tracking
-    is lost at the last frame."""
+    """A map of all frames whose poses are known, in which lost frames are found again. `is_lost`: whether tracking is
+    lost at the last frame."""
 
     def __init__(self, voxel_size: float, method: AbstractMethod, options: Options, num_neighbors: int):
         self._world, self._settings = VoxelMap(voxel_size), (method, options, num_neighbors)
@@ -44,7 +44,7 @@ class Relocalizer:
 
     def corrected(self, cloud: PointCloud, target: PointCloud, result: RegistrationResult) -> RegistrationResult | None:
         """The registration of a frame to the map, in the world's frame, if that to the target is doubtful and worse."""
-        overlap, misfit = float(np.asarray(result.overlap)), misfit_of(cloud, target, result)
+        overlap, misfit = float(np.asarray(result.overlap)), _misfit(cloud, target, result)
         limit = _WRONG * max(self._misfit, _LEAST_MISFIT)
         settled = result.status in (Status.CONVERGED, Status.DEGENERATE) and misfit <= limit
         if self.is_lost or not settled or overlap < _DOUBTFUL * self._overlap:
@@ -54,7 +54,7 @@ class Relocalizer:
                 target = map_target(world, *self._settings)
                 to_map = register_pair(cloud, target, method, start.matrix, options)
                 better = self.is_lost or not settled or float(np.asarray(to_map.overlap)) > overlap
-                if better and misfit_of(cloud, target, to_map) <= limit:
+                if better and _misfit(cloud, target, to_map) <= limit:
                     self.is_lost = False
                     return to_map
             self.is_lost = self.is_lost or misfit > limit
@@ -64,7 +64,7 @@ class Relocalizer:
         return None
 
 
-def misfit_of(source: PointCloud, target: PointCloud, result: RegistrationResult) -> float:
+def _misfit(source: PointCloud, target: PointCloud, result: RegistrationResult) -> float:
     """The 90 % quantile of the distances along normals between matches, in thicknesses of the source's neighbourhoods;
     infinite without matches or a usable pose."""
     if not is_usable(result):
@@ -72,11 +72,11 @@ def misfit_of(source: PointCloud, target: PointCloud, result: RegistrationResult
     points, rows = source.coordinates, np.flatnonzero(np.asarray(source.valid))
     rows = rows[np.random.default_rng(0).integers(0, len(rows), _SAMPLE)]
     thickness, along, normals = spreads(points, source.deferred_neighbors, rows)
-    matrix, of_target = np.asarray(result.matrix), target.coordinates[np.asarray(target.valid)]
+    matrix, target_points = np.asarray(result.matrix), target.coordinates[np.asarray(target.valid)]
     moved = points[rows] @ matrix[:3, :3].T + matrix[:3, 3]
-    matches = nearest_in_position(moved, of_target, float(_WITHIN * along.max()))
-    residuals = (of_target[matches] - moved) @ matrix[:3, :3]
-    matched = (matches >= 0) & (np.linalg.norm(residuals, axis=1) <= _WITHIN * along)
+    matches = nearest_in_position(moved, target_points, float(_SAME_SURFACE * along.max()))
+    residuals = (target_points[matches] - moved) @ matrix[:3, :3]
+    matched = (matches >= 0) & (np.linalg.norm(residuals, axis=1) <= _SAME_SURFACE * along)
     across = np.abs(np.sum(residuals * normals, axis=1)) / thickness
     return float(np.quantile(across[matched], 0.9)) if matched.any() else np.inf
 
