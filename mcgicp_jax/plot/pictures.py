@@ -21,9 +21,10 @@ if TYPE_CHECKING:
     import plotly.graph_objects
 
 # The constants affect only how figures look.
-# Most rows below each other; maximum width of a row and height of a panel, inches; pixels and tiles along the longer
-# side of a panel; fraction of each side that the detail shows; most pixels of a point of the sparser cloud.
-_MOST_ROWS, _WIDEST, _HIGHEST, _PANEL_PIXELS, _TILES, _DETAIL, _LARGEST_POINT = 5, 12, 4.5, 500, 12, 0.25, 9
+# Most rows below each other; maximum width of a row and height of a panel, inches.
+_MOST_ROWS, _WIDEST, _HIGHEST = 5, 12, 4.5
+# Pixels and tiles along the longer side of a panel; fraction of each side in the detail; most pixels of a point.
+_PANEL_PIXELS, _TILES, _DETAIL, _LARGEST_POINT = 500, 12, 0.25, 9
 # Pixels along the longer side of a map, and width of a figure in inches.
 _PIXELS, _WIDTH = 1400, 12
 # Points drawn in one 3-D figure, and colours there of clouds without channels.
@@ -34,13 +35,12 @@ _COLORS = ("#1f77d0", "#e8741c", "#2b9c5a", "#b03a8c", "#7a5230", "#707070")
 def before_after(source: PointCloud, target: PointCloud, poses: Mapping[str, Pose], *, path: File = None) -> Figure:
     """Compare poses: one row per pose shows the transformed source with the target, along the target's thinnest axis.
 
-    More than five rows are laid out side by side.
-
     If all points have the channels red, green and blue, target and source alternate in a checkerboard, in which
     patterns continue across tiles where the pose is right; a further panel shows the colour difference. Otherwise the
     clouds are overlaid, the target in blue and the source in orange, black where both are, points of the sparser cloud
     larger by the ratio of the spacings. Upright surfaces are drawn dark and flat ones pale, since the rings of a LiDAR
-    on the ground move with the sensor. The detail shows the region where the poses differ most.
+    on the ground move with the sensor. The detail shows the region where the poses differ most. More than five rows are
+    laid out side by side.
 
     Args:
         source, target: clouds in their own frames.
@@ -56,20 +56,22 @@ def before_after(source: PointCloud, target: PointCloud, poses: Mapping[str, Pos
         raise ValueError(
             f'poses: expected poses by name, such as {{"GICP": result.matrix}}, got {type(poses).__name__}'
         )
-    named = {name: pose_matrix(pose, f"poses[{name!r}]") for name, pose in ({"start": np.eye(4)} | dict(poses)).items()}
+    poses = {"start": np.eye(4)} | dict(poses)
+    matrices = [pose_matrix(pose, f"poses[{name!r}]") for name, pose in poses.items()]
     source, target = drawing.drawable(source), drawing.drawable(target)
     if len(target) < 3:
         raise ValueError(f"target: expected at least 3 points, got {len(target)}")
-    moved = [np.asarray(source.transform(matrix).unpad().points) for matrix in named.values()]
+    moved = [np.asarray(source.transform(matrix).unpad().points) for matrix in matrices]
     source_colors, target_colors = drawing.rgb_of(source), drawing.rgb_of(target)
     target_points = np.asarray(target.points)
     view = drawing.view_onto(target_points, _PANEL_PIXELS)
     if source_colors is not None and target_colors is not None:
-        rows = _chess_boards(view, target_points, target_colors, moved, source_colors)
+        rows = _checkerboards(view, drawing.paint(view, target_points, target_colors), moved, source_colors)
         headings = ["target and source in alternate tiles", "detail", "difference of colour"]
     else:
         spacings = np.maximum([raw_spacing(target), raw_spacing(source)], np.finfo(float).tiny)
-        rows = _overlays(view, target_points, moved, *np.minimum(spacings / spacings.min(), _LARGEST_POINT))
+        target_size, source_size = np.minimum(spacings / spacings.min(), _LARGEST_POINT)
+        rows = _overlays(view, _ink(view, target_points, target_size), moved, source_size)
         headings = ["target blue, source orange, both black", "detail"]
     detail = _where_they_differ([difference for _, difference in rows])
     headings[1] = f"detail, {(detail[0].stop - detail[0].start) * view.pixel:.2g} m wide"
@@ -84,7 +86,7 @@ def before_after(source: PointCloud, target: PointCloud, poses: Mapping[str, Pos
     for top_row in panels[::below]:
         for panel, heading in zip(top_row, headings, strict=True):
             panel.set_title(heading)
-    for row, name, (picture, difference) in zip(panels, named, rows, strict=False):
+    for row, name, (picture, difference) in zip(panels, poses, rows, strict=False):
         _draw_row(row, name, picture, difference, detail)
     for panel in panels[len(rows) :].flat:
         panel.set_visible(False)
@@ -109,23 +111,18 @@ def _draw_row(panels: np.ndarray, name: str, picture: Picture, difference: Map, 
         panel.set(xticks=[], yticks=[])
 
 
-def _chess_boards(
-    view: View,
-    target: Float[np.ndarray, "M 3"],
-    target_colors: Float[np.ndarray, "M 3"],
-    moved: Sequence[Points],
-    source_colors: Points,
+def _checkerboards(
+    view: View, target: Picture, moved: Sequence[Points], source_colors: Points
 ) -> list[tuple[Picture, Map]]:
     """For each moved source a checkerboard picture, and the colour difference, NaN where either cloud has no points."""
     tile = max(view.width, view.height) // _TILES + 1
     row, column = np.mgrid[: view.height, : view.width] // tile
     target_tiles = ((row + column) % 2 == 0)[..., None]
-    target_picture = drawing.paint(view, target, target_colors)
-    target_smooth, boards = _smooth(target_picture), []
+    target_smooth, boards = _smooth(target), []
     for points in moved:
-        source_picture = drawing.paint(view, points, source_colors)
-        board = np.nan_to_num(np.where(target_tiles, target_picture, source_picture), nan=1)
-        boards.append((board, np.abs(target_smooth - _smooth(source_picture)).mean(axis=-1)))
+        source = drawing.paint(view, points, source_colors)
+        board = np.nan_to_num(np.where(target_tiles, target, source), nan=1)
+        boards.append((board, np.abs(target_smooth - _smooth(source)).mean(axis=-1)))
     return boards
 
 
@@ -138,14 +135,11 @@ def _smooth(picture: Picture) -> Picture:
     return padded
 
 
-def _overlays(
-    view: View, target: Float[np.ndarray, "M 3"], moved: Sequence[Points], target_size: float, source_size: float
-) -> list[tuple[Picture, Map]]:
-    """For each moved source a picture of both clouds, whose points have these sizes in pixels, and the difference of
-    their inks."""
-    target_ink, overlays = _ink(view, target, target_size), []
+def _overlays(view: View, target_ink: Map, moved: Sequence[Points], size: float) -> list[tuple[Picture, Map]]:
+    """For each moved source, its points `size` pixels wide, a picture of both clouds and the difference of inks."""
+    overlays = []
     for points in moved:
-        source_ink = _ink(view, points, source_size)
+        source_ink = _ink(view, points, size)
         # Subtractive colours: the target removes all red, the source all blue, and each half of the green.
         picture = 1 - np.stack([target_ink, 0.5 * target_ink + 0.5 * source_ink, source_ink], axis=-1)
         overlays.append((picture, np.abs(target_ink - source_ink)))
@@ -163,8 +157,7 @@ def _ink(view: View, points: Points, size: float) -> Map:
     np.maximum.at(highest, pixels[inside], height[inside])
     highest = maximum_filter(highest.reshape(view.height, view.width), round(size))
     lowest = minimum_filter(lowest.reshape(view.height, view.width), round(size))
-    stands = np.clip((highest - lowest) / (4 * view.pixel), 0.15, 1)
-    return np.where(highest >= lowest, stands, 0)
+    return np.where(highest >= lowest, np.clip((highest - lowest) / (4 * view.pixel), 0.15, 1), 0)
 
 
 def _where_they_differ(differences: Sequence[Map]) -> tuple[slice, slice]:
@@ -259,10 +252,9 @@ def surface_covariances(
         matrices, size = np.asarray(values, np.float64), cloud.points.shape[0]
         if matrices.shape != (size, 3, 3):
             raise ValueError(f"covariances[{name!r}]: expected shape ({size}, 3, 3), got {matrices.shape}")
-        flat = view.axes[:, :2].T @ matrices[rows] @ view.axes[:, :2]
         panel.imshow(picture, origin="lower", extent=view.extent)
+        variances, vectors = np.linalg.eigh(view.axes[:, :2].T @ matrices[rows] @ view.axes[:, :2])
         # Axes are `room` metres long per standard deviation.
-        variances, vectors = np.linalg.eigh(flat)
         lengths = room * np.sqrt(np.maximum(variances, 0))
         angles = np.degrees(np.arctan2(vectors[:, 1, 1], vectors[:, 0, 1]))
         # Black lines alone would hide on dark surfaces.
