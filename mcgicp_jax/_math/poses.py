@@ -1,4 +1,4 @@
-"""Poses: validation of user input, conversion between matrices and `jaxlie.SE3`, and changes of frames of twists.
+"""Poses: validation of user input, conversions between matrices and `jaxlie.SE3`, and frames of twists.
 
 A twist ξ = (v, ω) is a small motion: v in metres (or in units of a radius), ω in radians.
 """
@@ -27,10 +27,10 @@ else:
 
 # Tolerance on the largest entry of R Rᵀ − I: a matrix typed with four digits still counts as a rotation.
 _ROTATION_TOLERANCE = 1e-3
+# The same for a rotation that is exact to rounding.
+_EXACT = 1e-14
 # Tolerance on the last row, which rounding may change, as in products of matrices.
 _LAST_ROW_TOLERANCE = 1e-9
-# The same of a rotation that is exact to rounding.
-_EXACT = 1e-14
 # Largest displacement, in radii of the cloud, that rounding of R may cause for a cloud far from the origin.
 _DISPLACEMENT_TOLERANCE = 0.1
 
@@ -45,30 +45,30 @@ def pose_matrix(
     Args:
         pose: `jaxlie.SE3`, (4, 4) matrix, or its first three rows; None is the identity.
         name: name of the argument, for error messages.
-        distance: distance of the cloud that the pose will move from the origin, in radii of that cloud.
+        distance: of the cloud to be moved from the origin, in radii of that cloud.
 
     Raises:
-        ValueError: if the shape is wrong; or, for a concrete pose, if the matrix is not a rigid motion or its rotation
-            has too few digits for a cloud at that distance.
+        ValueError: if the shape is wrong; for a concrete pose also if it is no rigid motion, or if its rotation has too
+            few digits for a cloud at that distance.
     """
     if pose is None:
         return np.eye(4)
+    expected, kind = f"{name}: expected a jaxlie.SE3 or a (4, 4) matrix", type(pose).__name__
     if not isinstance(pose, jaxlie.SE3) and hasattr(pose, "matrix"):
-        kind = type(pose).__name__
-        raise ValueError(f"{name}: expected a jaxlie.SE3 or a (4, 4) matrix, got {kind}; pass its .matrix")
+        raise ValueError(f"{expected}, got {kind}; pass its .matrix")
     matrix = matrix_of(pose)
-    if not is_concrete(matrix):
-        if matrix.shape not in ((4, 4), (3, 4)):
-            raise ValueError(f"{name}: expected a jaxlie.SE3 or a (4, 4) matrix, got shape {matrix.shape}")
-        return matrix if len(matrix) == 4 else jnp.concatenate([matrix, jnp.eye(4, dtype=matrix.dtype)[3:]])
-    try:
-        matrix = np.asarray(matrix, dtype=np.float64)
-    except (TypeError, ValueError) as error:
-        raise ValueError(f"{name}: expected a jaxlie.SE3 or a (4, 4) matrix, got {type(pose).__name__}") from error
-    if matrix.shape == (3, 4):
-        matrix = np.concatenate([matrix, np.eye(4)[3:]])
-    if matrix.shape != (4, 4):
-        raise ValueError(f"{name}: expected a jaxlie.SE3 or a (4, 4) matrix, got shape {matrix.shape}")
+    xp = numpy_for(matrix)
+    if xp is np:
+        try:
+            matrix = np.asarray(matrix, dtype=np.float64)
+        except (TypeError, ValueError) as error:
+            raise ValueError(f"{expected}, got {kind}") from error
+    if matrix.shape not in ((4, 4), (3, 4)):
+        raise ValueError(f"{expected}, got shape {matrix.shape}")
+    if len(matrix) == 3:
+        matrix = xp.concatenate([matrix, xp.eye(4, dtype=matrix.dtype)[3:]])
+    if xp is not np:
+        return matrix
     rotation = matrix[:3, :3]
     off = np.abs(rotation @ rotation.T - np.eye(3)).max()
     # Written so that NaN fails as well.
@@ -89,7 +89,7 @@ def pose_matrix(
 
 
 def pose_matrices(poses: Any, name: str = "poses[{}]") -> Float[np.ndarray, "n 4 4"]:
-    """`pose_matrix` of each of several concrete poses; `name` has a place for the number in error messages."""
+    """`pose_matrix` of each concrete pose; `name` has a place for the number of the pose in error messages."""
     if not isinstance(poses, np.ndarray | jax.Array):
         poses = [pose_matrix(pose, name.format(k)) for k, pose in enumerate(poses)]
     matrices = np.array(poses, np.float64)
@@ -107,9 +107,9 @@ def pose_matrices(poses: Any, name: str = "poses[{}]") -> Float[np.ndarray, "n 4
 
 
 def nearest_rotation(matrix: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, "4 4"]:
-    """The matrix with its upper left 3×3 block replaced by the nearest rotation (Frobenius norm)."""
+    """The matrix with its rotation replaced by the nearest exact one (Frobenius norm)."""
     rotation = matrix[:3, :3]
-    # A matrix that is a rotation to rounding is returned unchanged, so that the function is idempotent.
+    # A rotation that is exact to rounding stays, so that the function is idempotent.
     if np.abs(rotation @ rotation.T - np.eye(3)).max() <= _EXACT:
         return matrix
     left, _, right = np.linalg.svd(rotation)
@@ -143,7 +143,7 @@ def matrix_of(pose: Pose) -> Any:
 
 
 def matrices_of(parameters: Float[np.ndarray, "*batch 7"]) -> Float[np.ndarray, "*batch 4 4"]:
-    """Rigid motions as matrices from `parameters_of`."""
+    """Inverse of `parameters_of`."""
     matrices = np.zeros((*parameters.shape[:-1], 4, 4))
     matrices[..., :3, :3] = rotation_from_quaternion(parameters[..., :4])
     matrices[..., :3, 3] = parameters[..., 4:]
@@ -163,7 +163,7 @@ def se3(parameters: AnyArray) -> jaxlie.SE3:
 
 
 def rotation_from_quaternion(wxyz: Float[np.ndarray, "*batch 4"]) -> Float[np.ndarray, "*batch 3 3"]:
-    """Rotation matrices of quaternions, in the precision of the input: jaxlie would use float32 where x64 is off."""
+    """Rotation matrices in the precision of the quaternions: jaxlie would use float32 where x64 is off."""
     if wxyz.ndim == 1 and wxyz.dtype == np.float64:
         # Python's floats are float64, and ten times as fast as NumPy's scalars.
         w, x, y, z = wxyz.tolist()
@@ -181,11 +181,9 @@ def rotation_from_quaternion(wxyz: Float[np.ndarray, "*batch 4"]) -> Float[np.nd
 
 
 def rotated(points: Float[np.ndarray, "n 3"], rotation: Float[np.ndarray, "3 3"]) -> Float[np.ndarray, "n 3"]:
-    """R p of each point p.
-
-    Not `points @ rotation.T`: the threads of BLAS keep their cores busy for a while after each product, which was a
-    third of the processor time of odometry.
-    """
+    """R p of each point p."""
+    # Not `points @ rotation.T`: the threads of BLAS keep their cores busy for a while after each product, which was a
+    # third of the processor time of odometry.
     return np.einsum("ij,jn->in", rotation, np.ascontiguousarray(points.T)).T
 
 
@@ -220,7 +218,7 @@ def move_pose(pose: jaxlie.SE3, twist: Float[Array, "6"], center: Float[Array, "
 
 
 def adjoint_to_center(pose: jaxlie.SE3, center: Float[Array, "3"]) -> Float[Array, "6 6"]:
-    """(6, 6) matrix from ξ of T exp(ξ), in the source's frame, to twists about the centre in the target's frame."""
+    """Matrix from ξ of T exp(ξ), in the source's frame, to twists about the centre in the target's frame."""
     to_center = jaxlie.SE3.from_rotation_and_translation(jaxlie.SO3.identity(), -center) @ pose
     return to_center.adjoint().astype(pose.wxyz_xyz.dtype)
 
@@ -232,14 +230,13 @@ def adjoint_to_source(pose: jaxlie.SE3, center: Float[Array, "3"]) -> Float[Arra
 
 
 def units(radius: Float[AnyScalar, ""]) -> Float[AnyArray, "6"]:
-    """Factors that convert a twist from units of the radius to metres; radians stay."""
+    """Factors that convert a twist from units of the radius to metres; ω stays in radians."""
     xp = numpy_for(radius)
     return xp.stack([radius] * 3 + [xp.ones_like(radius)] * 3)
 
 
 def parameters_by_twist(pose: Float[AnyArray, "7"], center: Float[AnyArray, "3"]) -> Float[AnyArray, "7 6"]:
-    """Derivative of pose parameters `wxyz_xyz` by a twist about a centre, metres and radians: the pose turns by ω about
-    the centre and shifts by v."""
+    """Derivative of pose parameters `wxyz_xyz` by a twist: the pose turns by ω about the centre and shifts by v."""
     xp = numpy_for(pose, center)
     by_turn = turn_by_quaternion(pose[:4]).T / 4
     quaternion = xp.concatenate([xp.zeros_like(by_turn), by_turn], axis=1)
@@ -247,7 +244,7 @@ def parameters_by_twist(pose: Float[AnyArray, "7"], center: Float[AnyArray, "3"]
 
 
 def inverse(matrices: Float[AnyArray, "*batch 4 4"]) -> Float[AnyArray, "*batch 4 4"]:
-    """The inverses of rigid motions."""
+    """Inverses of rigid motions."""
     xp = numpy_for(matrices)
     turned = xp.swapaxes(matrices[..., :3, :3], -1, -2)
     last = xp.broadcast_to(xp.eye(4, dtype=matrices.dtype)[3:], (*matrices.shape[:-2], 1, 4))
@@ -265,13 +262,12 @@ def adjoint(matrices: Float[AnyArray, "*batch 4 4"]) -> Float[AnyArray, "*batch 
 
 
 def translation_adjoint(offset: Float[AnyArray, "3"]) -> Float[AnyArray, "6 6"]:
-    """The adjoint of a translation by `offset`."""
     xp = numpy_for(offset)
     return xp.block([[xp.eye(3), skew(offset)], [xp.zeros((3, 3)), xp.eye(3)]])
 
 
 def skew(vectors: Float[AnyArray, "*batch 3"]) -> Float[AnyArray, "*batch 3 3"]:
-    """The matrices of the cross products a × ·."""
+    """Matrices of the cross products a × ·."""
     xp = numpy_for(vectors)
     x, y, z = xp.moveaxis(vectors, -1, 0)
     zero = xp.zeros_like(x)
@@ -286,7 +282,7 @@ _ZETA = np.array([np.pi**2 / 6, np.pi**4 / 90, *(np.sum(np.arange(1.0, 999) ** (
 
 
 def exponential(twists: Float[np.ndarray, "*batch 6"]) -> Float[np.ndarray, "*batch 4 4"]:
-    """exp(ξ), as matrices."""
+    """exp(ξ)."""
     omega = skew(twists[..., 3:])
     square = omega @ omega
     angle = np.linalg.norm(twists[..., 3:], axis=-1)[..., None, None]
@@ -302,7 +298,11 @@ def exponential(twists: Float[np.ndarray, "*batch 6"]) -> Float[np.ndarray, "*ba
 
 def logarithm(matrices: Float[np.ndarray, "*batch 4 4"]) -> Float[np.ndarray, "*batch 6"]:
     """ξ with exp(ξ) = T and a rotation angle of at most π."""
-    turn = _rotation_vectors(matrices[..., :3, :3])
+    quaternions = quaternion_from_rotation(matrices[..., :3, :3])
+    sine = np.linalg.norm(quaternions[..., 1:], axis=-1, keepdims=True)
+    angle = 2 * np.arctan2(sine, quaternions[..., :1])
+    small = sine < 1e-150
+    turn = np.where(small, 2, angle / np.where(small, 1, sine)) * quaternions[..., 1:]
     omega = skew(turn)
     ratio = np.sum(turn * turn, axis=-1)[..., None, None] / (2 * np.pi) ** 2
     factor = 2 * np.polynomial.polynomial.polyval(ratio, _ZETA) / (2 * np.pi) ** 2
@@ -317,21 +317,10 @@ def logarithm_derivative(twists: Float[np.ndarray, "*batch 6"]) -> Float[np.ndar
     1995), powers of ad above the fourth reduce to the second and the fourth.
     """
     first, second = skew(twists[..., 3:]), skew(twists[..., :3])
-    ad = np.concatenate(
-        [np.concatenate([first, second], axis=-1), np.concatenate([np.zeros_like(first), first], axis=-1)], axis=-2
-    )
+    ad = np.block([[first, second], [np.zeros_like(first), first]])
     square = ad @ ad
     ratio = np.sum(twists[..., 3:] ** 2, axis=-1)[..., None, None] / (2 * np.pi) ** 2
     polynomial = np.polynomial.polynomial.polyval
     of_square = -2 * polynomial(ratio, (_POWERS - 2) * _ZETA) / (2 * np.pi) ** 2
     of_fourth = -2 * polynomial(ratio, ((_POWERS - 1) * _ZETA)[1:]) / (2 * np.pi) ** 4
     return np.eye(6) + 0.5 * ad + of_square * square + of_fourth * (square @ square)
-
-
-def _rotation_vectors(rotations: Float[np.ndarray, "*batch 3 3"]) -> Float[np.ndarray, "*batch 3"]:
-    """Axis times angle, of angles up to π."""
-    quaternions = quaternion_from_rotation(rotations)
-    sine = np.linalg.norm(quaternions[..., 1:], axis=-1, keepdims=True)
-    angle = 2 * np.arctan2(sine, quaternions[..., :1])
-    small = sine < 1e-150
-    return np.where(small, 2, angle / np.where(small, 1, sine)) * quaternions[..., 1:]

@@ -26,15 +26,14 @@ class Numbers(eqx.Module):
         parts = []
         for field in dataclasses.fields(self):
             value = getattr(self, field.name)
-            if value is None or not is_concrete(value):
-                parts.append(f"{field.name}={value}")
-            else:
-                parts.append(f"{field.name}={np.array2string(np.asarray(value), precision=4, separator=', ')}")
+            if value is not None and is_concrete(value):
+                value = np.array2string(np.asarray(value), precision=4, separator=", ")
+            parts.append(f"{field.name}={value}")
         return f"{type(self).__name__}({', '.join(parts)})"
 
 
 def number_of(name: str, value: Any) -> Array:
-    """The array of a parameter with this name, in the default precision; raises `ValueError` if it is none."""
+    """The value of the parameter `name` as an array, in the default precision; raises `ValueError` if it is none."""
     try:
         # NumPy converts concrete values without compiling a program.
         return put_on_cpu(np.asarray(value, canonical_float())) if is_concrete(value) else jnp.asarray(value)
@@ -135,9 +134,8 @@ class Tukey(AbstractKernel):
 def truncated_weights(ratio: Float[AnyArray, "*batch"], control: AnyScalar) -> Float[AnyArray, "*batch"]:
     """Weights of truncated squares in graduated non-convexity (Yang et al., RA-L 2020, eq. 14).
 
-    Args:
-        ratio: threshold divided by the residual.
-        control: μ; the decline from 1 to 0 around the threshold becomes steeper as it grows.
+    `ratio` is the threshold divided by the residual; `control` is μ: the larger, the steeper is the decline from 1 to 0
+    around the threshold.
     """
     xp = numpy_for(ratio, control)
     return xp.clip(ratio * xp.sqrt(control * (control + 1)) - control, 0, 1)

@@ -21,13 +21,9 @@ _BITS = np.uint64(0x9E3779B97F4A7C15)
 
 
 def sampled_rows(valid: Any) -> tuple[Any, Any]:
-    """Evenly spaced rows of a cloud, as the sample for a median.
+    """At most `MEDIAN_ROWS` evenly spaced rows of a cloud, as the sample for a median; and which of them are valid.
 
-    Args:
-        valid: (N,) booleans; False for padding, which comes last.
-
-    Returns:
-        (n,) row numbers, n at most `MEDIAN_ROWS`, and (n,) booleans: which of them are valid.
+    `valid`, (N,), is False for padding, which comes last.
     """
     xp = numpy_for(valid)
     count = min(valid.size, MEDIAN_ROWS)
@@ -38,14 +34,11 @@ def sampled_rows(valid: Any) -> tuple[Any, Any]:
 
 
 def spread_rows(valid: Any, count: int) -> Any:
-    """`count` of the valid rows of a cloud with more rows than that, in order: one of each of as many equal runs.
+    """`count` valid rows of a cloud with more rows than that, in order: one from each of `count` equal runs.
 
-    Rows sorted by voxel, as `preprocess` leaves them, are spread evenly in space, others as densely as the points.
-    The place in each run is random with a fixed seed: with a constant stride, all rows of an organised scan could be
-    from one scan line.
-
-    Args:
-        valid: (N,) booleans; False for padding. If fewer than `count` are True, rows of padding follow.
+    Rows sorted by voxel, as `preprocess` leaves them, are spread evenly in space, others as densely as the points. The
+    place in each run is random with a fixed seed: with a constant stride, all rows of an organised scan could be from
+    one scan line. `valid`, (N,), is False for padding; if fewer than `count` are True, rows of padding follow.
     """
     xp = numpy_for(valid)
     valid_first = xp.argsort(~xp.asarray(valid), stable=True)
@@ -58,25 +51,23 @@ def spread_rows(valid: Any, count: int) -> Any:
 
 
 def median(values: Any) -> Any:
-    """Median over the last axis, ignoring NaNs; NaN where all values are. Not meant to be differentiated."""
+    """Median over the last axis that ignores NaN; NaN where all values are NaN. Not meant to be differentiated."""
     if not is_concrete(values):
         return _traced_median(values)
     values = np.asarray(values)
     result = np.full(values.shape[:-1], np.nan, values.dtype)
-    for place in np.ndindex(values.shape[:-1]):
-        numbers = values[place][~np.isnan(values[place])]
+    for index in np.ndindex(values.shape[:-1]):
+        numbers = values[index][~np.isnan(values[index])]
         if numbers.size:
             # In float64, in which the sum of the two middle values does not overflow.
-            result[place] = np.median(numbers.astype(np.float64))
+            result[index] = np.median(numbers.astype(np.float64))
     return result[()]
 
 
 def of_known(statistic: Callable[[Any], Any], values: Float[AnyArray, "n C"]) -> Float[AnyArray, "*some C"]:
-    """A statistic over the first axis that ignores NaN, such as `nanstd`; NaN for columns of NaN.
-
-    NumPy would warn of such columns, and its warning cannot be suppressed in one thread alone.
-    """
+    """A statistic over the first axis that ignores NaN, such as `nanstd`; NaN for columns of NaN."""
     xp = numpy_for(values)
+    # NumPy would warn of columns of NaN, and its warning cannot be suppressed in one thread alone.
     missing = xp.all(xp.isnan(values), axis=0)
     # Squares of huge values overflow to infinity.
     with np.errstate(over="ignore", invalid="ignore"):
@@ -84,13 +75,12 @@ def of_known(statistic: Callable[[Any], Any], values: Float[AnyArray, "n C"]) ->
 
 
 def _traced_median(values: Float[Array, "*batch n"]) -> Float[Array, "*batch"]:
-    """Sorts the floats as integers of the same order: XLA on CPUs takes five times as long to sort floats."""
+    # Floats are sorted as integers of the same order: XLA on CPUs takes five times as long to sort floats.
     kind = jnp.int32 if values.dtype == jnp.float32 else jnp.int64
-    largest = jnp.iinfo(kind).max
 
     def reordered(bits: Int[Array, "*batch n"]) -> Int[Array, "*batch n"]:
         # Of two negative floats, the larger one has the smaller bit pattern.
-        return jnp.where(bits < 0, bits ^ largest, bits)
+        return jnp.where(bits < 0, bits ^ jnp.iinfo(kind).max, bits)
 
     missing: Bool[Array, "*batch n"] = jnp.isnan(values)
     # One canonical bit pattern for NaN, which sorts last.
@@ -103,21 +93,16 @@ def _traced_median(values: Float[Array, "*batch n"]) -> Float[Array, "*batch"]:
 
 
 def cell_numbers(keys: Sequence[Int[AnyArray, "n"]], num_cells: Int[AnyScalar, ""] | int) -> Int[AnyArray, "n"]:
-    """Hash of integer cell coordinates, below `num_cells`.
-
-    Collisions do no harm: scores of different cells are independent, so their products cancel on average.
-    """
+    """Hash of integer cell coordinates, below `num_cells`."""
+    # Collisions do no harm: scores of different cells are independent, so their products cancel on average.
     xp = numpy_for(keys, num_cells)
     products = [xp.asarray(key, np.int32) * prime for key, prime in zip(keys, _HASH, strict=False)]
     return xp.abs(sum(products[1:], start=products[0])) % num_cells
 
 
 def equal_rows(points: Float[np.ndarray, "N D"], most: int) -> Int[np.ndarray, "N"] | None:
-    """The number of the position of each point, if more than `most` finite points share one; None otherwise.
-
-    The sort of a hash takes a twentieth of the time of a k-d tree.
-    """
-    # The sum turns −0 into 0, whose bits differ.
+    """The number of each point's position, if more than `most` finite points share one; None otherwise."""
+    # The sort of a hash takes a twentieth of the time of a k-d tree. The sum turns −0 into 0, whose bits differ.
     columns = np.ascontiguousarray(points.T, np.float64) + 0.0
     keys = np.zeros(len(points), np.uint64)
     for column in columns.view(np.uint64):

@@ -18,6 +18,9 @@ from jaxtyping import Array, Float, Int
 from mcgicp_jax._compute.concrete import AnyArray, numpy_for
 from mcgicp_jax._compute.threads import with_settings_of_package
 
+# Vectors and matrices given by their entries, each an array of one number per point.
+Entries: TypeAlias = Sequence[Array]
+
 # Row and column of each entry of a symmetric matrix.
 _ROWS, _COLUMNS = np.array([[0, 0, 0, 1, 1, 2], [0, 1, 2, 1, 2, 2]], np.int32)
 
@@ -47,7 +50,7 @@ def rotate(rotation: Float[Array, "3 3"], symmetric: Float[Array, "6 N"]) -> Flo
 
 
 def inner(a: Float[Array, "3 N"], b: Float[Array, "3 N"]) -> Float[Array, "N"]:
-    """aᵀ b for each point, for the correspondences of a whole cloud, where `jnp.sum` over a first axis is slow on CPUs.
+    """aᵀ b of each point of a whole cloud, where `jnp.sum` over a first axis is slow on CPUs.
 
     Programs over neighbourhoods use `jnp.sum`: it keeps XLA from recomputing its operands for each use, and is faster.
     """
@@ -104,8 +107,12 @@ def smallest_eigenvector(symmetric: Float[Array, "6 N"]) -> Float[Array, "3 N"]:
 
 @jax.custom_jvp
 def _smallest_eigenvector(symmetric: Float[Array, "6 N"]) -> Float[Array, "3 N"]:
-    # Written out by coordinate: XLA fuses this into few loops, and stacked arrays into many.
-    xx, xy, xz, yy, yz, zz = _scale_to_one(symmetric)
+    # Written out by entry: XLA fuses this into few loops, and stacked arrays into many.
+    xx, xy, xz, yy, yz, zz = symmetric
+    # Divided by the trace, products of entries stay in the range of float32 from 1e-6 m to 1e6 m.
+    trace = xx + yy + zz
+    scale = 1 / jnp.where(trace > 0, trace, 1)
+    xx, xy, xz, yy, yz, zz = (entry * scale for entry in (xx, xy, xz, yy, yz, zz))
     mean = (xx + yy + zz) / 3
     ax, ay, az = xx - mean, yy - mean, zz - mean
     spread = jnp.sqrt((ax * ax + ay * ay + az * az + 2 * (xy * xy + xz * xz + yz * yz)) / 6)
@@ -131,12 +138,8 @@ def _smallest_eigenvector(symmetric: Float[Array, "6 N"]) -> Float[Array, "3 N"]
     regular = square > 0
     length = jnp.sqrt(jnp.where(regular, square, 1))
     along, across = along / length, jnp.where(regular, across / length, 1)
-    chosen = [jnp.where(positive, along * p + across * q, n) for p, q, n in zip(u, v, first, strict=True)]
-    return jnp.stack([jnp.where(isotropic, default, axis) for axis, default in zip(chosen, (0, 0, 1), strict=True)])
-
-
-# Vectors and matrices given by their entries, each an array of one number per point.
-Entries: TypeAlias = Sequence[Array]
+    normal = [jnp.where(positive, along * p + across * q, n) for p, q, n in zip(u, v, first, strict=True)]
+    return jnp.stack([jnp.where(isotropic, default, axis) for axis, default in zip(normal, (0, 0, 1), strict=True)])
 
 
 def dot(a: Entries, b: Entries) -> Array:
@@ -151,14 +154,6 @@ def _times(symmetric: Entries, vector: Entries) -> Entries:
 
 def cross(a: Entries, b: Entries) -> Entries:
     return a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
-
-
-def _scale_to_one(symmetric: Float[Array, "6 N"]) -> Entries:
-    """The matrix divided by its trace: products of entries stay in the range of float32 from 1e-6 m to 1e6 m."""
-    xx, xy, xz, yy, yz, zz = symmetric
-    trace = xx + yy + zz
-    scale = 1 / jnp.where(trace > 0, trace, 1)
-    return tuple(entry * scale for entry in (xx, xy, xz, yy, yz, zz))
 
 
 def _null_vector(xx: Array, xy: Array, xz: Array, yy: Array, yz: Array, zz: Array) -> Entries:
@@ -230,7 +225,7 @@ def sandwich(outside: Float[Array, "3 N"], inside: Float[Array, "3 N"]) -> Float
 
 
 def floor_eigenvalues(symmetric: Float[Array, "3 N"], floor: Float[Array, "*N"]) -> Float[Array, "3 N"]:
-    """Raise the eigenvalues of 2×2 matrices to at least `floor`; matrices above it are returned bit for bit."""
+    """2×2 matrices with eigenvalues raised to at least `floor`; matrices above it are returned bit for bit."""
     a, b, c = symmetric
     mean, half = 0.5 * (a + c), 0.5 * (a - c)
     square = half * half + b * b
@@ -260,7 +255,7 @@ def inverse_3(matrices: Float[AnyArray, "*n 3 3"]) -> Float[AnyArray, "*n 3 3"]:
     """Inverses of symmetric positive definite matrices: cross products of rows over the determinant."""
     xp = numpy_for(matrices)
     matrices = 0.5 * (matrices + matrices.swapaxes(-1, -2))
-    # So that the determinant of variances of 1e-10 does not underflow float32.
+    # Divided by the trace, so that the determinant of variances of 1e-10 does not underflow float32.
     size = xp.einsum("...ii->...", matrices)[..., None, None]
     first, second, third = (matrices[..., i, :] / size[..., 0] for i in range(3))
     rows = xp.stack([xp.cross(second, third), xp.cross(third, first), xp.cross(first, second)], axis=-2)
@@ -284,7 +279,6 @@ def solve(matrices: Float[AnyArray, "*n m m"], sides: Float[AnyArray, "*n m"]) -
     """A⁻¹ b of positive definite matrices A."""
     if numpy_for(matrices, sides) is np:
         return np.linalg.solve(matrices, sides[..., None])[..., 0]
-    size = sides.shape[-1]
 
     def eliminate(i: Int[Array, ""], rows: Float[Array, "*n m k"]) -> Float[Array, "*n m k"]:
         pivot = rows[..., i, :] / rows[..., i, i, None]
@@ -293,4 +287,4 @@ def solve(matrices: Float[AnyArray, "*n m m"], sides: Float[AnyArray, "*n m"]) -
 
     # Gauss-Jordan elimination; positive definite matrices need no pivoting.
     rows = jnp.concatenate([matrices, sides[..., None]], axis=-1)
-    return jax.lax.fori_loop(0, size, eliminate, rows)[..., -1]
+    return jax.lax.fori_loop(0, sides.shape[-1], eliminate, rows)[..., -1]
