@@ -34,18 +34,22 @@ class SearchPoints(NamedTuple):
     penalty: Float[AnyArray, "*batch N D"] | None = None
 
 
-def by_position(rows: SearchPoints) -> SearchPoints:
-    """The rows for a search in position alone."""
-    return SearchPoints(rows.points, rows.descriptors[:, :0], rows.valid)
-
-
-# The pose that leaves queries where they are, as the searches take it.
+# The identity, as the searches take poses.
 IDENTITY = np.array([1.0, 0, 0, 0, 0, 0, 0])
 
 
 def search_points(points: Float[np.ndarray, "N 3"]) -> SearchPoints:
-    """Points for a search in position alone."""
+    """Points without descriptors."""
     return SearchPoints(points, np.zeros((len(points), 0), points.dtype), np.ones(len(points), bool))
+
+
+def by_position(rows: SearchPoints) -> SearchPoints:
+    """The same points without descriptors."""
+    return SearchPoints(rows.points, rows.descriptors[:, :0], rows.valid)
+
+
+def on_host(rows: SearchPoints) -> SearchPoints:
+    return jax.tree.map(np.asarray, rows)
 
 
 class Correspondences(eqx.Module):
@@ -70,11 +74,10 @@ class Correspondences(eqx.Module):
 
 @jax.tree_util.register_pytree_node_class
 class NeighborsOnDemand(Deferred):
-    """Stands for the (N, k) array of `AbstractSearch.neighbors`, whose rows are found when they are first needed.
+    """The (N, k) array of `AbstractSearch.neighbors`, whose rows are computed when they are first needed.
 
-    Args:
-        find: maps row numbers, or None for all rows, to the rows of their k nearest neighbours.
-        anew: makes the same, for pickles, so that a worker finds the neighbours; None: pickles have the whole array.
+    `find` maps row numbers, or None for all rows, to the rows of their k nearest neighbours. `anew` makes the same
+    object for pickles, so that a worker searches for the neighbours; None: pickles hold the whole array.
     """
 
     def __init__(
@@ -89,9 +92,9 @@ class NeighborsOnDemand(Deferred):
     @property
     def whole(self) -> Int[np.ndarray, "N k"]:
         """All rows, as a read-only array."""
-        found = self._table.computed()
-        found.setflags(write=False)
-        return found
+        rows = self._table.computed()
+        rows.setflags(write=False)
+        return rows
 
     def __reduce__(self) -> Any:
         return super().__reduce__() if self._anew is None or self._table.complete else (self._anew, ())
@@ -120,10 +123,9 @@ class AbstractIndex(abc.ABC):
     def follow(
         self, source: SearchPoints, max_distance: float, num_candidates: int = 1
     ) -> Callable[[Float[ArrayLike, "7"]], Int[np.ndarray, "m N"]]:
-        """A function that maps a pose to the nearest target rows of each source row, for one registration.
+        """A function that maps a pose to the rows that `nearest` returns, several candidates in any order.
 
-        It returns the same rows as `nearest`, several candidates in any order, and may reuse the results of earlier
-        poses.
+        It serves one registration, and may reuse the results of earlier poses.
         """
 
 
@@ -168,10 +170,5 @@ class AbstractSearch(eqx.Module):
         """
 
     def neighbors_on_demand(self, points: Float[np.ndarray, "N 3"], num_neighbors: int) -> Any:
-        """`neighbors`, or what finds them when they are needed."""
+        """`neighbors`, as an array or as `NeighborsOnDemand`."""
         return self.neighbors(points, num_neighbors)
-
-
-def on_host(tree: SearchPoints) -> SearchPoints:
-    """The rows as NumPy arrays."""
-    return jax.tree.map(np.asarray, tree)

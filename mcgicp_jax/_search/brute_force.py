@@ -19,10 +19,11 @@ from mcgicp_jax._compute.programs import size_class
 from mcgicp_jax._search.base import IDENTITY, AbstractIndex, AbstractSearch, SearchPoints, on_host, search_points
 from mcgicp_jax._search.kd_tree import KDTreeSearch
 
-# Rows of a run and of its parts: on an H200, 20 neighbours of 6,144 points took 0.2 ms by these, and 1.45 ms by passes
-# over all distances. Fewer than eight runs exclude nothing. Rows of queries whose distances to the rows of parts are
-# stored at a time: 14 MB for 20 neighbours and five dimensions.
-_RUN, _PART, _LEAST_FOR_RUNS, _QUERIES = 64, 8, 512, 512
+# Rows of a run and of a part of it: on an H200, 20 neighbours of 6,144 points took 0.2 ms by these, and 1.45 ms by
+# passes over all distances. Fewer than eight runs exclude nothing.
+_RUN, _PART, _LEAST_FOR_RUNS = 64, 8, 512
+# Queries whose distances to the rows of parts are stored at a time: 14 MB for 20 neighbours and five dimensions.
+_QUERIES = 512
 
 
 def default_search(traced: bool = False, workers: int = -1) -> AbstractSearch:
@@ -68,9 +69,8 @@ class DenseIndex(AbstractIndex):
     def nearest(
         self, pose: Float[ArrayLike, "7"], source: SearchPoints, max_distance: float, num_candidates: int = 1
     ) -> Int[np.ndarray, "m N"]:
-        size, padded = source.valid.size, _padded(source)
-        found = _nearest(jnp.asarray(pose, source.points.dtype), padded, self._target, num_candidates)
-        return np.asarray(found)[:, :size]
+        pose = jnp.asarray(pose, source.points.dtype)
+        return np.asarray(_nearest(pose, _padded(source), self._target, num_candidates))[:, : source.valid.size]
 
     def follow(
         self, source: SearchPoints, max_distance: float, num_candidates: int = 1
@@ -79,7 +79,7 @@ class DenseIndex(AbstractIndex):
 
 
 def _padded(rows: SearchPoints) -> SearchPoints:
-    """The rows padded to their size class, so that clouds of all sizes run few programs."""
+    """The rows padded to their size class: clouds of all sizes run few programs."""
     rows = on_host(rows)
     missing = size_class(rows.valid.size) - rows.valid.size
     return jax.tree.map(lambda array: np.pad(array, [(0, missing)] + [(0, 0)] * (array.ndim - 1)), rows)
@@ -96,40 +96,60 @@ def _nearest(
     if num_candidates > 1 and complete and target.valid.size >= _LEAST_FOR_RUNS:
         return _nearest_by_runs(queries, target, num_candidates)
     rows = jnp.arange(target.valid.size, dtype=jnp.int32)
-
-    def squares(source: SearchPoints, target: SearchPoints, rows: Int[Array, "M"]) -> tuple[Array, Array]:
-        square = jnp.where(target.valid, _squares(source, target), jnp.inf)
-        return square, jnp.broadcast_to(rows, square.shape)
-
-    square, nearest = _first(squares, (queries, target, rows), source.valid.size, num_candidates)
+    square, nearest = _first(_squares, (queries, target, rows), source.valid.size, num_candidates)
     return jnp.where(jnp.isfinite(square) & source.valid, nearest, -1)
+
+
+def _squares(
+    source: SearchPoints, target: SearchPoints, rows: Int[Array, "M"]
+) -> tuple[Float[Array, "N M"], Int[Array, "N M"]]:
+    """Squared search distance of every source row to every target row, metres²; and the target rows."""
+    square = jnp.zeros((source.valid.size, target.valid.size), jnp.asarray(source.points).dtype)
+    for query, point in zip(source.points.T, target.points.T, strict=True):
+        square = square + (query[:, None] - point) ** 2
+    for column in range(source.descriptors.shape[1]):
+        added = (source.descriptors[:, column, None] - target.descriptors[:, column]) ** 2
+        for side, axis in ((source, 1), (target, 0)):
+            if side.penalty is not None:
+                penalty = jnp.expand_dims(side.penalty[:, column], axis)
+                added = jnp.where(penalty > 0, penalty, added)
+        square = square + added
+    square = jnp.where(target.valid, square, jnp.inf)
+    return square, jnp.broadcast_to(rows, square.shape)
 
 
 def _first(
     numbered: Callable[..., tuple[Float[Array, "N M"], Int[Array, "N M"]]], arguments: Any, size: int, count: int
 ) -> tuple[Float[Array, "m N"], Int[Array, "m N"]]:
-    """The `count` smallest squares of each of N rows, and their numbers, by which ties are broken; of the table that
-    `numbered(*arguments)` computes, which is not stored."""
+    """The `count` smallest squares of each of N rows, and their numbers, by which ties are broken.
+
+    `numbered(*arguments)` computes the table of squares and numbers, which is not stored.
+    """
 
     def following(before: tuple[Array, Array], _: None) -> tuple[tuple[Array, Array], tuple[Array, Array]]:
         """The next after `before` in the order of (square, number)."""
         # Without the barrier the compiler would hoist the loop-invariant squares out of the loop and store them.
-        before, again = jax.lax.optimization_barrier((before, arguments))
-        square, numbers = numbered(*again)
+        before, table = jax.lax.optimization_barrier((before, arguments))
+        square, numbers = numbered(*table)
         least, number = (values[:, None] for values in before)
         # False where the square is NaN.
         after = (square > least) | ((square == least) & (numbers > number))
-        found = jax.lax.reduce(
+        smallest = jax.lax.reduce(
             (jnp.where(after, square, jnp.inf), numbers),
             (jnp.asarray(jnp.inf, square.dtype), jnp.int32(np.iinfo(np.int32).max)),
             _nearer,
             dimensions=(1,),
         )
-        return found, found
+        return smallest, smallest
 
     dtype = jax.eval_shape(numbered, *arguments)[0].dtype
     start = (jnp.full(size, -1, dtype), jnp.full(size, -1, jnp.int32))
     return jax.lax.scan(following, start, length=count)[1]
+
+
+def _nearer(one: tuple[Array, Array], other: tuple[Array, Array]) -> tuple[Array, Array]:
+    first = (one[0] < other[0]) | ((one[0] == other[0]) & (one[1] < other[1]))
+    return jnp.where(first, one[0], other[0]), jnp.where(first, one[1], other[1])
 
 
 def _given(square: Float[Array, "N M"], numbers: Int[Array, "N M"]) -> tuple[Array, Array]:
@@ -137,8 +157,9 @@ def _given(square: Float[Array, "N M"], numbers: Int[Array, "N M"]) -> tuple[Arr
 
 
 def _nearest_by_runs(queries: SearchPoints, target: SearchPoints, num_candidates: int) -> Int[Array, "m N"]:
-    """Several nearest target rows, in three levels: the nearest runs of rows, of these the nearest parts, and of those
-    the nearest rows. Exact, since as many runs, or parts, each with a row at its distance, come before any other one.
+    """The m nearest target rows: first the m nearest runs of rows, then of these the m nearest parts, then the rows.
+
+    Exact: m rows, the nearest of each of the m nearest runs, come before any row of another run; likewise for parts.
     """
 
     def column_of(array: Float[Array, "n"], multiple: int) -> Float[Array, "m"]:
@@ -156,14 +177,14 @@ def _nearest_by_runs(queries: SearchPoints, target: SearchPoints, num_candidates
         numbers = jnp.broadcast_to(jnp.arange(valid.size // _RUN, dtype=jnp.int32), (_QUERIES, valid.size // _RUN))
         for width, finer in ((_RUN, _PART), (_PART, 1)):
             # Distances of all rows of these runs, or parts, reduced at once.
-            chosen = slice(None) if width == _RUN else numbers
+            groups = slice(None) if width == _RUN else numbers
             squares = [
-                (query[:, None, None] - column.reshape(-1, width)[chosen]) ** 2
+                (query[:, None, None] - column.reshape(-1, width)[groups]) ** 2
                 for query, column in zip(block, columns, strict=True)
             ]
             least = jnp.min(sum(squares[1:], squares[0]), axis=2)
             _, nearest = _first(_given, (least, numbers), _QUERIES, num_candidates)
-            # Numbers beyond the last are those of no run.
+            # Where no further run is left, the number is the largest int32.
             nearest = jnp.minimum(nearest.T, valid.size // width - 1)
             within = jnp.arange(width // finer, dtype=jnp.int32)
             numbers = (nearest[:, :, None] * (width // finer) + within).reshape(_QUERIES, -1)
@@ -171,26 +192,6 @@ def _nearest_by_runs(queries: SearchPoints, target: SearchPoints, num_candidates
         square, rows = _first(_given, (sum(squares[1:], squares[0]), numbers), _QUERIES, num_candidates)
         return jnp.where(jnp.isfinite(square), rows, -1)
 
-    found = jax.lax.map(of_block, [block.reshape(-1, _QUERIES) for block in blocks])
-    found = found.transpose(1, 0, 2).reshape(num_candidates, -1)[:, : queries.valid.size]
-    return jnp.where(queries.valid, found, -1)
-
-
-def _squares(source: SearchPoints, target: SearchPoints) -> Float[Array, "N M"]:
-    """Squared search distance of every source row to every target row, metres²; not stored if reduced at once."""
-    square = jnp.zeros((source.valid.size, target.valid.size), jnp.asarray(source.points).dtype)
-    for query, point in zip(source.points.T, target.points.T, strict=True):
-        square = square + (query[:, None] - point) ** 2
-    for column in range(source.descriptors.shape[1]):
-        added = (source.descriptors[:, column, None] - target.descriptors[:, column]) ** 2
-        for rows, axis in ((source, 1), (target, 0)):
-            if rows.penalty is not None:
-                penalty = jnp.expand_dims(rows.penalty[:, column], axis)
-                added = jnp.where(penalty > 0, penalty, added)
-        square = square + added
-    return square
-
-
-def _nearer(one: tuple[Array, Array], other: tuple[Array, Array]) -> tuple[Array, Array]:
-    first = (one[0] < other[0]) | ((one[0] == other[0]) & (one[1] < other[1]))
-    return jnp.where(first, one[0], other[0]), jnp.where(first, one[1], other[1])
+    rows = jax.lax.map(of_block, [block.reshape(-1, _QUERIES) for block in blocks])
+    rows = rows.transpose(1, 0, 2).reshape(num_candidates, -1)[:, : queries.valid.size]
+    return jnp.where(queries.valid, rows, -1)

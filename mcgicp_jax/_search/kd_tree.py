@@ -53,7 +53,6 @@ class PyKDTree:
     def query(
         self, queries: Float[np.ndarray, "N D"], k: int, bound: float
     ) -> tuple[Float[np.ndarray, "N k"], Int[np.ndarray, "N k"]]:
-        """As `AbstractTreeSearch.query`."""
         queries = np.ascontiguousarray(queries, np.float64)
         with _one_thread():
             distances, rows = self._tree.query(queries, k=k, distance_upper_bound=bound)
@@ -75,7 +74,7 @@ def _one_thread() -> Iterator[None]:
 
 @functools.cache
 def _openmp() -> list[Any]:
-    """The loaded OpenMP libraries. (`ThreadpoolController.limit` does the same, and describes them each time.)"""
+    # `ThreadpoolController.limit` would search for the loaded libraries at each call.
     import pykdtree.kdtree  # noqa: F401
     from threadpoolctl import ThreadpoolController
 
@@ -122,12 +121,12 @@ class AbstractTreeSearch(AbstractSearch, TreeBackend):
         def find(rows: Any) -> Int[np.ndarray, "n k"]:
             # In the order of the leaves, each query finds the nodes it needs in the processor's caches.
             order = tree().leaf_order() if rows is None else rows
-            found, _ = tree().nearest(points[order], num_neighbors)
+            nearest, _ = tree().nearest(points[order], num_neighbors)
             neighbors = np.full((len(order), num_neighbors), -1, np.int32)
-            neighbors[order if rows is None else slice(None), : found.shape[1]] = found
+            neighbors[order if rows is None else slice(None), : nearest.shape[1]] = nearest
             return neighbors
 
-        # Pickles name the class of the search by its place, which is inside a function for a local one.
+        # A search whose class is defined inside a function cannot be pickled.
         local = "<locals>" in type(self).__qualname__
         anew = None if local else partial(self.neighbors_on_demand, points, num_neighbors)
         return NeighborsOnDemand(find, (len(points), num_neighbors), anew)
@@ -168,7 +167,7 @@ class KDTreeSearch(AbstractTreeSearch):
 
     def leaf_order(self, tree: scipy.spatial.cKDTree | PyKDTree, num_points: int) -> Int[np.ndarray, "M"]:
         if isinstance(tree, PyKDTree):
-            # pykdtree does not give its order; SciPy's tree takes a tenth of the time that its order saves.
+            # pykdtree does not tell its order; building SciPy's tree takes a tenth of the time that the order saves.
             return _scipy_tree(tree.points).indices if num_points > LARGEST_UNORDERED else np.arange(num_points)
         return np.asarray(tree.indices)
 
@@ -179,7 +178,7 @@ def _scipy_tree(points: Float[np.ndarray, "M D"]) -> scipy.spatial.cKDTree:
     return scipy.spatial.cKDTree(points, leafsize=32, balanced_tree=False, compact_nodes=True)
 
 
-# Indices by content of their target: a pure callback keeps no state, yet each tree is built only once.
+# Indices by the content of their target: a pure callback keeps no state, and each tree is built only once.
 _indices = Cache(MAX_ROWS, lambda index: index.num_rows)
 
 
@@ -192,7 +191,6 @@ def _nearest_callback(
     max_distance: Any,
     running: Any,
 ) -> Int[np.ndarray, "m N"]:
-    """`TreeIndex.nearest` for the arguments of `AbstractSearch.nearest_traced`."""
     if not running:
         return np.full((num_candidates, source.valid.size), -1, np.int32)
     arrays = jax.tree.leaves(target)

@@ -1,4 +1,4 @@
-"""The index of a target by trees: with descriptors and missing channels, and with matches reused from pose to pose."""
+"""The index of a target by trees: descriptors, missing channels, and matches reused from pose to pose."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ class TreeIndex(AbstractIndex):
         penalty = np.zeros_like(target.descriptors) if target.penalty is None else target.penalty
         self._patterns, self._which = _patterns(penalty[self._rows])
         self._trees = trees
-        # By the penalties of the queries. Threads that need the same trees at once may each build them.
+        # Lists of trees by the penalties of the queries. Threads that need the same ones at once may each build them.
         self._parts = Cache(_MAX_SETS)
 
     @property
@@ -61,7 +61,7 @@ class TreeIndex(AbstractIndex):
 
         Args:
             queries: positions and descriptors, metres; rows that are not finite have no neighbours.
-            penalty: as in `SearchPoints`, for the queries.
+            penalty: of the queries, as in `SearchPoints`.
 
         Returns:
             (N, k) target rows, −1 for none; and (N,) the slack: the distance, metres, that a query may move before its
@@ -82,31 +82,34 @@ class TreeIndex(AbstractIndex):
         else:
             patterns, which = _patterns(penalty[active])
         groups = [active] if len(patterns) == 1 else [rows[which == i] for i in range(len(patterns))]
-        for alike, pattern in zip(groups, patterns, strict=True):
-            found, slack[alike] = self._nearest(queries[alike], pattern, k, bound)
-            indices[alike, : found.shape[1]] = found
+        for group, pattern in zip(groups, patterns, strict=True):
+            nearest, slack[group] = self._nearest(queries[group], pattern, k, bound)
+            indices[group, : nearest.shape[1]] = nearest
         return indices, slack
 
     def _nearest(
         self, queries: Float[np.ndarray, "N D"], penalty: Float[np.ndarray, "C"], k: int, bound: float
     ) -> tuple[Int[np.ndarray, "N m"], Float[np.ndarray, "N"]]:
         """`nearest_of` for queries that lack the same channels."""
-        parts = self._parts.get(penalty.tobytes(), partial(self._built, penalty))
-        if len(parts) == 1:
-            found, slack = parts[0].nearest(queries, k, bound)
-            return parts[0].rows[found], slack
-        # The slack depends on the next nearest row.
-        each = [part.nearest(queries, k + 1, bound)[0] for part in parts]
-        rows = np.hstack([part.rows[found] for part, found in zip(parts, each, strict=True)])
-        squares = np.hstack([part.squares(queries, found) for part, found in zip(parts, each, strict=True)])
+        trees = self._parts.get(penalty.tobytes(), partial(self._built, penalty))
+        if len(trees) == 1:
+            numbers, slack = trees[0].nearest(queries, k, bound)
+            return trees[0].rows[numbers], slack
+        candidates, distances = [], []
+        for tree in trees:
+            # The slack depends on the next nearest row.
+            numbers, _ = tree.nearest(queries, k + 1, bound)
+            candidates.append(tree.rows[numbers])
+            distances.append(tree.squares(queries, numbers))
+        rows, squares = np.hstack(candidates), np.hstack(distances)
         order = np.lexsort((rows, squares), axis=1)[:, : k + 1]
-        rows, squares = (np.take_along_axis(each, order, axis=1) for each in (rows, squares))
+        rows, squares = np.take_along_axis(rows, order, axis=1), np.take_along_axis(squares, order, axis=1)
         return rows[:, :k], slack_of(*np.sqrt(squares[:, [min(k, squares.shape[1]) - 1, -1]]).T)
 
     def _built(self, penalty: Float[np.ndarray, "C"]) -> list[_TreeForChannels]:
-        """The trees for queries that lack the same channels."""
-        common, alike = _patterns(np.maximum(self._patterns, penalty))
-        which = alike[self._which]
+        """The trees for queries of one penalty: one for each set of channels in common."""
+        common, numbers = _patterns(np.maximum(self._patterns, penalty))
+        which = numbers[self._which]
         groups = [slice(None) if len(common) == 1 else which == i for i in range(len(common))]
         return [
             _TreeForChannels(self._trees, self._points[group], self._rows[group], pattern)
@@ -115,7 +118,7 @@ class TreeIndex(AbstractIndex):
 
 
 class _TreeForChannels:
-    """A tree of the target rows that share one set of channels with a query."""
+    """A tree of the target rows that have one set of channels in common with the queries."""
 
     def __init__(
         self,
@@ -134,15 +137,15 @@ class _TreeForChannels:
     def nearest(
         self, queries: Float[np.ndarray, "N D"], k: int, bound: float
     ) -> tuple[Int[np.ndarray, "N m"], Float[np.ndarray, "N"]]:
-        """Tree indices of the k nearest (fewer if the tree has fewer), and the slack, as from `_nearest`."""
+        """Tree indices of the k nearest (fewer if the tree has fewer), and the slack."""
         return self._tree.nearest(queries[:, self._columns], k, bound)
 
-    def squares(self, queries: Float[np.ndarray, "N D"], found: Int[np.ndarray, "N m"]) -> Float[np.ndarray, "N m"]:
+    def squares(self, queries: Float[np.ndarray, "N D"], numbers: Int[np.ndarray, "N m"]) -> Float[np.ndarray, "N m"]:
         """Squared search distances to tree indices, including the penalties for missing channels; metres²."""
         points = self._tree.points
-        difference = queries[:, None, self._columns] - points[np.minimum(found, len(points) - 1)]
+        difference = queries[:, None, self._columns] - points[np.minimum(numbers, len(points) - 1)]
         squares = np.sum(difference * difference, axis=2) + self._penalty
-        return np.where(found < len(points), squares, np.inf)
+        return np.where(numbers < len(points), squares, np.inf)
 
 
 class _MatchTracker:
@@ -179,13 +182,13 @@ class _MatchTracker:
         self._queries[:, :3] = moved
         penalty = None if self._penalty is None else self._penalty[stale]
         # `take` takes a quarter of the time of an index array.
-        found, self._slack[stale] = self._index.nearest_of(
+        rows, self._slack[stale] = self._index.nearest_of(
             self._queries.take(stale, axis=0), penalty, self._max_distance, len(self._rows)
         )
         self._asked = np.where(unchanged[:, None], self._asked, moved)
         # Arrays returned earlier must not change.
         self._rows = self._rows.copy()
-        self._rows[:, self._order[stale]] = found.T
+        self._rows[:, self._order[stale]] = rows.T
         return self._rows
 
 
