@@ -1,9 +1,9 @@
-"""Matches of two clouds: given rows, features of images, and those that do not depend on the pose, FPFH and statistics
-of the channels.
+"""Matches of two clouds: by given rows, by features of images, and by features that do not depend on the pose, FPFH and
+statistics of the channels.
 
 FPFH (Rusu, Blodow & Beetz, Fast Point Feature Histograms for 3D Registration, ICRA 2009) depends on the signs of the
 normals, which are known for single scans at best. Here the normal of each neighbour is flipped to the side of the
-point's own normal, and histograms are averaged over both signs of the latter.
+point's normal, and histograms are averaged over both signs of the point's normal.
 """
 
 from __future__ import annotations
@@ -28,10 +28,9 @@ from mcgicp_jax._local_geometry.neighborhoods import Neighborhoods, neighborhood
 from mcgicp_jax._math import symmetric_matrices as alg
 from mcgicp_jax._search.kd_tree import nearest_in_position
 
-# Radii, in voxels, of the neighbourhoods for normals and for histograms: as in Open3D's examples.
-_NORMAL_RADIUS, _RADIUS = 2.0, 5.0
-# Radii, in voxels, of the neighbourhoods for statistics of the channels: from the nearest neighbours to `_RADIUS`.
-_CHANNEL_RADII = (1.5, 3.0, 5.0)
+# Neighbourhood radii in voxels. Normals and histograms: as in Open3D's examples. Statistics of the channels: from the
+# nearest neighbours to the radius of histograms.
+_NORMAL_RADIUS, _RADIUS, _CHANNEL_RADII = 2.0, 5.0, (1.5, 3.0, 5.0)
 # A disc of five voxels radius on a surface has 79 voxels; there are more where the surface is rough.
 NUM_NEIGHBORS = 100
 # Bins of each of three angles, as in the paper.
@@ -50,25 +49,25 @@ _MAX_PIXELS = 4.0
 
 
 def normals_of(cloud: PointCloud, voxel_size: float) -> Float[np.ndarray, "N 3"]:
-    """Unit normals of arbitrary sign, from the neighbours within two voxels."""
+    """Unit normals of arbitrary sign."""
     (normals,) = blockwise(_normals, np.float32(_NORMAL_RADIUS * voxel_size), *with_near(cloud, False))
     return normals
 
 
 def histograms_of(cloud: PointCloud, normals: Float[np.ndarray, "N 3"], voxel_size: float) -> Float[np.ndarray, "N 33"]:
-    """FPFH of each point of a preprocessed cloud: eleven bins for each of the angles α, φ, θ, which add up to two, or
-    are zero without neighbours within five voxels."""
+    """FPFH: eleven bins for each of the angles α, φ, θ, which add up to two; zero without neighbours in the radius."""
     size, radius = cloud.points.shape[0], np.float32(_RADIUS * voxel_size)
     inputs = with_near(cloud.replace_rows(channels=normals, channel_valid=None), True)
     simple, weights = blockwise(_simple_histograms, radius, *inputs)
-    # The point's histogram plus the weighted mean of its neighbours' histograms. Gathering takes ten times as long.
+    # The point's histogram plus the weighted mean of its neighbours', as a sparse product: gathering takes ten times as
+    # long.
     neighbors = np.maximum(np.asarray(cloud.neighbors), 0)
     starts = np.arange(size + 1) * neighbors.shape[1]
     return simple + csr_array((weights.ravel(), neighbors.ravel(), starts), shape=(size, size)) @ simple
 
 
 def statistics_of(cloud: PointCloud, voxel_size: float) -> Float[np.ndarray, "N D"]:
-    """Mean and standard deviation of each channel within three radii of each point; NaN where no point has it."""
+    """Mean and standard deviation of each channel within each radius; NaN where no point has the channel."""
     (statistics,) = blockwise(_statistics, np.float32(voxel_size), *with_near(cloud, True))
     return statistics
 
@@ -76,8 +75,10 @@ def statistics_of(cloud: PointCloud, voxel_size: float) -> Float[np.ndarray, "N 
 def comparable(
     histograms: Sequence[Float[np.ndarray, "_ 33"]], statistics: Sequence[Float[np.ndarray, "_ D"]] | None
 ) -> tuple[Float[np.ndarray, "N L"], Float[np.ndarray, "M L"]]:
-    """Features of two clouds on one scale: small integers as float32, whose distances are exact. Statistics of channels
-    are divided by their standard deviations in both clouds; missing ones are set to the mean."""
+    """Features of two clouds on one scale: small integers as float32, whose distances are exact.
+
+    Statistics of channels are divided by their standard deviations in both clouds; missing ones are set to the mean.
+    """
     all_histograms = np.concatenate(histograms).astype(np.float64)
     scale = _DEVIATION / max(float(all_histograms.std()), float(np.finfo(np.float32).tiny))
     center = all_histograms.mean(axis=0)
@@ -125,7 +126,6 @@ def _simple_histograms(
     distance = jnp.sqrt(jnp.where(near, square, 1))
     line = [offset / distance for offset in offsets]
     own, other = [axis[None] for axis in around.own_channels], list(around.near_channels)
-    # Normals of the neighbours, on the side of the point's own.
     side = jnp.where(alg.dot(own, other) >= 0, 1, -1).astype(square.dtype)
     other = [side * axis for axis in other]
     own_along, other_along = alg.dot(own, line), alg.dot(other, line)
@@ -153,8 +153,8 @@ def _simple_histograms(
 
 def _histogram(values: Float[Array, "k n"], counted: Array) -> Float[Array, "n 11"]:
     """Fractions of the counted values, from 0 to 1, in each bin."""
-    # Differences of cumulative counts: XLA may evaluate a value anew for each bin, with other rounding, and it would
-    # fall into two bins, or none.
+    # Differences of cumulative counts: XLA may compute a value anew for each bin, with other rounding, and the value
+    # would fall into two bins, or none.
     total = jnp.sum(counted, axis=0)
     below = [jnp.sum(counted & (NUM_BINS * values < i), axis=0) for i in range(1, NUM_BINS)]
     cumulative = jnp.stack([jnp.zeros_like(total), *below, total], axis=1)
@@ -181,17 +181,17 @@ def matches_of_features(source: PointCloud, target: PointCloud, voxel_size: floa
     """The mutual nearest neighbours in feature space; the most distinctive ones, if there are too many."""
     clouds = source, target
     normals = [normals_of(cloud, voxel_size) for cloud in clouds]
-    histograms = [histograms_of(cloud, sides, voxel_size) for cloud, sides in zip(clouds, normals, strict=True)]
+    histograms = [histograms_of(clouds[i], normals[i], voxel_size) for i in (0, 1)]
     statistics = [statistics_of(cloud, voxel_size) for cloud in clouds] if source.channels.shape[1] else None
-    rows = mutual_nearest(*comparable(histograms, statistics), NUM_MATCHES)
-    points = [np.asarray(cloud.points)[matched] for cloud, matched in zip(clouds, rows, strict=True)]
-    return _padded(*points, normals[0][rows[0]], normals[1][rows[1]])
+    sources, targets = mutual_nearest(*comparable(histograms, statistics), NUM_MATCHES)
+    points = np.asarray(source.points)[sources], np.asarray(target.points)[targets]
+    return _padded(*points, normals[0][sources], normals[1][targets])
 
 
 def matches_of_rows(
     source: Float[np.ndarray, "N 3"], target: Float[np.ndarray, "M 3"], rows: Int[np.ndarray, "2 n"]
 ) -> PutativeMatches:
-    """Matches of given rows of the points; evenly spaced ones, if there are too many. They have no normals."""
+    """Matches of given rows, without normals; evenly spaced ones, if there are too many."""
     points = source[rows[0]], target[rows[1]]
     finite = np.flatnonzero(np.isfinite(points).all(axis=(0, 2)))
     if finite.size > NUM_MATCHES:
@@ -201,7 +201,7 @@ def matches_of_rows(
 
 
 def _padded(*columns: Float[np.ndarray, "n 3"]) -> PutativeMatches:
-    """The first `NUM_MATCHES` matches: points of both clouds and normals of both."""
+    """The first `NUM_MATCHES` matches, from the points of both clouds and the normals of both."""
     padded = np.zeros((len(columns), NUM_MATCHES, 3), np.float32)
     count = min(len(columns[0]), NUM_MATCHES)
     padded[:, :count] = [column[:count] for column in columns]
@@ -214,20 +214,20 @@ def mutual_nearest(
     """Source and target rows that are nearest to each other in feature space; the most distinctive matches first.
 
     These have the smallest ratio of the squared distances to the nearest and to the second nearest target row. Ties go
-    to the first row. Features are integers as float32, and trees are no faster in so many dimensions. The search ends
-    with `count` matches.
+    to the first row. Features are integers as float32. The search ends when it has `count` matches. It uses no trees,
+    which are no faster in so many dimensions.
     """
     nearest, squares = _two_nearest(source, target)
     order = np.argsort(squares[:, 0] / np.maximum(squares[:, 1], 1), kind="stable")
     matched = nearest[order, 0]
     # Matched target rows in the order of their most distinctive match: the first blocks may yield enough matches.
-    hit, first, number = np.unique(matched, return_index=True, return_inverse=True)
-    wanted = np.argsort(first)
-    back = np.full(len(hit), -1)
-    for start in range(0, len(hit), BLOCK):
-        rows = wanted[start : start + BLOCK]
-        back[rows] = _two_nearest(target[hit[rows]], source)[0][:, 0]
-        searched = first[wanted[start + BLOCK]] if start + BLOCK < len(hit) else len(order)
+    targets, first, number = np.unique(matched, return_index=True, return_inverse=True)
+    search_order = np.argsort(first)
+    back = np.full(len(targets), -1)
+    for start in range(0, len(targets), BLOCK):
+        rows = search_order[start : start + BLOCK]
+        back[rows] = _two_nearest(target[targets[rows]], source)[0][:, 0]
+        searched = first[search_order[start + BLOCK]] if start + BLOCK < len(targets) else len(order)
         mutual = np.flatnonzero(back[number[:searched]] == order[:searched])
         if len(mutual) >= count:
             break
@@ -237,7 +237,7 @@ def mutual_nearest(
 def _two_nearest(
     queries: Float[np.ndarray, "N L"], rows: Float[np.ndarray, "M L"]
 ) -> tuple[Int[np.ndarray, "N 2"], Float[np.ndarray, "N 2"]]:
-    """The two nearest rows of each query, the first one first where distances tie; and the squared distances."""
+    """The two nearest rows of each query, by row where distances tie; and the squared distances."""
     parts: list[tuple[np.ndarray, np.ndarray]] = []
     for _, index in blocks(len(rows)):
         # The last block is filled by repeating its last row, which must count once.
@@ -284,7 +284,7 @@ def image_matches(source: Frame, target: Frame) -> tuple[Int[np.ndarray, "n"], I
         if frame.image is None or frame.pixels is None:
             raise ValueError(f"{name}: expected a frame with an image, got one without")
     cv2 = optional_module("cv2", "images", "matching images")
-    # Key points of both images, (column, row), and their features.
+    # Positions of the key points of both images, (column, row), and their features.
     pixels, features = [], []
     for frame in (source, target):
         gray = cv2.cvtColor(cast(Any, frame.image), cv2.COLOR_RGB2GRAY)

@@ -38,34 +38,33 @@ from mcgicp_jax._search.kd_tree import nearest_in_position
 RowMatches: TypeAlias = tuple[Any, Any]
 
 # Maximum number of voxels of the smaller and of the larger cloud, and as a fraction of the points. With 6,000 voxels a
-# scene has about a thousand mutual matches, and 5,000 to 8,000 find the same real pairs; 20,000 bound the time. With
+# scene has about a thousand mutual matches; 5,000 to 8,000 register the same real pairs. 20,000 bound the time. With
 # more voxels than half the points, most would hold one point.
 _VOXELS, _MAX_VOXELS, _MAX_FRACTION = 6000, 20_000, 0.5
 # Stride of the points whose voxels are counted first.
 _STRIDE = 4
 # Voxel sizes are 2^(j/8) metres, the same for all pairs; this many steps below the extent of the clouds are tried.
 _STEPS_PER_OCTAVE, _NUM_STEPS = 8, 120
-# Maximum correspondence distances of the registration that verifies a pose, in voxels, and its number of iterations.
-_VERIFIED_WITHIN, _VERIFIED_ITERATIONS = (4.0, TOLERANCE), 40
-# Number of neighbours for that registration, the default of `preprocess`.
-_NUM_NEIGHBORS = 20
+# The registration that verifies a pose: maximum correspondence distances, in voxels; number of iterations; and number
+# of neighbours, the default of `preprocess`.
+_VERIFIED_WITHIN, _VERIFIED_ITERATIONS, _NUM_NEIGHBORS = (4.0, TOLERANCE), 40, 20
 # Smallest i/√n (a/m)² of a success (see `GlobalPoseResult.support`), in general and where the shape of the clouds
-# leaves a direction of motion unconstrained, and smallest number of inliers: from the development half of
+# leaves a direction unconstrained, and smallest number of inliers: from the development half of
 # `tests/benchmarks/global_pose_verdicts`.
 _LEAST, _LEAST_UNCONSTRAINED, _MIN_INLIERS = 0.21, 0.7, 10
-# With fewer voxels than each of these, a success needs more, by the power 3/2 of their number. Where walls coincide at
-# a wrong pose, 15 to 60 matches are inliers by chance, however few there are, and furniture is no larger than a
-# neighbourhood of a sparse cloud. 3,000: on the development half no wrong pose is accepted with powers of 1.5 to 2 and
-# 3,000 to 4,000 voxels; larger ones accept fewer right poses. 1,400: in 900 to 990 voxels of a room whose furniture is
-# nearly the same after half a turn, that pose reaches 1.7 times what else suffices, with two to five times the inliers
-# of the right pose, which is then no rival.
+# For each of these numbers that exceeds the number N of voxels, a success needs (number / N)^1.5 times as much. Where
+# walls coincide at a wrong pose, 15 to 60 matches are inliers by chance, however few there are, and furniture is no
+# larger than a neighbourhood of a sparse cloud. 3,000: on the development half no wrong pose is accepted with powers of
+# 1.5 to 2 and 3,000 to 4,000 voxels; larger values accept fewer right poses. 1,400: in 900 to 990 voxels of a room with
+# nearly the same furniture after half a turn, the turned pose reaches 1.7 times what suffices without this number, with
+# two to five times the inliers of the right pose, which is then no rival.
 _SPARSE, _SPARSE_POWER = np.array([3000, 1400]), 1.5
 # Smallest fractions of the best pose's inliers, overlap and (a/m)² with which another pose is a rival, which makes the
 # result ambiguous; and of its support, with which any inliers and overlap do. Scans of a road reach 0.75 of the inliers
 # with 0.83 of the overlap at another place along it. Parts of a furnished room reach 0.5 to 1.9 of the inliers with up
 # to twice the overlap after half a turn, but 0.3 to 0.75 of (a/m)²; the two poses of halls that are the same after half
-# a turn, 0.86 to 1.2. Where furniture is nearly the same after it, the right pose had 0.4 of the inliers and 0.45 of
-# the overlap of the wrong one, but 1.7 times its (a/m)² and the same support.
+# a turn reach 0.86 to 1.2. Where furniture is nearly the same after half a turn, the right pose had 0.4 of the inliers
+# and 0.45 of the overlap of the wrong one, but 1.7 times its (a/m)² and the same support.
 _RIVAL_INLIERS, _RIVAL_OVERLAP, _RIVAL_AGREEMENT, _RIVAL_SUPPORT = 0.5, 0.9, 0.8, 0.9
 
 
@@ -182,14 +181,15 @@ def global_pose(
         check_positive("voxel_size", voxel_size)
     source, target = as_cloud("source", source), as_cloud("target", target)
     rows = None if correspondences is None else _checked(correspondences, source, target)
-    (one, source_center), (other, target_center) = _centred("source", source), _centred("target", target)
+    centred = _centred("source", source), _centred("target", target)
+    clouds, centers = [cloud for cloud, _ in centred], [center for _, center in centred]
     if not same_channels(source, target):
-        one, other = PointCloud(one.points), PointCloud(other.points)
-    size = _voxel_size((one, other)) if voxel_size is None else float(voxel_size)
+        clouds = [PointCloud(cloud.points) for cloud in clouds]
+    size = _voxel_size(clouds) if voxel_size is None else float(voxel_size)
     if not size:
         return _no_pose(0, size)
     try:
-        voxels = [with_neighbors(cloud, size, NUM_NEIGHBORS) for cloud in (one, other)]
+        voxels = [with_neighbors(cloud, size, NUM_NEIGHBORS) for cloud in clouds]
     except ValueError:
         # A cloud has too few voxels.
         return _no_pose(0, size)
@@ -197,13 +197,12 @@ def global_pose(
         if rows is None:
             matches = matches_of_features(voxels[0], voxels[1], size)
         else:
-            points = source.coordinates - source_center, target.coordinates - target_center
-            matches = matches_of_rows(*points, rows)
-        nearest = [np.ascontiguousarray(np.asarray(cloud.neighbors)[:, :_NUM_NEIGHBORS]) for cloud in voxels]
-        voxels = [cloud.replace_rows(deferred_neighbors=near) for cloud, near in zip(voxels, nearest, strict=True)]
+            matches = matches_of_rows(source.coordinates - centers[0], target.coordinates - centers[1], rows)
+        neighbors = [np.ascontiguousarray(np.asarray(cloud.neighbors)[:, :_NUM_NEIGHBORS]) for cloud in voxels]
+        voxels = [cloud.replace_rows(deferred_neighbors=near) for cloud, near in zip(voxels, neighbors, strict=True)]
         positions = np.asarray(voxels[0].points, np.float64)
         radius = float(np.sqrt(np.mean(np.sum(positions * positions, axis=1))))
-        return _best_pose(_Scene(matches, voxels[0], voxels[1], size, radius), source_center, target_center)
+        return _best_pose(_Scene(matches, voxels[0], voxels[1], size, radius), *centers)
 
 
 def _no_pose(num_matches: int, voxel_size: float) -> GlobalPoseResult:
@@ -225,7 +224,7 @@ def _checked(correspondences: RowMatches, source: PointCloud, target: PointCloud
 
 
 def _centred(name: str, cloud: PointCloud) -> tuple[PointCloud, Float[np.ndarray, "3"]]:
-    """The finite points, in float32 about the middle of their extent, as a raw cloud; and that middle, metres."""
+    """The finite points, in float32 about the middle of their extent, as a raw cloud; and the middle, metres."""
     with messages_named(name):
         cloud = finite_rows(cloud.replace_rows(covariances=None))
     points = cloud.coordinates
@@ -237,7 +236,7 @@ def _centred(name: str, cloud: PointCloud) -> tuple[PointCloud, Float[np.ndarray
     return PointCloud((points - center).astype(np.float32), channels, channel_valid=valid), center
 
 
-def _voxel_size(clouds: tuple[PointCloud, ...]) -> float:
+def _voxel_size(clouds: list[PointCloud]) -> float:
     """The smallest size with few enough voxels, metres; 0 if the clouds have no finite extent."""
     grids = [grid_of(np.asarray(cloud.points)).columns for cloud in clouds]
     extent = max(float(np.ptp(columns, axis=1).max()) for columns in grids)
@@ -262,20 +261,17 @@ def _voxel_size(clouds: tuple[PointCloud, ...]) -> float:
 
 
 class _Scene(NamedTuple):
-    """Matches of two centred clouds of voxels, metres.
-
-    Attributes:
-        radius: root mean square distance of the source's points from the centre, about which poses turn.
-    """
+    """Matches of two centred clouds of voxels."""
 
     matches: PutativeMatches
     source: PointCloud
     target: PointCloud
     voxel_size: float
+    # Root mean square distance of the source's points from the centre, about which poses turn, metres.
     radius: float
 
     def is_near(self, matrix: Float[np.ndarray, "4 4"], points: Float[AnyArray, "n 3"]) -> Bool[np.ndarray, "n"]:
-        """Which points of the source are within the overlap."""
+        """Which points of the source have a point of the target nearby."""
         moved = np.asarray(points, np.float64) @ matrix[:3, :3].T + matrix[:3, 3]
         return nearest_in_position(moved, self.target.points, TOLERANCE * self.voxel_size) >= 0
 
@@ -303,7 +299,7 @@ class _Scene(NamedTuple):
 def _best_pose(
     scene: _Scene, source_center: Float[np.ndarray, "3"], target_center: Float[np.ndarray, "3"]
 ) -> GlobalPoseResult:
-    """The best of the verified poses, in the user's frames."""
+    """The best of the verified poses, in the frames of the user's clouds."""
     matches, voxel_size = scene.matches, np.float32(scene.voxel_size)
     poses = hypotheses(matches, voxel_size, np.float32(scene.radius))
     verified = _verified(jax.tree.map(np.asarray, refined(poses, matches, voxel_size)), scene)
@@ -330,7 +326,7 @@ def _best_pose(
 
 
 def _verified(poses: PoseHypotheses, scene: _Scene) -> list[Candidate]:
-    """The best pose and its rivals, registered; without repetitions."""
+    """The best pose and possible rivals, registered; without repetitions."""
     method = MultiChannelGICP() if scene.source.channels.shape[1] else GICP()
     distances = _VERIFIED_WITHIN[0] * scene.voxel_size, _VERIFIED_WITHIN[1] * scene.voxel_size
     options = Options(max_distance=distances, max_iterations=_VERIFIED_ITERATIONS)

@@ -18,9 +18,9 @@ from mcgicp_jax._math.robust_kernels import truncated_weights
 
 # Maximum number of matches. Real pairs of 5,000 voxels have 200 to 2,400 mutual ones.
 NUM_MATCHES = 1024
-# For each match as the first of a triplet: number of the best supported partners, and of triplets with two of them.
+# For each match as the first of a triplet: number of partners with the most support, and of triplets with two of them.
 _NUM_PARTNERS, _NUM_TRIPLETS = 24, 16
-# Hypotheses, all of different poses, that are refined.
+# Number of hypotheses, all of different poses, that are refined.
 NUM_REFINED = 16
 # Voxels: largest distance between two matched points, and largest difference between the edges of matched triangles.
 # Mean points of voxels in two clouds are about half a voxel apart.
@@ -32,8 +32,8 @@ _SHORTEST_EDGE = 4.0
 _NORMAL_TOLERANCE = 0.3
 # Voxels: poses that move points by less than this relative to each other are the same.
 MIN_SEPARATION = 5.0
-# Graduated non-convexity: the control parameter μ at first, when matches count up to √5 tolerances away, its growth by
-# each step (Yang et al. 2020), and the number of steps, after which matches count up to 1.05 tolerances.
+# Graduated non-convexity: the first control parameter μ, with which matches count up to √5 tolerances away, its growth
+# by each step (Yang et al. 2020), and the number of steps, after which matches count up to 1.05 tolerances.
 _FIRST_CONTROL, _GROWTH, _NUM_STEPS = 0.25, 1.4, 12
 
 
@@ -101,10 +101,8 @@ def hypotheses(
     Two matches agree if the distance and the angle between their normals are the same in both clouds. The support of
     two matches that agree is the number of matches that agree with both (Chen et al., SC²-PCR, CVPR 2022): two wrong
     matches agree by chance, three seldom do. Each match forms triplets with two of the partners with which it has most
-    support, by a fixed draw.
-
-    Args:
-        radius: of the source, metres: a rotation by an angle moves points by about the angle times this.
+    support, by a fixed draw. `radius`, metres, is that of the source: a rotation moves points by about its angle times
+    the radius.
     """
     support = _support(matches, voxel_size)
     _, partners = jax.lax.top_k(support, _NUM_PARTNERS)
@@ -121,7 +119,16 @@ def hypotheses(
     area = jnp.sqrt(jnp.sum(jnp.cross(edges[0], edges[1]) ** 2, axis=-1))
     agree = agree & (area > (_SHORTEST_EDGE * voxel_size) ** 2)
     score = jnp.where(agree, _scores(rotation, translation, matches, voxel_size), 0)
-    return _different(PoseHypotheses(rotation, translation, score), voxel_size, radius)
+
+    # The best pose, the best of those that differ from it, and so on.
+    def step(score: Float[Array, "n"], _: None) -> tuple[Float[Array, "n"], tuple[Array, Array]]:
+        best = jnp.argmax(score)
+        separation = squared_separation(rotation - rotation[best], translation - translation[best], radius)
+        different = separation > (MIN_SEPARATION * voxel_size) ** 2
+        return jnp.where(different, score, 0), (best, score[best])
+
+    _, (rows, score) = jax.lax.scan(step, score, None, NUM_REFINED)
+    return PoseHypotheses(rotation[rows], translation[rows], score)
 
 
 def _support(matches: PutativeMatches, voxel_size: Float[AnyScalar, ""]) -> Float[Array, "M M"]:
@@ -142,10 +149,7 @@ def _support(matches: PutativeMatches, voxel_size: Float[AnyScalar, ""]) -> Floa
 def _triangles(
     p: Float[Array, "T 3"], q: Float[Array, "T 3"], r: Float[Array, "T 3"]
 ) -> tuple[Float[Array, "T 3 3"], Float[Array, "T 3"]]:
-    """The frame of each triangle (columns along the first edge, across it in the plane, and normal) and its centroid.
-
-    Meaningless for collinear points.
-    """
+    """Frame (columns: along the first edge, across it in the plane, normal) and centroid; meaningless if collinear."""
 
     def unit(vectors: Float[Array, "T 3"]) -> Float[Array, "T 3"]:
         length = jnp.sqrt(jnp.sum(vectors * vectors, axis=-1, keepdims=True))
@@ -175,23 +179,9 @@ def _squared_distances(
     return square
 
 
-def _different(poses: PoseHypotheses, voxel_size: AnyScalar, radius: AnyScalar) -> PoseHypotheses:
-    """The best pose, the best of those that differ from it, and so on."""
-
-    def step(left: Float[Array, "n"], _: None) -> tuple[Float[Array, "n"], tuple[Array, Array]]:
-        best = jnp.argmax(left)
-        shift = poses.translation - poses.translation[best]
-        turn = poses.rotation - poses.rotation[best]
-        different = squared_separation(turn, shift, radius) > (MIN_SEPARATION * voxel_size) ** 2
-        return jnp.where(different, left, 0), (best, left[best])
-
-    _, (rows, score) = jax.lax.scan(step, poses.score, None, NUM_REFINED)
-    return PoseHypotheses(poses.rotation[rows], poses.translation[rows], score)
-
-
 def squared_separation(turn: Float[AnyArray, "*n 3 3"], shift: Float[AnyArray, "*n 3"], radius: AnyScalar) -> Any:
-    """About the squared distance, m², by which two poses move points apart, from the differences of their rotations
-    and translations: |R − R'| = √8 sin(angle / 2), about √2 times the angle."""
+    """About the squared distance, m², by which two poses move points apart, from the differences R − R' and t − t'."""
+    # |R − R'| = √8 sin(angle / 2), about √2 times the angle.
     return (shift**2).sum(axis=-1) + 0.5 * radius**2 * (turn**2).sum(axis=(-1, -2))
 
 
