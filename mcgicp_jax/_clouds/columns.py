@@ -27,15 +27,13 @@ _NOT_CHANNELS = re.compile(
     "scanner_?channel|bit_fields|user_?data|point_?(source_?)?id|return_?(type|number)|num(ber_?of)?_?returns|"
     "edge_?of_?flight_?line|key_?point|synthetic|withheld|overlap"
 )
-
-
 _TIMES = re.compile("(scalar_)?(t|time|time_?stamp|adjusted_?time|gps_?time|offset_?time)")
-# The bits of NaN in float32, which stand for no colour where four bytes hold one.
+# The bits of NaN in float32, which mark a missing packed colour.
 _NO_COLOR = np.float32(np.nan).view(np.uint32)
 
 
 def channel_name(column: str) -> str | None:
-    """The name of the channel that a column holds; None if the column is not a channel."""
+    """Name of the channel in a column; None if the column is not a channel."""
     bare = column.removeprefix("channel_")
     if bare != column and channel_name(bare) != bare:
         return bare
@@ -56,7 +54,12 @@ def arrays_of_columns(columns: Columns) -> tuple[Float[np.ndarray, "N 3"], Float
     for column in sorted(columns, key=lambda column: column not in ORDER and channel_name(column) in ORDER):
         name = channel_name(column)
         if name is not None:
-            channels[column if name in channels else name] = _channel(name, columns[column], points.dtype)
+            column_values = columns[column]
+            if column_values.dtype.kind != "f":
+                # Without loss of precision; integer colours are scaled to 0..1.
+                scale = 1 if name not in COLORS else 65535 if column_values.dtype.itemsize == 2 else 255
+                column_values = column_values.astype(np.result_type(column_values.dtype, points.dtype)) / scale
+            channels[column if name in channels else name] = column_values
     names = sorted(channels, key=lambda name: ORDER.get(name, len(ORDER)))
     values = np.column_stack([channels[name] for name in names]) if names else np.zeros((len(points), 0), points.dtype)
     return points, values, names
@@ -71,16 +74,8 @@ def times_of(columns: Columns) -> Shaped[np.ndarray, "N"] | None:
     return None
 
 
-def _channel(name: str, values: Shaped[np.ndarray, "N"], dtype: np.dtype) -> Float[np.ndarray, "N"]:
-    """Convert to floating point without loss of precision; integer colours are scaled to 0..1."""
-    if values.dtype.kind == "f":
-        return values
-    scale = 1 if name not in COLORS else 65535 if values.dtype.itemsize == 2 else 255
-    return values.astype(np.result_type(values.dtype, dtype)) / scale
-
-
 def with_unpacked_colors(columns: Columns) -> Columns:
-    """The columns with `rgb`, or else `rgba`, split into colours where the bits of four bytes hold them, as in PCL."""
+    """Split the column `rgb`, or else `rgba`, into colours if its four bytes are packed ones, as in PCL."""
     for packed in columns.keys() & {"rgb"} or columns.keys() & {"rgba"}:
         if columns[packed].dtype.itemsize == 4:
             bits = np.ascontiguousarray(columns[packed]).view(np.uint32)
@@ -93,13 +88,12 @@ def with_unpacked_colors(columns: Columns) -> Columns:
 
 
 def arrays_of(points: Any) -> tuple[Any, Any, Sequence[str] | None]:
-    """Points, channels and their names: of a structured array or a table of pandas with the columns x, y and z, whose
-    other numbers become channels as in files, or of a cloud of Open3D, also of tensors. Anything else is returned as it
-    is.
+    """Points, channels and channel names of a structured array or pandas table with the columns x, y and z (other
+    numeric columns become channels, as in files) or of an Open3D cloud, legacy or tensor. Other arrays are returned
+    unchanged, without channels.
 
-    Raises:
-        ValueError: if it is a path, a `PointCloud`, an object without points, a structured array with masked fields, or
-            of a library whose coordinates have another name.
+    Raises `ValueError` for paths, `PointCloud`s, objects without points, structured arrays with masked fields, and
+    clouds of libraries whose coordinates have another name.
     """
     if isinstance(points, str | os.PathLike):
         raise ValueError(f"points: expected coordinates, got a path; mcgicp_jax.io.read({str(points)!r}) reads a file")

@@ -33,13 +33,12 @@ _SHARE, _SAME, _SPREAD = 0.08, 0.4, 0.05
 
 
 def harmful_steps(cloud: PointCloud, spacing: Float[AnyScalar, ""]) -> Float[AnyArray, "3"]:
-    """The step of the coordinates of a cloud on each axis, metres; 0 if it is below a third of the spacing.
+    """The step of the coordinates of a cloud on each axis, metres; 0 where it is below a third of the spacing.
 
-    Counted are coarse steps of all axes, those of float32, and those that are no regular sample of surfaces, such as a
-    height map, sections or profiles, whose points are exact.
+    Coarse steps of one or two axes count only if they are those of float32, or if the cloud is no exact regular sample
+    of surfaces, such as a height map, sections or profiles.
     """
-    find = cached_with_cloud(_steps) if is_concrete(cloud) else _steps
-    step, float32 = find(cloud)
+    step, float32 = (cached_with_cloud(_steps) if is_concrete(cloud) else _steps)(cloud)
     xp = numpy_for(step, spacing)
     coarse = step > _HARMFUL * spacing
     if xp is np and not coarse.any():
@@ -49,7 +48,7 @@ def harmful_steps(cloud: PointCloud, spacing: Float[AnyScalar, ""]) -> Float[Any
 
 
 def _steps(cloud: PointCloud) -> tuple[Float[AnyArray, "3"], Bool[AnyArray, "3"]]:
-    """The step of the coordinates on each axis, metres, 0 if there is none; and whether it is that of float32."""
+    """The step of the coordinates on each axis, metres (0: none), and whether it is the rounding of float32."""
     rows, counts = sampled_rows(cloud.valid)
     xp = numpy_for(cloud.points, counts)
     values = xp.where(counts, xp.asarray(cloud.points)[rows].T, xp.nan)
@@ -57,43 +56,42 @@ def _steps(cloud: PointCloud) -> tuple[Float[AnyArray, "3"], Bool[AnyArray, "3"]
     # Coordinates that overflow, or are missing, leave no gap.
     with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
         gaps = xp.diff(xp.sort(values, axis=1), axis=1)
-        apart = gaps > _ROUNDINGS * xp.finfo(gaps.dtype).eps * largest
-        number: Any = xp.sum(apart, axis=1, keepdims=True)
+        distinct = gaps > _ROUNDINGS * xp.finfo(gaps.dtype).eps * largest
+        number: Any = xp.sum(distinct, axis=1, keepdims=True)
         # Rounded coordinates repeat.
         rounded = (number > 1) & (2 * number < xp.sum(counts))
         if xp is np and not rounded.any():
             return np.zeros(3, gaps.dtype), np.zeros(3, bool)
-        ordered = xp.sort(xp.where(apart, gaps, xp.inf), axis=1)
+        ordered = xp.sort(xp.where(distinct, gaps, xp.inf), axis=1)
         step = xp.take_along_axis(ordered, number // _QUANTILE, axis=1)
-        multiple = xp.where(apart, gaps, 0) / step
+        multiple = xp.where(distinct, gaps, 0) / step
         fits = xp.abs(multiple - xp.round(multiple)) < _TOLERANCE
-        near = apart & (multiple < _MULTIPLES)
+        near = distinct & (multiple < _MULTIPLES)
         rounded = rounded & xp.isfinite(step) & (xp.sum(near) >= _LEAST_GAPS)
         rounded = rounded & (xp.sum(near & fits, axis=1, keepdims=True) >= _FIT * xp.sum(near, axis=1, keepdims=True))
         # The step of float32 at these coordinates, by its 23 bits of fraction.
-        place = xp.max(xp.where(counts, xp.abs(values + xp.asarray(cloud.origin)[:, None]), 0), axis=1, keepdims=True)
-        float32 = xp.abs(step * 2.0 ** (23 - xp.floor(xp.log2(place))) - 1) < _TOLERANCE
+        size = xp.max(xp.where(counts, xp.abs(values + xp.asarray(cloud.origin)[:, None]), 0), axis=1, keepdims=True)
+        float32 = xp.abs(step * 2.0 ** (23 - xp.floor(xp.log2(size))) - 1) < _TOLERANCE
     return xp.where(rounded, step, 0)[:, 0].astype(gaps.dtype), float32[:, 0]
 
 
 def _shows_rounding(cloud: PointCloud, coarse: Bool[AnyArray, "3"], steps: Float[AnyArray, "3"]) -> Any:
-    """Whether points with the same coordinates on the coarse axes are more than an exact sample of surfaces has: one
-    point for two axes, a line for one. Copies of a planar scan at several heights are exact. False for clouds without
-    neighbours."""
+    """Whether more points share their coordinates on the coarse axes than in an exact sample of surfaces: a point for
+    two axes, a line for one. Copies of a planar scan at several heights are exact. False without neighbours."""
     if cloud.deferred_neighbors is None:
         return False
     rows, counts = sampled_rows(cloud.valid)
     xp = numpy_for(cloud.points, counts, coarse, steps)
     points = xp.asarray(cloud.points)
-    # Traced rows need those of all.
+    # Traced rows need the neighbours of all points.
     neighbors = cloud.deferred_neighbors[rows] if xp is np else xp.asarray(cloud.neighbors)[rows]
-    found = (neighbors >= 0) & counts[:, None]
+    exists = (neighbors >= 0) & counts[:, None]
     offsets = points[neighbors] - points[rows][:, None]
-    same = found & ((xp.abs(offsets) < _SAME * steps) | ~coarse).all(axis=2)
-    copied = (found & ((offsets == 0) | coarse).all(axis=2) & (offsets != 0).any(axis=2)).any(axis=1)
+    same = exists & ((xp.abs(offsets) < _SAME * steps) | ~coarse).all(axis=2)
+    copied = (exists & ((offsets == 0) | coarse).all(axis=2) & (offsets != 0).any(axis=2)).any(axis=1)
     x, y, z = xp.where(same[..., None] & ~coarse, offsets, 0).transpose(2, 0, 1)
     xx, yy, zz, xy, yz, zx = (xp.sum(a * b, axis=1) for a, b in ((x, x), (y, y), (z, z), (x, y), (y, z), (z, x)))
     minors = xx * yy - xy**2 + yy * zz - yz**2 + zz * xx - zx**2
-    mostly = 2 * xp.sum(same, axis=1) > xp.sum(found, axis=1)
+    mostly = 2 * xp.sum(same, axis=1) > xp.sum(exists, axis=1)
     rounded = xp.where(xp.sum(coarse) > 1, xx + yy + zz > 0, mostly & (minors > _SPREAD * (xx + yy + zz) ** 2))
     return xp.sum(rounded & ~copied) > _SHARE * xp.sum(counts)

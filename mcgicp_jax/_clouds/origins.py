@@ -20,10 +20,7 @@ from mcgicp_jax._math.poses import Pose, matrices_of, pose_matrix, rotation_from
 @with_settings_of_package
 def centred_pose(pose: Pose | None, source: PointCloud, target: PointCloud, name: str = "init") -> Array | np.ndarray:
     """T(−o_t) · T · T(o_s), (4, 4): the pose between coordinates relative to the clouds' origins, in its own precision.
-
-    Raises:
-        ValueError: as `pose_matrix`; `name` is the argument's name for the message.
-    """
+    Raises `ValueError` as `pose_matrix` does, for the argument `name`."""
     distance = 0.0
     if is_concrete(source.origin, source.points) and np.any(source.origin):
         radius = float(np.abs(np.asarray(source.points)).max(initial=0))
@@ -35,7 +32,7 @@ def centred_pose(pose: Pose | None, source: PointCloud, target: PointCloud, name
     if is_concrete(source.origin, target.origin) and not (np.any(source.origin) or np.any(target.origin)):
         return matrix
     rotation, translation = matrix[:3, :3], matrix[:3, 3]
-    # In this form two far origins cancel exactly, before the rotation is applied to either.
+    # In this form two far origins cancel exactly before either is rotated.
     shifted = (rotation - np.eye(3)) @ source.origin + (source.origin - target.origin) + translation
     if isinstance(shifted, np.ndarray) and isinstance(matrix, np.ndarray):
         result = matrix.copy()
@@ -66,8 +63,8 @@ def pose_in_user_frame(
 
 
 class _InUserFrame(AbstractLinearMap):
-    """The derivative of `pose_in_user_frame` by the parameters `wxyz_xyz` and both origins, which compiles nothing;
-    `start` is the origin of the source."""
+    """Derivative of `pose_in_user_frame` by the parameters `wxyz_xyz` and both origins (`start`: that of the source);
+    compiles nothing."""
 
     def __init__(self, parameters: np.ndarray, rotation: np.ndarray, start: np.ndarray):
         turn = turn_by_quaternion(parameters[..., :4])
@@ -80,8 +77,8 @@ class _InUserFrame(AbstractLinearMap):
         self._slopes = by_pose, by_source, by_target
 
     def jvp(self, tangents: Sequence[np.ndarray], moving: tuple[int, ...]) -> list[np.ndarray]:
-        each = zip(moving, tangents, strict=True)
-        return [sum(np.einsum("...ijp,m...p->m...ij", self._slopes[i], tangent) for i, tangent in each)]
+        inputs = zip(moving, tangents, strict=True)
+        return [sum(np.einsum("...ijp,m...p->m...ij", self._slopes[i], tangent) for i, tangent in inputs)]
 
     def vjp(self, cotangents: Sequence[np.ndarray], moving: tuple[int, ...]) -> list[np.ndarray]:
         return [np.einsum("...ijp,m...ij->m...p", self._slopes[i], cotangents[0]) for i in moving]
@@ -89,7 +86,6 @@ class _InUserFrame(AbstractLinearMap):
 
 @jax.jit
 def _in_user_frame(centred: jaxlie.SE3, source_origin: Array, target_origin: Array) -> Array:
-    """`pose_in_user_frame` for traced arrays."""
     traced = centred.as_matrix().astype(centred.wxyz_xyz.dtype)
     turned = jnp.einsum("...ij,...j->...i", traced[..., :3, :3] - jnp.eye(3), source_origin, precision="highest")
     shift = target_origin - source_origin - turned

@@ -29,8 +29,8 @@ _SAMPLE = 10_000
 
 
 def measured_rows(cloud: PointCloud, complete: Bool[np.ndarray, "N"] | None = None) -> Bool[np.ndarray, "N"]:
-    """Which valid and finite points of a concrete cloud are measurements; of those at (0, 0, 0), where a sensor may be,
-    the first counts. `complete`: which rows count at all; None: all valid ones."""
+    """Which valid and finite points of a concrete cloud are measurements. Of points at (0, 0, 0), where a sensor may
+    be, only the first is one. `complete`: rows to consider; None: all valid ones."""
     points, finite = np.asarray(cloud.points), np.asarray(cloud.valid) if complete is None else complete
     # One check of all values is much faster than one per row.
     if not (np.abs(points) <= LARGEST).all():
@@ -40,7 +40,7 @@ def measured_rows(cloud: PointCloud, complete: Bool[np.ndarray, "N"] | None = No
     zero = np.flatnonzero((points == 0).all(axis=1))[1:]
     positions = equal_rows(points, _MANY)
     if (positions is None and not zero.size) or (points[:1] == points).all():
-        # A cloud at one place is what it is.
+        # Points that are all at one place stay.
         return _without_far(points, rows, finite)
     left_out = np.zeros(len(points), bool)
     if positions is not None:
@@ -48,10 +48,9 @@ def measured_rows(cloud: PointCloud, complete: Bool[np.ndarray, "N"] | None = No
         many = np.flatnonzero(counts > _MANY)
         search, places = KDTreeSearch(workers=1), points[first].astype(np.float64)
         _, near = search.query(search.build(places), places[many], min(1 + _NEAR, len(places)), np.inf)
-        # The first is the position itself.
+        # The nearest is the position itself.
         around = counts[near[:, 1:]].max(axis=1)
-        left_out = np.isin(positions, many[counts[many] > _MANY * around])
-        left_out &= (points != 0).any(axis=1)
+        left_out = np.isin(positions, many[counts[many] > _MANY * around]) & (points != 0).any(axis=1)
     left_out[zero] = True
     measured = finite.copy()
     measured[rows[left_out]] = False
@@ -61,7 +60,7 @@ def measured_rows(cloud: PointCloud, complete: Bool[np.ndarray, "N"] | None = No
 def _without_far(
     points: Float[np.ndarray, "n 3"], rows: Int[np.ndarray, "n"], measured: Bool[np.ndarray, "N"]
 ) -> Bool[np.ndarray, "N"]:
-    """`measured` without those of the rows that are far from all others."""
+    """`measured` without the `rows` whose `points` are far from all others."""
     if len(points) <= 2 * _SURFACE:
         return measured
     stride = 1 + len(points) // _SAMPLE

@@ -42,7 +42,7 @@ def is_far(offset: Float[np.ndarray, "3"], size: float) -> bool:
 
 
 def _as_float(name: str, values: Any) -> Any:
-    """Convert to a floating-point array. NumPy input stays NumPy: float64 is needed until the origin is subtracted."""
+    """`values` as a floating-point array. NumPy input stays NumPy: float64 is needed until the origin is subtracted."""
     if isinstance(values, jax.Array):
         if jnp.issubdtype(values.dtype, jnp.complexfloating):
             raise ValueError(f"{name}: expected real numbers, got dtype {values.dtype}")
@@ -62,7 +62,6 @@ def _as_float(name: str, values: Any) -> Any:
     return np.where(np.ma.getmaskarray(values), np.nan, array) if np.ma.is_masked(values) else array
 
 
-# What to do with a planar scan.
 PLANAR_ADVICE = (
     "lift a planar scan to 3-D: stack five copies of it, about five spacings apart in z, and fix z, roll and pitch by "
     "a prior"
@@ -70,7 +69,7 @@ PLANAR_ADVICE = (
 
 
 def _advice(shape: tuple[int, ...]) -> str:
-    """What to do with points of another shape."""
+    """What to do with points of a wrong shape."""
     if len(shape) == 2 and shape[0] == 3:
         return "; pass points.T"
     if len(shape) == 3 and shape[2] == 3:
@@ -80,30 +79,18 @@ def _advice(shape: tuple[int, ...]) -> str:
     return "; pass PointCloud(points, channels)" if len(shape) == 2 and shape[1] > 3 else ""
 
 
-def _check_one_array(points: Any) -> None:
-    """Raise `ValueError` for several arrays, which NumPy would stack to one."""
-    if isinstance(points, tuple | list) and points and getattr(points[0], "ndim", 0) == 2:
-        raise ValueError(
-            f"points: expected shape (N, 3), got a {type(points).__name__} of {len(points)} arrays; pass "
-            "PointCloud(points, channels), or several clouds to register_batch"
-        )
-
-
-def _as_mask(values: Values, shape: tuple[int, ...]) -> Any:
-    """Check `channel_valid` against the shape of the channels; a single channel may have a 1-D mask."""
-    mask = values if isinstance(values, jax.Array) else np.ma.filled(values, False)
-    if mask.dtype != bool:
-        raise ValueError(f"channel_valid: expected booleans, got dtype {mask.dtype}")
-    if mask.shape == shape[:-1] and shape[-1] == 1:
-        mask = mask[..., None]
-    if mask.shape != shape:
-        raise ValueError(f"channel_valid: expected shape {shape} to go with channels, got {mask.shape}")
-    return mask
-
-
-def _without_masked(channels: Any, channel_valid: Values | None, shape: tuple[int, ...]) -> Any:
-    """`channel_valid` for channels of this shape, False where the array is masked; None if nothing is missing."""
-    valid = None if channel_valid is None else _as_mask(channel_valid, shape)
+def _checked_mask(channels: Any, channel_valid: Values | None, shape: tuple[int, ...]) -> Any:
+    """`channel_valid` for channels of this shape, also False where `channels` is a masked array; None if nothing is
+    missing. A single channel may have a 1-D mask."""
+    valid: Any = None
+    if channel_valid is not None:
+        valid = channel_valid if isinstance(channel_valid, jax.Array) else np.ma.filled(channel_valid, False)
+        if valid.dtype != bool:
+            raise ValueError(f"channel_valid: expected booleans, got dtype {valid.dtype}")
+        if valid.shape == shape[:-1] and shape[-1] == 1:
+            valid = valid[..., None]
+        if valid.shape != shape:
+            raise ValueError(f"channel_valid: expected shape {shape} to go with channels, got {valid.shape}")
     if not np.ma.is_masked(channels):
         return valid
     measured = ~np.ma.getmaskarray(channels).reshape(shape)
@@ -111,7 +98,7 @@ def _without_masked(channels: Any, channel_valid: Values | None, shape: tuple[in
 
 
 def _fractions(times: Values, size: int) -> Any:
-    """Check `times`, and scale them so that the earliest is 0 and the latest 1; if all are equal, all are 1."""
+    """`times` scaled so that the earliest is 0 and the latest 1; if all are equal, all are 1."""
     values = _as_float("times", times)
     if values.shape != (size,):
         raise ValueError(f"times: expected shape ({size},) to go with points, got {values.shape}")
@@ -235,12 +222,17 @@ class PointCloud(eqx.Module):
         Raises:
             ValueError: if a shape or dtype does not fit; the message names the argument.
         """
-        _check_one_array(points)
-        points, found, names = arrays_of(points)
-        if channels is None and found is not None:
-            channels, channel_names = found, channel_names or names
-            if channel_valid is None and np.isnan(found).any():
-                channel_valid = ~np.isnan(found)
+        # NumPy would stack several arrays to one.
+        if isinstance(points, tuple | list) and points and getattr(points[0], "ndim", 0) == 2:
+            raise ValueError(
+                f"points: expected shape (N, 3), got a {type(points).__name__} of {len(points)} arrays; pass "
+                "PointCloud(points, channels), or several clouds to register_batch"
+            )
+        points, columns, names = arrays_of(points)
+        if channels is None and columns is not None:
+            channels, channel_names = columns, channel_names or names
+            if channel_valid is None and np.isnan(columns).any():
+                channel_valid = ~np.isnan(columns)
         self.points = _as_float("points", points)
         if self.points.ndim != 2 or self.points.shape[1] != 3:
             raise ValueError(f"points: expected shape (N, 3), got {self.points.shape}{_advice(self.points.shape)}")
@@ -252,7 +244,7 @@ class PointCloud(eqx.Module):
             self.channels = self.channels[:, None]
         if self.channels.ndim != 2 or self.channels.shape[0] != size:
             raise ValueError(f"channels: expected shape ({size}, C) to go with points, got {self.channels.shape}")
-        self.channel_valid = _without_masked(channels, channel_valid, np.shape(self.channels))
+        self.channel_valid = _checked_mask(channels, channel_valid, np.shape(self.channels))
         if self.channel_valid is not None:
             self.channels = _blank(self.channels, self.channel_valid)
         self.covariances = None if covariances is None else _as_float("covariances", covariances)
@@ -325,7 +317,7 @@ class PointCloud(eqx.Module):
             "origin": np.shape(self.origin),
             "times": np.shape(self.valid),
         }
-        given: Any = arrays.get("channels")
+        channels: Any = arrays.get("channels")
         for name in arrays.keys() & {"points", "channels", "covariances"}:
             if arrays[name] is not None:
                 array, dtype = _as_float(name, arrays[name]), self.points.dtype
@@ -333,9 +325,9 @@ class PointCloud(eqx.Module):
                 dtype = dtype if isinstance(array, np.ndarray) else jax.dtypes.canonicalize_dtype(dtype)
                 # Of traced arrays, even a conversion to the same dtype would be compiled.
                 arrays[name] = array if array.dtype == dtype else array.astype(dtype)
-        if np.ma.is_masked(given):
+        if np.ma.is_masked(channels):
             valid = arrays.get("channel_valid", self.channel_valid)
-            arrays["channel_valid"] = _without_masked(given, valid, np.shape(given))
+            arrays["channel_valid"] = _checked_mask(channels, valid, np.shape(channels))
         for name, value in arrays.items():
             expected = shapes.get(name, np.shape(value))
             if np.shape(value) != expected and not (name in ("covariances", "times") and value is None):
@@ -350,9 +342,10 @@ class PointCloud(eqx.Module):
         if "channel_names" in arrays:
             fields["channel_names"] = _checked_names(arrays["channel_names"], fields["channels"].shape[-1])
         if fields["channel_valid"] is not None and arrays.keys() & {"channels", "channel_valid"}:
-            fields["channel_valid"] = _as_mask(fields["channel_valid"], np.shape(fields["channels"]))
-            fields["channels"] = _blank(fields["channels"], fields["channel_valid"])
-        return _build(**fields)
+            channels = fields["channels"]
+            fields["channel_valid"] = _checked_mask(channels, fields["channel_valid"], np.shape(channels))
+            fields["channels"] = _blank(channels, fields["channel_valid"])
+        return self.replace_rows(**fields)
 
     @property
     def neighbors(self) -> Int[Array, "*batch N k"] | Int[np.ndarray, "*batch N k"] | None:
@@ -360,8 +353,8 @@ class PointCloud(eqx.Module):
 
         None for raw clouds. `preprocess` leaves the search to the first use of each row; reading this finds the rest.
         """
-        found = self.deferred_neighbors
-        return found.whole if isinstance(found, NeighborsOnDemand) else found
+        neighbors = self.deferred_neighbors
+        return neighbors.whole if isinstance(neighbors, NeighborsOnDemand) else neighbors
 
     @property
     def voxel_size(self) -> float | None:
@@ -400,21 +393,22 @@ class PointCloud(eqx.Module):
 
     def unpad(self) -> PointCloud:
         """Return the valid rows as a raw cloud: NumPy arrays in the user's frame, float64 if `origin` is not 0."""
-        keep = np.asarray(self.valid)
-        whole = bool(keep.all())
+        valid = np.asarray(self.valid)
+        all_valid = bool(valid.all())
 
-        def kept(array: Any) -> Any:
+        def copied(array: Any) -> Any:
+            if array is None:
+                return None
             # A plain copy takes a tenth of the time of boolean indexing.
-            return None if array is None else np.array(array) if whole else np.asarray(array)[keep]
+            return np.array(array) if all_valid else np.asarray(array)[valid]
 
-        points = kept(self.coordinates if np.any(self.origin) else self.points)
         return PointCloud(
-            points,
-            kept(self.channels),
-            channel_valid=kept(self.channel_valid),
-            covariances=kept(self.covariances),
+            copied(self.coordinates if np.any(self.origin) else self.points),
+            copied(self.channels),
+            channel_valid=copied(self.channel_valid),
+            covariances=copied(self.covariances),
             channel_names=self.channel_names,
-        ).replace_rows(times=kept(self.times))
+        ).replace_rows(times=copied(self.times))
 
     def crop(self, min_range: float = 0.0, max_range: float = np.inf) -> PointCloud:
         """Return the valid points of a cloud in its sensor's frame whose distance from the sensor lies in a range, as a
@@ -431,8 +425,8 @@ class PointCloud(eqx.Module):
         if not is_concrete(self):
             raise ValueError("cloud: expected concrete arrays, got tracers; crop outside of jit and vmap")
         ranges = np.linalg.norm(self.coordinates, axis=-1)
-        kept = np.asarray(self.valid) & (ranges >= min_range) & (ranges <= max_range)
-        return self.replace_rows(valid=kept).unpad()
+        inside = np.asarray(self.valid) & (ranges >= min_range) & (ranges <= max_range)
+        return self.replace_rows(valid=inside).unpad()
 
     def pad(self, size: int | None = None) -> PointCloud:
         """Append padding rows until the cloud has `size` rows.
@@ -457,8 +451,8 @@ class PointCloud(eqx.Module):
                 return None
             fill = 0 if fill is None and not len(array) else fill
             if not isinstance(array, np.ndarray):
-                how: dict[str, Any] = {"mode": "edge"} if fill is None else {"constant_values": fill}
-                return jnp.pad(array, [(0, missing)] + [(0, 0)] * (array.ndim - 1), **how)
+                options: dict[str, Any] = {"mode": "edge"} if fill is None else {"constant_values": fill}
+                return jnp.pad(array, [(0, missing)] + [(0, 0)] * (array.ndim - 1), **options)
             # Takes a tenth of the time of `np.pad`.
             grown = np.empty((size, *array.shape[1:]), array.dtype)
             grown[: len(array)], grown[len(array) :] = array, array[-1] if fill is None else fill
@@ -476,7 +470,10 @@ class PointCloud(eqx.Module):
 
     def replace_rows(self, **arrays: Any) -> PointCloud:
         """Replace fields without checks; the number of rows may change."""
-        return _build(**vars(self) | arrays)
+        cloud = object.__new__(PointCloud)
+        for name, value in (vars(self) | arrays).items():
+            object.__setattr__(cloud, name, value)
+        return cloud
 
     @with_settings_of_package
     def transform(self, pose: Pose) -> PointCloud:
@@ -524,10 +521,10 @@ class PointCloud(eqx.Module):
             if cloud.channel_names != names:
                 raise ValueError(f"clouds[{i}]: expected the channels {names}, got {cloud.channel_names}")
         if any(cloud.channel_valid is not None for cloud in clouds):
-            everywhere = [np.ones(cloud.channels.shape, bool) for cloud in clouds]
+            masks = [np.ones(cloud.channels.shape, bool) for cloud in clouds]
             clouds = [
                 cloud if cloud.channel_valid is not None else cloud.replace(channel_valid=mask)
-                for cloud, mask in zip(clouds, everywhere, strict=True)
+                for cloud, mask in zip(clouds, masks, strict=True)
             ]
         if any(cloud.times is None for cloud in clouds):
             clouds = [cloud.replace_rows(times=None) for cloud in clouds]
@@ -540,7 +537,7 @@ _set_field = PointCloud.__setattr__
 
 
 def _set_or_advise(cloud: PointCloud, name: str, value: Any) -> None:
-    """Set a field in the constructor; name `replace` afterwards."""
+    """Set a field in the constructor; afterwards, raise an error that names `replace`."""
     try:
         _set_field(cloud, name, value)
     except FrozenInstanceError as error:
@@ -552,7 +549,7 @@ PointCloud.__setattr__ = _set_or_advise  # type: ignore[assignment,method-assign
 
 
 def as_cloud(name: str, cloud: PointCloud | Values) -> PointCloud:
-    """The argument `name` as a `PointCloud`. Raises `ValueError`, which starts with the name, if it cannot be one."""
+    """The argument `name` as a `PointCloud`; messages of the `ValueError` for unsuitable ones start with the name."""
     if isinstance(cloud, PointCloud):
         return cloud
     with messages_named(name):
@@ -560,23 +557,14 @@ def as_cloud(name: str, cloud: PointCloud | Values) -> PointCloud:
 
 
 def check_several(name: str, clouds: object) -> None:
-    """Raise `ValueError` for one cloud instead of several."""
     if isinstance(clouds, PointCloud | Frame) or getattr(clouds, "ndim", None) == 2:
         raise ValueError(f"{name}: expected a sequence of clouds, got one {type(clouds).__name__}; pass a list")
 
 
 def same_channels(one: PointCloud, other: PointCloud) -> bool:
-    """Whether the channels of two clouds are as many and named alike; channels without names are like any."""
+    """Whether two clouds have equally many channels of the same names; default names match any."""
     count, names = one.channels.shape[-1], (one.channel_names, other.channel_names)
     return other.channels.shape[-1] == count and (names[0] == names[1] or _default_names(count) in names)
-
-
-def _build(**fields: Any) -> PointCloud:
-    """Build a cloud from fields, bypassing the conversions and checks of the constructor."""
-    cloud = object.__new__(PointCloud)
-    for name, value in fields.items():
-        object.__setattr__(cloud, name, value)
-    return cloud
 
 
 @dataclass(frozen=True, eq=False)

@@ -7,7 +7,7 @@ from typing import Any, cast
 
 import jax
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool
 
 from mcgicp_jax._clouds.coordinate_steps import harmful_steps
 from mcgicp_jax._clouds.placeholders import measured_rows
@@ -22,7 +22,7 @@ from mcgicp_jax._math.statistics import median, sampled_rows
 from mcgicp_jax._search.base import AbstractSearch
 from mcgicp_jax._search.brute_force import default_search
 
-# Fewest finite points of a cloud: four points are the fewest that are not always coplanar.
+# Fewest finite points of a cloud: the fewest that are not always coplanar.
 MIN_POINTS = 4
 # Number of points among which duplicates are counted: half of them is known to within 2 %.
 _SAMPLE = 500
@@ -86,8 +86,8 @@ def preprocess(
     if not is_concrete(primal(cloud)):
         check_preprocessing(voxel_size, num_neighbors)
         return preprocess_traced(cloud, voxel_size, num_neighbors, search, size)
-    found = preprocessed_in(None, cloud, voxel_size, num_neighbors, search)
-    return found if size is None else found.pad(size)
+    preprocessed = preprocessed_in(None, cloud, voxel_size, num_neighbors, search)
+    return preprocessed if size is None else preprocessed.pad(size)
 
 
 def preprocessed_in(
@@ -102,10 +102,10 @@ def preprocessed_in(
     neighbourhoods, for warnings."""
     check_preprocessing(voxel_size, num_neighbors)
     cloud = as_cloud("cloud", cloud)
-    fixed = primal(cloud)
-    if is_concrete(fixed) and not is_concrete(cloud):
-        found = preprocessed_in(grid, fixed, voxel_size, num_neighbors, search, checked)
-        return _differentiable(cloud, found, fixed)
+    values = primal(cloud)
+    if is_concrete(values) and not is_concrete(cloud):
+        preprocessed = preprocessed_in(grid, values, voxel_size, num_neighbors, search, checked)
+        return _differentiable(preprocessed, cloud, values)
     if not is_concrete(cloud):
         raise ValueError(
             "cloud: expected a preprocessed cloud inside jit and vmap; call preprocess(cloud, voxel_size, size=...), "
@@ -113,24 +113,23 @@ def preprocessed_in(
         )
     cloud = finite_rows(cloud, None if grid is None else grid.measured)
     if grid is not None and grid.columns.shape[1] != len(cloud):
-        # Rows without a finite channel were left out.
+        # Rows with a channel that is not finite were left out.
         grid = None
-    found = with_neighbors(cloud, voxel_size, num_neighbors, search, grid)
+    preprocessed = with_neighbors(cloud, voxel_size, num_neighbors, search, grid)
     if checked:
-        _warn_of_loss(cloud, found, num_neighbors)
-    if checked and found.covariances is None:
-        warn_of_shape(found, all_points=voxel_size is None)
-    return found
+        _warn_of_loss(cloud, preprocessed, num_neighbors)
+    if checked and preprocessed.covariances is None:
+        warn_of_shape(preprocessed, all_points=voxel_size is None)
+    return preprocessed
 
 
-def _differentiable(cloud: PointCloud, found: PointCloud, fixed: PointCloud) -> PointCloud:
-    """The preprocessed cloud `found` with the derivative by the traced arrays of a raw one; `fixed` is the raw cloud
-    without these traces."""
-    raw = fixed.unpad()
-    kept = measured_rows(raw, _is_finite(raw))
-    rows, voxels = np.flatnonzero(np.asarray(fixed.valid))[kept], np.arange(np.sum(kept))
-    if found.voxel_size is not None:
-        voxels, _ = grid_of(np.asarray(raw.points)[kept]).numbers(found.voxel_size)
+def _differentiable(preprocessed: PointCloud, cloud: PointCloud, values: PointCloud) -> PointCloud:
+    """Attach the derivative by the traced arrays of the raw `cloud`, of which `values` is the concrete copy."""
+    raw = values.unpad()
+    measured = measured_rows(raw, _is_finite(raw))
+    rows, voxels = np.flatnonzero(np.asarray(values.valid))[measured], np.arange(np.sum(measured))
+    if preprocessed.voxel_size is not None:
+        voxels, _ = grid_of(np.asarray(raw.points)[measured]).numbers(preprocessed.voxel_size)
     arrays: dict[str, Any] = {}
     for name in ("points", "channels", "covariances"):
         array = getattr(cloud, name)
@@ -139,10 +138,10 @@ def _differentiable(cloud: PointCloud, found: PointCloud, fixed: PointCloud) -> 
             array = array + cloud.origin
         if not is_concrete(array):
             mask = raw.channel_valid if name == "channels" else None
-            counted = np.ones((len(rows), 1)) if mask is None else mask[kept]
-            average = RowAverage(rows, voxels, counted, (array.shape[0], len(found.points)))
-            (arrays[name],) = with_derivative([getattr(found, name)], average, [array])
-    return found.replace_rows(**arrays)
+            counted = np.ones((len(rows), 1)) if mask is None else mask[measured]
+            average = RowAverage(rows, voxels, counted, (array.shape[0], len(preprocessed.points)))
+            (arrays[name],) = with_derivative([getattr(preprocessed, name)], average, [array])
+    return preprocessed.replace_rows(**arrays)
 
 
 def with_neighbors(
@@ -158,7 +157,11 @@ def with_neighbors(
         cloud = _downsampled(cloud, grid or own_grid or grid_of(np.asarray(cloud.points)), voxels.size)
     points, channel_valid, covariances = np.asarray(cloud.points), cloud.channel_valid, cloud.covariances
     dtype = jax.dtypes.canonicalize_dtype(points.dtype)
-    origin = _far_origin(points)
+    # Clouds far from zero are centred, at a float32 origin, which has the same value inside a transformation.
+    columns = np.ascontiguousarray(points.T)
+    low, high = columns.min(axis=1).astype(np.float64), columns.max(axis=1).astype(np.float64)
+    center = (0.5 * (low + high)).astype(np.float32).astype(np.float64)
+    origin = center if is_far(center, float(np.linalg.norm(high - low))) else np.zeros(3)
     points = (points - origin).astype(dtype)
     # Neighbours are searched among the rounded coordinates, which are those of the registration.
     search = search or default_search()
@@ -184,19 +187,19 @@ def with_neighbors(
     return cloud.replace_rows(**arrays, voxels=voxels)
 
 
-def _warn_of_loss(given: PointCloud, found: PointCloud, num_neighbors: int) -> None:
-    """Warn of coordinates that are rounded to coarse steps, of duplicates and few voxels."""
-    points, neighbors = np.asarray(found.points), cast(Any, found.deferred_neighbors)
-    # Of the rows from which the spacing of a target is computed. Each point is its own first neighbour.
-    rows, counts = sampled_rows(np.asarray(found.valid))
+def _warn_of_loss(raw: PointCloud, preprocessed: PointCloud, num_neighbors: int) -> None:
+    """Warn of coordinates that are rounded to coarse steps, of duplicates and of few voxels."""
+    points, neighbors = np.asarray(preprocessed.points), cast(Any, preprocessed.deferred_neighbors)
+    # Among the rows from which the spacing of a target is computed. Each point is its own first neighbour.
+    rows, counts = sampled_rows(np.asarray(preprocessed.valid))
     rows = rows[counts][:: 1 + rows.size // _SAMPLE]
     near = neighbors[rows][:, 1:]
     with np.errstate(over="ignore", invalid="ignore"):
         distances = np.linalg.norm(points[near] - points[rows, None], axis=2)
-    # Without coincident neighbours; 0 where all are.
+    # Without coincident neighbours; the spacing is 0 if all coincide.
     nearest = np.where((distances > 0) & (near >= 0), distances, np.inf).min(axis=1)
     spacing = float(np.nan_to_num(median(np.where(np.isfinite(nearest), nearest, np.nan))))
-    steps = harmful_steps(found, spacing)
+    steps = harmful_steps(preprocessed, spacing)
     if steps.any():
         names = "" if steps.all() else " " + " and ".join(np.array(["x", "y", "z"])[steps > 0])
         warn(
@@ -210,15 +213,14 @@ def _warn_of_loss(given: PointCloud, found: PointCloud, num_neighbors: int) -> N
             f"points: {duplicates:.0%} lie exactly on another one, so that neighbourhoods do not span the surface; "
             "average them: preprocess(cloud, voxel_size=...)"
         )
-    if len(found) < min(len(given), num_neighbors):
+    if len(preprocessed) < min(len(raw), num_neighbors):
         warn(
-            f"voxel_size: {found.voxel_size} m leaves {len(found)} of {len(given)} points, fewer than the "
+            f"voxel_size: {preprocessed.voxel_size} m leaves {len(preprocessed)} of {len(raw)} points, fewer than the "
             f"{num_neighbors} neighbours from which a covariance is computed; choose a smaller size"
         )
 
 
 def check_preprocessing(voxel_size: VoxelSize | Voxels, num_neighbors: int) -> None:
-    """Check the arguments of `preprocess` other than the cloud; raises `ValueError`."""
     automatic = isinstance(voxel_size, str) and voxel_size == "auto"
     if not (automatic or voxel_size is None or isinstance(voxel_size, Voxels)):
         check_positive("voxel_size", voxel_size, 'a positive number, "auto" or None')
@@ -226,8 +228,8 @@ def check_preprocessing(voxel_size: VoxelSize | Voxels, num_neighbors: int) -> N
 
 
 def finite_rows(cloud: PointCloud | Values, measured: Bool[np.ndarray, "N"] | None = None) -> PointCloud:
-    """A raw cloud without padding, rows that have a NaN or infinity in any array, and placeholders; warns of the latter
-    two. `measured` are its `measured_rows`, if they are known."""
+    """A raw cloud without padding, rows with NaN or infinity in any array, and placeholders; warns of the latter two.
+    `measured` are its `measured_rows`, if they are known."""
     cloud = as_cloud("cloud", cloud)
     if not is_concrete(cloud):
         raise ValueError("cloud: expected concrete arrays, got tracers; call this outside of jit and vmap")
@@ -253,23 +255,17 @@ def finite_rows(cloud: PointCloud | Values, measured: Bool[np.ndarray, "N"] | No
             f"left out {placeholders.sum()} of {keep.size} points that lie at exactly one place or far from all "
             f"others, such as ({x:g}, {y:g}, {z:g}), as sensors report rays without return"
         )
-    return PointCloud(
-        cloud.points[keep],
-        cloud.channels[keep],
-        channel_valid=None if cloud.channel_valid is None else cloud.channel_valid[keep],
-        covariances=None if cloud.covariances is None else cloud.covariances[keep],
-        channel_names=cloud.channel_names,
-    )
+    return cloud.replace_rows(valid=keep, times=None).unpad()
 
 
 def _is_finite(cloud: PointCloud) -> Bool[np.ndarray, "N"]:
-    """Which rows are finite in all arrays. Values such as 1e39 or 1e300 overflow float32 and count as infinite."""
+    """Which rows are finite in all arrays. Values that overflow float32 count as infinite."""
     arrays = [array for array in (cloud.points, cloud.channels, cloud.covariances) if array is not None]
-    finite = [np.abs(array) <= LARGEST for array in arrays]
+    masks = [np.abs(array) <= LARGEST for array in arrays]
     # Most clouds are finite throughout, and one check of all values is much faster than one per row.
-    if all(each.all() for each in finite):
+    if all(mask.all() for mask in masks):
         return np.ones(len(cloud.points), bool)
-    return np.all([each.all(axis=tuple(range(1, each.ndim))) for each in finite], axis=0)
+    return np.all([mask.all(axis=tuple(range(1, mask.ndim))) for mask in masks], axis=0)
 
 
 def _downsampled(cloud: PointCloud, grid: Grid, voxel_size: float) -> PointCloud:
@@ -289,21 +285,10 @@ def _downsampled(cloud: PointCloud, grid: Grid, voxel_size: float) -> PointCloud
 
     counts = np.bincount(voxels)[:, None]
     means = (total(np.asarray(cloud.points).T) / counts).astype(cloud.points.dtype)
-    channels, names = np.asarray(cloud.channels), cloud.channel_names
-    channel_valid = None
+    channels, channel_valid = np.asarray(cloud.channels), None
     if cloud.channel_valid is not None:
         # Missing values are stored as 0 and do not add to the sum.
         counts = total(np.asarray(cloud.channel_valid).T)
         counts, channel_valid = np.maximum(counts, 1), counts > 0
     channels = (total(channels.T) / counts).astype(channels.dtype)
-    return PointCloud(means, channels, channel_valid=channel_valid, channel_names=names)
-
-
-def _far_origin(points: Float[np.ndarray, "N 3"]) -> Float[np.ndarray, "3"]:
-    """Offset to subtract: the cloud's centre if `is_far` from zero, else zero."""
-    columns = np.ascontiguousarray(points.T)
-    low, high = columns.min(axis=1).astype(np.float64), columns.max(axis=1).astype(np.float64)
-    center = 0.5 * (low + high)
-    # Rounded to float32, so that the origin has the same value inside a transformation.
-    center = center.astype(np.float32).astype(np.float64)
-    return center if is_far(center, float(np.linalg.norm(high - low))) else np.zeros(3)
+    return PointCloud(means, channels, channel_valid=channel_valid, channel_names=cloud.channel_names)

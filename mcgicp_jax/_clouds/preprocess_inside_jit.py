@@ -22,7 +22,6 @@ from mcgicp_jax._search.brute_force import default_search
 def preprocess_traced(
     cloud: PointCloud, voxel_size: Any, num_neighbors: int, search: AbstractSearch | None, size: int | None
 ) -> PointCloud:
-    """`preprocess` of a traced cloud."""
     edge = voxel_size.size if isinstance(voxel_size, Voxels) else voxel_size
     if isinstance(edge, str) or not is_concrete(edge):
         raise ValueError(f"voxel_size: expected a Python number or None inside jit and vmap, got {edge!r}")
@@ -59,20 +58,20 @@ def traced_neighbors(cloud: PointCloud, num_neighbors: int, search: AbstractSear
 
 
 def _valid_first(cloud: PointCloud) -> PointCloud:
-    """The cloud with its valid rows first, in their order; the last of them fills up the others."""
+    """The cloud with its valid rows first, in their order; the last of them fills the others."""
     valid = jnp.asarray(cloud.valid)
     rows = jnp.argsort(~valid, stable=True)
     place = jnp.arange(valid.size)
     rows = rows[jnp.minimum(place, jnp.maximum(jnp.sum(valid) - 1, 0))]
 
-    def taken(array: Any) -> Any:
-        # A cloud without any valid row has zeros, whose derivative is 0.
-        known = valid[rows].reshape(-1, *[1] * (array.ndim - 1))
-        return jnp.where(known, jnp.asarray(array)[rows], jnp.zeros((), array.dtype))
-
-    names = ("points", "channels", "channel_valid", "covariances")
-    some = {name: taken(getattr(cloud, name)) for name in names if getattr(cloud, name) is not None}
-    return cloud.replace_rows(valid=place < jnp.sum(valid), **some)
+    arrays: dict[str, Any] = {}
+    for name in ("points", "channels", "channel_valid", "covariances"):
+        array = getattr(cloud, name)
+        if array is not None:
+            # A cloud without any valid row has zeros, whose derivative is 0.
+            mask = valid[rows].reshape(-1, *[1] * (array.ndim - 1))
+            arrays[name] = jnp.where(mask, jnp.asarray(array)[rows], jnp.zeros((), array.dtype))
+    return cloud.replace_rows(valid=place < jnp.sum(valid), **arrays)
 
 
 def _averaged(cloud: PointCloud, voxel_size: float, size: int) -> PointCloud:
@@ -83,7 +82,7 @@ def _averaged(cloud: PointCloud, voxel_size: float, size: int) -> PointCloud:
     def means(array: Float[Array, "N D"], counts: Bool[Array, "N D"]) -> tuple[Array, Bool[Array, "M D"]]:
         values, weights = jnp.where(counts, array, 0)[order], counts[order].astype(points.dtype)
         # Rows beyond the last voxel are dropped.
-        total, weight = (jax.ops.segment_sum(each, numbers, size) for each in (values, weights))
+        total, weight = (jax.ops.segment_sum(rows, numbers, size) for rows in (values, weights))
         return total / jnp.maximum(weight, 1), weight > 0
 
     channels = jnp.asarray(cloud.channels)
@@ -103,9 +102,9 @@ def _averaged(cloud: PointCloud, voxel_size: float, size: int) -> PointCloud:
 def _voxels_of(
     points: Float[Array, "N 3"], valid: Bool[Array, "N"], voxel_size: float
 ) -> tuple[Int[Array, "N"], Int[Array, "N"], Int[Array, ""]]:
-    """An order that sorts rows by voxel, the number of the voxel of each row in it, and how many are occupied. The
-    numbers of invalid rows, which come last, are beyond all others."""
-    # Turned as the grids of the host are, by other random numbers.
+    """An order that sorts rows by voxel, the voxel number of each row in it, and the number of occupied voxels. Invalid
+    rows come last, with a number beyond all others."""
+    # The grid is turned like those of `grid_of`, but by other random numbers.
     low = jnp.min(jnp.where(valid[:, None], points, jnp.inf), axis=0)
     middle = 0.5 * (low + jnp.max(jnp.where(valid[:, None], points, -jnp.inf), axis=0))
     key = jax.random.key(0)

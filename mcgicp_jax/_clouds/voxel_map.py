@@ -57,34 +57,43 @@ def merge_clouds(
 
 
 class VoxelMap:
-    """The sums of positions and channels in each voxel of the world."""
+    """Sums of positions and channels in each occupied voxel of the world."""
 
     def __init__(self, voxel_size: float):
         self._voxel_size = voxel_size
-        # Keys of the voxels, sorted; and for each the number of points, and sums of positions, channels and masks.
+        # Sorted keys of the voxels; for each, the number of points and the sums of positions, channels and masks.
         self._keys = np.empty(0, np.int64)
         self._sums: Any = None
         self._names: tuple[str, ...] | None = None
-        # Voxel of the first point, from which the others are counted: keys have no room for UTM coordinates.
+        # Voxel of the first point; keys count from it because they have no room for UTM coordinates.
         self._first: Float[np.ndarray, "3"] | None = None
 
     def __len__(self) -> int:
-        """Number of occupied voxels."""
         return len(self._keys)
 
     def add(self, name: str, cloud: PointCloud, pose: Float[np.ndarray, "4 4"]) -> None:
-        """Add the finite points of a cloud in its sensor frame, moved by its pose; `name` is for error messages."""
+        """Add the finite points of a cloud, moved by its pose (sensor to world); `name` is for error messages."""
         if self._names not in (None, cloud.channel_names):
             raise ValueError(f"{name}: expected the channels {self._names}, got {cloud.channel_names}")
         cloud, self._names = cloud.unpad(), cloud.channel_names
         points = rotated(np.asarray(cloud.points, np.float64), pose[:3, :3]) + pose[:3, 3]
-        rows = np.hstack([np.ones((len(points), 1)), points, *_valid_channels(cloud)])
+        channels = np.asarray(cloud.channels, np.float64)
+        measured = (
+            np.ones_like(channels) if cloud.channel_valid is None else np.asarray(cloud.channel_valid, np.float64)
+        )
+        rows = np.hstack([np.ones((len(points), 1)), points, channels, measured])
         finite = np.isfinite(rows).all(axis=1)
         if self._first is None and finite.any():
             self._first = voxel_of(points[finite][0], self._voxel_size)
         first = 0.0 if self._first is None else self._first
         with messages_named(name):
-            keys, sums = _merged(voxel_keys(points[finite], self._voxel_size, first), rows[finite])
+            point_keys = voxel_keys(points[finite], self._voxel_size, first)
+        # Sum the rows of each voxel, then add the sums to those of the map.
+        order = np.argsort(point_keys, kind="stable")
+        starts = starts_of(point_keys[order])
+        keys, sums = point_keys[order][starts], rows[finite]
+        if len(starts):
+            sums = np.add.reduceat(sums[order], starts, axis=0)
         if self._sums is None:
             self._keys, self._sums = keys, sums
             return
@@ -106,25 +115,6 @@ class VoxelMap:
         points = self._sums[:, 1:4] / self._sums[:, :1]
         values, counts = np.split(self._sums[:, 4:], 2, axis=1)
         valid = counts > 0
-        cloud = PointCloud(
-            points,
-            values / np.maximum(counts, 1),
-            channel_valid=None if valid.all() else valid,
-            channel_names=self._names,
-        )
+        mask = None if valid.all() else valid
+        cloud = PointCloud(points, values / np.maximum(counts, 1), channel_valid=mask, channel_names=self._names)
         return cloud.replace_rows(voxels=Voxels(self._voxel_size))
-
-
-def _valid_channels(cloud: PointCloud) -> tuple[Float[np.ndarray, "N C"], Float[np.ndarray, "N C"]]:
-    """Channels, 0 where missing, and their mask as 1 or 0."""
-    channels = np.asarray(cloud.channels, np.float64)
-    if cloud.channel_valid is None:
-        return channels, np.ones_like(channels)
-    return channels, np.asarray(cloud.channel_valid, np.float64)
-
-
-def _merged(keys: np.ndarray, rows: Float[np.ndarray, "N D"]) -> tuple[np.ndarray, Float[np.ndarray, "M D"]]:
-    """Unique keys, sorted, and the sum of the rows of each key."""
-    order = np.argsort(keys, kind="stable")
-    starts = starts_of(keys[order])
-    return keys[order][starts], np.add.reduceat(rows[order], starts, axis=0) if len(starts) else rows

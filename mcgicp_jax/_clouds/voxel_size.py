@@ -64,8 +64,8 @@ _MOSTLY_LINES = 0.5
 
 
 class Shape(NamedTuple):
-    """The neighbourhoods of a cloud: the fraction that are lines, the median of their third extent over the second, and
-    the median distance of the nearest neighbour, metres."""
+    """The neighbourhoods of a cloud: the fraction that are lines, the median of third over second extent, and the
+    median distance of the nearest neighbour, metres."""
 
     lines: float
     thickness: float
@@ -73,15 +73,13 @@ class Shape(NamedTuple):
 
 
 def voxels_for(voxel_size: VoxelSize | Voxels, *clouds: PointCloud) -> Voxels:
-    """The voxels for the raw ones of clouds that are registered with each other.
-
-    Chosen automatically, they are those of clouds among them that are preprocessed already and have some.
-    """
+    """The voxels for the raw clouds among those that are registered with each other. "auto" takes the voxels of the
+    first cloud that already has some."""
     return voxels_and_grids(voxel_size, *clouds)[0]
 
 
 def voxels_and_grids(voxel_size: VoxelSize | Voxels, *clouds: PointCloud) -> tuple[Voxels, Sequence[Grid | None]]:
-    """`voxels_for`, and the grids of the clouds for which a size was chosen, in which voxels of it are numbered."""
+    """`voxels_for`, and the grids of the clouds from which a size was chosen, with the voxels numbered; else None."""
     none = [None] * len(clouds)
     if isinstance(voxel_size, Voxels):
         return voxel_size, none
@@ -112,14 +110,14 @@ def map_voxel_size(cloud: PointCloud) -> float:
 
 
 def raw_spacing(cloud: PointCloud) -> float:
-    """Median distance of the nearest neighbour of some of the finite points, metres; 0 if there is only one."""
+    """Median distance of the nearest neighbour of a sample of the finite points, metres; 0 for a single point."""
     points, _ = _finite_points(cloud)
     return _shape_of(points.T).spacing if len(points) > 1 else 0.0
 
 
 def warn_of_shape(cloud: PointCloud, all_points: bool) -> None:
-    """Warn of a preprocessed cloud that is a planar scan; or whose neighbourhoods do not span the surface, if the user
-    asked for `all_points`."""
+    """Warn if a preprocessed cloud is a planar scan, or, if the user asked for `all_points`, if its neighbourhoods do
+    not span the surface."""
     points, neighbors = np.asarray(cloud.points), cast(Any, cloud.deferred_neighbors)
     constant = (points == points[0]).all(axis=0)
     planar, examined = constant.sum() == 1, all_points and len(cloud) >= _LEAST_VOXELS
@@ -130,37 +128,36 @@ def warn_of_shape(cloud: PointCloud, all_points: bool) -> None:
     if planar and shape.lines > _MOSTLY_LINES:
         warn(f"points: all have the same {'xyz'[int(constant.argmax())]}, and most lie on lines; {PLANAR_ADVICE}")
         return
-    seen = []
+    defects = []
     if shape.lines > _MANY_LINES:
-        seen.append(f"{shape.lines:.0%} of the neighbourhoods are lines")
+        defects.append(f"{shape.lines:.0%} of the neighbourhoods are lines")
     if shape.thickness > _AS_THICK_AS_WIDE:
-        seen.append(f"the neighbourhoods are {shape.thickness:.2f} times as thick as wide")
-    if seen and examined:
-        warn(f'voxel_size: without voxels, {" and ".join(seen)}, so they do not describe the surface; use "auto"')
+        defects.append(f"the neighbourhoods are {shape.thickness:.2f} times as thick as wide")
+    if defects and examined:
+        warn(f'voxel_size: without voxels, {" and ".join(defects)}, so they do not describe the surface; use "auto"')
 
 
 def _suitable_voxels(grids: Sequence[Grid]) -> Voxels:
-    """One voxel size for some raw clouds, metres, and the reason; None where their points are spread evenly.
+    """One voxel size for several raw clouds, and the reason; None where their points are spread evenly.
 
-    It is the smallest at which no cloud has more than 5 % of linear neighbourhoods or more than 40,000 voxels. If the
-    neighbourhoods are thicker than 0.3 of their width, but thinner in larger voxels, it is increased. A constant to
-    autodiff.
+    It is the smallest at which no cloud has more than 5 % of linear neighbourhoods or more than 40,000 voxels, or a
+    larger one if neighbourhoods are thicker than 0.3 of their width and thinner there. A constant to autodiff.
     """
     # Sizes are numbered, ten for each decade of metres; None stands for all points.
     step: int | None = None
     reason = ""
     smallest, largest = _range_of([grid.columns for grid in grids])
-    # What suffices for the largest cloud mostly suffices for the others.
+    # A size that suffices for the largest cloud mostly suffices for the others.
     clouds = [_Averages(grid) for grid in sorted(grids, key=lambda grid: grid.columns.shape[1], reverse=True)]
     most = clouds[0].count(None)
     if most > _MOST_VOXELS:
-        # The size in which a square of the extent of the clouds has as many voxels, where the search begins.
+        # The search begins at the size at which a square as large as the clouds has as many voxels.
         first, step = smallest, largest - round(_STEPS / 2 * np.log10(_MOST_VOXELS))
         for cloud in clouds:
             first = step = cloud.first_with_few(range(first, largest), step)
         reason = f"at most {_MOST_VOXELS:,} of {most:,} points"
         side_by_side([partial(cloud.average, step) for cloud in clouds])
-        if not _show_scene(clouds, step):
+        if not all(cloud.shows_scene(step) for cloud in clouds):
             return Voxels()
     shape = _worst_shape(clouds, step)
     # Voxels below the spacing would average nothing.
@@ -178,18 +175,17 @@ def _suitable_voxels(grids: Sequence[Grid]) -> Voxels:
 
 
 class _Averages:
-    """The means of a cloud in voxels of each numbered size, and the shapes of their neighbourhoods."""
+    """The means of a cloud in voxels of each numbered size, and the shapes of the neighbourhoods of these means."""
 
     def __init__(self, grid: Grid):
-        # Points, or means in voxels of the size number `step`, whose means would be the same.
+        # Points (step None), or their means in voxels of the size number `_step`, whose own means are the same.
         self._grid = grid
         self._step: int | None = None
-        # Fewer voxels do not show the scene.
         self._least = min(_LEAST_VOXELS, grid.columns.shape[1] // 2)
         self._shapes: dict[int | None, Shape] = {}
 
     def average(self, step: int) -> None:
-        """Take these means for the points: larger voxels are then examined in a third of the time."""
+        """Replace the points by these means: larger voxels are then examined in a third of the time."""
         self._grid, self._step = Grid(self._means(step)), step
 
     def count(self, step: int | None) -> int:
@@ -206,13 +202,13 @@ class _Averages:
         return self._shapes[step]
 
     def first_with_few(self, steps: range, guess: int) -> int:
-        """The first step with at most `_MOST_VOXELS` voxels, the end of the range if there is none."""
+        """The first step with at most `_MOST_VOXELS` voxels; the end of the range if there is none."""
         low, high = steps.start, steps.stop
         while low < high:
             guess = min(max(guess, low), high - 1)
             count = self.count(guess)
             low, high = (low, guess) if count <= _MOST_VOXELS else (guess + 1, high)
-            # Along scan lines the number of voxels goes with the inverse of their size, on a surface with its square.
+            # The number of voxels goes with 1 / size along scan lines, with 1 / size² on surfaces.
             guess += round(_STEPS * np.log10(count / _MOST_VOXELS))
         return low
 
@@ -224,10 +220,6 @@ class _Averages:
         return sums / np.bincount(numbers)
 
 
-def _show_scene(clouds: Sequence[_Averages], step: int) -> bool:
-    return all(cloud.shows_scene(step) for cloud in clouds)
-
-
 def _worst_shape(clouds: Sequence[_Averages], step: int | None) -> Shape:
     """The largest fraction of lines, thickness and spacing in any cloud."""
     shapes = side_by_side([partial(cloud.shape, step) for cloud in clouds])
@@ -236,27 +228,27 @@ def _worst_shape(clouds: Sequence[_Averages], step: int | None) -> Shape:
 
 def _without_lines(clouds: Sequence[_Averages], step: int | None, steps: range) -> int | None:
     """The smallest size at which few neighbourhoods are lines, or else the largest at which all clouds show the scene;
-    None if there is none. `step` is the number of the current size."""
+    None if there is none. `step` is the current size."""
 
     def suffices(cloud: _Averages, larger: int) -> bool:
         return not cloud.shows_scene(larger) or cloud.shape(larger).lines <= _MOST_LINES
 
-    # What suffices for the cloud of most lines mostly suffices for the others, or the next size does.
+    # A size that suffices for the cloud with the most lines mostly suffices for the others, or the next one does.
     worst, *others = sorted(clouds, key=lambda cloud: cloud.shape(step).lines, reverse=True)
     larger = bisect.bisect_left(steps, True, key=partial(suffices, worst)) + steps.start
     for cloud in others:
         while larger < steps.stop and not suffices(cloud, larger):
             larger += 1
-    while larger >= steps.start and not _show_scene(clouds, larger):
+    while larger >= steps.start and not all(cloud.shows_scene(larger) for cloud in clouds):
         larger -= 1
     return larger if larger >= steps.start else None
 
 
 def _thinner(clouds: Sequence[_Averages], thickness: float, start: int) -> int | None:
-    """The smallest size in whose voxels the neighbourhoods are clearly thinner than `thickness`, as they are now; None
-    if there is none. `start` is the number of the size that is doubled, the current one or the spacing."""
+    """The smallest size at which neighbourhoods are clearly thinner than `thickness`, the current one; None if there is
+    none. `start` is the size that is doubled: the current one or the spacing."""
     for larger in range(start + _DOUBLE, start + _DOUBLE * _DOUBLINGS + 1, _DOUBLE):
-        if not _show_scene(clouds, larger):
+        if not all(cloud.shows_scene(larger) for cloud in clouds):
             return None
         before, thickness = thickness, _worst_shape(clouds, larger).thickness
         if thickness > _THICKER * before:
@@ -286,7 +278,7 @@ def _shape_of(columns: Float[np.ndarray, "3 N"], neighbors: Any = None) -> Shape
 
 
 def _range_of(points: Sequence[Float[np.ndarray, "3 _"]]) -> tuple[int, int]:
-    """The numbers of the smallest and of the largest voxel size to consider."""
+    """The smallest and the largest step to consider."""
     samples = [columns[:, :: 1 + columns.shape[1] // _SAMPLE] for columns in points]
     inner = max(float(np.ptp(np.quantile(sample, _INNER, axis=1), axis=0).max()) for sample in samples)
     whole = max(float(np.ptp(columns, axis=1).max()) for columns in points)
@@ -296,12 +288,12 @@ def _range_of(points: Sequence[Float[np.ndarray, "3 _"]]) -> tuple[int, int]:
 
 
 def _step_of(size: float) -> int:
-    """The number of the smallest voxel size that is not below this one."""
+    """Number of the smallest voxel size that is not below this one."""
     return int(np.ceil(_STEPS * np.log10(size)))
 
 
 def _size(step: int) -> float:
-    """The voxel size with this number, metres, to two digits."""
+    """Voxel size with this number, metres, to two digits."""
     return float(f"{10 ** (step / _STEPS):.2g}")
 
 

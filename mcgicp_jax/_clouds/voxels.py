@@ -22,17 +22,16 @@ TURN, VARIATION = np.pi / 3, 0.3
 
 
 def voxel_of(points: Float[np.ndarray, "*N 3"], voxel_size: float) -> Float[np.ndarray, "*N 3"]:
-    """Integer coordinates of the voxels that contain the points."""
+    """Integer coordinates, as floats, of the voxels that contain the points."""
     return np.floor(points / voxel_size)
 
 
 def voxel_keys(
     points: Float[np.ndarray, "N 3"], voxel_size: float, first: Float[np.ndarray, "3"] | float
 ) -> Int[np.ndarray, "N"]:
-    """Keys of the voxels that contain the points, the same in every call with the same voxel `first`.
+    """Keys of the voxels that contain the points, counted from the voxel `first`.
 
-    Raises:
-        ValueError: if a point lies 2²⁰ or more voxels from `first` along an axis.
+    Raises `ValueError` if a point lies 2²⁰ or more voxels from `first` along an axis.
     """
     cells = voxel_of(points, voxel_size) - first
     if np.abs(cells).max(initial=0) >= VOXELS_PER_AXIS // 2:
@@ -45,7 +44,7 @@ def voxel_keys(
 
 
 def wrapped_keys(points: Float[np.ndarray, "N 3"], voxel_size: float) -> Int[np.ndarray, "N"]:
-    """Keys of the voxels that contain the points; voxels that are multiples of 2²¹ voxels apart have the same."""
+    """Keys of the voxels that contain the points, modulo 2²¹ voxels along each axis."""
     return _packed(np.mod(voxel_of(points, voxel_size), VOXELS_PER_AXIS))
 
 
@@ -60,8 +59,7 @@ def voxel_order(
 ) -> tuple[Int[np.ndarray, "N"], Int[np.ndarray, "M"]]:
     """An order that sorts points by voxel, and where each of the M occupied voxels starts in it.
 
-    Raises:
-        ValueError: if the points extend over more than 2²¹ voxels along an axis.
+    Raises `ValueError` if the points extend over more than 2²¹ voxels along an axis.
     """
     # Unlike in `voxel_keys`, the indices take no more bits than the extent of the points needs.
     key, num_keys = np.zeros(columns.shape[1], np.int64), 1
@@ -84,20 +82,15 @@ def voxel_order(
 
 
 class Grid:
-    """The points of a cloud in the grid in which it is averaged.
-
-    Attributes:
-        columns: coordinates along the axes of the grid, metres.
-        measured: which rows of the cloud these points are; None for all.
-    """
+    """The points of a cloud in the grid in which it is averaged: `columns` are coordinates along the axes of the grid,
+    metres; `measured` says which rows of the cloud these points are, None for all."""
 
     def __init__(self, columns: Float[np.ndarray, "3 N"], measured: Bool[np.ndarray, "M"] | None = None):
         self.columns, self.measured = columns, measured
         self._numbers: dict[float, tuple[Int[np.ndarray, "N"], int]] = {}
 
     def numbers(self, voxel_size: float) -> tuple[Int[np.ndarray, "N"], int]:
-        """The number of the voxel of each point, in the order of `voxel_order`, and how many are occupied; computed
-        once for each size."""
+        """The voxel number of each point, in the order of `voxel_order`, and the number of occupied voxels; cached."""
         if voxel_size not in self._numbers:
             order, starts = voxel_order(self.columns, voxel_size)
             numbers = np.empty_like(order)
@@ -107,10 +100,10 @@ class Grid:
 
 
 def grid_of(points: Float[np.ndarray, "N 3"], measured: Bool[np.ndarray, "M"] | None = None) -> Grid:
-    """The grid of finite points; `measured` is that of `Grid`.
+    """The turned grid of finite points.
 
-    Its angles depend on how many points lie on either side of the middle: at random from cloud to cloud, but the same
-    for any order of the points, and constant to derivatives.
+    The angles are seeded by the numbers of points on either side of the middle: they differ between clouds, but not
+    with the order of the points, and are constants to autodiff.
     """
     # Imported late: it takes a fifth of the import time of the package.
     from scipy.spatial.transform import Rotation
@@ -124,7 +117,6 @@ def grid_of(points: Float[np.ndarray, "N 3"], measured: Bool[np.ndarray, "M"] | 
 
 
 def starts_of(sorted_keys: Int[np.ndarray, "N"]) -> Int[np.ndarray, "M"]:
-    """Positions at which a new key starts."""
     first = np.ones(len(sorted_keys), bool)
     np.not_equal(sorted_keys[1:], sorted_keys[:-1], out=first[1:])
     return np.flatnonzero(first)
