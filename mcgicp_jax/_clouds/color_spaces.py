@@ -95,12 +95,12 @@ def rgb_to_yuv(rgb: Values) -> Float[AnyArray, "*batch 3"]:
     return xp.stack([luma, _BLUE * (blue - luma), _RED * (red - luma)], -1)
 
 
-# By the name that stands for the three channels.
+# By the name that stands for the three channels in options.
 COLOR_SPACES = {"lab": rgb_to_lab, "hsv": rgb_to_hsv, "yuv": rgb_to_yuv}
 
 
 def _colors(rgb: Values) -> tuple[Any, Any]:
-    """The colours as a floating-point array, and NumPy for a NumPy array or list, else `jax.numpy`."""
+    """The checked colours in floating point, and their array module: NumPy for concrete colours, else `jax.numpy`."""
     xp = numpy_for(rgb)
     colors: Any = xp.asarray(rgb)
     if colors.ndim == 0 or colors.shape[-1] != 3:

@@ -7,15 +7,15 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-# Value of pixels without depth in images of 16 bits, beside 0: that of Kinect v1 (7-Scenes).
+# Besides 0, the value of pixels without depth in 16-bit images of Kinect v1 (7-Scenes).
 _NO_DEPTH = 65535
 
 
 def back_project(
     depth: Any, intrinsics: Any, scale: int | float | None = None, max_depth: int | float | None = None
 ) -> tuple[Float[np.ndarray, "N 3"], Float[np.ndarray, "N 2"]]:
-    """Points of a pinhole camera (x right, y down, z ahead) and their pixels (column, row), row by row of the image.
-    The arguments are those of `PointCloud.from_depth`, which says what raises."""
+    """Points of a pinhole camera (x right, y down, z ahead), metres, and their pixels (column, row), row by row; the
+    arguments are those of `PointCloud.from_depth`."""
     depth = np.asarray(depth)
     if depth.ndim != 2 or depth.dtype.kind not in "fiu":
         raise ValueError(f"depth: expected numbers of shape (height, width), got {depth.dtype} of shape {depth.shape}")

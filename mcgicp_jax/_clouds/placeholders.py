@@ -1,8 +1,8 @@
-"""Rows of raw clouds that are no measurements: what sensors report for rays without return.
+"""Placeholders: rows of raw clouds that sensors report for rays without return.
 
-Many write (0, 0, 0), others one far place, such as 999 m in each coordinate, or the largest range on each ray. Matched
-to each other, these rows hold the pose at the identity. They are told from measurements by being exactly equal, or so
-far from all others that they are no surface: one of them, at 999 m, holds the rotation of a room of 5,000 points.
+Many sensors write (0, 0, 0), others one far place, such as 999 m in each coordinate, or the largest range on each ray.
+Matched to each other, these rows fix the pose at the identity; a single one at 999 m fixes the rotation of a room of
+5,000 points. Placeholders are exactly equal, or so far from all other points that they are no surface.
 """
 
 from __future__ import annotations
@@ -14,14 +14,14 @@ from mcgicp_jax._clouds.point_cloud import LARGEST, PointCloud
 from mcgicp_jax._math.statistics import equal_rows
 from mcgicp_jax._search.kd_tree import KDTreeSearch
 
-# A position is a placeholder if more rows than `_MANY` share it, and more than so many times as many as share any of
+# A position is a placeholder if more than `_MANY` rows share it, and more than `_MANY` times as many as share any of
 # the `_NEAR` nearest positions: where coordinates are rounded to steps, or clouds are concatenated, these numbers are
 # alike. (At most 4 times as many in rooms, streets and KITTI on grids of 0.01 to 0.5 m; the zeros of a LiDAR that
-# reports them: 20 times on grids up to 0.3 m, and 2,500 times as they are.)
+# reports them: 20 times on grids up to 0.3 m, 2,500 times without a grid.)
 _MANY, _NEAR = 5, 8
-# A point is no surface if it is further from the middle than `_FAR` times the median of the points, and if the nearest
-# `_SURFACE` others, as many as a covariance is computed from, reach back over more than half of the way to the middle.
-# (Facades of 25 points 30 to 300 m from a room reach over a third of it at most. KITTI and streets extend over 7 to 15
+# A point is no surface if its distance from the middle exceeds `_FAR` times the median distance, and if its `_SURFACE`
+# nearest others, as many as a covariance is computed from, extend over more than half of the way to the middle.
+# (Facades of 25 points 30 to 300 m from a room extend over a third of it at most. KITTI and streets extend over 7 to 15
 # medians. Up to 20 nearer points at fixed places in both clouds of a room of 5,000 points move the pose by 0.1 mm.)
 _FAR, _SURFACE = 20, 20
 # Points from which the middle and the median are computed.
@@ -74,8 +74,8 @@ def _without_far(
     # Others within half of the way are at least half as far.
     outer = columns[:, distance >= limit / 2].T
     search = KDTreeSearch(workers=1)
-    reach, _ = search.query(search.build(outer), columns[:, far].T, min(1 + _SURFACE, len(outer)), np.inf)
-    alone = (reach[:, -1] > distance[far] / 2) | (len(outer) <= _SURFACE)
+    distances, _ = search.query(search.build(outer), columns[:, far].T, min(1 + _SURFACE, len(outer)), np.inf)
+    isolated = (distances[:, -1] > distance[far] / 2) | (len(outer) <= _SURFACE)
     measured = measured.copy()
-    measured[rows[far[alone]]] = False
+    measured[rows[far[isolated]]] = False
     return measured

@@ -37,7 +37,7 @@ _FAR = 8.0
 
 
 def is_far(offset: Float[np.ndarray, "3"], size: float) -> bool:
-    """Whether a cloud of `size` metres lies so far from zero that float32 coordinates lose too much precision."""
+    """Whether a cloud of `size` metres lies too far from zero for float32 coordinates."""
     return bool(np.linalg.norm(offset) > _FAR * size)
 
 
@@ -118,8 +118,8 @@ def _blank(channels: Any, channel_valid: Any) -> Any:
 @jax.tree_util.register_pytree_node_class
 @dataclass(frozen=True)
 class Voxels:
-    """How a cloud was downsampled. As a pytree it is empty, so that it decides no program; copies that a transformation
-    of JAX makes do not have it.
+    """How a cloud was downsampled. An empty pytree, so that no program depends on it; copies that transformations of
+    JAX make lose it.
 
     Attributes:
         size: edge of the voxels, metres; None if every point was kept.

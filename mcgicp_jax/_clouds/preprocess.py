@@ -124,7 +124,7 @@ def preprocessed_in(
 
 
 def _differentiable(preprocessed: PointCloud, cloud: PointCloud, values: PointCloud) -> PointCloud:
-    """Attach the derivative by the traced arrays of the raw `cloud`, of which `values` is the concrete copy."""
+    """The preprocessed cloud with the derivative by the traced arrays of the raw `cloud`, whose values are `values`."""
     raw = values.unpad()
     measured = measured_rows(raw, _is_finite(raw))
     rows, voxels = np.flatnonzero(np.asarray(values.valid))[measured], np.arange(np.sum(measured))

@@ -40,6 +40,7 @@ def merge_clouds(
     if voxel_size != "auto":
         check_positive("voxel_size", voxel_size, 'a positive number or "auto"')
     world: Any = None
+    # Marks the end of the shorter sequence.
     end: Any = object()
     for i, (cloud, pose) in enumerate(itertools.zip_longest(clouds, poses, fillvalue=end)):
         if cloud is end or pose is end:

@@ -46,19 +46,19 @@ _FEWER = 0.5
 # Median thickness of neighbourhoods (third extent over the second) from which larger voxels are tried. Raw corridors
 # that noise made look constrained had 0.4 and more, and 20 points that fill a ball have 0.77.
 _THICK = 0.3
-# They are used if the thickness falls below that, and to this fraction or less while they double; they are given up if
-# it rises by this factor (measured: Constants in `tests/benchmarks/README.md`).
+# Larger voxels are used if the thickness falls below `_THICK`, and to the fraction `_THINNER` or less per doubling;
+# they are given up if it rises by the factor `_THICKER` (measured: Constants in `tests/benchmarks/README.md`).
 _THINNER, _THICKER = 0.6, 1.1
 # Sizes per decade: those of the preferred numbers R10 of ISO 3, 26 % apart.
 _STEPS = 10
-# Number of these steps by which sizes double.
+# Number of steps by which sizes double.
 _DOUBLE = 3
-# Sizes that are considered: four decades below the extent of the clouds, and for noise up to four doublings. The extent
-# is that between two quantiles of the coordinates, since a few points may be far away.
+# Sizes considered: four decades below the extent of the clouds, and for noise up to four doublings. The extent is that
+# between two quantiles of the coordinates, since a few points may be far away.
 _DECADES, _DOUBLINGS, _INNER = 4, 4, (0.05, 0.95)
 # Number of points whose neighbourhoods are examined: a fraction of 5 % is known to within 1.3 %.
 _SAMPLE = 300
-# Fractions of lines and thickness from which raw clouds are warned of; lines of which a plane is a planar scan.
+# Raw clouds are warned of above this fraction of lines or this thickness; a plane above that fraction is a planar scan.
 _MANY_LINES, _AS_THICK_AS_WIDE = 0.1, 0.6
 _MOSTLY_LINES = 0.5
 

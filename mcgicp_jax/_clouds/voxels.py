@@ -1,9 +1,9 @@
-"""Voxels: cubes of space with a corner at the origin, numbered by one integer key each.
+"""Voxels: cubes of space with a corner at the origin, each with one integer key.
 
-The grid in which a cloud is averaged is turned, differently for each cloud. A plane along a grid cuts all its voxels in
-the same place: where these hold few points, their means are biased to one side, by up to half the noise. And in grids
-of one direction, two scans of a surface have the same pattern of such errors, which favours the pose at which the grids
-coincide: the error of the pose was then up to twice as large as with different grids, and unknown to its covariance.
+The grid in which a cloud is averaged is turned, differently for each cloud. A plane along a grid cuts all its voxels at
+the same place: if these hold few points, their means are biased to one side, by up to half the noise. In parallel
+grids, two scans of a surface share this pattern of errors, which favours the pose at which the grids coincide: the
+error of the pose was up to twice as large as with different grids, and its covariance did not show it.
 """
 
 from __future__ import annotations
@@ -15,9 +15,9 @@ from mcgicp_jax._math.poses import rotated
 
 # Number of voxels along an axis: three 21-bit indices fit into one 63-bit key.
 VOXELS_PER_AXIS = 2**21
-# Angles in radians by which grids are turned: about the diagonal, so that the axes of a grid are 48 degrees from those
-# of the cloud, along which scenes often lie; and at most about each axis, to make grids differ. The axes then come no
-# nearer than 18 degrees. Variations of 0.1 to 0.3, and grids of any direction, give the same errors.
+# Angles in radians by which grids are turned: `TURN` about the diagonal puts the axes of a grid 48 degrees from those
+# of the cloud, along which scenes often lie; up to `VARIATION` about each axis makes grids differ. The axes then come
+# no nearer than 18 degrees. Variations of 0.1 to 0.3, and grids of any direction, give the same errors.
 TURN, VARIATION = np.pi / 3, 0.3
 
 
