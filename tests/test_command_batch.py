@@ -115,8 +115,12 @@ def test_pairs_that_fail_have_messages_of_their_own(folder, tmp_path, capsys):
     assert rows["scan_2.ply"]["status"] == "too_few_correspondences"
     for name in ("missing.ply", "notes.txt"):
         assert rows[name]["status"] == "invalid_input" and name in rows[name]["reason"]
-    errors = capsys.readouterr().err
+    text, errors = capsys.readouterr()
     assert "mcgicp: missing.ply scan_0.ply: source:" in errors and "3 of 4 pairs" in errors
+    assert "done:      4 of 4, " in text
+    # Files that cannot be read have no rate.
+    assert main(["batch", pairs, "--output", str(output), *OPTIONS]) == 1
+    assert "done:      2 of 2\n" in capsys.readouterr().out
 
 
 def test_a_pair_from_several_starts(folder, tmp_path, capsys):

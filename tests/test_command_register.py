@@ -116,7 +116,8 @@ def test_register_writes_its_files(files, tmp_path, capsys):
     # All points, not the voxels
     np.testing.assert_allclose(moved.points, source.points @ written[:3, :3].T + written[:3, 3], atol=1e-6)
     np.testing.assert_array_equal(moved.channels, source.channels)
-    assert matplotlib.image.imread(picture).ndim == 3 and str(picture) in text
+    assert matplotlib.image.imread(picture).ndim == 3
+    assert all(str(path) in text for path in (pose, aligned, picture))
     # The pose is one to start from: few updates are needed.
     again = ["register", files["source"], files["target"], "--init", str(pose), "--max-iterations", "4"]
     assert main(again) == 0

@@ -254,8 +254,10 @@ def _register_missing(
                         raise KeyboardInterrupt
         except KeyboardInterrupt:
             interrupted = True
-    done = sum(key in rows for key in pairs)
-    print(f"done:      {done:,} of {len(pairs):,}, {done / (time.perf_counter() - begin):.3g} pairs per second")
+    done = [rows[key]["status"] for key in pairs if key in rows]
+    registered = sum(status not in _TRIED_AGAIN for status in done)
+    rate = f", {registered / (time.perf_counter() - begin):.3g} pairs per second" if registered else ""
+    print(f"done:      {len(done):,} of {len(pairs):,}{rate}")
     return interrupted
 
 

@@ -157,6 +157,7 @@ def odometry(
         camera = frames.to_camera if pose_frame == "camera" else None
         in_frame = poses if camera is None else [camera @ pose @ np.linalg.inv(camera) for pose in poses]
         io.write_poses(output, in_frame, None if pose_format == "kitti" else times)
+        print(f"poses:     {output}")
     if plot is not None:
         true_poses = [pose for pose in truth if pose is not None]
         plots.trajectories(({"truth": true_poses} if true_poses else {}) | {name: poses}, path=plot)

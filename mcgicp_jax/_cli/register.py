@@ -181,8 +181,10 @@ def register(
 
     if output is not None:
         io.write_poses(output, [result.matrix])
+        print(f"pose:      {output}")
     if aligned is not None:
         io.write(aligned, pair.raw[0].transform(result.matrix))
+        print(f"aligned:   {aligned}")
     pair.draw({name: result})
     return _verdict({name: result})
 
