@@ -28,7 +28,7 @@ def pose_error(T: Pose, T_true: Pose, *, at: ArrayLike | None = None) -> tuple[S
     """Translation and rotation error of a pose: |T p − T_true p| at a point p, and the angle of `T_true⁻¹ T`.
 
     Concrete poses are compared in float64. Inside `jit`, `grad` and `vmap` the errors have the precision of the traced
-    pose; both are differentiable, with gradient 0 where the error is 0.
+    pose. Both are differentiable, with gradient 0 where the error is 0.
 
     Args:
         T: estimated pose, `jaxlie.SE3` or (4, 4).
@@ -79,8 +79,11 @@ def ate(poses: Poses, true_poses: Poses, alignment: Literal["umeyama", "first"] 
         raise ValueError(f"alignment: expected 'umeyama' or 'first', got {alignment!r}")
     positions, true_positions = estimated[:, :3, 3], true[:, :3, 3]
     if alignment == "umeyama":
-        rotation = _best_rotation(positions, true_positions)
-        aligned = (positions - positions.mean(axis=0)) @ rotation.T + true_positions.mean(axis=0)
+        # The least-squares rotation about the centroids, without a reflection.
+        centered, center = positions - positions.mean(axis=0), true_positions.mean(axis=0)
+        left, _, right = np.linalg.svd((true_positions - center).T @ centered)
+        sign = np.sign(np.linalg.det(left) * np.linalg.det(right))
+        aligned = centered @ (left @ np.diag([1, 1, sign]) @ right).T + center
     else:
         aligned = (true[0] @ np.linalg.inv(estimated[0]) @ estimated)[:, :3, 3]
     return float(np.sqrt(((aligned - true_positions) ** 2).sum(axis=1).mean()))
@@ -130,7 +133,8 @@ def kitti_errors(
     """
     estimated, true = _trajectories(poses, true_poses)
     along = np.concatenate([[0], np.linalg.norm(np.diff(true[:, :3, 3], axis=0), axis=1).cumsum()])
-    first, length = (part.ravel() for part in np.meshgrid(np.arange(0, len(true), step), np.asarray(lengths, float)))
+    first, length = np.meshgrid(np.arange(0, len(true), step), np.asarray(lengths, float))
+    first, length = first.ravel(), length.ravel()
     last = np.searchsorted(along, along[first] + length, side="right")
     complete = last < len(true)
     if not complete.any():
@@ -152,16 +156,8 @@ def _trajectories(poses: Poses, true_poses: Poses) -> tuple[Float[np.ndarray, "N
 def _relative_errors(
     estimated: Float[np.ndarray, "N 4 4"], true: Float[np.ndarray, "N 4 4"], first: np.ndarray, last: np.ndarray
 ) -> Float[np.ndarray, "2 M"]:
-    """Translation and rotation errors of the motions from frames `first` to frames `last`."""
     motions = (np.linalg.inv(poses[first]) @ poses[last] for poses in (estimated, true))
     return np.array([_errors(motion, truth, np.zeros(3), np) for motion, truth in zip(*motions, strict=True)]).T
-
-
-def _best_rotation(points: Float[np.ndarray, "N 3"], onto: Float[np.ndarray, "N 3"]) -> Float[np.ndarray, "3 3"]:
-    """The least-squares rotation between two sets of points about their centroids (Umeyama 1991)."""
-    left, _, right = np.linalg.svd((onto - onto.mean(axis=0)).T @ (points - points.mean(axis=0)))
-    sign = np.sign(np.linalg.det(left) * np.linalg.det(right))
-    return left @ np.diag([1, 1, sign]) @ right
 
 
 def _errors(matrix: Any, true: Any, point: Any, numpy: ModuleType) -> tuple[Any, Any]:
@@ -178,6 +174,5 @@ def _errors(matrix: Any, true: Any, point: Any, numpy: ModuleType) -> tuple[Any,
 def _norm(vector: Any, numpy: ModuleType) -> Any:
     """Euclidean norm with gradient 0, rather than NaN, at 0."""
     squared = (vector**2).sum()
-    # NaN is not 0.
-    nonzero = squared != 0
+    nonzero = squared != 0  # true for NaN, which is returned
     return numpy.where(nonzero, numpy.sqrt(numpy.where(nonzero, squared, 1)), 0)

@@ -24,6 +24,9 @@ from mcgicp_jax.io.clouds import is_cloud
 Matrix: TypeAlias = Float[np.ndarray, "4 4"]
 Picture: TypeAlias = UInt8[np.ndarray, "height width 3"]
 
+# Independent random streams of one seed: the scene, the path of the sensor, and one per frame.
+_SCENE, _PATH, _FIRST_FRAME = 0, 1, 2
+
 
 class AbstractFrames(Sequence[Frame]):
     """A lazy sequence of frames: each is generated or read on access and not kept.
@@ -144,10 +147,6 @@ class SyntheticFrames(AbstractFrames):
         if self.num_poses > 1:
             poses_of_scan = np.stack([self.path(row - float(time)) for time in np.linspace(1, 0, self.num_poses)])
         return Frame(self.observer(rng, poses_of_scan), pose, row * self.period)
-
-
-# Independent random streams of one seed: the scene, the path of the sensor, and one per frame.
-_SCENE, _PATH, _FIRST_FRAME = 0, 1, 2
 
 
 def scene_and_path_rng(seed: int) -> tuple[np.random.Generator, np.random.Generator]:

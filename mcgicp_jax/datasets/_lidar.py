@@ -11,8 +11,8 @@ from jaxtyping import Bool, Float
 from scipy.spatial.transform import Rotation
 
 from mcgicp_jax import io
-from mcgicp_jax._clouds.point_cloud import Frame, PointCloud
-from mcgicp_jax.datasets._frames import AbstractFrames, Matrix, Picture, colored_cloud, look_up, pose_of, read_image
+from mcgicp_jax._clouds.point_cloud import Frame
+from mcgicp_jax.datasets._frames import AbstractFrames, Matrix, colored_cloud, look_up, pose_of, read_image
 
 # Pose of the laser in the vehicle's frame: roll, pitch, yaw in radians; x, y, z in metres.
 _LASER_IN_VEHICLE = pose_of(Rotation.from_euler("xyz", [np.pi, 0, np.pi / 2]), [2.4, -0.01, -2.3])
@@ -72,25 +72,22 @@ class KITTIFrames(AbstractFrames):
         image = pixels = None
         if self._colored:
             image = read_image(self.folder / "image_2" / f"{scan.stem}.png")
-            cloud, pixels = self._paint(cloud, image)
+            # Append the colours as channels; pixels outside of the image are NaN in the frame.
+            homogeneous = cloud.points @ self._projection[:, :3].T + self._projection[:, 3]
+            ahead = homogeneous[:, 2:] > 0
+            pixels = np.where(ahead, homogeneous[:, :2] / np.where(ahead, homogeneous[:, 2:], 1), -1)
+            colors, inside = look_up(image, pixels)
+            cloud = colored_cloud(cloud.points, colors, inside, cloud.channels)
+            pixels = np.where(inside[:, None], pixels, np.nan)
         pose = None
         if self._poses is not None and number < len(self._poses):
             pose = np.linalg.inv(self.to_camera) @ self._poses[number] @ self.to_camera
         time = float(self._times[number]) if number < len(self._times) else None
         return Frame(cloud, pose, time, image, pixels)
 
-    def _paint(self, cloud: PointCloud, image: Picture) -> tuple[PointCloud, Float[np.ndarray, "N 2"]]:
-        """Append the colours of the image as channels; with the pixels, NaN outside of the image."""
-        homogeneous = cloud.points @ self._projection[:, :3].T + self._projection[:, 3]
-        ahead = homogeneous[:, 2:] > 0
-        pixels = np.where(ahead, homogeneous[:, :2] / np.where(ahead, homogeneous[:, 2:], 1), -1)
-        colors, inside = look_up(image, pixels)
-        painted = colored_cloud(cloud.points, colors, inside, cloud.channels)
-        return painted, np.where(inside[:, None], pixels, np.nan)
-
 
 def _read_calibration(path: Path) -> dict[str, Float[np.ndarray, "3 4"]]:
-    """Read the 3×4 matrices of calib.txt by name."""
+    """The 3×4 matrices by name."""
     matrices = {}
     for line in path.read_text().splitlines():
         name, _, numbers = line.partition(":")

@@ -97,9 +97,6 @@ def poster_wall(
     return SyntheticFrames(num_frames, path, observer, _PERIOD, seed)
 
 
-# The camera
-
-
 def _pose(
     start: Float[np.ndarray, "2"],
     move: Float[np.ndarray, "2"],
@@ -135,9 +132,6 @@ def _observe(wall: Image, size: int, noise: float, rng: np.random.Generator, pos
     return PointCloud(depth[:, None] * rays, colors, channel_names=COLORS)
 
 
-# The wall
-
-
 def _paint_wall(rng: np.random.Generator) -> Image:
     cell = np.array([round(_CELL_WIDTH / _TEXEL), round(_CELL_HEIGHT / _TEXEL)])
     wall = np.empty((_ROWS * cell[1], _COLUMNS * cell[0], 3), np.float32)
@@ -156,7 +150,6 @@ def _paint_wall(rng: np.random.Generator) -> Image:
 
 
 def _gradient(rng: np.random.Generator, x: Grid, y: Grid, colors: Colors) -> Image:
-    """A linear gradient through three colours."""
     angle = rng.uniform(0, 2 * np.pi)
     along = np.cos(angle) * x + np.sin(angle) * y
     fraction = (along - along.min()) / np.ptp(along)
@@ -164,18 +157,16 @@ def _gradient(rng: np.random.Generator, x: Grid, y: Grid, colors: Colors) -> Ima
 
 
 def _stripes(rng: np.random.Generator, x: Grid, y: Grid, colors: Colors) -> Image:
-    """Bands of uneven width in a random direction."""
     angle = rng.uniform(0, 2 * np.pi)
     return colors[_bands(rng, np.cos(angle) * x + np.sin(angle) * y, 0.02, 0.10) % 4]
 
 
 def _diamonds(rng: np.random.Generator, x: Grid, y: Grid, colors: Colors) -> Image:
-    """Uneven bands at 45° across uneven bands at −45°."""
+    # Bands at 45° across bands at −45°.
     return colors[(_bands(rng, x + y, 0.08, 0.25) + 2 * _bands(rng, x - y, 0.08, 0.25)) % 5]
 
 
 def _discs(rng: np.random.Generator, x: Grid, y: Grid, colors: Colors) -> Image:
-    """Overlapping discs on a plain background."""
     label = np.zeros(x.shape, int)
     for i in range(14):
         radius = rng.uniform(0.03, 0.12)
@@ -185,7 +176,7 @@ def _discs(rng: np.random.Generator, x: Grid, y: Grid, colors: Colors) -> Image:
 
 
 def _text(rng: np.random.Generator, x: Grid, y: Grid, colors: Colors) -> Image:
-    """Lines of words, drawn as solid blocks, below a larger headline."""
+    # Words are solid blocks; the first line is a larger headline.
     ink, paper = sorted(colors[:4], key=np.sum)[::3]
     letters = np.zeros(x.shape, bool)
     top, height = 0.04, 0.07
@@ -198,7 +189,7 @@ def _text(rng: np.random.Generator, x: Grid, y: Grid, colors: Colors) -> Image:
 
 
 def _bands(rng: np.random.Generator, along: Grid, narrowest: float, widest: float) -> Int[np.ndarray, "h w"]:
-    """Partition a coordinate into bands of random width and return the index of the band."""
+    """The index of the band of a coordinate that is cut into bands of random width."""
     count = int(np.ptp(along) / narrowest) + 1
     edges = along.min() + np.cumsum(rng.uniform(narrowest, widest, count))
     return np.searchsorted(edges, along)

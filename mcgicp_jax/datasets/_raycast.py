@@ -1,10 +1,10 @@
-"""Ray casting into scenes of boxes and upright cylinders, rays of sensors, and random surface patterns."""
+"""Ray casting into scenes of boxes and upright cylinders, rays of sensors, and random surface patterns; in metres."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TypeAlias
+from typing import NamedTuple, TypeAlias
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -17,18 +17,17 @@ Distances: TypeAlias = Float[np.ndarray, "N"]
 
 @dataclass(frozen=True, eq=False)
 class Box:
-    """An axis-aligned box between its lowest and highest corner, (3,), metres; the sensor must be outside of it."""
+    """An axis-aligned box between its lowest and highest corner; the sensor must be outside of it."""
 
     low: Vector
     high: Vector
 
     @property
     def bounds(self) -> tuple[Vector, Vector]:
-        """Lowest and highest coordinates, metres."""
         return self.low, self.high
 
     def meet(self, origin: Vector, rays: Rays) -> tuple[Distances, Rays]:
-        """Distance along unit rays to their entry into the solid, metres, infinite if they miss; and unit normals."""
+        """Distance along unit rays to their entry into the solid, infinite if they miss; and unit normals."""
         # A ray parallel to a face divides by zero: the result is an infinity of the right sign, or NaN, a miss.
         with np.errstate(divide="ignore", invalid="ignore"):
             to_low, to_high = (self.low - origin) / rays, (self.high - origin) / rays
@@ -42,7 +41,7 @@ class Box:
 
 @dataclass(frozen=True, eq=False)
 class Cylinder:
-    """The lateral surface of an upright cylinder, whose lower end is centred at `foot`; metres. See `Box`."""
+    """The lateral surface of an upright cylinder, whose lower end is centred at `foot`; see `Box`."""
 
     foot: Vector
     radius: float
@@ -67,46 +66,36 @@ class Cylinder:
 Solid: TypeAlias = Box | Cylinder
 
 
-@dataclass(frozen=True, eq=False)
-class Hits:
-    """The hits of rays on solids, without the rays that miss.
+class Hits(NamedTuple):
+    """The hits of rays on solids in the world frame, without the rays that miss."""
 
-    The rays and the normals, which point towards the sensor, have unit length. All is in the world frame, in metres;
-    `solid` is the index of the solid.
-    """
-
-    rays: Rays
+    rays: Rays  # unit vectors
     distance: Distances
     points: Rays
-    normals: Rays
-    solid: Int[np.ndarray, "N"]
+    normals: Rays  # unit vectors towards the sensor
+    solid: Int[np.ndarray, "N"]  # index of the solid
 
 
 def cast(origin: Vector, rays: Rays, solids: Sequence[Solid], max_range: float) -> Hits:
-    """The nearest hit of each ray within `max_range` metres; ties go to the first solid."""
-    distance = np.full(len(rays), max_range)
-    normals = np.zeros_like(rays)
-    solid = np.full(len(rays), -1)
+    """The nearest hit of each ray within `max_range`; ties go to the first solid."""
+    distance, normals, solid = np.full(len(rays), max_range), np.zeros_like(rays), np.full(len(rays), -1)
     for number, candidate in enumerate(solids):
         # Only the rays in the cone around its bounding sphere may hit the solid.
         low, high = candidate.bounds
         center, radius = (low + high) / 2 - origin, np.linalg.norm(high - low) / 2
-        away = np.linalg.norm(center)
-        if away - radius > max_range:
+        center_distance = np.linalg.norm(center)
+        if center_distance - radius > max_range:
             continue
         rows = np.arange(len(rays))
-        if away > radius:
-            rows = np.flatnonzero(rays @ (center / away) >= np.sqrt(1 - (radius / away) ** 2))
-        entry, facing = candidate.meet(origin, rays[rows])
+        if center_distance > radius:
+            rows = np.flatnonzero(rays @ (center / center_distance) >= np.sqrt(1 - (radius / center_distance) ** 2))
+        entry, entry_normals = candidate.meet(origin, rays[rows])
         nearer = entry < distance[rows]
         rows = rows[nearer]
-        distance[rows], normals[rows], solid[rows] = entry[nearer], facing[nearer], number
-    met = solid >= 0
-    points = origin + distance[met, None] * rays[met]
-    return Hits(rays[met], distance[met], points, normals[met], solid[met])
-
-
-# Sensors
+        distance[rows], normals[rows], solid[rows] = entry[nearer], entry_normals[nearer], number
+    hit = solid >= 0
+    points = origin + distance[hit, None] * rays[hit]
+    return Hits(rays[hit], distance[hit], points, normals[hit], solid[hit])
 
 
 def random_rays(rng: np.random.Generator, size: int) -> Rays:
@@ -135,31 +124,26 @@ def sensor_rotation(heading: float, tilt: float, direction: float) -> Rotation:
     return Rotation.from_euler("z", heading) * tilted
 
 
-# Patterns
-
-
-def value_noise(points: Float[np.ndarray, "N D"], cell: float, seed: int) -> Distances:
-    """Value noise: a smooth random pattern from −1 to 1 with patches about `cell` metres wide; D is 1, 2 or 3."""
-    scaled = np.asarray(points, float) / cell
-    corner = np.floor(scaled).astype(np.int64)
-    fraction = scaled - corner
-    fraction = fraction * fraction * (3 - 2 * fraction)
-    total = np.zeros(len(scaled))
-    for bits in np.ndindex(*(2,) * scaled.shape[1]):
-        weight = np.prod(np.where(bits, fraction, 1 - fraction), axis=1)
-        total += weight * random_cells(corner + bits, seed)
-    return 2 * total - 1
-
-
-def patches(points: Float[np.ndarray, "N D"], layers: Sequence[tuple[float, float]], seed: int) -> Distances:
-    """Sum of layers of `value_noise`, each given by the width of its patches (metres) and its amplitude."""
+def patches(
+    points: Float[np.ndarray, "N D"], layers: Sequence[tuple[float, float]], seed: int
+) -> Float[np.ndarray, "N"]:
+    """A smooth random pattern: a sum of layers, each with a width of its patches and an amplitude; D is 1, 2 or 3."""
     total = np.zeros(len(points))
-    for number, (cell, strength) in enumerate(layers):
-        total += strength * value_noise(points, cell, seed + number)
+    for number, (width, amplitude) in enumerate(layers):
+        # Value noise from −1 to 1: random values at the corners of grid cells, interpolated by smoothsteps.
+        scaled = np.asarray(points, float) / width
+        corner = np.floor(scaled).astype(np.int64)
+        fraction = scaled - corner
+        fraction = fraction * fraction * (3 - 2 * fraction)
+        noise = np.zeros(len(scaled))
+        for bits in np.ndindex(*(2,) * scaled.shape[1]):
+            weight = np.prod(np.where(bits, fraction, 1 - fraction), axis=1)
+            noise += weight * random_cells(corner + bits, seed + number)
+        total += amplitude * (2 * noise - 1)
     return total
 
 
-def random_cells(cells: Int[np.ndarray, "N D"], seed: int) -> Distances:
+def random_cells(cells: Int[np.ndarray, "N D"], seed: int) -> Float[np.ndarray, "N"]:
     """A random number from 0 to 1 for each cell of an infinite grid, by hashing its index with SplitMix64."""
     mixed = np.full(len(cells), seed, np.uint64)
     for column in cells.T:

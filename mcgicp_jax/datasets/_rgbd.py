@@ -94,7 +94,7 @@ class TUMFrames(AbstractFrames):
         return Frame(cloud, self._pose(self._times[index]), float(self._times[index]), image, pixels)
 
     def _pose(self, time: float) -> Float[np.ndarray, "4 4"] | None:
-        """The measured pose interpolated to a time in seconds; None if unknown."""
+        """The measured pose interpolated to a time in seconds; None if it is unknown."""
         if self._truth is None:
             return None
         times, poses = self._truth
@@ -109,7 +109,7 @@ class TUMFrames(AbstractFrames):
 
 
 def _read_list(path: Path) -> tuple[Float[np.ndarray, "N"], list[str]]:
-    """Read the time stamps and the file names."""
+    """Time stamps in seconds, and file names."""
     rows = [line.split() for line in path.read_text().splitlines() if line.strip() and not line.startswith("#")]
     try:
         return np.array([float(time) for time, _ in rows]), [name for _, name in rows]

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import enum
-from dataclasses import dataclass
 from functools import partial
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -41,6 +41,11 @@ _CAR_PALETTE = np.array(
     [[0.75, 0.10, 0.10], [0.90, 0.90, 0.90], [0.08, 0.08, 0.10], [0.15, 0.25, 0.55], [0.55, 0.57, 0.60]]
 )
 _GLASS = np.array([0.16, 0.20, 0.26])
+# Surface patterns: width of the patches, metres, and amplitude, per layer.
+_ASPHALT = ((2.5, 0.035), (0.5, 0.03), (0.12, 0.02))
+_PLASTER = ((3.0, 0.06), (0.5, 0.05), (0.15, 0.03))
+# Metres: sizes of the slabs of the pavement, the repaired pieces of the road, and the shop signs.
+_SLAB, _PIECE, _SIGN = 0.6, np.array([3.1, 1.55]), 3.7
 
 
 class _Kind(enum.IntEnum):
@@ -52,20 +57,14 @@ class _Kind(enum.IntEnum):
     BIN = 5
 
 
-@dataclass(frozen=True, eq=False)
-class _Thing:
-    """An object of the scene.
-
-    Attributes:
-        color: (3,), red, green and blue without the pattern.
-        reflectance: at the wavelength of the laser, 0 to 1, without the pattern.
-        windows: for buildings: pitch along the façade, pitch upwards, width, height and recess; metres.
-    """
+class _Thing(NamedTuple):
+    """An object of the scene; colour and reflectance are without the pattern."""
 
     kind: _Kind
     solid: raycast.Solid
     color: Float[np.ndarray, "3"]
-    reflectance: float
+    reflectance: float  # at the wavelength of the laser, 0 to 1
+    # Of buildings: pitch along the façade, pitch upwards, width, height and recess; metres.
     windows: Float[np.ndarray, "5"] | None = None
 
 
@@ -110,9 +109,6 @@ def street(
     return SyntheticFrames(num_frames, path, observer, _PERIOD, seed, _POSES_OF_A_TURN if spin else 1)
 
 
-# The sensor
-
-
 def _pose(smooth: bool, step: float, sway: float, yaw: float, tilt: float, time: float | int) -> Matrix:
     """The pose at a time in frames."""
     if smooth:
@@ -131,15 +127,16 @@ def _observe(
     rng: np.random.Generator,
     pose: Float[np.ndarray, "*poses 4 4"],
 ) -> PointCloud:
+    # Each pose of the turn measures one sector of the rays.
     poses, solids = pose.reshape(-1, 4, 4), [thing.solid for thing in things]
     rays = np.array_split(raycast.spinning_rays(rng, size, _BEAMS, _LOWEST, _HIGHEST), len(poses))
-    parts, directions = [], []
-    for part_pose, part_rays in zip(poses, rays, strict=True):
-        rotation, center = part_pose[:3, :3], part_pose[:3, 3]
-        parts.append(raycast.cast(center, part_rays @ rotation.T, solids, _MAX_RANGE))
-        directions.append(parts[-1].rays @ rotation)
-    hits = raycast.Hits(*(np.concatenate([getattr(part, name) for part in parts]) for name in vars(parts[0])))
-    times = None if len(poses) == 1 else np.repeat(np.arange(len(poses)), [len(part.distance) for part in parts])
+    sectors, directions = [], []
+    for sector_pose, sector_rays in zip(poses, rays, strict=True):
+        rotation, center = sector_pose[:3, :3], sector_pose[:3, 3]
+        sectors.append(raycast.cast(center, sector_rays @ rotation.T, solids, _MAX_RANGE))
+        directions.append(sectors[-1].rays @ rotation)
+    hits = raycast.Hits(*map(np.concatenate, zip(*sectors, strict=True)))
+    times = None if len(poses) == 1 else np.repeat(np.arange(len(poses)), [len(sector.rays) for sector in sectors])
 
     hits, glass = _into_windows(hits, things)
     colors, reflectance = _paint(hits, glass, things, pattern)
@@ -153,9 +150,6 @@ def _observe(
     distance = hits.distance + noise * _RANGE_NOISE * rng.normal(size=hits.distance.shape)
     points = distance[:, None] * np.concatenate(directions)
     return PointCloud(points, channels, channel_names=("intensity", *COLORS), times=times)
-
-
-# The street
 
 
 def _things(rng: np.random.Generator, start: float, end: float) -> list[_Thing]:
@@ -180,7 +174,7 @@ def _box(low: Float[np.ndarray, "3"], high: Float[np.ndarray, "3"], side: int) -
     return raycast.Box(np.minimum(mirror * low, mirror * high), np.maximum(mirror * low, mirror * high))
 
 
-# Each of these makes the things of one kind that begin at `x`, and says how far from there the next begins, metres.
+# Each of these makes the things of one kind that begin at `x`, and returns the distance to the start of the next.
 
 
 def _building(rng: np.random.Generator, side: int, x: float) -> tuple[list[_Thing], float]:
@@ -224,11 +218,10 @@ def _bin(rng: np.random.Generator, side: int, x: float) -> tuple[list[_Thing], f
 
 def _into_windows(hits: raycast.Hits, things: list[_Thing]) -> tuple[raycast.Hits, Bool[np.ndarray, "N"]]:
     """Move hits in the opening of a window on to the glass or the reveal, and return the mask of hits on glass."""
-    kinds = np.array([thing.kind for thing in things])[hits.solid]
-    rows = np.flatnonzero((kinds == _Kind.BUILDING) & (hits.normals[:, 1] != 0))
-    none = np.full(5, np.nan)
-    windows = np.array([none if thing.windows is None else thing.windows for thing in things])[hits.solid[rows]]
-    pitch, opening, recess = np.split(windows, [2, 4], axis=1)
+    no_windows = np.full(5, np.nan)
+    windows = np.array([no_windows if thing.windows is None else thing.windows for thing in things])[hits.solid]
+    rows = np.flatnonzero(np.isfinite(windows[:, 0]) & (hits.normals[:, 1] != 0))
+    pitch, opening, recess = np.split(windows[rows], [2, 4], axis=1)
     corner = np.array([thing.solid.bounds[0] for thing in things])[hits.solid[rows]]
     # Offset from the centre of the window, along the façade and upwards.
     offset = (hits.points[rows] - corner)[:, [0, 2]] % pitch - pitch / 2
@@ -252,16 +245,7 @@ def _into_windows(hits: raycast.Hits, things: list[_Thing]) -> tuple[raycast.Hit
     normals[rows, axis] = -np.sign(rays[ray, axis])
     glass = np.zeros(len(points), bool)
     glass[rows[plane == 0]] = True
-    return raycast.Hits(hits.rays, distance, points, normals, hits.solid), glass
-
-
-# Surface patterns
-
-# Width of the patches, metres, and amplitude, per layer.
-_ASPHALT = ((2.5, 0.035), (0.5, 0.03), (0.12, 0.02))
-_PLASTER = ((3.0, 0.06), (0.5, 0.05), (0.15, 0.03))
-# Metres: sizes of the slabs of the pavement, the repaired pieces of the road, and the shop signs.
-_SLAB, _PIECE, _SIGN = 0.6, np.array([3.1, 1.55]), 3.7
+    return hits._replace(distance=distance, points=points, normals=normals), glass
 
 
 def _paint(
@@ -276,7 +260,14 @@ def _paint(
     ground = hits.points[rows, :2]
     stain = raycast.patches(ground, _ASPHALT, pattern)
     mended = np.where(raycast.random_cells(np.floor(ground / _PIECE).astype(int), pattern + 3) < 0.15, -0.09, 0)
-    marked = _is_marked(ground, pattern + 4)
+    # White paint: a dashed centre line, parking bays along the kerbs, and occasional crossings.
+    x, y = ground.T
+    dashes = (np.abs(y) < 0.08) & (x % 9 < 4)
+    bays = (np.abs(np.abs(y) - _PARKING) < 0.06) & (x % 6 < 5.4)
+    ends = (np.abs(y) > _PARKING) & (np.abs(y) < _KERB) & (x % 6 < 0.12)
+    crossing_x = 4 + 20 * raycast.random_cells(np.floor(x / 30).astype(int)[:, None], pattern + 4)
+    crossings = (np.abs(x % 30 - crossing_x) < 1.5) & (y % 1.0 < 0.5) & (np.abs(y) < _KERB)
+    marked = dashes | bays | ends | crossings
     colors[rows] = np.where(marked[:, None], 0.85, colors[rows] + (stain + mended)[:, None])
     reflectance[rows] = np.where(marked, 0.85, reflectance[rows] + 0.6 * (stain + mended))
 
@@ -299,15 +290,3 @@ def _paint(
     colors[glass] = _GLASS
     reflectance[glass] = 0.06
     return np.clip(colors, 0.03, 0.97), np.clip(reflectance, 0.02, 0.97)
-
-
-def _is_marked(ground: Float[np.ndarray, "N 2"], pattern: int) -> Bool[np.ndarray, "N"]:
-    """The mask of white paint: a dashed centre line, parking bays along the kerbs, and occasional crossings."""
-    x, y = ground.T
-    dashes = (np.abs(y) < 0.08) & (x % 9 < 4)
-    bays = (np.abs(np.abs(y) - _PARKING) < 0.06) & (x % 6 < 5.4)
-    ends = (np.abs(y) > _PARKING) & (np.abs(y) < _KERB) & (x % 6 < 0.12)
-    block = np.floor(x / 30).astype(int)[:, None]
-    place = 4 + 20 * raycast.random_cells(block, pattern)
-    crossing = (np.abs(x % 30 - place) < 1.5) & (y % 1.0 < 0.5) & (np.abs(y) < _KERB)
-    return dashes | bays | ends | crossing
