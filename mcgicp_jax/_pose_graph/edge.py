@@ -17,22 +17,21 @@ from mcgicp_jax._math.poses import Pose, adjoint, inverse, logarithm, logarithm_
 
 # Row of the world's frame, whose pose is the identity. Unlike −1, it is not a row of any array.
 WORLD = -(2**31)
-# Largest negative eigenvalue of an information matrix that counts as rounding, as a fraction of the largest one; and
-# largest asymmetry. g2o files have six digits.
+# Rounding of an information matrix: its largest asymmetry and negative eigenvalue, as fractions of its largest
+# eigenvalue. g2o files have six digits.
 _ROUNDING = 1e-6
-# All measurements of a graph by kind, `AbstractFactor`s; the first are the edges.
+# The edges of a graph, and then its `AbstractFactor`s of other kinds.
 Factors: TypeAlias = tuple[Any, ...]
 
 
 class AbstractFactor(eqx.Module):
     """m measurements of one kind, each a function of two poses; a pytree of arrays with a leading axis of length m.
 
-    The cost of a measurement is ½ rᵀΛr. A subclass provides the fields below and `linearize`; the solver and the
-    covariances need nothing else.
+    The cost of a measurement is ½ rᵀΛr. A subclass provides the fields below and `linearize`.
 
     Attributes:
-        rows: (m, 2), rows of the poses that each measurement depends on. The first one of a measurement in the world's
-            frame, such as a height, is `WORLD`.
+        rows: (m, 2), rows of the two poses of each measurement. For measurements in the world's frame, such as heights,
+            the first one is `WORLD`.
         information: (m, d, d), Λ, the inverse covariance of the residual; symmetric, positive semidefinite.
         uncertain: (m,), whether the measurement may be an outlier, so that `optimize_poses` may reject it.
     """
@@ -47,7 +46,7 @@ class AbstractFactor(eqx.Module):
     ) -> tuple[Float[np.ndarray, "m d"], Float[np.ndarray, "m 2 d 6"]]:
         """Residuals r, and their derivatives with respect to the twists ξ = (v, ω) of both poses T exp(ξ).
 
-        Called on the host with NumPy arrays in float64, also from within compiled programs: it must not call JAX.
+        Called on the host with NumPy arrays in float64, also by compiled programs: it must not call JAX.
 
         Args:
             poses: sensor to world, metres; the identity for `WORLD`.
@@ -55,7 +54,6 @@ class AbstractFactor(eqx.Module):
 
 
 def check_rows(name: str, rows: Int[np.ndarray, "m 2"], num_poses: int) -> None:
-    """Raise `ValueError` for rows of poses outside of the graph."""
     outside = ((rows < 0) & (rows != WORLD)) | (rows >= num_poses)
     if outside.any():
         raise ValueError(f"{name}: expected rows from 0 to {num_poses - 1} or WORLD, got {rows[outside][0]}")
@@ -64,7 +62,7 @@ def check_rows(name: str, rows: Int[np.ndarray, "m 2"], num_poses: int) -> None:
 class Edge(AbstractFactor):
     """A measured motion between two poses of a graph, with its information matrix; a pytree.
 
-    If all fields have a leading axis of length m, one `Edge` holds m edges. A prior on a pose, such as a known start or
+    One `Edge` holds m edges if all fields have a leading axis of length m. A prior on a pose, such as a known start or
     a GNSS position, is an edge from the world: `Edge(WORLD, j, T_world_j, covariance=...)`.
 
     Attributes:
@@ -143,7 +141,7 @@ def motion_jacobians(poses: Float[np.ndarray, "m 2 4 4"]) -> Float[np.ndarray, "
 
 
 def checked_edges(edges: Edge, num_poses: int) -> Edge:
-    """The edges as NumPy arrays, with exact rotations and symmetric information."""
+    """The edges as NumPy arrays, with exact rotations and symmetric information; raises `ValueError` for a bad one."""
     i, j = np.asarray(edges.i), np.asarray(edges.j)
     _refuse(f"i: expected a row from 0 to {num_poses - 1}", (i != WORLD) & ((i < 0) | (i >= num_poses)), i)
     _refuse(f"j: expected a row from 0 to {num_poses - 1}", (j < 0) | (j >= num_poses), j)
@@ -162,7 +160,6 @@ def checked_edges(edges: Edge, num_poses: int) -> Edge:
 
 
 def _refuse(expected: str, wrong: Bool[np.ndarray, "m"], values: np.ndarray) -> None:
-    """Raise `ValueError` for the first edge that is wrong."""
     if wrong.any():
         k = int(np.argmax(wrong))
         raise ValueError(f"edges[{k}]: {expected}, got {values[k]}")

@@ -1,8 +1,8 @@
-"""Pose graphs: poses, measured motions between them, and other measurements; and poses to start from.
+"""Pose graphs: poses, measured motions between them, and other measurements; and initial poses.
 
-The start is a spanning tree of the edges, whose errors add up, and a chordal relaxation of those that are trusted: two
-sparse linear least-squares problems, for rotations as free 3×3 matrices, which are then made orthonormal, and for
-positions at these rotations (Martinec & Pajdla, CVPR 2007; Carlone et al., ICRA 2015).
+Initial poses follow a spanning tree of the edges. Since errors add up along it, they are then replaced by the chordal
+relaxation of the trusted edges: two sparse linear least-squares problems, one for rotations as free 3×3 matrices, which
+are then made orthonormal, and one for positions (Martinec & Pajdla, CVPR 2007; Carlone et al., ICRA 2015).
 """
 
 from __future__ import annotations
@@ -17,18 +17,12 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float, Int
 
 from mcgicp_jax._compute.concrete import is_concrete
-from mcgicp_jax._math.poses import Pose, inverse, pose_matrices
-from mcgicp_jax._pose_graph.edge import WORLD, AbstractFactor, Edge, Factors, check_rows, checked_edges
-from mcgicp_jax._pose_graph.levenberg_marquardt import factored, typical_information
+from mcgicp_jax._math.poses import Pose, pose_matrices
+from mcgicp_jax._pose_graph.edge import WORLD, AbstractFactor, Edge, check_rows, checked_edges
+from mcgicp_jax._pose_graph.levenberg_marquardt import factored
 
-# Eigenvalues of an edge's information below this fraction of the largest count as zero.
-_BLIND = 1e-6
-# Information about the start, as a multiple of what leaks, and at most as a fraction of that of a typical edge: poses
-# slide least in corridors with multiples of 30 to 100.
-_OF_LEAK, _MOST = 30.0, 1e-2
-# Radians to which an edge knows the axes of its unmeasured directions at best: registrations in corridors, whose
-# rotation is known to 0.2 mrad, differ by 2 mrad.
-_AXES = 2e-3
+# An edge does not measure a direction whose eigenvalue of information is below this fraction of the largest one.
+UNMEASURED = 1e-6
 
 
 class PoseGraph(eqx.Module):
@@ -66,11 +60,20 @@ class PoseGraph(eqx.Module):
                 to a row outside of the graph, or an information matrix is not finite, symmetric and positive
                 semidefinite. Of traced arrays, only the shapes are checked.
         """
-        self.edges = edges if isinstance(edges, Edge) else _stacked(edges)
+        if isinstance(edges, Edge):
+            self.edges = edges
+        elif not edges:
+            self.edges = Edge(np.zeros(0, int), np.zeros(0, int), np.zeros((0, 4, 4)), np.zeros((0, 6, 6)))
+        else:
+            for k, edge in enumerate(edges):
+                if not isinstance(edge, Edge) or np.ndim(edge.i):
+                    raise ValueError(f"edges[{k}]: expected a single Edge, got {edge!r}")
+            xp = np if is_concrete(*edges) else jnp
+            self.edges = jax.tree.map(lambda *values: xp.stack(values), *edges)
         if np.ndim(self.edges.i) != 1:
             raise ValueError(f"edges: expected one leading axis, got shape {np.shape(self.edges.i)}")
         if poses is None:
-            poses = _initial(self.edges)
+            poses = _initial_poses(self.edges)
         elif is_concrete(poses):
             poses = pose_matrices(poses)
         if np.ndim(poses) != 3 or np.shape(poses)[1:] != (4, 4):  # type: ignore
@@ -90,72 +93,63 @@ class PoseGraph(eqx.Module):
         self.factors = tuple(factors)
 
 
-def _stacked(edges: Sequence[Edge]) -> Edge:
-    if not edges:
-        none = np.zeros(0, int)
-        return Edge(none, none, np.zeros((0, 4, 4)), np.zeros((0, 6, 6)))
-    for k, edge in enumerate(edges):
-        if not isinstance(edge, Edge) or np.ndim(edge.i):
-            raise ValueError(f"edges[{k}]: expected a single Edge, got {edge!r}")
-    xp = np if is_concrete(*edges) else jnp
-    return jax.tree.map(lambda *values: xp.stack(values), *edges)
-
-
-def _initial(edges: Edge) -> Float[np.ndarray, "n 4 4"]:
-    """Poses to start from, by a spanning tree that prefers certain edges to uncertain ones, and these to edges without
-    information on some direction; then by relaxation of the certain edges and of the tree."""
+def _initial_poses(edges: Edge) -> Float[np.ndarray, "n 4 4"]:
     if not is_concrete(edges) or not len(edges):
         raise ValueError("poses: required, since initial poses can only be computed from at least one concrete edge")
     number = int(max(np.max(edges.i), np.max(edges.j))) + 1
     edges = checked_edges(edges, number)
-    # The world comes after the poses. An edge of the identity from it to each, to be used last, keeps other parts.
+    # The world's row is the last one. Identity edges from the world to every pose join unconnected parts of the graph.
     from_world = np.stack([np.full(number, number), np.arange(number)], axis=1)
     ends = np.concatenate([np.where(edges.rows == WORLD, number, edges.rows), from_world])
     motions = np.concatenate([edges.T_i_j, np.tile(np.eye(4), (number, 1, 1))])
+    # The tree prefers certain edges (rank 0) to uncertain ones (1), then to those with an unmeasured direction (2 and
+    # 3), and uses the identity edges last.
     eigenvalues = np.linalg.eigvalsh(edges.information)
-    blind = eigenvalues[:, 0] <= _BLIND * eigenvalues[:, -1]
-    rank = np.concatenate([edges.uncertain + 2 * blind, np.full(number, 4)])
-    poses, trusted = _along_tree(ends, motions, rank)
+    unmeasured = eigenvalues[:, 0] <= UNMEASURED * eigenvalues[:, -1]
+    rank = np.concatenate([edges.uncertain + 2 * unmeasured, np.full(number, 4)])
+    poses, trusted = _along_spanning_tree(ends, motions, rank)
+    # The relaxation uses the certain edges and those of the tree.
     trusted |= rank == 0
     if trusted.sum() > number:
-        # Mean information in translation and rotation.
+        # Mean information in translation and in rotation.
         means = np.diagonal(edges.information, axis1=1, axis2=2).reshape(-1, 2, 3).mean(axis=2)
         means = np.concatenate([np.where(means > 0, means, 1), np.ones((number, 2))])
-        poses = _relaxed(ends[trusted], motions[trusted], np.sqrt(means[trusted]), number)
+        poses = _chordal_relaxation(ends[trusted], motions[trusted], np.sqrt(means[trusted]), number)
     return poses
 
 
-def _along_tree(
+def _along_spanning_tree(
     ends: Int[np.ndarray, "m 2"], motions: Float[np.ndarray, "m 4 4"], rank: Int[np.ndarray, "m"]
 ) -> tuple[Float[np.ndarray, "n 4 4"], Bool[np.ndarray, "m"]]:
-    """Poses along a spanning tree from the world, of edges of lowest rank, and which edges it has."""
+    """Poses along the spanning tree of lowest rank from the world, the last row; and which edges are in the tree."""
     from scipy.sparse import coo_array
     from scipy.sparse.csgraph import breadth_first_order, minimum_spanning_tree
 
     world = int(ends.max())
     order = np.argsort(rank, kind="stable")
-    # Of several edges between two poses, the first in this order. Their weights are their places in it, from 1.
+    # Of several edges between two poses, the first one in order of rank. Weights are places in this order, from 1.
     _, places = np.unique((ends.min(axis=1) * (world + 1) + ends.max(axis=1))[order], return_index=True)
     tree = minimum_spanning_tree(coo_array((places + 1.0, tuple(ends[order[places]].T)), (world + 1, world + 1)))
     tree = (tree + tree.T).tocsr()
-    nodes, before = breadth_first_order(tree, world)
-    edges = order[tree[before[nodes[1:]], nodes[1:]].astype(int) - 1]
+    nodes, parents = breadth_first_order(tree, world)
+    edges = order[tree[parents[nodes[1:]], nodes[1:]].astype(int) - 1]
     poses = np.tile(np.eye(4), (world + 1, 1, 1))
     for node, edge in zip(nodes[1:], edges, strict=True):
         motion = motions[edge] if ends[edge, 1] == node else np.linalg.inv(motions[edge])
-        poses[node] = poses[before[node]] @ motion
+        poses[node] = poses[parents[node]] @ motion
     in_tree = np.zeros(len(ends), bool)
     in_tree[edges] = True
     return poses[:world], in_tree
 
 
-def _relaxed(
+def _chordal_relaxation(
     ends: Int[np.ndarray, "m 2"], motions: Float[np.ndarray, "m 4 4"], roots: Float[np.ndarray, "m 2"], number: int
 ) -> Float[np.ndarray, "number 4 4"]:
-    """The chordal relaxation; `roots` are those of the information, of translation and rotation."""
+    """`roots`: square roots of the information in translation and in rotation."""
     # R_jᵀ = R_i_jᵀ R_iᵀ, for the three columns at once.
-    turns = motions[:, :3, :3].swapaxes(1, 2)
-    blocks = roots[:, 1, None, None, None] * np.stack([-turns, np.broadcast_to(np.eye(3), turns.shape)], axis=1)
+    transposed = motions[:, :3, :3].swapaxes(1, 2)
+    identities = np.broadcast_to(np.eye(3), transposed.shape)
+    blocks = roots[:, 1, None, None, None] * np.stack([-transposed, identities], axis=1)
     columns = _least_squares(blocks, ends, np.zeros((3 * len(ends), 3)), np.eye(3), number)
     left, _, right = np.linalg.svd(columns.reshape(number + 1, 3, 3).swapaxes(1, 2))
     left[:, :, 2] *= np.linalg.det(left @ right)[:, None]
@@ -176,7 +170,7 @@ def _least_squares(
     last: Float[np.ndarray, "b 3"],
     number: int,
 ) -> Float[np.ndarray, "_ 3"]:
-    """Least squares of a sparse system with two blocks in each row, of whose unknowns the last are given."""
+    """Least-squares solution of a sparse system with two blocks in each row; the `last` unknowns are given."""
     from scipy.sparse import bsr_array
 
     m, _, b, _ = blocks.shape
@@ -185,27 +179,3 @@ def _least_squares(
     free, right = matrix[:, : b * number], right - matrix[:, b * number :] @ last
     solver = factored((free.T @ free).tocsc(), "MMD_AT_PLUS_A")
     return np.concatenate([solver.solve(free.T @ right), last])
-
-
-def unmeasured(factors: Factors, poses: Float[np.ndarray, "n 4 4"]) -> Edge:
-    """Edges between the same poses as the given ones that measure the motions at the given poses, the start, along
-    unmeasured directions alone.
-
-    The axes of an edge are only known to its standard deviation σ of rotation, in radians, and at best to 2 mrad: a
-    fraction σ² of its information leaks into the directions that it does not measure. Poses would slide along these by
-    many metres to explain the noise in the others. Priors get no information, since the world's axes are exact.
-    """
-    edges = factors[0]
-    typical = typical_information(factors)[: len(edges)]
-    between, roots = edges.i != WORLD, np.sqrt(typical)
-    i = np.where(between, edges.i, edges.j)
-    eigenvalues, vectors = np.linalg.eigh(np.nan_to_num(edges.information) / (roots[:, :, None] * roots[:, None]))
-    blind = between[:, None] & (eigenvalues <= _BLIND * eigenvalues[:, -1:])
-    scaled = roots[:, :, None] * vectors
-    information = (scaled * (blind * about_start(typical)[:, None])[:, None]) @ scaled.swapaxes(1, 2)
-    return Edge(edges.i, edges.j, inverse(poses[i]) @ poses[edges.j], information)
-
-
-def about_start(typical: Float[np.ndarray, "m 6"]) -> Float[np.ndarray, "m"]:
-    """Information of `unmeasured` edges, as a fraction of that of a typical edge."""
-    return np.minimum(_OF_LEAK * np.maximum(1 / typical[:, 5], _AXES**2), _MOST)

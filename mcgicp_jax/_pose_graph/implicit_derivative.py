@@ -1,8 +1,8 @@
-"""Pose graphs inside transformations: the solver runs on the host, and its derivative follows at the solution.
+"""Pose graphs inside transformations: the solver runs on the host, its derivative is implicit.
 
-The poses are the root of g(ξ, θ) = Σ w JᵀΛr, so dξ = −(∂g/∂ξ)⁻¹ ∂g/∂θ dθ, with the full Hessian ∂g/∂ξ and with the
-motions and information matrices θ of the edges. The host computes both derivatives in float64; JAX only contracts them
-with tangents.
+The poses are the root of g(ξ, θ) = Σ w JᵀΛr, so dξ = −(∂g/∂ξ)⁻¹ ∂g/∂θ dθ, with the full Hessian ∂g/∂ξ and the motions
+and information matrices θ of the edges. The host computes both derivatives in float64; JAX only contracts them with
+tangents.
 """
 
 from __future__ import annotations
@@ -31,10 +31,11 @@ _STEP = 1e-5
 
 
 class _Sensitivity(NamedTuple):
-    """(∂g/∂ξ)⁻¹, the derivative of JᵀΛr by the twist μ of T_i_j exp(μ), J and r. All are 0 unless the status is
-    CONVERGED, and for fixed poses and rejected edges."""
+    """0 unless the status is CONVERGED, and for fixed poses and rejected edges."""
 
+    # (∂g/∂ξ)⁻¹.
     inverse: Float[AnyArray, "n 6 n 6"]
+    # Derivative of JᵀΛr by the twist μ of T_i_j exp(μ).
     by_motion: Float[AnyArray, "m 2 6 6"]
     jacobians: Float[AnyArray, "m 2 6 6"]
     residuals: Float[AnyArray, "m 6"]
@@ -42,7 +43,7 @@ class _Sensitivity(NamedTuple):
 
 @partial(jax.custom_jvp, nondiff_argnums=(2, 3))
 def solve_traced(poses: Float[AnyArray, "n 4 4"], factors: Factors, robust: bool, max_iterations: int) -> GraphPoses:
-    """`solver.solve` inside transformations, differentiable by the edges, not by the initial poses."""
+    """`solver.solve`, differentiable with respect to the edges, not to the initial poses."""
     return _solved(poses, factors, robust, max_iterations, False)[0]
 
 
@@ -53,14 +54,14 @@ def _derivative(robust: bool, max_iterations: int, primals: Any, tangents: Any) 
         raise ValueError("graph: poses have derivatives only if edges are the only measurements, got further factors")
     solution, sensitivity = _solved(poses, factors, robust, max_iterations, True)
     edges = factors[0]
-    moved = _moved(solution, sensitivity, edges.rows, edges.T_i_j, change.T_i_j, change.information)
-    constants = jax.tree.map(lambda value: jax.custom_derivatives.zero_from_primal(value), solution)
-    return solution, constants._replace(poses=moved)
+    tangent = _pose_tangents(solution, sensitivity, edges.rows, edges.T_i_j, change.T_i_j, change.information)
+    zeros = jax.tree.map(jax.custom_derivatives.zero_from_primal, solution)
+    return solution, zeros._replace(poses=tangent)
 
 
-# Compiled as a whole: outside of `jit`, each of some fifty operations would be compiled alone.
+# One program: outside of `jit`, each of some fifty operations would be compiled alone.
 @jax.jit
-def _moved(
+def _pose_tangents(
     solution: GraphPoses,
     sensitivity: _Sensitivity,
     rows: Int[AnyArray, "m 2"],
@@ -68,7 +69,6 @@ def _moved(
     motion_change: Float[AnyArray, "m 4 4"],
     information_change: Float[AnyArray, "m 6 6"],
 ) -> Float[Array, "n 4 4"]:
-    """Tangents of the poses, given those of the motions and information matrices of the edges."""
     n, dtype = len(solution.poses), solution.poses.dtype
     einsum = partial(jnp.einsum, precision="highest")
     local = einsum("mji,mjk->mik", motions[:, :3, :3], motion_change[:, :3]).astype(dtype)
@@ -85,7 +85,7 @@ def _moved(
 
 
 def covariances_traced(poses: Float[AnyArray, "n 4 4"], factors: Factors, weights: Float[AnyArray, "m"]) -> Lazy[Any]:
-    """Covariances at a solution, (n, 6, 6), constants; `jit` leaves them out where they are not read."""
+    """Covariances at a solution, (n, 6, 6), as constants; `jit` removes their computation if they are not read."""
     arguments = jax.lax.stop_gradient((poses, factors, weights))
     dtype = _precision(arguments)
 
@@ -104,16 +104,16 @@ def _precision(tree: Any) -> Any:
 def _solved(
     poses: Float[AnyArray, "n 4 4"], factors: Factors, robust: bool, max_iterations: int, differentiated: bool
 ) -> tuple[GraphPoses, Any]:
-    """On the host, or by a callback if an argument is traced; with a `_Sensitivity` if differentiated."""
+    """The solution, by a callback if an argument is traced; with a `_Sensitivity` if `differentiated`."""
     dtype, n, line = _precision((poses, factors)), len(poses), calling_line()
 
     def on_host(poses: Any, factors: Any) -> Any:
         for k, factor in enumerate(factors):
-            # Indices of traced arrays are not known before.
+            # Rows of traced graphs are first known here.
             check_rows(f"factors[{k - 1}]" if k else "edges", np.asarray(factor.rows), n)
         result, state = solve(poses, factors, robust, max_iterations, exact=True)
         result = jax.tree.map(lambda value: value.astype(dtype) if value.dtype.kind == "f" else value, result)
-        # Warns if the spacing of floats at the positions exceeds the standard deviation of a typical edge. NaN and
+        # Warn if the spacing of floats at the positions exceeds the standard deviation of a typical edge. NaN and
         # overflow are a status.
         farthest = np.abs(result.poses[:, :3, 3]).max()
         spacing = np.spacing(farthest) if np.isfinite(farthest) else 0
@@ -144,7 +144,7 @@ def _sensitivity(state: GraphState, result: GraphPoses, dtype: DTypeLike) -> _Se
         for values, derivative in zip(by_edge, derivatives, strict=True):
             values[state.weights > 0] = derivative[state.weights > 0]
         if equations.size:
-            # Columns of the inverse, and then its rows, from unknowns to poses.
+            # From unknowns to poses: first the rows, then the columns of the inverse.
             columns = equations.spread(factored(equations.matrix(blocks)).solve(np.eye(equations.size)))
             inverse = equations.spread(np.moveaxis(columns, 2, 0))
     return _Sensitivity(*(values.astype(dtype) for values in (inverse[:n, :, :n], *by_edge)))
@@ -153,14 +153,14 @@ def _sensitivity(state: GraphState, result: GraphPoses, dtype: DTypeLike) -> _Se
 def _derivatives(edges: Edge, poses: Float[np.ndarray, "m 2 4 4"]) -> tuple[np.ndarray, ...]:
     """Derivatives of JᵀΛr by the twists of both poses, (m, 2, 2, 6, 6), and by that of the motion; J, and r.
 
-    With B the right Jacobian of the logarithm at r, inverted, and D the derivative of T_i⁻¹ T_j by both poses, J = BD.
+    J = BD, with the inverse B of the right Jacobian of SE(3) at r and the derivative D of T_i⁻¹ T_j by both poses.
     """
     residuals, jacobians = edges.linearize(poses)
     motion, information = motion_jacobians(poses), np.asarray(edges.information)
     forces = information @ residuals[..., None]
     steps = _STEP * np.eye(6)[:, None]
     slopes = (logarithm_derivative(residuals + steps) - logarithm_derivative(residuals - steps)) / (2 * _STEP)
-    # Of BᵀΛr by r.
+    # ∂(BᵀΛr)/∂r.
     by_residual = jacobians[:, 1].swapaxes(1, 2) @ information + np.einsum("bmia,mi->mab", slopes, forces[..., 0])
     outer = motion.swapaxes(2, 3) @ by_residual[:, None]
     blocks = outer[:, :, None] @ jacobians[:, None]

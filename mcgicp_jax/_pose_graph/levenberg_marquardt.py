@@ -2,7 +2,7 @@
 
 The Gauss-Newton matrix is H = Σ w JᵀΛJ, for twists ξ of T exp(ξ). The damping is λD, where D = Σ CᵀSC measures changes
 Cξ of the motions between poses that share a measurement, with a typical information S. Damped steps are then small in
-*relative* motions, and unobserved ones, such as along a corridor, are distributed evenly over the edges. (optimistix
+*relative* motions, and unobserved motions, such as along a corridor, are distributed evenly over the edges. (optimistix
 would compile its loop for every graph.)
 """
 
@@ -16,26 +16,26 @@ from jaxtyping import Bool, Float, Inexact, Int
 from mcgicp_jax._math.poses import exponential
 from mcgicp_jax._pose_graph.edge import WORLD, Factors, motion_jacobians
 
-# Poses of the graph and, with measurements in the world's frame, the world's; a number for every measurement.
+# Poses of the graph and, with measurements in the world's frame, that of the world; one number per measurement.
 Poses: TypeAlias = Float[np.ndarray, "n 4 4"]
 PerMeasurement: TypeAlias = Float[np.ndarray, "m"]
 
 # Least damping, as a fraction of the information of a typical edge: unobserved directions are 3e4 times as uncertain as
 # such an edge, and the factorisation loses half of the digits of float64.
 LEAST_DAMPING = 1e-9
-# Damping, as the same fraction: at the start, the factor by which it changes, and the largest one.
+# Initial damping (same fraction), the factor by which it changes, and largest damping.
 _START_DAMPING, _DAMPING_FACTOR, _MOST_DAMPING = 1e-4, 10.0, 1e12
-# A step is the last one if it lowers the cost by less than this fraction, as predicted. Near the minimum of noisy
-# graphs, steps were seen to lower it by 1e-2 to 1e-3 of the previous decrease: the cost is then right to 1e-8.
+# A step is the last one if it is predicted to lower the cost by less than this fraction. Near the minimum of noisy
+# graphs, each step was seen to lower it by 1e-2 to 1e-3 of the previous decrease: the cost is then right to 1e-8.
 _TOLERANCE = 1e-6
 # The same in σ², for graphs without contradiction: a step of a millionth of a standard deviation.
 _LEAST_DECREASE = 1e-12
 # Largest number of steps of `refine`, each of which reduces the error by a factor of 10 or more, and the relative size
 # of the last one.
 _REFINEMENTS, _ROUNDING = 10, 1e-13
-# Weight of the measurements of the start in `settle`. Poses in corridors slide by 0.49 m without, and by 0.12, 0.03 and
+# Weight of the anchors in `settle`. Poses in corridors slide by 0.49 m without, and by 0.12, 0.03 and
 # 0.01 m with 1, 2 and 3; errors of a sphere that loops correct are 8.8 m without, and 7.8, 10.5 and 12.7 m.
-_START_WEIGHT = 2.0
+_ANCHOR_WEIGHT = 2.0
 
 
 class Terms(NamedTuple):
@@ -49,35 +49,35 @@ class Terms(NamedTuple):
 class NormalEquations:
     """The sparse equations (H + λD) ξ = −g of a graph.
 
-    If there are measurements in the world's frame, the last pose is that of the world, the identity, and is fixed. Of
-    every other connected part, the first pose is fixed. Measurements that are not in use have no place in the matrix:
-    false loops between distant poses would fill the factors.
+    With measurements in the world's frame, the last pose is that of the world, the identity, and is fixed. The first
+    pose of every other connected part is fixed. Measurements that are not in use have no place in the matrix: false
+    loops between distant poses would fill the factors.
 
     Attributes:
         factors: all measurements, numbered in this order, the edges first.
         rows: (m, 2) rows of the poses of every measurement.
-        used: (m,) which measurements are in use.
+        in_use: (m,) which measurements are in use.
         place: place of each pose in the elimination order; −1 for `fixed` ones.
         parts: number of the connected part of each pose.
         root: the fixed pose to which covariances refer: the first one, or the world.
-        size: number of unknowns, six per pose.
-        metric: the sparse matrix D, at the given poses.
+        size: number of unknowns, six per free pose.
+        metric: the sparse matrix D at the initial poses.
     """
 
-    def __init__(self, factors: Factors, poses: Poses, used: Bool[np.ndarray, "m"] | None = None):
+    def __init__(self, factors: Factors, poses: Poses, in_use: Bool[np.ndarray, "m"] | None = None):
         # Imported late, as SciPy's sparse matrices take a tenth of the import time of the package.
         from scipy.sparse import coo_array
         from scipy.sparse.csgraph import connected_components
 
-        self.factors, self._start, num_poses = factors, poses, len(poses)
+        self.factors, self.initial_poses, num_poses = factors, poses, len(poses)
         rows = np.concatenate([np.asarray(factor.rows) for factor in factors])
         self.root = num_poses - 1 if np.any(rows == WORLD) else 0
         self.rows = np.where(rows == WORLD, self.root, rows)
-        self.used = np.ones(len(rows), bool) if used is None else used
-        # Poses of the rows and of the columns of the four blocks of each measurement.
-        of_rows, of_columns = np.repeat(self.rows, 2, axis=1), np.tile(self.rows, 2)
-        pairs = of_rows[self.used].ravel(), of_columns[self.used].ravel()
-        graph = coo_array((np.ones(len(pairs[0])), pairs), (num_poses, num_poses))
+        self.in_use = np.ones(len(rows), bool) if in_use is None else in_use
+        # Row and column, as poses, of the four blocks of each measurement.
+        block_rows, block_columns = np.repeat(self.rows, 2, axis=1), np.tile(self.rows, 2)
+        entries = block_rows[self.in_use].ravel(), block_columns[self.in_use].ravel()
+        graph = coo_array((np.ones(len(entries[0])), entries), (num_poses, num_poses))
         _, self.parts = connected_components(graph, directed=False)
         first_of_parts = np.unique(self.parts, return_index=True)[1]
         first_of_parts[self.parts[self.root]] = self.root
@@ -87,8 +87,8 @@ class NormalEquations:
         self.place = np.full(num_poses, -1)
         self.place[~self.fixed] = _elimination_order(graph, self.fixed)
         # Places of the blocks in compressed rows of blocks; blocks at the same place are summed.
-        rows, columns = self.place[of_rows].ravel(), self.place[of_columns].ravel()
-        inside = np.flatnonzero((rows >= 0) & (columns >= 0) & np.repeat(self.used, 4))
+        rows, columns = self.place[block_rows].ravel(), self.place[block_columns].ravel()
+        inside = np.flatnonzero((rows >= 0) & (columns >= 0) & np.repeat(self.in_use, 4))
         self._order = inside[np.lexsort((columns[inside], rows[inside]))]
         rows, columns = rows[self._order], columns[self._order]
         new = np.ones(len(rows), bool)
@@ -100,24 +100,19 @@ class NormalEquations:
         self.metric = self.matrix(normal_blocks(motion_jacobians(poses[self.rows]), typical))
 
     def split(self, values: np.ndarray) -> list[np.ndarray]:
-        """Values of all measurements, by kind; views."""
+        """Views of the values of the measurements of each factor."""
         return np.split(values, np.cumsum([len(factor.information) for factor in self.factors])[:-1])
 
-    def restricted(self, used: Bool[np.ndarray, "m"]) -> NormalEquations:
-        """The equations of the measurements that are `used`."""
-        return self if np.array_equal(used, self.used) else NormalEquations(self.factors, self._start, used)
-
     def terms(self, poses: Poses) -> Terms:
-        """Evaluate all measurements."""
-        of_kinds = []
+        by_factor = []
         for factor, rows in zip(self.factors, self.split(self.rows), strict=True):
             residuals, jacobians = factor.linearize(poses[rows])
             information = np.asarray(factor.information)
             forces = (information @ residuals[..., None])[..., 0]
             squares = np.einsum("mi,mi->m", residuals, forces)
             gradient = (jacobians.swapaxes(2, 3) @ forces[:, None, :, None])[..., 0]
-            of_kinds.append((squares, gradient, normal_blocks(jacobians, information)))
-        return Terms(*map(np.concatenate, zip(*of_kinds, strict=True)))
+            by_factor.append((squares, gradient, normal_blocks(jacobians, information)))
+        return Terms(*map(np.concatenate, zip(*by_factor, strict=True)))
 
     def gradient(self, terms: Terms, weights: PerMeasurement) -> Float[np.ndarray, "_"]:
         """g, in the elimination order."""
@@ -126,23 +121,22 @@ class NormalEquations:
         return self.gathered(np.stack(sums, axis=1))
 
     def gathered(self, rows: Float[np.ndarray, "n *k"]) -> Float[np.ndarray, "_"]:
-        """Rows of the poses as a vector of the unknowns."""
+        """Rows of the free poses as a vector of the unknowns."""
         vector = np.empty((self.size // 6, *rows.shape[1:]))
         vector[self.place[~self.fixed]] = rows[~self.fixed]
         return vector.reshape(-1)
 
     def spread(self, vector: Float[np.ndarray, "_ *k"]) -> Float[np.ndarray, "n 6 *k"]:
-        """A vector of the unknowns as rows of the poses, 0 for fixed poses."""
+        """A vector of the unknowns as rows of all poses, 0 for fixed ones."""
         rows = np.zeros((len(self.place), 6, *vector.shape[1:]))
         rows[~self.fixed] = vector.reshape(-1, *rows.shape[1:])[self.place[~self.fixed]]
         return rows
 
     def weighted(self, blocks: Float[np.ndarray, "m 2 2 6 6"], weights: Inexact[np.ndarray, "m"]) -> Any:
-        """The sparse matrix of the weighted blocks of all measurements, such as H."""
         return self.matrix(weights[:, None, None, None, None] * blocks)
 
     def matrix(self, blocks: Inexact[np.ndarray, "m 2 2 6 6"]) -> Any:
-        """The sparse symmetric matrix of the sum of all blocks."""
+        """The sparse symmetric sum of the blocks of all measurements; with JᵀΛJ, it is H."""
         from scipy.sparse import bsr_array, csc_array
 
         if not self.size:
@@ -169,30 +163,30 @@ def factored(matrix: Any, order: str = "NATURAL") -> Any:
 def normal_blocks(
     jacobians: Float[np.ndarray, "m 2 d 6"], information: Float[np.ndarray, "m d d"]
 ) -> Float[np.ndarray, "m 2 2 6 6"]:
-    """JᵀΛJ of every measurement, by first and second pose."""
+    """JᵀΛJ of every measurement."""
     weighted = information[:, None] @ jacobians
     return jacobians.swapaxes(2, 3)[:, :, None] @ weighted[:, None]
 
 
 def typical_information(factors: Factors) -> Float[np.ndarray, "m 6"]:
-    """Diagonal of S for every measurement: the median over edges of the mean information, in translation and rotation.
+    """Diagonal of S for every measurement: the median over edges of the mean information in translation and rotation.
 
-    Measurements in the world's frame have their own: next to motions known to millimetres, positions known to metres
-    would else look unconstrained.
+    For measurements in the world's frame, it is the median over priors: next to motions known to millimetres, positions
+    known to metres would else look unconstrained.
     """
     of_world = np.concatenate([(np.asarray(factor.rows) == WORLD).any(axis=1) for factor in factors])
-    diagonal = np.diagonal(np.asarray(factors[0].information), axis1=1, axis2=2).reshape(-1, 2, 3).mean(axis=2)
-    typical, edges_of_world = np.ones((len(of_world), 2)), of_world[: len(diagonal)]
-    for edges, measurements in ((~edges_of_world, slice(None)), (edges_of_world, of_world)):
-        for kind, values in enumerate(diagonal.T):
+    means = np.diagonal(np.asarray(factors[0].information), axis1=1, axis2=2).reshape(-1, 2, 3).mean(axis=2)
+    typical, priors = np.ones((len(of_world), 2)), of_world[: len(means)]
+    for edges, measurements in ((~priors, slice(None)), (priors, of_world)):
+        for column, values in enumerate(means.T):
             positive = values[edges & (values > 0)]
             if len(positive):
-                typical[measurements, kind] = np.median(positive)
+                typical[measurements, column] = np.median(positive)
     return np.repeat(typical, 3, axis=1)
 
 
 def _elimination_order(graph: Any, fixed: Bool[np.ndarray, "n"]) -> Int[np.ndarray, "k"]:
-    """Place of each free pose in an elimination order with little fill, minimum degree by SuperLU."""
+    """Place of each free pose in SuperLU's minimum-degree order, which has little fill."""
     from scipy.sparse import eye_array
 
     if fixed.all():
@@ -205,29 +199,29 @@ def _elimination_order(graph: Any, fixed: Bool[np.ndarray, "n"]) -> Int[np.ndarr
 
 
 class GraphState(NamedTuple):
-    """A state of the optimisation.
-
-    Attributes:
-        weights: of all measurements, 0 for those that are not in use.
-        num_iterations: number of steps, rejected ones included.
-        converged: whether the last step was small.
-        damping: λ for a next step.
-    """
+    """A state of the optimisation; `converged` if the last step was small."""
 
     equations: NormalEquations
+    # 0 for measurements that are not in use.
     weights: PerMeasurement
     poses: Poses
     terms: Terms
+    # Rejected steps included.
     num_iterations: int = 0
     converged: bool = False
+    # λ of the next step.
     damping: float = _START_DAMPING
 
     @classmethod
     def at(cls, equations: NormalEquations, weights: PerMeasurement, poses: Poses) -> GraphState:
-        return cls(equations.restricted(weights > 0), weights, poses, equations.terms(poses))
+        """The equations must be those of the measurements with positive weights."""
+        return cls(equations, weights, poses, equations.terms(poses))
 
     def weighted(self, weights: PerMeasurement) -> GraphState:
-        return self._replace(weights=weights, equations=self.equations.restricted(weights > 0))
+        equations, in_use = self.equations, weights > 0
+        if not np.array_equal(in_use, equations.in_use):
+            equations = NormalEquations(equations.factors, equations.initial_poses, in_use)
+        return self._replace(weights=weights, equations=equations)
 
     def moved(self, step: Float[np.ndarray, "_"]) -> GraphState:
         poses = self.poses @ exponential(self.equations.spread(step))
@@ -235,12 +229,10 @@ class GraphState(NamedTuple):
 
     @property
     def cost(self) -> float:
-        """½ Σ w rᵀΛr."""
         return 0.5 * float(self.weights @ self.terms.squares)
 
     @property
     def hessian(self) -> Any:
-        """The sparse Gauss-Newton matrix H."""
         return self.equations.weighted(self.terms.blocks, self.weights)
 
 
@@ -272,7 +264,7 @@ def minimize(state: GraphState, max_iterations: int) -> GraphState:
 
 
 def refine(state: GraphState) -> GraphState:
-    """The minimum to rounding, by more Gauss-Newton steps: derivatives are as exact as the poses."""
+    """The minimum to rounding, by more Gauss-Newton steps: derivatives are only as exact as the poses."""
     for _ in range(_REFINEMENTS):
         before = state.poses
         refined = minimize(state._replace(damping=LEAST_DAMPING), 1)
@@ -282,21 +274,21 @@ def refine(state: GraphState) -> GraphState:
     return state
 
 
-def settle(state: GraphState, start: Bool[np.ndarray, "m"]) -> Poses:
-    """Poses without what noise has moved along directions that only the measurements of the `start` constrain.
+def settle(state: GraphState, is_anchor: Bool[np.ndarray, "m"]) -> Poses:
+    """Undo drift, due to noise, along directions that only the anchors (see `solver._anchors`) constrain.
 
-    Against these, measurements that leak information μ there would weigh μ/ε, with ε that of the start. If ε is
-    imaginary, the real part of the step is −(μg + ε²b)/(μ² + ε²), for gradients g and εb of both: where it vanishes,
-    they weigh (μ/ε)², and the start weighs no more than (ε/μ)² along the directions that are measured.
+    Anchors have information ε there, and the measurements leak information μ, so they would weigh μ/ε against anchors.
+    If ε is imaginary, the real part of the step is −(μg + ε²b)/(μ² + ε²), for gradients g of the measurements and εb of
+    the anchors: at its root, measurements weigh (μ/ε)². Along measured directions, anchors weigh at most (ε/μ)².
     """
     equations, last = state.equations, np.inf
-    measured, started = state.weights * ~start, _START_WEIGHT * start
+    measured, anchored = state.weights * ~is_anchor, _ANCHOR_WEIGHT * is_anchor
     for _ in range(_REFINEMENTS):
-        system = equations.weighted(state.terms.blocks, measured + 1j * started)
-        gradient = equations.gradient(state.terms, measured) + 1j * equations.gradient(state.terms, started)
+        system = equations.weighted(state.terms.blocks, measured + 1j * anchored)
+        gradient = equations.gradient(state.terms, measured) + 1j * equations.gradient(state.terms, anchored)
         step = -factored(equations.damped(system)).solve(gradient).real
         largest = np.abs(step).max()
-        # Rounding, or no contraction.
+        # The steps have reached rounding, or do not contract.
         if not largest < last:
             break
         state, last = state.moved(step), largest

@@ -1,10 +1,9 @@
 """Covariances of poses and of functions of poses, from the factors of the sparse Gauss-Newton matrix.
 
-The diagonal blocks of the inverse follow from Takahashi's equations, which give the entries of the inverse where the
-factor L has entries. For M = L D Lᵀ in blocks, with N the rows of L below block k and Y = L[N, k], they are
-Z[N, k] = −Z[N, N] Y and Z[k, k] = D[k]⁻¹ − Yᵀ Z[N, k]. The first row of N, the parent of k, has all others below it,
-too. So Z[N, N] is known if the blocks are visited from the last to the first (Erisman & Tinney, CACM 1975; Kaess &
-Dellaert, RAS 2009).
+Takahashi's equations give the blocks of the inverse Z where the factor L has entries. For M = L D Lᵀ in blocks, with
+the rows N of L below block k and Y = L[N, k], they are Z[N, k] = −Z[N, N] Y and Z[k, k] = D[k]⁻¹ − Yᵀ Z[N, k]. The
+first row of N is the parent of k, and the column of the parent contains the other rows of N. So Z[N, N] is known if
+blocks are visited from the last to the first (Erisman & Tinney, CACM 1975; Kaess & Dellaert, RAS 2009).
 """
 
 from __future__ import annotations
@@ -28,7 +27,7 @@ def pose_covariances(state: GraphState) -> Float[np.ndarray, "n 6 6"]:
     if equations.size:
         try:
             factor = factored(equations.damped(state.hessian))
-            covariances[~equations.fixed] = inverse_blocks(factor)[equations.place[~equations.fixed]]
+            covariances[~equations.fixed] = _inverse_blocks(factor)[equations.place[~equations.fixed]]
         except (RuntimeError, np.linalg.LinAlgError):
             covariances[:] = np.nan
     covariances[equations.parts != equations.parts[equations.root]] = np.diag(np.full(6, np.inf))
@@ -38,10 +37,7 @@ def pose_covariances(state: GraphState) -> Float[np.ndarray, "n 6 6"]:
 def propagated(
     state: GraphState, rows: Int[np.ndarray, "q 2"], jacobians: Float[np.ndarray, "q 2 d 6"]
 ) -> Float[np.ndarray, "q d d"]:
-    """Covariances JΣJᵀ of functions of two poses each, by their Jacobians.
-
-    Infinite if the poses are not connected with each other, NaN if H is singular.
-    """
+    """JΣJᵀ; infinite if the two poses are not connected, NaN if H is singular."""
     equations, (number, _, d, _) = state.equations, jacobians.shape
     covariances = np.zeros((number, d, d))
     if equations.size:
@@ -53,29 +49,22 @@ def propagated(
         for start in range(0, number, step):
             q = slice(start, start + step)
             functions = np.arange(len(rows[q]))
-            of_poses = list(zip(rows[q].T, jacobians[q].swapaxes(0, 1), strict=True))
+            first_and_second = list(zip(rows[q].T, jacobians[q].swapaxes(0, 1), strict=True))
             # Jᵀ, H⁻¹Jᵀ and JH⁻¹Jᵀ.
             right = np.zeros((len(state.poses), 6, len(functions), d))
-            for row, jacobian in of_poses:
+            for row, jacobian in first_and_second:
                 right[row, :, functions] += jacobian.swapaxes(1, 2)
             gathered = equations.gathered(right.reshape(*right.shape[:2], -1)).reshape(equations.size, -1)
             solved = equations.spread(solver.solve(gathered)).reshape(right.shape)
-            for row, jacobian in of_poses:
+            for row, jacobian in first_and_second:
                 covariances[q] += jacobian @ solved[row, :, functions]
     first, second = equations.parts[rows].T
     covariances[first != second] = np.diag(np.full(d, np.inf))
     return covariances
 
 
-def inverse_blocks(factor: Any) -> Float[np.ndarray, "n 6 6"]:
-    """The diagonal 6×6 blocks of the inverse.
-
-    Args:
-        factor: `scipy.sparse.linalg.SuperLU` of a symmetric matrix in symmetric mode, with pivots on the diagonal.
-
-    Raises:
-        RuntimeError: if pivots are not on the diagonal.
-    """
+def _inverse_blocks(factor: Any) -> Float[np.ndarray, "n 6 6"]:
+    """Diagonal blocks of the inverse, from a symmetric `SuperLU`. Raises `RuntimeError` for pivots off the diagonal."""
     place = factor.perm_c[::_SIZE] // _SIZE
     ordered = (_SIZE * place[:, None] + np.arange(_SIZE)).reshape(-1)
     if not (np.array_equal(factor.perm_c, ordered) and np.array_equal(factor.perm_r, ordered)):
@@ -88,7 +77,7 @@ def inverse_blocks(factor: Any) -> Float[np.ndarray, "n 6 6"]:
     below = _rows_below(entries)
     diagonal = np.empty((number, _SIZE, _SIZE))
     children = np.bincount([rows[0] for rows in below if len(rows)], minlength=number)
-    # Of blocks k with children still to be visited, the rows k and N, and Z between these.
+    # For each block k with children still to be visited: the rows k and N, and Z between these rows.
     fronts: dict[int, tuple[Any, Any]] = {}
     here, there = slice(0, _SIZE), slice(_SIZE, None)
     for k in reversed(range(number)):
@@ -101,8 +90,8 @@ def inverse_blocks(factor: Any) -> Float[np.ndarray, "n 6 6"]:
         front[here, here] = np.linalg.inv((inner * pivots[k]) @ inner.T)
         if len(rows):
             parent = int(rows[0])
-            of_parent, inverse = fronts[parent]
-            places = (_SIZE * np.searchsorted(of_parent, rows)[:, None] + np.arange(_SIZE)).reshape(-1)
+            parent_members, inverse = fronts[parent]
+            places = (_SIZE * np.searchsorted(parent_members, rows)[:, None] + np.arange(_SIZE)).reshape(-1)
             ratio = np.linalg.solve(inner.T, outer.T).T
             front[there, there] = inverse[places[:, None], places]
             front[there, here] = -front[there, there] @ ratio
@@ -118,13 +107,14 @@ def inverse_blocks(factor: Any) -> Float[np.ndarray, "n 6 6"]:
 
 
 def _rows_below(entries: list[Int[np.ndarray, "_"]]) -> list[Int[np.ndarray, "_"]]:
-    """The rows of blocks below every block in L, with those that the inverse needs, from the rows of its entries."""
-    of_children: list[list[Any]] = [[] for _ in entries]
+    """N of every block: rows with entries in L, and those of its children, which Z[N, N] of the children needs."""
+    from_children: list[list[Any]] = [[] for _ in entries]
     below = []
     for k, rows in enumerate(entries):
-        rows = np.unique(np.concatenate([rows, *of_children[k]]))
+        rows = np.unique(np.concatenate([rows, *from_children[k]]))
         below.append(rows[rows > k])
         if len(below[k]):
-            of_children[below[k][0]].append(below[k][1:])
-        of_children[k] = []
+            from_children[below[k][0]].append(below[k][1:])
+        # Free the memory.
+        from_children[k] = []
     return below

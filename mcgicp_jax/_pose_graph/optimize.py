@@ -1,4 +1,4 @@
-"""Optimisation of pose graphs: least squares over all measurements, with outliers rejected."""
+"""`optimize_poses` and its result."""
 
 from __future__ import annotations
 
@@ -57,12 +57,11 @@ class PoseGraphResult:
 
     @property
     def chi_squared(self) -> Any:
-        """χ² of the edges that were kept, per redundant number: about 1 if their errors are independent and the
-        information matrices right.
+        """χ² of the kept edges per degree of freedom: about 1 for independent errors and right information matrices.
 
-        Each edge has six numbers, and each pose that may move takes six. NaN if none is redundant. Registrations of the
-        same clouds share their noise, which partly cancels around loops: graphs of `odometry` and `multiway` have 0.2
-        to 0.5.
+        There are six degrees of freedom per edge, less six per pose that may move; NaN if none is left. Registrations
+        of the same clouds share their noise, which partly cancels around loops: graphs of `odometry` and `multiway`
+        have 0.2 to 0.5.
         """
         xp = numpy_for(self.weights, self.residuals)
         of_world = xp.any(xp.asarray(self.edges.i) == WORLD)
@@ -74,10 +73,10 @@ class PoseGraphResult:
     def covariance(self) -> Float[Array, "n 6 6"] | Float[np.ndarray, "n 6 6"]:
         """(n, 6, 6) covariance of every pose: of ξ = (v, ω) in T exp(ξ), metres and radians; computed when first read.
 
-        It is the inverse of the Gauss-Newton matrix of the measurements that were kept, relative to the first pose or,
-        with measurements in the world's frame, to the world. It is right if the information matrices are, and does not
-        cover the risk that an outlier was kept or a true measurement rejected. The diagonal is infinite for poses that
-        are not connected with the first pose or the world.
+        It is the inverse of the Gauss-Newton matrix of the kept measurements, relative to the first pose or, with
+        measurements in the world's frame, to the world. It is right if the information matrices are, and does not cover
+        the risk that an outlier was kept or a true measurement rejected. The diagonal is infinite for poses that are
+        not connected with the first pose or the world.
         """
         return self.uncertainty.value
 
@@ -116,10 +115,9 @@ def optimize_poses(graph: PoseGraph, *, robust: bool = True, max_iterations: int
 
     Inside transformations the poses are differentiable with respect to the motions and information matrices of edges,
     by the implicit function theorem, but not with respect to the initial poses; second derivatives raise, and so do
-    derivatives of graphs with factors. Edges that were rejected are constants there. The derivative is 0 unless the
-    status is CONVERGED. It takes memory in proportion to n², which suits some hundreds of poses. The poses have the
-    precision of the given arrays there: in float32, 0.5 m at UTM coordinates. Outside of transformations they are
-    float64.
+    derivatives of graphs with factors. Rejected edges count as constants. The derivative is 0 unless the status is
+    CONVERGED. Its memory grows with n², which suits some hundreds of poses. Poses have the precision of the given
+    arrays: in float32, 0.5 m at UTM coordinates. Outside of transformations they are float64.
 
     Args:
         graph: poses and measurements.

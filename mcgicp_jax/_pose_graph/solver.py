@@ -1,8 +1,8 @@
 """The solver of pose graphs, on the host; NumPy and SciPy only, so that it may run inside callbacks.
 
-Outliers among the uncertain measurements are rejected by graduated non-convexity: truncated squares min(r², c²) are
-approached from a function whose convex part contains the largest residual (Yang, Antonante, Tzoumas & Carlone, RA-L
-2020).
+Outliers among the uncertain measurements are rejected by graduated non-convexity: the first cost function is convex up
+to the largest residual, and later ones approach the truncated squares min(r², c²) (Yang, Antonante, Tzoumas & Carlone,
+RA-L 2020).
 """
 
 from __future__ import annotations
@@ -14,23 +14,11 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from mcgicp_jax._compute.concrete import AnyArray
-from mcgicp_jax._math.poses import matrices_of, parameters_of
+from mcgicp_jax._math.poses import inverse, matrices_of, parameters_of
 from mcgicp_jax._math.robust_kernels import truncated_weights
+from mcgicp_jax._pose_graph import levenberg_marquardt as lm
 from mcgicp_jax._pose_graph.edge import WORLD, Edge, Factors, motion_jacobians
-from mcgicp_jax._pose_graph.graph import about_start, unmeasured
-from mcgicp_jax._pose_graph.levenberg_marquardt import (
-    LEAST_DAMPING,
-    GraphState,
-    NormalEquations,
-    PerMeasurement,
-    Poses,
-    factored,
-    minimize,
-    normal_blocks,
-    refine,
-    settle,
-    typical_information,
-)
+from mcgicp_jax._pose_graph.graph import UNMEASURED
 from mcgicp_jax._pose_graph.marginal_covariances import pose_covariances, propagated
 from mcgicp_jax._registration.result import Status
 
@@ -49,6 +37,12 @@ _NEAR = 4.0
 _UNCONSTRAINED = 10.0
 # Inverse iterations for the least constrained direction: unconstrained ones stand out by factors of 1e3 and more.
 _INVERSE_ITERATIONS = 4
+# Information of anchors, as a multiple of what leaks into unmeasured directions, and at most as a fraction of that of a
+# typical edge: poses slide least in corridors with multiples of 30 to 100.
+_OF_LEAK, _MOST = 30.0, 1e-2
+# Radians to which an edge knows the axes of its unmeasured directions at best: registrations in corridors, whose
+# rotation is known to 0.2 mrad, differ by 2 mrad.
+_AXES = 2e-3
 
 
 class GraphPoses(NamedTuple):
@@ -63,14 +57,14 @@ class GraphPoses(NamedTuple):
 
 
 def solve(
-    start: Poses, factors: Factors, robust: bool, max_iterations: int, exact: bool = False
-) -> tuple[GraphPoses, GraphState]:
-    """Minimise ½ Σ w rᵀΛr, to rounding if `exact`; NumPy arrays. The state refers to another origin of the world."""
+    start: lm.Poses, factors: Factors, robust: bool, max_iterations: int, exact: bool = False
+) -> tuple[GraphPoses, lm.GraphState]:
+    """Minimise ½ Σ w rᵀΛr, to rounding if `exact`; NumPy arrays. The poses of the state are centred."""
     # Overflow is a status.
     with np.errstate(over="ignore", invalid="ignore"):
         centred, factors, origin = _centred(start, factors)
         uncertain = np.concatenate([np.asarray(factor.uncertain) for factor in factors]) & robust
-        anchors = unmeasured(factors, centred)
+        anchors = _anchors(factors, centred)
         state = _minimum(centred, factors, anchors, uncertain, max_iterations)
         if not (np.isfinite(state.poses).all() and np.isfinite(state.terms.squares).all()):
             status = Status.NON_FINITE
@@ -79,7 +73,7 @@ def solve(
         else:
             status = Status.CONVERGED if state.converged else Status.MAX_ITERATIONS
         if exact and status == Status.CONVERGED:
-            state = refine(state)
+            state = lm.refine(state)
         poses = state.poses[: len(start)].copy()
         poses[:, :3, 3] += origin
         residuals, cost = np.sqrt(np.maximum(state.terms.squares, 0)), np.float64(state.cost)
@@ -87,37 +81,63 @@ def solve(
         return GraphPoses(poses, residuals, state.weights, cost, *counts), state
 
 
-def covariances_at(poses: Poses, factors: Factors, weights: PerMeasurement) -> Float[np.ndarray, "n 6 6"]:
-    """The covariances of the poses at a minimum that is known."""
+def covariances_at(poses: lm.Poses, factors: Factors, weights: lm.PerMeasurement) -> Float[np.ndarray, "n 6 6"]:
+    """Covariances of the poses at a known minimum."""
     with np.errstate(over="ignore", invalid="ignore"):
         centred, factors, _ = _centred(poses, factors)
-        equations = NormalEquations(factors, centred, weights > 0)
-        return uncertainty(GraphState.at(equations, weights, centred))[: len(poses)]
+        equations = lm.NormalEquations(factors, centred, weights > 0)
+        return uncertainty(lm.GraphState.at(equations, weights, centred))[: len(poses)]
 
 
-def uncertainty(state: GraphState) -> Float[np.ndarray, "n 6 6"]:
-    """Covariances of the poses. Information that leaks into unmeasured directions (see `unmeasured`) does not count.
+def uncertainty(state: lm.GraphState) -> Float[np.ndarray, "n 6 6"]:
+    """Covariances of the poses. Information that leaks into unmeasured directions (see `_anchors`) does not count.
 
-    For a degenerate graph they are (H + E)⁻¹ + 2 ε/λ ((H + E)⁻¹ − (H + 2E)⁻¹), with information E of relative size ε
-    along the unmeasured directions alone, and the least damping λ: 1/λ where H is far less than E, H⁻¹ where E is 0.
+    For a degenerate graph they are (H + E)⁻¹ + 2 ε/λ ((H + E)⁻¹ − (H + 2E)⁻¹), with the information E of anchors, of
+    relative size ε, and the least damping λ: 1/λ where H is far less than E, H⁻¹ where E is 0.
     """
     factors = state.equations.factors
-    anchors = unmeasured(factors, state.poses)
+    anchors = _anchors(factors, state.poses)
     if not (anchors.information.any() and _is_degenerate(state, anchors)):
         return pose_covariances(state)
-    equations, accepted = NormalEquations((*factors, anchors), state.poses), state.weights[: len(anchors)] > 0
-    weights = [np.append(state.weights, times * accepted) for times in (1.0, 2.0)]
-    once, twice = (pose_covariances(GraphState.at(equations, w, state.poses)) for w in weights)
-    share = about_start(typical_information(factors)[: len(anchors)])[anchors.i != WORLD][0]
-    difference = np.subtract(once, twice, out=np.zeros_like(once), where=np.isfinite(once))
-    return once + 2 * share / LEAST_DAMPING * difference
+    accepted = state.weights[: len(anchors)] > 0
+    weights = np.append(state.weights, 1.0 * accepted)
+    single = lm.GraphState.at(lm.NormalEquations((*factors, anchors), state.poses, weights > 0), weights, state.poses)
+    double = single._replace(weights=np.append(state.weights, 2.0 * accepted))
+    with_single, with_double = pose_covariances(single), pose_covariances(double)
+    fraction = _anchor_information(lm.typical_information(factors)[: len(anchors)])[anchors.i != WORLD][0]
+    difference = np.zeros_like(with_single)
+    np.subtract(with_single, with_double, out=difference, where=np.isfinite(with_single))
+    return with_single + 2 * fraction / lm.LEAST_DAMPING * difference
 
 
-def _centred(poses: Poses, factors: Factors) -> tuple[Float[np.ndarray, "_ 4 4"], Factors, Float[np.ndarray, "3"]]:
-    """Exact rigid poses and edges about the first position or the median of the priors, and that origin.
+def _anchors(factors: Factors, poses: lm.Poses) -> Edge:
+    """Edges between the same poses as the given ones that measure the motions at `poses` along unmeasured directions.
 
-    At UTM coordinates, rounding would hide differences of the cost next to the minimum. Measurements of other kinds may
-    depend on the origin, which then stays. With measurements in the world's frame, the pose of the world is appended.
+    The axes of an edge are known only to its standard deviation σ of rotation, in radians, and at best to 2 mrad: a
+    fraction σ² of its information leaks into the directions that it does not measure. Poses would slide along these by
+    many metres to explain the noise in the others. Priors get no anchor, since the world's axes are exact.
+    """
+    edges = factors[0]
+    typical = lm.typical_information(factors)[: len(edges)]
+    between, roots = edges.i != WORLD, np.sqrt(typical)
+    i = np.where(between, edges.i, edges.j)
+    eigenvalues, vectors = np.linalg.eigh(np.nan_to_num(edges.information) / (roots[:, :, None] * roots[:, None]))
+    unmeasured = between[:, None] & (eigenvalues <= UNMEASURED * eigenvalues[:, -1:])
+    scaled = roots[:, :, None] * vectors
+    information = (scaled * (unmeasured * _anchor_information(typical)[:, None])[:, None]) @ scaled.swapaxes(1, 2)
+    return Edge(edges.i, edges.j, inverse(poses[i]) @ poses[edges.j], information)
+
+
+def _anchor_information(typical: Float[np.ndarray, "m 6"]) -> Float[np.ndarray, "m"]:
+    """As a fraction of that of a typical edge."""
+    return np.minimum(_OF_LEAK * np.maximum(1 / typical[:, 5], _AXES**2), _MOST)
+
+
+def _centred(poses: lm.Poses, factors: Factors) -> tuple[Float[np.ndarray, "_ 4 4"], Factors, Float[np.ndarray, "3"]]:
+    """Exact rigid poses and edges relative to an origin, the median of the priors or else the first position.
+
+    At UTM coordinates, rounding would hide differences of the cost next to the minimum. With measurements of other
+    kinds, which may depend on the origin, it is 0. With any in the world's frame, the pose of the world is appended.
     """
     edges, *others = factors
     poses, motions = _rigid(poses), _rigid(edges.T_i_j)
@@ -134,52 +154,54 @@ def _centred(poses: Poses, factors: Factors) -> tuple[Float[np.ndarray, "_ 4 4"]
 
 
 def _rigid(matrices: np.ndarray) -> Float[np.ndarray, "_ 4 4"]:
-    """The matrices in float64 with exact rotations, of which float32 has seven digits; NaN stays."""
+    """The matrices in float64 with exact rotations (float32 has seven digits); NaN stays."""
     matrices = np.array(matrices, np.float64)
     finite = np.isfinite(matrices).all(axis=(1, 2))
     matrices[finite] = matrices_of(parameters_of(matrices[finite]))
     return matrices
 
 
-def _minimum(poses: Poses, factors: Factors, anchors: Edge, uncertain: Bool[np.ndarray, "m"], limit: int) -> GraphState:
-    """`_robust_minimum`; with `anchors`, edges to the start, if the measurements do not constrain all poses alone."""
+def _minimum(
+    poses: lm.Poses, factors: Factors, anchors: Edge, uncertain: Bool[np.ndarray, "m"], limit: int
+) -> lm.GraphState:
+    """`_robust_minimum`, with `anchors` if edges have unmeasured directions and the others do not constrain these."""
     if not anchors.information.any():
-        return _robust_minimum(NormalEquations(factors, poses), poses, uncertain, limit)
-    with_anchors = NormalEquations((*factors, anchors), poses)
+        return _robust_minimum(lm.NormalEquations(factors, poses), poses, uncertain, limit)
+    with_anchors = lm.NormalEquations((*factors, anchors), poses)
     anchored = _robust_minimum(with_anchors, poses, np.append(uncertain, anchors.uncertain), limit)
     weights = anchored.weights[: len(uncertain)]
-    state = GraphState.at(NormalEquations(factors, poses, weights > 0), weights, anchored.poses)
+    state = lm.GraphState.at(lm.NormalEquations(factors, poses, weights > 0), weights, anchored.poses)
     state = state._replace(num_iterations=anchored.num_iterations, damping=anchored.damping)
     if not _is_degenerate(state, anchors):
-        return minimize(state, limit)
+        return lm.minimize(state, limit)
     if anchored.converged:
-        settled = settle(anchored, np.arange(len(with_anchors.rows)) >= len(uncertain))
+        settled = lm.settle(anchored, np.arange(len(with_anchors.rows)) >= len(uncertain))
         state = state._replace(poses=settled, terms=state.equations.terms(settled), converged=True)
     return state
 
 
 def _robust_minimum(
-    equations: NormalEquations, start: Poses, uncertain: Bool[np.ndarray, "m"], max_iterations: int
-) -> GraphState:
-    """The minimum over the measurements that are kept, whose weight is 1; that of the others is 0."""
+    equations: lm.NormalEquations, start: lm.Poses, uncertain: Bool[np.ndarray, "m"], max_iterations: int
+) -> lm.GraphState:
+    """The minimum over the kept measurements, whose weight is 1; rejected ones have the weight 0."""
     from scipy.special import chdtri
 
-    state = GraphState.at(equations, np.ones(len(uncertain)), start)
+    state = lm.GraphState.at(equations, np.ones(len(uncertain)), start)
     sizes = [np.full(len(factor.information), factor.information.shape[-1]) for factor in equations.factors]
     limits = chdtri(np.concatenate(sizes), _LEVEL)
     largest = (state.terms.squares / limits)[uncertain].max(initial=0)
     if not largest > 1:
-        return minimize(state, max_iterations)
+        return lm.minimize(state, max_iterations)
     control = 1 / (2 * largest - 1)
     while True:
         ratio = np.sqrt(limits / np.maximum(state.terms.squares, np.finfo(float).tiny))
         weights = np.where(uncertain, truncated_weights(ratio, control), 1)
         if np.all((weights == 0) | (weights == 1)):
             break
-        state = minimize(state.weighted(weights), 1)
+        state = lm.minimize(state.weighted(weights), 1)
         control *= _GROWTH
     for _ in range(_SELECTIONS):
-        state = minimize(state.weighted(weights), max_iterations)
+        state = lm.minimize(state.weighted(weights), max_iterations)
         weights = np.where(uncertain, 1.0 * (state.terms.squares <= limits), 1)
         weights[_wrongly_rejected(state, limits)] = 1
         if np.array_equal(weights, state.weights):
@@ -187,33 +209,33 @@ def _robust_minimum(
     return state
 
 
-def _wrongly_rejected(state: GraphState, limits: PerMeasurement) -> Bool[np.ndarray, "m"]:
+def _wrongly_rejected(state: lm.GraphState, limits: lm.PerMeasurement) -> Bool[np.ndarray, "m"]:
     """Which rejected measurements have a residual within the threshold, given the combined uncertainty of the
     measurement and of the remaining graph."""
     squares, equations = state.terms.squares, state.equations
     wrong = (state.weights == 0) & (squares > limits) & (squares <= _NEAR * limits)
-    of_kinds = map(equations.split, (equations.rows, wrong, limits))
-    for factor, rows, tested, factor_limits in zip(equations.factors, *of_kinds, strict=True):
+    by_factor = map(equations.split, (equations.rows, wrong, limits))
+    for factor, rows, tested, factor_limits in zip(equations.factors, *by_factor, strict=True):
         if not tested.any():
             continue
         measurements = jax.tree.map(lambda values, tested=tested: np.asarray(values)[tested], factor)
         residuals, jacobians = measurements.linearize(state.poses[rows[tested]])
         covariances = propagated(state, rows[tested], jacobians)
-        # rᵀ(Λ⁻¹ + Σ)⁻¹r without the inverse of Λ, which may be singular. An infinite Σ leaves 0.
+        # rᵀ(Λ⁻¹ + Σ)⁻¹r without the inverse of Λ, which may be singular; 0 if Σ is infinite.
         finite = np.isfinite(covariances).all(axis=(1, 2))
         covariances[~finite] = 0
         system = np.eye(covariances.shape[-1]) + measurements.information @ covariances
         inner = np.linalg.solve(system, measurements.information @ residuals[..., None])[..., 0]
         combined = np.where(finite, np.einsum("ki,ki->k", residuals, inner), 0)
-        # A view of `wrong`.
+        # `tested` is a view of `wrong`.
         tested[tested] = combined <= factor_limits[tested]
     return wrong
 
 
-def _is_degenerate(state: GraphState, anchors: Edge) -> bool:
-    """Whether poses are not connected, or H along some direction is less than that of `anchors`, or than damping.
+def _is_degenerate(state: lm.GraphState, anchors: Edge) -> bool:
+    """Whether poses are not connected, or H along some direction is less than that of `anchors` or than damping.
 
-    By inverse iteration with the least damping: that of the last step may be too large to tell.
+    Uses the least damping, since that of the last step may be too large to tell.
     """
     equations = state.equations
     if np.any(equations.parts != equations.parts[equations.root]):
@@ -222,10 +244,10 @@ def _is_degenerate(state: GraphState, anchors: Edge) -> bool:
         return False
     hessian, blocks, number = state.hessian, np.zeros_like(state.terms.blocks), len(anchors)
     jacobians = motion_jacobians(state.poses[equations.rows[:number]])
-    blocks[:number] = normal_blocks(jacobians, np.asarray(anchors.information)) / _UNCONSTRAINED
+    blocks[:number] = lm.normal_blocks(jacobians, np.asarray(anchors.information)) / _UNCONSTRAINED
     least = equations.damped(equations.weighted(blocks, state.weights))
     try:
-        solver = factored(hessian + least)
+        solver = lm.factored(hessian + least)
     except RuntimeError:
         return True
     direction = np.random.default_rng(0).normal(size=equations.size)
