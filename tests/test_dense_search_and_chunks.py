@@ -218,6 +218,37 @@ def test_pairs_of_many_updates_leave_their_chunk_and_lose_nothing(clouds, monkey
     assert not found
 
 
+@pytest.mark.filterwarnings("ignore:channel channel_0")
+def test_given_neighbours_stay_where_a_channel_is_left_out(raw):
+    """Its first channel moves with the sensor: `register` works on copies of the clouds."""
+    sides = []
+    for side in (0, 1):
+        points, channels = (np.asarray(array) for array in (raw[0][side].points, raw[0][side].channels))
+        points = points - np.array([0.7, 0.8, 0.9])
+        channels = np.column_stack([np.linalg.norm(points, axis=1), channels[:, 0]])
+        sides.append([mcg.preprocess(mcg.PointCloud(points, channels), None, num_neighbors=6)])
+    (found,), (expected,) = in_chunks(*sides), in_chunks(*sides, executor="threads")
+    assert found.status is expected.status and found.overlap == expected.overlap
+    assert max(pose_error(found.matrix, expected.matrix)) < 1e-5
+
+
+def test_a_stream_yields_invalid_pairs_and_those_of_many_updates_on_the_way(clouds, monkeypatch):
+    sources, targets = ([side[1]] * 63 for side in clouds)
+    sources[2] = np.zeros((3, 3))
+    starts = [motion((0.1, -0.1, 0.05, 0.02, 0, 0.05)), *[None] * 62]
+    slow, usual = in_chunks(sources[:2], targets[:2], init=starts[:2])
+    assert slow.num_iterations > usual.num_iterations
+    monkeypatch.setattr(chunks, "_FIRST_UPDATES", int(slow.num_iterations))
+    monkeypatch.setattr(chunks, "_MANY", 1)
+    monkeypatch.setattr(chunks, "_CHUNKS_BETWEEN", 2)
+    options = {"init": starts, "max_distance": 0.5, "search": DenseSearch()}
+    with pytest.warns(mcg.PairWarning, match="pair 2"):
+        ended = dict(mcg.register_as_completed(sources, targets, UNSET, **options))
+    assert sorted(ended) == list(range(63))
+    assert_same([ended[0]], [slow])
+    assert max(list(ended).index(number) for number in (0, 2)) < 40
+
+
 def test_a_rare_size_does_not_wait_for_the_end(clouds, monkeypatch):
     monkeypatch.setattr(chunks, "_PATIENCE", 2)
     # 490 points fill the larger size class, the others the smaller.

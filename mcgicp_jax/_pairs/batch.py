@@ -106,8 +106,9 @@ def register_as_completed(
             default `KDTreeSearch` with one thread per pair. With `DenseSearch`, or without a search on accelerators,
             pairs run in chunks of one vectorised program on `jax.default_device`, or spread over all local devices (not
             with an `executor`, `priors`, `equalize_channels` or `voxel_sizes`), which finds neighbours by brute force.
-            It compiles for each combination of sizes, rounded up to 128, 192, 256, 384, ... points, and only the first
-            eight pairs are looked at for the warnings of `preprocess` about neighbourhoods.
+            It compiles for each combination of sizes, rounded up to 128, 192, 256, 384, ... points. Results depend on
+            the size of a chunk by rounding, only the first eight pairs are looked at for warnings, and it is not
+            checked whether a right initial pose was left, as also inside `jit`.
 
     Returns:
         A generator of the index of the pair, from 0, and its `RegistrationResult`.

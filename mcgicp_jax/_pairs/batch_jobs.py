@@ -32,7 +32,14 @@ from mcgicp_jax._registration.chunks import ChunkPair, Refused, run_pairs
 from mcgicp_jax._registration.input_checks import check_clouds, warn_of_estimated_parameters, warn_of_lengths
 from mcgicp_jax._registration.options import Options
 from mcgicp_jax._registration.pose_derivative import Inputs
-from mcgicp_jax._registration.register_pair import Run, prepared, preprocessed, results_of, run_pair
+from mcgicp_jax._registration.register_pair import (
+    Run,
+    prepared,
+    preprocessed,
+    results_of,
+    run_pair,
+    warn_of_inputs,
+)
 from mcgicp_jax._registration.result import RegistrationResult, Status, computed, verified
 from mcgicp_jax._registration.tie_points_and_prior import GivenPrior, checked_measurements
 from mcgicp_jax._search.brute_force import DenseSearch, default_search
@@ -268,6 +275,8 @@ class BatchJob:
                         yield pair
 
             for ended in run_pairs(ready(), self.method, self.options, search, self.num_neighbors):
+                while rejected:
+                    yield rejected.pop()
                 pair = ended.key
                 if isinstance(ended, Refused):
                     yield _invalid(pair.index, ended.reason)
@@ -288,6 +297,8 @@ class BatchJob:
             return ready
         source, target = ready.inputs[:2]
         check_clouds(source, target, self.method)
+        if pair.index < _CHECKED:
+            warn_of_inputs(ready.inputs, self.options)
         pose = se3_from_matrix(centred_pose(ready.init, source, target), source.points.dtype)
         # `preprocess` returns clouds that have neighbours as they are; the others get theirs on the devices.
         sides = [self._padded(*both) for both in zip((source, target), clouds.values(), strict=True)]
@@ -298,7 +309,7 @@ class BatchJob:
         arrays: dict[str, Any] = {"origin": np.zeros(3, cloud.points.dtype), "channel_names": ()}
         if not self.method.uses_channels:
             arrays |= {"channels": cloud.points[:, :0], "channel_valid": None}
-        if cloud is not before:
+        if before.deferred_neighbors is None:
             arrays["deferred_neighbors"] = None
         return cloud.replace_rows(**arrays).pad()
 

@@ -46,6 +46,8 @@ _SIZE_ON_CPU = 4
 # them: of 1,024 pairs of 2,000 points, 19 took up to 64 updates, and the others 6 to 20. Twice as many for further
 # chunks where more than this fraction of the pairs had to leave.
 _FIRST_UPDATES, _MANY = 24, 0.1
+# Chunks after which the pairs that left theirs run, at the latest: a stream then takes at most a tenth longer.
+_CHUNKS_BETWEEN = 32
 # Chunks that are dispatched before the results of the first are fetched: the host prepares one while the devices work.
 _DISPATCHED = 2
 # A chunk runs partly filled after this many pairs of other shapes: a stream of pairs yields results while it goes on.
@@ -141,6 +143,8 @@ class _Group(Generic[Key]):
         self._per_device = 0
         self.waiting: collections.deque[tuple[Key, ChunkPair]] = collections.deque()
         self._slow: collections.deque[tuple[Key, ChunkPair]] = collections.deque()
+        # Number of chunks since the last one of slow pairs.
+        self._since_slow = 0
         self._dispatched: collections.deque[tuple[list[tuple[Key, ChunkPair]], bool, Any]] = collections.deque()
 
     def _largest(self) -> int:
@@ -192,7 +196,10 @@ class _Group(Generic[Key]):
             most = self._largest()
             wanted = -(-len(self.waiting) // len(self._devices))
             self._per_device = next((size for size in _SIZES if wanted <= size < most), most)
-        size, first = self._per_device * len(self._devices), bool(self.waiting)
+        size = self._per_device * len(self._devices)
+        late = len(self._slow) >= size or (self._slow and self._since_slow >= _CHUNKS_BETWEEN)
+        first = bool(self.waiting) and not late
+        self._since_slow = self._since_slow + 1 if first else 0
         queue = self.waiting if first else self._slow
         pairs = [queue.popleft() for _ in range(min(len(queue), size))]
         self._dispatched.append((pairs, first, None))

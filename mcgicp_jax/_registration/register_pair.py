@@ -178,7 +178,6 @@ def run_pair(given: Inputs, init: Pose | None, options: Options, traced: bool = 
     """Register arrays that are all concrete, or some of which `jit` or `vmap` trace."""
     search = options.search or default_search(traced)
     measures = not (given.tie_points is None and given.prior is None)
-    compares_channels = not traced and given.method.uses_channels and not options.equalize_channels
 
     def solve(inputs: Inputs, init: Pose | None, options: Options = options) -> Run:
         problem, inputs = problem_of(inputs, init, options, search.num_threads)
@@ -187,11 +186,8 @@ def run_pair(given: Inputs, init: Pose | None, options: Options, traced: bool = 
             problem = measured(problem, given.tie_points, given.prior, traced, limits=limits)
         return run_loop(inputs, problem, search, options.max_iterations, traced)
 
-    if not traced and isinstance(given.method, GICP):
-        warn_of_covariances(given.source, given.target)
-    if compares_channels:
-        check_channels(given.source, given.target, given.method)
-        warn_of_units(given.source, given.target)
+    if not traced:
+        warn_of_inputs(given, options)
     *coarse, inputs = _at_scales(_equalized(given) if options.equalize_channels else given, options.voxel_sizes)
     start = init
     for scale in coarse:
@@ -207,7 +203,7 @@ def run_pair(given: Inputs, init: Pose | None, options: Options, traced: bool = 
         # Parameters left None are chosen anew, from the channels as equalised by the matches.
         again = _equalized(run.inputs._replace(method=inputs.method), _nearest_points(run, search))
         run = solve(again, _final_pose(run), replace(options, max_coarse_distance=0.0))
-    elif compares_channels:
+    elif not traced and _compares_channels(given, options):
         if run.loop.state.status == Status.UNVERIFIED and run.problem.settings.channels_may_move:
             warn_of_patterns(run.inputs.source)
         warn_of_exposure(inputs.source, inputs.target, lambda: _nearest_points(run, search))
@@ -225,6 +221,19 @@ def run_pair(given: Inputs, init: Pose | None, options: Options, traced: bool = 
         settings = settings._replace(max_distance=settings.fine_distance)
     problem = replace(run.problem, start=constant(run.loop.state.pose), settings=settings, measurements=fusion)
     return run_loop(run.inputs, problem, search, options.max_iterations, traced)
+
+
+def warn_of_inputs(given: Inputs, options: Options) -> None:
+    """Warn of units of covariances and channels that differ between the clouds."""
+    if isinstance(given.method, GICP):
+        warn_of_covariances(given.source, given.target)
+    if _compares_channels(given, options):
+        check_channels(given.source, given.target, given.method)
+        warn_of_units(given.source, given.target)
+
+
+def _compares_channels(given: Inputs, options: Options) -> bool:
+    return given.method.uses_channels and not options.equalize_channels
 
 
 @with_settings_of_package
