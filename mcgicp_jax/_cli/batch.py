@@ -33,18 +33,19 @@ from mcgicp_jax._pairs.processes import Processes
 from mcgicp_jax.io.files import replacing
 
 Row: TypeAlias = dict[str, str]
-# Source, target and initial pose.
+# Source, target and initial pose, as in the first columns of the table.
 Key: TypeAlias = tuple[str, str, str]
 Completed: TypeAlias = Generator[tuple[int, mcg.RegistrationResult], None, None]
 
-# Columns of the upper three rows of the pose matrix.
+# Columns of the table: the upper three rows of the pose matrix.
 _POSE = tuple(f"m{row}{column}" for row in range(3) for column in range(4))
 # Columns of `RegistrationResult.deviations`, metres and radians.
 _DEVIATIONS = tuple(f"deviation_{axis}" for axis in ("x", "y", "z", "rx", "ry", "rz"))
 _NUMBERS = ("iterations", "inliers", "overlap", "cost", "rmse", *_POSE, *_DEVIATIONS)
 _COLUMNS = ("source", "target", "init", "status", *_NUMBERS, "reason")
+# Exit code after Ctrl-C: 128 + SIGINT, as shells have it.
 _INTERRUPTED = 130
-# Status of pairs that could not be registered.
+# Statuses of pairs that could not be registered; a later run tries them again.
 _TRIED_AGAIN = ("invalid_input", "worker_failed")
 
 
@@ -102,7 +103,7 @@ def batch(
         raise ValueError(f"output: expected a .csv file, got {output}")
     file_pairs = _pairs_of_folder_or_table(pairs, glob)
     wanted = {pair.key: pair for pair in file_pairs}
-    rows = {_key_of(row): row for row in _read_rows(output)}
+    rows = {(row["source"], row["target"], row["init"]): row for row in _read_rows(output)}
     rows = {key: row for key, row in rows.items() if key not in wanted or row["status"] not in _TRIED_AGAIN}
     read, register = _reader_and_registration(file_pairs, method, shared)
     executor = None if workers == "auto" else Processes(workers)
@@ -174,8 +175,7 @@ def _pairs_of_table(path: Path) -> list[FilePair]:
 def _reader_and_registration(
     pairs: Sequence[FilePair], method: Method, options: Options
 ) -> tuple[Callable[[Path], mcg.PointCloud], Callable[..., Completed]]:
-    """Functions that read a cloud and that register pairs, with defaults chosen from the first pair whose files can be
-    read."""
+    """Functions that read a cloud and that register pairs, with defaults from the first pair that can be read."""
     for pair in pairs:
         try:
             source, target = (io.read(path, columns=options.columns) for path in pair.paths())
@@ -184,20 +184,20 @@ def _reader_and_registration(
             reason = error
     else:
         raise reason
-    choices = Choices.of(options, (pair.source, pair.target), (source, target))
+    choices = Choices(options, (pair.source, pair.target), (source, target))
     name = choices.method_name(method)
     size = None if options.voxel_size == "off" else options.voxel_size
     print(f"points:    {choices.voxels}{' in the first pair' if size == 'auto' else ''}")
 
-    def ready() -> tuple[mcg.PointCloud, mcg.PointCloud]:
+    def preprocessed() -> tuple[mcg.PointCloud, mcg.PointCloud]:
         return choices.preprocess(source), choices.preprocess(target)
 
     register = partial(
         mcg.register_as_completed,
-        method=choices.method(name, ready),
+        method=choices.method(name, preprocessed),
         voxel_size=size,
         num_neighbors=options.num_neighbors,
-        **choices.arguments(name, ready),
+        **choices.arguments(name, preprocessed),
     )
     return partial(_read, choices.channels, options.columns), register
 
@@ -217,10 +217,7 @@ def _register_missing(
     rows: dict[Key, Row],
     finished: int,
 ) -> bool:
-    """Register pairs, adding their rows to the table and to `rows`; return whether Ctrl-C stopped it.
-
-    Reasons for failure go into the row and to stderr.
-    """
+    """Register pairs, add their rows to the table and to `rows`, and return whether Ctrl-C stopped it."""
     keys, reasons = list(pairs), dict[int, str]()
     sources, targets = ([partial(read, pair.paths()[side]) for pair in pairs.values()] for side in (0, 1))
     starts = [pair.init for pair in pairs.values()]
@@ -234,6 +231,7 @@ def _register_missing(
     ):
         show = warnings.showwarning
 
+        # Reasons for failure go into the row and to stderr.
         def note_reason(message: Warning | str, *rest: Any, **options: Any) -> None:
             if isinstance(message, mcg.PairWarning) and message.index is not None:
                 reasons[message.index] = message.reason
@@ -263,10 +261,7 @@ def _register_missing(
 
 @contextlib.contextmanager
 def _interrupts() -> Iterator[list[int]]:
-    """Record each Ctrl-C in a list, besides raising `KeyboardInterrupt`.
-
-    Python swallows the exception during a callback of the garbage collector, and JAX installs one.
-    """
+    """A list that records each Ctrl-C: Python swallows `KeyboardInterrupt` during JAX's garbage-collection callback."""
     pressed: list[int] = []
 
     def notice(number: int, frame: FrameType | None) -> None:
@@ -285,7 +280,6 @@ def _interrupts() -> Iterator[list[int]]:
 
 
 def _read_rows(path: Path) -> list[Row]:
-    """The rows that a table has so far."""
     if not path.exists():
         return []
     with open(path, newline="", encoding="utf-8") as file:
@@ -314,7 +308,3 @@ def _row(key: Key, result: mcg.RegistrationResult, reason: str) -> Row:
     values = (np.asarray(number).item() for number in numbers)
     texts = (*key, result.status.name.lower(), *map(repr, values), " ".join(reason.split()))
     return dict(zip(_COLUMNS, texts, strict=True))
-
-
-def _key_of(row: Row) -> Key:
-    return row["source"], row["target"], row["init"]

@@ -1,9 +1,8 @@
-"""What the options leave open and the clouds decide: channels, voxels, the method and its parameters."""
+"""Defaults that depend on the clouds: channels, voxels, the method and its parameters."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from typing import Any, TypeAlias
 
 import numpy as np
@@ -18,43 +17,32 @@ from mcgicp_jax._local_geometry.cloud_statistics import point_spacing
 from mcgicp_jax._methods.base import AbstractMethod
 from mcgicp_jax.extend import METHODS
 
-# Preprocessed source and target, made when they are needed.
-Ready: TypeAlias = Callable[[], tuple[mcg.PointCloud, mcg.PointCloud]]
+# Returns the preprocessed source and target.
+Preprocessed: TypeAlias = Callable[[], tuple[mcg.PointCloud, mcg.PointCloud]]
 
 
-@dataclass(frozen=True)
 class Choices:
-    """The user's options, the names of the channels to use, and the voxels in which raw clouds are averaged.
+    """The user's options, completed from the raw clouds; messages call the first two of these by `names`."""
 
-    `first_two` are the first two raw clouds and what messages call them.
-    """
-
-    options: Options
-    channels: tuple[str, ...]
-    voxels: Voxels
-    first_two: dict[str, mcg.PointCloud]
-
-    @classmethod
-    def of(cls, options: Options, names: Sequence[str], clouds: Sequence[mcg.PointCloud]) -> Choices:
-        """The choices for raw clouds, of which the first two decide on the channels."""
+    def __init__(self, options: Options, names: Sequence[str], clouds: Sequence[mcg.PointCloud]):
+        self.options = options
+        self.first_two = dict(zip(names, clouds[:2], strict=False))
         common = [name for name in clouds[0].channel_names if all(name in cloud.channel_names for cloud in clouds[:2])]
-        voxels = voxels_for(None if options.voxel_size == "off" else options.voxel_size, *clouds)
-        first_two = dict(zip(names, clouds[:2], strict=False))
-        return cls(options, options.channels or tuple(common), voxels, first_two)
+        self.channels = options.channels or tuple(common)
+        self.voxels: Voxels = voxels_for(None if options.voxel_size == "off" else options.voxel_size, *clouds)
 
-    def method_name(self, wanted: MethodName | None) -> MethodName:
-        """The method that the user wants or else suits the channels, which are printed."""
-        name = wanted or ("mc-gicp" if self.channels else "gicp")
+    def method_name(self, method: MethodName | None) -> MethodName:
+        """The method of the options, or else one that suits the channels; prints the channels."""
+        name = method or ("mc-gicp" if self.channels else "gicp")
         if METHODS[name].kind.uses_channels and not self.channels:
             raise ValueError(
                 f"{name} needs channels in common, but {self._channels_of_each()}; use gicp instead (--method gicp)"
             )
         self.options.check(name)
-        self.print_channels("" if wanted or self.channels else " in common, therefore gicp")
+        self.print_channels("" if method or self.channels else " in common, therefore gicp")
         return name
 
     def print_channels(self, consequence: str = "") -> None:
-        """Print the channels that are used, and those of each cloud if these differ."""
         differ = not self.options.channels and len({cloud.channel_names for cloud in self.first_two.values()}) > 1
         details = f" ({self._channels_of_each()})" if differ else ""
         print(f"channels:  {listed(self.channels)}{consequence}{details}")
@@ -63,26 +51,23 @@ class Choices:
         return ", ".join(f"{name} has {listed(cloud.channel_names)}" for name, cloud in self.first_two.items())
 
     def preprocess(self, cloud: mcg.PointCloud) -> mcg.PointCloud:
-        """A raw cloud with the chosen channels, ready to register."""
         # Where the user asks for all points, `preprocess` warns of neighbourhoods that do not span the surface.
         voxels = None if self.options.voxel_size == "off" else self.voxels
         return mcg.preprocess(with_channels(cloud, self.channels), voxels, self.options.num_neighbors)
 
-    def method(self, name: MethodName, ready: Ready) -> AbstractMethod:
-        """The method with the user's parameters; Color ICP's weights, if not given, come from the data."""
+    def method(self, name: MethodName, preprocessed: Preprocessed) -> AbstractMethod:
+        """The method with the user's parameters; the default weights of Color ICP are those of mc-gicp."""
         parameters = self.options.parameters(name)
         if issubclass(METHODS[name].kind, mcg.ColorICP) and not parameters:
-            # As mc-gicp chooses them.
-            resolved: Any = mcg.MultiChannelGICP().resolve(*ready())
+            resolved: Any = mcg.MultiChannelGICP().resolve(*preprocessed())
             parameters["channel_weights"] = resolved.channel_weights
         return METHODS[name](**parameters)
 
-    def arguments(self, name: MethodName, ready: Ready) -> dict[str, Any]:
-        """Keyword arguments of `mcgicp_jax.register`; sizes of cells, if not given, come from the target."""
+    def arguments(self, name: MethodName, preprocessed: Preprocessed) -> dict[str, Any]:
+        """Keyword arguments of `mcgicp_jax.register`; default sizes of cells come from the target."""
         arguments = self.options.registration()
         if METHODS[name].kind.needs_covariances and not self.options.voxel_sizes:
-            _, target = ready()
-            spacing = float(point_spacing(target))
+            spacing = float(point_spacing(preprocessed()[1]))
             # With 8 spacings, a cell has some tens of points.
             arguments["voxel_sizes"] = tuple(float(f"{times * spacing:.2g}") for times in (32, 16, 8))
         return arguments

@@ -49,18 +49,19 @@ def multiway(
     shared.check(method)
     paths = clouds_in(folder, glob, map).paths
     raw = [io.read(path, columns=shared.columns) for path in paths]
-    choices = Choices.of(shared, [path.name for path in paths], raw)
+    choices = Choices(shared, [path.name for path in paths], raw)
     clouds = [choices.preprocess(cloud) for cloud in raw]
     voxels = choices.voxels
     print(f"clouds:    {len(clouds)}, {len(raw[0]):,} points in the first, {len(clouds[0]):,} used ({voxels})")
     name = choices.method_name(method)
     start = None if init is None else list(io.read_poses(init))
 
-    def ready() -> tuple[mcg.PointCloud, mcg.PointCloud]:
+    def source_and_target() -> tuple[mcg.PointCloud, mcg.PointCloud]:
         return clouds[1], clouds[0]
 
-    arguments = choices.arguments(name, ready)
-    result = mcg.multiway(clouds, choices.method(name, ready), init=start, voxel_size=voxels.size, **arguments)
+    arguments = choices.arguments(name, source_and_target)
+    resolved_method = choices.method(name, source_and_target)
+    result = mcg.multiway(clouds, resolved_method, init=start, voxel_size=voxels.size, **arguments)
 
     edges, rejected = result.graph.edges, int((~np.asarray(result.graph.kept)).sum())
     print(f"pairs:     {len(result.registrations)} registered, {len(edges)} with a result, {rejected} of them rejected")

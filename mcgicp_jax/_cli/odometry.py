@@ -123,18 +123,18 @@ def odometry(
 
     print(f"frames:    {len(frames)} of {dataset}, {len(first.cloud):,} points in the first")
     start = [first.cloud]
-    # Where the second frame cannot be read, the odometry names the error.
+    # If the second frame cannot be read, `mcg.odometry` raises the error and names the frame.
     with contextlib.suppress(ValueError, OSError):
         start.append(frames[1].cloud)
-    choices = Choices.of(shared, ("the first frame", "the second"), start)
+    choices = Choices(shared, ("the first frame", "the second"), start)
     name = choices.method_name(method)
     print(f"points:    {choices.voxels}")
 
-    def first_two() -> tuple[mcg.PointCloud, mcg.PointCloud]:
+    def source_and_target() -> tuple[mcg.PointCloud, mcg.PointCloud]:
         return choices.preprocess(frames[1].cloud), choices.preprocess(first.cloud)
 
-    resolved_method = choices.method(name, first_two)
-    options = choices.arguments(name, first_two)
+    resolved_method = choices.method(name, source_and_target)
+    options = choices.arguments(name, source_and_target)
     if isinstance(dataset, str):
         options.setdefault("max_distance", DATASETS[dataset].max_distance)
     options |= {"num_neighbors": shared.num_neighbors, "against": against, "map_radius": map_radius}
@@ -155,8 +155,8 @@ def odometry(
 
     if output is not None:
         camera = frames.to_camera if pose_frame == "camera" else None
-        in_frame = poses if camera is None else [camera @ pose @ np.linalg.inv(camera) for pose in poses]
-        io.write_poses(output, in_frame, None if pose_format == "kitti" else times)
+        written = poses if camera is None else [camera @ pose @ np.linalg.inv(camera) for pose in poses]
+        io.write_poses(output, written, None if pose_format == "kitti" else times)
         print(f"poses:     {output}")
     if plot is not None:
         true_poses = [pose for pose in truth if pose is not None]
@@ -194,6 +194,7 @@ def _open(
         try:
             frames = clouds_in(dataset, map=map, columns=columns)
         except ValueError as error:
+            # Suggest the format of a data set whose files are in the folder.
             for name in _RECORDED:
                 try:
                     DATASETS[name].frames(dataset)
@@ -212,9 +213,9 @@ def _open(
 def _follow(
     steps: Iterator[OdometryStep], num_frames: int, loops: bool, map: Path | None
 ) -> tuple[list[Pose], list[mcg.RegistrationResult], str]:
-    """Run the odometry, write the map if it has a file; return the poses, the registrations and why it stopped early.
+    """Run the odometry and write the map; return the poses, the registrations, and why it stopped early, or ''.
 
-    Raises the error of the first frame, since nothing is known then.
+    An error of the first frame is raised.
     """
     poses: list[Pose] = []
     results: list[mcg.RegistrationResult] = []
@@ -222,7 +223,7 @@ def _follow(
     world, last, failure = None, None, ""
     try:
         for step in tqdm(steps, total=num_frames, unit="frame", disable=None):
-            # Loops move the poses until the end. Without them, no cloud is kept once it is in the map.
+            # Loops change all poses until the end. Without loops, clouds go into the map at once, to save memory.
             if map is not None and loops:
                 clouds.append(step.cloud)
             elif map is not None:

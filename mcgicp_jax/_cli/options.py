@@ -1,4 +1,4 @@
-"""Shared by the commands: their options and checks of files."""
+"""Options that the commands share, and checks of files."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ def shown(metavar: str | None = None, default: str = "") -> Any:
 
 
 File: TypeAlias = Annotated[Path | None, shown("FILE")]
-# Of a `Literal | None`, tyro would list the choices in random order, and None with them.
+# For a `Literal | None`, tyro would list the choices in random order, and None among them.
 _METHOD = tyro.constructors.PrimitiveConstructorSpec[str | None](
     nargs=1,
     metavar=f"{{{','.join(METHODS)}}}",
@@ -74,11 +74,11 @@ _KERNEL = tyro.constructors.PrimitiveConstructorSpec[tuple[str, float] | None](
     str_from_instance=lambda value: [str(value)],
 )
 _EPSILON = str(inspect.signature(mcg.GICP).parameters["epsilon"].default)
-# Suffixes of clouds that texts such as poses do not have.
+# Suffixes of clouds that are not text; a text file, such as poses, has none of these.
 _BINARY = {suffix for suffix, cloud_format in FORMATS.items() if cloud_format.read is not read_text}
-# Number of files that a message lists.
+# Largest number of files that a message lists.
 _MOST_NAMES = 5
-# Parameters of methods that have an option.
+# Parameters of methods for which there is an option.
 PARAMETERS = ("channel_covariance", "channel_weights", "epsilon")
 
 
@@ -87,7 +87,7 @@ def enumerated(names: Sequence[str], last: str = "and") -> str:
 
 
 def with_names(documented: Documented, **others: str) -> Documented:
-    """Fill the names from the registries, and others, into the help text of a command or of its options."""
+    """Fill `others` and the names in the registries into the help text of a command or of its options."""
     kinds = {name: method.kind for name, method in METHODS.items()}
     documented.__doc__ = (documented.__doc__ or "").format(
         formats=enumerated(list(FORMATS), "or"),
@@ -165,7 +165,7 @@ class Options:
             raise ValueError(f"{method} has no {' and no '.join(sorted(unknown))}")
 
     def parameters(self, method: MethodName | None = None) -> dict[str, Any]:
-        """The parameters of methods that the user gave; only those that this method has, if one is named."""
+        """The user's parameters of methods; with a method, only those that it has."""
         parameters = {}
         for name in PARAMETERS:
             value = getattr(self, name)
@@ -214,12 +214,12 @@ class PairOptions(Options):
 def check_outputs(
     *files: Path | None, cloud: Path | None = None, picture: Path | None = None, inputs: Sequence[Path] = ()
 ) -> None:
-    """Raise `ValueError` or `OSError` for files that may not be written, before any work is done.
+    """Raise `ValueError` or `OSError`, before any work is done, for outputs that cannot or must not be written.
 
-    `files` are texts. `inputs` are clouds, which `cloud` may not replace, or folders, into which it may not go.
+    `files` are texts. `inputs` are clouds, which `cloud` may not replace, or folders, in which it may not be.
     """
     for path in files:
-        # A text file that exists is a cloud or not by its content.
+        # Whether an existing text file is a cloud depends on its content.
         if path is not None and (path.suffix.lower() in _BINARY or (path.is_file() and is_cloud(path))):
             raise ValueError(f"{path}: expected a text file, such as poses.txt, instead of a cloud")
     for path in inputs:
@@ -240,7 +240,7 @@ def check_outputs(
 
 
 def clouds_in(folder: Path, glob: str = "*", map: File = None, columns: int | None = None) -> datasets.CloudFiles:
-    """The clouds of a folder; `map`, a cloud that the command writes, may not become one of them."""
+    """The clouds of a folder; `map`, a file that the command writes, may not be among them."""
     if map is not None and map.resolve().parent == folder.resolve() and fnmatch(map.name, glob):
         raise ValueError(f"{map}: expected a map outside of {folder}, where it would be one of the clouds")
     files = datasets.clouds(folder, glob, columns=columns)

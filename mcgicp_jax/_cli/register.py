@@ -54,6 +54,7 @@ class PreparedPair:
     """Two preprocessed clouds with the channels that they have in common."""
 
     def __init__(self, source: Path, target: Path, options: PairOptions):
+        # Raise for unknown formats and missing files before any work is done.
         for path in (source, target):
             format_of(path)
             path.stat()
@@ -62,9 +63,9 @@ class PreparedPair:
         self.verified = True
         read = partial(io.read, columns=options.columns)
         self.raw = read(source), read(target)
-        self.choices = Choices.of(options, (str(source), str(target)), self.raw)
-        self.ready = self._preprocess(source, self.raw[0]), self._preprocess(target, self.raw[1])
-        in_source, in_target = (f"{len(self.ready[side]):,} of {len(self.raw[side]):,}" for side in (0, 1))
+        self.choices = Choices(options, (str(source), str(target)), self.raw)
+        self.preprocessed = self._preprocess(source, self.raw[0]), self._preprocess(target, self.raw[1])
+        in_source, in_target = (f"{len(self.preprocessed[side]):,} of {len(self.raw[side]):,}" for side in (0, 1))
         print(f"points:    source {in_source}, target {in_target} ({self.choices.voxels})")
 
     def _preprocess(self, path: Path, cloud: mcg.PointCloud) -> mcg.PointCloud:
@@ -72,13 +73,12 @@ class PreparedPair:
             return self.choices.preprocess(cloud)
 
     def print_distances(self) -> None:
-        """Print how far apart matches may be."""
-        target = self.ready[1]
+        target = self.preprocessed[1]
         distances = self.options.max_distance or default_distances(point_spacing(target), target)
         print(f"matches:   up to {' m, then '.join(f'{float(distance):.3g}' for distance in distances)} m apart")
 
     def find_start(self) -> None:
-        """With `--init global`, start from the pose by local features; raises `ValueError` if there is none."""
+        """With `--init global`, start from the pose found by local features."""
         if self.options.init != "global":
             return
         result = mcg.global_pose(*(with_channels(cloud, self.choices.channels) for cloud in self.raw))
@@ -89,28 +89,29 @@ class PreparedPair:
         self.start, self.verified = result.matrix, result.success
 
     def method(self, name: MethodName) -> AbstractMethod:
-        """The method with parameters from the options or else from the data, as `mcgicp_jax.register` chooses them."""
+        """The method with parameters from the options, or else from the data as in `mcgicp_jax.register`."""
         options = RegistrationOptions(max_source_points=self.options.registration()["max_source_points"])
-        pair = prepared(*self.ready, self.choices.method(name, lambda: self.ready), options)
+        pair = prepared(*self.preprocessed, self.choices.method(name, lambda: self.preprocessed), options)
         return resolved(pair.method, pair.source, pair.target, rows_to_match(pair.source, options))
 
     def errors(self, pose: Float[np.ndarray, "4 4"], true_pose: Float[np.ndarray, "4 4"]) -> str:
         """Translation error in mm at the centroid of the source, and rotation error in degrees, as two columns."""
-        centroid = np.asarray(self.ready[0].unpad().points, np.float64).mean(axis=0)
+        centroid = np.asarray(self.preprocessed[0].unpad().points, np.float64).mean(axis=0)
         translation, rotation = metrics.pose_error(pose, true_pose, at=centroid)
         return f"{1e3 * float(translation):9.2f}  {np.degrees(rotation):11.3f}"
 
     def register(self, name: MethodName, method: AbstractMethod) -> mcg.RegistrationResult:
         # Cells are made of all points.
-        source, target = (
-            with_channels(raw, self.choices.channels) if side in method.needs_covariances else ready
-            for side, raw, ready in zip(("source", "target"), self.raw, self.ready, strict=True)
-        )
+        source, target = self.preprocessed
+        if "source" in method.needs_covariances:
+            source = with_channels(self.raw[0], self.choices.channels)
+        if "target" in method.needs_covariances:
+            target = with_channels(self.raw[1], self.choices.channels)
         result = mcg.register(source, target, method, init=self.start, **self.arguments(name))
         return verified(result, self.verified)
 
     def arguments(self, name: MethodName) -> dict[str, Any]:
-        arguments = self.choices.arguments(name, lambda: self.ready)
+        arguments = self.choices.arguments(name, lambda: self.preprocessed)
         if self.options.fix:
             variances = np.where(np.isin(_DIRECTIONS, sum(self.options.fix, ())), 0, _UNKNOWN)
             arguments["prior"] = self.start, np.diag(variances)
@@ -175,7 +176,7 @@ def register(
         print(f"unconstr.: {as_text(result.unconstrained_directions)}")
     print("T_target_source:")
     # At UTM coordinates, 1e-8 in a rotation entry moves a point by centimetres.
-    form = "22.14f" if np.any(pair.ready[0].origin) else "15.8f"
+    form = "22.14f" if np.any(pair.preprocessed[0].origin) else "15.8f"
     for row in result.matrix:
         print("".join(f" {number:{form}}" for number in row))
 
@@ -202,7 +203,6 @@ def compare(source: Source, target: Target, shared: PairOptions, truth: File = N
             of the rotation.
     """
     shared.check()
-    check_outputs(picture=shared.plot)
     return _verdict(_compare(source, target, shared, truth))
 
 
@@ -221,7 +221,6 @@ def demo(output: Path = Path("mcgicp_demo"), *, all_methods: bool = False) -> in
     io.write(target_file, target.cloud)
     io.write_poses(truth_file, [np.linalg.inv(frames.path(0)) @ frames.path(1)])
     options = PairOptions(plot=output / "before_after.png")
-    check_outputs(picture=options.plot)
     names = tuple(METHODS) if all_methods else _DEMO
     _compare(source_file, target_file, options, truth_file, names)
     print(
@@ -237,6 +236,7 @@ def demo(output: Path = Path("mcgicp_demo"), *, all_methods: bool = False) -> in
 def _compare(
     source: Path, target: Path, options: PairOptions, truth: Path | None, names: Sequence[MethodName] = tuple(METHODS)
 ) -> dict[MethodName, mcg.RegistrationResult]:
+    check_outputs(picture=options.plot)
     true_pose = None if truth is None else _read_pose("truth", truth)
     pair = PreparedPair(source, target, options)
     pair.print_distances()
@@ -270,8 +270,10 @@ def _compare(
 def _compiled(
     pair: PreparedPair, names: Sequence[MethodName]
 ) -> tuple[dict[MethodName, AbstractMethod], dict[MethodName, str]]:
-    """The methods that the pair has channels for, each run once so that its programs are compiled; and the reasons of
-    those that refuse the clouds, such as too few points in cells."""
+    """The methods, each run once to compile its programs; and why others refuse the clouds (too few points in cells).
+
+    Methods that need channels are in neither if the clouds have none in common.
+    """
     methods: dict[MethodName, AbstractMethod] = {}
     refusals: dict[MethodName, str] = {}
 
@@ -298,7 +300,7 @@ def _words(result: mcg.RegistrationResult) -> str:
 
 
 def _verdict(results: dict[MethodName, mcg.RegistrationResult]) -> int:
-    """Return the exit code, and print to stderr which methods did not converge."""
+    """Print to stderr which methods did not converge, and return the exit code."""
     failed: dict[mcg.Status, list[str]] = {}
     for name, result in results.items():
         if not result.converged:
@@ -311,8 +313,8 @@ def _verdict(results: dict[MethodName, mcg.RegistrationResult]) -> int:
 
 def _read_pose(option: str, path: Path) -> Float[np.ndarray, "4 4"]:
     if not path.is_file():
-        others = ", or global" if option == "init" else ""
-        raise ValueError(f"--{option}: expected a file with a pose{others}; {path} is no file")
+        alternative = ", or global" if option == "init" else ""
+        raise ValueError(f"--{option}: expected a file with a pose{alternative}; {path} is no file")
     poses = io.read_poses(path)
     if len(poses) != 1:
         raise ValueError(f"{path}: expected one pose, got {len(poses)}")
