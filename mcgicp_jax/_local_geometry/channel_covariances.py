@@ -17,29 +17,28 @@ _REGULARISATION = 1e-6
 def channel_kernel(around: Neighborhoods, covariance: Float[Array, "..."]) -> Float[Array, "k n"]:
     """Channel similarity λ_j of each neighbour and its point: exp(−½ Δᵀ Λ⁻¹ Δ) (Servos & Waslander 2014, eq. 7).
 
+    `covariance` is Λ: scalar, (C,) variances or (C, C), channel units².
+
     Where points lack channels, Δ is restricted to the channels that both have, with the marginal of Λ. For each channel
     that a neighbour lacks, λ_j is multiplied by the mean single-channel kernel of the neighbours that have it (1 if
-    none has). A factor of 1 would treat the neighbour as similar, and stretch Ω across the border of a camera's view;
-    ignoring the neighbour would shrink Ω there. Measured at artificial borders through scans with complete channels,
-    this choice leaves Ω the least biased.
-
-    Args:
-        covariance: Λ, scalar or (C,) variances or (C, C), channel units².
+    none has). A factor of 1 would treat the neighbour as similar and stretch Ω across the border of a camera's view;
+    ignoring the neighbour would shrink Ω there. At artificial borders through scans with complete channels, this choice
+    biased Ω the least.
     """
-    count = around.num_channels
+    count, correlated = around.num_channels, covariance.ndim == 2
     differences = [around.difference(channel) for channel in range(count)]
-    matrix = covariance if covariance.ndim == 2 else jnp.diag(jnp.broadcast_to(covariance, (count,)))
+    matrix = covariance if correlated else jnp.diag(jnp.broadcast_to(covariance, (count,)))
     if around.near_measured is None:
-        return jnp.exp(-0.5 * _marginal_square(differences, None, matrix, covariance.ndim == 2))
-    common, others = list(around.near_measured), around.other
-    differences = [jnp.where(both, each, 0) for each, both in zip(differences, common, strict=True)]
-    kernel = jnp.exp(-0.5 * _marginal_square(differences, common, matrix, covariance.ndim == 2))
+        return jnp.exp(-0.5 * _marginal_square(differences, None, matrix, correlated))
+    common = list(around.near_measured)
+    differences = [jnp.where(both, difference, 0) for difference, both in zip(differences, common, strict=True)]
+    kernel = jnp.exp(-0.5 * _marginal_square(differences, common, matrix, correlated))
     for i, both in enumerate(common):
-        compared = both & others
-        number = jnp.sum(compared, axis=0)
-        alike = jnp.exp(-0.5 * differences[i] ** 2 / matrix[i, i])
-        average = jnp.sum(jnp.where(compared, alike, 0), axis=0) / jnp.maximum(number, 1)
-        kernel = kernel * jnp.where(both, 1, jnp.where(number > 0, average, 1))
+        others = both & around.other
+        number = jnp.sum(others, axis=0)
+        similarity = jnp.exp(-0.5 * differences[i] ** 2 / matrix[i, i])
+        mean = jnp.sum(jnp.where(others, similarity, 0), axis=0) / jnp.maximum(number, 1)
+        kernel = kernel * jnp.where(both, 1, jnp.where(number > 0, mean, 1))
     return kernel
 
 
@@ -49,13 +48,11 @@ def _marginal_square(
     covariance: Float[Array, "C C"],
     correlated: bool,
 ) -> Float[Array, "k N"]:
-    """Δᵀ Λ⁻¹ Δ over the common channels: for the others, Λ is replaced by the identity and Δ must be 0.
-
-    Solved by the Cholesky recurrence, unrolled over the channels, so that LAPACK is not called.
-    """
+    """Δᵀ Λ⁻¹ Δ over the common channels: for the others, Λ is replaced by the identity and Δ must be 0."""
     if not correlated:
         squares = [difference * difference / covariance[i, i] for i, difference in enumerate(differences)]
         return sum(squares[1:], start=squares[0])
+    # The Cholesky recurrence, unrolled over the channels, so that LAPACK is not called.
     root: list[list[Array]] = []
     solution: list[Array] = []
     for i, difference in enumerate(differences):
@@ -73,7 +70,7 @@ def _marginal_square(
 def plane_covariance(local: LocalGeometry, epsilon: Float[Array, ""]) -> Float[Array, "6 N"]:
     """GICP's covariance I − (1−ε) n nᵀ: 1 within the surface, ε along n (Segal et al., Generalized-ICP, RSS 2009).
 
-    It is the identity where all neighbours coincide, so that there is no normal.
+    It is the identity where all neighbours coincide and there is no normal.
     """
     covariance = local.covariance.T
     spread = covariance[0] + covariance[3] + covariance[5] > 0
@@ -90,21 +87,18 @@ def multichannel_covariance(
 ) -> Float[Array, "6 N"]:
     """MC-GICP's covariance: Ω in the tangent plane, ε along the normal (Servos & Waslander 2014, eqs. 6-10).
 
-    Args:
-        kernel: λ_j of the neighbours, from `channel_kernel`.
-        min_eigenvalue: floor for the eigenvalues of Ω, which approach 0 where no neighbour has similar channels.
-
-    Ω = Σ_w^{-1/2} Σ_t Σ_w^{-1/2} (Σ_t weighted by λ, Σ_w unweighted) is computed as I + Σ_w^{-1/2} (Σ_t − Σ_w)
-    Σ_w^{-1/2}, to give GICP's covariance for uniform channels.
+    Ω = Σ_w^{-1/2} Σ_t Σ_w^{-1/2} (Σ_t weighted by λ, the result of `channel_kernel`; Σ_w unweighted) is computed as
+    I + Σ_w^{-1/2} (Σ_t − Σ_w) Σ_w^{-1/2}, to give GICP's covariance for uniform channels. The eigenvalues of Ω, which
+    approach 0 where no neighbour has similar channels, are at least `min_eigenvalue`.
     """
-    alike = weighted_covariance(offsets_of(around), jnp.where(around.present, kernel, 0))
+    weighted_by_kernel = weighted_covariance(offsets_of(around), jnp.where(around.present, kernel, 0))
     u, v = alg.orthonormal_basis(local.normal.T)
-    unweighted, weighted = alg.project(local.covariance.T, u, v), alg.project(alike, u, v)
+    unweighted, weighted = alg.project(local.covariance.T, u, v), alg.project(weighted_by_kernel, u, v)
     trace = unweighted[0] + unweighted[2]
     spread = trace > 0
     scale = 1 / jnp.where(spread, trace, 1)
-    regular = unweighted * scale + _REGULARISATION * jnp.array([[1.0], [0.0], [1.0]], alike.dtype)
-    regular = jnp.where(spread, regular, jnp.array([[1.0], [0.0], [1.0]], alike.dtype))
+    regular = unweighted * scale + _REGULARISATION * jnp.array([[1.0], [0.0], [1.0]], weighted.dtype)
+    regular = jnp.where(spread, regular, jnp.array([[1.0], [0.0], [1.0]], weighted.dtype))
     change = alg.sandwich(alg.inverse_square_root(regular), (weighted - unweighted) * scale)
     inside = alg.embed(alg.floor_eigenvalues(change, min_eigenvalue - 1), u, v)
     return plane_covariance(local, epsilon) + inside

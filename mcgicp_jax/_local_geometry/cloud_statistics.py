@@ -21,9 +21,9 @@ from mcgicp_jax._local_geometry.neighborhoods import check_neighbors
 from mcgicp_jax._math.statistics import median, of_known, sampled_rows
 from mcgicp_jax._search.base import Correspondences
 
-# Quantiles between which the spread of a channel is measured: a few extreme values, of reflectors or flags, do not
-# raise the floor of its noise, and with it Λ. Where both are equal, as for rare marks, all values count. They are taken
-# from every fourth row of the sample: in 2,000, they are the eleventh from either end.
+# Quantiles between which the spread of a channel is measured, so that a few extreme values, of reflectors or flags, do
+# not raise the floor of its noise and Λ. Where both are equal, as for rare marks, all values count. They are taken from
+# every fourth row of the sample: of 2,000 rows, they are the eleventh from either end.
 _INNER, _STRIDE = (0.005, 0.995), 4
 # Smallest spread of a channel that is not uniform, in roundings of its largest value: what sums of constants leave.
 _ROUNDINGS = 10
@@ -42,32 +42,31 @@ def channel_noise(
 ) -> tuple[Float[AnyArray, "C"], Bool[AnyArray, "C"], Float[AnyScalar, ""]]:
     """Noise σ per channel, which channels are uniform (σ = 1), and the variance λ₀ along the normal, metres².
 
-    Both are medians over a sample of both clouds: σ of the residuals of linear fits, λ₀ of the variances of the
-    neighbours.
+    σ is the median deviation from linear fits and λ₀ the median variance of neighbours, over samples of both clouds.
     """
     samples = [_noise_rows(cloud) for cloud in (source, target)]
-    found = constant(geometries((samples[0][0], samples[1][0])))
-    xp = numpy_for(source, target, found)
+    local_geometries = constant(geometries((samples[0][0], samples[1][0])))
+    xp = numpy_for(source, target, local_geometries)
     residuals, values, sampled, across = [], [], [], []
-    for cloud, local, (rows, counts) in zip((source, target), found, samples, strict=True):
+    for cloud, local, (rows, counts) in zip((source, target), local_geometries, samples, strict=True):
         deviations = xp.sqrt(local.fits.residual.T)
         residuals.append(xp.where(counts[:-1], deviations, xp.nan))
-        values.append(known_values(cloud))
+        values.append(_channel_values(cloud))
         sampled.append(xp.where(counts[:-1].T, values[-1][rows], xp.nan))
-        across.append(xp.where(counts[-1], _smallest_variance(local, xp), xp.nan))
+        across.append(xp.where(counts[-1], _variance_along_normal(local), xp.nan))
     sigma = median(xp.concatenate(residuals, axis=1))
     low, high = _inner_range(xp.concatenate(sampled)[::_STRIDE])
-    everything = xp.concatenate(values)
-    everything = xp.where(low < high, xp.clip(everything, low, high), everything)
-    spread = of_known(partial(xp.nanstd, axis=0), everything)
-    largest = of_known(partial(xp.nanmax, axis=0), xp.abs(everything))
+    clipped = xp.concatenate(values)
+    clipped = xp.where(low < high, xp.clip(clipped, low, high), clipped)
+    spread = of_known(partial(xp.nanstd, axis=0), clipped)
+    largest = of_known(partial(xp.nanmax, axis=0), xp.abs(clipped))
     uniform = ~(spread > _ROUNDINGS * xp.finfo(spread.dtype).eps * largest)
     # Rendered channels have no noise; a floor of a thousandth of their standard deviation keeps α finite and Λ regular.
     return xp.where(uniform, 1, xp.fmax(sigma, 1e-3 * spread)), uniform, median(xp.concatenate(across))
 
 
 def _inner_range(sample: Float[AnyArray, "n C"]) -> tuple[Float[AnyArray, "C"], Float[AnyArray, "C"]]:
-    """The quantiles `_INNER` of each channel, without NaN, NaN if there is no other value."""
+    """The quantiles `_INNER` of each channel, ignoring NaN; NaN if there is no other value."""
     xp = numpy_for(sample)
     # NaN comes last.
     ordered, last = xp.sort(sample, axis=0), xp.sum(~xp.isnan(sample), axis=0, keepdims=True) - 1
@@ -77,33 +76,33 @@ def _inner_range(sample: Float[AnyArray, "n C"]) -> tuple[Float[AnyArray, "C"], 
 
 
 def _noise_rows(cloud: PointCloud) -> tuple[Any, Any]:
-    """(n,) sampled rows, and (C + 1, n) booleans: which of them are the sample of each channel, and of all points."""
+    """(n,) sampled rows, and (C + 1, n) booleans: which rows are the sample of each channel, and that of all points."""
     xp = numpy_for(cloud.valid, cloud.channel_valid)
     valid = xp.asarray(cloud.valid)
     if cloud.channel_valid is None:
         rows, counts = sampled_rows(valid)
         return rows, xp.broadcast_to(counts, (cloud.channels.shape[1] + 1, rows.size))
-    # One sample of all points might contain too few that have a channel.
+    # A single sample might contain too few points that have a channel.
     samples = []
     for measured in (*(valid & xp.asarray(cloud.channel_valid).T), valid):
         order = xp.argsort(~measured, stable=True)
         rows, counts = sampled_rows(measured[order])
         samples.append((order[rows], counts))
     owner = xp.repeat(xp.arange(len(samples)), samples[0][0].size)
-    rows, counts = (xp.concatenate(each) for each in zip(*samples, strict=True))
+    rows, counts = (xp.concatenate(parts) for parts in zip(*samples, strict=True))
     return rows, (owner == xp.arange(len(samples))[:, None]) & counts
 
 
-def _smallest_variance(local: LocalGeometry, xp: Any) -> Float[AnyArray, "N"]:
-    """λ₀ = nᵀ C n, the variance of the neighbours along the normal, metres²."""
+def _variance_along_normal(local: LocalGeometry) -> Float[AnyArray, "N"]:
+    """λ₀ = nᵀ C n, metres²."""
     xx, xy, xz, yy, yz, zz = local.covariance.T
     x, y, z = local.normal.T
     with np.errstate(over="ignore", invalid="ignore"):
         return xx * x * x + yy * y * y + zz * z * z + 2 * (xy * x * y + xz * x * z + yz * y * z)
 
 
-def known_values(cloud: PointCloud) -> Float[AnyArray, "N C"]:
-    """Channels, NaN where a point lacks them or is padding."""
+def _channel_values(cloud: PointCloud) -> Float[AnyArray, "N C"]:
+    """Channels; NaN where a point lacks them or is padding."""
     xp = numpy_for(cloud)
     valid = xp.asarray(cloud.valid)[:, None]
     if cloud.channel_valid is not None:
@@ -120,21 +119,30 @@ def point_spacing(cloud: PointCloud) -> Float[AnyScalar, ""]:
 
 
 def grid_spacing(cloud: PointCloud) -> Float[AnyScalar, ""]:
-    """Spacing of a square grid with the density of the points, metres: √(π/k) times the median distance of the k-th
-    neighbour.
-
-    Where points lie on scan lines, it is larger than `point_spacing`, which is the spacing along the lines.
+    """Spacing of a square grid with the density of the points, metres: the median of √(π/k) times the distance of the
+    k-th neighbour. For scan lines it is larger than `point_spacing`, the spacing along the lines.
     """
     return _spacings(cloud)[1]
 
 
 def _spacings(cloud: PointCloud) -> tuple[Float[AnyScalar, ""], Float[AnyScalar, ""]]:
-    """`point_spacing` and `grid_spacing`; cached with a concrete cloud."""
     return cached_with_cloud(_measured_spacings)(cloud) if is_concrete(cloud) else _measured_spacings(cloud)
 
 
 def _measured_spacings(cloud: PointCloud) -> tuple[Float[AnyScalar, ""], Float[AnyScalar, ""]]:
-    squares = _squared_neighbor_distances(cloud)
+    """`point_spacing` and `grid_spacing`."""
+    xp = numpy_for(cloud)
+    rows, counts = sampled_rows(xp.asarray(cloud.valid))
+    # (k, n): neighbours come first, so that NumPy's loops run over the points.
+    neighbors = check_neighbors(cloud, xp)[rows].T.copy()
+    near = xp.maximum(neighbors, 0)
+    squares = xp.zeros(near.shape, cloud.points.dtype)
+    # Distances that overflow become infinite and are ignored.
+    with np.errstate(over="ignore", invalid="ignore"):
+        for coordinate in xp.asarray(cloud.points).T:
+            squares = squares + (xp.take(coordinate, near) - coordinate[rows]) ** 2
+    squares = xp.where(counts & (neighbors >= 0) & xp.isfinite(squares), squares, xp.inf)
+    # Concrete where only the channels are traced.
     xp = numpy_for(squares)
     nearest = xp.sqrt(xp.min(xp.where(squares > 0, squares, xp.inf), axis=0))
     spacing = xp.nan_to_num(median(xp.where(xp.isfinite(nearest), nearest, xp.nan)))
@@ -142,23 +150,6 @@ def _measured_spacings(cloud: PointCloud) -> tuple[Float[AnyScalar, ""], Float[A
     count = xp.sum(measured, axis=0)
     grid = xp.sqrt(xp.max(xp.where(measured, squares, 0), axis=0)) * xp.sqrt(xp.pi / xp.maximum(count, 1))
     return spacing, xp.nan_to_num(median(xp.where(count > 1, grid, xp.nan))).astype(squares.dtype)
-
-
-def _squared_neighbor_distances(cloud: PointCloud) -> Float[AnyArray, "k n"]:
-    """Squared distances between the neighbours of sampled points and the points, metres²; infinite where there is none.
-
-    Neighbours come first, so that NumPy's loops run over the points.
-    """
-    xp = numpy_for(cloud)
-    rows, counts = sampled_rows(xp.asarray(cloud.valid))
-    neighbors = check_neighbors(cloud, xp)[rows].T.copy()
-    near = xp.maximum(neighbors, 0)
-    square = xp.zeros(near.shape, cloud.points.dtype)
-    # Distances that overflow become infinite and are ignored.
-    with np.errstate(over="ignore", invalid="ignore"):
-        for coordinate in xp.asarray(cloud.points).T:
-            square = square + (xp.take(coordinate, near) - coordinate[rows]) ** 2
-    return xp.where(counts & (neighbors >= 0) & xp.isfinite(square), square, xp.inf)
 
 
 def warn_of_units(source: PointCloud, target: PointCloud) -> None:
@@ -174,14 +165,15 @@ def warn_of_units(source: PointCloud, target: PointCloud) -> None:
 
 
 def warn_of_exposure(source: PointCloud, target: PointCloud, matches: Callable[[], Correspondences]) -> None:
-    """Warn of channels that differ by a gain between matched points; these are sought if the ranges differ as much."""
+    """Warn of channels that differ by a gain between matched points; `matches` is called if the ranges differ, too."""
     ranges = [_ranges(cloud) for cloud in (source, target)]
     widths = [sorted([high - low, last - first]) for (low, high), (first, last) in zip(*ranges, strict=False)]
     if not any(_OTHER_EXPOSURE * narrow < wide <= _OTHER_UNIT * narrow for narrow, wide in widths):
         return
-    for name, gain in zip(source.channel_names, np.asarray(_gain(source, target, matches())[0]), strict=True):
+    gains = np.asarray(_gains_and_offsets(source, target, matches())[0])
+    for name, gain in zip(source.channel_names, gains, strict=True):
         if not 1 / _OTHER_EXPOSURE < gain < _OTHER_EXPOSURE:
-            # Without the number, so that Python shows it once.
+            # Without the gain, so that Python shows the warning once.
             warn(
                 f"channel {name}: the spreads of its values at matched points of source and target differ by a factor "
                 f"of more than {_OTHER_EXPOSURE}, which displaces the pose; if the exposure differs, use "
@@ -192,16 +184,16 @@ def warn_of_exposure(source: PointCloud, target: PointCloud, matches: Callable[[
 @cached_with_cloud
 def _ranges(cloud: PointCloud) -> list[tuple[float, float]]:
     """The 5 and 95 % quantiles of a sample of each channel; NaN if no point has the channel."""
-    rows, counts = sampled_rows(np.asarray(cloud.valid))
-    rows = rows[counts]
+    rows, valid = sampled_rows(np.asarray(cloud.valid))
+    rows = rows[valid]
     # In float32, differences of quantiles may overflow.
     channels = np.asarray(cloud.channels, np.float64)[rows]
     measured = np.isfinite(channels)
     if cloud.channel_valid is not None:
         measured &= np.asarray(cloud.channel_valid)[rows]
     ranges = []
-    for column, there in zip(channels.T, measured.T, strict=True):
-        low, high = np.quantile(column[there], [_QUANTILES[0], _QUANTILES[-1]]) if there.any() else (np.nan, np.nan)
+    for column, present in zip(channels.T, measured.T, strict=True):
+        low, high = np.quantile(column[present], [_QUANTILES[0], _QUANTILES[-1]]) if present.any() else (np.nan, np.nan)
         ranges.append((float(low), float(high)))
     return ranges
 
@@ -212,48 +204,45 @@ def with_channels_matched(
     """The source with a gain and an offset applied to each channel, so that its distribution matches the target's; and
     the gains.
 
-    Gain and offset equalise mean and standard deviation of the quantiles from 5 to 95 %, which is robust against small
-    parts that only one cloud sees. Regression over matches is not used: noise, and matches across edges, would bias the
-    gain towards 0. With `matches`, only values of valid matches are used. Gain and offset are constants to autodiff;
-    they are 1 and 0 for channels without usable spread.
+    See `gain_and_offset`; both are constants to autodiff. With `matches`, only values of valid matches are used.
+    Regression over matches is not used: noise, and matches across edges, would bias the gain towards 0.
     """
-    gain, offset = _gain(source, target, matches)
+    gain, offset = _gains_and_offsets(source, target, matches)
     xp, dtype = numpy_for(source, gain), source.channels.dtype
     channels = xp.asarray(source.channels) * gain.astype(dtype) + offset.astype(dtype)
     return source.replace(channels=channels), gain
 
 
-def _gain(
+def _gains_and_offsets(
     source: PointCloud, target: PointCloud, matches: Correspondences | None
 ) -> tuple[Float[AnyArray, "C"], Float[AnyArray, "C"]]:
-    """Gain and offset of each channel of the source."""
     xp = numpy_for(source, target, matches)
-    values = [xp.asarray(known_values(constant(cloud))) for cloud in (source, target)]
+    values = [xp.asarray(_channel_values(constant(cloud))) for cloud in (source, target)]
     if matches is not None:
         values[1] = values[1][xp.asarray(matches.indices)]
         matched = xp.asarray(matches.valid)[:, None] & xp.isfinite(values[0]) & xp.isfinite(values[1])
         # Too few points do not determine a distribution.
         matched = matched & (xp.sum(matched, axis=0) > len(_QUANTILES))
-        values = [xp.where(matched, each, xp.nan) for each in values]
+        values = [xp.where(matched, channels, xp.nan) for channels in values]
     return gain_and_offset(*values)
 
 
 def gain_and_offset(
     values: Float[AnyArray, "n C"], wanted: Float[AnyArray, "m C"]
 ) -> tuple[Float[AnyArray, "C"], Float[AnyArray, "C"]]:
-    """Gain and offset of each channel that give its quantiles the mean and standard deviation of the wanted ones.
+    """Gain and offset of each channel that give its `_QUANTILES` the mean and standard deviation of the wanted ones.
 
     NaNs are ignored; 1 and 0 for channels without usable spread.
     """
     xp = numpy_for(values, wanted)
-    levels = xp.asarray(_QUANTILES, values.dtype)
-    # What overflows is not finite, and leaves its channel as it is.
+    fractions = xp.asarray(_QUANTILES, values.dtype)
+    # Channels whose statistics overflow remain as they are.
     with np.errstate(over="ignore", invalid="ignore"):
-        quantiles = [of_known(partial(xp.nanquantile, q=levels, axis=0), each) for each in (values, wanted)]
-        means = [xp.mean(each, axis=0) for each in quantiles]
-        spreads = [xp.std(each, axis=0) for each in quantiles]
+        quantiles = [of_known(partial(xp.nanquantile, q=fractions, axis=0), channels) for channels in (values, wanted)]
+        means = [xp.mean(levels, axis=0) for levels in quantiles]
+        spreads = [xp.std(levels, axis=0) for levels in quantiles]
         varying = (spreads[0] > 0) & (spreads[1] > 0)
         gain = xp.where(varying, spreads[1] / xp.where(varying, spreads[0], 1), 1)
         offset = means[1] - gain * means[0]
-    measured = xp.isfinite(gain) & xp.isfinite(offset)
-    return xp.where(measured, gain, 1), xp.where(measured, offset, 0)
+    finite = xp.isfinite(gain) & xp.isfinite(offset)
+    return xp.where(finite, gain, 1), xp.where(finite, offset, 0)

@@ -1,5 +1,5 @@
-"""Local geometry: covariance, normal, observability and channel fits of neighbourhoods, whatever the method; and the
-surface around each point as a registration sees it.
+"""Local geometry of neighbourhoods (covariance, normal, observability, channel fits), and the surface around each point
+that a method makes of it.
 """
 
 from __future__ import annotations
@@ -18,14 +18,8 @@ from mcgicp_jax._compute.cache import cached_with_cloud
 from mcgicp_jax._compute.concrete import AnyArray, AnyScalar, is_concrete, numpy_for
 from mcgicp_jax._compute.row_functions import ComputedTable, Rows, over_both
 from mcgicp_jax._compute.threads import side_by_side
-from mcgicp_jax._local_geometry.neighborhoods import (
-    ChannelFits,
-    Neighborhoods,
-    fit_channels,
-    neighborhoods,
-    of_rows,
-    with_near,
-)
+from mcgicp_jax._local_geometry import neighborhoods as nb
+from mcgicp_jax._local_geometry.neighborhoods import ChannelFits, Neighborhoods
 from mcgicp_jax._local_geometry.observability import geometry_observability, observability_of_halves
 from mcgicp_jax._math import symmetric_matrices as alg
 from mcgicp_jax._math.statistics import median, sampled_rows
@@ -34,8 +28,12 @@ from mcgicp_jax._search.base import SearchPoints
 # Rank of the neighbour from which roughness is measured (0 is the point itself). The nearest neighbours are biased
 # towards similar heights, and the heights of far ones include the curvature of the surface.
 _ROUGHNESS_RANK = 5
-# One (k, N) array per coordinate. Kept apart on purpose: jaxlib 0.10.2 on CPUs miscompiles, in float32, the reduction
-# of a (3, k, N) array over its middle axis where the result is broadcast back and subtracted.
+# Squared edge of a cell over the trace of its covariance, for a uniformly filled square: the trace is 2 edge²/12.
+_SQUARE_EDGE = 6.0
+# Assumed number of points from which the normal of a cell was estimated: the fewest of a cell by default.
+_CELL_POINTS = 6
+# Separate arrays per coordinate: in float32, jaxlib 0.10.2 on CPUs miscompiles the reduction of a (3, k, N) array over
+# its middle axis where the result is broadcast back and subtracted.
 Offsets: TypeAlias = tuple[Float[Array, "k N"], Float[Array, "k N"], Float[Array, "k N"]]
 
 
@@ -66,22 +64,21 @@ Geometries: TypeAlias = Callable[[tuple[Any, Any]], tuple[LocalGeometry, LocalGe
 
 
 def local_geometry_of(around: Neighborhoods) -> LocalGeometry:
-    """Local geometry of neighbourhoods."""
     offsets = offsets_of(around)
     present = around.present.astype(offsets[0].dtype)
     covariance = weighted_covariance(offsets, present)
     a, b, c = fixed = jax.lax.stop_gradient(offsets)
-    # Of every second neighbour, from the first on and then from the second on.
+    # Every second neighbour, from the first and from the second on.
     halves = [weighted_covariance((a[i::2], b[i::2], c[i::2]), present[i::2]) for i in (0, 1)]
-    counts = jnp.concatenate([jnp.sum(some, axis=0) for some in (present, present[::2], present[1::2])])
-    # Whole neighbourhoods and their halves as one array: what is done with each array is compiled anew. Without the
-    # barriers, so is how they are computed, for each of their uses.
+    counts = jnp.concatenate([jnp.sum(rows, axis=0) for rows in (present, present[::2], present[1::2])])
+    # One array of whole neighbourhoods and halves compiles faster than three. Without the barriers, XLA would compile
+    # the computation of the array again for each use.
     covariances = jax.lax.optimization_barrier(jnp.concatenate([covariance, *halves], axis=1))
     normals = jax.lax.optimization_barrier(alg.smallest_eigenvector(covariances))
     size = covariance.shape[1]
     normal = normals[:, :size]
     fixed_normal, covariances, normals = jax.lax.stop_gradient((normal, covariances, normals))
-    used = (counts[size:] >= 3) & ~jnp.tile(around.few, 2)
+    usable = (counts[size:] >= 3) & ~jnp.tile(around.few, 2)
     basis = alg.orthonormal_basis(fixed_normal)
     rank = min(_ROUGHNESS_RANK, present.shape[0] - 1)
     height = sum(offset[rank] * axis for offset, axis in zip(fixed, fixed_normal, strict=True))
@@ -89,10 +86,10 @@ def local_geometry_of(around: Neighborhoods) -> LocalGeometry:
     return LocalGeometry(
         covariance=covariance.T,
         normal=normal.T,
-        observability=observability_of_halves(covariances, normals, counts, used).T,
+        observability=observability_of_halves(covariances, normals, counts, usable).T,
         roughness=0.5 * height**2,
         neighborhood_radius=jnp.sqrt(jnp.max(sum(offset * offset for offset in fixed), axis=0)),
-        fits=fit_channels(jax.lax.stop_gradient(around), x, y),
+        fits=nb.fit_channels(jax.lax.stop_gradient(around), x, y),
     )
 
 
@@ -109,33 +106,28 @@ def weighted_covariance(offsets: Offsets, weights: Float[Array, "k N"]) -> Float
     return jnp.stack([jnp.sum(weights * p * q, axis=0) for p, q in pairs])
 
 
-# Squared edge of a cell over the trace of its covariance, for a uniformly filled square: the trace is 2 edge²/12.
-_SQUARE_EDGE = 6.0
-# Assumed number of points from which the normal of a cell was estimated: the fewest of a cell by default.
-_COUNT = 6
-
-
 def cell_edge(cells: PointCloud) -> Float[AnyScalar, ""]:
-    """The median edge of the cells, metres. (The median distance of cells may be smaller: where a plane lies between
-    two layers of voxels, cells are close together.)"""
+    """Median edge of the cells, metres. Their median distance may be smaller, where a plane between two layers of
+    voxels leaves cells close together."""
     xp = numpy_for(cells)
-    rows, counts = sampled_rows(xp.asarray(cells.valid))
+    rows, valid = sampled_rows(xp.asarray(cells.valid))
     traces = xp.trace(xp.asarray(cells.covariances)[rows], axis1=1, axis2=2)
-    return median(xp.where(counts, xp.sqrt(_SQUARE_EDGE * traces), xp.nan))
+    return median(xp.where(valid, xp.sqrt(_SQUARE_EDGE * traces), xp.nan))
 
 
-def geometry_of_cells(local: LocalGeometry, given: Float[Array, "6 n"], num_candidates: int) -> LocalGeometry:
-    """Local geometry of cells: channel fits from `local`, that of their neighbourhoods, everything else from the
-    covariances of the cells, metres², of which `num_candidates` are matched with each point or cell."""
-    given = jax.lax.stop_gradient(given)
-    normal = alg.smallest_eigenvector(given)
-    across = alg.inner(normal, alg.multiply(given, normal))
+def geometry_of_cells(local: LocalGeometry, covariances: Float[Array, "6 n"], num_candidates: int) -> LocalGeometry:
+    """Local geometry of cells, `num_candidates` of which are matched with each point or cell: from their covariances,
+    metres²; only the channel fits are those of `local`, the geometry of their neighbourhoods."""
+    covariances = jax.lax.stop_gradient(covariances)
+    normal = alg.smallest_eigenvector(covariances)
+    across = alg.inner(normal, alg.multiply(covariances, normal))
     return LocalGeometry(
-        covariance=given.T,
+        covariance=covariances.T,
         normal=normal.T,
-        observability=geometry_observability(given, normal, jnp.full_like(across, _COUNT)).T,
+        observability=geometry_observability(covariances, normal, jnp.full_like(across, _CELL_POINTS)).T,
         roughness=across,
-        neighborhood_radius=0.5 * jnp.sqrt(num_candidates * _SQUARE_EDGE * (given[0] + given[3] + given[5])),
+        neighborhood_radius=0.5
+        * jnp.sqrt(num_candidates * _SQUARE_EDGE * (covariances[0] + covariances[3] + covariances[5])),
         fits=local.fits,
     )
 
@@ -147,18 +139,19 @@ def local_geometries(
     rows: tuple[Any, Any] = (None, None),
     num_threads: int | None = 1,
 ) -> tuple[LocalGeometry, LocalGeometry]:
-    """Local geometry of some rows (None: all) of two preprocessed clouds; `with_channels` as in `with_near`. The host
-    uses at most `num_threads` threads (None: no limit)."""
+    """Local geometry of rows (None: all) of two preprocessed clouds; `with_channels` as in `with_near`. The host uses
+    at most `num_threads` threads (None: no limit)."""
     if is_concrete(source, target):
         calls = [
-            partial(geometry_table(cloud, with_channels).trees, some, num_threads)
-            for cloud, some in ((target, rows[1]), (source, rows[0]))
+            partial(geometry_table(target, with_channels).trees, rows[1], num_threads),
+            partial(geometry_table(source, with_channels).trees, rows[0], num_threads),
         ]
         (of_target,), (of_source,) = side_by_side(calls, num_threads)
         return of_source, of_target
     # A concrete cloud beside a traced one is traced as well, which needs no program of its own.
-    both = [of_rows(with_near(cloud, with_channels), some) for cloud, some in zip((source, target), rows, strict=True)]
-    (of_source,), (of_target,) = over_both(_geometry, None, *both)
+    source_inputs = nb.of_rows(nb.with_near(source, with_channels), rows[0])
+    target_inputs = nb.of_rows(nb.with_near(target, with_channels), rows[1])
+    (of_source,), (of_target,) = over_both(_geometry, None, source_inputs, target_inputs)
     return of_source, of_target
 
 
@@ -169,25 +162,24 @@ def geometry_table(cloud: PointCloud, with_channels: bool) -> ComputedTable:
 
 
 def differentiable_geometry(cloud: PointCloud, with_channels: bool, fixed: PointCloud) -> ComputedTable:
-    """Local geometry of a cloud whose points differentiation may trace, with the values of the same, concrete cloud."""
+    """Local geometry of a cloud whose points differentiation may trace; `fixed` is the same cloud, concrete."""
     return _table(cloud, with_channels, fixed, geometry_table(fixed, with_channels))
 
 
 def _table(
     cloud: PointCloud, with_channels: bool, fixed: PointCloud, values: ComputedTable | None = None
 ) -> ComputedTable:
-    # Another array: the local geometry has no derivative by channels.
-    channels = np.asarray(fixed.channels).view()
-    inputs = with_near(cloud.replace_rows(channels=channels), with_channels)
+    # A view is another array than the differentiated channels, by which the local geometry has no derivative.
+    inputs = nb.with_near(cloud.replace_rows(channels=np.asarray(fixed.channels).view()), with_channels)
     return ComputedTable(_geometry, None, inputs, cloud.points.shape[0], values)
 
 
 def _geometry(_: None, own: Rows, near: Rows) -> tuple[LocalGeometry]:
-    return (local_geometry_of(neighborhoods(own, near)),)
+    return (local_geometry_of(nb.neighborhoods(own, near)),)
 
 
 class SurfaceNoise(NamedTuple):
-    """What is used at the final pose alone, for its status and covariance; one row per point.
+    """Values that only the status and the covariance of the final pose need; one row per point.
 
     Attributes:
         descriptors: variance of the descriptors α · channel about their linear fits, metres², summed over the channels.
@@ -205,10 +197,10 @@ class SurfaceNoise(NamedTuple):
 
 
 class Surface(NamedTuple):
-    """The points of a cloud with the values that one method needs of each; one row per point.
+    """The points of a cloud with the values that a method needs of each; one row per point.
 
-    Rows come first, so that those of matched points can be gathered; formulas work on the transposes. Symmetric 3×3
-    matrices are stored as upper triangles.
+    Rows come first, so that matched points can be gathered; formulas work on the transposes. Symmetric 3×3 matrices are
+    stored as upper triangles.
 
     Attributes:
         points: positions, metres.
@@ -242,7 +234,7 @@ class Surface(NamedTuple):
 
 
 def searched(surface: Surface) -> SearchPoints:
-    """The input of the search of a surface of a whole cloud."""
+    """The search input of the surface of a whole cloud."""
     if surface.search is None:
         raise ValueError("surface: expected one with the input of the search")
     return surface.search

@@ -15,8 +15,9 @@ from mcgicp_jax._compute.concrete import AnyArray, is_deferred, numpy_for
 from mcgicp_jax._compute.row_functions import Input, Rows
 from mcgicp_jax._math import symmetric_matrices as alg
 
-# Number of points below which normals of halves of the neighbours are not used: their mean over 50 neighbourhoods of
-# 20 scatters by more than what counts as constrained. 100 to 500 random points in a cube seemed to be free, 1,000 not.
+# Number of points of a cloud below which normals of halves of the neighbours are not used: their mean over 50
+# neighbourhoods of 20 points scatters by more than what counts as constrained. Random points in a cube seemed
+# unconstrained with 100 to 500 points, but not with 1,000.
 FEW_POINTS = 1000
 
 NO_NEIGHBORS = "cloud: expected one with neighbors or covariances; make it with mcgicp_jax.preprocess"
@@ -26,12 +27,12 @@ class Neighborhoods(NamedTuple):
     """Positions and channels of n points of a cloud and of their k nearest neighbours.
 
     Positions and channels are separate arrays, so that a derivative with respect to one does not involve the other.
+    All but `own` and `given` are None where only the points themselves are needed.
 
     Attributes:
         own: (3, n) positions of the points, metres.
         given: (n, 3, 3) covariances that were given with the cloud; None if there are none.
-        near: (3, k, n) positions of their neighbours, metres, nearest first; the point itself is one of them. None, as
-            are the following, where only the points themselves are needed.
+        near: (3, k, n) positions of their neighbours, metres, nearest first; the point itself is one of them.
         own_channels: (C, n) channels of the points; C is 0 where channels are not used.
         near_channels: (C, k, n) channels of their neighbours.
         present: (k, n) which neighbours exist.
@@ -72,7 +73,7 @@ class Neighborhoods(NamedTuple):
         return jnp.where(self.present, self.near_channels[channel] - self.own_channels[channel], 0)
 
     def measured(self, channel: int) -> Bool[AnyArray, "k n"]:
-        """Which neighbours have a channel that the point has, too."""
+        """Which neighbours have a channel that the point also has."""
         return self.present if self.near_measured is None else self.near_measured[channel]
 
 
@@ -85,55 +86,52 @@ def check_neighbors(cloud: PointCloud, xp: ModuleType) -> Any:
 
 
 class PointRows(NamedTuple):
-    """The columns of a cloud from which its surface is computed; None for what is not needed."""
+    """The columns of a cloud from which its surface is computed; None where not needed."""
 
-    # (N, 3), metres.
-    points: Any
-    # (N, C), and which of them the points have; None if no point lacks any.
-    channels: Any = None
-    measured: Any = None
-    # (N, 3, 3) covariances that were given with the cloud.
-    given: Any = None
-    # (N,) whether the cloud has fewer points than `FEW_POINTS`.
-    few: Any = None
+    points: Any  # (N, 3), metres
+    channels: Any = None  # (N, C)
+    measured: Any = None  # (N, C) which channels the points have; None if no point lacks any
+    given: Any = None  # (N, 3, 3) covariances that were given with the cloud
+    few: Any = None  # (N,) whether the cloud has fewer points than `FEW_POINTS`
 
 
 def with_near(cloud: PointCloud, with_channels: bool, with_given: bool = False) -> list[Input]:
-    """The inputs of a row function of neighbourhoods, see `neighborhoods`: the points and their neighbours.
+    """The points and their neighbours as inputs of a row function, for `neighborhoods`.
 
-    Args:
-        with_channels: whether the channels are used; if not, the programs do not depend on their number.
-        with_given: whether to include the covariances given with the cloud.
+    Without channels, the programs do not depend on their number. `with_given` includes the covariances given with the
+    cloud.
     """
-    # Differentiation traces neither of them.
+    # Neighbours and `valid`, which differentiation does not trace.
     xp = numpy_for(cloud.deferred_neighbors, cloud.valid)
     neighbors, valid = check_neighbors(cloud, xp), xp.asarray(cloud.valid)
-    none = np.zeros((cloud.points.shape[0], 0), cloud.points.dtype)
-    near = PointRows(
-        cloud.points, cloud.channels if with_channels else none, cloud.channel_valid if with_channels else None
-    )
+    if with_channels:
+        near = PointRows(cloud.points, cloud.channels, cloud.channel_valid)
+    else:
+        near = PointRows(cloud.points, np.zeros((cloud.points.shape[0], 0), cloud.points.dtype))
     few = xp.broadcast_to(xp.sum(valid) < FEW_POINTS, valid.shape)
     own = near._replace(given=cloud.covariances if with_given else None, few=few)
     return [Input(own), Input(near, neighbors)]
 
 
 def of_rows(inputs: list[Input], rows: Any) -> list[Input]:
-    """The inputs for some rows (None: all)."""
+    """The inputs restricted to rows (None: all)."""
     if rows is None:
         return inputs
-    return [each._replace(index=rows if each.index is None else each.index[rows]) for each in inputs]
+    return [entry._replace(index=rows if entry.index is None else entry.index[rows]) for entry in inputs]
 
 
 def neighborhoods(own: Rows, near: Rows | None = None) -> Neighborhoods:
-    """The neighbourhoods of the rows of `with_near`, or the points alone."""
+    """The neighbourhoods of rows of the inputs `with_near`, or the points alone."""
     if near is None:
         return Neighborhoods(own.tree.points.T, own.tree.given)
-    present, measured, channels = near.index >= 0, own.tree.measured, own.tree.channels.T
+    present, measured, own_channels = near.index >= 0, own.tree.measured, own.tree.channels.T
     # Without the barrier XLA would gather each number again for each of its uses.
-    points, others = jax.lax.optimization_barrier(
+    positions, channels = jax.lax.optimization_barrier(
         (near.tree.points.transpose(2, 0, 1), near.tree.channels.transpose(2, 0, 1))
     )
-    around = Neighborhoods(own.tree.points.T, own.tree.given, points, channels, others, present, few=own.tree.few)
+    around = Neighborhoods(
+        own.tree.points.T, own.tree.given, positions, own_channels, channels, present, few=own.tree.few
+    )
     if measured is None:
         return around
     both = present & near.tree.measured.transpose(2, 0, 1) & measured.T[:, None]
@@ -141,9 +139,9 @@ def neighborhoods(own: Rows, near: Rows | None = None) -> Neighborhoods:
 
 
 class ChannelFits(NamedTuple):
-    """Linear fit of each channel over the tangent plane, by its basis `orthonormal_basis(normal)`; one row per point.
+    """Linear fit of each channel over the tangent plane, in the basis `orthonormal_basis(normal)`; one row per point.
 
-    Where too few neighbours have the channel, the residual is NaN and the rest 0.
+    Where too few neighbours have the channel, the residual is NaN and the other values are 0.
 
     Attributes:
         gradients: of the fits to every second neighbour, from the first and from the second on, channel units per
@@ -159,7 +157,6 @@ class ChannelFits(NamedTuple):
 
 def fit_channels(around: Neighborhoods, x: Float[Array, "k n"], y: Float[Array, "k n"]) -> ChannelFits:
     """Fit every channel; x and y are the coordinates of the neighbours in the tangent plane, metres."""
-    size = around.own.shape[1]
     gradients, residuals, inverses = [], [], []
     for channel in range(around.num_channels):
         values, measured = around.difference(channel), around.measured(channel).astype(x.dtype)
@@ -170,6 +167,7 @@ def fit_channels(around: Neighborhoods, x: Float[Array, "k n"], y: Float[Array, 
         residuals.append(jnp.where(enough, fit.residual, jnp.nan))
         inverses.append(jnp.where(enough, fit.inverse, 0))
     if not gradients:
+        size = around.own.shape[1]
         return ChannelFits(*(jnp.zeros(shape, x.dtype) for shape in ((size, 0, 2, 2), (size, 0), (size, 0, 3))))
     # From (C, columns, n) to rows.
     return ChannelFits(
@@ -178,17 +176,15 @@ def fit_channels(around: Neighborhoods, x: Float[Array, "k n"], y: Float[Array, 
 
 
 class LinearFit(NamedTuple):
-    """Linear fit of values over a plane, by weighted least squares.
+    """Weighted linear fit over a plane: `inverse` is that of the normal matrix, `weight` the sum of the weights.
 
-    Gradient and inverse are 0 where the points lie on a line; the residual is meaningless for three points or fewer.
+    Gradient and inverse are 0 where the points lie on a line; the residual variance is meaningless for three points or
+    fewer.
     """
 
-    # Derivatives along x and y, variance about the fit, and the inverse normal matrix: times the variance, the
-    # covariance of the gradient.
     gradient: tuple[Float[Array, "N"], Float[Array, "N"]]
     residual: Float[Array, "N"]
     inverse: Float[Array, "3 N"]
-    # The sum of the weights.
     weight: Float[Array, "N"]
 
 

@@ -2,9 +2,9 @@
 
 With GICP's in-plane variance of 1, every correspondence constrains every direction a little. But when the pose slides
 along a plane, the matches slide with it, and the plane constrains nothing in that direction. Observability excludes
-this apparent information. It is a symmetric 3×3 matrix O per point: for a motion of the point along the unit vector x,
-xᵀ O x is the fraction, 0 to 1, that changes the residual instead of the match. As the expected contribution of noise is
-subtracted, values of single points may be slightly negative.
+this apparent information. It is a symmetric 3×3 matrix O per point: of a motion of the point along the unit vector x,
+xᵀ O x is the fraction, 0 to 1, that changes the residual instead of the match. The expected contribution of noise is
+subtracted, so values of single points may be slightly negative.
 """
 
 from __future__ import annotations
@@ -16,12 +16,13 @@ from mcgicp_jax._compute.concrete import AnyArray
 from mcgicp_jax._local_geometry.neighborhoods import ChannelFits
 from mcgicp_jax._math import symmetric_matrices as alg
 
-# Fraction of the variance of a fitted gradient that is subtracted from the product of both halves: few points scatter.
-# Channels that are noise constrained a direction of 6 of 140 walls (400, 2,000 and 12,000 points); with 0, of 80.
+# Fraction of the variance of a fitted gradient that is subtracted from the product of both halves, because the mean
+# over few points scatters. Channels of pure noise constrained a direction of 6 of 140 walls (400, 2,000 and 12,000
+# points); with 0, of 80.
 _MARGIN = 0.2
 
-# κ of `observability_of_halves`: 1/16 makes normals that are nearly right unbiased, 5/16 those of random directions. In
-# between by corridors, planes and a street, see Constants in `tests/benchmarks/README.md`.
+# κ of `observability_of_halves`: 1/16 makes normals that are nearly right unbiased, 5/16 those of random directions.
+# The value between was measured on corridors, planes and a street, see Constants in `tests/benchmarks/README.md`.
 _NOISE = 0.22
 
 
@@ -30,40 +31,38 @@ def geometry_observability(
 ) -> Float[Array, "6 N"]:
     """Observability from one normal n: (n nᵀ − V) (1 − tr V), with the covariance V of n.
 
-    Args:
-        covariance: covariance of the neighbours about their mean, metres².
-        normal: unit eigenvector of its smallest eigenvalue.
-        count: number of neighbours.
+    `covariance` is that of `count` neighbours about their mean, metres², and n its eigenvector of the smallest
+    eigenvalue.
     """
     certain, variance = _certainty(covariance, normal, count)
     return certain * (alg.outer(normal) - variance)
 
 
 def observability_of_halves(
-    covariances: Float[Array, "6 M"], normals: Float[Array, "3 M"], counts: Float[Array, "M"], used: Bool[Array, "L"]
+    covariances: Float[Array, "6 M"], normals: Float[Array, "3 M"], counts: Float[Array, "M"], usable: Bool[Array, "L"]
 ) -> Float[Array, "6 N"]:
     """Observability from the normals n₁ and n₂ of two halves of the neighbours, whose noise is independent.
 
-    With the projectors Pᵢ = nᵢ nᵢᵀ, the part of noise in (P₁ P₂ + P₂ P₁) / 2 is the square of its part in each of them.
-    κ sin²φ (P₁ − P₂)² estimates it, where φ is the angle between the normals, and is subtracted. The rest is multiplied
-    by the certainties of both normals, which are independent, too: the certainty of the normal of all neighbours is
-    larger where both halves deviate alike. `geometry_observability` of all neighbours where a half is not used.
+    With the projectors Pᵢ = nᵢ nᵢᵀ, the noise in (P₁ P₂ + P₂ P₁) / 2 is the square of that in each of them. It is
+    estimated by κ sin²φ (P₁ − P₂)², where φ is the angle between the normals, and subtracted. The rest is multiplied by
+    the certainties of both normals, which are also independent: the certainty of the normal of all neighbours would be
+    larger where both halves deviate alike. Where a half is not usable: `geometry_observability` of all neighbours.
 
     Args:
-        covariances, normals, counts: as of `geometry_observability`, of all neighbours, then of the first halves, and
-            then of the second ones; M = 3 N.
-        used: whether the normal of each half may be used; L = 2 N.
+        covariances, normals, counts: as in `geometry_observability`, of all neighbours, of the first halves, and of the
+            second halves; M = 3 N.
+        usable: whether the normal of each half may be used; L = 2 N.
     """
     certain, variance = _certainty(covariances, normals, counts)
     (whole, *of_halves), (normal, first, second) = jnp.split(certain, 3), jnp.split(normals, 3, axis=1)
     whole = whole * (alg.outer(normal) - variance[:, : whole.size])
-    # By the sum and the difference of the normals, which are orthogonal; the signs of the normals do not matter.
+    # In terms of n₁ + n₂ and n₁ − n₂, which are orthogonal; the signs of the normals do not matter.
     cosine = jnp.sum(first * second, axis=0)
     by_sum, by_difference = (
         0.25 * sign * cosine - 0.5 * _NOISE * (1 - cosine * cosine) * (1 - sign * cosine) for sign in (1, -1)
     )
     split = by_sum * alg.outer(first + second) + by_difference * alg.outer(first - second)
-    both = jnp.all(used.reshape(2, -1), axis=0)
+    both = jnp.all(usable.reshape(2, -1), axis=0)
     return jnp.where(both, of_halves[0] * of_halves[1] * split, whole)
 
 
@@ -74,7 +73,7 @@ def _certainty(
 
     The eigenvector of the smallest eigenvalue λ₀ of a sample covariance of k points has the variance
     λ₀ λ / (k (λ − λ₀)²) towards the eigenvector of λ (Anderson 1963). It is large for points on a line, whose normal is
-    undetermined about it. The saturated form λ₀ λ / (k (λ − λ₀)² + λ₀ λ), used here, is at most 1.
+    undetermined. The saturated form λ₀ λ / (k (λ − λ₀)² + λ₀ λ), used here, is at most 1.
     """
     basis = alg.orthonormal_basis(normal)
     smallest = jnp.maximum(jnp.sum(normal * alg.multiply(covariance, normal), axis=0), 0)
@@ -89,7 +88,7 @@ def _certainty(
     determinant = p * r - q * q
     regular = determinant > 64 * jnp.finfo(covariance.dtype).eps * (p + r) ** 2
     inverse = jnp.stack([r, -q, p]) / jnp.where(regular, determinant, 1)
-    # Both factors are polynomials of the same matrix; they commute, so that their product is symmetric.
+    # Both factors are polynomials of the same matrix: they commute, and their product is symmetric.
     x, y, z = noise
     i, j, k = inverse
     variance = jnp.stack([x * i + y * j, x * j + y * k, y * j + z * k])
@@ -105,16 +104,12 @@ def channel_observability(
     If a point moves by x within the surface, its nearest target point in position and descriptors moves by (I + A)⁻¹ x,
     with A = Σ g gᵀ, and the residual changes by the rest, A (I + A)⁻¹ x. A / (1 + tr A) is used instead, which is equal
     for one channel and smaller for several. A is the mean of g hᵀ and h gᵀ, where g and h are fitted to different
-    neighbours: their noise is independent and contributes nothing on average. (To subtract the variance of one fit from
-    its square instead subtracts the misfit at sharp edges, too: on a wall of posters the sum along a direction that
-    was known to a millimetre was negative.) Each half needs three neighbours; with fewer, the observability is 0.
+    neighbours: their noise is independent and contributes nothing on average. (Subtracting the variance of one fit from
+    its square would also subtract the misfit at sharp edges: on a wall of posters, the sum along a direction that was
+    known to a millimetre was negative.) Each half needs three neighbours; with fewer, the observability is 0.
 
-    Args:
-        weights: α, metres per channel unit.
-
-    Returns:
-        Symmetric (6, N) matrices; the (N, C, 3) gradients of the descriptors, means of both fits; and the (N,) variance
-        of the descriptors about their linear fits, metres², summed over the channels.
+    `weights` are α, metres per channel unit. Also returned are the gradients of the descriptors, means of both fits,
+    and the variance of the descriptors about their linear fits, metres², summed over the channels.
     """
     total = jnp.zeros((3, normal.shape[0]), normal.dtype)
     length, noise = total[0], total[0]
@@ -142,13 +137,10 @@ def agreement(
     g and h are the gradients of the descriptors in the two clouds, in one frame. At a wrong pose they are unrelated,
     however distinct the channels of each cloud are, so that A vanishes on average, unless the sensor carries a pattern
     along: then the gradients agree where it has not moved. Such a pattern (of beams, ranges, angles of incidence) has
-    its gradients along the lines of sight, a texture has them in all directions. With the unit tangent t across the
-    line of sight, the surplus is ((t·g) (t·h) − g·h / 4) t tᵀ / (1 + tr A): positive, g·h / 4, on average over all
+    gradients along the lines of sight, a texture in all directions. With the unit tangent t across the line of sight
+    (0 where unknown), the surplus is ((t·g) (t·h) − g·h / 4) t tᵀ / (1 + tr A): g·h / 4 > 0 on average over all
     directions of the gradients, and negative for the pattern. A texture as strong as the pattern hides it, even if its
     gradients lie across the motion.
-
-    Args:
-        tangent: t, or 0 where it is unknown.
     """
     product = sum(0.5 * (alg.outer(g + h) - alg.outer(g) - alg.outer(h)) for g, h in zip(source, target, strict=True))
     scale = 1 / (1 + 0.5 * (jnp.sum(source * source, axis=(0, 1)) + jnp.sum(target * target, axis=(0, 1))))

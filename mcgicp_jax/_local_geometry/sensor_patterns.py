@@ -1,11 +1,11 @@
-"""Channels that move with the sensor, such as distance, time, vignetting or the gain of each beam: they fit
-perfectly, and hold a pose, where the sensor has not moved.
+"""Channels that move with the sensor, such as distance, time, vignetting or the gain of each beam: they match
+perfectly at the pose of no motion and constrain it, even where the sensor has moved.
 
-Such a channel is a function of a point's place in the frame of the sensor. A texture is not, or not one so simple. Two
-shares of the variance of a channel, each predicted from the other half of a sample, tell them apart. *By angles*: the
-largest of those that a function of range alone, of elevation alone or of azimuth alone explains, about the origin and
-the z axis of the cloud. Where these are not those of a sensor, they explain little. *Smooth*: the share that a
-polynomial of position explains, whatever the coordinates.
+Such a channel is a simple function of a point's place in the frame of the sensor, and a texture is not. Two shares of
+the variance of a channel, in which each half of a sample is predicted from the other, tell them apart. *By angles*: the
+largest share explained by a function of range alone, of elevation alone or of azimuth alone, about the origin and the z
+axis of the cloud (a small share where these are not those of a sensor). *Smooth*: the share explained by a polynomial
+of position, which does not depend on the choice of coordinates.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float
 
 from mcgicp_jax._clouds.point_cloud import PointCloud
 from mcgicp_jax._compute.cache import cached_with_cloud
@@ -26,45 +26,45 @@ from mcgicp_jax._math import symmetric_matrices as alg
 from mcgicp_jax._math.statistics import median, sampled_rows
 
 # Share of the variance above which a channel is no texture. By angles, nine patterns on three scenes have 0.82 to 1.00
-# (gains of beams 0.74 with tiles of ± 5 % beside them); tables, posters, streets, KITTI and TUM at most 0.47. Smooth,
-# all patterns but the gains of beams have 0.80 to 1.00; tables, posters, streets and KITTI at most 0.54, a wall of two
-# periods of a sine 0.59. Tables under a lamp that moves with the camera have 0.71 to 0.97, and are off by 3 to 140 mm.
+# (gains of beams with tiles of ± 5 % beside them 0.74); tables, posters, streets, KITTI and TUM at most 0.47. Smooth,
+# all patterns but the gains of beams have 0.80 to 1.00; tables, posters, streets and KITTI at most 0.54, a wall with
+# two periods of a sine 0.59. Tables under a lamp that moves with the camera have 0.71 to 0.97, errors 3 to 140 mm.
 _NO_TEXTURE = 0.7
 # Share by angles above which a channel is left out: distance, elevation, azimuth and time have at least 0.96.
 _LEFT_OUT = 0.9
-# Share of the variance above which equal values are a part such as that outside of an image: of views cut to a disc, a
-# box or a half and of the camera in KITTI's scans they have 0.73 to 0.98 (half of the points or more), of posters,
-# streets and intensities below a quantile at most 0.38.
+# Share of the variance of the mask of equal values above which they are a part such as that outside of an image. Views
+# cut to a disc, a box or a half, and the camera's view in KITTI's scans, have 0.73 to 0.98 (half of the points or
+# more); posters, streets and intensities below a quantile at most 0.38.
 _ONE_PART = 0.55
 # Neighbours of the part that count as its rim: a point itself and those around it.
 _RIM = 7
 # Bins of range, elevation and azimuth, of equally many points, and least number of points of each, half of which
-# predict. With 64 and 256 bins, patterns and textures are as far apart, but narrow beams less so with 64.
+# predict. 64 and 256 bins separate patterns from textures as well, but 64 less so for narrow beams.
 _BINS, _PER_BIN = 128, 16
-# Root mean square radii of a cloud from its centroid beyond which the origin is no sensor: from there range, elevation
-# and azimuth are coordinates, of which a texture of stripes may be a function. A view of 28° has 4.
+# Distance of the origin from the centroid, in root mean square radii of the cloud, beyond which the origin is no
+# sensor: from there range, elevation and azimuth are like Cartesian coordinates, of which a texture of stripes may be a
+# function. A view of 28° has 4.
 _FARTHEST = 4.0
-# Degree of the polynomial: with 3, jumps (time) are explained to 0.77, with 5, textures to 0.88. Ridge, as a fraction
-# of the mean eigenvalue of the normal equations, for float32; 1e-6 to 1e-3 give the same.
+# Degree of the polynomial: 3 explains jumps (time) to 0.77 only, 5 textures to 0.88. Ridge, as a fraction of the mean
+# eigenvalue of the normal equations, for float32; 1e-6 to 1e-3 give the same.
 _DEGREE, _RIDGE = 4, 1e-4
 # Bound of a prediction, standard deviations: a polynomial diverges where the other half has no points.
 _LARGEST = 3.0
-# Median distances from the centroid at which the coordinates of the polynomial level off, so that a few far points do
-# not decide it.
+# Distance from the centroid, in median distances, at which the coordinates of the polynomial level off, so that a few
+# far points do not decide it.
 _LEVEL = 2.0
 
 
 class Explained(NamedTuple):
-    """Shares of the variance of each channel: by angles and smooth. Of constant channels 0 and 1."""
+    """Shares of the variance of each channel; 0 and 1 for constant channels."""
 
     by_angles: Float[AnyArray, "C"]
     smooth: Float[AnyArray, "C"]
 
 
 class _Sample(NamedTuple):
-    """Evenly spaced rows of a cloud, of which the first half and the second predict each other. Channels have the mean
-    0 and the deviation 1, and are 0 where they are missing; weights are 1 where they are present, else 0, with one row
-    for all channels if none is missing."""
+    """Evenly spaced rows of a cloud, whose first and second halves predict each other. Channels are standardised, and 0
+    where missing; weights are 1 where present, else 0, in one row for all channels if none is missing."""
 
     points: Float[AnyArray, "3 n"]
     present: Bool[AnyArray, "n"]
@@ -73,14 +73,14 @@ class _Sample(NamedTuple):
 
 
 def channels_may_move(source: PointCloud) -> Bool[AnyScalar, ""]:
-    """Whether no channel is a texture, so that a pose that they alone hold may be that of no motion."""
+    """Whether no channel is a texture, so that a pose that only they constrain may be that of no motion."""
     by_angles, smooth = explained(source)
     return ((by_angles > _NO_TEXTURE) | (smooth > _NO_TEXTURE)).all()
 
 
 def warn_of_patterns(source: PointCloud) -> None:
-    """Warn that a pose is UNVERIFIED, as no channel of a concrete cloud is a texture; not of constant channels."""
-    largest = [max(each) for each in zip(*explained(source), strict=True)]
+    """Warn that a pose is UNVERIFIED because no channel of a concrete cloud, constant ones apart, is a texture."""
+    largest = [max(both) for both in zip(*explained(source), strict=True)]
     shares = [f"{share:.0%} of {name}" for name, share in zip(source.channel_names, largest, strict=True) if share < 1]
     if shares:
         warn(
@@ -90,8 +90,8 @@ def warn_of_patterns(source: PointCloud) -> None:
 
 
 def without_patterns(source: PointCloud, target: PointCloud) -> list[PointCloud]:
-    """The clouds with each channel set to 0 that is a function of range, elevation or azimuth in the source. The target
-    may be a map."""
+    """The clouds with those channels set to 0 that are a function of range, elevation or azimuth in the source (the
+    target may be a map)."""
     if not source.channels.shape[1] or source.channels.shape[1] != target.channels.shape[1]:
         return [source, target]
     by_angles = explained(primal(source)).by_angles
@@ -105,7 +105,8 @@ def without_patterns(source: PointCloud, target: PointCloud) -> list[PointCloud]
                     f"channel {name}: {share:.0%} of its variance is a function of range, elevation or azimuth about "
                     "the origin; it seems to move with the sensor, and is left out"
                 )
-    blank = _cached_blank if is_concrete(source, target, left_out) else _blank
+    # The cached copy is the same each time, with all that is cached of it.
+    blank = cached_with_cloud(_blank) if is_concrete(source, target, left_out) else _blank
     return [blank(cloud, left_out) for cloud in (source, target)]
 
 
@@ -113,37 +114,34 @@ def _blank(cloud: PointCloud, left_out: Bool[AnyArray, "C"]) -> PointCloud:
     return cloud.replace_rows(channels=numpy_for(cloud.channels, left_out).where(left_out, 0, cloud.channels))
 
 
-# The same copy each time, with all that is cached of it.
-_cached_blank = cached_with_cloud(_blank)
-
-
 def without_constant_part(cloud: PointCloud) -> PointCloud:
-    """The cloud without the channels that more than half of its points have in common, where these points lie together,
+    """The cloud with channels marked as missing where more than half of its points have one value and lie together,
     such as black outside of an image: the edge of this part may move with the sensor."""
     if not cloud.channels.shape[1]:
         return cloud
-    constant_part = _cached_constant_part if is_concrete(primal(cloud)) else _constant_part
-    part = constant_part(primal(cloud))
-    if is_concrete(part) and not part.any():
-        return cloud
+    fixed = primal(cloud)
+    part = cached_with_cloud(_constant_part)(fixed) if is_concrete(fixed) else _constant_part(fixed)
     if is_concrete(part):
-        names = [name for name, each in zip(cloud.channel_names, part.T, strict=True) if each.any()]
+        if not part.any():
+            return cloud
+        names = [name for name, rows in zip(cloud.channel_names, part.T, strict=True) if rows.any()]
         warn(
             f"channels {', '.join(names)}: {part.any(axis=1).sum()} of {len(part)} points lie together and have one "
             "value, as outside of an image; it counts as missing. Mark missing channels by channel_valid"
         )
-    return _cached_missing(cloud, part) if is_concrete(cloud, part) else _missing(cloud, part)
+    return cached_with_cloud(_missing)(cloud, part) if is_concrete(cloud, part) else _missing(cloud, part)
 
 
 def _constant_part(cloud: PointCloud) -> Bool[AnyArray, "N C"]:
     xp = numpy_for(cloud)
-    channels, rows = xp.asarray(cloud.channels), sampled_rows(xp.asarray(cloud.valid))
-    ordered = xp.sort(xp.where(rows[1][:, None], channels[rows[0]], xp.inf), axis=0)
-    middle = xp.take_along_axis(ordered, xp.full((1, channels.shape[1]), xp.sum(rows[1]) // 2), axis=0)
+    channels, (rows, valid) = xp.asarray(cloud.channels), sampled_rows(xp.asarray(cloud.valid))
+    # More than half of the points have one value: the median.
+    ordered = xp.sort(xp.where(valid[:, None], channels[rows], xp.inf), axis=0)
+    middle = xp.take_along_axis(ordered, xp.full((1, channels.shape[1]), xp.sum(valid) // 2), axis=0)
     part = channels == middle
-    share = xp.sum(part[rows[0]] & rows[1][:, None], axis=0) / xp.maximum(xp.sum(rows[1]), 1)
-    parts = cloud.replace_rows(channels=part.astype(channels.dtype))
-    constant_channels = (share > 0.5) & (share < 1) & (xp.maximum(*_measured(parts)) > _ONE_PART)
+    share = xp.sum(part[rows] & valid[:, None], axis=0) / xp.maximum(xp.sum(valid), 1)
+    masks = cloud.replace_rows(channels=part.astype(channels.dtype))
+    constant_channels = (share > 0.5) & (share < 1) & (xp.maximum(*_explained(masks)) > _ONE_PART)
     together = (part | ~constant_channels).all(axis=1) & constant_channels.any()
     if cloud.deferred_neighbors is not None and (xp is not np or together.any()):
         # Voxels across the edge hold means of both sides.
@@ -152,39 +150,31 @@ def _constant_part(cloud: PointCloud) -> Bool[AnyArray, "N C"]:
     return constant_channels & together[:, None]
 
 
-_cached_constant_part = cached_with_cloud(_constant_part)
-
-
 def _missing(cloud: PointCloud, part: Bool[AnyArray, "N C"]) -> PointCloud:
     present = ~part if cloud.channel_valid is None else cloud.channel_valid & ~part
     return cloud.replace_rows(channel_valid=present)
 
 
-_cached_missing = cached_with_cloud(_missing)
-
-
 def explained(cloud: PointCloud) -> Explained:
-    """The shares of a cloud; cached with a concrete one, and constant to autodiff."""
-    return _cached_measured(cloud) if is_concrete(cloud) else _measured(constant(cloud))
+    """Cached with a concrete cloud, and constant to autodiff."""
+    return cached_with_cloud(_explained)(cloud) if is_concrete(cloud) else _explained(constant(cloud))
 
 
-def _measured(cloud: PointCloud) -> Explained:
-    # Huge values overflow; shares that are not finite explain nothing.
+def _explained(cloud: PointCloud) -> Explained:
+    # Huge values overflow; comparisons with shares that are not finite are False.
     with np.errstate(all="ignore"):
         sample = _sample(cloud)
         return Explained(_by_angles(sample), _smooth(sample))
 
 
-_cached_measured = cached_with_cloud(_measured)
-
-
 def _sample(cloud: PointCloud) -> _Sample:
     xp = numpy_for(cloud)
     rows, present = sampled_rows(xp.asarray(cloud.valid))
+    # Every second row, then the others.
     order = np.argsort(np.arange(rows.size) % 2, stable=True)
     rows, present = rows[order], present[order]
     dtype = np.float64 if xp is np else cloud.points.dtype
-    points, channels = (xp.asarray(each)[rows].astype(dtype).T for each in (cloud.points, cloud.channels))
+    points, channels = (xp.asarray(array)[rows].astype(dtype).T for array in (cloud.points, cloud.channels))
     present = present & xp.isfinite(points).all(axis=0)
     weights = present[None].astype(dtype)
     if cloud.channel_valid is not None:
@@ -197,29 +187,34 @@ def _sample(cloud: PointCloud) -> _Sample:
 
 
 def _share(sample: _Sample, predicted: Float[AnyArray, "C n"]) -> Float[AnyArray, "C"]:
-    """The fraction of the variance that a prediction explains; 1 for constant channels."""
+    """The share of the variance that a prediction explains; 1 for constant channels."""
     total = (sample.channels**2).sum(axis=1)
-    left = (sample.weights * (sample.channels - predicted) ** 2).sum(axis=1)
-    return 1 - left / numpy_for(total).where(total > 0, total, 1)
+    unexplained = (sample.weights * (sample.channels - predicted) ** 2).sum(axis=1)
+    return 1 - unexplained / numpy_for(total).where(total > 0, total, 1)
 
 
 def _by_angles(sample: _Sample) -> Float[AnyArray, "C"]:
     xp = numpy_for(sample)
     x, y, z = sample.points
     distance = xp.sqrt(x * x + y * y + z * z)
-    half = (np.arange(x.size) >= _middle(x.size)).astype(int)
+    half = (np.arange(x.size) >= _first_half(x.size)).astype(int)
     count = sample.present.sum()
     num_bins = xp.clip(count // _PER_BIN, 1, _BINS)
     rows = xp.concatenate([sample.channels, xp.broadcast_to(sample.weights, sample.channels.shape)])
     shares = []
-    for place in (distance, z / xp.where(distance > 0, distance, 1), xp.arctan2(y, x)):
-        ranks = xp.argsort(xp.argsort(xp.where(sample.present, place, xp.inf)))
+    for coordinate in (distance, z / xp.where(distance > 0, distance, 1), xp.arctan2(y, x)):
+        ranks = xp.argsort(xp.argsort(xp.where(sample.present, coordinate, xp.inf)))
         bins = xp.minimum(ranks * num_bins // xp.maximum(count, 1), _BINS - 1)
-        sums = _sums(rows, half * _BINS + bins, 2 * _BINS)
+        # Sums per bin and half; each point is predicted from its bin in the other half.
+        keys = half * _BINS + bins
+        if is_concrete(rows, keys):
+            sums: Any = np.stack([np.bincount(keys, row, 2 * _BINS) for row in rows])
+        else:
+            sums = jnp.zeros((len(rows), 2 * _BINS), rows.dtype).at[:, keys].add(rows)
         totals, counts = xp.split(sums[:, (1 - half) * _BINS + bins], 2)
-        # A bin counts the mean of all as one more point.
+        # The mean of all points, 0, counts as one more point of each bin.
         shares.append(_share(sample, totals / (counts + 1)))
-    # From afar, coordinates are angles.
+    # A sensor far from the cloud sees angles that are like Cartesian coordinates, see `_FARTHEST`.
     center = sample.points.sum(axis=1) / xp.maximum(count, 1)
     radius = xp.sqrt((sample.present * ((sample.points.T - center) ** 2).sum(axis=1)).sum() / xp.maximum(count, 1))
     near = xp.sqrt((center**2).sum()) <= _FARTHEST * radius
@@ -227,23 +222,17 @@ def _by_angles(sample: _Sample) -> Float[AnyArray, "C"]:
     return xp.where(near & varies, xp.stack(shares).max(axis=0), 0)
 
 
-def _sums(rows: Float[AnyArray, "R n"], keys: Int[AnyArray, "n"], size: int) -> Float[AnyArray, "R size"]:
-    """The sum of each row over the columns of each key."""
-    if numpy_for(rows, keys) is np:
-        return np.stack([np.bincount(keys, row, size) for row in rows])
-    return jnp.zeros((len(rows), size), rows.dtype).at[:, keys].add(rows)
-
-
 def _smooth(sample: _Sample) -> Float[AnyArray, "C"]:
     xp = numpy_for(sample)
     basis = _monomials(sample)
-    middle = [_middle(basis.shape[1])]
-    halves = [xp.split(each, middle, axis=1) for each in (basis, sample.weights, sample.channels)]
+    middle = [_first_half(basis.shape[1])]
+    halves = [xp.split(array, middle, axis=1) for array in (basis, sample.weights, sample.channels)]
+    # The normal equations of each half, for each channel.
     equations = [
         (xp.stack([(row * part) @ part.T for row in weights]), values @ part.T)
         for part, weights, values in zip(*halves, strict=True)
     ]
-    matrix, side = (xp.stack(each) for each in zip(*equations, strict=True))
+    matrix, side = (xp.stack(parts) for parts in zip(*equations, strict=True))
     scale = xp.trace(matrix, axis1=-2, axis2=-1)[..., None, None] / len(basis)
     matrix = matrix + _RIDGE * xp.where(scale > 0, scale, 1) * np.eye(len(basis), dtype=matrix.dtype)
     matrix = xp.broadcast_to(matrix, (*side.shape, len(basis)))
@@ -252,13 +241,13 @@ def _smooth(sample: _Sample) -> Float[AnyArray, "C"]:
     return _share(sample, xp.clip(predicted, -_LARGEST, _LARGEST))
 
 
-def _middle(count: int) -> int:
-    """Number of rows in the first half of a sample."""
-    return (count + 1) // 2
+def _first_half(num_rows: int) -> int:
+    return (num_rows + 1) // 2
 
 
 def _monomials(sample: _Sample) -> Float[AnyArray, "m n"]:
-    """Products of up to `_DEGREE` coordinates about the centroid that level off far from it; root mean squares of 1."""
+    """Products of up to `_DEGREE` coordinates about the centroid, which level off far from it; scaled to unit root mean
+    square."""
     xp = numpy_for(sample)
     count = xp.maximum(sample.present.sum(), 1)
     offset = sample.points - sample.points.sum(axis=1, keepdims=True) / count
@@ -266,10 +255,10 @@ def _monomials(sample: _Sample) -> Float[AnyArray, "m n"]:
     level = _LEVEL * median(xp.where(sample.present, xp.sqrt(square), xp.nan))
     level = xp.where(level > 0, level, 1)
     bounded = sample.present * offset / xp.sqrt(level**2 + square)
-    found: dict[tuple[int, ...], Any] = {(): xp.ones_like(square)}
+    products: dict[tuple[int, ...], Any] = {(): xp.ones_like(square)}
     for degree in range(1, _DEGREE + 1):
         for axes in combinations_with_replacement(range(3), degree):
-            found[axes] = found[axes[1:]] * bounded[axes[0]]
-    rows = xp.stack(list(found.values()))
+            products[axes] = products[axes[1:]] * bounded[axes[0]]
+    rows = xp.stack(list(products.values()))
     sizes = xp.sqrt((rows * rows).mean(axis=1, keepdims=True))
     return rows / xp.where(sizes > 0, sizes, 1)

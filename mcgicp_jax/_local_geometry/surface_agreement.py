@@ -11,26 +11,23 @@ from mcgicp_jax._clouds.point_cloud import PointCloud
 from mcgicp_jax._math.poses import rotated
 from mcgicp_jax._search.kd_tree import nearest_in_position
 
-# Least thickness of a neighbourhood, as a fraction of its standard deviation along the surface: √ε of GICP. Without
-# noise it is 0 on planes, where the misfit would be rounding.
+# Least thickness of a neighbourhood, as a fraction of its standard deviation along the surface: √ε of GICP. Planes
+# without noise have the thickness 0, by which the misfit would be rounding.
 THINNEST = 0.032
-# Numbers of points that are compared, and of normals by which the directions of surfaces are counted. Twice as many
-# points cost 2 % of the time of `global_pose`.
+# Numbers of points that are compared, and of normals by which directions of surfaces are counted. Twice as many points
+# cost 2 % of the time of `global_pose`.
 _SAMPLE, _NUM_NORMALS = 2048, 400
-# Cosines of the largest angles between normals that agree, 30°, and that count as one direction, 26°.
+# Cosines of the largest angles between normals that agree (30°) and that count as one direction (26°).
 _AGREES, _SAME_DIRECTION = 0.866, 0.9
-# The quantile of the distances that is the misfit: most surfaces of two streets or rooms coincide by their ground and
-# walls alone, with a median as at right poses.
+# Quantile of the distances that is the misfit. A median would not do: in two different streets or rooms, most surfaces
+# coincide by their ground and walls alone.
 _QUANTILE = 0.9
 
 
 def surface_agreement(
     matrix: Float[np.ndarray, "4 4"], source: PointCloud, target: PointCloud, max_distance: float
 ) -> tuple[float, float]:
-    """Misfit and agreement of the normals of matched points of preprocessed clouds at a pose; ∞ and 0 without matches.
-
-    See `agreement_of`; `max_distance` of matches is in metres.
-    """
+    """`agreement_of` preprocessed clouds at a pose, matched within `max_distance`, metres; ∞ and 0 without matches."""
     points, others = (np.asarray(cloud.points, np.float64) for cloud in (source, target))
     count = min(len(points), _SAMPLE)
     rows = np.arange(count) * len(points) // count
@@ -51,19 +48,18 @@ def agreement_of(
     both_normals: tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3"]],
     thicknesses: tuple[Float[np.ndarray, "n"], Float[np.ndarray, "n"]],
 ) -> tuple[float, float]:
-    """Misfit and agreement of the normals of matches, from the difference of their points, their normals in one frame,
-    and the thicknesses of their neighbourhoods, metres.
+    """Misfit of matches and agreement of their normals. Offsets and thicknesses are in metres, normals in one frame.
 
     The misfit is a quantile of the distances along the normals, in thicknesses of the neighbourhoods; the agreement is
     the fraction of normals that agree. Both weigh each direction of surfaces equally, so that the ground does not
-    outvote the few surfaces that make a place.
+    outvote the few surfaces that distinguish a place.
     """
     normals, other_normals = both_normals
     across = [np.abs(np.sum(offsets * axes, axis=1)) for axes in both_normals]
     distances = np.maximum(*across) / np.sqrt(0.5 * np.sum(np.square(thicknesses), axis=0))
     sample = normals[:: -(-len(normals) // _NUM_NORMALS)]
     same = np.abs(np.einsum("ik,jk->ij", sample, normals)) > _SAME_DIRECTION
-    # A normal that resembles no other of the sample counts as if it were one more.
+    # A normal that resembles none of the sample counts as a direction of its own.
     weights = 1 / (1 + np.sum(same, axis=0))
     order = np.argsort(distances, kind="stable")
     cumulative = np.cumsum(weights[order])
@@ -75,8 +71,8 @@ def agreement_of(
 def spreads(
     points: Float[np.ndarray, "N 3"], neighbors: Any, rows: Int[np.ndarray, "n"]
 ) -> tuple[Float[np.ndarray, "n"], Float[np.ndarray, "n"], Float[np.ndarray, "n 3"]]:
-    """Standard deviations of the neighbourhoods of some rows along the normal and along the surface (the smaller one),
-    and the normals. `neighbors` are (N, k) rows, −1 for none."""
+    """Standard deviations of the neighbourhoods of rows, metres, along the normal and along the surface (the smaller
+    one), and the normals. `neighbors` are (N, k) rows, −1 for none."""
     near = neighbors[rows]
     offsets = np.where(near[..., None] >= 0, points[near] - points[rows][:, None], 0)
     offsets -= offsets.mean(axis=1, keepdims=True)

@@ -1,4 +1,4 @@
-"""The interface of terms: the cost of each correspondence, and the force and stiffness that follow from it.
+"""Terms: the cost of each correspondence, with its force and stiffness.
 
 The force is minus the gradient of half the cost with respect to the moved point T a, and the stiffness the Gauss-Newton
 Hessian of half the cost. Any residual that is linear in T a to first order has this form, and terms add.
@@ -7,7 +7,7 @@ Hessian of half the cost. Any residual that is linear in T a to first order has 
 from __future__ import annotations
 
 import abc
-from typing import Any, ClassVar, NamedTuple, Protocol, runtime_checkable
+from typing import Any, ClassVar, NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -90,9 +90,9 @@ class AbstractTerm(Numbers):
 
     # Key in `Surface.columns`, for terms that define `columns`.
     name: ClassVar[str] = ""
-    # Whether matches in the fine phase are nearest in position alone, even if the method also searches in channels.
+    # Whether matches of the fine phase are nearest in position alone, even if the method also searches in channels.
     by_position: ClassVar[bool] = False
-    # Edge of the cells within which scores are treated as correlated, in distances to the farthest neighbour; values
+    # Edge of the cells within which scores are treated as correlated, in distances to the farthest neighbour. Values
     # from 1 to 4 hardly change the covariance of a pose.
     correlation_length: ClassVar[float] = 2.0
 
@@ -100,8 +100,8 @@ class AbstractTerm(Numbers):
 
     @staticmethod
     def columns(around: Neighborhoods, local: LocalGeometry | None) -> Any:
-        """Further values of each point, which `linearize` finds in `Surface.columns[name]`: a pytree of arrays
-        (n, ...), or None."""
+        """Further values of each point for `linearize`, in `Surface.columns[name]`: a pytree of (n, ...) arrays, or
+        None."""
         return None
 
     @property
@@ -120,10 +120,10 @@ class AbstractTerm(Numbers):
 
 
 class AbstractAdaptiveTerm(AbstractTerm):
-    """A term that estimates numbers from the residuals, such as their scale.
+    """A term that estimates numbers, such as a scale, from the residuals at each pose of the fine phase.
 
-    The numbers are estimated again at each pose of the fine phase, and are constants to autodiff. A registration with
-    such a term always starts with a coarse phase, in which the term has its initial numbers.
+    The numbers are constants to autodiff. A registration with such a term always starts with a coarse phase, in which
+    the term has its initial numbers.
     """
 
     @abc.abstractmethod
@@ -132,7 +132,7 @@ class AbstractAdaptiveTerm(AbstractTerm):
 
     @abc.abstractmethod
     def adapt(self, sample: Any, fraction: Float[AnyScalar, ""]) -> AbstractTerm:
-        """The term with its numbers estimated from some correspondences, computed by NumPy if these are concrete.
+        """The term with its numbers estimated from a sample; computed by NumPy if the sample is concrete.
 
         Args:
             sample: result of `sample` for an even sample of the source points, NaN for points without a match.
@@ -150,12 +150,8 @@ class AbstractAdaptiveTerm(AbstractTerm):
 
     @abc.abstractmethod
     def with_response(self, samples: Any) -> AbstractTerm:
-        """The term for the covariance of the pose, whose stiffness is the change of the force when the points move and
-        are matched again.
-
-        Args:
-            samples: results of `sample` at each of the `shifts`, with new matches, stacked.
-        """
+        """The term for the covariance of the pose. Its stiffness is the change of the force when the points move and
+        are matched again; `samples` are stacked results of `sample` at each of the `shifts`, with new matches."""
 
 
 def is_adaptive(terms: tuple[AbstractTerm, ...]) -> bool:
@@ -163,7 +159,7 @@ def is_adaptive(terms: tuple[AbstractTerm, ...]) -> bool:
 
 
 def with_numbers_of(terms: tuple[AbstractTerm, ...], others: tuple[AbstractTerm, ...]) -> tuple[AbstractTerm, ...]:
-    """The terms with the numbers that the others have estimated, which are constants to autodiff."""
+    """The terms with the numbers that the others have estimated, as constants to autodiff."""
     return tuple(
         term.with_numbers_of(other) if isinstance(term, AbstractAdaptiveTerm) else term
         for term, other in zip(terms, others, strict=True)
@@ -171,21 +167,8 @@ def with_numbers_of(terms: tuple[AbstractTerm, ...], others: tuple[AbstractTerm,
 
 
 def linearize(terms: tuple[AbstractTerm, ...], matches: PosedMatches) -> Linearization:
-    """Sum of the terms."""
     first, *others = (term.linearize(matches) for term in terms)
     return sum(others, start=first)
-
-
-@runtime_checkable
-class HasInformation(Protocol):
-    """The members of an `AbstractMethod` that the term uses."""
-
-    @property
-    def needs_covariances(self) -> tuple[str, ...]: ...
-
-    def information(
-        self, target: Float[Array, "6 n"], source: Float[Array, "6 n"], rotation: Float[Array, "3 3"]
-    ) -> Float[Array, "6 n"]: ...
 
 
 class Mahalanobis(AbstractTerm):
@@ -195,7 +178,7 @@ class Mahalanobis(AbstractTerm):
         method: an `AbstractMethod`.
     """
 
-    method: HasInformation
+    method: Any
 
     @property
     def matches_slide(self) -> bool:

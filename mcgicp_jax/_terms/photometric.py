@@ -9,25 +9,23 @@ Cloud Registration Revisited, ICCV 2017). With p = T a and e = p − b, each cor
 
 Both points contribute the fitted value v instead of the measured one, since a measured value combined with a slope that
 is smoothed over a neighbourhood is biased at edges. v is the mean of the neighbours' values, extrapolated to the point
-along g, with weights that decrease with the squared distance (Epanechnikov). At edges, a neighbour that enters the
-neighbourhood then changes v less. The negative log-likelihood is Σ_k q_k/f_k Σ_i ρ(r_k²/σ_k²), so that all residuals
-count in standard deviations and no weight is set by hand. At each pose of the fine phase, `adapt` estimates from the
-residuals themselves
+along g, with weights that decrease with the squared distance (Epanechnikov), so that a neighbour that enters the
+neighbourhood at an edge changes v less. The negative log-likelihood is Σ_k q_k/f_k Σ_i ρ(r_k²/σ_k²): all residuals
+count in standard deviations, and no weight is set by hand. At each pose of the fine phase, `adapt` estimates from the
+residuals, as constants to autodiff,
 
-- σ_k, one scale per residual: 1.4826 times the median absolute deviation, where there is a slope. It contains the noise
-  of both measurements, the noise of the fits and the error of the interpolation. Channels that disagree, as from a
-  camera that is not synchronised, get a large σ.
-- f_k, the design effect (Kish 1965): the variance of the summed scores over the variance of independent ones. Residuals
-  of neighbours share samples, exposure and relief, so that n of them count as n/f_k. With the forces summed over cells,
-  u_c: f_k = Σ_c |u_c|² / Σ_i w_i |h_i|²/σ_k², at least 1. (The mean eigenvalue of H^{-1/2} (Σ u uᵀ)
-  H^{-1/2} over forces and torques differs by a third and changed errors by at most 3 %.)
-- q_k, the reliability of the slopes (Fuller, Measurement Error Models, 1987): Σ w g_Bᵀ R g_A / Σ w |h|², at most 1.
-  The noise of the gradients is independent in the two clouds, so that the numerator contains the true slopes alone. A
+- σ_k, one scale per residual: 1.4826 times the median absolute deviation where there is a slope. It contains the noise
+  of both measurements and of the fits, and the error of the interpolation. Channels that disagree, as from a camera
+  that is not synchronised, get a large σ.
+- f_k, the design effect (Kish 1965): the variance of the summed scores over that of independent ones. Residuals of
+  neighbours share samples, exposure and relief, so that n of them count as n/f_k. With the forces u_c summed over
+  cells, f_k = Σ_c |u_c|² / Σ_i w_i |h_i|²/σ_k², at least 1. (The mean eigenvalue of H^{-1/2} (Σ u uᵀ) H^{-1/2} over
+  forces and torques differs by a third and changed errors by at most 3 %.)
+- q_k, the reliability of the slopes (Fuller, Measurement Error Models, 1987): Σ w g_Bᵀ R g_A / Σ w |h|², at most 1. The
+  noise of the gradients is independent in the two clouds, so that the numerator contains the true slopes alone. A
   motion changes the force by the fraction q of its stiffness. The pose from one channel alone has a covariance of f/q²
   times the inverse stiffness; multiplying each channel by q combines such poses with minimal variance. A channel of
   pure noise has q ≈ 0. Normals count as reliable, q_0 = 1.
-
-These numbers are constants to autodiff.
 """
 
 from __future__ import annotations
@@ -39,7 +37,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Float, Int
 
 from mcgicp_jax._compute.concrete import AnyArray, AnyScalar, numpy_for
 from mcgicp_jax._local_geometry.cloud_statistics import gain_and_offset
@@ -56,14 +54,14 @@ from mcgicp_jax._terms.base import AbstractAdaptiveTerm, AbstractTerm, Lineariza
 _KERNEL_SCALE = 20**0.5
 # Edge of the cells of the design effect, spacings. 5 to 20 made little difference.
 _CELL = 10.0
-# Radius of the weights of fitted values, in distances to the farthest neighbour. With 1 instead, errors are 3 % less on
+# Radius of the weights of fitted values, in distances to the farthest neighbour. With 1, errors are 3 % less on
 # posters, 4 % less on the recorded table and 4 % more on 7-Scenes; with 1.4, 1 % more on the former two.
 _VALUE_RADIUS = 1.25
-# Spacings: a match further off lies outside the neighbourhood that the channels were fitted over (the 20 nearest of
-# randomly placed points lie within 5.4).
+# Largest distance of matches whose channels are compared, spacings: others lie outside the neighbourhood of the fits
+# (the 20 nearest of randomly placed points lie within 5.4).
 _MAX_OFFSET = 5.0
-# Least slope of a residual that counts for its σ, relative to the root mean square: that of a constant part, as black
-# outside an image, is 0 up to rounding, and one of noise is below it once in 10⁶. (1e-4 to 0.03 differ by 3 % on
+# Least slope of a residual that counts for its σ, relative to the root mean square: slopes of a constant part, as black
+# outside an image, are 0 up to rounding, and slopes of noise fall below it once in 10⁶. (1e-4 to 0.03 differ by 3 % on
 # posters of which 0 to 60 % are black.)
 _LEAST_SLOPE = 1e-3
 # Least σ, as an offset in spacings: rendered scenes leave no residuals.
@@ -81,39 +79,25 @@ _PER_MEDIAN = 1.4826
 
 
 class FittedChannels(NamedTuple):
-    """The columns of the term: fitted channels of each point.
-
-    Attributes:
-        normal: unit normal.
-        value: channel at the point by its linear fit; NaN where unknown.
-        gradient: of that fit, channel units per metre, in the tangent plane; 0 where unknown.
-    """
+    """The columns of the term: linear fits of the channels at each point."""
 
     normal: Float[AnyArray, "n 3"]
-    value: Float[AnyArray, "n C"]
-    gradient: Float[AnyArray, "n C 3"]
+    value: Float[AnyArray, "n C"]  # NaN where unknown
+    gradient: Float[AnyArray, "n C 3"]  # in the tangent plane, channel units per metre; 0 where unknown
 
 
 class Residuals(NamedTuple):
-    """The 1 + C = K residuals of n correspondences; NaN and slope 0 where there is none.
+    """The 1 + C = K residuals of n correspondences; NaN and slope 0 where there is none."""
 
-    Attributes:
-        values: r_k, metres and channel units.
-        slopes: derivatives of the residuals with respect to T a.
-        own: fitted channels of the source points.
-        products: g_Bᵀ R g_A, the gradient of the source multiplied by its gain.
-        moved: T a, metres; 0 where there is no match.
-    """
-
-    values: Float[AnyArray, "*some n K"]
-    slopes: Float[AnyArray, "*some n K 3"]
-    own: Float[AnyArray, "*some n C"]
-    products: Float[AnyArray, "*some n C"]
-    moved: Float[AnyArray, "*some n 3"]
+    values: Float[AnyArray, "*some n K"]  # r_k, metres and channel units
+    slopes: Float[AnyArray, "*some n K 3"]  # derivatives of the residuals with respect to T a
+    own: Float[AnyArray, "*some n C"]  # fitted channels of the source points
+    products: Float[AnyArray, "*some n C"]  # g_Bᵀ R g_A, the gradient of the source multiplied by its gain
+    moved: Float[AnyArray, "*some n 3"]  # T a, metres; 0 where there is no match
 
 
 def fitted_channels(around: Neighborhoods, local: LocalGeometry | None) -> FittedChannels:
-    """Fit each channel over the tangent plane of each point. Differentiable with respect to points and channels."""
+    """Fit each channel over the tangent plane of each point; differentiable by points and channels."""
     if local is None:
         raise ValueError(NO_NEIGHBORS)
     normal = local.normal.T
@@ -147,7 +131,7 @@ class Photometric(AbstractAdaptiveTerm):
         deviations: σ of each residual, metres and channel units; 0 before the first estimate.
         designs: f/q, design effect over reliability, of each residual.
         gains, offsets: applied to the fitted values of the source's channels; 1 and 0 unless `equalizes_channels`.
-        coarse: the term of the coarse phase, used until the numbers are known.
+        coarse: the term of the coarse phase, before the first estimate.
         robust: kernel of each residual in standard deviations; None: Cauchy's with k² = 20. Each residual has its own
             weight: a reflection is an outlier of the channels, but not of the geometry.
         equalizes_channels: whether gains and offsets are estimated.
@@ -177,7 +161,6 @@ class Photometric(AbstractAdaptiveTerm):
         robust: AbstractKernel | None,
         equalizes_channels: bool,
     ) -> Photometric:
-        """The term before its numbers are known."""
         xp = numpy_for(spacing)
         spacing = xp.asarray(spacing)
         zeros, ones = (make(1 + num_channels, spacing.dtype) for make in (xp.zeros, xp.ones))
@@ -199,12 +182,12 @@ class Photometric(AbstractAdaptiveTerm):
             for k, (value, slope) in enumerate(zip(values, slopes, strict=True)):
                 counts = (self.deviations[k] > 0) & ~jnp.isnan(value)
                 deviation = jnp.where(self.deviations[k] > 0, self.deviations[k], 1)
-                share = jnp.where(counts, 1 / self.designs[k], 0)
+                effective = jnp.where(counts, 1 / self.designs[k], 0)
                 scaled, direction = jnp.where(counts, value, 0) / deviation, slope / deviation
                 weight = robust.weight(scaled**2)
-                information = share * alg.outer(direction)
-                force = -share * weight * scaled * direction
-                cost = share * robust.rho(scaled**2)
+                information = effective * alg.outer(direction)
+                force = -effective * weight * scaled * direction
+                cost = effective * robust.rho(scaled**2)
                 parts.append(Linearization(force, weight * information, cost, weight, residual, information))
             return sum(parts[1:], start=parts[0])
 
@@ -212,25 +195,28 @@ class Photometric(AbstractAdaptiveTerm):
         return jax.lax.cond(self.deviations[0] > 0, photometric, lambda: self.coarse.linearize(matches))
 
     def _residuals(self, matches: PosedMatches) -> tuple[list[Any], list[Any], list[Any], list[Any]]:
-        """The columns of `Residuals` but the last, as one array (n,) or (3, n) per residual or channel."""
+        """The fields of `Residuals` but `moved`, each as a list of arrays (n,) or (3, n)."""
         source, target, moved, rotation, valid = matches
         offset = jnp.where(valid, moved - target.points.T, 0)
         a, b = source.columns[self.name], target.columns[self.name]
-        normal = _mean_direction(jnp.dot(rotation, a.normal.T, precision="highest"), b.normal.T)
+        # The unit mean of both normals, whose signs are arbitrary. The sum is at least √2 long: the angle between two
+        # lines is at most 90°.
+        source_normal, target_normal = jnp.dot(rotation, a.normal.T, precision="highest"), b.normal.T
+        total = target_normal + jnp.where(alg.inner(source_normal, target_normal) < 0, -1, 1) * source_normal
+        normal = total / jnp.sqrt(alg.inner(total, total))
         near = valid & (alg.inner(offset, offset) <= (_MAX_OFFSET * self.spacing) ** 2)
         values, slopes = [jnp.where(valid, alg.inner(normal, offset), jnp.nan)], [jnp.where(valid, normal, 0)]
         own, products = [], []
         for channel in range(self.gains.shape[0]):
-            here, there = a.value[:, channel], b.value[:, channel]
-            measured = near & ~jnp.isnan(here) & ~jnp.isnan(there)
+            source_value, target_value = a.value[:, channel], b.value[:, channel]
+            measured = near & ~jnp.isnan(source_value) & ~jnp.isnan(target_value)
             turned = self.gains[channel] * jnp.dot(rotation, a.gradient[:, channel].T, precision="highest")
             gradient = b.gradient[:, channel].T
             slope = 0.5 * (gradient + turned)
-            fitted = jnp.where(measured, here, 0)
-            predicted = jnp.where(measured, there, 0) + alg.inner(slope, offset)
-            values.append(
-                jnp.where(measured, predicted - self.gains[channel] * fitted - self.offsets[channel], jnp.nan)
-            )
+            fitted = jnp.where(measured, source_value, 0)
+            predicted = jnp.where(measured, target_value, 0) + alg.inner(slope, offset)
+            residual = predicted - self.gains[channel] * fitted - self.offsets[channel]
+            values.append(jnp.where(measured, residual, jnp.nan))
             slopes.append(jnp.where(measured, slope, 0))
             own.append(jnp.where(measured, fitted, jnp.nan))
             products.append(jnp.where(measured, alg.inner(turned, gradient), 0))
@@ -243,15 +229,10 @@ class Photometric(AbstractAdaptiveTerm):
         return Residuals(rows[0], jnp.stack(slopes).transpose(2, 0, 1), rows[1], rows[2], moved)
 
     def adapt(self, sample: Residuals, fraction: Float[AnyScalar, ""]) -> Photometric:
-        """The term with its numbers estimated from the residuals of an even sample of the correspondences.
-
-        In a sample each cell holds fewer pairs of correlated residuals, so that the excess f − 1 of the sample is
-        divided by `fraction`.
-        """
         xp = numpy_for(self, sample, fraction)
         # NumPy takes two thirds of the time for contiguous columns.
         values, own, products, moved = (
-            xp.asarray(each).T.copy() for each in (sample.values, sample.own, sample.products, sample.moved)
+            xp.asarray(rows).T.copy() for rows in (sample.values, sample.own, sample.products, sample.moved)
         )
         slopes = xp.asarray(sample.slopes).transpose(1, 2, 0).copy()
         gains, offsets = self.gains, self.offsets
@@ -263,10 +244,10 @@ class Photometric(AbstractAdaptiveTerm):
         slopes = xp.where(measured[:, None], slopes, 0)
         lengths = xp.sum(slopes**2, axis=1)
         number = xp.maximum(xp.sum(measured, axis=1), 1)
-        # Residuals of constant parts are 0, whatever the pose.
+        # σ. Residuals of constant parts, which are 0 at any pose, do not count.
         sloping = lengths * number[:, None] > _LEAST_SLOPE**2 * xp.sum(lengths, axis=1, keepdims=True)
-        telling = xp.where(sloping, values, xp.nan)
-        spread = _PER_MEDIAN * median(xp.abs(telling - median(telling)[:, None]))
+        sloping_values = xp.where(sloping, values, xp.nan)
+        spread = _PER_MEDIAN * median(xp.abs(sloping_values - median(sloping_values)[:, None]))
         least = _LEAST_OFFSET * self.spacing * xp.sqrt(xp.sum(lengths, axis=1) / number)
         deviations = xp.where(xp.isfinite(spread), xp.maximum(spread, least), 0)
         scale = xp.where(deviations > 0, deviations, 1)[:, None]
@@ -275,15 +256,16 @@ class Photometric(AbstractAdaptiveTerm):
         scores = (weights * scaled / scale)[:, None] * slopes
         expected = xp.sum(weights * lengths / scale**2, axis=1)
         size = xp.where(self.spacing > 0, _CELL * self.spacing, 1)
-        # Padding, which is NaN, does not change which cells share a sum. Samples of some points have equally many rows.
+        # Without the NaNs of padding, which thus does not change which cells collide; a sample of a part of the points
+        # always has the same number of rows.
         num_points = xp.maximum(xp.sum(~xp.isnan(moved[0])), 1)
         num_cells = xp.where(fraction < 1, moved.shape[1], num_points).astype(np.int32)
         cells = cell_numbers(tuple(xp.nan_to_num(xp.floor(moved / size)).astype(np.int32)), num_cells)
-        seen = _squared_sums(scores, cells)
-        # Of independent scores, `expected` without the factor.
-        alone = xp.sum((scores**2).sum(axis=1), axis=1)
+        correlated = _squared_sums(scores, cells)
+        independent = xp.sum((scores**2).sum(axis=1), axis=1)
         expected = xp.where(expected > 0, expected, 1)
-        designs = xp.maximum((alone + (seen - alone) / fraction) / expected, 1)
+        # In a sample, a cell holds fewer pairs of correlated residuals, by the factor `fraction`.
+        designs = xp.maximum((independent + (correlated - independent) / fraction) / expected, 1)
         agreeing = xp.sum(weights[1:] * xp.where(measured[1:], products, 0), axis=1)
         assumed = xp.sum(weights[1:] * lengths[1:], axis=1)
         reliability = xp.clip(agreeing / xp.where(assumed > 0, assumed, 1), _LEAST_RELIABILITY, 1)
@@ -305,23 +287,20 @@ class Photometric(AbstractAdaptiveTerm):
     def with_response(self, samples: Residuals) -> Photometric:
         """The term with designs divided by the response κ of each residual, so that its stiffness is the true one.
 
-        When points move and are matched again, the sum of the forces changes by a fraction κ of the change that the
-        slopes predict: 0.5 for the colours of posters, 0.5 to 0.75 in the box room, 0.75 for the normals of both. Where
-        slopes are large, the fitted values of two neighbouring matches differ by less than the slopes predict.
+        When points move and are matched again, the sum of the forces changes by a fraction κ of what the slopes
+        predict: 0.5 for the colours of posters, 0.5 to 0.75 in the box room, 0.75 for the normals of both. Where slopes
+        are large, the fitted values of two neighbouring matches differ by less than the slopes predict.
         """
         xp = numpy_for(self, samples)
         values, slopes = xp.asarray(samples.values), xp.asarray(samples.slopes)
         measured = ~xp.isnan(values) & (self.deviations > 0)
         scale = xp.where(self.deviations > 0, self.deviations, 1)
-        scaled, slopes = (
-            xp.where(measured, values, 0) / scale,
-            xp.where(measured[..., None], slopes, 0) / scale[:, None],
-        )
+        scaled = xp.where(measured, values, 0) / scale
+        slopes = xp.where(measured[..., None], slopes, 0) / scale[:, None]
         weights = 1 / (1 + scaled**2 / _KERNEL_SCALE**2)
         forces = xp.sum((weights * scaled)[..., None] * slopes, axis=1)
-        change = sum(forces[2 * axis, :, axis] - forces[2 * axis + 1, :, axis] for axis in range(3)) / (
-            2 * _SHIFT * self.spacing
-        )
+        differences = sum(forces[2 * axis, :, axis] - forces[2 * axis + 1, :, axis] for axis in range(3))
+        change = differences / (2 * _SHIFT * self.spacing)
         predicted = xp.sum(weights * xp.sum(slopes**2, axis=3), axis=(0, 1)) / len(values)
         response = change / xp.where(predicted > 0, predicted, 1)
         response = xp.where(predicted > 0, xp.clip(response, _LEAST_RESPONSE, 1), 1)
@@ -336,10 +315,3 @@ def _squared_sums(scores: Float[AnyArray, "K 3 n"], cells: Int[AnyArray, "n"]) -
     else:
         sums = jnp.zeros_like(columns.T).at[cells].add(columns.T)
     return (sums**2).sum(axis=0).reshape(scores.shape[:2]).sum(axis=1)
-
-
-def _mean_direction(a: Float[Array, "3 n"], b: Float[Array, "3 n"]) -> Float[Array, "3 n"]:
-    """Unit mean of two lines, given by unit vectors of either sign."""
-    total = b + jnp.where(alg.inner(a, b) < 0, -1, 1) * a
-    # At least √2 long: the angle between two lines is at most 90°.
-    return total / jnp.sqrt(alg.inner(total, total))
