@@ -232,6 +232,14 @@ def test_given_neighbours_stay_where_a_channel_is_left_out(raw):
     assert max(pose_error(found.matrix, expected.matrix)) < 1e-5
 
 
+@pytest.mark.slow
+def test_units_are_warned_of_in_chunks_too(raw):
+    source, target, _ = raw[0]
+    source = mcg.PointCloud(source.points, covariances=np.tile(1e-3 * np.eye(3), (len(source), 1, 1)))
+    with pytest.warns(UserWarning, match="covariances look like m²"):
+        mcg.register_batch([source], [target], mcg.GICP(), max_distance=0.5, search=DenseSearch())
+
+
 def test_a_stream_yields_invalid_pairs_and_those_of_many_updates_on_the_way(clouds, monkeypatch):
     sources, targets = ([side[1]] * 63 for side in clouds)
     sources[2] = np.zeros((3, 3))

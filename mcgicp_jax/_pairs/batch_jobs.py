@@ -29,17 +29,15 @@ from mcgicp_jax._methods.base import AbstractMethod
 from mcgicp_jax._pairs.register import coarse_distance_from, doubt_of, register_from, start_from_anywhere
 from mcgicp_jax._registration.assessment import registration_of
 from mcgicp_jax._registration.chunks import ChunkPair, Refused, run_pairs
-from mcgicp_jax._registration.input_checks import check_clouds, warn_of_estimated_parameters, warn_of_lengths
+from mcgicp_jax._registration.input_checks import (
+    check_clouds,
+    warn_of_estimated_parameters,
+    warn_of_inputs,
+    warn_of_lengths,
+)
 from mcgicp_jax._registration.options import Options
 from mcgicp_jax._registration.pose_derivative import Inputs
-from mcgicp_jax._registration.register_pair import (
-    Run,
-    prepared,
-    preprocessed,
-    results_of,
-    run_pair,
-    warn_of_inputs,
-)
+from mcgicp_jax._registration.register_pair import Run, prepared, preprocessed, results_of, run_pair
 from mcgicp_jax._registration.result import RegistrationResult, Status, computed, verified
 from mcgicp_jax._registration.tie_points_and_prior import GivenPrior, checked_measurements
 from mcgicp_jax._search.brute_force import DenseSearch, default_search
@@ -298,7 +296,7 @@ class BatchJob:
         source, target = ready.inputs[:2]
         check_clouds(source, target, self.method)
         if pair.index < _CHECKED:
-            warn_of_inputs(ready.inputs, self.options)
+            warn_of_inputs(source, target, self.method, self.options.equalize_channels)
         pose = se3_from_matrix(centred_pose(ready.init, source, target), source.points.dtype)
         # `preprocess` returns clouds that have neighbours as they are; the others get theirs on the devices.
         sides = [self._padded(*both) for both in zip((source, target), clouds.values(), strict=True)]

@@ -10,9 +10,10 @@ from mcgicp_jax._clouds.voxel_size import raw_spacing
 from mcgicp_jax._compute.concrete import is_concrete
 from mcgicp_jax._compute.linear_maps import primal
 from mcgicp_jax._compute.messages import warn
-from mcgicp_jax._local_geometry.cloud_statistics import point_spacing
+from mcgicp_jax._local_geometry.cloud_statistics import point_spacing, warn_of_units
 from mcgicp_jax._math.statistics import median, sampled_rows
 from mcgicp_jax._methods.base import AbstractMethod
+from mcgicp_jax._methods.icp import GICP
 from mcgicp_jax._methods.multichannel_gicp import MultiChannelGICP
 from mcgicp_jax._pose_solver.matched import Motion
 from mcgicp_jax._registration.loop import LoopResult
@@ -214,10 +215,11 @@ def _differ(lengths: list[float]) -> bool:
     return 0 < least < largest / _OTHER_LENGTHS
 
 
-def warn_of_covariances(source: PointCloud, target: PointCloud) -> None:
-    """Warn if one cloud has covariances in another unit than GICP's, which are computed for the other cloud."""
+def warn_of_inputs(source: PointCloud, target: PointCloud, method: AbstractMethod, equalize_channels: bool) -> None:
+    """Warn of channels in different units; and with GICP, if one cloud has covariances in another unit than GICP's,
+    which are computed for the other cloud."""
     for name, cloud, other in (("source", source, target), ("target", target, source)):
-        if cloud.covariances is not None and other.covariances is None:
+        if isinstance(method, GICP) and cloud.covariances is not None and other.covariances is None:
             rows, counts = sampled_rows(cloud.valid)
             trace = float(median(np.trace(np.asarray(cloud.covariances)[rows[counts]], axis1=1, axis2=2)))
             if not _LEAST_TRACE <= trace / 2 <= _LARGEST_TRACE:
@@ -225,3 +227,6 @@ def warn_of_covariances(source: PointCloud, target: PointCloud) -> None:
                     f"{name}: covariances look like m² (median trace {trace:.2g}; GICP's are dimensionless with trace "
                     '2). For voxel cells use NDT or D2DNDT, or voxel_gaussians(..., of="covariances")'
                 )
+    if method.uses_channels and not equalize_channels:
+        check_channels(source, target, method)
+        warn_of_units(source, target)

@@ -22,7 +22,6 @@ from mcgicp_jax._compute.messages import messages_named, warn
 from mcgicp_jax._compute.threads import in_new_thread, with_settings_of_package
 from mcgicp_jax._local_geometry.cloud_statistics import (
     warn_of_exposure,
-    warn_of_units,
     with_channels_matched,
 )
 from mcgicp_jax._local_geometry.neighborhoods import check_neighbors
@@ -47,9 +46,9 @@ from mcgicp_jax._registration.correspondences import find_correspondences, index
 from mcgicp_jax._registration.input_checks import (
     check_channels,
     check_clouds,
-    warn_of_covariances,
     warn_of_extensions,
     warn_of_hard_matches,
+    warn_of_inputs,
 )
 from mcgicp_jax._registration.loop import LoopResult, Problem, State
 from mcgicp_jax._registration.on_host import HostExecutor
@@ -187,7 +186,7 @@ def run_pair(given: Inputs, init: Pose | None, options: Options, traced: bool = 
         return run_loop(inputs, problem, search, options.max_iterations, traced)
 
     if not traced:
-        warn_of_inputs(given, options)
+        warn_of_inputs(given.source, given.target, given.method, options.equalize_channels)
     *coarse, inputs = _at_scales(_equalized(given) if options.equalize_channels else given, options.voxel_sizes)
     start = init
     for scale in coarse:
@@ -203,7 +202,7 @@ def run_pair(given: Inputs, init: Pose | None, options: Options, traced: bool = 
         # Parameters left None are chosen anew, from the channels as equalised by the matches.
         again = _equalized(run.inputs._replace(method=inputs.method), _nearest_points(run, search))
         run = solve(again, _final_pose(run), replace(options, max_coarse_distance=0.0))
-    elif not traced and _compares_channels(given, options):
+    elif not traced and given.method.uses_channels and not options.equalize_channels:
         if run.loop.state.status == Status.UNVERIFIED and run.problem.settings.channels_may_move:
             warn_of_patterns(run.inputs.source)
         warn_of_exposure(inputs.source, inputs.target, lambda: _nearest_points(run, search))
@@ -221,19 +220,6 @@ def run_pair(given: Inputs, init: Pose | None, options: Options, traced: bool = 
         settings = settings._replace(max_distance=settings.fine_distance)
     problem = replace(run.problem, start=constant(run.loop.state.pose), settings=settings, measurements=fusion)
     return run_loop(run.inputs, problem, search, options.max_iterations, traced)
-
-
-def warn_of_inputs(given: Inputs, options: Options) -> None:
-    """Warn of units of covariances and channels that differ between the clouds."""
-    if isinstance(given.method, GICP):
-        warn_of_covariances(given.source, given.target)
-    if _compares_channels(given, options):
-        check_channels(given.source, given.target, given.method)
-        warn_of_units(given.source, given.target)
-
-
-def _compares_channels(given: Inputs, options: Options) -> bool:
-    return given.method.uses_channels and not options.equalize_channels
 
 
 @with_settings_of_package
