@@ -210,7 +210,7 @@ class _Group(Generic[Key]):
         placed = jax.device_put(chunk, NamedSharding(mesh, PartitionSpec("pairs")))
         self._dispatched[-1] = pairs, first, self._program(placed, limit)
 
-    def _fetched(self) -> list[Ended[Key] | Refused[Key]]:
+    def _fetched(self) -> list[Any]:
         """The results of the oldest chunk; those of its pairs that have not ended join the slow ones."""
         pairs, first, packed = self._dispatched[0]
         results = jax.device_get(packed).tree
