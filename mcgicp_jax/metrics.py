@@ -79,7 +79,7 @@ def ate(poses: Poses, true_poses: Poses, alignment: Literal["umeyama", "first"] 
         raise ValueError(f"alignment: expected 'umeyama' or 'first', got {alignment!r}")
     positions, true_positions = estimated[:, :3, 3], true[:, :3, 3]
     if alignment == "umeyama":
-        # The least-squares rotation about the centroids, without a reflection.
+        # The least-squares rotation about the centroids, without a reflection (Umeyama 1991).
         centered, center = positions - positions.mean(axis=0), true_positions.mean(axis=0)
         left, _, right = np.linalg.svd((true_positions - center).T @ centered)
         sign = np.sign(np.linalg.det(left) * np.linalg.det(right))

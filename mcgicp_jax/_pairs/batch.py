@@ -80,9 +80,10 @@ def register_as_completed(
 ) -> Generator[tuple[int, RegistrationResult], None, None]:
     """Register many pairs of clouds of any sizes and yield each result as soon as it is computed.
 
-    Pairs are independent: a result is bitwise the same for any other pairs, any order and any number of workers, and a
-    slow pair does not delay others. Invalid pairs (too few finite points, mismatched channels, unreadable file, a
-    function that raises) get the status `INVALID_INPUT` and a warning. Iterators are consumed lazily.
+    Pairs are independent: a result is the same for any other pairs, any order and any number of workers, bitwise on a
+    CPU and to rounding on accelerators, and a slow pair does not delay others. Invalid pairs (too few finite points,
+    mismatched channels, unreadable file, a function that raises) get the status `INVALID_INPUT` and a warning.
+    Iterators are consumed lazily.
 
     Args:
         sources, targets: iterables of equal length, of clouds from `preprocess`, raw clouds or (N, 3) arrays, metres;
@@ -106,9 +107,9 @@ def register_as_completed(
             default `KDTreeSearch` with one thread per pair. With `DenseSearch`, or without a search on accelerators,
             pairs run in chunks of one vectorised program on `jax.default_device`, or spread over all local devices (not
             with an `executor`, `priors`, `equalize_channels` or `voxel_sizes`), which finds neighbours by brute force.
-            It compiles for each combination of sizes, rounded up to 128, 192, 256, 384, ... points. Results depend on
-            the size of a chunk by rounding, only the first eight pairs are looked at for warnings, and it is not
-            checked whether a right initial pose was left, as also inside `jit`.
+            It compiles for each combination of sizes, rounded up to 128, 192, 256, 384, ... points. Only the first
+            eight pairs are looked at for warnings of neighbourhoods and units. As inside `jit`, it is not checked
+            whether the registration has left a right initial pose.
 
     Returns:
         A generator of the index of the pair, from 0, and its `RegistrationResult`.

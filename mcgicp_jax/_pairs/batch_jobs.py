@@ -147,7 +147,10 @@ def _of_a_pair(work: Callable[..., Any]) -> Callable[..., Any]:
 
 @dataclass(frozen=True)
 class BatchJob:
-    """The settings common to all pairs, and the work on one pair or on several."""
+    """The settings common to all pairs, and the work on one pair or on several.
+
+    `checked`: whether to look at neighbourhoods and units, for warnings.
+    """
 
     method: AbstractMethod
     options: Options
@@ -155,6 +158,7 @@ class BatchJob:
     num_neighbors: int
     covariances: bool = True
     has_priors: bool = False
+    checked: bool = True
 
     @property
     def _options(self) -> Options:
@@ -168,22 +172,23 @@ class BatchJob:
         search = self.options.search
         return (on_accelerator() if search is None else isinstance(search, DenseSearch)) and not repeated
 
-    def ready(self, clouds: dict[str, Cloud], checked: bool = True) -> list[PointCloud]:
+    def ready(self, clouds: dict[str, Cloud]) -> list[PointCloud]:
         """Clouds by their names, read and preprocessed if necessary; errors become a `ValueError` that names one."""
-        return preprocessed(_read(clouds), self.method, self._options, self.voxel_size, self.num_neighbors, checked)
+        options = self._options, self.voxel_size, self.num_neighbors, self.checked
+        return preprocessed(_read(clouds), self.method, *options)
 
-    def _clouds(self, pair: Pair, checked: bool = True) -> list[PointCloud]:
+    def _clouds(self, pair: Pair) -> list[PointCloud]:
         """Both clouds by `ready`. Warnings of the pair as a whole do not name it, so that Python shows each once."""
         with warnings_named(f"pair {pair.index}"):
-            clouds = self.ready({"source": pair.source, "target": pair.target}, checked)
-            if checked:
+            clouds = self.ready({"source": pair.source, "target": pair.target})
+            if self.checked:
                 warn_of_lengths(*clouds)
             return clouds
 
     @_of_a_pair
-    def prepare(self, pair: Pair, checked: bool = True) -> PreparedPair | PairResult:
-        """The pair with its initial pose, or its result if it has none. `checked` as in `preprocessed_in`."""
-        source, target = self._clouds(pair, checked)
+    def prepare(self, pair: Pair) -> PreparedPair | PairResult:
+        """The pair with its initial pose, or its result if it has none."""
+        source, target = self._clouds(pair)
         options = self.options
         soft, equalized = options.soft_matches is not False, options.equalize_channels
         warn_of_estimated_parameters(self.method, source, target, soft, equalized)
@@ -265,8 +270,11 @@ class BatchJob:
         with ThreadPoolExecutor(num_threads, thread_name_prefix="mcgicp") as threads:
             rejected: list[PairResult] = []
 
+            def prepared_pair(pair: Pair) -> PairResult | tuple[PreparedPair, ChunkPair]:
+                return replace(on_host, checked=pair.index < _CHECKED)._chunk_pair(pair)
+
             def ready() -> Iterator[tuple[PreparedPair, ChunkPair]]:
-                for pair in _computed_ahead(threads, with_settings(on_host._chunk_pair), pairs, 2 * num_threads):
+                for pair in _computed_ahead(threads, with_settings(prepared_pair), pairs, 2 * num_threads):
                     if isinstance(pair, PairResult):
                         rejected.append(pair)
                     else:
@@ -274,7 +282,7 @@ class BatchJob:
 
             for ended in run_pairs(ready(), self.method, self.options, search, self.num_neighbors):
                 while rejected:
-                    yield rejected.pop()
+                    yield rejected.pop(0)
                 pair = ended.key
                 if isinstance(ended, Refused):
                     yield _invalid(pair.index, ended.reason)
@@ -290,12 +298,12 @@ class BatchJob:
         """The pair of a chunk, with each cloud padded to a size class so that few programs are compiled."""
         with warnings_named(f"pair {pair.index}"):
             clouds = _read({"source": pair.source, "target": pair.target})
-        ready = self.prepare(replace(pair, source=clouds["source"], target=clouds["target"]), pair.index < _CHECKED)
+        ready = self.prepare(replace(pair, source=clouds["source"], target=clouds["target"]))
         if isinstance(ready, PairResult):
             return ready
         source, target = ready.inputs[:2]
         check_clouds(source, target, self.method)
-        if pair.index < _CHECKED:
+        if self.checked:
             warn_of_inputs(source, target, self.method, self.options.equalize_channels)
         pose = se3_from_matrix(centred_pose(ready.init, source, target), source.points.dtype)
         # `preprocess` returns clouds that have neighbours as they are; the others get theirs on the devices.

@@ -7,7 +7,7 @@ a chunk of pairs into one array. All else is done on the devices: neighbours, su
 from __future__ import annotations
 
 import collections
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import replace
 from functools import partial
 from typing import Any, Generic, NamedTuple, TypeVar
@@ -35,18 +35,20 @@ from mcgicp_jax._search.base import AbstractSearch
 
 Key = TypeVar("Key")
 
-# Largest number of pairs of a chunk per device: on an H200, chunks of 256 pairs took 0.7 (2,000 points) to 0.95 (6,000
-# points) of the time of chunks of 64. Batches of fewer pairs have smaller chunks; a few sizes, each of which compiles.
+# Numbers of pairs of a chunk per device: with a sketch on an H200, chunks of 256 pairs took 0.7 (2,000 points) to 0.95
+# (6,000 points) of the time of chunks of 64. Batches of fewer pairs have smaller chunks. Each size compiles.
 _SIZES = (16, 64, 256)
-# Rows of both clouds of all pairs of a chunk per device, at most: 256 pairs of two clouds of 4,096 rows.
+# Most rows of both clouds of all pairs of a chunk per device: 256 pairs of two clouds of 4,096 rows. Half as many rows
+# take 0.7 GB of temporary memory (compiled for an H100).
 _ROWS = 2**21
 # On a CPU, where pairs that have ended cost as much as others until all have.
 _SIZE_ON_CPU = 4
-# Updates of the pose after which pairs that have not ended leave their chunk, and begin again in one with others like
-# them: of 1,024 pairs of 2,000 points, 19 took up to 64 updates, and the others 6 to 20. Twice as many for further
-# chunks where more than this fraction of the pairs had to leave.
+# Updates of the pose after which pairs that have not ended leave their chunk and begin again in a chunk of such pairs:
+# of 1,024 pairs of 2,000 points, 19 took up to 64 updates. The number is doubled for further chunks if more than this
+# fraction of the pairs had to leave.
 _FIRST_UPDATES, _MANY = 24, 0.1
-# Chunks after which the pairs that left theirs run, at the latest: a stream then takes at most a tenth longer.
+# Largest number of chunks for which such pairs wait: a partly filled chunk of 64 updates takes as long as 2.7 chunks of
+# 24 updates, a twelfth of 32.
 _CHUNKS_BETWEEN = 32
 # Chunks that are dispatched before the results of the first are fetched: the host prepares one while the devices work.
 _DISPATCHED = 2
@@ -104,7 +106,7 @@ def run_pairs(
     fixed = Options(
         **{name: getattr(options, name) for name in ("max_iterations", "max_source_points", "min_coarse_distance")}
     )
-    devices = np.array(default_devices())
+    mesh = Mesh(np.array(default_devices()), ("pairs",))
     program = partial(
         _registered,
         method=method,
@@ -113,14 +115,14 @@ def run_pairs(
         search=search,
         options=fixed,
         num_neighbors=num_neighbors,
-        mesh=Mesh(devices, ("pairs",)),
+        mesh=mesh,
     )
     groups: dict[Any, _Group[Key]] = {}
     last: dict[Any, int] = {}
     for number, (key, pair) in enumerate(pairs):
         kind = _shapes(pair)
         if kind not in groups:
-            groups[kind] = _Group(program, devices, fixed.max_iterations)
+            groups[kind] = _Group(program, mesh, fixed.max_iterations)
         last[kind] = number
         groups[kind].waiting.append((key, pair))
         while groups[kind].is_full():
@@ -135,16 +137,18 @@ class _Group(Generic[Key]):
     """Pairs of the same shapes, and their chunks. Where memory does not suffice, chunks have half the size, and the
     pairs on the devices begin again."""
 
-    def __init__(self, program: Any, devices: np.ndarray, max_iterations: int):
-        self._program, self._devices, self._on_cpu = program, devices, devices[0].platform == "cpu"
+    def __init__(self, program: Callable[..., Any], mesh: Mesh, max_iterations: int):
+        self._program, self._num_devices = program, mesh.size
+        self._sharding = NamedSharding(mesh, PartitionSpec("pairs"))
+        self._on_cpu = mesh.devices[0].platform == "cpu"
         # A loop that has not ended has made at most one update less.
         self._all_updates = max_iterations + 1
         self._first_updates = min(_FIRST_UPDATES, self._all_updates)
         self._per_device = 0
         self.waiting: collections.deque[tuple[Key, ChunkPair]] = collections.deque()
         self._slow: collections.deque[tuple[Key, ChunkPair]] = collections.deque()
-        # Number of chunks since the last one of slow pairs.
-        self._since_slow = 0
+        # Number of chunks for which slow pairs have waited.
+        self._chunks_waited = 0
         self._dispatched: collections.deque[tuple[list[tuple[Key, ChunkPair]], bool, Any]] = collections.deque()
 
     def _largest(self) -> int:
@@ -155,7 +159,7 @@ class _Group(Generic[Key]):
         return max(size for size in _SIZES if size * rows <= _ROWS or size == _SIZES[0])
 
     def is_full(self) -> bool:
-        return len(self.waiting) >= (self._per_device or self._largest()) * len(self._devices)
+        return len(self.waiting) >= (self._per_device or self._largest()) * self._num_devices
 
     def finish(self) -> Iterator[Ended[Key] | Refused[Key]]:
         """Run until no pair is left."""
@@ -194,21 +198,20 @@ class _Group(Generic[Key]):
         """Start the program for the next pairs; copies of the last one fill up the chunk."""
         if not self._per_device:
             most = self._largest()
-            wanted = -(-len(self.waiting) // len(self._devices))
+            wanted = -(-len(self.waiting) // self._num_devices)
             self._per_device = next((size for size in _SIZES if wanted <= size < most), most)
-        size = self._per_device * len(self._devices)
-        late = len(self._slow) >= size or (self._slow and self._since_slow >= _CHUNKS_BETWEEN)
+        size = self._per_device * self._num_devices
+        late = len(self._slow) >= size or self._chunks_waited >= _CHUNKS_BETWEEN
         first = bool(self.waiting) and not late
-        self._since_slow = self._since_slow + 1 if first else 0
+        self._chunks_waited = self._chunks_waited + 1 if first and self._slow else 0
         queue = self.waiting if first else self._slow
         pairs = [queue.popleft() for _ in range(min(len(queue), size))]
+        # Before the program starts, so that no pair is lost if memory does not suffice.
         self._dispatched.append((pairs, first, None))
         filled = [pair for _, pair in pairs] + [pairs[-1][1]] * (size - len(pairs))
-        chunk = jax.tree.map(lambda *leaves: np.stack(leaves), *filled)
+        chunk = jax.device_put(jax.tree.map(lambda *leaves: np.stack(leaves), *filled), self._sharding)
         limit = np.int32(self._first_updates if first else self._all_updates)
-        mesh = self._program.keywords["mesh"]
-        placed = jax.device_put(chunk, NamedSharding(mesh, PartitionSpec("pairs")))
-        self._dispatched[-1] = pairs, first, self._program(placed, limit)
+        self._dispatched[-1] = pairs, first, self._program(chunk, limit)
 
     def _fetched(self) -> list[Any]:
         """The results of the oldest chunk; those of its pairs that have not ended join the slow ones."""

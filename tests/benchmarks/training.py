@@ -254,9 +254,34 @@ def trained(name: str, seed: int, raw: Sequence[Any], unlit: Sequence[Any], meth
     ]
 
 
+def step_inside_jit(raw: Sequence[Any], method: Any) -> tuple[float, float]:
+    """Seconds of the first and of later steps of the network with eight pairs inside `jit`, padded to one size."""
+    ready = [[mcg.preprocess(cloud, 0.02) for cloud in pair[:2]] for pair in raw[NUM_TEST:]]
+    size = max(len(cloud) for pair in ready for cloud in pair)
+    sources, targets = (mcg.PointCloud.stack([pair[side].pad(size) for pair in ready]) for side in (0, 1))
+    truths = jnp.stack([pair.truth for pair in raw[NUM_TEST:]])
+
+    def error(weights: dict[str, Any], source: Any, target: Any, truth: Any) -> Any:
+        clouds = [corrected(weights, cloud) for cloud in (source, target)]
+        result = mcg.register(*clouds, method, init=truth, max_distance=0.05)
+        return jnp.minimum(sum(mcg.metrics.pose_error(result.matrix, truth)), LARGEST_ERROR)
+
+    @jax.jit
+    @jax.value_and_grad
+    def loss(weights: dict[str, Any]) -> Any:
+        return jnp.mean(jax.vmap(error, (None, 0, 0, 0))(weights, sources, targets, truths))
+
+    times = []
+    for _ in range(6):
+        begin = time.perf_counter()
+        jax.block_until_ready(loss(weights_of(0)))
+        times.append(time.perf_counter() - begin)
+    return times[0], float(np.median(times[1:]))
+
+
 def training() -> Iterator[list[str]]:
     """Rows of the table of training: eight pairs of four views of the table, tested on four pairs of two others, and
-    their means over the seeds, which test all twelve."""
+    their means over the seeds, which test all twelve; at last the time of a step of the network inside `jit`."""
     sets = [list(accuracy.table(suffix)) for suffix in ("_flat", "")]
     unlit = [
         Pair(grey(pair.source), grey(pair.target), pair.truth) for both in zip(*sets, strict=True) for pair in both
@@ -269,3 +294,5 @@ def training() -> Iterator[list[str]]:
         before, after, goal = (np.mean([float(row[i]) for row in rows]) for i in (4, 5, 6))
         mean = "", "", f"{before:.1f}", f"{after:.1f}", f"{goal:.1f}", f"{100 * (1 - after / before):.0f} %", ""
         yield from (*rows, [name, "all", *mean])
+    first, step = step_inside_jit(raw, method)
+    yield ["network inside jit", "", "", "", "", "", "", f"first {first:.0f} s", f"{step:.1f} s"]
