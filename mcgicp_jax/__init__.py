@@ -3,8 +3,8 @@
 `T_target_source` maps source coordinates into the target's frame. Units are metres and radians throughout.
 
 JAX keeps compiled programs for other processes if the environment has `JAX_COMPILATION_CACHE_DIR=folder` and
-`JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS=0`. The command line does so by itself. If compilation takes more than two
-seconds, the logger "mcgicp_jax" has a record of the level INFO.
+`JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS=0`. The command line does so by itself. Once compilation has taken two
+seconds in a process, the logger "mcgicp_jax" has a record of the level INFO.
 
 Clouds
     PointCloud                      points (N, 3) with channels (N, C)

@@ -84,6 +84,7 @@ def test_replaced_channels_keep_the_mask():
     np.testing.assert_array_equal(replaced.channel_valid, cloud.channel_valid)
     assert cloud.replace(channel_valid=None).channel_valid is None
     refused(lambda: cloud.replace(channels=jnp.zeros((160, 3))), "channel_valid", (160, 3))
+    refused(lambda: cloud.replace(neighbors=cloud.neighbors), "replace", "preprocess(cloud) finds neighbors")
     # What is missing has no gradient.
     gradient = jax.grad(lambda channels: jnp.sum(cloud.replace(channels=channels).channels))(
         jnp.where(cloud.channel_valid, cloud.channels, jnp.nan)

@@ -117,10 +117,16 @@ def test_pairs_that_fail_have_messages_of_their_own(folder, tmp_path, capsys):
         assert rows[name]["status"] == "invalid_input" and name in rows[name]["reason"]
     text, errors = capsys.readouterr()
     assert "mcgicp: missing.ply scan_0.ply: source:" in errors and "3 of 4 pairs" in errors
-    assert "done:      4 of 4, " in text
+    assert "done:      4 of 4, " in text and f"table:     {output}\n" in text
     # Files that cannot be read have no rate.
     assert main(["batch", pairs, "--output", str(output), *OPTIONS]) == 1
     assert "done:      2 of 2\n" in capsys.readouterr().out
+
+
+def test_tables_are_csv_files(folder, tmp_path, capsys):
+    for name in ("table.npz", "table.ply"):
+        assert run_folder(folder, tmp_path / name) == 2
+        assert "output: expected a .csv file" in capsys.readouterr().err
 
 
 def test_a_pair_from_several_starts(folder, tmp_path, capsys):

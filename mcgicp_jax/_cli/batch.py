@@ -98,9 +98,9 @@ def batch(
     shared.check(method)
     if workers != "auto":
         check_integer("workers", workers, 1)
-    check_outputs(output)
     if output.suffix.lower() != ".csv":
         raise ValueError(f"output: expected a .csv file, got {output}")
+    check_outputs(output)
     file_pairs = _pairs_of_folder_or_table(pairs, glob)
     wanted = {pair.key: pair for pair in file_pairs}
     rows = {(row["source"], row["target"], row["init"]): row for row in _read_rows(output)}
@@ -117,6 +117,7 @@ def batch(
         interrupted = _register_missing(missing, read, partial(register, executor=executor), output, rows, finished)
     rows = {key: rows[key] for key in wanted if key in rows} | rows
     _write_rows(output, rows.values())
+    print(f"table:     {output}")
     counts = collections.Counter(rows[key]["status"] for key in wanted if key in rows)
     print("status:    " + ", ".join(f"{count:,} {status}" for status, count in counts.most_common()))
     if interrupted:

@@ -309,7 +309,10 @@ class PointCloud(eqx.Module):
         fields = dict(vars(self))
         unknown = arrays.keys() - fields.keys()
         if unknown:
-            raise ValueError(f"replace: unknown field {', '.join(sorted(unknown))}; expected {', '.join(fields)}")
+            # Neighbours and voxels are those of `preprocess`.
+            names = ", ".join(name for name in fields if name not in ("deferred_neighbors", "voxels"))
+            advice = "; preprocess(cloud) finds neighbors" if "neighbors" in unknown else ""
+            raise ValueError(f"replace: unknown field {', '.join(sorted(unknown))}; expected {names}{advice}")
         shapes = {
             "points": np.shape(self.points),
             "valid": np.shape(self.valid),

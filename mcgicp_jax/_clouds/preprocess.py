@@ -44,8 +44,9 @@ def preprocess(
     Preprocess each cloud once and register it as often as needed. Points, channels and covariances of the result can be
     differentiated by those of the raw cloud; voxels and neighbours are constants.
 
-    Runs on the host, or inside `jit` and `vmap`. There, `voxel_size` is None or a number, coordinates are not centred,
-    points that are not finite become padding, all others are kept, and nothing is warned of.
+    Runs on the host, or inside `jit` and `vmap`. There, `voxel_size` is None or a number, the grid is turned by other
+    angles, coordinates are not centred, points that are not finite become padding, all others are kept, and nothing is
+    warned of.
 
     Args:
         cloud: raw cloud, or (N, 3) array in metres. Padding and old neighbours are dropped first.

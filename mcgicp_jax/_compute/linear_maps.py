@@ -177,7 +177,7 @@ def once(value: Any) -> Any:
 
 def _once_jvp(primals: tuple[Any], tangents: tuple[Any]) -> tuple[Any, Any]:
     if not is_symbolic_zero(tangents[0]):
-        raise NotImplementedError("poses have first derivatives only; so have costs outside of jit")
+        raise NotImplementedError("poses have first derivatives only; costs have second ones inside jit alone")
     return primals[0], jnp.zeros_like(primals[0])
 
 

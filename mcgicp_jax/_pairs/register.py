@@ -185,7 +185,7 @@ def register(
         soft_matches=soft_matches,
     )
     if not (tie_points is None and prior is None) and not hold_unconstrained:
-        raise ValueError("hold_unconstrained: expected True with tie_points or prior, got False")
+        raise ValueError("hold_unconstrained: expected True with tie_points or a prior (--fix), got False")
     source, target = as_cloud("source", source), as_cloud("target", target)
     warn_of_lengths(source, target)
     warn_of_estimated_parameters(method, source, target, soft_matches is not False, equalize_channels)
