@@ -30,11 +30,12 @@ class Status(enum.IntEnum):
         TOO_FEW_CORRESPONDENCES: fewer than four source points (in the coarse phase: of the subset) have a match within
             `max_distance`: the clouds do not overlap, or the initial pose is too far off.
         DEGENERATE: the last update was below both tolerances, but at least one direction of motion is unconstrained
-            (see `RegistrationResult.unconstrained_directions`). With `hold_unconstrained`, `register` keeps the initial
-            pose along it. Tie points or a prior constrain a direction if its standard deviation is then below
-            the radius of the clouds. Source points within a fifth of their median distance from the sensor, the origin
-            of their frame, constrain nothing: they may be the sensor's own vehicle. The derivative of the pose is that
-            within the constrained directions, and 0 along the others.
+            (see `RegistrationResult.unconstrained_directions`). With `hold_unconstrained`, updates move the pose only
+            along directions that are constrained when they are made: along others it remains the initial one. Tie
+            points or a prior constrain a direction if its standard deviation is then below the radius of the clouds.
+            Source points within a fifth of their median distance from the sensor, the origin of their frame, constrain
+            nothing: they may be the sensor's own vehicle. The derivative of the pose is that within the constrained
+            directions, and 0 along the others.
         NON_FINITE: the pose or the sums overflowed or became NaN.
         INVALID_INPUT: `register` would raise a `ValueError` for this pair. Only in batches; the pose is NaN.
         WORKER_FAILED: two workers in turn failed with this pair. Only in batches; the pose is NaN.
