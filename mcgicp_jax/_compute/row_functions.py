@@ -158,8 +158,7 @@ class RowFunction:
     @with_settings_of_package
     def _over_blocks(self, rows: Any, num_threads: int | None, packed: bool = True) -> list[tuple[slice, Any]]:
         gathered = _Gathered(self._inputs, self.size, rows, num_threads)
-        # Without its fusion emitters XLA compiles in half the time; programs over neighbourhoods would run longer.
-        run = _program(self._function, self._total, packed, gathered.block_size == BLOCK)
+        run = _program(self._function, self._total, packed)
         # Worker threads run outside a trace that is active in this thread; this thread leaves it for the same results.
         with outside_trace():
             return list(
@@ -491,7 +490,7 @@ def _add_rows(
 
 
 @cache
-def _program(function: Callable[..., Any], total: bool, packed: bool, quickly: bool) -> Callable[..., Any]:
+def _program(function: Callable[..., Any], total: bool, packed: bool) -> Callable[..., Any]:
     """A row function for a block, with packed arguments and results: to pass dozens of arrays takes longer than to use
     them."""
 
@@ -504,7 +503,7 @@ def _program(function: Callable[..., Any], total: bool, packed: bool, quickly: b
         return Packed.of(found, num_axes=0) if total else tuple(Packed.of(part) for part in found)
 
     program.__name__ = function.__name__
-    return quickly_compiled(program) if quickly else jax.jit(program)
+    return quickly_compiled(program)
 
 
 def _of_chosen(

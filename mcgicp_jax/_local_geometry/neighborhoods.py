@@ -156,36 +156,39 @@ class ChannelFits(NamedTuple):
 
 
 def fit_channels(around: Neighborhoods, x: Float[Array, "k n"], y: Float[Array, "k n"]) -> ChannelFits:
-    """Fit every channel; x and y are the coordinates of the neighbours in the tangent plane, metres."""
-    gradients, residuals, inverses = [], [], []
-    for channel in range(around.num_channels):
-        values, measured = around.difference(channel), around.measured(channel).astype(x.dtype)
-        fit = fit_linear(x, y, values, measured)
-        halves = [fit_linear(*(array[first::2] for array in (x, y, values, measured))).gradient for first in (0, 1)]
-        enough = fit.weight > 3 if around.own_measured is None else (fit.weight > 3) & around.own_measured[channel]
-        gradients.append(jnp.where(enough, jnp.stack([jnp.stack(half) for half in halves]), 0))
-        residuals.append(jnp.where(enough, fit.residual, jnp.nan))
-        inverses.append(jnp.where(enough, fit.inverse, 0))
-    if not gradients:
+    """Fit every channel; x and y are the coordinates of the neighbours in the tangent plane, metres, 0 if missing."""
+    if not around.num_channels:
         size = around.own.shape[1]
         return ChannelFits(*(jnp.zeros(shape, x.dtype) for shape in ((size, 0, 2, 2), (size, 0), (size, 0, 3))))
-    # From (C, columns, n) to rows.
+    present = around.present.astype(x.dtype)
+    count = jnp.maximum(jnp.sum(present, axis=0), 1)
+    x, y = (present * (each - jnp.sum(each, axis=0) / count) for each in (x, y))
+    sums = []
+    for channel in range(around.num_channels):
+        rows = x, y, around.difference(channel), around.measured(channel).astype(x.dtype)
+        # Every second neighbour, from the first and from the second on. What is summed over all is the sum of both.
+        first, second = (_fit_sums(*(each[i::2] for each in rows)) for i in (0, 1))
+        sums.append(jnp.stack([first + second, first, second], axis=1))
+    fit = _fit_of(jnp.stack(sums, axis=2))
+    enough = fit.weight[0] > 3 if around.own_measured is None else (fit.weight[0] > 3) & around.own_measured
     return ChannelFits(
-        jnp.stack(gradients).transpose(3, 0, 1, 2), jnp.stack(residuals).T, jnp.stack(inverses).transpose(2, 0, 1)
+        jnp.where(enough, fit.gradient[:, 1:], 0).transpose(3, 2, 1, 0),
+        jnp.where(enough, fit.residual[0], jnp.nan).T,
+        jnp.where(enough, fit.inverse[:, 0], 0).transpose(2, 1, 0),
     )
 
 
 class LinearFit(NamedTuple):
-    """Weighted linear fit over a plane: `inverse` is that of the normal matrix, `weight` the sum of the weights.
+    """Weighted linear fits over a plane: `inverse` is that of the normal matrix, `weight` the sum of the weights.
 
     Gradient and inverse are 0 where the points lie on a line; the residual variance is meaningless for three points or
     fewer.
     """
 
-    gradient: tuple[Float[Array, "N"], Float[Array, "N"]]
-    residual: Float[Array, "N"]
-    inverse: Float[Array, "3 N"]
-    weight: Float[Array, "N"]
+    gradient: Float[Array, "2 ..."]
+    residual: Float[Array, "..."]
+    inverse: Float[Array, "3 ..."]
+    weight: Float[Array, "..."]
 
 
 @jax.jit
@@ -193,18 +196,30 @@ def fit_linear(
     x: Float[Array, "k N"], y: Float[Array, "k N"], values: Float[Array, "k N"], weights: Float[Array, "k N"]
 ) -> LinearFit:
     """Fit a + b x + c y to the values of each neighbourhood; weights are 1, or 0 for values to ignore."""
-    count = jnp.sum(weights, axis=0)
+    count = jnp.maximum(jnp.sum(weights, axis=0), 1)
+    x, y = (each - jnp.sum(weights * each, axis=0) / count for each in (x, y))
+    return _fit_of(_fit_sums(x, y, values, weights))
 
-    def centred(values: Float[Array, "k N"]) -> Float[Array, "k N"]:
-        return weights * (values - jnp.sum(weights * values, axis=0) / jnp.maximum(count, 1))
 
-    x, y, values = centred(x), centred(y), centred(values)
-    xx, xy, yy = jnp.sum(x * x, axis=0), jnp.sum(x * y, axis=0), jnp.sum(y * y, axis=0)
+def _fit_sums(
+    x: Float[Array, "k N"], y: Float[Array, "k N"], values: Float[Array, "k N"], weights: Float[Array, "k N"]
+) -> Float[Array, "10 N"]:
+    """The sums from which a fit is computed: of the weights, and of the weighted x, y, x², xy, y², v, xv, yv, v². The
+    origin of x and y should be near their mean."""
+    wx, wy, wv = weights * x, weights * y, weights * values
+    products = (weights, wx, wy, wx * x, wx * y, wy * y, wv, wv * x, wv * y, wv * values)
+    return jnp.stack([jnp.sum(product, axis=0) for product in products])
+
+
+def _fit_of(sums: Float[Array, "10 ..."]) -> LinearFit:
+    count, x, y, xx, xy, yy, v, xv, yv, vv = sums
+    each = 1 / jnp.maximum(count, 1)
+    xx, xy, yy = xx - each * x * x, xy - each * x * y, yy - each * y * y
+    xv, yv, vv = xv - each * x * v, yv - each * y * v, vv - each * v * v
     determinant = xx * yy - xy * xy
     planar = determinant > 1e-6 * (xx + yy) ** 2
     inverse = jnp.where(planar, jnp.stack([yy, -xy, xx]) / jnp.where(planar, determinant, 1), 0)
     p, q, r = inverse
-    xv, yv = jnp.sum(x * values, axis=0), jnp.sum(y * values, axis=0)
     gx, gy = p * xv + q * yv, q * xv + r * yv
-    square = jnp.maximum(jnp.sum(values * values, axis=0) - gx * xv - gy * yv, 0)
-    return LinearFit((gx, gy), square / jnp.maximum(count - 3, 1), inverse, count)
+    square = jnp.maximum(vv - gx * xv - gy * yv, 0)
+    return LinearFit(jnp.stack([gx, gy]), square / jnp.maximum(count - 3, 1), inverse, count)

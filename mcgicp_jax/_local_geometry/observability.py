@@ -111,21 +111,17 @@ def channel_observability(
     `weights` are α, metres per channel unit. Also returned are the gradients of the descriptors, means of both fits,
     and the variance of the descriptors about their linear fits, metres², summed over the channels.
     """
-    total = jnp.zeros((3, normal.shape[0]), normal.dtype)
-    length, noise = total[0], total[0]
-    for channel in range(fits.residual.shape[1]):
-        (gx, gy), (hx, hy) = fits.gradients[:, channel].transpose(1, 2, 0)
-        square = weights[channel] ** 2
-        residual = square * jnp.where(jnp.isnan(fits.residual[:, channel]), 0, fits.residual[:, channel])
-        product = jnp.stack([gx * hx, 0.5 * (gx * hy + gy * hx), gy * hy])
-        total = total + square * product - _MARGIN * residual * fits.inverse[:, channel].T
-        length = length + 0.5 * square * (gx * gx + gy * gy + hx * hx + hy * hy)
-        noise = noise + residual
+    (gx, gy), (hx, hy) = fits.gradients.transpose(2, 3, 1, 0)
+    square = (weights * weights)[:, None]
+    residual = square * jnp.where(jnp.isnan(fits.residual), 0, fits.residual).T
+    product = square * jnp.stack([gx * hx, 0.5 * (gx * hy + gy * hx), gy * hy])
+    total = jnp.sum(product - _MARGIN * residual * fits.inverse.transpose(2, 1, 0), axis=1)
+    length = jnp.sum(0.5 * square * (gx * gx + gy * gy + hx * hx + hy * hy), axis=0)
     # The same tangent basis as in the linear fits.
     basis = alg.orthonormal_basis(normal.T)
     slopes = jnp.mean(fits.gradients, axis=2) * weights[:, None]
     within = slopes[..., :1] * basis[0].T[:, None] + slopes[..., 1:] * basis[1].T[:, None]
-    return alg.embed(total / (1 + length), *basis), within, noise
+    return alg.embed(total / (1 + length), *basis), within, jnp.sum(residual, axis=0)
 
 
 def agreement(
@@ -142,8 +138,8 @@ def agreement(
     directions of the gradients, and negative for the pattern. A texture as strong as the pattern hides it, even if its
     gradients lie across the motion.
     """
-    product = sum(0.5 * (alg.outer(g + h) - alg.outer(g) - alg.outer(h)) for g, h in zip(source, target, strict=True))
+    product = alg.symmetric_outer(source, target)
     scale = 1 / (1 + 0.5 * (jnp.sum(source * source, axis=(0, 1)) + jnp.sum(target * target, axis=(0, 1))))
-    across = alg.inner(tangent, alg.multiply(jnp.asarray(product), tangent))
+    across = alg.inner(tangent, alg.multiply(product, tangent))
     quarter = 0.25 * jnp.sum(source * target, axis=(0, 1))
     return scale * product, scale * (across - quarter) * alg.outer(tangent)

@@ -77,6 +77,12 @@ def outer(vector: Float[Array, "3 N"]) -> Float[Array, "6 N"]:
     return jnp.stack([x * x, x * y, x * z, y * y, y * z, z * z])
 
 
+def symmetric_outer(a: Float[Array, "C 3 N"], b: Float[Array, "C 3 N"]) -> Float[Array, "6 N"]:
+    """Σ (a bᵀ + b aᵀ) / 2."""
+    pairs = zip(_ROWS, _COLUMNS, strict=True)
+    return jnp.stack([0.5 * jnp.sum(a[:, i] * b[:, j] + a[:, j] * b[:, i], axis=0) for i, j in pairs])
+
+
 def orthonormal_basis(normal: Float[Array, "3 N"]) -> tuple[Float[Array, "3 N"], Float[Array, "3 N"]]:
     """Two unit vectors that complete the normal to a right-handed frame.
 
@@ -240,8 +246,8 @@ def floor_eigenvalues(symmetric: Float[Array, "3 N"], floor: Float[Array, "*N"])
 def embed(symmetric: Float[Array, "3 N"], u: Float[Array, "3 N"], v: Float[Array, "3 N"]) -> Float[Array, "6 N"]:
     """B A Bᵀ in the basis B = [u v]: a 2×2 matrix of the tangent plane as a 3×3 one."""
     a, b, c = symmetric
-    cross = jnp.stack([2 * u[i] * v[j] if i == j else u[i] * v[j] + u[j] * v[i] for i in range(3) for j in range(i, 3)])
-    return a * outer(u) + b * cross + c * outer(v)
+    first, second = a * u + b * v, b * u + c * v
+    return jnp.stack([first[i] * u[j] + second[i] * v[j] for i, j in zip(_ROWS, _COLUMNS, strict=True)])
 
 
 def symmetric_product(a: Float[Array, "6 N"], b: Float[Array, "6 N"]) -> Float[Array, "6 N"]:

@@ -150,8 +150,8 @@ def covariance_of_pose(state: State, weights: Moments | Fusion) -> Float[Array, 
     return jnp.where(exists, covariance, jnp.nan)
 
 
-_constraints_on_host = quickly_compiled(constraints_of, small=True)
-_covariance_on_host = quickly_compiled(covariance_of_pose, small=True)
+_constraints_on_host = quickly_compiled(constraints_of, level=0)
+_covariance_on_host = quickly_compiled(covariance_of_pose, level=0)
 
 
 def registration_of(

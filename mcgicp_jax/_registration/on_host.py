@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from operator import attrgetter
 from typing import Any, cast
 
@@ -144,7 +145,7 @@ def _combined(parts: list[Packed[Sums]]) -> Packed[Sums]:
     return Packed(table, parts[0].layout)
 
 
-@quickly_compiled
+@partial(quickly_compiled, level=1)
 def _update(
     state: tuple[Any, ...],
     sums: Packed[Sums],

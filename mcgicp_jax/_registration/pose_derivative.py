@@ -270,7 +270,7 @@ def _multiplied(gains: Float[Array, "C"], channels: Rows) -> tuple[Float[Array, 
 
 
 _form_at = jax.jit(form_at)
-_root_on_host = quickly_compiled(root_of, small=True)
+_root_on_host = quickly_compiled(root_of, level=0)
 
 
 def with_derivatives(states: Sequence[State], derivatives: Sequence[PoseDerivative | None]) -> list[State]:
