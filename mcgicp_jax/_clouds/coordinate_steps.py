@@ -90,8 +90,10 @@ def _shows_rounding(cloud: PointCloud, coarse: Bool[AnyArray, "3"], steps: Float
     same = exists & ((xp.abs(offsets) < _SAME * steps) | ~coarse).all(axis=2)
     copied = (exists & ((offsets == 0) | coarse).all(axis=2) & (offsets != 0).any(axis=2)).any(axis=1)
     x, y, z = xp.where(same[..., None] & ~coarse, offsets, 0).transpose(2, 0, 1)
-    xx, yy, zz, xy, yz, zx = (xp.sum(a * b, axis=1) for a, b in ((x, x), (y, y), (z, z), (x, y), (y, z), (z, x)))
-    minors = xx * yy - xy**2 + yy * zz - yz**2 + zz * xx - zx**2
     mostly = 2 * xp.sum(same, axis=1) > xp.sum(exists, axis=1)
-    rounded = xp.where(xp.sum(coarse) > 1, xx + yy + zz > 0, mostly & (minors > _SPREAD * (xx + yy + zz) ** 2))
+    # Squares of coordinates up to 1e30 overflow; such clouds are no measurements.
+    with np.errstate(over="ignore", invalid="ignore"):
+        xx, yy, zz, xy, yz, zx = (xp.sum(a * b, axis=1) for a, b in ((x, x), (y, y), (z, z), (x, y), (y, z), (z, x)))
+        minors = xx * yy - xy**2 + yy * zz - yz**2 + zz * xx - zx**2
+        rounded = xp.where(xp.sum(coarse) > 1, xx + yy + zz > 0, mostly & (minors > _SPREAD * (xx + yy + zz) ** 2))
     return xp.sum(rounded & ~copied) > _SHARE * xp.sum(counts)
