@@ -1,6 +1,7 @@
 """Brute force on the device: the tree's answers, and a whole batch as one program, on one device or several."""
 
 from concurrent.futures import ThreadPoolExecutor
+from functools import partial
 
 import jax
 import jax.numpy as jnp
@@ -11,13 +12,15 @@ from hypothesis import strategies as st
 
 import mcgicp_jax as mcg
 from mcgicp_jax import DenseSearch, KDTreeSearch, Status
-from mcgicp_jax._registration import chunks
+from mcgicp_jax._pairs.batch_jobs import BatchJob
+from mcgicp_jax._registration import chunks, register_pair
 from mcgicp_jax.extend import SearchPoints
 from mcgicp_jax.metrics import pose_error
 from tests import reference as ref
 from tests.batches import METHOD, assert_same, prepared
 from tests.compilations import compilations
 from tests.precision import in_both_precisions
+from tests.promise_scenes import office, views
 from tests.scenes import motion
 
 # Its parameters are computed for each pair.
@@ -186,6 +189,41 @@ def test_raw_clouds_in_chunks_are_prepared_as_one_by_one(raw):
     for i in (0, 2, 3):
         assert max(pose_error(found[i].matrix, expected[i].matrix)) < 1e-5
         assert found[i].overlap == expected[i].overlap
+
+
+def test_pairs_that_may_have_left_a_right_pose_are_registered_again(monkeypatch):
+    """Parts of rooms whose coarse phase leaves it, views with too little in common for a promise, and a whole room."""
+    pairs = [office(0, 500), office(1, 500), views(2, count=500), office(0, 500, common=1)]
+    sources, targets, _ = map(list, zip(*pairs, strict=True))
+    starts = [None, None, pairs[2].T_target_source, motion((0.3, -0.2, 0.1, 0.02, 0.01, 0.05))]
+    doubt_of_start, register_prepared = chunks.doubt_of_start, BatchJob._register_prepared
+    on_host, traced, again = [], [], []
+
+    def noted(fits, start, state, settings, fit, at_scales=False):
+        fits.append(fit())
+        return doubt_of_start(start, state, settings, lambda: fits[-1], at_scales)
+
+    def counted(job, pair):
+        again.append(pair.index)
+        return register_prepared(job, pair)
+
+    def batch(rows):
+        given = ([side[i] for i in rows] for side in (sources, targets))
+        return mcg.register_batch(*given, mcg.GICP(), init=[starts[i] for i in rows], search=DenseSearch())
+
+    with monkeypatch.context() as patched:
+        patched.setattr(register_pair, "doubt_of_start", partial(noted, on_host))
+        cases = zip(sources, targets, starts, strict=True)
+        expected = [mcg.register(source, target, mcg.GICP(), init=start) for source, target, start in cases]
+    monkeypatch.setattr(chunks, "doubt_of_start", partial(noted, traced))
+    monkeypatch.setattr(BatchJob, "_register_prepared", counted)
+    results = batch(range(4))
+    assert [result.status.name for result in results] == ["CONVERGED", "CONVERGED", "UNVERIFIED", "CONVERGED"]
+    assert sorted(again) == [0, 1, 2]
+    assert_same([result.T_target_source for result in results[:3]], [each.T_target_source for each in expected[:3]])
+    assert max(pose_error(results[3].matrix, expected[3].matrix)) < 1e-5
+    np.testing.assert_allclose(sorted(traced), sorted(on_host), rtol=1e-3)
+    assert_same(batch([3, 1]), [results[3], results[1]])
 
 
 def test_pairs_of_shapes_that_the_method_refuses(raw):

@@ -5,10 +5,12 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 
 from mcgicp_jax._clouds.point_cloud import PointCloud
+from mcgicp_jax._compute.concrete import AnyArray, AnyScalar, numpy_for
 from mcgicp_jax._math.poses import rotated
+from mcgicp_jax._math.statistics import sampled_rows
 from mcgicp_jax._search.kd_tree import nearest_in_position
 
 # Least thickness of a neighbourhood, as a fraction of its standard deviation along the surface: √ε of GICP. Planes
@@ -40,32 +42,37 @@ def surface_agreement(
     rows, matches, offsets = rows[matched], matches[matched], others[matches[matched]] - moved[matched]
     thin, _, normals = spreads(points, source.deferred_neighbors, rows)
     other_thin, _, other_normals = spreads(others, target.deferred_neighbors, matches)
-    return agreement_of(offsets, (rotated(normals, rotation), other_normals), (thin, other_thin))
+    return agreement_of(offsets, (rotated(normals, rotation), other_normals), (thin, other_thin), matched[matched])
 
 
 def agreement_of(
-    offsets: Float[np.ndarray, "n 3"],
-    both_normals: tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3"]],
-    thicknesses: tuple[Float[np.ndarray, "n"], Float[np.ndarray, "n"]],
-) -> tuple[float, float]:
-    """Misfit of matches and agreement of their normals. Offsets and thicknesses are in metres, normals in one frame.
+    offsets: Float[AnyArray, "n 3"],
+    both_normals: tuple[Float[AnyArray, "n 3"], Float[AnyArray, "n 3"]],
+    thicknesses: tuple[Float[AnyArray, "n"], Float[AnyArray, "n"]],
+    matched: Bool[AnyArray, "n"],
+) -> tuple[AnyScalar, AnyScalar]:
+    """Misfit of matches and agreement of their normals; ∞ and 0 if none are `matched`. Offsets and thicknesses are in
+    metres, normals in one frame.
 
     The misfit is a quantile of the distances along the normals, in thicknesses of the neighbourhoods; the agreement is
     the fraction of normals that agree. Both weigh each direction of surfaces equally, so that the ground does not
     outvote the few surfaces that distinguish a place.
     """
+    xp = numpy_for(offsets, both_normals, thicknesses, matched)
     normals, other_normals = both_normals
-    across = [np.abs(np.sum(offsets * axes, axis=1)) for axes in both_normals]
-    distances = np.maximum(*across) / np.sqrt(0.5 * np.sum(np.square(thicknesses), axis=0))
-    sample = normals[:: -(-len(normals) // _NUM_NORMALS)]
-    same = np.abs(np.einsum("ik,jk->ij", sample, normals)) > _SAME_DIRECTION
+    across = [xp.abs(xp.sum(offsets * axes, axis=1)) for axes in both_normals]
+    thickness = xp.sqrt(0.5 * (xp.square(thicknesses[0]) + xp.square(thicknesses[1])))
+    distances = xp.where(matched, xp.maximum(*across) / thickness, np.inf)
+    rows, counts = sampled_rows(matched, _NUM_NORMALS)
+    sample = xp.argsort(~matched, stable=True)[rows]
+    same = (xp.abs(xp.einsum("ik,jk->ij", normals[sample], normals)) > _SAME_DIRECTION) & counts[:, None]
     # A normal that resembles none of the sample counts as a direction of its own.
-    weights = 1 / (1 + np.sum(same, axis=0))
-    order = np.argsort(distances, kind="stable")
-    cumulative = np.cumsum(weights[order])
-    misfit = distances[order[np.searchsorted(cumulative, _QUANTILE * cumulative[-1])]]
-    agrees = np.abs(np.sum(normals * other_normals, axis=1)) > _AGREES
-    return float(misfit), float(np.sum(weights * agrees) / cumulative[-1])
+    weights = matched / (1 + xp.sum(same, axis=0))
+    order = xp.argsort(distances, stable=True)
+    cumulative = xp.cumsum(weights[order])
+    misfit = distances[order[xp.searchsorted(cumulative, _QUANTILE * cumulative[-1])]]
+    agrees = xp.abs(xp.sum(normals * other_normals, axis=1)) > _AGREES
+    return misfit, xp.sum(weights * agrees) / xp.maximum(cumulative[-1], 1e-9)
 
 
 def spreads(

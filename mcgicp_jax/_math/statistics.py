@@ -20,14 +20,14 @@ _HASH = np.array([73856093, 19349663, 83492791, 50331653], np.int32)
 _BITS = np.uint64(0x9E3779B97F4A7C15)
 
 
-def sampled_rows(valid: Any) -> tuple[Any, Any]:
-    """At most `MEDIAN_ROWS` evenly spaced rows of a cloud, as the sample for a median; and which of them are valid.
+def sampled_rows(valid: Any, most: int = MEDIAN_ROWS) -> tuple[Any, Any]:
+    """At most so many evenly spaced rows of a cloud, such as the sample for a median; and which of them are valid.
 
     `valid`, (N,), is False for padding, which comes last.
     """
     xp = numpy_for(valid)
-    count = min(valid.size, MEDIAN_ROWS)
-    rows = xp.arange(count) * (1 + xp.sum(valid) // MEDIAN_ROWS)
+    count = min(valid.size, most)
+    rows = xp.arange(count) * (1 + xp.sum(valid) // most)
     inside = rows < valid.size
     rows = xp.where(inside, rows, 0)
     return rows, inside & valid[rows]

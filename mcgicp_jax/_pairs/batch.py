@@ -108,8 +108,8 @@ def register_as_completed(
             pairs run in chunks of one vectorised program on `jax.default_device`, or spread over all local devices (not
             with an `executor`, `priors`, `equalize_channels` or `voxel_sizes`), which finds neighbours by brute force.
             It compiles for each combination of sizes, rounded up to 128, 192, 256, 384, ... points. Only the first
-            eight pairs are looked at for warnings of neighbourhoods and units. As inside `jit`, it is not checked
-            whether the registration has left a right initial pose.
+            eight pairs are looked at for warnings of neighbourhoods and units. Pairs that may have left a right initial
+            pose, see `register`, are registered again on the CPU.
 
     Returns:
         A generator of the index of the pair, from 0, and its `RegistrationResult`.

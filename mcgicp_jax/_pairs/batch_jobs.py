@@ -262,13 +262,25 @@ class BatchJob:
         options = replace(self._options, max_coarse_distance=pair.max_coarse_distance)
         return run_pair(pair.inputs, pair.init, options)
 
+    @computed_on_cpu
+    def _register_prepared(self, pair: PreparedPair) -> PairResult:
+        """The result of a pair alone."""
+        run = self._run(pair)
+        if isinstance(run, PairResult):
+            return run
+        (result,) = results_of([run], [None])
+        return self._result(pair.index, pair.checked(result))
+
     def register_in_chunks(self, pairs: Iterable[Pair], num_threads: int) -> Iterator[PairResult]:
-        """Register the pairs in chunks on this machine; threads preprocess them."""
+        """Register the pairs in chunks on this machine; threads preprocess them, and register those again that may have
+        left a right initial pose."""
         # On the host neighbours are needed for warnings alone, of a sample of points.
         on_host = replace(self, options=replace(self.options, search=None))
         search, most = self.options.search or DenseSearch(), self.options.max_source_points
         with ThreadPoolExecutor(num_threads, thread_name_prefix="mcgicp") as threads:
             rejected: list[PairResult] = []
+            again: collections.deque[Future[PairResult]] = collections.deque()
+            register = with_settings(on_host._register_prepared)
 
             def prepared_pair(pair: Pair) -> PairResult | tuple[PreparedPair, ChunkPair]:
                 return replace(on_host, checked=pair.index < _CHECKED)._chunk_pair(pair)
@@ -283,15 +295,21 @@ class BatchJob:
             for ended in run_pairs(ready(), self.method, self.options, search, self.num_neighbors):
                 while rejected:
                     yield rejected.pop(0)
+                while again and again[0].done():
+                    yield again.popleft().result()
                 pair = ended.key
                 if isinstance(ended, Refused):
                     yield _invalid(pair.index, ended.reason)
+                    continue
+                if ended.has_doubt:
+                    again.append(threads.submit(register, pair))
                     continue
                 source, target = pair.inputs[:2]
                 used = np.ones(min(len(source), most or len(source)), bool)
                 result = registration_of(ended.state, ended.assessment, ended.history, source, target, used)
                 yield self._result(pair.index, pair.checked(result))
             yield from rejected
+            yield from (future.result() for future in again)
 
     @_of_a_pair
     def _chunk_pair(self, pair: Pair) -> PairResult | tuple[PreparedPair, ChunkPair]:

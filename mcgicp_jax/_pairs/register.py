@@ -60,7 +60,7 @@ def register(
     The coarse phase may leave a right `init`, for instance where clouds were cut out of merged scans. If `max_distance`
     is None, and it has moved the points by more than the fine distance to a pose at which the surfaces do not coincide,
     a second registration from `init` uses the fine distance alone, and is the result if they coincide better. Not
-    inside transformations and with `DenseSearch` in batches: pass `max_distance` there if `init` is near.
+    inside transformations: pass `max_distance` there if `init` is near.
 
     Outside `jit` and `vmap`, also inside `grad` or `jvp`, the loop runs on the host and calls compiled programs whose
     shapes do not depend on the sizes of the clouds. Inside `jit`, it is one program per size of clouds, whose matches

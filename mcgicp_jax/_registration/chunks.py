@@ -30,6 +30,7 @@ from mcgicp_jax._registration.loop import Record, State
 from mcgicp_jax._registration.options import Options
 from mcgicp_jax._registration.pose_derivative import Inputs
 from mcgicp_jax._registration.register_pair import problem_of
+from mcgicp_jax._registration.start_check import doubt_of_start, surface_fit
 from mcgicp_jax._registration.traced import TracedExecutor, assess
 from mcgicp_jax._search.base import AbstractSearch
 
@@ -75,12 +76,13 @@ class ChunkPair(NamedTuple):
 
 
 class Ended(NamedTuple, Generic[Key]):
-    """A registration that has ended, with the key of its pair."""
+    """A registration that has ended, with the key of its pair; and whether it may have left a right initial pose."""
 
     key: Key
     state: State
     assessment: Assessment
     history: Record
+    has_doubt: bool
 
 
 class Refused(NamedTuple, Generic[Key]):
@@ -220,17 +222,22 @@ class _Group(Generic[Key]):
         self._dispatched.popleft()
         ended: list[Ended[Key] | Refused[Key]] = []
         for row, (key, pair) in enumerate(pairs):
-            state, assessment, history = jax.tree.map(lambda leaf, row=row: leaf[row], results)
+            state, assessment, history, check = jax.tree.map(lambda leaf, row=row: leaf[row], results)
             if state.status < 0:
                 self._slow.append((key, pair))
                 continue
             # One history entry per update, and one at the returned pose.
             count = int(state.num_iterations) + 1
             history = jax.tree.map(lambda entries, count=count: entries[:count], history)
-            ended.append(Ended(key, state, assessment, history))
+            ended.append(Ended(key, state, assessment, history, _has_doubt(pair.start, state, check)))
         if first and len(pairs) - len(ended) > _MANY * len(pairs):
             self._first_updates = min(2 * self._first_updates, self._all_updates)
         return ended
+
+
+def _has_doubt(start: jaxlie.SE3, state: State, check: Any) -> bool:
+    """Whether there is a `doubt_of_start`, by settings and fit; None if `max_distance` is given."""
+    return check is not None and doubt_of_start(start, state, check[0], lambda: check[1]) is not None
 
 
 def _shapes(tree: Any) -> Any:
@@ -251,17 +258,20 @@ def _registered(
     options: Options,
     num_neighbors: int,
     mesh: Mesh,
-) -> Packed[tuple[State, Assessment, Record]]:
-    """States, assessments at their poses and histories of stacked pairs, in one array; a status is negative where a
-    loop has not ended after `max_updates`. `numbers` are the options that are numbers, by name."""
+) -> Packed[tuple[State, Assessment, Record, Any]]:
+    """States, assessments at their poses, histories, and settings and fits for `doubt_of_start`, of stacked pairs, in
+    one array; a status is negative where a loop has not ended after `max_updates`. `numbers` are the options that are
+    numbers, by name."""
 
     def registered(pair: ChunkPair, common: Any) -> Any:
         method, robust, numbers, max_updates = common
         own = replace(options, **numbers | {"max_coarse_distance": pair.max_coarse_distance})
-        problem, _ = problem_of(Inputs(pair.source, pair.target, method, robust), None, own, 1)
+        problem, inputs = problem_of(Inputs(pair.source, pair.target, method, robust), None, own, 1)
         problem = replace(problem, start=pair.start)
-        loop = TracedExecutor(problem, search, options.max_iterations).run(max_updates)
-        return loop.state, assess(loop, problem, search), loop.history
+        executor = TracedExecutor(problem, search, options.max_iterations)
+        loop = executor.run(max_updates)
+        check = (problem.settings, surface_fit(inputs, executor, loop)) if own.max_distance is None else None
+        return loop.state, assess(loop, problem, search), loop.history, check
 
     def on_a_device(chunk: ChunkPair, common: Any) -> Any:
         source, target = (_with_neighbors(clouds, search, num_neighbors) for clouds in chunk[2:])

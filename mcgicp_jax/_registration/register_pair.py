@@ -16,7 +16,7 @@ from mcgicp_jax._clouds.point_cloud import PointCloud, Values, Voxels, as_cloud
 from mcgicp_jax._clouds.preprocess import finite_rows, preprocess, preprocessed_in, with_neighbors
 from mcgicp_jax._clouds.voxel_size import NUM_NEIGHBORS, VoxelSize, voxels_and_grids
 from mcgicp_jax._compute.cache import Lazy
-from mcgicp_jax._compute.concrete import AnyArray, constant, is_concrete, numpy_for, outside_trace
+from mcgicp_jax._compute.concrete import AnyArray, AnyScalar, constant, is_concrete, numpy_for, outside_trace
 from mcgicp_jax._compute.linear_maps import primal
 from mcgicp_jax._compute.messages import messages_named, warn
 from mcgicp_jax._compute.threads import in_new_thread, with_settings_of_package
@@ -59,9 +59,8 @@ from mcgicp_jax._registration.settings import settings_for, spacing_of
 from mcgicp_jax._registration.start_check import (
     BETTER,
     GOOD_FIT,
-    LEAST_FIT,
-    LITTLE_IN_COMMON,
     distance_moved,
+    doubt_of_start,
     surface_fit,
 )
 from mcgicp_jax._registration.tie_points_and_prior import (
@@ -338,24 +337,16 @@ def rows_to_match(source: PointCloud, options: Options) -> Int[AnyArray, "n"] | 
 
 def _unless_left(run: Run, init: Pose | None, at_scales: bool, finely: Callable[[], Run]) -> tuple[Run, bool]:
     """A registration, or `finely()`, the one with the fine `max_distance` alone, if it may have left a right initial
-    pose and surfaces coincide better there; and whether it is ambiguous.
-
-    It may have left it if it has moved the points by more than that distance, and surfaces do not coincide at its pose,
-    or have little in common. Then the pose is ambiguous unless both end at the same one. (At several scales the initial
-    pose is known to be far off, where the fine distance leads nowhere.)
+    pose and surfaces coincide better there (see `doubt_of_start`); and whether it is ambiguous: clouds have little in
+    common, and the two do not end at the same pose.
     """
     settings, state = run.problem.settings, run.loop.state
-    if not (at_scales or settings.max_distance > settings.fine_distance) or state.status not in USABLE:
-        return run, False
     source, target = run.inputs[:2]
     start = se3_from_matrix(centred_pose(init, source, target), source.points.dtype)
-    if distance_moved(start, state) <= settings.fine_distance:
+    doubt = doubt_of_start(start, state, settings, partial(_fit, run), at_scales)
+    if doubt is None:
         return run, False
-    fit, common = _fit(run)
-    little = bool(common < LITTLE_IN_COMMON) and not at_scales
-    if fit >= LEAST_FIT and not little:
-        return run, False
-    other = finely()
+    (fit, little), other = doubt, finely()
     if other.loop.state.status not in USABLE:
         return run, little
     other_fit, _ = _fit(other)
@@ -365,7 +356,7 @@ def _unless_left(run: Run, init: Pose | None, at_scales: bool, finely: Callable[
     return other if better and (other_matches <= matches or other_fit > GOOD_FIT) else run, little and apart
 
 
-def _fit(run: Run) -> tuple[float, float]:
+def _fit(run: Run) -> tuple[AnyScalar, AnyScalar]:
     return surface_fit(run.inputs, cast(HostExecutor, run.executor), run.loop)
 
 

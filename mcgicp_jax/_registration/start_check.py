@@ -8,21 +8,23 @@ common, the surfaces may coincide there, too, and neither pose can be promised.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import cast
 
 import jaxlie
 import numpy as np
 from jaxtyping import Float
 
-from mcgicp_jax._compute.concrete import AnyArray
-from mcgicp_jax._local_geometry.local_geometry import LocalGeometry, geometry_table
+from mcgicp_jax._compute.concrete import AnyArray, AnyScalar, numpy_for
+from mcgicp_jax._local_geometry.local_geometry import LocalGeometry, local_geometries
 from mcgicp_jax._local_geometry.surface_agreement import THINNEST, agreement_of
-from mcgicp_jax._math.poses import rotated
+from mcgicp_jax._math.statistics import sampled_rows
 from mcgicp_jax._pose_solver.degeneracy import Directions
 from mcgicp_jax._pose_solver.matched import Motion
-from mcgicp_jax._registration.loop import LoopResult, State
-from mcgicp_jax._registration.on_host import HostExecutor
+from mcgicp_jax._registration.loop import AbstractExecutor, LoopResult, State
 from mcgicp_jax._registration.pose_derivative import Inputs
+from mcgicp_jax._registration.result import USABLE
+from mcgicp_jax._registration.settings import Settings
 
 # `surface_fit` below which they do not coincide. From right, near and far starts it was at most 0.073 at 53 wrong poses
 # of rooms that were cut, KITTI, another LiDAR and simulated streets. At right poses it was 0.17 or more in these rooms,
@@ -45,37 +47,54 @@ LITTLE_IN_COMMON = 0.6
 _SAMPLE = 1024
 
 
-def surface_fit(inputs: Inputs, executor: HostExecutor, loop: LoopResult) -> tuple[float, float]:
+def doubt_of_start(
+    start: jaxlie.SE3,
+    state: State,
+    settings: Settings,
+    fit: Callable[[], tuple[AnyScalar, AnyScalar]],
+    at_scales: bool = False,
+) -> tuple[AnyScalar, bool] | None:
+    """None unless a registration that has ended may have left a right initial pose; or its fit, and whether the clouds
+    have little in common. `fit` computes its `surface_fit`.
+
+    It may have left it if it has moved the points by more than the fine `max_distance`, and surfaces do not coincide at
+    its pose, or have little in common. (At several scales the initial pose is known to be far off, where the fine
+    distance leads nowhere.)
+    """
+    if not (at_scales or settings.max_distance > settings.fine_distance) or state.status not in USABLE:
+        return None
+    if distance_moved(start, state) <= settings.fine_distance:
+        return None
+    found, common = fit()
+    little = bool(common < LITTLE_IN_COMMON) and not at_scales
+    return (found, little) if found < LEAST_FIT or little else None
+
+
+def surface_fit(inputs: Inputs, executor: AbstractExecutor, loop: LoopResult) -> tuple[AnyScalar, AnyScalar]:
     """(a/m)² at the end of a registration, for the agreement a and the misfit m, at least 1, of the surfaces of matched
     points: see `agreement_of`. 0 without matches. And the fraction of the source points that have a match."""
-    points = executor.problem.source.points
-    rows = np.flatnonzero(executor.problem.source.search.valid)
-    rows = rows[:: -(-len(rows) // _SAMPLE) or 1]
+    points, others = executor.problem.source.points, executor.problem.target.points
+    rows, counts = sampled_rows(executor.problem.source.search.valid, _SAMPLE)
     # In position alone: matches in position and channels lie further apart, also at right poses.
-    motion, matches = executor.rematched(loop.state.pose, np.zeros(3, points.dtype), rows, np.ones(len(rows), bool))
-    targets = matches.indices[0]
-    common = float(np.mean(targets >= 0))
-    rows, targets = rows[targets >= 0], targets[targets >= 0]
-    if not len(rows):
-        return 0.0, common
-    offsets = executor.problem.target.points[targets] - motion.move(points[rows]).T
+    motion, matches = executor.rematched(loop.state.pose, np.zeros(3, points.dtype), rows, counts)
+    targets = executor.within(motion, matches).indices[0]
+    matched, xp = targets >= 0, numpy_for(targets)
+    targets = xp.maximum(targets, 0)
     own = rows if inputs.source_rows is None else inputs.source_rows[rows]
-    source, target = (
-        geometry_table(cloud, inputs.method.uses_channels).trees(some)[0]
-        for cloud, some in ((inputs.source, own), (inputs.target, targets))
-    )
-    normals = rotated(source.normal, motion.rotation), target.normal
-    misfit, agreement = agreement_of(offsets, normals, (_thickness(source), _thickness(target)))
-    return (agreement / max(misfit, 1.0)) ** 2, common
+    source, target = local_geometries(inputs.source, inputs.target, inputs.method.uses_channels, (own, targets))
+    turned = motion._replace(translation=np.zeros(3, points.dtype)).move(source.normal).T
+    offsets, thicknesses = others[targets] - motion.move(points[rows]).T, (_thickness(source), _thickness(target))
+    misfit, agreement = agreement_of(offsets, (turned, target.normal), thicknesses, matched)
+    return (agreement / xp.maximum(misfit, 1)) ** 2, xp.sum(matched) / xp.maximum(xp.sum(counts), 1)
 
 
 def _thickness(local: LocalGeometry) -> Float[AnyArray, "n"]:
     """Standard deviations of neighbourhoods along their normals, metres."""
-    x, y, z = local.normal.T
-    variance = np.sum(local.covariance.T * np.stack([x * x, 2 * x * y, 2 * x * z, y * y, 2 * y * z, z * z]), axis=0)
+    xp, (x, y, z) = numpy_for(local), local.normal.T
+    variance = xp.sum(local.covariance.T * xp.stack([x * x, 2 * x * y, 2 * x * z, y * y, 2 * y * z, z * z]), axis=0)
     # A disc extends to twice its standard deviation.
     least = 0.5 * THINNEST * local.neighborhood_radius
-    return np.maximum(np.sqrt(np.maximum(variance, 0)), np.maximum(least, np.finfo(np.float32).tiny))
+    return xp.maximum(xp.sqrt(xp.maximum(variance, 0)), xp.maximum(least, np.finfo(np.float32).tiny))
 
 
 def distance_moved(start: jaxlie.SE3, state: State) -> float:
