@@ -45,7 +45,6 @@ def test_swapped_arguments_are_named():
         ("method", lambda: mcg.register(POINTS, POINTS, mcg.GICP)),
         ("init", lambda: mcg.register(cloud, cloud, mcg.GICP(), init=np.diag([1, 1, 1, 1.001]))),
         ("robust", lambda: mcg.register(cloud, cloud, mcg.GICP(), robust=mcg.Huber)),
-        ("tie_points", lambda: mcg.register(cloud, cloud, mcg.GICP(), tie_points=(POINTS, POINTS))),
         ("executor", lambda: mcg.register_batch([cloud], [cloud], mcg.GICP(), executor=ThreadPoolExecutor)),
         ("cloud", lambda: mcg.io.write("cloud.ply", POINTS)),
         ("cloud", lambda: mcg.io.write(cloud, "cloud.ply")),
@@ -71,10 +70,13 @@ def test_clouds_and_methods_in_the_wrong_form_are_named():
         cloud.points = POINTS
 
 
-@pytest.mark.parametrize("method", [mcg.ColorICP(0.1), mcg.MultiChannelGICP()])
-def test_methods_of_channels_warn_where_there_are_none(method):
+@pytest.mark.parametrize(
+    ("method", "same"), [(mcg.ColorICP(0.1), mcg.PointToPoint()), (mcg.MultiChannelGICP(), mcg.GICP())]
+)
+def test_methods_of_channels_warn_that_they_use_geometry_alone(method, same):
     with pytest.warns(UserWarning, match=f"no channels: {type(method).__name__} uses geometry alone"):
-        mcg.register(POINTS, POINTS, method)
+        result = mcg.register(POINTS, POINTS, method)
+    np.testing.assert_allclose(result.matrix, mcg.register(POINTS, POINTS, same).matrix, atol=1e-6)
 
 
 class NoNumbers(mcg.GICP):
