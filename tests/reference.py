@@ -83,7 +83,7 @@ def nearest(queries, targets, k: int = 1) -> np.ndarray:
     found = np.full((len(queries), k), -1)
     for i, query in enumerate(queries):
         squared = ((targets - query) ** 2).sum(axis=1)
-        order = np.lexsort((np.arange(len(targets)), squared))[:k]
+        order = np.argsort(squared, kind="stable")[:k]
         found[i, : len(order)] = order
     return found
 

@@ -9,7 +9,7 @@ import jax
 import numpy as np
 import pytest
 import scipy.spatial
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 import mcgicp_jax as mcg
@@ -32,7 +32,9 @@ STILL = np.array([1.0, 0, 0, 0, 0, 0, 0])
     high=st.sampled_from([3, 50, None]),
     max_distance=st.sampled_from([0.7, 3.0, np.inf]),
 )
-def test_it_finds_the_same(seed, size, k, num_channels, high, max_distance):
+@example(seed=0, size=400, k=100, num_channels=0, high=None, max_distance=np.inf)
+@example(seed=0, size=400, k=300, num_channels=0, high=None, max_distance=np.inf)
+def test_pykdtree_and_scipy_find_the_same_neighbours(seed, size, k, num_channels, high, max_distance):
     """Few integers, so that most distances are shared and points coincide; and random numbers."""
     rng = np.random.default_rng(seed)
 
@@ -48,7 +50,7 @@ def test_it_finds_the_same(seed, size, k, num_channels, high, max_distance):
     np.testing.assert_array_equal(*found)
 
 
-def test_it_is_used_where_it_wins():
+def test_pykdtree_is_used_for_three_columns_alone():
     points = np.random.default_rng(0).normal(size=(50, 6))
     for search, columns, used in (
         (mcg.KDTreeSearch(), 3, True),
@@ -62,7 +64,7 @@ def test_it_is_used_where_it_wins():
 
 
 @pytest.mark.slow
-def test_without_it_its_extra_is_named():
+def test_without_pykdtree_its_extra_is_named():
     """In a process of its own: whether the package is installed is looked up once."""
     code = """
         import importlib.util
@@ -95,9 +97,3 @@ def test_real_pairs_have_the_same_poses(data, name):
             results += [[mcg.register(*clouds, method, init=init, search=search, **options) for method in METHODS]]
         for one, other in zip(*map(jax.tree.leaves, results), strict=True):
             np.testing.assert_array_equal(np.asarray(one), np.asarray(other))
-
-
-def test_many_neighbors():
-    points = np.random.default_rng(0).normal(size=(400, 3))
-    for k in (100, 300):
-        np.testing.assert_array_equal(PYKDTREE.neighbors(points, k), SCIPY.neighbors(points, k))
