@@ -207,8 +207,7 @@ def middle(points):
 @settings(max_examples=40, deadline=None)
 @given(clouds(channels=False), st.sampled_from(["point-to-point", "gicp"]))
 def test_bare_arrays_of_any_kind(cloud, name):
-    points, _, _ = cloud
-    before = copied(points)
+    points, before = cloud[0], copied(cloud[0])
     result = outcome(lambda: mcg.register(points, points, METHODS[name]))
     if result is not None:
         assert_believable(result)
@@ -220,9 +219,9 @@ def test_bare_arrays_of_any_kind(cloud, name):
 @pytest.mark.parametrize("beams", [False, True])
 def test_points_in_one_place_do_not_set_the_default_distance(beams):
     """Points that are there twice, or beams without an echo."""
-    source, target, truth = (each.unpad() if isinstance(each, mcg.PointCloud) else each for each in pair(size=1000))
-    crowded = np.concatenate([target.points, np.zeros((1200, 3)) if beams else target.points])
-    result = mcg.register(source.points, crowded, mcg.GICP())
+    *clouds, truth = pair(size=1000)
+    source, target = (cloud.unpad().points for cloud in clouds)
+    result = mcg.register(source, np.concatenate([target, np.zeros((1200, 3)) if beams else target]), mcg.GICP())
     assert result.converged and max(pose_error(result.matrix, truth)) < 1e-2
 
 
@@ -232,25 +231,31 @@ def around(radius, count):
     return radius * directions / np.linalg.norm(directions, axis=1, keepdims=True)
 
 
+@pytest.fixture(scope="module")
+def room(precision):
+    """A pair, its true pose, and the poses that methods find."""
+    *clouds, truth = pair(size=2000)
+    return clouds, truth, {m: mcg.register(*clouds, METHODS[m]) for m in ("point-to-point", "gicp")}
+
+
 @pytest.mark.parametrize(
     ("place", "count"),
     [(0.0, 700), (999.0, 10), (-9999.0, 10), (999.0, 1), (65.535, 5), (around(999, 20), 20), (around(100, 5), 5)],
 )
-def test_rays_without_return_hold_no_pose(place, count):
+def test_rays_without_return_do_not_change_the_pose(place, count, room):
     """They lie at one place in both clouds, wherever the sensor is, and far ones beyond all points, few ones also at
     different places."""
-    clouds, truth = pair(size=2000)[:2], motion()
-    for method in (mcg.PointToPoint(), mcg.GICP()):
-        expected = mcg.register(*clouds, method)
-        rows = np.broadcast_to(place, (count, 3))
-        spoiled = [np.concatenate([cloud.points, rows.astype(np.float32)]) for cloud in clouds]
+    clouds, truth, found = room
+    rows = np.broadcast_to(place, (count, 3)).astype(np.float32)
+    spoiled = [np.concatenate([cloud.points, rows]) for cloud in clouds]
+    for method, expected in found.items():
         with pytest.warns(UserWarning, match="as sensors report rays without return"):
-            result = mcg.register(*spoiled, method)
+            result = mcg.register(*spoiled, METHODS[method])
         assert result.status == expected.status == Status.CONVERGED
         assert max(pose_error(result.matrix, truth)) < 1.1 * max(pose_error(expected.matrix, truth)) + 1e-3
 
 
-def test_what_no_float32_holds_is_left_out():
+def test_values_beyond_float32_are_left_out():
     """In both precisions alike, and without a warning from the arithmetic."""
     points, channels = room_corner(100)
     points[3, 0], channels[5, 1] = 1e39, -1e300
@@ -303,7 +308,7 @@ def unit_warnings(source, target):
     return [each for each in caught if re.search(OTHER_UNIT, str(each.message))]
 
 
-def test_clouds_of_one_unit_may_differ():
+def test_clouds_of_one_unit_and_different_extents_are_not_warned_of():
     """A small part of a map, and a thinned cloud."""
     source, target = np.tile(room_corner(20_000)[0], (2, 1)), room_corner(200, seed=1)[0]
     part = source[np.linalg.norm(source, axis=1) < 0.045]
@@ -334,7 +339,7 @@ def test_more_neighbors_than_points():
     assert_believable(result)
 
 
-def test_a_batch_tells_what_register_tells():
+def test_statuses_of_a_batch_are_those_of_register():
     """Hostile pairs side by side: each has the status of `register`, or INVALID_INPUT where that raises."""
     rng = np.random.default_rng(0)
     kinds = ["room", "plane", "line", "one place", "few places"]
@@ -358,7 +363,7 @@ def checks():
 
 
 @pytest.mark.parametrize("name", ["mc-gicp", pytest.param("photometric", marks=pytest.mark.slow)])
-def test_checks_of_jax_that_users_turn_on_are_for_their_code(name, checks):
+def test_register_passes_under_strict_checks_of_jax(name, checks):
     (points, channels), target = (room_corner(600, seed=seed) for seed in (1, 2))
     known = np.random.default_rng(0).random(channels.shape) < 0.8
     # Gradients of JAX's own functions fail under this guard.
@@ -369,7 +374,7 @@ def test_checks_of_jax_that_users_turn_on_are_for_their_code(name, checks):
 
 
 @pytest.mark.slow
-def test_checks_of_jax_in_gradients(checks):
+def test_gradients_pass_under_strict_checks_of_jax(checks):
     source, target, truth = pair(size=600)
     method = METHODS["mc-gicp"].resolve(source, target)
     matches = mcg.find_correspondences(source, target, truth, method, max_distance=0.2)

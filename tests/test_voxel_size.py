@@ -55,6 +55,8 @@ def test_scan_lines_are_averaged_until_their_neighbourhoods_are_no_lines():
     assert 0.05 < cloud.voxel_size < 0.5 and fraction_of_lines(cloud.points) < 0.1
     finer = mcg.preprocess(raw, cloud.voxel_size / 2)
     assert fraction_of_lines(finer.points) > 0.05
+    with pytest.warns(UserWarning, match=r"^voxel_size: .*\d+%"):
+        mcg.preprocess(raw, None)
 
 
 def test_points_that_are_spread_evenly_are_kept():
@@ -69,11 +71,17 @@ def test_points_that_are_spread_evenly_are_kept():
         refused(lambda wrong=wrong: mcg.preprocess(raw, wrong), "voxel_size")
 
 
-def test_noise_is_averaged():
-    raw = even(20_000, noise=0.1)
-    cloud = mcg.preprocess(raw)
+@pytest.fixture(scope="module")
+def thick():
+    return even(20_000, noise=0.1)
+
+
+def test_noise_is_averaged_and_warned_of_where_no_voxels_are_asked_for(thick):
+    cloud = mcg.preprocess(thick)
     assert "times as thick as wide" in repr(cloud)
-    assert thickness(raw[::4]) > 0.4 and thickness(cloud.points) < 0.35
+    assert thickness(thick[::4]) > 0.4 and thickness(cloud.points) < 0.35
+    with pytest.warns(UserWarning, match=r"^voxel_size: .*0\.\d+ times"):
+        mcg.preprocess(thick, None)
 
 
 def test_large_clouds_keep_at_most_40_000_voxels():
@@ -106,15 +114,18 @@ def test_the_size_goes_with_the_unit_and_not_with_far_points_or_the_order():
     ],
     ids=["one place", "duplicates", "one line", "huge", "far point"],
 )
-def test_any_cloud_has_a_size_or_none(raw):
+def test_degenerate_clouds_have_a_positive_size_or_none(raw):
     size = mcg.preprocess(raw).voxel_size
     assert size is None or size > 0
 
 
-def test_a_planar_scan_is_kept_and_sparse_lines_are_averaged_as_far_as_the_scene_is_shown():
+def test_a_planar_scan_is_kept():
     angle = np.linspace(0, 2 * np.pi, 1081)
     planar = np.stack([5 * np.cos(angle), 3 * np.sin(angle), np.zeros(1081)], axis=1)
     assert mcg.preprocess(planar).voxel_size is None
+
+
+def test_sparse_lines_are_averaged_as_far_as_500_points_remain():
     sparse = lines(spacing=1.0, along=0.05, size=16.0)
     assert fraction_of_lines(sparse) == 1
     cloud = mcg.preprocess(sparse)
@@ -168,14 +179,6 @@ def test_the_size_survives_what_users_do_with_clouds():
     moved = cloud.transform(np.eye(4)).replace(channels=np.zeros((len(cloud), 1)))
     assert moved.voxel_size == cloud.voxel_size
     assert jax.tree.structure(cloud) == jax.tree.structure(mcg.preprocess(lines(), 0.3))
-
-
-@pytest.mark.parametrize(
-    ("raw", "figure"), [(lines(), r"\d+%"), (even(20_000, noise=0.1), r"0\.\d+ times")], ids=["lines", "noise"]
-)
-def test_a_given_none_is_warned_of_with_figures(raw, figure):
-    with pytest.warns(UserWarning, match=rf"^voxel_size: .*{figure}"):
-        mcg.preprocess(raw, None)
 
 
 @in_float64
