@@ -29,33 +29,18 @@ def corridor(
     points_per_frame: int = 5000,
     step: float = 0.2,
     textured: bool = True,
-    noise: float = 1.0,
     seed: int = 0,
 ) -> SyntheticFrames:
-    """A sensor moves along an endless corridor, 2.4 m wide and 2.5 m high.
+    """A sensor moves along an endless corridor, 2.4 m wide and 2.5 m high, whose axis is x. The z axis is up.
 
-    The cross-section is constant along the x axis, so the geometry leaves exactly that direction unobservable. The rays
-    are uniform over the sphere, up to 12 m long, and drawn anew for every frame. From frame to frame the sensor moves
-    by `step` along the axis and by at most a third of that across it, and rotates by a few degrees.
-
-    Args:
-        num_frames: number of frames.
-        points_per_frame: number of rays; the few that hit nothing within 12 m give no point.
-        step: metres along the axis between consecutive frames.
-        textured: whether the intensity varies over the surfaces; otherwise it is constant.
-        noise: factor on the standard deviations, 0.01 m of the range and 0.02 of the intensity; 0 for none.
-        seed: determines the pattern, path, rays and noise. `observe` draws the latter two anew.
-
-    Returns:
-        Frames whose clouds have the channel intensity, from 0 to 1. The world's z axis points up.
-
-    Raises:
-        ValueError: if `num_frames`, `points_per_frame` or `noise` is out of range.
+    The rays are uniform over the sphere, up to 12 m long, and drawn anew for every frame; the few that hit nothing give
+    no point. From frame to frame the sensor moves by `step` metres along the axis and by at most a third of that across
+    it, and rotates by a few degrees. The channel intensity, from 0 to 1, is constant unless `textured`.
     """
-    check_scene(points_per_frame, noise)
+    check_scene(points_per_frame, 1.0)
     scene_rng, path_rng = scene_and_path_rng(seed)
     pattern = int(scene_rng.integers(2**31)) if textured else None
-    observer = partial(_observe, pattern, points_per_frame, noise)
+    observer = partial(_observe, pattern, points_per_frame)
     path = partial(_pose, step, *path_rng.uniform(0, 2 * np.pi, 3))
     return SyntheticFrames(num_frames, path, observer, _PERIOD, seed)
 
@@ -74,7 +59,7 @@ def bare_pair() -> tuple[PointCloud, PointCloud, Matrix, np.ndarray]:
     return *clouds, np.linalg.inv(target.pose) @ source.pose, source.pose[:3, :3].T @ [1, 0, 0]
 
 
-def _observe(pattern: int | None, size: int, noise: float, rng: np.random.Generator, pose: Matrix) -> PointCloud:
+def _observe(pattern: int | None, size: int, rng: np.random.Generator, pose: Matrix) -> PointCloud:
     rotation, center = pose[:3, :3], pose[:3, 3]
     hits = cast(center, random_rays(rng, size) @ rotation.T, _walls(center[0]), _MAX_RANGE)
     intensity = np.full(len(hits.points), 0.5)
@@ -83,8 +68,8 @@ def _observe(pattern: int | None, size: int, noise: float, rng: np.random.Genera
         # Hits are moved just into the wall, so that rounding does not scatter them over two panels.
         panel = np.floor((hits.points - 1e-6 * hits.normals) / _PANEL + 0.5).astype(int)
         intensity += 0.3 * (random_cells(panel, pattern + len(_PATCHES)) - 0.5)
-    distance = hits.distance + noise * _RANGE_NOISE * rng.normal(size=hits.distance.shape)
-    intensity += noise * _INTENSITY_NOISE * rng.normal(size=intensity.shape)
+    distance = hits.distance + _RANGE_NOISE * rng.normal(size=hits.distance.shape)
+    intensity += _INTENSITY_NOISE * rng.normal(size=intensity.shape)
     return PointCloud(distance[:, None] * (hits.rays @ rotation), np.clip(intensity, 0, 1), channel_names=["intensity"])
 
 

@@ -81,8 +81,8 @@ CORRIDOR: list[Side] = [
 ]
 ROAD: list[Side] = [((-20, -6, 0), (40, 0, 0), (0, 12, 0))]
 SCENES = {"floor and wall": FLOOR_AND_WALL, "corridor": CORRIDOR, "road": ROAD}
-# Metres: height of the sensor above the floor.
-_HEIGHT = 1.2
+# Metres: height of the sensor above the floor, and its maximum range.
+_HEIGHT, _MAX_RANGE = 1.2, 9.0
 
 Channel = Callable[[np.ndarray, np.ndarray], np.ndarray]
 """A channel (N,), of points (N, 3) in the sensor's frame, with x forward and z up, and of points in the world."""
@@ -127,8 +127,6 @@ def seen(
     count: int = 4000,
     channel_noise: float = 0.01,
     step: float = STEP,
-    maximum_range: float = 9.0,
-    forward_only: bool = False,
 ) -> Pair:
     """A sensor sees rectangles from the origin, and again after a step along x; clouds are in the sensor's frame.
 
@@ -139,9 +137,7 @@ def seen(
     def view(along: float) -> tuple[np.ndarray, np.ndarray]:
         at = np.array([along, 0, _HEIGHT])
         world = rects(rng, 6 * count, sides)
-        near = _range(world - at) < maximum_range
-        ahead = world[:, 0] > along if forward_only else np.ones(len(world), bool)
-        world = world[near & ahead][:count]
+        world = world[_range(world - at) < _MAX_RANGE][:count]
         return world - at + NOISE * rng.normal(size=world.shape), world
 
     target, source = view(0.0), view(step)

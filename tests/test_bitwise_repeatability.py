@@ -37,7 +37,7 @@ def expected():
 
 
 @pytest.mark.parametrize("name", METHODS)
-def test_again_and_again_with_any_number_of_workers(name, expected):
+def test_repeated_runs_with_any_number_of_workers_agree(name, expected):
     prepared = clouds()
     for turn in range(15):
         search = mcg.KDTreeSearch(workers=(-1, 1, 2, 3, 8)[turn % 5])
@@ -47,14 +47,14 @@ def test_again_and_again_with_any_number_of_workers(name, expected):
 
 
 @pytest.mark.parametrize("name", METHODS)
-def test_in_a_batch_of_threads(name, expected):
+def test_batches_of_threads_agree(name, expected):
     source, target = clouds()
     for result in mcg.register_batch([source] * 8, [target] * 8, METHODS[name]):
         assert bits(result) == expected[name]
 
 
 @pytest.mark.slow
-def test_in_another_process(expected):
+def test_another_process_agrees(expected):
     """On as many cores: what XLA compiles depends on their number. Compiled anew, not loaded from the cache."""
     environment = os.environ | {"JAX_ENABLE_COMPILATION_CACHE": "false"}
     command = [sys.executable, "-c", _IN_ANOTHER_PROCESS]

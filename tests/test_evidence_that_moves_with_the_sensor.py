@@ -34,20 +34,19 @@ def status(pair, **options):
         return mcg.register(pair.source, pair.target, METHOD, **options).status
 
 
-@pytest.mark.parametrize("channel", ["range", "elevation", "azimuth", "time", "vignetting", "coordinate", "ring"])
-def test_a_pattern_that_moves_with_the_sensor_constrains_nothing(channel):
-    assert status(seen(CORRIDOR, 0, MOVING_CHANNELS[channel])) in HONEST
-
-
-@pytest.mark.parametrize("channel", ["range", "time"])
-def test_a_pattern_is_found_out_in_any_frame_of_both_clouds(channel):
-    pair = in_frames(seen(FLOOR_AND_WALL, 0, MOVING_CHANNELS[channel]), ELSEWHERE, ELSEWHERE)
-    assert status(pair) in HONEST
-
-
-def test_the_target_may_be_a_map():
-    pair = in_frames(seen(FLOOR_AND_WALL, 0, MOVING_CHANNELS["ring"]), np.eye(4), ELSEWHERE)
-    assert status(pair, init=ELSEWHERE) in HONEST
+@pytest.mark.parametrize(
+    ("sides", "channel", "frames", "init"),
+    [
+        *(
+            (CORRIDOR, name, (np.eye(4), np.eye(4)), None)
+            for name in ("range", "elevation", "azimuth", "time", "vignetting", "coordinate", "ring")
+        ),
+        *((FLOOR_AND_WALL, name, (ELSEWHERE, ELSEWHERE), None) for name in ("range", "time")),
+        pytest.param(FLOOR_AND_WALL, "ring", (np.eye(4), ELSEWHERE), ELSEWHERE, id="the target is a map"),
+    ],
+)
+def test_a_pattern_that_moves_with_the_sensor_constrains_nothing_in_any_frame(sides, channel, frames, init):
+    assert status(in_frames(seen(sides, 0, MOVING_CHANNELS[channel]), *frames), init=init) in HONEST
 
 
 @pytest.mark.parametrize("frame", [np.eye(4), ELSEWHERE])

@@ -123,7 +123,7 @@ def test_compiled_programs_get_all_rows_of_a_target_that_is_computed_on_demand(c
     [mcg.MultiChannelGICP([0.05, 0.08], 0.3, epsilon=1e-2), mcg.GICP(epsilon=1e-2), mcg.PointToPoint()],
     ids=["mc-gicp", "gicp", "point-to-point"],
 )
-def test_the_gradient_is_that_of_differences(clouds, method):
+def test_gradients_agree_with_differences(clouds, method):
     source, target = clouds
     method = jax.tree.map(lambda number: jnp.asarray(number, float), method)
     options = {"max_distance": GATE, "max_source_points": 150, "soft_matches": False, **TO_ROUNDING}
@@ -166,7 +166,7 @@ def test_gradients_with_given_covariances_and_inside_jit(clouds):
         np.testing.assert_allclose(outside, inside, atol=1e-9 * np.abs(inside).max())
 
 
-def test_the_number_is_checked(clouds):
+def test_invalid_numbers_are_named(clouds):
     for wrong in (0, -3, 3):
         options = {"max_source_points": wrong}
         refused(lambda o=options: mcg.register_batch(clouds, clouds, mcg.GICP(), **o), "max_source_points", wrong)
@@ -181,30 +181,29 @@ def test_odometry_and_multiway_match_at_most_10000_points():
     assert matched == [10_000, 10_500, 10_000]
 
 
-def test_the_command_line_takes_a_number_or_all(tmp_path, capsys):
-    source, target, _ = pair(size=400)
-    files = [str(tmp_path / name) for name in ("source.npz", "target.npz")]
-    for path, cloud in zip(files, (source, target), strict=True):
+def written(folder, size):
+    """Paths of a source and a target."""
+    files = [str(folder / name) for name in ("source.npz", "target.npz")]
+    for path, cloud in zip(files, pair(size=size)[:2], strict=True):
         io.write(path, cloud)
-    shown = {}
+    return files
+
+
+def test_the_command_line_takes_a_number_or_all(tmp_path, capsys):
+    files, shown = written(tmp_path, 400), []
     for number in ("150", "all"):
         assert main(["register", *files, "--max-source-points", number]) == 0
-        shown[number] = capsys.readouterr().out
-    assert shown["150"] != shown["all"]
+        shown.append(capsys.readouterr().out)
+    assert shown[0] != shown[1]
 
 
 @pytest.mark.slow
 def test_the_command_line_chooses_parameters_as_register_does(tmp_path):
     """Of the points that are matched."""
-    source, target, _ = pair(size=900)
-    files = [str(tmp_path / name) for name in ("source.npz", "target.npz", "pose.txt")]
-    for path, cloud in zip(files, (source, target), strict=False):
-        io.write(path, cloud)
-    clouds = [io.read(path) for path in files[:2]]
-    options = ["--method", "mc-gicp", "--output", files[2], "--max-source-points", "150"]
-    assert main(["register", *files[:2], *options]) == 0
-    expected = mcg.register(*clouds, mcg.MultiChannelGICP(), max_source_points=150)
-    np.testing.assert_allclose(io.read_poses(files[2])[0], expected.matrix, atol=1e-9)
+    files, output = written(tmp_path, 900), str(tmp_path / "pose.txt")
+    assert main(["register", *files, "--method", "mc-gicp", "--output", output, "--max-source-points", "150"]) == 0
+    expected = mcg.register(*map(io.read, files), mcg.MultiChannelGICP(), max_source_points=150)
+    np.testing.assert_allclose(io.read_poses(output)[0], expected.matrix, atol=1e-9)
 
 
 @pytest.mark.slow
