@@ -149,10 +149,15 @@ def test_rounding_of_poses_in_float32_is_warned_of():
     assert caught[0].filename == __file__ or "jaxtyping" in caught[0].filename
 
 
-def test_parts_that_have_priors_are_well_defined():
+def test_parts_that_are_not_connected_need_priors_each():
     poses, loops = SMALL["grid"]
     graph, _ = measured(poses, loops)
     parts = graph.edges[(graph.edges.i < 13) == (graph.edges.j < 13)]
+    none = mcg.optimize_poses(mcg.PoseGraph(graph.poses, parts))
+    assert none.status == mcg.Status.DEGENERATE and not none.converged
+    assert np.isfinite(none.poses).all()
+    np.testing.assert_allclose(none.poses[13], graph.poses[13], atol=1e-14)
+    assert np.all(np.isfinite(none.covariance[:13])) and np.all(np.isinf(np.diagonal(none.covariance[13:], 0, 1, 2)))
     covariance = np.diag([1e-4] * 6)
     priors = [mcg.Edge(mcg.WORLD, k, poses[k], covariance=covariance)[None] for k in (3, 20)]
     found = mcg.optimize_poses(mcg.PoseGraph(graph.poses, joined(parts, *priors)))
@@ -378,16 +383,6 @@ def test_covariances_are_those_of_simulation():
     assert 0.9 < np.mean(squares) / 6 < 1.1
     np.testing.assert_allclose(np.std(twists, axis=0)[-1], np.sqrt(np.diag(found.covariance[-1])), rtol=0.35)
     np.testing.assert_array_equal(found.covariance[0], np.zeros((6, 6)))
-
-
-def test_parts_that_are_not_connected():
-    graph, _ = measured(*SMALL["grid"])
-    cut = (graph.edges.i < 13) == (graph.edges.j < 13)
-    found = mcg.optimize_poses(mcg.PoseGraph(graph.poses, graph.edges[cut]))
-    assert found.status == mcg.Status.DEGENERATE and not found.converged
-    assert np.isfinite(found.poses).all()
-    np.testing.assert_allclose(found.poses[13], graph.poses[13], atol=1e-14)
-    assert np.all(np.isfinite(found.covariance[:13])) and np.all(np.isinf(np.diagonal(found.covariance[13:], 0, 1, 2)))
 
 
 def test_double_edges_count_twice():
