@@ -123,6 +123,8 @@ def test_errors_of_motions_do_not_grow_by_deskewing():
 
 
 def test_odometry_needs_times_to_deskew_and_else_ignores_them():
+    street = datasets.street(1, points_per_frame=400, spin=True)[0].cloud
+    assert street.times.shape == (len(street),) and np.ptp(street.times) == 1
     timed, _ = rooms(spin=True, count=2)
     untimed = [cloud.replace(times=None) for cloud in timed]
     poses = [[step.pose for step in mcg.odometry(each, mcg.GICP(), max_distance=1.0)] for each in (timed, untimed)]
