@@ -108,7 +108,7 @@ def test_information_is_the_sum_of_jacobians(scale):
 
 @pytest.mark.parametrize("before", [COARSE, RUNNING, SETTLED])
 @pytest.mark.parametrize("count", [0, 1, 3, 4])
-def test_too_few_matches_go_before_convergence(before, count):
+def test_too_few_matches_are_the_status_even_after_convergence(before, count):
     """The last update may move matches beyond `max_distance`: three determine a pose, but one not to be believed."""
     moved, residual, information, weight, _ = random_pairs(3, noise=0.0)
     measured, _ = solve(moved, 0 * residual, information, weight, np.arange(N) < count)
@@ -125,7 +125,7 @@ def test_too_few_matches_go_before_convergence(before, count):
 
 
 @pytest.mark.parametrize("missing", ["no pairs", "one direction"])
-def test_unconstrained_directions_stay_where_they_are(missing):
+def test_unconstrained_directions_do_not_move(missing):
     moved, residual, information, weight, valid = random_pairs(3)
     if missing == "no pairs":
         valid[:], weight[:], residual[:] = False, 0, 0

@@ -108,7 +108,7 @@ def test_too_many_voxels_show_in_the_status():
     @jax.jit
     def registered(points):
         cloud = averaged(points, channels, size=100)
-        return mcg.register(cloud, cloud, mcg.GICP(), max_distance=0.5)
+        return mcg.register(cloud, cloud, mcg.PointToPoint(), max_distance=0.5)
 
     assert registered(points).status is mcg.Status.TOO_FEW_CORRESPONDENCES
 

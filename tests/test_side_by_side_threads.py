@@ -55,40 +55,27 @@ def test_answers_come_in_order_from_no_more_threads_than_asked_for(workers):
 
 
 @pytest.mark.timeout(60)
-@pytest.mark.parametrize("failing", [0, 3])
-def test_an_error_in_any_thread_is_raised(failing):
-    def before(number):
-        if number == failing:
+def test_an_error_in_any_thread_is_raised_and_stops_the_others():
+    def fails(number):
+        if number == 3:
             raise ZeroDivisionError
 
-    with pytest.raises(ZeroDivisionError):
-        watched(before, 2)
-
-
-def test_after_an_error_nobody_goes_on():
-    def before(_):
+    def fails_late(_):
         if threading.current_thread() is threading.main_thread():
             time.sleep(0.1)  # The other thread has begun.
             raise ZeroDivisionError
         # Far longer than the call that fails, on a busy machine, too.
         time.sleep(0.5)
 
-    with pytest.raises(ZeroDivisionError):
-        watched(before, 2)
+    for before in (fails, fails_late):
+        with pytest.raises(ZeroDivisionError):
+            watched(before, 2)
     assert len(CALLS) <= 3
 
 
 @pytest.mark.timeout(60)
-def test_users_may_have_threads_of_their_own():
+def test_users_may_have_threads_of_their_own_that_share_clouds():
     """More than there are cores, each of which shares its queries with the threads of the package."""
-    expected = mcg.KDTreeSearch().neighbors(POINTS, 5)
-    with ThreadPoolExecutor(8) as users:
-        for found in users.map(lambda _: mcg.KDTreeSearch().neighbors(POINTS, 5), range(16)):
-            np.testing.assert_array_equal(found, expected)
-
-
-def test_threads_may_share_clouds():
-    """And what is computed of their rows, by one of them."""
     first, second = (mcg.preprocess(room_corner(2000, seed=seed)[0]) for seed in (0, 1))
     sizes = (200, 500, None, 300) * 2
 
@@ -98,7 +85,9 @@ def test_threads_may_share_clouds():
     expected = [matrix((first.replace(), second.replace()), size) for size in sizes[:4]]
     with ThreadPoolExecutor(len(sizes)) as users:
         found = list(users.map(lambda size: matrix((first, second), size), sizes))
+        neighbors = list(users.map(lambda _: mcg.KDTreeSearch().neighbors(POINTS, 5), sizes))
     np.testing.assert_array_equal(found, expected * 2)
+    np.testing.assert_array_equal(neighbors, [cKDTree(POINTS).query(POINTS, 5)[1]] * len(sizes))
 
 
 @pytest.mark.slow

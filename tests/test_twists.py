@@ -1,58 +1,36 @@
 """Exponential, logarithm and adjoints of rigid motions against SciPy and finite differences, also near 0 and π."""
 
-import jax.numpy as jnp
 import numpy as np
 import pytest
 from scipy.linalg import expm
 
-from mcgicp_jax._math.poses import (
-    adjoint,
-    exponential,
-    inverse,
-    logarithm,
-    logarithm_derivative,
-    skew,
-    translation_adjoint,
-)
-
-ANGLES = (0.0, 1e-12, 1e-8, 1e-5, 1e-3, 0.1, 1.0, 2.5, 3.1, np.pi - 1e-9)
+from mcgicp_jax._math.poses import adjoint, exponential, inverse, logarithm, logarithm_derivative, skew
 
 
-def twists(angle, number=20):
-    rng = np.random.default_rng(0)
-    found = rng.normal(size=(number, 6))
+def twists(angle):
+    found = np.random.default_rng(0).normal(size=(20, 6))
     found[:, 3:] *= angle / np.linalg.norm(found[:, 3:], axis=1, keepdims=True)
     return found
 
 
-def generators(twist):
-    return np.block([[skew(twist[3:]), twist[:3, None]], [np.zeros((1, 4))]])
+def expected_exponential(twist):
+    return expm(np.block([[skew(twist[3:]), twist[:3, None]], [np.zeros((1, 4))]]))
 
 
-@pytest.mark.parametrize("angle", ANGLES)
+@pytest.mark.parametrize("angle", [0.0, 1e-12, 1e-8, 1e-5, 1e-3, 0.1, 1.0, 2.5, 3.1, np.pi - 1e-9])
 def test_exponential_and_logarithm(angle):
-    given = twists(angle)
+    given, h = twists(angle), 1e-3
     matrices = exponential(given)
-    np.testing.assert_allclose(matrices, [expm(generators(each)) for each in given], atol=1e-14)
+    np.testing.assert_allclose(matrices, [expected_exponential(each) for each in given], atol=1e-14)
     np.testing.assert_allclose(logarithm(matrices), given, atol=1e-13)
     np.testing.assert_allclose(inverse(matrices) @ matrices, np.broadcast_to(np.eye(4), matrices.shape), atol=1e-14)
+    if angle < 3.14:
+        near = [logarithm(matrices[:, None] @ exponential(k * h * np.eye(6))) for k in (1, -1, 2, -2)]
+        expected = (8 * (near[0] - near[1]) - (near[2] - near[3])) / (12 * h)
+        np.testing.assert_allclose(logarithm_derivative(given), expected.swapaxes(1, 2), atol=1e-9)
 
 
-@pytest.mark.parametrize("angle", ANGLES[:-1])
-def test_the_derivative_of_the_logarithm(angle):
-    given, h = twists(angle), 1e-3
-    steps = h * np.eye(6)
-    near = [logarithm(exponential(given)[:, None] @ exponential(k * steps)) for k in (1, -1, 2, -2)]
-    expected = (8 * (near[0] - near[1]) - (near[2] - near[3])) / (12 * h)
-    np.testing.assert_allclose(logarithm_derivative(given), expected.swapaxes(1, 2), atol=1e-9)
-
-
-def test_adjoints():
+def test_adjoint_moves_twists():
     matrices, given = exponential(twists(1.0)), twists(0.3)
-    moved = np.array([expm(generators(each)) for each in (adjoint(matrices) @ given[..., None])[..., 0]])
+    moved = [expected_exponential(each) for each in (adjoint(matrices) @ given[..., None])[..., 0]]
     np.testing.assert_allclose(moved, matrices @ exponential(given) @ inverse(matrices), atol=1e-13)
-    shift = np.eye(4)
-    shift[:3, 3] = (1, 2, 3)
-    np.testing.assert_allclose(translation_adjoint(shift[:3, 3]), adjoint(shift), atol=1e-15)
-    for function in (adjoint, inverse):
-        np.testing.assert_allclose(function(jnp.asarray(matrices)), function(matrices), atol=1e-5)
