@@ -1,5 +1,7 @@
 """Comparison of derivatives with finite differences, shared by the tests of transformations."""
 
+from typing import NamedTuple
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -54,47 +56,62 @@ def clouds_with(inputs, source, target):
     return filled("source", source), filled("target", target)
 
 
-def directional_errors(loss, inputs, gradient):
-    """Yield name, derivative and central difference along a random direction in each input."""
-    rng = np.random.default_rng(1)
+class Slope(NamedTuple):
+    """The central difference of a loss along a random direction in a leaf of an input."""
+
+    name: str
+    leaf: int
+    direction: np.ndarray
+    difference: float
+
+
+def slopes(loss, inputs):
+    """Central differences along a random direction in each input."""
+    rng, found = np.random.default_rng(1), []
     for name, value in inputs.items():
         leaves, structure = jax.tree.flatten(value)
         for i, leaf in enumerate(leaves):
             direction = rng.normal(size=leaf.shape)
             if name == "method" and leaf.ndim == 2:
                 direction = direction + direction.T
-            if name == "method" or name == "robust":
+            if name in ("method", "robust"):
                 direction = direction * np.abs(np.asarray(leaf))
-
-            def at(step, name=name, leaves=leaves, structure=structure, i=i, leaf=leaf, direction=direction):
-                moved = [*leaves[:i], leaf + step * direction, *leaves[i + 1 :]]
-                return float(loss(inputs | {name: jax.tree.unflatten(structure, moved)}))
-
             # Short, so that no match crosses the kink of a kernel, and that the next term of the series, of the step's
             # square, is far below rounding.
-            step = 5e-7
-            expected = (at(step) - at(-step)) / (2 * step)
-            actual = float(jnp.sum(jax.tree.leaves(gradient[name])[i] * direction))
-            yield f"{name}[{i}]", actual, expected
+            values, step = [], 5e-7
+            for each in (step, -step):
+                moved = [*leaves[:i], np.asarray(leaf) + each * direction, *leaves[i + 1 :]]
+                values.append(float(loss(inputs | {name: jax.tree.unflatten(structure, moved)})))
+            found.append(Slope(name, i, direction, (values[0] - values[1]) / (2 * step)))
+    return found
+
+
+def assert_slopes(gradient, expected, floor=1e-3, accuracy=1e-6):
+    """The gradient has these slopes, relative to each, or to `floor` where it is less."""
+    for name, leaf, direction, difference in expected:
+        actual = np.sum(np.asarray(jax.tree.leaves(gradient[name])[leaf]) * direction)
+        assert abs(actual - difference) <= accuracy * max(abs(difference), floor), f"{name}[{leaf}]"
 
 
 def check_gradient(loss, inputs):
     """Compare the gradient with differences of values outside of transformations; return the compiled gradient."""
     compiled = jax.jit(jax.grad(loss))
-    gradient = compiled(inputs)
-    for name, actual, expected in directional_errors(loss, inputs, gradient):
-        assert np.isfinite(actual)
-        assert abs(actual - expected) <= 1e-6 * max(abs(expected), 1e-3), name
+    assert_slopes(compiled(inputs), slopes(loss, inputs))
     return compiled
+
+
+def eager_gradient(loss, inputs):
+    """The gradient outside of `jit`, with which forward mode agrees."""
+    gradient = jax.grad(loss)(inputs)
+    tangent = jax.tree.map(lambda leaf: jnp.asarray(np.random.default_rng(2).normal(size=leaf.shape)), inputs)
+    _, forward = jax.jvp(loss, (inputs,), (tangent,))
+    reverse = jax.tree.map(lambda a, b: np.sum(np.asarray(a) * np.asarray(b)), gradient, tangent)
+    np.testing.assert_allclose(forward, sum(jax.tree.leaves(reverse)), rtol=1e-9)
+    return gradient
 
 
 def check_eager_gradient(loss, inputs, scale=1e-2, differences_of=None):
     """The gradient agrees with central differences along a random direction in each input, and with forward mode."""
-    gradient = jax.grad(loss)(inputs)
-    for name, actual, expected in directional_errors(differences_of or loss, inputs, gradient):
-        assert abs(actual - expected) <= 1e-6 * max(abs(expected), scale), name
-    tangent = jax.tree.map(lambda leaf: jnp.asarray(np.random.default_rng(2).normal(size=leaf.shape)), inputs)
-    _, forward = jax.jvp(loss, (inputs,), (tangent,))
-    reverse = sum(jax.tree.leaves(jax.tree.map(lambda a, b: jnp.sum(a * b), gradient, tangent)))
-    np.testing.assert_allclose(forward, reverse, rtol=1e-9)
+    gradient = eager_gradient(loss, inputs)
+    assert_slopes(gradient, slopes(differences_of or loss, inputs), scale)
     return gradient

@@ -1,0 +1,703 @@
+"""Gradients of poses: against central differences, each way to differentiate; and what has none, or is refused."""
+
+import re
+import warnings
+from collections.abc import Callable
+from functools import partial
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import jaxlie
+import numpy as np
+import pytest
+import scipy.spatial
+
+import mcgicp_jax as mcg
+from mcgicp_jax import Status
+from tests.compilations import compilations
+from tests.differences import (
+    GATE,
+    TO_ROUNDING,
+    assert_slopes,
+    case,
+    check_eager_gradient,
+    clouds_with,
+    eager_gradient,
+    inputs_of,
+    slopes,
+    weigh,
+)
+from tests.precision import cached, in_float64
+from tests.refusals import refused
+from tests.scenes import motion, pair, room_corner
+
+pytestmark = in_float64
+PADDED = 512
+METHOD, _ = case("mc-gicp")
+HARD = {"max_distance": GATE, "soft_matches": False, **TO_ROUNDING}
+FUNCTIONS = ("register", "register_batch", "estimate_pose", "mahalanobis_cost")
+
+
+@pytest.fixture(scope="module")
+def clouds(noisy):
+    return noisy[:2]
+
+
+def posed(clouds, method=METHOD, **options):
+    """A scalar that depends on all entries of the pose, registered to rounding. Its differences are over hard matches,
+    as those of the registration itself do not change over small steps."""
+    return weigh(mcg.register(*clouds, method, **HARD | options).matrix)
+
+
+def with_covariances(cloud, seed):
+    factor = np.random.default_rng(seed).normal(size=(400, 3, 3))
+    return cloud.replace(covariances=factor @ factor.swapaxes(1, 2) / 3 + 0.1 * np.eye(3))
+
+
+def with_missing_channels(cloud, seed):
+    return cloud.replace(channel_valid=np.random.default_rng(seed).random(cloud.channels.shape) < 0.7)
+
+
+class Case(NamedTuple):
+    """What is differentiated, by all of its inputs. Several candidates are soft matches."""
+
+    # Method and robust kernel, which have the precision in which they are made
+    make: Callable[[], tuple[Any, Any]]
+    num_candidates: int = 1
+    changed: Callable[..., Any] | None = None
+
+
+def soft_mc_gicp():
+    return mcg.MultiChannelGICP([[0.05, 0.01], [0.01, 0.08]], [0.3, 0.2], epsilon=1e-2), mcg.Cauchy(0.5)
+
+
+HARD_CASES = {
+    name: Case(partial(case, name)) for name in ("mc-gicp", "gicp", "point-to-plane", "point-to-point", "color-icp")
+}
+CASES = HARD_CASES | {
+    "covariances": Case(partial(case, "gicp"), changed=with_covariances),
+    "soft mc-gicp": Case(soft_mc_gicp, 4),
+    "soft color-icp": Case(lambda: (mcg.ColorICP(0.3), mcg.Cauchy(0.5)), 3),
+    "mc-gicp, missing channels": Case(partial(case, "mc-gicp"), 2, with_missing_channels),
+    "color-icp, missing channels": Case(partial(case, "color-icp"), 2, with_missing_channels),
+}
+
+
+class Problem:
+    """The inputs of a case, its functions, and their central differences."""
+
+    def __init__(self, name):
+        make, count, changed = CASES[name]
+        method, robust = make()
+        self.clouds = pair(size=400, noise=0.05, channel_noise=0.05)[:2]
+        if changed is not None:
+            self.clouds = [changed(cloud, seed) for seed, cloud in enumerate(self.clouds)]
+            method = method.resolve(*self.clouds)
+        self.inputs, self.start = inputs_of(*self.clouds, method, robust), motion()
+        if count == 1:
+            self.start = mcg.register(*self.clouds, method, robust=robust, max_distance=GATE, **TO_ROUNDING).matrix
+        else:
+            self.inputs["temperature"] = jnp.asarray(0.1)
+        options = {"max_distance": GATE, "num_candidates": count}
+        self.matches = mcg.find_correspondences(*self.clouds, self.start, method, **options)
+        assert self.matches.indices.shape == (count, 400)[count == 1 :]
+        self.compiled = jax.jit(jax.grad(self.aligned))
+        self.slopes = slopes(self.registered if count == 1 else self.aligned, self.inputs)
+
+    def registered(self, inputs):
+        return posed(clouds_with(inputs, *self.clouds), inputs["method"], robust=inputs["robust"], init=self.start)
+
+    def aligned(self, inputs):
+        """From elsewhere, to the matches at the start."""
+        options = {name: inputs[name] for name in ("robust", "temperature") if name in inputs}
+        clouds = clouds_with(inputs, *self.clouds)
+        return weigh(
+            mcg.estimate_pose(*clouds, self.matches, inputs["method"], init=motion(), **TO_ROUNDING, **options).matrix
+        )
+
+
+problem_of = cached(Problem)
+
+
+@jax.jit
+def gradients_in_lanes(inputs, source, target, starts):
+    """And the results, in a batch of starts; by dense search, as programs with callbacks are not kept on disk."""
+
+    def loss(inputs, start):
+        options = {"init": start, "robust": inputs["robust"], "search": mcg.DenseSearch(), **HARD}
+        result = mcg.register(*clouds_with(inputs, source, target), inputs["method"], **options)
+        return weigh(result.matrix), result
+
+    return jax.vmap(jax.grad(loss, has_aux=True), in_axes=(None, 0))(inputs, starts)
+
+
+def lane(lanes, i):
+    return jax.tree.map(lambda each: each[i], lanes)
+
+
+def gradient_in_lanes(problem):
+    """That of padded clouds, where one lane has no matches, and one starts beside the answer."""
+    source, target = (cloud.pad(PADDED) for cloud in problem.clouds)
+    starts = np.stack([problem.start, motion((50, 0, 0, 0, 0, 0)), problem.start @ motion(1e-7 * np.ones(6))])
+    inputs = inputs_of(source, target, problem.inputs["method"], problem.inputs["robust"])
+    lanes, results = gradients_in_lanes(inputs, source, target, starts)
+    assert list(results.status) == [Status.CONVERGED, Status.TOO_FEW_CORRESPONDENCES, Status.CONVERGED]
+    assert not any(np.any(leaf) for leaf in jax.tree.leaves(lane(lanes, 1)))
+    np.testing.assert_allclose(results.matrix[2], problem.start, atol=1e-9)
+    for leaf in jax.tree.leaves(lanes):
+        np.testing.assert_allclose(leaf[2], leaf[0], atol=1e-6 * np.abs(leaf[0]).max())
+    # Without the padding
+    return jax.tree.map(lambda leaf, of: leaf[tuple(map(slice, np.shape(of)))], lane(lanes, 0), problem.inputs)
+
+
+WAYS = {
+    "register outside": lambda problem: eager_gradient(problem.registered, problem.inputs),
+    "register in lanes": gradient_in_lanes,
+    "estimate_pose outside": lambda problem: eager_gradient(problem.aligned, problem.inputs),
+    "estimate_pose inside": lambda problem: problem.compiled(problem.inputs),
+}
+QUICK = [*((name, "register outside") for name in (*HARD_CASES, "covariances"))]
+QUICK += [("mc-gicp", "register in lanes"), ("point-to-point", "estimate_pose inside")]
+SLOW = [(name, way) for name in HARD_CASES for way in ("register in lanes", "estimate_pose inside")]
+SLOW += [("covariances", "estimate_pose inside")]
+SLOW += [
+    (name, f"estimate_pose {way}") for name in CASES if CASES[name].num_candidates > 1 for way in ("outside", "inside")
+]
+
+
+@pytest.mark.parametrize(
+    "name, way", QUICK + [pytest.param(*each, marks=pytest.mark.slow) for each in SLOW if each not in QUICK]
+)
+def test_gradient_by_every_input_agrees_with_central_differences(name, way):
+    problem = problem_of(name)
+    gradient = WAYS[way](problem)
+    assert_slopes(gradient, problem.slopes)
+    if "temperature" in problem.inputs:
+        assert np.abs(gradient["method"].channel_weights).min() > 1e-4 and gradient["temperature"] != 0
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", [name for name in CASES if "missing" in name])
+def test_what_stands_where_a_channel_is_missing_has_gradient_0(name):
+    problem = problem_of(name)
+    valid = {f"{side} channels": np.asarray(cloud.channel_valid) for side, cloud in sides(problem.clouds)}
+    unseen = {key: jnp.where(valid[key], problem.inputs[key], jnp.nan) for key in valid}
+    gradient = problem.compiled(problem.inputs | unseen)
+    for key in valid:
+        assert np.isfinite(gradient[key]).all()
+        np.testing.assert_array_equal(gradient[key][~valid[key]], 0)
+
+
+def sides(clouds):
+    return zip(("source", "target"), clouds, strict=True)
+
+
+@pytest.fixture(scope="module")
+def padded(noisy):
+    return [cloud.pad(PADDED) for cloud in noisy[:2]]
+
+
+def in_first_lane(inputs, source, target, start):
+    return lane(gradients_in_lanes(inputs, source, target, np.stack([start] * 3)), 0)
+
+
+def test_inside_jit_no_matches_give_no_gradient_and_identical_clouds_a_finite_one(padded):
+    source, target = padded
+    inputs = inputs_of(source, target, *case("mc-gicp"))
+    far = inputs | {"source points": inputs["source points"] + 100}
+    gradient, result = in_first_lane(far, source, target, motion())
+    assert result.status is Status.TOO_FEW_CORRESPONDENCES
+    for leaf in jax.tree.leaves(gradient):
+        np.testing.assert_array_equal(leaf, 0)
+    gradient, result = in_first_lane(inputs_of(source, source, *case("mc-gicp")), source, source, np.eye(4))
+    assert np.isfinite(gradient["source points"]).all()
+    np.testing.assert_allclose(result.matrix, np.eye(4), atol=1e-5)
+
+
+def test_inside_jit_padding_has_no_gradient_and_degenerate_neighborhoods_a_finite_one(padded):
+    source, target = padded
+    # Coincident, collinear and isotropic neighbourhoods.
+    points = np.array(source.unpad().points)
+    points[:25] = points[0]
+    points[25:50] = points[25] + np.linspace(0, 0.1, 25)[:, None] * [1.0, 2.0, 3.0]
+    points[50:77] = points[50] + np.stack(np.meshgrid(*[np.arange(3) * 0.05] * 3), axis=-1).reshape(-1, 3)
+    cloud = mcg.preprocess(mcg.PointCloud(points, source.unpad().channels)).pad(PADDED)
+    gradients, _ = in_first_lane(inputs_of(cloud, target, *case("mc-gicp")), cloud, target, motion())
+    for name in ("source points", "source channels"):
+        assert np.isfinite(gradients[name]).all()
+        assert np.abs(gradients[name][: len(cloud)]).max() > 0
+        np.testing.assert_array_equal(gradients[name][len(cloud) :], 0)
+
+
+@pytest.mark.slow
+def test_jacobians_of_estimate_pose_agree_forward_and_backward(clouds):
+    source, target = clouds
+    matches = mcg.find_correspondences(source, target, motion(), mcg.PointToPoint(), max_distance=GATE)
+
+    def pose(scale):
+        moved = source.replace(points=source.points * scale)
+        return mcg.estimate_pose(moved, target, matches, mcg.PointToPoint(), init=motion(), **TO_ROUNDING).matrix
+
+    forward, backward = (jax.jit(jacobian(pose))(jnp.ones(3)) for jacobian in (jax.jacfwd, jax.jacrev))
+    assert np.abs(forward).max() > 1e-3
+    np.testing.assert_allclose(forward, backward, rtol=1e-9, atol=1e-12)
+
+
+@pytest.mark.parametrize("name", [pytest.param("mc-gicp", marks=pytest.mark.slow), "color-icp"])
+def test_where_channels_are_matched_the_derivative_is_that_of_soft_matches(name, clouds):
+    """Differences of `estimate_pose` over the eight candidates at the pose of the hard matches, which is returned."""
+    method, robust = case(name)
+    options = {"init": motion(), "robust": robust}
+    hard = mcg.register(*clouds, method, **HARD | options).matrix
+    default = mcg.register(*clouds, method, **HARD | options | {"soft_matches": None}).matrix
+    np.testing.assert_array_equal(default, hard)
+    candidates = mcg.find_correspondences(*clouds, hard, method, max_distance=GATE, num_candidates=8)
+    spacing = np.median(scipy.spatial.cKDTree(clouds[1].points).query(clouds[1].points, 2)[0][:, 1])
+    # Updates of soft matches converge linearly.
+    soft = TO_ROUNDING | {"init": hard, "temperature": spacing, "max_iterations": 300}
+    root = mcg.estimate_pose(*clouds, candidates, method, robust=robust, **soft).matrix
+    assert np.linalg.norm(root - hard) > 1e-3
+
+    def at_root(inputs):
+        """A motion of the root moves the pose alike."""
+        pair, method, robust = clouds_with(inputs, *clouds), inputs["method"], inputs["robust"]
+        moved = mcg.estimate_pose(*pair, candidates, method, robust=robust, **soft).matrix
+        return weigh(moved @ np.linalg.inv(root) @ hard)
+
+    def loss(inputs):
+        options = {"robust": inputs["robust"], "init": hard, "soft_matches": None}
+        return posed(clouds_with(inputs, *clouds), inputs["method"], **options)
+
+    gradient = check_eager_gradient(loss, inputs_of(*clouds, method, robust), differences_of=at_root)
+    assert abs(gradient["method"].channel_weights) > 1e-3
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["mc-gicp", "color-icp"])
+def test_derivative_of_soft_matches_is_the_same_inside_jit_and_vmap(name, clouds):
+    method, _ = case(name)
+    channels = jnp.stack([clouds[0].channels, 1.1 * clouds[0].channels])
+
+    def loss(channels, method, search=None):
+        moved = clouds[0].replace(channels=channels), clouds[1]
+        return posed(moved, method, search=search, init=motion(), soft_matches=None)
+
+    expected = [jax.grad(loss, (0, 1))(each, method) for each in channels]
+    one = jax.jit(jax.grad(loss, (0, 1)))(channels[0], method)
+    dense = jax.grad(partial(loss, search=mcg.DenseSearch()), (0, 1))
+    several = jax.jit(jax.vmap(dense, in_axes=(0, None)))(channels, method)
+    for found, each in ((one, expected[0]), (lane(several, 0), expected[0]), (lane(several, 1), expected[1])):
+        for actual, wanted in zip(*map(jax.tree.leaves, (found, each)), strict=True):
+            np.testing.assert_allclose(actual, wanted, atol=1e-8 * np.abs(wanted).max())
+
+
+@pytest.mark.slow
+def test_photometric_term_has_the_gradient_of_jit(clouds):
+    """Its scales are constants to autodiff, which differences would see."""
+    method = mcg.MultiChannelGICP(0.05, 0.3, photometric=True)
+
+    def loss(points, search=None):
+        return posed((clouds[0].replace(points=points), clouds[1]), method, search=search)
+
+    expected = jax.jit(jax.grad(lambda points: loss(points, mcg.DenseSearch())))(clouds[0].points)
+    np.testing.assert_allclose(jax.grad(loss)(clouds[0].points), expected, atol=1e-9 * np.abs(expected).max())
+
+
+def answer(of, pair, method, matches=None, init=None, **options):
+    """A scalar of what a function returns, and its result."""
+    if of == "mahalanobis_cost":
+        return mcg.mahalanobis_cost(motion() if init is None else init, *pair, matches, method, **options), None
+    if of == "estimate_pose":
+        result = mcg.estimate_pose(*pair, matches, method, init=init, **options)
+    elif of == "register":
+        result = mcg.register(*pair, method, init=init, max_distance=GATE, **options)
+    else:
+        one = [None if init is None else [init]]
+        (result,) = mcg.register_batch([pair[0]], [pair[1]], method, init=one[0], max_distance=GATE, **options)
+    return weigh(result.matrix), result
+
+
+@pytest.mark.parametrize("of", FUNCTIONS)
+def test_poses_and_costs_have_gradients_by_origins_of_both_clouds(of, clouds):
+    """Poses in the user's frame depend on the origins, and so does the cost of a pose; as inside `jit`."""
+    method, origins = mcg.PointToPoint(), (np.array([30.0, -20, 10]), np.array([10.0, 40, -20]))
+    inputs = {"source origin": origins[0], "target origin": origins[1], "source points": clouds[0].points}
+    inputs = jax.tree.map(jnp.asarray, inputs)
+    init = motion()
+    init[:3, 3] += origins[1] - init[:3, :3] @ origins[0]
+    matches = mcg.find_correspondences(*clouds_with(inputs, *clouds), init, method, max_distance=GATE)
+    # The cost away from its minimum, so that its gradient is not 0.
+    options = {"init": init @ motion((0.01,) * 6)} if of == "mahalanobis_cost" else {"init": init, **TO_ROUNDING}
+
+    def loss(inputs):
+        value, result = answer(of, clouds_with(inputs, *clouds), method, matches, **options)
+        if result is None:
+            return value
+        assert f"{result.status.name}: translation" in repr(result)
+        return value + weigh(result.T_target_source.as_matrix()[::-1])
+
+    gradient = check_eager_gradient(loss, inputs)
+    if of == "mahalanobis_cost":
+        for name, expected in jax.jit(jax.grad(loss))(inputs).items():
+            np.testing.assert_allclose(gradient[name], expected, rtol=1e-6, atol=1e-9 * np.abs(expected).max())
+
+
+def test_zero_origin_of_a_raw_cloud_has_a_gradient(clouds):
+    """As `eqx.filter_grad` by a cloud has it: to move the origin is to move all points."""
+    source, target = (mcg.PointCloud(cloud.points) for cloud in clouds)
+    target = mcg.preprocess(target, None)
+
+    def loss(inputs):
+        return posed((mcg.preprocess(source.replace(**inputs), None), target), mcg.PointToPoint())
+
+    check_eager_gradient(loss, {"origin": jnp.zeros(3)})
+
+
+@pytest.mark.slow
+def test_tie_points_and_priors_have_gradients(clouds):
+    """By what was measured, and its variances, on which the weights of the matches from a first registration do not
+    depend."""
+    points = np.asarray(clouds[0].points[:5])
+
+    @jax.jit
+    def measurements(inputs):
+        ties = inputs["tie source"], inputs["tie target"], inputs["tie variance"] * jnp.tile(jnp.eye(3), (5, 1, 1))
+        pose = jaxlie.SE3.from_matrix(motion()) @ jaxlie.SE3.exp(inputs["prior twist"])
+        return ties, (pose, inputs["prior variance"] * jnp.eye(6))
+
+    def loss(inputs):
+        ties, prior = measurements(inputs)
+        return posed(clouds, mcg.PointToPoint(), tie_points=ties, prior=prior, max_distance=0.15)
+
+    # So far off that fewer points are matched than without: the unit of length is not that of the first registration.
+    target = points @ motion()[:3, :3].T + motion()[:3, 3] + 0.05
+    inputs = {"tie source": points, "tie target": target, "tie variance": 1e-3}
+    inputs |= {"prior twist": np.zeros(6), "prior variance": 1e-3}
+    check_eager_gradient(loss, jax.tree.map(jnp.asarray, inputs))
+
+
+def test_gains_of_equalized_channels_are_constants_of_which_gradients_warn(clouds):
+    """Twice the contrast: a gradient half as large."""
+    source, target = clouds
+
+    def registered(channels):
+        return mcg.register(source.replace(channels=channels), target, METHOD, equalize_channels=True, **HARD)
+
+    def gradient(channels):
+        with pytest.warns(UserWarning, match="equalize_channels: gain and offset"):
+            return jax.grad(lambda channels: weigh(registered(channels).matrix))(channels)
+
+    for derivative in (gradient, lambda channels: registered(channels).jacobian("source", "channels")):
+        once, twice = (derivative(gain * source.channels + 0.3) for gain in (1.0, 2.0))
+        assert np.any(once)
+        np.testing.assert_allclose(twice, 0.5 * once, rtol=1e-6, atol=1e-9)
+
+
+def test_preprocessing_has_a_derivative():
+    """Raw points, with rows to drop and missing channels, through the voxels."""
+    points, channels = room_corner(900, noise=0.02, seed=1)
+    points = (points - motion()[:3, 3]) @ motion()[:3, :3]
+    points[7] = np.nan
+    known = np.random.default_rng(3).random(channels.shape) > 0.1
+    target = mcg.preprocess(mcg.PointCloud(*room_corner(900, noise=0.02, seed=2)), 0.1)
+    others = np.arange(900) != 7
+    inputs = {"points": points[others], "channels": channels}
+
+    def loss(inputs):
+        # The NaN stays where it is.
+        whole = jnp.asarray(points).at[others].set(inputs["points"])
+        cloud = mcg.PointCloud(whole, inputs["channels"], channel_valid=known)
+        return posed((mcg.preprocess(cloud, 0.1), target), max_distance=0.5)
+
+    with pytest.warns(UserWarning, match="1 of 900"):
+        gradient = jax.tree.map(np.asarray, jax.grad(loss)(inputs))
+        assert not np.any(gradient["channels"][~known]) and not np.any(gradient["channels"][7])
+        assert_slopes(gradient, slopes(loss, inputs), 1e-2, 1e-5)
+
+
+def test_means_of_voxels_have_a_forward_derivative():
+    """They are linear in points and channels, as long as no point changes its voxel. Padding, here among the points,
+    does not count."""
+    points, channels = room_corner(300, noise=0.02, seed=1)
+    known, valid = (np.random.default_rng(3).random(shape) > 0.1 for shape in (channels.shape, 300))
+
+    def means(step):
+        cloud = mcg.PointCloud(points + step * directions[0], channels + step * directions[1], channel_valid=known)
+        found = mcg.preprocess(cloud.replace(valid=valid), 0.3)
+        return found.points, found.channels
+
+    directions = [np.random.default_rng(4).normal(size=array.shape) for array in (points, channels)]
+    _, found = jax.jvp(means, (0.0,), (1.0,))
+    for slope, plus, minus in zip(found, means(1e-6), means(-1e-6), strict=True):
+        np.testing.assert_allclose(slope, (plus - minus) / 2e-6, atol=1e-8)
+
+
+def test_all_modes_agree_and_second_derivatives_are_refused(clouds):
+    source, target = clouds
+
+    def pose(channels):
+        return mcg.register(source.replace(channels=channels), target, METHOD, max_distance=GATE).centred.wxyz_xyz
+
+    channels, direction = source.channels, np.random.default_rng(0).normal(size=source.channels.shape)
+    jacobian = jax.jacrev(pose)(channels)
+    assert jacobian.shape == (7, *channels.shape)
+    expected = np.tensordot(jacobian, direction, 2)
+    _, forward = jax.jvp(pose, (channels,), (direction,))
+    _, linear = jax.linearize(pose, channels)
+    few = jax.jacfwd(lambda scale: pose(channels + scale * direction))(jnp.zeros(()))
+    for found in (forward, linear(direction), few):
+        np.testing.assert_allclose(found, expected, rtol=1e-9)
+    _, pull = jax.vjp(pose, channels)
+    columns = np.random.default_rng(1).normal(size=(7, 2))
+    (several,) = jax.vmap(pull, in_axes=1)(columns)
+    np.testing.assert_allclose(several, np.tensordot(columns.T, jacobian, 1), rtol=1e-6, atol=1e-12)
+    np.testing.assert_allclose(pull(columns[:, 0])[0], several[0], rtol=1e-6, atol=1e-12)
+    with pytest.raises(NotImplementedError, match="first derivatives only"):
+        jax.hessian(lambda scale: pose(channels + scale * direction)[0])(0.0)
+    with pytest.raises(NotImplementedError, match="inside the jit"):
+        jax.jit(pull)(jnp.arange(7.0))
+
+
+@pytest.fixture(scope="module")
+def two_blocks(precision):
+    """2,500 points are two blocks, the second one padded."""
+    return pair(size=2500, noise=0.03)
+
+
+@pytest.mark.parametrize("soft", [False, None])
+def test_another_size_compiles_nothing(soft, two_blocks):
+    """But for a copy of each of the two arguments, which `jax.grad` itself makes."""
+
+    def gradient(source, target, *_):
+        def loss(points, channels):
+            moved = source.replace(points=points, channels=channels), target
+            return posed(moved, max_iterations=3, soft_matches=soft)
+
+        return jax.grad(loss, (0, 1))(source.points, source.channels)
+
+    gradient(*two_blocks)
+    other = pair(size=2600 + 10 * (soft is None), noise=0.03)
+    with compilations() as compiled:
+        gradient(*other)
+    assert len(compiled) <= 2
+
+
+@pytest.mark.slow
+def test_gradient_over_several_blocks_of_rows(two_blocks):
+    source, target, truth = two_blocks
+    # Of so many matches, some would flip.
+    matches = mcg.find_correspondences(source, target, truth, METHOD, max_distance=GATE)
+
+    def loss(inputs):
+        return weigh(mcg.estimate_pose(*clouds_with(inputs, source, target), matches, METHOD, **TO_ROUNDING).matrix)
+
+    check_eager_gradient(loss, {"source points": source.points, "target channels": target.channels})
+
+
+@pytest.mark.parametrize("options", [{}, {"max_source_points": 250}], ids=["all points", "some points"])
+def test_a_ragged_batch_has_the_gradients_of_its_pairs(options):
+    sources, targets, _ = zip(*(pair(size=size) for size in (300, 500, 2100)), strict=True)
+    options = {"max_distance": GATE, **options}
+
+    def loss(channels):
+        moved = [source.replace(channels=each) for source, each in zip(sources, channels, strict=True)]
+        return sum(weigh(each.matrix) for each in mcg.register_batch(moved, list(targets), METHOD, **options))
+
+    gradients = jax.grad(loss)([source.channels for source in sources])
+    for source, target, gradient in zip(sources, targets, gradients, strict=True):
+
+        def alone(each, source=source, target=target):
+            return weigh(mcg.register(source.replace(channels=each), target, METHOD, **options).matrix)
+
+        expected = jax.grad(alone)(source.channels)
+        assert np.any(expected)
+        np.testing.assert_array_equal(gradient, expected)
+
+
+def test_pairs_that_are_invalid_or_have_no_matches_have_no_gradient():
+    source, target, _ = pair(size=300)
+
+    def loss(points):
+        sources = [source.replace(points=points), np.zeros((3, 3))]
+        with pytest.warns(mcg.PairWarning, match="pair 1"):
+            found = mcg.register_batch(sources, target, mcg.GICP(), max_distance=GATE)
+        assert [each.status for each in found] == [Status.CONVERGED, Status.INVALID_INPUT]
+        return weigh(found[0].matrix)
+
+    def without_matches(points):
+        found = mcg.register(source.replace(points=points), target, mcg.GICP(), max_distance=1e-6)
+        assert found.status == Status.TOO_FEW_CORRESPONDENCES
+        return weigh(found.matrix)
+
+    assert np.any(jax.grad(loss)(source.points))
+    np.testing.assert_array_equal(jax.grad(without_matches)(source.points), 0)
+
+
+def test_jacobian_is_that_of_small_motions(clouds):
+    """Also at a far origin: ξ refers to the user's frame."""
+    for shift in (np.zeros(3), np.array([300.0, 400.0, 100.0])):
+        source, target = (mcg.preprocess(mcg.PointCloud(cloud.points + shift, cloud.channels)) for cloud in clouds)
+        result = mcg.register(source, target, METHOD, **HARD)
+        assert result.history["translation_step"][-1] < 1e-12
+        for field in ("points", "channels"):
+            array = np.asarray(getattr(source, field))
+            direction, step = np.random.default_rng(0).normal(size=array.shape), 1e-6
+            plus, minus = (
+                mcg.register(source.replace(**{field: array + each * direction}), target, METHOD, **HARD).matrix
+                for each in (step, -step)
+            )
+            change = np.linalg.inv(result.matrix) @ (plus - minus) / (2 * step)
+            expected = np.append(change[:3, 3], change[[2, 0, 1], [1, 2, 0]])
+            found = np.tensordot(result.jacobian("source", field), direction, array.ndim)
+            np.testing.assert_allclose(found, expected, atol=1e-5 * np.abs(expected).max())
+    copied = jax.tree.map(lambda leaf: leaf, result)
+    with pytest.raises(ValueError, match="copy"):
+        copied.jacobian("source", "points")
+    refused(lambda: result.jacobian("source", "covariances"), "covariances")
+
+
+def test_nested_differentiation_is_refused(clouds):
+    """By other inputs, too: the inner value would be a constant to the outer differentiation."""
+    source, target = clouds
+
+    def pose(scale, other):
+        moved = source.replace(points=source.points * scale), target.replace(points=target.points * other)
+        return mcg.register(*moved, mcg.GICP(), max_distance=GATE).matrix[0, 3]
+
+    for inner in (
+        lambda scale: jax.grad(lambda other: pose(scale, other))(1.0),
+        lambda scale: jax.jvp(lambda other: pose(scale, other), (1.0,), (1.0,))[0],
+    ):
+        with pytest.raises(NotImplementedError, match="first derivatives only"):
+            jax.grad(inner)(1.0)
+
+
+def pose_in_x(clouds, points, **options):
+    moved = clouds[0].replace(points=points), clouds[1]
+    return mcg.register(*moved, mcg.PointToPoint(), **{"max_distance": GATE} | options).matrix[0, 3]
+
+
+def test_options_are_constants_wherever_they_come_from(clouds):
+    loss, points = partial(pose_in_x, clouds), clouds[0].points
+    expected = jax.grad(loss)(points)
+    for name, value in (("max_distance", GATE), ("rotation_tolerance", 5e-4), ("init", np.eye(4))):
+        derived = jax.grad(lambda points, name=name, value=value: loss(points, **{name: value + 0 * points[0, 0]}))
+        np.testing.assert_allclose(derived(points), expected, rtol=1e-6, atol=1e-9)
+
+
+@pytest.mark.slow
+def test_starts_that_vmap_traces_compile_the_gradient(clouds):
+    """With `jit`, as one program."""
+    points, starts = clouds[0].points, jnp.tile(jnp.eye(4), (2, 1, 1))
+    gradient = jax.grad(partial(pose_in_x, clouds))
+    several = jax.jit(jax.vmap(lambda init: gradient(points, init=init, search=mcg.DenseSearch())))(starts)
+    np.testing.assert_allclose(several[1], gradient(points), rtol=1e-6, atol=1e-9)
+
+
+def test_a_batch_of_a_generator_is_refused_in_a_gradient(clouds):
+    source, target = clouds
+
+    def loss(points):
+        sources = (source.replace(points=points) for _ in range(2))
+        return mcg.register_batch(sources, [target, target], mcg.GICP())[0].matrix[0, 3]
+
+    refused(lambda: jax.grad(loss)(source.points), "pair 0", "tracers")
+
+
+UNSET, NO_WEIGHTS = mcg.MultiChannelGICP(), mcg.MultiChannelGICP(0.05)
+PHOTOMETRIC = mcg.MultiChannelGICP(0.05, 0.3, photometric=True)
+CANDIDATES = {"temperature": 0.1}
+ONE_UPDATE = {"max_iterations": 1, **{name: value for name, value in TO_ROUNDING.items() if "tolerance" in name}}
+HARD_UPDATE = ONE_UPDATE | {"soft_matches": False}
+# Function, method (None: all parameters estimated beforehand), what is differentiated, options, and the only warning.
+WARNINGS = [
+    *((of, None, "channels", {}, None) for of in FUNCTIONS),
+    *((of, UNSET, "points", {}, None) for of in FUNCTIONS),
+    *((of, UNSET, "channels", {}, "channel_covariance.*: estimated .* resolve") for of in FUNCTIONS),
+    # Of hard matches, α decides the matches alone.
+    *((of, NO_WEIGHTS, "channels", {}, None) for of in ("estimate_pose", "mahalanobis_cost")),
+    ("mahalanobis_cost", NO_WEIGHTS, "channels", CANDIDATES, "channel_weights: "),
+    *(("mahalanobis_cost", PHOTOMETRIC, by, CANDIDATES, "photometric: ") for by in ("channels", "points")),
+    ("register", METHOD, "channels", ONE_UPDATE, None),
+    ("register", METHOD, "points", HARD_UPDATE, None),
+    *(
+        ("register", method, "channels", HARD_UPDATE, "channels: .* soft_matches=False")
+        for method in (METHOD, mcg.ColorICP(0.3))
+    ),
+    ("register", NO_WEIGHTS, "channels", ONE_UPDATE, "channel_weights: estimated"),
+]
+
+
+@pytest.mark.parametrize(
+    "of, method, by, options, warning",
+    [
+        pytest.param(*each, marks=[pytest.mark.slow] * (each[0] != "mahalanobis_cost" and each[3] == {}))
+        for each in WARNINGS
+    ],
+)
+def test_what_is_constant_to_a_gradient_is_warned_of_once(of, method, by, options, warning, clouds):
+    """Estimated parameters, scales of photometric residuals, and hard matches, as far as they depend on the inputs."""
+    method = UNSET.resolve(*clouds) if method is None else method
+    count = 3 if options is CANDIDATES else 1
+    matches = mcg.find_correspondences(*clouds, motion(), method, max_distance=GATE, num_candidates=count)
+
+    def loss(inputs):
+        return answer(of, clouds_with(inputs, *clouds), method, matches, **options)[0]
+
+    inputs = {f"{side} {by}": getattr(cloud, by) for side, cloud in sides(clouds)}
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always", UserWarning)
+        jax.vjp(loss, inputs)
+    found = [str(each.message) for each in caught if each.category is UserWarning]
+    assert len(found) == (warning is not None), found
+    assert warning is None or re.match(warning, found[0]), found
+
+
+def test_inside_jit_the_cost_estimates_parameters_without_a_warning(clouds):
+    matches = mcg.find_correspondences(*clouds, motion(), METHOD, max_distance=GATE)
+
+    def loss(channels):
+        return answer("mahalanobis_cost", (clouds[0].replace(channels=channels), clouds[1]), UNSET, matches)[0]
+
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", UserWarning)
+        jax.eval_shape(jax.jit(jax.grad(loss)), clouds[0].channels)
+
+
+def test_a_gradient_by_weights_of_hard_matches_is_0_and_warned_of(clouds):
+    def loss(weights):
+        method = mcg.MultiChannelGICP(METHOD.channel_covariance, weights)
+        return mcg.register(*clouds, method, max_distance=0.5, soft_matches=False).matrix[0, 3]
+
+    with pytest.warns(UserWarning, match="channel_weights: the derivative is 0"):
+        gradient = jax.grad(loss)(jnp.full(2, 0.1))
+    np.testing.assert_array_equal(gradient, 0)
+
+
+def test_only_the_pose_has_a_derivative_and_nothing_is_0_without_a_word(clouds):
+    source, target = clouds
+    kept = []
+
+    def result(points):
+        kept.append(mcg.register(source.replace(points=points), target, mcg.GICP(), max_distance=0.4))
+        return kept[-1]
+
+    points = jnp.asarray(source.points)
+    for name in ("cost", "rmse", "covariance", "deviations"):
+
+        def loss(points, name=name):
+            return jnp.sum(getattr(result(points), name))
+
+        with pytest.raises(NotImplementedError, match=r"only the pose has a derivative.*mahalanobis_cost"):
+            jax.grad(loss)(points)
+        assert np.isnan(jax.jvp(loss, (points,), (points,))[1])
+
+    def both(points):
+        found = result(points)
+        assert "rmse" in repr(found)
+        return found.centred.translation()[0] + jax.lax.stop_gradient(found.cost)
+
+    assert np.any(jax.grad(both)(points))
+    # After the differentiation, what is no derivative can still be read.
+    assert np.isfinite(kept[-1].covariance).all()
