@@ -97,7 +97,7 @@ def test_missing_channels_against_the_reference(channel_covariance):
     compare(actual, ref.multi_channel_covariances(*args, present))
 
 
-def test_a_channel_that_nobody_has_changes_nothing():
+def test_a_channel_of_no_or_one_neighbour_changes_nothing():
     """Nor does one that is seen at a single point of each neighbourhood, or nowhere near."""
     cloud = cloud_of(150, 3)
     method = MultiChannelGICP(full_lambda(3), 0.1)
@@ -113,7 +113,7 @@ def test_a_channel_that_nobody_has_changes_nothing():
 
 
 @pytest.mark.parametrize("channels", ["none", "uniform"])
-def test_without_contrast_it_is_gicp(channels):
+def test_channels_without_contrast_make_covariances_of_gicp(channels):
     """To rounding: the two are different programs, which round differently."""
     points, _ = ref.scene(600, 3, seed=3)
     values = None if channels == "none" else np.full((600, 3), [0.1, 77.7, -3e4])
@@ -123,12 +123,7 @@ def test_without_contrast_it_is_gicp(channels):
     np.testing.assert_allclose(*compiled, rtol=0, atol=8 * np.finfo(dtype()).eps)
 
 
-def test_a_wide_kernel_tends_to_gicp():
-    cloud = cloud_of(600, 3)
-    compare(covariances(MultiChannelGICP(1e12, 0.1, EPSILON), cloud), covariances(GICP(EPSILON), cloud), 1e-5, 1e-9)
-
-
-def test_it_turns_with_the_cloud():
+def test_covariances_turn_with_the_cloud():
     """Which orthonormal tangent basis was chosen cannot be seen from outside."""
     R = ref.rotation(np.random.default_rng(0).normal(size=3) * 2)
     cloud = cloud_of(600, 3)
@@ -137,41 +132,51 @@ def test_it_turns_with_the_cloud():
     compare(covariances(method, turned), R @ covariances(method, cloud) @ R.T, 5e-4, 1e-9)
 
 
-@cached
-def edge(angle):
+@pytest.mark.parametrize("angle", [0, np.pi / 4])
+def test_covariance_is_large_along_an_edge_and_small_across_it(angle):
     """A flat grid, half of it of another colour; the line between runs at the angle through the middle."""
     x, y = (axis.ravel() for axis in np.meshgrid(np.arange(-7, 8) * 0.1, np.arange(-7, 8) * 0.1))
-    across = -np.sin(angle) * x + np.cos(angle) * y
-    cloud = preprocess(PointCloud(np.stack([x, y, 0 * x], axis=1), (across > -1e-9).astype(float)), num_neighbors=25)
-    return covariances(MultiChannelGICP(0.02, 0.1, EPSILON), cloud)[7 * 15 + 7]
-
-
-def test_an_edge_at_45_degrees_is_seen_in_the_off_diagonal():
-    C = edge(np.pi / 4)
-    along, across = np.array([1, 1, 0]) / np.sqrt(2), np.array([-1, 1, 0]) / np.sqrt(2)
-    assert C[0, 1] > 0.2
-    assert along @ C @ along > 0.9 > 0.6 > across @ C @ across
-    assert across @ C @ along == pytest.approx(0, abs=1e-5)
+    colour = (-np.sin(angle) * x + np.cos(angle) * y > -1e-9).astype(float)
+    cloud = preprocess(PointCloud(np.stack([x, y, 0 * x], axis=1), colour), num_neighbors=25)
+    C = covariances(MultiChannelGICP(0.02, 0.1, EPSILON), cloud)[7 * 15 + 7]
+    frame = ref.rotation([0, 0, angle])
+    turned = frame.T @ C @ frame
+    assert turned[0, 0] > 0.9 > 0.6 > turned[1, 1]
+    assert turned[0, 1] == pytest.approx(0, abs=1e-5)
     assert C[2, 2] == pytest.approx(EPSILON, abs=1e-6)
+    assert angle == 0 or C[0, 1] > 0.2
 
 
-def test_an_edge_along_an_axis_is_on_the_diagonal():
-    C = edge(0.0)
-    assert C[0, 0] > 0.9 > 0.6 > C[1, 1]
-    assert C[0, 1] == pytest.approx(0, abs=1e-5)
+UNITS = np.array([1e-3, 1.0, 255.0])
+FULL = full_lambda(3)
 
 
-def test_a_doubled_channel_with_doubled_variances_changes_nothing():
-    """dᵀΛ⁻¹d = 2 dᵀ(2Λ)⁻¹d."""
-    cloud, single = cloud_of(600, 3), full_lambda(3)
-    doubled = np.kron(np.eye(2), 2 * single)
-    twice = cloud.replace(channels=jnp.concatenate([cloud.channels, cloud.channels], axis=1))
-    actual = covariances(MultiChannelGICP(doubled, 0.1, EPSILON), twice)
-    compare(actual, covariances(MultiChannelGICP(single, 0.1, EPSILON), cloud), 1e-5, 1e-9)
+@pytest.mark.parametrize(
+    "changed, variances, expected",
+    [
+        # dᵀΛ⁻¹d = 2 dᵀ(2Λ)⁻¹d
+        (
+            lambda channels: np.hstack([channels] * 2),
+            np.kron(np.eye(2), 2 * FULL),
+            lambda: MultiChannelGICP(FULL, 0.1, EPSILON),
+        ),
+        (
+            lambda channels: channels * UNITS,
+            FULL * np.outer(UNITS, UNITS),
+            lambda: MultiChannelGICP(FULL, 0.1, EPSILON),
+        ),
+        (lambda channels: channels, 1e12, lambda: GICP(EPSILON)),
+    ],
+    ids=["doubled channels", "other units", "infinite variance"],
+)
+def test_channels_that_tell_the_same_make_the_same_covariances(changed, variances, expected):
+    cloud = cloud_of(600, 3)
+    same = cloud.replace(channels=changed(np.asarray(cloud.channels)))
+    compare(covariances(MultiChannelGICP(variances, 0.1, EPSILON), same), covariances(expected(), cloud), 1e-5, 1e-9)
 
 
 @pytest.mark.parametrize("floor", [1e-4, 1e-2, 0.3])
-def test_the_floor_of_omega(floor):
+def test_eigenvalues_in_the_plane_are_at_least_min_eigenvalue(floor):
     """Every point unlike all others: Ω would be 0, the covariance singular."""
     rng = np.random.default_rng(0)
     points, _ = ref.scene(600, 3, seed=3)
@@ -183,14 +188,6 @@ def test_the_floor_of_omega(floor):
     normals = np.array([ref.normal(points[row]) for row in neighbors_of(600, 3)])
     plane = np.eye(3) - normals[:, :, None] * normals[:, None, :]
     compare(actual, floor * plane + EPSILON * (np.eye(3) - plane), 1e-5, 2e-4 * floor)
-
-
-def test_the_unit_of_a_channel_does_not_matter():
-    cloud, single = cloud_of(600, 3), full_lambda(3)
-    units = np.array([1e-3, 1.0, 255.0])
-    scaled = cloud.replace(channels=cloud.channels * jnp.asarray(units, cloud.points.dtype))
-    actual = covariances(MultiChannelGICP(single * np.outer(units, units), 0.1, EPSILON), scaled)
-    compare(actual, covariances(MultiChannelGICP(single, 0.1, EPSILON), cloud), 2e-5, 1e-9)
 
 
 @in_both_precisions
@@ -364,7 +361,7 @@ def test_chosen_numbers_are_the_same_inside_transformations():
         np.testing.assert_allclose(one, other, rtol=tolerance(2e-4, 1e-9))
 
 
-def test_channels_without_noise_have_some():
+def test_channels_without_noise_are_given_some():
     """A ramp, which a linear fit leaves nothing of: σ is a thousandth of its standard deviation, and Λ = 2 (1.5 σ)².
 
     But for its outermost hundredth, which may be extreme values.
