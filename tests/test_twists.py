@@ -1,10 +1,19 @@
 """Exponential, logarithm and adjoints of rigid motions against SciPy and finite differences, also near 0 and π."""
 
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from scipy.linalg import expm
 
-from mcgicp_jax._math.poses import adjoint, exponential, inverse, logarithm, logarithm_derivative, skew
+from mcgicp_jax._math.poses import (
+    adjoint,
+    exponential,
+    inverse,
+    logarithm,
+    logarithm_derivative,
+    skew,
+    translation_adjoint,
+)
 
 
 def twists(angle):
@@ -34,3 +43,8 @@ def test_adjoint_moves_twists():
     matrices, given = exponential(twists(1.0)), twists(0.3)
     moved = [expected_exponential(each) for each in (adjoint(matrices) @ given[..., None])[..., 0]]
     np.testing.assert_allclose(moved, matrices @ exponential(given) @ inverse(matrices), atol=1e-13)
+    for function in (adjoint, inverse):
+        np.testing.assert_allclose(function(jnp.asarray(matrices)), function(matrices), atol=1e-5)
+    shift = np.eye(4)
+    shift[:3, 3] = (1, 2, 3)
+    np.testing.assert_allclose(translation_adjoint(shift[:3, 3]), adjoint(shift), atol=1e-15)
