@@ -172,7 +172,8 @@ SLOW += [
 def test_gradient_by_every_input_agrees_with_central_differences(name, way):
     problem = problem_of(name)
     gradient = WAYS[way](problem)
-    assert_slopes(gradient, problem.slopes)
+    # Poses of a whole registration are rounded to some 1e-15, and their differences over 1e-6 to some 1e-9.
+    assert_slopes(gradient, problem.slopes, 1e-2 if CASES[name].num_candidates == 1 else 1e-3)
     if "temperature" in problem.inputs:
         assert np.abs(gradient["method"].channel_weights).min() > 1e-4 and gradient["temperature"] != 0
 

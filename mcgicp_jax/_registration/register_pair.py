@@ -337,8 +337,8 @@ def rows_to_match(source: PointCloud, options: Options) -> Int[AnyArray, "n"] | 
 
 def _unless_left(run: Run, init: Pose | None, at_scales: bool, finely: Callable[[], Run]) -> tuple[Run, bool]:
     """A registration, or `finely()`, the one with the fine `max_distance` alone, if it may have left a right initial
-    pose and surfaces coincide better there (see `doubt_of_start`); and whether it is ambiguous: clouds have little in
-    common, and the two do not end at the same pose.
+    pose and surfaces coincide better there (see `doubt_of_start`); and whether it is ambiguous: the two do not end at
+    the same pose, and clouds have little in common, or surfaces coincide a little better at the one that is not taken.
     """
     settings, state = run.problem.settings, run.loop.state
     source, target = run.inputs[:2]
@@ -351,9 +351,11 @@ def _unless_left(run: Run, init: Pose | None, at_scales: bool, finely: Callable[
         return run, little
     other_fit, _ = _fit(other)
     matches, other_matches = (float(each.loop.state.record.num_inliers) for each in (run, other))
-    better = other_fit * other_matches > BETTER * fit * matches
-    apart = bool(distance_moved(state.pose, other.loop.state) > settings.fine_distance)
-    return other if better and (other_matches <= matches or other_fit > GOOD_FIT) else run, little and apart
+    ours, theirs = float(fit) * matches, float(other_fit) * other_matches
+    comparable = other_matches <= matches or other_fit > GOOD_FIT
+    better, as_good = (comparable and theirs > factor * ours for factor in (BETTER, 1.0))
+    apart = distance_moved(state.pose, other.loop.state) > settings.fine_distance
+    return other if better else run, apart and (little or (as_good and not better))
 
 
 def _fit(run: Run) -> tuple[AnyScalar, AnyScalar]:
