@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from mcgicp_jax._compute.devices import computed_on_cpu
+from mcgicp_jax._compute.devices import on_accelerator, on_cpu
 
 Result = TypeVar("Result")
 
@@ -61,7 +61,14 @@ def quickly_compiled(function: Callable[..., Result], *, level: int | None = Non
     def program() -> Callable[..., Result]:
         return jax.jit(function, compiler_options=_known(tuple(options.items())))
 
-    return computed_on_cpu(functools.wraps(function)(lambda *arguments: program()(*arguments)))
+    @functools.wraps(function)
+    def on_the_cpu(*arguments: Any) -> Result:
+        if not on_accelerator():
+            return program()(*arguments)
+        with on_cpu():
+            return program()(*arguments)
+
+    return on_the_cpu
 
 
 @functools.cache

@@ -29,7 +29,7 @@ from mcgicp_jax._registration.settings import Settings
 # `surface_fit` from which surfaces coincide. At right poses it was 0.17 or more in rooms that were cut, 0.27 in
 # furnished ones and in streets, 0.25 on KITTI. Where it is less, in rooms of 500 to 1,000 points and some raw scans of
 # all kinds, another registration, which is not better, costs its time alone. At wrong poses of cut rooms it was at most
-# 0.15: with a limit of 0.08, 38 of 144 registrations of rooms of 500 to 4,000 points were CONVERGED up to 1.3 m off,
+# 0.15: with a limit of 0.08, 35 of 144 registrations of rooms of 500 to 4,000 points were CONVERGED up to 1.3 m off,
 # and now one is.
 # Scan lines match themselves at the initial pose, where more points have matches, the fit was up to 0.14, and the
 # evidence up to 2.7 times as large as at the right pose (a LiDAR with an eighth of its beams). A pose with more matches
