@@ -355,7 +355,7 @@ def _unless_left(run: Run, init: Pose | None, at_scales: bool, finely: Callable[
     comparable = other_matches <= matches or other_fit > GOOD_FIT
     better, as_good = (comparable and theirs > factor * ours for factor in (BETTER, 1.0))
     apart = distance_moved(state.pose, other.loop.state) > settings.fine_distance
-    return other if better else run, apart and (little or (as_good and not better))
+    return other if better else run, bool(apart and (little or (as_good and not better)))
 
 
 def _fit(run: Run) -> tuple[AnyScalar, AnyScalar]:
