@@ -42,7 +42,9 @@ def surface_agreement(
     rows, matches, offsets = rows[matched], matches[matched], others[matches[matched]] - moved[matched]
     thin, _, normals = spreads(points, source.deferred_neighbors, rows)
     other_thin, _, other_normals = spreads(others, target.deferred_neighbors, matches)
-    return agreement_of(offsets, (rotated(normals, rotation), other_normals), (thin, other_thin), matched[matched])
+    both_normals = rotated(normals, rotation), other_normals
+    misfit, agreement = agreement_of(offsets, both_normals, (thin, other_thin), matched[matched])
+    return float(misfit), float(agreement)
 
 
 def agreement_of(
