@@ -80,7 +80,7 @@ def slopes(loss, inputs):
             # square, is far below rounding.
             values, step = [], 5e-7
             for each in (step, -step):
-                moved = [*leaves[:i], np.asarray(leaf) + each * direction, *leaves[i + 1 :]]
+                moved = [*leaves[:i], np.asarray(leaf + each * direction), *leaves[i + 1 :]]
                 values.append(float(loss(inputs | {name: jax.tree.unflatten(structure, moved)})))
             found.append(Slope(name, i, direction, (values[0] - values[1]) / (2 * step)))
     return found
