@@ -42,6 +42,9 @@ def computed_on_cpu(function: Callable[Parameters, Answer]) -> Callable[Paramete
 
     @functools.wraps(function)
     def computed(*arguments: Parameters.args, **named: Parameters.kwargs) -> Answer:
+        # To enter a context takes longer than to ask.
+        if not on_accelerator():
+            return function(*arguments, **named)
         with on_cpu():
             return function(*arguments, **named)
 

@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from mcgicp_jax._compute.devices import on_accelerator, on_cpu
+from mcgicp_jax._compute.devices import computed_on_cpu
 
 Result = TypeVar("Result")
 
@@ -43,8 +43,8 @@ class _Compilations:
 COMPILATIONS = _Compilations()
 jax.monitoring.register_event_duration_secs_listener(COMPILATIONS)
 
-# XLA's fusion emitters take a third to half of the time of compilation, and programs run no faster for it (jaxlib
-# 0.10.2): over 1,024 neighbourhoods they take 0.54 ms with them and 0.64 without, with channels 1.44 and 1.37.
+# XLA's fusion emitters take a third to half of the time of compilation, and save at most a tenth of the time to run
+# (jaxlib 0.10.2): 1,024 neighbourhoods take 0.64 ms with them and 0.70 without, with two channels 1.06 and 1.15.
 _QUICK: dict[str, bool | int] = {"xla_cpu_use_fusion_emitters": False}
 
 
@@ -61,14 +61,7 @@ def quickly_compiled(function: Callable[..., Result], *, level: int | None = Non
     def program() -> Callable[..., Result]:
         return jax.jit(function, compiler_options=_known(tuple(options.items())))
 
-    @functools.wraps(function)
-    def on_the_cpu(*arguments: Any) -> Result:
-        if not on_accelerator():
-            return program()(*arguments)
-        with on_cpu():
-            return program()(*arguments)
-
-    return on_the_cpu
+    return computed_on_cpu(functools.wraps(function)(lambda *arguments: program()(*arguments)))
 
 
 @functools.cache

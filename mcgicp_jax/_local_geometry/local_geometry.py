@@ -97,8 +97,9 @@ def offsets_of(around: Neighborhoods) -> Offsets:
 def _covariances_of_halves(
     offsets: Offsets, present: Float[Array, "k N"], covariance: Float[Array, "6 N"]
 ) -> tuple[list[Float[Array, "6 N"]], Float[Array, "M"]]:
-    """Covariances of every second neighbour, from the first and from the second on; and the numbers of all neighbours,
-    whose `covariance` is known, and of those of each half, M = 3 N."""
+    """Covariances of two halves of each neighbourhood, whose own `covariance` is known: of every second neighbour, from
+    the first and from the second on. And the numbers of neighbours: in all, in the first and in the second halves (M =
+    3 N)."""
     count = jnp.sum(present, axis=0)
     # About the mean of all, so that the sums over one half and over the other add up to those over all.
     x, y, z = (present * (offset - jnp.sum(offset, axis=0) / jnp.maximum(count, 1)) for offset in offsets)

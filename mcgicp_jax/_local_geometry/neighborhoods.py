@@ -162,12 +162,12 @@ def fit_channels(around: Neighborhoods, x: Float[Array, "k n"], y: Float[Array, 
         return ChannelFits(*(jnp.zeros(shape, x.dtype) for shape in ((size, 0, 2, 2), (size, 0), (size, 0, 3))))
     present = around.present.astype(x.dtype)
     count = jnp.maximum(jnp.sum(present, axis=0), 1)
-    x, y = (present * (each - jnp.sum(each, axis=0) / count) for each in (x, y))
+    x, y = (present * (offset - jnp.sum(offset, axis=0) / count) for offset in (x, y))
     sums = []
     for channel in range(around.num_channels):
         rows = x, y, around.difference(channel), around.measured(channel).astype(x.dtype)
-        # Every second neighbour, from the first and from the second on. What is summed over all is the sum of both.
-        first, second = (_fit_sums(*(each[i::2] for each in rows)) for i in (0, 1))
+        # Every second neighbour, from the first and from the second on. Sums over all are the sums of both halves.
+        first, second = (_fit_sums(*(row[i::2] for row in rows)) for i in (0, 1))
         sums.append(jnp.stack([first + second, first, second], axis=1))
     fit = _fit_of(jnp.stack(sums, axis=2))
     enough = fit.weight[0] > 3 if around.own_measured is None else (fit.weight[0] > 3) & around.own_measured
@@ -197,15 +197,15 @@ def fit_linear(
 ) -> LinearFit:
     """Fit a + b x + c y to the values of each neighbourhood; weights are 1, or 0 for values to ignore."""
     count = jnp.maximum(jnp.sum(weights, axis=0), 1)
-    x, y = (each - jnp.sum(weights * each, axis=0) / count for each in (x, y))
+    x, y = (offset - jnp.sum(weights * offset, axis=0) / count for offset in (x, y))
     return _fit_of(_fit_sums(x, y, values, weights))
 
 
 def _fit_sums(
     x: Float[Array, "k N"], y: Float[Array, "k N"], values: Float[Array, "k N"], weights: Float[Array, "k N"]
 ) -> Float[Array, "10 N"]:
-    """The sums from which a fit is computed: of the weights, and of the weighted x, y, x², xy, y², v, xv, yv, v². The
-    origin of x and y should be near their mean."""
+    """Weighted sums of 1, x, y, x², xy, y², v, xv, yv and v², from which a fit is computed. With an origin of x and y
+    far from their mean, the fit would be lost to rounding."""
     wx, wy, wv = weights * x, weights * y, weights * values
     products = (weights, wx, wy, wx * x, wx * y, wy * y, wv, wv * x, wv * y, wv * values)
     return jnp.stack([jnp.sum(product, axis=0) for product in products])
@@ -213,9 +213,10 @@ def _fit_sums(
 
 def _fit_of(sums: Float[Array, "10 ..."]) -> LinearFit:
     count, x, y, xx, xy, yy, v, xv, yv, vv = sums
-    each = 1 / jnp.maximum(count, 1)
-    xx, xy, yy = xx - each * x * x, xy - each * x * y, yy - each * y * y
-    xv, yv, vv = xv - each * x * v, yv - each * y * v, vv - each * v * v
+    # About the means.
+    mean_x, mean_y, mean_v = (total / jnp.maximum(count, 1) for total in (x, y, v))
+    xx, xy, yy = xx - mean_x * x, xy - mean_x * y, yy - mean_y * y
+    xv, yv, vv = xv - mean_x * v, yv - mean_y * v, vv - mean_v * v
     determinant = xx * yy - xy * xy
     planar = determinant > 1e-6 * (xx + yy) ** 2
     inverse = jnp.where(planar, jnp.stack([yy, -xy, xx]) / jnp.where(planar, determinant, 1), 0)

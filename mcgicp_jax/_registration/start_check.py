@@ -52,11 +52,11 @@ def doubt_of_start(
     start: jaxlie.SE3,
     state: State,
     settings: Settings,
-    fit: Callable[[], tuple[AnyScalar, AnyScalar]],
+    measure_fit: Callable[[], tuple[AnyScalar, AnyScalar]],
     at_scales: bool = False,
 ) -> tuple[AnyScalar, bool] | None:
-    """None unless a registration that has ended may have left a right initial pose; or its fit, and whether the clouds
-    have little in common. `fit` computes its `surface_fit`.
+    """If a registration may have left a right initial pose: its fit, and whether the clouds have little in common; else
+    None. `measure_fit` computes its `surface_fit`.
 
     It may have left it if it has moved the points by more than the fine `max_distance`, and surfaces do not coincide at
     its pose, or have little in common. (At several scales the initial pose is known to be far off, where the fine
@@ -66,9 +66,9 @@ def doubt_of_start(
         return None
     if distance_moved(start, state) <= settings.fine_distance:
         return None
-    found, common = fit()
+    fit, common = measure_fit()
     little = bool(common < LITTLE_IN_COMMON) and not at_scales
-    return (found, little) if found < GOOD_FIT or little else None
+    return (fit, little) if fit < GOOD_FIT or little else None
 
 
 def surface_fit(inputs: Inputs, executor: AbstractExecutor, loop: LoopResult) -> tuple[AnyScalar, AnyScalar]:
