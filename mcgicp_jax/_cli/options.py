@@ -137,7 +137,7 @@ class Options:
     channels: Annotated[tuple[str, ...], shown("NAMES", "all in common")] = ()
     voxel_size: float | Literal["auto", "off"] = "auto"
     num_neighbors: int = 20
-    max_distance: Annotated[tuple[float, ...], shown(default="10 spacings or more, then 2.5")] = ()
+    max_distance: Annotated[tuple[float, ...], shown(default="10 spacings or more, then 2.5 spacings")] = ()
     max_iterations: int = RegistrationOptions.max_iterations
     translation_tolerance: Annotated[float | None, shown("FLOAT", "0.005 spacings")] = None
     rotation_tolerance: float = ROTATION_TOLERANCE

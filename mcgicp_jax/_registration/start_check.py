@@ -26,15 +26,17 @@ from mcgicp_jax._registration.pose_derivative import Inputs
 from mcgicp_jax._registration.result import USABLE
 from mcgicp_jax._registration.settings import Settings
 
-# `surface_fit` from which surfaces coincide. At right poses it was 0.17 or more in rooms that were cut, 0.27 in
-# furnished ones and in streets, 0.25 on KITTI. Where it is less, in rooms of 500 to 1,000 points and some raw scans of
-# all kinds, another registration, which is not better, costs its time alone. At wrong poses of cut rooms it was at most
-# 0.15: with a limit of 0.08, 35 of 144 registrations of rooms of 500 to 4,000 points were CONVERGED up to 1.3 m off,
-# and now one is.
-# Scan lines match themselves at the initial pose, where more points have matches, the fit was up to 0.14, and the
-# evidence up to 2.7 times as large as at the right pose (a LiDAR with an eighth of its beams). A pose with more matches
-# than the one that it replaces must therefore fit so well; cut rooms have fewer matches at the right pose.
-GOOD_FIT = 0.16
+# `surface_fit` below which a registration with at least so many matches may have left a right pose. It was at most
+# 0.073 at 53 wrong poses of rooms that were cut, KITTI, another LiDAR and simulated streets. At right poses it was 0.17
+# or more in these rooms, 0.27 in furnished ones and in streets, 0.25 on KITTI; but less in 18 of 128 registrations of
+# raw scans, where another one, which is not better, costs its time alone.
+LEAST_FIT, _MANY = 0.08, 4000
+# The same for fewer matches, whose thick neighbourhoods fit wrong poses better: up to 0.2 in rooms of 500 to 2,000
+# points. With 0.08, 35 of 144 such registrations were CONVERGED up to 1.3 m off, and now one is. A pose with more
+# matches than the one that it replaces must fit so well, too. Scan lines match themselves at the initial pose, where
+# more points have matches, the fit was up to 0.14, and the evidence up to 2.7 times as large as at the right pose (a
+# LiDAR with an eighth of its beams); cut rooms have fewer matches at the right pose.
+GOOD_FIT = 0.25
 # Another pose is better if its overlap times its fit is at least so many times as large. It was 1.65 to 226 times as
 # large at right poses that replace wrong ones, and at most 1.04 times at wrong poses: on a plane, where any pose fits.
 # In between, as at a wrong pose in a room of 1,000 points, neither is promised.
@@ -68,7 +70,8 @@ def doubt_of_start(
         return None
     fit, common = measure_fit()
     little = bool(common < LITTLE_IN_COMMON) and not at_scales
-    return (fit, little) if fit < GOOD_FIT or little else None
+    least = LEAST_FIT if state.record.num_inliers >= _MANY else GOOD_FIT
+    return (fit, little) if fit < least or little else None
 
 
 def surface_fit(inputs: Inputs, executor: AbstractExecutor, loop: LoopResult) -> tuple[AnyScalar, AnyScalar]:
