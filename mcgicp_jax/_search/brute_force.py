@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable
 from functools import partial
-from typing import Any
+from typing import Any, TypeAlias
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import jaxlie
@@ -19,11 +19,15 @@ from mcgicp_jax._compute.programs import size_class
 from mcgicp_jax._search.base import IDENTITY, AbstractIndex, AbstractSearch, SearchPoints, on_host, search_points
 from mcgicp_jax._search.kd_tree import KDTreeSearch
 
-# Rows of a run and of a part of it: on an H200, 20 neighbours of 6,144 points took 0.2 ms by these, and 1.45 ms by
-# passes over all distances. Fewer than eight runs exclude nothing.
-_RUN, _PART, _LEAST_FOR_RUNS = 64, 8, 512
-# Queries whose distances to the rows of parts are stored at a time: 14 MB for 20 neighbours and five dimensions.
-_QUERIES = 512
+# Coordinates and descriptors of rows, each with its penalties.
+Columns: TypeAlias = list[tuple[Array, Array | None]]
+# Rows of a run. Of a run the nearest row alone is stored: a sixteenth of the table of distances.
+_RUN = 16
+# Columns of a group: on an H200, to sort all of 384 columns, and then 320, took 0.15 ms for a cloud of 6,144 rows, as
+# long as the rest of its preparation and registration.
+_GROUP = 4
+# Entries of that table that are stored at a time: 64 MB in float32, all queries of clouds of 16,384 rows.
+_STORED = 2**24
 
 
 def default_search(traced: bool = False, workers: int = -1) -> AbstractSearch:
@@ -34,7 +38,7 @@ def default_search(traced: bool = False, workers: int = -1) -> AbstractSearch:
 class DenseSearch(AbstractSearch):
     """Brute-force search for GPUs and TPUs, exact up to rounding; ties are broken by row.
 
-    Squared differences are summed and reduced at once, so that the N × M table of distances is never stored. (A matrix
+    The nearest row of each run of rows is found first, so that the N × M table of distances is never stored. (A matrix
     product for |a|² − 2ab + |b|² would have to store it, and in float32 would lose the distances of near neighbours to
     cancellation.) Distances are computed in the clouds' precision, in `KDTreeSearch` in float64: the two may choose
     different points where two distances agree to rounding. `register` searches concrete clouds on the CPU, where
@@ -89,109 +93,83 @@ def _padded(rows: SearchPoints) -> SearchPoints:
 def _nearest(
     pose: Float[Array, "7"], source: SearchPoints, target: SearchPoints, num_candidates: int
 ) -> Int[Array, "m N"]:
+    """The m nearest target rows of each source row: those among the rows of the m runs whose nearest row is nearest.
+
+    Exact: the nearest rows of these runs come before any row of another run.
+    """
     rotation = jaxlie.SO3(pose[:4]).as_matrix().astype(pose.dtype)
     moved = jnp.dot(source.points, rotation.T, precision="highest") + pose[4:]
-    queries = eqx.tree_at(lambda rows: rows.points, source, moved)
-    complete = source.penalty is None and target.penalty is None
-    if num_candidates > 1 and complete and target.valid.size >= _LEAST_FOR_RUNS:
-        return _nearest_by_runs(queries, target, num_candidates)
-    rows = jnp.arange(target.valid.size, dtype=jnp.int32)
-    square, nearest = _first(_squares, (queries, target, rows), source.valid.size, num_candidates)
-    return jnp.where(jnp.isfinite(square) & source.valid, nearest, -1)
+    queries, columns = _columns(source._replace(points=moved)), _columns(target)
+    # Rows to ignore are infinitely far. One with NaN would be nearest.
+    valid = target.valid & ~jnp.isnan(sum(value for value, _ in columns))
+    columns = [(jnp.where(valid, value, jnp.inf), penalty) for value, penalty in columns]
+    blocks = _in_blocks(columns, _RUN, jnp.inf)
+    num_runs = len(blocks[0][0])
+    # With the compiler's own choice of layout, GPUs would read the rows of a run far apart.
+    by_row = jax.lax.optimization_barrier(jax.tree.map(jnp.transpose, blocks))
+
+    def nearest(queries: Columns) -> Int[Array, "m n"]:
+        # Written out: on GPUs a reduction over so few rows takes several times as long.
+        of_rows = (_squares(_at(queries, np.s_[:, None]), _at(by_row, row)) for row in range(_RUN))
+        # In the order of rows, by which ties are broken.
+        runs = jnp.sort(_smallest(functools.reduce(jnp.minimum, of_rows), num_candidates), axis=1)
+        rows = (runs[:, :, None] * _RUN + jnp.arange(_RUN)).reshape(len(runs), -1)
+        squares = _squares(_at(queries, np.s_[:, None, None]), _at(blocks, runs)).reshape(rows.shape)
+        first = _smallest(squares, num_candidates)
+        square, row = (jnp.take_along_axis(table, first, axis=1) for table in (squares, rows))
+        found = jnp.where(jnp.isfinite(square), row, -1).astype(jnp.int32)
+        return jnp.pad(found, [(0, 0), (0, num_candidates - found.shape[1])], constant_values=-1).T
+
+    count = source.valid.size
+    block = max(1, _STORED // max(num_runs, num_candidates * _RUN * len(columns)))
+    if count <= block:
+        rows = nearest(queries)
+    else:
+        rows = jax.lax.map(nearest, _in_blocks(queries, block, 0.0)).swapaxes(0, 1).reshape(num_candidates, -1)
+    return jnp.where(source.valid, rows[:, :count], -1)
 
 
-def _squares(
-    source: SearchPoints, target: SearchPoints, rows: Int[Array, "M"]
-) -> tuple[Float[Array, "N M"], Int[Array, "N M"]]:
-    """Squared search distance of every source row to every target row, metres²; and the target rows."""
-    square = jnp.zeros((source.valid.size, target.valid.size), jnp.asarray(source.points).dtype)
-    for query, point in zip(source.points.T, target.points.T, strict=True):
-        square = square + (query[:, None] - point) ** 2
-    for column in range(source.descriptors.shape[1]):
-        added = (source.descriptors[:, column, None] - target.descriptors[:, column]) ** 2
-        for side, axis in ((source, 1), (target, 0)):
-            if side.penalty is not None:
-                penalty = jnp.expand_dims(side.penalty[:, column], axis)
-                added = jnp.where(penalty > 0, penalty, added)
-        square = square + added
-    square = jnp.where(target.valid, square, jnp.inf)
-    return square, jnp.broadcast_to(rows, square.shape)
+def _columns(rows: SearchPoints) -> Columns:
+    """The coordinates and descriptors of rows, each with the penalties for missing ones."""
+    values = [*rows.points.T, *rows.descriptors.T]
+    penalties = [None] * len(values) if rows.penalty is None else [None, None, None, *rows.penalty.T]
+    return list(zip(values, penalties, strict=True))
 
 
-def _first(
-    numbered: Callable[..., tuple[Float[Array, "N M"], Int[Array, "N M"]]], arguments: Any, size: int, count: int
-) -> tuple[Float[Array, "m N"], Int[Array, "m N"]]:
-    """The `count` smallest squares of each of N rows, and their numbers, by which ties are broken.
-
-    `numbered(*arguments)` computes the table of squares and numbers, which is not stored.
-    """
-
-    def following(before: tuple[Array, Array], _: None) -> tuple[tuple[Array, Array], tuple[Array, Array]]:
-        """The next after `before` in the order of (square, number)."""
-        # Without the barrier the compiler would hoist the loop-invariant squares out of the loop and store them.
-        before, table = jax.lax.optimization_barrier((before, arguments))
-        square, numbers = numbered(*table)
-        least, number = (values[:, None] for values in before)
-        # False where the square is NaN.
-        after = (square > least) | ((square == least) & (numbers > number))
-        smallest = jax.lax.reduce(
-            (jnp.where(after, square, jnp.inf), numbers),
-            (jnp.asarray(jnp.inf, square.dtype), jnp.int32(np.iinfo(np.int32).max)),
-            _nearer,
-            dimensions=(1,),
-        )
-        return smallest, smallest
-
-    dtype = jax.eval_shape(numbered, *arguments)[0].dtype
-    start = (jnp.full(size, -1, dtype), jnp.full(size, -1, jnp.int32))
-    return jax.lax.scan(following, start, length=count)[1]
-
-
-def _nearer(one: tuple[Array, Array], other: tuple[Array, Array]) -> tuple[Array, Array]:
-    first = (one[0] < other[0]) | ((one[0] == other[0]) & (one[1] < other[1]))
-    return jnp.where(first, one[0], other[0]), jnp.where(first, one[1], other[1])
-
-
-def _given(square: Float[Array, "N M"], numbers: Int[Array, "N M"]) -> tuple[Array, Array]:
-    return square, numbers
-
-
-def _nearest_by_runs(queries: SearchPoints, target: SearchPoints, num_candidates: int) -> Int[Array, "m N"]:
-    """The m nearest target rows: first the m nearest runs of rows, then of these the m nearest parts, then the rows.
-
-    Exact: m rows, the nearest of each of the m nearest runs, come before any row of another run; likewise for parts.
-    """
-
-    def column_of(array: Float[Array, "n"], multiple: int) -> Float[Array, "m"]:
-        return jnp.pad(array, (0, -array.size % multiple), constant_values=jnp.nan)
-
-    pairs = zip((queries, target), (_QUERIES, _RUN), strict=True)
-    blocks, columns = (
-        [column_of(column, multiple) for column in (*rows.points.T, *rows.descriptors.T)] for rows, multiple in pairs
+def _in_blocks(columns: Columns, size: int, last: float) -> Columns:
+    """Columns as (n, size); the value `last` fills up the last block."""
+    return jax.tree.map(
+        lambda column: jnp.pad(column, (0, -column.size % size), constant_values=last).reshape(-1, size), columns
     )
-    # A run with NaN would be no nearest one.
-    valid = jnp.pad(target.valid, (0, -target.valid.size % _RUN)) & ~jnp.isnan(sum(columns[1:], columns[0]))
-    columns = [jnp.where(valid, column, jnp.inf) for column in columns]
 
-    def of_block(block: list[Float[Array, "n"]]) -> Int[Array, "m n"]:
-        numbers = jnp.broadcast_to(jnp.arange(valid.size // _RUN, dtype=jnp.int32), (_QUERIES, valid.size // _RUN))
-        for width, finer in ((_RUN, _PART), (_PART, 1)):
-            # Distances of all rows of these runs, or parts, reduced at once.
-            groups = slice(None) if width == _RUN else numbers
-            squares = [
-                (query[:, None, None] - column.reshape(-1, width)[groups]) ** 2
-                for query, column in zip(block, columns, strict=True)
-            ]
-            least = jnp.min(sum(squares[1:], squares[0]), axis=2)
-            _, nearest = _first(_given, (least, numbers), _QUERIES, num_candidates)
-            # Where no further run is left, the number is the largest int32.
-            nearest = jnp.minimum(nearest.T, valid.size // width - 1)
-            within = jnp.arange(width // finer, dtype=jnp.int32)
-            numbers = (nearest[:, :, None] * (width // finer) + within).reshape(_QUERIES, -1)
-        squares = [(query[:, None] - column[numbers]) ** 2 for query, column in zip(block, columns, strict=True)]
-        square, rows = _first(_given, (sum(squares[1:], squares[0]), numbers), _QUERIES, num_candidates)
-        return jnp.where(jnp.isfinite(square), rows, -1)
 
-    rows = jax.lax.map(of_block, [block.reshape(-1, _QUERIES) for block in blocks])
-    rows = rows.transpose(1, 0, 2).reshape(num_candidates, -1)[:, : queries.valid.size]
-    return jnp.where(queries.valid, rows, -1)
+def _at(columns: Columns, index: Any) -> Columns:
+    return jax.tree.map(lambda column: column[index], columns)
+
+
+def _squares(queries: Columns, targets: Columns) -> Float[Array, "*rows"]:
+    """Squared search distances, metres², of rows whose axes broadcast."""
+    squares = []
+    for (query, query_penalty), (target, target_penalty) in zip(queries, targets, strict=True):
+        square = (query - target) ** 2
+        for penalty in (query_penalty, target_penalty):
+            if penalty is not None:
+                square = jnp.where(penalty > 0, penalty, square)
+        squares.append(square)
+    return sum(squares[1:], squares[0])
+
+
+def _smallest(squares: Float[Array, "N M"], count: int) -> Int[Array, "N m"]:
+    """Columns of the smallest squares of each row, ties by column."""
+    size = squares.shape[1]
+    if count == 1:
+        return jnp.argmin(squares, axis=1, keepdims=True)
+    if size <= 2 * _GROUP * count:
+        return jax.lax.top_k(-squares, min(count, size))[1]
+    # Among the columns of the groups whose smallest square is smallest.
+    squares = jnp.pad(squares, ((0, 0), (0, -size % _GROUP)), constant_values=jnp.inf)
+    least = functools.reduce(jnp.minimum, (squares[:, column::_GROUP] for column in range(_GROUP)))
+    groups = jnp.sort(_smallest(least, count), axis=1)
+    columns = (groups[:, :, None] * _GROUP + jnp.arange(_GROUP)).reshape(len(squares), -1)
+    nearest = _smallest(jnp.take_along_axis(squares, columns, axis=1), count)
+    return jnp.take_along_axis(columns, nearest, axis=1)
