@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -17,7 +18,6 @@ from mcgicp_jax._compute.threads import with_settings_of_package
 from mcgicp_jax._math.poses import Pose, matrices_of, pose_matrix, rotation_from_quaternion, turn_by_quaternion
 
 
-@with_settings_of_package
 def centred_pose(pose: Pose | None, source: PointCloud, target: PointCloud, name: str = "init") -> Array | np.ndarray:
     """T(−o_t) · T · T(o_s), (4, 4): the pose between coordinates relative to the clouds' origins, in its own precision.
     Raises `ValueError` as `pose_matrix` does, for the argument `name`."""
@@ -31,9 +31,14 @@ def centred_pose(pose: Pose | None, source: PointCloud, target: PointCloud, name
     matrix = pose_matrix(pose, name, distance)
     if is_concrete(source.origin, target.origin) and not (np.any(source.origin) or np.any(target.origin)):
         return matrix
+    return _between_origins(matrix, source.origin, target.origin)
+
+
+@with_settings_of_package
+def _between_origins(matrix: Any, source_origin: Any, target_origin: Any) -> Array | np.ndarray:
     rotation, translation = matrix[:3, :3], matrix[:3, 3]
     # In this form two far origins cancel exactly before either is rotated.
-    shifted = (rotation - np.eye(3)) @ source.origin + (source.origin - target.origin) + translation
+    shifted = (rotation - np.eye(3)) @ source_origin + (source_origin - target_origin) + translation
     if isinstance(shifted, np.ndarray) and isinstance(matrix, np.ndarray):
         result = matrix.copy()
         result[:3, 3] = shifted

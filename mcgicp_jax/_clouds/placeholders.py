@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from mcgicp_jax._clouds.point_cloud import LARGEST, PointCloud
-from mcgicp_jax._math.statistics import equal_rows
+from mcgicp_jax._math.statistics import equal_rows, upper_median
 from mcgicp_jax._search.kd_tree import KDTreeSearch
 
 # A position is a placeholder if more than `_MANY` rows share it, and more than `_MANY` times as many as share any of
@@ -33,15 +33,17 @@ def measured_rows(cloud: PointCloud, complete: Bool[np.ndarray, "N"] | None = No
     be, only the first is one. `complete`: rows to consider; None: all valid ones."""
     points, finite = np.asarray(cloud.points), np.asarray(cloud.valid) if complete is None else complete
     # One check of all values is much faster than one per row.
-    if not (np.abs(points) <= LARGEST).all():
+    if complete is None and not (np.abs(points) <= LARGEST).all():
         finite = np.logical_and.reduce([finite, *(np.abs(column) <= LARGEST for column in points.T)])
     rows = np.flatnonzero(finite)
     points = points if rows.size == len(points) else points[rows]
-    zero = np.flatnonzero((points == 0).all(axis=1))[1:]
-    positions = equal_rows(points, _MANY)
+    # Along columns NumPy reduces several times as fast.
+    columns = np.ascontiguousarray(points.T, np.float64)
+    zero = np.flatnonzero(~columns.any(axis=0))[1:]
+    positions = equal_rows(columns.T, _MANY)
     if (positions is None and not zero.size) or (points[:1] == points).all():
         # Points that are all at one place stay.
-        return _without_far(points, rows, finite)
+        return _without_far(columns, rows, finite)
     left_out = np.zeros(len(points), bool)
     if positions is not None:
         _, first, counts = np.unique(positions, return_index=True, return_counts=True)
@@ -54,20 +56,19 @@ def measured_rows(cloud: PointCloud, complete: Bool[np.ndarray, "N"] | None = No
     left_out[zero] = True
     measured = finite.copy()
     measured[rows[left_out]] = False
-    return _without_far(points[~left_out], rows[~left_out], measured)
+    return _without_far(columns[:, ~left_out], rows[~left_out], measured)
 
 
 def _without_far(
-    points: Float[np.ndarray, "n 3"], rows: Int[np.ndarray, "n"], measured: Bool[np.ndarray, "N"]
+    columns: Float[np.ndarray, "3 n"], rows: Int[np.ndarray, "n"], measured: Bool[np.ndarray, "N"]
 ) -> Bool[np.ndarray, "N"]:
-    """`measured` without the `rows` whose `points` are far from all others."""
-    if len(points) <= 2 * _SURFACE:
+    """`measured` without the `rows` whose coordinates, in `columns`, are far from all others."""
+    if rows.size <= 2 * _SURFACE:
         return measured
-    stride = 1 + len(points) // _SAMPLE
-    columns = points.T.astype(np.float64, order="C")
-    columns -= np.median(columns[:, ::stride], axis=1, keepdims=True)
+    stride = 1 + rows.size // _SAMPLE
+    columns = columns - upper_median(columns[:, ::stride])[:, None]
     distance = np.sqrt((columns * columns).sum(axis=0))
-    limit = _FAR * np.median(distance[::stride])
+    limit = _FAR * upper_median(distance[::stride])
     far = np.flatnonzero(distance > limit)
     if not far.size or limit == 0:
         return measured

@@ -103,11 +103,11 @@ def preprocessed_in(
     neighbourhoods, for warnings."""
     check_preprocessing(voxel_size, num_neighbors)
     cloud = as_cloud("cloud", cloud)
-    values = primal(cloud)
-    if is_concrete(values) and not is_concrete(cloud):
-        preprocessed = preprocessed_in(grid, values, voxel_size, num_neighbors, search, checked)
-        return _differentiable(preprocessed, cloud, values)
     if not is_concrete(cloud):
+        values = primal(cloud)
+        if is_concrete(values):
+            preprocessed = preprocessed_in(grid, values, voxel_size, num_neighbors, search, checked)
+            return _differentiable(preprocessed, cloud, values)
         raise ValueError(
             "cloud: expected a preprocessed cloud inside jit and vmap; call preprocess(cloud, voxel_size, size=...), "
             "or preprocess(cloud, None) for all points"

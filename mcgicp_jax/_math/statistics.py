@@ -100,6 +100,12 @@ def cell_numbers(keys: Sequence[Int[AnyArray, "n"]], num_cells: Int[AnyScalar, "
     return xp.abs(sum(products[1:], start=products[0])) % num_cells
 
 
+def upper_median(values: Float[np.ndarray, "*batch n"]) -> Float[np.ndarray, "*batch"]:
+    """The value at half of the count in order: for a few values, NumPy's median takes three times as long."""
+    middle = values.shape[-1] // 2
+    return np.partition(values, middle)[..., middle]
+
+
 def equal_rows(points: Float[np.ndarray, "N D"], most: int) -> Int[np.ndarray, "N"] | None:
     """The number of each point's position, if more than `most` finite points share one; None otherwise."""
     # The sort of a hash takes a twentieth of the time of a k-d tree. The sum turns −0 into 0, whose bits differ.

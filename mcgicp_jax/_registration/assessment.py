@@ -174,8 +174,9 @@ def registration_of(
     history: dict[str, Any] = records._asdict()
     # Outside `jit`, only the pose and the origins may be traced, by differentiation.
     pose, source_origin, target_origin = state.pose, source.origin, target.origin
-    state, source, target = map(primal, (state, source, target))
-    concrete = is_concrete(state, history)
+    fixed_pose, origin = primal((pose, source_origin))
+    state = state._replace(pose=fixed_pose)
+    concrete = is_concrete(state.status)
     if concrete:
         # Reading NumPy arrays compiles nothing, and NumPy scalars print as numbers.
         numbers = state.status, state.num_iterations, state.record, history, used
@@ -192,8 +193,10 @@ def registration_of(
         rmse=constant_by(record.rmse),
         overlap=(num_inliers / used.sum()).astype(record.rmse.dtype),
         history=history,
-        constraints=_later(lambda: _constraints_in_user_frame(assessment, source.origin), concrete),
-        uncertainty=_later(lambda: _uncertainty_in_user_frame(assessment, state, source.origin), concrete, constant_by),
+        constraints=assessment.constraints
+        if concrete and not np.any(origin)
+        else _later(lambda: _constraints_in_user_frame(assessment, origin), concrete),
+        uncertainty=_later(lambda: _uncertainty_in_user_frame(assessment, state, origin), concrete, constant_by),
         derivative=Held(derivative),
         **fields_of_pose(pose, source_origin, target_origin),
     )

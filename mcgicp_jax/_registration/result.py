@@ -7,7 +7,6 @@ from collections.abc import Callable
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple, TypeAlias
 
 import equinox as eqx
-import jax
 import jaxlie
 import numpy as np
 from jax.typing import ArrayLike
@@ -181,7 +180,7 @@ class RegistrationResult(eqx.Module):
             target_origin=np.zeros(3),
             centred=nowhere,
             constraints=Lazy.of(Constraints(np.zeros((6, 6)), None)),
-            uncertainty=Lazy.of(Uncertainty(np.full((6, 6), np.nan), np.full(6, np.nan))),
+            uncertainty=unknown_uncertainty(),
             derivative=Held(),
         )
 
@@ -316,9 +315,15 @@ def is_usable(result: RegistrationResult) -> bool:
     return result.status in USABLE
 
 
+def unknown_uncertainty() -> Lazy[Uncertainty]:
+    """NaN."""
+    return Lazy.of(Uncertainty(np.full((6, 6), np.nan), np.full(6, np.nan)))
+
+
 def computed(result: RegistrationResult) -> RegistrationResult:
     """The result with its deferred fields computed, so that it no longer references the clouds."""
-    return jax.tree.map(lambda leaf: leaf, result)
+    later = {name: Lazy.of(getattr(result, name).value) for name in ("constraints", "uncertainty")}
+    return result.build(**vars(result) | later | {"derivative": Held()})
 
 
 def verified(result: RegistrationResult, trusted: bool = True) -> RegistrationResult:
@@ -328,6 +333,8 @@ def verified(result: RegistrationResult, trusted: bool = True) -> RegistrationRe
     """
     code: Any = result.status_code
     overlap: Any = result.overlap
+    if isinstance(overlap, np.floating) and trusted and overlap >= LEAST_OVERLAP:
+        return result
     xp = numpy_for(code, overlap)
     doubtful = xp.isin(code, np.array(USABLE)) & ~(trusted & (overlap >= LEAST_OVERLAP))
     return result.build(**vars(result) | {"status_code": xp.where(doubtful, np.int32(Status.UNVERIFIED), code)[()]})

@@ -116,7 +116,12 @@ class AbstractTreeSearch(AbstractSearch, TreeBackend):
         return self.neighbors_on_demand(points, num_neighbors).whole
 
     def neighbors_on_demand(self, points: Float[np.ndarray, "N 3"], num_neighbors: int) -> NeighborsOnDemand:
-        tree = functools.cache(lambda: TiedTree(self, points))
+        built: list[TiedTree] = []
+
+        def tree() -> TiedTree:
+            if not built:
+                built.append(TiedTree(self, points))
+            return built[0]
 
         def find(rows: Any) -> Int[np.ndarray, "n k"]:
             # In the order of the leaves, each query finds the nodes it needs in the processor's caches.
