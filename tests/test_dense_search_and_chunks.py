@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 
 import mcgicp_jax as mcg
 from mcgicp_jax import DenseSearch, KDTreeSearch, Status
+from mcgicp_jax._pairs import batch_jobs
 from mcgicp_jax._pairs.batch_jobs import BatchJob
 from mcgicp_jax._registration import chunks, register_pair
 from mcgicp_jax.extend import SearchPoints
@@ -111,7 +112,7 @@ def test_no_table_of_pairs_is_stored(num_candidates, lanes):
     if lanes:
         arguments, nearest = jax.tree.map(lambda array: np.stack([array] * lanes), arguments), jax.vmap(nearest)
     memory = jax.jit(nearest).lower(*arguments).compile().memory_analysis()
-    assert memory.temp_size_in_bytes < 0.1 * 4 * size**2
+    assert memory.temp_size_in_bytes < 0.1 * 4 * size**2 * (lanes or 1)
 
 
 @pytest.fixture(scope="module")
@@ -258,8 +259,11 @@ def test_pairs_of_many_updates_leave_their_chunk_and_lose_nothing(clouds, monkey
 
 
 @pytest.mark.filterwarnings("ignore:channel channel_0")
-def test_given_neighbours_stay_where_a_channel_is_left_out(raw):
-    """Its first channel moves with the sensor: `register` works on copies of the clouds."""
+@pytest.mark.parametrize("on_host", [True, False])
+def test_given_neighbours_stay_where_a_channel_is_left_out(raw, on_host, monkeypatch):
+    """Its first channel moves with the sensor: `register` works on copies of the clouds. Of the first pairs the host
+    finds out, and warns; of others the program does."""
+    monkeypatch.setattr(batch_jobs, "_CHECKED", 8 if on_host else 0)
     sides = []
     for side in (0, 1):
         points, channels = (np.asarray(array) for array in (raw[0][side].points, raw[0][side].channels))
@@ -298,9 +302,9 @@ def test_a_stream_yields_invalid_pairs_and_those_of_many_updates_on_the_way(clou
 
 def test_a_rare_size_does_not_wait_for_the_end(clouds, monkeypatch):
     monkeypatch.setattr(chunks, "_PATIENCE", 2)
-    # 490 points fill the larger size class, the others the smaller.
+    # 490 points fill the larger size class, the others the smaller, whose pairs do not come first: they would join.
     rare, usual = 2, [0, 1, 3, 5] * 3
-    order = [rare, *usual]
+    order = [usual[0], rare, *usual[1:]]
 
     def ended():
         completed = mcg.register_as_completed(
@@ -310,16 +314,38 @@ def test_a_rare_size_does_not_wait_for_the_end(clouds, monkeypatch):
 
     first = ended()
     assert sorted(first) == list(range(len(order)))
-    assert first.index(0) < len(order) - 4
+    assert first.index(1) < len(order) - 4
     # Another batch uses the programs of the first.
     with compilations() as found:
         assert ended() == first
     assert not found
 
 
+def test_pairs_of_similar_sizes_share_a_program(raw, monkeypatch):
+    """Each fills at least half of the size of the first."""
+    sizes, shapes = (490, 400, 260, 310), []
+    program = chunks._registered
+
+    def noted(chunk, *arguments, **named):
+        shapes.append((chunk.source.valid.shape[1], chunk.target.valid.shape[1]))
+        return program(chunk, *arguments, **named)
+
+    monkeypatch.setattr(chunks, "_registered", noted)
+    sources, targets = (
+        [raw[2][side].replace_rows(valid=np.arange(len(raw[2][side])) < size).unpad() for size in sizes]
+        for side in (0, 1)
+    )
+    results = in_chunks(sources, targets)
+    assert set(shapes) == {(512, 512)}
+    for result, expected in zip(results, in_chunks(sources, targets, executor="threads"), strict=True):
+        assert max(pose_error(result.matrix, expected.matrix)) < 1e-5
+
+
 @in_both_precisions
-def test_several_neighbours_are_those_of_trees():
-    points = np.random.default_rng(0).normal(size=(1500, 3)).astype(float if jax.enable_x64.value else np.float32)
+@pytest.mark.parametrize("size", [1500, 2990])
+def test_several_neighbours_are_those_of_trees(size):
+    """More than 2,560 points are sought in two steps."""
+    points = np.random.default_rng(0).normal(size=(size, 3)).astype(float if jax.enable_x64.value else np.float32)
     np.testing.assert_array_equal(DenseSearch().neighbors(points, 20), KDTreeSearch().neighbors(points, 20))
 
 

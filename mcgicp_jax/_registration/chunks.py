@@ -29,7 +29,7 @@ from mcgicp_jax._registration.assessment import Assessment
 from mcgicp_jax._registration.loop import Record, State
 from mcgicp_jax._registration.options import Options
 from mcgicp_jax._registration.pose_derivative import Inputs
-from mcgicp_jax._registration.register_pair import problem_of
+from mcgicp_jax._registration.register_pair import problem_of, with_textures
 from mcgicp_jax._registration.start_check import doubt_of_start, surface_fit
 from mcgicp_jax._registration.traced import TracedExecutor, assess
 from mcgicp_jax._search.base import AbstractSearch
@@ -55,8 +55,8 @@ _CHUNKS_BETWEEN = 32
 _DISPATCHED = 2
 # A chunk runs partly filled after this many pairs of other shapes: a stream of pairs yields results while it goes on.
 _PATIENCE = 256
-# Clouds whose neighbours are found at a time: 14 MB each with 20 neighbours.
-_CLOUDS = 16
+# Rows whose neighbours are found at a time: 0.5 GB with 20 neighbours (compiled for an H100).
+_ROWS_WITH_NEIGHBORS = 2**16
 
 
 class ChunkPair(NamedTuple):
@@ -100,7 +100,8 @@ def run_pairs(
     num_neighbors: int,
 ) -> Iterator[Ended[Key] | Refused[Key]]:
     """Register many pairs, spread over the `default_devices`, and yield their results. `num_neighbors` is that of
-    clouds that have no neighbours yet. Pairs of the same shapes share a program."""
+    clouds that have no neighbours yet. Pairs of similar sizes share a program: to compile one takes as long as to
+    register thousands of pairs."""
     # Numbers are traced, so that others compile nothing.
     numbers = options.numbers
     if isinstance(options.max_distance, tuple):
@@ -121,7 +122,9 @@ def run_pairs(
     )
     groups: dict[Any, _Group[Key]] = {}
     last: dict[Any, int] = {}
+    sizes: list[tuple[int, int]] = []
     for number, (key, pair) in enumerate(pairs):
+        pair = _fitted(pair, sizes)
         kind = _shapes(pair)
         if kind not in groups:
             groups[kind] = _Group(program, mesh, fixed.max_iterations)
@@ -218,17 +221,17 @@ class _Group(Generic[Key]):
     def _fetched(self) -> list[Any]:
         """The results of the oldest chunk; those of its pairs that have not ended join the slow ones."""
         pairs, first, packed = self._dispatched[0]
-        results = jax.device_get(packed).tree
+        leaves, structure = jax.tree.flatten(jax.device_get(packed).tree)
         self._dispatched.popleft()
         ended: list[Ended[Key] | Refused[Key]] = []
-        for row, (key, pair) in enumerate(pairs):
-            state, assessment, history, check = jax.tree.map(lambda leaf, row=row: leaf[row], results)
+        for (key, pair), *row in zip(pairs, *leaves, strict=False):
+            state, assessment, history, check = jax.tree.unflatten(structure, row)
             if state.status < 0:
                 self._slow.append((key, pair))
                 continue
             # One history entry per update, and one at the returned pose.
             count = int(state.num_iterations) + 1
-            history = jax.tree.map(lambda entries, count=count: entries[:count], history)
+            history = Record(*(entries[:count] for entries in history))
             ended.append(Ended(key, state, assessment, history, _has_doubt(pair.start, state, check)))
         if first and len(pairs) - len(ended) > _MANY * len(pairs):
             self._first_updates = min(2 * self._first_updates, self._all_updates)
@@ -238,6 +241,19 @@ class _Group(Generic[Key]):
 def _has_doubt(start: jaxlie.SE3, state: State, check: Any) -> bool:
     """Whether there is a `doubt_of_start`, by settings and fit; None if `max_distance` is given."""
     return check is not None and doubt_of_start(start, state, check[0], lambda: check[1]) is not None
+
+
+def _fitted(pair: ChunkPair, sizes: list[tuple[int, int]]) -> ChunkPair:
+    """The pair padded to the smallest of the sizes whose rows it fills by half or more; else its own are added."""
+    own = pair.source.valid.size, pair.target.valid.size
+    suitable = [size for size in sizes if all(rows <= each <= 2 * rows for rows, each in zip(own, size, strict=True))]
+    if not suitable:
+        sizes.append(own)
+        return pair
+    source, target = min(suitable, key=np.prod)
+    if (source, target) == own:
+        return pair
+    return pair._replace(source=pair.source.pad(source), target=pair.target.pad(target))
 
 
 def _shapes(tree: Any) -> Any:
@@ -266,7 +282,10 @@ def _registered(
     def registered(pair: ChunkPair, common: Any) -> Any:
         method, robust, numbers, max_updates = common
         own = replace(options, **numbers | {"max_coarse_distance": pair.max_coarse_distance})
-        problem, inputs = problem_of(Inputs(pair.source, pair.target, method, robust), None, own, 1)
+        source, target = pair.source, pair.target
+        if method.uses_channels:
+            source, target = with_textures(source, target, method)
+        problem, inputs = problem_of(Inputs(source, target, method, robust), None, own, 1)
         problem = replace(problem, start=pair.start)
         executor = TracedExecutor(problem, search, options.max_iterations)
         loop = executor.run(max_updates)
@@ -291,4 +310,5 @@ def _with_neighbors(clouds: PointCloud, search: AbstractSearch, num_neighbors: i
     if clouds.deferred_neighbors is not None:
         return clouds
     find = partial(traced_neighbors, num_neighbors=num_neighbors, search=search)
-    return clouds.replace_rows(deferred_neighbors=jax.lax.map(find, clouds, batch_size=_CLOUDS))
+    at_a_time = max(1, _ROWS_WITH_NEIGHBORS // clouds.valid.shape[-1])
+    return clouds.replace_rows(deferred_neighbors=jax.lax.map(find, clouds, batch_size=at_a_time))

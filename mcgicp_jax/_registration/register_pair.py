@@ -148,17 +148,17 @@ def prepared(
     options: Options,
     tie_points: GivenTiePoints | None = None,
     prior: GivenPrior | None = None,
+    channels_checked: bool = True,
 ) -> Inputs:
-    """The arguments of a registration, checked; and the clouds, see `preprocessed`."""
+    """The arguments of a registration, checked; and the clouds, see `preprocessed`, by `with_textures` if
+    `channels_checked`."""
     check_method(method)
     sides = {"source": as_cloud("source", source), "target": as_cloud("target", target)}
     source, target = preprocessed(sides, method, options)
     if options.soft_matches is False:
         warn_of_hard_matches(method, source, target)
-    if method.uses_channels:
-        source, target = without_patterns(source, target)
-    if isinstance(method, MultiChannelGICP) and method.photometric:
-        source, target = without_constant_part(source), without_constant_part(target)
+    if channels_checked and method.uses_channels:
+        source, target = with_textures(source, target, method)
     if options.voxel_sizes and not (source.covariances is None and target.covariances is None):
         raise ValueError("voxel_sizes: expected none for clouds with covariances, which cannot be averaged in voxels")
     if options.voxel_sizes and not is_concrete(primal((source, target))):
@@ -169,6 +169,14 @@ def prepared(
     if options.voxel_sizes and method.needs_covariances and not is_concrete(source, target):
         raise ValueError("voxel_sizes: expected none for derivatives with cells; make these with voxel_gaussians")
     return Inputs(source, target, method, options.robust, *checked_measurements(tie_points, prior, source, target))
+
+
+def with_textures(source: PointCloud, target: PointCloud, method: AbstractMethod) -> tuple[PointCloud, PointCloud]:
+    """The clouds for a method that uses channels, without what moves with the sensor."""
+    source, target = without_patterns(source, target)
+    if isinstance(method, MultiChannelGICP) and method.photometric:
+        source, target = without_constant_part(source), without_constant_part(target)
+    return source, target
 
 
 @with_settings_of_package
