@@ -165,9 +165,9 @@ def register(
             matched points differ by a factor, probably because of another exposure; channels seem to move with the
             sensor (they are left out, or a pose that they alone hold is UNVERIFIED); extent and spacing of the clouds
             differ so much that their units of length probably differ; or `GICP` gets one cloud with covariances that
-            are not dimensionless. Outside of `jit`: if less than 10 % of the source points have a match at the end (the
-            pose is UNVERIFIED); channels or `channel_weights` are differentiated with `soft_matches=False`; or
-            channels are while `channel_covariance` or, unless it is False, `channel_weights` is None.
+            are not dimensionless. Outside of `jit`: if the pose is UNVERIFIED, why; if channels or `channel_weights`
+            are differentiated with `soft_matches=False`; or channels are while `channel_covariance` or, unless it is
+            False, `channel_weights` is None.
     """
     options_of(register, unknown)
     check_method(method)
@@ -213,6 +213,8 @@ def register_from(
         if start is None:
             return RegistrationResult.without_pose(Status.TOO_FEW_CORRESPONDENCES)
         init, trusted = start.matrix, start.success
+        if not trusted:
+            warn('init="global": too few matches of features support a pose; the one registered is UNVERIFIED')
         options = replace(options, max_coarse_distance=coarse_distance_from(start, options))
     return verified(register_pair(source, target, method, init, options, tie_points, prior), trusted)
 

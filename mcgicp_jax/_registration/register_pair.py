@@ -59,6 +59,7 @@ from mcgicp_jax._registration.settings import settings_for, spacing_of
 from mcgicp_jax._registration.start_check import (
     BETTER,
     GOOD_FIT,
+    LITTLE_IN_COMMON,
     distance_moved,
     doubt_of_start,
     surface_fit,
@@ -200,11 +201,11 @@ def run_pair(given: Inputs, init: Pose | None, options: Options, traced: bool = 
         (result,) = results_of([solve(scale, start, replace(options, max_distance=None))], [None])
         start = result.matrix if is_usable(result) else start
     run = solve(inputs, start)
-    ambiguous = False
+    doubt = ""
     # A given coarse distance says how far off the initial pose may be.
     if not traced and options.max_distance is None:
         finely = partial(solve, inputs, init, replace(options, max_coarse_distance=0.0))
-        run, ambiguous = _unless_left(run, init, len(coarse) > 0, finely)
+        run, doubt = _unless_left(run, init, len(coarse) > 0, finely)
     if options.equalize_channels and not any(term.estimates_gains for term in run.problem.terms):
         # Parameters left None are chosen anew, from the channels as equalised by the matches.
         again = _equalized(run.inputs._replace(method=inputs.method), _nearest_points(run, search))
@@ -216,7 +217,8 @@ def run_pair(given: Inputs, init: Pose | None, options: Options, traced: bool = 
     if not measures:
         if not traced and run.loop.state.status == Status.DEGENERATE and run.loop.state.directions is not None:
             _warn_of_near_points(run)
-        if ambiguous and run.loop.state.status == Status.CONVERGED:
+        if doubt and run.loop.state.status == Status.CONVERGED:
+            warn(f'{doubt}; the pose is UNVERIFIED. Try a better init, or init="global"')
             state = run.loop.state._replace(status=np.asarray(Status.UNVERIFIED, np.int32))
             run = run._replace(loop=run.loop._replace(state=state), state=lambda: state)
         return run
@@ -226,7 +228,10 @@ def run_pair(given: Inputs, init: Pose | None, options: Options, traced: bool = 
     if options.max_distance is None:
         settings = settings._replace(max_distance=settings.fine_distance)
     problem = replace(run.problem, start=constant(run.loop.state.pose), settings=settings, measurements=fusion)
-    return run_loop(run.inputs, problem, search, options.max_iterations, traced)
+    run = run_loop(run.inputs, problem, search, options.max_iterations, traced)
+    if not traced and run.loop.state.status == Status.UNVERIFIED and not settings.channels_may_move:
+        warn("prior: the pose contradicts it by more than its covariance allows, and is UNVERIFIED")
+    return run
 
 
 @with_settings_of_package
@@ -343,27 +348,29 @@ def rows_to_match(source: PointCloud, options: Options) -> Int[AnyArray, "n"] | 
     return None if limit is None or limit >= source.valid.size else spread_rows(source.valid, limit)
 
 
-def _unless_left(run: Run, init: Pose | None, at_scales: bool, finely: Callable[[], Run]) -> tuple[Run, bool]:
+def _unless_left(run: Run, init: Pose | None, at_scales: bool, finely: Callable[[], Run]) -> tuple[Run, str]:
     """A registration, or `finely()`, the one with the fine `max_distance` alone, if it may have left a right initial
-    pose and surfaces coincide better there (see `doubt_of_start`); and whether it is ambiguous: the two do not end at
-    the same pose, and clouds have little in common, or surfaces coincide a little better at the one that is not taken.
-    """
+    pose and surfaces coincide better there (see `doubt_of_start`); and why its pose is ambiguous, or nothing."""
     settings, state = run.problem.settings, run.loop.state
     source, target = run.inputs[:2]
     start = se3_from_matrix(centred_pose(init, source, target), source.points.dtype)
     doubt = doubt_of_start(start, state, settings, partial(_fit, run), at_scales)
     if doubt is None:
-        return run, False
+        return run, ""
     (fit, little), other = doubt, finely()
+    common = f"fewer than {LITTLE_IN_COMMON:.0%} of the source points lie on the target, and " if little else ""
     if other.loop.state.status not in USABLE:
-        return run, little
+        return run, common and f"{common}a fine max_distance leads nowhere from the same start"
     other_fit, _ = _fit(other)
     matches, other_matches = (float(each.loop.state.record.num_inliers) for each in (run, other))
     ours, theirs = float(fit) * matches, float(other_fit) * other_matches
     comparable = other_matches <= matches or other_fit > GOOD_FIT
     better, as_good = (comparable and theirs > factor * ours for factor in (BETTER, 1.0))
-    apart = distance_moved(state.pose, other.loop.state) > settings.fine_distance
-    return other if better else run, bool(apart and (little or (as_good and not better)))
+    apart = distance_moved(state.pose, other.loop.state)
+    if apart <= settings.fine_distance or not (little or (as_good and not better)):
+        return other if better else run, ""
+    ends = f"{common}a coarse and a fine max_distance lead from the same start to poses {apart:.2g} m apart"
+    return other if better else run, ends if little else f"{ends}, at which surfaces coincide about as well"
 
 
 def _fit(run: Run) -> tuple[AnyScalar, AnyScalar]:
