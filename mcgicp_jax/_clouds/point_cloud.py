@@ -372,7 +372,7 @@ class PointCloud(eqx.Module):
 
     def __len__(self) -> int:
         """The number of points, without padding."""
-        return int(np.sum(np.asarray(self.valid)))
+        return int(np.count_nonzero(self.valid))
 
     def __repr__(self) -> str:
         if not is_concrete(self) or self.points.ndim != 2:

@@ -311,7 +311,8 @@ class BatchJob:
                     else:
                         yield pair
 
-            for ended in run_pairs(ready(), self.method, self.options, search, self.num_neighbors):
+            given = self.method, self.options, search, self.num_neighbors, self.covariances
+            for ended in run_pairs(ready(), *given):
                 while rejected:
                     yield rejected.pop(0)
                 while again and again[0].done():

@@ -49,6 +49,11 @@ class Assessment(NamedTuple):
     constraints: Lazy[Constraints]
     covariance: Lazy[Float[AnyArray, "*batch 6 6"]]
 
+    @classmethod
+    def without_covariance(cls, state: State) -> Assessment:
+        """Of a traced state, with NaN for the covariance, whose computation takes most of the time of an assessment."""
+        return cls(Lazy.of(constraints_of(state)), Lazy.of(jnp.full((6, 6), jnp.nan)))
+
 
 def assessment_of(executor: AbstractExecutor, loop: LoopResult, moments: Callable[[], Moments]) -> Assessment:
     """The assessment of a loop that has ended; `moments` computes `moments_of` the loop."""

@@ -98,10 +98,13 @@ def run_pairs(
     options: Options,
     search: AbstractSearch,
     num_neighbors: int,
+    covariances: bool,
 ) -> Iterator[Ended[Key] | Refused[Key]]:
-    """Register many pairs, spread over the `default_devices`, and yield their results. `num_neighbors` is that of
-    clouds that have no neighbours yet. Pairs of similar sizes share a program: to compile one takes as long as to
-    register thousands of pairs."""
+    """Register many pairs, spread over the `default_devices`, and yield their results, if so wanted with `covariances`.
+
+    `num_neighbors` is that of clouds that have no neighbours yet. Pairs of similar sizes share a program: to compile
+    one takes as long as to register thousands of pairs.
+    """
     # Numbers are traced, so that others compile nothing.
     numbers = options.numbers
     if isinstance(options.max_distance, tuple):
@@ -118,6 +121,7 @@ def run_pairs(
         search=search,
         options=fixed,
         num_neighbors=num_neighbors,
+        covariances=covariances,
         mesh=mesh,
     )
     groups: dict[Any, _Group[Key]] = {}
@@ -246,13 +250,13 @@ def _has_doubt(start: jaxlie.SE3, state: State, check: Any) -> bool:
 def _fitted(pair: ChunkPair, sizes: list[tuple[int, int]]) -> ChunkPair:
     """The pair padded to the smallest of the sizes whose rows it fills by half or more; else its own are added."""
     own = pair.source.valid.size, pair.target.valid.size
+    if own in sizes:
+        return pair
     suitable = [size for size in sizes if all(rows <= each <= 2 * rows for rows, each in zip(own, size, strict=True))]
     if not suitable:
         sizes.append(own)
         return pair
     source, target = min(suitable, key=np.prod)
-    if (source, target) == own:
-        return pair
     return pair._replace(source=pair.source.pad(source), target=pair.target.pad(target))
 
 
@@ -262,7 +266,7 @@ def _shapes(tree: Any) -> Any:
 
 
 @with_settings_of_package
-@partial(jax.jit, static_argnames=("options", "num_neighbors", "mesh"))
+@partial(jax.jit, static_argnames=("options", "num_neighbors", "covariances", "mesh"))
 def _registered(
     chunk: ChunkPair,
     max_updates: Int[Array, ""],
@@ -273,6 +277,7 @@ def _registered(
     search: AbstractSearch,
     options: Options,
     num_neighbors: int,
+    covariances: bool,
     mesh: Mesh,
 ) -> Packed[tuple[State, Assessment, Record, Any]]:
     """States, assessments at their poses, histories, and settings and fits for `doubt_of_start`, of stacked pairs, in
@@ -290,7 +295,8 @@ def _registered(
         executor = TracedExecutor(problem, search, options.max_iterations)
         loop = executor.run(max_updates)
         check = (problem.settings, surface_fit(inputs, executor, loop)) if own.max_distance is None else None
-        return loop.state, assess(loop, problem, search), loop.history, check
+        assessment = assess(loop, problem, search) if covariances else Assessment.without_covariance(loop.state)
+        return loop.state, assessment, loop.history, check
 
     def on_a_device(chunk: ChunkPair, common: Any) -> Any:
         source, target = (_with_neighbors(clouds, search, num_neighbors) for clouds in chunk[2:])
