@@ -101,7 +101,7 @@ def batch(
     if output.suffix.lower() != ".csv":
         raise ValueError(f"output: expected a .csv file, got {output}")
     check_outputs(output)
-    file_pairs = _pairs_of_folder_or_table(pairs, glob)
+    file_pairs = _file_pairs(pairs, glob)
     wanted = {pair.key: pair for pair in file_pairs}
     rows = {(row["source"], row["target"], row["init"]): row for row in _read_rows(output)}
     rows = {key: row for key, row in rows.items() if key not in wanted or row["status"] not in _TRIED_AGAIN}
@@ -129,22 +129,10 @@ def batch(
     return 1 if failed else 0
 
 
-def _pairs_of_folder_or_table(path: Path, glob: str) -> list[FilePair]:
+def _file_pairs(path: Path, glob: str) -> list[FilePair]:
     if path.is_dir():
         names = [cloud.name for cloud in clouds_in(path, glob).paths]
-        pairs = [FilePair(path, source, target) for target, source in itertools.pairwise(names)]
-    else:
-        pairs = _pairs_of_table(path)
-    if not pairs:
-        raise ValueError(f"{path}: expected pairs of clouds, got none")
-    (source, target, _), count = collections.Counter(pair.key for pair in pairs).most_common(1)[0]
-    if count > 1:
-        pair_name = f"{source} {target}"
-        raise ValueError(f"{path}: expected each pair once from each initial pose, got {pair_name} several times")
-    return pairs
-
-
-def _pairs_of_table(path: Path) -> list[FilePair]:
+        return [FilePair(path, source, target) for target, source in itertools.pairwise(names)]
     # Spreadsheets write a byte order mark, people a blank after the comma.
     with open(path, newline="", encoding="utf-8-sig") as file:
         try:
@@ -155,21 +143,26 @@ def _pairs_of_table(path: Path) -> list[FilePair]:
     columns = reader.fieldnames or []
     if not {"source", "target"} <= set(columns):
         raise ValueError(f"{path}: expected the columns source and target, got {listed(columns)}")
-    has_start = set(_POSE) <= set(columns)
     pairs = []
     for row in reader:
+        line = f"{path}: line {reader.line_num}"
         if not row["source"] or not row["target"]:
-            raise ValueError(f"{path}: line {reader.line_num}: expected two files, got {row}")
-        start = None
-        if has_start:
+            raise ValueError(f"{line}: expected two files, got {row}")
+        init = None
+        if set(_POSE) <= set(columns):
             try:
                 numbers = [float(row[name]) for name in _POSE]
             except (TypeError, ValueError) as error:
-                raise ValueError(
-                    f"{path}: line {reader.line_num}: expected numbers in m00 ... m23, got {row}"
-                ) from error
-            start = np.vstack([np.reshape(numbers, (3, 4)), [0, 0, 0, 1]])
-        pairs.append(FilePair(path.parent, row["source"], row["target"], start))
+                raise ValueError(f"{line}: expected numbers in m00 ... m23, got {row}") from error
+            init = np.vstack([np.reshape(numbers, (3, 4)), [0, 0, 0, 1]])
+        pairs.append(FilePair(path.parent, row["source"], row["target"], init))
+    if not pairs:
+        raise ValueError(f"{path}: expected pairs of clouds, got none")
+    (source, target, _), count = collections.Counter(pair.key for pair in pairs).most_common(1)[0]
+    if count > 1:
+        raise ValueError(
+            f"{path}: expected each pair once from each initial pose, got {source} {target} several times"
+        )
     return pairs
 
 
@@ -221,7 +214,7 @@ def _register_missing(
     """Register pairs, add their rows to the table and to `rows`, and return whether Ctrl-C stopped it."""
     keys, reasons = list(pairs), dict[int, str]()
     sources, targets = ([partial(read, pair.paths()[side]) for pair in pairs.values()] for side in (0, 1))
-    starts = [pair.init for pair in pairs.values()]
+    inits = [pair.init for pair in pairs.values()]
     interrupted, begin = False, time.perf_counter()
     _write_rows(output, rows.values())
     with (
@@ -243,11 +236,10 @@ def _register_missing(
         warnings.simplefilter("always", mcg.PairWarning)
         warnings.showwarning = note_reason
         try:
-            with contextlib.closing(register(sources, targets, init=starts)) as completed:
+            with contextlib.closing(register(sources, targets, init=inits)) as completed:
                 for index, result in completed:
-                    row = _row(keys[index], result, reasons.pop(index, ""))
+                    row = rows[keys[index]] = _row(keys[index], result, reasons.pop(index, ""))
                     table.write(_line(row).encode())
-                    rows[keys[index]] = row
                     bar.update()
                     if pressed:
                         raise KeyboardInterrupt

@@ -7,7 +7,7 @@ from typing import Any, NamedTuple, TypeAlias
 
 import jax
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float
 
 from mcgicp_jax._clouds.point_cloud import PointCloud, Values, as_cloud, same_channels
 from mcgicp_jax._clouds.preprocess import finite_rows, with_neighbors
@@ -15,16 +15,8 @@ from mcgicp_jax._clouds.voxels import grid_of, voxel_order
 from mcgicp_jax._compute.concrete import AnyArray, outside_trace
 from mcgicp_jax._compute.messages import check_positive, messages_named
 from mcgicp_jax._compute.threads import with_settings_of_package
+from mcgicp_jax._global_pose import robust_pose_fit as fit
 from mcgicp_jax._global_pose.features import NUM_NEIGHBORS, matches_of_features, matches_of_rows
-from mcgicp_jax._global_pose.robust_pose_fit import (
-    MIN_SEPARATION,
-    TOLERANCE,
-    PoseHypotheses,
-    PutativeMatches,
-    hypotheses,
-    refined,
-    squared_separation,
-)
 from mcgicp_jax._local_geometry.surface_agreement import surface_agreement
 from mcgicp_jax._math.poses import nearest_rotation
 from mcgicp_jax._methods.icp import GICP
@@ -47,7 +39,7 @@ _STRIDE = 4
 _STEPS_PER_OCTAVE, _NUM_STEPS = 8, 120
 # The registration that verifies a pose: maximum correspondence distances, in voxels; number of iterations; and number
 # of neighbours, the default of `preprocess`.
-_VERIFIED_WITHIN, _VERIFIED_ITERATIONS, _NUM_NEIGHBORS = (4.0, TOLERANCE), 40, 20
+_VERIFIED_WITHIN, _VERIFIED_ITERATIONS, _NUM_NEIGHBORS = (4.0, fit.TOLERANCE), 40, 20
 # Smallest i/√n (a/m)² of a success (see `GlobalPoseResult.support`), in general and where the shape of the clouds
 # leaves a direction unconstrained, and smallest number of inliers: from the development half of
 # `tests/benchmarks/global_pose_verdicts`.
@@ -180,7 +172,17 @@ def global_pose(
     if voxel_size is not None:
         check_positive("voxel_size", voxel_size)
     source, target = as_cloud("source", source), as_cloud("target", target)
-    rows = None if correspondences is None else _checked(correspondences, source, target)
+    if correspondences is not None:
+        try:
+            rows = np.stack([np.asarray(side) for side in correspondences])
+        except (TypeError, ValueError) as error:
+            raise ValueError("correspondences: expected two arrays of rows, of one length") from error
+        sizes = np.array([[source.points.shape[0]], [target.points.shape[0]]])
+        if rows.ndim != 2 or rows.shape[0] != 2 or rows.dtype.kind not in "iu" or np.any((rows < 0) | (rows >= sizes)):
+            raise ValueError(
+                f"correspondences: expected integer rows (source_rows, target_rows) of clouds of {sizes[0, 0]} and "
+                f"{sizes[1, 0]} points, got shape {rows.shape} of {rows.dtype}"
+            )
     centred = _centred("source", source), _centred("target", target)
     clouds, centers = [cloud for cloud, _ in centred], [center for _, center in centred]
     if not same_channels(source, target):
@@ -194,7 +196,7 @@ def global_pose(
         # A cloud has too few voxels.
         return _no_pose(0, size)
     with outside_trace():
-        if rows is None:
+        if correspondences is None:
             matches = matches_of_features(voxels[0], voxels[1], size)
         else:
             matches = matches_of_rows(source.coordinates - centers[0], target.coordinates - centers[1], rows)
@@ -207,20 +209,6 @@ def global_pose(
 
 def _no_pose(num_matches: int, voxel_size: float) -> GlobalPoseResult:
     return GlobalPoseResult(np.eye(4), False, False, 0, num_matches, 0.0, 0.0, None, voxel_size)
-
-
-def _checked(correspondences: RowMatches, source: PointCloud, target: PointCloud) -> Int[np.ndarray, "2 n"]:
-    try:
-        rows = np.stack([np.asarray(side) for side in correspondences])
-    except (TypeError, ValueError) as error:
-        raise ValueError("correspondences: expected two arrays of rows, of one length") from error
-    sizes = np.array([[source.points.shape[0]], [target.points.shape[0]]])
-    if rows.ndim != 2 or rows.shape[0] != 2 or rows.dtype.kind not in "iu" or np.any((rows < 0) | (rows >= sizes)):
-        raise ValueError(
-            f"correspondences: expected integer rows (source_rows, target_rows) of clouds of {sizes[0, 0]} and "
-            f"{sizes[1, 0]} points, got shape {rows.shape} of {rows.dtype}"
-        )
-    return rows
 
 
 def _centred(name: str, cloud: PointCloud) -> tuple[PointCloud, Float[np.ndarray, "3"]]:
@@ -263,7 +251,7 @@ def _voxel_size(clouds: list[PointCloud]) -> float:
 class _Scene(NamedTuple):
     """Matches of two centred clouds of voxels."""
 
-    matches: PutativeMatches
+    matches: fit.PutativeMatches
     source: PointCloud
     target: PointCloud
     voxel_size: float
@@ -273,15 +261,15 @@ class _Scene(NamedTuple):
     def is_near(self, matrix: Float[np.ndarray, "4 4"], points: Float[AnyArray, "n 3"]) -> Bool[np.ndarray, "n"]:
         """Which points of the source have a point of the target nearby."""
         moved = np.asarray(points, np.float64) @ matrix[:3, :3].T + matrix[:3, 3]
-        return nearest_in_position(moved, self.target.points, TOLERANCE * self.voxel_size) >= 0
+        return nearest_in_position(moved, self.target.points, fit.TOLERANCE * self.voxel_size) >= 0
 
     def are_same(self, a: Float[np.ndarray, "4 4"], b: Float[np.ndarray, "4 4"]) -> bool:
-        square = squared_separation((a - b)[:3, :3], (a - b)[:3, 3], self.radius)
-        return bool(square <= (MIN_SEPARATION * self.voxel_size) ** 2)
+        square = fit.squared_separation((a - b)[:3, :3], (a - b)[:3, 3], self.radius)
+        return bool(square <= (fit.MIN_SEPARATION * self.voxel_size) ** 2)
 
     def candidate(self, matrix: Float[np.ndarray, "4 4"], constrained: bool) -> Candidate:
         """The pose with its support: see `GlobalPoseResult.support`."""
-        distance, valid = TOLERANCE * self.voxel_size, np.asarray(self.matches.valid)
+        distance, valid = fit.TOLERANCE * self.voxel_size, np.asarray(self.matches.valid)
         matched, targets = (np.asarray(side, np.float64)[valid] for side in (self.matches.source, self.matches.target))
         moved = matched @ matrix[:3, :3].T + matrix[:3, 3]
         inliers = int(np.sum(np.linalg.norm(moved - targets, axis=1) <= distance))
@@ -296,14 +284,9 @@ class _Scene(NamedTuple):
         return Candidate(matrix, inliers, overlap, agreement, float(support / least))
 
 
-def _best_pose(
-    scene: _Scene, source_center: Float[np.ndarray, "3"], target_center: Float[np.ndarray, "3"]
-) -> GlobalPoseResult:
+def _best_pose(scene: _Scene, source_center: np.ndarray, target_center: np.ndarray) -> GlobalPoseResult:
     """The best of the verified poses, in the frames of the user's clouds."""
-    matches, voxel_size = scene.matches, np.float32(scene.voxel_size)
-    poses = hypotheses(matches, voxel_size, np.float32(scene.radius))
-    verified = _verified(jax.tree.map(np.asarray, refined(poses, matches, voxel_size)), scene)
-    num_matches = int(matches.valid.sum())
+    verified, num_matches = _verified(scene), int(scene.matches.valid.sum())
     if not verified:
         return _no_pose(num_matches, scene.voxel_size)
     for pose in verified:
@@ -325,8 +308,11 @@ def _best_pose(
     )
 
 
-def _verified(poses: PoseHypotheses, scene: _Scene) -> list[Candidate]:
+def _verified(scene: _Scene) -> list[Candidate]:
     """The best pose and possible rivals, registered; without repetitions."""
+    voxel_size = np.float32(scene.voxel_size)
+    poses = fit.hypotheses(scene.matches, voxel_size, np.float32(scene.radius))
+    poses = jax.tree.map(np.asarray, fit.refined(poses, scene.matches, voxel_size))
     method = MultiChannelGICP() if scene.source.channels.shape[1] else GICP()
     distances = _VERIFIED_WITHIN[0] * scene.voxel_size, _VERIFIED_WITHIN[1] * scene.voxel_size
     options = Options(max_distance=distances, max_iterations=_VERIFIED_ITERATIONS)

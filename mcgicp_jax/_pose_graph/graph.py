@@ -14,7 +14,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.typing import ArrayLike
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Float, Int
 
 from mcgicp_jax._compute.concrete import is_concrete
 from mcgicp_jax._math.poses import Pose, pose_matrices
@@ -94,6 +94,9 @@ class PoseGraph(eqx.Module):
 
 
 def _initial_poses(edges: Edge) -> Float[np.ndarray, "n 4 4"]:
+    from scipy.sparse import coo_array
+    from scipy.sparse.csgraph import breadth_first_order, minimum_spanning_tree
+
     if not is_concrete(edges) or not len(edges):
         raise ValueError("poses: required, since initial poses can only be computed from at least one concrete edge")
     number = int(max(np.max(edges.i), np.max(edges.j))) + 1
@@ -102,44 +105,32 @@ def _initial_poses(edges: Edge) -> Float[np.ndarray, "n 4 4"]:
     from_world = np.stack([np.full(number, number), np.arange(number)], axis=1)
     ends = np.concatenate([np.where(edges.rows == WORLD, number, edges.rows), from_world])
     motions = np.concatenate([edges.T_i_j, np.tile(np.eye(4), (number, 1, 1))])
-    # The tree prefers certain edges (rank 0) to uncertain ones (1), then to those with an unmeasured direction (2 and
-    # 3), and uses the identity edges last.
+    # A spanning tree of lowest rank: it prefers certain edges (rank 0) to uncertain ones (1), then to those with an
+    # unmeasured direction (2 and 3), and uses the identity edges last.
     eigenvalues = np.linalg.eigvalsh(edges.information)
     unmeasured = eigenvalues[:, 0] <= UNMEASURED * eigenvalues[:, -1]
     rank = np.concatenate([edges.uncertain + 2 * unmeasured, np.full(number, 4)])
-    poses, trusted = _along_spanning_tree(ends, motions, rank)
-    # The relaxation uses the certain edges and those of the tree.
-    trusted |= rank == 0
-    if trusted.sum() > number:
-        # Mean information in translation and in rotation.
-        means = np.diagonal(edges.information, axis1=1, axis2=2).reshape(-1, 2, 3).mean(axis=2)
-        means = np.concatenate([np.where(means > 0, means, 1), np.ones((number, 2))])
-        poses = _chordal_relaxation(ends[trusted], motions[trusted], np.sqrt(means[trusted]), number)
-    return poses
-
-
-def _along_spanning_tree(
-    ends: Int[np.ndarray, "m 2"], motions: Float[np.ndarray, "m 4 4"], rank: Int[np.ndarray, "m"]
-) -> tuple[Float[np.ndarray, "n 4 4"], Bool[np.ndarray, "m"]]:
-    """Poses along the spanning tree of lowest rank from the world, the last row; and which edges are in the tree."""
-    from scipy.sparse import coo_array
-    from scipy.sparse.csgraph import breadth_first_order, minimum_spanning_tree
-
-    world = int(ends.max())
     order = np.argsort(rank, kind="stable")
     # Of several edges between two poses, the first one in order of rank. Weights are places in this order, from 1.
-    _, places = np.unique((ends.min(axis=1) * (world + 1) + ends.max(axis=1))[order], return_index=True)
-    tree = minimum_spanning_tree(coo_array((places + 1.0, tuple(ends[order[places]].T)), (world + 1, world + 1)))
+    _, places = np.unique((ends.min(axis=1) * (number + 1) + ends.max(axis=1))[order], return_index=True)
+    tree = minimum_spanning_tree(coo_array((places + 1.0, tuple(ends[order[places]].T)), (number + 1, number + 1)))
     tree = (tree + tree.T).tocsr()
-    nodes, parents = breadth_first_order(tree, world)
-    edges = order[tree[parents[nodes[1:]], nodes[1:]].astype(int) - 1]
-    poses = np.tile(np.eye(4), (world + 1, 1, 1))
-    for node, edge in zip(nodes[1:], edges, strict=True):
+    # Poses along the tree from the world.
+    nodes, parents = breadth_first_order(tree, number)
+    in_tree = order[tree[parents[nodes[1:]], nodes[1:]].astype(int) - 1]
+    poses = np.tile(np.eye(4), (number + 1, 1, 1))
+    for node, edge in zip(nodes[1:], in_tree, strict=True):
         motion = motions[edge] if ends[edge, 1] == node else np.linalg.inv(motions[edge])
         poses[node] = poses[parents[node]] @ motion
-    in_tree = np.zeros(len(ends), bool)
-    in_tree[edges] = True
-    return poses[:world], in_tree
+    # The relaxation uses the certain edges and those of the tree.
+    trusted = rank == 0
+    trusted[in_tree] = True
+    if trusted.sum() <= number:
+        return poses[:number]
+    # Mean information in translation and in rotation.
+    means = np.diagonal(edges.information, axis1=1, axis2=2).reshape(-1, 2, 3).mean(axis=2)
+    means = np.concatenate([np.where(means > 0, means, 1), np.ones((number, 2))])
+    return _chordal_relaxation(ends[trusted], motions[trusted], np.sqrt(means[trusted]), number)
 
 
 def _chordal_relaxation(
