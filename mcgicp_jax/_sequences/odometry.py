@@ -161,10 +161,11 @@ def odometry(
     settings = options_of(odometry, options)
     if priors is not None and not settings.hold_unconstrained:
         raise ValueError("hold_unconstrained: expected True with priors, got False")
-    reader = _Reader(
-        enumerate(frames), method, settings, voxel_size, num_neighbors, deskew, None if priors is None else iter(priors)
-    )
-    return _Sensor(reader, init, start, against == "map", map_radius, recover, loops)
+    given_priors = None if priors is None else iter(priors)
+    reader = _Reader(enumerate(frames), method, settings, voxel_size, num_neighbors, deskew, given_priors)
+    motion, pose = pose_matrix(init), np.asarray(pose_matrix(start, "start"))
+    in_hindsight = deskew and init is None
+    return _Sensor(reader, against == "map", map_radius, recover, loops, in_hindsight, pose, motion, motion)
 
 
 @dataclass
@@ -211,39 +212,34 @@ class _Reader:
         return self.prepared(name, deskew_scan(cloud, motion)) if self.deskew else cloud
 
 
+@dataclass(eq=False)
 class _Sensor(Iterator[OdometryStep]):
     """The sensor at its last frame, and maps of the frames so far. A class, since generators end when they raise."""
 
-    def __init__(
-        self,
-        reader: _Reader,
-        init: Pose | None,
-        start: Pose | None,
-        against_map: bool,
-        radius: float | None,
-        recover: bool,
-        loops: bool,
-    ):
-        self.reader, self.frames = reader, ReadAhead(reader)
-        self.method, self.options, self.num_neighbors = reader.method, reader.options, reader.num_neighbors
-        self.against_map, self.recover, self.loops = against_map, recover, loops
-        # Motion between the last two frames, and motion by which the next scan is first deskewed.
-        self.motion: Any = pose_matrix(init)
-        self.scan_motion: Any = self.motion
-        # Sensor to world.
-        self.pose = np.asarray(pose_matrix(start, "start"))
-        # Metres around the sensor beyond which points leave the map; None: to be taken from the first frame.
-        self.radius = radius
-        # The first frame is deskewed by the motion that the second registration measures, and is kept raw until then.
-        self.in_hindsight = reader.deskew and init is None
-        self.first: tuple[str, PointCloud] | None = None
-        # The last frame, None before the first.
-        self.cloud: PointCloud | None = None
-        # The map that frames are registered to, that in which lost frames are found, and the poses to close loops with;
-        # None: not used.
-        self.world: Any = None
-        self.relocalizer: Relocalizer | None = None
-        self.trajectory: Trajectory | None = None
+    reader: _Reader
+    against_map: bool
+    # Metres around the sensor beyond which points leave the map; None: to be taken from the first frame.
+    radius: float | None
+    recover: bool
+    loops: bool
+    # The first frame is deskewed by the motion that the second registration measures, and is kept raw until then.
+    in_hindsight: bool
+    # Sensor to world.
+    pose: Float[np.ndarray, "4 4"]
+    # Motion between the last two frames, and motion by which the next scan is first deskewed.
+    motion: Any
+    scan_motion: Any
+    first: tuple[str, PointCloud] | None = None
+    # The last frame, None before the first.
+    cloud: PointCloud | None = None
+    # The map that frames are registered to, that in which lost frames are found, and the poses to close loops with;
+    # None: not used.
+    world: Any = None
+    relocalizer: Relocalizer | None = None
+    trajectory: Trajectory | None = None
+
+    def __post_init__(self) -> None:
+        self.frames, self.method, self.options = ReadAhead(self.reader), self.reader.method, self.reader.options
         # Registrations of the last two steps.
         self.unread: collections.deque[Any] = collections.deque(maxlen=2)
 
@@ -294,7 +290,7 @@ class _Sensor(Iterator[OdometryStep]):
         if self.against_map:
             self.world = VoxelMap(voxel)
         if self.recover:
-            self.relocalizer = Relocalizer(voxel, self.method, self.options, self.num_neighbors)
+            self.relocalizer = Relocalizer(voxel, self.method, self.options, self.reader.num_neighbors)
         if self.loops:
             self.trajectory = Trajectory(self.method, self.options)
         if self.radius is None:
@@ -322,7 +318,7 @@ class _Sensor(Iterator[OdometryStep]):
                 self._begin(self.first[0], previous)
             target, init, prior_of_pair = previous, motion, prior
             if to_map:
-                target = map_target(self.world.cloud(), self.method, self.options, self.num_neighbors)
+                target = map_target(self.world.cloud(), self.method, self.options, self.reader.num_neighbors)
                 init = self.pose @ motion
                 if prior is not None:
                     # The covariance is that of a motion in the source's frame, which the target's does not change.
