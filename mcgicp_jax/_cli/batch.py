@@ -11,7 +11,7 @@ import sys
 import threading
 import time
 import warnings
-from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
 from io import StringIO
@@ -35,7 +35,9 @@ from mcgicp_jax.io.files import replacing
 Row: TypeAlias = dict[str, str]
 # Source, target and initial pose, as in the first columns of the table.
 Key: TypeAlias = tuple[str, str, str]
-Completed: TypeAlias = Generator[tuple[int, mcg.RegistrationResult], None, None]
+Reader: TypeAlias = Callable[[Path], mcg.PointCloud]
+# Number and result of each pair, as it is completed.
+Registration: TypeAlias = Callable[..., Generator[tuple[int, mcg.RegistrationResult], None, None]]
 
 # Columns of the table: the upper three rows of the pose matrix.
 _POSE = tuple(f"m{row}{column}" for row in range(3) for column in range(4))
@@ -160,15 +162,11 @@ def _file_pairs(path: Path, glob: str) -> list[FilePair]:
         raise ValueError(f"{path}: expected pairs of clouds, got none")
     (source, target, _), count = collections.Counter(pair.key for pair in pairs).most_common(1)[0]
     if count > 1:
-        raise ValueError(
-            f"{path}: expected each pair once from each initial pose, got {source} {target} several times"
-        )
+        raise ValueError(f"{path}: expected each pair once from each initial pose, got {source} {target} several times")
     return pairs
 
 
-def _reader_and_registration(
-    pairs: Sequence[FilePair], method: Method, options: Options
-) -> tuple[Callable[[Path], mcg.PointCloud], Callable[..., Completed]]:
+def _reader_and_registration(pairs: list[FilePair], method: Method, options: Options) -> tuple[Reader, Registration]:
     """Functions that read a cloud and that register pairs, with defaults from the first pair that can be read."""
     for pair in pairs:
         try:
@@ -204,12 +202,7 @@ def _read(channels: Sequence[str], columns: int | None, path: Path) -> mcg.Point
 
 
 def _register_missing(
-    pairs: Mapping[Key, FilePair],
-    read: Callable[[Path], mcg.PointCloud],
-    register: Callable[..., Completed],
-    output: Path,
-    rows: dict[Key, Row],
-    finished: int,
+    pairs: dict[Key, FilePair], read: Reader, register: Registration, output: Path, rows: dict[Key, Row], finished: int
 ) -> bool:
     """Register pairs, add their rows to the table and to `rows`, and return whether Ctrl-C stopped it."""
     keys, reasons = list(pairs), dict[int, str]()

@@ -54,14 +54,10 @@ def multiway(
     voxels = choices.voxels
     print(f"clouds:    {len(clouds)}, {len(raw[0]):,} points in the first, {len(clouds[0]):,} used ({voxels})")
     name = choices.method_name(method)
-    start = None if init is None else list(io.read_poses(init))
-
-    def source_and_target() -> tuple[mcg.PointCloud, mcg.PointCloud]:
-        return clouds[1], clouds[0]
-
-    arguments = choices.arguments(name, source_and_target)
-    resolved_method = choices.method(name, source_and_target)
-    result = mcg.multiway(clouds, resolved_method, init=start, voxel_size=voxels.size, **arguments)
+    initial_poses = None if init is None else list(io.read_poses(init))
+    arguments = choices.arguments(name, lambda: (clouds[1], clouds[0]))
+    resolved_method = choices.method(name, lambda: (clouds[1], clouds[0]))
+    result = mcg.multiway(clouds, resolved_method, init=initial_poses, voxel_size=voxels.size, **arguments)
 
     edges, rejected = result.graph.edges, int((~np.asarray(result.graph.kept)).sum())
     print(f"pairs:     {len(result.registrations)} registered, {len(edges)} with a result, {rejected} of them rejected")

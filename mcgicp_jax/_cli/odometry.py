@@ -33,6 +33,7 @@ else:
     DatasetName = Literal[tuple(DATASETS)]
 
 Pose: TypeAlias = Float[np.ndarray, "4 4"]
+NumFrames: TypeAlias = int | Literal["all"]
 
 _FRAMES_OF_A_SCENE = 20
 _RECORDED = [name for name, dataset in DATASETS.items() if not dataset.simulated]
@@ -55,7 +56,7 @@ def odometry(
     *,
     shared: Options,
     method: Method = None,
-    num_frames: int | Literal["all"] = "all",
+    num_frames: NumFrames = "all",
     every: int = 1,
     min_range: float = 0.0,
     max_range: float = float("inf"),
@@ -110,7 +111,7 @@ def odometry(
         raise ValueError(f"columns: expected none, since {dataset} has a layout of its own, got {shared.columns}")
     if deskew and every > 1:
         raise ValueError(f"--deskew: expected scans that follow each other without gaps, got --every {every}")
-    frames = _open(dataset, path, num_frames, every, map, shared.columns, deskew)
+    frames = _open(dataset, path, num_frames, every, map, shared, deskew)
     if (min_range, max_range) != (0, np.inf):
         frames = frames.crop(min_range, max_range)
     if pose_frame == "camera" and frames.to_camera is None:
@@ -171,13 +172,7 @@ def odometry(
 
 
 def _open(
-    dataset: DatasetName | Path,
-    path: Path | None,
-    num_frames: int | Literal["all"],
-    every: int,
-    map: Path | None,
-    columns: int | None,
-    deskew: bool,
+    dataset: DatasetName | Path, path: File, num_frames: NumFrames, every: int, map: File, shared: Options, deskew: bool
 ) -> AbstractFrames:
     if num_frames != "all" and num_frames < 2:
         raise ValueError(f"num_frames: expected at least 2, got {num_frames}")
@@ -192,7 +187,7 @@ def _open(
         frames = DATASETS[dataset].frames(path)
     elif dataset.is_dir():
         try:
-            frames = clouds_in(dataset, map=map, columns=columns)
+            frames = clouds_in(dataset, map=map, columns=shared.columns)
         except ValueError as error:
             # Suggest the format of a data set whose files are in the folder.
             for name in _RECORDED:
@@ -213,10 +208,7 @@ def _open(
 def _follow(
     steps: Iterator[OdometryStep], num_frames: int, loops: bool, map: Path | None
 ) -> tuple[list[Pose], list[mcg.RegistrationResult], str]:
-    """Run the odometry and write the map; return the poses, the registrations, and why it stopped early, or ''.
-
-    An error of the first frame is raised.
-    """
+    """Run the odometry and write the map; return the poses, the registrations, and why it stopped early, or ''."""
     poses: list[Pose] = []
     results: list[mcg.RegistrationResult] = []
     clouds: list[mcg.PointCloud] = []
@@ -234,6 +226,7 @@ def _follow(
                 results.append(step.registration)
             last = step
     except (ValueError, OSError, KeyboardInterrupt) as error:
+        # An error of the first frame is raised.
         if not poses:
             raise
         failure = "interrupted" if isinstance(error, KeyboardInterrupt) else f"frame {len(poses)}: {error}"
