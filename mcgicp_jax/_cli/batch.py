@@ -290,7 +290,6 @@ def _line(row: Row) -> str:
 
 def _row(key: Key, result: mcg.RegistrationResult, reason: str) -> Row:
     quality = result.num_iterations, result.num_inliers, result.overlap, result.cost, result.rmse
-    numbers = *quality, *result.matrix[:3].ravel(), *result.deviations
-    values = (np.asarray(number).item() for number in numbers)
+    values = (np.asarray(number).item() for number in (*quality, *result.matrix[:3].ravel(), *result.deviations))
     texts = (*key, result.status.name.lower(), *map(repr, values), " ".join(reason.split()))
     return dict(zip(_COLUMNS, texts, strict=True))

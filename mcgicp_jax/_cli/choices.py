@@ -9,13 +9,11 @@ import numpy as np
 
 import mcgicp_jax as mcg
 from mcgicp_jax._cli.options import MethodName, Options
-from mcgicp_jax._clouds.color_spaces import COLOR_SPACES
 from mcgicp_jax._clouds.columns import COLORS
 from mcgicp_jax._clouds.point_cloud import Voxels
 from mcgicp_jax._clouds.voxel_size import voxels_for
 from mcgicp_jax._local_geometry.cloud_statistics import point_spacing
-from mcgicp_jax._methods.base import AbstractMethod
-from mcgicp_jax.extend import METHODS
+from mcgicp_jax.extend import COLOR_SPACES, METHODS, AbstractMethod
 
 # Returns the preprocessed source and target.
 Preprocessed: TypeAlias = Callable[[], tuple[mcg.PointCloud, mcg.PointCloud]]

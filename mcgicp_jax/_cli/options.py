@@ -17,14 +17,12 @@ import tyro
 
 import mcgicp_jax as mcg
 from mcgicp_jax import datasets, plot
-from mcgicp_jax._clouds.color_spaces import COLOR_SPACES
 from mcgicp_jax._clouds.preprocess import check_preprocessing
 from mcgicp_jax._compute.messages import check_integer, check_positive
-from mcgicp_jax._math.robust_kernels import KERNELS
 from mcgicp_jax._registration.options import ROTATION_TOLERANCE
 from mcgicp_jax._registration.options import Options as RegistrationOptions
-from mcgicp_jax.extend import METHODS
-from mcgicp_jax.io.clouds import FORMATS, format_of, is_cloud
+from mcgicp_jax.extend import COLOR_SPACES, FORMATS, KERNELS, METHODS
+from mcgicp_jax.io.clouds import format_of, is_cloud
 from mcgicp_jax.io.text import read_text
 
 if TYPE_CHECKING:

@@ -16,27 +16,17 @@ from jaxtyping import Float
 import mcgicp_jax as mcg
 from mcgicp_jax import datasets, io, metrics, plot
 from mcgicp_jax._cli.choices import Choices, with_channels
-from mcgicp_jax._cli.options import (
-    PARAMETERS,
-    File,
-    Method,
-    MethodName,
-    PairOptions,
-    check_outputs,
-    enumerated,
-    with_names,
-)
+from mcgicp_jax._cli.options import PARAMETERS, File, Method, PairOptions, check_outputs, enumerated, with_names
 from mcgicp_jax._compute.messages import messages_named
 from mcgicp_jax._compute.threads import side_by_side
 from mcgicp_jax._local_geometry.cloud_statistics import point_spacing
-from mcgicp_jax._methods.base import AbstractMethod
 from mcgicp_jax._methods.surfaces import resolved
 from mcgicp_jax._pose_solver.degeneracy import as_text
 from mcgicp_jax._registration.options import Options as RegistrationOptions
 from mcgicp_jax._registration.register_pair import prepared, rows_to_match
 from mcgicp_jax._registration.result import verified
 from mcgicp_jax._registration.settings import default_distances
-from mcgicp_jax.extend import METHODS
+from mcgicp_jax.extend import METHODS, AbstractMethod
 from mcgicp_jax.io.clouds import format_of
 
 Source: TypeAlias = Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="SOURCE")]
@@ -88,7 +78,7 @@ class PreparedPair:
         print(f"start:     {verdict}, {result.num_inliers:,} of {result.num_matches:,} features match")
         self.start, self.verified = result.matrix, result.success
 
-    def method(self, name: MethodName) -> AbstractMethod:
+    def method(self, name: str) -> AbstractMethod:
         """The method with parameters from the options, or else from the data as in `mcgicp_jax.register`."""
         options = RegistrationOptions(max_source_points=self.options.registration()["max_source_points"])
         pair = prepared(*self.preprocessed, self.choices.method(name, lambda: self.preprocessed), options)
@@ -100,24 +90,23 @@ class PreparedPair:
         translation, rotation = metrics.pose_error(pose, true_pose, at=centroid)
         return f"{1e3 * float(translation):9.2f}  {np.degrees(rotation):11.3f}"
 
-    def register(self, name: MethodName, method: AbstractMethod) -> mcg.RegistrationResult:
+    def register(self, name: str, method: AbstractMethod) -> mcg.RegistrationResult:
         # Cells are made of all points.
         source, target = self.preprocessed
         if "source" in method.needs_covariances:
             source = with_channels(self.raw[0], self.choices.channels)
         if "target" in method.needs_covariances:
             target = with_channels(self.raw[1], self.choices.channels)
-        result = mcg.register(source, target, method, init=self.start, **self.arguments(name))
-        return verified(result, self.verified)
+        return verified(mcg.register(source, target, method, init=self.start, **self.arguments(name)), self.verified)
 
-    def arguments(self, name: MethodName) -> dict[str, Any]:
+    def arguments(self, name: str) -> dict[str, Any]:
         arguments = self.choices.arguments(name, lambda: self.preprocessed)
         if self.options.fix:
             variances = np.where(np.isin(_DIRECTIONS, sum(self.options.fix, ())), 0, _UNKNOWN)
             arguments["prior"] = self.start, np.diag(variances)
         return arguments
 
-    def draw(self, results: dict[MethodName, mcg.RegistrationResult]) -> None:
+    def draw(self, results: dict[str, mcg.RegistrationResult]) -> None:
         if self.options.plot is not None:
             poses: dict[str, Any] = {name: result.matrix for name, result in results.items()}
             if self.options.init != "global":
@@ -234,29 +223,28 @@ def demo(output: Path = Path("mcgicp_demo"), *, all_methods: bool = False) -> in
 
 
 def _compare(
-    source: Path, target: Path, options: PairOptions, truth: Path | None, names: Sequence[MethodName] = tuple(METHODS)
-) -> dict[MethodName, mcg.RegistrationResult]:
+    source: Path, target: Path, options: PairOptions, truth: Path | None, names: Sequence[str] = tuple(METHODS)
+) -> dict[str, mcg.RegistrationResult]:
     check_outputs(picture=options.plot)
     true_pose = None if truth is None else _read_pose("truth", truth)
     pair = PreparedPair(source, target, options)
     pair.print_distances()
     pair.choices.print_channels()
     pair.find_start()
-    results: dict[MethodName, mcg.RegistrationResult] = {}
+    results: dict[str, mcg.RegistrationResult] = {}
     measures = "inliers      rmse, m" if true_pose is None else "error, mm   error, deg"
     width = max(map(len, names))
     print(f"\n{'method':{width}}  {measures:>22}  iterations  time, ms  status")
     if true_pose is not None:
         print(f"{'(start)':{width}}  {pair.errors(pair.start, true_pose)}")
-    methods, refusals = _compiled(pair, names)
+    methods, reasons = _compiled(pair, names)
     for name in names:
         if name not in methods:
-            print(f"{name:{width}}  left out: {refusals.get(name, 'no channels in common')}")
+            print(f"{name:{width}}  left out: {reasons.get(name, 'no channels in common')}")
             continue
-        method = methods[name]
-        pair.register(name, method)
+        pair.register(name, methods[name])
         begin = time.perf_counter()
-        result = results[name] = pair.register(name, method)
+        result = results[name] = pair.register(name, methods[name])
         milliseconds = 1e3 * (time.perf_counter() - begin)
         values = f"{result.num_inliers:9,}  {result.rmse:11.4g}"
         if true_pose is not None:
@@ -267,39 +255,35 @@ def _compare(
     return results
 
 
-def _compiled(
-    pair: PreparedPair, names: Sequence[MethodName]
-) -> tuple[dict[MethodName, AbstractMethod], dict[MethodName, str]]:
-    """The methods, each run once to compile its programs; and why others refuse the clouds (too few points in cells).
-
-    Methods that need channels are in neither if the clouds have none in common.
-    """
-    methods: dict[MethodName, AbstractMethod] = {}
-    refusals: dict[MethodName, str] = {}
+def _compiled(pair: PreparedPair, names: Sequence[str]) -> tuple[dict[str, AbstractMethod], dict[str, str]]:
+    """The methods, each run once to compile its programs; and why others are left out."""
+    methods: dict[str, AbstractMethod] = {}
+    reasons: dict[str, str] = {}
 
     def run(uses_channels: bool) -> None:
         for name in names:
             if METHODS[name].kind.uses_channels == uses_channels:
                 method = pair.method(name)
+                # Clouds may have too few points for cells.
                 try:
                     pair.register(name, method)
                     methods[name] = method
                 except ValueError as error:
-                    refusals[name] = str(error)
+                    reasons[name] = str(error)
 
     # Methods with and without channels share no programs.
     groups = [True, False] if pair.choices.channels else [False]
     side_by_side([partial(run, uses_channels) for uses_channels in groups])
     if not methods:
-        raise ValueError("; ".join(f"{name}: {reason}" for name, reason in refusals.items()))
-    return methods, refusals
+        raise ValueError("; ".join(f"{name}: {reason}" for name, reason in reasons.items()))
+    return methods, reasons
 
 
 def _words(result: mcg.RegistrationResult) -> str:
     return result.status.name.lower().replace("_", " ")
 
 
-def _verdict(results: dict[MethodName, mcg.RegistrationResult]) -> int:
+def _verdict(results: dict[str, mcg.RegistrationResult]) -> int:
     """Print to stderr which methods did not converge, and return the exit code."""
     failed: dict[mcg.Status, list[str]] = {}
     for name, result in results.items():
