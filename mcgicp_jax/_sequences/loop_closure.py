@@ -165,14 +165,13 @@ class Trajectory:
         distances[variances <= _GAIN * self._usual_variance] = np.inf
         # The nearest frame in each range of gaps: the nearest ones of all would be the latest ones of a slow sensor.
         nearest = [rows.start + int(np.argmin(distances[rows.start : rows.stop])) for rows in rows_before(last)]
-        tries = 0
+        num_tries = 0
         for i in sorted((i for i in nearest if np.isfinite(distances[i])), key=lambda i: -variances[i]):
             path = [i]
             while path[-1] != last:
                 path.append(int(predecessors[path[-1]]))
             rows = [self._edge_between[ends] for ends in itertools.pairwise(path)]
-            total = np.sum(self._world_covariances[rows], axis=0)
-            covariance = _transported(total, inverse(self._poses[last]))
+            covariance = _transported(np.sum(self._world_covariances[rows], axis=0), inverse(self._poses[last]))
             sigma = float(np.sqrt(np.linalg.eigvalsh(covariance[:3, :3])[-1]))
             if distances[i] > self._range(last) + _DEVIATIONS * sigma:
                 continue
@@ -181,12 +180,11 @@ class Trajectory:
             init = inverse(self._poses[i]) @ self._poses[last]
             result = register_pair(self._clouds[last], self._clouds[i], self._method, init, options)
             edge = edge_from(i, last, result, uncertain=True)
+            num_tries += 1
             if edge is not None:
                 self._connect(edge)
                 self._correct(edge, covariance)
-                return
-            tries += 1
-            if tries == _TRIES:
+            if edge is not None or num_tries == _TRIES:
                 return
 
     def _correct(self, loop: Edge, covariance: Float[np.ndarray, "6 6"]) -> None:

@@ -145,8 +145,7 @@ def odometry(
     check_preprocessing(voxel_size, num_neighbors)
     check_method(method)
     check_several("frames", frames)
-    arguments: dict[str, Any] = {"init": init, "start": start, "method": method, **options}
-    for name, value in arguments.items():
+    for name, value in {"init": init, "start": start, "method": method, **options}.items():
         check_concrete(name, value)
     if against not in ("previous", "map"):
         raise ValueError(f'against: expected "previous" or "map", got {against!r}')
@@ -155,9 +154,8 @@ def odometry(
         if against != "map":
             raise ValueError(f'map_radius: expected None without against="map", got {map_radius}')
     if loops and (against == "map" or recover):
-        raise ValueError(
-            'loops: expected against="previous" and no recover: registrations to the previous frame become edges'
-        )
+        expected = 'against="previous" and no recover: registrations to the previous frame become edges'
+        raise ValueError(f"loops: expected {expected}")
     settings = options_of(odometry, options)
     if priors is not None and not settings.hold_unconstrained:
         raise ValueError("hold_unconstrained: expected True with priors, got False")
@@ -191,11 +189,9 @@ class _Reader:
             prior = pose_matrix(prior[0], f"priors[{number}]: pose"), prior[1]
         cloud = as_cloud(name, frame.cloud if isinstance(frame, Frame) else frame)
         check_concrete(name, cloud)
-        if not self.deskew:
-            return name, self.prepared(name, cloud), prior
-        if cloud.times is None:
+        if self.deskew and cloud.times is None:
             raise ValueError(f"{name}: expected times of the points to deskew, PointCloud(points, times=...), got none")
-        return name, cloud, prior
+        return name, cloud if self.deskew else self.prepared(name, cloud), prior
 
     def prepared(self, name: str, cloud: PointCloud) -> PointCloud:
         """The cloud preprocessed, with the local geometry that a source needs."""
@@ -278,8 +274,7 @@ class _Sensor(Iterator[OdometryStep]):
         registration = Lazy(partial(computed, verified(result)))
         # The registration of the step before the last is computed if somebody keeps it, since it refers to two frames.
         # The caller of a loop still holds the last step. What nobody reads is not computed.
-        before_last = self.unread[0]() if len(self.unread) == 2 else None
-        if before_last is not None:
+        if len(self.unread) == 2 and (before_last := self.unread[0]()) is not None:
             _ = before_last.value
         self.unread.append(weakref.ref(registration))
         return OdometryStep(self.pose, cloud, registration, self.is_lost or not is_usable(result), graph)
@@ -320,15 +315,12 @@ class _Sensor(Iterator[OdometryStep]):
             if to_map:
                 target = map_target(self.world.cloud(), self.method, self.options, self.reader.num_neighbors)
                 init = self.pose @ motion
-                if prior is not None:
-                    # The covariance is that of a motion in the source's frame, which the target's does not change.
-                    prior_of_pair = self.pose @ prior[0], prior[1]
+                # The covariance is that of a motion in the source's frame, which the target's does not change.
+                prior_of_pair = prior and (self.pose @ prior[0], prior[1])
             result = register_pair(cloud, target, self.method, init, self.options, prior=prior_of_pair)
             if not is_usable(result):
                 break
-            motion = np.asarray(result.matrix)
-            if to_map:
-                motion = np.linalg.solve(self.pose, motion)
+            motion = np.linalg.solve(self.pose, result.matrix) if to_map else np.asarray(result.matrix)
             if not self.reader.deskew:
                 break
             # Root mean square distance between the points moved by the motion that was assumed and the measured one.
