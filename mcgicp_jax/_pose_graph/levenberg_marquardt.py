@@ -16,9 +16,10 @@ from jaxtyping import Bool, Float, Inexact, Int
 from mcgicp_jax._math.poses import exponential
 from mcgicp_jax._pose_graph.edge import WORLD, Factors, motion_jacobians
 
-# Poses of the graph and, with measurements in the world's frame, that of the world; one number per measurement.
+# Poses of the graph and, if measurements are in the world's frame, of the world. A number and a choice per measurement.
 Poses: TypeAlias = Float[np.ndarray, "n 4 4"]
 PerMeasurement: TypeAlias = Float[np.ndarray, "m"]
+Mask: TypeAlias = Bool[np.ndarray, "m"]
 
 # Least damping, as a fraction of the information of a typical edge: unobserved directions are 3e4 times as uncertain as
 # such an edge, and the factorisation loses half of the digits of float64.
@@ -64,7 +65,7 @@ class NormalEquations:
         metric: the sparse matrix D at the initial poses.
     """
 
-    def __init__(self, factors: Factors, poses: Poses, in_use: Bool[np.ndarray, "m"] | None = None):
+    def __init__(self, factors: Factors, poses: Poses, in_use: Mask | None = None):
         # Imported late, as SciPy's sparse matrices take a tenth of the import time of the package.
         from scipy.sparse import coo_array
         from scipy.sparse.csgraph import connected_components
@@ -274,7 +275,7 @@ def refine(state: GraphState) -> GraphState:
     return state
 
 
-def settle(state: GraphState, is_anchor: Bool[np.ndarray, "m"]) -> Poses:
+def settle(state: GraphState, is_anchor: Mask) -> Poses:
     """Undo drift, due to noise, along directions that only the anchors (see `solver._anchors`) constrain.
 
     Anchors have information ε there, and the measurements leak information μ, so they would weigh μ/ε against anchors.

@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 import jax
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 
 from mcgicp_jax._compute.concrete import AnyArray
 from mcgicp_jax._math.poses import inverse, matrices_of, parameters_of
@@ -161,9 +161,7 @@ def _rigid(matrices: np.ndarray) -> Float[np.ndarray, "_ 4 4"]:
     return matrices
 
 
-def _minimum(
-    poses: lm.Poses, factors: Factors, anchors: Edge, uncertain: Bool[np.ndarray, "m"], limit: int
-) -> lm.GraphState:
+def _minimum(poses: lm.Poses, factors: Factors, anchors: Edge, uncertain: lm.Mask, limit: int) -> lm.GraphState:
     """`_robust_minimum`, with `anchors` if edges have unmeasured directions and the others do not constrain these."""
     if not anchors.information.any():
         return _robust_minimum(lm.NormalEquations(factors, poses), poses, uncertain, limit)
@@ -180,42 +178,40 @@ def _minimum(
     return state
 
 
-def _robust_minimum(
-    equations: lm.NormalEquations, start: lm.Poses, uncertain: Bool[np.ndarray, "m"], max_iterations: int
-) -> lm.GraphState:
+def _robust_minimum(equations: lm.NormalEquations, start: lm.Poses, uncertain: lm.Mask, limit: int) -> lm.GraphState:
     """The minimum over the kept measurements, whose weight is 1; rejected ones have the weight 0."""
     from scipy.special import chdtri
 
     state = lm.GraphState.at(equations, np.ones(len(uncertain)), start)
     sizes = [np.full(len(factor.information), factor.information.shape[-1]) for factor in equations.factors]
-    limits = chdtri(np.concatenate(sizes), _LEVEL)
-    largest = (state.terms.squares / limits)[uncertain].max(initial=0)
+    thresholds = chdtri(np.concatenate(sizes), _LEVEL)
+    largest = (state.terms.squares / thresholds)[uncertain].max(initial=0)
     if not largest > 1:
-        return lm.minimize(state, max_iterations)
+        return lm.minimize(state, limit)
     control = 1 / (2 * largest - 1)
     while True:
-        ratio = np.sqrt(limits / np.maximum(state.terms.squares, np.finfo(float).tiny))
+        ratio = np.sqrt(thresholds / np.maximum(state.terms.squares, np.finfo(float).tiny))
         weights = np.where(uncertain, truncated_weights(ratio, control), 1)
         if np.all((weights == 0) | (weights == 1)):
             break
         state = lm.minimize(state.weighted(weights), 1)
         control *= _GROWTH
     for _ in range(_SELECTIONS):
-        state = lm.minimize(state.weighted(weights), max_iterations)
-        weights = np.where(uncertain, 1.0 * (state.terms.squares <= limits), 1)
-        weights[_wrongly_rejected(state, limits)] = 1
+        state = lm.minimize(state.weighted(weights), limit)
+        weights = np.where(uncertain, 1.0 * (state.terms.squares <= thresholds), 1)
+        weights[_wrongly_rejected(state, thresholds)] = 1
         if np.array_equal(weights, state.weights):
             break
     return state
 
 
-def _wrongly_rejected(state: lm.GraphState, limits: lm.PerMeasurement) -> Bool[np.ndarray, "m"]:
+def _wrongly_rejected(state: lm.GraphState, thresholds: lm.PerMeasurement) -> lm.Mask:
     """Which rejected measurements have a residual within the threshold, given the combined uncertainty of the
     measurement and of the remaining graph."""
     squares, equations = state.terms.squares, state.equations
-    wrong = (state.weights == 0) & (squares > limits) & (squares <= _NEAR * limits)
-    by_factor = map(equations.split, (equations.rows, wrong, limits))
-    for factor, rows, tested, factor_limits in zip(equations.factors, *by_factor, strict=True):
+    wrong = (state.weights == 0) & (squares > thresholds) & (squares <= _NEAR * thresholds)
+    by_factor = map(equations.split, (equations.rows, wrong, thresholds))
+    for factor, rows, tested, factor_thresholds in zip(equations.factors, *by_factor, strict=True):
         if not tested.any():
             continue
         measurements = jax.tree.map(lambda values, tested=tested: np.asarray(values)[tested], factor)
@@ -228,7 +224,7 @@ def _wrongly_rejected(state: lm.GraphState, limits: lm.PerMeasurement) -> Bool[n
         inner = np.linalg.solve(system, measurements.information @ residuals[..., None])[..., 0]
         combined = np.where(finite, np.einsum("ki,ki->k", residuals, inner), 0)
         # `tested` is a view of `wrong`.
-        tested[tested] = combined <= factor_limits[tested]
+        tested[tested] = combined <= factor_thresholds[tested]
     return wrong
 
 
