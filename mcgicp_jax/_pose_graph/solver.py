@@ -82,7 +82,6 @@ def solve(
 
 
 def covariances_at(poses: lm.Poses, factors: Factors, weights: lm.PerMeasurement) -> Float[np.ndarray, "n 6 6"]:
-    """Covariances of the poses at a known minimum."""
     with np.errstate(over="ignore", invalid="ignore"):
         centred, factors, _ = _centred(poses, factors)
         equations = lm.NormalEquations(factors, centred, weights > 0)

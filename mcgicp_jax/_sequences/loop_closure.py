@@ -106,7 +106,6 @@ class Trajectory:
 
     @property
     def size(self) -> tuple[int, int]:
-        """The numbers of frames and edges."""
         return len(self._clouds), len(self._edges)
 
     def add(
