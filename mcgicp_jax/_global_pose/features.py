@@ -104,8 +104,8 @@ def _offsets(around: Neighborhoods) -> tuple[Offsets, Float[Array, "k n"]]:
     return (x, y, z), x * x + y * y + z * z
 
 
-def _normals(radius: Float[AnyScalar, ""], own: Rows, near: Rows) -> tuple[Float[Array, "n 3"]]:
-    around = neighborhoods(own, near)
+def _normals(radius: Float[AnyScalar, ""], points: Rows, neighbors: Rows) -> tuple[Float[Array, "n 3"]]:
+    around = neighborhoods(points, neighbors)
     offsets, square = _offsets(around)
     weights = (around.present & (square <= radius * radius)).astype(square.dtype)
     return (alg.smallest_eigenvector(weighted_covariance(offsets, weights)).T,)
@@ -161,8 +161,8 @@ def _histogram(values: Float[Array, "k n"], counted: Array) -> Float[Array, "n 1
     return jnp.diff(cumulative, axis=1) / jnp.maximum(total, 1)[:, None].astype(values.dtype)
 
 
-def _statistics(voxel_size: Float[AnyScalar, ""], own: Rows, near: Rows) -> tuple[Float[Array, "n D"]]:
-    around = neighborhoods(own, near)
+def _statistics(voxel_size: Float[AnyScalar, ""], points: Rows, neighbors: Rows) -> tuple[Float[Array, "n D"]]:
+    around = neighborhoods(points, neighbors)
     _, square = _offsets(around)
     columns = []
     for channel in range(around.num_channels):
@@ -250,12 +250,12 @@ def _two_nearest(
 
 
 def _two_nearest_of_block(
-    block: tuple[Float[AnyArray, "n L"], Bool[AnyArray, "n"]], own: Rows
+    block: tuple[Float[AnyArray, "n L"], Bool[AnyArray, "n"]], queries: Rows
 ) -> tuple[Float[Array, "m 2"], Int[Array, "m 2"]]:
     """Squared distances and numbers of the two nearest rows. All terms are integers, hence exact."""
-    (rows, counted), queries = block, own.tree
-    squares = [jnp.sum(values * values, axis=1) for values in (queries, rows)]
-    product = jnp.matmul(queries, rows.T, precision="highest")
+    rows, counted = block
+    squares = [jnp.sum(values * values, axis=1) for values in (queries.tree, rows)]
+    product = jnp.matmul(queries.tree, rows.T, precision="highest")
     square = squares[0][:, None] + jnp.where(counted, squares[1], jnp.inf) - 2 * product
     # XLA's top_k takes a third of the time of its argmin.
     nearest, numbers = jax.lax.top_k(-square, 2)

@@ -99,58 +99,58 @@ def _initial_poses(edges: Edge) -> Float[np.ndarray, "n 4 4"]:
 
     if not is_concrete(edges) or not len(edges):
         raise ValueError("poses: required, since initial poses can only be computed from at least one concrete edge")
-    number = int(max(np.max(edges.i), np.max(edges.j))) + 1
-    edges = checked_edges(edges, number)
+    n = int(max(np.max(edges.i), np.max(edges.j))) + 1
+    edges = checked_edges(edges, n)
     # The world's row is the last one. Identity edges from the world to every pose join unconnected parts of the graph.
-    from_world = np.stack([np.full(number, number), np.arange(number)], axis=1)
-    ends = np.concatenate([np.where(edges.rows == WORLD, number, edges.rows), from_world])
-    motions = np.concatenate([edges.T_i_j, np.tile(np.eye(4), (number, 1, 1))])
+    from_world = np.stack([np.full(n, n), np.arange(n)], axis=1)
+    ends = np.concatenate([np.where(edges.rows == WORLD, n, edges.rows), from_world])
+    motions = np.concatenate([edges.T_i_j, np.tile(np.eye(4), (n, 1, 1))])
     # A spanning tree of lowest rank: it prefers certain edges (rank 0) to uncertain ones (1), then to those with an
     # unmeasured direction (2 and 3), and uses the identity edges last.
     eigenvalues = np.linalg.eigvalsh(edges.information)
     unmeasured = eigenvalues[:, 0] <= UNMEASURED * eigenvalues[:, -1]
-    rank = np.concatenate([edges.uncertain + 2 * unmeasured, np.full(number, 4)])
+    rank = np.concatenate([edges.uncertain + 2 * unmeasured, np.full(n, 4)])
     order = np.argsort(rank, kind="stable")
     # Of several edges between two poses, the first one in order of rank. Weights are places in this order, from 1.
-    _, places = np.unique((ends.min(axis=1) * (number + 1) + ends.max(axis=1))[order], return_index=True)
-    tree = minimum_spanning_tree(coo_array((places + 1.0, tuple(ends[order[places]].T)), (number + 1, number + 1)))
+    _, places = np.unique((ends.min(axis=1) * (n + 1) + ends.max(axis=1))[order], return_index=True)
+    tree = minimum_spanning_tree(coo_array((places + 1.0, tuple(ends[order[places]].T)), (n + 1, n + 1)))
     tree = (tree + tree.T).tocsr()
     # Poses along the tree from the world.
-    nodes, parents = breadth_first_order(tree, number)
+    nodes, parents = breadth_first_order(tree, n)
     in_tree = order[tree[parents[nodes[1:]], nodes[1:]].astype(int) - 1]
-    poses = np.tile(np.eye(4), (number + 1, 1, 1))
+    poses = np.tile(np.eye(4), (n + 1, 1, 1))
     for node, edge in zip(nodes[1:], in_tree, strict=True):
         motion = motions[edge] if ends[edge, 1] == node else np.linalg.inv(motions[edge])
         poses[node] = poses[parents[node]] @ motion
     # The relaxation uses the certain edges and those of the tree.
     trusted = rank == 0
     trusted[in_tree] = True
-    if trusted.sum() <= number:
-        return poses[:number]
+    if trusted.sum() <= n:
+        return poses[:n]
     # Mean information in translation and in rotation.
     means = np.diagonal(edges.information, axis1=1, axis2=2).reshape(-1, 2, 3).mean(axis=2)
-    means = np.concatenate([np.where(means > 0, means, 1), np.ones((number, 2))])
-    return _chordal_relaxation(ends[trusted], motions[trusted], np.sqrt(means[trusted]), number)
+    means = np.concatenate([np.where(means > 0, means, 1), np.ones((n, 2))])
+    return _chordal_relaxation(ends[trusted], motions[trusted], np.sqrt(means[trusted]), n)
 
 
 def _chordal_relaxation(
-    ends: Int[np.ndarray, "m 2"], motions: Float[np.ndarray, "m 4 4"], roots: Float[np.ndarray, "m 2"], number: int
-) -> Float[np.ndarray, "number 4 4"]:
+    ends: Int[np.ndarray, "m 2"], motions: Float[np.ndarray, "m 4 4"], roots: Float[np.ndarray, "m 2"], n: int
+) -> Float[np.ndarray, "n 4 4"]:
     """`roots`: square roots of the information in translation and in rotation."""
     # R_jᵀ = R_i_jᵀ R_iᵀ, for the three columns at once.
     transposed = motions[:, :3, :3].swapaxes(1, 2)
     identities = np.broadcast_to(np.eye(3), transposed.shape)
     blocks = roots[:, 1, None, None, None] * np.stack([-transposed, identities], axis=1)
-    columns = _least_squares(blocks, ends, np.zeros((3 * len(ends), 3)), np.eye(3), number)
-    left, _, right = np.linalg.svd(columns.reshape(number + 1, 3, 3).swapaxes(1, 2))
+    columns = _least_squares(blocks, ends, np.zeros((3 * len(ends), 3)), np.eye(3), n)
+    left, _, right = np.linalg.svd(columns.reshape(n + 1, 3, 3).swapaxes(1, 2))
     left[:, :, 2] *= np.linalg.det(left @ right)[:, None]
     rotations = left @ right
     # t_j − t_i = R_i t_i_j.
     blocks = roots[:, 0, None, None, None] * np.array([-1.0, 1.0])[:, None, None]
     steps = roots[:, :1] * np.einsum("mij,mj->mi", rotations[ends[:, 0]], motions[:, :3, 3])
-    poses = np.tile(np.eye(4), (number, 1, 1))
+    poses = np.tile(np.eye(4), (n, 1, 1))
     poses[:, :3, :3] = rotations[:-1]
-    poses[:, :3, 3] = _least_squares(blocks, ends, steps, np.zeros((1, 3)), number)[:-1]
+    poses[:, :3, 3] = _least_squares(blocks, ends, steps, np.zeros((1, 3)), n)[:-1]
     return poses
 
 
@@ -159,14 +159,14 @@ def _least_squares(
     ends: Int[np.ndarray, "m 2"],
     right: Float[np.ndarray, "_ 3"],
     last: Float[np.ndarray, "b 3"],
-    number: int,
+    n: int,
 ) -> Float[np.ndarray, "_ 3"]:
     """Least-squares solution of a sparse system with two blocks in each row; the `last` unknowns are given."""
     from scipy.sparse import bsr_array
 
     m, _, b, _ = blocks.shape
     pointers = 2 * np.arange(m + 1)
-    matrix = bsr_array((blocks.reshape(-1, b, b), ends.ravel(), pointers), (b * m, b * (number + 1))).tocsc()
-    free, right = matrix[:, : b * number], right - matrix[:, b * number :] @ last
+    matrix = bsr_array((blocks.reshape(-1, b, b), ends.ravel(), pointers), (b * m, b * (n + 1))).tocsc()
+    free, right = matrix[:, : b * n], right - matrix[:, b * n :] @ last
     solver = factored((free.T @ free).tocsc(), "MMD_AT_PLUS_A")
     return np.concatenate([solver.solve(free.T @ right), last])

@@ -159,8 +159,8 @@ def odometry(
     settings = options_of(odometry, options)
     if priors is not None and not settings.hold_unconstrained:
         raise ValueError("hold_unconstrained: expected True with priors, got False")
-    given_priors = None if priors is None else iter(priors)
-    reader = _Reader(enumerate(frames), method, settings, voxel_size, num_neighbors, deskew, given_priors)
+    remaining_priors = None if priors is None else iter(priors)
+    reader = _Reader(enumerate(frames), method, settings, voxel_size, num_neighbors, deskew, remaining_priors)
     motion, pose = pose_matrix(init), np.asarray(pose_matrix(start, "start"))
     in_hindsight = deskew and init is None
     return _Sensor(reader, against == "map", map_radius, recover, loops, in_hindsight, pose, motion, motion)
