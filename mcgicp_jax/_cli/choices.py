@@ -8,7 +8,7 @@ from typing import Any, TypeAlias
 import numpy as np
 
 import mcgicp_jax as mcg
-from mcgicp_jax._cli.options import MethodName, Options
+from mcgicp_jax._cli.options import Options
 from mcgicp_jax._clouds.columns import COLORS
 from mcgicp_jax._clouds.point_cloud import Voxels
 from mcgicp_jax._clouds.voxel_size import voxels_for
@@ -29,7 +29,7 @@ class Choices:
         self.channels = options.channels or tuple(common)
         self.voxels: Voxels = voxels_for(None if options.voxel_size == "off" else options.voxel_size, *clouds)
 
-    def method_name(self, method: MethodName | None) -> MethodName:
+    def method_name(self, method: str | None) -> str:
         """The method of the options, or else one that suits the channels; prints the channels."""
         name = method or ("mc-gicp" if self.channels else "gicp")
         if METHODS[name].kind.uses_channels and not self.channels:
@@ -53,7 +53,7 @@ class Choices:
         voxels = None if self.options.voxel_size == "off" else self.voxels
         return mcg.preprocess(with_channels(cloud, self.channels), voxels, self.options.num_neighbors)
 
-    def method(self, name: MethodName, preprocessed: Preprocessed) -> AbstractMethod:
+    def method(self, name: str, preprocessed: Preprocessed) -> AbstractMethod:
         """The method with the user's parameters; the default weights of Color ICP are those of mc-gicp."""
         parameters = self.options.parameters(name)
         if issubclass(METHODS[name].kind, mcg.ColorICP) and not parameters:
@@ -61,7 +61,7 @@ class Choices:
             parameters["channel_weights"] = resolved.channel_weights
         return METHODS[name](**parameters)
 
-    def arguments(self, name: MethodName, preprocessed: Preprocessed) -> dict[str, Any]:
+    def arguments(self, name: str, preprocessed: Preprocessed) -> dict[str, Any]:
         """Keyword arguments of `mcgicp_jax.register`; default sizes of cells come from the target."""
         arguments = self.options.registration()
         if METHODS[name].kind.needs_covariances and not self.options.voxel_sizes:

@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from fnmatch import fnmatch
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeAlias, TypeVar
+from typing import Annotated, Any, Literal, TypeAlias, TypeVar
 
 import numpy as np
 import tyro
@@ -24,12 +24,6 @@ from mcgicp_jax._registration.options import Options as RegistrationOptions
 from mcgicp_jax.extend import COLOR_SPACES, FORMATS, KERNELS, METHODS
 from mcgicp_jax.io.clouds import format_of, is_cloud
 from mcgicp_jax.io.text import read_text
-
-if TYPE_CHECKING:
-    MethodName: TypeAlias = str
-    KernelName: TypeAlias = str
-else:
-    MethodName, KernelName = Literal[tuple(METHODS)], Literal[tuple(KERNELS)]
 
 Documented = TypeVar("Documented")
 
@@ -49,9 +43,7 @@ _METHOD = tyro.constructors.PrimitiveConstructorSpec[str | None](
     str_from_instance=lambda value: [str(value)],
     choices=tuple(METHODS),
 )
-Method: TypeAlias = Annotated[
-    MethodName | None, _METHOD, shown(default="mc-gicp; gicp for clouds without common channels")
-]
+Method: TypeAlias = Annotated[str | None, _METHOD, shown(default="mc-gicp; gicp for clouds without common channels")]
 Numbers: TypeAlias = Annotated[tuple[float, ...], shown(default="from the data")]
 
 
@@ -139,7 +131,7 @@ class Options:
     max_iterations: int = RegistrationOptions.max_iterations
     translation_tolerance: Annotated[float | None, shown("FLOAT", "0.005 spacings")] = None
     rotation_tolerance: float = ROTATION_TOLERANCE
-    robust: Annotated[tuple[KernelName, float] | None, _KERNEL, shown(default="none")] = None
+    robust: Annotated[tuple[str, float] | None, _KERNEL, shown(default="none")] = None
     hold_unconstrained: bool = True
     equalize_channels: bool = False
     voxel_sizes: Annotated[tuple[float, ...], shown(default="none")] = ()
@@ -149,7 +141,7 @@ class Options:
     epsilon: Annotated[float | None, shown("FLOAT", _EPSILON)] = None
     columns: Annotated[int | None, shown("INT", "recognised")] = None
 
-    def check(self, method: MethodName | None = None) -> None:
+    def check(self, method: str | None = None) -> None:
         """Raise `ValueError` or `OSError` for invalid options, or parameters that the method lacks; reads no cloud."""
         if self.columns is not None:
             check_integer("columns", self.columns, 3)
@@ -162,7 +154,7 @@ class Options:
         if unknown := parameters.keys() - self.parameters(method).keys():
             raise ValueError(f"{method} has no {' and no '.join(sorted(unknown))}")
 
-    def parameters(self, method: MethodName | None = None) -> dict[str, Any]:
+    def parameters(self, method: str | None = None) -> dict[str, Any]:
         """The user's parameters of methods; with a method, only those that it has."""
         parameters = {}
         for name in PARAMETERS:
