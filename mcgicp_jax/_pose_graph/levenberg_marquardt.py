@@ -11,7 +11,7 @@ from __future__ import annotations
 from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
-from jaxtyping import Bool, Float, Inexact, Int
+from jaxtyping import Bool, Float, Inexact
 
 from mcgicp_jax._math.poses import exponential
 from mcgicp_jax._pose_graph.edge import WORLD, Factors, motion_jacobians
@@ -67,7 +67,7 @@ class NormalEquations:
 
     def __init__(self, factors: Factors, poses: Poses, in_use: Mask | None = None):
         # Imported late, as SciPy's sparse matrices take a tenth of the import time of the package.
-        from scipy.sparse import coo_array
+        from scipy.sparse import coo_array, eye_array
         from scipy.sparse.csgraph import connected_components
 
         self.factors, self.initial_poses, num_poses = factors, poses, len(poses)
@@ -86,7 +86,12 @@ class NormalEquations:
         self.fixed[first_of_parts] = True
         self.size = 6 * int((~self.fixed).sum())
         self.place = np.full(num_poses, -1)
-        self.place[~self.fixed] = _elimination_order(graph, self.fixed)
+        if self.size:
+            # SuperLU's minimum-degree order has little fill. A dominant diagonal lets the factorisation exist.
+            pattern = graph.tocsr()[~self.fixed][:, ~self.fixed]
+            pattern.data[:] = -1.0
+            dominant = pattern + eye_array(pattern.shape[0]) * (2.0 + np.diff(pattern.indptr).max())
+            self.place[~self.fixed] = factored(dominant.tocsc(), "MMD_AT_PLUS_A").perm_c
         # Places of the blocks in compressed rows of blocks; blocks at the same place are summed.
         rows, columns = self.place[block_rows].ravel(), self.place[block_columns].ravel()
         inside = np.flatnonzero((rows >= 0) & (columns >= 0) & np.repeat(self.in_use, 4))
@@ -184,19 +189,6 @@ def typical_information(factors: Factors) -> Float[np.ndarray, "m 6"]:
             if len(positive):
                 typical[measurements, column] = np.median(positive)
     return np.repeat(typical, 3, axis=1)
-
-
-def _elimination_order(graph: Any, fixed: Bool[np.ndarray, "n"]) -> Int[np.ndarray, "k"]:
-    """Place of each free pose in SuperLU's minimum-degree order, which has little fill."""
-    from scipy.sparse import eye_array
-
-    if fixed.all():
-        return np.zeros(0, int)
-    pattern = graph.tocsr()[~fixed][:, ~fixed]
-    pattern.data[:] = -1.0
-    # Diagonally dominant, so that the factorisation exists.
-    dominant = pattern + eye_array(pattern.shape[0]) * (2.0 + np.diff(pattern.indptr).max())
-    return factored(dominant.tocsc(), "MMD_AT_PLUS_A").perm_c
 
 
 class GraphState(NamedTuple):
