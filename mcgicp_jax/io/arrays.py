@@ -128,13 +128,7 @@ def is_npz_cloud(file: BinaryIO) -> bool:
 
 
 def write_npz(file: BinaryIO, cloud: PointCloud) -> None:
-    arrays: dict[str, Any] = {
-        "points": cloud.points,
-        "channels": cloud.channels,
-        "channel_names": np.array(cloud.channel_names, str),
-    }
-    if cloud.covariances is not None:
-        arrays["covariances"] = cloud.covariances
-    if cloud.times is not None:
-        arrays["times"] = cloud.times
-    np.savez(file, **arrays)
+    names = np.array(cloud.channel_names, str)
+    optional: dict[str, Any] = {"covariances": cloud.covariances, "times": cloud.times}
+    optional = {name: array for name, array in optional.items() if array is not None}
+    np.savez(file, points=cloud.points, channels=cloud.channels, channel_names=names, **optional)

@@ -78,10 +78,10 @@ def _known_format(path: Path, columns: int | None = None) -> Format | None:
             _not_written,
             lambda file: inner.is_cloud(_decompressed(file, os.fstat(file.fileno()).st_size)[0]),
         )
-    found = FORMATS.get("".join(suffixes[-2:])) or FORMATS.get("".join(suffixes[-1:]))
-    if columns is not None and found is not None and found.read is arrays.read_kitti:
-        return replace(found, read=partial(arrays.read_kitti, columns=columns))
-    return found
+    known = FORMATS.get("".join(suffixes[-2:])) or FORMATS.get("".join(suffixes[-1:]))
+    if columns is not None and known is not None and known.read is arrays.read_kitti:
+        return replace(known, read=partial(arrays.read_kitti, columns=columns))
+    return known
 
 
 class _Decompressed(io.BytesIO):

@@ -6,7 +6,6 @@ import struct
 from typing import Any, BinaryIO
 
 import numpy as np
-from jaxtyping import Float, Shaped
 
 from mcgicp_jax._clouds.columns import COLORS, ORDER
 from mcgicp_jax._clouds.point_cloud import PointCloud
@@ -93,25 +92,20 @@ def write_las(file: BinaryIO, cloud: PointCloud, compress: bool) -> None:
     if not np.isfinite(cloud.points).all():
         raise ValueError("points: LAS holds only finite coordinates; .ply also holds NaN and infinity")
     points = cloud.points.astype(np.float64)
-    columns = dict(zip(cloud.channel_names, cloud.channels.T, strict=True))
     header = laspy.LasHeader(version="1.2", point_format=2 if "red" in names else 0)
     header.offsets = np.floor(points.min(axis=0))
     extent = np.maximum(points.max(axis=0) - header.offsets, 1)
     header.scales = 10.0 ** np.ceil(np.log10(extent / (2**31 - 1)))
     las = laspy.LasData(header)
     las.xyz = points
-    for name, values in columns.items():
-        las[name] = _las_integers(name, values)
+    for name, values in zip(cloud.channel_names, cloud.channels.T, strict=True):
+        # Means of whole intensities are rounded; intensities from 0 to 1 would be lost.
+        scaled = np.rint(values if name == "intensity" else values.astype(np.float64) * 65535)
+        lost = name == "intensity" and values.max(initial=0) <= 1 and (scaled != values).any()
+        if lost or not ((scaled >= 0) & (scaled <= 65535)).all():
+            unit = "whole numbers from 0 to 65535" if name == "intensity" else "colours from 0 to 1"
+            raise ValueError(f"channels: LAS holds {name} as {unit}; .ply holds any number")
+        las[name] = scaled.astype(np.uint16)
     if "red" in names and 0 < max(las[name].max() for name in COLORS) < 256:
         raise ValueError("channels: colours this dark would be read as 8-bit values from LAS; .ply holds them")
     las.write(file, do_compress=compress, laz_backend=laspy.LazBackend.Lazrs)
-
-
-def _las_integers(name: str, values: Float[np.ndarray, "N"]) -> Shaped[np.ndarray, "N"]:
-    # Means of whole intensities are rounded; intensities from 0 to 1 would be lost.
-    scaled = np.rint(values if name == "intensity" else values.astype(np.float64) * 65535)
-    lost = name == "intensity" and values.max(initial=0) <= 1 and (scaled != values).any()
-    if lost or not ((scaled >= 0) & (scaled <= 65535)).all():
-        unit = "whole numbers from 0 to 65535" if name == "intensity" else "colours from 0 to 1"
-        raise ValueError(f"channels: LAS holds {name} as {unit}; .ply holds any number")
-    return scaled.astype(np.uint16)

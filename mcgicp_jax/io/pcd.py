@@ -22,7 +22,7 @@ def read_pcd(file: BinaryIO, size: int) -> PointCloud:
     metadata, start = pypcd4.MetaData.parse_header(_pcd_header(file)), file.tell()
     if metadata.points == 0:
         raise ValueError("it has no points")
-    widths = [width * count for width, count in zip(metadata.size, metadata.count, strict=True)]
+    num_bytes = metadata.points * sum(w * count for w, count in zip(metadata.size, metadata.count, strict=True))
     if metadata.data == pypcd4.Encoding.ASCII:
         check_size(2 * metadata.points * sum(metadata.count), size + 1)
         # pypcd4's own ASCII reader accepts only single spaces between numbers.
@@ -34,9 +34,14 @@ def read_pcd(file: BinaryIO, size: int) -> PointCloud:
                 rows[name][np.isnan(rows[name])] = np.nan
     else:
         if metadata.data == pypcd4.Encoding.BINARY:
-            check_size(metadata.points * sum(widths), size - file.tell())
+            check_size(num_bytes, size - file.tell())
         else:
-            _check_lzf(file, metadata.points * sum(widths), size)
+            # pypcd4 allocates the second of the two lengths at the start of a compressed block without a check.
+            compressed, raw = struct.unpack("<II", file.read(8))
+            check_size(compressed, size - file.tell())
+            check_size(raw, _LZF_RATIO * compressed)
+            if raw != num_bytes:
+                raise ValueError(f"the header claims {num_bytes} bytes of points, the compressed data {raw}")
         file.seek(start)
         # With a header of today's version.
         rows = pypcd4.PointCloud.from_fileobj(io.BytesIO(metadata.compose_header().encode() + file.read())).pc_data
@@ -65,15 +70,6 @@ def _pcd_header(file: BinaryIO) -> list[str]:
         if len(columns.get(key, [])) == len(counts):
             columns[key] = [columns[key][number] for number in kept]
     return [" ".join([key, *values]) for key, values in columns.items()]
-
-
-def _check_lzf(file: BinaryIO, claimed: int, size: int) -> None:
-    """Check the two lengths at the start of a compressed block; pypcd4 allocates the second without a check."""
-    compressed, raw = struct.unpack("<II", file.read(8))
-    check_size(compressed, size - file.tell())
-    check_size(raw, _LZF_RATIO * compressed)
-    if raw != claimed:
-        raise ValueError(f"the header claims {claimed} bytes of points, the compressed data {raw}")
 
 
 def write_pcd(file: BinaryIO, cloud: PointCloud) -> None:

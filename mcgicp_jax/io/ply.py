@@ -31,11 +31,15 @@ def read_ply(file: BinaryIO, size: int) -> PointCloud:
         header = b"".join(line for line in lines if line.split()[:1] not in ([b"comment"], [b"obj_info"]))
     text = header.decode("ascii").replace("\r\n", "\n").replace("\r", "\n")
     # plyfile allocates what the header claims, so the header is first parsed alone, with all counts set to 0.
-    element = re.compile(r"^(\s*element\s+\S+\s+)(\S+)", re.MULTILINE)
-    counts = [int(count) for _, count in element.findall(text)]
-    layout = plyfile.PlyData.read(io.BytesIO(element.sub(r"\g<1>0", text).encode()))
-    claimed = sum(count * _ply_row_bytes(part, layout.text) for count, part in zip(counts, layout, strict=True))
-    check_size(claimed, size - len(head))
+    declaration = re.compile(r"^(\s*element\s+\S+\s+)(\S+)", re.MULTILINE)
+    counts = [int(count) for _, count in declaration.findall(text)]
+    layout = plyfile.PlyData.read(io.BytesIO(declaration.sub(r"\g<1>0", text).encode()))
+    # The smallest size: lists are empty; in text, a number takes one digit and one separator.
+    num_bytes = 0
+    for count, element in zip(counts, layout, strict=True):
+        dtypes = ["S2" if layout.text else getattr(prop, "len_dtype", prop.val_dtype) for prop in element.properties]
+        num_bytes += count * sum(np.dtype(dtype).itemsize for dtype in dtypes)
+    check_size(num_bytes, size - len(head))
     if "vertex" not in layout:
         raise ValueError("it has no vertices")
     file.seek(0)
@@ -43,13 +47,6 @@ def read_ply(file: BinaryIO, size: int) -> PointCloud:
     with io.TextIOWrapper(body, "ascii") if layout.text else body as stream:
         vertex: Any = np.array(plyfile.PlyData.read(stream)["vertex"].data)  # copied, since plyfile maps the file
     return cloud_of({name: vertex[name] for name in vertex.dtype.names})
-
-
-def _ply_row_bytes(element: Any, text: bool) -> int:
-    """The smallest size of one row in bytes: empty lists; in text, one digit and one separator per number."""
-    if text:
-        return 2 * len(element.properties)
-    return sum(np.dtype(getattr(prop, "len_dtype", prop.val_dtype)).itemsize for prop in element.properties)
 
 
 def write_ply(file: BinaryIO, cloud: PointCloud) -> None:

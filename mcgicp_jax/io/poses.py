@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Sequence
 from typing import Any
 
 import numpy as np
@@ -139,9 +139,23 @@ def write_g2o(path: str | os.PathLike[str], graph: PoseGraph | Any) -> None:
         raise ValueError(f"graph: expected a PoseGraph or a PoseGraphResult, got {type(graph).__name__}")
     if others := getattr(graph, "factors", None) or getattr(graph, "factor_weights", None):
         raise ValueError(f"graph: expected edges alone, which g2o files can hold, got {len(others)} further factors")
+    edges, poses = graph.edges[np.asarray(getattr(graph, "kept", np.ones(len(graph.edges), bool)))], graph.poses
+    i, j, motions = np.asarray(edges.i), np.asarray(edges.j), np.asarray(edges.T_i_j)
+    upper, none = np.asarray(edges.information)[:, *np.triu_indices(6)], np.zeros((len(poses), 0))
+    of_world = i == WORLD
+    lines = [
+        (_VERTEX, np.arange(len(poses))[:, None], poses, none),
+        (_EDGE, np.column_stack([i, j])[~of_world], motions[~of_world], upper[~of_world]),
+    ]
+    if of_world.any():
+        lines.append((_OFFSET, np.zeros((1, 1)), np.eye(4)[None], none[:1]))
+        lines.append((_PRIOR, np.column_stack([j, 0 * j])[of_world], motions[of_world], upper[of_world]))
     with replacing(path) as file:
-        for form, rows in _lines_of(graph):
-            np.savetxt(file, rows, fmt=form)
+        for tag, numbers, matrices, information in lines:
+            parameters = parameters_of(np.asarray(matrices, np.float64))[:, [4, 5, 6, 1, 2, 3, 0]]
+            whole, width = _WIDTHS[tag]
+            form = " ".join([tag, *["%d"] * whole, *["%.17g"] * (width - whole)])
+            np.savetxt(file, np.column_stack([numbers, parameters, information]), fmt=form)
 
 
 def _graph_of(lines: Iterable[str]) -> PoseGraph:
@@ -169,23 +183,10 @@ def _graph_of(lines: Iterable[str]) -> PoseGraph:
     )
 
 
-def _lines_of(graph: PoseGraph | Any) -> Iterator[tuple[str, Float[np.ndarray, "N _"]]]:
-    """Format and numbers of the lines of a graph, of each kind."""
-    edges, poses = graph.edges[np.asarray(getattr(graph, "kept", np.ones(len(graph.edges), bool)))], graph.poses
-    i, j, motions = np.asarray(edges.i), np.asarray(edges.j), np.asarray(edges.T_i_j)
-    upper, none = np.asarray(edges.information)[:, *np.triu_indices(6)], np.zeros((len(poses), 0))
-    of_world = i == WORLD
-    yield _formatted(_VERTEX, np.arange(len(poses))[:, None], np.asarray(poses), none)
-    yield _formatted(_EDGE, np.column_stack([i, j])[~of_world], motions[~of_world], upper[~of_world])
-    if of_world.any():
-        yield _formatted(_OFFSET, np.zeros((1, 1)), np.eye(4)[None], none[:1])
-        yield _formatted(_PRIOR, np.column_stack([j, 0 * j])[of_world], motions[of_world], upper[of_world])
-
-
 def _rows(lines: list[tuple[int, list[str]]], tag: str) -> tuple[list[int], Float[np.ndarray, "N _"]]:
     """Line numbers and numbers of the lines with a tag."""
     whole, width = _WIDTHS[tag]
-    chosen, rows = [], []
+    line_numbers, rows = [], []
     for line, words in lines:
         if words[:1] == [tag]:
             try:
@@ -198,20 +199,11 @@ def _rows(lines: list[tuple[int, list[str]]], tag: str) -> tuple[list[int], Floa
                 raise ValueError(f"line {line}: expected finite numbers and a quaternion other than 0, got {row}")
             if any(abs(number) >= 2**53 for number in row[:whole]):
                 raise ValueError(f"line {line}: expected vertex numbers below 2^53, got {words[1]}; number them anew")
-            chosen.append(line)
+            line_numbers.append(line)
             rows.append(row)
-    return chosen, np.array(rows).reshape(-1, width)
+    return line_numbers, np.array(rows).reshape(-1, width)
 
 
 def _poses(rows: Float[np.ndarray, "N 7"]) -> Float[np.ndarray, "N 4 4"]:
     """Poses from x y z qx qy qz qw, with quaternions of any norm."""
     return matrices_of(rows[:, [6, 3, 4, 5, 0, 1, 2]])
-
-
-def _formatted(
-    tag: str, numbers: Any, poses: Float[np.ndarray, "N 4 4"], information: Float[np.ndarray, "N _"]
-) -> tuple[str, Float[np.ndarray, "N _"]]:
-    parameters = parameters_of(np.asarray(poses, np.float64))[:, [4, 5, 6, 1, 2, 3, 0]]
-    rows = np.column_stack([numbers, parameters, information])
-    whole, width = _WIDTHS[tag]
-    return " ".join([tag, *["%d"] * whole, *["%.17g"] * (width - whole)]), rows
