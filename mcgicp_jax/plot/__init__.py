@@ -7,12 +7,4 @@ from mcgicp_jax.plot.charts import graph, trajectories
 from mcgicp_jax.plot.drawing import check_picture
 from mcgicp_jax.plot.pictures import before_after, clouds, maps, surface_covariances
 
-__all__ = [
-    "before_after",
-    "check_picture",
-    "clouds",
-    "graph",
-    "maps",
-    "surface_covariances",
-    "trajectories",
-]
+__all__ = ["before_after", "check_picture", "clouds", "graph", "maps", "surface_covariances", "trajectories"]

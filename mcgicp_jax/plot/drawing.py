@@ -117,13 +117,7 @@ def drawable(cloud: PointCloud) -> PointCloud:
     """The finite points and their channels, as NumPy arrays in float64."""
     cloud = cloud.unpad()
     points = np.asarray(cloud.points, np.float64)
-    finite = np.isfinite(points).all(axis=1)
-    return PointCloud(
-        points[finite],
-        np.asarray(cloud.channels)[finite],
-        channel_valid=None if cloud.channel_valid is None else np.asarray(cloud.channel_valid)[finite],
-        channel_names=cloud.channel_names,
-    )
+    return cloud.replace_rows(points=points, valid=np.isfinite(points).all(axis=1), covariances=None).unpad()
 
 
 def channels_of(cloud: PointCloud, names: tuple[str, ...]) -> Float[np.ndarray, "N D"] | None:

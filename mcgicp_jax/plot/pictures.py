@@ -71,7 +71,12 @@ def before_after(source: PointCloud, target: PointCloud, poses: Mapping[str, Pos
     else:
         spacings = np.maximum([raw_spacing(target), raw_spacing(source)], np.finfo(float).tiny)
         target_size, source_size = np.minimum(spacings / spacings.min(), _LARGEST_POINT)
-        rows = _overlays(view, _ink(view, target_points, target_size), moved, source_size)
+        target_ink, rows = _ink(view, target_points, target_size), []
+        for points in moved:
+            source_ink = _ink(view, points, source_size)
+            # Subtractive colours: the target removes all red, the source all blue, and each half of the green.
+            picture = 1 - np.stack([target_ink, 0.5 * target_ink + 0.5 * source_ink, source_ink], axis=-1)
+            rows.append((picture, np.abs(target_ink - source_ink)))
         headings = ["target blue, source orange, both black", "detail"]
     detail = _where_they_differ([difference for _, difference in rows])
     headings[1] = f"detail, {(detail[0].stop - detail[0].start) * view.pixel:.2g} m wide"
@@ -111,16 +116,14 @@ def _draw_row(panels: np.ndarray, name: str, picture: Picture, difference: Map, 
         panel.set(xticks=[], yticks=[])
 
 
-def _checkerboards(
-    view: View, target: Picture, moved: Sequence[Points], source_colors: Points
-) -> list[tuple[Picture, Map]]:
+def _checkerboards(view: View, target: Picture, moved: list[Points], colors: Points) -> list[tuple[Picture, Map]]:
     """For each moved source a checkerboard picture, and the colour difference, NaN where either cloud has no points."""
     tile = max(view.width, view.height) // _TILES + 1
     row, column = np.mgrid[: view.height, : view.width] // tile
     target_tiles = ((row + column) % 2 == 0)[..., None]
     target_smooth, boards = _smooth(target), []
     for points in moved:
-        source = drawing.paint(view, points, source_colors)
+        source = drawing.paint(view, points, colors)
         board = np.nan_to_num(np.where(target_tiles, target, source), nan=1)
         boards.append((board, np.abs(target_smooth - _smooth(source)).mean(axis=-1)))
     return boards
@@ -133,17 +136,6 @@ def _smooth(picture: Picture) -> Picture:
     for axis in (0, 1):
         padded = np.lib.stride_tricks.sliding_window_view(padded, 2 * half + 1, axis).mean(axis=-1)
     return padded
-
-
-def _overlays(view: View, target_ink: Map, moved: Sequence[Points], size: float) -> list[tuple[Picture, Map]]:
-    """For each moved source, its points `size` pixels wide, a picture of both clouds and the difference of inks."""
-    overlays = []
-    for points in moved:
-        source_ink = _ink(view, points, size)
-        # Subtractive colours: the target removes all red, the source all blue, and each half of the green.
-        picture = 1 - np.stack([target_ink, 0.5 * target_ink + 0.5 * source_ink, source_ink], axis=-1)
-        overlays.append((picture, np.abs(target_ink - source_ink)))
-    return overlays
 
 
 def _ink(view: View, points: Points, size: float) -> Map:
