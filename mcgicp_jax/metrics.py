@@ -18,7 +18,8 @@ from mcgicp_jax._math.poses import Pose, matrix_of, pose_matrix
 __all__ = ["ate", "kitti_errors", "pose_error", "rpe"]
 
 Scalar: TypeAlias = float | Float[Array, ""]
-Poses: TypeAlias = Float[np.ndarray, "N 4 4"] | Sequence[Any]
+Matrices: TypeAlias = Float[np.ndarray, "N 4 4"]
+Poses: TypeAlias = Matrices | Sequence[Any]
 
 # Metres: the segment lengths of the KITTI odometry benchmark.
 KITTI_LENGTHS = (100.0, 200.0, 300.0, 400.0, 500.0, 600.0, 700.0, 800.0)
@@ -143,7 +144,7 @@ def kitti_errors(
     return float(100 * np.mean(translation)), float(np.degrees(np.mean(rotation)))
 
 
-def _trajectories(poses: Poses, true_poses: Poses) -> tuple[Float[np.ndarray, "N 4 4"], Float[np.ndarray, "N 4 4"]]:
+def _trajectories(poses: Poses, true_poses: Poses) -> tuple[Matrices, Matrices]:
     estimated, true = (
         np.array([pose_matrix(pose, f"{name}[{i}]") for i, pose in enumerate(trajectory)]).reshape(-1, 4, 4)
         for name, trajectory in (("poses", poses), ("true_poses", true_poses))
@@ -153,9 +154,7 @@ def _trajectories(poses: Poses, true_poses: Poses) -> tuple[Float[np.ndarray, "N
     return estimated, true
 
 
-def _relative_errors(
-    estimated: Float[np.ndarray, "N 4 4"], true: Float[np.ndarray, "N 4 4"], first: np.ndarray, last: np.ndarray
-) -> Float[np.ndarray, "2 M"]:
+def _relative_errors(estimated: Matrices, true: Matrices, first: Any, last: Any) -> Float[np.ndarray, "2 M"]:
     motions = (np.linalg.inv(poses[first]) @ poses[last] for poses in (estimated, true))
     return np.array([_errors(motion, truth, np.zeros(3), np) for motion, truth in zip(*motions, strict=True)]).T
 

@@ -78,11 +78,8 @@ class VoxelMap:
             raise ValueError(f"{name}: expected the channels {self._names}, got {cloud.channel_names}")
         cloud, self._names = cloud.unpad(), cloud.channel_names
         points = rotated(np.asarray(cloud.points, np.float64), pose[:3, :3]) + pose[:3, 3]
-        channels = np.asarray(cloud.channels, np.float64)
-        measured = (
-            np.ones_like(channels) if cloud.channel_valid is None else np.asarray(cloud.channel_valid, np.float64)
-        )
-        rows = np.hstack([np.ones((len(points), 1)), points, channels, measured])
+        measured = np.ones(cloud.channels.shape) if cloud.channel_valid is None else cloud.channel_valid
+        rows = np.hstack([np.ones((len(points), 1)), points, cloud.channels, measured])
         finite = np.isfinite(rows).all(axis=1)
         if self._first is None and finite.any():
             self._first = voxel_of(points[finite][0], self._voxel_size)

@@ -146,7 +146,12 @@ def _suitable_voxels(grids: Sequence[Grid]) -> Voxels:
     # Sizes are numbered, ten for each decade of metres; None stands for all points.
     step: int | None = None
     reason = ""
-    smallest, largest = _range_of([grid.columns for grid in grids])
+    samples = [grid.columns[:, :: 1 + grid.columns.shape[1] // _SAMPLE] for grid in grids]
+    inner = max(float(np.ptp(np.quantile(sample, _INNER, axis=1), axis=0).max()) for sample in samples)
+    whole = max(float(np.ptp(grid.columns, axis=1).max()) for grid in grids)
+    largest = _step_of(inner or whole or 1.0)
+    # 1 %, since sizes are rounded to two digits.
+    smallest = max(largest - _STEPS * _DECADES, _step_of(1.01 * whole / VOXELS_PER_AXIS or 1.0))
     # A size that suffices for the largest cloud mostly suffices for the others.
     clouds = [_Averages(grid) for grid in sorted(grids, key=lambda grid: grid.columns.shape[1], reverse=True)]
     most = clouds[0].count(None)
@@ -275,16 +280,6 @@ def _shape_of(columns: Float[np.ndarray, "3 N"], neighbors: Any = None) -> Shape
     squares = np.linalg.eigvalsh(np.einsum("ikn,jkn->ijn", offsets, offsets).T)
     thin, second, first = np.sqrt(np.maximum(squares.T, np.finfo(float).tiny))
     return Shape(float(np.mean(second < _LINE * first)), float(np.median(thin / second)), float(np.median(distances)))
-
-
-def _range_of(points: Sequence[Float[np.ndarray, "3 _"]]) -> tuple[int, int]:
-    """The smallest and the largest step to consider."""
-    samples = [columns[:, :: 1 + columns.shape[1] // _SAMPLE] for columns in points]
-    inner = max(float(np.ptp(np.quantile(sample, _INNER, axis=1), axis=0).max()) for sample in samples)
-    whole = max(float(np.ptp(columns, axis=1).max()) for columns in points)
-    largest = _step_of(inner or whole or 1.0)
-    # 1 %, since sizes are rounded to two digits.
-    return max(largest - _STEPS * _DECADES, _step_of(1.01 * whole / VOXELS_PER_AXIS or 1.0)), largest
 
 
 def _step_of(size: float) -> int:

@@ -5,11 +5,11 @@ from __future__ import annotations
 from functools import partial
 
 import numpy as np
-from jaxtyping import Float
+from numpy.random import Generator
 
 from mcgicp_jax._clouds.columns import COLORS
 from mcgicp_jax._clouds.point_cloud import PointCloud
-from mcgicp_jax.datasets._frames import Matrix, SyntheticFrames, check_scene, pose_of, scene_and_path_rng
+from mcgicp_jax.datasets._frames import Colors, Matrix, SyntheticFrames, check_scene, pose_of, scene_and_path_rng
 from mcgicp_jax.datasets._raycast import Box, cast, patches, random_rays, sensor_rotation
 
 # The constants of this module define the scene.
@@ -59,42 +59,7 @@ def box_room(
         ValueError: if `num_frames`, `points_per_frame` or `noise` is out of range.
     """
     check_scene(points_per_frame, noise)
-    scene_rng, path_rng = scene_and_path_rng(seed)
-    boxes = _boxes(scene_rng)
-    colors = scene_rng.uniform(0.25, 0.75, (len(boxes), 3))
-    observer = partial(_observe, boxes, colors, int(scene_rng.integers(2**31)), points_per_frame, noise, along_rays)
-    path = partial(_pose, step, *path_rng.uniform(0, 2 * np.pi, 2))
-    return SyntheticFrames(num_frames, path, observer, _PERIOD, seed)
-
-
-def _pose(step: float, start: float, tilt_start: float, index: int) -> Matrix:
-    angle = start + index * step / _RADIUS
-    x, y = _SIZE[:2] / 2 + _RADIUS * np.array([np.cos(angle), np.sin(angle)])
-    rotation = sensor_rotation(angle + np.pi / 2, _TILT, tilt_start + index * _TILT_PHASE)
-    return pose_of(rotation, (x, y, _SENSOR_HEIGHT))
-
-
-def _observe(
-    boxes: list[Box],
-    colors: Float[np.ndarray, "B 3"],
-    pattern: int,
-    size: int,
-    noise: float,
-    along_rays: bool,
-    rng: np.random.Generator,
-    pose: Matrix,
-) -> PointCloud:
-    rotation, center = pose[:3, :3], pose[:3, 3]
-    hits = cast(center, random_rays(rng, size) @ rotation.T, boxes, np.inf)
-    rays = hits.rays @ rotation
-    error = rng.normal(size=(len(rays), 1)) * rays if along_rays else rng.normal(size=rays.shape)
-    points = hits.distance[:, None] * rays + noise * _POINT_NOISE * error
-    paint = colors[hits.solid] + patches(hits.points, _PAINT, pattern)[:, None] * _PAINT_COLOR
-    channels = np.clip(paint + noise * _COLOR_NOISE * rng.normal(size=paint.shape), 0, 1)
-    return PointCloud(points, channels, channel_names=COLORS)
-
-
-def _boxes(rng: np.random.Generator) -> list[Box]:
+    rng, path_rng = scene_and_path_rng(seed)
     boxes = []
     # Floor, ceiling and four walls, overlapping at their edges.
     for axis in range(3):
@@ -112,4 +77,27 @@ def _boxes(rng: np.random.Generator) -> list[Box]:
             axis = int(rng.integers(2))
             low[axis] = rng.choice([0, _SIZE[axis] - size[axis]])
         boxes.append(Box(low, low + size))
-    return boxes
+    colors = rng.uniform(0.25, 0.75, (len(boxes), 3))
+    observer = partial(_observe, boxes, colors, int(rng.integers(2**31)), points_per_frame, noise, along_rays)
+    path = partial(_pose, step, *path_rng.uniform(0, 2 * np.pi, 2))
+    return SyntheticFrames(num_frames, path, observer, _PERIOD, seed)
+
+
+def _pose(step: float, start: float, tilt_start: float, index: int) -> Matrix:
+    angle = start + index * step / _RADIUS
+    x, y = _SIZE[:2] / 2 + _RADIUS * np.array([np.cos(angle), np.sin(angle)])
+    rotation = sensor_rotation(angle + np.pi / 2, _TILT, tilt_start + index * _TILT_PHASE)
+    return pose_of(rotation, (x, y, _SENSOR_HEIGHT))
+
+
+def _observe(
+    boxes: list[Box], colors: Colors, seed: int, size: int, noise: float, along_rays: bool, rng: Generator, pose: Matrix
+) -> PointCloud:
+    rotation, center = pose[:3, :3], pose[:3, 3]
+    hits = cast(center, random_rays(rng, size) @ rotation.T, boxes, np.inf)
+    rays = hits.rays @ rotation
+    error = rng.normal(size=(len(rays), 1)) * rays if along_rays else rng.normal(size=rays.shape)
+    points = hits.distance[:, None] * rays + noise * _POINT_NOISE * error
+    paint = colors[hits.solid] + patches(hits.points, _PAINT, seed)[:, None] * _PAINT_COLOR
+    channels = np.clip(paint + noise * _COLOR_NOISE * rng.normal(size=paint.shape), 0, 1)
+    return PointCloud(points, channels, channel_names=COLORS)

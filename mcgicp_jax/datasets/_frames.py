@@ -23,6 +23,10 @@ from mcgicp_jax.io.clouds import is_cloud
 
 Matrix: TypeAlias = Float[np.ndarray, "4 4"]
 Picture: TypeAlias = UInt8[np.ndarray, "height width 3"]
+# Column and row, from (0, 0) in the centre of the first pixel.
+Pixels: TypeAlias = Float[np.ndarray, "N 2"]
+Colors: TypeAlias = Float[np.ndarray, "N 3"]
+Mask: TypeAlias = Bool[np.ndarray, "N"]
 
 # Independent random streams of one seed: the scene, the path of the sensor, and one per frame.
 _SCENE, _PATH, _FIRST_FRAME = 0, 1, 2
@@ -182,11 +186,8 @@ def read_depth(path: str | os.PathLike[str]) -> UInt16[np.ndarray, "height width
     return depth
 
 
-def look_up(image: Picture, pixels: Float[np.ndarray, "N 2"]) -> tuple[Float[np.ndarray, "N 3"], Bool[np.ndarray, "N"]]:
-    """Bilinear colours from 0 to 1 in float32, and the mask of pixels inside the image.
-
-    Pixels are (column, row); the centre of the first is (0, 0).
-    """
+def look_up(image: Picture, pixels: Pixels) -> tuple[Colors, Mask]:
+    """Bilinear colours from 0 to 1 in float32, and the mask of pixels inside the image."""
     height, width, _ = image.shape
     # NaN compares false and is outside.
     inside = np.all((pixels >= 0) & (pixels <= (width - 1, height - 1)), axis=1)
@@ -194,10 +195,8 @@ def look_up(image: Picture, pixels: Float[np.ndarray, "N 2"]) -> tuple[Float[np.
     return colors.astype(np.float32), inside
 
 
-def bilinear(
-    image: Shaped[np.ndarray, "height width 3"], pixels: Float[np.ndarray, "N 2"], mode: str
-) -> Float[np.ndarray, "N 3"]:
-    """Values at pixels (column, row) of an image; `mode` says how SciPy's `map_coordinates` continues it."""
+def bilinear(image: Shaped[np.ndarray, "height width 3"], pixels: Pixels, mode: str) -> Colors:
+    """Values at pixels of an image; `mode` says how SciPy's `map_coordinates` continues it."""
     from scipy.ndimage import map_coordinates
 
     channels = np.moveaxis(image, 2, 0)
@@ -206,18 +205,14 @@ def bilinear(
 
 
 def colored_cloud(
-    points: Float[AnyArray, "N 3"],
-    colors: Float[np.ndarray, "N 3"],
-    colored: Bool[np.ndarray, "N"],
-    intensity: Float[AnyArray, "N 1"] | None = None,
+    points: Float[AnyArray, "N 3"], colors: Colors, colored: Mask, intensity: Float[AnyArray, "N 1"] | None = None
 ) -> PointCloud:
     """A cloud whose colours are valid where `colored`; an intensity becomes the first channel, valid everywhere."""
-    channels, valid, names = colors, np.repeat(colored[:, None], 3, axis=1), list(COLORS)
-    if intensity is not None:
-        channels = np.hstack([intensity, colors])
-        valid = np.hstack([np.ones_like(intensity, bool), valid])
-        names = ["intensity", *COLORS]
-    return PointCloud(points, channels, channel_valid=valid, channel_names=names)
+    valid = np.repeat(colored[:, None], 3, axis=1)
+    if intensity is None:
+        return PointCloud(points, colors, channel_valid=valid, channel_names=COLORS)
+    channels, valid = np.hstack([intensity, colors]), np.hstack([np.ones_like(intensity, bool), valid])
+    return PointCloud(points, channels, channel_valid=valid, channel_names=("intensity", *COLORS))
 
 
 def _open(path: str | os.PathLike[str]) -> Any:

@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from mcgicp_jax import io
 from mcgicp_jax._clouds.point_cloud import Frame
-from mcgicp_jax.datasets._frames import AbstractFrames, Matrix, colored_cloud, look_up, pose_of, read_image
+from mcgicp_jax.datasets._frames import AbstractFrames, Colors, Matrix, colored_cloud, look_up, pose_of, read_image
 
 # Pose of the laser in the vehicle's frame: roll, pitch, yaw in radians; x, y, z in metres.
 _LASER_IN_VEHICLE = pose_of(Rotation.from_euler("xyz", [np.pi, 0, np.pi / 2]), [2.4, -0.01, -2.3])
@@ -164,9 +164,7 @@ class FordFrames(AbstractFrames):
         pose = pose_of(Rotation.from_euler("xyz", vehicle[3:]), vehicle[:3]) @ _LASER_IN_VEHICLE
         return Frame(cloud, pose, _MICROSECOND * time)
 
-    def _paint(
-        self, size: int, cameras: list[dict[str, Any]], time: float
-    ) -> tuple[Float[np.ndarray, "N 3"], Bool[np.ndarray, "N"]]:
+    def _paint(self, size: int, cameras: list[dict[str, Any]], time: float) -> tuple[Colors, Bool[np.ndarray, "N"]]:
         """Colours of the points and the mask of coloured points; the first camera that saw a point determines it."""
         colors, colored = np.zeros((size, 3), np.float32), np.zeros(size, bool)
         # The image nearest in time, in microseconds, if near enough. (The `image_index` of the scans is always 0.)

@@ -49,6 +49,8 @@ _PALETTE = np.array(
     ]
 )
 
+# Metres to the right and downwards along the wall.
+Offset: TypeAlias = Float[np.ndarray, "2"]
 Grid: TypeAlias = Float[np.ndarray, "h w"]
 Image: TypeAlias = Float[np.ndarray, "h w 3"]
 Colors: TypeAlias = Float[np.ndarray, "colors 3"]
@@ -98,12 +100,7 @@ def poster_wall(
 
 
 def _pose(
-    start: Float[np.ndarray, "2"],
-    move: Float[np.ndarray, "2"],
-    tilt_start: float,
-    tilt_axes: Float[np.ndarray, "3 2"],
-    sway_start: float,
-    index: int,
+    start: Offset, move: Offset, tilt_start: float, tilt_axes: Float[np.ndarray, "3 2"], sway_start: float, index: int
 ) -> Matrix:
     tilt = tilt_start + index * _TILT_PHASE
     sway = sway_start + 0.3 * np.linalg.norm(move) / _DISTANCE_SWAY * index

@@ -16,11 +16,7 @@ from mcgicp_jax._clouds.point_cloud import Frame, PointCloud
 from mcgicp_jax.datasets._frames import AbstractFrames, colored_cloud, look_up, pose_of, read_depth, read_image
 
 # Pixels: focal lengths and principal point of the three calibrated cameras, and the default of the camera driver.
-_CAMERAS = {
-    "1": (517.3, 516.5, 318.6, 255.3),
-    "2": (520.9, 521.0, 325.1, 249.7),
-    "3": (535.4, 539.2, 320.1, 247.6),
-}
+_CAMERAS = {"1": (517.3, 516.5, 318.6, 255.3), "2": (520.9, 521.0, 325.1, 249.7), "3": (535.4, 539.2, 320.1, 247.6)}
 _OTHER_CAMERA = (525.0, 525.0, 319.5, 239.5)
 # Units of the depth images per metre.
 _DEPTH_SCALE = 5000

@@ -7,12 +7,13 @@ from functools import partial
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Float
+from numpy.random import Generator
 
 import mcgicp_jax.datasets._raycast as raycast
 from mcgicp_jax._clouds.columns import COLORS
 from mcgicp_jax._clouds.point_cloud import PointCloud
-from mcgicp_jax.datasets._frames import Matrix, SyntheticFrames, check_scene, pose_of, scene_and_path_rng
+from mcgicp_jax.datasets._frames import Colors, Mask, Matrix, SyntheticFrames, check_scene, pose_of, scene_and_path_rng
 
 # The constants of this module define the scene and the sensor.
 # The LiDAR, a Velodyne HDL-64E on the roof of a car: beams and their elevations, radians; range and height, metres;
@@ -102,9 +103,21 @@ def street(
         ValueError: if `num_frames`, `points_per_frame` or `noise` is out of range.
     """
     check_scene(points_per_frame, noise)
-    scene_rng, path_rng = scene_and_path_rng(seed)
-    things = _things(scene_rng, -2 * _MAX_RANGE, num_frames * step + 2 * _MAX_RANGE)
-    observer = partial(_observe, things, int(scene_rng.integers(2**31)), points_per_frame, noise)
+    rng, path_rng = scene_and_path_rng(seed)
+    start, end = -2 * _MAX_RANGE, num_frames * step + 2 * _MAX_RANGE
+    road = raycast.Box(np.array([start, -60.0, -1.0]), np.array([end, 60.0, 0.0]))
+    things = [_Thing(_Kind.GROUND, road, np.full(3, 0.33), 0.2)]
+    for side, side_rng in zip((-1, 1), rng.spawn(2), strict=True):
+        low, high = np.array([start, _KERB, -1.0]), np.array([end, 30.0, _KERB_HEIGHT])
+        things.append(_Thing(_Kind.PAVEMENT, _box(low, high, side), np.full(3, 0.52), 0.3))
+        # Each kind in order of x, so that a longer street begins like a shorter one.
+        for make, kind_rng in zip((_building, _car, _pole, _bin), side_rng.spawn(4), strict=True):
+            x = start
+            while x < end:
+                new_things, advance = make(kind_rng, side, x)
+                things += new_things
+                x += advance
+    observer = partial(_observe, things, int(rng.integers(2**31)), points_per_frame, noise)
     path = partial(_pose, spin, step, *path_rng.uniform(0, 2 * np.pi, 3))
     return SyntheticFrames(num_frames, path, observer, _PERIOD, seed, _POSES_OF_A_TURN if spin else 1)
 
@@ -120,12 +133,7 @@ def _pose(smooth: bool, step: float, sway: float, yaw: float, tilt: float, time:
 
 
 def _observe(
-    things: list[_Thing],
-    pattern: int,
-    size: int,
-    noise: float,
-    rng: np.random.Generator,
-    pose: Float[np.ndarray, "*poses 4 4"],
+    things: list[_Thing], pattern: int, size: int, noise: float, rng: Generator, pose: Float[np.ndarray, "*poses 4 4"]
 ) -> PointCloud:
     # Each pose of the turn measures one sector of the rays.
     poses, solids = pose.reshape(-1, 4, 4), [thing.solid for thing in things]
@@ -152,22 +160,6 @@ def _observe(
     return PointCloud(points, channels, channel_names=("intensity", *COLORS), times=times)
 
 
-def _things(rng: np.random.Generator, start: float, end: float) -> list[_Thing]:
-    """The objects of the street, each kind in order of x, so that a longer street begins like a shorter one."""
-    road = raycast.Box(np.array([start, -60.0, -1.0]), np.array([end, 60.0, 0.0]))
-    things = [_Thing(_Kind.GROUND, road, np.full(3, 0.33), 0.2)]
-    for side, side_rng in zip((-1, 1), rng.spawn(2), strict=True):
-        low, high = np.array([start, _KERB, -1.0]), np.array([end, 30.0, _KERB_HEIGHT])
-        things.append(_Thing(_Kind.PAVEMENT, _box(low, high, side), np.full(3, 0.52), 0.3))
-        for make, kind_rng in zip((_building, _car, _pole, _bin), side_rng.spawn(4), strict=True):
-            x = start
-            while x < end:
-                new_things, advance = make(kind_rng, side, x)
-                things += new_things
-                x += advance
-    return things
-
-
 def _box(low: Float[np.ndarray, "3"], high: Float[np.ndarray, "3"], side: int) -> raycast.Box:
     """A box on the left of the street (side 1), or its mirror image on the right (−1)."""
     mirror = np.array([1, side, 1])
@@ -177,7 +169,7 @@ def _box(low: Float[np.ndarray, "3"], high: Float[np.ndarray, "3"], side: int) -
 # Each of these makes the things of one kind that begin at `x`, and returns the distance to the start of the next.
 
 
-def _building(rng: np.random.Generator, side: int, x: float) -> tuple[list[_Thing], float]:
+def _building(rng: Generator, side: int, x: float) -> tuple[list[_Thing], float]:
     width, height, setback = rng.uniform((7, 6, 0), (16, 15, 0.8))
     pitch, opening = rng.uniform((1.8, 2.9), (3.2, 3.5)), rng.uniform((0.8, 1.3), (1.4, 1.9))
     # Fit a whole number of windows and storeys, so that no window is cut off.
@@ -190,7 +182,7 @@ def _building(rng: np.random.Generator, side: int, x: float) -> tuple[list[_Thin
     return [building], width + rng.choice([0, rng.uniform(1.5, 4), 9], p=[0.7, 0.2, 0.1])
 
 
-def _car(rng: np.random.Generator, side: int, x: float) -> tuple[list[_Thing], float]:
+def _car(rng: Generator, side: int, x: float) -> tuple[list[_Thing], float]:
     length, width, sill, roof = rng.uniform((3.6, 1.65, 0.85, 1.40), (4.9, 1.85, 1.05, 1.60))
     y = rng.uniform(_PARKING + 0.1, _KERB - width - 0.05)
     color, reflectance = rng.choice(_CAR_PALETTE), rng.uniform(0.15, 0.6)
@@ -202,21 +194,21 @@ def _car(rng: np.random.Generator, side: int, x: float) -> tuple[list[_Thing], f
     return [_Thing(_Kind.CAR, body, color, reflectance), cabin], length + gap
 
 
-def _pole(rng: np.random.Generator, side: int, x: float) -> tuple[list[_Thing], float]:
+def _pole(rng: Generator, side: int, x: float) -> tuple[list[_Thing], float]:
     radius, height = rng.uniform((0.06, 4.0), (0.18, 8.0))
     cylinder = raycast.Cylinder(np.array([x, side * (_KERB + rng.uniform(0.4, 0.9)), 0.0]), radius, height)
     pole = _Thing(_Kind.POLE, cylinder, rng.uniform(0.2, 0.5, 3), rng.uniform(0.3, 0.7))
     return [pole], rng.uniform(8, 22)
 
 
-def _bin(rng: np.random.Generator, side: int, x: float) -> tuple[list[_Thing], float]:
+def _bin(rng: Generator, side: int, x: float) -> tuple[list[_Thing], float]:
     size = rng.uniform((0.4, 0.4, 0.8), (1.2, 0.7, 1.3))
     low = np.array([x, rng.uniform(_KERB + 1.2, _FACADE - 0.9), 0.0])
     box = _box(low, low + size, side)
     return [_Thing(_Kind.BIN, box, rng.uniform(0.1, 0.6, 3), rng.uniform(0.2, 0.5))], rng.uniform(6, 25)
 
 
-def _into_windows(hits: raycast.Hits, things: list[_Thing]) -> tuple[raycast.Hits, Bool[np.ndarray, "N"]]:
+def _into_windows(hits: raycast.Hits, things: list[_Thing]) -> tuple[raycast.Hits, Mask]:
     """Move hits in the opening of a window on to the glass or the reveal, and return the mask of hits on glass."""
     no_windows = np.full(5, np.nan)
     windows = np.array([no_windows if thing.windows is None else thing.windows for thing in things])[hits.solid]
@@ -248,9 +240,7 @@ def _into_windows(hits: raycast.Hits, things: list[_Thing]) -> tuple[raycast.Hit
     return hits._replace(distance=distance, points=points, normals=normals), glass
 
 
-def _paint(
-    hits: raycast.Hits, glass: Bool[np.ndarray, "N"], things: list[_Thing], pattern: int
-) -> tuple[Float[np.ndarray, "N 3"], Float[np.ndarray, "N"]]:
+def _paint(hits: raycast.Hits, glass: Mask, things: list[_Thing], pattern: int) -> tuple[Colors, raycast.Distances]:
     """Colour and laser reflectance of the surface at each hit."""
     kinds = np.array([thing.kind for thing in things])[hits.solid]
     colors = np.array([thing.color for thing in things])[hits.solid]
