@@ -108,13 +108,10 @@ def read_npz(file: BinaryIO, size: int) -> PointCloud:
             raise ValueError(f"it has no array 'points'; found {', '.join(names)}")
         points = np.asarray(PointCloud(load("points")).points)
         if "channels" in names:
-            return PointCloud(
-                points,
-                load("channels"),
-                covariances=load("covariances") if "covariances" in names else None,
-                channel_names=load("channel_names").astype(str).tolist() if "channel_names" in names else None,
-                times=load("times") if "times" in names else None,
-            )
+            optional: dict[str, Any] = {name: load(name) for name in ("covariances", "times") if name in names}
+            if "channel_names" in names:
+                optional["channel_names"] = load("channel_names").astype(str).tolist()
+            return PointCloud(points, load("channels"), **optional)
         columns = dict(zip("xyz", points.T, strict=True))
         columns |= {name: load(name).ravel() for name in names if name.lower() in INTENSITIES}
         for name in [name for name in names if name.lower() in _RGB_ARRAYS]:

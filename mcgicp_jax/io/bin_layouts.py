@@ -25,11 +25,8 @@ _PADDING = 1e-30
 def columns_of_floats(values: Float[np.ndarray, "n"], given: int | None = None) -> dict[str, Float[np.ndarray, "N"]]:
     """x, y, z and perhaps intensity, by the layout whose columns fit: KITTI (x, y, z, intensity), nuScenes (ring last),
     ring and time last, PCL's points of 32 bytes (x, y, z, padding, intensity, padding), or x, y, z. Of a given number
-    of columns, the first are x, y, z, and the fourth is the intensity unless it has negative values.
-
-    Raises:
-        ValueError: if none fits.
-    """
+    of columns, the first are x, y, z, and the fourth is the intensity unless it has negative values. Raises
+    `ValueError` if none fits."""
 
     def split(size: int) -> Any:
         return values.reshape(-1, size).T if values.size % size == 0 else None

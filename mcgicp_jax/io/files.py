@@ -8,7 +8,7 @@ import re
 import uuid
 from collections.abc import Iterator
 from pathlib import Path
-from typing import BinaryIO
+from typing import BinaryIO, TextIO
 
 import numpy as np
 
@@ -32,6 +32,16 @@ def check_size(claimed: int, size: int) -> None:
 
 def reason_of(error: BaseException) -> str:
     return "it is not text" if isinstance(error, UnicodeError) else str(error) or type(error).__name__
+
+
+@contextlib.contextmanager
+def open_text(path: str | os.PathLike[str], kind: str) -> Iterator[TextIO]:
+    """Open a text file of a kind, such as "poses"; a `ValueError` in the block gets the path and the kind."""
+    with open(path, encoding="utf-8-sig") as file:
+        try:
+            yield file
+        except ValueError as error:
+            raise ValueError(f"{path}: cannot be read as {kind}: {reason_of(error)}") from error
 
 
 @contextlib.contextmanager

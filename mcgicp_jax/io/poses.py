@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -12,7 +12,7 @@ from jaxtyping import Float
 from mcgicp_jax._math.poses import matrices_of, parameters_of, pose_matrices, pose_matrix
 from mcgicp_jax._pose_graph.edge import WORLD, Edge
 from mcgicp_jax._pose_graph.graph import PoseGraph
-from mcgicp_jax.io.files import reason_of, replacing
+from mcgicp_jax.io.files import open_text, replacing
 
 # Quaternions are commonly written with four digits.
 _UNIT_TOLERANCE = 1e-3
@@ -36,13 +36,10 @@ def read_poses(path: str | os.PathLike[str]) -> Float[np.ndarray, "N 4 4"]:
         OSError: if the file cannot be opened.
         ValueError: if the file has another format, or a pose is no rigid motion; the message starts with the path.
     """
-    with open(path, encoding="utf-8-sig") as file:
-        try:
-            # Blank lines and comments are removed because loadtxt warns if no data remain.
-            lines = [line for line in file if line.split("#")[0].strip()]
-            poses = _poses_of(np.loadtxt(lines, ndmin=2) if lines else np.empty((0, 0)))
-        except ValueError as error:
-            raise ValueError(f"{path}: cannot be read as poses: {reason_of(error)}") from error
+    with open_text(path, "poses") as file:
+        # Blank lines and comments are removed because loadtxt warns if no data remain.
+        lines = [line for line in file if line.split("#")[0].strip()]
+        poses = _poses_of(np.loadtxt(lines, ndmin=2) if lines else np.empty((0, 0)))
     for i, pose in enumerate(poses):
         pose_matrix(pose, f"{path}: pose {i}")
     return poses
@@ -121,11 +118,28 @@ def read_g2o(path: str | os.PathLike[str]) -> PoseGraph:
         OSError: if the file cannot be opened.
         ValueError: if a line has the wrong format, or the graph is not valid; the message starts with the path.
     """
-    with open(path, encoding="utf-8-sig") as file:
-        try:
-            return _graph_of(file)
-        except ValueError as error:
-            raise ValueError(f"{path}: cannot be read as a pose graph: {reason_of(error)}") from error
+    with open_text(path, "a pose graph") as file:
+        words = [(number, line.split()) for number, line in enumerate(file, 1)]
+        (_, vertices), (edge_lines, edges), (prior_lines, priors), (_, offsets) = (_rows(words, tag) for tag in _WIDTHS)
+        if not len(vertices):
+            others = ", ".join(sorted({line[0] for _, line in words if line})[:4])
+            raise ValueError(f"expected lines {_VERTEX}, poses in space, got {others or 'none'}")
+        if len(priors) and np.any(offsets[:, 1:] != [0, 0, 0, 0, 0, 0, 1]):
+            raise ValueError(f"expected priors of the poses themselves, got {_OFFSET} other than the identity")
+        ends, values = np.concatenate([edges[:, :2], priors[:, [0, 0]]]), np.concatenate([edges, priors])
+        numbers, first = np.unique(vertices[:, 0], return_index=True)
+        rows = np.searchsorted(numbers, ends).clip(max=len(numbers) - 1)
+        missing = np.argwhere(numbers[rows] != ends)
+        if len(missing):
+            line = [*edge_lines, *prior_lines][missing[0, 0]]
+            raise ValueError(f"line {line}: expected a vertex for each end, got none of number {ends[*missing[0]]:g}")
+        upper, information = np.triu_indices(6), np.zeros((len(values), 6, 6))
+        information[:, *upper] = information[:, *upper[::-1]] = values[:, 9:]
+        of_world = np.arange(len(values)) >= len(edges)
+        loop = ~of_world & (np.abs(ends[:, 0] - ends[:, 1]) != 1)
+        i = np.where(of_world, WORLD, rows[:, 0])
+        motions = _poses(values[:, 2:9])
+        return PoseGraph(_poses(vertices[first, 1:]), Edge(i, rows[:, 1], motions, information, uncertain=loop))
 
 
 def write_g2o(path: str | os.PathLike[str], graph: PoseGraph | Any) -> None:
@@ -156,31 +170,6 @@ def write_g2o(path: str | os.PathLike[str], graph: PoseGraph | Any) -> None:
             whole, width = _WIDTHS[tag]
             form = " ".join([tag, *["%d"] * whole, *["%.17g"] * (width - whole)])
             np.savetxt(file, np.column_stack([numbers, parameters, information]), fmt=form)
-
-
-def _graph_of(lines: Iterable[str]) -> PoseGraph:
-    words = [(number, line.split()) for number, line in enumerate(lines, 1)]
-    (_, vertices), (edge_lines, edges), (prior_lines, priors), (_, offsets) = (_rows(words, tag) for tag in _WIDTHS)
-    if not len(vertices):
-        others = ", ".join(sorted({line[0] for _, line in words if line})[:4])
-        raise ValueError(f"expected lines {_VERTEX}, poses in space, got {others or 'none'}")
-    if len(priors) and np.any(offsets[:, 1:] != [0, 0, 0, 0, 0, 0, 1]):
-        raise ValueError(f"expected priors of the poses themselves, got {_OFFSET} other than the identity")
-    ends, values = np.concatenate([edges[:, :2], priors[:, [0, 0]]]), np.concatenate([edges, priors])
-    numbers, first = np.unique(vertices[:, 0], return_index=True)
-    rows = np.searchsorted(numbers, ends).clip(max=len(numbers) - 1)
-    missing = np.argwhere(numbers[rows] != ends)
-    if len(missing):
-        line = [*edge_lines, *prior_lines][missing[0, 0]]
-        raise ValueError(f"line {line}: expected a vertex for each end, got none of number {ends[*missing[0]]:g}")
-    upper, information = np.triu_indices(6), np.zeros((len(values), 6, 6))
-    information[:, *upper] = information[:, *upper[::-1]] = values[:, 9:]
-    of_world = np.arange(len(values)) >= len(edges)
-    loop = ~of_world & (np.abs(ends[:, 0] - ends[:, 1]) != 1)
-    i = np.where(of_world, WORLD, rows[:, 0])
-    return PoseGraph(
-        _poses(vertices[first, 1:]), Edge(i, rows[:, 1], _poses(values[:, 2:9]), information, uncertain=loop)
-    )
 
 
 def _rows(lines: list[tuple[int, list[str]]], tag: str) -> tuple[list[int], Float[np.ndarray, "N _"]]:

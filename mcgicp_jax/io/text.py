@@ -23,12 +23,10 @@ def read_text(file: BinaryIO, size: int) -> PointCloud:
     with _as_text(file) as text:
         names, line, cells = _text_start(text)
         lines = plain_numbers(line + text.read())
-    delimiter = _delimiter(line)
-    if delimiter is not None:
-        lines = re.sub(
-            rf"^[ \t]*(?={delimiter})|(?<={delimiter})[ \t]*(?={delimiter}|$)", "nan", lines, flags=re.MULTILINE
-        )
-    table = np.loadtxt(lines.splitlines(), delimiter=delimiter, ndmin=2)
+    mark = _delimiter(line)
+    if mark is not None:
+        lines = re.sub(rf"^[ \t]*(?={mark})|(?<={mark})[ \t]*(?={mark}|$)", "nan", lines, flags=re.MULTILINE)
+    table = np.loadtxt(lines.splitlines(), delimiter=mark, ndmin=2)
     if not names and table.shape[1] < 3:
         raise ValueError(f"expected at least three columns, x, y and z, got {table.shape[1]}")
     names = names or ["x", "y", "z", *(f"channel_{i}" for i in range(table.shape[1] - 3))]
